@@ -1,0 +1,1 @@
+//! From a run's MCAP file to rows.

@@ -1,0 +1,32 @@
+//! Ids, quantities, grid, symmetry, messages and table schemas of echolake. Knows no other member and does no I/O.
+//!
+//! ```
+//! use echolake_schema::{Rig, SurfaceId};
+//!
+//! let rig = Rig::paper();
+//! let grid = rig.grid()?;
+//! assert_eq!((grid.points().len(), grid.pairs().len()), (78, 2951));
+//! let surface: SurfaceId = "panel_0016_r180_0".parse()?;
+//! assert_eq!(surface.panel(), "0016");
+//! # Ok::<(), echolake_schema::Error>(())
+//! ```
+
+mod error;
+pub mod grid;
+pub mod ids;
+pub mod manifest;
+pub mod messages;
+pub mod quantities;
+pub mod rig;
+pub mod symmetry;
+pub mod tables;
+pub mod topics;
+
+pub use error::Error;
+pub use grid::{Grid, Pair, Point};
+pub use ids::{PairId, PointId, RunId, SurfaceId};
+pub use manifest::{RunManifest, SurfaceRecord};
+pub use quantities::{Celsius, SampleRate, Timestamp};
+pub use rig::Rig;
+pub use symmetry::Symmetry;
+pub use tables::Table;

@@ -1,0 +1,280 @@
+//! What a run's file says of itself: the manifest in its metadata, and the record of its surface.
+
+use std::collections::BTreeMap;
+
+use serde::{Deserialize, Serialize};
+
+use crate::{Error, RunId, SurfaceId, Timestamp};
+
+/// Format of run files that this version writes, and the newest that it reads.
+pub const RUN_FORMAT: u32 = 1;
+
+/// Metadata `echolake.run`: what a run is.
+#[derive(Debug, Clone, PartialEq)]
+pub struct RunManifest {
+    /// The run's name.
+    pub run_id: RunId,
+    /// The measured surface.
+    pub surface_id: SurfaceId,
+    /// When it began.
+    pub started: Timestamp,
+    /// Name and version of the program that wrote it.
+    pub software: String,
+    /// Name of the rig.
+    pub rig: String,
+    /// Where its signals come from.
+    pub origin: Origin,
+}
+
+/// Where a run's signals come from.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Origin {
+    /// Measured by a rig.
+    Measured,
+    /// Computed by the simulated rig.
+    Simulated,
+    /// Imported from somebody's WAV files.
+    ImportedWav,
+    /// Imported from the published GIR data set.
+    ImportedGir,
+}
+
+/// Metadata `echolake.run.end`: how a run ended.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct RunEnd {
+    /// When.
+    pub ended: Timestamp,
+    /// Measurements accepted.
+    pub accepted: u64,
+    /// Pairs given up.
+    pub rejected: u64,
+    /// Attempts made.
+    pub attempts: u64,
+}
+
+/// Attachment `surface.json`: what is known of a surface.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, Default)]
+#[serde(default)]
+pub struct SurfaceRecord {
+    /// Kind of relief, as `stretcher_bond`.
+    pub typology: String,
+    /// The large shape beneath the relief: the surface that has it alone, or a description.
+    pub macrostructure: Option<String>,
+    /// The relief's pattern.
+    pub mesostructure: Option<String>,
+    /// The finish.
+    pub microstructure: Option<String>,
+    /// Material, as `coated print`.
+    pub material: Option<String>,
+    /// Pressure reflection factor that a simulation used.
+    pub reflection_factor: Option<f64>,
+    /// The surface that normalises this one; the lake's choice where none is given.
+    pub flat_reference: Option<SurfaceId>,
+    /// The surface whose direct sound is subtracted from this one; the lake's choice where none is given.
+    pub foam_reference: Option<SurfaceId>,
+    /// Parameters of the relief's generator.
+    pub parameters: serde_json::Value,
+    /// Facts about the producer's own mesh file.
+    pub mesh: Option<MeshFacts>,
+}
+
+/// Facts about a mesh.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct MeshFacts {
+    /// Name of the attachment that holds it.
+    pub file: String,
+    /// Triangles.
+    pub triangles: u64,
+    /// Whether every edge has two triangles.
+    pub watertight: bool,
+    /// Lowest and highest point of the relief, mm.
+    pub relief_mm: [f64; 2],
+}
+
+impl Origin {
+    /// Its name in metadata and tables.
+    pub fn label(self) -> &'static str {
+        match self {
+            Self::Measured => "measured",
+            Self::Simulated => "simulated",
+            Self::ImportedWav => "imported_wav",
+            Self::ImportedGir => "imported_gir",
+        }
+    }
+
+    fn parse(text: &str) -> Option<Self> {
+        [Self::Measured, Self::Simulated, Self::ImportedWav, Self::ImportedGir].into_iter().find(|o| o.label() == text)
+    }
+}
+
+/// Why metadata is not that of a run.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum ManifestError {
+    /// A key is missing.
+    #[error("its metadata `{record}` has no `{key}`")]
+    Missing {
+        /// The metadata record.
+        record: &'static str,
+        /// The key.
+        key: &'static str,
+    },
+    /// A value cannot be read.
+    #[error("its metadata `{record}` has `{key}` = `{actual}`, expected {expected}")]
+    Value {
+        /// The metadata record.
+        record: &'static str,
+        /// The key.
+        key: &'static str,
+        /// What stands there.
+        actual: String,
+        /// What should.
+        expected: &'static str,
+    },
+    /// Written by a later version.
+    #[error("its format is {actual}, the newest that this version reads is {newest}; hint: update echolake")]
+    Newer {
+        /// The file's format.
+        actual: u32,
+        /// Ours.
+        newest: u32,
+    },
+    /// A name in it is not valid.
+    #[error(transparent)]
+    Name(#[from] Error),
+}
+
+/// Keys of one metadata record, read with errors that name it.
+struct Record<'a> {
+    name: &'static str,
+    values: &'a BTreeMap<String, String>,
+}
+
+impl Record<'_> {
+    fn text(&self, key: &'static str) -> Result<&str, ManifestError> {
+        let value = self.values.get(key).map(String::as_str);
+        value.ok_or(ManifestError::Missing { record: self.name, key })
+    }
+
+    fn number<T: std::str::FromStr>(&self, key: &'static str) -> Result<T, ManifestError> {
+        let text = self.text(key)?;
+        text.parse().map_err(|_| ManifestError::Value {
+            record: self.name,
+            key,
+            actual: text.to_owned(),
+            expected: "a whole number",
+        })
+    }
+}
+
+impl RunManifest {
+    /// As the metadata record's key and value pairs.
+    pub fn to_metadata(&self) -> BTreeMap<String, String> {
+        [
+            ("format", RUN_FORMAT.to_string()),
+            ("run_id", self.run_id.to_string()),
+            ("surface_id", self.surface_id.to_string()),
+            ("started", self.started.to_string()),
+            ("software", self.software.clone()),
+            ("rig", self.rig.clone()),
+            ("origin", self.origin.label().to_owned()),
+        ]
+        .map(|(key, value)| (key.to_owned(), value))
+        .into()
+    }
+
+    /// Reads the metadata record.
+    ///
+    /// # Errors
+    /// [`ManifestError`], naming the key.
+    pub fn from_metadata(values: &BTreeMap<String, String>) -> Result<Self, ManifestError> {
+        let record = Record { name: crate::topics::RUN_METADATA, values };
+        let format = record.number("format")?;
+        if format > RUN_FORMAT {
+            return Err(ManifestError::Newer { actual: format, newest: RUN_FORMAT });
+        }
+        let origin = record.text("origin")?;
+        Ok(Self {
+            run_id: record.text("run_id")?.parse()?,
+            surface_id: record.text("surface_id")?.parse()?,
+            started: Timestamp::parse(record.text("started")?)?,
+            software: record.text("software")?.to_owned(),
+            rig: record.text("rig")?.to_owned(),
+            origin: Origin::parse(origin).ok_or_else(|| ManifestError::Value {
+                record: record.name,
+                key: "origin",
+                actual: origin.to_owned(),
+                expected: "measured, simulated, imported_wav or imported_gir",
+            })?,
+        })
+    }
+}
+
+impl RunEnd {
+    /// As the metadata record's key and value pairs.
+    pub fn to_metadata(&self) -> BTreeMap<String, String> {
+        [
+            ("ended", self.ended.to_string()),
+            ("accepted", self.accepted.to_string()),
+            ("rejected", self.rejected.to_string()),
+            ("attempts", self.attempts.to_string()),
+        ]
+        .map(|(key, value)| (key.to_owned(), value))
+        .into()
+    }
+
+    /// Reads the metadata record.
+    ///
+    /// # Errors
+    /// [`ManifestError`], naming the key.
+    pub fn from_metadata(values: &BTreeMap<String, String>) -> Result<Self, ManifestError> {
+        let record = Record { name: crate::topics::RUN_END_METADATA, values };
+        Ok(Self {
+            ended: Timestamp::parse(record.text("ended")?)?,
+            accepted: record.number("accepted")?,
+            rejected: record.number("rejected")?,
+            attempts: record.number("attempts")?,
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn manifest() -> RunManifest {
+        RunManifest {
+            run_id: "20260105T080000Z-flat-7c1e".parse().expect("valid"),
+            surface_id: "flat".parse().expect("valid"),
+            started: Timestamp(1_767_600_000_000_000_000),
+            software: "echolake 0.1.0".into(),
+            rig: "paper".into(),
+            origin: Origin::Simulated,
+        }
+    }
+
+    #[test]
+    fn metadata_round_trips() {
+        let manifest = manifest();
+        assert_eq!(RunManifest::from_metadata(&manifest.to_metadata()), Ok(manifest));
+        let end = RunEnd { ended: Timestamp(5), accepted: 2951, rejected: 0, attempts: 2960 };
+        assert_eq!(RunEnd::from_metadata(&end.to_metadata()), Ok(end));
+    }
+
+    #[test]
+    fn damaged_metadata_names_the_key() {
+        let check = |key: &str, value: Option<&str>, expected: &str| {
+            let mut metadata = manifest().to_metadata();
+            metadata.remove(key);
+            metadata.extend(value.map(|v| (key.to_owned(), v.to_owned())));
+            let error = RunManifest::from_metadata(&metadata).expect_err(expected).to_string();
+            assert!(error.contains(expected), "{error}");
+        };
+        check("run_id", None, "no `run_id`");
+        check("run_id", Some("../../etc"), "not a valid run id");
+        check("format", Some("2"), "update echolake");
+        check("format", Some("x"), "whole number");
+        check("origin", Some("guessed"), "measured, simulated");
+        check("started", Some("noon"), "RFC 3339");
+    }
+}

@@ -1,0 +1,54 @@
+//! The messages of `proto/echolake/v1`, compiled at build time, and their descriptors for MCAP schemas.
+
+#![allow(missing_docs, reason = "generated; the meaning of every field stands in proto/")]
+
+include!(concat!(env!("OUT_DIR"), "/echolake.v1.rs"));
+
+/// The `FileDescriptorSet` of all messages, as the data of an MCAP schema with encoding `protobuf`.
+pub const FILE_DESCRIPTOR_SET: &[u8] = include_bytes!(concat!(env!("OUT_DIR"), "/echolake.v1.fds"));
+
+/// A message that a run's file can hold.
+pub trait Message: prost::Message + Default {
+    /// Its full name, the name of its MCAP schema.
+    const FULL_NAME: &'static str;
+}
+
+impl Message for SweepRecording {
+    const FULL_NAME: &'static str = "echolake.v1.SweepRecording";
+}
+
+impl Message for ImpulseResponse {
+    const FULL_NAME: &'static str = "echolake.v1.ImpulseResponse";
+}
+
+impl Message for AmbientSample {
+    const FULL_NAME: &'static str = "echolake.v1.AmbientSample";
+}
+
+impl Message for Measurement {
+    const FULL_NAME: &'static str = "echolake.v1.Measurement";
+}
+
+impl Verdict {
+    /// Its name in the tables.
+    pub fn label(self) -> &'static str {
+        match self {
+            Self::Unspecified => "unspecified",
+            Self::Accepted => "accepted",
+            Self::Repeated => "repeated",
+            Self::Rejected => "rejected",
+        }
+    }
+}
+
+impl SampleFormat {
+    /// Bytes of one sample; None where the format is unknown.
+    pub fn bytes(self) -> Option<usize> {
+        match self {
+            Self::Unspecified => None,
+            Self::S16le => Some(2),
+            Self::S24le => Some(3),
+            Self::S32le | Self::F32le => Some(4),
+        }
+    }
+}

@@ -1,0 +1,351 @@
+//! Description of a rig: its grid, its sweep, and how its recordings become impulse responses and bands.
+
+use serde::{Deserialize, Serialize};
+
+use crate::grid::{Grid, GridParams};
+use crate::{Celsius, Error, SampleRate};
+
+/// A rig, as its TOML describes it. What the TOML leaves out is as in Rust et al. 2021
+/// ("A data acquisition setup for data driven acoustic design", Building Acoustics 28(4)).
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Rig {
+    /// Its name.
+    pub name: String,
+    /// The excitation.
+    pub sweep: Sweep,
+    /// What is kept of each response.
+    pub impulse_response: ImpulseResponse,
+    /// The filter bank.
+    pub bands: Bands,
+    /// The measured object.
+    pub panel: Panel,
+    /// When a measurement is good enough.
+    pub validation: Validation,
+    /// The points and pairs.
+    pub grid: GridParams,
+}
+
+/// The sweep that is played.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Sweep {
+    /// Sampling rate, Hz.
+    pub rate_hz: SampleRate,
+    /// Lowest frequency, Hz.
+    pub low_hz: f64,
+    /// Highest frequency, Hz.
+    pub high_hz: f64,
+    /// Duration, s.
+    pub duration_secs: f64,
+    /// Half-cosine fade at either end, s.
+    pub fade_secs: f64,
+    /// Silence recorded after it, s.
+    pub tail_secs: f64,
+    /// Peak level, dB re full scale.
+    pub level_dbfs: f64,
+}
+
+/// What is kept of each impulse response.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct ImpulseResponse {
+    /// Samples.
+    pub length: usize,
+    /// Temperature that responses are corrected to, C.
+    pub reference_temperature_c: Celsius,
+    /// Outside of the sweep's range the divisor's power stays above this, dB re its mean in the range.
+    pub floor_db: f64,
+}
+
+/// The octave-spaced itersine filter bank.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Bands {
+    /// Band centres an octave apart, Hz, ascending.
+    pub centres_hz: Vec<f64>,
+}
+
+/// The measured object.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Panel {
+    /// Edge of the square, mm.
+    pub size_mm: f64,
+    /// Depth that the relief may have, mm.
+    pub depth_mm: f64,
+}
+
+/// When a measurement is good enough, and how often it is tried.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Validation {
+    /// Tries at one pair.
+    pub attempts: u32,
+    /// Least signal-to-noise ratio in the sweep's band, dB.
+    pub snr_db: f64,
+    /// Least level of the loopback, dB re full scale.
+    pub loopback_dbfs: f64,
+    /// Highest sound pressure level outside, dB re 20 uPa.
+    pub outside_level_db: f64,
+    /// Most that the direct sound may arrive off the time that geometry gives, us.
+    pub arrival_us: f64,
+}
+
+impl Default for Rig {
+    fn default() -> Self {
+        Self {
+            name: "paper".into(),
+            sweep: Sweep::default(),
+            impulse_response: ImpulseResponse::default(),
+            bands: Bands::default(),
+            panel: Panel::default(),
+            validation: Validation::default(),
+            grid: GridParams::default(),
+        }
+    }
+}
+
+impl Default for Sweep {
+    fn default() -> Self {
+        Self {
+            rate_hz: SampleRate::PAPER,
+            low_hz: 2_000.0,
+            high_hz: 40_000.0,
+            duration_secs: 0.5,
+            fade_secs: 0.001,
+            tail_secs: 0.01,
+            level_dbfs: -3.0,
+        }
+    }
+}
+
+impl Default for ImpulseResponse {
+    fn default() -> Self {
+        Self { length: 384, reference_temperature_c: Celsius::PAPER, floor_db: -60.0 }
+    }
+}
+
+impl Default for Bands {
+    fn default() -> Self {
+        Self { centres_hz: vec![2_500.0, 5_000.0, 10_000.0, 20_000.0, 40_000.0] }
+    }
+}
+
+impl Default for Panel {
+    fn default() -> Self {
+        Self { size_mm: 585.0, depth_mm: 40.0 }
+    }
+}
+
+impl Default for Validation {
+    fn default() -> Self {
+        Self { attempts: 3, snr_db: 30.0, loopback_dbfs: -40.0, outside_level_db: 65.0, arrival_us: 20.0 }
+    }
+}
+
+impl Rig {
+    /// The rig of Rust et al. 2021.
+    pub fn paper() -> Self {
+        Self::default()
+    }
+
+    /// Reads a TOML description and checks it.
+    ///
+    /// # Errors
+    /// [`Error::RigSyntax`] where it is no such TOML, [`Error::Rig`] or [`Error::Quantity`] where it
+    /// contradicts itself.
+    pub fn from_toml(text: &str) -> Result<Self, Error> {
+        let rig: Self = toml::from_str(text).map_err(|e| Error::RigSyntax { message: e.to_string() })?;
+        rig.check()?;
+        Ok(rig)
+    }
+
+    /// As TOML.
+    pub fn to_toml(&self) -> String {
+        toml::to_string(self).unwrap_or_default()
+    }
+
+    /// The points and pairs.
+    ///
+    /// # Errors
+    /// [`Error::Quantity`] where there are no points or too many.
+    pub fn grid(&self) -> Result<Grid, Error> {
+        self.grid.build()
+    }
+
+    /// Samples of the whole recording: sweep and tail.
+    pub fn recording_len(&self) -> usize {
+        let rate = self.sweep.rate_hz.get();
+        (self.sweep.duration_secs * rate).round() as usize + (self.sweep.tail_secs * rate).round() as usize
+    }
+
+    /// Suffix of each band's columns: its centre in Hz.
+    pub fn band_names(&self) -> Vec<String> {
+        self.bands.centres_hz.iter().map(|hz| format!("{hz:.0}")).collect()
+    }
+
+    /// The settings that decide what the tables' numbers mean and that differ from `other`'s, as
+    /// (field, here, there). A lake holds only runs for which there are none.
+    pub fn differences(&self, other: &Self) -> Vec<(&'static str, String, String)> {
+        fn entry<T: PartialEq + std::fmt::Debug>(
+            field: &'static str,
+            a: &T,
+            b: &T,
+        ) -> Option<(&'static str, String, String)> {
+            (a != b).then(|| (field, format!("{a:?}"), format!("{b:?}")))
+        }
+        let rates = (self.sweep.rate_hz.get(), other.sweep.rate_hz.get());
+        let references = [self, other].map(|r| r.impulse_response.reference_temperature_c.get());
+        [
+            entry("sweep.rate_hz", &rates.0, &rates.1),
+            entry("sweep.low_hz", &self.sweep.low_hz, &other.sweep.low_hz),
+            entry("sweep.high_hz", &self.sweep.high_hz, &other.sweep.high_hz),
+            entry("impulse_response.length", &self.impulse_response.length, &other.impulse_response.length),
+            entry("impulse_response.reference_temperature_c", &references[0], &references[1]),
+            entry("impulse_response.floor_db", &self.impulse_response.floor_db, &other.impulse_response.floor_db),
+            entry("bands.centres_hz", &self.bands.centres_hz, &other.bands.centres_hz),
+            entry("panel", &self.panel, &other.panel),
+            entry("grid", &self.grid, &other.grid),
+        ]
+        .into_iter()
+        .flatten()
+        .collect()
+    }
+
+    /// Checks that the description does not contradict itself.
+    ///
+    /// # Errors
+    /// [`Error::Rig`] or [`Error::Quantity`], naming the field.
+    pub fn check(&self) -> Result<(), Error> {
+        let (sweep, nyquist) = (&self.sweep, self.sweep.rate_hz.get() / 2.0);
+        let positive = |x: f64, max: f64| x > 0.0 && x <= max;
+        let rules = [
+            (!self.name.trim().is_empty(), "name", "is empty".to_owned()),
+            (
+                sweep.low_hz > 0.0 && sweep.low_hz < sweep.high_hz,
+                "sweep.low_hz",
+                format!("is {}, expected above 0 and below sweep.high_hz = {}", sweep.low_hz, sweep.high_hz),
+            ),
+            (
+                sweep.high_hz <= nyquist,
+                "sweep.high_hz",
+                format!("is {}, above half the sampling rate, {nyquist} Hz", sweep.high_hz),
+            ),
+            (
+                positive(sweep.duration_secs, 600.0),
+                "sweep.duration_secs",
+                format!("is {}, expected above 0, up to 600", sweep.duration_secs),
+            ),
+            (
+                (0.0..=sweep.duration_secs / 2.0).contains(&sweep.fade_secs),
+                "sweep.fade_secs",
+                format!("is {}, expected 0 to half the duration", sweep.fade_secs),
+            ),
+            (
+                (0.0..=60.0).contains(&sweep.tail_secs),
+                "sweep.tail_secs",
+                format!("is {}, expected 0 to 60", sweep.tail_secs),
+            ),
+            (
+                (-120.0..=0.0).contains(&sweep.level_dbfs),
+                "sweep.level_dbfs",
+                format!("is {}, expected -120 to 0", sweep.level_dbfs),
+            ),
+            (
+                (1..=16_777_216).contains(&self.impulse_response.length),
+                "impulse_response.length",
+                format!("is {}, expected 1 to 16777216", self.impulse_response.length),
+            ),
+            (
+                (-200.0..=0.0).contains(&self.impulse_response.floor_db),
+                "impulse_response.floor_db",
+                format!("is {}, expected -200 to 0", self.impulse_response.floor_db),
+            ),
+            (
+                octaves(&self.bands.centres_hz),
+                "bands.centres_hz",
+                format!(
+                    "is {:?}, expected 1 to 12 whole numbers of Hz, each twice the one before",
+                    self.bands.centres_hz
+                ),
+            ),
+            (
+                positive(self.panel.size_mm, 1e5) && positive(self.panel.depth_mm, 1e5),
+                "panel",
+                format!("is {:?}, expected positive lengths up to 100 m", self.panel),
+            ),
+            (
+                (1..=100).contains(&self.validation.attempts),
+                "validation.attempts",
+                format!("is {}, expected 1 to 100", self.validation.attempts),
+            ),
+        ];
+        match rules.into_iter().find(|(holds, ..)| !holds) {
+            Some((_, field, reason)) => Err(Error::Rig { rig: self.name.clone(), field, reason }),
+            None => self.grid().map(drop),
+        }
+    }
+}
+
+// Column names carry the centre in whole Hz.
+fn octaves(centres: &[f64]) -> bool {
+    let whole = centres.iter().all(|c| (1.0..=1e6).contains(c) && c.fract() == 0.0);
+    let doubled = centres.windows(2).all(|w| (w[1] / w[0] - 2.0).abs() < 1e-6);
+    (1..=12).contains(&centres.len()) && whole && doubled
+}
+
+impl SampleRate {
+    /// 96 kHz (Rust et al. 2021, appendix, step 2).
+    pub const PAPER: Self = Self::known(96_000.0);
+}
+
+impl Celsius {
+    /// 20 C (Rust et al. 2021, appendix, step 2).
+    pub const PAPER: Self = Self::known(20.0);
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_paper_s_rig_is_valid_and_round_trips() {
+        let rig = Rig::paper();
+        assert_eq!(rig.check(), Ok(()));
+        assert_eq!(Rig::from_toml(&rig.to_toml()), Ok(rig.clone()));
+        assert_eq!(Rig::from_toml(""), Ok(rig.clone()));
+        assert_eq!(rig.band_names(), ["2500", "5000", "10000", "20000", "40000"]);
+        assert_eq!(rig.recording_len(), 48_960);
+    }
+
+    #[test]
+    fn contradictions_name_the_field() {
+        let check = |toml: &str, expected: &str| {
+            let error = Rig::from_toml(toml).expect_err(toml).to_string();
+            assert!(error.contains(expected), "{toml}: {error}");
+        };
+        check("sweep.rate_hz = 48000", "sweep.high_hz");
+        check("sweep.rate_hz = -1", "sampling rate");
+        check("sweep.low_hz = 50000", "sweep.low_hz");
+        check("bands.centres_hz = [1000, 3000]", "bands.centres_hz");
+        check("bands.centres_hz = []", "bands.centres_hz");
+        check("impulse_response.length = 0", "impulse_response.length");
+        check("impulse_response.reference_temperature_c = 400", "temperature");
+        check("sweeep.rate_hz = 1", "unknown field");
+        check("[grid]\nlayers = []\npoints_mm = []", "number of grid points");
+        check("name = [", "line 1");
+    }
+
+    #[test]
+    fn only_what_changes_the_tables_counts_as_different() {
+        let paper = Rig::paper();
+        let mut other = Rig::paper();
+        other.name = "attic".into();
+        other.sweep.duration_secs = 0.05;
+        other.validation.attempts = 9;
+        assert_eq!(paper.differences(&other), []);
+        other.impulse_response.length = 400;
+        assert_eq!(paper.differences(&other), [("impulse_response.length", "384".into(), "400".into())]);
+    }
+}

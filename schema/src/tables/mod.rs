@@ -1,0 +1,165 @@
+//! The tables of a lake: their names and Arrow schemas. Column metadata carries `unit` and `comment`.
+//!
+//! Keys come first, because Delta keeps statistics of the first 32 columns only. Lists are `LIST` with
+//! the child `element`; times are microseconds beside a `BIGINT` of nanoseconds, which Delta cannot hold.
+
+mod column;
+mod definitions;
+
+use std::sync::Arc;
+
+use arrow_schema::{Schema, SchemaRef};
+
+pub use column::{COMMENT, LIST_CHILD, UNIT};
+
+use crate::Rig;
+
+/// A table of the lake.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub enum Table {
+    /// A row a surface and run of it.
+    Surfaces,
+    /// A row a run; what it names is what readers see.
+    Runs,
+    /// A row a grid point.
+    Points,
+    /// A row a pair.
+    Pairs,
+    /// A row an accepted measurement, with its impulse response.
+    Measurements,
+    /// A row a measurement: its reflected response and its cumulative energy curves.
+    Nce,
+    /// A row a measurement: its energies.
+    Tnce,
+    /// A row a measurement and symmetry: its energies, moved.
+    TnceD4,
+    /// A row a surface and symmetry.
+    Heightmaps,
+    /// A row a reading of the ambient sensor.
+    Environment,
+    /// A row a line of a run's log.
+    Events,
+    /// A row a surface and band.
+    SurfaceStats,
+}
+
+impl Table {
+    /// All tables.
+    pub const ALL: [Self; 12] = [
+        Self::Surfaces,
+        Self::Runs,
+        Self::Points,
+        Self::Pairs,
+        Self::Measurements,
+        Self::Nce,
+        Self::Tnce,
+        Self::TnceD4,
+        Self::Heightmaps,
+        Self::Environment,
+        Self::Events,
+        Self::SurfaceStats,
+    ];
+
+    /// Its name in SQL and its folder.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Surfaces => "surfaces",
+            Self::Runs => "runs",
+            Self::Points => "points",
+            Self::Pairs => "pairs",
+            Self::Measurements => "measurements",
+            Self::Nce => "nce",
+            Self::Tnce => "tnce",
+            Self::TnceD4 => "tnce_d4",
+            Self::Heightmaps => "heightmaps",
+            Self::Environment => "environment",
+            Self::Events => "events",
+            Self::SurfaceStats => "surface_stats",
+        }
+    }
+
+    /// The table of a name.
+    pub fn by_name(name: &str) -> Option<Self> {
+        Self::ALL.into_iter().find(|t| t.name() == name)
+    }
+
+    /// Where its rows come from.
+    pub fn source(self) -> Source {
+        match self {
+            Self::Points | Self::Pairs => Source::Rig,
+            Self::Runs => Source::Pointer,
+            Self::Nce | Self::Tnce | Self::TnceD4 | Self::SurfaceStats => Source::References,
+            _ => Source::Run,
+        }
+    }
+
+    /// Its schema in a lake of this rig.
+    pub fn schema(self, rig: &Rig) -> SchemaRef {
+        let fields: Vec<_> = definitions::columns(self, &rig.band_names()).into_iter().map(|c| c.field()).collect();
+        Arc::new(Schema::new(fields))
+    }
+
+    /// Cells along each side of a stored height map.
+    pub const HEIGHTMAP_CELLS: usize = 128;
+}
+
+/// Where a table's rows come from, and so when they change.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Source {
+    /// The rig alone: written once a lake.
+    Rig,
+    /// One run alone.
+    Run,
+    /// One run and the references of its surface: written anew when a reference changes.
+    References,
+    /// The table that says what of the others is visible.
+    Pointer,
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_column_says_what_it_means() {
+        let rig = Rig::paper();
+        for table in Table::ALL {
+            assert_eq!(Table::by_name(table.name()), Some(table));
+            for field in table.schema(&rig).fields() {
+                assert!(
+                    field.metadata().get(COMMENT).is_some_and(|c| c.len() > 5),
+                    "{}.{}",
+                    table.name(),
+                    field.name()
+                );
+                assert!(field.metadata().contains_key(UNIT), "{}.{}", table.name(), field.name());
+            }
+        }
+    }
+
+    #[test]
+    fn band_columns_follow_the_rig() {
+        let mut rig = Rig::paper();
+        rig.bands.centres_hz = vec![500.0, 1000.0];
+        let schema = Table::Tnce.schema(&rig);
+        for name in ["tnce_500", "tnce_1000", "tnce_total", "tnce_band_500", "energy_1000"] {
+            assert!(schema.field_with_name(name).is_ok(), "{name}");
+        }
+        assert!(schema.field_with_name("tnce_2500").is_err());
+    }
+
+    #[test]
+    fn names_do_not_repeat_and_keys_lead() {
+        for table in Table::ALL {
+            let schema = table.schema(&Rig::paper());
+            let mut names: Vec<_> = schema.fields().iter().map(|f| f.name().clone()).collect();
+            if matches!(table.source(), Source::Run | Source::References | Source::Pointer) {
+                assert_eq!(names[..2], ["surface_id", "run_id"], "{}", table.name());
+            }
+            let count = names.len();
+            names.sort();
+            names.dedup();
+            assert_eq!(names.len(), count, "{}", table.name());
+        }
+    }
+}

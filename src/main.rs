@@ -1,0 +1,2 @@
+//! The `echolake` command.
+fn main() {}
