@@ -1,0 +1,1 @@
+//! From a rig, or from somebody's files, to a run's MCAP file.

@@ -1,0 +1,1 @@
+//! The signal-processing kernels of echolake.

@@ -1,0 +1,1 @@
+//! The lake: its object store, its commit log and what a reader may see.
