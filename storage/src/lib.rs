@@ -1,1 +1,38 @@
-//! The lake: its object store, its commit log and what a reader may see.
+//! The lake: where it is, what it is configured for, its commit log, and what a reader may see of it.
+//!
+//! ```
+//! use echolake_lake::{Lake, References};
+//! use echolake_schema::{Rig, tables::Table};
+//!
+//! # let folder = tempfile::tempdir()?;
+//! # let url = folder.path().join("lake").display().to_string();
+//! # tokio::runtime::Runtime::new()?.block_on(async {
+//! let lake = Lake::open_or_create(&url, &Rig::paper(), &References::default()).await?;
+//! let snapshot = lake.snapshot().await?;
+//! assert_eq!(snapshot.files(Table::Pairs)[0].rows, 2951);
+//! assert!(snapshot.files(Table::Runs).is_empty());
+//! # Ok::<(), echolake_lake::Error>(())
+//! # })?;
+//! # Ok::<(), Box<dyn std::error::Error>>(())
+//! ```
+
+mod commit_log;
+mod config;
+mod data_file;
+mod delta;
+mod durable;
+mod error;
+mod lake;
+mod location;
+mod rig_tables;
+mod snapshot;
+
+pub use commit_log::{Commit, CommitLog, Committed, DataFile, FileStats, NewFile};
+pub use config::{LAKE_FORMAT, LakeConfig, References};
+pub use data_file::encode;
+pub use error::Error;
+pub use lake::Lake;
+pub use snapshot::{FileName, Snapshot, VisibleRun};
+
+/// The result of what a lake does.
+pub type Result<T> = std::result::Result<T, Error>;

@@ -1,0 +1,112 @@
+//! One chunk of a run's file: decompressed, its CRC checked, cut into messages.
+
+use std::collections::HashMap;
+
+use mcap::records::Record;
+
+/// Largest chunk that is decompressed; the recorder's are about 1 MiB, or one message where that is larger.
+const LARGEST: u64 = 1 << 30;
+/// Opcode and length in front of every record.
+const FRAME: usize = 9;
+
+/// Channels by id: the topic and the schema's name.
+pub(crate) type Channels = HashMap<u16, Channel>;
+
+/// A channel, as far as ingest needs it.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) struct Channel {
+    pub(crate) topic: String,
+    pub(crate) schema: String,
+}
+
+/// A chunk's records.
+#[derive(Debug)]
+pub(crate) struct Chunk {
+    data: Vec<u8>,
+}
+
+/// A message in a chunk.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Message<'a> {
+    pub(crate) channel: u16,
+    pub(crate) log_time_ns: i64,
+    pub(crate) data: &'a [u8],
+}
+
+/// Schemas seen so far, needed to name a channel's schema.
+#[derive(Debug, Default, Clone)]
+pub(crate) struct Definitions {
+    schemas: HashMap<u16, String>,
+    pub(crate) channels: Channels,
+}
+
+impl Definitions {
+    pub(crate) fn learn(&mut self, record: &Record<'_>) {
+        match record {
+            Record::Schema { header, .. } => {
+                self.schemas.insert(header.id, header.name.clone());
+            }
+            Record::Channel(channel) => {
+                let schema = self.schemas.get(&channel.schema_id).cloned().unwrap_or_default();
+                self.channels.insert(channel.id, Channel { topic: channel.topic.clone(), schema });
+            }
+            _ => {}
+        }
+    }
+}
+
+impl Chunk {
+    /// Decompresses a chunk record's body. The text of an error says what is wrong with it.
+    pub(crate) fn decode(body: &[u8]) -> Result<Self, String> {
+        let Ok(Record::Chunk { header, data }) = mcap::parse_record(0x06, body) else {
+            return Err("its header is damaged".into());
+        };
+        if header.uncompressed_size > LARGEST {
+            return Err(format!("it claims {} bytes, more than {LARGEST}", header.uncompressed_size));
+        }
+        let size = header.uncompressed_size as usize;
+        let data = match header.compression.as_str() {
+            "" => data.into_owned(),
+            "zstd" => zstd::bulk::decompress(&data, size).map_err(|e| format!("it does not decompress: {e}"))?,
+            other => return Err(format!("it is compressed with `{other}`, expected zstd")),
+        };
+        if data.len() != size {
+            return Err(format!("it has {} bytes, expected {size}", data.len()));
+        }
+        let crc = crc32fast::hash(&data);
+        if header.uncompressed_crc != 0 && header.uncompressed_crc != crc {
+            return Err(format!("its CRC is {crc:08x}, expected {:08x}", header.uncompressed_crc));
+        }
+        Ok(Self { data })
+    }
+
+    /// Its records as (opcode, body); ends early where a frame makes no sense, which a right CRC excludes.
+    pub(crate) fn records(&self) -> impl Iterator<Item = (u8, &[u8])> {
+        let mut rest = &self.data[..];
+        std::iter::from_fn(move || {
+            let (frame, behind) = rest.split_at_checked(FRAME)?;
+            let length = usize::try_from(u64::from_le_bytes(frame[1..].try_into().ok()?)).ok()?;
+            let (body, behind) = behind.split_at_checked(length)?;
+            rest = behind;
+            Some((frame[0], body))
+        })
+    }
+
+    /// Schemas and channels that the chunk introduces.
+    pub(crate) fn learn(&self, definitions: &mut Definitions) {
+        for (code, body) in self.records().filter(|(code, _)| matches!(code, 0x03 | 0x04)) {
+            if let Ok(record) = mcap::parse_record(code, body) {
+                definitions.learn(&record);
+            }
+        }
+    }
+
+    /// Its messages.
+    pub(crate) fn messages(&self) -> impl Iterator<Item = Message<'_>> {
+        self.records().filter(|(code, body)| *code == 0x05 && body.len() >= 22).map(|(_, body)| Message {
+            channel: u16::from_le_bytes([body[0], body[1]]),
+            log_time_ns: i64::from_le_bytes(body[6..14].try_into().unwrap_or_default()),
+            data: &body[22..],
+        })
+    }
+}

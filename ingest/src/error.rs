@@ -1,0 +1,97 @@
+//! What can go wrong between a run's file and the tables.
+
+use echolake_schema::manifest::ManifestError;
+
+/// Why a run could not be taken in.
+#[derive(Debug, thiserror::Error)]
+pub enum Error {
+    /// The file cannot be read.
+    #[error("cannot read `{file}`: {reason}")]
+    Read {
+        /// The file.
+        file: String,
+        /// Why not.
+        reason: String,
+    },
+    /// The file is no MCAP file at all.
+    #[error("`{file}` is not an MCAP file: it begins with {actual}, expected the magic bytes `89 MCAP 30 0D 0A`; hint: is it the right file?")]
+    NotMcap {
+        /// The file.
+        file: String,
+        /// Its first bytes.
+        actual: String,
+    },
+    /// An MCAP file, but not one of our runs.
+    #[error("`{file}` is an MCAP file but no run of echolake: it has no metadata `echolake.run`; hint: only recordings of `echolake acquire` and `echolake import` can be ingested")]
+    Foreign {
+        /// The file.
+        file: String,
+    },
+    /// Its metadata is damaged.
+    #[error("`{file}` cannot be taken in: {cause}")]
+    Manifest {
+        /// The file.
+        file: String,
+        /// What is wrong.
+        cause: ManifestError,
+    },
+    /// An attachment that must be there is missing or damaged.
+    #[error("`{file}`: attachment `{attachment}` {reason}")]
+    Attachment {
+        /// The file.
+        file: String,
+        /// The attachment.
+        attachment: &'static str,
+        /// What is wrong with it.
+        reason: String,
+    },
+    /// Another run of this name is in the lake.
+    #[error("run `{run}` is already in the lake with other content: `{file}` has SHA-256 {given}, the lake's file {there}; hint: a run file never changes once closed, so record it under another name")]
+    OtherContent {
+        /// The run.
+        run: String,
+        /// The given file.
+        file: String,
+        /// Its digest.
+        given: String,
+        /// The digest of the lake's file.
+        there: String,
+    },
+    /// No such run.
+    #[error("no run at `{given}`: it is neither a file nor the name of a run in the lake's inbox or runs")]
+    NoRun {
+        /// What was given.
+        given: String,
+    },
+    /// A kernel refused.
+    #[error("`{file}`: {cause}")]
+    Kernel {
+        /// The file.
+        file: String,
+        /// Why.
+        cause: echolake_dsp::Error,
+    },
+    /// A data file of the lake cannot be read.
+    #[error("`{file}` in the lake is damaged: {reason}; hint: delete the folder `tables` and run `echolake ingest`, which makes it anew from the runs")]
+    DataFile {
+        /// The file.
+        file: String,
+        /// Why not.
+        reason: String,
+    },
+    /// The ingest was stopped.
+    #[error("stopped; hint: the same command goes on where this one ended")]
+    Stopped,
+    /// The lake refused.
+    #[error(transparent)]
+    Lake(#[from] echolake_lake::Error),
+}
+
+/// The result of a step of ingest.
+pub type Result<T> = std::result::Result<T, Error>;
+
+impl Error {
+    pub(crate) fn read(file: impl ToString, reason: impl std::fmt::Display) -> Self {
+        Self::Read { file: file.to_string(), reason: reason.to_string() }
+    }
+}

@@ -1,0 +1,84 @@
+//! `lake.toml`: the lake's format, its rig and its references.
+
+use echolake_schema::{Rig, SurfaceId};
+use serde::{Deserialize, Serialize};
+
+use crate::{Error, Result};
+
+/// Format of lakes that this version writes, and the newest that it reads.
+pub const LAKE_FORMAT: u32 = 1;
+
+/// What `lake.toml` says.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct LakeConfig {
+    /// The lake's format.
+    pub format: u32,
+    /// References of surfaces that name none of their own.
+    pub references: References,
+    /// The rig that all of its runs share.
+    pub rig: Rig,
+}
+
+/// The surfaces that normalise, and whose direct sound is subtracted.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct References {
+    /// The surface that normalises.
+    pub flat: SurfaceId,
+    /// The surface whose response is the direct sound.
+    pub foam: SurfaceId,
+}
+
+impl Default for References {
+    #[allow(clippy::expect_used, reason = "two constants, checked by the test below")]
+    fn default() -> Self {
+        Self { flat: "flat".parse().expect("a valid id"), foam: "foam".parse().expect("a valid id") }
+    }
+}
+
+/// The part of any version's `lake.toml` that tells its format.
+#[derive(Deserialize)]
+struct FormatOnly {
+    format: u32,
+}
+
+impl LakeConfig {
+    pub(crate) fn to_toml(&self) -> Result<String> {
+        let body =
+            toml::to_string(self).map_err(|e| Error::Config { location: String::new(), reason: e.to_string() })?;
+        Ok(format!("# What this lake holds; written once, when it was made.\n{body}"))
+    }
+
+    pub(crate) fn from_toml(text: &str, location: &str) -> Result<Self> {
+        let damaged = |reason: String| Error::Config { location: location.to_owned(), reason };
+        // A newer format may have any other fields, so its number is read first.
+        let FormatOnly { format } = toml::from_str(text).map_err(|e| damaged(e.to_string()))?;
+        if format > LAKE_FORMAT {
+            return Err(Error::Newer { location: location.to_owned(), actual: format, newest: LAKE_FORMAT });
+        }
+        let config: Self = toml::from_str(text).map_err(|e| damaged(e.to_string()))?;
+        config.rig.check().map_err(|e| damaged(e.to_string()))?;
+        Ok(config)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn config_round_trips() {
+        let config = LakeConfig { format: LAKE_FORMAT, references: References::default(), rig: Rig::paper() };
+        let text = config.to_toml().expect("text");
+        assert_eq!(LakeConfig::from_toml(&text, "x").expect("the same"), config);
+    }
+
+    #[test]
+    fn newer_and_damaged_files_are_told_apart() {
+        let newer = LakeConfig::from_toml("format = 9\nfuture = true", "x").expect_err("newer");
+        assert!(matches!(newer, Error::Newer { actual: 9, .. }), "{newer}");
+        let damaged = LakeConfig::from_toml("format = 1", "x").expect_err("damaged");
+        assert!(matches!(damaged, Error::Config { .. }), "{damaged}");
+    }
+}

@@ -1,0 +1,144 @@
+//! What can go wrong with a lake.
+
+use deltalake_core::DeltaTableError;
+
+/// What a lake could not do, by what the caller can do about it.
+#[derive(Debug, thiserror::Error)]
+pub enum Error {
+    /// The location is no path and no URL that this build reaches.
+    #[error(
+        "`{location}` is not a lake's location: {reason}; hint: give a folder, or file:///... (object stores are not in this build)"
+    )]
+    Location {
+        /// What was given.
+        location: String,
+        /// What is wrong with it.
+        reason: String,
+    },
+    /// There is no lake there.
+    #[error(
+        "no lake at `{location}`: it has no lake.toml; hint: `echolake demo`, `echolake acquire` and `echolake import` make one"
+    )]
+    NoLake {
+        /// The location.
+        location: String,
+    },
+    /// Another program's files are there.
+    #[error("`{location}` holds other files and no lake.toml, so no lake is made there; hint: name an empty folder")]
+    Occupied {
+        /// The location.
+        location: String,
+    },
+    /// `lake.toml` cannot be read.
+    #[error("`{location}/lake.toml` is damaged: {reason}")]
+    Config {
+        /// The lake's location.
+        location: String,
+        /// What is wrong with it.
+        reason: String,
+    },
+    /// A later version wrote the lake.
+    #[error(
+        "the lake at `{location}` has format {actual}, the newest that this version reads is {newest}; hint: update echolake"
+    )]
+    Newer {
+        /// The lake's location.
+        location: String,
+        /// Its format.
+        actual: u32,
+        /// Ours.
+        newest: u32,
+    },
+    /// The lake was made for another rig.
+    #[error(
+        "rig `{given}` does not fit the lake at `{location}`, made for rig `{lake}`: {differences}; hint: use the lake's rig, or another lake"
+    )]
+    OtherRig {
+        /// The lake's location.
+        location: String,
+        /// Name of the given rig.
+        given: String,
+        /// Name of the lake's rig.
+        lake: String,
+        /// Field by field, what differs.
+        differences: String,
+    },
+    /// The store refused.
+    #[error("cannot {action} `{path}`: {}{}", reason(cause), hint(cause))]
+    Store {
+        /// What was tried.
+        action: &'static str,
+        /// On what.
+        path: String,
+        /// Why not; no `source`, because the text above already says it.
+        cause: StoreError,
+    },
+    /// The commit log of a table is damaged or unreadable.
+    #[error("the log of table `{table}` cannot be {action}: {reason}")]
+    Log {
+        /// The table.
+        table: &'static str,
+        /// What was tried.
+        action: &'static str,
+        /// Delta's own words.
+        reason: String,
+    },
+    /// Rows could not be encoded.
+    #[error("rows of table `{table}` cannot be encoded: {reason}")]
+    Encode {
+        /// The table.
+        table: &'static str,
+        /// Why not.
+        reason: String,
+    },
+    /// A rig or id that is not valid.
+    #[error(transparent)]
+    Schema(#[from] echolake_schema::Error),
+}
+
+/// An object store's error, kept apart so that its text is printed once.
+#[derive(Debug)]
+pub struct StoreError(pub object_store::Error);
+
+impl Error {
+    pub(crate) fn store(action: &'static str, path: impl ToString, source: object_store::Error) -> Self {
+        Self::Store { action, path: path.to_string(), cause: StoreError(source) }
+    }
+
+    pub(crate) fn log(table: &'static str, action: &'static str, source: DeltaTableError) -> Self {
+        match source {
+            DeltaTableError::ObjectStore { source } => {
+                Self::store(action, format!("tables/{table}/_delta_log"), source)
+            }
+            other => Self::Log { table, action, reason: other.to_string() },
+        }
+    }
+}
+
+// object_store wraps the system's error several times; the innermost one is what a user can act on.
+fn reason(error: &StoreError) -> String {
+    let mut source: &dyn std::error::Error = &error.0;
+    while let Some(inner) = source.source() {
+        source = inner;
+    }
+    source.to_string()
+}
+
+fn hint(error: &StoreError) -> &'static str {
+    let mut source: Option<&dyn std::error::Error> = Some(&error.0);
+    while let Some(error) = source {
+        if let Some(io) = error.downcast_ref::<std::io::Error>() {
+            return match io.kind() {
+                std::io::ErrorKind::StorageFull | std::io::ErrorKind::QuotaExceeded => {
+                    "; hint: the disk is full; make space and run the command again, nothing is half-written"
+                }
+                std::io::ErrorKind::PermissionDenied | std::io::ErrorKind::ReadOnlyFilesystem => {
+                    "; hint: the lake must be writable for this command"
+                }
+                _ => "",
+            };
+        }
+        source = error.source();
+    }
+    ""
+}

@@ -1,0 +1,84 @@
+//! A lake's location: a folder, `file://` or `memory://`.
+
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use object_store::ObjectStore;
+use object_store::memory::InMemory;
+use object_store::path::Path as ObjectPath;
+use object_store::prefix::PrefixStore;
+use url::Url;
+
+use crate::durable::DurableFileSystem;
+use crate::{Error, Result};
+
+/// A lake's location, opened.
+#[derive(Debug)]
+pub(crate) struct Location {
+    /// As the user wrote it.
+    pub(crate) text: String,
+    /// As a URL with a slash at its end.
+    pub(crate) url: Url,
+    /// The folder, where it is one.
+    pub(crate) folder: Option<PathBuf>,
+    /// Everything that the URL's scheme reaches.
+    pub(crate) root: Arc<dyn ObjectStore>,
+    /// The lake alone.
+    pub(crate) store: Arc<dyn ObjectStore>,
+}
+
+impl Location {
+    pub(crate) fn parse(text: &str) -> Result<Self> {
+        let wrong = |reason: &str| Error::Location { location: text.to_owned(), reason: reason.to_owned() };
+        if text.trim().is_empty() {
+            return Err(wrong("it is empty"));
+        }
+        if !text.contains("://") {
+            return Self::folder(text, Path::new(text));
+        }
+        let url = Url::parse(text).map_err(|e| wrong(&e.to_string()))?;
+        match url.scheme() {
+            "file" => Self::folder(text, &url.to_file_path().map_err(|()| wrong("it names no local folder"))?),
+            "memory" => {
+                let url = Url::parse("memory:///").map_err(|e| wrong(&e.to_string()))?;
+                let root: Arc<dyn ObjectStore> = Arc::new(InMemory::new());
+                Ok(Self { text: text.to_owned(), url, folder: None, store: root.clone(), root })
+            }
+            scheme => Err(wrong(&format!("this build does not reach `{scheme}://`"))),
+        }
+    }
+
+    fn folder(text: &str, path: &Path) -> Result<Self> {
+        let wrong = |reason: String| Error::Location { location: text.to_owned(), reason };
+        let absolute = std::path::absolute(path).map_err(|e| wrong(e.to_string()))?;
+        if absolute.exists() && !absolute.is_dir() {
+            return Err(wrong("it is a file".to_owned()));
+        }
+        let url = Url::from_directory_path(&absolute).map_err(|()| wrong("it makes no URL".to_owned()))?;
+        let prefix = ObjectPath::from_absolute_path(&absolute).map_err(|e| wrong(e.to_string()))?;
+        let root: Arc<dyn ObjectStore> = Arc::new(DurableFileSystem::new());
+        let store = Arc::new(PrefixStore::new(root.clone(), prefix));
+        Ok(Self { text: text.to_owned(), url, folder: Some(absolute), root, store })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn nonsense_is_refused_with_a_hint() {
+        for bad in ["", "s3://bucket/lake", "http://host/lake", "://", "/dev/null"] {
+            let error = Location::parse(bad).expect_err(bad).to_string();
+            assert!(error.contains("hint"), "{error}");
+        }
+    }
+
+    #[test]
+    fn folders_and_file_urls_are_the_same() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let plain = Location::parse(&folder.path().display().to_string()).expect("a folder");
+        let url = Location::parse(plain.url.as_str()).expect("its URL");
+        assert_eq!(plain.folder, url.folder);
+    }
+}
