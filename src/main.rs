@@ -1,2 +1,48 @@
-//! The `echolake` command.
-fn main() {}
+//! The `echolake` command: reads its arguments, runs one verb, and decides the exit code.
+
+mod cli;
+mod commands;
+mod progress;
+
+use std::process::ExitCode;
+
+use clap::Parser as _;
+
+/// How a command that did not fail ended.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Done {
+    /// Everything was done.
+    Whole,
+    /// It was done, and data were lost on the way.
+    WithLoss,
+}
+
+const FAILED: u8 = 1;
+const DONE_WITH_LOSS: u8 = 3;
+
+fn main() -> ExitCode {
+    // clap itself ends with 2 on wrong usage.
+    let cli = cli::Cli::parse();
+    let outcome = tokio::runtime::Builder::new_multi_thread()
+        .enable_all()
+        .build()
+        .map_err(anyhow::Error::from)
+        .and_then(|runtime| runtime.block_on(commands::run(cli)));
+    match outcome {
+        Ok(Done::Whole) => ExitCode::SUCCESS,
+        Ok(Done::WithLoss) => ExitCode::from(DONE_WITH_LOSS),
+        Err(error) if is_broken_pipe(&error) => ExitCode::SUCCESS,
+        Err(error) => {
+            eprintln!("error: {error:#}");
+            ExitCode::from(FAILED)
+        }
+    }
+}
+
+// Whoever closed the pipe has seen enough.
+fn is_broken_pipe(error: &anyhow::Error) -> bool {
+    let io = |e: &(dyn std::error::Error + 'static)| {
+        e.downcast_ref::<std::io::Error>().is_some_and(|e| e.kind() == std::io::ErrorKind::BrokenPipe)
+    };
+    error.chain().any(io)
+}

@@ -1,1 +1,44 @@
-//! The signal-processing kernels of echolake.
+//! The signal-processing kernels of echolake: plan once, run many, nothing allocated in `run`. No I/O.
+//!
+//! Signals are slices of `f32` (the product) or `f64` (its oracle); see [`Real`]. The order of work is
+//! deconvolve, temperature-correct, crop, subtract Foam, filter, cumulate, normalise by Flat.
+//!
+//! ```
+//! use echolake_dsp::chain::{MeasurementParams, MeasurementPlan};
+//! use echolake_dsp::sweep::LinearSweep;
+//!
+//! let sweep = LinearSweep { rate_hz: 96e3, duration_secs: 0.03, low_hz: 2e3, high_hz: 40e3, fade_secs: 0.001 };
+//! let loopback = sweep.samples();
+//! let recording: Vec<f64> = (0..loopback.len()).map(|n| if n < 10 { 0.0 } else { 0.5 * loopback[n - 10] }).collect();
+//! let plan = MeasurementPlan::new(&MeasurementParams {
+//!     recording_len: loopback.len(),
+//!     ir_len: 384,
+//!     rate_hz: 96e3,
+//!     low_hz: 2e3,
+//!     high_hz: 40e3,
+//!     floor_db: -60.0,
+//!     reference_celsius: 20.0,
+//! })?;
+//! let mut ir = vec![0.0; 384];
+//! plan.ir(&recording, &loopback, 20.0, &mut ir, &mut plan.scratch())?;
+//! let peak = (0..384).max_by(|a, b| ir[*a].total_cmp(&ir[*b]));
+//! assert_eq!(peak, Some(10));
+//! # Ok::<(), echolake_dsp::Error>(())
+//! ```
+
+pub mod chain;
+pub mod deconvolution;
+pub mod energy;
+mod error;
+pub mod filter_bank;
+pub mod fresnel;
+pub mod geometry;
+#[cfg(test)]
+mod golden;
+pub mod level;
+mod real;
+pub mod sweep;
+pub mod temperature;
+
+pub use error::Error;
+pub use real::Real;

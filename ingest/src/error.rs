@@ -14,7 +14,9 @@ pub enum Error {
         reason: String,
     },
     /// The file is no MCAP file at all.
-    #[error("`{file}` is not an MCAP file: it begins with {actual}, expected the magic bytes `89 MCAP 30 0D 0A`; hint: is it the right file?")]
+    #[error(
+        "`{file}` is not an MCAP file: it begins with {actual}, expected the magic bytes `89 MCAP 30 0D 0A`; hint: is it the right file?"
+    )]
     NotMcap {
         /// The file.
         file: String,
@@ -22,7 +24,9 @@ pub enum Error {
         actual: String,
     },
     /// An MCAP file, but not one of our runs.
-    #[error("`{file}` is an MCAP file but no run of echolake: it has no metadata `echolake.run`; hint: only recordings of `echolake acquire` and `echolake import` can be ingested")]
+    #[error(
+        "`{file}` is an MCAP file but no run of echolake: it has no metadata `echolake.run`; hint: only recordings of `echolake acquire` and `echolake import` can be ingested"
+    )]
     Foreign {
         /// The file.
         file: String,
@@ -46,7 +50,9 @@ pub enum Error {
         reason: String,
     },
     /// Another run of this name is in the lake.
-    #[error("run `{run}` is already in the lake with other content: `{file}` has SHA-256 {given}, the lake's file {there}; hint: a run file never changes once closed, so record it under another name")]
+    #[error(
+        "run `{run}` is already in the lake with other content: `{file}` has SHA-256 {given}, the lake's file {there}; hint: a run file never changes once closed, so record it under another name"
+    )]
     OtherContent {
         /// The run.
         run: String,
@@ -72,7 +78,9 @@ pub enum Error {
         cause: echolake_dsp::Error,
     },
     /// A data file of the lake cannot be read.
-    #[error("`{file}` in the lake is damaged: {reason}; hint: delete the folder `tables` and run `echolake ingest`, which makes it anew from the runs")]
+    #[error(
+        "`{file}` in the lake is damaged: {reason}; hint: delete the folder `tables` and run `echolake ingest`, which makes it anew from the runs"
+    )]
     DataFile {
         /// The file.
         file: String,

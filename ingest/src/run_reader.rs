@@ -121,7 +121,8 @@ impl RunReader {
         let start = reader.peek((MAGIC.len() as u64).min(size)).await?;
         if start[..] != MAGIC[..] {
             let actual = start.iter().map(|b| format!("{b:02x}")).collect::<Vec<_>>().join(" ");
-            let actual = if actual.is_empty() { "nothing (the file is empty)".to_owned() } else { format!("`{actual}`") };
+            let actual =
+                if actual.is_empty() { "nothing (the file is empty)".to_owned() } else { format!("`{actual}`") };
             return Err(Error::NotMcap { file: reader.name, actual });
         }
         reader.skip(MAGIC.len() as u64, true);

@@ -1,0 +1,189 @@
+//! The kernels in their order, planned once: recording to response, and response to curves and energies.
+
+use crate::deconvolution::{DeconvolutionParams, DeconvolutionPlan, DeconvolutionScratch, TransformLength};
+use crate::energy::{cumulate, energy, subtract};
+use crate::error::check_len;
+use crate::filter_bank::{FilterBankPlan, FilterBankScratch};
+use crate::temperature::{TemperatureCorrection, resampling_ratio};
+use crate::{Error, Real};
+
+/// Coldest and warmest air that a plan is made for, C: as far as a temperature is taken at all.
+const TEMPERATURES: [f64; 2] = [-60.0, 80.0];
+
+/// Settings of a [`MeasurementPlan`].
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct MeasurementParams {
+    /// Samples of recording and loopback.
+    pub recording_len: usize,
+    /// Samples of the response.
+    pub ir_len: usize,
+    /// Sampling rate, Hz.
+    pub rate_hz: f64,
+    /// Lowest frequency of the sweep, Hz.
+    pub low_hz: f64,
+    /// Highest frequency of the sweep, Hz.
+    pub high_hz: f64,
+    /// See [`DeconvolutionParams::floor_db`].
+    pub floor_db: f64,
+    /// Temperature that responses are corrected to, C.
+    pub reference_celsius: f64,
+}
+
+/// Recording to response: deconvolve, correct the temperature, crop.
+pub struct MeasurementPlan<T: Real> {
+    deconvolution: DeconvolutionPlan<T>,
+    correction: TemperatureCorrection<T>,
+    ir_len: usize,
+    reference_celsius: f64,
+}
+
+/// Buffers of a [`MeasurementPlan`].
+pub struct MeasurementScratch<T> {
+    deconvolution: DeconvolutionScratch<T>,
+    raw: Vec<T>,
+}
+
+impl<T: Real> MeasurementPlan<T> {
+    /// Plans for recordings of one length.
+    ///
+    /// # Errors
+    /// As [`DeconvolutionPlan::new`].
+    pub fn new(params: &MeasurementParams) -> Result<Self, Error> {
+        let raw_len = raw_len(params.ir_len, params.reference_celsius).min(params.recording_len);
+        let deconvolution = DeconvolutionPlan::new(DeconvolutionParams {
+            recording_len: params.recording_len,
+            output_len: raw_len,
+            rate_hz: params.rate_hz,
+            low_hz: params.low_hz,
+            high_hz: params.high_hz,
+            floor_db: params.floor_db,
+            length: TransformLength::Fast,
+        })?;
+        Ok(Self {
+            deconvolution,
+            correction: TemperatureCorrection::new(),
+            ir_len: params.ir_len,
+            reference_celsius: params.reference_celsius,
+        })
+    }
+
+    /// Buffers for [`Self::ir`]; one a thread.
+    pub fn scratch(&self) -> MeasurementScratch<T> {
+        let raw = vec![T::default(); self.deconvolution.output_len()];
+        MeasurementScratch { deconvolution: self.deconvolution.scratch(), raw }
+    }
+
+    /// The response of one measurement at the reference temperature.
+    ///
+    /// # Errors
+    /// As [`DeconvolutionPlan::run`].
+    pub fn ir(
+        &self,
+        recording: &[T],
+        loopback: &[T],
+        celsius: f64,
+        ir: &mut [T],
+        scratch: &mut MeasurementScratch<T>,
+    ) -> Result<(), Error> {
+        check_len("the response", ir.len(), self.ir_len)?;
+        self.deconvolution.run(recording, loopback, &mut scratch.raw, &mut scratch.deconvolution)?;
+        self.correction.run(&scratch.raw, resampling_ratio(celsius, self.reference_celsius), ir);
+        Ok(())
+    }
+}
+
+/// Samples before the correction that `ir_len` samples after it can depend on, at any temperature.
+pub fn raw_len(ir_len: usize, reference_celsius: f64) -> usize {
+    let len =
+        |celsius| TemperatureCorrection::<f64>::input_len_for(ir_len, resampling_ratio(celsius, reference_celsius));
+    TEMPERATURES.into_iter().map(len).max().unwrap_or(ir_len)
+}
+
+/// What is derived of one response.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Derived<T> {
+    /// `[len]`: the response without the direct sound.
+    pub reflected: Vec<T>,
+    /// `[bands x len]`: NCE, over Flat's total energy.
+    pub curves: Vec<T>,
+    /// `[bands]`: energy.
+    pub energies: Vec<f64>,
+    /// `[bands]`: TNCE, over Flat's total energy; NaN or infinite where Flat has none.
+    pub tnce: Vec<f64>,
+    /// The sum of `tnce`.
+    pub total: f64,
+    /// `[bands]`: energy over Flat's of the same band.
+    pub tnce_over_band: Vec<f64>,
+}
+
+/// Response to reflected response, curves and energies.
+pub struct DerivationPlan<T: Real> {
+    bank: FilterBankPlan<T>,
+}
+
+/// Buffers of a [`DerivationPlan`].
+pub struct DerivationScratch<T> {
+    bank: FilterBankScratch<T>,
+    bands: Vec<T>,
+    flat: Vec<f64>,
+}
+
+impl<T: Real> DerivationPlan<T> {
+    /// Plans for responses of `len` samples.
+    ///
+    /// # Errors
+    /// As [`FilterBankPlan::new`].
+    pub fn new(len: usize, rate_hz: f64, centres_hz: &[f64]) -> Result<Self, Error> {
+        Ok(Self { bank: FilterBankPlan::new(len, rate_hz, centres_hz)? })
+    }
+
+    /// Buffers for [`Self::run`]; one a thread.
+    pub fn scratch(&self) -> DerivationScratch<T> {
+        let (bands, len) = (self.bank.bands(), self.bank.len());
+        DerivationScratch { bank: self.bank.scratch(), bands: vec![T::default(); bands * len], flat: vec![0.0; bands] }
+    }
+
+    /// A place for results, which runs fill again and again.
+    pub fn derived(&self) -> Derived<T> {
+        let (bands, len) = (self.bank.bands(), self.bank.len());
+        Derived {
+            reflected: vec![T::default(); len],
+            curves: vec![T::default(); bands * len],
+            energies: vec![0.0; bands],
+            tnce: vec![0.0; bands],
+            total: 0.0,
+            tnce_over_band: vec![0.0; bands],
+        }
+    }
+
+    /// Derives; `flat` has Foam subtracted already, all three are of the same pair.
+    ///
+    /// # Errors
+    /// [`Error::Length`] or [`Error::NotFinite`].
+    pub fn run(
+        &self,
+        ir: &[T],
+        foam: &[T],
+        flat: &[T],
+        derived: &mut Derived<T>,
+        scratch: &mut DerivationScratch<T>,
+    ) -> Result<(), Error> {
+        for (what, signal) in [("the response", ir), ("Foam's response", foam), ("Flat's response", flat)] {
+            check_len(what, signal.len(), self.bank.len())?;
+        }
+        subtract(ir, foam, &mut derived.reflected);
+        self.bank.run(&derived.reflected, &mut scratch.bands, &mut scratch.bank)?;
+        let flat_total = energy(flat);
+        cumulate(&scratch.bands, self.bank.len(), flat_total, &mut derived.curves, &mut derived.tnce);
+        derived.total = derived.tnce.iter().sum();
+        self.bank.energies(flat, &mut scratch.flat, &mut scratch.bank)?;
+        let bands = scratch.bands.chunks_exact(self.bank.len()).zip(&scratch.flat);
+        for ((energy_out, over_band), (band, flat)) in
+            derived.energies.iter_mut().zip(&mut derived.tnce_over_band).zip(bands)
+        {
+            *energy_out = energy(band);
+            *over_band = *energy_out / flat;
+        }
+        Ok(())
+    }
+}

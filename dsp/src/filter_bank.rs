@@ -1,0 +1,194 @@
+//! The octave-warped itersine filter bank: zero phase, circular, its gains' squares sum to 1.
+
+use std::f64::consts::PI;
+use std::sync::Arc;
+
+use realfft::num_complex::Complex;
+use realfft::{ComplexToReal, RealFftPlanner, RealToComplex};
+
+use crate::error::check_len;
+use crate::{Error, Real};
+
+/// The itersine window on |x| <= 1/2: sin(pi/2 cos^2(pi x)), 0 elsewhere.
+///
+/// The paper prints the cosine without its square; only with it do the squares of two windows half apart
+/// sum to 1, as in PyGSP, GSPBox and LTFAT.
+pub fn itersine(x: f64) -> f64 {
+    if x.abs() > 0.5 { 0.0 } else { (PI / 2.0 * (PI * x).cos().powi(2)).sin() }
+}
+
+/// Gain of one band at a frequency. The first band takes all that is lower, the last all that is higher.
+pub fn gain(centres_hz: &[f64], band: usize, frequency_hz: f64) -> f64 {
+    let last = centres_hz.len().saturating_sub(1) as f64;
+    let octaves = (frequency_hz / centres_hz[0]).log2().clamp(0.0, last);
+    itersine((octaves - band as f64) / 2.0)
+}
+
+/// Splits a signal into bands.
+///
+/// ir    `[len]`
+/// bands `[centres x len]`, band after band
+///
+/// Source: Rust et al. 2021; Wesfreid and Wickerhauser 1993 for the window.
+pub struct FilterBankPlan<T: Real> {
+    len: usize,
+    bands: usize,
+    /// `[bands x (len/2 + 1)]`.
+    gains: Vec<T>,
+    forward: Arc<dyn RealToComplex<T>>,
+    inverse: Arc<dyn ComplexToReal<T>>,
+}
+
+/// Buffers of a [`FilterBankPlan`].
+pub struct FilterBankScratch<T> {
+    signal: Vec<T>,
+    spectrum: Vec<Complex<T>>,
+    band: Vec<Complex<T>>,
+    work: Vec<Complex<T>>,
+}
+
+impl<T: Real> FilterBankPlan<T> {
+    /// Plans for signals of `len` samples; the centres are an octave apart, ascending.
+    ///
+    /// # Errors
+    /// [`Error::Setting`] where they are not, or there are none.
+    pub fn new(len: usize, rate_hz: f64, centres_hz: &[f64]) -> Result<Self, Error> {
+        let octaves = centres_hz.windows(2).all(|w| (w[1] / w[0] - 2.0).abs() < 1e-6);
+        if centres_hz.is_empty() || !octaves || !(centres_hz[0] > 0.0) {
+            let actual = format!("{centres_hz:?}");
+            return Err(Error::Setting { what: "the bands' centres", actual, expected: "frequencies an octave apart" });
+        }
+        if len == 0 {
+            return Err(Error::Setting { what: "the signal's length", actual: "0".into(), expected: "1 or more" });
+        }
+        let frequency = |k: usize| k as f64 * rate_hz / len as f64;
+        let gains = |band| (0..len / 2 + 1).map(move |k| T::of(gain(centres_hz, band, frequency(k))));
+        let mut planner = RealFftPlanner::new();
+        Ok(Self {
+            len,
+            bands: centres_hz.len(),
+            gains: (0..centres_hz.len()).flat_map(gains).collect(),
+            forward: planner.plan_fft_forward(len),
+            inverse: planner.plan_fft_inverse(len),
+        })
+    }
+
+    /// Number of bands.
+    pub fn bands(&self) -> usize {
+        self.bands
+    }
+
+    /// Samples of a signal.
+    #[allow(clippy::len_without_is_empty, reason = "a plan for no samples is refused")]
+    pub fn len(&self) -> usize {
+        self.len
+    }
+
+    /// Buffers for [`Self::run`]; one a thread.
+    pub fn scratch(&self) -> FilterBankScratch<T> {
+        let work = self.forward.get_scratch_len().max(self.inverse.get_scratch_len());
+        FilterBankScratch {
+            signal: self.forward.make_input_vec(),
+            spectrum: self.forward.make_output_vec(),
+            band: self.forward.make_output_vec(),
+            work: vec![Complex::default(); work],
+        }
+    }
+
+    /// Splits one signal.
+    ///
+    /// # Errors
+    /// [`Error::Length`] or [`Error::NotFinite`].
+    pub fn run(&self, ir: &[T], bands: &mut [T], scratch: &mut FilterBankScratch<T>) -> Result<(), Error> {
+        check_len("the bands", bands.len(), self.bands * self.len)?;
+        self.spectrum(ir, scratch)?;
+        let FilterBankScratch { spectrum, band, work, .. } = scratch;
+        let scale = T::of(1.0 / self.len as f64);
+        for (gains, out) in self.gains.chunks_exact(spectrum.len()).zip(bands.chunks_exact_mut(self.len)) {
+            for ((to, from), gain) in band.iter_mut().zip(&*spectrum).zip(gains) {
+                *to = from.scale(*gain * scale);
+            }
+            self.inverse.process_with_scratch(band, out, work).map_err(|_| Error::NotFinite { what: "the bands" })?;
+        }
+        Ok(())
+    }
+
+    /// Energy of a signal in each band, by Parseval: no band is computed for it.
+    ///
+    /// # Errors
+    /// [`Error::Length`] or [`Error::NotFinite`].
+    pub fn energies(&self, ir: &[T], energies: &mut [f64], scratch: &mut FilterBankScratch<T>) -> Result<(), Error> {
+        check_len("the energies", energies.len(), self.bands)?;
+        self.spectrum(ir, scratch)?;
+        for (gains, energy) in self.gains.chunks_exact(scratch.spectrum.len()).zip(energies) {
+            let power = |(k, (c, g)): (usize, (&Complex<T>, &T))| self.weight(k) * (*g * *g * c.norm_sqr()).f64();
+            *energy = scratch.spectrum.iter().zip(gains).enumerate().map(power).sum::<f64>() / self.len as f64;
+        }
+        Ok(())
+    }
+
+    // A bin stands for its mirror image too, but for 0 Hz and, where the length is even, the last one.
+    fn weight(&self, bin: usize) -> f64 {
+        if bin == 0 || 2 * bin == self.len { 1.0 } else { 2.0 }
+    }
+
+    fn spectrum(&self, ir: &[T], scratch: &mut FilterBankScratch<T>) -> Result<(), Error> {
+        check_len("the response", ir.len(), self.len)?;
+        let FilterBankScratch { signal, spectrum, work, .. } = scratch;
+        signal.copy_from_slice(ir);
+        self.forward
+            .process_with_scratch(signal, spectrum, work)
+            .map_err(|_| Error::NotFinite { what: "the response" })?;
+        // What rounding leaves there would keep the inverse transform from running.
+        let last = spectrum.len() - 1;
+        spectrum[0].im = T::default();
+        if self.len % 2 == 0 {
+            spectrum[last].im = T::default();
+        }
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const PAPER: [f64; 5] = [2_500.0, 5_000.0, 10_000.0, 20_000.0, 40_000.0];
+
+    #[test]
+    fn the_frame_is_tight_for_any_number_of_bands() {
+        for count in 1..=5 {
+            for i in 0..10_000 {
+                let hz = f64::from(i) * 4.8;
+                let sum: f64 = (0..count).map(|b| gain(&PAPER[..count], b, hz).powi(2)).sum();
+                assert!((sum - 1.0).abs() < 1e-14, "{count} bands at {hz} Hz: {sum}");
+            }
+        }
+    }
+
+    #[test]
+    fn energy_is_conserved_for_odd_and_even_lengths() {
+        for len in [1, 2, 3, 383, 384, 399, 400, 401, 512, 997] {
+            let plan = FilterBankPlan::<f64>::new(len, 96e3, &PAPER).expect("a plan");
+            let ir: Vec<f64> = (0..len).map(|i| f64::from((i as u32 * 7919) % 101) - 50.0).collect();
+            let (mut bands, mut scratch) = (vec![f64::NAN; 5 * len], plan.scratch());
+            let mut energies = vec![f64::NAN; 5];
+            plan.run(&ir, &mut bands, &mut scratch).expect("split");
+            plan.energies(&ir, &mut energies, &mut scratch).expect("energies");
+            let whole: f64 = ir.iter().map(|x| x * x).sum();
+            let split: f64 = bands.iter().map(|x| x * x).sum();
+            assert!((split / whole - 1.0).abs() < 1e-12, "{len}: {split} {whole}");
+            for (band, energy) in bands.chunks_exact(len).zip(&energies) {
+                let direct: f64 = band.iter().map(|x| x * x).sum();
+                assert!((direct - energy).abs() <= 1e-12 * whole, "{len}: {direct} {energy}");
+            }
+        }
+    }
+
+    #[test]
+    fn centres_must_be_octaves() {
+        for bad in [&[][..], &[1e3, 3e3], &[2e3, 1e3], &[0.0, 0.0], &[f64::NAN]] {
+            assert!(FilterBankPlan::<f32>::new(384, 96e3, bad).is_err(), "{bad:?}");
+        }
+    }
+}

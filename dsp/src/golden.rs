@@ -1,0 +1,259 @@
+//! The kernels against the reference's golden cases, within the tolerances that the reference states.
+
+use std::collections::HashMap;
+
+use arrow::array::AsArray as _;
+use arrow::datatypes::Float64Type;
+use bytes::Bytes;
+use echolake_schema::{Rig, Symmetry};
+use parquet::arrow::arrow_reader::ParquetRecordBatchReaderBuilder;
+use serde_json::Value;
+
+use crate::chain::{DerivationPlan, MeasurementParams, MeasurementPlan};
+use crate::deconvolution::{DeconvolutionParams, DeconvolutionPlan, TransformLength};
+use crate::energy::{energy, subtract};
+use crate::filter_bank::{FilterBankPlan, gain};
+use crate::fresnel::first_fresnel_zone;
+use crate::level::{p90_mean, power_to_db};
+use crate::temperature::resampling_ratio;
+use crate::{Real, fresnel::FresnelZone};
+
+const CENTRES: [f64; 5] = [2_500.0, 5_000.0, 10_000.0, 20_000.0, 40_000.0];
+const LEN: usize = 384;
+
+/// A case: signals by column name; scalars are signals of one sample.
+type Case = HashMap<String, Vec<f64>>;
+
+struct Golden {
+    cases: Vec<Case>,
+    metadata: HashMap<String, Value>,
+}
+
+fn golden() -> Golden {
+    let path = concat!(env!("CARGO_MANIFEST_DIR"), "/../tests/fixtures/golden.parquet");
+    let bytes = Bytes::from(std::fs::read(path).expect("the fixture is committed"));
+    let builder = ParquetRecordBatchReaderBuilder::try_new(bytes).expect("a Parquet file");
+    let pairs = builder.metadata().file_metadata().key_value_metadata().cloned().unwrap_or_default();
+    let metadata = pairs.into_iter().filter_map(|kv| Some((kv.key, serde_json::from_str(&kv.value?).ok()?))).collect();
+    let mut cases = Vec::new();
+    for batch in builder.build().expect("a reader") {
+        let batch = batch.expect("a batch");
+        for row in 0..batch.num_rows() {
+            let value = |name: &str| -> Option<Vec<f64>> {
+                let column = batch.column_by_name(name)?;
+                match column.as_list_opt::<i32>() {
+                    Some(list) => Some(list.value(row).as_primitive::<Float64Type>().values().to_vec()),
+                    None => Some(vec![column.as_primitive_opt::<Float64Type>()?.value(row)]),
+                }
+            };
+            let schema = batch.schema();
+            let names = schema.fields().iter().map(|f| f.name().clone());
+            cases.push(names.filter_map(|n| value(&n).map(|v| (n, v))).collect());
+        }
+    }
+    assert_eq!(cases.len(), 8, "all cases are read");
+    Golden { cases, metadata }
+}
+
+fn of<T: Real>(x: &[f64]) -> Vec<T> {
+    x.iter().map(|x| T::of(*x)).collect()
+}
+
+/// Relative L2 error.
+fn error<T: Real>(actual: &[T], expected: &[f64]) -> f64 {
+    assert_eq!(actual.len(), expected.len());
+    let off: f64 = actual.iter().zip(expected).map(|(a, e)| (a.f64() - e).powi(2)).sum();
+    (off / energy(expected)).sqrt()
+}
+
+fn params(recording_len: usize) -> MeasurementParams {
+    MeasurementParams {
+        recording_len,
+        ir_len: LEN,
+        rate_hz: 96e3,
+        low_hz: 2e3,
+        high_hz: 40e3,
+        floor_db: -60.0,
+        reference_celsius: 20.0,
+    }
+}
+
+fn check_deconvolution<T: Real>(length: TransformLength, tolerance: f64) {
+    for case in golden().cases {
+        for kind in ["foam", "flat", "panel"] {
+            let (x, s) = (&case[&format!("{kind}_recording")], &case[&format!("{kind}_loopback")]);
+            // Padding with zeros continues the response behind its end, where the reference wraps around.
+            let wanted = &case[&format!("{kind}_deconvolved")][..LEN];
+            let MeasurementParams { rate_hz, low_hz, high_hz, floor_db, .. } = params(x.len());
+            let settings = DeconvolutionParams {
+                recording_len: x.len(),
+                output_len: LEN,
+                rate_hz,
+                low_hz,
+                high_hz,
+                floor_db,
+                length,
+            };
+            let plan = DeconvolutionPlan::<T>::new(settings).expect("a plan");
+            let mut ir = vec![T::default(); LEN];
+            plan.run(&of(x), &of(s), &mut ir, &mut plan.scratch()).expect("a response");
+            let off = error(&ir, wanted);
+            assert!(off <= tolerance, "{kind}: {off}");
+        }
+    }
+}
+
+#[test]
+fn deconvolution() {
+    check_deconvolution::<f64>(TransformLength::Exact, 1e-9);
+    check_deconvolution::<f32>(TransformLength::Exact, 1e-3);
+    check_deconvolution::<f32>(TransformLength::Fast, 1e-3);
+}
+
+// The reference's own fraction is within 5e-9 of the exact ratio, so f64 differs by less than 1e-5.
+fn check_responses<T: Real>(tolerance: f64) {
+    for case in golden().cases {
+        let plan = MeasurementPlan::<T>::new(&params(case["foam_recording"].len())).expect("a plan");
+        let mut scratch = plan.scratch();
+        for kind in ["foam", "flat", "panel"] {
+            let signal = |what: &str| of::<T>(&case[&format!("{kind}_{what}")]);
+            let mut ir = vec![T::default(); LEN];
+            let celsius = case[&format!("{kind}_celsius")][0];
+            plan.ir(&signal("recording"), &signal("loopback"), celsius, &mut ir, &mut scratch).expect("a response");
+            let off = error(&ir, &case[&format!("{kind}_ir")]);
+            assert!(off <= tolerance, "{kind} at {celsius}: {off}");
+        }
+    }
+}
+
+#[test]
+fn responses() {
+    check_responses::<f32>(1e-3);
+    check_responses::<f64>(1e-3);
+}
+
+#[test]
+fn responses_in_f64_without_padding() {
+    for case in golden().cases {
+        for kind in ["foam", "flat", "panel"] {
+            let celsius = case[&format!("{kind}_celsius")][0];
+            let mut ir = vec![0.0; LEN];
+            let rho = resampling_ratio(celsius, 20.0);
+            crate::temperature::TemperatureCorrection::new().run(&case[&format!("{kind}_deconvolved")], rho, &mut ir);
+            let off = error(&ir, &case[&format!("{kind}_ir")]);
+            assert!(off <= 5e-6, "{kind} at {celsius}: {off}");
+        }
+    }
+}
+
+fn check_derivation<T: Real>(tolerance: f64) {
+    let plan = DerivationPlan::<T>::new(LEN, 96e3, &CENTRES).expect("a plan");
+    let (mut derived, mut scratch) = (plan.derived(), plan.scratch());
+    for case in golden().cases {
+        let (ir, foam) = (of::<T>(&case["panel_ir"]), of::<T>(&case["foam_ir"]));
+        let flat = of::<T>(&case["flat_reflected_ir"]);
+        plan.run(&ir, &foam, &flat, &mut derived, &mut scratch).expect("derived");
+        assert!(error(&derived.reflected, &case["reflected_ir"]) <= tolerance);
+        assert!(error(&derived.curves, &case["nce"]) <= tolerance);
+        assert!((derived.total / case["tnce_total"][0] - 1.0).abs() <= tolerance);
+        for (band, tnce) in derived.tnce.iter().enumerate() {
+            assert!((tnce / case["tnce"][band] - 1.0).abs() <= tolerance, "band {band}");
+            assert!((power_to_db(*tnce) - case["tnce_db"][band]).abs() <= 0.01, "band {band}");
+        }
+        let sum: f64 = derived.energies.iter().sum();
+        assert!((sum / energy(&derived.reflected) - 1.0).abs() <= tolerance);
+    }
+}
+
+#[test]
+fn derivation() {
+    check_derivation::<f32>(1e-3);
+    check_derivation::<f64>(1e-9);
+}
+
+// What a scratch was used for before leaves no trace, to the last bit.
+#[test]
+fn dirty_scratch_changes_nothing() {
+    let cases = golden().cases;
+    let plan = MeasurementPlan::<f32>::new(&params(cases[0]["panel_recording"].len())).expect("a plan");
+    let run = |case: &Case, scratch: &mut _| {
+        let mut ir = vec![f32::NAN; LEN];
+        let (x, s) = (of(&case["panel_recording"]), of(&case["panel_loopback"]));
+        plan.ir(&x, &s, case["panel_celsius"][0], &mut ir, scratch).expect("a response");
+        ir
+    };
+    let mut used = plan.scratch();
+    for case in &cases {
+        assert_eq!(run(case, &mut used), run(case, &mut plan.scratch()));
+    }
+}
+
+#[test]
+fn bands() {
+    let plan = FilterBankPlan::<f64>::new(LEN, 96e3, &CENTRES).expect("a plan");
+    let (mut bands, mut scratch) = (vec![0.0; 5 * LEN], plan.scratch());
+    for case in golden().cases {
+        plan.run(&case["reflected_ir"], &mut bands, &mut scratch).expect("split");
+        assert!(error(&bands, &case["bands"]) <= 1e-9);
+        let mut reflected = vec![0.0; LEN];
+        subtract(&case["panel_ir"], &case["foam_ir"], &mut reflected);
+        assert!(error(&reflected, &case["reflected_ir"]) <= 1e-12);
+    }
+}
+
+fn numbers(value: &Value) -> Vec<f64> {
+    value.as_array().expect("a list").iter().map(|x| x.as_f64().expect("a number")).collect()
+}
+
+#[test]
+fn gains_ratios_and_means() {
+    let golden = golden();
+    let frequencies = numbers(&golden.metadata["frequencies_hz"]);
+    for (band, gains) in golden.metadata["gains"].as_array().expect("bands").iter().enumerate() {
+        for (hz, expected) in frequencies.iter().zip(numbers(gains)) {
+            assert!((gain(&CENTRES, band, *hz) - expected).abs() <= 1e-6, "band {band} at {hz}");
+        }
+    }
+    for (celsius, fraction) in golden.metadata["resampling"].as_object().expect("ratios") {
+        let fraction = numbers(fraction);
+        let exact = resampling_ratio(celsius.parse().expect("a temperature"), 20.0);
+        // Denominators go to 10,000, so the nearest fraction is within 1/10,000^2 but close to simple ones.
+        assert!((exact - fraction[0] / fraction[1]).abs() <= 1e-4, "{celsius}");
+    }
+    let p90 = &golden.metadata["p90"];
+    let mean = p90_mean(&numbers(&p90["values"]), &mut Vec::new()).expect("a mean");
+    assert!((mean / p90["p90_mean"].as_f64().expect("a number") - 1.0).abs() <= 1e-12);
+}
+
+#[test]
+fn grid_pairs_and_symmetries_are_identical() {
+    let golden = golden();
+    let grid = Rig::paper().grid().expect("the built-in rig is valid");
+    let points: Vec<_> = golden.metadata["points_mm"].as_array().expect("points").iter().map(numbers).collect();
+    assert_eq!(grid.points().iter().map(|p| p.position_mm.to_vec()).collect::<Vec<_>>(), points);
+    let pairs: Vec<_> = golden.metadata["pairs"].as_array().expect("pairs").iter().map(numbers).collect();
+    let ours = grid.pairs().iter().map(|p| vec![f64::from(p.microphone.0), f64::from(p.speaker.0)]);
+    assert_eq!(ours.collect::<Vec<_>>(), pairs);
+    for symmetry in Symmetry::ALL {
+        let expected = numbers(&golden.metadata["d4"][symmetry.name()]);
+        let ours = grid.permutation(symmetry).expect("the grid is square");
+        assert_eq!(ours.iter().map(|p| f64::from(p.0)).collect::<Vec<_>>(), expected, "{}", symmetry.name());
+    }
+}
+
+// The four diameters of DESIGN's definition, to the tenth of a millimetre that it prints.
+#[test]
+fn fresnel_zones_of_the_measured_pairs() {
+    let grid = Rig::paper().grid().expect("the built-in rig is valid");
+    let at = |id: echolake_schema::PointId| grid.point(id).expect("a point").position_mm;
+    let extremes = |hz: f64| {
+        let zones = grid.pairs().iter().map(|p| first_fresnel_zone(at(p.microphone), at(p.speaker), hz, 343.0));
+        zones.fold((f64::INFINITY, 0.0f64), |(least, greatest), FresnelZone { semi_major_mm, semi_minor_mm, .. }| {
+            (least.min(2.0 * semi_minor_mm), greatest.max(2.0 * semi_major_mm))
+        })
+    };
+    for (hz, expected) in [(2_000.0, (227.6, 535.5)), (40_000.0, (47.3, 162.3))] {
+        let (least, greatest) = extremes(hz);
+        assert!((least - expected.0).abs() < 0.05 && (greatest - expected.1).abs() < 0.05, "{hz}: {least} {greatest}");
+    }
+}

@@ -1,0 +1,61 @@
+//! Decibels and order statistics.
+
+/// 10 log10 x: the level of a power ratio, dB. No power is minus infinity.
+pub fn power_to_db(power: f64) -> f64 {
+    10.0 * power.log10()
+}
+
+/// 10^(x/10): the power ratio of a level.
+pub fn db_to_power(level_db: f64) -> f64 {
+    10f64.powf(level_db / 10.0)
+}
+
+/// The `percent`-th percentile of ascending values, linearly interpolated as in NumPy; NaN of none.
+pub fn percentile(sorted: &[f64], percent: f64) -> f64 {
+    let Some(last) = sorted.len().checked_sub(1) else { return f64::NAN };
+    let position = percent / 100.0 * last as f64;
+    let below = (position.floor() as usize).min(last);
+    let above = (below + 1).min(last);
+    sorted[below] + (sorted[above] - sorted[below]) * (position - below as f64)
+}
+
+/// Mean of the values up to their 90th percentile, as in the paper's tables; None of none.
+pub fn p90_mean(values: &[f64], scratch: &mut Vec<f64>) -> Option<f64> {
+    scratch.clear();
+    scratch.extend_from_slice(values);
+    scratch.sort_by(f64::total_cmp);
+    let limit = percentile(scratch, 90.0);
+    let kept = scratch.iter().take_while(|x| **x <= limit);
+    let (count, sum) = kept.fold((0u32, 0.0), |(n, sum), x| (n + 1, sum + x));
+    (count > 0).then(|| sum / f64::from(count))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn percentiles_interpolate() {
+        let values = [1.0, 2.0, 4.0, 8.0];
+        for (percent, expected) in [(0.0, 1.0), (50.0, 3.0), (100.0, 8.0), (90.0, 6.8)] {
+            assert!((percentile(&values, percent) - expected).abs() < 1e-12, "{percent}");
+        }
+        assert!(percentile(&[], 50.0).is_nan());
+        assert_eq!(percentile(&[5.0], 90.0), 5.0);
+    }
+
+    #[test]
+    fn outliers_above_the_90th_percentile_do_not_count() {
+        let values: Vec<f64> = (1..=10).map(f64::from).chain([1e9]).collect();
+        assert_eq!(p90_mean(&values, &mut Vec::new()), Some(5.5));
+        assert_eq!(p90_mean(&[], &mut Vec::new()), None);
+        assert_eq!(p90_mean(&[3.0, 3.0], &mut vec![1.0]), Some(3.0));
+    }
+
+    #[test]
+    fn levels_and_powers() {
+        assert_eq!(power_to_db(100.0), 20.0);
+        assert!((db_to_power(power_to_db(0.37)) - 0.37).abs() < 1e-15);
+        assert_eq!(power_to_db(0.0), f64::NEG_INFINITY);
+    }
+}

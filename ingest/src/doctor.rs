@@ -1,0 +1,229 @@
+//! Looks a lake over: what is in it, what is missing, and what is damaged, to the last CRC.
+
+use std::collections::BTreeSet;
+
+use arrow::record_batch::RecordBatch;
+use echolake_lake::{DataFile, FileName, Lake, Snapshot};
+use echolake_schema::tables::Table;
+use futures::TryStreamExt as _;
+use object_store::path::Path;
+use object_store::{ObjectStore as _, ObjectStoreExt as _};
+use serde::Serialize;
+
+use crate::chunk::Chunk;
+use crate::error::{Error, Result};
+use crate::read_back;
+use crate::references::Finder;
+use crate::rows::runs::text_of;
+use crate::run_reader::{Item, RunReader};
+
+/// What a lake was found to be.
+#[derive(Debug, Clone, Default, Serialize)]
+pub struct Report {
+    /// The tables, in order.
+    pub tables: Vec<TableReport>,
+    /// Runs that readers see.
+    pub runs: usize,
+    /// Bytes of run files.
+    pub run_bytes: u64,
+    /// What there is to see to, worst first.
+    pub findings: Vec<Finding>,
+}
+
+/// What a table was found to be.
+#[derive(Debug, Clone, Serialize)]
+pub struct TableReport {
+    /// Its name.
+    pub table: &'static str,
+    /// Files that readers see.
+    pub files: usize,
+    /// Rows in them.
+    pub rows: u64,
+    /// Their bytes.
+    pub bytes: u64,
+}
+
+/// Something to see to.
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Serialize)]
+pub struct Finding {
+    /// How bad it is.
+    pub severity: Severity,
+    /// The file or run.
+    pub subject: String,
+    /// What it is, with a hint.
+    pub what: String,
+}
+
+/// How bad a finding is, worst first.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Severity {
+    /// Data are damaged or lost.
+    Damaged,
+    /// Something is not there yet.
+    Missing,
+    /// Worth knowing.
+    Note,
+}
+
+/// How far the check has come.
+#[derive(Debug, Clone, Copy)]
+pub struct Step<'a> {
+    /// What is checked now.
+    pub subject: &'a str,
+    /// Files done.
+    pub done: usize,
+    /// Files in all.
+    pub total: usize,
+}
+
+impl Report {
+    /// Whether data are damaged or lost.
+    pub fn is_damaged(&self) -> bool {
+        self.findings.iter().any(|f| f.severity == Severity::Damaged)
+    }
+
+    fn find(&mut self, severity: Severity, subject: impl ToString, what: impl Into<String>) {
+        self.findings.push(Finding { severity, subject: subject.to_string(), what: what.into() });
+    }
+}
+
+/// Checks a lake: every file of every table is decoded, and every run file read to its last CRC.
+///
+/// # Errors
+/// [`Error`] where the lake itself cannot be read; damage in it is a finding.
+pub async fn examine(lake: &Lake, progress: &mut dyn FnMut(Step<'_>)) -> Result<Report> {
+    let snapshot = lake.snapshot().await?;
+    let mut report = Report { runs: snapshot.runs().count(), ..Report::default() };
+    let total = Table::ALL.iter().map(|t| snapshot.files(*t).len()).sum::<usize>() + report.runs;
+    let mut done = 0;
+    for table in Table::ALL {
+        let files = snapshot.files(table);
+        for file in files {
+            progress(Step { subject: file.path.as_ref(), done, total });
+            done += 1;
+            if let Err(error) = check_table_file(lake, table, file).await {
+                report.find(Severity::Damaged, &file.path, error.to_string());
+            }
+        }
+        report.tables.push(TableReport {
+            table: table.name(),
+            files: files.len(),
+            rows: files.iter().map(|f| f.rows).sum(),
+            bytes: files.iter().map(|f| f.bytes).sum(),
+        });
+    }
+    let pointers: Vec<_> = snapshot.files(Table::Runs).to_vec();
+    for file in pointers {
+        progress(Step { subject: file.path.as_ref(), done, total });
+        done += 1;
+        match read_back::run_row(lake, &file).await {
+            Ok(row) => check_run(lake, &snapshot, &row, &mut report).await?,
+            // Said above, where the table's files were decoded.
+            Err(_) => continue,
+        }
+    }
+    find_strays(lake, &snapshot, &mut report).await?;
+    report.findings.sort();
+    Ok(report)
+}
+
+async fn check_table_file(lake: &Lake, table: Table, file: &DataFile) -> Result<()> {
+    let batches = read_back::batches(lake, table, file, &[]).await?;
+    let rows: usize = batches.iter().map(RecordBatch::num_rows).sum();
+    if rows as u64 == file.rows {
+        return Ok(());
+    }
+    let reason = format!("it has {rows} rows, its log says {}", file.rows);
+    Err(Error::DataFile { file: file.path.to_string(), reason })
+}
+
+async fn check_run(lake: &Lake, snapshot: &Snapshot, row: &RecordBatch, report: &mut Report) -> Result<()> {
+    let text = |column| text_of(row, column).unwrap_or_default();
+    let (run, path, state) = (text("run_id"), text("file"), text("state"));
+    for finding in check_run_file(lake, &Path::from(path.as_str()), &text("file_sha256"), report).await? {
+        report.find(Severity::Damaged, &path, finding);
+    }
+    if state == "partial" {
+        report.find(
+            Severity::Note,
+            &run,
+            "the run was cut off or damaged when it was taken in; what was whole is in the tables",
+        );
+    }
+    if let Ok(surface) = text("surface_id").parse() {
+        let missing = Finder::new(lake, snapshot).wanted(&surface).missing();
+        if !missing.is_empty() {
+            let what =
+                format!("waits for reference {missing}; hint: ingest a run of that surface, and it is completed");
+            report.find(Severity::Missing, &run, what);
+        } else if text("reference_derivation").is_empty() {
+            report.find(
+                Severity::Missing,
+                &run,
+                "its references are there, its derived rows are not; hint: `echolake ingest`",
+            );
+        }
+    }
+    Ok(())
+}
+
+/// What is wrong with a run's file, in words.
+async fn check_run_file(lake: &Lake, path: &Path, sha256: &str, report: &mut Report) -> Result<Vec<String>> {
+    let mut reader = match RunReader::open(lake.store(), path.clone(), path.to_string()).await {
+        Ok(reader) => reader,
+        Err(e) => return Ok(vec![e.to_string()]),
+    };
+    let mut wrong = Vec::new();
+    while let Some(item) = reader.next().await? {
+        if let Item::Chunk(raw) = item {
+            let offset = raw.offset;
+            if let Err(reason) = Chunk::decode(&raw.body) {
+                wrong.push(format!("the chunk at byte {offset}: {reason}"));
+            }
+        }
+    }
+    let integrity = reader.finish().await?;
+    report.run_bytes += integrity.bytes;
+    wrong.extend(integrity.damage);
+    if integrity.sha256 != sha256 {
+        wrong.push(format!("its SHA-256 is {}, at ingest it was {sha256}", integrity.sha256));
+    }
+    Ok(wrong)
+}
+
+// Files that nothing names: not yet taken in, refused, or left behind by a crash.
+async fn find_strays(lake: &Lake, snapshot: &Snapshot, report: &mut Report) -> Result<()> {
+    let named: BTreeSet<Path> = Table::ALL
+        .iter()
+        .flat_map(|t| snapshot.files(*t).iter().chain(snapshot.superseded(*t)))
+        .map(|f| f.path.clone())
+        .chain(snapshot.runs().map(|r| Lake::run_path(&r.surface, &r.run)))
+        .collect();
+    let listed: Vec<_> = lake.store().list(None).try_collect().await.map_err(|e| Error::read(lake.location(), e))?;
+    let mut left_behind = (0, 0);
+    for meta in listed.into_iter().filter(|m| !named.contains(&m.location)) {
+        let path = meta.location;
+        let parts: Vec<_> = path.parts().map(|p| p.as_ref().to_owned()).collect();
+        match parts.first().map(String::as_str) {
+            Some("inbox") if path.extension() == Some("mcap") => {
+                report.find(Severity::Missing, &path, "not yet taken in; hint: `echolake ingest`");
+            }
+            Some("inbox") => report.find(Severity::Note, &path, "a recording that goes on, or was cut off"),
+            Some("runs") => report.find(Severity::Missing, &path, "in no table; hint: `echolake ingest`"),
+            Some("quarantine") => report.find(Severity::Note, &path, "was refused; the reason stands beside it"),
+            Some("tables") if FileName::parse(&path).is_some() => {
+                left_behind = (left_behind.0 + 1, left_behind.1 + meta.size);
+            }
+            _ => {}
+        }
+    }
+    if left_behind.0 > 0 {
+        let what = format!(
+            "{} files ({} bytes) of older derivations or of an ingest that was cut off",
+            left_behind.0, left_behind.1
+        );
+        report.find(Severity::Note, "tables", what);
+    }
+    Ok(())
+}

@@ -1,0 +1,271 @@
+//! Messages of one chunk become impulse responses, verdicts, readings and log lines.
+
+use std::collections::HashMap;
+use std::sync::{Arc, Mutex, PoisonError};
+
+use echolake_dsp::chain::{MeasurementParams, MeasurementPlan};
+use echolake_dsp::temperature::{TemperatureCorrection, resampling_ratio};
+use echolake_schema::messages::{
+    AmbientSample, ImpulseResponse, Measurement, Message as RunMessage, SampleFormat, SweepRecording,
+};
+use echolake_schema::{Celsius, Rig, topics};
+use prost::Message as _;
+
+use crate::chunk::{Channels, Chunk, Message};
+
+/// Turns recordings into responses; one for all chunks of a run.
+pub(crate) struct Measurer {
+    rig: Rig,
+    pairs: u32,
+    /// Recordings of a run are of one length, those of an import may not be.
+    plans: Mutex<HashMap<usize, Arc<MeasurementPlan<f32>>>>,
+    correction: TemperatureCorrection<f32>,
+}
+
+/// All that a chunk yields.
+#[derive(Debug, Default)]
+pub(crate) struct Yield {
+    pub(crate) responses: Vec<Response>,
+    pub(crate) verdicts: Vec<(i64, Measurement)>,
+    pub(crate) readings: Vec<(i64, AmbientSample)>,
+    pub(crate) events: Vec<(i64, Event)>,
+    /// What could not be read, in words.
+    pub(crate) damaged: Vec<String>,
+    pub(crate) last_time_ns: i64,
+}
+
+/// One impulse response at the reference temperature, cropped.
+#[derive(Debug, Clone)]
+pub(crate) struct Response {
+    pub(crate) pair: u32,
+    pub(crate) attempt: u32,
+    pub(crate) log_time_ns: i64,
+    pub(crate) chunk_offset: u64,
+    pub(crate) temperature_c: f64,
+    pub(crate) source: Source,
+    pub(crate) ir: Vec<f32>,
+}
+
+/// What a response was made from; the greater is preferred.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub(crate) enum Source {
+    Corrected,
+    Ir,
+    Sweep,
+}
+
+impl Source {
+    pub(crate) fn label(self) -> &'static str {
+        match self {
+            Self::Corrected => "corrected",
+            Self::Ir => "ir",
+            Self::Sweep => "sweep",
+        }
+    }
+}
+
+/// A line of the log: the fields of foxglove.Log that the tables keep, with its field numbers.
+#[derive(Clone, PartialEq, prost::Message)]
+pub(crate) struct Event {
+    #[prost(int32, tag = "2")]
+    pub(crate) level: i32,
+    #[prost(string, tag = "3")]
+    pub(crate) message: String,
+    #[prost(string, tag = "4")]
+    pub(crate) name: String,
+}
+
+impl Event {
+    /// The names of foxglove.Log's levels.
+    pub(crate) fn level_name(&self) -> &'static str {
+        ["unknown", "debug", "info", "warning", "error", "fatal"]
+            .get(usize::try_from(self.level).unwrap_or(0))
+            .copied()
+            .unwrap_or("unknown")
+    }
+}
+
+impl Measurer {
+    pub(crate) fn new(rig: &Rig, pairs: usize) -> Self {
+        Self {
+            rig: rig.clone(),
+            pairs: pairs as u32,
+            plans: Mutex::default(),
+            correction: TemperatureCorrection::new(),
+        }
+    }
+
+    /// Reads all messages of a chunk. What is wrong with one of them is said, and the others go on.
+    pub(crate) fn process(&self, offset: u64, chunk: &Chunk, channels: &Channels) -> Yield {
+        let mut out = Yield { last_time_ns: i64::MIN, ..Yield::default() };
+        for message in chunk.messages() {
+            out.last_time_ns = out.last_time_ns.max(message.log_time_ns);
+            let Some(channel) = channels.get(&message.channel) else {
+                out.damaged.push(format!("a message of channel {}, which nothing introduces", message.channel));
+                continue;
+            };
+            let taken = match channel.topic.as_str() {
+                topics::SWEEP => decode::<SweepRecording>(&channel.schema, &message)
+                    .and_then(|s| self.sweep(offset, &message, &s))
+                    .map(|r| out.responses.push(r)),
+                topics::IR => decode::<ImpulseResponse>(&channel.schema, &message)
+                    .and_then(|i| self.ir(offset, &message, &i))
+                    .map(|r| out.responses.push(r)),
+                topics::MEASUREMENT => decode::<Measurement>(&channel.schema, &message)
+                    .and_then(|m| self.known_pair(m.pair_id).map(|()| m))
+                    .map(|m| out.verdicts.push((message.log_time_ns, m))),
+                topics::ENVIRONMENT => decode::<AmbientSample>(&channel.schema, &message)
+                    .map(|a| out.readings.push((message.log_time_ns, a))),
+                topics::LOG => Event::decode(message.data)
+                    .map_err(|e| e.to_string())
+                    .map(|e| out.events.push((message.log_time_ns, e))),
+                _ => Ok(()),
+            };
+            if let Err(reason) = taken {
+                out.damaged.push(format!("a message of `{}` at {} ns: {reason}", channel.topic, message.log_time_ns));
+            }
+        }
+        out
+    }
+
+    fn sweep(&self, chunk_offset: u64, message: &Message<'_>, sweep: &SweepRecording) -> Result<Response, String> {
+        self.known_pair(sweep.pair_id)?;
+        self.known_rate(sweep.sample_rate_hz)?;
+        let celsius = Celsius::new(sweep.temperature_c).map_err(|e| e.to_string())?;
+        let format = SampleFormat::try_from(sweep.format).unwrap_or_default();
+        let count = sweep.sample_count as usize;
+        let microphone = samples(format, count, &sweep.microphone)?;
+        let loopback = samples(format, count, &sweep.loopback)?;
+        let plan = self.plan(count)?;
+        let mut ir = vec![0.0; self.rig.impulse_response.length];
+        let mut scratch = plan.scratch();
+        plan.ir(&microphone, &loopback, celsius.get(), &mut ir, &mut scratch).map_err(|e| e.to_string())?;
+        Ok(Response {
+            pair: sweep.pair_id,
+            attempt: sweep.attempt,
+            log_time_ns: message.log_time_ns,
+            chunk_offset,
+            temperature_c: celsius.get(),
+            source: Source::Sweep,
+            ir,
+        })
+    }
+
+    fn ir(&self, chunk_offset: u64, message: &Message<'_>, given: &ImpulseResponse) -> Result<Response, String> {
+        self.known_pair(given.pair_id)?;
+        self.known_rate(given.sample_rate_hz)?;
+        let celsius = Celsius::new(given.temperature_c).map_err(|e| e.to_string())?;
+        if let Some(at) = given.samples.iter().position(|x| !x.is_finite()) {
+            return Err(format!("sample {at} is {}", given.samples[at]));
+        }
+        let length = self.rig.impulse_response.length;
+        let mut ir = vec![0.0; length];
+        let source = if given.temperature_corrected {
+            let kept = given
+                .samples
+                .get(..length)
+                .ok_or_else(|| format!("it has {} samples, the lake's responses have {length}", given.samples.len()))?;
+            ir.copy_from_slice(kept);
+            Source::Corrected
+        } else {
+            let reference = self.rig.impulse_response.reference_temperature_c.get();
+            self.correction.run(&given.samples, resampling_ratio(celsius.get(), reference), &mut ir);
+            Source::Ir
+        };
+        Ok(Response {
+            pair: given.pair_id,
+            attempt: given.attempt,
+            log_time_ns: message.log_time_ns,
+            chunk_offset,
+            temperature_c: celsius.get(),
+            source,
+            ir,
+        })
+    }
+
+    fn plan(&self, recording_len: usize) -> Result<Arc<MeasurementPlan<f32>>, String> {
+        let mut plans = self.plans.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some(plan) = plans.get(&recording_len) {
+            return Ok(plan.clone());
+        }
+        let plan = MeasurementPlan::new(&MeasurementParams {
+            recording_len,
+            ir_len: self.rig.impulse_response.length,
+            rate_hz: self.rig.sweep.rate_hz.get(),
+            low_hz: self.rig.sweep.low_hz,
+            high_hz: self.rig.sweep.high_hz,
+            floor_db: self.rig.impulse_response.floor_db,
+            reference_celsius: self.rig.impulse_response.reference_temperature_c.get(),
+        });
+        let plan = Arc::new(plan.map_err(|e| e.to_string())?);
+        plans.insert(recording_len, plan.clone());
+        Ok(plan)
+    }
+
+    fn known_pair(&self, pair: u32) -> Result<(), String> {
+        if pair < self.pairs { Ok(()) } else { Err(format!("pair {pair}, but the rig has {}", self.pairs)) }
+    }
+
+    fn known_rate(&self, rate_hz: f64) -> Result<(), String> {
+        let expected = self.rig.sweep.rate_hz.get();
+        if rate_hz == expected { Ok(()) } else { Err(format!("sampled at {rate_hz} Hz, the lake's rig at {expected}")) }
+    }
+}
+
+fn decode<M: RunMessage>(schema: &str, message: &Message<'_>) -> Result<M, String> {
+    if schema != M::FULL_NAME {
+        return Err(format!("its schema is `{schema}`, expected `{}`", M::FULL_NAME));
+    }
+    M::decode(message.data).map_err(|e| e.to_string())
+}
+
+/// Samples as fractions of full scale.
+fn samples(format: SampleFormat, count: usize, bytes: &[u8]) -> Result<Vec<f32>, String> {
+    let width = format.bytes().ok_or("its sample format is unknown")?;
+    if count.checked_mul(width) != Some(bytes.len()) {
+        return Err(format!("it has {} bytes for {count} samples of {width}", bytes.len()));
+    }
+    let samples: Vec<f32> = match format {
+        SampleFormat::S16le => {
+            bytes.chunks_exact(2).map(|b| f32::from(i16::from_le_bytes([b[0], b[1]])) / 32_768.0).collect()
+        }
+        SampleFormat::S24le => bytes
+            .chunks_exact(3)
+            .map(|b| (i32::from_le_bytes([0, b[0], b[1], b[2]]) >> 8) as f32 / 8_388_608.0)
+            .collect(),
+        SampleFormat::S32le => bytes
+            .chunks_exact(4)
+            .map(|b| i32::from_le_bytes([b[0], b[1], b[2], b[3]]) as f32 / 2_147_483_648.0)
+            .collect(),
+        SampleFormat::F32le => bytes.chunks_exact(4).map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]])).collect(),
+        SampleFormat::Unspecified => return Err("its sample format is unknown".into()),
+    };
+    match samples.iter().position(|x| !x.is_finite()) {
+        Some(at) => Err(format!("sample {at} is {}", samples[at])),
+        None => Ok(samples),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_format_has_the_same_full_scale() {
+        let check = |format, bytes: &[u8]| {
+            assert_eq!(samples(format, 2, bytes).expect("two samples"), [-1.0, 0.5], "{format:?}");
+        };
+        check(SampleFormat::S16le, &[0, 0x80, 0, 0x40]);
+        check(SampleFormat::S24le, &[0, 0, 0x80, 0, 0, 0x40]);
+        check(SampleFormat::S32le, &[0, 0, 0, 0x80, 0, 0, 0, 0x40]);
+        check(SampleFormat::F32le, &[0, 0, 0x80, 0xBF, 0, 0, 0, 0x3F]);
+    }
+
+    #[test]
+    fn wrong_lengths_and_nan_are_said() {
+        assert!(samples(SampleFormat::S24le, 2, &[0; 5]).is_err());
+        assert!(samples(SampleFormat::S24le, usize::MAX, &[0; 5]).is_err());
+        assert!(samples(SampleFormat::Unspecified, 0, &[]).is_err());
+        assert!(samples(SampleFormat::F32le, 1, &f32::NAN.to_le_bytes()).expect_err("NaN").contains("sample 0 is NaN"));
+    }
+}

@@ -1,0 +1,62 @@
+//! Rows that are in the lake, read back by ingest itself.
+
+use arrow::array::{Array as _, AsArray as _};
+use arrow::compute::concat_batches;
+use arrow::datatypes::{Float32Type, Int32Type};
+use arrow::record_batch::RecordBatch;
+use echolake_lake::{DataFile, Lake, Snapshot};
+use echolake_schema::RunId;
+use echolake_schema::tables::Table;
+use object_store::ObjectStoreExt as _;
+use parquet::arrow::ProjectionMask;
+use parquet::arrow::arrow_reader::{ArrowReaderOptions, ParquetRecordBatchReaderBuilder};
+
+use crate::derive::Responses;
+use crate::error::{Error, Result};
+
+/// A run's impulse responses as they stand in `measurements`.
+pub(crate) async fn responses(lake: &Lake, snapshot: &Snapshot, run: &RunId) -> Result<Responses> {
+    let mut out = Responses::default();
+    let files: Vec<_> = snapshot.files_of(Table::Measurements, run).cloned().collect();
+    for file in files {
+        for batch in batches(lake, Table::Measurements, &file, &["pair_id", "ir"]).await? {
+            let lost = |what: &str| Error::DataFile { file: file.path.to_string(), reason: format!("no `{what}`") };
+            let pairs = batch.column_by_name("pair_id").ok_or_else(|| lost("pair_id"))?.as_primitive::<Int32Type>();
+            let irs = batch.column_by_name("ir").ok_or_else(|| lost("ir"))?.as_list::<i32>();
+            let (from, to) = (irs.value_offsets()[0] as usize, irs.value_offsets()[irs.len()] as usize);
+            out.pairs.extend(pairs.values().iter().map(|p| *p as u32));
+            out.irs.extend_from_slice(&irs.values().as_primitive::<Float32Type>().values()[from..to]);
+        }
+    }
+    if out.irs.len() != out.pairs.len() * lake.rig().impulse_response.length {
+        let reason = "its responses do not have the lake's length".to_owned();
+        return Err(Error::DataFile { file: format!("tables/measurements, run {run}"), reason });
+    }
+    Ok(out)
+}
+
+/// A run's row of `runs`.
+pub(crate) async fn run_row(lake: &Lake, file: &DataFile) -> Result<RecordBatch> {
+    let batches = batches(lake, Table::Runs, file, &[]).await?;
+    concat_batches(&Table::Runs.schema(lake.rig()), &batches)
+        .map_err(|e| Error::DataFile { file: file.path.to_string(), reason: e.to_string() })
+}
+
+/// The named columns of a file, or all.
+pub(crate) async fn batches(lake: &Lake, table: Table, file: &DataFile, columns: &[&str]) -> Result<Vec<RecordBatch>> {
+    let damaged = |reason: String| Error::DataFile { file: file.path.to_string(), reason };
+    let found = lake.store().get(&file.path).await.map_err(|e| damaged(e.to_string()))?;
+    let bytes = found.bytes().await.map_err(|e| damaged(e.to_string()))?;
+    if bytes.len() as u64 != file.bytes {
+        return Err(damaged(format!("it has {} bytes, its log says {}", bytes.len(), file.bytes)));
+    }
+    let options = ArrowReaderOptions::new().with_schema(table.schema(lake.rig()));
+    let builder =
+        ParquetRecordBatchReaderBuilder::try_new_with_options(bytes, options).map_err(|e| damaged(e.to_string()))?;
+    let mask = match columns {
+        [] => ProjectionMask::all(),
+        some => ProjectionMask::columns(builder.parquet_schema(), some.iter().copied()),
+    };
+    let reader = builder.with_projection(mask).build().map_err(|e| damaged(e.to_string()))?;
+    reader.collect::<std::result::Result<_, _>>().map_err(|e| damaged(e.to_string()))
+}

@@ -1,0 +1,94 @@
+//! Rows of tables `nce`, `tnce` and `tnce_d4`.
+
+use arrow::record_batch::RecordBatch;
+use echolake_schema::tables::Table;
+use echolake_schema::{Grid, PairId, Rig, Symmetry};
+
+use super::{Columns, Keys};
+use crate::CODE_VERSION;
+use crate::derive::DerivedRun;
+use crate::error::Result;
+
+/// Which references the rows used.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Versions<'a> {
+    pub(crate) flat: &'a str,
+    pub(crate) foam: &'a str,
+}
+
+/// Rows of `nce`.
+pub(crate) fn nce(rig: &Rig, grid: &Grid, keys: &Keys, derived: &DerivedRun, of: Versions<'_>) -> Result<RecordBatch> {
+    let (bands, length) = (rig.bands.centres_hz.len(), rig.impulse_response.length);
+    let rows = derived.pairs.len();
+    let mut columns = Columns::of_run(Table::Nce, rows, keys);
+    pair_columns(&mut columns, grid, &derived.pairs);
+    columns.lists(derived.reflected.clone());
+    for band in 0..bands {
+        let curve = |row: usize| {
+            let start = (row * bands + band) * length;
+            derived.curves[start..start + length].iter().copied()
+        };
+        columns.lists((0..rows).flat_map(curve).collect());
+    }
+    columns.same(of.flat).same(of.foam).same(CODE_VERSION);
+    columns.finish(rig)
+}
+
+/// Rows of `tnce`.
+pub(crate) fn tnce(rig: &Rig, grid: &Grid, keys: &Keys, derived: &DerivedRun, of: Versions<'_>) -> Result<RecordBatch> {
+    let mut columns = Columns::of_run(Table::Tnce, derived.pairs.len(), keys);
+    pair_columns(&mut columns, grid, &derived.pairs);
+    energy_columns(&mut columns, derived, 1);
+    columns.same(of.flat).same(of.foam).same(CODE_VERSION);
+    columns.finish(rig)
+}
+
+/// Rows of `tnce_d4`, the eight of a pair one after the other. Symmetries that the grid lacks are left out.
+pub(crate) fn tnce_d4(
+    rig: &Rig,
+    grid: &Grid,
+    keys: &Keys,
+    derived: &DerivedRun,
+    of: Versions<'_>,
+) -> Result<RecordBatch> {
+    let moved: Vec<_> = Symmetry::ALL.into_iter().filter_map(|s| grid.moved_pairs(s).map(|pairs| (s, pairs))).collect();
+    let each = moved.len();
+    let rows: Vec<_> = derived
+        .pairs
+        .iter()
+        .flat_map(|pair| moved.iter().map(move |(symmetry, pairs)| (*symmetry, pairs[*pair as usize])))
+        .collect();
+    let pairs: Vec<u32> = derived.pairs.iter().flat_map(|p| std::iter::repeat_n(*p, each)).collect();
+    let mut columns = Columns::of_run(Table::TnceD4, rows.len(), keys);
+    pair_columns(&mut columns, grid, &pairs);
+    columns
+        .texts(rows.iter().map(|(s, _)| Some(s.name())))
+        .flags(rows.iter().map(|(_, m)| Some(m.swapped)))
+        .ints(rows.iter().map(|(_, m)| Some(m.pair.id.0 as i32)))
+        .ints(rows.iter().map(|(_, m)| Some(m.pair.microphone.0 as i32)))
+        .ints(rows.iter().map(|(_, m)| Some(m.pair.speaker.0 as i32)));
+    for axis in 0..3 {
+        columns.doubles(rows.iter().map(|(_, m)| grid.point(m.pair.microphone).map(|p| p.position_mm[axis])));
+    }
+    for axis in 0..3 {
+        columns.doubles(rows.iter().map(|(_, m)| grid.point(m.pair.speaker).map(|p| p.position_mm[axis])));
+    }
+    energy_columns(&mut columns, derived, each);
+    columns.same(of.flat).same(of.foam).same(CODE_VERSION);
+    columns.finish(rig)
+}
+
+fn pair_columns(columns: &mut Columns, grid: &Grid, pairs: &[u32]) {
+    let pair = |id: &u32| grid.pair(PairId(*id));
+    columns
+        .ints(pairs.iter().map(|p| Some(*p as i32)))
+        .ints(pairs.iter().map(|p| pair(p).map(|p| p.microphone.0 as i32)))
+        .ints(pairs.iter().map(|p| pair(p).map(|p| p.speaker.0 as i32)));
+}
+
+// Each measurement's numbers stand in `each` rows.
+fn energy_columns(columns: &mut Columns, derived: &DerivedRun, each: usize) {
+    for values in derived.energy_columns() {
+        columns.doubles(values.into_iter().flat_map(|x| std::iter::repeat_n(Some(x), each)));
+    }
+}

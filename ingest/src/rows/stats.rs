@@ -1,0 +1,94 @@
+//! Rows of table `surface_stats`.
+
+use arrow::record_batch::RecordBatch;
+use echolake_dsp::level::{p90_mean, percentile, power_to_db};
+use echolake_schema::Rig;
+use echolake_schema::tables::Table;
+
+use super::columns::finite;
+use super::derived::Versions;
+use super::{Columns, Keys};
+use crate::CODE_VERSION;
+use crate::derive::DerivedRun;
+use crate::error::Result;
+
+/// What a row says of one band's TNCE values over the pairs.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+struct Stats {
+    p90_mean_db: Option<f64>,
+    p5_db: Option<f64>,
+    p50_db: Option<f64>,
+    p95_db: Option<f64>,
+    min_db: Option<f64>,
+    max_db: Option<f64>,
+    spread_db: Option<f64>,
+}
+
+/// A row a band, and one for the total.
+pub(crate) fn rows(rig: &Rig, keys: &Keys, derived: &DerivedRun, of: Versions<'_>) -> Result<RecordBatch> {
+    let names = rig.band_names();
+    let stats: Vec<_> = derived.tnce_columns().into_iter().map(stats_of).collect();
+    let mut columns = Columns::of_run(Table::SurfaceStats, stats.len(), keys);
+    columns
+        .texts(names.iter().map(|n| Some(n.as_str())).chain([Some("total")]))
+        .doubles(rig.bands.centres_hz.iter().map(|hz| Some(*hz)).chain([None]))
+        .ints(std::iter::repeat_n(Some(derived.pairs.len() as i32), stats.len()))
+        .doubles(stats.iter().map(|s| s.p90_mean_db))
+        .doubles(stats.iter().map(|s| s.p5_db))
+        .doubles(stats.iter().map(|s| s.p50_db))
+        .doubles(stats.iter().map(|s| s.p95_db))
+        .doubles(stats.iter().map(|s| s.min_db))
+        .doubles(stats.iter().map(|s| s.max_db))
+        .doubles(stats.iter().map(|s| s.spread_db))
+        .same(of.flat)
+        .same(of.foam)
+        .same(CODE_VERSION);
+    columns.finish(rig)
+}
+
+// Means are of power, as in the paper's tables; no energy at all has no level.
+fn stats_of(values: Vec<f64>) -> Stats {
+    let mut sorted: Vec<f64> = values.into_iter().filter(|x| x.is_finite()).collect();
+    if sorted.is_empty() {
+        return Stats::default();
+    }
+    sorted.sort_by(f64::total_cmp);
+    let db = |power: f64| finite(power_to_db(power));
+    let levels: Vec<f64> = sorted.iter().filter_map(|x| db(*x)).collect();
+    Stats {
+        p90_mean_db: p90_mean(&sorted, &mut Vec::new()).and_then(db),
+        p5_db: db(percentile(&sorted, 5.0)),
+        p50_db: db(percentile(&sorted, 50.0)),
+        p95_db: db(percentile(&sorted, 95.0)),
+        min_db: db(sorted[0]),
+        max_db: db(sorted[sorted.len() - 1]),
+        spread_db: spread(&levels),
+    }
+}
+
+fn spread(levels: &[f64]) -> Option<f64> {
+    let count = levels.len() as f64;
+    let mean = levels.iter().sum::<f64>() / count;
+    finite((levels.iter().map(|x| (x - mean).powi(2)).sum::<f64>() / count).sqrt())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn levels_of_known_values() {
+        let stats = stats_of(vec![10.0, 1.0, 0.1]);
+        assert_eq!(stats.p50_db, Some(0.0));
+        assert!((stats.min_db.expect("there") + 10.0).abs() < 1e-12);
+        assert!((stats.max_db.expect("there") - 10.0).abs() < 1e-12);
+        assert!((stats.spread_db.expect("there") - (200.0f64 / 3.0).sqrt()).abs() < 1e-12);
+    }
+
+    #[test]
+    fn no_energy_has_no_level() {
+        assert_eq!(stats_of(vec![]), Stats::default());
+        let silent = stats_of(vec![0.0, 0.0]);
+        assert_eq!((silent.p50_db, silent.spread_db), (None, None));
+    }
+}

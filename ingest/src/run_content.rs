@@ -1,0 +1,226 @@
+//! A whole run's file, read and measured: what becomes its rows.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+
+use bytes::Bytes;
+use echolake_lake::Lake;
+use echolake_schema::manifest::{RunEnd, RunManifest};
+use echolake_schema::messages::{AmbientSample, Measurement, Verdict};
+use echolake_schema::{Rig, SurfaceRecord, topics};
+use object_store::ObjectStore;
+use object_store::path::Path;
+use tokio::sync::Semaphore;
+use tokio::task::JoinHandle;
+
+use crate::chunk::{Chunk, Definitions};
+use crate::error::{Error, Result};
+use crate::measure::{Event, Measurer, Response, Yield};
+use crate::run_reader::{Integrity, Item, RawChunk, RunReader};
+
+/// A run, read.
+pub(crate) struct RunContent {
+    pub(crate) manifest: RunManifest,
+    pub(crate) end: Option<RunEnd>,
+    pub(crate) surface: SurfaceRecord,
+    /// Heights over a square of the panel's size, mm; empty where the run has none.
+    pub(crate) heights_mm: Vec<f32>,
+    /// Accepted measurements by pair.
+    pub(crate) accepted: Vec<(Measurement, Response)>,
+    pub(crate) rejected: u64,
+    pub(crate) attempts: u64,
+    pub(crate) readings: Vec<(i64, AmbientSample)>,
+    pub(crate) events: Vec<(i64, Event)>,
+    pub(crate) last_time_ns: i64,
+    pub(crate) integrity: Integrity,
+    /// What could not be read, in words.
+    pub(crate) damaged: Vec<String>,
+}
+
+/// What stands outside of chunks.
+#[derive(Default)]
+struct Envelope {
+    metadata: BTreeMap<String, BTreeMap<String, String>>,
+    attachments: BTreeMap<String, Bytes>,
+}
+
+/// Largest attachment that ingest keeps; meshes that are larger stay in the run's file alone.
+const LARGEST_KEPT: usize = 64 << 20;
+
+impl RunContent {
+    /// Reads a run; its chunks are measured on all cores while the next ones are fetched.
+    pub(crate) async fn read(lake: &Lake, store: Arc<dyn ObjectStore>, path: &Path, name: &str) -> Result<Self> {
+        let pairs = lake.rig().grid().map_err(echolake_lake::Error::from)?.pairs().len();
+        let measurer = Arc::new(Measurer::new(lake.rig(), pairs));
+        let mut reader = RunReader::open(store, path.clone(), name.to_owned()).await?;
+        let mut envelope = Envelope::default();
+        let mut definitions = Definitions::default();
+        let mut whole = Yield { last_time_ns: i64::MIN, ..Yield::default() };
+        let mut checked = false;
+        // Two chunks a core in flight: memory is bounded by them, not by the run.
+        let cores = std::thread::available_parallelism().map_or(2, usize::from);
+        let slots = Arc::new(Semaphore::new(2 * cores));
+        let mut tasks: Vec<JoinHandle<Yield>> = Vec::new();
+        while let Some(item) = reader.next().await? {
+            match item {
+                Item::Chunk(raw) => {
+                    if !checked {
+                        envelope.check(lake, name)?;
+                        checked = true;
+                    }
+                    match decode(raw).await {
+                        Ok((offset, chunk)) => {
+                            chunk.learn(&mut definitions);
+                            let channels = definitions.channels.clone();
+                            let (measurer, slot) = (measurer.clone(), slots.clone().acquire_owned().await);
+                            tasks.push(tokio::task::spawn_blocking(move || {
+                                let _slot = slot;
+                                measurer.process(offset, &chunk, &channels)
+                            }));
+                        }
+                        Err(reason) => whole.damaged.push(reason),
+                    }
+                }
+                Item::Attachment { name, data } if data.len() <= LARGEST_KEPT => {
+                    envelope.attachments.insert(name, data);
+                }
+                Item::Attachment { .. } => {}
+                Item::Metadata(record) => {
+                    envelope.metadata.insert(record.name, record.metadata);
+                }
+                Item::Definition(record) => definitions.learn(&record),
+            }
+        }
+        let manifest = envelope.check(lake, name)?;
+        for task in tasks {
+            whole.append(task.await.map_err(|e| Error::read(name, e))?);
+        }
+        let integrity = reader.finish().await?;
+        Ok(Self::assemble(manifest, envelope, whole, integrity, name)?)
+    }
+
+    fn assemble(
+        manifest: RunManifest,
+        envelope: Envelope,
+        whole: Yield,
+        integrity: Integrity,
+        name: &str,
+    ) -> Result<Self> {
+        let end = envelope.metadata.get(topics::RUN_END_METADATA).map(RunEnd::from_metadata).transpose();
+        let end = end.map_err(|cause| Error::Manifest { file: name.to_owned(), cause })?;
+        let mut damaged = integrity.damage.clone();
+        damaged.extend(whole.damaged);
+        let responses = best_responses(whole.responses);
+        let rejected = whole.verdicts.iter().filter(|v| v.1.verdict() == Verdict::Rejected).count() as u64;
+        let attempts = whole.verdicts.len() as u64;
+        let accepted = join(whole.verdicts, responses, &mut damaged);
+        Ok(Self {
+            surface: envelope.surface(name)?,
+            heights_mm: envelope.heights(),
+            manifest,
+            end,
+            accepted,
+            rejected,
+            attempts,
+            readings: whole.readings,
+            events: whole.events,
+            last_time_ns: whole.last_time_ns,
+            integrity,
+            damaged,
+        })
+    }
+
+    /// The file was closed and says how the run ended.
+    pub(crate) fn is_whole(&self) -> bool {
+        self.integrity.closed && self.end.is_some()
+    }
+}
+
+impl Envelope {
+    // Checked before the first chunk is measured, so that a wrong file costs nothing.
+    fn check(&self, lake: &Lake, name: &str) -> Result<RunManifest> {
+        let Some(record) = self.metadata.get(topics::RUN_METADATA) else {
+            return Err(Error::Foreign { file: name.to_owned() });
+        };
+        let manifest =
+            RunManifest::from_metadata(record).map_err(|cause| Error::Manifest { file: name.to_owned(), cause })?;
+        lake.fits(&self.rig(name)?)?;
+        Ok(manifest)
+    }
+
+    fn rig(&self, name: &str) -> Result<Rig> {
+        let wrong = |reason| Error::Attachment { file: name.to_owned(), attachment: topics::RIG_ATTACHMENT, reason };
+        let bytes = self.attachments.get(topics::RIG_ATTACHMENT).ok_or_else(|| wrong("is missing".to_owned()))?;
+        let text = std::str::from_utf8(bytes).map_err(|e| wrong(format!("is no text: {e}")))?;
+        Rig::from_toml(text).map_err(|e| wrong(e.to_string()))
+    }
+
+    fn surface(&self, name: &str) -> Result<SurfaceRecord> {
+        let wrong =
+            |reason| Error::Attachment { file: name.to_owned(), attachment: topics::SURFACE_ATTACHMENT, reason };
+        let bytes = self.attachments.get(topics::SURFACE_ATTACHMENT).ok_or_else(|| wrong("is missing".to_owned()))?;
+        serde_json::from_slice(bytes).map_err(|e| wrong(e.to_string()))
+    }
+
+    fn heights(&self) -> Vec<f32> {
+        let bytes = self.attachments.get(topics::HEIGHTS_ATTACHMENT).map_or(&[][..], |b| &b[..]);
+        bytes.chunks_exact(4).map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]])).collect()
+    }
+}
+
+impl Yield {
+    fn append(&mut self, mut other: Self) {
+        self.responses.append(&mut other.responses);
+        self.verdicts.append(&mut other.verdicts);
+        self.readings.append(&mut other.readings);
+        self.events.append(&mut other.events);
+        self.damaged.append(&mut other.damaged);
+        self.last_time_ns = self.last_time_ns.max(other.last_time_ns);
+    }
+}
+
+async fn decode(raw: RawChunk) -> std::result::Result<(u64, Chunk), String> {
+    let RawChunk { offset, body } = raw;
+    let decoded = tokio::task::spawn_blocking(move || Chunk::decode(&body)).await;
+    match decoded {
+        Ok(Ok(chunk)) => Ok((offset, chunk)),
+        Ok(Err(reason)) => Err(format!("the chunk at byte {offset}: {reason}")),
+        Err(e) => Err(format!("the chunk at byte {offset}: {e}")),
+    }
+}
+
+// A recording that is there twice, as sweep and as response, counts as sweep.
+fn best_responses(responses: Vec<Response>) -> BTreeMap<(u32, u32), Response> {
+    let mut best: BTreeMap<(u32, u32), Response> = BTreeMap::new();
+    for response in responses {
+        let key = (response.pair, response.attempt);
+        if best.get(&key).is_none_or(|b| b.source < response.source) {
+            best.insert(key, response);
+        }
+    }
+    best
+}
+
+// The last accepted attempt at a pair is its measurement.
+fn join(
+    verdicts: Vec<(i64, Measurement)>,
+    mut responses: BTreeMap<(u32, u32), Response>,
+    damaged: &mut Vec<String>,
+) -> Vec<(Measurement, Response)> {
+    let mut last: BTreeMap<u32, Measurement> = BTreeMap::new();
+    for (_, verdict) in verdicts {
+        if verdict.verdict() == Verdict::Accepted
+            && last.get(&verdict.pair_id).is_none_or(|v| v.attempt <= verdict.attempt)
+        {
+            last.insert(verdict.pair_id, verdict);
+        }
+    }
+    let mut accepted = Vec::with_capacity(last.len());
+    for (pair, verdict) in last {
+        match responses.remove(&(pair, verdict.attempt)) {
+            Some(response) => accepted.push((verdict, response)),
+            None => damaged.push(format!("pair {pair}, attempt {}: its response cannot be read", verdict.attempt)),
+        }
+    }
+    accepted
+}

@@ -1,0 +1,143 @@
+//! The arguments, and nothing else.
+
+use std::path::PathBuf;
+
+use clap::{Args, Parser, Subcommand};
+use echolake_schema::SurfaceId;
+
+use crate::commands::sql::SqlArgs;
+
+/// A data lake and catalogue for sweep measurements.
+#[derive(Debug, Parser)]
+#[command(version, max_term_width = 100)]
+pub(crate) struct Cli {
+    /// The lake: a folder or a file:// URL.
+    #[arg(long, global = true, env = "ECHOLAKE_LAKE", default_value = "lake", value_name = "URL")]
+    pub(crate) lake: String,
+    #[command(subcommand)]
+    pub(crate) command: Command,
+}
+
+#[derive(Debug, Subcommand)]
+pub(crate) enum Command {
+    /// Measure a few surfaces with the simulated rig, ingest them and print the paper's tables.
+    Demo(DemoArgs),
+    /// Measure one surface with the simulated rig: one run, one MCAP file.
+    Acquire(AcquireArgs),
+    /// Write a generated relief as a mesh.
+    Panel(PanelArgs),
+    /// Turn existing measurements into runs.
+    #[command(subcommand)]
+    Import(ImportCommand),
+    /// Turn runs into rows.
+    Ingest(IngestArgs),
+    /// Ask the lake in SQL; a prompt where no query is given.
+    Sql(SqlArgs),
+    /// Say what is in the lake, what is missing and what is damaged.
+    Doctor(DoctorArgs),
+    /// Print a completion script for a shell.
+    Completions {
+        /// The shell.
+        shell: clap_complete::Shell,
+    },
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct DemoArgs {
+    /// Only measure, ingest and print. (This version serves nothing yet, so it changes nothing.)
+    #[arg(long)]
+    pub(crate) no_serve: bool,
+    /// Seed of the simulation: the same seed gives the same lake.
+    #[arg(long, default_value_t = 1)]
+    pub(crate) seed: u64,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct AcquireArgs {
+    /// Name of the measured surface, as 0015_0.
+    #[arg(long)]
+    pub(crate) surface: SurfaceId,
+    /// What the simulated rig measures: flat, foam, wood, prd, brick, flemish or wavy; by default what the surface's
+    /// name begins with.
+    #[arg(long, value_name = "NAME", conflicts_with = "mesh")]
+    pub(crate) panel: Option<String>,
+    /// A parameter of it.
+    #[arg(long, value_name = "KEY=VALUE")]
+    pub(crate) set: Vec<String>,
+    /// A mesh to measure instead: GLB, STL, OBJ or PLY.
+    #[arg(long)]
+    pub(crate) mesh: Option<PathBuf>,
+    /// The rig; by default the lake's, or that of the paper for a new lake.
+    #[arg(long)]
+    pub(crate) rig: Option<PathBuf>,
+    /// Surface that normalises this one, where it is not the lake's.
+    #[arg(long)]
+    pub(crate) flat: Option<SurfaceId>,
+    /// Surface whose direct sound is subtracted from this one, where it is not the lake's.
+    #[arg(long)]
+    pub(crate) foam: Option<SurfaceId>,
+    /// Seed of the simulation.
+    #[arg(long, default_value_t = 1)]
+    pub(crate) seed: u64,
+    /// Record no sweeps, only impulse responses.
+    #[arg(long)]
+    pub(crate) ir_only: bool,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct PanelArgs {
+    /// Kind of relief: flat, foam, wood, prd, brick, flemish or wavy.
+    pub(crate) name: String,
+    /// A parameter of it.
+    #[arg(long, value_name = "KEY=VALUE")]
+    pub(crate) set: Vec<String>,
+    /// The file; its extension tells the format: glb, stl, obj or ply.
+    #[arg(short, long)]
+    pub(crate) output: PathBuf,
+}
+
+#[derive(Debug, Subcommand)]
+pub(crate) enum ImportCommand {
+    /// Recordings and loopbacks as WAV files, listed in a CSV manifest.
+    Wav {
+        /// The manifest.
+        manifest: PathBuf,
+        /// The rig that made them: sweep range, response length, bands, grid.
+        #[arg(long)]
+        rig: Option<PathBuf>,
+    },
+    /// A folder of the published GIR data set.
+    Gir {
+        /// The folder.
+        folder: PathBuf,
+        /// The rig; by default the lake's, or the paper's with responses of 400 samples for a new lake.
+        #[arg(long)]
+        rig: Option<PathBuf>,
+    },
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct IngestArgs {
+    /// Run files, or names of runs in the lake; by default all that are not in the tables yet.
+    pub(crate) runs: Vec<String>,
+    /// Print what was done as JSON.
+    #[arg(long)]
+    pub(crate) json: bool,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct DoctorArgs {
+    /// Print the report as JSON.
+    #[arg(long)]
+    pub(crate) json: bool,
+}
+
+#[cfg(test)]
+mod tests {
+    use clap::CommandFactory as _;
+
+    #[test]
+    fn the_arguments_are_consistent() {
+        super::Cli::command().debug_assert();
+    }
+}

@@ -1,0 +1,81 @@
+//! The verbs, a file each.
+
+mod acquire;
+mod demo;
+mod doctor;
+mod import;
+mod ingest;
+mod panel;
+pub(crate) mod sql;
+
+use std::path::Path;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+use anyhow::Context as _;
+use clap::CommandFactory as _;
+use echolake_lake::{Error as LakeError, Lake};
+use echolake_schema::Rig;
+
+use crate::Done;
+use crate::cli::{Cli, Command};
+
+/// Runs the command's verb.
+pub(crate) async fn run(cli: Cli) -> anyhow::Result<Done> {
+    let lake = &cli.lake;
+    match &cli.command {
+        Command::Demo(args) => demo::run(args, lake).await,
+        Command::Acquire(args) => acquire::run(args, lake).await,
+        Command::Panel(args) => panel::run(args),
+        Command::Import(args) => import::run(args, lake).await,
+        Command::Ingest(args) => ingest::run(args, lake).await,
+        Command::Sql(args) => sql::run(args, lake).await.map(|()| Done::Whole),
+        Command::Doctor(args) => doctor::run(args, lake).await,
+        Command::Completions { shell } => {
+            clap_complete::generate(*shell, &mut Cli::command(), "echolake", &mut std::io::stdout());
+            Ok(Done::Whole)
+        }
+    }
+}
+
+/// Writes text and a line break to stdout; a closed pipe is an error that `main` takes for success.
+fn print(text: &str) -> std::io::Result<()> {
+    use std::io::Write as _;
+    writeln!(std::io::stdout().lock(), "{text}")
+}
+
+/// The rig of a file; else the lake's; else `otherwise`.
+async fn rig_or(file: Option<&Path>, lake_url: &str, otherwise: impl FnOnce() -> Rig) -> anyhow::Result<Rig> {
+    if let Some(file) = file {
+        let text = std::fs::read_to_string(file).with_context(|| format!("cannot read rig file `{}`", file.display()))?;
+        return Rig::from_toml(&text).with_context(|| format!("rig file `{}`", file.display()));
+    }
+    match Lake::open(lake_url).await {
+        Ok(lake) => Ok(lake.rig().clone()),
+        Err(LakeError::NoLake { .. }) => Ok(otherwise()),
+        Err(e) => Err(e.into()),
+    }
+}
+
+/// The folder of the lake that new recordings go to.
+fn inbox(lake: &Lake) -> anyhow::Result<std::path::PathBuf> {
+    let folder = lake.folder().context("recordings need a lake in a folder; hint: --lake FOLDER")?.join("inbox");
+    std::fs::create_dir_all(&folder).with_context(|| format!("cannot make `{}`", folder.display()))?;
+    Ok(folder)
+}
+
+/// Becomes true at the first Ctrl-C, so that work ends at a clean place; the second one ends at once.
+fn stop_on_interrupt() -> Arc<AtomicBool> {
+    let stop = Arc::new(AtomicBool::new(false));
+    let flag = stop.clone();
+    tokio::spawn(async move {
+        if tokio::signal::ctrl_c().await.is_ok() {
+            flag.store(true, Ordering::Relaxed);
+            eprintln!("stopping at the next clean place; Ctrl-C again stops at once");
+        }
+        if tokio::signal::ctrl_c().await.is_ok() {
+            std::process::exit(130);
+        }
+    });
+    stop
+}
