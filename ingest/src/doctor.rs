@@ -7,7 +7,7 @@ use echolake_lake::{DataFile, FileName, Lake, Snapshot};
 use echolake_schema::tables::Table;
 use futures::TryStreamExt as _;
 use object_store::path::Path;
-use object_store::{ObjectStore as _, ObjectStoreExt as _};
+use object_store::ObjectStore as _;
 use serde::Serialize;
 
 use crate::chunk::Chunk;

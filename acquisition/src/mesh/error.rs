@@ -1,0 +1,67 @@
+//! What can be wrong with a mesh or its file.
+
+use std::io;
+use std::path::PathBuf;
+
+/// Why a mesh cannot be used.
+#[derive(Debug, thiserror::Error)]
+pub enum Error {
+    /// The system refused.
+    #[error("cannot read mesh `{}`", path.display())]
+    Read {
+        /// The file.
+        path: PathBuf,
+        /// Why.
+        source: io::Error,
+    },
+    /// The extension tells no format.
+    #[error("`{}` is no mesh file that is known; hint: .glb, .stl, .obj or .ply", path.display())]
+    Format {
+        /// The file.
+        path: PathBuf,
+    },
+    /// The file is damaged, or of a kind that is not read.
+    #[error("mesh `{}`: {place} has {actual}, expected {expected}", path.display())]
+    Syntax {
+        /// The file.
+        path: PathBuf,
+        /// Where.
+        place: String,
+        /// What is there.
+        actual: String,
+        /// What should be.
+        expected: &'static str,
+    },
+    /// The mesh has no triangle.
+    #[error("mesh `{}` is empty: it has no triangles", path.display())]
+    Empty {
+        /// The file.
+        path: PathBuf,
+    },
+    /// The mesh has edges with one triangle only.
+    #[error("mesh `{}` is open: {edges} edges have no second triangle, the first at {place:?} mm; hint: export a closed solid", path.display())]
+    Open {
+        /// The file.
+        path: PathBuf,
+        /// How many.
+        edges: usize,
+        /// One end of one of them.
+        place: [f32; 3],
+    },
+    /// The mesh is larger than the rig's panel.
+    #[error("mesh `{}` is {actual}, larger than the panel: expected {expected}; hint: lengths are in mm (GLB: metres)", path.display())]
+    TooLarge {
+        /// The file.
+        path: PathBuf,
+        /// Its size.
+        actual: String,
+        /// The panel's.
+        expected: String,
+    },
+}
+
+impl PartialEq for Error {
+    fn eq(&self, other: &Self) -> bool {
+        self.to_string() == other.to_string()
+    }
+}

@@ -1,0 +1,177 @@
+//! Meshes of panels: made from height fields, read from and written to GLB, STL, OBJ and PLY.
+
+mod error;
+mod glb;
+mod obj;
+mod ply;
+mod solid;
+mod stl;
+
+pub use error::Error;
+
+use std::path::Path;
+
+/// Largest mesh file that is read: ten times the published panels'.
+const LARGEST_FILE: u64 = 1 << 30;
+
+/// Triangles over shared vertices, in mm; x and y along the panel, z up from it.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct Mesh {
+    /// Positions, mm.
+    pub vertices_mm: Vec<[f32; 3]>,
+    /// Corners of each triangle, counter-clockwise seen from outside.
+    pub triangles: Vec<[u32; 3]>,
+}
+
+/// A file format, told by the file's extension.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Format {
+    /// glTF 2.0, binary.
+    Glb,
+    /// Stereolithography, binary or text.
+    Stl,
+    /// Wavefront.
+    Obj,
+    /// Stanford polygons, text or binary little-endian.
+    Ply,
+}
+
+impl Format {
+    /// The format of a path's extension.
+    ///
+    /// # Errors
+    /// [`Error::Format`], which lists the formats.
+    pub fn of(path: &Path) -> Result<Self, Error> {
+        let extension = path.extension().and_then(|e| e.to_str()).map(str::to_ascii_lowercase);
+        match extension.as_deref() {
+            Some("glb") => Ok(Self::Glb),
+            Some("stl") => Ok(Self::Stl),
+            Some("obj") => Ok(Self::Obj),
+            Some("ply") => Ok(Self::Ply),
+            _ => Err(Error::Format { path: path.to_owned() }),
+        }
+    }
+
+    /// Its media type.
+    pub fn media_type(self) -> &'static str {
+        match self {
+            Self::Glb => "model/gltf-binary",
+            Self::Stl => "model/stl",
+            Self::Obj => "model/obj",
+            Self::Ply => "application/octet-stream",
+        }
+    }
+}
+
+impl Mesh {
+    /// Reads a file.
+    ///
+    /// # Errors
+    /// [`Error`], naming the file and the place in it.
+    pub fn read(path: &Path) -> Result<Self, Error> {
+        let format = Format::of(path)?;
+        let failed = |source| Error::Read { path: path.to_owned(), source };
+        let size = std::fs::metadata(path).map_err(failed)?.len();
+        if size > LARGEST_FILE {
+            let (place, actual) = ("the file".to_owned(), format!("{size} bytes"));
+            return Err(Error::Syntax { path: path.to_owned(), place, actual, expected: "up to 1 GiB" });
+        }
+        Self::from_bytes(format, &std::fs::read(path).map_err(failed)?, path)
+    }
+
+    /// Reads a file's bytes; `path` is for messages.
+    ///
+    /// # Errors
+    /// As [`Mesh::read`].
+    pub fn from_bytes(format: Format, bytes: &[u8], path: &Path) -> Result<Self, Error> {
+        let mesh = match format {
+            Format::Glb => glb::parse(bytes, path),
+            Format::Stl => stl::parse(bytes, path),
+            Format::Obj => obj::parse(bytes, path),
+            Format::Ply => ply::parse(bytes, path),
+        }?;
+        let count = mesh.vertices_mm.len();
+        match mesh.triangles.iter().flatten().find(|i| **i as usize >= count) {
+            None => Ok(mesh),
+            Some(index) => Err(Error::Syntax {
+                path: path.to_owned(),
+                place: "a face".to_owned(),
+                actual: format!("vertex {index}"),
+                expected: "one of the file's vertices",
+            }),
+        }
+    }
+
+    /// The bytes of a file.
+    pub fn to_bytes(&self, format: Format) -> Vec<u8> {
+        match format {
+            Format::Glb => glb::write(self),
+            Format::Stl => stl::write(self),
+            Format::Obj => obj::write(self),
+            Format::Ply => ply::write(self),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::relief::Relief;
+
+    const ALL: [Format; 4] = [Format::Glb, Format::Stl, Format::Obj, Format::Ply];
+
+    fn small() -> Mesh {
+        Mesh::from_height_field(&Relief::by_name("wavy").expect("a relief").height_field(4), -20.0)
+    }
+
+    fn parse(format: Format, bytes: &[u8]) -> Result<Mesh, Error> {
+        Mesh::from_bytes(format, bytes, Path::new("panel"))
+    }
+
+    #[test]
+    fn every_format_round_trips() {
+        let mesh = small();
+        for format in ALL {
+            let again = parse(format, &mesh.to_bytes(format)).expect("its own file").welded();
+            assert_eq!(again.triangles.len(), mesh.triangles.len(), "{format:?}");
+            assert!((again.volume_mm3() / mesh.volume_mm3() - 1.0).abs() < 1e-5, "{format:?}");
+            assert_eq!(again.check(585.0, 40.0, Path::new("panel")).map(drop), Ok(()), "{format:?}");
+        }
+    }
+
+    #[test]
+    fn every_truncation_is_an_error_or_a_smaller_mesh_but_no_panic() {
+        let mesh = small();
+        for format in ALL {
+            let bytes = mesh.to_bytes(format);
+            let mut refused = 0;
+            for end in 0..bytes.len() {
+                match parse(format, &bytes[..end]) {
+                    Err(_) => refused += 1,
+                    // Text formats without counts cannot tell; the missing faces leave the mesh open.
+                    Ok(part) => assert!(part.triangles.len() <= mesh.triangles.len()),
+                }
+            }
+            let binary = matches!(format, Format::Glb | Format::Stl);
+            assert!(refused == bytes.len() || !binary, "{format:?}: {refused} of {}", bytes.len());
+        }
+    }
+
+    #[test]
+    fn flipped_bytes_do_not_panic() {
+        let mesh = small();
+        for format in ALL {
+            let bytes = mesh.to_bytes(format);
+            let mut state = 1u64;
+            for _ in 0..3_000 {
+                state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+                let mut broken = bytes.clone();
+                let at = (state >> 33) as usize % broken.len();
+                broken[at] ^= (state >> 20) as u8 | 1;
+                if let Ok(mesh) = parse(format, &broken) {
+                    let _ = mesh.check(585.0, 40.0, Path::new("panel"));
+                }
+            }
+        }
+    }
+}

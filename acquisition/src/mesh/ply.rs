@@ -1,0 +1,177 @@
+//! PLY: text or binary little-endian; positions and faces, other properties are passed over.
+
+use std::path::Path;
+
+use super::obj::fan;
+use super::{Error, Mesh};
+
+/// The mesh as binary little-endian PLY.
+pub(super) fn write(mesh: &Mesh) -> Vec<u8> {
+    let header = format!(
+        "ply\nformat binary_little_endian 1.0\ncomment millimetres, z up\nelement vertex {}\nproperty float x\n\
+         property float y\nproperty float z\nelement face {}\nproperty list uchar int vertex_indices\nend_header\n",
+        mesh.vertices_mm.len(),
+        mesh.triangles.len()
+    );
+    let mut file = header.into_bytes();
+    file.extend(mesh.vertices_mm.iter().flatten().flat_map(|x| x.to_le_bytes()));
+    for triangle in &mesh.triangles {
+        file.push(3);
+        file.extend(triangle.iter().flat_map(|i| i.to_le_bytes()));
+    }
+    file
+}
+
+struct Element {
+    name: String,
+    count: usize,
+    properties: Vec<Property>,
+}
+
+struct Property {
+    name: String,
+    kind: Kind,
+    /// Of a list: the kind of its length.
+    length: Option<Kind>,
+}
+
+#[derive(Debug, Clone, Copy)]
+enum Kind {
+    Signed(usize),
+    Unsigned(usize),
+    Float,
+    Double,
+}
+
+impl Kind {
+    fn parse(name: &str) -> Option<Self> {
+        Some(match name {
+            "char" | "int8" => Self::Signed(1),
+            "short" | "int16" => Self::Signed(2),
+            "int" | "int32" => Self::Signed(4),
+            "uchar" | "uint8" => Self::Unsigned(1),
+            "ushort" | "uint16" => Self::Unsigned(2),
+            "uint" | "uint32" => Self::Unsigned(4),
+            "float" | "float32" => Self::Float,
+            "double" | "float64" => Self::Double,
+            _ => return None,
+        })
+    }
+}
+
+/// The numbers of the body, one after the other.
+enum Body<'a> {
+    Text(Vec<&'a str>, usize),
+    Binary(&'a [u8], usize),
+}
+
+impl Body<'_> {
+    fn next(&mut self, kind: Kind) -> Option<f64> {
+        match self {
+            Self::Text(words, at) => {
+                *at += 1;
+                words.get(*at - 1)?.parse().ok()
+            }
+            Self::Binary(bytes, at) => {
+                let size = match kind {
+                    Kind::Signed(n) | Kind::Unsigned(n) => n,
+                    Kind::Float => 4,
+                    Kind::Double => 8,
+                };
+                let raw = bytes.get(*at..*at + size)?;
+                *at += size;
+                let bits = raw.iter().rev().fold(0u64, |n, b| n << 8 | u64::from(*b));
+                Some(match kind {
+                    Kind::Signed(n) => ((bits << (64 - 8 * n)) as i64 >> (64 - 8 * n)) as f64,
+                    Kind::Unsigned(_) => bits as f64,
+                    Kind::Float => f64::from(f32::from_bits(bits as u32)),
+                    Kind::Double => f64::from_bits(bits),
+                })
+            }
+        }
+    }
+}
+
+pub(super) fn parse(bytes: &[u8], path: &Path) -> Result<Mesh, Error> {
+    let wrong = |place: &str, actual: String, expected: &'static str| Error::Syntax {
+        path: path.to_owned(),
+        place: place.to_owned(),
+        actual,
+        expected,
+    };
+    const END: &[u8] = b"end_header\n";
+    let end = bytes.windows(END.len()).position(|w| w == END).ok_or_else(|| wrong("the header", "no end".into(), "`end_header`"))?;
+    let header = String::from_utf8_lossy(&bytes[..end]);
+    let body = &bytes[end + END.len()..];
+    let mut lines = header.lines().map(str::trim);
+    if lines.next() != Some("ply") {
+        return Err(wrong("line 1", "something else".into(), "`ply`"));
+    }
+    let (mut elements, mut format) = (Vec::<Element>::new(), "");
+    for line in lines {
+        let words: Vec<_> = line.split_whitespace().collect();
+        match words[..] {
+            ["format", kind, _] => format = if kind == "ascii" { "ascii" } else if kind == "binary_little_endian" { "binary" } else { "" },
+            ["element", name, count] => {
+                let count = count.parse().map_err(|_| wrong("the header", format!("`{line}`"), "a count"))?;
+                elements.push(Element { name: name.into(), count, properties: Vec::new() });
+            }
+            ["property", "list", length, kind, name] => add(&mut elements, name, kind, Some(length))
+                .ok_or_else(|| wrong("the header", format!("`{line}`"), "a property of an element"))?,
+            ["property", kind, name] => add(&mut elements, name, kind, None)
+                .ok_or_else(|| wrong("the header", format!("`{line}`"), "a property of an element"))?,
+            _ => {}
+        }
+    }
+    let mut body = match format {
+        "ascii" => Body::Text(std::str::from_utf8(body).unwrap_or_default().split_whitespace().collect(), 0),
+        "binary" => Body::Binary(body, 0),
+        _ => return Err(wrong("the header", "another format".into(), "ascii or binary_little_endian")),
+    };
+    let mut mesh = Mesh::default();
+    for element in &elements {
+        for row in 0..element.count {
+            read_row(element, &mut body, &mut mesh)
+                .ok_or_else(|| wrong(&format!("{} {row}", element.name), "no number".into(), "as many as the header counts"))?;
+        }
+    }
+    Ok(mesh)
+}
+
+fn add(elements: &mut [Element], name: &str, kind: &str, length: Option<&str>) -> Option<()> {
+    let length = match length {
+        Some(length) => Some(Kind::parse(length)?),
+        None => None,
+    };
+    elements.last_mut()?.properties.push(Property { name: name.into(), kind: Kind::parse(kind)?, length });
+    Some(())
+}
+
+// An element without properties would be read without end.
+fn read_row(element: &Element, body: &mut Body<'_>, mesh: &mut Mesh) -> Option<()> {
+    let mut position = [f32::NAN; 3];
+    element.properties.first()?;
+    for property in &element.properties {
+        let Some(length) = property.length else {
+            let value = body.next(property.kind)?;
+            if let Some(axis) = ["x", "y", "z"].iter().position(|n| *n == property.name) {
+                position[axis] = value as f32;
+            }
+            continue;
+        };
+        let length = body.next(length)?;
+        let mut corners = Vec::new();
+        let mut left = length;
+        while left >= 1.0 {
+            corners.push(body.next(property.kind)? as u32);
+            left -= 1.0;
+        }
+        if element.name == "face" && property.name.starts_with("vertex_ind") {
+            mesh.triangles.extend(fan(&corners));
+        }
+    }
+    if element.name == "vertex" {
+        mesh.vertices_mm.push(position);
+    }
+    Some(())
+}

@@ -1,0 +1,232 @@
+//! Solids: from height fields and back, closed or not, how large.
+
+use std::collections::HashMap;
+use std::path::Path;
+
+use super::{Error, Mesh};
+use crate::relief::{HeightField, RELIEF_MM};
+
+impl Mesh {
+    /// A closed solid: the relief on top, four walls, and a plane at `base_mm` below.
+    pub fn from_height_field(relief: &HeightField, base_mm: f32) -> Self {
+        let side = relief.cells() + 1;
+        let at = |i: usize| (i as f64 / relief.cells() as f64 - 0.5) * relief.size_mm();
+        let mut mesh = Self::default();
+        for top in [true, false] {
+            for iy in 0..side {
+                for ix in 0..side {
+                    let (x, y) = (at(ix), at(iy));
+                    let z = if top { relief.height_at(x, y) as f32 } else { base_mm };
+                    mesh.vertices_mm.push([x as f32, y as f32, z]);
+                }
+            }
+        }
+        let top = |ix: usize, iy: usize| (iy * side + ix) as u32;
+        let bottom = |ix: usize, iy: usize| top(ix, iy) + (side * side) as u32;
+        let mut quad = |a, b, c, d| mesh.triangles.extend([[a, b, c], [a, c, d]]);
+        for iy in 0..side - 1 {
+            for ix in 0..side - 1 {
+                quad(top(ix, iy), top(ix + 1, iy), top(ix + 1, iy + 1), top(ix, iy + 1));
+                quad(bottom(ix, iy), bottom(ix, iy + 1), bottom(ix + 1, iy + 1), bottom(ix + 1, iy));
+            }
+        }
+        let last = side - 1;
+        for i in 0..last {
+            quad(bottom(i, 0), bottom(i + 1, 0), top(i + 1, 0), top(i, 0));
+            quad(bottom(i + 1, last), bottom(i, last), top(i, last), top(i + 1, last));
+            quad(bottom(0, i + 1), bottom(0, i), top(0, i), top(0, i + 1));
+            quad(bottom(last, i), bottom(last, i + 1), top(last, i + 1), top(last, i));
+        }
+        mesh
+    }
+
+    /// The same mesh with vertices at one place made one: STL shares none.
+    pub fn welded(&self) -> Self {
+        let mut index: HashMap<[u32; 3], u32> = HashMap::new();
+        let mut vertices_mm = Vec::new();
+        // Adding zero turns -0.0, which has other bits, into 0.0.
+        let key = |v: &[f32; 3]| v.map(|x| (x + 0.0).to_bits());
+        let to: Vec<u32> = self
+            .vertices_mm
+            .iter()
+            .map(|v| {
+                *index.entry(key(v)).or_insert_with(|| {
+                    vertices_mm.push(*v);
+                    vertices_mm.len() as u32 - 1
+                })
+            })
+            .collect();
+        let triangles = self.triangles.iter().map(|t| t.map(|i| to[i as usize])).collect();
+        Self { vertices_mm, triangles }
+    }
+
+    /// Lowest and highest corner, mm.
+    pub fn bounds_mm(&self) -> [[f32; 3]; 2] {
+        let used = self.triangles.iter().flatten().map(|i| self.vertices_mm[*i as usize]);
+        used.fold([[f32::INFINITY; 3], [f32::NEG_INFINITY; 3]], |[low, high], v| {
+            [[0, 1, 2].map(|i| low[i].min(v[i])), [0, 1, 2].map(|i| high[i].max(v[i]))]
+        })
+    }
+
+    /// Volume of a closed mesh, mm^3.
+    pub fn volume_mm3(&self) -> f64 {
+        let signed = |t: &[u32; 3]| {
+            let [a, b, c] = t.map(|i| self.vertices_mm[i as usize].map(f64::from));
+            a[0] * (b[1] * c[2] - b[2] * c[1]) - a[1] * (b[0] * c[2] - b[2] * c[0]) + a[2] * (b[0] * c[1] - b[1] * c[0])
+        };
+        self.triangles.iter().map(signed).sum::<f64>() / 6.0
+    }
+
+    /// Checks that the mesh is a closed solid that fits the panel; returns it welded.
+    ///
+    /// # Errors
+    /// [`Error::Empty`], [`Error::Open`], [`Error::TooLarge`], or [`Error::Syntax`] for numbers that are none.
+    pub fn check(&self, panel_mm: f64, depth_mm: f64, path: &Path) -> Result<Self, Error> {
+        if self.triangles.is_empty() {
+            return Err(Error::Empty { path: path.to_owned() });
+        }
+        if let Some(at) = self.vertices_mm.iter().position(|v| v.iter().any(|x| !x.is_finite())) {
+            let actual = format!("{:?}", self.vertices_mm[at]);
+            let place = format!("vertex {at}");
+            return Err(Error::Syntax { path: path.to_owned(), place, actual, expected: "finite numbers" });
+        }
+        let [low, high] = self.bounds_mm();
+        let size = [0, 1, 2].map(|i| f64::from(high[i]) - f64::from(low[i]));
+        // A tenth of a millimetre is what exporters lose.
+        if size[0].max(size[1]) > panel_mm + 0.1 {
+            return Err(Error::TooLarge {
+                path: path.to_owned(),
+                actual: format!("{:.1} x {:.1} x {:.1} mm", size[0], size[1], size[2]),
+                expected: format!("up to {panel_mm} x {panel_mm} mm with a relief of {depth_mm} mm"),
+            });
+        }
+        let welded = self.welded();
+        match welded.open_edges() {
+            (0, _) => Ok(welded),
+            (edges, place) => Err(Error::Open { path: path.to_owned(), edges, place }),
+        }
+    }
+
+    // Each edge of a closed mesh is passed as often in one direction as in the other.
+    fn open_edges(&self) -> (usize, [f32; 3]) {
+        let mut balance: HashMap<(u32, u32), i32> = HashMap::new();
+        for [a, b, c] in &self.triangles {
+            for (from, to) in [(*a, *b), (*b, *c), (*c, *a)] {
+                if from != to {
+                    *balance.entry((from.min(to), from.max(to))).or_default() += if from < to { 1 } else { -1 };
+                }
+            }
+        }
+        let mut open: Vec<_> = balance.into_iter().filter(|(_, sum)| *sum != 0).map(|(edge, _)| edge).collect();
+        open.sort_unstable();
+        (open.len(), open.first().map_or([0.0; 3], |(a, _)| self.vertices_mm[*a as usize]))
+    }
+
+    /// The surface seen from above, as heights; the mesh is centred over the panel, and where it does not lie
+    /// within the relief's range its top is moved so that its mean is 0.
+    ///
+    /// # Errors
+    /// [`Error::TooLarge`] where the relief is deeper than `depth_mm`, [`Error::Syntax`] where the panel shows
+    /// through: a mesh smaller than the panel.
+    pub fn to_height_field(&self, cells: usize, panel_mm: f64, depth_mm: f64, path: &Path) -> Result<HeightField, Error> {
+        let [low, high] = self.bounds_mm();
+        let centre = [0, 1].map(|i| f64::from(low[i] + high[i]) / 2.0);
+        let mut tops = vec![f32::NEG_INFINITY; cells * cells];
+        for triangle in &self.triangles {
+            let corners = triangle.map(|i| {
+                let v = self.vertices_mm[i as usize].map(f64::from);
+                let cell = |x: f64, c: f64| ((x - c) / panel_mm + 0.5) * cells as f64 - 0.5;
+                [cell(v[0], centre[0]), cell(v[1], centre[1]), v[2]]
+            });
+            rasterise(corners, cells, &mut tops);
+        }
+        let bare = tops.iter().filter(|t| !t.is_finite()).count();
+        // The outermost cells may lie just beyond the mesh's edge.
+        if bare > 4 * cells {
+            let actual = format!("{bare} of {} cells without a surface", tops.len());
+            let place = "its view from above".to_owned();
+            return Err(Error::Syntax { path: path.to_owned(), place, actual, expected: "a surface over the whole panel" });
+        }
+        let seen = || tops.iter().copied().filter(|t| t.is_finite());
+        let (least, greatest) = (seen().fold(f32::INFINITY, f32::min), seen().fold(f32::NEG_INFINITY, f32::max));
+        if f64::from(greatest - least) > depth_mm + 0.1 {
+            return Err(Error::TooLarge {
+                path: path.to_owned(),
+                actual: format!("{:.1} mm deep on its upper side", greatest - least),
+                expected: format!("a relief of up to {depth_mm} mm"),
+            });
+        }
+        let mean = seen().map(f64::from).sum::<f64>() / seen().count() as f64;
+        let inside = f64::from(least) >= RELIEF_MM[0] - 0.1 && f64::from(greatest) <= RELIEF_MM[1] + 0.1;
+        let shift = if inside { 0.0 } else { mean };
+        let mut heights = tops.iter().map(|t| if t.is_finite() { f64::from(*t) - shift } else { mean - shift });
+        Ok(HeightField::from_fn(panel_mm, cells, |_, _| heights.next().unwrap_or(0.0)))
+    }
+}
+
+// Raises every cell whose centre lies under the triangle, seen from above, to the triangle.
+fn rasterise(corners: [[f64; 3]; 3], cells: usize, tops: &mut [f32]) {
+    let [a, b, c] = corners;
+    let area = (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0]);
+    if area.abs() < 1e-12 {
+        return;
+    }
+    let range = |i: usize| {
+        let low = corners.iter().map(|p| p[i]).fold(f64::INFINITY, f64::min).ceil().max(0.0);
+        let high = corners.iter().map(|p| p[i]).fold(f64::NEG_INFINITY, f64::max).floor().min(cells as f64 - 1.0);
+        if low <= high { low as usize..high as usize + 1 } else { 0..0 }
+    };
+    for iy in range(1) {
+        for ix in range(0) {
+            let (x, y) = (ix as f64, iy as f64);
+            let v = ((x - a[0]) * (c[1] - a[1]) - (y - a[1]) * (c[0] - a[0])) / area;
+            let w = ((b[0] - a[0]) * (y - a[1]) - (b[1] - a[1]) * (x - a[0])) / area;
+            if v >= -1e-9 && w >= -1e-9 && v + w <= 1.0 + 1e-9 {
+                let z = (a[2] + v * (b[2] - a[2]) + w * (c[2] - a[2])) as f32;
+                let top = &mut tops[iy * cells + ix];
+                *top = top.max(z);
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::relief::{PANEL_SIZE_MM, Relief};
+
+    #[test]
+    fn a_box_has_its_volume_and_is_closed() {
+        let mesh = Mesh::from_height_field(&HeightField::from_fn(100.0, 5, |_, _| 0.0), -20.0);
+        assert!((mesh.volume_mm3() - 100.0 * 100.0 * 20.0).abs() < 1e-3);
+        assert!(mesh.check(585.0, 40.0, Path::new("box")).is_ok());
+    }
+
+    #[test]
+    fn heights_survive_the_way_through_a_mesh() {
+        let field = Relief::by_name("wavy").expect("a relief").height_field(100);
+        let mesh = Mesh::from_height_field(&field, -20.0);
+        let again = mesh.to_height_field(100, PANEL_SIZE_MM, 40.0, Path::new("wavy")).expect("heights");
+        let off = field.heights_mm().iter().zip(again.heights_mm()).fold(0.0f32, |m, (a, b)| m.max((a - b).abs()));
+        // Corners of the mesh stand between the cells: twice a linear interpolation, and level at the rim.
+        assert!(off < 0.25, "{off} mm");
+    }
+
+    #[test]
+    fn bad_meshes_are_told_apart() {
+        let path = Path::new("bad.stl");
+        let good = Mesh::from_height_field(&HeightField::from_fn(585.0, 5, |_, _| 0.0), -20.0);
+        let mut open = good.clone();
+        open.triangles.pop();
+        assert!(matches!(open.check(585.0, 40.0, path), Err(Error::Open { edges: 3, .. })));
+        assert!(matches!(Mesh::default().check(585.0, 40.0, path), Err(Error::Empty { .. })));
+        assert!(matches!(good.check(500.0, 40.0, path), Err(Error::TooLarge { .. })));
+        let mut nan = good.clone();
+        nan.vertices_mm[3][1] = f32::NAN;
+        assert!(nan.check(585.0, 40.0, path).expect_err("NaN").to_string().contains("vertex 3"));
+        let deep = Mesh::from_height_field(&HeightField::from_fn(585.0, 20, |x, _| if x < 0.0 { 0.0 } else { 60.0 }), -20.0);
+        assert!(matches!(deep.to_height_field(50, 585.0, 40.0, path), Err(Error::TooLarge { .. })));
+        let small = Mesh::from_height_field(&HeightField::from_fn(100.0, 5, |_, _| 0.0), -20.0);
+        assert!(small.to_height_field(50, 585.0, 40.0, path).is_err());
+    }
+}

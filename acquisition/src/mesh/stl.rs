@@ -1,0 +1,73 @@
+//! STL: triangles without shared corners, binary or text.
+
+use std::path::Path;
+
+use super::obj::numbers;
+use super::{Error, Mesh};
+
+const HEADER: usize = 80;
+const FACET: usize = 50;
+
+/// The mesh as binary STL.
+pub(super) fn write(mesh: &Mesh) -> Vec<u8> {
+    let mut file = vec![0; HEADER];
+    file[..8].copy_from_slice(b"echolake");
+    file.extend((mesh.triangles.len() as u32).to_le_bytes());
+    for triangle in &mesh.triangles {
+        // Normals of zero tell readers to take the corners' order.
+        file.extend([0; 12]);
+        file.extend(triangle.iter().flat_map(|i| mesh.vertices_mm[*i as usize]).flat_map(f32::to_le_bytes));
+        file.extend([0; 2]);
+    }
+    file
+}
+
+pub(super) fn parse(bytes: &[u8], path: &Path) -> Result<Mesh, Error> {
+    let count = bytes.get(HEADER..HEADER + 4).and_then(|b| b.try_into().ok()).map(u32::from_le_bytes);
+    let expected = count.map(|n| HEADER as u64 + 4 + FACET as u64 * u64::from(n));
+    // Binary files may begin with `solid` too; their length tells them apart.
+    if expected == Some(bytes.len() as u64) {
+        return Ok(binary(&bytes[HEADER + 4..]));
+    }
+    if bytes.starts_with(b"solid") && bytes.is_ascii() {
+        return text(bytes, path);
+    }
+    Err(Error::Syntax {
+        path: path.to_owned(),
+        place: "the file".to_owned(),
+        actual: format!("{} bytes", bytes.len()),
+        expected: "84 bytes and 50 for each of the triangles that its header counts",
+    })
+}
+
+fn binary(facets: &[u8]) -> Mesh {
+    let float = |b: &[u8]| f32::from_le_bytes([b[0], b[1], b[2], b[3]]);
+    let corner = |b: &[u8]| [float(&b[0..4]), float(&b[4..8]), float(&b[8..12])];
+    let corners = facets.chunks_exact(FACET).flat_map(|f| [corner(&f[12..24]), corner(&f[24..36]), corner(&f[36..48])]);
+    soup(corners.collect())
+}
+
+fn text(bytes: &[u8], path: &Path) -> Result<Mesh, Error> {
+    let text = String::from_utf8_lossy(bytes);
+    let mut corners = Vec::new();
+    for (number, line) in text.lines().enumerate() {
+        if let Some(rest) = line.trim().strip_prefix("vertex") {
+            corners.push(numbers::<3>(rest, path, number)?);
+        }
+    }
+    let complete = corners.len().is_multiple_of(3) && text.trim_end().lines().last().is_some_and(|l| l.starts_with("endsolid"));
+    if complete {
+        return Ok(soup(corners));
+    }
+    Err(Error::Syntax {
+        path: path.to_owned(),
+        place: "its last line".to_owned(),
+        actual: "no end".to_owned(),
+        expected: "three vertices a facet and `endsolid`",
+    })
+}
+
+fn soup(vertices_mm: Vec<[f32; 3]>) -> Mesh {
+    let triangles = (0..vertices_mm.len() as u32 / 3).map(|t| [3 * t, 3 * t + 1, 3 * t + 2]).collect();
+    Mesh { vertices_mm, triangles }
+}

@@ -1,0 +1,101 @@
+//! A square field of heights.
+
+/// Heights in mm over a square, at the centres of its cells; origin at the square's centre.
+#[derive(Debug, Clone, PartialEq)]
+pub struct HeightField {
+    size_mm: f64,
+    cells: usize,
+    heights_mm: Vec<f32>,
+}
+
+impl HeightField {
+    /// Heights given by a function of x and y, mm. At least two cells a side are made.
+    pub fn from_fn(size_mm: f64, cells: usize, mut height: impl FnMut(f64, f64) -> f64) -> Self {
+        let cells = cells.max(2);
+        let at = |i: usize| ((i as f64 + 0.5) / cells as f64 - 0.5) * size_mm;
+        let mut heights_mm = Vec::with_capacity(cells * cells);
+        for iy in 0..cells {
+            heights_mm.extend((0..cells).map(|ix| height(at(ix), at(iy)) as f32));
+        }
+        Self { size_mm, cells, heights_mm }
+    }
+
+    /// Edge of the square, mm.
+    pub fn size_mm(&self) -> f64 {
+        self.size_mm
+    }
+
+    /// Cells along each side.
+    pub fn cells(&self) -> usize {
+        self.cells
+    }
+
+    /// `[cells x cells]`, row by row along x, y ascending.
+    pub fn heights_mm(&self) -> &[f32] {
+        &self.heights_mm
+    }
+
+    /// Edge of a cell, mm.
+    pub fn pitch_mm(&self) -> f64 {
+        self.size_mm / self.cells as f64
+    }
+
+    /// Coordinate of a cell's centre along either axis, mm.
+    pub fn centre_mm(&self, index: usize) -> f64 {
+        ((index as f64 + 0.5) / self.cells as f64 - 0.5) * self.size_mm
+    }
+
+    /// Height of a cell, mm.
+    pub fn at(&self, ix: usize, iy: usize) -> f32 {
+        self.heights_mm[iy * self.cells + ix]
+    }
+
+    /// Slope of a cell along x and y, from its neighbours.
+    pub fn gradient(&self, ix: usize, iy: usize) -> [f32; 2] {
+        let last = self.cells - 1;
+        let pitch = self.pitch_mm() as f32;
+        let (left, right) = (ix.saturating_sub(1), (ix + 1).min(last));
+        let (below, above) = (iy.saturating_sub(1), (iy + 1).min(last));
+        [
+            (self.at(right, iy) - self.at(left, iy)) / (pitch * (right - left) as f32),
+            (self.at(ix, above) - self.at(ix, below)) / (pitch * (above - below) as f32),
+        ]
+    }
+
+    /// Height at a place, linear between the cells' centres and level beyond the outermost, mm.
+    pub fn height_at(&self, x_mm: f64, y_mm: f64) -> f64 {
+        let position = |v: f64| {
+            let at = ((v / self.size_mm + 0.5) * self.cells as f64 - 0.5).clamp(0.0, (self.cells - 1) as f64);
+            let low = (at.floor() as usize).min(self.cells - 2);
+            (low, at - low as f64)
+        };
+        let ((ix, u), (iy, v)) = (position(x_mm), position(y_mm));
+        let h = |i, j| f64::from(self.at(i, j));
+        let lower = h(ix, iy) * (1.0 - u) + h(ix + 1, iy) * u;
+        let upper = h(ix, iy + 1) * (1.0 - u) + h(ix + 1, iy + 1) * u;
+        lower * (1.0 - v) + upper * v
+    }
+
+    /// Lowest and highest height, mm.
+    pub fn extent_mm(&self) -> [f32; 2] {
+        let low = self.heights_mm.iter().copied().fold(f32::INFINITY, f32::min);
+        let high = self.heights_mm.iter().copied().fold(f32::NEG_INFINITY, f32::max);
+        [low, high]
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_plane_keeps_its_slope_and_heights() {
+        let plane = HeightField::from_fn(100.0, 50, |x, y| 0.1 * x - 0.2 * y);
+        for (ix, iy) in [(0, 0), (10, 30), (49, 49)] {
+            let [dx, dy] = plane.gradient(ix, iy);
+            assert!((dx - 0.1).abs() < 1e-5 && (dy + 0.2).abs() < 1e-5, "{dx} {dy}");
+        }
+        assert!((plane.height_at(12.3, -4.5) - (1.23 + 0.9)).abs() < 1e-4);
+        assert_eq!(plane.height_at(1e9, 0.0), plane.height_at(49.0, 0.0));
+    }
+}

@@ -1,0 +1,238 @@
+//! Reliefs: surfaces as height fields, and the generators that make them.
+
+mod height_field;
+mod bricks;
+mod primitive_root;
+mod wavy;
+
+pub use height_field::HeightField;
+pub use primitive_root::PrimitiveRootDiffuser;
+pub use bricks::{Bond, Bricks};
+pub use wavy::Wavy;
+
+use serde::{Deserialize, Serialize};
+
+/// Edge of a panel, mm (Rust et al. 2021).
+pub const PANEL_SIZE_MM: f64 = 585.0;
+/// The relief lies between these heights over the plane that the grid's heights count from, mm: in the published
+/// data the lowest layer stands 135 mm over its bottom and 95 mm over its top, and 124 mm over the plane.
+pub const RELIEF_MM: [f64; 2] = [-11.0, 29.0];
+
+/// A relief and its material.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(tag = "relief", rename_all = "snake_case")]
+pub enum Relief {
+    /// A plane print.
+    Flat,
+    /// A plane absorber: what remains is the direct sound.
+    Foam,
+    /// A plane board.
+    Wood,
+    /// A 2D primitive-root diffuser.
+    Prd(PrimitiveRootDiffuser),
+    /// Bricks in stretcher bond.
+    Brick(Bricks),
+    /// Bricks in Flemish bond.
+    Flemish(Bricks),
+    /// A smooth macrostructure.
+    Wavy(Wavy),
+}
+
+/// What a surface is made of.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Material {
+    /// Its name.
+    pub name: &'static str,
+    /// Pressure reflection factor.
+    pub reflection_factor: f64,
+}
+
+/// Why a relief cannot be made.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum Error {
+    /// No such relief.
+    #[error("`{given}` is no relief; hint: {}", Relief::NAMES.join(", "))]
+    Name {
+        /// What was given.
+        given: String,
+    },
+    /// No such parameter.
+    #[error("relief `{relief}` has no parameter `{given}`; hint: {valid}")]
+    Parameter {
+        /// The relief.
+        relief: &'static str,
+        /// What was given.
+        given: String,
+        /// What it has.
+        valid: String,
+    },
+    /// A value that makes no such relief.
+    #[error("parameter `{key}` of relief `{relief}` is `{given}`, expected {expected}")]
+    Value {
+        /// The relief.
+        relief: &'static str,
+        /// The parameter.
+        key: String,
+        /// What was given.
+        given: String,
+        /// What is taken.
+        expected: &'static str,
+    },
+}
+
+impl Relief {
+    /// The names that [`Relief::by_name`] knows.
+    pub const NAMES: [&'static str; 7] = ["flat", "foam", "wood", "prd", "brick", "flemish", "wavy"];
+
+    /// A relief with its default parameters.
+    ///
+    /// # Errors
+    /// [`Error::Name`], which lists the names.
+    pub fn by_name(name: &str) -> Result<Self, Error> {
+        Ok(match name {
+            "flat" => Self::Flat,
+            "foam" => Self::Foam,
+            "wood" => Self::Wood,
+            "prd" => Self::Prd(PrimitiveRootDiffuser::default()),
+            "brick" => Self::Brick(Bricks { bond: Bond::Stretcher, ..Bricks::default() }),
+            "flemish" => Self::Flemish(Bricks { bond: Bond::Flemish, ..Bricks::default() }),
+            "wavy" => Self::Wavy(Wavy::default()),
+            _ => return Err(Error::Name { given: name.to_owned() }),
+        })
+    }
+
+    /// Sets a parameter.
+    ///
+    /// # Errors
+    /// [`Error::Parameter`] or [`Error::Value`], which say what would do.
+    pub fn set(&mut self, key: &str, value: &str) -> Result<(), Error> {
+        let relief = self.name();
+        let mut fields = self.parameters();
+        let old = fields.get(key).cloned().ok_or_else(|| Error::Parameter {
+            relief,
+            given: key.to_owned(),
+            valid: match fields.keys().cloned().collect::<Vec<_>>() {
+                names if names.is_empty() => "it has none".to_owned(),
+                names => names.join(", "),
+            },
+        })?;
+        let expected = if old.is_u64() { "a whole number" } else { "a number" };
+        let wrong = |expected| Error::Value { relief, key: key.to_owned(), given: value.to_owned(), expected };
+        let number: f64 = value.parse().ok().filter(|x: &f64| x.is_finite()).ok_or_else(|| wrong(expected))?;
+        let new = match old.is_u64() {
+            true => value.parse::<u64>().map_err(|_| wrong(expected))?.into(),
+            false => number.into(),
+        };
+        fields.insert(key.to_owned(), new);
+        fields.insert("relief".to_owned(), relief.into());
+        let changed: Self = serde_json::from_value(fields.into()).map_err(|_| wrong(expected))?;
+        changed.check().map_err(wrong)?;
+        *self = changed;
+        Ok(())
+    }
+
+    /// Its name.
+    pub fn name(&self) -> &'static str {
+        match self {
+            Self::Flat => "flat",
+            Self::Foam => "foam",
+            Self::Wood => "wood",
+            Self::Prd(_) => "prd",
+            Self::Brick(_) => "brick",
+            Self::Flemish(_) => "flemish",
+            Self::Wavy(_) => "wavy",
+        }
+    }
+
+    /// Its kind, as table `surfaces` names it.
+    pub fn typology(&self) -> &'static str {
+        match self {
+            Self::Flat | Self::Foam | Self::Wood => "reference",
+            Self::Prd(_) => "primitive_root_diffuser",
+            Self::Brick(_) => "stretcher_bond_bricks",
+            Self::Flemish(_) => "flemish_bond_bricks",
+            Self::Wavy(_) => "macrostructure",
+        }
+    }
+
+    /// What it is made of. Flat reflects 29.3 % less energy than Wood (Rust et al. 2021), hence 0.83.
+    pub fn material(&self) -> Material {
+        match self {
+            Self::Foam => Material { name: "melamine foam", reflection_factor: 0.05 },
+            Self::Wood => Material { name: "MDF", reflection_factor: 0.99 },
+            _ => Material { name: "coated print", reflection_factor: 0.83 },
+        }
+    }
+
+    /// Its parameters by name.
+    pub fn parameters(&self) -> serde_json::Map<String, serde_json::Value> {
+        match serde_json::to_value(self) {
+            Ok(serde_json::Value::Object(mut fields)) => {
+                fields.remove("relief");
+                fields.remove("bond");
+                fields
+            }
+            _ => serde_json::Map::new(),
+        }
+    }
+
+    /// Its heights, `cells` along each side.
+    pub fn height_field(&self, cells: usize) -> HeightField {
+        match self {
+            Self::Flat | Self::Foam | Self::Wood => HeightField::from_fn(PANEL_SIZE_MM, cells, |_, _| 0.0),
+            Self::Prd(prd) => {
+                let depths = prd.depths_mm();
+                HeightField::from_fn(PANEL_SIZE_MM, cells, |x, y| prd.height(&depths, x, y))
+            }
+            Self::Brick(bricks) | Self::Flemish(bricks) => {
+                HeightField::from_fn(PANEL_SIZE_MM, cells, |x, y| bricks.height(x, y))
+            }
+            Self::Wavy(wavy) => {
+                let waves = wavy.waves();
+                HeightField::from_fn(PANEL_SIZE_MM, cells, |x, y| waves.height(x, y))
+            }
+        }
+    }
+
+    fn check(&self) -> Result<(), &'static str> {
+        match self {
+            Self::Prd(prd) => prd.check(),
+            Self::Brick(bricks) | Self::Flemish(bricks) => bricks.check(),
+            Self::Wavy(wavy) => wavy.check(),
+            _ => Ok(()),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_relief_stays_within_its_depth() {
+        for name in Relief::NAMES {
+            let relief = Relief::by_name(name).expect(name);
+            assert_eq!(relief.name(), name);
+            let [low, high] = relief.height_field(274).extent_mm();
+            assert!(low >= -11.0 && high <= 29.0, "{name}: {low} {high}");
+            let is_plane = matches!(relief, Relief::Flat | Relief::Foam | Relief::Wood);
+            assert_eq!(high - low < 1.0, is_plane, "{name}: {low} {high}");
+            assert_eq!(relief.height_field(64), relief.height_field(64), "{name}");
+        }
+    }
+
+    #[test]
+    fn parameters_are_set_by_name() {
+        let mut brick = Relief::by_name("brick").expect("a relief");
+        brick.set("joint_depth_mm", "6").expect("a parameter");
+        brick.set("seed", "7").expect("a parameter");
+        assert_eq!(brick.parameters()["joint_depth_mm"], 6.0);
+        let unknown = brick.set("colour", "red").expect_err("unknown").to_string();
+        assert!(unknown.contains("joint_depth_mm"), "{unknown}");
+        for (key, value) in [("joint_depth_mm", "NaN"), ("joint_depth_mm", "-1"), ("length_mm", "0"), ("seed", "1.5")] {
+            assert!(brick.set(key, value).is_err(), "{key}={value}");
+        }
+        assert!(Relief::Flat.set("depth", "1").expect_err("none").to_string().contains("it has none"));
+        assert!(Relief::by_name("marble").expect_err("unknown").to_string().contains("wavy"));
+    }
+}
