@@ -171,11 +171,8 @@ impl Seen {
         cosine_over_distance.reserve_exact(cells * cells);
         for iy in 0..cells {
             for ix in 0..cells {
-                let [dx, dy, dz] = [
-                    px - relief.centre_mm(ix),
-                    py - relief.centre_mm(iy),
-                    pz - f64::from(relief.at(ix, iy)),
-                ];
+                let [dx, dy, dz] =
+                    [px - relief.centre_mm(ix), py - relief.centre_mm(iy), pz - f64::from(relief.at(ix, iy))];
                 let r = (dx * dx + dy * dy + dz * dz).sqrt() / 1e3;
                 let [sx, sy] = relief.gradient(ix, iy).map(|s| s.f64());
                 // N = (-sx, -sy, 1) is as long as the facet is larger than its cell.

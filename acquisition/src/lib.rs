@@ -1,5 +1,20 @@
 //! From a rig, or from somebody's files, to a run's MCAP file.
+//!
+//! ```
+//! use echolake_acquisition::relief::Relief;
+//!
+//! let wall = Relief::by_name("brick")?;
+//! assert_eq!(wall.material().reflection_factor, 0.83);
+//! # Ok::<(), echolake_acquisition::relief::Error>(())
+//! ```
 
-pub mod relief;
-pub mod mesh;
+pub mod assessment;
+pub mod conformance;
+pub mod controller;
 pub mod kirchhoff;
+pub mod mesh;
+pub mod recorder;
+pub mod relief;
+pub mod rig;
+pub mod rigs;
+pub mod simulate;

@@ -6,8 +6,8 @@ use arrow::record_batch::RecordBatch;
 use echolake_lake::{DataFile, FileName, Lake, Snapshot};
 use echolake_schema::tables::Table;
 use futures::TryStreamExt as _;
-use object_store::path::Path;
 use object_store::ObjectStore as _;
+use object_store::path::Path;
 use serde::Serialize;
 
 use crate::chunk::Chunk;

@@ -23,9 +23,8 @@ pub(super) fn write(mesh: &Mesh) -> Vec<u8> {
     let positions: Vec<[f32; 3]> = mesh.vertices_mm.iter().map(|v| to_gltf(*v)).collect();
     let normals = normals(mesh);
     let count = positions.len();
-    let bound = |f: fn(f32, f32) -> f32, start: f32| {
-        positions.iter().fold([start; 3], |m, p| [0, 1, 2].map(|i| f(m[i], p[i])))
-    };
+    let bound =
+        |f: fn(f32, f32) -> f32, start: f32| positions.iter().fold([start; 3], |m, p| [0, 1, 2].map(|i| f(m[i], p[i])));
     let mut bin = Vec::with_capacity(count * 24 + mesh.triangles.len() * 12);
     bin.extend(positions.iter().chain(&normals).flatten().flat_map(|x| x.to_le_bytes()));
     bin.extend(mesh.triangles.iter().flatten().flat_map(|i| i.to_le_bytes()));
@@ -104,7 +103,11 @@ pub(super) fn parse(bytes: &[u8], path: &Path) -> Result<Mesh, Error> {
         return Err(wrong("byte 0", "no glTF 2.0 header".into(), "`glTF` and version 2"));
     }
     if word(8) != Some(bytes.len()) {
-        return Err(wrong("byte 8", format!("a length that is not the file's {} bytes", bytes.len()), "the file's length"));
+        return Err(wrong(
+            "byte 8",
+            format!("a length that is not the file's {} bytes", bytes.len()),
+            "the file's length",
+        ));
     }
     let chunk = |at: usize, kind: u32| -> Option<&[u8]> {
         (word(at + 4)? == kind as usize).then(|| bytes.get(at + 8..at + 8 + word(at)?)).flatten()
@@ -116,7 +119,8 @@ pub(super) fn parse(bytes: &[u8], path: &Path) -> Result<Mesh, Error> {
     let mut mesh = Mesh::default();
     let primitives = file.list(&file.document["meshes"]).iter().flat_map(|m| file.list(&m["primitives"]));
     for primitive in primitives {
-        let missing = |what: &str| wrong("a primitive", format!("no readable {what}"), "plain positions and triangle indices");
+        let missing =
+            |what: &str| wrong("a primitive", format!("no readable {what}"), "plain positions and triangle indices");
         if primitive["mode"].as_u64().unwrap_or(4) != 4 {
             return Err(wrong("a primitive", format!("mode {}", primitive["mode"]), "triangles"));
         }

@@ -100,7 +100,10 @@ pub(super) fn parse(bytes: &[u8], path: &Path) -> Result<Mesh, Error> {
         expected,
     };
     const END: &[u8] = b"end_header\n";
-    let end = bytes.windows(END.len()).position(|w| w == END).ok_or_else(|| wrong("the header", "no end".into(), "`end_header`"))?;
+    let end = bytes
+        .windows(END.len())
+        .position(|w| w == END)
+        .ok_or_else(|| wrong("the header", "no end".into(), "`end_header`"))?;
     let header = String::from_utf8_lossy(&bytes[..end]);
     let body = &bytes[end + END.len()..];
     let mut lines = header.lines().map(str::trim);
@@ -111,7 +114,15 @@ pub(super) fn parse(bytes: &[u8], path: &Path) -> Result<Mesh, Error> {
     for line in lines {
         let words: Vec<_> = line.split_whitespace().collect();
         match words[..] {
-            ["format", kind, _] => format = if kind == "ascii" { "ascii" } else if kind == "binary_little_endian" { "binary" } else { "" },
+            ["format", kind, _] => {
+                format = if kind == "ascii" {
+                    "ascii"
+                } else if kind == "binary_little_endian" {
+                    "binary"
+                } else {
+                    ""
+                }
+            }
             ["element", name, count] => {
                 let count = count.parse().map_err(|_| wrong("the header", format!("`{line}`"), "a count"))?;
                 elements.push(Element { name: name.into(), count, properties: Vec::new() });
@@ -131,8 +142,9 @@ pub(super) fn parse(bytes: &[u8], path: &Path) -> Result<Mesh, Error> {
     let mut mesh = Mesh::default();
     for element in &elements {
         for row in 0..element.count {
-            read_row(element, &mut body, &mut mesh)
-                .ok_or_else(|| wrong(&format!("{} {row}", element.name), "no number".into(), "as many as the header counts"))?;
+            read_row(element, &mut body, &mut mesh).ok_or_else(|| {
+                wrong(&format!("{} {row}", element.name), "no number".into(), "as many as the header counts")
+            })?;
         }
     }
     Ok(mesh)

@@ -128,7 +128,13 @@ impl Mesh {
     /// # Errors
     /// [`Error::TooLarge`] where the relief is deeper than `depth_mm`, [`Error::Syntax`] where the panel shows
     /// through: a mesh smaller than the panel.
-    pub fn to_height_field(&self, cells: usize, panel_mm: f64, depth_mm: f64, path: &Path) -> Result<HeightField, Error> {
+    pub fn to_height_field(
+        &self,
+        cells: usize,
+        panel_mm: f64,
+        depth_mm: f64,
+        path: &Path,
+    ) -> Result<HeightField, Error> {
         let [low, high] = self.bounds_mm();
         let centre = [0, 1].map(|i| f64::from(low[i] + high[i]) / 2.0);
         let mut tops = vec![f32::NEG_INFINITY; cells * cells];
@@ -145,7 +151,12 @@ impl Mesh {
         if bare > 4 * cells {
             let actual = format!("{bare} of {} cells without a surface", tops.len());
             let place = "its view from above".to_owned();
-            return Err(Error::Syntax { path: path.to_owned(), place, actual, expected: "a surface over the whole panel" });
+            return Err(Error::Syntax {
+                path: path.to_owned(),
+                place,
+                actual,
+                expected: "a surface over the whole panel",
+            });
         }
         let seen = || tops.iter().copied().filter(|t| t.is_finite());
         let (least, greatest) = (seen().fold(f32::INFINITY, f32::min), seen().fold(f32::NEG_INFINITY, f32::max));
@@ -224,7 +235,8 @@ mod tests {
         let mut nan = good.clone();
         nan.vertices_mm[3][1] = f32::NAN;
         assert!(nan.check(585.0, 40.0, path).expect_err("NaN").to_string().contains("vertex 3"));
-        let deep = Mesh::from_height_field(&HeightField::from_fn(585.0, 20, |x, _| if x < 0.0 { 0.0 } else { 60.0 }), -20.0);
+        let deep =
+            Mesh::from_height_field(&HeightField::from_fn(585.0, 20, |x, _| if x < 0.0 { 0.0 } else { 60.0 }), -20.0);
         assert!(matches!(deep.to_height_field(50, 585.0, 40.0, path), Err(Error::TooLarge { .. })));
         let small = Mesh::from_height_field(&HeightField::from_fn(100.0, 5, |_, _| 0.0), -20.0);
         assert!(small.to_height_field(50, 585.0, 40.0, path).is_err());

@@ -55,7 +55,8 @@ fn text(bytes: &[u8], path: &Path) -> Result<Mesh, Error> {
             corners.push(numbers::<3>(rest, path, number)?);
         }
     }
-    let complete = corners.len().is_multiple_of(3) && text.trim_end().lines().last().is_some_and(|l| l.starts_with("endsolid"));
+    let complete =
+        corners.len().is_multiple_of(3) && text.trim_end().lines().last().is_some_and(|l| l.starts_with("endsolid"));
     if complete {
         return Ok(soup(corners));
     }

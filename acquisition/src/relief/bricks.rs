@@ -110,9 +110,7 @@ impl Bricks {
                 let in_unit = x - unit * period;
                 match in_unit < stretcher {
                     true => (2 * unit as i64, in_unit - stretcher / 2.0, self.length_mm),
-                    false => {
-                        (2 * unit as i64 + 1, in_unit - stretcher - header / 2.0, header - self.joint_width_mm)
-                    }
+                    false => (2 * unit as i64 + 1, in_unit - stretcher - header / 2.0, header - self.joint_width_mm),
                 }
             }
         };

@@ -1,13 +1,13 @@
 //! Reliefs: surfaces as height fields, and the generators that make them.
 
-mod height_field;
 mod bricks;
+mod height_field;
 mod primitive_root;
 mod wavy;
 
+pub use bricks::{Bond, Bricks};
 pub use height_field::HeightField;
 pub use primitive_root::PrimitiveRootDiffuser;
-pub use bricks::{Bond, Bricks};
 pub use wavy::Wavy;
 
 use serde::{Deserialize, Serialize};

@@ -1,0 +1,134 @@
+//! How good a recording is: signal to noise, clipping, loopback, and the direct sound's arrival.
+
+use echolake_dsp::deconvolution::{DeconvolutionParams, DeconvolutionPlan, DeconvolutionScratch, TransformLength};
+use echolake_dsp::level::power_to_db;
+use echolake_dsp::{Error, chain};
+use echolake_schema::Rig;
+use echolake_schema::rig::Validation;
+
+/// Outside of the sweep's range the assessed response is put down by this, dB: only the range counts.
+const OUT_OF_RANGE_DB: f64 = 60.0;
+/// The direct sound is looked for this near its time, samples: the first echo is nine samples behind it at least.
+const ARRIVAL_WINDOW: f64 = 5.0;
+
+/// What was found of one recording.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Assessment {
+    /// Mean power of the response's first part over that of its noise, in the sweep's range, dB; NaN where the
+    /// recording is too short to tell.
+    pub snr_db: f64,
+    /// Samples at full scale, both channels.
+    pub clipped_samples: u32,
+    /// Level of the loopback, dB re full scale.
+    pub loopback_dbfs: f64,
+    /// Direct sound's arrival minus the expected one, us; NaN where the expected one is outside of the response.
+    pub arrival_error_us: f64,
+}
+
+/// Assesses recordings of one length.
+pub struct Assessor {
+    plan: DeconvolutionPlan<f32>,
+    scratch: DeconvolutionScratch<f32>,
+    response: Vec<f32>,
+    signal_len: usize,
+    rate_hz: f64,
+}
+
+impl Assessor {
+    /// For recordings of `recording_len` samples of this rig.
+    ///
+    /// # Errors
+    /// As [`DeconvolutionPlan::new`].
+    pub fn new(rig: &Rig, recording_len: usize) -> Result<Self, Error> {
+        let rate_hz = rig.sweep.rate_hz.get();
+        let plan = DeconvolutionPlan::new(DeconvolutionParams {
+            recording_len,
+            output_len: recording_len,
+            rate_hz,
+            low_hz: rig.sweep.low_hz,
+            high_hz: rig.sweep.high_hz,
+            floor_db: OUT_OF_RANGE_DB,
+            length: TransformLength::Fast,
+        })?;
+        let reference = rig.impulse_response.reference_temperature_c.get();
+        Ok(Self {
+            scratch: plan.scratch(),
+            plan,
+            response: vec![0.0; recording_len],
+            signal_len: chain::raw_len(rig.impulse_response.length, reference).min(recording_len),
+            rate_hz,
+        })
+    }
+
+    /// Assesses one recording; samples are fractions of full scale.
+    ///
+    /// # Errors
+    /// As [`DeconvolutionPlan::run`]: a silent loopback leaves nothing to assess.
+    pub fn assess(
+        &mut self,
+        microphone: &[f32],
+        loopback: &[f32],
+        expected_arrival_secs: f64,
+        clipped_samples: u32,
+    ) -> Result<Assessment, Error> {
+        self.plan.run(microphone, loopback, &mut self.response, &mut self.scratch)?;
+        Ok(Assessment {
+            snr_db: self.snr_db(),
+            clipped_samples,
+            loopback_dbfs: power_to_db(mean_power(loopback)),
+            arrival_error_us: self.arrival_error_us(expected_arrival_secs),
+        })
+    }
+
+    // The deconvolution spreads noise over the whole length; far behind the response there is nothing else.
+    fn snr_db(&self) -> f64 {
+        let len = self.response.len();
+        let quiet = (len / 2).max(self.signal_len)..len / 4 * 3;
+        let (Some(noise), signal) = (self.response.get(quiet), &self.response[..self.signal_len]) else {
+            return f64::NAN;
+        };
+        let noise = mean_power(noise);
+        power_to_db((mean_power(signal) - noise).max(0.0) / noise)
+    }
+
+    fn arrival_error_us(&self, expected_secs: f64) -> f64 {
+        let expected = expected_secs * self.rate_hz;
+        let from = (expected - ARRIVAL_WINDOW).ceil().max(1.0) as usize;
+        let to = ((expected + ARRIVAL_WINDOW).floor().max(0.0) as usize).min(self.response.len().saturating_sub(2));
+        let magnitude = |n: usize| f64::from(self.response[n].abs());
+        let Some(peak) = (from..=to).max_by(|a, b| magnitude(*a).total_cmp(&magnitude(*b))) else { return f64::NAN };
+        // A parabola through the peak and its neighbours.
+        let [before, at, after] = [peak - 1, peak, peak + 1].map(magnitude);
+        let bend = before - 2.0 * at + after;
+        let shift = if bend < 0.0 { (0.5 * (before - after) / bend).clamp(-1.0, 1.0) } else { 0.0 };
+        (peak as f64 + shift - expected) / self.rate_hz * 1e6
+    }
+}
+
+impl Assessment {
+    /// Why the rig would not accept it; empty where it would.
+    pub fn objections(&self, limits: &Validation, outside_level_db: f64) -> Vec<String> {
+        let mut reasons = Vec::new();
+        if self.clipped_samples > 0 {
+            reasons.push(format!("{} samples clipped", self.clipped_samples));
+        }
+        if !(self.loopback_dbfs >= limits.loopback_dbfs) {
+            reasons.push(format!("loopback at {:.1} dBFS, least {:.1}", self.loopback_dbfs, limits.loopback_dbfs));
+        }
+        if self.snr_db < limits.snr_db {
+            reasons.push(format!("signal-to-noise ratio {:.1} dB, least {:.1}", self.snr_db, limits.snr_db));
+        }
+        if self.arrival_error_us.abs() > limits.arrival_us {
+            let (off, most) = (self.arrival_error_us, limits.arrival_us);
+            reasons.push(format!("direct sound {off:.1} us off, most {most:.1}"));
+        }
+        if outside_level_db > limits.outside_level_db {
+            reasons.push(format!("{outside_level_db:.1} dB outside, most {:.1}", limits.outside_level_db));
+        }
+        reasons
+    }
+}
+
+fn mean_power(x: &[f32]) -> f64 {
+    echolake_dsp::energy::energy(x) / x.len().max(1) as f64
+}

@@ -1,0 +1,335 @@
+//! Writes a run's MCAP file, crash-safe: what a checkpoint has passed survives a power cut, and the file stands
+//! under its name only when it is whole.
+
+mod scene;
+
+use std::fs::{File, OpenOptions};
+use std::io::BufWriter;
+use std::path::{Path, PathBuf};
+
+use echolake_schema::manifest::{RunEnd, RunManifest};
+use echolake_schema::messages::{
+    AmbientSample, FILE_DESCRIPTOR_SET, ImpulseResponse, Measurement, Message as RunMessage, SampleFormat,
+    SweepRecording,
+};
+use echolake_schema::{Rig, SurfaceRecord, Timestamp, topics};
+use foxglove::Encode;
+use mcap::records::{MessageHeader, Metadata};
+use mcap::{Attachment, WriteOptions, Writer};
+
+use crate::mesh::Mesh;
+use crate::relief::HeightField;
+
+/// A chunk is ended at this size; a message never straddles two.
+const CHUNK_BYTES: u64 = 1 << 20;
+/// `/sweep/audio` is played this many times slower: at a scale of 1:10, 2-40 kHz become 200 Hz to 4 kHz.
+const SLOWER: f64 = 10.0;
+
+/// What is known when a run starts.
+pub struct RunStart<'a> {
+    /// The run.
+    pub manifest: &'a RunManifest,
+    /// The rig.
+    pub rig: &'a Rig,
+    /// The surface.
+    pub surface: &'a SurfaceRecord,
+    /// Its shape, where it is known.
+    pub relief: Option<Relief<'a>>,
+}
+
+/// A surface's shape.
+pub struct Relief<'a> {
+    /// Heights over the panel.
+    pub heights: &'a HeightField,
+    /// The panel as a solid.
+    pub mesh: &'a Mesh,
+    /// The producer's own file.
+    pub original: Option<OriginalFile<'a>>,
+}
+
+/// A file that is kept as it is.
+pub struct OriginalFile<'a> {
+    /// Its name.
+    pub name: &'a str,
+    /// Its media type.
+    pub media_type: &'a str,
+    /// Its content.
+    pub bytes: &'a [u8],
+}
+
+/// How much a line of the log matters.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum LogLevel {
+    /// For whoever debugs.
+    Debug,
+    /// The usual course.
+    Info,
+    /// Something was not right, and was dealt with.
+    Warning,
+    /// Something failed.
+    Error,
+}
+
+/// Why a run cannot be recorded.
+#[derive(Debug, thiserror::Error)]
+pub enum Error {
+    /// A recording of this name is there.
+    #[error("`{}` is there already; hint: a run is never overwritten", path.display())]
+    Exists {
+        /// The file.
+        path: PathBuf,
+    },
+    /// The system refused.
+    #[error("cannot write `{}`: {reason}; hint: is the disk full or read-only? What was recorded so far is in `{}`", path.display(), partial.display())]
+    Write {
+        /// The file.
+        path: PathBuf,
+        /// What is written until it is whole.
+        partial: PathBuf,
+        /// The system's or the writer's words.
+        reason: String,
+    },
+    /// A record that has no JSON.
+    #[error("the surface's record cannot be written: {reason}")]
+    Surface {
+        /// Why.
+        reason: String,
+    },
+}
+
+/// Channels of the topics, in the order of their registration.
+struct Channels {
+    tf: u16,
+    scene: u16,
+    points: u16,
+    microphone: u16,
+    speaker: u16,
+    sweep: u16,
+    audio: u16,
+    ir: u16,
+    environment: u16,
+    measurement: u16,
+    log: u16,
+}
+
+/// A run being recorded. Dropped before [`Recorder::finish`], it leaves `<path>.partial`.
+pub struct Recorder {
+    writer: Writer<BufWriter<File>>,
+    path: PathBuf,
+    partial: PathBuf,
+    channels: Channels,
+    sequence: u32,
+    encoded: Vec<u8>,
+}
+
+/// The name of a recording until it is whole.
+fn partial_of(path: &Path) -> PathBuf {
+    let mut name = path.as_os_str().to_owned();
+    name.push(".partial");
+    name.into()
+}
+
+impl Recorder {
+    /// Starts a recording that will stand at `path`.
+    ///
+    /// # Errors
+    /// [`Error::Exists`], or [`Error::Write`] where the folder cannot be written.
+    pub fn create(path: &Path, start: &RunStart<'_>) -> Result<Self, Error> {
+        let partial = partial_of(path);
+        if path.exists() {
+            return Err(Error::Exists { path: path.to_owned() });
+        }
+        let failed = |reason: String| Error::Write { path: path.to_owned(), partial: partial.clone(), reason };
+        let file = OpenOptions::new().write(true).create_new(true).open(&partial).map_err(|e| match e.kind() {
+            std::io::ErrorKind::AlreadyExists => Error::Exists { path: partial.clone() },
+            _ => failed(e.to_string()),
+        })?;
+        let mut writer = WriteOptions::new()
+            .profile("")
+            .library(concat!("echolake ", env!("CARGO_PKG_VERSION")))
+            .chunk_size(Some(CHUNK_BYTES))
+            // One thread: the same run gives the same bytes, and runs are recorded side by side.
+            .compression_threads(0)
+            .create(BufWriter::new(file))
+            .map_err(|e| failed(e.to_string()))?;
+        let channels = Channels::register(&mut writer).map_err(|e| failed(e.to_string()))?;
+        let (path, partial) = (path.to_owned(), partial.clone());
+        let mut recorder = Self { writer, path, partial, channels, sequence: 0, encoded: Vec::new() };
+        recorder.head(start)?;
+        Ok(recorder)
+    }
+
+    fn head(&mut self, start: &RunStart<'_>) -> Result<(), Error> {
+        let at = start.manifest.started;
+        self.metadata(topics::RUN_METADATA, start.manifest.to_metadata())?;
+        let surface = serde_json::to_vec_pretty(start.surface).map_err(|e| Error::Surface { reason: e.to_string() })?;
+        self.attach(at, topics::RIG_ATTACHMENT, "application/toml", start.rig.to_toml().as_bytes())?;
+        self.attach(at, topics::SURFACE_ATTACHMENT, "application/json", &surface)?;
+        if let Some(relief) = &start.relief {
+            let glb = relief.mesh.to_bytes(crate::mesh::Format::Glb);
+            let heights: Vec<u8> = relief.heights.heights_mm().iter().flat_map(|h| h.to_le_bytes()).collect();
+            self.attach(at, topics::MESH_ATTACHMENT, "model/gltf-binary", &glb)?;
+            self.attach(at, topics::HEIGHTS_ATTACHMENT, "application/octet-stream", &heights)?;
+            if let Some(file) = &relief.original {
+                self.attach(at, file.name, file.media_type, file.bytes)?;
+            }
+            self.foxglove(self.channels.scene, at, &scene::panel(at, glb))?;
+            self.foxglove(self.channels.points, at, &scene::points(at, relief.heights))?;
+        }
+        self.checkpoint()
+    }
+
+    /// Records where microphone and speaker stand, mm: `/tf` and both poses.
+    ///
+    /// # Errors
+    /// [`Error::Write`]; so do all methods below.
+    pub fn poses(&mut self, at: Timestamp, microphone_mm: [f64; 3], speaker_mm: [f64; 3]) -> Result<(), Error> {
+        self.foxglove(self.channels.tf, at, &scene::frames(at, microphone_mm, speaker_mm))?;
+        self.foxglove(self.channels.microphone, at, &scene::pose(at, microphone_mm))?;
+        self.foxglove(self.channels.speaker, at, &scene::pose(at, speaker_mm))
+    }
+
+    /// Records a reading of the ambient sensor.
+    pub fn environment(&mut self, at: Timestamp, sample: &AmbientSample) -> Result<(), Error> {
+        self.own(self.channels.environment, at, sample)
+    }
+
+    /// Records a sweep, and its microphone channel for ears.
+    pub fn sweep(&mut self, at: Timestamp, recording: &SweepRecording) -> Result<(), Error> {
+        self.own(self.channels.sweep, at, recording)?;
+        let rate = (recording.sample_rate_hz / SLOWER).round() as u32;
+        self.foxglove(self.channels.audio, at, &scene::audio(at, top_16_bits(recording), rate))
+    }
+
+    /// Records an impulse response.
+    pub fn ir(&mut self, at: Timestamp, ir: &ImpulseResponse) -> Result<(), Error> {
+        self.own(self.channels.ir, at, ir)
+    }
+
+    /// Records what became of an attempt.
+    pub fn measurement(&mut self, at: Timestamp, measurement: &Measurement) -> Result<(), Error> {
+        self.own(self.channels.measurement, at, measurement)
+    }
+
+    /// Records a line of the log.
+    pub fn log(&mut self, at: Timestamp, level: LogLevel, name: &str, message: &str) -> Result<(), Error> {
+        self.foxglove(self.channels.log, at, &scene::log(at, level, name, message))
+    }
+
+    /// Ends the chunk and waits until it is on the disk: what was recorded survives a power cut.
+    pub fn checkpoint(&mut self) -> Result<(), Error> {
+        let flushed = self.writer.flush().map_err(|e| e.to_string());
+        flushed.and_then(|()| sync(&self.partial)).map_err(|reason| self.failed(reason))
+    }
+
+    /// Ends the recording and gives it its name; returns its path.
+    pub fn finish(mut self, end: &RunEnd) -> Result<PathBuf, Error> {
+        self.metadata(topics::RUN_END_METADATA, end.to_metadata())?;
+        // The writer's own drop would swallow what goes wrong here.
+        let finished = self.writer.finish().map(drop).map_err(|e| e.to_string());
+        let named = finished.and_then(|()| sync(&self.partial)).and_then(|()| {
+            std::fs::rename(&self.partial, &self.path).map_err(|e| e.to_string())?;
+            self.path.parent().map_or(Ok(()), sync)
+        });
+        named.map_err(|reason| self.failed(reason))?;
+        Ok(self.path.clone())
+    }
+
+    fn own<M: RunMessage>(&mut self, channel: u16, at: Timestamp, message: &M) -> Result<(), Error> {
+        let mut encoded = std::mem::take(&mut self.encoded);
+        encoded.clear();
+        // A Vec grows, so encoding into it cannot fail.
+        let _ = prost::Message::encode(message, &mut encoded);
+        let written = self.write(channel, at, &encoded);
+        self.encoded = encoded;
+        written
+    }
+
+    fn foxglove<M: Encode>(&mut self, channel: u16, at: Timestamp, message: &M) -> Result<(), Error> {
+        let mut encoded = std::mem::take(&mut self.encoded);
+        encoded.clear();
+        let _ = message.encode(&mut encoded);
+        let written = self.write(channel, at, &encoded);
+        self.encoded = encoded;
+        written
+    }
+
+    fn write(&mut self, channel_id: u16, at: Timestamp, data: &[u8]) -> Result<(), Error> {
+        let log_time = u64::try_from(at.0).unwrap_or(0);
+        self.sequence += 1;
+        let header = MessageHeader { channel_id, sequence: self.sequence, log_time, publish_time: log_time };
+        self.writer.write_to_known_channel(&header, data).map_err(|e| self.failed(e.to_string()))
+    }
+
+    fn attach(&mut self, at: Timestamp, name: &str, media_type: &str, data: &[u8]) -> Result<(), Error> {
+        let time = u64::try_from(at.0).unwrap_or(0);
+        let attachment = Attachment {
+            log_time: time,
+            create_time: time,
+            name: name.to_owned(),
+            media_type: media_type.to_owned(),
+            data: data.into(),
+        };
+        self.writer.attach(&attachment).map_err(|e| self.failed(e.to_string()))
+    }
+
+    fn metadata(&mut self, name: &str, metadata: std::collections::BTreeMap<String, String>) -> Result<(), Error> {
+        let record = Metadata { name: name.to_owned(), metadata };
+        self.writer.write_metadata(&record).map_err(|e| self.failed(e.to_string()))
+    }
+
+    fn failed(&self, reason: String) -> Error {
+        Error::Write { path: self.path.clone(), partial: self.partial.clone(), reason }
+    }
+}
+
+impl Channels {
+    fn register(writer: &mut Writer<BufWriter<File>>) -> mcap::McapResult<Self> {
+        use foxglove::messages as fg;
+        Ok(Self {
+            tf: foxglove_channel::<fg::FrameTransforms>(writer, topics::TF)?,
+            scene: foxglove_channel::<fg::SceneUpdate>(writer, topics::PANEL_SCENE)?,
+            points: foxglove_channel::<fg::PointCloud>(writer, topics::PANEL_POINTS)?,
+            microphone: foxglove_channel::<fg::PoseInFrame>(writer, topics::MICROPHONE_POSE)?,
+            speaker: foxglove_channel::<fg::PoseInFrame>(writer, topics::SPEAKER_POSE)?,
+            sweep: own_channel::<SweepRecording>(writer, topics::SWEEP)?,
+            audio: foxglove_channel::<fg::RawAudio>(writer, topics::SWEEP_AUDIO)?,
+            ir: own_channel::<ImpulseResponse>(writer, topics::IR)?,
+            environment: own_channel::<AmbientSample>(writer, topics::ENVIRONMENT)?,
+            measurement: own_channel::<Measurement>(writer, topics::MEASUREMENT)?,
+            log: foxglove_channel::<fg::Log>(writer, topics::LOG)?,
+        })
+    }
+}
+
+fn foxglove_channel<M: Encode>(writer: &mut Writer<BufWriter<File>>, topic: &str) -> mcap::McapResult<u16> {
+    let schema = match M::get_schema() {
+        Some(schema) => writer.add_schema(&schema.name, &schema.encoding, &schema.data)?,
+        None => 0,
+    };
+    writer.add_channel(schema, topic, &M::get_message_encoding(), &Default::default())
+}
+
+fn own_channel<M: RunMessage>(writer: &mut Writer<BufWriter<File>>, topic: &str) -> mcap::McapResult<u16> {
+    let schema = writer.add_schema(M::FULL_NAME, "protobuf", FILE_DESCRIPTOR_SET)?;
+    writer.add_channel(schema, topic, "protobuf", &Default::default())
+}
+
+fn sync(path: &Path) -> Result<(), String> {
+    File::open(path).and_then(|f| f.sync_all()).map_err(|e| e.to_string())
+}
+
+// The microphone's samples as little-endian 16 bit: the upper bits of integers, the nearest of floats.
+fn top_16_bits(recording: &SweepRecording) -> Vec<u8> {
+    let bytes = &recording.microphone;
+    match recording.format() {
+        SampleFormat::S16le => bytes.clone(),
+        SampleFormat::S24le => bytes.chunks_exact(3).flat_map(|b| [b[1], b[2]]).collect(),
+        SampleFormat::S32le => bytes.chunks_exact(4).flat_map(|b| [b[2], b[3]]).collect(),
+        SampleFormat::F32le => bytes
+            .chunks_exact(4)
+            .flat_map(|b| ((f32::from_le_bytes([b[0], b[1], b[2], b[3]]) * 32_767.0) as i16).to_le_bytes())
+            .collect(),
+        SampleFormat::Unspecified => Vec::new(),
+    }
+}

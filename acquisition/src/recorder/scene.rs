@@ -1,0 +1,126 @@
+//! The messages that viewers show: frames, poses, the panel, its points, audio and log. Metres and quaternions.
+
+use echolake_schema::Timestamp;
+use foxglove::messages::{
+    Color, FrameTransform, FrameTransforms, Log, ModelPrimitive, PackedElementField, PointCloud, Pose, PoseInFrame,
+    Quaternion, RawAudio, SceneEntity, SceneUpdate, Timestamp as FoxgloveTime, Vector3, log,
+    packed_element_field::NumericType,
+};
+
+use super::LogLevel;
+use crate::relief::HeightField;
+
+/// The panel stands on a table this high, m.
+const TABLE_M: f64 = 0.8;
+/// Length of the holders between flange and microphone or speaker, m.
+const HOLDER_M: f64 = 0.15;
+/// Points along each side of `/panel/points`.
+const POINTS_A_SIDE: usize = 137;
+
+const NO_TURN: Quaternion = Quaternion { x: 0.0, y: 0.0, z: 0.0, w: 1.0 };
+
+/// `/tf`: the panel in the world, and each arm's flange and tool over the panel.
+pub(super) fn frames(at: Timestamp, microphone_mm: [f64; 3], speaker_mm: [f64; 3]) -> FrameTransforms {
+    let holder = Vector3 { x: 0.0, y: 0.0, z: -HOLDER_M };
+    let flange = |mm: [f64; 3]| {
+        let Vector3 { x, y, z } = metres(mm);
+        Vector3 { x, y, z: z + HOLDER_M }
+    };
+    let frame = |parent: &str, child: &str, translation: Vector3| FrameTransform {
+        timestamp: Some(time(at)),
+        parent_frame_id: parent.into(),
+        child_frame_id: child.into(),
+        translation: Some(translation),
+        rotation: Some(NO_TURN),
+    };
+    FrameTransforms {
+        transforms: vec![
+            frame("world", "panel", Vector3 { x: 0.0, y: 0.0, z: TABLE_M }),
+            frame("panel", "microphone_flange", flange(microphone_mm)),
+            frame("microphone_flange", "microphone", holder),
+            frame("panel", "speaker_flange", flange(speaker_mm)),
+            frame("speaker_flange", "speaker", holder),
+        ],
+    }
+}
+
+/// A position over the panel.
+pub(super) fn pose(at: Timestamp, position_mm: [f64; 3]) -> PoseInFrame {
+    let pose = Pose { position: Some(metres(position_mm)), orientation: Some(NO_TURN) };
+    PoseInFrame { timestamp: Some(time(at)), frame_id: "panel".into(), pose: Some(pose) }
+}
+
+/// `/panel/scene`: the panel as a GLB model. Viewers turn GLB's Y-up into Z-up themselves.
+pub(super) fn panel(at: Timestamp, glb: Vec<u8>) -> SceneUpdate {
+    let model = ModelPrimitive {
+        pose: Some(Pose { position: Some(Vector3 { x: 0.0, y: 0.0, z: 0.0 }), orientation: Some(NO_TURN) }),
+        scale: Some(Vector3 { x: 1.0, y: 1.0, z: 1.0 }),
+        color: Some(Color { r: 0.8, g: 0.78, b: 0.74, a: 1.0 }),
+        override_color: false,
+        url: String::new(),
+        media_type: "model/gltf-binary".into(),
+        data: glb.into(),
+    };
+    let entity = SceneEntity {
+        timestamp: Some(time(at)),
+        frame_id: "panel".into(),
+        id: "panel".into(),
+        frame_locked: true,
+        models: vec![model],
+        ..SceneEntity::default()
+    };
+    SceneUpdate { deletions: Vec::new(), entities: vec![entity] }
+}
+
+/// `/panel/points`: the relief, thinned out.
+pub(super) fn points(at: Timestamp, heights: &HeightField) -> PointCloud {
+    let step = heights.cells().div_ceil(POINTS_A_SIDE);
+    let mut data = Vec::new();
+    for iy in (0..heights.cells()).step_by(step) {
+        for ix in (0..heights.cells()).step_by(step) {
+            let mm = [heights.centre_mm(ix), heights.centre_mm(iy), f64::from(heights.at(ix, iy))];
+            data.extend(mm.into_iter().flat_map(|x| ((x / 1e3) as f32).to_le_bytes()));
+        }
+    }
+    let field =
+        |name: &str, offset| PackedElementField { name: name.into(), offset, r#type: NumericType::Float32 as i32 };
+    PointCloud {
+        timestamp: Some(time(at)),
+        frame_id: "panel".into(),
+        pose: Some(Pose { position: Some(Vector3 { x: 0.0, y: 0.0, z: 0.0 }), orientation: Some(NO_TURN) }),
+        point_stride: 12,
+        fields: vec![field("x", 0), field("y", 4), field("z", 8)],
+        data: data.into(),
+    }
+}
+
+/// `/sweep/audio`.
+pub(super) fn audio(at: Timestamp, data: Vec<u8>, sample_rate: u32) -> RawAudio {
+    RawAudio {
+        timestamp: Some(time(at)),
+        data: data.into(),
+        format: "pcm-s16".into(),
+        sample_rate,
+        number_of_channels: 1,
+    }
+}
+
+/// `/log`.
+pub(super) fn log(at: Timestamp, level: LogLevel, name: &str, message: &str) -> Log {
+    let level = match level {
+        LogLevel::Debug => log::Level::Debug,
+        LogLevel::Info => log::Level::Info,
+        LogLevel::Warning => log::Level::Warning,
+        LogLevel::Error => log::Level::Error,
+    };
+    Log { timestamp: Some(time(at)), level: level as i32, message: message.into(), name: name.into(), ..Log::default() }
+}
+
+fn metres([x, y, z]: [f64; 3]) -> Vector3 {
+    Vector3 { x: x / 1e3, y: y / 1e3, z: z / 1e3 }
+}
+
+fn time(at: Timestamp) -> FoxgloveTime {
+    let secs = u32::try_from(at.0.div_euclid(1_000_000_000)).unwrap_or(0);
+    FoxgloveTime::new(secs, at.0.rem_euclid(1_000_000_000) as u32)
+}

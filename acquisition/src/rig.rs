@@ -1,0 +1,122 @@
+//! What a rig can do, as traits: robots, audio interface, ambient sensor. Every implementation passes the checks of
+//! [`crate::conformance`].
+
+use echolake_schema::Timestamp;
+use echolake_schema::manifest::Origin;
+
+/// Two arms: one carries the microphone, one the speaker. Positions in mm over the panel.
+pub trait Robots: Send {
+    /// Moves both and waits until they stand; returns where. A position that cannot be reached is refused, and then
+    /// nothing has moved.
+    ///
+    /// # Errors
+    /// [`Error::Unreachable`] or [`Error::Device`].
+    fn move_to(&mut self, microphone_mm: [f64; 3], speaker_mm: [f64; 3]) -> Result<Positions, Error>;
+
+    /// Switches the drives; with them off the arms are silent and hold by their brakes.
+    ///
+    /// # Errors
+    /// [`Error::Device`].
+    fn power(&mut self, power: Power) -> Result<(), Error>;
+}
+
+/// Where the arms stand, mm.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Positions {
+    /// The microphone.
+    pub microphone_mm: [f64; 3],
+    /// The speaker.
+    pub speaker_mm: [f64; 3],
+}
+
+/// The drives' power.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Power {
+    /// The arms can move.
+    On,
+    /// The arms are silent.
+    Off,
+}
+
+/// Plays one channel and records two at the same time, sample by sample.
+pub trait AudioInterface: Send {
+    /// Sampling rate, Hz.
+    fn rate_hz(&self) -> f64;
+
+    /// Plays `output` (1.0 is full scale) and records as many samples of microphone and loopback; blocks until it is
+    /// over. A take with a gap or an overrun is an error, never a take.
+    ///
+    /// # Errors
+    /// [`Error::Device`].
+    fn play_and_record(&mut self, output: &[f32], take: &mut Take) -> Result<(), Error>;
+}
+
+/// One recording: signed 24-bit samples, full scale 2^23.
+#[derive(Debug, Clone, Default)]
+pub struct Take {
+    /// When its first sample was taken.
+    pub started: Option<Timestamp>,
+    /// The measurement microphone.
+    pub microphone: Vec<i32>,
+    /// The output, looped back.
+    pub loopback: Vec<i32>,
+}
+
+/// Measures the air of the room.
+pub trait AmbientSensor: Send {
+    /// The latest reading; never older than the one before.
+    ///
+    /// # Errors
+    /// [`Error::Device`].
+    fn read(&mut self) -> Result<Reading, Error>;
+}
+
+/// One reading.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Reading {
+    /// When.
+    pub at: Timestamp,
+    /// Temperature, C.
+    pub temperature_c: f64,
+    /// Relative humidity, %.
+    pub humidity_pct: f64,
+    /// Pressure, hPa.
+    pub pressure_hpa: f64,
+    /// Highest sound pressure level outside since the last reading, dB re 20 uPa.
+    pub outside_level_db: f64,
+}
+
+/// A rig's devices.
+pub struct Devices {
+    /// The arms.
+    pub robots: Box<dyn Robots>,
+    /// The audio interface.
+    pub audio: Box<dyn AudioInterface>,
+    /// The ambient sensor.
+    pub sensor: Box<dyn AmbientSensor>,
+    /// Whether they are real.
+    pub origin: Origin,
+}
+
+/// Why a device did not do what it was told.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum Error {
+    /// The arms cannot go there.
+    #[error("the robots cannot reach microphone {microphone_mm:?}, speaker {speaker_mm:?} mm: {reason}")]
+    Unreachable {
+        /// The microphone's position.
+        microphone_mm: [f64; 3],
+        /// The speaker's position.
+        speaker_mm: [f64; 3],
+        /// Why.
+        reason: &'static str,
+    },
+    /// The device failed.
+    #[error("{device}: {reason}")]
+    Device {
+        /// Which.
+        device: &'static str,
+        /// What it says.
+        reason: String,
+    },
+}

@@ -1,0 +1,3 @@
+//! Implementations of the rig's traits.
+
+pub mod simulated;

@@ -1,0 +1,319 @@
+//! The simulated rig: computed, never measured, and said to be so in every run it makes ([`Origin::Simulated`]).
+//!
+//! The room's air drifts over the simulated hours; the panel reflects as [`KirchhoffPlan`] says, times its
+//! material's factor; the direct sound goes as 1/d; both channels pass the converter; noise is added, and now and
+//! then something outside spoils a take. The same seed gives the same bits.
+
+use std::f64::consts::{PI, TAU};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+
+use echolake_dsp::deconvolution::fast_length;
+use echolake_dsp::temperature::speed_of_sound;
+use echolake_schema::manifest::Origin;
+use echolake_schema::{Grid, Rig, Timestamp};
+use rand::{Rng as _, SeedableRng as _};
+use rand_chacha::ChaCha8Rng;
+use rand_distr::{Distribution as _, StandardNormal};
+use realfft::num_complex::Complex;
+use realfft::{ComplexToReal, RealFftPlanner, RealToComplex};
+
+use crate::kirchhoff::{KirchhoffPlan, KirchhoffScratch};
+use crate::relief::HeightField;
+use crate::rig::{AmbientSensor, AudioInterface, Devices, Error, Positions, Power, Reading, Robots, Take};
+
+/// Facets along each side: 2.14 mm, a quarter of the wavelength at 40 kHz.
+pub const FACETS: usize = 274;
+/// Samples of a simulated response: the farthest echo at 1.55 m arrives before them.
+const RESPONSE: usize = 512;
+/// Time of one measurement (Rust et al. 2021): moving, settling, sweep.
+const TAKE_SECS: f64 = 12.3;
+/// Gain from pressure at 1 m to full scale: the direct sound at 75 mm stays 9 dB under it.
+const MICROPHONE_GAIN: f64 = 0.037;
+/// Noise of the channels, rms re full scale: -102 and -108 dB.
+const NOISE: [f64; 2] = [8e-6, 4e-6];
+/// The converter: a pole above the audio range, and a delay that both channels share.
+const CONVERTER_POLE_HZ: f64 = 60_000.0;
+const CONVERTER_DELAY: f64 = 37.0;
+/// Share of takes that something outside spoils, and how loud it is: dB re 20 uPa outside, rms re full scale inside.
+const SPOILED: f64 = 0.004;
+const SPOILED_LEVEL_DB: f64 = 78.0;
+const SPOILED_NOISE: f64 = 3e-3;
+/// Full scale of 24 bits.
+const FULL_SCALE: f64 = 8_388_608.0;
+
+/// What is simulated.
+#[derive(Debug, Clone)]
+pub struct Simulation<'a> {
+    /// The rig.
+    pub rig: &'a Rig,
+    /// The panel.
+    pub relief: &'a HeightField,
+    /// Its pressure reflection factor.
+    pub reflection_factor: f64,
+    /// When the first take begins.
+    pub start: Timestamp,
+    /// Which room, drift and noise.
+    pub seed: u64,
+}
+
+/// What the devices share.
+struct World {
+    grid: Grid,
+    now: Timestamp,
+    start: Timestamp,
+    power: Power,
+    /// Where microphone and speaker stand, as points of the grid.
+    stand: [usize; 2],
+    air: Air,
+    rng: ChaCha8Rng,
+    /// Level outside during the last take.
+    outside_level_db: f64,
+}
+
+/// The air's slow course.
+struct Air {
+    phase: f64,
+    walk: f64,
+}
+
+type Shared = Arc<Mutex<World>>;
+
+/// The devices of a simulated rig.
+///
+/// # Errors
+/// [`Error::Device`] where the rig's grid has no points.
+pub fn devices(simulation: &Simulation<'_>) -> Result<Devices, Error> {
+    let failed = |e: echolake_schema::Error| Error::Device { device: "simulated rig", reason: e.to_string() };
+    let grid = simulation.rig.grid().map_err(failed)?;
+    let mut rng = ChaCha8Rng::seed_from_u64(simulation.seed);
+    let points: Vec<_> = grid.points().iter().map(|p| p.position_mm).collect();
+    let rate_hz = simulation.rig.sweep.rate_hz.get();
+    let plan = KirchhoffPlan::new(simulation.relief, &points, rate_hz, RESPONSE);
+    let world = Arc::new(Mutex::new(World {
+        grid,
+        now: simulation.start,
+        start: simulation.start,
+        power: Power::Off,
+        stand: [0, 1],
+        air: Air { phase: rng.random_range(0.0..TAU), walk: 0.0 },
+        rng,
+        outside_level_db: 42.0,
+    }));
+    Ok(Devices {
+        robots: Box::new(SimulatedRobots(world.clone())),
+        audio: Box::new(SimulatedAudio {
+            world: world.clone(),
+            rate_hz,
+            reflection_factor: simulation.reflection_factor,
+            scratch: plan.scratch(),
+            response: vec![0.0; RESPONSE],
+            plan,
+            output: None,
+        }),
+        sensor: Box::new(SimulatedSensor(world)),
+        origin: Origin::Simulated,
+    })
+}
+
+fn lock(world: &Shared) -> MutexGuard<'_, World> {
+    world.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+impl World {
+    fn temperature_c(&self) -> f64 {
+        let hours = (self.now.0 - self.start.0) as f64 / 3.6e12;
+        21.5 + 0.8 * (TAU * hours / 7.0 + self.air.phase).sin() + self.air.walk
+    }
+
+    fn normal(&mut self) -> f64 {
+        StandardNormal.sample(&mut self.rng)
+    }
+}
+
+struct SimulatedRobots(Shared);
+
+impl Robots for SimulatedRobots {
+    fn move_to(&mut self, microphone_mm: [f64; 3], speaker_mm: [f64; 3]) -> Result<Positions, Error> {
+        let mut world = lock(&self.0);
+        let refuse = |reason| Error::Unreachable { microphone_mm, speaker_mm, reason };
+        if world.power == Power::Off {
+            return Err(refuse("the drives are off"));
+        }
+        let index = |mm| world.grid.point_at(mm).map(|p| p.id.index());
+        let stand = [index(microphone_mm), index(speaker_mm)];
+        let [Some(microphone), Some(speaker)] = stand else {
+            return Err(refuse("the simulated arms know the grid's points only"));
+        };
+        if microphone == speaker {
+            return Err(refuse("microphone and speaker would touch"));
+        }
+        world.stand = [microphone, speaker];
+        // The arms repeat to 0.02 mm. The residual is told; the simulated sound does not know of it.
+        let mut off = |mm: [f64; 3]| mm.map(|x| x + 0.01 * world.normal().clamp(-2.0, 2.0));
+        Ok(Positions { microphone_mm: off(microphone_mm), speaker_mm: off(speaker_mm) })
+    }
+
+    fn power(&mut self, power: Power) -> Result<(), Error> {
+        lock(&self.0).power = power;
+        Ok(())
+    }
+}
+
+struct SimulatedSensor(Shared);
+
+impl AmbientSensor for SimulatedSensor {
+    fn read(&mut self) -> Result<Reading, Error> {
+        let mut world = lock(&self.0);
+        let hours = (world.now.0 - world.start.0) as f64 / 3.6e12;
+        // A resolution of 0.01 C, and as much noise.
+        let temperature_c = ((world.temperature_c() + 0.005 * world.normal()) * 100.0).round() / 100.0;
+        Ok(Reading {
+            at: world.now,
+            temperature_c,
+            humidity_pct: 45.0 + 4.0 * (TAU * hours / 9.0).sin() + 0.1 * world.normal(),
+            pressure_hpa: 965.0 + 1.5 * (TAU * hours / 20.0).cos() + 0.02 * world.normal(),
+            outside_level_db: world.outside_level_db,
+        })
+    }
+}
+
+struct SimulatedAudio {
+    world: Shared,
+    rate_hz: f64,
+    reflection_factor: f64,
+    plan: KirchhoffPlan,
+    scratch: KirchhoffScratch,
+    response: Vec<f32>,
+    /// What was prepared for the output that was played last: a run plays one sweep.
+    output: Option<Played>,
+}
+
+/// An output, its loopback without noise, and the transforms that take it through the room.
+struct Played {
+    output: Vec<f32>,
+    loopback: Vec<f32>,
+    spectrum: Vec<Complex<f32>>,
+    forward: Arc<dyn RealToComplex<f32>>,
+    inverse: Arc<dyn ComplexToReal<f32>>,
+    signal: Vec<f32>,
+    product: Vec<Complex<f32>>,
+    work: Vec<Complex<f32>>,
+}
+
+impl AudioInterface for SimulatedAudio {
+    fn rate_hz(&self) -> f64 {
+        self.rate_hz
+    }
+
+    fn play_and_record(&mut self, output: &[f32], take: &mut Take) -> Result<(), Error> {
+        let mut world = lock(&self.world);
+        world.now = world.now.plus_secs(TAKE_SECS);
+        world.air.walk += 0.002 * world.normal();
+        let spoiled = world.rng.random_bool(SPOILED);
+        let level = if spoiled { SPOILED_LEVEL_DB } else { 42.0 };
+        world.outside_level_db = level + 1.5 * world.normal();
+        let c = speed_of_sound(world.temperature_c());
+        self.plan.response(world.stand, c, self.reflection_factor, &mut self.scratch, &mut self.response);
+        let played = match &mut self.output {
+            Some(played) if played.output == output => played,
+            other => other.insert(Played::new(output, self.rate_hz)),
+        };
+        played.through(&self.response);
+        let noise = if spoiled { SPOILED_NOISE } else { NOISE[0] };
+        take.started = Some(world.now);
+        quantise(&played.signal[..output.len()], MICROPHONE_GAIN, noise, &mut world, &mut take.microphone);
+        quantise(&played.loopback, 1.0, NOISE[1], &mut world, &mut take.loopback);
+        Ok(())
+    }
+}
+
+impl Played {
+    fn new(output: &[f32], rate_hz: f64) -> Self {
+        // Room for the response and the converter's delay behind the output, so that nothing wraps around.
+        let len = fast_length(output.len() + RESPONSE + 2 * CONVERTER_DELAY as usize);
+        let mut planner = RealFftPlanner::new();
+        let (forward, inverse) = (planner.plan_fft_forward(len), planner.plan_fft_inverse(len));
+        let mut played = Self {
+            output: output.to_vec(),
+            loopback: Vec::new(),
+            spectrum: forward.make_output_vec(),
+            signal: vec![0.0; len],
+            product: forward.make_output_vec(),
+            work: vec![Complex::default(); forward.get_scratch_len().max(inverse.get_scratch_len())],
+            forward,
+            inverse,
+        };
+        played.signal[..output.len()].copy_from_slice(output);
+        let _ = played.forward.process_with_scratch(&mut played.signal, &mut played.spectrum, &mut played.work);
+        for (k, x) in played.spectrum.iter_mut().enumerate() {
+            let hz = k as f64 * rate_hz / len as f64;
+            let pole = Complex::new(1.0, hz / CONVERTER_POLE_HZ).inv();
+            let delay = Complex::from_polar(1.0, -2.0 * PI * k as f64 * CONVERTER_DELAY / len as f64);
+            let response = pole * delay;
+            *x *= Complex::new(response.re as f32, response.im as f32);
+        }
+        played.through(&[1.0]);
+        played.loopback = played.signal[..output.len()].to_vec();
+        played
+    }
+
+    // `signal` becomes the output through the converter and this response.
+    fn through(&mut self, response: &[f32]) {
+        let len = self.signal.len();
+        self.signal.fill(0.0);
+        self.signal[..response.len()].copy_from_slice(response);
+        // Lengths are the plan's own, so the transforms cannot refuse; they ask for real ends only.
+        let _ = self.forward.process_with_scratch(&mut self.signal, &mut self.product, &mut self.work);
+        let scale = 1.0 / len as f32;
+        self.product.iter_mut().zip(&self.spectrum).for_each(|(p, s)| *p = *p * *s * scale);
+        self.product[0].im = 0.0;
+        if let Some(last) = self.product.last_mut() {
+            last.im = 0.0;
+        }
+        let _ = self.inverse.process_with_scratch(&mut self.product, &mut self.signal, &mut self.work);
+    }
+}
+
+// 24 bits with noise; what is louder than full scale is clipped.
+fn quantise(signal: &[f32], gain: f64, noise: f64, world: &mut World, out: &mut Vec<i32>) {
+    out.clear();
+    out.extend(signal.iter().map(|x| {
+        let value = f64::from(*x) * gain + noise * world.normal();
+        (value * FULL_SCALE).round().clamp(-FULL_SCALE, FULL_SCALE - 1.0) as i32
+    }));
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::conformance;
+    use crate::relief::Relief;
+
+    fn simulated(seed: u64) -> Devices {
+        let (rig, relief) = (Rig::paper(), Relief::Flat.height_field(40));
+        let start = Timestamp(1_767_600_000_000_000_000);
+        devices(&Simulation { rig: &rig, relief: &relief, reflection_factor: 0.83, start, seed }).expect("devices")
+    }
+
+    #[test]
+    fn it_conforms() {
+        let mut devices = simulated(1);
+        let (near, far) = ([-187.5, -187.5, 124.0], [-187.5, -112.5, 124.0]);
+        conformance::robots(devices.robots.as_mut(), [near, far], [near, near]);
+        conformance::robots(devices.robots.as_mut(), [near, far], [near, [0.0, 0.0, 5_000.0]]);
+        conformance::audio(devices.audio.as_mut());
+        conformance::sensor(devices.sensor.as_mut());
+        assert_eq!(devices.origin, Origin::Simulated);
+    }
+
+    #[test]
+    fn seeds_tell_runs_apart_and_repeat_them() {
+        let take = |seed| {
+            let (mut devices, mut take) = (simulated(seed), Take::default());
+            devices.audio.play_and_record(&[0.5; 500], &mut take).expect("a take");
+            take.microphone
+        };
+        assert_eq!(take(1), take(1));
+        assert_ne!(take(1), take(2));
+    }
+}
