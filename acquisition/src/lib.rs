@@ -11,6 +11,7 @@
 pub mod assessment;
 pub mod conformance;
 pub mod controller;
+pub mod import;
 pub mod kirchhoff;
 pub mod mesh;
 pub mod recorder;

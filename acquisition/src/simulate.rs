@@ -13,9 +13,9 @@ use crate::relief::{HeightField, Relief};
 use crate::rigs::simulated::{FACETS, Simulation, devices};
 
 /// Cells along each side of the recorded panel mesh.
-const MESH_CELLS: usize = 117;
+pub(crate) const MESH_CELLS: usize = 117;
 /// The back of a generated panel, mm.
-const BACK_MM: f32 = -30.0;
+pub(crate) const BACK_MM: f32 = -30.0;
 /// Pairs between two checkpoints; a simulated run that is lost is made again.
 const CHECKPOINT_EVERY: usize = 200;
 
@@ -89,9 +89,8 @@ impl SimulatedRun<'_> {
             seed: self.seed,
         };
         let devices = devices(&simulation).map_err(controller::Error::from)?;
-        let tag = (self.seed ^ (self.seed >> 16) ^ (self.seed >> 32)) as u16;
         let manifest = RunManifest {
-            run_id: RunId::compose(self.start, &self.surface, tag)?,
+            run_id: self.run_id()?,
             surface_id: self.surface.clone(),
             started: self.start,
             software: concat!("echolake ", env!("CARGO_PKG_VERSION")).to_owned(),
@@ -105,13 +104,26 @@ impl SimulatedRun<'_> {
         });
         let relief = RecordedRelief { heights: &prepared.heights, mesh: &prepared.mesh, original };
         let start = RunStart { manifest: &manifest, rig: self.rig, surface: &prepared.record, relief: Some(relief) };
-        let path = self.folder.join(format!("{}.mcap", manifest.run_id));
+        let path = self.path()?;
         let mut recorder = Recorder::create(&path, &start).map_err(controller::Error::from)?;
         let mut controller = RunController::new(self.rig, devices)?;
         let options = RunOptions { keep: self.keep, checkpoint_every: CHECKPOINT_EVERY };
         let grid = self.rig.grid()?;
         let end = controller.run(&mut recorder, grid.pairs(), options, stop, progress)?;
         Ok((recorder.finish(&end).map_err(controller::Error::from)?, end))
+    }
+
+    /// The run's file.
+    ///
+    /// # Errors
+    /// [`Error::Schema`] where the surface's name is too long for a run's.
+    pub fn path(&self) -> Result<PathBuf, Error> {
+        Ok(self.folder.join(format!("{}.mcap", self.run_id()?)))
+    }
+
+    fn run_id(&self) -> Result<RunId, Error> {
+        let tag = (self.seed ^ (self.seed >> 16) ^ (self.seed >> 32)) as u16;
+        Ok(RunId::compose(self.start, &self.surface, tag)?)
     }
 
     fn prepare(&self) -> Result<Prepared, Error> {

@@ -47,7 +47,8 @@ fn print(text: &str) -> std::io::Result<()> {
 /// The rig of a file; else the lake's; else `otherwise`.
 async fn rig_or(file: Option<&Path>, lake_url: &str, otherwise: impl FnOnce() -> Rig) -> anyhow::Result<Rig> {
     if let Some(file) = file {
-        let text = std::fs::read_to_string(file).with_context(|| format!("cannot read rig file `{}`", file.display()))?;
+        let text =
+            std::fs::read_to_string(file).with_context(|| format!("cannot read rig file `{}`", file.display()))?;
         return Rig::from_toml(&text).with_context(|| format!("rig file `{}`", file.display()));
     }
     match Lake::open(lake_url).await {

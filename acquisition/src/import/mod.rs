@@ -1,0 +1,124 @@
+//! Existing measurements become runs: WAV files listed in a manifest, and the published GIR data set.
+
+mod gir;
+mod wav;
+mod wav_file;
+mod wav_manifest;
+
+use std::path::{Path, PathBuf};
+
+use echolake_schema::{RunId, SurfaceId, Timestamp};
+
+pub use gir::{GIR_IR_LEN, import_gir};
+pub use wav::{check_wav, import_wav, sampling_rate_of};
+
+/// A run made of somebody's files.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ImportedRun {
+    /// Its file.
+    pub path: PathBuf,
+    /// Its name.
+    pub run_id: RunId,
+    /// Its surface.
+    pub surface: SurfaceId,
+    /// Measurements in it.
+    pub measurements: usize,
+    /// What is not as it should be, in words; it was imported all the same.
+    pub warnings: Vec<String>,
+}
+
+/// How an import is made.
+#[derive(Debug, Clone, Copy)]
+pub struct ImportOptions<'a> {
+    /// Time of what has none of its own.
+    pub started: Timestamp,
+    /// Folder of the runs' files.
+    pub folder: &'a Path,
+}
+
+/// Why an import is not made. Nothing of it is left behind.
+#[derive(Debug, thiserror::Error)]
+pub enum Error {
+    /// The system refused.
+    #[error("cannot read `{}`: {reason}", path.display())]
+    Read {
+        /// The file.
+        path: PathBuf,
+        /// Why.
+        reason: String,
+    },
+    /// The manifest has a wrong header.
+    #[error("manifest `{}`: {what}; hint: the columns are {}", path.display(), wav_manifest::COLUMNS.join(", "))]
+    Header {
+        /// The manifest.
+        path: PathBuf,
+        /// What is wrong.
+        what: String,
+    },
+    /// A row of the manifest is wrong.
+    #[error("manifest `{}`, line {line}, column `{column}`: {what}", path.display())]
+    Row {
+        /// The manifest.
+        path: PathBuf,
+        /// The line, 1 the header's.
+        line: u64,
+        /// The column.
+        column: &'static str,
+        /// What is wrong, expected and actual.
+        what: String,
+    },
+    /// A file of the GIR data set is not as it should be.
+    #[error("`{}`: {place}: {actual}, expected {expected}", path.display())]
+    Gir {
+        /// The file.
+        path: PathBuf,
+        /// The array or line.
+        place: String,
+        /// What is there.
+        actual: String,
+        /// What should be.
+        expected: String,
+    },
+    /// The run cannot be recorded.
+    #[error(transparent)]
+    Record(#[from] crate::recorder::Error),
+    /// The rig's settings make no plan.
+    #[error("rig `{rig}` does not fit: {cause}")]
+    Plan {
+        /// The rig.
+        rig: String,
+        /// Why.
+        cause: echolake_dsp::Error,
+    },
+    /// A name or rig is not valid.
+    #[error(transparent)]
+    Schema(#[from] echolake_schema::Error),
+}
+
+/// Runs that are written; unless they are kept, they are removed again.
+#[derive(Default)]
+struct Written {
+    paths: Vec<PathBuf>,
+    kept: bool,
+}
+
+impl Written {
+    fn keep(mut self) {
+        self.kept = true;
+    }
+}
+
+impl Drop for Written {
+    fn drop(&mut self) {
+        if self.kept {
+            return;
+        }
+        for path in &self.paths {
+            let mut partial = path.clone().into_os_string();
+            partial.push(".partial");
+            // What cannot be removed was most likely never there; the import's own error is the one to tell.
+            let _ = std::fs::remove_file(path);
+            let _ = std::fs::remove_file(PathBuf::from(partial));
+        }
+    }
+}

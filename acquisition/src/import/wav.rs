@@ -1,0 +1,206 @@
+//! WAV files become runs, one a surface. One row at a time is in memory.
+
+use std::path::Path;
+
+use echolake_dsp::chain::raw_len;
+use echolake_dsp::deconvolution::{DeconvolutionParams, DeconvolutionPlan, TransformLength};
+use echolake_dsp::geometry::direct_mm;
+use echolake_dsp::temperature::speed_of_sound;
+use echolake_schema::manifest::{Origin, RunEnd, RunManifest};
+use echolake_schema::messages::{AmbientSample, ImpulseResponse, Measurement, SweepRecording, Verdict};
+use echolake_schema::{Grid, Rig, RunId, SampleRate, SurfaceId, SurfaceRecord, Timestamp};
+
+use super::wav_manifest::{self, Row};
+use super::{Error, ImportOptions, ImportedRun, Written};
+use crate::assessment::Assessor;
+use crate::recorder::{LogLevel, Recorder, RunStart};
+
+/// Who speaks in the log.
+const NAME: &str = "import wav";
+
+/// The sampling rate of a manifest's first recording.
+///
+/// # Errors
+/// [`Error`], naming the manifest and the place.
+pub fn sampling_rate_of(manifest: &Path) -> Result<SampleRate, Error> {
+    Ok(SampleRate::new(f64::from(wav_manifest::first_recording(manifest)?.spec.sample_rate))?)
+}
+
+/// Imports all rows of a manifest; `progress` hears how many are done, of how many.
+///
+/// # Errors
+/// [`Error`], naming the place; every row is checked before the first is imported, and nothing half-written stays.
+pub fn import_wav(
+    manifest: &Path,
+    rig: &Rig,
+    options: ImportOptions<'_>,
+    progress: &mut dyn FnMut(usize, usize),
+) -> Result<Vec<ImportedRun>, Error> {
+    let grid = rig.grid()?;
+    let surfaces = wav_manifest::read(manifest, rig, &grid)?;
+    let total = surfaces.values().map(Vec::len).sum();
+    let (mut runs, mut written, mut done) = (Vec::new(), Written::default(), 0);
+    for (tag, (surface, rows)) in (0u16..).zip(surfaces) {
+        let import = Import { manifest, rig, grid: &grid, options };
+        let run = import.surface(surface, &rows, tag, &mut written, &mut || {
+            done += 1;
+            progress(done, total);
+        })?;
+        runs.push(run);
+    }
+    written.keep();
+    Ok(runs)
+}
+
+struct Import<'a> {
+    manifest: &'a Path,
+    rig: &'a Rig,
+    grid: &'a Grid,
+    options: ImportOptions<'a>,
+}
+
+impl Import<'_> {
+    fn surface(
+        &self,
+        surface: SurfaceId,
+        rows: &[Row],
+        tag: u16,
+        written: &mut Written,
+        done: &mut dyn FnMut(),
+    ) -> Result<ImportedRun, Error> {
+        let times: Vec<_> = (0u32..).zip(rows).map(|(i, r)| self.time(r, i)).collect();
+        let started = times.iter().copied().min().unwrap_or(self.options.started);
+        let run_id = RunId::compose(started, &surface, tag)?;
+        let run = RunManifest {
+            run_id: run_id.clone(),
+            surface_id: surface.clone(),
+            started,
+            software: concat!("echolake ", env!("CARGO_PKG_VERSION")).to_owned(),
+            rig: self.rig.name.clone(),
+            origin: Origin::ImportedWav,
+        };
+        let record = SurfaceRecord { typology: "imported".into(), ..SurfaceRecord::default() };
+        let path = self.options.folder.join(format!("{run_id}.mcap"));
+        let start = RunStart { manifest: &run, rig: self.rig, surface: &record, relief: None };
+        let mut recorder = Recorder::create(&path, &start)?;
+        written.paths.push(path);
+        recorder.log(started, LogLevel::Info, NAME, &format!("{} recordings", rows.len()))?;
+        let mut warnings = Vec::new();
+        for (row, at) in rows.iter().zip(&times) {
+            warnings.extend(self.row(&mut recorder, row, *at)?);
+            done();
+        }
+        let count = rows.len() as u64;
+        let ended = times.iter().copied().max().unwrap_or(started);
+        let path = recorder.finish(&RunEnd { ended, accepted: count, rejected: 0, attempts: count })?;
+        Ok(ImportedRun { path, run_id, surface, measurements: rows.len(), warnings })
+    }
+
+    fn time(&self, row: &Row, index: u32) -> Timestamp {
+        row.recorded_at.unwrap_or_else(|| self.options.started.plus_secs(f64::from(index)))
+    }
+
+    // Import keeps what it is given: what the rig would not accept becomes words, not a refusal.
+    fn row(&self, recorder: &mut Recorder, row: &Row, at: Timestamp) -> Result<Option<String>, Error> {
+        let unread = |column, what| Error::Row { path: self.manifest.to_owned(), line: row.line, column, what };
+        let microphone = row.recording.read(row.format).map_err(|e| unread("recording", e))?;
+        let loopback = row.loopback.read(row.format).map_err(|e| unread("loopback", e))?;
+        let (rig, celsius) = (self.rig, row.celsius.get());
+        let planned = |cause| Error::Plan { rig: rig.name.clone(), cause };
+        let len = microphone.fractions.len();
+        let plan = DeconvolutionPlan::<f32>::new(DeconvolutionParams {
+            recording_len: len,
+            output_len: raw_len(rig.impulse_response.length, rig.impulse_response.reference_temperature_c.get())
+                .min(len),
+            rate_hz: rig.sweep.rate_hz.get(),
+            low_hz: rig.sweep.low_hz,
+            high_hz: rig.sweep.high_hz,
+            floor_db: rig.impulse_response.floor_db,
+            length: TransformLength::Fast,
+        })
+        .map_err(planned)?;
+        let mut samples = vec![0.0; plan.output_len()];
+        plan.run(&microphone.fractions, &loopback.fractions, &mut samples, &mut plan.scratch())
+            .map_err(|e| unread("loopback", e.to_string()))?;
+        let [m, s] = [row.pair.microphone, row.pair.speaker].map(|id| self.grid.points()[id.index()].position_mm);
+        let arrival = direct_mm(m, s) / 1e3 / speed_of_sound(celsius);
+        let clipped = microphone.clipped + loopback.clipped;
+        let assessment = Assessor::new(rig, len)
+            .and_then(|mut a| a.assess(&microphone.fractions, &loopback.fractions, arrival, clipped))
+            .map_err(planned)?;
+        // Where a foreign rig stands is known less well than its files say, so its arrival is told, not judged.
+        let mut judged = assessment;
+        judged.arrival_error_us = 0.0;
+        let reasons = judged.objections(&rig.validation, f64::NAN);
+        let sample_rate_hz = rig.sweep.rate_hz.get();
+        recorder.poses(at, m, s)?;
+        recorder.environment(
+            at,
+            &AmbientSample {
+                temperature_c: celsius,
+                humidity_pct: row.humidity_pct,
+                pressure_hpa: row.pressure_hpa,
+                outside_level_db: f64::NAN,
+            },
+        )?;
+        recorder.sweep(
+            at,
+            &SweepRecording {
+                pair_id: row.pair.id.0,
+                attempt: row.attempt,
+                sample_rate_hz,
+                sample_count: len as u32,
+                format: row.format.into(),
+                microphone: microphone.bytes,
+                loopback: loopback.bytes,
+                temperature_c: celsius,
+            },
+        )?;
+        recorder.ir(
+            at,
+            &ImpulseResponse {
+                pair_id: row.pair.id.0,
+                attempt: row.attempt,
+                sample_rate_hz,
+                samples,
+                temperature_c: celsius,
+                temperature_corrected: false,
+            },
+        )?;
+        let warning = (!reasons.is_empty()).then(|| format!("line {}: {}", row.line, reasons.join("; ")));
+        recorder.measurement(
+            at,
+            &Measurement {
+                pair_id: row.pair.id.0,
+                attempt: row.attempt,
+                microphone: row.pair.microphone.0,
+                speaker: row.pair.speaker.0,
+                verdict: Verdict::Accepted.into(),
+                snr_db: assessment.snr_db,
+                clipped_samples: clipped,
+                loopback_level_dbfs: assessment.loopback_dbfs,
+                arrival_error_us: assessment.arrival_error_us,
+                outside_level_db: f64::NAN,
+                temperature_c: celsius,
+                humidity_pct: row.humidity_pct,
+                pressure_hpa: row.pressure_hpa,
+                reasons,
+                microphone_residual_mm: f64::NAN,
+                speaker_residual_mm: f64::NAN,
+            },
+        )?;
+        if let Some(warning) = &warning {
+            recorder.log(at, LogLevel::Warning, NAME, warning)?;
+        }
+        recorder.checkpoint()?;
+        Ok(warning)
+    }
+}
+
+/// Checks all rows of a manifest and the files that they name, and imports nothing.
+///
+/// # Errors
+/// As [`import_wav`].
+pub fn check_wav(manifest: &Path, rig: &Rig) -> Result<(), Error> {
+    wav_manifest::read(manifest, rig, &rig.grid()?).map(drop)
+}

@@ -1,0 +1,144 @@
+//! One channel of a WAV file, checked before it is believed.
+
+use std::fs::File;
+use std::io::{BufReader, Read as _, Seek as _, SeekFrom};
+use std::path::{Path, PathBuf};
+
+use echolake_schema::messages::SampleFormat;
+use hound::{SampleFormat as WavFormat, WavReader, WavSpec};
+
+/// A channel of a file.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) struct WavChannel {
+    path: PathBuf,
+    channel: u16,
+    pub(super) spec: WavSpec,
+    pub(super) samples: u32,
+}
+
+/// The samples of a channel.
+pub(super) struct Samples {
+    pub(super) bytes: Vec<u8>,
+    pub(super) fractions: Vec<f32>,
+    pub(super) clipped: u32,
+}
+
+impl WavChannel {
+    /// Opens `file.wav`, or `file.wav#2` for its second channel. The text of an error says what is wrong.
+    pub(super) fn open(folder: &Path, reference: &str) -> Result<Self, String> {
+        let (name, channel) = match reference.rsplit_once('#') {
+            Some((name, number)) => {
+                let number: u16 = number.parse().map_err(|_| format!("`#{number}` is no channel number"))?;
+                (name, number)
+            }
+            None => (reference, 1),
+        };
+        let path = folder.join(name);
+        let shown = path.display();
+        let size = std::fs::metadata(&path).map_err(|e| format!("cannot read `{shown}`: {e}"))?.len();
+        if size == 0 {
+            return Err(format!("`{shown}` is empty"));
+        }
+        let reader = WavReader::open(&path).map_err(|e| format!("`{shown}` is no WAV file that can be read: {e}"))?;
+        let (spec, samples) = (reader.spec(), reader.duration());
+        drop(reader);
+        // The header is believed by hound; a file that was cut off is shorter than it says.
+        let (start, declared) = data_chunk(&path).map_err(|e| format!("`{shown}`: {e}"))?;
+        if size < start + declared {
+            let there = size.saturating_sub(start);
+            return Err(format!(
+                "`{shown}` is cut off: its header says {declared} bytes of samples, {there} are there"
+            ));
+        }
+        if samples == 0 {
+            return Err(format!("`{shown}` has no samples"));
+        }
+        if !(1..=spec.channels).contains(&channel) {
+            return Err(format!("`{shown}` has {} channels, expected one with number {channel}", spec.channels));
+        }
+        let found = Self { path, channel: channel - 1, spec, samples };
+        match found.format() {
+            Some(_) => Ok(found),
+            None => Err(format!(
+                "`{}` has {} bits a sample, expected 16, 24 or 32",
+                found.path.display(),
+                spec.bits_per_sample
+            )),
+        }
+    }
+
+    /// The format that loses nothing of it.
+    pub(super) fn format(&self) -> Option<SampleFormat> {
+        match (self.spec.sample_format, self.spec.bits_per_sample) {
+            (WavFormat::Int, 16) => Some(SampleFormat::S16le),
+            (WavFormat::Int, 24) => Some(SampleFormat::S24le),
+            (WavFormat::Int, 32) => Some(SampleFormat::S32le),
+            (WavFormat::Float, 32) => Some(SampleFormat::F32le),
+            _ => None,
+        }
+    }
+
+    /// Reads its samples, as bytes of `format`, which is its own or a wider one.
+    pub(super) fn read(&self, format: SampleFormat) -> Result<Samples, String> {
+        let failed = |e: hound::Error| format!("cannot read `{}`: {e}", self.path.display());
+        let mut reader = WavReader::open(&self.path).map_err(failed)?;
+        let (skip, step) = (usize::from(self.channel), usize::from(self.spec.channels));
+        let mut out = Samples { bytes: Vec::new(), fractions: Vec::new(), clipped: 0 };
+        if self.spec.sample_format == WavFormat::Float {
+            for sample in reader.samples::<f32>().skip(skip).step_by(step) {
+                let x = sample.map_err(failed)?;
+                if !x.is_finite() {
+                    return Err(format!("`{}` has a sample that is {x}", self.path.display()));
+                }
+                out.bytes.extend(x.to_le_bytes());
+                out.fractions.push(x);
+                out.clipped += u32::from(x.abs() >= 1.0);
+            }
+            return Ok(out);
+        }
+        let bits = u32::from(self.spec.bits_per_sample);
+        let full = 2f64.powi(bits as i32 - 1);
+        let width = format.bytes().unwrap_or(4);
+        let shift = 8 * width as u32 - bits;
+        for sample in reader.samples::<i32>().skip(skip).step_by(step) {
+            let x = sample.map_err(failed)?;
+            out.bytes.extend_from_slice(&(x << shift).to_le_bytes()[..width]);
+            out.fractions.push((f64::from(x) / full) as f32);
+            let at_full_scale = f64::from(x) <= -full || f64::from(x) >= full - 1.0;
+            out.clipped += u32::from(at_full_scale);
+        }
+        Ok(out)
+    }
+}
+
+/// The wider of two formats, where one holds the other's samples exactly.
+pub(super) fn common_format(a: SampleFormat, b: SampleFormat) -> Option<SampleFormat> {
+    match (a == b, a == SampleFormat::F32le || b == SampleFormat::F32le) {
+        (true, _) => Some(a),
+        (false, true) => None,
+        (false, false) => {
+            if a.bytes() > b.bytes() {
+                Some(a)
+            } else {
+                Some(b)
+            }
+        }
+    }
+}
+
+// Where the `data` chunk's content begins, and how long its header says it is.
+fn data_chunk(path: &Path) -> Result<(u64, u64), String> {
+    let mut file = BufReader::new(File::open(path).map_err(|e| e.to_string())?);
+    let mut at = 12;
+    loop {
+        let mut head = [0; 8];
+        file.seek(SeekFrom::Start(at)).map_err(|e| e.to_string())?;
+        file.read_exact(&mut head).map_err(|_| "it has no `data` chunk".to_owned())?;
+        let length = u64::from(u32::from_le_bytes([head[4], head[5], head[6], head[7]]));
+        if &head[..4] == b"data" {
+            return Ok((at + 8, length));
+        }
+        // Chunks begin at even places.
+        at += 8 + length + length % 2;
+    }
+}

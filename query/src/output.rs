@@ -1,0 +1,297 @@
+//! Answers as text and files: table, CSV, JSON, Parquet and Arrow, written as they come.
+
+use std::fmt::Write as _;
+use std::io::Write;
+use std::sync::Arc;
+
+use arrow::array::{Array as _, ArrayRef, AsArray as _, RecordBatch, StringArray};
+use arrow::datatypes::{DataType, Field, Schema, SchemaRef};
+use arrow::error::ArrowError;
+use arrow::util::display::{ArrayFormatter, FormatOptions};
+use arrow::util::pretty::pretty_format_batches;
+use parquet::arrow::ArrowWriter;
+use parquet::basic::{Compression, ZstdLevel};
+use parquet::errors::ParquetError;
+use parquet::file::properties::WriterProperties;
+
+use crate::Error;
+
+/// Values of a list that a table shows.
+const SHOWN: usize = 3;
+
+/// A format of answers.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Format {
+    /// For people; lists are cut short.
+    Table,
+    /// Comma-separated, lists as JSON.
+    Csv,
+    /// One array of objects.
+    Json,
+    /// Parquet, zstd.
+    Parquet,
+    /// Arrow IPC stream.
+    Arrow,
+}
+
+impl Format {
+    /// All formats.
+    pub const ALL: [Self; 5] = [Self::Table, Self::Csv, Self::Json, Self::Parquet, Self::Arrow];
+
+    /// Its name.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Table => "table",
+            Self::Csv => "csv",
+            Self::Json => "json",
+            Self::Parquet => "parquet",
+            Self::Arrow => "arrow",
+        }
+    }
+
+    /// Whether its bytes are no text.
+    pub fn is_binary(self) -> bool {
+        matches!(self, Self::Parquet | Self::Arrow)
+    }
+}
+
+/// Writes the batches of one answer.
+pub struct AnswerWriter<W: Write + Send> {
+    format: Format,
+    schema: SchemaRef,
+    rows: usize,
+    inner: Inner<W>,
+}
+
+enum Inner<W: Write + Send> {
+    Table(W, Vec<RecordBatch>),
+    Csv(arrow::csv::Writer<W>),
+    Json(arrow::json::ArrayWriter<W>),
+    Parquet(Box<ArrowWriter<W>>),
+    Arrow(arrow::ipc::writer::StreamWriter<W>),
+}
+
+impl<W: Write + Send> AnswerWriter<W> {
+    /// Begins an answer of this schema.
+    ///
+    /// # Errors
+    /// [`Error::Format`] or [`Error::Write`].
+    pub fn new(format: Format, schema: &SchemaRef, to: W) -> Result<Self, Error> {
+        let inner = match format {
+            Format::Table => Inner::Table(to, Vec::new()),
+            Format::Csv => {
+                let mut writer = arrow::csv::WriterBuilder::new().with_header(true).build(to);
+                // A header even where no row comes.
+                writer.write(&RecordBatch::new_empty(flat_schema(schema))).map_err(|e| arrow_error(format, e))?;
+                Inner::Csv(writer)
+            }
+            Format::Json => Inner::Json(arrow::json::WriterBuilder::new().with_explicit_nulls(true).build(to)),
+            Format::Parquet => {
+                let zstd = Compression::ZSTD(ZstdLevel::try_new(3).unwrap_or_default());
+                let properties = WriterProperties::builder().set_compression(zstd).build();
+                let writer = ArrowWriter::try_new(to, schema.clone(), Some(properties));
+                Inner::Parquet(Box::new(writer.map_err(|e| parquet_error(e))?))
+            }
+            Format::Arrow => {
+                let writer = arrow::ipc::writer::StreamWriter::try_new(to, schema);
+                Inner::Arrow(writer.map_err(|e| arrow_error(format, e))?)
+            }
+        };
+        Ok(Self { format, schema: schema.clone(), rows: 0, inner })
+    }
+
+    /// Writes a batch.
+    ///
+    /// # Errors
+    /// As [`AnswerWriter::new`].
+    pub fn write(&mut self, batch: &RecordBatch) -> Result<(), Error> {
+        self.rows += batch.num_rows();
+        let failed = |e| arrow_error(self.format, e);
+        match &mut self.inner {
+            Inner::Table(_, batches) => batches.push(flat(batch, short_list).map_err(failed)?),
+            Inner::Csv(writer) => writer.write(&flat(batch, json_list).map_err(failed)?).map_err(failed)?,
+            Inner::Json(writer) => writer.write(batch).map_err(failed)?,
+            Inner::Parquet(writer) => writer.write(batch).map_err(parquet_error)?,
+            Inner::Arrow(writer) => writer.write(batch).map_err(failed)?,
+        }
+        Ok(())
+    }
+
+    /// Ends the answer; returns its number of rows.
+    ///
+    /// # Errors
+    /// As [`AnswerWriter::new`].
+    pub fn finish(self) -> Result<usize, Error> {
+        let failed = |e| arrow_error(self.format, e);
+        match self.inner {
+            Inner::Table(mut to, batches) => {
+                let batches =
+                    if batches.is_empty() { vec![RecordBatch::new_empty(flat_schema(&self.schema))] } else { batches };
+                writeln!(to, "{}", pretty_format_batches(&batches).map_err(failed)?)?;
+                to.flush()?;
+            }
+            Inner::Csv(writer) => writer.into_inner().flush()?,
+            Inner::Json(mut writer) => {
+                writer.finish().map_err(failed)?;
+                let mut to = writer.into_inner();
+                writeln!(to)?;
+                to.flush()?;
+            }
+            Inner::Parquet(writer) => writer.into_inner().map_err(parquet_error)?.flush()?,
+            Inner::Arrow(writer) => writer.into_inner().map_err(failed)?.flush()?,
+        }
+        Ok(self.rows)
+    }
+}
+
+// The system's own error is kept as one, so that a closed pipe is known for what it is.
+fn arrow_error(format: Format, error: ArrowError) -> Error {
+    match error {
+        ArrowError::IoError(_, source) => Error::Write(source),
+        other => Error::Format { format: format.name(), message: other.to_string() },
+    }
+}
+
+fn parquet_error(error: ParquetError) -> Error {
+    match error {
+        ParquetError::External(source) => match source.downcast::<std::io::Error>() {
+            Ok(source) => Error::Write(*source),
+            Err(other) => Error::Format { format: "parquet", message: other.to_string() },
+        },
+        other => Error::Format { format: "parquet", message: other.to_string() },
+    }
+}
+
+fn flat_schema(schema: &SchemaRef) -> SchemaRef {
+    let fields = schema.fields().iter().map(|field| match field.data_type().is_nested() {
+        true => Field::new(field.name(), DataType::Utf8, true),
+        false => field.as_ref().clone(),
+    });
+    Arc::new(Schema::new(fields.collect::<Vec<_>>()))
+}
+
+// The batch with each nested column as text.
+fn flat(
+    batch: &RecordBatch,
+    text: fn(&ArrayRef) -> Result<Vec<String>, ArrowError>,
+) -> Result<RecordBatch, ArrowError> {
+    let columns = batch.columns().iter().map(|column| {
+        if !column.data_type().is_nested() {
+            return Ok(column.clone());
+        }
+        let mut texts = Vec::with_capacity(column.len());
+        for row in 0..column.len() {
+            let value = match column.is_null(row) {
+                true => None,
+                false => Some(match column.as_list_opt::<i32>() {
+                    Some(list) => join(&text(&list.value(row))?, list.value(row).len()),
+                    None => display(column, row)?,
+                }),
+            };
+            texts.push(value);
+        }
+        Ok(Arc::new(StringArray::from(texts)) as ArrayRef)
+    });
+    RecordBatch::try_new(flat_schema(&batch.schema()), columns.collect::<Result<_, ArrowError>>()?)
+}
+
+fn join(shown: &[String], count: usize) -> String {
+    let mut text = format!("[{}", shown.join(","));
+    if shown.len() < count {
+        let _ = write!(text, ", ... {count} values");
+    }
+    text.push(']');
+    text
+}
+
+fn short_list(values: &ArrayRef) -> Result<Vec<String>, ArrowError> {
+    (0..values.len().min(SHOWN)).map(|i| display(values, i)).collect()
+}
+
+fn json_list(values: &ArrayRef) -> Result<Vec<String>, ArrowError> {
+    let is_text = matches!(values.data_type(), DataType::Utf8 | DataType::LargeUtf8 | DataType::Utf8View);
+    let one = |i| match (values.is_null(i), is_text) {
+        (true, _) => Ok("null".to_owned()),
+        (false, true) => Ok(format!("{:?}", display(values, i)?)),
+        (false, false) => display(values, i),
+    };
+    (0..values.len()).map(one).collect()
+}
+
+fn display(array: &ArrayRef, row: usize) -> Result<String, ArrowError> {
+    Ok(ArrayFormatter::try_new(array, &FormatOptions::default())?.value(row).to_string())
+}
+
+#[cfg(test)]
+mod tests {
+    use arrow::array::{Float32Array, Int64Array, ListArray, TimestampMicrosecondArray};
+    use arrow::buffer::OffsetBuffer;
+    use arrow::datatypes::TimeUnit;
+
+    use super::*;
+
+    fn batch() -> RecordBatch {
+        let child = Arc::new(Field::new("element", DataType::Float32, false));
+        let values = Float32Array::from(vec![0.5, -1.0, 2.0, 3.0, 1e-9]);
+        let list = ListArray::new(child.clone(), OffsetBuffer::from_lengths([4, 1]), Arc::new(values), None);
+        let time = TimestampMicrosecondArray::from(vec![Some(1_767_600_000_000_000), None]).with_timezone("UTC");
+        let schema = Schema::new(vec![
+            Field::new("id", DataType::Int64, true),
+            Field::new("name", DataType::Utf8, true),
+            Field::new("ir", DataType::List(child), true),
+            Field::new("at", DataType::Timestamp(TimeUnit::Microsecond, Some("UTC".into())), true),
+        ]);
+        let columns: Vec<ArrayRef> = vec![
+            Arc::new(Int64Array::from(vec![Some(1), None])),
+            Arc::new(StringArray::from(vec![Some("a,\"b\""), None])),
+            Arc::new(list),
+            Arc::new(time),
+        ];
+        RecordBatch::try_new(Arc::new(schema), columns).expect("a batch")
+    }
+
+    fn written(format: Format) -> Vec<u8> {
+        let (batch, mut out) = (batch(), Vec::new());
+        let mut writer = AnswerWriter::new(format, &batch.schema(), &mut out).expect("begun");
+        writer.write(&batch).expect("written");
+        assert_eq!(writer.finish().expect("finished"), 2);
+        out
+    }
+
+    fn text(format: Format) -> String {
+        String::from_utf8(written(format)).expect("text")
+    }
+
+    #[test]
+    fn text_formats() {
+        assert!(text(Format::Table).contains("| [0.5,-1.0,2.0, ... 4 values] |"), "{}", text(Format::Table));
+        assert_eq!(
+            text(Format::Csv),
+            "id,name,ir,at\n1,\"a,\"\"b\"\"\",\"[0.5,-1.0,2.0,3.0]\",2026-01-05T08:00:00Z\n,,[1e-9],\n"
+        );
+        assert_eq!(
+            text(Format::Json).trim(),
+            r#"[{"id":1,"name":"a,\"b\"","ir":[0.5,-1.0,2.0,3.0],"at":"2026-01-05T08:00:00Z"},{"id":null,"name":null,"ir":[1e-9],"at":null}]"#
+        );
+    }
+
+    #[test]
+    fn binary_formats_read_back() {
+        let parquet = bytes::Bytes::from(written(Format::Parquet));
+        let reader = parquet::arrow::arrow_reader::ParquetRecordBatchReaderBuilder::try_new(parquet).expect("Parquet");
+        let back: Vec<_> = reader.build().expect("a reader").map(|b| b.expect("a batch")).collect();
+        assert_eq!(back, [batch()]);
+        let arrow = written(Format::Arrow);
+        let reader = arrow::ipc::reader::StreamReader::try_new(&arrow[..], None).expect("Arrow");
+        assert_eq!(reader.map(|b| b.expect("a batch")).collect::<Vec<_>>(), [batch()]);
+    }
+
+    #[test]
+    fn an_answer_without_rows_still_has_its_columns() {
+        for (format, expected) in [(Format::Csv, "id,name,ir,at\n"), (Format::Json, "[]\n")] {
+            let mut out = Vec::new();
+            AnswerWriter::new(format, &batch().schema(), &mut out).expect("begun").finish().expect("finished");
+            assert_eq!(String::from_utf8(out).expect("text"), expected);
+        }
+    }
+}

@@ -1,0 +1,81 @@
+//! `echolake import`: existing measurements become runs.
+
+use echolake_acquisition::import::{
+    Error, GIR_IR_LEN, ImportOptions, ImportedRun, import_gir, import_wav, sampling_rate_of,
+};
+use echolake_lake::{Lake, References};
+use echolake_schema::{Rig, Timestamp};
+
+use crate::Done;
+use crate::cli::ImportCommand;
+use crate::progress::{Progress, Task};
+
+pub(crate) async fn run(args: &ImportCommand, lake_url: &str) -> anyhow::Result<Done> {
+    let rig = match args {
+        ImportCommand::Wav { manifest, rig } => {
+            let rate = sampling_rate_of(manifest)?;
+            let mut given = super::rig_or(rig.as_deref(), lake_url, Rig::paper).await?;
+            // A rig file that says nothing of the rate takes that of the recordings.
+            let says_rate = |text: String| text.contains("rate_hz");
+            let silent = rig.as_deref().is_some_and(|f| !std::fs::read_to_string(f).is_ok_and(says_rate));
+            if silent {
+                given.sweep.rate_hz = rate;
+                given.check()?;
+            }
+            given
+        }
+        ImportCommand::Gir { rig, .. } => super::rig_or(rig.as_deref(), lake_url, gir_rig).await?,
+    };
+    // All is checked and written beside the lake's tables before a lake is made for it.
+    let existing = match Lake::open(lake_url).await {
+        Ok(lake) => {
+            lake.fits(&rig)?;
+            Some(lake)
+        }
+        Err(echolake_lake::Error::NoLake { .. }) => None,
+        Err(e) => return Err(e.into()),
+    };
+    if existing.is_none()
+        && let ImportCommand::Wav { manifest, .. } = args
+    {
+        echolake_acquisition::import::check_wav(manifest, &rig)?;
+    }
+    let lake = Lake::open_or_create(lake_url, &rig, &References::default()).await?;
+    let folder = super::inbox(&lake)?;
+    let progress = Progress::new();
+    let mut task = None;
+    let options = ImportOptions { started: Timestamp::now(), folder: &folder };
+    let mut step = |unit: &'static str, done: usize, total: usize| {
+        task.get_or_insert_with(|| progress.task("import", total as u64, unit)).at(done as u64);
+    };
+    let runs: Result<Vec<ImportedRun>, Error> = tokio::task::block_in_place(|| match args {
+        ImportCommand::Wav { manifest, .. } => {
+            import_wav(manifest, &rig, options, &mut |d, t| step("recordings", d, t))
+        }
+        ImportCommand::Gir { folder, .. } => import_gir(folder, &rig, options, &mut |d, t| step("surfaces", d, t)),
+    });
+    let runs = runs?;
+    finish(task, &runs);
+    for run in &runs {
+        for warning in &run.warnings {
+            progress.say(format!("{}: warning: {warning}", run.run_id));
+        }
+        super::print(&run.path.display().to_string())?;
+    }
+    eprintln!("next: echolake --lake {lake_url} ingest");
+    Ok(Done::Whole)
+}
+
+fn finish(task: Option<Task>, runs: &[ImportedRun]) {
+    let measurements: usize = runs.iter().map(|r| r.measurements).sum();
+    if let Some(task) = task {
+        task.done(format!("{} runs, {measurements} measurements", runs.len()));
+    }
+}
+
+fn gir_rig() -> Rig {
+    let mut rig = Rig::paper();
+    rig.name = "gir".into();
+    rig.impulse_response.length = GIR_IR_LEN;
+    rig
+}

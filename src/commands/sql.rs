@@ -1,0 +1,110 @@
+//! `echolake sql`: one query, or a prompt.
+
+mod prompt;
+
+use std::fs::File;
+use std::io::{BufWriter, IsTerminal as _, Read as _, Write};
+use std::path::{Path, PathBuf};
+
+use anyhow::Context as _;
+use clap::ValueEnum;
+use echolake_lake::Lake;
+use echolake_query::output::{AnswerWriter, Format};
+use echolake_query::{Answer, Session};
+use futures::TryStreamExt as _;
+
+#[derive(Debug, clap::Args)]
+pub(crate) struct SqlArgs {
+    /// The query; without it a prompt, or standard input where that is no terminal.
+    query: Option<String>,
+    /// Format of the answer.
+    #[arg(long, value_enum, default_value_t = FormatArg::Table)]
+    format: FormatArg,
+    /// The same as --format json.
+    #[arg(long, conflicts_with = "format")]
+    json: bool,
+    /// File for the answer.
+    #[arg(short, long)]
+    output: Option<PathBuf>,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+enum FormatArg {
+    Table,
+    Csv,
+    Json,
+    Parquet,
+    Arrow,
+}
+
+impl From<FormatArg> for Format {
+    fn from(arg: FormatArg) -> Self {
+        match arg {
+            FormatArg::Table => Self::Table,
+            FormatArg::Csv => Self::Csv,
+            FormatArg::Json => Self::Json,
+            FormatArg::Parquet => Self::Parquet,
+            FormatArg::Arrow => Self::Arrow,
+        }
+    }
+}
+
+pub(crate) async fn run(args: &SqlArgs, lake_url: &str) -> anyhow::Result<()> {
+    let lake = Lake::open(lake_url).await?;
+    let session = Session::new(&lake)?;
+    let query = match args.query.as_deref() {
+        Some("-") | None if !std::io::stdin().is_terminal() => {
+            let mut text = String::new();
+            std::io::stdin().read_to_string(&mut text).context("cannot read the query from standard input")?;
+            text
+        }
+        Some(query) => query.to_owned(),
+        None => return prompt::run(&session, &lake).await,
+    };
+    let format = if args.json { Format::Json } else { args.format.into() };
+    let answer = session.query(&query).await?;
+    match &args.output {
+        Some(path) => to_file(answer, format, path).await,
+        None => {
+            anyhow::ensure!(
+                !(format.is_binary() && std::io::stdout().is_terminal()),
+                "{} is not for a terminal; hint: -o FILE",
+                format.name()
+            );
+            write(answer, format, BufWriter::new(std::io::stdout())).await.map(drop)
+        }
+    }
+}
+
+/// Prints an answer for people.
+pub(super) async fn print_table(session: &Session, sql: &str) -> anyhow::Result<()> {
+    write(session.query(sql).await?, Format::Table, std::io::stdout()).await.map(drop)
+}
+
+async fn write(mut answer: Answer, format: Format, to: impl Write + Send) -> anyhow::Result<usize> {
+    let mut writer = AnswerWriter::new(format, &answer.schema, to)?;
+    while let Some(batch) = answer.batches.try_next().await.context("the query failed")? {
+        writer.write(&batch)?;
+    }
+    Ok(writer.finish()?)
+}
+
+// Beside its place first, so that a file is whole or not there.
+async fn to_file(answer: Answer, format: Format, path: &Path) -> anyhow::Result<()> {
+    let mut partial = path.as_os_str().to_owned();
+    partial.push(".partial");
+    let partial = PathBuf::from(partial);
+    let failed = || format!("cannot write `{}`", path.display());
+    let file = File::create(&partial).with_context(failed)?;
+    let written = write(answer, format, BufWriter::new(file)).await;
+    let named = written.and_then(|rows| {
+        std::fs::rename(&partial, path).with_context(failed)?;
+        eprintln!("{}: {rows} rows", path.display());
+        Ok(())
+    });
+    if named.is_err() {
+        // The first error is the one to tell.
+        let _ = std::fs::remove_file(&partial);
+    }
+    named
+}
