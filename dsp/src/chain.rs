@@ -1,9 +1,10 @@
 //! The kernels in their order, planned once: recording to response, and response to curves and energies.
 
 use crate::deconvolution::{DeconvolutionParams, DeconvolutionPlan, DeconvolutionScratch, TransformLength};
-use crate::energy::{cumulate, energy, subtract};
+use crate::energy::{cumulate, energy, tnce_over_band};
 use crate::error::check_len;
 use crate::filter_bank::{FilterBankPlan, FilterBankScratch};
+use crate::foam::subtract;
 use crate::temperature::{TemperatureCorrection, resampling_ratio};
 use crate::{Error, Real};
 
@@ -47,8 +48,9 @@ impl<T: Real> MeasurementPlan<T> {
     /// Plans for recordings of one length.
     ///
     /// # Errors
-    /// As [`DeconvolutionPlan::new`].
+    /// As [`DeconvolutionPlan::new`], and [`Error::Setting`] for a reference outside of -60 to 80 C.
     pub fn new(params: &MeasurementParams) -> Result<Self, Error> {
+        check_celsius("the reference temperature (C)", params.reference_celsius)?;
         let raw_len = raw_len(params.ir_len, params.reference_celsius).min(params.recording_len);
         let deconvolution = DeconvolutionPlan::new(DeconvolutionParams {
             recording_len: params.recording_len,
@@ -76,7 +78,8 @@ impl<T: Real> MeasurementPlan<T> {
     /// The response of one measurement at the reference temperature.
     ///
     /// # Errors
-    /// As [`DeconvolutionPlan::run`].
+    /// As [`DeconvolutionPlan::run`], and [`Error::Setting`] for a temperature outside of -60 to 80 C: the plan
+    /// has deconvolved too little for it.
     pub fn ir(
         &self,
         recording: &[T],
@@ -86,6 +89,7 @@ impl<T: Real> MeasurementPlan<T> {
         scratch: &mut MeasurementScratch<T>,
     ) -> Result<(), Error> {
         check_len("the response", ir.len(), self.ir_len)?;
+        check_celsius("the temperature (C)", celsius)?;
         self.deconvolution.run(recording, loopback, &mut scratch.raw, &mut scratch.deconvolution)?;
         self.correction.run(&scratch.raw, resampling_ratio(celsius, self.reference_celsius), ir);
         Ok(())
@@ -97,6 +101,14 @@ pub fn raw_len(ir_len: usize, reference_celsius: f64) -> usize {
     let len =
         |celsius| TemperatureCorrection::<f64>::input_len_for(ir_len, resampling_ratio(celsius, reference_celsius));
     TEMPERATURES.into_iter().map(len).max().unwrap_or(ir_len)
+}
+
+fn check_celsius(what: &'static str, celsius: f64) -> Result<(), Error> {
+    let [coldest, warmest] = TEMPERATURES;
+    if (coldest..=warmest).contains(&celsius) {
+        return Ok(());
+    }
+    Err(Error::Setting { what, actual: celsius.to_string(), expected: "-60 to 80" })
 }
 
 /// What is derived of one response.
@@ -177,13 +189,73 @@ impl<T: Real> DerivationPlan<T> {
         cumulate(&scratch.bands, self.bank.len(), flat_total, &mut derived.curves, &mut derived.tnce);
         derived.total = derived.tnce.iter().sum();
         self.bank.energies(flat, &mut scratch.flat, &mut scratch.bank)?;
-        let bands = scratch.bands.chunks_exact(self.bank.len()).zip(&scratch.flat);
-        for ((energy_out, over_band), (band, flat)) in
-            derived.energies.iter_mut().zip(&mut derived.tnce_over_band).zip(bands)
-        {
-            *energy_out = energy(band);
-            *over_band = *energy_out / flat;
-        }
+        let bands = scratch.bands.chunks_exact(self.bank.len());
+        derived.energies.iter_mut().zip(bands).for_each(|(out, band)| *out = energy(band));
+        tnce_over_band(&derived.energies, &scratch.flat, &mut derived.tnce_over_band);
         Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn params() -> MeasurementParams {
+        MeasurementParams {
+            recording_len: 1_000,
+            ir_len: 384,
+            rate_hz: 96e3,
+            low_hz: 2e3,
+            high_hz: 40e3,
+            floor_db: -60.0,
+            reference_celsius: 20.0,
+        }
+    }
+
+    fn noise() -> Vec<f64> {
+        (0..1_000).map(|i| f64::from((i * 7919) % 1013) - 506.0).collect()
+    }
+
+    #[test]
+    fn temperatures_that_the_plan_is_not_for_are_refused() {
+        let plan = MeasurementPlan::<f64>::new(&params()).expect("a plan");
+        let (mut ir, mut scratch) = (vec![0.0; 384], plan.scratch());
+        for bad in [-61.0, 81.0, -273.15, -300.0, 400.0, f64::NAN, f64::INFINITY] {
+            let result = plan.ir(&noise(), &noise(), bad, &mut ir, &mut scratch);
+            assert!(matches!(result, Err(Error::Setting { .. })), "{bad}: {result:?}");
+            assert!(MeasurementPlan::<f64>::new(&MeasurementParams { reference_celsius: bad, ..params() }).is_err());
+        }
+        for good in [-60.0, 80.0] {
+            plan.ir(&noise(), &noise(), good, &mut ir, &mut scratch).expect("a response");
+            assert!(ir.iter().all(|x| x.is_finite()), "{good}");
+        }
+    }
+
+    // A surface that is Flat itself: bands that sum to 1 in all, and 1 in each band.
+    #[test]
+    fn flat_over_itself_is_one() {
+        for len in [383, 384, 400, 401] {
+            let plan = DerivationPlan::<f32>::new(len, 96e3, &[2_500.0, 5e3, 10e3, 20e3, 40e3]).expect("a plan");
+            let flat: Vec<f32> = noise()[..len].iter().map(|x| *x as f32).collect();
+            let (mut derived, silence) = (plan.derived(), vec![0.0; len]);
+            plan.run(&flat, &silence, &flat, &mut derived, &mut plan.scratch()).expect("derived");
+            // f32 transforms of some 400 samples.
+            assert!((derived.total - 1.0).abs() < 1e-5, "{len}: {}", derived.total);
+            assert!(derived.tnce_over_band.iter().all(|x| (x - 1.0).abs() < 1e-5), "{:?}", derived.tnce_over_band);
+        }
+    }
+
+    #[test]
+    fn nan_and_wrong_lengths_are_refused() {
+        let plan = DerivationPlan::<f64>::new(16, 96e3, &[1e3]).expect("a plan");
+        let (mut derived, mut scratch) = (plan.derived(), plan.scratch());
+        let (one, mut broken) = ([1.0; 16], [1.0; 16]);
+        broken[3] = f64::NAN;
+        for [ir, foam, flat] in [[&broken, &one, &one], [&one, &broken, &one], [&one, &one, &broken]] {
+            let result = plan.run(ir, foam, flat, &mut derived, &mut scratch);
+            assert!(matches!(result, Err(Error::NotFinite { .. })), "{result:?}");
+        }
+        let result = plan.run(&one[1..], &one, &one, &mut derived, &mut scratch);
+        assert!(matches!(result, Err(Error::Length { .. })), "{result:?}");
     }
 }

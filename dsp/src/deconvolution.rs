@@ -67,18 +67,21 @@ impl<T: Real> DeconvolutionPlan<T> {
     /// # Errors
     /// [`Error::Setting`] where there is nothing to transform or the range is empty.
     pub fn new(params: DeconvolutionParams) -> Result<Self, Error> {
-        let n = match params.length {
-            TransformLength::Exact => params.recording_len,
-            TransformLength::Fast => fast_length(params.recording_len),
-        };
         let setting = |what, actual: String, expected| Err(Error::Setting { what, actual, expected });
         if params.recording_len < 2 {
             return setting("the recording's length", params.recording_len.to_string(), "2 samples or more");
         }
+        if !(params.floor_db.is_finite() && params.floor_db <= 0.0) {
+            return setting("the divisor's floor (dB)", params.floor_db.to_string(), "finite, 0 or less");
+        }
+        let n = match params.length {
+            TransformLength::Exact => params.recording_len,
+            TransformLength::Fast => fast_length(params.recording_len),
+        };
         let step = params.rate_hz / n as f64;
         let first = (params.low_hz / step).ceil().max(0.0) as usize;
         let last = ((params.high_hz / step).floor() as usize).min(n / 2);
-        if !(step > 0.0 && params.low_hz >= 0.0) || first > last {
+        if !(step > 0.0 && step.is_finite() && params.low_hz >= 0.0) || first > last {
             let range = format!("{} to {} Hz at {} Hz", params.low_hz, params.high_hz, params.rate_hz);
             return setting("the sweep's range", range, "one that holds a frequency of the transform");
         }
@@ -128,8 +131,12 @@ impl<T: Real> DeconvolutionPlan<T> {
         self.transform("the loopback", loopback, signal, s, work)?;
         self.divide(x, s)?;
         self.inverse.process_with_scratch(x, signal, work).map_err(|_| Error::NotFinite { what: "the response" })?;
-        let scale = T::of(1.0 / signal.len() as f64);
         let kept = ir.len().min(signal.len());
+        // Finite samples can still be too large for a spectrum; that spoils every sample of the response.
+        if !signal[..kept].iter().all(|x| x.f64().is_finite()) {
+            return Err(Error::NotFinite { what: "the response" });
+        }
+        let scale = T::of(1.0 / signal.len() as f64);
         ir[kept..].fill(T::default());
         ir.iter_mut().zip(&*signal).for_each(|(out, x)| *out = *x * scale);
         Ok(())
@@ -155,6 +162,9 @@ impl<T: Real> DeconvolutionPlan<T> {
         let power = |c: &Complex<T>| c.norm_sqr();
         let inside = &s[self.in_range.clone()];
         let mean = inside.iter().map(|c| power(c).f64()).sum::<f64>() / inside.len() as f64;
+        if !mean.is_finite() {
+            return Err(Error::NotFinite { what: "the loopback's power" });
+        }
         let floor = T::of(mean * self.floor);
         if !(mean > 0.0 && floor > T::default()) || inside.iter().any(|c| power(c) <= T::default()) {
             return Err(Error::NoLoopback);
@@ -221,7 +231,60 @@ mod tests {
         broken[50] = f32::NAN;
         assert!(matches!(plan.run(&broken, &noise, &mut ir, &mut scratch), Err(Error::NotFinite { .. })));
         assert!(matches!(plan.run(&noise[1..], &noise, &mut ir, &mut scratch), Err(Error::Length { .. })));
+        // Finite, but its power is past what an f32 holds.
+        let loud: Vec<f32> = noise.iter().map(|x| x * 1e20).collect();
+        assert!(matches!(plan.run(&noise, &loud, &mut ir, &mut scratch), Err(Error::NotFinite { .. })));
+        assert!(matches!(plan.run(&loud, &loud, &mut ir, &mut scratch), Err(Error::NotFinite { .. })));
+        let faint: Vec<f32> = noise.iter().map(|x| x * 1e-30).collect();
+        assert_eq!(plan.run(&noise, &faint, &mut ir, &mut scratch), Err(Error::NoLoopback));
         plan.run(&noise, &noise, &mut ir, &mut scratch).expect("good after bad");
         assert!((ir[0] - ir.iter().copied().fold(0.0, f32::max)).abs() < 1e-6, "{ir:?}");
+    }
+
+    #[test]
+    fn settings_without_a_meaning_are_refused() {
+        let good = DeconvolutionParams {
+            recording_len: 100,
+            output_len: 10,
+            rate_hz: 96e3,
+            low_hz: 2e3,
+            high_hz: 40e3,
+            floor_db: -60.0,
+            length: TransformLength::Exact,
+        };
+        assert!(DeconvolutionPlan::<f32>::new(good).is_ok());
+        for bad in [
+            DeconvolutionParams { recording_len: 1, ..good },
+            DeconvolutionParams { rate_hz: 0.0, ..good },
+            DeconvolutionParams { rate_hz: f64::NAN, ..good },
+            DeconvolutionParams { rate_hz: f64::INFINITY, ..good },
+            DeconvolutionParams { low_hz: f64::NAN, ..good },
+            DeconvolutionParams { low_hz: 41e3, ..good },
+            DeconvolutionParams { high_hz: f64::NAN, ..good },
+            DeconvolutionParams { floor_db: f64::NAN, ..good },
+            DeconvolutionParams { floor_db: f64::NEG_INFINITY, ..good },
+        ] {
+            assert!(matches!(DeconvolutionPlan::<f32>::new(bad), Err(Error::Setting { .. })), "{bad:?}");
+        }
+    }
+
+    // Zeros follow where more is asked for than the transform holds.
+    #[test]
+    fn what_is_longer_than_the_transform_ends_in_zeros() {
+        let plan = DeconvolutionPlan::<f64>::new(DeconvolutionParams {
+            recording_len: 99,
+            output_len: 120,
+            rate_hz: 96e3,
+            low_hz: 2e3,
+            high_hz: 40e3,
+            floor_db: -60.0,
+            length: TransformLength::Exact,
+        })
+        .expect("a plan");
+        let noise: Vec<f64> = (0..99).map(|i| f64::from((i * 37) % 19) - 9.0).collect();
+        let mut ir = vec![f64::NAN; 120];
+        plan.run(&noise, &noise, &mut ir, &mut plan.scratch()).expect("a response");
+        assert!(ir[..99].iter().all(|x| x.is_finite()));
+        assert_eq!(&ir[99..], &[0.0; 21]);
     }
 }

@@ -1,15 +1,16 @@
 //! Energy, its running sum along time, and both over Flat's.
 
 use crate::Real;
+pub use crate::foam::subtract;
 
 /// Sum of squares.
 pub fn energy<T: Real>(x: &[T]) -> f64 {
     x.iter().map(|x| x.f64() * x.f64()).sum()
 }
 
-/// Difference of two signals: a response without the direct sound, which is Foam's of the same pair.
-pub fn subtract<T: Real>(ir: &[T], foam: &[T], out: &mut [T]) {
-    out.iter_mut().zip(ir.iter().zip(foam)).for_each(|(out, (ir, foam))| *out = *ir - *foam);
+/// Root of the mean square; 0 of no samples.
+pub fn rms<T: Real>(x: &[T]) -> f64 {
+    (energy(x) / x.len().max(1) as f64).sqrt()
 }
 
 /// Running sum of squares of each band over `scale`, summed up in f64.
@@ -18,12 +19,99 @@ pub fn subtract<T: Real>(ir: &[T], foam: &[T], out: &mut [T]) {
 /// curves `[bands x len]`  cumulative energy (scale 1), or NCE (scale: Flat's total energy)
 /// last   `[bands]`        each curve's last value, in f64
 pub fn cumulate<T: Real>(bands: &[T], len: usize, scale: f64, curves: &mut [T], last: &mut [f64]) {
+    let len = len.max(1);
     for ((band, curve), last) in bands.chunks_exact(len).zip(curves.chunks_exact_mut(len)).zip(last) {
-        let mut sum = 0.0;
-        for (x, c) in band.iter().zip(curve) {
-            sum += x.f64() * x.f64();
-            *c = T::of(sum / scale);
-        }
-        *last = sum / scale;
+        *last = accumulate(band, scale, curve);
+    }
+}
+
+/// Running sum of squares of each band, summed up in f64.
+///
+/// bands, curves  `[bands x len]`
+pub fn cumulative_energy<T: Real>(bands: &[T], curves: &mut [T], len: usize) {
+    let len = len.max(1);
+    for (band, curve) in bands.chunks_exact(len).zip(curves.chunks_exact_mut(len)) {
+        accumulate(band, 1.0, curve);
+    }
+}
+
+/// Cumulative energy becomes NCE, in place: over Flat's total energy for the same pair. A Flat without energy
+/// leaves values that are not finite.
+pub fn nce<T: Real>(curves: &mut [T], flat_energy: f64) {
+    curves.iter_mut().for_each(|x| *x = T::of(x.f64() / flat_energy));
+}
+
+/// TNCE, the last value of each NCE curve; returns their sum.
+///
+/// curves `[bands x len]`
+/// out    `[bands]`
+pub fn tnce<T: Real>(curves: &[T], len: usize, out: &mut [f64]) -> f64 {
+    let last = curves.chunks_exact(len.max(1)).filter_map(<[T]>::last);
+    let mut total = 0.0;
+    for (out, last) in out.iter_mut().zip(last) {
+        *out = last.f64();
+        total += *out;
+    }
+    total
+}
+
+/// Energy of each band over Flat's of the same band. Where Flat has none, the value is not finite.
+///
+/// energies, flat_energies, out  `[bands]`
+pub fn tnce_over_band(energies: &[f64], flat_energies: &[f64], out: &mut [f64]) {
+    out.iter_mut().zip(energies.iter().zip(flat_energies)).for_each(|(out, (energy, flat))| *out = energy / flat);
+}
+
+fn accumulate<T: Real>(band: &[T], scale: f64, curve: &mut [T]) -> f64 {
+    let mut sum = 0.0;
+    for (x, c) in band.iter().zip(curve) {
+        sum += x.f64() * x.f64();
+        *c = T::of(sum / scale);
+    }
+    sum / scale
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    // Two bands of three samples with squares that are exact: every number below follows by hand.
+    const BANDS: [f64; 6] = [1.0, 2.0, 2.0, 0.0, -1.0, 3.0];
+
+    #[test]
+    fn curves_rise_to_each_bands_energy() {
+        let mut curves = [f64::NAN; 6];
+        cumulative_energy(&BANDS, &mut curves, 3);
+        assert_eq!(curves, [1.0, 5.0, 9.0, 0.0, 1.0, 10.0]);
+        nce(&mut curves, 20.0);
+        let mut last = [f64::NAN; 2];
+        assert!((tnce(&curves, 3, &mut last) - 0.95).abs() < 1e-15);
+        assert_eq!(last, [0.45, 0.5]);
+        let (mut at_once, mut last_at_once) = ([f64::NAN; 6], [f64::NAN; 2]);
+        cumulate(&BANDS, 3, 20.0, &mut at_once, &mut last_at_once);
+        assert_eq!((at_once, last_at_once), (curves, last));
+    }
+
+    #[test]
+    fn each_band_over_flats() {
+        let mut over = [f64::NAN; 2];
+        tnce_over_band(&[9.0, 10.0], &[18.0, 5.0], &mut over);
+        assert_eq!(over, [0.5, 2.0]);
+    }
+
+    // An f32 sum of a million equal squares would stall long before; ours is exact.
+    #[test]
+    fn long_sums_do_not_stall() {
+        let band = vec![1.0f32; 20_000_000];
+        let mut curve = vec![0.0f32; band.len()];
+        cumulative_energy(&band, &mut curve, band.len());
+        assert_eq!(curve.last(), Some(&20_000_000.0));
+    }
+
+    #[test]
+    fn nothing_is_no_energy() {
+        assert_eq!((energy::<f32>(&[]), rms::<f32>(&[]), rms(&[3.0, -3.0])), (0.0, 0.0, 3.0));
+        assert_eq!(tnce::<f32>(&[], 0, &mut []), 0.0);
+        cumulate::<f32>(&[], 0, 1.0, &mut [], &mut []);
     }
 }

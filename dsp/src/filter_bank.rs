@@ -17,10 +17,12 @@ pub fn itersine(x: f64) -> f64 {
     if x.abs() > 0.5 { 0.0 } else { (PI / 2.0 * (PI * x).cos().powi(2)).sin() }
 }
 
-/// Gain of one band at a frequency. The first band takes all that is lower, the last all that is higher.
+/// Gain of one band at a frequency. The first band takes all that is lower, the last all that is higher;
+/// a band that is not there has none.
 pub fn gain(centres_hz: &[f64], band: usize, frequency_hz: f64) -> f64 {
-    let last = centres_hz.len().saturating_sub(1) as f64;
-    let octaves = (frequency_hz / centres_hz[0]).log2().clamp(0.0, last);
+    let (Some(first), true) = (centres_hz.first(), band < centres_hz.len()) else { return 0.0 };
+    let last = (centres_hz.len() - 1) as f64;
+    let octaves = (frequency_hz.abs() / first).log2().clamp(0.0, last);
     itersine((octaves - band as f64) / 2.0)
 }
 
@@ -54,9 +56,13 @@ impl<T: Real> FilterBankPlan<T> {
     /// [`Error::Setting`] where they are not, or there are none.
     pub fn new(len: usize, rate_hz: f64, centres_hz: &[f64]) -> Result<Self, Error> {
         let octaves = centres_hz.windows(2).all(|w| (w[1] / w[0] - 2.0).abs() < 1e-6);
-        if centres_hz.is_empty() || !octaves || !(centres_hz[0] > 0.0) {
+        if !octaves || !centres_hz.first().is_some_and(|hz| *hz > 0.0 && hz.is_finite()) {
             let actual = format!("{centres_hz:?}");
             return Err(Error::Setting { what: "the bands' centres", actual, expected: "frequencies an octave apart" });
+        }
+        if !(rate_hz > 0.0 && rate_hz.is_finite()) {
+            let actual = rate_hz.to_string();
+            return Err(Error::Setting { what: "the sampling rate (Hz)", actual, expected: "finite, above 0" });
         }
         if len == 0 {
             return Err(Error::Setting { what: "the signal's length", actual: "0".into(), expected: "1 or more" });
@@ -134,6 +140,9 @@ impl<T: Real> FilterBankPlan<T> {
 
     fn spectrum(&self, ir: &[T], scratch: &mut FilterBankScratch<T>) -> Result<(), Error> {
         check_len("the response", ir.len(), self.len)?;
+        if !ir.iter().all(|x| x.f64().is_finite()) {
+            return Err(Error::NotFinite { what: "the response" });
+        }
         let FilterBankScratch { signal, spectrum, work, .. } = scratch;
         signal.copy_from_slice(ir);
         self.forward
@@ -157,11 +166,16 @@ mod tests {
 
     #[test]
     fn the_frame_is_tight_for_any_number_of_bands() {
-        for count in 1..=5 {
+        let audible: Vec<f64> = (0..10).map(|k| 31.25 * f64::from(1 << k)).collect();
+        let lists = (1..=5).map(|count| &PAPER[..count]).chain([&audible[..]]);
+        for centres in lists {
             for i in 0..10_000 {
                 let hz = f64::from(i) * 4.8;
-                let sum: f64 = (0..count).map(|b| gain(&PAPER[..count], b, hz).powi(2)).sum();
-                assert!((sum - 1.0).abs() < 1e-14, "{count} bands at {hz} Hz: {sum}");
+                let sum: f64 = (0..centres.len()).map(|b| gain(centres, b, hz).powi(2)).sum();
+                assert!((sum - 1.0).abs() < 1e-14, "{} bands at {hz} Hz: {sum}", centres.len());
+            }
+            for (band, hz) in centres.iter().enumerate() {
+                assert!((gain(centres, band, *hz) - 1.0).abs() < 1e-12, "{hz} Hz is the middle of its band");
             }
         }
     }
@@ -187,8 +201,37 @@ mod tests {
 
     #[test]
     fn centres_must_be_octaves() {
-        for bad in [&[][..], &[1e3, 3e3], &[2e3, 1e3], &[0.0, 0.0], &[f64::NAN]] {
+        for bad in [&[][..], &[1e3, 3e3], &[2e3, 1e3], &[0.0, 0.0], &[f64::NAN], &[f64::INFINITY], &[-1e3, -2e3]] {
             assert!(FilterBankPlan::<f32>::new(384, 96e3, bad).is_err(), "{bad:?}");
+        }
+        for bad in [0.0, -96e3, f64::NAN, f64::INFINITY] {
+            assert!(FilterBankPlan::<f32>::new(384, bad, &PAPER).is_err(), "{bad} Hz");
+        }
+        assert!(FilterBankPlan::<f32>::new(0, 96e3, &PAPER).is_err());
+        assert_eq!((gain(&[], 0, 1e3), gain(&PAPER, 5, 1e3)), (0.0, 0.0));
+    }
+
+    #[test]
+    fn signals_that_are_not_finite_are_refused() {
+        let plan = FilterBankPlan::<f32>::new(16, 96e3, &PAPER).expect("a plan");
+        let (mut bands, mut energies, mut scratch) = (vec![0.0; 80], vec![0.0; 5], plan.scratch());
+        for bad in [f32::NAN, f32::INFINITY] {
+            let mut ir = [1.0; 16];
+            ir[9] = bad;
+            assert_eq!(plan.run(&ir, &mut bands, &mut scratch), Err(Error::NotFinite { what: "the response" }));
+            assert_eq!(plan.energies(&ir, &mut energies, &mut scratch), Err(Error::NotFinite { what: "the response" }));
+        }
+    }
+
+    // A single centre passes everything, whatever it is.
+    #[test]
+    fn one_band_is_the_signal() {
+        for len in [1, 15, 16] {
+            let plan = FilterBankPlan::<f64>::new(len, 48e3, &[1e3]).expect("a plan");
+            let ir: Vec<f64> = (0..len).map(|i| f64::from(i as u32) - 3.5).collect();
+            let mut bands = vec![f64::NAN; len];
+            plan.run(&ir, &mut bands, &mut plan.scratch()).expect("split");
+            assert!(ir.iter().zip(&bands).all(|(a, b)| (a - b).abs() < 1e-12), "{len}: {bands:?}");
         }
     }
 }

@@ -9,14 +9,15 @@ use echolake_schema::{Rig, Symmetry};
 use parquet::arrow::arrow_reader::ParquetRecordBatchReaderBuilder;
 use serde_json::Value;
 
+use crate::Real;
 use crate::chain::{DerivationPlan, MeasurementParams, MeasurementPlan};
 use crate::deconvolution::{DeconvolutionParams, DeconvolutionPlan, TransformLength};
-use crate::energy::{energy, subtract};
+use crate::energy::{cumulative_energy, energy, nce, tnce};
 use crate::filter_bank::{FilterBankPlan, gain};
-use crate::fresnel::first_fresnel_zone;
+use crate::foam::subtract;
+use crate::fresnel::{FresnelZone, first_fresnel_zone};
 use crate::level::{p90_mean, power_to_db};
-use crate::temperature::resampling_ratio;
-use crate::{Real, fresnel::FresnelZone};
+use crate::temperature::{TemperatureCorrection, resampling_ratio};
 
 const CENTRES: [f64; 5] = [2_500.0, 5_000.0, 10_000.0, 20_000.0, 40_000.0];
 const LEN: usize = 384;
@@ -78,24 +79,17 @@ fn params(recording_len: usize) -> MeasurementParams {
     }
 }
 
-fn check_deconvolution<T: Real>(length: TransformLength, tolerance: f64) {
+fn check_deconvolution<T: Real>(length: TransformLength, output_len: impl Fn(usize) -> usize, tolerance: f64) {
     for case in golden().cases {
         for kind in ["foam", "flat", "panel"] {
             let (x, s) = (&case[&format!("{kind}_recording")], &case[&format!("{kind}_loopback")]);
-            // Padding with zeros continues the response behind its end, where the reference wraps around.
-            let wanted = &case[&format!("{kind}_deconvolved")][..LEN];
+            let output_len = output_len(x.len());
+            let wanted = &case[&format!("{kind}_deconvolved")][..output_len];
             let MeasurementParams { rate_hz, low_hz, high_hz, floor_db, .. } = params(x.len());
-            let settings = DeconvolutionParams {
-                recording_len: x.len(),
-                output_len: LEN,
-                rate_hz,
-                low_hz,
-                high_hz,
-                floor_db,
-                length,
-            };
+            let settings =
+                DeconvolutionParams { recording_len: x.len(), output_len, rate_hz, low_hz, high_hz, floor_db, length };
             let plan = DeconvolutionPlan::<T>::new(settings).expect("a plan");
-            let mut ir = vec![T::default(); LEN];
+            let mut ir = vec![T::default(); output_len];
             plan.run(&of(x), &of(s), &mut ir, &mut plan.scratch()).expect("a response");
             let off = error(&ir, wanted);
             assert!(off <= tolerance, "{kind}: {off}");
@@ -105,12 +99,14 @@ fn check_deconvolution<T: Real>(length: TransformLength, tolerance: f64) {
 
 #[test]
 fn deconvolution() {
-    check_deconvolution::<f64>(TransformLength::Exact, 1e-9);
-    check_deconvolution::<f32>(TransformLength::Exact, 1e-3);
-    check_deconvolution::<f32>(TransformLength::Fast, 1e-3);
+    // The whole response, to rounding; the README asks for 1e-6 in f64 and 1e-3 in f32.
+    check_deconvolution::<f64>(TransformLength::Exact, |n| n, 1e-9);
+    check_deconvolution::<f32>(TransformLength::Exact, |n| n, 1e-3);
+    // Padding with zeros continues the response behind its end, where the reference wraps around.
+    check_deconvolution::<f32>(TransformLength::Fast, |_| LEN, 1e-3);
 }
 
-// The reference's own fraction is within 5e-9 of the exact ratio, so f64 differs by less than 1e-5.
+// Both are padded to a fast length, which is what keeps f64 from coming closer; see `responses_in_f64_without_padding`.
 fn check_responses<T: Real>(tolerance: f64) {
     for case in golden().cases {
         let plan = MeasurementPlan::<T>::new(&params(case["foam_recording"].len())).expect("a plan");
@@ -132,17 +128,45 @@ fn responses() {
     check_responses::<f64>(1e-3);
 }
 
+// The reference resamples by a fraction, which moves the last samples by up to 5e-6 of a sample from where the
+// exact ratio puts them: 5e-6. With the fraction, what is left is its filter's design in place of a formula.
 #[test]
 fn responses_in_f64_without_padding() {
+    let (mut worst_exact, mut worst_fraction) = (0.0f64, 0.0f64);
     for case in golden().cases {
         for kind in ["foam", "flat", "panel"] {
             let celsius = case[&format!("{kind}_celsius")][0];
-            let mut ir = vec![0.0; LEN];
-            let rho = resampling_ratio(celsius, 20.0);
-            crate::temperature::TemperatureCorrection::new().run(&case[&format!("{kind}_deconvolved")], rho, &mut ir);
-            let off = error(&ir, &case[&format!("{kind}_ir")]);
-            assert!(off <= 5e-6, "{kind} at {celsius}: {off}");
+            let exact = resampling_ratio(celsius, 20.0);
+            let (up, down) = nearest_fraction(exact, 10_000);
+            let off = |rho| {
+                let mut ir = vec![0.0; LEN];
+                TemperatureCorrection::new().run(&case[&format!("{kind}_deconvolved")], rho, &mut ir);
+                error(&ir, &case[&format!("{kind}_ir")])
+            };
+            worst_exact = worst_exact.max(off(exact));
+            worst_fraction = worst_fraction.max(off(up as f64 / down as f64));
         }
+    }
+    assert!(worst_exact <= 5e-6 && worst_fraction <= 1e-6, "{worst_exact} {worst_fraction}");
+}
+
+/// Python's `Fraction.limit_denominator`, by which the reference chooses its ratios.
+fn nearest_fraction(x: f64, largest: u64) -> (u64, u64) {
+    let (mut before, mut last, mut rest) = ((0, 1), (1, 0), x);
+    loop {
+        let whole = rest.floor() as u64;
+        let next = (before.0 + whole * last.0, before.1 + whole * last.1);
+        if next.1 > largest {
+            let steps = (largest - before.1) / last.1;
+            let between = (before.0 + steps * last.0, before.1 + steps * last.1);
+            let off = |(up, down): (u64, u64)| (up as f64 / down as f64 - x).abs();
+            return if off(last) <= off(between) { last } else { between };
+        }
+        (before, last) = (last, next);
+        if rest == whole as f64 {
+            return last;
+        }
+        rest = (rest - whole as f64).recip();
     }
 }
 
@@ -154,7 +178,10 @@ fn check_derivation<T: Real>(tolerance: f64) {
         let flat = of::<T>(&case["flat_reflected_ir"]);
         plan.run(&ir, &foam, &flat, &mut derived, &mut scratch).expect("derived");
         assert!(error(&derived.reflected, &case["reflected_ir"]) <= tolerance);
-        assert!(error(&derived.curves, &case["nce"]) <= tolerance);
+        // Curve by curve, as the quiet bands would drown in the norm of all; and the product's last value of each.
+        for (curve, expected) in derived.curves.chunks_exact(LEN).zip(case["nce"].chunks_exact(LEN)) {
+            assert!(error(curve, expected) <= tolerance);
+        }
         assert!((derived.total / case["tnce_total"][0] - 1.0).abs() <= tolerance);
         for (band, tnce) in derived.tnce.iter().enumerate() {
             assert!((tnce / case["tnce"][band] - 1.0).abs() <= tolerance, "band {band}");
@@ -189,12 +216,59 @@ fn dirty_scratch_changes_nothing() {
 }
 
 #[test]
-fn bands() {
+fn dirty_derivation_scratch_changes_nothing() {
+    let cases = golden().cases;
+    let plan = DerivationPlan::<f32>::new(LEN, 96e3, &CENTRES).expect("a plan");
+    let run = |case: &Case, (derived, scratch): &mut (_, _)| {
+        let [ir, foam, flat] = ["panel_ir", "foam_ir", "flat_reflected_ir"].map(|name| of(&case[name]));
+        plan.run(&ir, &foam, &flat, derived, scratch).expect("derived");
+        derived.clone()
+    };
+    let mut used = (plan.derived(), plan.scratch());
+    for case in &cases {
+        assert_eq!(run(case, &mut used), run(case, &mut (plan.derived(), plan.scratch())));
+    }
+}
+
+// The whole chain from recordings to dB as the product runs it, errors of all its steps together.
+#[test]
+fn recordings_to_levels_in_f32() {
+    let (mut worst, mut worst_db) = (0.0f64, 0.0f64);
+    for case in golden().cases {
+        let plan = MeasurementPlan::<f32>::new(&params(case["foam_recording"].len())).expect("a plan");
+        let derivation = DerivationPlan::<f32>::new(LEN, 96e3, &CENTRES).expect("a plan");
+        let [foam, flat, panel] = ["foam", "flat", "panel"].map(|kind| {
+            let signal = |what: &str| of::<f32>(&case[&format!("{kind}_{what}")]);
+            let (mut ir, celsius) = (vec![0.0; LEN], case[&format!("{kind}_celsius")][0]);
+            plan.ir(&signal("recording"), &signal("loopback"), celsius, &mut ir, &mut plan.scratch()).expect("one");
+            ir
+        });
+        let mut flat_reflected = vec![0.0; LEN];
+        subtract(&flat, &foam, &mut flat_reflected);
+        let mut derived = derivation.derived();
+        derivation.run(&panel, &foam, &flat_reflected, &mut derived, &mut derivation.scratch()).expect("derived");
+        worst = worst.max((derived.total / case["tnce_total"][0] - 1.0).abs());
+        for (band, tnce) in derived.tnce.iter().enumerate() {
+            worst = worst.max((tnce / case["tnce"][band] - 1.0).abs());
+            worst_db = worst_db.max((power_to_db(*tnce) - case["tnce_db"][band]).abs());
+        }
+    }
+    assert!(worst <= 1e-3 && worst_db <= 0.01, "{worst} {worst_db} dB");
+}
+
+#[test]
+fn bands_and_single_steps() {
     let plan = FilterBankPlan::<f64>::new(LEN, 96e3, &CENTRES).expect("a plan");
     let (mut bands, mut scratch) = (vec![0.0; 5 * LEN], plan.scratch());
     for case in golden().cases {
         plan.run(&case["reflected_ir"], &mut bands, &mut scratch).expect("split");
         assert!(error(&bands, &case["bands"]) <= 1e-9);
+        let (mut curves, mut last) = (vec![0.0; 5 * LEN], [0.0; 5]);
+        cumulative_energy(&bands, &mut curves, LEN);
+        nce(&mut curves, energy(&case["flat_reflected_ir"]));
+        assert!(error(&curves, &case["nce"]) <= 1e-9);
+        assert!((tnce(&curves, LEN, &mut last) / case["tnce_total"][0] - 1.0).abs() <= 1e-9);
+        assert!(error(&last, &case["tnce"]) <= 1e-9);
         let mut reflected = vec![0.0; LEN];
         subtract(&case["panel_ir"], &case["foam_ir"], &mut reflected);
         assert!(error(&reflected, &case["reflected_ir"]) <= 1e-12);
@@ -215,10 +289,9 @@ fn gains_ratios_and_means() {
         }
     }
     for (celsius, fraction) in golden.metadata["resampling"].as_object().expect("ratios") {
-        let fraction = numbers(fraction);
         let exact = resampling_ratio(celsius.parse().expect("a temperature"), 20.0);
-        // Denominators go to 10,000, so the nearest fraction is within 1/10,000^2 but close to simple ones.
-        assert!((exact - fraction[0] / fraction[1]).abs() <= 1e-4, "{celsius}");
+        let (up, down) = nearest_fraction(exact, 10_000);
+        assert_eq!(vec![up as f64, down as f64], numbers(fraction), "{celsius}");
     }
     let p90 = &golden.metadata["p90"];
     let mean = p90_mean(&numbers(&p90["values"]), &mut Vec::new()).expect("a mean");

@@ -19,11 +19,15 @@ pub fn percentile(sorted: &[f64], percent: f64) -> f64 {
     sorted[below] + (sorted[above] - sorted[below]) * (position - below as f64)
 }
 
-/// Mean of the values up to their 90th percentile, as in the paper's tables; None of none.
+/// Mean of the values up to their 90th percentile, as in the paper's tables; None of none, NaN where one is.
 pub fn p90_mean(values: &[f64], scratch: &mut Vec<f64>) -> Option<f64> {
     scratch.clear();
     scratch.extend_from_slice(values);
-    scratch.sort_by(f64::total_cmp);
+    if scratch.iter().any(|x| x.is_nan()) {
+        return Some(f64::NAN);
+    }
+    // Unstable, because the stable sort allocates.
+    scratch.sort_unstable_by(f64::total_cmp);
     let limit = percentile(scratch, 90.0);
     let kept = scratch.iter().take_while(|x| **x <= limit);
     let (count, sum) = kept.fold((0u32, 0.0), |(n, sum), x| (n + 1, sum + x));
@@ -50,6 +54,9 @@ mod tests {
         assert_eq!(p90_mean(&values, &mut Vec::new()), Some(5.5));
         assert_eq!(p90_mean(&[], &mut Vec::new()), None);
         assert_eq!(p90_mean(&[3.0, 3.0], &mut vec![1.0]), Some(3.0));
+        for nan in [f64::NAN, -f64::NAN] {
+            assert!(p90_mean(&[1.0, nan, 2.0], &mut Vec::new()).is_some_and(f64::is_nan));
+        }
     }
 
     #[test]

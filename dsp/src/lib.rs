@@ -31,6 +31,7 @@ pub mod deconvolution;
 pub mod energy;
 mod error;
 pub mod filter_bank;
+pub mod foam;
 pub mod fresnel;
 pub mod geometry;
 #[cfg(test)]

@@ -14,7 +14,7 @@ const LOBES: f64 = 10.0;
 const KAISER_BETA: f64 = 5.0;
 /// Gain at 0 Hz that SciPy's normalisation of its filter amounts to, in continuous form.
 const GAIN: f64 = 1.000_675;
-/// Table entries a lobe: cubic interpolation between them is within 1e-9.
+/// Pieces of the table a lobe: cubics through the kernel at their ends and neighbours are within 1e-9 of it.
 const STEPS: usize = 256;
 
 /// c = c0 sqrt(1 + T / 273.15), m/s.
@@ -34,14 +34,20 @@ pub fn resampling_ratio(celsius: f64, reference_celsius: f64) -> f64 {
 /// fc = min(1, rho): SciPy's `resample_poly` in continuous form, so that no fraction limits the ratio.
 #[derive(Debug, Clone)]
 pub struct TemperatureCorrection<T> {
-    table: &'static [f64],
+    table: &'static [Piece],
     kind: std::marker::PhantomData<T>,
 }
 
-// Entry i is k((i - 1) / STEPS): one entry before zero and two after the end for the interpolation.
-static TABLE: LazyLock<Vec<f64>> = LazyLock::new(|| {
-    let entries = LOBES as usize * STEPS + 4;
-    (0..entries).map(|i| kernel((i as f64 - 1.0) / STEPS as f64)).collect()
+/// Coefficients of 1, t, t^2 and t^3, t from 0 to 1 along a piece.
+type Piece = [f64; 4];
+
+// Piece i is k from i / STEPS to (i + 1) / STEPS; there is one past the edge, which rounding can reach.
+static TABLE: LazyLock<Vec<Piece>> = LazyLock::new(|| {
+    let piece = |i: usize| {
+        let [a, b, c, d] = [-1.0, 0.0, 1.0, 2.0].map(|t| kernel((i as f64 + t) / STEPS as f64));
+        [b, c - a / 3.0 - b / 2.0 - d / 6.0, (a + c) / 2.0 - b, (d - a) / 6.0 + (b - c) / 2.0]
+    };
+    (0..=LOBES as usize * STEPS).map(piece).collect()
 });
 
 impl<T: Real> Default for TemperatureCorrection<T> {
@@ -83,16 +89,12 @@ impl<T: Real> TemperatureCorrection<T> {
         }
     }
 
-    // Cubic Lagrange interpolation of the table.
     fn at(&self, u: f64) -> f64 {
         let position = u.abs() * STEPS as f64;
-        let index = position as usize;
-        let t = position - index as f64;
-        let Some(&[a, b, c, d]) = self.table.get(index..index + 4) else { return 0.0 };
-        let (before, after) = (t + 1.0, t - 2.0);
-        let near = t - 1.0;
-        b * before * near * after / 2.0 - a * t * near * after / 6.0 - c * before * t * after / 2.0
-            + d * before * t * near / 6.0
+        let index = position as u32;
+        let t = position - f64::from(index);
+        let Some([c0, c1, c2, c3]) = self.table.get(index as usize) else { return 0.0 };
+        c0 + t * (c1 + t * (c2 + t * c3))
     }
 }
 

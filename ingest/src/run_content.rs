@@ -64,7 +64,7 @@ impl RunContent {
         while let Some(item) = reader.next().await? {
             match item {
                 Item::Chunk(raw) => {
-                    if !checked {
+                    if !checked && envelope.is_complete() {
                         envelope.check(lake, name)?;
                         checked = true;
                     }
@@ -137,7 +137,12 @@ impl RunContent {
 }
 
 impl Envelope {
-    // Checked before the first chunk is measured, so that a wrong file costs nothing.
+    // Other writers may put what the run is behind its first chunks.
+    fn is_complete(&self) -> bool {
+        self.metadata.contains_key(topics::RUN_METADATA) && self.attachments.contains_key(topics::RIG_ATTACHMENT)
+    }
+
+    // Checked before chunks are measured where that can be, so that a wrong file costs nothing.
     fn check(&self, lake: &Lake, name: &str) -> Result<RunManifest> {
         let Some(record) = self.metadata.get(topics::RUN_METADATA) else {
             return Err(Error::Foreign { file: name.to_owned() });

@@ -98,6 +98,7 @@ pub enum Error {
 }
 
 /// Channels of the topics, in the order of their registration.
+#[derive(Default)]
 struct Channels {
     tf: u16,
     scene: u16,
@@ -144,7 +145,7 @@ impl Recorder {
             std::io::ErrorKind::AlreadyExists => Error::Exists { path: partial.clone() },
             _ => failed(e.to_string()),
         })?;
-        let mut writer = WriteOptions::new()
+        let writer = WriteOptions::new()
             .profile("")
             .library(concat!("echolake ", env!("CARGO_PKG_VERSION")))
             .chunk_size(Some(CHUNK_BYTES))
@@ -152,27 +153,30 @@ impl Recorder {
             .compression_threads(0)
             .create(BufWriter::new(file))
             .map_err(|e| failed(e.to_string()))?;
-        let channels = Channels::register(&mut writer).map_err(|e| failed(e.to_string()))?;
         let (path, partial) = (path.to_owned(), partial.clone());
-        let mut recorder = Self { writer, path, partial, channels, sequence: 0, encoded: Vec::new() };
+        let mut recorder = Self { writer, path, partial, channels: Channels::default(), sequence: 0, encoded: Vec::new() };
         recorder.head(start)?;
         Ok(recorder)
     }
 
+    // What the run is stands first, so that a reader knows it before the first chunk.
     fn head(&mut self, start: &RunStart<'_>) -> Result<(), Error> {
         let at = start.manifest.started;
         self.metadata(topics::RUN_METADATA, start.manifest.to_metadata())?;
         let surface = serde_json::to_vec_pretty(start.surface).map_err(|e| Error::Surface { reason: e.to_string() })?;
         self.attach(at, topics::RIG_ATTACHMENT, "application/toml", start.rig.to_toml().as_bytes())?;
         self.attach(at, topics::SURFACE_ATTACHMENT, "application/json", &surface)?;
-        if let Some(relief) = &start.relief {
-            let glb = relief.mesh.to_bytes(crate::mesh::Format::Glb);
+        let glb = start.relief.as_ref().map(|r| r.mesh.to_bytes(crate::mesh::Format::Glb));
+        if let (Some(relief), Some(glb)) = (&start.relief, &glb) {
             let heights: Vec<u8> = relief.heights.heights_mm().iter().flat_map(|h| h.to_le_bytes()).collect();
-            self.attach(at, topics::MESH_ATTACHMENT, "model/gltf-binary", &glb)?;
+            self.attach(at, topics::MESH_ATTACHMENT, "model/gltf-binary", glb)?;
             self.attach(at, topics::HEIGHTS_ATTACHMENT, "application/octet-stream", &heights)?;
             if let Some(file) = &relief.original {
                 self.attach(at, file.name, file.media_type, file.bytes)?;
             }
+        }
+        self.channels = Channels::register(&mut self.writer).map_err(|e| self.failed(e.to_string()))?;
+        if let (Some(relief), Some(glb)) = (&start.relief, glb) {
             self.foxglove(self.channels.scene, at, &scene::panel(at, glb))?;
             self.foxglove(self.channels.points, at, &scene::points(at, relief.heights))?;
         }

@@ -1,0 +1,22 @@
+//! Removal of the direct sound, which is what a surface that absorbs everything leaves over.
+
+use crate::Real;
+
+/// A response minus Foam's of the same pair (Rust et al. 2021, appendix, step 3): what the surface reflected.
+///
+/// ir, foam, out  `[n]`, all at the reference temperature; past the shortest, `out` stays as it was
+pub fn subtract<T: Real>(ir: &[T], foam: &[T], out: &mut [T]) {
+    out.iter_mut().zip(ir.iter().zip(foam)).for_each(|(out, (ir, foam))| *out = *ir - *foam);
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_difference_is_taken_sample_by_sample() {
+        let mut out = [f64::NAN; 3];
+        subtract(&[3.0, 2.0, 1.0], &[1.0, 2.0, 4.0], &mut out);
+        assert_eq!(out, [2.0, 0.0, -3.0]);
+    }
+}
