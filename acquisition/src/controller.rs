@@ -152,7 +152,7 @@ impl<'a> RunController<'a> {
                 break;
             }
             self.measure(recorder, *pair, options, &mut end)?;
-            if (done + 1) % options.checkpoint_every.max(1) == 0 {
+            if (done + 1).is_multiple_of(options.checkpoint_every.max(1)) {
                 recorder.checkpoint()?;
             }
             progress(done + 1);

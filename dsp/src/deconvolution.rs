@@ -71,8 +71,8 @@ impl<T: Real> DeconvolutionPlan<T> {
         if params.recording_len < 2 {
             return setting("the recording's length", params.recording_len.to_string(), "2 samples or more");
         }
-        if !(params.floor_db.is_finite() && params.floor_db <= 0.0) {
-            return setting("the divisor's floor (dB)", params.floor_db.to_string(), "finite, 0 or less");
+        if !params.floor_db.is_finite() {
+            return setting("the divisor's floor (dB)", params.floor_db.to_string(), "a finite level");
         }
         let n = match params.length {
             TransformLength::Exact => params.recording_len,
@@ -179,7 +179,7 @@ impl<T: Real> DeconvolutionPlan<T> {
         if let Some(dc) = x.first_mut() {
             dc.im = T::default();
         }
-        if self.forward.len() % 2 == 0
+        if self.forward.len().is_multiple_of(2)
             && let Some(nyquist) = x.last_mut()
         {
             nyquist.im = T::default();

@@ -151,7 +151,7 @@ impl<T: Real> FilterBankPlan<T> {
         // What rounding leaves there would keep the inverse transform from running.
         let last = spectrum.len() - 1;
         spectrum[0].im = T::default();
-        if self.len % 2 == 0 {
+        if self.len.is_multiple_of(2) {
             spectrum[last].im = T::default();
         }
         Ok(())

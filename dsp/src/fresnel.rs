@@ -26,7 +26,7 @@ pub fn first_fresnel_zone(
 ) -> FresnelZone {
     let (from, to) = (speaker[2], microphone[2]);
     let distance = across(microphone, speaker);
-    let excess = speed_of_sound_m_s * 1e3 / frequency_hz / 4.0;
+    let excess = speed_of_sound_m_s * 1e3 / frequency_hz / 2.0;
     let path = image_mm(microphone, speaker) + excess;
     let k = from * from - to * to - distance * distance;
     // A x^2 + B x + C + (2 L)^2 y^2 = 0, x from the speaker's foot towards the microphone's.

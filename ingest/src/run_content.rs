@@ -96,7 +96,7 @@ impl RunContent {
             whole.append(task.await.map_err(|e| Error::read(name, e))?);
         }
         let integrity = reader.finish().await?;
-        Ok(Self::assemble(manifest, envelope, whole, integrity, name)?)
+        Self::assemble(manifest, envelope, whole, integrity, name)
     }
 
     fn assemble(

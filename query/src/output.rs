@@ -65,7 +65,7 @@ pub struct AnswerWriter<W: Write + Send> {
 
 enum Inner<W: Write + Send> {
     Table(W, Vec<RecordBatch>),
-    Csv(arrow::csv::Writer<W>),
+    Csv(Box<arrow::csv::Writer<W>>),
     Json(arrow::json::ArrayWriter<W>),
     Parquet(Box<ArrowWriter<W>>),
     Arrow(arrow::ipc::writer::StreamWriter<W>),
@@ -83,14 +83,14 @@ impl<W: Write + Send> AnswerWriter<W> {
                 let mut writer = arrow::csv::WriterBuilder::new().with_header(true).build(to);
                 // A header even where no row comes.
                 writer.write(&RecordBatch::new_empty(flat_schema(schema))).map_err(|e| arrow_error(format, e))?;
-                Inner::Csv(writer)
+                Inner::Csv(Box::new(writer))
             }
             Format::Json => Inner::Json(arrow::json::WriterBuilder::new().with_explicit_nulls(true).build(to)),
             Format::Parquet => {
                 let zstd = Compression::ZSTD(ZstdLevel::try_new(3).unwrap_or_default());
                 let properties = WriterProperties::builder().set_compression(zstd).build();
                 let writer = ArrowWriter::try_new(to, schema.clone(), Some(properties));
-                Inner::Parquet(Box::new(writer.map_err(|e| parquet_error(e))?))
+                Inner::Parquet(Box::new(writer.map_err(parquet_error)?))
             }
             Format::Arrow => {
                 let writer = arrow::ipc::writer::StreamWriter::try_new(to, schema);

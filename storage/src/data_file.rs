@@ -90,7 +90,7 @@ fn stats(schema: &SchemaRef, batches: &[RecordBatch]) -> Value {
 }
 
 fn extremes(columns: &[Arc<dyn Array>]) -> Option<(Value, Value)> {
-    let pairs: Vec<_> = columns.iter().map(|c| extremes_of(c)).collect::<Option<Vec<_>>>()?;
+    let pairs: Vec<_> = columns.iter().map(extremes_of).collect::<Option<Vec<_>>>()?;
     let low = pairs.iter().map(|p| &p.0).reduce(|a, b| if less(b, a) { b } else { a })?;
     let high = pairs.iter().map(|p| &p.1).reduce(|a, b| if less(a, b) { b } else { a })?;
     Some((low.clone(), high.clone()))

@@ -154,7 +154,8 @@ impl Recorder {
             .create(BufWriter::new(file))
             .map_err(|e| failed(e.to_string()))?;
         let (path, partial) = (path.to_owned(), partial.clone());
-        let mut recorder = Self { writer, path, partial, channels: Channels::default(), sequence: 0, encoded: Vec::new() };
+        let mut recorder =
+            Self { writer, path, partial, channels: Channels::default(), sequence: 0, encoded: Vec::new() };
         recorder.head(start)?;
         Ok(recorder)
     }

@@ -1,0 +1,166 @@
+//! Bad input: a clear error that names the place, and nothing half-written.
+
+use std::path::Path;
+
+use super::Place;
+
+fn files(folder: &Path) -> usize {
+    std::fs::read_dir(folder).map_or(0, Iterator::count)
+}
+
+fn wav(path: &Path, rate: u32, samples: &[i16]) {
+    let spec =
+        hound::WavSpec { channels: 1, sample_rate: rate, bits_per_sample: 16, sample_format: hound::SampleFormat::Int };
+    let mut writer = hound::WavWriter::create(path, spec).expect("a file");
+    samples.iter().for_each(|s| writer.write_sample(*s).expect("written"));
+    writer.finalize().expect("closed");
+}
+
+fn noise(len: usize) -> Vec<i16> {
+    (0..len).map(|i| ((i * 7919) % 20_011) as i16 - 10_005).collect()
+}
+
+const HEADER: &str = "surface,recording,loopback,microphone,speaker,temperature_c\n";
+
+#[test]
+fn manifests_and_wav_files() {
+    let place = Place::new();
+    wav(&place.path("good.wav"), 96_000, &noise(4_000));
+    wav(&place.path("short.wav"), 96_000, &noise(3_999));
+    wav(&place.path("slow.wav"), 48_000, &noise(4_000));
+    std::fs::write(place.path("empty.wav"), "").expect("written");
+    std::fs::write(place.path("text.wav"), "RIFF, but not really").expect("written");
+    let whole = std::fs::read(place.path("good.wav")).expect("read");
+    std::fs::write(place.path("cut.wav"), &whole[..whole.len() - 100]).expect("written");
+    let check = |manifest: &str, expected: &str| {
+        std::fs::write(place.path("manifest.csv"), manifest).expect("written");
+        place.fails(1, &["import", "wav", "manifest.csv", "--rig", "rig.toml"], expected);
+        assert_eq!(files(&place.path("lake/inbox")), 0, "{expected}");
+        assert!(!place.path("lake").exists(), "no lake is made for it: {expected}");
+    };
+    let row = |row: &str, expected: &str| check(&format!("{HEADER}{row}\n"), expected);
+    row("a,missing.wav,good.wav,0/0/0,0/0/1,20", "missing.wav");
+    row("a,empty.wav,good.wav,0/0/0,0/0/1,20", "is empty");
+    row("a,text.wav,good.wav,0/0/0,0/0/1,20", "no WAV file");
+    row("a,cut.wav,good.wav,0/0/0,0/0/1,20", "");
+    row("a,good.wav,cut.wav,0/0/0,0/0/1,20", "line 2, column `loopback`");
+    row("a,good.wav,short.wav,0/0/0,0/0/1,20", "3999 samples, expected the recording's 4000");
+    row("a,good.wav,slow.wav,0/0/0,0/0/1,20", "sampled at 48000 Hz, expected the rig's 96000 Hz");
+    row("a,good.wav,good.wav#2,0/0/0,0/0/1,20", "has 1 channels");
+    row("a,good.wav,good.wav,9/0/0,0/0/1,20", "line 2, column `microphone`");
+    row("a,good.wav,good.wav,1 2 3,0/0/1,20", "the nearest is");
+    row("a,good.wav,good.wav,0/0/1,0/0/0,20", "exchanged");
+    row("a,good.wav,good.wav,0/0/0,0/0/1,NaN", "`NaN` is no number");
+    row("a,good.wav,good.wav,0/0/0,0/0/1,400", "temperature (C) is 400");
+    row("../a,good.wav,good.wav,0/0/0,0/0/1,20", "not a valid surface id");
+    check("", "it is empty");
+    check(HEADER, "no rows");
+    check("surface,recording\na,b\n", "column `loopback` is missing");
+    check(&format!("{},colour\n", HEADER.trim()), "unknown column `colour`");
+    place.fails(1, &["import", "wav", "nowhere.csv", "--rig", "rig.toml"], "nowhere.csv");
+}
+
+#[test]
+fn a_clipped_recording_is_kept_and_said() {
+    let place = Place::new();
+    let mut clipped = noise(4_000);
+    clipped[100] = i16::MAX;
+    wav(&place.path("clipped.wav"), 96_000, &clipped);
+    wav(&place.path("good.wav"), 96_000, &noise(4_000));
+    std::fs::write(place.path("manifest.csv"), format!("{HEADER}a,clipped.wav,good.wav,0/0/0,0/0/1,20\n"))
+        .expect("written");
+    place.fails(0, &["import", "wav", "manifest.csv", "--rig", "rig.toml"], "1 samples clipped");
+    place.ok(&["ingest"]);
+    assert_eq!(place.number("select clipped_samples from measurements"), 1.0);
+}
+
+#[test]
+fn meshes_and_surfaces() {
+    let place = Place::new();
+    let acquire = |mesh: &str| {
+        vec![
+            "acquire".to_owned(),
+            "--surface".into(),
+            "x".into(),
+            "--rig".into(),
+            "rig.toml".into(),
+            "--mesh".into(),
+            mesh.into(),
+        ]
+    };
+    let check = |mesh: &str, expected: &str| {
+        let args = acquire(mesh);
+        place.fails(1, &args.iter().map(String::as_str).collect::<Vec<_>>(), expected);
+        assert_eq!(files(&place.path("lake/inbox")), 0, "{mesh}");
+    };
+    std::fs::write(place.path("empty.obj"), "v 0 0 0\n").expect("written");
+    std::fs::write(place.path("open.obj"), "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n").expect("written");
+    std::fs::write(
+        place.path("large.obj"),
+        "v 0 0 0\nv 1000 0 0\nv 0 1000 0\nv 0 0 1\nf 1 2 3\nf 1 2 4\nf 2 3 4\nf 1 3 4\n",
+    )
+    .expect("written");
+    check("empty.obj", "is empty");
+    check("open.obj", "is open: 3 edges");
+    check("large.obj", "larger than the panel");
+    check("missing.stl", "cannot read mesh");
+    check("panel.step", "no mesh file that is known");
+    place.fails(1, &["acquire", "--surface", "mystery", "--rig", "rig.toml"], "unknown surface `mystery`");
+    place.fails(2, &["acquire", "--surface", "../x", "--rig", "rig.toml"], "not a valid surface id");
+    place.fails(1, &["acquire", "--surface", "brick", "--set", "colour=red"], "no parameter `colour`");
+    place.ok(&["panel", "wavy", "-o", "wavy.stl"]);
+    place.acquire("from_file", &["--mesh", "wavy.stl"]);
+    place.ok(&["ingest"]);
+    assert_eq!(place.sql("select mesh_file from surfaces")[0]["mesh_file"], "wavy.stl");
+}
+
+#[test]
+fn run_files_that_are_none_or_damaged() {
+    let place = Place::new();
+    let run = place.acquire("flat", &[]);
+    let whole = std::fs::read(&run).expect("the run");
+    std::fs::remove_file(&run).expect("removed");
+    let ingest = |name: &str, bytes: &[u8], code: i32, expected: &str| {
+        std::fs::write(place.path(name), bytes).expect("written");
+        place.fails(code, &["ingest", name], expected);
+    };
+    ingest("empty.mcap", b"", 1, "the file is empty");
+    ingest("text.mcap", b"this is no MCAP file at all", 1, "not an MCAP file");
+    let mut foreign = std::io::Cursor::new(Vec::new());
+    mcap::Writer::new(&mut foreign).expect("a writer").finish().expect("closed");
+    ingest("foreign.mcap", foreign.get_ref(), 1, "no run of echolake");
+    assert_eq!(place.number("select count(*) from runs"), 0.0);
+
+    // Cut off in the middle: what was complete is taken in.
+    ingest("cut.mcap", &whole[..whole.len() / 2], 3, "the file was cut off");
+    let kept = place.number("select count(*) from measurements");
+    assert!(kept > 0.0 && kept < 45.0, "{kept}");
+    assert_eq!(place.sql("select state from runs")[0]["state"], "partial");
+    // The whole file has other content under the same name.
+    ingest("whole.mcap", &whole, 1, "already in the lake with other content");
+
+    let other = Place::new();
+    other.acquire("wavy", &["--seed", "5"]);
+    let mut flipped = whole.clone();
+    let at = flipped.len() / 2;
+    flipped[at] ^= 0x10;
+    std::fs::write(other.path("flipped.mcap"), &flipped).expect("written");
+    other.fails(3, &["ingest", "flipped.mcap"], "warning: ");
+    other.fails(0, &["ingest"], "45 measurements");
+}
+
+#[test]
+fn lakes_that_are_none_newer_or_someone_elses() {
+    let place = Place::new();
+    place.fails(1, &["sql", "select 1"], "no lake at");
+    place.acquire("flat", &[]);
+    let config = place.path("lake/lake.toml");
+    let text = std::fs::read_to_string(&config).expect("read");
+    std::fs::write(&config, text.replace("format = 1", "format = 2")).expect("written");
+    place.fails(1, &["sql", "select 1"], "update echolake");
+    std::fs::write(&config, "format = [").expect("written");
+    place.fails(1, &["ingest"], "lake.toml` is damaged");
+    std::fs::write(&config, text).expect("written");
+    std::fs::write(place.path("other.toml"), "impulse_response.length = 100").expect("written");
+    place.fails(1, &["acquire", "--surface", "flat", "--rig", "other.toml"], "does not fit the lake");
+}

@@ -1,0 +1,138 @@
+//! From the simulated rig to answers, and what the physics must be.
+
+use super::Place;
+
+const PAIRS: f64 = 45.0;
+
+#[test]
+fn references_complete_what_waits_and_the_physics_holds() {
+    let place = Place::new();
+    place.acquire("wood", &["--seed", "3"]);
+    place.fails(0, &["ingest"], "waits for reference flat, foam");
+    assert_eq!(place.number("select count(*) from measurements"), PAIRS);
+    assert_eq!(place.number("select count(*) from tnce"), 0.0);
+    assert_eq!(place.sql("select state, missing from runs")[0]["state"], "waiting");
+
+    place.acquire("flat", &["--seed", "1"]);
+    place.acquire("foam", &["--seed", "2"]);
+    // A second Foam run under a name of its own: what the first one does not explain is noise and drift.
+    place.acquire("foam_2", &["--seed", "4"]);
+    place.ok(&["ingest"]);
+    assert_eq!(place.number("select count(*) from runs where state = 'complete' and missing = ''"), 4.0);
+    assert_eq!(place.number("select count(*) from tnce"), 4.0 * PAIRS);
+    assert_eq!(place.number("select count(*) from tnce_d4"), 4.0 * PAIRS * 8.0);
+    assert_eq!(place.number("select count(*) from heightmaps"), 4.0 * 8.0);
+    assert_eq!(place.number("select count(*) from surfaces where origin = 'simulated'"), 4.0);
+
+    // Flat over itself is 1, and its bands sum to it.
+    let off =
+        "select max(abs(tnce_total - 1)) + max(abs(tnce_2500 + tnce_5000 + tnce_10000 + tnce_20000 + tnce_40000 - 1))
+               + max(abs(tnce_band_5000 - 1)) from tnce where surface_id = 'flat'";
+    assert!(place.number(off) < 1e-4);
+    // The second Foam run lies 25 dB under Flat at least, on the mean over the pairs.
+    let foam = place.number("select 10 * log10(avg(tnce_total)) from tnce where surface_id = 'foam_2'");
+    assert!(foam < -25.0, "{foam} dB");
+    // Wood is over Flat by the ratio of their reflection factors; noise and drift leave less than 2 %.
+    let wood = place.number("select avg(tnce_total) from tnce where surface_id = 'wood'");
+    let expected = (0.99f64 / 0.83).powi(2);
+    assert!((wood / expected - 1.0).abs() < 0.02, "{wood} {expected}");
+
+    // The same runs again add nothing, and say so.
+    let before = place.sql("select run_id, run_derivation, reference_derivation from runs order by run_id");
+    let name = before[0]["run_id"].as_str().expect("a name").to_owned();
+    place.fails(0, &["ingest", &name], "is in the lake already, nothing added");
+    assert_eq!(place.sql("select run_id, run_derivation, reference_derivation from runs order by run_id"), before);
+    let report: serde_json::Value = serde_json::from_str(&place.ok(&["doctor", "--json"])).expect("JSON");
+    let findings = report["findings"].as_array().expect("a list");
+    assert!(findings.iter().all(|f| f["severity"] == "note"), "{findings:?}");
+    assert_eq!(report["runs"], 4);
+}
+
+#[test]
+fn a_second_flat_run_rewrites_its_dependants_and_a_lost_table_is_made_anew() {
+    let place = Place::new();
+    for (surface, seed) in [("flat", "1"), ("foam", "2"), ("wavy", "3")] {
+        place.acquire(surface, &["--seed", seed]);
+    }
+    place.ok(&["ingest"]);
+    let version = |place: &Place| place.sql("select distinct flat_version from nce where surface_id = 'wavy'");
+    let first = version(&place);
+    place.acquire("flat", &["--seed", "9"]);
+    place.ok(&["ingest"]);
+    let second = version(&place);
+    assert_eq!(second.len(), 1, "only the new derivation is seen");
+    assert_ne!(first, second);
+    assert!(second[0]["flat_version"].as_str().expect("text").starts_with("flat:2:"), "{second:?}");
+    let sum = "select sum(tnce_total) from tnce where surface_id = 'wavy'";
+    let before = place.number(sum);
+    // Tables can be deleted: the runs are the truth.
+    std::fs::remove_dir_all(place.path("lake/tables")).expect("removed");
+    place.ok(&["ingest"]);
+    assert_eq!(place.number("select count(*) from measurements"), 4.0 * PAIRS);
+    assert_eq!(place.number(sum), before);
+}
+
+#[test]
+fn answers_come_in_every_format_or_are_refused_clearly() {
+    let place = Place::new();
+    place.acquire("flat", &[]);
+    place.ok(&["ingest"]);
+    for format in ["csv", "json", "parquet", "arrow", "table"] {
+        let query = "select pair_id, ir from measurements order by pair_id";
+        place.ok(&["sql", "--format", format, "-o", "answer", query]);
+        assert!(std::fs::metadata(place.path("answer")).expect("written").len() > 1_000, "{format}");
+    }
+    place.fails(1, &["sql", "-o", "missing/answer", "select 1"], "cannot write");
+    place.fails(1, &["sql", "selec 1"], "^");
+    place.fails(1, &["sql", "drop table runs"], "only reading");
+    place.fails(2, &["sql", "--format", "xml", "select 1"], "xml");
+}
+
+// A folder as the published data set has them, of the small rig's size.
+#[test]
+fn a_gir_folder_becomes_runs_with_references_of_their_own() {
+    let place = Place::new();
+    let folder = place.path("gir");
+    std::fs::create_dir(&folder).expect("made");
+    let write = |surface: &str, gain: f64, rows: usize, columns: usize| {
+        let matrix = ndarray::Array2::from_shape_fn((rows, columns), |(r, n)| {
+            let direct = if n == 20 { 1.0 } else { 0.0 };
+            let echo = if n == 60 + r % 7 { gain } else { 0.0 };
+            (direct + echo) as f32
+        });
+        let file = std::fs::File::create(folder.join(format!("{surface}.npz"))).expect("a file");
+        let mut npz = ndarray_npy::NpzWriter::new(file);
+        npz.add_array("matrix", &matrix).expect("written");
+        npz.add_array("temperatures", &ndarray::Array1::from_elem(rows, 21.5)).expect("written");
+        npz.finish().expect("closed");
+    };
+    write("mean_flat_rfl_1", 0.5, 45, 400);
+    write("mean_foam_1", 0.0, 45, 400);
+    write("panel_0016_r180_0", 0.25, 45, 400);
+    let info = "panel id,flat reference,foam reference,macrostructure reference,mesostructure reference,sand type,binder type\n\
+                panel_0016_r180_0,mean_flat_rfl_1,mean_foam_1,flat,Primitives,GS14,Furan\n\
+                mean_flat_rfl_1,mean_flat_rfl_1,mean_foam_1,flat,Baseline_mean,GS14,Furan\n";
+    std::fs::write(folder.join("panel_info.csv"), info).expect("written");
+    place.ok(&["import", "gir", "gir", "--rig", "rig.toml"]);
+    place.ok(&["ingest"]);
+    let query = "select panel, side, flat_reference from surfaces where surface_id = 'panel_0016_r180_0'";
+    let row = &place.sql(query)[0];
+    assert_eq!(
+        (&row["panel"], &row["side"], &row["flat_reference"]),
+        (&"0016".into(), &0.into(), &"mean_flat_rfl_1".into())
+    );
+    // Half of Flat's amplitude is a quarter of its energy.
+    let total = place.number("select avg(tnce_total) from tnce where surface_id = 'panel_0016_r180_0'");
+    assert!((total - 0.25).abs() < 1e-4, "{total}");
+    assert_eq!(place.number("select count(*) from measurements where source = 'corrected'"), 3.0 * PAIRS);
+
+    write("panel_0001_0", 0.1, 44, 400);
+    place.fails(1, &["import", "gir", "gir", "--rig", "rig.toml"], "matrix: 44 x 400, expected 45 rows");
+    write("panel_0001_0", 0.1, 45, 383);
+    place.fails(1, &["import", "gir", "gir", "--rig", "rig.toml"], "expected 45 rows of at least 384 samples");
+    assert_eq!(
+        std::fs::read_dir(place.path("lake/inbox")).expect("the inbox").count(),
+        0,
+        "nothing half-written stays"
+    );
+}
