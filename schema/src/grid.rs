@@ -37,7 +37,7 @@ pub struct Pair {
 
 /// How a rig describes its grid: square layers, or single points.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
+#[serde(from = "GridText")]
 pub struct GridParams {
     /// Which pairs are measured.
     pub pairs: PairRule,
@@ -49,6 +49,30 @@ pub struct GridParams {
     /// Points that form no layers, mm; they count as layer 0, gridx 0, 1, 2, ...
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub points_mm: Vec<[f64; 3]>,
+}
+
+/// A grid as TOML describes it: what it leaves out is the paper's, but a grid of single points has no layers.
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct GridText {
+    pairs: Option<PairRule>,
+    clearance_mm: Option<f64>,
+    layers: Option<Vec<Layer>>,
+    #[serde(default)]
+    points_mm: Vec<[f64; 3]>,
+}
+
+impl From<GridText> for GridParams {
+    fn from(text: GridText) -> Self {
+        let paper = Self::default();
+        let layers = if text.points_mm.is_empty() { paper.layers } else { Vec::new() };
+        Self {
+            pairs: text.pairs.unwrap_or(paper.pairs),
+            clearance_mm: text.clearance_mm.unwrap_or(paper.clearance_mm),
+            layers: text.layers.unwrap_or(layers),
+            points_mm: text.points_mm,
+        }
+    }
 }
 
 /// A square layer of points, centred over the panel.
@@ -296,6 +320,15 @@ mod tests {
         let (a, b) = (grid.points()[0], grid.points()[1]);
         assert_eq!(grid.parse_pair(&a, &b), Ok(PairId(0)));
         assert!(grid.parse_pair(&b, &a).expect_err("exchanged").to_string().contains("exchanged"));
+    }
+
+    #[test]
+    fn a_description_of_single_points_has_no_layers() {
+        let grid = |text: &str| crate::Rig::from_toml(text).and_then(|r| r.grid()).expect(text);
+        assert_eq!(grid("grid.points_mm = [[0, 0, 0], [1000, 0, 0]]").points().len(), 2);
+        assert_eq!(grid("grid.clearance_mm = 40.0").points().len(), 78);
+        let room = crate::Rig::from_toml("grid.points_mm = [[0, 0, 0], [1000, 0, 0]]").expect("a rig");
+        assert_eq!(crate::Rig::from_toml(&room.to_toml()), Ok(room));
     }
 
     #[test]

@@ -154,8 +154,9 @@ fn remove_partial(path: &Path) -> anyhow::Result<()> {
 async fn print_tables(lake: &Lake) -> anyhow::Result<()> {
     let session = Session::new(lake)?;
     let bands = lake.rig().band_names();
-    let column =
-        |band: &str, name: &str| format!("round(max(p90_mean_db) filter (where band = '{band}'), 1) as \"{name}\"");
+    let column = |band: &str, name: &str| {
+        format!("round(max(p90_mean_db) filter (where band = '{band}'), 1) + 0.0 as \"{name}\"")
+    };
     let columns: Vec<_> =
         bands.iter().map(|b| column(b, &format!("{b} Hz"))).chain([column("total", "total")]).collect();
     super::print("\nMean TNCE of the values up to the 90th percentile, dB re Flat (simulated)")?;
