@@ -2,6 +2,7 @@
 
 use anyhow::Context as _;
 use echolake_acquisition::controller::Keep;
+use echolake_acquisition::mesh::Mesh;
 use echolake_acquisition::relief::Relief;
 use echolake_acquisition::simulate::{SimulatedRun, Specimen};
 use echolake_lake::{Lake, References};
@@ -18,6 +19,9 @@ pub(crate) async fn run(args: &AcquireArgs, lake_url: &str) -> anyhow::Result<Do
         None => Specimen::Relief(relief(args.panel.as_deref(), &args.surface, &args.set)?),
     };
     let rig = super::rig_or(args.rig.as_deref(), lake_url, Rig::paper).await?;
+    if let Specimen::Mesh(path) = &specimen {
+        Mesh::read(path)?.check(rig.panel.size_mm, rig.panel.depth_mm, path)?;
+    }
     let lake = Lake::open_or_create(lake_url, &rig, &References::default()).await?;
     let folder = super::inbox(&lake)?;
     let stop = super::stop_on_interrupt();
