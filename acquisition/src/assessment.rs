@@ -10,6 +10,10 @@ use echolake_schema::rig::Validation;
 const OUT_OF_RANGE_DB: f64 = 60.0;
 /// The direct sound is looked for this near its time, samples: the first echo is nine samples behind it at least.
 const ARRIVAL_WINDOW: f64 = 5.0;
+/// What stands at that time is the direct sound only if nothing before it reaches this share of the strongest, and
+/// it does itself: the ringing of a band-limited arrival stays under 0.22, a reflection under the direct sound or,
+/// focused, not far over it.
+const ARRIVAL_SHARE: f32 = 0.3;
 
 /// What was found of one recording.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -21,7 +25,8 @@ pub struct Assessment {
     pub clipped_samples: u32,
     /// Level of the loopback, dB re full scale.
     pub loopback_dbfs: f64,
-    /// Direct sound's arrival minus the expected one, us; NaN where the expected one is outside of the response.
+    /// Direct sound's arrival minus the expected one, us; NaN where the expected one is outside of the response. Where
+    /// no direct sound stands at its time, the arrival is the first strong one, wherever that is.
     pub arrival_error_us: f64,
 }
 
@@ -96,12 +101,24 @@ impl Assessor {
         let from = (expected - ARRIVAL_WINDOW).ceil().max(1.0) as usize;
         let to = ((expected + ARRIVAL_WINDOW).floor().max(0.0) as usize).min(self.response.len().saturating_sub(2));
         let magnitude = |n: usize| f64::from(self.response[n].abs());
-        let Some(peak) = (from..=to).max_by(|a, b| magnitude(*a).total_cmp(&magnitude(*b))) else { return f64::NAN };
+        let Some(near) = (from..=to).max_by(|a, b| magnitude(*a).total_cmp(&magnitude(*b))) else { return f64::NAN };
+        let first = self.first_arrival(to);
+        let peak = if (from..=to).contains(&first) { near } else { first };
         // A parabola through the peak and its neighbours.
         let [before, at, after] = [peak - 1, peak, peak + 1].map(magnitude);
         let bend = before - 2.0 * at + after;
         let shift = if bend < 0.0 { (0.5 * (before - after) / bend).clamp(-1.0, 1.0) } else { 0.0 };
         (peak as f64 + shift - expected) / self.rate_hz * 1e6
+    }
+
+    // The local maximum that follows the first sample of a strong arrival, up to the response's end or `to`.
+    fn first_arrival(&self, to: usize) -> usize {
+        let end = self.signal_len.max(to + 1).min(self.response.len() - 1);
+        let searched = &self.response[..end];
+        let strongest = searched.iter().fold(0.0f32, |most, x| most.max(x.abs()));
+        let strong = searched.iter().position(|x| x.abs() >= ARRIVAL_SHARE * strongest).unwrap_or(0);
+        let rises = |n: &usize| self.response[n + 1].abs() > self.response[*n].abs();
+        (strong.max(1)..end - 1).find(|n| !rises(n)).unwrap_or(end - 1).max(1)
     }
 }
 
@@ -131,4 +148,46 @@ impl Assessment {
 
 fn mean_power(x: &[f32]) -> f64 {
     echolake_dsp::energy::energy(x) / x.len().max(1) as f64
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use echolake_dsp::sweep::LinearSweep;
+
+    // A sweep and its echo-free recording, `delay` samples late, in a little noise.
+    fn assessed(delay: usize, expected: f64) -> Assessment {
+        let rig = Rig::from_toml("sweep.duration_secs = 0.03").expect("a rig");
+        let sweep = LinearSweep { rate_hz: 96e3, duration_secs: 0.03, low_hz: 2e3, high_hz: 40e3, fade_secs: 1e-3 };
+        let mut loopback: Vec<f32> = sweep.samples().iter().map(|x| 0.5 * *x as f32).collect();
+        loopback.resize(rig.recording_len(), 0.0);
+        let mut state = 1u32;
+        let mut microphone: Vec<f32> = (0..loopback.len())
+            .map(|_| {
+                state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+                (state >> 8) as f32 / 16_777_216.0 * 1e-5
+            })
+            .collect();
+        microphone[delay..].iter_mut().zip(&loopback).for_each(|(m, l)| *m += 0.3 * l);
+        let mut assessor = Assessor::new(&rig, loopback.len()).expect("a plan");
+        assessor.assess(&microphone, &loopback, expected / 96e3, 0).expect("assessed")
+    }
+
+    #[test]
+    fn an_arrival_is_told_however_far_off_it_is() {
+        // One sample is 10.4 us. Half a sample off, the parabola is right to a tenth of one.
+        for off in [-80i32, -37, -12, -7, -3, -1, 0, 1, 3, 7, 12, 37, 80, 200] {
+            for fraction in [0.0, 0.4] {
+                let expected = f64::from(100 - off) + fraction;
+                let told = assessed(100, expected.max(2.0)).arrival_error_us;
+                let wanted = (100.0 - expected.max(2.0)) / 96e3 * 1e6;
+                assert!((told - wanted).abs() < 2.0, "{off}, {fraction}: {told} us, {wanted} us");
+            }
+        }
+    }
+
+    #[test]
+    fn an_arrival_outside_of_the_response_is_unknown() {
+        assert!(assessed(100, 1e6).arrival_error_us.is_nan());
+    }
 }

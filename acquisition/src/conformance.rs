@@ -17,6 +17,9 @@ pub fn robots(robots: &mut dyn Robots, reachable: [[f64; 3]; 2], unreachable: [[
         assert!(off < 0.5, "{off} mm off");
     }
     assert!(robots.move_to(unreachable[0], unreachable[1]).is_err(), "an unreachable position is refused");
+    for bad in [f64::NAN, f64::INFINITY] {
+        assert!(robots.move_to([bad, microphone[1], microphone[2]], speaker).is_err(), "{bad} is no position");
+    }
     assert!(robots.power(Power::Off).is_ok(), "the drives switch off");
     assert!(robots.move_to(speaker, microphone).is_err(), "nothing moves without power");
     assert!(robots.power(Power::On).is_ok(), "the drives switch on again");
@@ -28,7 +31,8 @@ pub fn robots(robots: &mut dyn Robots, reachable: [[f64; 3]; 2], unreachable: [[
 /// Where they are not.
 pub fn audio(audio: &mut dyn AudioInterface) {
     assert!(audio.rate_hz() > 0.0);
-    let tone: Vec<f32> = (0..4_800).map(|n| 0.25 * (n as f32 * 0.7).sin()).collect();
+    // Its frequency rises, so that it resembles itself at one delay only.
+    let tone: Vec<f32> = (0..4_800).map(|n| n as f32).map(|n| 0.25 * (n * (0.2 + n * 1e-4)).sin()).collect();
     let (mut take, mut last) = (Take::default(), Timestamp(i64::MIN));
     for output in [&tone[..], &tone[..1_000], &[0.0; 2_000]] {
         audio.play_and_record(output, &mut take).unwrap_or_else(|e| panic!("{e}"));
@@ -40,10 +44,25 @@ pub fn audio(audio: &mut dyn AudioInterface) {
         let power = |x: &[i32]| x.iter().map(|x| (f64::from(*x) / 8_388_608.0).powi(2)).sum::<f64>() / x.len() as f64;
         let sent = output.iter().map(|x| f64::from(*x).powi(2)).sum::<f64>() / output.len() as f64;
         match sent > 0.0 {
-            true => assert!((0.01..4.0).contains(&(power(&take.loopback) / sent)), "the loopback carries the output"),
-            false => assert!(power(&take.loopback) < 1e-6, "silence stays silent"),
+            true => {
+                assert!((0.01..4.0).contains(&(power(&take.loopback) / sent)), "the loopback has the output's level");
+                let likeness = likeness(output, &take.loopback);
+                assert!(likeness > 0.8, "the loopback carries the output: correlation {likeness}");
+            }
+            false => {
+                assert!(power(&take.loopback) < 1e-6, "silence stays silent");
+                assert!(take.microphone.iter().all(|x| x.abs() < (1 << 23) - 1), "silence does not reach full scale");
+            }
         }
     }
+}
+
+// Highest normalised correlation at any delay up to a quarter of the output: converters take their time.
+fn likeness(output: &[f32], loopback: &[i32]) -> f64 {
+    let norm = |x: &mut dyn Iterator<Item = f64>| x.map(|x| x * x).sum::<f64>().sqrt();
+    let whole = norm(&mut output.iter().map(|x| f64::from(*x))) * norm(&mut loopback.iter().map(|x| f64::from(*x)));
+    let at = |delay: usize| output.iter().zip(&loopback[delay..]).map(|(x, y)| f64::from(*x) * f64::from(*y)).sum();
+    (0..output.len() / 4).map(at).fold(0.0, f64::max) / whole
 }
 
 /// Readings are finite, plausible, and in the order of time.

@@ -58,6 +58,18 @@ pub enum Error {
     /// The rig's grid is not valid.
     #[error(transparent)]
     Schema(#[from] echolake_schema::Error),
+    /// The interface runs at another rate than the rig's sweep is made for.
+    #[error(
+        "rig `{rig}` samples at {expected_hz} Hz, the audio interface at {actual_hz} Hz; hint: set the interface, or `sweep.rate_hz`"
+    )]
+    Rate {
+        /// The rig.
+        rig: String,
+        /// Its rate, Hz.
+        expected_hz: f64,
+        /// The interface's, Hz.
+        actual_hz: f64,
+    },
 }
 
 /// Measures runs with one rig.
@@ -81,16 +93,31 @@ struct Attempt {
     reading: Reading,
     reached: Positions,
     measurement: Measurement,
+    response: Response,
+}
+
+/// Whether an attempt gave a response.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Response {
+    /// It is in the controller's buffer.
+    Deconvolved,
+    /// The recording cannot be deconvolved, and the buffer still has the response of an attempt before.
+    Missing,
 }
 
 impl<'a> RunController<'a> {
     /// Plans for this rig.
     ///
     /// # Errors
-    /// [`Error::Plan`] where its settings contradict each other.
+    /// [`Error::Plan`] where its settings contradict each other, [`Error::Rate`] where the interface's rate is not
+    /// the rig's.
     pub fn new(rig: &'a Rig, devices: Devices) -> Result<Self, Error> {
         let failed = |cause| Error::Plan { rig: rig.name.clone(), cause };
         let (sweep, recording_len) = (&rig.sweep, rig.recording_len());
+        let (expected_hz, actual_hz) = (sweep.rate_hz.get(), devices.audio.rate_hz());
+        if actual_hz != expected_hz {
+            return Err(Error::Rate { rig: rig.name.clone(), expected_hz, actual_hz });
+        }
         let reference = rig.impulse_response.reference_temperature_c.get();
         let deconvolution = DeconvolutionPlan::new(DeconvolutionParams {
             recording_len,
@@ -131,7 +158,8 @@ impl<'a> RunController<'a> {
     /// ends after the current pair. Finishing the recording is the caller's.
     ///
     /// # Errors
-    /// [`Error::Device`] or [`Error::Record`]; what was recorded before is kept.
+    /// [`Error::Device`] or [`Error::Record`]; what was recorded before is kept, the log says at which pair it broke
+    /// off, and the drives are off if they can be.
     pub fn run(
         &mut self,
         recorder: &mut Recorder,
@@ -151,7 +179,9 @@ impl<'a> RunController<'a> {
                 recorder.log(end.ended, LogLevel::Warning, NAME, &what)?;
                 break;
             }
-            self.measure(recorder, *pair, options, &mut end)?;
+            if let Err(error) = self.measure(recorder, *pair, options, &mut end) {
+                return Err(self.broken_off(recorder, end.ended, *pair, error));
+            }
             if (done + 1).is_multiple_of(options.checkpoint_every.max(1)) {
                 recorder.checkpoint()?;
             }
@@ -161,6 +191,14 @@ impl<'a> RunController<'a> {
         let what = format!("{accepted} pairs accepted, {rejected} given up, {attempts} attempts");
         recorder.log(end.ended, LogLevel::Info, NAME, &what)?;
         Ok(end)
+    }
+
+    fn broken_off(&mut self, recorder: &mut Recorder, at: Timestamp, pair: Pair, error: Error) -> Error {
+        let what = format!("broken off at pair {}: {error}", pair.id.0);
+        // The caller must hear of the first failure; that these fail behind it too would only hide it.
+        let _ = self.devices.robots.power(Power::Off);
+        let _ = recorder.log(at, LogLevel::Error, NAME, &what).and_then(|()| recorder.checkpoint());
+        error
     }
 
     fn measure(
@@ -199,16 +237,15 @@ impl<'a> RunController<'a> {
         let mut clipped = to_fractions(&self.take.microphone, &mut self.microphone);
         clipped += to_fractions(&self.take.loopback, &mut self.loopback);
         let arrival = direct_mm(microphone, speaker) / 1e3 / speed_of_sound(reading.temperature_c);
-        let (assessment, mut reasons) = match self.assess(arrival, clipped) {
-            Ok(assessment) => {
-                let limits = &self.rig.validation;
-                (assessment, assessment.objections(limits, reading.outside_level_db))
+        let limits = &self.rig.validation;
+        let (assessment, response, reasons) = match self.assess(arrival, clipped) {
+            Ok(found) => {
+                let mut reasons = found.objections(limits, reading.outside_level_db);
+                reasons.extend(unknowns(&found, &reading));
+                (found, Response::Deconvolved, reasons)
             }
-            Err(cause) => (nothing(clipped), vec![cause.to_string()]),
+            Err(cause) => (nothing(clipped), Response::Missing, vec![cause.to_string()]),
         };
-        if !reading.temperature_c.is_finite() {
-            reasons.push("the ambient sensor gives no temperature".to_owned());
-        }
         let verdict = match (reasons.is_empty(), attempt < self.rig.validation.attempts) {
             (true, _) => Verdict::Accepted,
             (false, true) => Verdict::Repeated,
@@ -233,7 +270,7 @@ impl<'a> RunController<'a> {
             microphone_residual_mm: off(microphone, reached.microphone_mm),
             speaker_residual_mm: off(speaker, reached.speaker_mm),
         };
-        Ok(Attempt { at: self.take.started.unwrap_or(reading.at), reading, reached, measurement })
+        Ok(Attempt { at: self.take.started.unwrap_or(reading.at), reading, reached, measurement, response })
     }
 
     fn assess(&mut self, arrival_secs: f64, clipped: u32) -> Result<Assessment, echolake_dsp::Error> {
@@ -267,15 +304,17 @@ impl<'a> RunController<'a> {
             };
             recorder.sweep(at, &recording)?;
         }
-        let ir = ImpulseResponse {
-            pair_id: m.pair_id,
-            attempt: m.attempt,
-            sample_rate_hz,
-            samples: self.ir.clone(),
-            temperature_c: reading.temperature_c,
-            temperature_corrected: false,
-        };
-        recorder.ir(at, &ir)?;
+        if made.response == Response::Deconvolved {
+            let ir = ImpulseResponse {
+                pair_id: m.pair_id,
+                attempt: m.attempt,
+                sample_rate_hz,
+                samples: self.ir.clone(),
+                temperature_c: reading.temperature_c,
+                temperature_corrected: false,
+            };
+            recorder.ir(at, &ir)?;
+        }
         recorder.measurement(at, m)?;
         if m.verdict() != Verdict::Accepted {
             let next = if m.verdict() == Verdict::Repeated { "tried again" } else { "given up" };
@@ -284,6 +323,18 @@ impl<'a> RunController<'a> {
         }
         Ok(())
     }
+}
+
+// A comparison with NaN objects to nothing, and a take of which nothing is known is no good one.
+fn unknowns(found: &Assessment, reading: &Reading) -> Vec<String> {
+    let values = [
+        ("signal-to-noise ratio", found.snr_db),
+        ("arrival of the direct sound", found.arrival_error_us),
+        // Infinite is as bad as unknown here, while a take without any noise has an infinite ratio.
+        ("temperature", if reading.temperature_c.is_finite() { reading.temperature_c } else { f64::NAN }),
+        ("level outside", reading.outside_level_db),
+    ];
+    values.into_iter().filter(|(_, x)| x.is_nan()).map(|(what, _)| format!("{what} unknown")).collect()
 }
 
 // Samples as fractions of full scale; returns how many are at it.
@@ -307,130 +358,4 @@ fn nothing(clipped_samples: u32) -> Assessment {
 }
 
 #[cfg(test)]
-mod tests {
-    use echolake_schema::RunId;
-    use echolake_schema::manifest::{Origin, RunManifest};
-
-    use super::*;
-    use crate::recorder::RunStart;
-    use crate::relief::Relief;
-    use crate::rig::{AudioInterface, Error as RigError};
-    use crate::rigs::simulated::{Simulation, devices};
-
-    /// An interface with something wrong on its first takes.
-    struct Faulty {
-        inner: Box<dyn AudioInterface>,
-        fault: fn(&mut Take),
-        takes: u32,
-    }
-
-    impl AudioInterface for Faulty {
-        fn rate_hz(&self) -> f64 {
-            self.inner.rate_hz()
-        }
-
-        fn play_and_record(&mut self, output: &[f32], take: &mut Take) -> Result<(), RigError> {
-            self.inner.play_and_record(output, take)?;
-            if self.takes > 0 {
-                self.takes -= 1;
-                (self.fault)(take);
-            }
-            Ok(())
-        }
-    }
-
-    fn quick() -> Rig {
-        Rig::from_toml("sweep.duration_secs = 0.03").expect("a rig")
-    }
-
-    fn start() -> Timestamp {
-        Timestamp(1_767_600_000_000_000_000)
-    }
-
-    fn faulty(rig: &Rig, fault: fn(&mut Take), takes: u32) -> Devices {
-        let relief = Relief::Flat.height_field(60);
-        let simulation = Simulation { rig, relief: &relief, reflection_factor: 0.83, start: start(), seed: 3 };
-        let mut devices = devices(&simulation).expect("devices");
-        devices.audio = Box::new(Faulty { inner: devices.audio, fault, takes });
-        devices
-    }
-
-    fn run_of(rig: &Rig, devices: Devices, pairs: usize) -> (RunEnd, Vec<Measurement>) {
-        let folder = tempfile::tempdir().expect("a folder");
-        let surface = "flat".parse().expect("an id");
-        let manifest = RunManifest {
-            run_id: RunId::compose(start(), &surface, 1).expect("an id"),
-            surface_id: surface,
-            started: start(),
-            software: "test".into(),
-            rig: rig.name.clone(),
-            origin: Origin::Simulated,
-        };
-        let record = echolake_schema::SurfaceRecord::default();
-        let run = RunStart { manifest: &manifest, rig, surface: &record, relief: None };
-        let path = folder.path().join("run.mcap");
-        let mut recorder = Recorder::create(&path, &run).expect("a recorder");
-        let mut controller = RunController::new(rig, devices).expect("a controller");
-        let pairs: Vec<_> = controller.grid.pairs().iter().step_by(2951 / pairs).copied().take(pairs).collect();
-        let options = RunOptions { keep: Keep::ResponsesOnly, checkpoint_every: 1 };
-        let end = controller.run(&mut recorder, &pairs, options, &AtomicBool::new(false), &mut |_| {}).expect("a run");
-        let path = recorder.finish(&end).expect("finished");
-        let file = std::fs::read(path).expect("the file");
-        let messages = mcap::MessageStream::new(&file).expect("an MCAP file").map(|m| m.expect("a message"));
-        let verdicts = messages
-            .filter(|m| m.channel.topic == echolake_schema::topics::MEASUREMENT)
-            .map(|m| <Measurement as prost::Message>::decode(&m.data[..]).expect("a measurement"));
-        (end, verdicts.collect())
-    }
-
-    #[test]
-    fn good_takes_are_accepted_at_once() {
-        let rig = quick();
-        let (end, verdicts) = run_of(&rig, faulty(&rig, |_| {}, 0), 40);
-        assert_eq!((end.accepted, end.rejected), (40, 0), "{verdicts:?}");
-        for v in verdicts.iter().filter(|v| v.verdict() == Verdict::Accepted) {
-            assert!(v.snr_db > 30.0 && v.arrival_error_us.abs() < 5.0, "{v:?}");
-        }
-    }
-
-    fn check(fault: fn(&mut Take), takes: u32, expected: &str) {
-        let rig = quick();
-        let (end, verdicts) = run_of(&rig, faulty(&rig, fault, takes), 1);
-        let reasons = verdicts[0].reasons.join("; ");
-        assert!(reasons.contains(expected), "{reasons}");
-        if takes < 3 {
-            assert_eq!((end.accepted, end.rejected, end.attempts), (1, 0, u64::from(takes) + 1), "{verdicts:?}");
-            assert_eq!(verdicts[0].verdict(), Verdict::Repeated);
-        } else {
-            assert_eq!((end.accepted, end.rejected, end.attempts), (0, 1, 3));
-            assert_eq!(verdicts[2].verdict(), Verdict::Rejected);
-        }
-    }
-
-    #[test]
-    fn a_silent_loopback_is_noticed_and_given_up() {
-        check(|take| take.loopback.fill(0), 9, "loopback");
-    }
-
-    #[test]
-    fn clipping_is_repeated() {
-        check(|take| take.microphone[100] = (1 << 23) - 1, 1, "1 samples clipped");
-    }
-
-    #[test]
-    fn noise_is_repeated() {
-        let noisy: fn(&mut Take) = |take| {
-            let mut state = 1u32;
-            for x in &mut take.microphone {
-                state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
-                *x = (*x + (state >> 12) as i32 - (1 << 19)).clamp(-(1 << 23) + 1, (1 << 23) - 2);
-            }
-        };
-        check(noisy, 2, "signal-to-noise ratio");
-    }
-
-    #[test]
-    fn a_displaced_microphone_is_noticed() {
-        check(|take| take.microphone.rotate_right(4), 9, "direct sound");
-    }
-}
+mod tests;

@@ -1,19 +1,23 @@
 //! What a rig can do, as traits: robots, audio interface, ambient sensor. Every implementation passes the checks of
 //! [`crate::conformance`].
+//!
+//! One clock: take and reading carry the time of the same clock, and it never goes backwards. Every call blocks
+//! until it is done; nothing goes on behind the caller's back.
 
 use echolake_schema::Timestamp;
 use echolake_schema::manifest::Origin;
 
 /// Two arms: one carries the microphone, one the speaker. Positions in mm over the panel.
 pub trait Robots: Send {
-    /// Moves both and waits until they stand; returns where. A position that cannot be reached is refused, and then
-    /// nothing has moved.
+    /// Moves both and waits until they stand; returns where. A position that cannot be reached or is not finite, two
+    /// positions too near each other, and any move without power are refused, and then nothing has moved.
     ///
     /// # Errors
     /// [`Error::Unreachable`] or [`Error::Device`].
     fn move_to(&mut self, microphone_mm: [f64; 3], speaker_mm: [f64; 3]) -> Result<Positions, Error>;
 
-    /// Switches the drives; with them off the arms are silent and hold by their brakes.
+    /// Switches the drives; with them off the arms are silent and hold by their brakes. What is recorded with them
+    /// on is a take all the same, with their noise in it.
     ///
     /// # Errors
     /// [`Error::Device`].
@@ -44,7 +48,8 @@ pub trait AudioInterface: Send {
     fn rate_hz(&self) -> f64;
 
     /// Plays `output` (1.0 is full scale) and records as many samples of microphone and loopback; blocks until it is
-    /// over. A take with a gap or an overrun is an error, never a take.
+    /// over. A take with a gap or an overrun is an error, never a take. What `take` held before is gone; its buffers
+    /// are used again. `started` is set, and later than that of the take before.
     ///
     /// # Errors
     /// [`Error::Device`].

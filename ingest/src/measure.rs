@@ -107,7 +107,7 @@ impl Measurer {
             let taken = match channel.topic.as_str() {
                 topics::SWEEP => decode::<SweepRecording>(&channel.schema, &message)
                     .and_then(|s| self.sweep(offset, &message, &s))
-                    .map(|r| out.responses.push(r)),
+                    .map(|r| out.responses.extend(r)),
                 topics::IR => decode::<ImpulseResponse>(&channel.schema, &message)
                     .and_then(|i| self.ir(offset, &message, &i))
                     .map(|r| out.responses.push(r)),
@@ -128,7 +128,13 @@ impl Measurer {
         out
     }
 
-    fn sweep(&self, chunk_offset: u64, message: &Message<'_>, sweep: &SweepRecording) -> Result<Response, String> {
+    // None where the loopback is silent: the recording is as it was, and its attempt was rejected for that.
+    fn sweep(
+        &self,
+        chunk_offset: u64,
+        message: &Message<'_>,
+        sweep: &SweepRecording,
+    ) -> Result<Option<Response>, String> {
         self.known_pair(sweep.pair_id)?;
         self.known_rate(sweep.sample_rate_hz)?;
         let celsius = Celsius::new(sweep.temperature_c).map_err(|e| e.to_string())?;
@@ -139,8 +145,12 @@ impl Measurer {
         let plan = self.plan(count)?;
         let mut ir = vec![0.0; self.rig.impulse_response.length];
         let mut scratch = plan.scratch();
-        plan.ir(&microphone, &loopback, celsius.get(), &mut ir, &mut scratch).map_err(|e| e.to_string())?;
-        Ok(Response {
+        match plan.ir(&microphone, &loopback, celsius.get(), &mut ir, &mut scratch) {
+            Ok(()) => {}
+            Err(echolake_dsp::Error::NoLoopback) => return Ok(None),
+            Err(e) => return Err(e.to_string()),
+        }
+        Ok(Some(Response {
             pair: sweep.pair_id,
             attempt: sweep.attempt,
             log_time_ns: message.log_time_ns,
@@ -148,7 +158,7 @@ impl Measurer {
             temperature_c: celsius.get(),
             source: Source::Sweep,
             ir,
-        })
+        }))
     }
 
     fn ir(&self, chunk_offset: u64, message: &Message<'_>, given: &ImpulseResponse) -> Result<Response, String> {

@@ -128,10 +128,14 @@ impl Import<'_> {
         let assessment = Assessor::new(rig, len)
             .and_then(|mut a| a.assess(&microphone.fractions, &loopback.fractions, arrival, clipped))
             .map_err(planned)?;
-        // Where a foreign rig stands is known less well than its files say, so its arrival is told, not judged.
+        // Where a foreign rig stands is known less well than its files say, and nobody listened outside: the arrival
+        // is told, not judged, and so is a signal-to-noise ratio that a long response leaves no room for.
         let mut judged = assessment;
         judged.arrival_error_us = 0.0;
-        let reasons = judged.objections(&rig.validation, f64::NAN);
+        if judged.snr_db.is_nan() {
+            judged.snr_db = f64::INFINITY;
+        }
+        let reasons = judged.objections(&rig.validation, f64::NEG_INFINITY);
         let sample_rate_hz = rig.sweep.rate_hz.get();
         recorder.poses(at, m, s)?;
         recorder.environment(

@@ -23,14 +23,16 @@ use crate::rig::{AmbientSensor, AudioInterface, Devices, Error, Positions, Power
 
 /// Facets along each side: 2.14 mm, a quarter of the wavelength at 40 kHz.
 pub const FACETS: usize = 274;
-/// Samples of a simulated response: the farthest echo at 1.55 m arrives before them.
-const RESPONSE: usize = 512;
+/// Samples that a response goes on for behind its farthest echo: the band limit rings.
+const RINGING: f64 = 32.0;
 /// Time of one measurement (Rust et al. 2021): moving, settling, sweep.
 const TAKE_SECS: f64 = 12.3;
 /// Gain from pressure at 1 m to full scale: the direct sound at 75 mm stays 9 dB under it.
 const MICROPHONE_GAIN: f64 = 0.037;
 /// Noise of the channels, rms re full scale: -102 and -108 dB.
 const NOISE: [f64; 2] = [8e-6, 4e-6];
+/// The drives' noise in the microphone, rms re full scale: 36 dB over its own.
+const DRIVES: f64 = 5e-4;
 /// The converter: a pole above the audio range, and a delay that both channels share.
 const CONVERTER_POLE_HZ: f64 = 60_000.0;
 const CONVERTER_DELAY: f64 = 37.0;
@@ -88,7 +90,8 @@ pub fn devices(simulation: &Simulation<'_>) -> Result<Devices, Error> {
     let mut rng = ChaCha8Rng::seed_from_u64(simulation.seed);
     let points: Vec<_> = grid.points().iter().map(|p| p.position_mm).collect();
     let rate_hz = simulation.rig.sweep.rate_hz.get();
-    let plan = KirchhoffPlan::new(simulation.relief, &points, rate_hz, RESPONSE);
+    let plan =
+        KirchhoffPlan::new(simulation.relief, &points, rate_hz, response_len(simulation.relief, &points, rate_hz));
     let world = Arc::new(Mutex::new(World {
         grid,
         now: simulation.start,
@@ -106,13 +109,23 @@ pub fn devices(simulation: &Simulation<'_>) -> Result<Devices, Error> {
             rate_hz,
             reflection_factor: simulation.reflection_factor,
             scratch: plan.scratch(),
-            response: vec![0.0; RESPONSE],
+            response: vec![0.0; plan.len()],
             plan,
             output: None,
         }),
         sensor: Box::new(SimulatedSensor(world)),
         origin: Origin::Simulated,
     })
+}
+
+// The farthest echo comes by a corner of the panel, between the two points that are farthest from theirs, in air of
+// 0 C at the coldest.
+fn response_len(relief: &HeightField, points: &[[f64; 3]], rate_hz: f64) -> usize {
+    let (half, lowest) = (relief.size_mm() / 2.0, f64::from(relief.extent_mm()[0]));
+    let to_corner = |[x, y, z]: [f64; 3]| (x.abs() + half).hypot(y.abs() + half).hypot(z - lowest);
+    let farthest = points.iter().map(|p| to_corner(*p)).fold(0.0, f64::max);
+    let samples = 2.0 * farthest / 1e3 / speed_of_sound(0.0) * rate_hz + RINGING;
+    (samples as usize).next_power_of_two()
 }
 
 fn lock(world: &Shared) -> MutexGuard<'_, World> {
@@ -144,8 +157,9 @@ impl Robots for SimulatedRobots {
         let [Some(microphone), Some(speaker)] = stand else {
             return Err(refuse("the simulated arms know the grid's points only"));
         };
-        if microphone == speaker {
-            return Err(refuse("microphone and speaker would touch"));
+        let [a, b] = [microphone, speaker].map(|index| world.grid.points()[index].id);
+        if world.grid.pair_id(a, b).or_else(|| world.grid.pair_id(b, a)).is_none() {
+            return Err(refuse("the arms would touch"));
         }
         world.stand = [microphone, speaker];
         // The arms repeat to 0.02 mm. The residual is told; the simulated sound does not know of it.
@@ -216,10 +230,11 @@ impl AudioInterface for SimulatedAudio {
         self.plan.response(world.stand, c, self.reflection_factor, &mut self.scratch, &mut self.response);
         let played = match &mut self.output {
             Some(played) if played.output == output => played,
-            other => other.insert(Played::new(output, self.rate_hz)),
+            other => other.insert(Played::new(output, self.rate_hz, self.response.len())),
         };
         played.through(&self.response);
-        let noise = if spoiled { SPOILED_NOISE } else { NOISE[0] };
+        let room = if spoiled { SPOILED_NOISE } else { NOISE[0] };
+        let noise = if world.power == Power::On { room.hypot(DRIVES) } else { room };
         take.started = Some(world.now);
         quantise(&played.signal[..output.len()], MICROPHONE_GAIN, noise, &mut world, &mut take.microphone);
         quantise(&played.loopback, 1.0, NOISE[1], &mut world, &mut take.loopback);
@@ -228,9 +243,9 @@ impl AudioInterface for SimulatedAudio {
 }
 
 impl Played {
-    fn new(output: &[f32], rate_hz: f64) -> Self {
+    fn new(output: &[f32], rate_hz: f64, response_len: usize) -> Self {
         // Room for the response and the converter's delay behind the output, so that nothing wraps around.
-        let len = fast_length(output.len() + RESPONSE + 2 * CONVERTER_DELAY as usize);
+        let len = fast_length(output.len() + response_len + 2 * CONVERTER_DELAY as usize);
         let mut planner = RealFftPlanner::new();
         let (forward, inverse) = (planner.plan_fft_forward(len), planner.plan_fft_inverse(len));
         let mut played = Self {
@@ -301,9 +316,38 @@ mod tests {
         let (near, far) = ([-187.5, -187.5, 124.0], [-187.5, -112.5, 124.0]);
         conformance::robots(devices.robots.as_mut(), [near, far], [near, near]);
         conformance::robots(devices.robots.as_mut(), [near, far], [near, [0.0, 0.0, 5_000.0]]);
+        // One straight over the other: the grid leaves that pair out.
+        conformance::robots(devices.robots.as_mut(), [near, far], [near, [-187.5, -187.5, 214.0]]);
         conformance::audio(devices.audio.as_mut());
         conformance::sensor(devices.sensor.as_mut());
         assert_eq!(devices.origin, Origin::Simulated);
+    }
+
+    #[test]
+    fn drives_are_heard_until_they_are_off() {
+        let (mut devices, mut take) = (simulated(1), Take::default());
+        let mut noise = |power| {
+            devices.robots.power(power).expect("a switch");
+            devices.audio.play_and_record(&[0.0; 4_000], &mut take).expect("a take");
+            let sum: f64 = take.microphone.iter().map(|x| (f64::from(*x) / FULL_SCALE).powi(2)).sum();
+            (sum / 4_000.0).sqrt()
+        };
+        // 4,000 samples of white noise tell its rms to about 1 %.
+        let (off, on) = (noise(Power::Off), noise(Power::On));
+        assert!((off / NOISE[0] - 1.0).abs() < 0.1, "{off}");
+        assert!((on / DRIVES - 1.0).abs() < 0.1, "{on}");
+    }
+
+    #[test]
+    fn responses_hold_the_farthest_echo_at_any_rate() {
+        let relief = Relief::Flat.height_field(40);
+        let points: Vec<_> = Rig::paper().grid().expect("a grid").points().iter().map(|p| p.position_mm).collect();
+        // From over one corner to the far corner and back, 743.8 mm each way: the third layer's outermost point.
+        for rate_hz in [48e3, 96e3, 192e3] {
+            let echo = 2.0 * 0.7438 / 331.3 * rate_hz;
+            let len = response_len(&relief, &points, rate_hz) as f64;
+            assert!(len > echo + 30.0 && len < 2.5 * echo, "{rate_hz}: {len}, {echo}");
+        }
     }
 
     #[test]
