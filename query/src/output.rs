@@ -271,7 +271,7 @@ mod tests {
         );
         assert_eq!(
             text(Format::Json).trim(),
-            r#"[{"id":1,"name":"a,\"b\"","ir":[0.5,-1.0,2.0,3.0],"at":"2026-01-05T08:00:00Z"},{"id":null,"name":null,"ir":[1e-9],"at":null}]"#
+            r#"[{"id":1,"name":"a,\"b\"","ir":[0.5,-1.0,2.0,3.0],"at":"2026-01-05T08:00:00Z"},{"id":null,"name":null,"ir":[1.0e-9],"at":null}]"#
         );
     }
 
