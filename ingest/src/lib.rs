@@ -1,6 +1,6 @@
 //! From a run's MCAP file to rows.
 //!
-//! A run's own rows are committed first and its row in `runs` last. Then [`complete`] derives what needs
+//! A run's own rows are committed first and its row in `runs` last. Then [`complete()`] derives what needs
 //! references, for every run whose references are there and are not the ones its rows used.
 //!
 //! ```no_run
