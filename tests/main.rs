@@ -88,7 +88,7 @@ fn stderr(output: &Output) -> String {
 
 /// Real data beside the checkout; tests that want it skip where it is absent, and say so.
 fn shared_data(name: &str) -> Option<PathBuf> {
-    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared/data").join(name);
+    let path = Path::new("../shared/data").join(name);
     if !path.exists() {
         eprintln!("skipped: ../shared/data/{name} is not there");
         return None;

@@ -1,23 +1,40 @@
 //! Why a query has no answer, said so that its author finds the place.
 
+use std::cmp::Reverse;
+use std::collections::BTreeSet;
+
+use arrow::error::ArrowError;
+use datafusion::common::utils::datafusion_strsim::normalized_levenshtein;
+use datafusion::common::{Column, SchemaError};
 use datafusion::error::DataFusionError;
+use datafusion::sql::sqlparser::parser::ParserError;
+use echolake_schema::tables::Table;
+
+/// How alike two names must be for one to be suggested: half of the letters, as in DataFusion's own suggestions.
+const ALIKE: f64 = 0.5;
+/// Names that a hint lists.
+const SUGGESTED: usize = 3;
+/// Columns that a hint lists where no name is near.
+const LISTED: usize = 12;
 
 /// What went wrong with a query.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
     /// The query is not right.
-    #[error("{message}{}", place.as_deref().unwrap_or_default())]
+    #[error("{message}{}{}", place.as_deref().unwrap_or_default(), hint_line(hint.as_deref()))]
     Query {
         /// What is wrong.
         message: String,
         /// The line, with a mark under the place.
         place: Option<String>,
+        /// What might be meant.
+        hint: Option<String>,
     },
     /// The query would change something.
-    #[error("only reading is allowed here: {message}; hint: select, explain, describe and show tables are")]
+    #[error("only reading is allowed here, not {statement}; hint: SELECT, EXPLAIN, DESCRIBE and SHOW are")]
     NotReading {
-        /// What it would do.
-        message: String,
+        /// The refused statement's name.
+        statement: String,
     },
     /// The query was right, and failed on its way.
     #[error("the query failed: {message}")]
@@ -42,45 +59,124 @@ pub enum Error {
 }
 
 impl Error {
-    /// An error of planning `sql`.
+    /// An error of parsing or planning `sql`.
     pub(crate) fn plan(sql: &str, error: &DataFusionError) -> Self {
-        let message = message(error);
+        let (message, hint) = explain(error);
         let span = error.diagnostic().and_then(|d| d.span).map(|s| (s.start.line, s.start.column));
-        let place = span.or_else(|| line_and_column(&message)).and_then(|(line, column)| mark(sql, line, column));
-        Self::Query { message, place }
+        let (message, parsed) = without_place(sql, &message);
+        let place = span.or(parsed).and_then(|(line, column)| mark(sql, line, column));
+        Self::Query { message, place, hint }
     }
 
     /// An error of running a query.
     pub(crate) fn execution(error: &DataFusionError) -> Self {
-        Self::Execution { message: message(error) }
+        Self::Execution { message: explain(error).0 }
     }
 }
 
-// DataFusion's own words without the name of the layer that said them.
-pub(crate) fn message(error: &DataFusionError) -> String {
-    let text = error.find_root().strip_backtrace();
-    let text = ["SQL error: ", "Error during planning: ", "Schema error: ", "External error: "]
-        .into_iter()
-        .fold(text.as_str(), |text, prefix| text.strip_prefix(prefix).unwrap_or(text))
-        .to_owned();
-    match text.strip_prefix("ParserError(\"").and_then(|t| t.strip_suffix("\")")) {
-        Some(inner) => inner.replace("\\\"", "\""),
-        None => text,
+fn hint_line(hint: Option<&str>) -> String {
+    hint.map_or_else(String::new, |hint| format!("\nhint: {hint}"))
+}
+
+// What is wrong in words without the name of the layer that said them, and a hint.
+fn explain(error: &DataFusionError) -> (String, Option<String>) {
+    match error.find_root() {
+        DataFusionError::SchemaError(schema, _) => match schema.as_ref() {
+            SchemaError::FieldNotFound { field, valid_fields } => {
+                (format!("no column `{}`", field.flat_name()), column_hint(field, valid_fields))
+            }
+            other => (other.to_string(), None),
+        },
+        DataFusionError::SQL(parser, _) => match parser.as_ref() {
+            ParserError::TokenizerError(text) | ParserError::ParserError(text) => (text.clone(), None),
+            ParserError::RecursionLimitExceeded => ("the query is nested too deeply".to_owned(), None),
+        },
+        DataFusionError::ArrowError(arrow, _) => (arrow_message(arrow), None),
+        DataFusionError::Plan(text) => match text.strip_prefix("table '").and_then(|t| t.strip_suffix("' not found")) {
+            Some(name) => missing_table(name),
+            None => (text.clone(), None),
+        },
+        DataFusionError::Execution(text) => (text.clone(), None),
+        DataFusionError::NotImplemented(text) if text.contains("a single SQL statement") => {
+            ("one statement at a time".to_owned(), Some("the prompt takes several, each ended by ;".to_owned()))
+        }
+        other => (other.strip_backtrace(), None),
     }
 }
 
-// The parser puts the place into its text: `... at Line: 1, Column: 8`.
-fn line_and_column(message: &str) -> Option<(u64, u64)> {
-    let (_, place) = message.rsplit_once("Line: ")?;
-    let (line, column) = place.split_once(", Column: ")?;
+fn arrow_message(error: &ArrowError) -> String {
+    match error {
+        ArrowError::DivideByZero => "division by zero".to_owned(),
+        ArrowError::CastError(text) | ArrowError::ComputeError(text) | ArrowError::ArithmeticOverflow(text) => {
+            text.clone()
+        }
+        ArrowError::ExternalError(source) => match source.downcast_ref::<DataFusionError>() {
+            Some(inner) => explain(inner).0,
+            None => source.to_string(),
+        },
+        other => other.to_string(),
+    }
+}
+
+// DataFusion spells the catalogue and schema out, which nobody wrote.
+fn missing_table(qualified: &str) -> (String, Option<String>) {
+    let name = qualified.strip_prefix("datafusion.public.").unwrap_or(qualified);
+    let tables = Table::ALL.map(Table::name);
+    let hint = did_you_mean(name, &tables).unwrap_or_else(|| format!("the tables are {}", tables.join(", ")));
+    (format!("no table `{name}`"), Some(hint))
+}
+
+fn column_hint(field: &Column, valid: &[Column]) -> Option<String> {
+    let mut seen = BTreeSet::new();
+    let names: Vec<_> = valid.iter().map(|c| c.name.as_str()).filter(|name| seen.insert(*name)).collect();
+    if names.is_empty() {
+        return None;
+    }
+    Some(did_you_mean(&field.name, &names).unwrap_or_else(|| {
+        let more = if names.len() > LISTED { ", ...; DESCRIBE lists all of a table" } else { "" };
+        format!("the columns are {}{more}", names[..names.len().min(LISTED)].join(", "))
+    }))
+}
+
+fn did_you_mean(name: &str, names: &[&str]) -> Option<String> {
+    let wanted = name.to_lowercase();
+    let score = |known: &str| normalized_levenshtein(&wanted, &known.to_lowercase());
+    let mut near: Vec<_> = names.iter().map(|known| (score(known), *known)).filter(|n| n.0 >= ALIKE).collect();
+    near.sort_by_key(|(score, _)| Reverse((score * 1e6) as u64));
+    let near: Vec<_> = near.into_iter().take(SUGGESTED).map(|(_, known)| format!("`{known}`")).collect();
+    let (last, before) = near.split_last()?;
+    Some(match before {
+        [] => format!("did you mean {last}?"),
+        _ => format!("did you mean {} or {last}?", before.join(", ")),
+    })
+}
+
+// The parser puts the place into its text, `... at Line: 1, Column: 8`, except at the end of the query.
+fn without_place(sql: &str, message: &str) -> (String, Option<(u64, u64)>) {
+    if let Some(expected) = message.strip_suffix(", found: EOF") {
+        return (format!("{expected}, found the end of the query"), end_of(sql));
+    }
+    let Some((text, place)) = message.rsplit_once(" at Line: ") else { return (message.to_owned(), None) };
     let digits = |text: &str| text.chars().take_while(char::is_ascii_digit).collect::<String>().parse().ok();
-    Some((digits(line)?, digits(column)?))
+    let found = place.split_once(", Column: ").and_then(|(line, column)| Some((digits(line)?, digits(column)?)));
+    match found {
+        Some(place) => (text.to_owned(), Some(place)),
+        None => (message.to_owned(), None),
+    }
+}
+
+fn end_of(sql: &str) -> Option<(u64, u64)> {
+    let text = sql.trim_end();
+    let last = text.lines().last()?;
+    Some((text.lines().count() as u64, last.chars().count() as u64 + 1))
 }
 
 fn mark(sql: &str, line: u64, column: u64) -> Option<String> {
     let text = sql.lines().nth(usize::try_from(line.checked_sub(1)?).ok()?)?;
     let column = usize::try_from(column.checked_sub(1)?).ok()?.min(text.chars().count());
-    Some(format!("\n  {text}\n  {}^", " ".repeat(column)))
+    // Tabs stay tabs, so that the mark stands under its place however wide they are shown.
+    let blank: String = text.chars().take(column).map(|c| if c == '\t' { '\t' } else { ' ' }).collect();
+    Some(format!("\n  {text}\n  {blank}^"))
 }
 
 #[cfg(test)]
@@ -88,9 +184,21 @@ mod tests {
     use super::*;
 
     #[test]
-    fn places_are_marked() {
-        assert_eq!(line_and_column("Expected: x at Line: 2, Column: 5"), Some((2, 5)));
+    fn places_are_found_and_marked() {
+        assert_eq!(without_place("", "Expected: x at Line: 2, Column: 5"), ("Expected: x".to_owned(), Some((2, 5))));
+        assert_eq!(without_place("", "meet me at Line: nowhere"), ("meet me at Line: nowhere".to_owned(), None));
+        let (message, place) = without_place("select\n  1 +\n", "Expected: an expression, found: EOF");
+        assert_eq!((message.as_str(), place), ("Expected: an expression, found the end of the query", Some((2, 6))));
         assert_eq!(mark("select\nfrom x", 2, 6).as_deref(), Some("\n  from x\n       ^"));
+        assert_eq!(mark("\tx", 1, 2).as_deref(), Some("\n  \tx\n  \t^"));
         assert_eq!(mark("select", 9, 1), None);
+    }
+
+    #[test]
+    fn near_names_are_suggested_nearest_first() {
+        let names = ["ended", "ended_ns", "started", "pair_id"];
+        assert_eq!(did_you_mean("endd", &names).as_deref(), Some("did you mean `ended` or `ended_ns`?"));
+        assert_eq!(did_you_mean("Pair_Id", &names).as_deref(), Some("did you mean `pair_id`?"));
+        assert_eq!(did_you_mean("qqq", &names), None);
     }
 }

@@ -1,18 +1,20 @@
 //! SQL over the lake's tables: reading only, one frozen view of the lake a query.
 //!
 //! ```no_run
-//! use futures::TryStreamExt as _;
 //! # async fn example() -> Result<(), Box<dyn std::error::Error>> {
 //! let lake = echolake_lake::Lake::open("lake").await?;
 //! let session = echolake_query::Session::new(&lake)?;
-//! let rows = session.query("select surface_id, state from runs").await?;
-//! println!("{} columns", rows.schema.fields().len());
-//! let batches: Vec<_> = rows.batches.try_collect().await?;
+//! let mut answer = session.query("select surface_id, state from runs").await?;
+//! println!("{} columns", answer.schema.fields().len());
+//! while let Some(batch) = answer.next().await? {
+//!     println!("{} rows more", batch.num_rows());
+//! }
 //! # Ok(())
 //! # }
 //! ```
 
 mod error;
+mod gate;
 pub mod output;
 mod session;
 mod table;

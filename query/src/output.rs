@@ -1,5 +1,6 @@
 //! Answers as text and files: table, CSV, JSON, Parquet and Arrow, written as they come.
 
+use std::collections::HashSet;
 use std::fmt::Write as _;
 use std::io::Write;
 use std::sync::Arc;
@@ -18,11 +19,13 @@ use crate::Error;
 
 /// Values of a list that a table shows.
 const SHOWN: usize = 3;
+/// Rows that a table shows: all of them are held until their widths are known.
+pub const TABLE_ROWS: usize = 10_000;
 
 /// A format of answers.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Format {
-    /// For people; lists are cut short.
+    /// For people: lists are cut short, and rows after [`TABLE_ROWS`] are counted only.
     Table,
     /// Comma-separated, lists as JSON.
     Csv,
@@ -65,7 +68,7 @@ pub struct AnswerWriter<W: Write + Send> {
 
 enum Inner<W: Write + Send> {
     Table(W, Vec<RecordBatch>),
-    Csv(Box<arrow::csv::Writer<W>>),
+    Csv(W, Vec<u8>),
     Json(arrow::json::ArrayWriter<W>),
     Parquet(Box<ArrowWriter<W>>),
     Arrow(arrow::ipc::writer::StreamWriter<W>),
@@ -77,13 +80,16 @@ impl<W: Write + Send> AnswerWriter<W> {
     /// # Errors
     /// [`Error::Format`] or [`Error::Write`].
     pub fn new(format: Format, schema: &SchemaRef, to: W) -> Result<Self, Error> {
+        if matches!(format, Format::Json | Format::Parquet) {
+            one_name_each(format, schema)?;
+        }
         let inner = match format {
             Format::Table => Inner::Table(to, Vec::new()),
             Format::Csv => {
-                let mut writer = arrow::csv::WriterBuilder::new().with_header(true).build(to);
+                let (mut to, mut text) = (to, Vec::new());
                 // A header even where no row comes.
-                writer.write(&RecordBatch::new_empty(flat_schema(schema))).map_err(|e| arrow_error(format, e))?;
-                Inner::Csv(Box::new(writer))
+                write_csv(&mut to, &mut text, &RecordBatch::new_empty(flat_schema(schema)), true)?;
+                Inner::Csv(to, text)
             }
             Format::Json => Inner::Json(arrow::json::WriterBuilder::new().with_explicit_nulls(true).build(to)),
             Format::Parquet => {
@@ -105,11 +111,15 @@ impl<W: Write + Send> AnswerWriter<W> {
     /// # Errors
     /// As [`AnswerWriter::new`].
     pub fn write(&mut self, batch: &RecordBatch) -> Result<(), Error> {
+        let room = TABLE_ROWS.saturating_sub(self.rows).min(batch.num_rows());
         self.rows += batch.num_rows();
         let failed = |e| arrow_error(self.format, e);
         match &mut self.inner {
-            Inner::Table(_, batches) => batches.push(flat(batch, short_list).map_err(failed)?),
-            Inner::Csv(writer) => writer.write(&flat(batch, json_list).map_err(failed)?).map_err(failed)?,
+            Inner::Table(_, batches) if room > 0 => {
+                batches.push(flat(&batch.slice(0, room), short_list).map_err(failed)?);
+            }
+            Inner::Table(..) => {}
+            Inner::Csv(to, text) => write_csv(to, text, &flat(batch, json_list).map_err(failed)?, false)?,
             Inner::Json(writer) => writer.write(batch).map_err(failed)?,
             Inner::Parquet(writer) => writer.write(batch).map_err(parquet_error)?,
             Inner::Arrow(writer) => writer.write(batch).map_err(failed)?,
@@ -130,17 +140,41 @@ impl<W: Write + Send> AnswerWriter<W> {
                 writeln!(to, "{}", pretty_format_batches(&batches).map_err(failed)?)?;
                 to.flush()?;
             }
-            Inner::Csv(writer) => writer.into_inner().flush()?,
+            Inner::Csv(mut to, _) => to.flush()?,
             Inner::Json(mut writer) => {
                 writer.finish().map_err(failed)?;
                 let mut to = writer.into_inner();
                 writeln!(to)?;
                 to.flush()?;
             }
-            Inner::Parquet(writer) => writer.into_inner().map_err(parquet_error)?.flush()?,
+            // It flushes, and unlike into_inner it keeps the system's error.
+            Inner::Parquet(mut writer) => writer.finish().map(drop).map_err(parquet_error)?,
             Inner::Arrow(writer) => writer.into_inner().map_err(failed)?.flush()?,
         }
         Ok(self.rows)
+    }
+}
+
+// By way of memory: arrow's writer makes a text of the system's error, and a closed pipe would not be known.
+fn write_csv(to: &mut impl Write, text: &mut Vec<u8>, batch: &RecordBatch, header: bool) -> Result<(), Error> {
+    text.clear();
+    arrow::csv::WriterBuilder::new()
+        .with_header(header)
+        .build(&mut *text)
+        .write(batch)
+        .map_err(|e| arrow_error(Format::Csv, e))?;
+    Ok(to.write_all(text)?)
+}
+
+// Readers of objects and of Parquet find columns by name.
+fn one_name_each(format: Format, schema: &SchemaRef) -> Result<(), Error> {
+    let mut seen = HashSet::new();
+    match schema.fields().iter().find(|field| !seen.insert(field.name())) {
+        None => Ok(()),
+        Some(field) => {
+            let message = format!("two columns are called `{}`; hint: name one with AS", field.name());
+            Err(Error::Format { format: format.name(), message })
+        }
     }
 }
 
@@ -212,7 +246,7 @@ fn json_list(values: &ArrayRef) -> Result<Vec<String>, ArrowError> {
     let is_text = matches!(values.data_type(), DataType::Utf8 | DataType::LargeUtf8 | DataType::Utf8View);
     let one = |i| match (values.is_null(i), is_text) {
         (true, _) => Ok("null".to_owned()),
-        (false, true) => Ok(format!("{:?}", display(values, i)?)),
+        (false, true) => Ok(serde_json::Value::from(display(values, i)?).to_string()),
         (false, false) => display(values, i),
     };
     (0..values.len()).map(one).collect()
@@ -284,6 +318,61 @@ mod tests {
         let arrow = written(Format::Arrow);
         let reader = arrow::ipc::reader::StreamReader::try_new(&arrow[..], None).expect("Arrow");
         assert_eq!(reader.map(|b| b.expect("a batch")).collect::<Vec<_>>(), [batch()]);
+    }
+
+    #[test]
+    fn long_tables_are_cut_and_counted() {
+        let schema = Arc::new(Schema::new(vec![Field::new("n", DataType::Int64, false)]));
+        let column: ArrayRef = Arc::new(Int64Array::from_iter_values(0..6_000));
+        let batch = RecordBatch::try_new(schema.clone(), vec![column]).expect("a batch");
+        let mut out = Vec::new();
+        let mut writer = AnswerWriter::new(Format::Table, &schema, &mut out).expect("begun");
+        (0..3).for_each(|_| writer.write(&batch).expect("written"));
+        assert_eq!(writer.finish().expect("finished"), 18_000);
+        let lines = String::from_utf8(out).expect("text").lines().count();
+        assert_eq!(lines, TABLE_ROWS + 4);
+    }
+
+    #[test]
+    fn a_name_twice_is_refused_where_columns_go_by_name() {
+        let field = || Field::new("run_id", DataType::Int64, false);
+        let schema = Arc::new(Schema::new(vec![field(), field()]));
+        for format in Format::ALL {
+            let begun = AnswerWriter::new(format, &schema, Vec::new());
+            let by_name = matches!(format, Format::Json | Format::Parquet);
+            assert_eq!(begun.is_err(), by_name, "{}", format.name());
+        }
+    }
+
+    #[test]
+    fn a_closed_pipe_is_known_in_every_format() {
+        struct Closed;
+        impl Write for Closed {
+            fn write(&mut self, _: &[u8]) -> std::io::Result<usize> {
+                Err(std::io::ErrorKind::BrokenPipe.into())
+            }
+            fn flush(&mut self) -> std::io::Result<()> {
+                Ok(())
+            }
+        }
+        for format in Format::ALL {
+            let batch = batch();
+            let failed = AnswerWriter::new(format, &batch.schema(), Closed)
+                .and_then(|mut writer| writer.write(&batch).and_then(|()| writer.finish()))
+                .expect_err(format.name());
+            assert!(matches!(&failed, Error::Write(e) if e.kind() == std::io::ErrorKind::BrokenPipe), "{failed:?}");
+        }
+    }
+
+    #[test]
+    fn lists_of_texts_are_json() {
+        let mut list = arrow::array::ListBuilder::new(arrow::array::StringBuilder::new());
+        list.values().append_value("tab\t\"quote\"\u{1}");
+        list.append(true);
+        let column: ArrayRef = Arc::new(list.finish());
+        let batch = RecordBatch::try_from_iter([("texts", column)]).expect("a batch");
+        let flat = flat(&batch, json_list).expect("flat");
+        assert_eq!(flat.column(0).as_string::<i32>().value(0), r#"["tab\t\"quote\"\u0001"]"#);
     }
 
     #[test]

@@ -3,28 +3,37 @@
 use std::sync::Arc;
 
 use arrow::datatypes::SchemaRef;
+use arrow::record_batch::RecordBatch;
+use datafusion::datasource::physical_plan::parquet::CachedParquetFileReaderFactory;
+use datafusion::error::DataFusionError;
 use datafusion::execution::SendableRecordBatchStream;
 use datafusion::execution::context::SQLOptions;
-use datafusion::execution::object_store::ObjectStoreUrl;
-use datafusion::execution::runtime_env::RuntimeEnv;
+use datafusion::execution::object_store::{DefaultObjectStoreRegistry, ObjectStoreRegistry as _, ObjectStoreUrl};
+use datafusion::execution::runtime_env::{RuntimeEnv, RuntimeEnvBuilder};
 use datafusion::prelude::{SessionConfig, SessionContext};
 use echolake_lake::Lake;
 use echolake_schema::tables::Table;
+use futures::StreamExt as _;
 
-use crate::Error;
-use crate::table::LakeTable;
+use crate::table::{LakeTable, Source};
+use crate::{Error, gate};
 
 /// Where the lake's store is registered; no other store is, so no query reaches a file outside of the lake.
 const STORE: &str = "echolake://lake/";
+/// The store that DataFusion registers by itself: the whole machine.
+const MACHINE: &str = "file:///";
 /// Rows a batch: 384 samples each make 3 MB of responses.
 const BATCH_ROWS: usize = 2048;
+/// Memory for the files' footers and page indexes. A session asks the same files again and again, and those of a
+/// thousand runs are more than DataFusion's 50 MiB.
+const METADATA_BYTES: usize = 256 << 20;
 
 /// Asks a lake in SQL.
 pub struct Session {
     lake: Lake,
     config: SessionConfig,
     runtime: Arc<RuntimeEnv>,
-    store: ObjectStoreUrl,
+    source: Source,
 }
 
 /// An answer, as it comes.
@@ -35,34 +44,47 @@ pub struct Answer {
     pub batches: SendableRecordBatchStream,
 }
 
+impl Answer {
+    /// The next rows; None after the last.
+    ///
+    /// # Errors
+    /// [`Error::Execution`] where the query fails on its way.
+    pub async fn next(&mut self) -> Result<Option<RecordBatch>, Error> {
+        self.batches.next().await.transpose().map_err(|e| Error::execution(&e))
+    }
+}
+
 impl Session {
     /// A session on a lake.
     ///
     /// # Errors
     /// [`Error::Execution`] where DataFusion cannot be set up.
     pub fn new(lake: &Lake) -> Result<Self, Error> {
-        let store = ObjectStoreUrl::parse(STORE).map_err(|e| Error::execution(&e))?;
-        let mut config = SessionConfig::new().with_information_schema(true).with_batch_size(BATCH_ROWS);
-        let options = config.options_mut();
-        options.sql_parser.collect_spans = true;
-        // Files hold plain strings, and so do the formats that answers are written in.
-        options.execution.parquet.schema_force_view_types = false;
-        let runtime = Arc::new(RuntimeEnv::default());
-        runtime.register_object_store(store.as_ref(), lake.store());
-        Ok(Self { lake: lake.clone(), config, runtime, store })
+        let failed = |e: DataFusionError| Error::execution(&e);
+        let url = ObjectStoreUrl::parse(STORE).map_err(failed)?;
+        let runtime = runtime(lake, &url).map_err(failed)?;
+        let metadata = runtime.cache_manager.get_file_metadata_cache();
+        let reader = Arc::new(CachedParquetFileReaderFactory::new(lake.store(), metadata));
+        Ok(Self { lake: lake.clone(), config: config(), runtime, source: Source { url, reader } })
     }
 
     /// Answers a query.
     ///
     /// # Errors
-    /// [`Error::Query`] where it is not right, [`Error::NotReading`] where it would change something.
+    /// [`Error::Query`] where it is not right, [`Error::NotReading`] where it would change something,
+    /// [`Error::Lake`] where the lake cannot be read.
     pub async fn query(&self, sql: &str) -> Result<Answer, Error> {
         let context = self.context().await?;
-        let plan = context.state().create_logical_plan(sql).await.map_err(|e| Error::plan(sql, &e))?;
+        let wrong = |e: DataFusionError| Error::plan(sql, &e);
+        let state = context.state();
+        let statement = state.sql_to_statement(sql, &state.config().options().sql_parser.dialect).map_err(wrong)?;
+        gate::check(&statement)?;
+        let plan = state.statement_to_plan(statement).await.map_err(wrong)?;
+        // `SELECT INTO` reads by its first word and makes a table by its plan.
         let reading = SQLOptions::new().with_allow_ddl(false).with_allow_dml(false).with_allow_statements(false);
-        reading.verify_plan(&plan).map_err(|e| Error::NotReading { message: crate::error::message(&e) })?;
-        let frame = context.execute_logical_plan(plan).await.map_err(|e| Error::plan(sql, &e))?;
-        let batches = frame.execute_stream().await.map_err(|e| Error::plan(sql, &e))?;
+        reading.verify_plan(&plan).map_err(|_| Error::NotReading { statement: plan.display().to_string() })?;
+        let frame = context.execute_logical_plan(plan).await.map_err(wrong)?;
+        let batches = frame.execute_stream().await.map_err(wrong)?;
         Ok(Answer { schema: batches.schema(), batches })
     }
 
@@ -77,95 +99,32 @@ impl Session {
         let context = SessionContext::new_with_config_rt(self.config.clone(), self.runtime.clone());
         for table in Table::ALL {
             let files = snapshot.files(table).to_vec();
-            let provider = LakeTable::new(table.schema(self.lake.rig()), files, self.store.clone());
+            let provider = LakeTable::new(table.schema(self.lake.rig()), files, self.source.clone());
             context.register_table(table.name(), Arc::new(provider)).map_err(|e| Error::execution(&e))?;
         }
         Ok(context)
     }
 }
 
-#[cfg(test)]
-mod tests {
-    use arrow::array::AsArray as _;
-    use arrow::datatypes::{Float64Type, Int64Type};
-    use echolake_lake::References;
-    use echolake_schema::Rig;
-    use futures::TryStreamExt as _;
-
-    use super::*;
-
-    async fn lake() -> (tempfile::TempDir, Lake) {
-        let folder = tempfile::tempdir().expect("a folder");
-        let url = folder.path().join("lake").display().to_string();
-        let lake = Lake::open_or_create(&url, &Rig::paper(), &References::default()).await.expect("a lake");
-        (folder, lake)
-    }
-
-    async fn rows(session: &Session, sql: &str) -> Vec<arrow::record_batch::RecordBatch> {
-        let answer = session.query(sql).await.unwrap_or_else(|e| panic!("{sql}: {e}"));
-        answer.batches.try_collect().await.unwrap_or_else(|e| panic!("{sql}: {e}"))
-    }
-
-    #[tokio::test]
-    async fn tables_are_asked_and_joined() {
-        let (_folder, lake) = lake().await;
-        let session = Session::new(&lake).expect("a session");
-        let count = rows(&session, "select count(*) from pairs").await;
-        assert_eq!(count[0].column(0).as_primitive::<Int64Type>().value(0), 2951);
-        let highest = rows(
-            &session,
-            "select max(p.z_mm) from pairs join points p on p.point_id = pairs.speaker where pairs.pair_id > 2900",
-        )
-        .await;
-        assert_eq!(highest[0].column(0).as_primitive::<Float64Type>().value(0), 474.0);
-        let one = rows(&session, "select direct_mm from pairs where pair_id = 0").await;
-        assert_eq!(one.iter().map(|b| b.num_rows()).sum::<usize>(), 1);
-        assert_eq!(
-            one.iter().find(|b| b.num_rows() > 0).expect("a row").column(0).as_primitive::<Float64Type>().value(0),
-            75.0
-        );
-        assert_eq!(rows(&session, "select * from measurements").await.iter().map(|b| b.num_rows()).sum::<usize>(), 0);
-        assert!(!rows(&session, "show tables").await.is_empty());
-        assert!(!rows(&session, "describe measurements").await.is_empty());
-        assert!(!rows(&session, "explain select * from runs").await.is_empty());
-    }
-
-    #[tokio::test]
-    async fn nothing_but_reading_is_allowed() {
-        let (folder, lake) = lake().await;
-        let session = Session::new(&lake).expect("a session");
-        let outside = folder.path().join("out.csv");
-        for sql in [
-            "create table x as select 1".to_owned(),
-            "drop table runs".to_owned(),
-            "insert into points values (1)".to_owned(),
-            "delete from runs".to_owned(),
-            format!("copy (select 1) to '{}'", outside.display()),
-            "set datafusion.execution.batch_size = 1".to_owned(),
-            "create external table x stored as parquet location '/etc'".to_owned(),
-            "begin".to_owned(),
-        ] {
-            let error = session.query(&sql).await.map(drop).expect_err(&sql);
-            assert!(matches!(error, Error::NotReading { .. } | Error::Query { .. }), "{sql}: {error}");
-        }
-        assert!(!outside.exists());
-        let file = format!("select * from '{}'", folder.path().join("lake/lake.toml").display());
-        assert!(session.query(&file).await.is_err(), "files are no tables");
-        assert_eq!(rows(&session, "select * from points").await.iter().map(|b| b.num_rows()).sum::<usize>(), 78);
-    }
-
-    #[tokio::test]
-    async fn errors_point_at_the_place() {
-        let (_folder, lake) = lake().await;
-        let session = Session::new(&lake).expect("a session");
-        let check = async |sql: &str, expected: &[&str]| {
-            let error = session.query(sql).await.map(drop).expect_err(sql).to_string();
-            for text in expected {
-                assert!(error.contains(text), "{sql}: {error}");
-            }
-        };
-        check("select nonsense from runs", &["nonsense", "\n  select nonsense from runs\n         ^"]).await;
-        check("selec 1", &["selec", "^"]).await;
-        check("select * from rums", &["rums"]).await;
-    }
+// DataFusion's defaults already use all cores and prune by row group and page.
+fn config() -> SessionConfig {
+    let mut config = SessionConfig::new().with_information_schema(true).with_batch_size(BATCH_ROWS);
+    let options = config.options_mut();
+    options.sql_parser.collect_spans = true;
+    // Files hold plain strings, and so do the formats that answers are written in.
+    options.execution.parquet.schema_force_view_types = false;
+    config
 }
+
+fn runtime(lake: &Lake, url: &ObjectStoreUrl) -> Result<Arc<RuntimeEnv>, DataFusionError> {
+    let stores = DefaultObjectStoreRegistry::new();
+    stores.deregister_store(ObjectStoreUrl::parse(MACHINE)?.as_ref())?;
+    stores.register_store(url.as_ref(), lake.store());
+    RuntimeEnvBuilder::new()
+        .with_object_store_registry(Arc::new(stores))
+        .with_metadata_cache_limit(METADATA_BYTES)
+        .build_arc()
+}
+
+#[cfg(test)]
+mod tests;

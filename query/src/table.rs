@@ -2,34 +2,47 @@
 
 use std::sync::Arc;
 
-use arrow::datatypes::SchemaRef;
+use arrow::datatypes::{DataType, SchemaRef};
 use async_trait::async_trait;
 use datafusion::catalog::{Session, TableProvider};
 use datafusion::common::stats::Precision;
-use datafusion::common::{DFSchema, Statistics};
+use datafusion::common::{ScalarValue, Statistics};
 use datafusion::datasource::TableType;
 use datafusion::datasource::listing::PartitionedFile;
-use datafusion::datasource::physical_plan::{FileGroup, FileScanConfigBuilder, ParquetSource};
+use datafusion::datasource::physical_plan::{
+    FileGroup, FileScanConfigBuilder, ParquetFileReaderFactory, ParquetSource,
+};
 use datafusion::datasource::source::DataSourceExec;
 use datafusion::error::Result;
 use datafusion::execution::object_store::ObjectStoreUrl;
-use datafusion::logical_expr::utils::conjunction;
 use datafusion::logical_expr::{Expr, TableProviderFilterPushDown};
 use datafusion::physical_plan::ExecutionPlan;
 use echolake_lake::DataFile;
 use object_store::ObjectMeta;
+
+/// Delta's writers cut texts in statistics to 32 characters; a shorter one is whole, whoever wrote it.
+const WHOLE_TEXT: usize = 32;
 
 /// Files of one table in one snapshot.
 #[derive(Debug)]
 pub(crate) struct LakeTable {
     schema: SchemaRef,
     files: Vec<DataFile>,
-    store: ObjectStoreUrl,
+    source: Source,
+}
+
+/// How files are read.
+#[derive(Debug, Clone)]
+pub(crate) struct Source {
+    /// Where the lake's store is registered.
+    pub(crate) url: ObjectStoreUrl,
+    /// Reads footers once a session.
+    pub(crate) reader: Arc<dyn ParquetFileReaderFactory>,
 }
 
 impl LakeTable {
-    pub(crate) fn new(schema: SchemaRef, files: Vec<DataFile>, store: ObjectStoreUrl) -> Self {
-        Self { schema, files, store }
+    pub(crate) fn new(schema: SchemaRef, files: Vec<DataFile>, source: Source) -> Self {
+        Self { schema, files, source }
     }
 
     // Whole files in groups of about the same size; a file is split further by DataFusion where that pays.
@@ -37,19 +50,40 @@ impl LakeTable {
         let mut groups: Vec<(u64, Vec<PartitionedFile>)> =
             vec![(0, Vec::new()); count.clamp(1, self.files.len().max(1))];
         for file in &self.files {
-            let meta = ObjectMeta {
-                location: file.path.clone(),
-                last_modified: file.modified,
-                size: file.bytes,
-                e_tag: None,
-                version: None,
-            };
             if let Some((bytes, group)) = groups.iter_mut().min_by_key(|g| g.0) {
                 *bytes += file.bytes;
-                group.push(PartitionedFile::new_from_meta(meta));
+                group.push(self.file(file));
             }
         }
         groups.into_iter().map(|(_, files)| FileGroup::new(files)).collect()
+    }
+
+    fn file(&self, file: &DataFile) -> PartitionedFile {
+        let meta = ObjectMeta {
+            location: file.path.clone(),
+            last_modified: file.modified,
+            size: file.bytes,
+            e_tag: None,
+            version: None,
+        };
+        PartitionedFile::new_from_meta(meta).with_statistics(Arc::new(self.known(file)))
+    }
+
+    // What the log knows of a file, so that a query for one surface does not open the files of the others.
+    fn known(&self, file: &DataFile) -> Statistics {
+        let mut known = Statistics::new_unknown(&self.schema);
+        known.num_rows = Precision::Exact(file.rows as usize);
+        let Some(stats) = &file.stats else { return known };
+        for (field, column) in self.schema.fields().iter().zip(&mut known.column_statistics) {
+            let kind = field.data_type();
+            let least = stats.min.get(field.name()).and_then(|v| scalar(kind, v.as_str(), v.as_i64()));
+            let greatest = stats.max.get(field.name()).and_then(|v| scalar(kind, v.as_str(), v.as_i64()));
+            if let (Some(least), Some(greatest)) = (least, greatest) {
+                column.min_value = Precision::Exact(least);
+                column.max_value = Precision::Exact(greatest);
+            }
+        }
+        known
     }
 
     fn rows(&self) -> Statistics {
@@ -57,6 +91,25 @@ impl LakeTable {
         let mut statistics = Statistics::new_unknown(&self.schema);
         statistics.num_rows = Precision::Exact(rows as usize);
         statistics
+    }
+
+    // Lists are decoded for the rows that a filter leaves. Scans of narrow columns alone would only lose by it.
+    fn reads_lists(&self, projection: Option<&Vec<usize>>) -> bool {
+        let nested = |i: usize| self.schema.field(i).data_type().is_nested();
+        match projection {
+            Some(columns) => columns.iter().any(|i| nested(*i)),
+            None => (0..self.schema.fields().len()).any(nested),
+        }
+    }
+}
+
+// Keys are integers and texts. JSON does not keep every float, so those are left to the file's own statistics.
+fn scalar(kind: &DataType, text: Option<&str>, int: Option<i64>) -> Option<ScalarValue> {
+    match kind {
+        DataType::Utf8 => text.filter(|t| t.chars().count() < WHOLE_TEXT).map(ScalarValue::from),
+        DataType::Int32 => int.and_then(|v| i32::try_from(v).ok()).map(ScalarValue::from),
+        DataType::Int64 => int.map(ScalarValue::from),
+        _ => None,
     }
 }
 
@@ -70,7 +123,8 @@ impl TableProvider for LakeTable {
         TableType::Base
     }
 
-    // Statistics leave out row groups and pages, not rows, so DataFusion still filters.
+    // DataFusion keeps its filter, and its physical optimizer hands it to the Parquet reader, which leaves out files,
+    // row groups and pages by statistics, and rows where lists are read.
     fn supports_filters_pushdown(&self, filters: &[&Expr]) -> Result<Vec<TableProviderFilterPushDown>> {
         Ok(vec![TableProviderFilterPushDown::Inexact; filters.len()])
     }
@@ -83,17 +137,14 @@ impl TableProvider for LakeTable {
         &self,
         state: &dyn Session,
         projection: Option<&Vec<usize>>,
-        filters: &[Expr],
+        _filters: &[Expr],
         limit: Option<usize>,
     ) -> Result<Arc<dyn ExecutionPlan>> {
-        let mut source = ParquetSource::new(self.schema.clone())
+        let source = ParquetSource::new(self.schema.clone())
             .with_table_parquet_options(state.table_options().parquet.clone())
-            .with_enable_page_index(true);
-        if let Some(filter) = conjunction(filters.to_vec()) {
-            let schema = DFSchema::try_from(self.schema.clone())?;
-            source = source.with_predicate(state.create_physical_expr(filter, &schema)?);
-        }
-        let config = FileScanConfigBuilder::new(self.store.clone(), Arc::new(source))
+            .with_parquet_file_reader_factory(self.source.reader.clone())
+            .with_pushdown_filters(self.reads_lists(projection));
+        let config = FileScanConfigBuilder::new(self.source.url.clone(), Arc::new(source))
             .with_file_groups(self.groups(state.config().target_partitions()))
             .with_statistics(self.rows())
             .with_projection_indices(projection.cloned())?

@@ -2,20 +2,19 @@
 
 mod prompt;
 
-use std::fs::File;
+use std::fs::{File, OpenOptions};
 use std::io::{BufWriter, IsTerminal as _, Read as _, Write};
 use std::path::{Path, PathBuf};
 
 use anyhow::Context as _;
 use clap::ValueEnum;
 use echolake_lake::Lake;
-use echolake_query::output::{AnswerWriter, Format};
+use echolake_query::output::{AnswerWriter, Format, TABLE_ROWS};
 use echolake_query::{Answer, Session};
-use futures::TryStreamExt as _;
 
 #[derive(Debug, clap::Args)]
 pub(crate) struct SqlArgs {
-    /// The query; without it a prompt, or standard input where that is no terminal.
+    /// The query; - for standard input. Without it a prompt, or standard input where that is no terminal.
     query: Option<String>,
     /// Format of the answer.
     #[arg(long, value_enum, default_value_t = FormatArg::Table)]
@@ -53,13 +52,10 @@ pub(crate) async fn run(args: &SqlArgs, lake_url: &str) -> anyhow::Result<()> {
     let lake = Lake::open(lake_url).await?;
     let session = Session::new(&lake)?;
     let query = match args.query.as_deref() {
-        Some("-") | None if !std::io::stdin().is_terminal() => {
-            let mut text = String::new();
-            std::io::stdin().read_to_string(&mut text).context("cannot read the query from standard input")?;
-            text
-        }
+        Some("-") => from_stdin()?,
         Some(query) => query.to_owned(),
-        None => return prompt::run(&session, &lake).await,
+        None if std::io::stdin().is_terminal() => return prompt::run(&session, &lake).await,
+        None => from_stdin()?,
     };
     let format = if args.json { Format::Json } else { args.format.into() };
     let answer = session.query(&query).await?;
@@ -76,6 +72,12 @@ pub(crate) async fn run(args: &SqlArgs, lake_url: &str) -> anyhow::Result<()> {
     }
 }
 
+fn from_stdin() -> anyhow::Result<String> {
+    let mut text = String::new();
+    std::io::stdin().read_to_string(&mut text).context("cannot read the query from standard input")?;
+    Ok(text)
+}
+
 /// Prints an answer for people.
 pub(super) async fn print_table(session: &Session, sql: &str) -> anyhow::Result<()> {
     write(session.query(sql).await?, Format::Table, std::io::stdout()).await.map(drop)
@@ -83,18 +85,26 @@ pub(super) async fn print_table(session: &Session, sql: &str) -> anyhow::Result<
 
 async fn write(mut answer: Answer, format: Format, to: impl Write + Send) -> anyhow::Result<usize> {
     let mut writer = AnswerWriter::new(format, &answer.schema, to)?;
-    while let Some(batch) = answer.batches.try_next().await.context("the query failed")? {
+    while let Some(batch) = answer.next().await? {
         writer.write(&batch)?;
     }
-    Ok(writer.finish()?)
+    let rows = writer.finish()?;
+    if format == Format::Table && rows > TABLE_ROWS {
+        eprintln!("the first {TABLE_ROWS} of {rows} rows; hint: --format csv prints all");
+    }
+    Ok(rows)
 }
 
-// Beside its place first, so that a file is whole or not there.
+// Beside its place first, so that a file is whole or not there. A device or a pipe is written as it is.
 async fn to_file(answer: Answer, format: Format, path: &Path) -> anyhow::Result<()> {
+    let failed = || format!("cannot write `{}`", path.display());
+    if path.metadata().is_ok_and(|m| !m.is_file()) {
+        let special = OpenOptions::new().write(true).open(path).with_context(failed)?;
+        return write(answer, format, BufWriter::new(special)).await.map(drop);
+    }
     let mut partial = path.as_os_str().to_owned();
     partial.push(".partial");
     let partial = PathBuf::from(partial);
-    let failed = || format!("cannot write `{}`", path.display());
     let file = File::create(&partial).with_context(failed)?;
     let written = write(answer, format, BufWriter::new(file)).await;
     let named = written.and_then(|rows| {
