@@ -111,7 +111,7 @@ fn own<M: RunMessage + Default>(file: &[u8], topic: &str) -> M {
 }
 
 fn shown<M: Decode>(file: &[u8], topic: &str) -> M {
-    M::decode(&one(file, topic).data[..]).ok().expect(topic)
+    M::decode(&one(file, topic).data[..]).unwrap_or_else(|_| panic!("{topic} holds another message"))
 }
 
 #[test]
