@@ -9,7 +9,7 @@
 use std::f64::consts::PI;
 use std::sync::Arc;
 
-use echolake_dsp::Real as _;
+use echolake_dsp::{Error, Real as _};
 use realfft::num_complex::Complex;
 use realfft::{ComplexToReal, RealFftPlanner, RealToComplex};
 
@@ -93,6 +93,10 @@ impl KirchhoffPlan {
     /// whose pressure is s(t - r/c)/r, r in m. What arrives past the end is left out.
     ///
     /// out `[len]`
+    ///
+    /// # Errors
+    /// [`Error::Length`] where `out` or `scratch` is not the plan's, [`Error::Setting`] where a point is none of its;
+    /// `out` is left as it was.
     pub fn response(
         &self,
         [microphone, speaker]: [usize; 2],
@@ -100,19 +104,28 @@ impl KirchhoffPlan {
         reflection_factor: f64,
         scratch: &mut KirchhoffScratch,
         out: &mut [f32],
-    ) {
+    ) -> Result<(), Error> {
+        let (microphone, speaker) = (self.point("microphone", microphone)?, self.point("speaker", speaker)?);
+        check_len("the response", out.len(), self.len)?;
+        check_len("the scratch", scratch.plain.len(), self.len * OVERSAMPLING)?;
         let per_metre = self.rate_hz * OVERSAMPLING as f64 / speed_of_sound_m_s;
         scratch.derivative.fill(0.0);
         scratch.plain.fill(0.0);
-        self.gather(&self.points[microphone], &self.points[speaker], per_metre as f32, scratch);
+        self.gather(microphone, speaker, per_metre as f32, scratch);
         // The sums lack the factors that all facets share. The derivative is per second, taken by 2 pi i f below.
         let common = f64::from(self.area) * reflection_factor / (4.0 * PI);
         let derivative = (common / speed_of_sound_m_s) as f32;
         scratch.derivative.iter_mut().for_each(|x| *x *= derivative);
         scratch.plain.iter_mut().for_each(|x| *x *= common as f32);
-        let direct = self.points[microphone].distance_to(&self.points[speaker]);
+        let direct = microphone.distance_to(speaker);
         deposit(&mut scratch.plain, (direct * per_metre) as f32, (1.0 / direct) as f32);
         self.band_limit(scratch, out);
+        Ok(())
+    }
+
+    fn point(&self, what: &'static str, index: usize) -> Result<&Seen, Error> {
+        let expected = "one of the plan's points";
+        self.points.get(index).ok_or_else(|| Error::Setting { what, actual: format!("point {index}"), expected })
     }
 
     fn gather(&self, a: &Seen, b: &Seen, per_metre: f32, scratch: &mut KirchhoffScratch) {
@@ -189,6 +202,10 @@ impl Seen {
     }
 }
 
+fn check_len(what: &'static str, actual: usize, expected: usize) -> Result<(), Error> {
+    if actual == expected { Ok(()) } else { Err(Error::Length { what, actual, expected }) }
+}
+
 fn deposit(times: &mut [f32], at: f32, weight: f32) {
     let index = at as usize;
     if index + 1 < times.len() {
@@ -227,8 +244,8 @@ mod tests {
     fn reflection(plan: &KirchhoffPlan, pair: [usize; 2]) -> Vec<f32> {
         let (mut with, mut without) = (vec![0.0; plan.len()], vec![0.0; plan.len()]);
         let mut scratch = plan.scratch();
-        plan.response(pair, C, 1.0, &mut scratch, &mut with);
-        plan.response(pair, C, 0.0, &mut scratch, &mut without);
+        plan.response(pair, C, 1.0, &mut scratch, &mut with).expect("a response");
+        plan.response(pair, C, 0.0, &mut scratch, &mut without).expect("a response");
         with.iter().zip(&without).map(|(a, b)| a - b).collect()
     }
 
@@ -285,11 +302,33 @@ mod tests {
     }
 
     #[test]
+    fn what_is_not_the_plans_is_refused() {
+        let plate = HeightField::from_fn(PANEL_SIZE_MM, 20, |_, _| 0.0);
+        let points = [[0.0, 0.0, 124.0], [0.0, 150.0, 124.0]];
+        let [plan, longer] = [256, 512].map(|len| KirchhoffPlan::new(&plate, &points, RATE, len));
+        let respond = |pair, scratch: &mut KirchhoffScratch, len: usize| {
+            let mut out = vec![7.0; len];
+            let outcome = plan.response(pair, C, 0.83, scratch, &mut out);
+            (outcome, out.iter().all(|x| *x == 7.0))
+        };
+        let refused = |actual, expected, what| (Err(Error::Length { what, actual, expected }), true);
+        for len in [0, 1, 255, 257, 512] {
+            assert_eq!(respond([0, 1], &mut plan.scratch(), len), refused(len, 256, "the response"));
+        }
+        assert_eq!(respond([0, 1], &mut longer.scratch(), 256), refused(4_096, 2_048, "the scratch"));
+        for (pair, what) in [([2, 0], "microphone"), ([0, 2], "speaker")] {
+            let error = respond(pair, &mut plan.scratch(), 256).0.expect_err(what).to_string();
+            assert_eq!(error, format!("{what} is point 2, expected one of the plan's points"));
+        }
+        assert_eq!(respond([0, 1], &mut plan.scratch(), 256), (Ok(()), false));
+    }
+
+    #[test]
     fn the_direct_sound_is_one_over_its_distance() {
         let plate = HeightField::from_fn(PANEL_SIZE_MM, 20, |_, _| 0.0);
         let plan = KirchhoffPlan::new(&plate, &[[0.0, 0.0, 124.0], [0.0, 150.0, 124.0]], RATE, 512);
         let mut direct = vec![0.0; 512];
-        plan.response([0, 1], C, 0.0, &mut plan.scratch(), &mut direct);
+        plan.response([0, 1], C, 0.0, &mut plan.scratch(), &mut direct).expect("a response");
         for hz in [2_000.0, 10_000.0, 40_000.0] {
             let off = spectrum_db(&direct, hz) - 20.0 * (1.0f64 / 0.15).log10();
             // One arrival alone: the linear deposit is right on the mean over its place between two steps.

@@ -105,10 +105,11 @@ impl SimulatedRun<'_> {
         let relief = RecordedRelief { heights: &prepared.heights, mesh: &prepared.mesh, original };
         let start = RunStart { manifest: &manifest, rig: self.rig, surface: &prepared.record, relief: Some(relief) };
         let path = self.path()?;
-        let mut recorder = Recorder::create(&path, &start).map_err(controller::Error::from)?;
+        // What can be refused is refused before there is a file.
         let mut controller = RunController::new(self.rig, devices)?;
         let options = RunOptions { keep: self.keep, checkpoint_every: CHECKPOINT_EVERY };
         let grid = self.rig.grid()?;
+        let mut recorder = Recorder::create(&path, &start).map_err(controller::Error::from)?;
         let end = controller.run(&mut recorder, grid.pairs(), options, stop, progress)?;
         Ok((recorder.finish(&end).map_err(controller::Error::from)?, end))
     }

@@ -1,6 +1,9 @@
 //! A folder of the published GIR data set becomes runs, one a surface. Its responses are temperature-corrected
 //! already, and say so.
 
+#[cfg(test)]
+mod tests;
+
 use std::collections::HashMap;
 use std::fs::File;
 use std::path::{Path, PathBuf};
@@ -11,7 +14,8 @@ use echolake_schema::{Celsius, Grid, Pair, PairId, Rig, RunId, SurfaceId, Surfac
 use ndarray::{Array1, Array2, Ix1, Ix2};
 use ndarray_npy::{NpzReader, ReadableElement};
 
-use super::{Error, ImportOptions, ImportedRun, Written};
+use super::batch::Batch;
+use super::{Error, ImportOptions, ImportedRun};
 use crate::mesh::Mesh;
 use crate::recorder::{LogLevel, Recorder, Relief, RunStart};
 use crate::relief::HeightField;
@@ -27,7 +31,7 @@ const NAME: &str = "import gir";
 /// Imports every `<surface>.npz` of a folder; `progress` hears how many surfaces are done, of how many.
 ///
 /// # Errors
-/// [`Error`], naming the file and the place; nothing half-written stays.
+/// [`Error`], naming the file and the place; a refused import leaves nothing behind.
 pub fn import_gir(
     folder: &Path,
     rig: &Rig,
@@ -38,14 +42,14 @@ pub fn import_gir(
     let order = visiting_order(&folder.join("combinations.csv"), &grid)?;
     let info = panel_info(&folder.join("panel_info.csv"))?;
     let files = surfaces(folder)?;
-    let (mut runs, mut written) = (Vec::new(), Written::default());
+    let (mut runs, mut batch) = (Vec::new(), Batch::default());
     for (number, file) in (0u32..).zip(&files) {
         let surface: SurfaceId = file.file_stem().unwrap_or_default().to_string_lossy().parse()?;
         let import = Import { rig, order: order.as_ref(), grid: &grid, options, number };
-        runs.push(import.surface(file, surface.clone(), info.get(&surface), &mut written)?);
+        runs.push(import.surface(file, surface.clone(), info.get(&surface), &mut batch)?);
         progress(runs.len(), files.len());
     }
-    written.keep();
+    batch.publish()?;
     Ok(runs)
 }
 
@@ -63,19 +67,11 @@ impl Import<'_> {
         file: &Path,
         surface: SurfaceId,
         info: Option<&SurfaceRecord>,
-        written: &mut Written,
+        batch: &mut Batch,
     ) -> Result<ImportedRun, Error> {
         let pairs = self.order.map_or(self.grid.pairs(), Vec::as_slice);
         let matrix = self.matrix(file, pairs.len())?;
-        let temperatures: Array1<f64> = array::<Ix1>(file, "temperatures")?;
-        if temperatures.len() != pairs.len() {
-            return Err(wrong(
-                file,
-                "temperatures",
-                format!("{} values", temperatures.len()),
-                format!("{}", pairs.len()),
-            ));
-        }
+        let temperatures = temperatures(file, pairs.len())?;
         let heights = self.heights(file, &surface)?;
         let mesh = heights.as_ref().map(|h| Mesh::from_height_field(&smaller(h), BACK_MM));
         let mut record =
@@ -101,8 +97,7 @@ impl Import<'_> {
         let relief =
             heights.as_ref().zip(mesh.as_ref()).map(|(heights, mesh)| Relief { heights, mesh, original: None });
         let start = RunStart { manifest: &manifest, rig: self.rig, surface: &record, relief };
-        let mut recorder = Recorder::create(&path, &start)?;
-        written.paths.push(path);
+        let mut recorder = batch.create(&path, &start)?;
         if self.order.is_none() {
             let what = "no combinations.csv: rows are taken in the order of the rig's pairs";
             recorder.log(started, LogLevel::Warning, NAME, what)?;
@@ -110,15 +105,13 @@ impl Import<'_> {
         let what = "times are made up: the data set has none; temperatures are those of the correction";
         recorder.log(started, LogLevel::Info, NAME, what)?;
         let mut at = started;
-        for (row, pair) in pairs.iter().enumerate() {
-            let celsius = Celsius::new(temperatures[row])
-                .map_err(|e| wrong(file, format!("temperatures[{row}]"), e.to_string(), "a temperature"))?;
+        for ((row, pair), celsius) in pairs.iter().enumerate().zip(&temperatures) {
             at = at.plus_secs(TAKE_SECS);
             let samples = matrix.row(row).iter().map(|x| *x as f32).collect();
             self.record(&mut recorder, *pair, at, celsius.get(), samples)?;
         }
         let count = pairs.len() as u64;
-        let path = recorder.finish(&RunEnd { ended: at, accepted: count, rejected: 0, attempts: count })?;
+        batch.seal(recorder, &RunEnd { ended: at, accepted: count, rejected: 0, attempts: count })?;
         Ok(ImportedRun { path, run_id, surface, measurements: pairs.len(), warnings: Vec::new() })
     }
 
@@ -183,8 +176,9 @@ impl Import<'_> {
             let expected = format!("{rows} rows of at least {least} samples, the lake's response length");
             return Err(wrong(file, "matrix", format!("{} x {}", actual.0, actual.1), expected));
         }
-        if let Some(((row, column), x)) = matrix.indexed_iter().find(|(_, x)| !x.is_finite()) {
-            return Err(wrong(file, format!("matrix[{row}, {column}]"), x.to_string(), "a finite number"));
+        // Responses are recorded in single precision.
+        if let Some(((row, column), x)) = matrix.indexed_iter().find(|(_, x)| !(**x as f32).is_finite()) {
+            return Err(wrong(file, format!("matrix[{row}, {column}]"), format!("{x:e}"), "a finite f32"));
         }
         Ok(matrix)
     }
@@ -211,6 +205,19 @@ impl Import<'_> {
 
 fn smaller(heights: &HeightField) -> HeightField {
     HeightField::from_fn(heights.size_mm(), MESH_CELLS, |x, y| heights.height_at(x, y))
+}
+
+// One a row of the matrix.
+fn temperatures(file: &Path, rows: usize) -> Result<Vec<Celsius>, Error> {
+    let values: Array1<f64> = array::<Ix1>(file, "temperatures")?;
+    if values.len() != rows {
+        return Err(wrong(file, "temperatures", format!("{} values", values.len()), rows.to_string()));
+    }
+    let checked = values.iter().enumerate().map(|(row, celsius)| {
+        let place = format!("temperatures[{row}]");
+        Celsius::new(*celsius).map_err(|e| wrong(file, place, e.to_string(), "a temperature"))
+    });
+    checked.collect()
 }
 
 fn wrong(path: &Path, place: impl Into<String>, actual: impl Into<String>, expected: impl Into<String>) -> Error {

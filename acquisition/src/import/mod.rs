@@ -1,5 +1,6 @@
 //! Existing measurements become runs: WAV files listed in a manifest, and the published GIR data set.
 
+mod batch;
 mod gir;
 mod wav;
 mod wav_file;
@@ -93,32 +94,4 @@ pub enum Error {
     /// A name or rig is not valid.
     #[error(transparent)]
     Schema(#[from] echolake_schema::Error),
-}
-
-/// Runs that are written; unless they are kept, they are removed again.
-#[derive(Default)]
-struct Written {
-    paths: Vec<PathBuf>,
-    kept: bool,
-}
-
-impl Written {
-    fn keep(mut self) {
-        self.kept = true;
-    }
-}
-
-impl Drop for Written {
-    fn drop(&mut self) {
-        if self.kept {
-            return;
-        }
-        for path in &self.paths {
-            let mut partial = path.clone().into_os_string();
-            partial.push(".partial");
-            // What cannot be removed was most likely never there; the import's own error is the one to tell.
-            let _ = std::fs::remove_file(path);
-            let _ = std::fs::remove_file(PathBuf::from(partial));
-        }
-    }
 }

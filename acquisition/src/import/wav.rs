@@ -1,5 +1,8 @@
 //! WAV files become runs, one a surface. One row at a time is in memory.
 
+#[cfg(test)]
+mod tests;
+
 use std::path::Path;
 
 use echolake_dsp::chain::raw_len;
@@ -10,8 +13,9 @@ use echolake_schema::manifest::{Origin, RunEnd, RunManifest};
 use echolake_schema::messages::{AmbientSample, ImpulseResponse, Measurement, SweepRecording, Verdict};
 use echolake_schema::{Grid, Rig, RunId, SampleRate, SurfaceId, SurfaceRecord, Timestamp};
 
+use super::batch::Batch;
 use super::wav_manifest::{self, Row};
-use super::{Error, ImportOptions, ImportedRun, Written};
+use super::{Error, ImportOptions, ImportedRun};
 use crate::assessment::Assessor;
 use crate::recorder::{LogLevel, Recorder, RunStart};
 
@@ -29,7 +33,8 @@ pub fn sampling_rate_of(manifest: &Path) -> Result<SampleRate, Error> {
 /// Imports all rows of a manifest; `progress` hears how many are done, of how many.
 ///
 /// # Errors
-/// [`Error`], naming the place; every row is checked before the first is imported, and nothing half-written stays.
+/// [`Error`], naming the place; every row is checked before the first is imported, and a refused import leaves nothing
+/// behind.
 pub fn import_wav(
     manifest: &Path,
     rig: &Rig,
@@ -39,16 +44,16 @@ pub fn import_wav(
     let grid = rig.grid()?;
     let surfaces = wav_manifest::read(manifest, rig, &grid)?;
     let total = surfaces.values().map(Vec::len).sum();
-    let (mut runs, mut written, mut done) = (Vec::new(), Written::default(), 0);
+    let (mut runs, mut batch, mut done) = (Vec::new(), Batch::default(), 0);
     for (tag, (surface, rows)) in (0u16..).zip(surfaces) {
         let import = Import { manifest, rig, grid: &grid, options };
-        let run = import.surface(surface, &rows, tag, &mut written, &mut || {
+        let run = import.surface(surface, &rows, tag, &mut batch, &mut || {
             done += 1;
             progress(done, total);
         })?;
         runs.push(run);
     }
-    written.keep();
+    batch.publish()?;
     Ok(runs)
 }
 
@@ -65,7 +70,7 @@ impl Import<'_> {
         surface: SurfaceId,
         rows: &[Row],
         tag: u16,
-        written: &mut Written,
+        batch: &mut Batch,
         done: &mut dyn FnMut(),
     ) -> Result<ImportedRun, Error> {
         let times: Vec<_> = (0u32..).zip(rows).map(|(i, r)| self.time(r, i)).collect();
@@ -82,8 +87,7 @@ impl Import<'_> {
         let record = SurfaceRecord { typology: "imported".into(), ..SurfaceRecord::default() };
         let path = self.options.folder.join(format!("{run_id}.mcap"));
         let start = RunStart { manifest: &run, rig: self.rig, surface: &record, relief: None };
-        let mut recorder = Recorder::create(&path, &start)?;
-        written.paths.push(path);
+        let mut recorder = batch.create(&path, &start)?;
         recorder.log(started, LogLevel::Info, NAME, &format!("{} recordings", rows.len()))?;
         let mut warnings = Vec::new();
         for (row, at) in rows.iter().zip(&times) {
@@ -92,7 +96,7 @@ impl Import<'_> {
         }
         let count = rows.len() as u64;
         let ended = times.iter().copied().max().unwrap_or(started);
-        let path = recorder.finish(&RunEnd { ended, accepted: count, rejected: 0, attempts: count })?;
+        batch.seal(recorder, &RunEnd { ended, accepted: count, rejected: 0, attempts: count })?;
         Ok(ImportedRun { path, run_id, surface, measurements: rows.len(), warnings })
     }
 

@@ -1,10 +1,14 @@
 //! GLB: glTF 2.0 in one binary file, metres, Y up.
 
-use std::path::Path;
+mod accessor;
+mod read;
+mod scene;
 
-use serde_json::{Value, json};
+pub(super) use read::parse;
 
-use super::{Error, Mesh};
+use serde_json::json;
+
+use super::Mesh;
 
 const MAGIC: &[u8; 4] = b"glTF";
 const JSON_CHUNK: u32 = 0x4E4F_534A;
@@ -88,100 +92,4 @@ fn normals(mesh: &Mesh) -> Vec<[f32; 3]> {
         [x, z, -y]
     };
     sums.into_iter().map(unit).collect()
-}
-
-/// Reads positions and triangles of every mesh in the file. Transforms of nodes are not applied.
-pub(super) fn parse(bytes: &[u8], path: &Path) -> Result<Mesh, Error> {
-    let wrong = |place: &str, actual: String, expected: &'static str| Error::Syntax {
-        path: path.to_owned(),
-        place: place.to_owned(),
-        actual,
-        expected,
-    };
-    let word = |at: usize| Some(u32::from_le_bytes(bytes.get(at..at + 4)?.try_into().ok()?) as usize);
-    if bytes.get(..4) != Some(MAGIC) || word(4) != Some(2) {
-        return Err(wrong("byte 0", "no glTF 2.0 header".into(), "`glTF` and version 2"));
-    }
-    if word(8) != Some(bytes.len()) {
-        return Err(wrong(
-            "byte 8",
-            format!("a length that is not the file's {} bytes", bytes.len()),
-            "the file's length",
-        ));
-    }
-    let chunk = |at: usize, kind: u32| -> Option<&[u8]> {
-        (word(at + 4)? == kind as usize).then(|| bytes.get(at + 8..at + 8 + word(at)?)).flatten()
-    };
-    let text = chunk(12, JSON_CHUNK).ok_or_else(|| wrong("byte 12", "no JSON chunk".into(), "a JSON chunk"))?;
-    let bin = chunk(20 + text.len(), BIN_CHUNK).unwrap_or(&[]);
-    let document: Value = serde_json::from_slice(text).map_err(|e| wrong("its JSON", e.to_string(), "valid JSON"))?;
-    let file = File { document, bin };
-    let mut mesh = Mesh::default();
-    let primitives = file.list(&file.document["meshes"]).iter().flat_map(|m| file.list(&m["primitives"]));
-    for primitive in primitives {
-        let missing =
-            |what: &str| wrong("a primitive", format!("no readable {what}"), "plain positions and triangle indices");
-        if primitive["mode"].as_u64().unwrap_or(4) != 4 {
-            return Err(wrong("a primitive", format!("mode {}", primitive["mode"]), "triangles"));
-        }
-        let first = mesh.vertices_mm.len() as u32;
-        let positions = file.positions(&primitive["attributes"]["POSITION"]).ok_or_else(|| missing("positions"))?;
-        let count = positions.len() as u32;
-        mesh.vertices_mm.extend(positions.into_iter().map(from_gltf));
-        let indices = match &primitive["indices"] {
-            Value::Null => (0..count).collect(),
-            accessor => file.indices(accessor).ok_or_else(|| missing("indices"))?,
-        };
-        let triangles = indices.chunks_exact(3).map(|t| [t[0], t[1], t[2]].map(|i| first.saturating_add(i)));
-        mesh.triangles.extend(triangles);
-    }
-    Ok(mesh)
-}
-
-struct File<'a> {
-    document: Value,
-    bin: &'a [u8],
-}
-
-impl File<'_> {
-    fn list<'v>(&self, value: &'v Value) -> &'v [Value] {
-        value.as_array().map_or(&[], Vec::as_slice)
-    }
-
-    fn positions(&self, accessor: &Value) -> Option<Vec<[f32; 3]>> {
-        let (kind, elements) = self.elements(accessor, "VEC3", 3)?;
-        let float = |b: &[u8]| Some(f32::from_le_bytes(b.try_into().ok()?));
-        (kind == FLOAT).then_some(())?;
-        elements.into_iter().map(|e| Some([float(&e[..4])?, float(&e[4..8])?, float(&e[8..12])?])).collect()
-    }
-
-    fn indices(&self, accessor: &Value) -> Option<Vec<u32>> {
-        let (_, elements) = self.elements(accessor, "SCALAR", 1)?;
-        let int = |e: &[u8]| e.iter().rev().fold(0, |n, b| n << 8 | u32::from(*b));
-        Some(elements.into_iter().map(int).collect())
-    }
-
-    // The bytes of each element; None where the accessor leads out of the file.
-    fn elements(&self, accessor: &Value, shape: &str, width: usize) -> Option<(u64, Vec<&[u8]>)> {
-        let number = |v: &Value| v.as_u64().and_then(|n| usize::try_from(n).ok());
-        let accessor = self.list(&self.document["accessors"]).get(number(accessor)?)?;
-        let view = self.list(&self.document["bufferViews"]).get(number(&accessor["bufferView"])?)?;
-        let kind = accessor["componentType"].as_u64()?;
-        let size = match kind {
-            FLOAT | UNSIGNED_INT => 4,
-            UNSIGNED_SHORT => 2,
-            UNSIGNED_BYTE => 1,
-            _ => return None,
-        } * width;
-        if accessor["type"] != shape || number(&view["buffer"])? != 0 {
-            return None;
-        }
-        let start = number(&view["byteOffset"]).unwrap_or(0);
-        let view_bytes = self.bin.get(start..start.checked_add(number(&view["byteLength"])?)?)?;
-        let stride = number(&view["byteStride"]).unwrap_or(size).max(size);
-        let from = view_bytes.get(number(&accessor["byteOffset"]).unwrap_or(0)..)?;
-        let count = number(&accessor["count"])?;
-        let needed = count.checked_sub(1).map_or(Some(0), |n| n.checked_mul(stride)?.checked_add(size))?;
-        (needed <= from.len()).then(|| (kind, (0..count).map(|i| &from[i * stride..i * stride + size]).collect()))
-    }
 }

@@ -20,11 +20,11 @@ pub(super) fn write(mesh: &Mesh) -> Vec<u8> {
 pub(super) fn parse(bytes: &[u8], path: &Path) -> Result<Mesh, Error> {
     let mut mesh = Mesh::default();
     for (number, line) in String::from_utf8_lossy(bytes).lines().enumerate() {
-        let line = line.trim();
-        if let Some(rest) = line.strip_prefix("v ") {
+        let (keyword, rest) = line.trim().split_once(char::is_whitespace).unwrap_or((line.trim(), ""));
+        if keyword == "v" {
             // Colours may follow the position.
             mesh.vertices_mm.push(numbers::<3>(rest, path, number)?);
-        } else if let Some(rest) = line.strip_prefix("f ") {
+        } else if keyword == "f" {
             let corners = rest.split_whitespace().map(|c| corner(c, mesh.vertices_mm.len()));
             let corners = corners.collect::<Option<Vec<u32>>>().filter(|c| c.len() >= 3);
             let corners = corners.ok_or_else(|| Error::Syntax {
@@ -65,4 +65,23 @@ fn corner(text: &str, vertices: usize) -> Option<u32> {
     let number: i64 = text.split('/').next()?.parse().ok()?;
     let index = if number < 0 { vertices as i64 + number } else { number - 1 };
     u32::try_from(index).ok().filter(|i| (*i as usize) < vertices)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn any_whitespace_stands_between_words() {
+        let text = "v 0 0 0\nv 1 0 0\nv 0 1 0\nvn 0 0 1\nf 1 2 3\n";
+        let expected = parse(text.as_bytes(), Path::new("a.obj")).expect("a triangle");
+        assert_eq!((expected.vertices_mm.len(), &expected.triangles[..]), (3, &[[0, 1, 2]][..]));
+        for other in ["\t", "  ", " \t"] {
+            let text = text.replace(' ', other).replace('\n', "\r\n");
+            assert_eq!(parse(text.as_bytes(), Path::new("a.obj")), Ok(expected.clone()), "{other:?}");
+        }
+        for broken in ["v\n", "v 1 2\n", "v 0 0 0\nf\n"] {
+            assert!(parse(broken.as_bytes(), Path::new("a.obj")).is_err(), "{broken:?}");
+        }
+    }
 }

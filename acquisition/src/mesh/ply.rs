@@ -99,13 +99,8 @@ pub(super) fn parse(bytes: &[u8], path: &Path) -> Result<Mesh, Error> {
         actual,
         expected,
     };
-    const END: &[u8] = b"end_header\n";
-    let end = bytes
-        .windows(END.len())
-        .position(|w| w == END)
-        .ok_or_else(|| wrong("the header", "no end".into(), "`end_header`"))?;
-    let header = String::from_utf8_lossy(&bytes[..end]);
-    let body = &bytes[end + END.len()..];
+    let (header, body) = split(bytes).ok_or_else(|| wrong("the header", "no end".into(), "`end_header`"))?;
+    let header = String::from_utf8_lossy(header);
     let mut lines = header.lines().map(str::trim);
     if lines.next() != Some("ply") {
         return Err(wrong("line 1", "something else".into(), "`ply`"));
@@ -142,9 +137,8 @@ pub(super) fn parse(bytes: &[u8], path: &Path) -> Result<Mesh, Error> {
     let mut mesh = Mesh::default();
     for element in &elements {
         for row in 0..element.count {
-            read_row(element, &mut body, &mut mesh).ok_or_else(|| {
-                wrong(&format!("{} {row}", element.name), "no number".into(), "as many as the header counts")
-            })?;
+            read_row(element, &mut body, &mut mesh)
+                .map_err(|(actual, expected)| wrong(&format!("{} {row}", element.name), actual, expected))?;
         }
     }
     Ok(mesh)
@@ -159,31 +153,94 @@ fn add(elements: &mut [Element], name: &str, kind: &str, length: Option<&str>) -
     Some(())
 }
 
-// An element without properties would be read without end.
-fn read_row(element: &Element, body: &mut Body<'_>, mesh: &mut Mesh) -> Option<()> {
+// Header and body; lines may end in a carriage return too.
+fn split(bytes: &[u8]) -> Option<(&[u8], &[u8])> {
+    let mut at = 0;
+    for line in bytes.split_inclusive(|b| *b == b'\n') {
+        at += line.len();
+        if matches!(line, b"end_header\n" | b"end_header\r\n") {
+            return Some((&bytes[..at - line.len()], &bytes[at..]));
+        }
+    }
+    None
+}
+
+// What is wrong is told as what is there and what should be.
+fn read_row(element: &Element, body: &mut Body<'_>, mesh: &mut Mesh) -> Result<(), (String, &'static str)> {
+    let no_number = || ("no number".to_owned(), "as many as the header counts");
     let mut position = [f32::NAN; 3];
-    element.properties.first()?;
+    // An element without properties would be read without end.
+    element.properties.first().ok_or_else(no_number)?;
     for property in &element.properties {
         let Some(length) = property.length else {
-            let value = body.next(property.kind)?;
+            let value = body.next(property.kind).ok_or_else(no_number)?;
             if let Some(axis) = ["x", "y", "z"].iter().position(|n| *n == property.name) {
                 position[axis] = value as f32;
             }
             continue;
         };
-        let length = body.next(length)?;
+        let length = body.next(length).ok_or_else(no_number)?;
+        let length = whole(length).ok_or_else(|| (format!("a list of {length}"), "a whole number of items"))?;
+        let is_corners = element.name == "face" && property.name.starts_with("vertex_ind");
         let mut corners = Vec::new();
-        let mut left = length;
-        while left >= 1.0 {
-            corners.push(body.next(property.kind)? as u32);
-            left -= 1.0;
+        for _ in 0..length {
+            let value = body.next(property.kind).ok_or_else(no_number)?;
+            if is_corners {
+                corners.push(whole(value).ok_or_else(|| (format!("vertex {value}"), "one of the file's vertices"))?);
+            }
         }
-        if element.name == "face" && property.name.starts_with("vertex_ind") {
-            mesh.triangles.extend(fan(&corners));
-        }
+        mesh.triangles.extend(fan(&corners));
     }
     if element.name == "vertex" {
         mesh.vertices_mm.push(position);
     }
-    Some(())
+    Ok(())
+}
+
+// A number from 0 that has no fraction.
+fn whole(value: f64) -> Option<u32> {
+    (value.fract() == 0.0 && (0.0..=f64::from(u32::MAX)).contains(&value)).then_some(value as u32)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const HEADER: &str = "ply\nformat ascii 1.0\ncomment before end_header\nelement vertex 3\nproperty float x\n\
+                          property float y\nproperty float z\nelement face 1\n\
+                          property list uchar int vertex_indices\nend_header\n";
+    const VERTICES: &str = "0 0 0\n1 0 0\n0 1 0\n";
+
+    fn read(face: &str) -> Result<Mesh, Error> {
+        parse(format!("{HEADER}{VERTICES}{face}\n").as_bytes(), Path::new("a.ply"))
+    }
+
+    #[test]
+    fn corners_are_whole_numbers_from_0() {
+        assert_eq!(read("3 0 1 2").expect("a triangle").triangles, [[0, 1, 2]]);
+        for (face, expected) in [
+            ("3 -1 1 2", "face 0 has vertex -1"),
+            ("3 2.7 1 0", "face 0 has vertex 2.7"),
+            ("3 NaN 1 0", "face 0 has vertex NaN"),
+            ("3 5e9 1 0", "face 0 has vertex 5000000000"),
+            ("2.5 0 1 2", "face 0 has a list of 2.5"),
+            ("-3 0 1 2", "face 0 has a list of -3"),
+            ("3 0 1", "face 0 has no number"),
+        ] {
+            let error = read(face).expect_err(expected).to_string();
+            assert!(error.contains(expected), "{error}");
+        }
+    }
+
+    #[test]
+    fn lines_may_end_in_carriage_returns() {
+        let text = format!("{HEADER}{VERTICES}3 0 1 2\n").replace('\n', "\r\n");
+        assert_eq!(parse(text.as_bytes(), Path::new("a.ply")), read("3 0 1 2"));
+        // Binary numbers begin right behind the header's last line.
+        let mut binary = HEADER.replace("ascii", "binary_little_endian").replace('\n', "\r\n").into_bytes();
+        binary.extend([0f32, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0].map(f32::to_le_bytes).as_flattened());
+        binary.push(3);
+        binary.extend([0i32, 1, 2].map(i32::to_le_bytes).as_flattened());
+        assert_eq!(parse(&binary, Path::new("a.ply")), read("3 0 1 2"));
+    }
 }

@@ -5,6 +5,7 @@ use std::path::Path;
 
 use super::{Error, Mesh};
 use crate::relief::{HeightField, RELIEF_MM};
+use crate::rigs::simulated::FACETS;
 
 impl Mesh {
     /// A closed solid: the relief on top, four walls, and a plane at `base_mm` below.
@@ -77,10 +78,11 @@ impl Mesh {
         self.triangles.iter().map(signed).sum::<f64>() / 6.0
     }
 
-    /// Checks that the mesh is a closed solid that fits the panel; returns it welded.
+    /// Checks that the mesh is a closed solid that fits the panel and has the heights of a relief; returns it welded.
     ///
     /// # Errors
-    /// [`Error::Empty`], [`Error::Open`], [`Error::TooLarge`], or [`Error::Syntax`] for numbers that are none.
+    /// [`Error::Empty`], [`Error::Open`], [`Error::TooLarge`], or [`Error::Syntax`] for numbers that are none and
+    /// for holes.
     pub fn check(&self, panel_mm: f64, depth_mm: f64, path: &Path) -> Result<Self, Error> {
         if self.triangles.is_empty() {
             return Err(Error::Empty { path: path.to_owned() });
@@ -101,10 +103,12 @@ impl Mesh {
             });
         }
         let welded = self.welded();
-        match welded.open_edges() {
-            (0, _) => Ok(welded),
-            (edges, place) => Err(Error::Open { path: path.to_owned(), edges, place }),
+        if let (edges @ 1.., place) = welded.open_edges() {
+            return Err(Error::Open { path: path.to_owned(), edges, place });
         }
+        // Heights are found as the simulation will find them.
+        welded.to_height_field(FACETS, panel_mm, depth_mm, path)?;
+        Ok(welded)
     }
 
     // Each edge of a closed mesh is passed as often in one direction as in the other.
@@ -126,8 +130,8 @@ impl Mesh {
     /// within the relief's range its top is moved so that its mean is 0.
     ///
     /// # Errors
-    /// [`Error::TooLarge`] where the relief is deeper than `depth_mm`, [`Error::Syntax`] where the panel shows
-    /// through: a mesh smaller than the panel.
+    /// [`Error::TooLarge`] where the relief is deeper than `depth_mm`, [`Error::Syntax`] where there is no surface: a
+    /// hole, or a mesh smaller than the panel.
     pub fn to_height_field(
         &self,
         cells: usize,
@@ -137,6 +141,7 @@ impl Mesh {
     ) -> Result<HeightField, Error> {
         let [low, high] = self.bounds_mm();
         let centre = [0, 1].map(|i| f64::from(low[i] + high[i]) / 2.0);
+        let cells = cells.max(3);
         let mut tops = vec![f32::NEG_INFINITY; cells * cells];
         for triangle in &self.triangles {
             let corners = triangle.map(|i| {
@@ -146,20 +151,21 @@ impl Mesh {
             });
             rasterise(corners, cells, &mut tops);
         }
-        let bare = tops.iter().filter(|t| !t.is_finite()).count();
-        // The outermost cells may lie just beyond the mesh's edge.
-        if bare > 4 * cells {
-            let actual = format!("{bare} of {} cells without a surface", tops.len());
-            let place = "its view from above".to_owned();
+        fill_rim(&mut tops, cells);
+        if let Some(hole) = tops.iter().position(|t| !t.is_finite()) {
+            let bare = tops.iter().filter(|t| !t.is_finite()).count();
+            let [x, y] = [(hole % cells, centre[0]), (hole / cells, centre[1])]
+                .map(|(i, c)| ((i as f64 + 0.5) / cells as f64 - 0.5) * panel_mm + c);
+            let cm2 = bare as f64 * (panel_mm / cells as f64 / 10.0).powi(2);
             return Err(Error::Syntax {
                 path: path.to_owned(),
-                place,
-                actual,
+                place: "its view from above".to_owned(),
+                actual: format!("a hole at x = {x:.0}, y = {y:.0} mm, {cm2:.1} cm² in all"),
                 expected: "a surface over the whole panel",
             });
         }
-        let seen = || tops.iter().copied().filter(|t| t.is_finite());
-        let (least, greatest) = (seen().fold(f32::INFINITY, f32::min), seen().fold(f32::NEG_INFINITY, f32::max));
+        let least = tops.iter().copied().fold(f32::INFINITY, f32::min);
+        let greatest = tops.iter().copied().fold(f32::NEG_INFINITY, f32::max);
         if f64::from(greatest - least) > depth_mm + 0.1 {
             return Err(Error::TooLarge {
                 path: path.to_owned(),
@@ -167,11 +173,23 @@ impl Mesh {
                 expected: format!("a relief of up to {depth_mm} mm"),
             });
         }
-        let mean = seen().map(f64::from).sum::<f64>() / seen().count() as f64;
+        let mean = tops.iter().copied().map(f64::from).sum::<f64>() / tops.len() as f64;
         let inside = f64::from(least) >= RELIEF_MM[0] - 0.1 && f64::from(greatest) <= RELIEF_MM[1] + 0.1;
         let shift = if inside { 0.0 } else { mean };
-        let mut heights = tops.iter().map(|t| if t.is_finite() { f64::from(*t) - shift } else { mean - shift });
+        let mut heights = tops.iter().map(|t| f64::from(*t) - shift);
         Ok(HeightField::from_fn(panel_mm, cells, |_, _| heights.next().unwrap_or(0.0)))
+    }
+}
+
+// The outermost cells may lie just beyond the mesh's edge: they are as high as their inner neighbours.
+fn fill_rim(tops: &mut [f32], cells: usize) {
+    for iy in 0..cells {
+        for ix in 0..cells {
+            let inner = iy.clamp(1, cells - 2) * cells + ix.clamp(1, cells - 2);
+            if !tops[iy * cells + ix].is_finite() {
+                tops[iy * cells + ix] = tops[inner];
+            }
+        }
     }
 }
 
@@ -210,7 +228,7 @@ mod tests {
     fn a_box_has_its_volume_and_is_closed() {
         let mesh = Mesh::from_height_field(&HeightField::from_fn(100.0, 5, |_, _| 0.0), -20.0);
         assert!((mesh.volume_mm3() - 100.0 * 100.0 * 20.0).abs() < 1e-3);
-        assert!(mesh.check(585.0, 40.0, Path::new("box")).is_ok());
+        assert_eq!(mesh.check(100.0, 40.0, Path::new("box")).map(drop), Ok(()));
     }
 
     #[test]
@@ -238,7 +256,56 @@ mod tests {
         let deep =
             Mesh::from_height_field(&HeightField::from_fn(585.0, 20, |x, _| if x < 0.0 { 0.0 } else { 60.0 }), -20.0);
         assert!(matches!(deep.to_height_field(50, 585.0, 40.0, path), Err(Error::TooLarge { .. })));
+        assert!(deep.check(585.0, 40.0, path).expect_err("deep").to_string().contains("60.0 mm deep"));
         let small = Mesh::from_height_field(&HeightField::from_fn(100.0, 5, |_, _| 0.0), -20.0);
-        assert!(small.to_height_field(50, 585.0, 40.0, path).is_err());
+        assert!(small.check(585.0, 40.0, path).expect_err("small").to_string().contains("a hole at x = -291"));
+    }
+
+    /// A plate from -50 mm to 0 with a square hole of this width right through it, its middle at (100, 30) mm.
+    fn plate_with_hole(width: f32) -> Mesh {
+        let square = |half: f32, [x, y]: [f32; 2]| {
+            [[x - half, y - half], [x + half, y - half], [x + half, y + half], [x - half, y + half]]
+        };
+        let rings = [square(292.5, [0.0, 0.0]), square(width / 2.0, [100.0, 30.0])];
+        let corners = [0.0, -50.0].map(|z| rings.map(|ring| ring.map(|[x, y]| [x, y, z])));
+        let vertices_mm = corners.as_flattened().as_flattened().to_vec();
+        // Outer ring above 0-3, inner 4-7, the same below from 8.
+        let mut triangles = Vec::new();
+        let mut quad = |[a, b, c, d]: [u32; 4]| triangles.extend([[a, b, c], [a, c, d]]);
+        for (i, j) in [(0, 1), (1, 2), (2, 3), (3, 0)] {
+            quad([i, j, j + 4, i + 4]);
+            quad([i + 12, j + 12, j + 8, i + 8]);
+            quad([i + 8, j + 8, j, i]);
+            quad([i + 4, j + 4, j + 12, i + 12]);
+        }
+        Mesh { vertices_mm, triangles }
+    }
+
+    #[test]
+    fn holes_are_named_wherever_a_cell_falls_into_them() {
+        for width in [60.0, 8.0] {
+            let mesh = plate_with_hole(width);
+            let solid = f64::from(50.0 * (585.0 * 585.0 - width * width));
+            assert!((mesh.volume_mm3() / solid - 1.0).abs() < 1e-6, "a closed solid: {}", mesh.volume_mm3());
+            let error = mesh.check(585.0, 40.0, Path::new("hole.stl")).expect_err("a hole").to_string();
+            // The first cell within the hole is next to its lower left corner.
+            let [x, y] = [100.0, 30.0].map(|middle| middle - width / 2.0 + 1.0);
+            let named: Vec<f32> =
+                error.split(|c: char| !(c.is_ascii_digit() || c == '-')).filter_map(|word| word.parse().ok()).collect();
+            assert!(error.contains("a hole at x = "), "{error}");
+            assert!((named[0] - x).abs() <= 2.0 && (named[1] - y).abs() <= 2.0, "{error}");
+        }
+    }
+
+    #[test]
+    fn a_mesh_that_ends_within_the_outermost_cells_is_level_there() {
+        let slope = HeightField::from_fn(582.0, 50, |x, _| x / 50.0);
+        let mesh = Mesh::from_height_field(&slope, -20.0);
+        let again = mesh.to_height_field(FACETS, 585.0, 40.0, Path::new("slope")).expect("heights");
+        for iy in [0, 100, FACETS - 1] {
+            assert_eq!(again.at(0, iy), again.at(1, iy));
+            // The slope's corner, half of its own cells within the edge, is at -5.70 mm.
+            assert!((again.at(1, iy) + 5.69).abs() < 0.02, "{}", again.at(1, iy));
+        }
     }
 }

@@ -29,7 +29,8 @@ pub(super) fn parse(bytes: &[u8], path: &Path) -> Result<Mesh, Error> {
     if expected == Some(bytes.len() as u64) {
         return Ok(binary(&bytes[HEADER + 4..]));
     }
-    if bytes.starts_with(b"solid") && bytes.is_ascii() {
+    // A name may be in any alphabet and encoding, but text has no zeros, and binary numbers do.
+    if bytes.starts_with(b"solid") && !bytes.contains(&0) {
         return text(bytes, path);
     }
     Err(Error::Syntax {
@@ -55,8 +56,8 @@ fn text(bytes: &[u8], path: &Path) -> Result<Mesh, Error> {
             corners.push(numbers::<3>(rest, path, number)?);
         }
     }
-    let complete =
-        corners.len().is_multiple_of(3) && text.trim_end().lines().last().is_some_and(|l| l.starts_with("endsolid"));
+    let complete = corners.len().is_multiple_of(3)
+        && text.trim_end().lines().last().is_some_and(|l| l.trim_start().starts_with("endsolid"));
     if complete {
         return Ok(soup(corners));
     }
@@ -71,4 +72,34 @@ fn text(bytes: &[u8], path: &Path) -> Result<Mesh, Error> {
 fn soup(vertices_mm: Vec<[f32; 3]>) -> Mesh {
     let triangles = (0..vertices_mm.len() as u32 / 3).map(|t| [3 * t, 3 * t + 1, 3 * t + 2]).collect();
     Mesh { vertices_mm, triangles }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn text(name: &[u8]) -> Vec<u8> {
+        let facet =
+            b"\nfacet normal 0 0 1\n outer loop\n  vertex 0 0 0\n\tvertex\t1 0 0\n  vertex 0 1 0\n endloop\nendfacet\n";
+        [b"solid ", name, facet, b"endsolid ", name, b"\n"].concat()
+    }
+
+    #[test]
+    fn names_may_be_in_any_alphabet() {
+        let expected = parse(&text(b"wall"), Path::new("a.stl")).expect("a triangle");
+        assert_eq!(expected.vertices_mm, [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]);
+        // UTF-8, and the same in Latin-1.
+        for name in ["Mauerstück".as_bytes(), b"Mauerst\xFCck"] {
+            assert_eq!(parse(&text(name), Path::new("a.stl")), Ok(expected.clone()), "{name:?}");
+        }
+    }
+
+    #[test]
+    fn a_binary_file_that_was_cut_off_is_no_text() {
+        let mut bytes = write(&Mesh { vertices_mm: vec![[1.5; 3]; 3], triangles: vec![[0, 1, 2]] });
+        bytes[..6].copy_from_slice(b"solid ");
+        assert!(parse(&bytes, Path::new("a.stl")).is_ok());
+        let cut = bytes.len() - 10;
+        assert!(parse(&bytes[..cut], Path::new("a.stl")).expect_err("cut").to_string().contains("124 bytes"));
+    }
 }

@@ -1,7 +1,12 @@
 //! Writes a run's MCAP file, crash-safe: what a checkpoint has passed survives a power cut, and the file stands
 //! under its name only when it is whole.
 
+mod channels;
+mod error;
 mod scene;
+mod sealed;
+#[cfg(test)]
+mod tests;
 
 use std::fs::{File, OpenOptions};
 use std::io::BufWriter;
@@ -9,8 +14,7 @@ use std::path::{Path, PathBuf};
 
 use echolake_schema::manifest::{RunEnd, RunManifest};
 use echolake_schema::messages::{
-    AmbientSample, FILE_DESCRIPTOR_SET, ImpulseResponse, Measurement, Message as RunMessage, SampleFormat,
-    SweepRecording,
+    AmbientSample, ImpulseResponse, Measurement, Message as RunMessage, SampleFormat, SweepRecording,
 };
 use echolake_schema::{Rig, SurfaceRecord, Timestamp, topics};
 use foxglove::Encode;
@@ -19,6 +23,10 @@ use mcap::{Attachment, WriteOptions, Writer};
 
 use crate::mesh::Mesh;
 use crate::relief::HeightField;
+use channels::Channels;
+pub use error::Error;
+pub use sealed::Sealed;
+use sealed::sync;
 
 /// A chunk is ended at this size; a message never straddles two.
 const CHUNK_BYTES: u64 = 1 << 20;
@@ -70,49 +78,6 @@ pub enum LogLevel {
     Error,
 }
 
-/// Why a run cannot be recorded.
-#[derive(Debug, thiserror::Error)]
-pub enum Error {
-    /// A recording of this name is there.
-    #[error("`{}` is there already; hint: a run is never overwritten", path.display())]
-    Exists {
-        /// The file.
-        path: PathBuf,
-    },
-    /// The system refused.
-    #[error("cannot write `{}`: {reason}; hint: is the disk full or read-only? What was recorded so far is in `{}`", path.display(), partial.display())]
-    Write {
-        /// The file.
-        path: PathBuf,
-        /// What is written until it is whole.
-        partial: PathBuf,
-        /// The system's or the writer's words.
-        reason: String,
-    },
-    /// A record that has no JSON.
-    #[error("the surface's record cannot be written: {reason}")]
-    Surface {
-        /// Why.
-        reason: String,
-    },
-}
-
-/// Channels of the topics, in the order of their registration.
-#[derive(Default)]
-struct Channels {
-    tf: u16,
-    scene: u16,
-    points: u16,
-    microphone: u16,
-    speaker: u16,
-    sweep: u16,
-    audio: u16,
-    ir: u16,
-    environment: u16,
-    measurement: u16,
-    log: u16,
-}
-
 /// A run being recorded. Dropped before [`Recorder::finish`], it leaves `<path>.partial`.
 pub struct Recorder {
     writer: Writer<BufWriter<File>>,
@@ -134,30 +99,49 @@ impl Recorder {
     /// Starts a recording that will stand at `path`.
     ///
     /// # Errors
-    /// [`Error::Exists`], or [`Error::Write`] where the folder cannot be written.
+    /// [`Error::Exists`], or [`Error::Create`] where the folder cannot be written; nothing is left behind.
     pub fn create(path: &Path, start: &RunStart<'_>) -> Result<Self, Error> {
+        Self::begin(path, |recorder| recorder.head(start))
+    }
+
+    // Opens the file and writes its head; where that fails nothing is recorded yet, so there is nothing to keep.
+    fn begin(path: &Path, head: impl FnOnce(&mut Self) -> Result<(), Error>) -> Result<Self, Error> {
         let partial = partial_of(path);
         if path.exists() {
             return Err(Error::Exists { path: path.to_owned() });
         }
-        let failed = |reason: String| Error::Write { path: path.to_owned(), partial: partial.clone(), reason };
+        let failed = |reason: String| Error::Create { path: path.to_owned(), reason };
         let file = OpenOptions::new().write(true).create_new(true).open(&partial).map_err(|e| match e.kind() {
             std::io::ErrorKind::AlreadyExists => Error::Exists { path: partial.clone() },
             _ => failed(e.to_string()),
         })?;
+        let begun = Self::over(file, path, &partial).and_then(|mut recorder| head(&mut recorder).map(|()| recorder));
+        begun.map_err(|e| {
+            // What cannot be removed either has a cause that the error tells already.
+            let _ = std::fs::remove_file(&partial);
+            match e {
+                Error::Write { reason, .. } => failed(reason),
+                other => other,
+            }
+        })
+    }
+
+    fn over(file: File, path: &Path, partial: &Path) -> Result<Self, Error> {
+        let (path, partial) = (path.to_owned(), partial.to_owned());
         let writer = WriteOptions::new()
             .profile("")
             .library(concat!("echolake ", env!("CARGO_PKG_VERSION")))
             .chunk_size(Some(CHUNK_BYTES))
             // One thread: the same run gives the same bytes, and runs are recorded side by side.
             .compression_threads(0)
-            .create(BufWriter::new(file))
-            .map_err(|e| failed(e.to_string()))?;
-        let (path, partial) = (path.to_owned(), partial.clone());
-        let mut recorder =
-            Self { writer, path, partial, channels: Channels::default(), sequence: 0, encoded: Vec::new() };
-        recorder.head(start)?;
-        Ok(recorder)
+            .create(BufWriter::new(file));
+        match writer {
+            Ok(writer) => {
+                let channels = Channels::default();
+                Ok(Self { writer, path, partial, channels, sequence: 0, encoded: Vec::new() })
+            }
+            Err(e) => Err(Error::Create { path, reason: e.to_string() }),
+        }
     }
 
     // What the run is stands first, so that a reader knows it before the first chunk.
@@ -173,7 +157,7 @@ impl Recorder {
             self.attach(at, topics::MESH_ATTACHMENT, "model/gltf-binary", glb)?;
             self.attach(at, topics::HEIGHTS_ATTACHMENT, "application/octet-stream", &heights)?;
             if let Some(file) = &relief.original {
-                self.attach(at, file.name, file.media_type, file.bytes)?;
+                self.attach(at, &own_name(file.name), file.media_type, file.bytes)?;
             }
         }
         self.channels = Channels::register(&mut self.writer).map_err(|e| self.failed(e.to_string()))?;
@@ -228,16 +212,29 @@ impl Recorder {
     }
 
     /// Ends the recording and gives it its name; returns its path.
-    pub fn finish(mut self, end: &RunEnd) -> Result<PathBuf, Error> {
+    ///
+    /// # Errors
+    /// [`Error::Exists`] where the name was taken meanwhile, or [`Error::Write`].
+    pub fn finish(self, end: &RunEnd) -> Result<PathBuf, Error> {
+        self.seal(end)?.publish()
+    }
+
+    /// Ends the recording, whole and on the disk, but not yet under its name: runs that belong together are all
+    /// sealed before the first is published.
+    ///
+    /// # Errors
+    /// [`Error::Write`].
+    pub fn seal(mut self, end: &RunEnd) -> Result<Sealed, Error> {
         self.metadata(topics::RUN_END_METADATA, end.to_metadata())?;
         // The writer's own drop would swallow what goes wrong here.
         let finished = self.writer.finish().map(drop).map_err(|e| e.to_string());
-        let named = finished.and_then(|()| sync(&self.partial)).and_then(|()| {
-            std::fs::rename(&self.partial, &self.path).map_err(|e| e.to_string())?;
-            self.path.parent().map_or(Ok(()), sync)
-        });
-        named.map_err(|reason| self.failed(reason))?;
-        Ok(self.path.clone())
+        finished.and_then(|()| sync(&self.partial)).map_err(|reason| self.failed(reason))?;
+        Ok(Sealed::new(self.path.clone(), self.partial.clone()))
+    }
+
+    /// Where the recording stands until it is published.
+    pub fn partial(&self) -> &Path {
+        &self.partial
     }
 
     fn own<M: RunMessage>(&mut self, channel: u16, at: Timestamp, message: &M) -> Result<(), Error> {
@@ -288,40 +285,11 @@ impl Recorder {
     }
 }
 
-impl Channels {
-    fn register(writer: &mut Writer<BufWriter<File>>) -> mcap::McapResult<Self> {
-        use foxglove::messages as fg;
-        Ok(Self {
-            tf: foxglove_channel::<fg::FrameTransforms>(writer, topics::TF)?,
-            scene: foxglove_channel::<fg::SceneUpdate>(writer, topics::PANEL_SCENE)?,
-            points: foxglove_channel::<fg::PointCloud>(writer, topics::PANEL_POINTS)?,
-            microphone: foxglove_channel::<fg::PoseInFrame>(writer, topics::MICROPHONE_POSE)?,
-            speaker: foxglove_channel::<fg::PoseInFrame>(writer, topics::SPEAKER_POSE)?,
-            sweep: own_channel::<SweepRecording>(writer, topics::SWEEP)?,
-            audio: foxglove_channel::<fg::RawAudio>(writer, topics::SWEEP_AUDIO)?,
-            ir: own_channel::<ImpulseResponse>(writer, topics::IR)?,
-            environment: own_channel::<AmbientSample>(writer, topics::ENVIRONMENT)?,
-            measurement: own_channel::<Measurement>(writer, topics::MEASUREMENT)?,
-            log: foxglove_channel::<fg::Log>(writer, topics::LOG)?,
-        })
-    }
-}
-
-fn foxglove_channel<M: Encode>(writer: &mut Writer<BufWriter<File>>, topic: &str) -> mcap::McapResult<u16> {
-    let schema = match M::get_schema() {
-        Some(schema) => writer.add_schema(&schema.name, &schema.encoding, &schema.data)?,
-        None => 0,
-    };
-    writer.add_channel(schema, topic, &M::get_message_encoding(), &Default::default())
-}
-
-fn own_channel<M: RunMessage>(writer: &mut Writer<BufWriter<File>>, topic: &str) -> mcap::McapResult<u16> {
-    let schema = writer.add_schema(M::FULL_NAME, "protobuf", FILE_DESCRIPTOR_SET)?;
-    writer.add_channel(schema, topic, "protobuf", &Default::default())
-}
-
-fn sync(path: &Path) -> Result<(), String> {
-    File::open(path).and_then(|f| f.sync_all()).map_err(|e| e.to_string())
+// The producer's file keeps its name, unless it is one of ours: two attachments of one name hide each other.
+fn own_name(name: &str) -> String {
+    let ours =
+        [topics::RIG_ATTACHMENT, topics::SURFACE_ATTACHMENT, topics::MESH_ATTACHMENT, topics::HEIGHTS_ATTACHMENT];
+    if ours.contains(&name) { format!("original-{name}") } else { name.to_owned() }
 }
 
 // The microphone's samples as little-endian 16 bit: the upper bits of integers, the nearest of floats.
@@ -333,7 +301,7 @@ fn top_16_bits(recording: &SweepRecording) -> Vec<u8> {
         SampleFormat::S32le => bytes.chunks_exact(4).flat_map(|b| [b[2], b[3]]).collect(),
         SampleFormat::F32le => bytes
             .chunks_exact(4)
-            .flat_map(|b| ((f32::from_le_bytes([b[0], b[1], b[2], b[3]]) * 32_767.0) as i16).to_le_bytes())
+            .flat_map(|b| ((f32::from_le_bytes([b[0], b[1], b[2], b[3]]) * 32_767.0).round() as i16).to_le_bytes())
             .collect(),
         SampleFormat::Unspecified => Vec::new(),
     }

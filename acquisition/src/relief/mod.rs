@@ -108,14 +108,17 @@ impl Relief {
     pub fn set(&mut self, key: &str, value: &str) -> Result<(), Error> {
         let relief = self.name();
         let mut fields = self.parameters();
-        let old = fields.get(key).cloned().ok_or_else(|| Error::Parameter {
+        // The bond is the relief's own: another one is another relief.
+        let names = || fields.iter().filter(|(_, value)| value.is_number()).map(|(name, _)| name.as_str());
+        let unknown = || Error::Parameter {
             relief,
             given: key.to_owned(),
-            valid: match fields.keys().cloned().collect::<Vec<_>>() {
+            valid: match names().collect::<Vec<_>>() {
                 names if names.is_empty() => "it has none".to_owned(),
                 names => names.join(", "),
             },
-        })?;
+        };
+        let old = fields.get(key).filter(|value| value.is_number()).ok_or_else(unknown)?;
         let expected = if old.is_u64() { "a whole number" } else { "a number" };
         let wrong = |expected| Error::Value { relief, key: key.to_owned(), given: value.to_owned(), expected };
         let number: f64 = value.parse().ok().filter(|x: &f64| x.is_finite()).ok_or_else(|| wrong(expected))?;
@@ -164,12 +167,11 @@ impl Relief {
         }
     }
 
-    /// Its parameters by name.
+    /// Its parameters by name, all that [`Bricks`] and the like have.
     pub fn parameters(&self) -> serde_json::Map<String, serde_json::Value> {
         match serde_json::to_value(self) {
             Ok(serde_json::Value::Object(mut fields)) => {
                 fields.remove("relief");
-                fields.remove("bond");
                 fields
             }
             _ => serde_json::Map::new(),
@@ -219,6 +221,18 @@ mod tests {
             assert_eq!(high - low < 1.0, is_plane, "{name}: {low} {high}");
             assert_eq!(relief.height_field(64), relief.height_field(64), "{name}");
         }
+    }
+
+    #[test]
+    fn a_flemish_wall_stays_one_whatever_is_set() {
+        let mut wall = Relief::by_name("flemish").expect("a relief");
+        wall.set("seed", "7").expect("a parameter");
+        assert_eq!(wall, Relief::Flemish(Bricks { bond: Bond::Flemish, seed: 7, ..Bricks::default() }));
+        // Parameters alone say what the wall is: the table `surfaces` keeps them.
+        let again: Bricks = serde_json::from_value(wall.parameters().into()).expect("bricks");
+        assert_eq!(Relief::Flemish(again), wall);
+        let refused = wall.set("bond", "stretcher").expect_err("another relief").to_string();
+        assert!(refused.contains("has no parameter `bond`") && !refused.contains("bond,"), "{refused}");
     }
 
     #[test]

@@ -227,7 +227,10 @@ impl AudioInterface for SimulatedAudio {
         let level = if spoiled { SPOILED_LEVEL_DB } else { 42.0 };
         world.outside_level_db = level + 1.5 * world.normal();
         let c = speed_of_sound(world.temperature_c());
-        self.plan.response(world.stand, c, self.reflection_factor, &mut self.scratch, &mut self.response);
+        let failed = |e: echolake_dsp::Error| Error::Device { device: "simulated room", reason: e.to_string() };
+        self.plan
+            .response(world.stand, c, self.reflection_factor, &mut self.scratch, &mut self.response)
+            .map_err(failed)?;
         let played = match &mut self.output {
             Some(played) if played.output == output => played,
             other => other.insert(Played::new(output, self.rate_hz, self.response.len())),

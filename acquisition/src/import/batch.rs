@@ -1,0 +1,58 @@
+//! The runs of one import stand under their names together, or none of them does.
+
+use std::path::{Path, PathBuf};
+
+use echolake_schema::manifest::RunEnd;
+
+use crate::recorder::{Error, Recorder, RunStart, Sealed};
+
+/// Runs that are written and not yet named. Dropped before [`Batch::publish`] has named all, it removes its files,
+/// and only its own.
+#[derive(Default)]
+pub(super) struct Batch {
+    sealed: Vec<Sealed>,
+    ours: Vec<PathBuf>,
+}
+
+impl Batch {
+    /// Begins one of the runs.
+    pub(super) fn create(&mut self, path: &Path, start: &RunStart<'_>) -> Result<Recorder, Error> {
+        let recorder = Recorder::create(path, start)?;
+        self.ours.push(recorder.partial().to_owned());
+        Ok(recorder)
+    }
+
+    /// Ends one of the runs: it is whole and on the disk.
+    pub(super) fn seal(&mut self, recorder: Recorder, end: &RunEnd) -> Result<(), Error> {
+        self.sealed.push(recorder.seal(end)?);
+        Ok(())
+    }
+
+    /// Gives all runs their names.
+    pub(super) fn publish(mut self) -> Result<(), Error> {
+        // What can be known to fail is known before the first has its name.
+        if let Some(taken) = self.sealed.iter().find(|run| run.path().exists()) {
+            return Err(Error::Exists { path: taken.path().to_owned() });
+        }
+        for run in std::mem::take(&mut self.sealed) {
+            let path = run.path().to_owned();
+            let named = run.publish();
+            // A name that was taken meanwhile is somebody else's file.
+            if !matches!(named, Err(Error::Exists { .. })) {
+                self.ours.push(path);
+            }
+            named?;
+        }
+        self.ours.clear();
+        Ok(())
+    }
+}
+
+impl Drop for Batch {
+    fn drop(&mut self) {
+        for path in &self.ours {
+            // Most partial files have been renamed; what cannot be removed, the import's own error explains.
+            let _ = std::fs::remove_file(path);
+        }
+    }
+}

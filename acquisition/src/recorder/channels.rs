@@ -1,0 +1,60 @@
+//! The topics of a run's file and their schemas.
+
+use std::fs::File;
+use std::io::BufWriter;
+
+use echolake_schema::messages::{
+    AmbientSample, FILE_DESCRIPTOR_SET, ImpulseResponse, Measurement, Message as RunMessage, SweepRecording,
+};
+use echolake_schema::topics;
+use foxglove::Encode;
+use mcap::Writer;
+
+/// Channels of the topics, in the order of their registration.
+#[derive(Default)]
+pub(super) struct Channels {
+    pub(super) tf: u16,
+    pub(super) scene: u16,
+    pub(super) points: u16,
+    pub(super) microphone: u16,
+    pub(super) speaker: u16,
+    pub(super) sweep: u16,
+    pub(super) audio: u16,
+    pub(super) ir: u16,
+    pub(super) environment: u16,
+    pub(super) measurement: u16,
+    pub(super) log: u16,
+}
+
+impl Channels {
+    /// Declares every topic, so that a reader knows all of them whatever the run holds.
+    pub(super) fn register(writer: &mut Writer<BufWriter<File>>) -> mcap::McapResult<Self> {
+        use foxglove::messages as fg;
+        Ok(Self {
+            tf: foxglove_channel::<fg::FrameTransforms>(writer, topics::TF)?,
+            scene: foxglove_channel::<fg::SceneUpdate>(writer, topics::PANEL_SCENE)?,
+            points: foxglove_channel::<fg::PointCloud>(writer, topics::PANEL_POINTS)?,
+            microphone: foxglove_channel::<fg::PoseInFrame>(writer, topics::MICROPHONE_POSE)?,
+            speaker: foxglove_channel::<fg::PoseInFrame>(writer, topics::SPEAKER_POSE)?,
+            sweep: own_channel::<SweepRecording>(writer, topics::SWEEP)?,
+            audio: foxglove_channel::<fg::RawAudio>(writer, topics::SWEEP_AUDIO)?,
+            ir: own_channel::<ImpulseResponse>(writer, topics::IR)?,
+            environment: own_channel::<AmbientSample>(writer, topics::ENVIRONMENT)?,
+            measurement: own_channel::<Measurement>(writer, topics::MEASUREMENT)?,
+            log: foxglove_channel::<fg::Log>(writer, topics::LOG)?,
+        })
+    }
+}
+
+fn foxglove_channel<M: Encode>(writer: &mut Writer<BufWriter<File>>, topic: &str) -> mcap::McapResult<u16> {
+    let schema = match M::get_schema() {
+        Some(schema) => writer.add_schema(&schema.name, &schema.encoding, &schema.data)?,
+        None => 0,
+    };
+    writer.add_channel(schema, topic, &M::get_message_encoding(), &Default::default())
+}
+
+fn own_channel<M: RunMessage>(writer: &mut Writer<BufWriter<File>>, topic: &str) -> mcap::McapResult<u16> {
+    let schema = writer.add_schema(M::FULL_NAME, "protobuf", FILE_DESCRIPTOR_SET)?;
+    writer.add_channel(schema, topic, "protobuf", &Default::default())
+}
