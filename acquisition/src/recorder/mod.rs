@@ -12,7 +12,7 @@ use echolake_schema::messages::{
     AmbientSample, FILE_DESCRIPTOR_SET, ImpulseResponse, Measurement, Message as RunMessage, SampleFormat,
     SweepRecording,
 };
-use echolake_schema::{Rig, SurfaceRecord, Timestamp, topics};
+use echolake_schema::{Rig, SurfaceRecord, Timestamp, samples, topics};
 use foxglove::Encode;
 use mcap::records::{MessageHeader, Metadata};
 use mcap::{Attachment, WriteOptions, Writer};
@@ -330,6 +330,7 @@ fn top_16_bits(recording: &SweepRecording) -> Vec<u8> {
     match recording.format() {
         SampleFormat::S16le => bytes.clone(),
         SampleFormat::S24le => bytes.chunks_exact(3).flat_map(|b| [b[1], b[2]]).collect(),
+        SampleFormat::S24Split => samples::upper_16(bytes).to_vec(),
         SampleFormat::S32le => bytes.chunks_exact(4).flat_map(|b| [b[2], b[3]]).collect(),
         SampleFormat::F32le => bytes
             .chunks_exact(4)
