@@ -4,6 +4,7 @@
 use std::error::Error;
 use std::hint::black_box;
 use std::io::Write as _;
+use std::ops::Range;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
@@ -16,6 +17,7 @@ use echolake_schema::samples::{decode, split_24};
 use echolake_schema::{Rig, Timestamp};
 use flacenc::component::BitRepr as _;
 use flacenc::error::Verify as _;
+use zstd::stream::raw::Operation as _;
 
 type Result<T> = std::result::Result<T, Box<dyn Error>>;
 
@@ -25,9 +27,8 @@ const ROUNDS: usize = 9;
 const DECODINGS: usize = 3;
 /// Samples of a recording that are stored as one channel: those of a sweep of 0.5 s at 96 kHz.
 const CHANNEL: usize = 48_000;
-/// Takes in a chunk of a run's file, and chunks that are measured.
-const CHUNK_TAKES: usize = 3;
-const CHUNKS: usize = 2;
+/// Simulated takes: those of a chunk of 4 MiB. A chunk of 1 MiB has three.
+const TAKES: usize = 12;
 /// Samples of a FLAC frame: of 512 to 4,096, what chunks become smallest with; a sweep's frequency moves.
 const FLAC_BLOCK: usize = 1_024;
 const FULL_SCALE: f32 = 8_388_608.0;
@@ -83,8 +84,15 @@ const CHOSEN: usize = 9;
 /// What is compressed in one go: channels of 24-bit samples, and what a chunk holds besides.
 struct Block {
     channels: Vec<Vec<i32>>,
-    /// The upper 16 bits of some channels as `/sweep/audio` repeats them.
-    audio: Vec<u8>,
+    beside: Beside,
+}
+
+/// What stands between the channels.
+#[derive(Clone, Copy, PartialEq)]
+enum Beside {
+    Nothing,
+    /// Behind each microphone and its loopback, the microphone's upper 16 bits: `/sweep/audio`.
+    Audio,
 }
 
 struct Input {
@@ -153,7 +161,7 @@ fn simulated() -> Result<Vec<Input>> {
     output.resize(rig.recording_len(), 0.0);
     let grid = rig.grid()?;
     let mut takes = Vec::new();
-    for pair in grid.pairs().iter().step_by(grid.pairs().len() / (CHUNKS * CHUNK_TAKES)).take(CHUNKS * CHUNK_TAKES) {
+    for pair in grid.pairs().iter().step_by(grid.pairs().len() / TAKES).take(TAKES) {
         let [microphone, speaker] = [pair.microphone, pair.speaker].map(|id| grid.points()[id.index()].position_mm);
         let mut take = Take::default();
         devices.robots.power(Power::On)?;
@@ -166,8 +174,8 @@ fn simulated() -> Result<Vec<Input>> {
         Input { name: "simulated microphone", blocks: alone(&takes, |t| &t.microphone) },
         Input { name: "simulated loopback", blocks: alone(&takes, |t| &t.loopback) },
         Input { name: "simulated, chunk of one take", blocks: takes.chunks(1).map(chunk).collect() },
-        Input { name: "simulated, chunk of three", blocks: takes.chunks(CHUNK_TAKES).map(chunk).collect() },
-        Input { name: "simulated, chunk of six", blocks: takes.chunks(2 * CHUNK_TAKES).map(chunk).collect() },
+        Input { name: "simulated, chunk of three", blocks: takes.chunks(3).map(chunk).collect() },
+        Input { name: "simulated, chunk of twelve", blocks: takes.chunks(12).map(chunk).collect() },
     ])
 }
 
@@ -196,13 +204,12 @@ fn read_24(path: &Path) -> Result<Vec<i32>> {
 }
 
 fn alone(takes: &[Take], channel: fn(&Take) -> &Vec<i32>) -> Vec<Block> {
-    takes.iter().map(|t| Block { channels: vec![channel(t).clone()], audio: Vec::new() }).collect()
+    takes.iter().map(|t| Block { channels: vec![channel(t).clone()], beside: Beside::Nothing }).collect()
 }
 
 fn chunk(takes: &[Take]) -> Block {
     let channels = takes.iter().flat_map(|t| [t.microphone.clone(), t.loopback.clone()]).collect();
-    let upper = |x: &i32| [(x >> 8) as u8, (x >> 16) as u8];
-    Block { channels, audio: takes.iter().flat_map(|t| t.microphone.iter().flat_map(upper)).collect() }
+    Block { channels, beside: Beside::Audio }
 }
 
 fn measure(input: &Input) -> Result<Vec<Measured>> {
@@ -240,38 +247,52 @@ fn measure(input: &Input) -> Result<Vec<Measured>> {
 struct Encoded {
     bytes: Vec<u8>,
     plain_len: usize,
-    /// Bytes of each channel before zstd.
-    channel_lens: Vec<usize>,
+    /// Where each channel stands before zstd.
+    ranges: Vec<Range<usize>>,
 }
 
 struct Codec {
     layout: Layout,
-    zstd: Option<(zstd::bulk::Compressor<'static>, zstd::bulk::Decompressor<'static>)>,
+    zstd: Option<(zstd::stream::raw::Encoder<'static>, zstd::bulk::Decompressor<'static>)>,
     plain: Vec<u8>,
     integers: Vec<i32>,
 }
 
 impl Codec {
     fn new(encoding: &Encoding) -> Result<Self> {
-        let pair = |level| std::io::Result::Ok((zstd::bulk::Compressor::new(level)?, zstd::bulk::Decompressor::new()?));
+        let pair =
+            |level| std::io::Result::Ok((zstd::stream::raw::Encoder::new(level)?, zstd::bulk::Decompressor::new()?));
         let zstd = encoding.zstd.map(pair).transpose()?;
         Ok(Self { layout: encoding.layout, zstd, plain: Vec::new(), integers: Vec::new() })
     }
 
     fn encode(&mut self, block: &Block) -> Result<Encoded> {
-        self.plain.clear();
-        let mut channel_lens = Vec::new();
-        for channel in &block.channels {
-            let before = self.plain.len();
-            lay_out(self.layout, channel, &mut self.plain)?;
-            channel_lens.push(self.plain.len() - before);
+        let plain = &mut self.plain;
+        plain.clear();
+        let mut ranges = Vec::new();
+        for (index, channel) in block.channels.iter().enumerate() {
+            let before = plain.len();
+            lay_out(self.layout, channel, plain)?;
+            ranges.push(before..plain.len());
+            if block.beside == Beside::Audio && index % 2 == 1 {
+                let microphone = block.channels[index - 1].iter();
+                plain.extend(microphone.flat_map(|x| [(x >> 8) as u8, (x >> 16) as u8]));
+            }
         }
-        self.plain.extend_from_slice(&block.audio);
-        let bytes = match &mut self.zstd {
-            Some((compressor, _)) => compressor.compress(&self.plain)?,
-            None => self.plain.clone(),
+        let bytes = match self.zstd.take() {
+            Some((mut compressor, decompressor)) => {
+                // As a run's file is written: in a stream, whose length zstd does not know when it begins.
+                compressor.reinit()?;
+                let mut writer = zstd::stream::zio::Writer::new(Vec::new(), compressor);
+                writer.write_all(plain)?;
+                writer.finish()?;
+                let (bytes, compressor) = writer.into_inner();
+                self.zstd = Some((compressor, decompressor));
+                bytes
+            }
+            None => plain.clone(),
         };
-        Ok(Encoded { bytes, plain_len: self.plain.len(), channel_lens })
+        Ok(Encoded { bytes, plain_len: plain.len(), ranges })
     }
 
     fn decode<'a>(&mut self, block: &Encoded, channels: &mut impl Iterator<Item = &'a mut Vec<f32>>) -> Result<()> {
@@ -283,11 +304,8 @@ impl Codec {
             }
             None => &block.bytes,
         };
-        let mut rest = plain.as_slice();
-        for (len, channel) in block.channel_lens.iter().zip(channels) {
-            let (bytes, behind) = rest.split_at(*len);
-            read_back(self.layout, bytes, channel, &mut self.integers)?;
-            rest = behind;
+        for (range, channel) in block.ranges.iter().zip(channels) {
+            read_back(self.layout, &plain[range.clone()], channel, &mut self.integers)?;
         }
         Ok(())
     }
