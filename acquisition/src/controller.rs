@@ -9,6 +9,7 @@ use echolake_dsp::sweep::LinearSweep;
 use echolake_dsp::temperature::speed_of_sound;
 use echolake_schema::manifest::RunEnd;
 use echolake_schema::messages::{AmbientSample, ImpulseResponse, Measurement, SampleFormat, SweepRecording, Verdict};
+use echolake_schema::samples::split_24;
 use echolake_schema::{Grid, Pair, Rig, Timestamp};
 
 use crate::assessment::{Assessment, Assessor};
@@ -297,9 +298,9 @@ impl<'a> RunController<'a> {
                 attempt: m.attempt,
                 sample_rate_hz,
                 sample_count: self.take.microphone.len() as u32,
-                format: SampleFormat::S24le.into(),
-                microphone: packed(&self.take.microphone),
-                loopback: packed(&self.take.loopback),
+                format: SampleFormat::S24Split.into(),
+                microphone: split_24(&self.take.microphone),
+                loopback: split_24(&self.take.loopback),
                 temperature_c: reading.temperature_c,
             };
             recorder.sweep(at, &recording)?;
@@ -342,14 +343,6 @@ fn to_fractions(samples: &[i32], out: &mut Vec<f32>) -> u32 {
     out.clear();
     out.extend(samples.iter().map(|x| *x as f32 / FULL_SCALE));
     samples.iter().filter(|x| **x <= -(1 << 23) || **x >= (1 << 23) - 1).count() as u32
-}
-
-fn packed(samples: &[i32]) -> Vec<u8> {
-    let mut bytes = Vec::with_capacity(samples.len() * 3);
-    for sample in samples {
-        bytes.extend_from_slice(&sample.to_le_bytes()[..3]);
-    }
-    bytes
 }
 
 fn nothing(clipped_samples: u32) -> Assessment {

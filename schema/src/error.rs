@@ -61,4 +61,25 @@ pub enum Error {
         /// What would be one.
         hint: &'static str,
     },
+    /// Samples in a format that this version does not know.
+    #[error("its sample format is unknown; hint: a newer version may have written it")]
+    SampleFormat,
+    /// Bytes that are not the samples they should be.
+    #[error("it has {actual} bytes for {samples} samples of {width}")]
+    SampleBytes {
+        /// How many bytes there are.
+        actual: usize,
+        /// How many samples there should be.
+        samples: usize,
+        /// Bytes of one sample.
+        width: usize,
+    },
+    /// A sample that is no number.
+    #[error("sample {index} is {value}")]
+    Sample {
+        /// Which, 0-based.
+        index: usize,
+        /// What it is.
+        value: f32,
+    },
 }

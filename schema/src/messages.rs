@@ -47,7 +47,7 @@ impl SampleFormat {
         match self {
             Self::Unspecified => None,
             Self::S16le => Some(2),
-            Self::S24le => Some(3),
+            Self::S24le | Self::S24Split => Some(3),
             Self::S32le | Self::F32le => Some(4),
         }
     }

@@ -310,6 +310,28 @@ fn an_attempt_is_recorded_before_its_verdict() {
     }
 }
 
+// Steps of a prime, so that all three bytes take all values over a take.
+fn pattern(index: usize) -> i32 {
+    (index as i32).wrapping_mul(104_729) << 8 >> 8
+}
+
+#[test]
+fn samples_are_recorded_bit_by_bit() {
+    let rig = quick();
+    let fault = |take: &mut Take| {
+        take.microphone.iter_mut().enumerate().for_each(|(i, x)| *x = pattern(i));
+        take.loopback.iter_mut().enumerate().for_each(|(i, x)| *x = pattern(i + 1));
+    };
+    let run = record(&rig, faulty(&rig, fault, 1), 1, Keep::Sweeps, usize::MAX);
+    let sweep = run.all::<SweepRecording>(topics::SWEEP).swap_remove(0);
+    let expected: Vec<i32> = (0..=rig.recording_len()).map(pattern).collect();
+    for (bytes, expected) in [(&sweep.microphone, &expected[..]), (&sweep.loopback, &expected[1..])] {
+        let mut fractions = vec![0.0; rig.recording_len()];
+        echolake_schema::samples::decode(sweep.format(), bytes, &mut fractions).expect("samples");
+        assert!(fractions.iter().zip(expected).all(|(y, x)| (y * FULL_SCALE) as i32 == *x));
+    }
+}
+
 #[test]
 fn a_stop_waits_for_its_pair() {
     let rig = quick();

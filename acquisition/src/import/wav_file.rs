@@ -5,6 +5,7 @@ use std::io::{BufReader, Read as _, Seek as _, SeekFrom};
 use std::path::{Path, PathBuf};
 
 use echolake_schema::messages::SampleFormat;
+use echolake_schema::samples::split_24;
 use hound::{SampleFormat as WavFormat, WavReader, WavSpec};
 
 /// A channel of a file.
@@ -71,7 +72,7 @@ impl WavChannel {
     pub(super) fn format(&self) -> Option<SampleFormat> {
         match (self.spec.sample_format, self.spec.bits_per_sample) {
             (WavFormat::Int, 16) => Some(SampleFormat::S16le),
-            (WavFormat::Int, 24) => Some(SampleFormat::S24le),
+            (WavFormat::Int, 24) => Some(SampleFormat::S24Split),
             (WavFormat::Int, 32) => Some(SampleFormat::S32le),
             (WavFormat::Float, 32) => Some(SampleFormat::F32le),
             _ => None,
@@ -100,13 +101,18 @@ impl WavChannel {
         let full = 2f64.powi(bits as i32 - 1);
         let width = format.bytes().unwrap_or(4);
         let shift = 8 * width as u32 - bits;
+        let mut wide = Vec::with_capacity(self.samples as usize);
         for sample in reader.samples::<i32>().skip(skip).step_by(step) {
             let x = sample.map_err(failed)?;
-            out.bytes.extend_from_slice(&(x << shift).to_le_bytes()[..width]);
+            wide.push(x << shift);
             out.fractions.push((f64::from(x) / full) as f32);
             let at_full_scale = f64::from(x) <= -full || f64::from(x) >= full - 1.0;
             out.clipped += u32::from(at_full_scale);
         }
+        out.bytes = match format {
+            SampleFormat::S24Split => split_24(&wide),
+            _ => wide.iter().flat_map(|x| x.to_le_bytes().into_iter().take(width)).collect(),
+        };
         Ok(out)
     }
 }
@@ -140,5 +146,42 @@ fn data_chunk(path: &Path) -> Result<(u64, u64), String> {
         }
         // Chunks begin at even places.
         at += 8 + length + length % 2;
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use echolake_schema::samples::decode;
+
+    use super::*;
+
+    fn written(folder: &Path, bits_per_sample: u16, samples: &[i32]) -> WavChannel {
+        let spec = WavSpec { channels: 1, sample_rate: 96_000, bits_per_sample, sample_format: WavFormat::Int };
+        let name = format!("{bits_per_sample}.wav");
+        let mut writer = hound::WavWriter::create(folder.join(&name), spec).expect("a file");
+        samples.iter().for_each(|x| writer.write_sample(*x).expect("a sample"));
+        writer.finalize().expect("a whole file");
+        WavChannel::open(folder, &name).expect("a channel")
+    }
+
+    // What is stored is read back as the fractions that import itself computed with.
+    #[test]
+    fn every_width_keeps_its_samples() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let widths = [(16, SampleFormat::S16le), (24, SampleFormat::S24Split), (32, SampleFormat::S32le)];
+        for (bits, format) in widths {
+            let full = 1i64 << (bits - 1);
+            let samples = [0, 1, -1, 0x1234, -0x1235, full - 1, -full].map(|x| x as i32);
+            let channel = written(folder.path(), bits, &samples);
+            assert_eq!(channel.format(), Some(format));
+            for wider in widths.into_iter().filter(|(w, _)| *w >= bits).map(|(_, f)| f) {
+                let read = channel.read(wider).expect("samples");
+                let mut decoded = [f32::NAN; 7];
+                decode(wider, &read.bytes, &mut decoded).expect("bytes of this format");
+                assert_eq!(decoded.as_slice(), read.fractions, "{bits} bits as {wider:?}");
+                assert_eq!(decoded.map(|y| (f64::from(y) * full as f64) as i32), samples.map(|x| (x as f32) as i32));
+                assert_eq!(read.clipped, 2);
+            }
+        }
     }
 }

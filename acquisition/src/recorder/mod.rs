@@ -16,7 +16,7 @@ use echolake_schema::manifest::{RunEnd, RunManifest};
 use echolake_schema::messages::{
     AmbientSample, ImpulseResponse, Measurement, Message as RunMessage, SampleFormat, SweepRecording,
 };
-use echolake_schema::{Rig, SurfaceRecord, Timestamp, topics};
+use echolake_schema::{Rig, SurfaceRecord, Timestamp, samples, topics};
 use foxglove::Encode;
 use mcap::records::{MessageHeader, Metadata};
 use mcap::{Attachment, WriteOptions, Writer};
@@ -298,11 +298,33 @@ fn top_16_bits(recording: &SweepRecording) -> Vec<u8> {
     match recording.format() {
         SampleFormat::S16le => bytes.clone(),
         SampleFormat::S24le => bytes.chunks_exact(3).flat_map(|b| [b[1], b[2]]).collect(),
+        SampleFormat::S24Split => samples::upper_16(bytes).to_vec(),
         SampleFormat::S32le => bytes.chunks_exact(4).flat_map(|b| [b[2], b[3]]).collect(),
         SampleFormat::F32le => bytes
             .chunks_exact(4)
             .flat_map(|b| ((f32::from_le_bytes([b[0], b[1], b[2], b[3]]) * 32_767.0).round() as i16).to_le_bytes())
             .collect(),
         SampleFormat::Unspecified => Vec::new(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_format_sounds_the_same() {
+        let heard = |format: SampleFormat, microphone: &[u8]| {
+            let microphone = microphone.to_vec();
+            top_16_bits(&SweepRecording { format: format.into(), microphone, ..SweepRecording::default() })
+        };
+        // 0x1234 and -2 in 16 bits.
+        let expected = [0x34, 0x12, 0xFE, 0xFF];
+        assert_eq!(heard(SampleFormat::S16le, &expected), expected);
+        assert_eq!(heard(SampleFormat::S24le, &[9, 0x34, 0x12, 9, 0xFE, 0xFF]), expected);
+        assert_eq!(heard(SampleFormat::S24Split, &[9, 9, 0x34, 0x12, 0xFE, 0xFF]), expected);
+        assert_eq!(heard(SampleFormat::S32le, &[9, 9, 0x34, 0x12, 9, 9, 0xFE, 0xFF]), expected);
+        let fractions = [f32::from(0x1234_i16), -2.0].map(|x| x / 32_767.0);
+        assert_eq!(heard(SampleFormat::F32le, &fractions.map(f32::to_le_bytes).concat()), expected);
     }
 }
