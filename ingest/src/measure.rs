@@ -231,29 +231,14 @@ fn decode<M: RunMessage>(schema: &str, message: &Message<'_>) -> Result<M, Strin
 
 /// Samples as fractions of full scale.
 fn samples(format: SampleFormat, count: usize, bytes: &[u8]) -> Result<Vec<f32>, String> {
+    // The count comes from the file: nothing is allocated for one that its bytes do not bear out.
     let width = format.bytes().ok_or("its sample format is unknown")?;
     if count.checked_mul(width) != Some(bytes.len()) {
         return Err(format!("it has {} bytes for {count} samples of {width}", bytes.len()));
     }
-    let samples: Vec<f32> = match format {
-        SampleFormat::S16le => {
-            bytes.chunks_exact(2).map(|b| f32::from(i16::from_le_bytes([b[0], b[1]])) / 32_768.0).collect()
-        }
-        SampleFormat::S24le => bytes
-            .chunks_exact(3)
-            .map(|b| (i32::from_le_bytes([0, b[0], b[1], b[2]]) >> 8) as f32 / 8_388_608.0)
-            .collect(),
-        SampleFormat::S32le => bytes
-            .chunks_exact(4)
-            .map(|b| i32::from_le_bytes([b[0], b[1], b[2], b[3]]) as f32 / 2_147_483_648.0)
-            .collect(),
-        SampleFormat::F32le => bytes.chunks_exact(4).map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]])).collect(),
-        SampleFormat::Unspecified => return Err("its sample format is unknown".into()),
-    };
-    match samples.iter().position(|x| !x.is_finite()) {
-        Some(at) => Err(format!("sample {at} is {}", samples[at])),
-        None => Ok(samples),
-    }
+    let mut samples = vec![0.0; count];
+    echolake_schema::samples::decode(format, bytes, &mut samples).map_err(|e| e.to_string())?;
+    Ok(samples)
 }
 
 #[cfg(test)]

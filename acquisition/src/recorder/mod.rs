@@ -307,24 +307,3 @@ fn top_16_bits(recording: &SweepRecording) -> Vec<u8> {
         SampleFormat::Unspecified => Vec::new(),
     }
 }
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn every_format_sounds_the_same() {
-        let heard = |format: SampleFormat, microphone: &[u8]| {
-            let microphone = microphone.to_vec();
-            top_16_bits(&SweepRecording { format: format.into(), microphone, ..SweepRecording::default() })
-        };
-        // 0x1234 and -2 in 16 bits.
-        let expected = [0x34, 0x12, 0xFE, 0xFF];
-        assert_eq!(heard(SampleFormat::S16le, &expected), expected);
-        assert_eq!(heard(SampleFormat::S24le, &[9, 0x34, 0x12, 9, 0xFE, 0xFF]), expected);
-        assert_eq!(heard(SampleFormat::S24Split, &[9, 9, 0x34, 0x12, 0xFE, 0xFF]), expected);
-        assert_eq!(heard(SampleFormat::S32le, &[9, 9, 0x34, 0x12, 9, 9, 0xFE, 0xFF]), expected);
-        let fractions = [f32::from(0x1234_i16), -2.0].map(|x| x / 32_767.0);
-        assert_eq!(heard(SampleFormat::F32le, &fractions.map(f32::to_le_bytes).concat()), expected);
-    }
-}

@@ -399,6 +399,7 @@ fn audio_is_the_upper_16_bits() {
     };
     check(SampleFormat::S16le, vec![0x34, 0x12, 0xFE, 0xFF], [0x1234, -2]);
     check(SampleFormat::S24le, vec![0xFF, 0x34, 0x12, 0x00, 0xFE, 0xFF], [0x1234, -2]);
+    check(SampleFormat::S24Split, vec![9, 9, 0x34, 0x12, 0xFE, 0xFF], [0x1234, -2]);
     check(SampleFormat::S32le, vec![0xFF, 0xFF, 0x34, 0x12, 0, 0, 0xFE, 0xFF], [0x1234, -2]);
     let floats = |a: f32, b: f32| [a.to_le_bytes(), b.to_le_bytes()].concat();
     // Beyond full scale, floats are held there; between two steps, the nearer counts.

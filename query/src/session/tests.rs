@@ -82,7 +82,11 @@ async fn errors_point_at_the_place() {
             assert!(error.contains(text), "{sql}: {error}");
         }
     };
-    check("select nonsense from runs", &["no column `nonsense`", "\n  select nonsense from runs\n         ^", "hint: "]).await;
+    check(
+        "select nonsense from runs",
+        &["no column `nonsense`", "\n  select nonsense from runs\n         ^", "hint: "],
+    )
+    .await;
     check("select pair_idd from pairs", &["did you mean `pair_id`"]).await;
     check("selec 1", &["selec", "^"]).await;
     check("select * from rums", &["no table `rums`", "did you mean `runs`"]).await;

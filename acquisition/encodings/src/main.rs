@@ -1,5 +1,5 @@
 //! What a sweep's samples cost in each encoding, in bytes and in time, side by side in one run; start it with
-//! `cargo run --release -p echolake-acquisition --example sweep_encodings [folder of data]`.
+//! `cargo run --release --manifest-path acquisition/encodings/Cargo.toml [folder of data]`.
 
 use std::error::Error;
 use std::hint::black_box;
@@ -109,7 +109,7 @@ struct Measured {
 }
 
 fn main() -> Result<()> {
-    let default = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../shared/data");
+    let default = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../../shared/data");
     let folder = std::env::args_os().nth(1).map_or(default, PathBuf::from).join("recordings");
     let mut out = std::io::stdout().lock();
     let mut inputs = simulated()?;
