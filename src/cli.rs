@@ -120,6 +120,9 @@ pub(crate) enum ImportCommand {
 pub(crate) struct IngestArgs {
     /// Run files, or names of runs in the lake; by default all that are not in the tables yet.
     pub(crate) runs: Vec<String>,
+    /// Go on: take in what comes into the lake's inbox, until Ctrl-C.
+    #[arg(long, conflicts_with_all = ["runs", "json"])]
+    pub(crate) watch: bool,
     /// Print what was done as JSON.
     #[arg(long)]
     pub(crate) json: bool,

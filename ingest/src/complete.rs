@@ -1,16 +1,21 @@
-//! Derives what needs references, for every run whose references are there and not yet used.
+//! Derives what needs references, for every run whose references are there and are not the ones its rows used.
 
-use echolake_lake::{Committed, FileName, Lake, Snapshot, VisibleRun};
+use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
+
+use echolake_lake::{Committed, FileName, Lake, Snapshot, VisibleRun, encode};
 use echolake_schema::tables::Table;
 use echolake_schema::{RunId, SurfaceId};
 
-use crate::CODE_VERSION;
-use crate::derive::derive;
+use crate::derive::Derivation;
 use crate::error::Result;
+use crate::pipeline::{self, Cores, Ready};
 use crate::read_back;
-use crate::references::{Finder, Wanted, digest};
-use crate::rows::derived::Versions;
+use crate::references::{Finder, SharedFinder, Wanted};
 use crate::rows::{self, Keys};
+
+/// Looks at the lake again after another ingest was faster; each sees what that one did.
+const ROUNDS: usize = 20;
 
 /// A run whose derived rows are new.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -19,7 +24,7 @@ pub struct Completed {
     pub run: RunId,
     /// Its surface.
     pub surface: SurfaceId,
-    /// Measurements that both references have.
+    /// Measurements of the run.
     pub measurements: usize,
 }
 
@@ -28,78 +33,81 @@ pub struct Completed {
 ///
 /// # Errors
 /// [`crate::Error`]; what was completed before stays, and the same call goes on.
-pub async fn complete(lake: &Lake, done: &mut dyn FnMut(&Completed)) -> Result<usize> {
-    let snapshot = lake.snapshot().await?;
-    let mut finder = Finder::new(lake, &snapshot);
+pub async fn complete(
+    lake: &Lake,
+    stop: &AtomicBool,
+    done: &mut (dyn FnMut(&Completed) + Send),
+) -> Result<usize> {
     let mut count = 0;
-    let runs: Vec<_> = snapshot.runs().cloned().collect();
-    for run in runs {
-        let wanted = finder.wanted(&run.surface);
-        if let Some(completed) = complete_run(lake, &snapshot, &mut finder, &run, &wanted).await? {
-            done(&completed);
-            count += 1;
+    for _ in 0..ROUNDS {
+        let (changed, overtaken) = round(lake, stop, done).await?;
+        count += changed;
+        if !overtaken {
+            break;
         }
     }
     lake.remove_superseded().await?;
     Ok(count)
 }
 
-async fn complete_run(
-    lake: &Lake,
-    snapshot: &Snapshot,
-    finder: &mut Finder<'_>,
-    run: &VisibleRun,
-    wanted: &Wanted,
-) -> Result<Option<Completed>> {
-    let (Some(flat), Some(foam)) = (wanted.flat_version(), wanted.foam.version.clone()) else { return Ok(None) };
-    let derivation = digest(&[run.run_derivation.as_str(), &flat, &foam, CODE_VERSION]);
-    if run.reference_derivation.as_ref() == Some(&derivation) {
-        return Ok(None);
+// How many runs were changed, and whether another ingest changed one of them meanwhile.
+async fn round(lake: &Lake, stop: &AtomicBool, done: &mut (dyn FnMut(&Completed) + Send)) -> Result<(usize, bool)> {
+    let cores = Cores::all();
+    let snapshot = Arc::new(lake.snapshot().await?);
+    let finder = Finder::shared(lake, snapshot.clone());
+    let mut jobs = Vec::new();
+    for run in snapshot.runs() {
+        let wanted = finder.lock().await.wanted(&run.surface);
+        if wanted.derivation(&run.run_derivation).is_some_and(|d| run.reference_derivation.as_ref() != Some(&d)) {
+            jobs.push((run.clone(), wanted));
+        }
     }
-    let Some((foam_means, flat_means)) = finder.load(wanted).await? else { return Ok(None) };
-    let responses = read_back::responses(lake, snapshot, &run.run).await?;
-    let derived = derive(lake.rig(), &responses, &foam_means, &flat_means, run.run.as_str())?;
-    let (rig, grid) = (lake.rig(), lake.rig().grid().map_err(echolake_lake::Error::from)?);
-    let keys = Keys { surface: run.surface.clone(), run: run.run.clone() };
-    let of = Versions { flat: &flat, foam: &foam };
-    for (table, rows) in [
-        (Table::Nce, rows::derived::nce(rig, &grid, &keys, &derived, of)?),
-        (Table::Tnce, rows::derived::tnce(rig, &grid, &keys, &derived, of)?),
-        (Table::TnceD4, rows::derived::tnce_d4(rig, &grid, &keys, &derived, of)?),
-        (Table::SurfaceStats, rows::stats::rows(rig, &keys, &derived, of)?),
-    ] {
-        let name =
-            FileName::Rows { surface: run.surface.clone(), run: run.run.clone(), derivation: derivation.clone() };
-        lake.append_rows(table, name, vec![rows]).await?;
-    }
-    let unpaired = responses.pairs.len() - derived.pairs.len();
-    let references = rows::runs::References {
-        missing: if unpaired == 0 { String::new() } else { format!("references of {unpaired} pairs") },
-        derivation: Some(derivation.clone()),
-        flat_version: Some(flat),
-        foam_version: Some(foam),
+    let (mut count, mut overtaken) = (0, false);
+    let work = Work { lake: lake.clone(), cores: cores.clone(), snapshot, finder };
+    let do_one = move |(run, wanted): (VisibleRun, Wanted)| {
+        let work = work.clone();
+        async move { work.complete(&run, &wanted).await }
     };
-    let named = repoint(lake, snapshot, run, derivation, &references).await?;
-    Ok((named == Committed::Now).then(|| Completed {
-        run: run.run.clone(),
-        surface: run.surface.clone(),
-        measurements: derived.pairs.len(),
-    }))
+    let ended = &mut |(_, result): pipeline::Ended<_, Completed>| {
+        let (completed, outcome) = result?;
+        if outcome == Some(Committed::Now) {
+            count += 1;
+            done(&completed);
+        }
+        overtaken |= outcome == Some(Committed::Outdated);
+        Ok(())
+    };
+    pipeline::run(lake, &cores, jobs, stop, do_one, ended).await?;
+    Ok((count, overtaken))
 }
 
-// The run's row names the new derivation: from this commit on readers see its rows, and no more the old ones.
-async fn repoint(
-    lake: &Lake,
-    snapshot: &Snapshot,
-    run: &VisibleRun,
-    derivation: String,
-    references: &rows::runs::References,
-) -> Result<Committed> {
-    let old: Vec<_> = snapshot.files_of(Table::Runs, &run.run).cloned().collect();
-    let mut batches = Vec::new();
-    for file in &old {
-        batches.push(rows::runs::with_references(&read_back::run_row(lake, file).await?, references)?);
+#[derive(Clone)]
+struct Work {
+    lake: Lake,
+    cores: Cores,
+    snapshot: Arc<Snapshot>,
+    finder: SharedFinder,
+}
+
+impl Work {
+    async fn complete(&self, run: &VisibleRun, wanted: &Wanted) -> Result<Ready<Completed>> {
+        let (lake, keys) = (&self.lake, Keys { surface: run.surface.clone(), run: run.run.clone() });
+        let responses = read_back::responses(lake, &self.snapshot, &run.run).await?;
+        let report =
+            Completed { run: run.run.clone(), surface: run.surface.clone(), measurements: responses.pairs.len() };
+        let Some(derivation) = Derivation::new(&run.run_derivation, wanted, &self.finder).await? else {
+            return Ok(Ready { staged: Vec::new(), report });
+        };
+        let (mut staged, references) = derivation.stage(lake, &self.cores, &keys, responses).await?;
+        let old: Vec<_> = self.snapshot.files_of(Table::Runs, &run.run).cloned().collect();
+        let mut batches = Vec::new();
+        for file in &old {
+            batches.push(rows::runs::with_references(&read_back::run_row(lake, file).await?, &references)?);
+        }
+        let pointer = VisibleRun { reference_derivation: references.derivation.clone(), ..run.clone() };
+        // From the commit of this row on readers see the new rows, and no more the old ones.
+        let row = encode(Table::Runs, &Table::Runs.schema(lake.rig()), &batches)?;
+        staged.push(lake.stage(Table::Runs, &FileName::Pointer(pointer), row).await?.replacing(run, &old));
+        Ok(Ready { staged, report })
     }
-    let pointer = FileName::Pointer(VisibleRun { reference_derivation: Some(derivation), ..run.clone() });
-    Ok(lake.replace_rows(Table::Runs, pointer, batches, &old).await?)
 }

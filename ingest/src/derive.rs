@@ -1,12 +1,22 @@
-//! From a run's impulse responses and its references to reflected responses, curves and energies.
+//! From a run's impulse responses and its references to reflected responses, curves and energies, and their files.
 
 use std::collections::HashMap;
+use std::sync::Arc;
 
 use echolake_dsp::chain::{DerivationPlan, Derived};
+use echolake_lake::{EncodedFile, FileEncoder, FileName, Lake, Staged, encode};
 use echolake_schema::Rig;
-use rayon::prelude::*;
+use echolake_schema::tables::Table;
 
 use crate::error::{Error, Result};
+use crate::pipeline::Cores;
+use crate::references::{SharedFinder, Wanted};
+use crate::rows::derived::Versions;
+use crate::rows::runs::References;
+use crate::rows::{self, Keys};
+
+/// Measurements that are derived and encoded at a time: memory is bounded by them, not by the run.
+const SLICE: usize = 256;
 
 /// Mean impulse response of each pair of a reference.
 pub(crate) type Means = HashMap<u32, Vec<f32>>;
@@ -19,22 +29,47 @@ pub(crate) struct Responses {
     pub(crate) irs: Vec<f32>,
 }
 
-/// What is derived of a run, a row a pair that both references have.
+/// What is derived of some of a run's measurements.
 #[derive(Debug, Clone, Default)]
-pub(crate) struct DerivedRun {
+pub(crate) struct DerivedRows {
     bands: usize,
     pub(crate) pairs: Vec<u32>,
     /// `[pairs x length]`.
     pub(crate) reflected: Vec<f32>,
-    /// `[pairs x bands x length]`.
-    pub(crate) curves: Vec<f32>,
+    /// `[bands][pairs x length]`.
+    pub(crate) curves: Vec<Vec<f32>>,
     /// `[pairs x bands]`.
     energies: Vec<f64>,
     tnce: Vec<f64>,
     tnce_over_band: Vec<f64>,
 }
 
-impl DerivedRun {
+/// References, loaded, and the name of what is derived with them.
+pub(crate) struct Derivation {
+    pub(crate) name: String,
+    flat_version: String,
+    foam_version: String,
+    flat: Arc<Means>,
+    foam: Arc<Means>,
+}
+
+impl DerivedRows {
+    fn new(bands: usize) -> Self {
+        Self { bands, curves: vec![Vec::new(); bands], ..Self::default() }
+    }
+
+    fn push(&mut self, pair: u32, derived: &Derived<f32>) {
+        self.pairs.push(pair);
+        self.reflected.extend_from_slice(&derived.reflected);
+        let length = derived.reflected.len();
+        for (all, curve) in self.curves.iter_mut().zip(derived.curves.chunks_exact(length)) {
+            all.extend_from_slice(curve);
+        }
+        self.energies.extend_from_slice(&derived.energies);
+        self.tnce.extend_from_slice(&derived.tnce);
+        self.tnce_over_band.extend_from_slice(&derived.tnce_over_band);
+    }
+
     /// Values of every column from `tnce_*` to `energy_total`, in the tables' order.
     pub(crate) fn energy_columns(&self) -> Vec<Vec<f64>> {
         let mut columns = self.tnce_columns();
@@ -60,48 +95,92 @@ impl DerivedRun {
     }
 }
 
-/// Derives all of a run that both references have. `flat` has Foam subtracted already.
-pub(crate) fn derive(rig: &Rig, responses: &Responses, foam: &Means, flat: &Means, file: &str) -> Result<DerivedRun> {
-    let (bands, length) = (rig.bands.centres_hz.len(), rig.impulse_response.length);
-    let failed = |cause| Error::Kernel { file: file.to_owned(), cause };
-    let plan = DerivationPlan::<f32>::new(length, rig.sweep.rate_hz.get(), &rig.bands.centres_hz).map_err(failed)?;
-    let wanted: Vec<_> = responses
-        .pairs
-        .iter()
-        .zip(responses.irs.chunks_exact(length))
-        .filter_map(|(pair, ir)| Some((*pair, ir, foam.get(pair)?, flat.get(pair)?)))
-        .collect();
-    let count = wanted.len();
-    let mut out = DerivedRun {
-        bands,
-        pairs: wanted.iter().map(|w| w.0).collect(),
-        reflected: vec![0.0; count * length],
-        curves: vec![0.0; count * bands * length],
-        energies: vec![0.0; count * bands],
-        tnce: vec![0.0; count * bands],
-        tnce_over_band: vec![0.0; count * bands],
-    };
-    let rows = wanted
-        .par_iter()
-        .zip(out.reflected.par_chunks_exact_mut(length))
-        .zip(out.curves.par_chunks_exact_mut(bands * length))
-        .zip(out.energies.par_chunks_exact_mut(bands))
-        .zip(out.tnce.par_chunks_exact_mut(bands))
-        .zip(out.tnce_over_band.par_chunks_exact_mut(bands));
-    rows.try_for_each_init(
-        || (plan.scratch(), plan.derived()),
-        |(scratch, derived), (((((row, reflected), curves), energies), tnce), over_band)| {
-            let (_, ir, foam, flat) = *row;
-            plan.run(ir, foam, flat, derived, scratch)?;
-            let Derived { reflected: r, curves: c, energies: e, tnce: t, tnce_over_band: b, .. } = derived;
-            reflected.copy_from_slice(r);
-            curves.copy_from_slice(c);
-            energies.copy_from_slice(e);
-            tnce.copy_from_slice(t);
-            over_band.copy_from_slice(b);
+impl Derivation {
+    /// With the references that are wanted; None while one is missing.
+    pub(crate) async fn new(run_derivation: &str, wanted: &Wanted, finder: &SharedFinder) -> Result<Option<Self>> {
+        let (Some((flat_version, foam_version)), Some(name)) = (wanted.versions(), wanted.derivation(run_derivation))
+        else {
+            return Ok(None);
+        };
+        let Some((foam, flat)) = finder.lock().await.load(wanted).await? else { return Ok(None) };
+        Ok(Some(Self { name, flat_version, foam_version, flat, foam }))
+    }
+
+    /// Derives all of a run that both references have, and stages its files. Returns what the run's row says of it.
+    pub(crate) async fn stage(
+        self,
+        lake: &Lake,
+        cores: &Cores,
+        keys: &Keys,
+        responses: Responses,
+    ) -> Result<(Vec<Staged>, References)> {
+        let (this, for_rows, its_lake) = (Arc::new(self), keys.clone(), lake.clone());
+        let derivation = this.clone();
+        let (files, unpaired) = cores.compute(move || derivation.encode(&its_lake, &for_rows, &responses)).await?;
+        let mut staged = Vec::with_capacity(files.len());
+        for (table, file) in files {
+            let name =
+                FileName::Rows { surface: keys.surface.clone(), run: keys.run.clone(), derivation: this.name.clone() };
+            staged.push(lake.stage(table, &name, file).await?);
+        }
+        let references = References {
+            missing: if unpaired == 0 { String::new() } else { format!("references of {unpaired} pairs") },
+            derivation: Some(this.name.clone()),
+            flat_version: Some(this.flat_version.clone()),
+            foam_version: Some(this.foam_version.clone()),
+        };
+        Ok((staged, references))
+    }
+
+    // The files, and how many pairs a reference lacks.
+    fn encode(&self, lake: &Lake, keys: &Keys, responses: &Responses) -> Result<(Vec<(Table, EncodedFile)>, usize)> {
+        let (rig, grid) = (lake.rig(), lake.rig().grid().map_err(echolake_lake::Error::from)?);
+        let of = Versions { flat: &self.flat_version, foam: &self.foam_version };
+        let mut encoders =
+            [Table::Nce, Table::Tnce, Table::TnceD4].map(|table| (table, FileEncoder::new(table, table.schema(rig))));
+        let mut totals: Vec<Vec<f64>> = vec![Vec::new(); rig.bands.centres_hz.len() + 1];
+        let mut paired = 0;
+        self.slices(rig, keys, responses, &mut |slice| {
+            paired += slice.pairs.len();
+            totals.iter_mut().zip(slice.tnce_columns()).for_each(|(all, some)| all.extend(some));
+            let [nce, tnce, tnce_d4] = &mut encoders;
+            tnce.1.write(&rows::derived::tnce(rig, &grid, keys, slice, of)?)?;
+            tnce_d4.1.write(&rows::derived::tnce_d4(rig, &grid, keys, slice, of)?)?;
+            nce.1.write(&rows::derived::nce(rig, &grid, keys, slice, of)?)?;
             Ok(())
-        },
-    )
-    .map_err(failed)?;
-    Ok(out)
+        })?;
+        let mut files = Vec::with_capacity(4);
+        for (table, encoder) in encoders {
+            files.push((table, encoder.finish()?));
+        }
+        let stats = rows::stats::rows(rig, keys, &totals, of)?;
+        files.push((Table::SurfaceStats, encode(Table::SurfaceStats, &Table::SurfaceStats.schema(rig), &[stats])?));
+        Ok((files, responses.pairs.len() - paired))
+    }
+
+    fn slices(
+        &self,
+        rig: &Rig,
+        keys: &Keys,
+        responses: &Responses,
+        take: &mut dyn FnMut(&mut DerivedRows) -> Result<()>,
+    ) -> Result<()> {
+        let (bands, length) = (rig.bands.centres_hz.len(), rig.impulse_response.length);
+        let failed = |cause| Error::Kernel { file: keys.run.to_string(), cause };
+        let plan =
+            DerivationPlan::<f32>::new(length, rig.sweep.rate_hz.get(), &rig.bands.centres_hz).map_err(failed)?;
+        let (mut scratch, mut derived) = (plan.scratch(), plan.derived());
+        let irs = responses.pairs.chunks(SLICE).zip(responses.irs.chunks(SLICE * length));
+        for (pairs, irs) in irs {
+            let mut slice = DerivedRows::new(bands);
+            for (pair, ir) in pairs.iter().zip(irs.chunks_exact(length)) {
+                if let (Some(foam), Some(flat)) = (self.foam.get(pair), self.flat.get(pair)) {
+                    plan.run(ir, foam, flat, &mut derived, &mut scratch).map_err(failed)?;
+                    slice.push(*pair, &derived);
+                }
+            }
+            take(&mut slice)?;
+        }
+        Ok(())
+    }
 }

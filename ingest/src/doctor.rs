@@ -1,6 +1,7 @@
 //! Looks a lake over: what is in it, what is missing, and what is damaged, to the last CRC.
 
 use std::collections::BTreeSet;
+use std::sync::Arc;
 
 use arrow::record_batch::RecordBatch;
 use echolake_lake::{DataFile, FileName, Lake, Snapshot};
@@ -93,7 +94,7 @@ impl Report {
 /// # Errors
 /// [`Error`] where the lake itself cannot be read; damage in it is a finding.
 pub async fn examine(lake: &Lake, progress: &mut dyn FnMut(Step<'_>)) -> Result<Report> {
-    let snapshot = lake.snapshot().await?;
+    let snapshot = Arc::new(lake.snapshot().await?);
     let mut report = Report { runs: snapshot.runs().count(), ..Report::default() };
     let total = Table::ALL.iter().map(|t| snapshot.files(*t).len()).sum::<usize>() + report.runs;
     let mut done = 0;
@@ -138,7 +139,7 @@ async fn check_table_file(lake: &Lake, table: Table, file: &DataFile) -> Result<
     Err(Error::DataFile { file: file.path.to_string(), reason })
 }
 
-async fn check_run(lake: &Lake, snapshot: &Snapshot, row: &RecordBatch, report: &mut Report) -> Result<()> {
+async fn check_run(lake: &Lake, snapshot: &Arc<Snapshot>, row: &RecordBatch, report: &mut Report) -> Result<()> {
     let text = |column| text_of(row, column).unwrap_or_default();
     let (run, path, state) = (text("run_id"), text("file"), text("state"));
     for finding in check_run_file(lake, &Path::from(path.as_str()), &text("file_sha256"), report).await? {
@@ -152,7 +153,7 @@ async fn check_run(lake: &Lake, snapshot: &Snapshot, row: &RecordBatch, report: 
         );
     }
     if let Ok(surface) = text("surface_id").parse() {
-        let missing = Finder::new(lake, snapshot).wanted(&surface).missing();
+        let missing = Finder::new(lake, snapshot.clone()).wanted(&surface).missing();
         if !missing.is_empty() {
             let what =
                 format!("waits for reference {missing}; hint: ingest a run of that surface, and it is completed");

@@ -69,6 +69,12 @@ pub enum Error {
         /// What was given.
         given: String,
     },
+    /// The file was there and is no more.
+    #[error("`{file}` is gone: another ingest has taken it")]
+    Gone {
+        /// The file.
+        file: String,
+    },
     /// A kernel refused.
     #[error("`{file}`: {cause}")]
     Kernel {
@@ -99,6 +105,16 @@ pub enum Error {
 pub type Result<T> = std::result::Result<T, Error>;
 
 impl Error {
+    /// Whether it is this one file that cannot be taken in, so that others may still be.
+    pub fn is_refusal(&self) -> bool {
+        match self {
+            Self::Read { .. } | Self::NotMcap { .. } | Self::Foreign { .. } | Self::Manifest { .. } => true,
+            Self::Attachment { .. } | Self::OtherContent { .. } | Self::NoRun { .. } | Self::Gone { .. } => true,
+            Self::Kernel { .. } | Self::Lake(echolake_lake::Error::OtherRig { .. }) => true,
+            Self::DataFile { .. } | Self::Stopped | Self::Lake(_) => false,
+        }
+    }
+
     pub(crate) fn read(file: impl ToString, reason: impl std::fmt::Display) -> Self {
         Self::Read { file: file.to_string(), reason: reason.to_string() }
     }

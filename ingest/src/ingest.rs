@@ -1,30 +1,23 @@
-//! One run's file becomes the rows that come from the run alone.
+//! Runs' files become rows: read, measured, derived, staged, and committed in groups.
 
-use std::path::{Path as FsPath, PathBuf};
+use std::collections::BTreeSet;
 use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
 
-use echolake_lake::{FileName, Lake, VisibleRun};
+use echolake_lake::{Committed, FileName, Lake, Snapshot, Staged, VisibleRun, encode};
 use echolake_schema::tables::Table;
 use echolake_schema::{RunId, SurfaceId};
-use futures::TryStreamExt as _;
-use object_store::local::LocalFileSystem;
 use object_store::path::Path;
-use object_store::{ObjectStore, ObjectStoreExt as _, WriteMultipart};
 
 use crate::CODE_VERSION;
+use crate::derive::{Derivation, Responses};
 use crate::error::{Error, Result};
-use crate::references::{Finder, digest};
+use crate::files::{self, Source};
+use crate::pipeline::{self, Cores, Ready};
+use crate::read_back;
+use crate::references::{Finder, Names, SharedFinder, digest};
 use crate::rows::{self, Keys};
-use crate::run_content::RunContent;
-
-/// Where a run's file is.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub enum Source {
-    /// In the lake: under `inbox/` or `runs/`.
-    Lake(Path),
-    /// Anywhere else on this machine.
-    File(PathBuf),
-}
+use crate::run_content::{Head, RunContent};
 
 /// What became of a run.
 #[derive(Debug, Clone, PartialEq)]
@@ -35,6 +28,8 @@ pub struct Taken {
     pub surface: SurfaceId,
     /// Measurements in the table.
     pub measurements: usize,
+    /// Whether its derived rows are there, too.
+    pub derived: bool,
     /// References that are missing, separated by commas; empty where none is.
     pub missing: String,
     /// Whether it is new.
@@ -54,174 +49,224 @@ pub enum Outcome {
     Known,
 }
 
+/// What became of a file.
+#[derive(Debug)]
+pub enum Report {
+    /// It is in the tables.
+    Taken(Taken),
+    /// It cannot be taken in, now or later.
+    Refused {
+        /// The file.
+        source: Source,
+        /// Why not.
+        why: Error,
+        /// Where it is now, where it was moved.
+        moved: Option<Path>,
+    },
+    /// Another ingest has taken it meanwhile.
+    Gone(Source),
+}
+
 /// Takes runs into a lake.
 #[derive(Debug, Clone)]
 pub struct Ingest<'a> {
     lake: &'a Lake,
+    stop: Arc<AtomicBool>,
+}
+
+/// All that the workers share.
+#[derive(Clone)]
+struct Work {
+    lake: Lake,
+    cores: Cores,
+    snapshot: Arc<Snapshot>,
+    finder: SharedFinder,
 }
 
 impl<'a> Ingest<'a> {
-    /// Into this lake.
-    pub fn new(lake: &'a Lake) -> Self {
-        Self { lake }
+    /// Into this lake, until `stop` is set: then what is under way is brought to its end.
+    pub fn new(lake: &'a Lake, stop: Arc<AtomicBool>) -> Self {
+        Self { lake, stop }
     }
 
-    /// Takes in one run. The same run again adds nothing.
+    /// Takes in runs, references first so that the others are derived with them at once. The same runs again add
+    /// nothing. `report` hears of each file once it is done with.
     ///
     /// # Errors
-    /// [`Error`], naming the file; then nothing of the run is seen by readers, and the same call may be made again.
-    pub async fn take_in(&self, source: &Source) -> Result<Taken> {
-        let (store, path, name) = self.resolve(source)?;
-        let content = RunContent::read(self.lake, store, &path, &name).await?;
-        let keys = Keys { surface: content.manifest.surface_id.clone(), run: content.manifest.run_id.clone() };
-        let derivation = digest(&[content.integrity.sha256.as_str(), CODE_VERSION]);
-        let snapshot = self.lake.snapshot().await?;
-        let known = snapshot.run(&keys.run).cloned();
-        if let Some(known) = &known {
-            let there = self.recorded_sha256(&snapshot, known).await?;
-            if there != content.integrity.sha256 {
-                let given = content.integrity.sha256.clone();
-                return Err(Error::OtherContent { run: keys.run.to_string(), file: name, given, there });
-            }
+    /// [`Error::Stopped`], or what the lake says. Files that are not reported yet are not seen by readers; the same
+    /// call goes on with them.
+    pub async fn take_in(&self, sources: Vec<Source>, report: &mut (dyn FnMut(Report) + Send)) -> Result<()> {
+        let (references, others) = self.in_order(sources).await?;
+        for sources in [references, others].into_iter().filter(|s| !s.is_empty()) {
+            self.take_in_group(sources, report).await?;
         }
-        self.keep_file(source, &keys, &content).await?;
-        let outcome = match known {
-            Some(known) if known.run_derivation == derivation => Outcome::Known,
-            _ => {
-                self.commit(&keys, &content, &derivation).await?;
-                Outcome::Added
-            }
-        };
-        let after = self.lake.snapshot().await?;
-        Ok(Taken {
-            measurements: content.accepted.len(),
-            missing: Finder::new(self.lake, &after).wanted(&keys.surface).missing(),
-            outcome,
-            whole: content.is_whole(),
-            damaged: content.damaged,
-            surface: keys.surface,
-            run: keys.run,
-        })
+        Ok(())
     }
 
-    async fn commit(&self, keys: &Keys, content: &RunContent, derivation: &str) -> Result<()> {
-        let (lake, rig) = (self.lake, self.lake.rig());
-        let grid = rig.grid().map_err(echolake_lake::Error::from)?;
-        let origin = content.manifest.origin.label();
-        let surface =
-            rows::surfaces::row(rig, keys, &content.surface, &lake.config().references, origin, &content.heights_mm)?;
-        let mut tables = vec![
-            (Table::Surfaces, vec![surface]),
-            (Table::Measurements, rows::measurements::rows(rig, &grid, keys, &content.accepted)?),
-            (Table::Environment, vec![rows::logs::environment(rig, keys, &content.readings)?]),
-            (Table::Events, vec![rows::logs::events(rig, keys, &content.events)?]),
-        ];
-        tables.extend(rows::heightmaps::rows(rig, keys, &content.heights_mm)?.map(|b| (Table::Heightmaps, vec![b])));
-        for (table, batches) in tables {
+    async fn take_in_group(&self, sources: Vec<Source>, report: &mut (dyn FnMut(Report) + Send)) -> Result<()> {
+        let cores = Cores::all();
+        let snapshot = Arc::new(self.lake.snapshot().await?);
+        let finder = Finder::shared(self.lake, snapshot.clone());
+        let work = Work { lake: self.lake.clone(), cores: cores.clone(), snapshot, finder };
+        let mut refused = Vec::new();
+        let ended = &mut |(source, done): pipeline::Ended<Source, Taken>| match done {
+            Ok((taken, outcome)) => {
+                let known = outcome.is_none_or(|o| o != Committed::Now);
+                let outcome = if known { Outcome::Known } else { Outcome::Added };
+                report(Report::Taken(Taken { outcome, ..taken }));
+                Ok(())
+            }
+            Err(why) if why.is_refusal() => {
+                refused.push((source, why));
+                Ok(())
+            }
+            Err(why) => Err(why),
+        };
+        let do_one = move |source| {
+            let work = work.clone();
+            async move { work.take_in(&source).await }
+        };
+        let done = pipeline::run(self.lake, &cores, sources, &self.stop, do_one, ended).await;
+        for (source, why) in refused {
+            report(match why {
+                Error::Gone { .. } => Report::Gone(source),
+                why => Report::Refused { moved: files::quarantine(self.lake, &source, &why).await?, source, why },
+            });
+        }
+        done
+    }
+
+    // Runs of surfaces that others name as references, and the rest. It is for speed alone: what was derived with
+    // references that change is derived again.
+    async fn in_order(&self, sources: Vec<Source>) -> Result<(Vec<Source>, Vec<Source>)> {
+        let defaults = &self.lake.config().references;
+        let mut names = BTreeSet::from([defaults.flat.clone(), defaults.foam.clone()]);
+        let mut heads = Vec::with_capacity(sources.len());
+        for source in sources {
+            let head = match source.open(self.lake) {
+                Ok(opened) => Head::read(&opened).await,
+                Err(_) => None,
+            };
+            names.extend(head.iter().flat_map(|h| h.references.clone()));
+            heads.push((source, head));
+        }
+        let is_reference = |head: &Option<Head>| head.as_ref().is_some_and(|h| names.contains(&h.surface));
+        let (references, others): (Vec<_>, Vec<_>) = heads.into_iter().partition(|(_, head)| is_reference(head));
+        let sources = |of: Vec<(Source, _)>| of.into_iter().map(|(source, _)| source).collect();
+        Ok((sources(references), sources(others)))
+    }
+}
+
+impl Work {
+    async fn take_in(&self, source: &Source) -> Result<Ready<Taken>> {
+        let (lake, opened) = (&self.lake, source.open(&self.lake)?);
+        let content = Arc::new(RunContent::read(lake, &self.cores, &opened).await?);
+        let keys = Keys { surface: content.manifest.surface_id.clone(), run: content.manifest.run_id.clone() };
+        let derivation = digest(&[content.integrity.sha256.as_str(), CODE_VERSION]);
+        let known = self.snapshot.run(&keys.run);
+        if let Some(known) = known {
+            self.check_same(known, &content, &opened.name).await?;
+        }
+        files::keep(lake, source, &Lake::run_path(&keys.surface, &keys.run), content.integrity.bytes).await?;
+        let names = Names::of(&content.surface, &lake.config().references);
+        let wanted = self.finder.lock().await.wanted_by(names);
+        let mut taken = Taken {
+            run: keys.run.clone(),
+            surface: keys.surface.clone(),
+            measurements: content.accepted.len(),
+            derived: false,
+            missing: wanted.missing(),
+            outcome: Outcome::Added,
+            damaged: content.damaged.clone(),
+            whole: content.is_whole(),
+        };
+        if known.is_some_and(|k| k.run_derivation == derivation) {
+            return Ok(Ready { staged: Vec::new(), report: taken });
+        }
+        let mut staged = self.stage_run(&keys, &content, &derivation).await?;
+        let mut references =
+            rows::runs::References { missing: taken.missing.clone(), ..rows::runs::References::default() };
+        let derived = Derivation::new(&derivation, &wanted, &self.finder).await?;
+        if let Some(derived) = derived {
+            let responses = content.responses();
+            let (files, used) = derived.stage(lake, &self.cores, &keys, responses).await?;
+            staged.extend(files);
+            taken.derived = true;
+            taken.missing.clone_from(&used.missing);
+            references = used;
+        }
+        let run = VisibleRun {
+            surface: keys.surface.clone(),
+            run: keys.run.clone(),
+            run_derivation: derivation.clone(),
+            reference_derivation: references.derivation.clone(),
+        };
+        let row = rows::runs::row(lake, &keys, &content, &derivation, &references)?;
+        let row = encode(Table::Runs, &Table::Runs.schema(lake.rig()), &[row])?;
+        let old = self.snapshot.files_of(Table::Runs, &keys.run);
+        staged.push(lake.stage(Table::Runs, &FileName::Pointer(run.clone()), row).await?.replacing(&run, old));
+        Ok(Ready { staged, report: taken })
+    }
+
+    // The rows that come from the run alone.
+    async fn stage_run(&self, keys: &Keys, content: &Arc<RunContent>, derivation: &str) -> Result<Vec<Staged>> {
+        let (lake, for_rows, content) = (self.lake.clone(), keys.clone(), content.clone());
+        let encoded = self.cores.compute(move || encode_run(&lake, &for_rows, &content)).await?;
+        let mut staged = Vec::with_capacity(encoded.len());
+        for (table, file) in encoded {
             let name = FileName::Rows {
                 surface: keys.surface.clone(),
                 run: keys.run.clone(),
                 derivation: derivation.to_owned(),
             };
-            lake.append_rows(table, name, batches).await?;
+            staged.push(self.lake.stage(table, &name, file).await?);
         }
-        let snapshot = lake.snapshot().await?;
-        let old: Vec<_> = snapshot.files_of(Table::Runs, &keys.run).cloned().collect();
-        let references = rows::runs::References {
-            missing: Finder::new(lake, &snapshot).wanted(&keys.surface).missing(),
-            ..rows::runs::References::default()
-        };
-        let row = rows::runs::row(lake, keys, content, derivation, &references)?;
-        let pointer = FileName::Pointer(VisibleRun {
-            surface: keys.surface.clone(),
-            run: keys.run.clone(),
-            run_derivation: derivation.to_owned(),
-            reference_derivation: None,
-        });
-        lake.replace_rows(Table::Runs, pointer, vec![row], &old).await?;
-        Ok(())
+        Ok(staged)
     }
 
-    fn resolve(&self, source: &Source) -> Result<(Arc<dyn ObjectStore>, Path, String)> {
-        match source {
-            Source::Lake(path) => Ok((self.lake.store(), path.clone(), path.to_string())),
-            Source::File(file) => {
-                let name = file.display().to_string();
-                if !file.is_file() {
-                    return Err(Error::NoRun { given: name });
-                }
-                let path = Path::from_absolute_path(std::path::absolute(file).map_err(|e| Error::read(&name, e))?);
-                Ok((Arc::new(LocalFileSystem::new()), path.map_err(|e| Error::read(&name, e))?, name))
-            }
+    async fn check_same(&self, known: &VisibleRun, content: &RunContent, file: &str) -> Result<()> {
+        let Some(row) = self.snapshot.files_of(Table::Runs, &known.run).next() else { return Ok(()) };
+        let row = read_back::run_row(&self.lake, row).await?;
+        let there = rows::runs::text_of(&row, "file_sha256").unwrap_or_default();
+        if there == content.integrity.sha256 {
+            return Ok(());
         }
-    }
-
-    async fn recorded_sha256(&self, snapshot: &echolake_lake::Snapshot, run: &VisibleRun) -> Result<String> {
-        let Some(file) = snapshot.files_of(Table::Runs, &run.run).next() else { return Ok(String::new()) };
-        let row = crate::read_back::run_row(self.lake, file).await?;
-        Ok(rows::runs::text_of(&row, "file_sha256").unwrap_or_default())
-    }
-
-    // The lake's copy stands under runs/ before any row names it.
-    async fn keep_file(&self, source: &Source, keys: &Keys, content: &RunContent) -> Result<()> {
-        let to = Lake::run_path(&keys.surface, &keys.run);
-        let store = self.lake.store();
-        let failed = |e: object_store::Error| Error::read(&to, e);
-        let there = match store.head(&to).await {
-            Ok(meta) => meta.size == content.integrity.bytes,
-            Err(object_store::Error::NotFound { .. }) => false,
-            Err(e) => return Err(failed(e)),
-        };
-        match source {
-            Source::Lake(from) if *from == to => {}
-            Source::Lake(from) if there => store.delete(from).await.map_err(failed)?,
-            Source::Lake(from) => store.rename(from, &to).await.map_err(failed)?,
-            Source::File(_) if there => {}
-            Source::File(from) => self.copy_in(from, &to).await?,
-        }
-        Ok(())
-    }
-
-    // Under another name first, so that a run is under its own name whole or not at all.
-    async fn copy_in(&self, from: &FsPath, to: &Path) -> Result<()> {
-        let store = self.lake.store();
-        let failed = |e: object_store::Error| Error::read(to, e);
-        let staged = Path::from(format!("inbox/{}.copying", to.filename().unwrap_or("run")));
-        let upload = store.put_multipart(&staged).await.map_err(failed)?;
-        let mut writer = WriteMultipart::new(upload);
-        let source: Arc<dyn ObjectStore> = Arc::new(LocalFileSystem::new());
-        let path = Path::from_absolute_path(std::path::absolute(from).map_err(|e| Error::read(from.display(), e))?)
-            .map_err(|e| Error::read(from.display(), e))?;
-        let size = source.head(&path).await.map_err(failed)?.size;
-        let mut at = 0;
-        while at < size {
-            let end = (at + (8 << 20)).min(size);
-            writer.put(source.get_range(&path, at..end).await.map_err(failed)?);
-            writer.wait_for_capacity(2).await.map_err(failed)?;
-            at = end;
-        }
-        writer.finish().await.map_err(failed)?;
-        store.rename(&staged, to).await.map_err(failed)
+        let given = content.integrity.sha256.clone();
+        Err(Error::OtherContent { run: known.run.to_string(), file: file.to_owned(), given, there })
     }
 }
 
-/// The run files of the lake that are in no table yet: all of `inbox/`, and those of `runs/` that `runs` does not name.
-///
-/// # Errors
-/// [`Error::Lake`] where the lake cannot be listed.
-pub async fn pending(lake: &Lake) -> Result<Vec<Source>> {
-    let snapshot = lake.snapshot().await?;
-    let mut found = Vec::new();
-    for folder in ["inbox", "runs"] {
-        let listed: Vec<_> =
-            lake.store().list(Some(&Path::from(folder))).try_collect().await.map_err(|e| Error::read(folder, e))?;
-        found.extend(listed.into_iter().map(|meta| meta.location));
+fn encode_run(
+    lake: &Lake,
+    keys: &Keys,
+    content: &RunContent,
+) -> Result<Vec<(Table, echolake_lake::EncodedFile)>> {
+    let rig = lake.rig();
+    let grid = rig.grid().map_err(echolake_lake::Error::from)?;
+    let origin = content.manifest.origin.label();
+    let references = &lake.config().references;
+    let surface = rows::surfaces::row(rig, keys, &content.surface, references, origin, &content.heights_mm)?;
+    let heights = rows::heightmaps::rows(rig, keys, &content.heights_mm)?;
+    let mut tables = vec![
+        (Table::Surfaces, vec![surface]),
+        (Table::Environment, vec![rows::logs::environment(rig, keys, &content.readings)?]),
+        (Table::Events, vec![rows::logs::events(rig, keys, &content.events)?]),
+    ];
+    tables.extend(heights.map(|batch| (Table::Heightmaps, vec![batch])));
+    let mut encoded = Vec::with_capacity(tables.len() + 1);
+    for (table, batches) in tables {
+        encoded.push((table, encode(table, &table.schema(rig), &batches)?));
     }
-    found.sort();
-    let known = |path: &Path| {
-        let run = path.filename().and_then(|n| n.strip_suffix(".mcap")).and_then(|n| n.parse::<RunId>().ok());
-        run.and_then(|r| snapshot.run(&r)).is_some_and(|r| Lake::run_path(&r.surface, &r.run) == *path)
-    };
-    found.retain(|p| p.extension() == Some("mcap") && !known(p));
-    Ok(found.into_iter().map(Source::Lake).collect())
+    encoded.push((Table::Measurements, rows::measurements::encode(rig, &grid, keys, &content.accepted)?));
+    Ok(encoded)
+}
+
+impl RunContent {
+    /// The responses alone, sorted by pair.
+    fn responses(&self) -> Responses {
+        Responses {
+            pairs: self.accepted.iter().map(|(m, _)| m.pair_id).collect(),
+            irs: self.accepted.iter().flat_map(|(_, r)| r.ir.iter().copied()).collect(),
+        }
+    }
 }

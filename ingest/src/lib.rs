@@ -1,15 +1,22 @@
 //! From a run's MCAP file to rows.
 //!
-//! A run's own rows are committed first and its row in `runs` last. Then [`complete()`] derives what needs
-//! references, for every run whose references are there and are not the ones its rows used.
+//! A run's rows are committed first and its row in `runs` last: from that commit on readers see them. Then
+//! [`complete()`] derives again what used references that are no longer the current ones, and nothing else.
 //!
 //! ```no_run
-//! use echolake_ingest::{Ingest, Source, complete};
+//! use echolake_ingest::{Ingest, Report, complete, pending};
 //! # async fn example() -> Result<(), Box<dyn std::error::Error>> {
 //! let lake = echolake_lake::Lake::open("lake").await?;
-//! let taken = Ingest::new(&lake).take_in(&Source::File("run.mcap".into())).await?;
-//! println!("{} measurements of {}", taken.measurements, taken.surface);
-//! complete(&lake, &mut |_| {}).await?;
+//! let stop = std::sync::Arc::default();
+//! let ingest = Ingest::new(&lake, std::sync::Arc::clone(&stop));
+//! ingest
+//!     .take_in(pending(&lake).await?, &mut |report| {
+//!         if let Report::Taken(taken) = report {
+//!             println!("{} measurements of {}", taken.measurements, taken.surface);
+//!         }
+//!     })
+//!     .await?;
+//! complete(&lake, &stop, &mut |_| {}).await?;
 //! # Ok(())
 //! # }
 //! ```
@@ -19,8 +26,10 @@ mod complete;
 mod derive;
 pub mod doctor;
 mod error;
+mod files;
 mod ingest;
 mod measure;
+mod pipeline;
 mod read_back;
 mod references;
 mod rows;
@@ -29,7 +38,8 @@ mod run_reader;
 
 pub use complete::{Completed, complete};
 pub use error::{Error, Result};
-pub use ingest::{Ingest, Outcome, Source, Taken, pending};
+pub use files::{Source, pending};
+pub use ingest::{Ingest, Outcome, Report, Taken};
 pub use run_reader::Integrity;
 
 /// Version of the code that derives rows; it stands in every row.

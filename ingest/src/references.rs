@@ -3,11 +3,13 @@
 use std::collections::{BTreeSet, HashMap};
 use std::sync::Arc;
 
-use echolake_lake::{FileName, Lake, Snapshot};
-use echolake_schema::SurfaceId;
+use echolake_lake::{FileName, Lake, References, Snapshot};
+use echolake_schema::{SurfaceId, SurfaceRecord};
 use echolake_schema::tables::Table;
 use sha2::{Digest as _, Sha256};
+use tokio::sync::Mutex;
 
+use crate::CODE_VERSION;
 use crate::derive::Means;
 use crate::error::Result;
 use crate::read_back;
@@ -17,11 +19,31 @@ use crate::run_reader::hex;
 const VERSION_DIGITS: usize = 12;
 
 /// Finds references in one snapshot, and keeps what it loaded.
-pub(crate) struct Finder<'a> {
-    lake: &'a Lake,
-    snapshot: &'a Snapshot,
+pub(crate) struct Finder {
+    lake: Lake,
+    snapshot: Arc<Snapshot>,
     /// By version: means change with the runs, and then so does the version.
     means: HashMap<String, Arc<Means>>,
+}
+
+/// One finder for all workers: what one has loaded, the others use.
+pub(crate) type SharedFinder = Arc<Mutex<Finder>>;
+
+/// The surfaces that a surface names as its references.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) struct Names {
+    pub(crate) flat: SurfaceId,
+    pub(crate) foam: SurfaceId,
+}
+
+impl Names {
+    /// Those that a run's surface gives, else the lake's.
+    pub(crate) fn of(surface: &SurfaceRecord, references: &References) -> Self {
+        Self {
+            flat: surface.flat_reference.clone().unwrap_or_else(|| references.flat.clone()),
+            foam: surface.foam_reference.clone().unwrap_or_else(|| references.foam.clone()),
+        }
+    }
 }
 
 /// The references of a surface, as far as they are there.
@@ -41,21 +63,29 @@ pub(crate) struct Found {
     pub(crate) version: Option<String>,
 }
 
-impl<'a> Finder<'a> {
-    pub(crate) fn new(lake: &'a Lake, snapshot: &'a Snapshot) -> Self {
-        Self { lake, snapshot, means: HashMap::new() }
+impl Finder {
+    pub(crate) fn new(lake: &Lake, snapshot: Arc<Snapshot>) -> Self {
+        Self { lake: lake.clone(), snapshot, means: HashMap::new() }
+    }
+
+    pub(crate) fn shared(lake: &Lake, snapshot: Arc<Snapshot>) -> SharedFinder {
+        Arc::new(Mutex::new(Self::new(lake, snapshot)))
     }
 
     /// What the surface's rows are to be derived with.
     pub(crate) fn wanted(&self, surface: &SurfaceId) -> Wanted {
-        let (flat, foam) = self.names(surface);
-        let (_, flat_foam) = self.names(&flat);
+        self.wanted_by(self.names(surface))
+    }
+
+    /// The same for a surface that names these.
+    pub(crate) fn wanted_by(&self, Names { flat, foam }: Names) -> Wanted {
+        let flat_foam = self.names(&flat).foam;
         Wanted { flat: self.found(flat), foam: self.found(foam), flat_foam: self.found(flat_foam) }
     }
 
     /// Mean responses of Foam, and of Flat with its Foam subtracted; None where one is missing.
     pub(crate) async fn load(&mut self, wanted: &Wanted) -> Result<Option<(Arc<Means>, Arc<Means>)>> {
-        let (Some(flat), Some(_)) = (wanted.flat_version(), &wanted.foam.version) else { return Ok(None) };
+        let Some((flat, _)) = wanted.versions() else { return Ok(None) };
         let foam = self.mean(&wanted.foam).await?;
         if let Some(known) = self.means.get(&flat) {
             return Ok(Some((foam, known.clone())));
@@ -78,7 +108,7 @@ impl<'a> Finder<'a> {
         }
         let mut sums: HashMap<u32, (u32, Vec<f64>)> = HashMap::new();
         for run in self.snapshot.runs().filter(|r| r.surface == of.surface) {
-            let responses = read_back::responses(self.lake, self.snapshot, &run.run).await?;
+            let responses = read_back::responses(&self.lake, &self.snapshot, &run.run).await?;
             let length = self.lake.rig().impulse_response.length;
             for (pair, ir) in responses.pairs.iter().zip(responses.irs.chunks_exact(length)) {
                 let (count, sum) = sums.entry(*pair).or_insert_with(|| (0, vec![0.0; length]));
@@ -106,25 +136,31 @@ impl<'a> Finder<'a> {
     }
 
     // The names that the surface's row gives; the lake's for a surface that is not there.
-    fn names(&self, surface: &SurfaceId) -> (SurfaceId, SurfaceId) {
+    fn names(&self, surface: &SurfaceId) -> Names {
         let row = self.snapshot.files(Table::Surfaces).iter().find(|f| match FileName::parse(&f.path) {
             Some(FileName::Rows { surface: of, .. }) => of == *surface,
             _ => false,
         });
         let text = |column: &str| row?.stats.as_ref()?.min.get(column)?.as_str()?.parse().ok();
         let references = &self.lake.config().references;
-        (
-            text("flat_reference").unwrap_or_else(|| references.flat.clone()),
-            text("foam_reference").unwrap_or_else(|| references.foam.clone()),
-        )
+        Names {
+            flat: text("flat_reference").unwrap_or_else(|| references.flat.clone()),
+            foam: text("foam_reference").unwrap_or_else(|| references.foam.clone()),
+        }
     }
 }
 
 impl Wanted {
-    /// Flat's version: its numbers depend on what was subtracted from it, too.
-    pub(crate) fn flat_version(&self) -> Option<String> {
-        let (flat, foam) = (self.flat.version.as_ref()?, self.flat_foam.version.as_ref()?);
-        Some(format!("{flat}-{}", digest(&[foam])))
+    /// Flat's version and Foam's; None while one is missing. Flat's numbers depend on what was subtracted from it, too.
+    pub(crate) fn versions(&self) -> Option<(String, String)> {
+        let (flat, flat_foam) = (self.flat.version.as_ref()?, self.flat_foam.version.as_ref()?);
+        Some((format!("{flat}-{}", digest(&[flat_foam])), self.foam.version.clone()?))
+    }
+
+    /// The name of what is derived with them of a run.
+    pub(crate) fn derivation(&self, run_derivation: &str) -> Option<String> {
+        let (flat, foam) = self.versions()?;
+        Some(digest(&[run_derivation, &flat, &foam, CODE_VERSION]))
     }
 
     /// The surfaces that have no run, for people.

@@ -7,15 +7,15 @@ use bytes::Bytes;
 use echolake_lake::Lake;
 use echolake_schema::manifest::{RunEnd, RunManifest};
 use echolake_schema::messages::{AmbientSample, Measurement, Verdict};
-use echolake_schema::{Rig, SurfaceRecord, topics};
-use object_store::ObjectStore;
-use object_store::path::Path;
+use echolake_schema::{Rig, SurfaceId, SurfaceRecord, topics};
 use tokio::sync::Semaphore;
 use tokio::task::JoinHandle;
 
 use crate::chunk::{Chunk, Definitions};
 use crate::error::{Error, Result};
+use crate::files::Opened;
 use crate::measure::{Event, Measurer, Response, Yield};
+use crate::pipeline::Cores;
 use crate::run_reader::{Integrity, Item, RawChunk, RunReader};
 
 /// A run, read.
@@ -44,22 +44,50 @@ struct Envelope {
     attachments: BTreeMap<String, Bytes>,
 }
 
+/// What a run says of itself before its first measurement.
+#[derive(Debug)]
+pub(crate) struct Head {
+    pub(crate) surface: SurfaceId,
+    pub(crate) references: Vec<SurfaceId>,
+}
+
+impl Head {
+    /// None where the file does not begin as a run of ours does.
+    pub(crate) async fn read(opened: &Opened) -> Option<Self> {
+        let (store, path) = (opened.store.clone(), opened.path.clone());
+        let mut reader = RunReader::open(store, path, opened.name.clone()).await.ok()?;
+        let mut envelope = Envelope::default();
+        while let Ok(Some(item)) = reader.next().await {
+            match item {
+                Item::Attachment { name, data } => drop(envelope.attachments.insert(name, data)),
+                Item::Metadata(record) => drop(envelope.metadata.insert(record.name, record.metadata)),
+                Item::Definition(_) => {}
+                Item::Chunk(_) => break,
+            }
+        }
+        let manifest = RunManifest::from_metadata(envelope.metadata.get(topics::RUN_METADATA)?).ok()?;
+        let surface = envelope.surface(&opened.name).ok()?;
+        let references = [surface.flat_reference, surface.foam_reference].into_iter().flatten().collect();
+        Some(Self { surface: manifest.surface_id, references })
+    }
+}
+
 /// Largest attachment that ingest keeps; meshes that are larger stay in the run's file alone.
 const LARGEST_KEPT: usize = 64 << 20;
 
 impl RunContent {
     /// Reads a run; its chunks are measured on all cores while the next ones are fetched.
-    pub(crate) async fn read(lake: &Lake, store: Arc<dyn ObjectStore>, path: &Path, name: &str) -> Result<Self> {
+    pub(crate) async fn read(lake: &Lake, cores: &Cores, opened: &Opened) -> Result<Self> {
         let pairs = lake.rig().grid().map_err(echolake_lake::Error::from)?.pairs().len();
         let measurer = Arc::new(Measurer::new(lake.rig(), pairs));
-        let mut reader = RunReader::open(store, path.clone(), name.to_owned()).await?;
+        let name = opened.name.as_str();
+        let mut reader = RunReader::open(opened.store.clone(), opened.path.clone(), name.to_owned()).await?;
         let mut envelope = Envelope::default();
         let mut definitions = Definitions::default();
         let mut whole = Yield { last_time_ns: i64::MIN, ..Yield::default() };
         let mut checked = false;
         // Two chunks a core in flight: memory is bounded by them, not by the run.
-        let cores = std::thread::available_parallelism().map_or(2, usize::from);
-        let slots = Arc::new(Semaphore::new(2 * cores));
+        let slots = Arc::new(Semaphore::new(2 * cores.count()));
         let mut tasks: Vec<JoinHandle<Yield>> = Vec::new();
         while let Some(item) = reader.next().await? {
             match item {
@@ -73,9 +101,10 @@ impl RunContent {
                             chunk.learn(&mut definitions);
                             let channels = definitions.channels.clone();
                             let (measurer, slot) = (measurer.clone(), slots.clone().acquire_owned().await);
-                            tasks.push(tokio::task::spawn_blocking(move || {
+                            let cores = cores.clone();
+                            tasks.push(tokio::spawn(async move {
                                 let _slot = slot;
-                                measurer.process(offset, &chunk, &channels)
+                                cores.compute(move || measurer.process(offset, &chunk, &channels)).await
                             }));
                         }
                         Err(reason) => whole.damaged.push(reason),

@@ -102,7 +102,11 @@ enum End {
 impl RunReader {
     /// Opens a file and checks its first bytes.
     pub(crate) async fn open(store: Arc<dyn ObjectStore>, path: Path, name: String) -> Result<Self> {
-        let size = store.head(&path).await.map_err(|e| Error::read(&name, e))?.size;
+        let size = match store.head(&path).await {
+            Ok(meta) => meta.size,
+            Err(object_store::Error::NotFound { .. }) => return Err(Error::Gone { file: name }),
+            Err(e) => return Err(Error::read(&name, e)),
+        };
         let mut reader = Self {
             store,
             path,

@@ -47,7 +47,7 @@ pub(crate) async fn run(args: &DemoArgs, lake_url: &str) -> anyhow::Result<Done>
         anyhow::bail!("stopped; hint: the same command goes on where this one ended");
     }
     let sources = pending(&lake).await?;
-    super::ingest::take_in(&lake, &sources, &stop, &Progress::new()).await?;
+    super::ingest::take_in(&lake, sources, &stop, &Progress::new()).await?;
     print_tables(&lake).await?;
     eprintln!("\ndone in {:.0} s. Next:", begun.elapsed().as_secs_f64());
     let flag = if lake_url == "lake" { String::new() } else { format!("--lake {lake_url} ") };

@@ -1,13 +1,16 @@
 //! `echolake ingest`: runs become rows.
 
+use std::collections::HashMap;
 use std::path::Path;
+use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Duration;
 
 use anyhow::Context as _;
-use echolake_ingest::{Ingest, Outcome, Source, Taken, complete, pending};
+use echolake_ingest::{Ingest, Outcome, Report, Source, Taken, complete, pending};
 use echolake_lake::Lake;
 use futures::TryStreamExt as _;
-use object_store::ObjectStore as _;
+use object_store::ObjectStoreExt as _;
 use object_store::path::Path as ObjectPath;
 use serde_json::json;
 
@@ -15,56 +18,140 @@ use crate::Done;
 use crate::cli::IngestArgs;
 use crate::progress::Progress;
 
+/// Time between two looks at the inbox.
+const LOOK_EVERY: Duration = Duration::from_secs(2);
+/// Time that a watch waits after an error.
+const RETRY_AFTER: Duration = Duration::from_secs(10);
+
+/// What became of all that was given.
+#[derive(Default)]
+pub(crate) struct Summary {
+    pub(crate) taken: Vec<Taken>,
+    /// Files that cannot be taken in: the file, why, and where it is now.
+    refused: Vec<(String, String, Option<String>)>,
+}
+
+impl Summary {
+    fn lost(&self) -> bool {
+        !self.refused.is_empty() || self.taken.iter().any(|t| !t.whole || !t.damaged.is_empty())
+    }
+
+    fn as_json(&self) -> serde_json::Value {
+        let refused = |(file, why, moved): &(String, String, Option<String>)| json!({ "file": file, "reason": why, "moved_to": moved });
+        json!({
+            "taken": self.taken.iter().map(as_json).collect::<Vec<_>>(),
+            "refused": self.refused.iter().map(refused).collect::<Vec<_>>(),
+        })
+    }
+}
+
 pub(crate) async fn run(args: &IngestArgs, lake_url: &str) -> anyhow::Result<Done> {
     let lake = Lake::open(lake_url).await?;
     lake.ensure_tables().await?;
+    let stop = super::stop_on_interrupt();
+    let progress = Progress::new();
+    if args.watch {
+        return watch(&lake, &stop, &progress).await;
+    }
     let sources = match args.runs.as_slice() {
         [] => pending(&lake).await?,
         names => sources_of(&lake, names).await?,
     };
-    let stop = super::stop_on_interrupt();
-    let taken = take_in(&lake, &sources, &stop, &Progress::new()).await?;
+    let nothing = sources.is_empty();
+    let summary = take_in(&lake, sources, &stop, &progress).await?;
     if args.json {
-        let runs: Vec<_> = taken.iter().map(as_json).collect();
-        super::print(&serde_json::to_string_pretty(&runs)?)?;
+        super::print(&serde_json::to_string_pretty(&summary.as_json())?)?;
     }
-    if sources.is_empty() && !args.json {
+    if nothing && !args.json {
         eprintln!("nothing to ingest: every run of the lake is in its tables");
     }
-    let lost = taken.iter().any(|t| !t.whole || !t.damaged.is_empty());
-    Ok(if lost { Done::WithLoss } else { Done::Whole })
+    // Files that were named are the whole job; where none of them could be taken in, it failed.
+    if !args.runs.is_empty() && summary.taken.is_empty() && !summary.refused.is_empty() {
+        anyhow::bail!("nothing was taken in");
+    }
+    Ok(if summary.lost() { Done::WithLoss } else { Done::Whole })
 }
 
-/// Takes in runs one after the other, then completes what waited for references.
+/// Takes in runs, then completes what waited for references.
 pub(crate) async fn take_in(
     lake: &Lake,
-    sources: &[Source],
-    stop: &AtomicBool,
+    sources: Vec<Source>,
+    stop: &Arc<AtomicBool>,
     progress: &Progress,
-) -> anyhow::Result<Vec<Taken>> {
-    let mut taken = Vec::new();
+) -> anyhow::Result<Summary> {
+    let mut summary = Summary::default();
     let mut task = progress.task("ingest", sources.len() as u64, "runs");
-    for source in sources {
-        if stop.load(Ordering::Relaxed) {
-            return Err(echolake_ingest::Error::Stopped.into());
+    let mut ended = 0;
+    let mut report = |report: Report| {
+        ended += 1;
+        match report {
+            Report::Taken(taken) => {
+                say(progress, &taken);
+                summary.taken.push(taken);
+            }
+            Report::Refused { source, why, moved } => {
+                let whereto = moved.as_ref().map(|m| format!(" (now at `{m}`)")).unwrap_or_default();
+                progress.say(format!("error: {why}{whereto}"));
+                summary.refused.push((source.to_string(), why.to_string(), moved.map(|m| m.to_string())));
+            }
+            Report::Gone(source) => progress.say(format!("{source}: another ingest has taken it")),
         }
-        let run = Ingest::new(lake).take_in(source).await?;
-        say(progress, &run);
-        taken.push(run);
-        task.at(taken.len() as u64);
-    }
-    let measurements: usize = taken.iter().filter(|t| t.outcome == Outcome::Added).map(|t| t.measurements).sum();
-    task.done(format!("{} runs, {measurements} new measurements", taken.len()));
+        task.at(ended);
+    };
+    let outcome = Ingest::new(lake, stop.clone()).take_in(sources, &mut report).await;
+    let added = || summary.taken.iter().filter(|t| t.outcome == Outcome::Added);
+    let measurements: usize = added().map(|t| t.measurements).sum();
+    let derived: usize = added().filter(|t| t.derived).map(|t| t.measurements).sum();
+    task.done(format!("{} runs, {measurements} new measurements, {derived} of them derived", summary.taken.len()));
+    outcome?;
     let mut task = progress.task("complete", lake.snapshot().await?.runs().count() as u64, "runs");
     let (mut rows, mut runs) = (0, 0);
-    complete(lake, &mut |completed| {
+    complete(lake, stop, &mut |completed| {
         rows += completed.measurements;
         runs += 1;
         task.at(runs);
     })
     .await?;
     task.done(format!("{runs} runs, {rows} measurements derived"));
-    Ok(taken)
+    Ok(summary)
+}
+
+// What comes into the inbox, until Ctrl-C. A file that somebody copies there grows while we look; one that is as it
+// was at the last look is whole.
+async fn watch(lake: &Lake, stop: &Arc<AtomicBool>, progress: &Progress) -> anyhow::Result<Done> {
+    eprintln!("watching `{}/inbox`; Ctrl-C ends it", lake.location());
+    let mut before: HashMap<ObjectPath, (u64, chrono::DateTime<chrono::Utc>)> = HashMap::new();
+    let mut lost = false;
+    while !stop.load(Ordering::Relaxed) {
+        let mut settled = Vec::new();
+        let mut now = HashMap::new();
+        for source in pending(lake).await? {
+            let Source::Lake(path) = &source else { continue };
+            // It may be gone again.
+            let Ok(meta) = lake.store().head(path).await else { continue };
+            let state = (meta.size, meta.last_modified);
+            if before.get(path) == Some(&state) {
+                settled.push(source);
+            } else {
+                now.insert(path.clone(), state);
+            }
+        }
+        before = now;
+        if settled.is_empty() {
+            tokio::time::sleep(LOOK_EVERY).await;
+            continue;
+        }
+        match take_in(lake, settled, stop, progress).await {
+            Ok(summary) => lost |= summary.lost(),
+            Err(e) if stop.load(Ordering::Relaxed) => drop(e),
+            // A full disk or an absent store passes; the files are still there.
+            Err(e) => {
+                eprintln!("error: {e:#}; trying again in {} s", RETRY_AFTER.as_secs());
+                tokio::time::sleep(RETRY_AFTER).await;
+            }
+        }
+    }
+    Ok(if lost { Done::WithLoss } else { Done::Whole })
 }
 
 fn say(progress: &Progress, taken: &Taken) {

@@ -32,8 +32,8 @@ pub struct FileStats {
     pub max: Map<String, Value>,
 }
 
-/// A file about to be registered; its bytes are already in the store.
-#[derive(Debug, Clone)]
+/// A file about to be registered; its bytes are already in the store. Its name is its application transaction.
+#[derive(Debug, Clone, PartialEq, Eq)]
 pub struct NewFile {
     /// Name in the table's folder.
     pub name: String,
@@ -41,27 +41,37 @@ pub struct NewFile {
     pub bytes: u64,
     /// Delta's statistics, JSON.
     pub stats: String,
+    /// What it takes the place of, where it does.
+    pub replaces: Option<Replaces>,
 }
 
-/// One change of one table.
-#[derive(Debug, Clone)]
+/// The files that a new one takes the place of. Where others stand there by now, it is not added.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Replaces {
+    /// What the names of all files in that place begin with.
+    pub prefix: String,
+    /// The names that are expected there; they go with the same commit.
+    pub names: Vec<String>,
+}
+
+/// One change of one table: all of it or nothing.
+#[derive(Debug, Clone, Default)]
 pub struct Commit {
-    /// The application transaction: a change with an id that is already in the log is not made again.
-    /// None for a change that may be repeated without harm.
-    pub transaction: Option<String>,
     /// Files that come.
     pub add: Vec<NewFile>,
     /// Files that go; one that is already gone is passed over.
     pub remove: Vec<Path>,
 }
 
-/// How a commit ended.
+/// What became of a new file.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Committed {
     /// It is in the log now.
     Now,
     /// It was there before.
     Before,
+    /// It was to replace what is no longer there, and is not in the log.
+    Outdated,
 }
 
 /// A log of each table's files, with atomic commits of one table.
@@ -71,8 +81,8 @@ pub trait CommitLog: Send + Sync + std::fmt::Debug {
     async fn ensure(&self, table: Table) -> Result<()>;
     /// The table's files as of now; none where there is no table.
     async fn files(&self, table: Table) -> Result<Vec<DataFile>>;
-    /// Whether a commit with this transaction id was made.
-    async fn has(&self, table: Table, transaction: &str) -> Result<bool>;
-    /// Makes a change, once.
-    async fn commit(&self, table: Table, commit: Commit) -> Result<Committed>;
+    /// Whether a file of this name is in the log.
+    async fn has(&self, table: Table, name: &str) -> Result<bool>;
+    /// Makes a change; says for each new file, in order, what became of it. The same change again adds nothing.
+    async fn commit(&self, table: Table, commit: &Commit) -> Result<Vec<Committed>>;
 }

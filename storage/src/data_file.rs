@@ -27,27 +27,87 @@ const STATS_COLUMNS: usize = 32;
 /// Longest text that statistics keep: Delta readers compare prefixes, and parameters are long.
 const STATS_TEXT: usize = 64;
 
-/// Encodes rows; returns the file's bytes and Delta's statistics of it as JSON.
+/// Rows on their way into a file, a batch at a time.
+pub struct FileEncoder {
+    table: Table,
+    schema: SchemaRef,
+    /// Made with the first batch, from whose rows the size of row groups follows.
+    writer: Option<ArrowWriter<Vec<u8>>>,
+    stats: Stats,
+}
+
+/// A file's bytes, and Delta's statistics of it as JSON.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct EncodedFile {
+    pub(crate) bytes: Bytes,
+    pub(crate) stats: String,
+}
+
+impl FileEncoder {
+    /// A file of a table, whose schema is given because it depends on the lake's rig.
+    pub fn new(table: Table, schema: SchemaRef) -> Self {
+        let stats = Stats::new(&schema);
+        Self { table, schema, writer: None, stats }
+    }
+
+    /// Adds rows.
+    ///
+    /// # Errors
+    /// [`Error::Encode`] where the batch does not have the table's schema.
+    pub fn write(&mut self, batch: &RecordBatch) -> Result<()> {
+        let table = self.table;
+        self.stats.add(batch);
+        self.writer(batch)?.write(batch).map_err(|e| failed(table, e))
+    }
+
+    /// The file.
+    ///
+    /// # Errors
+    /// As [`Self::write`].
+    pub fn finish(mut self) -> Result<EncodedFile> {
+        let table = self.table;
+        self.writer(&RecordBatch::new_empty(self.schema.clone()))?;
+        let bytes = match self.writer {
+            Some(writer) => writer.into_inner().map_err(|e| failed(table, e))?,
+            None => Vec::new(),
+        };
+        Ok(EncodedFile { bytes: bytes.into(), stats: self.stats.json().to_string() })
+    }
+
+    fn writer(&mut self, first: &RecordBatch) -> Result<&mut ArrowWriter<Vec<u8>>> {
+        let table = self.table;
+        let made = match self.writer.take() {
+            Some(writer) => writer,
+            None => {
+                let properties = properties(&self.schema, first);
+                let options = ArrowWriterOptions::new().with_properties(properties).with_skip_arrow_metadata(true);
+                ArrowWriter::try_new_with_options(Vec::new(), self.schema.clone(), options)
+                    .map_err(|e| failed(table, e))?
+            }
+        };
+        Ok(self.writer.insert(made))
+    }
+}
+
+fn failed(table: Table, error: ParquetError) -> Error {
+    Error::Encode { table: table.name(), reason: error.to_string() }
+}
+
+/// Encodes rows that are all there.
 ///
 /// # Errors
 /// [`Error::Encode`] where the batches do not have the table's schema.
-pub fn encode(table: Table, schema: &SchemaRef, batches: &[RecordBatch]) -> Result<(Bytes, String)> {
-    let failed = |e: ParquetError| Error::Encode { table: table.name(), reason: e.to_string() };
-    let options = ArrowWriterOptions::new().with_properties(properties(schema, batches)).with_skip_arrow_metadata(true);
-    let mut writer = ArrowWriter::try_new_with_options(Vec::new(), schema.clone(), options).map_err(failed)?;
-    for batch in batches {
-        writer.write(batch).map_err(failed)?;
-    }
-    let bytes = writer.into_inner().map_err(failed)?;
-    Ok((bytes.into(), stats(schema, batches).to_string()))
+pub fn encode(table: Table, schema: &SchemaRef, batches: &[RecordBatch]) -> Result<EncodedFile> {
+    let mut encoder = FileEncoder::new(table, schema.clone());
+    batches.iter().try_for_each(|batch| encoder.write(batch))?;
+    encoder.finish()
 }
 
 // Samples do not repeat, so a dictionary only costs; their bytes by significance compress best
 // (measured on dB spectra: 0.74 of raw f32 against 1.00 with the defaults).
-fn properties(schema: &SchemaRef, batches: &[RecordBatch]) -> WriterProperties {
-    let rows: usize = batches.iter().map(RecordBatch::num_rows).sum();
-    let bytes: usize = batches.iter().map(RecordBatch::get_array_memory_size).sum();
-    let rows_a_group = (ROW_GROUP_BYTES * rows.max(1) / bytes.max(1)).max(1);
+fn properties(schema: &SchemaRef, first: &RecordBatch) -> WriterProperties {
+    let (rows, bytes) = (first.num_rows(), first.get_array_memory_size());
+    let rows_a_group = if rows == 0 { 1 } else { (ROW_GROUP_BYTES * rows / bytes.max(1)).max(1) };
     let mut builder = WriterProperties::builder()
         .set_compression(Compression::ZSTD(ZstdLevel::try_new(3).unwrap_or_default()))
         .set_created_by(concat!("echolake ", env!("CARGO_PKG_VERSION")).to_owned())
@@ -71,29 +131,68 @@ fn properties(schema: &SchemaRef, batches: &[RecordBatch]) -> WriterProperties {
     builder.build()
 }
 
-fn stats(schema: &SchemaRef, batches: &[RecordBatch]) -> Value {
-    let rows: usize = batches.iter().map(RecordBatch::num_rows).sum();
-    let (mut least, mut greatest, mut nulls) = (Map::new(), Map::new(), Map::new());
-    for (index, field) in schema.fields().iter().enumerate().take(STATS_COLUMNS) {
-        let columns: Vec<_> = batches.iter().map(|b| b.column(index).clone()).collect();
-        if matches!(field.data_type(), DataType::List(_) | DataType::Boolean | DataType::Timestamp(..)) {
-            continue;
-        }
-        let count: usize = columns.iter().map(|c| c.null_count()).sum();
-        nulls.insert(field.name().clone(), count.into());
-        if let Some((low, high)) = extremes(&columns) {
-            least.insert(field.name().clone(), low);
-            greatest.insert(field.name().clone(), high);
-        }
-    }
-    json!({ "numRecords": rows, "minValues": least, "maxValues": greatest, "nullCount": nulls })
+/// Delta's statistics of a file, gathered batch by batch.
+struct Stats {
+    rows: usize,
+    columns: Vec<ColumnStats>,
 }
 
-fn extremes(columns: &[Arc<dyn Array>]) -> Option<(Value, Value)> {
-    let pairs: Vec<_> = columns.iter().map(extremes_of).collect::<Option<Vec<_>>>()?;
-    let low = pairs.iter().map(|p| &p.0).reduce(|a, b| if less(b, a) { b } else { a })?;
-    let high = pairs.iter().map(|p| &p.1).reduce(|a, b| if less(a, b) { b } else { a })?;
-    Some((low.clone(), high.clone()))
+struct ColumnStats {
+    name: String,
+    index: usize,
+    nulls: usize,
+    /// None before the first batch with a value.
+    extremes: Option<(Value, Value)>,
+    /// A batch had no extremes that can be told, so the file has none either.
+    unknown: bool,
+}
+
+impl Stats {
+    fn new(schema: &SchemaRef) -> Self {
+        let told = |kind: &DataType| {
+            !matches!(kind, DataType::List(_) | DataType::Boolean | DataType::Timestamp(..))
+        };
+        let columns = schema.fields().iter().enumerate().take(STATS_COLUMNS).filter(|(_, f)| told(f.data_type()));
+        let column = |(index, field): (usize, &Arc<arrow::datatypes::Field>)| ColumnStats {
+            name: field.name().clone(),
+            index,
+            nulls: 0,
+            extremes: None,
+            unknown: false,
+        };
+        Self { rows: 0, columns: columns.map(column).collect() }
+    }
+
+    fn add(&mut self, batch: &RecordBatch) {
+        self.rows += batch.num_rows();
+        for column in self.columns.iter_mut().filter(|c| c.index < batch.num_columns()) {
+            let values = batch.column(column.index);
+            column.nulls += values.null_count();
+            if values.null_count() == values.len() {
+                continue;
+            }
+            let Some((low, high)) = extremes_of(values) else {
+                column.unknown = true;
+                continue;
+            };
+            column.extremes = Some(match column.extremes.take() {
+                Some((l, h)) => (if less(&low, &l) { low } else { l }, if less(&h, &high) { high } else { h }),
+                None => (low, high),
+            });
+        }
+    }
+
+    fn json(self) -> Value {
+        let (mut least, mut greatest, mut nulls) = (Map::new(), Map::new(), Map::new());
+        for column in self.columns {
+            nulls.insert(column.name.clone(), column.nulls.into());
+            if let (Some((low, high)), false) = (column.extremes, column.unknown) {
+                least.insert(column.name.clone(), low);
+                greatest.insert(column.name, high);
+            }
+        }
+        json!({ "numRecords": self.rows, "minValues": least, "maxValues": greatest, "nullCount": nulls })
+    }
 }
 
 fn extremes_of(column: &Arc<dyn Array>) -> Option<(Value, Value)> {
@@ -170,6 +269,8 @@ mod tests {
             "maxValues": { "id": 7, "name": "b" },
             "nullCount": { "id": 0, "name": 1, "x": 0 },
         });
-        assert_eq!(stats(&schema, &batches), expected);
+        let mut stats = Stats::new(&schema);
+        batches.iter().for_each(|b| stats.add(b));
+        assert_eq!(stats.json(), expected);
     }
 }

@@ -1,6 +1,6 @@
 //! The commit log as Delta, reader version 1 and writer version 2, so that every Delta reader reads it.
 
-use std::collections::{HashMap, HashSet};
+use std::collections::{BTreeSet, HashMap, HashSet};
 use std::sync::Arc;
 
 use arrow::datatypes::{DataType as ArrowType, Field, SchemaRef};
@@ -22,7 +22,7 @@ use serde_json::{Map, Value};
 use tokio::sync::Mutex;
 use url::Url;
 
-use crate::{Commit, CommitLog, Committed, DataFile, Error, FileStats, Result};
+use crate::{Commit, CommitLog, Committed, DataFile, Error, FileStats, NewFile, Result};
 
 /// Tries of one commit against other writers; each loses to a commit that went through.
 const COMMIT_TRIES: usize = 50;
@@ -87,32 +87,28 @@ impl DeltaLog {
         })
     }
 
-    async fn try_commit(&self, delta: &DeltaTable, commit: &Commit) -> std::result::Result<(), DeltaTableError> {
-        let present: HashSet<_> = match commit.remove.is_empty() {
-            true => HashSet::new(),
-            false => {
-                let state = delta.snapshot()?;
-                state
-                    .snapshot()
-                    .file_views(delta.log_store().as_ref(), None)
-                    .map_ok(|f| f.path().into_owned())
-                    .try_collect()
-                    .await?
-            }
-        };
+    async fn names(&self, table: Table, delta: &DeltaTable) -> Result<HashSet<String>> {
+        let broken = |e| Error::log(table.name(), "read", e);
+        let log_store = delta.log_store();
+        let views = delta.snapshot().map_err(broken)?.snapshot().file_views(log_store.as_ref(), None);
+        views.map_ok(|f| f.path().into_owned()).try_collect().await.map_err(broken)
+    }
+
+    async fn try_commit(&self, delta: &DeltaTable, change: &Change<'_>) -> std::result::Result<(), DeltaTableError> {
         let now = Utc::now().timestamp_millis();
-        let mut actions: Vec<_> = commit.add.iter().map(|f| Action::Add(add(f, now))).collect();
-        let gone = commit.remove.iter().filter_map(Path::filename).filter(|n| present.contains(*n));
-        actions.extend(gone.map(|name| Action::Remove(remove(name, now))));
-        if actions.is_empty() && commit.transaction.is_none() {
-            return Ok(());
+        let mut actions: Vec<_> = change.add.iter().map(|f| Action::Add(add(f, now))).collect();
+        actions.extend(change.remove.iter().map(|name| Action::Remove(remove(name, now))));
+        // The ids only record. They make Delta tell of a conflict with a commit of the same ones; what is in the log
+        // already is ours to see before each try.
+        let mut properties = CommitProperties::default();
+        for file in &change.add {
+            properties = properties.with_application_transaction(Transaction::new(&file.name, 1));
+            if let Some(replaces) = &file.replaces {
+                properties = properties.with_application_transaction(Transaction::new(&replaces.prefix, 1));
+            }
         }
-        let properties = match &commit.transaction {
-            Some(id) => CommitProperties::default().with_application_transaction(Transaction::new(id, 1)),
-            None => CommitProperties::default(),
-        };
         // Without a predicate Delta would not compare our Removes with what others add.
-        let predicate = (!commit.remove.is_empty()).then(|| "true".to_owned());
+        let predicate = (!change.remove.is_empty()).then(|| "true".to_owned());
         let mode = if predicate.is_some() { SaveMode::Overwrite } else { SaveMode::Append };
         let operation = DeltaOperation::Write { mode, partition_by: None, predicate };
         CommitBuilder::from(properties)
@@ -120,6 +116,44 @@ impl DeltaLog {
             .build(Some(delta.snapshot()?), delta.log_store(), operation)
             .await
             .map(drop)
+    }
+}
+
+/// What is left to do of a commit in one version of a table.
+struct Change<'a> {
+    outcomes: Vec<Committed>,
+    add: Vec<&'a NewFile>,
+    remove: BTreeSet<String>,
+}
+
+impl<'a> Change<'a> {
+    fn of(commit: &'a Commit, mut names: HashSet<String>) -> Self {
+        let gone = commit.remove.iter().filter_map(Path::filename).filter(|n| names.contains(*n));
+        let mut change = Self { outcomes: Vec::new(), add: Vec::new(), remove: gone.map(str::to_owned).collect() };
+        for file in &commit.add {
+            let outcome = change.outcome(file, &names);
+            if outcome == Committed::Now {
+                if let Some(replaces) = &file.replaces {
+                    names.retain(|name| !replaces.names.contains(name));
+                    change.remove.extend(replaces.names.iter().cloned());
+                }
+                names.insert(file.name.clone());
+                change.remove.remove(&file.name);
+                change.add.push(file);
+            }
+            change.outcomes.push(outcome);
+        }
+        change
+    }
+
+    fn outcome(&self, file: &NewFile, names: &HashSet<String>) -> Committed {
+        if names.contains(&file.name) {
+            return Committed::Before;
+        }
+        let Some(replaces) = &file.replaces else { return Committed::Now };
+        let there = names.iter().filter(|n| n.starts_with(&replaces.prefix)).count();
+        let expected = replaces.names.iter().all(|n| names.contains(n));
+        if expected && there == replaces.names.len() { Committed::Now } else { Committed::Outdated }
     }
 }
 
@@ -169,25 +203,22 @@ impl CommitLog for DeltaLog {
         Ok(files)
     }
 
-    async fn has(&self, table: Table, transaction: &str) -> Result<bool> {
-        let Some(delta) = self.load(table).await? else { return Ok(false) };
-        let broken = |e| Error::log(table.name(), "read", e);
-        let log_store = delta.log_store();
-        let state = delta.snapshot().map_err(broken)?;
-        Ok(state.transaction_version(log_store.as_ref(), transaction).await.map_err(broken)?.is_some())
+    async fn has(&self, table: Table, name: &str) -> Result<bool> {
+        match self.load(table).await? {
+            Some(delta) => Ok(self.names(table, &delta).await?.contains(name)),
+            None => Ok(false),
+        }
     }
 
-    async fn commit(&self, table: Table, commit: Commit) -> Result<Committed> {
+    async fn commit(&self, table: Table, commit: &Commit) -> Result<Vec<Committed>> {
         for _ in 0..COMMIT_TRIES {
-            // The transaction id only records: whether it is there is ours to ask, before each try.
-            if let Some(id) = &commit.transaction
-                && self.has(table, id).await?
-            {
-                return Ok(Committed::Before);
-            }
             let delta = self.require(table).await?;
-            match self.try_commit(&delta, &commit).await {
-                Ok(()) => return Ok(Committed::Now),
+            let change = Change::of(commit, self.names(table, &delta).await?);
+            if change.add.is_empty() && change.remove.is_empty() {
+                return Ok(change.outcomes);
+            }
+            match self.try_commit(&delta, &change).await {
+                Ok(()) => return Ok(change.outcomes),
                 Err(e) if is_conflict(&e) => {}
                 Err(e) => return Err(Error::log(table.name(), "written", e)),
             }
@@ -215,7 +246,7 @@ fn is_conflict(error: &DeltaTableError) -> bool {
     }
 }
 
-fn add(file: &crate::NewFile, now_millis: i64) -> Add {
+fn add(file: &NewFile, now_millis: i64) -> Add {
     Add {
         path: file.name.clone(),
         size: i64::try_from(file.bytes).unwrap_or(i64::MAX),
@@ -259,5 +290,54 @@ fn delta_type(data_type: &ArrowType) -> DataType {
         ArrowType::Timestamp(..) => DataType::TIMESTAMP,
         ArrowType::List(child) => ArrayType::new(delta_type(child.data_type()), child.is_nullable()).into(),
         _ => DataType::STRING,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::Replaces;
+
+    fn file(name: &str, replaces: Option<(&str, &[&str])>) -> NewFile {
+        let replaces = replaces.map(|(prefix, names)| Replaces {
+            prefix: prefix.into(),
+            names: names.iter().map(|n| (*n).to_owned()).collect(),
+        });
+        NewFile { name: name.into(), bytes: 1, stats: "{}".into(), replaces }
+    }
+
+    fn names(names: &[&str]) -> HashSet<String> {
+        names.iter().map(|n| (*n).to_owned()).collect()
+    }
+
+    #[test]
+    fn what_is_there_is_not_added_again_and_what_is_gone_not_removed() {
+        let commit = Commit {
+            add: vec![file("a", None), file("b", None), file("b", None)],
+            remove: vec![Path::from("tables/runs/c"), Path::from("tables/runs/d")],
+        };
+        let change = Change::of(&commit, names(&["a", "c"]));
+        assert_eq!(change.outcomes, [Committed::Before, Committed::Now, Committed::Before]);
+        assert_eq!(change.add.iter().map(|f| f.name.as_str()).collect::<Vec<_>>(), ["b"]);
+        assert_eq!(change.remove.iter().collect::<Vec<_>>(), ["c"]);
+    }
+
+    #[test]
+    fn a_file_takes_the_place_of_what_it_expects_there_and_of_nothing_else() {
+        let outcomes = |add: Vec<NewFile>, there: &[&str]| {
+            let commit = Commit { add, remove: Vec::new() };
+            let change = Change::of(&commit, names(there));
+            (change.outcomes.clone(), change.remove.into_iter().collect::<Vec<_>>())
+        };
+        let new = || file("x.2", Some(("x.", &["x.1"])));
+        assert_eq!(outcomes(vec![new()], &["x.1", "y.1"]), (vec![Committed::Now], vec!["x.1".to_owned()]));
+        assert_eq!(outcomes(vec![new()], &["x.3"]), (vec![Committed::Outdated], vec![]));
+        assert_eq!(outcomes(vec![new()], &["x.1", "x.3"]), (vec![Committed::Outdated], vec![]));
+        assert_eq!(outcomes(vec![new()], &["x.2"]), (vec![Committed::Before], vec![]));
+        let first = |name| file(name, Some(("x.", &[])));
+        assert_eq!(
+            outcomes(vec![first("x.1"), first("x.2")], &[]),
+            (vec![Committed::Now, Committed::Outdated], vec![])
+        );
     }
 }

@@ -12,8 +12,8 @@ use object_store::{ObjectStore, ObjectStoreExt as _, PutMode};
 use crate::delta::{DeltaLog, folder};
 use crate::location::Location;
 use crate::{
-    Commit, CommitLog, Committed, DataFile, Error, FileName, LAKE_FORMAT, LakeConfig, NewFile, References, Result,
-    Snapshot, encode, rig_tables,
+    Commit, CommitLog, Committed, DataFile, EncodedFile, Error, FileName, LAKE_FORMAT, LakeConfig, NewFile, References,
+    Replaces, Result, Snapshot, VisibleRun, encode, rig_tables,
 };
 
 /// A lake. Cheap to clone.
@@ -27,11 +27,22 @@ struct Inner {
     log: DeltaLog,
 }
 
-/// Rows on their way into a table.
-#[derive(Debug, Clone)]
-pub(crate) struct Rows {
-    pub(crate) name: FileName,
-    pub(crate) batches: Vec<RecordBatch>,
+/// A file in the store that no commit names yet.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Staged {
+    table: Table,
+    file: NewFile,
+}
+
+impl Staged {
+    /// Makes a run's row take the place of the rows that are there, which are these files or none. Where others stand
+    /// there by the time of the commit, it is [`Committed::Outdated`].
+    #[must_use]
+    pub fn replacing<'a>(mut self, run: &VisibleRun, old: impl IntoIterator<Item = &'a DataFile>) -> Self {
+        let names = old.into_iter().filter_map(|f| f.path.filename()).map(str::to_owned).collect();
+        self.file.replaces = Some(Replaces { prefix: run.prefix(), names });
+        self
+    }
 }
 
 const CONFIG: &str = "lake.toml";
@@ -106,7 +117,7 @@ impl Lake {
                 Table::Points => rig_tables::points(self.rig(), &grid)?,
                 _ => rig_tables::pairs(self.rig(), &grid)?,
             };
-            self.append(table, Rows { name: derivation(), batches: vec![rows] }).await?;
+            self.append_rows(table, &derivation(), &[rows]).await?;
         }
         Ok(())
     }
@@ -154,44 +165,57 @@ impl Lake {
         Path::from(format!("runs/{surface}/{run}.mcap"))
     }
 
+    /// Puts a file's bytes into the store, for a commit to name. Nobody sees them before that.
+    ///
+    /// # Errors
+    /// What the store says.
+    pub async fn stage(&self, table: Table, name: &FileName, file: EncodedFile) -> Result<Staged> {
+        let (name, replaces) = (name.compose(), None);
+        let path = folder(table).join(name.as_str());
+        let (bytes, stats) = (file.bytes.len() as u64, file.stats);
+        self.store().put(&path, file.bytes.into()).await.map_err(|e| Error::store("write", &path, e))?;
+        Ok(Staged { table, file: NewFile { name, bytes, stats, replaces } })
+    }
+
+    /// Whether a file of this name is in the table.
+    ///
+    /// # Errors
+    /// [`Error::Log`] where the table's log is damaged.
+    pub async fn has(&self, table: Table, name: &FileName) -> Result<bool> {
+        self.log().has(table, &name.compose()).await
+    }
+
+    /// Commits staged files, each of their tables once and `runs` last: from that commit on readers see them.
+    /// Returns what became of each file, in the given order. The same files again add nothing.
+    ///
+    /// # Errors
+    /// What the store says. Tables that were committed before stay so, seen by nobody; the same call goes on.
+    pub async fn commit(&self, staged: &[Staged]) -> Result<Vec<Committed>> {
+        let mut outcomes = vec![Committed::Before; staged.len()];
+        let mut tables = Table::ALL;
+        tables.sort_by_key(|table| *table == Table::Runs);
+        for table in tables {
+            let of: Vec<_> = (0..staged.len()).filter(|i| staged[*i].table == table).collect();
+            if of.is_empty() {
+                continue;
+            }
+            let add = of.iter().map(|i| staged[*i].file.clone()).collect();
+            let done = self.log().commit(table, &Commit { add, remove: Vec::new() }).await?;
+            of.into_iter().zip(done).for_each(|(i, outcome)| outcomes[i] = outcome);
+        }
+        Ok(outcomes)
+    }
+
     /// Puts rows into a table, once: the same name again adds nothing.
     ///
     /// # Errors
     /// [`Error::Encode`] where the rows do not fit the table, or what the store says.
-    pub async fn append_rows(&self, table: Table, name: FileName, batches: Vec<RecordBatch>) -> Result<Committed> {
-        self.append(table, Rows { name, batches }).await
-    }
-
-    async fn append(&self, table: Table, rows: Rows) -> Result<Committed> {
-        self.replace(table, rows, Vec::new()).await
-    }
-
-    /// Puts a run's row into `runs` and takes its older rows out, in one commit.
-    ///
-    /// # Errors
-    /// As [`Lake::append_rows`].
-    pub async fn replace_rows(
-        &self,
-        table: Table,
-        name: FileName,
-        batches: Vec<RecordBatch>,
-        old: &[DataFile],
-    ) -> Result<Committed> {
-        self.replace(table, Rows { name, batches }, old.iter().map(|f| f.path.clone()).collect()).await
-    }
-
-    async fn replace(&self, table: Table, rows: Rows, remove: Vec<Path>) -> Result<Committed> {
-        let name = rows.name.compose();
-        if self.log().has(table, &name).await? {
+    pub async fn append_rows(&self, table: Table, name: &FileName, batches: &[RecordBatch]) -> Result<Committed> {
+        if self.has(table, name).await? {
             return Ok(Committed::Before);
         }
-        let (bytes, stats) = encode(table, &table.schema(self.rig()), &rows.batches)?;
-        let path = folder(table).join(name.as_str());
-        let size = bytes.len() as u64;
-        self.store().put(&path, bytes.into()).await.map_err(|e| Error::store("write", &path, e))?;
-        let add = vec![NewFile { name: name.clone(), bytes: size, stats }];
-        let remove = remove.into_iter().filter(|p| *p != path).collect();
-        self.log().commit(table, Commit { transaction: Some(name), add, remove }).await
+        let staged = self.stage(table, name, encode(table, &table.schema(self.rig()), batches)?).await?;
+        Ok(self.commit(&[staged]).await?[0])
     }
 
     /// Takes out of the logs what no run's row names any more. The files stay for readers that hold older views.
@@ -205,7 +229,7 @@ impl Lake {
             let remove: Vec<_> = snapshot.superseded(table).iter().map(|f| f.path.clone()).collect();
             if !remove.is_empty() {
                 count += remove.len();
-                self.log().commit(table, Commit { transaction: None, add: Vec::new(), remove }).await?;
+                self.log().commit(table, &Commit { add: Vec::new(), remove }).await?;
             }
         }
         Ok(count)
@@ -295,8 +319,8 @@ mod tests {
         let grid = lake.rig().grid().expect("a grid");
         let rows = || vec![rig_tables::points(lake.rig(), &grid).expect("rows")];
         let name = || FileName::Rig { derivation: "test".into() };
-        assert_eq!(lake.append_rows(Table::Points, name(), rows()).await.expect("added"), Committed::Now);
-        assert_eq!(lake.append_rows(Table::Points, name(), rows()).await.expect("known"), Committed::Before);
+        assert_eq!(lake.append_rows(Table::Points, &name(), &rows()).await.expect("added"), Committed::Now);
+        assert_eq!(lake.append_rows(Table::Points, &name(), &rows()).await.expect("known"), Committed::Before);
         assert_eq!(lake.log().files(Table::Points).await.expect("files").len(), 2);
     }
 
@@ -310,7 +334,7 @@ mod tests {
             tokio::spawn(async move {
                 for i in 0..10 {
                     let name = FileName::Rig { derivation: format!("{writer}x{i}") };
-                    lake.append_rows(Table::Points, name, vec![rows.clone()]).await.expect("committed");
+                    lake.append_rows(Table::Points, &name, std::slice::from_ref(&rows)).await.expect("committed");
                 }
             })
         };

@@ -27,11 +27,11 @@ mod location;
 mod rig_tables;
 mod snapshot;
 
-pub use commit_log::{Commit, CommitLog, Committed, DataFile, FileStats, NewFile};
+pub use commit_log::{Commit, CommitLog, Committed, DataFile, FileStats, NewFile, Replaces};
 pub use config::{LAKE_FORMAT, LakeConfig, References};
-pub use data_file::encode;
+pub use data_file::{EncodedFile, FileEncoder, encode};
 pub use error::Error;
-pub use lake::Lake;
+pub use lake::{Lake, Staged};
 pub use snapshot::{FileName, Snapshot, VisibleRun};
 
 /// The result of what a lake does.

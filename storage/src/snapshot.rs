@@ -5,6 +5,7 @@
 
 use std::collections::{BTreeMap, HashMap};
 
+use chrono::{DateTime, Utc};
 use echolake_schema::tables::{Source, Table};
 use echolake_schema::{RunId, SurfaceId};
 use object_store::path::Path;
@@ -45,12 +46,26 @@ pub struct VisibleRun {
     pub reference_derivation: Option<String>,
 }
 
+impl VisibleRun {
+    /// What the names of all of the run's rows in `runs` begin with.
+    pub(crate) fn prefix(&self) -> String {
+        format!("{}.{}.", self.surface, self.run)
+    }
+}
+
 /// A frozen view of all tables.
 #[derive(Debug, Clone, Default)]
 pub struct Snapshot {
     files: HashMap<Table, Vec<DataFile>>,
-    runs: BTreeMap<RunId, VisibleRun>,
+    runs: BTreeMap<RunId, Current>,
     hidden: HashMap<Table, Vec<DataFile>>,
+}
+
+/// A run's row in `runs`, and when it was committed.
+#[derive(Debug, Clone)]
+struct Current {
+    run: VisibleRun,
+    since: DateTime<Utc>,
 }
 
 const EXTENSION: &str = ".parquet";
@@ -107,19 +122,20 @@ impl Snapshot {
         self.files.get(&table).map_or(&[], Vec::as_slice)
     }
 
-    /// The files of a table that belong to a run that readers see, but are no longer seen themselves.
+    /// The files of a table that belong to a run that readers see, but are no longer seen themselves. Those that are
+    /// newer than the run's row may be about to be named by another ingest, and are none of them.
     pub fn superseded(&self, table: Table) -> &[DataFile] {
         self.hidden.get(&table).map_or(&[], Vec::as_slice)
     }
 
     /// The runs that readers see, by name and so by time.
     pub fn runs(&self) -> impl DoubleEndedIterator<Item = &VisibleRun> {
-        self.runs.values()
+        self.runs.values().map(|current| &current.run)
     }
 
     /// One run.
     pub fn run(&self, run: &RunId) -> Option<&VisibleRun> {
-        self.runs.get(run)
+        self.runs.get(run).map(|current| &current.run)
     }
 
     /// The files of one run in a table.
@@ -136,8 +152,8 @@ impl Snapshot {
         for file in files {
             match self.sees(table, &file) {
                 Some(true) => seen.push(file),
-                Some(false) => hidden.push(file),
-                None => {}
+                Some(false) if self.is_older_than_its_run(&file) => hidden.push(file),
+                Some(false) | None => {}
             }
         }
         self.files.insert(table, seen);
@@ -160,6 +176,15 @@ impl Snapshot {
         }
     }
 
+    fn is_older_than_its_run(&self, file: &DataFile) -> bool {
+        let run = match FileName::parse(&file.path) {
+            Some(FileName::Rows { run, .. }) => run,
+            Some(FileName::Pointer(pointer)) => pointer.run,
+            _ => return false,
+        };
+        self.runs.get(&run).is_some_and(|current| file.modified <= current.since)
+    }
+
     fn latest(&self, surface: &SurfaceId) -> Option<&RunId> {
         self.runs().rev().find(|r| r.surface == *surface).map(|r| &r.run)
     }
@@ -171,11 +196,11 @@ fn one_a_surface(table: Table) -> bool {
 }
 
 // A crash between a run's new row and the removal of its old one leaves two; the newer one counts.
-fn current_runs(pointers: &[DataFile]) -> BTreeMap<RunId, VisibleRun> {
+fn current_runs(pointers: &[DataFile]) -> BTreeMap<RunId, Current> {
     let mut by_age: Vec<_> = pointers.iter().collect();
     by_age.sort_by_key(|f| (f.modified, f.path.clone()));
     let parsed = by_age.into_iter().filter_map(|f| match FileName::parse(&f.path) {
-        Some(FileName::Pointer(run)) => Some((run.run.clone(), run)),
+        Some(FileName::Pointer(run)) => Some((run.run.clone(), Current { run, since: f.modified })),
         _ => None,
     });
     parsed.collect()
@@ -229,6 +254,7 @@ mod tests {
             (Table::Measurements, "flat.r1.ab.parquet", 1),
             (Table::Nce, "flat.r1.cd.parquet", 1),
             (Table::Nce, "flat.r1.old.parquet", 0),
+            (Table::Nce, "flat.r1.ef.parquet", 3),
             (Table::Runs, "flat.r1.ab.cd.parquet", 2),
         ]);
         assert_eq!(names(after.files(Table::Measurements)), ["flat.r1.ab.parquet"]);

@@ -6,7 +6,7 @@ use echolake_schema::{Grid, PairId, Rig, Symmetry};
 
 use super::{Columns, Keys};
 use crate::CODE_VERSION;
-use crate::derive::DerivedRun;
+use crate::derive::DerivedRows;
 use crate::error::Result;
 
 /// Which references the rows used.
@@ -16,26 +16,26 @@ pub(crate) struct Versions<'a> {
     pub(crate) foam: &'a str,
 }
 
-/// Rows of `nce`.
-pub(crate) fn nce(rig: &Rig, grid: &Grid, keys: &Keys, derived: &DerivedRun, of: Versions<'_>) -> Result<RecordBatch> {
-    let (bands, length) = (rig.bands.centres_hz.len(), rig.impulse_response.length);
-    let rows = derived.pairs.len();
-    let mut columns = Columns::of_run(Table::Nce, rows, keys);
+/// Rows of `nce`; takes the responses and curves out of `derived`.
+pub(crate) fn nce(
+    rig: &Rig,
+    grid: &Grid,
+    keys: &Keys,
+    derived: &mut DerivedRows,
+    of: Versions<'_>,
+) -> Result<RecordBatch> {
+    let mut columns = Columns::of_run(Table::Nce, derived.pairs.len(), keys);
     pair_columns(&mut columns, grid, &derived.pairs);
-    columns.lists(derived.reflected.clone());
-    for band in 0..bands {
-        let curve = |row: usize| {
-            let start = (row * bands + band) * length;
-            derived.curves[start..start + length].iter().copied()
-        };
-        columns.lists((0..rows).flat_map(curve).collect());
+    columns.lists(std::mem::take(&mut derived.reflected));
+    for curves in std::mem::take(&mut derived.curves) {
+        columns.lists(curves);
     }
     columns.same(of.flat).same(of.foam).same(CODE_VERSION);
     columns.finish(rig)
 }
 
 /// Rows of `tnce`.
-pub(crate) fn tnce(rig: &Rig, grid: &Grid, keys: &Keys, derived: &DerivedRun, of: Versions<'_>) -> Result<RecordBatch> {
+pub(crate) fn tnce(rig: &Rig, grid: &Grid, keys: &Keys, derived: &DerivedRows, of: Versions<'_>) -> Result<RecordBatch> {
     let mut columns = Columns::of_run(Table::Tnce, derived.pairs.len(), keys);
     pair_columns(&mut columns, grid, &derived.pairs);
     energy_columns(&mut columns, derived, 1);
@@ -48,7 +48,7 @@ pub(crate) fn tnce_d4(
     rig: &Rig,
     grid: &Grid,
     keys: &Keys,
-    derived: &DerivedRun,
+    derived: &DerivedRows,
     of: Versions<'_>,
 ) -> Result<RecordBatch> {
     let moved: Vec<_> = Symmetry::ALL.into_iter().filter_map(|s| grid.moved_pairs(s).map(|pairs| (s, pairs))).collect();
@@ -87,7 +87,7 @@ fn pair_columns(columns: &mut Columns, grid: &Grid, pairs: &[u32]) {
 }
 
 // Each measurement's numbers stand in `each` rows.
-fn energy_columns(columns: &mut Columns, derived: &DerivedRun, each: usize) {
+fn energy_columns(columns: &mut Columns, derived: &DerivedRows, each: usize) {
     for values in derived.energy_columns() {
         columns.doubles(values.into_iter().flat_map(|x| std::iter::repeat_n(Some(x), each)));
     }

@@ -1,6 +1,7 @@
 //! Rows of table `measurements`.
 
 use arrow::record_batch::RecordBatch;
+use echolake_lake::{EncodedFile, FileEncoder};
 use echolake_schema::messages::Measurement;
 use echolake_schema::tables::Table;
 use echolake_schema::{Grid, PairId, Rig};
@@ -10,18 +11,22 @@ use crate::CODE_VERSION;
 use crate::error::Result;
 use crate::measure::Response;
 
-/// Values of one list column in a batch: offsets are 32 bits, and a batch must fit into memory twice.
-const LIST_VALUES: usize = 1 << 26;
+/// Values of the list column in a batch, which is encoded before the next one is made.
+const LIST_VALUES: usize = 1 << 18;
 
 /// A row a measurement, sorted by pair.
-pub(crate) fn rows(
+pub(crate) fn encode(
     rig: &Rig,
     grid: &Grid,
     keys: &Keys,
     accepted: &[(Measurement, Response)],
-) -> Result<Vec<RecordBatch>> {
+) -> Result<EncodedFile> {
     let rows_a_batch = (LIST_VALUES / rig.impulse_response.length).max(1);
-    accepted.chunks(rows_a_batch).map(|part| batch(rig, grid, keys, part)).collect()
+    let mut encoder = FileEncoder::new(Table::Measurements, Table::Measurements.schema(rig));
+    for part in accepted.chunks(rows_a_batch) {
+        encoder.write(&batch(rig, grid, keys, part)?)?;
+    }
+    Ok(encoder.finish()?)
 }
 
 fn batch(rig: &Rig, grid: &Grid, keys: &Keys, rows: &[(Measurement, Response)]) -> Result<RecordBatch> {

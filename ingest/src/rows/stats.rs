@@ -9,7 +9,6 @@ use super::columns::finite;
 use super::derived::Versions;
 use super::{Columns, Keys};
 use crate::CODE_VERSION;
-use crate::derive::DerivedRun;
 use crate::error::Result;
 
 /// What a row says of one band's TNCE values over the pairs.
@@ -24,15 +23,16 @@ struct Stats {
     spread_db: Option<f64>,
 }
 
-/// A row a band, and one for the total.
-pub(crate) fn rows(rig: &Rig, keys: &Keys, derived: &DerivedRun, of: Versions<'_>) -> Result<RecordBatch> {
+/// A row a band, and one for the total, from the TNCE values of each over all pairs.
+pub(crate) fn rows(rig: &Rig, keys: &Keys, tnce: &[Vec<f64>], of: Versions<'_>) -> Result<RecordBatch> {
     let names = rig.band_names();
-    let stats: Vec<_> = derived.tnce_columns().into_iter().map(stats_of).collect();
+    let pairs = tnce.first().map_or(0, Vec::len);
+    let stats: Vec<_> = tnce.iter().map(|values| stats_of(values)).collect();
     let mut columns = Columns::of_run(Table::SurfaceStats, stats.len(), keys);
     columns
         .texts(names.iter().map(|n| Some(n.as_str())).chain([Some("total")]))
         .doubles(rig.bands.centres_hz.iter().map(|hz| Some(*hz)).chain([None]))
-        .ints(std::iter::repeat_n(Some(derived.pairs.len() as i32), stats.len()))
+        .ints(std::iter::repeat_n(Some(pairs as i32), stats.len()))
         .doubles(stats.iter().map(|s| s.p90_mean_db))
         .doubles(stats.iter().map(|s| s.p5_db))
         .doubles(stats.iter().map(|s| s.p50_db))
@@ -47,8 +47,8 @@ pub(crate) fn rows(rig: &Rig, keys: &Keys, derived: &DerivedRun, of: Versions<'_
 }
 
 // Means are of power, as in the paper's tables; no energy at all has no level.
-fn stats_of(values: Vec<f64>) -> Stats {
-    let mut sorted: Vec<f64> = values.into_iter().filter(|x| x.is_finite()).collect();
+fn stats_of(values: &[f64]) -> Stats {
+    let mut sorted: Vec<f64> = values.iter().copied().filter(|x| x.is_finite()).collect();
     if sorted.is_empty() {
         return Stats::default();
     }
@@ -78,7 +78,7 @@ mod tests {
 
     #[test]
     fn levels_of_known_values() {
-        let stats = stats_of(vec![10.0, 1.0, 0.1]);
+        let stats = stats_of(&[10.0, 1.0, 0.1]);
         assert_eq!(stats.p50_db, Some(0.0));
         assert!((stats.min_db.expect("there") + 10.0).abs() < 1e-12);
         assert!((stats.max_db.expect("there") - 10.0).abs() < 1e-12);
@@ -87,8 +87,8 @@ mod tests {
 
     #[test]
     fn no_energy_has_no_level() {
-        assert_eq!(stats_of(vec![]), Stats::default());
-        let silent = stats_of(vec![0.0, 0.0]);
+        assert_eq!(stats_of(&[]), Stats::default());
+        let silent = stats_of(&[0.0, 0.0]);
         assert_eq!((silent.p50_db, silent.spread_db), (None, None));
     }
 }
