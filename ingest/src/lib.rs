@@ -23,6 +23,8 @@
 
 mod chunk;
 mod complete;
+#[cfg(test)]
+mod crash_tests;
 mod derive;
 pub mod doctor;
 mod error;

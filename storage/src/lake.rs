@@ -66,8 +66,24 @@ impl Lake {
     /// As [`Lake::open`]; [`Error::OtherRig`] where the lake is there and was made for another rig, and
     /// [`Error::Occupied`] where other files are.
     pub async fn open_or_create(url: &str, rig: &Rig, references: &References) -> Result<Self> {
+        Self::open_or_create_at(Location::parse(url)?, rig, references).await
+    }
+
+    /// The same in a store that holds nothing but the lake; `name` is what messages call it.
+    ///
+    /// # Errors
+    /// As [`Lake::open_or_create`].
+    pub async fn open_or_create_in(
+        store: Arc<dyn ObjectStore>,
+        name: &str,
+        rig: &Rig,
+        references: &References,
+    ) -> Result<Self> {
+        Self::open_or_create_at(Location::store(name, store)?, rig, references).await
+    }
+
+    async fn open_or_create_at(location: Location, rig: &Rig, references: &References) -> Result<Self> {
         rig.check()?;
-        let location = Location::parse(url)?;
         let config = match read_config(&location).await? {
             Some(config) => config,
             None => create_config(&location, rig, references).await?,

@@ -39,13 +39,16 @@ impl Location {
         let url = Url::parse(text).map_err(|e| wrong(&e.to_string()))?;
         match url.scheme() {
             "file" => Self::folder(text, &url.to_file_path().map_err(|()| wrong("it names no local folder"))?),
-            "memory" => {
-                let url = Url::parse("memory:///").map_err(|e| wrong(&e.to_string()))?;
-                let root: Arc<dyn ObjectStore> = Arc::new(InMemory::new());
-                Ok(Self { text: text.to_owned(), url, folder: None, store: root.clone(), root })
-            }
+            "memory" => Self::store(text, Arc::new(InMemory::new())),
             scheme => Err(wrong(&format!("this build does not reach `{scheme}://`"))),
         }
+    }
+
+    /// A store that holds nothing but the lake.
+    pub(crate) fn store(text: &str, store: Arc<dyn ObjectStore>) -> Result<Self> {
+        let wrong = |e: url::ParseError| Error::Location { location: text.to_owned(), reason: e.to_string() };
+        let url = Url::parse("memory:///").map_err(wrong)?;
+        Ok(Self { text: text.to_owned(), url, folder: None, root: store.clone(), store })
     }
 
     fn folder(text: &str, path: &Path) -> Result<Self> {
