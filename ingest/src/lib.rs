@@ -20,8 +20,10 @@ mod derive;
 pub mod doctor;
 mod error;
 mod ingest;
+mod inspect;
 mod measure;
 mod read_back;
+mod record_shape;
 mod references;
 mod rows;
 mod run_content;
@@ -30,6 +32,8 @@ mod run_reader;
 pub use complete::{Completed, complete};
 pub use error::{Error, Result};
 pub use ingest::{Ingest, Outcome, Source, Taken, pending};
+#[doc(hidden)]
+pub use inspect::{Inspected, Inspection, inspect};
 pub use run_reader::Integrity;
 
 /// Version of the code that derives rows; it stands in every row.
