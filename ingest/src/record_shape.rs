@@ -63,6 +63,11 @@ impl Frame {
         self.length <= left && !parts(self.code).is_empty()
     }
 
+    /// Whether the specification has such records, or leaves them to others.
+    pub(crate) fn is_possible(self, left: u64) -> bool {
+        self.is_worth_a_look(left) || (self.length <= left && matches!(self.code, opcode::MESSAGE | opcode::PRIVATE..))
+    }
+
     /// What the first bytes behind the frame, at most [`PREFIX`], say of the record.
     pub(crate) fn shape(self, prefix: &[u8]) -> Shape {
         if self.code == opcode::MESSAGE || self.code >= opcode::PRIVATE {

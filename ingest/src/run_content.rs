@@ -71,7 +71,7 @@ impl RunContent {
                         envelope.check(lake, name)?;
                         checked = true;
                     }
-                    let length = raw.body.len() as u64;
+                    let (begin, length) = (raw.offset, raw.body.len() as u64);
                     match decode(raw).await {
                         Ok((offset, chunk)) if !seen.insert(chunk.identity()) => {
                             whole.damaged.push(format!("the chunk at byte {offset}: a copy of one before it"));
@@ -89,7 +89,10 @@ impl RunContent {
                                 measurer.process(offset, &chunk, &channels)
                             }));
                         }
-                        Err(reason) => whole.damaged.push(reason),
+                        Err(reason) => {
+                            whole.damaged.push(reason);
+                            reader.look_into(begin).await?;
+                        }
                     }
                 }
                 Item::Attachment { name, data } if data.len() <= LARGEST_KEPT => {

@@ -3,6 +3,7 @@
 //! The walk needs no summary, so a file that was cut off yields all that was complete. Where a record cannot be
 //! one, the next that can is searched byte by byte, so damage costs the records that it touches and no others.
 
+use std::collections::HashSet;
 use std::sync::Arc;
 
 use bytes::{Bytes, BytesMut};
@@ -66,6 +67,8 @@ pub(crate) struct RunReader {
     offset: u64,
     /// Where the last record began that nothing but the next one's place can confirm.
     doubtful: Option<u64>,
+    /// Where the chunks began that were given out.
+    chunks: HashSet<u64>,
     /// What is fetched of the file from `offset` on.
     buffer: BytesMut,
     /// How far the file is in the digest; a search may begin before it.
@@ -73,15 +76,10 @@ pub(crate) struct RunReader {
     digest: Sha256,
     crc: Crc32,
     in_summary: bool,
-    summary: SummaryCrc,
+    /// The summary's own checksum, gathered while its records pass.
+    summary: Crc32,
     end: Option<End>,
     damage: Vec<String>,
-}
-
-/// The summary's own checksum, gathered while its records pass.
-#[derive(Default)]
-struct SummaryCrc {
-    running: Crc32,
 }
 
 /// Why the walk is over.
@@ -102,12 +100,13 @@ impl RunReader {
             size,
             offset: 0,
             doubtful: None,
+            chunks: HashSet::new(),
             buffer: BytesMut::new(),
             hashed: 0,
             digest: Sha256::new(),
             crc: Crc32::new(),
             in_summary: false,
-            summary: SummaryCrc::default(),
+            summary: Crc32::new(),
             end: None,
             damage: Vec::new(),
         };
@@ -146,6 +145,14 @@ impl RunReader {
         })
     }
 
+    /// The chunk that began at `offset` is damaged. Where bytes of it are missing it reached too far, so the walk
+    /// goes on at the next whole record behind its first byte; no chunk comes twice.
+    pub(crate) async fn look_into(&mut self, offset: u64) -> Result<()> {
+        self.doubtful = Some(offset);
+        self.end = None;
+        self.search().await
+    }
+
     /// A chunk that the walk came by earlier, once more.
     pub(crate) async fn again(&self, offset: u64, length: u64) -> Result<RawChunk> {
         let start = offset + FRAME;
@@ -169,7 +176,15 @@ impl RunReader {
             opcode::CHUNK | opcode::ATTACHMENT | opcode::METADATA | opcode::SCHEMA | opcode::CHANNEL => {
                 self.fill(FRAME + frame.length).await?;
                 let mut record = self.skip(FRAME + frame.length, true);
-                Ok(self.item(frame.code, offset, record.split_off(FRAME as usize)))
+                let body = record.split_off(FRAME as usize);
+                if frame.code == opcode::CHUNK {
+                    return Ok(self.chunks.insert(offset).then_some(Item::Chunk(RawChunk { offset, body })));
+                }
+                let item = self.item(frame.code, offset, &body);
+                if item.is_none() {
+                    self.look_into(offset).await?;
+                }
+                Ok(item)
             }
             opcode::DATA_END => self.data_end().await,
             opcode::FOOTER => self.footer().await,
@@ -189,11 +204,22 @@ impl RunReader {
             return Ok(Err(format!("ends within a record of kind {:#04x} and {} bytes", frame.code, frame.length)));
         }
         let prefix = frame.length.min(PREFIX as u64);
-        let shape = frame.shape(&self.buffer[FRAME as usize..(FRAME + prefix) as usize]);
-        if shape == Shape::Broken || (frame.code == opcode::FOOTER && !self.ends_with_footer()) {
-            return Ok(Err(format!("has no whole record of kind {:#04x}", frame.code)));
+        let sound = match frame.shape(&self.buffer[FRAME as usize..(FRAME + prefix) as usize]) {
+            Shape::Sound => frame.code != opcode::FOOTER || self.ends_with_footer(),
+            Shape::Unknown => self.goes_on(self.offset + FRAME + frame.length).await?,
+            Shape::Broken => false,
+        };
+        Ok(if sound { Ok(frame) } else { Err(format!("has no whole record of kind {:#04x}", frame.code)) })
+    }
+
+    // Whether a record can begin at `offset`: that speaks for the one before it, where nothing else does.
+    async fn goes_on(&self, offset: u64) -> Result<bool> {
+        if self.size - offset < FRAME {
+            return Ok(false);
         }
-        Ok(Ok(frame))
+        let bytes = self.store.get_range(&self.path, offset..offset + FRAME).await;
+        let frame = Frame::read(&bytes.map_err(|e| Error::read(&self.name, e))?);
+        Ok(frame.is_possible(self.size - offset - FRAME))
     }
 
     // Whether the footer at `offset` is followed by the magic bytes and by nothing else.
@@ -231,26 +257,15 @@ impl RunReader {
         }
     }
 
-    fn item(&mut self, code: u8, offset: u64, body: Bytes) -> Option<Item> {
-        if code == opcode::CHUNK {
-            return Some(Item::Chunk(RawChunk { offset, body }));
-        }
-        match mcap::parse_record(code, &body) {
-            Ok(Record::Attachment { header, data, crc }) => {
-                // The CRC covers the record's fields up to itself.
-                let sum = body.len().checked_sub(4).map(|end| crc32fast::hash(&body[..end]));
-                if crc != 0 && sum != Some(crc) {
-                    self.damage.push(format!("attachment `{}` at byte {offset}: wrong CRC", header.name));
-                    return None;
-                }
+    fn item(&mut self, code: u8, offset: u64, body: &Bytes) -> Option<Item> {
+        match mcap::parse_record(code, body) {
+            // Its CRC was checked.
+            Ok(Record::Attachment { header, data, .. }) => {
                 self.doubtful = None;
                 Some(Item::Attachment { name: header.name, data: Bytes::copy_from_slice(&data) })
             }
             Ok(Record::Metadata(metadata)) => Some(Item::Metadata(metadata)),
-            Ok(definition @ (Record::Schema { .. } | Record::Channel(_))) => {
-                Some(Item::Definition(definition.into_owned()))
-            }
-            Ok(_) => None,
+            Ok(definition) => Some(Item::Definition(definition.into_owned())),
             Err(e) => {
                 self.damage.push(format!("record at byte {offset}: {e}"));
                 None
@@ -274,8 +289,9 @@ impl RunReader {
         let at = self.offset;
         let record = self.skip(FOOTER, false);
         // The summary's CRC covers all of it up to the CRC itself, the footer's frame and offsets included.
-        self.summary.running.update(&record[..25]);
-        let sum = self.summary.running.clone().finalize();
+        let mut sum = self.summary.clone();
+        sum.update(&record[..25]);
+        let sum = sum.finalize();
         let stored = u32_at(&record, 25);
         let has_summary = record[9..17] != [0; 8];
         if has_summary && stored != 0 && stored != sum {
@@ -310,7 +326,7 @@ impl RunReader {
         self.hashed = self.hashed.max(self.offset);
         self.digest.update(fresh);
         if counts_in_crc && self.in_summary {
-            self.summary.running.update(fresh);
+            self.summary.update(fresh);
         } else if counts_in_crc {
             self.crc.update(fresh);
         }
