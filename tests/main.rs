@@ -2,25 +2,14 @@
 
 mod bad_input;
 mod end_to_end;
+mod kills;
 mod real_data;
+mod small_rig;
 
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
-/// A rig small enough for tests: 10 points, 45 pairs less none, sweeps of 30 ms.
-const SMALL_RIG: &str = r#"
-name = "small"
-[sweep]
-duration_secs = 0.03
-[[grid.layers]]
-points_per_side = 3
-pitch_mm = 120.0
-height_mm = 124.0
-[[grid.layers]]
-points_per_side = 1
-pitch_mm = 0.0
-height_mm = 304.0
-"#;
+use small_rig::SMALL_RIG;
 
 /// A folder with a lake and a small rig.
 struct Place {

@@ -1,11 +1,15 @@
 //! One chunk of a run's file: decompressed, its CRC checked, cut into messages.
 
 use std::collections::HashMap;
+use std::io::Read as _;
 
 use mcap::records::Record;
 
 /// Largest chunk that is decompressed; the recorder's are about 1 MiB, or one message where that is larger.
 const LARGEST: u64 = 1 << 30;
+/// A chunk that claims to have shrunk more than this is decompressed piece by piece: nothing large is allocated for a
+/// size that its bytes do not bear out. Sweeps and responses shrink to about half.
+const USUAL_RATIO: u64 = 64;
 /// Opcode and length in front of every record.
 const FRAME: usize = 9;
 
@@ -23,7 +27,11 @@ pub(crate) struct Channel {
 #[derive(Debug)]
 pub(crate) struct Chunk {
     data: Vec<u8>,
+    crc: u32,
 }
+
+/// What distinguishes a chunk from all others of its run: CRC and size, and channel, number and time of its first message.
+pub(crate) type Identity = (u32, usize, Option<[u8; 14]>);
 
 /// A message in a chunk.
 #[derive(Debug, Clone, Copy)]
@@ -41,14 +49,15 @@ pub(crate) struct Definitions {
 }
 
 impl Definitions {
+    /// What is known stays: a chunk's definitions have its CRC, those of the summary may be damaged.
     pub(crate) fn learn(&mut self, record: &Record<'_>) {
         match record {
             Record::Schema { header, .. } => {
-                self.schemas.insert(header.id, header.name.clone());
+                self.schemas.entry(header.id).or_insert_with(|| header.name.clone());
             }
             Record::Channel(channel) => {
                 let schema = self.schemas.get(&channel.schema_id).cloned().unwrap_or_default();
-                self.channels.insert(channel.id, Channel { topic: channel.topic.clone(), schema });
+                self.channels.entry(channel.id).or_insert_with(|| Channel { topic: channel.topic.clone(), schema });
             }
             _ => {}
         }
@@ -67,7 +76,7 @@ impl Chunk {
         let size = header.uncompressed_size as usize;
         let data = match header.compression.as_str() {
             "" => data.into_owned(),
-            "zstd" => zstd::bulk::decompress(&data, size).map_err(|e| format!("it does not decompress: {e}"))?,
+            "zstd" => decompress(&data, size).map_err(|e| format!("it does not decompress: {e}"))?,
             other => return Err(format!("it is compressed with `{other}`, expected zstd")),
         };
         if data.len() != size {
@@ -77,7 +86,18 @@ impl Chunk {
         if header.uncompressed_crc != 0 && header.uncompressed_crc != crc {
             return Err(format!("its CRC is {crc:08x}, expected {:08x}", header.uncompressed_crc));
         }
-        Ok(Self { data })
+        Ok(Self { data, crc })
+    }
+
+    /// The same for two copies of one chunk.
+    pub(crate) fn identity(&self) -> Identity {
+        let first = self.records().find(|(code, body)| *code == 0x05 && body.len() >= 22);
+        (self.crc, self.data.len(), first.and_then(|(_, body)| body[..14].try_into().ok()))
+    }
+
+    /// Whether all its messages are of these channels.
+    pub(crate) fn is_known_to(&self, channels: &Channels) -> bool {
+        self.messages().all(|m| channels.contains_key(&m.channel))
     }
 
     /// Its records as (opcode, body); ends early where a frame makes no sense, which a right CRC excludes.
@@ -109,4 +129,13 @@ impl Chunk {
             data: &body[22..],
         })
     }
+}
+
+fn decompress(data: &[u8], size: usize) -> std::io::Result<Vec<u8>> {
+    if size as u64 / USUAL_RATIO <= data.len() as u64 {
+        return zstd::bulk::decompress(data, size);
+    }
+    let mut out = Vec::new();
+    zstd::stream::read::Decoder::with_buffer(data)?.take(size as u64 + 1).read_to_end(&mut out)?;
+    Ok(out)
 }

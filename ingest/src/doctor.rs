@@ -181,6 +181,7 @@ async fn check_run_file(lake: &Lake, path: &Path, sha256: &str, report: &mut Rep
             let offset = raw.offset;
             if let Err(reason) = Chunk::decode(&raw.body) {
                 wrong.push(format!("the chunk at byte {offset}: {reason}"));
+                reader.look_into(offset).await?;
             }
         }
     }

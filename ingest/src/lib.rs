@@ -30,9 +30,11 @@ pub mod doctor;
 mod error;
 mod files;
 mod ingest;
+mod inspect;
 mod measure;
 mod pipeline;
 mod read_back;
+mod record_shape;
 mod references;
 mod rows;
 mod run_content;
@@ -42,6 +44,8 @@ pub use complete::{Completed, complete};
 pub use error::{Error, Result};
 pub use files::{Source, pending};
 pub use ingest::{Ingest, Outcome, Report, Taken};
+#[doc(hidden)]
+pub use inspect::{Inspected, Inspection, inspect};
 pub use run_reader::Integrity;
 
 /// Version of the code that derives rows; it stands in every row.

@@ -1,6 +1,6 @@
 //! A whole run's file, read and measured: what becomes its rows.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, HashSet};
 use std::sync::Arc;
 
 use bytes::Bytes;
@@ -89,6 +89,9 @@ impl RunContent {
         // Two chunks a core in flight: memory is bounded by them, not by the run.
         let slots = Arc::new(Semaphore::new(2 * cores.count()));
         let mut tasks: Vec<JoinHandle<Yield>> = Vec::new();
+        let mut seen = HashSet::new();
+        // Chunks whose channels are not known yet: the chunk that introduces them is damaged, the summary has them too.
+        let mut waiting = Vec::new();
         while let Some(item) = reader.next().await? {
             match item {
                 Item::Chunk(raw) => {
@@ -96,9 +99,17 @@ impl RunContent {
                         envelope.check(lake, name)?;
                         checked = true;
                     }
+                    let (begin, length) = (raw.offset, raw.body.len() as u64);
                     match decode(raw).await {
+                        Ok((offset, chunk)) if !seen.insert(chunk.identity()) => {
+                            whole.damaged.push(format!("the chunk at byte {offset}: a copy of one before it"));
+                        }
                         Ok((offset, chunk)) => {
                             chunk.learn(&mut definitions);
+                            if !chunk.is_known_to(&definitions.channels) {
+                                waiting.push((offset, length));
+                                continue;
+                            }
                             let channels = definitions.channels.clone();
                             let (measurer, slot) = (measurer.clone(), slots.clone().acquire_owned().await);
                             let cores = cores.clone();
@@ -107,15 +118,18 @@ impl RunContent {
                                 cores.compute(move || measurer.process(offset, &chunk, &channels)).await
                             }));
                         }
-                        Err(reason) => whole.damaged.push(reason),
+                        Err(reason) => {
+                            whole.damaged.push(reason);
+                            reader.look_into(begin).await?;
+                        }
                     }
                 }
                 Item::Attachment { name, data } if data.len() <= LARGEST_KEPT => {
-                    envelope.attachments.insert(name, data);
+                    envelope.attachments.entry(name).or_insert(data);
                 }
                 Item::Attachment { .. } => {}
                 Item::Metadata(record) => {
-                    envelope.metadata.insert(record.name, record.metadata);
+                    envelope.metadata.entry(record.name).or_insert(record.metadata);
                 }
                 Item::Definition(record) => definitions.learn(&record),
             }
@@ -123,6 +137,13 @@ impl RunContent {
         let manifest = envelope.check(lake, name)?;
         for task in tasks {
             whole.append(task.await.map_err(|e| Error::read(name, e))?);
+        }
+        for (offset, length) in waiting {
+            let (offset, chunk) =
+                decode(reader.again(offset, length).await?).await.map_err(|e| Error::read(name, e))?;
+            let (measurer, channels) = (measurer.clone(), definitions.channels.clone());
+            let taken = tokio::task::spawn_blocking(move || measurer.process(offset, &chunk, &channels)).await;
+            whole.append(taken.map_err(|e| Error::read(name, e))?);
         }
         let integrity = reader.finish().await?;
         Self::assemble(manifest, envelope, whole, integrity, name)
@@ -135,10 +156,11 @@ impl RunContent {
         integrity: Integrity,
         name: &str,
     ) -> Result<Self> {
-        let end = envelope.metadata.get(topics::RUN_END_METADATA).map(RunEnd::from_metadata).transpose();
-        let end = end.map_err(|cause| Error::Manifest { file: name.to_owned(), cause })?;
         let mut damaged = integrity.damage.clone();
         damaged.extend(whole.damaged);
+        // How a run ended is no reason to refuse what it measured.
+        let end = envelope.metadata.get(topics::RUN_END_METADATA).map(RunEnd::from_metadata);
+        let end = end.and_then(|end| end.map_err(|cause| damaged.push(cause.to_string())).ok());
         let responses = best_responses(whole.responses);
         let rejected = whole.verdicts.iter().filter(|v| v.1.verdict() == Verdict::Rejected).count() as u64;
         let attempts = whole.verdicts.len() as u64;

@@ -1,8 +1,9 @@
 //! Walks a run's MCAP file from its first byte to its last, in one pass that also hashes it.
 //!
-//! The walk needs no summary, so a file that was cut off yields all that was complete. Where a record's
-//! frame is damaged, the chunks behind it are found through the summary's index.
+//! The walk needs no summary, so a file that was cut off yields all that was complete. Where a record cannot be
+//! one, the next that can is searched byte by byte, so damage costs the records that it touches and no others.
 
+use std::collections::HashSet;
 use std::sync::Arc;
 
 use bytes::{Bytes, BytesMut};
@@ -13,25 +14,15 @@ use object_store::{ObjectStore, ObjectStoreExt as _};
 use sha2::{Digest as _, Sha256};
 
 use crate::error::{Error, Result};
+use crate::record_shape::{self, Frame, PREFIX, Shape, opcode};
 
 const MAGIC: &[u8; 8] = b"\x89MCAP0\r\n";
 /// Opcode and length in front of every record.
-const FRAME: u64 = 9;
+const FRAME: u64 = record_shape::FRAME as u64;
 /// How much is fetched at a time.
 const BLOCK: u64 = 8 << 20;
-
-/// Opcodes of the MCAP specification that the walk looks at.
-mod opcode {
-    pub(super) const FOOTER: u8 = 0x02;
-    pub(super) const SCHEMA: u8 = 0x03;
-    pub(super) const CHANNEL: u8 = 0x04;
-    pub(super) const CHUNK: u8 = 0x06;
-    pub(super) const ATTACHMENT: u8 = 0x09;
-    pub(super) const METADATA: u8 = 0x0C;
-    pub(super) const DATA_END: u8 = 0x0F;
-    /// The highest opcode of the specification; from 0x80 on they are private.
-    pub(super) const LAST: u8 = 0x0F;
-}
+/// Bytes from the footer's frame to the end of the file.
+const FOOTER: u64 = FRAME + 20 + MAGIC.len() as u64;
 
 /// Something that the walk came by.
 #[derive(Debug)]
@@ -74,22 +65,21 @@ pub(crate) struct RunReader {
     size: u64,
     /// Where the next record begins.
     offset: u64,
+    /// Where the last record began that nothing but the next one's place can confirm.
+    doubtful: Option<u64>,
+    /// Where the chunks began that were given out.
+    chunks: HashSet<u64>,
     /// What is fetched of the file from `offset` on.
     buffer: BytesMut,
+    /// How far the file is in the digest; a search may begin before it.
+    hashed: u64,
     digest: Sha256,
     crc: Crc32,
     in_summary: bool,
-    summary: SummaryCrc,
+    /// The summary's own checksum, gathered while its records pass.
+    summary: Crc32,
     end: Option<End>,
     damage: Vec<String>,
-    /// Chunks that the summary names behind a broken frame.
-    detour: Option<std::vec::IntoIter<(u64, u64)>>,
-}
-
-/// The summary's own checksum, gathered while its records pass.
-#[derive(Default)]
-struct SummaryCrc {
-    running: Crc32,
 }
 
 /// Why the walk is over.
@@ -113,32 +103,32 @@ impl RunReader {
             name,
             size,
             offset: 0,
+            doubtful: None,
+            chunks: HashSet::new(),
             buffer: BytesMut::new(),
+            hashed: 0,
             digest: Sha256::new(),
             crc: Crc32::new(),
             in_summary: false,
-            summary: SummaryCrc::default(),
+            summary: Crc32::new(),
             end: None,
             damage: Vec::new(),
-            detour: None,
         };
-        let start = reader.peek((MAGIC.len() as u64).min(size)).await?;
+        let length = (MAGIC.len() as u64).min(size);
+        reader.fill(length).await?;
+        let start = reader.skip(length, true);
         if start[..] != MAGIC[..] {
             let actual = start.iter().map(|b| format!("{b:02x}")).collect::<Vec<_>>().join(" ");
             let actual =
                 if actual.is_empty() { "nothing (the file is empty)".to_owned() } else { format!("`{actual}`") };
             return Err(Error::NotMcap { file: reader.name, actual });
         }
-        reader.skip(MAGIC.len() as u64, true);
         Ok(reader)
     }
 
     /// The next item, or None at the end.
     pub(crate) async fn next(&mut self) -> Result<Option<Item>> {
         loop {
-            if let Some(found) = self.detour_next().await? {
-                return Ok(found);
-            }
             if self.end.is_some() {
                 return Ok(None);
             }
@@ -150,11 +140,7 @@ impl RunReader {
 
     /// What is known of the whole file, once [`Self::next`] returned None.
     pub(crate) async fn finish(mut self) -> Result<Integrity> {
-        while self.offset < self.size {
-            let some = (self.size - self.offset).min(BLOCK);
-            self.peek(some).await?;
-            self.skip(some, false);
-        }
+        self.pass(self.size - self.offset).await?;
         Ok(Integrity {
             bytes: self.size,
             sha256: hex(&self.digest.finalize()),
@@ -163,63 +149,127 @@ impl RunReader {
         })
     }
 
-    // One record; None where it is of no interest.
-    async fn record(&mut self) -> Result<Option<Item>> {
-        let left = self.size - self.offset;
-        if left < FRAME {
-            return self.stop_early("ends within a record's frame").await;
-        }
-        let frame = self.peek(FRAME).await?;
-        let code = frame[0];
-        let length = u64::from_le_bytes(frame[1..9].try_into().unwrap_or_default());
-        if code == 0 || (code > opcode::LAST && code < 0x80) {
-            return self.stop_early(&format!("has a record of unknown kind {code:#04x}")).await;
-        }
-        if length > left - FRAME {
-            return self.stop_early(&format!("ends within a record of {length} bytes")).await;
-        }
-        let offset = self.offset;
-        match code {
-            opcode::CHUNK | opcode::ATTACHMENT | opcode::METADATA | opcode::DATA_END | opcode::FOOTER => {}
-            opcode::SCHEMA | opcode::CHANNEL => {}
-            _ => {
-                self.pass(FRAME + length).await?;
-                return Ok(None);
-            }
-        }
-        if code == opcode::DATA_END {
-            self.data_end(length).await?;
-            return Ok(None);
-        }
-        if code == opcode::FOOTER {
-            self.footer(length).await?;
-            return Ok(None);
-        }
-        let record = self.peek(FRAME + length).await?;
-        let body = Bytes::copy_from_slice(&record[FRAME as usize..]);
-        self.skip(FRAME + length, true);
-        Ok(self.item(code, offset, body))
+    /// The chunk that began at `offset` is damaged. Where bytes of it are missing it reached too far, so the walk
+    /// goes on at the next whole record behind its first byte; no chunk comes twice.
+    pub(crate) async fn look_into(&mut self, offset: u64) -> Result<()> {
+        self.doubtful = Some(offset);
+        self.end = None;
+        self.search().await
     }
 
-    fn item(&mut self, code: u8, offset: u64, body: Bytes) -> Option<Item> {
-        if code == opcode::CHUNK {
-            return Some(Item::Chunk(RawChunk { offset, body }));
-        }
-        match mcap::parse_record(code, &body) {
-            Ok(Record::Attachment { header, data, crc }) => {
-                // The CRC covers the record's fields up to itself.
-                let sum = body.len().checked_sub(4).map(|end| crc32fast::hash(&body[..end]));
-                if crc != 0 && sum != Some(crc) {
-                    self.damage.push(format!("attachment `{}` at byte {offset}: wrong CRC", header.name));
-                    return None;
+    /// A chunk that the walk came by earlier, once more.
+    pub(crate) async fn again(&self, offset: u64, length: u64) -> Result<RawChunk> {
+        let start = offset + FRAME;
+        let body = self.store.get_range(&self.path, start..start + length).await;
+        Ok(RawChunk { offset, body: body.map_err(|e| Error::read(&self.name, e))? })
+    }
+
+    // One record; None where it is of no interest.
+    async fn record(&mut self) -> Result<Option<Item>> {
+        let frame = match self.frame().await? {
+            Ok(frame) => frame,
+            Err(what) => {
+                self.damage.push(format!("the file {what} at byte {}", self.offset));
+                self.search().await?;
+                return Ok(None);
+            }
+        };
+        let offset = self.offset;
+        self.doubtful = Some(offset);
+        match frame.code {
+            opcode::CHUNK | opcode::ATTACHMENT | opcode::METADATA | opcode::SCHEMA | opcode::CHANNEL => {
+                self.fill(FRAME + frame.length).await?;
+                let mut record = self.skip(FRAME + frame.length, true);
+                let body = record.split_off(FRAME as usize);
+                if frame.code == opcode::CHUNK {
+                    return Ok(self.chunks.insert(offset).then_some(Item::Chunk(RawChunk { offset, body })));
                 }
+                let item = self.item(frame.code, offset, &body);
+                if item.is_none() {
+                    self.look_into(offset).await?;
+                }
+                Ok(item)
+            }
+            opcode::DATA_END => self.data_end().await,
+            opcode::FOOTER => self.footer().await,
+            _ => self.pass(FRAME + frame.length).await,
+        }
+    }
+
+    // The frame at `offset`, or in words why no record begins there.
+    async fn frame(&mut self) -> Result<std::result::Result<Frame, String>> {
+        let left = self.size - self.offset;
+        if left < FRAME {
+            return Ok(Err("ends within a record's frame".to_owned()));
+        }
+        self.fill(left.min(FRAME + PREFIX as u64)).await?;
+        let frame = Frame::read(&self.buffer);
+        if frame.length > left - FRAME {
+            return Ok(Err(format!("ends within a record of kind {:#04x} and {} bytes", frame.code, frame.length)));
+        }
+        let prefix = frame.length.min(PREFIX as u64);
+        let sound = match frame.shape(&self.buffer[FRAME as usize..(FRAME + prefix) as usize]) {
+            Shape::Sound => frame.code != opcode::FOOTER || self.ends_with_footer(),
+            Shape::Unknown => self.goes_on(self.offset + FRAME + frame.length).await?,
+            Shape::Broken => false,
+        };
+        Ok(if sound { Ok(frame) } else { Err(format!("has no whole record of kind {:#04x}", frame.code)) })
+    }
+
+    // Whether a record can begin at `offset`: that speaks for the one before it, where nothing else does.
+    async fn goes_on(&self, offset: u64) -> Result<bool> {
+        if self.size - offset < FRAME {
+            return Ok(false);
+        }
+        let bytes = self.store.get_range(&self.path, offset..offset + FRAME).await;
+        let frame = Frame::read(&bytes.map_err(|e| Error::read(&self.name, e))?);
+        Ok(frame.is_possible(self.size - offset - FRAME))
+    }
+
+    // Whether the footer at `offset` is followed by the magic bytes and by nothing else.
+    fn ends_with_footer(&self) -> bool {
+        self.buffer[..].ends_with(MAGIC) && self.size - self.offset == FOOTER && self.buffer.len() as u64 == FOOTER
+    }
+
+    // Goes on to the next bytes that can be a record. The record before may have swallowed it, where its length or
+    // what is missing in it made it reach too far.
+    async fn search(&mut self) -> Result<()> {
+        if let Some(doubtful) = self.doubtful.take() {
+            self.buffer.clear();
+            self.offset = doubtful;
+        }
+        loop {
+            self.fill(1).await?;
+            self.skip(1, true);
+            let left = self.size - self.offset;
+            if left < FRAME {
+                self.end = Some(End::CutOff);
+                return Ok(());
+            }
+            self.fill(FRAME).await?;
+            let last = self.buffer.len() - FRAME as usize;
+            let worth = |at: &usize| Frame::read(&self.buffer[*at..]).is_worth_a_look(left - FRAME - *at as u64);
+            match (0..=last).find(worth) {
+                None => drop(self.skip(last as u64, true)),
+                Some(at) => {
+                    self.skip(at as u64, true);
+                    if self.frame().await?.is_ok() {
+                        return Ok(());
+                    }
+                }
+            }
+        }
+    }
+
+    fn item(&mut self, code: u8, offset: u64, body: &Bytes) -> Option<Item> {
+        match mcap::parse_record(code, body) {
+            // Its CRC was checked.
+            Ok(Record::Attachment { header, data, .. }) => {
+                self.doubtful = None;
                 Some(Item::Attachment { name: header.name, data: Bytes::copy_from_slice(&data) })
             }
             Ok(Record::Metadata(metadata)) => Some(Item::Metadata(metadata)),
-            Ok(definition @ (Record::Schema { .. } | Record::Channel(_))) => {
-                Some(Item::Definition(definition.into_owned()))
-            }
-            Ok(_) => None,
+            Ok(definition) => Some(Item::Definition(definition.into_owned())),
             Err(e) => {
                 self.damage.push(format!("record at byte {offset}: {e}"));
                 None
@@ -227,81 +277,36 @@ impl RunReader {
         }
     }
 
-    async fn data_end(&mut self, length: u64) -> Result<()> {
+    async fn data_end(&mut self) -> Result<Option<Item>> {
         let sum = self.crc.clone().finalize();
-        let record = self.peek(FRAME + length).await?;
-        let stored = record.get(9..13).and_then(|b| b.try_into().ok()).map(u32::from_le_bytes);
-        if let Some(stored) = stored.filter(|s| *s != 0 && *s != sum) {
-            let at = self.offset;
+        let at = self.offset;
+        let record = self.skip(FRAME + 4, true);
+        let stored = u32_at(&record, FRAME as usize);
+        if stored != 0 && stored != sum {
             self.damage.push(format!("data section up to byte {at}: CRC is {sum:08x}, expected {stored:08x}"));
         }
-        self.skip(FRAME + length, true);
         self.in_summary = true;
-        Ok(())
-    }
-
-    async fn footer(&mut self, length: u64) -> Result<()> {
-        let record = self.peek(FRAME + length).await?;
-        let at = self.offset;
-        // The summary's CRC covers all of it up to the CRC itself, the footer's frame and offsets included.
-        if length == 20 {
-            self.summary.running.update(&record[..25]);
-            let sum = self.summary.running.clone().finalize();
-            let stored = u32::from_le_bytes(record[25..29].try_into().unwrap_or_default());
-            let has_summary = record[9..17] != [0; 8];
-            if has_summary && stored != 0 && stored != sum {
-                self.damage.push(format!("summary before byte {at}: CRC is {sum:08x}, expected {stored:08x}"));
-            }
-        }
-        self.skip(FRAME + length, false);
-        let end = self.peek((MAGIC.len() as u64).min(self.size - self.offset)).await?;
-        let closed = end[..] == MAGIC[..] && self.offset + MAGIC.len() as u64 == self.size;
-        if !closed {
-            self.damage.push(format!("no magic bytes at the end, byte {}", self.offset));
-        }
-        self.end = Some(if closed { End::Closed } else { End::CutOff });
-        Ok(())
-    }
-
-    // The frame at `offset` makes no sense: whatever the summary still names behind it is read instead.
-    async fn stop_early(&mut self, what: &str) -> Result<Option<Item>> {
-        self.damage.push(format!("the file {what} at byte {}", self.offset));
-        let behind = self.chunks_behind(self.offset).await;
-        self.end = Some(if behind.is_some() { End::Closed } else { End::CutOff });
-        self.detour = behind.map(Vec::into_iter);
         Ok(None)
     }
 
-    async fn chunks_behind(&self, offset: u64) -> Option<Vec<(u64, u64)>> {
-        let footer_start = self.size.checked_sub(FRAME + 20 + 8)?;
-        let footer = self.store.get_range(&self.path, footer_start..self.size).await.ok()?;
-        let intact = footer[0] == opcode::FOOTER && footer[29..] == MAGIC[..];
-        let start = u64::from_le_bytes(footer[9..17].try_into().ok()?);
-        if !intact || start == 0 || start >= footer_start {
-            return None;
+    async fn footer(&mut self) -> Result<Option<Item>> {
+        let at = self.offset;
+        let record = self.skip(FOOTER, false);
+        // The summary's CRC covers all of it up to the CRC itself, the footer's frame and offsets included.
+        let mut sum = self.summary.clone();
+        sum.update(&record[..25]);
+        let sum = sum.finalize();
+        let stored = u32_at(&record, 25);
+        let has_summary = record[9..17] != [0; 8];
+        if has_summary && stored != 0 && stored != sum {
+            self.damage.push(format!("summary before byte {at}: CRC is {sum:08x}, expected {stored:08x}"));
         }
-        let summary = self.store.get_range(&self.path, start..footer_start).await.ok()?;
-        let chunks = mcap::read::LinearReader::sans_magic(&summary).map_while(|r| r.ok()).filter_map(|r| match r {
-            Record::ChunkIndex(index) => Some((index.chunk_start_offset, index.chunk_length)),
-            _ => None,
-        });
-        let fits = |&(at, length): &(u64, u64)| at > offset && length >= FRAME && at.saturating_add(length) <= start;
-        Some(chunks.filter(fits).collect())
+        self.end = Some(End::Closed);
+        Ok(None)
     }
 
-    async fn detour_next(&mut self) -> Result<Option<Option<Item>>> {
-        let Some(chunks) = &mut self.detour else { return Ok(None) };
-        let Some((offset, length)) = chunks.next() else {
-            self.detour = None;
-            return Ok(None);
-        };
-        let range = offset + FRAME..offset + length;
-        let body = self.store.get_range(&self.path, range).await.map_err(|e| Error::read(&self.name, e))?;
-        Ok(Some(Some(Item::Chunk(RawChunk { offset, body }))))
-    }
-
-    /// The next `count` bytes, which the file has.
-    async fn peek(&mut self, count: u64) -> Result<Bytes> {
+    /// Fetches, so that the buffer has the next `count` bytes; the file has them.
+    async fn fill(&mut self, count: u64) -> Result<()> {
         let count = count as usize;
         if self.buffer.len() < count {
             let from = self.offset + self.buffer.len() as u64;
@@ -312,31 +317,41 @@ impl RunReader {
         if self.buffer.len() < count {
             return Err(Error::read(&self.name, "it became shorter while it was read"));
         }
-        Ok(Bytes::copy_from_slice(&self.buffer[..count]))
+        Ok(())
     }
 
-    fn skip(&mut self, count: u64, counts_in_crc: bool) {
-        let passed = self.buffer.split_to(count as usize);
-        self.digest.update(&passed);
-        if counts_in_crc && self.in_summary {
-            self.summary.running.update(&passed);
-        } else if counts_in_crc {
-            self.crc.update(&passed);
-        }
+    /// Takes the next `count` bytes, which the buffer has.
+    fn skip(&mut self, count: u64, counts_in_crc: bool) -> Bytes {
+        let passed = self.buffer.split_to(count as usize).freeze();
         self.offset += count;
+        // What a search goes over once more is in the sums already.
+        let fresh = self.offset.saturating_sub(self.hashed).min(count);
+        let fresh = &passed[(count - fresh) as usize..];
+        self.hashed = self.hashed.max(self.offset);
+        self.digest.update(fresh);
+        if counts_in_crc && self.in_summary {
+            self.summary.update(fresh);
+        } else if counts_in_crc {
+            self.crc.update(fresh);
+        }
+        passed
     }
 
     // Passes over what may be larger than the buffer should become.
-    async fn pass(&mut self, count: u64) -> Result<()> {
+    async fn pass(&mut self, count: u64) -> Result<Option<Item>> {
         let mut left = count;
         while left > 0 {
             let some = left.min(BLOCK);
-            self.peek(some).await?;
+            self.fill(some).await?;
             self.skip(some, true);
             left -= some;
         }
-        Ok(())
+        Ok(None)
     }
+}
+
+fn u32_at(bytes: &[u8], at: usize) -> u32 {
+    u32::from_le_bytes([bytes[at], bytes[at + 1], bytes[at + 2], bytes[at + 3]])
 }
 
 pub(crate) fn hex(bytes: &[u8]) -> String {

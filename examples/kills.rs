@@ -1,0 +1,35 @@
+//! Kills `echolake ingest` at random moments, many times, and compares its tables with those of an undisturbed one:
+//! `cargo build --release && cargo run --release --example kills -- [rounds] [seed]`.
+
+#[path = "../tests/kills.rs"]
+mod kills;
+#[path = "../tests/small_rig.rs"]
+mod small_rig;
+
+use std::io::Write as _;
+
+use small_rig::SMALL_RIG;
+
+fn main() -> Result<(), Box<dyn std::error::Error>> {
+    let mut args = std::env::args().skip(1);
+    let rounds = args.next().map_or(Ok(200), |a| a.parse())?;
+    let seed = args.next().map_or(Ok(1), |a| a.parse())?;
+    let example = std::env::current_exe()?;
+    let binary = example.ancestors().nth(2).ok_or("no folder")?.join("echolake");
+    if !binary.exists() {
+        return Err(format!("`{}` is missing; hint: cargo build --release", binary.display()).into());
+    }
+    let mut out = std::io::stdout();
+    let outcome = kills::Campaign::new(&binary, seed).rounds(rounds, &mut |round, so_far| {
+        if round % 10 == 0 {
+            // Progress is not worth an error.
+            let _ = writeln!(std::io::stderr(), "{round} of {rounds} rounds, {} killed", so_far.killed);
+        }
+    });
+    writeln!(
+        out,
+        "{rounds} rounds, seed {seed}: {} kills while ingest worked, {} after its end; all tables equal",
+        outcome.killed, outcome.ended
+    )?;
+    Ok(())
+}

@@ -1,0 +1,265 @@
+//! Ways to damage a file, with what of it stays as it was.
+
+use std::ops::Range;
+
+use anyhow::{Context as _, Result};
+use bytes::Bytes;
+use mcap::records::Record;
+use rand::Rng;
+use rand::seq::IndexedRandom as _;
+
+use super::specimen::{FRAME, Specimen};
+
+/// Largest block that is zeroed, doubled or taken out.
+const LARGEST_BLOCK: f64 = 65_536.0;
+/// Flips near a record's start hit its frame and the lengths in it.
+const NEAR: usize = 64;
+/// Channel, number and two times in front of a message's own bytes.
+const MESSAGE_HEAD: usize = 22;
+
+/// How a file is damaged.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Kind {
+    /// 1 to 8 bytes anywhere.
+    Flips,
+    /// 1 to 8 bytes in the first ones of records.
+    FrameFlips,
+    /// The end is missing.
+    Truncated,
+    /// A block of zeros.
+    Zeroed,
+    /// A block is there twice.
+    Doubled,
+    /// A block is missing.
+    Removed,
+    /// All between two places is missing.
+    Cut,
+    /// Two to four of the above.
+    Several,
+    /// Bytes of messages, and the chunk's CRC is that of the damaged ones: damage from before it was written.
+    Sealed,
+}
+
+/// A part of a damaged file.
+#[derive(Debug, Clone)]
+enum Piece {
+    /// Bytes of the undamaged file.
+    Intact(Range<usize>),
+    /// Others.
+    Altered(Vec<u8>),
+}
+
+/// A damaged file.
+#[derive(Debug)]
+pub(crate) struct Damaged {
+    pieces: Vec<Piece>,
+}
+
+impl Kind {
+    pub(crate) const ALL: [Self; 9] = [
+        Self::Flips,
+        Self::FrameFlips,
+        Self::Truncated,
+        Self::Zeroed,
+        Self::Doubled,
+        Self::Removed,
+        Self::Cut,
+        Self::Several,
+        Self::Sealed,
+    ];
+    const SINGLE: [Self; 7] =
+        [Self::Flips, Self::FrameFlips, Self::Truncated, Self::Zeroed, Self::Doubled, Self::Removed, Self::Cut];
+
+    pub(crate) fn label(self) -> &'static str {
+        match self {
+            Self::Flips => "1-8 bytes flipped",
+            Self::FrameFlips => "flipped near frames",
+            Self::Truncated => "truncated",
+            Self::Zeroed => "block zeroed",
+            Self::Doubled => "block doubled",
+            Self::Removed => "block removed",
+            Self::Cut => "cut in the middle",
+            Self::Several => "several of these",
+            Self::Sealed => "messages, CRC right",
+        }
+    }
+}
+
+impl Damaged {
+    /// Damages a specimen.
+    ///
+    /// # Errors
+    /// Where the specimen itself is not as expected.
+    pub(crate) fn new(specimen: &Specimen, kind: Kind, rng: &mut impl Rng) -> Result<Self> {
+        let mut damaged = Self { pieces: vec![Piece::Intact(0..specimen.bytes.len())] };
+        match kind {
+            Kind::Several => {
+                for _ in 0..rng.random_range(2..=4) {
+                    let kind = *Kind::SINGLE.choose(rng).context("there are kinds")?;
+                    damaged.apply(specimen, kind, rng);
+                }
+            }
+            Kind::Sealed => damaged.seal(specimen, rng)?,
+            kind => damaged.apply(specimen, kind, rng),
+        }
+        Ok(damaged)
+    }
+
+    /// The damaged file's bytes.
+    pub(crate) fn bytes(&self, specimen: &Specimen) -> Bytes {
+        let mut bytes = Vec::with_capacity(self.len());
+        for piece in &self.pieces {
+            match piece {
+                Piece::Intact(range) => bytes.extend_from_slice(&specimen.bytes[range.clone()]),
+                Piece::Altered(altered) => bytes.extend_from_slice(altered),
+            }
+        }
+        bytes.into()
+    }
+
+    /// Whether these bytes of the undamaged file still stand in one piece somewhere.
+    pub(crate) fn keeps(&self, part: &Range<usize>) -> bool {
+        self.pieces.iter().any(|p| matches!(p, Piece::Intact(r) if r.start <= part.start && part.end <= r.end))
+    }
+
+    fn len(&self) -> usize {
+        self.pieces.iter().map(Piece::len).sum()
+    }
+
+    fn apply(&mut self, specimen: &Specimen, kind: Kind, rng: &mut impl Rng) {
+        let size = self.len();
+        if size == 0 {
+            return;
+        }
+        let length = (LARGEST_BLOCK.powf(rng.random_range(0.0..1.0)) as usize).min(size);
+        let start = rng.random_range(0..=size - length);
+        match kind {
+            Kind::FrameFlips => {
+                for _ in 0..rng.random_range(1..=8) {
+                    let record = specimen.records.choose(rng).map_or(0, |r| r.start);
+                    self.flip((record + rng.random_range(0..NEAR)).min(size - 1), specimen, rng);
+                }
+            }
+            Kind::Truncated => {
+                let kept = self.split(rng.random_range(0..size));
+                self.pieces.truncate(kept);
+            }
+            Kind::Zeroed => self.replace(start, length, vec![Piece::Altered(vec![0; length])]),
+            Kind::Doubled => {
+                let (from, to) = (self.split(start), self.split(start + length));
+                let copy = self.pieces[from..to].to_vec();
+                self.pieces.splice(to..to, copy);
+            }
+            Kind::Removed => self.replace(start, length, Vec::new()),
+            Kind::Cut => {
+                let (a, b) = (rng.random_range(0..size), rng.random_range(0..size));
+                self.replace(a.min(b), a.abs_diff(b), Vec::new());
+            }
+            Kind::Flips | Kind::Several | Kind::Sealed => {
+                for _ in 0..rng.random_range(1..=8) {
+                    self.flip(rng.random_range(0..size), specimen, rng);
+                }
+            }
+        }
+    }
+
+    fn flip(&mut self, at: usize, specimen: &Specimen, rng: &mut impl Rng) {
+        // Half of them a single bit, as memory and wires do.
+        let mask = if rng.random() { 1 << rng.random_range(0..8) } else { rng.random_range(1..=255) };
+        let index = self.split(at);
+        self.split(at + 1);
+        let byte = match &self.pieces[index] {
+            Piece::Intact(range) => specimen.bytes[range.start],
+            Piece::Altered(bytes) => bytes[0],
+        };
+        self.pieces[index] = Piece::Altered(vec![byte ^ mask]);
+    }
+
+    fn replace(&mut self, start: usize, length: usize, by: Vec<Piece>) {
+        let (from, to) = (self.split(start), self.split(start + length));
+        self.pieces.splice(from..to, by);
+    }
+
+    /// Makes a piece begin at `at`; returns its number.
+    fn split(&mut self, at: usize) -> usize {
+        let mut before = 0;
+        for index in 0..self.pieces.len() {
+            let length = self.pieces[index].len();
+            if at == before {
+                return index;
+            }
+            if at < before + length {
+                let (left, right) = self.pieces[index].halves(at - before);
+                self.pieces.splice(index..=index, [left, right]);
+                return index + 1;
+            }
+            before += length;
+        }
+        self.pieces.len()
+    }
+
+    // Flips bytes of messages in one chunk, and makes its record anew.
+    fn seal(&mut self, specimen: &Specimen, rng: &mut impl Rng) -> Result<()> {
+        let range = specimen.chunks.choose(rng).context("there are chunks")?.range.clone();
+        let body = &specimen.bytes[range.start + FRAME..range.end];
+        let Record::Chunk { mut header, data } = mcap::parse_record(0x06, body)? else {
+            anyhow::bail!("the specimen has a damaged chunk");
+        };
+        let mut records = zstd::bulk::decompress(&data, usize::try_from(header.uncompressed_size)?)?;
+        let messages = messages(&records)?;
+        if messages.is_empty() {
+            return Ok(());
+        }
+        for _ in 0..rng.random_range(1..=8) {
+            // Most are short, and the few bytes at the front are what readers trust.
+            let message = messages.choose(rng).context("there are messages")?.clone();
+            let reach = if rng.random() { message.len() } else { message.len().min(24) };
+            if reach > 0 {
+                records[message.start + rng.random_range(0..reach)] ^= 1 << rng.random_range(0..8);
+            }
+        }
+        let data = zstd::bulk::compress(&records, 1)?;
+        header.uncompressed_crc = crc32fast::hash(&records);
+        let mut record = vec![0x06];
+        record.extend((body.len() - usize::try_from(header.compressed_size)? + data.len()).to_le_bytes());
+        record.extend(header.message_start_time.to_le_bytes());
+        record.extend(header.message_end_time.to_le_bytes());
+        record.extend(header.uncompressed_size.to_le_bytes());
+        record.extend(header.uncompressed_crc.to_le_bytes());
+        record.extend((header.compression.len() as u32).to_le_bytes());
+        record.extend(header.compression.bytes());
+        record.extend((data.len() as u64).to_le_bytes());
+        record.extend(data);
+        self.replace(range.start, range.len(), vec![Piece::Altered(record)]);
+        Ok(())
+    }
+}
+
+impl Piece {
+    fn len(&self) -> usize {
+        match self {
+            Self::Intact(range) => range.len(),
+            Self::Altered(bytes) => bytes.len(),
+        }
+    }
+
+    fn halves(&self, at: usize) -> (Self, Self) {
+        match self {
+            Self::Intact(r) => (Self::Intact(r.start..r.start + at), Self::Intact(r.start + at..r.end)),
+            Self::Altered(bytes) => (Self::Altered(bytes[..at].to_vec()), Self::Altered(bytes[at..].to_vec())),
+        }
+    }
+}
+
+/// Where the messages' own bytes stand in a chunk's records.
+fn messages(records: &[u8]) -> Result<Vec<Range<usize>>> {
+    let (mut at, mut found) = (0, Vec::new());
+    while at + FRAME <= records.len() {
+        let length = usize::try_from(u64::from_le_bytes(records[at + 1..at + FRAME].try_into()?))?;
+        if records[at] == 0x05 {
+            found.push(at + FRAME + MESSAGE_HEAD..at + FRAME + length);
+        }
+        at += FRAME + length;
+    }
+    Ok(found)
+}

@@ -1,0 +1,58 @@
+//! What ingest would take in of a run's file, without taking it in: for checks of the reader against damaged files.
+
+use std::sync::Arc;
+
+use echolake_lake::Lake;
+use echolake_schema::RunId;
+use object_store::ObjectStore;
+use object_store::path::Path;
+
+use crate::error::Result;
+use crate::files::Opened;
+use crate::pipeline::Cores;
+use crate::run_content::RunContent;
+
+/// A run's file, read.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Inspection {
+    /// The run that the file says it is.
+    pub run: RunId,
+    /// Accepted measurements by pair.
+    pub measurements: Vec<Inspected>,
+    /// Times of the ambient sensor's readings, ns since 1970, as they came.
+    pub readings_ns: Vec<i64>,
+    /// Whether the file was closed and says how the run ended.
+    pub whole: bool,
+    /// What could not be read, in words.
+    pub damaged: Vec<String>,
+}
+
+/// An accepted measurement.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Inspected {
+    /// Pair.
+    pub pair: u32,
+    /// Attempt.
+    pub attempt: u32,
+    /// Response at the reference temperature, cropped to the rig's length.
+    pub ir: Vec<f32>,
+}
+
+/// Reads a run's file as ingest does, and writes nothing.
+///
+/// # Errors
+/// [`Error`](crate::Error) where ingest would refuse the whole file, naming it.
+pub async fn inspect(lake: &Lake, store: Arc<dyn ObjectStore>, path: &Path, name: &str) -> Result<Inspection> {
+    let opened = Opened { store, path: path.clone(), name: name.to_owned() };
+    let content = RunContent::read(lake, &Cores::all(), &opened).await?;
+    let whole = content.is_whole();
+    let inspected =
+        content.accepted.into_iter().map(|(m, r)| Inspected { pair: m.pair_id, attempt: m.attempt, ir: r.ir });
+    Ok(Inspection {
+        run: content.manifest.run_id,
+        measurements: inspected.collect(),
+        readings_ns: content.readings.iter().map(|r| r.0).collect(),
+        whole,
+        damaged: content.damaged,
+    })
+}

@@ -1,0 +1,142 @@
+//! Ingest killed at random moments: run through once afterwards, its tables equal those of an undisturbed ingest.
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Stdio};
+use std::time::{Duration, Instant};
+
+use rand::{Rng as _, SeedableRng as _};
+use rand_chacha::ChaCha8Rng;
+
+use super::SMALL_RIG;
+
+/// Surfaces of the lake: references and what waits for them, in an order that a run must not depend on.
+const SURFACES: [&str; 6] = ["wood", "flat", "prd", "foam", "brick", "wavy"];
+/// Every table, with the order that makes its rows comparable.
+const TABLES: [(&str, &str); 12] = [
+    ("surfaces", "surface_id"),
+    ("runs", "run_id"),
+    ("points", "point_id"),
+    ("pairs", "pair_id"),
+    ("measurements", "run_id, pair_id"),
+    ("nce", "run_id, pair_id"),
+    ("tnce", "run_id, pair_id"),
+    ("tnce_d4", "run_id, pair_id, symmetry"),
+    ("heightmaps", "surface_id, symmetry"),
+    ("environment", "run_id, log_time_ns"),
+    ("events", "run_id, log_time_ns, message"),
+    ("surface_stats", "surface_id, band"),
+];
+
+/// How a campaign went.
+#[derive(Debug, Default)]
+pub(crate) struct Outcome {
+    /// Processes that were killed while they worked.
+    pub(crate) killed: usize,
+    /// Processes that ended before their moment came.
+    pub(crate) ended: usize,
+}
+
+/// A campaign in a folder of its own.
+pub(crate) struct Campaign {
+    folder: tempfile::TempDir,
+    binary: PathBuf,
+    random: ChaCha8Rng,
+}
+
+impl Campaign {
+    /// Measures the runs of the lake that every round begins with.
+    pub(crate) fn new(binary: &Path, seed: u64) -> Self {
+        let folder = tempfile::tempdir().expect("a folder");
+        std::fs::write(folder.path().join("rig.toml"), SMALL_RIG).expect("written");
+        let campaign = Self { folder, binary: binary.to_owned(), random: ChaCha8Rng::seed_from_u64(seed) };
+        for (number, surface) in SURFACES.iter().enumerate() {
+            let seed = number.to_string();
+            campaign.run("start", &["acquire", "--surface", surface, "--seed", &seed, "--rig", "rig.toml", "--ir-only"]);
+        }
+        campaign
+    }
+
+    /// Kills ingest once to three times in each round, lets it run through, and compares. `told` hears of each round.
+    ///
+    /// # Panics
+    /// Where the tables are not those of an undisturbed ingest; the text names the round.
+    pub(crate) fn rounds(&mut self, rounds: usize, told: &mut dyn FnMut(usize, &Outcome)) -> Outcome {
+        self.copy("undisturbed");
+        let begun = Instant::now();
+        self.run("undisturbed", &["ingest"]);
+        let whole = begun.elapsed();
+        let expected = self.tables("undisturbed");
+        let mut outcome = Outcome::default();
+        for round in 0..rounds {
+            self.copy("round");
+            let kills = self.random.random_range(1..=3);
+            for _ in 0..kills {
+                let moment = whole.mul_f64(self.random.random());
+                match self.killed_after(moment) {
+                    true => outcome.killed += 1,
+                    false => outcome.ended += 1,
+                }
+            }
+            self.run("round", &["ingest"]);
+            let actual = self.tables("round");
+            for (table, rows) in &expected {
+                assert!(actual[table] == *rows, "round {round}: table {table} differs from that of an undisturbed ingest");
+            }
+            told(round + 1, &outcome);
+        }
+        outcome
+    }
+
+    fn command(&self, lake: &str) -> Command {
+        let mut command = Command::new(&self.binary);
+        command.args(["--lake", lake]).current_dir(self.folder.path()).env_remove("ECHOLAKE_LAKE");
+        command
+    }
+
+    fn run(&self, lake: &str, args: &[&str]) -> Vec<u8> {
+        let output = self.command(lake).args(args).output().expect("the command starts");
+        assert!(output.status.success(), "{args:?}: {}", String::from_utf8_lossy(&output.stderr));
+        output.stdout
+    }
+
+    fn killed_after(&self, moment: Duration) -> bool {
+        let mut command = self.command("round");
+        let mut child =
+            command.arg("ingest").stdout(Stdio::null()).stderr(Stdio::null()).spawn().expect("the command starts");
+        std::thread::sleep(moment);
+        let ended = child.try_wait().expect("its state").is_some();
+        // SIGKILL: nothing of the process runs after it.
+        let _ = child.kill();
+        child.wait().expect("its end");
+        !ended
+    }
+
+    fn tables(&self, lake: &str) -> BTreeMap<&'static str, Vec<u8>> {
+        let rows = |(table, order): &(&'static str, &str)| {
+            let query = format!("select * from {table} order by {order}");
+            (*table, self.run(lake, &["sql", "--format", "csv", &query]))
+        };
+        TABLES.iter().map(rows).collect()
+    }
+
+    fn copy(&self, lake: &str) {
+        let to = self.folder.path().join(lake);
+        // The first round finds none.
+        let _ = std::fs::remove_dir_all(&to);
+        copy_folder(&self.folder.path().join("start"), &to);
+    }
+}
+
+fn copy_folder(from: &Path, to: &Path) {
+    std::fs::create_dir_all(to).expect("made");
+    for entry in std::fs::read_dir(from).expect("listed") {
+        let entry = entry.expect("an entry");
+        let target = to.join(entry.file_name());
+        if entry.file_type().expect("its kind").is_dir() {
+            copy_folder(&entry.path(), &target);
+        } else {
+            std::fs::copy(entry.path(), target).expect("copied");
+        }
+    }
+}
