@@ -2,6 +2,7 @@
 
 mod bad_input;
 mod end_to_end;
+mod load;
 mod real_data;
 
 use std::path::{Path, PathBuf};

@@ -25,7 +25,7 @@ pub struct Member {
 pub fn collection(seed: u64, count: usize) -> Result<Vec<Member>, Error> {
     if count > LARGEST {
         let (quantity, expected) = ("number of surfaces", "20001 at most, as panels have four digits");
-        return Err(Error::Quantity { quantity, actual: count as f64, expected });
+        return Err(Error::Quantity { quantity, actual: count.to_string(), expected });
     }
     let references = REFERENCES.map(|(name, relief)| (name.to_owned(), relief));
     let sides = (0u64..).map(|n| (format!("{:04}_{}", n / 2 + 1, n % 2), Relief::drawn(seed, n)));
