@@ -72,12 +72,12 @@ fn few_surfaces() -> anyhow::Result<Vec<Member>> {
 
 // Without a file the demo's rig, whatever the lake's is: a lake of another rig refuses it.
 async fn rig(file: Option<&Path>, lake_url: &str) -> anyhow::Result<Rig> {
+    if file.is_some() {
+        return super::rig_or(file, lake_url, Rig::paper).await;
+    }
     let mut rig = Rig::paper();
     rig.sweep.duration_secs = SWEEP_SECS;
-    match file {
-        Some(_) => super::rig_or(file, lake_url, || rig).await,
-        None => Ok(rig),
-    }
+    Ok(rig)
 }
 
 fn lake_flag(lake_url: &str) -> String {
@@ -109,16 +109,17 @@ fn band_columns(lake: &Lake, value: impl Fn(&str) -> String) -> String {
     columns.join(", ")
 }
 
-// One row a typology: a large collection's surfaces are too many to print. Returns a surface to look at.
+// One row a reference or typology: a large collection's surfaces are too many to print. Returns a surface to look at.
 async fn print_typologies(lake: &Lake) -> anyhow::Result<&'static str> {
     let session = Session::new(lake)?;
     let columns =
         band_columns(lake, |band| format!("round(avg(s.p90_mean_db) filter (where s.band = '{band}'), 1) + 0.0"));
     super::print("\nTNCE of the values up to the 90th percentile, dB re Flat, mean over surfaces (simulated)")?;
     let sql = format!(
-        "select u.typology, count(distinct u.surface_id) as surfaces, {columns} \
+        "select case u.typology when 'reference' then u.surface_id else u.typology end as kind, \
+         count(distinct u.surface_id) as surfaces, {columns} \
          from surfaces u left join surface_stats s on s.surface_id = u.surface_id \
-         group by u.typology order by u.typology"
+         group by kind, u.typology order by u.typology <> 'reference', kind"
     );
     super::sql::print_table(&session, &sql).await?;
     Ok("flat")
