@@ -49,7 +49,7 @@ pub(crate) struct DemoArgs {
     /// Those that are measured already are not measured again.
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=LARGEST as i64))]
     pub(crate) surfaces: Option<u32>,
-    /// Record no sweeps, only impulse responses: a fifteenth of the space.
+    /// Record no sweeps, only impulse responses: a tenth of the space.
     #[arg(long)]
     pub(crate) ir_only: bool,
     /// Do not serve the catalogue afterwards.
