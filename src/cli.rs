@@ -3,6 +3,7 @@
 use std::path::PathBuf;
 
 use clap::{Args, Parser, Subcommand};
+use echolake_acquisition::collection::LARGEST;
 use echolake_schema::SurfaceId;
 
 use crate::commands::sql::SqlArgs;
@@ -44,9 +45,22 @@ pub(crate) enum Command {
 
 #[derive(Debug, Args)]
 pub(crate) struct DemoArgs {
-    /// Only measure, ingest and print. (This version serves nothing yet, so it changes nothing.)
+    /// Measure this many surfaces instead: the references, then panels of every typology with random parameters.
+    /// Those that are measured already are not measured again.
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=LARGEST as i64))]
+    pub(crate) surfaces: Option<u32>,
+    /// Record no sweeps, only impulse responses: a tenth of the space.
+    #[arg(long)]
+    pub(crate) ir_only: bool,
+    /// Do not serve the catalogue afterwards.
     #[arg(long)]
     pub(crate) no_serve: bool,
+    /// Leave the runs in the lake's inbox/.
+    #[arg(long, hide = true)]
+    pub(crate) no_ingest: bool,
+    /// The rig; by default that of the paper with sweeps of 0.05 s.
+    #[arg(long)]
+    pub(crate) rig: Option<PathBuf>,
     /// Seed of the simulation: the same seed gives the same lake.
     #[arg(long, default_value_t = 1)]
     pub(crate) seed: u64,

@@ -3,6 +3,7 @@
 mod bad_input;
 mod end_to_end;
 mod kills;
+mod load;
 mod real_data;
 mod small_rig;
 

@@ -9,6 +9,7 @@
 //! ```
 
 pub mod assessment;
+pub mod collection;
 pub mod conformance;
 pub mod controller;
 pub mod import;

@@ -3,6 +3,7 @@
 mod bricks;
 mod height_field;
 mod primitive_root;
+mod random;
 mod wavy;
 
 pub use bricks::{Bond, Bricks};

@@ -1,0 +1,176 @@
+//! The demo's measuring: surface after surface on the simulated rig, one on each core.
+
+use std::collections::HashSet;
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
+use std::sync::{Mutex, PoisonError};
+use std::time::Instant;
+
+use anyhow::Context as _;
+use echolake_acquisition::collection::Member;
+use echolake_acquisition::controller::Keep;
+use echolake_acquisition::simulate::{SimulatedRun, Specimen};
+use echolake_schema::manifest::RunEnd;
+use echolake_schema::{Rig, Timestamp};
+
+use crate::progress::{Progress, Task};
+
+/// 2026-01-05 08:00 UTC, and eleven hours from run to run: a run takes ten.
+const FIRST_START: Timestamp = Timestamp(1_767_600_000_000_000_000);
+const RUN_EVERY_SECS: f64 = 39_600.0;
+/// With more surfaces than this, progress is told in surfaces.
+const TOLD_EACH: usize = 20;
+
+/// What is to be measured.
+pub(super) struct Campaign {
+    pub(super) rig: Rig,
+    /// In the order in which they are measured.
+    pub(super) surfaces: Vec<Member>,
+    pub(super) keep: Keep,
+    pub(super) seed: u64,
+    /// Where the runs go.
+    pub(super) folder: PathBuf,
+    /// Names of the runs that the lake has already.
+    pub(super) known: HashSet<String>,
+}
+
+/// What the threads of a campaign share.
+struct Shared<'a> {
+    campaign: &'a Campaign,
+    progress: &'a Progress,
+    stop: &'a AtomicBool,
+    next: AtomicUsize,
+    /// Of all surfaces, where they are not told one by one.
+    whole: Option<Mutex<(Task, u64)>>,
+    made: Mutex<Made>,
+}
+
+/// What was measured, as opposed to found.
+#[derive(Default)]
+struct Made {
+    runs: u64,
+    accepted: u64,
+    attempts: u64,
+    bytes: u64,
+    failure: Option<anyhow::Error>,
+}
+
+impl Campaign {
+    /// Measures what is not measured yet. When `stop` becomes true it ends behind the surfaces that are in hand.
+    pub(super) fn measure(&self, stop: &AtomicBool, progress: &Progress) -> anyhow::Result<()> {
+        let cores = std::thread::available_parallelism().map_or(1, usize::from);
+        let begun = Instant::now();
+        let count = self.surfaces.len();
+        let whole = (count > TOLD_EACH).then(|| Mutex::new((progress.task("measure", count as u64, "surfaces"), 0)));
+        let shared =
+            Shared { campaign: self, progress, stop, next: AtomicUsize::new(0), whole, made: Mutex::default() };
+        std::thread::scope(|scope| {
+            for _ in 0..cores.min(count) {
+                scope.spawn(|| shared.work());
+            }
+        });
+        let Shared { whole, made, .. } = shared;
+        let Made { runs, accepted, attempts, bytes, failure } =
+            made.into_inner().unwrap_or_else(PoisonError::into_inner);
+        if let Some(failure) = failure {
+            return Err(failure);
+        }
+        if let Some(whole) = whole {
+            let (task, _) = whole.into_inner().unwrap_or_else(PoisonError::into_inner);
+            let rate = accepted as f64 / begun.elapsed().as_secs_f64();
+            task.done(format!(
+                "{runs} of {count} surfaces made, {accepted} pairs in {attempts} attempts, {rate:.0} pairs a second, {:.0} MB",
+                bytes as f64 / 1e6
+            ));
+        }
+        Ok(())
+    }
+}
+
+impl Shared<'_> {
+    fn work(&self) {
+        while !self.stop.load(Ordering::Relaxed) {
+            let number = self.next.fetch_add(1, Ordering::Relaxed);
+            let Some(member) = self.campaign.surfaces.get(number) else { return };
+            let outcome = self.surface(number, member);
+            let mut made = self.made.lock().unwrap_or_else(PoisonError::into_inner);
+            match outcome {
+                Ok(None) => {}
+                Ok(Some((end, bytes))) => {
+                    made.runs += 1;
+                    made.accepted += end.accepted;
+                    made.attempts += end.attempts;
+                    made.bytes += bytes;
+                }
+                Err(error) => {
+                    made.failure.get_or_insert(error);
+                    self.stop.store(true, Ordering::Relaxed);
+                }
+            }
+            drop(made);
+            self.tell();
+        }
+    }
+
+    fn tell(&self) {
+        if let Some(whole) = &self.whole {
+            let mut whole = whole.lock().unwrap_or_else(PoisonError::into_inner);
+            let (task, done) = &mut *whole;
+            *done += 1;
+            task.at(*done);
+        }
+    }
+
+    // How the run ended and its size; nothing where it was measured before.
+    fn surface(&self, number: usize, member: &Member) -> anyhow::Result<Option<(RunEnd, u64)>> {
+        let Campaign { rig, keep, seed, folder, known, .. } = self.campaign;
+        let surface = &member.surface;
+        let run = SimulatedRun {
+            rig,
+            surface: surface.clone(),
+            specimen: &Specimen::Relief(member.relief.clone()),
+            flat: None,
+            foam: None,
+            start: FIRST_START.plus_secs(number as f64 * RUN_EVERY_SECS),
+            seed: seed.wrapping_mul(1_000).wrapping_add(number as u64),
+            keep: *keep,
+            folder,
+        };
+        let path = run.path()?;
+        let name = path.file_stem().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default();
+        if path.exists() || known.contains(&name) {
+            if self.whole.is_none() {
+                self.progress.say(format!("{surface}: measured before"));
+            }
+            return Ok(None);
+        }
+        remove_partial(&path)?;
+        let pairs = rig.grid()?.pairs().len();
+        let mut task = self.whole.is_none().then(|| self.progress.task(surface.to_string(), pairs as u64, "pairs"));
+        let begun = Instant::now();
+        // A demo's run takes seconds, so it is whole or there is none: only the next one is not begun.
+        let measured = run.measure(&AtomicBool::new(false), &mut |done| {
+            if let Some(task) = &mut task {
+                task.at(done as u64);
+            }
+        });
+        let (path, end) = measured.with_context(|| format!("surface {surface}"))?;
+        if let Some(task) = task {
+            let rate = end.attempts as f64 / begun.elapsed().as_secs_f64();
+            task.done(format!("{} pairs in {} attempts, {rate:.0} a second", end.accepted, end.attempts));
+        }
+        let bytes = path.metadata().with_context(|| format!("cannot read `{}`", path.display()))?.len();
+        Ok(Some((end, bytes)))
+    }
+}
+
+// What a demo that was killed left behind.
+fn remove_partial(path: &Path) -> anyhow::Result<()> {
+    let mut partial = path.as_os_str().to_owned();
+    partial.push(".partial");
+    let partial = PathBuf::from(partial);
+    match partial.exists() {
+        true => std::fs::remove_file(&partial).with_context(|| format!("cannot remove `{}`", partial.display())),
+        false => Ok(()),
+    }
+}
