@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use echolake_lake::Lake;
-use echolake_schema::RunId;
+use echolake_schema::{RunId, SurfaceId};
 use object_store::ObjectStore;
 use object_store::path::Path;
 
@@ -17,6 +17,8 @@ use crate::run_content::RunContent;
 pub struct Inspection {
     /// The run that the file says it is.
     pub run: RunId,
+    /// The surface that it says was measured.
+    pub surface: SurfaceId,
     /// Accepted measurements by pair.
     pub measurements: Vec<Inspected>,
     /// Times of the ambient sensor's readings, ns since 1970, as they came.
@@ -50,6 +52,7 @@ pub async fn inspect(lake: &Lake, store: Arc<dyn ObjectStore>, path: &Path, name
         content.accepted.into_iter().map(|(m, r)| Inspected { pair: m.pair_id, attempt: m.attempt, ir: r.ir });
     Ok(Inspection {
         run: content.manifest.run_id,
+        surface: content.manifest.surface_id,
         measurements: inspected.collect(),
         readings_ns: content.readings.iter().map(|r| r.0).collect(),
         whole,

@@ -146,6 +146,9 @@ impl RunContent {
             whole.append(taken.map_err(|e| Error::read(name, e))?);
         }
         let integrity = reader.finish().await?;
+        if !integrity.damage.is_empty() {
+            vouch(&manifest, name)?;
+        }
         Self::assemble(manifest, envelope, whole, integrity, name)
     }
 
@@ -233,6 +236,26 @@ impl Yield {
         self.damaged.append(&mut other.damaged);
         self.last_time_ns = self.last_time_ns.max(other.last_time_ns);
     }
+}
+
+// A manifest has no CRC of its own. Where something outside of chunks is damaged, the run's name must be that of its
+// file and say the same surface and start, or its measurements could become those of another run.
+fn vouch(manifest: &RunManifest, name: &str) -> Result<()> {
+    let run = manifest.run_id.as_str();
+    let file = name.rsplit(['/', '\\']).next().unwrap_or_default();
+    let stem = file.strip_suffix(".partial").unwrap_or(file).trim_end_matches(".mcap");
+    let begins = format!("{}-{}-", manifest.started.compact(), manifest.surface_id);
+    // Files may have names of their own; one that is as long as the run's was meant to be it.
+    let renamed = stem.len() == run.len() && stem != run;
+    if run.starts_with(&begins) && !renamed {
+        return Ok(());
+    }
+    let reason = format!(
+        "it is damaged, and its manifest may be: it says run `{run}` of `{}`, begun {}, in a file named `{file}`; \
+         hint: if it is right, name the file after the run",
+        manifest.surface_id, manifest.started
+    );
+    Err(Error::read(name, reason))
 }
 
 async fn decode(raw: RawChunk) -> std::result::Result<(u64, Chunk), String> {

@@ -263,9 +263,9 @@ impl RunReader {
 
     fn item(&mut self, code: u8, offset: u64, body: &Bytes) -> Option<Item> {
         match mcap::parse_record(code, body) {
-            // Its CRC was checked.
-            Ok(Record::Attachment { header, data, .. }) => {
-                self.doubtful = None;
+            Ok(Record::Attachment { header, data, crc }) => {
+                // Its CRC was checked, but 0 stands for none: it may be what now stands at its end.
+                self.doubtful = (crc == 0).then_some(offset);
                 Some(Item::Attachment { name: header.name, data: Bytes::copy_from_slice(&data) })
             }
             Ok(Record::Metadata(metadata)) => Some(Item::Metadata(metadata)),

