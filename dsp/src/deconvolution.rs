@@ -1,12 +1,13 @@
 //! Division of the recording by the loopback in the Fourier domain, with a floor outside of the sweep's range.
 
-use std::ops::RangeInclusive;
+use std::ops::{Range, RangeInclusive};
 use std::sync::Arc;
 
 use realfft::num_complex::Complex;
-use realfft::{ComplexToReal, RealFftPlanner, RealToComplex};
+use rustfft::{Fft, FftPlanner};
 
 use crate::error::check_len;
+use crate::pruned::PrunedInverse;
 use crate::{Error, Real};
 
 /// Settings of a deconvolution.
@@ -37,6 +38,11 @@ pub enum TransformLength {
     Fast,
 }
 
+/// Bins that are divided at a time.
+const PIECE: usize = 64;
+/// Sums and minima that a piece is reduced by side by side.
+const LANES: usize = 8;
+
 /// x / s in the Fourier domain (Rust et al. 2021, appendix, step 1).
 ///
 /// recording `[recording_len]`, loopback `[recording_len]`  any unit, the same
@@ -44,21 +50,33 @@ pub enum TransformLength {
 ///
 /// Inside of the sweep's range the division is exact. Outside, the sweep has next to no energy and plain
 /// division would fill the lowest and the highest band with noise, so the divisor has a floor.
+///
+/// Both signals are real, so one complex transform of z = x + i s does for both: with the mirror image
+/// b\[k\] = conj Z\[n - k\], X = (Z + b) / 2 and S = (Z - b) / 2i, and their quotient needs neither of them. It goes
+/// straight to where the inverse transform, of the wanted samples only, reads it.
 pub struct DeconvolutionPlan<T: Real> {
     recording_len: usize,
     output_len: usize,
-    forward: Arc<dyn RealToComplex<T>>,
-    inverse: Arc<dyn ComplexToReal<T>>,
+    len: usize,
+    forward: Arc<dyn Fft<T>>,
+    inverse: PrunedInverse<T>,
     in_range: RangeInclusive<usize>,
     floor: f64,
 }
 
 /// Buffers of a [`DeconvolutionPlan`].
 pub struct DeconvolutionScratch<T> {
-    signal: Vec<T>,
-    recording: Vec<Complex<T>>,
-    loopback: Vec<Complex<T>>,
+    /// `[len + 1]`: the transform of both signals, and its first bin again as the mirror image of itself.
+    joint: Vec<Complex<T>>,
+    /// What the transforms need; between them, the quotient. One buffer, as the cache has no room for two.
     work: Vec<Complex<T>>,
+    sums: Vec<Complex<T>>,
+}
+
+/// Power of the divisor over some bins.
+struct Power {
+    sum: f64,
+    least: f64,
 }
 
 impl<T: Real> DeconvolutionPlan<T> {
@@ -85,12 +103,13 @@ impl<T: Real> DeconvolutionPlan<T> {
             let range = format!("{} to {} Hz at {} Hz", params.low_hz, params.high_hz, params.rate_hz);
             return setting("the sweep's range", range, "one that holds a frequency of the transform");
         }
-        let mut planner = RealFftPlanner::new();
+        let mut planner = FftPlanner::new();
         Ok(Self {
             recording_len: params.recording_len,
             output_len: params.output_len,
+            len: n,
             forward: planner.plan_fft_forward(n),
-            inverse: planner.plan_fft_inverse(n),
+            inverse: PrunedInverse::new(n, params.output_len, &mut planner),
             in_range: first..=last,
             floor: 10f64.powf(params.floor_db / 10.0),
         })
@@ -98,12 +117,12 @@ impl<T: Real> DeconvolutionPlan<T> {
 
     /// Buffers for [`Self::run`]; one a thread.
     pub fn scratch(&self) -> DeconvolutionScratch<T> {
-        let work = self.forward.get_scratch_len().max(self.inverse.get_scratch_len());
+        let work = self.forward.get_inplace_scratch_len();
+        let work = work.max(self.inverse.spectrum_len() + self.inverse.scratch_len());
         DeconvolutionScratch {
-            signal: self.forward.make_input_vec(),
-            recording: self.forward.make_output_vec(),
-            loopback: self.forward.make_output_vec(),
+            joint: vec![Complex::default(); self.len + 1],
             work: vec![Complex::default(); work],
+            sums: self.inverse.sums(),
         }
     }
 
@@ -126,66 +145,119 @@ impl<T: Real> DeconvolutionPlan<T> {
         check_len("the recording", recording.len(), self.recording_len)?;
         check_len("the loopback", loopback.len(), self.recording_len)?;
         check_len("the response", ir.len(), self.output_len)?;
-        let DeconvolutionScratch { signal, recording: x, loopback: s, work } = scratch;
-        self.transform("the recording", recording, signal, x, work)?;
-        self.transform("the loopback", loopback, signal, s, work)?;
-        self.divide(x, s)?;
-        self.inverse.process_with_scratch(x, signal, work).map_err(|_| Error::NotFinite { what: "the response" })?;
-        let kept = ir.len().min(signal.len());
+        let DeconvolutionScratch { joint, work, sums } = scratch;
+        let levels = Levels::of(recording, loopback)?;
+        self.transform(recording, loopback, T::of(levels.gain), joint, work);
+        let (quotient, work) = work.split_at_mut(self.inverse.spectrum_len());
+        self.divide(joint, levels.rounding, quotient)?;
+        let kept = ir.len().min(self.len);
+        let (ir, rest) = ir.split_at_mut(kept);
+        self.inverse.run(quotient, T::of(levels.gain / self.len as f64), ir, sums, work);
+        rest.fill(T::default());
         // Finite samples can still be too large for a spectrum; that spoils every sample of the response.
-        if !signal[..kept].iter().all(|x| x.f64().is_finite()) {
-            return Err(Error::NotFinite { what: "the response" });
+        if ir.iter().all(|x| x.f64().is_finite()) { Ok(()) } else { Err(Error::NotFinite { what: "the response" }) }
+    }
+
+    // Z of x + i gain s.
+    fn transform(&self, x: &[T], s: &[T], gain: T, joint: &mut [Complex<T>], work: &mut [Complex<T>]) {
+        for (z, (x, s)) in joint.iter_mut().zip(x.iter().zip(s)) {
+            *z = Complex::new(*x, *s * gain);
         }
-        let scale = T::of(1.0 / signal.len() as f64);
-        ir[kept..].fill(T::default());
-        ir.iter_mut().zip(&*signal).for_each(|(out, x)| *out = *x * scale);
-        Ok(())
+        joint[self.recording_len..].fill(Complex::default());
+        self.forward.process_with_scratch(&mut joint[..self.len], work);
+        joint[self.len] = joint[0];
     }
 
-    fn transform(
-        &self,
-        what: &'static str,
-        from: &[T],
-        signal: &mut [T],
-        to: &mut [Complex<T>],
-        work: &mut [Complex<T>],
-    ) -> Result<(), Error> {
-        signal[..from.len()].copy_from_slice(from);
-        signal[from.len()..].fill(T::default());
-        self.forward.process_with_scratch(signal, to, work).map_err(|_| Error::NotFinite { what })?;
-        // A sum over the spectrum's first bin would cancel; one value of the signal spoils them all.
-        if to.first().is_some_and(|c| c.re.f64().is_finite()) { Ok(()) } else { Err(Error::NotFinite { what }) }
-    }
-
-    // x becomes x conj(s) / |s|^2.
-    fn divide(&self, x: &mut [Complex<T>], s: &[Complex<T>]) -> Result<(), Error> {
-        let power = |c: &Complex<T>| c.norm_sqr();
-        let inside = &s[self.in_range.clone()];
-        let mean = inside.iter().map(|c| power(c).f64()).sum::<f64>() / inside.len() as f64;
+    // Lays X / S for the inverse transform: first where there is no floor, which is where the floor follows from.
+    fn divide(&self, joint: &[Complex<T>], rounding: f64, quotient: &mut [Complex<T>]) -> Result<(), Error> {
+        let (first, end) = (*self.in_range.start(), *self.in_range.end() + 1);
+        let power = self.divide_bins(first..end, T::default(), joint, quotient);
+        let mean = power.sum / (end - first) as f64;
+        // One sample that is not finite spoils all bins.
         if !mean.is_finite() {
-            return Err(Error::NotFinite { what: "the loopback's power" });
+            return Err(Error::NotFinite { what: "the recording's or the loopback's spectrum" });
         }
         let floor = T::of(mean * self.floor);
-        if !(mean > 0.0 && floor > T::default()) || inside.iter().any(|c| power(c) <= T::default()) {
+        if !(mean > rounding && power.least > 0.0 && floor > T::default()) {
             return Err(Error::NoLoopback);
         }
-        let (first, last) = (*self.in_range.start(), *self.in_range.end());
-        for (k, (x, s)) in x.iter_mut().zip(s).enumerate() {
-            let power = power(s);
-            let raised = if (first..=last).contains(&k) || power > floor { power } else { floor };
-            *x = (*x * s.conj()).unscale(raised);
-        }
-        // The inverse transform asks for real ends, and rounding leaves a trace.
-        if let Some(dc) = x.first_mut() {
-            dc.im = T::default();
-        }
-        if self.forward.len().is_multiple_of(2)
-            && let Some(nyquist) = x.last_mut()
-        {
-            nyquist.im = T::default();
-        }
+        self.divide_bins(0..first, floor, joint, quotient);
+        self.divide_bins(end..self.len / 2 + 1, floor, joint, quotient);
         Ok(())
     }
+
+    // Divides where the divisor's power is raised to `floor`; the power is that before it is raised, times 4.
+    fn divide_bins(&self, bins: Range<usize>, floor: T, joint: &[Complex<T>], quotient: &mut [Complex<T>]) -> Power {
+        let (mut piece, mut powers) = ([Complex::default(); PIECE], [T::default(); PIECE]);
+        let mut total = Power { sum: 0.0, least: f64::INFINITY };
+        for first in bins.clone().step_by(PIECE) {
+            let count = PIECE.min(bins.end - first);
+            let mirrored = &joint[self.len + 1 - first - count..=self.len - first];
+            let pairs = joint[first..first + count].iter().zip(mirrored.iter().rev());
+            for (((z, m), to), power) in pairs.zip(&mut piece).zip(&mut powers) {
+                // With d = Z - b = 2i S and u = Z + b = 2 X, X / S = i u conj(d) / |d|^2.
+                let (u, d) = (Complex::new(z.re + m.re, z.im - m.im), Complex::new(z.re - m.re, z.im + m.im));
+                *power = d.re * d.re + d.im * d.im;
+                let raised = T::of(1.0) / if *power > floor { *power } else { floor };
+                *to = Complex::new((u.re * d.im - u.im * d.re) * raised, (u.re * d.re + u.im * d.im) * raised);
+            }
+            self.inverse.lay(first, &piece[..count], quotient);
+            total.add(&powers[..count]);
+        }
+        total
+    }
+}
+
+impl Power {
+    fn add<T: Real>(&mut self, powers: &[T]) {
+        let Some(first) = powers.first() else { return };
+        let (mut sums, mut least) = ([T::default(); LANES], [*first; LANES]);
+        for lanes in powers.chunks(LANES) {
+            for ((power, sum), least) in lanes.iter().zip(&mut sums).zip(&mut least) {
+                *sum = *sum + *power;
+                *least = if *power < *least { *power } else { *least };
+            }
+        }
+        self.sum += sums.iter().map(|x| x.f64()).sum::<f64>();
+        self.least = least.iter().map(|x| x.f64()).fold(self.least, f64::min);
+    }
+}
+
+/// How loud the two signals are, from an eighth of their samples.
+struct Levels {
+    /// Power of two that brings the loopback to the recording's level: in one transform, the rounding of the louder
+    /// signal is noise in the other.
+    gain: f64,
+    /// Power of a bin that rounding alone may leave.
+    rounding: f64,
+}
+
+impl Levels {
+    fn of<T: Real>(recording: &[T], loopback: &[T]) -> Result<Self, Error> {
+        let (x, s) = (sampled_energy(recording), sampled_energy(loopback));
+        for (what, energy) in [("the recording's energy", x), ("the loopback's energy", s)] {
+            if !energy.is_finite() {
+                return Err(Error::NotFinite { what });
+            }
+        }
+        if loopback.iter().all(|s| *s == T::default()) {
+            return Err(Error::NoLoopback);
+        }
+        let exponent = ((x / s).log2() / 2.0).round();
+        let gain = if exponent.abs() <= 60.0 { exponent.exp2() } else { 1.0 };
+        Ok(Self { gain, rounding: (16.0 * T::epsilon()).powi(2) * (x + gain * gain * s) })
+    }
+}
+
+// Blocks that are long enough to be read at full speed, close enough to each other to miss no sweep.
+fn sampled_energy<T: Real>(signal: &[T]) -> f64 {
+    let mut sums = [T::default(); LANES];
+    for block in signal.chunks(8 * PIECE) {
+        for lanes in block[..block.len().min(PIECE)].chunks_exact(LANES) {
+            sums.iter_mut().zip(lanes).for_each(|(sum, x)| *sum = *sum + *x * *x);
+        }
+    }
+    8.0 * sums.iter().map(|x| x.f64()).sum::<f64>()
 }
 
 /// The least even length without prime factors above 5 that holds `len` samples.

@@ -37,6 +37,7 @@ pub mod geometry;
 #[cfg(test)]
 mod golden;
 pub mod level;
+mod pruned;
 mod real;
 pub mod sweep;
 pub mod temperature;
