@@ -73,10 +73,10 @@ pub struct DeconvolutionScratch<T> {
     sums: Vec<Complex<T>>,
 }
 
-/// Power of the divisor over some bins.
-struct Power {
-    sum: f64,
-    least: f64,
+/// Power of the divisor over some bins, in lanes that the compiler makes vectors of.
+struct Power<T> {
+    sums: [T; LANES],
+    least: [T; LANES],
 }
 
 impl<T: Real> DeconvolutionPlan<T> {
@@ -172,13 +172,13 @@ impl<T: Real> DeconvolutionPlan<T> {
     fn divide(&self, joint: &[Complex<T>], rounding: f64, quotient: &mut [Complex<T>]) -> Result<(), Error> {
         let (first, end) = (*self.in_range.start(), *self.in_range.end() + 1);
         let power = self.divide_bins(first..end, T::default(), joint, quotient);
-        let mean = power.sum / (end - first) as f64;
+        let mean = power.sum() / (end - first) as f64;
         // One sample that is not finite spoils all bins.
         if !mean.is_finite() {
             return Err(Error::NotFinite { what: "the recording's or the loopback's spectrum" });
         }
         let floor = T::of(mean * self.floor);
-        if !(mean > rounding && power.least > 0.0 && floor > T::default()) {
+        if !(mean > rounding && power.least() > 0.0 && floor > T::default()) {
             return Err(Error::NoLoopback);
         }
         self.divide_bins(0..first, floor, joint, quotient);
@@ -187,9 +187,9 @@ impl<T: Real> DeconvolutionPlan<T> {
     }
 
     // Divides where the divisor's power is raised to `floor`; the power is that before it is raised, times 4.
-    fn divide_bins(&self, bins: Range<usize>, floor: T, joint: &[Complex<T>], quotient: &mut [Complex<T>]) -> Power {
+    fn divide_bins(&self, bins: Range<usize>, floor: T, joint: &[Complex<T>], quotient: &mut [Complex<T>]) -> Power<T> {
         let (mut piece, mut powers) = ([Complex::default(); PIECE], [T::default(); PIECE]);
-        let mut total = Power { sum: 0.0, least: f64::INFINITY };
+        let mut total = Power::none();
         for first in bins.clone().step_by(PIECE) {
             let count = PIECE.min(bins.end - first);
             let mirrored = &joint[self.len + 1 - first - count..=self.len - first];
@@ -208,18 +208,35 @@ impl<T: Real> DeconvolutionPlan<T> {
     }
 }
 
-impl Power {
-    fn add<T: Real>(&mut self, powers: &[T]) {
-        let Some(first) = powers.first() else { return };
-        let (mut sums, mut least) = ([T::default(); LANES], [*first; LANES]);
-        for lanes in powers.chunks(LANES) {
-            for ((power, sum), least) in lanes.iter().zip(&mut sums).zip(&mut least) {
-                *sum = *sum + *power;
-                *least = if *power < *least { *power } else { *least };
-            }
+impl<T: Real> Power<T> {
+    fn none() -> Self {
+        Self { sums: [T::default(); LANES], least: [T::max_value(); LANES] }
+    }
+
+    fn add(&mut self, powers: &[T]) {
+        let (whole, rest) = powers.as_chunks();
+        for lanes in whole {
+            self.add_lanes(lanes);
         }
-        self.sum += sums.iter().map(|x| x.f64()).sum::<f64>();
-        self.least = least.iter().map(|x| x.f64()).fold(self.least, f64::min);
+        for power in rest {
+            self.sums[0] = self.sums[0] + *power;
+            self.least[0] = if *power < self.least[0] { *power } else { self.least[0] };
+        }
+    }
+
+    fn add_lanes(&mut self, lanes: &[T; LANES]) {
+        for ((power, sum), least) in lanes.iter().zip(&mut self.sums).zip(&mut self.least) {
+            *sum = *sum + *power;
+            *least = if *power < *least { *power } else { *least };
+        }
+    }
+
+    fn sum(&self) -> f64 {
+        self.sums.iter().map(|x| x.f64()).sum()
+    }
+
+    fn least(&self) -> f64 {
+        self.least.iter().map(|x| x.f64()).fold(f64::INFINITY, f64::min)
     }
 }
 

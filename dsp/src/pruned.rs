@@ -54,23 +54,27 @@ impl<T: Real> PrunedInverse<T> {
     }
 
     /// Lays bins from `first` on, none of them past n / 2, into their strands; all from 0 to n / 2 must be laid.
-    pub(crate) fn lay(&self, first: usize, bins: &[Complex<T>], spectrum: &mut [Complex<T>]) {
-        let (p, row) = (self.strands, self.strand_len + GAP);
-        let (mut q, mut r) = (first / p, first % p);
-        for bin in bins {
-            if 2 * r <= p {
-                spectrum[r * row + q] = *bin;
-            }
-            // Its mirror image n - k is in strand p - r, but for r = 0 in its own.
-            if r == 0 && q > 0 {
-                spectrum[self.strand_len - q] = bin.conj();
-            } else if r > 0 && 2 * r >= p {
-                spectrum[(p - r) * row + self.strand_len - 1 - q] = bin.conj();
-            }
-            r += 1;
-            if r == p {
-                (q, r) = (q + 1, 0);
-            }
+    pub(crate) fn lay(&self, first: usize, mut bins: &[Complex<T>], spectrum: &mut [Complex<T>]) {
+        let (mut q, mut r) = (first / self.strands, first % self.strands);
+        while !bins.is_empty() {
+            let (now, later) = bins.split_at(bins.len().min(self.strands - r));
+            self.lay_across(q, r, now, spectrum);
+            (bins, q, r) = (later, q + 1, 0);
+        }
+    }
+
+    // Bin q of strands r and on; where a strand is not kept, its bin stands for its mirror image, n - k.
+    fn lay_across(&self, q: usize, r: usize, bins: &[Complex<T>], spectrum: &mut [Complex<T>]) {
+        let (p, row, last) = (self.strands, self.strand_len + GAP, self.strand_len - 1);
+        let direct = spectrum.chunks_exact_mut(row).skip(r);
+        direct.zip(bins).for_each(|(strand, bin)| strand[q] = *bin);
+        let skipped = p.div_ceil(2).saturating_sub(r);
+        if let Some(mirrored) = bins.get(skipped..).filter(|bins| !bins.is_empty()) {
+            let images = spectrum[..(p - r - skipped + 1) * row].chunks_exact_mut(row).rev();
+            images.zip(mirrored).for_each(|(strand, bin)| strand[last - q] = bin.conj());
+        }
+        if r == 0 && q > 0 {
+            spectrum[self.strand_len - q] = bins[0].conj();
         }
     }
 
@@ -123,7 +127,8 @@ mod tests {
     #[test]
     fn samples_are_those_of_the_whole_transform() {
         // Odd and even, with an odd and an even number of strands, and with a single one.
-        for (n, output_len) in [(480, 30), (450, 30), (495, 33), (375, 20), (17, 5), (16, 16), (12, 20), (1, 1), (2, 1)] {
+        for (n, output_len) in [(480, 30), (450, 30), (495, 33), (375, 20), (17, 5), (16, 16), (12, 20), (1, 1), (2, 1)]
+        {
             let spectrum = |k: usize| {
                 let edge = k == 0 || 2 * k == n;
                 Complex::new(((k * 37) % 19) as f64 - 9.0, if edge { 0.0 } else { ((k * 53) % 23) as f64 - 11.0 })

@@ -10,6 +10,8 @@ pub trait Real: FftNum + PartialOrd + Default {
     fn f64(self) -> f64;
     /// Distance from 1 to the next sample value.
     fn epsilon() -> f64;
+    /// The largest that is finite.
+    fn max_value() -> Self;
 }
 
 impl Real for f32 {
@@ -24,6 +26,10 @@ impl Real for f32 {
     fn epsilon() -> f64 {
         f64::from(Self::EPSILON)
     }
+
+    fn max_value() -> Self {
+        Self::MAX
+    }
 }
 
 impl Real for f64 {
@@ -37,5 +43,9 @@ impl Real for f64 {
 
     fn epsilon() -> f64 {
         Self::EPSILON
+    }
+
+    fn max_value() -> Self {
+        Self::MAX
     }
 }
