@@ -6,7 +6,9 @@ use std::sync::Arc;
 use realfft::num_complex::Complex;
 use rustfft::{Fft, FftPlanner};
 
+use crate::aligned::Aligned;
 use crate::error::check_len;
+use crate::joint::{Levels, Power};
 use crate::pruned::PrunedInverse;
 use crate::{Error, Real};
 
@@ -40,8 +42,6 @@ pub enum TransformLength {
 
 /// Bins that are divided at a time.
 const PIECE: usize = 64;
-/// Sums and minima that a piece is reduced by side by side.
-const LANES: usize = 8;
 
 /// x / s in the Fourier domain (Rust et al. 2021, appendix, step 1).
 ///
@@ -67,16 +67,10 @@ pub struct DeconvolutionPlan<T: Real> {
 /// Buffers of a [`DeconvolutionPlan`].
 pub struct DeconvolutionScratch<T> {
     /// `[len + 1]`: the transform of both signals, and its first bin again as the mirror image of itself.
-    joint: Vec<Complex<T>>,
+    joint: Aligned<Complex<T>>,
     /// What the transforms need; between them, the quotient. One buffer, as the cache has no room for two.
-    work: Vec<Complex<T>>,
+    work: Aligned<Complex<T>>,
     sums: Vec<Complex<T>>,
-}
-
-/// Power of the divisor over some bins, in lanes that the compiler makes vectors of.
-struct Power<T> {
-    sums: [T; LANES],
-    least: [T; LANES],
 }
 
 impl<T: Real> DeconvolutionPlan<T> {
@@ -119,11 +113,7 @@ impl<T: Real> DeconvolutionPlan<T> {
     pub fn scratch(&self) -> DeconvolutionScratch<T> {
         let work = self.forward.get_inplace_scratch_len();
         let work = work.max(self.inverse.spectrum_len() + self.inverse.scratch_len());
-        DeconvolutionScratch {
-            joint: vec![Complex::default(); self.len + 1],
-            work: vec![Complex::default(); work],
-            sums: self.inverse.sums(),
-        }
+        DeconvolutionScratch { joint: Aligned::new(self.len + 1), work: Aligned::new(work), sums: self.inverse.sums() }
     }
 
     /// Samples of the response that a run gives.
@@ -146,6 +136,7 @@ impl<T: Real> DeconvolutionPlan<T> {
         check_len("the loopback", loopback.len(), self.recording_len)?;
         check_len("the response", ir.len(), self.output_len)?;
         let DeconvolutionScratch { joint, work, sums } = scratch;
+        let (joint, work) = (joint.values(), work.values());
         let levels = Levels::of(recording, loopback)?;
         self.transform(recording, loopback, T::of(levels.gain), joint, work);
         let (quotient, work) = work.split_at_mut(self.inverse.spectrum_len());
@@ -175,7 +166,7 @@ impl<T: Real> DeconvolutionPlan<T> {
         let mean = power.sum() / (end - first) as f64;
         // One sample that is not finite spoils all bins.
         if !mean.is_finite() {
-            return Err(Error::NotFinite { what: "the recording's or the loopback's spectrum" });
+            return Err(Error::NotFinite { what: "the recording or the loopback" });
         }
         let floor = T::of(mean * self.floor);
         if !(mean > rounding && power.least() > 0.0 && floor > T::default()) {
@@ -206,75 +197,6 @@ impl<T: Real> DeconvolutionPlan<T> {
         }
         total
     }
-}
-
-impl<T: Real> Power<T> {
-    fn none() -> Self {
-        Self { sums: [T::default(); LANES], least: [T::max_value(); LANES] }
-    }
-
-    fn add(&mut self, powers: &[T]) {
-        let (whole, rest) = powers.as_chunks();
-        for lanes in whole {
-            self.add_lanes(lanes);
-        }
-        for power in rest {
-            self.sums[0] = self.sums[0] + *power;
-            self.least[0] = if *power < self.least[0] { *power } else { self.least[0] };
-        }
-    }
-
-    fn add_lanes(&mut self, lanes: &[T; LANES]) {
-        for ((power, sum), least) in lanes.iter().zip(&mut self.sums).zip(&mut self.least) {
-            *sum = *sum + *power;
-            *least = if *power < *least { *power } else { *least };
-        }
-    }
-
-    fn sum(&self) -> f64 {
-        self.sums.iter().map(|x| x.f64()).sum()
-    }
-
-    fn least(&self) -> f64 {
-        self.least.iter().map(|x| x.f64()).fold(f64::INFINITY, f64::min)
-    }
-}
-
-/// How loud the two signals are, from an eighth of their samples.
-struct Levels {
-    /// Power of two that brings the loopback to the recording's level: in one transform, the rounding of the louder
-    /// signal is noise in the other.
-    gain: f64,
-    /// Power of a bin that rounding alone may leave.
-    rounding: f64,
-}
-
-impl Levels {
-    fn of<T: Real>(recording: &[T], loopback: &[T]) -> Result<Self, Error> {
-        let (x, s) = (sampled_energy(recording), sampled_energy(loopback));
-        for (what, energy) in [("the recording's energy", x), ("the loopback's energy", s)] {
-            if !energy.is_finite() {
-                return Err(Error::NotFinite { what });
-            }
-        }
-        if loopback.iter().all(|s| *s == T::default()) {
-            return Err(Error::NoLoopback);
-        }
-        let exponent = ((x / s).log2() / 2.0).round();
-        let gain = if exponent.abs() <= 60.0 { exponent.exp2() } else { 1.0 };
-        Ok(Self { gain, rounding: (16.0 * T::epsilon()).powi(2) * (x + gain * gain * s) })
-    }
-}
-
-// Blocks that are long enough to be read at full speed, close enough to each other to miss no sweep.
-fn sampled_energy<T: Real>(signal: &[T]) -> f64 {
-    let mut sums = [T::default(); LANES];
-    for block in signal.chunks(8 * PIECE) {
-        for lanes in block[..block.len().min(PIECE)].chunks_exact(LANES) {
-            sums.iter_mut().zip(lanes).for_each(|(sum, x)| *sum = *sum + *x * *x);
-        }
-    }
-    8.0 * sums.iter().map(|x| x.f64()).sum::<f64>()
 }
 
 /// The least even length without prime factors above 5 that holds `len` samples.
@@ -354,6 +276,59 @@ mod tests {
             DeconvolutionParams { floor_db: f64::NEG_INFINITY, ..good },
         ] {
             assert!(matches!(DeconvolutionPlan::<f32>::new(bad), Err(Error::Setting { .. })), "{bad:?}");
+        }
+    }
+
+    // Odd and even lengths, with few samples wanted of many and with all: a delay comes out as one sample.
+    #[test]
+    fn a_delayed_recording_is_a_single_sample() {
+        for (len, output_len) in [(99, 99), (99, 11), (100, 100), (100, 10), (487, 10), (500, 10), (2, 1), (3, 3)] {
+            let plan = DeconvolutionPlan::<f64>::new(DeconvolutionParams {
+                recording_len: len,
+                output_len,
+                rate_hz: 96e3,
+                low_hz: 0.0,
+                high_hz: 48e3,
+                floor_db: -60.0,
+                length: TransformLength::Exact,
+            })
+            .expect("a plan");
+            let delay = 7 % output_len;
+            let loopback: Vec<f64> = (0..len).map(|i| f64::from((i as u32 * 7919) % 101) - 33.0).collect();
+            let recording: Vec<f64> = (0..len).map(|i| 0.5 * loopback[(i + len - delay) % len]).collect();
+            let mut ir = vec![f64::NAN; output_len];
+            plan.run(&recording, &loopback, &mut ir, &mut plan.scratch()).expect("a response");
+            for (n, x) in ir.iter().enumerate() {
+                let expected = if n == delay { 0.5 } else { 0.0 };
+                assert!((x - expected).abs() < 1e-10, "{len}, {output_len}: sample {n} is {x}");
+            }
+        }
+    }
+
+    // Both channels share a transform; the faint one must not drown in the rounding of the loud one.
+    #[test]
+    fn faint_channels_keep_their_precision() {
+        let plan = DeconvolutionPlan::<f32>::new(DeconvolutionParams {
+            recording_len: 4_096,
+            output_len: 100,
+            rate_hz: 96e3,
+            low_hz: 2e3,
+            high_hz: 40e3,
+            floor_db: -60.0,
+            length: TransformLength::Fast,
+        })
+        .expect("a plan");
+        let loopback: Vec<f32> = (0..4_096u32).map(|i| ((i * 7919) % 1013) as f32 - 506.0).collect();
+        let run = |gain: f32| {
+            let recording: Vec<f32> = (0..4_096).map(|i| if i < 9 { 0.0 } else { gain * loopback[i - 9] }).collect();
+            let mut ir = vec![f32::NAN; 100];
+            plan.run(&recording, &loopback, &mut ir, &mut plan.scratch()).expect("a response");
+            ir.iter().map(|x| f64::from(x / gain)).collect::<Vec<_>>()
+        };
+        let even = run(1.0);
+        for gain in [1e-6, 1e-3, 1e4] {
+            let worst = run(gain).iter().zip(&even).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
+            assert!(worst < 1e-5, "{gain}: {worst}");
         }
     }
 

@@ -26,6 +26,7 @@
 //! # Ok::<(), echolake_dsp::Error>(())
 //! ```
 
+mod aligned;
 pub mod chain;
 pub mod deconvolution;
 pub mod energy;
@@ -36,6 +37,7 @@ pub mod fresnel;
 pub mod geometry;
 #[cfg(test)]
 mod golden;
+mod joint;
 pub mod level;
 mod pruned;
 mod real;
