@@ -7,7 +7,7 @@ use rustfft::{Fft, FftPlanner};
 
 use crate::Real;
 
-/// Room behind each strand: rows of a multiple of 4 KiB would all fall into the same few lines of the cache.
+/// Room behind each strand: rows of whole KiB would all fall into the same few lines of the cache.
 const GAP: usize = 8;
 
 /// x\[m\] = sum_k X\[k\] e^(2 pi i k m / n) for the first m only, X the spectrum of a real signal.
