@@ -1,7 +1,7 @@
 //! The kernels in their order, planned once: recording to response, and response to curves and energies.
 
 use crate::deconvolution::{DeconvolutionParams, DeconvolutionPlan, DeconvolutionScratch, TransformLength};
-use crate::energy::{cumulate, energy, tnce_over_band};
+use crate::energy::{accumulate, energy, tnce_over_band};
 use crate::error::check_len;
 use crate::filter_bank::{FilterBankPlan, FilterBankScratch};
 use crate::foam::subtract;
@@ -128,6 +128,15 @@ pub struct Derived<T> {
     pub tnce_over_band: Vec<f64>,
 }
 
+/// What Flat's response of a pair lends to all responses of that pair.
+#[derive(Debug, Clone, PartialEq)]
+pub struct FlatEnergies {
+    /// Energy of the whole response.
+    pub total: f64,
+    /// `[bands]`: energy in each band.
+    pub bands: Vec<f64>,
+}
+
 /// Response to reflected response, curves and energies.
 pub struct DerivationPlan<T: Real> {
     bank: FilterBankPlan<T>,
@@ -137,7 +146,7 @@ pub struct DerivationPlan<T: Real> {
 pub struct DerivationScratch<T> {
     bank: FilterBankScratch<T>,
     bands: Vec<T>,
-    flat: Vec<f64>,
+    flat: FlatEnergies,
 }
 
 impl<T: Real> DerivationPlan<T> {
@@ -152,7 +161,11 @@ impl<T: Real> DerivationPlan<T> {
     /// Buffers for [`Self::run`]; one a thread.
     pub fn scratch(&self) -> DerivationScratch<T> {
         let (bands, len) = (self.bank.bands(), self.bank.len());
-        DerivationScratch { bank: self.bank.scratch(), bands: vec![T::default(); bands * len], flat: vec![0.0; bands] }
+        DerivationScratch {
+            bank: self.bank.scratch(),
+            bands: vec![T::default(); bands * len],
+            flat: FlatEnergies { total: 0.0, bands: vec![0.0; bands] },
+        }
     }
 
     /// A place for results, which runs fill again and again.
@@ -168,6 +181,16 @@ impl<T: Real> DerivationPlan<T> {
         }
     }
 
+    /// What [`Self::run_over`] needs of a pair's Flat, Foam subtracted already: once a pair, as every response of
+    /// that pair is put over the same.
+    ///
+    /// # Errors
+    /// [`Error::Length`] or [`Error::NotFinite`].
+    pub fn flat_energies(&self, flat: &[T], scratch: &mut DerivationScratch<T>) -> Result<FlatEnergies, Error> {
+        self.measure_flat(flat, scratch)?;
+        Ok(scratch.flat.clone())
+    }
+
     /// Derives; `flat` has Foam subtracted already, all three are of the same pair.
     ///
     /// # Errors
@@ -180,20 +203,59 @@ impl<T: Real> DerivationPlan<T> {
         derived: &mut Derived<T>,
         scratch: &mut DerivationScratch<T>,
     ) -> Result<(), Error> {
-        for (what, signal) in [("the response", ir), ("Foam's response", foam), ("Flat's response", flat)] {
-            check_len(what, signal.len(), self.bank.len())?;
-        }
-        subtract(ir, foam, &mut derived.reflected);
-        self.bank.run(&derived.reflected, &mut scratch.bands, &mut scratch.bank)?;
-        let flat_total = energy(flat);
-        cumulate(&scratch.bands, self.bank.len(), flat_total, &mut derived.curves, &mut derived.tnce);
-        derived.total = derived.tnce.iter().sum();
-        self.bank.energies(flat, &mut scratch.flat, &mut scratch.bank)?;
-        let bands = scratch.bands.chunks_exact(self.bank.len());
-        derived.energies.iter_mut().zip(bands).for_each(|(out, band)| *out = energy(band));
-        tnce_over_band(&derived.energies, &scratch.flat, &mut derived.tnce_over_band);
+        self.measure_flat(flat, scratch)?;
+        self.filter(ir, foam, derived, scratch)?;
+        put_over(&scratch.flat, &scratch.bands, derived);
         Ok(())
     }
+
+    /// Derives as [`Self::run`] does, over energies of Flat that are known already.
+    ///
+    /// # Errors
+    /// [`Error::Length`] or [`Error::NotFinite`].
+    pub fn run_over(
+        &self,
+        ir: &[T],
+        foam: &[T],
+        flat: &FlatEnergies,
+        derived: &mut Derived<T>,
+        scratch: &mut DerivationScratch<T>,
+    ) -> Result<(), Error> {
+        check_len("Flat's energies", flat.bands.len(), self.bank.bands())?;
+        self.filter(ir, foam, derived, scratch)?;
+        put_over(flat, &scratch.bands, derived);
+        Ok(())
+    }
+
+    fn measure_flat(&self, flat: &[T], scratch: &mut DerivationScratch<T>) -> Result<(), Error> {
+        check_len("Flat's response", flat.len(), self.bank.len())?;
+        scratch.flat.total = energy(flat);
+        self.bank.energies(flat, &mut scratch.flat.bands, &mut scratch.bank)
+    }
+
+    fn filter(
+        &self,
+        ir: &[T],
+        foam: &[T],
+        derived: &mut Derived<T>,
+        scratch: &mut DerivationScratch<T>,
+    ) -> Result<(), Error> {
+        check_len("the response", ir.len(), self.bank.len())?;
+        check_len("Foam's response", foam.len(), self.bank.len())?;
+        subtract(ir, foam, &mut derived.reflected);
+        self.bank.run(&derived.reflected, &mut scratch.bands, &mut scratch.bank)
+    }
+}
+
+fn put_over<T: Real>(flat: &FlatEnergies, bands: &[T], derived: &mut Derived<T>) {
+    let (len, factor) = (derived.reflected.len(), flat.total.recip());
+    let curves = bands.chunks_exact(len).zip(derived.curves.chunks_exact_mut(len));
+    for ((band, curve), energy) in curves.zip(&mut derived.energies) {
+        *energy = accumulate(band, factor, curve);
+    }
+    derived.tnce.iter_mut().zip(&derived.energies).for_each(|(tnce, energy)| *tnce = energy * factor);
+    derived.total = derived.tnce.iter().sum();
+    tnce_over_band(&derived.energies, &flat.bands, &mut derived.tnce_over_band);
 }
 
 #[cfg(test)]
@@ -243,6 +305,23 @@ mod tests {
             assert!((derived.total - 1.0).abs() < 1e-5, "{len}: {}", derived.total);
             assert!(derived.tnce_over_band.iter().all(|x| (x - 1.0).abs() < 1e-5), "{:?}", derived.tnce_over_band);
         }
+    }
+
+    #[test]
+    fn energies_of_flat_serve_every_response_of_a_pair() {
+        let plan = DerivationPlan::<f32>::new(384, 96e3, &[2_500.0, 5e3, 10e3, 20e3, 40e3]).expect("a plan");
+        let noise: Vec<f32> = noise().iter().map(|x| *x as f32).collect();
+        let (mut scratch, foam, flat) = (plan.scratch(), &noise[..384], &noise[384..768]);
+        let energies = plan.flat_energies(flat, &mut scratch).expect("energies");
+        for ir in [&noise[100..484], &noise[500..884]] {
+            let (mut once, mut again) = (plan.derived(), plan.derived());
+            plan.run(ir, foam, flat, &mut once, &mut plan.scratch()).expect("derived");
+            plan.run_over(ir, foam, &energies, &mut again, &mut scratch).expect("derived");
+            assert_eq!(once, again);
+        }
+        let short = FlatEnergies { bands: vec![1.0; 4], ..energies };
+        let result = plan.run_over(flat, foam, &short, &mut plan.derived(), &mut scratch);
+        assert!(matches!(result, Err(Error::Length { .. })), "{result:?}");
     }
 
     #[test]

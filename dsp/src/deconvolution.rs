@@ -1,12 +1,15 @@
 //! Division of the recording by the loopback in the Fourier domain, with a floor outside of the sweep's range.
 
-use std::ops::RangeInclusive;
+use std::ops::{Range, RangeInclusive};
 use std::sync::Arc;
 
 use realfft::num_complex::Complex;
-use realfft::{ComplexToReal, RealFftPlanner, RealToComplex};
+use rustfft::{Fft, FftPlanner};
 
+use crate::aligned::Aligned;
 use crate::error::check_len;
+use crate::joint::{Levels, Power};
+use crate::pruned::PrunedInverse;
 use crate::{Error, Real};
 
 /// Settings of a deconvolution.
@@ -37,6 +40,9 @@ pub enum TransformLength {
     Fast,
 }
 
+/// Bins that are divided at a time.
+const PIECE: usize = 64;
+
 /// x / s in the Fourier domain (Rust et al. 2021, appendix, step 1).
 ///
 /// recording `[recording_len]`, loopback `[recording_len]`  any unit, the same
@@ -44,21 +50,27 @@ pub enum TransformLength {
 ///
 /// Inside of the sweep's range the division is exact. Outside, the sweep has next to no energy and plain
 /// division would fill the lowest and the highest band with noise, so the divisor has a floor.
+///
+/// Both signals are real, so one complex transform of z = x + i s does for both: with the mirror image
+/// b\[k\] = conj Z\[n - k\], X = (Z + b) / 2 and S = (Z - b) / 2i, and their quotient needs neither of them. It goes
+/// straight to where the inverse transform, of the wanted samples only, reads it.
 pub struct DeconvolutionPlan<T: Real> {
     recording_len: usize,
     output_len: usize,
-    forward: Arc<dyn RealToComplex<T>>,
-    inverse: Arc<dyn ComplexToReal<T>>,
+    len: usize,
+    forward: Arc<dyn Fft<T>>,
+    inverse: PrunedInverse<T>,
     in_range: RangeInclusive<usize>,
     floor: f64,
 }
 
 /// Buffers of a [`DeconvolutionPlan`].
 pub struct DeconvolutionScratch<T> {
-    signal: Vec<T>,
-    recording: Vec<Complex<T>>,
-    loopback: Vec<Complex<T>>,
-    work: Vec<Complex<T>>,
+    /// `[len + 1]`: the transform of both signals, and its first bin again as the mirror image of itself.
+    joint: Aligned<Complex<T>>,
+    /// What the transforms need; between them, the quotient. One buffer, as the cache has no room for two.
+    work: Aligned<Complex<T>>,
+    sums: Vec<Complex<T>>,
 }
 
 impl<T: Real> DeconvolutionPlan<T> {
@@ -85,12 +97,13 @@ impl<T: Real> DeconvolutionPlan<T> {
             let range = format!("{} to {} Hz at {} Hz", params.low_hz, params.high_hz, params.rate_hz);
             return setting("the sweep's range", range, "one that holds a frequency of the transform");
         }
-        let mut planner = RealFftPlanner::new();
+        let mut planner = FftPlanner::new();
         Ok(Self {
             recording_len: params.recording_len,
             output_len: params.output_len,
+            len: n,
             forward: planner.plan_fft_forward(n),
-            inverse: planner.plan_fft_inverse(n),
+            inverse: PrunedInverse::new(n, params.output_len, &mut planner),
             in_range: first..=last,
             floor: 10f64.powf(params.floor_db / 10.0),
         })
@@ -98,13 +111,9 @@ impl<T: Real> DeconvolutionPlan<T> {
 
     /// Buffers for [`Self::run`]; one a thread.
     pub fn scratch(&self) -> DeconvolutionScratch<T> {
-        let work = self.forward.get_scratch_len().max(self.inverse.get_scratch_len());
-        DeconvolutionScratch {
-            signal: self.forward.make_input_vec(),
-            recording: self.forward.make_output_vec(),
-            loopback: self.forward.make_output_vec(),
-            work: vec![Complex::default(); work],
-        }
+        let work = self.forward.get_inplace_scratch_len();
+        let work = work.max(self.inverse.spectrum_len() + self.inverse.scratch_len());
+        DeconvolutionScratch { joint: Aligned::new(self.len + 1), work: Aligned::new(work), sums: self.inverse.sums() }
     }
 
     /// Samples of the response that a run gives.
@@ -126,65 +135,67 @@ impl<T: Real> DeconvolutionPlan<T> {
         check_len("the recording", recording.len(), self.recording_len)?;
         check_len("the loopback", loopback.len(), self.recording_len)?;
         check_len("the response", ir.len(), self.output_len)?;
-        let DeconvolutionScratch { signal, recording: x, loopback: s, work } = scratch;
-        self.transform("the recording", recording, signal, x, work)?;
-        self.transform("the loopback", loopback, signal, s, work)?;
-        self.divide(x, s)?;
-        self.inverse.process_with_scratch(x, signal, work).map_err(|_| Error::NotFinite { what: "the response" })?;
-        let kept = ir.len().min(signal.len());
+        let DeconvolutionScratch { joint, work, sums } = scratch;
+        let (joint, work) = (joint.values(), work.values());
+        let levels = Levels::of(recording, loopback)?;
+        self.transform(recording, loopback, T::of(levels.gain), joint, work);
+        let (quotient, work) = work.split_at_mut(self.inverse.spectrum_len());
+        self.divide(joint, levels.rounding, quotient)?;
+        let kept = ir.len().min(self.len);
+        let (ir, rest) = ir.split_at_mut(kept);
+        self.inverse.run(quotient, T::of(levels.gain / self.len as f64), ir, sums, work);
+        rest.fill(T::default());
         // Finite samples can still be too large for a spectrum; that spoils every sample of the response.
-        if !signal[..kept].iter().all(|x| x.f64().is_finite()) {
-            return Err(Error::NotFinite { what: "the response" });
+        if ir.iter().all(|x| x.f64().is_finite()) { Ok(()) } else { Err(Error::NotFinite { what: "the response" }) }
+    }
+
+    // Z of x + i gain s.
+    fn transform(&self, x: &[T], s: &[T], gain: T, joint: &mut [Complex<T>], work: &mut [Complex<T>]) {
+        for (z, (x, s)) in joint.iter_mut().zip(x.iter().zip(s)) {
+            *z = Complex::new(*x, *s * gain);
         }
-        let scale = T::of(1.0 / signal.len() as f64);
-        ir[kept..].fill(T::default());
-        ir.iter_mut().zip(&*signal).for_each(|(out, x)| *out = *x * scale);
-        Ok(())
+        joint[self.recording_len..].fill(Complex::default());
+        self.forward.process_with_scratch(&mut joint[..self.len], work);
+        joint[self.len] = joint[0];
     }
 
-    fn transform(
-        &self,
-        what: &'static str,
-        from: &[T],
-        signal: &mut [T],
-        to: &mut [Complex<T>],
-        work: &mut [Complex<T>],
-    ) -> Result<(), Error> {
-        signal[..from.len()].copy_from_slice(from);
-        signal[from.len()..].fill(T::default());
-        self.forward.process_with_scratch(signal, to, work).map_err(|_| Error::NotFinite { what })?;
-        // A sum over the spectrum's first bin would cancel; one value of the signal spoils them all.
-        if to.first().is_some_and(|c| c.re.f64().is_finite()) { Ok(()) } else { Err(Error::NotFinite { what }) }
-    }
-
-    // x becomes x conj(s) / |s|^2.
-    fn divide(&self, x: &mut [Complex<T>], s: &[Complex<T>]) -> Result<(), Error> {
-        let power = |c: &Complex<T>| c.norm_sqr();
-        let inside = &s[self.in_range.clone()];
-        let mean = inside.iter().map(|c| power(c).f64()).sum::<f64>() / inside.len() as f64;
+    // Lays X / S for the inverse transform: first where there is no floor, which is where the floor follows from.
+    fn divide(&self, joint: &[Complex<T>], rounding: f64, quotient: &mut [Complex<T>]) -> Result<(), Error> {
+        let (first, end) = (*self.in_range.start(), *self.in_range.end() + 1);
+        let power = self.divide_bins(first..end, T::default(), joint, quotient);
+        let mean = power.sum() / (end - first) as f64;
+        // One sample that is not finite spoils all bins.
         if !mean.is_finite() {
-            return Err(Error::NotFinite { what: "the loopback's power" });
+            return Err(Error::NotFinite { what: "the recording or the loopback" });
         }
         let floor = T::of(mean * self.floor);
-        if !(mean > 0.0 && floor > T::default()) || inside.iter().any(|c| power(c) <= T::default()) {
+        if !(mean > rounding && power.least() > 0.0 && floor > T::default()) {
             return Err(Error::NoLoopback);
         }
-        let (first, last) = (*self.in_range.start(), *self.in_range.end());
-        for (k, (x, s)) in x.iter_mut().zip(s).enumerate() {
-            let power = power(s);
-            let raised = if (first..=last).contains(&k) || power > floor { power } else { floor };
-            *x = (*x * s.conj()).unscale(raised);
-        }
-        // The inverse transform asks for real ends, and rounding leaves a trace.
-        if let Some(dc) = x.first_mut() {
-            dc.im = T::default();
-        }
-        if self.forward.len().is_multiple_of(2)
-            && let Some(nyquist) = x.last_mut()
-        {
-            nyquist.im = T::default();
-        }
+        self.divide_bins(0..first, floor, joint, quotient);
+        self.divide_bins(end..self.len / 2 + 1, floor, joint, quotient);
         Ok(())
+    }
+
+    // Divides where the divisor's power is raised to `floor`; the power is that before it is raised, times 4.
+    fn divide_bins(&self, bins: Range<usize>, floor: T, joint: &[Complex<T>], quotient: &mut [Complex<T>]) -> Power<T> {
+        let (mut piece, mut powers) = ([Complex::default(); PIECE], [T::default(); PIECE]);
+        let mut total = Power::none();
+        for first in bins.clone().step_by(PIECE) {
+            let count = PIECE.min(bins.end - first);
+            let mirrored = &joint[self.len + 1 - first - count..=self.len - first];
+            let pairs = joint[first..first + count].iter().zip(mirrored.iter().rev());
+            for (((z, m), to), power) in pairs.zip(&mut piece).zip(&mut powers) {
+                // With d = Z - b = 2i S and u = Z + b = 2 X, X / S = i u conj(d) / |d|^2.
+                let (u, d) = (Complex::new(z.re + m.re, z.im - m.im), Complex::new(z.re - m.re, z.im + m.im));
+                *power = d.re * d.re + d.im * d.im;
+                let raised = T::of(1.0) / if *power > floor { *power } else { floor };
+                *to = Complex::new((u.re * d.im - u.im * d.re) * raised, (u.re * d.re + u.im * d.im) * raised);
+            }
+            self.inverse.lay(first, &piece[..count], quotient);
+            total.add(&powers[..count]);
+        }
+        total
     }
 }
 
@@ -265,6 +276,59 @@ mod tests {
             DeconvolutionParams { floor_db: f64::NEG_INFINITY, ..good },
         ] {
             assert!(matches!(DeconvolutionPlan::<f32>::new(bad), Err(Error::Setting { .. })), "{bad:?}");
+        }
+    }
+
+    // Odd and even lengths, with few samples wanted of many and with all: a delay comes out as one sample.
+    #[test]
+    fn a_delayed_recording_is_a_single_sample() {
+        for (len, output_len) in [(99, 99), (99, 11), (100, 100), (100, 10), (487, 10), (500, 10), (2, 1), (3, 3)] {
+            let plan = DeconvolutionPlan::<f64>::new(DeconvolutionParams {
+                recording_len: len,
+                output_len,
+                rate_hz: 96e3,
+                low_hz: 0.0,
+                high_hz: 48e3,
+                floor_db: -60.0,
+                length: TransformLength::Exact,
+            })
+            .expect("a plan");
+            let delay = 7 % output_len;
+            let loopback: Vec<f64> = (0..len).map(|i| f64::from((i as u32 * 7919) % 101) - 33.0).collect();
+            let recording: Vec<f64> = (0..len).map(|i| 0.5 * loopback[(i + len - delay) % len]).collect();
+            let mut ir = vec![f64::NAN; output_len];
+            plan.run(&recording, &loopback, &mut ir, &mut plan.scratch()).expect("a response");
+            for (n, x) in ir.iter().enumerate() {
+                let expected = if n == delay { 0.5 } else { 0.0 };
+                assert!((x - expected).abs() < 1e-10, "{len}, {output_len}: sample {n} is {x}");
+            }
+        }
+    }
+
+    // Both channels share a transform; the faint one must not drown in the rounding of the loud one.
+    #[test]
+    fn faint_channels_keep_their_precision() {
+        let plan = DeconvolutionPlan::<f32>::new(DeconvolutionParams {
+            recording_len: 4_096,
+            output_len: 100,
+            rate_hz: 96e3,
+            low_hz: 2e3,
+            high_hz: 40e3,
+            floor_db: -60.0,
+            length: TransformLength::Fast,
+        })
+        .expect("a plan");
+        let loopback: Vec<f32> = (0..4_096u32).map(|i| ((i * 7919) % 1013) as f32 - 506.0).collect();
+        let run = |gain: f32| {
+            let recording: Vec<f32> = (0..4_096).map(|i| if i < 9 { 0.0 } else { gain * loopback[i - 9] }).collect();
+            let mut ir = vec![f32::NAN; 100];
+            plan.run(&recording, &loopback, &mut ir, &mut plan.scratch()).expect("a response");
+            ir.iter().map(|x| f64::from(x / gain)).collect::<Vec<_>>()
+        };
+        let even = run(1.0);
+        for gain in [1e-6, 1e-3, 1e4] {
+            let worst = run(gain).iter().zip(&even).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
+            assert!(worst < 1e-5, "{gain}: {worst}");
         }
     }
 

@@ -21,7 +21,7 @@ pub fn rms<T: Real>(x: &[T]) -> f64 {
 pub fn cumulate<T: Real>(bands: &[T], len: usize, scale: f64, curves: &mut [T], last: &mut [f64]) {
     let len = len.max(1);
     for ((band, curve), last) in bands.chunks_exact(len).zip(curves.chunks_exact_mut(len)).zip(last) {
-        *last = accumulate(band, scale, curve);
+        *last = accumulate(band, scale.recip(), curve) * scale.recip();
     }
 }
 
@@ -62,13 +62,34 @@ pub fn tnce_over_band(energies: &[f64], flat_energies: &[f64], out: &mut [f64]) 
     out.iter_mut().zip(energies.iter().zip(flat_energies)).for_each(|(out, (energy, flat))| *out = energy / flat);
 }
 
-fn accumulate<T: Real>(band: &[T], scale: f64, curve: &mut [T]) -> f64 {
-    let mut sum = 0.0;
-    for (x, c) in band.iter().zip(curve) {
-        sum += x.f64() * x.f64();
-        *c = T::of(sum / scale);
+/// Samples that are summed up side by side.
+const BLOCK: usize = 8;
+
+/// Running sum of squares times `factor`; returns the sum itself.
+///
+/// Within a block the sums come from doubling (to each, the one 1, 2 and 4 before it), which leaves one dependent
+/// addition a block instead of one a sample.
+pub(crate) fn accumulate<T: Real>(band: &[T], factor: f64, curve: &mut [T]) -> f64 {
+    let (mut sum, (blocks, rest)) = (0.0, band.as_chunks::<BLOCK>());
+    let (curve_blocks, curve_rest) = curve.as_chunks_mut::<BLOCK>();
+    for (block, out) in blocks.iter().zip(curve_blocks) {
+        let mut sums = block.map(|x| x.f64() * x.f64());
+        for distance in [1, 2, 4] {
+            let before = sums;
+            for i in distance..BLOCK {
+                sums[i] = before[i] + before[i - distance];
+            }
+        }
+        for (out, within) in out.iter_mut().zip(&sums) {
+            *out = T::of((sum + within) * factor);
+        }
+        sum += sums[BLOCK - 1];
     }
-    sum / scale
+    for (x, out) in rest.iter().zip(curve_rest) {
+        sum += x.f64() * x.f64();
+        *out = T::of(sum * factor);
+    }
+    sum
 }
 
 #[cfg(test)]

@@ -1,10 +1,12 @@
 //! The octave-warped itersine filter bank: zero phase, circular, its gains' squares sum to 1.
 
 use std::f64::consts::PI;
+use std::ops::Range;
 use std::sync::Arc;
 
 use realfft::num_complex::Complex;
-use realfft::{ComplexToReal, RealFftPlanner, RealToComplex};
+use realfft::{RealFftPlanner, RealToComplex};
+use rustfft::{Fft, FftPlanner};
 
 use crate::error::check_len;
 use crate::{Error, Real};
@@ -31,21 +33,33 @@ pub fn gain(centres_hz: &[f64], band: usize, frequency_hz: f64) -> f64 {
 /// ir    `[len]`
 /// bands `[centres x len]`, band after band
 ///
+/// Band signals are real, so one complex inverse transform does for two, a + i b, with gains a + i b for its bins.
+///
 /// Source: Rust et al. 2021; Wesfreid and Wickerhauser 1993 for the window.
 pub struct FilterBankPlan<T: Real> {
     len: usize,
     bands: usize,
     /// `[bands x (len/2 + 1)]`.
     gains: Vec<T>,
+    couples: Vec<Couple<T>>,
     forward: Arc<dyn RealToComplex<T>>,
-    inverse: Arc<dyn ComplexToReal<T>>,
+    inverse: Arc<dyn Fft<T>>,
+}
+
+/// Two bands that are transformed as one; the second is empty where the number of bands is odd.
+struct Couple<T> {
+    /// Where one of them has a gain, up to half of the rate.
+    bins: Range<usize>,
+    /// `[bins]`: first + i second, over the number of samples.
+    gains: Vec<Complex<T>>,
 }
 
 /// Buffers of a [`FilterBankPlan`].
 pub struct FilterBankScratch<T> {
     signal: Vec<T>,
     spectrum: Vec<Complex<T>>,
-    band: Vec<Complex<T>>,
+    /// `[couples x len]`.
+    coupled: Vec<Complex<T>>,
     work: Vec<Complex<T>>,
 }
 
@@ -69,13 +83,21 @@ impl<T: Real> FilterBankPlan<T> {
         }
         let frequency = |k: usize| k as f64 * rate_hz / len as f64;
         let gains = |band| (0..len / 2 + 1).map(move |k| T::of(gain(centres_hz, band, frequency(k))));
-        let mut planner = RealFftPlanner::new();
+        let bands: Vec<usize> = (0..centres_hz.len()).collect();
+        let couple = |bands: &[usize]| {
+            let scaled = |band: Option<&usize>, k| {
+                T::of(band.map_or(0.0, |band| gain(centres_hz, *band, frequency(k)) / len as f64))
+            };
+            let at = |k: usize| Complex::new(scaled(bands.first(), k), scaled(bands.get(1), k));
+            Couple::new((0..len / 2 + 1).map(at).collect())
+        };
         Ok(Self {
             len,
-            bands: centres_hz.len(),
-            gains: (0..centres_hz.len()).flat_map(gains).collect(),
-            forward: planner.plan_fft_forward(len),
-            inverse: planner.plan_fft_inverse(len),
+            bands: bands.len(),
+            gains: bands.iter().copied().flat_map(gains).collect(),
+            couples: bands.chunks(2).map(couple).collect(),
+            forward: RealFftPlanner::new().plan_fft_forward(len),
+            inverse: FftPlanner::new().plan_fft_inverse(len),
         })
     }
 
@@ -92,11 +114,11 @@ impl<T: Real> FilterBankPlan<T> {
 
     /// Buffers for [`Self::run`]; one a thread.
     pub fn scratch(&self) -> FilterBankScratch<T> {
-        let work = self.forward.get_scratch_len().max(self.inverse.get_scratch_len());
+        let work = self.forward.get_scratch_len().max(self.inverse.get_inplace_scratch_len());
         FilterBankScratch {
             signal: self.forward.make_input_vec(),
             spectrum: self.forward.make_output_vec(),
-            band: self.forward.make_output_vec(),
+            coupled: vec![Complex::default(); self.couples.len() * self.len],
             work: vec![Complex::default(); work],
         }
     }
@@ -108,13 +130,15 @@ impl<T: Real> FilterBankPlan<T> {
     pub fn run(&self, ir: &[T], bands: &mut [T], scratch: &mut FilterBankScratch<T>) -> Result<(), Error> {
         check_len("the bands", bands.len(), self.bands * self.len)?;
         self.spectrum(ir, scratch)?;
-        let FilterBankScratch { spectrum, band, work, .. } = scratch;
-        let scale = T::of(1.0 / self.len as f64);
-        for (gains, out) in self.gains.chunks_exact(spectrum.len()).zip(bands.chunks_exact_mut(self.len)) {
-            for ((to, from), gain) in band.iter_mut().zip(&*spectrum).zip(gains) {
-                *to = from.scale(*gain * scale);
-            }
-            self.inverse.process_with_scratch(band, out, work).map_err(|_| Error::NotFinite { what: "the bands" })?;
+        let FilterBankScratch { spectrum, coupled, work, .. } = scratch;
+        for (couple, coupled) in self.couples.iter().zip(coupled.chunks_exact_mut(self.len)) {
+            couple.filter(spectrum, coupled);
+        }
+        self.inverse.process_with_scratch(coupled, work);
+        for (out, coupled) in bands.chunks_mut(2 * self.len).zip(coupled.chunks_exact(self.len)) {
+            let (first, second) = out.split_at_mut(self.len);
+            first.iter_mut().zip(coupled).for_each(|(out, c)| *out = c.re);
+            second.iter_mut().zip(coupled).for_each(|(out, c)| *out = c.im);
         }
         Ok(())
     }
@@ -140,21 +164,38 @@ impl<T: Real> FilterBankPlan<T> {
 
     fn spectrum(&self, ir: &[T], scratch: &mut FilterBankScratch<T>) -> Result<(), Error> {
         check_len("the response", ir.len(), self.len)?;
-        if !ir.iter().all(|x| x.f64().is_finite()) {
-            return Err(Error::NotFinite { what: "the response" });
-        }
         let FilterBankScratch { signal, spectrum, work, .. } = scratch;
         signal.copy_from_slice(ir);
-        self.forward
-            .process_with_scratch(signal, spectrum, work)
-            .map_err(|_| Error::NotFinite { what: "the response" })?;
-        // What rounding leaves there would keep the inverse transform from running.
-        let last = spectrum.len() - 1;
-        spectrum[0].im = T::default();
-        if self.len.is_multiple_of(2) {
-            spectrum[last].im = T::default();
+        let not_finite = Error::NotFinite { what: "the response" };
+        if self.forward.process_with_scratch(signal, spectrum, work).is_err() {
+            return Err(not_finite);
         }
-        Ok(())
+        // The first bin is the sum of all samples, and one that is not finite spoils it.
+        if spectrum.first().is_some_and(|dc| dc.re.f64().is_finite()) { Ok(()) } else { Err(not_finite) }
+    }
+}
+
+impl<T: Real> Couple<T> {
+    fn new(mut gains: Vec<Complex<T>>) -> Self {
+        let used = |c: &Complex<T>| c.re != T::default() || c.im != T::default();
+        let first = gains.iter().position(used).unwrap_or(0);
+        let end = gains.iter().rposition(used).map_or(first, |last| last + 1);
+        gains.truncate(end);
+        Self { bins: first..end, gains: gains.split_off(first) }
+    }
+
+    // A bin k and its mirror image n - k: both bands are real, so it is conj X[k] with the same gains.
+    fn filter(&self, spectrum: &[Complex<T>], out: &mut [Complex<T>]) {
+        let Range { start, end } = self.bins;
+        let (low, high) = out.split_at_mut(spectrum.len());
+        low[..start].fill(Complex::default());
+        low[end..].fill(Complex::default());
+        let bins = spectrum[start..end].iter().zip(&self.gains);
+        low[start..end].iter_mut().zip(bins.clone()).for_each(|(out, (x, gain))| *out = x * gain);
+        high.fill(Complex::default());
+        // The first bin has no mirror image; nor has the last where the length is even, and `high` ends before it.
+        let images = high.iter_mut().rev().skip(start.saturating_sub(1));
+        images.zip(bins.skip(usize::from(start == 0))).for_each(|(out, (x, gain))| *out = x.conj() * gain);
     }
 }
 

@@ -26,6 +26,7 @@
 //! # Ok::<(), echolake_dsp::Error>(())
 //! ```
 
+mod aligned;
 pub mod chain;
 pub mod deconvolution;
 pub mod energy;
@@ -36,7 +37,9 @@ pub mod fresnel;
 pub mod geometry;
 #[cfg(test)]
 mod golden;
+mod joint;
 pub mod level;
+mod pruned;
 mod real;
 pub mod sweep;
 pub mod temperature;

@@ -8,6 +8,10 @@ pub trait Real: FftNum + PartialOrd + Default {
     fn of(value: f64) -> Self;
     /// As f64, exactly.
     fn f64(self) -> f64;
+    /// Distance from 1 to the next sample value.
+    fn epsilon() -> f64;
+    /// The largest that is finite.
+    fn max_value() -> Self;
 }
 
 impl Real for f32 {
@@ -18,6 +22,14 @@ impl Real for f32 {
     fn f64(self) -> f64 {
         f64::from(self)
     }
+
+    fn epsilon() -> f64 {
+        f64::from(Self::EPSILON)
+    }
+
+    fn max_value() -> Self {
+        Self::MAX
+    }
 }
 
 impl Real for f64 {
@@ -27,5 +39,13 @@ impl Real for f64 {
 
     fn f64(self) -> f64 {
         self
+    }
+
+    fn epsilon() -> f64 {
+        Self::EPSILON
+    }
+
+    fn max_value() -> Self {
+        Self::MAX
     }
 }

@@ -1,7 +1,7 @@
 //! Speed of sound, and the correction of a response's time axis to the reference temperature.
 
 use std::f64::consts::PI;
-use std::sync::LazyLock;
+use std::sync::{Arc, LazyLock};
 
 use crate::Real;
 
@@ -14,8 +14,12 @@ const LOBES: f64 = 10.0;
 const KAISER_BETA: f64 = 5.0;
 /// Gain at 0 Hz that SciPy's normalisation of its filter amounts to, in continuous form.
 const GAIN: f64 = 1.000_675;
-/// Pieces of the table a lobe: cubics through the kernel at their ends and neighbours are within 1e-9 of it.
-const STEPS: usize = 256;
+/// Values of the kernel, a sample apart, that one position meets.
+const TAPS: usize = 2 * LOBES as usize;
+/// The tap that a position is at, or up to a sample past.
+const CENTRE: usize = TAPS / 2 - 1;
+/// Pieces between two samples: cubics through the kernel at their ends and neighbours are within 5e-8 of it.
+const PIECES: usize = 64;
 
 /// c = c0 sqrt(1 + T / 273.15), m/s.
 pub fn speed_of_sound(celsius: f64) -> f64 {
@@ -32,22 +36,30 @@ pub fn resampling_ratio(celsius: f64, reference_celsius: f64) -> f64 {
 ///
 /// y\[m\] = g sum_n x\[n\] fc k(fc (m/rho - n)), k(u) = sinc(u) I0(5 sqrt(1 - (u/10)^2)) / I0(5), |u| <= 10,
 /// fc = min(1, rho): SciPy's `resample_poly` in continuous form, so that no fraction limits the ratio.
+///
+/// For rho >= 1 the kernel is read at m/rho - n, and all taps of one output have the same fraction of a sample.
+/// For rho < 1 it is read at m - rho n, and all taps of one *input* have. So one table of the kernel at whole steps
+/// from a fraction serves every ratio: outputs gather where they grow scarcer, inputs scatter where they do.
 #[derive(Debug, Clone)]
 pub struct TemperatureCorrection<T> {
-    table: &'static [Piece],
-    kind: std::marker::PhantomData<T>,
+    table: Arc<[Piece<T>]>,
 }
 
-/// Coefficients of 1, t, t^2 and t^3, t from 0 to 1 along a piece.
-type Piece = [f64; 4];
+/// Coefficients of 1, t, t^2 and t^3 of each tap, t from 0 to 1 along a piece.
+type Piece<T> = [[T; TAPS]; 4];
 
-// Piece i is k from i / STEPS to (i + 1) / STEPS; there is one past the edge, which rounding can reach.
-static TABLE: LazyLock<Vec<Piece>> = LazyLock::new(|| {
-    let piece = |i: usize| {
-        let [a, b, c, d] = [-1.0, 0.0, 1.0, 2.0].map(|t| kernel((i as f64 + t) / STEPS as f64));
+// Tap j is k(fraction + CENTRE - j), piece i for fractions from i / PIECES to (i + 1) / PIECES.
+static TABLE: LazyLock<Vec<Piece<f64>>> = LazyLock::new(|| {
+    let cubic = |i: usize, j: usize| {
+        let at = |t: f64| kernel((i as f64 + t) / PIECES as f64 + CENTRE as f64 - j as f64);
+        let [a, b, c, d] = [-1.0, 0.0, 1.0, 2.0].map(at);
         [b, c - a / 3.0 - b / 2.0 - d / 6.0, (a + c) / 2.0 - b, (d - a) / 6.0 + (b - c) / 2.0]
     };
-    (0..=LOBES as usize * STEPS).map(piece).collect()
+    let piece = |i: usize| {
+        let taps: [[f64; 4]; TAPS] = std::array::from_fn(|j| cubic(i, j));
+        std::array::from_fn(|power| taps.map(|tap| tap[power]))
+    };
+    (0..PIECES).map(piece).collect()
 });
 
 impl<T: Real> Default for TemperatureCorrection<T> {
@@ -59,7 +71,7 @@ impl<T: Real> Default for TemperatureCorrection<T> {
 impl<T: Real> TemperatureCorrection<T> {
     /// The plan; it serves every ratio.
     pub fn new() -> Self {
-        Self { table: &TABLE, kind: std::marker::PhantomData }
+        Self { table: TABLE.iter().map(|piece| piece.map(|taps| taps.map(T::of))).collect() }
     }
 
     /// Samples of input that `output_len` samples of output depend on.
@@ -74,28 +86,67 @@ impl<T: Real> TemperatureCorrection<T> {
     /// ir_out `[m]` at the reference temperature
     pub fn run(&self, ir_in: &[T], rho: f64, ir_out: &mut [T]) {
         if rho == 1.0 {
-            return crop(ir_in, ir_out);
-        }
-        let fc = rho.min(1.0);
-        let reach = LOBES / fc;
-        for (m, out) in ir_out.iter_mut().enumerate() {
-            let centre = m as f64 / rho;
-            let first = (centre - reach).ceil().max(0.0) as usize;
-            let end = ((centre + reach).floor() as usize + 1).min(ir_in.len());
-            let taps = ir_in.get(first..end).unwrap_or(&[]);
-            let offset = centre - first as f64;
-            let sum: f64 = (0u32..).zip(taps).map(|(i, x)| x.f64() * self.at(fc * (offset - f64::from(i)))).sum();
-            *out = T::of(GAIN * fc * sum);
+            crop(ir_in, ir_out);
+        } else if rho > 1.0 {
+            self.gather(ir_in, rho.recip(), ir_out);
+        } else {
+            self.scatter(ir_in, rho, ir_out);
         }
     }
 
-    fn at(&self, u: f64) -> f64 {
-        let position = u.abs() * STEPS as f64;
-        let index = position as u32;
-        let t = position - f64::from(index);
-        let Some([c0, c1, c2, c3]) = self.table.get(index as usize) else { return 0.0 };
-        c0 + t * (c1 + t * (c2 + t * c3))
+    fn gather(&self, ir_in: &[T], step: f64, ir_out: &mut [T]) {
+        let gain = T::of(GAIN);
+        for (m, out) in ir_out.iter_mut().enumerate() {
+            let (at, taps) = self.taps(m as f64 * step);
+            let inside = at.checked_sub(CENTRE).and_then(|first| ir_in.get(first..)?.first_chunk());
+            let x = inside.copied().unwrap_or_else(|| {
+                std::array::from_fn(|j| {
+                    (at + j).checked_sub(CENTRE).and_then(|n| ir_in.get(n)).copied().unwrap_or_default()
+                })
+            });
+            *out = gain * dot(&x, &taps);
+        }
     }
+
+    fn scatter(&self, ir_in: &[T], rho: f64, ir_out: &mut [T]) {
+        ir_out.fill(T::default());
+        let gain = T::of(GAIN * rho);
+        for (n, x) in ir_in.iter().enumerate() {
+            let (at, taps) = self.taps(n as f64 * rho);
+            if at >= ir_out.len() + CENTRE {
+                return;
+            }
+            let x = *x * gain;
+            if let Some(out) =
+                at.checked_sub(CENTRE).and_then(|first| ir_out.get_mut(first..)?.first_chunk_mut::<TAPS>())
+            {
+                out.iter_mut().zip(&taps).for_each(|(out, tap)| *out = *out + x * *tap);
+            } else {
+                let skipped = CENTRE.saturating_sub(at);
+                let out = ir_out[(at + skipped).saturating_sub(CENTRE)..].iter_mut();
+                out.zip(&taps[skipped..]).for_each(|(out, tap)| *out = *out + x * *tap);
+            }
+        }
+    }
+
+    /// The sample at or before a position, which tap `CENTRE` belongs to, and the kernel around it.
+    fn taps(&self, position: f64) -> (usize, [T; TAPS]) {
+        let at = position as usize;
+        let along = (position - at as f64) * PIECES as f64;
+        let index = (along as usize).min(PIECES - 1);
+        let t = T::of(along - index as f64);
+        let [c0, c1, c2, c3] = &self.table[index];
+        (at, std::array::from_fn(|j| c0[j] + t * (c1[j] + t * (c2[j] + t * c3[j]))))
+    }
+}
+
+// Four sums side by side, which the compiler makes a vector of.
+fn dot<T: Real>(x: &[T; TAPS], taps: &[T; TAPS]) -> T {
+    let mut sums = [T::default(); 4];
+    for (x, taps) in x.as_chunks::<4>().0.iter().zip(taps.as_chunks::<4>().0) {
+        sums.iter_mut().zip(x.iter().zip(taps)).for_each(|(sum, (x, tap))| *sum = *sum + *x * *tap);
+    }
+    (sums[0] + sums[1]) + (sums[2] + sums[3])
 }
 
 /// The first samples, with zeros where there are fewer.
@@ -133,9 +184,35 @@ mod tests {
     #[test]
     fn the_table_is_accurate() {
         let plan = TemperatureCorrection::<f64>::new();
-        for i in 0..100_000 {
-            let u = f64::from(i) / 10_000.0;
-            assert!((plan.at(u) - kernel(u)).abs() < 1e-9, "{u}: {} {}", plan.at(u), kernel(u));
+        for i in 0..10_000 {
+            let position = f64::from(i) / 1_234.5;
+            let (at, taps) = plan.taps(position);
+            assert_eq!(at, position.floor() as usize);
+            for (j, tap) in taps.iter().enumerate() {
+                let u = position - (at + j) as f64 + CENTRE as f64;
+                assert!((tap - kernel(u)).abs() < 5e-8, "{u}: {tap} {}", kernel(u));
+            }
+        }
+    }
+
+    // Sample by sample, as the definition says, where inputs and outputs end within the kernel's reach too.
+    #[test]
+    fn corrections_are_the_defined_sum() {
+        let x: Vec<f64> = (0..431).map(|i| f64::from((i * 7919) % 101) - 50.0).collect();
+        for (input, output) in [(431, 384), (100, 384), (431, 5), (3, 2), (15, 12), (0, 4), (4, 0)] {
+            for rho in [0.8f64, 0.97, 0.999_9, 1.000_1, 1.03, 1.2] {
+                let fc = rho.min(1.0);
+                let mut out = vec![f64::NAN; output];
+                TemperatureCorrection::new().run(&x[..input], rho, &mut out);
+                for (m, out) in out.iter().enumerate() {
+                    let term = |(n, x): (usize, &f64)| {
+                        let u = fc * (m as f64 / rho - n as f64);
+                        if u.abs() <= LOBES { x * kernel(u) } else { 0.0 }
+                    };
+                    let expected = GAIN * fc * x[..input].iter().enumerate().map(term).sum::<f64>();
+                    assert!((out - expected).abs() < 1e-5, "{rho}, {input} to {output}, {m}: {out} {expected}");
+                }
+            }
         }
     }
 
