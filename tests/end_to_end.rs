@@ -141,6 +141,7 @@ fn a_gir_folder_becomes_runs_with_references_of_their_own() {
 // The long form is the example `kills`.
 #[test]
 fn a_killed_ingest_is_repaired_by_running_it_again() {
-    let outcome = super::kills::Campaign::new(std::path::Path::new(env!("CARGO_BIN_EXE_echolake")), 1).rounds(4, &mut |_, _| {});
+    let outcome =
+        super::kills::Campaign::new(std::path::Path::new(env!("CARGO_BIN_EXE_echolake")), 1).rounds(4, &mut |_, _| {});
     assert!(outcome.killed > 0, "{outcome:?}");
 }

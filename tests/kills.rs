@@ -52,7 +52,8 @@ impl Campaign {
         let campaign = Self { folder, binary: binary.to_owned(), random: ChaCha8Rng::seed_from_u64(seed) };
         for (number, surface) in SURFACES.iter().enumerate() {
             let seed = number.to_string();
-            campaign.run("start", &["acquire", "--surface", surface, "--seed", &seed, "--rig", "rig.toml", "--ir-only"]);
+            campaign
+                .run("start", &["acquire", "--surface", surface, "--seed", &seed, "--rig", "rig.toml", "--ir-only"]);
         }
         campaign
     }
@@ -81,7 +82,10 @@ impl Campaign {
             self.run("round", &["ingest"]);
             let actual = self.tables("round");
             for (table, rows) in &expected {
-                assert!(actual[table] == *rows, "round {round}: table {table} differs from that of an undisturbed ingest");
+                assert!(
+                    actual[table] == *rows,
+                    "round {round}: table {table} differs from that of an undisturbed ingest"
+                );
             }
             told(round + 1, &outcome);
         }

@@ -33,11 +33,7 @@ pub struct Completed {
 ///
 /// # Errors
 /// [`crate::Error`]; what was completed before stays, and the same call goes on.
-pub async fn complete(
-    lake: &Lake,
-    stop: &AtomicBool,
-    done: &mut (dyn FnMut(&Completed) + Send),
-) -> Result<usize> {
+pub async fn complete(lake: &Lake, stop: &AtomicBool, done: &mut (dyn FnMut(&Completed) + Send)) -> Result<usize> {
     let mut count = 0;
     for _ in 0..ROUNDS {
         let (changed, overtaken) = round(lake, stop, done).await?;

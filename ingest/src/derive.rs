@@ -3,7 +3,7 @@
 use std::collections::HashMap;
 use std::sync::Arc;
 
-use echolake_dsp::chain::{DerivationPlan, Derived};
+use echolake_dsp::chain::{DerivationPlan, Derived, FlatEnergies};
 use echolake_lake::{EncodedFile, FileEncoder, FileName, Lake, Staged, encode};
 use echolake_schema::Rig;
 use echolake_schema::tables::Table;
@@ -20,6 +20,14 @@ const SLICE: usize = 256;
 
 /// Mean impulse response of each pair of a reference.
 pub(crate) type Means = HashMap<u32, Vec<f32>>;
+
+/// Energies of each pair of Flat, its Foam subtracted.
+pub(crate) type Flats = HashMap<u32, FlatEnergies>;
+
+/// The plan of a rig's responses.
+pub(crate) fn derivation_plan(rig: &Rig) -> std::result::Result<DerivationPlan<f32>, echolake_dsp::Error> {
+    DerivationPlan::new(rig.impulse_response.length, rig.sweep.rate_hz.get(), &rig.bands.centres_hz)
+}
 
 /// A run's impulse responses.
 #[derive(Debug, Clone, Default)]
@@ -49,7 +57,7 @@ pub(crate) struct Derivation {
     pub(crate) name: String,
     flat_version: String,
     foam_version: String,
-    flat: Arc<Means>,
+    flat: Arc<Flats>,
     foam: Arc<Means>,
 }
 
@@ -134,7 +142,8 @@ impl Derivation {
 
     // The files, and how many pairs a reference lacks.
     fn encode(&self, lake: &Lake, keys: &Keys, responses: &Responses) -> Result<(Vec<(Table, EncodedFile)>, usize)> {
-        let (rig, grid) = (lake.rig(), lake.rig().grid().map_err(echolake_lake::Error::from)?);
+        let (rig, grid) = (lake.rig(), lake.grid());
+        let moved = rows::derived::Moved::of(grid);
         let of = Versions { flat: &self.flat_version, foam: &self.foam_version };
         let mut encoders =
             [Table::Nce, Table::Tnce, Table::TnceD4].map(|table| (table, FileEncoder::new(table, table.schema(rig))));
@@ -144,9 +153,9 @@ impl Derivation {
             paired += slice.pairs.len();
             totals.iter_mut().zip(slice.tnce_columns()).for_each(|(all, some)| all.extend(some));
             let [nce, tnce, tnce_d4] = &mut encoders;
-            tnce.1.write(&rows::derived::tnce(rig, &grid, keys, slice, of)?)?;
-            tnce_d4.1.write(&rows::derived::tnce_d4(rig, &grid, keys, slice, of)?)?;
-            nce.1.write(&rows::derived::nce(rig, &grid, keys, slice, of)?)?;
+            tnce.1.write(&rows::derived::tnce(rig, grid, keys, slice, of)?)?;
+            tnce_d4.1.write(&rows::derived::tnce_d4(rig, grid, &moved, keys, slice, of)?)?;
+            nce.1.write(&rows::derived::nce(rig, grid, keys, slice, of)?)?;
             Ok(())
         })?;
         let mut files = Vec::with_capacity(4);
@@ -167,15 +176,14 @@ impl Derivation {
     ) -> Result<()> {
         let (bands, length) = (rig.bands.centres_hz.len(), rig.impulse_response.length);
         let failed = |cause| Error::Kernel { file: keys.run.to_string(), cause };
-        let plan =
-            DerivationPlan::<f32>::new(length, rig.sweep.rate_hz.get(), &rig.bands.centres_hz).map_err(failed)?;
+        let plan = derivation_plan(rig).map_err(failed)?;
         let (mut scratch, mut derived) = (plan.scratch(), plan.derived());
         let irs = responses.pairs.chunks(SLICE).zip(responses.irs.chunks(SLICE * length));
         for (pairs, irs) in irs {
             let mut slice = DerivedRows::new(bands);
             for (pair, ir) in pairs.iter().zip(irs.chunks_exact(length)) {
                 if let (Some(foam), Some(flat)) = (self.foam.get(pair), self.flat.get(pair)) {
-                    plan.run(ir, foam, flat, &mut derived, &mut scratch).map_err(failed)?;
+                    plan.run_over(ir, foam, flat, &mut derived, &mut scratch).map_err(failed)?;
                     slice.push(*pair, &derived);
                 }
             }

@@ -13,6 +13,7 @@ use crate::CODE_VERSION;
 use crate::derive::{Derivation, Responses};
 use crate::error::{Error, Result};
 use crate::files::{self, Source};
+use crate::measure::Measurer;
 use crate::pipeline::{self, Cores, Ready};
 use crate::read_back;
 use crate::references::{Finder, Names, SharedFinder, digest};
@@ -81,6 +82,7 @@ struct Work {
     cores: Cores,
     snapshot: Arc<Snapshot>,
     finder: SharedFinder,
+    measurer: Arc<Measurer>,
 }
 
 impl<'a> Ingest<'a> {
@@ -107,7 +109,8 @@ impl<'a> Ingest<'a> {
         let cores = Cores::all();
         let snapshot = Arc::new(self.lake.snapshot().await?);
         let finder = Finder::shared(self.lake, snapshot.clone());
-        let work = Work { lake: self.lake.clone(), cores: cores.clone(), snapshot, finder };
+        let measurer = Arc::new(Measurer::new(self.lake));
+        let work = Work { lake: self.lake.clone(), cores: cores.clone(), snapshot, finder, measurer };
         let mut refused = Vec::new();
         let ended = &mut |(source, done): pipeline::Ended<Source, Taken>| match done {
             Ok((taken, outcome)) => {
@@ -160,7 +163,7 @@ impl<'a> Ingest<'a> {
 impl Work {
     async fn take_in(&self, source: &Source) -> Result<Ready<Taken>> {
         let (lake, opened) = (&self.lake, source.open(&self.lake)?);
-        let content = Arc::new(RunContent::read(lake, &self.cores, &opened).await?);
+        let content = Arc::new(RunContent::read(lake, &self.measurer, &self.cores, &opened).await?);
         let keys = Keys { surface: content.manifest.surface_id.clone(), run: content.manifest.run_id.clone() };
         let derivation = digest(&[content.integrity.sha256.as_str(), CODE_VERSION]);
         let known = self.snapshot.run(&keys.run);
@@ -236,13 +239,8 @@ impl Work {
     }
 }
 
-fn encode_run(
-    lake: &Lake,
-    keys: &Keys,
-    content: &RunContent,
-) -> Result<Vec<(Table, echolake_lake::EncodedFile)>> {
+fn encode_run(lake: &Lake, keys: &Keys, content: &RunContent) -> Result<Vec<(Table, echolake_lake::EncodedFile)>> {
     let rig = lake.rig();
-    let grid = rig.grid().map_err(echolake_lake::Error::from)?;
     let origin = content.manifest.origin.label();
     let references = &lake.config().references;
     let surface = rows::surfaces::row(rig, keys, &content.surface, references, origin, &content.heights_mm)?;
@@ -257,7 +255,7 @@ fn encode_run(
     for (table, batches) in tables {
         encoded.push((table, encode(table, &table.schema(rig), &batches)?));
     }
-    encoded.push((Table::Measurements, rows::measurements::encode(rig, &grid, keys, &content.accepted)?));
+    encoded.push((Table::Measurements, rows::measurements::encode(rig, lake.grid(), keys, &content.accepted)?));
     Ok(encoded)
 }
 

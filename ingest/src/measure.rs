@@ -3,23 +3,51 @@
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, PoisonError};
 
-use echolake_dsp::chain::{MeasurementParams, MeasurementPlan};
+use echolake_dsp::chain::{MeasurementParams, MeasurementPlan, MeasurementScratch};
 use echolake_dsp::temperature::{TemperatureCorrection, resampling_ratio};
+use echolake_lake::Lake;
 use echolake_schema::messages::{
     AmbientSample, ImpulseResponse, Measurement, Message as RunMessage, SampleFormat, SweepRecording,
 };
-use echolake_schema::{Celsius, Rig, topics};
+use echolake_schema::{Celsius, Rig, samples, topics};
 use prost::Message as _;
 
 use crate::chunk::{Channels, Chunk, Message};
 
-/// Turns recordings into responses; one for all chunks of a run.
+/// Turns recordings into responses; one for all chunks of all runs.
 pub(crate) struct Measurer {
     rig: Rig,
     pairs: u32,
     /// Recordings of a run are of one length, those of an import may not be.
-    plans: Mutex<HashMap<usize, Arc<MeasurementPlan<f32>>>>,
+    plans: Mutex<HashMap<usize, Arc<Planned>>>,
     correction: TemperatureCorrection<f32>,
+}
+
+/// The plan of one length, and buffers that no thread uses now.
+struct Planned {
+    plan: MeasurementPlan<f32>,
+    idle: Mutex<Vec<Buffers>>,
+}
+
+struct Buffers {
+    microphone: Vec<f32>,
+    loopback: Vec<f32>,
+    scratch: MeasurementScratch<f32>,
+}
+
+impl Planned {
+    fn with_buffers<T>(&self, len: usize, work: impl FnOnce(&mut Buffers) -> T) -> T {
+        let idle = || self.idle.lock().unwrap_or_else(PoisonError::into_inner);
+        let found = idle().pop();
+        let mut buffers = found.unwrap_or_else(|| Buffers {
+            microphone: vec![0.0; len],
+            loopback: vec![0.0; len],
+            scratch: self.plan.scratch(),
+        });
+        let done = work(&mut buffers);
+        idle().push(buffers);
+        done
+    }
 }
 
 /// All that a chunk yields.
@@ -86,10 +114,10 @@ impl Event {
 }
 
 impl Measurer {
-    pub(crate) fn new(rig: &Rig, pairs: usize) -> Self {
+    pub(crate) fn new(lake: &Lake) -> Self {
         Self {
-            rig: rig.clone(),
-            pairs: pairs as u32,
+            rig: lake.rig().clone(),
+            pairs: lake.grid().pairs().len() as u32,
             plans: Mutex::default(),
             correction: TemperatureCorrection::new(),
         }
@@ -140,15 +168,22 @@ impl Measurer {
         let celsius = Celsius::new(sweep.temperature_c).map_err(|e| e.to_string())?;
         let format = SampleFormat::try_from(sweep.format).unwrap_or_default();
         let count = sweep.sample_count as usize;
-        let microphone = samples(format, count, &sweep.microphone)?;
-        let loopback = samples(format, count, &sweep.loopback)?;
-        let plan = self.plan(count)?;
+        check_bytes(format, count, &sweep.microphone)?;
+        check_bytes(format, count, &sweep.loopback)?;
+        let planned = self.plan(count)?;
         let mut ir = vec![0.0; self.rig.impulse_response.length];
-        let mut scratch = plan.scratch();
-        match plan.ir(&microphone, &loopback, celsius.get(), &mut ir, &mut scratch) {
-            Ok(()) => {}
-            Err(echolake_dsp::Error::NoLoopback) => return Ok(None),
-            Err(e) => return Err(e.to_string()),
+        let measured = planned.with_buffers(count, |buffers| {
+            let Buffers { microphone, loopback, scratch } = buffers;
+            samples::decode(format, &sweep.microphone, microphone).map_err(|e| e.to_string())?;
+            samples::decode(format, &sweep.loopback, loopback).map_err(|e| e.to_string())?;
+            match planned.plan.ir(microphone, loopback, celsius.get(), &mut ir, scratch) {
+                Ok(()) => Ok(true),
+                Err(echolake_dsp::Error::NoLoopback) => Ok(false),
+                Err(e) => Err(e.to_string()),
+            }
+        });
+        if !measured? {
+            return Ok(None);
         }
         Ok(Some(Response {
             pair: sweep.pair_id,
@@ -193,7 +228,7 @@ impl Measurer {
         })
     }
 
-    fn plan(&self, recording_len: usize) -> Result<Arc<MeasurementPlan<f32>>, String> {
+    fn plan(&self, recording_len: usize) -> Result<Arc<Planned>, String> {
         let mut plans = self.plans.lock().unwrap_or_else(PoisonError::into_inner);
         if let Some(plan) = plans.get(&recording_len) {
             return Ok(plan.clone());
@@ -207,7 +242,7 @@ impl Measurer {
             floor_db: self.rig.impulse_response.floor_db,
             reference_celsius: self.rig.impulse_response.reference_temperature_c.get(),
         });
-        let plan = Arc::new(plan.map_err(|e| e.to_string())?);
+        let plan = Arc::new(Planned { plan: plan.map_err(|e| e.to_string())?, idle: Mutex::default() });
         plans.insert(recording_len, plan.clone());
         Ok(plan)
     }
@@ -229,16 +264,13 @@ fn decode<M: RunMessage>(schema: &str, message: &Message<'_>) -> Result<M, Strin
     M::decode(message.data).map_err(|e| e.to_string())
 }
 
-/// Samples as fractions of full scale.
-fn samples(format: SampleFormat, count: usize, bytes: &[u8]) -> Result<Vec<f32>, String> {
-    // The count comes from the file: nothing is allocated for one that its bytes do not bear out.
+// The count comes from the file: nothing is allocated for one that its bytes do not bear out.
+fn check_bytes(format: SampleFormat, count: usize, bytes: &[u8]) -> Result<(), String> {
     let width = format.bytes().ok_or("its sample format is unknown")?;
-    if count.checked_mul(width) != Some(bytes.len()) {
-        return Err(format!("it has {} bytes for {count} samples of {width}", bytes.len()));
+    match count.checked_mul(width) == Some(bytes.len()) {
+        true => Ok(()),
+        false => Err(format!("it has {} bytes for {count} samples of {width}", bytes.len())),
     }
-    let mut samples = vec![0.0; count];
-    echolake_schema::samples::decode(format, bytes, &mut samples).map_err(|e| e.to_string())?;
-    Ok(samples)
 }
 
 #[cfg(test)]
@@ -246,21 +278,10 @@ mod tests {
     use super::*;
 
     #[test]
-    fn every_format_has_the_same_full_scale() {
-        let check = |format, bytes: &[u8]| {
-            assert_eq!(samples(format, 2, bytes).expect("two samples"), [-1.0, 0.5], "{format:?}");
-        };
-        check(SampleFormat::S16le, &[0, 0x80, 0, 0x40]);
-        check(SampleFormat::S24le, &[0, 0, 0x80, 0, 0, 0x40]);
-        check(SampleFormat::S32le, &[0, 0, 0, 0x80, 0, 0, 0, 0x40]);
-        check(SampleFormat::F32le, &[0, 0, 0x80, 0xBF, 0, 0, 0, 0x3F]);
-    }
-
-    #[test]
-    fn wrong_lengths_and_nan_are_said() {
-        assert!(samples(SampleFormat::S24le, 2, &[0; 5]).is_err());
-        assert!(samples(SampleFormat::S24le, usize::MAX, &[0; 5]).is_err());
-        assert!(samples(SampleFormat::Unspecified, 0, &[]).is_err());
-        assert!(samples(SampleFormat::F32le, 1, &f32::NAN.to_le_bytes()).expect_err("NaN").contains("sample 0 is NaN"));
+    fn counts_that_the_bytes_do_not_bear_out_are_refused() {
+        assert!(check_bytes(SampleFormat::S24le, 2, &[0; 6]).is_ok());
+        assert!(check_bytes(SampleFormat::S24le, 2, &[0; 5]).is_err());
+        assert!(check_bytes(SampleFormat::S24le, usize::MAX, &[0; 5]).is_err());
+        assert!(check_bytes(SampleFormat::Unspecified, 0, &[]).is_err());
     }
 }

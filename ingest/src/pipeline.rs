@@ -123,7 +123,8 @@ async fn commit<J, R>(
     group: Vec<(J, Result<Ready<R>>)>,
     ended: &mut (dyn FnMut(Ended<J, R>) -> Result<()> + Send),
 ) -> Result<()> {
-    let staged: Vec<_> = group.iter().flat_map(|(_, done)| done.iter().flat_map(|r| r.staged.iter().cloned())).collect();
+    let staged: Vec<_> =
+        group.iter().flat_map(|(_, done)| done.iter().flat_map(|r| r.staged.iter().cloned())).collect();
     let mut outcomes = lake.commit(&staged).await?.into_iter();
     for (job, done) in group {
         let done = done.map(|ready| {

@@ -3,15 +3,15 @@
 use std::collections::{BTreeSet, HashMap};
 use std::sync::Arc;
 
-use echolake_lake::{FileName, Lake, References, Snapshot};
-use echolake_schema::{SurfaceId, SurfaceRecord};
+use echolake_lake::{DataFile, FileName, Lake, References, Snapshot};
 use echolake_schema::tables::Table;
+use echolake_schema::{Rig, SurfaceId, SurfaceRecord};
 use sha2::{Digest as _, Sha256};
 use tokio::sync::Mutex;
 
 use crate::CODE_VERSION;
-use crate::derive::Means;
-use crate::error::Result;
+use crate::derive::{Flats, Means, derivation_plan};
+use crate::error::{Error, Result};
 use crate::read_back;
 use crate::run_reader::hex;
 
@@ -22,8 +22,12 @@ const VERSION_DIGITS: usize = 12;
 pub(crate) struct Finder {
     lake: Lake,
     snapshot: Arc<Snapshot>,
+    /// The references that each surface's row names.
+    names: HashMap<SurfaceId, Names>,
+    versions: HashMap<SurfaceId, String>,
     /// By version: means change with the runs, and then so does the version.
     means: HashMap<String, Arc<Means>>,
+    flats: HashMap<String, Arc<Flats>>,
 }
 
 /// One finder for all workers: what one has loaded, the others use.
@@ -65,7 +69,19 @@ pub(crate) struct Found {
 
 impl Finder {
     pub(crate) fn new(lake: &Lake, snapshot: Arc<Snapshot>) -> Self {
-        Self { lake: lake.clone(), snapshot, means: HashMap::new() }
+        let mut runs: HashMap<_, Vec<_>> = HashMap::new();
+        for run in snapshot.runs() {
+            runs.entry(run.surface.clone()).or_default().push(format!("{}.{}", run.run, run.run_derivation));
+        }
+        // `flat:2:1f00ab...`: the surface, how many runs, and a digest of what their rows were made from.
+        let version = |(surface, runs): (SurfaceId, Vec<String>)| {
+            let version = format!("{surface}:{}:{}", runs.len(), digest(&runs));
+            (surface, version)
+        };
+        let versions = runs.into_iter().map(version).collect();
+        let names =
+            snapshot.files(Table::Surfaces).iter().filter_map(|f| names(f, &lake.config().references)).collect();
+        Self { lake: lake.clone(), snapshot, names, versions, means: HashMap::new(), flats: HashMap::new() }
     }
 
     pub(crate) fn shared(lake: &Lake, snapshot: Arc<Snapshot>) -> SharedFinder {
@@ -83,22 +99,18 @@ impl Finder {
         Wanted { flat: self.found(flat), foam: self.found(foam), flat_foam: self.found(flat_foam) }
     }
 
-    /// Mean responses of Foam, and of Flat with its Foam subtracted; None where one is missing.
-    pub(crate) async fn load(&mut self, wanted: &Wanted) -> Result<Option<(Arc<Means>, Arc<Means>)>> {
-        let Some((flat, _)) = wanted.versions() else { return Ok(None) };
+    /// Mean responses of Foam, and energies of Flat's with its Foam subtracted; None where one is missing.
+    pub(crate) async fn load(&mut self, wanted: &Wanted) -> Result<Option<(Arc<Means>, Arc<Flats>)>> {
+        let Some((version, _)) = wanted.versions() else { return Ok(None) };
         let foam = self.mean(&wanted.foam).await?;
-        if let Some(known) = self.means.get(&flat) {
+        if let Some(known) = self.flats.get(&version) {
             return Ok(Some((foam, known.clone())));
         }
         let flat_foam = self.mean(&wanted.flat_foam).await?;
-        let raw = self.mean(&wanted.flat).await?;
-        let subtracted = raw.iter().filter_map(|(pair, ir)| {
-            let foam = flat_foam.get(pair)?;
-            Some((*pair, ir.iter().zip(foam).map(|(a, b)| a - b).collect()))
-        });
-        let subtracted: Arc<Means> = Arc::new(subtracted.collect());
-        self.means.insert(flat, subtracted.clone());
-        Ok(Some((foam, subtracted)))
+        let flat = self.mean(&wanted.flat).await?;
+        let flats = Arc::new(flats(self.lake.rig(), &flat, &flat_foam)?);
+        self.flats.insert(version, flats.clone());
+        Ok(Some((foam, flats)))
     }
 
     async fn mean(&mut self, of: &Found) -> Result<Arc<Means>> {
@@ -125,29 +137,39 @@ impl Finder {
     }
 
     fn found(&self, surface: SurfaceId) -> Found {
-        Found { version: self.version(&surface), surface }
+        Found { version: self.versions.get(&surface).cloned(), surface }
     }
 
-    // `flat:2:1f00ab...`: the surface, how many runs, and a digest of what their rows were made from.
-    fn version(&self, surface: &SurfaceId) -> Option<String> {
-        let runs: Vec<_> = self.snapshot.runs().filter(|r| r.surface == *surface).collect();
-        let parts: Vec<_> = runs.iter().map(|r| format!("{}.{}", r.run, r.run_derivation)).collect();
-        (!runs.is_empty()).then(|| format!("{surface}:{}:{}", runs.len(), digest(&parts)))
-    }
-
-    // The names that the surface's row gives; the lake's for a surface that is not there.
+    // The lake's for a surface that is not there.
     fn names(&self, surface: &SurfaceId) -> Names {
-        let row = self.snapshot.files(Table::Surfaces).iter().find(|f| match FileName::parse(&f.path) {
-            Some(FileName::Rows { surface: of, .. }) => of == *surface,
-            _ => false,
-        });
-        let text = |column: &str| row?.stats.as_ref()?.min.get(column)?.as_str()?.parse().ok();
         let references = &self.lake.config().references;
-        Names {
-            flat: text("flat_reference").unwrap_or_else(|| references.flat.clone()),
-            foam: text("foam_reference").unwrap_or_else(|| references.foam.clone()),
-        }
+        let defaults = || Names { flat: references.flat.clone(), foam: references.foam.clone() };
+        self.names.get(surface).cloned().unwrap_or_else(defaults)
     }
+}
+
+// The names that a surface's row gives, which stand in its file's statistics.
+fn names(file: &DataFile, references: &References) -> Option<(SurfaceId, Names)> {
+    let Some(FileName::Rows { surface, .. }) = FileName::parse(&file.path) else { return None };
+    let text = |column: &str| file.stats.as_ref()?.min.get(column)?.as_str()?.parse().ok();
+    let names = Names {
+        flat: text("flat_reference").unwrap_or_else(|| references.flat.clone()),
+        foam: text("foam_reference").unwrap_or_else(|| references.foam.clone()),
+    };
+    Some((surface, names))
+}
+
+fn flats(rig: &Rig, flat: &Means, foam: &Means) -> Result<Flats> {
+    let failed = |cause| Error::Kernel { file: "the reference".to_owned(), cause };
+    let plan = derivation_plan(rig).map_err(failed)?;
+    let mut scratch = plan.scratch();
+    let mut flats = Flats::with_capacity(flat.len());
+    for (pair, ir) in flat {
+        let Some(foam) = foam.get(pair) else { continue };
+        let subtracted: Vec<f32> = ir.iter().zip(foam).map(|(a, b)| a - b).collect();
+        flats.insert(*pair, plan.flat_energies(&subtracted, &mut scratch).map_err(failed)?);
+    }
+    Ok(flats)
 }
 
 impl Wanted {

@@ -77,9 +77,7 @@ const LARGEST_KEPT: usize = 64 << 20;
 
 impl RunContent {
     /// Reads a run; its chunks are measured on all cores while the next ones are fetched.
-    pub(crate) async fn read(lake: &Lake, cores: &Cores, opened: &Opened) -> Result<Self> {
-        let pairs = lake.rig().grid().map_err(echolake_lake::Error::from)?.pairs().len();
-        let measurer = Arc::new(Measurer::new(lake.rig(), pairs));
+    pub(crate) async fn read(lake: &Lake, measurer: &Arc<Measurer>, cores: &Cores, opened: &Opened) -> Result<Self> {
         let name = opened.name.as_str();
         let mut reader = RunReader::open(opened.store.clone(), opened.path.clone(), name.to_owned()).await?;
         let mut envelope = Envelope::default();

@@ -149,9 +149,7 @@ struct ColumnStats {
 
 impl Stats {
     fn new(schema: &SchemaRef) -> Self {
-        let told = |kind: &DataType| {
-            !matches!(kind, DataType::List(_) | DataType::Boolean | DataType::Timestamp(..))
-        };
+        let told = |kind: &DataType| !matches!(kind, DataType::List(_) | DataType::Boolean | DataType::Timestamp(..));
         let columns = schema.fields().iter().enumerate().take(STATS_COLUMNS).filter(|(_, f)| told(f.data_type()));
         let column = |(index, field): (usize, &Arc<arrow::datatypes::Field>)| ColumnStats {
             name: field.name().clone(),

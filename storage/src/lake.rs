@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use arrow::record_batch::RecordBatch;
 use echolake_schema::tables::{Source, Table};
-use echolake_schema::{Rig, RunId, SurfaceId};
+use echolake_schema::{Grid, Rig, RunId, SurfaceId};
 use object_store::path::Path;
 use object_store::{ObjectStore, ObjectStoreExt as _, PutMode};
 
@@ -24,6 +24,7 @@ pub struct Lake(Arc<Inner>);
 struct Inner {
     location: Location,
     config: LakeConfig,
+    grid: Grid,
     log: DeltaLog,
 }
 
@@ -55,7 +56,7 @@ impl Lake {
     pub async fn open(url: &str) -> Result<Self> {
         let location = Location::parse(url)?;
         match read_config(&location).await? {
-            Some(config) => Ok(Self::assemble(location, config)),
+            Some(config) => Self::assemble(location, config),
             None => Err(Error::NoLake { location: location.text }),
         }
     }
@@ -88,16 +89,17 @@ impl Lake {
             Some(config) => config,
             None => create_config(&location, rig, references).await?,
         };
-        let lake = Self::assemble(location, config);
+        let lake = Self::assemble(location, config)?;
         lake.fits(rig)?;
         lake.ensure_tables().await?;
         Ok(lake)
     }
 
-    fn assemble(location: Location, config: LakeConfig) -> Self {
+    fn assemble(location: Location, config: LakeConfig) -> Result<Self> {
+        let grid = config.rig.grid()?;
         let log =
             DeltaLog::new(location.url.clone(), location.root.clone(), location.store.clone(), config.rig.clone());
-        Self(Arc::new(Inner { location, config, log }))
+        Ok(Self(Arc::new(Inner { location, config, grid, log })))
     }
 
     /// Whether runs of this rig may stand beside those that are here.
@@ -126,12 +128,12 @@ impl Lake {
         for table in Table::ALL {
             self.log().ensure(table).await?;
         }
-        let grid = self.rig().grid()?;
+        let grid = self.grid();
         let derivation = || FileName::Rig { derivation: format!("v{LAKE_FORMAT}") };
         for table in Table::ALL.into_iter().filter(|t| t.source() == Source::Rig) {
             let rows = match table {
-                Table::Points => rig_tables::points(self.rig(), &grid)?,
-                _ => rig_tables::pairs(self.rig(), &grid)?,
+                Table::Points => rig_tables::points(self.rig(), grid)?,
+                _ => rig_tables::pairs(self.rig(), grid)?,
             };
             self.append_rows(table, &derivation(), &[rows]).await?;
         }
@@ -161,6 +163,11 @@ impl Lake {
     /// The rig that all runs share.
     pub fn rig(&self) -> &Rig {
         &self.0.config.rig
+    }
+
+    /// The rig's points and pairs.
+    pub fn grid(&self) -> &Grid {
+        &self.0.grid
     }
 
     /// The commit log.

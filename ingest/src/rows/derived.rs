@@ -1,6 +1,7 @@
 //! Rows of tables `nce`, `tnce` and `tnce_d4`.
 
 use arrow::record_batch::RecordBatch;
+use echolake_schema::symmetry::MovedPair;
 use echolake_schema::tables::Table;
 use echolake_schema::{Grid, PairId, Rig, Symmetry};
 
@@ -14,6 +15,16 @@ use crate::error::Result;
 pub(crate) struct Versions<'a> {
     pub(crate) flat: &'a str,
     pub(crate) foam: &'a str,
+}
+
+/// Where each pair goes under each symmetry that the grid has.
+pub(crate) struct Moved(Vec<(Symmetry, Vec<MovedPair>)>);
+
+impl Moved {
+    pub(crate) fn of(grid: &Grid) -> Self {
+        let moved = |symmetry| grid.moved_pairs(symmetry).map(|pairs| (symmetry, pairs));
+        Self(Symmetry::ALL.into_iter().filter_map(moved).collect())
+    }
 }
 
 /// Rows of `nce`; takes the responses and curves out of `derived`.
@@ -35,7 +46,13 @@ pub(crate) fn nce(
 }
 
 /// Rows of `tnce`.
-pub(crate) fn tnce(rig: &Rig, grid: &Grid, keys: &Keys, derived: &DerivedRows, of: Versions<'_>) -> Result<RecordBatch> {
+pub(crate) fn tnce(
+    rig: &Rig,
+    grid: &Grid,
+    keys: &Keys,
+    derived: &DerivedRows,
+    of: Versions<'_>,
+) -> Result<RecordBatch> {
     let mut columns = Columns::of_run(Table::Tnce, derived.pairs.len(), keys);
     pair_columns(&mut columns, grid, &derived.pairs);
     energy_columns(&mut columns, derived, 1);
@@ -47,11 +64,11 @@ pub(crate) fn tnce(rig: &Rig, grid: &Grid, keys: &Keys, derived: &DerivedRows, o
 pub(crate) fn tnce_d4(
     rig: &Rig,
     grid: &Grid,
+    Moved(moved): &Moved,
     keys: &Keys,
     derived: &DerivedRows,
     of: Versions<'_>,
 ) -> Result<RecordBatch> {
-    let moved: Vec<_> = Symmetry::ALL.into_iter().filter_map(|s| grid.moved_pairs(s).map(|pairs| (s, pairs))).collect();
     let each = moved.len();
     let rows: Vec<_> = derived
         .pairs

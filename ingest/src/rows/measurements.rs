@@ -15,12 +15,7 @@ use crate::measure::Response;
 const LIST_VALUES: usize = 1 << 18;
 
 /// A row a measurement, sorted by pair.
-pub(crate) fn encode(
-    rig: &Rig,
-    grid: &Grid,
-    keys: &Keys,
-    accepted: &[(Measurement, Response)],
-) -> Result<EncodedFile> {
+pub(crate) fn encode(rig: &Rig, grid: &Grid, keys: &Keys, accepted: &[(Measurement, Response)]) -> Result<EncodedFile> {
     let rows_a_batch = (LIST_VALUES / rig.impulse_response.length).max(1);
     let mut encoder = FileEncoder::new(Table::Measurements, Table::Measurements.schema(rig));
     for part in accepted.chunks(rows_a_batch) {
