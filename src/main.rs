@@ -21,6 +21,8 @@ enum Done {
     WithLoss,
 }
 
+/// More would not make a disk faster, and each keeps memory.
+const BLOCKING_THREADS: usize = 16;
 const FAILED: u8 = 1;
 const DONE_WITH_LOSS: u8 = 3;
 
@@ -29,6 +31,8 @@ fn main() -> ExitCode {
     let cli = cli::Cli::parse();
     let outcome = tokio::runtime::Builder::new_multi_thread()
         .enable_all()
+        // Files are read and written there; what computes has threads of its own.
+        .max_blocking_threads(BLOCKING_THREADS)
         .build()
         .map_err(anyhow::Error::from)
         .and_then(|runtime| runtime.block_on(commands::run(cli)));

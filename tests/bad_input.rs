@@ -164,3 +164,94 @@ fn lakes_that_are_none_newer_or_someone_elses() {
     std::fs::write(place.path("other.toml"), "impulse_response.length = 100").expect("written");
     place.fails(1, &["acquire", "--surface", "flat", "--rig", "other.toml"], "does not fit the lake");
 }
+
+/// A small file system of its own; unmounted at the end.
+struct Disk(std::path::PathBuf);
+
+impl Disk {
+    // None where we may not mount, as outside of containers and for anyone but root.
+    fn mounted(at: &Path, kib: u64) -> Option<Self> {
+        std::fs::create_dir(at).expect("made");
+        let size = format!("size={kib}k");
+        let done = std::process::Command::new("mount").args(["-t", "tmpfs", "-o", &size, "tmpfs"]).arg(at).output();
+        match done {
+            Ok(output) if output.status.success() => Some(Self(at.to_owned())),
+            _ => {
+                eprintln!("skipped: no file system can be mounted here");
+                None
+            }
+        }
+    }
+
+    fn remount(&self, option: &str) {
+        let option = format!("remount,{option}");
+        let done = std::process::Command::new("mount").args(["-o", &option]).arg(&self.0).status();
+        assert!(done.expect("mount starts").success(), "{option}");
+    }
+}
+
+impl Drop for Disk {
+    fn drop(&mut self) {
+        let _ = std::process::Command::new("umount").arg(&self.0).status();
+    }
+}
+
+#[test]
+fn a_full_disk_stops_everything_cleanly_and_with_space_it_goes_on() {
+    let place = Place::new();
+    let Some(disk) = Disk::mounted(&place.path("lake"), 12 << 10) else { return };
+    for (surface, seed) in [("flat", "1"), ("foam", "2"), ("wood", "3")] {
+        place.acquire(surface, &["--seed", seed, "--ir-only"]);
+    }
+    // As much space as two of the runs' tables need, less than all.
+    let used = || {
+        let output = std::process::Command::new("du").arg("-sk").arg(&disk.0).output().expect("du starts");
+        String::from_utf8(output.stdout).expect("text").split_whitespace().next().and_then(|n| n.parse::<u64>().ok())
+    };
+    let before = used().expect("a number");
+    disk.remount(&format!("size={}k", before + 700));
+    place.fails(1, &["ingest"], "full");
+    place.fails(1, &["acquire", "--surface", "prd", "--rig", "rig.toml"], "full");
+    // Readers are not disturbed.
+    place.ok(&["sql", "select count(*) from runs"]);
+    disk.remount("size=24m");
+    place.ok(&["ingest"]);
+    assert_eq!(place.number("select count(*) from tnce"), 3.0 * 45.0);
+    assert_eq!(place.number("select count(*) from runs where state = 'complete'"), 3.0);
+    let report = place.ok(&["doctor"]);
+    assert!(report.contains("nothing is missing or damaged"), "{report}");
+}
+
+#[test]
+fn a_lake_that_is_read_only_can_be_read() {
+    let place = Place::new();
+    let Some(disk) = Disk::mounted(&place.path("lake"), 24 << 10) else { return };
+    place.acquire("flat", &["--ir-only"]);
+    place.ok(&["ingest"]);
+    place.acquire("foam", &["--ir-only", "--seed", "2"]);
+    disk.remount("ro");
+    assert_eq!(place.number("select count(*) from measurements"), 45.0);
+    place.fails(1, &["ingest"], "Read-only");
+    place.fails(1, &["acquire", "--surface", "wood", "--rig", "rig.toml"], "Read-only");
+    disk.remount("rw");
+    place.ok(&["ingest"]);
+    assert_eq!(place.number("select count(*) from measurements"), 2.0 * 45.0);
+}
+
+#[test]
+fn a_recording_whose_recorder_died_yields_what_was_complete() {
+    let place = Place::new();
+    let run = place.acquire("flat", &["--ir-only"]);
+    let whole = std::fs::read(&run).expect("read");
+    let partial = run.with_extension("mcap.partial");
+    std::fs::remove_file(&run).expect("removed");
+    std::fs::write(&partial, &whole[..whole.len() - whole.len() / 4]).expect("written");
+    // While somebody records, it is left alone.
+    let recorder = std::fs::File::open(&partial).expect("open");
+    recorder.lock().expect("locked");
+    place.fails(0, &["ingest"], "nothing to ingest");
+    drop(recorder);
+    place.fails(3, &["ingest"], "was cut off");
+    assert_eq!(place.number("select count(*) from runs where state = 'partial'"), 1.0);
+    assert!(!partial.exists());
+}

@@ -46,9 +46,20 @@ pub async fn complete(lake: &Lake, stop: &AtomicBool, done: &mut (dyn FnMut(&Com
     Ok(count)
 }
 
+/// The runs that wait for references, and which, in words.
+///
+/// # Errors
+/// [`crate::Error::Lake`] where the lake cannot be read.
+pub async fn waiting(lake: &Lake) -> Result<Vec<(RunId, String)>> {
+    let snapshot = Arc::new(lake.snapshot().await?);
+    let finder = Finder::new(lake, snapshot.clone());
+    let missing = |run: &VisibleRun| (run.run.clone(), finder.wanted(&run.surface).missing());
+    Ok(snapshot.runs().map(missing).filter(|(_, missing)| !missing.is_empty()).collect())
+}
+
 // How many runs were changed, and whether another ingest changed one of them meanwhile.
 async fn round(lake: &Lake, stop: &AtomicBool, done: &mut (dyn FnMut(&Completed) + Send)) -> Result<(usize, bool)> {
-    let cores = Cores::all();
+    let cores = Cores::all()?;
     let snapshot = Arc::new(lake.snapshot().await?);
     let finder = Finder::shared(lake, snapshot.clone());
     let mut jobs = Vec::new();

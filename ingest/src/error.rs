@@ -93,6 +93,12 @@ pub enum Error {
         /// Why not.
         reason: String,
     },
+    /// The machine gives no more threads.
+    #[error("cannot start the threads that compute: {reason}; hint: is a limit of processes reached?")]
+    Threads {
+        /// Why not.
+        reason: String,
+    },
     /// The ingest was stopped.
     #[error("stopped; hint: the same command goes on where this one ended")]
     Stopped,
@@ -111,7 +117,7 @@ impl Error {
             Self::Read { .. } | Self::NotMcap { .. } | Self::Foreign { .. } | Self::Manifest { .. } => true,
             Self::Attachment { .. } | Self::OtherContent { .. } | Self::NoRun { .. } | Self::Gone { .. } => true,
             Self::Kernel { .. } | Self::Lake(echolake_lake::Error::OtherRig { .. }) => true,
-            Self::DataFile { .. } | Self::Stopped | Self::Lake(_) => false,
+            Self::DataFile { .. } | Self::Threads { .. } | Self::Stopped | Self::Lake(_) => false,
         }
     }
 

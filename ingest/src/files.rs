@@ -3,14 +3,16 @@
 use std::path::{Path as FsPath, PathBuf};
 use std::sync::Arc;
 
-use echolake_lake::Lake;
+use echolake_lake::{Lake, StoreError};
 use echolake_schema::RunId;
+use echolake_schema::manifest::Origin;
 use futures::TryStreamExt as _;
 use object_store::local::LocalFileSystem;
 use object_store::path::Path;
 use object_store::{ObjectStore, ObjectStoreExt as _, WriteMultipart};
 
 use crate::error::{Error, Result};
+use crate::run_content::Head;
 
 /// Folder of runs that are not taken in yet.
 const INBOX: &str = "inbox";
@@ -18,6 +20,8 @@ const INBOX: &str = "inbox";
 const RUNS: &str = "runs";
 /// Folder of refused files.
 const QUARANTINE: &str = "quarantine";
+/// What the name of a recording ends in until it is whole.
+const PARTIAL: &str = ".partial";
 /// Bytes that are copied at a time.
 const PART: u64 = 8 << 20;
 
@@ -86,10 +90,51 @@ pub async fn pending(lake: &Lake) -> Result<Vec<Source>> {
     Ok(found.into_iter().map(Source::Lake).collect())
 }
 
+/// Makes runs of the recordings in the inbox whose recorder died, so that ingest takes in what was complete; returns
+/// them. Those that are still being recorded stay, and so do those of imports, which are made again from their files.
+///
+/// # Errors
+/// [`Error::Read`] where the inbox cannot be changed.
+pub async fn adopt_cut_off(lake: &Lake) -> Result<Vec<Path>> {
+    let Some(inbox) = lake.folder().map(|folder| folder.join(INBOX)).filter(|inbox| inbox.is_dir()) else {
+        return Ok(Vec::new());
+    };
+    let mut adopted = Vec::new();
+    for entry in std::fs::read_dir(&inbox).map_err(|e| Error::read(inbox.display(), e))? {
+        let partial = entry.map_err(|e| Error::read(inbox.display(), e))?.path();
+        let Some(name) = partial.file_name().and_then(|n| n.to_str()).and_then(|n| n.strip_suffix(PARTIAL)) else {
+            continue;
+        };
+        let to = inbox.join(name);
+        if !name.ends_with(".mcap") || to.exists() || is_being_recorded(&partial) || is_imported(&partial).await {
+            continue;
+        }
+        let failed = |e: std::io::Error| Error::read(partial.display(), e);
+        std::fs::rename(&partial, &to).map_err(failed)?;
+        std::fs::File::open(&inbox).and_then(|folder| folder.sync_all()).map_err(failed)?;
+        adopted.push(Path::from(format!("{INBOX}/{name}")));
+    }
+    Ok(adopted)
+}
+
+// Its recorder holds a lock as long as it lives. What cannot be asked counts as alive.
+fn is_being_recorded(partial: &FsPath) -> bool {
+    match std::fs::File::open(partial) {
+        Ok(file) => file.try_lock_shared().is_err(),
+        Err(_) => true,
+    }
+}
+
+async fn is_imported(partial: &FsPath) -> bool {
+    let Ok(path) = absolute(partial) else { return false };
+    let opened = Opened { store: Arc::new(LocalFileSystem::new()), path, name: partial.display().to_string() };
+    Head::read(&opened).await.is_some_and(|head| matches!(head.origin, Origin::ImportedWav | Origin::ImportedGir))
+}
+
 /// Brings a run's file to its place, before any row names it.
 pub(crate) async fn keep(lake: &Lake, source: &Source, to: &Path, bytes: u64) -> Result<()> {
     let store = lake.store();
-    let failed = |e: object_store::Error| Error::read(to, e);
+    let failed = |e: object_store::Error| written(to, e);
     let there = match store.head(to).await {
         Ok(meta) => meta.size == bytes,
         Err(object_store::Error::NotFound { .. }) => false,
@@ -121,11 +166,11 @@ pub(crate) async fn quarantine(lake: &Lake, source: &Source, why: &Error) -> Res
     let store = lake.store();
     let to = free_name(lake, from.filename().unwrap_or("run")).await?;
     let reason = Path::from(format!("{to}.reason.txt"));
-    store.put(&reason, format!("{why}\n").into()).await.map_err(|e| Error::read(&reason, e))?;
+    store.put(&reason, format!("{why}\n").into()).await.map_err(|e| written(&reason, e))?;
     match store.rename(from, &to).await {
         // Another ingest refused it, too.
         Err(object_store::Error::NotFound { .. }) => Ok(None),
-        renamed => renamed.map(|()| Some(to)).map_err(|e| Error::read(from, e)),
+        renamed => renamed.map(|()| Some(to)).map_err(|e| written(from, e)),
     }
 }
 
@@ -138,7 +183,7 @@ async fn free_name(lake: &Lake, name: &str) -> Result<Path> {
         };
         match lake.store().head(&path).await {
             Err(object_store::Error::NotFound { .. }) => return Ok(path),
-            Err(e) => return Err(Error::read(path, e)),
+            Err(e) => return Err(written(&path, e)),
             Ok(_) => number += 1,
         }
     }
@@ -147,21 +192,28 @@ async fn free_name(lake: &Lake, name: &str) -> Result<Path> {
 // Under another name first, so that a run is under its own name whole or not at all.
 async fn copy_in(lake: &Lake, from: &FsPath, to: &Path) -> Result<()> {
     let store = lake.store();
-    let failed = |e: object_store::Error| Error::read(to, e);
+    let failed = |e: object_store::Error| written(to, e);
+    let unread = |e: object_store::Error| Error::read(from.display(), e);
     let staged = Path::from(format!("{INBOX}/{}.copying", to.filename().unwrap_or("run")));
     let mut writer = WriteMultipart::new(store.put_multipart(&staged).await.map_err(failed)?);
     let source: Arc<dyn ObjectStore> = Arc::new(LocalFileSystem::new());
     let path = absolute(from)?;
-    let size = source.head(&path).await.map_err(failed)?.size;
+    let size = source.head(&path).await.map_err(unread)?.size;
     let mut at = 0;
     while at < size {
         let end = (at + PART).min(size);
-        writer.put(source.get_range(&path, at..end).await.map_err(failed)?);
+        writer.put(source.get_range(&path, at..end).await.map_err(unread)?);
         writer.wait_for_capacity(2).await.map_err(failed)?;
         at = end;
     }
     writer.finish().await.map_err(failed)?;
     store.rename(&staged, to).await.map_err(failed)
+}
+
+// The lake itself cannot be written, which is no fault of the run.
+fn written(path: &Path, cause: object_store::Error) -> Error {
+    let cause = StoreError(cause);
+    Error::Lake(echolake_lake::Error::Store { action: "write", path: path.to_string(), cause })
 }
 
 fn absolute(file: &FsPath) -> Result<Path> {

@@ -106,7 +106,7 @@ impl<'a> Ingest<'a> {
     }
 
     async fn take_in_group(&self, sources: Vec<Source>, report: &mut (dyn FnMut(Report) + Send)) -> Result<()> {
-        let cores = Cores::all();
+        let cores = Cores::all()?;
         let snapshot = Arc::new(self.lake.snapshot().await?);
         let finder = Finder::shared(self.lake, snapshot.clone());
         let measurer = Arc::new(Measurer::new(self.lake));

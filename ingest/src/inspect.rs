@@ -47,7 +47,7 @@ pub struct Inspected {
 /// [`Error`](crate::Error) where ingest would refuse the whole file, naming it.
 pub async fn inspect(lake: &Lake, store: Arc<dyn ObjectStore>, path: &Path, name: &str) -> Result<Inspection> {
     let opened = Opened { store, path: path.clone(), name: name.to_owned() };
-    let content = RunContent::read(lake, &Arc::new(Measurer::new(lake)), &Cores::all(), &opened).await?;
+    let content = RunContent::read(lake, &Arc::new(Measurer::new(lake)), &Cores::all()?, &opened).await?;
     let whole = content.is_whole();
     let inspected =
         content.accepted.into_iter().map(|(m, r)| Inspected { pair: m.pair_id, attempt: m.attempt, ir: r.ir });

@@ -40,9 +40,9 @@ mod rows;
 mod run_content;
 mod run_reader;
 
-pub use complete::{Completed, complete};
+pub use complete::{Completed, complete, waiting};
 pub use error::{Error, Result};
-pub use files::{Source, pending};
+pub use files::{Source, adopt_cut_off, pending};
 pub use ingest::{Ingest, Outcome, Report, Taken};
 #[doc(hidden)]
 pub use inspect::{Inspected, Inspection, inspect};

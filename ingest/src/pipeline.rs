@@ -1,27 +1,35 @@
 //! Jobs done by a few workers at once, and their files committed in groups.
 //!
-//! A commit costs the same for one run as for many, and a table's log grows with every commit; so whatever is ready
-//! while one commit is under way goes into the next together. Queues are bounded: what waits in memory is a few
+//! A commit costs the same for one run as for many, and a table's log grows with every commit; so what becomes ready
+//! within a short time is committed together. Queues are bounded: what waits in memory is a few
 //! lists of staged files, not rows.
 
 use std::collections::VecDeque;
+use std::panic::{AssertUnwindSafe, catch_unwind, resume_unwind};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
+use std::time::Duration;
 
 use echolake_lake::{Committed, Lake, Staged};
-use tokio::sync::{Semaphore, mpsc};
+use rayon::{ThreadPool, ThreadPoolBuilder};
+use tokio::sync::{mpsc, oneshot};
 use tokio::task::JoinSet;
+use tokio::time::{Instant, timeout_at};
 
 use crate::error::{Error, Result};
 
 /// Jobs whose files go into one commit at most: a crash loses that much work, and nothing else.
 const GROUP: usize = 16;
 
-/// The machine's cores, shared by all that computes.
+/// How long a job waits for others to be committed with: every commit is a file in each table's log, which all readers
+/// read.
+const GATHER: Duration = Duration::from_secs(2);
+
+/// The machine's cores, shared by all that computes: a thread each, whose memory is used again and again. Tokio's own
+/// pool would spread the work, and what it frees, over hundreds.
 #[derive(Debug, Clone)]
 pub(crate) struct Cores {
-    count: usize,
-    free: Arc<Semaphore>,
+    pool: Arc<ThreadPool>,
 }
 
 /// What a job brings to the commit.
@@ -35,30 +43,27 @@ pub(crate) struct Ready<R> {
 pub(crate) type Ended<J, R> = (J, Result<(R, Option<Committed>)>);
 
 impl Cores {
-    pub(crate) fn all() -> Self {
-        let count = std::thread::available_parallelism().map_or(2, usize::from);
-        Self { count, free: Arc::new(Semaphore::new(count)) }
+    pub(crate) fn all() -> Result<Self> {
+        let pool = ThreadPoolBuilder::new().thread_name(|i| format!("compute-{i}")).build();
+        Ok(Self { pool: Arc::new(pool.map_err(|e| Error::Threads { reason: e.to_string() })?) })
     }
 
     pub(crate) fn count(&self) -> usize {
-        self.count
+        self.pool.current_num_threads()
     }
 
-    /// Computes on a core of its own, once one is free.
+    /// Computes on a core of its own, once one is free: in the order of the calls.
     pub(crate) async fn compute<T: Send + 'static>(&self, work: impl FnOnce() -> T + Send + 'static) -> T {
-        // The semaphore is never closed; without a permit the work is only less well spread.
-        let permit = self.free.clone().acquire_owned().await.ok();
-        let task = tokio::task::spawn_blocking(move || {
-            let _permit = permit;
-            work()
+        let (sender, done) = oneshot::channel();
+        self.pool.spawn_fifo(move || {
+            // Nobody waits any more where the whole ingest was given up.
+            let _ = sender.send(catch_unwind(AssertUnwindSafe(work)));
         });
-        match task.await {
-            Ok(done) => done,
-            Err(e) => match e.try_into_panic() {
-                Ok(panic) => std::panic::resume_unwind(panic),
-                // Blocking work is cancelled only where the whole runtime ends.
-                Err(_) => std::future::pending().await,
-            },
+        match done.await {
+            Ok(Ok(done)) => done,
+            Ok(Err(panic)) => resume_unwind(panic),
+            // The pool sends always, and lives as long as we do.
+            Err(_) => std::future::pending().await,
         }
     }
 }
@@ -102,20 +107,31 @@ where
         });
     }
     drop(sender);
-    let mut group = Vec::new();
-    while ready.recv_many(&mut group, GROUP).await > 0 {
+    while let Some(group) = gather(&mut ready).await {
+        commit(lake, group, ended).await?;
         halt.store(stop.load(Ordering::Relaxed), Ordering::Relaxed);
-        commit(lake, std::mem::take(&mut group), ended).await?;
     }
     // A worker that panicked has left its job undone.
     while let Some(worker) = workers.join_next().await {
         if let Err(e) = worker
             && e.is_panic()
         {
-            std::panic::resume_unwind(e.into_panic());
+            resume_unwind(e.into_panic());
         }
     }
     if next(&queue).is_some() { Err(Error::Stopped) } else { Ok(()) }
+}
+
+// What is ready, until it is enough for a commit or has waited long enough; None once no more will come.
+async fn gather<T>(ready: &mut mpsc::Receiver<T>) -> Option<Vec<T>> {
+    let mut group = vec![ready.recv().await?];
+    let deadline = Instant::now() + GATHER;
+    while group.len() < GROUP
+        && let Ok(Some(next)) = timeout_at(deadline, ready.recv()).await
+    {
+        group.push(next);
+    }
+    Some(group)
 }
 
 async fn commit<J, R>(

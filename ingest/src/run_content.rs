@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use bytes::Bytes;
 use echolake_lake::Lake;
-use echolake_schema::manifest::{RunEnd, RunManifest};
+use echolake_schema::manifest::{Origin, RunEnd, RunManifest};
 use echolake_schema::messages::{AmbientSample, Measurement, Verdict};
 use echolake_schema::{Rig, SurfaceId, SurfaceRecord, topics};
 use tokio::sync::Semaphore;
@@ -49,6 +49,7 @@ struct Envelope {
 pub(crate) struct Head {
     pub(crate) surface: SurfaceId,
     pub(crate) references: Vec<SurfaceId>,
+    pub(crate) origin: Origin,
 }
 
 impl Head {
@@ -68,7 +69,7 @@ impl Head {
         let manifest = RunManifest::from_metadata(envelope.metadata.get(topics::RUN_METADATA)?).ok()?;
         let surface = envelope.surface(&opened.name).ok()?;
         let references = [surface.flat_reference, surface.foam_reference].into_iter().flatten().collect();
-        Some(Self { surface: manifest.surface_id, references })
+        Some(Self { surface: manifest.surface_id, references, origin: manifest.origin })
     }
 }
 
@@ -98,7 +99,7 @@ impl RunContent {
                         checked = true;
                     }
                     let (begin, length) = (raw.offset, raw.body.len() as u64);
-                    match decode(raw).await {
+                    match decode(cores, raw).await {
                         Ok((offset, chunk)) if !seen.insert(chunk.identity()) => {
                             whole.damaged.push(format!("the chunk at byte {offset}: a copy of one before it"));
                         }
@@ -138,10 +139,9 @@ impl RunContent {
         }
         for (offset, length) in waiting {
             let (offset, chunk) =
-                decode(reader.again(offset, length).await?).await.map_err(|e| Error::read(name, e))?;
+                decode(cores, reader.again(offset, length).await?).await.map_err(|e| Error::read(name, e))?;
             let (measurer, channels) = (measurer.clone(), definitions.channels.clone());
-            let taken = tokio::task::spawn_blocking(move || measurer.process(offset, &chunk, &channels)).await;
-            whole.append(taken.map_err(|e| Error::read(name, e))?);
+            whole.append(cores.compute(move || measurer.process(offset, &chunk, &channels)).await);
         }
         let integrity = reader.finish().await?;
         if !integrity.damage.is_empty() {
@@ -256,13 +256,11 @@ fn vouch(manifest: &RunManifest, name: &str) -> Result<()> {
     Err(Error::read(name, reason))
 }
 
-async fn decode(raw: RawChunk) -> std::result::Result<(u64, Chunk), String> {
+async fn decode(cores: &Cores, raw: RawChunk) -> std::result::Result<(u64, Chunk), String> {
     let RawChunk { offset, body } = raw;
-    let decoded = tokio::task::spawn_blocking(move || Chunk::decode(&body)).await;
-    match decoded {
-        Ok(Ok(chunk)) => Ok((offset, chunk)),
-        Ok(Err(reason)) => Err(format!("the chunk at byte {offset}: {reason}")),
-        Err(e) => Err(format!("the chunk at byte {offset}: {e}")),
+    match cores.compute(move || Chunk::decode(&body)).await {
+        Ok(chunk) => Ok((offset, chunk)),
+        Err(reason) => Err(format!("the chunk at byte {offset}: {reason}")),
     }
 }
 

@@ -7,7 +7,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use anyhow::Context as _;
-use echolake_ingest::{Ingest, Outcome, Report, Source, Taken, complete, pending};
+use echolake_ingest::{Ingest, Outcome, Report, Source, Taken, adopt_cut_off, complete, pending, waiting};
 use echolake_lake::Lake;
 use futures::TryStreamExt as _;
 use object_store::ObjectStoreExt as _;
@@ -54,7 +54,7 @@ pub(crate) async fn run(args: &IngestArgs, lake_url: &str) -> anyhow::Result<Don
         return watch(&lake, &stop, &progress).await;
     }
     let sources = match args.runs.as_slice() {
-        [] => pending(&lake).await?,
+        [] => all_pending(&lake).await?,
         names => sources_of(&lake, names).await?,
     };
     let nothing = sources.is_empty();
@@ -70,6 +70,14 @@ pub(crate) async fn run(args: &IngestArgs, lake_url: &str) -> anyhow::Result<Don
         anyhow::bail!("nothing was taken in");
     }
     Ok(if summary.lost() { Done::WithLoss } else { Done::Whole })
+}
+
+// With the recordings that a dead recorder left.
+async fn all_pending(lake: &Lake) -> anyhow::Result<Vec<Source>> {
+    for path in adopt_cut_off(lake).await? {
+        eprintln!("`{path}` was cut off; what was complete is taken in");
+    }
+    Ok(pending(lake).await?)
 }
 
 /// Takes in runs, then completes what waited for references.
@@ -113,6 +121,11 @@ pub(crate) async fn take_in(
     })
     .await?;
     task.done(format!("{runs} runs, {rows} measurements derived"));
+    for (run, missing) in waiting(lake).await? {
+        if summary.taken.iter().any(|t| t.run == run) {
+            progress.say(format!("{run}: waits for reference {missing}; ingest a run of it, and it is completed"));
+        }
+    }
     Ok(summary)
 }
 
@@ -125,7 +138,7 @@ async fn watch(lake: &Lake, stop: &Arc<AtomicBool>, progress: &Progress) -> anyh
     while !stop.load(Ordering::Relaxed) {
         let mut settled = Vec::new();
         let mut now = HashMap::new();
-        for source in pending(lake).await? {
+        for source in all_pending(lake).await? {
             let Source::Lake(path) = &source else { continue };
             // It may be gone again.
             let Ok(meta) = lake.store().head(path).await else { continue };
@@ -159,9 +172,6 @@ fn say(progress: &Progress, taken: &Taken) {
     match taken.outcome {
         Outcome::Known => progress.say(format!("{run}: is in the lake already, nothing added")),
         Outcome::Added => progress.say(format!("{run}: {measurements} measurements")),
-    }
-    if !taken.missing.is_empty() {
-        progress.say(format!("{run}: waits for reference {}; ingest a run of it, and it is completed", taken.missing));
     }
     if !taken.whole {
         progress.say(format!("{run}: warning: the file was cut off; what was complete is in the tables"));

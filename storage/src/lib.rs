@@ -30,7 +30,7 @@ mod snapshot;
 pub use commit_log::{Commit, CommitLog, Committed, DataFile, FileStats, NewFile, Replaces};
 pub use config::{LAKE_FORMAT, LakeConfig, References};
 pub use data_file::{EncodedFile, FileEncoder, encode};
-pub use error::Error;
+pub use error::{Error, StoreError};
 pub use lake::{Lake, Staged};
 pub use snapshot::{FileName, Snapshot, VisibleRun};
 

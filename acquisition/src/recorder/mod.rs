@@ -115,6 +115,9 @@ impl Recorder {
             std::io::ErrorKind::AlreadyExists => Error::Exists { path: partial.clone() },
             _ => failed(e.to_string()),
         })?;
+        // Held until the file is closed: whoever finds it unlocked knows that its recorder is dead. Where the file
+        // system has no locks, it is never found so.
+        let _ = file.try_lock();
         let begun = Self::over(file, path, &partial).and_then(|mut recorder| head(&mut recorder).map(|()| recorder));
         begun.map_err(|e| {
             // What cannot be removed either has a cause that the error tells already.
