@@ -10,7 +10,7 @@ use parquet::file::metadata::{PageIndexPolicy, ParquetMetaDataReader};
 use parquet::file::properties::WriterPropertiesBuilder;
 
 use crate::Args;
-use crate::parquet_files::{LEVEL, Numbers, PAGE_BYTES, Rows, builder_as, read_all, zstd};
+use crate::parquet_files::{LEVEL, Numbers, PAGE_BYTES, Rows, Stored, builder_as, read_all, zstd};
 use crate::report::Report;
 
 /// Page sizes that are compared.
@@ -23,19 +23,19 @@ struct Layout {
     compression: Compression,
 }
 
-pub(crate) fn measure(args: &Args, files: &[(Table, Bytes)], rows: &[Rows], report: &mut Report) -> Result<()> {
+pub(crate) fn measure(args: &Args, files: &[Stored], rows: &[Rows], report: &mut Report) -> Result<()> {
     for table in [Table::Measurements, Table::Nce] {
-        // The last run's, because the references are the first.
-        let (_, file) = files.iter().rfind(|(t, _)| *t == table).context("no file of a table")?;
-        let rows = rows.iter().rfind(|r| r.table == table).context("no rows of a table")?;
+        // Much of what is derived of the references is zero.
+        let file = files.iter().rfind(|f| f.table == table && !f.of_reference).context("no file of a table")?;
+        let rows = rows.iter().rfind(|r| r.table == table && !r.of_reference).context("no rows of a table")?;
         report.title(&format!(
             "One file of `{}` in other layouts, {:.1} MB of raw numbers; the best of {} repeats on one thread",
             table.name(),
             rows.raw as f64 / 1e6,
             args.repeats()
         ))?;
-        layouts(args, file, rows, report)?;
-        pages(file, rows, report)?;
+        layouts(args, &file.bytes, rows, report)?;
+        pages(&file.bytes, rows, report)?;
     }
     Ok(())
 }

@@ -18,6 +18,7 @@ use std::path::PathBuf;
 use anyhow::Result;
 use clap::Parser;
 use report::Report;
+use simulated::REFERENCES;
 
 // As in the `echolake` command, so that it is measured as it is used.
 #[global_allocator]
@@ -29,10 +30,10 @@ pub(crate) struct Args {
     /// Smaller runs and fewer repeats.
     #[arg(long)]
     quick: bool,
-    /// Pairs of each of the three runs with sweeps.
+    /// Pairs of each of the four runs with sweeps.
     #[arg(long, value_name = "N")]
     pairs: Option<usize>,
-    /// Runs without sweeps, of all pairs.
+    /// Runs without sweeps, of all pairs, the references among them.
     #[arg(long, value_name = "K")]
     runs: Option<usize>,
     /// Repeats, of which the best counts.
@@ -54,12 +55,11 @@ pub(crate) struct Args {
 
 impl Args {
     fn pairs(&self) -> usize {
-        self.pairs.unwrap_or(if self.quick { 300 } else { 1000 }).max(1)
+        self.pairs.unwrap_or(if self.quick { 300 } else { 1500 }).max(1)
     }
 
-    // The references and one more at least: nothing is derived without them.
     fn runs(&self) -> usize {
-        self.runs.unwrap_or(if self.quick { 3 } else { 6 }).max(2)
+        self.runs.unwrap_or(if self.quick { 4 } else { 6 }).max(REFERENCES + 1)
     }
 
     fn repeats(&self) -> usize {

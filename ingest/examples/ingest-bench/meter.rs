@@ -24,6 +24,10 @@ pub(crate) struct Meter {
 impl Cost {
     pub(crate) const NONE: Self = Self { cpu: f64::INFINITY, wall: f64::INFINITY };
 
+    pub(crate) fn plus(self, other: Self) -> Self {
+        Self { cpu: self.cpu + other.cpu, wall: self.wall + other.wall }
+    }
+
     /// The least of both, each by itself: what disturbs one need not disturb the other.
     pub(crate) fn least(self, other: Self) -> Self {
         Self { cpu: self.cpu.min(other.cpu), wall: self.wall.min(other.wall) }

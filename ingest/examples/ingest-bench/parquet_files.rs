@@ -4,7 +4,7 @@ use arrow::array::RecordBatchReader as _;
 use arrow::datatypes::SchemaRef;
 use arrow::record_batch::RecordBatch;
 use bytes::Bytes;
-use echolake_lake::Lake;
+use echolake_lake::{FileName, Lake, VisibleRun};
 use echolake_schema::tables::{Source, Table};
 use object_store::ObjectStoreExt as _;
 use parquet::arrow::ArrowWriter;
@@ -21,9 +21,18 @@ pub(crate) const PAGE_BYTES: usize = 128 * 1024;
 /// Rows in a batch, about as many as ingest encodes at a time.
 const BATCH_ROWS: usize = 512;
 
+/// A file that ingest wrote.
+pub(crate) struct Stored {
+    pub(crate) table: Table,
+    /// It is of a reference's run.
+    pub(crate) of_reference: bool,
+    pub(crate) bytes: Bytes,
+}
+
 /// A file's rows, and how they were written.
 pub(crate) struct Rows {
     pub(crate) table: Table,
+    pub(crate) of_reference: bool,
     pub(crate) schema: SchemaRef,
     pub(crate) batches: Vec<RecordBatch>,
     pub(crate) properties: WriterProperties,
@@ -47,26 +56,34 @@ pub(crate) fn zstd(level: i32) -> Compression {
 }
 
 /// All files that ingest wrote.
-pub(crate) async fn files(lake: &Lake) -> anyhow::Result<Vec<(Table, Bytes)>> {
+pub(crate) async fn files(lake: &Lake) -> anyhow::Result<Vec<Stored>> {
     let snapshot = lake.snapshot().await?;
     let mut found = Vec::new();
     for table in Table::ALL.into_iter().filter(|t| t.source() != Source::Rig) {
         for file in snapshot.files(table) {
-            found.push((table, lake.store().get(&file.path).await?.bytes().await?));
+            let references = &lake.config().references;
+            let of_reference = match FileName::parse(&file.path) {
+                Some(FileName::Rows { surface, .. } | FileName::Pointer(VisibleRun { surface, .. })) => {
+                    surface == references.flat || surface == references.foam
+                }
+                _ => false,
+            };
+            let bytes = lake.store().get(&file.path).await?.bytes().await?;
+            found.push(Stored { table, of_reference, bytes });
         }
     }
     Ok(found)
 }
 
 impl Rows {
-    pub(crate) fn read(table: Table, file: &Bytes) -> anyhow::Result<Self> {
+    pub(crate) fn read(&Stored { table, of_reference, bytes: ref file }: &Stored) -> anyhow::Result<Self> {
         let builder = ParquetRecordBatchReaderBuilder::try_new(file.clone())?.with_batch_size(BATCH_ROWS);
         let properties = builder_as(builder.metadata(), Numbers::AsStored).set_data_page_size_limit(PAGE_BYTES).build();
         let raw = raw_bytes(builder.metadata());
         let reader = builder.build()?;
         let schema = reader.schema();
         let batches = reader.collect::<Result<_, _>>()?;
-        Ok(Self { table, schema, batches, properties, bytes: file.len() as u64, raw })
+        Ok(Self { table, of_reference, schema, batches, properties, bytes: file.len() as u64, raw })
     }
 
     /// Writes them with the parquet crate and nothing else.

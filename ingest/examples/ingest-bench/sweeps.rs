@@ -19,8 +19,8 @@ use crate::meter::{Cost, Meter};
 use crate::report::{Goal, Report};
 use crate::simulated::{Order, Runs};
 
-/// Runs: Flat, Foam and one panel.
-const RUNS: usize = 3;
+/// Runs: Flat, Foam and two others.
+const RUNS: usize = 4;
 /// Recordings that the bare transforms and Python get.
 const SAMPLED: usize = 60;
 /// Samples of a sweep of 0.5 s alone; recordings have a tail.
@@ -42,26 +42,30 @@ pub(crate) async fn measure(args: &Args, folder: &Path, report: &mut Report) -> 
     let recordings = sampled(&runs)?;
     let length = recordings.first().context("no recordings")?.microphone.len();
     let padded = fast_length(length);
-    let (mut ingest, mut bare, mut unpadded) = (Cost::NONE, f64::INFINITY, f64::INFINITY);
+    let (mut whole, mut panels) = (Cost::NONE, Cost::NONE);
+    let (mut bare, mut unpadded) = (f64::INFINITY, f64::INFINITY);
     let mut peak: f64 = 0.0;
     for _ in 0..args.repeats() {
         let ingested = runs.ingest(&folder.join("lake")).await?;
-        ingest = ingest.least(ingested.cost);
+        whole = whole.least(ingested.whole);
+        panels = panels.least(ingested.panels);
         peak = peak.max(ingested.peak_mib);
         bare = bare.min(transforms(&recordings, padded)?);
         unpadded = unpadded.min(transforms(&recordings, SWEEP_LEN)?);
     }
-    let count = runs.attempts as f64;
-    let each = ingest.cpu / count;
+    let (count, all) = (runs.panels.attempts as f64, runs.all.attempts as f64);
+    let each = panels.cpu / count;
     report.title(&format!(
-        "{RUNS} runs with sweeps: {count} recordings of {length} samples, two channels, 24 bit; {:.0} MB",
-        runs.bytes as f64 / 1e6
+        "{RUNS} runs with sweeps, two of them references: {all} recordings of {length} samples, two channels, 24 bit; {:.0} MB",
+        runs.all.bytes as f64 / 1e6
     ))?;
-    report.figure("ingest, CPU a recording", each * 1e6, "us")?;
-    report.figure("ingest, wall time a recording, all cores", ingest.wall / count * 1e6, "us")?;
+    report.figure("ingest, references there, CPU a recording", each * 1e6, "us")?;
+    report.figure("the same, wall time, all cores", panels.wall / count * 1e6, "us")?;
+    report.figure("ingest with the references', CPU a recording", whole.cpu / all * 1e6, "us")?;
     report.figure(&format!("two bare transforms of {padded} samples (padded as ingest does)"), bare * 1e6, "us")?;
     report.figure(&format!("two bare transforms of {SWEEP_LEN} samples (the sweep alone)"), unpadded * 1e6, "us")?;
     report.goal("ingest / bare transforms", each / bare, "x", Goal::AtMost(3.0))?;
+    report.figure("the same with the references'", whole.cpu / all / bare, "x")?;
     report.figure(&format!("ingest / bare transforms of {SWEEP_LEN}"), each / unpadded, "x")?;
     match reference(args, folder, &recordings) {
         Ok(process) => {
@@ -77,7 +81,7 @@ pub(crate) async fn measure(args: &Args, folder: &Path, report: &mut Report) -> 
 fn sampled(runs: &Runs) -> Result<Vec<Recording>> {
     let bytes = std::fs::read(runs.files.last().context("no runs")?)?;
     let mut found = Vec::new();
-    let every = (runs.attempts as usize / RUNS / SAMPLED).max(1);
+    let every = (runs.all.attempts as usize / RUNS / SAMPLED).max(1);
     let mut number = 0;
     for message in MessageStream::new(&bytes)? {
         let message = message?;
