@@ -1,9 +1,12 @@
 //! One chunk of a run's file: decompressed, its CRC checked, cut into messages.
 
+use std::cell::RefCell;
 use std::collections::HashMap;
 use std::io::Read as _;
 
+use bytes::Bytes;
 use mcap::records::Record;
+use zstd::bulk::Decompressor;
 
 /// Largest chunk that is decompressed; the recorder's are about 1 MiB, or one message where that is larger.
 const LARGEST: u64 = 1 << 30;
@@ -26,7 +29,7 @@ pub(crate) struct Channel {
 /// A chunk's records.
 #[derive(Debug)]
 pub(crate) struct Chunk {
-    data: Vec<u8>,
+    data: Bytes,
     crc: u32,
 }
 
@@ -86,7 +89,7 @@ impl Chunk {
         if header.uncompressed_crc != 0 && header.uncompressed_crc != crc {
             return Err(format!("its CRC is {crc:08x}, expected {:08x}", header.uncompressed_crc));
         }
-        Ok(Self { data, crc })
+        Ok(Self { data: data.into(), crc })
     }
 
     /// The same for two copies of one chunk.
@@ -121,6 +124,11 @@ impl Chunk {
         }
     }
 
+    /// Some of its bytes, shared.
+    pub(crate) fn share(&self, part: &[u8]) -> Bytes {
+        self.data.slice_ref(part)
+    }
+
     /// Its messages.
     pub(crate) fn messages(&self) -> impl Iterator<Item = Message<'_>> {
         self.records().filter(|(code, body)| *code == 0x05 && body.len() >= 22).map(|(_, body)| Message {
@@ -131,9 +139,20 @@ impl Chunk {
     }
 }
 
+thread_local! {
+    /// Its tables are large beside a chunk, so each thread makes them once.
+    static DECOMPRESSOR: RefCell<Option<Decompressor<'static>>> = const { RefCell::new(None) };
+}
+
 fn decompress(data: &[u8], size: usize) -> std::io::Result<Vec<u8>> {
     if size as u64 / USUAL_RATIO <= data.len() as u64 {
-        return zstd::bulk::decompress(data, size);
+        return DECOMPRESSOR.with_borrow_mut(|kept| {
+            let decompressor = match kept.take() {
+                Some(decompressor) => decompressor,
+                None => Decompressor::new()?,
+            };
+            kept.insert(decompressor).decompress(data, size)
+        });
     }
     let mut out = Vec::new();
     zstd::stream::read::Decoder::with_buffer(data)?.take(size as u64 + 1).read_to_end(&mut out)?;

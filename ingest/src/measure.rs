@@ -1,8 +1,9 @@
 //! Messages of one chunk become impulse responses, verdicts, readings and log lines.
 
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet};
 use std::sync::{Arc, Mutex, PoisonError};
 
+use bytes::Bytes;
 use echolake_dsp::chain::{MeasurementParams, MeasurementPlan, MeasurementScratch};
 use echolake_dsp::temperature::{TemperatureCorrection, resampling_ratio};
 use echolake_lake::Lake;
@@ -103,6 +104,27 @@ pub(crate) struct Event {
     pub(crate) name: String,
 }
 
+/// A [`SweepRecording`] whose samples stay where they are in the chunk.
+#[derive(Clone, PartialEq, prost::Message)]
+struct Sweep {
+    #[prost(uint32, tag = "1")]
+    pair_id: u32,
+    #[prost(uint32, tag = "2")]
+    attempt: u32,
+    #[prost(double, tag = "3")]
+    sample_rate_hz: f64,
+    #[prost(uint32, tag = "4")]
+    sample_count: u32,
+    #[prost(enumeration = "SampleFormat", tag = "5")]
+    format: i32,
+    #[prost(bytes = "bytes", tag = "6")]
+    microphone: Bytes,
+    #[prost(bytes = "bytes", tag = "7")]
+    loopback: Bytes,
+    #[prost(double, tag = "8")]
+    temperature_c: f64,
+}
+
 impl Event {
     /// The names of foxglove.Log's levels.
     pub(crate) fn level_name(&self) -> &'static str {
@@ -126,6 +148,7 @@ impl Measurer {
     /// Reads all messages of a chunk. What is wrong with one of them is said, and the others go on.
     pub(crate) fn process(&self, offset: u64, chunk: &Chunk, channels: &Channels) -> Yield {
         let mut out = Yield { last_time_ns: i64::MIN, ..Yield::default() };
+        let mut swept = HashSet::new();
         for message in chunk.messages() {
             out.last_time_ns = out.last_time_ns.max(message.log_time_ns);
             let Some(channel) = channels.get(&message.channel) else {
@@ -133,12 +156,15 @@ impl Measurer {
                 continue;
             };
             let taken = match channel.topic.as_str() {
-                topics::SWEEP => decode::<SweepRecording>(&channel.schema, &message)
+                topics::SWEEP => sweep_of(&channel.schema, chunk, &message)
                     .and_then(|s| self.sweep(offset, &message, &s))
-                    .map(|r| out.responses.extend(r)),
+                    .map(|response| {
+                        swept.extend(response.iter().map(|r| (r.pair, r.attempt)));
+                        out.responses.extend(response);
+                    }),
                 topics::IR => decode::<ImpulseResponse>(&channel.schema, &message)
-                    .and_then(|i| self.ir(offset, &message, &i))
-                    .map(|r| out.responses.push(r)),
+                    .and_then(|i| self.ir(offset, &message, &i, &swept))
+                    .map(|r| out.responses.extend(r)),
                 topics::MEASUREMENT => decode::<Measurement>(&channel.schema, &message)
                     .and_then(|m| self.known_pair(m.pair_id).map(|()| m))
                     .map(|m| out.verdicts.push((message.log_time_ns, m))),
@@ -157,12 +183,7 @@ impl Measurer {
     }
 
     // None where the loopback is silent: the recording is as it was, and its attempt was rejected for that.
-    fn sweep(
-        &self,
-        chunk_offset: u64,
-        message: &Message<'_>,
-        sweep: &SweepRecording,
-    ) -> Result<Option<Response>, String> {
+    fn sweep(&self, chunk_offset: u64, message: &Message<'_>, sweep: &Sweep) -> Result<Option<Response>, String> {
         self.known_pair(sweep.pair_id)?;
         self.known_rate(sweep.sample_rate_hz)?;
         let celsius = Celsius::new(sweep.temperature_c).map_err(|e| e.to_string())?;
@@ -196,7 +217,14 @@ impl Measurer {
         }))
     }
 
-    fn ir(&self, chunk_offset: u64, message: &Message<'_>, given: &ImpulseResponse) -> Result<Response, String> {
+    // None where the chunk has its recording, too, which is preferred: then there is nothing left but to check it.
+    fn ir(
+        &self,
+        chunk_offset: u64,
+        message: &Message<'_>,
+        given: &ImpulseResponse,
+        swept: &HashSet<(u32, u32)>,
+    ) -> Result<Option<Response>, String> {
         self.known_pair(given.pair_id)?;
         self.known_rate(given.sample_rate_hz)?;
         let celsius = Celsius::new(given.temperature_c).map_err(|e| e.to_string())?;
@@ -212,12 +240,14 @@ impl Measurer {
                 .ok_or_else(|| format!("it has {} samples, the lake's responses have {length}", given.samples.len()))?;
             ir.copy_from_slice(kept);
             Source::Corrected
+        } else if swept.contains(&(given.pair_id, given.attempt)) {
+            return Ok(None);
         } else {
             let reference = self.rig.impulse_response.reference_temperature_c.get();
             self.correction.run(&given.samples, resampling_ratio(celsius.get(), reference), &mut ir);
             Source::Ir
         };
-        Ok(Response {
+        Ok(Some(Response {
             pair: given.pair_id,
             attempt: given.attempt,
             log_time_ns: message.log_time_ns,
@@ -225,7 +255,7 @@ impl Measurer {
             temperature_c: celsius.get(),
             source,
             ir,
-        })
+        }))
     }
 
     fn plan(&self, recording_len: usize) -> Result<Arc<Planned>, String> {
@@ -258,10 +288,20 @@ impl Measurer {
 }
 
 fn decode<M: RunMessage>(schema: &str, message: &Message<'_>) -> Result<M, String> {
-    if schema != M::FULL_NAME {
-        return Err(format!("its schema is `{schema}`, expected `{}`", M::FULL_NAME));
-    }
+    check_schema::<M>(schema)?;
     M::decode(message.data).map_err(|e| e.to_string())
+}
+
+fn sweep_of(schema: &str, chunk: &Chunk, message: &Message<'_>) -> Result<Sweep, String> {
+    check_schema::<SweepRecording>(schema)?;
+    Sweep::decode(chunk.share(message.data)).map_err(|e| e.to_string())
+}
+
+fn check_schema<M: RunMessage>(schema: &str) -> Result<(), String> {
+    match schema == M::FULL_NAME {
+        true => Ok(()),
+        false => Err(format!("its schema is `{schema}`, expected `{}`", M::FULL_NAME)),
+    }
 }
 
 // The count comes from the file: nothing is allocated for one that its bytes do not bear out.
@@ -276,6 +316,34 @@ fn check_bytes(format: SampleFormat, count: usize, bytes: &[u8]) -> Result<(), S
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn shared_samples_are_those_of_the_message() {
+        let sent = SweepRecording {
+            pair_id: 1,
+            attempt: 2,
+            sample_rate_hz: 96e3,
+            sample_count: 3,
+            format: SampleFormat::S24le.into(),
+            microphone: vec![4; 9],
+            loopback: vec![5; 9],
+            temperature_c: 6.5,
+        };
+        let Sweep { pair_id, attempt, sample_rate_hz, sample_count, format, microphone, loopback, temperature_c } =
+            Sweep::decode(Bytes::from(sent.encode_to_vec())).expect("the same message");
+        let (microphone, loopback) = (microphone.to_vec(), loopback.to_vec());
+        let received = SweepRecording {
+            pair_id,
+            attempt,
+            sample_rate_hz,
+            sample_count,
+            format,
+            microphone,
+            loopback,
+            temperature_c,
+        };
+        assert_eq!(received, sent);
+    }
 
     #[test]
     fn counts_that_the_bytes_do_not_bear_out_are_refused() {

@@ -6,7 +6,7 @@
 use std::collections::HashSet;
 use std::sync::Arc;
 
-use bytes::{Bytes, BytesMut};
+use bytes::Bytes;
 use crc32fast::Hasher as Crc32;
 use mcap::records::Record;
 use object_store::path::Path;
@@ -19,8 +19,8 @@ use crate::record_shape::{self, Frame, PREFIX, Shape, opcode};
 const MAGIC: &[u8; 8] = b"\x89MCAP0\r\n";
 /// Opcode and length in front of every record.
 const FRAME: u64 = record_shape::FRAME as u64;
-/// How much is fetched at a time.
-const BLOCK: u64 = 8 << 20;
+/// How much is fetched at a time: a few chunks, which stay in memory while one of them is in use.
+const BLOCK: u64 = 4 << 20;
 /// Bytes from the footer's frame to the end of the file.
 const FOOTER: u64 = FRAME + 20 + MAGIC.len() as u64;
 
@@ -70,7 +70,7 @@ pub(crate) struct RunReader {
     /// Where the chunks began that were given out.
     chunks: HashSet<u64>,
     /// What is fetched of the file from `offset` on.
-    buffer: BytesMut,
+    buffer: Bytes,
     /// How far the file is in the digest; a search may begin before it.
     hashed: u64,
     digest: Sha256,
@@ -105,7 +105,7 @@ impl RunReader {
             offset: 0,
             doubtful: None,
             chunks: HashSet::new(),
-            buffer: BytesMut::new(),
+            buffer: Bytes::new(),
             hashed: 0,
             digest: Sha256::new(),
             crc: Crc32::new(),
@@ -305,16 +305,15 @@ impl RunReader {
         Ok(None)
     }
 
-    /// Fetches, so that the buffer has the next `count` bytes; the file has them.
+    /// Fetches, so that the buffer has the next `count` bytes; the file has them. What was left of the buffer is fetched
+    /// once more: that is less than to copy all behind it.
     async fn fill(&mut self, count: u64) -> Result<()> {
-        let count = count as usize;
-        if self.buffer.len() < count {
-            let from = self.offset + self.buffer.len() as u64;
-            let to = (from + BLOCK.max((count - self.buffer.len()) as u64)).min(self.size);
-            let fetched = self.store.get_range(&self.path, from..to).await.map_err(|e| Error::read(&self.name, e))?;
-            self.buffer.extend_from_slice(&fetched);
+        if (self.buffer.len() as u64) < count {
+            let to = (self.offset + BLOCK.max(count)).min(self.size);
+            let fetched = self.store.get_range(&self.path, self.offset..to).await;
+            self.buffer = fetched.map_err(|e| Error::read(&self.name, e))?;
         }
-        if self.buffer.len() < count {
+        if (self.buffer.len() as u64) < count {
             return Err(Error::read(&self.name, "it became shorter while it was read"));
         }
         Ok(())
@@ -322,7 +321,7 @@ impl RunReader {
 
     /// Takes the next `count` bytes, which the buffer has.
     fn skip(&mut self, count: u64, counts_in_crc: bool) -> Bytes {
-        let passed = self.buffer.split_to(count as usize).freeze();
+        let passed = self.buffer.split_to(count as usize);
         self.offset += count;
         // What a search goes over once more is in the sums already.
         let fresh = self.offset.saturating_sub(self.hashed).min(count);

@@ -1,0 +1,134 @@
+//! The lake's Parquet files by themselves: their rows read back, and written again by the parquet crate alone.
+
+use arrow::array::RecordBatchReader as _;
+use arrow::datatypes::SchemaRef;
+use arrow::record_batch::RecordBatch;
+use bytes::Bytes;
+use echolake_lake::{FileName, Lake, VisibleRun};
+use echolake_schema::tables::{Source, Table};
+use object_store::ObjectStoreExt as _;
+use parquet::arrow::ArrowWriter;
+use parquet::arrow::arrow_reader::ParquetRecordBatchReaderBuilder;
+use parquet::arrow::arrow_writer::ArrowWriterOptions;
+use parquet::basic::{Compression, Encoding, Type, ZstdLevel};
+use parquet::errors::Result as ParquetResult;
+use parquet::file::metadata::ParquetMetaData;
+use parquet::file::properties::{EnabledStatistics, WriterProperties, WriterPropertiesBuilder};
+
+/// The lake's level of zstd and its page size, which its files do not tell.
+pub(crate) const LEVEL: i32 = 3;
+pub(crate) const PAGE_BYTES: usize = 128 * 1024;
+/// Rows in a batch, about as many as ingest encodes at a time.
+const BATCH_ROWS: usize = 512;
+
+/// A file that ingest wrote.
+pub(crate) struct Stored {
+    pub(crate) table: Table,
+    /// It is of a reference's run.
+    pub(crate) of_reference: bool,
+    pub(crate) bytes: Bytes,
+}
+
+/// A file's rows, and how they were written.
+pub(crate) struct Rows {
+    pub(crate) table: Table,
+    pub(crate) of_reference: bool,
+    pub(crate) schema: SchemaRef,
+    pub(crate) batches: Vec<RecordBatch>,
+    pub(crate) properties: WriterProperties,
+    /// Size as it was.
+    pub(crate) bytes: u64,
+    /// Its numbers as raw f32 and f64.
+    pub(crate) raw: u64,
+}
+
+/// How columns of numbers are encoded.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Numbers {
+    /// As in the file.
+    AsStored,
+    Plain,
+    Dictionary,
+}
+
+pub(crate) fn zstd(level: i32) -> Compression {
+    Compression::ZSTD(ZstdLevel::try_new(level).unwrap_or_default())
+}
+
+/// All files that ingest wrote.
+pub(crate) async fn files(lake: &Lake) -> anyhow::Result<Vec<Stored>> {
+    let snapshot = lake.snapshot().await?;
+    let mut found = Vec::new();
+    for table in Table::ALL.into_iter().filter(|t| t.source() != Source::Rig) {
+        for file in snapshot.files(table) {
+            let references = &lake.config().references;
+            let of_reference = match FileName::parse(&file.path) {
+                Some(FileName::Rows { surface, .. } | FileName::Pointer(VisibleRun { surface, .. })) => {
+                    surface == references.flat || surface == references.foam
+                }
+                _ => false,
+            };
+            let bytes = lake.store().get(&file.path).await?.bytes().await?;
+            found.push(Stored { table, of_reference, bytes });
+        }
+    }
+    Ok(found)
+}
+
+impl Rows {
+    pub(crate) fn read(&Stored { table, of_reference, bytes: ref file }: &Stored) -> anyhow::Result<Self> {
+        let builder = ParquetRecordBatchReaderBuilder::try_new(file.clone())?.with_batch_size(BATCH_ROWS);
+        let properties = builder_as(builder.metadata(), Numbers::AsStored).set_data_page_size_limit(PAGE_BYTES).build();
+        let raw = raw_bytes(builder.metadata());
+        let reader = builder.build()?;
+        let schema = reader.schema();
+        let batches = reader.collect::<Result<_, _>>()?;
+        Ok(Self { table, of_reference, schema, batches, properties, bytes: file.len() as u64, raw })
+    }
+
+    /// Writes them with the parquet crate and nothing else.
+    pub(crate) fn write(&self, properties: &WriterProperties) -> ParquetResult<Vec<u8>> {
+        let options = ArrowWriterOptions::new().with_properties(properties.clone()).with_skip_arrow_metadata(true);
+        let mut writer = ArrowWriter::try_new_with_options(Vec::new(), self.schema.clone(), options)?;
+        self.batches.iter().try_for_each(|batch| writer.write(batch))?;
+        writer.into_inner()
+    }
+}
+
+/// Reads all rows, and returns how many they are.
+pub(crate) fn read_all(file: &Bytes) -> anyhow::Result<usize> {
+    let reader = ParquetRecordBatchReaderBuilder::try_new(file.clone())?.with_batch_size(BATCH_ROWS).build()?;
+    reader.map(|batch| Ok(batch?.num_rows())).sum()
+}
+
+/// Bytes of a file's floating-point values, without any encoding.
+pub(crate) fn raw_bytes(metadata: &ParquetMetaData) -> u64 {
+    let columns = metadata.row_groups().iter().flat_map(|group| group.columns());
+    let raw = columns.map(|column| match column.column_type() {
+        Type::FLOAT => 4 * column.num_values() as u64,
+        Type::DOUBLE => 8 * column.num_values() as u64,
+        _ => 0,
+    });
+    raw.sum()
+}
+
+/// What a file says of how it was written, its numbers' encoding apart; compressed as the lake's files are.
+pub(crate) fn builder_as(metadata: &ParquetMetaData, numbers: Numbers) -> WriterPropertiesBuilder {
+    let mut builder =
+        WriterProperties::builder().set_compression(zstd(LEVEL)).set_statistics_enabled(EnabledStatistics::Page);
+    let Some(group) = metadata.row_groups().first() else { return builder };
+    builder = builder.set_max_row_group_row_count(Some(group.num_rows().max(1) as usize));
+    for column in group.columns() {
+        let path = column.column_path().clone();
+        let split = column.encodings().any(|e| e == Encoding::BYTE_STREAM_SPLIT);
+        if split && numbers != Numbers::Dictionary {
+            let encoding = if numbers == Numbers::Plain { Encoding::PLAIN } else { Encoding::BYTE_STREAM_SPLIT };
+            builder =
+                builder.set_column_encoding(path.clone(), encoding).set_column_dictionary_enabled(path.clone(), false);
+        }
+        if column.statistics().is_none() {
+            builder = builder.set_column_statistics_enabled(path, EnabledStatistics::None);
+        }
+    }
+    builder
+}
