@@ -25,7 +25,7 @@ pub(crate) const TABLES: [(&str, &str); 12] = [
     ("heightmaps", "surface_id, symmetry"),
     ("environment", "run_id, log_time_ns"),
     ("events", "run_id, log_time_ns, message"),
-    ("surface_stats", "surface_id, band"),
+    ("surface_stats", "surface_id, band, run_id"),
 ];
 
 /// How a campaign went.
