@@ -4,6 +4,7 @@ use std::path::PathBuf;
 
 use clap::{Args, Parser, Subcommand};
 use echolake_acquisition::collection::LARGEST;
+use echolake_lake::{KEEP_HOURS, TARGET_BYTES};
 use echolake_schema::SurfaceId;
 
 use crate::commands::sql::SqlArgs;
@@ -36,6 +37,10 @@ pub(crate) enum Command {
     Sql(SqlArgs),
     /// Say what is in the lake, what is missing and what is damaged.
     Doctor(DoctorArgs),
+    /// Merge the tables' small files into large ones; ingest and queries may go on.
+    Optimize(OptimizeArgs),
+    /// Delete files that are in no table any more, and what crashes left behind.
+    Vacuum(VacuumArgs),
     /// Print a completion script for a shell.
     Completions {
         /// The shell.
@@ -145,6 +150,30 @@ pub(crate) struct IngestArgs {
 #[derive(Debug, Args)]
 pub(crate) struct DoctorArgs {
     /// Print the report as JSON.
+    #[arg(long)]
+    pub(crate) json: bool,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct OptimizeArgs {
+    /// Size of the merged files in MB; files of half of it and more are left alone.
+    #[arg(long, value_name = "MB", default_value_t = TARGET_BYTES >> 20, value_parser = clap::value_parser!(u64).range(1..=1024))]
+    pub(crate) target_mb: u64,
+    /// Print what was done as JSON.
+    #[arg(long)]
+    pub(crate) json: bool,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct VacuumArgs {
+    /// Keep files that went out of their table less than this long ago: longer than any query runs. 168 at most,
+    /// because a table's log forgets after a week when that was.
+    #[arg(long, value_name = "HOURS", default_value_t = KEEP_HOURS, value_parser = clap::value_parser!(u32).range(0..=KEEP_HOURS as i64))]
+    pub(crate) keep_hours: u32,
+    /// Only say what would be deleted.
+    #[arg(long)]
+    pub(crate) dry_run: bool,
+    /// Print what was done as JSON.
     #[arg(long)]
     pub(crate) json: bool,
 }

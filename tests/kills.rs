@@ -13,7 +13,7 @@ use super::SMALL_RIG;
 /// Surfaces of the lake: references and what waits for them, in an order that a run must not depend on.
 const SURFACES: [&str; 6] = ["wood", "flat", "prd", "foam", "brick", "wavy"];
 /// Every table, with the order that makes its rows comparable.
-const TABLES: [(&str, &str); 12] = [
+pub(crate) const TABLES: [(&str, &str); 12] = [
     ("surfaces", "surface_id"),
     ("runs", "run_id"),
     ("points", "point_id"),
@@ -25,7 +25,7 @@ const TABLES: [(&str, &str); 12] = [
     ("heightmaps", "surface_id, symmetry"),
     ("environment", "run_id, log_time_ns"),
     ("events", "run_id, log_time_ns, message"),
-    ("surface_stats", "surface_id, band"),
+    ("surface_stats", "surface_id, band, run_id"),
 ];
 
 /// How a campaign went.

@@ -4,6 +4,7 @@ mod bad_input;
 mod end_to_end;
 mod kills;
 mod load;
+mod maintenance;
 mod real_data;
 mod small_rig;
 

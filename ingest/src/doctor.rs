@@ -110,7 +110,7 @@ pub async fn examine(lake: &Lake, progress: &mut dyn FnMut(Step<'_>)) -> Result<
         report.tables.push(TableReport {
             table: table.name(),
             files: files.len(),
-            rows: files.iter().map(|f| f.rows).sum(),
+            rows: files.iter().map(DataFile::visible_rows).sum(),
             bytes: files.iter().map(|f| f.bytes).sum(),
         });
     }
@@ -222,7 +222,7 @@ async fn find_strays(lake: &Lake, snapshot: &Snapshot, report: &mut Report) -> R
     }
     if left_behind.0 > 0 {
         let what = format!(
-            "{} files ({} bytes) of older derivations or of an ingest that was cut off",
+            "{} files ({} bytes) of older derivations or of an ingest that was cut off; hint: `echolake vacuum`",
             left_behind.0, left_behind.1
         );
         report.find(Severity::Note, "tables", what);

@@ -7,6 +7,7 @@ use arrow::record_batch::RecordBatch;
 use echolake_lake::{DataFile, Lake, Snapshot};
 use echolake_schema::RunId;
 use echolake_schema::tables::Table;
+use futures::TryStreamExt as _;
 use object_store::ObjectStoreExt as _;
 use parquet::arrow::ProjectionMask;
 use parquet::arrow::arrow_reader::{ArrowReaderOptions, ParquetRecordBatchReaderBuilder};
@@ -19,7 +20,7 @@ pub(crate) async fn responses(lake: &Lake, snapshot: &Snapshot, run: &RunId) -> 
     let mut out = Responses::default();
     let files: Vec<_> = snapshot.files_of(Table::Measurements, run).cloned().collect();
     for file in files {
-        for batch in batches(lake, Table::Measurements, &file, &["pair_id", "ir"]).await? {
+        for batch in responses_in(lake, &file, run).await? {
             let lost = |what: &str| Error::DataFile { file: file.path.to_string(), reason: format!("no `{what}`") };
             let pairs = batch.column_by_name("pair_id").ok_or_else(|| lost("pair_id"))?.as_primitive::<Int32Type>();
             let irs = batch.column_by_name("ir").ok_or_else(|| lost("ir"))?.as_list::<i32>();
@@ -33,6 +34,16 @@ pub(crate) async fn responses(lake: &Lake, snapshot: &Snapshot, run: &RunId) -> 
         return Err(Error::DataFile { file: format!("tables/measurements, run {run}"), reason });
     }
     Ok(out)
+}
+
+// A file of the run alone is read whole, and with it its checks; of a merged one the run's pages are.
+async fn responses_in(lake: &Lake, file: &DataFile, run: &RunId) -> Result<Vec<RecordBatch>> {
+    let columns = ["pair_id", "ir"];
+    let place = file.visible_parts().find(|(part, _)| part.run == *run).map(|(_, rows)| rows);
+    match place {
+        Some(rows) => Ok(lake.rows(Table::Measurements, file, &columns, rows).await?.try_collect().await?),
+        None => batches(lake, Table::Measurements, file, &columns).await,
+    }
 }
 
 /// A run's row of `runs`.

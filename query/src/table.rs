@@ -1,5 +1,6 @@
 //! A table of the lake as DataFusion sees it: a plain Parquet scan over the files of one snapshot.
 
+use std::collections::BTreeSet;
 use std::sync::Arc;
 
 use arrow::datatypes::{DataType, SchemaRef};
@@ -16,12 +17,18 @@ use datafusion::datasource::source::DataSourceExec;
 use datafusion::error::Result;
 use datafusion::execution::object_store::ObjectStoreUrl;
 use datafusion::logical_expr::{Expr, TableProviderFilterPushDown};
+use datafusion::physical_expr::PhysicalExpr;
+use datafusion::physical_expr::expressions::{Column, in_list, lit};
 use datafusion::physical_plan::ExecutionPlan;
+use datafusion::physical_plan::filter::{FilterExec, FilterExecBuilder};
+use datafusion::physical_plan::union::UnionExec;
 use echolake_lake::DataFile;
 use object_store::ObjectMeta;
 
 /// Delta's writers cut texts in statistics to 32 characters; a shorter one is whole, whoever wrote it.
 const WHOLE_TEXT: usize = 32;
+/// The column that tells the runs of a merged file apart.
+const RUN: &str = "run_id";
 
 /// Files of one table in one snapshot.
 #[derive(Debug)]
@@ -45,17 +52,58 @@ impl LakeTable {
         Self { schema, files, source }
     }
 
-    // Whole files in groups of about the same size; a file is split further by DataFusion where that pays.
-    fn groups(&self, count: usize) -> Vec<FileGroup> {
-        let mut groups: Vec<(u64, Vec<PartitionedFile>)> =
-            vec![(0, Vec::new()); count.clamp(1, self.files.len().max(1))];
-        for file in &self.files {
+    // A plain scan of files, in groups of about the same size; a file is split further by DataFusion where that pays.
+    fn files(
+        &self,
+        files: &[&DataFile],
+        state: &dyn Session,
+        projection: Option<Vec<usize>>,
+        limit: Option<usize>,
+    ) -> Result<Arc<dyn ExecutionPlan>> {
+        let count = state.config().target_partitions();
+        let mut groups: Vec<(u64, Vec<PartitionedFile>)> = vec![(0, Vec::new()); count.clamp(1, files.len().max(1))];
+        for file in files {
             if let Some((bytes, group)) = groups.iter_mut().min_by_key(|g| g.0) {
                 *bytes += file.bytes;
                 group.push(self.file(file));
             }
         }
-        groups.into_iter().map(|(_, files)| FileGroup::new(files)).collect()
+        let mut statistics = Statistics::new_unknown(&self.schema);
+        statistics.num_rows = Precision::Exact(files.iter().map(|f| f.rows as usize).sum());
+        let source = ParquetSource::new(self.schema.clone())
+            .with_table_parquet_options(state.table_options().parquet.clone())
+            .with_parquet_file_reader_factory(self.source.reader.clone())
+            .with_pushdown_filters(self.reads_lists(projection.as_ref()));
+        let config = FileScanConfigBuilder::new(self.source.url.clone(), Arc::new(source))
+            .with_file_groups(groups.into_iter().map(|(_, files)| FileGroup::new(files)).collect())
+            .with_statistics(statistics)
+            .with_projection_indices(projection)?
+            .with_limit(limit)
+            .build();
+        Ok(DataSourceExec::from_data_source(config))
+    }
+
+    // Merged files with runs that are replaced since: the same scan without their rows. The limit counts rows that
+    // stay, so it is not the scan's.
+    fn partly_hidden(
+        &self,
+        files: &[&DataFile],
+        state: &dyn Session,
+        projection: Option<&Vec<usize>>,
+    ) -> Result<Arc<dyn ExecutionPlan>> {
+        let mut columns = projection.cloned().unwrap_or_else(|| (0..self.schema.fields().len()).collect());
+        let wanted: Vec<_> = (0..columns.len()).collect();
+        let run = self.schema.index_of(RUN)?;
+        let at = columns.iter().position(|c| *c == run).unwrap_or_else(|| {
+            columns.push(run);
+            columns.len() - 1
+        });
+        let scan = self.files(files, state, Some(columns), None)?;
+        let hidden: BTreeSet<_> = files.iter().flat_map(|f| f.hidden.iter().map(|r| r.as_str())).collect();
+        let hidden: Vec<Arc<dyn PhysicalExpr>> = hidden.into_iter().map(lit).collect();
+        let shown = in_list(Arc::new(Column::new(RUN, at)), hidden, &true, &scan.schema())?;
+        let filter: FilterExec = FilterExecBuilder::new(shown, scan).apply_projection(Some(wanted))?.build()?;
+        Ok(Arc::new(filter))
     }
 
     fn file(&self, file: &DataFile) -> PartitionedFile {
@@ -87,7 +135,7 @@ impl LakeTable {
     }
 
     fn rows(&self) -> Statistics {
-        let rows: u64 = self.files.iter().map(|f| f.rows).sum();
+        let rows: u64 = self.files.iter().map(DataFile::visible_rows).sum();
         let mut statistics = Statistics::new_unknown(&self.schema);
         statistics.num_rows = Precision::Exact(rows as usize);
         statistics
@@ -140,16 +188,14 @@ impl TableProvider for LakeTable {
         _filters: &[Expr],
         limit: Option<usize>,
     ) -> Result<Arc<dyn ExecutionPlan>> {
-        let source = ParquetSource::new(self.schema.clone())
-            .with_table_parquet_options(state.table_options().parquet.clone())
-            .with_parquet_file_reader_factory(self.source.reader.clone())
-            .with_pushdown_filters(self.reads_lists(projection));
-        let config = FileScanConfigBuilder::new(self.source.url.clone(), Arc::new(source))
-            .with_file_groups(self.groups(state.config().target_partitions()))
-            .with_statistics(self.rows())
-            .with_projection_indices(projection.cloned())?
-            .with_limit(limit)
-            .build();
-        Ok(DataSourceExec::from_data_source(config))
+        let (whole, partial): (Vec<_>, Vec<_>) = self.files.iter().partition(|f| f.hidden.is_empty());
+        if partial.is_empty() {
+            return self.files(&whole, state, projection.cloned(), limit);
+        }
+        let partial = self.partly_hidden(&partial, state, projection)?;
+        if whole.is_empty() {
+            return Ok(partial);
+        }
+        UnionExec::try_new(vec![self.files(&whole, state, projection.cloned(), limit)?, partial])
     }
 }

@@ -29,10 +29,10 @@ pub(crate) async fn run(args: &DoctorArgs, lake_url: &str) -> anyhow::Result<Don
 
 fn text(lake: &Lake, report: &Report) -> String {
     let mut out = format!("lake {}, rig {}\n", lake.location(), lake.rig().name);
-    let _ = writeln!(out, "{} runs, {} in run files\n", report.runs, bytes(report.run_bytes));
+    let _ = writeln!(out, "{} runs, {} in run files\n", report.runs, super::size(report.run_bytes));
     let _ = writeln!(out, "{:<14} {:>6} {:>10} {:>10}", "table", "files", "rows", "size");
     for t in &report.tables {
-        let _ = writeln!(out, "{:<14} {:>6} {:>10} {:>10}", t.table, t.files, t.rows, bytes(t.bytes));
+        let _ = writeln!(out, "{:<14} {:>6} {:>10} {:>10}", t.table, t.files, t.rows, super::size(t.bytes));
     }
     for Finding { severity, subject, what } in &report.findings {
         let word = match severity {
@@ -46,12 +46,4 @@ fn text(lake: &Lake, report: &Report) -> String {
         let _ = write!(out, "\nnothing is missing or damaged");
     }
     out
-}
-
-fn bytes(count: u64) -> String {
-    match count {
-        0..1_000_000 => format!("{:.1} kB", count as f64 / 1e3),
-        1_000_000..1_000_000_000 => format!("{:.1} MB", count as f64 / 1e6),
-        _ => format!("{:.2} GB", count as f64 / 1e9),
-    }
 }

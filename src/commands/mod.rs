@@ -5,8 +5,10 @@ mod demo;
 mod doctor;
 mod import;
 mod ingest;
+mod optimize;
 mod panel;
 pub(crate) mod sql;
+mod vacuum;
 
 use std::path::Path;
 use std::sync::Arc;
@@ -31,6 +33,8 @@ pub(crate) async fn run(cli: Cli) -> anyhow::Result<Done> {
         Command::Ingest(args) => ingest::run(args, lake).await,
         Command::Sql(args) => sql::run(args, lake).await.map(|()| Done::Whole),
         Command::Doctor(args) => doctor::run(args, lake).await,
+        Command::Optimize(args) => optimize::run(args, lake).await,
+        Command::Vacuum(args) => vacuum::run(args, lake).await,
         Command::Completions { shell } => {
             clap_complete::generate(*shell, &mut Cli::command(), "echolake", &mut std::io::stdout());
             Ok(Done::Whole)
@@ -42,6 +46,15 @@ pub(crate) async fn run(cli: Cli) -> anyhow::Result<Done> {
 fn print(text: &str) -> std::io::Result<()> {
     use std::io::Write as _;
     writeln!(std::io::stdout().lock(), "{text}")
+}
+
+/// A size for people.
+fn size(bytes: u64) -> String {
+    match bytes {
+        0..1_000_000 => format!("{:.1} kB", bytes as f64 / 1e3),
+        1_000_000..1_000_000_000 => format!("{:.1} MB", bytes as f64 / 1e6),
+        _ => format!("{:.2} GB", bytes as f64 / 1e9),
+    }
 }
 
 /// The rig of a file; else the lake's; else `otherwise`.

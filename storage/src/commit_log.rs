@@ -1,8 +1,12 @@
 //! What the lake asks of a commit log. Delta stands behind it; see `delta.rs`.
 
+use std::collections::{HashMap, HashSet};
+use std::ops::Range;
+
 use async_trait::async_trait;
 use chrono::{DateTime, Utc};
 use echolake_schema::tables::Table;
+use echolake_schema::{RunId, SurfaceId};
 use object_store::path::Path;
 use serde_json::{Map, Value};
 
@@ -21,6 +25,42 @@ pub struct DataFile {
     pub modified: DateTime<Utc>,
     /// Least and greatest values, where the log has them.
     pub stats: Option<FileStats>,
+    /// Where it was merged from files of several runs: those, in the order of their rows, which are contiguous.
+    pub parts: Vec<Part>,
+    /// The runs of parts that a snapshot does not show; empty as the log gives it.
+    pub hidden: Vec<RunId>,
+}
+
+/// The rows of one run in a file that was merged from several.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Part {
+    /// The run's surface.
+    pub surface: SurfaceId,
+    /// The run.
+    pub run: RunId,
+    /// Digest of what the rows were made from.
+    pub derivation: String,
+    /// How many they are.
+    pub rows: u64,
+}
+
+impl DataFile {
+    /// Rows that readers see.
+    pub fn visible_rows(&self) -> u64 {
+        let hidden = self.parts.iter().filter(|p| self.hidden.contains(&p.run)).map(|p| p.rows).sum();
+        self.rows.saturating_sub(hidden)
+    }
+
+    /// The parts that readers see, each with where its rows stand in the file.
+    pub fn visible_parts(&self) -> impl Iterator<Item = (&Part, Range<u64>)> {
+        let mut end = 0;
+        let placed = self.parts.iter().map(move |part| {
+            let start = end;
+            end += part.rows;
+            (part, start..end)
+        });
+        placed.filter(|(part, _)| !self.hidden.contains(&part.run))
+    }
 }
 
 /// Least and greatest values of a file's columns, by name, as in Delta's log.
@@ -43,15 +83,27 @@ pub struct NewFile {
     pub stats: String,
     /// What it takes the place of, where it does.
     pub replaces: Option<Replaces>,
+    /// What it was merged from, where it was.
+    pub parts: Vec<Part>,
 }
 
 /// The files that a new one takes the place of. Where others stand there by now, it is not added.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Replaces {
-    /// What the names of all files in that place begin with.
-    pub prefix: String,
+    /// What the names of all files in that place begin with; None where the names alone are the place.
+    pub prefix: Option<String>,
     /// The names that are expected there; they go with the same commit.
     pub names: Vec<String>,
+}
+
+/// What a commit is to a reader that follows a table.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Effect {
+    /// Rows come or go.
+    #[default]
+    Rows,
+    /// The same rows stand in other files.
+    Layout,
 }
 
 /// One change of one table: all of it or nothing.
@@ -61,6 +113,17 @@ pub struct Commit {
     pub add: Vec<NewFile>,
     /// Files that go; one that is already gone is passed over.
     pub remove: Vec<Path>,
+    /// What it is to readers.
+    pub effect: Effect,
+}
+
+/// The names of a table's files, as the log knows them.
+#[derive(Debug, Clone, Default)]
+pub struct History {
+    /// Those that are in the table.
+    pub current: HashSet<String>,
+    /// Those that were, and when they went. The log forgets them after a week.
+    pub removed: HashMap<String, DateTime<Utc>>,
 }
 
 /// What became of a new file.
@@ -83,6 +146,8 @@ pub trait CommitLog: Send + Sync + std::fmt::Debug {
     async fn files(&self, table: Table) -> Result<Vec<DataFile>>;
     /// Whether a file of this name is in the log.
     async fn has(&self, table: Table, name: &str) -> Result<bool>;
+    /// What the log names and named; None where there is no log.
+    async fn history(&self, table: Table) -> Result<Option<History>>;
     /// Makes a change; says for each new file, in order, what became of it. The same change again adds nothing.
     async fn commit(&self, table: Table, commit: &Commit) -> Result<Vec<Committed>>;
 }

@@ -7,7 +7,9 @@ use arrow::datatypes::{DataType as ArrowType, Field, SchemaRef};
 use async_trait::async_trait;
 use chrono::{DateTime, Utc};
 use deltalake_core::kernel::transaction::{CommitBuilder, CommitConflictError, CommitProperties, TransactionError};
-use deltalake_core::kernel::{Action, Add, ArrayType, DataType, MetadataValue, Remove, StructField, Transaction};
+use deltalake_core::kernel::{
+    Action, Add, ArrayType, DataType, LogicalFileView, MetadataValue, Remove, StructField, Transaction,
+};
 use deltalake_core::logstore::{LogStoreRef, StorageConfig, default_logstore};
 use deltalake_core::operations::create::CreateBuilder;
 use deltalake_core::protocol::{DeltaOperation, SaveMode};
@@ -22,10 +24,16 @@ use serde_json::{Map, Value};
 use tokio::sync::Mutex;
 use url::Url;
 
-use crate::{Commit, CommitLog, Committed, DataFile, Error, FileStats, NewFile, Result};
+use crate::snapshot::{decode_parts, encode_parts, is_merged};
+use crate::{Commit, CommitLog, Committed, DataFile, Effect, Error, FileStats, History, NewFile, Part, Result};
 
 /// Tries of one commit against other writers; each loses to a commit that went through.
 const COMMIT_TRIES: usize = 50;
+/// The tag of a merged file's Add that holds its parts.
+const PARTS: &str = "echolake.parts";
+/// The application of all commits that take files away. Delta does not compare Removes that change no data with
+/// those of others, so that two merges at once would double rows; of two commits of one application it tells.
+const REMOVALS: &str = "echolake.removals";
 
 /// The tables' Delta logs under `tables/`.
 #[derive(Debug)]
@@ -96,21 +104,31 @@ impl DeltaLog {
 
     async fn try_commit(&self, delta: &DeltaTable, change: &Change<'_>) -> std::result::Result<(), DeltaTableError> {
         let now = Utc::now().timestamp_millis();
-        let mut actions: Vec<_> = change.add.iter().map(|f| Action::Add(add(f, now))).collect();
-        actions.extend(change.remove.iter().map(|name| Action::Remove(remove(name, now))));
+        let effect = change.effect;
+        let mut actions: Vec<_> = change.add.iter().map(|f| Action::Add(add(f, now, effect))).collect();
+        actions.extend(change.remove.iter().map(|name| Action::Remove(remove(name, now, effect))));
         // The ids only record. They make Delta tell of a conflict with a commit of the same ones; what is in the log
         // already is ours to see before each try.
         let mut properties = CommitProperties::default();
         for file in &change.add {
             properties = properties.with_application_transaction(Transaction::new(&file.name, 1));
-            if let Some(replaces) = &file.replaces {
-                properties = properties.with_application_transaction(Transaction::new(&replaces.prefix, 1));
+            if let Some(prefix) = file.replaces.as_ref().and_then(|r| r.prefix.as_ref()) {
+                properties = properties.with_application_transaction(Transaction::new(prefix, 1));
             }
+        }
+        if !change.remove.is_empty() {
+            properties = properties.with_application_transaction(Transaction::new(REMOVALS, 1));
         }
         // Without a predicate Delta would not compare our Removes with what others add.
         let predicate = (!change.remove.is_empty()).then(|| "true".to_owned());
         let mode = if predicate.is_some() { SaveMode::Overwrite } else { SaveMode::Append };
-        let operation = DeltaOperation::Write { mode, partition_by: None, predicate };
+        let operation = match effect {
+            Effect::Rows => DeltaOperation::Write { mode, partition_by: None, predicate },
+            Effect::Layout => {
+                let bytes = change.add.iter().map(|f| f.bytes).max().unwrap_or(0);
+                DeltaOperation::Optimize { predicate: None, target_size: i64::try_from(bytes).unwrap_or(i64::MAX) }
+            }
+        };
         CommitBuilder::from(properties)
             .with_actions(actions)
             .build(Some(delta.snapshot()?), delta.log_store(), operation)
@@ -124,12 +142,14 @@ struct Change<'a> {
     outcomes: Vec<Committed>,
     add: Vec<&'a NewFile>,
     remove: BTreeSet<String>,
+    effect: Effect,
 }
 
 impl<'a> Change<'a> {
     fn of(commit: &'a Commit, mut names: HashSet<String>) -> Self {
         let gone = commit.remove.iter().filter_map(Path::filename).filter(|n| names.contains(*n));
-        let mut change = Self { outcomes: Vec::new(), add: Vec::new(), remove: gone.map(str::to_owned).collect() };
+        let remove = gone.map(str::to_owned).collect();
+        let mut change = Self { outcomes: Vec::new(), add: Vec::new(), remove, effect: commit.effect };
         for file in &commit.add {
             let outcome = change.outcome(file, &names);
             if outcome == Committed::Now {
@@ -151,9 +171,12 @@ impl<'a> Change<'a> {
             return Committed::Before;
         }
         let Some(replaces) = &file.replaces else { return Committed::Now };
-        let there = names.iter().filter(|n| n.starts_with(&replaces.prefix)).count();
         let expected = replaces.names.iter().all(|n| names.contains(n));
-        if expected && there == replaces.names.len() { Committed::Now } else { Committed::Outdated }
+        let alone = replaces
+            .prefix
+            .as_ref()
+            .is_none_or(|prefix| names.iter().filter(|n| n.starts_with(prefix)).count() == replaces.names.len());
+        if expected && alone { Committed::Now } else { Committed::Outdated }
     }
 }
 
@@ -188,17 +211,19 @@ impl CommitLog for DeltaLog {
         let state = delta.snapshot().map_err(broken)?;
         let log_store = delta.log_store();
         let views = state.snapshot().file_views(log_store.as_ref(), None);
-        let mut files: Vec<_> = views
-            .map_ok(|view| DataFile {
+        let views: Vec<_> = views.try_collect().await.map_err(broken)?;
+        let mut files = Vec::with_capacity(views.len());
+        for view in views {
+            files.push(DataFile {
                 path: folder(table).join(view.path().as_ref()),
                 bytes: u64::try_from(view.size()).unwrap_or(0),
                 rows: view.num_records().unwrap_or(0) as u64,
                 modified: view.modification_datetime().unwrap_or(DateTime::UNIX_EPOCH),
                 stats: view.stats().as_deref().and_then(parse_stats),
-            })
-            .try_collect()
-            .await
-            .map_err(broken)?;
+                parts: if is_merged(&view.path()) { parts(table, &view)? } else { Vec::new() },
+                hidden: Vec::new(),
+            });
+        }
         files.sort_by(|a, b| a.path.cmp(&b.path));
         Ok(files)
     }
@@ -208,6 +233,20 @@ impl CommitLog for DeltaLog {
             Some(delta) => Ok(self.names(table, &delta).await?.contains(name)),
             None => Ok(false),
         }
+    }
+
+    async fn history(&self, table: Table) -> Result<Option<History>> {
+        let Some(delta) = self.load(table).await? else { return Ok(None) };
+        let mut history = History { current: self.names(table, &delta).await?, ..History::default() };
+        let broken = |e| Error::log(table.name(), "read", e);
+        let log_store = delta.log_store();
+        let mut gone = delta.snapshot().map_err(broken)?.all_tombstones(log_store.as_ref());
+        while let Some(tombstone) = gone.try_next().await.map_err(broken)? {
+            let at = tombstone.deletion_timestamp().and_then(DateTime::from_timestamp_millis);
+            let known = history.removed.entry(tombstone.path().into_owned()).or_default();
+            *known = at.unwrap_or_default().max(*known);
+        }
+        Ok(Some(history))
     }
 
     async fn commit(&self, table: Table, commit: &Commit) -> Result<Vec<Committed>> {
@@ -246,19 +285,36 @@ fn is_conflict(error: &DeltaTableError) -> bool {
     }
 }
 
-fn add(file: &NewFile, now_millis: i64) -> Add {
+// The view has no other way to a file's tags.
+#[expect(deprecated)]
+fn parts(table: Table, view: &LogicalFileView) -> Result<Vec<Part>> {
+    let tags = view.add_action().tags.unwrap_or_default();
+    let text = tags.get(PARTS).cloned().flatten();
+    text.and_then(|text| decode_parts(&text)).ok_or_else(|| {
+        let reason = format!(
+            "`{}` has lost the list of its parts; hint: delete the table's folder, `echolake ingest` makes it anew",
+            view.path()
+        );
+        Error::Log { table: table.name(), action: "read", reason }
+    })
+}
+
+fn add(file: &NewFile, now_millis: i64, effect: Effect) -> Add {
+    let parts = (!file.parts.is_empty()).then(|| encode_parts(&file.parts));
     Add {
         path: file.name.clone(),
         size: i64::try_from(file.bytes).unwrap_or(i64::MAX),
         modification_time: now_millis,
-        data_change: true,
+        data_change: effect == Effect::Rows,
         stats: Some(file.stats.clone()),
+        tags: parts.map(|parts| HashMap::from([(PARTS.to_owned(), Some(parts))])),
         ..Add::default()
     }
 }
 
-fn remove(name: &str, now_millis: i64) -> Remove {
-    Remove { path: name.to_owned(), data_change: true, deletion_timestamp: Some(now_millis), ..Remove::default() }
+fn remove(name: &str, now_millis: i64, effect: Effect) -> Remove {
+    let data_change = effect == Effect::Rows;
+    Remove { path: name.to_owned(), data_change, deletion_timestamp: Some(now_millis), ..Remove::default() }
 }
 
 fn parse_stats(json: &str) -> Option<FileStats> {
@@ -300,10 +356,10 @@ mod tests {
 
     fn file(name: &str, replaces: Option<(&str, &[&str])>) -> NewFile {
         let replaces = replaces.map(|(prefix, names)| Replaces {
-            prefix: prefix.into(),
+            prefix: Some(prefix.to_owned()).filter(|p| !p.is_empty()),
             names: names.iter().map(|n| (*n).to_owned()).collect(),
         });
-        NewFile { name: name.into(), bytes: 1, stats: "{}".into(), replaces }
+        NewFile { name: name.into(), bytes: 1, stats: "{}".into(), replaces, parts: Vec::new() }
     }
 
     fn names(names: &[&str]) -> HashSet<String> {
@@ -315,6 +371,7 @@ mod tests {
         let commit = Commit {
             add: vec![file("a", None), file("b", None), file("b", None)],
             remove: vec![Path::from("tables/runs/c"), Path::from("tables/runs/d")],
+            effect: Effect::Rows,
         };
         let change = Change::of(&commit, names(&["a", "c"]));
         assert_eq!(change.outcomes, [Committed::Before, Committed::Now, Committed::Before]);
@@ -325,7 +382,7 @@ mod tests {
     #[test]
     fn a_file_takes_the_place_of_what_it_expects_there_and_of_nothing_else() {
         let outcomes = |add: Vec<NewFile>, there: &[&str]| {
-            let commit = Commit { add, remove: Vec::new() };
+            let commit = Commit { add, ..Commit::default() };
             let change = Change::of(&commit, names(there));
             (change.outcomes.clone(), change.remove.into_iter().collect::<Vec<_>>())
         };
@@ -334,6 +391,10 @@ mod tests {
         assert_eq!(outcomes(vec![new()], &["x.3"]), (vec![Committed::Outdated], vec![]));
         assert_eq!(outcomes(vec![new()], &["x.1", "x.3"]), (vec![Committed::Outdated], vec![]));
         assert_eq!(outcomes(vec![new()], &["x.2"]), (vec![Committed::Before], vec![]));
+        let merged = || file("m", Some(("", &["x.1", "y.1"])));
+        let gone = vec!["x.1".to_owned(), "y.1".to_owned()];
+        assert_eq!(outcomes(vec![merged()], &["x.1", "y.1", "x.2"]), (vec![Committed::Now], gone));
+        assert_eq!(outcomes(vec![merged()], &["x.1", "y.2"]), (vec![Committed::Outdated], vec![]));
         let first = |name| file(name, Some(("x.", &[])));
         assert_eq!(
             outcomes(vec![first("x.1"), first("x.2")], &[]),

@@ -91,6 +91,34 @@ pub enum Error {
         /// Why not.
         reason: String,
     },
+    /// A file of a table cannot be read.
+    #[error("`{file}` is damaged: {reason}; hint: delete the table's folder, `echolake ingest` makes it anew")]
+    DataFile {
+        /// The file.
+        file: String,
+        /// What is wrong with it.
+        reason: String,
+    },
+    /// Somebody else is at work on the lake's files.
+    #[error(
+        "`{location}` is being maintained by process {pid} on {host} (lease until {until}); hint: wait for it; where it has died, its lease ends by itself"
+    )]
+    Maintained {
+        /// The lake's location.
+        location: String,
+        /// The machine.
+        host: String,
+        /// The process there.
+        pid: u32,
+        /// When the lease ends, where it is not renewed.
+        until: String,
+    },
+    /// Somebody else has taken the lease, because it was not renewed in time.
+    #[error("the maintenance lease of `{location}` was lost; hint: nothing is half-done, run the command again")]
+    LeaseLost {
+        /// The lake's location.
+        location: String,
+    },
     /// A rig or id that is not valid.
     #[error(transparent)]
     Schema(#[from] echolake_schema::Error),

@@ -31,8 +31,8 @@ struct Inner {
 /// A file in the store that no commit names yet.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Staged {
-    table: Table,
-    file: NewFile,
+    pub(crate) table: Table,
+    pub(crate) file: NewFile,
 }
 
 impl Staged {
@@ -41,7 +41,7 @@ impl Staged {
     #[must_use]
     pub fn replacing<'a>(mut self, run: &VisibleRun, old: impl IntoIterator<Item = &'a DataFile>) -> Self {
         let names = old.into_iter().filter_map(|f| f.path.filename()).map(str::to_owned).collect();
-        self.file.replaces = Some(Replaces { prefix: run.prefix(), names });
+        self.file.replaces = Some(Replaces { prefix: Some(run.prefix()), names });
         self
     }
 }
@@ -193,11 +193,11 @@ impl Lake {
     /// # Errors
     /// What the store says.
     pub async fn stage(&self, table: Table, name: &FileName, file: EncodedFile) -> Result<Staged> {
-        let (name, replaces) = (name.compose(), None);
+        let name = name.compose();
         let path = folder(table).join(name.as_str());
         let (bytes, stats) = (file.bytes.len() as u64, file.stats);
         self.store().put(&path, file.bytes.into()).await.map_err(|e| Error::store("write", &path, e))?;
-        Ok(Staged { table, file: NewFile { name, bytes, stats, replaces } })
+        Ok(Staged { table, file: NewFile { name, bytes, stats, replaces: None, parts: Vec::new() } })
     }
 
     /// Whether a file of this name is in the table.
@@ -223,7 +223,7 @@ impl Lake {
                 continue;
             }
             let add = of.iter().map(|i| staged[*i].file.clone()).collect();
-            let done = self.log().commit(table, &Commit { add, remove: Vec::new() }).await?;
+            let done = self.log().commit(table, &Commit { add, ..Commit::default() }).await?;
             of.into_iter().zip(done).for_each(|(i, outcome)| outcomes[i] = outcome);
         }
         Ok(outcomes)
@@ -241,7 +241,8 @@ impl Lake {
         Ok(self.commit(&[staged]).await?[0])
     }
 
-    /// Takes out of the logs what no run's row names any more. The files stay for readers that hold older views.
+    /// Takes out of the logs what no run's row names any more; merged files are written anew without it. The files
+    /// stay for readers that hold older views.
     ///
     /// # Errors
     /// What the store says.
@@ -252,7 +253,11 @@ impl Lake {
             let remove: Vec<_> = snapshot.superseded(table).iter().map(|f| f.path.clone()).collect();
             if !remove.is_empty() {
                 count += remove.len();
-                self.log().commit(table, &Commit { add: Vec::new(), remove }).await?;
+                self.log().commit(table, &Commit { remove, ..Commit::default() }).await?;
+            }
+            for file in snapshot.outgrown(table) {
+                self.rewrite(table, file).await?;
+                count += 1;
             }
         }
         Ok(count)

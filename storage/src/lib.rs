@@ -23,16 +23,22 @@ mod delta;
 mod durable;
 mod error;
 mod lake;
+mod lease;
 mod location;
+mod optimize;
 mod rig_tables;
+mod rows;
 mod snapshot;
+mod vacuum;
 
-pub use commit_log::{Commit, CommitLog, Committed, DataFile, FileStats, NewFile, Replaces};
+pub use commit_log::{Commit, CommitLog, Committed, DataFile, Effect, FileStats, History, NewFile, Part, Replaces};
 pub use config::{LAKE_FORMAT, LakeConfig, References};
 pub use data_file::{EncodedFile, FileEncoder, encode};
 pub use error::{Error, StoreError};
 pub use lake::{Lake, Staged};
+pub use optimize::{Merging, Optimized, TARGET_BYTES, TableOptimized};
 pub use snapshot::{FileName, Snapshot, VisibleRun};
+pub use vacuum::{Deletion, Freed, KEEP_HOURS, Vacuumed};
 
 /// The result of what a lake does.
 pub type Result<T> = std::result::Result<T, Error>;

@@ -1,8 +1,11 @@
 //! Sessions on a small lake: answers, refusals, and what an error says.
 
-use arrow::array::AsArray as _;
-use arrow::datatypes::{Float64Type, Int64Type};
-use echolake_lake::References;
+use std::sync::atomic::AtomicBool;
+
+use arrow::array::{ArrayRef, AsArray as _, Int64Array, StringArray};
+use arrow::compute::cast;
+use arrow::datatypes::{DataType, Field, Float64Type, Int64Type};
+use echolake_lake::{FileName, References, VisibleRun, encode};
 use echolake_schema::Rig;
 use futures::TryStreamExt as _;
 
@@ -92,4 +95,78 @@ async fn errors_point_at_the_place() {
     check("select * from rums", &["no table `rums`", "did you mean `runs`"]).await;
     check("select 1; select 2", &["one statement at a time"]).await;
     check("select 1 +", &["the end of the query", "\n  select 1 +\n            ^"]).await;
+}
+
+/// Adds a run's log lines, or others in their place, as ingest does.
+async fn put_events(lake: &Lake, surface: &str, run: &str, derivation: &str, lines: usize) {
+    let pointer = VisibleRun {
+        surface: surface.parse().expect("an id"),
+        run: run.parse().expect("an id"),
+        run_derivation: derivation.into(),
+        reference_derivation: None,
+    };
+    let part = FileName::Rows {
+        surface: pointer.surface.clone(),
+        run: pointer.run.clone(),
+        derivation: derivation.to_owned(),
+    };
+    let old: Vec<_> = lake.snapshot().await.expect("a view").files_of(Table::Runs, &pointer.run).cloned().collect();
+    let mut staged = Vec::new();
+    for (table, name, count) in [(Table::Events, part, lines), (Table::Runs, FileName::Pointer(pointer.clone()), 1)] {
+        let schema = table.schema(lake.rig());
+        let column = |field: &Arc<Field>| -> ArrayRef {
+            let text = match field.name().as_str() {
+                "surface_id" => surface,
+                "run_id" => run,
+                _ => derivation,
+            };
+            match field.data_type() {
+                DataType::Utf8 => Arc::new(StringArray::from(vec![text; count])),
+                kind => cast(&(0..count as i64).collect::<Int64Array>(), kind).expect("numbers"),
+            }
+        };
+        let batch = RecordBatch::try_new(schema.clone(), schema.fields().iter().map(column).collect()).expect("rows");
+        let file = encode(table, &schema, &[batch]).expect("encoded");
+        staged.push(lake.stage(table, &name, file).await.expect("staged"));
+    }
+    let row = staged.pop().expect("the run's row").replacing(&pointer, &old);
+    staged.push(row);
+    lake.commit(&staged).await.expect("committed");
+}
+
+// Between the commit of a run's new rows and the clean-up, a merged file still holds its old ones.
+#[tokio::test]
+async fn replaced_rows_of_a_merged_file_are_not_seen() {
+    let (_folder, lake) = lake().await;
+    for (surface, run, lines) in [("flat", "r1", 3), ("foam", "r2", 5), ("wood", "r3", 7)] {
+        put_events(&lake, surface, run, "old", lines).await;
+    }
+    lake.optimize(128 << 20, &AtomicBool::new(false), &mut |_| {}).await.expect("merged");
+    let session = Session::new(&lake).expect("a session");
+    let number = async |sql: &str| rows(&session, sql).await[0].column(0).as_primitive::<Int64Type>().value(0);
+    assert_eq!(number("select count(*) from events").await, 15);
+    put_events(&lake, "foam", "r2", "new", 2).await;
+    let view = lake.snapshot().await.expect("a view");
+    let hidden: Vec<_> = view.files(Table::Events).iter().map(|f| f.hidden.len()).collect();
+    assert_eq!(hidden, [0, 1], "not cleaned up yet");
+    for (sql, expected) in [
+        ("select count(*) from events", 12),
+        ("select count(log_time_ns) from events", 12),
+        ("select count(*) from events where surface_id = 'foam'", 2),
+        ("select count(*) from events where run_id = 'r3'", 7),
+        ("select count(distinct message) from events where surface_id = 'foam'", 1),
+        ("select max(log_time_ns) from events where surface_id = 'foam'", 1),
+        ("select count(*) from (select message from events limit 100)", 12),
+        ("select count(*) from (select message from events limit 11)", 11),
+    ] {
+        assert_eq!(number(sql).await, expected, "{sql}");
+    }
+    let all = rows(&session, "select * from events order by surface_id, log_time_ns").await;
+    assert_eq!(all.iter().map(RecordBatch::num_rows).sum::<usize>(), 12);
+    assert_eq!(all[0].schema().fields().len(), Table::Events.schema(lake.rig()).fields().len());
+
+    // Rows that stand in a file of their own once more are seen once.
+    put_events(&lake, "foam", "r2", "old", 5).await;
+    put_events(&lake, "wood", "r3", "empty", 0).await;
+    assert_eq!(number("select count(*) from events").await, 8);
 }

@@ -1,0 +1,47 @@
+//! `echolake optimize`: small files of a table become large ones.
+
+use echolake_lake::{Lake, TableOptimized};
+
+use crate::Done;
+use crate::cli::OptimizeArgs;
+use crate::progress::Progress;
+
+pub(crate) async fn run(args: &OptimizeArgs, lake_url: &str) -> anyhow::Result<Done> {
+    let lake = Lake::open(lake_url).await?;
+    let stop = super::stop_on_interrupt();
+    let progress = Progress::new();
+    let mut task = None;
+    let done = lake
+        .optimize(args.target_mb << 20, &stop, &mut |at| {
+            task.get_or_insert_with(|| progress.task("optimize", at.total as u64, "files")).at(at.done as u64);
+        })
+        .await;
+    let report = done?;
+    let merged: usize = report.tables.iter().map(|t| t.merged).sum();
+    let files: usize = report.tables.iter().map(|t| t.files).sum();
+    if let Some(task) = task {
+        task.done(format!("{merged} files became {files}"));
+    }
+    match args.json {
+        true => super::print(&serde_json::to_string_pretty(&report)?)?,
+        false if report.tables.is_empty() => eprintln!("nothing to merge: no table has two small files"),
+        false => super::print(&text(&report.tables))?,
+    }
+    if report.stopped {
+        anyhow::bail!("stopped; what was merged stays so, and the same command goes on");
+    }
+    Ok(Done::Whole)
+}
+
+fn text(tables: &[TableOptimized]) -> String {
+    let head = format!("{:<14} {:>7} {:>10} {:>7} {:>10}", "table", "merged", "size", "into", "size");
+    let line = |t: &TableOptimized| {
+        let (before, after) = (super::size(t.bytes_before), super::size(t.bytes_after));
+        let outdated = match t.outdated {
+            0 => String::new(),
+            count => format!("  {count} merges dropped, ingest was faster"),
+        };
+        format!("{:<14} {:>7} {before:>10} {:>7} {after:>10}{outdated}", t.table, t.merged, t.files)
+    };
+    std::iter::once(head).chain(tables.iter().map(line)).collect::<Vec<_>>().join("\n")
+}

@@ -1,0 +1,255 @@
+//! Merges of files of made-up rows: what readers see before and after, and what others do meanwhile.
+
+use std::sync::Arc;
+
+use arrow::array::{
+    ArrayRef, BooleanArray, Float32Array, Float64Array, Int32Array, Int64Array, ListArray, StringArray,
+    TimestampMicrosecondArray,
+};
+use arrow::buffer::OffsetBuffer;
+use arrow::compute::concat_batches;
+use arrow::datatypes::{DataType, Field};
+use arrow::record_batch::RecordBatch;
+use echolake_schema::Rig;
+use object_store::ObjectStore;
+use object_store::memory::InMemory;
+use parquet::basic::Encoding;
+use parquet::file::metadata::{PageIndexPolicy, ParquetMetaDataReader};
+
+use super::*;
+use crate::{References, VisibleRun, encode};
+
+const TABLE: Table = Table::Nce;
+const ROWS: usize = 20;
+
+async fn lake(store: &Arc<InMemory>) -> Lake {
+    let store: Arc<dyn ObjectStore> = store.clone();
+    Lake::open_or_create_in(store, "a lake under test", &Rig::paper(), &References::default()).await.expect("a lake")
+}
+
+fn column(field: &Field, surface: &str, run: &str, value: usize) -> ArrayRef {
+    let numbers = || (0..ROWS).map(|row| (row * 1000 + value) as f32 * 0.37);
+    match (field.name().as_str(), field.data_type()) {
+        ("surface_id", _) => Arc::new(StringArray::from(vec![surface; ROWS])),
+        ("run_id", _) => Arc::new(StringArray::from(vec![run; ROWS])),
+        (_, DataType::Utf8) => Arc::new(StringArray::from(vec![value.to_string(); ROWS])),
+        (_, DataType::Int32) => Arc::new((0..ROWS as i32).collect::<Int32Array>()),
+        (_, DataType::Int64) => Arc::new((0..ROWS as i64).collect::<Int64Array>()),
+        (_, DataType::Float32) => Arc::new(numbers().collect::<Float32Array>()),
+        (_, DataType::Float64) => Arc::new(numbers().map(f64::from).collect::<Float64Array>()),
+        (_, DataType::Boolean) => Arc::new(BooleanArray::from(vec![true; ROWS])),
+        (_, DataType::Timestamp(..)) => Arc::new(TimestampMicrosecondArray::from(vec![0; ROWS]).with_timezone("UTC")),
+        (_, DataType::List(child)) => {
+            let items = numbers().flat_map(|x| (0..384).map(move |i| x + i as f32)).collect::<Float32Array>();
+            let offsets = OffsetBuffer::from_lengths(vec![384; ROWS]);
+            Arc::new(ListArray::new(child.clone(), offsets, Arc::new(items), None))
+        }
+        (name, kind) => panic!("{name} is {kind}"),
+    }
+}
+
+fn visible(surface: &str, run: &str, derivation: &str) -> VisibleRun {
+    VisibleRun {
+        surface: surface.parse().expect("an id"),
+        run: run.parse().expect("an id"),
+        run_derivation: "ab".into(),
+        reference_derivation: Some(derivation.into()),
+    }
+}
+
+/// Adds a run's derived rows, or others in their place, and its row in `runs`.
+async fn put(lake: &Lake, surface: &str, run: &str, derivation: &str, value: usize) {
+    let pointer = visible(surface, run, derivation);
+    let part = FileName::Rows {
+        surface: pointer.surface.clone(),
+        run: pointer.run.clone(),
+        derivation: derivation.to_owned(),
+    };
+    let old: Vec<_> = lake.snapshot().await.expect("a view").files_of(Table::Runs, &pointer.run).cloned().collect();
+    let mut staged = Vec::new();
+    for (table, name) in [(TABLE, part), (Table::Runs, FileName::Pointer(pointer.clone()))] {
+        let schema = table.schema(lake.rig());
+        let columns = schema.fields().iter().map(|f| column(f, surface, run, value)).collect();
+        let rows = RecordBatch::try_new(schema.clone(), columns).expect("rows");
+        let file = encode(table, &schema, &[rows]).expect("encoded");
+        staged.push(lake.stage(table, &name, file).await.expect("staged"));
+    }
+    let row = staged.pop().expect("the run's row").replacing(&pointer, &old);
+    staged.push(row);
+    lake.commit(&staged).await.expect("committed");
+}
+
+/// The rows that readers see, sorted by surface and run.
+async fn seen(lake: &Lake) -> RecordBatch {
+    let snapshot = lake.snapshot().await.expect("a view");
+    let mut slices: Vec<_> = snapshot.files(TABLE).iter().flat_map(slices).collect();
+    slices.sort_by(|a, b| key(&a.part).cmp(&key(&b.part)));
+    let mut batches = Vec::new();
+    for slice in slices {
+        let rows = lake.rows(TABLE, slice.file, &[], slice.rows).await.expect("a stream");
+        batches.extend(rows.try_collect::<Vec<_>>().await.expect("rows"));
+    }
+    concat_batches(&TABLE.schema(lake.rig()), &batches).expect("rows of one schema")
+}
+
+async fn files(lake: &Lake) -> Vec<DataFile> {
+    lake.log().files(TABLE).await.expect("a log")
+}
+
+async fn optimize(lake: &Lake) -> Optimized {
+    lake.optimize(TARGET_BYTES, &AtomicBool::new(false), &mut |_| {}).await.expect("merged")
+}
+
+/// Five runs, of surfaces and in an order that are not sorted.
+async fn five() -> (Arc<InMemory>, Lake) {
+    let store = Arc::new(InMemory::new());
+    let lake = lake(&store).await;
+    for (number, surface) in ["wood", "flat", "prd", "foam", "brick"].iter().enumerate() {
+        put(&lake, surface, &format!("r{number}"), "d1", number).await;
+    }
+    (store, lake)
+}
+
+#[tokio::test]
+async fn readers_see_the_same_rows_in_the_same_layout() {
+    let (store, lake) = five().await;
+    let (before, singles) = (seen(&lake).await, files(&lake).await);
+    let report = optimize(&lake).await;
+    assert_eq!((report.tables.len(), report.tables[0].merged, report.tables[0].files), (1, 5, 1), "{report:?}");
+    let merged = files(&lake).await;
+    assert_eq!(merged.len(), 1, "nothing else is left in the log");
+    let surfaces: Vec<_> = merged[0].parts.iter().map(|p| (p.surface.as_str(), p.rows)).collect();
+    assert_eq!(surfaces, ["brick", "flat", "foam", "prd", "wood"].map(|s| (s, ROWS as u64)));
+    assert!(seen(&lake).await == before, "other rows");
+    assert_eq!(merged[0].stats.as_ref().expect("statistics").max["surface_id"], "wood");
+
+    let layout = |bytes: bytes::Bytes| {
+        let mut reader = ParquetMetaDataReader::new().with_page_index_policy(PageIndexPolicy::Required);
+        reader.try_parse(&bytes).expect("metadata");
+        let metadata = reader.finish().expect("metadata");
+        let columns = metadata.row_group(0).columns().iter();
+        let layout: Vec<_> = columns
+            .map(|c| {
+                (
+                    c.column_path().string(),
+                    c.compression(),
+                    c.encodings_mask().is_set(Encoding::BYTE_STREAM_SPLIT),
+                    c.statistics().is_some(),
+                )
+            })
+            .collect();
+        (layout, metadata.file_metadata().key_value_metadata().cloned())
+    };
+    let mut layouts = Vec::new();
+    for file in [&singles[0], &merged[0]] {
+        let found = object_store::ObjectStoreExt::get(store.as_ref(), &file.path).await.expect("kept");
+        layouts.push(layout(found.bytes().await.expect("bytes")));
+    }
+    assert_eq!(layouts[0], layouts[1]);
+    assert!(layouts[1].0.iter().any(|c| c.0 == "reflected_ir.list.element" && c.2 && !c.3), "{:?}", layouts[1]);
+
+    // What is new is merged with what is merged.
+    assert!(optimize(&lake).await.tables.is_empty());
+    put(&lake, "cube", "r9", "d1", 9).await;
+    let before = seen(&lake).await;
+    optimize(&lake).await;
+    assert_eq!(files(&lake).await.len(), 1);
+    assert!(seen(&lake).await == before, "other rows");
+}
+
+#[tokio::test]
+async fn a_replaced_run_is_left_out_at_once_and_written_out_by_the_clean_up() {
+    let (_, lake) = five().await;
+    optimize(&lake).await;
+    put(&lake, "flat", "r1", "d2", 77).await;
+    let expected = seen(&lake).await;
+    assert_eq!(expected.num_rows(), 5 * ROWS);
+    let logged = |files: &[DataFile]| files.iter().map(|f| f.rows).sum::<u64>() as usize;
+    assert_eq!(logged(&files(&lake).await), 6 * ROWS, "other Delta readers still see the old rows");
+    lake.remove_superseded().await.expect("cleaned up");
+    assert_eq!(logged(&files(&lake).await), 5 * ROWS);
+    assert!(seen(&lake).await == expected, "other rows");
+    optimize(&lake).await;
+    assert_eq!(files(&lake).await.len(), 1);
+    assert!(seen(&lake).await == expected, "other rows");
+    for (number, surface) in ["wood", "flat", "prd", "foam", "brick"].iter().enumerate() {
+        put(&lake, surface, &format!("r{number}"), "d3", number).await;
+    }
+    lake.remove_superseded().await.expect("cleaned up");
+    assert!(files(&lake).await.iter().all(|f| f.parts.is_empty()), "all of its parts are replaced");
+}
+
+#[tokio::test]
+async fn a_merge_of_what_is_replaced_meanwhile_changes_nothing() {
+    let (_, lake) = five().await;
+    let planned = lake.snapshot().await.expect("a view").files(TABLE).to_vec();
+    put(&lake, "flat", "r1", "d2", 77).await;
+    lake.remove_superseded().await.expect("cleaned up");
+    let (before, named) = (seen(&lake).await, files(&lake).await);
+    let (outcome, _) = lake.merge(TABLE, &planned, Effect::Layout, None).await.expect("no error");
+    assert_eq!(outcome, Committed::Outdated);
+    assert_eq!(files(&lake).await, named);
+    assert!(seen(&lake).await == before, "other rows");
+}
+
+// Delta itself lets both through: their Removes change no data.
+#[tokio::test(flavor = "multi_thread")]
+async fn of_two_merges_at_once_one_is_made() {
+    for _ in 0..10 {
+        let (store, lakes) = five().await;
+        let before = seen(&lakes).await;
+        let planned = lakes.snapshot().await.expect("a view").files(TABLE).to_vec();
+        let merge = |range: std::ops::Range<usize>| {
+            let (store, planned) = (store.clone(), planned.clone());
+            tokio::spawn(async move {
+                let lake = lake(&store).await;
+                lake.merge(TABLE, &planned[range], Effect::Layout, None).await.expect("no error").0
+            })
+        };
+        let (a, b) = tokio::join!(merge(0..4), merge(1..5));
+        let mut outcomes = [a.expect("done"), b.expect("done")].map(|o| o == Committed::Now);
+        outcomes.sort();
+        assert_eq!(outcomes, [false, true]);
+        assert_eq!(files(&lakes).await.iter().map(|f| f.rows).sum::<u64>() as usize, 5 * ROWS);
+        assert!(seen(&lakes).await == before, "other rows");
+    }
+}
+
+// Delta's log is condensed every hundred commits.
+#[tokio::test]
+async fn parts_outlive_a_checkpoint() {
+    let (store, first) = five().await;
+    optimize(&first).await;
+    let parts = files(&first).await[0].parts.clone();
+    for number in 0..100 {
+        put(&first, "cube", "r9", &format!("e{number}"), 9).await;
+    }
+    let checkpoint = object_store::path::Path::from("tables/nce/_delta_log/_last_checkpoint");
+    object_store::ObjectStoreExt::head(store.as_ref(), &checkpoint).await.expect("a checkpoint");
+    let anew = lake(&store).await;
+    let merged: Vec<_> = files(&anew).await.into_iter().filter(|f| !f.parts.is_empty()).collect();
+    assert_eq!(merged.len(), 1);
+    assert_eq!(merged[0].parts, parts);
+}
+
+#[tokio::test]
+async fn vacuum_deletes_what_is_merged_and_nothing_that_is_named() {
+    let (store, lake) = five().await;
+    let singles = files(&lake).await;
+    optimize(&lake).await;
+    let before = seen(&lake).await;
+    let vacuum = |hours, deletion| {
+        let lake = lake.clone();
+        async move { lake.vacuum(chrono::TimeDelta::hours(hours), deletion, &mut |_, _| {}).await.expect("no error") }
+    };
+    assert!(vacuum(1, crate::Deletion::Real).await.files.is_empty(), "readers may hold them");
+    let told = vacuum(0, crate::Deletion::Pretended).await;
+    let names: Vec<_> = told.files.iter().map(|f| f.path.clone()).collect();
+    assert_eq!(names, singles.iter().map(|f| f.path.to_string()).collect::<Vec<_>>());
+    assert_eq!(told.bytes, singles.iter().map(|f| f.bytes).sum::<u64>());
+    object_store::ObjectStoreExt::head(store.as_ref(), &singles[0].path).await.expect("only told");
+    assert_eq!(vacuum(0, crate::Deletion::Real).await.files, told.files);
+    object_store::ObjectStoreExt::head(store.as_ref(), &singles[0].path).await.expect_err("deleted");
+    assert!(seen(&lake).await == before, "other rows");
+    assert!(vacuum(0, crate::Deletion::Real).await.files.is_empty());
+}

@@ -1,0 +1,91 @@
+//! Rows of a table's file, read as a stream: of a merged file those of one run alone.
+
+use std::ops::Range;
+use std::sync::Arc;
+
+use arrow::record_batch::RecordBatch;
+use bytes::Bytes;
+use echolake_schema::tables::Table;
+use futures::future::BoxFuture;
+use futures::stream::BoxStream;
+use futures::{FutureExt as _, StreamExt as _, TryFutureExt as _, TryStreamExt as _};
+use object_store::path::Path;
+use object_store::{ObjectStore, ObjectStoreExt as _};
+use parquet::arrow::arrow_reader::{ArrowReaderOptions, RowSelection, RowSelector};
+use parquet::arrow::async_reader::AsyncFileReader;
+use parquet::arrow::{ParquetRecordBatchStreamBuilder, ProjectionMask};
+use parquet::errors::ParquetError;
+use parquet::file::metadata::{PageIndexPolicy, ParquetMetaData, ParquetMetaDataReader};
+
+use crate::{DataFile, Error, Lake, Result};
+
+/// Rows a batch: those of six curves of 384 samples each make 9 MB.
+const BATCH_ROWS: usize = 1024;
+/// Bytes of a file's end that are read at once: footer and page index of most files.
+const FOOTER_BYTES: usize = 64 * 1024;
+
+/// A file in the store, for the Parquet reader.
+struct StoredFile {
+    store: Arc<dyn ObjectStore>,
+    path: Path,
+    bytes: u64,
+}
+
+type Read<'a, T> = BoxFuture<'a, std::result::Result<T, ParquetError>>;
+
+impl AsyncFileReader for StoredFile {
+    fn get_bytes(&mut self, range: Range<u64>) -> Read<'_, Bytes> {
+        self.store.get_range(&self.path, range).map_err(|e| ParquetError::External(e.into())).boxed()
+    }
+
+    fn get_byte_ranges(&mut self, ranges: Vec<Range<u64>>) -> Read<'_, Vec<Bytes>> {
+        let read = async move { self.store.get_ranges(&self.path, &ranges).await };
+        read.map_err(|e| ParquetError::External(e.into())).boxed()
+    }
+
+    fn get_metadata<'a>(&'a mut self, options: Option<&'a ArrowReaderOptions>) -> Read<'a, Arc<ParquetMetaData>> {
+        let bytes = self.bytes;
+        let reader =
+            ParquetMetaDataReader::new().with_arrow_reader_options(options).with_prefetch_hint(Some(FOOTER_BYTES));
+        async move { reader.load_and_finish(self, bytes).await.map(Arc::new) }.boxed()
+    }
+}
+
+impl Lake {
+    /// Rows of a file, by their places in it, with the named columns or all. Pages of other rows are not fetched.
+    ///
+    /// # Errors
+    /// [`Error::DataFile`] where the file is not what its log says, also in the stream.
+    pub async fn rows(
+        &self,
+        table: Table,
+        file: &DataFile,
+        columns: &[&str],
+        rows: Range<u64>,
+    ) -> Result<BoxStream<'static, Result<RecordBatch>>> {
+        let name = file.path.to_string();
+        let damaged = move |e: ParquetError| Error::DataFile { file: name.clone(), reason: e.to_string() };
+        let reader = StoredFile { store: self.store(), path: file.path.clone(), bytes: file.bytes };
+        let options = ArrowReaderOptions::new()
+            .with_schema(table.schema(self.rig()))
+            .with_page_index_policy(PageIndexPolicy::Optional);
+        let mut builder =
+            ParquetRecordBatchStreamBuilder::new_with_options(reader, options).await.map_err(damaged.clone())?;
+        let there = u64::try_from(builder.metadata().file_metadata().num_rows()).unwrap_or(0);
+        if there != file.rows {
+            let reason = format!("it has {there} rows, its log says {}", file.rows);
+            return Err(Error::DataFile { file: file.path.to_string(), reason });
+        }
+        if !columns.is_empty() {
+            let mask = ProjectionMask::columns(builder.parquet_schema(), columns.iter().copied());
+            builder = builder.with_projection(mask);
+        }
+        if rows != (0..file.rows) {
+            let (skip, take) = (rows.start as usize, rows.end.saturating_sub(rows.start) as usize);
+            let selection = RowSelection::from(vec![RowSelector::skip(skip), RowSelector::select(take)]);
+            builder = builder.with_row_selection(selection);
+        }
+        let stream = builder.with_batch_size(BATCH_ROWS).build().map_err(damaged.clone())?;
+        Ok(stream.map_err(damaged).boxed())
+    }
+}
