@@ -299,8 +299,8 @@ impl<'a> RunController<'a> {
                 sample_rate_hz,
                 sample_count: self.take.microphone.len() as u32,
                 format: SampleFormat::S24Split.into(),
-                microphone: split_24(&self.take.microphone),
-                loopback: split_24(&self.take.loopback),
+                microphone: split_24(&self.take.microphone).into(),
+                loopback: split_24(&self.take.loopback).into(),
                 temperature_c: reading.temperature_c,
             };
             recorder.sweep(at, &recording)?;

@@ -104,27 +104,6 @@ pub(crate) struct Event {
     pub(crate) name: String,
 }
 
-/// A [`SweepRecording`] whose samples stay where they are in the chunk.
-#[derive(Clone, PartialEq, prost::Message)]
-struct Sweep {
-    #[prost(uint32, tag = "1")]
-    pair_id: u32,
-    #[prost(uint32, tag = "2")]
-    attempt: u32,
-    #[prost(double, tag = "3")]
-    sample_rate_hz: f64,
-    #[prost(uint32, tag = "4")]
-    sample_count: u32,
-    #[prost(enumeration = "SampleFormat", tag = "5")]
-    format: i32,
-    #[prost(bytes = "bytes", tag = "6")]
-    microphone: Bytes,
-    #[prost(bytes = "bytes", tag = "7")]
-    loopback: Bytes,
-    #[prost(double, tag = "8")]
-    temperature_c: f64,
-}
-
 impl Event {
     /// The names of foxglove.Log's levels.
     pub(crate) fn level_name(&self) -> &'static str {
@@ -156,19 +135,19 @@ impl Measurer {
                 continue;
             };
             let taken = match channel.topic.as_str() {
-                topics::SWEEP => sweep_of(&channel.schema, chunk, &message)
+                topics::SWEEP => decode::<SweepRecording>(&channel.schema, chunk.share(message.data))
                     .and_then(|s| self.sweep(offset, &message, &s))
                     .map(|response| {
                         swept.extend(response.iter().map(|r| (r.pair, r.attempt)));
                         out.responses.extend(response);
                     }),
-                topics::IR => decode::<ImpulseResponse>(&channel.schema, &message)
+                topics::IR => decode::<ImpulseResponse>(&channel.schema, chunk.share(message.data))
                     .and_then(|i| self.ir(offset, &message, &i, &swept))
                     .map(|r| out.responses.extend(r)),
-                topics::MEASUREMENT => decode::<Measurement>(&channel.schema, &message)
+                topics::MEASUREMENT => decode::<Measurement>(&channel.schema, chunk.share(message.data))
                     .and_then(|m| self.known_pair(m.pair_id).map(|()| m))
                     .map(|m| out.verdicts.push((message.log_time_ns, m))),
-                topics::ENVIRONMENT => decode::<AmbientSample>(&channel.schema, &message)
+                topics::ENVIRONMENT => decode::<AmbientSample>(&channel.schema, chunk.share(message.data))
                     .map(|a| out.readings.push((message.log_time_ns, a))),
                 topics::LOG => Event::decode(message.data)
                     .map_err(|e| e.to_string())
@@ -183,7 +162,12 @@ impl Measurer {
     }
 
     // None where the loopback is silent: the recording is as it was, and its attempt was rejected for that.
-    fn sweep(&self, chunk_offset: u64, message: &Message<'_>, sweep: &Sweep) -> Result<Option<Response>, String> {
+    fn sweep(
+        &self,
+        chunk_offset: u64,
+        message: &Message<'_>,
+        sweep: &SweepRecording,
+    ) -> Result<Option<Response>, String> {
         self.known_pair(sweep.pair_id)?;
         self.known_rate(sweep.sample_rate_hz)?;
         let celsius = Celsius::new(sweep.temperature_c).map_err(|e| e.to_string())?;
@@ -287,21 +271,12 @@ impl Measurer {
     }
 }
 
-fn decode<M: RunMessage>(schema: &str, message: &Message<'_>) -> Result<M, String> {
-    check_schema::<M>(schema)?;
-    M::decode(message.data).map_err(|e| e.to_string())
-}
-
-fn sweep_of(schema: &str, chunk: &Chunk, message: &Message<'_>) -> Result<Sweep, String> {
-    check_schema::<SweepRecording>(schema)?;
-    Sweep::decode(chunk.share(message.data)).map_err(|e| e.to_string())
-}
-
-fn check_schema<M: RunMessage>(schema: &str) -> Result<(), String> {
-    match schema == M::FULL_NAME {
-        true => Ok(()),
-        false => Err(format!("its schema is `{schema}`, expected `{}`", M::FULL_NAME)),
+// Samples stay where they are in the chunk.
+fn decode<M: RunMessage>(schema: &str, data: Bytes) -> Result<M, String> {
+    if schema != M::FULL_NAME {
+        return Err(format!("its schema is `{schema}`, expected `{}`", M::FULL_NAME));
     }
+    M::decode(data).map_err(|e| e.to_string())
 }
 
 // The count comes from the file: nothing is allocated for one that its bytes do not bear out.
@@ -325,24 +300,16 @@ mod tests {
             sample_rate_hz: 96e3,
             sample_count: 3,
             format: SampleFormat::S24le.into(),
-            microphone: vec![4; 9],
-            loopback: vec![5; 9],
+            microphone: vec![4; 9].into(),
+            loopback: vec![5; 9].into(),
             temperature_c: 6.5,
         };
-        let Sweep { pair_id, attempt, sample_rate_hz, sample_count, format, microphone, loopback, temperature_c } =
-            Sweep::decode(Bytes::from(sent.encode_to_vec())).expect("the same message");
-        let (microphone, loopback) = (microphone.to_vec(), loopback.to_vec());
-        let received = SweepRecording {
-            pair_id,
-            attempt,
-            sample_rate_hz,
-            sample_count,
-            format,
-            microphone,
-            loopback,
-            temperature_c,
-        };
+        let chunk = Bytes::from(sent.encode_to_vec());
+        let received: SweepRecording = decode(SweepRecording::FULL_NAME, chunk.clone()).expect("the same message");
         assert_eq!(received, sent);
+        for samples in [&received.microphone, &received.loopback] {
+            assert!(chunk.as_ptr_range().contains(&samples.as_ptr()), "they are copied");
+        }
     }
 
     #[test]

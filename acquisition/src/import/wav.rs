@@ -159,8 +159,8 @@ impl Import<'_> {
                 sample_rate_hz,
                 sample_count: len as u32,
                 format: row.format.into(),
-                microphone: microphone.bytes,
-                loopback: loopback.bytes,
+                microphone: microphone.bytes.into(),
+                loopback: loopback.bytes.into(),
                 temperature_c: celsius,
             },
         )?;

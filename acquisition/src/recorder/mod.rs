@@ -299,7 +299,7 @@ fn own_name(name: &str) -> String {
 fn top_16_bits(recording: &SweepRecording) -> Vec<u8> {
     let bytes = &recording.microphone;
     match recording.format() {
-        SampleFormat::S16le => bytes.clone(),
+        SampleFormat::S16le => bytes.to_vec(),
         SampleFormat::S24le => bytes.chunks_exact(3).flat_map(|b| [b[1], b[2]]).collect(),
         SampleFormat::S24Split => samples::upper_16(bytes).to_vec(),
         SampleFormat::S32le => bytes.chunks_exact(4).flat_map(|b| [b[2], b[3]]).collect(),

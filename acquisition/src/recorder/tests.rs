@@ -29,8 +29,8 @@ fn sweep(samples: usize) -> SweepRecording {
         sample_rate_hz: 96e3,
         sample_count: samples as u32,
         format: SampleFormat::S24le.into(),
-        microphone: channel(1),
-        loopback: channel(2),
+        microphone: channel(1).into(),
+        loopback: channel(2).into(),
         temperature_c: 21.25,
     }
 }
@@ -393,7 +393,7 @@ fn a_run_without_a_folder_cannot_be_finished() {
 #[test]
 fn audio_is_the_upper_16_bits() {
     let check = |format: SampleFormat, microphone: Vec<u8>, expected: [i16; 2]| {
-        let recording = SweepRecording { format: format.into(), microphone, ..Default::default() };
+        let recording = SweepRecording { format: format.into(), microphone: microphone.into(), ..Default::default() };
         let bytes: Vec<u8> = expected.iter().flat_map(|x| x.to_le_bytes()).collect();
         assert_eq!(top_16_bits(&recording), bytes, "{format:?}");
     };
