@@ -3,12 +3,11 @@
 
 #[path = "../tests/kills.rs"]
 mod kills;
-#[path = "../tests/small_rig.rs"]
-mod small_rig;
 
 use std::io::Write as _;
 
-use small_rig::SMALL_RIG;
+/// A rig that measures in milliseconds.
+const SMALL_RIG: &str = include_str!("../tests/fixtures/small_rig.toml");
 
 fn main() -> Result<(), Box<dyn std::error::Error>> {
     let mut args = std::env::args().skip(1);

@@ -6,12 +6,12 @@ mod kills;
 mod load;
 mod maintenance;
 mod real_data;
-mod small_rig;
 
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
-use small_rig::SMALL_RIG;
+/// A rig that measures in milliseconds.
+const SMALL_RIG: &str = include_str!("fixtures/small_rig.toml");
 
 /// A folder with a lake and a small rig.
 struct Place {

@@ -3,15 +3,16 @@
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
-use echolake_lake::{Committed, FileName, Lake, Snapshot, VisibleRun, encode};
+use echolake_lake::{Committed, Lake, VisibleRun};
 use echolake_schema::tables::Table;
 use echolake_schema::{RunId, SurfaceId};
 
+use crate::context::Context;
 use crate::derive::Derivation;
 use crate::error::Result;
 use crate::pipeline::{self, Cores, Ready};
 use crate::read_back;
-use crate::references::{Finder, SharedFinder, Wanted};
+use crate::references::{Finder, Wanted};
 use crate::rows::{self, Keys};
 
 /// Looks at the lake again after another ingest was faster; each sees what that one did.
@@ -34,9 +35,9 @@ pub struct Completed {
 /// # Errors
 /// [`crate::Error`]; what was completed before stays, and the same call goes on.
 pub async fn complete(lake: &Lake, stop: &AtomicBool, done: &mut (dyn FnMut(&Completed) + Send)) -> Result<usize> {
-    let mut count = 0;
+    let (cores, mut count) = (Cores::all()?, 0);
     for _ in 0..ROUNDS {
-        let (changed, overtaken) = round(lake, stop, done).await?;
+        let (changed, overtaken) = round(lake, &cores, stop, done).await?;
         count += changed;
         if !overtaken {
             break;
@@ -58,22 +59,24 @@ pub async fn waiting(lake: &Lake) -> Result<Vec<(RunId, String)>> {
 }
 
 // How many runs were changed, and whether another ingest changed one of them meanwhile.
-async fn round(lake: &Lake, stop: &AtomicBool, done: &mut (dyn FnMut(&Completed) + Send)) -> Result<(usize, bool)> {
-    let cores = Cores::all()?;
-    let snapshot = Arc::new(lake.snapshot().await?);
-    let finder = Finder::shared(lake, snapshot.clone());
+async fn round(
+    lake: &Lake,
+    cores: &Cores,
+    stop: &AtomicBool,
+    done: &mut (dyn FnMut(&Completed) + Send),
+) -> Result<(usize, bool)> {
+    let context = Context::now(lake, cores).await?;
     let mut jobs = Vec::new();
-    for run in snapshot.runs() {
-        let wanted = finder.lock().await.wanted(&run.surface);
+    for run in context.snapshot.runs() {
+        let wanted = context.finder.lock().await.wanted(&run.surface);
         if wanted.derivation(&run.run_derivation).is_some_and(|d| run.reference_derivation.as_ref() != Some(&d)) {
             jobs.push((run.clone(), wanted));
         }
     }
     let (mut count, mut overtaken) = (0, false);
-    let work = Work { lake: lake.clone(), cores: cores.clone(), snapshot, finder };
     let do_one = move |(run, wanted): (VisibleRun, Wanted)| {
-        let work = work.clone();
-        async move { work.complete(&run, &wanted).await }
+        let context = context.clone();
+        async move { complete_run(&context, &run, &wanted).await }
     };
     let ended = &mut |(_, result): pipeline::Ended<_, Completed>| {
         let (completed, outcome) = result?;
@@ -84,37 +87,23 @@ async fn round(lake: &Lake, stop: &AtomicBool, done: &mut (dyn FnMut(&Completed)
         overtaken |= outcome == Some(Committed::Outdated);
         Ok(())
     };
-    pipeline::run(lake, &cores, jobs, stop, do_one, ended).await?;
+    pipeline::run(lake, cores, jobs, stop, do_one, ended).await?;
     Ok((count, overtaken))
 }
 
-#[derive(Clone)]
-struct Work {
-    lake: Lake,
-    cores: Cores,
-    snapshot: Arc<Snapshot>,
-    finder: SharedFinder,
-}
-
-impl Work {
-    async fn complete(&self, run: &VisibleRun, wanted: &Wanted) -> Result<Ready<Completed>> {
-        let (lake, keys) = (&self.lake, Keys { surface: run.surface.clone(), run: run.run.clone() });
-        let responses = read_back::responses(lake, &self.snapshot, &run.run).await?;
-        let report =
-            Completed { run: run.run.clone(), surface: run.surface.clone(), measurements: responses.pairs.len() };
-        let Some(derivation) = Derivation::new(&run.run_derivation, wanted, &self.finder).await? else {
-            return Ok(Ready { staged: Vec::new(), report });
-        };
-        let (mut staged, references) = derivation.stage(lake, &self.cores, &keys, responses).await?;
-        let old: Vec<_> = self.snapshot.files_of(Table::Runs, &run.run).cloned().collect();
-        let mut batches = Vec::new();
-        for file in &old {
-            batches.push(rows::runs::with_references(&read_back::run_row(lake, file).await?, &references)?);
-        }
-        let pointer = VisibleRun { reference_derivation: references.derivation.clone(), ..run.clone() };
-        // From the commit of this row on readers see the new rows, and no more the old ones.
-        let row = encode(Table::Runs, &Table::Runs.schema(lake.rig()), &batches)?;
-        staged.push(lake.stage(Table::Runs, &FileName::Pointer(pointer), row).await?.replacing(run, &old));
-        Ok(Ready { staged, report })
+async fn complete_run(context: &Context, run: &VisibleRun, wanted: &Wanted) -> Result<Ready<Completed>> {
+    let (lake, keys) = (&context.lake, Keys { surface: run.surface.clone(), run: run.run.clone() });
+    let responses = read_back::responses(lake, &context.snapshot, &run.run).await?;
+    let report = Completed { run: run.run.clone(), surface: run.surface.clone(), measurements: responses.pairs.len() };
+    let Some(derivation) = Derivation::new(&run.run_derivation, wanted, &context.finder).await? else {
+        return Ok(Ready { staged: Vec::new(), report });
+    };
+    let (mut staged, references) = derivation.stage(context, &keys, responses).await?;
+    let mut row = Vec::new();
+    for file in context.snapshot.files_of(Table::Runs, &run.run) {
+        row.push(rows::runs::with_references(&read_back::run_row(lake, file).await?, &references)?);
     }
+    let pointer = VisibleRun { reference_derivation: references.derivation.clone(), ..run.clone() };
+    staged.push(context.stage_pointer(pointer, &row).await?);
+    Ok(Ready { staged, report })
 }

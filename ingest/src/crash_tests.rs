@@ -24,19 +24,7 @@ use object_store::{
 use crate::{Ingest, Report, complete, pending};
 
 /// Ten points, so that a run takes milliseconds.
-const SMALL_RIG: &str = r#"
-name = "small"
-[sweep]
-duration_secs = 0.03
-[[grid.layers]]
-points_per_side = 3
-pitch_mm = 120.0
-height_mm = 124.0
-[[grid.layers]]
-points_per_side = 1
-pitch_mm = 0.0
-height_mm = 304.0
-"#;
+const SMALL_RIG: &str = include_str!("../../tests/fixtures/small_rig.toml");
 
 /// Where a store dies.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

@@ -4,12 +4,12 @@ use std::collections::HashMap;
 use std::sync::Arc;
 
 use echolake_dsp::chain::{DerivationPlan, Derived, FlatEnergies};
-use echolake_lake::{EncodedFile, FileEncoder, FileName, Lake, Staged, encode};
+use echolake_lake::{EncodedFile, FileEncoder, Lake, Staged, encode};
 use echolake_schema::Rig;
 use echolake_schema::tables::Table;
 
+use crate::context::Context;
 use crate::error::{Error, Result};
-use crate::pipeline::Cores;
 use crate::references::{SharedFinder, Wanted};
 use crate::rows::derived::Versions;
 use crate::rows::runs::References;
@@ -117,20 +117,14 @@ impl Derivation {
     /// Derives all of a run that both references have, and stages its files. Returns what the run's row says of it.
     pub(crate) async fn stage(
         self,
-        lake: &Lake,
-        cores: &Cores,
+        context: &Context,
         keys: &Keys,
         responses: Responses,
     ) -> Result<(Vec<Staged>, References)> {
-        let (this, for_rows, its_lake) = (Arc::new(self), keys.clone(), lake.clone());
+        let (this, for_rows, lake) = (Arc::new(self), keys.clone(), context.lake.clone());
         let derivation = this.clone();
-        let (files, unpaired) = cores.compute(move || derivation.encode(&its_lake, &for_rows, &responses)).await?;
-        let mut staged = Vec::with_capacity(files.len());
-        for (table, file) in files {
-            let name =
-                FileName::Rows { surface: keys.surface.clone(), run: keys.run.clone(), derivation: this.name.clone() };
-            staged.push(lake.stage(table, &name, file).await?);
-        }
+        let (files, unpaired) = context.cores.compute(move || derivation.encode(&lake, &for_rows, &responses)).await?;
+        let staged = context.stage_rows(keys, &this.name, files).await?;
         let references = References {
             missing: if unpaired == 0 { String::new() } else { format!("references of {unpaired} pairs") },
             derivation: Some(this.name.clone()),

@@ -4,19 +4,20 @@ use std::collections::BTreeSet;
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
-use echolake_lake::{Committed, FileName, Lake, Snapshot, Staged, VisibleRun, encode};
+use echolake_lake::{Committed, EncodedFile, Lake, VisibleRun, encode};
 use echolake_schema::tables::Table;
 use echolake_schema::{RunId, SurfaceId};
 use object_store::path::Path;
 
 use crate::CODE_VERSION;
+use crate::context::Context;
 use crate::derive::{Derivation, Responses};
 use crate::error::{Error, Result};
 use crate::files::{self, Source};
 use crate::measure::Measurer;
 use crate::pipeline::{self, Cores, Ready};
 use crate::read_back;
-use crate::references::{Finder, Names, SharedFinder, digest};
+use crate::references::{Names, digest};
 use crate::rows::{self, Keys};
 use crate::run_content::{Head, RunContent};
 
@@ -78,10 +79,7 @@ pub struct Ingest<'a> {
 /// All that the workers share.
 #[derive(Clone)]
 struct Work {
-    lake: Lake,
-    cores: Cores,
-    snapshot: Arc<Snapshot>,
-    finder: SharedFinder,
+    context: Context,
     measurer: Arc<Measurer>,
 }
 
@@ -99,18 +97,21 @@ impl<'a> Ingest<'a> {
     /// call goes on with them.
     pub async fn take_in(&self, sources: Vec<Source>, report: &mut (dyn FnMut(Report) + Send)) -> Result<()> {
         let (references, others) = self.in_order(sources).await?;
+        let (cores, measurer) = (Cores::all()?, Arc::new(Measurer::new(self.lake)));
         for sources in [references, others].into_iter().filter(|s| !s.is_empty()) {
-            self.take_in_group(sources, report).await?;
+            let context = Context::now(self.lake, &cores).await?;
+            self.take_in_group(Work { context, measurer: measurer.clone() }, sources, report).await?;
         }
         Ok(())
     }
 
-    async fn take_in_group(&self, sources: Vec<Source>, report: &mut (dyn FnMut(Report) + Send)) -> Result<()> {
-        let cores = Cores::all()?;
-        let snapshot = Arc::new(self.lake.snapshot().await?);
-        let finder = Finder::shared(self.lake, snapshot.clone());
-        let measurer = Arc::new(Measurer::new(self.lake));
-        let work = Work { lake: self.lake.clone(), cores: cores.clone(), snapshot, finder, measurer };
+    async fn take_in_group(
+        &self,
+        work: Work,
+        sources: Vec<Source>,
+        report: &mut (dyn FnMut(Report) + Send),
+    ) -> Result<()> {
+        let cores = work.context.cores.clone();
         let mut refused = Vec::new();
         let ended = &mut |(source, done): pipeline::Ended<Source, Taken>| match done {
             Ok((taken, outcome)) => {
@@ -162,17 +163,18 @@ impl<'a> Ingest<'a> {
 
 impl Work {
     async fn take_in(&self, source: &Source) -> Result<Ready<Taken>> {
-        let (lake, opened) = (&self.lake, source.open(&self.lake)?);
-        let content = Arc::new(RunContent::read(lake, &self.measurer, &self.cores, &opened).await?);
+        let Context { lake, cores, snapshot, finder } = &self.context;
+        let opened = source.open(lake)?;
+        let content = Arc::new(RunContent::read(lake, &self.measurer, cores, &opened).await?);
         let keys = Keys { surface: content.manifest.surface_id.clone(), run: content.manifest.run_id.clone() };
         let derivation = digest(&[content.integrity.sha256.as_str(), CODE_VERSION]);
-        let known = self.snapshot.run(&keys.run);
+        let known = snapshot.run(&keys.run);
         if let Some(known) = known {
             self.check_same(known, &content, &opened.name).await?;
         }
         files::keep(lake, source, &Lake::run_path(&keys.surface, &keys.run), content.integrity.bytes).await?;
         let names = Names::of(&content.surface, &lake.config().references);
-        let wanted = self.finder.lock().await.wanted_by(names);
+        let wanted = finder.lock().await.wanted_by(names);
         let mut taken = Taken {
             run: keys.run.clone(),
             surface: keys.surface.clone(),
@@ -186,13 +188,13 @@ impl Work {
         if known.is_some_and(|k| k.run_derivation == derivation) {
             return Ok(Ready { staged: Vec::new(), report: taken });
         }
-        let mut staged = self.stage_run(&keys, &content, &derivation).await?;
+        let (its_lake, for_rows, its_content) = (lake.clone(), keys.clone(), content.clone());
+        let files = cores.compute(move || encode_run(&its_lake, &for_rows, &its_content)).await?;
+        let mut staged = self.context.stage_rows(&keys, &derivation, files).await?;
         let mut references =
             rows::runs::References { missing: taken.missing.clone(), ..rows::runs::References::default() };
-        let derived = Derivation::new(&derivation, &wanted, &self.finder).await?;
-        if let Some(derived) = derived {
-            let responses = content.responses();
-            let (files, used) = derived.stage(lake, &self.cores, &keys, responses).await?;
+        if let Some(derived) = Derivation::new(&derivation, &wanted, finder).await? {
+            let (files, used) = derived.stage(&self.context, &keys, content.responses()).await?;
             staged.extend(files);
             taken.derived = true;
             taken.missing.clone_from(&used.missing);
@@ -205,31 +207,13 @@ impl Work {
             reference_derivation: references.derivation.clone(),
         };
         let row = rows::runs::row(lake, &keys, &content, &derivation, &references)?;
-        let row = encode(Table::Runs, &Table::Runs.schema(lake.rig()), &[row])?;
-        let old = self.snapshot.files_of(Table::Runs, &keys.run);
-        staged.push(lake.stage(Table::Runs, &FileName::Pointer(run.clone()), row).await?.replacing(&run, old));
+        staged.push(self.context.stage_pointer(run, &[row]).await?);
         Ok(Ready { staged, report: taken })
     }
 
-    // The rows that come from the run alone.
-    async fn stage_run(&self, keys: &Keys, content: &Arc<RunContent>, derivation: &str) -> Result<Vec<Staged>> {
-        let (lake, for_rows, content) = (self.lake.clone(), keys.clone(), content.clone());
-        let encoded = self.cores.compute(move || encode_run(&lake, &for_rows, &content)).await?;
-        let mut staged = Vec::with_capacity(encoded.len());
-        for (table, file) in encoded {
-            let name = FileName::Rows {
-                surface: keys.surface.clone(),
-                run: keys.run.clone(),
-                derivation: derivation.to_owned(),
-            };
-            staged.push(self.lake.stage(table, &name, file).await?);
-        }
-        Ok(staged)
-    }
-
     async fn check_same(&self, known: &VisibleRun, content: &RunContent, file: &str) -> Result<()> {
-        let Some(row) = self.snapshot.files_of(Table::Runs, &known.run).next() else { return Ok(()) };
-        let row = read_back::run_row(&self.lake, row).await?;
+        let Some(row) = self.context.snapshot.files_of(Table::Runs, &known.run).next() else { return Ok(()) };
+        let row = read_back::run_row(&self.context.lake, row).await?;
         let there = rows::runs::text_of(&row, "file_sha256").unwrap_or_default();
         if there == content.integrity.sha256 {
             return Ok(());
@@ -239,7 +223,8 @@ impl Work {
     }
 }
 
-fn encode_run(lake: &Lake, keys: &Keys, content: &RunContent) -> Result<Vec<(Table, echolake_lake::EncodedFile)>> {
+// The rows that come from the run alone.
+fn encode_run(lake: &Lake, keys: &Keys, content: &RunContent) -> Result<Vec<(Table, EncodedFile)>> {
     let rig = lake.rig();
     let origin = content.manifest.origin.label();
     let references = &lake.config().references;

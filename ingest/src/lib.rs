@@ -23,6 +23,7 @@
 
 mod chunk;
 mod complete;
+mod context;
 #[cfg(test)]
 mod crash_tests;
 mod derive;
