@@ -13,11 +13,14 @@
 //! # }
 //! ```
 
+mod catalog;
+mod engine;
 mod error;
 mod gate;
 pub mod output;
 mod session;
 mod table;
 
+pub use engine::{Client, Engine, Quota};
 pub use error::Error;
-pub use session::{Answer, Session};
+pub use session::{Answer, Extend, Prepared, Session};

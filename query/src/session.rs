@@ -2,46 +2,72 @@
 
 use std::sync::Arc;
 
-use arrow::datatypes::SchemaRef;
+use arrow::datatypes::{DataType, SchemaRef};
 use arrow::record_batch::RecordBatch;
-use datafusion::datasource::physical_plan::parquet::CachedParquetFileReaderFactory;
+use datafusion::common::ParamValues;
 use datafusion::error::DataFusionError;
 use datafusion::execution::SendableRecordBatchStream;
 use datafusion::execution::context::SQLOptions;
-use datafusion::execution::object_store::{DefaultObjectStoreRegistry, ObjectStoreRegistry as _, ObjectStoreUrl};
-use datafusion::execution::runtime_env::{RuntimeEnv, RuntimeEnvBuilder};
-use datafusion::prelude::{SessionConfig, SessionContext};
+use datafusion::logical_expr::LogicalPlan;
+use datafusion::prelude::SessionContext;
+use datafusion::sql::parser::Statement;
 use echolake_lake::Lake;
-use echolake_schema::tables::Table;
 use futures::StreamExt as _;
 
-use crate::table::{LakeTable, Source};
+use crate::engine::{Client, Engine, Quota};
 use crate::{Error, gate};
 
-/// Where the lake's store is registered; no other store is, so no query reaches a file outside of the lake.
-const STORE: &str = "echolake://lake/";
-/// The store that DataFusion registers by itself: the whole machine.
-const MACHINE: &str = "file:///";
-/// Rows a batch: 384 samples each make 3 MB of responses.
-const BATCH_ROWS: usize = 2048;
-/// Memory for the files' footers and page indexes. A session asks the same files again and again, and those of a
-/// thousand runs are more than DataFusion's 50 MiB.
-const METADATA_BYTES: usize = 256 << 20;
-
-/// Asks a lake in SQL.
+/// Asks a lake in SQL: one a connection.
 pub struct Session {
-    lake: Lake,
-    config: SessionConfig,
-    runtime: Arc<RuntimeEnv>,
-    source: Source,
+    engine: Engine,
+    client: Arc<Client>,
+    extend: Option<Extend>,
 }
 
-/// An answer, as it comes.
+/// Adds a protocol's own tables and functions to the context of every query.
+pub type Extend = Arc<dyn Fn(&SessionContext) -> Result<(), DataFusionError> + Send + Sync>;
+
+/// A query that is planned and may be run again and again with other values. It keeps the view of the lake it was
+/// planned on.
+pub struct Prepared {
+    context: SessionContext,
+    plan: LogicalPlan,
+    sql: String,
+}
+
+impl Prepared {
+    /// The columns of its answers.
+    pub fn schema(&self) -> SchemaRef {
+        Arc::new(self.plan.schema().as_arrow().clone())
+    }
+
+    /// Types of its placeholders `$1`, `$2`, ... in this order; None where the query does not tell.
+    ///
+    /// # Errors
+    /// [`Error::Query`] where a placeholder is not a number.
+    pub fn parameters(&self) -> Result<Vec<Option<DataType>>, Error> {
+        let types = self.plan.get_parameter_types().map_err(|e| Error::plan(&self.sql, &e))?;
+        let number = |name: &str| name.strip_prefix('$').and_then(|n| n.parse::<usize>().ok()).filter(|n| *n > 0);
+        let mut found = Vec::new();
+        for (name, kind) in types {
+            let Some(number) = number(&name) else {
+                let message = format!("`{name}` is no placeholder");
+                return Err(Error::Query { message, place: None, hint: Some("they are $1, $2, ...".to_owned()) });
+            };
+            if found.len() < number {
+                found.resize(number, None);
+            }
+            found[number - 1] = kind;
+        }
+        Ok(found)
+    }
+}
+
+/// An answer, as it comes. Dropping it ends its query.
 pub struct Answer {
     /// Its columns.
     pub schema: SchemaRef,
-    /// Its rows.
-    pub batches: SendableRecordBatchStream,
+    batches: SendableRecordBatchStream,
 }
 
 impl Answer {
@@ -55,17 +81,29 @@ impl Answer {
 }
 
 impl Session {
-    /// A session on a lake.
+    /// A session on a lake that nobody else asks, without limits.
     ///
     /// # Errors
     /// [`Error::Execution`] where DataFusion cannot be set up.
     pub fn new(lake: &Lake) -> Result<Self, Error> {
-        let failed = |e: DataFusionError| Error::execution(&e);
-        let url = ObjectStoreUrl::parse(STORE).map_err(failed)?;
-        let runtime = runtime(lake, &url).map_err(failed)?;
-        let metadata = runtime.cache_manager.get_file_metadata_cache();
-        let reader = Arc::new(CachedParquetFileReaderFactory::new(lake.store(), metadata));
-        Ok(Self { lake: lake.clone(), config: config(), runtime, source: Source { url, reader } })
+        let client = Client { name: "local".to_owned(), quota: Quota::default() };
+        Ok(Engine::new(lake)?.session(&Arc::new(client)))
+    }
+
+    pub(crate) fn of(engine: Engine, client: Arc<Client>) -> Self {
+        Self { engine, client, extend: None }
+    }
+
+    /// The same with a protocol's own tables and functions.
+    #[must_use]
+    pub fn extended(mut self, extend: Extend) -> Self {
+        self.extend = Some(extend);
+        self
+    }
+
+    /// Who asks.
+    pub fn client(&self) -> &Client {
+        &self.client
     }
 
     /// Answers a query.
@@ -74,15 +112,58 @@ impl Session {
     /// [`Error::Query`] where it is not right, [`Error::NotReading`] where it would change something,
     /// [`Error::Lake`] where the lake cannot be read.
     pub async fn query(&self, sql: &str) -> Result<Answer, Error> {
-        let context = self.context().await?;
+        let prepared = self.prepare(sql).await?;
+        self.run(&prepared.context, prepared.plan, sql).await
+    }
+
+    /// Plans a query.
+    ///
+    /// # Errors
+    /// As [`Session::query`].
+    pub async fn prepare(&self, sql: &str) -> Result<Prepared, Error> {
+        let statement = self.parse(sql)?;
+        self.prepare_statement(sql, statement).await
+    }
+
+    /// Plans a statement that a protocol has parsed, and perhaps rewritten, from `sql`.
+    ///
+    /// # Errors
+    /// As [`Session::query`].
+    pub async fn prepare_statement(&self, sql: &str, mut statement: Statement) -> Result<Prepared, Error> {
         let wrong = |e: DataFusionError| Error::plan(sql, &e);
-        let state = context.state();
-        let statement = state.sql_to_statement(sql, &state.config().options().sql_parser.dialect).map_err(wrong)?;
         gate::check(&statement)?;
-        let plan = state.statement_to_plan(statement).await.map_err(wrong)?;
+        let context = self.engine.context();
+        self.engine.catalog().register(&context, &mut statement).await?;
+        if let Some(extend) = &self.extend {
+            extend(&context).map_err(|e| Error::execution(&e))?;
+        }
+        let plan = context.state().statement_to_plan(statement).await.map_err(wrong)?;
         // `SELECT INTO` reads by its first word and makes a table by its plan.
         let reading = SQLOptions::new().with_allow_ddl(false).with_allow_dml(false).with_allow_statements(false);
         reading.verify_plan(&plan).map_err(|_| Error::NotReading { statement: plan.display().to_string() })?;
+        Ok(Prepared { context, plan, sql: sql.to_owned() })
+    }
+
+    /// Answers a planned query with values for its placeholders.
+    ///
+    /// # Errors
+    /// [`Error::Query`] where values are missing or of the wrong type.
+    pub async fn execute(&self, prepared: &Prepared, values: ParamValues) -> Result<Answer, Error> {
+        let plan = prepared.plan.clone().with_param_values(values).map_err(|e| Error::plan(&prepared.sql, &e))?;
+        self.run(&prepared.context, plan, &prepared.sql).await
+    }
+
+    /// Parses one statement.
+    ///
+    /// # Errors
+    /// [`Error::Query`] where it is none.
+    pub fn parse(&self, sql: &str) -> Result<Statement, Error> {
+        let state = self.engine.context().state();
+        state.sql_to_statement(sql, &state.config().options().sql_parser.dialect).map_err(|e| Error::plan(sql, &e))
+    }
+
+    async fn run(&self, context: &SessionContext, plan: LogicalPlan, sql: &str) -> Result<Answer, Error> {
+        let wrong = |e: DataFusionError| Error::plan(sql, &e);
         let frame = context.execute_logical_plan(plan).await.map_err(wrong)?;
         let batches = frame.execute_stream().await.map_err(wrong)?;
         Ok(Answer { schema: batches.schema(), batches })
@@ -90,40 +171,8 @@ impl Session {
 
     /// The tables and their schemas.
     pub fn tables(&self) -> impl Iterator<Item = (&'static str, SchemaRef)> {
-        Table::ALL.into_iter().map(|t| (t.name(), t.schema(self.lake.rig())))
+        self.engine.catalog().tables()
     }
-
-    // A new one a query: the tables are those of one snapshot, and nothing a query does outlives it.
-    async fn context(&self) -> Result<SessionContext, Error> {
-        let snapshot = self.lake.snapshot().await?;
-        let context = SessionContext::new_with_config_rt(self.config.clone(), self.runtime.clone());
-        for table in Table::ALL {
-            let files = snapshot.files(table).to_vec();
-            let provider = LakeTable::new(table.schema(self.lake.rig()), files, self.source.clone());
-            context.register_table(table.name(), Arc::new(provider)).map_err(|e| Error::execution(&e))?;
-        }
-        Ok(context)
-    }
-}
-
-// DataFusion's defaults already use all cores and prune by row group and page.
-fn config() -> SessionConfig {
-    let mut config = SessionConfig::new().with_information_schema(true).with_batch_size(BATCH_ROWS);
-    let options = config.options_mut();
-    options.sql_parser.collect_spans = true;
-    // Files hold plain strings, and so do the formats that answers are written in.
-    options.execution.parquet.schema_force_view_types = false;
-    config
-}
-
-fn runtime(lake: &Lake, url: &ObjectStoreUrl) -> Result<Arc<RuntimeEnv>, DataFusionError> {
-    let stores = DefaultObjectStoreRegistry::new();
-    stores.deregister_store(ObjectStoreUrl::parse(MACHINE)?.as_ref())?;
-    stores.register_store(url.as_ref(), lake.store());
-    RuntimeEnvBuilder::new()
-        .with_object_store_registry(Arc::new(stores))
-        .with_metadata_cache_limit(METADATA_BYTES)
-        .build_arc()
 }
 
 #[cfg(test)]
