@@ -67,7 +67,7 @@ impl Engine {
         let runtime = runtime(lake, &url).map_err(failed)?;
         let metadata = runtime.cache_manager.get_file_metadata_cache();
         let reader = Arc::new(CachedParquetFileReaderFactory::new(lake.store(), metadata));
-        let catalog = Catalog::new(lake, Source { url, reader });
+        let catalog = Catalog::new(lake, Source { url, reader })?;
         Ok(Self(Arc::new(Inner { config: config(), runtime, catalog })))
     }
 

@@ -13,6 +13,7 @@
 //! # }
 //! ```
 
+mod as_of;
 mod catalog;
 mod engine;
 mod error;
@@ -20,6 +21,7 @@ mod gate;
 pub mod output;
 mod session;
 mod table;
+mod views;
 
 pub use engine::{Client, Engine, Quota};
 pub use error::Error;

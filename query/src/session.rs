@@ -15,7 +15,7 @@ use echolake_lake::Lake;
 use futures::StreamExt as _;
 
 use crate::engine::{Client, Engine, Quota};
-use crate::{Error, gate};
+use crate::{Error, as_of, gate};
 
 /// Asks a lake in SQL: one a connection.
 pub struct Session {
@@ -159,6 +159,7 @@ impl Session {
     /// [`Error::Query`] where it is none.
     pub fn parse(&self, sql: &str) -> Result<Statement, Error> {
         let state = self.engine.context().state();
+        let sql = &as_of::respelled(sql);
         state.sql_to_statement(sql, &state.config().options().sql_parser.dialect).map_err(|e| Error::plan(sql, &e))
     }
 
