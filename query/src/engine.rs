@@ -11,6 +11,7 @@ use datafusion::prelude::{SessionConfig, SessionContext};
 use echolake_lake::Lake;
 
 use crate::catalog::Catalog;
+use crate::small::SmallTables;
 use crate::table::Source;
 use crate::{Error, Session};
 
@@ -67,7 +68,7 @@ impl Engine {
         let runtime = runtime(lake, &url).map_err(failed)?;
         let metadata = runtime.cache_manager.get_file_metadata_cache();
         let reader = Arc::new(CachedParquetFileReaderFactory::new(lake.store(), metadata));
-        let catalog = Catalog::new(lake, Source { url, reader })?;
+        let catalog = Catalog::new(lake, Source { url, reader, small: Arc::new(SmallTables::new(lake)) })?;
         Ok(Self(Arc::new(Inner { config: config(), runtime, catalog })))
     }
 

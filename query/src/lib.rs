@@ -20,6 +20,7 @@ mod error;
 mod gate;
 pub mod output;
 mod session;
+mod small;
 mod table;
 mod views;
 
