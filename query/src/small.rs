@@ -42,11 +42,11 @@ impl SmallTables {
     /// # Errors
     /// Where a file is not what its log says.
     pub(crate) async fn rows(&self, table: Table, schema: &SchemaRef, files: &[&DataFile]) -> Result<RecordBatch> {
-        let missing: Vec<_> = {
+        let missing: Vec<DataFile> = {
             let known = self.files.lock().unwrap_or_else(PoisonError::into_inner);
-            files.iter().filter(|f| !known.contains_key(&f.path)).copied().collect()
+            files.iter().filter(|f| !known.contains_key(&f.path)).map(|f| (*f).clone()).collect()
         };
-        let read = missing.into_iter().map(|file| self.read(table, schema, file));
+        let read: Vec<_> = missing.into_iter().map(|file| self.read(table, schema, file)).collect();
         let read: Vec<_> = futures::stream::iter(read).buffered(TOGETHER).try_collect().await?;
         let mut known = self.files.lock().unwrap_or_else(PoisonError::into_inner);
         known.extend(read);
@@ -58,10 +58,10 @@ impl SmallTables {
         Ok(concat_batches(schema, batches)?)
     }
 
-    async fn read(&self, table: Table, schema: &SchemaRef, file: &DataFile) -> Result<(Path, RecordBatch)> {
+    async fn read(&self, table: Table, schema: &SchemaRef, file: DataFile) -> Result<(Path, RecordBatch)> {
         let failed = |e: echolake_lake::Error| DataFusionError::External(Box::new(e));
-        let stream = self.lake.rows(table, file, &[], 0..file.rows).await.map_err(failed)?;
+        let stream = self.lake.rows(table, &file, &[], 0..file.rows).await.map_err(failed)?;
         let batches: Vec<_> = stream.try_collect().await.map_err(failed)?;
-        Ok((file.path.clone(), concat_batches(schema, &batches)?))
+        Ok((file.path, concat_batches(schema, &batches)?))
     }
 }
