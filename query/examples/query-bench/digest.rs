@@ -49,7 +49,9 @@ fn column_sum(column: &ArrayRef) -> Result<f64> {
             let lengths = arrow::compute::kernels::length::length(&cast(column, &DataType::Utf8)?)?;
             sum(lengths.as_primitive::<Int32Type>()).map_or(0.0, f64::from)
         }
-        kind if kind.is_integer() => sum(cast(column, &DataType::Int64)?.as_primitive::<Int64Type>()).unwrap_or(0) as f64,
+        kind if kind.is_integer() => {
+            sum(cast(column, &DataType::Int64)?.as_primitive::<Int64Type>()).unwrap_or(0) as f64
+        }
         _ => sum(cast(column, &DataType::Float64)?.as_primitive::<Float64Type>()).unwrap_or(0.0),
     })
 }

@@ -33,7 +33,8 @@ impl Peer {
         let ask = child.stdin.take().context("no pipe to the peer")?;
         let answers = BufReader::new(child.stdout.take().context("no pipe from the peer")?);
         let mut peer = Self { child, ask, answers, version: String::new() };
-        let tables: Value = tables.iter().map(|(name, files)| (name.clone(), json!(files))).collect::<serde_json::Map<_, _>>().into();
+        let tables: Value =
+            tables.iter().map(|(name, files)| (name.clone(), json!(files))).collect::<serde_json::Map<_, _>>().into();
         let hello = peer.exchange(&json!({ "tables": tables, "threads": threads }))?;
         peer.version = hello["version"].as_str().unwrap_or_default().to_owned();
         Ok(peer)
