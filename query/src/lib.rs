@@ -14,6 +14,7 @@
 //! ```
 
 mod catalog;
+mod control;
 mod engine;
 mod error;
 mod gate;
@@ -21,6 +22,6 @@ pub mod output;
 mod session;
 mod table;
 
-pub use engine::{Client, Engine, Quota};
+pub use engine::{Client, Engine, Function, Limits, Quota};
 pub use error::Error;
-pub use session::{Answer, Extend, Prepared, Session};
+pub use session::{Answer, CancelHandle, Extend, Prepared, Session};

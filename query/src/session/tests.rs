@@ -7,7 +7,6 @@ use arrow::compute::cast;
 use arrow::datatypes::{DataType, Field, Float64Type, Int64Type};
 use echolake_lake::{FileName, References, VisibleRun, encode};
 use echolake_schema::Rig;
-use futures::TryStreamExt as _;
 
 use super::*;
 
@@ -19,8 +18,12 @@ async fn lake() -> (tempfile::TempDir, Lake) {
 }
 
 async fn rows(session: &Session, sql: &str) -> Vec<arrow::record_batch::RecordBatch> {
-    let answer = session.query(sql).await.unwrap_or_else(|e| panic!("{sql}: {e}"));
-    answer.batches.try_collect().await.unwrap_or_else(|e| panic!("{sql}: {e}"))
+    let mut answer = session.query(sql).await.unwrap_or_else(|e| panic!("{sql}: {e}"));
+    let mut batches = Vec::new();
+    while let Some(batch) = answer.next().await.unwrap_or_else(|e| panic!("{sql}: {e}")) {
+        batches.push(batch);
+    }
+    batches
 }
 
 #[tokio::test]
