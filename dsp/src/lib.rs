@@ -44,6 +44,7 @@ mod golden;
 pub mod heights;
 mod joint;
 pub mod level;
+pub mod mean;
 mod pruned;
 mod real;
 pub mod spectrum;

@@ -12,7 +12,7 @@ use echolake_lake::Lake;
 
 use crate::catalog::Catalog;
 use crate::table::Source;
-use crate::{Error, Session};
+use crate::{Error, Functions, Session};
 
 /// Where the lake's store is registered; no other store is, so no query reaches a file outside of the lake.
 const STORE: &str = "echolake://lake/";
@@ -32,6 +32,7 @@ struct Inner {
     config: SessionConfig,
     runtime: Arc<RuntimeEnv>,
     catalog: Catalog,
+    functions: Functions,
 }
 
 /// Who asks, and how much they may have. One for all sessions of a token.
@@ -68,7 +69,8 @@ impl Engine {
         let metadata = runtime.cache_manager.get_file_metadata_cache();
         let reader = Arc::new(CachedParquetFileReaderFactory::new(lake.store(), metadata));
         let catalog = Catalog::new(lake, Source { url, reader });
-        Ok(Self(Arc::new(Inner { config: config(), runtime, catalog })))
+        let functions = Functions::all(lake.rig()).map_err(|e| Error::Execution { message: e.to_string() })?;
+        Ok(Self(Arc::new(Inner { config: config(), runtime, catalog, functions })))
     }
 
     /// A session of a client: one a connection.
@@ -83,7 +85,9 @@ impl Engine {
 
     // A new one a query: the tables are those of one snapshot, and nothing a query does outlives it.
     pub(crate) fn context(&self) -> SessionContext {
-        SessionContext::new_with_config_rt(self.0.config.clone(), self.0.runtime.clone())
+        let context = SessionContext::new_with_config_rt(self.0.config.clone(), self.0.runtime.clone());
+        self.0.functions.register(&context);
+        context
     }
 }
 

@@ -16,6 +16,7 @@
 mod catalog;
 mod engine;
 mod error;
+mod functions;
 mod gate;
 pub mod output;
 mod session;
@@ -23,4 +24,5 @@ mod table;
 
 pub use engine::{Client, Engine, Quota};
 pub use error::Error;
+pub use functions::Functions;
 pub use session::{Answer, Extend, Prepared, Session};
