@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use arrow::array::{Array, ArrayRef, ArrowPrimitiveType, AsArray as _, ListArray, StringArray};
 use arrow::buffer::NullBuffer;
-use arrow::datatypes::{DataType, Field, Float32Type, Float64Type, Int64Type};
+use arrow::datatypes::{ArrowNativeType, DataType, Field, Float32Type, Float64Type, Int64Type};
 use datafusion::error::{DataFusionError, Result};
 use datafusion::logical_expr::ColumnarValue;
 use echolake_dsp::Real;
@@ -13,7 +13,7 @@ use echolake_dsp::Real;
 use super::description::{Description, Kind, Parameter};
 
 /// A sample that Arrow knows too.
-pub(super) trait Element: Real {
+pub(super) trait Element: Real + ArrowNativeType {
     type Arrow: ArrowPrimitiveType<Native = Self>;
 }
 

@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use arrow::array::{Array as _, ArrayRef, AsArray as _, UInt64Array};
+use arrow::array::{ArrayRef, AsArray as _, UInt64Array};
 use arrow::buffer::NullBuffer;
 use arrow::datatypes::{DataType, Float64Type, UInt64Type};
 use datafusion::error::{DataFusionError, Result};
