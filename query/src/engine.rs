@@ -7,6 +7,7 @@ use datafusion::catalog::{CatalogProvider as _, CatalogProviderList as _};
 use datafusion::catalog::{MemoryCatalogProvider, MemoryCatalogProviderList, MemorySchemaProvider};
 use datafusion::datasource::physical_plan::parquet::CachedParquetFileReaderFactory;
 use datafusion::error::DataFusionError;
+use datafusion::execution::FunctionRegistry as _;
 use datafusion::execution::disk_manager::DiskManagerBuilder;
 use datafusion::execution::memory_pool::GreedyMemoryPool;
 use datafusion::execution::object_store::{DefaultObjectStoreRegistry, ObjectStoreRegistry as _, ObjectStoreUrl};
@@ -22,7 +23,7 @@ use crate::control::governor::{Running, govern, resident_bytes};
 use crate::control::guard::guarded;
 use crate::control::lanes::{Lanes, Threads};
 use crate::table::Source;
-use crate::{Error, Session};
+use crate::{Error, Functions, Session};
 
 /// Where the lake's store is registered; no other store is, so no query reaches a file outside of the lake.
 const STORE: &str = "echolake://lake/";
@@ -135,9 +136,10 @@ impl Engine {
         let runtime = runtime(lake, &url, limits).map_err(failed)?;
         let metadata = runtime.cache_manager.get_file_metadata_cache();
         let reader = Arc::new(CachedParquetFileReaderFactory::new(lake.store(), metadata));
+        let functions = Functions::all(lake.rig()).map_err(|e| Error::Execution { message: e.to_string() })?;
         let threads = |e: std::io::Error| Error::Execution { message: format!("no threads for queries: {e}") };
         let inner = Inner {
-            template: template(runtime),
+            template: template(runtime, &functions),
             catalog: Catalog::new(lake, Source { url, reader }),
             lanes: Lanes::new(limits.heavy.max(1)).map_err(threads)?,
             running: Arc::default(),
@@ -227,13 +229,19 @@ fn function(name: &str, doc: Option<&Documentation>) -> Function {
     }
 }
 
-fn template(runtime: Arc<RuntimeEnv>) -> SessionState {
-    let mut state =
-        SessionStateBuilder::new().with_config(config()).with_runtime_env(runtime).with_default_features().build();
+fn template(runtime: Arc<RuntimeEnv>, functions: &Functions) -> SessionState {
+    let mut state = SessionStateBuilder::new()
+        .with_config(config())
+        .with_runtime_env(runtime)
+        .with_default_features()
+        .build();
     let asked: Vec<_> = state.scalar_functions().values().filter_map(guarded).collect();
-    for function in asked {
-        // Replaces the function of its name and aliases; only a registry that is closed refuses.
-        let _ = datafusion::execution::FunctionRegistry::register_udf(&mut state, function);
+    // The new ones replace those of their names and aliases; only a registry that is closed refuses.
+    for function in asked.into_iter().chain(functions.scalar().iter().cloned()) {
+        let _ = state.register_udf(function);
+    }
+    for function in functions.aggregate() {
+        let _ = state.register_udaf(function.clone());
     }
     state
 }

@@ -17,6 +17,7 @@ mod catalog;
 mod control;
 mod engine;
 mod error;
+mod functions;
 mod gate;
 pub mod output;
 mod session;
@@ -24,4 +25,5 @@ mod table;
 
 pub use engine::{Client, Engine, Function, Limits, Quota};
 pub use error::Error;
+pub use functions::Functions;
 pub use session::{Answer, CancelHandle, Extend, Prepared, Session};
