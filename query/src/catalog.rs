@@ -1,44 +1,207 @@
-//! The catalogue of one query: tables of one frozen view of the lake, and what the query names beside them.
+//! The catalogue of one query: tables and views of one frozen view of the lake, and what the query names beside them.
+//!
+//! Taking a view reads twelve logs, so the last one is kept for as long as `runs` has no newer version: a run's rows
+//! are seen when its row in `runs` is. What `optimize` does is not seen by that, and need not be at once, because the
+//! files that it replaces stay for as long as `vacuum` keeps them; so all logs are looked at now and then.
 
-use std::sync::Arc;
+use std::collections::HashMap;
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::{Duration, Instant};
 
 use arrow::datatypes::SchemaRef;
+use datafusion::datasource::TableProvider;
+use datafusion::error::DataFusionError;
 use datafusion::prelude::SessionContext;
+use datafusion::common::TableReference;
 use datafusion::sql::parser::Statement;
-use echolake_lake::Lake;
+use echolake_lake::{DataFile, Lake, Moment, Snapshot};
 use echolake_schema::tables::Table;
 
-use crate::Error;
+use crate::as_of::{self, Past};
 use crate::table::{LakeTable, Source};
+use crate::views::{Lookups, UnusedJoin, View};
+use crate::{Error, error};
+
+/// How long another layout of the same rows may go unseen; vacuum keeps replaced files an hour at least.
+const LAYOUT_SEEN: Duration = Duration::from_secs(30);
+/// Tables of the past that are kept.
+const PAST_KEPT: usize = 32;
 
 /// Makes the tables of a lake known to a query's context.
 pub(crate) struct Catalog {
     lake: Lake,
     source: Source,
+    lookups: Lookups,
+    names: Vec<(&'static str, SchemaRef)>,
+    current: Mutex<Option<Arc<Current>>>,
+    /// One takes a new view, the others wait for it.
+    taking: tokio::sync::Mutex<()>,
+    /// Tables of the past, which do not change. The oldest goes first.
+    past: Mutex<Vec<((Moment, Table), Arc<LakeTable>)>>,
+}
+
+/// One view of the lake.
+struct Current {
+    snapshot: Snapshot,
+    tables: HashMap<Table, Arc<LakeTable>>,
+    providers: Vec<(&'static str, Arc<dyn TableProvider>)>,
+    looked: Mutex<Instant>,
 }
 
 impl Catalog {
-    pub(crate) fn new(lake: &Lake, source: Source) -> Self {
-        Self { lake: lake.clone(), source }
+    /// # Errors
+    /// [`Error::Lake`] where the rig cannot be laid out, [`Error::Execution`] where a view does not fit its tables.
+    pub(crate) fn new(lake: &Lake, source: Source) -> Result<Self, Error> {
+        let lookups = Lookups::of(lake)?;
+        let mut names: Vec<_> = Table::ALL.into_iter().map(|t| (t.name(), t.schema(lake.rig()))).collect();
+        for view in View::ALL {
+            names.push((view.name(), view.schema(lake, &lookups).map_err(failed)?));
+        }
+        Ok(Self {
+            lake: lake.clone(),
+            source,
+            lookups,
+            names,
+            current: Mutex::default(),
+            taking: tokio::sync::Mutex::default(),
+            past: Mutex::default(),
+        })
     }
 
     /// Registers what `statement` may name, all of one view of the lake. The statement is known before its plan, since
     /// what it names may have to be looked up, and planning cannot wait.
     ///
     /// # Errors
-    /// [`Error::Lake`] where the lake cannot be read.
-    pub(crate) async fn register(&self, context: &SessionContext, _statement: &mut Statement) -> Result<(), Error> {
-        let snapshot = self.lake.snapshot().await?;
-        for table in Table::ALL {
-            let files = snapshot.files(table).to_vec();
-            let provider = LakeTable::new(table.schema(self.lake.rig()), files, self.source.clone());
-            context.register_table(table.name(), Arc::new(provider)).map_err(|e| Error::execution(&e))?;
+    /// [`Error::Lake`] where the lake cannot be read, or not as of the moment that the statement wants;
+    /// [`Error::Query`] where that is none.
+    pub(crate) async fn register(&self, context: &SessionContext, statement: &mut Statement) -> Result<(), Error> {
+        let past = as_of::named(statement);
+        for (name, provider) in &self.current().await?.providers {
+            context.register_table(TableReference::bare(*name), provider.clone()).map_err(failed)?;
         }
+        for past in past {
+            let provider = self.at(&past).await?;
+            context.register_table(TableReference::bare(past.name), provider).map_err(failed)?;
+        }
+        context.add_optimizer_rule(Arc::new(UnusedJoin));
         Ok(())
     }
 
-    /// The tables and their schemas.
+    /// The tables and views and their schemas.
     pub(crate) fn tables(&self) -> impl Iterator<Item = (&'static str, SchemaRef)> {
-        Table::ALL.into_iter().map(|t| (t.name(), t.schema(self.lake.rig())))
+        self.names.iter().cloned()
     }
+
+    async fn current(&self) -> Result<Arc<Current>, Error> {
+        let known = self.known();
+        if let Some(current) = &known
+            && self.is_fresh(current).await?
+        {
+            return Ok(current.clone());
+        }
+        let _taking = self.taking.lock().await;
+        // Somebody else may have taken one meanwhile, but before what this query may expect to see.
+        let newer = self.known();
+        if let Some(newer) = &newer
+            && known.as_ref().is_none_or(|known| !Arc::ptr_eq(known, newer))
+            && self.is_fresh(newer).await?
+        {
+            return Ok(newer.clone());
+        }
+        let taken = Arc::new(self.take(newer.as_deref()).await?);
+        *self.current.lock().unwrap_or_else(PoisonError::into_inner) = Some(taken.clone());
+        Ok(taken)
+    }
+
+    fn known(&self) -> Option<Arc<Current>> {
+        self.current.lock().unwrap_or_else(PoisonError::into_inner).clone()
+    }
+
+    async fn is_fresh(&self, current: &Current) -> Result<bool, Error> {
+        let log = self.lake.log();
+        let Some(version) = current.snapshot.version(Table::Runs) else { return Ok(false) };
+        if log.has_after(Table::Runs, version).await? {
+            return Ok(false);
+        }
+        let due = {
+            let mut looked = current.looked.lock().unwrap_or_else(PoisonError::into_inner);
+            let due = looked.elapsed() > LAYOUT_SEEN;
+            if due {
+                *looked = Instant::now();
+            }
+            due
+        };
+        if due {
+            for table in Table::ALL {
+                if log.version(table).await? != current.snapshot.version(table) {
+                    return Ok(false);
+                }
+            }
+        }
+        Ok(true)
+    }
+
+    async fn take(&self, before: Option<&Current>) -> Result<Current, Error> {
+        let snapshot = self.lake.snapshot().await?;
+        let mut tables = HashMap::new();
+        for table in Table::ALL {
+            let files = snapshot.files(table);
+            let kept = before.and_then(|b| b.tables.get(&table)).filter(|t| t.is_of(files)).cloned();
+            let provider = match kept {
+                Some(kept) => kept,
+                None => self.table(table, files)?,
+            };
+            tables.insert(table, provider);
+        }
+        let mut providers: Vec<(&'static str, Arc<dyn TableProvider>)> =
+            tables.iter().map(|(table, provider)| (table.name(), provider.clone() as _)).collect();
+        for view in View::ALL {
+            let of = |table: &Table| Some((*table, tables.get(table)?.clone() as Arc<dyn TableProvider>));
+            let beneath = view.tables().iter().filter_map(of).collect();
+            providers.push((view.name(), Arc::new(view.over(&self.lake, &self.lookups, &beneath).map_err(failed)?)));
+        }
+        Ok(Current { snapshot, tables, providers, looked: Mutex::new(Instant::now()) })
+    }
+
+    fn table(&self, table: Table, files: &[DataFile]) -> Result<Arc<LakeTable>, Error> {
+        let schema = table.schema(self.lake.rig());
+        Ok(Arc::new(LakeTable::new(table, schema, files.to_vec(), self.source.clone()).map_err(failed)?))
+    }
+
+    async fn at(&self, past: &Past) -> Result<Arc<dyn TableProvider>, Error> {
+        let moment = past.moment()?;
+        if let Some(table) = Table::by_name(&past.table) {
+            return Ok(self.table_at(moment, table).await?);
+        }
+        let Some(view) = View::by_name(&past.table) else { return Err(error::missing(&past.table)) };
+        let mut beneath = HashMap::new();
+        for table in view.tables() {
+            beneath.insert(*table, self.table_at(moment, *table).await? as Arc<dyn TableProvider>);
+        }
+        Ok(Arc::new(view.over(&self.lake, &self.lookups, &beneath).map_err(failed)?))
+    }
+
+    async fn table_at(&self, moment: Moment, table: Table) -> Result<Arc<LakeTable>, Error> {
+        let kept = |past: &[((Moment, Table), Arc<LakeTable>)]| {
+            past.iter().find(|(key, _)| *key == (moment, table)).map(|(_, provider)| provider.clone())
+        };
+        if let Some(kept) = kept(&self.past.lock().unwrap_or_else(PoisonError::into_inner)) {
+            return Ok(kept);
+        }
+        let snapshot = self.lake.snapshot_at(moment, table).await?;
+        let provider = self.table(table, snapshot.files(table))?;
+        // What a later time shows is not settled yet.
+        if matches!(moment, Moment::Version(_)) {
+            let mut past = self.past.lock().unwrap_or_else(PoisonError::into_inner);
+            if past.len() >= PAST_KEPT {
+                past.remove(0);
+            }
+            past.push(((moment, table), provider.clone()));
+        }
+        Ok(provider)
+    }
+}
+
+fn failed(error: DataFusionError) -> Error {
+    Error::execution(&error)
 }

@@ -140,7 +140,7 @@ impl Engine {
         let threads = |e: std::io::Error| Error::Execution { message: format!("no threads for queries: {e}") };
         let inner = Inner {
             template: template(runtime, &functions),
-            catalog: Catalog::new(lake, Source { url, reader }),
+            catalog: Catalog::new(lake, Source { url, reader })?,
             lanes: Lanes::new(limits.heavy.max(1)).map_err(threads)?,
             running: Arc::default(),
             limits,

@@ -173,6 +173,12 @@ fn arrow_message(error: &ArrowError) -> String {
     }
 }
 
+/// The error of a query that names a table that is not there.
+pub(crate) fn missing(name: &str) -> Error {
+    let (message, hint) = missing_table(name);
+    Error::Query { message, place: None, hint }
+}
+
 // DataFusion spells the catalogue and schema out, which nobody wrote.
 fn missing_table(qualified: &str) -> (String, Option<String>) {
     let name = qualified.strip_prefix("datafusion.public.").unwrap_or(qualified);

@@ -13,6 +13,7 @@
 //! # }
 //! ```
 
+mod as_of;
 mod catalog;
 mod control;
 mod engine;
@@ -22,6 +23,7 @@ mod gate;
 pub mod output;
 mod session;
 mod table;
+mod views;
 
 pub use engine::{Client, Engine, Function, Limits, Quota};
 pub use error::Error;

@@ -23,7 +23,7 @@ use crate::control::pool::QueryPool;
 use crate::control::watched::watch;
 use crate::control::{Stop, Ticket};
 use crate::engine::{Client, Engine, Function, Limits, Quota};
-use crate::{Error, gate};
+use crate::{Error, as_of, gate};
 
 /// Batches that wait for a slow reader.
 const AHEAD: usize = 2;
@@ -210,6 +210,7 @@ impl Session {
     /// [`Error::Query`] where it is none.
     pub fn parse(&self, sql: &str) -> Result<Statement, Error> {
         let state = self.engine.context().state();
+        let sql = &as_of::respelled(sql);
         state.sql_to_statement(sql, &state.config().options().sql_parser.dialect).map_err(|e| Error::plan(sql, &e))
     }
 

@@ -6,8 +6,9 @@ use std::sync::Arc;
 use arrow::datatypes::{DataType, SchemaRef};
 use async_trait::async_trait;
 use datafusion::catalog::{Session, TableProvider};
+use datafusion::common::pruning::PrunableStatistics;
 use datafusion::common::stats::Precision;
-use datafusion::common::{ScalarValue, Statistics};
+use datafusion::common::{DFSchema, ScalarValue, Statistics};
 use datafusion::datasource::TableType;
 use datafusion::datasource::listing::PartitionedFile;
 use datafusion::datasource::physical_plan::{
@@ -16,26 +17,45 @@ use datafusion::datasource::physical_plan::{
 use datafusion::datasource::source::DataSourceExec;
 use datafusion::error::Result;
 use datafusion::execution::object_store::ObjectStoreUrl;
+use datafusion::logical_expr::utils::conjunction;
 use datafusion::logical_expr::{Expr, TableProviderFilterPushDown};
 use datafusion::physical_expr::PhysicalExpr;
 use datafusion::physical_expr::expressions::{Column, in_list, lit};
+use datafusion::physical_optimizer::pruning::PruningPredicateBuilder;
 use datafusion::physical_plan::ExecutionPlan;
+use datafusion::physical_plan::empty::EmptyExec;
 use datafusion::physical_plan::filter::{FilterExec, FilterExecBuilder};
 use datafusion::physical_plan::union::UnionExec;
 use echolake_lake::DataFile;
+use echolake_schema::tables::Table;
 use object_store::ObjectMeta;
 
 /// Delta's writers cut texts in statistics to 32 characters; a shorter one is whole, whoever wrote it.
 const WHOLE_TEXT: usize = 32;
 /// The column that tells the runs of a merged file apart.
 const RUN: &str = "run_id";
+/// Files whose statistics are summed up for a plan; those of all files are summed up once.
+const FEW: usize = 8;
+/// Rows a batch of a scan without lists: what the engine's kernels are fastest with.
+const NARROW_BATCH_ROWS: usize = 8192;
 
 /// Files of one table in one snapshot.
 #[derive(Debug)]
 pub(crate) struct LakeTable {
+    table: Table,
     schema: SchemaRef,
-    files: Vec<DataFile>,
+    columns: DFSchema,
+    files: Vec<ScanFile>,
+    all: Statistics,
     source: Source,
+}
+
+/// A file, and how a scan names it.
+#[derive(Debug)]
+struct ScanFile {
+    file: DataFile,
+    part: PartitionedFile,
+    known: Arc<Statistics>,
 }
 
 /// How files are read.
@@ -48,46 +68,86 @@ pub(crate) struct Source {
 }
 
 impl LakeTable {
-    pub(crate) fn new(schema: SchemaRef, files: Vec<DataFile>, source: Source) -> Self {
-        Self { schema, files, source }
+    /// # Errors
+    /// Where the schema names a column twice.
+    pub(crate) fn new(table: Table, schema: SchemaRef, files: Vec<DataFile>, source: Source) -> Result<Self> {
+        let columns = DFSchema::try_from(schema.clone())?;
+        let files: Vec<_> = files.into_iter().map(|file| ScanFile::new(file, &schema)).collect();
+        let all = Statistics::try_merge_iter(files.iter().map(|f| f.known.as_ref()), &schema)?;
+        Ok(Self { table, schema, columns, files, all, source })
+    }
+
+    /// Whether the table has just these files.
+    pub(crate) fn is_of(&self, files: &[DataFile]) -> bool {
+        self.files.len() == files.len() && self.files.iter().zip(files).all(|(a, b)| a.file == *b)
+    }
+
+    /// The columns of which no two rows have the same values, where a view joins by them.
+    pub(crate) fn key(&self) -> Option<&'static [&'static str]> {
+        match self.table {
+            Table::Nce | Table::Tnce | Table::Measurements => Some(&["run_id", "pair_id"]),
+            Table::Heightmaps => Some(&["surface_id", "symmetry"]),
+            Table::Surfaces => Some(&["surface_id"]),
+            Table::Runs => Some(&["run_id"]),
+            Table::Pairs => Some(&["pair_id"]),
+            Table::Points => Some(&["point_id"]),
+            _ => None,
+        }
+    }
+
+    // The files that may have rows that pass the filters, by what the log knows of them. DataFusion would find the
+    // same when it comes to each file; a query for one surface should not come to the others at all.
+    fn kept(&self, state: &dyn Session, filters: &[Expr]) -> Result<Vec<&ScanFile>> {
+        let all = || self.files.iter().collect();
+        let Some(filter) = conjunction(filters.iter().cloned()) else { return Ok(all()) };
+        let filter = state.create_physical_expr(filter, &self.columns)?;
+        let predicate = PruningPredicateBuilder::new().with_file_schema(self.schema.clone()).build(filter);
+        let Some(predicate) = predicate else { return Ok(all()) };
+        let known = self.files.iter().map(|f| f.known.clone()).collect();
+        let may = predicate.prune(&PrunableStatistics::new(known, self.schema.clone()))?;
+        Ok(self.files.iter().zip(may).filter(|(_, may)| *may).map(|(file, _)| file).collect())
     }
 
     // A plain scan of files, in groups of about the same size; a file is split further by DataFusion where that pays.
-    fn files(
+    fn scan_files(
         &self,
-        files: &[&DataFile],
+        files: &[&ScanFile],
         state: &dyn Session,
         projection: Option<Vec<usize>>,
         limit: Option<usize>,
     ) -> Result<Arc<dyn ExecutionPlan>> {
-        let count = state.config().target_partitions();
-        let mut groups: Vec<(u64, Vec<PartitionedFile>)> = vec![(0, Vec::new()); count.clamp(1, files.len().max(1))];
-        for file in files {
-            if let Some((bytes, group)) = groups.iter_mut().min_by_key(|g| g.0) {
-                *bytes += file.bytes;
-                group.push(self.file(file));
-            }
-        }
-        let mut statistics = Statistics::new_unknown(&self.schema);
-        statistics.num_rows = Precision::Exact(files.iter().map(|f| f.rows as usize).sum());
+        let lists = self.reads_lists(projection.as_ref());
         let source = ParquetSource::new(self.schema.clone())
             .with_table_parquet_options(state.table_options().parquet.clone())
             .with_parquet_file_reader_factory(self.source.reader.clone())
-            .with_pushdown_filters(self.reads_lists(projection.as_ref()));
+            .with_pushdown_filters(lists);
         let config = FileScanConfigBuilder::new(self.source.url.clone(), Arc::new(source))
-            .with_file_groups(groups.into_iter().map(|(_, files)| FileGroup::new(files)).collect())
-            .with_statistics(statistics)
+            .with_file_groups(groups(files, state.config().target_partitions()))
+            .with_statistics(self.known(files)?)
+            .with_batch_size((!lists).then_some(NARROW_BATCH_ROWS))
             .with_projection_indices(projection)?
             .with_limit(limit)
             .build();
         Ok(DataSourceExec::from_data_source(config))
     }
 
+    fn known(&self, files: &[&ScanFile]) -> Result<Statistics> {
+        if files.len() == self.files.len() {
+            return Ok(self.all.clone());
+        }
+        if files.len() <= FEW {
+            return Statistics::try_merge_iter(files.iter().map(|f| f.known.as_ref()), &self.schema);
+        }
+        let mut known = Statistics::new_unknown(&self.schema);
+        known.num_rows = Precision::Exact(files.iter().map(|f| f.file.rows as usize).sum());
+        Ok(known)
+    }
+
     // Merged files with runs that are replaced since: the same scan without their rows. The limit counts rows that
     // stay, so it is not the scan's.
     fn partly_hidden(
         &self,
-        files: &[&DataFile],
+        files: &[&ScanFile],
         state: &dyn Session,
         projection: Option<&Vec<usize>>,
     ) -> Result<Arc<dyn ExecutionPlan>> {
@@ -98,47 +158,12 @@ impl LakeTable {
             columns.push(run);
             columns.len() - 1
         });
-        let scan = self.files(files, state, Some(columns), None)?;
-        let hidden: BTreeSet<_> = files.iter().flat_map(|f| f.hidden.iter().map(|r| r.as_str())).collect();
+        let scan = self.scan_files(files, state, Some(columns), None)?;
+        let hidden: BTreeSet<_> = files.iter().flat_map(|f| f.file.hidden.iter().map(|r| r.as_str())).collect();
         let hidden: Vec<Arc<dyn PhysicalExpr>> = hidden.into_iter().map(lit).collect();
         let shown = in_list(Arc::new(Column::new(RUN, at)), hidden, &true, &scan.schema())?;
         let filter: FilterExec = FilterExecBuilder::new(shown, scan).apply_projection(Some(wanted))?.build()?;
         Ok(Arc::new(filter))
-    }
-
-    fn file(&self, file: &DataFile) -> PartitionedFile {
-        let meta = ObjectMeta {
-            location: file.path.clone(),
-            last_modified: file.modified,
-            size: file.bytes,
-            e_tag: None,
-            version: None,
-        };
-        PartitionedFile::new_from_meta(meta).with_statistics(Arc::new(self.known(file)))
-    }
-
-    // What the log knows of a file, so that a query for one surface does not open the files of the others.
-    fn known(&self, file: &DataFile) -> Statistics {
-        let mut known = Statistics::new_unknown(&self.schema);
-        known.num_rows = Precision::Exact(file.rows as usize);
-        let Some(stats) = &file.stats else { return known };
-        for (field, column) in self.schema.fields().iter().zip(&mut known.column_statistics) {
-            let kind = field.data_type();
-            let least = stats.min.get(field.name()).and_then(|v| scalar(kind, v.as_str(), v.as_i64()));
-            let greatest = stats.max.get(field.name()).and_then(|v| scalar(kind, v.as_str(), v.as_i64()));
-            if let (Some(least), Some(greatest)) = (least, greatest) {
-                column.min_value = Precision::Exact(least);
-                column.max_value = Precision::Exact(greatest);
-            }
-        }
-        known
-    }
-
-    fn rows(&self) -> Statistics {
-        let rows: u64 = self.files.iter().map(DataFile::visible_rows).sum();
-        let mut statistics = Statistics::new_unknown(&self.schema);
-        statistics.num_rows = Precision::Exact(rows as usize);
-        statistics
     }
 
     // Lists are decoded for the rows that a filter leaves. Scans of narrow columns alone would only lose by it.
@@ -151,6 +176,41 @@ impl LakeTable {
     }
 }
 
+impl ScanFile {
+    fn new(file: DataFile, schema: &SchemaRef) -> Self {
+        let meta = ObjectMeta {
+            location: file.path.clone(),
+            last_modified: file.modified,
+            size: file.bytes,
+            e_tag: None,
+            version: None,
+        };
+        let known = Arc::new(known(&file, schema));
+        let part = PartitionedFile::new_from_meta(meta).with_statistics(known.clone());
+        Self { file, part, known }
+    }
+}
+
+// What the log knows of a file, so that a query for one surface does not open the files of the others.
+fn known(file: &DataFile, schema: &SchemaRef) -> Statistics {
+    let mut known = Statistics::new_unknown(schema);
+    known.num_rows = Precision::Exact(file.rows as usize);
+    for (field, column) in schema.fields().iter().zip(&mut known.column_statistics) {
+        if !field.is_nullable() {
+            column.null_count = Precision::Exact(0);
+        }
+        let Some(stats) = &file.stats else { continue };
+        let kind = field.data_type();
+        let least = stats.min.get(field.name()).and_then(|v| scalar(kind, v.as_str(), v.as_i64()));
+        let greatest = stats.max.get(field.name()).and_then(|v| scalar(kind, v.as_str(), v.as_i64()));
+        if let (Some(least), Some(greatest)) = (least, greatest) {
+            column.min_value = Precision::Exact(least);
+            column.max_value = Precision::Exact(greatest);
+        }
+    }
+    known
+}
+
 // Keys are integers and texts. JSON does not keep every float, so those are left to the file's own statistics.
 fn scalar(kind: &DataType, text: Option<&str>, int: Option<i64>) -> Option<ScalarValue> {
     match kind {
@@ -159,6 +219,17 @@ fn scalar(kind: &DataType, text: Option<&str>, int: Option<i64>) -> Option<Scala
         DataType::Int64 => int.map(ScalarValue::from),
         _ => None,
     }
+}
+
+fn groups(files: &[&ScanFile], count: usize) -> Vec<FileGroup> {
+    let mut groups: Vec<(u64, Vec<PartitionedFile>)> = vec![(0, Vec::new()); count.clamp(1, files.len().max(1))];
+    for file in files {
+        if let Some((bytes, group)) = groups.iter_mut().min_by_key(|g| g.0) {
+            *bytes += file.file.bytes;
+            group.push(file.part.clone());
+        }
+    }
+    groups.into_iter().map(|(_, files)| FileGroup::new(files)).collect()
 }
 
 #[async_trait]
@@ -171,31 +242,45 @@ impl TableProvider for LakeTable {
         TableType::Base
     }
 
-    // DataFusion keeps its filter, and its physical optimizer hands it to the Parquet reader, which leaves out files,
-    // row groups and pages by statistics, and rows where lists are read.
+    // DataFusion keeps its filter, and its physical optimizer hands it to the Parquet reader, which leaves out row
+    // groups and pages by statistics, and rows where lists are read.
     fn supports_filters_pushdown(&self, filters: &[&Expr]) -> Result<Vec<TableProviderFilterPushDown>> {
         Ok(vec![TableProviderFilterPushDown::Inexact; filters.len()])
     }
 
     fn statistics(&self) -> Option<Statistics> {
-        Some(self.rows())
+        let mut statistics = self.all.clone();
+        if self.files.iter().any(|f| !f.file.hidden.is_empty()) {
+            statistics = statistics.to_inexact();
+        }
+        let rows: u64 = self.files.iter().map(|f| f.file.visible_rows()).sum();
+        statistics.num_rows = Precision::Exact(rows as usize);
+        Some(statistics)
     }
 
     async fn scan(
         &self,
         state: &dyn Session,
         projection: Option<&Vec<usize>>,
-        _filters: &[Expr],
+        filters: &[Expr],
         limit: Option<usize>,
     ) -> Result<Arc<dyn ExecutionPlan>> {
-        let (whole, partial): (Vec<_>, Vec<_>) = self.files.iter().partition(|f| f.hidden.is_empty());
-        if partial.is_empty() {
-            return self.files(&whole, state, projection.cloned(), limit);
+        let kept = self.kept(state, filters)?;
+        let (whole, partial): (Vec<_>, Vec<_>) = kept.into_iter().partition(|f| f.file.hidden.is_empty());
+        match (whole.is_empty(), partial.is_empty()) {
+            (true, true) => {
+                let schema = match projection {
+                    Some(columns) => Arc::new(self.schema.project(columns)?),
+                    None => self.schema.clone(),
+                };
+                Ok(Arc::new(EmptyExec::new(schema)))
+            }
+            (false, true) => self.scan_files(&whole, state, projection.cloned(), limit),
+            (true, false) => self.partly_hidden(&partial, state, projection),
+            (false, false) => UnionExec::try_new(vec![
+                self.scan_files(&whole, state, projection.cloned(), limit)?,
+                self.partly_hidden(&partial, state, projection)?,
+            ]),
         }
-        let partial = self.partly_hidden(&partial, state, projection)?;
-        if whole.is_empty() {
-            return Ok(partial);
-        }
-        UnionExec::try_new(vec![self.files(&whole, state, projection.cloned(), limit)?, partial])
     }
 }

@@ -10,7 +10,7 @@ use echolake_schema::{RunId, SurfaceId};
 use object_store::path::Path;
 use serde_json::{Map, Value};
 
-use crate::Result;
+use crate::{Result, TableVersion};
 
 /// A Parquet file of a table.
 #[derive(Debug, Clone, PartialEq)]
@@ -144,6 +144,15 @@ pub trait CommitLog: Send + Sync + std::fmt::Debug {
     async fn ensure(&self, table: Table) -> Result<()>;
     /// The table's files as of now; none where there is no table.
     async fn files(&self, table: Table) -> Result<Vec<DataFile>>;
+    /// The table's newest version; None where there is no table.
+    async fn version(&self, table: Table) -> Result<Option<u64>>;
+    /// Whether there is a version after this one. One look at the store; where the log was cleaned up since, it may
+    /// not see what [`CommitLog::version`] sees.
+    async fn has_after(&self, table: Table, version: u64) -> Result<bool>;
+    /// The versions that the log still holds, oldest first.
+    async fn versions(&self, table: Table) -> Result<Vec<TableVersion>>;
+    /// The table's files as of a version that the log still holds.
+    async fn files_at(&self, table: Table, version: u64) -> Result<Vec<DataFile>>;
     /// Whether a file of this name is in the log.
     async fn has(&self, table: Table, name: &str) -> Result<bool>;
     /// What the log names and named; None where there is no log.

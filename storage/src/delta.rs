@@ -17,15 +17,18 @@ use deltalake_core::{DeltaTable, DeltaTableError};
 use echolake_schema::Rig;
 use echolake_schema::tables::Table;
 use futures::TryStreamExt as _;
-use object_store::ObjectStore;
 use object_store::path::Path;
 use object_store::prefix::PrefixStore;
+use object_store::{ObjectStore, ObjectStoreExt as _};
 use serde_json::{Map, Value};
 use tokio::sync::Mutex;
 use url::Url;
 
 use crate::snapshot::{decode_parts, encode_parts, is_merged};
-use crate::{Commit, CommitLog, Committed, DataFile, Effect, Error, FileStats, History, NewFile, Part, Result};
+use crate::versions::{self, commit_name};
+use crate::{
+    Commit, CommitLog, Committed, DataFile, Effect, Error, FileStats, History, NewFile, Part, Result, TableVersion,
+};
 
 /// Tries of one commit against other writers; each loses to a commit that went through.
 const COMMIT_TRIES: usize = 50;
@@ -206,26 +209,33 @@ impl CommitLog for DeltaLog {
     }
 
     async fn files(&self, table: Table) -> Result<Vec<DataFile>> {
-        let Some(delta) = self.load(table).await? else { return Ok(Vec::new()) };
-        let broken = |e| Error::log(table.name(), "read", e);
-        let state = delta.snapshot().map_err(broken)?;
-        let log_store = delta.log_store();
-        let views = state.snapshot().file_views(log_store.as_ref(), None);
-        let views: Vec<_> = views.try_collect().await.map_err(broken)?;
-        let mut files = Vec::with_capacity(views.len());
-        for view in views {
-            files.push(DataFile {
-                path: folder(table).join(view.path().as_ref()),
-                bytes: u64::try_from(view.size()).unwrap_or(0),
-                rows: view.num_records().unwrap_or(0) as u64,
-                modified: view.modification_datetime().unwrap_or(DateTime::UNIX_EPOCH),
-                stats: view.stats().as_deref().and_then(parse_stats),
-                parts: if is_merged(&view.path()) { parts(table, &view)? } else { Vec::new() },
-                hidden: Vec::new(),
-            });
+        match self.load(table).await? {
+            Some(delta) => files_of(table, &delta).await,
+            None => Ok(Vec::new()),
         }
-        files.sort_by(|a, b| a.path.cmp(&b.path));
-        Ok(files)
+    }
+
+    async fn version(&self, table: Table) -> Result<Option<u64>> {
+        Ok(self.load(table).await?.and_then(|delta| delta.version()))
+    }
+
+    async fn has_after(&self, table: Table, version: u64) -> Result<bool> {
+        let next = folder(table).join("_delta_log").join(commit_name(version + 1));
+        match self.store.head(&next).await {
+            Ok(_) => Ok(true),
+            Err(object_store::Error::NotFound { .. }) => Ok(false),
+            Err(e) => Err(Error::store("read", next, e)),
+        }
+    }
+
+    async fn versions(&self, table: Table) -> Result<Vec<TableVersion>> {
+        versions::listed(self.store.as_ref(), table).await
+    }
+
+    async fn files_at(&self, table: Table, version: u64) -> Result<Vec<DataFile>> {
+        let mut delta = DeltaTable::new(self.log_store(table)?);
+        delta.load_version(version).await.map_err(|e| Error::log(table.name(), "read", e))?;
+        files_of(table, &delta).await
     }
 
     async fn has(&self, table: Table, name: &str) -> Result<bool> {
@@ -265,6 +275,28 @@ impl CommitLog for DeltaLog {
         let reason = format!("{COMMIT_TRIES} tries lost to other writers; hint: run the command again");
         Err(Error::Log { table: table.name(), action: "written", reason })
     }
+}
+
+async fn files_of(table: Table, delta: &DeltaTable) -> Result<Vec<DataFile>> {
+    let broken = |e| Error::log(table.name(), "read", e);
+    let state = delta.snapshot().map_err(broken)?;
+    let log_store = delta.log_store();
+    let views = state.snapshot().file_views(log_store.as_ref(), None);
+    let views: Vec<_> = views.try_collect().await.map_err(broken)?;
+    let mut files = Vec::with_capacity(views.len());
+    for view in views {
+        files.push(DataFile {
+            path: folder(table).join(view.path().as_ref()),
+            bytes: u64::try_from(view.size()).unwrap_or(0),
+            rows: view.num_records().unwrap_or(0) as u64,
+            modified: view.modification_datetime().unwrap_or(DateTime::UNIX_EPOCH),
+            stats: view.stats().as_deref().and_then(parse_stats),
+            parts: if is_merged(&view.path()) { parts(table, &view)? } else { Vec::new() },
+            hidden: Vec::new(),
+        });
+    }
+    files.sort_by(|a, b| a.path.cmp(&b.path));
+    Ok(files)
 }
 
 fn is_conflict(error: &DeltaTableError) -> bool {

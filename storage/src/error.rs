@@ -119,6 +119,28 @@ pub enum Error {
         /// The lake's location.
         location: String,
     },
+    /// The log does not hold the lake at that moment.
+    #[error("the lake has no {moment}: {held}; hint: older versions are forgotten with the log's own clean-up")]
+    NoMoment {
+        /// The moment.
+        moment: String,
+        /// What is there instead.
+        held: String,
+    },
+    /// Files of that moment are deleted.
+    #[error(
+        "table `{table}` cannot be seen at {moment}: {missing} of its {files} files then are deleted; hint: `echolake vacuum --keep-hours` keeps files longer"
+    )]
+    Vacuumed {
+        /// The moment.
+        moment: String,
+        /// The table.
+        table: &'static str,
+        /// Files that are gone.
+        missing: usize,
+        /// Files that it had.
+        files: usize,
+    },
     /// A rig or id that is not valid.
     #[error(transparent)]
     Schema(#[from] echolake_schema::Error),

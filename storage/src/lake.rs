@@ -133,11 +133,19 @@ impl Lake {
         for table in Table::ALL.into_iter().filter(|t| t.source() == Source::Rig) {
             let rows = match table {
                 Table::Points => rig_tables::points(self.rig(), grid)?,
-                _ => rig_tables::pairs(self.rig(), grid)?,
+                _ => self.pairs()?,
             };
             self.append_rows(table, &derivation(), &[rows]).await?;
         }
         Ok(())
+    }
+
+    /// The rows of table `pairs`, which follow from the rig: row i is pair i.
+    ///
+    /// # Errors
+    /// [`Error::Encode`] where the rig has no such columns, which is a mistake in this crate.
+    pub fn pairs(&self) -> Result<RecordBatch> {
+        rig_tables::pairs(self.rig(), self.grid())
     }
 
     /// The lake's location as the user wrote it.

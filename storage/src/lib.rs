@@ -30,6 +30,7 @@ mod rig_tables;
 mod rows;
 mod snapshot;
 mod vacuum;
+mod versions;
 
 pub use commit_log::{Commit, CommitLog, Committed, DataFile, Effect, FileStats, History, NewFile, Part, Replaces};
 pub use config::{LAKE_FORMAT, LakeConfig, References};
@@ -39,6 +40,7 @@ pub use lake::{Lake, Staged};
 pub use optimize::{Merging, Optimized, TARGET_BYTES, TableOptimized};
 pub use snapshot::{FileName, Snapshot, VisibleRun};
 pub use vacuum::{Deletion, Freed, KEEP_HOURS, Vacuumed};
+pub use versions::{Moment, NoMoment, TableVersion};
 
 /// The result of what a lake does.
 pub type Result<T> = std::result::Result<T, Error>;

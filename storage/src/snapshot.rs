@@ -66,6 +66,7 @@ pub struct Snapshot {
     runs: BTreeMap<RunId, Current>,
     hidden: HashMap<Table, Vec<DataFile>>,
     outgrown: HashMap<Table, Vec<DataFile>>,
+    versions: HashMap<Table, u64>,
 }
 
 /// A run's row in `runs`, and when it was committed.
@@ -118,13 +119,31 @@ impl FileName {
 impl Snapshot {
     /// Takes a view. `runs` is read first, so that whatever it names was committed before.
     pub(crate) async fn take(log: &dyn CommitLog) -> Result<Self> {
+        // Versions are read before files, so that a commit between the two is taken for one that is yet to be seen.
+        let mut versions = HashMap::new();
+        versions.extend(log.version(Table::Runs).await?.map(|v| (Table::Runs, v)));
         let pointers = log.files(Table::Runs).await?;
         let mut snapshot = Self { runs: current_runs(&pointers), ..Self::default() };
-        for table in Table::ALL {
-            let files = if table == Table::Runs { pointers.clone() } else { log.files(table).await? };
-            snapshot.sort_in(table, files);
+        for table in Table::ALL.into_iter().filter(|t| *t != Table::Runs) {
+            versions.extend(log.version(table).await?.map(|v| (table, v)));
+            snapshot.sort_in(table, log.files(table).await?);
         }
+        snapshot.sort_in(Table::Runs, pointers);
+        snapshot.versions = versions;
         Ok(snapshot)
+    }
+
+    /// The view of one table that a version of `runs` gives, its files as the log had them then.
+    pub(crate) fn of(pointers: &[DataFile], table: Table, files: Vec<DataFile>) -> Self {
+        let mut snapshot = Self { runs: current_runs(pointers), ..Self::default() };
+        snapshot.sort_in(table, files);
+        snapshot
+    }
+
+    /// The version of a table's log that the view was taken of, or a little before it; that of `runs` is the lake's.
+    /// None where there was no table, and for views of the past.
+    pub fn version(&self, table: Table) -> Option<u64> {
+        self.versions.get(&table).copied()
     }
 
     /// The files of a table that readers see.

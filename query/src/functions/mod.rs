@@ -28,7 +28,6 @@ mod tests;
 use std::sync::Arc;
 
 use datafusion::logical_expr::{AggregateUDF, ScalarUDF};
-use datafusion::prelude::SessionContext;
 use echolake_schema::Rig;
 
 use aggregate::udaf;

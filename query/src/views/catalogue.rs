@@ -1,0 +1,63 @@
+//! `catalogue`: a row a surface, with its newest run and the levels that it reached there.
+
+use std::collections::HashMap;
+
+use echolake_schema::Rig;
+
+use super::note;
+
+// What a column of `surface_stats` is called here, and what it is.
+const STATS: [(&str, &str, &str, &str); 4] = [
+    ("p90_mean_db", "level", "dB re Flat", "Mean of the TNCE values up to their 90th percentile"),
+    ("p5_db", "p5", "dB re Flat", "5th percentile of TNCE"),
+    ("p95_db", "p95", "dB re Flat", "95th percentile of TNCE"),
+    ("spread_db", "spread", "dB", "Standard deviation of TNCE in dB over the pairs"),
+];
+
+fn bands(rig: &Rig) -> Vec<String> {
+    rig.band_names().into_iter().chain(["total".to_owned()]).collect()
+}
+
+pub(super) fn sql(rig: &Rig) -> String {
+    let names: Vec<_> = STATS
+        .iter()
+        .flat_map(|(column, name, ..)| bands(rig).into_iter().map(move |b| (*column, format!("{name}_{b}_db"), b)))
+        .collect();
+    let pivot = |(column, name, band): &(&str, String, String)| {
+        format!("max(CASE WHEN band = '{band}' THEN {column} END) AS {name}")
+    };
+    let pivots: Vec<_> = names.iter().map(pivot).collect();
+    let levels: Vec<_> = names.iter().map(|(_, name, _)| format!("t.{name}")).collect();
+    format!(
+        "SELECT s.surface_id, s.panel, s.side, s.typology, s.macrostructure, s.mesostructure, s.microstructure, \
+         s.material, s.reflection_factor, s.parameters, s.relief_min_mm, s.relief_max_mm, s.relief_rms_mm, \
+         s.mesh_triangles, s.flat_reference, s.foam_reference, s.origin, \
+         a.runs, a.all_measurements, a.first_started, a.last_ended, \
+         r.run_id, r.state, r.missing, r.started, r.ended, r.measurements, r.rejected, r.attempts, r.damaged, \
+         r.temperature_min_c, r.temperature_max_c, r.file, r.file_bytes, r.flat_version, r.foam_version, {levels} \
+         FROM surfaces s JOIN runs r ON r.run_id = s.run_id \
+         JOIN (SELECT surface_id, count(*) AS runs, CAST(sum(measurements) AS BIGINT) AS all_measurements, \
+         min(started) AS first_started, max(ended) AS last_ended FROM runs GROUP BY surface_id) a \
+         ON a.surface_id = s.surface_id \
+         LEFT JOIN (SELECT run_id, {pivots} FROM surface_stats GROUP BY run_id) t ON t.run_id = s.run_id",
+        levels = levels.join(", "),
+        pivots = pivots.join(", ")
+    )
+}
+
+pub(super) fn notes(rig: &Rig) -> HashMap<String, HashMap<String, String>> {
+    let own = [
+        note("runs", "1", "Runs of the surface"),
+        note("all_measurements", "1", "Accepted measurements of all of its runs"),
+        note("first_started", "", "Start of its first run, UTC"),
+        note("last_ended", "", "End of its last run, UTC"),
+        note("run_id", "", "Its newest run; what follows is of that"),
+    ];
+    let levels = STATS.iter().flat_map(|(_, name, unit, comment)| {
+        bands(rig).into_iter().map(move |b| {
+            let of = if b == "total" { "all bands".to_owned() } else { format!("the band at {b} Hz") };
+            note(format!("{name}_{b}_db"), unit, format!("{comment}, {of}, newest run"))
+        })
+    });
+    own.into_iter().chain(levels).collect()
+}

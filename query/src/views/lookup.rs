@@ -1,0 +1,138 @@
+//! What follows from the rig alone is looked up by pair, and by symmetry, instead of joined: `pair_incidence_deg(pair_id)`,
+//! `d4_pair_id(pair_id, symmetry_id)`. One array access a row; a join would hold up what could stream.
+
+use std::hash::{Hash, Hasher};
+use std::sync::Arc;
+
+use arrow::array::{Array as _, ArrayRef, AsArray as _, BooleanArray, Float64Array, Int32Array, UInt32Array};
+use arrow::compute::take;
+use arrow::datatypes::{DataType, Int32Type};
+use datafusion::error::Result;
+use datafusion::logical_expr::{
+    ColumnarValue, ScalarFunctionArgs, ScalarUDF, ScalarUDFImpl, Signature, Volatility,
+};
+use datafusion::prelude::SessionContext;
+use echolake_lake::Lake;
+use echolake_schema::symmetry::MovedPair;
+use echolake_schema::{Grid, Symmetry};
+
+/// The lookup functions of a lake.
+pub(crate) struct Lookups(Vec<Arc<ScalarUDF>>);
+
+/// Values of all pairs, or of all pairs under each symmetry of D4, one symmetry after the other.
+#[derive(Debug)]
+struct Lookup {
+    name: String,
+    /// `[pairs]`, or `[symmetries * pairs]`.
+    values: ArrayRef,
+    pairs: usize,
+    signature: Signature,
+}
+
+impl Lookups {
+    /// The functions.
+    ///
+    /// # Errors
+    /// Where the rig's pairs cannot be laid out.
+    pub(crate) fn of(lake: &Lake) -> echolake_lake::Result<Self> {
+        let pairs = lake.pairs()?;
+        let columns = pairs.schema();
+        let own = columns.fields().iter().zip(pairs.columns()).skip(1);
+        let mut all: Vec<_> =
+            own.map(|(field, values)| Lookup::new("pair_", field.name(), values.clone(), pairs.num_rows(), 1)).collect();
+        all.extend(moved(lake.grid()));
+        Ok(Self(all.into_iter().map(|lookup| Arc::new(ScalarUDF::from(lookup))).collect()))
+    }
+
+    pub(super) fn register(&self, context: &SessionContext) {
+        for function in &self.0 {
+            context.register_udf(function.as_ref().clone());
+        }
+    }
+}
+
+fn moved(grid: &Grid) -> Vec<Lookup> {
+    // A symmetry that the grid lacks is in no view; its place is kept, so that ids stay.
+    let moved: Vec<Option<MovedPair>> = Symmetry::ALL
+        .into_iter()
+        .flat_map(|s| match grid.moved_pairs(s) {
+            Some(pairs) => pairs.into_iter().map(Some).collect(),
+            None => vec![None; grid.pairs().len()],
+        })
+        .collect();
+    let int = |f: fn(&MovedPair) -> u32| -> ArrayRef {
+        Arc::new(moved.iter().map(|m| m.as_ref().map(|m| f(m) as i32)).collect::<Int32Array>())
+    };
+    let axis = |end: fn(&Grid, &MovedPair) -> Option<[f64; 3]>, i: usize| -> ArrayRef {
+        Arc::new(moved.iter().map(|m| m.as_ref().and_then(|m| end(grid, m)).map(|p| p[i])).collect::<Float64Array>())
+    };
+    let swapped: BooleanArray = moved.iter().map(|m| m.as_ref().map(|m| m.swapped)).collect();
+    let mut columns: Vec<(String, ArrayRef)> = vec![
+        ("swapped".into(), Arc::new(swapped)),
+        ("pair_id".into(), int(|m| m.pair.id.0)),
+        ("microphone".into(), int(|m| m.pair.microphone.0)),
+        ("speaker".into(), int(|m| m.pair.speaker.0)),
+    ];
+    for (i, name) in ["x_mm", "y_mm", "z_mm"].into_iter().enumerate() {
+        let microphone = axis(|g, m| g.point(m.pair.microphone).map(|p| p.position_mm), i);
+        let speaker = axis(|g, m| g.point(m.pair.speaker).map(|p| p.position_mm), i);
+        columns.extend([(format!("microphone_{name}"), microphone), (format!("speaker_{name}"), speaker)]);
+    }
+    columns.into_iter().map(|(name, values)| Lookup::new("d4_", &name, values, grid.pairs().len(), 2)).collect()
+}
+
+impl Lookup {
+    fn new(prefix: &str, name: &str, values: ArrayRef, pairs: usize, arguments: usize) -> Self {
+        let signature = Signature::exact(vec![DataType::Int32; arguments], Volatility::Immutable);
+        Self { name: format!("{prefix}{name}"), values, pairs, signature }
+    }
+
+    fn index(&self, pair: Option<i32>, symmetry: Option<i32>) -> Option<u32> {
+        let pair = usize::try_from(pair?).ok().filter(|p| *p < self.pairs)?;
+        let index = usize::try_from(symmetry?).ok()?.checked_mul(self.pairs)?.checked_add(pair)?;
+        u32::try_from(index).ok().filter(|_| index < self.values.len())
+    }
+}
+
+// The same name over other values is another lake's.
+impl PartialEq for Lookup {
+    fn eq(&self, other: &Self) -> bool {
+        self.name == other.name && Arc::ptr_eq(&self.values, &other.values)
+    }
+}
+
+impl Eq for Lookup {}
+
+impl Hash for Lookup {
+    fn hash<H: Hasher>(&self, state: &mut H) {
+        self.name.hash(state);
+    }
+}
+
+impl ScalarUDFImpl for Lookup {
+    fn name(&self) -> &str {
+        &self.name
+    }
+
+    fn signature(&self) -> &Signature {
+        &self.signature
+    }
+
+    fn return_type(&self, _arguments: &[DataType]) -> Result<DataType> {
+        Ok(self.values.data_type().clone())
+    }
+
+    fn invoke_with_args(&self, args: ScalarFunctionArgs) -> Result<ColumnarValue> {
+        let rows = args.number_rows;
+        let columns = args.args.iter().map(|a| a.to_array(rows)).collect::<Result<Vec<_>>>()?;
+        let pairs = columns[0].as_primitive::<Int32Type>();
+        let indices: UInt32Array = match columns.get(1) {
+            Some(symmetries) => {
+                let symmetries = symmetries.as_primitive::<Int32Type>();
+                pairs.iter().zip(symmetries).map(|(p, s)| self.index(p, s)).collect()
+            }
+            None => pairs.iter().map(|p| self.index(p, Some(0))).collect(),
+        };
+        Ok(ColumnarValue::Array(take(&self.values, &indices, None)?))
+    }
+}

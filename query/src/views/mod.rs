@@ -1,0 +1,149 @@
+//! Views that read well: what most questions join, joined. Computed by each query, never stored.
+//!
+//! Each is SQL over the lake's tables, planned once a snapshot and merged into the queries that name it, so that their
+//! filters and columns reach the scans beneath.
+
+mod augmented;
+mod catalogue;
+mod ir;
+mod lookup;
+mod tnce_db;
+mod unused_join;
+
+use std::collections::HashMap;
+use std::sync::Arc;
+
+use arrow::datatypes::{Field, SchemaRef};
+use datafusion::common::metadata::FieldMetadata;
+use datafusion::datasource::{TableProvider, ViewTable};
+use datafusion::error::{DataFusionError, Result};
+use datafusion::logical_expr::{LogicalPlan, LogicalPlanBuilder};
+use datafusion::prelude::{SessionContext, ident};
+use echolake_lake::Lake;
+use echolake_schema::tables::{COMMENT, Table, UNIT};
+use futures::FutureExt as _;
+
+pub(crate) use lookup::Lookups;
+pub(crate) use unused_join::UnusedJoin;
+
+/// A view.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum View {
+    /// A row a measurement: geometry and samples.
+    Ir,
+    /// A row a measurement: TNCE in dB, with geometry.
+    TnceDb,
+    /// A row a measurement and symmetry: moved geometry, samples, moved height map.
+    Augmented,
+    /// A row a surface: what it is and what was measured.
+    Catalogue,
+}
+
+/// What columns mean, by name: the metadata of their fields.
+type Notes = HashMap<String, HashMap<String, String>>;
+
+impl View {
+    /// All views.
+    pub(crate) const ALL: [Self; 4] = [Self::Ir, Self::TnceDb, Self::Augmented, Self::Catalogue];
+
+    /// Its name in SQL.
+    pub(crate) fn name(self) -> &'static str {
+        match self {
+            Self::Ir => "ir",
+            Self::TnceDb => "tnce_db",
+            Self::Augmented => "augmented",
+            Self::Catalogue => "catalogue",
+        }
+    }
+
+    /// The view of a name.
+    pub(crate) fn by_name(name: &str) -> Option<Self> {
+        Self::ALL.into_iter().find(|v| v.name() == name)
+    }
+
+    /// The tables that it reads.
+    pub(crate) fn tables(self) -> &'static [Table] {
+        match self {
+            Self::Ir => &[Table::Measurements, Table::Nce],
+            Self::TnceDb => &[Table::Tnce],
+            Self::Augmented => &[Table::Measurements, Table::Nce, Table::Heightmaps],
+            Self::Catalogue => &[Table::Surfaces, Table::Runs, Table::SurfaceStats],
+        }
+    }
+
+    fn sql(self, lake: &Lake) -> String {
+        match self {
+            Self::Ir => ir::sql(),
+            Self::TnceDb => tnce_db::sql(lake.rig()),
+            Self::Augmented => augmented::sql(lake.grid()),
+            Self::Catalogue => catalogue::sql(lake.rig()),
+        }
+    }
+
+    // What the tables' own columns mean goes with them; these are the others.
+    fn notes(self, lake: &Lake) -> Notes {
+        match self {
+            Self::Ir => notes_of(Table::Pairs, lake),
+            Self::TnceDb => notes_of(Table::Pairs, lake).into_iter().chain(tnce_db::notes(lake.rig())).collect(),
+            Self::Augmented => notes_of(Table::TnceD4, lake),
+            Self::Catalogue => catalogue::notes(lake.rig()),
+        }
+    }
+
+    /// Plans the view over tables, which are those of [`View::tables`].
+    ///
+    /// # Errors
+    /// Where the view does not fit the tables, which is a mistake in this crate.
+    pub(crate) fn over(
+        self,
+        lake: &Lake,
+        lookups: &Lookups,
+        tables: &HashMap<Table, Arc<dyn TableProvider>>,
+    ) -> Result<ViewTable> {
+        let context = SessionContext::new();
+        for (table, provider) in tables {
+            context.register_table(table.name(), provider.clone())?;
+        }
+        lookups.register(&context);
+        let sql = self.sql(lake);
+        // Tables in memory are all that planning asks for, so it does not wait.
+        let plan = context.state().create_logical_plan(&sql).now_or_never().ok_or_else(|| {
+            DataFusionError::Internal(format!("planning the view {} waits for something", self.name()))
+        })??;
+        Ok(ViewTable::new(annotated(plan, &self.notes(lake))?, Some(sql)))
+    }
+
+    /// Its columns.
+    ///
+    /// # Errors
+    /// As [`View::over`].
+    pub(crate) fn schema(self, lake: &Lake, lookups: &Lookups) -> Result<SchemaRef> {
+        let empty = |table: Table| -> Result<(Table, Arc<dyn TableProvider>)> {
+            let schema = table.schema(lake.rig());
+            Ok((table, Arc::new(datafusion::datasource::empty::EmptyTable::new(schema))))
+        };
+        let tables = self.tables().iter().map(|t| empty(*t)).collect::<Result<_>>()?;
+        Ok(self.over(lake, lookups, &tables)?.schema())
+    }
+}
+
+fn annotated(plan: LogicalPlan, notes: &Notes) -> Result<LogicalPlan> {
+    let column = |field: &Arc<Field>| match notes.get(field.name()) {
+        Some(note) => ident(field.name()).alias_with_metadata(field.name(), Some(FieldMetadata::from(note))),
+        None => ident(field.name()),
+    };
+    let columns: Vec<_> = plan.schema().fields().iter().map(column).collect();
+    LogicalPlanBuilder::from(plan).project(columns)?.build()
+}
+
+fn note(column: impl Into<String>, unit: &str, comment: impl Into<String>) -> (String, HashMap<String, String>) {
+    let metadata = [(UNIT.to_owned(), unit.to_owned()), (COMMENT.to_owned(), comment.into())];
+    (column.into(), HashMap::from(metadata))
+}
+
+fn notes_of(table: Table, lake: &Lake) -> Notes {
+    table.schema(lake.rig()).fields().iter().map(|f| (f.name().clone(), f.metadata().clone())).collect()
+}
+
+#[cfg(test)]
+mod tests;
