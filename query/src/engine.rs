@@ -22,6 +22,7 @@ use crate::catalog::Catalog;
 use crate::control::governor::{Running, govern, resident_bytes};
 use crate::control::guard::guarded;
 use crate::control::lanes::{Lanes, Threads};
+use crate::small::SmallTables;
 use crate::table::Source;
 use crate::{Error, Functions, Session};
 
@@ -140,7 +141,7 @@ impl Engine {
         let threads = |e: std::io::Error| Error::Execution { message: format!("no threads for queries: {e}") };
         let inner = Inner {
             template: template(runtime, &functions),
-            catalog: Catalog::new(lake, Source { url, reader })?,
+            catalog: Catalog::new(lake, Source { url, reader, small: Arc::new(SmallTables::new(lake)) })?,
             lanes: Lanes::new(limits.heavy.max(1)).map_err(threads)?,
             running: Arc::default(),
             limits,

@@ -22,6 +22,7 @@ mod functions;
 mod gate;
 pub mod output;
 mod session;
+mod small;
 mod table;
 mod views;
 

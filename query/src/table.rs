@@ -4,12 +4,14 @@ use std::collections::BTreeSet;
 use std::sync::Arc;
 
 use arrow::datatypes::{DataType, SchemaRef};
+use arrow::record_batch::RecordBatch;
 use async_trait::async_trait;
 use datafusion::catalog::{Session, TableProvider};
 use datafusion::common::pruning::PrunableStatistics;
 use datafusion::common::stats::Precision;
 use datafusion::common::{DFSchema, ScalarValue, Statistics};
 use datafusion::datasource::TableType;
+use datafusion::datasource::memory::MemorySourceConfig;
 use datafusion::datasource::listing::PartitionedFile;
 use datafusion::datasource::physical_plan::{
     FileGroup, FileScanConfigBuilder, ParquetFileReaderFactory, ParquetSource,
@@ -29,6 +31,9 @@ use datafusion::physical_plan::union::UnionExec;
 use echolake_lake::DataFile;
 use echolake_schema::tables::Table;
 use object_store::ObjectMeta;
+use tokio::sync::OnceCell;
+
+use crate::small::SmallTables;
 
 /// Delta's writers cut texts in statistics to 32 characters; a shorter one is whole, whoever wrote it.
 const WHOLE_TEXT: usize = 32;
@@ -48,6 +53,8 @@ pub(crate) struct LakeTable {
     files: Vec<ScanFile>,
     all: Statistics,
     source: Source,
+    /// All rows, where the table is small and was asked.
+    rows: OnceCell<RecordBatch>,
 }
 
 /// A file, and how a scan names it.
@@ -65,6 +72,8 @@ pub(crate) struct Source {
     pub(crate) url: ObjectStoreUrl,
     /// Reads footers once a session.
     pub(crate) reader: Arc<dyn ParquetFileReaderFactory>,
+    /// Keeps the rows of small tables.
+    pub(crate) small: Arc<SmallTables>,
 }
 
 impl LakeTable {
@@ -74,7 +83,7 @@ impl LakeTable {
         let columns = DFSchema::try_from(schema.clone())?;
         let files: Vec<_> = files.into_iter().map(|file| ScanFile::new(file, &schema)).collect();
         let all = Statistics::try_merge_iter(files.iter().map(|f| f.known.as_ref()), &schema)?;
-        Ok(Self { table, schema, columns, files, all, source })
+        Ok(Self { table, schema, columns, files, all, source, rows: OnceCell::new() })
     }
 
     /// Whether the table has just these files.
@@ -129,6 +138,11 @@ impl LakeTable {
             .with_limit(limit)
             .build();
         Ok(DataSourceExec::from_data_source(config))
+    }
+
+    async fn small_rows(&self) -> Result<RecordBatch> {
+        let files: Vec<_> = self.files.iter().map(|f| &f.file).collect();
+        self.source.small.rows(self.table, &self.schema, &files).await
     }
 
     fn known(&self, files: &[&ScanFile]) -> Result<Statistics> {
@@ -265,6 +279,11 @@ impl TableProvider for LakeTable {
         filters: &[Expr],
         limit: Option<usize>,
     ) -> Result<Arc<dyn ExecutionPlan>> {
+        if SmallTables::keeps(&self.schema, self.files.iter().map(|f| &f.file)) {
+            let rows = self.rows.get_or_try_init(|| self.small_rows()).await?;
+            let exec = MemorySourceConfig::try_new_exec(&[vec![rows.clone()]], self.schema.clone(), projection.cloned())?;
+            return Ok(exec);
+        }
         let kept = self.kept(state, filters)?;
         let (whole, partial): (Vec<_>, Vec<_>) = kept.into_iter().partition(|f| f.file.hidden.is_empty());
         match (whole.is_empty(), partial.is_empty()) {

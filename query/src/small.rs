@@ -1,0 +1,67 @@
+//! Rows of small tables, kept in memory: `runs` and `surfaces` have one row a file, and most questions begin with them.
+//! A file never changes, so its rows are read once a process.
+
+use std::collections::{HashMap, HashSet};
+use std::sync::{Mutex, PoisonError};
+
+use arrow::compute::concat_batches;
+use arrow::datatypes::SchemaRef;
+use arrow::record_batch::RecordBatch;
+use datafusion::error::{DataFusionError, Result};
+use echolake_lake::{DataFile, Lake};
+use echolake_schema::tables::Table;
+use futures::{StreamExt as _, TryStreamExt as _};
+use object_store::path::Path;
+
+/// Rows up to which a table is small: some ten megabytes of the widest one.
+const SMALL_ROWS: u64 = 20_000;
+/// Files that are read together.
+const TOGETHER: usize = 16;
+
+/// What is kept.
+#[derive(Debug)]
+pub(crate) struct SmallTables {
+    lake: Lake,
+    files: Mutex<HashMap<Path, RecordBatch>>,
+}
+
+impl SmallTables {
+    pub(crate) fn new(lake: &Lake) -> Self {
+        Self { lake: lake.clone(), files: Mutex::default() }
+    }
+
+    /// Whether a table is kept in memory: few rows without lists, all of which readers see.
+    pub(crate) fn keeps<'a>(schema: &SchemaRef, mut files: impl Iterator<Item = &'a DataFile>) -> bool {
+        let narrow = !schema.fields().iter().any(|f| f.data_type().is_nested());
+        let rows = files.try_fold(0, |rows, file| file.hidden.is_empty().then_some(rows + file.rows));
+        narrow && rows.is_some_and(|rows| rows <= SMALL_ROWS)
+    }
+
+    /// The rows of these files, which are all of the table's.
+    ///
+    /// # Errors
+    /// Where a file is not what its log says.
+    pub(crate) async fn rows(&self, table: Table, schema: &SchemaRef, files: &[&DataFile]) -> Result<RecordBatch> {
+        let missing: Vec<_> = {
+            let known = self.files.lock().unwrap_or_else(PoisonError::into_inner);
+            files.iter().filter(|f| !known.contains_key(&f.path)).copied().collect()
+        };
+        let read = missing.into_iter().map(|file| self.read(table, schema, file));
+        let read: Vec<_> = futures::stream::iter(read).buffered(TOGETHER).try_collect().await?;
+        let mut known = self.files.lock().unwrap_or_else(PoisonError::into_inner);
+        known.extend(read);
+        let now: HashSet<_> = files.iter().map(|f| &f.path).collect();
+        let folder = files.first().and_then(|f| f.path.parts().nth(1)).map(|part| part.as_ref().to_owned());
+        // Files of this table that are gone from it.
+        known.retain(|path, _| now.contains(path) || path.parts().nth(1).map(|p| p.as_ref().to_owned()) != folder);
+        let batches: Vec<_> = files.iter().filter_map(|f| known.get(&f.path)).collect();
+        Ok(concat_batches(schema, batches)?)
+    }
+
+    async fn read(&self, table: Table, schema: &SchemaRef, file: &DataFile) -> Result<(Path, RecordBatch)> {
+        let failed = |e: echolake_lake::Error| DataFusionError::External(Box::new(e));
+        let stream = self.lake.rows(table, file, &[], 0..file.rows).await.map_err(failed)?;
+        let batches: Vec<_> = stream.try_collect().await.map_err(failed)?;
+        Ok((file.path.clone(), concat_batches(schema, &batches)?))
+    }
+}
