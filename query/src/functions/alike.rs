@@ -28,8 +28,14 @@ static PEARSON: Description = Description {
         Parameter { name: "y", kind: Kind::Samples, about: "the second list, as long as the first" },
     ],
     optional: 0,
-    example: "select pearson([1, 2, 3], [5, 7, 9]), pearson([1, 2, 3], [4, 4, 4])",
-    answer: "",
+    example: "select round(pearson([1, 2, 3], [5, 7, 9]), 6) as alike, pearson([1, 2, 3], [4, 4, 4]) as \
+              constant",
+    answer: "\
++-------+----------+
+| alike | constant |
++-------+----------+
+| 1.0   |          |
++-------+----------+",
     related: &["similarity"],
 };
 
@@ -45,7 +51,12 @@ static SIMILARITY: Description = Description {
     ],
     optional: 0,
     example: "select round(similarity([1, -2, 0, 0], [0, 0, 3, -6]), 6) as alike",
-    answer: "",
+    answer: "\
++-------+
+| alike |
++-------+
+| 1.0   |
++-------+",
     related: &["pearson", "arrival"],
 };
 

@@ -2,8 +2,8 @@
 
 use std::sync::Arc;
 
-use arrow::array::{ArrayRef, Float64Array, ListArray, PrimitiveArray, StructArray};
 use arrow::array::builder::NullBufferBuilder;
+use arrow::array::{ArrayRef, Float64Array, ListArray, PrimitiveArray, StructArray};
 use arrow::buffer::{NullBuffer, OffsetBuffer, ScalarBuffer};
 use arrow::datatypes::{DataType, Field, Fields};
 use datafusion::error::{DataFusionError, Result};

@@ -66,7 +66,9 @@ pub(super) fn coerced(description: &Description, types: &[DataType]) -> Vec<Data
     let kind = |i: usize| description.parameters.get(i).map(|p| p.kind);
     let samples = types.iter().enumerate().filter(|(i, _)| kind(*i) == Some(Kind::Samples));
     let narrow = samples.clone().any(|(_, t)| element(t) == Some(&DataType::Float32))
-        && samples.into_iter().all(|(_, t)| matches!(element(t), Some(DataType::Float32 | DataType::Null)) || t.is_null());
+        && samples
+            .into_iter()
+            .all(|(_, t)| matches!(element(t), Some(DataType::Float32 | DataType::Null)) || t.is_null());
     let wanted = if narrow { DataType::Float32 } else { DataType::Float64 };
     let coerce = |(i, given): (usize, &DataType)| match kind(i) {
         Some(Kind::Samples) if given.is_null() || element(given).is_some_and(is_number) => match given {
@@ -91,7 +93,8 @@ pub(super) fn check(description: &Description, types: &[DataType]) -> Result<()>
         };
         return Err(DataFusionError::Plan(format!("`{name}`: {given} given; hint: {}", description.syntax())));
     }
-    for (i, (given, Parameter { name: parameter, kind, about })) in types.iter().zip(description.parameters).enumerate() {
+    for (i, (given, Parameter { name: parameter, kind, about })) in types.iter().zip(description.parameters).enumerate()
+    {
         let fits = match kind {
             Kind::Samples => matches!(element(given), Some(DataType::Float32 | DataType::Float64)),
             Kind::Number => *given == DataType::Float64,
@@ -100,7 +103,8 @@ pub(super) fn check(description: &Description, types: &[DataType]) -> Result<()>
         };
         if !fits {
             let (i, words) = (i + 1, kind.words());
-            let message = format!("`{name}`: argument {i}, `{parameter}`, is {given}, not {words}; hint: it is {about}");
+            let message =
+                format!("`{name}`: argument {i}, `{parameter}`, is {given}, not {words}; hint: it is {about}");
             return Err(DataFusionError::Plan(message));
         }
     }
@@ -223,7 +227,9 @@ impl<'a> Arguments<'a> {
     pub(super) fn refused(&self, row: usize, error: &echolake_dsp::Error) -> DataFusionError {
         let hint = match error {
             echolake_dsp::Error::Length { .. } => "the lists of a row must be equally long",
-            echolake_dsp::Error::NotFinite { .. } => "leave out rows with NaN or infinity, as WHERE list_energy(ir) < 'inf'",
+            echolake_dsp::Error::NotFinite { .. } => {
+                "leave out rows with NaN or infinity, as WHERE list_energy(ir) < 'inf'"
+            }
             _ => self.description.about,
         };
         let (name, row) = (self.description.name, row + 1);
@@ -233,7 +239,11 @@ impl<'a> Arguments<'a> {
     // Planning casts to the right types, so that only a plan made by hand gets here.
     fn other_type(&self, argument: usize) -> DataFusionError {
         let (name, kind) = (self.description.name, self.columns[argument].array.data_type());
-        DataFusionError::Execution(format!("`{name}`: argument {} is {kind}; hint: {}", argument + 1, self.description.syntax()))
+        DataFusionError::Execution(format!(
+            "`{name}`: argument {} is {kind}; hint: {}",
+            argument + 1,
+            self.description.syntax()
+        ))
     }
 }
 

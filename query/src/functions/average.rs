@@ -24,8 +24,13 @@ static DESCRIPTION: Description = Description {
             reference is. Summed up in f64. Null lists do not count; null of none.",
     parameters: &[Parameter { name: "list", kind: Kind::Samples, about: "the lists, as ir" }],
     optional: 0,
-    example: "select avg_list(x) from (values ([1, 2]), ([3, 6])) as t(x)",
-    answer: "",
+    example: "select avg_list(x) as mean from (values ([1, 2]), ([3, 6])) as t(x)",
+    answer: "\
++------------+
+| mean       |
++------------+
+| [2.0, 4.0] |
++------------+",
     related: &["list_energy", "pearson"],
 };
 
@@ -76,7 +81,9 @@ impl Aggregate for AvgList {
             let sums = &sums[ends[0] as usize..ends[1] as usize];
             groups.at(row, |group| {
                 let merged = group.merge(sums, counts[row]);
-                merged.map_err(|e| DataFusionError::Execution(format!("`avg_list`: {e}; hint: group by what has one length")))
+                merged.map_err(|e| {
+                    DataFusionError::Execution(format!("`avg_list`: {e}; hint: group by what has one length"))
+                })
             })?;
         }
         Ok(())
@@ -106,5 +113,7 @@ fn offsets(groups: &[Mean]) -> Result<Vec<i32>> {
         Some(i32::try_from(*end))
     });
     let offsets: Result<Vec<i32>, _> = std::iter::once(Ok(0)).chain(ends).collect();
-    offsets.map_err(|_| DataFusionError::Execution("`avg_list`: more than 2^31 values in a batch; hint: group by less".into()))
+    offsets.map_err(|_| {
+        DataFusionError::Execution("`avg_list`: more than 2^31 values in a batch; hint: group by less".into())
+    })
 }

@@ -27,13 +27,23 @@ static DESCRIPTION: Description = Description {
             a band, `energy_2500` and so on as in table tnce, and `energy_total`, their sum; of one band where its centre \
             is given. Null for a list without samples.",
     parameters: &[
-        Parameter { name: "ir", kind: Kind::Samples, about: "the response at the lake's sampling rate, as reflected_ir" },
+        Parameter {
+            name: "ir",
+            kind: Kind::Samples,
+            about: "the response at the lake's sampling rate, as reflected_ir",
+        },
         Parameter { name: "centre_hz", kind: Kind::Number, about: "centre of one band, Hz" },
     ],
     optional: 1,
-    example: "select band_energy([1, 0])['energy_total'] as total, round(band_energy(reflected_ir, 2500) / energy_2500, 3) \
-              as ratio from nce join tnce using (surface_id, pair_id) where pair_id = 0",
-    answer: "",
+    example: "select band_energy([1, 0])['energy_total'] as total, round(band_energy(reflected_ir, 2500) / \
+              energy_2500, 3) as ratio from nce join tnce on nce.run_id = tnce.run_id and nce.pair_id = \
+              tnce.pair_id where nce.surface_id = '0015_0' and nce.pair_id = 0",
+    answer: "\
++-------+-------+
+| total | ratio |
++-------+-------+
+| 1.0   | 1.0   |
++-------+-------+",
     related: &["nce", "list_energy", "spectrum"],
 };
 

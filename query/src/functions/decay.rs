@@ -30,8 +30,13 @@ static EDC: Description = Description {
             in dB. It starts at 0 dB; where nothing is left it is minus infinity. Null for a response without energy.",
     parameters: &[Parameter { name: "ir", kind: Kind::Samples, about: "the response" }],
     optional: 0,
-    example: "select edc([3, 0, 1, 0])",
-    answer: "",
+    example: "select edc([3, 0, 1, 0]) as levels",
+    answer: "\
++---------------------------+
+| levels                    |
++---------------------------+
+| [0.0, -10.0, -10.0, -inf] |
++---------------------------+",
     related: &["nce", "arrival"],
 };
 
@@ -47,7 +52,12 @@ static ARRIVAL: Description = Description {
     ],
     optional: 1,
     example: "select arrival([0, 0, 0, 1, 0.5], 0) as ms",
-    answer: "",
+    answer: "\
++---------+
+| ms      |
++---------+
+| 0.03125 |
++---------+",
     related: &["edc", "speed_of_sound"],
 };
 

@@ -27,10 +27,19 @@ static LIST: Description = Description {
             sum e^2) / ((n - 1) sum e^2), e = 10^(L/10), 1 where all are equal, 0 where all energy is at one. It has the \
             form of ISO 17497-2, with equal weights; but that asks for receivers in the far field, and the grid of a rig is \
             in the near field, so compare it with surfaces measured alike only. Null for fewer than two levels or no sound.",
-    parameters: &[Parameter { name: "levels_db", kind: Kind::Samples, about: "levels, dB; minus infinity is no sound" }],
+    parameters: &[Parameter {
+        name: "levels_db",
+        kind: Kind::Samples,
+        about: "levels, dB; minus infinity is no sound",
+    }],
     optional: 0,
     example: "select diffusion([60, 60, 60, 60]) as even, round(diffusion([60, 30, 30, 30]), 4) as focused",
-    answer: "",
+    answer: "\
++------+---------+
+| even | focused |
++------+---------+
+| 1.0  | 0.002   |
++------+---------+",
     related: &["diffusion_coefficient"],
 };
 
@@ -42,8 +51,14 @@ static ROWS: Description = Description {
             is minus infinity.",
     parameters: &[Parameter { name: "level_db", kind: Kind::Number, about: "level at one receiver, dB" }],
     optional: 0,
-    example: "select round(diffusion_coefficient(level), 4) from (values (60), (57), (63)) as receivers(level)",
-    answer: "",
+    example: "select round(diffusion_coefficient(level), 4) as d from (values (60), (57), (63)) as \
+              receivers(level)",
+    answer: "\
++--------+
+| d      |
++--------+
+| 0.6682 |
++--------+",
     related: &["diffusion", "p90_mean"],
 };
 

@@ -44,7 +44,12 @@ static DESCRIPTION: Description = Description {
     optional: 1,
     example: "select round(max(fresnel(m.x_mm, m.y_mm, m.z_mm, s.x_mm, s.y_mm, s.z_mm, 2000)['major_mm']), 1) as largest_mm \
               from pairs join points m on m.point_id = microphone join points s on s.point_id = speaker",
-    answer: "",
+    answer: "\
++------------+
+| largest_mm |
++------------+
+| 535.5      |
++------------+",
     related: &["speed_of_sound"],
 };
 

@@ -29,8 +29,13 @@ static DB: Description = Description {
             less, so that averages and files meet no infinity.",
     parameters: &[Parameter { name: "x", kind: Kind::Number, about: "ratio of energies, as tnce_total" }],
     optional: 0,
-    example: "select db(0.5), db(0)",
-    answer: "",
+    example: "select round(db(0.5), 2) as half, db(0) as none",
+    answer: "\
++-------+------+
+| half  | none |
++-------+------+
+| -3.01 |      |
++-------+------+",
     related: &["db_amplitude", "list_db", "p90_mean"],
 };
 
@@ -40,8 +45,13 @@ static DB_AMPLITUDE: Description = Description {
     about: "Level of a ratio of amplitudes, 20 log10 |x|, in dB; null for 0.",
     parameters: &[Parameter { name: "x", kind: Kind::Number, about: "ratio of amplitudes, of either sign" }],
     optional: 0,
-    example: "select db_amplitude(-0.5)",
-    answer: "",
+    example: "select round(db_amplitude(-0.5), 2) as half",
+    answer: "\
++-------+
+| half  |
++-------+
+| -6.02 |
++-------+",
     related: &["db", "spl"],
 };
 
@@ -49,10 +59,19 @@ static SPL: Description = Description {
     name: "spl",
     family: Family::Levels,
     about: "Sound pressure level, 20 log10(p / 20 uPa), in dB; null for 0 and less.",
-    parameters: &[Parameter { name: "rms_pa", kind: Kind::Number, about: "root mean square of the sound pressure, Pa" }],
+    parameters: &[Parameter {
+        name: "rms_pa",
+        kind: Kind::Number,
+        about: "root mean square of the sound pressure, Pa",
+    }],
     optional: 0,
-    example: "select round(spl(1), 2)",
-    answer: "",
+    example: "select round(spl(1), 2) as one_pa",
+    answer: "\
++--------+
+| one_pa |
++--------+
+| 93.98  |
++--------+",
     related: &["db_amplitude", "list_rms"],
 };
 
@@ -62,8 +81,13 @@ static LIST_DB: Description = Description {
     about: "Level of each element, 10 log10(x), in dB. Inside of a list, no energy is minus infinity.",
     parameters: &[Parameter { name: "list", kind: Kind::Samples, about: "ratios of energies, as an NCE curve" }],
     optional: 0,
-    example: "select list_db([1, 0.1, 0])",
-    answer: "",
+    example: "select list_db([1, 0.1, 0]) as levels",
+    answer: "\
++--------------------+
+| levels             |
++--------------------+
+| [0.0, -10.0, -inf] |
++--------------------+",
     related: &["db", "nce"],
 };
 

@@ -29,8 +29,13 @@ static MULTIPLY: Description = Description {
         Parameter { name: "y", kind: Kind::Samples, about: "the second list, as long as the first" },
     ],
     optional: 0,
-    example: "select list_multiply([1, 2, 3], [2, 0, -1])",
-    answer: "",
+    example: "select list_multiply([1, 2, 3], [2, 0, -1]) as product",
+    answer: "\
++------------------+
+| product          |
++------------------+
+| [2.0, 0.0, -3.0] |
++------------------+",
     related: &["list_energy", "avg_list"],
 };
 
@@ -40,8 +45,13 @@ static ENERGY: Description = Description {
     about: "Sum of the squares of a list, in f64: the energy of a response. 0 for a list without elements.",
     parameters: &[Parameter { name: "list", kind: Kind::Samples, about: "the list, as reflected_ir" }],
     optional: 0,
-    example: "select list_energy([3, -4])",
-    answer: "",
+    example: "select list_energy([3, -4]) as energy",
+    answer: "\
++--------+
+| energy |
++--------+
+| 25.0   |
++--------+",
     related: &["list_rms", "band_energy"],
 };
 
@@ -51,8 +61,13 @@ static RMS: Description = Description {
     about: "Root of the mean square of a list, in its unit. 0 for a list without elements.",
     parameters: &[Parameter { name: "list", kind: Kind::Samples, about: "the list" }],
     optional: 0,
-    example: "select round(list_rms([3, -4]), 4)",
-    answer: "",
+    example: "select round(list_rms([3, -4]), 4) as rms",
+    answer: "\
++--------+
+| rms    |
++--------+
+| 3.5355 |
++--------+",
     related: &["list_energy", "spl"],
 };
 

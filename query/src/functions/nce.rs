@@ -26,12 +26,21 @@ static DESCRIPTION: Description = Description {
             given, as the columns `nce_2500` and so on of table nce. Null where Flat has no energy.",
     parameters: &[
         Parameter { name: "ir", kind: Kind::Samples, about: "the response with Foam's subtracted, as reflected_ir" },
-        Parameter { name: "flat_energy", kind: Kind::Number, about: "Flat's energy of the pair, sum of squares, all bands" },
+        Parameter {
+            name: "flat_energy",
+            kind: Kind::Number,
+            about: "Flat's energy of the pair, sum of squares, all bands",
+        },
         Parameter { name: "centre_hz", kind: Kind::Number, about: "centre of one band, Hz" },
     ],
     optional: 1,
-    example: "select nce([1, 2, 0, 1], 8)",
-    answer: "",
+    example: "select nce([1, 2, 0, 1], 8) as curve",
+    answer: "\
++-----------------------------+
+| curve                       |
++-----------------------------+
+| [0.125, 0.625, 0.625, 0.75] |
++-----------------------------+",
     related: &["band_energy", "list_db", "edc"],
 };
 

@@ -24,8 +24,13 @@ static DESCRIPTION: Description = Description {
             say. Null values and those that are not finite do not count; null of none.",
     parameters: &[Parameter { name: "x", kind: Kind::Number, about: "the values, as tnce_total (linear, not dB)" }],
     optional: 0,
-    example: "select p90_mean(x) from (values (1), (2), (3), (4), (1000)) as t(x)",
-    answer: "",
+    example: "select p90_mean(x) as mean from (values (1), (2), (3), (4), (1000)) as t(x)",
+    answer: "\
++------+
+| mean |
++------+
+| 2.5  |
++------+",
     related: &["db", "diffusion_coefficient"],
 };
 

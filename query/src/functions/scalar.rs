@@ -39,7 +39,11 @@ struct Adapter<F> {
 /// Makes it known to DataFusion.
 pub(super) fn udf(function: impl Scalar) -> ScalarUDF {
     let documentation = function.description().documentation();
-    ScalarUDF::new_from_impl(Adapter { function, signature: Signature::user_defined(Volatility::Immutable), documentation })
+    ScalarUDF::new_from_impl(Adapter {
+        function,
+        signature: Signature::user_defined(Volatility::Immutable),
+        documentation,
+    })
 }
 
 impl<F: Scalar> ScalarUDFImpl for Adapter<F> {

@@ -23,7 +23,12 @@ static DESCRIPTION: Description = Description {
     parameters: &[Parameter { name: "temperature_c", kind: Kind::Number, about: "temperature, C, -273.15 or more" }],
     optional: 0,
     example: "select round(speed_of_sound(20), 2) as m_s",
-    answer: "",
+    answer: "\
++--------+
+| m_s    |
++--------+
+| 343.21 |
++--------+",
     related: &["fresnel", "arrival"],
 };
 

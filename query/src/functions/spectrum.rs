@@ -31,8 +31,13 @@ static SPECTRUM: Description = Description {
             and a single sample of 1 is 0 dB throughout. Nothing is minus infinity.",
     parameters: &[Parameter { name: "ir", kind: Kind::Samples, about: "the response" }],
     optional: 0,
-    example: "select spectrum([0, 10, 0, 0])",
-    answer: "",
+    example: "select spectrum([0, 10, 0, 0]) as levels",
+    answer: "\
++--------------------+
+| levels             |
++--------------------+
+| [20.0, 20.0, 20.0] |
++--------------------+",
     related: &["spectrum_frequencies", "band_energy"],
 };
 
@@ -42,8 +47,13 @@ static FREQUENCIES: Description = Description {
     about: "Frequencies of the values of spectrum() for n samples at the lake's sampling rate, in Hz.",
     parameters: &[Parameter { name: "n", kind: Kind::Integer, about: "samples of the response, 0 to 1048576" }],
     optional: 0,
-    example: "select spectrum_frequencies(4)",
-    answer: "",
+    example: "select spectrum_frequencies(4) as hz",
+    answer: "\
++-------------------------+
+| hz                      |
++-------------------------+
+| [0.0, 24000.0, 48000.0] |
++-------------------------+",
     related: &["spectrum"],
 };
 

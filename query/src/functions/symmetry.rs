@@ -36,10 +36,7 @@ const SYMMETRY: Parameter = Parameter {
 static POSITION_FIELDS: LazyLock<Fields> = LazyLock::new(|| number_fields(["x", "y"]));
 
 static PAIR_FIELDS: LazyLock<Fields> = LazyLock::new(|| {
-    Fields::from(vec![
-        Field::new("pair_id", DataType::Int32, true),
-        Field::new("swapped", DataType::Boolean, true),
-    ])
+    Fields::from(vec![Field::new("pair_id", DataType::Int32, true), Field::new("swapped", DataType::Boolean, true)])
 });
 
 static D4_POSITION: Description = Description {
@@ -55,7 +52,12 @@ static D4_POSITION: Description = Description {
     ],
     optional: 0,
     example: "select d4(100, 20, 'rot90') as moved",
-    answer: "",
+    answer: "\
++----------------------+
+| moved                |
++----------------------+
+| {x: -20.0, y: 100.0} |
++----------------------+",
     related: &["d4_point", "d4_pair", "d4_heightmap"],
 };
 
@@ -66,7 +68,12 @@ static D4_POINT: Description = Description {
     parameters: &[Parameter { name: "point_id", kind: Kind::Integer, about: "a point of table points" }, SYMMETRY],
     optional: 0,
     example: "select d4_point(0, 'rot180') as point",
-    answer: "",
+    answer: "\
++-------+
+| point |
++-------+
+| 35    |
++-------+",
     related: &["d4", "d4_pair"],
 };
 
@@ -78,7 +85,12 @@ static D4_PAIR: Description = Description {
     parameters: &[Parameter { name: "pair_id", kind: Kind::Integer, about: "a pair of table pairs" }, SYMMETRY],
     optional: 0,
     example: "select d4_pair(0, 'rot180') as moved",
-    answer: "",
+    answer: "\
++--------------------------------+
+| moved                          |
++--------------------------------+
+| {pair_id: 2020, swapped: true} |
++--------------------------------+",
     related: &["d4", "d4_point"],
 };
 
@@ -87,12 +99,21 @@ static D4_HEIGHTMAP: Description = Description {
     family: Family::Geometry,
     about: "A square map under a symmetry about its centre, in the unit of its values: what stood at p stands where p goes.",
     parameters: &[
-        Parameter { name: "list", kind: Kind::Samples, about: "n x n values, row by row along x, y ascending, as heights_mm" },
+        Parameter {
+            name: "list",
+            kind: Kind::Samples,
+            about: "n x n values, row by row along x, y ascending, as heights_mm",
+        },
         SYMMETRY,
     ],
     optional: 0,
     example: "select d4_heightmap([1, 2, 3, 4], 'mirror_x') as moved",
-    answer: "",
+    answer: "\
++----------------------+
+| moved                |
++----------------------+
+| [2.0, 1.0, 4.0, 3.0] |
++----------------------+",
     related: &["d4"],
 };
 

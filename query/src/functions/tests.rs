@@ -72,7 +72,7 @@ impl Small {
 
     async fn refusal(&self, sql: &str) -> String {
         match self.batches(sql).await {
-            Ok(batches) => panic!("{sql}: {}", pretty_format_batches(&batches).expect("a table")),
+            Ok(batches) => format!("answered {}", pretty_format_batches(&batches).expect("a table")),
             Err(error) => error.to_string(),
         }
     }
@@ -206,11 +206,12 @@ async fn bands_and_curves_are_the_golden_ones() {
             assert!((off / size).sqrt() < 1e-3, "{name}, case {case}");
         }
         // The same energies from the transform, and from a struct's field.
-        for value in [format!("band_energy(reflected_ir, {name})"), format!("band_energy(reflected_ir)['energy_{name}']")]
+        for value in
+            [format!("band_energy(reflected_ir, {name})"), format!("band_energy(reflected_ir)['energy_{name}']")]
         {
             let sql = format!(
-                "select max(abs({value} / energy_{name} - 1)) from nce join tnce using (surface_id, pair_id) \
-                 where surface_id = '0015_0'"
+                "select max(abs({value} / energy_{name} - 1)) from nce join tnce on nce.run_id = tnce.run_id \
+                 and nce.pair_id = tnce.pair_id where nce.surface_id = '0015_0'"
             );
             assert!(small.number(&sql).await < 1e-3, "{value}");
         }
@@ -264,7 +265,9 @@ async fn symmetries_are_a_group_on_points_pairs_and_maps() {
         let (there, back) = (symmetry.name(), inverse(symmetry).name());
         for sql in [
             format!("select count(*) from points where d4_point(d4_point(point_id, '{there}'), '{back}') <> point_id"),
-            format!("select count(*) from pairs where d4_pair(d4_pair(pair_id, '{there}')['pair_id'], '{back}')['pair_id'] <> pair_id"),
+            format!(
+                "select count(*) from pairs where d4_pair(d4_pair(pair_id, '{there}')['pair_id'], '{back}')['pair_id'] <> pair_id"
+            ),
             format!(
                 "select count(*) from points p join points q on q.point_id = d4_point(p.point_id, '{there}') \
                  where abs(d4(p.x_mm, p.y_mm, '{there}')['x'] - q.x_mm) + abs(d4(p.x_mm, p.y_mm, '{there}')['y'] - q.y_mm) > 1e-9"
@@ -282,7 +285,8 @@ async fn symmetries_are_a_group_on_points_pairs_and_maps() {
 #[tokio::test]
 async fn aggregates_are_the_same_however_rows_are_divided() {
     let small = Small::new().await;
-    let values = "(select n, n % 7 as g, cast((n * 7919) % 1009 as double) as x from (select unnest(range(20000)) as n))";
+    let values =
+        "(select n, n % 7 as g, cast((n * 7919) % 1009 as double) as x from (select unnest(range(20000)) as n))";
     let all: Vec<f64> = (0..20_000u32).map(|n| f64::from((n * 7919) % 1009)).collect();
     let expected = echolake_dsp::level::p90_mean(&all, &mut Vec::new()).expect("some");
     let close = |a: f64, b: f64| (a - b).abs() <= 1e-9 * b.abs();
@@ -292,7 +296,8 @@ async fn aggregates_are_the_same_however_rows_are_divided() {
     let sql = format!("select p from (select g, p90_mean(x) as p from {values} group by g) where g = 3");
     assert!(close(small.number(&sql).await, expected));
     let expected = echolake_dsp::diffusion::diffusion(&one.iter().map(|x| x / 50.0).collect::<Vec<_>>()).expect("some");
-    let sql = format!("select d from (select g, diffusion_coefficient(x / 50) as d from {values} group by g) where g = 3");
+    let sql =
+        format!("select d from (select g, diffusion_coefficient(x / 50) as d from {values} group by g) where g = 3");
     assert!(close(small.number(&sql).await, expected));
     let list = small.number(&format!("select diffusion(array_agg(x / 50)) from {values} where g = 3")).await;
     assert!(close(list, expected));
@@ -301,7 +306,14 @@ async fn aggregates_are_the_same_however_rows_are_divided() {
     let ours = small.numbers(&sql).await;
     assert!(close(ours[0], mean) && close(ours[1], -mean) && ours[2] == 1.0, "{ours:?}");
     // One group a row, filters, and windows.
-    assert_eq!(small.number(&format!("select count(*) from (select n, p90_mean(x) as p, x from {values} group by n, x) where p <> x")).await, 0.0);
+    assert_eq!(
+        small
+            .number(&format!(
+                "select count(*) from (select n, p90_mean(x) as p, x from {values} group by n, x) where p <> x"
+            ))
+            .await,
+        0.0
+    );
     assert_eq!(small.number(&format!("select p90_mean(x) filter (where x = 5) from {values}")).await, 5.0);
     let running = "select avg_list(x) over (order by k) from (values (1, [2]), (2, [4]), (3, [9])) as t(k, x)";
     assert_eq!(small.numbers(running).await, [2.0, 3.0, 5.0]);
@@ -315,13 +327,19 @@ async fn aggregates_are_the_same_however_rows_are_divided() {
     }
 }
 
-// surface_stats is made by the same kernel; the query over table tnce says the same.
 #[tokio::test]
 async fn any_kind_of_list_gives_the_same() {
     let small = Small::new().await;
-    for kind in ["List(Float32)", "List(Float64)", "LargeList(Float32)", "LargeList(Float64)", "List(Int16)",
-        "FixedSizeList(4 x Float32)", "FixedSizeList(4 x Float64)", "LargeList(Int64)"]
-    {
+    for kind in [
+        "List(Float32)",
+        "List(Float64)",
+        "LargeList(Float32)",
+        "LargeList(Float64)",
+        "List(Int16)",
+        "FixedSizeList(4 x Float32)",
+        "FixedSizeList(4 x Float64)",
+        "LargeList(Int64)",
+    ] {
         let list = format!("arrow_cast([1, 2, 3, 6], '{kind}')");
         for (call, expected) in [
             (format!("list_energy({list})"), 50.0),
@@ -338,7 +356,8 @@ async fn any_kind_of_list_gives_the_same() {
             assert!((given - expected).abs() < 2e-5, "{call}: {given}");
             // As a column, with a null row before it.
             let column = call.replace(&list, "x");
-            let rows = format!("select {column} from (select null as x union all select {list} as x) order by 1 nulls first");
+            let rows =
+                format!("select {column} from (select null as x union all select {list} as x) order by 1 nulls first");
             let given = small.numbers(&rows).await;
             assert!(given[0].is_nan() && (given[1] - expected).abs() < 2e-5, "{column} of {kind}: {given:?}");
         }
@@ -354,6 +373,7 @@ async fn any_kind_of_list_gives_the_same() {
 #[tokio::test]
 async fn hostile_arguments_are_refused_in_words_or_null() {
     let small = Small::new().await;
+    let mut wrong = String::new();
     for (sql, words) in [
         ("select edc()", &["`edc`: 0 arguments are given", "edc(ir)"][..]),
         ("select nce([1])", &["`nce`: 1 argument is given", "nce(ir, flat_energy[, centre_hz])"]),
@@ -361,12 +381,18 @@ async fn hostile_arguments_are_refused_in_words_or_null() {
         ("select edc(['x'])", &["`edc`", "a list of numbers"]),
         ("select db('loud')", &["`db`: argument 1", "a number"]),
         ("select d4_point(1.5, 'rot90')", &["`d4_point`: argument 1", "a whole number"]),
-        ("select band_energy([1, 2], 3000)", &["`band_energy`: `centre_hz` is 3000.0", "2500, 5000, 10000, 20000, 40000"]),
+        (
+            "select band_energy([1, 2], 3000)",
+            &["`band_energy`: `centre_hz` is 3000.0", "2500, 5000, 10000, 20000, 40000"],
+        ),
         ("select band_energy([1, 2], 'nan'::double)", &["`centre_hz` is NaN"]),
         ("select nce([1, 2], 1, 0)", &["`centre_hz` is 0.0", "row 1"]),
         ("select edc([1, null])", &["`edc`: element 2 of `ir` is null in row 1", "array_compact"]),
         ("select avg_list(x) from (values ([1]), ([1, null])) as t(x)", &["element 2 of `list` is null in row 2"]),
-        ("select avg_list(x) from (values ([1]), ([1, 2])) as t(x)", &["`avg_list`", "2 samples, expected 1", "equally long"]),
+        (
+            "select avg_list(x) from (values ([1]), ([1, 2])) as t(x)",
+            &["`avg_list`", "2 samples, expected 1", "equally long"],
+        ),
         ("select pearson([1, 2], [1])", &["`pearson`, row 1", "1 samples, expected 2", "equally long"]),
         ("select similarity([1, 2], [1])", &["`similarity`, row 1", "expected 2"]),
         ("select list_multiply([1, 2], [1])", &["`list_multiply`, row 1"]),
@@ -386,38 +412,80 @@ async fn hostile_arguments_are_refused_in_words_or_null() {
         ("select spectrum_frequencies(-1)", &["`n` is -1"]),
         ("select spectrum_frequencies(9223372036854775807)", &["`n` is 9223372036854775807"]),
         ("select spectrum(array_repeat(1, 200000))", &["`spectrum`: a list has 200000 samples, at most 131072"]),
-        ("select p90_mean(distinct x), sum(x) from (values (1), (2)) as t(x)", &["`p90_mean` knows no DISTINCT"]),
+        (
+            "select p90_mean(distinct x), p90_mean(distinct y) from (values (1, 2), (2, 3)) as t(x, y)",
+            &["`p90_mean` knows no DISTINCT"],
+        ),
         ("select p90_mean('x')", &["`p90_mean`: argument 1"]),
     ] {
         let said = small.refusal(sql).await;
-        for text in words {
-            assert!(said.contains(text), "{sql}: {said}");
+        if !words.iter().chain(&["hint"]).all(|text| said.contains(text)) {
+            wrong += &format!("{sql}: {said}\n");
         }
-        assert!(said.contains("hint"), "{sql}: {said}");
     }
     for null in [
-        "edc(null)", "edc([0, 0])", "edc([])", "arrival([])", "arrival([0])", "db(0)", "db(-1)", "db(null)", "spl(0)",
-        "db_amplitude(0)", "band_energy([])", "band_energy([], 2500)", "band_energy(null, 2500)", "nce([1], 0)",
-        "nce([1], null)", "nce(null, 1)", "nce([1], 1, null)", "pearson([], [])", "pearson([1], [1])", "pearson(null, [1])",
-        "similarity([], [])", "similarity([0], [1])", "diffusion([])", "diffusion([1])", "d4(1, null, 'rot90')",
-        "d4(1, 2, null)", "d4_point(null, 'rot90')", "d4_pair(null, 'rot90')", "d4_heightmap(null, 'rot90')",
-        "spectrum(null)", "spectrum_frequencies(null)", "list_energy(null)", "list_multiply(null, [1])", "speed_of_sound(null)",
-        "fresnel(0, 0, 1, 0, 0, null, 1000)", "arrival([1], null)",
+        "edc(null)",
+        "edc([0, 0])",
+        "edc([])",
+        "arrival([])",
+        "arrival([0])",
+        "db(0)",
+        "db(-1)",
+        "db(null)",
+        "spl(0)",
+        "db_amplitude(0)",
+        "band_energy([])",
+        "band_energy([], 2500)",
+        "band_energy(null, 2500)",
+        "nce([1], 0)",
+        "nce([1], null)",
+        "nce(null, 1)",
+        "nce([1], 1, null)",
+        "pearson([], [])",
+        "pearson([1], [1])",
+        "pearson(null, [1])",
+        "similarity([], [])",
+        "similarity([0], [1])",
+        "diffusion([])",
+        "diffusion([1])",
+        "d4(1, null, 'rot90')",
+        "d4(1, 2, null)",
+        "d4_point(null, 'rot90')",
+        "d4_pair(null, 'rot90')",
+        "d4_heightmap(null, 'rot90')",
+        "spectrum(null)",
+        "spectrum_frequencies(null)",
+        "list_energy(null)",
+        "list_multiply(null, [1])",
+        "speed_of_sound(null)",
+        "fresnel(0, 0, 1, 0, 0, null, 1000)",
+        "arrival([1], null)",
     ] {
-        let batch = small.rows(&format!("select {null}")).await;
-        assert!(batch.column(0).is_null(0), "{null}: {batch:?}");
+        match small.batches(&format!("select {null}")).await {
+            Ok(batches) if batches[1].column(0).is_null(0) => {}
+            other => wrong += &format!("{null}: {other:?}\n"),
+        }
     }
     for (call, expected) in [
-        ("list_energy([])", 0.0), ("list_rms([])", 0.0), ("array_length(spectrum([1]))", 1.0),
-        ("coalesce(array_length(spectrum([])), 0)", 0.0), ("coalesce(array_length(d4_heightmap([], 'rot90')), 0)", 0.0),
-        ("coalesce(array_length(nce([], 1)), 0)", 0.0), ("coalesce(array_length(spectrum_frequencies(0)), 0)", 0.0),
-        ("array_length(edc(array_repeat(1, 2000000)))", 2e6), ("list_energy(array_repeat(2, 2000000))", 8e6),
-        ("array_length(spectrum(array_repeat(1, 131072)))", 65537.0), ("array_length(spectrum(array_repeat(1, 99991)))", 49996.0),
+        ("list_energy([])", 0.0),
+        ("list_rms([])", 0.0),
+        ("array_length(spectrum([1]))", 1.0),
+        ("coalesce(array_length(spectrum([])), 0)", 0.0),
+        ("coalesce(array_length(d4_heightmap([], 'rot90')), 0)", 0.0),
+        ("coalesce(array_length(nce([], 1)), 0)", 0.0),
+        ("coalesce(array_length(spectrum_frequencies(0)), 0)", 0.0),
+        ("array_length(edc(array_repeat(1, 2000000)))", 2e6),
+        ("list_energy(array_repeat(2, 2000000))", 8e6),
+        ("array_length(spectrum(array_repeat(1, 131072)))", 65537.0),
+        ("array_length(spectrum(array_repeat(1, 99991)))", 49996.0),
         ("band_energy([1, 2, 3], 2500) + 0 * band_energy([1, 2], 2500)", f64::NAN),
     ] {
         let given = small.number(&format!("select {call}")).await;
-        assert!(given == expected || expected.is_nan() && given.is_finite(), "{call}: {given}");
+        if given != expected && !(expected.is_nan() && given.is_finite()) {
+            wrong += &format!("{call}: {given}\n");
+        }
     }
+    assert!(wrong.is_empty(), "{wrong}");
     // More lengths than plans are kept for, in one batch.
     let lengths = "select count(spectrum(array_repeat(1, n))) from (select unnest(range(1, 300)) as n)";
     assert_eq!(small.number(lengths).await, 299.0);
