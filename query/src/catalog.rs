@@ -9,17 +9,19 @@ use echolake_lake::Lake;
 use echolake_schema::tables::Table;
 
 use crate::Error;
+use crate::mcap;
 use crate::table::{LakeTable, Source};
 
 /// Makes the tables of a lake known to a query's context.
 pub(crate) struct Catalog {
     lake: Lake,
     source: Source,
+    runs: Arc<mcap::Files>,
 }
 
 impl Catalog {
     pub(crate) fn new(lake: &Lake, source: Source) -> Self {
-        Self { lake: lake.clone(), source }
+        Self { lake: lake.clone(), source, runs: Arc::new(mcap::Files::new(lake.store())) }
     }
 
     /// Registers what `statement` may name, all of one view of the lake. The statement is known before its plan, since
@@ -27,14 +29,14 @@ impl Catalog {
     ///
     /// # Errors
     /// [`Error::Lake`] where the lake cannot be read.
-    pub(crate) async fn register(&self, context: &SessionContext, _statement: &mut Statement) -> Result<(), Error> {
+    pub(crate) async fn register(&self, context: &SessionContext, statement: &mut Statement) -> Result<(), Error> {
         let snapshot = self.lake.snapshot().await?;
         for table in Table::ALL {
             let files = snapshot.files(table).to_vec();
             let provider = LakeTable::new(table.schema(self.lake.rig()), files, self.source.clone());
             context.register_table(table.name(), Arc::new(provider)).map_err(|e| Error::execution(&e))?;
         }
-        Ok(())
+        mcap::register(context, &snapshot, &self.runs, statement).await
     }
 
     /// The tables and their schemas.

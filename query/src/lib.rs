@@ -17,6 +17,7 @@ mod catalog;
 mod engine;
 mod error;
 mod gate;
+mod mcap;
 pub mod output;
 mod session;
 mod table;

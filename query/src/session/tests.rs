@@ -5,8 +5,10 @@ use std::sync::atomic::AtomicBool;
 use arrow::array::{ArrayRef, AsArray as _, Int64Array, StringArray};
 use arrow::compute::cast;
 use arrow::datatypes::{DataType, Field, Float64Type, Int64Type};
+use datafusion::execution::object_store::ObjectStoreUrl;
 use echolake_lake::{FileName, References, VisibleRun, encode};
 use echolake_schema::Rig;
+use echolake_schema::tables::Table;
 use futures::TryStreamExt as _;
 
 use super::*;
@@ -70,7 +72,8 @@ async fn nothing_but_reading_is_allowed() {
     assert!(!outside.exists());
     let file = format!("select * from '{}'", folder.path().join("lake/lake.toml").display());
     assert!(session.query(&file).await.is_err(), "files are no tables");
-    let machine = session.runtime.object_store(ObjectStoreUrl::parse(MACHINE).expect("a URL"));
+    let machine =
+        session.engine.context().runtime_env().object_store(ObjectStoreUrl::parse("file:///").expect("a URL"));
     assert!(machine.is_err(), "the machine's files are no store of a query");
     assert_eq!(rows(&session, "select * from points").await.iter().map(|b| b.num_rows()).sum::<usize>(), 78);
 }
