@@ -231,11 +231,8 @@ fn function(name: &str, doc: Option<&Documentation>) -> Function {
 }
 
 fn template(runtime: Arc<RuntimeEnv>, functions: &Functions) -> SessionState {
-    let mut state = SessionStateBuilder::new()
-        .with_config(config())
-        .with_runtime_env(runtime)
-        .with_default_features()
-        .build();
+    let mut state =
+        SessionStateBuilder::new().with_config(config()).with_runtime_env(runtime).with_default_features().build();
     let asked: Vec<_> = state.scalar_functions().values().filter_map(guarded).collect();
     // The new ones replace those of their names and aliases; only a registry that is closed refuses.
     for function in asked.into_iter().chain(functions.scalar().iter().cloned()) {

@@ -20,6 +20,7 @@ mod engine;
 mod error;
 mod functions;
 mod gate;
+mod mcap;
 pub mod output;
 mod session;
 mod small;

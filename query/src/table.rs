@@ -11,8 +11,8 @@ use datafusion::common::pruning::PrunableStatistics;
 use datafusion::common::stats::Precision;
 use datafusion::common::{DFSchema, ScalarValue, Statistics};
 use datafusion::datasource::TableType;
-use datafusion::datasource::memory::MemorySourceConfig;
 use datafusion::datasource::listing::PartitionedFile;
+use datafusion::datasource::memory::MemorySourceConfig;
 use datafusion::datasource::physical_plan::{
     FileGroup, FileScanConfigBuilder, ParquetFileReaderFactory, ParquetSource,
 };
@@ -281,7 +281,8 @@ impl TableProvider for LakeTable {
     ) -> Result<Arc<dyn ExecutionPlan>> {
         if SmallTables::keeps(&self.schema, self.files.iter().map(|f| &f.file)) {
             let rows = self.rows.get_or_try_init(|| self.small_rows()).await?;
-            let exec = MemorySourceConfig::try_new_exec(&[vec![rows.clone()]], self.schema.clone(), projection.cloned())?;
+            let exec =
+                MemorySourceConfig::try_new_exec(&[vec![rows.clone()]], self.schema.clone(), projection.cloned())?;
             return Ok(exec);
         }
         let kept = self.kept(state, filters)?;

@@ -7,9 +7,11 @@ pub(super) fn sql(grid: &Grid) -> String {
     let has = |s: &Symmetry| grid.permutation(*s).is_some() && grid.moved_pairs(*s).is_some();
     let row = |(id, s): (usize, Symmetry)| format!("(CAST({id} AS INT), '{}')", s.name());
     let symmetries: Vec<_> = Symmetry::ALL.into_iter().enumerate().filter(|(_, s)| has(s)).map(row).collect();
-    let ends = ["microphone", "speaker"].into_iter().flat_map(|end| ["x", "y", "z"].map(|axis| format!("{end}_{axis}_mm")));
+    let ends =
+        ["microphone", "speaker"].into_iter().flat_map(|end| ["x", "y", "z"].map(|axis| format!("{end}_{axis}_mm")));
     let moved = |name: &str, column: &str| format!("d4_{name}(m.pair_id, d.symmetry_id) AS {column}");
-    let ids = [("swapped", "swapped"), ("pair_id", "d4_pair_id"), ("microphone", "d4_microphone"), ("speaker", "d4_speaker")];
+    let ids =
+        [("swapped", "swapped"), ("pair_id", "d4_pair_id"), ("microphone", "d4_microphone"), ("speaker", "d4_speaker")];
     let ids = ids.into_iter().map(|(name, column)| moved(name, column));
     let columns: Vec<_> = ids.chain(ends.map(|name| moved(&name, &name))).collect();
     // The symmetries stand first: what stands first is held in memory, the other side streams.

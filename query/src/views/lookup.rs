@@ -8,9 +8,7 @@ use arrow::array::{Array as _, ArrayRef, AsArray as _, BooleanArray, Float64Arra
 use arrow::compute::take;
 use arrow::datatypes::{DataType, Int32Type};
 use datafusion::error::Result;
-use datafusion::logical_expr::{
-    ColumnarValue, ScalarFunctionArgs, ScalarUDF, ScalarUDFImpl, Signature, Volatility,
-};
+use datafusion::logical_expr::{ColumnarValue, ScalarFunctionArgs, ScalarUDF, ScalarUDFImpl, Signature, Volatility};
 use datafusion::prelude::SessionContext;
 use echolake_lake::Lake;
 use echolake_schema::symmetry::MovedPair;
@@ -38,8 +36,9 @@ impl Lookups {
         let pairs = lake.pairs()?;
         let columns = pairs.schema();
         let own = columns.fields().iter().zip(pairs.columns()).skip(1);
-        let mut all: Vec<_> =
-            own.map(|(field, values)| Lookup::new("pair_", field.name(), values.clone(), pairs.num_rows(), 1)).collect();
+        let mut all: Vec<_> = own
+            .map(|(field, values)| Lookup::new("pair_", field.name(), values.clone(), pairs.num_rows(), 1))
+            .collect();
         all.extend(moved(lake.grid()));
         Ok(Self(all.into_iter().map(|lookup| Arc::new(ScalarUDF::from(lookup))).collect()))
     }

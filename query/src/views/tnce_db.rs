@@ -12,11 +12,12 @@ fn levels(rig: &Rig) -> Vec<(String, String, String)> {
     let bands = rig.band_names();
     let over_total = bands.iter().map(|b| (format!("tnce_{b}"), format!("of the band at {b} Hz over Flat's total")));
     let total = [("tnce_total".to_owned(), "of all bands over Flat's total".to_owned())];
-    let over_band = bands.iter().map(|b| {
-        (format!("tnce_band_{b}"), format!("of the band at {b} Hz over Flat's of the same band"))
-    });
+    let over_band =
+        bands.iter().map(|b| (format!("tnce_band_{b}"), format!("of the band at {b} Hz over Flat's of the same band")));
     let named = over_total.chain(total).chain(over_band);
-    named.map(|(column, what)| (column.clone(), format!("{column}_db"), format!("Level of the energy {what}"))).collect()
+    named
+        .map(|(column, what)| (column.clone(), format!("{column}_db"), format!("Level of the energy {what}")))
+        .collect()
 }
 
 // No energy has no level.
