@@ -13,6 +13,13 @@ pub fn rms<T: Real>(x: &[T]) -> f64 {
     (energy(x) / x.len().max(1) as f64).sqrt()
 }
 
+/// Running sum of squares of one signal over `scale`: its NCE over Flat's total energy.
+///
+/// ir, curve  `[n]`
+pub fn cumulate_whole<T: Real>(ir: &[T], scale: f64, curve: &mut [T]) {
+    accumulate(ir, scale.recip(), curve);
+}
+
 /// Running sum of squares of each band over `scale`, summed up in f64.
 ///
 /// bands  `[bands x len]`

@@ -1,8 +1,21 @@
 //! Decibels and order statistics.
 
+/// Reference of sound pressure levels in air, Pa (ISO 1683:2015).
+const REFERENCE_PRESSURE_PA: f64 = 20e-6;
+
 /// 10 log10 x: the level of a power ratio, dB. No power is minus infinity.
 pub fn power_to_db(power: f64) -> f64 {
     10.0 * power.log10()
+}
+
+/// 20 log10 |x|: the level of an amplitude ratio, dB. No amplitude is minus infinity.
+pub fn amplitude_to_db(amplitude: f64) -> f64 {
+    20.0 * amplitude.abs().log10()
+}
+
+/// Sound pressure level of a root mean square pressure in Pa, dB re 20 uPa.
+pub fn sound_pressure_level_db(rms_pa: f64) -> f64 {
+    amplitude_to_db(rms_pa / REFERENCE_PRESSURE_PA)
 }
 
 /// 10^(x/10): the power ratio of a level.
@@ -64,5 +77,7 @@ mod tests {
         assert_eq!(power_to_db(100.0), 20.0);
         assert!((db_to_power(power_to_db(0.37)) - 0.37).abs() < 1e-15);
         assert_eq!(power_to_db(0.0), f64::NEG_INFINITY);
+        assert_eq!((amplitude_to_db(-10.0), amplitude_to_db(0.0)), (20.0, f64::NEG_INFINITY));
+        assert!((sound_pressure_level_db(1.0) - 93.979).abs() < 1e-3, "the calibrator's 94 dB");
     }
 }

@@ -27,8 +27,12 @@
 //! ```
 
 mod aligned;
+pub mod arrival;
 pub mod chain;
+pub mod correlation;
+pub mod decay;
 pub mod deconvolution;
+pub mod diffusion;
 pub mod energy;
 mod error;
 pub mod filter_bank;
@@ -37,10 +41,13 @@ pub mod fresnel;
 pub mod geometry;
 #[cfg(test)]
 mod golden;
+pub mod heights;
 mod joint;
 pub mod level;
+pub mod mean;
 mod pruned;
 mod real;
+pub mod spectrum;
 pub mod sweep;
 pub mod temperature;
 

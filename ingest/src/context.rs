@@ -5,6 +5,7 @@ use std::sync::Arc;
 use arrow::record_batch::RecordBatch;
 use echolake_lake::{EncodedFile, FileName, Lake, Snapshot, Staged, VisibleRun, encode};
 use echolake_schema::tables::Table;
+use futures::future::join_all;
 
 use crate::error::Result;
 use crate::pipeline::Cores;
@@ -37,11 +38,9 @@ impl Context {
     ) -> Result<Vec<Staged>> {
         let Keys { surface, run } = keys.clone();
         let name = FileName::Rows { surface, run, derivation: derivation.to_owned() };
-        let mut staged = Vec::with_capacity(files.len());
-        for (table, file) in files {
-            staged.push(self.lake.stage(table, &name, file).await?);
-        }
-        Ok(staged)
+        // Each waits for the disk by itself.
+        let staged = join_all(files.into_iter().map(|(table, file)| self.lake.stage(table, &name, file))).await;
+        Ok(staged.into_iter().collect::<std::result::Result<_, _>>()?)
     }
 
     /// Stages a run's row of `runs`, in place of those that the view has. From its commit on readers see what it names,

@@ -43,13 +43,23 @@ pub(crate) struct DerivedRows {
     bands: usize,
     pub(crate) pairs: Vec<u32>,
     /// `[pairs x length]`.
-    pub(crate) reflected: Vec<f32>,
+    reflected: Vec<f32>,
     /// `[bands][pairs x length]`.
-    pub(crate) curves: Vec<Vec<f32>>,
+    curves: Vec<Vec<f32>>,
     /// `[pairs x bands]`.
     energies: Vec<f64>,
     tnce: Vec<f64>,
     tnce_over_band: Vec<f64>,
+}
+
+/// Responses and curves of [`DerivedRows`].
+#[derive(Debug, Clone, Default)]
+pub(crate) struct DerivedLists {
+    pub(crate) pairs: Vec<u32>,
+    /// `[pairs x length]`.
+    pub(crate) reflected: Vec<f32>,
+    /// `[bands][pairs x length]`.
+    pub(crate) curves: Vec<Vec<f32>>,
 }
 
 /// References, loaded, and the name of what is derived with them.
@@ -76,6 +86,15 @@ impl DerivedRows {
         self.energies.extend_from_slice(&derived.energies);
         self.tnce.extend_from_slice(&derived.tnce);
         self.tnce_over_band.extend_from_slice(&derived.tnce_over_band);
+    }
+
+    /// Responses and curves, which are left empty here.
+    fn take_lists(&mut self) -> DerivedLists {
+        DerivedLists {
+            pairs: self.pairs.clone(),
+            reflected: std::mem::take(&mut self.reflected),
+            curves: std::mem::take(&mut self.curves),
+        }
     }
 
     /// Values of every column from `tnce_*` to `energy_total`, in the tables' order.
@@ -147,10 +166,16 @@ impl Derivation {
             paired += slice.pairs.len();
             totals.iter_mut().zip(slice.tnce_columns()).for_each(|(all, some)| all.extend(some));
             let [nce, tnce, tnce_d4] = &mut encoders;
-            tnce.1.write(&rows::derived::tnce(rig, grid, keys, slice, of)?)?;
-            tnce_d4.1.write(&rows::derived::tnce_d4(rig, grid, &moved, keys, slice, of)?)?;
-            nce.1.write(&rows::derived::nce(rig, grid, keys, slice, of)?)?;
-            Ok(())
+            let lists = slice.take_lists();
+            // Lists are most of it, and the rest is for another core that has nothing else to do.
+            let (first, second) = rayon::join(
+                || Ok(nce.1.write(&rows::derived::nce(rig, grid, keys, lists, of)?)?),
+                || {
+                    tnce.1.write(&rows::derived::tnce(rig, grid, keys, slice, of)?)?;
+                    Ok(tnce_d4.1.write(&rows::derived::tnce_d4(rig, grid, &moved, keys, slice, of)?)?)
+                },
+            );
+            first.and(second)
         })?;
         let mut files = Vec::with_capacity(4);
         for (table, encoder) in encoders {

@@ -189,12 +189,20 @@ impl Work {
             return Ok(Ready { staged: Vec::new(), report: taken });
         }
         let (its_lake, for_rows, its_content) = (lake.clone(), keys.clone(), content.clone());
-        let files = cores.compute(move || encode_run(&its_lake, &for_rows, &its_content)).await?;
-        let mut staged = self.context.stage_rows(&keys, &derivation, files).await?;
+        let of_the_run = async {
+            let files = cores.compute(move || encode_run(&its_lake, &for_rows, &its_content)).await?;
+            self.context.stage_rows(&keys, &derivation, files).await
+        };
+        let of_references = async {
+            match Derivation::new(&derivation, &wanted, finder).await? {
+                Some(derived) => derived.stage(&self.context, &keys, content.responses()).await.map(Some),
+                None => Ok(None),
+            }
+        };
+        let (mut staged, derived) = tokio::try_join!(of_the_run, of_references)?;
         let mut references =
             rows::runs::References { missing: taken.missing.clone(), ..rows::runs::References::default() };
-        if let Some(derived) = Derivation::new(&derivation, &wanted, finder).await? {
-            let (files, used) = derived.stage(&self.context, &keys, content.responses()).await?;
+        if let Some((files, used)) = derived {
             staged.extend(files);
             taken.derived = true;
             taken.missing.clone_from(&used.missing);

@@ -21,6 +21,7 @@
 //! # }
 //! ```
 
+mod block_reader;
 mod chunk;
 mod complete;
 mod context;

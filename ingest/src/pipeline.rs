@@ -6,7 +6,7 @@
 
 use std::collections::VecDeque;
 use std::panic::{AssertUnwindSafe, catch_unwind, resume_unwind};
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
@@ -30,6 +30,20 @@ const GATHER: Duration = Duration::from_secs(2);
 #[derive(Debug, Clone)]
 pub(crate) struct Cores {
     pool: Arc<ThreadPool>,
+    /// How many are at work, here and elsewhere.
+    busy: Arc<AtomicUsize>,
+}
+
+/// A core at work, for as long as this lives.
+pub(crate) struct Busy(Arc<AtomicUsize>);
+
+/// Something that a core computes.
+pub(crate) struct Begun<T>(oneshot::Receiver<std::thread::Result<T>>);
+
+impl Drop for Busy {
+    fn drop(&mut self) {
+        self.0.fetch_sub(1, Ordering::Relaxed);
+    }
 }
 
 /// What a job brings to the commit.
@@ -45,21 +59,48 @@ pub(crate) type Ended<J, R> = (J, Result<(R, Option<Committed>)>);
 impl Cores {
     pub(crate) fn all() -> Result<Self> {
         let pool = ThreadPoolBuilder::new().thread_name(|i| format!("compute-{i}")).build();
-        Ok(Self { pool: Arc::new(pool.map_err(|e| Error::Threads { reason: e.to_string() })?) })
+        let pool = pool.map_err(|e| Error::Threads { reason: e.to_string() })?;
+        Ok(Self { pool: Arc::new(pool), busy: Arc::default() })
     }
 
     pub(crate) fn count(&self) -> usize {
         self.pool.current_num_threads()
     }
 
-    /// Computes on a core of its own, once one is free: in the order of the calls.
-    pub(crate) async fn compute<T: Send + 'static>(&self, work: impl FnOnce() -> T + Send + 'static) -> T {
+    /// Counts the caller as a core at work.
+    pub(crate) fn busy(&self) -> Busy {
+        self.busy.fetch_add(1, Ordering::Relaxed);
+        Busy(self.busy.clone())
+    }
+
+    /// Whether there is a core that would begin at once.
+    pub(crate) fn is_one_idle(&self) -> bool {
+        self.busy.load(Ordering::Relaxed) < self.count()
+    }
+
+    /// Begins to compute on a core of its own, once one is free: in the order of the calls.
+    pub(crate) fn begin<T: Send + 'static>(&self, work: impl FnOnce() -> T + Send + 'static) -> Begun<T> {
         let (sender, done) = oneshot::channel();
+        let busy = self.busy();
         self.pool.spawn_fifo(move || {
+            let done = catch_unwind(AssertUnwindSafe(work));
+            drop(busy);
             // Nobody waits any more where the whole ingest was given up.
-            let _ = sender.send(catch_unwind(AssertUnwindSafe(work)));
+            let _ = sender.send(done);
         });
-        match done.await {
+        Begun(done)
+    }
+
+    /// Computes on a core of its own, as [`Self::begin`] does.
+    pub(crate) async fn compute<T: Send + 'static>(&self, work: impl FnOnce() -> T + Send + 'static) -> T {
+        self.begin(work).done().await
+    }
+}
+
+impl<T> Begun<T> {
+    /// What was computed.
+    pub(crate) async fn done(self) -> T {
+        match self.0.await {
             Ok(Ok(done)) => done,
             Ok(Err(panic)) => resume_unwind(panic),
             // The pool sends always, and lives as long as we do.

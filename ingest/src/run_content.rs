@@ -8,14 +8,12 @@ use echolake_lake::Lake;
 use echolake_schema::manifest::{Origin, RunEnd, RunManifest};
 use echolake_schema::messages::{AmbientSample, Measurement, Verdict};
 use echolake_schema::{Rig, SurfaceId, SurfaceRecord, topics};
-use tokio::sync::Semaphore;
-use tokio::task::JoinHandle;
 
 use crate::chunk::{Chunk, Definitions};
 use crate::error::{Error, Result};
 use crate::files::Opened;
 use crate::measure::{Event, Measurer, Response, Yield};
-use crate::pipeline::Cores;
+use crate::pipeline::{Begun, Cores};
 use crate::run_reader::{Integrity, Item, RawChunk, RunReader};
 
 /// A run, read.
@@ -35,6 +33,12 @@ pub(crate) struct RunContent {
     pub(crate) integrity: Integrity,
     /// What could not be read, in words.
     pub(crate) damaged: Vec<String>,
+}
+
+/// What became of a chunk, or will.
+enum Measured {
+    Here(Yield),
+    Elsewhere(Begun<Yield>),
 }
 
 /// What stands outside of chunks.
@@ -85,9 +89,8 @@ impl RunContent {
         let mut definitions = Definitions::default();
         let mut whole = Yield { last_time_ns: i64::MIN, ..Yield::default() };
         let mut checked = false;
-        // Two chunks a core in flight: memory is bounded by them, not by the run.
-        let slots = Arc::new(Semaphore::new(2 * cores.count()));
-        let mut tasks: Vec<JoinHandle<Yield>> = Vec::new();
+        let busy = cores.busy();
+        let mut measured: Vec<Measured> = Vec::new();
         let mut seen = HashSet::new();
         // Chunks whose channels are not known yet: the chunk that introduces them is damaged, the summary has them too.
         let mut waiting = Vec::new();
@@ -109,13 +112,15 @@ impl RunContent {
                                 waiting.push((offset, length));
                                 continue;
                             }
-                            let channels = definitions.channels.clone();
-                            let (measurer, slot) = (measurer.clone(), slots.clone().acquire_owned().await);
-                            let cores = cores.clone();
-                            tasks.push(tokio::spawn(async move {
-                                let _slot = slot;
-                                cores.compute(move || measurer.process(offset, &chunk, &channels)).await
-                            }));
+                            let (measurer, channels) = (measurer.clone(), definitions.channels.clone());
+                            let work = move || measurer.process(offset, &chunk, &channels);
+                            // Another core would have to fetch what this one has in its cache, so it gets a chunk only
+                            // where it has nothing else to do. That also bounds how many are in memory.
+                            measured.push(match cores.is_one_idle() {
+                                true => Measured::Elsewhere(cores.begin(work)),
+                                false => Measured::Here(work()),
+                            });
+                            tokio::task::yield_now().await;
                         }
                         Err(reason) => {
                             whole.damaged.push(reason);
@@ -134,8 +139,12 @@ impl RunContent {
             }
         }
         let manifest = envelope.check(lake, name)?;
-        for task in tasks {
-            whole.append(task.await.map_err(|e| Error::read(name, e))?);
+        drop(busy);
+        for part in measured {
+            whole.append(match part {
+                Measured::Here(part) => part,
+                Measured::Elsewhere(part) => part.done().await,
+            });
         }
         for (offset, length) in waiting {
             let (offset, chunk) = decode(&reader.again(offset, length).await?).map_err(|e| Error::read(name, e))?;

@@ -13,14 +13,15 @@ use object_store::path::Path;
 use object_store::{ObjectStore, ObjectStoreExt as _};
 use sha2::{Digest as _, Sha256};
 
+use crate::block_reader::BlockReader;
 use crate::error::{Error, Result};
 use crate::record_shape::{self, Frame, PREFIX, Shape, opcode};
 
 const MAGIC: &[u8; 8] = b"\x89MCAP0\r\n";
 /// Opcode and length in front of every record.
 const FRAME: u64 = record_shape::FRAME as u64;
-/// How much is fetched at a time: a few chunks, which stay in memory while one of them is in use.
-const BLOCK: u64 = 4 << 20;
+/// Most that is passed over at a time.
+const PASS: u64 = 1 << 20;
 /// Bytes from the footer's frame to the end of the file.
 const FOOTER: u64 = FRAME + 20 + MAGIC.len() as u64;
 
@@ -59,8 +60,7 @@ pub struct Integrity {
 
 /// A walk over one file.
 pub(crate) struct RunReader {
-    store: Arc<dyn ObjectStore>,
-    path: Path,
+    file: BlockReader,
     name: String,
     size: u64,
     /// Where the next record begins.
@@ -98,8 +98,7 @@ impl RunReader {
             Err(e) => return Err(Error::read(&name, e)),
         };
         let mut reader = Self {
-            store,
-            path,
+            file: BlockReader::open(store, path).await,
             name,
             size,
             offset: 0,
@@ -160,7 +159,7 @@ impl RunReader {
     /// A chunk that the walk came by earlier, once more.
     pub(crate) async fn again(&self, offset: u64, length: u64) -> Result<RawChunk> {
         let start = offset + FRAME;
-        let body = self.store.get_range(&self.path, start..start + length).await;
+        let body = self.file.range(start..start + length).await;
         Ok(RawChunk { offset, body: body.map_err(|e| Error::read(&self.name, e))? })
     }
 
@@ -221,7 +220,7 @@ impl RunReader {
         if self.size - offset < FRAME {
             return Ok(false);
         }
-        let bytes = self.store.get_range(&self.path, offset..offset + FRAME).await;
+        let bytes = self.file.range(offset..offset + FRAME).await;
         let frame = Frame::read(&bytes.map_err(|e| Error::read(&self.name, e))?);
         Ok(frame.is_possible(self.size - offset - FRAME))
     }
@@ -309,8 +308,10 @@ impl RunReader {
     /// once more: that is less than to copy all behind it.
     async fn fill(&mut self, count: u64) -> Result<()> {
         if (self.buffer.len() as u64) < count {
-            let to = (self.offset + BLOCK.max(count)).min(self.size);
-            let fetched = self.store.get_range(&self.path, self.offset..to).await;
+            // Let go, so that its memory serves again.
+            self.buffer = Bytes::new();
+            let to = (self.offset + count.max(self.file.ahead())).min(self.size);
+            let fetched = self.file.block(self.offset..to).await;
             self.buffer = fetched.map_err(|e| Error::read(&self.name, e))?;
         }
         if (self.buffer.len() as u64) < count {
@@ -340,7 +341,7 @@ impl RunReader {
     async fn pass(&mut self, count: u64) -> Result<Option<Item>> {
         let mut left = count;
         while left > 0 {
-            let some = left.min(BLOCK);
+            let some = left.min(PASS);
             self.fill(some).await?;
             self.skip(some, true);
             left -= some;

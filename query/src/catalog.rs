@@ -18,6 +18,7 @@ use echolake_lake::{DataFile, Lake, Moment, Snapshot};
 use echolake_schema::tables::Table;
 
 use crate::as_of::{self, Past};
+use crate::mcap;
 use crate::table::{LakeTable, Source};
 use crate::views::{Lookups, UnusedJoin, View};
 use crate::{Error, error};
@@ -38,6 +39,7 @@ pub(crate) struct Catalog {
     taking: tokio::sync::Mutex<()>,
     /// Tables of the past, which do not change. The oldest goes first.
     past: Mutex<Vec<((Moment, Table), Arc<LakeTable>)>>,
+    runs: Arc<mcap::Files>,
 }
 
 /// One view of the lake.
@@ -65,6 +67,7 @@ impl Catalog {
             current: Mutex::default(),
             taking: tokio::sync::Mutex::default(),
             past: Mutex::default(),
+            runs: Arc::new(mcap::Files::new(lake.store())),
         })
     }
 
@@ -76,7 +79,8 @@ impl Catalog {
     /// [`Error::Query`] where that is none.
     pub(crate) async fn register(&self, context: &SessionContext, statement: &mut Statement) -> Result<(), Error> {
         let past = as_of::named(statement);
-        for (name, provider) in &self.current().await?.providers {
+        let current = self.current().await?;
+        for (name, provider) in &current.providers {
             context.register_table(TableReference::bare(*name), provider.clone()).map_err(failed)?;
         }
         for past in past {
@@ -84,7 +88,7 @@ impl Catalog {
             context.register_table(TableReference::bare(past.name), provider).map_err(failed)?;
         }
         context.add_optimizer_rule(Arc::new(UnusedJoin));
-        Ok(())
+        mcap::register(context, &current.snapshot, &self.runs, statement).await
     }
 
     /// The tables and views and their schemas.

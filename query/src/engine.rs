@@ -3,17 +3,28 @@
 use std::sync::Arc;
 use std::time::Duration;
 
+use datafusion::catalog::{CatalogProvider as _, CatalogProviderList as _};
+use datafusion::catalog::{MemoryCatalogProvider, MemoryCatalogProviderList, MemorySchemaProvider};
 use datafusion::datasource::physical_plan::parquet::CachedParquetFileReaderFactory;
 use datafusion::error::DataFusionError;
+use datafusion::execution::FunctionRegistry as _;
+use datafusion::execution::disk_manager::DiskManagerBuilder;
+use datafusion::execution::memory_pool::GreedyMemoryPool;
 use datafusion::execution::object_store::{DefaultObjectStoreRegistry, ObjectStoreRegistry as _, ObjectStoreUrl};
 use datafusion::execution::runtime_env::{RuntimeEnv, RuntimeEnvBuilder};
+use datafusion::execution::session_state::{SessionState, SessionStateBuilder};
+use datafusion::logical_expr::Documentation;
 use datafusion::prelude::{SessionConfig, SessionContext};
 use echolake_lake::Lake;
+use tokio::sync::Semaphore;
 
 use crate::catalog::Catalog;
+use crate::control::governor::{Running, govern, resident_bytes};
+use crate::control::guard::guarded;
+use crate::control::lanes::{Lanes, Threads};
 use crate::small::SmallTables;
 use crate::table::Source;
-use crate::{Error, Session};
+use crate::{Error, Functions, Session};
 
 /// Where the lake's store is registered; no other store is, so no query reaches a file outside of the lake.
 const STORE: &str = "echolake://lake/";
@@ -25,23 +36,81 @@ const BATCH_ROWS: usize = 2048;
 /// thousand runs are more than DataFusion's 50 MiB.
 const METADATA_BYTES: usize = 256 << 20;
 
+/// Disk that sorts and aggregations of all queries may use.
+const SPILL_BYTES: u64 = 16 << 30;
+/// Heavy queries at once, where nobody says how many.
+const HEAVY: usize = 2;
+/// What the process may weigh over what its queries may hold, before one of them is ended.
+const OVER: f64 = 0.1;
+
 /// Answers the queries of many sessions on one lake.
 #[derive(Clone)]
 pub struct Engine(Arc<Inner>);
 
 struct Inner {
-    config: SessionConfig,
-    runtime: Arc<RuntimeEnv>,
+    template: SessionState,
     catalog: Catalog,
+    lanes: Lanes,
+    running: Arc<Running>,
+    limits: Limits,
+    // Watches times and sizes whatever the queries do to their own threads.
+    watch: Threads,
+}
+
+/// What all queries of a process together may use.
+#[derive(Debug, Clone, Copy)]
+pub struct Limits {
+    /// Bytes that queries may hold; None for no limit.
+    pub memory: Option<usize>,
+    /// Queries at once that read much or compare each row with each. Each may have its part of the memory; more wait.
+    pub heavy: usize,
+}
+
+impl Default for Limits {
+    fn default() -> Self {
+        Self { memory: None, heavy: HEAVY }
+    }
+}
+
+/// A function that queries may call.
+#[derive(Debug, Clone)]
+pub struct Function {
+    /// Its name.
+    pub name: String,
+    /// How it is called.
+    pub syntax: String,
+    /// What it does.
+    pub description: String,
 }
 
 /// Who asks, and how much they may have. One for all sessions of a token.
 #[derive(Debug)]
 pub struct Client {
+    name: String,
+    quota: Quota,
+    places: Option<Arc<Semaphore>>,
+}
+
+impl Client {
+    /// A client.
+    pub fn new(name: impl Into<String>, quota: Quota) -> Self {
+        let places = quota.concurrent.map(|places| Arc::new(Semaphore::new(places)));
+        Self { name: name.into(), quota, places }
+    }
+
     /// Name for logs and refusals.
-    pub name: String,
+    pub fn name(&self) -> &str {
+        &self.name
+    }
+
     /// What their queries may use.
-    pub quota: Quota,
+    pub fn quota(&self) -> &Quota {
+        &self.quota
+    }
+
+    pub(crate) fn places(&self) -> Option<&Arc<Semaphore>> {
+        self.places.as_ref()
+    }
 }
 
 /// What the queries of one client may use; None is as much as there is.
@@ -53,7 +122,7 @@ pub struct Quota {
     pub memory: Option<usize>,
     /// Rows of one answer; a longer one ends with an error, it is not cut in silence.
     pub rows: Option<u64>,
-    /// Queries that run at once; more wait.
+    /// Queries that run at once; more are refused.
     pub concurrent: Option<usize>,
 }
 
@@ -62,14 +131,25 @@ impl Engine {
     ///
     /// # Errors
     /// [`Error::Execution`] where DataFusion cannot be set up.
-    pub fn new(lake: &Lake) -> Result<Self, Error> {
+    pub fn new(lake: &Lake, limits: Limits) -> Result<Self, Error> {
         let failed = |e: DataFusionError| Error::execution(&e);
         let url = ObjectStoreUrl::parse(STORE).map_err(failed)?;
-        let runtime = runtime(lake, &url).map_err(failed)?;
+        let runtime = runtime(lake, &url, limits).map_err(failed)?;
         let metadata = runtime.cache_manager.get_file_metadata_cache();
         let reader = Arc::new(CachedParquetFileReaderFactory::new(lake.store(), metadata));
-        let catalog = Catalog::new(lake, Source { url, reader, small: Arc::new(SmallTables::new(lake)) })?;
-        Ok(Self(Arc::new(Inner { config: config(), runtime, catalog })))
+        let functions = Functions::all(lake.rig()).map_err(|e| Error::Execution { message: e.to_string() })?;
+        let threads = |e: std::io::Error| Error::Execution { message: format!("no threads for queries: {e}") };
+        let inner = Inner {
+            template: template(runtime, &functions),
+            catalog: Catalog::new(lake, Source { url, reader, small: Arc::new(SmallTables::new(lake)) })?,
+            lanes: Lanes::new(limits.heavy.max(1)).map_err(threads)?,
+            running: Arc::default(),
+            limits,
+            watch: Threads::new("query-watch", 1).map_err(threads)?,
+        };
+        let engine = Self(Arc::new(inner));
+        engine.start_governor();
+        Ok(engine)
     }
 
     /// A session of a client: one a connection.
@@ -77,15 +157,91 @@ impl Engine {
         Session::of(self.clone(), client.clone())
     }
 
+    /// Queries that run or wait now.
+    pub fn running(&self) -> usize {
+        self.0.running.count()
+    }
+
+    /// The functions, by name.
+    pub(crate) fn functions(&self) -> Vec<Function> {
+        let state = &self.0.template;
+        let scalar = state.scalar_functions().iter().map(|(name, f)| (name, f.documentation()));
+        let aggregate = state.aggregate_functions().iter().map(|(name, f)| (name, f.documentation()));
+        let window = state.window_functions().iter().map(|(name, f)| (name, f.documentation()));
+        let mut functions: Vec<_> =
+            scalar.chain(aggregate).chain(window).map(|(name, doc)| function(name, doc)).collect();
+        functions.sort_by(|a, b| a.name.cmp(&b.name));
+        functions.dedup_by(|a, b| a.name == b.name);
+        functions
+    }
+
     /// What can be asked.
     pub(crate) fn catalog(&self) -> &Catalog {
         &self.0.catalog
     }
 
-    // A new one a query: the tables are those of one snapshot, and nothing a query does outlives it.
-    pub(crate) fn context(&self) -> SessionContext {
-        SessionContext::new_with_config_rt(self.0.config.clone(), self.0.runtime.clone())
+    pub(crate) fn lanes(&self) -> &Lanes {
+        &self.0.lanes
     }
+
+    pub(crate) fn queries(&self) -> &Running {
+        &self.0.running
+    }
+
+    /// Threads that no query can hold up.
+    pub(crate) fn watch(&self) -> &Threads {
+        &self.0.watch
+    }
+
+    /// Bytes that one query may hold, where there is a limit.
+    pub(crate) fn memory(&self, quota: &Quota) -> usize {
+        let part = self.0.limits.memory.map_or(usize::MAX, |all| all / self.0.limits.heavy.max(1));
+        quota.memory.map_or(part, |own| own.min(part))
+    }
+
+    // A new one a query: the tables are those of one snapshot, and nothing a query does outlives it. Functions are
+    // looked up once an engine.
+    pub(crate) fn context(&self) -> SessionContext {
+        let names = &self.0.template.config_options().catalog;
+        let catalog = MemoryCatalogProvider::new();
+        // New ones take any name.
+        let _ = catalog.register_schema(&names.default_schema, Arc::new(MemorySchemaProvider::new()));
+        let catalogs = MemoryCatalogProviderList::new();
+        catalogs.register_catalog(names.default_catalog.clone(), Arc::new(catalog));
+        let state = SessionStateBuilder::new_from_existing(self.0.template.clone())
+            .with_catalog_list(Arc::new(catalogs))
+            .build();
+        SessionContext::new_with_state(state)
+    }
+
+    fn start_governor(&self) {
+        let (Some(memory), Some(threads)) = (self.0.limits.memory, self.0.watch.handle()) else { return };
+        let own = resident_bytes().unwrap_or(0);
+        let limit = own + memory + (memory as f64 * OVER) as usize;
+        threads.spawn(govern(Arc::downgrade(&self.0.running), limit));
+    }
+}
+
+fn function(name: &str, doc: Option<&Documentation>) -> Function {
+    Function {
+        name: name.to_owned(),
+        syntax: doc.map_or_else(|| format!("{name}(...)"), |d| d.syntax_example.clone()),
+        description: doc.map_or_else(String::new, |d| d.description.clone()),
+    }
+}
+
+fn template(runtime: Arc<RuntimeEnv>, functions: &Functions) -> SessionState {
+    let mut state =
+        SessionStateBuilder::new().with_config(config()).with_runtime_env(runtime).with_default_features().build();
+    let asked: Vec<_> = state.scalar_functions().values().filter_map(guarded).collect();
+    // The new ones replace those of their names and aliases; only a registry that is closed refuses.
+    for function in asked.into_iter().chain(functions.scalar().iter().cloned()) {
+        let _ = state.register_udf(function);
+    }
+    for function in functions.aggregate() {
+        let _ = state.register_udaf(function.clone());
+    }
+    state
 }
 
 // DataFusion's defaults already use all cores and prune by row group and page.
@@ -98,11 +254,16 @@ fn config() -> SessionConfig {
     config
 }
 
-fn runtime(lake: &Lake, url: &ObjectStoreUrl) -> Result<Arc<RuntimeEnv>, DataFusionError> {
+fn runtime(lake: &Lake, url: &ObjectStoreUrl, limits: Limits) -> Result<Arc<RuntimeEnv>, DataFusionError> {
     let stores = DefaultObjectStoreRegistry::new();
     stores.deregister_store(ObjectStoreUrl::parse(MACHINE)?.as_ref())?;
     stores.register_store(url.as_ref(), lake.store());
-    RuntimeEnvBuilder::new()
+    let mut builder = RuntimeEnvBuilder::new();
+    if let Some(memory) = limits.memory {
+        builder = builder.with_memory_pool(Arc::new(GreedyMemoryPool::new(memory)));
+    }
+    builder
+        .with_disk_manager_builder(DiskManagerBuilder::default().with_max_temp_directory_size(SPILL_BYTES))
         .with_object_store_registry(Arc::new(stores))
         .with_metadata_cache_limit(METADATA_BYTES)
         .build_arc()

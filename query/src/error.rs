@@ -2,6 +2,7 @@
 
 use std::cmp::Reverse;
 use std::collections::BTreeSet;
+use std::time::Duration;
 
 use arrow::error::ArrowError;
 use datafusion::common::utils::datafusion_strsim::normalized_levenshtein;
@@ -9,6 +10,8 @@ use datafusion::common::{Column, SchemaError};
 use datafusion::error::DataFusionError;
 use datafusion::sql::sqlparser::parser::ParserError;
 use echolake_schema::tables::Table;
+
+use crate::control::Stop;
 
 /// How alike two names must be for one to be suggested: half of the letters, as in DataFusion's own suggestions.
 const ALIKE: f64 = 0.5;
@@ -42,6 +45,35 @@ pub enum Error {
         /// Why.
         message: String,
     },
+    /// Whoever asked does not want it any more.
+    #[error("the query was cancelled")]
+    Cancelled,
+    /// It took longer than its client may.
+    #[error("the query took longer than {} s; hint: ask for less, or for fewer surfaces at a time", limit.as_secs_f64())]
+    TimeLimit {
+        /// The client's time for a query.
+        limit: Duration,
+    },
+    /// It needed more memory than there is for it.
+    #[error("the query needs more memory than it may have: {message}; hint: ask for less, or for fewer columns")]
+    MemoryLimit {
+        /// What ran out.
+        message: String,
+    },
+    /// Its answer is longer than its client may have.
+    #[error("the answer has more than {limit} rows; hint: LIMIT, or a WHERE that asks for less")]
+    RowLimit {
+        /// Rows that the client may have.
+        limit: u64,
+    },
+    /// The client runs as many queries as it may.
+    #[error("`{client}` already runs {limit} queries, as many as it may; hint: wait for one, or cancel it")]
+    Busy {
+        /// Who.
+        client: String,
+        /// How many.
+        limit: usize,
+    },
     /// The answer cannot be written.
     #[error("the answer cannot be written as {format}: {message}")]
     Format {
@@ -61,6 +93,9 @@ pub enum Error {
 impl Error {
     /// An error of parsing or planning `sql`.
     pub(crate) fn plan(sql: &str, error: &DataFusionError) -> Self {
+        if let Some(limit) = Self::limit(error) {
+            return limit;
+        }
         let (message, hint) = explain(error);
         let span = error.diagnostic().and_then(|d| d.span).map(|s| (s.start.line, s.start.column));
         let (message, parsed) = without_place(sql, &message);
@@ -70,7 +105,27 @@ impl Error {
 
     /// An error of running a query.
     pub(crate) fn execution(error: &DataFusionError) -> Self {
-        Self::Execution { message: explain(error).0 }
+        Self::limit(error).unwrap_or_else(|| Self::Execution { message: explain(error).0 })
+    }
+
+    // An error that tells of a limit, not of the query.
+    fn limit(error: &DataFusionError) -> Option<Self> {
+        match error.find_root() {
+            DataFusionError::External(source) => source.downcast_ref::<Stop>().map(Self::stopped),
+            DataFusionError::ResourcesExhausted(text) => Some(Self::MemoryLimit { message: text.clone() }),
+            _ => None,
+        }
+    }
+
+    /// What a stopped query's client is told.
+    pub(crate) fn stopped(why: &Stop) -> Self {
+        match why {
+            Stop::Cancelled => Self::Cancelled,
+            Stop::Time(limit) => Self::TimeLimit { limit: *limit },
+            Stop::Memory => {
+                Self::MemoryLimit { message: "the service was over its limit, and this query the largest".to_owned() }
+            }
+        }
     }
 }
 

@@ -15,15 +15,19 @@
 
 mod as_of;
 mod catalog;
+mod control;
 mod engine;
 mod error;
+mod functions;
 mod gate;
+mod mcap;
 pub mod output;
 mod session;
 mod small;
 mod table;
 mod views;
 
-pub use engine::{Client, Engine, Quota};
+pub use engine::{Client, Engine, Function, Limits, Quota};
 pub use error::Error;
-pub use session::{Answer, Extend, Prepared, Session};
+pub use functions::Functions;
+pub use session::{Answer, CancelHandle, Extend, Prepared, Session};

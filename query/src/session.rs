@@ -1,23 +1,35 @@
 //! A session: every query sees one frozen view of the lake and may only read.
 
+use std::future::Future;
 use std::sync::Arc;
 
 use arrow::datatypes::{DataType, SchemaRef};
 use arrow::record_batch::RecordBatch;
 use datafusion::common::ParamValues;
 use datafusion::error::DataFusionError;
-use datafusion::execution::SendableRecordBatchStream;
+use datafusion::execution::TaskContext;
 use datafusion::execution::context::SQLOptions;
 use datafusion::logical_expr::LogicalPlan;
+use datafusion::physical_plan::{ExecutionPlan, execute_stream};
 use datafusion::prelude::SessionContext;
 use datafusion::sql::parser::Statement;
 use echolake_lake::Lake;
 use futures::StreamExt as _;
+use tokio::sync::{OwnedSemaphorePermit, mpsc};
+use tokio::task::JoinHandle;
 
-use crate::engine::{Client, Engine, Quota};
+use crate::control::lanes::Lane;
+use crate::control::pool::QueryPool;
+use crate::control::watched::watch;
+use crate::control::{Stop, Ticket};
+use crate::engine::{Client, Engine, Function, Limits, Quota};
 use crate::{Error, as_of, gate};
 
-/// Asks a lake in SQL: one a connection.
+/// Batches that wait for a slow reader.
+const AHEAD: usize = 2;
+
+/// Asks a lake in SQL: one a connection. Clones are the same session.
+#[derive(Clone)]
 pub struct Session {
     engine: Engine,
     client: Arc<Client>,
@@ -67,16 +79,64 @@ impl Prepared {
 pub struct Answer {
     /// Its columns.
     pub schema: SchemaRef,
-    batches: SendableRecordBatchStream,
+    batches: mpsc::Receiver<Result<RecordBatch, DataFusionError>>,
+    query: Option<JoinHandle<()>>,
+    ticket: Arc<Ticket>,
+    rows: u64,
+    limit: Option<u64>,
+}
+
+/// Ends a query from elsewhere.
+#[derive(Clone)]
+pub struct CancelHandle(Arc<Ticket>);
+
+impl CancelHandle {
+    /// Ends the query; its answer fails with [`Error::Cancelled`]. Nothing happens where it is at its end.
+    pub fn cancel(&self) {
+        self.0.stop(Stop::Cancelled);
+    }
 }
 
 impl Answer {
     /// The next rows; None after the last.
     ///
     /// # Errors
-    /// [`Error::Execution`] where the query fails on its way.
+    /// [`Error::Execution`] where the query fails on its way, [`Error::Cancelled`], [`Error::TimeLimit`],
+    /// [`Error::MemoryLimit`] or [`Error::RowLimit`] where it may not go on.
     pub async fn next(&mut self) -> Result<Option<RecordBatch>, Error> {
-        self.batches.next().await.transpose().map_err(|e| Error::execution(&e))
+        let batch = tokio::select! {
+            biased;
+            batch = self.batches.recv() => batch,
+            why = self.ticket.stopped() => return Err(Error::stopped(&why)),
+        };
+        let Some(batch) = batch else { return self.end().await };
+        let batch = batch.map_err(|e| Error::execution(&e))?;
+        self.rows += batch.num_rows() as u64;
+        if let Some(limit) = self.limit.filter(|limit| self.rows > *limit) {
+            self.ticket.stop(Stop::Cancelled);
+            return Err(Error::RowLimit { limit });
+        }
+        Ok(Some(batch))
+    }
+
+    /// Ends this answer's query from elsewhere.
+    pub fn cancel_handle(&self) -> CancelHandle {
+        CancelHandle(self.ticket.clone())
+    }
+
+    // Without this an answer whose query died would look like one that is whole.
+    async fn end(&mut self) -> Result<Option<RecordBatch>, Error> {
+        let Some(query) = self.query.take() else { return Ok(None) };
+        match query.await {
+            Ok(()) => self.ticket.why().map_or(Ok(None), |why| Err(Error::stopped(why))),
+            Err(_) => Err(Error::Execution { message: "a defect ended it".to_owned() }),
+        }
+    }
+}
+
+impl Drop for Answer {
+    fn drop(&mut self) {
+        self.ticket.stop(Stop::Cancelled);
     }
 }
 
@@ -86,8 +146,8 @@ impl Session {
     /// # Errors
     /// [`Error::Execution`] where DataFusion cannot be set up.
     pub fn new(lake: &Lake) -> Result<Self, Error> {
-        let client = Client { name: "local".to_owned(), quota: Quota::default() };
-        Ok(Engine::new(lake)?.session(&Arc::new(client)))
+        let client = Client::new("local", Quota::default());
+        Ok(Engine::new(lake, Limits::default())?.session(&Arc::new(client)))
     }
 
     pub(crate) fn of(engine: Engine, client: Arc<Client>) -> Self {
@@ -102,7 +162,7 @@ impl Session {
     }
 
     /// Who asks.
-    pub fn client(&self) -> &Client {
+    pub fn client(&self) -> &Arc<Client> {
         &self.client
     }
 
@@ -110,10 +170,12 @@ impl Session {
     ///
     /// # Errors
     /// [`Error::Query`] where it is not right, [`Error::NotReading`] where it would change something,
-    /// [`Error::Lake`] where the lake cannot be read.
+    /// [`Error::Lake`] where the lake cannot be read, [`Error::Busy`] and those of [`Answer::next`] where it may not
+    /// go on.
     pub async fn query(&self, sql: &str) -> Result<Answer, Error> {
-        let prepared = self.prepare(sql).await?;
-        self.run(&prepared.context, prepared.plan, sql).await
+        let started = self.start()?;
+        let prepared = self.plan(sql, self.parse(sql)?, &started.ticket).await?;
+        self.run(&prepared, prepared.plan.clone(), started).await
     }
 
     /// Plans a query.
@@ -121,36 +183,25 @@ impl Session {
     /// # Errors
     /// As [`Session::query`].
     pub async fn prepare(&self, sql: &str) -> Result<Prepared, Error> {
-        let statement = self.parse(sql)?;
-        self.prepare_statement(sql, statement).await
+        self.prepare_statement(sql, self.parse(sql)?).await
     }
 
     /// Plans a statement that a protocol has parsed, and perhaps rewritten, from `sql`.
     ///
     /// # Errors
     /// As [`Session::query`].
-    pub async fn prepare_statement(&self, sql: &str, mut statement: Statement) -> Result<Prepared, Error> {
-        let wrong = |e: DataFusionError| Error::plan(sql, &e);
-        gate::check(&statement)?;
-        let context = self.engine.context();
-        self.engine.catalog().register(&context, &mut statement).await?;
-        if let Some(extend) = &self.extend {
-            extend(&context).map_err(|e| Error::execution(&e))?;
-        }
-        let plan = context.state().statement_to_plan(statement).await.map_err(wrong)?;
-        // `SELECT INTO` reads by its first word and makes a table by its plan.
-        let reading = SQLOptions::new().with_allow_ddl(false).with_allow_dml(false).with_allow_statements(false);
-        reading.verify_plan(&plan).map_err(|_| Error::NotReading { statement: plan.display().to_string() })?;
-        Ok(Prepared { context, plan, sql: sql.to_owned() })
+    pub async fn prepare_statement(&self, sql: &str, statement: Statement) -> Result<Prepared, Error> {
+        let started = self.start()?;
+        self.plan(sql, statement, &started.ticket).await
     }
 
     /// Answers a planned query with values for its placeholders.
     ///
     /// # Errors
-    /// [`Error::Query`] where values are missing or of the wrong type.
+    /// [`Error::Query`] where values are missing or of the wrong type; else as [`Session::query`].
     pub async fn execute(&self, prepared: &Prepared, values: ParamValues) -> Result<Answer, Error> {
         let plan = prepared.plan.clone().with_param_values(values).map_err(|e| Error::plan(&prepared.sql, &e))?;
-        self.run(&prepared.context, plan, &prepared.sql).await
+        self.run(prepared, plan, self.start()?).await
     }
 
     /// Parses one statement.
@@ -163,16 +214,158 @@ impl Session {
         state.sql_to_statement(sql, &state.config().options().sql_parser.dialect).map_err(|e| Error::plan(sql, &e))
     }
 
-    async fn run(&self, context: &SessionContext, plan: LogicalPlan, sql: &str) -> Result<Answer, Error> {
-        let wrong = |e: DataFusionError| Error::plan(sql, &e);
-        let frame = context.execute_logical_plan(plan).await.map_err(wrong)?;
-        let batches = frame.execute_stream().await.map_err(wrong)?;
-        Ok(Answer { schema: batches.schema(), batches })
+    // A query's time begins here, with its waiting.
+    fn start(&self) -> Result<Started, Error> {
+        let place = match self.client.places() {
+            None => None,
+            Some(places) => Some(places.clone().try_acquire_owned().map_err(|_| Error::Busy {
+                client: self.client.name().to_owned(),
+                limit: self.client.quota().concurrent.unwrap_or(0),
+            })?),
+        };
+        let ticket = Arc::new(Ticket::new());
+        self.engine.queries().add(&ticket);
+        if let (Some(time), Some(threads)) = (self.client.quota().time, self.engine.watch().handle()) {
+            let watched = Arc::downgrade(&ticket);
+            threads.spawn(async move {
+                tokio::time::sleep(time).await;
+                if let Some(ticket) = watched.upgrade() {
+                    ticket.stop(Stop::Time(time));
+                }
+            });
+        }
+        Ok(Started { ticket, place })
+    }
+
+    async fn plan(&self, sql: &str, mut statement: Statement, ticket: &Arc<Ticket>) -> Result<Prepared, Error> {
+        gate::check(&statement)?;
+        let (session, text) = (self.clone(), sql.to_owned());
+        let plan = async move {
+            let sql = text;
+            let wrong = |e: DataFusionError| Error::plan(&sql, &e);
+            let context = session.engine.context();
+            session.engine.catalog().register(&context, &mut statement).await?;
+            if let Some(extend) = &session.extend {
+                extend(&context).map_err(|e| Error::execution(&e))?;
+            }
+            let plan = context.state().statement_to_plan(statement).await.map_err(wrong)?;
+            // `SELECT INTO` reads by its first word and makes a table by its plan.
+            let reading = SQLOptions::new().with_allow_ddl(false).with_allow_dml(false).with_allow_statements(false);
+            reading.verify_plan(&plan).map_err(|_| Error::NotReading { statement: plan.display().to_string() })?;
+            Ok(Prepared { context, plan, sql })
+        };
+        self.on_threads(ticket, plan).await
+    }
+
+    async fn run(&self, prepared: &Prepared, plan: LogicalPlan, started: Started) -> Result<Answer, Error> {
+        let Started { ticket, place } = started;
+        let (state, sql, asked) = (prepared.context.state(), prepared.sql.clone(), ticket.clone());
+        let physical = async move {
+            let wrong = |e: DataFusionError| Error::plan(&sql, &e);
+            let plan = state.create_physical_plan(&plan).await.map_err(wrong)?;
+            let lane = Lane::of(&plan);
+            Ok((lane, watch(plan, &asked).map_err(wrong)?))
+        };
+        let (lane, plan) = self.on_threads(&ticket, physical).await?;
+        let room = tokio::select! {
+            room = self.engine.lanes().place(lane) => room,
+            why = ticket.stopped() => return Err(Error::stopped(&why)),
+        };
+        let Some(threads) = self.engine.lanes().threads(lane) else { return Err(ended()) };
+        let (send, batches) = mpsc::channel(AHEAD);
+        let schema = plan.schema();
+        let context = self.task_context(&prepared.context, &ticket);
+        let places = (place, room);
+        let query = threads.spawn(drive(plan, context, send, ticket.clone(), places));
+        Ok(Answer { schema, batches, query: Some(query), ticket, rows: 0, limit: self.client.quota().rows })
+    }
+
+    // Constants are computed while a query is planned, so planning must not hold up the caller's threads either.
+    async fn on_threads<T: Send + 'static>(
+        &self,
+        ticket: &Ticket,
+        work: impl Future<Output = Result<T, Error>> + Send + 'static,
+    ) -> Result<T, Error> {
+        let Some(threads) = self.engine.lanes().threads(Lane::Light) else { return Err(ended()) };
+        let mut work = AbortOnDrop(threads.spawn(work));
+        tokio::select! {
+            done = &mut work.0 => done.unwrap_or_else(|_| Err(Error::Execution { message: "a defect ended it".to_owned() })),
+            why = ticket.stopped() => Err(Error::stopped(&why)),
+        }
+    }
+
+    fn task_context(&self, context: &SessionContext, ticket: &Arc<Ticket>) -> Arc<TaskContext> {
+        let task = context.task_ctx();
+        let mut runtime = task.runtime_env().as_ref().clone();
+        let limit = self.engine.memory(self.client.quota());
+        runtime.memory_pool = Arc::new(QueryPool::new(runtime.memory_pool, limit, ticket.clone()));
+        let state = context.state();
+        Arc::new(TaskContext::new(
+            task.task_id(),
+            task.session_id(),
+            task.session_config().clone(),
+            state.scalar_functions().clone(),
+            state.higher_order_functions().clone(),
+            state.aggregate_functions().clone(),
+            state.window_functions().clone(),
+            Arc::new(runtime),
+        ))
+    }
+
+    /// The functions, by name.
+    pub fn functions(&self) -> Vec<Function> {
+        self.engine.functions()
     }
 
     /// The tables and their schemas.
     pub fn tables(&self) -> impl Iterator<Item = (&'static str, SchemaRef)> {
         self.engine.catalog().tables()
+    }
+}
+
+/// A query that has begun, before it is planned.
+struct Started {
+    ticket: Arc<Ticket>,
+    place: Option<OwnedSemaphorePermit>,
+}
+
+/// Work that nobody waits for any more ends where it next waits itself.
+struct AbortOnDrop<T>(JoinHandle<T>);
+
+impl<T> Drop for AbortOnDrop<T> {
+    fn drop(&mut self) {
+        self.0.abort();
+    }
+}
+
+fn ended() -> Error {
+    Error::Execution { message: "the query service has ended".to_owned() }
+}
+
+// Runs a query on its lane's threads. It keeps its places until its operators are gone, whoever still waits for it.
+async fn drive(
+    plan: Arc<dyn ExecutionPlan>,
+    context: Arc<TaskContext>,
+    send: mpsc::Sender<Result<RecordBatch, DataFusionError>>,
+    ticket: Arc<Ticket>,
+    _places: (Option<OwnedSemaphorePermit>, Option<OwnedSemaphorePermit>),
+) {
+    let mut batches = match execute_stream(plan, context) {
+        Ok(batches) => batches,
+        Err(e) => return drop(send.send(Err(e)).await),
+    };
+    loop {
+        let batch = tokio::select! {
+            biased;
+            _ = ticket.stopped() => return,
+            batch = batches.next() => batch,
+        };
+        let Some(batch) = batch else { return };
+        let is_last = batch.is_err();
+        // Nobody listens any more: the answer was dropped.
+        if send.send(batch).await.is_err() || is_last {
+            return;
+        }
     }
 }
 

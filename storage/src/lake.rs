@@ -6,6 +6,7 @@ use std::sync::Arc;
 use arrow::record_batch::RecordBatch;
 use echolake_schema::tables::{Source, Table};
 use echolake_schema::{Grid, Rig, RunId, SurfaceId};
+use futures::future::join_all;
 use object_store::path::Path;
 use object_store::{ObjectStore, ObjectStoreExt as _, PutMode};
 
@@ -216,25 +217,32 @@ impl Lake {
         self.log().has(table, &name.compose()).await
     }
 
-    /// Commits staged files, each of their tables once and `runs` last: from that commit on readers see them.
+    /// Commits staged files, each of their tables once, all of them side by side but `runs`, which is last: from that commit on readers see them.
     /// Returns what became of each file, in the given order. The same files again add nothing.
     ///
     /// # Errors
     /// What the store says. Tables that were committed before stay so, seen by nobody; the same call goes on.
     pub async fn commit(&self, staged: &[Staged]) -> Result<Vec<Committed>> {
         let mut outcomes = vec![Committed::Before; staged.len()];
-        let mut tables = Table::ALL;
-        tables.sort_by_key(|table| *table == Table::Runs);
-        for table in tables {
-            let of: Vec<_> = (0..staged.len()).filter(|i| staged[*i].table == table).collect();
-            if of.is_empty() {
-                continue;
+        let (pointers, others): (Vec<_>, Vec<_>) = Table::ALL.into_iter().partition(|table| *table == Table::Runs);
+        for tables in [others, pointers] {
+            // Each is brought to its end, whatever becomes of the others.
+            for done in join_all(tables.into_iter().map(|table| self.commit_table(table, staged))).await {
+                done?.into_iter().for_each(|(i, outcome)| outcomes[i] = outcome);
             }
-            let add = of.iter().map(|i| staged[*i].file.clone()).collect();
-            let done = self.log().commit(table, &Commit { add, ..Commit::default() }).await?;
-            of.into_iter().zip(done).for_each(|(i, outcome)| outcomes[i] = outcome);
         }
         Ok(outcomes)
+    }
+
+    // What became of the files of one table, each with its place among all.
+    async fn commit_table(&self, table: Table, staged: &[Staged]) -> Result<Vec<(usize, Committed)>> {
+        let of: Vec<_> = (0..staged.len()).filter(|i| staged[*i].table == table).collect();
+        if of.is_empty() {
+            return Ok(Vec::new());
+        }
+        let add = of.iter().map(|i| staged[*i].file.clone()).collect();
+        let done = self.log().commit(table, &Commit { add, ..Commit::default() }).await?;
+        Ok(of.into_iter().zip(done).collect())
     }
 
     /// Puts rows into a table, once: the same name again adds nothing.

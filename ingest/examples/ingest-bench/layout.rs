@@ -44,12 +44,12 @@ fn layouts(args: &Args, file: &Bytes, rows: &Rows, report: &mut Report) -> Resul
     let layout = |name, numbers, compression| Layout { name, numbers, compression };
     let metadata = ParquetMetaDataReader::new().parse_and_finish(file)?;
     let candidates = [
-        layout("as stored: byte stream split, zstd 3", Numbers::AsStored, zstd(LEVEL)),
-        layout("byte stream split, zstd 1", Numbers::AsStored, zstd(1)),
+        layout("as stored: byte stream split, zstd 1", Numbers::AsStored, zstd(LEVEL)),
+        layout("byte stream split, zstd 3", Numbers::AsStored, zstd(3)),
         layout("byte stream split, snappy", Numbers::AsStored, Compression::SNAPPY),
         layout("byte stream split, uncompressed", Numbers::AsStored, Compression::UNCOMPRESSED),
-        layout("plain, zstd 3", Numbers::Plain, zstd(LEVEL)),
-        layout("dictionary, zstd 3", Numbers::Dictionary, zstd(LEVEL)),
+        layout("plain, zstd 1", Numbers::Plain, zstd(LEVEL)),
+        layout("dictionary, zstd 1", Numbers::Dictionary, zstd(LEVEL)),
     ];
     report.line(&format!("{:<40} {:>10} {:>12} {:>12}", "layout", "of raw", "write MB/s", "read MB/s"))?;
     for Layout { name, numbers, compression } in candidates {

@@ -16,7 +16,7 @@ use parquet::file::metadata::ParquetMetaData;
 use parquet::file::properties::{EnabledStatistics, WriterProperties, WriterPropertiesBuilder};
 
 /// The lake's level of zstd and its page size, which its files do not tell.
-pub(crate) const LEVEL: i32 = 3;
+pub(crate) const LEVEL: i32 = 1;
 pub(crate) const PAGE_BYTES: usize = 128 * 1024;
 /// Rows in a batch, about as many as ingest encodes at a time.
 const BATCH_ROWS: usize = 512;

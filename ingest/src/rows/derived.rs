@@ -7,7 +7,7 @@ use echolake_schema::{Grid, PairId, Rig, Symmetry};
 
 use super::{Columns, Keys};
 use crate::CODE_VERSION;
-use crate::derive::DerivedRows;
+use crate::derive::{DerivedLists, DerivedRows};
 use crate::error::Result;
 
 /// Which references the rows used.
@@ -27,18 +27,12 @@ impl Moved {
     }
 }
 
-/// Rows of `nce`; takes the responses and curves out of `derived`.
-pub(crate) fn nce(
-    rig: &Rig,
-    grid: &Grid,
-    keys: &Keys,
-    derived: &mut DerivedRows,
-    of: Versions<'_>,
-) -> Result<RecordBatch> {
+/// Rows of `nce`.
+pub(crate) fn nce(rig: &Rig, grid: &Grid, keys: &Keys, derived: DerivedLists, of: Versions<'_>) -> Result<RecordBatch> {
     let mut columns = Columns::of_run(Table::Nce, derived.pairs.len(), keys);
     pair_columns(&mut columns, grid, &derived.pairs);
-    columns.lists(std::mem::take(&mut derived.reflected));
-    for curves in std::mem::take(&mut derived.curves) {
+    columns.lists(derived.reflected);
+    for curves in derived.curves {
         columns.lists(curves);
     }
     columns.same(of.flat).same(of.foam).same(CODE_VERSION);

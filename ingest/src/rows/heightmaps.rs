@@ -1,12 +1,13 @@
 //! Rows of table `heightmaps`: the relief at 128 x 128, under each symmetry.
 
 use arrow::record_batch::RecordBatch;
+use echolake_dsp::heights::moved;
 use echolake_schema::tables::Table;
 use echolake_schema::{Rig, Symmetry};
 
 use super::{Columns, Keys};
 use crate::CODE_VERSION;
-use crate::error::Result;
+use crate::error::{Error, Result};
 
 const CELLS: usize = Table::HEIGHTMAP_CELLS;
 
@@ -17,8 +18,11 @@ pub(crate) fn rows(rig: &Rig, keys: &Keys, heights_mm: &[f32]) -> Result<Option<
         return Ok(None);
     }
     let small = area_mean(heights_mm, side);
-    let all: Vec<f32> = Symmetry::ALL.into_iter().flat_map(|s| moved(&small, s)).collect();
     let rows = Symmetry::ALL.len();
+    let mut all = vec![0.0; rows * small.len()];
+    for (symmetry, out) in Symmetry::ALL.into_iter().zip(all.chunks_exact_mut(small.len())) {
+        moved(&small, symmetry, out).map_err(|cause| Error::Kernel { file: keys.run.to_string(), cause })?;
+    }
     let mut columns = Columns::of_run(Table::Heightmaps, rows, keys);
     columns
         .texts(Symmetry::ALL.map(|s| Some(s.name())))
@@ -63,22 +67,6 @@ fn shrink(line: &[f32], weights: &[(usize, Vec<f64>)]) -> Vec<f32> {
     weights.iter().map(mean).collect()
 }
 
-// The height at p stands at M p afterwards; M is orthogonal, so its transpose leads back.
-fn moved(heights: &[f32], symmetry: Symmetry) -> Vec<f32> {
-    let [[a, b], [c, d]] = symmetry.matrix();
-    let last = CELLS as i32 - 1;
-    let at = |x: i32, y: i32| heights[(y as usize) * CELLS + x as usize];
-    let mut out = Vec::with_capacity(CELLS * CELLS);
-    for y in 0..CELLS as i32 {
-        for x in 0..CELLS as i32 {
-            // Doubled coordinates about the centre stay whole numbers.
-            let (u, v) = (2 * x - last, 2 * y - last);
-            out.push(at((a * u + c * v + last) / 2, (b * u + d * v + last) / 2));
-        }
-    }
-    out
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -91,20 +79,6 @@ mod tests {
             let mean = |h: &[f32]| h.iter().map(|x| f64::from(*x)).sum::<f64>() / h.len() as f64;
             assert!((mean(&small) - mean(&slope)).abs() < 1e-5, "{side}");
             assert!(small[..CELLS].windows(2).all(|w| w[1] >= w[0]), "{side}");
-        }
-    }
-
-    #[test]
-    fn symmetries_move_cells_as_they_move_points() {
-        let heights: Vec<f32> = (0..CELLS * CELLS).map(|i| i as f32).collect();
-        let centre = (CELLS as f64 - 1.0) / 2.0;
-        for symmetry in Symmetry::ALL {
-            let after = moved(&heights, symmetry);
-            for (x, y) in [(0, 0), (5, 0), (127, 3), (64, 100)] {
-                let [u, v, _] = symmetry.apply([x as f64 - centre, y as f64 - centre, 0.0]);
-                let (to_x, to_y) = ((u + centre).round() as usize, (v + centre).round() as usize);
-                assert_eq!(after[to_y * CELLS + to_x], heights[y * CELLS + x], "{}", symmetry.name());
-            }
         }
     }
 }

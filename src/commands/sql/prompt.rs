@@ -1,66 +1,52 @@
-//! The prompt: lines become queries at `;`, with history, completion, `\d` and timing.
+//! The prompt: lines become queries at `;`, with history, completion, commands, timing and a pager.
 
+mod command;
+mod pager;
+mod words;
+
+use std::io::Write as _;
 use std::path::PathBuf;
 use std::time::Instant;
 
+use anyhow::Context as _;
 use echolake_lake::Lake;
 use echolake_query::Session;
 use echolake_query::output::Format;
 use echolake_schema::tables::{COMMENT, UNIT};
-use rustyline::completion::{Completer, Pair};
+use rustyline::config::Configurer as _;
 use rustyline::error::ReadlineError;
 use rustyline::history::DefaultHistory;
-use rustyline::{Context, Editor, Helper, Highlighter, Hinter, Validator};
+use rustyline::{CompletionType, Editor};
 
-const HELP: &str = "\
-a query ends with ;
-\\d          the tables          \\d TABLE   its columns, with units
-\\timing     how long it took    \\q         leave
-Tab completes, Ctrl-C stops a query or clears the line, Ctrl-D leaves";
+use command::{Command, HELP};
+use words::Words;
 
-/// Words that are completed besides the names of tables and columns.
-const KEYWORDS: [&str; 20] = [
-    "select", "from", "where", "group by", "order by", "limit", "join", "on", "and", "or", "not", "as", "count", "avg",
-    "min", "max", "sum", "distinct", "explain", "desc",
-];
+/// Lines of history that are kept.
+const HISTORY: usize = 10_000;
 
-/// Completes table names, columns and keywords.
-#[derive(Helper, Highlighter, Hinter, Validator)]
-struct Words(Vec<String>);
-
-impl Completer for Words {
-    type Candidate = Pair;
-
-    fn complete(&self, line: &str, pos: usize, _: &Context<'_>) -> rustyline::Result<(usize, Vec<Pair>)> {
-        let is_word = |c: char| c.is_alphanumeric() || c == '_';
-        let start =
-            line[..pos].rfind(|c| !is_word(c)).map_or(0, |i| i + line[i..].chars().next().map_or(1, char::len_utf8));
-        let begun = &line[start..pos];
-        let fits = self.0.iter().filter(|w| !begun.is_empty() && w.starts_with(begun));
-        Ok((start, fits.map(|w| Pair { display: w.clone(), replacement: w.clone() }).collect()))
-    }
-}
-
-/// What a line asks for.
-enum Line {
-    Quit,
-    Help,
-    Timing,
-    Tables,
-    Columns(String),
-    Sql,
+/// How answers are given.
+struct Settings {
+    format: Format,
+    /// Where to, instead of the terminal; the next answer alone.
+    output: Option<PathBuf>,
+    timing: bool,
+    pager: bool,
 }
 
 pub(super) async fn run(session: &Session, lake: &Lake) -> anyhow::Result<()> {
     let mut editor: Editor<Words, DefaultHistory> = Editor::new()?;
-    editor.set_helper(Some(Words(words(session))));
+    editor.set_helper(Some(Words::of(session)));
+    editor.set_completion_type(CompletionType::List);
+    editor.set_max_history_size(HISTORY)?;
+    editor.set_history_ignore_dups(true)?;
     let history = history_file();
     if let Some(file) = &history {
         // A first session has none.
         let _ = editor.load_history(file);
     }
     eprintln!("lake {}; \\? for help", lake.location());
-    let (mut begun, mut timing) = (String::new(), false);
+    let mut settings = Settings { format: Format::Table, output: None, timing: false, pager: true };
+    let mut begun = String::new();
     loop {
         let line = match editor.readline(if begun.is_empty() { "echolake> " } else { "      ..> " }) {
             Ok(line) => line,
@@ -71,63 +57,92 @@ pub(super) async fn run(session: &Session, lake: &Lake) -> anyhow::Result<()> {
             Err(ReadlineError::Eof) => break,
             Err(e) => return Err(e.into()),
         };
-        match if begun.is_empty() { parse(&line) } else { Line::Sql } {
-            Line::Quit => break,
-            Line::Help => eprintln!("{HELP}"),
-            Line::Timing => {
-                timing = !timing;
-                eprintln!("timing is {}", if timing { "on" } else { "off" });
+        if begun.is_empty()
+            && let Some(command) = command::parse(&line)
+        {
+            editor.add_history_entry(line.trim_end())?;
+            match command {
+                Ok(Command::Quit) => break,
+                Ok(command) => obey(command, session, &mut settings)?,
+                Err(message) => eprintln!("error: {message}"),
             }
-            Line::Tables => super::super::print(&tables(session))?,
-            Line::Columns(table) => super::super::print(&columns(session, &table))?,
-            Line::Sql => {
-                begun.push_str(&line);
-                begun.push('\n');
-                if !line.trim_end().ends_with(';') {
-                    continue;
-                }
-                let sql = std::mem::take(&mut begun);
-                editor.add_history_entry(sql.trim_end())?;
-                answer(session, sql.trim_end().trim_end_matches(';'), timing).await;
-            }
+            continue;
         }
-    }
-    if let Some(file) = &history
-        && let Err(e) = editor.save_history(file)
-    {
-        eprintln!("warning: the history is not kept: {e}");
+        begun.push_str(&line);
+        begun.push('\n');
+        if !line.trim_end().ends_with(';') {
+            continue;
+        }
+        let sql = std::mem::take(&mut begun);
+        editor.add_history_entry(sql.trim_end())?;
+        answer(session, sql.trim_end().trim_end_matches(';'), &mut settings).await;
+        // Kept at once: a closed terminal must not cost the history of a day.
+        if let Some(file) = &history
+            && let Err(e) = editor.append_history(file)
+        {
+            eprintln!("warning: the history is not kept: {e}");
+        }
     }
     Ok(())
 }
 
-fn parse(line: &str) -> Line {
-    let mut words = line.split_whitespace();
-    match (words.next(), words.next()) {
-        (Some("\\q" | "exit" | "quit"), None) => Line::Quit,
-        (Some("\\?"), _) => Line::Help,
-        (Some("\\timing"), _) => Line::Timing,
-        (Some("\\d"), None) => Line::Tables,
-        (Some("\\d"), Some(table)) => Line::Columns(table.trim_end_matches(';').to_owned()),
-        _ => Line::Sql,
+fn obey(command: Command, session: &Session, settings: &mut Settings) -> anyhow::Result<()> {
+    match command {
+        Command::Quit => {}
+        Command::Help => eprintln!("{HELP}"),
+        Command::Timing => {
+            settings.timing = !settings.timing;
+            eprintln!("timing is {}", on_or_off(settings.timing));
+        }
+        Command::Pager => {
+            settings.pager = !settings.pager;
+            eprintln!("the pager is {}", on_or_off(settings.pager));
+        }
+        Command::Format(format) => {
+            settings.format = format;
+            eprintln!("answers are {}", format.name());
+        }
+        Command::Output(path) => settings.output = path,
+        Command::Tables => pager::show(settings.pager, &tables(session))?,
+        Command::Columns(table) => pager::show(settings.pager, &columns(session, &table))?,
+        Command::Functions(part) => pager::show(settings.pager, &functions(session, part.as_deref()))?,
     }
+    Ok(())
+}
+
+fn on_or_off(is_on: bool) -> &'static str {
+    if is_on { "on" } else { "off" }
 }
 
 // An error or an interrupt ends the query, not the prompt.
-async fn answer(session: &Session, sql: &str, timing: bool) {
+async fn answer(session: &Session, sql: &str, settings: &mut Settings) {
     let begun = Instant::now();
-    let work = async {
-        let answer = session.query(sql).await?;
-        super::write(answer, Format::Table, std::io::stdout()).await
-    };
     let outcome = tokio::select! {
-        outcome = work => outcome,
+        outcome = give(session, sql, settings) => outcome,
         _ = tokio::signal::ctrl_c() => Err(anyhow::anyhow!("stopped")),
     };
+    settings.output = None;
     match outcome {
-        Ok(rows) if timing => eprintln!("{rows} rows, {:.3} s", begun.elapsed().as_secs_f64()),
+        Ok(rows) if settings.timing => eprintln!("{rows} rows, {:.3} s", begun.elapsed().as_secs_f64()),
         Ok(rows) => eprintln!("{rows} rows"),
         Err(e) => eprintln!("error: {e:#}"),
     }
+}
+
+async fn give(session: &Session, sql: &str, settings: &Settings) -> anyhow::Result<usize> {
+    let answer = session.query(sql).await?;
+    if let Some(path) = &settings.output {
+        return super::to_file(answer, settings.format, path).await;
+    }
+    anyhow::ensure!(
+        !settings.format.is_binary(),
+        "{} is not for a terminal; hint: \\o FILE before the query",
+        settings.format.name()
+    );
+    let mut page = pager::Page::open(settings.pager);
+    let rows = super::write(answer, settings.format, &mut page).await?;
+    page.flush().context("cannot write the answer")?;
+    Ok(rows)
 }
 
 fn tables(session: &Session) -> String {
@@ -153,15 +168,14 @@ fn columns(session: &Session, table: &str) -> String {
     schema.fields().iter().map(|f| line(f)).collect::<Vec<_>>().join("\n")
 }
 
-fn words(session: &Session) -> Vec<String> {
-    let mut words: Vec<String> = KEYWORDS.map(str::to_owned).into();
-    for (name, schema) in session.tables() {
-        words.push(name.to_owned());
-        words.extend(schema.fields().iter().map(|f| f.name().clone()));
+fn functions(session: &Session, part: Option<&str>) -> String {
+    let fits = |name: &str| part.is_none_or(|part| name.contains(part));
+    let found: Vec<_> = session.functions().into_iter().filter(|f| fits(&f.name)).collect();
+    match found.as_slice() {
+        [] => format!("no function with `{}` in its name; \\df lists all", part.unwrap_or_default()),
+        [one] => format!("{}\n{}", one.syntax, one.description),
+        many => many.iter().map(|f| format!("{:<24} {}", f.name, f.syntax)).collect::<Vec<_>>().join("\n"),
     }
-    words.sort();
-    words.dedup();
-    words
 }
 
 fn history_file() -> Option<PathBuf> {

@@ -1,0 +1,188 @@
+//! How alike two signals are.
+
+use std::sync::Arc;
+
+use realfft::num_complex::Complex;
+use realfft::{ComplexToReal, RealFftPlanner, RealToComplex};
+
+use crate::energy::energy;
+use crate::error::check_len;
+use crate::{Error, Real};
+
+/// Pearson's coefficient of correlation, -1 to 1. None where one does not vary, where there are fewer than two values,
+/// or where one is not finite.
+///
+/// x, y  `[n]`
+///
+/// # Errors
+/// [`Error::Length`] where they are not equally long.
+pub fn pearson<T: Real>(x: &[T], y: &[T]) -> Result<Option<f64>, Error> {
+    check_len("the second signal", y.len(), x.len())?;
+    let count = x.len() as f64;
+    let mean = |x: &[T]| x.iter().map(|x| x.f64()).sum::<f64>() / count;
+    let (mean_x, mean_y) = (mean(x), mean(y));
+    let (mut xx, mut yy, mut xy) = (0.0, 0.0, 0.0);
+    for (x, y) in x.iter().zip(y) {
+        let (dx, dy) = (x.f64() - mean_x, y.f64() - mean_y);
+        xx += dx * dx;
+        yy += dy * dy;
+        xy += dx * dy;
+    }
+    // Of equal values, the mean's rounding alone is left, and its square.
+    let varies = |sum: f64, mean: f64| sum.is_finite() && sum > count * (f64::EPSILON * mean).powi(2);
+    if !(varies(xx, mean_x) && varies(yy, mean_y)) {
+        return Ok(None);
+    }
+    Ok(Some((xy / xx.sqrt() / yy.sqrt()).clamp(-1.0, 1.0)))
+}
+
+/// Greatest cross-correlation of signals of one length over all shifts.
+///
+/// Signals are padded so that nothing wraps around.
+pub struct CorrelationPlan<T: Real> {
+    len: usize,
+    forward: Arc<dyn RealToComplex<T>>,
+    inverse: Arc<dyn ComplexToReal<T>>,
+}
+
+/// Buffers of a [`CorrelationPlan`].
+pub struct CorrelationScratch<T> {
+    signal: Vec<T>,
+    spectra: [Vec<Complex<T>>; 2],
+    work: Vec<Complex<T>>,
+}
+
+impl<T: Real> CorrelationPlan<T> {
+    /// Plans for signals of `len` samples.
+    ///
+    /// # Errors
+    /// [`Error::Setting`] for none.
+    pub fn new(len: usize) -> Result<Self, Error> {
+        if len == 0 {
+            return Err(Error::Setting { what: "the signal's length", actual: "0".into(), expected: "1 or more" });
+        }
+        let (padded, mut planner) = (padded_len(2 * len - 1), RealFftPlanner::new());
+        Ok(Self { len, forward: planner.plan_fft_forward(padded), inverse: planner.plan_fft_inverse(padded) })
+    }
+
+    /// Buffers for [`Self::similarity`]; one a thread.
+    pub fn scratch(&self) -> CorrelationScratch<T> {
+        let work = self.forward.get_scratch_len().max(self.inverse.get_scratch_len());
+        CorrelationScratch {
+            signal: self.forward.make_input_vec(),
+            spectra: [self.forward.make_output_vec(), self.forward.make_output_vec()],
+            work: vec![Complex::default(); work],
+        }
+    }
+
+    /// max over m of sum_n x\[n\] y\[n + m\], over the root of both energies: 1 where one is the other, later or
+    /// louder; at least 0 but for signals of a single sample. None where one has no energy.
+    ///
+    /// # Errors
+    /// [`Error::Length`] or [`Error::NotFinite`].
+    pub fn similarity(&self, x: &[T], y: &[T], scratch: &mut CorrelationScratch<T>) -> Result<Option<f64>, Error> {
+        let scales = [self.scale("the first signal", x)?, self.scale("the second signal", y)?];
+        let [Some(x_scale), Some(y_scale)] = scales else { return Ok(None) };
+        let CorrelationScratch { signal, spectra, work } = scratch;
+        for ((values, scale), spectrum) in [(x, x_scale), (y, y_scale)].into_iter().zip(spectra.iter_mut()) {
+            signal[self.len..].fill(T::default());
+            signal.iter_mut().zip(values).for_each(|(to, from)| *to = T::of(from.f64() * scale));
+            let done = self.forward.process_with_scratch(signal, spectrum, work);
+            done.map_err(|_| Error::NotFinite { what: "a signal" })?;
+        }
+        let [first, second] = spectra;
+        first.iter_mut().zip(&*second).for_each(|(x, y)| *x = x.conj() * *y);
+        // Both ends are real already; only their rounding could be complained of.
+        for edge in [0, first.len() - 1] {
+            first[edge].im = T::default();
+        }
+        let done = self.inverse.process_with_scratch(first, signal, work);
+        done.map_err(|_| Error::NotFinite { what: "a signal" })?;
+        let greatest = signal.iter().fold(f64::NEG_INFINITY, |most, x| most.max(x.f64()));
+        Ok(Some((greatest / signal.len() as f64).clamp(-1.0, 1.0)))
+    }
+
+    // What brings a signal to an energy of 1; None where it has none.
+    fn scale(&self, what: &'static str, signal: &[T]) -> Result<Option<f64>, Error> {
+        check_len(what, signal.len(), self.len)?;
+        let energy = energy(signal);
+        if !energy.is_finite() {
+            return Err(Error::NotFinite { what });
+        }
+        Ok((energy > 0.0).then(|| energy.sqrt().recip()).filter(|scale| scale.is_finite()))
+    }
+}
+
+/// The shortest length from `least` on that is a power of two, or three quarters of one: fast to transform, and even
+/// but for 1, so that the last bin is real.
+fn padded_len(least: usize) -> usize {
+    let power = least.next_power_of_two();
+    if power >= 8 && power / 4 * 3 >= least { power / 4 * 3 } else { power }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn linear_data_correlate_fully() {
+        let x: Vec<f64> = (0..50).map(f64::from).collect();
+        let y: Vec<f64> = x.iter().map(|x| 1e6 + 3.0 * x).collect();
+        let falling: Vec<f64> = x.iter().map(|x| -0.5 * x).collect();
+        assert!((pearson(&x, &y).expect("equally long").expect("one") - 1.0).abs() < 1e-12);
+        assert!((pearson(&x, &falling).expect("equally long").expect("one") + 1.0).abs() < 1e-12);
+        // By hand: deviations -1.5 -0.5 0.5 1.5 and -1 1 -1 1 give 2 / sqrt(5 x 4).
+        let r = pearson(&[1.0, 2.0, 3.0, 4.0], &[0.0f32, 2.0, 0.0, 2.0]).expect("equally long");
+        assert!((r.expect("one") - 2.0 / 20f64.sqrt()).abs() < 1e-12);
+    }
+
+    #[test]
+    fn what_does_not_vary_has_no_correlation() {
+        for (x, y) in [(&[][..], &[][..]), (&[1.0], &[2.0]), (&[0.1, 0.1, 0.1], &[1.0, 2.0, 3.0])] {
+            assert_eq!(pearson(x, y), Ok(None), "{x:?}");
+        }
+        assert_eq!(pearson(&[1.0, f64::NAN], &[1.0, 2.0]), Ok(None));
+        assert!(matches!(pearson(&[1.0], &[1.0, 2.0]), Err(Error::Length { .. })));
+    }
+
+    #[test]
+    fn a_later_and_louder_copy_is_the_same() {
+        for len in [1usize, 2, 7, 64, 384] {
+            let plan = CorrelationPlan::<f32>::new(len).expect("a plan");
+            let x: Vec<f32> = (0..len).map(|n| if n < len.div_ceil(2) { 1.0 + n as f32 } else { 0.0 }).collect();
+            let shift = len / 2;
+            let y: Vec<f32> = (0..len).map(|n| n.checked_sub(shift).map_or(0.0, |n| 7.0 * x[n])).collect();
+            let mut scratch = plan.scratch();
+            for (a, b) in [(&x, &y), (&y, &x), (&x, &x)] {
+                let alike = plan.similarity(a, b, &mut scratch).expect("finite").expect("some");
+                assert!((alike - 1.0).abs() < 1e-5, "{len}: {alike}");
+            }
+            assert_eq!(plan.similarity(&x, &vec![0.0; len], &mut scratch), Ok(None));
+            assert!(plan.similarity(&x, &vec![f32::NAN; len], &mut scratch).is_err());
+        }
+    }
+
+    // Against the sum itself, at every shift.
+    #[test]
+    fn the_greatest_is_that_of_the_plain_sum() {
+        let len = 31;
+        let signal = |factor: u32| -> Vec<f64> { (0..len).map(|n| f64::from((n * factor + 11) % 37) - 18.0).collect() };
+        let (x, y) = (signal(17), signal(29));
+        let at = |shift: i32| -> f64 {
+            let pairs =
+                x.iter().enumerate().filter_map(|(n, x)| Some(x * y.get(usize::try_from(n as i32 + shift).ok()?)?));
+            pairs.sum::<f64>()
+        };
+        let greatest = (-30..=30).map(at).fold(f64::NEG_INFINITY, f64::max);
+        let plan = CorrelationPlan::<f64>::new(x.len()).expect("a plan");
+        let alike = plan.similarity(&x, &y, &mut plan.scratch()).expect("finite").expect("some");
+        assert!((alike - greatest / (energy(&x) * energy(&y)).sqrt()).abs() < 1e-12);
+    }
+
+    #[test]
+    fn padded_lengths_are_short_and_fast() {
+        for (least, expected) in [(1, 1), (2, 2), (3, 4), (5, 6), (767, 768), (769, 1024)] {
+            assert_eq!(padded_len(least), expected, "{least}");
+        }
+    }
+}

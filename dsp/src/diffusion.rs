@@ -1,0 +1,124 @@
+//! How evenly a surface spreads sound over receivers.
+
+/// Sums that the directional diffusion coefficient needs, kept relative to the loudest so that no level overflows.
+///
+/// d = ((sum e)^2 - sum e^2) / ((n - 1) sum e^2), e = 10^(L/10), over n receivers: 1 where all levels are equal, 0 where
+/// all energy is at one. The autocorrelation coefficient of ISO 17497-2:2012, all receivers of equal weight. That
+/// standard asks for receivers in the far field; on the grid of a rig they are in the near field, and the number
+/// compares surfaces measured alike, no more.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Diffusion {
+    receivers: u64,
+    loudest_db: f64,
+    /// Sum of the energies over that of the loudest.
+    energy: f64,
+    /// Sum of their squares.
+    square: f64,
+}
+
+impl Default for Diffusion {
+    fn default() -> Self {
+        Self { receivers: 0, loudest_db: f64::NEG_INFINITY, energy: 0.0, square: 0.0 }
+    }
+}
+
+impl Diffusion {
+    /// Adds a receiver by its level, dB. Minus infinity is a receiver without sound; NaN makes the coefficient NaN.
+    pub fn add(&mut self, level_db: f64) {
+        let (energy, square) = if level_db == f64::NEG_INFINITY { (0.0, 0.0) } else { (1.0, 1.0) };
+        self.merge(&Self { receivers: 1, loudest_db: level_db, energy, square });
+    }
+
+    /// Adds the receivers of another.
+    pub fn merge(&mut self, other: &Self) {
+        self.receivers += other.receivers;
+        if other.energy == 0.0 {
+            return;
+        }
+        if self.energy == 0.0 {
+            (self.loudest_db, self.energy, self.square) = (other.loudest_db, other.energy, other.square);
+            return;
+        }
+        let loudest = self.loudest_db.max(other.loudest_db);
+        let (ours, theirs) = (ratio(self.loudest_db, loudest), ratio(other.loudest_db, loudest));
+        self.loudest_db = loudest;
+        self.energy = self.energy * ours + other.energy * theirs;
+        self.square = self.square * ours * ours + other.square * theirs * theirs;
+    }
+
+    /// The coefficient; None of fewer than two receivers, or of no sound.
+    pub fn coefficient(&self) -> Option<f64> {
+        if self.receivers < 2 || self.square == 0.0 {
+            return None;
+        }
+        let others = (self.receivers - 1) as f64;
+        Some((self.energy * self.energy - self.square) / (others * self.square))
+    }
+
+    /// The sums as numbers: receivers, loudest level, energy and square relative to it.
+    pub fn parts(&self) -> (u64, f64, f64, f64) {
+        (self.receivers, self.loudest_db, self.energy, self.square)
+    }
+
+    /// From [`Self::parts`].
+    pub fn from_parts((receivers, loudest_db, energy, square): (u64, f64, f64, f64)) -> Self {
+        Self { receivers, loudest_db, energy, square }
+    }
+}
+
+/// Energy of a level over that of the loudest. Two infinite ones are NaN, as is one that is NaN.
+fn ratio(level_db: f64, loudest_db: f64) -> f64 {
+    if level_db == loudest_db && level_db.is_finite() { 1.0 } else { 10f64.powf((level_db - loudest_db) / 10.0) }
+}
+
+/// The coefficient of one list of levels, dB; None of fewer than two, or of no sound.
+pub fn diffusion<T: crate::Real>(levels_db: &[T]) -> Option<f64> {
+    let mut sums = Diffusion::default();
+    levels_db.iter().for_each(|level| sums.add(level.f64()));
+    sums.coefficient()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn equal_levels_are_diffuse_and_one_direction_is_not() {
+        for level in [-300.0, 0.0, 94.0, 4_000.0] {
+            assert!((diffusion(&[level; 37]).expect("one") - 1.0).abs() < 1e-12, "{level}");
+        }
+        let mut one = [f64::NEG_INFINITY; 37];
+        one[20] = 80.0;
+        assert_eq!(diffusion(&one), Some(0.0));
+        one.fill(-40.0);
+        one[3] = 80.0;
+        assert!(diffusion(&one).expect("one") < 1e-10);
+        // Half of the receivers alike, the others silent: (n/2 - 1) / (n - 1).
+        let half: Vec<f32> = (0..10).map(|i| if i < 5 { 3.0 } else { f32::NEG_INFINITY }).collect();
+        assert!((diffusion(&half).expect("one") - 4.0 / 9.0).abs() < 1e-12);
+    }
+
+    #[test]
+    fn the_formula_itself() {
+        let levels = [3.0f64, -1.5, 7.25, 0.0, 2.0];
+        let e: Vec<f64> = levels.iter().map(|l| 10f64.powf(l / 10.0)).collect();
+        let (sum, square) = (e.iter().sum::<f64>(), e.iter().map(|e| e * e).sum::<f64>());
+        let expected = (sum * sum - square) / (4.0 * square);
+        assert!((diffusion(&levels).expect("one") - expected).abs() < 1e-12);
+        let (mut first, mut second) = (Diffusion::default(), Diffusion::default());
+        levels[..2].iter().for_each(|l| first.add(*l));
+        levels[2..].iter().for_each(|l| second.add(*l));
+        first.merge(&Diffusion::from_parts(second.parts()));
+        first.merge(&Diffusion::default());
+        assert!((first.coefficient().expect("one") - expected).abs() < 1e-12);
+    }
+
+    #[test]
+    fn too_few_or_no_sound_have_none() {
+        assert_eq!(diffusion::<f64>(&[]), None);
+        assert_eq!(diffusion(&[3.0]), None);
+        assert_eq!(diffusion(&[f64::NEG_INFINITY; 4]), None);
+        assert!(diffusion(&[1.0, f64::NAN]).expect("not a number").is_nan());
+        assert!(diffusion(&[f64::INFINITY, f64::INFINITY]).expect("not a number").is_nan());
+    }
+}

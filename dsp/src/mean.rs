@@ -1,0 +1,100 @@
+//! Signals multiplied and averaged, sample by sample.
+
+use crate::error::check_len;
+use crate::{Error, Real};
+
+/// Sum of equally long signals, in f64, for their mean.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Mean {
+    sums: Vec<f64>,
+    count: u64,
+}
+
+impl Mean {
+    /// Adds a signal; the first decides the length.
+    ///
+    /// # Errors
+    /// [`Error::Length`] where it is not as long as those before.
+    pub fn add<T: Real>(&mut self, signal: &[T]) -> Result<(), Error> {
+        self.fit(signal.len())?;
+        self.sums.iter_mut().zip(signal).for_each(|(sum, x)| *sum += x.f64());
+        self.count += 1;
+        Ok(())
+    }
+
+    /// Adds the sums of `count` other signals.
+    ///
+    /// # Errors
+    /// As [`Self::add`].
+    pub fn merge(&mut self, sums: &[f64], count: u64) -> Result<(), Error> {
+        if count == 0 {
+            return Ok(());
+        }
+        self.fit(sums.len())?;
+        self.sums.iter_mut().zip(sums).for_each(|(sum, x)| *sum += x);
+        self.count += count;
+        Ok(())
+    }
+
+    /// The sums.
+    pub fn sums(&self) -> &[f64] {
+        &self.sums
+    }
+
+    /// How many signals there were.
+    pub fn count(&self) -> u64 {
+        self.count
+    }
+
+    /// The mean, sample by sample.
+    pub fn values(&self) -> impl Iterator<Item = f64> {
+        self.sums.iter().map(|sum| sum / self.count as f64)
+    }
+
+    fn fit(&mut self, len: usize) -> Result<(), Error> {
+        if self.count == 0 {
+            self.sums.resize(len, 0.0);
+        }
+        check_len("a list", len, self.sums.len())
+    }
+}
+
+/// The product, sample by sample.
+///
+/// x, y, out  `[n]`
+///
+/// # Errors
+/// [`Error::Length`] where they are not equally long.
+pub fn multiply<T: Real>(x: &[T], y: &[T], out: &mut [T]) -> Result<(), Error> {
+    check_len("the second list", y.len(), x.len())?;
+    check_len("the product", out.len(), x.len())?;
+    out.iter_mut().zip(x.iter().zip(y)).for_each(|(out, (x, y))| *out = *x * *y);
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn means_are_of_each_sample() {
+        let (mut first, mut second) = (Mean::default(), Mean::default());
+        first.add(&[1.0f32, 2.0]).expect("equally long");
+        second.add(&[3.0, 6.0]).expect("equally long");
+        second.add(&[5.0, 1.0]).expect("equally long");
+        first.merge(second.sums(), second.count()).expect("equally long");
+        first.merge(&[], 0).expect("nothing");
+        assert_eq!((first.values().collect::<Vec<_>>(), first.count()), (vec![3.0, 3.0], 3));
+        assert!(matches!(first.add(&[1.0]), Err(Error::Length { actual: 1, expected: 2, .. })));
+        assert!(matches!(first.merge(&[1.0], 1), Err(Error::Length { .. })));
+        assert_eq!(Mean::default().values().count(), 0);
+    }
+
+    #[test]
+    fn products_are_of_each_sample() {
+        let mut out = [f64::NAN; 2];
+        multiply(&[2.0, 3.0], &[-1.0, 0.5], &mut out).expect("equally long");
+        assert_eq!(out, [-2.0, 1.5]);
+        assert!(multiply(&[2.0, 3.0], &[1.0], &mut out).is_err());
+    }
+}

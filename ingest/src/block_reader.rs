@@ -1,0 +1,79 @@
+//! Fetches a run's file block by block: from a disk into the same memory again and again, which the cache then holds
+//! while the block is hashed and decompressed.
+
+use std::fs::File;
+use std::io::{self, Read as _, Seek as _, SeekFrom};
+use std::ops::Range;
+use std::sync::Arc;
+
+use bytes::Bytes;
+use object_store::path::Path;
+use object_store::{Error as StoreError, GetOptions, GetResultPayload, ObjectStore, ObjectStoreExt as _};
+
+/// How much is fetched of a store at a time: a few chunks, as a request takes long.
+const FROM_STORE: u64 = 4 << 20;
+/// How much is read of a disk at a time where nothing more is needed. A chunk is read at once when its length is known,
+/// so what is read ahead of it is read twice.
+const FROM_DISK: u64 = 16 << 10;
+
+/// One file, in a store or on this machine's disk.
+pub(crate) struct BlockReader {
+    store: Arc<dyn ObjectStore>,
+    path: Path,
+    /// Where the store has it on a disk of this machine.
+    file: Option<File>,
+    /// The last block, for the next one to take its place.
+    last: Bytes,
+}
+
+impl BlockReader {
+    /// Opens a file; what is wrong with it shows when it is read.
+    pub(crate) async fn open(store: Arc<dyn ObjectStore>, path: Path) -> Self {
+        // A range, as other stores than a disk begin to send what is asked for.
+        let first = GetOptions { range: Some((0..1).into()), ..GetOptions::default() };
+        let file = match store.get_opts(&path, first).await.map(|found| found.payload) {
+            Ok(GetResultPayload::File(file, _)) => Some(file),
+            _ => None,
+        };
+        Self { store, path, file, last: Bytes::new() }
+    }
+
+    /// Bytes that are fetched at least, where the file has them.
+    pub(crate) fn ahead(&self) -> u64 {
+        if self.file.is_some() { FROM_DISK } else { FROM_STORE }
+    }
+
+    /// Some of the file's bytes. Their memory serves the next block, where nothing holds this one any more.
+    pub(crate) async fn block(&mut self, range: Range<u64>) -> Result<Bytes, StoreError> {
+        let Some(file) = &mut self.file else { return self.store.get_range(&self.path, range).await };
+        let count = (range.end - range.start) as usize;
+        let mut room = std::mem::take(&mut self.last).try_into_mut().unwrap_or_default();
+        if room.len() < count {
+            room.resize(count, 0);
+        }
+        let read = read_at(file, range.start, &mut room[..count])
+            .map_err(|e| StoreError::Generic { store: "file", source: Box::new(e) })?;
+        self.last = room.freeze();
+        Ok(self.last.slice(..read))
+    }
+
+    /// Some of the file's bytes, elsewhere than where the walk is.
+    pub(crate) async fn range(&self, range: Range<u64>) -> Result<Bytes, StoreError> {
+        self.store.get_range(&self.path, range).await
+    }
+}
+
+// How many bytes there are, up to those asked for: fewer where the file has become shorter.
+fn read_at(file: &mut File, from: u64, room: &mut [u8]) -> io::Result<usize> {
+    file.seek(SeekFrom::Start(from))?;
+    let mut done = 0;
+    while done < room.len() {
+        match file.read(&mut room[done..]) {
+            Ok(0) => break,
+            Ok(read) => done += read,
+            Err(e) if e.kind() == io::ErrorKind::Interrupted => {}
+            Err(e) => return Err(e),
+        }
+    }
+    Ok(done)
+}

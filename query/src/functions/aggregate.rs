@@ -1,0 +1,278 @@
+//! One function of many rows as DataFusion takes it, over one group or many at once.
+
+use std::fmt::{self, Debug};
+use std::hash::{Hash, Hasher};
+
+use arrow::array::{ArrayRef, BooleanArray};
+use arrow::datatypes::{DataType, Field, FieldRef};
+use datafusion::common::ScalarValue;
+use datafusion::error::{DataFusionError, Result};
+use datafusion::logical_expr::function::{AccumulatorArgs, StateFieldsArgs};
+use datafusion::logical_expr::utils::format_state_name;
+use datafusion::logical_expr::{
+    Accumulator, AggregateUDF, AggregateUDFImpl, Documentation, EmitTo, GroupsAccumulator, Signature, Volatility,
+};
+
+use super::arguments::{Arguments, check, coerced};
+use super::description::Description;
+
+/// A function of the values of many rows. Null rows do not count.
+pub(super) trait Aggregate: Send + Sync + Clone + 'static {
+    /// What is kept of a group's rows.
+    type Group: Default + Debug + Send + Sync;
+
+    /// What it says of itself.
+    fn description(&self) -> &'static Description;
+
+    /// The type of its answer; the arguments' types are right.
+    fn returns(&self, arguments: &[DataType]) -> DataType;
+
+    /// Name and type of what is kept, as it is sent between the steps of a query.
+    fn state(&self) -> Vec<(&'static str, DataType)>;
+
+    /// Adds rows.
+    ///
+    /// # Errors
+    /// Where a value makes no sense, with its row.
+    fn update(&self, arguments: &Arguments<'_>, groups: &mut Groups<'_, Self>) -> Result<()>;
+
+    /// Adds rows of what was kept elsewhere.
+    ///
+    /// # Errors
+    /// Where it does not fit what is kept here.
+    fn merge(&self, states: &[ArrayRef], groups: &mut Groups<'_, Self>) -> Result<()>;
+
+    /// What is kept, a row a group.
+    ///
+    /// # Errors
+    /// Where it is more than an array takes.
+    fn keep(&self, groups: &[Self::Group]) -> Result<Vec<ArrayRef>>;
+
+    /// The answer, a row a group.
+    ///
+    /// # Errors
+    /// Where it is more than an array takes.
+    fn answer(&self, groups: &[Self::Group], returns: &DataType) -> Result<ArrayRef>;
+
+    /// Bytes that a group holds beside its own.
+    fn heap(_group: &Self::Group) -> usize {
+        0
+    }
+}
+
+/// The groups that a batch's rows belong to.
+pub(super) struct Groups<'a, A: Aggregate> {
+    all: &'a mut [A::Group],
+    heap: &'a mut usize,
+    /// None: all to the first.
+    of: Option<&'a [usize]>,
+    filter: Option<&'a BooleanArray>,
+}
+
+impl<A: Aggregate> Groups<'_, A> {
+    /// Changes the group of a row, if the row counts.
+    pub(super) fn at(&mut self, row: usize, change: impl FnOnce(&mut A::Group) -> Result<()>) -> Result<()> {
+        if self.filter.is_some_and(|filter| !filter.value(row) || arrow::array::Array::is_null(filter, row)) {
+            return Ok(());
+        }
+        let Some(group) = self.all.get_mut(self.of.map_or(0, |of| of[row])) else { return Ok(()) };
+        let before = A::heap(group);
+        let done = change(group);
+        *self.heap += A::heap(group).saturating_sub(before);
+        done
+    }
+}
+
+/// An [`Aggregate`] with what DataFusion asks of it.
+struct Adapter<A> {
+    function: A,
+    signature: Signature,
+    documentation: Documentation,
+}
+
+/// Groups in the making; a single one where there is no GROUP BY.
+struct Accumulated<A: Aggregate> {
+    function: A,
+    returns: DataType,
+    groups: Vec<A::Group>,
+    heap: usize,
+}
+
+/// Makes it known to DataFusion.
+pub(super) fn udaf(function: impl Aggregate) -> AggregateUDF {
+    let documentation = function.description().documentation();
+    AggregateUDF::new_from_impl(Adapter {
+        function,
+        signature: Signature::user_defined(Volatility::Immutable),
+        documentation,
+    })
+}
+
+impl<A: Aggregate> Adapter<A> {
+    fn accumulated(&self, args: &AccumulatorArgs<'_>) -> Result<Accumulated<A>> {
+        if args.is_distinct {
+            let name = self.function.description().name;
+            let hint = "take them from a subquery with SELECT DISTINCT";
+            return Err(DataFusionError::Plan(format!("`{name}` knows no DISTINCT; hint: {hint}")));
+        }
+        let returns = args.return_field.data_type().clone();
+        Ok(Accumulated { function: self.function.clone(), returns, groups: Vec::new(), heap: 0 })
+    }
+}
+
+impl<A: Aggregate> AggregateUDFImpl for Adapter<A> {
+    fn name(&self) -> &str {
+        self.function.description().name
+    }
+
+    fn signature(&self) -> &Signature {
+        &self.signature
+    }
+
+    fn coerce_types(&self, types: &[DataType]) -> Result<Vec<DataType>> {
+        Ok(coerced(self.function.description(), types))
+    }
+
+    fn return_type(&self, types: &[DataType]) -> Result<DataType> {
+        check(self.function.description(), types)?;
+        Ok(self.function.returns(types))
+    }
+
+    fn state_fields(&self, args: StateFieldsArgs) -> Result<Vec<FieldRef>> {
+        let field = |(name, kind)| Field::new(format_state_name(args.name, name), kind, true).into();
+        Ok(self.function.state().into_iter().map(field).collect())
+    }
+
+    fn accumulator(&self, args: AccumulatorArgs) -> Result<Box<dyn Accumulator>> {
+        let mut one = self.accumulated(&args)?;
+        one.groups.push(A::Group::default());
+        Ok(Box::new(one))
+    }
+
+    fn groups_accumulator_supported(&self, args: AccumulatorArgs) -> bool {
+        !args.is_distinct
+    }
+
+    fn create_groups_accumulator(&self, args: AccumulatorArgs) -> Result<Box<dyn GroupsAccumulator>> {
+        Ok(Box::new(self.accumulated(&args)?))
+    }
+
+    fn documentation(&self) -> Option<&Documentation> {
+        Some(&self.documentation)
+    }
+}
+
+impl<A: Aggregate> Accumulated<A> {
+    fn update(&mut self, values: &[ArrayRef], of: Option<&[usize]>, filter: Option<&BooleanArray>) -> Result<()> {
+        let Self { function, groups, heap, .. } = self;
+        let arguments = Arguments::columns(function.description(), values);
+        function.update(&arguments, &mut Groups { all: groups, heap, of, filter })
+    }
+
+    fn merge(&mut self, states: &[ArrayRef], of: Option<&[usize]>) -> Result<()> {
+        let Self { function, groups, heap, .. } = self;
+        function.merge(states, &mut Groups { all: groups, heap, of, filter: None })
+    }
+
+    fn take(&mut self, emit: EmitTo) -> Vec<A::Group> {
+        let taken = emit.take_needed(&mut self.groups);
+        self.heap -= taken.iter().map(A::heap).sum::<usize>().min(self.heap);
+        taken
+    }
+
+    fn bytes(&self) -> usize {
+        size_of::<Self>() + self.groups.capacity() * size_of::<A::Group>() + self.heap
+    }
+}
+
+impl<A: Aggregate> Accumulator for Accumulated<A> {
+    fn update_batch(&mut self, values: &[ArrayRef]) -> Result<()> {
+        self.update(values, None, None)
+    }
+
+    fn merge_batch(&mut self, states: &[ArrayRef]) -> Result<()> {
+        self.merge(states, None)
+    }
+
+    fn evaluate(&mut self) -> Result<ScalarValue> {
+        ScalarValue::try_from_array(&self.function.answer(&self.groups, &self.returns)?, 0)
+    }
+
+    fn state(&mut self) -> Result<Vec<ScalarValue>> {
+        let columns = self.function.keep(&self.groups)?;
+        columns.iter().map(|column| ScalarValue::try_from_array(column, 0)).collect()
+    }
+
+    fn size(&self) -> usize {
+        self.bytes()
+    }
+}
+
+impl<A: Aggregate> GroupsAccumulator for Accumulated<A> {
+    fn update_batch(
+        &mut self,
+        values: &[ArrayRef],
+        of: &[usize],
+        filter: Option<&BooleanArray>,
+        total: usize,
+    ) -> Result<()> {
+        self.groups.resize_with(total, A::Group::default);
+        self.update(values, Some(of), filter)
+    }
+
+    fn merge_batch(&mut self, states: &[ArrayRef], of: &[usize], total: usize) -> Result<()> {
+        self.groups.resize_with(total, A::Group::default);
+        self.merge(states, Some(of))
+    }
+
+    fn evaluate(&mut self, emit: EmitTo) -> Result<ArrayRef> {
+        let groups = self.take(emit);
+        self.function.answer(&groups, &self.returns)
+    }
+
+    fn state(&mut self, emit: EmitTo) -> Result<Vec<ArrayRef>> {
+        let groups = self.take(emit);
+        self.function.keep(&groups)
+    }
+
+    fn convert_to_state(&self, values: &[ArrayRef], filter: Option<&BooleanArray>) -> Result<Vec<ArrayRef>> {
+        let arguments = Arguments::columns(self.function.description(), values);
+        let of: Vec<usize> = (0..arguments.rows()).collect();
+        let mut groups = Vec::new();
+        groups.resize_with(of.len(), A::Group::default);
+        let rows = &mut Groups { all: &mut groups, heap: &mut 0, of: Some(&of), filter };
+        self.function.update(&arguments, rows)?;
+        self.function.keep(&groups)
+    }
+
+    fn size(&self) -> usize {
+        self.bytes()
+    }
+}
+
+impl<A: Aggregate> Debug for Accumulated<A> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{} of {} groups", self.function.description().name, self.groups.len())
+    }
+}
+
+impl<A: Aggregate> Debug for Adapter<A> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(self.name())
+    }
+}
+
+// As for functions of a row.
+impl<A: Aggregate> PartialEq for Adapter<A> {
+    fn eq(&self, other: &Self) -> bool {
+        self.name() == other.name()
+    }
+}
+
+impl<A: Aggregate> Eq for Adapter<A> {}
+
+impl<A: Aggregate> Hash for Adapter<A> {
+    fn hash<H: Hasher>(&self, state: &mut H) {
+        self.name().hash(state);
+    }
+}

@@ -1,0 +1,107 @@
+//! `pearson` and `similarity`: how alike two lists are.
+
+use arrow::array::ArrayRef;
+use arrow::datatypes::DataType;
+use datafusion::error::Result;
+use echolake_dsp::Error;
+use echolake_dsp::correlation::{CorrelationPlan, pearson};
+
+use super::answers::numbers;
+use super::arguments::{Arguments, Element};
+use super::description::{Description, Family, Kind, Parameter};
+use super::per_length::PerLength;
+use super::scalar::Scalar;
+
+/// `pearson`.
+pub(super) struct Pearson;
+
+/// `similarity`.
+pub(super) struct Similarity;
+
+static PEARSON: Description = Description {
+    name: "pearson",
+    family: Family::Comparison,
+    about: "Pearson's coefficient of correlation of two equally long lists, -1 to 1, without unit. Null where one of them \
+            does not vary, is shorter than two, or is not finite. Of two columns, corr() is the aggregate.",
+    parameters: &[
+        Parameter { name: "x", kind: Kind::Samples, about: "the first list" },
+        Parameter { name: "y", kind: Kind::Samples, about: "the second list, as long as the first" },
+    ],
+    optional: 0,
+    example: "select round(pearson([1, 2, 3], [5, 7, 9]), 6) as alike, pearson([1, 2, 3], [4, 4, 4]) as \
+              constant",
+    answer: "\
++-------+----------+
+| alike | constant |
++-------+----------+
+| 1.0   |          |
++-------+----------+",
+    related: &["similarity"],
+};
+
+static SIMILARITY: Description = Description {
+    name: "similarity",
+    family: Family::Comparison,
+    about: "Greatest normalised cross-correlation of two equally long responses over all shifts, up to 1, without unit: 1 \
+            where one is the other, later or louder, whatever its level; an inverted one is not alike. Null where one has \
+            no energy.",
+    parameters: &[
+        Parameter { name: "ir", kind: Kind::Samples, about: "the first response" },
+        Parameter { name: "other", kind: Kind::Samples, about: "the second response, as long as the first" },
+    ],
+    optional: 0,
+    example: "select round(similarity([1, -2, 0, 0], [0, 0, 3, -6]), 6) as alike",
+    answer: "\
++-------+
+| alike |
++-------+
+| 1.0   |
++-------+",
+    related: &["pearson", "arrival"],
+};
+
+impl Scalar for Pearson {
+    fn description(&self) -> &'static Description {
+        &PEARSON
+    }
+
+    fn returns(&self, _: &[DataType]) -> DataType {
+        DataType::Float64
+    }
+
+    fn call<T: Element>(&self, arguments: &Arguments<'_>) -> Result<ArrayRef> {
+        let (x, y) = (arguments.samples::<T>(0)?, arguments.samples::<T>(1)?);
+        numbers(arguments, |row| pearson(x.at(row)?, y.at(row)?).map_err(|e| arguments.refused(row, &e)))
+    }
+}
+
+impl Scalar for Similarity {
+    fn description(&self) -> &'static Description {
+        &SIMILARITY
+    }
+
+    fn returns(&self, _: &[DataType]) -> DataType {
+        DataType::Float64
+    }
+
+    fn call<T: Element>(&self, arguments: &Arguments<'_>) -> Result<ArrayRef> {
+        let (x, y) = (arguments.samples::<T>(0)?, arguments.samples::<T>(1)?);
+        let mut plans = PerLength::new(SIMILARITY.name);
+        numbers(arguments, |row| {
+            let (x, y) = (x.at(row)?, y.at(row)?);
+            if x.len() != y.len() {
+                let error = Error::Length { what: "the second response", actual: y.len(), expected: x.len() };
+                return Err(arguments.refused(row, &error));
+            }
+            if x.is_empty() {
+                return Ok(None);
+            }
+            let (plan, scratch) = plans.get(x.len(), |len| {
+                let plan = CorrelationPlan::<T>::new(len)?;
+                let scratch = plan.scratch();
+                Ok((plan, scratch))
+            })?;
+            plan.similarity(x, y, scratch).map_err(|e| arguments.refused(row, &e))
+        })
+    }
+}

@@ -1,0 +1,101 @@
+//! Answers as Arrow takes them, built row by row; null where an argument is.
+
+use std::sync::Arc;
+
+use arrow::array::builder::NullBufferBuilder;
+use arrow::array::{ArrayRef, Float64Array, ListArray, PrimitiveArray, StructArray};
+use arrow::buffer::{NullBuffer, OffsetBuffer, ScalarBuffer};
+use arrow::datatypes::{DataType, Field, Fields};
+use datafusion::error::{DataFusionError, Result};
+
+use super::arguments::{Arguments, Element};
+
+/// A number a row; None is null.
+pub(super) fn numbers(
+    arguments: &Arguments<'_>,
+    mut number: impl FnMut(usize) -> Result<Option<f64>>,
+) -> Result<ArrayRef> {
+    let mut values = Vec::with_capacity(arguments.rows());
+    let mut valid = NullBufferBuilder::new(arguments.rows());
+    for row in 0..arguments.rows() {
+        let value = if arguments.is_null(row) { None } else { number(row)? };
+        values.push(value.unwrap_or_default());
+        valid.append(value.is_some());
+    }
+    Ok(Arc::new(Float64Array::new(values.into(), valid.finish())))
+}
+
+/// A list a row, with room for `room` values in all. `list` appends a row's values; where it returns false the row is
+/// null.
+pub(super) fn lists<T: Element>(
+    arguments: &Arguments<'_>,
+    room: usize,
+    mut list: impl FnMut(usize, &mut Vec<T>) -> Result<bool>,
+) -> Result<ArrayRef> {
+    let mut values = Vec::with_capacity(room.min(i32::MAX as usize));
+    let mut offsets = Vec::with_capacity(arguments.rows() + 1);
+    let mut valid = NullBufferBuilder::new(arguments.rows());
+    offsets.push(0);
+    for row in 0..arguments.rows() {
+        let start = values.len();
+        let there = !arguments.is_null(row) && list(row, &mut values)?;
+        if !there {
+            values.truncate(start);
+        }
+        offsets.push(i32::try_from(values.len()).map_err(|_| too_long())?);
+        valid.append(there);
+    }
+    Ok(Arc::new(list_array::<T>(values, offsets, valid.finish())?))
+}
+
+/// Lists of the kind that [`super::arguments::list_of`] names.
+pub(super) fn list_array<T: Element>(
+    values: Vec<T>,
+    offsets: Vec<i32>,
+    nulls: Option<NullBuffer>,
+) -> Result<ListArray> {
+    let values = PrimitiveArray::<T::Arrow>::new(values.into(), None);
+    let field = Field::new_list_field(<T::Arrow as arrow::datatypes::ArrowPrimitiveType>::DATA_TYPE, true);
+    let offsets = OffsetBuffer::new(ScalarBuffer::from(offsets));
+    Ok(ListArray::try_new(Arc::new(field), offsets, Arc::new(values), nulls)?)
+}
+
+/// Numbers with names a row. `numbers` fills them; where it returns false the row is null.
+pub(super) fn structs(
+    arguments: &Arguments<'_>,
+    fields: &Fields,
+    mut numbers: impl FnMut(usize, &mut [f64]) -> Result<bool>,
+) -> Result<ArrayRef> {
+    let mut columns = vec![Vec::with_capacity(arguments.rows()); fields.len()];
+    let mut valid = NullBufferBuilder::new(arguments.rows());
+    let mut values = vec![0.0; fields.len()];
+    for row in 0..arguments.rows() {
+        let there = !arguments.is_null(row) && numbers(row, &mut values)?;
+        valid.append(there);
+        for (column, value) in columns.iter_mut().zip(&values) {
+            column.push(if there { *value } else { 0.0 });
+        }
+    }
+    let nulls = valid.finish();
+    // A field taken out of a null struct is null because its own array says so.
+    let column = |values: Vec<f64>| -> ArrayRef { Arc::new(Float64Array::new(values.into(), nulls.clone())) };
+    let columns = columns.into_iter().map(column).collect();
+    Ok(Arc::new(StructArray::try_new_with_length(fields.clone(), columns, nulls, arguments.rows())?))
+}
+
+/// Fields of a struct of numbers.
+pub(super) fn number_fields<'a>(names: impl IntoIterator<Item = &'a str>) -> Fields {
+    names.into_iter().map(|name| Field::new(name, DataType::Float64, true)).collect()
+}
+
+/// More values at the end of a list in the making.
+pub(super) fn grow<T: Element>(values: &mut Vec<T>, by: usize) -> &mut [T] {
+    let start = values.len();
+    values.resize(start + by, T::default());
+    &mut values[start..]
+}
+
+fn too_long() -> DataFusionError {
+    let hint = "SET datafusion.execution.batch_size to less, or shorten the lists";
+    DataFusionError::Execution(format!("the lists of one batch have more than 2^31 values; hint: {hint}"))
+}

@@ -1,0 +1,291 @@
+//! Arguments as kernels take them: slices of samples, numbers and texts out of Arrow arrays, checked.
+
+use std::fmt::Debug;
+use std::sync::Arc;
+
+use arrow::array::{Array, ArrayRef, ArrowPrimitiveType, AsArray as _, ListArray, StringArray};
+use arrow::buffer::NullBuffer;
+use arrow::datatypes::{ArrowNativeType, DataType, Field, Float32Type, Float64Type, Int64Type};
+use datafusion::error::{DataFusionError, Result};
+use datafusion::logical_expr::ColumnarValue;
+use echolake_dsp::Real;
+
+use super::description::{Description, Kind, Parameter};
+
+/// A sample that Arrow knows too.
+pub(super) trait Element: Real + ArrowNativeType {
+    type Arrow: ArrowPrimitiveType<Native = Self>;
+}
+
+impl Element for f32 {
+    type Arrow = Float32Type;
+}
+
+impl Element for f64 {
+    type Arrow = Float64Type;
+}
+
+/// The arguments of one call: arrays of as many rows, or of a single value for all of them.
+pub(super) struct Arguments<'a> {
+    description: &'a Description,
+    columns: Vec<Column>,
+    rows: usize,
+    /// Where one of them is null.
+    nulls: Option<NullBuffer>,
+}
+
+struct Column {
+    array: ArrayRef,
+    constant: bool,
+}
+
+/// Lists of samples.
+pub(super) struct Samples<'a, T> {
+    list: &'a ListArray,
+    values: &'a [T],
+    nulls: Option<&'a NullBuffer>,
+    constant: bool,
+    function: &'a str,
+    parameter: &'a str,
+}
+
+/// Numbers, or whole numbers.
+pub(super) struct Numbers<'a, N> {
+    values: &'a [N],
+    constant: bool,
+}
+
+/// Texts.
+pub(super) struct Texts<'a> {
+    values: &'a StringArray,
+    constant: bool,
+}
+
+/// The types that a call's arguments are cast to. What cannot be is left as it is: [`check`] says why.
+pub(super) fn coerced(description: &Description, types: &[DataType]) -> Vec<DataType> {
+    let kind = |i: usize| description.parameters.get(i).map(|p| p.kind);
+    let samples = types.iter().enumerate().filter(|(i, _)| kind(*i) == Some(Kind::Samples));
+    let narrow = samples.clone().any(|(_, t)| element(t) == Some(&DataType::Float32))
+        && samples
+            .into_iter()
+            .all(|(_, t)| matches!(element(t), Some(DataType::Float32 | DataType::Null)) || t.is_null());
+    let wanted = if narrow { DataType::Float32 } else { DataType::Float64 };
+    let coerce = |(i, given): (usize, &DataType)| match kind(i) {
+        Some(Kind::Samples) if given.is_null() || element(given).is_some_and(is_number) => match given {
+            DataType::List(child) if *child.data_type() == wanted => given.clone(),
+            _ => list_of(wanted.clone()),
+        },
+        Some(Kind::Number) if is_number(given) => DataType::Float64,
+        Some(Kind::Integer) if given.is_integer() || given.is_null() => DataType::Int64,
+        Some(Kind::Text) if is_text(given) => DataType::Utf8,
+        _ => given.clone(),
+    };
+    types.iter().enumerate().map(coerce).collect()
+}
+
+/// Checks the number of arguments and their types, after [`coerced`].
+pub(super) fn check(description: &Description, types: &[DataType]) -> Result<()> {
+    let (most, name) = (description.parameters.len(), description.name);
+    if !(most - description.optional..=most).contains(&types.len()) {
+        let given = match types.len() {
+            1 => "1 argument is".to_owned(),
+            count => format!("{count} arguments are"),
+        };
+        return Err(DataFusionError::Plan(format!("`{name}`: {given} given; hint: {}", description.syntax())));
+    }
+    for (i, (given, Parameter { name: parameter, kind, about })) in types.iter().zip(description.parameters).enumerate()
+    {
+        let fits = match kind {
+            Kind::Samples => matches!(element(given), Some(DataType::Float32 | DataType::Float64)),
+            Kind::Number => *given == DataType::Float64,
+            Kind::Integer => *given == DataType::Int64,
+            Kind::Text => *given == DataType::Utf8,
+        };
+        if !fits {
+            let (i, words) = (i + 1, kind.words());
+            let message =
+                format!("`{name}`: argument {i}, `{parameter}`, is {given}, not {words}; hint: it is {about}");
+            return Err(DataFusionError::Plan(message));
+        }
+    }
+    Ok(())
+}
+
+/// A list as our functions return it.
+pub(super) fn list_of(element: DataType) -> DataType {
+    DataType::List(Arc::new(Field::new_list_field(element, true)))
+}
+
+/// What the elements of a list are.
+pub(super) fn element(list: &DataType) -> Option<&DataType> {
+    match list {
+        DataType::List(child)
+        | DataType::LargeList(child)
+        | DataType::ListView(child)
+        | DataType::LargeListView(child)
+        | DataType::FixedSizeList(child, _) => Some(child.data_type()),
+        _ => None,
+    }
+}
+
+fn is_number(kind: &DataType) -> bool {
+    kind.is_numeric() || kind.is_null()
+}
+
+fn is_text(kind: &DataType) -> bool {
+    match kind {
+        DataType::Dictionary(_, values) => is_text(values),
+        kind => kind.is_string() || kind.is_null(),
+    }
+}
+
+impl<'a> Arguments<'a> {
+    /// Of a call of scalar functions; constants are kept as one value.
+    pub(super) fn new(description: &'a Description, values: &[ColumnarValue], rows: usize) -> Result<Self> {
+        let column = |value: &ColumnarValue| match value {
+            ColumnarValue::Array(array) => Ok(Column { array: array.clone(), constant: false }),
+            ColumnarValue::Scalar(value) => Ok(Column { array: value.to_array_of_size(1)?, constant: true }),
+        };
+        Ok(Self::of(description, values.iter().map(column).collect::<Result<_>>()?, rows))
+    }
+
+    /// Of a batch of an aggregate's input.
+    pub(super) fn columns(description: &'a Description, arrays: &[ArrayRef]) -> Self {
+        let rows = arrays.first().map_or(0, |a| a.len());
+        let column = |array: &ArrayRef| Column { array: array.clone(), constant: false };
+        Self::of(description, arrays.iter().map(column).collect(), rows)
+    }
+
+    fn of(description: &'a Description, columns: Vec<Column>, rows: usize) -> Self {
+        let nulls = columns.iter().fold(None, |nulls: Option<NullBuffer>, column| match column.constant {
+            true if column.array.is_null(0) => Some(NullBuffer::new_null(rows)),
+            true => nulls,
+            false => NullBuffer::union(nulls.as_ref(), column.array.nulls()),
+        });
+        Self { description, columns, rows, nulls }
+    }
+
+    /// Rows of the answer.
+    pub(super) fn rows(&self) -> usize {
+        self.rows
+    }
+
+    /// How many arguments were given.
+    pub(super) fn given(&self) -> usize {
+        self.columns.len()
+    }
+
+    /// Whether an argument of the row is null, and its answer with it.
+    pub(super) fn is_null(&self, row: usize) -> bool {
+        self.nulls.as_ref().is_some_and(|nulls| nulls.is_null(row))
+    }
+
+    /// Lists of `T`.
+    pub(super) fn samples<T: Element>(&self, argument: usize) -> Result<Samples<'_, T>> {
+        let Column { array, constant } = &self.columns[argument];
+        let list = array.as_list_opt::<i32>().ok_or_else(|| self.other_type(argument))?;
+        let values = list.values().as_primitive_opt::<T::Arrow>().ok_or_else(|| self.other_type(argument))?;
+        Ok(Samples {
+            list,
+            values: values.values(),
+            nulls: values.nulls().filter(|nulls| nulls.null_count() > 0),
+            constant: *constant,
+            function: self.description.name,
+            parameter: self.description.parameters[argument].name,
+        })
+    }
+
+    /// Numbers.
+    pub(super) fn numbers(&self, argument: usize) -> Result<Numbers<'_, f64>> {
+        let Column { array, constant } = &self.columns[argument];
+        let values = array.as_primitive_opt::<Float64Type>().ok_or_else(|| self.other_type(argument))?;
+        Ok(Numbers { values: values.values(), constant: *constant })
+    }
+
+    /// Whole numbers.
+    pub(super) fn integers(&self, argument: usize) -> Result<Numbers<'_, i64>> {
+        let Column { array, constant } = &self.columns[argument];
+        let values = array.as_primitive_opt::<Int64Type>().ok_or_else(|| self.other_type(argument))?;
+        Ok(Numbers { values: values.values(), constant: *constant })
+    }
+
+    /// Texts.
+    pub(super) fn texts(&self, argument: usize) -> Result<Texts<'_>> {
+        let Column { array, constant } = &self.columns[argument];
+        let values = array.as_string_opt::<i32>().ok_or_else(|| self.other_type(argument))?;
+        Ok(Texts { values, constant: *constant })
+    }
+
+    /// What is wrong with an argument of a row, and what would be right.
+    pub(super) fn wrong(&self, argument: usize, row: usize, is: impl Debug, hint: &str) -> DataFusionError {
+        let (name, parameter) = (self.description.name, self.description.parameters[argument].name);
+        let row = row + 1;
+        DataFusionError::Execution(format!("`{name}`: `{parameter}` is {is:?} in row {row} of its batch; hint: {hint}"))
+    }
+
+    /// What a kernel said of a row.
+    pub(super) fn refused(&self, row: usize, error: &echolake_dsp::Error) -> DataFusionError {
+        let hint = match error {
+            echolake_dsp::Error::Length { .. } => "the lists of a row must be equally long",
+            echolake_dsp::Error::NotFinite { .. } => {
+                "leave out rows with NaN or infinity, as WHERE list_energy(ir) < 'inf'"
+            }
+            _ => self.description.about,
+        };
+        let (name, row) = (self.description.name, row + 1);
+        DataFusionError::Execution(format!("`{name}`, row {row} of its batch: {error}; hint: {hint}"))
+    }
+
+    // Planning casts to the right types, so that only a plan made by hand gets here.
+    fn other_type(&self, argument: usize) -> DataFusionError {
+        let (name, kind) = (self.description.name, self.columns[argument].array.data_type());
+        DataFusionError::Execution(format!(
+            "`{name}`: argument {} is {kind}; hint: {}",
+            argument + 1,
+            self.description.syntax()
+        ))
+    }
+}
+
+impl<'a, T> Samples<'a, T> {
+    /// The samples of a row that is not null.
+    pub(super) fn at(&self, row: usize) -> Result<&'a [T]> {
+        let row = if self.constant { 0 } else { row };
+        let offsets = self.list.value_offsets();
+        let (from, to) = (offsets[row] as usize, offsets[row + 1] as usize);
+        match self.nulls {
+            Some(nulls) if nulls.slice(from, to - from).null_count() > 0 => Err(self.null_inside(row, from, to)),
+            _ => Ok(&self.values[from..to]),
+        }
+    }
+
+    /// Samples of all rows, about: how much room an answer of as many needs.
+    pub(super) fn room(&self, rows: usize) -> usize {
+        let offsets = self.list.value_offsets();
+        let whole = (offsets[offsets.len() - 1] - offsets[0]) as usize;
+        if self.constant { whole.saturating_mul(rows) } else { whole }
+    }
+
+    fn null_inside(&self, row: usize, from: usize, to: usize) -> DataFusionError {
+        let at = self.nulls.and_then(|nulls| (from..to).find(|i| nulls.is_null(*i))).unwrap_or(from) - from;
+        let (function, parameter, row, at) = (self.function, self.parameter, row + 1, at + 1);
+        let hint = "array_compact() takes nulls out, or leave such rows out";
+        DataFusionError::Execution(format!(
+            "`{function}`: element {at} of `{parameter}` is null in row {row} of its batch; hint: {hint}"
+        ))
+    }
+}
+
+impl<N: Copy> Numbers<'_, N> {
+    /// The number of a row that is not null.
+    pub(super) fn at(&self, row: usize) -> N {
+        self.values[if self.constant { 0 } else { row }]
+    }
+}
+
+impl Texts<'_> {
+    /// The text of a row that is not null.
+    pub(super) fn at(&self, row: usize) -> &str {
+        self.values.value(if self.constant { 0 } else { row })
+    }
+}

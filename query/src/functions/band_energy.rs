@@ -1,0 +1,108 @@
+//! `band_energy`: a response's energy in each band of the lake's filter bank.
+
+use std::sync::Arc;
+
+use arrow::array::ArrayRef;
+use arrow::datatypes::{DataType, Fields};
+use datafusion::error::Result;
+use echolake_dsp::filter_bank::FilterBankPlan;
+
+use super::answers::{number_fields, numbers, structs};
+use super::arguments::{Arguments, Element, Samples};
+use super::description::{Description, Family, Kind, Parameter};
+use super::per_length::PerLength;
+use super::rig::Facts;
+use super::scalar::Scalar;
+
+/// `band_energy`.
+pub(super) struct BandEnergy {
+    facts: Arc<Facts>,
+    fields: Fields,
+}
+
+static DESCRIPTION: Description = Description {
+    name: "band_energy",
+    family: Family::Responses,
+    about: "Energy of a response, sum of squares, in each band of the lake's itersine filter bank: a struct with a field \
+            a band, `energy_2500` and so on as in table tnce, and `energy_total`, their sum; of one band where its centre \
+            is given. Null for a list without samples.",
+    parameters: &[
+        Parameter {
+            name: "ir",
+            kind: Kind::Samples,
+            about: "the response at the lake's sampling rate, as reflected_ir",
+        },
+        Parameter { name: "centre_hz", kind: Kind::Number, about: "centre of one band, Hz" },
+    ],
+    optional: 1,
+    example: "select band_energy([1, 0])['energy_total'] as total, round(band_energy(reflected_ir, 2500) / \
+              energy_2500, 3) as ratio from nce join tnce on nce.run_id = tnce.run_id and nce.pair_id = \
+              tnce.pair_id where nce.surface_id = '0015_0' and nce.pair_id = 0",
+    answer: "\
++-------+-------+
+| total | ratio |
++-------+-------+
+| 1.0   | 1.0   |
++-------+-------+",
+    related: &["nce", "list_energy", "spectrum"],
+};
+
+impl BandEnergy {
+    pub(super) fn new(facts: &Arc<Facts>) -> Self {
+        let mut names: Vec<_> = facts.band_names.iter().map(|name| format!("energy_{name}")).collect();
+        names.push("energy_total".into());
+        Self { facts: facts.clone(), fields: number_fields(names.iter().map(String::as_str)) }
+    }
+
+    /// A function that puts a row's energies into a slice; false where the row has no samples.
+    fn energies<'a, T: Element>(
+        &'a self,
+        arguments: &'a Arguments<'_>,
+        ir: &'a Samples<'a, T>,
+    ) -> impl FnMut(usize, &mut [f64]) -> Result<bool> + 'a {
+        let Facts { rate_hz, centres_hz, .. } = &*self.facts;
+        let mut plans = PerLength::new(DESCRIPTION.name);
+        move |row, energies| {
+            let ir = ir.at(row)?;
+            if ir.is_empty() {
+                return Ok(false);
+            }
+            let (plan, scratch) = plans.get(ir.len(), |len| {
+                let plan = FilterBankPlan::<T>::new(len, *rate_hz, centres_hz)?;
+                let scratch = plan.scratch();
+                Ok((plan, scratch))
+            })?;
+            plan.energies(ir, energies, scratch).map_err(|e| arguments.refused(row, &e))?;
+            Ok(true)
+        }
+    }
+}
+
+impl Scalar for BandEnergy {
+    fn description(&self) -> &'static Description {
+        &DESCRIPTION
+    }
+
+    fn returns(&self, arguments: &[DataType]) -> DataType {
+        if arguments.len() > 1 { DataType::Float64 } else { DataType::Struct(self.fields.clone()) }
+    }
+
+    fn call<T: Element>(&self, arguments: &Arguments<'_>) -> Result<ArrayRef> {
+        let (ir, bands) = (arguments.samples::<T>(0)?, self.facts.centres_hz.len());
+        let mut energies = self.energies(arguments, &ir);
+        if arguments.given() == 1 {
+            return structs(arguments, &self.fields, |row, values| {
+                let there = energies(row, &mut values[..bands])?;
+                values[bands] = values[..bands].iter().sum();
+                Ok(there)
+            });
+        }
+        let (centre, mut all) = (arguments.numbers(1)?, vec![0.0; bands]);
+        numbers(arguments, |row| {
+            let centre = centre.at(row);
+            let band = self.facts.band(centre);
+            let band = band.ok_or_else(|| arguments.wrong(1, row, centre, &self.facts.bands_hint()))?;
+            Ok(energies(row, &mut all)?.then(|| all[band]))
+        })
+    }
+}

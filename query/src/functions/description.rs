@@ -1,0 +1,112 @@
+//! What a function says of itself, once: for planning, for `SHOW FUNCTIONS` and for the manual.
+
+use datafusion::logical_expr::{DocSection, Documentation};
+
+/// A function's name, arguments and meaning.
+#[derive(Debug)]
+pub(super) struct Description {
+    pub(super) name: &'static str,
+    pub(super) family: Family,
+    /// What it gives, with the unit.
+    pub(super) about: &'static str,
+    pub(super) parameters: &'static [Parameter],
+    /// How many of the last arguments may be left out.
+    pub(super) optional: usize,
+    /// A query on a small lake.
+    pub(super) example: &'static str,
+    /// What it answers; a test compares.
+    pub(super) answer: &'static str,
+    pub(super) related: &'static [&'static str],
+}
+
+/// A chapter of the manual.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Family {
+    Levels,
+    Responses,
+    Comparison,
+    Geometry,
+    Lists,
+    Aggregates,
+}
+
+/// One argument.
+#[derive(Debug)]
+pub(super) struct Parameter {
+    pub(super) name: &'static str,
+    pub(super) kind: Kind,
+    /// What it means, with the unit.
+    pub(super) about: &'static str,
+}
+
+/// What an argument may be.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Kind {
+    /// A list of numbers, f32 or f64 in the kernel.
+    Samples,
+    /// A number, f64 in the kernel.
+    Number,
+    /// A whole number.
+    Integer,
+    /// Text.
+    Text,
+}
+
+impl Family {
+    #[cfg(test)]
+    pub(super) const ALL: [Self; 6] =
+        [Self::Levels, Self::Responses, Self::Comparison, Self::Geometry, Self::Lists, Self::Aggregates];
+
+    /// Its heading.
+    pub(super) fn title(self) -> &'static str {
+        match self {
+            Self::Levels => "Levels",
+            Self::Responses => "Impulse responses",
+            Self::Comparison => "Correlation and diffusion",
+            Self::Geometry => "Geometry and symmetry",
+            Self::Lists => "Lists",
+            Self::Aggregates => "Aggregates",
+        }
+    }
+}
+
+impl Kind {
+    /// In words, for errors and the manual.
+    pub(super) fn words(self) -> &'static str {
+        match self {
+            Self::Samples => "a list of numbers",
+            Self::Number => "a number",
+            Self::Integer => "a whole number",
+            Self::Text => "text",
+        }
+    }
+}
+
+impl Description {
+    /// As it is written, `nce(ir, flat_energy[, centre_hz])`.
+    pub(super) fn syntax(&self) -> String {
+        let required = self.parameters.len() - self.optional;
+        let mut text = format!("{}(", self.name);
+        for (i, parameter) in self.parameters.iter().enumerate() {
+            text += match (i, i < required) {
+                (0, true) => "",
+                (0, false) => "[",
+                (_, true) => ", ",
+                (_, false) => "[, ",
+            };
+            text += parameter.name;
+        }
+        text + &"]".repeat(self.optional) + ")"
+    }
+
+    /// As DataFusion keeps it.
+    pub(super) fn documentation(&self) -> Documentation {
+        let section = DocSection { include: true, label: self.family.title(), description: None };
+        let example = format!("```sql\n> {};\n{}\n```", self.example, self.answer);
+        let mut built = Documentation::builder(section, self.about, self.syntax()).with_sql_example(example);
+        for parameter in self.parameters {
+            built = built.with_argument(parameter.name, format!("{}, {}", parameter.kind.words(), parameter.about));
+        }
+        self.related.iter().fold(built, |built, name| built.with_related_udf(*name)).build()
+    }
+}

@@ -1,0 +1,126 @@
+//! Arithmetic on lists that DataFusion lacks.
+
+use arrow::array::ArrayRef;
+use arrow::datatypes::DataType;
+use datafusion::error::Result;
+use echolake_dsp::energy::{energy, rms};
+use echolake_dsp::mean::multiply;
+
+use super::answers::{grow, lists, numbers};
+use super::arguments::{Arguments, Element, element, list_of};
+use super::description::{Description, Family, Kind, Parameter};
+use super::scalar::Scalar;
+
+/// `list_multiply`.
+pub(super) struct Multiply;
+
+/// `list_energy`.
+pub(super) struct Energy;
+
+/// `list_rms`.
+pub(super) struct Rms;
+
+static MULTIPLY: Description = Description {
+    name: "list_multiply",
+    family: Family::Lists,
+    about: "Product of two equally long lists, element by element: a window on a response.",
+    parameters: &[
+        Parameter { name: "x", kind: Kind::Samples, about: "the first list" },
+        Parameter { name: "y", kind: Kind::Samples, about: "the second list, as long as the first" },
+    ],
+    optional: 0,
+    example: "select list_multiply([1, 2, 3], [2, 0, -1]) as product",
+    answer: "\
++------------------+
+| product          |
++------------------+
+| [2.0, 0.0, -3.0] |
++------------------+",
+    related: &["list_energy", "avg_list"],
+};
+
+static ENERGY: Description = Description {
+    name: "list_energy",
+    family: Family::Lists,
+    about: "Sum of the squares of a list, in f64: the energy of a response. 0 for a list without elements.",
+    parameters: &[Parameter { name: "list", kind: Kind::Samples, about: "the list, as reflected_ir" }],
+    optional: 0,
+    example: "select list_energy([3, -4]) as energy",
+    answer: "\
++--------+
+| energy |
++--------+
+| 25.0   |
++--------+",
+    related: &["list_rms", "band_energy"],
+};
+
+static RMS: Description = Description {
+    name: "list_rms",
+    family: Family::Lists,
+    about: "Root of the mean square of a list, in its unit. 0 for a list without elements.",
+    parameters: &[Parameter { name: "list", kind: Kind::Samples, about: "the list" }],
+    optional: 0,
+    example: "select round(list_rms([3, -4]), 4) as rms",
+    answer: "\
++--------+
+| rms    |
++--------+
+| 3.5355 |
++--------+",
+    related: &["list_energy", "spl"],
+};
+
+/// A list of the same element.
+pub(super) fn like(list: &DataType) -> DataType {
+    list_of(element(list).cloned().unwrap_or(DataType::Float64))
+}
+
+impl Scalar for Multiply {
+    fn description(&self) -> &'static Description {
+        &MULTIPLY
+    }
+
+    fn returns(&self, arguments: &[DataType]) -> DataType {
+        like(&arguments[0])
+    }
+
+    fn call<T: Element>(&self, arguments: &Arguments<'_>) -> Result<ArrayRef> {
+        let (x, y) = (arguments.samples::<T>(0)?, arguments.samples::<T>(1)?);
+        lists::<T>(arguments, x.room(arguments.rows()), |row, out| {
+            let (x, y) = (x.at(row)?, y.at(row)?);
+            multiply(x, y, grow(out, x.len())).map_err(|e| arguments.refused(row, &e))?;
+            Ok(true)
+        })
+    }
+}
+
+impl Scalar for Energy {
+    fn description(&self) -> &'static Description {
+        &ENERGY
+    }
+
+    fn returns(&self, _: &[DataType]) -> DataType {
+        DataType::Float64
+    }
+
+    fn call<T: Element>(&self, arguments: &Arguments<'_>) -> Result<ArrayRef> {
+        let list = arguments.samples::<T>(0)?;
+        numbers(arguments, |row| Ok(Some(energy(list.at(row)?))))
+    }
+}
+
+impl Scalar for Rms {
+    fn description(&self) -> &'static Description {
+        &RMS
+    }
+
+    fn returns(&self, _: &[DataType]) -> DataType {
+        DataType::Float64
+    }
+
+    fn call<T: Element>(&self, arguments: &Arguments<'_>) -> Result<ArrayRef> {
+        let list = arguments.samples::<T>(0)?;
+        numbers(arguments, |row| Ok(Some(rms(list.at(row)?))))
+    }
+}

@@ -1,0 +1,47 @@
+//! Plans of kernels for the lengths that the rows of one batch have.
+
+use std::collections::HashMap;
+
+use datafusion::error::{DataFusionError, Result};
+
+/// Lengths that are planned for at once; responses of a lake have one.
+const KEPT: usize = 8;
+/// The longest signal that is transformed: over a second at 96 kHz, a whole sweep. A longer one would take memory that
+/// no query's limit counts.
+const LONGEST: usize = 1 << 17;
+
+/// A plan, and the buffers that go with it, of each length met.
+pub(super) struct PerLength<P> {
+    function: &'static str,
+    plans: HashMap<usize, P>,
+}
+
+impl<P> PerLength<P> {
+    pub(super) fn new(function: &'static str) -> Self {
+        Self { function, plans: HashMap::new() }
+    }
+
+    /// The plan for a length.
+    pub(super) fn get(
+        &mut self,
+        len: usize,
+        make: impl FnOnce(usize) -> Result<P, echolake_dsp::Error>,
+    ) -> Result<&mut P> {
+        let name = self.function;
+        if len > LONGEST {
+            let hint = "array_slice() takes a part";
+            let message = format!("`{name}`: a list has {len} samples, at most {LONGEST} are taken; hint: {hint}");
+            return Err(DataFusionError::Execution(message));
+        }
+        if self.plans.len() >= KEPT && !self.plans.contains_key(&len) {
+            self.plans.clear();
+        }
+        match self.plans.entry(len) {
+            std::collections::hash_map::Entry::Occupied(plan) => Ok(plan.into_mut()),
+            std::collections::hash_map::Entry::Vacant(place) => {
+                let plan = make(len).map_err(|e| DataFusionError::Execution(format!("`{name}`: {e}")))?;
+                Ok(place.insert(plan))
+            }
+        }
+    }
+}

@@ -1,0 +1,93 @@
+//! Why messages of an MCAP file cannot be given as rows.
+
+use datafusion::error::DataFusionError;
+
+use crate::Error;
+
+/// What is wrong, with the file and the place in it.
+#[derive(Debug, thiserror::Error)]
+pub(super) enum Fault {
+    /// The call is not right.
+    #[error("{what}")]
+    Call { what: String, hint: String },
+    /// The store does not give the file.
+    #[error("cannot read `{file}`: {source}")]
+    Read { file: String, source: object_store::Error },
+    /// A record of the file is damaged.
+    #[error("`{file}` is damaged at byte {offset}: {what}")]
+    Damaged { file: String, offset: u64, what: String },
+    /// A channel's schema cannot be made columns of.
+    #[error("`{file}`: topic `{topic}` has no columns: {what}; hint: mcap_messages gives its messages as they are")]
+    Schema { file: String, topic: String, what: String },
+    /// Two files have columns of one name and different types.
+    #[error("`{column}` of topic `{topic}` is {one} in `{file}` and {other} in others; hint: ask for them one by one")]
+    Conflict { file: String, topic: String, column: String, one: String, other: String },
+    /// A message is not what its schema says.
+    #[error(
+        "`{file}`: message {sequence} of topic `{topic}` in the chunk at byte {offset} does not fit its schema: {what}"
+    )]
+    Message { file: String, topic: String, sequence: u32, offset: u64, what: Malformed },
+}
+
+/// Why bytes are no message of their schema.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+pub(super) enum Malformed {
+    #[error("it ends within a value")]
+    Ends,
+    #[error("there is no field number 0 and no wire type above 5")]
+    Tag,
+    #[error("a variable-length integer has more than ten bytes")]
+    Varint,
+    #[error("a group ends that did not begin")]
+    Group,
+    #[error("it expands to more than {} MiB", Spent::MOST >> 20)]
+    Expands,
+    #[error("it is no JSON object")]
+    Json,
+    #[error("its encapsulation is none of CDR's that are known here")]
+    Encapsulation,
+}
+
+/// What the rows under construction take, roughly, in bytes: messages are small beside what some of them expand to.
+#[derive(Debug, Default)]
+pub(super) struct Spent(usize);
+
+impl Spent {
+    /// No batch of rows may take more, so that offsets fit 32 bits and a hostile message does not fill the memory.
+    pub(super) const MOST: usize = 512 << 20;
+
+    /// Counts some more.
+    pub(super) fn add(&mut self, bytes: usize) -> Result<(), Malformed> {
+        self.0 = self.0.saturating_add(bytes);
+        if self.0 <= Self::MOST { Ok(()) } else { Err(Malformed::Expands) }
+    }
+
+    /// So far.
+    pub(super) fn bytes(&self) -> usize {
+        self.0
+    }
+}
+
+impl Fault {
+    pub(super) fn call(what: impl Into<String>, hint: impl Into<String>) -> Self {
+        Self::Call { what: what.into(), hint: hint.into() }
+    }
+}
+
+impl From<Fault> for Error {
+    fn from(fault: Fault) -> Self {
+        match fault {
+            Fault::Call { what, hint } => Self::Query { message: what, place: None, hint: Some(hint) },
+            other => Self::Execution { message: other.to_string() },
+        }
+    }
+}
+
+impl From<Fault> for DataFusionError {
+    fn from(fault: Fault) -> Self {
+        match fault {
+            Fault::Call { what, hint } => Self::Plan(format!("{what}; hint: {hint}")),
+            other => Self::Execution(other.to_string()),
+        }
+    }
+}

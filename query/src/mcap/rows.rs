@@ -1,0 +1,230 @@
+//! Rows under construction: what is known of every message, and what its decoder makes of it.
+
+use std::collections::VecDeque;
+use std::sync::Arc;
+
+use arrow::array::{ArrayRef, new_null_array};
+use arrow::datatypes::{DataType, Field, SchemaRef};
+use arrow::error::ArrowError;
+use arrow::record_batch::{RecordBatch, RecordBatchOptions};
+use mcap::records::MessageHeader;
+
+use super::column::{Column, time_type};
+use super::error::Malformed;
+use super::schema::{Decoder, Layout};
+
+/// Bytes that the rows of a batch take, roughly; a batch of whole sweeps has a few rows.
+const BATCH_BYTES: usize = 8 << 20;
+
+/// A column that every message has, whatever its schema.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Head {
+    Surface,
+    Run,
+    Topic,
+    Time,
+    TimeNanos,
+    Published,
+    Sequence,
+    Size,
+    Data,
+}
+
+impl Head {
+    /// Those in front of a message's own columns.
+    pub(super) const OF_COLUMNS: [Self; 6] =
+        [Self::Surface, Self::Run, Self::Time, Self::TimeNanos, Self::Published, Self::Sequence];
+    /// Those of messages that are given as they are.
+    pub(super) const OF_MESSAGES: [Self; 9] = [
+        Self::Surface,
+        Self::Run,
+        Self::Topic,
+        Self::Time,
+        Self::TimeNanos,
+        Self::Published,
+        Self::Sequence,
+        Self::Size,
+        Self::Data,
+    ];
+
+    pub(super) fn field(self) -> Field {
+        match self {
+            Self::Surface => Field::new("surface_id", DataType::Utf8, true),
+            Self::Run => Field::new("run_id", DataType::Utf8, true),
+            Self::Topic => Field::new("topic", DataType::Utf8, false),
+            Self::Time => Field::new("log_time", time_type(), false),
+            Self::TimeNanos => Field::new("log_time_ns", DataType::Int64, false),
+            Self::Published => Field::new("publish_time", time_type(), false),
+            Self::Sequence => Field::new("sequence", DataType::Int64, false),
+            Self::Size => Field::new("size", DataType::Int64, false),
+            Self::Data => Field::new("data", DataType::Binary, false),
+        }
+    }
+}
+
+/// A message and where it comes from.
+pub(super) struct Message<'a> {
+    pub(super) run: Option<&'a (String, String)>,
+    pub(super) topic: &'a str,
+    pub(super) header: &'a MessageHeader,
+    pub(super) data: &'a [u8],
+}
+
+/// A schema of some files, and where the table's own columns are in it.
+#[derive(Debug, Clone)]
+pub(super) struct Mapping {
+    pub(super) layout: Arc<Layout>,
+    /// For each column of the messages in the table, its place in the layout.
+    pub(super) columns: Vec<Option<usize>>,
+}
+
+/// Makes batches of messages.
+pub(super) struct Rows {
+    /// What is asked for, in its order.
+    schema: SchemaRef,
+    output: Vec<Output>,
+    heads: Vec<(Head, Column)>,
+    /// The schema that rows are decoded with now; another one begins another batch.
+    current: Option<Current>,
+    count: usize,
+    bytes: usize,
+    most: usize,
+    ready: VecDeque<RecordBatch>,
+}
+
+struct Current {
+    mapping: usize,
+    decoder: Decoder,
+    /// Which columns of the output it has.
+    has: Vec<bool>,
+}
+
+#[derive(Debug, Clone, Copy)]
+enum Output {
+    Head(usize),
+    /// A message's own column, by its place among those of the table.
+    Own(usize),
+}
+
+impl Rows {
+    /// Rows with some of the columns of a table that begins with `heads`.
+    pub(super) fn new(schema: SchemaRef, heads: &[Head], projection: &[usize], most: usize) -> Self {
+        let (mut output, mut wanted) = (Vec::new(), Vec::new());
+        for place in projection {
+            match heads.get(*place) {
+                Some(head) => {
+                    output.push(Output::Head(wanted.len()));
+                    wanted.push((*head, Column::new(head.field().data_type())));
+                }
+                None => output.push(Output::Own(place - heads.len())),
+            }
+        }
+        Self { schema, output, heads: wanted, current: None, count: 0, bytes: 0, most, ready: VecDeque::new() }
+    }
+
+    /// Adds a message; true once a batch is ready.
+    pub(super) fn push(
+        &mut self,
+        message: &Message<'_>,
+        mapping: Option<(usize, &Mapping)>,
+    ) -> Result<Result<bool, Malformed>, ArrowError> {
+        if let Some((id, mapping)) = mapping
+            && self.current.as_ref().is_none_or(|current| current.mapping != id)
+        {
+            self.finish()?;
+            self.current = Some(self.decoder(id, mapping));
+        }
+        let mut bytes = 0;
+        if let Some(current) = &mut self.current {
+            if let Err(e) = current.decoder.push(message.data) {
+                return Ok(Err(e));
+            }
+            bytes = current.decoder.bytes();
+        }
+        for (head, column) in &mut self.heads {
+            self.bytes += head.push(message, column);
+        }
+        self.count += 1;
+        if self.count >= self.most || self.bytes + bytes >= BATCH_BYTES {
+            self.finish()?;
+        }
+        Ok(Ok(!self.ready.is_empty()))
+    }
+
+    /// A batch that is ready.
+    pub(super) fn take(&mut self) -> Option<RecordBatch> {
+        self.ready.pop_front()
+    }
+
+    /// Makes a batch of the rows so far.
+    pub(super) fn finish(&mut self) -> Result<(), ArrowError> {
+        let count = std::mem::take(&mut self.count);
+        self.bytes = 0;
+        if count == 0 {
+            return Ok(());
+        }
+        let heads = self.heads.iter_mut().map(|(_, c)| c.finish()).collect::<Result<Vec<_>, _>>()?;
+        let own = match &mut self.current {
+            Some(current) => current.decoder.finish()?,
+            None => Vec::new(),
+        };
+        let arrays = self.arrays(&heads, own, count);
+        let options = RecordBatchOptions::new().with_row_count(Some(count));
+        self.ready.push_back(RecordBatch::try_new_with_options(self.schema.clone(), arrays, &options)?);
+        Ok(())
+    }
+}
+
+impl Head {
+    // The bytes that the value takes.
+    fn push(self, message: &Message<'_>, column: &mut Column) -> usize {
+        let nanos = |time: u64| i64::try_from(time).unwrap_or(i64::MAX);
+        match (self, column) {
+            (Self::Time, Column::Time(c)) => c.push(nanos(message.header.log_time)),
+            (Self::TimeNanos, Column::I64(c)) => c.push(nanos(message.header.log_time)),
+            (Self::Published, Column::Time(c)) => c.push(nanos(message.header.publish_time)),
+            (Self::Sequence, Column::I64(c)) => c.push(i64::from(message.header.sequence)),
+            (Self::Size, Column::I64(c)) => c.push(message.data.len() as i64),
+            (Self::Data, Column::Binary(c)) => {
+                c.push(message.data);
+                return message.data.len();
+            }
+            (Self::Topic, Column::Text(c)) => c.push(message.topic.as_bytes()),
+            (Self::Surface, Column::Text(c)) if message.run.is_some() => {
+                c.push(message.run.map_or(&[], |(surface, _)| surface.as_bytes()));
+            }
+            (Self::Run, Column::Text(c)) if message.run.is_some() => {
+                c.push(message.run.map_or(&[], |(_, run)| run.as_bytes()));
+            }
+            (_, column) => column.push_null(),
+        }
+        8
+    }
+}
+
+impl Rows {
+    // Of the layout's columns those that are asked for.
+    fn decoder(&self, id: usize, mapping: &Mapping) -> Current {
+        let place = |output: &Output| match output {
+            Output::Own(i) => mapping.columns.get(*i).copied().flatten(),
+            Output::Head(_) => None,
+        };
+        let places: Vec<_> = self.output.iter().map(place).collect();
+        let wanted: Vec<_> = places.iter().copied().flatten().collect();
+        let has = places.iter().map(Option::is_some).collect();
+        Current { mapping: id, decoder: mapping.layout.decoder(&wanted), has }
+    }
+
+    fn arrays(&self, heads: &[ArrayRef], own: Vec<ArrayRef>, count: usize) -> Vec<ArrayRef> {
+        let mut own = own.into_iter();
+        let has = |i: usize| self.current.as_ref().is_some_and(|current| current.has[i]);
+        let one = |(i, (output, field)): (usize, (&Output, &Arc<Field>))| match output {
+            Output::Head(head) => heads[*head].clone(),
+            Output::Own(_) => {
+                let array = if has(i) { own.next() } else { None };
+                array.unwrap_or_else(|| new_null_array(field.data_type(), count))
+            }
+        };
+        self.output.iter().zip(self.schema.fields()).enumerate().map(one).collect()
+    }
+}

@@ -1,0 +1,333 @@
+//! The scan of a topic: reads the pieces that have it, side by side, and decodes what is asked for.
+
+use std::collections::VecDeque;
+use std::fmt;
+use std::ops::{Range, RangeInclusive};
+use std::sync::Arc;
+
+use arrow::datatypes::SchemaRef;
+use arrow::record_batch::RecordBatch;
+use bytes::Bytes;
+use datafusion::common::tree_node::TreeNodeRecursion;
+use datafusion::error::{DataFusionError, Result};
+use datafusion::execution::memory_pool::{MemoryConsumer, MemoryReservation};
+use datafusion::execution::{SendableRecordBatchStream, TaskContext};
+use datafusion::physical_expr::{EquivalenceProperties, PhysicalExpr};
+use datafusion::physical_plan::coop::make_cooperative;
+use datafusion::physical_plan::execution_plan::{Boundedness, EmissionType, SchedulingType};
+use datafusion::physical_plan::metrics::{BaselineMetrics, Count, ExecutionPlanMetricsSet, MetricBuilder, MetricsSet};
+use datafusion::physical_plan::stream::RecordBatchStreamAdapter;
+use datafusion::physical_plan::{
+    DisplayAs, DisplayFormatType, ExecutionPlan, Partitioning, PlanProperties, ReplaceChildrenOptions,
+};
+use futures::stream::{self, BoxStream};
+use futures::{StreamExt as _, TryStreamExt as _};
+use mcap::records::Record;
+use object_store::ObjectStoreExt as _;
+
+use super::chunk::{Progress, Records, Step, Stop};
+use super::error::Fault;
+use super::file::Piece;
+use super::rows::{Message, Rows};
+use super::table::Parts;
+
+/// Neighbouring pieces are fetched together up to this size.
+const READ: u64 = 4 << 20;
+/// What stands between two pieces is fetched with them where it is less: a request costs more.
+const GAP: u64 = 128 << 10;
+/// Reads under way while another one is decoded.
+const AHEAD: usize = 2;
+
+/// What a scan is asked for.
+#[derive(Debug)]
+pub(super) struct Scan {
+    pub(super) parts: Arc<Parts>,
+    /// Columns that are asked for, by their place in the table.
+    pub(super) projection: Vec<usize>,
+    /// The same as fields.
+    pub(super) schema: SchemaRef,
+    /// Times of messages, ns.
+    pub(super) times: RangeInclusive<i64>,
+    pub(super) limit: Option<usize>,
+}
+
+/// The plan of a scan.
+#[derive(Debug)]
+pub(super) struct McapExec {
+    scan: Arc<Scan>,
+    partitions: Vec<Vec<Read>>,
+    /// Pieces that are read, all pieces, and bytes that are fetched.
+    chosen: (usize, usize, u64),
+    properties: Arc<PlanProperties>,
+    metrics: ExecutionPlanMetricsSet,
+}
+
+/// Bytes of one file that are fetched at once, and the pieces in them.
+#[derive(Debug, Clone)]
+struct Read {
+    source: usize,
+    range: Range<u64>,
+    pieces: Vec<Piece>,
+}
+
+impl McapExec {
+    /// A plan that reads `pieces`, each with its source, in up to `most` partitions of about the same size.
+    pub(super) fn new(scan: Scan, pieces: Vec<(usize, Piece)>, all: usize, most: usize) -> Self {
+        let count = pieces.len();
+        let bytes: u64 = pieces.iter().map(|(_, p)| p.range.end - p.range.start).sum();
+        let share = bytes.div_ceil(most.max(1) as u64).max(1);
+        let mut partitions: Vec<Vec<Read>> = vec![Vec::new()];
+        let mut taken = 0;
+        for (source, piece) in pieces {
+            if taken >= share {
+                partitions.push(Vec::new());
+                taken = 0;
+            }
+            taken += piece.range.end - piece.range.start;
+            if let Some(reads) = partitions.last_mut() {
+                add(reads, source, piece);
+            }
+        }
+        let fetched = partitions.iter().flatten().map(|r| r.range.end - r.range.start).sum();
+        let properties = PlanProperties::new(
+            EquivalenceProperties::new(scan.schema.clone()),
+            Partitioning::UnknownPartitioning(partitions.len()),
+            EmissionType::Incremental,
+            Boundedness::Bounded,
+        );
+        let properties = Arc::new(properties.with_scheduling_type(SchedulingType::Cooperative));
+        let metrics = ExecutionPlanMetricsSet::new();
+        MetricBuilder::new(&metrics).global_counter("chunks_pruned").add(all - count);
+        Self { scan: Arc::new(scan), partitions, chosen: (count, all, fetched), properties, metrics }
+    }
+}
+
+// To the last read, where the piece is near enough, or as another one.
+fn add(reads: &mut Vec<Read>, source: usize, piece: Piece) {
+    let near = |r: &&mut Read| {
+        let gap = piece.range.start.checked_sub(r.range.end);
+        r.source == source && gap.is_some_and(|gap| gap <= GAP) && piece.range.end - r.range.start <= READ
+    };
+    match reads.last_mut().filter(near) {
+        Some(read) => {
+            read.range.end = piece.range.end;
+            read.pieces.push(piece);
+        }
+        None => reads.push(Read { source, range: piece.range.clone(), pieces: vec![piece] }),
+    }
+}
+
+impl DisplayAs for McapExec {
+    fn fmt_as(&self, _: DisplayFormatType, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let (chosen, all, bytes) = self.chosen;
+        let (parts, fields) = (&self.scan.parts, self.scan.schema.fields());
+        let columns: Vec<_> = fields.iter().map(|f| f.name().as_str()).collect();
+        write!(f, "McapExec: {}, files={}, chunks={chosen} of {all}", parts.name, parts.sources.len())?;
+        write!(f, ", bytes={bytes}, columns=[{}]", columns.join(", "))?;
+        match self.scan.limit {
+            Some(limit) => write!(f, ", limit={limit}"),
+            None => Ok(()),
+        }
+    }
+}
+
+impl ExecutionPlan for McapExec {
+    fn name(&self) -> &'static str {
+        "McapExec"
+    }
+
+    fn properties(&self) -> &Arc<PlanProperties> {
+        &self.properties
+    }
+
+    fn children(&self) -> Vec<&Arc<dyn ExecutionPlan>> {
+        Vec::new()
+    }
+
+    fn apply_expressions(
+        &self,
+        _: &mut dyn FnMut(&Arc<dyn PhysicalExpr>) -> Result<TreeNodeRecursion>,
+    ) -> Result<TreeNodeRecursion> {
+        Ok(TreeNodeRecursion::Continue)
+    }
+
+    fn replace_children(
+        self: Arc<Self>,
+        _: Vec<Arc<dyn ExecutionPlan>>,
+        _: ReplaceChildrenOptions,
+    ) -> Result<Arc<dyn ExecutionPlan>> {
+        Ok(self)
+    }
+
+    fn with_new_children(self: Arc<Self>, _: Vec<Arc<dyn ExecutionPlan>>) -> Result<Arc<dyn ExecutionPlan>> {
+        Ok(self)
+    }
+
+    fn metrics(&self) -> Option<MetricsSet> {
+        Some(self.metrics.clone_inner())
+    }
+
+    fn execute(&self, partition: usize, context: Arc<TaskContext>) -> Result<SendableRecordBatchStream> {
+        let reads = self.partitions.get(partition).cloned().unwrap_or_default();
+        let count = |name: &'static str| MetricBuilder::new(&self.metrics).counter(name, partition);
+        let scan = &self.scan;
+        let most = context.session_config().batch_size();
+        let scanner = Scanner {
+            scan: scan.clone(),
+            reads: fetch(scan.parts.clone(), reads, count("bytes_read")),
+            fetched: None,
+            current: None,
+            rows: Rows::new(scan.schema.clone(), &scan.parts.heads, &scan.projection, most),
+            left: scan.limit.unwrap_or(usize::MAX),
+            memory: MemoryConsumer::new("McapExec").register(context.memory_pool()),
+            chunks: count("chunks_read"),
+            baseline: BaselineMetrics::new(&self.metrics, partition),
+        };
+        let batches = stream::try_unfold(scanner, |mut scanner| async move {
+            Ok(scanner.next().await?.map(|batch| (batch, scanner)))
+        });
+        Ok(make_cooperative(Box::pin(RecordBatchStreamAdapter::new(scan.schema.clone(), batches))))
+    }
+}
+
+// The next ones are on their way while one is decoded.
+fn fetch(parts: Arc<Parts>, reads: Vec<Read>, bytes_read: Count) -> BoxStream<'static, Result<(Read, Bytes), Fault>> {
+    let one = move |read: Read| {
+        let (parts, bytes_read) = (parts.clone(), bytes_read.clone());
+        async move {
+            let path = &parts.sources[read.source].file.path;
+            let failed = |source| Fault::Read { file: path.to_string(), source };
+            let bytes = parts.files.store.get_range(path, read.range.clone()).await.map_err(failed)?;
+            bytes_read.add(bytes.len());
+            if bytes.len() as u64 != read.range.end - read.range.start {
+                let what = "it became shorter while it was read".to_owned();
+                return Err(Fault::Damaged { file: path.to_string(), offset: read.range.start, what });
+            }
+            Ok((read, bytes))
+        }
+    };
+    stream::iter(reads).map(one).buffered(AHEAD).boxed()
+}
+
+/// One partition on its way.
+struct Scanner {
+    scan: Arc<Scan>,
+    reads: BoxStream<'static, Result<(Read, Bytes), Fault>>,
+    fetched: Option<Fetched>,
+    current: Option<Current>,
+    rows: Rows,
+    /// Rows until the limit.
+    left: usize,
+    memory: MemoryReservation,
+    chunks: Count,
+    baseline: BaselineMetrics,
+}
+
+/// What was fetched at once, and what of it is still to be read.
+struct Fetched {
+    source: usize,
+    start: u64,
+    bytes: Bytes,
+    pieces: VecDeque<Piece>,
+}
+
+/// The piece at hand.
+struct Current {
+    source: usize,
+    offset: u64,
+    records: Records,
+}
+
+impl Scanner {
+    async fn next(&mut self) -> Result<Option<RecordBatch>> {
+        loop {
+            if let Some(batch) = self.rows.take() {
+                self.baseline.record_output(batch.num_rows());
+                return Ok(Some(batch));
+            }
+            if self.left == 0 || !self.open().await? {
+                self.rows.finish()?;
+                self.left = 0;
+                let Some(batch) = self.rows.take() else { return Ok(None) };
+                self.baseline.record_output(batch.num_rows());
+                return Ok(Some(batch));
+            }
+            let elapsed = self.baseline.elapsed_compute().clone();
+            let _timer = elapsed.timer();
+            self.decode()?;
+        }
+    }
+
+    // Whether there is a piece at hand, or another one.
+    async fn open(&mut self) -> Result<bool> {
+        while self.current.is_none() {
+            let Some(fetched) = &mut self.fetched else {
+                match self.reads.try_next().await? {
+                    Some((read, bytes)) => {
+                        let (source, start) = (read.source, read.range.start);
+                        self.fetched = Some(Fetched { source, start, bytes, pieces: read.pieces.into() });
+                    }
+                    None => return Ok(false),
+                }
+                continue;
+            };
+            let Some(piece) = fetched.pieces.pop_front() else {
+                self.fetched = None;
+                continue;
+            };
+            // Between chunks others have their turn, and a query that is dropped ends.
+            let (source, offset) = (fetched.source, piece.range.start);
+            let bytes =
+                fetched.bytes.slice((offset - fetched.start) as usize..(piece.range.end - fetched.start) as usize);
+            let records = Records::new(bytes, piece.kind).map_err(|what| self.damaged(source, offset, what))?;
+            self.memory.try_resize(records.memory)?;
+            self.chunks.add(1);
+            self.current = Some(Current { source, offset, records });
+            tokio::task::yield_now().await;
+        }
+        Ok(true)
+    }
+
+    // Goes on with the piece at hand until a batch is ready.
+    fn decode(&mut self) -> Result<()> {
+        let Some(current) = &mut self.current else { return Ok(()) };
+        let parts = &self.scan.parts;
+        let source = &parts.sources[current.source];
+        let (rows, left, times) = (&mut self.rows, &mut self.left, &self.scan.times);
+        let offset = current.offset;
+        let mut sink = |record: Record<'_>| {
+            let Record::Message { header, data } = &record else { return Ok(Step::Go) };
+            let Some((topic, mapping)) = source.channels.get(&header.channel_id) else { return Ok(Step::Go) };
+            if !times.contains(&i64::try_from(header.log_time).unwrap_or(i64::MAX)) {
+                return Ok(Step::Go);
+            }
+            let message = Message { run: source.run.as_ref(), topic, header, data };
+            let mapping = parts.mappings.as_ref().map(|all| (*mapping, &all[*mapping]));
+            let ready = rows.push(&message, mapping)?.map_err(|what| Fault::Message {
+                file: source.file.path.to_string(),
+                topic: topic.clone(),
+                sequence: header.sequence,
+                offset,
+                what,
+            })?;
+            *left -= 1;
+            Ok::<_, DataFusionError>(if ready || *left == 0 { Step::Pause } else { Step::Go })
+        };
+        match current.records.read(&mut sink) {
+            Ok(Progress::Paused) => Ok(()),
+            Ok(Progress::Done) => {
+                self.current = None;
+                Ok(())
+            }
+            Err(Stop::Damage(what)) => {
+                let source = current.source;
+                Err(self.damaged(source, offset, what).into())
+            }
+            Err(Stop::Sink(e)) => Err(e),
+        }
+    }
+
+    fn damaged(&self, source: usize, offset: u64, what: String) -> Fault {
+        Fault::Damaged { file: self.scan.parts.sources[source].file.path.to_string(), offset, what }
+    }
+}

@@ -1,0 +1,399 @@
+//! Runs as tables on files that the mcap crate writes: what comes out, what is read for it, and what damage does.
+
+use std::io::Cursor;
+
+use arrow::array::{AsArray as _, RecordBatch};
+use arrow::datatypes::Int64Type;
+use arrow::util::pretty::pretty_format_batches;
+use echolake_lake::{FileName, Lake, References, VisibleRun, encode};
+use echolake_schema::Rig;
+use echolake_schema::tables::Table;
+use mcap::records::MessageHeader;
+use mcap::{Compression, WriteOptions, Writer};
+use object_store::ObjectStoreExt as _;
+use object_store::path::Path;
+
+use crate::{Error, Session};
+
+const SECOND: u64 = 1_000_000_000;
+/// 2026-01-06, 00:00.
+const START: u64 = 1_767_657_600 * SECOND;
+
+async fn lake() -> Lake {
+    Lake::open_or_create("memory://", &Rig::paper(), &References::default()).await.expect("a lake")
+}
+
+async fn put(lake: &Lake, path: &str, file: Vec<u8>) {
+    lake.store().put(&Path::from(path), file.into()).await.expect("written");
+}
+
+async fn try_rows(lake: &Lake, sql: &str) -> Result<Vec<RecordBatch>, Error> {
+    let mut answer = Session::new(lake)?.query(sql).await?;
+    let mut batches = Vec::new();
+    while let Some(batch) = answer.next().await? {
+        batches.push(batch);
+    }
+    Ok(batches)
+}
+
+async fn rows(lake: &Lake, sql: &str) -> Vec<RecordBatch> {
+    try_rows(lake, sql).await.unwrap_or_else(|e| panic!("{sql}: {e}"))
+}
+
+async fn number(lake: &Lake, sql: &str) -> i64 {
+    rows(lake, sql).await[0].column(0).as_primitive::<Int64Type>().value(0)
+}
+
+/// Checks an answer as it is printed, the frame aside.
+async fn check(lake: &Lake, sql: &str, expected: &[&str]) {
+    let printed = pretty_format_batches(&rows(lake, sql).await).expect("printed").to_string();
+    let lines: Vec<_> = printed.lines().filter(|l| l.starts_with('|')).skip(1).collect();
+    let lines: Vec<String> =
+        lines.iter().map(|l| l.trim_matches('|').split(" | ").map(str::trim).collect::<Vec<_>>().join(" | ")).collect();
+    assert_eq!(lines, expected, "{sql}\n{printed}");
+}
+
+async fn refused(lake: &Lake, sql: &str, expected: &[&str]) {
+    let error = try_rows(lake, sql).await.map(|b| b.len()).expect_err(sql).to_string();
+    for text in expected {
+        assert!(error.contains(text), "{sql}: {error}");
+    }
+}
+
+fn options(compression: Option<Compression>) -> WriteOptions {
+    WriteOptions::new().compression(compression).chunk_size(Some(1000))
+}
+
+const POINT: &str = r#"{"type":"object","properties":{"x":{"type":"number"},"name":{"type":["string","null"]},
+    "tags":{"type":"array","items":{"type":"integer"}},"at":{"type":"object","properties":{"z":{"type":"number"}}},
+    "sequence":{"type":"integer"}}}"#;
+
+/// A second of `/point` at ten a second for each of `seconds`, and one `/note` a second, in small chunks.
+fn json_file(options: WriteOptions, seconds: u64) -> Vec<u8> {
+    let mut file = Cursor::new(Vec::new());
+    let mut writer = options.create(&mut file).expect("a writer");
+    let schema = writer.add_schema("Point", "jsonschema", POINT.as_bytes()).expect("added");
+    let point = writer.add_channel(schema, "/point", "json", &Default::default()).expect("added");
+    let note = writer.add_channel(0, "/note", "json", &Default::default()).expect("added");
+    for tick in 0..seconds * 10 {
+        let header = |channel_id| MessageHeader {
+            channel_id,
+            sequence: tick as u32,
+            log_time: START + tick * SECOND / 10,
+            publish_time: START,
+        };
+        let x = tick as f64 / 4.0;
+        let data = format!(r#"{{"x":{x},"name":"p{tick}","tags":[{tick},1],"at":{{"z":-{x}}},"sequence":{tick}}}"#);
+        writer.write_to_known_channel(&header(point), data.as_bytes()).expect("written");
+        if tick % 10 == 0 {
+            writer.write_to_known_channel(&header(note), br#"{"free":"form"}"#).expect("written");
+            // The chunk ends here, so that the notes stand in each tenth of the chunks at most.
+            writer.flush().expect("flushed");
+        }
+    }
+    writer.finish().expect("finished");
+    drop(writer);
+    file.into_inner()
+}
+
+/// Makes a run that readers see out of a file.
+async fn put_run(lake: &Lake, surface: &str, run: &str, file: Vec<u8>) {
+    use arrow::array::{ArrayRef, Int64Array, StringArray};
+    use std::sync::Arc;
+    let (surface, run) = (surface.parse().expect("an id"), run.parse().expect("an id"));
+    put(lake, Lake::run_path(&surface, &run).as_ref(), file).await;
+    let pointer = VisibleRun { surface, run, run_derivation: "d".into(), reference_derivation: None };
+    let schema = Table::Runs.schema(lake.rig());
+    let column = |field: &Arc<arrow::datatypes::Field>| -> ArrayRef {
+        let text = match field.name().as_str() {
+            "surface_id" => pointer.surface.as_str(),
+            "run_id" => pointer.run.as_str(),
+            _ => "d",
+        };
+        match field.data_type() {
+            arrow::datatypes::DataType::Utf8 => Arc::new(StringArray::from(vec![text])),
+            kind => arrow::compute::cast(&Int64Array::from(vec![0]), kind).expect("a number"),
+        }
+    };
+    let batch = RecordBatch::try_new(schema.clone(), schema.fields().iter().map(column).collect()).expect("a row");
+    let file = encode(Table::Runs, &schema, &[batch]).expect("encoded");
+    let staged = lake.stage(Table::Runs, &FileName::Pointer(pointer.clone()), file).await.expect("staged");
+    lake.commit(&[staged]).await.expect("committed");
+}
+
+#[tokio::test]
+async fn json_channels_are_columns_by_their_schema_or_text() {
+    let lake = lake().await;
+    put(&lake, "inbox/j.mcap", json_file(options(Some(Compression::Zstd)), 3)).await;
+    check(
+        &lake,
+        "select run_id, log_time, sequence, x, name, tags, \"at\", message_sequence \
+         from mcap('inbox/j.mcap', '/point') where sequence in (0, 17) order by log_time_ns",
+        &[
+            "| 2026-01-06T00:00:00Z | 0 | 0.0 | p0 | [0, 1] | {z: 0.0} | 0".trim_start_matches("| "),
+            "| 2026-01-06T00:00:01.700Z | 17 | 4.25 | p17 | [17, 1] | {z: -4.25} | 17".trim_start_matches("| "),
+        ]
+        .map(|line| format!("| {line}"))
+        .each_ref()
+        .map(|line| line.as_str()),
+    )
+    .await;
+    check(&lake, "select json from mcap('inbox/j.mcap', '/note') limit 1", &[r#"{"free":"form"}"#]).await;
+    check(
+        &lake,
+        "select topic, size, arrow_cast(data, 'Utf8') from mcap_messages('inbox/j.mcap', '/note') limit 1",
+        &[r#"/note | 15 | {"free":"form"}"#],
+    )
+    .await;
+    assert_eq!(number(&lake, "select count(*) from MCAP_MESSAGES('inbox/j.mcap')").await, 33);
+    assert_eq!(number(&lake, "select count(*) from mcap('inbox/j.mcap', '/point') a join mcap('inbox/j.mcap', '/note') b on a.log_time_ns = b.log_time_ns").await, 3);
+}
+
+#[tokio::test]
+async fn topics_are_listed_with_their_times() {
+    let lake = lake().await;
+    put(&lake, "inbox/j.mcap", json_file(options(None), 2)).await;
+    let whole = json_file(options(None), 2);
+    put(&lake, "inbox/cut.mcap", whole[..whole.len() - 20].to_vec()).await;
+    for (file, indexed) in [("inbox/j.mcap", true), ("inbox/cut.mcap", false)] {
+        let sql = format!(
+            "select topic, schema_name, message_encoding, messages, first_time, last_time, indexed \
+             from mcap_topics('{file}') order by topic"
+        );
+        let note = format!("/note |  | json | 2 | 2026-01-06T00:00:00Z | 2026-01-06T00:00:01Z | {indexed}");
+        let point = format!("/point | Point | json | 20 | 2026-01-06T00:00:00Z | 2026-01-06T00:00:01.900Z | {indexed}");
+        check(&lake, &sql, &[&note, &point]).await;
+    }
+}
+
+#[tokio::test]
+async fn runs_are_asked_by_surface_run_and_pattern() {
+    let lake = lake().await;
+    for (surface, run) in [("flat", "r1"), ("foam", "r2"), ("0015_0", "r3")] {
+        put_run(&lake, surface, run, json_file(options(Some(Compression::Lz4)), 2)).await;
+    }
+    for (pattern, expected) in [("flat", 20), ("r2", 20), ("f*", 40), ("*", 60), ("flat, r?", 60), ("00??_0", 20)] {
+        let sql = format!("select count(*) from mcap('{pattern}', '/point')");
+        assert_eq!(number(&lake, &sql).await, expected, "{sql}");
+    }
+    assert_eq!(number(&lake, "select count(x) from mcap('*', '/point') where surface_id like 'fo%'").await, 20);
+    assert_eq!(number(&lake, "select count(*) from mcap('runs/flat/r1.mcap', '/point') where run_id = 'r1'").await, 20);
+    check(&lake, "select distinct run_id from mcap('*', '/note') order by 1", &["r1", "r2", "r3"]).await;
+    refused(&lake, "select * from mcap('wood', '/point')", &["no surface and no run is called `wood`"]).await;
+    refused(&lake, "select * from mcap('*', '/pint')", &["no topic `/pint`", "/note, /point"]).await;
+    refused(&lake, "select * from mcap('*')", &["is called with 1 texts"]).await;
+    refused(&lake, "select * from mcap('fl' || 'at', '/point')", &["take texts, written out"]).await;
+    for path in ["../x.mcap", "/etc/x.mcap", "file:///x.mcap", "inbox/%2e%2e/x.mcap", "lake.toml/"] {
+        refused(&lake, &format!("select * from mcap('{path}', '/point')"), &["is no file in the lake"]).await;
+    }
+    refused(&lake, "select * from mcap('inbox/none.mcap', '/x')", &["cannot read `inbox/none.mcap`"]).await;
+}
+
+/// A metric of EXPLAIN ANALYZE.
+async fn metric(lake: &Lake, sql: &str, name: &str) -> u64 {
+    let plan =
+        pretty_format_batches(&rows(lake, &format!("explain analyze {sql}")).await).expect("printed").to_string();
+    let (_, behind) = plan.split_once(&format!("{name}=")).unwrap_or_else(|| panic!("no {name} in {plan}"));
+    let text: String = behind.chars().take_while(|c| c.is_ascii_digit() || *c == '.').collect();
+    text.parse().unwrap_or_else(|_| panic!("{name}={behind}"))
+}
+
+#[tokio::test]
+async fn only_what_is_asked_for_is_read() {
+    let lake = lake().await;
+    put(&lake, "inbox/j.mcap", json_file(options(None), 40)).await;
+    let all = "select x from mcap('inbox/j.mcap', '/point')";
+    let chunks = metric(&lake, all, "chunks_read").await;
+    assert!(chunks > 40, "{chunks}");
+    assert_eq!(metric(&lake, all, "chunks_pruned").await, 0);
+    // Notes are in one chunk of each second.
+    let notes = "select json from mcap('inbox/j.mcap', '/note')";
+    assert_eq!(metric(&lake, notes, "chunks_read").await, 40);
+    for (filter, expected) in [
+        ("log_time < '2026-01-06T00:00:02Z'", 20),
+        ("log_time between '2026-01-06T00:00:10Z' and '2026-01-06T00:00:10.5Z'", 6),
+        ("log_time_ns = 1767657605000000000", 1),
+        ("log_time_ns > 1767657639000000000", 9),
+        ("'2026-01-06T00:00:39Z' <= log_time and x > 97", 11),
+        ("log_time > '2027-01-01'", 0),
+        ("log_time_ns < -9223372036854775808", 0),
+        ("surface_id = 'flat'", 0),
+        ("run_id is null", 400),
+    ] {
+        let sql = format!("select count(x) from mcap('inbox/j.mcap', '/point') where {filter}");
+        assert_eq!(number(&lake, &sql).await, expected, "{sql}");
+        if expected < 100 {
+            let read = metric(&lake, &sql, "chunks_read").await;
+            assert!(read * 8 < chunks, "{filter}: {read} of {chunks}");
+        }
+    }
+    assert_eq!(rows(&lake, &format!("{all} limit 7")).await.iter().map(RecordBatch::num_rows).sum::<usize>(), 7);
+}
+
+#[tokio::test]
+async fn every_way_to_store_messages_is_read() {
+    let lake = lake().await;
+    let ways: [(&str, WriteOptions); 6] = [
+        ("zstd", options(Some(Compression::Zstd))),
+        ("lz4", options(Some(Compression::Lz4))),
+        ("none", options(None)),
+        ("unchunked", options(None).use_chunks(false)),
+        ("unindexed", options(None).emit_message_indexes(false).emit_chunk_indexes(false)),
+        ("bare", options(None).emit_summary_records(false).emit_summary_offsets(false).calculate_chunk_crcs(false)),
+    ];
+    for (name, options) in ways {
+        put(&lake, &format!("inbox/{name}.mcap"), json_file(options, 20)).await;
+        let sql = format!("select count(*), sum(x), min(log_time_ns) from mcap('inbox/{name}.mcap', '/point')");
+        check(&lake, &sql, &["200 | 4975.0 | 1767657600000000000"]).await;
+        assert_eq!(number(&lake, &format!("select count(*) from mcap_messages('inbox/{name}.mcap')")).await, 220);
+    }
+}
+
+// What is cut off is missing, what stands in whole chunks before is there.
+#[tokio::test]
+async fn files_that_are_cut_off_give_what_they_have() {
+    let whole = json_file(options(Some(Compression::Zstd)), 5);
+    let lake = lake().await;
+    let mut seen = 0;
+    for length in (0..whole.len()).rev().step_by(61) {
+        put(&lake, "inbox/cut.mcap", whole[..length].to_vec()).await;
+        let sql = "select count(*) from mcap_messages('inbox/cut.mcap')";
+        match try_rows(&lake, sql).await {
+            Ok(batches) => {
+                let count = batches[0].column(0).as_primitive::<Int64Type>().value(0);
+                seen = if seen == 0 { 55 } else { seen };
+                assert!(count <= seen, "{length}: {count} after {seen}");
+                seen = count.max(1);
+            }
+            Err(e) => assert!(length < 8, "{length}: {e}"),
+        }
+    }
+}
+
+#[tokio::test]
+async fn a_flipped_bit_is_an_error_or_harmless() {
+    let whole = json_file(options(Some(Compression::Zstd)), 5);
+    let lake = lake().await;
+    let mut state: u64 = 7;
+    let (mut errors, mut fine) = (0, 0);
+    for _ in 0..600 {
+        // A linear congruential generator: Knuth, MMIX.
+        state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+        let mut file = whole.clone();
+        let at = (state >> 16) as usize % file.len();
+        file[at] ^= 1 << ((state >> 8) % 8);
+        put(&lake, "inbox/flip.mcap", file).await;
+        match try_rows(&lake, "select count(*), sum(x) from mcap('inbox/flip.mcap', '/point')").await {
+            Ok(batches) => {
+                fine += 1;
+                assert_eq!(batches[0].column(0).as_primitive::<Int64Type>().value(0), 50, "byte {at}");
+            }
+            Err(e) => {
+                errors += 1;
+                assert!(e.to_string().contains("inbox/flip.mcap"), "byte {at}: {e}");
+            }
+        }
+    }
+    assert!(errors > 100 && fine > 100, "{errors} errors, {fine} harmless");
+}
+
+/// Encodes a ROS 2 message: values aligned to their size behind a header of four bytes.
+#[derive(Default)]
+struct Cdr(Vec<u8>);
+
+impl Cdr {
+    fn put<const N: usize>(mut self, bytes: [u8; N]) -> Self {
+        self.0.resize(self.0.len().next_multiple_of(N), 0);
+        self.0.extend_from_slice(&bytes);
+        self
+    }
+
+    fn text(self, text: &str) -> Self {
+        let mut cdr = self.put((text.len() as u32 + 1).to_le_bytes());
+        cdr.0.extend_from_slice(text.as_bytes());
+        cdr.0.push(0);
+        cdr
+    }
+
+    fn message(self) -> Vec<u8> {
+        [&[0, 1, 0, 0], self.0.as_slice()].concat()
+    }
+}
+
+const STATE: &str = "
+# A state.
+int8 KIND=3
+std_msgs/Header header
+float64[] position
+geometry_msgs/Point[2] corners
+uint8[] image
+string<=10 name \"none\"
+bool ok
+Extra extra
+================================================================================
+MSG: std_msgs/Header
+builtin_interfaces/Time stamp
+string frame_id
+================================================================================
+MSG: geometry_msgs/Point
+float32 x
+float32 y
+================================================================================
+MSG: test_msgs/Extra
+int16 a
+uint64 b
+";
+
+fn state(n: u32) -> Vec<u8> {
+    let cdr = Cdr::default().put(n.to_le_bytes()).put(5u32.to_le_bytes()).text("panel");
+    let cdr = cdr.put(3u32.to_le_bytes()).put(1.5f64.to_le_bytes()).put(2.5f64.to_le_bytes());
+    let cdr = cdr.put(f64::from(n).to_le_bytes());
+    let cdr = [1f32, 2.0, 3.0, 4.0].into_iter().fold(cdr, |cdr, v| cdr.put(v.to_le_bytes()));
+    let cdr = cdr.put(3u32.to_le_bytes()).put([7]).put([8]).put([9]).text("x").put([1]);
+    cdr.put((-2i16).to_le_bytes()).put(99u64.to_le_bytes()).message()
+}
+
+fn ros_file(messages: &[Vec<u8>]) -> Vec<u8> {
+    let mut file = Cursor::new(Vec::new());
+    let mut writer = Writer::new(&mut file).expect("a writer");
+    let schema = writer.add_schema("test_msgs/msg/State", "ros2msg", STATE.as_bytes()).expect("added");
+    let channel = writer.add_channel(schema, "/state", "cdr", &Default::default()).expect("added");
+    for (i, data) in messages.iter().enumerate() {
+        let header = MessageHeader { channel_id: channel, sequence: i as u32, log_time: START, publish_time: START };
+        writer.write_to_known_channel(&header, data).expect("written");
+    }
+    writer.finish().expect("finished");
+    drop(writer);
+    file.into_inner()
+}
+
+#[tokio::test]
+async fn ros_messages_are_columns() {
+    let lake = lake().await;
+    put(&lake, "inbox/r.mcap", ros_file(&[state(1), state(2)])).await;
+    check(
+        &lake,
+        "select header, position, corners, encode(image, 'hex'), name, ok, extra from mcap('inbox/r.mcap', '/state') order by sequence",
+        &[
+            "{stamp: 1970-01-01T00:00:01.000000005Z, frame_id: panel} | [1.5, 2.5, 1.0] | [{x: 1.0, y: 2.0}, {x: 3.0, y: 4.0}] | 070809 | x | true | {a: -2, b: 99}",
+            "{stamp: 1970-01-01T00:00:02.000000005Z, frame_id: panel} | [1.5, 2.5, 2.0] | [{x: 1.0, y: 2.0}, {x: 3.0, y: 4.0}] | 070809 | x | true | {a: -2, b: 99}",
+        ],
+    )
+    .await;
+    check(&lake, "select name from mcap('inbox/r.mcap', '/state') where sequence = 1", &["x"]).await;
+}
+
+#[tokio::test]
+async fn messages_that_do_not_fit_their_schema_are_named() {
+    let lake = lake().await;
+    let whole = state(1);
+    for length in 0..whole.len() {
+        put(&lake, "inbox/r.mcap", ros_file(&[state(0), whole[..length].to_vec()])).await;
+        refused(&lake, "select * from mcap('inbox/r.mcap', '/state')", &["message 1 of topic `/state`"]).await;
+    }
+    let mut lies = state(1);
+    // The count of `position`, behind the header.
+    lies[24..28].copy_from_slice(&u32::MAX.to_le_bytes());
+    put(&lake, "inbox/r.mcap", ros_file(&[lies])).await;
+    refused(&lake, "select * from mcap('inbox/r.mcap', '/state')", &["ends within a value"]).await;
+}

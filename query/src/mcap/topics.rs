@@ -1,0 +1,183 @@
+//! The topics of files as a table: what there is, before anything is scanned.
+
+use std::collections::HashMap;
+use std::sync::Arc;
+
+use arrow::array::{ArrayRef, BooleanArray, Int64Array, StringArray, TimestampNanosecondArray};
+use arrow::datatypes::{DataType, Field, Schema};
+use arrow::record_batch::RecordBatch;
+use datafusion::catalog::TableProvider;
+use datafusion::datasource::MemTable;
+use futures::{StreamExt as _, TryStreamExt as _};
+use mcap::records::Record;
+use object_store::ObjectStoreExt as _;
+
+use super::column::{UTC, time_type};
+use super::error::Fault;
+use super::file::{Files, McapFile, Piece};
+use super::rows::Head;
+use super::target::Target;
+
+/// Files that are asked for their first and last times at once.
+const AT_ONCE: usize = 16;
+/// Message indexes larger than this are not read for two times.
+const LARGEST_INDEX: u64 = 16 << 20;
+
+type Times = Option<(u64, u64)>;
+
+/// A row for each channel of each file.
+pub(super) async fn table(targets: Vec<Target>, files: &Arc<Files>) -> Result<Arc<dyn TableProvider>, Fault> {
+    let times = |target: Target| async move {
+        let times = times(&target.file, files).await?;
+        Ok::<_, Fault>((target, times))
+    };
+    let found: Vec<_> = futures::stream::iter(targets).map(times).buffered(AT_ONCE).try_collect().await?;
+    let rows: Vec<_> = found.iter().flat_map(|(target, times)| rows(target, times)).collect();
+    let batch = batch(&rows).map_err(|e| Fault::call(format!("the topics make no table: {e}"), "this is a bug"))?;
+    let table = MemTable::try_new(batch.schema(), vec![vec![batch]]);
+    Ok(Arc::new(table.map_err(|e| Fault::call(e.strip_backtrace(), "this is a bug"))?))
+}
+
+struct Row<'a> {
+    target: &'a Target,
+    channel: &'a super::file::Channel,
+    times: Times,
+    chunk_bytes: u64,
+}
+
+fn rows<'a>(target: &'a Target, times: &'a HashMap<u16, (u64, u64)>) -> impl Iterator<Item = Row<'a>> {
+    target.file.channels.iter().map(|(id, channel)| {
+        let size = |p: &Piece| p.range.end - p.range.start;
+        let chunk_bytes = target.file.pieces.iter().filter(|p| p.has(*id)).map(size).sum();
+        Row { target, channel, times: times.get(id).copied(), chunk_bytes }
+    })
+}
+
+fn batch(rows: &[Row<'_>]) -> Result<RecordBatch, arrow::error::ArrowError> {
+    fn text<'a>(rows: &'a [Row<'a>], of: impl Fn(&'a Row<'a>) -> Option<&'a str>) -> ArrayRef {
+        Arc::new(rows.iter().map(of).collect::<StringArray>())
+    }
+    fn long(rows: &[Row<'_>], of: impl Fn(&Row<'_>) -> Option<u64>) -> ArrayRef {
+        Arc::new(rows.iter().map(|r| of(r).and_then(|n| i64::try_from(n).ok())).collect::<Int64Array>())
+    }
+    fn time(rows: &[Row<'_>], of: impl Fn((u64, u64)) -> u64) -> ArrayRef {
+        let nanos = |r: &Row<'_>| r.times.and_then(|times| i64::try_from(of(times)).ok());
+        Arc::new(rows.iter().map(nanos).collect::<TimestampNanosecondArray>().with_timezone(UTC))
+    }
+    let named = |name: &str, kind, nullable| Field::new(name, kind, nullable);
+    let schema = Schema::new(vec![
+        Head::Surface.field(),
+        Head::Run.field(),
+        named("file", DataType::Utf8, false),
+        named("topic", DataType::Utf8, false),
+        named("schema_name", DataType::Utf8, false),
+        named("schema_encoding", DataType::Utf8, false),
+        named("message_encoding", DataType::Utf8, false),
+        named("messages", DataType::Int64, true),
+        named("first_time", time_type(), true),
+        named("last_time", time_type(), true),
+        named("chunk_bytes", DataType::Int64, true),
+        named("file_bytes", DataType::Int64, true),
+        named("indexed", DataType::Boolean, false),
+    ]);
+    let indexed: Vec<bool> = rows.iter().map(|r| r.target.file.indexed).collect();
+    let columns: Vec<ArrayRef> = vec![
+        text(rows, |r| r.target.run.as_ref().map(|(surface, _)| surface.as_str())),
+        text(rows, |r| r.target.run.as_ref().map(|(_, run)| run.as_str())),
+        text(rows, |r| Some(r.target.file.path.as_ref())),
+        text(rows, |r| Some(&r.channel.topic)),
+        text(rows, |r| Some(&r.channel.schema.name)),
+        text(rows, |r| Some(&r.channel.schema.encoding)),
+        text(rows, |r| Some(&r.channel.schema.messages)),
+        long(rows, |r| r.channel.messages),
+        time(rows, |times| times.0),
+        time(rows, |times| times.1),
+        long(rows, |r| Some(r.chunk_bytes)),
+        long(rows, |r| Some(r.target.file.bytes)),
+        Arc::new(BooleanArray::from(indexed)),
+    ];
+    RecordBatch::try_new(Arc::new(schema), columns)
+}
+
+// Times of each channel's first and last message: from the message indexes behind the first and the last chunks that
+// have it, and behind others only where their times overlap.
+async fn times(file: &McapFile, files: &Files) -> Result<HashMap<u16, (u64, u64)>, Fault> {
+    let mut found = HashMap::new();
+    let mut indexes = Indexes { file, files, read: HashMap::new() };
+    for (id, channel) in &file.channels {
+        if let Some(times) = channel.times {
+            found.insert(*id, times);
+        } else if channel.messages != Some(0)
+            && let (Some(first), Some(last)) = (indexes.first(*id).await?, indexes.last(*id).await?)
+        {
+            found.insert(*id, (first, last));
+        }
+    }
+    Ok(found)
+}
+
+struct Indexes<'a> {
+    file: &'a McapFile,
+    files: &'a Files,
+    /// First and last time of each channel, by the place of the piece.
+    read: HashMap<u64, HashMap<u16, (u64, u64)>>,
+}
+
+impl Indexes<'_> {
+    async fn first(&mut self, channel: u16) -> Result<Option<u64>, Fault> {
+        let mut pieces: Vec<_> = self.file.pieces.iter().filter(|p| p.has(channel)).collect();
+        pieces.sort_by_key(|p| p.times.0);
+        let mut best: Option<u64> = None;
+        for piece in pieces {
+            if best.is_some_and(|best| piece.times.0 >= best) {
+                break;
+            }
+            let Some((first, _)) = self.of(piece, channel).await? else { return Ok(None) };
+            best = Some(best.map_or(first, |best| best.min(first)));
+        }
+        Ok(best)
+    }
+
+    async fn last(&mut self, channel: u16) -> Result<Option<u64>, Fault> {
+        let mut pieces: Vec<_> = self.file.pieces.iter().filter(|p| p.has(channel)).collect();
+        pieces.sort_by_key(|p| std::cmp::Reverse(p.times.1));
+        let mut best: Option<u64> = None;
+        for piece in pieces {
+            if best.is_some_and(|best| piece.times.1 <= best) {
+                break;
+            }
+            let Some((_, last)) = self.of(piece, channel).await? else { return Ok(None) };
+            best = Some(best.map_or(last, |best| best.max(last)));
+        }
+        Ok(best)
+    }
+
+    // None where no index says it.
+    async fn of(&mut self, piece: &Piece, channel: u16) -> Result<Times, Fault> {
+        let at = piece.range.end;
+        if !self.read.contains_key(&at) {
+            let times = if piece.index == 0 || piece.index > LARGEST_INDEX {
+                HashMap::new()
+            } else {
+                let path = &self.file.path;
+                let bytes = self.files.store.get_range(path, at..at + piece.index).await;
+                index_times(&bytes.map_err(|source| Fault::Read { file: path.to_string(), source })?)
+            };
+            self.read.insert(at, times);
+        }
+        Ok(self.read.get(&at).and_then(|times| times.get(&channel).copied()))
+    }
+}
+
+fn index_times(bytes: &[u8]) -> HashMap<u16, (u64, u64)> {
+    let mut times = HashMap::new();
+    for record in mcap::read::LinearReader::sans_magic(bytes).map_while(Result::ok) {
+        if let Record::MessageIndex(index) = record {
+            let all = || index.records.iter().map(|entry| entry.log_time);
+            if let (Some(first), Some(last)) = (all().min(), all().max()) {
+                times.insert(index.channel_id, (first, last));
+            }
+        }
+    }
+    times
+}

@@ -1,0 +1,83 @@
+//! What a line of the prompt orders when it is no SQL.
+
+use std::path::PathBuf;
+
+use clap::ValueEnum as _;
+use echolake_query::output::Format;
+
+use super::super::FormatArg;
+
+/// What `\?` prints.
+pub(super) const HELP: &str = "\
+a query ends with ;
+\\d          the tables               \\d TABLE      its columns, with units
+\\df         the functions            \\df PART      those with PART in their name; of one, what it does
+\\f FORMAT   table, csv, json; parquet and arrow into a file
+\\o FILE     the next answer goes into a file
+\\timing     how long it took         \\pager        long answers page by page, or all at once
+\\q          leave
+Tab completes; Ctrl-R searches the history; Ctrl-C stops a query or clears the line; Ctrl-D leaves";
+
+/// An order to the prompt.
+#[derive(Debug, PartialEq, Eq)]
+pub(super) enum Command {
+    /// Leave.
+    Quit,
+    /// Print the help.
+    Help,
+    /// Print times, or do not.
+    Timing,
+    /// Page, or do not.
+    Pager,
+    /// The format of answers.
+    Format(Format),
+    /// The file for the next answer.
+    Output(Option<PathBuf>),
+    /// List the tables.
+    Tables,
+    /// Describe a table.
+    Columns(String),
+    /// List functions.
+    Functions(Option<String>),
+}
+
+/// The order of a line; None where it is SQL.
+pub(super) fn parse(line: &str) -> Option<Result<Command, String>> {
+    let line = line.trim();
+    let (word, rest) = line.split_once(char::is_whitespace).unwrap_or((line, ""));
+    let rest = rest.trim().trim_end_matches(';').trim_end();
+    let name = (!rest.is_empty()).then(|| rest.to_owned());
+    Some(Ok(match word.trim_end_matches(';') {
+        "\\q" | "exit" | "quit" if name.is_none() => Command::Quit,
+        "\\?" | "\\h" | "help" if name.is_none() => Command::Help,
+        "\\timing" => Command::Timing,
+        "\\pager" | "\\pset" => Command::Pager,
+        "\\f" | "\\format" => match FormatArg::from_str(rest, true) {
+            Ok(format) => Command::Format(format.into()),
+            Err(_) => return Some(Err(format!("no format `{rest}`; hint: table, csv, json, parquet or arrow"))),
+        },
+        "\\o" => Command::Output(name.map(PathBuf::from)),
+        "\\d" | "\\dt" | "\\d+" => name.map_or(Command::Tables, Command::Columns),
+        "\\df" => Command::Functions(name),
+        other if other.starts_with('\\') => return Some(Err(format!("no command `{other}`; hint: \\? lists them"))),
+        _ => return None,
+    }))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn lines_are_orders_or_sql() {
+        assert_eq!(parse("\\d  runs;"), Some(Ok(Command::Columns("runs".to_owned()))));
+        assert_eq!(parse("\\d"), Some(Ok(Command::Tables)));
+        assert_eq!(parse("  quit "), Some(Ok(Command::Quit)));
+        assert_eq!(parse("\\f CSV"), Some(Ok(Command::Format(Format::Csv))));
+        assert_eq!(parse("\\o a b.csv"), Some(Ok(Command::Output(Some("a b.csv".into())))));
+        assert_eq!(parse("select 1;"), None);
+        assert_eq!(parse(""), None);
+        assert!(matches!(parse("\\f xls"), Some(Err(m)) if m.contains("xls")));
+        assert!(matches!(parse("\\z"), Some(Err(m)) if m.contains("\\z")));
+    }
+}

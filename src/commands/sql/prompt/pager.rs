@@ -1,0 +1,67 @@
+//! Long answers go through the reader's pager, as in psql.
+
+use std::io::{IsTerminal as _, Write};
+use std::process::{Child, Command, Stdio};
+
+/// Leaves at once where all fits on the screen, and what was shown stays there; long lines are not folded.
+const PAGER: &str = "less -FRSX";
+
+/// Somewhere to write an answer for people.
+pub(super) enum Page {
+    /// The pager.
+    Pager(Child),
+    /// The terminal itself.
+    Terminal(std::io::Stdout),
+}
+
+impl Page {
+    /// The pager where one is wanted and there, else the terminal.
+    pub(super) fn open(is_wanted: bool) -> Self {
+        let terminal = std::io::stdout();
+        if !is_wanted || !terminal.is_terminal() {
+            return Self::Terminal(terminal);
+        }
+        let command = std::env::var("PAGER").unwrap_or_else(|_| PAGER.to_owned());
+        let mut words = command.split_whitespace();
+        let child =
+            words.next().and_then(|program| Command::new(program).args(words).stdin(Stdio::piped()).spawn().ok());
+        child.map_or(Self::Terminal(terminal), Self::Pager)
+    }
+}
+
+impl Write for Page {
+    fn write(&mut self, bytes: &[u8]) -> std::io::Result<usize> {
+        match self {
+            Self::Terminal(terminal) => terminal.write(bytes),
+            Self::Pager(child) => match child.stdin.as_mut().map(|pipe| pipe.write(bytes)) {
+                // Whoever leaves the pager early has seen enough.
+                Some(Err(e)) if e.kind() == std::io::ErrorKind::BrokenPipe => Ok(bytes.len()),
+                Some(written) => written,
+                None => Ok(bytes.len()),
+            },
+        }
+    }
+
+    fn flush(&mut self) -> std::io::Result<()> {
+        match self {
+            Self::Terminal(terminal) => terminal.flush(),
+            Self::Pager(_) => Ok(()),
+        }
+    }
+}
+
+impl Drop for Page {
+    // The prompt comes back when the pager has gone.
+    fn drop(&mut self) {
+        if let Self::Pager(child) = self {
+            drop(child.stdin.take());
+            // It has been shown; how the pager ended changes nothing.
+            let _ = child.wait();
+        }
+    }
+}
+
+/// Shows a text.
+pub(super) fn show(is_paged: bool, text: &str) -> std::io::Result<()> {
+    writeln!(Page::open(is_paged), "{text}")
+}
