@@ -68,8 +68,10 @@ pub(crate) fn respelled(sql: &str) -> Cow<'_, str> {
     let mut done = 0;
     for Clause { start, end, name } in found {
         let (Some(from), Some(to)) = (offset(sql, start), offset(sql, end)) else { return unchanged };
-        out.push_str(&sql[done..from]);
-        fill(&mut out, &name, &sql[from..to]);
+        let Some(between) = sql.get(done..from) else { continue };
+        let Some(replaced) = sql.get(from..to) else { continue };
+        out.push_str(between);
+        fill(&mut out, &name, replaced);
         done = to;
     }
     out.push_str(&sql[done..]);
@@ -85,6 +87,10 @@ struct Clause {
 
 fn clause(tokens: &[TokenWithSpan], at: usize) -> Option<Clause> {
     let Token::Word(table) = &tokens[at].token else { return None };
+    // `FOR VERSION AS OF 3` belongs to the name before it.
+    if is_word(&tokens[at], "for") {
+        return None;
+    }
     let mut next = at + 1;
     if is_word(tokens.get(next)?, "for") {
         next += 1;
@@ -194,6 +200,8 @@ mod tests {
         check("select * from runs for system_time as of '2026-11-21'", "select * from \"runs@2026-11-21\"");
         check("select * from public.nce\n  version as of 3\nwhere x", "select * from public.\"nce@3\" where x");
         check("select 'runs version as of 3' as of_course", "select 'runs version as of 3' as of_course");
+        check("select * from a version as of version as of 3", "select * from a version as of version as of 3");
+        check("select * from a for version as of 3, b for version as of 4", "select * from \"a@3\" , \"b@4\"");
         check("select version as of from runs", "select version as of from runs");
         check("select 'broken of", "select 'broken of");
     }

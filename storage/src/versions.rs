@@ -177,7 +177,9 @@ async fn commit_time(store: &dyn ObjectStore, path: &Path) -> Result<Option<Date
 
 fn millis_of(line: &str) -> Option<i64> {
     let after = line.strip_prefix("{\"commitInfo\":")?;
-    if let Ok(Value::Object(whole)) = serde_json::from_str::<Value>(after.strip_suffix('}')?) {
+    if let Some(whole) = after.strip_suffix('}')
+        && let Ok(Value::Object(whole)) = serde_json::from_str::<Value>(whole)
+    {
         return whole.get("timestamp")?.as_i64();
     }
     let (_, from) = after.split_once("\"timestamp\":")?;
