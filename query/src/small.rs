@@ -10,7 +10,7 @@ use arrow::record_batch::RecordBatch;
 use datafusion::error::{DataFusionError, Result};
 use echolake_lake::{DataFile, Lake};
 use echolake_schema::tables::Table;
-use futures::{StreamExt as _, TryStreamExt as _};
+use futures::{FutureExt as _, StreamExt as _, TryStreamExt as _};
 use object_store::path::Path;
 
 /// Rows up to which a table is small: some ten megabytes of the widest one.
@@ -46,7 +46,8 @@ impl SmallTables {
             let known = self.files.lock().unwrap_or_else(PoisonError::into_inner);
             files.iter().filter(|f| !known.contains_key(&f.path)).copied().collect()
         };
-        let read = missing.into_iter().map(|file| self.read(table, schema, file));
+        // Boxed, or the compiler cannot prove that the whole query may change threads.
+        let read: Vec<_> = missing.into_iter().map(|file| self.read(table, schema, file).boxed()).collect();
         let read: Vec<_> = futures::stream::iter(read).buffered(TOGETHER).try_collect().await?;
         let mut known = self.files.lock().unwrap_or_else(PoisonError::into_inner);
         known.extend(read);
