@@ -1,7 +1,7 @@
 //! Rows of small tables, kept in memory: `runs` and `surfaces` have one row a file, and most questions begin with them.
 //! A file never changes, so its rows are read once a process.
 
-use std::collections::{HashMap, HashSet};
+use std::collections::HashMap;
 use std::sync::{Mutex, PoisonError};
 
 use arrow::compute::concat_batches;
@@ -10,7 +10,7 @@ use arrow::record_batch::RecordBatch;
 use datafusion::error::{DataFusionError, Result};
 use echolake_lake::{DataFile, Lake};
 use echolake_schema::tables::Table;
-use futures::{FutureExt as _, StreamExt as _, TryStreamExt as _};
+use futures::{StreamExt as _, TryStreamExt as _};
 use object_store::path::Path;
 
 /// Rows up to which a table is small: some ten megabytes of the widest one.
@@ -22,7 +22,7 @@ const TOGETHER: usize = 16;
 #[derive(Debug)]
 pub(crate) struct SmallTables {
     lake: Lake,
-    files: Mutex<HashMap<Path, RecordBatch>>,
+    files: Mutex<HashMap<Table, HashMap<Path, RecordBatch>>>,
 }
 
 impl SmallTables {
@@ -42,27 +42,32 @@ impl SmallTables {
     /// # Errors
     /// Where a file is not what its log says.
     pub(crate) async fn rows(&self, table: Table, schema: &SchemaRef, files: &[&DataFile]) -> Result<RecordBatch> {
-        let missing: Vec<_> = {
+        let mut rows: HashMap<Path, RecordBatch> = {
             let known = self.files.lock().unwrap_or_else(PoisonError::into_inner);
-            files.iter().filter(|f| !known.contains_key(&f.path)).copied().collect()
+            let known = known.get(&table);
+            files.iter().filter_map(|f| known?.get_key_value(&f.path)).map(|(p, b)| (p.clone(), b.clone())).collect()
         };
-        // Boxed, or the compiler cannot prove that the whole query may change threads.
-        let read: Vec<_> = missing.into_iter().map(|file| self.read(table, schema, file).boxed()).collect();
+        let missing: Vec<DataFile> =
+            files.iter().filter(|f| !rows.contains_key(&f.path)).map(|f| (*f).clone()).collect();
+        let read: Vec<_> = missing.into_iter().map(|file| self.read(table, schema, file)).collect();
         let read: Vec<_> = futures::stream::iter(read).buffered(TOGETHER).try_collect().await?;
+        rows.extend(read);
+        let all = concat_batches(schema, files.iter().filter_map(|f| rows.get(&f.path)))?;
         let mut known = self.files.lock().unwrap_or_else(PoisonError::into_inner);
-        known.extend(read);
-        let now: HashSet<_> = files.iter().map(|f| &f.path).collect();
-        let folder = files.first().and_then(|f| f.path.parts().nth(1)).map(|part| part.as_ref().to_owned());
-        // Files of this table that are gone from it.
-        known.retain(|path, _| now.contains(path) || path.parts().nth(1).map(|p| p.as_ref().to_owned()) != folder);
-        let batches: Vec<_> = files.iter().filter_map(|f| known.get(&f.path)).collect();
-        Ok(concat_batches(schema, batches)?)
+        let known = known.entry(table).or_default();
+        // What has gone from the table goes from memory too, once it is as much again: views of the past take turns
+        // with the present.
+        if known.len() > 2 * files.len() {
+            known.clear();
+        }
+        known.extend(rows);
+        Ok(all)
     }
 
-    async fn read(&self, table: Table, schema: &SchemaRef, file: &DataFile) -> Result<(Path, RecordBatch)> {
+    async fn read(&self, table: Table, schema: &SchemaRef, file: DataFile) -> Result<(Path, RecordBatch)> {
         let failed = |e: echolake_lake::Error| DataFusionError::External(Box::new(e));
-        let stream = self.lake.rows(table, file, &[], 0..file.rows).await.map_err(failed)?;
+        let stream = self.lake.rows(table, &file, &[], 0..file.rows).await.map_err(failed)?;
         let batches: Vec<_> = stream.try_collect().await.map_err(failed)?;
-        Ok((file.path.clone(), concat_batches(schema, &batches)?))
+        Ok((file.path, concat_batches(schema, &batches)?))
     }
 }

@@ -8,6 +8,7 @@ mod digest;
 mod peer;
 mod queries;
 
+use std::io::Write as _;
 use std::path::PathBuf;
 use std::time::Instant;
 
@@ -79,7 +80,7 @@ async fn measure(args: &Args) -> Result<()> {
         }
     }
     if !args.explain {
-        report(&rows, peer.as_ref().map(|p| p.version.as_str()));
+        report(&rows, peer.as_ref().map(|p| p.version.as_str()))?;
     }
     Ok(())
 }
@@ -121,7 +122,7 @@ async fn explain(session: &Session, query: &Query) -> Result<()> {
     collect(session, &query.sql).await?;
     let batches = collect(session, &format!("EXPLAIN ANALYZE {}", query.sql)).await?;
     let text = arrow::util::pretty::pretty_format_batches(&batches)?;
-    println!("{}\n{text}", query.name);
+    writeln!(std::io::stdout(), "{}\n{text}", query.name)?;
     Ok(())
 }
 
@@ -150,8 +151,9 @@ async fn middle_surface(lake: &Lake) -> Result<String> {
     Ok(runs.get(runs.len() / 2).context("the lake has no runs")?.surface.to_string())
 }
 
-fn report(rows: &[Row], version: Option<&str>) {
-    println!("{:<20} {:>9} {:>12} {:>12} {:>7}", "query", "rows", "echolake ms", "duckdb ms", "ratio");
+fn report(rows: &[Row], version: Option<&str>) -> Result<()> {
+    let mut out = std::io::stdout().lock();
+    writeln!(out, "{:<20} {:>9} {:>12} {:>12} {:>7}", "query", "rows", "echolake ms", "duckdb ms", "ratio")?;
     let mut logs = Vec::new();
     for row in rows {
         let (peer, ratio) = match row.peer {
@@ -159,10 +161,11 @@ fn report(rows: &[Row], version: Option<&str>) {
             None => ("-".to_owned(), "-".to_owned()),
         };
         logs.extend(row.peer.map(|peer| (row.own / peer).ln()));
-        println!("{:<20} {:>9} {:>12.2} {peer:>12} {ratio:>7}", row.name, row.rows, row.own * 1e3);
+        writeln!(out, "{:<20} {:>9} {:>12.2} {peer:>12} {ratio:>7}", row.name, row.rows, row.own * 1e3)?;
     }
     if let Some(version) = version {
         let mean = (logs.iter().sum::<f64>() / logs.len().max(1) as f64).exp();
-        println!("geometric mean of echolake / DuckDB {version}: {mean:.2}");
+        writeln!(out, "geometric mean of echolake / DuckDB {version}: {mean:.2}")?;
     }
+    Ok(())
 }
