@@ -92,12 +92,11 @@ impl Metrics {
                 let _ = writeln!(text, "{name}{suffix} {value}");
             }
         };
-        let by_protocol = Protocol::ALL.map(|p| {
-            (format!("{{protocol=\"{}\"}}", p.name()), get(&self.queries[p as usize]).to_string())
-        });
+        let by_protocol = Protocol::ALL
+            .map(|p| (format!("{{protocol=\"{}\"}}", p.name()), get(&self.queries[p as usize]).to_string()));
         family("echolake_queries_total", "counter", "Queries that were begun.", &by_protocol);
-        let by_code = Code::ALL
-            .map(|c| (format!("{{code=\"{}\"}}", c.name()), get(&self.failures[c as usize]).to_string()));
+        let by_code =
+            Code::ALL.map(|c| (format!("{{code=\"{}\"}}", c.name()), get(&self.failures[c as usize]).to_string()));
         family("echolake_failures_total", "counter", "Requests that failed.", &by_code);
         let plain = |value: String| [(String::new(), value)];
         family("echolake_rows_total", "counter", "Rows of all answers.", &plain(get(&self.rows).to_string()));

@@ -129,8 +129,6 @@ fn stopped(stopping: &watch::Sender<bool>) -> impl Future<Output = ()> + Send + 
 async fn listen(address: Option<SocketAddr>) -> Result<Option<TcpListener>, Error> {
     match address {
         None => Ok(None),
-        Some(address) => {
-            TcpListener::bind(address).await.map(Some).map_err(|source| Error::Bind { address, source })
-        }
+        Some(address) => TcpListener::bind(address).await.map(Some).map_err(|source| Error::Bind { address, source }),
     }
 }

@@ -2,6 +2,7 @@
 
 use std::sync::Arc;
 use std::thread::available_parallelism;
+use std::time::Duration;
 
 use arrow::datatypes::SchemaRef;
 use datafusion::common::ParamValues;
@@ -22,6 +23,8 @@ const BLOCKING_THREADS: usize = 16;
 /// Threads that compute where the system does not say how many cores there are.
 const CORES: usize = 2;
 
+/// How long a plan is good for: it sees the lake as it was.
+pub(crate) const FRESH: Duration = Duration::from_secs(2);
 /// The catalogue and schema of the lake's tables, as DataFusion calls them.
 pub(crate) const CATALOG: &str = "datafusion";
 pub(crate) const SCHEMA: &str = "public";

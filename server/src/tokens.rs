@@ -101,8 +101,8 @@ impl Tokens {
     /// # Errors
     /// [`Error::ReadTokens`], [`Error::Tokens`].
     pub fn read(path: &Path) -> Result<Self, Error> {
-        let text = std::fs::read_to_string(path)
-            .map_err(|source| Error::ReadTokens { path: path.to_owned(), source })?;
+        let text =
+            std::fs::read_to_string(path).map_err(|source| Error::ReadTokens { path: path.to_owned(), source })?;
         Self::parse(&text).map_err(|message| Error::Tokens { path: path.to_owned(), message })
     }
 

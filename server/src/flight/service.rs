@@ -2,6 +2,7 @@
 
 use std::pin::Pin;
 use std::sync::Arc;
+use std::time::Instant;
 
 use arrow::datatypes::Schema;
 use arrow_flight::error::FlightError;
@@ -22,7 +23,7 @@ use arrow_flight::{
 };
 use bytes::Bytes;
 use datafusion::common::{ParamValues, ScalarValue};
-use echolake_query::{Client, Error as QueryError};
+use echolake_query::{Client, Error as QueryError, Prepared, Session};
 use futures::{Stream, StreamExt as _, stream};
 use prost::Message as _;
 use tonic::metadata::MetadataValue;
@@ -35,7 +36,7 @@ use super::{info, values};
 use crate::fault::Fault;
 use crate::metrics::Protocol;
 use crate::running::Stop;
-use crate::service::{CATALOG, Job, SCHEMA, Service, Work};
+use crate::service::{CATALOG, FRESH, Job, SCHEMA, Service, Work};
 use crate::tokens::{Scope, of_header};
 
 /// The action that ends a query by what GetFlightInfo gave.
@@ -68,12 +69,28 @@ impl Flight {
     }
 
     async fn plan(&self, client: &Arc<Client>, sql: String) -> Result<Statement, Status> {
-        let session = Arc::new(self.service.session(client));
-        let planner = session.clone();
-        let planned = self.service.plan(async move { Ok(planner.prepare(&sql).await?) }).await;
-        let prepared = Arc::new(planned.map_err(|f| status(&f))?);
+        let (session, sql): (_, Arc<str>) = (Arc::new(self.service.session(client)), sql.into());
+        let prepared = self.prepare(&session, &sql).await?;
         let values = ParamValues::from(Vec::<ScalarValue>::new());
-        Ok(Statement { session, schema: prepared.schema(), prepared, values, stop: Stop::new() })
+        let (schema, planned) = (prepared.schema(), Instant::now());
+        Ok(Statement { session, sql, prepared, planned, schema, values, stop: Stop::new() })
+    }
+
+    async fn prepare(&self, session: &Arc<Session>, sql: &Arc<str>) -> Result<Arc<Prepared>, Status> {
+        let (planner, sql) = (session.clone(), sql.clone());
+        let planned = self.service.plan(async move { Ok(planner.prepare(&sql).await?) }).await;
+        Ok(Arc::new(planned.map_err(|f| status(&f))?))
+    }
+
+    // A statement of a client's handle, for a run of its own on today's lake.
+    async fn prepared(&self, client: &Client, handle: &[u8]) -> Result<Statement, Status> {
+        let found = self.statements.find(&client.name, handle).map_err(|f| status(&f))?;
+        let mut statement = Statement { stop: Stop::new(), ..found };
+        if statement.planned.elapsed() >= FRESH {
+            statement.prepared = self.prepare(&statement.session, &statement.sql).await?;
+            statement.planned = Instant::now();
+        }
+        Ok(statement)
     }
 
     // A ticket of its own for each run, so that binding other values meanwhile does not change it.
@@ -207,8 +224,7 @@ impl FlightSqlService for Flight {
         request: Request<FlightDescriptor>,
     ) -> Result<Response<FlightInfo>, Status> {
         let client = self.client(&request)?;
-        let found = self.statements.find(&client.name, &query.prepared_statement_handle);
-        let statement = Statement { stop: Stop::new(), ..found.map_err(|f| status(&f))? };
+        let statement = self.prepared(&client, &query.prepared_statement_handle).await?;
         self.ticket(statement, request.into_inner())
     }
 
@@ -218,8 +234,8 @@ impl FlightSqlService for Flight {
         request: Request<Ticket>,
     ) -> Result<Response<<Self as FlightService>::DoGetStream>, Status> {
         let client = self.client(&request)?;
-        let found = self.statements.find(&client.name, &query.prepared_statement_handle);
-        self.run(Statement { stop: Stop::new(), ..found.map_err(|f| status(&f))? }).await
+        let statement = self.prepared(&client, &query.prepared_statement_handle).await?;
+        self.run(statement).await
     }
 
     async fn do_action_close_prepared_statement(
@@ -252,7 +268,8 @@ impl FlightSqlService for Flight {
         if action.r#type != CANCEL_FLIGHT_INFO {
             return Err(status(&Fault::unsupported(format!("the action `{}`", action.r#type))));
         }
-        let asked = CancelFlightInfoRequest::decode(action.body).map_err(|e| Status::invalid_argument(e.to_string()))?;
+        let asked =
+            CancelFlightInfoRequest::decode(action.body).map_err(|e| Status::invalid_argument(e.to_string()))?;
         let info = asked.info.ok_or_else(|| Status::invalid_argument("no FlightInfo to cancel"))?;
         self.cancel(&client, &info)?;
         let body = CancelFlightInfoResult::new(CancelStatus::Cancelled).encode_to_vec().into();

@@ -26,7 +26,10 @@ type Handle = [u8; 16];
 pub(super) struct Statement {
     /// The session it was planned in; its client owns the handle.
     pub(super) session: Arc<Session>,
+    pub(super) sql: Arc<str>,
     pub(super) prepared: Arc<Prepared>,
+    /// When: it sees the lake as it was then.
+    pub(super) planned: Instant,
     /// Columns as they were told to the client.
     pub(super) schema: SchemaRef,
     /// Values of its placeholders.

@@ -75,9 +75,7 @@ fn is_own(request: &Request) -> Result<(), Fault> {
         return Err(Fault::Foreign { what: "origin", found: origin });
     }
     match text(&FETCH_SITE) {
-        Some(site) if site != "same-origin" && site != "none" => {
-            Err(Fault::Foreign { what: "site", found: site })
-        }
+        Some(site) if site != "same-origin" && site != "none" => Err(Fault::Foreign { what: "site", found: site }),
         _ => Ok(()),
     }
 }

@@ -28,7 +28,7 @@ struct Column {
 
 impl Column {
     fn of(field: &Field) -> Self {
-        let metadata = |key: &str| field.metadata().get(key).cloned();
+        let metadata = |key: &str| field.metadata().get(key).filter(|text| !text.is_empty()).cloned();
         Self {
             name: field.name().clone(),
             kind: field.data_type().to_string(),

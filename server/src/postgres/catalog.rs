@@ -1,16 +1,19 @@
 //! The lake as `pg_catalog` shows it: one for all connections, so that the numbers of tables stay the same from one
 //! question of a client to the next.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, HashMap};
 use std::sync::Arc;
 
-use arrow::datatypes::SchemaRef;
+use arrow::array::AsArray as _;
+use arrow::compute::cast;
+use arrow::datatypes::{DataType, Field, Int32Type, Schema, SchemaRef};
 use async_trait::async_trait;
-use datafusion::catalog::SchemaProvider;
-use datafusion::datasource::TableType;
+use datafusion::catalog::{MemTable, SchemaProvider, TableProvider};
+use datafusion::common::ScalarValue;
+use datafusion::datasource::{TableType, ViewTable, provider_as_source};
 use datafusion::error::DataFusionError;
 use datafusion::execution::session_state::SessionStateBuilder;
-use datafusion::logical_expr::ScalarUDF;
+use datafusion::logical_expr::{LogicalPlanBuilder, ScalarUDF, ident, lit};
 use datafusion::prelude::SessionContext;
 use datafusion_pg_catalog::pg_catalog::catalog_info::CatalogInfo;
 use datafusion_pg_catalog::pg_catalog::context::{PgCatalogContextProvider, Role};
@@ -20,6 +23,7 @@ use datafusion_pg_catalog::pg_catalog::{ArrowTable, PgCatalogSchemaProvider, PgC
 use echolake_query::Extend;
 
 use super::functions;
+use super::rewrite::OWN_TABLES;
 use super::settings::Settings;
 use crate::Error;
 use crate::service::{CATALOG, SCHEMA};
@@ -43,8 +47,10 @@ impl PgCatalog {
         let fixed = Arc::new(PgCatalogStaticTables::try_new()?);
         let keywords = fixed.pg_get_keywords.clone();
         let names = Names(Arc::new(tables.into_iter().collect()));
-        let schema = Arc::new(PgCatalogSchemaProvider::try_new(names, fixed, Roles)?);
-        Ok(Self { schema, keywords, functions: Arc::new(functions::fixed()) })
+        let mut functions = functions::fixed();
+        functions.push(functions::to_regtype(type_numbers(&fixed.pg_type)?));
+        let schema = Arc::new(Complete(PgCatalogSchemaProvider::try_new(names, fixed, Roles)?));
+        Ok(Self { schema, keywords, functions: Arc::new(functions) })
     }
 
     /// For a session of these settings.
@@ -69,6 +75,69 @@ impl PgCatalog {
         CoerceIntArgsToBigInt::widen(context);
         Ok(())
     }
+}
+
+fn type_numbers(types: &ArrowTable) -> Result<HashMap<String, i32>, DataFusionError> {
+    let mut numbers = HashMap::new();
+    for batch in types.data() {
+        let column = |name: &str, kind: &DataType| {
+            let missing = || DataFusionError::Internal(format!("pg_type has no column `{name}`"));
+            Ok::<_, DataFusionError>(cast(batch.column_by_name(name).ok_or_else(missing)?, kind)?)
+        };
+        let (oids, names) = (column("oid", &DataType::Int32)?, column("typname", &DataType::Utf8)?);
+        let names = names.as_string::<i32>().iter().flatten().map(str::to_owned);
+        numbers.extend(names.zip(oids.as_primitive::<Int32Type>().values().iter().copied()));
+    }
+    Ok(numbers)
+}
+
+// The tables of `datafusion-pg-catalog`, and what clients miss in them.
+#[derive(Debug)]
+struct Complete<S>(S);
+
+#[async_trait]
+impl<S: SchemaProvider> SchemaProvider for Complete<S> {
+    fn table_names(&self) -> Vec<String> {
+        let mut names = self.0.table_names();
+        names.extend(OWN_TABLES.map(str::to_owned));
+        names
+    }
+
+    async fn table(&self, name: &str) -> Result<Option<Arc<dyn TableProvider>>, DataFusionError> {
+        match (name, self.0.table(name).await?) {
+            ("pg_indexes", _) => Ok(Some(no_indexes()?)),
+            ("pg_class", Some(table)) => Ok(Some(with_nothing(name, table, &["relacl", "reloptions"])?)),
+            ("pg_attribute", Some(table)) => Ok(Some(with_nothing(name, table, &["attacl"])?)),
+            (_, table) => Ok(table),
+        }
+    }
+
+    fn table_exist(&self, name: &str) -> bool {
+        OWN_TABLES.contains(&name) || self.0.table_exist(name)
+    }
+}
+
+fn no_indexes() -> Result<Arc<dyn TableProvider>, DataFusionError> {
+    let names = ["schemaname", "tablename", "indexname", "tablespace", "indexdef"];
+    let fields = names.map(|name| Field::new(name, DataType::Utf8, true));
+    let schema = Arc::new(Schema::new(fields.to_vec()));
+    Ok(Arc::new(MemTable::try_new(schema, vec![Vec::new()])?))
+}
+
+// Neither tables nor columns have rights or options of their own; clients know these as lists.
+fn with_nothing(
+    name: &str,
+    table: Arc<dyn TableProvider>,
+    lists: &[&str],
+) -> Result<Arc<dyn TableProvider>, DataFusionError> {
+    let nothing = ScalarValue::new_null_list(DataType::Utf8, true, 1);
+    let own = table.schema();
+    let kept = own.fields().iter().filter(|f| !lists.contains(&f.name().as_str())).map(|f| ident(f.name()));
+    let lists = lists.iter().map(|list| lit(nothing.clone()).alias(*list));
+    let plan = LogicalPlanBuilder::scan(name, provider_as_source(table), None)?
+        .project(kept.chain(lists).collect::<Vec<_>>())?
+        .build()?;
+    Ok(Arc::new(ViewTable::new(plan, None)))
 }
 
 // The lake's tables by name.
@@ -106,12 +175,7 @@ impl CatalogInfo for Names {
         Ok(self.find(catalog, schema, table).cloned())
     }
 
-    async fn table_type(
-        &self,
-        catalog: &str,
-        schema: &str,
-        table: &str,
-    ) -> Result<Option<TableType>, DataFusionError> {
+    async fn table_type(&self, catalog: &str, schema: &str, table: &str) -> Result<Option<TableType>, DataFusionError> {
         Ok(self.find(catalog, schema, table).map(|_| TableType::Base))
     }
 }

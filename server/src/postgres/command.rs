@@ -34,7 +34,11 @@ pub(super) enum Reply {
 }
 
 /// The columns that a statement gives.
-pub(super) fn columns(connection: &Connection, statement: &Statement, format: &Format) -> Result<Vec<FieldInfo>, Fault> {
+pub(super) fn columns(
+    connection: &Connection,
+    statement: &Statement,
+    format: &Format,
+) -> Result<Vec<FieldInfo>, Fault> {
     let fields = match statement {
         Statement::Query(planned) => fields(&planned.prepared.schema(), format)?,
         Statement::Fetch { name, .. } => fields(&connection.cursor(name)?.schema, format)?,
@@ -106,9 +110,7 @@ async fn ask(
             connection.declare(name, Cursor::new(running, *held))?;
             Ok(Reply::Done(Tag::new("DECLARE CURSOR")))
         }
-        Statement::Fetch { name, rows } => {
-            Ok(Reply::Rows(connection.cursor(name)?.fetch(*rows, run, format).await?))
-        }
+        Statement::Fetch { name, rows } => Ok(Reply::Rows(connection.cursor(name)?.fetch(*rows, run, format).await?)),
         other => settle(connection, other),
     }
 }

@@ -3,12 +3,13 @@
 use std::collections::{HashMap, HashSet};
 use std::sync::atomic::{AtomicI32, AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use bytes::Bytes;
 use datafusion::common::ParamValues;
 use datafusion_pg_catalog::sql::PostgresCompatibilityParser;
 use echolake_query::{Client, Session};
+use pgwire::api::Type;
 use pgwire::messages::startup::SecretKey;
 use tokio::sync::OwnedSemaphorePermit;
 
@@ -21,14 +22,12 @@ use crate::fault::Fault;
 use crate::metrics::Protocol;
 use crate::random;
 use crate::running::{Encode, Limit, Running, Stop, ended};
-use crate::service::{Job, Service, Work};
+use crate::service::{FRESH, Job, Service, Work};
 
 /// Cursors of a connection at once.
 const CURSORS: usize = 16;
 /// Prepared statements of a connection at once.
 const STATEMENTS: usize = 500;
-/// How long a plan is good for: it sees the lake as it was.
-const FRESH: Duration = Duration::from_secs(2);
 /// How often a server that stops looks whether a connection is done.
 const LOOK: Duration = Duration::from_millis(50);
 
@@ -165,12 +164,17 @@ impl Connection {
     }
 
     /// Parses and plans.
-    pub(super) async fn statements(&self, sql: &str, run: &Run) -> Result<Vec<Statement>, Fault> {
+    pub(super) async fn statements(
+        &self,
+        sql: &str,
+        types: &[Option<Type>],
+        run: &Run,
+    ) -> Result<Vec<Statement>, Fault> {
         let (shared, session) = (self.shared.clone(), self.session()?.clone());
-        let sql: Arc<str> = sql.into();
+        let (sql, types): (Arc<str>, _) = (sql.into(), types.to_vec());
         self.planned(run, async move {
             let mut statements = Vec::new();
-            for parsed in statement::parse(&shared.parser, &session, &sql)? {
+            for parsed in statement::parse(&shared.parser, &session, &sql, &types)? {
                 statements.push(statement::plan(&session, &sql, parsed).await?);
             }
             Ok(statements)
@@ -273,9 +277,4 @@ impl Connection {
 
 fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
-}
-
-/// The moment of planning.
-pub(super) fn now() -> Instant {
-    Instant::now()
 }

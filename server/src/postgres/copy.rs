@@ -149,14 +149,16 @@ impl CopyAs {
             Some(Bytes::from(names.join(delimiter) + "\n"))
         };
         match self {
-            Self::Text { delimiter, header: true, .. } => names(delimiter, &|name| {
-                name.replace('\\', "\\\\").replace('\t', "\\t").replace('\n', "\\n")
-            }),
-            Self::Csv { delimiter, quote, header: true, .. } => names(delimiter, &|name| {
-                match name.contains([',', '"', '\n', '\r']) || name.contains(&**delimiter) || name.contains(&**quote) {
-                    true => format!("{quote}{}{quote}", name.replace(&**quote, &quote.repeat(2))),
-                    false => name.to_owned(),
-                }
+            Self::Text { delimiter, header: true, .. } => {
+                names(delimiter, &|name| name.replace('\\', "\\\\").replace('\t', "\\t").replace('\n', "\\n"))
+            }
+            Self::Csv { delimiter, quote, header: true, .. } => names(delimiter, &|name| match name
+                .contains([',', '"', '\n', '\r'])
+                || name.contains(&**delimiter)
+                || name.contains(&**quote)
+            {
+                true => format!("{quote}{}{quote}", name.replace(&**quote, &quote.repeat(2))),
+                false => name.to_owned(),
             }),
             _ => None,
         }
@@ -239,7 +241,8 @@ where
     }
     if *form == CopyAs::Binary {
         // The encoder puts the header before its first row.
-        data(if count == 0 { [BINARY_HEADER, BINARY_END].concat().into() } else { Bytes::from_static(BINARY_END) }).await?;
+        data(if count == 0 { [BINARY_HEADER, BINARY_END].concat().into() } else { Bytes::from_static(BINARY_END) })
+            .await?;
     }
     client.feed(PgWireBackendMessage::CopyDone(CopyDone::new())).await?;
     client.feed(PgWireBackendMessage::CommandComplete(Tag::new("COPY").with_rows(count).into())).await?;
@@ -270,7 +273,10 @@ mod tests {
             assert_eq!(check(sql).expect(sql), binary);
         }
         let text = CopyAs::Text { delimiter: "\t".to_owned(), null: "\\N".to_owned(), header: false };
-        assert_eq!(check("COPY pairs (pair_id) TO STDOUT").expect("read"), ("SELECT pair_id FROM pairs".to_owned(), text));
+        assert_eq!(
+            check("COPY pairs (pair_id) TO STDOUT").expect("read"),
+            ("SELECT pair_id FROM pairs".to_owned(), text)
+        );
         let csv = check("COPY (SELECT 1) TO STDOUT WITH (FORMAT csv, HEADER, DELIMITER ';')").expect("read").1;
         assert!(matches!(csv, CopyAs::Csv { delimiter, header: true, .. } if delimiter == ";"));
     }

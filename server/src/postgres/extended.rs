@@ -50,12 +50,12 @@ pub(super) struct Planner(Arc<Connection>);
 impl QueryParser for Planner {
     type Statement = Statement;
 
-    async fn parse_sql<C>(&self, _: &C, sql: &str, _: &[Option<Type>]) -> PgWireResult<Option<Statement>>
+    async fn parse_sql<C>(&self, _: &C, sql: &str, types: &[Option<Type>]) -> PgWireResult<Option<Statement>>
     where
         C: ClientInfo + Unpin + Send + Sync,
     {
         let run = self.0.command();
-        let mut statements = self.0.statements(sql, &run).await.map_err(|fault| error(&fault))?;
+        let mut statements = self.0.statements(sql, types, &run).await.map_err(|fault| error(&fault))?;
         match statements.len() {
             0 | 1 => Ok(statements.pop()),
             _ => Err(error(&Fault::request("cannot insert multiple commands into a prepared statement"))),

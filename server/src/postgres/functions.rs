@@ -1,10 +1,11 @@
 //! Functions that Postgres' clients call to learn about the server. Most have one answer here, since there are no
 //! indexes, triggers or comments to speak of.
 
+use std::collections::HashMap;
 use std::hash::{Hash, Hasher};
 use std::sync::Arc;
 
-use arrow::array::{Array as _, ArrayRef, AsArray as _, StringArray};
+use arrow::array::{Array as _, ArrayRef, AsArray as _, Int32Array, StringArray};
 use arrow::compute::cast;
 use arrow::datatypes::DataType;
 use datafusion::common::ScalarValue;
@@ -12,6 +13,7 @@ use datafusion::error::{DataFusionError, Result};
 use datafusion::logical_expr::{
     ColumnarValue, ScalarFunctionArgs, ScalarUDF, ScalarUDFImpl, Signature, TypeSignature, Volatility,
 };
+use datafusion::prelude::create_udf;
 use datafusion_pg_catalog::pg_catalog as pg;
 
 use super::settings::{Settings, VERSION};
@@ -93,7 +95,36 @@ pub(super) fn fixed() -> Vec<Arc<ScalarUDF>> {
     all.extend(sizes.map(|name| Answer::udf(name, ScalarValue::Int64(Some(0)))));
     all.push(Answer::udf("pg_my_temp_schema", ScalarValue::Int32(Some(0))));
     all.push(Answer::udf("pg_backend_pid", ScalarValue::Int32(Some(0))));
+    all.push(ScalarUDF::new_from_impl(JsonObject::new()));
     all.into_iter().map(Arc::new).collect()
+}
+
+/// `to_regtype(name)`: the number of a type; NULL where there is none.
+pub(super) fn to_regtype(types: HashMap<String, i32>) -> Arc<ScalarUDF> {
+    let find = move |args: &[ColumnarValue]| {
+        let names = ColumnarValue::values_to_arrays(args)?;
+        let number = |name: Option<&str>| name.and_then(|n| types.get(standard(n.trim())).copied());
+        let numbers: Int32Array = names[0].as_string::<i32>().iter().map(number).collect();
+        Ok(ColumnarValue::Array(Arc::new(numbers)))
+    };
+    Arc::new(create_udf("to_regtype", vec![DataType::Utf8], DataType::Int32, Volatility::Stable, Arc::new(find)))
+}
+
+// `pg_type` has the short names.
+fn standard(name: &str) -> &str {
+    match name {
+        "boolean" => "bool",
+        "smallint" => "int2",
+        "integer" | "int" => "int4",
+        "bigint" => "int8",
+        "real" => "float4",
+        "double precision" => "float8",
+        "character varying" => "varchar",
+        "decimal" => "numeric",
+        "timestamp without time zone" => "timestamp",
+        "timestamp with time zone" => "timestamptz",
+        other => other,
+    }
 }
 
 /// Functions of a session's settings.
@@ -132,6 +163,61 @@ impl ScalarUDFImpl for Answer {
 
     fn invoke_with_args(&self, _: ScalarFunctionArgs) -> Result<ColumnarValue> {
         Ok(ColumnarValue::Scalar(self.answer.clone()))
+    }
+}
+
+/// `json_build_object(key, value, ...)`, as a text.
+#[derive(Debug, PartialEq, Eq, Hash)]
+struct JsonObject(Signature);
+
+impl JsonObject {
+    fn new() -> Self {
+        let any = vec![TypeSignature::Nullary, TypeSignature::VariadicAny];
+        Self(Signature::one_of(any, Volatility::Immutable))
+    }
+}
+
+impl ScalarUDFImpl for JsonObject {
+    fn name(&self) -> &str {
+        "json_build_object"
+    }
+
+    fn signature(&self) -> &Signature {
+        &self.0
+    }
+
+    fn return_type(&self, _: &[DataType]) -> Result<DataType> {
+        Ok(DataType::Utf8)
+    }
+
+    fn invoke_with_args(&self, args: ScalarFunctionArgs) -> Result<ColumnarValue> {
+        let columns = args.args.iter().map(|v| v.to_array(args.number_rows)).collect::<Result<Vec<_>>>()?;
+        let object = |row: usize| {
+            let mut object = serde_json::Map::new();
+            for pair in columns.chunks(2) {
+                let [key, value] = pair else {
+                    return Err(DataFusionError::Execution("json_build_object needs a value for each key".to_owned()));
+                };
+                let key = ScalarValue::try_from_array(key, row)?.to_string();
+                let value = ScalarValue::try_from_array(value, row)?;
+                object.insert(key, json(&value));
+            }
+            Ok(serde_json::Value::Object(object).to_string())
+        };
+        let objects = (0..args.number_rows).map(object).collect::<Result<Vec<_>>>()?;
+        Ok(ColumnarValue::Array(Arc::new(StringArray::from(objects))))
+    }
+}
+
+fn json(value: &ScalarValue) -> serde_json::Value {
+    if value.is_null() {
+        return serde_json::Value::Null;
+    }
+    let text = value.to_string();
+    match value.data_type() {
+        DataType::Boolean => serde_json::Value::Bool(text == "true"),
+        kind if kind.is_numeric() => serde_json::from_str(&text).unwrap_or(serde_json::Value::String(text)),
+        _ => serde_json::Value::String(text),
     }
 }
 

@@ -101,7 +101,8 @@ async fn gone(socket: &TcpStream) {
         match socket.ready(Interest::READABLE).await {
             Ok(ready) if !ready.is_read_closed() => {
                 // Takes the readiness back, so that the next wait is for news.
-                let _ = socket.try_io(Interest::READABLE, || -> io::Result<()> { Err(io::ErrorKind::WouldBlock.into()) });
+                let _ =
+                    socket.try_io(Interest::READABLE, || -> io::Result<()> { Err(io::ErrorKind::WouldBlock.into()) });
             }
             _ => return,
         }

@@ -12,9 +12,10 @@ use datafusion::sql::sqlparser::dialect::PostgreSqlDialect;
 use datafusion::sql::sqlparser::parser::Parser;
 use datafusion_pg_catalog::sql::PostgresCompatibilityParser;
 use echolake_query::{Error as QueryError, Prepared, Session};
+use pgwire::api::Type;
 
 use super::copy::{self, CopyAs};
-use super::{connection, rewrite};
+use super::rewrite;
 use crate::fault::Fault;
 
 /// Statements of one text at most.
@@ -31,7 +32,7 @@ pub(super) struct Planned {
 impl Planned {
     async fn new(session: &Session, sql: &Arc<str>, statement: Parsed) -> Result<Arc<Self>, Fault> {
         let prepared = Arc::new(session.prepare_statement(sql, statement.clone()).await?);
-        Ok(Arc::new(Self { prepared, at: connection::now(), statement, sql: sql.clone() }))
+        Ok(Arc::new(Self { prepared, at: Instant::now(), statement, sql: sql.clone() }))
     }
 
     /// The same on today's lake.
@@ -69,11 +70,12 @@ pub(super) enum Statement {
     Deallocate(Option<String>),
 }
 
-/// The statements of a text.
+/// The statements of a text, whose placeholders have these types where their client tells.
 pub(super) fn parse(
     parser: &PostgresCompatibilityParser,
     session: &Session,
     sql: &str,
+    types: &[Option<Type>],
 ) -> Result<Vec<Parsed>, Fault> {
     let Ok(adapted) = parser.parse(sql) else {
         // DataFusion's own parser knows more, such as DESCRIBE, and says where an error is.
@@ -86,7 +88,7 @@ pub(super) fn parse(
     let placed = Parser::parse_sql(&PostgreSqlDialect {}, sql).unwrap_or_default();
     let placed: Vec<_> = placed.into_iter().map(|s| parser.rewrite(s)).collect();
     let statements = if placed == adapted { placed } else { adapted };
-    Ok(statements.into_iter().map(|s| Parsed::Statement(Box::new(rewrite::rewrite(s)))).collect())
+    Ok(statements.into_iter().map(|s| Parsed::Statement(Box::new(rewrite::rewrite(s, types)))).collect())
 }
 
 /// Makes of a statement what can be done.
