@@ -84,7 +84,7 @@ impl Flight {
 
     // A statement of a client's handle, for a run of its own on today's lake.
     async fn prepared(&self, client: &Client, handle: &[u8]) -> Result<Statement, Status> {
-        let found = self.statements.find(&client.name, handle).map_err(|f| status(&f))?;
+        let found = self.statements.find(client.name(), handle).map_err(|f| status(&f))?;
         let mut statement = Statement { stop: Stop::new(), ..found };
         if statement.planned.elapsed() >= FRESH {
             statement.prepared = self.prepare(&statement.session, &statement.sql).await?;
@@ -121,7 +121,7 @@ impl Flight {
             let ticket = endpoint.ticket.as_ref().map(|t| t.ticket.clone()).unwrap_or_default();
             let handle = Any::decode(ticket).ok().and_then(|any| any.unpack::<TicketStatementQuery>().ok().flatten());
             let handle = handle.ok_or_else(|| Status::invalid_argument("this ticket is of no query"))?;
-            let found = self.statements.find(&client.name, &handle.statement_handle);
+            let found = self.statements.find(client.name(), &handle.statement_handle);
             found.map_err(|f| status(&f))?.stop.stop();
         }
         Ok(())
@@ -182,7 +182,7 @@ impl FlightSqlService for Flight {
         request: Request<Ticket>,
     ) -> Result<Response<<Self as FlightService>::DoGetStream>, Status> {
         let client = self.client(&request)?;
-        let found = self.statements.find(&client.name, &ticket.statement_handle);
+        let found = self.statements.find(client.name(), &ticket.statement_handle);
         self.run(found.map_err(|f| status(&f))?).await
     }
 
@@ -212,9 +212,9 @@ impl FlightSqlService for Flight {
     ) -> Result<DoPutPreparedStatementResult, Status> {
         let client = self.client(&request)?;
         let handle = query.prepared_statement_handle;
-        let statement = self.statements.find(&client.name, &handle).map_err(|f| status(&f))?;
+        let statement = self.statements.find(client.name(), &handle).map_err(|f| status(&f))?;
         let values = values::read(request.into_inner(), &statement.prepared).await.map_err(|f| status(&f))?;
-        self.statements.bind(&client.name, &handle, values).map_err(|f| status(&f))?;
+        self.statements.bind(client.name(), &handle, values).map_err(|f| status(&f))?;
         Ok(DoPutPreparedStatementResult { prepared_statement_handle: Some(handle) })
     }
 
@@ -244,7 +244,7 @@ impl FlightSqlService for Flight {
         request: Request<Action>,
     ) -> Result<(), Status> {
         let client = self.client(&request)?;
-        self.statements.forget(&client.name, &query.prepared_statement_handle);
+        self.statements.forget(client.name(), &query.prepared_statement_handle);
         Ok(())
     }
 
