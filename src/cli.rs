@@ -7,6 +7,7 @@ use echolake_acquisition::collection::LARGEST;
 use echolake_lake::{KEEP_HOURS, TARGET_BYTES};
 use echolake_schema::SurfaceId;
 
+use crate::commands::serve::ServeArgs;
 use crate::commands::sql::SqlArgs;
 
 /// A data lake and catalogue for sweep measurements.
@@ -35,6 +36,13 @@ pub(crate) enum Command {
     Ingest(IngestArgs),
     /// Ask the lake in SQL; a prompt where no query is given.
     Sql(SqlArgs),
+    /// Serve the lake over HTTP, Arrow Flight SQL and Postgres' protocol, for reading.
+    Serve(ServeArgs),
+    /// Make a token for `serve --tokens`.
+    Token {
+        /// Whose it is.
+        name: String,
+    },
     /// Say what is in the lake, what is missing and what is damaged.
     Doctor(DoctorArgs),
     /// Merge the tables' small files into large ones; ingest and queries may go on.

@@ -6,6 +6,7 @@ mod kills;
 mod load;
 mod maintenance;
 mod real_data;
+mod serve;
 
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};

@@ -1,1 +1,28 @@
-//! The query service: HTTP, Arrow Flight SQL and Postgres wire, all behind one gate.
+//! The lake over HTTP, Arrow Flight SQL and Postgres wire: three doors to one query engine, which only reads.
+//!
+//! ```no_run
+//! # async fn example() -> Result<(), Box<dyn std::error::Error>> {
+//! let lake = echolake_lake::Lake::open("lake").await?;
+//! let server = echolake_server::Server::bind(&lake, echolake_server::Settings::default()).await?;
+//! for address in server.addresses() {
+//!     eprintln!("{address}");
+//! }
+//! server.run(std::future::pending()).await?;
+//! # Ok(())
+//! # }
+//! ```
+
+mod error;
+mod fault;
+mod flight;
+mod http;
+mod metrics;
+mod postgres;
+mod random;
+mod running;
+mod serve;
+mod service;
+pub mod tokens;
+
+pub use error::Error;
+pub use serve::{Server, Settings};

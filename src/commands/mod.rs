@@ -7,6 +7,7 @@ mod import;
 mod ingest;
 mod optimize;
 mod panel;
+pub(crate) mod serve;
 pub(crate) mod sql;
 mod vacuum;
 
@@ -32,6 +33,8 @@ pub(crate) async fn run(cli: Cli) -> anyhow::Result<Done> {
         Command::Import(args) => import::run(args, lake).await,
         Command::Ingest(args) => ingest::run(args, lake).await,
         Command::Sql(args) => sql::run(args, lake).await.map(|()| Done::Whole),
+        Command::Serve(args) => serve::run(args, lake).await,
+        Command::Token { name } => serve::token(name),
         Command::Doctor(args) => doctor::run(args, lake).await,
         Command::Optimize(args) => optimize::run(args, lake).await,
         Command::Vacuum(args) => vacuum::run(args, lake).await,

@@ -96,6 +96,6 @@ pub(super) fn grow<T: Element>(values: &mut Vec<T>, by: usize) -> &mut [T] {
 }
 
 fn too_long() -> DataFusionError {
-    let hint = "SET datafusion.execution.batch_size to less, or shorten the lists";
+    let hint = "array_slice() takes a part of a list";
     DataFusionError::Execution(format!("the lists of one batch have more than 2^31 values; hint: {hint}"))
 }

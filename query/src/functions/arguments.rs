@@ -228,7 +228,7 @@ impl<'a> Arguments<'a> {
         let hint = match error {
             echolake_dsp::Error::Length { .. } => "the lists of a row must be equally long",
             echolake_dsp::Error::NotFinite { .. } => {
-                "leave out rows with NaN or infinity, as WHERE list_energy(ir) < 'inf'"
+                "leave out rows with NaN or infinity, as WHERE list_energy(ir) < 1e300"
             }
             _ => self.description.about,
         };

@@ -162,8 +162,9 @@ enum Kind {
     Number(Wire, Zigzag),
     Enum(HashMap<i32, String>),
     Text,
-    /// Bytes, and messages that are given as such.
     Bytes,
+    /// A message that is given as its bytes.
+    Opaque,
     Time,
     Empty,
     Message(Box<Node>),
@@ -410,7 +411,7 @@ impl Kind {
                 }
                 DataType::Timestamp(..) | DataType::Duration(_) => Self::Time,
                 DataType::Boolean => Self::Empty,
-                _ => Self::Bytes,
+                _ => Self::Opaque,
             },
         }
     }
@@ -424,7 +425,7 @@ impl Kind {
     }
 
     fn merges(&self) -> bool {
-        matches!(self, Self::Message(_) | Self::Time)
+        matches!(self, Self::Message(_) | Self::Time | Self::Opaque)
     }
 
     // One more value of a repeated field, or a packed list of them.
@@ -679,3 +680,6 @@ impl Reader<'_> {
         }
     }
 }
+
+#[cfg(test)]
+mod tests;

@@ -130,12 +130,9 @@ async fn json_channels_are_columns_by_their_schema_or_text() {
         "select run_id, log_time, sequence, x, name, tags, \"at\", message_sequence \
          from mcap('inbox/j.mcap', '/point') where sequence in (0, 17) order by log_time_ns",
         &[
-            "| 2026-01-06T00:00:00Z | 0 | 0.0 | p0 | [0, 1] | {z: 0.0} | 0".trim_start_matches("| "),
-            "| 2026-01-06T00:00:01.700Z | 17 | 4.25 | p17 | [17, 1] | {z: -4.25} | 17".trim_start_matches("| "),
-        ]
-        .map(|line| format!("| {line}"))
-        .each_ref()
-        .map(|line| line.as_str()),
+            " | 2026-01-06T00:00:00Z | 0 | 0.0 | p0 | [0, 1] | {z: -0.0} | 0",
+            " | 2026-01-06T00:00:01.700Z | 17 | 4.25 | p17 | [17, 1] | {z: -4.25} | 17",
+        ],
     )
     .await;
     check(&lake, "select json from mcap('inbox/j.mcap', '/note') limit 1", &[r#"{"free":"form"}"#]).await;
@@ -205,7 +202,8 @@ async fn only_what_is_asked_for_is_read() {
     let all = "select x from mcap('inbox/j.mcap', '/point')";
     let chunks = metric(&lake, all, "chunks_read").await;
     assert!(chunks > 40, "{chunks}");
-    assert_eq!(metric(&lake, all, "chunks_pruned").await, 0);
+    let whole = metric(&lake, "select size from mcap_messages('inbox/j.mcap')", "chunks_read").await;
+    assert_eq!(metric(&lake, all, "chunks_pruned").await, whole - chunks);
     // Notes are in one chunk of each second.
     let notes = "select json from mcap('inbox/j.mcap', '/note')";
     assert_eq!(metric(&lake, notes, "chunks_read").await, 40);
@@ -214,7 +212,7 @@ async fn only_what_is_asked_for_is_read() {
         ("log_time between '2026-01-06T00:00:10Z' and '2026-01-06T00:00:10.5Z'", 6),
         ("log_time_ns = 1767657605000000000", 1),
         ("log_time_ns > 1767657639000000000", 9),
-        ("'2026-01-06T00:00:39Z' <= log_time and x > 97", 11),
+        ("'2026-01-06T00:00:39Z' <= log_time and x > 97", 10),
         ("log_time > '2027-01-01'", 0),
         ("log_time_ns < -9223372036854775808", 0),
         ("surface_id = 'flat'", 0),

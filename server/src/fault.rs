@@ -1,0 +1,197 @@
+//! Why a request has no answer, with a code that stays the same over versions and protocols. Each protocol says it in
+//! its own words in one place: `http/problem.rs`, `flight/status.rs`, `postgres/sqlstate.rs`.
+
+use std::time::Duration;
+
+use echolake_query::Error as QueryError;
+
+use crate::tokens::Scope;
+
+/// Why a request has no answer.
+#[derive(Debug, thiserror::Error)]
+pub(crate) enum Fault {
+    /// The query, or its run.
+    #[error(transparent)]
+    Query(#[from] QueryError),
+    /// The request is not one that this server understands.
+    #[error("{message}")]
+    Request {
+        /// What is wrong with it, and what would be right.
+        message: String,
+    },
+    /// It is understood, and is no part of what this server does.
+    #[error("{what} is not supported here")]
+    Unsupported {
+        /// What was asked for.
+        what: String,
+    },
+    /// It asks for something that is not there, or not any more.
+    #[error("{what} is not there; hint: {hint}")]
+    NotFound {
+        /// What was asked for.
+        what: String,
+        /// What to do.
+        hint: &'static str,
+    },
+    /// The request is larger than is read.
+    #[error("the request is larger than {limit} bytes")]
+    TooLarge {
+        /// What is read.
+        limit: usize,
+    },
+    /// No token, or a wrong one.
+    #[error("a valid token is needed; hint: `Authorization: Bearer TOKEN`, or the token as password")]
+    Unauthenticated,
+    /// The token is right, and is not for this.
+    #[error("the token `{name}` is not for {scope}")]
+    Forbidden {
+        /// The token's name.
+        name: String,
+        /// What it is not for.
+        scope: Scope,
+    },
+    /// A web page elsewhere, or a name that is not this machine's, stands behind the request.
+    #[error("{what} `{found}` is not this server's; hint: without tokens only http://localhost is answered")]
+    Foreign {
+        /// Which header.
+        what: &'static str,
+        /// What it says.
+        found: String,
+    },
+    /// Somebody ended the query.
+    #[error("the query was cancelled")]
+    Cancelled,
+    /// The session's own limit of time.
+    #[error("the query ran longer than the {limit:?} that this session allows")]
+    Timeout {
+        /// The limit.
+        limit: Duration,
+    },
+    /// Too much of something at once.
+    #[error("too many {what}: {limit} at most; hint: close some first")]
+    TooMany {
+        /// Of what.
+        what: &'static str,
+        /// The limit.
+        limit: usize,
+    },
+    /// A defect. What it was stands in the server's log.
+    #[error("the server failed; the query is ended, the server goes on")]
+    Internal,
+}
+
+/// What a client's code can tell failures apart by; never renamed.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Code {
+    Query,
+    ReadOnly,
+    Execution,
+    Format,
+    Lake,
+    Request,
+    Unsupported,
+    NotFound,
+    TooLarge,
+    Unauthenticated,
+    Forbidden,
+    Foreign,
+    Cancelled,
+    TimeLimit,
+    MemoryLimit,
+    RowLimit,
+    TooMany,
+    Internal,
+}
+
+impl Code {
+    /// All of them.
+    pub(crate) const ALL: [Self; 18] = [
+        Self::Query,
+        Self::ReadOnly,
+        Self::Execution,
+        Self::Format,
+        Self::Lake,
+        Self::Request,
+        Self::Unsupported,
+        Self::NotFound,
+        Self::TooLarge,
+        Self::Unauthenticated,
+        Self::Forbidden,
+        Self::Foreign,
+        Self::Cancelled,
+        Self::TimeLimit,
+        Self::MemoryLimit,
+        Self::RowLimit,
+        Self::TooMany,
+        Self::Internal,
+    ];
+
+    /// As clients and metrics see it.
+    pub(crate) fn name(self) -> &'static str {
+        match self {
+            Self::Query => "query_invalid",
+            Self::ReadOnly => "read_only",
+            Self::Execution => "query_failed",
+            Self::Format => "format_impossible",
+            Self::Lake => "lake_unreadable",
+            Self::Request => "request_invalid",
+            Self::Unsupported => "unsupported",
+            Self::NotFound => "not_found",
+            Self::TooLarge => "request_too_large",
+            Self::Unauthenticated => "unauthenticated",
+            Self::Forbidden => "forbidden",
+            Self::Foreign => "foreign_origin",
+            Self::Cancelled => "cancelled",
+            Self::TimeLimit => "time_limit",
+            Self::MemoryLimit => "memory_limit",
+            Self::RowLimit => "row_limit",
+            Self::TooMany => "too_many",
+            Self::Internal => "internal",
+        }
+    }
+}
+
+impl Fault {
+    /// A request that is not understood.
+    pub(crate) fn request(message: impl Into<String>) -> Self {
+        Self::Request { message: message.into() }
+    }
+
+    /// A request for what this server does not do.
+    pub(crate) fn unsupported(what: impl Into<String>) -> Self {
+        Self::Unsupported { what: what.into() }
+    }
+
+    /// Its code.
+    pub(crate) fn code(&self) -> Code {
+        match self {
+            Self::Query(error) => query_code(error),
+            Self::Request { .. } => Code::Request,
+            Self::Unsupported { .. } => Code::Unsupported,
+            Self::NotFound { .. } => Code::NotFound,
+            Self::TooLarge { .. } => Code::TooLarge,
+            Self::Unauthenticated => Code::Unauthenticated,
+            Self::Forbidden { .. } => Code::Forbidden,
+            Self::Foreign { .. } => Code::Foreign,
+            Self::Cancelled => Code::Cancelled,
+            Self::Timeout { .. } => Code::TimeLimit,
+            Self::TooMany { .. } => Code::TooMany,
+            Self::Internal => Code::Internal,
+        }
+    }
+}
+
+fn query_code(error: &QueryError) -> Code {
+    match error {
+        QueryError::Query { .. } => Code::Query,
+        QueryError::NotReading { .. } => Code::ReadOnly,
+        QueryError::Execution { .. } => Code::Execution,
+        QueryError::Cancelled => Code::Cancelled,
+        QueryError::TimeLimit { .. } => Code::TimeLimit,
+        QueryError::MemoryLimit { .. } => Code::MemoryLimit,
+        QueryError::RowLimit { .. } => Code::RowLimit,
+        QueryError::Busy { .. } => Code::TooMany,
+        QueryError::Format { .. } => Code::Format,
+        QueryError::Write(_) | QueryError::Lake(_) => Code::Lake,
+    }
+}

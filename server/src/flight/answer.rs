@@ -1,0 +1,106 @@
+//! Answers as Flight data: schemas, tickets, and batches cut to what gRPC carries.
+
+use std::pin::Pin;
+use std::sync::Arc;
+
+use arrow::array::RecordBatch;
+use arrow::compute::cast;
+use arrow::datatypes::{DataType, Schema, SchemaRef};
+use arrow::error::ArrowError;
+use arrow::ipc::writer::IpcWriteOptions;
+use arrow_flight::encode::FlightDataEncoderBuilder;
+use arrow_flight::error::FlightError;
+use arrow_flight::sql::ProstMessageExt;
+use arrow_flight::{FlightData, FlightDescriptor, FlightEndpoint, FlightInfo, IpcMessage, SchemaAsIpc, Ticket};
+use bytes::Bytes;
+use futures::{Stream, StreamExt as _, TryStreamExt as _, stream};
+use prost::Message as _;
+use tonic::{Response, Status};
+
+use super::status::status;
+use crate::fault::Fault;
+use crate::running::{Encode, Running};
+
+/// What DoGet sends.
+pub(super) type Data = Pin<Box<dyn Stream<Item = Result<FlightData, Status>> + Send>>;
+
+/// Rows in the columns that were told before: the plan's, which may differ from those of its run in what may be null.
+pub(super) struct Told(pub(super) SchemaRef);
+
+impl Encode for Told {
+    type Item = RecordBatch;
+
+    fn batch(&mut self, batch: RecordBatch) -> Result<Vec<RecordBatch>, Fault> {
+        let wrong = |e: ArrowError| {
+            eprintln!("an answer does not have the columns that were told: {e}");
+            Fault::Internal
+        };
+        let columns = batch.columns().iter().zip(self.0.fields()).map(|(column, field)| {
+            if column.data_type() == field.data_type() { Ok(column.clone()) } else { cast(column, field.data_type()) }
+        });
+        let columns = columns.collect::<Result<Vec<_>, _>>().map_err(wrong)?;
+        Ok(vec![RecordBatch::try_new(self.0.clone(), columns).map_err(wrong)?])
+    }
+
+    fn end(self) -> Result<Vec<RecordBatch>, Fault> {
+        Ok(Vec::new())
+    }
+}
+
+/// Whether these columns can be told: a placeholder without a value has no type yet.
+pub(super) fn is_settled(schema: &Schema) -> bool {
+    schema.fields().iter().all(|f| *f.data_type() != DataType::Null)
+}
+
+/// The rows of a run.
+pub(super) fn run(schema: SchemaRef, running: Running<RecordBatch>) -> Response<Data> {
+    let batches = stream::try_unfold(running, |mut running| async move {
+        match running.next().await {
+            Ok(Some(batch)) => Ok(Some((batch, running))),
+            Ok(None) => Ok(None),
+            Err(fault) => Err(FlightError::Tonic(Box::new(status(&fault)))),
+        }
+    });
+    send(schema, batches)
+}
+
+/// The rows of a batch.
+pub(super) fn batch(batch: Result<RecordBatch, FlightError>) -> Result<Response<Data>, Status> {
+    let batch = batch.map_err(|e| Status::internal(e.to_string()))?;
+    Ok(send(batch.schema(), stream::iter([Ok(batch)])))
+}
+
+// The encoder cuts batches to 2 MiB, half of what gRPC's clients take by default.
+fn send(
+    schema: SchemaRef,
+    batches: impl Stream<Item = Result<RecordBatch, FlightError>> + Send + 'static,
+) -> Response<Data> {
+    let data = FlightDataEncoderBuilder::new().with_schema(schema).build(batches);
+    Response::new(data.map_err(Status::from).boxed())
+}
+
+/// Where an answer is fetched.
+pub(super) fn info(
+    schema: Option<&Schema>,
+    ticket: &impl ProstMessageExt,
+    descriptor: FlightDescriptor,
+) -> Result<Response<FlightInfo>, Status> {
+    let ticket = Ticket { ticket: ticket.as_any().encode_to_vec().into() };
+    let info = FlightInfo::new().with_endpoint(FlightEndpoint::new().with_ticket(ticket)).with_descriptor(descriptor);
+    Ok(Response::new(match schema {
+        Some(schema) => info.try_with_schema(schema).map_err(|e| Status::internal(e.to_string()))?,
+        None => info,
+    }))
+}
+
+/// Columns as a message.
+pub(super) fn schema_bytes(schema: &Schema) -> Result<Bytes, Status> {
+    let options = IpcWriteOptions::default();
+    let message: Result<IpcMessage, ArrowError> = SchemaAsIpc::new(schema, &options).try_into();
+    message.map(|m| m.0).map_err(|e| Status::internal(e.to_string()))
+}
+
+/// Columns, shared.
+pub(super) fn shared(schema: Schema) -> SchemaRef {
+    Arc::new(schema)
+}

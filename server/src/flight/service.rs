@@ -1,0 +1,509 @@
+//! The calls of Flight SQL. Every one of them looks at the token; a ticket is a handle, never a text to run.
+
+use std::pin::Pin;
+use std::sync::Arc;
+use std::time::Instant;
+
+use arrow::datatypes::Schema;
+use arrow_flight::error::FlightError;
+use arrow_flight::flight_service_server::FlightService;
+use arrow_flight::sql::metadata::{SqlInfoData, XdbcTypeInfoData};
+use arrow_flight::sql::server::{FlightSqlService, PeekableFlightDataStream};
+use arrow_flight::sql::{
+    ActionBeginTransactionRequest, ActionBeginTransactionResult, ActionCancelQueryRequest, ActionCancelQueryResult,
+    ActionClosePreparedStatementRequest, ActionCreatePreparedStatementRequest, ActionCreatePreparedStatementResult,
+    Any, CommandGetCatalogs, CommandGetCrossReference, CommandGetDbSchemas, CommandGetExportedKeys,
+    CommandGetImportedKeys, CommandGetPrimaryKeys, CommandGetSqlInfo, CommandGetTableTypes, CommandGetTables,
+    CommandGetXdbcTypeInfo, CommandPreparedStatementQuery, CommandPreparedStatementUpdate, CommandStatementIngest,
+    CommandStatementQuery, CommandStatementUpdate, DoPutPreparedStatementResult, SqlInfo, TicketStatementQuery,
+};
+use arrow_flight::{
+    Action, CancelFlightInfoRequest, CancelFlightInfoResult, CancelStatus, FlightDescriptor, FlightInfo,
+    HandshakeRequest, HandshakeResponse, Ticket,
+};
+use bytes::Bytes;
+use datafusion::common::{ParamValues, ScalarValue};
+use echolake_query::{Client, Error as QueryError, Prepared, Session};
+use futures::{Stream, StreamExt as _, stream};
+use prost::Message as _;
+use tonic::metadata::MetadataValue;
+use tonic::{Request, Response, Status, Streaming};
+
+use super::answer::{self, Data, Told, is_settled};
+use super::statements::{Statement, Statements};
+use super::status::status;
+use super::{info, values};
+use crate::fault::Fault;
+use crate::metrics::Protocol;
+use crate::running::Stop;
+use crate::service::{CATALOG, FRESH, Job, SCHEMA, Service, Work};
+use crate::tokens::{Scope, of_header};
+
+/// The action that ends a query by what GetFlightInfo gave.
+const CANCEL_FLIGHT_INFO: &str = "CancelFlightInfo";
+/// `ActionCancelQueryResult.CancelResult.CANCEL_RESULT_CANCELLED`, which the crate keeps to itself.
+const CANCELLED: i32 = 1;
+/// The only kind of table.
+const TABLE: &str = "TABLE";
+
+/// Flight SQL on the shared service.
+pub(super) struct Flight {
+    service: Service,
+    statements: Statements,
+    sql_info: SqlInfoData,
+    types: XdbcTypeInfoData,
+}
+
+impl Flight {
+    pub(super) fn new(service: Service) -> Result<Self, FlightError> {
+        Ok(Self { service, statements: Statements::default(), sql_info: info::sql_info()?, types: info::types()? })
+    }
+
+    fn client<T>(&self, request: &Request<T>) -> Result<Arc<Client>, Status> {
+        let header = request.metadata().get("authorization").and_then(|v| v.to_str().ok());
+        let client = self.service.access().client(header.and_then(of_header).as_deref(), Scope::Sql);
+        client.map_err(|fault| {
+            self.service.metrics().failed(fault.code());
+            status(&fault)
+        })
+    }
+
+    async fn plan(&self, client: &Arc<Client>, sql: String) -> Result<Statement, Status> {
+        let (session, sql): (_, Arc<str>) = (Arc::new(self.service.session(client)), sql.into());
+        let prepared = self.prepare(&session, &sql).await?;
+        let values = ParamValues::from(Vec::<ScalarValue>::new());
+        let (schema, planned) = (prepared.schema(), Instant::now());
+        Ok(Statement { session, sql, prepared, planned, schema, values, stop: Stop::new() })
+    }
+
+    async fn prepare(&self, session: &Arc<Session>, sql: &Arc<str>) -> Result<Arc<Prepared>, Status> {
+        let (planner, sql) = (session.clone(), sql.clone());
+        let planned = self.service.plan(async move { Ok(planner.prepare(&sql).await?) }).await;
+        Ok(Arc::new(planned.map_err(|f| status(&f))?))
+    }
+
+    // A statement of a client's handle, for a run of its own on today's lake.
+    async fn prepared(&self, client: &Client, handle: &[u8]) -> Result<Statement, Status> {
+        let found = self.statements.find(client.name(), handle).map_err(|f| status(&f))?;
+        let mut statement = Statement { stop: Stop::new(), ..found };
+        if statement.planned.elapsed() >= FRESH {
+            statement.prepared = self.prepare(&statement.session, &statement.sql).await?;
+            statement.planned = Instant::now();
+        }
+        Ok(statement)
+    }
+
+    // A ticket of its own for each run, so that binding other values meanwhile does not change it.
+    fn ticket(&self, statement: Statement, descriptor: FlightDescriptor) -> Result<Response<FlightInfo>, Status> {
+        let schema = statement.schema.clone();
+        let handle = self.statements.keep(statement).map_err(|f| status(&f))?;
+        let ticket = TicketStatementQuery { statement_handle: handle };
+        answer::info(is_settled(&schema).then_some(schema.as_ref()), &ticket, descriptor)
+    }
+
+    async fn run(&self, statement: Statement) -> Result<Response<Data>, Status> {
+        let told = is_settled(&statement.schema).then(|| statement.schema.clone());
+        let job = Job {
+            protocol: Protocol::FlightSql,
+            session: statement.session,
+            work: Work::Prepared(statement.prepared, statement.values),
+            limit: None,
+            stop: statement.stop,
+        };
+        let given = told.clone();
+        let begun = self.service.begin(job, move |schema| Ok(Told(given.unwrap_or_else(|| schema.clone())))).await;
+        let running = begun.map_err(|f| status(&f))?;
+        Ok(answer::run(told.unwrap_or_else(|| running.schema.clone()), running))
+    }
+
+    fn cancel(&self, client: &Client, info: &FlightInfo) -> Result<(), Status> {
+        for endpoint in &info.endpoint {
+            let ticket = endpoint.ticket.as_ref().map(|t| t.ticket.clone()).unwrap_or_default();
+            let handle = Any::decode(ticket).ok().and_then(|any| any.unpack::<TicketStatementQuery>().ok().flatten());
+            let handle = handle.ok_or_else(|| Status::invalid_argument("this ticket is of no query"))?;
+            let found = self.statements.find(client.name(), &handle.statement_handle);
+            found.map_err(|f| status(&f))?.stop.stop();
+        }
+        Ok(())
+    }
+}
+
+fn read_only() -> Status {
+    status(&Fault::Query(QueryError::NotReading { statement: "an update".to_owned() }))
+}
+
+fn batch_info<T: arrow_flight::sql::ProstMessageExt>(
+    query: &T,
+    schema: &Schema,
+    request: Request<FlightDescriptor>,
+) -> Result<Response<FlightInfo>, Status> {
+    answer::info(Some(schema), query, request.into_inner())
+}
+
+// Nothing in a lake is declared a key.
+fn no_keys() -> Result<Response<Data>, Status> {
+    answer::batch(Ok(arrow::array::RecordBatch::new_empty(answer::shared(info::key_schema()))))
+}
+
+#[tonic::async_trait]
+impl FlightSqlService for Flight {
+    type FlightService = Self;
+
+    // What a driver does with a user and password: the password is the token, and becomes the bearer's.
+    async fn do_handshake(
+        &self,
+        request: Request<Streaming<HandshakeRequest>>,
+    ) -> Result<Response<Pin<Box<dyn Stream<Item = Result<HandshakeResponse, Status>> + Send>>>, Status> {
+        self.client(&request)?;
+        let token = request.metadata().get("authorization").and_then(|v| v.to_str().ok()).and_then(of_header);
+        let token = token.unwrap_or_default();
+        let payload = Bytes::from(token.clone().into_bytes());
+        let mut response =
+            Response::new(stream::iter([Ok(HandshakeResponse { protocol_version: 0, payload })]).boxed());
+        if let Ok(value) = MetadataValue::try_from(format!("Bearer {token}")) {
+            response.metadata_mut().insert("authorization", value);
+        }
+        Ok(response)
+    }
+
+    async fn get_flight_info_statement(
+        &self,
+        query: CommandStatementQuery,
+        request: Request<FlightDescriptor>,
+    ) -> Result<Response<FlightInfo>, Status> {
+        let client = self.client(&request)?;
+        let statement = self.plan(&client, query.query).await?;
+        self.ticket(statement, request.into_inner())
+    }
+
+    async fn do_get_statement(
+        &self,
+        ticket: TicketStatementQuery,
+        request: Request<Ticket>,
+    ) -> Result<Response<<Self as FlightService>::DoGetStream>, Status> {
+        let client = self.client(&request)?;
+        let found = self.statements.find(client.name(), &ticket.statement_handle);
+        self.run(found.map_err(|f| status(&f))?).await
+    }
+
+    async fn do_action_create_prepared_statement(
+        &self,
+        query: ActionCreatePreparedStatementRequest,
+        request: Request<Action>,
+    ) -> Result<ActionCreatePreparedStatementResult, Status> {
+        let client = self.client(&request)?;
+        let statement = self.plan(&client, query.query).await?;
+        let parameters = values::parameter_schema(&statement.prepared).map_err(|f| status(&f))?;
+        let dataset_schema = match is_settled(&statement.schema) {
+            true => answer::schema_bytes(&statement.schema)?,
+            false => Bytes::new(),
+        };
+        Ok(ActionCreatePreparedStatementResult {
+            dataset_schema,
+            parameter_schema: answer::schema_bytes(&parameters)?,
+            prepared_statement_handle: self.statements.keep(statement).map_err(|f| status(&f))?,
+        })
+    }
+
+    async fn do_put_prepared_statement_query(
+        &self,
+        query: CommandPreparedStatementQuery,
+        request: Request<PeekableFlightDataStream>,
+    ) -> Result<DoPutPreparedStatementResult, Status> {
+        let client = self.client(&request)?;
+        let handle = query.prepared_statement_handle;
+        let statement = self.statements.find(client.name(), &handle).map_err(|f| status(&f))?;
+        let values = values::read(request.into_inner(), &statement.prepared).await.map_err(|f| status(&f))?;
+        self.statements.bind(client.name(), &handle, values).map_err(|f| status(&f))?;
+        Ok(DoPutPreparedStatementResult { prepared_statement_handle: Some(handle) })
+    }
+
+    async fn get_flight_info_prepared_statement(
+        &self,
+        query: CommandPreparedStatementQuery,
+        request: Request<FlightDescriptor>,
+    ) -> Result<Response<FlightInfo>, Status> {
+        let client = self.client(&request)?;
+        let statement = self.prepared(&client, &query.prepared_statement_handle).await?;
+        self.ticket(statement, request.into_inner())
+    }
+
+    async fn do_get_prepared_statement(
+        &self,
+        query: CommandPreparedStatementQuery,
+        request: Request<Ticket>,
+    ) -> Result<Response<<Self as FlightService>::DoGetStream>, Status> {
+        let client = self.client(&request)?;
+        let statement = self.prepared(&client, &query.prepared_statement_handle).await?;
+        self.run(statement).await
+    }
+
+    async fn do_action_close_prepared_statement(
+        &self,
+        query: ActionClosePreparedStatementRequest,
+        request: Request<Action>,
+    ) -> Result<(), Status> {
+        let client = self.client(&request)?;
+        self.statements.forget(client.name(), &query.prepared_statement_handle);
+        Ok(())
+    }
+
+    async fn do_action_cancel_query(
+        &self,
+        query: ActionCancelQueryRequest,
+        request: Request<Action>,
+    ) -> Result<ActionCancelQueryResult, Status> {
+        let client = self.client(&request)?;
+        let info = FlightInfo::decode(query.info).map_err(|e| Status::invalid_argument(e.to_string()))?;
+        self.cancel(&client, &info)?;
+        Ok(ActionCancelQueryResult { result: CANCELLED })
+    }
+
+    async fn do_action_fallback(
+        &self,
+        request: Request<Action>,
+    ) -> Result<Response<<Self as FlightService>::DoActionStream>, Status> {
+        let client = self.client(&request)?;
+        let action = request.into_inner();
+        if action.r#type != CANCEL_FLIGHT_INFO {
+            return Err(status(&Fault::unsupported(format!("the action `{}`", action.r#type))));
+        }
+        let asked =
+            CancelFlightInfoRequest::decode(action.body).map_err(|e| Status::invalid_argument(e.to_string()))?;
+        let info = asked.info.ok_or_else(|| Status::invalid_argument("no FlightInfo to cancel"))?;
+        self.cancel(&client, &info)?;
+        let body = CancelFlightInfoResult::new(CancelStatus::Cancelled).encode_to_vec().into();
+        Ok(Response::new(stream::iter([Ok(arrow_flight::Result { body })]).boxed()))
+    }
+
+    async fn get_flight_info_catalogs(
+        &self,
+        query: CommandGetCatalogs,
+        request: Request<FlightDescriptor>,
+    ) -> Result<Response<FlightInfo>, Status> {
+        self.client(&request)?;
+        batch_info(&query, &query.into_builder().schema(), request)
+    }
+
+    async fn do_get_catalogs(
+        &self,
+        query: CommandGetCatalogs,
+        request: Request<Ticket>,
+    ) -> Result<Response<<Self as FlightService>::DoGetStream>, Status> {
+        self.client(&request)?;
+        let mut catalogs = query.into_builder();
+        catalogs.append(CATALOG);
+        answer::batch(catalogs.build())
+    }
+
+    async fn get_flight_info_schemas(
+        &self,
+        query: CommandGetDbSchemas,
+        request: Request<FlightDescriptor>,
+    ) -> Result<Response<FlightInfo>, Status> {
+        self.client(&request)?;
+        batch_info(&query, &query.clone().into_builder().schema(), request)
+    }
+
+    async fn do_get_schemas(
+        &self,
+        query: CommandGetDbSchemas,
+        request: Request<Ticket>,
+    ) -> Result<Response<<Self as FlightService>::DoGetStream>, Status> {
+        self.client(&request)?;
+        let mut schemas = query.into_builder();
+        schemas.append(CATALOG, SCHEMA);
+        answer::batch(schemas.build())
+    }
+
+    async fn get_flight_info_tables(
+        &self,
+        query: CommandGetTables,
+        request: Request<FlightDescriptor>,
+    ) -> Result<Response<FlightInfo>, Status> {
+        self.client(&request)?;
+        batch_info(&query, &query.clone().into_builder().schema(), request)
+    }
+
+    async fn do_get_tables(
+        &self,
+        query: CommandGetTables,
+        request: Request<Ticket>,
+    ) -> Result<Response<<Self as FlightService>::DoGetStream>, Status> {
+        self.client(&request)?;
+        let mut tables = query.into_builder();
+        for (name, schema) in self.service.tables() {
+            tables.append(CATALOG, SCHEMA, name, TABLE, &schema).map_err(|e| Status::internal(e.to_string()))?;
+        }
+        answer::batch(tables.build())
+    }
+
+    async fn get_flight_info_table_types(
+        &self,
+        query: CommandGetTableTypes,
+        request: Request<FlightDescriptor>,
+    ) -> Result<Response<FlightInfo>, Status> {
+        self.client(&request)?;
+        batch_info(&query, &query.into_builder().schema(), request)
+    }
+
+    async fn do_get_table_types(
+        &self,
+        query: CommandGetTableTypes,
+        request: Request<Ticket>,
+    ) -> Result<Response<<Self as FlightService>::DoGetStream>, Status> {
+        self.client(&request)?;
+        let mut kinds = query.into_builder();
+        kinds.append(TABLE);
+        answer::batch(kinds.build())
+    }
+
+    async fn get_flight_info_sql_info(
+        &self,
+        query: CommandGetSqlInfo,
+        request: Request<FlightDescriptor>,
+    ) -> Result<Response<FlightInfo>, Status> {
+        self.client(&request)?;
+        batch_info(&query, &self.sql_info.schema(), request)
+    }
+
+    async fn do_get_sql_info(
+        &self,
+        query: CommandGetSqlInfo,
+        request: Request<Ticket>,
+    ) -> Result<Response<<Self as FlightService>::DoGetStream>, Status> {
+        self.client(&request)?;
+        answer::batch(query.into_builder(&self.sql_info).build())
+    }
+
+    async fn get_flight_info_xdbc_type_info(
+        &self,
+        query: CommandGetXdbcTypeInfo,
+        request: Request<FlightDescriptor>,
+    ) -> Result<Response<FlightInfo>, Status> {
+        self.client(&request)?;
+        batch_info(&query, &self.types.schema(), request)
+    }
+
+    async fn do_get_xdbc_type_info(
+        &self,
+        query: CommandGetXdbcTypeInfo,
+        request: Request<Ticket>,
+    ) -> Result<Response<<Self as FlightService>::DoGetStream>, Status> {
+        self.client(&request)?;
+        answer::batch(query.into_builder(&self.types).build())
+    }
+
+    async fn get_flight_info_primary_keys(
+        &self,
+        query: CommandGetPrimaryKeys,
+        request: Request<FlightDescriptor>,
+    ) -> Result<Response<FlightInfo>, Status> {
+        self.client(&request)?;
+        batch_info(&query, &info::primary_key_schema(), request)
+    }
+
+    async fn do_get_primary_keys(
+        &self,
+        _: CommandGetPrimaryKeys,
+        request: Request<Ticket>,
+    ) -> Result<Response<<Self as FlightService>::DoGetStream>, Status> {
+        self.client(&request)?;
+        answer::batch(Ok(arrow::array::RecordBatch::new_empty(answer::shared(info::primary_key_schema()))))
+    }
+
+    async fn get_flight_info_exported_keys(
+        &self,
+        query: CommandGetExportedKeys,
+        request: Request<FlightDescriptor>,
+    ) -> Result<Response<FlightInfo>, Status> {
+        self.client(&request)?;
+        batch_info(&query, &info::key_schema(), request)
+    }
+
+    async fn do_get_exported_keys(
+        &self,
+        _: CommandGetExportedKeys,
+        request: Request<Ticket>,
+    ) -> Result<Response<<Self as FlightService>::DoGetStream>, Status> {
+        self.client(&request)?;
+        no_keys()
+    }
+
+    async fn get_flight_info_imported_keys(
+        &self,
+        query: CommandGetImportedKeys,
+        request: Request<FlightDescriptor>,
+    ) -> Result<Response<FlightInfo>, Status> {
+        self.client(&request)?;
+        batch_info(&query, &info::key_schema(), request)
+    }
+
+    async fn do_get_imported_keys(
+        &self,
+        _: CommandGetImportedKeys,
+        request: Request<Ticket>,
+    ) -> Result<Response<<Self as FlightService>::DoGetStream>, Status> {
+        self.client(&request)?;
+        no_keys()
+    }
+
+    async fn get_flight_info_cross_reference(
+        &self,
+        query: CommandGetCrossReference,
+        request: Request<FlightDescriptor>,
+    ) -> Result<Response<FlightInfo>, Status> {
+        self.client(&request)?;
+        batch_info(&query, &info::key_schema(), request)
+    }
+
+    async fn do_get_cross_reference(
+        &self,
+        _: CommandGetCrossReference,
+        request: Request<Ticket>,
+    ) -> Result<Response<<Self as FlightService>::DoGetStream>, Status> {
+        self.client(&request)?;
+        no_keys()
+    }
+
+    async fn do_put_statement_update(
+        &self,
+        query: CommandStatementUpdate,
+        request: Request<PeekableFlightDataStream>,
+    ) -> Result<i64, Status> {
+        let client = self.client(&request)?;
+        // What is wrong with the statement itself is worth more than that updates are not for here.
+        self.plan(&client, query.query).await?;
+        Err(read_only())
+    }
+
+    async fn do_put_statement_ingest(
+        &self,
+        _: CommandStatementIngest,
+        request: Request<PeekableFlightDataStream>,
+    ) -> Result<i64, Status> {
+        self.client(&request)?;
+        Err(read_only())
+    }
+
+    async fn do_put_prepared_statement_update(
+        &self,
+        _: CommandPreparedStatementUpdate,
+        request: Request<PeekableFlightDataStream>,
+    ) -> Result<i64, Status> {
+        self.client(&request)?;
+        Err(read_only())
+    }
+
+    async fn do_action_begin_transaction(
+        &self,
+        _: ActionBeginTransactionRequest,
+        request: Request<Action>,
+    ) -> Result<ActionBeginTransactionResult, Status> {
+        self.client(&request)?;
+        Err(status(&Fault::unsupported("a transaction (each query sees one frozen view of the lake)")))
+    }
+
+    // What the server is, is not for others to say.
+    async fn register_sql_info(&self, _: i32, _: &SqlInfo) {}
+}

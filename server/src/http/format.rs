@@ -1,0 +1,136 @@
+//! Which format an answer has, and its bytes.
+
+use std::io::{self, Write};
+use std::mem::take;
+use std::sync::{Arc, Mutex, PoisonError};
+
+use arrow::datatypes::SchemaRef;
+use arrow::record_batch::RecordBatch;
+use bytes::Bytes;
+use echolake_query::output::{AnswerWriter, Format};
+
+use crate::fault::Fault;
+use crate::running::Encode;
+
+/// The formats of answers, each with its media types, the first of them ours.
+const FORMATS: [(Format, &[&str]); 4] = [
+    (Format::Json, &["application/json", "application/*", "*/*"]),
+    (Format::Arrow, &["application/vnd.apache.arrow.stream"]),
+    (Format::Csv, &["text/csv", "text/*"]),
+    (Format::Parquet, &["application/vnd.apache.parquet", "application/x-parquet"]),
+];
+
+/// The format of this name.
+pub(super) fn named(name: &str) -> Result<Format, Fault> {
+    let known = FORMATS.iter().map(|(format, _)| *format);
+    known.clone().find(|f| f.name() == name).ok_or_else(|| {
+        let names: Vec<_> = known.map(Format::name).collect();
+        Fault::request(format!("no format `{name}`; hint: {}", names.join(", ")))
+    })
+}
+
+/// The format that an `Accept` header likes best.
+pub(super) fn accepted(accept: &str) -> Result<Format, Fault> {
+    let mut best: Option<(f32, Format)> = None;
+    for range in accept.split(',') {
+        let mut parts = range.split(';').map(str::trim);
+        let kind = parts.next().unwrap_or_default().to_ascii_lowercase();
+        let quality = parts.find_map(|p| p.strip_prefix("q=")).map_or(1.0, |q| q.parse().unwrap_or(0.0));
+        let known = FORMATS.iter().find(|(_, types)| types.contains(&kind.as_str()));
+        if let Some((format, _)) = known
+            && quality > best.map_or(0.0, |(q, _)| q)
+        {
+            best = Some((quality, *format));
+        }
+    }
+    best.map(|(_, format)| format).ok_or_else(|| {
+        let types: Vec<_> = FORMATS.iter().map(|(_, types)| types[0]).collect();
+        Fault::request(format!("nothing in `Accept: {accept}` can be had; hint: {}", types.join(", ")))
+    })
+}
+
+/// The media type of a format.
+pub(super) fn media_type(format: Format) -> &'static str {
+    FORMATS.iter().find(|(known, _)| *known == format).map_or("application/octet-stream", |(_, types)| types[0])
+}
+
+/// Writes an answer into bytes that are taken as they come.
+pub(super) struct Written {
+    writer: AnswerWriter<Shared>,
+    written: Shared,
+}
+
+#[derive(Clone, Default)]
+struct Shared(Arc<Mutex<Vec<u8>>>);
+
+impl Shared {
+    fn take(&self) -> Vec<Bytes> {
+        let bytes = take(&mut *self.0.lock().unwrap_or_else(PoisonError::into_inner));
+        if bytes.is_empty() { Vec::new() } else { vec![bytes.into()] }
+    }
+}
+
+impl Write for Shared {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner).extend_from_slice(bytes);
+        Ok(bytes.len())
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        Ok(())
+    }
+}
+
+impl Written {
+    /// Begins an answer of this schema.
+    pub(super) fn new(format: Format, schema: &SchemaRef) -> Result<Self, Fault> {
+        let written = Shared::default();
+        Ok(Self { writer: AnswerWriter::new(format, schema, written.clone())?, written })
+    }
+}
+
+impl Encode for Written {
+    type Item = Bytes;
+
+    fn batch(&mut self, batch: RecordBatch) -> Result<Vec<Bytes>, Fault> {
+        self.writer.write(&batch)?;
+        Ok(self.written.take())
+    }
+
+    fn end(self) -> Result<Vec<Bytes>, Fault> {
+        self.writer.finish()?;
+        Ok(self.written.take())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_best_liked_format_is_chosen() {
+        for (accept, expected) in [
+            ("*/*", Some(Format::Json)),
+            ("text/csv", Some(Format::Csv)),
+            ("text/html,application/xhtml+xml,*/*;q=0.8", Some(Format::Json)),
+            ("application/json;q=0.1, application/vnd.apache.arrow.stream", Some(Format::Arrow)),
+            ("text/csv;q=0.5, application/vnd.apache.parquet;q=0.9", Some(Format::Parquet)),
+            ("TEXT/CSV; charset=utf-8", Some(Format::Csv)),
+            ("text/html", None),
+            ("application/json;q=0", None),
+            ("", None),
+        ] {
+            assert_eq!(accepted(accept).ok(), expected, "{accept}");
+        }
+    }
+
+    #[test]
+    fn formats_have_names_and_types() {
+        for (format, types) in FORMATS {
+            assert_eq!(named(format.name()).ok(), Some(format));
+            assert_eq!(media_type(format), types[0]);
+            assert_eq!(accepted(types[0]).ok(), Some(format));
+        }
+        assert!(named("table").is_err_and(|e| e.to_string().contains("json, arrow, csv, parquet")));
+    }
+}

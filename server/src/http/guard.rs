@@ -1,0 +1,159 @@
+//! Who may speak HTTP to the server: holders of a token, or, where none are set, this machine's own programs and
+//! pages. A browser lets every page of the web send requests to loopback, and a name that its owner points there
+//! (DNS rebinding) lets it read the answers too; so without tokens `Host` and `Origin` must be this machine's.
+
+use std::net::IpAddr;
+use std::sync::Arc;
+
+use axum::extract::{FromRequestParts, Request, State};
+use axum::http::request::Parts;
+use axum::http::{HeaderMap, HeaderName, HeaderValue, header};
+use axum::middleware::Next;
+use axum::response::{IntoResponse as _, Response};
+use echolake_query::Client;
+
+use super::problem::Problem;
+use crate::fault::Fault;
+use crate::service::Service;
+use crate::tokens::{Scope, of_header};
+
+const FETCH_SITE: HeaderName = HeaderName::from_static("sec-fetch-site");
+
+/// Whoever may ask in SQL.
+pub(super) struct MayQuery(pub(super) Arc<Client>);
+/// Whoever may see the server's figures.
+pub(super) struct MaySeeMetrics;
+
+fn client(service: &Service, headers: &HeaderMap, scope: Scope) -> Result<Arc<Client>, Problem> {
+    let token = headers.get(header::AUTHORIZATION).and_then(|v| v.to_str().ok()).and_then(of_header);
+    let client = service.access().client(token.as_deref(), scope);
+    Ok(client.inspect_err(|fault| service.metrics().failed(fault.code()))?)
+}
+
+impl FromRequestParts<Service> for MayQuery {
+    type Rejection = Problem;
+
+    async fn from_request_parts(parts: &mut Parts, service: &Service) -> Result<Self, Problem> {
+        client(service, &parts.headers, Scope::Sql).map(Self)
+    }
+}
+
+impl FromRequestParts<Service> for MaySeeMetrics {
+    type Rejection = Problem;
+
+    async fn from_request_parts(parts: &mut Parts, service: &Service) -> Result<Self, Problem> {
+        client(service, &parts.headers, Scope::Metrics).map(|_| Self)
+    }
+}
+
+/// Lets no page of elsewhere through.
+pub(super) async fn own_pages_only(State(service): State<Service>, request: Request, next: Next) -> Response {
+    // With tokens there is nothing that a page could use without having one.
+    if service.access().is_open()
+        && let Err(fault) = is_own(&request)
+    {
+        service.metrics().failed(fault.code());
+        return Problem(fault).into_response();
+    }
+    next.run(request).await
+}
+
+fn is_own(request: &Request) -> Result<(), Fault> {
+    let headers = request.headers();
+    let text = |name: &HeaderName| headers.get(name).map(|v| String::from_utf8_lossy(v.as_bytes()).into_owned());
+    // HTTP/1.1 wants one Host; with two, they who check and they who route may look at different ones.
+    let host = match (headers.get_all(header::HOST).iter().count(), text(&header::HOST)) {
+        (1, Some(host)) => host,
+        (_, host) => return Err(Fault::Foreign { what: "host", found: host.unwrap_or_default() }),
+    };
+    if !is_local(&host) {
+        return Err(Fault::Foreign { what: "host", found: host });
+    }
+    if let Some(origin) = text(&header::ORIGIN)
+        && origin.strip_prefix("http://") != Some(&host)
+    {
+        return Err(Fault::Foreign { what: "origin", found: origin });
+    }
+    match text(&FETCH_SITE) {
+        Some(site) if site != "same-origin" && site != "none" => Err(Fault::Foreign { what: "site", found: site }),
+        _ => Ok(()),
+    }
+}
+
+// A name or address that cannot be another machine's.
+fn is_local(host: &str) -> bool {
+    let name = match host.strip_prefix('[') {
+        Some(rest) => rest.split(']').next().unwrap_or_default(),
+        None => host.rsplit_once(':').map_or(host, |(name, _)| name),
+    };
+    name.eq_ignore_ascii_case("localhost") || name.parse::<IpAddr>().is_ok_and(|ip| ip.is_loopback())
+}
+
+/// What every answer says to browsers, unless its route knows better.
+pub(super) async fn security_headers(mut response: Response) -> Response {
+    let headers = response.headers_mut();
+    for (name, value) in [
+        (header::X_CONTENT_TYPE_OPTIONS, "nosniff"),
+        (header::X_FRAME_OPTIONS, "DENY"),
+        (header::REFERRER_POLICY, "no-referrer"),
+        (header::CONTENT_SECURITY_POLICY, "default-src 'none'; frame-ancestors 'none'"),
+        (HeaderName::from_static("cross-origin-resource-policy"), "same-origin"),
+        (header::CACHE_CONTROL, "no-store"),
+    ] {
+        headers.entry(name).or_insert(HeaderValue::from_static(value));
+    }
+    response
+}
+
+#[cfg(test)]
+mod tests {
+    use axum::body::Body;
+
+    use super::*;
+
+    #[test]
+    fn only_this_machine_is_local() {
+        for (host, local) in [
+            ("localhost", true),
+            ("LOCALHOST:8080", true),
+            ("127.0.0.1:8080", true),
+            ("127.9.9.9", true),
+            ("[::1]:8080", true),
+            ("[::1]", true),
+            ("evil.example", false),
+            ("localhost.evil.example", false),
+            ("127.0.0.1.evil.example:8080", false),
+            ("192.168.1.2", false),
+            ("[fe80::1]:80", false),
+            ("0.0.0.0", false),
+            ("", false),
+            ("localhost@evil.example", false),
+        ] {
+            assert_eq!(is_local(host), local, "{host}");
+        }
+    }
+
+    #[test]
+    fn pages_of_elsewhere_are_refused() {
+        let check = |headers: &[(&str, &str)]| {
+            let request = headers.iter().fold(Request::builder(), |r, (name, value)| r.header(*name, *value));
+            is_own(&request.body(Body::empty()).expect("a request")).is_ok()
+        };
+        let own = ("host", "localhost:8080");
+        assert!(check(&[own]));
+        assert!(check(&[own, ("origin", "http://localhost:8080"), ("sec-fetch-site", "same-origin")]));
+        for foreign in [
+            &[("host", "evil.example")][..],
+            &[],
+            &[own, ("host", "evil.example")],
+            &[own, ("origin", "http://evil.example")],
+            &[own, ("origin", "https://localhost:8080")],
+            &[own, ("origin", "http://localhost:9090")],
+            &[own, ("origin", "null")],
+            &[own, ("sec-fetch-site", "cross-site")],
+            &[own, ("sec-fetch-site", "same-site")],
+        ] {
+            assert!(!check(foreign), "{foreign:?}");
+        }
+    }
+}

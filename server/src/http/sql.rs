@@ -1,0 +1,104 @@
+//! `POST /api/v1/sql`: a query, its answer as it comes.
+
+use std::sync::Arc;
+
+use axum::body::Body;
+use axum::extract::rejection::{BytesRejection, QueryRejection};
+use axum::extract::{Query, State};
+use axum::http::{HeaderMap, StatusCode, header};
+use axum::response::{IntoResponse as _, Response};
+use bytes::Bytes;
+use echolake_query::output::Format;
+use futures::stream;
+use serde::Deserialize;
+
+use super::format::{Written, accepted, media_type, named};
+use super::guard::MayQuery;
+use super::problem::Problem;
+use crate::fault::Fault;
+use crate::metrics::Protocol;
+use crate::running::{Running, Stop};
+use crate::service::{Job, Service, Work};
+
+/// Bytes of a request, axum's own limit.
+const LARGEST: usize = 2 << 20;
+
+/// What stands behind the path's `?`.
+#[derive(Deserialize)]
+pub(super) struct Params {
+    format: Option<String>,
+}
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Asked {
+    query: String,
+    format: Option<String>,
+}
+
+/// Answers a query.
+pub(super) async fn post(
+    State(service): State<Service>,
+    MayQuery(client): MayQuery,
+    params: Result<Query<Params>, QueryRejection>,
+    headers: HeaderMap,
+    body: Result<Bytes, BytesRejection>,
+) -> Result<Response, Problem> {
+    let Query(params) = params.map_err(|_| Fault::request("the path's parameters are not right; hint: ?format=csv"))?;
+    let asked = asked(&headers, &whole(body)?)?;
+    let format = format(&headers, params.format.or(asked.format))?;
+    let job = Job {
+        protocol: Protocol::Http,
+        session: Arc::new(service.session(&client)),
+        work: Work::Sql(asked.query),
+        limit: None,
+        stop: Stop::new(),
+    };
+    let mut running = service.begin(job, move |schema| Written::new(format, schema)).await?;
+    // A query that fails at once still has a status to say so with.
+    let first = running.next().await?;
+    let headers = [(header::CONTENT_TYPE, media_type(format))];
+    Ok((headers, Body::from_stream(rest(first, running))).into_response())
+}
+
+// An error on the way breaks the connection off: a short answer would look like a whole one.
+fn rest(first: Option<Bytes>, running: Running<Bytes>) -> impl stream::Stream<Item = Result<Bytes, Fault>> + Send {
+    stream::try_unfold((first, running), |(first, mut running)| async move {
+        let part = match first {
+            Some(part) => Some(part),
+            None => running.next().await?,
+        };
+        Ok(part.map(|part| (part, (None, running))))
+    })
+}
+
+fn whole(body: Result<Bytes, BytesRejection>) -> Result<Bytes, Fault> {
+    body.map_err(|rejection| match rejection.status() {
+        StatusCode::PAYLOAD_TOO_LARGE => Fault::TooLarge { limit: LARGEST },
+        _ => Fault::request("the request's body did not come whole"),
+    })
+}
+
+fn asked(headers: &HeaderMap, body: &[u8]) -> Result<Asked, Fault> {
+    let kind = headers.get(header::CONTENT_TYPE).and_then(|v| v.to_str().ok()).unwrap_or_default();
+    match kind.split(';').next().unwrap_or_default().trim().to_ascii_lowercase().as_str() {
+        "application/json" => serde_json::from_slice(body).map_err(|e| {
+            Fault::request(format!("the body is not as expected: {e}; hint: {{\"query\": \"select 1\"}}"))
+        }),
+        "text/plain" | "application/sql" => match std::str::from_utf8(body) {
+            Ok(query) => Ok(Asked { query: query.to_owned(), format: None }),
+            Err(_) => Err(Fault::request("the query is not UTF-8")),
+        },
+        other => Err(Fault::request(format!(
+            "a query does not come as `{other}`; hint: Content-Type application/json, application/sql or text/plain"
+        ))),
+    }
+}
+
+fn format(headers: &HeaderMap, name: Option<String>) -> Result<Format, Fault> {
+    match (name, headers.get(header::ACCEPT).and_then(|v| v.to_str().ok())) {
+        (Some(name), _) => named(&name),
+        (None, Some(accept)) => accepted(accept),
+        (None, None) => Ok(Format::Json),
+    }
+}

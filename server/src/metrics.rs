@@ -1,0 +1,151 @@
+//! Figures of the server, in Prometheus' text format.
+
+use std::fmt::Write as _;
+use std::sync::atomic::{AtomicI64, AtomicU64, Ordering};
+use std::time::{Duration, Instant};
+
+use crate::fault::Code;
+
+/// How a query came.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Protocol {
+    Http,
+    FlightSql,
+    Postgres,
+}
+
+impl Protocol {
+    const ALL: [Self; 3] = [Self::Http, Self::FlightSql, Self::Postgres];
+
+    fn name(self) -> &'static str {
+        match self {
+            Self::Http => "http",
+            Self::FlightSql => "flight_sql",
+            Self::Postgres => "postgres",
+        }
+    }
+}
+
+/// Upper bounds of the buckets of a query's time, in milliseconds.
+const BUCKETS: [u64; 7] = [3, 10, 30, 100, 300, 1_000, 10_000];
+
+/// Counters since the start.
+#[derive(Default)]
+pub(crate) struct Metrics {
+    queries: [AtomicU64; Protocol::ALL.len()],
+    failures: [AtomicU64; Code::ALL.len()],
+    rows: AtomicU64,
+    running: AtomicI64,
+    micros: AtomicU64,
+    finished: AtomicU64,
+    buckets: [AtomicU64; BUCKETS.len()],
+}
+
+/// A query that runs; dropping it counts its time.
+pub(crate) struct Timed<'a> {
+    metrics: &'a Metrics,
+    begun: Instant,
+}
+
+impl Drop for Timed<'_> {
+    fn drop(&mut self) {
+        self.metrics.running.fetch_sub(1, Ordering::Relaxed);
+        self.metrics.took(self.begun.elapsed());
+    }
+}
+
+impl Metrics {
+    /// A query begins.
+    pub(crate) fn begin(&self, protocol: Protocol) -> Timed<'_> {
+        self.queries[protocol as usize].fetch_add(1, Ordering::Relaxed);
+        self.running.fetch_add(1, Ordering::Relaxed);
+        Timed { metrics: self, begun: Instant::now() }
+    }
+
+    /// It gave rows.
+    pub(crate) fn rows(&self, rows: usize) {
+        self.rows.fetch_add(rows as u64, Ordering::Relaxed);
+    }
+
+    /// A request failed.
+    pub(crate) fn failed(&self, code: Code) {
+        self.failures[code as usize].fetch_add(1, Ordering::Relaxed);
+    }
+
+    fn took(&self, time: Duration) {
+        self.finished.fetch_add(1, Ordering::Relaxed);
+        self.micros.fetch_add(time.as_micros() as u64, Ordering::Relaxed);
+        for (bound, count) in BUCKETS.iter().zip(&self.buckets) {
+            if time <= Duration::from_millis(*bound) {
+                count.fetch_add(1, Ordering::Relaxed);
+            }
+        }
+    }
+
+    /// All of it.
+    pub(crate) fn text(&self) -> String {
+        let mut text = String::new();
+        let get = |counter: &AtomicU64| counter.load(Ordering::Relaxed);
+        let mut family = |name: &str, kind: &str, help: &str, lines: &[(String, String)]| {
+            let _ = writeln!(text, "# HELP {name} {help}\n# TYPE {name} {kind}");
+            for (suffix, value) in lines {
+                let _ = writeln!(text, "{name}{suffix} {value}");
+            }
+        };
+        let by_protocol = Protocol::ALL
+            .map(|p| (format!("{{protocol=\"{}\"}}", p.name()), get(&self.queries[p as usize]).to_string()));
+        family("echolake_queries_total", "counter", "Queries that were begun.", &by_protocol);
+        let by_code =
+            Code::ALL.map(|c| (format!("{{code=\"{}\"}}", c.name()), get(&self.failures[c as usize]).to_string()));
+        family("echolake_failures_total", "counter", "Requests that failed.", &by_code);
+        let plain = |value: String| [(String::new(), value)];
+        family("echolake_rows_total", "counter", "Rows of all answers.", &plain(get(&self.rows).to_string()));
+        let running = self.running.load(Ordering::Relaxed).to_string();
+        family("echolake_running_queries", "gauge", "Queries that run now.", &plain(running));
+        let mut seconds: Vec<_> = BUCKETS
+            .iter()
+            .zip(&self.buckets)
+            .map(|(bound, count)| (format!("_bucket{{le=\"{}\"}}", *bound as f64 / 1e3), get(count).to_string()))
+            .collect();
+        let finished = get(&self.finished).to_string();
+        seconds.push(("_bucket{le=\"+Inf\"}".to_owned(), finished.clone()));
+        seconds.push(("_sum".to_owned(), (get(&self.micros) as f64 / 1e6).to_string()));
+        seconds.push(("_count".to_owned(), finished));
+        family("echolake_query_seconds", "histogram", "Time of a query, to its last row sent.", &seconds);
+        text
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_happened_is_counted() {
+        let metrics = Metrics::default();
+        let timed = metrics.begin(Protocol::Postgres);
+        metrics.rows(3);
+        metrics.failed(Code::ReadOnly);
+        let text = metrics.text();
+        for line in [
+            "echolake_queries_total{protocol=\"postgres\"} 1",
+            "echolake_queries_total{protocol=\"http\"} 0",
+            "echolake_failures_total{code=\"read_only\"} 1",
+            "echolake_rows_total 3",
+            "echolake_running_queries 1",
+            "echolake_query_seconds_count 0",
+        ] {
+            assert!(text.lines().any(|l| l == line), "{line} in {text}");
+        }
+        drop(timed);
+        let text = metrics.text();
+        assert!(text.contains("echolake_running_queries 0\n") && text.contains("_bucket{le=\"+Inf\"} 1\n"), "{text}");
+    }
+
+    #[test]
+    fn counters_stand_where_their_code_says() {
+        for (i, code) in Code::ALL.into_iter().enumerate() {
+            assert_eq!(code as usize, i, "{}", code.name());
+        }
+    }
+}

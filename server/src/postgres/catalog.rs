@@ -1,0 +1,205 @@
+//! The lake as `pg_catalog` shows it: one for all connections, so that the numbers of tables stay the same from one
+//! question of a client to the next.
+
+use std::collections::{BTreeMap, HashMap};
+use std::sync::Arc;
+
+use arrow::array::AsArray as _;
+use arrow::compute::cast;
+use arrow::datatypes::{DataType, Field, Int32Type, Schema, SchemaRef};
+use async_trait::async_trait;
+use datafusion::catalog::{MemTable, SchemaProvider, TableProvider};
+use datafusion::common::ScalarValue;
+use datafusion::datasource::{TableType, ViewTable, provider_as_source};
+use datafusion::error::DataFusionError;
+use datafusion::execution::session_state::SessionStateBuilder;
+use datafusion::logical_expr::{LogicalPlanBuilder, ScalarUDF, ident, lit};
+use datafusion::prelude::SessionContext;
+use datafusion_pg_catalog::pg_catalog::catalog_info::CatalogInfo;
+use datafusion_pg_catalog::pg_catalog::context::{PgCatalogContextProvider, Role};
+use datafusion_pg_catalog::pg_catalog::generate_series_arg_coercion::CoerceIntArgsToBigInt;
+use datafusion_pg_catalog::pg_catalog::oid_type_planner::PgOidTypePlanner;
+use datafusion_pg_catalog::pg_catalog::{ArrowTable, PgCatalogSchemaProvider, PgCatalogStaticTables};
+use echolake_query::Extend;
+
+use super::functions;
+use super::rewrite::OWN_TABLES;
+use super::settings::Settings;
+use crate::Error;
+use crate::service::{CATALOG, SCHEMA};
+
+const PG_CATALOG: &str = "pg_catalog";
+const KEYWORDS: &str = "pg_get_keywords";
+/// The only role; `pg_get_userbyid` and `session_user` say the same.
+const ROLE: &str = "postgres";
+
+/// What every session is extended by.
+#[derive(Clone)]
+pub(super) struct PgCatalog {
+    schema: Arc<dyn SchemaProvider>,
+    keywords: Arc<ArrowTable>,
+    functions: Arc<Vec<Arc<ScalarUDF>>>,
+}
+
+impl PgCatalog {
+    /// For a lake of these tables.
+    pub(super) fn new(tables: Vec<(&'static str, SchemaRef)>) -> Result<Self, Error> {
+        let fixed = Arc::new(PgCatalogStaticTables::try_new()?);
+        let keywords = fixed.pg_get_keywords.clone();
+        let names = Names(Arc::new(tables.into_iter().collect()));
+        let mut functions = functions::fixed();
+        functions.push(functions::to_regtype(type_numbers(&fixed.pg_type)?));
+        let schema = Arc::new(Complete(PgCatalogSchemaProvider::try_new(names, fixed, Roles)?));
+        Ok(Self { schema, keywords, functions: Arc::new(functions) })
+    }
+
+    /// For a session of these settings.
+    pub(super) fn extend(&self, settings: &Arc<Settings>) -> Extend {
+        let (pg, own) = (self.clone(), functions::of_settings(settings));
+        Arc::new(move |context| pg.register(context, &own))
+    }
+
+    fn register(&self, context: &SessionContext, own: &[Arc<ScalarUDF>]) -> Result<(), DataFusionError> {
+        let catalog = context.catalog(CATALOG);
+        let missing = || DataFusionError::Internal(format!("no catalogue `{CATALOG}`"));
+        catalog.ok_or_else(missing)?.register_schema(PG_CATALOG, self.schema.clone())?;
+        for function in self.functions.iter().chain(own) {
+            context.register_udf(function.as_ref().clone());
+        }
+        context.register_udtf(KEYWORDS, self.keywords.clone());
+        // Types such as regclass are known to this planner of types.
+        let state = context.state_ref();
+        let known = context.state();
+        *state.write() =
+            SessionStateBuilder::new_from_existing(known).with_type_planner(Arc::new(PgOidTypePlanner)).build();
+        CoerceIntArgsToBigInt::widen(context);
+        Ok(())
+    }
+}
+
+fn type_numbers(types: &ArrowTable) -> Result<HashMap<String, i32>, DataFusionError> {
+    let mut numbers = HashMap::new();
+    for batch in types.data() {
+        let column = |name: &str, kind: &DataType| {
+            let missing = || DataFusionError::Internal(format!("pg_type has no column `{name}`"));
+            Ok::<_, DataFusionError>(cast(batch.column_by_name(name).ok_or_else(missing)?, kind)?)
+        };
+        let (oids, names) = (column("oid", &DataType::Int32)?, column("typname", &DataType::Utf8)?);
+        let names = names.as_string::<i32>().iter().flatten().map(str::to_owned);
+        numbers.extend(names.zip(oids.as_primitive::<Int32Type>().values().iter().copied()));
+    }
+    Ok(numbers)
+}
+
+// The tables of `datafusion-pg-catalog`, and what clients miss in them.
+#[derive(Debug)]
+struct Complete<S>(S);
+
+#[async_trait]
+impl<S: SchemaProvider> SchemaProvider for Complete<S> {
+    fn table_names(&self) -> Vec<String> {
+        let mut names = self.0.table_names();
+        names.extend(OWN_TABLES.map(str::to_owned));
+        names
+    }
+
+    async fn table(&self, name: &str) -> Result<Option<Arc<dyn TableProvider>>, DataFusionError> {
+        match (name, self.0.table(name).await?) {
+            ("pg_indexes", _) => Ok(Some(no_indexes()?)),
+            ("pg_class", Some(table)) => Ok(Some(with_nothing(name, table, &["relacl", "reloptions"])?)),
+            ("pg_attribute", Some(table)) => Ok(Some(with_nothing(name, table, &["attacl"])?)),
+            (_, table) => Ok(table),
+        }
+    }
+
+    fn table_exist(&self, name: &str) -> bool {
+        OWN_TABLES.contains(&name) || self.0.table_exist(name)
+    }
+}
+
+fn no_indexes() -> Result<Arc<dyn TableProvider>, DataFusionError> {
+    let names = ["schemaname", "tablename", "indexname", "tablespace", "indexdef"];
+    let fields = names.map(|name| Field::new(name, DataType::Utf8, true));
+    let schema = Arc::new(Schema::new(fields.to_vec()));
+    Ok(Arc::new(MemTable::try_new(schema, vec![Vec::new()])?))
+}
+
+// Neither tables nor columns have rights or options of their own; clients know these as lists.
+fn with_nothing(
+    name: &str,
+    table: Arc<dyn TableProvider>,
+    lists: &[&str],
+) -> Result<Arc<dyn TableProvider>, DataFusionError> {
+    let nothing = ScalarValue::new_null_list(DataType::Utf8, true, 1);
+    let own = table.schema();
+    let kept = own.fields().iter().filter(|f| !lists.contains(&f.name().as_str())).map(|f| ident(f.name()));
+    let lists = lists.iter().map(|list| lit(nothing.clone()).alias(*list));
+    let plan = LogicalPlanBuilder::scan(name, provider_as_source(table), None)?
+        .project(kept.chain(lists).collect::<Vec<_>>())?
+        .build()?;
+    Ok(Arc::new(ViewTable::new(plan, None)))
+}
+
+// The lake's tables by name.
+#[derive(Debug, Clone)]
+struct Names(Arc<BTreeMap<&'static str, SchemaRef>>);
+
+impl Names {
+    fn find(&self, catalog: &str, schema: &str, table: &str) -> Option<&SchemaRef> {
+        (catalog == CATALOG && schema == SCHEMA).then(|| self.0.get(table)).flatten()
+    }
+}
+
+#[async_trait]
+impl CatalogInfo for Names {
+    async fn catalog_names(&self) -> Result<Vec<String>, DataFusionError> {
+        Ok(vec![CATALOG.to_owned()])
+    }
+
+    async fn schema_names(&self, catalog: &str) -> Result<Option<Vec<String>>, DataFusionError> {
+        let all = || [SCHEMA, PG_CATALOG, "information_schema"].map(str::to_owned).to_vec();
+        Ok((catalog == CATALOG).then(all))
+    }
+
+    async fn table_names(&self, catalog: &str, schema: &str) -> Result<Option<Vec<String>>, DataFusionError> {
+        let is_lake = catalog == CATALOG && schema == SCHEMA;
+        Ok(Some(if is_lake { self.0.keys().map(|name| (*name).to_owned()).collect() } else { Vec::new() }))
+    }
+
+    async fn table_schema(
+        &self,
+        catalog: &str,
+        schema: &str,
+        table: &str,
+    ) -> Result<Option<SchemaRef>, DataFusionError> {
+        Ok(self.find(catalog, schema, table).cloned())
+    }
+
+    async fn table_type(&self, catalog: &str, schema: &str, table: &str) -> Result<Option<TableType>, DataFusionError> {
+        Ok(self.find(catalog, schema, table).map(|_| TableType::Base))
+    }
+}
+
+#[derive(Debug, Clone)]
+struct Roles;
+
+#[async_trait]
+impl PgCatalogContextProvider for Roles {
+    async fn roles(&self) -> Vec<String> {
+        vec![ROLE.to_owned()]
+    }
+
+    async fn role(&self, name: &str) -> Option<Role> {
+        (name == ROLE).then(|| Role {
+            name: ROLE.to_owned(),
+            is_superuser: false,
+            can_login: true,
+            can_create_db: false,
+            can_create_role: false,
+            can_create_user: false,
+            can_replication: false,
+            grants: Vec::new(),
+            inherited_roles: Vec::new(),
+        })
+    }
+}

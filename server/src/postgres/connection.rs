@@ -1,0 +1,280 @@
+//! A connection: its session, settings and cursors, and what runs on it.
+
+use std::collections::{HashMap, HashSet};
+use std::sync::atomic::{AtomicI32, AtomicUsize, Ordering};
+use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
+use std::time::Duration;
+
+use bytes::Bytes;
+use datafusion::common::ParamValues;
+use datafusion_pg_catalog::sql::PostgresCompatibilityParser;
+use echolake_query::{Client, Session};
+use pgwire::api::Type;
+use pgwire::messages::startup::SecretKey;
+use tokio::sync::OwnedSemaphorePermit;
+
+use super::catalog::PgCatalog;
+use super::cursor::Cursor;
+use super::settings::Settings;
+use super::statement::{self, Planned, Statement};
+use crate::Error;
+use crate::fault::Fault;
+use crate::metrics::Protocol;
+use crate::random;
+use crate::running::{Encode, Limit, Running, Stop, ended};
+use crate::service::{FRESH, Job, Service, Work};
+
+/// Cursors of a connection at once.
+const CURSORS: usize = 16;
+/// Prepared statements of a connection at once.
+const STATEMENTS: usize = 500;
+/// How often a server that stops looks whether a connection is done.
+const LOOK: Duration = Duration::from_millis(50);
+
+/// What all connections share.
+pub(super) struct Shared {
+    pub(super) service: Service,
+    pub(super) parser: PostgresCompatibilityParser,
+    pub(super) catalog: PgCatalog,
+    next_pid: AtomicI32,
+    running: Mutex<HashMap<(i32, Bytes), Arc<Mutex<Stop>>>>,
+}
+
+impl Shared {
+    pub(super) fn new(service: Service) -> Result<Self, Error> {
+        let catalog = PgCatalog::new(service.tables())?;
+        let parser = PostgresCompatibilityParser::new();
+        Ok(Self { service, parser, catalog, next_pid: AtomicI32::new(1), running: Mutex::default() })
+    }
+
+    /// Ends what runs on the connection of this key.
+    pub(super) fn cancel(&self, pid: i32, key: &SecretKey) {
+        let found = lock(&self.running).get(&(pid, key.to_bytes())).cloned();
+        if let Some(current) = found {
+            lock(&current).stop();
+        }
+    }
+}
+
+/// A connection.
+pub(super) struct Connection {
+    shared: Arc<Shared>,
+    place: Option<OwnedSemaphorePermit>,
+    session: OnceLock<Arc<Session>>,
+    key: OnceLock<(i32, Bytes)>,
+    current: Arc<Mutex<Stop>>,
+    cursors: Mutex<HashMap<String, Arc<Cursor>>>,
+    statements: Mutex<HashSet<String>>,
+    busy: AtomicUsize,
+    pub(super) settings: Arc<Settings>,
+}
+
+impl Drop for Connection {
+    fn drop(&mut self) {
+        if let Some(key) = self.key.get() {
+            lock(&self.shared.running).remove(key);
+        }
+    }
+}
+
+/// Something that is being done; a server that stops waits for it.
+pub(super) struct Busy<'a>(&'a AtomicUsize);
+
+impl Drop for Busy<'_> {
+    fn drop(&mut self) {
+        self.0.fetch_sub(1, Ordering::Relaxed);
+    }
+}
+
+/// What a command runs under.
+#[derive(Clone)]
+pub(super) struct Run {
+    pub(super) stop: Stop,
+    pub(super) limit: Option<Limit>,
+}
+
+impl Connection {
+    /// A connection that nobody has logged in on; without a place it is one too many.
+    pub(super) fn new(shared: Arc<Shared>, place: Option<OwnedSemaphorePermit>) -> Self {
+        Self {
+            shared,
+            place,
+            session: OnceLock::new(),
+            key: OnceLock::new(),
+            current: Arc::new(Mutex::new(Stop::new())),
+            cursors: Mutex::default(),
+            statements: Mutex::default(),
+            busy: AtomicUsize::new(0),
+            settings: Arc::default(),
+        }
+    }
+
+    pub(super) fn shared(&self) -> &Shared {
+        &self.shared
+    }
+
+    /// Whether there is a place for it.
+    pub(super) fn has_place(&self) -> bool {
+        self.place.is_some()
+    }
+
+    /// Logs a client in; returns what a CancelRequest must show. `wide` keys are of protocol 3.2.
+    pub(super) fn log_in(&self, client: &Arc<Client>, wide: bool) -> Result<(i32, SecretKey), Fault> {
+        let secret: [u8; 32] = random::bytes().map_err(|failed| {
+            eprintln!("no random bytes: {failed}");
+            Fault::Internal
+        })?;
+        let pid = self.shared.next_pid.fetch_add(1, Ordering::Relaxed);
+        let key = match wide {
+            true => SecretKey::Bytes(Bytes::copy_from_slice(&secret)),
+            false => SecretKey::I32(i32::from_be_bytes([secret[0], secret[1], secret[2], secret[3]])),
+        };
+        let session = self.shared.service.session(client).extended(self.shared.catalog.extend(&self.settings));
+        let known = (pid, key.to_bytes());
+        if self.session.set(Arc::new(session)).is_err() || self.key.set(known.clone()).is_err() {
+            return Err(Fault::request("this connection is logged in already"));
+        }
+        lock(&self.shared.running).insert(known, self.current.clone());
+        Ok((pid, key))
+    }
+
+    /// Its session.
+    pub(super) fn session(&self) -> Result<&Arc<Session>, Fault> {
+        self.session.get().ok_or(Fault::Unauthenticated)
+    }
+
+    /// Marks it as doing something.
+    pub(super) fn busy(&self) -> Busy<'_> {
+        self.busy.fetch_add(1, Ordering::Relaxed);
+        Busy(&self.busy)
+    }
+
+    /// Waits until it does nothing.
+    pub(super) async fn idle(&self) {
+        while self.busy.load(Ordering::Relaxed) > 0 {
+            tokio::time::sleep(LOOK).await;
+        }
+    }
+
+    /// Begins a command: a CancelRequest ends this one from now on.
+    pub(super) fn command(&self) -> Run {
+        let stop = Stop::new();
+        *lock(&self.current) = stop.clone();
+        Run { stop, limit: self.settings.statement_timeout().map(Limit::of) }
+    }
+
+    /// Parses and plans.
+    pub(super) async fn statements(
+        &self,
+        sql: &str,
+        types: &[Option<Type>],
+        run: &Run,
+    ) -> Result<Vec<Statement>, Fault> {
+        let (shared, session) = (self.shared.clone(), self.session()?.clone());
+        let (sql, types): (Arc<str>, _) = (sql.into(), types.to_vec());
+        self.planned(run, async move {
+            let mut statements = Vec::new();
+            for parsed in statement::parse(&shared.parser, &session, &sql, &types)? {
+                statements.push(statement::plan(&session, &sql, parsed).await?);
+            }
+            Ok(statements)
+        })
+        .await
+    }
+
+    async fn planned<T: Send + 'static>(
+        &self,
+        run: &Run,
+        work: impl Future<Output = Result<T, Fault>> + Send + 'static,
+    ) -> Result<T, Fault> {
+        tokio::select! {
+            fault = ended(&run.stop, run.limit) => Err(fault),
+            planned = self.shared.service.plan(work) => planned,
+        }
+    }
+
+    /// Runs what was planned, anew where the plan is old.
+    pub(super) async fn run<E: Encode>(
+        &self,
+        run: &Run,
+        planned: &Arc<Planned>,
+        values: ParamValues,
+        encode: impl FnOnce(&arrow::datatypes::SchemaRef) -> Result<E, Fault> + Send + 'static,
+    ) -> Result<Running<E::Item>, Fault> {
+        let session = self.session()?.clone();
+        let prepared = match planned.at.elapsed() < FRESH {
+            true => planned.prepared.clone(),
+            false => {
+                let (planner, old) = (session.clone(), planned.clone());
+                let new = self.planned(run, async move { Ok(old.again(&planner).await?) }).await?;
+                if new.schema() != planned.prepared.schema() {
+                    return Err(Fault::unsupported("a prepared statement whose columns have changed since"));
+                }
+                Arc::new(new)
+            }
+        };
+        let job = Job {
+            protocol: Protocol::Postgres,
+            session,
+            work: Work::Prepared(prepared, values),
+            limit: run.limit,
+            stop: run.stop.clone(),
+        };
+        self.shared.service.begin(job, encode).await
+    }
+
+    /// Counts a prepared statement of this name.
+    pub(super) fn remember(&self, name: &str) -> Result<(), Fault> {
+        let mut statements = lock(&self.statements);
+        if statements.len() >= STATEMENTS && !statements.contains(name) {
+            return Err(Fault::TooMany { what: "prepared statements", limit: STATEMENTS });
+        }
+        statements.insert(name.to_owned());
+        Ok(())
+    }
+
+    /// Counts it no more.
+    pub(super) fn forget(&self, name: &str) {
+        lock(&self.statements).remove(name);
+    }
+
+    /// Keeps a cursor.
+    pub(super) fn declare(&self, name: &str, cursor: Cursor) -> Result<(), Fault> {
+        let mut cursors = lock(&self.cursors);
+        if cursors.contains_key(name) {
+            return Err(Fault::request(format!("cursor \"{name}\" already exists")));
+        }
+        if cursors.len() >= CURSORS {
+            return Err(Fault::TooMany { what: "cursors", limit: CURSORS });
+        }
+        cursors.insert(name.to_owned(), Arc::new(cursor));
+        Ok(())
+    }
+
+    /// A cursor.
+    pub(super) fn cursor(&self, name: &str) -> Result<Arc<Cursor>, Fault> {
+        let missing = || Fault::NotFound { what: format!("cursor \"{name}\""), hint: "DECLARE it first" };
+        lock(&self.cursors).get(name).cloned().ok_or_else(missing)
+    }
+
+    /// Closes a cursor, or all of them.
+    pub(super) fn close(&self, name: Option<&str>) -> Result<(), Fault> {
+        match name {
+            Some(name) => {
+                self.cursor(name)?;
+                lock(&self.cursors).remove(name);
+            }
+            None => lock(&self.cursors).clear(),
+        }
+        Ok(())
+    }
+
+    /// Ends a transaction: the cursors go that are not held.
+    pub(super) fn end_transaction(&self) {
+        lock(&self.cursors).retain(|_, cursor| cursor.held);
+    }
+}
+
+fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}

@@ -1,0 +1,264 @@
+//! The extended way to ask: parse, bind, describe, execute, with values and in parts.
+
+use std::fmt::Debug;
+use std::sync::Arc;
+
+use arrow::datatypes::DataType;
+use arrow_pg::datatypes::df::deserialize_parameters;
+use arrow_pg::datatypes::into_pg_type;
+use async_trait::async_trait;
+use datafusion::common::ParamValues;
+use futures::{Sink, SinkExt as _};
+use pgwire::api::portal::{Format, Portal, PortalExecutionState};
+use pgwire::api::query::{ExtendedQueryHandler, send_describe_response, send_partial_query_response};
+use pgwire::api::results::{DescribePortalResponse, FieldInfo, Response, Tag};
+use pgwire::api::stmt::{QueryParser, StoredStatement};
+use pgwire::api::store::{Entry, PortalStore};
+use pgwire::api::{ClientInfo, ClientPortalStore, DEFAULT_NAME, PgWireConnectionState, Type};
+use pgwire::error::{PgWireError, PgWireResult};
+use pgwire::messages::PgWireBackendMessage;
+use pgwire::messages::extendedquery::{
+    Close, CloseComplete, Describe, Execute, Parse, ParseComplete, Sync as PgSync, TARGET_TYPE_BYTE_PORTAL,
+    TARGET_TYPE_BYTE_STATEMENT,
+};
+use pgwire::messages::response::{EmptyQueryResponse, ReadyForQuery, TransactionStatus};
+
+use super::command::{Reply, act, columns};
+use super::connection::Connection;
+use super::copy;
+use super::rows::fields;
+use super::sqlstate::error;
+use super::statement::Statement;
+use crate::fault::Fault;
+
+/// Answers extended queries.
+pub(super) struct Extended {
+    connection: Arc<Connection>,
+    parser: Arc<Planner>,
+}
+
+impl Extended {
+    pub(super) fn new(connection: Arc<Connection>) -> Self {
+        Self { parser: Arc::new(Planner(connection.clone())), connection }
+    }
+}
+
+/// Plans what is parsed.
+pub(super) struct Planner(Arc<Connection>);
+
+#[async_trait]
+impl QueryParser for Planner {
+    type Statement = Statement;
+
+    async fn parse_sql<C>(&self, _: &C, sql: &str, types: &[Option<Type>]) -> PgWireResult<Option<Statement>>
+    where
+        C: ClientInfo + Unpin + Send + Sync,
+    {
+        let run = self.0.command();
+        let mut statements = self.0.statements(sql, types, &run).await.map_err(|fault| error(&fault))?;
+        match statements.len() {
+            0 | 1 => Ok(statements.pop()),
+            _ => Err(error(&Fault::request("cannot insert multiple commands into a prepared statement"))),
+        }
+    }
+
+    fn get_parameter_types(&self, statement: &Statement) -> PgWireResult<Vec<Type>> {
+        let kinds = kinds(statement).map_err(|fault| error(&fault))?;
+        // Where the query does not tell, Postgres takes a text.
+        let one = |kind: Option<DataType>| kind.map_or(Ok(Type::TEXT), |kind| into_pg_type(&kind));
+        kinds.into_iter().map(one).collect()
+    }
+
+    fn get_result_schema(&self, statement: &Statement, format: Option<&Format>) -> PgWireResult<Vec<FieldInfo>> {
+        let format = format.unwrap_or(&Format::UnifiedText);
+        columns(&self.0, statement, format).map_err(|fault| error(&fault))
+    }
+}
+
+fn kinds(statement: &Statement) -> Result<Vec<Option<DataType>>, Fault> {
+    match statement {
+        Statement::Query(planned) | Statement::Copy(planned, _) | Statement::Declare { planned, .. } => {
+            Ok(planned.prepared.parameters()?)
+        }
+        _ => Ok(Vec::new()),
+    }
+}
+
+fn values(portal: &Portal<Statement>) -> Result<ParamValues, Fault> {
+    let kinds = kinds(&portal.statement.statement)?;
+    let given = portal.parameter_len();
+    if given != kinds.len() {
+        return Err(Fault::request(format!("{given} values for {} placeholders", kinds.len())));
+    }
+    if let Format::Individual(codes) = &portal.parameter_format
+        && codes.len() != given
+    {
+        return Err(Fault::request(format!("{} formats for {given} values", codes.len())));
+    }
+    // Where neither side tells the type, it is the text that was advertised.
+    let kinds: Vec<_> = kinds.into_iter().map(|kind| kind.unwrap_or(DataType::Utf8)).collect();
+    let hints: Vec<_> = kinds.iter().map(Some).collect();
+    deserialize_parameters(portal, &hints).map_err(|e| match e {
+        PgWireError::UserError(info) => Fault::request(info.message.clone()),
+        other => Fault::request(other.to_string()),
+    })
+}
+
+#[async_trait]
+impl ExtendedQueryHandler for Extended {
+    type Statement = Statement;
+    type QueryParser = Planner;
+
+    fn query_parser(&self) -> Arc<Planner> {
+        self.parser.clone()
+    }
+
+    async fn on_parse<C>(&self, client: &mut C, message: Parse) -> PgWireResult<()>
+    where
+        C: ClientInfo + ClientPortalStore + Sink<PgWireBackendMessage> + Unpin + Send + Sync,
+        C::PortalStore: PortalStore<Statement = Statement>,
+        C::Error: Debug,
+        PgWireError: From<<C as Sink<PgWireBackendMessage>>::Error>,
+    {
+        let _busy = self.connection.busy();
+        let name = message.name.clone().unwrap_or_else(|| DEFAULT_NAME.to_owned());
+        self.connection.remember(&name).map_err(|fault| error(&fault))?;
+        match StoredStatement::parse(client, &message, self.parser.clone()).await? {
+            Some(statement) => client.portal_store().put_statement(Arc::new(statement)),
+            None => client.portal_store().put_empty_statement(&name),
+        }
+        client.feed(PgWireBackendMessage::ParseComplete(ParseComplete::new())).await?;
+        Ok(())
+    }
+
+    // The library's own gathers a whole answer before it sends the first row.
+    async fn on_execute<C>(&self, client: &mut C, message: Execute) -> PgWireResult<()>
+    where
+        C: ClientInfo + ClientPortalStore + Sink<PgWireBackendMessage> + Unpin + Send + Sync,
+        C::PortalStore: PortalStore<Statement = Statement>,
+        C::Error: Debug,
+        PgWireError: From<<C as Sink<PgWireBackendMessage>>::Error>,
+    {
+        if !matches!(client.state(), PgWireConnectionState::ReadyForQuery) {
+            return Err(PgWireError::NotReadyForQuery);
+        }
+        let _busy = self.connection.busy();
+        client.set_state(PgWireConnectionState::QueryInProgress);
+        let name = message.name.as_deref().unwrap_or(DEFAULT_NAME);
+        match client.portal_store().get_portal(name) {
+            Some(Entry::Value(portal)) => {
+                let most = usize::try_from(message.max_rows).unwrap_or(0);
+                self.execute(client, &portal, most).await?;
+            }
+            Some(Entry::Empty) => {
+                client.feed(PgWireBackendMessage::EmptyQueryResponse(EmptyQueryResponse::new())).await?;
+            }
+            None => return Err(PgWireError::PortalNotFound(name.to_owned())),
+        }
+        client.set_state(PgWireConnectionState::ReadyForQuery);
+        Ok(())
+    }
+
+    // A cursor can be described by its name, as psycopg does.
+    async fn on_describe<C>(&self, client: &mut C, message: Describe) -> PgWireResult<()>
+    where
+        C: ClientInfo + ClientPortalStore + Sink<PgWireBackendMessage> + Unpin + Send + Sync,
+        C::PortalStore: PortalStore<Statement = Statement>,
+        C::Error: Debug,
+        PgWireError: From<<C as Sink<PgWireBackendMessage>>::Error>,
+    {
+        if let Some(name) = message.name.as_deref().filter(|_| message.target_type == TARGET_TYPE_BYTE_PORTAL)
+            && client.portal_store().get_portal(name).is_none()
+            && let Ok(cursor) = self.connection.cursor(name)
+        {
+            let columns = fields(&cursor.schema, &Format::UnifiedText).map_err(|fault| error(&fault))?;
+            return send_describe_response(client, &DescribePortalResponse::new(columns.to_vec())).await;
+        }
+        self._on_describe(client, message).await
+    }
+
+    // What is not held ends with its transaction, and without one with the next Sync.
+    async fn on_sync<C>(&self, client: &mut C, _: PgSync) -> PgWireResult<()>
+    where
+        C: ClientInfo + ClientPortalStore + Sink<PgWireBackendMessage> + Unpin + Send + Sync,
+        C::PortalStore: PortalStore<Statement = Statement>,
+        C::Error: Debug,
+        PgWireError: From<<C as Sink<PgWireBackendMessage>>::Error>,
+    {
+        let status = client.transaction_status();
+        match status {
+            TransactionStatus::Idle => client.portal_store().clear_portals(),
+            _ => client.portal_store().rm_portal(DEFAULT_NAME),
+        }
+        client.send(PgWireBackendMessage::ReadyForQuery(ReadyForQuery::new(status))).await?;
+        Ok(())
+    }
+
+    async fn on_close<C>(&self, client: &mut C, message: Close) -> PgWireResult<()>
+    where
+        C: ClientInfo + ClientPortalStore + Sink<PgWireBackendMessage> + Unpin + Send + Sync,
+        C::PortalStore: PortalStore<Statement = Statement>,
+        C::Error: Debug,
+        PgWireError: From<<C as Sink<PgWireBackendMessage>>::Error>,
+    {
+        let name = message.name.as_deref().unwrap_or(DEFAULT_NAME);
+        match message.target_type {
+            TARGET_TYPE_BYTE_STATEMENT => {
+                client.portal_store().rm_statement(name);
+                self.connection.forget(name);
+            }
+            _ => client.portal_store().rm_portal(name),
+        }
+        client.feed(PgWireBackendMessage::CloseComplete(CloseComplete::new())).await?;
+        Ok(())
+    }
+
+    async fn do_query<C>(&self, _: &mut C, _: &Portal<Statement>, _: usize) -> PgWireResult<Response>
+    where
+        C: ClientInfo + ClientPortalStore + Sink<PgWireBackendMessage> + Unpin + Send + Sync,
+        C::PortalStore: PortalStore<Statement = Statement>,
+        C::Error: Debug,
+        PgWireError: From<<C as Sink<PgWireBackendMessage>>::Error>,
+    {
+        // `on_execute` does all.
+        Err(PgWireError::NotReadyForQuery)
+    }
+}
+
+impl Extended {
+    async fn execute<C>(&self, client: &mut C, portal: &Portal<Statement>, most: usize) -> PgWireResult<()>
+    where
+        C: ClientInfo + ClientPortalStore + Sink<PgWireBackendMessage> + Unpin + Send + Sync,
+        C::PortalStore: PortalStore<Statement = Statement>,
+        C::Error: Debug,
+        PgWireError: From<<C as Sink<PgWireBackendMessage>>::Error>,
+    {
+        let state = portal.state();
+        let mut state = state.lock().await;
+        if matches!(*state, PortalExecutionState::Initial) {
+            let values = values(portal).map_err(|fault| error(&fault))?;
+            let run = self.connection.command();
+            let statement = &portal.statement.statement;
+            match act(&self.connection, client, &run, statement, values, &portal.result_column_format).await? {
+                Reply::Rows(rows) => *state = PortalExecutionState::Suspended(rows),
+                Reply::Copy(form, running) => return copy::send(client, &form, running).await,
+                Reply::Done(tag) => {
+                    client.feed(PgWireBackendMessage::CommandComplete(tag.into())).await?;
+                    return Ok(());
+                }
+            }
+        }
+        match &mut *state {
+            PortalExecutionState::Suspended(rows) => {
+                if !send_partial_query_response(client, rows, most).await? {
+                    *state = PortalExecutionState::Finished;
+                }
+            }
+            _ => {
+                let tag = Tag::new("SELECT").with_rows(0);
+                client.feed(PgWireBackendMessage::CommandComplete(tag.into())).await?;
+            }
+        }
+        Ok(())
+    }
+}

@@ -1,0 +1,74 @@
+//! The simple way to ask: a text of one or more statements, done one after the other.
+
+use std::fmt::Debug;
+use std::sync::Arc;
+
+use async_trait::async_trait;
+use datafusion::common::{ParamValues, ScalarValue};
+use futures::{Sink, SinkExt as _};
+use pgwire::api::portal::Format;
+use pgwire::api::query::{SimpleQueryHandler, send_query_response, send_ready_for_query};
+use pgwire::api::results::Response;
+use pgwire::api::store::PortalStore;
+use pgwire::api::{ClientInfo, ClientPortalStore, PgWireConnectionState};
+use pgwire::error::{PgWireError, PgWireResult};
+use pgwire::messages::PgWireBackendMessage;
+use pgwire::messages::response::EmptyQueryResponse;
+use pgwire::messages::simplequery::Query;
+
+use super::command::{Reply, act};
+use super::connection::Connection;
+use super::copy;
+use super::sqlstate::error;
+
+/// Answers simple queries.
+pub(super) struct Simple(pub(super) Arc<Connection>);
+
+/// No values.
+pub(super) fn none() -> ParamValues {
+    ParamValues::from(Vec::<ScalarValue>::new())
+}
+
+#[async_trait]
+impl SimpleQueryHandler for Simple {
+    // The library's own plans and begins all statements of a text before the first is answered.
+    async fn on_query<C>(&self, client: &mut C, query: Query) -> PgWireResult<()>
+    where
+        C: ClientInfo + ClientPortalStore + Sink<PgWireBackendMessage> + Unpin + Send + Sync,
+        C::PortalStore: PortalStore,
+        C::Error: Debug,
+        PgWireError: From<<C as Sink<PgWireBackendMessage>>::Error>,
+    {
+        if !matches!(client.state(), PgWireConnectionState::ReadyForQuery) {
+            return Err(PgWireError::NotReadyForQuery);
+        }
+        let _busy = self.0.busy();
+        client.set_state(PgWireConnectionState::QueryInProgress);
+        let run = self.0.command();
+        let statements = self.0.statements(&query.query, &[], &run).await.map_err(|fault| error(&fault))?;
+        if statements.is_empty() {
+            client.feed(PgWireBackendMessage::EmptyQueryResponse(EmptyQueryResponse::new())).await?;
+        }
+        for statement in &statements {
+            match act(&self.0, client, &run, statement, none(), &Format::UnifiedText).await? {
+                Reply::Rows(rows) => send_query_response(client, rows, true).await?,
+                Reply::Copy(form, running) => copy::send(client, &form, running).await?,
+                Reply::Done(tag) => client.feed(PgWireBackendMessage::CommandComplete(tag.into())).await?,
+            }
+        }
+        client.set_state(PgWireConnectionState::ReadyForQuery);
+        let status = client.transaction_status();
+        send_ready_for_query(client, status).await
+    }
+
+    async fn do_query<C>(&self, _: &mut C, _: &str) -> PgWireResult<Vec<Response>>
+    where
+        C: ClientInfo + ClientPortalStore + Sink<PgWireBackendMessage> + Unpin + Send + Sync,
+        C::PortalStore: PortalStore,
+        C::Error: Debug,
+        PgWireError: From<<C as Sink<PgWireBackendMessage>>::Error>,
+    {
+        // `on_query` does all.
+        Err(PgWireError::NotReadyForQuery)
+    }
+}

@@ -1,0 +1,109 @@
+//! Logging in: a token as password where there are tokens, and the settings that a client begins with.
+
+use std::fmt::Debug;
+use std::sync::Arc;
+
+use async_trait::async_trait;
+use futures::{Sink, SinkExt as _};
+use pgwire::api::auth::{
+    DefaultServerParameterProvider, StartupHandler, finish_authentication, protocol_negotiation,
+    save_startup_parameters_to_metadata,
+};
+use pgwire::api::{ClientInfo, METADATA_USER, PgWireConnectionState};
+use pgwire::error::{PgWireError, PgWireResult};
+use pgwire::messages::startup::Authentication;
+use pgwire::messages::{PgWireBackendMessage, PgWireFrontendMessage, ProtocolVersion};
+
+use super::CONNECTIONS;
+use super::connection::Connection;
+use super::settings::VERSION;
+use super::sqlstate::fatal;
+use crate::fault::Fault;
+use crate::tokens::Scope;
+
+/// Logs in.
+pub(super) struct Startup(pub(super) Arc<Connection>);
+
+#[async_trait]
+impl StartupHandler for Startup {
+    async fn on_startup<C>(&self, client: &mut C, message: PgWireFrontendMessage) -> PgWireResult<()>
+    where
+        C: ClientInfo + Sink<PgWireBackendMessage> + Unpin + Send + Sync,
+        C::Error: Debug,
+        PgWireError: From<<C as Sink<PgWireBackendMessage>>::Error>,
+    {
+        match message {
+            PgWireFrontendMessage::Startup(startup) => {
+                if !self.0.has_place() {
+                    return Err(fatal(&Fault::TooMany { what: "connections", limit: CONNECTIONS }));
+                }
+                protocol_negotiation(client, &startup).await?;
+                save_startup_parameters_to_metadata(client, &startup);
+                self.begin_with(client.metadata()).map_err(|fault| fatal(&fault))?;
+                client.set_state(PgWireConnectionState::AuthenticationInProgress);
+                if self.0.shared().service.access().is_open() {
+                    return self.let_in(client, None).await;
+                }
+                client.send(PgWireBackendMessage::Authentication(Authentication::CleartextPassword)).await?;
+                Ok(())
+            }
+            PgWireFrontendMessage::PasswordMessageFamily(password) => {
+                let password = password.into_password()?;
+                self.let_in(client, Some(&password.password)).await
+            }
+            _ => Err(fatal(&Fault::request("the protocol's startup is expected"))),
+        }
+    }
+}
+
+impl Startup {
+    async fn let_in<C>(&self, client: &mut C, token: Option<&str>) -> PgWireResult<()>
+    where
+        C: ClientInfo + Sink<PgWireBackendMessage> + Unpin + Send + Sync,
+        C::Error: Debug,
+        PgWireError: From<<C as Sink<PgWireBackendMessage>>::Error>,
+    {
+        let service = &self.0.shared().service;
+        let who = service.access().client(token, Scope::Sql).map_err(|fault| {
+            service.metrics().failed(fault.code());
+            fatal(&fault)
+        })?;
+        let wide = client.protocol_version() != ProtocolVersion::PROTOCOL3_0;
+        let (pid, key) = self.0.log_in(&who, wide).map_err(|fault| fatal(&fault))?;
+        client.set_pid_and_secret_key(pid, key);
+        let mut parameters = DefaultServerParameterProvider::default();
+        parameters.server_version = VERSION.to_owned();
+        parameters.is_superuser = false;
+        parameters.default_transaction_read_only = true;
+        parameters.time_zone = "UTC".to_owned();
+        finish_authentication(client, &parameters).await
+    }
+
+    // `options` may carry settings, as in `-c statement_timeout=5s`.
+    fn begin_with(&self, given: &std::collections::HashMap<String, String>) -> Result<(), Fault> {
+        let settings = &self.0.settings;
+        if given.get("replication").is_some_and(|v| v != "false" && v != "off" && v != "0") {
+            return Err(Fault::unsupported("replication"));
+        }
+        if let Some(user) = given.get(METADATA_USER) {
+            settings.set_user(user);
+        }
+        // What a driver always sends counts where it is known, and is no reason to turn it away.
+        for (name, value) in given {
+            let _ = settings.set(name, value);
+        }
+        let words: Vec<_> = given.get("options").map(|o| o.split_whitespace().collect()).unwrap_or_default();
+        let mut words = words.into_iter();
+        while let Some(word) = words.next() {
+            let pair = match word.strip_prefix("--").or_else(|| word.strip_prefix("-c")) {
+                Some("") => words.next(),
+                pair => pair,
+            };
+            let (name, value) = pair
+                .and_then(|p| p.split_once('='))
+                .ok_or_else(|| Fault::request(format!("`{word}` is no option; hint: -c name=value")))?;
+            settings.set(name, value)?;
+        }
+        Ok(())
+    }
+}

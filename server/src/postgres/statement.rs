@@ -1,0 +1,200 @@
+//! Statements as Postgres' clients write them: queries are planned, what changes nothing is known, all else is refused.
+
+use std::sync::Arc;
+use std::time::Instant;
+
+use datafusion::sql::parser::Statement as Parsed;
+use datafusion::sql::sqlparser::ast::{
+    CloseCursor, Declare, DeclareType, DiscardObject, Expr, FetchDirection, Ident, ObjectName, Reset, Set,
+    Statement as Sql, Value, ValueWithSpan,
+};
+use datafusion::sql::sqlparser::dialect::PostgreSqlDialect;
+use datafusion::sql::sqlparser::parser::Parser;
+use datafusion_pg_catalog::sql::PostgresCompatibilityParser;
+use echolake_query::{Error as QueryError, Prepared, Session};
+use pgwire::api::Type;
+
+use super::copy::{self, CopyAs};
+use super::rewrite;
+use crate::fault::Fault;
+
+/// Statements of one text at most.
+const TOGETHER: usize = 100;
+
+/// A planned query.
+pub(super) struct Planned {
+    pub(super) prepared: Arc<Prepared>,
+    pub(super) at: Instant,
+    statement: Parsed,
+    sql: Arc<str>,
+}
+
+impl Planned {
+    async fn new(session: &Session, sql: &Arc<str>, statement: Parsed) -> Result<Arc<Self>, Fault> {
+        let prepared = Arc::new(session.prepare_statement(sql, statement.clone()).await?);
+        Ok(Arc::new(Self { prepared, at: Instant::now(), statement, sql: sql.clone() }))
+    }
+
+    /// The same on today's lake.
+    pub(super) async fn again(&self, session: &Session) -> Result<Prepared, QueryError> {
+        session.prepare_statement(&self.sql, self.statement.clone()).await
+    }
+}
+
+/// What a client may ask.
+#[derive(Clone)]
+pub(super) enum Statement {
+    Query(Arc<Planned>),
+    Copy(Arc<Planned>, CopyAs),
+    Declare {
+        name: String,
+        planned: Arc<Planned>,
+        held: bool,
+    },
+    /// None for all rows that are left.
+    Fetch {
+        name: String,
+        rows: Option<u64>,
+    },
+    /// None for all cursors, and so below for settings and prepared statements.
+    Close(Option<String>),
+    Begin,
+    Commit,
+    Rollback,
+    /// Savepoints: there is nothing to go back from.
+    Savepoint(&'static str),
+    Set(Vec<(String, String)>),
+    Reset(Option<String>),
+    Show(Option<String>),
+    Discard(DiscardObject),
+    Deallocate(Option<String>),
+}
+
+/// The statements of a text, whose placeholders have these types where their client tells.
+pub(super) fn parse(
+    parser: &PostgresCompatibilityParser,
+    session: &Session,
+    sql: &str,
+    types: &[Option<Type>],
+) -> Result<Vec<Parsed>, Fault> {
+    let Ok(adapted) = parser.parse(sql) else {
+        // DataFusion's own parser knows more, such as DESCRIBE, and says where an error is.
+        return Ok(vec![session.parse(sql)?]);
+    };
+    if adapted.len() > TOGETHER {
+        return Err(Fault::TooMany { what: "statements in one text", limit: TOGETHER });
+    }
+    // The adapted ones have lost their places; where nothing but places differs, these keep them.
+    let placed = Parser::parse_sql(&PostgreSqlDialect {}, sql).unwrap_or_default();
+    let placed: Vec<_> = placed.into_iter().map(|s| parser.rewrite(s)).collect();
+    let statements = if placed == adapted { placed } else { adapted };
+    Ok(statements.into_iter().map(|s| Parsed::Statement(Box::new(rewrite::rewrite(s, types)))).collect())
+}
+
+/// Makes of a statement what can be done.
+pub(super) async fn plan(session: &Session, sql: &Arc<str>, parsed: Parsed) -> Result<Statement, Fault> {
+    let query = async |statement: Parsed| Planned::new(session, sql, statement).await;
+    let statement = match parsed {
+        Parsed::Statement(statement) => *statement,
+        other => return Ok(Statement::Query(query(other).await?)),
+    };
+    Ok(match statement {
+        Sql::StartTransaction { statements, .. } if statements.is_empty() => Statement::Begin,
+        Sql::Commit { .. } => Statement::Commit,
+        Sql::Rollback { savepoint: None, .. } => Statement::Rollback,
+        Sql::Rollback { .. } => Statement::Savepoint("ROLLBACK"),
+        Sql::Savepoint { .. } => Statement::Savepoint("SAVEPOINT"),
+        Sql::ReleaseSavepoint { .. } => Statement::Savepoint("RELEASE"),
+        Sql::Set(set) => Statement::Set(settings(set)?),
+        Sql::Reset(reset) => Statement::Reset(match reset.reset {
+            Reset::ALL => None,
+            Reset::ConfigurationParameter(name) => Some(name.to_string()),
+        }),
+        Sql::ShowVariable { variable } => Statement::Show(shown(&variable)),
+        Sql::Discard { object_type } => Statement::Discard(object_type),
+        Sql::Deallocate { name, .. } => Statement::Deallocate(unless_all(&name)),
+        Sql::Declare { stmts } => {
+            let (name, held, asked) = declared(stmts)?;
+            Statement::Declare { name, held, planned: query(asked).await? }
+        }
+        Sql::Fetch { name, direction, .. } => Statement::Fetch { name: name.value, rows: forward(&direction)? },
+        Sql::Close { cursor: CloseCursor::All } => Statement::Close(None),
+        Sql::Close { cursor: CloseCursor::Specific { name } } => Statement::Close(Some(name.value)),
+        Sql::Copy { source, to: true, target, options, legacy_options, .. } => {
+            let (asked, form) = copy::read(source, &target, options, legacy_options)?;
+            Statement::Copy(query(Parsed::Statement(Box::new(asked))).await?, form)
+        }
+        other => Statement::Query(query(Parsed::Statement(Box::new(other))).await?),
+    })
+}
+
+fn unless_all(name: &Ident) -> Option<String> {
+    let all = name.quote_style.is_none() && name.value.eq_ignore_ascii_case("all");
+    (!all).then(|| name.value.clone())
+}
+
+// SHOW TRANSACTION ISOLATION LEVEL and SHOW TIME ZONE have names of their own.
+fn shown(variable: &[Ident]) -> Option<String> {
+    let words: Vec<_> = variable.iter().map(|i| i.value.to_ascii_lowercase()).collect();
+    match words.join(" ").as_str() {
+        "all" => None,
+        "transaction isolation level" => Some("transaction_isolation".to_owned()),
+        "time zone" => Some("timezone".to_owned()),
+        "session authorization" => Some("session_authorization".to_owned()),
+        _ => Some(words.join(".")),
+    }
+}
+
+fn settings(set: Set) -> Result<Vec<(String, String)>, Fault> {
+    match set {
+        Set::SingleAssignment { variable, values, .. } => Ok(vec![(name(&variable), text(&values)?)]),
+        Set::SetTimeZone { value, .. } => Ok(vec![("timezone".to_owned(), text(&[value])?)]),
+        Set::SetNames { charset_name, .. } => Ok(vec![("client_encoding".to_owned(), charset_name.value)]),
+        // All transactions read, and see what is there when each of their queries begins.
+        Set::SetTransaction { .. } => Ok(Vec::new()),
+        other => Err(Fault::unsupported(format!("`{other}`"))),
+    }
+}
+
+fn name(name: &ObjectName) -> String {
+    let parts = name.0.iter().map(|p| p.as_ident().map_or_else(|| p.to_string(), |i| i.value.clone()));
+    parts.collect::<Vec<_>>().join(".")
+}
+
+fn text(values: &[Expr]) -> Result<String, Fault> {
+    let one = |value: &Expr| match value {
+        Expr::Value(ValueWithSpan { value: Value::SingleQuotedString(text), .. }) => Ok(text.clone()),
+        Expr::Value(value) => Ok(value.to_string()),
+        Expr::Identifier(word) => Ok(word.value.clone()),
+        Expr::UnaryOp { .. } | Expr::Interval(_) => Ok(value.to_string()),
+        other => Err(Fault::request(format!("`{other}` is no value of a setting"))),
+    };
+    Ok(values.iter().map(one).collect::<Result<Vec<_>, _>>()?.join(", "))
+}
+
+fn declared(mut statements: Vec<Declare>) -> Result<(String, bool, Parsed), Fault> {
+    let refused = || Fault::unsupported("DECLARE of anything but one cursor");
+    let (Some(declare), true) = (statements.pop(), statements.is_empty()) else { return Err(refused()) };
+    let (Some(name), Some(query), Some(DeclareType::Cursor)) =
+        (declare.names.first(), declare.for_query, declare.declare_type)
+    else {
+        return Err(refused());
+    };
+    if declare.scroll == Some(true) {
+        return Err(Fault::unsupported("a cursor that goes back (SCROLL)"));
+    }
+    let statement = Parsed::Statement(Box::new(Sql::Query(query)));
+    Ok((name.value.clone(), declare.hold == Some(true), statement))
+}
+
+fn forward(direction: &FetchDirection) -> Result<Option<u64>, Fault> {
+    let count = |limit: &ValueWithSpan| {
+        limit.to_string().parse().map_err(|_| Fault::request(format!("`{limit}` is no number of rows to go forward")))
+    };
+    match direction {
+        FetchDirection::Next | FetchDirection::Forward { limit: None } => Ok(Some(1)),
+        FetchDirection::Count { limit } | FetchDirection::Forward { limit: Some(limit) } => count(limit).map(Some),
+        FetchDirection::All | FetchDirection::ForwardAll => Ok(None),
+        other => Err(Fault::unsupported(format!("FETCH {other}"))),
+    }
+}

@@ -1,0 +1,166 @@
+//! A query that runs: computed and encoded on threads of its own, handed over as it is fetched, ended when it is
+//! dropped.
+
+use std::time::Duration;
+
+use arrow::datatypes::SchemaRef;
+use arrow::record_batch::RecordBatch;
+use tokio::sync::{mpsc, watch};
+use tokio::task::JoinSet;
+use tokio::time::Instant;
+
+use crate::fault::Fault;
+use crate::service::Service;
+
+/// Bytes of rows that are encoded at once: what an answer holds in memory is a few of these.
+const PART_BYTES: usize = 4 << 20;
+/// Parts that wait while the client reads.
+pub(crate) const WAITING: usize = 2;
+
+/// Makes of rows what a protocol sends.
+pub(crate) trait Encode: Send + 'static {
+    /// What is sent.
+    type Item: Send + 'static;
+
+    /// Encodes rows.
+    fn batch(&mut self, batch: RecordBatch) -> Result<Vec<Self::Item>, Fault>;
+
+    /// What comes after the last row.
+    fn end(self) -> Result<Vec<Self::Item>, Fault>;
+}
+
+/// Rows as they are.
+pub(crate) struct Batches;
+
+impl Encode for Batches {
+    type Item = RecordBatch;
+
+    fn batch(&mut self, batch: RecordBatch) -> Result<Vec<RecordBatch>, Fault> {
+        Ok(vec![batch])
+    }
+
+    fn end(self) -> Result<Vec<RecordBatch>, Fault> {
+        Ok(Vec::new())
+    }
+}
+
+/// Ends a query from elsewhere.
+#[derive(Debug, Clone)]
+pub(crate) struct Stop(watch::Sender<bool>);
+
+impl Stop {
+    pub(crate) fn new() -> Self {
+        Self(watch::Sender::new(false))
+    }
+
+    /// Ends it.
+    pub(crate) fn stop(&self) {
+        self.0.send_replace(true);
+    }
+
+    /// Waits until somebody did.
+    pub(crate) async fn stopped(&self) {
+        // The sender lives in `self`, so there is no error to come.
+        let _ = self.0.subscribe().wait_for(|stopped| *stopped).await;
+    }
+}
+
+/// A query that runs. Dropping it ends it.
+pub(crate) struct Running<T> {
+    /// The columns.
+    pub(crate) schema: SchemaRef,
+    pub(crate) items: mpsc::Receiver<T>,
+    pub(crate) task: JoinSet<Result<(), Fault>>,
+    pub(crate) stop: Stop,
+    pub(crate) limit: Option<Limit>,
+    pub(crate) service: Service,
+}
+
+/// A session's own limit of time.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Limit {
+    time: Duration,
+    end: Instant,
+}
+
+impl Limit {
+    /// This long, from now.
+    pub(crate) fn of(time: Duration) -> Self {
+        Self { time, end: Instant::now() + time }
+    }
+}
+
+impl<T: Send + 'static> Running<T> {
+    /// The next part; None after the last.
+    ///
+    /// # Errors
+    /// What ended the query before its end.
+    pub(crate) async fn next(&mut self) -> Result<Option<T>, Fault> {
+        let limit = self.limit;
+        tokio::select! {
+            biased;
+            fault = ended(&self.stop, limit) => {
+                self.task.abort_all();
+                self.service.metrics().failed(fault.code());
+                return Err(fault);
+            }
+            item = self.items.recv() => if let Some(item) = item {
+                return Ok(Some(item));
+            }
+        }
+        finish(&mut self.task).await.map(|()| None)
+    }
+}
+
+/// Waits until somebody ends the query, or its session's time is over.
+pub(crate) async fn ended(stop: &Stop, limit: Option<Limit>) -> Fault {
+    match limit {
+        None => {
+            stop.stopped().await;
+            Fault::Cancelled
+        }
+        Some(limit) => tokio::select! {
+            () = stop.stopped() => Fault::Cancelled,
+            () = tokio::time::sleep_until(limit.end) => Fault::Timeout { limit: limit.time },
+        },
+    }
+}
+
+/// How a task ended that sends nothing more.
+pub(crate) async fn finish(task: &mut JoinSet<Result<(), Fault>>) -> Result<(), Fault> {
+    match task.join_next().await {
+        None => Ok(()),
+        Some(Ok(done)) => done,
+        Some(Err(failed)) => {
+            eprintln!("a query ended its task: {failed}");
+            Err(Fault::Internal)
+        }
+    }
+}
+
+/// Rows in parts that are cheap to hold.
+pub(crate) fn parts(batch: &RecordBatch) -> impl Iterator<Item = RecordBatch> {
+    let rows = batch.num_rows();
+    let row_bytes = batch.get_array_memory_size() / rows.max(1);
+    let step = (PART_BYTES / row_bytes.max(1)).max(1);
+    (0..rows).step_by(step).map(move |at| batch.slice(at, step.min(rows - at)))
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Arc;
+
+    use arrow::array::{ArrayRef, Int64Array};
+
+    use super::*;
+
+    #[test]
+    fn parts_are_all_rows_in_order() {
+        let numbers: ArrayRef = Arc::new(Int64Array::from_iter_values(0..1_500_000));
+        let batch = RecordBatch::try_from_iter([("n", numbers)]).expect("a batch");
+        let parts: Vec<_> = parts(&batch).collect();
+        assert!(parts.len() > 1);
+        assert_eq!(arrow::compute::concat_batches(&batch.schema(), &parts).expect("together"), batch);
+        assert_eq!(super::parts(&batch.slice(0, 0)).count(), 0);
+    }
+}

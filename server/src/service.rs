@@ -1,0 +1,199 @@
+//! What the three protocols share: the engine, who may ask, threads to compute on, and figures.
+
+use std::sync::Arc;
+use std::thread::available_parallelism;
+use std::time::Duration;
+
+use arrow::datatypes::SchemaRef;
+use datafusion::common::ParamValues;
+use echolake_lake::Lake;
+use echolake_query::{Client, Engine, Limits, Prepared, Quota, Session};
+use tokio::runtime::{Builder, Runtime};
+use tokio::sync::{mpsc, oneshot};
+use tokio::task::JoinSet;
+
+use crate::Error;
+use crate::fault::Fault;
+use crate::metrics::{Metrics, Protocol};
+use crate::running::{Encode, Limit, Running, Stop, WAITING, ended, finish, parts};
+use crate::tokens::{Access, Tokens};
+
+/// Threads that wait for files.
+const BLOCKING_THREADS: usize = 16;
+/// Threads that compute where the system does not say how many cores there are.
+const CORES: usize = 2;
+
+/// How long a plan is good for: it sees the lake as it was.
+pub(crate) const FRESH: Duration = Duration::from_secs(2);
+/// The catalogue and schema of the lake's tables, as DataFusion calls them.
+pub(crate) const CATALOG: &str = "datafusion";
+pub(crate) const SCHEMA: &str = "public";
+
+/// What the three protocols share.
+#[derive(Clone)]
+pub(crate) struct Service(Arc<Inner>);
+
+struct Inner {
+    engine: Engine,
+    access: Access,
+    metrics: Metrics,
+    compute: Compute,
+}
+
+// Queries compute on threads of their own: connections are answered, and queries cancelled, while all of them are busy.
+struct Compute(Option<Runtime>);
+
+impl Drop for Compute {
+    // Dropping a runtime waits for its threads, which is forbidden where this is dropped.
+    fn drop(&mut self) {
+        if let Some(runtime) = self.0.take() {
+            runtime.shutdown_background();
+        }
+    }
+}
+
+/// What to run.
+pub(crate) enum Work {
+    /// A text.
+    Sql(String),
+    /// What was planned before, with values for its placeholders.
+    Prepared(Arc<Prepared>, ParamValues),
+}
+
+/// A query to run.
+pub(crate) struct Job {
+    pub(crate) protocol: Protocol,
+    pub(crate) session: Arc<Session>,
+    pub(crate) work: Work,
+    /// The session's own limit of time, beside its client's quota.
+    pub(crate) limit: Option<Limit>,
+    /// Ends it from elsewhere.
+    pub(crate) stop: Stop,
+}
+
+impl Service {
+    pub(crate) fn new(lake: &Lake, tokens: Option<Tokens>, limits: Limits) -> Result<Self, Error> {
+        let compute = Builder::new_multi_thread()
+            .worker_threads(available_parallelism().map_or(CORES, usize::from))
+            .max_blocking_threads(BLOCKING_THREADS)
+            .thread_name("query")
+            .enable_all()
+            .build()
+            .map_err(Error::System)?;
+        Ok(Self(Arc::new(Inner {
+            engine: Engine::new(lake, limits)?,
+            access: Access::new(tokens),
+            metrics: Metrics::default(),
+            compute: Compute(Some(compute)),
+        })))
+    }
+
+    pub(crate) fn access(&self) -> &Access {
+        &self.0.access
+    }
+
+    pub(crate) fn metrics(&self) -> &Metrics {
+        &self.0.metrics
+    }
+
+    /// A session: one a connection, or a request where connections are not known.
+    pub(crate) fn session(&self, client: &Arc<Client>) -> Session {
+        self.0.engine.session(client)
+    }
+
+    /// The tables and their schemas.
+    pub(crate) fn tables(&self) -> Vec<(&'static str, SchemaRef)> {
+        let nobody = Arc::new(Client::new("tables", Quota::default()));
+        self.session(&nobody).tables().collect()
+    }
+
+    fn spawn<T: Send + 'static>(&self, work: impl Future<Output = T> + Send + 'static) -> JoinSet<T> {
+        let mut task = JoinSet::new();
+        if let Some(runtime) = &self.0.compute.0 {
+            task.spawn_on(work, runtime.handle());
+        }
+        task
+    }
+
+    /// Plans on the threads that compute.
+    pub(crate) async fn plan<T: Send + 'static>(
+        &self,
+        work: impl Future<Output = Result<T, Fault>> + Send + 'static,
+    ) -> Result<T, Fault> {
+        let planned = match self.spawn(work).join_next().await {
+            Some(Ok(planned)) => planned,
+            Some(Err(failed)) => {
+                eprintln!("planning ended its task: {failed}");
+                Err(Fault::Internal)
+            }
+            None => Err(Fault::Internal),
+        };
+        planned.inspect_err(|fault| self.0.metrics.failed(fault.code()))
+    }
+
+    /// Begins a query; its columns are known when this returns.
+    ///
+    /// # Errors
+    /// What is wrong with the query, or ended it.
+    pub(crate) async fn begin<E: Encode>(
+        &self,
+        job: Job,
+        encode: impl FnOnce(&SchemaRef) -> Result<E, Fault> + Send + 'static,
+    ) -> Result<Running<E::Item>, Fault> {
+        let (columns, known) = oneshot::channel();
+        let (to, items) = mpsc::channel(WAITING);
+        let (stop, limit) = (job.stop.clone(), job.limit);
+        let inner = self.0.clone();
+        let mut task = self.spawn(async move {
+            let _timed = inner.metrics.begin(job.protocol);
+            let done = run(&inner.metrics, job, encode, columns, to).await;
+            done.inspect_err(|fault| inner.metrics.failed(fault.code()))
+        });
+        tokio::select! {
+            biased;
+            fault = ended(&stop, limit) => {
+                self.0.metrics.failed(fault.code());
+                Err(fault)
+            }
+            schema = known => match schema {
+                Ok(schema) => Ok(Running { schema, items, task, stop, limit, service: self.clone() }),
+                // It ended without having any: it says why.
+                Err(_) => finish(&mut task).await.and(Err(Fault::Internal)),
+            }
+        }
+    }
+}
+
+async fn run<E: Encode>(
+    metrics: &Metrics,
+    job: Job,
+    encode: impl FnOnce(&SchemaRef) -> Result<E, Fault>,
+    columns: oneshot::Sender<SchemaRef>,
+    to: mpsc::Sender<E::Item>,
+) -> Result<(), Fault> {
+    let mut answer = match job.work {
+        Work::Sql(sql) => job.session.query(&sql).await?,
+        Work::Prepared(prepared, values) => job.session.execute(&prepared, values).await?,
+    };
+    let mut encoder = encode(&answer.schema)?;
+    // Nobody listens any more where sending fails, here and below: the query ends by being dropped.
+    if columns.send(answer.schema.clone()).is_err() {
+        return Ok(());
+    }
+    while let Some(batch) = answer.next().await? {
+        metrics.rows(batch.num_rows());
+        for part in parts(&batch) {
+            for item in encoder.batch(part)? {
+                if to.send(item).await.is_err() {
+                    return Ok(());
+                }
+            }
+        }
+    }
+    for item in encoder.end()? {
+        if to.send(item).await.is_err() {
+            return Ok(());
+        }
+    }
+    Ok(())
+}

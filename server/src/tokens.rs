@@ -1,0 +1,287 @@
+//! Who may ask: tokens, kept as hashes in a file, each with scopes and quotas.
+
+use std::fmt;
+use std::path::Path;
+use std::sync::Arc;
+use std::time::Duration;
+
+use echolake_query::{Client, Quota};
+use serde::Deserialize;
+use sha2::{Digest as _, Sha256};
+use subtle::{Choice, ConstantTimeEq as _};
+
+use crate::fault::Fault;
+use crate::{Error, random};
+
+/// What tokens begin with, so that they are found where they leaked.
+const PREFIX: &str = "echolake_";
+
+/// What a token is for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Scope {
+    /// Queries, and what the tables are.
+    Sql,
+    /// The runs' and tables' files.
+    Files,
+    /// The server's own figures.
+    Metrics,
+}
+
+impl fmt::Display for Scope {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::Sql => "SQL",
+            Self::Files => "files",
+            Self::Metrics => "metrics",
+        })
+    }
+}
+
+/// The tokens of a file.
+pub struct Tokens(Vec<Entry>);
+
+struct Entry {
+    client: Arc<Client>,
+    hash: [u8; 32],
+    scopes: Vec<Scope>,
+}
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct File {
+    #[serde(default)]
+    token: Vec<Line>,
+}
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Line {
+    name: String,
+    sha256: String,
+    #[serde(default = "sql_alone")]
+    scopes: Vec<Scope>,
+    seconds: Option<u64>,
+    memory_mb: Option<usize>,
+    rows: Option<u64>,
+    concurrent: Option<usize>,
+}
+
+fn sql_alone() -> Vec<Scope> {
+    vec![Scope::Sql]
+}
+
+impl Line {
+    fn entry(&self) -> Result<Entry, String> {
+        let name = &self.name;
+        let hash = random::unhex(&self.sha256)
+            .ok_or_else(|| format!("the sha256 of `{name}` is not 64 hexadecimal digits"))?;
+        let at_least_one = |what: &str, value: Option<u64>| match value {
+            Some(0) => Err(format!("{what} of `{name}` is 0; hint: leave it out where there is no limit")),
+            _ => Ok(()),
+        };
+        at_least_one("seconds", self.seconds)?;
+        at_least_one("memory_mb", self.memory_mb.map(|v| v as u64))?;
+        at_least_one("rows", self.rows)?;
+        at_least_one("concurrent", self.concurrent.map(|v| v as u64))?;
+        let quota = Quota {
+            time: self.seconds.map(Duration::from_secs),
+            memory: self.memory_mb.map(|mb| mb.saturating_mul(1_000_000)),
+            rows: self.rows,
+            concurrent: self.concurrent,
+        };
+        let client = Arc::new(Client::new(name.clone(), quota));
+        Ok(Entry { client, hash, scopes: self.scopes.clone() })
+    }
+}
+
+impl Tokens {
+    /// Reads a file of tokens.
+    ///
+    /// # Errors
+    /// [`Error::ReadTokens`], [`Error::Tokens`].
+    pub fn read(path: &Path) -> Result<Self, Error> {
+        let text =
+            std::fs::read_to_string(path).map_err(|source| Error::ReadTokens { path: path.to_owned(), source })?;
+        Self::parse(&text).map_err(|message| Error::Tokens { path: path.to_owned(), message })
+    }
+
+    fn parse(text: &str) -> Result<Self, String> {
+        let file: File = toml::from_str(text).map_err(|e| e.to_string())?;
+        let entries = file.token.iter().map(Line::entry).collect::<Result<Vec<_>, _>>()?;
+        for (i, entry) in entries.iter().enumerate() {
+            if entries[..i].iter().any(|e| e.client.name() == entry.client.name() || e.hash == entry.hash) {
+                return Err(format!("`{}` is there twice", entry.client.name()));
+            }
+        }
+        if entries.is_empty() {
+            return Err("there is none; hint: `echolake token NAME` makes one".to_owned());
+        }
+        Ok(Self(entries))
+    }
+
+    // Every hash is compared to its end, so that the time does not tell which token is nearly right.
+    fn find(&self, token: &str) -> Option<&Entry> {
+        let hash: [u8; 32] = Sha256::digest(token.as_bytes()).into();
+        let mut found = None;
+        for entry in &self.0 {
+            let same: Choice = entry.hash.ct_eq(&hash);
+            if same.into() {
+                found = Some(entry);
+            }
+        }
+        found
+    }
+}
+
+/// A new token, and the lines that let it in.
+pub struct Fresh {
+    /// The token: it is nowhere else.
+    pub token: String,
+    /// Lines for the file of tokens.
+    pub lines: String,
+}
+
+/// Makes a token.
+///
+/// # Errors
+/// [`Error::Random`].
+pub fn fresh(name: &str) -> Result<Fresh, Error> {
+    let secret: [u8; 32] = random::bytes().map_err(Error::Random)?;
+    let token = format!("{PREFIX}{}", random::hex(&secret));
+    let hash = random::hex(&Sha256::digest(token.as_bytes()));
+    let name = toml::Value::from(name);
+    let lines = format!(
+        "[[token]]\nname = {name}\nsha256 = \"{hash}\"\nscopes = [\"sql\"]\n\
+         seconds = 60\nmemory_mb = 2000\nrows = 10_000_000\nconcurrent = 4\n"
+    );
+    Ok(Fresh { token, lines })
+}
+
+/// Who is let in.
+pub(crate) enum Access {
+    /// Everybody on this machine.
+    Open(Arc<Client>),
+    /// Whoever has a token.
+    Tokens(Tokens),
+}
+
+impl Access {
+    /// Who may ask: by tokens where there are some.
+    pub(crate) fn new(tokens: Option<Tokens>) -> Self {
+        match tokens {
+            Some(tokens) => Self::Tokens(tokens),
+            None => Self::Open(Arc::new(Client::new("local", Quota::default()))),
+        }
+    }
+
+    /// Whether everybody is let in.
+    pub(crate) fn is_open(&self) -> bool {
+        matches!(self, Self::Open(_))
+    }
+
+    /// Who holds this token.
+    ///
+    /// # Errors
+    /// [`Fault::Unauthenticated`], [`Fault::Forbidden`].
+    pub(crate) fn client(&self, token: Option<&str>, scope: Scope) -> Result<Arc<Client>, Fault> {
+        let tokens = match self {
+            Self::Open(client) => return Ok(client.clone()),
+            Self::Tokens(tokens) => tokens,
+        };
+        let entry = token.and_then(|t| tokens.find(t)).ok_or(Fault::Unauthenticated)?;
+        if !entry.scopes.contains(&scope) {
+            return Err(Fault::Forbidden { name: entry.client.name().to_owned(), scope });
+        }
+        Ok(entry.client.clone())
+    }
+}
+
+/// The token of an `Authorization` header: a bearer's, or the password of a basic one.
+pub(crate) fn of_header(value: &str) -> Option<String> {
+    let (scheme, rest) = value.split_once(' ')?;
+    if scheme.eq_ignore_ascii_case("bearer") {
+        return Some(rest.trim().to_owned());
+    }
+    if !scheme.eq_ignore_ascii_case("basic") {
+        return None;
+    }
+    let pair = String::from_utf8(base64(rest.trim())?).ok()?;
+    Some(pair.split_once(':')?.1.to_owned())
+}
+
+// RFC 4648, section 4; padding may be missing, as gRPC's clients leave it out.
+fn base64(text: &str) -> Option<Vec<u8>> {
+    let value = |c: u8| match c {
+        b'A'..=b'Z' => Some(c - b'A'),
+        b'a'..=b'z' => Some(c - b'a' + 26),
+        b'0'..=b'9' => Some(c - b'0' + 52),
+        b'+' => Some(62),
+        b'/' => Some(63),
+        _ => None,
+    };
+    let mut bytes = Vec::with_capacity(text.len() * 3 / 4);
+    let (mut bits, mut count) = (0_u32, 0);
+    for c in text.trim_end_matches('=').bytes() {
+        bits = (bits << 6) | u32::from(value(c)?);
+        count += 6;
+        if count >= 8 {
+            count -= 8;
+            bytes.push((bits >> count) as u8);
+            bits &= (1 << count) - 1;
+        }
+    }
+    Some(bytes)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_fresh_token_lets_in_and_no_other_does() {
+        let fresh = fresh("a \"quoted\" name").expect("a token");
+        assert!(!fresh.lines.contains(&fresh.token), "only its hash is kept");
+        let access = Access::new(Some(Tokens::parse(&fresh.lines).expect("tokens")));
+        let client = access.client(Some(&fresh.token), Scope::Sql).expect("let in");
+        assert_eq!(client.name, "a \"quoted\" name");
+        assert_eq!(client.quota.time, Some(Duration::from_secs(60)));
+        assert!(matches!(access.client(Some(&fresh.token), Scope::Files), Err(Fault::Forbidden { .. })));
+        let other = super::fresh("b").expect("a token").token;
+        let cut = &fresh.token[..fresh.token.len() - 1];
+        for wrong in [None, Some(""), Some(other.as_str()), Some(cut)] {
+            assert!(matches!(access.client(wrong, Scope::Sql), Err(Fault::Unauthenticated)), "{wrong:?}");
+        }
+    }
+
+    #[test]
+    fn wrong_files_say_what_is_wrong() {
+        let hash = "ab".repeat(32);
+        for (text, expected) in [
+            (String::new(), "there is none"),
+            ("[[token]]\nname = 'a'\nsha256 = 'ab'".to_owned(), "64 hexadecimal"),
+            (format!("[[token]]\nname = 'a'\nsha256 = '{hash}'\nrows = 0"), "rows of `a` is 0"),
+            (format!("[[token]]\nname = 'a'\nsha256 = '{hash}'\nscopes = ['all']"), "unknown variant"),
+            (format!("[[token]]\nname = 'a'\nsha256 = '{hash}'\n").repeat(2), "twice"),
+        ] {
+            let error = Tokens::parse(&text).map(|_| ()).expect_err(&text);
+            assert!(error.contains(expected), "{text}: {error}");
+        }
+    }
+
+    #[test]
+    fn tokens_of_headers() {
+        for (value, expected) in [
+            ("Bearer x", Some("x")),
+            ("bearer  x ", Some("x")),
+            ("Basic dXNlcjpwYXNzOndvcmQ=", Some("pass:word")),
+            ("Basic dXNlcjpwYXNzOndvcmQ", Some("pass:word")),
+            ("Basic !!", None),
+            ("Basic dXNlcg==", None),
+            ("Digest x", None),
+            ("x", None),
+        ] {
+            assert_eq!(of_header(value).as_deref(), expected, "{value}");
+        }
+    }
+}

@@ -1,0 +1,99 @@
+//! `echolake serve` and `echolake token`: the lake over HTTP, Flight SQL and Postgres, for those who may.
+
+use std::net::SocketAddr;
+use std::path::PathBuf;
+use std::str::FromStr;
+
+use anyhow::Context as _;
+use echolake_lake::Lake;
+use echolake_query::Limits;
+use echolake_server::tokens::{self, Tokens};
+use echolake_server::{Server, Settings};
+use tokio::signal::unix::{SignalKind, signal};
+
+use crate::Done;
+
+#[derive(Debug, clap::Args)]
+pub(crate) struct ServeArgs {
+    /// Address for HTTP, `off` for none; port 0 for any that is free, and so below.
+    #[arg(long, value_name = "ADDRESS", default_value = "127.0.0.1:8080")]
+    listen: Listen,
+    /// Address for Arrow Flight SQL.
+    #[arg(long, value_name = "ADDRESS", default_value = "127.0.0.1:8081")]
+    flight_sql: Listen,
+    /// Address for Postgres' protocol.
+    #[arg(long, value_name = "ADDRESS", default_value = "127.0.0.1:5433")]
+    postgres: Listen,
+    /// File of tokens, without which only this machine may ask; `echolake token` makes its lines.
+    #[arg(long, value_name = "FILE")]
+    tokens: Option<PathBuf>,
+    /// Memory that the queries may hold, all together.
+    #[arg(long, value_name = "MIB", default_value_t = 4096, value_parser = clap::value_parser!(u32).range(64..))]
+    memory: u32,
+    /// Queries at once that read much; more of them wait, and each may hold its part of the memory.
+    #[arg(long, value_name = "N", default_value_t = 2, value_parser = clap::value_parser!(u32).range(1..=64))]
+    heavy: u32,
+}
+
+/// Where to listen.
+#[derive(Debug, Clone, Copy)]
+enum Listen {
+    Off,
+    On(SocketAddr),
+}
+
+impl FromStr for Listen {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        match text {
+            "off" => Ok(Self::Off),
+            _ => text.parse().map(Self::On).map_err(|_| "not as 127.0.0.1:8080, [::1]:8080 or off".to_owned()),
+        }
+    }
+}
+
+impl Listen {
+    fn address(self) -> Option<SocketAddr> {
+        match self {
+            Self::Off => None,
+            Self::On(address) => Some(address),
+        }
+    }
+}
+
+pub(crate) async fn run(args: &ServeArgs, lake_url: &str) -> anyhow::Result<Done> {
+    let lake = Lake::open(lake_url).await?;
+    let settings = Settings {
+        http: args.listen.address(),
+        flight_sql: args.flight_sql.address(),
+        postgres: args.postgres.address(),
+        tokens: args.tokens.as_deref().map(Tokens::read).transpose()?,
+        limits: Limits { memory: Some((args.memory as usize) << 20), heavy: args.heavy as usize },
+    };
+    let server = Server::bind(&lake, settings).await?;
+    let addresses = server.addresses();
+    anyhow::ensure!(!addresses.is_empty(), "nothing to listen on; hint: all three are off");
+    eprintln!("lake {}", lake.location());
+    for address in addresses {
+        eprintln!("  {address}");
+    }
+    let mut terminate = signal(SignalKind::terminate()).context("cannot listen for SIGTERM")?;
+    let stop = async {
+        tokio::select! {
+            _ = tokio::signal::ctrl_c() => {}
+            _ = terminate.recv() => {}
+        }
+        eprintln!("stopping: answers may go on for five seconds");
+    };
+    server.run(stop).await?;
+    Ok(Done::Whole)
+}
+
+/// Prints a new token to stderr, once, and its lines for the file of tokens to stdout.
+pub(crate) fn token(name: &str) -> anyhow::Result<Done> {
+    let fresh = tokens::fresh(name)?;
+    eprintln!("{}\nthis token is kept nowhere: only its hash is, in the lines for the file of --tokens", fresh.token);
+    super::print(fresh.lines.trim_end())?;
+    Ok(Done::Whole)
+}

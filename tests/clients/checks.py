@@ -1,0 +1,28 @@
+"""What the checks of served lakes share: a line each, and an exit code."""
+
+
+class Checks:
+    """Counts what fails."""
+
+    def __init__(self):
+        self.failed = 0
+
+    def same(self, name, expected, act):
+        """What `act` returns must be this."""
+        self.holds(name, act, lambda value: value == expected)
+
+    def holds(self, name, act, is_right=bool):
+        """What `act` returns must be right."""
+        try:
+            value = act()
+            right = is_right(value)
+        except Exception as error:  # whatever a driver throws is a failure of this check alone
+            value, right = f"{type(error).__name__}: {error}", False
+        text = str(value).replace("\n", " ")
+        print(f"{'ok  ' if right else 'FAIL'} {name}: {text[:100 if right else 600]}", flush=True)
+        self.failed += not right
+
+    def done(self):
+        """The exit code."""
+        print(f"{self.failed} failed")
+        return 1 if self.failed else 0

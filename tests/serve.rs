@@ -1,0 +1,222 @@
+//! `echolake serve` as its clients see it: answers, refusals, queries that end with who asked, and its own end.
+
+mod http;
+mod postgres;
+mod server;
+
+use std::time::{Duration, Instant};
+
+use super::Place;
+use http::{Answer, Request};
+use server::Served;
+
+/// Runs for hours where nothing ends it.
+const ENDLESS: &str = "select count(*) from generate_series(1, 1000000) a cross join generate_series(1, 1000000) b \
+                       where a.value + b.value = 7";
+/// How soon a query must have ended whose client is gone.
+const SOON: Duration = Duration::from_secs(5);
+
+fn lake() -> Place {
+    let place = Place::new();
+    place.acquire("flat", &["--ir-only"]);
+    place.ok(&["ingest"]);
+    place
+}
+
+fn sql(server: &Served, query: &str) -> Answer {
+    Request::post("/api/v1/sql", query).with("content-type", "text/plain").send(server)
+}
+
+fn running(server: &Served) -> f64 {
+    let text = Request::get("/metrics").send(server).text();
+    let line = text.lines().find_map(|l| l.strip_prefix("echolake_running_queries ")).expect("a figure");
+    line.parse().expect("a number")
+}
+
+fn wait_until(what: &str, mut done: impl FnMut() -> bool) {
+    let begun = Instant::now();
+    while !done() {
+        assert!(begun.elapsed() < SOON, "{what}");
+        std::thread::sleep(Duration::from_millis(20));
+    }
+}
+
+#[test]
+fn answers_in_every_format() {
+    let place = lake();
+    let server = Served::start(&place, &[]);
+    let query = "select pair_id, direct_mm from pairs order by pair_id limit 2";
+    let answer = sql(&server, query);
+    assert_eq!((answer.status, answer.header("content-type")), (200, Some("application/json")));
+    assert_eq!(answer.text().trim(), r#"[{"pair_id":0,"direct_mm":120.0},{"pair_id":1,"direct_mm":240.0}]"#);
+    assert_eq!(answer.header("x-content-type-options"), Some("nosniff"));
+    let csv = Request::post("/api/v1/sql?format=csv", query).with("content-type", "application/sql").send(&server);
+    assert_eq!(csv.text(), "pair_id,direct_mm\n0,120.0\n1,240.0\n");
+    let body = serde_json::json!({ "query": query, "format": "csv" }).to_string();
+    let json = Request::post("/api/v1/sql", &body).with("content-type", "application/json").send(&server);
+    assert_eq!(json.text(), csv.text());
+    let arrow = Request::post("/api/v1/sql", query)
+        .with("content-type", "text/plain")
+        .with("accept", "application/vnd.apache.arrow.stream")
+        .send(&server);
+    assert_eq!(&arrow.body[..4], [0xff; 4], "a stream's first message");
+    let parquet = Request::post("/api/v1/sql?format=parquet", query).with("content-type", "text/plain").send(&server);
+    assert!(parquet.body.starts_with(b"PAR1") && parquet.body.ends_with(b"PAR1"));
+    let tables: serde_json::Value =
+        serde_json::from_str(&Request::get("/api/v1/tables").send(&server).text()).expect("JSON");
+    let pairs = tables.as_array().expect("a list").iter().find(|t| t["name"] == "pairs").expect("pairs");
+    let direct = pairs["columns"].as_array().expect("a list").iter().find(|c| c["name"] == "direct_mm");
+    assert_eq!(direct.expect("a column")["unit"], "mm");
+    assert_eq!(Request::get("/health").send(&server).status, 200);
+}
+
+#[test]
+fn what_is_wrong_has_a_code() {
+    let place = lake();
+    let server = Served::start(&place, &[]);
+    let check = |answer: Answer, status: u16, code: &str| {
+        let problem: serde_json::Value = serde_json::from_str(&answer.text()).expect("JSON");
+        assert_eq!(answer.header("content-type"), Some("application/problem+json"), "{problem}");
+        assert_eq!((answer.status, problem["code"].as_str()), (status, Some(code)), "{problem}");
+        assert_eq!(problem["status"], status);
+    };
+    check(sql(&server, "select nonsense from runs"), 400, "query_invalid");
+    check(sql(&server, "drop table runs"), 403, "read_only");
+    check(sql(&server, "copy (select 1) to '/tmp/echolake-out.csv'"), 403, "read_only");
+    check(sql(&server, "select 1/(value - 1) from generate_series(1, 2)"), 422, "query_failed");
+    check(sql(&server, &"-".repeat(3 << 20)), 413, "request_too_large");
+    let post = |body: &str| Request::post("/api/v1/sql", body);
+    check(post("select 1").send(&server), 400, "request_invalid");
+    check(
+        post("select 1").with("content-type", "text/plain").with("accept", "text/html").send(&server),
+        400,
+        "request_invalid",
+    );
+    check(post("{\"sql\": 1}").with("content-type", "application/json").send(&server), 400, "request_invalid");
+    check(
+        Request::post("/api/v1/sql?format=xlsx", "select 1").with("content-type", "text/plain").send(&server),
+        400,
+        "request_invalid",
+    );
+    check(Request::get("/api/v1/sql").send(&server), 400, "request_invalid");
+    check(Request::get("/api/v1/nothing").send(&server), 404, "not_found");
+    // A page of elsewhere, and a name that points here.
+    for (name, value) in [("origin", "http://evil.example"), ("origin", "null"), ("sec-fetch-site", "cross-site")] {
+        check(
+            post("select 1").with("content-type", "text/plain").with(name, value).send(&server),
+            403,
+            "foreign_origin",
+        );
+    }
+    check(Request::get("/api/v1/tables").host("evil.example").send(&server), 403, "foreign_origin");
+    check(Request::get("/health").host("evil.example").send(&server), 403, "foreign_origin");
+}
+
+#[test]
+fn tokens_let_in_and_are_needed_beyond_this_machine() {
+    let place = lake();
+    place.fails(1, &["serve", "--listen", "0.0.0.0:0"], "can be reached from other machines");
+    place.fails(2, &["serve", "--listen", "somewhere"], "127.0.0.1:8080");
+    place.fails(1, &["serve", "--listen", "off", "--flight-sql", "off", "--postgres", "off"], "nothing to listen on");
+    place.fails(1, &["serve", "--tokens", "none.toml"], "cannot read the tokens");
+    let made = place.run(&["token", "analyst"]);
+    let lines = String::from_utf8_lossy(&made.stdout).into_owned();
+    let token = super::stderr(&made).lines().next().expect("a token").to_owned();
+    assert!(!lines.contains(&token), "only its hash is printed to be kept");
+    std::fs::write(place.path("tokens.toml"), &lines).expect("written");
+    let server = Served::start(&place, &["--tokens", "tokens.toml"]);
+    let ask = |header: Option<String>| {
+        let request = Request::post("/api/v1/sql", "select 1 as one").with("content-type", "text/plain");
+        header.into_iter().fold(request, |request, value| request.with("authorization", &value)).send(&server)
+    };
+    assert_eq!(ask(Some(format!("Bearer {token}"))).text().trim(), r#"[{"one":1}]"#);
+    for wrong in [None, Some("Bearer x".to_owned()), Some(format!("Bearer {}", &token[1..])), Some(token.clone())] {
+        let answer = ask(wrong);
+        assert_eq!((answer.status, answer.header("www-authenticate").is_some()), (401, true));
+    }
+    let metrics = Request::get("/metrics").with("authorization", &format!("Bearer {token}")).send(&server);
+    assert_eq!(metrics.status, 403, "{}", metrics.text());
+    let mut postgres = postgres::Client::connect(&server, None);
+    assert_eq!(postgres.log_in("nonsense").as_deref(), Some("28P01"));
+    let mut postgres = postgres::Client::connect(&server, None);
+    assert_eq!(postgres.log_in(&token), None);
+    assert_eq!(postgres.query("select 1 as one"), Ok(vec![vec![Some("1".to_owned())]]));
+}
+
+#[test]
+fn a_query_ends_with_its_client() {
+    let place = lake();
+    let server = Served::start(&place, &[]);
+    let asked = Request::post("/api/v1/sql", ENDLESS).with("content-type", "text/plain").begin(&server);
+    wait_until("it runs", || running(&server) == 1.0);
+    drop(asked);
+    wait_until("it ends with its connection", || running(&server) == 0.0);
+    let mut client = postgres::Client::connect(&server, None);
+    client.begin(ENDLESS);
+    wait_until("it runs", || running(&server) == 1.0);
+    drop(client);
+    wait_until("it ends with its connection", || running(&server) == 0.0);
+    let mut client = postgres::Client::connect(&server, None);
+    client.begin(ENDLESS);
+    wait_until("it runs", || running(&server) == 1.0);
+    client.cancel(&server);
+    assert_eq!(client.rows(), Err("57014".to_owned()));
+    wait_until("it ends by a CancelRequest", || running(&server) == 0.0);
+    assert_eq!(client.query("select 2 as two"), Ok(vec![vec![Some("2".to_owned())]]));
+    client.query("set statement_timeout = '200ms'").expect("set");
+    assert_eq!(client.query(ENDLESS), Err("57014".to_owned()));
+}
+
+#[test]
+fn a_short_answer_does_not_look_whole() {
+    let place = lake();
+    let server = Served::start(&place, &[]);
+    let query = "select 1/(900000 - value) as n from generate_series(1, 1000000)";
+    let answer = sql(&server, query);
+    assert_eq!(answer.status, 200);
+    assert!(!answer.is_whole, "{} bytes", answer.body.len());
+}
+
+#[test]
+fn postgres_answers_and_refuses() {
+    let place = lake();
+    let server = Served::start(&place, &[]);
+    let mut client = postgres::Client::connect(&server, None);
+    let one = |text: &str| Ok(vec![vec![Some(text.to_owned())]]);
+    assert_eq!(client.query("select count(*) from measurements"), one("45"));
+    assert_eq!(client.query("select [1.5, 2.5]::float[]"), one("{1.5,2.5}"));
+    assert_eq!(client.query("show server_version_num"), one("160006"));
+    assert_eq!(client.query("select relname from pg_class where relname = 'pairs'"), one("pairs"));
+    for (sql, state) in [
+        ("drop table runs", "25006"),
+        ("copy pairs to '/tmp/echolake-out'", "25006"),
+        ("copy (select 1) to program 'sh'", "25006"),
+        ("set datafusion.runtime.memory_limit = '900G'", "42704"),
+        ("set default_transaction_read_only = off", "22023"),
+        ("select * from nope", "42P01"),
+        ("select nope from runs", "42703"),
+        ("selec 1", "42601"),
+        ("fetch 1 from nothing", "34000"),
+    ] {
+        assert_eq!(client.query(sql), Err(state.to_owned()), "{sql}");
+    }
+    assert_eq!(client.query("begin; declare c cursor for select pair_id from pairs order by 1; fetch 2 from c"), {
+        Ok(vec![vec![Some("0".to_owned())], vec![Some("1".to_owned())]])
+    });
+    assert_eq!(client.query("select nope from runs"), Err("42703".to_owned()));
+    assert_eq!(client.query("select 1"), Err("25P02".to_owned()), "the transaction failed");
+    assert_eq!(client.query("rollback; select 3 as three"), one("3"));
+    // What breaks the protocol breaks its own connection only.
+    client.send_raw(b"Q\xff\xff\xff\xff");
+    let mut other = postgres::Client::connect(&server, None);
+    assert_eq!(other.query("select 4 as four"), one("4"));
+}
+
+#[test]
+fn it_stops_when_told() {
+    let place = lake();
+    let mut server = Served::start(&place, &[]);
+    let mut idle = postgres::Client::connect(&server, None);
+    assert!(idle.query("select 1").is_ok());
+    assert_eq!(server.terminate(), Some(0));
+}

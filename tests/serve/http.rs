@@ -1,0 +1,110 @@
+//! As much of an HTTP client as these tests need, so that they see what is on the wire.
+
+use std::fmt::Write as _;
+use std::io::{Read as _, Write as _};
+use std::net::TcpStream;
+
+use super::server::Served;
+
+/// A request.
+pub(super) struct Request {
+    method: &'static str,
+    path: String,
+    host: Option<String>,
+    headers: String,
+    body: String,
+}
+
+/// An answer.
+#[derive(Debug)]
+pub(super) struct Answer {
+    pub(super) status: u16,
+    headers: Vec<(String, String)>,
+    pub(super) body: Vec<u8>,
+    /// Whether its end came.
+    pub(super) is_whole: bool,
+}
+
+impl Request {
+    pub(super) fn get(path: &str) -> Self {
+        Self { method: "GET", path: path.to_owned(), host: None, headers: String::new(), body: String::new() }
+    }
+
+    pub(super) fn post(path: &str, body: &str) -> Self {
+        Self { method: "POST", body: body.to_owned(), ..Self::get(path) }
+    }
+
+    pub(super) fn with(mut self, name: &str, value: &str) -> Self {
+        let _ = write!(self.headers, "{name}: {value}\r\n");
+        self
+    }
+
+    pub(super) fn host(mut self, host: &str) -> Self {
+        self.host = Some(host.to_owned());
+        self
+    }
+
+    /// Sends it and does not wait.
+    pub(super) fn begin(self, server: &Served) -> TcpStream {
+        let mut stream = TcpStream::connect(&server.http).expect("connected");
+        let host = self.host.as_ref().unwrap_or(&server.http);
+        let head = format!(
+            "{} {} HTTP/1.1\r\nhost: {host}\r\nconnection: close\r\ncontent-length: {}\r\n{}\r\n",
+            self.method,
+            self.path,
+            self.body.len(),
+            self.headers
+        );
+        stream.write_all(head.as_bytes()).expect("sent");
+        // A server that has read enough may close before it has all.
+        let _ = stream.write_all(self.body.as_bytes());
+        stream
+    }
+
+    pub(super) fn send(self, server: &Served) -> Answer {
+        let mut stream = self.begin(server);
+        let mut bytes = Vec::new();
+        // A connection that is broken off ends in an error, after what came.
+        let _ = stream.read_to_end(&mut bytes);
+        Answer::read(&bytes)
+    }
+}
+
+impl Answer {
+    fn read(bytes: &[u8]) -> Self {
+        let end = bytes.windows(4).position(|w| w == b"\r\n\r\n").expect("headers");
+        let head = std::str::from_utf8(&bytes[..end]).expect("text");
+        let mut lines = head.lines();
+        let status = lines.next().and_then(|l| l.split(' ').nth(1)).and_then(|s| s.parse().ok()).expect("a status");
+        let pair = |line: &str| line.split_once(": ").map(|(n, v)| (n.to_ascii_lowercase(), v.to_owned()));
+        let headers: Vec<_> = lines.filter_map(pair).collect();
+        let rest = &bytes[end + 4..];
+        let chunked = headers.iter().any(|(name, value)| name == "transfer-encoding" && value == "chunked");
+        let (body, is_whole) = if chunked { unchunked(rest) } else { (rest.to_vec(), true) };
+        Self { status, headers, body, is_whole }
+    }
+
+    pub(super) fn header(&self, name: &str) -> Option<&str> {
+        self.headers.iter().find(|(known, _)| known == name).map(|(_, value)| value.as_str())
+    }
+
+    pub(super) fn text(&self) -> String {
+        String::from_utf8(self.body.clone()).expect("text")
+    }
+}
+
+// The chunks that came, and whether the last one, which is empty, did.
+fn unchunked(mut bytes: &[u8]) -> (Vec<u8>, bool) {
+    let mut body = Vec::new();
+    while let Some(line) = bytes.windows(2).position(|w| w == b"\r\n") {
+        let size = std::str::from_utf8(&bytes[..line]).ok().and_then(|t| usize::from_str_radix(t, 16).ok());
+        let size = size.expect("a chunk's size");
+        if size == 0 {
+            return (body, true);
+        }
+        let Some(chunk) = bytes.get(line + 2..line + 2 + size) else { break };
+        body.extend_from_slice(chunk);
+        bytes = bytes.get(line + 4 + size..).unwrap_or_default();
+    }
+    (body, false)
+}
