@@ -200,7 +200,7 @@ mod tests {
         check("select * from runs for system_time as of '2026-11-21'", "select * from \"runs@2026-11-21\"");
         check("select * from public.nce\n  version as of 3\nwhere x", "select * from public.\"nce@3\" where x");
         check("select 'runs version as of 3' as of_course", "select 'runs version as of 3' as of_course");
-        check("select * from a version as of version as of 3", "select * from a version as of version as of 3");
+        check("select * from a version as of version as of 3", "select * from a version as \"of@3\"");
         check("select * from a for version as of 3, b for version as of 4", "select * from \"a@3\" , \"b@4\"");
         check("select version as of from runs", "select version as of from runs");
         check("select 'broken of", "select 'broken of");
