@@ -107,9 +107,10 @@ impl Aggregate for DiffusionCoefficient {
     fn merge(&self, states: &[ArrayRef], groups: &mut Groups<'_, Self>) -> Result<()> {
         let receivers = states[0].as_primitive::<UInt64Type>().values();
         let [loudest, energy, square] = [1, 2, 3].map(|i| states[i].as_primitive::<Float64Type>().values());
-        for row in 0..receivers.len() {
+        let parts = receivers.iter().zip(loudest).zip(energy.iter().zip(square));
+        for (row, ((receivers, loudest), (energy, square))) in parts.enumerate() {
             groups.at(row, |group| {
-                group.merge(&Diffusion::from_parts((receivers[row], loudest[row], energy[row], square[row])));
+                group.merge(&Diffusion::from_parts((*receivers, *loudest, *energy, *square)));
                 Ok(())
             })?;
         }
@@ -120,7 +121,7 @@ impl Aggregate for DiffusionCoefficient {
         let parts = || groups.iter().map(Diffusion::parts);
         let number = |values: Vec<f64>| -> ArrayRef { Arc::new(Float64Array::from(values)) };
         Ok(vec![
-            Arc::new(parts().map(|p| p.0).collect::<Vec<_>>().into_iter().map(Some).collect::<UInt64Array>()),
+            Arc::new(parts().map(|p| Some(p.0)).collect::<UInt64Array>()),
             number(parts().map(|p| p.1).collect()),
             number(parts().map(|p| p.2).collect()),
             number(parts().map(|p| p.3).collect()),

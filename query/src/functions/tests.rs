@@ -109,8 +109,7 @@ async fn put(lake: &Lake, surface: &str, golden: &[RecordBatch], ir: &str, refle
     };
     let lists = |name: &str| -> ArrayRef {
         let all = golden.iter().map(|b| b.column_by_name(name).expect("a column").clone()).collect::<Vec<_>>();
-        let all = arrow::compute::concat(&all.iter().map(AsRef::as_ref).collect::<Vec<_>>()).expect("lists");
-        all
+        arrow::compute::concat(&all.iter().map(AsRef::as_ref).collect::<Vec<_>>()).expect("lists")
     };
     let pairs = lists(ir).len();
     let tables = [
