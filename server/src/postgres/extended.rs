@@ -18,13 +18,13 @@ use pgwire::api::{ClientInfo, ClientPortalStore, DEFAULT_NAME, PgWireConnectionS
 use pgwire::error::{PgWireError, PgWireResult};
 use pgwire::messages::PgWireBackendMessage;
 use pgwire::messages::extendedquery::{
-    Close, CloseComplete, Describe, Execute, Parse, ParseComplete, Sync as PgSync, TARGET_TYPE_BYTE_PORTAL,
-    TARGET_TYPE_BYTE_STATEMENT,
+    Bind, BindComplete, Close, CloseComplete, Describe, Execute, Parse, ParseComplete, Sync as PgSync,
+    TARGET_TYPE_BYTE_PORTAL, TARGET_TYPE_BYTE_STATEMENT,
 };
 use pgwire::messages::response::{EmptyQueryResponse, ReadyForQuery, TransactionStatus};
 
 use super::command::{Reply, act, columns};
-use super::connection::Connection;
+use super::connection::{Connection, Kept};
 use super::copy;
 use super::rows::fields;
 use super::sqlstate::error;
@@ -122,12 +122,35 @@ impl ExtendedQueryHandler for Extended {
     {
         let _busy = self.connection.busy();
         let name = message.name.clone().unwrap_or_else(|| DEFAULT_NAME.to_owned());
-        self.connection.remember(&name).map_err(|fault| error(&fault))?;
-        match StoredStatement::parse(client, &message, self.parser.clone()).await? {
+        let parsed = StoredStatement::parse(client, &message, self.parser.clone()).await?;
+        self.connection.remember(Kept::Statement, &name).map_err(|fault| error(&fault))?;
+        match parsed {
             Some(statement) => client.portal_store().put_statement(Arc::new(statement)),
             None => client.portal_store().put_empty_statement(&name),
         }
         client.feed(PgWireBackendMessage::ParseComplete(ParseComplete::new())).await?;
+        Ok(())
+    }
+
+    // As the library's own, but that portals are counted.
+    async fn on_bind<C>(&self, client: &mut C, message: Bind) -> PgWireResult<()>
+    where
+        C: ClientInfo + ClientPortalStore + Sink<PgWireBackendMessage> + Unpin + Send + Sync,
+        C::PortalStore: PortalStore<Statement = Statement>,
+        C::Error: Debug,
+        PgWireError: From<<C as Sink<PgWireBackendMessage>>::Error>,
+    {
+        let statement = message.statement_name.as_deref().unwrap_or(DEFAULT_NAME);
+        let portal = message.portal_name.as_deref().unwrap_or(DEFAULT_NAME);
+        self.connection.remember(Kept::Portal, portal).map_err(|fault| error(&fault))?;
+        match client.portal_store().get_statement(statement) {
+            Some(Entry::Value(statement)) => {
+                client.portal_store().put_portal(Arc::new(Portal::try_new(&message, statement)?));
+            }
+            Some(Entry::Empty) => client.portal_store().put_empty_portal(portal),
+            None => return Err(PgWireError::StatementNotFound(statement.to_owned())),
+        }
+        client.feed(PgWireBackendMessage::BindComplete(BindComplete::new())).await?;
         Ok(())
     }
 
@@ -187,7 +210,10 @@ impl ExtendedQueryHandler for Extended {
     {
         let status = client.transaction_status();
         match status {
-            TransactionStatus::Idle => client.portal_store().clear_portals(),
+            TransactionStatus::Idle => {
+                client.portal_store().clear_portals();
+                self.connection.forget_portals();
+            }
             _ => client.portal_store().rm_portal(DEFAULT_NAME),
         }
         client.send(PgWireBackendMessage::ReadyForQuery(ReadyForQuery::new(status))).await?;
@@ -205,9 +231,12 @@ impl ExtendedQueryHandler for Extended {
         match message.target_type {
             TARGET_TYPE_BYTE_STATEMENT => {
                 client.portal_store().rm_statement(name);
-                self.connection.forget(name);
+                self.connection.forget(Kept::Statement, name);
             }
-            _ => client.portal_store().rm_portal(name),
+            _ => {
+                client.portal_store().rm_portal(name);
+                self.connection.forget(Kept::Portal, name);
+            }
         }
         client.feed(PgWireBackendMessage::CloseComplete(CloseComplete::new())).await?;
         Ok(())
