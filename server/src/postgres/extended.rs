@@ -96,8 +96,12 @@ fn values(portal: &Portal<Statement>) -> Result<ParamValues, Fault> {
         return Err(Fault::request(format!("{} formats for {given} values", codes.len())));
     }
     // Where neither side tells the type, it is the text that was advertised.
-    let kinds: Vec<_> = kinds.into_iter().map(|kind| kind.unwrap_or(DataType::Utf8)).collect();
-    let hints: Vec<_> = kinds.iter().map(Some).collect();
+    let told = |i: usize| {
+        portal.statement.parameter_types.get(i).is_some_and(|t| t.as_ref().is_some_and(|t| *t != Type::UNKNOWN))
+    };
+    let settled = |(i, kind): (usize, Option<DataType>)| kind.or_else(|| (!told(i)).then_some(DataType::Utf8));
+    let kinds: Vec<_> = kinds.into_iter().enumerate().map(settled).collect();
+    let hints: Vec<_> = kinds.iter().map(Option::as_ref).collect();
     deserialize_parameters(portal, &hints).map_err(|e| match e {
         PgWireError::UserError(info) => Fault::request(info.message.clone()),
         other => Fault::request(other.to_string()),
