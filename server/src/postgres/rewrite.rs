@@ -119,9 +119,10 @@ fn array_of_query(expr: &Expr) -> Option<Expr> {
     };
     // What it unnests is a column of the query around it, which DataFusion cannot do; in what clients ask, such columns
     // hold nothing here.
-    let unnests = |factor: &TableFactor| {
-        matches!(factor, TableFactor::Table { name, args: Some(_), .. }
-        if name.to_string().eq_ignore_ascii_case("unnest"))
+    let unnests = |factor: &TableFactor| match factor {
+        TableFactor::UNNEST { .. } => true,
+        TableFactor::Table { name, args: Some(_), .. } => name.to_string().eq_ignore_ascii_case("unnest"),
+        _ => false,
     };
     if select.from.iter().any(|from| unnests(&from.relation)) {
         return Some(Expr::value(Value::Null));
