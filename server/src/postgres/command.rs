@@ -14,7 +14,7 @@ use pgwire::messages::PgWireBackendMessage;
 use pgwire::messages::copy::CopyData;
 use pgwire::messages::response::{NoticeResponse, TransactionStatus};
 
-use super::connection::{Connection, Run};
+use super::connection::{Connection, Kept, Run};
 use super::copy::{Copied, CopyAs};
 use super::cursor::Cursor;
 use super::rows::{Rows, fields, response, text_fields, texts};
@@ -74,12 +74,13 @@ where
         }
         Statement::Discard(DiscardObject::ALL) => {
             client.portal_store().clear_portals();
+            connection.forget_portals();
             settle(connection, statement).map_err(|fault| error(&fault))
         }
         Statement::Deallocate(name) => {
             if let Some(name) = name {
                 client.portal_store().rm_statement(name);
-                connection.forget(name);
+                connection.forget(Kept::Statement, name);
             }
             Ok(Reply::Done(Tag::new("DEALLOCATE")))
         }
@@ -182,6 +183,7 @@ where
             }
             let committed = matches!(ended, Statement::Commit) && before != TransactionStatus::Error;
             connection.end_transaction();
+            connection.forget_portals();
             client.portal_store().clear_portals();
             (if committed { "COMMIT" } else { "ROLLBACK" }, TransactionStatus::Idle)
         }

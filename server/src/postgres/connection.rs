@@ -26,8 +26,10 @@ use crate::service::{FRESH, Job, Service, Work};
 
 /// Cursors of a connection at once.
 const CURSORS: usize = 16;
-/// Prepared statements of a connection at once.
-const STATEMENTS: usize = 500;
+/// Bytes of a query, as over HTTP.
+const LARGEST: usize = 2 << 20;
+/// Prepared statements of a connection at once, and portals.
+const NAMED: usize = 500;
 /// How often a server that stops looks whether a connection is done.
 const LOOK: Duration = Duration::from_millis(50);
 
@@ -64,7 +66,7 @@ pub(super) struct Connection {
     key: OnceLock<(i32, Bytes)>,
     current: Arc<Mutex<Stop>>,
     cursors: Mutex<HashMap<String, Arc<Cursor>>>,
-    statements: Mutex<HashSet<String>>,
+    kept: Mutex<HashSet<(Kept, String)>>,
     busy: AtomicUsize,
     pub(super) settings: Arc<Settings>,
 }
@@ -86,6 +88,22 @@ impl Drop for Busy<'_> {
     }
 }
 
+/// What clients keep by name.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub(super) enum Kept {
+    Statement,
+    Portal,
+}
+
+impl Kept {
+    fn name(self) -> &'static str {
+        match self {
+            Self::Statement => "prepared statements",
+            Self::Portal => "portals",
+        }
+    }
+}
+
 /// What a command runs under.
 #[derive(Clone)]
 pub(super) struct Run {
@@ -103,7 +121,7 @@ impl Connection {
             key: OnceLock::new(),
             current: Arc::new(Mutex::new(Stop::new())),
             cursors: Mutex::default(),
-            statements: Mutex::default(),
+            kept: Mutex::default(),
             busy: AtomicUsize::new(0),
             settings: Arc::default(),
         }
@@ -170,6 +188,9 @@ impl Connection {
         types: &[Option<Type>],
         run: &Run,
     ) -> Result<Vec<Statement>, Fault> {
+        if sql.len() > LARGEST {
+            return Err(Fault::TooLarge { limit: LARGEST });
+        }
         let (shared, session) = (self.shared.clone(), self.session()?.clone());
         let (sql, types): (Arc<str>, _) = (sql.into(), types.to_vec());
         self.planned(run, async move {
@@ -223,19 +244,25 @@ impl Connection {
         self.shared.service.begin(job, encode).await
     }
 
-    /// Counts a prepared statement of this name.
-    pub(super) fn remember(&self, name: &str) -> Result<(), Fault> {
-        let mut statements = lock(&self.statements);
-        if statements.len() >= STATEMENTS && !statements.contains(name) {
-            return Err(Fault::TooMany { what: "prepared statements", limit: STATEMENTS });
+    /// Counts what a client keeps by name.
+    pub(super) fn remember(&self, kind: Kept, name: &str) -> Result<(), Fault> {
+        let mut all = lock(&self.kept);
+        let new = (kind, name.to_owned());
+        if !all.contains(&new) && all.iter().filter(|(known, _)| *known == kind).count() >= NAMED {
+            return Err(Fault::TooMany { what: kind.name(), limit: NAMED });
         }
-        statements.insert(name.to_owned());
+        all.insert(new);
         Ok(())
     }
 
     /// Counts it no more.
-    pub(super) fn forget(&self, name: &str) {
-        lock(&self.statements).remove(name);
+    pub(super) fn forget(&self, kind: Kept, name: &str) {
+        lock(&self.kept).remove(&(kind, name.to_owned()));
+    }
+
+    /// All portals are gone.
+    pub(super) fn forget_portals(&self) {
+        lock(&self.kept).retain(|(kind, _)| *kind != Kept::Portal);
     }
 
     /// Keeps a cursor.

@@ -18,13 +18,13 @@ use pgwire::api::{ClientInfo, ClientPortalStore, DEFAULT_NAME, PgWireConnectionS
 use pgwire::error::{PgWireError, PgWireResult};
 use pgwire::messages::PgWireBackendMessage;
 use pgwire::messages::extendedquery::{
-    Close, CloseComplete, Describe, Execute, Parse, ParseComplete, Sync as PgSync, TARGET_TYPE_BYTE_PORTAL,
-    TARGET_TYPE_BYTE_STATEMENT,
+    Bind, BindComplete, Close, CloseComplete, Describe, Execute, Parse, ParseComplete, Sync as PgSync,
+    TARGET_TYPE_BYTE_PORTAL, TARGET_TYPE_BYTE_STATEMENT,
 };
 use pgwire::messages::response::{EmptyQueryResponse, ReadyForQuery, TransactionStatus};
 
 use super::command::{Reply, act, columns};
-use super::connection::Connection;
+use super::connection::{Connection, Kept};
 use super::copy;
 use super::rows::fields;
 use super::sqlstate::error;
@@ -96,8 +96,12 @@ fn values(portal: &Portal<Statement>) -> Result<ParamValues, Fault> {
         return Err(Fault::request(format!("{} formats for {given} values", codes.len())));
     }
     // Where neither side tells the type, it is the text that was advertised.
-    let kinds: Vec<_> = kinds.into_iter().map(|kind| kind.unwrap_or(DataType::Utf8)).collect();
-    let hints: Vec<_> = kinds.iter().map(Some).collect();
+    let told = |i: usize| {
+        portal.statement.parameter_types.get(i).is_some_and(|t| t.as_ref().is_some_and(|t| *t != Type::UNKNOWN))
+    };
+    let settled = |(i, kind): (usize, Option<DataType>)| kind.or_else(|| (!told(i)).then_some(DataType::Utf8));
+    let kinds: Vec<_> = kinds.into_iter().enumerate().map(settled).collect();
+    let hints: Vec<_> = kinds.iter().map(Option::as_ref).collect();
     deserialize_parameters(portal, &hints).map_err(|e| match e {
         PgWireError::UserError(info) => Fault::request(info.message.clone()),
         other => Fault::request(other.to_string()),
@@ -122,12 +126,35 @@ impl ExtendedQueryHandler for Extended {
     {
         let _busy = self.connection.busy();
         let name = message.name.clone().unwrap_or_else(|| DEFAULT_NAME.to_owned());
-        self.connection.remember(&name).map_err(|fault| error(&fault))?;
-        match StoredStatement::parse(client, &message, self.parser.clone()).await? {
+        let parsed = StoredStatement::parse(client, &message, self.parser.clone()).await?;
+        self.connection.remember(Kept::Statement, &name).map_err(|fault| error(&fault))?;
+        match parsed {
             Some(statement) => client.portal_store().put_statement(Arc::new(statement)),
             None => client.portal_store().put_empty_statement(&name),
         }
         client.feed(PgWireBackendMessage::ParseComplete(ParseComplete::new())).await?;
+        Ok(())
+    }
+
+    // As the library's own, but that portals are counted.
+    async fn on_bind<C>(&self, client: &mut C, message: Bind) -> PgWireResult<()>
+    where
+        C: ClientInfo + ClientPortalStore + Sink<PgWireBackendMessage> + Unpin + Send + Sync,
+        C::PortalStore: PortalStore<Statement = Statement>,
+        C::Error: Debug,
+        PgWireError: From<<C as Sink<PgWireBackendMessage>>::Error>,
+    {
+        let statement = message.statement_name.as_deref().unwrap_or(DEFAULT_NAME);
+        let portal = message.portal_name.as_deref().unwrap_or(DEFAULT_NAME);
+        self.connection.remember(Kept::Portal, portal).map_err(|fault| error(&fault))?;
+        match client.portal_store().get_statement(statement) {
+            Some(Entry::Value(statement)) => {
+                client.portal_store().put_portal(Arc::new(Portal::try_new(&message, statement)?));
+            }
+            Some(Entry::Empty) => client.portal_store().put_empty_portal(portal),
+            None => return Err(PgWireError::StatementNotFound(statement.to_owned())),
+        }
+        client.feed(PgWireBackendMessage::BindComplete(BindComplete::new())).await?;
         Ok(())
     }
 
@@ -187,7 +214,10 @@ impl ExtendedQueryHandler for Extended {
     {
         let status = client.transaction_status();
         match status {
-            TransactionStatus::Idle => client.portal_store().clear_portals(),
+            TransactionStatus::Idle => {
+                client.portal_store().clear_portals();
+                self.connection.forget_portals();
+            }
             _ => client.portal_store().rm_portal(DEFAULT_NAME),
         }
         client.send(PgWireBackendMessage::ReadyForQuery(ReadyForQuery::new(status))).await?;
@@ -205,9 +235,12 @@ impl ExtendedQueryHandler for Extended {
         match message.target_type {
             TARGET_TYPE_BYTE_STATEMENT => {
                 client.portal_store().rm_statement(name);
-                self.connection.forget(name);
+                self.connection.forget(Kept::Statement, name);
             }
-            _ => client.portal_store().rm_portal(name),
+            _ => {
+                client.portal_store().rm_portal(name);
+                self.connection.forget(Kept::Portal, name);
+            }
         }
         client.feed(PgWireBackendMessage::CloseComplete(CloseComplete::new())).await?;
         Ok(())

@@ -3,8 +3,8 @@
 use std::ops::ControlFlow;
 
 use datafusion::sql::sqlparser::ast::{
-    BinaryOperator, Expr, Function, FunctionArg, FunctionArgExpr, FunctionArgumentList, FunctionArguments, Ident,
-    ObjectName, ObjectNamePart, Query, SelectItem, SetExpr, Statement, TableFactor, Value, ValueWithSpan,
+    BinaryOperator, Expr, Function, FunctionArg, FunctionArgExpr, FunctionArgumentList, FunctionArguments, GroupByExpr,
+    Ident, ObjectName, ObjectNamePart, Query, SelectItem, SetExpr, Statement, TableFactor, Value, ValueWithSpan,
     VisitMut as _, VisitorMut,
 };
 use datafusion::sql::sqlparser::dialect::PostgreSqlDialect;
@@ -13,6 +13,8 @@ use pgwire::api::Type;
 
 /// Columns of `pg_type` that name a function, as texts; Postgres has their numbers there, and 0 for none.
 const FUNCTIONS: [&str; 6] = ["typinput", "typoutput", "typreceive", "typsend", "typmodin", "typmodout"];
+/// Aggregates that a subquery may have already.
+const AGGREGATES: [&str; 8] = ["array_agg", "avg", "bool_or", "count", "max", "min", "string_agg", "sum"];
 /// How such a column says that there is none.
 const NONE: &str = "-";
 
@@ -41,7 +43,8 @@ impl Adapt<'_> {
         let number: usize = placeholder.strip_prefix('$')?.parse().ok()?;
         let told = self.0.get(number.checked_sub(1)?).and_then(Option::as_ref);
         if told.is_none_or(|told| matches!(*told, Type::UNKNOWN | Type::TEXT | Type::VARCHAR)) {
-            let sql = format!("string_to_array(replace(btrim({placeholder}, '{{}}'), '\"', ''), ',')");
+            let unquoted = format!("replace(replace(btrim({placeholder}, '{{}}'), '\"', ''), ', ', ',')");
+            let sql = format!("string_to_array({unquoted}, ',')");
             *array = Parser::new(&PostgreSqlDialect {}).try_with_sql(&sql).ok()?.parse_expr().ok()?;
         }
         Some(())
@@ -66,6 +69,9 @@ impl VisitorMut for Adapt<'_> {
         }
         if let Some(better) = array_of_query(expr) {
             *expr = better;
+        }
+        if let Expr::Subquery(query) = expr {
+            one_row(query);
         }
         self.any_of_text(expr);
         if let Expr::BinaryOp { left, op: BinaryOperator::Eq | BinaryOperator::NotEq, right } = expr
@@ -113,25 +119,63 @@ fn array_of_query(expr: &Expr) -> Option<Expr> {
     };
     // What it unnests is a column of the query around it, which DataFusion cannot do; in what clients ask, such columns
     // hold nothing here.
-    let unnests = |factor: &TableFactor| {
-        matches!(factor, TableFactor::Table { name, args: Some(_), .. }
-        if name.to_string().eq_ignore_ascii_case("unnest"))
+    let unnests = |factor: &TableFactor| match factor {
+        TableFactor::UNNEST { .. } => true,
+        TableFactor::Table { name, args: Some(_), .. } => name.to_string().eq_ignore_ascii_case("unnest"),
+        _ => false,
     };
     if select.from.iter().any(|from| unnests(&from.relation)) {
         return Some(Expr::value(Value::Null));
     }
     let mut select = select.clone();
-    select.projection = vec![SelectItem::UnnamedExpr(Expr::Function(Function {
-        name: ObjectName::from(vec![Ident::new("array_agg")]),
-        args: FunctionArguments::List(FunctionArgumentList {
-            duplicate_treatment: None,
-            args: vec![FunctionArg::Unnamed(FunctionArgExpr::Expr(item.clone()))],
-            clauses: Vec::new(),
-        }),
-        ..function.clone()
-    }))];
+    select.projection = vec![SelectItem::UnnamedExpr(call("array_agg", item.clone(), function))];
     let body = Box::new(SetExpr::Select(select));
     Some(Expr::Subquery(Box::new(Query { body, order_by: None, ..query.as_ref().clone() })))
+}
+
+fn call(name: &str, argument: Expr, like: &Function) -> Expr {
+    let args = FunctionArguments::List(FunctionArgumentList {
+        duplicate_treatment: None,
+        args: vec![FunctionArg::Unnamed(FunctionArgExpr::Expr(argument))],
+        clauses: Vec::new(),
+    });
+    Expr::Function(Function { name: ObjectName::from(vec![Ident::new(name)]), args, ..like.clone() })
+}
+
+// DataFusion wants to be sure that a scalar subquery has one row. Those that clients ask of the catalogue look one up
+// by its key: its greatest is the same.
+fn one_row(query: &mut Query) {
+    let SetExpr::Select(select) = query.body.as_mut() else { return };
+    let of_catalog = |factor: &TableFactor| {
+        matches!(factor, TableFactor::Table { name, args: None, .. }
+            if name.0.last().and_then(|n| n.as_ident()).is_some_and(|n| n.value.starts_with("pg_")))
+    };
+    let plain = select.distinct.is_none() && select.having.is_none() && !select.from.is_empty();
+    let grouped = !matches!(&select.group_by, GroupByExpr::Expressions(by, _) if by.is_empty());
+    let known = select.from.iter().all(|f| of_catalog(&f.relation) && f.joins.iter().all(|j| of_catalog(&j.relation)));
+    if !plain || grouped || !known {
+        return;
+    }
+    let [SelectItem::UnnamedExpr(item) | SelectItem::ExprWithAlias { expr: item, .. }] = &mut select.projection[..]
+    else {
+        return;
+    };
+    let is_aggregate = |name: &str| AGGREGATES.iter().any(|a| name.eq_ignore_ascii_case(a));
+    if matches!(item, Expr::Function(function) if is_aggregate(&function.name.to_string())) {
+        return;
+    }
+    let plain_call = Function {
+        name: ObjectName::from(Vec::<Ident>::new()),
+        uses_odbc_syntax: false,
+        parameters: FunctionArguments::None,
+        args: FunctionArguments::None,
+        filter: None,
+        null_treatment: None,
+        over: None,
+        within_group: Vec::new(),
+    };
+    *item = call("max", item.clone(), &plain_call);
+    (query.limit_clause, query.order_by) = (None, None);
 }
 
 #[cfg(test)]
@@ -152,10 +196,16 @@ mod tests {
         );
         check("SELECT 1 FROM t WHERE typreceive != 0", "SELECT 1 FROM t WHERE typreceive <> '-'");
         check("SELECT 1 FROM t WHERE t.typsend = 0", "SELECT 1 FROM t WHERE t.typsend = '-'");
+        check(
+            "SELECT (SELECT d.x FROM pg_catalog.pg_attrdef d WHERE d.i = a.i LIMIT 1) FROM a",
+            "SELECT (SELECT max(d.x) FROM pg_catalog.pg_attrdef d WHERE d.i = a.i) FROM a",
+        );
+        check("SELECT (SELECT d.x FROM d) FROM a", "SELECT (SELECT d.x FROM d) FROM a");
+        check("SELECT (SELECT count(*) FROM pg_class) FROM a", "SELECT (SELECT count(*) FROM pg_class) FROM a");
         check("SELECT 1 FROM pg_indexes", "SELECT 1 FROM pg_catalog.pg_indexes");
         check(
             "SELECT array_contains($1, x), array_contains($2, x) FROM t",
-            "SELECT array_contains(string_to_array(replace(btrim($1, '{}'), '\"', ''), ','), x), array_contains($2, x) FROM t",
+            "SELECT array_contains(string_to_array(replace(replace(btrim($1, '{}'), '\"', ''), ', ', ','), ','), x), array_contains($2, x) FROM t",
         );
         check(
             "SELECT 1 FROM t WHERE ctid BETWEEN '(0,0)'::tid AND '(4294967295,0)'::tid AND n < 1",
