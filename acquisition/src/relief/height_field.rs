@@ -20,6 +20,12 @@ impl HeightField {
         Self { size_mm, cells, heights_mm }
     }
 
+    /// The same field, higher by this, mm.
+    pub(super) fn raised_by(mut self, mm: f64) -> Self {
+        self.heights_mm.iter_mut().for_each(|h| *h = (f64::from(*h) + mm) as f32);
+        self
+    }
+
     /// Edge of the square, mm.
     pub fn size_mm(&self) -> f64 {
         self.size_mm
