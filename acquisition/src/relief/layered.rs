@@ -161,3 +161,167 @@ fn centred(heights: HeightField) -> HeightField {
     let shift = (-mean).clamp(RELIEF_MM[0] - low, (RELIEF_MM[1] - high).max(RELIEF_MM[0] - low));
     heights.raised_by(shift)
 }
+
+#[cfg(test)]
+mod tests {
+    use super::super::{Domain, Relief};
+    use super::*;
+
+    fn wall(name: &str, settings: &[(&str, &str)]) -> Relief {
+        let mut relief = Relief::by_name(name).expect(name);
+        settings.iter().for_each(|(key, value)| relief.set(key, value).expect(key));
+        relief
+    }
+
+    fn depth(relief: &Relief) -> f32 {
+        let [low, high] = relief.height_field(128).extent_mm();
+        high - low
+    }
+
+    // Ranges are chosen so that everything fits: all parameters at their greatest, under every large shape, with
+    // every joint and every solid.
+    #[test]
+    fn every_combination_fits_the_relief() {
+        for mesostructure in Mesostructure::ALL {
+            let mut greatest = Relief::Layered(Layered::new(mesostructure));
+            let parameters = greatest.describe();
+            for parameter in &parameters {
+                match parameter.domain {
+                    Domain::Number { high, .. } => greatest.set(parameter.key, &high.to_string()).expect("in range"),
+                    Domain::Whole { .. } => greatest.set(parameter.key, "7").expect("in range"),
+                    Domain::Choice { .. } => {}
+                }
+            }
+            for parameter in &parameters {
+                let Domain::Choice { options, .. } = parameter.domain else { continue };
+                for option in options {
+                    let mut relief = greatest.clone();
+                    relief.set("macrostructure", "convex").expect("a shape");
+                    relief.set(parameter.key, option).expect("an option");
+                    let [low, high] = relief.height_field(40).extent_mm().map(f64::from);
+                    let fits = low >= RELIEF_MM[0] - 1e-4 && high <= RELIEF_MM[1] + 1e-4;
+                    assert!(fits, "{} {}={option}: {low} to {high}", relief.name(), parameter.key);
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn parameters_move_what_their_names_say() {
+        let flat_bricks = [("projection_mm", "0"), ("lean_mm", "0")];
+        let bricks = |more: &[(&str, &str)]| wall("stretcher_bond", &[&flat_bricks, more].concat());
+        // A cell of the 512 is 1.14 mm: joints of 30 mm are 3 mm here, and some cells lie wholly in them.
+        let deep = |mm| {
+            let [low, high] = bricks(&[("joint_width_mm", "30"), ("joint_depth_mm", mm)]).height_field(512).extent_mm();
+            high - low
+        };
+        assert_eq!(deep("0"), 0.0);
+        assert!((deep("10") - 1.0).abs() < 1e-5 && (deep("30") - 3.0).abs() < 1e-5, "{} {}", deep("10"), deep("30"));
+        assert_eq!(depth(&bricks(&[("joint_shape", "flush")])), 0.0);
+        let mean_square = |relief: &Relief| {
+            let heights = relief.height_field(512);
+            heights.heights_mm().iter().map(|h| f64::from(h * h)).sum::<f64>()
+        };
+        // Heights' mean is 0, so their mean square says how much of the wall lies how deep.
+        let wide = |mm| mean_square(&bricks(&[("joint_width_mm", mm)]));
+        assert!(wide("20") > 1.5 * wide("10"));
+        let shape = |name| mean_square(&bricks(&[("joint_width_mm", "30"), ("joint_shape", name)]));
+        assert!(shape("recessed") > shape("concave") && shape("concave") > shape("v"), "a v is the shallowest");
+        let rough = |mm| mean_square(&wall("macrostructure", &[("macrostructure", "flat"), ("roughness_mm", mm)]));
+        assert!(rough("0") == 0.0 && rough("5") > 0.0);
+        assert!((rough("10") / rough("5") - 4.0).abs() < 1e-2, "twice as rough");
+        let large = |mm| depth(&wall("macrostructure", &[("macrostructure", "convex"), ("macro_depth_mm", mm)]));
+        assert!((large("100") - 10.0).abs() < 0.2 && (large("200") - 20.0).abs() < 0.4);
+        for (name, key, low, high) in [
+            ("coursed_ashlar", "projection_mm", "0", "80"),
+            ("slated_stone", "lean_mm", "0", "30"),
+            ("polygonal_rubble", "bulge_mm", "0", "40"),
+            ("river_rock", "bulge_mm", "20", "120"),
+            ("primitives", "primitive_height_mm", "20", "150"),
+            ("primitive_root", "well_depth_mm", "20", "150"),
+        ] {
+            let [less, more] = [low, high].map(|value| depth(&wall(name, &[(key, value)])));
+            assert!(more > less + 1.0, "{name} {key}: {less} {more}");
+        }
+    }
+
+    #[test]
+    fn layers_add_up() {
+        let bricks = wall("stretcher_bond", &[]).height_field(64);
+        let dome = [("macrostructure", "convex"), ("macro_depth_mm", "100")];
+        let (both, alone) =
+            (wall("stretcher_bond", &dome).height_field(64), wall("macrostructure", &dome).height_field(64));
+        for (n, height) in both.heights_mm().iter().enumerate() {
+            let sum = bricks.heights_mm()[n] + alone.heights_mm()[n];
+            assert!((height - sum).abs() < 1e-4, "{n}: {height} {sum}");
+        }
+    }
+
+    // The heights' bits, as numbers that say when a wall of some seed is no longer what it was, or is another on
+    // another machine.
+    #[test]
+    fn walls_have_the_same_bits_everywhere() {
+        let digest = |name: &str| {
+            let heights = wall(name, &[("roughness_mm", "4")]).height_field(48);
+            let bytes: Vec<u8> = heights.heights_mm().iter().flat_map(|h| h.to_le_bytes()).collect();
+            crc32fast::hash(&bytes)
+        };
+        let digests = Mesostructure::ALL.map(|m| digest(m.name()));
+        assert_eq!(digests, DIGESTS);
+    }
+
+    const DIGESTS: [u32; 9] = [
+        449_339_013,
+        1_870_956_126,
+        3_730_505_683,
+        112_774_444,
+        3_391_104_038,
+        581_177_784,
+        1_716_257_505,
+        1_133_449_639,
+        607_196_090,
+    ];
+
+    #[test]
+    fn seeds_and_walls_are_told_apart() {
+        for mesostructure in Mesostructure::ALL {
+            let of = |seed| wall(mesostructure.name(), &[("roughness_mm", "3"), ("seed", seed)]).height_field(32);
+            assert_eq!(of("5"), of("5"));
+            assert_ne!(of("5"), of("6"), "{mesostructure:?}");
+        }
+    }
+
+    #[test]
+    fn values_out_of_range_are_refused_by_name_range_and_hint() {
+        let mut relief = wall("coursed_ashlar", &[]);
+        let refused = relief.set("joint_depth_mm", "50").expect_err("too deep").to_string();
+        assert_eq!(
+            refused,
+            "parameter `joint_depth_mm` of relief `coursed_ashlar` is `50`, expected 0 to 40 mm full scale; \
+             hint: how far the joints lie behind the stones' faces"
+        );
+        let refused = relief.set("joint_shape", "round").expect_err("no shape").to_string();
+        assert!(refused.contains("recessed, flush, raked, concave, v"), "{refused}");
+        for value in ["NaN", "inf", "", "-1", "1e9"] {
+            assert!(relief.set("stone_length_mm", value).is_err(), "{value}");
+        }
+        let refused = relief.set("brick_length_mm", "200").expect_err("no bricks").to_string();
+        assert!(refused.contains("course_height_mm"), "{refused}");
+    }
+
+    #[test]
+    fn parameters_go_through_json() {
+        for name in Relief::NAMES {
+            let mut relief = Relief::by_name(name).expect(name);
+            if relief.describe().iter().any(|p| p.key == "seed") {
+                relief.set("seed", "9").expect("a seed");
+            }
+            assert_eq!(Relief::from_json(&relief.to_json().to_string()), Ok(relief));
+        }
+        let deep = r#"{"relief": "stretcher_bond", "parameters": {"joint_depth_mm": 400}}"#;
+        assert!(matches!(Relief::from_json(deep), Err(Error::Value { .. })));
+        for text in ["", "[]", "{}", r#"{"relief": "flat"}"#] {
+            assert!(matches!(Relief::from_json(text), Err(Error::Text { .. })), "{text}");
+        }
+    }
+}

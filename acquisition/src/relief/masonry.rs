@@ -18,7 +18,7 @@ const HEIGHT: Parameter =
     Parameter::mm("brick_height_mm", Layer::Mesostructure, [40.0, 250.0, 65.0], "height of a brick");
 
 pub(super) const PARAMETERS: [Parameter; 8] =
-    [LENGTH, HEIGHT, projection(4.0), lean(3.0), SEED, JOINT_SHAPE, JOINT_WIDTH, JOINT_DEPTH];
+    [LENGTH, HEIGHT, projection(80.0, 4.0), lean(3.0), SEED, JOINT_SHAPE, JOINT_WIDTH, JOINT_DEPTH];
 
 /// A wall of bricks, model mm.
 pub(super) struct Masonry {
@@ -76,8 +76,7 @@ impl Stones for Masonry {
         let course = (y / (2.0 * half_height)).floor();
         let dy = y - (2.0 * course + 1.0) * half_height;
         let (column, dx, half_length) = self.along(x, course as i64);
-        let face =
-            self.faces.height(self.chance.at(column, course as i64), [dx / half_length, dy / half_height], 0.0);
+        let face = self.faces.height(self.chance.at(column, course as i64), [dx / half_length, dy / half_height], 0.0);
         Spot { to_joint: (half_length - dx.abs()).min(half_height - dy.abs()), face }
     }
 }

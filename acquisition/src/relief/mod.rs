@@ -3,6 +3,7 @@
 mod bricks;
 mod chance;
 mod courses;
+pub mod group;
 mod height_field;
 mod layered;
 mod macrostructure;

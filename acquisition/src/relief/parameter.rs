@@ -109,7 +109,12 @@ impl Parameter {
     }
 
     /// A whole number.
-    pub(super) const fn whole(key: &'static str, layer: Layer, [low, high, default]: [u64; 3], about: &'static str) -> Self {
+    pub(super) const fn whole(
+        key: &'static str,
+        layer: Layer,
+        [low, high, default]: [u64; 3],
+        about: &'static str,
+    ) -> Self {
         Self { key, layer, unit: "", domain: Domain::Whole { low, high, default }, about }
     }
 

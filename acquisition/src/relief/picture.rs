@@ -42,8 +42,7 @@ impl HeightField {
 
     fn pixel(&self, column: usize, row: usize, top: f64) -> u8 {
         let within = (0..OVERSAMPLING).flat_map(|j| (0..OVERSAMPLING).map(move |i| (i, j)));
-        let light: f64 =
-            within.map(|(i, j)| self.light(column * OVERSAMPLING + i, row * OVERSAMPLING + j, top)).sum();
+        let light: f64 = within.map(|(i, j)| self.light(column * OVERSAMPLING + i, row * OVERSAMPLING + j, top)).sum();
         let light = light / (OVERSAMPLING * OVERSAMPLING) as f64;
         (255.0 * light.clamp(0.0, 1.0).powf(GAMMA)).round() as u8
     }

@@ -26,18 +26,8 @@ const TURN: Parameter = Parameter::choice(
     "how wedges and ridges are turned, in quarter turns",
 );
 
-pub(super) const PARAMETERS: [Parameter; 10] = [
-    SOLID,
-    SIZE,
-    HEIGHT,
-    GAP,
-    VARIATION,
-    TURN,
-    SEED,
-    JOINT_SHAPE,
-    joint_width(0.0),
-    joint_depth(0.0),
-];
+pub(super) const PARAMETERS: [Parameter; 10] =
+    [SOLID, SIZE, HEIGHT, GAP, VARIATION, TURN, SEED, JOINT_SHAPE, joint_width(0.0), joint_depth(0.0)];
 
 #[derive(Debug, Clone, Copy, PartialEq)]
 enum Solid {

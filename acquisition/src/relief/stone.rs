@@ -5,9 +5,9 @@ use super::layered::Settings;
 use super::parameter::{Layer, Parameter};
 
 /// How far stones stand out.
-pub(super) const fn projection(default: f64) -> Parameter {
+pub(super) const fn projection(high: f64, default: f64) -> Parameter {
     let about = "stones stand out of the wall by up to this";
-    Parameter::mm("projection_mm", Layer::Mesostructure, [0.0, 80.0, default], about)
+    Parameter::mm("projection_mm", Layer::Mesostructure, [0.0, high, default], about)
 }
 
 /// How far stones lean.
@@ -33,7 +33,7 @@ pub(super) struct Faces {
 impl Faces {
     pub(super) fn of(settings: &Settings) -> Self {
         Self {
-            projection: settings.model_mm(&projection(0.0)),
+            projection: settings.model_mm(&projection(0.0, 0.0)),
             lean: settings.model_mm(&lean(0.0)),
             bulge: settings.model_mm(&bulge(0.0, 0.0)),
         }

@@ -10,7 +10,7 @@ use super::stone::{Faces, bulge, lean, pillow, projection};
 
 const MESO: Layer = Layer::Mesostructure;
 /// Round stones leave this share of the way to their middle to the joint: it widens in the corners.
-const CORNERS: f64 = 0.1;
+const CORNERS: f64 = 0.2;
 /// Stones further away than this many lengths of the lattice border on no other.
 const REACH: i64 = 2;
 /// Bulging rubble is level from this distance to its edges on, as a share of the way to its middle.
@@ -34,7 +34,7 @@ pub(super) const RUBBLE: [Parameter; 10] = [
     size([100.0, 1200.0, 400.0]),
     IRREGULARITY,
     ELONGATION,
-    projection(20.0),
+    projection(80.0, 20.0),
     lean(10.0),
     bulge(40.0, 15.0),
     SEED,
@@ -47,7 +47,7 @@ pub(super) const RIVER_ROCK: [Parameter; 9] = [
     size([80.0, 800.0, 280.0]),
     IRREGULARITY,
     ELONGATION,
-    projection(20.0),
+    projection(30.0, 20.0),
     bulge(120.0, 70.0),
     SEED,
     JOINT_SHAPE,
@@ -101,8 +101,7 @@ impl Cells {
             Stone { middle: [ix as f64 + shift + off(8), iy as f64 + off(9)], radius: 0.0 }
         };
         let stones = (0..counts[0] * counts[1]).map(stone).collect();
-        let mut cells =
-            Self { scale, first, row: counts[0], stones, outline, faces: Faces::of(settings), chance };
+        let mut cells = Self { scale, first, row: counts[0], stones, outline, faces: Faces::of(settings), chance };
         let radius = |n: usize| cells.to_border(cells.stones[n].middle, n);
         let radii: Vec<f64> = (0..cells.stones.len()).map(radius).collect();
         cells.stones.iter_mut().zip(radii).for_each(|(stone, radius)| stone.radius = radius);
@@ -162,7 +161,7 @@ impl Stones for Cells {
                 let to_joint = (to_border - CORNERS * radius).max(0.0);
                 let dome = ((1.0 - CORNERS) * radius - half_joint).max(0.1 * radius);
                 let t = ((to_joint - half_joint) / dome).clamp(0.0, 1.0);
-                (to_joint, (t * (2.0 - t)).sqrt())
+                (to_joint, t * (2.0 - t))
             }
         };
         let stone = self.chance.at(self.first[0] + (own % self.row) as i64, self.first[1] + (own / self.row) as i64);
