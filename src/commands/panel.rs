@@ -45,7 +45,8 @@ pub(crate) struct PanelArgs {
     /// FILE.json are two files, FILE_0 and FILE_1. With --group a folder, with --next the next ranges.
     #[arg(short, long, required_unless_present = "list", value_name = "FILE")]
     output: Vec<PathBuf>,
-    /// Cells along each side of the mesh, 274 or 585 by default: a tenth of a millimetre less than 2.2 or 1 mm each.
+    /// Cells along each side of the mesh; by default 585, which are 1 mm, for walls with joints, and 274 for flat, foam,
+    /// wood, prd, brick, flemish and wavy.
     #[arg(long, value_parser = clap::value_parser!(u32).range(16..=2340))]
     cells: Option<u32>,
     /// Print all reliefs and parameters with ranges, defaults and units; of one relief where it is named.
