@@ -8,6 +8,7 @@ use echolake_lake::{KEEP_HOURS, TARGET_BYTES};
 use echolake_schema::SurfaceId;
 
 use crate::commands::serve::ServeArgs;
+use crate::commands::panel::PanelArgs;
 use crate::commands::sql::SqlArgs;
 
 /// A data lake and catalogue for sweep measurements.
@@ -27,7 +28,7 @@ pub(crate) enum Command {
     Demo(DemoArgs),
     /// Measure one surface with the simulated rig: one run, one MCAP file.
     Acquire(AcquireArgs),
-    /// Write a generated relief as a mesh.
+    /// Write a generated relief as a mesh, heights or a picture; make groups of them.
     Panel(PanelArgs),
     /// Turn existing measurements into runs.
     #[command(subcommand)]
@@ -84,10 +85,13 @@ pub(crate) struct AcquireArgs {
     /// Name of the measured surface, as 0015_0.
     #[arg(long)]
     pub(crate) surface: SurfaceId,
-    /// What the simulated rig measures: flat, foam, wood, prd, brick, flemish or wavy; by default what the surface's
-    /// name begins with.
+    /// What the simulated rig measures, as `echolake panel --list` names it; by default what the surface's name begins
+    /// with.
     #[arg(long, value_name = "NAME", conflicts_with = "mesh")]
     pub(crate) panel: Option<String>,
+    /// A JSON file of parameters, as `echolake panel` writes them, in place of a name.
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["mesh", "panel"])]
+    pub(crate) parameters: Option<PathBuf>,
     /// A parameter of it.
     #[arg(long, value_name = "KEY=VALUE")]
     pub(crate) set: Vec<String>,
@@ -109,18 +113,6 @@ pub(crate) struct AcquireArgs {
     /// Record no sweeps, only impulse responses.
     #[arg(long)]
     pub(crate) ir_only: bool,
-}
-
-#[derive(Debug, Args)]
-pub(crate) struct PanelArgs {
-    /// Kind of relief: flat, foam, wood, prd, brick, flemish or wavy.
-    pub(crate) name: String,
-    /// A parameter of it.
-    #[arg(long, value_name = "KEY=VALUE")]
-    pub(crate) set: Vec<String>,
-    /// The file; its extension tells the format: glb, stl, obj or ply.
-    #[arg(short, long)]
-    pub(crate) output: PathBuf,
 }
 
 #[derive(Debug, Subcommand)]

@@ -115,6 +115,34 @@ fn meshes_and_surfaces() {
 }
 
 #[test]
+fn panels_and_groups_that_cannot_be_made() {
+    let place = Place::new();
+    place.fails(1, &["panel", "marble", "-o", "x.stl"], "no relief; hint: flat");
+    place.fails(
+        1,
+        &["panel", "stretcher_bond", "--set", "joint_depth_mm=50", "-o", "x.stl"],
+        "expected 0 to 40 mm full",
+    );
+    place.fails(1, &["panel", "river_rock", "-o", "x.stl", "-o", "x.step"], "no mesh file that is known");
+    assert!(!place.path("x.stl").exists(), "nothing is written where something is refused");
+    place.fails(2, &["panel", "river_rock"], "--output");
+    place.fails(2, &["panel", "--next", "ranges.toml", "-o", "next.toml"], "--results");
+    let ranges = "relief = \"slated_stone\"\n[ranges]\nprojection_mm = [20, 60]\n";
+    std::fs::write(place.path("ranges.toml"), ranges).expect("written");
+    std::fs::write(place.path("wide.toml"), ranges.replace("60", "90")).expect("written");
+    place.fails(1, &["panel", "--group", "wide.toml", "-o", "group"], "range of `projection_mm` is 20 to 90");
+    place.ok(&["panel", "--group", "ranges.toml", "--count", "3", "-o", "group"]);
+    place.ok(&["panel", "--parameters", "group/0002_0.json", "--back", "prd", "--cells", "32", "-o", "0002.stl"]);
+    place.acquire("0002_0", &["--parameters", "group/0002_0.json"]);
+    std::fs::write(place.path("one.csv"), "surface_id,band,p90_mean_db\n0001_0,total,-1\n").expect("written");
+    let next = |results| ["panel", "--next", "ranges.toml", "--results", results, "-o", "next.toml"];
+    place.fails(1, &next("one.csv"), "two surfaces or more");
+    std::fs::write(place.path("two.csv"), "surface_id,band,p90_mean_db\n0001_0,total,-1\n0001_1,total,-1\n")
+        .expect("written");
+    assert!(place.ok(&next("two.csv")).contains("projection_mm: 20 to 60 becomes 0 to 80."));
+}
+
+#[test]
 fn run_files_that_are_none_or_damaged() {
     let place = Place::new();
     let run = place.acquire("flat", &[]);

@@ -148,10 +148,16 @@ fn generated(relief: &Relief) -> Prepared {
         watertight: true,
         relief_mm: heights.extent_mm().map(f64::from),
     };
+    let (macrostructure, microstructure) = match relief {
+        Relief::Layered(wall) => (Some(wall.macrostructure().to_owned()), Some(wall.microstructure())),
+        _ => (None, None),
+    };
     Prepared {
         record: SurfaceRecord {
             typology: relief.typology().to_owned(),
+            macrostructure,
             mesostructure: Some(relief.name().to_owned()),
+            microstructure,
             material: Some(material.name.to_owned()),
             reflection_factor: Some(material.reflection_factor),
             parameters: relief.parameters().into(),

@@ -1,5 +1,7 @@
 //! `echolake acquire`: one surface measured with the simulated rig.
 
+use std::path::Path;
+
 use anyhow::Context as _;
 use echolake_acquisition::controller::Keep;
 use echolake_acquisition::mesh::Mesh;
@@ -14,9 +16,14 @@ use crate::progress::Progress;
 
 pub(crate) async fn run(args: &AcquireArgs, lake_url: &str) -> anyhow::Result<Done> {
     // What is to be measured is checked before a lake is made for it.
-    let specimen = match &args.mesh {
-        Some(mesh) => Specimen::Mesh(mesh.clone()),
-        None => Specimen::Relief(relief(args.panel.as_deref(), &args.surface, &args.set)?),
+    let specimen = match (&args.mesh, &args.parameters) {
+        (Some(mesh), _) => Specimen::Mesh(mesh.clone()),
+        (None, Some(file)) => {
+            let mut relief = relief_of_file(file)?;
+            set_all(&mut relief, &args.set)?;
+            Specimen::Relief(relief)
+        }
+        (None, None) => Specimen::Relief(relief(args.panel.as_deref(), &args.surface, &args.set)?),
     };
     let rig = super::rig_or(args.rig.as_deref(), lake_url, Rig::paper).await?;
     if let Specimen::Mesh(path) = &specimen {
@@ -58,7 +65,7 @@ pub(crate) async fn run(args: &AcquireArgs, lake_url: &str) -> anyhow::Result<Do
 
 /// The named relief, or the one that the surface's name begins with, with its parameters set.
 pub(super) fn relief(name: Option<&str>, surface: &SurfaceId, set: &[String]) -> anyhow::Result<Relief> {
-    let guessed = || Relief::NAMES.into_iter().find(|n| surface.as_str().starts_with(n));
+    let guessed = || Relief::guess(surface.as_str());
     let name = name.or_else(guessed).with_context(|| {
         format!(
             "unknown surface `{surface}`: it says nothing of its relief; hint: --panel {} or --mesh FILE",
@@ -71,10 +78,22 @@ pub(super) fn relief(name: Option<&str>, surface: &SurfaceId, set: &[String]) ->
 /// A relief with its parameters set from `key=value`.
 pub(super) fn with_parameters(name: &str, set: &[String]) -> anyhow::Result<Relief> {
     let mut relief = Relief::by_name(name)?;
+    set_all(&mut relief, set)?;
+    Ok(relief)
+}
+
+/// Sets parameters from `key=value`.
+pub(super) fn set_all(relief: &mut Relief, set: &[String]) -> anyhow::Result<()> {
     for setting in set {
         let (key, value) =
             setting.split_once('=').with_context(|| format!("`--set {setting}` has no `=`; hint: --set key=value"))?;
         relief.set(key, value)?;
     }
-    Ok(relief)
+    Ok(())
+}
+
+/// The relief of a file of parameters.
+pub(super) fn relief_of_file(path: &Path) -> anyhow::Result<Relief> {
+    let text = std::fs::read_to_string(path).with_context(|| format!("cannot read parameters `{}`", path.display()))?;
+    Relief::from_json(&text).with_context(|| format!("parameters `{}`", path.display()))
 }

@@ -6,7 +6,7 @@ mod doctor;
 mod import;
 mod ingest;
 mod optimize;
-mod panel;
+pub(crate) mod panel;
 pub(crate) mod serve;
 pub(crate) mod sql;
 mod vacuum;

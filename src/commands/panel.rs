@@ -1,21 +1,180 @@
-//! `echolake panel`: a generated relief as a mesh.
+//! `echolake panel`: generated reliefs as meshes, height fields, pictures and parameters; groups of them.
 
-use anyhow::Context as _;
+mod group;
+mod list;
+
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context as _, bail};
+use clap::Args;
 use echolake_acquisition::mesh::{Format, Mesh};
+use echolake_acquisition::relief::{HeightField, Relief};
 
 use crate::Done;
-use crate::cli::PanelArgs;
 
-/// Cells along each side of a written mesh, and its back, mm.
+/// Cells along each side of a mesh of the older reliefs, and of those whose joints are 1 mm wide.
 const CELLS: usize = 274;
+const FINE_CELLS: usize = 585;
+/// Cells along each side of a height field, as in the published data.
+const FIELD_CELLS: usize = 512;
+/// Cells along each side of a picture; two make a pixel.
+const PICTURE_CELLS: usize = 1600;
+/// The back of a panel with one side, mm.
 const BACK_MM: f32 = -30.0;
 
+/// Arguments of `echolake panel`.
+#[derive(Debug, Args)]
+pub(crate) struct PanelArgs {
+    /// Kind of relief; --list says which there are and what can be set.
+    #[arg(required_unless_present_any = ["list", "parameters", "group", "next"])]
+    name: Option<String>,
+    /// A parameter of it.
+    #[arg(long, value_name = "KEY=VALUE")]
+    set: Vec<String>,
+    /// A JSON file of parameters, as `-o FILE.json` writes them, in place of a name.
+    #[arg(long, value_name = "FILE", conflicts_with = "name")]
+    parameters: Option<PathBuf>,
+    /// Kind of relief of the panel's other side.
+    #[arg(long, value_name = "NAME")]
+    back: Option<String>,
+    /// A parameter of the other side.
+    #[arg(long, value_name = "KEY=VALUE", requires = "back")]
+    back_set: Vec<String>,
+    /// A file to write, as often as wanted; its extension tells what: glb, stl, obj or ply the panel's mesh, png a
+    /// picture, npy 512 x 512 heights in mm, json the parameters. Of a panel with two sides FILE.png, FILE.npy and
+    /// FILE.json are two files, FILE_0 and FILE_1. With --group a folder, with --next the next ranges.
+    #[arg(short, long, required_unless_present = "list", value_name = "FILE")]
+    output: Vec<PathBuf>,
+    /// Cells along each side of the mesh; by default 585, which are 1 mm, for walls with joints, and 274 for flat, foam,
+    /// wood, prd, brick, flemish and wavy.
+    #[arg(long, value_parser = clap::value_parser!(u32).range(16..=2340))]
+    cells: Option<u32>,
+    /// Print all reliefs and parameters with ranges, defaults and units; of one relief where it is named.
+    #[arg(long)]
+    list: bool,
+    /// Print the list as JSON.
+    #[arg(long, requires = "list")]
+    json: bool,
+    /// Make a group of surfaces: parameters drawn from the ranges in this TOML file. One JSON file a surface and
+    /// group.csv go into the folder that -o names.
+    #[arg(long, value_name = "RANGES", conflicts_with_all = ["name", "set", "back", "list", "parameters"])]
+    group: Option<PathBuf>,
+    /// Surfaces of the group; two are a panel.
+    #[arg(long, value_name = "N", default_value_t = 8, value_parser = clap::value_parser!(u32).range(1..=10_000))]
+    count: u32,
+    /// Write the ranges of the next group: wider where the last one's results are alike, else narrower.
+    #[arg(long, value_name = "RANGES", requires = "results", conflicts_with_all = ["name", "set", "back", "list", "group", "parameters"])]
+    next: Option<PathBuf>,
+    /// Results of the last group: CSV with surface_id, band and p90_mean_db, from `echolake sql` on surface_stats.
+    #[arg(long, value_name = "CSV", requires = "next")]
+    results: Option<PathBuf>,
+}
+
 pub(crate) fn run(args: &PanelArgs) -> anyhow::Result<Done> {
-    let relief = super::acquire::with_parameters(&args.name, &args.set)?;
-    let format = Format::of(&args.output)?;
-    let mesh = Mesh::from_height_field(&relief.height_field(CELLS), BACK_MM);
-    std::fs::write(&args.output, mesh.to_bytes(format))
-        .with_context(|| format!("cannot write `{}`", args.output.display()))?;
-    eprintln!("{}: {} triangles", args.output.display(), mesh.triangles.len());
+    if args.list {
+        return list::run(args.name.as_deref(), args.json);
+    }
+    if let Some(ranges) = &args.group {
+        return group::make(ranges, args.count as usize, one(&args.output)?);
+    }
+    if let (Some(ranges), Some(results)) = (&args.next, &args.results) {
+        return group::next(ranges, results, one(&args.output)?);
+    }
+    let mut front = match &args.parameters {
+        Some(path) => super::acquire::relief_of_file(path)?,
+        None => Relief::by_name(args.name.as_deref().unwrap_or_default())?,
+    };
+    super::acquire::set_all(&mut front, &args.set)?;
+    let mut back = args.back.as_deref().map(Relief::by_name).transpose()?;
+    if let Some(back) = &mut back {
+        super::acquire::set_all(back, &args.back_set)?;
+    }
+    // What can be refused is refused before anything is written.
+    let kinds = args.output.iter().map(|path| Kind::of(path)).collect::<anyhow::Result<Vec<_>>>()?;
+    for (path, kind) in args.output.iter().zip(kinds) {
+        write_one(path, kind, &front, back.as_ref(), args.cells.map(|n| n as usize))?;
+    }
     Ok(Done::Whole)
+}
+
+/// What a file is to hold.
+#[derive(Debug, Clone, Copy)]
+enum Kind {
+    Mesh(Format),
+    Picture,
+    Heights,
+    Parameters,
+}
+
+impl Kind {
+    fn of(path: &Path) -> anyhow::Result<Self> {
+        Ok(match path.extension().and_then(|e| e.to_str()).map(str::to_ascii_lowercase).as_deref() {
+            Some("png") => Self::Picture,
+            Some("npy") => Self::Heights,
+            Some("json") => Self::Parameters,
+            _ => Self::Mesh(Format::of(path).with_context(|| {
+                format!(
+                    "cannot tell what `{}` is to hold; or a picture .png, heights .npy, parameters .json",
+                    path.display()
+                )
+            })?),
+        })
+    }
+
+    fn bytes(self, relief: &Relief) -> anyhow::Result<Vec<u8>> {
+        Ok(match self {
+            Self::Picture => relief.height_field(PICTURE_CELLS).to_png(),
+            Self::Heights => relief.height_field(FIELD_CELLS).to_npy(),
+            Self::Parameters => serde_json::to_vec_pretty(&relief.to_json())?,
+            Self::Mesh(_) => bail!("a mesh is of a whole panel"),
+        })
+    }
+}
+
+fn write_one(
+    path: &Path,
+    kind: Kind,
+    front: &Relief,
+    back: Option<&Relief>,
+    cells: Option<usize>,
+) -> anyhow::Result<()> {
+    match (kind, back) {
+        (Kind::Mesh(format), _) => {
+            let field = |relief: &Relief| -> HeightField { relief.height_field(cells.unwrap_or(mesh_cells(relief))) };
+            let mesh = match back {
+                Some(back) => Mesh::double_sided(&field(front), &field(back)),
+                None => Mesh::from_height_field(&field(front), BACK_MM),
+            };
+            write(path, &mesh.to_bytes(format))?;
+            eprintln!("{}: {} triangles", path.display(), mesh.triangles.len());
+        }
+        (_, None) => write(path, &kind.bytes(front)?)?,
+        (_, Some(back)) => {
+            for (side, relief) in [front, back].into_iter().enumerate() {
+                write(&of_side(path, side), &kind.bytes(relief)?)?;
+            }
+        }
+    }
+    Ok(())
+}
+
+fn mesh_cells(relief: &Relief) -> usize {
+    if matches!(relief, Relief::Layered(_)) { FINE_CELLS } else { CELLS }
+}
+
+/// `0015.png` is `0015_0.png` for side 0.
+fn of_side(path: &Path, side: usize) -> PathBuf {
+    let [stem, extension] = [path.file_stem(), path.extension()].map(|part| part.unwrap_or_default().to_string_lossy());
+    path.with_file_name(format!("{stem}_{side}.{extension}"))
+}
+
+fn one(outputs: &[PathBuf]) -> anyhow::Result<&Path> {
+    match outputs {
+        [path] => Ok(path),
+        _ => bail!("{} outputs for a group; hint: one -o", outputs.len()),
+    }
+}
+
+fn write(path: &Path, bytes: &[u8]) -> anyhow::Result<()> {
+    std::fs::write(path, bytes).with_context(|| format!("cannot write `{}`", path.display()))
 }

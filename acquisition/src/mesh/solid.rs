@@ -7,9 +7,22 @@ use super::{Error, Mesh};
 use crate::relief::{HeightField, RELIEF_MM};
 use crate::rigs::simulated::FACETS;
 
+/// From the plane of a panel's front to that of its back, mm: 100 less twice the relief's greatest height.
+const CORE_MM: f64 = 42.0;
+
 impl Mesh {
     /// A closed solid: the relief on top, four walls, and a plane at `base_mm` below.
     pub fn from_height_field(relief: &HeightField, base_mm: f32) -> Self {
+        Self::between(relief, |_, _| base_mm)
+    }
+
+    /// A panel with a relief on either side, 100 mm thick at most: the planes that heights count from are 42 mm apart,
+    /// so that the deepest reliefs leave 20 mm between them. The panel is turned over about its y axis to see its back.
+    pub fn double_sided(front: &HeightField, back: &HeightField) -> Self {
+        Self::between(front, |x, y| (-CORE_MM - back.height_at(-x, y)) as f32)
+    }
+
+    fn between(relief: &HeightField, below: impl Fn(f64, f64) -> f32) -> Self {
         let side = relief.cells() + 1;
         let at = |i: usize| (i as f64 / relief.cells() as f64 - 0.5) * relief.size_mm();
         let mut mesh = Self::default();
@@ -17,7 +30,7 @@ impl Mesh {
             for iy in 0..side {
                 for ix in 0..side {
                     let (x, y) = (at(ix), at(iy));
-                    let z = if top { relief.height_at(x, y) as f32 } else { base_mm };
+                    let z = if top { relief.height_at(x, y) as f32 } else { below(x, y) };
                     mesh.vertices_mm.push([x as f32, y as f32, z]);
                 }
             }
@@ -229,6 +242,24 @@ mod tests {
         let mesh = Mesh::from_height_field(&HeightField::from_fn(100.0, 5, |_, _| 0.0), -20.0);
         assert!((mesh.volume_mm3() - 100.0 * 100.0 * 20.0).abs() < 1e-3);
         assert_eq!(mesh.check(100.0, 40.0, Path::new("box")).map(drop), Ok(()));
+    }
+
+    // The thinnest and the thickest that two reliefs can make, and which way round the back is.
+    #[test]
+    fn a_panel_with_two_sides_fits_and_keeps_its_thickness() {
+        let [low, high] = RELIEF_MM;
+        let level = |mm: f64| HeightField::from_fn(PANEL_SIZE_MM, 8, move |_, _| mm);
+        let thickness = |mesh: &Mesh| mesh.volume_mm3() / PANEL_SIZE_MM.powi(2);
+        assert!((thickness(&Mesh::double_sided(&level(low), &level(low))) - 20.0).abs() < 1e-4);
+        let thickest = Mesh::double_sided(&level(high), &level(high));
+        assert!((thickness(&thickest) - 100.0).abs() < 1e-3);
+        assert_eq!(thickest.check(PANEL_SIZE_MM, 40.0, Path::new("panel")).map(drop), Ok(()));
+        // The back's left, seen from behind, is the front's right.
+        let slope = HeightField::from_fn(PANEL_SIZE_MM, 8, |x, _| x / 100.0);
+        let panel = Mesh::double_sided(&level(0.0), &slope);
+        let lowest = panel.vertices_mm.iter().copied().min_by(|a, b| a[2].total_cmp(&b[2])).expect("vertices");
+        assert!(lowest[0] < 0.0 && lowest[2] < -44.0, "{lowest:?}");
+        assert_eq!(panel.check(PANEL_SIZE_MM, 40.0, Path::new("panel")).map(drop), Ok(()));
     }
 
     #[test]

@@ -20,6 +20,12 @@ impl HeightField {
         Self { size_mm, cells, heights_mm }
     }
 
+    /// The same field, higher by this, mm.
+    pub(super) fn raised_by(mut self, mm: f64) -> Self {
+        self.heights_mm.iter_mut().for_each(|h| *h = (f64::from(*h) + mm) as f32);
+        self
+    }
+
     /// Edge of the square, mm.
     pub fn size_mm(&self) -> f64 {
         self.size_mm
@@ -76,6 +82,18 @@ impl HeightField {
         lower * (1.0 - v) + upper * v
     }
 
+    /// A NumPy file of the heights, `[cells x cells]` f32, mm, rows along x with y ascending.
+    pub fn to_npy(&self) -> Vec<u8> {
+        let shape = format!("{{'descr': '<f4', 'fortran_order': False, 'shape': ({0}, {0}), }}", self.cells);
+        // NPY 1.0: magic, version, length of the header; the data begin at a multiple of 64.
+        let len = (shape.len() + 11).next_multiple_of(64) - 10;
+        let mut file = b"\x93NUMPY\x01\x00".to_vec();
+        file.extend((len as u16).to_le_bytes());
+        file.extend(format!("{shape:<width$}\n", width = len - 1).into_bytes());
+        file.extend(self.heights_mm.iter().flat_map(|h| h.to_le_bytes()));
+        file
+    }
+
     /// Lowest and highest height, mm.
     pub fn extent_mm(&self) -> [f32; 2] {
         let low = self.heights_mm.iter().copied().fold(f32::INFINITY, f32::min);
@@ -87,6 +105,15 @@ impl HeightField {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn numpy_files_hold_the_heights() {
+        let plane = HeightField::from_fn(100.0, 7, |x, y| x + y / 7.0);
+        let read = ndarray_npy::ReadNpyExt::read_npy(plane.to_npy().as_slice());
+        let again: ndarray::Array2<f32> = read.expect("its own file");
+        assert_eq!((again.nrows(), again.ncols()), (7, 7));
+        assert!(again.iter().eq(plane.heights_mm()));
+    }
 
     #[test]
     fn a_plane_keeps_its_slope_and_heights() {

@@ -1,13 +1,32 @@
 //! Reliefs: surfaces as height fields, and the generators that make them.
 
 mod bricks;
+mod chance;
+mod courses;
+pub mod group;
 mod height_field;
+mod layered;
+mod macrostructure;
+mod masonry;
+mod mesostructure;
+mod microstructure;
+mod model;
+mod parameter;
+mod picture;
+mod png;
 mod primitive_root;
+mod primitives;
 mod random;
+mod stone;
+mod voronoi;
 mod wavy;
+mod wells;
 
 pub use bricks::{Bond, Bricks};
 pub use height_field::HeightField;
+pub use layered::{FULL_SCALE, Layered};
+pub use mesostructure::Mesostructure;
+pub use parameter::{Domain, Layer, Parameter, Setting};
 pub use primitive_root::PrimitiveRootDiffuser;
 pub use wavy::Wavy;
 
@@ -37,6 +56,8 @@ pub enum Relief {
     Flemish(Bricks),
     /// A smooth macrostructure.
     Wavy(Wavy),
+    /// A wall in layers, with full-scale parameters.
+    Layered(Layered),
 }
 
 /// What a surface is made of.
@@ -68,7 +89,7 @@ pub enum Error {
         valid: String,
     },
     /// A value that makes no such relief.
-    #[error("parameter `{key}` of relief `{relief}` is `{given}`, expected {expected}")]
+    #[error("parameter `{key}` of relief `{relief}` is `{given}`, expected {expected}; hint: {hint}")]
     Value {
         /// The relief.
         relief: &'static str,
@@ -77,13 +98,38 @@ pub enum Error {
         /// What was given.
         given: String,
         /// What is taken.
-        expected: &'static str,
+        expected: String,
+        /// What the parameter means.
+        hint: &'static str,
+    },
+    /// Text that says no relief.
+    #[error("these are no parameters of a relief: {reason}; hint: `echolake panel NAME -o FILE.json` writes some")]
+    Text {
+        /// What is wrong with it.
+        reason: String,
     },
 }
 
 impl Relief {
     /// The names that [`Relief::by_name`] knows.
-    pub const NAMES: [&'static str; 7] = ["flat", "foam", "wood", "prd", "brick", "flemish", "wavy"];
+    pub const NAMES: [&'static str; 16] = [
+        "flat",
+        "foam",
+        "wood",
+        "prd",
+        "brick",
+        "flemish",
+        "wavy",
+        "macrostructure",
+        "stretcher_bond",
+        "flemish_bond",
+        "coursed_ashlar",
+        "polygonal_rubble",
+        "river_rock",
+        "slated_stone",
+        "primitives",
+        "primitive_root",
+    ];
 
     /// A relief with its default parameters.
     ///
@@ -98,8 +144,60 @@ impl Relief {
             "brick" => Self::Brick(Bricks { bond: Bond::Stretcher, ..Bricks::default() }),
             "flemish" => Self::Flemish(Bricks { bond: Bond::Flemish, ..Bricks::default() }),
             "wavy" => Self::Wavy(Wavy::default()),
-            _ => return Err(Error::Name { given: name.to_owned() }),
+            _ => match Mesostructure::ALL.into_iter().find(|m| m.name() == name) {
+                Some(mesostructure) => Self::Layered(Layered::new(mesostructure)),
+                None => return Err(Error::Name { given: name.to_owned() }),
+            },
         })
+    }
+
+    /// The relief that a surface's name begins with: the longest of the names that it does.
+    pub fn guess(surface: &str) -> Option<&'static str> {
+        Self::NAMES.into_iter().filter(|name| surface.starts_with(name)).max_by_key(|name| name.len())
+    }
+
+    /// A relief out of what [`Relief::to_json`] wrote; every parameter is checked, those that are missing have their
+    /// defaults.
+    ///
+    /// # Errors
+    /// [`Error`], as for the names and values themselves.
+    pub fn from_json(text: &str) -> Result<Self, Error> {
+        let wrong = |reason: String| Error::Text { reason };
+        let fields: serde_json::Map<_, _> = serde_json::from_str(text).map_err(|e| wrong(e.to_string()))?;
+        let name = fields.get("relief").and_then(|name| name.as_str());
+        let mut relief = Self::by_name(name.ok_or_else(|| wrong("they do not name a `relief`".to_owned()))?)?;
+        let parameters = fields.get("parameters").and_then(|p| p.as_object());
+        for (key, value) in parameters.ok_or_else(|| wrong("they have no `parameters`".to_owned()))? {
+            // The bond of the older walls is their name's.
+            if key != "bond" {
+                relief.set(key, value.as_str().unwrap_or(&value.to_string()))?;
+            }
+        }
+        Ok(relief)
+    }
+
+    /// All that says what the relief is: its name, its kind, the length that parameters in mm count in, and the
+    /// parameters.
+    pub fn to_json(&self) -> serde_json::Value {
+        serde_json::json!({
+            "relief": self.name(),
+            "typology": self.typology(),
+            "scale": match self { Self::Layered(_) => "full scale, 10 times the panel", _ => "the panel's, 1:10" },
+            "parameters": self.parameters(),
+        })
+    }
+
+    /// What may be set, with ranges and defaults.
+    pub fn describe(&self) -> Vec<Parameter> {
+        match self {
+            Self::Layered(wall) => {
+                let mut all = layered::parameters(wall.mesostructure());
+                let fresh = Layered::new(wall.mesostructure());
+                all.iter_mut().for_each(|p| fresh.name_default(p));
+                all
+            }
+            older => model::parameters(older.name()).to_vec(),
+        }
     }
 
     /// Sets a parameter.
@@ -107,29 +205,32 @@ impl Relief {
     /// # Errors
     /// [`Error::Parameter`] or [`Error::Value`], which say what would do.
     pub fn set(&mut self, key: &str, value: &str) -> Result<(), Error> {
+        if let Self::Layered(wall) = self {
+            return wall.set(key, value);
+        }
         let relief = self.name();
-        let mut fields = self.parameters();
-        // The bond is the relief's own: another one is another relief.
-        let names = || fields.iter().filter(|(_, value)| value.is_number()).map(|(name, _)| name.as_str());
-        let unknown = || Error::Parameter {
+        let known = model::parameters(relief);
+        let parameter = known.iter().find(|p| p.key == key).ok_or_else(|| Error::Parameter {
             relief,
             given: key.to_owned(),
-            valid: match names().collect::<Vec<_>>() {
+            valid: match known.iter().map(|p| p.key).collect::<Vec<_>>() {
                 names if names.is_empty() => "it has none".to_owned(),
                 names => names.join(", "),
             },
+        })?;
+        let setting = parameter.parse(relief, value)?;
+        let wrong = |expected: &str| Error::Value {
+            relief,
+            key: key.to_owned(),
+            given: value.to_owned(),
+            expected: expected.to_owned(),
+            hint: parameter.about,
         };
-        let old = fields.get(key).filter(|value| value.is_number()).ok_or_else(unknown)?;
-        let expected = if old.is_u64() { "a whole number" } else { "a number" };
-        let wrong = |expected| Error::Value { relief, key: key.to_owned(), given: value.to_owned(), expected };
-        let number: f64 = value.parse().ok().filter(|x: &f64| x.is_finite()).ok_or_else(|| wrong(expected))?;
-        let new = match old.is_u64() {
-            true => value.parse::<u64>().map_err(|_| wrong(expected))?.into(),
-            false => number.into(),
-        };
-        fields.insert(key.to_owned(), new);
+        let mut fields = self.parameters();
+        fields.insert(key.to_owned(), serde_json::to_value(setting).unwrap_or_default());
         fields.insert("relief".to_owned(), relief.into());
-        let changed: Self = serde_json::from_value(fields.into()).map_err(|_| wrong(expected))?;
+        let changed: Self = serde_json::from_value(fields.into()).map_err(|_| wrong("another kind of value"))?;
+        // What depends on other parameters too.
         changed.check().map_err(wrong)?;
         *self = changed;
         Ok(())
@@ -145,6 +246,7 @@ impl Relief {
             Self::Brick(_) => "brick",
             Self::Flemish(_) => "flemish",
             Self::Wavy(_) => "wavy",
+            Self::Layered(wall) => wall.mesostructure().name(),
         }
     }
 
@@ -156,6 +258,7 @@ impl Relief {
             Self::Brick(_) => "stretcher_bond_bricks",
             Self::Flemish(_) => "flemish_bond_bricks",
             Self::Wavy(_) => "macrostructure",
+            Self::Layered(wall) => wall.mesostructure().typology(),
         }
     }
 
@@ -170,6 +273,10 @@ impl Relief {
 
     /// Its parameters by name, all that [`Bricks`] and the like have.
     pub fn parameters(&self) -> serde_json::Map<String, serde_json::Value> {
+        if let Self::Layered(wall) = self {
+            let value = |setting| serde_json::to_value(setting).unwrap_or_default();
+            return wall.settings().map(|(key, setting)| (key.to_owned(), value(setting))).collect();
+        }
         match serde_json::to_value(self) {
             Ok(serde_json::Value::Object(mut fields)) => {
                 fields.remove("relief");
@@ -194,6 +301,7 @@ impl Relief {
                 let waves = wavy.waves();
                 HeightField::from_fn(PANEL_SIZE_MM, cells, |x, y| waves.height(x, y))
             }
+            Self::Layered(wall) => wall.height_field(cells),
         }
     }
 

@@ -1,0 +1,327 @@
+//! Walls in three layers, as the paper makes its panels: any large shape, with any stones, with any joints and skin.
+//!
+//! Parameters are full-scale: the panel is a tenth of the wall. Every parameter's range is such that all of them at
+//! their greatest still fit the relief's 40 mm, so that each combination can be made.
+
+use std::collections::BTreeMap;
+
+use serde::{Deserialize, Serialize};
+
+use super::macrostructure::{self, Macrostructure};
+use super::mesostructure::{Mesostructure, SEED};
+use super::microstructure::{GRAIN, JOINT_DEPTH, JOINT_SHAPE, JOINT_WIDTH, Microstructure, ROUGHNESS};
+use super::parameter::{Domain, Parameter, Setting};
+use super::{Error, HeightField, PANEL_SIZE_MM, RELIEF_MM};
+
+/// The wall is this many times as large as the panel (Rust et al. 2021).
+pub const FULL_SCALE: f64 = 10.0;
+/// Heights of a cell are the mean of those this far apart or less, mm: a joint is 1 mm wide.
+const DETAIL_MM: f64 = 0.4;
+
+/// A wall in layers.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Layered {
+    mesostructure: Mesostructure,
+    #[serde(flatten)]
+    settings: Settings,
+}
+
+/// What parameters are set to; those that are not have their defaults.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[serde(transparent)]
+pub(super) struct Settings(BTreeMap<String, Setting>);
+
+impl Settings {
+    pub(super) fn number(&self, parameter: &Parameter) -> f64 {
+        match (self.0.get(parameter.key), parameter.domain) {
+            (Some(Setting::Number(x)), _) => *x,
+            (Some(Setting::Whole(x)), _) => *x as f64,
+            (_, Domain::Number { default, .. }) => default,
+            _ => 0.0,
+        }
+    }
+
+    /// A full-scale length as the panel's.
+    pub(super) fn model_mm(&self, parameter: &Parameter) -> f64 {
+        self.number(parameter) / FULL_SCALE
+    }
+
+    pub(super) fn word(&self, parameter: &Parameter) -> &str {
+        match (self.0.get(parameter.key), parameter.domain) {
+            (Some(Setting::Word(word)), _) => word,
+            (_, Domain::Choice { default, .. }) => default,
+            _ => "",
+        }
+    }
+}
+
+impl Layered {
+    /// A wall with its default parameters.
+    pub fn new(mesostructure: Mesostructure) -> Self {
+        let default = |p: Parameter| (p.key.to_owned(), p.default_setting());
+        let mut settings = Settings(parameters(mesostructure).into_iter().map(default).collect());
+        if mesostructure == Mesostructure::Macrostructure {
+            // Without stones and flat it would be Flat.
+            settings.0.insert(macrostructure::SHAPE.key.to_owned(), Setting::Word("wavy_xy".to_owned()));
+        }
+        Self { mesostructure, settings }
+    }
+
+    /// How its stones lie.
+    pub fn mesostructure(&self) -> Mesostructure {
+        self.mesostructure
+    }
+
+    /// Its large shape.
+    pub fn macrostructure(&self) -> &str {
+        self.settings.word(&macrostructure::SHAPE)
+    }
+
+    /// Its joints and skin, in words.
+    pub fn microstructure(&self) -> String {
+        let skin = match self.settings.number(&ROUGHNESS) {
+            0.0 => "smooth".to_owned(),
+            roughness => format!("rough by {roughness} mm"),
+        };
+        let [width, depth] = [&JOINT_WIDTH, &JOINT_DEPTH].map(|p| self.settings.number(p));
+        match self.settings.word(&JOINT_SHAPE) {
+            _ if width == 0.0 || self.mesostructure == Mesostructure::Macrostructure => skin,
+            "flush" => format!("flush joints {width} mm wide, {skin}"),
+            shape => format!("{shape} joints {width} mm wide and {depth} mm deep, {skin}"),
+        }
+    }
+
+    /// Its parameters and what they are set to.
+    pub fn settings(&self) -> impl Iterator<Item = (&str, &Setting)> {
+        self.settings.0.iter().map(|(key, setting)| (key.as_str(), setting))
+    }
+
+    /// Makes what the parameter is set to here its default.
+    pub(super) fn name_default(&self, parameter: &mut Parameter) {
+        if let Domain::Choice { options, default } = &mut parameter.domain {
+            let set = self.settings.word(&Parameter::choice(parameter.key, parameter.layer, options, ""));
+            *default = options.iter().find(|o| **o == set).unwrap_or(default);
+        }
+    }
+
+    pub(super) fn set(&mut self, key: &str, text: &str) -> Result<(), Error> {
+        let relief = self.mesostructure.name();
+        let known = parameters(self.mesostructure);
+        let parameter = known.iter().find(|p| p.key == key).ok_or_else(|| Error::Parameter {
+            relief,
+            given: key.to_owned(),
+            valid: known.iter().map(|p| p.key).collect::<Vec<_>>().join(", "),
+        })?;
+        self.settings.0.insert(key.to_owned(), parameter.parse(relief, text)?);
+        Ok(())
+    }
+
+    /// Its heights, each the mean over its cell. Their mean is 0 where that keeps them within the relief.
+    pub(super) fn height_field(&self, cells: usize) -> HeightField {
+        let settings = &self.settings;
+        let seed = match settings.0.get(SEED.key) {
+            Some(Setting::Whole(seed)) => *seed,
+            _ => 1,
+        };
+        let shape = Macrostructure::of(settings);
+        let skin = Microstructure::of(settings, seed);
+        let stones = self.mesostructure.stones(settings, seed);
+        let half_joint = settings.model_mm(&JOINT_WIDTH) / 2.0;
+        let height = |x: f64, y: f64| {
+            let relief = stones.as_ref().map_or(0.0, |stones| {
+                let spot = stones.spot(x, y, half_joint);
+                let inside = skin.inside(spot.to_joint);
+                if inside < 0.0 { skin.joint(inside, x, y) } else { spot.face }
+            });
+            shape.height(x, y) + relief + skin.roughness(x, y)
+        };
+        let pitch = PANEL_SIZE_MM / cells.max(2) as f64;
+        let places = ((pitch / DETAIL_MM).ceil() as usize).clamp(2, 6);
+        let off = |i: usize| ((i as f64 + 0.5) / places as f64 - 0.5) * pitch;
+        let mean = |x: f64, y: f64| {
+            let rows = (0..places).map(|j| (0..places).map(|i| height(x + off(i), y + off(j))).sum::<f64>());
+            rows.sum::<f64>() / (places * places) as f64
+        };
+        centred(HeightField::from_fn(PANEL_SIZE_MM, cells, mean))
+    }
+}
+
+/// Parameters of all layers of a wall.
+pub(super) fn parameters(mesostructure: Mesostructure) -> Vec<Parameter> {
+    use macrostructure::{DEPTH, PHASE, SHAPE, WAVELENGTH};
+    let large = [SHAPE, DEPTH, WAVELENGTH, PHASE];
+    let seed = (mesostructure.parameters().iter().all(|p| p.key != SEED.key)).then_some(SEED);
+    large.into_iter().chain(mesostructure.parameters().iter().copied()).chain([ROUGHNESS, GRAIN]).chain(seed).collect()
+}
+
+fn centred(heights: HeightField) -> HeightField {
+    let all = heights.heights_mm();
+    let mean = all.iter().copied().map(f64::from).sum::<f64>() / all.len() as f64;
+    let [low, high] = heights.extent_mm().map(f64::from);
+    let shift = (-mean).clamp(RELIEF_MM[0] - low, (RELIEF_MM[1] - high).max(RELIEF_MM[0] - low));
+    heights.raised_by(shift)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::{Domain, Relief};
+    use super::*;
+
+    fn wall(name: &str, settings: &[(&str, &str)]) -> Relief {
+        let mut relief = Relief::by_name(name).expect(name);
+        settings.iter().for_each(|(key, value)| relief.set(key, value).expect(key));
+        relief
+    }
+
+    fn depth(relief: &Relief) -> f32 {
+        let [low, high] = relief.height_field(128).extent_mm();
+        high - low
+    }
+
+    // Ranges are chosen so that everything fits: all parameters at their greatest, under every large shape, with
+    // every joint and every solid.
+    #[test]
+    fn every_combination_fits_the_relief() {
+        for mesostructure in Mesostructure::ALL {
+            let mut greatest = Relief::Layered(Layered::new(mesostructure));
+            let parameters = greatest.describe();
+            for parameter in &parameters {
+                match parameter.domain {
+                    Domain::Number { high, .. } => greatest.set(parameter.key, &high.to_string()).expect("in range"),
+                    Domain::Whole { .. } => greatest.set(parameter.key, "7").expect("in range"),
+                    Domain::Choice { .. } => {}
+                }
+            }
+            for parameter in &parameters {
+                let Domain::Choice { options, .. } = parameter.domain else { continue };
+                for option in options {
+                    let mut relief = greatest.clone();
+                    relief.set("macrostructure", "convex").expect("a shape");
+                    relief.set(parameter.key, option).expect("an option");
+                    let [low, high] = relief.height_field(40).extent_mm().map(f64::from);
+                    let fits = low >= RELIEF_MM[0] - 1e-4 && high <= RELIEF_MM[1] + 1e-4;
+                    assert!(fits, "{} {}={option}: {low} to {high}", relief.name(), parameter.key);
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn parameters_move_what_their_names_say() {
+        let flat_bricks = [("projection_mm", "0"), ("lean_mm", "0")];
+        let bricks = |more: &[(&str, &str)]| wall("stretcher_bond", &[&flat_bricks, more].concat());
+        // A cell of the 512 is 1.14 mm: joints of 30 mm are 3 mm here, and some cells lie wholly in them.
+        let deep = |mm| {
+            let [low, high] = bricks(&[("joint_width_mm", "30"), ("joint_depth_mm", mm)]).height_field(512).extent_mm();
+            high - low
+        };
+        assert_eq!(deep("0"), 0.0);
+        assert!((deep("10") - 1.0).abs() < 1e-5 && (deep("30") - 3.0).abs() < 1e-5, "{} {}", deep("10"), deep("30"));
+        assert_eq!(depth(&bricks(&[("joint_shape", "flush")])), 0.0);
+        let mean_square = |relief: &Relief| {
+            let heights = relief.height_field(512);
+            heights.heights_mm().iter().map(|h| f64::from(h * h)).sum::<f64>()
+        };
+        // Heights' mean is 0, so their mean square says how much of the wall lies how deep.
+        let wide = |mm| mean_square(&bricks(&[("joint_width_mm", mm)]));
+        assert!(wide("20") > 1.5 * wide("10"));
+        let shape = |name| mean_square(&bricks(&[("joint_width_mm", "30"), ("joint_shape", name)]));
+        assert!(shape("recessed") > shape("concave") && shape("concave") > shape("v"), "a v is the shallowest");
+        let rough = |mm| mean_square(&wall("macrostructure", &[("macrostructure", "flat"), ("roughness_mm", mm)]));
+        assert!(rough("0") == 0.0 && rough("5") > 0.0);
+        assert!((rough("10") / rough("5") - 4.0).abs() < 1e-2, "twice as rough");
+        let large = |mm| depth(&wall("macrostructure", &[("macrostructure", "convex"), ("macro_depth_mm", mm)]));
+        assert!((large("100") - 10.0).abs() < 0.2 && (large("200") - 20.0).abs() < 0.4);
+        for (name, key, low, high) in [
+            ("coursed_ashlar", "projection_mm", "0", "80"),
+            ("slated_stone", "lean_mm", "0", "30"),
+            ("polygonal_rubble", "bulge_mm", "0", "40"),
+            ("river_rock", "bulge_mm", "20", "120"),
+            ("primitives", "primitive_height_mm", "20", "150"),
+            ("primitive_root", "well_depth_mm", "20", "150"),
+        ] {
+            let [less, more] = [low, high].map(|value| depth(&wall(name, &[(key, value)])));
+            assert!(more > less + 1.0, "{name} {key}: {less} {more}");
+        }
+    }
+
+    #[test]
+    fn layers_add_up() {
+        let bricks = wall("stretcher_bond", &[]).height_field(64);
+        let dome = [("macrostructure", "convex"), ("macro_depth_mm", "100")];
+        let (both, alone) =
+            (wall("stretcher_bond", &dome).height_field(64), wall("macrostructure", &dome).height_field(64));
+        for (n, height) in both.heights_mm().iter().enumerate() {
+            let sum = bricks.heights_mm()[n] + alone.heights_mm()[n];
+            assert!((height - sum).abs() < 1e-4, "{n}: {height} {sum}");
+        }
+    }
+
+    // The heights' bits, as numbers that say when a wall of some seed is no longer what it was, or is another on
+    // another machine.
+    #[test]
+    fn walls_have_the_same_bits_everywhere() {
+        let digest = |name: &str| {
+            let heights = wall(name, &[("roughness_mm", "4")]).height_field(48);
+            let bytes: Vec<u8> = heights.heights_mm().iter().flat_map(|h| h.to_le_bytes()).collect();
+            crc32fast::hash(&bytes)
+        };
+        let digests = Mesostructure::ALL.map(|m| digest(m.name()));
+        assert_eq!(digests, DIGESTS);
+    }
+
+    const DIGESTS: [u32; 9] = [
+        449_339_013,
+        1_870_956_126,
+        3_730_505_683,
+        112_774_444,
+        3_391_104_038,
+        581_177_784,
+        1_716_257_505,
+        1_133_449_639,
+        607_196_090,
+    ];
+
+    #[test]
+    fn seeds_and_walls_are_told_apart() {
+        for mesostructure in Mesostructure::ALL {
+            let of = |seed| wall(mesostructure.name(), &[("roughness_mm", "3"), ("seed", seed)]).height_field(32);
+            assert_eq!(of("5"), of("5"));
+            assert_ne!(of("5"), of("6"), "{mesostructure:?}");
+        }
+    }
+
+    #[test]
+    fn values_out_of_range_are_refused_by_name_range_and_hint() {
+        let mut relief = wall("coursed_ashlar", &[]);
+        let refused = relief.set("joint_depth_mm", "50").expect_err("too deep").to_string();
+        assert_eq!(
+            refused,
+            "parameter `joint_depth_mm` of relief `coursed_ashlar` is `50`, expected 0 to 40 mm full scale; \
+             hint: how far the joints lie behind the stones' faces"
+        );
+        let refused = relief.set("joint_shape", "round").expect_err("no shape").to_string();
+        assert!(refused.contains("recessed, flush, raked, concave, v"), "{refused}");
+        for value in ["NaN", "inf", "", "-1", "1e9"] {
+            assert!(relief.set("stone_length_mm", value).is_err(), "{value}");
+        }
+        let refused = relief.set("brick_length_mm", "200").expect_err("no bricks").to_string();
+        assert!(refused.contains("course_height_mm"), "{refused}");
+    }
+
+    #[test]
+    fn parameters_go_through_json() {
+        for name in Relief::NAMES {
+            let mut relief = Relief::by_name(name).expect(name);
+            if relief.describe().iter().any(|p| p.key == "seed") {
+                relief.set("seed", "9").expect("a seed");
+            }
+            assert_eq!(Relief::from_json(&relief.to_json().to_string()), Ok(relief));
+        }
+        let deep = r#"{"relief": "stretcher_bond", "parameters": {"joint_depth_mm": 400}}"#;
+        assert!(matches!(Relief::from_json(deep), Err(Error::Value { .. })));
+        for text in ["", "[]", "{}", r#"{"relief": "flat"}"#] {
+            assert!(matches!(Relief::from_json(text), Err(Error::Text { .. })), "{text}");
+        }
+    }
+}

@@ -1,0 +1,131 @@
+//! Solids of geometry on a square lattice.
+
+use super::chance::Chance;
+use super::layered::Settings;
+use super::mesostructure::{SEED, Spot, Stones};
+use super::microstructure::{JOINT_SHAPE, joint_depth, joint_width};
+use super::parameter::{Layer, Parameter};
+
+const MESO: Layer = Layer::Mesostructure;
+
+const SOLID: Parameter = Parameter::choice(
+    "primitive",
+    MESO,
+    &["pyramid", "hemisphere", "box", "wedge", "ridge", "cone", "cylinder"],
+    "the solid that is repeated; a wedge rises to one side, a ridge to its middle line",
+);
+const SIZE: Parameter = Parameter::mm("primitive_size_mm", MESO, [100.0, 2000.0, 450.0], "edge of a solid's base");
+const HEIGHT: Parameter = Parameter::mm("primitive_height_mm", MESO, [0.0, 150.0, 150.0], "height of a solid");
+const GAP: Parameter = Parameter::mm("gap_mm", MESO, [0.0, 500.0, 30.0], "between the bases of two solids");
+const VARIATION: Parameter =
+    Parameter::number("variation", MESO, "share", [0.0, 1.0, 0.0], "solids are lower by up to this share");
+const TURN: Parameter = Parameter::choice(
+    "turn",
+    MESO,
+    &["alike", "alternating", "random"],
+    "how wedges and ridges are turned, in quarter turns",
+);
+
+pub(super) const PARAMETERS: [Parameter; 10] =
+    [SOLID, SIZE, HEIGHT, GAP, VARIATION, TURN, SEED, JOINT_SHAPE, joint_width(0.0), joint_depth(0.0)];
+
+#[derive(Debug, Clone, Copy, PartialEq)]
+enum Solid {
+    Pyramid,
+    Hemisphere,
+    Box,
+    Wedge,
+    Ridge,
+    Cone,
+    Cylinder,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq)]
+enum Turn {
+    Alike,
+    Alternating,
+    Random,
+}
+
+/// A lattice of solids, model mm.
+pub(super) struct Primitives {
+    solid: Solid,
+    half_size: f64,
+    height: f64,
+    half_pitch: f64,
+    variation: f64,
+    turn: Turn,
+    chance: Chance,
+}
+
+impl Primitives {
+    pub(super) fn of(settings: &Settings, seed: u64) -> Self {
+        let solid = match settings.word(&SOLID) {
+            "hemisphere" => Solid::Hemisphere,
+            "box" => Solid::Box,
+            "wedge" => Solid::Wedge,
+            "ridge" => Solid::Ridge,
+            "cone" => Solid::Cone,
+            "cylinder" => Solid::Cylinder,
+            _ => Solid::Pyramid,
+        };
+        let turn = match settings.word(&TURN) {
+            "alternating" => Turn::Alternating,
+            "random" => Turn::Random,
+            _ => Turn::Alike,
+        };
+        let half_size = settings.model_mm(&SIZE) / 2.0;
+        Self {
+            solid,
+            half_size,
+            height: settings.model_mm(&HEIGHT),
+            half_pitch: half_size + settings.model_mm(&GAP) / 2.0,
+            variation: settings.number(&VARIATION),
+            turn,
+            chance: Chance::new(seed, 0x9813),
+        }
+    }
+
+    fn turned(&self, place: [f64; 2], cell: [i64; 2], stone: Chance) -> [f64; 2] {
+        let quarters = match self.turn {
+            Turn::Alike => 0,
+            Turn::Alternating => (cell[0] + cell[1]).rem_euclid(2) as u64,
+            Turn::Random => stone.whole(3) % 4,
+        };
+        (0..quarters).fold(place, |[u, v], _| [v, -u])
+    }
+}
+
+impl Solid {
+    /// Height as a share of the greatest, at a place from -1 to 1 in both directions.
+    fn share(self, [u, v]: [f64; 2]) -> f64 {
+        if u.abs() > 1.0 || v.abs() > 1.0 {
+            return 0.0;
+        }
+        let square = u * u + v * v;
+        match self {
+            Self::Pyramid => 1.0 - u.abs().max(v.abs()),
+            Self::Hemisphere => (1.0 - square).max(0.0).sqrt(),
+            Self::Box => 1.0,
+            Self::Wedge => (1.0 + u) / 2.0,
+            Self::Ridge => 1.0 - u.abs(),
+            Self::Cone => (1.0 - square.sqrt()).max(0.0),
+            Self::Cylinder => f64::from(u8::from(square <= 1.0)),
+        }
+    }
+}
+
+impl Stones for Primitives {
+    fn spot(&self, x: f64, y: f64, _half_joint: f64) -> Spot {
+        let pitch = 2.0 * self.half_pitch;
+        // A solid stands in the panel's middle.
+        let cell = [x, y].map(|v| (v / pitch + 0.5).floor());
+        let [dx, dy] = [x - cell[0] * pitch, y - cell[1] * pitch];
+        let cell = cell.map(|c| c as i64);
+        let stone = self.chance.at(cell[0], cell[1]);
+        let place = self.turned([dx / self.half_size, dy / self.half_size], cell, stone);
+        let height = self.height * (1.0 - self.variation * stone.unit(0));
+        let to_joint = (self.half_pitch - dx.abs()).min(self.half_pitch - dy.abs()).max(0.0);
+        Spot { to_joint, face: height * self.solid.share(place) }
+    }
+}

@@ -1,0 +1,56 @@
+//! What stones of every kind have in common: they stand out, lean and bulge.
+
+use super::chance::Chance;
+use super::layered::Settings;
+use super::parameter::{Layer, Parameter};
+
+/// How far stones stand out.
+pub(super) const fn projection(high: f64, default: f64) -> Parameter {
+    let about = "stones stand out of the wall by up to this";
+    Parameter::mm("projection_mm", Layer::Mesostructure, [0.0, high, default], about)
+}
+
+/// How far stones lean.
+pub(super) const fn lean(default: f64) -> Parameter {
+    let about = "one edge or corner of a stone stands out over its opposite by up to this";
+    Parameter::mm("lean_mm", Layer::Mesostructure, [0.0, 30.0, default], about)
+}
+
+/// How round faces are.
+pub(super) const fn bulge(high: f64, default: f64) -> Parameter {
+    let about = "the middle of a stone's face stands out over its edges by this";
+    Parameter::mm("bulge_mm", Layer::Mesostructure, [0.0, high, default], about)
+}
+
+/// Face of each stone of a wall, model mm.
+#[derive(Debug, Clone)]
+pub(super) struct Faces {
+    projection: f64,
+    lean: f64,
+    bulge: f64,
+}
+
+impl Faces {
+    pub(super) fn of(settings: &Settings) -> Self {
+        Self {
+            projection: settings.model_mm(&projection(0.0, 0.0)),
+            lean: settings.model_mm(&lean(0.0)),
+            bulge: settings.model_mm(&bulge(0.0, 0.0)),
+        }
+    }
+
+    /// Height of a stone's face. `place` runs from -1 to 1 over the stone, `rise` from 0 at its edge to 1 where it
+    /// bulges most.
+    pub(super) fn height(&self, stone: Chance, place: [f64; 2], rise: f64) -> f64 {
+        let slope = [stone.signed(1), stone.signed(2)];
+        // Leaning stones turn out of the wall, never into it.
+        let lean: f64 = (0..2).map(|i| slope[i] * place[i].clamp(-1.0, 1.0) + slope[i].abs()).sum();
+        self.projection * stone.unit(0) + self.lean * lean / 4.0 + self.bulge * rise
+    }
+}
+
+/// Rises from 0 at the edge to 1 at a distance, and is level there.
+pub(super) fn pillow(inside: f64, distance: f64) -> f64 {
+    let t = (inside / distance).clamp(0.0, 1.0);
+    t * (2.0 - t)
+}
