@@ -1,0 +1,37 @@
+//! The layered grid plot on paper.
+import type { Grid, Lake } from './api'
+import { css, inkOn, levelColour, token } from './colour'
+import { layout } from './gridLayout'
+import type { TableData } from './plot'
+import { label, picture } from './svg'
+import { settings } from './settings.svelte'
+
+export function gridSvg(lake: Lake, grid: Grid, title: string): string {
+  const plan = layout(lake, 560, lake.bands.length)
+  let body = `<g transform="translate(12 34)">${label(0, -14, title, 'start', 'font-weight="600"')}`
+  for (const block of plan.blocks) body += label(block.x + block.side / 2, 14, `${lake.points.find((p) => p.layer === block.layer)?.z_mm ?? ''} mm`, 'middle')
+  lake.bands.forEach((band, row) => {
+    const top = plan.rowTops[row]
+    body += label(0, top + plan.side / 2 + 4, band.label)
+    for (const block of plan.blocks) {
+      body += `<rect x="${block.x}" y="${top}" width="${block.side}" height="${block.side}" fill="${token('--plot-block')}"/>`
+      for (const cell of block.cells) {
+        const id = cell.point.point_id
+        const value = grid.bands[row][id]
+        const [cx, cy] = [cell.x + cell.size / 2, top + cell.y + cell.size / 2 + 4]
+        const colour = value === null ? null : levelColour(value, settings.palette)
+        body += `<rect x="${cell.x}" y="${top + cell.y}" width="${cell.size}" height="${cell.size}" fill="${id === grid.microphone ? token('--accent') : colour ? css(colour) : token('--well')}"/>`
+        if (id === grid.microphone) body += `<text x="${cx}" y="${cy}" text-anchor="middle" font-weight="600" fill="${inkOn([11, 92, 140])}">M</text>`
+        else if (value === null) body += label(cx, cy, '+', 'middle')
+      }
+    }
+  })
+  return picture(plan.width + 24, plan.height + 40, body + '</g>')
+}
+
+export function gridTable(lake: Lake, grid: Grid): TableData {
+  return {
+    columns: ['point', 'layer', 'gridx', 'gridy', 'x_mm', 'y_mm', 'z_mm', 'pair', 'measured the other way round', ...lake.bands.map((band) => `tnce ${band.label}, dB`)],
+    rows: lake.points.map((p) => [p.point_id, p.layer, p.gridx, p.gridy, p.x_mm, p.y_mm, p.z_mm, grid.pairs[p.point_id], grid.swapped[p.point_id], ...lake.bands.map((_, b) => grid.bands[b][p.point_id])]),
+  }
+}
