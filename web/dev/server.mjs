@@ -99,6 +99,7 @@ const routes = [
     return json(seriesOf(rows, span.first))
   }],
   [/^\/schema$/, async () => json(await schema())],
+  [/^\/openapi\.json$/, async () => ({ type: 'application/json', body: await readFile(join(web, 'openapi.json')) })],
 ]
 
 async function schema() {

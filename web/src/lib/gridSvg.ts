@@ -2,7 +2,6 @@
 import type { Grid, Lake } from './api'
 import { css, inkOn, levelColour, token } from './colour'
 import { layout } from './gridLayout'
-import type { TableData } from './plot'
 import { label, picture } from './svg'
 import { settings } from './settings.svelte'
 
@@ -27,11 +26,4 @@ export function gridSvg(lake: Lake, grid: Grid, title: string): string {
     }
   })
   return picture(plan.width + 24, plan.height + 40, body + '</g>')
-}
-
-export function gridTable(lake: Lake, grid: Grid): TableData {
-  return {
-    columns: ['point', 'layer', 'gridx', 'gridy', 'x_mm', 'y_mm', 'z_mm', 'pair', 'measured the other way round', ...lake.bands.map((band) => `tnce ${band.label}, dB`)],
-    rows: lake.points.map((p) => [p.point_id, p.layer, p.gridx, p.gridy, p.x_mm, p.y_mm, p.z_mm, grid.pairs[p.point_id], grid.swapped[p.point_id], ...lake.bands.map((_, b) => grid.bands[b][p.point_id])]),
-  }
 }
