@@ -8,6 +8,9 @@ export const SCALE_DB = { low: -20, zero: 0, high: 6 } as const
 
 const HIGH: Record<Palette, Rgb> = { paper: [255, 0, 0], safe: [255, 176, 0] }
 
+/** How many dB the small bars reach up and down. */
+export const BAR_REACH_DB = 4
+
 /** A level's colour; beyond the ends it stays at the ends. */
 export function levelColour(level_db: number, palette: Palette): Rgb {
   const { low, zero, high } = SCALE_DB

@@ -11,7 +11,7 @@ export function stacked(lake: Lake, set: CurveSet, which: 'surface' | 'flat' = '
   const flat = total(set.flat)
   return {
     x: { label: 'Time', unit: 'ms', values: set.time_ms },
-    y: { label: 'NCE over Flat’s total', unit: '1', low: 0, ...(high === undefined ? {} : { high }) },
+    y: { label: 'NCE over Flat’s total', unit: 'ratio', low: 0, ...(high === undefined ? {} : { high }) },
     lines: [
       ...bands.map((band, b) => ({ label: band.label, values: sums[b] ?? [], colour: `--band-${b % 5}`, width: 0.5, fillTo: b === 0 ? ('zero' as const) : b - 1, parts: own.bands[b] ?? [] })),
       ...(which === 'surface' ? [{ label: 'Flat, total', values: flat, colour: '--ink', width: 1.6, dash: [5, 4] }] : []),

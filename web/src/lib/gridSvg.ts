@@ -13,13 +13,13 @@ export function gridSvg(lake: Lake, grid: Grid, title: string): string {
     const top = plan.rowTops[row]
     body += label(0, top + plan.side / 2 + 4, band.label)
     for (const block of plan.blocks) {
-      body += `<rect x="${block.x}" y="${top}" width="${block.side}" height="${block.side}" fill="${token('--plot-block')}"/>`
+      body += `<rect x="${block.x + block.inset - 1}" y="${top + block.inset - 1}" width="${block.side - 2 * block.inset + 2}" height="${block.side - 2 * block.inset + 2}" fill="${token('--plot-block')}"/>`
       for (const cell of block.cells) {
         const id = cell.point.point_id
         const value = grid.bands[row][id]
         const [cx, cy] = [cell.x + cell.size / 2, top + cell.y + cell.size / 2 + 4]
         const colour = value === null ? null : levelColour(value, settings.palette)
-        body += `<rect x="${cell.x}" y="${top + cell.y}" width="${cell.size}" height="${cell.size}" fill="${id === grid.microphone ? token('--accent') : colour ? css(colour) : token('--well')}"/>`
+        body += `<rect x="${cell.x}" y="${top + cell.y}" width="${cell.size}" height="${cell.size}" fill="${id === grid.microphone ? token('--accent') : colour ? css(colour) : token('--plot-block')}"/>`
         if (id === grid.microphone) body += `<text x="${cx}" y="${cy}" text-anchor="middle" font-weight="600" fill="${inkOn([11, 92, 140])}">M</text>`
         else if (value === null) body += label(cx, cy, '+', 'middle')
       }

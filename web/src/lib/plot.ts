@@ -8,6 +8,8 @@ export interface Line {
   readonly colour: string
   readonly width?: number
   readonly dash?: readonly number[]
+  /** Points instead of a line. */
+  readonly dots?: boolean
   /** Fills down to zero, or to the line of this number. */
   readonly fillTo?: number | 'zero'
   /** What the legend shows instead of `values`: the parts of a stack. */
@@ -42,6 +44,9 @@ export function yRange(spec: PlotSpec): [number, number] {
   const air = (high - low || Math.abs(high) || 1) * 0.05
   return [spec.y.low ?? (low === 0 ? 0 : low - air), spec.y.high ?? high + air]
 }
+
+/** As many decimals as steps of this size need. */
+export const decimals = (step: number) => Math.max(0, Math.ceil(-Math.log10(step) - 1e-9))
 
 /** Round numbers across a range. */
 export function ticks(low: number, high: number, about: number): number[] {

@@ -37,7 +37,8 @@ export function plotSvg(spec: PlotSpec, title: string, width = 720, height = 400
     }
   })
   spec.lines.forEach((line) => {
-    if (line.fillTo === undefined) body += `<path d="M${points(line.values).join('L')}" fill="none" stroke="${token(line.colour)}" stroke-width="${line.width ?? 1.5}"${line.dash ? ` stroke-dasharray="${line.dash.join(' ')}"` : ''}/>`
+    if (line.dots) body += points(line.values).map((p) => `<circle cx="${p.split(',')[0]}" cy="${p.split(',')[1]}" r="2" fill="${token(line.colour)}"/>`).join('')
+    else if (line.fillTo === undefined) body += `<path d="M${points(line.values).join('L')}" fill="none" stroke="${token(line.colour)}" stroke-width="${line.width ?? 1.5}"${line.dash ? ` stroke-dasharray="${line.dash.join(' ')}"` : ''}/>`
   })
   body += `<path d="M${left} ${top}V${height - bottom}H${width - right}" fill="none" stroke="${token('--ink')}"/>`
   body += label((left + width - right) / 2, height - 8, axisTitle(spec.x), 'middle') + label(0, 0, axisTitle(spec.y), 'middle', `transform="translate(14 ${(top + height - bottom) / 2}) rotate(-90)"`)
