@@ -162,7 +162,7 @@ async function api(request, response, url) {
 }
 
 function send(request, response, { type, body, name }, headers = {}) {
-  const packed = body.length > 1000 && /json|csv|octet/.test(type) && /gzip/.test(request.headers['accept-encoding'] ?? '')
+  const packed = body.length > 1000 && /json|csv|octet|javascript|css|html|svg/.test(type) && /gzip/.test(request.headers['accept-encoding'] ?? '')
   const sent = packed ? gzipSync(body, { level: 5 }) : body
   response.writeHead(200, { 'content-type': type, 'content-length': sent.length, 'x-content-type-options': 'nosniff', ...(packed ? { 'content-encoding': 'gzip' } : {}), ...(name ? { 'content-disposition': `attachment; filename="${name.replace(/[^\w.-]/g, '_')}"` } : {}), ...headers })
   response.end(sent)
