@@ -50,7 +50,12 @@ const routes = [
   [/^\/lake$/, async () => json({ ...rig, name: options.lake.split('/').filter(Boolean).at(-1), version, software: 'echolake', layers: 1 + Math.max(...points.map((p) => p.layer)), points, counts: { surfaces: entries.length, ...totals }, simulated: entries.every((e) => e.surface.origin === 'simulated') })],
   [/^\/surfaces$/, async (_, q) => json(page(entries, rig.bands, q))],
   [/^\/surfaces\/([^/]+)$/, async ([id]) => json(await detail(lake, rig.bands, entries, id))],
-  [/^\/surfaces\/([^/]+)\/grid$/, async ([id], q) => json(await grid(lake, rig.bands, points, id, whole(q.get('microphone'), 'microphone'), q.get('over') ?? 'flat-total'))],
+  [/^\/surfaces\/([^/]+)\/grid$/, async ([id], q) => {
+    runOfSurface(id)
+    const microphone = whole(q.get('microphone'), 'microphone')
+    if (microphone >= points.length) throw fail(400, 'bad_request', `there is no point ${microphone}`, `Points run from 0 to ${points.length - 1}.`)
+    return json(await grid(lake, rig.bands, points, id, microphone, q.get('over') ?? 'flat-total'))
+  }],
   [/^\/surfaces\/([^/]+)\/curves$/, async ([id], q) => {
     const microphone = q.get('microphone')
     const where = microphone === null ? '' : ` and (microphone = ${whole(microphone, 'microphone')} or speaker = ${microphone})`
@@ -191,7 +196,8 @@ const vite = options.built ? null : await (await import('vite')).createServer({ 
 createServer((request, response) => {
   const url = new URL(request.url, 'http://localhost')
   if (url.pathname.startsWith('/api/v1/')) api(request, response, url).catch((error) => problem(response, error))
-  else if (url.pathname === '/health') response.end('ok')
+  else if (url.pathname === '/health') send(request, response, { type: 'text/plain', body: Buffer.from('ok\n') })
+  else if (url.pathname === '/metrics') problem(response, fail(404, 'not_found', 'this server counts nothing'))
   else if (vite) vite.middlewares(request, response)
   else built(request, response, url).catch((error) => problem(response, error))
 }).listen(Number(options.port), '127.0.0.1', () => process.stderr.write(`http://127.0.0.1:${options.port}/\n`))

@@ -1,5 +1,5 @@
 //! The SQL editor. It lives in a shadow root, where its styles need no inline style element that the page's policy forbids.
-import { acceptCompletion, autocompletion, closeBrackets, completionKeymap } from '@codemirror/autocomplete'
+import { acceptCompletion, autocompletion, closeBrackets, completionKeymap, type Completion, type CompletionContext } from '@codemirror/autocomplete'
 import { defaultKeymap, history, historyKeymap } from '@codemirror/commands'
 import { PostgreSQL, sql, type SQLNamespace } from '@codemirror/lang-sql'
 import { bracketMatching, HighlightStyle, syntaxHighlighting } from '@codemirror/language'
@@ -16,7 +16,7 @@ const look = EditorView.theme({
   '.cm-scroller': { fontFamily: 'var(--mono)', lineHeight: '1.5' },
   '.cm-gutters': { backgroundColor: 'var(--paper)', color: 'var(--ink-2)', border: 'none' },
   '.cm-activeLine': { backgroundColor: 'transparent' },
-  '&.cm-focused': { outline: '2px solid var(--accent)', outlineOffset: '-1px' },
+  '&.cm-focused': { outline: 'none' },
   '.cm-cursor': { borderLeftColor: 'var(--ink)' },
   '&.cm-focused .cm-selectionBackground, .cm-selectionBackground': { backgroundColor: 'var(--accent-well) !important' },
   '.cm-tooltip': { backgroundColor: 'var(--paper)', color: 'var(--ink)', border: '1px solid var(--ink)' },
@@ -27,6 +27,22 @@ const colours = HighlightStyle.define([
   { tag: tags.keyword, color: 'var(--accent)' }, { tag: [tags.string, tags.special(tags.string)], color: 'var(--mark)' },
   { tag: [tags.number, tags.bool, tags.null], color: 'var(--under)' }, { tag: tags.comment, color: 'var(--ink-2)' },
 ])
+
+/** Functions and every column, also before a table is named. */
+function words(tables: Schemas['Tables']): Completion[] {
+  const columns = new Map<string, { unit: string; comment: string; tables: string[] }>()
+  for (const table of tables.tables) {
+    for (const column of table.columns) {
+      const known = columns.get(column.name)
+      if (known) known.tables.push(table.name)
+      else columns.set(column.name, { unit: column.unit, comment: column.comment, tables: [table.name] })
+    }
+  }
+  return [
+    ...tables.functions.map((label) => ({ label, type: 'function', apply: `${label}(` })),
+    ...[...columns].map(([label, about]) => ({ label, type: 'property', boost: -1, detail: about.unit, info: `${about.comment}. In ${about.tables.join(', ')}.` })),
+  ]
+}
 
 function names(tables: Schemas['Tables']): SQLNamespace {
   return Object.fromEntries(tables.tables.map((table) => [table.name, table.columns.map((column) => ({ label: column.name, type: 'property', detail: column.unit, info: column.comment }))]))
@@ -59,9 +75,9 @@ export function editor(host: HTMLElement, text: string, changed: (text: string) 
     set: (next) => view.dispatch({ changes: { from: 0, to: view.state.doc.length, insert: next } }),
     complete(tables) {
       const support = sql({ dialect: PostgreSQL, schema: names(tables), upperCaseKeywords: false })
-      const called = tables.functions.map((label) => ({ label, type: 'function', apply: `${label}(` }))
+      const called = words(tables)
       view.dispatch({ effects: [language.reconfigure(support), functions.reconfigure(PostgreSQL.language.data.of({
-        autocomplete: (context: import('@codemirror/autocomplete').CompletionContext) => { const word = context.matchBefore(/\w+/); return word ? { from: word.from, options: called } : null },
+        autocomplete: (context: CompletionContext) => { const word = context.matchBefore(/\w+/); return word ? { from: word.from, options: called } : null },
       }))] })
     },
     focus: () => view.focus(),

@@ -1,6 +1,6 @@
 //! The layered grid plot on paper.
 import type { Grid, Lake } from './api'
-import { css, inkOn, levelColour, token } from './colour'
+import { css, inkOn, levelColour, SCALE_DB, token } from './colour'
 import { layout } from './gridLayout'
 import { label, picture } from './svg'
 import { settings } from './settings.svelte'
@@ -25,5 +25,10 @@ export function gridSvg(lake: Lake, grid: Grid, title: string): string {
       }
     }
   })
-  return picture(plan.width + 24, plan.height + 40, body + '</g>')
+  const steps = 52
+  const at = (i: number) => SCALE_DB.low + ((SCALE_DB.high - SCALE_DB.low) * i) / (steps - 1)
+  for (let i = 0; i < steps; i += 1) body += `<rect x="${plan.left + i * 5}" y="${plan.height + 4}" width="5.2" height="11" fill="${css(levelColour(at(i), settings.palette))}"/>`
+  body += `<rect x="${plan.left}" y="${plan.height + 4}" width="${steps * 5}" height="11" fill="none" stroke="${token('--rule-2')}"/>`
+  for (const db of [-20, -10, 0, 6]) body += label(plan.left + (steps * 5 * (db - SCALE_DB.low)) / (SCALE_DB.high - SCALE_DB.low), plan.height + 29, `${db > 0 ? '+' : ''}${db}${db === 6 ? ' dB' : ''}`.replace('-', '\u2212'), 'middle')
+  return picture(plan.width + 24, plan.height + 76, body + '</g>')
 }

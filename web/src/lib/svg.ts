@@ -13,6 +13,8 @@ export const picture = (width: number, height: number, body: string) =>
 export const label = (x: number, y: number, text: string, anchor = 'start', extra = '') =>
   `<text x="${x}" y="${y}" text-anchor="${anchor}" fill="${token('--ink')}" ${extra}>${escape(text)}</text>`
 
+const minus = (value: number) => String(value).replace('-', '\u2212')
+
 /** A line plot. */
 export function plotSvg(spec: PlotSpec, title: string, width = 720, height = 400): string {
   const [left, right, top, bottom] = [64, 16, 56, 46]
@@ -26,9 +28,9 @@ export function plotSvg(spec: PlotSpec, title: string, width = 720, height = 400
   const points = (values: readonly (number | null)[]) => values.flatMap((v, i) => (v === null || !within[i] ? [] : [`${px(xs[i]).toFixed(2)},${py(Math.max(y0, Math.min(y1, v))).toFixed(2)}`]))
   const grid = token('--rule')
   let body = label(left, 20, title, 'start', 'font-weight="600"')
-  for (const t of ticks(y0, y1, 6)) body += `<path d="M${left} ${py(t)}H${width - right}" stroke="${grid}"/>` + label(left - 6, py(t) + 4, String(t), 'end')
+  for (const t of ticks(y0, y1, 6)) body += `<path d="M${left} ${py(t)}H${width - right}" stroke="${grid}"/>` + label(left - 6, py(t) + 4, minus(t), 'end')
   const xTicks = spec.x.log ? [1, 2, 5, 10, 20, 50, 100].filter((t) => t >= x0 && t <= x1) : ticks(x0, x1, 8)
-  for (const t of xTicks) body += `<path d="M${px(t)} ${top}V${height - bottom}" stroke="${grid}"/>` + label(px(t), height - bottom + 16, String(t), 'middle')
+  for (const t of xTicks) body += `<path d="M${px(t)} ${top}V${height - bottom}" stroke="${grid}"/>` + label(px(t), height - bottom + 16, minus(t), 'middle')
   spec.lines.forEach((line) => {
     const colour = token(line.colour)
     if (line.fillTo !== undefined) {
