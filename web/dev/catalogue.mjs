@@ -60,7 +60,7 @@ function filters(bands, params) {
   }
   const range = (name, given, value) => {
     const [low, high] = given.split('..').map(Number)
-    if (Number.isNaN(low) || Number.isNaN(high)) throw Object.assign(new Error(`${name} is not lo..hi: ${given}`), { status: 400, code: 'bad_request' })
+    if (Number.isNaN(low) || Number.isNaN(high)) throw Object.assign(new Error(`${name} is not lo..hi: ${given}`), { status: 400, code: 'request_invalid' })
     tests.set(name, (entry) => value(entry) !== null && value(entry) >= low && value(entry) <= high)
   }
   if (params.get('started')) range('started', params.get('started'), (entry) => entry.day)
@@ -68,7 +68,7 @@ function filters(bands, params) {
   for (const given of params.getAll('level')) {
     const [band, span] = given.split(':')
     const index = bands.findIndex((one) => one.key === band)
-    if (index < 0) throw Object.assign(new Error(`no band ${band}`), { status: 400, code: 'bad_request' })
+    if (index < 0) throw Object.assign(new Error(`no band ${band}`), { status: 400, code: 'request_invalid' })
     range(`level:${band}`, span, (entry) => entry.surface.against_flat_db[index])
   }
   return tests

@@ -1,6 +1,6 @@
 //! Serves the pages and the API of openapi.json from a lake, for developing and trying the pages:
 //! `node dev/server.mjs --lake FOLDER --echolake BINARY [--port 8420] [--built]`. With `--built` it serves dist/
-//! with the headers of the real server, without it Vite serves the sources.
+//! with the headers of the real server, without it Vite serves the sources. With `--token T` only who knows it is answered.
 import { createServer } from 'node:http'
 import { createReadStream } from 'node:fs'
 import { readFile, stat } from 'node:fs/promises'
@@ -16,7 +16,7 @@ import { attachment, summary } from './mcap.mjs'
 import { map } from './map.mjs'
 import { hillshade } from './png.mjs'
 
-const { values: options } = parseArgs({ options: { lake: { type: 'string' }, echolake: { type: 'string', default: 'echolake' }, port: { type: 'string', default: '8420' }, built: { type: 'boolean', default: false } } })
+const { values: options } = parseArgs({ options: { lake: { type: 'string' }, echolake: { type: 'string', default: 'echolake' }, port: { type: 'string', default: '8420' }, built: { type: 'boolean', default: false }, token: { type: 'string' } } })
 const web = fileURLToPath(new URL('..', import.meta.url))
 const lake = openLake(options.echolake, options.lake)
 const rig = rigOf(await readFile(join(options.lake, 'lake.toml'), 'utf8'))
@@ -28,7 +28,7 @@ const version = createHash('sha256').update(JSON.stringify([entries.map((e) => e
 const CSP = "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob:; font-src 'self'; media-src 'self' blob:; connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
 const fail = (status, code, detail, hint) => Object.assign(new Error(detail), { status, code, hint })
 const whole = (value, name) => {
-  if (!/^\d+$/.test(value ?? '')) throw fail(400, 'bad_request', `${name} is not a whole number: ${value}`)
+  if (!/^\d+$/.test(value ?? '')) throw fail(400, 'request_invalid', `${name} is not a whole number: ${value}`)
   return Number(value)
 }
 const runFile = async (id) => {
@@ -53,7 +53,7 @@ const routes = [
   [/^\/surfaces\/([^/]+)\/grid$/, async ([id], q) => {
     runOfSurface(id)
     const microphone = whole(q.get('microphone'), 'microphone')
-    if (microphone >= points.length) throw fail(400, 'bad_request', `there is no point ${microphone}`, `Points run from 0 to ${points.length - 1}.`)
+    if (microphone >= points.length) throw fail(400, 'request_invalid', `there is no point ${microphone}`, `Points run from 0 to ${points.length - 1}.`)
     return json(await grid(lake, rig.bands, points, id, microphone, q.get('over') ?? 'flat-total'))
   }],
   [/^\/surfaces\/([^/]+)\/curves$/, async ([id], q) => {
@@ -103,35 +103,38 @@ const routes = [
     const rows = await lake.rows(`select min(log_time_ns) as ns, avg(temperature_c) as temperature_c, avg(humidity_pct) as humidity_pct, avg(pressure_hpa) as pressure_hpa, max(outside_level_db) as outside_level_db from environment where run_id = ${text(id)} group by (log_time_ns - ${span.first}) / ${width} order by 1`)
     return json(seriesOf(rows, span.first))
   }],
-  [/^\/schema$/, async () => json(await schema())],
+  [/^\/tables$/, async () => json(await schema())],
   [/^\/openapi\.json$/, async () => ({ type: 'application/json', body: await readFile(join(web, 'openapi.json')) })],
 ]
 
 async function schema() {
-  const rows = await lake.rows("select table_name, column_name, data_type from information_schema.columns where table_schema = 'public' order by table_name, ordinal_position")
+  const rows = await lake.rows("select table_name, column_name, data_type, is_nullable from information_schema.columns where table_schema = 'public' order by table_name, ordinal_position")
   const tables = []
   for (const name of [...new Set(rows.map((r) => r.table_name))]) {
     const log = await readFile(join(options.lake, 'tables', name, '_delta_log', '00000000000000000000.json'), 'utf8')
     const meta = log.split('\n').filter(Boolean).map((line) => JSON.parse(line).metaData).find(Boolean)
     const fields = new Map(JSON.parse(meta.schemaString).fields.map((f) => [f.name, f.metadata]))
-    tables.push({ name, rows: null, columns: rows.filter((r) => r.table_name === name).map((r) => ({ name: r.column_name, type: r.data_type.replace(/\(.*/, ''), unit: fields.get(r.column_name)?.unit ?? '', comment: fields.get(r.column_name)?.comment ?? '' })) })
+    tables.push({ name, columns: rows.filter((r) => r.table_name === name).map((r) => ({ name: r.column_name, type: r.data_type, nullable: r.is_nullable === 'YES', unit: fields.get(r.column_name)?.unit || null, comment: fields.get(r.column_name)?.comment || null })) })
   }
-  return { tables, functions: ['avg', 'sum', 'min', 'max', 'count', 'corr', 'stddev', 'median', 'approx_percentile_cont', 'log10', 'sqrt', 'abs', 'array_max', 'array_element', 'array_length'] }
+  return tables
 }
 
 const FORMATS = { 'text/csv': 'csv', 'application/json': 'json', 'application/vnd.apache.parquet': 'parquet', 'application/vnd.apache.arrow.stream': 'arrow' }
 
-async function sql(request, response) {
+async function bodyOf(request) {
   const parts = []
   for await (const part of request) parts.push(part)
-  let query
-  try { query = JSON.parse(Buffer.concat(parts).toString()).query } catch { throw fail(400, 'bad_request', 'the body is not JSON', 'Send {"query": "select 1"}.') }
-  if (typeof query !== 'string' || !query.trim()) throw fail(400, 'bad_request', 'there is no query in the body')
-  const accepted = (request.headers.accept ?? '').split(',').map((one) => one.split(';')[0].trim()).find((one) => FORMATS[one]) ?? 'application/vnd.apache.arrow.stream'
+  try { return JSON.parse(Buffer.concat(parts).toString()) } catch { throw fail(400, 'request_invalid', 'the body is not JSON', 'Send {"query": "select 1"}.') }
+}
+
+async function sql(request, response) {
+  const { query } = await bodyOf(request)
+  if (typeof query !== 'string' || !query.trim()) throw fail(400, 'request_invalid', 'there is no query in the body')
+  const accepted = (request.headers.accept ?? '').split(',').map((one) => one.split(';')[0].trim()).find((one) => FORMATS[one]) ?? 'application/json'
   const stop = new AbortController()
   response.on('close', () => stop.abort())
   try { return { type: accepted, body: await lake.bytes(query, FORMATS[accepted], stop.signal) } } catch (error) {
-    if (error instanceof QueryError) throw fail(400, 'bad_query', error.message.replace(/^error: /, ''))
+    if (error instanceof QueryError) throw fail(400, 'query_invalid', error.message.replace(/^error: /, ''))
     throw error
   }
 }
@@ -151,8 +154,20 @@ async function sendFile(request, response, path, etag, type) {
   else createReadStream(path, { start: from, end: to }).pipe(response)
 }
 
+/** Cookie of this process, once somebody showed the token. */
+const session = createHash('sha256').update(`${process.pid} ${Date.now()} ${Math.random()}`).digest('hex')
+
+async function login(request, response) {
+  const { token } = await bodyOf(request)
+  if (!options.token || token !== options.token) throw fail(401, 'unauthenticated', 'this token is not known')
+  response.writeHead(204, { 'set-cookie': `echolake=${session}; HttpOnly; SameSite=Strict; Path=/` })
+  response.end()
+}
+
 async function api(request, response, url) {
   const path = url.pathname.slice('/api/v1'.length)
+  if (path === '/session' && request.method === 'POST') return login(request, response)
+  if (options.token && request.headers.authorization !== `Bearer ${options.token}` && !request.headers.cookie?.includes(`echolake=${session}`)) throw fail(401, 'unauthenticated', 'a token is needed')
   const file = /^\/runs\/([^/]+)\/file\.mcap$/.exec(path)
   if (file) { const found = await runFile(decodeURIComponent(file[1])); return sendFile(request, response, found.path, found.sha, 'application/octet-stream') }
   if (path === '/sql' && request.method === 'POST') return send(request, response, await sql(request, response))
@@ -179,7 +194,7 @@ function problem(response, error) {
   if (response.headersSent || response.destroyed) return response.destroy()
   const code = error.code && typeof error.code === 'string' && error.status ? error.code : 'internal'
   response.writeHead(status, { 'content-type': 'application/problem+json' })
-  response.end(JSON.stringify({ type: `urn:echolake:${code}`, title: code.replaceAll('_', ' '), status, code, detail: error.message, ...(error.hint ? { hint: error.hint } : {}) }))
+  response.end(JSON.stringify({ type: `urn:echolake:problem:${code}`, title: code.replaceAll('_', ' '), status, code, detail: error.message + (error.hint ? `; hint: ${error.hint}` : '') }))
 }
 
 const TYPES = { '.html': 'text/html; charset=utf-8', '.js': 'text/javascript', '.css': 'text/css', '.woff2': 'font/woff2', '.svg': 'image/svg+xml', '.json': 'application/json' }
@@ -196,7 +211,7 @@ const vite = options.built ? null : await (await import('vite')).createServer({ 
 createServer((request, response) => {
   const url = new URL(request.url, 'http://localhost')
   if (url.pathname.startsWith('/api/v1/')) api(request, response, url).catch((error) => problem(response, error))
-  else if (url.pathname === '/health') send(request, response, { type: 'text/plain', body: Buffer.from('ok\n') })
+  else if (url.pathname === '/health') send(request, response, { type: 'application/json', body: Buffer.from(JSON.stringify({ status: 'ok', version: 'development' })) })
   else if (url.pathname === '/metrics') problem(response, fail(404, 'not_found', 'this server counts nothing'))
   else if (vite) vite.middlewares(request, response)
   else built(request, response, url).catch((error) => problem(response, error))

@@ -9,6 +9,7 @@ const ajv = new Ajv({ strict: false, allErrors: true })
 formats(ajv)
 ajv.addSchema(api, 'api')
 const get = async (path) => (await fetch(base + path)).json()
+const post = (query, accept) => fetch(`${base}/api/v1/sql`, { method: 'POST', headers: { 'content-type': 'application/json', accept }, body: JSON.stringify({ query }) })
 const surfaces = (await get('/api/v1/surfaces?limit=500')).items
 const runs = (await get('/api/v1/runs?limit=1')).items
 const measured = surfaces.find((s) => s.typology !== 'reference') ?? surfaces[0]
@@ -48,5 +49,18 @@ for (const [template, { get: operation }] of Object.entries(api.paths)) {
 await check('/api/v1/surfaces?level=nonsense:1..2', '/api/v1/surfaces', 400)
 await check('/api/v1/surfaces?relief=a..b', '/api/v1/surfaces', 400)
 await check(`/api/v1/surfaces/${measured.surface_id}/grid?microphone=x`, '/api/v1/surfaces/{surface_id}/grid', 400)
+for (const [type, opening] of [['application/vnd.apache.arrow.stream', '\xff\xff\xff\xff'], ['application/vnd.apache.parquet', 'PAR1'], ['text/csv', 'n'], ['application/json', '[']]) {
+  asked += 1
+  const response = await post('select 1 as n', type)
+  const bytes = Buffer.from(await response.arrayBuffer()).toString('latin1')
+  // The command writes Arrow files where the server writes streams.
+  if (response.status !== 200 || !(bytes.startsWith(opening) || bytes.startsWith('ARROW1'))) { failures += 1; process.stdout.write(`FAIL sql as ${type}: ${response.status}, ${JSON.stringify(bytes.slice(0, 40))}\n`) }
+}
+for (const [query, code] of [['select nope', 'query_invalid'], ['delete from points', 'read_only']]) {
+  asked += 1
+  const problem = await (await post(query, 'application/json')).json()
+  if (problem.code !== code) process.stdout.write(`note: ${query}: ${problem.code}, not ${code}\n`)
+  if (!problem.detail || !(problem.status >= 400 && problem.status < 500)) { failures += 1; process.stdout.write(`FAIL ${query}: ${JSON.stringify(problem)}\n`) }
+}
 process.stdout.write(failures ? `${failures} failures of ${asked}\n` : `${asked} answers as in openapi.json\n`)
 process.exitCode = failures ? 1 : 0

@@ -18,7 +18,7 @@ export async function readAnswer(response: Response, stop: () => void): Promise<
     const { done, value } = await reader.read()
     if (done) break
     bytes += value.length
-    if (bytes > MOST_BYTES) { stop(); throw new ApiError(413, 'too_large', `the answer is larger than ${MOST_BYTES / 1e6} MB`, 'Add a limit, or export it: an export is not kept in the page.') }
+    if (bytes > MOST_BYTES) { stop(); throw new ApiError(413, 'request_too_large', `the answer is larger than ${MOST_BYTES / 1e6} MB`, 'Add a limit, or export it: an export is not kept in the page.') }
     parts.push(value)
   }
   const whole = new Uint8Array(bytes)

@@ -43,7 +43,8 @@ export function apiHref(path: string, params: Record<string, string | number | n
 async function refusal(response: Response): Promise<ApiError> {
   try {
     const problem = (await response.json()) as Schemas['Problem']
-    return new ApiError(problem.status, problem.code, problem.detail ?? problem.title, problem.hint ?? '')
+    const [detail, hint = ''] = (problem.detail ?? problem.title).split('; hint: ')
+    return new ApiError(problem.status, problem.code, detail, hint)
   } catch {
     return new ApiError(response.status, 'internal', `the server answered ${response.status}`, '')
   }
@@ -53,7 +54,7 @@ async function ask(href: string, init?: RequestInit): Promise<Response> {
   let response: Response
   try { response = await fetch(href, init) } catch (error) {
     if (error instanceof DOMException && error.name === 'AbortError') throw error
-    throw new ApiError(0, 'lake_unavailable', 'the server does not answer', 'See whether echolake serve still runs, then try again.')
+    throw new ApiError(0, 'lake_unreadable', 'the server does not answer', 'See whether echolake serve still runs, then try again.')
   }
   if (!response.ok) throw await refusal(response)
   return response
@@ -83,5 +84,8 @@ export const heightmap = (id: string): Promise<Float32Array> =>
 /** Runs a query; closing by `signal` cancels it. */
 export const sql = (query: string, accept: string, signal?: AbortSignal): Promise<Response> =>
   ask('/api/v1/sql', { method: 'POST', headers: { 'content-type': 'application/json', accept }, body: JSON.stringify({ query }), ...(signal ? { signal } : {}) })
+
+/** Shows the server a token; it answers with a cookie, which pictures and downloads send too. */
+export const login = (token: string): Promise<Response> => ask('/api/v1/session', { method: 'POST', headers: { 'content-type': 'application/json' }, body: JSON.stringify({ token }) })
 
 export const thumbnailHref = (id: string) => apiHref(`/surfaces/${encodeURIComponent(id)}/thumbnail.png`)

@@ -276,17 +276,34 @@ export interface paths {
         readonly patch?: never;
         readonly trace?: never;
     };
-    readonly "/api/v1/schema": {
+    readonly "/api/v1/tables": {
         readonly parameters: {
             readonly query?: never;
             readonly header?: never;
             readonly path?: never;
             readonly cookie?: never;
         };
-        /** Tables, columns, units, meanings, and functions, for completion */
-        readonly get: operations["schema"];
+        /** Tables, columns, units, meanings; for completion. Functions: select distinct routine_name from information_schema.routines */
+        readonly get: operations["tables"];
         readonly put?: never;
         readonly post?: never;
+        readonly delete?: never;
+        readonly options?: never;
+        readonly head?: never;
+        readonly patch?: never;
+        readonly trace?: never;
+    };
+    readonly "/api/v1/session": {
+        readonly parameters: {
+            readonly query?: never;
+            readonly header?: never;
+            readonly path?: never;
+            readonly cookie?: never;
+        };
+        readonly get?: never;
+        readonly put?: never;
+        /** Takes a token and answers with a cookie (HttpOnly, SameSite=Strict) that stands for it, because pictures and downloads of a page can send no Authorization header. Only where the server has tokens */
+        readonly post: operations["session"];
         readonly delete?: never;
         readonly options?: never;
         readonly head?: never;
@@ -302,7 +319,7 @@ export interface paths {
         };
         readonly get?: never;
         readonly put?: never;
-        /** One read-only query. The Accept header chooses the form, Arrow stream by default. Closing the connection cancels it */
+        /** One read-only query. The Accept header chooses the form, JSON where there is none. Closing the connection cancels it */
         readonly post: operations["sql"];
         readonly delete?: never;
         readonly options?: never;
@@ -388,9 +405,9 @@ export interface components {
             readonly title: string;
             readonly status: number;
             /** @enum {string} */
-            readonly code: "bad_request" | "bad_query" | "not_found" | "no_data" | "query_timeout" | "query_cancelled" | "too_large" | "lake_unavailable" | "internal";
+            readonly code: "query_invalid" | "read_only" | "query_failed" | "format_impossible" | "lake_unreadable" | "request_invalid" | "unsupported" | "not_found" | "no_data" | "request_too_large" | "unauthenticated" | "forbidden" | "foreign_origin" | "cancelled" | "time_limit" | "too_many" | "internal";
+            /** @description What is wrong; what to do follows after `; hint: ` */
             readonly detail?: string;
-            readonly hint?: string;
             readonly instance?: string;
         };
         readonly Band: {
@@ -725,18 +742,18 @@ export interface components {
         };
         readonly Column: {
             readonly name: string;
+            /** @description As Arrow writes it */
             readonly type: string;
-            readonly unit: string;
-            readonly comment: string;
+            readonly nullable: boolean;
+            readonly unit: string | null;
+            readonly comment: string | null;
         };
         readonly Table: {
             readonly name: string;
-            readonly rows: number | null;
             readonly columns: readonly components["schemas"]["Column"][];
         };
-        readonly Tables: {
-            readonly tables: readonly components["schemas"]["Table"][];
-            readonly functions: readonly string[];
+        readonly Session: {
+            readonly token: string;
         };
         readonly Query: {
             readonly query: string;
@@ -1304,7 +1321,7 @@ export interface operations {
             readonly default: components["responses"]["Problem"];
         };
     };
-    readonly schema: {
+    readonly tables: {
         readonly parameters: {
             readonly query?: never;
             readonly header?: never;
@@ -1320,11 +1337,34 @@ export interface operations {
                     readonly [name: string]: unknown;
                 };
                 content: {
-                    readonly "application/json": components["schemas"]["Tables"];
+                    readonly "application/json": readonly components["schemas"]["Table"][];
                 };
             };
             /** @description Not changed since the ETag of If-None-Match */
             readonly 304: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content?: never;
+            };
+            readonly default: components["responses"]["Problem"];
+        };
+    };
+    readonly session: {
+        readonly parameters: {
+            readonly query?: never;
+            readonly header?: never;
+            readonly path?: never;
+            readonly cookie?: never;
+        };
+        readonly requestBody: {
+            readonly content: {
+                readonly "application/json": components["schemas"]["Session"];
+            };
+        };
+        readonly responses: {
+            /** @description The cookie is set */
+            readonly 204: {
                 headers: {
                     readonly [name: string]: unknown;
                 };
@@ -1445,10 +1485,13 @@ export interface operations {
                     readonly [name: string]: unknown;
                 };
                 content: {
-                    readonly "text/plain": string;
+                    readonly "application/json": {
+                        readonly status: string;
+                        readonly version: string;
+                    };
                 };
             };
-            readonly 503: components["responses"]["Problem"];
+            readonly default: components["responses"]["Problem"];
         };
     };
     readonly metrics: {
@@ -1469,6 +1512,7 @@ export interface operations {
                     readonly "text/plain": string;
                 };
             };
+            readonly default: components["responses"]["Problem"];
         };
     };
 }

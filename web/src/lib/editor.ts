@@ -8,7 +8,9 @@ import { EditorView, highlightActiveLine, keymap, lineNumbers } from '@codemirro
 import { tags } from '@lezer/highlight'
 import type { Schemas } from './api'
 
-export interface Editor { text(): string; set(text: string): void; complete(tables: Schemas['Tables']): void; focus(): void; destroy(): void }
+type Table = Schemas['Table']
+
+export interface Editor { text(): string; set(text: string): void; complete(tables: readonly Table[], functions: readonly string[]): void; focus(): void; destroy(): void }
 
 const look = EditorView.theme({
   '&': { height: '100%', fontSize: '14px', color: 'var(--ink)', backgroundColor: 'var(--paper)' },
@@ -21,6 +23,7 @@ const look = EditorView.theme({
   '&.cm-focused .cm-selectionBackground, .cm-selectionBackground': { backgroundColor: 'var(--accent-well) !important' },
   '.cm-tooltip': { backgroundColor: 'var(--paper)', color: 'var(--ink)', border: '1px solid var(--ink)' },
   '.cm-tooltip-autocomplete ul li[aria-selected]': { backgroundColor: 'var(--ink)', color: 'var(--paper)' },
+  '.cm-tooltip-autocomplete ul li[aria-selected] .cm-completionDetail': { color: 'inherit' },
   '.cm-completionDetail': { color: 'var(--ink-2)', fontStyle: 'normal', marginLeft: '12px' },
 })
 const colours = HighlightStyle.define([
@@ -29,23 +32,23 @@ const colours = HighlightStyle.define([
 ])
 
 /** Functions and every column, also before a table is named. */
-function words(tables: Schemas['Tables']): Completion[] {
+function words(tables: readonly Table[], functions: readonly string[]): Completion[] {
   const columns = new Map<string, { unit: string; comment: string; tables: string[] }>()
-  for (const table of tables.tables) {
+  for (const table of tables) {
     for (const column of table.columns) {
       const known = columns.get(column.name)
       if (known) known.tables.push(table.name)
-      else columns.set(column.name, { unit: column.unit, comment: column.comment, tables: [table.name] })
+      else columns.set(column.name, { unit: column.unit ?? '', comment: column.comment ?? '', tables: [table.name] })
     }
   }
   return [
-    ...tables.functions.map((label) => ({ label, type: 'function', apply: `${label}(` })),
+    ...functions.map((label) => ({ label, type: 'function', apply: `${label}(` })),
     ...[...columns].map(([label, about]) => ({ label, type: 'property', boost: -1, detail: about.unit, info: `${about.comment}. In ${about.tables.join(', ')}.` })),
   ]
 }
 
-function names(tables: Schemas['Tables']): SQLNamespace {
-  return Object.fromEntries(tables.tables.map((table) => [table.name, table.columns.map((column) => ({ label: column.name, type: 'property', detail: column.unit, info: column.comment }))]))
+function names(tables: readonly Table[]): SQLNamespace {
+  return Object.fromEntries(tables.map((table) => [table.name, table.columns.map((column) => ({ label: column.name, type: 'property', detail: column.unit ?? '', info: column.comment ?? '' }))]))
 }
 
 export function editor(host: HTMLElement, text: string, changed: (text: string) => void, run: () => void, stop: () => void): Editor {
@@ -61,7 +64,7 @@ export function editor(host: HTMLElement, text: string, changed: (text: string) 
     state: EditorState.create({
       doc: text,
       extensions: [
-        lineNumbers(), history(), bracketMatching(), closeBrackets(), autocompletion(), highlightActiveLine(), EditorView.lineWrapping, look, syntaxHighlighting(colours),
+        lineNumbers(), history(), bracketMatching(), closeBrackets(), autocompletion({ icons: false }), highlightActiveLine(), EditorView.lineWrapping, look, syntaxHighlighting(colours),
         EditorView.contentAttributes.of({ 'aria-label': 'Query. Ctrl Enter runs it, Escape cancels it.' }),
         Prec.highest(keymap.of([{ key: 'Mod-Enter', run: () => { run(); return true } }, { key: 'Tab', run: acceptCompletion }])),
         keymap.of([...completionKeymap, { key: 'Escape', run: () => { stop(); return false } }, ...defaultKeymap, ...historyKeymap]),
@@ -73,11 +76,11 @@ export function editor(host: HTMLElement, text: string, changed: (text: string) 
   return {
     text: () => view.state.doc.toString(),
     set: (next) => view.dispatch({ changes: { from: 0, to: view.state.doc.length, insert: next } }),
-    complete(tables) {
+    complete(tables, called) {
       const support = sql({ dialect: PostgreSQL, schema: names(tables), upperCaseKeywords: false })
-      const called = words(tables)
+      const options = words(tables, called)
       view.dispatch({ effects: [language.reconfigure(support), functions.reconfigure(PostgreSQL.language.data.of({
-        autocomplete: (context: CompletionContext) => { const word = context.matchBefore(/\w+/); return word ? { from: word.from, options: called } : null },
+        autocomplete: (context: CompletionContext) => { const word = context.matchBefore(/\w+/); return word ? { from: word.from, options } : null },
       }))] })
     },
     focus: () => view.focus(),

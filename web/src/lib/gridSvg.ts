@@ -13,7 +13,7 @@ export function gridSvg(lake: Lake, grid: Grid, title: string): string {
     const top = plan.rowTops[row]
     body += label(0, top + plan.side / 2 + 4, band.label)
     for (const block of plan.blocks) {
-      body += `<rect x="${block.x + block.inset - 1}" y="${top + block.inset - 1}" width="${block.side - 2 * block.inset + 2}" height="${block.side - 2 * block.inset + 2}" fill="${token('--plot-block')}"/>`
+      body += `<rect x="${block.x + block.inset - 1}" y="${top + block.inset - 1}" width="${block.extent + 2}" height="${block.extent + 2}" fill="${token('--plot-block')}"/>`
       for (const cell of block.cells) {
         const id = cell.point.point_id
         const value = grid.bands[row][id]
