@@ -20,6 +20,9 @@ const PAGES = {
   map: `/map?at=${id}`, runs: '/runs', run: `/runs/${runs[0].run_id}`, sql: `/sql?q=${encodeURIComponent(query)}`, wrong: '/sql?q=select%20nope',
 }
 
+/** Of the screen, while a page comes up; browsers call up to 0.1 good. */
+const MOST_JUMP = 0.1
+
 await mkdir(folder, { recursive: true })
 const browser = await chromium.launch({ executablePath: process.env.CHROMIUM ?? '/usr/bin/chromium', args: ['--no-sandbox', '--enable-unsafe-swiftshader', '--disable-dev-shm-usage'] })
 let failures = 0
@@ -28,6 +31,10 @@ for (const theme of ['light', 'dark']) {
   for (const width of [1280, 390]) {
     const context = await browser.newContext({ viewport: { width, height: width === 390 ? 844 : 900 }, colorScheme: theme, hasTouch: width === 390, bypassCSP: false })
     const page = await context.newPage()
+    await page.addInitScript(() => {
+      globalThis.jumps = []
+      new PerformanceObserver((list) => { for (const entry of list.getEntries()) if (!entry.hadRecentInput) globalThis.jumps.push([entry.value, entry.sources?.[0]?.node?.className ?? '']) }).observe({ type: 'layout-shift', buffered: true })
+    })
     for (const [name, path] of Object.entries(PAGES)) {
       if (only && !only.split(',').includes(name)) continue
       const expected = name === 'missing' ? 404 : name === 'wrong' ? 400 : 0
@@ -40,6 +47,9 @@ for (const theme of ['light', 'dark']) {
       const at = `${name}-${theme}-${width}`
       await page.goto(base + path, { waitUntil: 'networkidle' })
       await page.waitForTimeout(['surface', 'sql', 'wrong'].includes(name) ? 900 : 250)
+      const jumps = await page.evaluate(() => globalThis.jumps)
+      const jumped = jumps.reduce((sum, [value]) => sum + value, 0)
+      if (jumped > MOST_JUMP) fail(`${at}: the layout jumped by ${jumped.toFixed(3)}: ${JSON.stringify(jumps.filter(([value]) => value > 0.01))}`)
       const wide = await page.evaluate(() => document.documentElement.scrollWidth - innerWidth)
       if (wide > 0) fail(`${at}: the page is ${wide} px too wide`)
       await page.screenshot({ path: `${folder}/${at}.png`, fullPage: true })

@@ -30,7 +30,9 @@ export class ApiError extends Error {
 }
 
 const KEPT = 120
-const kept = new Map<string, Promise<unknown>>()
+/** Older answers are asked for again, because the lake may have grown; the browser's own cache answers by ETag. */
+const FRESH_MS = 30_000
+const kept = new Map<string, { readonly since: number; readonly answer: Promise<unknown> }>()
 
 /** Builds an address of the API. */
 export function apiHref(path: string, params: Record<string, string | number | null | undefined> = {}): string {
@@ -62,13 +64,10 @@ async function ask(href: string, init?: RequestInit): Promise<Response> {
 
 function remember<T>(href: string, make: () => Promise<T>): Promise<T> {
   const found = kept.get(href)
-  if (found) {
-    kept.delete(href)
-    kept.set(href, found)
-    return found as Promise<T>
-  }
+  if (found && performance.now() - found.since < FRESH_MS) return found.answer as Promise<T>
   const answer = make()
-  kept.set(href, answer)
+  kept.delete(href)
+  kept.set(href, { since: performance.now(), answer })
   answer.catch(() => kept.delete(href))
   if (kept.size > KEPT) kept.delete(kept.keys().next().value as string)
   return answer
