@@ -1,0 +1,90 @@
+//! The API's client: types from the contract, one kept answer an address.
+import type { components } from './contract'
+
+export type Schemas = components['schemas']
+export type Lake = Schemas['Lake']
+export type Surface = Schemas['Surface']
+export type SurfacePage = Schemas['SurfacePage']
+export type SurfaceDetail = Schemas['SurfaceDetail']
+export type Grid = Schemas['Grid']
+export type CurveSet = Schemas['CurveSet']
+export type PairDetail = Schemas['PairDetail']
+export type Run = Schemas['Run']
+export type RunDetail = Schemas['RunDetail']
+export type SurfaceMap = Schemas['SurfaceMap']
+export type Correlations = Schemas['Correlations']
+export type EnvironmentSeries = Schemas['EnvironmentSeries']
+export type Point = Schemas['Point']
+
+/** An answer that says what went wrong. */
+export class ApiError extends Error {
+  readonly code: string
+  readonly hint: string
+  readonly status: number
+  constructor(status: number, code: string, detail: string, hint: string) {
+    super(detail)
+    this.status = status
+    this.code = code
+    this.hint = hint
+  }
+}
+
+const KEPT = 120
+/** Older answers are asked for again, because the lake may have grown; the browser's own cache answers by ETag. */
+const FRESH_MS = 30_000
+const kept = new Map<string, { readonly since: number; readonly answer: Promise<unknown> }>()
+
+/** Builds an address of the API. */
+export function apiHref(path: string, params: Record<string, string | number | null | undefined> = {}): string {
+  const search = new URLSearchParams()
+  for (const [name, value] of Object.entries(params)) if (value !== null && value !== undefined) search.set(name, String(value))
+  const text = search.toString()
+  return `/api/v1${path}${text ? `?${text}` : ''}`
+}
+
+async function refusal(response: Response): Promise<ApiError> {
+  try {
+    const problem = (await response.json()) as Schemas['Problem']
+    const [detail, hint = ''] = (problem.detail ?? problem.title).split('; hint: ')
+    return new ApiError(problem.status, problem.code, detail, hint)
+  } catch {
+    return new ApiError(response.status, 'internal', `the server answered ${response.status}`, '')
+  }
+}
+
+async function ask(href: string, init?: RequestInit): Promise<Response> {
+  let response: Response
+  try { response = await fetch(href, init) } catch (error) {
+    if (error instanceof DOMException && error.name === 'AbortError') throw error
+    throw new ApiError(0, 'lake_unreadable', 'the server does not answer', 'See whether echolake serve still runs, then try again.')
+  }
+  if (!response.ok) throw await refusal(response)
+  return response
+}
+
+function remember<T>(href: string, make: () => Promise<T>): Promise<T> {
+  const found = kept.get(href)
+  if (found && performance.now() - found.since < FRESH_MS) return found.answer as Promise<T>
+  const answer = make()
+  kept.delete(href)
+  kept.set(href, { since: performance.now(), answer })
+  answer.catch(() => kept.delete(href))
+  if (kept.size > KEPT) kept.delete(kept.keys().next().value as string)
+  return answer
+}
+
+/** A JSON answer. */
+export const get = <T>(href: string): Promise<T> => remember(href, async () => (await ask(href)).json() as Promise<T>)
+
+/** A surface's heights in mm. */
+export const heightmap = (id: string): Promise<Float32Array> =>
+  remember(`heights ${id}`, async () => new Float32Array(await (await ask(apiHref(`/surfaces/${encodeURIComponent(id)}/heightmap`))).arrayBuffer()))
+
+/** Runs a query; closing by `signal` cancels it. */
+export const sql = (query: string, accept: string, signal?: AbortSignal): Promise<Response> =>
+  ask('/api/v1/sql', { method: 'POST', headers: { 'content-type': 'application/json', accept }, body: JSON.stringify({ query }), ...(signal ? { signal } : {}) })
+
+/** Shows the server a token; it answers with a cookie, which pictures and downloads send too. */
+export const login = (token: string): Promise<Response> => ask('/api/v1/session', { method: 'POST', headers: { 'content-type': 'application/json' }, body: JSON.stringify({ token }) })
+
+export const thumbnailHref = (id: string) => apiHref(`/surfaces/${encodeURIComponent(id)}/thumbnail.png`)

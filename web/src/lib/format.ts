@@ -1,0 +1,48 @@
+//! Numbers and names as people read them.
+
+const MINUS = '\u2212'
+
+/** A number with fixed decimals and a true minus; a dash where there is none. */
+export function fixed(value: number | null | undefined, digits = 1): string {
+  if (value === null || value === undefined || !Number.isFinite(value)) return '\u2013'
+  const text = Math.abs(value).toFixed(digits)
+  return value < 0 && Number(text) !== 0 ? MINUS + text : text
+}
+
+/** The same with a plus before what is over zero. */
+export function signed(value: number | null | undefined, digits = 1): string {
+  const text = fixed(value, digits)
+  return typeof value === 'number' && value > 0 && Number(value.toFixed(digits)) > 0 ? `+${text}` : text
+}
+
+export const count = (value: number) => value.toLocaleString('en').replaceAll(',', '\u202f')
+
+/** `stretcher_bond_bricks` as words. */
+export const words = (name: string | null | undefined) => (name ? name.replaceAll('_', ' ') : '\u2013')
+
+export function bytes(value: number | null): string {
+  if (value === null) return '\u2013'
+  const units = ['B', 'kB', 'MB', 'GB', 'TB']
+  let power = 0
+  while (value >= 1000 && power < units.length - 1) { value /= 1000; power += 1 }
+  return `${value.toFixed(power === 0 || value >= 100 ? 0 : 1)} ${units[power]}`
+}
+
+/** A time as `2026-01-07 04:00` UTC. */
+export const moment = (iso: string | null) => (iso ? `${iso.slice(0, 10)} ${iso.slice(11, 16)}` : '\u2013')
+export const second = (iso: string) => iso.slice(11, 19)
+
+export function duration(from: string, to: string): string {
+  const minutes = Math.round((Date.parse(to) - Date.parse(from)) / 60000)
+  return minutes < 60 ? `${minutes} min` : `${Math.floor(minutes / 60)} h ${String(minutes % 60).padStart(2, '0')} min`
+}
+
+/** A parameter's name and unit from `joint_depth_mm`. */
+export function parameter(name: string): { label: string; unit: string } {
+  const found = /^(.*)_(mm|deg|c|pct|hpa|hz)$/.exec(name)
+  const units: Record<string, string> = { deg: '°', c: '°C', pct: '%', hpa: 'hPa', hz: 'Hz' }
+  return found ? { label: found[1].replaceAll('_', ' '), unit: units[found[2]] ?? found[2] } : { label: name.replaceAll('_', ' '), unit: '' }
+}
+
+/** A grid point as the paper names it: layer, then column and row. */
+export const pointName = (p: { layer: number; gridx: number; gridy: number }) => `${p.layer}/${p.gridx}/${p.gridy}`

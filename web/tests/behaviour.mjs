@@ -1,0 +1,204 @@
+//! What the pages must do, tried in a browser: `node tests/behaviour.mjs http://127.0.0.1:8420`.
+import assert from 'node:assert/strict'
+import { chromium } from 'playwright-core'
+
+const base = process.argv[2]
+const get = async (path) => (await fetch(base + path)).json()
+const sql = async (query) => (await fetch(base + '/api/v1/sql', { method: 'POST', headers: { accept: 'application/json', 'content-type': 'application/json' }, body: JSON.stringify({ query }) })).json()
+const lake = await get('/api/v1/lake')
+const all = await get('/api/v1/surfaces?limit=500')
+const id = all.items.find((s) => s.typology !== 'reference').surface_id
+const browser = await chromium.launch({ executablePath: process.env.CHROMIUM ?? '/usr/bin/chromium', args: ['--no-sandbox', '--enable-unsafe-swiftshader', '--disable-dev-shm-usage'] })
+const context = await browser.newContext({ viewport: { width: 1280, height: 900 }, deviceScaleFactor: 1, acceptDownloads: true })
+const page = await context.newPage()
+const said = []
+page.on('console', (message) => { if (!message.text().includes('GPU stall due to ReadPixels')) said.push(message.text()) })
+page.on('pageerror', (error) => said.push(error.message))
+const open = (path) => page.goto(base + path, { waitUntil: 'networkidle' })
+const settled = () => page.waitForLoadState('networkidle').then(() => page.waitForTimeout(150))
+let done = 0
+async function check(name, what) {
+  const from = performance.now()
+  await what()
+  done += 1
+  process.stdout.write(`ok ${name} (${(performance.now() - from).toFixed(0)} ms)\n`)
+}
+
+/** The paper's scale, written out once more so that the pages' own cannot agree with itself. */
+function expected(db) {
+  if (db >= 0) return [Math.round((255 * Math.min(6, db)) / 6), 0, 0]
+  return Array(3).fill(Math.round((255 * Math.min(20, -db)) / 20))
+}
+
+await check('the grid plot’s pixels have the colours that SQL says', async () => {
+  const microphone = 14
+  await open(`/surfaces/${id}?microphone=${microphone}`)
+  await settled()
+  const columns = lake.bands.map((b) => `10 * log10(${b.key === 'total' ? 'tnce_total' : `tnce_${b.key}`}) as "${b.key}"`).join(', ')
+  const rows = await sql(`select case when microphone = ${microphone} then speaker else microphone end as point, ${columns} from tnce where surface_id = '${id}' and (microphone = ${microphone} or speaker = ${microphone})`)
+  const width = await page.evaluate(() => document.querySelector('.cells canvas').width)
+  // Layers across in equal columns, bands down: found from the outside by the plot's size alone.
+  const left = 58
+  const side = Math.floor((width - left - 10 * (lake.layers - 1)) / lake.layers)
+  const wanted = rows.flatMap((row) => {
+    const point = lake.points[row.point]
+    const across = new Set(lake.points.filter((p) => p.layer === point.layer).map((p) => p.gridx)).size
+    const size = across === 1 ? Math.floor(side / 3) : Math.floor((side - 2) / across)
+    const inset = Math.floor((side - size * across) / 2)
+    return lake.bands.map((band, b) => ({
+      x: left + point.layer * (side + 10) + inset + point.gridx * size + 3, y: 22 + b * (side + 10) + inset + (across - 1 - point.gridy) * size + 3,
+      db: row[band.key], what: `point ${row.point}, band ${band.key}`,
+    }))
+  })
+  const colours = await page.evaluate((places) => {
+    const canvas = document.querySelector('.cells canvas')
+    const { data } = canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height)
+    return places.map(({ x, y }) => [...data.slice(4 * (y * canvas.width + x), 4 * (y * canvas.width + x) + 3)])
+  }, wanted)
+  wanted.forEach((cell, i) => assert.deepEqual(colours[i], expected(cell.db), `${cell.what}, ${cell.db} dB`))
+  const seen = wanted.length
+  assert.ok(seen > 300, `${seen} cells`)
+})
+
+await check('a facet click changes the address and the counts, and a fresh link shows the same', async () => {
+  await open('/')
+  const before = await page.locator('h1').innerText()
+  const facet = all.facets.find((f) => f.name === 'typology').values[0]
+  await page.locator('button.value', { hasText: facet.value.replaceAll('_', ' ') }).first().click()
+  await page.waitForFunction((text) => document.querySelector('h1').innerText !== text, before)
+  await settled()
+  assert.match(page.url(), new RegExp(`typology=${facet.value}`))
+  const shown = await page.locator('h1').innerText()
+  assert.ok(shown.startsWith(String(facet.count)), shown)
+  const cards = await page.locator('.sheet li').allInnerTexts()
+  await open(page.url().slice(base.length))
+  assert.equal(await page.locator('h1').innerText(), shown)
+  assert.deepEqual(await page.locator('.sheet li').allInnerTexts(), cards)
+  await page.goBack()
+})
+
+await check('the relief is not blank, and shows more once a pair is chosen', async () => {
+  const kinds = async () => page.evaluate(() => {
+    const canvas = document.querySelector('.stage canvas')
+    const copy = document.createElement('canvas')
+    copy.width = canvas.width
+    copy.height = canvas.height
+    const context = copy.getContext('2d')
+    context.drawImage(canvas, 0, 0)
+    const { data } = context.getImageData(0, 0, copy.width, copy.height)
+    const colours = new Set()
+    let orange = 0
+    for (let i = 0; i < data.length; i += 4) { colours.add((data[i] << 16) | (data[i + 1] << 8) | data[i + 2]); if (data[i] > data[i + 2] + 60) orange += 1 }
+    return { colours: colours.size, orange }
+  })
+  await open(`/surfaces/${id}?microphone=14`)
+  await page.waitForTimeout(900)
+  const alone = await kinds()
+  assert.ok(alone.colours > 50, `${alone.colours} colours`)
+  await open(`/surfaces/${id}?microphone=14&point=40`)
+  await page.waitForTimeout(900)
+  const pair = await kinds()
+  assert.ok(pair.orange > alone.orange + 50, `${pair.orange} pixels of the speaker and its path`)
+})
+
+await check('a click makes a point the microphone, another chooses the pair', async () => {
+  await open(`/surfaces/${id}`)
+  await settled()
+  const box = await page.locator('.cells').boundingBox()
+  await page.mouse.click(box.x + 58 + 8, box.y + 22 + 8)
+  await settled()
+  assert.match(page.url(), /microphone=5(&|$)/)
+  await page.mouse.click(box.x + 58 + 60, box.y + 22 + 60)
+  await settled()
+  assert.match(page.url(), /microphone=5&point=\d+/)
+  await page.locator('a', { hasText: 'Open impulse response' }).waitFor()
+})
+
+await check('the keyboard alone reaches an impulse response from the wall', async () => {
+  await open('/')
+  for (let i = 0; i < 120; i += 1) {
+    await page.keyboard.press('Tab')
+    if (await page.evaluate((wanted) => document.activeElement?.dataset?.id !== undefined && wanted !== '', id)) break
+  }
+  while (await page.evaluate((wanted) => document.activeElement?.dataset?.id !== wanted, id)) await page.keyboard.press('ArrowRight')
+  await page.keyboard.press('Enter')
+  await page.waitForURL(`**/surfaces/${id}`)
+  await settled()
+  for (let i = 0; i < 60; i += 1) {
+    await page.keyboard.press('Tab')
+    if (await page.evaluate(() => document.activeElement?.classList.contains('cells'))) break
+  }
+  await page.keyboard.press('ArrowRight')
+  await page.keyboard.press('m')
+  await page.keyboard.press('ArrowDown')
+  await page.keyboard.press('Enter')
+  await page.waitForURL(/microphone=\d+&point=\d+/)
+  await page.locator('a', { hasText: 'Open impulse response' }).waitFor()
+  for (let i = 0; i < 20; i += 1) {
+    await page.keyboard.press('Tab')
+    if (await page.evaluate(() => document.activeElement?.textContent?.includes('Open impulse response'))) break
+  }
+  await page.keyboard.press('Enter')
+  await page.waitForURL(/\/pairs\/\d+$/)
+  await page.getByRole('heading', { name: 'Spectrogram' }).waitFor()
+})
+
+await check('a WAV, a picture and numbers can be saved', async () => {
+  const [wav] = await Promise.all([page.waitForEvent('download'), page.getByRole('link', { name: 'WAV, full scale' }).click()])
+  assert.match(wav.suggestedFilename(), /\.wav$/)
+  for (const [item, ending] of [['Picture, PNG', 'png'], ['Picture, SVG', 'svg'], ['Numbers, CSV', 'csv'], ['Numbers, Parquet', 'parquet'], ['Numbers, Arrow', 'arrow']]) {
+    await page.locator('section[aria-label="Spectrum"] summary').click()
+    const [file] = await Promise.all([page.waitForEvent('download'), page.locator('details[open] .menu button', { hasText: item }).click()])
+    assert.ok(file.suggestedFilename().endsWith(`.${ending}`), file.suggestedFilename())
+    const stream = await file.createReadStream()
+    let bytes = 0
+    for await (const part of stream) bytes += part.length
+    assert.ok(bytes > 500, `${ending}: ${bytes} bytes`)
+  }
+})
+
+await check('names from the lake stay text', async () => {
+  await page.route('**/api/v1/surfaces?*', async (route) => {
+    const answer = await (await route.fetch()).json()
+    answer.items[0].surface_id = '<img src=x onerror="document.title=1">'
+    await route.fulfill({ json: answer })
+  })
+  await open('/')
+  assert.equal(await page.locator('.sheet .id').first().innerText(), '<img src=x onerror="document.title=1">')
+  assert.match(await page.title(), /Wall/)
+  await page.unroute('**/api/v1/surfaces?*')
+  said.splice(0, said.length, ...said.filter((line) => !line.includes('404')))
+})
+
+await check('what the first view costs', async () => {
+  const fresh = await browser.newContext({ viewport: { width: 1280, height: 900 } })
+  const first = await fresh.newPage()
+  let script = 0
+  first.on('response', async (response) => { if (response.url().endsWith('.js')) script += Number(response.headers()['content-length'] ?? 0) })
+  const client = await fresh.newCDPSession(first)
+  await first.goto(base + '/')
+  await first.locator('.sheet li').first().waitFor()
+  const shown = await first.evaluate(() => performance.now())
+  const times = []
+  const facets = first.locator('button.value')
+  for (let i = 0; i < 20; i += 1) {
+    // From the click to the frame that shows the answer, in the page's own time.
+    times.push(await facets.nth(i % 4).evaluate((button) => new Promise((resolve) => {
+      const start = performance.now()
+      button.click()
+      const look = () => (document.querySelector('.sheet').ariaBusy === 'false' ? resolve(performance.now() - start) : requestAnimationFrame(look))
+      requestAnimationFrame(() => requestAnimationFrame(look))
+    })))
+  }
+  times.sort((a, b) => a - b)
+  await client.send('HeapProfiler.enable')
+  await client.send('HeapProfiler.collectGarbage')
+  const { usedSize } = await client.send('Runtime.getHeapUsage')
+  process.stdout.write(`  first cards after ${shown.toFixed(0)} ms, facet click p95 ${times[18].toFixed(0)} ms, scripts ${(script / 1000).toFixed(0)} kB as sent, heap ${(usedSize / 1e6).toFixed(1)} MB\n`)
+  assert.ok(script > 0 && script < 120_000, `${script} bytes of script`)
+  await fresh.close()
+})
+
+assert.deepEqual(said, [], 'the console is not empty')
+await browser.close()
+process.stdout.write(`${done} checks\n`)
