@@ -7,8 +7,8 @@ use echolake_acquisition::collection::LARGEST;
 use echolake_lake::{KEEP_HOURS, TARGET_BYTES};
 use echolake_schema::SurfaceId;
 
-use crate::commands::serve::ServeArgs;
 use crate::commands::panel::PanelArgs;
+use crate::commands::serve::ServeArgs;
 use crate::commands::sql::SqlArgs;
 
 /// A data lake and catalogue for sweep measurements.
