@@ -38,9 +38,12 @@ pub(crate) struct Catalog {
     /// One takes a new view, the others wait for it.
     taking: tokio::sync::Mutex<()>,
     /// Tables of the past, which do not change. The oldest goes first.
-    past: Mutex<Vec<((Moment, Table), Arc<LakeTable>)>>,
+    past: Mutex<Vec<PastTable>>,
     runs: Arc<mcap::Files>,
 }
+
+/// A table as it was at a moment.
+type PastTable = ((Moment, Table), Arc<LakeTable>);
 
 /// One view of the lake.
 struct Current {
@@ -186,7 +189,7 @@ impl Catalog {
     }
 
     async fn table_at(&self, moment: Moment, table: Table) -> Result<Arc<LakeTable>, Error> {
-        let kept = |past: &[((Moment, Table), Arc<LakeTable>)]| {
+        let kept = |past: &[PastTable]| {
             past.iter().find(|(key, _)| *key == (moment, table)).map(|(_, provider)| provider.clone())
         };
         if let Some(kept) = kept(&self.past.lock().unwrap_or_else(PoisonError::into_inner)) {

@@ -244,8 +244,8 @@ mod tests {
         assert!(!fresh.lines.contains(&fresh.token), "only its hash is kept");
         let access = Access::new(Some(Tokens::parse(&fresh.lines).expect("tokens")));
         let client = access.client(Some(&fresh.token), Scope::Sql).expect("let in");
-        assert_eq!(client.name, "a \"quoted\" name");
-        assert_eq!(client.quota.time, Some(Duration::from_secs(60)));
+        assert_eq!(client.name(), "a \"quoted\" name");
+        assert_eq!(client.quota().time, Some(Duration::from_secs(60)));
         assert!(matches!(access.client(Some(&fresh.token), Scope::Files), Err(Fault::Forbidden { .. })));
         let other = super::fresh("b").expect("a token").token;
         let cut = &fresh.token[..fresh.token.len() - 1];

@@ -20,6 +20,7 @@ mod tests;
 mod topics;
 
 use std::collections::HashMap;
+use std::collections::hash_map::Entry;
 use std::ops::ControlFlow;
 use std::sync::Arc;
 
@@ -80,9 +81,9 @@ pub(crate) async fn register(
     let mut tables: HashMap<Function, HashMap<Vec<String>, Arc<dyn TableProvider>>> = HashMap::new();
     for (function, arguments) in calls(statement) {
         let of = tables.entry(function).or_default();
-        if !of.contains_key(&arguments) {
-            let table = table(function, &arguments, snapshot, files).await?;
-            of.insert(arguments, table);
+        if let Entry::Vacant(place) = of.entry(arguments) {
+            let table = table(function, place.key(), snapshot, files).await?;
+            place.insert(table);
         }
     }
     for function in Function::ALL {

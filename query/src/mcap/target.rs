@@ -42,11 +42,14 @@ impl Target {
     }
 }
 
+/// A file, and the surface and run that it is; None of a foreign one.
+type Meant = (Path, Option<(String, String)>);
+
 fn names(run: &VisibleRun) -> (String, String) {
     (run.surface.to_string(), run.run.to_string())
 }
 
-fn runs(pattern: &str, snapshot: &Snapshot) -> Result<Vec<(Path, Option<(String, String)>)>, Fault> {
+fn runs(pattern: &str, snapshot: &Snapshot) -> Result<Vec<Meant>, Fault> {
     let meant = |r: &&VisibleRun| matches(pattern, r.surface.as_str()) || matches(pattern, r.run.as_str());
     let found = snapshot.runs().filter(meant).map(|r| (Lake::run_path(&r.surface, &r.run), Some(names(r))));
     let found: Vec<_> = found.collect();

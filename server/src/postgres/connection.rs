@@ -33,13 +33,16 @@ const NAMED: usize = 500;
 /// How often a server that stops looks whether a connection is done.
 const LOOK: Duration = Duration::from_millis(50);
 
+/// What a client cancels by: the process's number and the secret that it was given.
+type BackendKey = (i32, Bytes);
+
 /// What all connections share.
 pub(super) struct Shared {
     pub(super) service: Service,
     pub(super) parser: PostgresCompatibilityParser,
     pub(super) catalog: PgCatalog,
     next_pid: AtomicI32,
-    running: Mutex<HashMap<(i32, Bytes), Arc<Mutex<Stop>>>>,
+    running: Mutex<HashMap<BackendKey, Arc<Mutex<Stop>>>>,
 }
 
 impl Shared {
