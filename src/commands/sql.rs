@@ -60,7 +60,7 @@ pub(crate) async fn run(args: &SqlArgs, lake_url: &str) -> anyhow::Result<()> {
     let format = if args.json { Format::Json } else { args.format.into() };
     let answer = session.query(&query).await?;
     match &args.output {
-        Some(path) => to_file(answer, format, path).await,
+        Some(path) => to_file(answer, format, path).await.map(drop),
         None => {
             anyhow::ensure!(
                 !(format.is_binary() && std::io::stdout().is_terminal()),
@@ -96,11 +96,11 @@ async fn write(mut answer: Answer, format: Format, to: impl Write + Send) -> any
 }
 
 // Beside its place first, so that a file is whole or not there. A device or a pipe is written as it is.
-async fn to_file(answer: Answer, format: Format, path: &Path) -> anyhow::Result<()> {
+async fn to_file(answer: Answer, format: Format, path: &Path) -> anyhow::Result<usize> {
     let failed = || format!("cannot write `{}`", path.display());
     if path.metadata().is_ok_and(|m| !m.is_file()) {
         let special = OpenOptions::new().write(true).open(path).with_context(failed)?;
-        return write(answer, format, BufWriter::new(special)).await.map(drop);
+        return write(answer, format, BufWriter::new(special)).await;
     }
     let mut partial = path.as_os_str().to_owned();
     partial.push(".partial");
@@ -110,7 +110,7 @@ async fn to_file(answer: Answer, format: Format, path: &Path) -> anyhow::Result<
     let named = written.and_then(|rows| {
         std::fs::rename(&partial, path).with_context(failed)?;
         eprintln!("{}: {rows} rows", path.display());
-        Ok(())
+        Ok(rows)
     });
     if named.is_err() {
         // The first error is the one to tell.
