@@ -84,6 +84,8 @@ pub struct Answer {
     ticket: Arc<Ticket>,
     rows: u64,
     limit: Option<u64>,
+    // Its threads run the query for as long as somebody reads, though its session is gone.
+    _engine: Engine,
 }
 
 /// Ends a query from elsewhere.
@@ -277,7 +279,15 @@ impl Session {
         let context = self.task_context(&prepared.context, &ticket);
         let places = (place, room);
         let query = threads.spawn(drive(plan, context, send, ticket.clone(), places));
-        Ok(Answer { schema, batches, query: Some(query), ticket, rows: 0, limit: self.client.quota().rows })
+        Ok(Answer {
+            schema,
+            batches,
+            query: Some(query),
+            ticket,
+            rows: 0,
+            limit: self.client.quota().rows,
+            _engine: self.engine.clone(),
+        })
     }
 
     // Constants are computed while a query is planned, so planning must not hold up the caller's threads either.
@@ -371,3 +381,6 @@ async fn drive(
 
 #[cfg(test)]
 mod tests;
+
+#[cfg(test)]
+mod limits_tests;

@@ -1,0 +1,116 @@
+//! Queries that must end: by their client, their time, their rows, their memory, and by dropping what reads them.
+
+use std::time::Duration;
+
+use echolake_lake::{Lake, References};
+use echolake_schema::Rig;
+
+use super::*;
+
+/// Never ends by itself.
+const ENDLESS: &str = "with recursive r as (select 1 n union all select n + 1 from r) select count(*) from r";
+/// A join that finds nothing for hours: DataFusion alone could not end it.
+const BARREN: &str = "select count(*) from generate_series(1, 1000000) a(x) join generate_series(1, 1000000) b(y) \
+                      on a.x > b.y + 2000000";
+
+async fn engine(limits: Limits) -> (tempfile::TempDir, Engine) {
+    let folder = tempfile::tempdir().expect("a folder");
+    let url = folder.path().join("lake").display().to_string();
+    let lake = Lake::open_or_create(&url, &Rig::paper(), &References::default()).await.expect("a lake");
+    (folder, Engine::new(&lake, limits).expect("an engine"))
+}
+
+fn session(engine: &Engine, quota: Quota) -> Session {
+    engine.session(&Arc::new(Client::new("somebody", quota)))
+}
+
+async fn outcome(session: &Session, sql: &str) -> Result<u64, Error> {
+    let mut answer = session.query(sql).await?;
+    let mut rows = 0;
+    while let Some(batch) = answer.next().await? {
+        rows += batch.num_rows() as u64;
+    }
+    Ok(rows)
+}
+
+#[tokio::test]
+async fn a_query_ends_when_it_is_cancelled() {
+    let (_folder, engine) = engine(Limits::default()).await;
+    for sql in [ENDLESS, BARREN] {
+        let mut answer = session(&engine, Quota::default()).query(sql).await.expect("it begins");
+        let handle = answer.cancel_handle();
+        let reading = tokio::spawn(async move { answer.next().await.map(|_| ()) });
+        tokio::time::sleep(Duration::from_millis(50)).await;
+        handle.cancel();
+        let ended = tokio::time::timeout(Duration::from_secs(10), reading).await.expect("in time").expect("no panic");
+        assert!(matches!(ended, Err(Error::Cancelled)), "{sql}: {ended:?}");
+    }
+    assert_eq!(engine.running(), 0, "what is cancelled does not run on");
+}
+
+#[tokio::test]
+async fn a_heavy_place_is_free_again_when_its_answer_is_dropped() {
+    let (_folder, engine) = engine(Limits { heavy: 1, ..Limits::default() }).await;
+    let session = session(&engine, Quota::default());
+    drop(session.query(BARREN).await.expect("it begins"));
+    let next = tokio::time::timeout(Duration::from_secs(10), session.query(BARREN)).await;
+    assert!(next.expect("a place in time").is_ok());
+}
+
+#[tokio::test]
+async fn time_rows_and_places_are_limited() {
+    let (_folder, engine) = engine(Limits::default()).await;
+    let brief = session(&engine, Quota { time: Some(Duration::from_millis(100)), ..Quota::default() });
+    assert!(matches!(outcome(&brief, ENDLESS).await, Err(Error::TimeLimit { .. })));
+    let few = session(&engine, Quota { rows: Some(10), ..Quota::default() });
+    assert!(matches!(outcome(&few, "select * from pairs").await, Err(Error::RowLimit { limit: 10 })));
+    assert_eq!(outcome(&few, "select * from pairs limit 10").await.expect("ten rows"), 10);
+    let alone = session(&engine, Quota { concurrent: Some(1), ..Quota::default() });
+    let first = alone.query(BARREN).await.expect("it begins");
+    assert!(matches!(alone.query("select 1").await, Err(Error::Busy { limit: 1, .. })));
+    drop(first);
+    for _ in 0..100 {
+        if alone.query("select 1").await.is_ok() {
+            return;
+        }
+        tokio::time::sleep(Duration::from_millis(50)).await;
+    }
+    panic!("the place of a dropped query never came back");
+}
+
+#[tokio::test]
+async fn memory_is_limited_and_asked_for_beforehand() {
+    let (_folder, engine) = engine(Limits { memory: Some(64 << 20), heavy: 2 }).await;
+    let session = session(&engine, Quota::default());
+    let sql = "select count(distinct x || 'abcdefghijklmnopqrstuvwxyz') from generate_series(1, 10000000) t(x)";
+    assert!(matches!(outcome(&session, sql).await, Err(Error::MemoryLimit { .. })));
+    for sql in [
+        "select repeat('x', 2000000000)",
+        "select rpad('x', 2000000000, 'y')",
+        "select range(1, 10000000000)",
+        "select array_repeat(1, 10000000000)",
+        "select replace(repeat('a', 100000), 'a', repeat('b', 100000))",
+        "select regexp_replace(repeat('a', 100000), 'a', repeat('b', 100000), 'g')",
+        "select levenshtein(repeat('a', 1000000), repeat('b', 1000000))",
+        "select array_to_string(range(1, 100000), repeat('b', 100000))",
+    ] {
+        let said = outcome(&session, sql).await.expect_err(sql).to_string();
+        assert!(said.contains("hint: "), "{sql}: {said}");
+    }
+    assert_eq!(
+        outcome(&session, "select repeat('ab', 1000), lpad('7', 3, '0'), range(1, 10)").await.expect("a row"),
+        1
+    );
+}
+
+#[tokio::test]
+async fn an_answer_outlives_its_session() {
+    let (_folder, engine) = engine(Limits::default()).await;
+    let mut answer = session(&engine, Quota::default()).query("select * from pairs").await.expect("it begins");
+    drop(engine);
+    let mut rows = 0;
+    while let Some(batch) = answer.next().await.expect("rows") {
+        rows += batch.num_rows();
+    }
+    assert_eq!(rows, 2951);
+}
