@@ -384,3 +384,9 @@ mod tests;
 
 #[cfg(test)]
 mod limits_tests;
+
+#[cfg(test)]
+mod attempts;
+
+#[cfg(test)]
+mod escape_tests;

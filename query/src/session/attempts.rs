@@ -3,29 +3,50 @@
 use std::path::Path;
 
 /// Attempts that would read `secret`, write under `outside`, or change the lake or another session.
-pub(crate) fn attempts(secret: &Path, outside: &Path) -> Vec<String> {
+pub(super) fn attempts(secret: &Path, outside: &Path) -> Vec<String> {
     let mut all = reads(&secret.display().to_string());
     all.extend(writes(&outside.display().to_string()));
     all.extend(changes());
     all.extend(settings(&outside.display().to_string()));
     all.extend(patterns(&secret.display().to_string()));
-    let hidden: Vec<_> = all.iter().filter(|a| !a.contains(';')).step_by(3).map(|a| wrapped(a)).flatten().collect();
+    let hidden: Vec<_> = all.iter().filter(|a| !a.contains(';')).step_by(3).flat_map(|a| wrapped(a)).collect();
     all.extend(hidden);
+    all.sort();
+    all.dedup();
     all
 }
 
 fn reads(secret: &str) -> Vec<String> {
     let up = format!("../../../../../../../../..{secret}");
-    let places =
-        [secret.to_owned(), format!("file://{secret}"), up, format!("/proc/self/root{secret}"), "/etc/passwd".to_owned()];
+    let places = [
+        secret.to_owned(),
+        format!("file://{secret}"),
+        up,
+        format!("/proc/self/root{secret}"),
+        "/etc/passwd".to_owned(),
+    ];
     let mut all = Vec::new();
     for place in &places {
         all.push(format!("select * from '{place}'"));
         all.push(format!("select * from \"{place}\""));
         all.push(format!("table \"{place}\""));
         for function in [
-            "read_csv", "read_csv_auto", "read_parquet", "parquet_scan", "read_json", "read_text", "read_blob", "glob",
-            "csv_scan", "delta_scan", "sniff_csv", "parquet_metadata", "arrow_scan", "url_table", "file", "s3",
+            "read_csv",
+            "read_csv_auto",
+            "read_parquet",
+            "parquet_scan",
+            "read_json",
+            "read_text",
+            "read_blob",
+            "glob",
+            "csv_scan",
+            "delta_scan",
+            "sniff_csv",
+            "parquet_metadata",
+            "arrow_scan",
+            "url_table",
+            "file",
+            "s3",
         ] {
             all.push(format!("select * from {function}('{place}')"));
         }
@@ -33,7 +54,8 @@ fn reads(secret: &str) -> Vec<String> {
             all.push(format!("select {function}('{place}')"));
         }
     }
-    for url in ["http://127.0.0.1:9/x.csv", "https://example.org/x.parquet", "s3://bucket/x", "gs://b/x", "hdfs://h/x"] {
+    for url in ["http://127.0.0.1:9/x.csv", "https://example.org/x.parquet", "s3://bucket/x", "gs://b/x", "hdfs://h/x"]
+    {
         all.push(format!("select * from '{url}'"));
         all.push(format!("create external table x stored as csv location '{url}'"));
     }
@@ -74,24 +96,62 @@ fn changes() -> Vec<String> {
     let mut all: Vec<String> = Vec::new();
     for table in ["runs", "measurements", "tnce", "points", "information_schema.tables", "pg_catalog.pg_class"] {
         for text in [
-            "drop table T", "drop view T", "truncate table T", "delete from T", "alter table T rename to gone",
-            "alter table T add column x int", "insert into T select * from T", "update T set run_id = 'x'",
-            "create index i on T (run_id)", "create or replace view T as select 1", "create or replace table T as select 1",
-            "merge into T using (select 1 a) s on true when matched then delete", "lock table T in exclusive mode",
-            "comment on table T is 'x'", "grant all on T to public", "vacuum T", "optimize table T", "analyze T",
-            "with x as (insert into T select * from T returning *) select * from x", "select * into gone from T",
-            "refresh materialized view T", "cluster T",
+            "drop table T",
+            "drop view T",
+            "truncate table T",
+            "delete from T",
+            "alter table T rename to gone",
+            "alter table T add column x int",
+            "insert into T select * from T",
+            "update T set run_id = 'x'",
+            "create index i on T (run_id)",
+            "create or replace view T as select 1",
+            "create or replace table T as select 1",
+            "merge into T using (select 1 a) s on true when matched then delete",
+            "lock table T in exclusive mode",
+            "comment on table T is 'x'",
+            "grant all on T to public",
+            "vacuum T",
+            "optimize table T",
+            "analyze T",
+            "with x as (insert into T select * from T returning *) select * from x",
+            "select * into gone from T",
+            "refresh materialized view T",
+            "cluster T",
         ] {
             all.push(text.replace('T', table));
         }
     }
     for text in [
-        "create schema s", "drop schema public cascade", "drop database datafusion", "create database d", "create role r",
-        "create table t as select 1", "create temporary table t (a int)", "create view v as select 1",
-        "create function f(x int) returns int return x + 1", "drop function sum", "create sequence s", "create type t as (a int)",
-        "create extension dblink", "install httpfs", "pragma database_list", "call system('id')", "exec xp_cmdshell 'id'",
-        "listen x", "notify x", "checkpoint", "reindex database d", "drop owned by postgres", "alter system set x = 1",
-        "kill 1", "shutdown", "use other", "prepare p as drop table runs", "execute p", "declare c cursor for delete from runs",
+        "create schema s",
+        "drop schema public cascade",
+        "drop database datafusion",
+        "create database d",
+        "create role r",
+        "create table t as select 1",
+        "create temporary table t (a int)",
+        "create view v as select 1",
+        "create function f(x int) returns int return x + 1",
+        "drop function sum",
+        "create sequence s",
+        "create type t as (a int)",
+        "create extension dblink",
+        "install httpfs",
+        "pragma database_list",
+        "call system('id')",
+        "exec xp_cmdshell 'id'",
+        "listen x",
+        "notify x",
+        "checkpoint",
+        "reindex database d",
+        "drop owned by postgres",
+        "alter system set x = 1",
+        "kill 1",
+        "shutdown",
+        "use other",
+        "prepare p as drop table runs",
+        "execute p",
+        "declare c cursor for delete from runs",
     ] {
         all.push(text.to_owned());
     }
@@ -101,12 +161,19 @@ fn changes() -> Vec<String> {
 fn settings(outside: &str) -> Vec<String> {
     let mut all = Vec::new();
     for (name, value) in [
-        ("datafusion.runtime.memory_limit", "900G"), ("datafusion.runtime.temp_directory", outside),
-        ("datafusion.catalog.location", outside), ("datafusion.catalog.format", "CSV"),
-        ("datafusion.catalog.information_schema", "false"), ("datafusion.execution.target_partitions", "100000"),
-        ("datafusion.execution.batch_size", "1000000000"), ("datafusion.sql_parser.recursion_limit", "1000000"),
-        ("datafusion.execution.parquet.pruning", "false"), ("datafusion.runtime.max_temp_directory_size", "900G"),
-        ("role", "postgres"), ("session_authorization", "postgres"), ("search_path", "pg_temp"),
+        ("datafusion.runtime.memory_limit", "900G"),
+        ("datafusion.runtime.temp_directory", outside),
+        ("datafusion.catalog.location", outside),
+        ("datafusion.catalog.format", "CSV"),
+        ("datafusion.catalog.information_schema", "false"),
+        ("datafusion.execution.target_partitions", "100000"),
+        ("datafusion.execution.batch_size", "1000000000"),
+        ("datafusion.sql_parser.recursion_limit", "1000000"),
+        ("datafusion.execution.parquet.pruning", "false"),
+        ("datafusion.runtime.max_temp_directory_size", "900G"),
+        ("role", "postgres"),
+        ("session_authorization", "postgres"),
+        ("search_path", "pg_temp"),
     ] {
         all.push(format!("set {name} = '{value}'"));
         all.push(format!("set session {name} to '{value}'"));
@@ -156,8 +223,5 @@ fn wrapped(attempt: &str) -> [String; 4] {
 #[test]
 fn there_are_three_hundred_of_them() {
     let all = attempts(Path::new("/secret"), Path::new("/outside"));
-    let mut different = all.clone();
-    different.sort();
-    different.dedup();
-    assert!(different.len() >= 300 && different.len() == all.len(), "{} of {}", different.len(), all.len());
+    assert!(all.len() >= 300, "{}", all.len());
 }
