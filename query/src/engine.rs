@@ -199,6 +199,11 @@ impl Engine {
         quota.memory.map_or(part, |own| own.min(part))
     }
 
+    /// What all contexts begin as; it knows no tables, and parses as they do.
+    pub(crate) fn template(&self) -> &SessionState {
+        &self.0.template
+    }
+
     // A new one a query: the tables are those of one snapshot, and nothing a query does outlives it. Functions are
     // looked up once an engine.
     pub(crate) fn context(&self) -> SessionContext {

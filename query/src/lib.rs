@@ -27,6 +27,7 @@ mod small;
 mod table;
 mod views;
 
+pub use control::lanes::Threads;
 pub use engine::{Client, Engine, Function, Limits, Quota};
 pub use error::Error;
 pub use functions::Functions;
