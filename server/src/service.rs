@@ -6,7 +6,7 @@ use std::time::Duration;
 use arrow::datatypes::SchemaRef;
 use datafusion::common::ParamValues;
 use echolake_lake::Lake;
-use echolake_query::{Client, Engine, Limits, Prepared, Quota, Session, Threads};
+use echolake_query::{Client, Engine, Function, Limits, Prepared, Quota, Session, Threads};
 use tokio::sync::{mpsc, oneshot};
 use tokio::task::JoinSet;
 
@@ -80,6 +80,12 @@ impl Service {
     pub(crate) fn tables(&self) -> Vec<(&'static str, SchemaRef)> {
         let nobody = Arc::new(Client::new("tables", Quota::default()));
         self.session(&nobody).tables().collect()
+    }
+
+    /// The field's functions.
+    pub(crate) fn functions(&self) -> Vec<Function> {
+        let nobody = Arc::new(Client::new("functions", Quota::default()));
+        self.session(&nobody).functions().into_iter().filter(|f| f.is_own).collect()
     }
 
     fn spawn<T: Send + 'static>(&self, work: impl Future<Output = T> + Send + 'static) -> JoinSet<T> {
