@@ -30,4 +30,5 @@ mod views;
 pub use engine::{Client, Engine, Function, Limits, Quota};
 pub use error::Error;
 pub use functions::Functions;
+pub use mcap::{Attachment, Contents, Topic};
 pub use session::{Answer, CancelHandle, Extend, Prepared, Session};
