@@ -1,5 +1,7 @@
 //! `echolake serve` as its clients see it: answers, refusals, queries that end with who asked, and its own end.
 
+mod catalogue;
+mod contract;
 mod http;
 mod postgres;
 mod server;
@@ -8,7 +10,7 @@ use std::time::{Duration, Instant};
 
 use super::Place;
 use http::{Answer, Request};
-use server::Served;
+pub(crate) use server::Served;
 
 /// Runs for hours where nothing ends it.
 const ENDLESS: &str = "select count(*) from generate_series(1, 1000000) a cross join generate_series(1, 1000000) b \
@@ -98,7 +100,7 @@ fn what_is_wrong_has_a_code() {
         400,
         "request_invalid",
     );
-    check(Request::get("/api/v1/sql").send(&server), 400, "request_invalid");
+    check(Request::get("/api/v1/sql").send(&server), 405, "method_not_allowed");
     check(Request::get("/api/v1/nothing").send(&server), 404, "not_found");
     // A page of elsewhere, and a name that points here.
     for (name, value) in [("origin", "http://evil.example"), ("origin", "null"), ("sec-fetch-site", "cross-site")] {

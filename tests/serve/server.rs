@@ -6,15 +6,15 @@ use std::process::{Child, Command, Stdio};
 use crate::Place;
 
 /// A server; dropping it ends it.
-pub(super) struct Served {
+pub(crate) struct Served {
     child: Child,
     /// `host:port` of each protocol.
-    pub(super) http: String,
+    pub(crate) http: String,
     pub(super) postgres: String,
 }
 
 impl Served {
-    pub(super) fn start(place: &Place, more: &[&str]) -> Self {
+    pub(crate) fn start(place: &Place, more: &[&str]) -> Self {
         let any = "127.0.0.1:0";
         let mut child = Command::new(env!("CARGO_BIN_EXE_echolake"))
             .args(["--lake", "lake", "serve", "--listen", any, "--flight-sql", any, "--postgres", any])
