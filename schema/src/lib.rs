@@ -18,6 +18,7 @@ pub mod manifest;
 pub mod messages;
 pub mod quantities;
 pub mod rig;
+pub mod robots;
 pub mod samples;
 pub mod symmetry;
 pub mod tables;

@@ -3,6 +3,7 @@
 use serde::{Deserialize, Serialize};
 
 use crate::grid::{Grid, GridParams};
+use crate::robots::RobotCell;
 use crate::{Celsius, Error, SampleRate};
 
 /// A rig, as its TOML describes it. What the TOML leaves out is as in Rust et al. 2021
@@ -24,6 +25,9 @@ pub struct Rig {
     pub validation: Validation,
     /// The points and pairs.
     pub grid: GridParams,
+    /// Where the arms stand and how they go about.
+    #[serde(skip_serializing_if = "RobotCell::is_default")]
+    pub robots: RobotCell,
 }
 
 /// The sweep that is played.
@@ -102,6 +106,7 @@ impl Default for Rig {
             panel: Panel::default(),
             validation: Validation::default(),
             grid: GridParams::default(),
+            robots: RobotCell::default(),
         }
     }
 }
@@ -280,6 +285,7 @@ impl Rig {
                 "validation.attempts",
                 format!("is {}, expected 1 to 100", self.validation.attempts),
             ),
+            (self.robots.contradiction().is_none(), "robots", self.robots.contradiction().unwrap_or_default()),
         ];
         match rules.into_iter().find(|(holds, ..)| !holds) {
             Some((_, field, reason)) => Err(Error::Rig { rig: self.name.clone(), field, reason }),
@@ -335,6 +341,8 @@ mod tests {
         check("sweeep.rate_hz = 1", "unknown field");
         check("[grid]\nlayers = []\npoints_mm = []", "number of grid points");
         check("name = [", "line 1");
+        check("robots.table_mm = 50", "robots");
+        check("robots.order = \"random\"", "unknown variant");
     }
 
     #[test]
