@@ -33,7 +33,7 @@ const HOME_DEG: Joints = [0.0, -10.0, 110.0, 0.0, 50.0, 0.0];
 /// What a joint's distance from home counts: a turn of the big joints changes more.
 const WEIGHTS: Joints = [1.0, 1.0, 1.0, 0.3, 0.3, 0.05];
 /// A capsule of the wrist is this thick, m; so are the others. Radii enclose the castings as the drawings show them.
-const RADII_M: [f64; 4] = [0.095, 0.075, 0.060, 0.045];
+pub(super) const RADII_M: [f64; 4] = [0.095, 0.075, 0.060, 0.045];
 
 /// What an arm carries.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
@@ -70,7 +70,7 @@ impl Tool {
     }
 
     /// Radii of its two capsules, m: rod or neck, then holder of the capsule or the driver.
-    const fn radii_m(self) -> [f64; 2] {
+    pub(super) const fn radii_m(self) -> [f64; 2] {
         match self {
             Self::Microphone => [0.008, 0.0065],
             Self::Speaker => [0.015, 0.022],
@@ -86,7 +86,7 @@ impl Tool {
     }
 
     // Flange to tool: the tool's z is its acoustic axis, its origin the acoustic centre.
-    fn pose(self) -> Pose {
+    pub(super) fn pose(self) -> Pose {
         let turn = DQuat::from_rotation_y(self.bend());
         let centre = DVec3::new(0.0, 0.0, self.length_m()) + turn * DVec3::new(0.0, 0.0, self.reach_m());
         Pose::from_parts(centre, turn)
@@ -161,11 +161,17 @@ impl Arm {
 
     /// Frames over the panel: foot, links 1 to 6 (the last is the flange), tool.
     pub fn frames(&self, joints: &Joints) -> [Pose; 8] {
-        let mut frames = [self.foot; 8];
-        for (i, step) in steps(joints).into_iter().chain([self.tool.pose()]).enumerate() {
-            frames[i + 1] = frames[i].compose(step);
+        let mut frames = self.steps(joints);
+        for i in 1..frames.len() {
+            frames[i] = frames[i - 1].compose(frames[i]);
         }
         frames
+    }
+
+    /// Each frame over the one before it, the foot over the panel.
+    pub fn steps(&self, joints: &Joints) -> [Pose; 8] {
+        let [a, b, c, d, e, f] = steps(joints);
+        [self.foot, a, b, c, d, e, f, self.tool.pose()]
     }
 
     /// All joints that bring the tool to this pose, nearest to home first, whether or not they are in their ranges.
@@ -204,7 +210,7 @@ impl Arm {
 }
 
 /// Poses of each link over the one before, foot to flange.
-pub(super) fn steps(q: &Joints) -> [Pose; 6] {
+fn steps(q: &Joints) -> [Pose; 6] {
     let (y, z) = (DQuat::from_rotation_y, DQuat::from_rotation_z);
     let step = |x: [f64; 3], turn| Pose::from_parts(DVec3::from_array(x), turn);
     [

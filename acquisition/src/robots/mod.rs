@@ -11,11 +11,15 @@
 
 pub mod arm;
 mod cell;
+mod choreography;
 pub mod clearance;
+mod description;
 mod motion;
 mod plan;
 
 pub use arm::{Arm, Joints, Part, Tool};
 pub use cell::{Aim, Cell, Standing, Unreachable, Ways};
+pub use choreography::{Choreography, Missing};
+pub use description::{PANEL_M, frame_names, joint_names};
 pub use motion::{Course, Motion, course};
 pub use plan::{PlanParams, length_secs, plan};
