@@ -2,6 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
+use crate::devices::DeviceParams;
 use crate::grid::{Grid, GridParams};
 use crate::robots::RobotCell;
 use crate::{Celsius, Error, SampleRate};
@@ -28,6 +29,9 @@ pub struct Rig {
     /// Where the arms stand and how they go about.
     #[serde(skip_serializing_if = "RobotCell::is_default")]
     pub robots: RobotCell,
+    /// Its devices.
+    #[serde(skip_serializing_if = "DeviceParams::are_simulated")]
+    pub devices: DeviceParams,
 }
 
 /// The sweep that is played.
@@ -107,6 +111,7 @@ impl Default for Rig {
             validation: Validation::default(),
             grid: GridParams::default(),
             robots: RobotCell::default(),
+            devices: DeviceParams::default(),
         }
     }
 }
@@ -286,6 +291,7 @@ impl Rig {
                 format!("is {}, expected 1 to 100", self.validation.attempts),
             ),
             (self.robots.contradiction().is_none(), "robots", self.robots.contradiction().unwrap_or_default()),
+            (self.devices.contradiction().is_none(), "devices", self.devices.contradiction().unwrap_or_default()),
         ];
         match rules.into_iter().find(|(holds, ..)| !holds) {
             Some((_, field, reason)) => Err(Error::Rig { rig: self.name.clone(), field, reason }),
@@ -325,6 +331,17 @@ mod tests {
         assert_eq!(rig.recording_len(), 48_960);
     }
 
+    const REAL: &str = "[devices]\naudio.kind = \"alsa\"\nsensor.kind = \"serial\"\nrobots.kind = \"rosbridge\"\n";
+
+    #[test]
+    fn a_rig_with_devices_round_trips() {
+        let rig = Rig::from_toml(REAL).expect("a rig");
+        assert!(!rig.devices.are_simulated() && Rig::paper().devices.are_simulated());
+        assert_eq!(Rig::from_toml(&rig.to_toml()), Ok(rig.clone()));
+        assert_eq!(rig.differences(&Rig::paper()), [], "devices do not change what numbers mean");
+        assert!(!Rig::paper().to_toml().contains("devices") && !Rig::paper().to_toml().contains("robots"));
+    }
+
     #[test]
     fn contradictions_name_the_field() {
         let check = |toml: &str, expected: &str| {
@@ -342,6 +359,11 @@ mod tests {
         check("[grid]\nlayers = []\npoints_mm = []", "number of grid points");
         check("name = [", "line 1");
         check("robots.table_mm = 50", "robots");
+        check("devices.sensor.kind = \"serial\"", "simulated devices beside real ones");
+        check("devices.sensor.kind = \"parallel\"", "unknown variant");
+        check("devices.sensor = { kind = \"serial\", bauds = 3 }", "unknown field");
+        check(&format!("{REAL}audio.loopback = 3"), "devices");
+        check(&format!("{REAL}robots.speed = 2.0"), "speed");
         check("robots.order = \"random\"", "unknown variant");
     }
 
