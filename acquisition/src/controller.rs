@@ -285,6 +285,9 @@ impl<'a> RunController<'a> {
         let (at, m, reading) = (made.at, &made.measurement, &made.reading);
         let sample_rate_hz = self.rig.sweep.rate_hz.get();
         recorder.poses(at, made.reached.microphone_mm, made.reached.speaker_mm)?;
+        if let Some(joints) = &made.reached.joints {
+            recorder.joints(at, joints)?;
+        }
         let sample = AmbientSample {
             temperature_c: reading.temperature_c,
             humidity_pct: reading.humidity_pct,

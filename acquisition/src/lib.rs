@@ -19,4 +19,5 @@ pub mod recorder;
 pub mod relief;
 pub mod rig;
 pub mod rigs;
+pub mod robots;
 pub mod simulate;

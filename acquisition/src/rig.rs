@@ -7,6 +7,8 @@
 use echolake_schema::Timestamp;
 use echolake_schema::manifest::Origin;
 
+use crate::robots::Joints;
+
 /// Two arms: one carries the microphone, one the speaker. Positions in mm over the panel.
 pub trait Robots: Send {
     /// Moves both and waits until they stand; returns where. A position that cannot be reached or is not finite, two
@@ -31,6 +33,8 @@ pub struct Positions {
     pub microphone_mm: [f64; 3],
     /// The speaker.
     pub speaker_mm: [f64; 3],
+    /// Joints of the microphone's and the speaker's arm, rad, where they are known.
+    pub joints: Option<[Joints; 2]>,
 }
 
 /// The drives' power.

@@ -11,6 +11,7 @@ use crate::mesh::{self, Format, Mesh};
 use crate::recorder::{OriginalFile, Recorder, Relief as RecordedRelief, RunStart};
 use crate::relief::{HeightField, Relief};
 use crate::rigs::simulated::{FACETS, Simulation, devices};
+use crate::robots::Choreography;
 
 /// Cells along each side of the recorded panel mesh.
 pub(crate) const MESH_CELLS: usize = 117;
@@ -81,12 +82,14 @@ impl SimulatedRun<'_> {
     /// [`Error`]; a run that was begun leaves its `.partial` file.
     pub fn measure(&self, stop: &AtomicBool, progress: &mut dyn FnMut(usize)) -> Result<(PathBuf, RunEnd), Error> {
         let prepared = self.prepare()?;
+        let arms = Choreography::of(self.rig)?;
         let simulation = Simulation {
             rig: self.rig,
             relief: &prepared.heights,
             reflection_factor: prepared.reflection_factor,
             start: self.start,
             seed: self.seed,
+            arms: arms.clone(),
         };
         let devices = devices(&simulation).map_err(controller::Error::from)?;
         let manifest = RunManifest {
@@ -110,7 +113,13 @@ impl SimulatedRun<'_> {
         let options = RunOptions { keep: self.keep, checkpoint_every: CHECKPOINT_EVERY };
         let grid = self.rig.grid()?;
         let mut recorder = Recorder::create(&path, &start).map_err(controller::Error::from)?;
-        let end = controller.run(&mut recorder, grid.pairs(), options, stop, progress)?;
+        let mut pairs = grid.pairs().to_vec();
+        if let Some(arms) = &arms {
+            let shown = recorder.arms(self.start, arms.cell(), "simulated_rig");
+            shown.map_err(controller::Error::from)?;
+            arms.sort(&mut pairs);
+        }
+        let end = controller.run(&mut recorder, &pairs, options, stop, progress)?;
         Ok((recorder.finish(&end).map_err(controller::Error::from)?, end))
     }
 

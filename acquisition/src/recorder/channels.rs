@@ -46,7 +46,7 @@ impl Channels {
     }
 }
 
-fn foxglove_channel<M: Encode>(writer: &mut Writer<BufWriter<File>>, topic: &str) -> mcap::McapResult<u16> {
+pub(super) fn foxglove_channel<M: Encode>(writer: &mut Writer<BufWriter<File>>, topic: &str) -> mcap::McapResult<u16> {
     let schema = match M::get_schema() {
         Some(schema) => writer.add_schema(&schema.name, &schema.encoding, &schema.data)?,
         None => 0,

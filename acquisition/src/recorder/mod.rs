@@ -1,6 +1,7 @@
 //! Writes a run's MCAP file, crash-safe: what a checkpoint has passed survives a power cut, and the file stands
 //! under its name only when it is whole.
 
+mod arms;
 mod channels;
 mod error;
 mod scene;
@@ -86,6 +87,8 @@ pub struct Recorder {
     channels: Channels,
     sequence: u32,
     encoded: Vec<u8>,
+    /// The arms, where their joints are known.
+    arms: Option<arms::Arms>,
 }
 
 /// The name of a recording until it is whole.
@@ -141,7 +144,7 @@ impl Recorder {
         match writer {
             Ok(writer) => {
                 let channels = Channels::default();
-                Ok(Self { writer, path, partial, channels, sequence: 0, encoded: Vec::new() })
+                Ok(Self { writer, path, partial, channels, sequence: 0, encoded: Vec::new(), arms: None })
             }
             Err(e) => Err(Error::Create { path, reason: e.to_string() }),
         }
@@ -176,7 +179,9 @@ impl Recorder {
     /// # Errors
     /// [`Error::Write`]; so do all methods below.
     pub fn poses(&mut self, at: Timestamp, microphone_mm: [f64; 3], speaker_mm: [f64; 3]) -> Result<(), Error> {
-        self.foxglove(self.channels.tf, at, &scene::frames(at, microphone_mm, speaker_mm))?;
+        if self.arms.is_none() {
+            self.foxglove(self.channels.tf, at, &scene::frames(at, microphone_mm, speaker_mm))?;
+        }
         self.foxglove(self.channels.microphone, at, &scene::pose(at, microphone_mm))?;
         self.foxglove(self.channels.speaker, at, &scene::pose(at, speaker_mm))
     }
