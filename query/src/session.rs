@@ -5,6 +5,7 @@ use std::sync::Arc;
 
 use arrow::datatypes::{DataType, SchemaRef};
 use arrow::record_batch::RecordBatch;
+use bytes::Bytes;
 use datafusion::common::ParamValues;
 use datafusion::error::DataFusionError;
 use datafusion::execution::TaskContext;
@@ -14,7 +15,7 @@ use datafusion::logical_expr::LogicalPlan;
 use datafusion::physical_plan::{ExecutionPlan, execute_stream};
 use datafusion::prelude::SessionContext;
 use datafusion::sql::parser::Statement;
-use echolake_lake::Lake;
+use echolake_lake::{Lake, Snapshot, VisibleRun};
 use futures::StreamExt as _;
 use tokio::sync::{OwnedSemaphorePermit, mpsc};
 use tokio::task::JoinHandle;
@@ -24,6 +25,7 @@ use crate::control::pool::QueryPool;
 use crate::control::watched::watch;
 use crate::control::{Stop, Ticket};
 use crate::engine::{Client, Engine, Function, Limits, Quota};
+use crate::mcap::Contents;
 use crate::{Error, as_of, gate};
 
 /// Batches that wait for a slow reader.
@@ -311,6 +313,30 @@ impl Session {
         let limit = self.engine.memory(self.client.quota());
         runtime.memory_pool = Arc::new(QueryPool::new(runtime.memory_pool, limit, ticket.clone()));
         Arc::new(TaskContext::from(state).with_runtime(Arc::new(runtime)))
+    }
+
+    /// The view of the lake that a query of now sees; the same one for as long as nothing changes.
+    ///
+    /// # Errors
+    /// [`Error::Lake`] where the lake cannot be read.
+    pub async fn snapshot(&self) -> Result<Arc<Snapshot>, Error> {
+        self.engine.catalog().snapshot().await
+    }
+
+    /// What a run's file holds, of its summary and message indexes.
+    ///
+    /// # Errors
+    /// [`Error::Execution`] where the file cannot be read.
+    pub async fn contents(&self, run: &VisibleRun) -> Result<Contents, Error> {
+        self.engine.catalog().contents(run).await
+    }
+
+    /// The bytes of the first attachment of a run's file whose name ends so; None where there is none.
+    ///
+    /// # Errors
+    /// As [`Session::contents`].
+    pub async fn attachment(&self, run: &VisibleRun, ending: &str) -> Result<Option<Bytes>, Error> {
+        self.engine.catalog().attachment(run, ending).await
     }
 
     /// The functions, by name.

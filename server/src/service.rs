@@ -27,6 +27,7 @@ pub(crate) const SCHEMA: &str = "public";
 pub(crate) struct Service(Arc<Inner>);
 
 struct Inner {
+    lake: Lake,
     engine: Engine,
     access: Access,
     metrics: Metrics,
@@ -56,11 +57,16 @@ pub(crate) struct Job {
 impl Service {
     pub(crate) fn new(lake: &Lake, tokens: Option<Tokens>, limits: Limits) -> Result<Self, Error> {
         Ok(Self(Arc::new(Inner {
+            lake: lake.clone(),
             engine: Engine::new(lake, limits)?,
             access: Access::new(tokens),
             metrics: Metrics::default(),
             encoders: Threads::per_core("encode").map_err(Error::System)?,
         })))
+    }
+
+    pub(crate) fn lake(&self) -> &Lake {
+        &self.0.lake
     }
 
     pub(crate) fn access(&self) -> &Access {
@@ -110,6 +116,16 @@ impl Service {
             None => Err(Fault::Internal),
         };
         planned.inspect_err(|fault| self.0.metrics.failed(fault.code()))
+    }
+
+    /// Computes something long, which waits for nothing.
+    pub(crate) async fn crunch<T: Send + 'static>(&self, work: impl FnOnce() -> T + Send + 'static) -> Result<T, Fault> {
+        let handle = self.0.compute.0.as_ref().map(|runtime| runtime.spawn_blocking(work));
+        let Some(handle) = handle else { return Err(Fault::Internal) };
+        handle.await.map_err(|failed| {
+            eprintln!("computing ended its task: {failed}");
+            Fault::Internal
+        })
     }
 
     /// Begins a query; its columns are known when this returns.

@@ -5,6 +5,7 @@
 
 mod chunk;
 mod column;
+mod contents;
 mod error;
 mod file;
 mod json;
@@ -37,6 +38,9 @@ use echolake_lake::Snapshot;
 
 use crate::Error;
 use error::Fault;
+pub use contents::{Contents, Topic};
+pub(crate) use contents::{attachment, contents};
+pub use file::Attachment;
 pub(crate) use file::Files;
 use target::Target;
 

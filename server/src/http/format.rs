@@ -6,6 +6,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 
 use arrow::datatypes::SchemaRef;
 use arrow::record_batch::RecordBatch;
+use axum::http::{HeaderMap, header};
 use bytes::Bytes;
 use echolake_query::output::{AnswerWriter, Format};
 
@@ -47,6 +48,12 @@ pub(super) fn accepted(accept: &str) -> Result<Format, Fault> {
         let types: Vec<_> = FORMATS.iter().map(|(_, types)| types[0]).collect();
         Fault::request(format!("nothing in `Accept: {accept}` can be had; hint: {}", types.join(", ")))
     })
+}
+
+/// Whether an Arrow stream is liked better than JSON.
+pub(super) fn prefers_arrow(headers: &HeaderMap) -> bool {
+    let accept = headers.get(header::ACCEPT).and_then(|v| v.to_str().ok()).unwrap_or_default();
+    accepted(accept).is_ok_and(|format| format == Format::Arrow)
 }
 
 /// The media type of a format.
