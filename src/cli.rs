@@ -24,7 +24,7 @@ pub(crate) struct Cli {
 
 #[derive(Debug, Subcommand)]
 pub(crate) enum Command {
-    /// Measure a few surfaces with the simulated rig, ingest them and print the paper's tables.
+    /// Measure a few surfaces with the simulated rig, ingest them, print the paper's tables and serve the catalogue.
     Demo(DemoArgs),
     /// Measure one surface with the simulated rig: one run, one MCAP file.
     Acquire(AcquireArgs),
@@ -37,7 +37,7 @@ pub(crate) enum Command {
     Ingest(IngestArgs),
     /// Ask the lake in SQL; a prompt where no query is given.
     Sql(SqlArgs),
-    /// Serve the lake over HTTP, Arrow Flight SQL and Postgres' protocol, for reading.
+    /// Serve the catalogue, and the lake over HTTP, Arrow Flight SQL and Postgres' protocol, for reading.
     Serve(ServeArgs),
     /// Make a token for `serve --tokens`.
     Token {

@@ -8,6 +8,8 @@ mod load;
 mod maintenance;
 mod real_data;
 mod serve;
+#[cfg(feature = "web")]
+mod web;
 
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};

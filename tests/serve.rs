@@ -1,5 +1,7 @@
 //! `echolake serve` as its clients see it: answers, refusals, queries that end with who asked, and its own end.
 
+mod catalogue;
+mod contract;
 mod escapes;
 pub(crate) mod http;
 pub(crate) mod postgres;
@@ -25,7 +27,7 @@ fn lake() -> Place {
     place
 }
 
-fn served(place: &Place, more: &[&str]) -> Served {
+pub(crate) fn served(place: &Place, more: &[&str]) -> Served {
     Served::start(Path::new(env!("CARGO_BIN_EXE_echolake")), &place.path(""), more)
 }
 
@@ -104,7 +106,7 @@ fn what_is_wrong_has_a_code() {
         400,
         "request_invalid",
     );
-    check(Request::get("/api/v1/sql").send(&server), 400, "request_invalid");
+    check(Request::get("/api/v1/sql").send(&server), 405, "method_not_allowed");
     check(Request::get("/api/v1/nothing").send(&server), 404, "not_found");
     // A page of elsewhere, and a name that points here.
     for (name, value) in [("origin", "http://evil.example"), ("origin", "null"), ("sec-fetch-site", "cross-site")] {

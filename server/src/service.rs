@@ -119,7 +119,10 @@ impl Service {
     }
 
     /// Computes something long, which waits for nothing.
-    pub(crate) async fn crunch<T: Send + 'static>(&self, work: impl FnOnce() -> T + Send + 'static) -> Result<T, Fault> {
+    pub(crate) async fn crunch<T: Send + 'static>(
+        &self,
+        work: impl FnOnce() -> T + Send + 'static,
+    ) -> Result<T, Fault> {
         let handle = self.0.compute.0.as_ref().map(|runtime| runtime.spawn_blocking(work));
         let Some(handle) = handle else { return Err(Fault::Internal) };
         handle.await.map_err(|failed| {

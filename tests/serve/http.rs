@@ -30,6 +30,10 @@ impl Request {
         Self { method: "GET", path: path.to_owned(), host: None, headers: String::new(), body: String::new() }
     }
 
+    pub(crate) fn options(path: &str) -> Self {
+        Self { method: "OPTIONS", ..Self::get(path) }
+    }
+
     pub(crate) fn post(path: &str, body: &str) -> Self {
         Self { method: "POST", body: body.to_owned(), ..Self::get(path) }
     }

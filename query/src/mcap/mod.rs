@@ -37,9 +37,9 @@ use datafusion::sql::sqlparser::ast::{
 use echolake_lake::Snapshot;
 
 use crate::Error;
-use error::Fault;
 pub use contents::{Contents, Topic};
 pub(crate) use contents::{attachment, contents};
+use error::Fault;
 pub use file::Attachment;
 pub(crate) use file::Files;
 use target::Target;

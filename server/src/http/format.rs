@@ -56,6 +56,15 @@ pub(super) fn prefers_arrow(headers: &HeaderMap) -> bool {
     accepted(accept).is_ok_and(|format| format == Format::Arrow)
 }
 
+/// Whether an encoding of HTTP is taken.
+pub(super) fn takes(headers: &HeaderMap, encoding: &str) -> bool {
+    let accepted = headers.get(header::ACCEPT_ENCODING).and_then(|v| v.to_str().ok()).unwrap_or_default();
+    accepted.split(',').any(|one| {
+        let mut parts = one.split(';').map(str::trim);
+        parts.next() == Some(encoding) && !parts.any(|p| p == "q=0")
+    })
+}
+
 /// The media type of a format.
 pub(super) fn media_type(format: Format) -> &'static str {
     FORMATS.iter().find(|(known, _)| *known == format).map_or("application/octet-stream", |(_, types)| types[0])

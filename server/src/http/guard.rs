@@ -35,9 +35,8 @@ pub(super) fn client(service: &Service, headers: &HeaderMap, scope: Scope) -> Re
     let token = headers.get(header::AUTHORIZATION).and_then(|v| v.to_str().ok()).and_then(of_header);
     let client = match (token, cookie(headers)) {
         // A browser sends the cookie along whichever page of this machine asks, on whatever port it was served.
-        (None, Some(secret)) => {
-            is_same_origin(headers, &["http://", "https://"]).and_then(|()| service.access().client_of_session(secret, scope))
-        }
+        (None, Some(secret)) => is_same_origin(headers, &["http://", "https://"])
+            .and_then(|()| service.access().client_of_session(secret, scope)),
         (token, _) => service.access().client(token.as_deref(), scope),
     };
     client.inspect_err(|fault| service.metrics().failed(fault.code()))

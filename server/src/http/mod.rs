@@ -7,6 +7,8 @@ mod format;
 mod guard;
 mod health;
 mod openapi;
+#[cfg(feature = "web")]
+mod pages;
 mod problem;
 mod session;
 mod sql;
@@ -45,10 +47,14 @@ fn router(service: Service) -> Router {
         .merge(catalogue.router())
         .merge(files::for_own(&catalogue))
         .layer(from_fn_with_state(service, guard::own_pages_only));
+    #[cfg(feature = "web")]
+    let rest = pages::fallback;
+    #[cfg(not(feature = "web"))]
+    let rest = nothing;
     Router::new()
         .merge(own)
         .merge(files::for_viewers(&catalogue))
-        .fallback(nothing)
+        .fallback(rest)
         .method_not_allowed_fallback(wrong_method)
         .layer(CatchPanicLayer::custom(|_| Problem(Fault::Internal).answer()))
         .layer(axum::middleware::map_response(guard::security_headers))

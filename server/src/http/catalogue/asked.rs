@@ -94,7 +94,11 @@ impl Asked {
     }
 
     /// The rows of a query. `sql` is a text of the program's own; what came with the request is among `values`.
-    pub(in super::super) async fn rows<T: DeserializeOwned>(&self, sql: &str, values: Vec<ScalarValue>) -> Result<Vec<T>, Fault> {
+    pub(in super::super) async fn rows<T: DeserializeOwned>(
+        &self,
+        sql: &str,
+        values: Vec<ScalarValue>,
+    ) -> Result<Vec<T>, Fault> {
         let mut running = self.begin(sql, values, |schema| Written::new(Format::Json, schema)).await?;
         let mut json = Vec::new();
         while let Some(part) = running.next().await? {

@@ -4,10 +4,11 @@ use std::sync::OnceLock;
 
 use arrow::ipc::writer::StreamWriter;
 use arrow::record_batch::RecordBatch;
-use axum::http::{HeaderMap, header};
+use axum::http::HeaderMap;
 use bytes::Bytes;
 use serde::Serialize;
 
+use super::super::format::takes;
 use crate::fault::Fault;
 
 pub(super) const ARROW: &str = "application/vnd.apache.arrow.stream";
@@ -77,19 +78,11 @@ impl Content {
     /// The bytes to send, and whether they are packed.
     pub(super) fn body(&self, headers: &HeaderMap) -> (Bytes, bool) {
         let packs = matches!(self.media_type, "application/json" | "application/octet-stream" | ARROW);
-        if !packs || self.bytes.len() < WORTH_PACKING || !takes_gzip(headers) {
+        if !packs || self.bytes.len() < WORTH_PACKING || !takes(headers, "gzip") {
             return (self.bytes.clone(), false);
         }
         (self.packed.get_or_init(|| gzip(&self.bytes)).clone(), true)
     }
-}
-
-fn takes_gzip(headers: &HeaderMap) -> bool {
-    let accepted = headers.get(header::ACCEPT_ENCODING).and_then(|v| v.to_str().ok()).unwrap_or_default();
-    accepted.split(',').any(|one| {
-        let mut parts = one.split(';').map(str::trim);
-        parts.next() == Some("gzip") && !parts.any(|p| p == "q=0")
-    })
 }
 
 fn gzip(bytes: &[u8]) -> Bytes {
@@ -102,6 +95,8 @@ fn gzip(bytes: &[u8]) -> Bytes {
 
 #[cfg(test)]
 mod tests {
+    use axum::http::header;
+
     use super::*;
 
     #[test]

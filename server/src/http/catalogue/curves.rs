@@ -103,7 +103,8 @@ fn curves(surface: &str, row: Option<&Row>, rig: &Rig, kept: &[usize]) -> Curves
         let curve = curve.as_deref().unwrap_or_default();
         kept.iter().filter_map(|i| curve.get(*i).copied()).collect()
     };
-    let bands = row.map_or_else(|| vec![Vec::new(); rig.band_names().len()], |row| row.bands.iter().map(thin).collect());
+    let bands =
+        row.map_or_else(|| vec![Vec::new(); rig.band_names().len()], |row| row.bands.iter().map(thin).collect());
     Curves { surface_id: surface.to_owned(), pairs: row.map_or(0, |row| row.pairs), bands }
 }
 

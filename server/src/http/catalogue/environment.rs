@@ -60,7 +60,8 @@ pub(super) async fn environment(asked: Asked) -> Result<Content, Fault> {
     let run = asked.run()?.run.to_string();
     let points = asked.params.whole("points", 10..=2000)?.unwrap_or(300);
     let span: Vec<Span> = asked.rows(SPAN, vec![text(&run)]).await?;
-    let none = || Fault::NoData { what: format!("run `{run}`"), data: "readings of the air", hint: "imports may have none" };
+    let none =
+        || Fault::NoData { what: format!("run `{run}`"), data: "readings of the air", hint: "imports may have none" };
     let Some(Span { first: Some(first), last: Some(last), start: Some(start) }) = span.into_iter().next() else {
         return Err(none());
     };

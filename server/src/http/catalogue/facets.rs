@@ -181,7 +181,8 @@ pub(super) async fn surfaces(asked: Asked) -> Result<Content, Fault> {
     let offset = params.whole("offset", 0..=usize::MAX)?.unwrap_or(0);
     let limit = params.whole("limit", 1..=500)?.unwrap_or(60);
     let all: Vec<_> = summary.entries.iter().map(|entry| (entry, standing(&filters, entry))).collect();
-    let mut left: Vec<_> = all.iter().filter(|(_, standing)| *standing == Standing::In).map(|(entry, _)| *entry).collect();
+    let mut left: Vec<_> =
+        all.iter().filter(|(_, standing)| *standing == Standing::In).map(|(entry, _)| *entry).collect();
     left.sort_by(|a, b| order.compare(a, b));
     Content::json(&Page {
         total: left.len(),

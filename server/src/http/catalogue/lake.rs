@@ -32,8 +32,12 @@ pub(super) fn bands(rig: &Rig) -> Vec<Band> {
 /// Names of bands come from `lake.toml`, and are digits.
 pub(super) fn band_list(rig: &Rig, column: impl Fn(&str) -> String) -> String {
     let names = rig.band_names();
-    let columns: Vec<_> =
-        names.iter().map(String::as_str).chain([TOTAL]).map(|band| format!("cast({} as double)", column(band))).collect();
+    let columns: Vec<_> = names
+        .iter()
+        .map(String::as_str)
+        .chain([TOTAL])
+        .map(|band| format!("cast({} as double)", column(band)))
+        .collect();
     format!("make_array({})", columns.join(", "))
 }
 

@@ -126,7 +126,8 @@ impl Vectors {
 
     fn add(&mut self, batch: &RecordBatch) -> Result<(), Fault> {
         let columns = batch.columns();
-        let (Some(names), Some(pairs)) = (columns[0].as_string_opt::<i32>(), columns[1].as_primitive_opt::<Int32Type>())
+        let (Some(names), Some(pairs)) =
+            (columns[0].as_string_opt::<i32>(), columns[1].as_primitive_opt::<Int32Type>())
         else {
             eprintln!("the map's columns are not as expected: {}", batch.schema());
             return Err(Fault::Internal);

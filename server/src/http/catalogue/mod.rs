@@ -142,7 +142,8 @@ impl Catalogue {
         let path = path.iter().map(|(name, value)| (name.to_owned(), value.to_owned())).collect();
         let asked = Asked { catalogue: self.clone(), view: view.clone(), path, params, as_arrow };
         let answer = (endpoint.answer)(asked);
-        let content = view.answers.once(key, answer).await.inspect_err(|f| self.service().metrics().failed(f.code()))?;
+        let content =
+            view.answers.once(key, answer).await.inspect_err(|f| self.service().metrics().failed(f.code()))?;
         Ok(response(&content, headers, etag))
     }
 }
@@ -155,8 +156,8 @@ pub(super) fn is_known(headers: &HeaderMap, etag: &str) -> bool {
 
 fn response(content: &Content, headers: &HeaderMap, etag: String) -> Response {
     let (body, packed) = content.body(headers);
-    let mut response = ([(header::CONTENT_TYPE, content.media_type), (header::VARY, "Accept, Accept-Encoding")], body)
-        .into_response();
+    let mut response =
+        ([(header::CONTENT_TYPE, content.media_type), (header::VARY, "Accept, Accept-Encoding")], body).into_response();
     let out = response.headers_mut();
     // Asked again each time, and answered by 304 for as long as nothing changes; no cache between keeps what a token opened.
     out.insert(header::CACHE_CONTROL, HeaderValue::from_static("private, no-cache"));

@@ -78,7 +78,9 @@ mod tests {
         assert_eq!(given.one("a").expect("one"), Some("1"));
         assert!(given.one("b").is_err());
         assert_eq!(given.whole("limit", 1..=500).expect("a number"), Some(7));
-        for wrong in ["limit=0", "limit=501", "limit=+7", "limit=7.0", "limit=", "limit=x", "limit=99999999999999999999"] {
+        for wrong in
+            ["limit=0", "limit=501", "limit=+7", "limit=7.0", "limit=", "limit=x", "limit=99999999999999999999"]
+        {
             assert!(params(wrong).whole("limit", 1..=500).is_err(), "{wrong}");
         }
         assert_eq!(given.choice("order", &["asc", "desc"]).expect("the first"), "asc");

@@ -46,7 +46,8 @@ pub(super) async fn thumbnail(asked: Asked) -> Result<Content, Fault> {
 pub(super) async fn mesh(asked: Asked) -> Result<Content, Fault> {
     let surface = &asked.surface().await?.surface;
     let id = &surface.surface_id;
-    let run = surface.run_id.as_deref().ok_or_else(|| missing(format!("a run of surface `{id}`"), "it is a reference"))?;
+    let run =
+        surface.run_id.as_deref().ok_or_else(|| missing(format!("a run of surface `{id}`"), "it is a reference"))?;
     let (session, visible) = (asked.view.session.clone(), run_of(&asked, run)?);
     let read = async move { Ok(session.attachment(&visible, ".glb").await?) };
     let bytes = asked.catalogue.service().plan(read).await?;

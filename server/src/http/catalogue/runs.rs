@@ -79,7 +79,8 @@ pub(super) async fn runs(asked: Asked) -> Result<Content, Fault> {
     let limit = params.whole("limit", 1..=500)?.unwrap_or(100);
     let one = |name| Ok::<_, Fault>(params.one(name)?.unwrap_or_default());
     let chosen = vec![text(&one("q")?.to_lowercase()), text(one("surface_id")?), text(one("state")?)];
-    let page = format!("select {COLUMNS} from runs where {CHOSEN} order by {column} {order}, run_id limit $5 offset $4");
+    let page =
+        format!("select {COLUMNS} from runs where {CHOSEN} order by {column} {order}, run_id limit $5 offset $4");
     let count = format!("select count(*) as total from runs where {CHOSEN}");
     let whole = |n: usize| ScalarValue::Int64(Some(i64::try_from(n).unwrap_or(i64::MAX)));
     let values = chosen.iter().cloned().chain([whole(offset), whole(limit)]).collect();

@@ -107,7 +107,8 @@ const OVER: [&str; 2] = ["flat-total", "flat-band"];
 /// TNCE over the grid for one microphone point; a pair that was measured the other way round is used by reciprocity.
 pub(super) async fn grid(asked: Asked) -> Result<Content, Fault> {
     let entry = asked.surface().await?;
-    let microphone = asked.microphone()?.ok_or_else(|| Fault::request("`microphone` is missing; hint: a grid point"))?;
+    let microphone =
+        asked.microphone()?.ok_or_else(|| Fault::request("`microphone` is missing; hint: a grid point"))?;
     let over = asked.params.choice("over", &OVER)?;
     let column = |band: &str| match band == super::lake::TOTAL || over == OVER[0] {
         true => format!("avg(tnce_{band})"),
@@ -118,8 +119,7 @@ pub(super) async fn grid(asked: Asked) -> Result<Content, Fault> {
         "select pair_id, microphone, speaker, {energies} as energies from tnce \
          where surface_id = $1 and (microphone = $2 or speaker = $2) group by pair_id, microphone, speaker"
     );
-    let mut cells: Vec<Cell> =
-        asked.rows(&sql, vec![text(&entry.surface.surface_id), number(microphone)]).await?;
+    let mut cells: Vec<Cell> = asked.rows(&sql, vec![text(&entry.surface.surface_id), number(microphone)]).await?;
     // Where both directions were measured, the one that was asked for counts.
     cells.sort_by_key(|cell| cell.microphone == microphone);
     let points = asked.catalogue.lake().grid().points().len();
