@@ -4,8 +4,8 @@ use serde_json::Value;
 
 use super::contract::Contract;
 use super::http::{Answer, Request};
-use super::server::Served;
 use super::served;
+use super::server::Served;
 use crate::Place;
 
 /// Reliefs with both references, so that every answer has something in it.
