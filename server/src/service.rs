@@ -123,7 +123,7 @@ impl Service {
         &self,
         work: impl FnOnce() -> T + Send + 'static,
     ) -> Result<T, Fault> {
-        let handle = self.0.compute.0.as_ref().map(|runtime| runtime.spawn_blocking(work));
+        let handle = self.0.encoders.handle().map(|threads| threads.spawn_blocking(work));
         let Some(handle) = handle else { return Err(Fault::Internal) };
         handle.await.map_err(|failed| {
             eprintln!("computing ended its task: {failed}");
