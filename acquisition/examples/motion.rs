@@ -7,6 +7,7 @@
 
 use std::collections::BTreeMap;
 use std::error::Error;
+use std::io::{self, Write};
 use std::time::Instant;
 
 use echolake_acquisition::robots::{Cell, Course, PlanParams, Standing, Unreachable, course, length_secs, plan};
@@ -14,30 +15,31 @@ use echolake_schema::robots::{RobotCell, Rod};
 use echolake_schema::{Grid, Rig};
 
 fn main() -> Result<(), Box<dyn Error>> {
+    let mut out = io::stdout();
     let rig = Rig::paper();
     let grid = rig.grid()?;
     for rod in [Rod::Leaning, Rod::Upright] {
-        println!("microphone's rod {rod:?}:");
-        who_reaches_what(&grid, &Cell::new(&RobotCell { rod, ..rig.robots.clone() }, rig.panel.size_mm));
+        writeln!(out, "microphone's rod {rod:?}:")?;
+        who_reaches_what(&mut out, &grid, &Cell::new(&RobotCell { rod, ..rig.robots.clone() }, rig.panel.size_mm))?;
     }
     let cell = Cell::of(&rig);
     let standings = standings(&grid, &cell)?;
     let own: Vec<usize> = (0..standings.len()).collect();
     if let Some(path) = std::env::args().nth(1) {
-        report("published", &cell, &standings, &published(&grid, &path)?);
+        report(&mut out, "published", &cell, &standings, &published(&grid, &path)?)?;
     }
-    report("by number", &cell, &standings, &own);
+    report(&mut out, "by number", &cell, &standings, &own)?;
     for seed in 1..=3 {
         let began = Instant::now();
         let order = plan(&standings, PlanParams { seed, ..PlanParams::default() });
         let took = began.elapsed().as_secs_f64();
-        report(&format!("planned, seed {seed} ({took:.1} s)"), &cell, &standings, &order);
+        report(&mut out, &format!("planned, seed {seed} ({took:.1} s)"), &cell, &standings, &order)?;
     }
     Ok(())
 }
 
 // Every two points of the grid, lower number first, whether the grid pairs them or not.
-fn who_reaches_what(grid: &Grid, cell: &Cell) {
+fn who_reaches_what(out: &mut dyn Write, grid: &Grid, cell: &Cell) -> io::Result<()> {
     let began = Instant::now();
     let mut tally: BTreeMap<String, [usize; 2]> = BTreeMap::new();
     for a in grid.points() {
@@ -49,8 +51,8 @@ fn who_reaches_what(grid: &Grid, cell: &Cell) {
             tally.entry(what).or_default()[usize::from(!paired)] += 1;
         }
     }
-    println!("  {:>6} {:>9}  ({:.2} s)", "paired", "left out", began.elapsed().as_secs_f64());
-    tally.iter().for_each(|(what, [paired, left_out])| println!("  {paired:>6} {left_out:>9}  {what}"));
+    writeln!(out, "  {:>6} {:>9}  ({:.2} s)", "paired", "left out", began.elapsed().as_secs_f64())?;
+    tally.iter().try_for_each(|(what, [paired, left_out])| writeln!(out, "  {paired:>6} {left_out:>9}  {what}"))
 }
 
 fn named(why: Unreachable) -> String {
@@ -73,7 +75,7 @@ fn published(grid: &Grid, path: &str) -> Result<Vec<usize>, Box<dyn Error>> {
     Ok(order)
 }
 
-fn report(name: &str, cell: &Cell, standings: &[Standing], order: &[usize]) {
+fn report(out: &mut dyn Write, name: &str, cell: &Cell, standings: &[Standing], order: &[usize]) -> io::Result<()> {
     let mut courses: BTreeMap<String, usize> = BTreeMap::new();
     let (mut secs, mut turned, mut last) = (0.0, 0.0, Standing::home());
     for next in order.iter().map(|i| standings[*i]) {
@@ -91,12 +93,13 @@ fn report(name: &str, cell: &Cell, standings: &[Standing], order: &[usize]) {
         }
         last = next;
     }
-    println!("{name}: {} pairs", order.len());
-    println!(
+    writeln!(out, "{name}: {} pairs", order.len())?;
+    writeln!(
+        out,
         "  straight {:.0} s; without touching {secs:.0} s; joints turn {:.0} turns",
         length_secs(standings, order),
         turned / std::f64::consts::TAU
-    );
+    )?;
     let together = courses.remove(&format!("{:?}", Course::Together)).unwrap_or(0);
-    println!("  moves: {together} both arms at once; else {courses:?}");
+    writeln!(out, "  moves: {together} both arms at once; else {courses:?}")
 }
