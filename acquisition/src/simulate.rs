@@ -1,23 +1,31 @@
 //! One run of the simulated rig, from a relief or a mesh to a closed MCAP file.
 
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
-use std::sync::atomic::AtomicBool;
+use std::sync::atomic::{AtomicBool, Ordering};
 
-use echolake_schema::manifest::{MeshFacts, RunEnd, RunManifest};
+use echolake_schema::manifest::{MeshFacts, Origin, RunEnd, RunManifest};
+use echolake_schema::messages::Verdict;
 use echolake_schema::{Rig, RunId, SurfaceId, SurfaceRecord, Timestamp};
 
-use crate::controller::{self, Keep, RunController, RunOptions};
+use crate::controller::{self, Control, Event, Keep, RunController};
 use crate::mesh::{self, Format, Mesh};
-use crate::recorder::{OriginalFile, Recorder, Relief as RecordedRelief, RunStart};
+use crate::plan::{PlannedSpecimen, RunPlan};
+use crate::preflight::Finding;
+use crate::recorder::{Held, OriginalFile, Recorder, Relief as RecordedRelief, RunStart, folder_of};
+use crate::recovery;
 use crate::relief::{HeightField, Relief};
-use crate::rigs::simulated::{FACETS, Simulation, devices};
+use crate::rig::Devices;
+use crate::rigs::paced::paced;
+use crate::rigs::simulated::{FACETS, Simulation, TAKE_SECS, devices};
+use crate::session::{Job, Measured, Pace, Preflight, Session, Shape};
 
 /// Cells along each side of the recorded panel mesh.
 pub(crate) const MESH_CELLS: usize = 117;
 /// The back of a generated panel, mm.
 pub(crate) const BACK_MM: f32 = -30.0;
 /// Pairs between two checkpoints; a simulated run that is lost is made again.
-const CHECKPOINT_EVERY: usize = 200;
+pub const CHECKPOINT_EVERY: usize = 200;
 
 /// What is measured.
 #[derive(Debug, Clone)]
@@ -63,6 +71,15 @@ pub enum Error {
     /// A name is not valid.
     #[error(transparent)]
     Schema(#[from] echolake_schema::Error),
+    /// The run cannot be gone on with.
+    #[error(transparent)]
+    Resume(#[from] recovery::Error),
+    /// Something is not fit, and nothing was begun.
+    #[error("not fit to measure: {}", findings.iter().map(ToString::to_string).collect::<Vec<_>>().join("\n  and: "))]
+    Unfit {
+        /// What.
+        findings: Vec<Finding>,
+    },
 }
 
 /// A specimen, ready to be measured and recorded.
@@ -75,20 +92,48 @@ struct Prepared {
 }
 
 impl SimulatedRun<'_> {
-    /// Measures all pairs; returns the run's file and how it ended.
+    /// Measures all pairs, looked over by nobody; returns the run's file and how it ended.
     ///
     /// # Errors
     /// [`Error`]; a run that was begun leaves its `.partial` file.
     pub fn measure(&self, stop: &AtomicBool, progress: &mut dyn FnMut(usize)) -> Result<(PathBuf, RunEnd), Error> {
-        let prepared = self.prepare()?;
-        let simulation = Simulation {
-            rig: self.rig,
-            relief: &prepared.heights,
-            reflection_factor: prepared.reflection_factor,
-            start: self.start,
-            seed: self.seed,
+        let (control, mut done) = (Control::default(), 0);
+        let mut observe = |event: Event<'_>| match event {
+            Event::Pair(_) => control.stop.store(stop.load(Ordering::Relaxed), Ordering::Relaxed),
+            Event::Attempt(m) if m.verdict() != Verdict::Repeated => {
+                done += 1;
+                progress(done);
+            }
+            _ => {}
         };
-        let devices = devices(&simulation).map_err(controller::Error::from)?;
+        let session = Session {
+            control: &control,
+            observe: &mut observe,
+            tap: None,
+            preflight: Preflight::Skip,
+            checkpoint_every: CHECKPOINT_EVERY,
+            pace: Pace::Fast,
+        };
+        let measured = self.begin(session, None)?;
+        Ok((measured.path, measured.outcome.end))
+    }
+
+    /// Measures all pairs under somebody's eyes. A run that is stopped, or that breaks off, can be gone on with.
+    ///
+    /// # Errors
+    /// [`Error`]; a run that was begun leaves its `.partial` file.
+    pub fn supervised(&self, session: Session<'_>) -> Result<Measured, Error> {
+        let specimen = match self.specimen {
+            Specimen::Relief(relief) => PlannedSpecimen::Relief(relief.clone()),
+            Specimen::Mesh(path) => PlannedSpecimen::Mesh(path.clone()),
+        };
+        let plan = RunPlan { keep: self.keep, seed: self.seed, specimen };
+        self.begin(session, Some(plan.to_metadata()))
+    }
+
+    fn begin(&self, session: Session<'_>, plan: Option<BTreeMap<String, String>>) -> Result<Measured, Error> {
+        let prepared = self.prepare()?;
+        let devices = prepared.devices(self.rig, self.start, self.seed, session.pace)?;
         let manifest = RunManifest {
             run_id: self.run_id()?,
             surface_id: self.surface.clone(),
@@ -103,15 +148,16 @@ impl SimulatedRun<'_> {
             bytes,
         });
         let relief = RecordedRelief { heights: &prepared.heights, mesh: &prepared.mesh, original };
-        let start = RunStart { manifest: &manifest, rig: self.rig, surface: &prepared.record, relief: Some(relief) };
+        let (surface, relief) = (&prepared.record, Some(relief));
+        let start = RunStart { manifest: &manifest, rig: self.rig, surface, relief, plan };
         let path = self.path()?;
+        let nothing = BTreeMap::new();
+        let job = prepared.job(self.rig, self.folder, self.keep, &nothing, self.start);
         // What can be refused is refused before there is a file.
         let mut controller = RunController::new(self.rig, devices)?;
-        let options = RunOptions { keep: self.keep, checkpoint_every: CHECKPOINT_EVERY };
-        let grid = self.rig.grid()?;
-        let mut recorder = Recorder::create(&path, &start).map_err(controller::Error::from)?;
-        let end = controller.run(&mut recorder, grid.pairs(), options, stop, progress)?;
-        Ok((recorder.finish(&end).map_err(controller::Error::from)?, end))
+        fit(&job, &mut controller, session.preflight)?;
+        let recorder = Recorder::create(&path, &start).map_err(controller::Error::from)?;
+        Ok(job.measure(&mut controller, recorder, session)?)
     }
 
     /// The run's file.
@@ -135,6 +181,66 @@ impl SimulatedRun<'_> {
         prepared.record.flat_reference = self.flat.clone();
         prepared.record.foam_reference = self.foam.clone();
         Ok(prepared)
+    }
+}
+
+/// Goes on with a run that was stopped or broken off: what is safe in its file is not measured again.
+///
+/// # Errors
+/// [`Error::Resume`] where that cannot be; the file is as it was.
+pub fn resume(partial: &Path, session: Session<'_>) -> Result<Measured, Error> {
+    let held = Held::read(partial)?;
+    let reason = |reason: String| recovery::Error::NoPlan { path: partial.to_owned(), reason };
+    let plan = RunPlan::from_metadata(&held.plan).map_err(reason)?;
+    if held.manifest.origin != Origin::Simulated {
+        return Err(reason("its rig is not the simulated one".to_owned()).into());
+    }
+    let prepared = match &plan.specimen {
+        PlannedSpecimen::Relief(relief) => generated(relief),
+        PlannedSpecimen::Mesh(path) => from_file(path, &held.rig)?,
+    };
+    // Behind all that was recorded: the simulated clock runs ahead of ours.
+    let start = Timestamp::now().max(held.last.plus_secs(TAKE_SECS));
+    // The same noise twice would be no noise.
+    let seed = plan.seed.wrapping_add(held.attempts.wrapping_add(1).wrapping_mul(0x9E37_79B9));
+    let devices = prepared.devices(&held.rig, start, seed, session.pace)?;
+    let folder = folder_of(partial);
+    let job = prepared.job(&held.rig, folder, plan.keep, &held.pairs, start);
+    let mut controller = RunController::new(&held.rig, devices)?;
+    fit(&job, &mut controller, session.preflight)?;
+    let (recorder, _) = Recorder::resume(partial)?;
+    Ok(job.measure(&mut controller, recorder, session)?)
+}
+
+fn fit(job: &Job<'_>, controller: &mut RunController<'_>, preflight: Preflight) -> Result<(), Error> {
+    if preflight == Preflight::Skip {
+        return Ok(());
+    }
+    let findings = job.look_over(controller, job.rig.grid()?.pairs());
+    if findings.is_empty() { Ok(()) } else { Err(Error::Unfit { findings }) }
+}
+
+impl Prepared {
+    fn devices(&self, rig: &Rig, start: Timestamp, seed: u64, pace: Pace) -> Result<Devices, Error> {
+        let reflection_factor = self.reflection_factor;
+        let simulation = Simulation { rig, relief: &self.heights, reflection_factor, start, seed };
+        let devices = devices(&simulation).map_err(controller::Error::from)?;
+        Ok(match pace {
+            Pace::Fast => devices,
+            Pace::Secs(secs) => paced(devices, secs),
+        })
+    }
+
+    fn job<'a>(
+        &'a self,
+        rig: &'a Rig,
+        folder: &'a Path,
+        keep: Keep,
+        before: &'a BTreeMap<u32, crate::recorder::Tried>,
+        started: Timestamp,
+    ) -> Job<'a> {
+        let shape = Some(Shape { heights: &self.heights, mesh: &self.mesh });
+        Job { rig, folder, shape, keep, before, started }
     }
 }
 

@@ -64,7 +64,7 @@ fn begun<T>(path: &Path, record: impl FnOnce(Result<Recorder, Error>) -> T) -> T
     let relief = Relief { heights: &heights, mesh: &mesh, original: Some(original) };
     record(Recorder::create(
         path,
-        &RunStart { manifest: &manifest, rig: &rig, surface: &surface, relief: Some(relief) },
+        &RunStart { manifest: &manifest, rig: &rig, surface: &surface, relief: Some(relief), plan: None },
     ))
 }
 
@@ -405,4 +405,46 @@ fn audio_is_the_upper_16_bits() {
     // Beyond full scale, floats are held there; between two steps, the nearer counts.
     check(SampleFormat::F32le, floats(-1.5, 1.0), [i16::MIN, i16::MAX]);
     check(SampleFormat::F32le, floats(1.6 / 32_767.0, -1.6 / 32_767.0), [2, -2]);
+}
+
+/// The topics in each chunk, in the file's order.
+fn topics_of_chunks(file: &[u8]) -> Vec<std::collections::BTreeSet<String>> {
+    let summary = Summary::read(file).expect("a summary").expect("it is there");
+    let mut chunks = summary.chunk_indexes.clone();
+    chunks.sort_by_key(|c| c.chunk_start_offset);
+    let name = |id: &u16| summary.channels[id].topic.clone();
+    chunks.iter().map(|c| c.message_index_offsets.keys().map(name).collect()).collect()
+}
+
+// Three attempts of 6 MB, so that chunks end for their size between the two checkpoints.
+#[test]
+fn heavy_topics_have_chunks_of_their_own_before_their_verdicts() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = folder.path().join("run.mcap");
+    begun(&path, |recorder| {
+        let mut recorder = recorder.expect("a recorder");
+        for second in 1..=3 {
+            attempt(&mut recorder, START.plus_secs(f64::from(second)), &sweep(1_000_000));
+        }
+        recorder.checkpoint().expect("on the disk");
+        attempt(&mut recorder, START.plus_secs(4.0), &sweep(1_000));
+        recorder.finish(&end()).expect("finished");
+    });
+    let file = std::fs::read(path).expect("the file");
+    let chunks = topics_of_chunks(&file);
+    let of = |topic: &str| chunks.iter().filter(|c| c.contains(topic)).count();
+    assert_eq!((of(topics::SWEEP), of(topics::IR), of(topics::MEASUREMENT)), (4, 2, 2), "{chunks:?}");
+    for chunk in &chunks {
+        let parts: std::collections::BTreeSet<_> = chunk.iter().map(|t| Part::of(t)).collect();
+        assert_eq!(parts.len(), 1, "{chunk:?}");
+    }
+    // Whatever byte the file is cut at: what is read has no verdict without its sweep and its response.
+    for cut in (0..file.len()).step_by(file.len() / 97) {
+        let options = Options::IgnoreEndMagic.into();
+        let Ok(messages) = MessageStream::new_with_options(&file[..cut], options) else { continue };
+        let seen: Vec<_> = messages.map_while(|m| m.ok()).map(|m| (m.channel.topic.clone(), m.log_time)).collect();
+        for (_, at) in seen.iter().filter(|(topic, _)| topic == topics::MEASUREMENT) {
+            assert!([topics::SWEEP, topics::IR, topics::TF].iter().all(|t| seen.contains(&((*t).to_owned(), *at))), "{cut}");
+        }
+    }
 }

@@ -80,7 +80,7 @@ impl Specimen {
         let record = SurfaceRecord { typology: "wavy".into(), ..SurfaceRecord::default() };
         let path = folder.path().join("run.mcap");
         let shape = Relief { heights: &relief, mesh: &mesh, original: None };
-        let start = RunStart { manifest: &manifest, rig, surface: &record, relief: Some(shape) };
+        let start = RunStart { manifest: &manifest, rig, surface: &record, relief: Some(shape), plan: None };
         let mut recorder = Recorder::create(&path, &start)?;
         let options = RunOptions { keep, checkpoint_every: PAIRS_A_CHUNK };
         let grid = rig.grid()?;
