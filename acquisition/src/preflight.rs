@@ -16,7 +16,7 @@ const RESPONSE_BYTES_A_SAMPLE: f64 = 4.0;
 /// Bytes of a pair's poses, readings and verdict, compressed, with their indexes.
 const PAIR_BYTES: f64 = 600.0;
 /// Bytes of panel, heights, summary, once a run.
-const RUN_BYTES: f64 = 4e6;
+const RUN_BYTES: f64 = 2.5e6;
 /// Attempts over pairs: more is a rig that needs looking after.
 const REPEATS: f64 = 1.1;
 
@@ -64,7 +64,7 @@ fn room(folder: &Path, free: u64, needed: u64) -> Option<Finding> {
     let megabytes = |bytes: u64| bytes as f64 / 1e6;
     (free < needed).then(|| {
         let what = format!(
-            "`{}` has {:.0} MB left, the run needs about {:.0}",
+            "the disk of `{}` is nearly full: {:.1} MB are left, the run needs about {:.1}",
             folder.display(),
             megabytes(free),
             megabytes(needed)
@@ -116,6 +116,6 @@ mod tests {
         let folder = Path::new("/data");
         assert_eq!(room(folder, 100, 100), None);
         let finding = room(folder, 99_000_000, 700_000_000).expect("a finding").to_string();
-        assert!(finding.contains("99 MB left") && finding.contains("about 700") && finding.contains("--ir-only"));
+        assert!(finding.contains("99.0 MB are left") && finding.contains("about 700.0") && finding.contains("--ir-only"));
     }
 }

@@ -7,6 +7,7 @@ mod import;
 mod ingest;
 mod optimize;
 pub(crate) mod panel;
+mod recover;
 pub(crate) mod serve;
 pub(crate) mod sql;
 mod vacuum;
@@ -35,6 +36,7 @@ pub(crate) async fn run(cli: Cli) -> anyhow::Result<Done> {
         Command::Sql(args) => sql::run(args, lake).await.map(|()| Done::Whole),
         Command::Serve(args) => serve::run(args, lake).await,
         Command::Token { name } => serve::token(name),
+        Command::Recover(args) => recover::run(args),
         Command::Doctor(args) => doctor::run(args, lake).await,
         Command::Optimize(args) => optimize::run(args, lake).await,
         Command::Vacuum(args) => vacuum::run(args, lake).await,

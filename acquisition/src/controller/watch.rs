@@ -11,8 +11,8 @@ use crate::recorder::{folder_of, free_bytes};
 
 /// Pairs that are given up in a row before the run is: one may be bad luck, with its attempts three are none.
 const LASTING: usize = 3;
-/// Kept free, so that the log, the summary and other programs' files still fit.
-pub(crate) const KEPT_FREE: u64 = 4 << 20;
+/// Kept free, so that the log and the summary still fit.
+pub(crate) const KEPT_FREE: u64 = 1 << 20;
 
 /// What is known of the run as a whole.
 pub(super) struct Watch {

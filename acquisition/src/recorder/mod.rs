@@ -31,6 +31,7 @@ use crate::session::Shape;
 use channels::Channels;
 use chunks::{ChunkWriter, Part};
 pub use error::Error;
+pub(crate) use resume::lock;
 pub use resume::{Held, Tried};
 pub use sealed::Sealed;
 pub(crate) use sealed::{folder_of, sync};

@@ -81,7 +81,8 @@ impl Held {
             rig,
             pairs: seen.pairs,
             attempts: seen.attempts,
-            bytes: [walk.verified, walk.size],
+            // A recorder that ends in order writes a summary behind its data; it is made anew.
+            bytes: [if walk.ended { walk.size } else { walk.verified }, walk.size],
             times: seen.times,
         })
     }
@@ -181,8 +182,8 @@ impl Recorder {
     }
 }
 
-// Its recorder holds a lock as long as it lives.
-fn lock(partial: &Path) -> Result<File, Error> {
+/// Takes a recording for oneself, until the file is dropped: its recorder holds a lock as long as it lives.
+pub(crate) fn lock(partial: &Path) -> Result<File, Error> {
     let file = File::open(partial).map_err(|source| Error::Read { path: partial.to_owned(), source })?;
     match file.try_lock() {
         Err(TryLockError::WouldBlock) => Err(Error::Busy { path: partial.to_owned() }),

@@ -16,7 +16,7 @@ use mcap::sans_io::linear_reader::{LinearReadEvent, LinearReader, LinearReaderOp
 use serde::Serialize;
 
 use crate::recorder::chunks::ChunkWriter;
-use crate::recorder::{folder_of, sync};
+use crate::recorder::{folder_of, lock, sync};
 pub(crate) use copy::{Copy, Counts, is_end};
 pub use error::Error;
 pub(crate) use walk::{Item, Walk};
@@ -62,8 +62,10 @@ pub fn beside(from: &Path) -> PathBuf {
 /// Rebuilds `from` as `to`, reads it back, and only then gives it its name.
 ///
 /// # Errors
-/// [`Error`]; nothing stands at `to` then, and `from` is as it was.
+/// [`Error`], [`Error::Busy`] where somebody records it; nothing stands at `to` then, and `from` is as it was.
 pub fn recover(from: &Path, to: &Path) -> Result<Report, Error> {
+    // What is being recorded goes on growing behind the copy.
+    let _lock = lock(from)?;
     let mut report = survey(from)?;
     if report.defect.is_none() && prove(from).is_ok() {
         return Ok(report);
