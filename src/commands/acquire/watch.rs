@@ -4,10 +4,11 @@ use std::io::{BufRead as _, IsTerminal as _};
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
+use std::time::Instant;
 
 use echolake_acquisition::controller::{Control, Event};
 use echolake_acquisition::metrics::RunMetrics;
-use echolake_acquisition::recorder::free_bytes;
+use echolake_acquisition::recorder::{Cost, free_bytes};
 use echolake_schema::manifest::RunEnd;
 use echolake_schema::messages::Verdict;
 use tokio::signal::unix::{SignalKind, signal};
@@ -23,6 +24,8 @@ pub(super) struct Watcher {
     given_up: u64,
     snr_db: f64,
     pair: String,
+    begun: Instant,
+    cost: Cost,
 }
 
 impl Watcher {
@@ -37,7 +40,8 @@ impl Watcher {
     ) -> Self {
         let mut task = progress.task(surface.to_owned(), planned, "pairs");
         task.begin_at(accepted);
-        Self { task, metrics, folder, repeats: 0, given_up: 0, snr_db: f64::NAN, pair: String::new() }
+        let (begun, cost) = (Instant::now(), Cost::default());
+        Self { task, metrics, folder, repeats: 0, given_up: 0, snr_db: f64::NAN, pair: String::new(), begun, cost }
     }
 
     /// Something happened. Only what is on the disk counts as done.
@@ -53,7 +57,8 @@ impl Watcher {
                 self.given_up += u64::from(m.verdict() == Verdict::Rejected);
                 self.task.note(self.line());
             }
-            Event::Safe { accepted, .. } => {
+            Event::Safe { accepted, cost, .. } => {
+                self.cost = *cost;
                 if let Ok(bytes) = free_bytes(&self.folder) {
                     self.metrics.disk_free(bytes);
                 }
@@ -66,6 +71,13 @@ impl Watcher {
 
     /// The run is over, or broke off.
     pub(super) fn done(self, end: Option<RunEnd>) {
+        let (busy, whole) = (self.cost.busy.as_secs_f64(), self.begun.elapsed().as_secs_f64());
+        self.task.say(&format!(
+            "recording took {busy:.2} s of {whole:.2}, {:.2} of it waiting for the disk; {:.1} MB in {} checkpoints",
+            self.cost.waited.as_secs_f64(),
+            self.cost.bytes as f64 / 1e6,
+            self.cost.checkpoints
+        ));
         match end {
             Some(RunEnd { accepted, rejected, attempts, .. }) => {
                 self.task.done(format!("{accepted} pairs accepted, {rejected} given up, {attempts} attempts"));
