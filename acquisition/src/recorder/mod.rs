@@ -10,6 +10,7 @@ mod sealed;
 mod space;
 #[cfg(test)]
 mod tests;
+mod tidy;
 
 use std::collections::BTreeMap;
 use std::fs::{File, OpenOptions};
@@ -39,6 +40,9 @@ pub use space::free_bytes;
 
 /// `/sweep/audio` is played this many times slower: at a scale of 1:10, 2-40 kHz become 200 Hz to 4 kHz.
 const SLOWER: f64 = 10.0;
+
+/// A run with more of them has chunks of a pair each, which cost every reader a request each.
+const MANY_CHECKPOINTS: u64 = 64;
 
 /// What is known when a run starts.
 pub struct RunStart<'a> {
@@ -316,6 +320,10 @@ impl Recorder {
         self.metadata(topics::RUN_END_METADATA, end.to_metadata())?;
         // The writer's own drop would swallow what goes wrong here.
         self.writer.finish().map_err(|e| self.failed(e.to_string()))?;
+        if self.cost.checkpoints >= MANY_CHECKPOINTS {
+            // What is on the disk is whole: where there is no room to make it better it stays as it is.
+            let _ = tidy::with_larger_chunks(&self.partial, &self.path);
+        }
         Ok(Sealed::new(self.path.clone(), self.partial.clone()))
     }
 

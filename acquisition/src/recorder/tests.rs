@@ -462,3 +462,27 @@ fn heavy_topics_have_chunks_of_their_own_before_their_verdicts() {
         }
     }
 }
+
+#[test]
+fn a_checkpoint_after_every_pair_makes_no_small_chunks_in_the_end() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = folder.path().join("run.mcap");
+    begun(&path, |recorder| {
+        let mut recorder = recorder.expect("a recorder");
+        for second in 0..100 {
+            attempt(&mut recorder, START.plus_secs(f64::from(second)), &sweep(1_000));
+            recorder.checkpoint().expect("on the disk");
+        }
+        recorder.finish(&end()).expect("finished");
+    });
+    assert_eq!(crate::recovery::prove(&path), Ok(()));
+    let file = std::fs::read(&path).expect("the file");
+    let chunks = topics_of_chunks(&file);
+    assert!(chunks.len() < 8, "{}", chunks.len());
+    let summary = Summary::read(&file).expect("a summary").expect("it is there");
+    let statistics = summary.stats.expect("statistics");
+    let counts: Vec<_> = statistics.channel_message_counts.values().copied().filter(|n| *n > 1).collect();
+    assert_eq!(counts, [100; 9]);
+    let names: Vec<_> = std::fs::read_dir(folder.path()).expect("a folder").flatten().map(|e| e.file_name()).collect();
+    assert_eq!(names, ["run.mcap"], "nothing else is left");
+}

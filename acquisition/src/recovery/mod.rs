@@ -121,6 +121,11 @@ fn survey(from: &Path) -> Result<Report, Error> {
     Ok(Report { from, to: None, bytes, verified_bytes, messages, has_end, defect })
 }
 
+/// Messages of each topic in a file's verified prefix.
+pub(crate) fn messages(path: &Path) -> Result<Counts, Error> {
+    Ok(survey(path)?.messages)
+}
+
 fn rebuild(from: &Path, to: &Path, report: &Report) -> Result<(), Error> {
     let failed = |e: mcap::McapError| Error::Write { path: to.to_owned(), reason: e.to_string() };
     let file = OpenOptions::new().write(true).create(true).truncate(true).open(to);
