@@ -4,6 +4,7 @@ use std::path::PathBuf;
 
 use clap::{Args, Parser, Subcommand};
 use echolake_acquisition::collection::LARGEST;
+use echolake_acquisition::simulate::CHECKPOINT_EVERY;
 use echolake_lake::{KEEP_HOURS, TARGET_BYTES};
 use echolake_schema::SurfaceId;
 
@@ -44,6 +45,8 @@ pub(crate) enum Command {
         /// Whose it is.
         name: String,
     },
+    /// Rebuild a recording that was cut off or damaged, as far as every checksum is right.
+    Recover(RecoverArgs),
     /// Say what is in the lake, what is missing and what is damaged.
     Doctor(DoctorArgs),
     /// Merge the tables' small files into large ones; ingest and queries may go on.
@@ -83,8 +86,11 @@ pub(crate) struct DemoArgs {
 #[derive(Debug, Args)]
 pub(crate) struct AcquireArgs {
     /// Name of the measured surface, as 0015_0.
-    #[arg(long)]
-    pub(crate) surface: SurfaceId,
+    #[arg(long, required_unless_present = "resume")]
+    pub(crate) surface: Option<SurfaceId>,
+    /// Go on with a run that was stopped or cut off: its `.mcap.partial`. What is safe in it is not measured again.
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["surface", "panel", "parameters", "set", "mesh", "rig", "flat", "foam", "seed", "ir_only"])]
+    pub(crate) resume: Option<PathBuf>,
     /// What the simulated rig measures, as `echolake panel --list` names it; by default what the surface's name begins
     /// with.
     #[arg(long, value_name = "NAME", conflicts_with = "mesh")]
@@ -113,6 +119,40 @@ pub(crate) struct AcquireArgs {
     /// Record no sweeps, only impulse responses.
     #[arg(long)]
     pub(crate) ir_only: bool,
+    /// Pairs between two checkpoints: what a power cut costs at most, and how late a pair is told to be safe.
+    #[arg(long, value_name = "PAIRS", default_value_t = CHECKPOINT_EVERY as u32, value_parser = clap::value_parser!(u32).range(1..))]
+    pub(crate) checkpoint_every: u32,
+    /// Seconds that a simulated take lasts at least; a real rig's are 12.3.
+    #[arg(long, value_name = "SECS", default_value_t = 0.0)]
+    pub(crate) pace: f64,
+    /// Begin even where disk, sensor, level or loopback are not fit.
+    #[arg(long)]
+    pub(crate) skip_checks: bool,
+    /// Append a line to this file for every attempt once it is safe on the disk: pair, attempt, verdict, SNR in dB.
+    /// `-` is stdout.
+    #[arg(long, value_name = "FILE")]
+    pub(crate) acknowledge: Option<PathBuf>,
+    /// Show the run as it happens to Foxglove and Lichtblick, which open ws://ADDR.
+    #[arg(long, value_name = "ADDR")]
+    pub(crate) live: Option<std::net::SocketAddr>,
+    /// Serve metrics for Prometheus under http://ADDR/metrics.
+    #[arg(long, value_name = "ADDR")]
+    pub(crate) metrics: Option<std::net::SocketAddr>,
+    /// Send metrics every ten seconds as InfluxDB lines: udp://HOST:PORT, or an http:// address of a write endpoint.
+    #[arg(long, value_name = "URL")]
+    pub(crate) influx: Option<String>,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct RecoverArgs {
+    /// The recording that was cut off or damaged; it is only read.
+    pub(crate) file: PathBuf,
+    /// Where the rebuilt file goes; by default beside it, without `.partial`.
+    #[arg(short, long, value_name = "FILE")]
+    pub(crate) output: Option<PathBuf>,
+    /// Print what was done as JSON.
+    #[arg(long)]
+    pub(crate) json: bool,
 }
 
 #[derive(Debug, Subcommand)]

@@ -21,6 +21,8 @@ pub(crate) struct Task {
     bar: Option<ProgressBar>,
     begun: Instant,
     last_line: Instant,
+    /// What else there is to say, behind the bar or in the line.
+    note: String,
 }
 
 impl Progress {
@@ -32,7 +34,7 @@ impl Progress {
     pub(crate) fn task(&self, name: impl Into<String>, total: u64, unit: &'static str) -> Task {
         let name = name.into();
         let bar = self.bars.as_ref().map(|bars| bars.add(bar(&name, total, unit)));
-        Task { name, unit, total, bar, begun: Instant::now(), last_line: Instant::now() }
+        Task { name, unit, total, bar, begun: Instant::now(), last_line: Instant::now(), note: String::new() }
     }
 
     /// A line among the bars.
@@ -51,9 +53,34 @@ impl Task {
             Some(bar) => bar.set_position(done),
             None if self.last_line.elapsed() >= LINE_EVERY => {
                 self.last_line = Instant::now();
-                eprintln!("{}: {done} of {} {}", self.name, self.total, self.unit);
+                let note = if self.note.is_empty() { String::new() } else { format!("; {}", self.note) };
+                eprintln!("{}: {done} of {} {}{note}", self.name, self.total, self.unit);
             }
             None => {}
+        }
+    }
+
+    /// A line that stays.
+    pub(crate) fn say(&self, line: &str) {
+        match &self.bar {
+            Some(bar) => bar.suspend(|| eprintln!("{line}")),
+            None => eprintln!("{}: {line}", self.name),
+        }
+    }
+
+    /// Says something beside the numbers.
+    pub(crate) fn note(&mut self, note: String) {
+        if let Some(bar) = &self.bar {
+            bar.set_message(note.clone());
+        }
+        self.note = note;
+    }
+
+    /// `done` units were done before it began: they do not count for the time that is left.
+    pub(crate) fn begin_at(&mut self, done: u64) {
+        if let Some(bar) = &self.bar {
+            bar.set_position(done);
+            bar.reset_eta();
         }
     }
 
@@ -71,7 +98,7 @@ impl Task {
 }
 
 fn bar(name: &str, total: u64, unit: &'static str) -> ProgressBar {
-    let template = format!("{{prefix:24}} {{wide_bar}} {{pos}}/{{len}} {unit}, {{eta}} left");
+    let template = format!("{{prefix:24}} {{wide_bar}} {{pos}}/{{len}} {unit}, {{eta}} left {{msg}}");
     let style = ProgressStyle::with_template(&template).unwrap_or_else(|_| ProgressStyle::default_bar());
     ProgressBar::new(total).with_style(style).with_prefix(name.to_owned())
 }

@@ -279,8 +279,12 @@ fn a_recording_whose_recorder_died_yields_what_was_complete() {
     let recorder = std::fs::File::open(&partial).expect("open");
     recorder.lock().expect("locked");
     place.fails(0, &["ingest"], "nothing to ingest");
+    place.fails(1, &["recover", &partial.to_string_lossy()], "is being recorded");
     drop(recorder);
-    place.fails(3, &["ingest"], "was cut off");
+    // It could be gone on with, so nobody takes it for a run but on request.
+    place.fails(0, &["ingest"], "nothing to ingest");
+    place.fails(3, &["recover", &partial.to_string_lossy()], "read back and compared");
+    place.fails(3, &["ingest"], "");
     assert_eq!(place.number("select count(*) from runs where state = 'partial'"), 1.0);
-    assert!(!partial.exists());
+    assert!(partial.exists(), "the original is as it was");
 }

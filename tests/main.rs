@@ -1,7 +1,9 @@
 //! The `echolake` command as its users run it: whole ways, exit codes, bad input, real data.
 
+mod acquire_kills;
 mod bad_input;
 mod end_to_end;
+mod forgetful;
 mod fuzz;
 mod kills;
 mod load;

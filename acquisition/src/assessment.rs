@@ -6,6 +6,8 @@ use echolake_dsp::{Error, chain};
 use echolake_schema::Rig;
 use echolake_schema::rig::Validation;
 
+use crate::objection::Objection;
+
 /// Outside of the sweep's range the assessed response is put down by this, dB: only the range counts.
 const OUT_OF_RANGE_DB: f64 = 60.0;
 /// The direct sound is looked for this near its time, samples: the first echo is nine samples behind it at least.
@@ -124,23 +126,22 @@ impl Assessor {
 
 impl Assessment {
     /// Why the rig would not accept it; empty where it would.
-    pub fn objections(&self, limits: &Validation, outside_level_db: f64) -> Vec<String> {
+    pub fn objections(&self, limits: &Validation, outside_level_db: f64) -> Vec<Objection> {
         let mut reasons = Vec::new();
         if self.clipped_samples > 0 {
-            reasons.push(format!("{} samples clipped", self.clipped_samples));
+            reasons.push(Objection::Clipped { samples: self.clipped_samples });
         }
         if !(self.loopback_dbfs >= limits.loopback_dbfs) {
-            reasons.push(format!("loopback at {:.1} dBFS, least {:.1}", self.loopback_dbfs, limits.loopback_dbfs));
+            reasons.push(Objection::Loopback { dbfs: self.loopback_dbfs, least_dbfs: limits.loopback_dbfs });
         }
         if self.snr_db < limits.snr_db {
-            reasons.push(format!("signal-to-noise ratio {:.1} dB, least {:.1}", self.snr_db, limits.snr_db));
+            reasons.push(Objection::Noise { snr_db: self.snr_db, least_db: limits.snr_db });
         }
         if self.arrival_error_us.abs() > limits.arrival_us {
-            let (off, most) = (self.arrival_error_us, limits.arrival_us);
-            reasons.push(format!("direct sound {off:.1} us off, most {most:.1}"));
+            reasons.push(Objection::Arrival { off_us: self.arrival_error_us, most_us: limits.arrival_us });
         }
         if outside_level_db > limits.outside_level_db {
-            reasons.push(format!("{outside_level_db:.1} dB outside, most {:.1}", limits.outside_level_db));
+            reasons.push(Objection::Outside { level_db: outside_level_db, most_db: limits.outside_level_db });
         }
         reasons
     }

@@ -1,25 +1,35 @@
 //! The run controller: moves, powers off, plays, records, reads the air, validates, and tries again.
 
+mod attempt;
+mod error;
+#[cfg(test)]
+mod fault_tests;
+#[cfg(test)]
+mod tests;
+pub(crate) mod watch;
+
+use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Duration;
 
 use echolake_dsp::chain::raw_len;
 use echolake_dsp::deconvolution::{DeconvolutionParams, DeconvolutionPlan, DeconvolutionScratch, TransformLength};
-use echolake_dsp::geometry::direct_mm;
 use echolake_dsp::sweep::LinearSweep;
-use echolake_dsp::temperature::speed_of_sound;
 use echolake_schema::manifest::RunEnd;
-use echolake_schema::messages::{AmbientSample, ImpulseResponse, Measurement, SampleFormat, SweepRecording, Verdict};
-use echolake_schema::samples::split_24;
+use echolake_schema::messages::{Measurement, Verdict};
 use echolake_schema::{Grid, Pair, Rig, Timestamp};
 
-use crate::assessment::{Assessment, Assessor};
-use crate::recorder::{LogLevel, Recorder};
-use crate::rig::{Devices, Positions, Power, Reading, Take};
+use crate::assessment::Assessor;
+use crate::recorder::{LogLevel, Recorder, Tried};
+use crate::rig::{Devices, Power, Take};
+pub(crate) use attempt::implausible;
+pub use error::Error;
+use watch::Watch;
 
-/// Full scale of a take's samples.
-const FULL_SCALE: f32 = 8_388_608.0;
 /// Who speaks in the log.
 const NAME: &str = "controller";
+/// How often a paused run looks whether it may go on.
+const PAUSE_LOOKS: Duration = Duration::from_millis(50);
 
 /// What a run records.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -39,38 +49,56 @@ pub struct RunOptions {
     pub checkpoint_every: usize,
 }
 
-/// Why a run ended early. What was recorded until then is kept.
-#[derive(Debug, thiserror::Error)]
-pub enum Error {
-    /// A device failed.
-    #[error(transparent)]
-    Device(#[from] crate::rig::Error),
-    /// The recording cannot be written.
-    #[error(transparent)]
-    Record(#[from] crate::recorder::Error),
-    /// The rig's settings make no plan.
-    #[error("rig `{rig}` cannot measure: {cause}")]
-    Plan {
-        /// The rig.
-        rig: String,
-        /// Why.
-        cause: echolake_dsp::Error,
+/// What a run is to measure.
+#[derive(Debug, Clone, Copy)]
+pub struct Work<'a> {
+    /// The pairs, in their order.
+    pub pairs: &'a [Pair],
+    /// What is known of pairs from before, where the run is gone on with: those that were accepted are left out.
+    pub before: &'a BTreeMap<u32, Tried>,
+    /// How it is recorded.
+    pub options: RunOptions,
+}
+
+/// What whoever watches a run can do to it, from any thread.
+#[derive(Debug, Default)]
+pub struct Control {
+    /// The run ends after the current pair.
+    pub stop: AtomicBool,
+    /// The run waits after the current pair, for as long as this is true.
+    pub pause: AtomicBool,
+}
+
+/// What happens in a run.
+#[derive(Debug, Clone, Copy)]
+pub enum Event<'a> {
+    /// The arms go to a pair.
+    Pair(Pair),
+    /// An attempt was made; it is not on the disk yet.
+    Attempt(&'a Measurement),
+    /// These verdicts are on the disk, with all they rest on: they survive a power cut. Only from here on may anybody
+    /// be told that they were measured.
+    Safe {
+        /// The verdicts since the checkpoint before.
+        verdicts: &'a [Measurement],
+        /// Pairs with an accepted measurement, those from before among them.
+        accepted: u64,
+        /// What recording has cost so far.
+        cost: crate::recorder::Cost,
     },
-    /// The rig's grid is not valid.
-    #[error(transparent)]
-    Schema(#[from] echolake_schema::Error),
-    /// The interface runs at another rate than the rig's sweep is made for.
-    #[error(
-        "rig `{rig}` samples at {expected_hz} Hz, the audio interface at {actual_hz} Hz; hint: set the interface, or `sweep.rate_hz`"
-    )]
-    Rate {
-        /// The rig.
-        rig: String,
-        /// Its rate, Hz.
-        expected_hz: f64,
-        /// The interface's, Hz.
-        actual_hz: f64,
-    },
+    /// The run waits.
+    Paused,
+    /// The run goes on.
+    Continued,
+}
+
+/// How a run ended.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Outcome {
+    /// What its file says of it.
+    pub end: RunEnd,
+    /// Pairs that were not tried, because it was stopped.
+    pub left: usize,
 }
 
 /// Measures runs with one rig.
@@ -88,22 +116,18 @@ pub struct RunController<'a> {
     ir: Vec<f32>,
 }
 
-/// One attempt, as it was measured.
-struct Attempt {
-    at: Timestamp,
-    reading: Reading,
-    reached: Positions,
-    measurement: Measurement,
-    response: Response,
-}
-
-/// Whether an attempt gave a response.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Response {
-    /// It is in the controller's buffer.
-    Deconvolved,
-    /// The recording cannot be deconvolved, and the buffer still has the response of an attempt before.
-    Missing,
+/// A run while it goes on.
+struct Running<'r> {
+    recorder: &'r mut Recorder,
+    options: RunOptions,
+    tried: BTreeMap<u32, Tried>,
+    attempts: u64,
+    ended: Timestamp,
+    watch: Watch,
+    /// Verdicts since the last checkpoint.
+    unsafe_verdicts: Vec<Measurement>,
+    /// Pairs since the last checkpoint.
+    unsafe_pairs: usize,
 }
 
 impl<'a> RunController<'a> {
@@ -155,206 +179,153 @@ impl<'a> RunController<'a> {
         })
     }
 
-    /// Measures the pairs in their order; `progress` hears of each that is done. When `stop` becomes true the run
-    /// ends after the current pair. Finishing the recording is the caller's.
+    /// The rig.
+    pub fn rig(&self) -> &'a Rig {
+        self.rig
+    }
+
+    /// Measures the pairs in their order, and tells `observe` what happens. When `control` says so the run waits or ends
+    /// after the current pair; all that was measured is on the disk then. Finishing the recording is the caller's.
     ///
     /// # Errors
-    /// [`Error::Device`] or [`Error::Record`]; what was recorded before is kept, the log says at which pair it broke
-    /// off, and the drives are off if they can be.
+    /// [`Error`]; what was recorded before is kept, the log says at which pair it broke off, and the drives are off if
+    /// they can be.
     pub fn run(
         &mut self,
         recorder: &mut Recorder,
-        pairs: &[Pair],
-        options: RunOptions,
-        stop: &AtomicBool,
-        progress: &mut dyn FnMut(usize),
-    ) -> Result<RunEnd, Error> {
-        let mut end = RunEnd { ended: Timestamp(0), accepted: 0, rejected: 0, attempts: 0 };
-        let begun = self.devices.sensor.read()?;
-        let what = format!("{} pairs with rig {}, {}", pairs.len(), self.rig.name, self.devices.origin.label());
-        recorder.log(begun.at, LogLevel::Info, NAME, &what)?;
-        end.ended = begun.at;
-        for (done, pair) in pairs.iter().enumerate() {
-            if stop.load(Ordering::Relaxed) {
-                let what = format!("stopped by hand after {done} of {} pairs", pairs.len());
-                recorder.log(end.ended, LogLevel::Warning, NAME, &what)?;
-                break;
+        work: &Work<'_>,
+        control: &Control,
+        observe: &mut dyn FnMut(Event<'_>),
+    ) -> Result<Outcome, Error> {
+        let begun = self.air()?;
+        let watch = Watch::new(recorder.partial(), begun.at);
+        let (tried, options) = (work.before.clone(), work.options);
+        let attempts = tried.values().map(|t| u64::from(t.attempts)).sum();
+        let (unsafe_verdicts, unsafe_pairs) = (Vec::new(), 0);
+        let mut run =
+            Running { recorder, options, tried, attempts, ended: begun.at, watch, unsafe_verdicts, unsafe_pairs };
+        let todo: Vec<Pair> = work.pairs.iter().filter(|p| !run.is_accepted(p.id.0)).copied().collect();
+        let (left_out, of) = (work.pairs.len() - todo.len(), work.pairs.len());
+        let what = match work.before.is_empty() {
+            true => format!("{of} pairs with rig {}, {}", self.rig.name, self.devices.origin.label()),
+            false => format!("gone on with: {left_out} of {of} pairs are measured already"),
+        };
+        run.say(LogLevel::Info, &what)?;
+        for (done, pair) in todo.iter().enumerate() {
+            if self.is_to_stop(&mut run, control, observe)? {
+                let left = todo.len() - done;
+                run.say(LogLevel::Warning, &format!("stopped by hand with {left} of {of} pairs left"))?;
+                run.checkpoint(observe)?;
+                return Ok(Outcome { end: run.end(), left });
             }
-            if let Err(error) = self.measure(recorder, *pair, options, &mut end) {
-                return Err(self.broken_off(recorder, end.ended, *pair, error));
+            observe(Event::Pair(*pair));
+            let measured = self.measure(&mut run, *pair, observe);
+            if let Err(error) = measured.and_then(|()| run.pair_done(observe)) {
+                return Err(self.broken_off(&mut run, *pair, error, observe));
             }
-            if (done + 1).is_multiple_of(options.checkpoint_every.max(1)) {
-                recorder.checkpoint()?;
-            }
-            progress(done + 1);
         }
+        let end = run.end();
         let RunEnd { accepted, rejected, attempts, .. } = end;
-        let what = format!("{accepted} pairs accepted, {rejected} given up, {attempts} attempts");
-        recorder.log(end.ended, LogLevel::Info, NAME, &what)?;
-        Ok(end)
+        run.say(LogLevel::Info, &format!("{accepted} pairs accepted, {rejected} given up, {attempts} attempts"))?;
+        run.checkpoint(observe)?;
+        Ok(Outcome { end, left: 0 })
     }
 
-    fn broken_off(&mut self, recorder: &mut Recorder, at: Timestamp, pair: Pair, error: Error) -> Error {
-        let what = format!("broken off at pair {}: {error}", pair.id.0);
+    // Waits where the run is paused.
+    fn is_to_stop(
+        &mut self,
+        run: &mut Running<'_>,
+        control: &Control,
+        observe: &mut dyn FnMut(Event<'_>),
+    ) -> Result<bool, Error> {
+        let is_set = |flag: &AtomicBool| flag.load(Ordering::Relaxed);
+        if is_set(&control.pause) && !is_set(&control.stop) {
+            run.say(LogLevel::Info, "paused by hand")?;
+            run.checkpoint(observe)?;
+            observe(Event::Paused);
+            while is_set(&control.pause) && !is_set(&control.stop) {
+                std::thread::sleep(PAUSE_LOOKS);
+            }
+            observe(Event::Continued);
+            run.ended = run.ended.max(self.air()?.at);
+            run.say(LogLevel::Info, "gone on with by hand")?;
+        }
+        Ok(is_set(&control.stop))
+    }
+
+    fn broken_off(
+        &mut self,
+        run: &mut Running<'_>,
+        pair: Pair,
+        error: Error,
+        observe: &mut dyn FnMut(Event<'_>),
+    ) -> Error {
         // The caller must hear of the first failure; that these fail behind it too would only hide it.
         let _ = self.devices.robots.power(Power::Off);
-        let _ = recorder.log(at, LogLevel::Error, NAME, &what).and_then(|()| recorder.checkpoint());
+        let told = run.say(LogLevel::Error, &format!("broken off at pair {}: {error}", pair.id.0));
+        let _ = told.and_then(|()| run.checkpoint(observe));
         error
     }
 
-    fn measure(
-        &mut self,
-        recorder: &mut Recorder,
-        pair: Pair,
-        options: RunOptions,
-        end: &mut RunEnd,
-    ) -> Result<(), Error> {
+    fn measure(&mut self, run: &mut Running<'_>, pair: Pair, observe: &mut dyn FnMut(Event<'_>)) -> Result<(), Error> {
+        let before = run.tried.get(&pair.id.0).map_or(0, |t| t.attempts);
+        let mut objections = Vec::new();
         for attempt in 1..=self.rig.validation.attempts {
-            let made = self.attempt(pair, attempt)?;
-            self.record(recorder, &made, options)?;
-            end.attempts += 1;
-            end.ended = made.at.plus_secs(self.output.len() as f64 / self.rig.sweep.rate_hz.get());
-            match made.measurement.verdict() {
-                Verdict::Accepted => {
-                    end.accepted += 1;
-                    return Ok(());
-                }
-                Verdict::Rejected => end.rejected += 1,
-                _ => {}
+            let is_last = attempt == self.rig.validation.attempts;
+            let mut made = self.attempt(run, pair, before + attempt, is_last)?;
+            run.watch.at(made.at)?;
+            self.record(run, &made)?;
+            run.attempts += 1;
+            run.ended = made.at.plus_secs(self.output.len() as f64 / self.rig.sweep.rate_hz.get());
+            observe(Event::Attempt(&made.measurement));
+            let verdict = made.measurement.verdict();
+            objections = std::mem::take(&mut made.objections);
+            let accepted = verdict == Verdict::Accepted;
+            run.tried.insert(pair.id.0, Tried { attempts: before + attempt, accepted });
+            run.unsafe_verdicts.push(made.measurement);
+            if accepted {
+                run.watch.accepted();
+                return Ok(());
+            }
+            if verdict == Verdict::Rejected {
+                break;
             }
         }
-        Ok(())
+        run.watch.given_up(&objections)
+    }
+}
+
+impl Running<'_> {
+    fn is_accepted(&self, pair: u32) -> bool {
+        self.tried.get(&pair).is_some_and(|t| t.accepted)
     }
 
-    fn attempt(&mut self, pair: Pair, attempt: u32) -> Result<Attempt, Error> {
-        let [microphone, speaker] =
-            [pair.microphone, pair.speaker].map(|id| self.grid.points()[id.index()].position_mm);
-        self.devices.robots.power(Power::On)?;
-        let reached = self.devices.robots.move_to(microphone, speaker)?;
-        // The drives hum; the arms hold by their brakes while the sweep is recorded.
-        self.devices.robots.power(Power::Off)?;
-        self.devices.audio.play_and_record(&self.output, &mut self.take)?;
-        let reading = self.devices.sensor.read()?;
-        let mut clipped = to_fractions(&self.take.microphone, &mut self.microphone);
-        clipped += to_fractions(&self.take.loopback, &mut self.loopback);
-        let arrival = direct_mm(microphone, speaker) / 1e3 / speed_of_sound(reading.temperature_c);
-        let limits = &self.rig.validation;
-        let (assessment, response, reasons) = match self.assess(arrival, clipped) {
-            Ok(found) => {
-                let mut reasons = found.objections(limits, reading.outside_level_db);
-                reasons.extend(unknowns(&found, &reading));
-                (found, Response::Deconvolved, reasons)
-            }
-            Err(cause) => (nothing(clipped), Response::Missing, vec![cause.to_string()]),
-        };
-        let verdict = match (reasons.is_empty(), attempt < self.rig.validation.attempts) {
-            (true, _) => Verdict::Accepted,
-            (false, true) => Verdict::Repeated,
-            (false, false) => Verdict::Rejected,
-        };
-        let off = |wanted: [f64; 3], reached: [f64; 3]| direct_mm(wanted, reached);
-        let measurement = Measurement {
-            pair_id: pair.id.0,
-            attempt,
-            microphone: pair.microphone.0,
-            speaker: pair.speaker.0,
-            verdict: verdict.into(),
-            snr_db: assessment.snr_db,
-            clipped_samples: clipped,
-            loopback_level_dbfs: assessment.loopback_dbfs,
-            arrival_error_us: assessment.arrival_error_us,
-            outside_level_db: reading.outside_level_db,
-            temperature_c: reading.temperature_c,
-            humidity_pct: reading.humidity_pct,
-            pressure_hpa: reading.pressure_hpa,
-            reasons,
-            microphone_residual_mm: off(microphone, reached.microphone_mm),
-            speaker_residual_mm: off(speaker, reached.speaker_mm),
-        };
-        Ok(Attempt { at: self.take.started.unwrap_or(reading.at), reading, reached, measurement, response })
+    fn end(&self) -> RunEnd {
+        let accepted = self.tried.values().filter(|t| t.accepted).count();
+        let rejected = (self.tried.len() - accepted) as u64;
+        RunEnd { ended: self.ended, accepted: accepted as u64, rejected, attempts: self.attempts }
     }
 
-    fn assess(&mut self, arrival_secs: f64, clipped: u32) -> Result<Assessment, echolake_dsp::Error> {
-        self.deconvolution.run(&self.microphone, &self.loopback, &mut self.ir, &mut self.scratch)?;
-        self.assessor.assess(&self.microphone, &self.loopback, arrival_secs, clipped)
+    fn say(&mut self, level: LogLevel, what: &str) -> Result<(), Error> {
+        Ok(self.recorder.log(self.ended, level, NAME, what)?)
     }
 
-    // The order within an attempt: what a verdict rests on stands before it, so that a cut-off file never has a
-    // verdict without its recording.
-    fn record(&mut self, recorder: &mut Recorder, made: &Attempt, options: RunOptions) -> Result<(), Error> {
-        let (at, m, reading) = (made.at, &made.measurement, &made.reading);
-        let sample_rate_hz = self.rig.sweep.rate_hz.get();
-        recorder.poses(at, made.reached.microphone_mm, made.reached.speaker_mm)?;
-        if let Some(joints) = &made.reached.joints {
-            recorder.joints(at, joints)?;
+    fn pair_done(&mut self, observe: &mut dyn FnMut(Event<'_>)) -> Result<(), Error> {
+        self.unsafe_pairs += 1;
+        if self.unsafe_pairs < self.options.checkpoint_every {
+            return Ok(());
         }
-        let sample = AmbientSample {
-            temperature_c: reading.temperature_c,
-            humidity_pct: reading.humidity_pct,
-            pressure_hpa: reading.pressure_hpa,
-            outside_level_db: reading.outside_level_db,
-        };
-        recorder.environment(reading.at, &sample)?;
-        for (device, notice) in self.devices.notices() {
-            recorder.log(at, LogLevel::Warning, device, &notice)?;
-        }
-        if options.keep == Keep::Sweeps {
-            let recording = SweepRecording {
-                pair_id: m.pair_id,
-                attempt: m.attempt,
-                sample_rate_hz,
-                sample_count: self.take.microphone.len() as u32,
-                format: SampleFormat::S24Split.into(),
-                microphone: split_24(&self.take.microphone).into(),
-                loopback: split_24(&self.take.loopback).into(),
-                temperature_c: reading.temperature_c,
-            };
-            recorder.sweep(at, &recording)?;
-        }
-        if made.response == Response::Deconvolved {
-            let ir = ImpulseResponse {
-                pair_id: m.pair_id,
-                attempt: m.attempt,
-                sample_rate_hz,
-                samples: self.ir.clone(),
-                temperature_c: reading.temperature_c,
-                temperature_corrected: false,
-            };
-            recorder.ir(at, &ir)?;
-        }
-        recorder.measurement(at, m)?;
-        if m.verdict() != Verdict::Accepted {
-            let next = if m.verdict() == Verdict::Repeated { "tried again" } else { "given up" };
-            let what = format!("pair {}, attempt {}: {}; {next}", m.pair_id, m.attempt, m.reasons.join("; "));
-            recorder.log(at, LogLevel::Warning, NAME, &what)?;
-        }
+        self.checkpoint(observe)?;
+        self.watch.disk()
+    }
+
+    // Nobody hears of a verdict before the disk has it.
+    fn checkpoint(&mut self, observe: &mut dyn FnMut(Event<'_>)) -> Result<(), Error> {
+        self.recorder.checkpoint()?;
+        self.unsafe_pairs = 0;
+        let verdicts = std::mem::take(&mut self.unsafe_verdicts);
+        let accepted = self.tried.values().filter(|t| t.accepted).count() as u64;
+        observe(Event::Safe { verdicts: &verdicts, accepted, cost: self.recorder.cost() });
         Ok(())
     }
 }
-
-// A comparison with NaN objects to nothing, and a take of which nothing is known is no good one.
-fn unknowns(found: &Assessment, reading: &Reading) -> Vec<String> {
-    let values = [
-        ("signal-to-noise ratio", found.snr_db),
-        ("arrival of the direct sound", found.arrival_error_us),
-        // Infinite is as bad as unknown here, while a take without any noise has an infinite ratio.
-        ("temperature", if reading.temperature_c.is_finite() { reading.temperature_c } else { f64::NAN }),
-        ("level outside", reading.outside_level_db),
-    ];
-    values.into_iter().filter(|(_, x)| x.is_nan()).map(|(what, _)| format!("{what} unknown")).collect()
-}
-
-// Samples as fractions of full scale; returns how many are at it.
-fn to_fractions(samples: &[i32], out: &mut Vec<f32>) -> u32 {
-    out.clear();
-    out.extend(samples.iter().map(|x| *x as f32 / FULL_SCALE));
-    samples.iter().filter(|x| **x <= -(1 << 23) || **x >= (1 << 23) - 1).count() as u32
-}
-
-fn nothing(clipped_samples: u32) -> Assessment {
-    let unknown = f64::NAN;
-    Assessment { snr_db: unknown, clipped_samples, loopback_dbfs: unknown, arrival_error_us: unknown }
-}
-
-#[cfg(test)]
-mod tests;

@@ -1,25 +1,33 @@
 //! One run of the simulated rig, from a relief or a mesh to a closed MCAP file.
 
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
-use std::sync::atomic::AtomicBool;
+use std::sync::atomic::{AtomicBool, Ordering};
 
 use echolake_schema::manifest::{MeshFacts, Origin, RunEnd, RunManifest};
+use echolake_schema::messages::Verdict;
 use echolake_schema::{Rig, RunId, SurfaceId, SurfaceRecord, Timestamp};
 
-use crate::controller::{self, Keep, RunController, RunOptions};
+use crate::controller::{self, Control, Event, Keep, RunController};
 use crate::drivers;
 use crate::mesh::{self, Format, Mesh};
-use crate::recorder::{OriginalFile, Recorder, Relief as RecordedRelief, RunStart};
+use crate::plan::{PlannedSpecimen, RunPlan};
+use crate::preflight::Finding;
+use crate::recorder::{Held, OriginalFile, Recorder, Relief as RecordedRelief, RunStart, Tried, folder_of};
+use crate::recovery;
 use crate::relief::{HeightField, Relief};
-use crate::rigs::simulated::{FACETS, Simulation, devices};
+use crate::rig::Devices;
+use crate::rigs::paced::paced;
+use crate::rigs::simulated::{FACETS, Simulation, TAKE_SECS, devices};
 use crate::robots::Choreography;
+use crate::session::{Job, Measured, Pace, Preflight, Session, Shape};
 
 /// Cells along each side of the recorded panel mesh.
 pub(crate) const MESH_CELLS: usize = 117;
 /// The back of a generated panel, mm.
 pub(crate) const BACK_MM: f32 = -30.0;
 /// Pairs between two checkpoints; a simulated run that is lost is made again.
-const CHECKPOINT_EVERY: usize = 200;
+pub const CHECKPOINT_EVERY: usize = 200;
 
 /// What is measured.
 #[derive(Debug, Clone)]
@@ -65,6 +73,15 @@ pub enum Error {
     /// A name is not valid.
     #[error(transparent)]
     Schema(#[from] echolake_schema::Error),
+    /// The run cannot be gone on with.
+    #[error(transparent)]
+    Resume(#[from] recovery::Error),
+    /// Something is not fit, and nothing was begun.
+    #[error("not fit to measure: {}", findings.iter().map(ToString::to_string).collect::<Vec<_>>().join("\n  and: "))]
+    Unfit {
+        /// What.
+        findings: Vec<Finding>,
+    },
 }
 
 /// A specimen, ready to be measured and recorded.
@@ -77,27 +94,49 @@ struct Prepared {
 }
 
 impl SimulatedRun<'_> {
-    /// Measures all pairs; returns the run's file and how it ended.
+    /// Measures all pairs, looked over by nobody; returns the run's file and how it ended.
     ///
     /// # Errors
     /// [`Error`]; a run that was begun leaves its `.partial` file.
     pub fn measure(&self, stop: &AtomicBool, progress: &mut dyn FnMut(usize)) -> Result<(PathBuf, RunEnd), Error> {
+        let (control, mut done) = (Control::default(), 0);
+        let mut observe = |event: Event<'_>| match event {
+            Event::Pair(_) => control.stop.store(stop.load(Ordering::Relaxed), Ordering::Relaxed),
+            Event::Attempt(m) if m.verdict() != Verdict::Repeated => {
+                done += 1;
+                progress(done);
+            }
+            _ => {}
+        };
+        let session = Session {
+            control: &control,
+            observe: &mut observe,
+            tap: None,
+            preflight: Preflight::Skip,
+            checkpoint_every: CHECKPOINT_EVERY,
+            pace: Pace::Fast,
+        };
+        let measured = self.begin(session, None)?;
+        Ok((measured.path, measured.outcome.end))
+    }
+
+    /// Measures all pairs under somebody's eyes. A run that is stopped, or that breaks off, can be gone on with.
+    ///
+    /// # Errors
+    /// [`Error`]; a run that was begun leaves its `.partial` file.
+    pub fn supervised(&self, session: Session<'_>) -> Result<Measured, Error> {
+        let specimen = match self.specimen {
+            Specimen::Relief(relief) => PlannedSpecimen::Relief(relief.clone()),
+            Specimen::Mesh(path) => PlannedSpecimen::Mesh(path.clone()),
+        };
+        let plan = RunPlan { keep: self.keep, seed: self.seed, specimen };
+        self.begin(session, Some(plan.to_metadata()))
+    }
+
+    fn begin(&self, session: Session<'_>, plan: Option<BTreeMap<String, String>>) -> Result<Measured, Error> {
         let prepared = self.prepare()?;
-        let arms = Choreography::of(self.rig)?;
-        let simulation = Simulation {
-            rig: self.rig,
-            relief: &prepared.heights,
-            reflection_factor: prepared.reflection_factor,
-            start: self.start,
-            seed: self.seed,
-            arms: arms.clone(),
-        };
-        let real = drivers::open(self.rig).map_err(controller::Error::from)?;
-        let devices = match real {
-            Some(real) => real,
-            None => devices(&simulation).map_err(controller::Error::from)?,
-        };
-        let (origin, checkpoint_every) = (devices.origin, checkpoint_every(devices.origin));
+        let devices = prepared.devices(self.rig, self.start, self.seed, session.pace)?;
+        let origin = devices.origin;
         let manifest = RunManifest {
             run_id: self.run_id()?,
             surface_id: self.surface.clone(),
@@ -112,21 +151,17 @@ impl SimulatedRun<'_> {
             bytes,
         });
         let relief = RecordedRelief { heights: &prepared.heights, mesh: &prepared.mesh, original };
-        let start = RunStart { manifest: &manifest, rig: self.rig, surface: &prepared.record, relief: Some(relief) };
+        let (surface, relief) = (&prepared.record, Some(relief));
+        let start = RunStart { manifest: &manifest, rig: self.rig, surface, relief, plan };
         let path = self.path()?;
+        let nothing = BTreeMap::new();
+        let specimen = (&prepared, origin);
+        let job = job(specimen, self.rig, self.folder, self.keep, &nothing, self.start)?;
         // What can be refused is refused before there is a file.
         let mut controller = RunController::new(self.rig, devices)?;
-        let options = RunOptions { keep: self.keep, checkpoint_every };
-        let grid = self.rig.grid()?;
-        let mut recorder = Recorder::create(&path, &start).map_err(controller::Error::from)?;
-        let mut pairs = grid.pairs().to_vec();
-        if let Some(arms) = &arms {
-            let shown = recorder.arms(self.start, arms.cell(), name_of(origin));
-            shown.map_err(controller::Error::from)?;
-            arms.sort(&mut pairs);
-        }
-        let end = controller.run(&mut recorder, &pairs, options, stop, progress)?;
-        Ok((recorder.finish(&end).map_err(controller::Error::from)?, end))
+        fit(&job, &mut controller, session.preflight)?;
+        let recorder = Recorder::create(&path, &start).map_err(controller::Error::from)?;
+        Ok(job.measure(&mut controller, recorder, session)?)
     }
 
     /// The run's file.
@@ -153,19 +188,68 @@ impl SimulatedRun<'_> {
     }
 }
 
-// A measured pair is 12 s of a rig's time.
-fn checkpoint_every(origin: Origin) -> usize {
-    match origin {
-        Origin::Simulated => CHECKPOINT_EVERY,
-        _ => 1,
+/// Goes on with a run that was stopped or broken off: what is safe in its file is not measured again.
+///
+/// # Errors
+/// [`Error::Resume`] where that cannot be; the file is as it was.
+pub fn resume(partial: &Path, session: Session<'_>) -> Result<Measured, Error> {
+    let held = Held::read(partial)?;
+    let reason = |reason: String| recovery::Error::NoPlan { path: partial.to_owned(), reason };
+    let plan = RunPlan::from_metadata(&held.plan).map_err(reason)?;
+    let prepared = match &plan.specimen {
+        PlannedSpecimen::Relief(relief) => generated(relief),
+        PlannedSpecimen::Mesh(path) => from_file(path, &held.rig)?,
+    };
+    // Behind all that was recorded: the simulated clock runs ahead of ours.
+    let start = Timestamp::now().max(held.last.plus_secs(TAKE_SECS));
+    // The same noise twice would be no noise.
+    let seed = plan.seed.wrapping_add(held.attempts.wrapping_add(1).wrapping_mul(0x9E37_79B9));
+    let devices = prepared.devices(&held.rig, start, seed, session.pace)?;
+    let origin = devices.origin;
+    if held.manifest.origin != origin {
+        let reason = reason("the rig's devices are simulated now and were not, or the other way round".to_owned());
+        return Err(reason.into());
+    }
+    let job = job((&prepared, origin), &held.rig, folder_of(partial), plan.keep, &held.pairs, start)?;
+    let mut controller = RunController::new(&held.rig, devices)?;
+    fit(&job, &mut controller, session.preflight)?;
+    let (recorder, _) = Recorder::resume(partial)?;
+    Ok(job.measure(&mut controller, recorder, session)?)
+}
+
+fn fit(job: &Job<'_>, controller: &mut RunController<'_>, preflight: Preflight) -> Result<(), Error> {
+    if preflight == Preflight::Skip {
+        return Ok(());
+    }
+    let findings = job.look_over(controller, job.rig.grid()?.pairs());
+    if findings.is_empty() { Ok(()) } else { Err(Error::Unfit { findings }) }
+}
+
+impl Prepared {
+    fn devices(&self, rig: &Rig, start: Timestamp, seed: u64, pace: Pace) -> Result<Devices, Error> {
+        if let Some(real) = drivers::open(rig).map_err(controller::Error::from)? {
+            return Ok(real);
+        }
+        let (reflection_factor, arms) = (self.reflection_factor, Choreography::of(rig)?);
+        let simulation = Simulation { rig, relief: &self.heights, reflection_factor, start, seed, arms };
+        let devices = devices(&simulation).map_err(controller::Error::from)?;
+        Ok(match pace {
+            Pace::Fast => devices,
+            Pace::Secs(secs) => paced(devices, secs),
+        })
     }
 }
 
-fn name_of(origin: Origin) -> &'static str {
-    match origin {
-        Origin::Simulated => "simulated_rig",
-        _ => "rig",
-    }
+fn job<'a>(
+    (prepared, origin): (&'a Prepared, Origin),
+    rig: &'a Rig,
+    folder: &'a Path,
+    keep: Keep,
+    before: &'a BTreeMap<u32, Tried>,
+    started: Timestamp,
+) -> Result<Job<'a>, Error> {
+    let shape = Some(Shape { heights: &prepared.heights, mesh: &prepared.mesh });
+    Ok(Job { rig, folder, shape, keep, before, started, arms: Choreography::of(rig)?, origin })
 }
 
 fn generated(relief: &Relief) -> Prepared {

@@ -211,7 +211,12 @@ async fn find_strays(lake: &Lake, snapshot: &Snapshot, report: &mut Report) -> R
             Some("inbox") if path.extension() == Some("mcap") => {
                 report.find(Severity::Missing, &path, "not yet taken in; hint: `echolake ingest`");
             }
-            Some("inbox") => report.find(Severity::Note, &path, "a recording that goes on, or was cut off"),
+            Some("inbox") => report.find(
+                Severity::Note,
+                &path,
+                "a recording that goes on, or was stopped or cut off; hint: `echolake acquire --resume` goes on with it, \
+                 `echolake recover` makes a run of what it holds",
+            ),
             Some("runs") => report.find(Severity::Missing, &path, "in no table; hint: `echolake ingest`"),
             Some("quarantine") => report.find(Severity::Note, &path, "was refused; the reason stands beside it"),
             Some("tables") if FileName::parse(&path).is_some() => {

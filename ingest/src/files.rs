@@ -91,7 +91,8 @@ pub async fn pending(lake: &Lake) -> Result<Vec<Source>> {
 }
 
 /// Makes runs of the recordings in the inbox whose recorder died, so that ingest takes in what was complete; returns
-/// them. Those that are still being recorded stay, and so do those of imports, which are made again from their files.
+/// them. Those that are still being recorded stay, those that can be gone on with, and those of imports, which are made
+/// again from their files.
 ///
 /// # Errors
 /// [`Error::Read`] where the inbox cannot be changed.
@@ -106,7 +107,11 @@ pub async fn adopt_cut_off(lake: &Lake) -> Result<Vec<Path>> {
             continue;
         };
         let to = inbox.join(name);
-        if !name.ends_with(".mcap") || to.exists() || is_being_recorded(&partial) || is_imported(&partial).await {
+        if !name.ends_with(".mcap")
+            || to.exists()
+            || is_being_recorded(&partial)
+            || is_made_whole_otherwise(&partial).await
+        {
             continue;
         }
         let failed = |e: std::io::Error| Error::read(partial.display(), e);
@@ -125,10 +130,12 @@ fn is_being_recorded(partial: &FsPath) -> bool {
     }
 }
 
-async fn is_imported(partial: &FsPath) -> bool {
+// A run that is gone on with becomes a better one than its first part; an import is made again.
+async fn is_made_whole_otherwise(partial: &FsPath) -> bool {
     let Ok(path) = absolute(partial) else { return false };
     let opened = Opened { store: Arc::new(LocalFileSystem::new()), path, name: partial.display().to_string() };
-    Head::read(&opened).await.is_some_and(|head| matches!(head.origin, Origin::ImportedWav | Origin::ImportedGir))
+    let is = |head: Head| head.has_plan || matches!(head.origin, Origin::ImportedWav | Origin::ImportedGir);
+    Head::read(&opened).await.is_some_and(is)
 }
 
 /// Brings a run's file to its place, before any row names it.

@@ -54,6 +54,8 @@ pub(crate) struct Head {
     pub(crate) surface: SurfaceId,
     pub(crate) references: Vec<SurfaceId>,
     pub(crate) origin: Origin,
+    /// It says how the run is gone on with.
+    pub(crate) has_plan: bool,
 }
 
 impl Head {
@@ -73,7 +75,8 @@ impl Head {
         let manifest = RunManifest::from_metadata(envelope.metadata.get(topics::RUN_METADATA)?).ok()?;
         let surface = envelope.surface(&opened.name).ok()?;
         let references = [surface.flat_reference, surface.foam_reference].into_iter().flatten().collect();
-        Some(Self { surface: manifest.surface_id, references, origin: manifest.origin })
+        let has_plan = envelope.metadata.contains_key(topics::RUN_PLAN_METADATA);
+        Some(Self { surface: manifest.surface_id, references, origin: manifest.origin, has_plan })
     }
 }
 
@@ -171,7 +174,7 @@ impl RunContent {
         let end = envelope.metadata.get(topics::RUN_END_METADATA).map(RunEnd::from_metadata);
         let end = end.and_then(|end| end.map_err(|cause| damaged.push(cause.to_string())).ok());
         let responses = best_responses(whole.responses);
-        let rejected = whole.verdicts.iter().filter(|v| v.1.verdict() == Verdict::Rejected).count() as u64;
+        let rejected = given_up(&whole.verdicts);
         let attempts = whole.verdicts.len() as u64;
         let accepted = join(whole.verdicts, responses, &mut damaged);
         Ok(Self {
@@ -280,6 +283,14 @@ fn best_responses(responses: Vec<Response>) -> BTreeMap<(u32, u32), Response> {
         }
     }
     best
+}
+
+// Pairs without an accepted attempt. A run that is gone on with tries those again that it gave up before.
+fn given_up(verdicts: &[(i64, Measurement)]) -> u64 {
+    let of = |verdict: Verdict| -> HashSet<u32> {
+        verdicts.iter().filter(|v| v.1.verdict() == verdict).map(|v| v.1.pair_id).collect()
+    };
+    of(Verdict::Rejected).difference(&of(Verdict::Accepted)).count() as u64
 }
 
 // The last accepted attempt at a pair is its measurement.

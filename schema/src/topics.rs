@@ -32,6 +32,11 @@ pub const SPEAKER_JOINTS: &str = "/robots/speaker/joint_states";
 
 /// Metadata record written first: what the run is.
 pub const RUN_METADATA: &str = "echolake.run";
+/// Metadata record written behind it where a run can be gone on with: what that takes. Such a recording is no run yet
+/// while it is unfinished, however its recorder ended.
+pub const RUN_PLAN_METADATA: &str = "echolake.run.plan";
+/// Metadata record of a file that was rebuilt: from what, and what was lost.
+pub const RECOVERY_METADATA: &str = "echolake.recovery";
 /// Metadata record written last: how the run ended. A file without it was cut off.
 pub const RUN_END_METADATA: &str = "echolake.run.end";
 

@@ -1,99 +1,223 @@
-//! `echolake acquire`: one surface measured with the simulated rig.
+//! `echolake acquire`: one surface measured with the simulated rig, watched, paused, stopped and gone on with.
 
-use std::path::Path;
+mod acknowledge;
+mod specimen;
+mod watch;
+
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::time::Duration;
 
 use anyhow::Context as _;
-use echolake_acquisition::controller::Keep;
+use echolake_acquisition::controller::{Control, Event, Keep};
+use echolake_acquisition::live::LiveServer;
 use echolake_acquisition::mesh::Mesh;
-use echolake_acquisition::relief::Relief;
-use echolake_acquisition::simulate::{SimulatedRun, Specimen};
+use echolake_acquisition::metrics::{InfluxPush, MetricsServer, RunMetrics, Target};
+use echolake_acquisition::recorder::{Held, partial_of};
+use echolake_acquisition::session::{Measured, Pace, Preflight, Session};
+use echolake_acquisition::simulate::{self, SimulatedRun, Specimen};
 use echolake_lake::{Lake, References};
 use echolake_schema::{Rig, SurfaceId, Timestamp};
 
 use crate::Done;
 use crate::cli::AcquireArgs;
 use crate::progress::Progress;
+use acknowledge::Acknowledgements;
+pub(super) use specimen::{relief_of_file, set_all};
+use watch::Watcher;
+
+/// How often a time-series store is told.
+const TOLD_EVERY: Duration = Duration::from_secs(10);
+
+/// A run that is about to begin, or to be gone on with.
+enum Job {
+    Fresh(Box<Fresh>),
+    Resumed { partial: PathBuf, held: Box<Held> },
+}
+
+/// A run that is about to begin.
+struct Fresh {
+    rig: Rig,
+    surface: SurfaceId,
+    specimen: Specimen,
+    folder: PathBuf,
+    flat: Option<SurfaceId>,
+    foam: Option<SurfaceId>,
+    start: Timestamp,
+    seed: u64,
+    keep: Keep,
+}
 
 pub(crate) async fn run(args: &AcquireArgs, lake_url: &str) -> anyhow::Result<Done> {
-    // What is to be measured is checked before a lake is made for it.
-    let specimen = match (&args.mesh, &args.parameters) {
-        (Some(mesh), _) => Specimen::Mesh(mesh.clone()),
-        (None, Some(file)) => {
-            let mut relief = relief_of_file(file)?;
-            set_all(&mut relief, &args.set)?;
-            Specimen::Relief(relief)
-        }
-        (None, None) => Specimen::Relief(relief(args.panel.as_deref(), &args.surface, &args.set)?),
+    // What can be refused is refused before anything is made for it.
+    let influx = args.influx.as_deref().map(str::parse::<Target>).transpose()?;
+    let pace = if args.pace > 0.0 { Pace::Secs(args.pace) } else { Pace::Fast };
+    let progress = Progress::new();
+    let job = match &args.resume {
+        Some(partial) => Job::Resumed { partial: partial.clone(), held: Box::new(Held::read(partial)?) },
+        None => fresh(args, lake_url, &progress).await?,
     };
+    progress.say("simulated rig: nothing here is measured");
+    let (surface, planned, accepted) = job.size()?;
+    let mut acknowledgements = args.acknowledge.as_deref().map(Acknowledgements::open).transpose()?;
+    let metrics = RunMetrics::new(&surface, planned, accepted);
+    let live = args.live.map(LiveServer::start).transpose()?;
+    if let Some(live) = &live {
+        progress.say(format!("live: open ws://{} in Foxglove or Lichtblick", live.address()));
+    }
+    let served = args.metrics.map(|address| MetricsServer::start(address, metrics.clone()));
+    let served = served.transpose().with_context(|| format!("cannot serve metrics at {:?}", args.metrics))?;
+    if let Some(served) = &served {
+        progress.say(format!("metrics: http://{}/metrics", served.address()));
+    }
+    let pushed = influx.map(|target| {
+        InfluxPush::start(target, metrics.clone(), TOLD_EVERY, |e| eprintln!("warning: metrics were not taken: {e}"))
+    });
+    let control = Arc::new(Control::default());
+    watch::obey(&control);
+    let mut watcher = Watcher::new(&progress, &surface, planned, accepted, metrics.clone(), job.folder());
+    let preflight = if args.skip_checks { Preflight::Skip } else { Preflight::Check };
+    let (checkpoint_every, tap) = (args.checkpoint_every as usize, live.as_ref().map(LiveServer::tap));
+    let partial = job.partial()?;
+    let measured = tokio::task::spawn_blocking(move || {
+        let mut observe = |event: Event<'_>| {
+            if let Some(acknowledgements) = &mut acknowledgements {
+                acknowledgements.observe(&event);
+            }
+            watcher.observe(&event);
+        };
+        let session = Session { control: &control, observe: &mut observe, tap, preflight, checkpoint_every, pace };
+        let measured = job.measure(session);
+        if measured.is_err() {
+            metrics.broke_off();
+        }
+        watcher.done(measured.as_ref().ok().map(|m| m.outcome.end));
+        measured
+    });
+    let measured = measured.await?;
+    // The last numbers are told, and viewers are let go, before the command ends.
+    drop((pushed, served, live));
+    match measured {
+        Ok(measured) => tell(&measured, lake_url),
+        Err(error) => {
+            if partial.exists() {
+                go_on(&partial, lake_url);
+            }
+            Err(error.into())
+        }
+    }
+}
+
+// Where the run's file is, and what to do next.
+fn tell(measured: &Measured, lake_url: &str) -> anyhow::Result<Done> {
+    let Measured { path, outcome } = measured;
+    if outcome.left > 0 {
+        eprintln!("stopped with {} pairs left; nothing that was measured is lost", outcome.left);
+        go_on(path, lake_url);
+        return Ok(Done::Whole);
+    }
+    super::print(&path.display().to_string())?;
+    eprintln!("next: echolake --lake {lake_url} ingest");
+    Ok(if outcome.end.rejected > 0 { Done::WithLoss } else { Done::Whole })
+}
+
+fn go_on(partial: &Path, lake_url: &str) {
+    eprintln!("to go on: echolake --lake {lake_url} acquire --resume {}", partial.display());
+}
+
+async fn fresh(args: &AcquireArgs, lake_url: &str, progress: &Progress) -> anyhow::Result<Job> {
+    let specimen = specimen::of(args)?;
     let rig = super::rig_or(args.rig.as_deref(), lake_url, Rig::paper).await?;
     if let Specimen::Mesh(path) = &specimen {
         Mesh::read(path)?.check(rig.panel.size_mm, rig.panel.depth_mm, path)?;
     }
     let lake = Lake::open_or_create(lake_url, &rig, &References::default()).await?;
     let folder = super::inbox(&lake)?;
-    let stop = super::stop_on_interrupt();
-    let (args_surface, seed) = (args.surface.clone(), args.seed);
-    let (flat, foam) = (args.flat.clone(), args.foam.clone());
-    let keep = if args.ir_only { Keep::ResponsesOnly } else { Keep::Sweeps };
-    let progress = Progress::new();
-    progress.say("simulated rig: nothing here is measured");
-    let pairs = rig.grid()?.pairs().len();
-    let mut task = progress.task(args.surface.to_string(), pairs as u64, "pairs");
-    let measured = tokio::task::spawn_blocking(move || {
-        let run = SimulatedRun {
-            rig: &rig,
-            surface: args_surface,
-            specimen: &specimen,
-            flat,
-            foam,
-            start: Timestamp::now(),
-            seed,
-            keep,
-            folder: &folder,
-        };
-        let outcome = run.measure(&stop, &mut |done| task.at(done as u64));
-        outcome.map(|(path, end)| {
-            task.done(format!("{} pairs accepted, {} given up, {} attempts", end.accepted, end.rejected, end.attempts));
-            (path, end)
-        })
-    });
-    let (path, end) = measured.await??;
-    super::print(&path.display().to_string())?;
-    eprintln!("next: echolake --lake {lake_url} ingest");
-    Ok(if end.rejected > 0 { Done::WithLoss } else { Done::Whole })
-}
-
-/// The named relief, or the one that the surface's name begins with, with its parameters set.
-pub(super) fn relief(name: Option<&str>, surface: &SurfaceId, set: &[String]) -> anyhow::Result<Relief> {
-    let guessed = || Relief::guess(surface.as_str());
-    let name = name.or_else(guessed).with_context(|| {
-        format!(
-            "unknown surface `{surface}`: it says nothing of its relief; hint: --panel {} or --mesh FILE",
-            Relief::NAMES.join("|")
-        )
-    })?;
-    with_parameters(name, set)
-}
-
-/// A relief with its parameters set from `key=value`.
-pub(super) fn with_parameters(name: &str, set: &[String]) -> anyhow::Result<Relief> {
-    let mut relief = Relief::by_name(name)?;
-    set_all(&mut relief, set)?;
-    Ok(relief)
-}
-
-/// Sets parameters from `key=value`.
-pub(super) fn set_all(relief: &mut Relief, set: &[String]) -> anyhow::Result<()> {
-    for setting in set {
-        let (key, value) =
-            setting.split_once('=').with_context(|| format!("`--set {setting}` has no `=`; hint: --set key=value"))?;
-        relief.set(key, value)?;
+    let surface = args.surface.clone().context("no surface is named; hint: --surface NAME")?;
+    // Its references may well come later: its rows wait for them. Whoever measures by mistake without any is told.
+    let snapshot = lake.snapshot().await?;
+    for named in [&args.flat, &args.foam].into_iter().flatten() {
+        if *named != surface && !snapshot.runs().any(|run| run.surface == *named) {
+            progress.say(format!("warning: reference `{named}` is not measured yet; rows of `{surface}` wait for it"));
+        }
     }
-    Ok(())
+    for unfinished in unfinished(&folder, surface.as_str()) {
+        progress.say(format!(
+            "note: `{}` is unfinished; hint: `echolake acquire --resume` goes on with it",
+            unfinished.display()
+        ));
+    }
+    Ok(Job::Fresh(Box::new(Fresh {
+        rig,
+        surface,
+        specimen,
+        folder,
+        flat: args.flat.clone(),
+        foam: args.foam.clone(),
+        start: Timestamp::now(),
+        seed: args.seed,
+        keep: if args.ir_only { Keep::ResponsesOnly } else { Keep::Sweeps },
+    })))
 }
 
-/// The relief of a file of parameters.
-pub(super) fn relief_of_file(path: &Path) -> anyhow::Result<Relief> {
-    let text = std::fs::read_to_string(path).with_context(|| format!("cannot read parameters `{}`", path.display()))?;
-    Relief::from_json(&text).with_context(|| format!("parameters `{}`", path.display()))
+// Recordings of the surface that were not ended: names of runs have the surface behind their time.
+fn unfinished(folder: &Path, surface: &str) -> Vec<PathBuf> {
+    let Ok(entries) = std::fs::read_dir(folder) else { return Vec::new() };
+    let is_of = |path: &PathBuf| {
+        let name = path.file_name().and_then(|n| n.to_str()).and_then(|n| n.strip_suffix(".mcap.partial"));
+        name.is_some_and(|n| n.rsplit_once('-').is_some_and(|(rest, _)| rest.ends_with(&format!("Z-{surface}"))))
+    };
+    entries.flatten().map(|entry| entry.path()).filter(is_of).collect()
+}
+
+impl Job {
+    fn folder(&self) -> PathBuf {
+        match self {
+            Self::Fresh(fresh) => fresh.folder.clone(),
+            Self::Resumed { partial, .. } => match partial.parent() {
+                Some(folder) if !folder.as_os_str().is_empty() => folder.to_owned(),
+                _ => PathBuf::from("."),
+            },
+        }
+    }
+
+    // The surface, its pairs, and how many of them are measured already.
+    fn size(&self) -> anyhow::Result<(String, u64, u64)> {
+        let (surface, rig, accepted) = match self {
+            Self::Fresh(fresh) => (&fresh.surface, &fresh.rig, 0),
+            Self::Resumed { held, .. } => (&held.manifest.surface_id, &held.rig, held.accepted() as u64),
+        };
+        Ok((surface.to_string(), rig.grid()?.pairs().len() as u64, accepted))
+    }
+
+    // What the recording is named until it is whole.
+    fn partial(&self) -> anyhow::Result<PathBuf> {
+        match self {
+            Self::Fresh(fresh) => Ok(partial_of(&fresh.run().path()?)),
+            Self::Resumed { partial, .. } => Ok(partial.clone()),
+        }
+    }
+
+    fn measure(&self, session: Session<'_>) -> Result<Measured, simulate::Error> {
+        match self {
+            Self::Fresh(fresh) => fresh.run().supervised(session),
+            Self::Resumed { partial, .. } => simulate::resume(partial, session),
+        }
+    }
+}
+
+impl Fresh {
+    fn run(&self) -> SimulatedRun<'_> {
+        SimulatedRun {
+            rig: &self.rig,
+            surface: self.surface.clone(),
+            specimen: &self.specimen,
+            flat: self.flat.clone(),
+            foam: self.foam.clone(),
+            start: self.start,
+            seed: self.seed,
+            keep: self.keep,
+            folder: &self.folder,
+        }
+    }
 }

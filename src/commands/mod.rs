@@ -7,6 +7,7 @@ mod import;
 mod ingest;
 mod optimize;
 pub(crate) mod panel;
+mod recover;
 pub(crate) mod serve;
 pub(crate) mod sql;
 mod vacuum;
@@ -35,6 +36,7 @@ pub(crate) async fn run(cli: Cli) -> anyhow::Result<Done> {
         Command::Sql(args) => sql::run(args, lake).await.map(|()| Done::Whole),
         Command::Serve(args) => serve::run(args, lake).await,
         Command::Token { name } => serve::token(name),
+        Command::Recover(args) => recover::run(args),
         Command::Doctor(args) => doctor::run(args, lake).await,
         Command::Optimize(args) => optimize::run(args, lake).await,
         Command::Vacuum(args) => vacuum::run(args, lake).await,
@@ -78,6 +80,12 @@ async fn rig_or(file: Option<&Path>, lake_url: &str, otherwise: impl FnOnce() ->
 fn inbox(lake: &Lake) -> anyhow::Result<std::path::PathBuf> {
     let folder = lake.folder().context("recordings need a lake in a folder; hint: --lake FOLDER")?.join("inbox");
     std::fs::create_dir_all(&folder).with_context(|| format!("cannot make `{}`", folder.display()))?;
+    // A recording that is on the disk is of no use where its folder's name is not, or the lake's.
+    for above in folder.ancestors().skip(1).take(2) {
+        let above = if above.as_os_str().is_empty() { Path::new(".") } else { above };
+        let synced = std::fs::File::open(above).and_then(|opened| opened.sync_all());
+        synced.with_context(|| format!("cannot sync `{}`", above.display()))?;
+    }
     Ok(folder)
 }
 

@@ -4,13 +4,13 @@ use std::sync::Arc;
 use std::sync::atomic::AtomicU32;
 
 use echolake_schema::manifest::{Origin, RunManifest};
-use echolake_schema::messages::Message as RunMessage;
+use echolake_schema::messages::{ImpulseResponse, Message as RunMessage, SweepRecording};
 use echolake_schema::{RunId, topics};
 
 use super::*;
 use crate::recorder::RunStart;
 use crate::relief::Relief;
-use crate::rig::{AmbientSensor, AudioInterface, Error as RigError, Robots};
+use crate::rig::{AmbientSensor, AudioInterface, Error as RigError, Positions, Reading, Robots};
 use crate::rigs::simulated::{Simulation, devices};
 
 /// An interface with something wrong on its first takes.
@@ -145,22 +145,30 @@ fn record(rig: &Rig, devices: Devices, pairs: usize, keep: Keep, stop_after: usi
         origin: Origin::Simulated,
     };
     let surface = echolake_schema::SurfaceRecord::default();
-    let run = RunStart { manifest: &manifest, rig, surface: &surface, relief: None };
+    let run = RunStart { manifest: &manifest, rig, surface: &surface, relief: None, plan: None };
     let path = folder.path().join("run.mcap");
     let mut recorder = Recorder::create(&path, &run).expect("a recorder");
     let mut controller = RunController::new(rig, devices).expect("a controller");
     let pairs: Vec<_> = controller.grid.pairs().iter().step_by(2951 / pairs).copied().take(pairs).collect();
-    let (stop, options) = (AtomicBool::new(false), RunOptions { keep, checkpoint_every: 50 });
-    let mut progress = |done| stop.store(done >= stop_after, Ordering::Relaxed);
-    let end = controller.run(&mut recorder, &pairs, options, &stop, &mut progress);
-    let path = match &end {
-        Ok(end) => recorder.finish(end).expect("finished"),
+    let (control, nothing) = (Control::default(), BTreeMap::new());
+    let options = RunOptions { keep, checkpoint_every: 50 };
+    let work = Work { pairs: &pairs, before: &nothing, options };
+    let mut tried = 0;
+    let mut observe = |event: Event<'_>| {
+        if matches!(event, Event::Attempt(m) if m.verdict() != Verdict::Repeated) {
+            tried += 1;
+            control.stop.store(tried >= stop_after, Ordering::Relaxed);
+        }
+    };
+    let outcome = controller.run(&mut recorder, &work, &control, &mut observe);
+    let path = match &outcome {
+        Ok(outcome) => recorder.finish(&outcome.end).expect("finished"),
         Err(_) => {
             drop(recorder);
             path.with_extension("mcap.partial")
         }
     };
-    Recorded { end, file: std::fs::read(path).expect("the file") }
+    Recorded { end: outcome.map(|o| o.end), file: std::fs::read(path).expect("the file") }
 }
 
 fn run_of(rig: &Rig, devices: Devices, pairs: usize) -> Recorded {
@@ -290,19 +298,14 @@ fn an_interface_at_another_rate_is_refused() {
 fn an_attempt_is_recorded_before_its_verdict() {
     let rig = quick();
     let run = record(&rig, simulated(&rig, 0.83, 3), 2, Keep::Sweeps, usize::MAX);
-    let attempt = [
-        topics::TF,
-        topics::MICROPHONE_POSE,
-        topics::SPEAKER_POSE,
-        topics::ENVIRONMENT,
-        topics::SWEEP,
-        topics::SWEEP_AUDIO,
-        topics::IR,
-        topics::MEASUREMENT,
-    ];
-    let expected: Vec<_> = [topics::LOG].iter().chain(&attempt).chain(&attempt).chain(&[topics::LOG]).collect();
     let recorded = run.topics();
-    assert_eq!(recorded[recorded.len() - expected.len()..].iter().collect::<Vec<_>>(), expected);
+    let places =
+        |topic: &str| recorded.iter().enumerate().filter(|(_, t)| *t == topic).map(|(i, _)| i).collect::<Vec<_>>();
+    for rests_on in [topics::SWEEP, topics::SWEEP_AUDIO, topics::IR, topics::TF, topics::ENVIRONMENT] {
+        let (before, verdicts) = (places(rests_on), places(topics::MEASUREMENT));
+        assert_eq!(before.len(), 2, "{rests_on}");
+        assert!(before.iter().zip(&verdicts).all(|(a, b)| a < b), "{rests_on}: {recorded:?}");
+    }
     let rate = rig.sweep.rate_hz.get();
     for sweep in run.all::<SweepRecording>(topics::SWEEP) {
         assert_eq!([sweep.microphone.len(), sweep.loopback.len()], [3 * rig.recording_len(); 2]);
@@ -328,7 +331,7 @@ fn samples_are_recorded_bit_by_bit() {
     for (bytes, expected) in [(&sweep.microphone, &expected[..]), (&sweep.loopback, &expected[1..])] {
         let mut fractions = vec![0.0; rig.recording_len()];
         echolake_schema::samples::decode(sweep.format(), bytes, &mut fractions).expect("samples");
-        assert!(fractions.iter().zip(expected).all(|(y, x)| (y * FULL_SCALE) as i32 == *x));
+        assert!(fractions.iter().zip(expected).all(|(y, x)| (y * 8_388_608.0) as i32 == *x));
     }
 }
 

@@ -96,7 +96,7 @@ impl Import<'_> {
         let path = self.options.folder.join(format!("{run_id}.mcap"));
         let relief =
             heights.as_ref().zip(mesh.as_ref()).map(|(heights, mesh)| Relief { heights, mesh, original: None });
-        let start = RunStart { manifest: &manifest, rig: self.rig, surface: &record, relief };
+        let start = RunStart { manifest: &manifest, rig: self.rig, surface: &record, relief, plan: None };
         let mut recorder = batch.create(&path, &start)?;
         if self.order.is_none() {
             let what = "no combinations.csv: rows are taken in the order of the rig's pairs";

@@ -86,7 +86,7 @@ impl Import<'_> {
         };
         let record = SurfaceRecord { typology: "imported".into(), ..SurfaceRecord::default() };
         let path = self.options.folder.join(format!("{run_id}.mcap"));
-        let start = RunStart { manifest: &run, rig: self.rig, surface: &record, relief: None };
+        let start = RunStart { manifest: &run, rig: self.rig, surface: &record, relief: None, plan: None };
         let mut recorder = batch.create(&path, &start)?;
         recorder.log(started, LogLevel::Info, NAME, &format!("{} recordings", rows.len()))?;
         let mut warnings = Vec::new();
@@ -139,7 +139,8 @@ impl Import<'_> {
         if judged.snr_db.is_nan() {
             judged.snr_db = f64::INFINITY;
         }
-        let reasons = judged.objections(&rig.validation, f64::NEG_INFINITY);
+        let reasons: Vec<_> =
+            judged.objections(&rig.validation, f64::NEG_INFINITY).iter().map(ToString::to_string).collect();
         let sample_rate_hz = rig.sweep.rate_hz.get();
         recorder.poses(at, m, s)?;
         recorder.environment(

@@ -10,6 +10,9 @@ use echolake_schema::topics;
 use foxglove::Encode;
 use mcap::Writer;
 
+use super::Topic;
+use super::chunks::Part;
+
 /// Channels of the topics, in the order of their registration.
 #[derive(Default)]
 pub(super) struct Channels {
@@ -27,6 +30,33 @@ pub(super) struct Channels {
 }
 
 impl Channels {
+    /// Which chunks a channel's messages go to.
+    pub(super) fn part(&self, channel: u16) -> Part {
+        match channel {
+            c if c == self.sweep || c == self.audio => Part::Sweeps,
+            c if c == self.ir => Part::Responses,
+            _ => Part::Light,
+        }
+    }
+
+    /// All of them, as readers need them.
+    pub(super) fn topics(&self) -> Vec<Topic> {
+        use foxglove::messages as fg;
+        vec![
+            foxglove_topic::<fg::FrameTransforms>(self.tf, topics::TF),
+            foxglove_topic::<fg::SceneUpdate>(self.scene, topics::PANEL_SCENE),
+            foxglove_topic::<fg::PointCloud>(self.points, topics::PANEL_POINTS),
+            foxglove_topic::<fg::PoseInFrame>(self.microphone, topics::MICROPHONE_POSE),
+            foxglove_topic::<fg::PoseInFrame>(self.speaker, topics::SPEAKER_POSE),
+            own_topic::<SweepRecording>(self.sweep, topics::SWEEP),
+            foxglove_topic::<fg::RawAudio>(self.audio, topics::SWEEP_AUDIO),
+            own_topic::<ImpulseResponse>(self.ir, topics::IR),
+            own_topic::<AmbientSample>(self.environment, topics::ENVIRONMENT),
+            own_topic::<Measurement>(self.measurement, topics::MEASUREMENT),
+            foxglove_topic::<fg::Log>(self.log, topics::LOG),
+        ]
+    }
+
     /// Declares every topic, so that a reader knows all of them whatever the run holds.
     pub(super) fn register(writer: &mut Writer<BufWriter<File>>) -> mcap::McapResult<Self> {
         use foxglove::messages as fg;
@@ -57,4 +87,28 @@ pub(super) fn foxglove_channel<M: Encode>(writer: &mut Writer<BufWriter<File>>, 
 fn own_channel<M: RunMessage>(writer: &mut Writer<BufWriter<File>>, topic: &str) -> mcap::McapResult<u16> {
     let schema = writer.add_schema(M::FULL_NAME, "protobuf", FILE_DESCRIPTOR_SET)?;
     writer.add_channel(schema, topic, "protobuf", &Default::default())
+}
+
+pub(super) fn foxglove_topic<M: Encode>(channel: u16, topic: &str) -> Topic {
+    let schema = M::get_schema();
+    let (name, encoding, data) = schema.map(|s| (s.name, s.encoding, s.data.into_owned())).unwrap_or_default();
+    Topic {
+        channel,
+        topic: topic.into(),
+        encoding: M::get_message_encoding(),
+        schema: name,
+        schema_encoding: encoding,
+        schema_data: data,
+    }
+}
+
+fn own_topic<M: RunMessage>(channel: u16, topic: &str) -> Topic {
+    Topic {
+        channel,
+        topic: topic.into(),
+        encoding: "protobuf".into(),
+        schema: M::FULL_NAME.into(),
+        schema_encoding: "protobuf".into(),
+        schema_data: FILE_DESCRIPTOR_SET.to_vec(),
+    }
 }

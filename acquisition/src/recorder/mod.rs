@@ -3,15 +3,20 @@
 
 mod arms;
 mod channels;
+pub(crate) mod chunks;
 mod error;
+mod resume;
 mod scene;
 mod sealed;
+mod space;
 #[cfg(test)]
 mod tests;
+mod tidy;
 
+use std::collections::BTreeMap;
 use std::fs::{File, OpenOptions};
-use std::io::BufWriter;
 use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
 
 use echolake_schema::manifest::{RunEnd, RunManifest};
 use echolake_schema::messages::{
@@ -19,20 +24,26 @@ use echolake_schema::messages::{
 };
 use echolake_schema::{Rig, SurfaceRecord, Timestamp, samples, topics};
 use foxglove::Encode;
+use mcap::Attachment;
 use mcap::records::{MessageHeader, Metadata};
-use mcap::{Attachment, WriteOptions, Writer};
 
 use crate::mesh::Mesh;
 use crate::relief::HeightField;
+use crate::session::Shape;
 use channels::Channels;
+use chunks::{ChunkWriter, Part};
 pub use error::Error;
+pub(crate) use resume::lock;
+pub use resume::{Held, Tried};
 pub use sealed::Sealed;
-use sealed::sync;
+pub(crate) use sealed::{folder_of, sync};
+pub use space::free_bytes;
 
-/// A chunk is ended at this size; a message never straddles two.
-const CHUNK_BYTES: u64 = 1 << 20;
 /// `/sweep/audio` is played this many times slower: at a scale of 1:10, 2-40 kHz become 200 Hz to 4 kHz.
 const SLOWER: f64 = 10.0;
+
+/// A run with more of them has chunks of a pair each, which cost every reader a request each.
+const MANY_CHECKPOINTS: u64 = 64;
 
 /// What is known when a run starts.
 pub struct RunStart<'a> {
@@ -44,6 +55,8 @@ pub struct RunStart<'a> {
     pub surface: &'a SurfaceRecord,
     /// Its shape, where it is known.
     pub relief: Option<Relief<'a>>,
+    /// What it takes to go on with the run, where it can be; becomes metadata `echolake.run.plan`.
+    pub plan: Option<BTreeMap<String, String>>,
 }
 
 /// A surface's shape.
@@ -79,9 +92,50 @@ pub enum LogLevel {
     Error,
 }
 
+/// Hears every message as it is recorded, before it is on the disk: for live views.
+pub trait Tap: Send {
+    /// The topics that may come, before the first message.
+    fn topics(&mut self, topics: Vec<Topic>);
+
+    /// A message; it must not wait for anybody.
+    fn message(&mut self, channel: u16, log_time_nanos: u64, data: &[u8]);
+}
+
+/// A topic, as readers of its messages need it.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Topic {
+    /// Its channel in the file.
+    pub channel: u16,
+    /// Its name.
+    pub topic: String,
+    /// How messages are encoded.
+    pub encoding: String,
+    /// The schema's name.
+    pub schema: String,
+    /// How the schema is encoded.
+    pub schema_encoding: String,
+    /// The schema.
+    pub schema_data: Vec<u8>,
+}
+
+/// What recording has cost so far.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub struct Cost {
+    /// Messages taken.
+    pub messages: u64,
+    /// Their bytes, before compression.
+    pub bytes: u64,
+    /// Checkpoints.
+    pub checkpoints: u64,
+    /// Time spent in taking, compressing and writing.
+    pub busy: Duration,
+    /// Time spent waiting for the disk at checkpoints, which `busy` has, too.
+    pub waited: Duration,
+}
+
 /// A run being recorded. Dropped before [`Recorder::finish`], it leaves `<path>.partial`.
 pub struct Recorder {
-    writer: Writer<BufWriter<File>>,
+    writer: ChunkWriter,
     path: PathBuf,
     partial: PathBuf,
     channels: Channels,
@@ -89,10 +143,12 @@ pub struct Recorder {
     encoded: Vec<u8>,
     /// The arms, where their joints are known.
     arms: Option<arms::Arms>,
+    tap: Option<Box<dyn Tap>>,
+    cost: Cost,
 }
 
 /// The name of a recording until it is whole.
-fn partial_of(path: &Path) -> PathBuf {
+pub fn partial_of(path: &Path) -> PathBuf {
     let mut name = path.as_os_str().to_owned();
     name.push(".partial");
     name.into()
@@ -134,19 +190,23 @@ impl Recorder {
 
     fn over(file: File, path: &Path, partial: &Path) -> Result<Self, Error> {
         let (path, partial) = (path.to_owned(), partial.to_owned());
-        let writer = WriteOptions::new()
-            .profile("")
-            .library(concat!("echolake ", env!("CARGO_PKG_VERSION")))
-            .chunk_size(Some(CHUNK_BYTES))
-            // One thread: the same run gives the same bytes, and runs are recorded side by side.
-            .compression_threads(0)
-            .create(BufWriter::new(file));
-        match writer {
-            Ok(writer) => {
-                let channels = Channels::default();
-                Ok(Self { writer, path, partial, channels, sequence: 0, encoded: Vec::new(), arms: None })
-            }
+        match ChunkWriter::new(file) {
+            Ok(writer) => Ok(Self::with(writer, path, partial, Channels::default(), 0)),
             Err(e) => Err(Error::Create { path, reason: e.to_string() }),
+        }
+    }
+
+    fn with(writer: ChunkWriter, path: PathBuf, partial: PathBuf, channels: Channels, sequence: u32) -> Self {
+        Self {
+            writer,
+            path,
+            partial,
+            channels,
+            sequence,
+            encoded: Vec::new(),
+            arms: None,
+            tap: None,
+            cost: Cost::default(),
         }
     }
 
@@ -154,6 +214,9 @@ impl Recorder {
     fn head(&mut self, start: &RunStart<'_>) -> Result<(), Error> {
         let at = start.manifest.started;
         self.metadata(topics::RUN_METADATA, start.manifest.to_metadata())?;
+        if let Some(plan) = &start.plan {
+            self.metadata(topics::RUN_PLAN_METADATA, plan.clone())?;
+        }
         let surface = serde_json::to_vec_pretty(start.surface).map_err(|e| Error::Surface { reason: e.to_string() })?;
         self.attach(at, topics::RIG_ATTACHMENT, "application/toml", start.rig.to_toml().as_bytes())?;
         self.attach(at, topics::SURFACE_ATTACHMENT, "application/json", &surface)?;
@@ -166,12 +229,40 @@ impl Recorder {
                 self.attach(at, &own_name(file.name), file.media_type, file.bytes)?;
             }
         }
-        self.channels = Channels::register(&mut self.writer).map_err(|e| self.failed(e.to_string()))?;
+        self.channels = Channels::register(&mut self.writer.mcap).map_err(|e| self.failed(e.to_string()))?;
         if let (Some(relief), Some(glb)) = (&start.relief, glb) {
             self.foxglove(self.channels.scene, at, &scene::panel(at, glb))?;
             self.foxglove(self.channels.points, at, &scene::points(at, relief.heights))?;
         }
-        self.checkpoint()
+        self.checkpoint()?;
+        // The file's name, too, survives a power cut from here on.
+        sync(folder_of(&self.partial)).map_err(|reason| self.failed(reason))
+    }
+
+    /// Lets `tap` hear every message from now on, and shows it the panel, which is in the file since its head.
+    pub(crate) fn listen(&mut self, mut tap: Box<dyn Tap>, at: Timestamp, shape: Option<Shape<'_>>) {
+        let mut topics = self.channels.topics();
+        topics.extend(self.arms.iter().flat_map(arms::Arms::topics));
+        tap.topics(topics);
+        if let Some(arms) = &self.arms {
+            arms.show(at, &mut *tap);
+        }
+        if let Some(Shape { heights, mesh }) = shape {
+            let time = u64::try_from(at.0).unwrap_or(0);
+            let mut encoded = Vec::new();
+            // A Vec grows, so encoding into it cannot fail.
+            let _ = scene::panel(at, mesh.to_bytes(crate::mesh::Format::Glb)).encode(&mut encoded);
+            tap.message(self.channels.scene, time, &encoded);
+            encoded.clear();
+            let _ = scene::points(at, heights).encode(&mut encoded);
+            tap.message(self.channels.points, time, &encoded);
+        }
+        self.tap = Some(tap);
+    }
+
+    /// What recording has cost so far.
+    pub fn cost(&self) -> Cost {
+        self.cost
     }
 
     /// Records where microphone and speaker stand, mm: `/tf` and both poses.
@@ -195,17 +286,20 @@ impl Recorder {
     pub fn sweep(&mut self, at: Timestamp, recording: &SweepRecording) -> Result<(), Error> {
         self.own(self.channels.sweep, at, recording)?;
         let rate = (recording.sample_rate_hz / SLOWER).round() as u32;
-        self.foxglove(self.channels.audio, at, &scene::audio(at, top_16_bits(recording), rate))
+        self.foxglove(self.channels.audio, at, &scene::audio(at, top_16_bits(recording), rate))?;
+        self.end_large(Part::Sweeps)
     }
 
     /// Records an impulse response.
     pub fn ir(&mut self, at: Timestamp, ir: &ImpulseResponse) -> Result<(), Error> {
-        self.own(self.channels.ir, at, ir)
+        self.own(self.channels.ir, at, ir)?;
+        self.end_large(Part::Responses)
     }
 
     /// Records what became of an attempt.
     pub fn measurement(&mut self, at: Timestamp, measurement: &Measurement) -> Result<(), Error> {
-        self.own(self.channels.measurement, at, measurement)
+        self.own(self.channels.measurement, at, measurement)?;
+        self.end_large(Part::Light)
     }
 
     /// Records a line of the log.
@@ -213,10 +307,20 @@ impl Recorder {
         self.foxglove(self.channels.log, at, &scene::log(at, level, name, message))
     }
 
-    /// Ends the chunk and waits until it is on the disk: what was recorded survives a power cut.
+    /// Ends the chunks and waits until they are on the disk: what was recorded survives a power cut, and may be
+    /// acknowledged.
+    ///
+    /// # Errors
+    /// [`Error::Write`]: nothing that was recorded since the checkpoint before may be acknowledged.
     pub fn checkpoint(&mut self) -> Result<(), Error> {
-        let flushed = self.writer.flush().map_err(|e| e.to_string());
-        flushed.and_then(|()| sync(&self.partial)).map_err(|reason| self.failed(reason))
+        let begun = Instant::now();
+        self.writer.end_all().map_err(|e| self.failed(e.to_string()))?;
+        let written = Instant::now();
+        self.writer.sync().map_err(|e| self.failed(e.to_string()))?;
+        self.cost.checkpoints += 1;
+        self.cost.waited += written.elapsed();
+        self.cost.busy += begun.elapsed();
+        Ok(())
     }
 
     /// Ends the recording and gives it its name; returns its path.
@@ -235,8 +339,11 @@ impl Recorder {
     pub fn seal(mut self, end: &RunEnd) -> Result<Sealed, Error> {
         self.metadata(topics::RUN_END_METADATA, end.to_metadata())?;
         // The writer's own drop would swallow what goes wrong here.
-        let finished = self.writer.finish().map(drop).map_err(|e| e.to_string());
-        finished.and_then(|()| sync(&self.partial)).map_err(|reason| self.failed(reason))?;
+        self.writer.finish().map_err(|e| self.failed(e.to_string()))?;
+        if self.cost.checkpoints >= MANY_CHECKPOINTS {
+            // What is on the disk is whole: where there is no room to make it better it stays as it is.
+            let _ = tidy::with_larger_chunks(&self.partial, &self.path);
+        }
         Ok(Sealed::new(self.path.clone(), self.partial.clone()))
     }
 
@@ -265,10 +372,25 @@ impl Recorder {
     }
 
     fn write(&mut self, channel_id: u16, at: Timestamp, data: &[u8]) -> Result<(), Error> {
+        let begun = Instant::now();
         let log_time = u64::try_from(at.0).unwrap_or(0);
         self.sequence += 1;
         let header = MessageHeader { channel_id, sequence: self.sequence, log_time, publish_time: log_time };
-        self.writer.write_to_known_channel(&header, data).map_err(|e| self.failed(e.to_string()))
+        self.writer.push(self.channels.part(channel_id), header, data);
+        self.cost.messages += 1;
+        self.cost.bytes += data.len() as u64;
+        self.cost.busy += begun.elapsed();
+        if let Some(tap) = &mut self.tap {
+            tap.message(channel_id, log_time, data);
+        }
+        Ok(())
+    }
+
+    fn end_large(&mut self, part: Part) -> Result<(), Error> {
+        let begun = Instant::now();
+        let ended = self.writer.end_large(part).map_err(|e| self.failed(e.to_string()));
+        self.cost.busy += begun.elapsed();
+        ended
     }
 
     fn attach(&mut self, at: Timestamp, name: &str, media_type: &str, data: &[u8]) -> Result<(), Error> {
@@ -280,12 +402,14 @@ impl Recorder {
             media_type: media_type.to_owned(),
             data: data.into(),
         };
-        self.writer.attach(&attachment).map_err(|e| self.failed(e.to_string()))
+        self.writer.mcap.attach(&attachment).map_err(|e| self.failed(e.to_string()))
     }
 
-    fn metadata(&mut self, name: &str, metadata: std::collections::BTreeMap<String, String>) -> Result<(), Error> {
+    fn metadata(&mut self, name: &str, metadata: BTreeMap<String, String>) -> Result<(), Error> {
         let record = Metadata { name: name.to_owned(), metadata };
-        self.writer.write_metadata(&record).map_err(|e| self.failed(e.to_string()))
+        // Behind all that came before it: a run's end is the last of it.
+        let written = self.writer.end_all().and_then(|()| self.writer.mcap.write_metadata(&record));
+        written.map_err(|e| self.failed(e.to_string()))
     }
 
     fn failed(&self, reason: String) -> Error {

@@ -39,12 +39,12 @@ impl Sealed {
 }
 
 /// Waits until a file's content, or a folder's entries, are on the disk.
-pub(super) fn sync(path: &Path) -> Result<(), String> {
+pub(crate) fn sync(path: &Path) -> Result<(), String> {
     File::open(path).and_then(|f| f.sync_all()).map_err(|e| e.to_string())
 }
 
-// A bare name's parent is the empty path, which nobody can open.
-fn folder_of(path: &Path) -> &Path {
+/// The folder that a file stands in. A bare name's parent is the empty path, which nobody can open.
+pub(crate) fn folder_of(path: &Path) -> &Path {
     match path.parent() {
         Some(folder) if !folder.as_os_str().is_empty() => folder,
         _ => Path::new("."),

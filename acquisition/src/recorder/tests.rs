@@ -14,6 +14,7 @@ use prost::Message as _;
 use rs_opw_kinematics::glam;
 
 use super::*;
+use crate::recovery::{Item, Walk};
 use crate::robots::Choreography;
 
 const START: Timestamp = Timestamp(1_767_600_000_123_456_789);
@@ -67,7 +68,7 @@ fn begun<T>(path: &Path, record: impl FnOnce(Result<Recorder, Error>) -> T) -> T
     let relief = Relief { heights: &heights, mesh: &mesh, original: Some(original) };
     record(Recorder::create(
         path,
-        &RunStart { manifest: &manifest, rig: &rig, surface: &surface, relief: Some(relief) },
+        &RunStart { manifest: &manifest, rig: &rig, surface: &surface, relief: Some(relief), plan: None },
     ))
 }
 
@@ -328,16 +329,15 @@ fn records_are_chunked_checked_and_in_order() {
 
 #[test]
 fn a_flipped_bit_is_noticed() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = folder.path().join("flipped.mcap");
     let file = whole();
     let summary = Summary::read(&file).expect("a summary").expect("it is there");
     for chunk in &summary.chunk_indexes {
         let mut flipped = file.clone();
         flipped[(chunk.chunk_start_offset + chunk.chunk_length / 2) as usize] ^= 0x10;
-        // The reader checks the chunks' sums where it is asked to.
-        let options = Options::ValidateChunkCrcs.into();
-        let messages: McapResult<Vec<_>> =
-            MessageStream::new_with_options(&flipped, options).expect("an MCAP file").collect();
-        assert!(messages.is_err(), "the chunk at {}", chunk.chunk_start_offset);
+        std::fs::write(&path, &flipped).expect("written");
+        assert!(crate::recovery::prove(&path).is_err(), "the chunk at {}", chunk.chunk_start_offset);
     }
 }
 
@@ -457,4 +457,84 @@ fn audio_is_the_upper_16_bits() {
     // Beyond full scale, floats are held there; between two steps, the nearer counts.
     check(SampleFormat::F32le, floats(-1.5, 1.0), [i16::MIN, i16::MAX]);
     check(SampleFormat::F32le, floats(1.6 / 32_767.0, -1.6 / 32_767.0), [2, -2]);
+}
+
+/// The topics in each chunk, in the file's order.
+fn topics_of_chunks(file: &[u8]) -> Vec<std::collections::BTreeSet<String>> {
+    let summary = Summary::read(file).expect("a summary").expect("it is there");
+    let mut chunks = summary.chunk_indexes.clone();
+    chunks.sort_by_key(|c| c.chunk_start_offset);
+    let name = |id: &u16| summary.channels[id].topic.clone();
+    chunks.iter().map(|c| c.message_index_offsets.keys().map(name).collect()).collect()
+}
+
+// Three attempts of 1.6 MB, so that chunks end for their size between the two checkpoints.
+#[test]
+fn heavy_topics_have_chunks_of_their_own_before_their_verdicts() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = folder.path().join("run.mcap");
+    begun(&path, |recorder| {
+        let mut recorder = recorder.expect("a recorder");
+        for second in 1..=3 {
+            attempt(&mut recorder, START.plus_secs(f64::from(second)), &sweep(200_000));
+        }
+        recorder.checkpoint().expect("on the disk");
+        attempt(&mut recorder, START.plus_secs(4.0), &sweep(1_000));
+        recorder.finish(&end()).expect("finished");
+    });
+    let file = std::fs::read(path).expect("the file");
+    let chunks = topics_of_chunks(&file);
+    let of = |topic: &str| chunks.iter().filter(|c| c.contains(topic)).count();
+    assert_eq!((of(topics::SWEEP), of(topics::IR), of(topics::MEASUREMENT)), (4, 2, 2), "{chunks:?}");
+    for chunk in &chunks {
+        let parts: std::collections::BTreeSet<_> = chunk.iter().map(|t| Part::of(t)).collect();
+        assert_eq!(parts.len(), 1, "{chunk:?}");
+    }
+    // Whatever byte the file is cut at: what is read has no verdict without its sweep and its response.
+    let cut_off = folder.path().join("cut.mcap");
+    for cut in (0..file.len()).step_by(file.len() / 41) {
+        std::fs::write(&cut_off, &file[..cut]).expect("written");
+        let Ok(mut walk) = Walk::open(&cut_off) else { continue };
+        let (mut names, mut seen) = (BTreeMap::new(), std::collections::BTreeSet::new());
+        while let Some(item) = walk.next().expect("readable") {
+            let Item::Chunk(records) = item else { continue };
+            for record in records {
+                match record {
+                    Record::Channel(channel) => drop(names.insert(channel.id, channel.topic)),
+                    Record::Message { header, .. } => {
+                        seen.insert((names[&header.channel_id].clone(), header.log_time));
+                    }
+                    _ => {}
+                }
+            }
+        }
+        for (_, at) in seen.iter().filter(|(topic, _)| topic == topics::MEASUREMENT) {
+            let is_there = |topic: &&str| seen.contains(&((*topic).to_owned(), *at));
+            assert!([topics::SWEEP, topics::IR, topics::TF].iter().all(is_there), "cut at {cut}");
+        }
+    }
+}
+
+#[test]
+fn a_checkpoint_after_every_pair_makes_no_small_chunks_in_the_end() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = folder.path().join("run.mcap");
+    begun(&path, |recorder| {
+        let mut recorder = recorder.expect("a recorder");
+        for second in 0..100 {
+            attempt(&mut recorder, START.plus_secs(f64::from(second)), &sweep(1_000));
+            recorder.checkpoint().expect("on the disk");
+        }
+        recorder.finish(&end()).expect("finished");
+    });
+    assert_eq!(crate::recovery::prove(&path), Ok(()));
+    let file = std::fs::read(&path).expect("the file");
+    let chunks = topics_of_chunks(&file);
+    assert!(chunks.len() < 8, "{}", chunks.len());
+    let summary = Summary::read(&file).expect("a summary").expect("it is there");
+    let statistics = summary.stats.expect("statistics");
+    let counts: Vec<_> = statistics.channel_message_counts.values().copied().filter(|n| *n > 1).collect();
+    assert_eq!(counts, [100; 9]);
+    let names: Vec<_> = std::fs::read_dir(folder.path()).expect("a folder").flatten().map(|e| e.file_name()).collect();
+    assert_eq!(names, ["run.mcap"], "nothing else is left");
 }

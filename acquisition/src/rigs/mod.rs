@@ -1,3 +1,4 @@
 //! Implementations of the rig's traits.
 
+pub(crate) mod paced;
 pub mod simulated;

@@ -27,7 +27,7 @@ pub const FACETS: usize = 274;
 /// Samples that a response goes on for behind its farthest echo: the band limit rings.
 const RINGING: f64 = 32.0;
 /// Time of one measurement (Rust et al. 2021): moving, settling, sweep.
-const TAKE_SECS: f64 = 12.3;
+pub(crate) const TAKE_SECS: f64 = 12.3;
 /// Gain from pressure at 1 m to full scale: the direct sound at 75 mm stays 9 dB under it.
 const MICROPHONE_GAIN: f64 = 0.037;
 /// Noise of the channels, rms re full scale: -102 and -108 dB.

@@ -76,6 +76,8 @@ pub(crate) struct Summary {
 struct Subject {
     specimen: Specimen,
     whole: Inspection,
+    /// What it makes of the recorded responses: they are taken where their sweeps cannot be read.
+    from_responses: Vec<Inspected>,
 }
 
 /// Runs the campaign; `progress` hears of each round.
@@ -93,7 +95,11 @@ pub(crate) async fn run(settings: Settings, progress: &mut dyn FnMut(u64)) -> Re
         ensure!(NAME == format!("runs/{}/{}.mcap", whole.surface, whole.run), "it is run {}", whole.run);
         ensure!(whole.whole && whole.damaged.is_empty(), "undamaged, but {:?}", whole.damaged);
         ensure!(whole.measurements.len() > specimen.chunks.len(), "too few measurements: {}", whole.measurements.len());
-        subjects.push(Subject { specimen, whole });
+        subjects.push(Subject { specimen, whole, from_responses: Vec::new() });
+    }
+    // The same seed: the second specimen is the first one without its sweeps.
+    if let [sweeps, responses] = &mut subjects[..] {
+        sweeps.from_responses.clone_from(&responses.whole.measurements);
     }
     let mut summary = Summary {
         by_kind: Kind::ALL.map(|k| (k.label(), Tally::default())).to_vec(),
@@ -146,7 +152,7 @@ fn count_panics() {
 
 impl Subject {
     fn facts(&self) -> (&'static str, usize, usize, usize) {
-        let Self { specimen, whole } = self;
+        let Self { specimen, whole, .. } = self;
         (specimen.name, specimen.bytes.len(), specimen.chunks.len(), whole.measurements.len())
     }
 
@@ -189,10 +195,10 @@ impl Subject {
         let mut pairs = BTreeSet::new();
         for measured in &inspection.measurements {
             let same = |m: &&Inspected| m.pair == measured.pair && m.attempt == measured.attempt;
-            let whole = self.whole.measurements.iter().find(same);
-            let whole = whole.with_context(|| format!("pair {} is new", measured.pair))?;
+            ensure!(self.whole.measurements.iter().any(|m| same(&m)), "pair {} is new", measured.pair);
             let bits = |m: &Inspected| m.ir.iter().map(|x| x.to_bits()).collect::<Vec<_>>();
-            ensure!(bits(whole) == bits(measured), "pair {} is another than was measured", measured.pair);
+            let mut made = self.whole.measurements.iter().chain(&self.from_responses).filter(same);
+            ensure!(made.any(|m| bits(m) == bits(measured)), "pair {} is another than was measured", measured.pair);
             ensure!(pairs.insert(measured.pair), "pair {} is there twice", measured.pair);
         }
         let (all, mut readings) = (BTreeSet::from_iter(&self.whole.readings_ns), BTreeSet::new());
@@ -203,11 +209,14 @@ impl Subject {
         Ok(())
     }
 
-    /// What stands in chunks that the damage does not touch must be returned.
+    /// What stands in chunks that the damage does not touch, verdict and sweep or response, must be returned.
     fn untouched(&self, damaged: &Damaged, inspection: &Inspection, tally: &mut Tally) -> Result<()> {
         let whole = || self.specimen.chunks.iter().filter(|c| damaged.keeps(&c.range));
         let returned: BTreeSet<_> = inspection.measurements.iter().map(|m| (m.pair, m.attempt)).collect();
-        let expected = |m: &&Inspected| whole().any(|c| c.verdicts.contains(&(m.pair, m.attempt)));
+        let expected = |m: &&Inspected| {
+            let key = (m.pair, m.attempt);
+            whole().any(|c| c.verdicts.contains(&key)) && whole().any(|c| c.responses.contains(&key))
+        };
         let missing = self.whole.measurements.iter().filter(expected);
         let missing: Vec<_> = missing.map(|m| (m.pair, m.attempt)).filter(|m| !returned.contains(m)).collect();
         // Messages carry a channel's number only, and what it means stands in two places.

@@ -1,20 +1,19 @@
 //! The run files that are damaged, and what stands where in them.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::ops::Range;
 use std::path::Path;
-use std::sync::atomic::AtomicBool;
 
 use anyhow::{Context as _, Result, ensure};
 use bytes::Bytes;
-use echolake_acquisition::controller::{Keep, RunController, RunOptions};
+use echolake_acquisition::controller::{Control, Keep, RunController, RunOptions, Work};
 use echolake_acquisition::mesh::Mesh;
 use echolake_acquisition::recorder::{Recorder, Relief, RunStart};
 use echolake_acquisition::relief::HeightField;
 use echolake_acquisition::rigs::simulated::{Simulation, devices};
 use echolake_schema::grid::Layer;
 use echolake_schema::manifest::RunManifest;
-use echolake_schema::messages::Measurement;
+use echolake_schema::messages::{ImpulseResponse, Measurement, SweepRecording};
 use echolake_schema::{Rig, RunId, SurfaceRecord, Timestamp, topics};
 use mcap::records::Record;
 use prost::Message as _;
@@ -25,7 +24,7 @@ const MAGIC: usize = 8;
 /// 2026-01-05, 08:00.
 const START: Timestamp = Timestamp(1_767_600_000_000_000_000);
 /// Small, so that there are many chunks and a round takes milliseconds.
-const PAIRS_A_CHUNK: usize = 2;
+const PAIRS_A_CHUNK: usize = 5;
 
 /// A run's file and its parts.
 pub(crate) struct Specimen {
@@ -45,6 +44,8 @@ pub(crate) struct ChunkFacts {
     pub(crate) range: Range<usize>,
     /// Pair and attempt of each verdict.
     pub(crate) verdicts: BTreeSet<(u32, u32)>,
+    /// Pair and attempt of each sweep and response.
+    pub(crate) responses: BTreeSet<(u32, u32)>,
     /// Whether schemas and channels stand in it.
     pub(crate) defines: bool,
 }
@@ -81,18 +82,14 @@ impl Specimen {
         let record = SurfaceRecord { typology: "wavy".into(), ..SurfaceRecord::default() };
         let path = folder.path().join("run.mcap");
         let shape = Relief { heights: &relief, mesh: &mesh, original: None };
-        let start = RunStart { manifest: &manifest, rig, surface: &record, relief: Some(shape) };
+        let start = RunStart { manifest: &manifest, rig, surface: &record, relief: Some(shape), plan: None };
         let mut recorder = Recorder::create(&path, &start)?;
         let options = RunOptions { keep, checkpoint_every: PAIRS_A_CHUNK };
         let grid = rig.grid()?;
-        let end = RunController::new(rig, devices)?.run(
-            &mut recorder,
-            grid.pairs(),
-            options,
-            &AtomicBool::new(false),
-            &mut |_| {},
-        )?;
-        Self::map(name, &recorder.finish(&end)?)
+        let nothing = BTreeMap::new();
+        let work = Work { pairs: grid.pairs(), before: &nothing, options };
+        let outcome = RunController::new(rig, devices)?.run(&mut recorder, &work, &Control::default(), &mut |_| {})?;
+        Self::map(name, &recorder.finish(&outcome.end)?)
     }
 
     fn map(name: &'static str, path: &Path) -> Result<Self> {
@@ -140,15 +137,26 @@ impl Specimen {
         for index in indexes {
             let start = usize::try_from(index.chunk_start_offset)?;
             let range = start..start + usize::try_from(index.chunk_length)?;
-            let mut verdicts = BTreeSet::new();
+            let (mut verdicts, mut responses) = (BTreeSet::new(), BTreeSet::new());
             for message in summary.stream_chunk(&self.bytes, &index)? {
                 let message = message?;
-                if message.channel.topic == topics::MEASUREMENT {
-                    let verdict = Measurement::decode(&message.data[..])?;
-                    verdicts.insert((verdict.pair_id, verdict.attempt));
+                match message.channel.topic.as_str() {
+                    topics::MEASUREMENT => {
+                        let verdict = Measurement::decode(&message.data[..])?;
+                        verdicts.insert((verdict.pair_id, verdict.attempt));
+                    }
+                    topics::SWEEP => {
+                        let sweep = SweepRecording::decode(&message.data[..])?;
+                        responses.insert((sweep.pair_id, sweep.attempt));
+                    }
+                    topics::IR => {
+                        let ir = ImpulseResponse::decode(&message.data[..])?;
+                        responses.insert((ir.pair_id, ir.attempt));
+                    }
+                    _ => {}
                 }
             }
-            self.chunks.push(ChunkFacts { range, verdicts, defines: self.chunks.is_empty() });
+            self.chunks.push(ChunkFacts { range, verdicts, responses, defines: self.chunks.is_empty() });
         }
         Ok(())
     }

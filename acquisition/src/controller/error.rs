@@ -1,0 +1,67 @@
+//! Why a run ended early.
+
+/// Why a run ended early. What was acknowledged until then is safe, and the run can be gone on with.
+#[derive(Debug, thiserror::Error)]
+pub enum Error {
+    /// A device failed.
+    #[error(transparent)]
+    Device(#[from] crate::rig::Error),
+    /// The recording cannot be written.
+    #[error(transparent)]
+    Record(#[from] crate::recorder::Error),
+    /// The rig's settings make no plan.
+    #[error("rig `{rig}` cannot measure: {cause}")]
+    Plan {
+        /// The rig.
+        rig: String,
+        /// Why.
+        cause: echolake_dsp::Error,
+    },
+    /// The rig's grid is not valid.
+    #[error(transparent)]
+    Schema(#[from] echolake_schema::Error),
+    /// The interface runs at another rate than the rig's sweep is made for.
+    #[error(
+        "rig `{rig}` samples at {expected_hz} Hz, the audio interface at {actual_hz} Hz; hint: set the interface, or `sweep.rate_hz`"
+    )]
+    Rate {
+        /// The rig.
+        rig: String,
+        /// Its rate, Hz.
+        expected_hz: f64,
+        /// The interface's, Hz.
+        actual_hz: f64,
+    },
+    /// Pair after pair was given up: to go on would only spoil more.
+    #[error("{pairs} pairs in a row were given up, the last because of: {reasons}; hint: {hint}")]
+    Lasting {
+        /// How many.
+        pairs: usize,
+        /// The last one's reasons.
+        reasons: String,
+        /// What to do.
+        hint: &'static str,
+    },
+    /// The clock went backwards.
+    #[error(
+        "the clock went back by {back_secs:.1} s, to {now}; hint: set it right (is NTP on?), and go on when it is past {before}"
+    )]
+    Clock {
+        /// What it said before.
+        before: echolake_schema::Timestamp,
+        /// What it says now.
+        now: echolake_schema::Timestamp,
+        /// The difference, s.
+        back_secs: f64,
+    },
+    /// The disk is nearly full: stopped while all that was measured could still be written.
+    #[error("the disk of `{}` is nearly full: {free_mb:.1} MB are left, {needed_mb:.1} are kept free to end the run; hint: make room", folder.display())]
+    DiskNearlyFull {
+        /// The folder of the recording.
+        folder: std::path::PathBuf,
+        /// What is left, MB.
+        free_mb: f64,
+        /// What there should be, MB.
+        needed_mb: f64,
+    },
+}

@@ -1,0 +1,104 @@
+//! Notices what makes a whole run go wrong, as opposed to one take: lasting faults, a clock that goes back, a disk that
+//! fills up.
+
+use std::path::{Path, PathBuf};
+
+use echolake_schema::Timestamp;
+
+use super::Error;
+use crate::objection::Objection;
+use crate::recorder::{folder_of, free_bytes};
+
+/// Pairs that are given up in a row before the run is: one may be bad luck, with its attempts three are none.
+const LASTING: usize = 3;
+/// Kept free, so that the log and the summary still fit.
+pub(crate) const KEPT_FREE: u64 = 1 << 20;
+
+/// What is known of the run as a whole.
+pub(super) struct Watch {
+    folder: PathBuf,
+    given_up: usize,
+    last: Timestamp,
+    free: fn(&Path) -> std::io::Result<u64>,
+}
+
+impl Watch {
+    /// Begins at a time, for a recording at `path`.
+    pub(super) fn new(path: &Path, last: Timestamp) -> Self {
+        Self { folder: folder_of(path).to_owned(), given_up: 0, last, free: free_bytes }
+    }
+
+    /// A pair was measured.
+    pub(super) fn accepted(&mut self) {
+        self.given_up = 0;
+    }
+
+    /// A pair was given up.
+    ///
+    /// # Errors
+    /// [`Error::Lasting`] where too many were in a row.
+    pub(super) fn given_up(&mut self, reasons: &[Objection]) -> Result<(), Error> {
+        self.given_up += 1;
+        if self.given_up < LASTING {
+            return Ok(());
+        }
+        let text: Vec<_> = reasons.iter().map(ToString::to_string).collect();
+        let hint = reasons.first().map_or("look at the log", Objection::hint);
+        Err(Error::Lasting { pairs: self.given_up, reasons: text.join("; "), hint })
+    }
+
+    /// Something happened at this time.
+    ///
+    /// # Errors
+    /// [`Error::Clock`] where that is before what happened last.
+    pub(super) fn at(&mut self, now: Timestamp) -> Result<(), Error> {
+        if now < self.last {
+            let back_secs = (self.last.0 - now.0) as f64 / 1e9;
+            return Err(Error::Clock { before: self.last, now, back_secs });
+        }
+        self.last = now;
+        Ok(())
+    }
+
+    /// Looks at the disk.
+    ///
+    /// # Errors
+    /// [`Error::DiskNearlyFull`].
+    pub(super) fn disk(&self) -> Result<(), Error> {
+        // A file system that does not tell will refuse to write in the end.
+        let Ok(free) = (self.free)(&self.folder) else { return Ok(()) };
+        if free >= KEPT_FREE {
+            return Ok(());
+        }
+        let megabytes = |bytes: u64| bytes as f64 / 1e6;
+        let (free_mb, needed_mb) = (megabytes(free), megabytes(KEPT_FREE));
+        Err(Error::DiskNearlyFull { folder: self.folder.clone(), free_mb, needed_mb })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn one_bad_pair_is_luck_and_three_are_a_fault() {
+        let mut watch = Watch::new(Path::new("run.mcap"), Timestamp(0));
+        let loud = [Objection::Outside { level_db: 80.0, most_db: 65.0 }];
+        assert!(watch.given_up(&loud).is_ok() && watch.given_up(&loud).is_ok());
+        watch.accepted();
+        assert!(watch.given_up(&loud).is_ok() && watch.given_up(&loud).is_ok());
+        let error = watch.given_up(&loud).expect_err("the third in a row").to_string();
+        assert!(error.contains("3 pairs") && error.contains("80.0 dB outside") && error.contains("quiet"), "{error}");
+    }
+
+    #[test]
+    fn a_disk_that_fills_up_is_noticed_before_it_is_full() {
+        let mut watch = Watch::new(Path::new("run.mcap"), Timestamp(0));
+        watch.free = |_| Ok(KEPT_FREE);
+        assert!(watch.disk().is_ok());
+        watch.free = |_| Ok(KEPT_FREE - 1);
+        assert!(matches!(watch.disk(), Err(Error::DiskNearlyFull { .. })));
+        watch.free = |_| Err(std::io::ErrorKind::Unsupported.into());
+        assert!(watch.disk().is_ok(), "what cannot be told is no reason to stop");
+    }
+}

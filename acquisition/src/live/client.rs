@@ -1,0 +1,92 @@
+//! One client of the live view, on a thread of its own.
+
+use std::net::TcpStream;
+use std::time::Duration;
+
+use tungstenite::handshake::server::{Request, Response};
+use tungstenite::http::{HeaderValue, StatusCode};
+use tungstenite::protocol::WebSocketConfig;
+use tungstenite::{Message, WebSocket};
+
+use super::protocol::{self, Wish};
+use super::{Queue, Shared};
+
+/// How often it is looked whether the client says something.
+const LOOKS: Duration = Duration::from_millis(10);
+/// A client that takes nothing for so long is gone.
+const PATIENCE: Duration = Duration::from_secs(10);
+/// What a client says is short.
+const LARGEST_WISH: usize = 1 << 20;
+
+/// Serves a client until it or the run is gone.
+pub(super) fn serve(stream: TcpStream, shared: &Shared, queue: &Queue) {
+    // Whatever goes wrong here, the client is gone, and comes again if it likes.
+    let _ = talk(stream, shared, queue);
+}
+
+#[expect(clippy::result_large_err, reason = "tungstenite's own type")]
+fn choose(
+    request: &Request,
+    mut response: Response,
+) -> Result<Response, tungstenite::handshake::server::ErrorResponse> {
+    let offered = request.headers().get_all("Sec-WebSocket-Protocol").iter().filter_map(|v| v.to_str().ok());
+    match protocol::choose(offered) {
+        Some(chosen) => {
+            response.headers_mut().insert("Sec-WebSocket-Protocol", HeaderValue::from_static(chosen));
+            Ok(response)
+        }
+        None => {
+            let mut refused =
+                tungstenite::handshake::server::ErrorResponse::new(Some("open this address in Foxglove\n".into()));
+            *refused.status_mut() = StatusCode::BAD_REQUEST;
+            Err(refused)
+        }
+    }
+}
+
+fn talk(stream: TcpStream, shared: &Shared, queue: &Queue) -> Result<(), Box<dyn std::error::Error>> {
+    stream.set_nodelay(true)?;
+    stream.set_read_timeout(Some(PATIENCE))?;
+    stream.set_write_timeout(Some(PATIENCE))?;
+    let config = WebSocketConfig::default().max_message_size(Some(LARGEST_WISH)).max_frame_size(Some(LARGEST_WISH));
+    let mut socket = tungstenite::accept_hdr_with_config(stream, choose, Some(config)).map_err(|e| e.to_string())?;
+    socket.get_ref().set_read_timeout(Some(LOOKS))?;
+    socket.send(Message::text(protocol::server_info()))?;
+    socket.send(Message::text(protocol::advertise(&shared.topics())))?;
+    while !shared.has_ended() {
+        listen(&mut socket, shared, queue)?;
+        while let Some((subscription, message)) = queue.pop() {
+            socket.write(Message::binary(protocol::message_data(
+                subscription,
+                message.log_time_nanos,
+                &message.data,
+            )))?;
+        }
+        socket.flush()?;
+    }
+    // What came last is still shown.
+    socket.close(None)?;
+    Ok(socket.flush()?)
+}
+
+fn listen(socket: &mut WebSocket<TcpStream>, shared: &Shared, queue: &Queue) -> Result<(), tungstenite::Error> {
+    match socket.read() {
+        Ok(Message::Text(text)) => {
+            match protocol::wish(&text) {
+                Some(Wish::Subscribe(wishes)) => {
+                    wishes.into_iter().for_each(|(id, channel)| shared.subscribe(queue, channel, id));
+                }
+                Some(Wish::Unsubscribe(ids)) => queue.unsubscribe(&ids),
+                None => {}
+            }
+            Ok(())
+        }
+        Ok(_) => Ok(()),
+        Err(tungstenite::Error::Io(e))
+            if matches!(e.kind(), std::io::ErrorKind::WouldBlock | std::io::ErrorKind::TimedOut) =>
+        {
+            Ok(())
+        }
+        Err(error) => Err(error),
+    }
+}

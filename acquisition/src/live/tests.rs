@@ -1,0 +1,125 @@
+//! A client of another make than the server looks on while a simulated run goes on.
+
+use std::time::{Duration, Instant};
+
+use tungstenite::Message;
+use tungstenite::client::IntoClientRequest as _;
+
+use super::*;
+
+fn topic(channel: u16, name: &str) -> Topic {
+    Topic {
+        channel,
+        topic: name.into(),
+        encoding: "protobuf".into(),
+        schema: "a.B".into(),
+        schema_encoding: "protobuf".into(),
+        schema_data: vec![1, 2, 3],
+    }
+}
+
+type Socket = tungstenite::WebSocket<tungstenite::stream::MaybeTlsStream<TcpStream>>;
+
+fn connect(server: &LiveServer) -> Socket {
+    let mut request = format!("ws://{}", server.address()).into_client_request().expect("a request");
+    let offered = "foxglove.sdk.v1".parse().expect("a header");
+    request.headers_mut().insert("Sec-WebSocket-Protocol", offered);
+    let stream = TcpStream::connect(server.address()).expect("connected");
+    let stream = tungstenite::stream::MaybeTlsStream::Plain(stream);
+    let (socket, response) = tungstenite::client(request, stream).expect("a handshake");
+    assert_eq!(response.headers()["Sec-WebSocket-Protocol"], "foxglove.sdk.v1");
+    socket
+}
+
+fn json(socket: &mut Socket) -> serde_json::Value {
+    match socket.read().expect("a message") {
+        Message::Text(text) => serde_json::from_str(&text).expect("JSON"),
+        other => panic!("{other:?}"),
+    }
+}
+
+fn data(socket: &mut Socket) -> (u32, u64, Vec<u8>) {
+    match socket.read().expect("a message") {
+        Message::Binary(bytes) => {
+            assert_eq!(bytes[0], 1);
+            let subscription = u32::from_le_bytes(bytes[1..5].try_into().expect("four"));
+            (subscription, u64::from_le_bytes(bytes[5..13].try_into().expect("eight")), bytes[13..].to_vec())
+        }
+        other => panic!("{other:?}"),
+    }
+}
+
+#[test]
+fn a_client_sees_what_it_subscribes_to_and_what_it_came_too_late_for() {
+    let server = LiveServer::start(([127, 0, 0, 1], 0).into()).expect("a server");
+    let mut tap = server.tap();
+    tap.topics(vec![topic(1, "/panel/scene"), topic(2, "/sweep"), topic(3, "/log")]);
+    tap.message(1, 10, b"the panel");
+    tap.message(2, 11, b"a sweep that nobody waited for");
+    let mut socket = connect(&server);
+    assert_eq!(json(&mut socket)["op"], "serverInfo");
+    let advertised = json(&mut socket);
+    let channels = advertised["channels"].as_array().expect("channels");
+    assert_eq!(channels.len(), 3);
+    assert_eq!(
+        channels[1],
+        serde_json::json!({"id": 2, "topic": "/sweep", "encoding": "protobuf", "schemaName": "a.B",
+            "schemaEncoding": "protobuf", "schema": "AQID"})
+    );
+    let subscribe = r#"{"op":"subscribe","subscriptions":[{"id":70,"channelId":1},{"id":71,"channelId":2}]}"#;
+    socket.send(Message::text(subscribe)).expect("sent");
+    assert_eq!(data(&mut socket), (70, 10, b"the panel".to_vec()));
+    tap.message(3, 12, b"a line that was not asked for");
+    tap.message(2, 13, b"a sweep");
+    assert_eq!(data(&mut socket), (71, 13, b"a sweep".to_vec()));
+    drop(server);
+    assert!(matches!(socket.read(), Ok(Message::Close(_)) | Err(_)), "it is let go");
+}
+
+#[test]
+fn a_client_that_sleeps_loses_the_oldest_and_stops_nobody() {
+    let server = LiveServer::start(([127, 0, 0, 1], 0).into()).expect("a server");
+    let mut tap = server.tap();
+    tap.topics(vec![topic(2, "/sweep")]);
+    let mut socket = connect(&server);
+    json(&mut socket);
+    json(&mut socket);
+    socket.send(Message::text(r#"{"op":"subscribe","subscriptions":[{"id":1,"channelId":2}]}"#)).expect("sent");
+    let begun = Instant::now();
+    while !server.shared.state().clients.iter().any(|c| c.wants(2)) {
+        assert!(begun.elapsed() < Duration::from_secs(10), "the subscription arrives");
+        std::thread::sleep(Duration::from_millis(5));
+    }
+    // 200 MB that nobody reads.
+    for time in 0..200 {
+        tap.message(2, time, &vec![0; 1 << 20]);
+    }
+    let waiting = server.shared.state().clients[0].inner().bytes;
+    assert!(waiting <= WAITING_BYTES, "{waiting}");
+    let mut last = 0;
+    while last != 199 {
+        let (_, time, _) = data(&mut socket);
+        assert!(time >= last);
+        last = time;
+    }
+}
+
+#[test]
+fn browsers_that_are_no_viewers_are_told() {
+    use std::io::{Read as _, Write as _};
+    let server = LiveServer::start(([127, 0, 0, 1], 0).into()).expect("a server");
+    let mut stream = TcpStream::connect(server.address()).expect("connected");
+    let request = "GET / HTTP/1.1\r\nHost: a\r\nConnection: Upgrade\r\nUpgrade: websocket\r\n\
+        Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\n\r\n";
+    stream.write_all(request.as_bytes()).expect("sent");
+    let mut answer = String::new();
+    stream.read_to_string(&mut answer).expect("an answer");
+    assert!(answer.starts_with("HTTP/1.1 400") && answer.contains("Foxglove"), "{answer}");
+}
+
+#[test]
+fn an_address_that_is_taken_is_named() {
+    let server = LiveServer::start(([127, 0, 0, 1], 0).into()).expect("a server");
+    let error = LiveServer::start(server.address()).map(drop).expect_err("taken").to_string();
+    assert!(error.contains(&server.address().to_string()) && error.contains("taken?"), "{error}");
+}

@@ -1,0 +1,168 @@
+//! What a run's course is in numbers: for Prometheus, which asks, and for InfluxDB, which is told.
+
+mod push;
+mod serve;
+#[cfg(test)]
+mod tests;
+
+use std::fmt::Write as _;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+
+use echolake_schema::messages::{Measurement, Verdict};
+
+use crate::controller::Event;
+use crate::recorder::Cost;
+pub use push::{InfluxPush, Target, TargetError};
+pub use serve::MetricsServer;
+
+/// A run's numbers; clones share them.
+#[derive(Clone)]
+pub struct RunMetrics {
+    surface: String,
+    inner: Arc<Mutex<Numbers>>,
+}
+
+#[derive(Default)]
+struct Numbers {
+    planned: u64,
+    accepted: u64,
+    attempts: u64,
+    repeated: u64,
+    rejected: u64,
+    pair: u32,
+    paused: bool,
+    broken_off: bool,
+    last: Option<Measurement>,
+    cost: Cost,
+    disk_free_bytes: Option<u64>,
+}
+
+/// Whether a number only grows.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Kind {
+    Counter,
+    Gauge,
+}
+
+impl Kind {
+    fn name(self) -> &'static str {
+        match self {
+            Self::Counter => "counter",
+            Self::Gauge => "gauge",
+        }
+    }
+}
+
+/// A number, its name without `echolake_`, and what it is.
+type Metric = (&'static str, Kind, &'static str, f64);
+
+impl RunMetrics {
+    /// Of a run over `planned` pairs, `accepted` of which are measured already.
+    pub fn new(surface: &str, planned: u64, accepted: u64) -> Self {
+        let numbers = Numbers { planned, accepted, ..Numbers::default() };
+        Self { surface: surface.to_owned(), inner: Arc::new(Mutex::new(numbers)) }
+    }
+
+    /// Takes in what happens.
+    pub fn observe(&self, event: &Event<'_>) {
+        let mut numbers = self.numbers();
+        match event {
+            Event::Pair(pair) => numbers.pair = pair.id.0,
+            Event::Attempt(m) => {
+                numbers.attempts += 1;
+                match m.verdict() {
+                    Verdict::Repeated => numbers.repeated += 1,
+                    Verdict::Rejected => numbers.rejected += 1,
+                    _ => {}
+                }
+                numbers.last = Some((*m).clone());
+            }
+            // What is counted is on the disk.
+            Event::Safe { accepted, cost, .. } => (numbers.accepted, numbers.cost) = (*accepted, *cost),
+            Event::Paused => numbers.paused = true,
+            Event::Continued => numbers.paused = false,
+        }
+    }
+
+    /// Bytes left on the recording's disk.
+    pub fn disk_free(&self, bytes: u64) {
+        self.numbers().disk_free_bytes = Some(bytes);
+    }
+
+    /// The run broke off.
+    pub fn broke_off(&self) {
+        self.numbers().broken_off = true;
+    }
+
+    /// In Prometheus' text format 0.0.4.
+    pub fn prometheus(&self) -> String {
+        let mut out = String::new();
+        // Backslash, quote and line break are no part of a surface's name.
+        let label = format!("{{surface=\"{}\"}}", self.surface);
+        for (name, kind, help, value) in self.numbers().metrics() {
+            let _ = writeln!(out, "# HELP echolake_{name} {help}\n# TYPE echolake_{name} {}", kind.name());
+            let _ = writeln!(out, "echolake_{name}{label} {value}");
+        }
+        out
+    }
+
+    /// As one line of InfluxDB's line protocol, at this time in ns since 1970. Unknown numbers are left out: it has no NaN.
+    pub fn influx(&self, at_nanos: i64) -> String {
+        let metrics = self.numbers().metrics();
+        let fields: Vec<_> =
+            metrics.iter().filter(|m| m.3.is_finite()).map(|(name, .., value)| format!("{name}={value}")).collect();
+        format!("echolake_run,surface={} {} {at_nanos}\n", self.surface, fields.join(","))
+    }
+
+    fn numbers(&self) -> MutexGuard<'_, Numbers> {
+        self.inner.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl Numbers {
+    fn metrics(&self) -> Vec<Metric> {
+        use Kind::{Counter, Gauge};
+        let flag = |on: bool| f64::from(u8::from(on));
+        let mut metrics: Vec<Metric> = vec![
+            ("pairs_planned", Gauge, "Pairs of the run.", self.planned as f64),
+            ("pairs_accepted", Gauge, "Pairs whose measurement is safe on the disk.", self.accepted as f64),
+            ("pair", Gauge, "The pair that is measured now.", f64::from(self.pair)),
+            ("attempts_total", Counter, "Attempts of this session.", self.attempts as f64),
+            ("repeats_total", Counter, "Attempts of this session that were tried again.", self.repeated as f64),
+            ("given_up_total", Counter, "Pairs of this session that were given up.", self.rejected as f64),
+            ("paused", Gauge, "1 while the run waits.", flag(self.paused)),
+            ("broken_off", Gauge, "1 where the run broke off.", flag(self.broken_off)),
+            ("recorded_bytes_total", Counter, "Bytes recorded, before compression.", self.cost.bytes as f64),
+            ("recorded_messages_total", Counter, "Messages recorded.", self.cost.messages as f64),
+            ("checkpoints_total", Counter, "Checkpoints.", self.cost.checkpoints as f64),
+            ("recorder_busy_seconds_total", Counter, "Time spent recording.", self.cost.busy.as_secs_f64()),
+            (
+                "recorder_sync_seconds_total",
+                Counter,
+                "Time of it spent waiting for the disk.",
+                self.cost.waited.as_secs_f64(),
+            ),
+        ];
+        if let Some(m) = &self.last {
+            metrics.extend([
+                ("snr_db", Gauge, "Signal-to-noise ratio of the last take, dB.", m.snr_db),
+                ("loopback_dbfs", Gauge, "Level of its loopback, dB re full scale.", m.loopback_level_dbfs),
+                (
+                    "arrival_error_us",
+                    Gauge,
+                    "Its direct sound's arrival minus the expected one, us.",
+                    m.arrival_error_us,
+                ),
+                ("clipped_samples", Gauge, "Its samples at full scale.", f64::from(m.clipped_samples)),
+                ("outside_level_db", Gauge, "Sound pressure level outside, dB re 20 uPa.", m.outside_level_db),
+                ("temperature_c", Gauge, "Temperature of the air, C.", m.temperature_c),
+                ("humidity_pct", Gauge, "Relative humidity, %.", m.humidity_pct),
+                ("pressure_hpa", Gauge, "Air pressure, hPa.", m.pressure_hpa),
+            ]);
+        }
+        if let Some(bytes) = self.disk_free_bytes {
+            metrics.push(("disk_free_bytes", Gauge, "Bytes left on the recording's disk.", bytes as f64));
+        }
+        metrics
+    }
+}

@@ -1,0 +1,123 @@
+//! What is looked at before a run begins: room on the disk, the air, and a take at the first pair.
+
+use std::path::Path;
+
+use echolake_dsp::chain::raw_len;
+use echolake_schema::{Pair, Rig};
+
+use crate::controller::watch::KEPT_FREE;
+use crate::controller::{Keep, RunController, implausible};
+use crate::recorder::free_bytes;
+
+/// Bytes of a recorded sample of both channels and audio, compressed: measured 4.6 on simulated runs with sweeps of 0.5 s.
+const SWEEP_BYTES_A_SAMPLE: f64 = 5.0;
+/// Bytes of a sample of an impulse response, which hardly compresses.
+const RESPONSE_BYTES_A_SAMPLE: f64 = 4.0;
+/// Bytes of a pair's poses, readings and verdict, compressed, with their indexes.
+const PAIR_BYTES: f64 = 600.0;
+/// Bytes of panel, heights, summary, once a run.
+const RUN_BYTES: f64 = 2.5e6;
+/// Attempts over pairs: more is a rig that needs looking after.
+const REPEATS: f64 = 1.1;
+
+/// Something that is not fit.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Finding {
+    /// What it is.
+    pub what: String,
+    /// What to do.
+    pub hint: String,
+}
+
+impl Finding {
+    /// A finding.
+    pub fn new(what: impl Into<String>, hint: impl Into<String>) -> Self {
+        Self { what: what.into(), hint: hint.into() }
+    }
+}
+
+impl std::fmt::Display for Finding {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "{}; hint: {}", self.what, self.hint)
+    }
+}
+
+/// About how large the file of a run of so many pairs becomes, bytes.
+pub fn expected_bytes(rig: &Rig, keep: Keep, pairs: usize) -> u64 {
+    let reference = rig.impulse_response.reference_temperature_c.get();
+    let response = raw_len(rig.impulse_response.length, reference) as f64 * RESPONSE_BYTES_A_SAMPLE;
+    let sweep = match keep {
+        Keep::Sweeps => rig.recording_len() as f64 * SWEEP_BYTES_A_SAMPLE,
+        Keep::ResponsesOnly => 0.0,
+    };
+    (RUN_BYTES + (sweep + response + PAIR_BYTES) * REPEATS * pairs as f64) as u64
+}
+
+/// Whether the disk has room for a run of so many pairs.
+pub fn disk(folder: &Path, rig: &Rig, keep: Keep, pairs: usize) -> Option<Finding> {
+    // A file system that does not tell is no reason to refuse.
+    let free = free_bytes(folder).ok()?;
+    room(folder, free, expected_bytes(rig, keep, pairs) + KEPT_FREE)
+}
+
+fn room(folder: &Path, free: u64, needed: u64) -> Option<Finding> {
+    let megabytes = |bytes: u64| bytes as f64 / 1e6;
+    (free < needed).then(|| {
+        let what = format!(
+            "the disk of `{}` is nearly full: {:.1} MB are left, the run needs about {:.1}",
+            folder.display(),
+            megabytes(free),
+            megabytes(needed)
+        );
+        Finding::new(what, "make room, or record impulse responses alone (--ir-only)")
+    })
+}
+
+/// Whether sensor, loopback, level and room are fit: a reading, and a take at a pair that is not recorded. A single take
+/// may be spoiled, so it is made again as often as the rig allows.
+pub fn devices(controller: &mut RunController<'_>, pair: Pair) -> Vec<Finding> {
+    let failed = |error: crate::rig::Error| {
+        vec![Finding::new(error.to_string(), "is it plugged in, switched on, and named rightly in the rig file?")]
+    };
+    let reading = match controller.air() {
+        Ok(reading) => reading,
+        Err(error) => return failed(error),
+    };
+    let nonsense = implausible(&reading);
+    if !nonsense.is_empty() {
+        return nonsense.iter().map(|o| Finding::new(format!("the ambient sensor says {o}"), o.hint())).collect();
+    }
+    let mut objections = Vec::new();
+    for _ in 0..controller.rig().validation.attempts {
+        match controller.trial(pair) {
+            Ok((_, found)) if found.is_empty() => return Vec::new(),
+            Ok((_, found)) => objections = found,
+            Err(error) => return failed(error),
+        }
+    }
+    objections.iter().map(|o| Finding::new(format!("a take at pair {}: {o}", pair.id.0), o.hint())).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_run_s_size_is_known_beforehand() {
+        let rig = Rig::paper();
+        let megabytes = |keep| expected_bytes(&rig, keep, 2951) as f64 / 1e6;
+        // Of simulated runs with the paper's rig: 666 MB with sweeps, 8 without.
+        assert!((650.0..1_000.0).contains(&megabytes(Keep::Sweeps)), "{}", megabytes(Keep::Sweeps));
+        assert!((8.0..16.0).contains(&megabytes(Keep::ResponsesOnly)), "{}", megabytes(Keep::ResponsesOnly));
+    }
+
+    #[test]
+    fn a_full_disk_is_told_before_there_is_a_file() {
+        let folder = Path::new("/data");
+        assert_eq!(room(folder, 100, 100), None);
+        let finding = room(folder, 99_000_000, 700_000_000).expect("a finding").to_string();
+        assert!(
+            finding.contains("99.0 MB are left") && finding.contains("about 700.0") && finding.contains("--ir-only")
+        );
+    }
+}

@@ -1,0 +1,61 @@
+//! Why a recording cannot be recovered or gone on with.
+
+use std::io;
+use std::path::PathBuf;
+
+/// Why a recording cannot be recovered or gone on with. The recording itself is as it was.
+#[derive(Debug, thiserror::Error)]
+pub enum Error {
+    /// The system refused to read it.
+    #[error("cannot read `{}`", path.display())]
+    Read {
+        /// The file.
+        path: PathBuf,
+        /// The system's reason.
+        source: io::Error,
+    },
+    /// Somebody records it.
+    #[error("`{}` is being recorded; hint: stop that `echolake acquire` first", path.display())]
+    Busy {
+        /// The file.
+        path: PathBuf,
+    },
+    /// It holds nothing that could be kept.
+    #[error("`{}` holds no run: {reason}; hint: nothing was measured into it, measure anew", path.display())]
+    Headless {
+        /// The file.
+        path: PathBuf,
+        /// What is missing, or where it is damaged.
+        reason: String,
+    },
+    /// It does not say how to go on.
+    #[error("`{}` cannot be gone on with: {reason}; hint: `echolake recover` makes a run of what it holds", path.display())]
+    NoPlan {
+        /// The file.
+        path: PathBuf,
+        /// Why.
+        reason: String,
+    },
+    /// The name is taken.
+    #[error("`{}` is there already; hint: give another with -o", path.display())]
+    Exists {
+        /// The file that would have been written.
+        path: PathBuf,
+    },
+    /// The system refused to write.
+    #[error("cannot write `{}`: {reason}; hint: is the disk full or read-only?", path.display())]
+    Write {
+        /// The file.
+        path: PathBuf,
+        /// The system's or the writer's words.
+        reason: String,
+    },
+    /// What was written is not what was read; it was removed again.
+    #[error("what was written to `{}` is not what was read: {reason}; hint: is the disk sound?", path.display())]
+    Unproven {
+        /// The file that was removed.
+        path: PathBuf,
+        /// What differs.
+        reason: String,
+    },
+}

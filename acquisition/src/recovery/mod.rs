@@ -1,0 +1,204 @@
+//! Rebuilds a recording that was cut off or damaged to its longest verified prefix. The original is only read.
+
+mod copy;
+mod error;
+#[cfg(test)]
+mod tests;
+mod walk;
+
+use std::collections::BTreeMap;
+use std::fs::{File, OpenOptions};
+use std::path::{Path, PathBuf};
+
+use echolake_schema::topics;
+use mcap::records::Metadata;
+use mcap::sans_io::linear_reader::{LinearReadEvent, LinearReader, LinearReaderOptions};
+use serde::Serialize;
+
+use crate::recorder::chunks::ChunkWriter;
+use crate::recorder::{folder_of, lock, sync};
+pub(crate) use copy::{Copy, Counts, is_end};
+pub use error::Error;
+pub(crate) use walk::{Item, Walk};
+
+/// Bytes that are read at a time when a file is proven.
+const BLOCK: usize = 1 << 20;
+
+/// What became of a recording.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub struct Report {
+    /// The recording.
+    pub from: PathBuf,
+    /// What was written; nothing where the recording is whole.
+    pub to: Option<PathBuf>,
+    /// Size of the recording, bytes.
+    pub bytes: u64,
+    /// Size of its verified prefix: all that was kept.
+    pub verified_bytes: u64,
+    /// Messages that were kept, by topic.
+    pub messages: BTreeMap<String, u64>,
+    /// Whether it says how its run ended.
+    pub has_end: bool,
+    /// What stands behind the verified prefix, in words.
+    pub defect: Option<String>,
+}
+
+impl Report {
+    /// Bytes that could not be kept.
+    pub fn lost_bytes(&self) -> u64 {
+        self.bytes - self.verified_bytes
+    }
+}
+
+/// Where a recording is rebuilt to, if nobody says otherwise: beside it, under the name that it would have had, or
+/// with `.recovered` in it where it has that name.
+pub fn beside(from: &Path) -> PathBuf {
+    match from.extension().is_some_and(|e| e == "partial") {
+        true => from.with_extension(""),
+        false => from.with_extension("recovered.mcap"),
+    }
+}
+
+/// Rebuilds `from` as `to`, reads it back, and only then gives it its name.
+///
+/// # Errors
+/// [`Error`], [`Error::Busy`] where somebody records it; nothing stands at `to` then, and `from` is as it was.
+pub fn recover(from: &Path, to: &Path) -> Result<Report, Error> {
+    // What is being recorded goes on growing behind the copy.
+    let _lock = lock(from)?;
+    let mut report = survey(from)?;
+    if report.defect.is_none() && prove(from).is_ok() {
+        return Ok(report);
+    }
+    if to.exists() {
+        return Err(Error::Exists { path: to.to_owned() });
+    }
+    let mut staged = to.as_os_str().to_owned();
+    staged.push(".recovering");
+    let staged = PathBuf::from(staged);
+    let made = rebuild(from, &staged, &report).and_then(|()| compare(&staged, &report));
+    let named = made.and_then(|()| publish(&staged, to));
+    if let Err(error) = named {
+        // Half a copy of what is whole elsewhere; the cause is told.
+        let _ = std::fs::remove_file(&staged);
+        return Err(error);
+    }
+    report.to = Some(to.to_owned());
+    Ok(report)
+}
+
+// What there is to keep, without writing anything.
+fn survey(from: &Path) -> Result<Report, Error> {
+    let mut walk = Walk::open(from)?;
+    let (mut messages, mut topics_by_id, mut has_head, mut has_end) = (Counts::new(), BTreeMap::new(), false, false);
+    while let Some(item) = walk.next()? {
+        has_end |= is_end(&item);
+        match item {
+            Item::Metadata(m) => has_head |= m.name == topics::RUN_METADATA,
+            Item::Attachment(_) => {}
+            Item::Chunk(records) => {
+                for record in records {
+                    match record {
+                        mcap::records::Record::Channel(c) => drop(topics_by_id.insert(c.id, c.topic)),
+                        mcap::records::Record::Message { header, .. } => {
+                            if let Some(topic) = topics_by_id.get(&header.channel_id) {
+                                *messages.entry(topic.clone()).or_default() += 1;
+                            }
+                        }
+                        _ => {}
+                    }
+                }
+            }
+        }
+    }
+    if !has_head {
+        let found = walk.defect.clone().unwrap_or_else(|| "it ends".to_owned());
+        return Err(walk.headless(format!("{found}, before it says what it is")));
+    }
+    // What follows the data can be made anew from them.
+    let verified_bytes = if walk.ended { walk.size } else { walk.verified };
+    let (from, bytes, defect) = (from.to_owned(), walk.size, walk.defect);
+    Ok(Report { from, to: None, bytes, verified_bytes, messages, has_end, defect })
+}
+
+/// Messages of each topic in a file's verified prefix.
+pub(crate) fn messages(path: &Path) -> Result<Counts, Error> {
+    Ok(survey(path)?.messages)
+}
+
+fn rebuild(from: &Path, to: &Path, report: &Report) -> Result<(), Error> {
+    let failed = |e: mcap::McapError| Error::Write { path: to.to_owned(), reason: e.to_string() };
+    let file = OpenOptions::new().write(true).create(true).truncate(true).open(to);
+    let file = file.map_err(|e| failed(e.into()))?;
+    let mut writer = ChunkWriter::new(file).map_err(failed)?;
+    let mut walk = Walk::open(from)?;
+    let mut copy = Copy::new(&mut writer);
+    while let Some(item) = walk.next()? {
+        copy.take(item, &|_, _| true).map_err(failed)?;
+    }
+    let record = [
+        ("software", concat!("echolake ", env!("CARGO_PKG_VERSION")).to_owned()),
+        ("from", from.file_name().unwrap_or_default().to_string_lossy().into_owned()),
+        ("bytes", report.bytes.to_string()),
+        ("verified_bytes", report.verified_bytes.to_string()),
+        ("defect", report.defect.clone().unwrap_or_default()),
+    ];
+    let metadata = record.map(|(key, value)| (key.to_owned(), value)).into();
+    let noted = writer
+        .end_all()
+        .and_then(|()| writer.mcap.write_metadata(&Metadata { name: topics::RECOVERY_METADATA.to_owned(), metadata }));
+    noted.and_then(|()| writer.finish()).map_err(failed)
+}
+
+// What was written is read back from its first byte: by another reader for every CRC and the summary, and by ours for
+// what it holds.
+fn compare(written: &Path, expected: &Report) -> Result<(), Error> {
+    let unproven = |reason: String| Error::Unproven { path: written.to_owned(), reason };
+    prove(written).map_err(unproven)?;
+    let found = survey(written)?;
+    if found.messages != expected.messages || found.has_end != expected.has_end {
+        return Err(unproven(format!("it has {:?}, read were {:?}", found.messages, expected.messages)));
+    }
+    Ok(())
+}
+
+fn publish(staged: &Path, to: &Path) -> Result<(), Error> {
+    let failed = |reason: String| Error::Write { path: to.to_owned(), reason };
+    if to.exists() {
+        return Err(Error::Exists { path: to.to_owned() });
+    }
+    std::fs::rename(staged, to).map_err(|e| failed(e.to_string()))?;
+    sync(folder_of(to)).map_err(failed)
+}
+
+/// Whether a file is closed and all of its checksums are right: chunks, attachments, data and summary.
+///
+/// # Errors
+/// What is wrong with it, in words.
+pub fn prove(path: &Path) -> Result<(), String> {
+    use std::io::Read as _;
+    let mut file = File::open(path).map_err(|e| e.to_string())?;
+    let options = LinearReaderOptions::default()
+        .with_prevalidate_chunk_crcs(true)
+        .with_validate_data_section_crc(true)
+        .with_validate_summary_section_crc(true)
+        .with_check_finishes_after_end_magic(true)
+        .with_record_length_limit(walk::LARGEST as usize);
+    let mut reader = LinearReader::new_with_options(options);
+    let mut has_summary = false;
+    while let Some(event) = reader.next_event() {
+        match event.map_err(|e| e.to_string())? {
+            LinearReadEvent::ReadRequest(wanted) => {
+                let buffer = reader.insert(wanted.max(BLOCK));
+                let read = file.read(buffer).map_err(|e| e.to_string())?;
+                reader.notify_read(read);
+            }
+            LinearReadEvent::Record { data, opcode } => {
+                // Attachments' sums are compared where they are parsed.
+                let record = mcap::parse_record(opcode, data).map_err(|e| e.to_string())?;
+                has_summary |= matches!(record, mcap::records::Record::Statistics(_));
+            }
+        }
+    }
+    if has_summary { Ok(()) } else { Err("it has no summary".to_owned()) }
+}

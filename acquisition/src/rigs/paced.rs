@@ -1,0 +1,30 @@
+//! A simulated rig that takes its time: for live views, and for what recording costs at a real rig's pace.
+
+use std::time::{Duration, Instant};
+
+use crate::rig::{AudioInterface, Devices, Error, Take};
+
+/// The devices, with takes that last so long at least, s.
+pub(crate) fn paced(mut devices: Devices, secs: f64) -> Devices {
+    let pace = Duration::try_from_secs_f64(secs).unwrap_or_default();
+    devices.audio = Box::new(Paced { inner: devices.audio, pace });
+    devices
+}
+
+struct Paced {
+    inner: Box<dyn AudioInterface>,
+    pace: Duration,
+}
+
+impl AudioInterface for Paced {
+    fn rate_hz(&self) -> f64 {
+        self.inner.rate_hz()
+    }
+
+    fn play_and_record(&mut self, output: &[f32], take: &mut Take) -> Result<(), Error> {
+        let begun = Instant::now();
+        self.inner.play_and_record(output, take)?;
+        std::thread::sleep(self.pace.saturating_sub(begun.elapsed()));
+        Ok(())
+    }
+}

@@ -1,0 +1,118 @@
+//! A run that somebody supervises: looked over before it begins, watched and stopped while it goes on, and gone on with
+//! afterwards.
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use echolake_schema::manifest::Origin;
+use echolake_schema::{Pair, Rig, Timestamp};
+
+use crate::controller::{self, Control, Event, Keep, Outcome, RunController, RunOptions, Work};
+use crate::mesh::Mesh;
+use crate::preflight::{self, Finding};
+use crate::recorder::{Recorder, Tap, Tried};
+use crate::relief::HeightField;
+use crate::robots::Choreography;
+
+/// Who supervises a run, and how.
+pub struct Session<'a> {
+    /// Stops it or lets it wait.
+    pub control: &'a Control,
+    /// Hears what happens.
+    pub observe: &'a mut dyn FnMut(Event<'_>),
+    /// Hears every message.
+    pub tap: Option<Box<dyn Tap>>,
+    /// Whether it is looked over first.
+    pub preflight: Preflight,
+    /// Pairs between two checkpoints.
+    pub checkpoint_every: usize,
+    /// How long a take lasts where it is simulated.
+    pub pace: Pace,
+}
+
+/// Whether a run is looked over before it begins.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Preflight {
+    /// It is, and refused where something is not fit.
+    Check,
+    /// It is not.
+    Skip,
+}
+
+/// How long a simulated take lasts.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Pace {
+    /// As long as it takes to compute it.
+    Fast,
+    /// So many seconds at least.
+    Secs(f64),
+}
+
+/// What a session left.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Measured {
+    /// The run's file; its `.partial` where it was stopped.
+    pub path: PathBuf,
+    /// How it ended.
+    pub outcome: Outcome,
+}
+
+/// A panel that is shown.
+#[derive(Clone, Copy)]
+pub(crate) struct Shape<'a> {
+    pub(crate) heights: &'a HeightField,
+    pub(crate) mesh: &'a Mesh,
+}
+
+/// What is to be done, apart from the recorder.
+pub(crate) struct Job<'a> {
+    pub(crate) rig: &'a Rig,
+    pub(crate) folder: &'a Path,
+    pub(crate) shape: Option<Shape<'a>>,
+    pub(crate) keep: Keep,
+    pub(crate) before: &'a BTreeMap<u32, Tried>,
+    pub(crate) started: Timestamp,
+    /// How the arms stand, where that is known.
+    pub(crate) arms: Option<Arc<Choreography>>,
+    pub(crate) origin: Origin,
+}
+
+impl Job<'_> {
+    /// What is not fit.
+    pub(crate) fn look_over(&self, controller: &mut RunController<'_>, pairs: &[Pair]) -> Vec<Finding> {
+        let todo: Vec<_> = pairs.iter().filter(|p| !self.before.get(&p.id.0).is_some_and(|t| t.accepted)).collect();
+        let mut findings: Vec<_> = preflight::disk(self.folder, self.rig, self.keep, todo.len()).into_iter().collect();
+        if let Some(first) = todo.first() {
+            findings.extend(preflight::devices(controller, **first));
+        }
+        findings
+    }
+
+    /// Measures what is left to a file that is begun. Where it was stopped the file stays `.partial`.
+    pub(crate) fn measure(
+        &self,
+        controller: &mut RunController<'_>,
+        mut recorder: Recorder,
+        session: Session<'_>,
+    ) -> Result<Measured, controller::Error> {
+        let grid = self.rig.grid()?;
+        let mut pairs = grid.pairs().to_vec();
+        if let Some(arms) = &self.arms {
+            let name = if self.origin == Origin::Simulated { "simulated_rig" } else { "rig" };
+            recorder.arms(self.started, arms.cell(), name)?;
+            arms.sort(&mut pairs);
+        }
+        if let Some(tap) = session.tap {
+            recorder.listen(tap, self.started, self.shape);
+        }
+        let options = RunOptions { keep: self.keep, checkpoint_every: session.checkpoint_every };
+        let work = Work { pairs: &pairs, before: self.before, options };
+        let outcome = controller.run(&mut recorder, &work, session.control, session.observe)?;
+        let path = match outcome.left {
+            0 => recorder.finish(&outcome.end)?,
+            _ => recorder.partial().to_owned(),
+        };
+        Ok(Measured { path, outcome })
+    }
+}

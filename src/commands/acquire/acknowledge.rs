@@ -1,0 +1,53 @@
+//! The list of what is safe, for whoever must know: a line an attempt, written when the disk has it.
+
+use std::fs::{File, OpenOptions};
+use std::io::{self, Write};
+use std::path::Path;
+
+use anyhow::Context as _;
+use echolake_acquisition::controller::Event;
+use echolake_schema::messages::Verdict;
+
+/// An open list.
+pub(super) struct Acknowledgements {
+    out: Out,
+}
+
+enum Out {
+    Stdout,
+    File(File),
+}
+
+impl Acknowledgements {
+    /// Opens the list for more lines; `-` is stdout.
+    pub(super) fn open(path: &Path) -> anyhow::Result<Self> {
+        if path == Path::new("-") {
+            return Ok(Self { out: Out::Stdout });
+        }
+        let file = OpenOptions::new().create(true).append(true).open(path);
+        Ok(Self { out: Out::File(file.with_context(|| format!("cannot write `{}`", path.display()))?) })
+    }
+
+    /// Writes what became safe.
+    pub(super) fn observe(&mut self, event: &Event<'_>) {
+        let Event::Safe { verdicts, .. } = event else { return };
+        let mut lines = String::new();
+        for m in *verdicts {
+            let verdict = match m.verdict() {
+                Verdict::Accepted => "accepted",
+                Verdict::Repeated => "repeated",
+                Verdict::Rejected => "rejected",
+                Verdict::Unspecified => "unknown",
+            };
+            lines.push_str(&format!("{} {} {verdict} {:.1}\n", m.pair_id, m.attempt, m.snr_db));
+        }
+        let written = match &mut self.out {
+            Out::Stdout => io::stdout().lock().write_all(lines.as_bytes()),
+            Out::File(file) => file.write_all(lines.as_bytes()),
+        };
+        // The run is worth more than the list; whoever reads it takes what is missing for not measured.
+        if let Err(error) = written {
+            eprintln!("warning: the list of what is safe cannot be written: {error}");
+        }
+    }
+}

@@ -1,0 +1,134 @@
+//! What whoever runs the rig sees and can do: progress, pause, stop.
+
+use std::io::{BufRead as _, IsTerminal as _};
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::sync::atomic::Ordering;
+use std::time::Instant;
+
+use echolake_acquisition::controller::{Control, Event};
+use echolake_acquisition::metrics::RunMetrics;
+use echolake_acquisition::recorder::{Cost, free_bytes};
+use echolake_schema::manifest::RunEnd;
+use echolake_schema::messages::Verdict;
+use tokio::signal::unix::{SignalKind, signal};
+
+use crate::progress::{Progress, Task};
+
+/// The progress of one run.
+pub(super) struct Watcher {
+    task: Task,
+    metrics: RunMetrics,
+    folder: PathBuf,
+    repeats: u64,
+    given_up: u64,
+    snr_db: f64,
+    pair: String,
+    begun: Instant,
+    cost: Cost,
+}
+
+impl Watcher {
+    /// Of a run over `planned` pairs, `accepted` of which are measured already.
+    pub(super) fn new(
+        progress: &Progress,
+        surface: &str,
+        planned: u64,
+        accepted: u64,
+        metrics: RunMetrics,
+        folder: PathBuf,
+    ) -> Self {
+        let mut task = progress.task(surface.to_owned(), planned, "pairs");
+        task.begin_at(accepted);
+        let (begun, cost) = (Instant::now(), Cost::default());
+        Self { task, metrics, folder, repeats: 0, given_up: 0, snr_db: f64::NAN, pair: String::new(), begun, cost }
+    }
+
+    /// Something happened. Only what is on the disk counts as done.
+    pub(super) fn observe(&mut self, event: &Event<'_>) {
+        self.metrics.observe(event);
+        match event {
+            Event::Pair(pair) => {
+                self.pair =
+                    format!("pair {} (microphone {}, speaker {})", pair.id.0, pair.microphone.0, pair.speaker.0);
+            }
+            Event::Attempt(m) => {
+                self.snr_db = m.snr_db;
+                self.repeats += u64::from(m.verdict() == Verdict::Repeated);
+                self.given_up += u64::from(m.verdict() == Verdict::Rejected);
+                self.task.note(self.line());
+            }
+            Event::Safe { accepted, cost, .. } => {
+                self.cost = *cost;
+                if let Ok(bytes) = free_bytes(&self.folder) {
+                    self.metrics.disk_free(bytes);
+                }
+                self.task.at(*accepted);
+            }
+            Event::Paused => self.task.say("paused: everything is safe; `p` and Enter, or SIGUSR1, goes on"),
+            Event::Continued => self.task.say("going on"),
+        }
+    }
+
+    /// The run is over, or broke off.
+    pub(super) fn done(self, end: Option<RunEnd>) {
+        let (busy, whole) = (self.cost.busy.as_secs_f64(), self.begun.elapsed().as_secs_f64());
+        self.task.say(&format!(
+            "recording took {busy:.2} s of {whole:.2}, {:.2} of it waiting for the disk; {:.1} MB in {} checkpoints",
+            self.cost.waited.as_secs_f64(),
+            self.cost.bytes as f64 / 1e6,
+            self.cost.checkpoints
+        ));
+        match end {
+            Some(RunEnd { accepted, rejected, attempts, .. }) => {
+                self.task.done(format!("{accepted} pairs accepted, {rejected} given up, {attempts} attempts"));
+            }
+            None => self.task.done("broken off"),
+        }
+    }
+
+    fn line(&self) -> String {
+        let Self { pair, snr_db, repeats, given_up, .. } = self;
+        format!("{pair}, SNR {snr_db:.1} dB, {repeats} repeated, {given_up} given up")
+    }
+}
+
+/// Lets signals and the terminal control a run: Ctrl-C and SIGTERM stop it after the current pair, a second Ctrl-C at
+/// once; SIGUSR1, or `p` and Enter on a terminal, pauses it and lets it go on.
+pub(super) fn obey(control: &Arc<Control>) {
+    let stopped = control.clone();
+    tokio::spawn(async move {
+        // Without a handler the signal ends the process at once, which loses nothing that is safe.
+        let Ok(mut terminated) = signal(SignalKind::terminate()) else { return };
+        tokio::select! {
+            _ = tokio::signal::ctrl_c() => {}
+            _ = terminated.recv() => {}
+        }
+        stopped.stop.store(true, Ordering::Relaxed);
+        eprintln!("stopping after the current pair; Ctrl-C again stops at once");
+        if tokio::signal::ctrl_c().await.is_ok() {
+            std::process::exit(130);
+        }
+    });
+    let paused = control.clone();
+    tokio::spawn(async move {
+        let Ok(mut asked) = signal(SignalKind::user_defined1()) else { return };
+        while asked.recv().await.is_some() {
+            toggle(&paused);
+        }
+    });
+    if std::io::stdin().is_terminal() {
+        let paused = control.clone();
+        std::thread::spawn(move || {
+            for line in std::io::stdin().lock().lines().map_while(Result::ok) {
+                if line.trim().eq_ignore_ascii_case("p") {
+                    toggle(&paused);
+                }
+            }
+        });
+    }
+}
+
+fn toggle(control: &Control) {
+    control.pause.fetch_xor(true, Ordering::Relaxed);
+}

@@ -1,0 +1,373 @@
+//! A file system in memory, mounted by FUSE, that forgets at a power cut what was not synced.
+//!
+//! What POSIX leaves open is drawn by lot at each cut, sector by sector: of a file's bytes that were written since its
+//! last sync some are there, some are as before, some are zeros, and its length is anything in between; of a folder's
+//! entries since its last sync all are there or none. Only what was synced is certain, a file's content by its own sync
+//! and its name by its folder's. A disk that lies about syncs is not simulated: nothing can be kept on one.
+
+use std::collections::BTreeMap;
+use std::ffi::{OsStr, OsString};
+use std::path::Path;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::{Duration, SystemTime};
+
+use fuser::{
+    BackgroundSession, BsdFileFlags, Config, Errno, FileAttr, FileHandle, FileType, Filesystem, FopenFlags, Generation,
+    INodeNo, LockOwner, MountOption, OpenFlags, RenameFlags, ReplyAttr, ReplyCreate, ReplyData, ReplyDirectory,
+    ReplyEmpty, ReplyEntry, ReplyStatfs, ReplyWrite, Request, TimeOrNow, WriteFlags,
+};
+use rand::Rng as _;
+use rand_chacha::ChaCha8Rng;
+
+/// What is written as a whole or not at all.
+const SECTOR: usize = 512;
+/// Nothing is cached: the kernel asks each time.
+const NO_TIME: Duration = Duration::ZERO;
+const ROOT: u64 = 1;
+
+/// The disk; clones share it.
+#[derive(Clone)]
+pub(crate) struct ForgetfulDisk(Arc<Mutex<Tree>>);
+
+/// A disk in use. Dropped, it is unmounted.
+pub(crate) struct Mounted {
+    _session: BackgroundSession,
+}
+
+struct Tree {
+    nodes: BTreeMap<u64, Node>,
+    next: u64,
+}
+
+#[derive(Clone)]
+enum Node {
+    File { now: Vec<u8>, safe: Vec<u8> },
+    Folder { now: Entries, safe: Entries },
+}
+
+type Entries = BTreeMap<OsString, u64>;
+
+impl ForgetfulDisk {
+    pub(crate) fn new() -> Self {
+        let root = Node::Folder { now: Entries::new(), safe: Entries::new() };
+        Self(Arc::new(Mutex::new(Tree { nodes: BTreeMap::from([(ROOT, root)]), next: ROOT + 1 })))
+    }
+
+    /// Mounts the disk; nothing where this machine does not let us.
+    pub(crate) fn mount(&self, at: &Path) -> Option<Mounted> {
+        let mut config = Config::default();
+        config.mount_options = vec![MountOption::FSName("forgetful".into())];
+        match fuser::spawn_mount(Disk(self.0.clone()), at, &config) {
+            Ok(session) => Some(Mounted { _session: session }),
+            Err(error) => {
+                eprintln!("skipped: no file system can be mounted here: {error}");
+                None
+            }
+        }
+    }
+
+    /// The power is cut. Nobody may have the disk mounted.
+    pub(crate) fn cut(&self, random: &mut ChaCha8Rng) {
+        let mut tree = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        for node in tree.nodes.values_mut() {
+            match node {
+                Node::Folder { now, safe } => {
+                    if random.random_bool(0.5) {
+                        now.clone_from(safe);
+                    }
+                    safe.clone_from(now);
+                }
+                Node::File { now, safe } => {
+                    *now = torn(now, safe, random);
+                    safe.clone_from(now);
+                }
+            }
+        }
+    }
+}
+
+// What is left of a file.
+fn torn(now: &[u8], safe: &[u8], random: &mut ChaCha8Rng) -> Vec<u8> {
+    let length = match now.len().cmp(&safe.len()) {
+        std::cmp::Ordering::Equal => now.len(),
+        _ => random.random_range(now.len().min(safe.len())..=now.len().max(safe.len())),
+    };
+    let mut left = Vec::with_capacity(length);
+    while left.len() < length {
+        let range = left.len()..(left.len() + SECTOR).min(length);
+        // Zeros where neither reaches; of a sector that was synced and not written since, both are the same.
+        let sector = |of: &[u8]| -> Vec<u8> { range.clone().map(|i| of.get(i).copied().unwrap_or(0)).collect() };
+        left.extend(if random.random_bool(0.5) { sector(now) } else { sector(safe) });
+    }
+    left
+}
+
+impl Tree {
+    fn folder(&mut self, ino: u64) -> Result<&mut Entries, Errno> {
+        match self.nodes.get_mut(&ino) {
+            Some(Node::Folder { now, .. }) => Ok(now),
+            Some(Node::File { .. }) => Err(Errno::ENOTDIR),
+            None => Err(Errno::ENOENT),
+        }
+    }
+
+    fn file(&mut self, ino: u64) -> Result<&mut Vec<u8>, Errno> {
+        match self.nodes.get_mut(&ino) {
+            Some(Node::File { now, .. }) => Ok(now),
+            Some(Node::Folder { .. }) => Err(Errno::EISDIR),
+            None => Err(Errno::ENOENT),
+        }
+    }
+
+    fn child(&mut self, parent: u64, name: &OsStr) -> Result<u64, Errno> {
+        self.folder(parent)?.get(name).copied().ok_or(Errno::ENOENT)
+    }
+
+    fn add(&mut self, parent: u64, name: &OsStr, node: Node) -> Result<FileAttr, Errno> {
+        if self.child(parent, name).is_ok() {
+            return Err(Errno::EEXIST);
+        }
+        let ino = self.next;
+        self.folder(parent)?.insert(name.to_owned(), ino);
+        self.next += 1;
+        self.nodes.insert(ino, node);
+        self.attributes(ino)
+    }
+
+    // Whatever is removed stays in memory: a cut may bring its name back.
+    fn remove(&mut self, parent: u64, name: &OsStr) -> Result<(), Errno> {
+        self.folder(parent)?.remove(name).map(drop).ok_or(Errno::ENOENT)
+    }
+
+    fn sync(&mut self, ino: u64) -> Result<(), Errno> {
+        match self.nodes.get_mut(&ino).ok_or(Errno::ENOENT)? {
+            Node::File { now, safe } => safe.clone_from(now),
+            Node::Folder { now, safe } => safe.clone_from(now),
+        }
+        Ok(())
+    }
+
+    fn attributes(&self, ino: u64) -> Result<FileAttr, Errno> {
+        let (kind, size, perm) = match self.nodes.get(&ino).ok_or(Errno::ENOENT)? {
+            Node::File { now, .. } => (FileType::RegularFile, now.len() as u64, 0o644),
+            Node::Folder { .. } => (FileType::Directory, 0, 0o755),
+        };
+        let time = SystemTime::UNIX_EPOCH;
+        Ok(FileAttr {
+            ino: INodeNo(ino),
+            size,
+            blocks: size.div_ceil(SECTOR as u64),
+            atime: time,
+            mtime: time,
+            ctime: time,
+            crtime: time,
+            kind,
+            perm,
+            nlink: 1,
+            uid: 0,
+            gid: 0,
+            rdev: 0,
+            blksize: 4096,
+            flags: 0,
+        })
+    }
+}
+
+struct Disk(Arc<Mutex<Tree>>);
+
+impl Disk {
+    fn tree(&self) -> MutexGuard<'_, Tree> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+fn entry(reply: ReplyEntry, found: Result<FileAttr, Errno>) {
+    match found {
+        Ok(attributes) => reply.entry(&NO_TIME, &attributes, Generation(0)),
+        Err(error) => reply.error(error),
+    }
+}
+
+fn empty(reply: ReplyEmpty, done: Result<(), Errno>) {
+    match done {
+        Ok(()) => reply.ok(),
+        Err(error) => reply.error(error),
+    }
+}
+
+fn attributes(reply: ReplyAttr, found: Result<FileAttr, Errno>) {
+    match found {
+        Ok(attributes) => reply.attr(&NO_TIME, &attributes),
+        Err(error) => reply.error(error),
+    }
+}
+
+impl Filesystem for Disk {
+    fn lookup(&self, _: &Request, parent: INodeNo, name: &OsStr, reply: ReplyEntry) {
+        let mut tree = self.tree();
+        let found = tree.child(parent.0, name).and_then(|ino| tree.attributes(ino));
+        entry(reply, found);
+    }
+
+    fn getattr(&self, _: &Request, ino: INodeNo, _: Option<FileHandle>, reply: ReplyAttr) {
+        attributes(reply, self.tree().attributes(ino.0));
+    }
+
+    fn setattr(
+        &self,
+        _: &Request,
+        ino: INodeNo,
+        _mode: Option<u32>,
+        _uid: Option<u32>,
+        _gid: Option<u32>,
+        size: Option<u64>,
+        _atime: Option<TimeOrNow>,
+        _mtime: Option<TimeOrNow>,
+        _ctime: Option<SystemTime>,
+        _fh: Option<FileHandle>,
+        _crtime: Option<SystemTime>,
+        _chgtime: Option<SystemTime>,
+        _bkuptime: Option<SystemTime>,
+        _flags: Option<BsdFileFlags>,
+        reply: ReplyAttr,
+    ) {
+        let mut tree = self.tree();
+        let resized = match size {
+            Some(size) => tree.file(ino.0).map(|file| file.resize(size as usize, 0)),
+            None => Ok(()),
+        };
+        let found = resized.and_then(|()| tree.attributes(ino.0));
+        attributes(reply, found);
+    }
+
+    fn mkdir(&self, _: &Request, parent: INodeNo, name: &OsStr, _: u32, _: u32, reply: ReplyEntry) {
+        let node = Node::Folder { now: Entries::new(), safe: Entries::new() };
+        entry(reply, self.tree().add(parent.0, name, node));
+    }
+
+    fn unlink(&self, _: &Request, parent: INodeNo, name: &OsStr, reply: ReplyEmpty) {
+        empty(reply, self.tree().remove(parent.0, name));
+    }
+
+    fn rmdir(&self, _: &Request, parent: INodeNo, name: &OsStr, reply: ReplyEmpty) {
+        let mut tree = self.tree();
+        let is_empty = tree.child(parent.0, name).and_then(|ino| tree.folder(ino).map(|f| f.is_empty()));
+        let removed = match is_empty {
+            Ok(true) => tree.remove(parent.0, name),
+            Ok(false) => Err(Errno::ENOTEMPTY),
+            Err(error) => Err(error),
+        };
+        empty(reply, removed);
+    }
+
+    fn rename(
+        &self,
+        _: &Request,
+        parent: INodeNo,
+        name: &OsStr,
+        to: INodeNo,
+        new_name: &OsStr,
+        _: RenameFlags,
+        reply: ReplyEmpty,
+    ) {
+        let mut tree = self.tree();
+        let renamed = tree.child(parent.0, name).and_then(|ino| {
+            tree.folder(to.0)?.insert(new_name.to_owned(), ino);
+            if (parent.0, name) != (to.0, new_name) { tree.remove(parent.0, name) } else { Ok(()) }
+        });
+        empty(reply, renamed);
+    }
+
+    fn link(&self, _: &Request, ino: INodeNo, parent: INodeNo, name: &OsStr, reply: ReplyEntry) {
+        let mut tree = self.tree();
+        let linked = match tree.child(parent.0, name) {
+            Ok(_) => Err(Errno::EEXIST),
+            Err(_) => tree.folder(parent.0).map(|folder| drop(folder.insert(name.to_owned(), ino.0))),
+        };
+        let found = linked.and_then(|()| tree.attributes(ino.0));
+        entry(reply, found);
+    }
+
+    fn create(&self, _: &Request, parent: INodeNo, name: &OsStr, _: u32, _: u32, _: i32, reply: ReplyCreate) {
+        match self.tree().add(parent.0, name, Node::File { now: Vec::new(), safe: Vec::new() }) {
+            Ok(made) => reply.created(&NO_TIME, &made, Generation(0), FileHandle(0), FopenFlags::empty()),
+            Err(error) => reply.error(error),
+        }
+    }
+
+    fn read(
+        &self,
+        _: &Request,
+        ino: INodeNo,
+        _: FileHandle,
+        offset: u64,
+        size: u32,
+        _: OpenFlags,
+        _: Option<LockOwner>,
+        reply: ReplyData,
+    ) {
+        match self.tree().file(ino.0) {
+            Ok(file) => {
+                let from = (offset as usize).min(file.len());
+                reply.data(&file[from..(from + size as usize).min(file.len())]);
+            }
+            Err(error) => reply.error(error),
+        }
+    }
+
+    fn write(
+        &self,
+        _: &Request,
+        ino: INodeNo,
+        _: FileHandle,
+        offset: u64,
+        data: &[u8],
+        _: WriteFlags,
+        _: OpenFlags,
+        _: Option<LockOwner>,
+        reply: ReplyWrite,
+    ) {
+        match self.tree().file(ino.0) {
+            Ok(file) => {
+                let (from, to) = (offset as usize, offset as usize + data.len());
+                file.resize(file.len().max(to), 0);
+                file[from..to].copy_from_slice(data);
+                reply.written(data.len() as u32);
+            }
+            Err(error) => reply.error(error),
+        }
+    }
+
+    // Called at every close, which promises nothing.
+    fn flush(&self, _: &Request, _: INodeNo, _: FileHandle, _: LockOwner, reply: ReplyEmpty) {
+        reply.ok();
+    }
+
+    fn fsync(&self, _: &Request, ino: INodeNo, _: FileHandle, _: bool, reply: ReplyEmpty) {
+        empty(reply, self.tree().sync(ino.0));
+    }
+
+    fn fsyncdir(&self, _: &Request, ino: INodeNo, _: FileHandle, _: bool, reply: ReplyEmpty) {
+        empty(reply, self.tree().sync(ino.0));
+    }
+
+    fn readdir(&self, _: &Request, ino: INodeNo, _: FileHandle, offset: u64, mut reply: ReplyDirectory) {
+        let mut tree = self.tree();
+        let entries: Vec<_> = match tree.folder(ino.0) {
+            Ok(entries) => entries.iter().map(|(name, ino)| (name.clone(), *ino)).collect(),
+            Err(error) => return reply.error(error),
+        };
+        for (index, (name, child)) in entries.iter().enumerate().skip(offset as usize) {
+            let kind = tree.attributes(*child).map_or(FileType::RegularFile, |a| a.kind);
+            if reply.add(INodeNo(*child), index as u64 + 1, kind, name) {
+                break;
+            }
+        }
+        reply.ok();
+    }
+
+    fn statfs(&self, _: &Request, _: INodeNo, reply: ReplyStatfs) {
+        // 4 GiB, all free.
+        reply.statfs(1 << 20, 1 << 20, 1 << 20, 1 << 20, 1 << 20, 4096, 255, 4096);
+    }
+}
