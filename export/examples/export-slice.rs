@@ -36,9 +36,10 @@ async fn slice(
     topics: &[String],
     path: &Path,
 ) -> Result<(), Box<dyn std::error::Error>> {
+    let snapshot = lake.snapshot().await?;
     let (started, count) = (Instant::now(), taken.len());
     let params = SliceParams { taken, topics: topics.to_vec(), check: Check::Ends, ..SliceParams::default() };
-    let mut slice = Slice::open(lake, params).await?;
+    let mut slice = Slice::open(lake, &snapshot, params).await?;
     let mut file = PendingFile::create(path)?;
     let (mut bytes, mut first) = (0, None);
     while let Some(piece) = slice.next().await? {

@@ -17,6 +17,8 @@ mod ml;
 mod output;
 mod rows;
 mod slice;
+#[cfg(test)]
+mod tests;
 
 pub use acoustics::{ResponseFormat, write_responses, write_wav};
 pub use error::{Error, Result};

@@ -60,5 +60,7 @@ pub(crate) fn optional_texts<'a>(batch: &'a RecordBatch, column: &str) -> Vec<Op
 pub(crate) fn numbers<'a, T: ArrowPrimitiveType>(batch: &'a RecordBatch, column: &str) -> Result<&'a [T::Native]> {
     let found = batch.column_by_name(column).and_then(|c| c.as_primitive_opt::<T>());
     let found = found.filter(|array| array.null_count() == 0);
-    found.map(|array| array.values().as_ref()).ok_or_else(|| Error::damaged(column, "the column is not as it should be"))
+    found
+        .map(|array| array.values().as_ref())
+        .ok_or_else(|| Error::damaged(column, "the column is not as it should be"))
 }

@@ -35,10 +35,19 @@ pub(super) async fn write(
     let matrix = Array2::from_shape_vec((all, responses.length), samples).map_err(damaged)?;
     let temperatures = Array1::from_vec(responses.celsius.clone());
     let name = format!("{surface}.npz");
-    let mut files = vec![folder.write(&name, &archive(&[("matrix", &matrix)], &[("temperatures", &temperatures)]).map_err(|e| Error::write(&folder.named(&name), e))?)?];
+    let mut files = vec![
+        folder.write(
+            &name,
+            &archive(&[("matrix", &matrix)], &[("temperatures", &temperatures)])
+                .map_err(|e| Error::write(&folder.named(&name), e))?,
+        )?,
+    ];
     if let Some(heights) = heights(lake, snapshot, responses).await? {
         let name = format!("{surface}_mat.npz");
-        files.push(folder.write(&name, &archive(&[("surface", &heights)], &[]).map_err(|e| Error::write(&folder.named(&name), e))?)?);
+        files.push(folder.write(
+            &name,
+            &archive(&[("surface", &heights)], &[]).map_err(|e| Error::write(&folder.named(&name), e))?,
+        )?);
     }
     Ok(files)
 }

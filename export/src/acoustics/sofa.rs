@@ -64,7 +64,8 @@ fn fill(file: &H5File, lake: &Lake, responses: &Responses) -> std::result::Resul
         file.set_attr_string(name, value)?;
     }
     let pairs = responses.pairs.len();
-    let dimensions = Dimensions::create(file, &[('M', pairs), ('R', 1), ('E', 1), ('N', responses.length), ('C', 3), ('I', 1)])?;
+    let dimensions =
+        Dimensions::create(file, &[('M', pairs), ('R', 1), ('E', 1), ('N', responses.length), ('C', 3), ('I', 1)])?;
     let cartesian: &[(&str, &str)] = &[("Type", "cartesian"), ("Units", "metre")];
     let points = lake.grid().points();
     let at = |of: &dyn Fn(usize) -> usize| -> Vec<f64> {
@@ -73,7 +74,8 @@ fn fill(file: &H5File, lake: &Lake, responses: &Responses) -> std::result::Resul
     let pair = |id: usize| lake.grid().pairs()[id];
     let listeners = at(&|id| pair(id).microphone.index());
     let sources = at(&|id| pair(id).speaker.index());
-    let put = |name: &str, shape: &str, values: &[f64], attributes| dimensions.write(file, name, shape, values, attributes);
+    let put =
+        |name: &str, shape: &str, values: &[f64], attributes| dimensions.write(file, name, shape, values, attributes);
     put("ListenerPosition", "MC", &listeners, cartesian)?;
     put("ListenerView", "IC", &[1.0, 0.0, 0.0], cartesian)?;
     put("ListenerUp", "IC", &[0.0, 0.0, 1.0], &[])?;

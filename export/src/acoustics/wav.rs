@@ -49,8 +49,16 @@ pub async fn write_wav(
     for run in &mut runs {
         while let Some(measured) = run.next().await? {
             let recording = Recording::of(&measured)?;
-            let name = format!("{}/{}-p{:04}-a{}.wav", run.surface(), run.run(), recording.sweep.pair_id, recording.sweep.attempt);
-            let bytes = recording.wav().map_err(|reason| Error::damaged(run.file(), format!("pair {}: {reason}", recording.sweep.pair_id)))?;
+            let name = format!(
+                "{}/{}-p{:04}-a{}.wav",
+                run.surface(),
+                run.run(),
+                recording.sweep.pair_id,
+                recording.sweep.attempt
+            );
+            let bytes = recording
+                .wav()
+                .map_err(|reason| Error::damaged(run.file(), format!("pair {}: {reason}", recording.sweep.pair_id)))?;
             pending.write(&name, &bytes)?;
             let row = recording.row(lake, run.surface().as_str(), &name).ok_or_else(|| {
                 Error::damaged(run.file(), format!("pair {}, which the rig does not have", recording.sweep.pair_id))
@@ -129,7 +137,12 @@ impl Recording {
         Ok(bytes.into_inner())
     }
 
-    fn interleave<W: Write + Seek>(&self, mut to: WavWriter<W>, format: SampleFormat, count: usize) -> hound::Result<()> {
+    fn interleave<W: Write + Seek>(
+        &self,
+        mut to: WavWriter<W>,
+        format: SampleFormat,
+        count: usize,
+    ) -> hound::Result<()> {
         for i in 0..count {
             for channel in [&self.sweep.microphone, &self.sweep.loopback] {
                 match format {
@@ -186,7 +199,12 @@ mod tests {
 
     #[test]
     fn lengths_that_the_bytes_do_not_bear_out_are_refused() {
-        let sweep = SweepRecording { sample_count: 9, format: SampleFormat::S24le.into(), microphone: vec![0; 6].into(), ..SweepRecording::default() };
+        let sweep = SweepRecording {
+            sample_count: 9,
+            format: SampleFormat::S24le.into(),
+            microphone: vec![0; 6].into(),
+            ..SweepRecording::default()
+        };
         let recording = Recording { sweep, verdict: Measurement::default(), time_ns: 0 };
         assert!(recording.wav().is_err_and(|e| e.contains("6 bytes for 9")));
     }

@@ -34,7 +34,8 @@ impl About<'_> {
 
     /// The origins of the surfaces: measured, simulated, imported.
     pub(super) fn origins(&self) -> Vec<String> {
-        let mut origins: Vec<_> = Part::ALL.iter().flat_map(|p| self.plan.of_part(*p)).map(|s| s.origin.clone()).collect();
+        let mut origins: Vec<_> =
+            Part::ALL.iter().flat_map(|p| self.plan.of_part(*p)).map(|s| s.origin.clone()).collect();
         origins.sort();
         origins.dedup();
         origins
@@ -63,9 +64,20 @@ pub(super) fn write(about: &About<'_>) -> String {
     text.push_str(
         "No physical panel (column `group`) is in two splits: neither a side of it, nor a repeated run, nor a symmetry.\nSurfaces that normalise others are for training always, because they are in every number anyway.\n\n",
     );
-    text.push_str("| split | files | panels | surfaces | rows | height maps |\n| --- | ---: | ---: | ---: | ---: | ---: |\n");
+    text.push_str(
+        "| split | files | panels | surfaces | rows | height maps |\n| --- | ---: | ---: | ---: | ---: | ---: |\n",
+    );
     for p in &about.exported.parts {
-        let _ = writeln!(text, "| {} | {} | {} | {} | {} | {} |", p.part.name(), p.files, p.panels, p.surfaces, p.rows, p.height_maps);
+        let _ = writeln!(
+            text,
+            "| {} | {} | {} | {} | {} | {} |",
+            p.part.name(),
+            p.files,
+            p.panels,
+            p.surfaces,
+            p.rows,
+            p.height_maps
+        );
     }
     if !about.exported.left_out.is_empty() {
         let names: Vec<_> = about.exported.left_out.iter().map(|s| s.as_str()).collect();
@@ -93,9 +105,12 @@ pub(super) fn write(about: &About<'_>) -> String {
 }
 
 fn front_matter(about: &About<'_>) -> String {
-    let mut text = String::from("---\npretty_name: Reflections of relief surfaces\ntags:\n- acoustics\n- impulse-response\nconfigs:\n");
+    let mut text = String::from(
+        "---\npretty_name: Reflections of relief surfaces\ntags:\n- acoustics\n- impulse-response\nconfigs:\n",
+    );
     let mut config = |name: &str, default: bool, path: &dyn Fn(Part) -> String, has: &dyn Fn(Part) -> bool| {
-        let _ = write!(text, "- config_name: {name}\n{}  data_files:\n", if default { "  default: true\n" } else { "" });
+        let _ =
+            write!(text, "- config_name: {name}\n{}  data_files:\n", if default { "  default: true\n" } else { "" });
         for part in Part::ALL.into_iter().filter(|p| has(*p)) {
             let _ = writeln!(text, "  - split: {}\n    path: {}", part.name(), path(part));
         }
@@ -119,7 +134,11 @@ fn files(text: &mut String, about: &About<'_>) {
         Symmetries::None => "Rows are as they were measured. The grid and the panel have the eight symmetries of a square; `echolake.torch.Measurements(symmetries=\"all\")` turns positions and height maps together while it loads.\n",
         Symmetries::All => "Every measurement stands there under each of the square's eight symmetries: its positions are turned, its numbers are the same, and the height map of the same `symmetry` is turned with it. Where `swapped` is true, microphone and speaker changed places as well, which relies on reciprocity; leave these rows out where that is not wanted.\n",
     });
-    let _ = writeln!(text, "Made by echolake {}; the same lake, arguments and version give the same bytes.", env!("CARGO_PKG_VERSION"));
+    let _ = writeln!(
+        text,
+        "Made by echolake {}; the same lake, arguments and version give the same bytes.",
+        env!("CARGO_PKG_VERSION")
+    );
 }
 
 fn columns<'a>(text: &mut String, fields: impl Iterator<Item = &'a Field>) {

@@ -113,7 +113,12 @@ fn keys() -> Vec<FieldRef> {
     vec![
         field("surface_id", DataType::Utf8, "", "The measured surface, as 0015_0"),
         field("run_id", DataType::Utf8, "", "The run that it was measured in"),
-        field("symmetry", DataType::Utf8, "", "What the row is turned by: identity, rot90, rot180, rot270, mirror_x, mirror_y, mirror_diag or mirror_anti"),
+        field(
+            "symmetry",
+            DataType::Utf8,
+            "",
+            "What the row is turned by: identity, rot90, rot180, rot270, mirror_x, mirror_y, mirror_diag or mirror_anti",
+        ),
         field("split", DataType::Utf8, "", "train, validation or test"),
         field("group", DataType::Utf8, "", "Physical panel: all of its sides, runs and symmetries are in one split"),
         field("typology", DataType::Utf8, "", "Kind of relief"),
@@ -121,8 +126,18 @@ fn keys() -> Vec<FieldRef> {
         field("pair_id", DataType::Int32, "", "The measured pair that the numbers come from"),
         field("microphone", DataType::Int32, "", "Grid point of the microphone, after the symmetry"),
         field("speaker", DataType::Int32, "", "Grid point of the speaker, after the symmetry"),
-        field("swapped", DataType::Boolean, "", "The symmetry made microphone and speaker change places: the row relies on reciprocity"),
-        field("microphone_mm", position.clone(), "mm", "x, y, z of the microphone, after the symmetry; origin at the panel's centre"),
+        field(
+            "swapped",
+            DataType::Boolean,
+            "",
+            "The symmetry made microphone and speaker change places: the row relies on reciprocity",
+        ),
+        field(
+            "microphone_mm",
+            position.clone(),
+            "mm",
+            "x, y, z of the microphone, after the symmetry; origin at the panel's centre",
+        ),
         field("speaker_mm", position, "mm", "x, y, z of the speaker, after the symmetry"),
     ]
 }

@@ -20,10 +20,18 @@ pub(super) fn write(about: &About<'_>) -> Result<String> {
         let name = part.part.name();
         let id = format!("measurements-{name}");
         distribution.push(file_set(&id, &format!("data/{name}-*.parquet"), &format!("Measurements of split {name}")));
-        record_sets.push(record_set(&id, &format!("{} rows", part.rows), about.plan.schema().fields().iter().map(AsRef::as_ref)));
+        record_sets.push(record_set(
+            &id,
+            &format!("{} rows", part.rows),
+            about.plan.schema().fields().iter().map(AsRef::as_ref),
+        ));
         if part.height_maps > 0 {
             let id = format!("heightmaps-{name}");
-            distribution.push(file_set(&id, &format!("heightmaps/{name}.parquet"), &format!("Height maps of split {name}")));
+            distribution.push(file_set(
+                &id,
+                &format!("heightmaps/{name}.parquet"),
+                &format!("Height maps of split {name}"),
+            ));
             let schema = heights::schema()?;
             let about = format!("Height maps of {} surfaces", part.height_maps);
             record_sets.push(record_set(&id, &about, schema.fields().iter().map(AsRef::as_ref)));

@@ -81,7 +81,10 @@ impl Maker<'_> {
         for (table, field) in self.columns.chosen() {
             let (batch, places) = &tables[table];
             let order: UInt32Array = pairs.iter().map(|pair| places[pair]).collect();
-            values.push(column(batch, field, &order).map_err(|e| Error::damaged(format!("{}, {}", table.name(), run.visible.run), e))?);
+            values.push(
+                column(batch, field, &order)
+                    .map_err(|e| Error::damaged(format!("{}, {}", table.name(), run.visible.run), e))?,
+            );
         }
         Ok(RunRows { pairs, values })
     }
@@ -100,7 +103,8 @@ impl Maker<'_> {
         (symmetry, moved): (Symmetry, &[MovedPair]),
     ) -> Result<RecordBatch> {
         let count = rows.pairs.len();
-        let same = |text: &str| -> ArrayRef { Arc::new(StringArray::from_iter_values(std::iter::repeat_n(text, count))) };
+        let same =
+            |text: &str| -> ArrayRef { Arc::new(StringArray::from_iter_values(std::iter::repeat_n(text, count))) };
         let moved: Vec<_> = rows.pairs.iter().map(|pair| moved[*pair as usize]).collect();
         let points = |of: fn(&MovedPair) -> PointId| -> ArrayRef {
             Arc::new(Int32Array::from_iter_values(moved.iter().map(|m| of(m).0 as i32)))
@@ -137,7 +141,8 @@ impl Maker<'_> {
 // Where each pair's row is. A pair stands once in a run; of several the last counts.
 fn places(batch: &RecordBatch, pairs: usize) -> Result<HashMap<u32, u32>> {
     let ids = rows::numbers::<Int32Type>(batch, "pair_id")?;
-    let place = |(row, id): (usize, &i32)| Some((u32::try_from(*id).ok().filter(|id| (*id as usize) < pairs)?, row as u32));
+    let place =
+        |(row, id): (usize, &i32)| Some((u32::try_from(*id).ok().filter(|id| (*id as usize) < pairs)?, row as u32));
     let all: Option<HashMap<_, _>> = ids.iter().enumerate().map(place).collect();
     all.ok_or_else(|| Error::damaged("pair_id", "a pair that the rig does not have"))
 }

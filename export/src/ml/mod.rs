@@ -116,7 +116,8 @@ impl Plan {
                 None => left_out.push(surface.id),
             }
         }
-        let shards = Part::ALL.into_iter().zip(of_part).flat_map(|(part, of)| shards(part, of, set.split.seed)).collect();
+        let shards =
+            Part::ALL.into_iter().zip(of_part).flat_map(|(part, of)| shards(part, of, set.split.seed)).collect();
         let moves = Moves::of(lake.grid(), set.symmetries);
         Ok(Self { set: set.clone(), columns, moves, shards, left_out, waiting })
     }
@@ -135,7 +136,11 @@ fn shards(part: Part, mut surfaces: Vec<Surface>, seed: u64) -> Vec<Shard> {
     surfaces.sort_by_cached_key(|s| split::digest(seed, s.id.as_str()));
     let count = SHARDS.max(surfaces.len().div_ceil(SURFACES_A_SHARD)).min(surfaces.len());
     let mut shards: Vec<_> = (0..count)
-        .map(|i| Shard { part, name: format!("data/{}-{i:05}-of-{count:05}.parquet", part.name()), surfaces: Vec::new() })
+        .map(|i| Shard {
+            part,
+            name: format!("data/{}-{i:05}-of-{count:05}.parquet", part.name()),
+            surfaces: Vec::new(),
+        })
         .collect();
     surfaces.into_iter().enumerate().for_each(|(i, surface)| shards[i % count].surfaces.push(surface));
     shards

@@ -121,7 +121,8 @@ fn draw(surfaces: &[Surface], split: Split) -> Result<BTreeMap<String, Part>> {
     let wanted = [(Part::Test, split.test), (Part::Validation, split.validation)];
     let needed = 1 + wanted.iter().filter(|(_, share)| *share > 0.0).count();
     if categories < needed {
-        let reason = format!("beside references it has {categories} of them, expected {needed} at least; hint: --split none");
+        let reason =
+            format!("beside references it has {categories} of them, expected {needed} at least; hint: --split none");
         return Err(Error::Split { by: split.by.name(), reason });
     }
     let mut order: Vec<_> = counts.into_iter().collect();

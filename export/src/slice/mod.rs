@@ -8,7 +8,7 @@ use std::cmp::Reverse;
 use std::collections::{BTreeMap, BTreeSet, BinaryHeap, HashSet, VecDeque};
 
 use bytes::Bytes;
-use echolake_lake::Lake;
+use echolake_lake::{Lake, Snapshot};
 use echolake_schema::{RunId, SurfaceId, topics};
 use futures::stream::{self, BoxStream, StreamExt as _};
 use mcap::records::Metadata;
@@ -115,7 +115,7 @@ impl OpenedRun {
 /// Opens the runs of measurements, each checked.
 pub(crate) async fn open_runs(lake: &Lake, taken: &[Taken], check: Check) -> Result<Vec<OpenedRun>> {
     let mut opened = Vec::new();
-    for (file, taken) in files(lake, taken).await? {
+    for (file, taken) in files(lake, &lake.snapshot().await?, taken).await? {
         let source = Source::open(lake.store(), file, check).await?;
         opened.push(OpenedRun(Groups::new(source, &taken)));
     }
@@ -123,16 +123,15 @@ pub(crate) async fn open_runs(lake: &Lake, taken: &[Taken], check: Check) -> Res
 }
 
 // The runs of measurements with their files, by their start.
-async fn files(lake: &Lake, taken: &[Taken]) -> Result<Vec<(RunFile, Vec<Taken>)>> {
+async fn files(lake: &Lake, snapshot: &Snapshot, taken: &[Taken]) -> Result<Vec<(RunFile, Vec<Taken>)>> {
     if taken.is_empty() {
         return Err(Error::Nothing { reason: "no measurement is selected".into() });
     }
     let mut by_run: BTreeMap<RunId, Vec<Taken>> = BTreeMap::new();
     taken.iter().for_each(|t| by_run.entry(t.run.clone()).or_default().push(t.clone()));
-    let snapshot = lake.snapshot().await?;
     let mut runs = Vec::new();
     for (run, taken) in by_run {
-        runs.push((RunFile::find(lake, &snapshot, &run).await?, taken));
+        runs.push((RunFile::find(lake, snapshot, &run).await?, taken));
     }
     runs.sort_by_key(|(file, _)| file.started_ns);
     Ok(runs)
@@ -185,13 +184,14 @@ impl Ord for Waiting {
 }
 
 impl Slice {
-    /// Checks everything that can be known to fail: the runs' files, and the topics.
+    /// Checks everything that can be known to fail: the runs' files, and the topics. A server gives the snapshot that it
+    /// has, because taking one costs more than the first bytes of a slice.
     ///
     /// # Errors
     /// [`Error::Nothing`] without measurements, [`Error::Unknown`] for a topic that none of the runs has,
     /// [`Error::Changed`] for a file that is not the ingested one.
-    pub async fn open(lake: &Lake, params: SliceParams) -> Result<Self> {
-        let (runs, mut known) = (files(lake, &params.taken).await?, BTreeSet::new());
+    pub async fn open(lake: &Lake, snapshot: &Snapshot, params: SliceParams) -> Result<Self> {
+        let (runs, mut known) = (files(lake, snapshot, &params.taken).await?, BTreeSet::new());
         for (file, _) in &runs {
             let source = Source::open(lake.store(), file.clone(), params.check).await?;
             known.extend(source.channels.values().map(|c| c.topic.clone()));
@@ -268,7 +268,8 @@ impl Slice {
             writer.metadata(Metadata { name: SLICE_RUN_METADATA.into(), metadata: source.manifest.clone() })?;
             let mut number = 0;
             // They are attached where nothing is left out.
-            while let Some(mut attachment) = source.attachment(number).await?.filter(|_| self.params.topics.is_empty()) {
+            while let Some(mut attachment) = source.attachment(number).await?.filter(|_| self.params.topics.is_empty())
+            {
                 if self.several {
                     attachment.name = format!("{}/{}", source.file.run, attachment.name);
                 }
@@ -322,6 +323,9 @@ fn about(runs: &[(RunFile, Vec<Taken>)], params: &SliceParams) -> Metadata {
         ("topics".to_owned(), params.topics.join(",")),
     ]);
     // What each run's file was, so that a slice can be checked against it.
-    metadata.extend(runs.iter().map(|(file, taken)| (format!("run.{}", file.run), format!("{} of sha256:{}", taken.len(), file.sha256))));
+    metadata.extend(
+        runs.iter()
+            .map(|(file, taken)| (format!("run.{}", file.run), format!("{} of sha256:{}", taken.len(), file.sha256))),
+    );
     Metadata { name: SLICE_METADATA.into(), metadata }
 }

@@ -10,7 +10,9 @@ use echolake_lake::{Lake, Snapshot};
 use echolake_schema::tables::Table;
 use echolake_schema::{RunId, SurfaceId, topics};
 use mcap::records::{ChunkIndex, Record};
-use mcap::sans_io::{LinearReadEvent, LinearReader, LinearReaderOptions, SummaryReadEvent, SummaryReader, SummaryReaderOptions};
+use mcap::sans_io::{
+    LinearReadEvent, LinearReader, LinearReaderOptions, SummaryReadEvent, SummaryReader, SummaryReaderOptions,
+};
 use mcap::{Attachment, Channel, McapError};
 use object_store::path::Path;
 use object_store::{ObjectStore, ObjectStoreExt as _};
@@ -158,7 +160,8 @@ impl Source {
         self.channels = summary.channels.into_iter().collect();
         self.chunks = summary.chunk_indexes;
         self.chunks.sort_by_key(|chunk| chunk.chunk_start_offset);
-        self.attachments = summary.attachment_indexes.iter().map(|a| a.offset..a.offset.saturating_add(a.length)).collect();
+        self.attachments =
+            summary.attachment_indexes.iter().map(|a| a.offset..a.offset.saturating_add(a.length)).collect();
         let manifest = summary.metadata_indexes.iter().find(|m| m.name == topics::RUN_METADATA);
         if let Some(index) = manifest {
             let record = self.read(index.offset..index.offset.saturating_add(index.length)).await?;
@@ -195,7 +198,8 @@ impl Source {
 
     /// All messages of a chunk, in the file's order; its CRC is checked before the first is given out.
     pub(super) async fn messages(&self, chunk: &ChunkIndex) -> Result<Vec<Message>> {
-        let record = self.read(chunk.chunk_start_offset..chunk.chunk_start_offset.saturating_add(chunk.chunk_length)).await?;
+        let record =
+            self.read(chunk.chunk_start_offset..chunk.chunk_start_offset.saturating_add(chunk.chunk_length)).await?;
         let options = LinearReaderOptions::default()
             .with_skip_start_magic(true)
             .with_skip_end_magic(true)
@@ -215,7 +219,8 @@ impl Source {
                     if opcode != mcap::records::op::MESSAGE {
                         continue;
                     }
-                    let Record::Message { header, data } = mcap::parse_record(opcode, data).map_err(|e| self.damaged(&e))?
+                    let Record::Message { header, data } =
+                        mcap::parse_record(opcode, data).map_err(|e| self.damaged(&e))?
                     else {
                         continue;
                     };

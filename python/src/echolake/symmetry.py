@@ -46,5 +46,7 @@ def turn_heights(heights: NDArray[Any], symmetry: str) -> NDArray[Any]:
     y, x = np.meshgrid(axis, axis, indexing="ij")
     # What stands at a place came from where the inverse, the transpose, takes it.
     from_x, from_y = np.tensordot(MATRICES[symmetry].T, np.stack([x, y]), axes=1)
-    index = lambda place: (place + cells - 1) // 2  # noqa: E731
-    return heights[..., index(from_y), index(from_x)]
+    rows: NDArray[np.int64] = (from_y + cells - 1) // 2
+    columns: NDArray[np.int64] = (from_x + cells - 1) // 2
+    turned: NDArray[Any] = np.take(heights.reshape(*heights.shape[:-2], -1), rows * cells + columns, axis=-1)
+    return turned

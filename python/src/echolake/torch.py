@@ -153,7 +153,8 @@ class Measurements(IterableDataset[Batch]):
 
     def _read(self, items: list[_Item]) -> dict[str, Any]:
         parts: list[dict[str, NDArray[Any]]] = []
-        surface_ids, symmetries = [], []
+        surface_ids: list[str] = []
+        symmetries: list[str] = []
         for item in items:
             names = [*self.columns, "surface_id", "symmetry"]
             table = pq.ParquetFile(item.file, memory_map=True).read_row_group(item.row_group, columns=names)
@@ -187,6 +188,7 @@ class Measurements(IterableDataset[Batch]):
     def _batches(self, block: dict[str, Any], random: np.random.Generator) -> Iterator[Batch]:
         rows = len(block["surface"])
         order = random.permutation(rows) if self.shuffle else None
+        maps = self._maps(block["surface_ids"], block["symmetries"]) if self.with_heights else None
         for start in range(0, rows, self.batch_size):
             stop = min(start + self.batch_size, rows)
             chosen: Any = slice(start, stop) if order is None else order[start:stop]
@@ -194,19 +196,14 @@ class Measurements(IterableDataset[Batch]):
                 name: torch.from_numpy(values[chosen]) for name, values in block.items() if isinstance(values, np.ndarray)
             }
             batch["surface_ids"], batch["symmetries"] = block["surface_ids"], block["symmetries"]
-            if self.with_heights:
-                batch["heights"] = torch.from_numpy(self._maps(block))
+            if maps is not None:
+                batch["heights"] = maps
             yield batch
 
-    def _maps(self, block: dict[str, Any]) -> NDArray[np.float32]:
-        if "_maps" not in block:
-            known = self._known_heights()
-            block["_maps"] = np.stack([
-                turn_heights(known[surface], symmetry) for surface, symmetry in zip(block["surface_ids"], block["symmetries"])
-            ]).astype(np.float32)
-            block["_maps"].setflags(write=True)
-        maps: NDArray[np.float32] = block["_maps"]
-        return maps
+    def _maps(self, surface_ids: list[str], symmetries: list[str]) -> torch.Tensor:
+        known = self._known_heights()
+        turned = [turn_heights(known[surface], symmetry) for surface, symmetry in zip(surface_ids, symmetries)]
+        return torch.from_numpy(np.stack(turned))
 
     def _known_heights(self) -> dict[str, NDArray[np.float32]]:
         if self._heights is None:
