@@ -44,13 +44,13 @@ def test_shuffling_mixes_surfaces_and_is_repeatable(training_set: Path) -> None:
 
 
 def test_turns_are_those_of_the_rows_as_measured(training_set: Path) -> None:
-    columns = ["microphone_mm", "speaker_mm", "tnce_total"]
+    columns = ["microphone_mm", "speaker_mm", "ir"]
     plain, maps = {}, {}
     for batch in Measurements(training_set, columns=columns, shuffle=False, heights=True):
         for row, place in enumerate(batch["surface"].tolist()):
             surface = batch["surface_ids"][place]
             maps[surface] = batch["heights"][place].numpy()
-            key = (surface, batch["tnce_total"][row].item())
+            key = (surface, batch["ir"][row].numpy().tobytes())
             plain[key] = batch["microphone_mm"][row].numpy(), batch["speaker_mm"][row].numpy()
     seen = set()
     for batch in Measurements(training_set, columns=columns, symmetries="all", heights=True, seed=3):
@@ -59,7 +59,7 @@ def test_turns_are_those_of_the_rows_as_measured(training_set: Path) -> None:
             assert np.array_equal(batch["heights"][place], turn_heights(maps[surface], symmetry))
         for row in range(0, len(batch["surface"]), 97):
             place = int(batch["surface"][row])
-            microphone, speaker = plain[batch["surface_ids"][place], batch["tnce_total"][row].item()]
+            microphone, speaker = plain[batch["surface_ids"][place], batch["ir"][row].numpy().tobytes()]
             symmetry = batch["symmetries"][place]
             assert np.allclose(batch["microphone_mm"][row], turn_positions(microphone, symmetry))
             assert np.allclose(batch["speaker_mm"][row], turn_positions(speaker, symmetry))
