@@ -1,4 +1,4 @@
-//! `echolake acquire`: one surface measured with the simulated rig.
+//! `echolake acquire`: one surface measured, with the simulated rig or the devices that the rig file names.
 
 use std::path::Path;
 
@@ -36,7 +36,9 @@ pub(crate) async fn run(args: &AcquireArgs, lake_url: &str) -> anyhow::Result<Do
     let (flat, foam) = (args.flat.clone(), args.foam.clone());
     let keep = if args.ir_only { Keep::ResponsesOnly } else { Keep::Sweeps };
     let progress = Progress::new();
-    progress.say("simulated rig: nothing here is measured");
+    if rig.devices.are_simulated() {
+        progress.say("simulated rig: nothing here is measured");
+    }
     let pairs = rig.grid()?.pairs().len();
     let mut task = progress.task(args.surface.to_string(), pairs as u64, "pairs");
     let measured = tokio::task::spawn_blocking(move || {
