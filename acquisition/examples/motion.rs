@@ -22,6 +22,7 @@ fn main() -> Result<(), Box<dyn Error>> {
         writeln!(out, "microphone's rod {rod:?}:")?;
         who_reaches_what(&mut out, &grid, &Cell::new(&RobotCell { rod, ..rig.robots.clone() }, rig.panel.size_mm))?;
     }
+    who_shades_whom(&mut out, &grid)?;
     let cell = Cell::of(&rig);
     let standings = standings(&grid, &cell)?;
     let own: Vec<usize> = (0..standings.len()).collect();
@@ -53,6 +54,34 @@ fn who_reaches_what(out: &mut dyn Write, grid: &Grid, cell: &Cell) -> io::Result
     }
     writeln!(out, "  {:>6} {:>9}  ({:.2} s)", "paired", "left out", began.elapsed().as_secs_f64())?;
     tally.iter().try_for_each(|(what, [paired, left_out])| writeln!(out, "  {paired:>6} {left_out:>9}  {what}"))
+}
+
+// How near the microphone is to the way from the speaker to the mirror point: what the pairs that the grid leaves out
+// have in common, whether or not the arms get there.
+fn who_shades_whom(out: &mut dyn Write, grid: &Grid) -> io::Result<()> {
+    let mut distances = [Vec::new(), Vec::new()];
+    for a in grid.points() {
+        for b in grid.points().iter().filter(|b| b.id > a.id) {
+            let paired = grid.pair_id(a.id, b.id).is_some();
+            distances[usize::from(!paired)].push(off_axis_mm(a.position_mm, b.position_mm));
+        }
+    }
+    let farthest = distances[1].iter().copied().fold(0.0, f64::max);
+    let near = distances[0].iter().filter(|d| **d <= farthest).count();
+    writeln!(
+        out,
+        "microphone beside the way from speaker to mirror point: {} pairs that are left out at most {farthest:.1} mm, \
+         {near} of {} that are measured as near",
+        distances[1].len(),
+        distances[0].len()
+    )
+}
+
+fn off_axis_mm(microphone: [f64; 3], speaker: [f64; 3]) -> f64 {
+    let axis = [0, 1, 2].map(|i| if i == 2 { -microphone[2] } else { microphone[i] } - speaker[i]);
+    let to = [0, 1, 2].map(|i| microphone[i] - speaker[i]);
+    let dot = |a: [f64; 3], b: [f64; 3]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
+    (dot(to, to) - dot(to, axis).powi(2) / dot(axis, axis)).max(0.0).sqrt()
 }
 
 fn named(why: Unreachable) -> String {

@@ -1,4 +1,5 @@
-//! `echolake acquire`: one surface measured with the simulated rig, watched, paused, stopped and gone on with.
+//! `echolake acquire`: one surface measured, with the simulated rig or the devices that the rig file names; watched,
+//! paused, stopped and gone on with.
 
 mod acknowledge;
 mod specimen;
@@ -57,7 +58,9 @@ pub(crate) async fn run(args: &AcquireArgs, lake_url: &str) -> anyhow::Result<Do
         Some(partial) => Job::Resumed { partial: partial.clone(), held: Box::new(Held::read(partial)?) },
         None => fresh(args, lake_url, &progress).await?,
     };
-    progress.say("simulated rig: nothing here is measured");
+    if job.rig().devices.are_simulated() {
+        progress.say("simulated rig: nothing here is measured");
+    }
     let (surface, planned, accepted) = job.size()?;
     let mut acknowledgements = args.acknowledge.as_deref().map(Acknowledgements::open).transpose()?;
     let metrics = RunMetrics::new(&surface, planned, accepted);
@@ -171,6 +174,13 @@ fn unfinished(folder: &Path, surface: &str) -> Vec<PathBuf> {
 }
 
 impl Job {
+    fn rig(&self) -> &Rig {
+        match self {
+            Self::Fresh(fresh) => &fresh.rig,
+            Self::Resumed { held, .. } => &held.rig,
+        }
+    }
+
     fn folder(&self) -> PathBuf {
         match self {
             Self::Fresh(fresh) => fresh.folder.clone(),
