@@ -295,6 +295,9 @@ impl<'a> RunController<'a> {
             outside_level_db: reading.outside_level_db,
         };
         recorder.environment(reading.at, &sample)?;
+        for (device, notice) in self.devices.notices() {
+            recorder.log(at, LogLevel::Warning, device, &notice)?;
+        }
         if options.keep == Keep::Sweeps {
             let recording = SweepRecording {
                 pair_id: m.pair_id,

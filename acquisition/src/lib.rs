@@ -12,6 +12,7 @@ pub mod assessment;
 pub mod collection;
 pub mod conformance;
 pub mod controller;
+pub mod drivers;
 pub mod import;
 pub mod kirchhoff;
 pub mod mesh;

@@ -24,6 +24,11 @@ pub trait Robots: Send {
     /// # Errors
     /// [`Error::Device`].
     fn power(&mut self, power: Power) -> Result<(), Error>;
+
+    /// What was not right since the last call, though it was dealt with: for the run's log.
+    fn notices(&mut self) -> Vec<String> {
+        Vec::new()
+    }
 }
 
 /// Where the arms stand, mm.
@@ -58,6 +63,11 @@ pub trait AudioInterface: Send {
     /// # Errors
     /// [`Error::Device`].
     fn play_and_record(&mut self, output: &[f32], take: &mut Take) -> Result<(), Error>;
+
+    /// What was not right since the last call, though it was dealt with: for the run's log.
+    fn notices(&mut self) -> Vec<String> {
+        Vec::new()
+    }
 }
 
 /// One recording: signed 24-bit samples, full scale 2^23.
@@ -78,6 +88,11 @@ pub trait AmbientSensor: Send {
     /// # Errors
     /// [`Error::Device`].
     fn read(&mut self) -> Result<Reading, Error>;
+
+    /// What was not right since the last call, though it was dealt with: for the run's log.
+    fn notices(&mut self) -> Vec<String> {
+        Vec::new()
+    }
 }
 
 /// One reading.
@@ -105,6 +120,15 @@ pub struct Devices {
     pub sensor: Box<dyn AmbientSensor>,
     /// Whether they are real.
     pub origin: Origin,
+}
+
+impl Devices {
+    /// What was not right since the last call, and with which device.
+    pub fn notices(&mut self) -> Vec<(&'static str, String)> {
+        let of = |device, notices: Vec<String>| notices.into_iter().map(move |notice| (device, notice));
+        let (robots, audio) = (self.robots.notices(), self.audio.notices());
+        of("robots", robots).chain(of("audio", audio)).chain(of("sensor", self.sensor.notices())).collect()
+    }
 }
 
 /// Why a device did not do what it was told.

@@ -3,10 +3,11 @@
 use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
 
-use echolake_schema::manifest::{MeshFacts, RunEnd, RunManifest};
+use echolake_schema::manifest::{MeshFacts, Origin, RunEnd, RunManifest};
 use echolake_schema::{Rig, RunId, SurfaceId, SurfaceRecord, Timestamp};
 
 use crate::controller::{self, Keep, RunController, RunOptions};
+use crate::drivers;
 use crate::mesh::{self, Format, Mesh};
 use crate::recorder::{OriginalFile, Recorder, Relief as RecordedRelief, RunStart};
 use crate::relief::{HeightField, Relief};
@@ -91,14 +92,19 @@ impl SimulatedRun<'_> {
             seed: self.seed,
             arms: arms.clone(),
         };
-        let devices = devices(&simulation).map_err(controller::Error::from)?;
+        let real = drivers::open(self.rig).map_err(controller::Error::from)?;
+        let devices = match real {
+            Some(real) => real,
+            None => devices(&simulation).map_err(controller::Error::from)?,
+        };
+        let (origin, checkpoint_every) = (devices.origin, checkpoint_every(devices.origin));
         let manifest = RunManifest {
             run_id: self.run_id()?,
             surface_id: self.surface.clone(),
             started: self.start,
             software: concat!("echolake ", env!("CARGO_PKG_VERSION")).to_owned(),
             rig: self.rig.name.clone(),
-            origin: devices.origin,
+            origin,
         };
         let original = prepared.original.as_ref().map(|(name, format, bytes)| OriginalFile {
             name,
@@ -110,12 +116,12 @@ impl SimulatedRun<'_> {
         let path = self.path()?;
         // What can be refused is refused before there is a file.
         let mut controller = RunController::new(self.rig, devices)?;
-        let options = RunOptions { keep: self.keep, checkpoint_every: CHECKPOINT_EVERY };
+        let options = RunOptions { keep: self.keep, checkpoint_every };
         let grid = self.rig.grid()?;
         let mut recorder = Recorder::create(&path, &start).map_err(controller::Error::from)?;
         let mut pairs = grid.pairs().to_vec();
         if let Some(arms) = &arms {
-            let shown = recorder.arms(self.start, arms.cell(), "simulated_rig");
+            let shown = recorder.arms(self.start, arms.cell(), name_of(origin));
             shown.map_err(controller::Error::from)?;
             arms.sort(&mut pairs);
         }
@@ -144,6 +150,21 @@ impl SimulatedRun<'_> {
         prepared.record.flat_reference = self.flat.clone();
         prepared.record.foam_reference = self.foam.clone();
         Ok(prepared)
+    }
+}
+
+// A measured pair is 12 s of a rig's time.
+fn checkpoint_every(origin: Origin) -> usize {
+    match origin {
+        Origin::Simulated => CHECKPOINT_EVERY,
+        _ => 1,
+    }
+}
+
+fn name_of(origin: Origin) -> &'static str {
+    match origin {
+        Origin::Simulated => "simulated_rig",
+        _ => "rig",
     }
 }
 
