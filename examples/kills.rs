@@ -1,5 +1,6 @@
 //! Kills `echolake ingest` at random moments, many times, and compares its tables with those of an undisturbed one:
-//! `cargo build --release && cargo run --release --example kills -- [rounds] [seed]`.
+//! `cargo build --release && cargo run --release --example kills -- [rounds] [seed]`. With a third argument `halves`,
+//! two processes ingest 20 of 40 runs each at once, and one of them is killed in every second round.
 
 #[path = "../tests/kills.rs"]
 mod kills;
@@ -19,12 +20,17 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         return Err(format!("`{}` is missing; hint: cargo build --release", binary.display()).into());
     }
     let mut out = std::io::stdout();
-    let outcome = kills::Campaign::new(&binary, seed).rounds(rounds, &mut |round, so_far| {
+    let mut tell = |round, so_far: &kills::Outcome| {
         if round % 10 == 0 {
             // Progress is not worth an error.
             let _ = writeln!(std::io::stderr(), "{round} of {rounds} rounds, {} killed", so_far.killed);
         }
-    });
+    };
+    let outcome = match args.next().as_deref() {
+        None => kills::Campaign::new(&binary, seed).rounds(rounds, &mut tell),
+        Some("halves") => kills::Campaign::of(&binary, seed, 40).halves(rounds, &mut tell),
+        Some(other) => return Err(format!("`{other}`? hint: halves, or nothing").into()),
+    };
     writeln!(
         out,
         "{rounds} rounds, seed {seed}: {} kills while ingest worked, {} after its end; all tables equal",

@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
 
+use rand::seq::SliceRandom as _;
 use rand::{Rng as _, SeedableRng as _};
 use rand_chacha::ChaCha8Rng;
 
@@ -47,10 +48,15 @@ pub(crate) struct Campaign {
 impl Campaign {
     /// Measures the runs of the lake that every round begins with.
     pub(crate) fn new(binary: &Path, seed: u64) -> Self {
+        Self::of(binary, seed, SURFACES.len())
+    }
+
+    /// The same with so many runs, of the same surfaces again and again.
+    pub(crate) fn of(binary: &Path, seed: u64, runs: usize) -> Self {
         let folder = tempfile::tempdir().expect("a folder");
         std::fs::write(folder.path().join("rig.toml"), SMALL_RIG).expect("written");
         let campaign = Self { folder, binary: binary.to_owned(), random: ChaCha8Rng::seed_from_u64(seed) };
-        for (number, surface) in SURFACES.iter().enumerate() {
+        for (number, surface) in SURFACES.iter().cycle().take(runs).enumerate() {
             let seed = number.to_string();
             campaign
                 .run("start", &["acquire", "--surface", surface, "--seed", &seed, "--rig", "rig.toml", "--ir-only"]);
@@ -80,16 +86,71 @@ impl Campaign {
                 }
             }
             self.run("round", &["ingest"]);
-            let actual = self.tables("round");
-            for (table, rows) in &expected {
-                assert!(
-                    actual[table] == *rows,
-                    "round {round}: table {table} differs from that of an undisturbed ingest"
-                );
-            }
+            self.is_undisturbed(round, &expected);
             told(round + 1, &outcome);
         }
         outcome
+    }
+
+    /// Two processes ingest at once, half of the runs each, in an order of chance; in every second round one of them is
+    /// killed at some moment and begins again. Then compares.
+    ///
+    /// # Panics
+    /// As [`Self::rounds`].
+    pub(crate) fn halves(&mut self, rounds: usize, told: &mut dyn FnMut(usize, &Outcome)) -> Outcome {
+        self.copy("undisturbed");
+        let begun = Instant::now();
+        self.run("undisturbed", &["ingest"]);
+        let whole = begun.elapsed();
+        let expected = self.tables("undisturbed");
+        let mut outcome = Outcome::default();
+        for round in 0..rounds {
+            self.copy("round");
+            let mut runs = self.inbox("round");
+            runs.shuffle(&mut self.random);
+            let moment = whole.mul_f64(self.random.random());
+            let (first, second) = runs.split_at(runs.len() / 2);
+            let start = |runs: &[String]| {
+                let mut command = self.command("round");
+                command.arg("ingest").args(runs).stdout(Stdio::null()).stderr(Stdio::piped());
+                command.spawn().expect("the command starts")
+            };
+            let (mut one, other) = (start(first), start(second));
+            if round % 2 == 1 {
+                std::thread::sleep(moment);
+                match one.try_wait().expect("its state") {
+                    None => outcome.killed += 1,
+                    Some(_) => outcome.ended += 1,
+                }
+                let _ = one.kill();
+                one.wait().expect("its end");
+                // What it had taken in is not in the inbox any more.
+                one = start(&[]);
+            }
+            for process in [one, other] {
+                let output = process.wait_with_output().expect("its end");
+                assert!(output.status.success(), "round {round}: {}", String::from_utf8_lossy(&output.stderr));
+            }
+            self.run("round", &["ingest"]);
+            self.is_undisturbed(round, &expected);
+            told(round + 1, &outcome);
+        }
+        outcome
+    }
+
+    fn is_undisturbed(&self, round: usize, expected: &BTreeMap<&'static str, Vec<u8>>) {
+        let actual = self.tables("round");
+        for (table, rows) in expected {
+            assert!(actual[table] == *rows, "round {round}: table {table} differs from that of an undisturbed ingest");
+        }
+    }
+
+    fn inbox(&self, lake: &str) -> Vec<String> {
+        let folder = self.folder.path().join(lake).join("inbox");
+        let files = std::fs::read_dir(folder).expect("the inbox").map(|e| e.expect("an entry").path());
+        let mut names: Vec<_> = files.map(|p| p.display().to_string()).collect();
+        names.sort();
+        names
     }
 
     fn command(&self, lake: &str) -> Command {

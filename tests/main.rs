@@ -4,11 +4,14 @@ mod acquire_kills;
 mod bad_input;
 mod end_to_end;
 mod forgetful;
+mod fuzz;
 mod kills;
 mod load;
 mod maintenance;
 mod real_data;
 mod serve;
+#[cfg(feature = "web")]
+mod web;
 
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};

@@ -1,9 +1,13 @@
 //! `echolake serve` as its clients see it: answers, refusals, queries that end with who asked, and its own end.
 
-mod http;
-mod postgres;
-mod server;
+mod catalogue;
+mod contract;
+mod escapes;
+pub(crate) mod http;
+pub(crate) mod postgres;
+pub(crate) mod server;
 
+use std::path::Path;
 use std::time::{Duration, Instant};
 
 use super::Place;
@@ -21,6 +25,10 @@ fn lake() -> Place {
     place.acquire("flat", &["--ir-only"]);
     place.ok(&["ingest"]);
     place
+}
+
+pub(crate) fn served(place: &Place, more: &[&str]) -> Served {
+    Served::start(Path::new(env!("CARGO_BIN_EXE_echolake")), &place.path(""), more)
 }
 
 fn sql(server: &Served, query: &str) -> Answer {
@@ -44,7 +52,7 @@ fn wait_until(what: &str, mut done: impl FnMut() -> bool) {
 #[test]
 fn answers_in_every_format() {
     let place = lake();
-    let server = Served::start(&place, &[]);
+    let server = served(&place, &[]);
     let query = "select pair_id, direct_mm from pairs order by pair_id limit 2";
     let answer = sql(&server, query);
     assert_eq!((answer.status, answer.header("content-type")), (200, Some("application/json")));
@@ -73,7 +81,7 @@ fn answers_in_every_format() {
 #[test]
 fn what_is_wrong_has_a_code() {
     let place = lake();
-    let server = Served::start(&place, &[]);
+    let server = served(&place, &[]);
     let check = |answer: Answer, status: u16, code: &str| {
         let problem: serde_json::Value = serde_json::from_str(&answer.text()).expect("JSON");
         assert_eq!(answer.header("content-type"), Some("application/problem+json"), "{problem}");
@@ -98,7 +106,7 @@ fn what_is_wrong_has_a_code() {
         400,
         "request_invalid",
     );
-    check(Request::get("/api/v1/sql").send(&server), 400, "request_invalid");
+    check(Request::get("/api/v1/sql").send(&server), 405, "method_not_allowed");
     check(Request::get("/api/v1/nothing").send(&server), 404, "not_found");
     // A page of elsewhere, and a name that points here.
     for (name, value) in [("origin", "http://evil.example"), ("origin", "null"), ("sec-fetch-site", "cross-site")] {
@@ -124,7 +132,7 @@ fn tokens_let_in_and_are_needed_beyond_this_machine() {
     let token = super::stderr(&made).lines().next().expect("a token").to_owned();
     assert!(!lines.contains(&token), "only its hash is printed to be kept");
     std::fs::write(place.path("tokens.toml"), &lines).expect("written");
-    let server = Served::start(&place, &["--tokens", "tokens.toml"]);
+    let server = served(&place, &["--tokens", "tokens.toml"]);
     let ask = |header: Option<String>| {
         let request = Request::post("/api/v1/sql", "select 1 as one").with("content-type", "text/plain");
         header.into_iter().fold(request, |request, value| request.with("authorization", &value)).send(&server)
@@ -146,7 +154,7 @@ fn tokens_let_in_and_are_needed_beyond_this_machine() {
 #[test]
 fn a_query_ends_with_its_client() {
     let place = lake();
-    let server = Served::start(&place, &[]);
+    let server = served(&place, &[]);
     let asked = Request::post("/api/v1/sql", ENDLESS).with("content-type", "text/plain").begin(&server);
     wait_until("it runs", || running(&server) == 1.0);
     drop(asked);
@@ -170,7 +178,7 @@ fn a_query_ends_with_its_client() {
 #[test]
 fn a_short_answer_does_not_look_whole() {
     let place = lake();
-    let server = Served::start(&place, &[]);
+    let server = served(&place, &[]);
     let query = "select 1/(900000 - value) as n from generate_series(1, 1000000)";
     let answer = sql(&server, query);
     assert_eq!(answer.status, 200);
@@ -180,7 +188,7 @@ fn a_short_answer_does_not_look_whole() {
 #[test]
 fn postgres_answers_and_refuses() {
     let place = lake();
-    let server = Served::start(&place, &[]);
+    let server = served(&place, &[]);
     let mut client = postgres::Client::connect(&server, None);
     let one = |text: &str| Ok(vec![vec![Some(text.to_owned())]]);
     assert_eq!(client.query("select count(*) from measurements"), one("45"));
@@ -215,8 +223,19 @@ fn postgres_answers_and_refuses() {
 #[test]
 fn it_stops_when_told() {
     let place = lake();
-    let mut server = Served::start(&place, &[]);
+    let mut server = served(&place, &[]);
     let mut idle = postgres::Client::connect(&server, None);
     assert!(idle.query("select 1").is_ok());
     assert_eq!(server.terminate(), Some(0));
+}
+
+// Long form: example `fuzz`.
+#[test]
+fn changed_input_harms_nothing() {
+    use super::fuzz::{Campaign, Target};
+    for target in Target::ALL {
+        let mut campaign = Campaign::new(Path::new(env!("CARGO_BIN_EXE_echolake")), 1);
+        let outcome = campaign.throw(target, &mut |so_far| so_far.rounds < 100);
+        assert!(outcome.answered > 0, "{}: some are right all the same", target.name());
+    }
 }

@@ -7,6 +7,8 @@
 use echolake_schema::Timestamp;
 use echolake_schema::manifest::Origin;
 
+use crate::robots::Joints;
+
 /// Two arms: one carries the microphone, one the speaker. Positions in mm over the panel.
 pub trait Robots: Send {
     /// Moves both and waits until they stand; returns where. A position that cannot be reached or is not finite, two
@@ -22,6 +24,11 @@ pub trait Robots: Send {
     /// # Errors
     /// [`Error::Device`].
     fn power(&mut self, power: Power) -> Result<(), Error>;
+
+    /// What was not right since the last call, though it was dealt with: for the run's log.
+    fn notices(&mut self) -> Vec<String> {
+        Vec::new()
+    }
 }
 
 /// Where the arms stand, mm.
@@ -31,6 +38,8 @@ pub struct Positions {
     pub microphone_mm: [f64; 3],
     /// The speaker.
     pub speaker_mm: [f64; 3],
+    /// Joints of the microphone's and the speaker's arm, rad, where they are known.
+    pub joints: Option<[Joints; 2]>,
 }
 
 /// The drives' power.
@@ -54,6 +63,11 @@ pub trait AudioInterface: Send {
     /// # Errors
     /// [`Error::Device`].
     fn play_and_record(&mut self, output: &[f32], take: &mut Take) -> Result<(), Error>;
+
+    /// What was not right since the last call, though it was dealt with: for the run's log.
+    fn notices(&mut self) -> Vec<String> {
+        Vec::new()
+    }
 }
 
 /// One recording: signed 24-bit samples, full scale 2^23.
@@ -74,6 +88,11 @@ pub trait AmbientSensor: Send {
     /// # Errors
     /// [`Error::Device`].
     fn read(&mut self) -> Result<Reading, Error>;
+
+    /// What was not right since the last call, though it was dealt with: for the run's log.
+    fn notices(&mut self) -> Vec<String> {
+        Vec::new()
+    }
 }
 
 /// One reading.
@@ -101,6 +120,15 @@ pub struct Devices {
     pub sensor: Box<dyn AmbientSensor>,
     /// Whether they are real.
     pub origin: Origin,
+}
+
+impl Devices {
+    /// What was not right since the last call, and with which device.
+    pub fn notices(&mut self) -> Vec<(&'static str, String)> {
+        let of = |device, notices: Vec<String>| notices.into_iter().map(move |notice| (device, notice));
+        let (robots, audio) = (self.robots.notices(), self.audio.notices());
+        of("robots", robots).chain(of("audio", audio)).chain(of("sensor", self.sensor.notices())).collect()
+    }
 }
 
 /// Why a device did not do what it was told.

@@ -3,7 +3,9 @@
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
+use echolake_schema::manifest::Origin;
 use echolake_schema::{Pair, Rig, Timestamp};
 
 use crate::controller::{self, Control, Event, Keep, Outcome, RunController, RunOptions, Work};
@@ -11,6 +13,8 @@ use crate::mesh::Mesh;
 use crate::preflight::{self, Finding};
 use crate::recorder::{Recorder, Tap, Tried};
 use crate::relief::HeightField;
+use crate::robots::Choreography;
+use crate::simulate::CHECKPOINT_EVERY;
 
 /// Who supervises a run, and how.
 pub struct Session<'a> {
@@ -22,8 +26,9 @@ pub struct Session<'a> {
     pub tap: Option<Box<dyn Tap>>,
     /// Whether it is looked over first.
     pub preflight: Preflight,
-    /// Pairs between two checkpoints.
-    pub checkpoint_every: usize,
+    /// Pairs between two checkpoints; where nothing is said, 1 on a real rig, whose pairs take 12 s each, and 200 on the
+    /// simulated one.
+    pub checkpoint_every: Option<usize>,
     /// How long a take lasts where it is simulated.
     pub pace: Pace,
 }
@@ -70,6 +75,8 @@ pub(crate) struct Job<'a> {
     pub(crate) keep: Keep,
     pub(crate) before: &'a BTreeMap<u32, Tried>,
     pub(crate) started: Timestamp,
+    /// How the arms go about, where the rig's are known.
+    pub(crate) arms: Option<Arc<Choreography>>,
 }
 
 impl Job<'_> {
@@ -90,17 +97,38 @@ impl Job<'_> {
         mut recorder: Recorder,
         session: Session<'_>,
     ) -> Result<Measured, controller::Error> {
+        let origin = controller.origin();
+        let mut pairs = self.rig.grid()?.pairs().to_vec();
+        if let Some(arms) = &self.arms {
+            recorder.arms(self.started, arms.cell(), name_of(origin))?;
+            arms.sort(&mut pairs);
+        }
         if let Some(tap) = session.tap {
             recorder.listen(tap, self.started, self.shape);
         }
-        let options = RunOptions { keep: self.keep, checkpoint_every: session.checkpoint_every };
-        let grid = self.rig.grid()?;
-        let work = Work { pairs: grid.pairs(), before: self.before, options };
+        let checkpoint_every = session.checkpoint_every.unwrap_or_else(|| checkpoint_every(origin));
+        let options = RunOptions { keep: self.keep, checkpoint_every };
+        let work = Work { pairs: &pairs, before: self.before, options };
         let outcome = controller.run(&mut recorder, &work, session.control, session.observe)?;
         let path = match outcome.left {
             0 => recorder.finish(&outcome.end)?,
             _ => recorder.partial().to_owned(),
         };
         Ok(Measured { path, outcome })
+    }
+}
+
+// A measured pair is 12 s of a rig's time.
+fn checkpoint_every(origin: Origin) -> usize {
+    match origin {
+        Origin::Simulated => CHECKPOINT_EVERY,
+        _ => 1,
+    }
+}
+
+fn name_of(origin: Origin) -> &'static str {
+    match origin {
+        Origin::Simulated => "simulated_rig",
+        _ => "rig",
     }
 }

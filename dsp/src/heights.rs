@@ -33,9 +33,67 @@ pub fn moved<T: Copy>(heights: &[T], symmetry: Symmetry, out: &mut [T]) -> Resul
     Ok(())
 }
 
+/// Towards the light: the upper left, 40 degrees over the plane.
+const LIGHT: [f32; 3] = [-0.54, 0.54, 0.643];
+/// Grey of what the light does not reach, and how much the light adds to it.
+const SHADE: f32 = 40.0;
+const LIT: f32 = 225.0;
+/// Slopes count twice, so that shallow reliefs are seen.
+const RELIEF: f32 = 2.0;
+/// Neither black nor white, which the page around may be.
+const GREYS: [f32; 2] = [18.0, 250.0];
+
+/// A relief in oblique light from the upper left, by Lambert's law, without shadows: quick, and of the same light for
+/// all reliefs.
+///
+/// heights  `[side x side]`  mm, row by row along x, y ascending
+/// pitch    mm from cell to cell
+/// returns  `[side x side]`  grey, rows from the top
+///
+/// # Errors
+/// [`Error::Setting`] where they are no square.
+pub fn shaded(heights: &[f32], pitch_mm: f32) -> Result<Vec<u8>, Error> {
+    let side = heights.len().isqrt();
+    if side * side != heights.len() {
+        let actual = format!("{} values", heights.len());
+        return Err(Error::Setting { what: "the map of heights", actual, expected: "a square number of values" });
+    }
+    let mut pixels = Vec::with_capacity(heights.len());
+    for y in (0..side).rev() {
+        let row = |y: usize| &heights[y * side..(y + 1) * side];
+        let (below, here, above) = (row(y.saturating_sub(1)), row(y), row((y + 1).min(side - 1)));
+        for x in 0..side {
+            // Differences go over two cells.
+            let slope = RELIEF / (2.0 * pitch_mm);
+            let along_x = slope * (here[(x + 1).min(side - 1)] - here[x.saturating_sub(1)]);
+            let along_y = slope * (above[x] - below[x]);
+            let facing = LIGHT[2] - along_x * LIGHT[0] - along_y * LIGHT[1];
+            let light = facing / (1.0 + along_x * along_x + along_y * along_y).sqrt();
+            pixels.push((SHADE + LIT * light).clamp(GREYS[0], GREYS[1]) as u8);
+        }
+    }
+    Ok(pixels)
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn light_comes_from_the_upper_left() {
+        // A ridge along y in the middle of seven columns.
+        let heights: Vec<f32> = (0..49).map(|i| if i % 7 == 3 { 5.0 } else { 0.0 }).collect();
+        let pixels = shaded(&heights, 5.0).expect("a square");
+        let row = &pixels[21..28];
+        assert!(row[2] > row[0], "its left side faces the light: {row:?}");
+        assert!(row[4] < row[0], "its right side turns away: {row:?}");
+        assert_eq!(row[0], (SHADE + LIT * LIGHT[2]) as u8, "level ground");
+        // What is higher in the picture has a greater y: a slope down towards smaller y turns away from the light.
+        let slope: Vec<f32> = (0..49).map(|i| (i / 7) as f32 * 5.0).collect();
+        assert!(shaded(&slope, 5.0).expect("a square")[24] < row[0]);
+        assert!(shaded(&[0.0; 3], 1.0).is_err());
+        assert_eq!(shaded(&[], 1.0).expect("nothing"), Vec::<u8>::new());
+    }
 
     #[test]
     fn cells_move_as_points_do() {

@@ -29,6 +29,7 @@
 mod aligned;
 pub mod arrival;
 pub mod chain;
+pub mod components;
 pub mod correlation;
 pub mod decay;
 pub mod deconvolution;
@@ -45,6 +46,7 @@ pub mod heights;
 mod joint;
 pub mod level;
 pub mod mean;
+pub mod png;
 mod pruned;
 mod real;
 pub mod spectrum;

@@ -1,6 +1,6 @@
 //! Shows that hostile queries end when they are told to, and that many heavy ones leave room for the light.
 //!
-//! `cargo run --release -p echolake-query --example limits -- LAKE [ROUNDS] [SEED]` on a lake of some hundred
+//! `cargo run --release --workspace --example limits -- LAKE [ROUNDS] [SEED]` on a lake of some hundred
 //! surfaces (`echolake demo --surfaces 350 --ir-only --no-serve`). It prints, for each of the hostile queries, the time
 //! from cancelling it until the process is idle, and then the longest light query and the memory while twenty heavy
 //! queries are asked at once.

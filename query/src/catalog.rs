@@ -9,16 +9,17 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use arrow::datatypes::SchemaRef;
+use bytes::Bytes;
 use datafusion::common::TableReference;
 use datafusion::datasource::TableProvider;
 use datafusion::error::DataFusionError;
 use datafusion::prelude::SessionContext;
 use datafusion::sql::parser::Statement;
-use echolake_lake::{DataFile, Lake, Moment, Snapshot};
+use echolake_lake::{DataFile, Lake, Moment, Snapshot, VisibleRun};
 use echolake_schema::tables::Table;
 
 use crate::as_of::{self, Past};
-use crate::mcap;
+use crate::mcap::{self, Contents};
 use crate::table::{LakeTable, Source};
 use crate::views::{Lookups, UnusedJoin, View};
 use crate::{Error, error};
@@ -47,7 +48,7 @@ type PastTable = ((Moment, Table), Arc<LakeTable>);
 
 /// One view of the lake.
 struct Current {
-    snapshot: Snapshot,
+    snapshot: Arc<Snapshot>,
     tables: HashMap<Table, Arc<LakeTable>>,
     providers: Vec<(&'static str, Arc<dyn TableProvider>)>,
     looked: Mutex<Instant>,
@@ -92,6 +93,30 @@ impl Catalog {
         }
         context.add_optimizer_rule(Arc::new(UnusedJoin));
         mcap::register(context, &current.snapshot, &self.runs, statement).await
+    }
+
+    /// The view of the lake that a query of now sees; the same one for as long as nothing changes.
+    ///
+    /// # Errors
+    /// [`Error::Lake`] where the lake cannot be read.
+    pub(crate) async fn snapshot(&self) -> Result<Arc<Snapshot>, Error> {
+        Ok(self.current().await?.snapshot.clone())
+    }
+
+    /// What a run's file holds.
+    ///
+    /// # Errors
+    /// [`Error::Execution`] where the file cannot be read.
+    pub(crate) async fn contents(&self, run: &VisibleRun) -> Result<Contents, Error> {
+        mcap::contents(run, &self.runs).await
+    }
+
+    /// The bytes of the first attachment of a run's file whose name ends so; None where there is none.
+    ///
+    /// # Errors
+    /// As [`Catalog::contents`].
+    pub(crate) async fn attachment(&self, run: &VisibleRun, ending: &str) -> Result<Option<Bytes>, Error> {
+        mcap::attachment(run, ending, &self.runs).await
     }
 
     /// The tables and views and their schemas.
@@ -149,7 +174,7 @@ impl Catalog {
     }
 
     async fn take(&self, before: Option<&Current>) -> Result<Current, Error> {
-        let snapshot = self.lake.snapshot().await?;
+        let snapshot = Arc::new(self.lake.snapshot().await?);
         let mut tables = HashMap::new();
         for table in Table::ALL {
             let files = snapshot.files(table);

@@ -1,5 +1,6 @@
 //! The engine: what all sessions of a process share, a lake, its files' footers, memory and limits.
 
+use std::collections::BTreeSet;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -53,6 +54,8 @@ struct Inner {
     lanes: Lanes,
     running: Arc<Running>,
     limits: Limits,
+    /// Names of the field's functions.
+    own: BTreeSet<String>,
     // Watches times and sizes whatever the queries do to their own threads.
     watch: Threads,
 }
@@ -81,6 +84,16 @@ pub struct Function {
     pub syntax: String,
     /// What it does.
     pub description: String,
+    /// Whether it is of the field and not of SQL at large.
+    pub is_own: bool,
+}
+
+impl Function {
+    /// What it is given, as its call names it.
+    pub fn arguments(&self) -> &str {
+        let inner = self.syntax.split_once('(').map_or("", |(_, rest)| rest);
+        inner.rsplit_once(')').map_or(inner, |(inner, _)| inner)
+    }
 }
 
 /// Who asks, and how much they may have. One for all sessions of a token.
@@ -145,6 +158,7 @@ impl Engine {
             lanes: Lanes::new(limits.heavy.max(1)).map_err(threads)?,
             running: Arc::default(),
             limits,
+            own: functions.names().map(str::to_owned).collect(),
             watch: Threads::new("query-watch", 1).map_err(threads)?,
         };
         let engine = Self(Arc::new(inner));
@@ -169,10 +183,19 @@ impl Engine {
         let aggregate = state.aggregate_functions().iter().map(|(name, f)| (name, f.documentation()));
         let window = state.window_functions().iter().map(|(name, f)| (name, f.documentation()));
         let mut functions: Vec<_> =
-            scalar.chain(aggregate).chain(window).map(|(name, doc)| function(name, doc)).collect();
+            scalar.chain(aggregate).chain(window).map(|(name, doc)| self.function(name, doc)).collect();
         functions.sort_by(|a, b| a.name.cmp(&b.name));
         functions.dedup_by(|a, b| a.name == b.name);
         functions
+    }
+
+    fn function(&self, name: &str, doc: Option<&Documentation>) -> Function {
+        Function {
+            name: name.to_owned(),
+            syntax: doc.map_or_else(|| format!("{name}(...)"), |d| d.syntax_example.clone()),
+            description: doc.map_or_else(String::new, |d| d.description.clone()),
+            is_own: self.0.own.contains(name),
+        }
     }
 
     /// What can be asked.
@@ -199,6 +222,11 @@ impl Engine {
         quota.memory.map_or(part, |own| own.min(part))
     }
 
+    /// What all contexts begin as; it knows no tables, and parses as they do.
+    pub(crate) fn template(&self) -> &SessionState {
+        &self.0.template
+    }
+
     // A new one a query: the tables are those of one snapshot, and nothing a query does outlives it. Functions are
     // looked up once an engine.
     pub(crate) fn context(&self) -> SessionContext {
@@ -219,14 +247,6 @@ impl Engine {
         let own = resident_bytes().unwrap_or(0);
         let limit = own + memory + (memory as f64 * OVER) as usize;
         threads.spawn(govern(Arc::downgrade(&self.0.running), limit));
-    }
-}
-
-fn function(name: &str, doc: Option<&Documentation>) -> Function {
-    Function {
-        name: name.to_owned(),
-        syntax: doc.map_or_else(|| format!("{name}(...)"), |d| d.syntax_example.clone()),
-        description: doc.map_or_else(String::new, |d| d.description.clone()),
     }
 }
 

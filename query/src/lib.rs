@@ -27,7 +27,9 @@ mod small;
 mod table;
 mod views;
 
+pub use control::lanes::Threads;
 pub use engine::{Client, Engine, Function, Limits, Quota};
 pub use error::Error;
 pub use functions::Functions;
+pub use mcap::{Attachment, Contents, Topic};
 pub use session::{Answer, CancelHandle, Extend, Prepared, Session};

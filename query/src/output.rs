@@ -22,6 +22,9 @@ const SHOWN: usize = 3;
 /// Rows that a table shows: all of them are held until their widths are known.
 pub const TABLE_ROWS: usize = 10_000;
 
+/// Size that a row group of a Parquet answer grows to: all of it is held until it ends.
+const ROW_GROUP_BYTES: usize = 16 << 20;
+
 /// A format of answers.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Format {
@@ -94,7 +97,10 @@ impl<W: Write + Send> AnswerWriter<W> {
             Format::Json => Inner::Json(arrow::json::WriterBuilder::new().with_explicit_nulls(true).build(to)),
             Format::Parquet => {
                 let zstd = Compression::ZSTD(ZstdLevel::try_new(3).unwrap_or_default());
-                let properties = WriterProperties::builder().set_compression(zstd).build();
+                let properties = WriterProperties::builder()
+                    .set_compression(zstd)
+                    .set_max_row_group_bytes(Some(ROW_GROUP_BYTES))
+                    .build();
                 let writer = ArrowWriter::try_new(to, schema.clone(), Some(properties));
                 Inner::Parquet(Box::new(writer.map_err(parquet_error)?))
             }
@@ -318,6 +324,18 @@ mod tests {
         let arrow = written(Format::Arrow);
         let reader = arrow::ipc::reader::StreamReader::try_new(&arrow[..], None).expect("Arrow");
         assert_eq!(reader.map(|b| b.expect("a batch")).collect::<Vec<_>>(), [batch()]);
+    }
+
+    #[test]
+    fn a_long_parquet_answer_has_row_groups_of_a_bounded_size() {
+        let text: ArrayRef = Arc::new(StringArray::from_iter_values((0..4096).map(|n| format!("{n:0>2048}"))));
+        let batch = RecordBatch::try_from_iter([("text", text)]).expect("a batch");
+        let mut out = Vec::new();
+        let mut writer = AnswerWriter::new(Format::Parquet, &batch.schema(), &mut out).expect("begun");
+        (0..6).for_each(|_| writer.write(&batch).expect("written"));
+        writer.finish().expect("finished");
+        let reader = parquet::arrow::arrow_reader::ParquetRecordBatchReaderBuilder::try_new(bytes::Bytes::from(out));
+        assert!(reader.expect("Parquet").metadata().num_row_groups() > 1);
     }
 
     #[test]

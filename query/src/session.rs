@@ -5,15 +5,17 @@ use std::sync::Arc;
 
 use arrow::datatypes::{DataType, SchemaRef};
 use arrow::record_batch::RecordBatch;
+use bytes::Bytes;
 use datafusion::common::ParamValues;
 use datafusion::error::DataFusionError;
 use datafusion::execution::TaskContext;
 use datafusion::execution::context::SQLOptions;
+use datafusion::execution::session_state::SessionState;
 use datafusion::logical_expr::LogicalPlan;
 use datafusion::physical_plan::{ExecutionPlan, execute_stream};
 use datafusion::prelude::SessionContext;
 use datafusion::sql::parser::Statement;
-use echolake_lake::Lake;
+use echolake_lake::{Lake, Snapshot, VisibleRun};
 use futures::StreamExt as _;
 use tokio::sync::{OwnedSemaphorePermit, mpsc};
 use tokio::task::JoinHandle;
@@ -23,6 +25,7 @@ use crate::control::pool::QueryPool;
 use crate::control::watched::watch;
 use crate::control::{Stop, Ticket};
 use crate::engine::{Client, Engine, Function, Limits, Quota};
+use crate::mcap::Contents;
 use crate::{Error, as_of, gate};
 
 /// Batches that wait for a slow reader.
@@ -42,7 +45,7 @@ pub type Extend = Arc<dyn Fn(&SessionContext) -> Result<(), DataFusionError> + S
 /// A query that is planned and may be run again and again with other values. It keeps the view of the lake it was
 /// planned on.
 pub struct Prepared {
-    context: SessionContext,
+    state: Arc<SessionState>,
     plan: LogicalPlan,
     sql: String,
 }
@@ -211,7 +214,7 @@ impl Session {
     /// # Errors
     /// [`Error::Query`] where it is none.
     pub fn parse(&self, sql: &str) -> Result<Statement, Error> {
-        let state = self.engine.context().state();
+        let state = self.engine.template();
         let sql = &as_of::respelled(sql);
         state.sql_to_statement(sql, &state.config().options().sql_parser.dialect).map_err(|e| Error::plan(sql, &e))
     }
@@ -254,14 +257,14 @@ impl Session {
             // `SELECT INTO` reads by its first word and makes a table by its plan.
             let reading = SQLOptions::new().with_allow_ddl(false).with_allow_dml(false).with_allow_statements(false);
             reading.verify_plan(&plan).map_err(|_| Error::NotReading { statement: plan.display().to_string() })?;
-            Ok(Prepared { context, plan, sql })
+            Ok(Prepared { state: Arc::new(context.state()), plan, sql })
         };
         self.on_threads(ticket, plan).await
     }
 
     async fn run(&self, prepared: &Prepared, plan: LogicalPlan, started: Started) -> Result<Answer, Error> {
         let Started { ticket, place } = started;
-        let (state, sql, asked) = (prepared.context.state(), prepared.sql.clone(), ticket.clone());
+        let (state, sql, asked) = (prepared.state.clone(), prepared.sql.clone(), ticket.clone());
         let physical = async move {
             let wrong = |e: DataFusionError| Error::plan(&sql, &e);
             let plan = state.create_physical_plan(&plan).await.map_err(wrong)?;
@@ -276,7 +279,7 @@ impl Session {
         let Some(threads) = self.engine.lanes().threads(lane) else { return Err(ended()) };
         let (send, batches) = mpsc::channel(AHEAD);
         let schema = plan.schema();
-        let context = self.task_context(&prepared.context, &ticket);
+        let context = self.task_context(&prepared.state, &ticket);
         let places = (place, room);
         let query = threads.spawn(drive(plan, context, send, ticket.clone(), places));
         Ok(Answer {
@@ -304,22 +307,36 @@ impl Session {
         }
     }
 
-    fn task_context(&self, context: &SessionContext, ticket: &Arc<Ticket>) -> Arc<TaskContext> {
-        let task = context.task_ctx();
-        let mut runtime = task.runtime_env().as_ref().clone();
+    // As DataFusion makes it, but for the memory.
+    fn task_context(&self, state: &SessionState, ticket: &Arc<Ticket>) -> Arc<TaskContext> {
+        let mut runtime = state.runtime_env().as_ref().clone();
         let limit = self.engine.memory(self.client.quota());
         runtime.memory_pool = Arc::new(QueryPool::new(runtime.memory_pool, limit, ticket.clone()));
-        let state = context.state();
-        Arc::new(TaskContext::new(
-            task.task_id(),
-            task.session_id(),
-            task.session_config().clone(),
-            state.scalar_functions().clone(),
-            state.higher_order_functions().clone(),
-            state.aggregate_functions().clone(),
-            state.window_functions().clone(),
-            Arc::new(runtime),
-        ))
+        Arc::new(TaskContext::from(state).with_runtime(Arc::new(runtime)))
+    }
+
+    /// The view of the lake that a query of now sees; the same one for as long as nothing changes.
+    ///
+    /// # Errors
+    /// [`Error::Lake`] where the lake cannot be read.
+    pub async fn snapshot(&self) -> Result<Arc<Snapshot>, Error> {
+        self.engine.catalog().snapshot().await
+    }
+
+    /// What a run's file holds, of its summary and message indexes.
+    ///
+    /// # Errors
+    /// [`Error::Execution`] where the file cannot be read.
+    pub async fn contents(&self, run: &VisibleRun) -> Result<Contents, Error> {
+        self.engine.catalog().contents(run).await
+    }
+
+    /// The bytes of the first attachment of a run's file whose name ends so; None where there is none.
+    ///
+    /// # Errors
+    /// As [`Session::contents`].
+    pub async fn attachment(&self, run: &VisibleRun, ending: &str) -> Result<Option<Bytes>, Error> {
+        self.engine.catalog().attachment(run, ending).await
     }
 
     /// The functions, by name.

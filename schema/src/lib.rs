@@ -11,6 +11,7 @@
 //! # Ok::<(), echolake_schema::Error>(())
 //! ```
 
+pub mod devices;
 mod error;
 pub mod grid;
 pub mod ids;
@@ -18,6 +19,7 @@ pub mod manifest;
 pub mod messages;
 pub mod quantities;
 pub mod rig;
+pub mod robots;
 pub mod samples;
 pub mod symmetry;
 pub mod tables;

@@ -2,7 +2,9 @@
 
 use serde::{Deserialize, Serialize};
 
+use crate::devices::DeviceParams;
 use crate::grid::{Grid, GridParams};
+use crate::robots::RobotCell;
 use crate::{Celsius, Error, SampleRate};
 
 /// A rig, as its TOML describes it. What the TOML leaves out is as in Rust et al. 2021
@@ -24,6 +26,12 @@ pub struct Rig {
     pub validation: Validation,
     /// The points and pairs.
     pub grid: GridParams,
+    /// Where the arms stand and how they go about.
+    #[serde(skip_serializing_if = "RobotCell::is_default")]
+    pub robots: RobotCell,
+    /// Its devices.
+    #[serde(skip_serializing_if = "DeviceParams::are_simulated")]
+    pub devices: DeviceParams,
 }
 
 /// The sweep that is played.
@@ -102,6 +110,8 @@ impl Default for Rig {
             panel: Panel::default(),
             validation: Validation::default(),
             grid: GridParams::default(),
+            robots: RobotCell::default(),
+            devices: DeviceParams::default(),
         }
     }
 }
@@ -280,6 +290,8 @@ impl Rig {
                 "validation.attempts",
                 format!("is {}, expected 1 to 100", self.validation.attempts),
             ),
+            (self.robots.contradiction().is_none(), "robots", self.robots.contradiction().unwrap_or_default()),
+            (self.devices.contradiction().is_none(), "devices", self.devices.contradiction().unwrap_or_default()),
         ];
         match rules.into_iter().find(|(holds, ..)| !holds) {
             Some((_, field, reason)) => Err(Error::Rig { rig: self.name.clone(), field, reason }),
@@ -319,6 +331,17 @@ mod tests {
         assert_eq!(rig.recording_len(), 48_960);
     }
 
+    const REAL: &str = "[devices]\naudio.kind = \"alsa\"\nsensor.kind = \"serial\"\nrobots.kind = \"rosbridge\"\n";
+
+    #[test]
+    fn a_rig_with_devices_round_trips() {
+        let rig = Rig::from_toml(REAL).expect("a rig");
+        assert!(!rig.devices.are_simulated() && Rig::paper().devices.are_simulated());
+        assert_eq!(Rig::from_toml(&rig.to_toml()), Ok(rig.clone()));
+        assert_eq!(rig.differences(&Rig::paper()), [], "devices do not change what numbers mean");
+        assert!(!Rig::paper().to_toml().contains("devices") && !Rig::paper().to_toml().contains("robots"));
+    }
+
     #[test]
     fn contradictions_name_the_field() {
         let check = |toml: &str, expected: &str| {
@@ -335,6 +358,13 @@ mod tests {
         check("sweeep.rate_hz = 1", "unknown field");
         check("[grid]\nlayers = []\npoints_mm = []", "number of grid points");
         check("name = [", "line 1");
+        check("robots.table_mm = 50", "robots");
+        check("devices.sensor.kind = \"serial\"", "simulated devices beside real ones");
+        check("devices.sensor.kind = \"parallel\"", "unknown variant");
+        check("devices.sensor = { kind = \"serial\", bauds = 3 }", "unknown field");
+        check(&format!("{REAL}audio.loopback = 3"), "devices");
+        check(&format!("{REAL}robots.speed = 2.0"), "speed");
+        check("robots.order = \"random\"", "unknown variant");
     }
 
     #[test]

@@ -23,6 +23,13 @@ pub const MEASUREMENT: &str = "/measurement";
 /// The run's log.
 pub const LOG: &str = "/log";
 
+/// The arms as URDF, once, where their joints are known.
+pub const ROBOT_DESCRIPTION: &str = "/robot_description";
+/// Joints of the arm that carries the microphone, at each measurement.
+pub const MICROPHONE_JOINTS: &str = "/robots/microphone/joint_states";
+/// Joints of the arm that carries the speaker.
+pub const SPEAKER_JOINTS: &str = "/robots/speaker/joint_states";
+
 /// Metadata record written first: what the run is.
 pub const RUN_METADATA: &str = "echolake.run";
 /// Metadata record written behind it where a run can be gone on with: what that takes. Such a recording is no run yet

@@ -33,6 +33,28 @@ pub(crate) enum Fault {
         /// What to do.
         hint: &'static str,
     },
+    /// What is asked about is there, and has no such data.
+    #[error("{what} has no {data}; hint: {hint}")]
+    NoData {
+        /// What was asked about.
+        what: String,
+        /// What it lacks.
+        data: &'static str,
+        /// What to do.
+        hint: &'static str,
+    },
+    /// The lake's store does not give a file. Why not stands in the server's log.
+    #[error("the lake's store does not give the file; hint: ask again")]
+    Unreadable,
+    /// The path is there, for other methods.
+    #[error("this path is not for this method; hint: the header `Allow` lists those it is for")]
+    Method,
+    /// A part of a file that it does not have.
+    #[error("the file has {bytes} bytes; hint: ask for a range within them")]
+    Range {
+        /// How many there are.
+        bytes: u64,
+    },
     /// The request is larger than is read.
     #[error("the request is larger than {limit} bytes")]
     TooLarge {
@@ -91,6 +113,9 @@ pub(crate) enum Code {
     Request,
     Unsupported,
     NotFound,
+    NoData,
+    Method,
+    Range,
     TooLarge,
     Unauthenticated,
     Forbidden,
@@ -105,7 +130,7 @@ pub(crate) enum Code {
 
 impl Code {
     /// All of them.
-    pub(crate) const ALL: [Self; 18] = [
+    pub(crate) const ALL: [Self; 21] = [
         Self::Query,
         Self::ReadOnly,
         Self::Execution,
@@ -114,6 +139,9 @@ impl Code {
         Self::Request,
         Self::Unsupported,
         Self::NotFound,
+        Self::NoData,
+        Self::Method,
+        Self::Range,
         Self::TooLarge,
         Self::Unauthenticated,
         Self::Forbidden,
@@ -137,6 +165,9 @@ impl Code {
             Self::Request => "request_invalid",
             Self::Unsupported => "unsupported",
             Self::NotFound => "not_found",
+            Self::NoData => "no_data",
+            Self::Method => "method_not_allowed",
+            Self::Range => "range_not_satisfiable",
             Self::TooLarge => "request_too_large",
             Self::Unauthenticated => "unauthenticated",
             Self::Forbidden => "forbidden",
@@ -169,6 +200,10 @@ impl Fault {
             Self::Request { .. } => Code::Request,
             Self::Unsupported { .. } => Code::Unsupported,
             Self::NotFound { .. } => Code::NotFound,
+            Self::NoData { .. } => Code::NoData,
+            Self::Unreadable => Code::Lake,
+            Self::Method => Code::Method,
+            Self::Range { .. } => Code::Range,
             Self::TooLarge { .. } => Code::TooLarge,
             Self::Unauthenticated => Code::Unauthenticated,
             Self::Forbidden { .. } => Code::Forbidden,

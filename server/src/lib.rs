@@ -22,6 +22,7 @@ mod random;
 mod running;
 mod serve;
 mod service;
+mod sessions;
 pub mod tokens;
 
 pub use error::Error;

@@ -1,14 +1,12 @@
 //! What the three protocols share: the engine, who may ask, threads to compute on, and figures.
 
 use std::sync::Arc;
-use std::thread::available_parallelism;
 use std::time::Duration;
 
 use arrow::datatypes::SchemaRef;
 use datafusion::common::ParamValues;
 use echolake_lake::Lake;
-use echolake_query::{Client, Engine, Limits, Prepared, Quota, Session};
-use tokio::runtime::{Builder, Runtime};
+use echolake_query::{Client, Engine, Function, Limits, Prepared, Quota, Session, Threads};
 use tokio::sync::{mpsc, oneshot};
 use tokio::task::JoinSet;
 
@@ -17,11 +15,6 @@ use crate::fault::Fault;
 use crate::metrics::{Metrics, Protocol};
 use crate::running::{Encode, Limit, Running, Stop, WAITING, ended, finish, parts};
 use crate::tokens::{Access, Tokens};
-
-/// Threads that wait for files.
-const BLOCKING_THREADS: usize = 16;
-/// Threads that compute where the system does not say how many cores there are.
-const CORES: usize = 2;
 
 /// How long a plan is good for: it sees the lake as it was.
 pub(crate) const FRESH: Duration = Duration::from_secs(2);
@@ -34,22 +27,12 @@ pub(crate) const SCHEMA: &str = "public";
 pub(crate) struct Service(Arc<Inner>);
 
 struct Inner {
+    lake: Lake,
     engine: Engine,
     access: Access,
     metrics: Metrics,
-    compute: Compute,
-}
-
-// Queries compute on threads of their own: connections are answered, and queries cancelled, while all of them are busy.
-struct Compute(Option<Runtime>);
-
-impl Drop for Compute {
-    // Dropping a runtime waits for its threads, which is forbidden where this is dropped.
-    fn drop(&mut self) {
-        if let Some(runtime) = self.0.take() {
-            runtime.shutdown_background();
-        }
-    }
+    // Answers are encoded on threads of their own: connections are answered, and queries cancelled, while all are busy.
+    encoders: Threads,
 }
 
 /// What to run.
@@ -73,19 +56,17 @@ pub(crate) struct Job {
 
 impl Service {
     pub(crate) fn new(lake: &Lake, tokens: Option<Tokens>, limits: Limits) -> Result<Self, Error> {
-        let compute = Builder::new_multi_thread()
-            .worker_threads(available_parallelism().map_or(CORES, usize::from))
-            .max_blocking_threads(BLOCKING_THREADS)
-            .thread_name("query")
-            .enable_all()
-            .build()
-            .map_err(Error::System)?;
         Ok(Self(Arc::new(Inner {
+            lake: lake.clone(),
             engine: Engine::new(lake, limits)?,
             access: Access::new(tokens),
             metrics: Metrics::default(),
-            compute: Compute(Some(compute)),
+            encoders: Threads::per_core("encode").map_err(Error::System)?,
         })))
+    }
+
+    pub(crate) fn lake(&self) -> &Lake {
+        &self.0.lake
     }
 
     pub(crate) fn access(&self) -> &Access {
@@ -107,15 +88,21 @@ impl Service {
         self.session(&nobody).tables().collect()
     }
 
+    /// The field's functions.
+    pub(crate) fn functions(&self) -> Vec<Function> {
+        let nobody = Arc::new(Client::new("functions", Quota::default()));
+        self.session(&nobody).functions().into_iter().filter(|f| f.is_own).collect()
+    }
+
     fn spawn<T: Send + 'static>(&self, work: impl Future<Output = T> + Send + 'static) -> JoinSet<T> {
         let mut task = JoinSet::new();
-        if let Some(runtime) = &self.0.compute.0 {
-            task.spawn_on(work, runtime.handle());
+        if let Some(threads) = self.0.encoders.handle() {
+            task.spawn_on(work, threads);
         }
         task
     }
 
-    /// Plans on the threads that compute.
+    /// Parses and plans away from the threads that answer connections.
     pub(crate) async fn plan<T: Send + 'static>(
         &self,
         work: impl Future<Output = Result<T, Fault>> + Send + 'static,
@@ -129,6 +116,19 @@ impl Service {
             None => Err(Fault::Internal),
         };
         planned.inspect_err(|fault| self.0.metrics.failed(fault.code()))
+    }
+
+    /// Computes something long, which waits for nothing.
+    pub(crate) async fn crunch<T: Send + 'static>(
+        &self,
+        work: impl FnOnce() -> T + Send + 'static,
+    ) -> Result<T, Fault> {
+        let handle = self.0.encoders.handle().map(|threads| threads.spawn_blocking(work));
+        let Some(handle) = handle else { return Err(Fault::Internal) };
+        handle.await.map_err(|failed| {
+            eprintln!("computing ended its task: {failed}");
+            Fault::Internal
+        })
     }
 
     /// Begins a query; its columns are known when this returns.

@@ -11,6 +11,7 @@ use sha2::{Digest as _, Sha256};
 use subtle::{Choice, ConstantTimeEq as _};
 
 use crate::fault::Fault;
+use crate::sessions::Sessions;
 use crate::{Error, random};
 
 /// What tokens begin with, so that they are found where they leaked.
@@ -95,6 +96,15 @@ impl Line {
     }
 }
 
+impl Entry {
+    fn allowed(&self, scope: Scope) -> Result<Arc<Client>, Fault> {
+        match self.scopes.contains(&scope) {
+            true => Ok(self.client.clone()),
+            false => Err(Fault::Forbidden { name: self.client.name().to_owned(), scope }),
+        }
+    }
+}
+
 impl Tokens {
     /// Reads a file of tokens.
     ///
@@ -121,13 +131,13 @@ impl Tokens {
     }
 
     // Every hash is compared to its end, so that the time does not tell which token is nearly right.
-    fn find(&self, token: &str) -> Option<&Entry> {
+    fn find(&self, token: &str) -> Option<usize> {
         let hash: [u8; 32] = Sha256::digest(token.as_bytes()).into();
         let mut found = None;
-        for entry in &self.0 {
+        for (i, entry) in self.0.iter().enumerate() {
             let same: Choice = entry.hash.ct_eq(&hash);
             if same.into() {
-                found = Some(entry);
+                found = Some(i);
             }
         }
         found
@@ -162,15 +172,15 @@ pub fn fresh(name: &str) -> Result<Fresh, Error> {
 pub(crate) enum Access {
     /// Everybody on this machine.
     Open(Arc<Client>),
-    /// Whoever has a token.
-    Tokens(Tokens),
+    /// Whoever has a token, or showed one to begin a session of a browser.
+    Tokens(Tokens, Sessions),
 }
 
 impl Access {
     /// Who may ask: by tokens where there are some.
     pub(crate) fn new(tokens: Option<Tokens>) -> Self {
         match tokens {
-            Some(tokens) => Self::Tokens(tokens),
+            Some(tokens) => Self::Tokens(tokens, Sessions::default()),
             None => Self::Open(Arc::new(Client::new("local", Quota::default()))),
         }
     }
@@ -187,13 +197,38 @@ impl Access {
     pub(crate) fn client(&self, token: Option<&str>, scope: Scope) -> Result<Arc<Client>, Fault> {
         let tokens = match self {
             Self::Open(client) => return Ok(client.clone()),
-            Self::Tokens(tokens) => tokens,
+            Self::Tokens(tokens, _) => tokens,
         };
         let entry = token.and_then(|t| tokens.find(t)).ok_or(Fault::Unauthenticated)?;
-        if !entry.scopes.contains(&scope) {
-            return Err(Fault::Forbidden { name: entry.client.name().to_owned(), scope });
-        }
-        Ok(entry.client.clone())
+        tokens.0[entry].allowed(scope)
+    }
+
+    /// Begins a browser's session; returns its secret.
+    ///
+    /// # Errors
+    /// [`Fault::Unauthenticated`]; [`Fault::NotFound`] where there are no tokens.
+    pub(crate) fn begin_session(&self, token: &str) -> Result<String, Fault> {
+        let Self::Tokens(tokens, sessions) = self else {
+            let hint = "this server has no tokens, ask right away";
+            return Err(Fault::NotFound { what: "a session".to_owned(), hint });
+        };
+        sessions.begin(tokens.find(token).ok_or(Fault::Unauthenticated)?).map_err(|failed| {
+            eprintln!("no session can begin: {failed}");
+            Fault::Internal
+        })
+    }
+
+    /// Who holds the session of this secret.
+    ///
+    /// # Errors
+    /// As [`Access::client`].
+    pub(crate) fn client_of_session(&self, secret: &str, scope: Scope) -> Result<Arc<Client>, Fault> {
+        let (tokens, sessions) = match self {
+            Self::Open(client) => return Ok(client.clone()),
+            Self::Tokens(tokens, sessions) => (tokens, sessions),
+        };
+        let entry = sessions.holder(secret).and_then(|i| tokens.0.get(i)).ok_or(Fault::Unauthenticated)?;
+        entry.allowed(scope)
     }
 }
 
@@ -247,6 +282,11 @@ mod tests {
         assert_eq!(client.name(), "a \"quoted\" name");
         assert_eq!(client.quota().time, Some(Duration::from_secs(60)));
         assert!(matches!(access.client(Some(&fresh.token), Scope::Files), Err(Fault::Forbidden { .. })));
+        let secret = access.begin_session(&fresh.token).expect("a session");
+        assert_eq!(access.client_of_session(&secret, Scope::Sql).expect("let in").name(), client.name());
+        assert!(matches!(access.client_of_session(&secret, Scope::Files), Err(Fault::Forbidden { .. })));
+        assert!(matches!(access.client_of_session(&fresh.token, Scope::Sql), Err(Fault::Unauthenticated)));
+        assert!(matches!(access.begin_session(&secret), Err(Fault::Unauthenticated)));
         let other = super::fresh("b").expect("a token").token;
         let cut = &fresh.token[..fresh.token.len() - 1];
         for wrong in [None, Some(""), Some(other.as_str()), Some(cut)] {

@@ -1,4 +1,4 @@
-//! `echolake demo`: the main job end to end, on the simulated rig: measure, record, ingest, ask.
+//! `echolake demo`: the main job end to end, on the simulated rig: measure, record, ingest, ask, look.
 
 mod measure;
 
@@ -62,7 +62,11 @@ pub(crate) async fn run(args: &DemoArgs, lake_url: &str) -> anyhow::Result<Done>
     };
     eprintln!("\ndone in {:.0} s. Next:", begun.elapsed().as_secs_f64());
     print_next(lake_url, example);
-    Ok(Done::Whole)
+    if args.no_serve {
+        return Ok(Done::Whole);
+    }
+    eprintln!();
+    super::serve::catalogue(&lake).await
 }
 
 fn few_surfaces() -> anyhow::Result<Vec<Member>> {

@@ -1,6 +1,6 @@
 //! `echolake serve` and `echolake token`: the lake over HTTP, Flight SQL and Postgres, for those who may.
 
-use std::net::SocketAddr;
+use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 use std::path::PathBuf;
 use std::str::FromStr;
 
@@ -8,10 +8,14 @@ use anyhow::Context as _;
 use echolake_lake::Lake;
 use echolake_query::Limits;
 use echolake_server::tokens::{self, Tokens};
-use echolake_server::{Server, Settings};
+use echolake_server::{Error, Server, Settings};
 use tokio::signal::unix::{SignalKind, signal};
 
 use crate::Done;
+
+/// Memory for queries, and how many of them may be heavy, if nobody says otherwise.
+const MEMORY_MIB: u32 = 4096;
+const HEAVY: u32 = 2;
 
 #[derive(Debug, clap::Args)]
 pub(crate) struct ServeArgs {
@@ -28,10 +32,10 @@ pub(crate) struct ServeArgs {
     #[arg(long, value_name = "FILE")]
     tokens: Option<PathBuf>,
     /// Memory that the queries may hold, all together.
-    #[arg(long, value_name = "MIB", default_value_t = 4096, value_parser = clap::value_parser!(u32).range(64..))]
+    #[arg(long, value_name = "MIB", default_value_t = MEMORY_MIB, value_parser = clap::value_parser!(u32).range(64..))]
     memory: u32,
     /// Queries at once that read much; more of them wait, and each may hold its part of the memory.
-    #[arg(long, value_name = "N", default_value_t = 2, value_parser = clap::value_parser!(u32).range(1..=64))]
+    #[arg(long, value_name = "N", default_value_t = HEAVY, value_parser = clap::value_parser!(u32).range(1..=64))]
     heavy: u32,
 }
 
@@ -62,6 +66,9 @@ impl Listen {
     }
 }
 
+/// Where HTTP is served if nobody says otherwise.
+const HTTP: SocketAddr = SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 8080);
+
 pub(crate) async fn run(args: &ServeArgs, lake_url: &str) -> anyhow::Result<Done> {
     let lake = Lake::open(lake_url).await?;
     let settings = Settings {
@@ -69,13 +76,37 @@ pub(crate) async fn run(args: &ServeArgs, lake_url: &str) -> anyhow::Result<Done
         flight_sql: args.flight_sql.address(),
         postgres: args.postgres.address(),
         tokens: args.tokens.as_deref().map(Tokens::read).transpose()?,
-        limits: Limits { memory: Some((args.memory as usize) << 20), heavy: args.heavy as usize },
+        limits: limits(args.memory, args.heavy),
     };
     let server = Server::bind(&lake, settings).await?;
-    let addresses = server.addresses();
-    anyhow::ensure!(!addresses.is_empty(), "nothing to listen on; hint: all three are off");
+    anyhow::ensure!(!server.addresses().is_empty(), "nothing to listen on; hint: all three are off");
     eprintln!("lake {}", lake.location());
-    for address in addresses {
+    answer(server).await
+}
+
+/// Serves the catalogue alone, where others look for it or, if somebody else is there, on any port that is free.
+pub(crate) async fn catalogue(lake: &Lake) -> anyhow::Result<Done> {
+    let settings = |http| Settings {
+        http: Some(http),
+        flight_sql: None,
+        postgres: None,
+        tokens: None,
+        limits: limits(MEMORY_MIB, HEAVY),
+    };
+    let server = match Server::bind(lake, settings(HTTP)).await {
+        Err(Error::Bind { .. }) => Server::bind(lake, settings(SocketAddr::new(HTTP.ip(), 0))).await?,
+        bound => bound?,
+    };
+    eprintln!("the catalogue, until Ctrl-C:");
+    answer(server).await
+}
+
+fn limits(memory_mib: u32, heavy: u32) -> Limits {
+    Limits { memory: Some((memory_mib as usize) << 20), heavy: heavy as usize }
+}
+
+async fn answer(server: Server) -> anyhow::Result<Done> {
+    for address in server.addresses() {
         eprintln!("  {address}");
     }
     let mut terminate = signal(SignalKind::terminate()).context("cannot listen for SIGTERM")?;

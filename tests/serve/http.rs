@@ -7,7 +7,7 @@ use std::net::TcpStream;
 use super::server::Served;
 
 /// A request.
-pub(super) struct Request {
+pub(crate) struct Request {
     method: &'static str,
     path: String,
     host: Option<String>,
@@ -17,35 +17,39 @@ pub(super) struct Request {
 
 /// An answer.
 #[derive(Debug)]
-pub(super) struct Answer {
-    pub(super) status: u16,
+pub(crate) struct Answer {
+    pub(crate) status: u16,
     headers: Vec<(String, String)>,
-    pub(super) body: Vec<u8>,
+    pub(crate) body: Vec<u8>,
     /// Whether its end came.
-    pub(super) is_whole: bool,
+    pub(crate) is_whole: bool,
 }
 
 impl Request {
-    pub(super) fn get(path: &str) -> Self {
+    pub(crate) fn get(path: &str) -> Self {
         Self { method: "GET", path: path.to_owned(), host: None, headers: String::new(), body: String::new() }
     }
 
-    pub(super) fn post(path: &str, body: &str) -> Self {
+    pub(crate) fn options(path: &str) -> Self {
+        Self { method: "OPTIONS", ..Self::get(path) }
+    }
+
+    pub(crate) fn post(path: &str, body: &str) -> Self {
         Self { method: "POST", body: body.to_owned(), ..Self::get(path) }
     }
 
-    pub(super) fn with(mut self, name: &str, value: &str) -> Self {
+    pub(crate) fn with(mut self, name: &str, value: &str) -> Self {
         let _ = write!(self.headers, "{name}: {value}\r\n");
         self
     }
 
-    pub(super) fn host(mut self, host: &str) -> Self {
+    pub(crate) fn host(mut self, host: &str) -> Self {
         self.host = Some(host.to_owned());
         self
     }
 
     /// Sends it and does not wait.
-    pub(super) fn begin(self, server: &Served) -> TcpStream {
+    pub(crate) fn begin(self, server: &Served) -> TcpStream {
         let mut stream = TcpStream::connect(&server.http).expect("connected");
         let host = self.host.as_ref().unwrap_or(&server.http);
         let head = format!(
@@ -61,7 +65,7 @@ impl Request {
         stream
     }
 
-    pub(super) fn send(self, server: &Served) -> Answer {
+    pub(crate) fn send(self, server: &Served) -> Answer {
         let mut stream = self.begin(server);
         let mut bytes = Vec::new();
         // A connection that is broken off ends in an error, after what came.
@@ -84,11 +88,11 @@ impl Answer {
         Self { status, headers, body, is_whole }
     }
 
-    pub(super) fn header(&self, name: &str) -> Option<&str> {
+    pub(crate) fn header(&self, name: &str) -> Option<&str> {
         self.headers.iter().find(|(known, _)| known == name).map(|(_, value)| value.as_str())
     }
 
-    pub(super) fn text(&self) -> String {
+    pub(crate) fn text(&self) -> String {
         String::from_utf8(self.body.clone()).expect("text")
     }
 }

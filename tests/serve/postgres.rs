@@ -6,18 +6,18 @@ use std::net::TcpStream;
 use super::server::Served;
 
 /// A connection.
-pub(super) struct Client {
+pub(crate) struct Client {
     stream: TcpStream,
     // What a CancelRequest must show.
     key: Vec<u8>,
 }
 
 /// Rows as texts, or the state of an error.
-pub(super) type Rows = Result<Vec<Vec<Option<String>>>, String>;
+pub(crate) type Rows = Result<Vec<Vec<Option<String>>>, String>;
 
 impl Client {
     /// Connects; where no token is asked for, the session has begun.
-    pub(super) fn connect(server: &Served, options: Option<&str>) -> Self {
+    pub(crate) fn connect(server: &Served, options: Option<&str>) -> Self {
         let mut stream = TcpStream::connect(&server.postgres).expect("connected");
         let mut body = 196_608_i32.to_be_bytes().to_vec();
         for (name, value) in
@@ -38,23 +38,23 @@ impl Client {
     }
 
     /// Sends a token; returns the state of the refusal.
-    pub(super) fn log_in(&mut self, token: &str) -> Option<String> {
+    pub(crate) fn log_in(&mut self, token: &str) -> Option<String> {
         self.send(b'p', &[token.as_bytes(), b"\0"].concat());
         self.ready()
     }
 
-    pub(super) fn query(&mut self, sql: &str) -> Rows {
+    pub(crate) fn query(&mut self, sql: &str) -> Rows {
         self.begin(sql);
         self.rows()
     }
 
     /// Asks and does not wait.
-    pub(super) fn begin(&mut self, sql: &str) {
+    pub(crate) fn begin(&mut self, sql: &str) {
         self.send(b'Q', &[sql.as_bytes(), b"\0"].concat());
     }
 
     /// The rows of what was asked.
-    pub(super) fn rows(&mut self) -> Rows {
+    pub(crate) fn rows(&mut self) -> Rows {
         let (mut rows, mut failed) = (Vec::new(), None);
         loop {
             match self.message() {
@@ -67,7 +67,7 @@ impl Client {
     }
 
     /// Ends what runs, as a second connection does.
-    pub(super) fn cancel(&self, server: &Served) {
+    pub(crate) fn cancel(&self, server: &Served) {
         let mut stream = TcpStream::connect(&server.postgres).expect("connected");
         let mut packet = ((8 + self.key.len()) as i32).to_be_bytes().to_vec();
         packet.extend(80_877_102_i32.to_be_bytes());
@@ -75,7 +75,7 @@ impl Client {
         stream.write_all(&packet).expect("sent");
     }
 
-    pub(super) fn send_raw(&mut self, bytes: &[u8]) {
+    pub(crate) fn send_raw(&mut self, bytes: &[u8]) {
         self.stream.write_all(bytes).expect("sent");
     }
 

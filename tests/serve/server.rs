@@ -1,25 +1,28 @@
 //! A server of the test's own, on ports that are free.
 
 use std::io::{BufRead as _, BufReader};
+use std::path::Path;
 use std::process::{Child, Command, Stdio};
-
-use crate::Place;
+use std::sync::{Arc, Mutex};
 
 /// A server; dropping it ends it.
-pub(super) struct Served {
+pub(crate) struct Served {
     child: Child,
+    said: Arc<Mutex<Vec<String>>>,
     /// `host:port` of each protocol.
-    pub(super) http: String,
-    pub(super) postgres: String,
+    pub(crate) http: String,
+    pub(crate) flight_sql: String,
+    pub(crate) postgres: String,
 }
 
 impl Served {
-    pub(super) fn start(place: &Place, more: &[&str]) -> Self {
+    /// Serves the lake `lake` of a folder.
+    pub(crate) fn start(binary: &Path, folder: &Path, more: &[&str]) -> Self {
         let any = "127.0.0.1:0";
-        let mut child = Command::new(env!("CARGO_BIN_EXE_echolake"))
+        let mut child = Command::new(binary)
             .args(["--lake", "lake", "serve", "--listen", any, "--flight-sql", any, "--postgres", any])
             .args(more)
-            .current_dir(place.path(""))
+            .current_dir(folder)
             .env_remove("ECHOLAKE_LAKE")
             .stderr(Stdio::piped())
             .spawn()
@@ -30,14 +33,33 @@ impl Served {
             let rest = line.split_once("://").expect("a URL").1;
             rest.split('/').next().expect("host and port").to_owned()
         };
-        let (http, _, postgres) = (address("http://"), address("grpc://"), address("postgresql://"));
+        let (http, flight_sql, postgres) = (address("http://"), address("grpc://"), address("postgresql://"));
         // What it says later must not fill the pipe.
-        std::thread::spawn(move || lines.for_each(drop));
-        Self { child, http, postgres }
+        let said = Arc::new(Mutex::new(Vec::new()));
+        let heard = said.clone();
+        std::thread::spawn(move || lines.for_each(|line| heard.lock().expect("lines").push(line)));
+        Self { child, said, http, flight_sql, postgres }
+    }
+
+    /// What it said on stderr since it listens.
+    pub(crate) fn said(&self) -> Vec<String> {
+        self.said.lock().expect("lines").clone()
+    }
+
+    /// Whether its process is there.
+    pub(crate) fn is_up(&mut self) -> bool {
+        self.child.try_wait().expect("its state").is_none()
+    }
+
+    /// What its process weighs.
+    pub(crate) fn resident_kib(&self) -> u64 {
+        let status = std::fs::read_to_string(format!("/proc/{}/status", self.child.id())).unwrap_or_default();
+        let line = status.lines().find_map(|l| l.strip_prefix("VmRSS:"));
+        line.and_then(|l| l.trim().split(' ').next()).and_then(|n| n.parse().ok()).unwrap_or(0)
     }
 
     /// Tells it to stop; returns its exit code.
-    pub(super) fn terminate(&mut self) -> Option<i32> {
+    pub(crate) fn terminate(&mut self) -> Option<i32> {
         let told = Command::new("kill").arg(self.child.id().to_string()).status().expect("kill starts");
         assert!(told.success());
         self.child.wait().expect("its end").code()

@@ -172,6 +172,9 @@ impl RunController<'_> {
         let sample_rate_hz = self.rig.sweep.rate_hz.get();
         if let Some(reached) = made.reached {
             run.recorder.poses(at, reached.microphone_mm, reached.speaker_mm)?;
+            if let Some(joints) = &reached.joints {
+                run.recorder.joints(at, joints)?;
+            }
         }
         let sample = AmbientSample {
             temperature_c: reading.temperature_c,
@@ -180,6 +183,9 @@ impl RunController<'_> {
             outside_level_db: reading.outside_level_db,
         };
         run.recorder.environment(reading.at, &sample)?;
+        for (device, notice) in self.devices.notices() {
+            run.recorder.log(at, LogLevel::Warning, device, &notice)?;
+        }
         // Without a temperature nobody could use them; the verdict says what the sensor said.
         let is_usable = made.reached.is_some() && Celsius::new(reading.temperature_c).is_ok();
         if run.options.keep == Keep::Sweeps && is_usable {

@@ -90,7 +90,7 @@ fn rig() -> Rig {
 fn simulated(rig: &Rig, fault: Fault, start: Timestamp, seed: u64) -> (Devices, Shared) {
     let relief = Relief::Flat.height_field(60);
     let inner =
-        devices(&Simulation { rig, relief: &relief, reflection_factor: 0.83, start, seed }).expect("devices");
+        devices(&Simulation { rig, relief: &relief, reflection_factor: 0.83, start, seed, arms: None }).expect("devices");
     let shared = Shared { fault, takes: Arc::default(), moves: Arc::default(), mended: Arc::default() };
     let faulty = Devices {
         robots: Box::new(Arms(inner.robots, shared.clone())),

@@ -91,7 +91,7 @@ fn start() -> Timestamp {
 
 fn simulated(rig: &Rig, reflection_factor: f64, seed: u64) -> Devices {
     let relief = Relief::Flat.height_field(60);
-    devices(&Simulation { rig, relief: &relief, reflection_factor, start: start(), seed }).expect("devices")
+    devices(&Simulation { rig, relief: &relief, reflection_factor, start: start(), seed, arms: None }).expect("devices")
 }
 
 fn faulty(rig: &Rig, fault: fn(&mut Take), takes: u32) -> Devices {

@@ -76,7 +76,7 @@ impl Channels {
     }
 }
 
-fn foxglove_channel<M: Encode>(writer: &mut Writer<BufWriter<File>>, topic: &str) -> mcap::McapResult<u16> {
+pub(super) fn foxglove_channel<M: Encode>(writer: &mut Writer<BufWriter<File>>, topic: &str) -> mcap::McapResult<u16> {
     let schema = match M::get_schema() {
         Some(schema) => writer.add_schema(&schema.name, &schema.encoding, &schema.data)?,
         None => 0,
@@ -89,7 +89,7 @@ fn own_channel<M: RunMessage>(writer: &mut Writer<BufWriter<File>>, topic: &str)
     writer.add_channel(schema, topic, "protobuf", &Default::default())
 }
 
-fn foxglove_topic<M: Encode>(channel: u16, topic: &str) -> Topic {
+pub(super) fn foxglove_topic<M: Encode>(channel: u16, topic: &str) -> Topic {
     let schema = M::get_schema();
     let (name, encoding, data) =
         schema.map(|s| (s.name, s.encoding, s.data.into_owned())).unwrap_or_default();

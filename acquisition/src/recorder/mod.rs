@@ -1,6 +1,7 @@
 //! Writes a run's MCAP file, crash-safe: what a checkpoint has passed survives a power cut, and the file stands
 //! under its name only when it is whole.
 
+mod arms;
 mod channels;
 pub(crate) mod chunks;
 mod error;
@@ -142,6 +143,10 @@ pub struct Recorder {
     encoded: Vec<u8>,
     tap: Option<Box<dyn Tap>>,
     cost: Cost,
+    /// The run is gone on with: what stands in a file once is there.
+    is_resumed: bool,
+    /// The arms, where their joints are known.
+    arms: Option<arms::Arms>,
 }
 
 /// The name of a recording until it is whole.
@@ -194,7 +199,9 @@ impl Recorder {
     }
 
     fn with(writer: ChunkWriter, path: PathBuf, partial: PathBuf, channels: Channels, sequence: u32) -> Self {
-        Self { writer, path, partial, channels, sequence, encoded: Vec::new(), tap: None, cost: Cost::default() }
+        let is_resumed = sequence > 0;
+        let (encoded, tap, cost, arms) = (Vec::new(), None, Cost::default(), None);
+        Self { writer, path, partial, channels, sequence, encoded, tap, cost, is_resumed, arms }
     }
 
     // What the run is stands first, so that a reader knows it before the first chunk.
@@ -228,7 +235,11 @@ impl Recorder {
 
     /// Lets `tap` hear every message from now on, and shows it the panel, which is in the file since its head.
     pub(crate) fn listen(&mut self, mut tap: Box<dyn Tap>, at: Timestamp, shape: Option<Shape<'_>>) {
-        tap.topics(self.channels.topics());
+        let arms = self.arms.as_ref();
+        tap.topics([self.channels.topics(), arms.map(arms::Arms::topics).unwrap_or_default()].concat());
+        if let Some((channel, description)) = arms.map(arms::Arms::description) {
+            tap.message(channel, u64::try_from(at.0).unwrap_or(0), description);
+        }
         if let Some(Shape { heights, mesh }) = shape {
             let time = u64::try_from(at.0).unwrap_or(0);
             let mut encoded = Vec::new();
@@ -252,7 +263,9 @@ impl Recorder {
     /// # Errors
     /// [`Error::Write`]; so do all methods below.
     pub fn poses(&mut self, at: Timestamp, microphone_mm: [f64; 3], speaker_mm: [f64; 3]) -> Result<(), Error> {
-        self.foxglove(self.channels.tf, at, &scene::frames(at, microphone_mm, speaker_mm))?;
+        if self.arms.is_none() {
+            self.foxglove(self.channels.tf, at, &scene::frames(at, microphone_mm, speaker_mm))?;
+        }
         self.foxglove(self.channels.microphone, at, &scene::pose(at, microphone_mm))?;
         self.foxglove(self.channels.speaker, at, &scene::pose(at, speaker_mm))
     }

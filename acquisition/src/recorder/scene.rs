@@ -2,16 +2,15 @@
 
 use echolake_schema::Timestamp;
 use foxglove::messages::{
-    Color, FrameTransform, FrameTransforms, Log, ModelPrimitive, PackedElementField, PointCloud, Pose, PoseInFrame,
-    Quaternion, RawAudio, SceneEntity, SceneUpdate, Timestamp as FoxgloveTime, Vector3, log,
-    packed_element_field::NumericType,
+    Color, FrameTransform, FrameTransforms, JointState, JointStates, Log, ModelPrimitive, PackedElementField,
+    PointCloud, Pose, PoseInFrame, Quaternion, RawAudio, SceneEntity, SceneUpdate, Timestamp as FoxgloveTime, Vector3,
+    log, packed_element_field::NumericType,
 };
 
 use super::LogLevel;
 use crate::relief::HeightField;
+use crate::robots::{Cell, Joints, PANEL_M, Tool, frame_names, joint_names};
 
-/// The panel stands on a table this high, m.
-const TABLE_M: f64 = 0.8;
 /// Length of the holders between flange and microphone or speaker, m.
 const HOLDER_M: f64 = 0.15;
 /// Points along each side of `/panel/points`.
@@ -35,13 +34,43 @@ pub(super) fn frames(at: Timestamp, microphone_mm: [f64; 3], speaker_mm: [f64; 3
     };
     FrameTransforms {
         transforms: vec![
-            frame("world", "panel", Vector3 { x: 0.0, y: 0.0, z: TABLE_M }),
+            frame("world", "panel", Vector3 { x: 0.0, y: 0.0, z: PANEL_M }),
             frame("panel", "microphone_flange", flange(microphone_mm)),
             frame("microphone_flange", "microphone", holder),
             frame("panel", "speaker_flange", flange(speaker_mm)),
             frame("speaker_flange", "speaker", holder),
         ],
     }
+}
+
+/// `/tf`: the panel in the world, and each arm's links from foot to tool.
+pub(super) fn arm_frames(at: Timestamp, cell: &Cell, joints: &[Joints; 2]) -> FrameTransforms {
+    let frame = |parent: &str, child: &str, [x, y, z]: [f64; 3], [qx, qy, qz, qw]: [f64; 4]| FrameTransform {
+        timestamp: Some(time(at)),
+        parent_frame_id: parent.into(),
+        child_frame_id: child.into(),
+        translation: Some(Vector3 { x, y, z }),
+        rotation: Some(Quaternion { x: qx, y: qy, z: qz, w: qw }),
+    };
+    let mut transforms = vec![frame("world", "panel", [0.0, 0.0, PANEL_M], [0.0, 0.0, 0.0, 1.0])];
+    for (tool, joints) in [Tool::Microphone, Tool::Speaker].into_iter().zip(joints) {
+        let (mut parent, names) = ("world".to_owned(), frame_names(tool));
+        for (i, (name, pose)) in names.into_iter().zip(cell.arm(tool).steps(joints)).enumerate() {
+            let mut at = pose.translation.to_array();
+            // Feet are known over the panel, and stand on the world.
+            at[2] += if i == 0 { PANEL_M } else { 0.0 };
+            transforms.push(frame(&parent, &name, at, pose.rotation.to_array()));
+            parent = name;
+        }
+    }
+    FrameTransforms { transforms }
+}
+
+/// `/robots/<name>/joint_states`.
+pub(super) fn joint_states(at: Timestamp, tool: Tool, joints: &Joints) -> JointStates {
+    let state =
+        |(name, position): (String, &f64)| JointState { name, position: Some(*position), ..JointState::default() };
+    JointStates { timestamp: Some(time(at)), joints: joint_names(tool).into_iter().zip(joints).map(state).collect() }
 }
 
 /// A position over the panel.

@@ -2,6 +2,7 @@
 
 use std::collections::BTreeMap;
 
+use echolake_schema::PairId;
 use echolake_schema::manifest::Origin;
 use echolake_schema::messages::Verdict;
 use foxglove::Decode;
@@ -10,9 +11,11 @@ use mcap::read::{LinearReader, MessageStream, Options};
 use mcap::records::Record;
 use mcap::{McapResult, Summary};
 use prost::Message as _;
+use rs_opw_kinematics::glam;
 
 use super::*;
 use crate::recovery::{Item, Walk};
+use crate::robots::Choreography;
 
 const START: Timestamp = Timestamp(1_767_600_000_123_456_789);
 const MICROPHONE_MM: [f64; 3] = [-187.5, 37.5, 124.0];
@@ -185,6 +188,54 @@ fn viewers_see_metres_and_frames() {
     );
     let time = log.timestamp.expect("a time");
     assert_eq!((time.sec(), time.nsec()), (1_767_600_001, 123_456_789));
+}
+
+#[test]
+fn arms_are_shown_where_their_joints_are_known() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = folder.path().join("run.mcap");
+    let arms = Choreography::of(&Rig::paper()).expect("a grid").expect("within reach");
+    let at = START.plus_secs(1.0);
+    begun(&path, |recorder| {
+        let mut recorder = recorder.expect("a recorder");
+        recorder.arms(START, arms.cell(), "simulated & <odd>").expect("recorded");
+        recorder.poses(at, MICROPHONE_MM, SPEAKER_MM).expect("recorded");
+        recorder.joints(at, &arms.joints(PairId(100))).expect("recorded");
+        recorder.finish(&end()).expect("finished");
+    });
+    let file = std::fs::read(&path).expect("the file");
+    let description = one(&file, topics::ROBOT_DESCRIPTION);
+    let schema = description.channel.schema.clone().expect("a schema");
+    assert_eq!((schema.name.as_str(), schema.encoding.as_str()), ("std_msgs/msg/String", "ros2msg"));
+    assert_eq!(description.channel.message_encoding, "cdr");
+    let urdf = std::str::from_utf8(&description.data[8..description.data.len() - 1]).expect("text");
+    assert!(urdf.contains("<robot name=\"simulated _ _odd_\">"), "{urdf}");
+
+    // Every link but the world has one frame in `/tf`, and every frame one parent, up to the world.
+    let frames = shown::<fg::FrameTransforms>(&file, topics::TF).transforms;
+    let links: Vec<_> = urdf.split("<link name=\"").skip(1).filter_map(|l| l.split('"').next()).collect();
+    assert_eq!((links.len(), frames.len()), (18, 17));
+    for link in links.iter().filter(|l| **l != "world") {
+        assert_eq!(frames.iter().filter(|f| f.child_frame_id == *link).count(), 1, "{link}");
+    }
+    assert!(frames.iter().all(|f| links.contains(&f.parent_frame_id.as_str())));
+
+    let grid = Rig::paper().grid().expect("a grid");
+    let pair = grid.pairs()[100];
+    let joints = [topics::MICROPHONE_JOINTS, topics::SPEAKER_JOINTS].map(|t| shown::<fg::JointStates>(&file, t).joints);
+    for (tool, point, joints) in [("microphone", pair.microphone, &joints[0]), ("speaker", pair.speaker, &joints[1])] {
+        assert_eq!(joints.len(), 6);
+        assert!(joints.iter().all(|j| urdf.contains(&format!("<joint name=\"{}\"", j.name))));
+        let (mut at, mut frame) = (glam::DVec3::ZERO, tool.to_owned());
+        while frame != "world" {
+            let link = frames.iter().find(|f| f.child_frame_id == frame).expect("a parent");
+            let (t, q) = (link.translation.as_ref().expect("there"), link.rotation.as_ref().expect("there"));
+            at = glam::DQuat::from_xyzw(q.x, q.y, q.z, q.w) * at + glam::DVec3::new(t.x, t.y, t.z);
+            frame = link.parent_frame_id.clone();
+        }
+        let wanted = glam::DVec3::from_array(grid.points()[point.index()].position_mm) / 1e3;
+        assert!(at.distance(wanted + glam::DVec3::new(0.0, 0.0, 0.8)) < 1e-6, "{tool} at {at}");
+    }
 }
 
 #[test]

@@ -13,7 +13,6 @@ mod microstructure;
 mod model;
 mod parameter;
 mod picture;
-mod png;
 mod primitive_root;
 mod primitives;
 mod random;

@@ -20,6 +20,7 @@ use realfft::{ComplexToReal, RealFftPlanner, RealToComplex};
 use crate::kirchhoff::{KirchhoffPlan, KirchhoffScratch};
 use crate::relief::HeightField;
 use crate::rig::{AmbientSensor, AudioInterface, Devices, Error, Positions, Power, Reading, Robots, Take};
+use crate::robots::Choreography;
 
 /// Facets along each side: 2.14 mm, a quarter of the wavelength at 40 kHz.
 pub const FACETS: usize = 274;
@@ -56,6 +57,8 @@ pub struct Simulation<'a> {
     pub start: Timestamp,
     /// Which room, drift and noise.
     pub seed: u64,
+    /// How the arms stand at each pair, where a model of them is wanted.
+    pub arms: Option<Arc<Choreography>>,
 }
 
 /// What the devices share.
@@ -103,7 +106,7 @@ pub fn devices(simulation: &Simulation<'_>) -> Result<Devices, Error> {
         outside_level_db: 42.0,
     }));
     Ok(Devices {
-        robots: Box::new(SimulatedRobots(world.clone())),
+        robots: Box::new(SimulatedRobots { world: world.clone(), arms: simulation.arms.clone() }),
         audio: Box::new(SimulatedAudio {
             world: world.clone(),
             rate_hz,
@@ -143,11 +146,14 @@ impl World {
     }
 }
 
-struct SimulatedRobots(Shared);
+struct SimulatedRobots {
+    world: Shared,
+    arms: Option<Arc<Choreography>>,
+}
 
 impl Robots for SimulatedRobots {
     fn move_to(&mut self, microphone_mm: [f64; 3], speaker_mm: [f64; 3]) -> Result<Positions, Error> {
-        let mut world = lock(&self.0);
+        let mut world = lock(&self.world);
         let refuse = |reason| Error::Unreachable { microphone_mm, speaker_mm, reason };
         if world.power == Power::Off {
             return Err(refuse("the drives are off"));
@@ -158,17 +164,20 @@ impl Robots for SimulatedRobots {
             return Err(refuse("the simulated arms know the grid's points only"));
         };
         let [a, b] = [microphone, speaker].map(|index| world.grid.points()[index].id);
-        if world.grid.pair_id(a, b).or_else(|| world.grid.pair_id(b, a)).is_none() {
+        let Some(pair) = world.grid.pair_id(a, b).or_else(|| world.grid.pair_id(b, a)) else {
             return Err(refuse("the arms would touch"));
-        }
+        };
+        // The model knows the roles that the grid gives.
+        let known = self.arms.as_ref().filter(|_| world.grid.pair_id(a, b).is_some());
+        let joints = known.map(|arms| arms.joints(pair));
         world.stand = [microphone, speaker];
         // The arms repeat to 0.02 mm. The residual is told; the simulated sound does not know of it.
         let mut off = |mm: [f64; 3]| mm.map(|x| x + 0.01 * world.normal().clamp(-2.0, 2.0));
-        Ok(Positions { microphone_mm: off(microphone_mm), speaker_mm: off(speaker_mm) })
+        Ok(Positions { microphone_mm: off(microphone_mm), speaker_mm: off(speaker_mm), joints })
     }
 
     fn power(&mut self, power: Power) -> Result<(), Error> {
-        lock(&self.0).power = power;
+        lock(&self.world).power = power;
         Ok(())
     }
 }
@@ -310,7 +319,8 @@ mod tests {
     fn simulated(seed: u64) -> Devices {
         let (rig, relief) = (Rig::paper(), Relief::Flat.height_field(40));
         let start = Timestamp(1_767_600_000_000_000_000);
-        devices(&Simulation { rig: &rig, relief: &relief, reflection_factor: 0.83, start, seed }).expect("devices")
+        devices(&Simulation { rig: &rig, relief: &relief, reflection_factor: 0.83, start, seed, arms: None })
+            .expect("devices")
     }
 
     #[test]

@@ -60,14 +60,14 @@ pub(crate) struct Lanes {
 }
 
 /// A runtime that may be dropped anywhere.
-pub(crate) struct Threads(Option<Runtime>);
+pub struct Threads(Option<Runtime>);
 
 impl Threads {
     /// `count` threads of a name.
     ///
     /// # Errors
     /// Where the system gives no threads.
-    pub(crate) fn new(name: &str, count: usize) -> std::io::Result<Self> {
+    pub fn new(name: &str, count: usize) -> std::io::Result<Self> {
         let runtime = Builder::new_multi_thread()
             .worker_threads(count)
             .thread_name(name)
@@ -79,7 +79,16 @@ impl Threads {
         Ok(Self(Some(runtime)))
     }
 
-    pub(crate) fn handle(&self) -> Option<&Handle> {
+    /// One thread a core.
+    ///
+    /// # Errors
+    /// As [`Threads::new`].
+    pub fn per_core(name: &str) -> std::io::Result<Self> {
+        Self::new(name, std::thread::available_parallelism().map_or(1, usize::from))
+    }
+
+    /// Where work is given to them; None while they end.
+    pub fn handle(&self) -> Option<&Handle> {
         self.0.as_ref().map(Runtime::handle)
     }
 }
@@ -99,10 +108,9 @@ impl Lanes {
     /// # Errors
     /// Where the system gives no threads.
     pub(crate) fn new(heavy: usize) -> std::io::Result<Self> {
-        let cores = std::thread::available_parallelism().map_or(1, usize::from);
         Ok(Self {
-            light: Threads::new("query", cores)?,
-            heavy: Threads::new("query-heavy", cores)?,
+            light: Threads::per_core("query")?,
+            heavy: Threads::per_core("query-heavy")?,
             light_places: Arc::new(Semaphore::new(LIGHT_AT_ONCE)),
             heavy_places: Arc::new(Semaphore::new(heavy)),
         })

@@ -83,6 +83,11 @@ impl Functions {
         &self.scalar
     }
 
+    /// Names of all.
+    pub fn names(&self) -> impl Iterator<Item = &str> {
+        self.scalar.iter().map(|f| f.name()).chain(self.aggregate.iter().map(|f| f.name()))
+    }
+
     /// Functions of the values of many rows.
     pub fn aggregate(&self) -> &[Arc<AggregateUDF>] {
         &self.aggregate

@@ -41,6 +41,20 @@ pub(super) struct McapFile {
     pub(super) channels: BTreeMap<u16, Channel>,
     /// In the file's order, without overlaps.
     pub(super) pieces: Vec<Piece>,
+    pub(super) attachments: Vec<Attachment>,
+}
+
+/// A file within a run's file.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Attachment {
+    /// Its name.
+    pub name: String,
+    /// As it was recorded with it.
+    pub media_type: String,
+    /// Size of what it holds.
+    pub bytes: u64,
+    /// Where its record is.
+    pub(super) range: Range<u64>,
 }
 
 /// A channel.
@@ -65,6 +79,8 @@ pub(super) struct Piece {
     pub(super) channels: Option<Box<[u16]>>,
     /// Bytes of message indexes behind it.
     pub(super) index: u64,
+    /// Bytes of its records before compression, where its index tells.
+    pub(super) plain: u64,
 }
 
 impl Piece {
@@ -157,7 +173,7 @@ impl Opening<'_> {
     // None where the summary does not tell where all messages are.
     fn summary(&self, summary: &[u8], start: u64) -> Result<Option<McapFile>, McapError> {
         let mut definitions = Definitions::default();
-        let (mut statistics, mut indexes) = (None, Vec::new());
+        let (mut statistics, mut indexes, mut attachments) = (None, Vec::new(), Vec::new());
         let options = LinearReaderOptions::default()
             .with_skip_start_magic(true)
             .with_skip_end_magic(true)
@@ -179,6 +195,7 @@ impl Opening<'_> {
                 LinearReadEvent::Record { opcode, data } => match mcap::parse_record(opcode, data)? {
                     Record::Statistics(found) => statistics = Some(found),
                     Record::ChunkIndex(index) => indexes.push(index),
+                    Record::AttachmentIndex(index) => attachments.push(index),
                     other => definitions.learn(&other),
                 },
             }
@@ -197,6 +214,7 @@ impl Opening<'_> {
                 // A writer may make no message indexes.
                 channels: (!channels.is_empty()).then_some(channels),
                 index: index.message_index_length.min(start - end),
+                plain: index.uncompressed_size,
             })
         });
         let Some(mut pieces) = pieces.collect::<Option<Vec<_>>>() else { return Ok(None) };
@@ -211,7 +229,13 @@ impl Opening<'_> {
         for (id, channel) in &mut channels {
             channel.messages = Some(statistics.channel_message_counts.get(id).copied().unwrap_or(0));
         }
-        Ok(Some(McapFile { path: self.path.clone(), bytes: self.bytes, indexed: true, channels, pieces }))
+        let attachments = attachments.into_iter().filter_map(|index| {
+            let end = index.offset.checked_add(index.length).filter(|end| *end <= start)?;
+            let range = index.offset..end;
+            Some(Attachment { name: index.name, media_type: index.media_type, bytes: index.data_size, range })
+        });
+        let attachments = attachments.collect();
+        Ok(Some(McapFile { path: self.path.clone(), bytes: self.bytes, indexed: true, channels, pieces, attachments }))
     }
 
     fn damaged(&self, offset: u64, what: impl Into<String>) -> Fault {
@@ -254,8 +278,9 @@ impl Opening<'_> {
                 Some(Err(e)) => return Err(self.damaged(walk.at, words(&e))),
             }
         }
+        let attachments = std::mem::take(&mut walk.attachments);
         let (channels, pieces) = walk.finish();
-        Ok(McapFile { path: self.path.clone(), bytes: self.bytes, indexed: false, channels, pieces })
+        Ok(McapFile { path: self.path.clone(), bytes: self.bytes, indexed: false, channels, pieces, attachments })
     }
 }
 
@@ -318,6 +343,7 @@ struct Walk {
     /// Messages of each channel, and the times of the first and last.
     seen: BTreeMap<u16, (u64, (u64, u64))>,
     pieces: Vec<Piece>,
+    attachments: Vec<Attachment>,
     /// Whether the last piece is one of messages in no chunk, which may go on.
     open: bool,
 }
@@ -334,6 +360,15 @@ impl Walk {
                 self.see(&record, &mut seen);
                 if opcode == op::MESSAGE {
                     self.message(range, seen);
+                }
+                Ok(())
+            }
+            op::ATTACHMENT => {
+                self.open = false;
+                if let Ok(Record::Attachment { header, data, .. }) = mcap::parse_record(opcode, data) {
+                    let bytes = data.len() as u64;
+                    let (name, media_type) = (header.name, header.media_type);
+                    self.attachments.push(Attachment { name, media_type, bytes, range });
                 }
                 Ok(())
             }
@@ -413,6 +448,6 @@ struct Seen {
 
 impl Seen {
     fn piece(self, kind: Kind, range: Range<u64>, times: (u64, u64)) -> Piece {
-        Piece { kind, range, times, channels: Some(self.channels.into_iter().collect()), index: 0 }
+        Piece { kind, range, times, channels: Some(self.channels.into_iter().collect()), index: 0, plain: 0 }
     }
 }

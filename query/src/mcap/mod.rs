@@ -5,6 +5,7 @@
 
 mod chunk;
 mod column;
+mod contents;
 mod error;
 mod file;
 mod json;
@@ -36,7 +37,10 @@ use datafusion::sql::sqlparser::ast::{
 use echolake_lake::Snapshot;
 
 use crate::Error;
+pub use contents::{Contents, Topic};
+pub(crate) use contents::{attachment, contents};
 use error::Fault;
+pub use file::Attachment;
 pub(crate) use file::Files;
 use target::Target;
 

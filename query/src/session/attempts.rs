@@ -3,7 +3,7 @@
 use std::path::Path;
 
 /// Attempts that would read `secret`, write under `outside`, or change the lake or another session.
-pub(super) fn attempts(secret: &Path, outside: &Path) -> Vec<String> {
+pub(crate) fn attempts(secret: &Path, outside: &Path) -> Vec<String> {
     let mut all = reads(&secret.display().to_string());
     all.extend(writes(&outside.display().to_string()));
     all.extend(changes());

@@ -18,12 +18,13 @@ pub(super) fn status(fault: &Fault) -> Status {
 
 fn grpc(code: Code) -> Grpc {
     match code {
-        Code::Query | Code::Request | Code::Format => Grpc::InvalidArgument,
+        Code::Query | Code::Request | Code::Format | Code::Method => Grpc::InvalidArgument,
         Code::ReadOnly | Code::Forbidden | Code::Foreign => Grpc::PermissionDenied,
         Code::Execution => Grpc::FailedPrecondition,
         Code::Lake => Grpc::Unavailable,
         Code::Unsupported => Grpc::Unimplemented,
-        Code::NotFound => Grpc::NotFound,
+        Code::NotFound | Code::NoData => Grpc::NotFound,
+        Code::Range => Grpc::OutOfRange,
         Code::Unauthenticated => Grpc::Unauthenticated,
         Code::Cancelled => Grpc::Cancelled,
         Code::TimeLimit => Grpc::DeadlineExceeded,

@@ -6,6 +6,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 
 use arrow::datatypes::SchemaRef;
 use arrow::record_batch::RecordBatch;
+use axum::http::{HeaderMap, header};
 use bytes::Bytes;
 use echolake_query::output::{AnswerWriter, Format};
 
@@ -46,6 +47,21 @@ pub(super) fn accepted(accept: &str) -> Result<Format, Fault> {
     best.map(|(_, format)| format).ok_or_else(|| {
         let types: Vec<_> = FORMATS.iter().map(|(_, types)| types[0]).collect();
         Fault::request(format!("nothing in `Accept: {accept}` can be had; hint: {}", types.join(", ")))
+    })
+}
+
+/// Whether an Arrow stream is liked better than JSON.
+pub(super) fn prefers_arrow(headers: &HeaderMap) -> bool {
+    let accept = headers.get(header::ACCEPT).and_then(|v| v.to_str().ok()).unwrap_or_default();
+    accepted(accept).is_ok_and(|format| format == Format::Arrow)
+}
+
+/// Whether an encoding of HTTP is taken.
+pub(super) fn takes(headers: &HeaderMap, encoding: &str) -> bool {
+    let accepted = headers.get(header::ACCEPT_ENCODING).and_then(|v| v.to_str().ok()).unwrap_or_default();
+    accepted.split(',').any(|one| {
+        let mut parts = one.split(';').map(str::trim);
+        parts.next() == Some(encoding) && !parts.any(|p| p == "q=0")
     })
 }
 

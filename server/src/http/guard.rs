@@ -24,17 +24,34 @@ pub(super) struct MayQuery(pub(super) Arc<Client>);
 /// Whoever may see the server's figures.
 pub(super) struct MaySeeMetrics;
 
-fn client(service: &Service, headers: &HeaderMap, scope: Scope) -> Result<Arc<Client>, Problem> {
+/// The cookie of a browser's session.
+pub(super) const COOKIE: &str = "echolake";
+
+/// Who asks, by token or by session.
+///
+/// # Errors
+/// [`Fault::Unauthenticated`], [`Fault::Forbidden`], [`Fault::Foreign`].
+pub(super) fn client(service: &Service, headers: &HeaderMap, scope: Scope) -> Result<Arc<Client>, Fault> {
     let token = headers.get(header::AUTHORIZATION).and_then(|v| v.to_str().ok()).and_then(of_header);
-    let client = service.access().client(token.as_deref(), scope);
-    Ok(client.inspect_err(|fault| service.metrics().failed(fault.code()))?)
+    let client = match (token, cookie(headers)) {
+        // A browser sends the cookie along whichever page of this machine asks, on whatever port it was served.
+        (None, Some(secret)) => is_same_origin(headers, &["http://", "https://"])
+            .and_then(|()| service.access().client_of_session(secret, scope)),
+        (token, _) => service.access().client(token.as_deref(), scope),
+    };
+    client.inspect_err(|fault| service.metrics().failed(fault.code()))
+}
+
+fn cookie(headers: &HeaderMap) -> Option<&str> {
+    let all = headers.get_all(header::COOKIE).iter().filter_map(|v| v.to_str().ok());
+    all.flat_map(|v| v.split(';')).find_map(|pair| pair.trim().strip_prefix(COOKIE)?.strip_prefix('='))
 }
 
 impl FromRequestParts<Service> for MayQuery {
     type Rejection = Problem;
 
     async fn from_request_parts(parts: &mut Parts, service: &Service) -> Result<Self, Problem> {
-        client(service, &parts.headers, Scope::Sql).map(Self)
+        Ok(Self(client(service, &parts.headers, Scope::Sql)?))
     }
 }
 
@@ -42,7 +59,8 @@ impl FromRequestParts<Service> for MaySeeMetrics {
     type Rejection = Problem;
 
     async fn from_request_parts(parts: &mut Parts, service: &Service) -> Result<Self, Problem> {
-        client(service, &parts.headers, Scope::Metrics).map(|_| Self)
+        client(service, &parts.headers, Scope::Metrics)?;
+        Ok(Self)
     }
 }
 
@@ -60,24 +78,33 @@ pub(super) async fn own_pages_only(State(service): State<Service>, request: Requ
 
 fn is_own(request: &Request) -> Result<(), Fault> {
     let headers = request.headers();
-    let text = |name: &HeaderName| headers.get(name).map(|v| String::from_utf8_lossy(v.as_bytes()).into_owned());
     // HTTP/1.1 wants one Host; with two, they who check and they who route may look at different ones.
-    let host = match (headers.get_all(header::HOST).iter().count(), text(&header::HOST)) {
+    let host = match (headers.get_all(header::HOST).iter().count(), text(headers, &header::HOST)) {
         (1, Some(host)) => host,
         (_, host) => return Err(Fault::Foreign { what: "host", found: host.unwrap_or_default() }),
     };
     if !is_local(&host) {
         return Err(Fault::Foreign { what: "host", found: host });
     }
-    if let Some(origin) = text(&header::ORIGIN)
-        && origin.strip_prefix("http://") != Some(&host)
+    is_same_origin(headers, &["http://"])
+}
+
+// That no page of elsewhere stands behind a request, as browsers tell.
+fn is_same_origin(headers: &HeaderMap, schemes: &[&str]) -> Result<(), Fault> {
+    let host = text(headers, &header::HOST).unwrap_or_default();
+    if let Some(origin) = text(headers, &header::ORIGIN)
+        && !schemes.iter().any(|scheme| origin.strip_prefix(scheme) == Some(&host))
     {
         return Err(Fault::Foreign { what: "origin", found: origin });
     }
-    match text(&FETCH_SITE) {
+    match text(headers, &FETCH_SITE) {
         Some(site) if site != "same-origin" && site != "none" => Err(Fault::Foreign { what: "site", found: site }),
         _ => Ok(()),
     }
+}
+
+fn text(headers: &HeaderMap, name: &HeaderName) -> Option<String> {
+    headers.get(name).map(|v| String::from_utf8_lossy(v.as_bytes()).into_owned())
 }
 
 // A name or address that cannot be another machine's.

@@ -1,11 +1,17 @@
-//! HTTP: queries, the tables, health and figures. What else is served over HTTP is added to this one table.
+//! HTTP: queries, the catalogue, the lake's files, the pages, health and figures.
 
+mod catalogue;
+mod connections;
+mod files;
 mod format;
 mod guard;
 mod health;
+mod openapi;
+#[cfg(feature = "web")]
+mod pages;
 mod problem;
+mod session;
 mod sql;
-mod tables;
 
 use axum::Router;
 use axum::middleware::from_fn_with_state;
@@ -16,6 +22,7 @@ use tower_http::catch_panic::CatchPanicLayer;
 use crate::Error;
 use crate::fault::Fault;
 use crate::service::Service;
+use catalogue::Catalogue;
 use problem::Problem;
 
 /// Answers HTTP until `stop`.
@@ -24,29 +31,39 @@ pub(crate) async fn serve(
     listener: TcpListener,
     stop: impl Future<Output = ()> + Send + 'static,
 ) -> Result<(), Error> {
-    axum::serve(listener, router(service)).with_graceful_shutdown(stop).await.map_err(Error::System)
+    connections::serve(listener, router(service), stop).await;
+    Ok(())
 }
 
 fn router(service: Service) -> Router {
-    let asked = Router::new()
+    let catalogue = Catalogue::new(service.clone());
+    let own = Router::new()
         .route("/api/v1/sql", post(sql::post))
-        .route("/api/v1/tables", get(tables::get))
-        .route("/metrics", get(health::metrics));
-    Router::new()
-        .merge(asked)
+        .route("/api/v1/session", post(session::post))
+        .route("/api/v1/openapi.json", get(openapi::get))
+        .route("/metrics", get(health::metrics))
         .route("/health", get(health::health))
-        .fallback(nothing)
+        .with_state(service.clone())
+        .merge(catalogue.router())
+        .merge(files::for_own(&catalogue))
+        .layer(from_fn_with_state(service, guard::own_pages_only));
+    #[cfg(feature = "web")]
+    let rest = pages::fallback;
+    #[cfg(not(feature = "web"))]
+    let rest = nothing;
+    Router::new()
+        .merge(own)
+        .merge(files::for_viewers(&catalogue))
+        .fallback(rest)
         .method_not_allowed_fallback(wrong_method)
-        .layer(from_fn_with_state(service.clone(), guard::own_pages_only))
         .layer(CatchPanicLayer::custom(|_| Problem(Fault::Internal).answer()))
         .layer(axum::middleware::map_response(guard::security_headers))
-        .with_state(service)
 }
 
 async fn nothing() -> Problem {
-    Problem(Fault::NotFound { what: "this path".to_owned(), hint: "POST /api/v1/sql, GET /api/v1/tables, GET /health" })
+    Problem(Fault::NotFound { what: "this path".to_owned(), hint: "GET /api/v1/openapi.json lists what there is" })
 }
 
 async fn wrong_method() -> Problem {
-    Problem(Fault::request("this path is not for this method; hint: POST /api/v1/sql, GET for all others"))
+    Problem(Fault::Method)
 }

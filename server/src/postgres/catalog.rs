@@ -4,7 +4,7 @@
 use std::collections::{BTreeMap, HashMap};
 use std::sync::Arc;
 
-use arrow::array::AsArray as _;
+use arrow::array::{ArrayRef, AsArray as _, Int32Array, RecordBatch, StringArray};
 use arrow::compute::cast;
 use arrow::datatypes::{DataType, Field, Int32Type, Schema, SchemaRef};
 use async_trait::async_trait;
@@ -13,14 +13,14 @@ use datafusion::common::ScalarValue;
 use datafusion::datasource::{TableType, ViewTable, provider_as_source};
 use datafusion::error::DataFusionError;
 use datafusion::execution::session_state::SessionStateBuilder;
-use datafusion::logical_expr::{LogicalPlanBuilder, ScalarUDF, ident, lit};
+use datafusion::logical_expr::{LogicalPlanBuilder, ScalarUDF, cast as cast_to, ident, lit};
 use datafusion::prelude::SessionContext;
 use datafusion_pg_catalog::pg_catalog::catalog_info::CatalogInfo;
 use datafusion_pg_catalog::pg_catalog::context::{PgCatalogContextProvider, Role};
 use datafusion_pg_catalog::pg_catalog::generate_series_arg_coercion::CoerceIntArgsToBigInt;
 use datafusion_pg_catalog::pg_catalog::oid_type_planner::PgOidTypePlanner;
 use datafusion_pg_catalog::pg_catalog::{ArrowTable, PgCatalogSchemaProvider, PgCatalogStaticTables};
-use echolake_query::Extend;
+use echolake_query::{Extend, Function};
 
 use super::functions;
 use super::rewrite::OWN_TABLES;
@@ -29,6 +29,13 @@ use crate::Error;
 use crate::service::{CATALOG, SCHEMA};
 
 const PG_CATALOG: &str = "pg_catalog";
+/// The first number of the field's functions; Postgres keeps those below for itself, and tables have those from 16384.
+const OWN_NUMBERS: i32 = 1_000_000;
+const OWN_NUMBER: &str = "own_number";
+const OWN_NAME: &str = "own_name";
+const OWN_SCHEMA: &str = "own_schema";
+/// The function of Postgres that the field's are like.
+const LIKE: &str = "upper";
 const KEYWORDS: &str = "pg_get_keywords";
 /// The only role; `pg_get_userbyid` and `session_user` say the same.
 const ROLE: &str = "postgres";
@@ -42,14 +49,17 @@ pub(super) struct PgCatalog {
 }
 
 impl PgCatalog {
-    /// For a lake of these tables.
-    pub(super) fn new(tables: Vec<(&'static str, SchemaRef)>) -> Result<Self, Error> {
+    /// For a lake of these tables, and the field's functions.
+    pub(super) fn new(tables: Vec<(&'static str, SchemaRef)>, own: Vec<Function>) -> Result<Self, Error> {
         let fixed = Arc::new(PgCatalogStaticTables::try_new()?);
         let keywords = fixed.pg_get_keywords.clone();
         let names = Names(Arc::new(tables.into_iter().collect()));
         let mut functions = functions::fixed();
         functions.push(functions::to_regtype(type_numbers(&fixed.pg_type)?));
-        let schema = Arc::new(Complete(PgCatalogSchemaProvider::try_new(names, fixed, Roles)?));
+        let of_own = own.iter().zip(OWN_NUMBERS..).map(|(f, n)| (n, f.arguments().to_owned())).collect();
+        functions.push(functions::arguments(of_own));
+        let own = own_functions(&own)?;
+        let schema = Arc::new(Complete { inner: PgCatalogSchemaProvider::try_new(names, fixed, Roles)?, own });
         Ok(Self { schema, keywords, functions: Arc::new(functions) })
     }
 
@@ -93,27 +103,35 @@ fn type_numbers(types: &ArrowTable) -> Result<HashMap<String, i32>, DataFusionEr
 
 // The tables of `datafusion-pg-catalog`, and what clients miss in them.
 #[derive(Debug)]
-struct Complete<S>(S);
+struct Complete<S> {
+    inner: S,
+    /// Number and name of the field's functions.
+    own: Arc<dyn TableProvider>,
+}
 
 #[async_trait]
 impl<S: SchemaProvider> SchemaProvider for Complete<S> {
     fn table_names(&self) -> Vec<String> {
-        let mut names = self.0.table_names();
+        let mut names = self.inner.table_names();
         names.extend(OWN_TABLES.map(str::to_owned));
         names
     }
 
     async fn table(&self, name: &str) -> Result<Option<Arc<dyn TableProvider>>, DataFusionError> {
-        match (name, self.0.table(name).await?) {
+        match (name, self.inner.table(name).await?) {
             ("pg_indexes", _) => Ok(Some(no_indexes()?)),
             ("pg_class", Some(table)) => Ok(Some(with_nothing(name, table, &["relacl", "reloptions"])?)),
             ("pg_attribute", Some(table)) => Ok(Some(with_nothing(name, table, &["attacl"])?)),
+            ("pg_proc", Some(table)) => match self.inner.table("pg_namespace").await? {
+                Some(schemas) => Ok(Some(with_own(table, schemas, self.own.clone())?)),
+                None => Ok(Some(table)),
+            },
             (_, table) => Ok(table),
         }
     }
 
     fn table_exist(&self, name: &str) -> bool {
-        OWN_TABLES.contains(&name) || self.0.table_exist(name)
+        OWN_TABLES.contains(&name) || self.inner.table_exist(name)
     }
 }
 
@@ -122,6 +140,40 @@ fn no_indexes() -> Result<Arc<dyn TableProvider>, DataFusionError> {
     let fields = names.map(|name| Field::new(name, DataType::Utf8, true));
     let schema = Arc::new(Schema::new(fields.to_vec()));
     Ok(Arc::new(MemTable::try_new(schema, vec![Vec::new()])?))
+}
+
+fn own_functions(functions: &[Function]) -> Result<Arc<dyn TableProvider>, DataFusionError> {
+    let numbers: ArrayRef = Arc::new(Int32Array::from_iter_values(OWN_NUMBERS..OWN_NUMBERS + functions.len() as i32));
+    let names: ArrayRef = Arc::new(StringArray::from_iter_values(functions.iter().map(|f| &f.name)));
+    let rows = RecordBatch::try_from_iter([(OWN_NUMBER, numbers), (OWN_NAME, names)])?;
+    Ok(Arc::new(MemTable::try_new(rows.schema(), vec![vec![rows]])?))
+}
+
+// The field's functions beside Postgres' own: in the lake's schema, and else like one of those.
+fn with_own(
+    functions: Arc<dyn TableProvider>,
+    schemas: Arc<dyn TableProvider>,
+    own: Arc<dyn TableProvider>,
+) -> Result<Arc<dyn TableProvider>, DataFusionError> {
+    let scan = |name: &str, table: &Arc<dyn TableProvider>| {
+        LogicalPlanBuilder::scan(name, provider_as_source(table.clone()), None)
+    };
+    let schema = scan("schemas", &schemas)?
+        .filter(ident("nspname").eq(lit(SCHEMA)))?
+        .project([ident("oid").alias(OWN_SCHEMA)])?
+        .build()?;
+    let own = scan("own", &own)?.build()?;
+    let column = |name: &str, kind: &DataType| match name {
+        "oid" => cast_to(ident(OWN_NUMBER), kind.clone()).alias(name),
+        "proname" => cast_to(ident(OWN_NAME), kind.clone()).alias(name),
+        "pronamespace" => cast_to(ident(OWN_SCHEMA), kind.clone()).alias(name),
+        _ => ident(name),
+    };
+    let columns: Vec<_> = functions.schema().fields().iter().map(|f| column(f.name(), f.data_type())).collect();
+    let like = scan("pg_proc", &functions)?.filter(ident("proname").eq(lit(LIKE)))?.limit(0, Some(1))?;
+    let own = like.cross_join(schema)?.cross_join(own)?.project(columns)?.build()?;
+    let plan = scan("pg_proc", &functions)?.union(own)?.build()?;
+    Ok(Arc::new(ViewTable::new(plan, None)))
 }
 
 // Neither tables nor columns have rights or options of their own; clients know these as lists.

@@ -47,7 +47,7 @@ pub(super) struct Shared {
 
 impl Shared {
     pub(super) fn new(service: Service) -> Result<Self, Error> {
-        let catalog = PgCatalog::new(service.tables())?;
+        let catalog = PgCatalog::new(service.tables(), service.functions())?;
         let parser = PostgresCompatibilityParser::new();
         Ok(Self { service, parser, catalog, next_pid: AtomicI32::new(1), running: Mutex::default() })
     }

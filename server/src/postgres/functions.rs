@@ -7,7 +7,7 @@ use std::sync::Arc;
 
 use arrow::array::{Array as _, ArrayRef, AsArray as _, Int32Array, StringArray};
 use arrow::compute::cast;
-use arrow::datatypes::DataType;
+use arrow::datatypes::{DataType, Int32Type};
 use datafusion::common::ScalarValue;
 use datafusion::error::{DataFusionError, Result};
 use datafusion::logical_expr::{
@@ -52,7 +52,6 @@ pub(super) fn fixed() -> Vec<Arc<ScalarUDF>> {
         ("version", Some(format!("PostgreSQL {VERSION}"))),
         ("pg_client_encoding", Some("UTF8".to_owned())),
         ("pg_get_function_result", Some(String::new())),
-        ("pg_get_function_arguments", Some(String::new())),
         ("pg_get_function_identity_arguments", Some(String::new())),
         ("pg_get_functiondef", None),
         ("pg_get_indexdef", None),
@@ -97,6 +96,18 @@ pub(super) fn fixed() -> Vec<Arc<ScalarUDF>> {
     all.push(Answer::udf("pg_backend_pid", ScalarValue::Int32(Some(0))));
     all.push(ScalarUDF::new_from_impl(JsonObject::new()));
     all.into_iter().map(Arc::new).collect()
+}
+
+/// `pg_get_function_arguments(oid)`: what the field's functions take, by their numbers; empty for all others.
+pub(super) fn arguments(of: HashMap<i32, String>) -> Arc<ScalarUDF> {
+    let find = move |args: &[ColumnarValue]| {
+        let numbers = cast(&ColumnarValue::values_to_arrays(args)?[0], &DataType::Int32)?;
+        let numbers = numbers.as_primitive::<Int32Type>().iter();
+        let texts: StringArray = numbers.map(|n| n.map(|n| of.get(&n).map_or("", String::as_str))).collect();
+        Ok(ColumnarValue::Array(Arc::new(texts)))
+    };
+    let name = "pg_get_function_arguments";
+    Arc::new(create_udf(name, vec![DataType::Int32], DataType::Utf8, Volatility::Stable, Arc::new(find)))
 }
 
 /// `to_regtype(name)`: the number of a type; NULL where there is none.

@@ -15,6 +15,8 @@ use pgwire::api::Type;
 const FUNCTIONS: [&str; 6] = ["typinput", "typoutput", "typreceive", "typsend", "typmodin", "typmodout"];
 /// Aggregates that a subquery may have already.
 const AGGREGATES: [&str; 8] = ["array_agg", "avg", "bool_or", "count", "max", "min", "string_agg", "sum"];
+/// Tables about what no column of the lake has.
+const NOTHING: [&str; 3] = ["pg_attrdef", "pg_collation", "pg_sequence"];
 /// How such a column says that there is none.
 const NONE: &str = "-";
 
@@ -69,6 +71,11 @@ impl VisitorMut for Adapt<'_> {
         }
         if let Some(better) = array_of_query(expr) {
             *expr = better;
+        }
+        if let Expr::Subquery(query) = expr
+            && asks_for_nothing(query)
+        {
+            *expr = Expr::value(Value::Null);
         }
         if let Expr::Subquery(query) = expr {
             one_row(query);
@@ -142,6 +149,24 @@ fn call(name: &str, argument: Expr, like: &Function) -> Expr {
     Expr::Function(Function { name: ObjectName::from(vec![Ident::new(name)]), args, ..like.clone() })
 }
 
+// What a column's default, sequence or collation is: none has one of its own.
+fn asks_for_nothing(query: &Query) -> bool {
+    let SetExpr::Select(select) = query.body.as_ref() else { return false };
+    let counts = |item: &SelectItem| {
+        matches!(item, SelectItem::UnnamedExpr(Expr::Function(f)) | SelectItem::ExprWithAlias { expr: Expr::Function(f), .. }
+            if is_aggregate(f))
+    };
+    let first = select.from.first().map(|from| &from.relation);
+    let of_none = matches!(first, Some(TableFactor::Table { name, args: None, .. })
+        if name.0.last().and_then(|n| n.as_ident()).is_some_and(|n| NOTHING.contains(&n.value.as_str())));
+    of_none && !select.projection.iter().any(counts)
+}
+
+fn is_aggregate(function: &Function) -> bool {
+    let name = function.name.to_string();
+    AGGREGATES.iter().any(|a| name.eq_ignore_ascii_case(a))
+}
+
 // DataFusion wants to be sure that a scalar subquery has one row. Those that clients ask of the catalogue look one up
 // by its key: its greatest is the same.
 fn one_row(query: &mut Query) {
@@ -160,8 +185,7 @@ fn one_row(query: &mut Query) {
     else {
         return;
     };
-    let is_aggregate = |name: &str| AGGREGATES.iter().any(|a| name.eq_ignore_ascii_case(a));
-    if matches!(item, Expr::Function(function) if is_aggregate(&function.name.to_string())) {
+    if matches!(item, Expr::Function(function) if is_aggregate(function)) {
         return;
     }
     let plain_call = Function {
@@ -196,9 +220,14 @@ mod tests {
         );
         check("SELECT 1 FROM t WHERE typreceive != 0", "SELECT 1 FROM t WHERE typreceive <> '-'");
         check("SELECT 1 FROM t WHERE t.typsend = 0", "SELECT 1 FROM t WHERE t.typsend = '-'");
+        check("SELECT (SELECT d.x FROM pg_catalog.pg_attrdef d WHERE d.i = a.i LIMIT 1) FROM a", "SELECT NULL FROM a");
         check(
-            "SELECT (SELECT d.x FROM pg_catalog.pg_attrdef d WHERE d.i = a.i LIMIT 1) FROM a",
-            "SELECT (SELECT max(d.x) FROM pg_catalog.pg_attrdef d WHERE d.i = a.i) FROM a",
+            "SELECT (SELECT count(*) FROM pg_catalog.pg_attrdef) FROM a",
+            "SELECT (SELECT count(*) FROM pg_catalog.pg_attrdef) FROM a",
+        );
+        check(
+            "SELECT (SELECT d.x FROM pg_catalog.pg_class d WHERE d.i = a.i LIMIT 1) FROM a",
+            "SELECT (SELECT max(d.x) FROM pg_catalog.pg_class d WHERE d.i = a.i) FROM a",
         );
         check("SELECT (SELECT d.x FROM d) FROM a", "SELECT (SELECT d.x FROM d) FROM a");
         check("SELECT (SELECT count(*) FROM pg_class) FROM a", "SELECT (SELECT count(*) FROM pg_class) FROM a");

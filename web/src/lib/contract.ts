@@ -79,7 +79,7 @@ export interface paths {
             readonly path?: never;
             readonly cookie?: never;
         };
-        /** NCE by band, mean over all pairs or over those of one microphone point, and the same of the surface's Flat, decimated to `points` */
+        /** NCE by band, mean over all pairs or over those of one microphone point, and the same of the surface's Flat, decimated to `points`. As an Arrow stream: `time_ms`, `nce_2500`, ..., `flat_nce_2500`, ... */
         readonly get: operations["curves"];
         readonly put?: never;
         readonly post?: never;
@@ -147,7 +147,7 @@ export interface paths {
             readonly path?: never;
             readonly cookie?: never;
         };
-        /** Everything about one impulse response */
+        /** Everything about one impulse response. As an Arrow stream its samples: `time_ms`, `measured`, `reflected`, `flat_reflected` */
         readonly get: operations["pair"];
         readonly put?: never;
         readonly post?: never;
@@ -395,6 +395,23 @@ export interface paths {
         readonly patch?: never;
         readonly trace?: never;
     };
+    readonly "/api/v1/openapi.json": {
+        readonly parameters: {
+            readonly query?: never;
+            readonly header?: never;
+            readonly path?: never;
+            readonly cookie?: never;
+        };
+        /** This document */
+        readonly get: operations["openapi"];
+        readonly put?: never;
+        readonly post?: never;
+        readonly delete?: never;
+        readonly options?: never;
+        readonly head?: never;
+        readonly patch?: never;
+        readonly trace?: never;
+    };
 }
 export type webhooks = Record<string, never>;
 export interface components {
@@ -405,7 +422,7 @@ export interface components {
             readonly title: string;
             readonly status: number;
             /** @enum {string} */
-            readonly code: "query_invalid" | "read_only" | "query_failed" | "format_impossible" | "lake_unreadable" | "request_invalid" | "unsupported" | "not_found" | "no_data" | "request_too_large" | "unauthenticated" | "forbidden" | "foreign_origin" | "cancelled" | "time_limit" | "too_many" | "internal";
+            readonly code: "query_invalid" | "read_only" | "query_failed" | "format_impossible" | "lake_unreadable" | "request_invalid" | "unsupported" | "not_found" | "no_data" | "method_not_allowed" | "range_not_satisfiable" | "request_too_large" | "unauthenticated" | "forbidden" | "foreign_origin" | "cancelled" | "time_limit" | "memory_limit" | "row_limit" | "too_many" | "internal";
             /** @description What is wrong; what to do follows after `; hint: ` */
             readonly detail?: string;
             readonly instance?: string;
@@ -661,7 +678,7 @@ export interface components {
             /** @description Share of the variance by component */
             readonly explained: readonly number[];
             readonly points: readonly components["schemas"]["MapPoint"][];
-            /** @description Surfaces without TNCE */
+            /** @description Surfaces without TNCE, and those beyond the first 2000 */
             readonly left_out: readonly string[];
         };
         readonly Correlation: {
@@ -943,6 +960,7 @@ export interface operations {
                 };
                 content: {
                     readonly "application/json": components["schemas"]["CurveSet"];
+                    readonly "application/vnd.apache.arrow.stream": string;
                 };
             };
             /** @description Not changed since the ETag of If-None-Match */
@@ -1068,6 +1086,7 @@ export interface operations {
                 };
                 content: {
                     readonly "application/json": components["schemas"]["PairDetail"];
+                    readonly "application/vnd.apache.arrow.stream": string;
                 };
             };
             /** @description Not changed since the ETag of If-None-Match */
@@ -1441,7 +1460,9 @@ export interface operations {
     readonly table_file: {
         readonly parameters: {
             readonly query?: never;
-            readonly header?: never;
+            readonly header?: {
+                readonly Range?: string;
+            };
             readonly path: {
                 readonly table: string;
                 readonly file: string;
@@ -1460,6 +1481,15 @@ export interface operations {
                     readonly "application/vnd.apache.parquet": string;
                 };
             };
+            /** @description The range */
+            readonly 206: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "application/vnd.apache.parquet": string;
+                };
+            };
             /** @description Not changed since the ETag of If-None-Match */
             readonly 304: {
                 headers: {
@@ -1467,6 +1497,7 @@ export interface operations {
                 };
                 content?: never;
             };
+            readonly 416: components["responses"]["Problem"];
             readonly default: components["responses"]["Problem"];
         };
     };
@@ -1510,6 +1541,29 @@ export interface operations {
                 };
                 content: {
                     readonly "text/plain": string;
+                };
+            };
+            readonly default: components["responses"]["Problem"];
+        };
+    };
+    readonly openapi: {
+        readonly parameters: {
+            readonly query?: never;
+            readonly header?: never;
+            readonly path?: never;
+            readonly cookie?: never;
+        };
+        readonly requestBody?: never;
+        readonly responses: {
+            /** @description OK */
+            readonly 200: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "application/json": {
+                        readonly [key: string]: unknown;
+                    };
                 };
             };
             readonly default: components["responses"]["Problem"];

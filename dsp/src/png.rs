@@ -7,8 +7,13 @@ const FORMAT: [u8; 5] = [8, 0, 0, 0, 0];
 const FILTER_UP: u8 = 2;
 const COMPRESSION: u8 = 6;
 
-/// A picture of rows of `width` pixels, from the top.
-pub(super) fn grey(pixels: &[u8], width: usize) -> Vec<u8> {
+/// A picture as a file.
+///
+/// pixels  `[height x width]`, rows from the top, 0 black
+///
+/// # Panics
+/// Where `width` is 0.
+pub fn grey(pixels: &[u8], width: usize) -> Vec<u8> {
     let mut rows = Vec::with_capacity(pixels.len() + pixels.len() / width);
     let mut above = vec![0; width];
     for row in pixels.chunks_exact(width) {

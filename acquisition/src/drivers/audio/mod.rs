@@ -1,0 +1,173 @@
+//! What every audio interface needs above its system's calls: takes that begin with the output to the sample, gaps
+//! that are noticed, takes that are repeated. [`Duplex`] is what a system provides.
+
+mod delay;
+#[cfg(test)]
+mod tests;
+
+use echolake_schema::Timestamp;
+
+use crate::rig::{AudioInterface, Error, Take};
+use delay::{Delay, locate};
+
+pub(crate) const DEVICE: &str = "audio interface";
+/// Least likeness of loopback and output, -1 to 1: below it the loopback is something else.
+const LIKENESS: f64 = 0.5;
+/// An output below this has no start that could be found, rms re full scale.
+const SILENCE: f64 = 1e-5;
+/// Parts of an output shorter than this are not looked for by themselves.
+const SHORTEST_PART: usize = 512;
+
+/// Plays and records at the same time; the start of one against the other is not known.
+pub trait Duplex: Send {
+    /// Sampling rate, Hz.
+    fn rate_hz(&self) -> f64;
+
+    /// Plays `output` (1.0 is full scale), then silence, and records `frames` frames, which begin no later than the
+    /// output. Returns when the first frame was taken.
+    ///
+    /// # Errors
+    /// [`Trouble`].
+    fn transfer(&mut self, output: &[f32], frames: usize, recorded: &mut Recorded) -> Result<Timestamp, Trouble>;
+}
+
+/// Two channels, signed 24 bits.
+#[derive(Debug, Clone, Default)]
+pub struct Recorded {
+    /// The microphone.
+    pub microphone: Vec<i32>,
+    /// The output, looped back.
+    pub loopback: Vec<i32>,
+}
+
+/// Why nothing whole was recorded.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Trouble {
+    /// The computer was too late to fetch or to bring samples; another try may do.
+    Late(String),
+    /// The device is gone or refuses.
+    Gone(String),
+}
+
+/// An audio interface whose takes begin with the output.
+pub struct Aligned<D> {
+    duplex: D,
+    latency_secs: f64,
+    repeats: u32,
+    recorded: Recorded,
+    /// The last delay that was found, for outputs that are silent.
+    delay: usize,
+    last: Timestamp,
+    notices: Vec<String>,
+}
+
+impl<D: Duplex> Aligned<D> {
+    /// Over a duplex that records at most `latency_secs` late; takes with a gap are repeated `repeats` times.
+    pub fn new(duplex: D, latency_secs: f64, repeats: u32) -> Self {
+        let (recorded, last) = (Recorded::default(), Timestamp(i64::MIN));
+        Self { duplex, latency_secs, repeats, recorded, delay: 0, last, notices: Vec::new() }
+    }
+
+    // One try: the delay, and when the first sample of the take was taken.
+    fn attempt(&mut self, output: &[f32]) -> Result<(usize, Timestamp), Failure> {
+        let rate_hz = self.duplex.rate_hz();
+        let latency = (self.latency_secs * rate_hz).ceil() as usize;
+        let frames = output.len() + latency;
+        let began = self.duplex.transfer(output, frames, &mut self.recorded).map_err(|trouble| match trouble {
+            Trouble::Late(why) => Failure::Again(why),
+            Trouble::Gone(why) => Failure::Final(why),
+        })?;
+        let counts = [self.recorded.microphone.len(), self.recorded.loopback.len()];
+        if counts != [frames; 2] {
+            return Err(Failure::Again(format!("{counts:?} frames came, expected {frames}")));
+        }
+        let delay = self.delay_of(output)?;
+        Ok((delay, began.plus_secs(delay as f64 / rate_hz)))
+    }
+
+    fn delay_of(&self, output: &[f32]) -> Result<usize, Failure> {
+        if rms(output) < SILENCE {
+            return Ok(self.delay);
+        }
+        let found = locate(output, &self.recorded.loopback);
+        if found.likeness < LIKENESS {
+            return Err(Failure::Final(self.no_loopback(&found)));
+        }
+        // A gap moves what comes behind it, and no counter need have noticed.
+        let part = output.len() / 3;
+        if part >= SHORTEST_PART {
+            let ends = [0, output.len() - part].map(|from| {
+                let window = from..(from + part + self.recorded.loopback.len() - output.len());
+                locate(&output[from..from + part], &self.recorded.loopback[window]).at
+            });
+            if ends[0] != ends[1] {
+                let why = format!("{} samples went missing or came twice", ends[1].abs_diff(ends[0]));
+                return Err(Failure::Again(why));
+            }
+        }
+        Ok(found.at)
+    }
+
+    fn no_loopback(&self, found: &Delay) -> String {
+        let level = 20.0 * rms_24(&self.recorded.loopback).max(1e-9).log10();
+        let likeness = found.likeness;
+        format!(
+            "the loopback does not carry the output (level {level:.0} dBFS, likeness {likeness:.2}); hint: is its cable \
+             plugged in, from the output that the rig file names to the input that it names?"
+        )
+    }
+}
+
+/// Whether another try may do.
+enum Failure {
+    Again(String),
+    Final(String),
+}
+
+impl<D: Duplex> AudioInterface for Aligned<D> {
+    fn rate_hz(&self) -> f64 {
+        self.duplex.rate_hz()
+    }
+
+    fn play_and_record(&mut self, output: &[f32], take: &mut Take) -> Result<(), Error> {
+        let failed = |reason| Err(Error::Device { device: DEVICE, reason });
+        for attempt in 0..=self.repeats {
+            match self.attempt(output) {
+                Ok((delay, began)) => {
+                    self.delay = delay;
+                    self.last = Timestamp(began.0.max(self.last.0.saturating_add(1)));
+                    take.started = Some(self.last);
+                    let cut = |from: &[i32], to: &mut Vec<i32>| {
+                        to.clear();
+                        to.extend_from_slice(&from[delay..delay + output.len()]);
+                    };
+                    cut(&self.recorded.microphone, &mut take.microphone);
+                    cut(&self.recorded.loopback, &mut take.loopback);
+                    return Ok(());
+                }
+                Err(Failure::Again(why)) if attempt < self.repeats => {
+                    self.notices.push(format!("take repeated: {why}"));
+                }
+                Err(Failure::Again(why)) => {
+                    let tries = self.repeats + 1;
+                    let hint = "a larger `period_frames`, fewer other programs, another USB port";
+                    return failed(format!("{tries} takes in a row have gaps, the last: {why}; hint: {hint}"));
+                }
+                Err(Failure::Final(why)) => return failed(why),
+            }
+        }
+        failed("no take was tried".into())
+    }
+
+    fn notices(&mut self) -> Vec<String> {
+        std::mem::take(&mut self.notices)
+    }
+}
+
+fn rms(x: &[f32]) -> f64 {
+    (x.iter().map(|x| f64::from(*x).powi(2)).sum::<f64>() / x.len().max(1) as f64).sqrt()
+}
+
+fn rms_24(x: &[i32]) -> f64 {
+    (x.iter().map(|x| (f64::from(*x) / 8_388_608.0).powi(2)).sum::<f64>() / x.len().max(1) as f64).sqrt()
+}

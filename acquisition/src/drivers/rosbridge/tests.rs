@@ -1,0 +1,91 @@
+//! The driver against the fake bridge, well and with everything that can go wrong.
+
+use echolake_schema::Rig;
+
+use super::fake::{FakeBridge, Fault};
+use super::*;
+use crate::conformance;
+
+const NEAR: [[f64; 3]; 2] = [[-62.5, 62.5, 124.0], [62.5, -62.5, 214.0]];
+
+fn bridge() -> FakeBridge {
+    FakeBridge::start("127.0.0.1:0").expect("a bridge")
+}
+
+fn connected(bridge: &FakeBridge) -> RosbridgeRobots {
+    let params = RosbridgeParams { url: bridge.url(), speed: 1.0, timeout_secs: 1.0, ..RosbridgeParams::default() };
+    RosbridgeRobots::connect(&params, Cell::of(&Rig::paper())).expect("connected")
+}
+
+#[test]
+fn it_conforms() {
+    let bridge = bridge();
+    let mut robots = connected(&bridge);
+    conformance::robots(&mut robots, NEAR, [NEAR[0], [0.0, 0.0, 5_000.0]]);
+    conformance::robots(&mut robots, NEAR, [NEAR[0], NEAR[0]]);
+    assert!(bridge.has_power());
+    robots.power(Power::Off).expect("a switch");
+    assert!(!bridge.has_power());
+}
+
+#[test]
+fn joints_are_those_that_the_arms_told() {
+    let bridge = bridge();
+    let mut robots = connected(&bridge);
+    robots.power(Power::On).expect("a switch");
+    let reached = robots.move_to(NEAR[0], NEAR[1]).expect("reached");
+    let joints = reached.joints.expect("joints");
+    let wanted = Cell::of(&Rig::paper()).reach(NEAR[0], NEAR[1]).expect("within reach");
+    for (is, wanted) in joints.iter().flatten().zip(wanted.microphone.iter().chain(&wanted.speaker)) {
+        assert!((is - wanted).abs().to_degrees() < 0.02, "{is} {wanted}");
+    }
+}
+
+#[test]
+fn faults_are_named() {
+    let check = |fault, expected: &str| {
+        let bridge = bridge();
+        let mut robots = connected(&bridge);
+        robots.power(Power::On).expect("a switch");
+        bridge.set_fault(fault);
+        let error = robots.move_to(NEAR[0], NEAR[1]).expect_err(expected).to_string();
+        assert!(error.starts_with("robots: ") && error.contains(expected), "{fault:?}: {error}");
+        // Back to normal, the next try does; after a lost connection the motors have to be switched on again.
+        bridge.set_fault(Fault::None);
+        robots.power(Power::On).expect("a switch");
+        robots.move_to(NEAR[0], NEAR[1]).unwrap_or_else(|e| panic!("{fault:?}: {e}"));
+    };
+    check(Fault::Refuses, "the bridge refuses the target: the target is outside of the joints' ranges");
+    check(Fault::StopsHalfWay, "degrees off; hint: are the motors on");
+    check(Fault::EmergencyStop, "refuses to move: emergency stop");
+    check(Fault::Silent, "no joint states on `/microphone/joint_states`");
+    check(Fault::HangsUp, "is the controller still on");
+    check(Fault::Nonsense, "no joint states on");
+}
+
+#[test]
+fn motors_that_stay_off_are_named() {
+    let bridge = bridge();
+    let mut robots = connected(&bridge);
+    bridge.set_fault(Fault::NoPower);
+    let error = robots.power(Power::On).expect_err("refused").to_string();
+    assert!(error.contains("`/microphone/robot_enable` refuses: the safety chain is open"), "{error}");
+    let error = robots.move_to(NEAR[0], NEAR[1]).expect_err("no power").to_string();
+    assert!(error.contains("the drives are off"), "{error}");
+}
+
+#[test]
+fn nonsense_is_told_of() {
+    let bridge = bridge();
+    let mut robots = connected(&bridge);
+    bridge.set_fault(Fault::Nonsense);
+    let _ = robots.current();
+    assert!(robots.notices().iter().any(|n| n.contains("no JSON")));
+}
+
+#[test]
+fn a_bridge_that_is_not_there_is_named() {
+    let params = RosbridgeParams { url: "ws://127.0.0.1:1".into(), ..RosbridgeParams::default() };
+    let error = RosbridgeRobots::connect(&params, Cell::of(&Rig::paper())).err().expect("nobody").to_string();
+    assert!(error.contains("cannot reach `ws://127.0.0.1:1`") && error.contains("is rosbridge running"), "{error}");
+}

@@ -1,0 +1,187 @@
+//! The ambient sensor on a serial line. It sends lines by itself; [`line`] says what stands in them.
+
+pub mod line;
+#[cfg(test)]
+mod tests;
+
+use std::time::{Duration, Instant};
+
+use echolake_schema::Timestamp;
+use echolake_schema::devices::SerialParams;
+use serial2::SerialPort;
+
+use crate::rig::{AmbientSensor, Error, Reading};
+use line::Line;
+
+const DEVICE: &str = "ambient sensor";
+/// One wait for bytes; what comes without a pause of this length is taken together.
+const PAUSE: Duration = Duration::from_millis(30);
+/// Between two tries to open a lost line.
+const RETRY: Duration = Duration::from_millis(100);
+/// A line without an end is not kept beyond this.
+const LONGEST_LINE: usize = 1024;
+
+/// A sensor on a serial line.
+pub struct SerialSensor {
+    params: SerialParams,
+    port: Option<SerialPort>,
+    /// What came since the last end of a line.
+    bytes: Vec<u8>,
+    /// Whether a line's end was seen since the line was opened: what stands before the first one was cut off.
+    in_step: bool,
+    last: Timestamp,
+    notices: Vec<String>,
+}
+
+/// What was taken in while one reading was waited for.
+#[derive(Default)]
+struct Taken {
+    line: Option<Line>,
+    loudest_db: f64,
+    nonsense: usize,
+    last_nonsense: String,
+}
+
+impl SerialSensor {
+    /// Opens the line.
+    ///
+    /// # Errors
+    /// [`Error::Device`] where that fails.
+    pub fn open(params: &SerialParams) -> Result<Self, Error> {
+        let mut sensor = Self {
+            params: params.clone(),
+            port: None,
+            bytes: Vec::new(),
+            in_step: false,
+            last: Timestamp(i64::MIN),
+            notices: Vec::new(),
+        };
+        sensor.connect().map_err(|reason| Error::Device { device: DEVICE, reason })?;
+        Ok(sensor)
+    }
+
+    fn connect(&mut self) -> Result<(), String> {
+        let path = &self.params.path;
+        let opened = SerialPort::open(path, self.params.baud).and_then(|mut port| {
+            port.set_read_timeout(PAUSE)?;
+            Ok(port)
+        });
+        let hint = "is the sensor plugged in, and may this user open it?";
+        self.port = Some(opened.map_err(|e| format!("cannot open `{path}`: {e}; hint: {hint}"))?);
+        self.bytes.clear();
+        self.in_step = false;
+        Ok(())
+    }
+
+    // What is there already, or comes until a pause. An error means that the line is gone.
+    fn take(&mut self, taken: &mut Taken) -> std::io::Result<()> {
+        let mut buffer = [0; 512];
+        loop {
+            let Some(port) = &self.port else { return Ok(()) };
+            match port.read(&mut buffer) {
+                Ok(0) => return Err(std::io::ErrorKind::UnexpectedEof.into()),
+                Ok(count) => self.split(&buffer[..count], taken),
+                Err(e) if e.kind() == std::io::ErrorKind::TimedOut => return Ok(()),
+                Err(e) if e.kind() == std::io::ErrorKind::Interrupted => {}
+                Err(e) => return Err(e),
+            }
+        }
+    }
+
+    fn split(&mut self, bytes: &[u8], taken: &mut Taken) {
+        for byte in bytes {
+            match byte {
+                b'\n' => {
+                    if self.in_step {
+                        taken.line(&String::from_utf8_lossy(&self.bytes));
+                    }
+                    self.bytes.clear();
+                    self.in_step = true;
+                }
+                byte if self.bytes.len() < LONGEST_LINE => self.bytes.push(*byte),
+                // At the wrong speed there may never be an end.
+                _ => {
+                    taken.nonsense(&String::from_utf8_lossy(&self.bytes), "it has no end");
+                    self.bytes.clear();
+                }
+            }
+        }
+    }
+
+    fn silent(&self, taken: &Taken, lost: Option<String>) -> Error {
+        let secs = self.params.timeout_secs;
+        let path = &self.params.path;
+        let reason = match (lost, taken.nonsense) {
+            (Some(lost), _) => format!("lost `{path}`: {lost}; hint: is the sensor still plugged in?"),
+            (None, 0) => format!("no line on `{path}` for {secs} s; hint: is the sensor powered?"),
+            (None, count) => format!(
+                "nothing but nonsense on `{path}` for {secs} s, {count} lines, the last {}; hint: is {} baud right?",
+                taken.last_nonsense, self.params.baud
+            ),
+        };
+        Error::Device { device: DEVICE, reason }
+    }
+}
+
+impl Taken {
+    fn line(&mut self, text: &str) {
+        match Line::parse(text) {
+            Ok(Some(line)) => {
+                self.loudest_db = self.loudest_db.max(line.level_db);
+                self.line = Some(line);
+            }
+            Ok(None) => {}
+            Err(why) => self.nonsense(text, &why),
+        }
+    }
+
+    fn nonsense(&mut self, text: &str, why: &str) {
+        self.nonsense += 1;
+        let text: String = text.chars().take(40).collect();
+        self.last_nonsense = format!("{text:?}: {why}");
+    }
+}
+
+impl AmbientSensor for SerialSensor {
+    fn read(&mut self) -> Result<Reading, Error> {
+        let end = Instant::now() + Duration::from_secs_f64(self.params.timeout_secs);
+        let (mut taken, mut lost) = (Taken::default(), None);
+        loop {
+            if self.port.is_none() {
+                match self.connect() {
+                    Ok(()) => self.notices.push(format!("`{}` is open again", self.params.path)),
+                    Err(why) => lost = Some(why),
+                }
+            }
+            if let Err(e) = self.take(&mut taken) {
+                self.notices.push(format!("lost `{}`: {e}", self.params.path));
+                lost = Some(e.to_string());
+                self.port = None;
+            }
+            if let Some(line) = taken.line {
+                if taken.nonsense > 0 {
+                    let (count, last) = (taken.nonsense, &taken.last_nonsense);
+                    self.notices.push(format!("{count} lines of nonsense, the last {last}"));
+                }
+                self.last = Timestamp(Timestamp::now().0.max(self.last.0));
+                return Ok(Reading {
+                    at: self.last,
+                    temperature_c: line.temperature_c,
+                    humidity_pct: line.humidity_pct,
+                    pressure_hpa: line.pressure_hpa,
+                    outside_level_db: taken.loudest_db,
+                });
+            }
+            if Instant::now() >= end {
+                return Err(self.silent(&taken, lost.filter(|_| self.port.is_none())));
+            }
+            if self.port.is_none() {
+                std::thread::sleep(RETRY);
+            }
+        }
+    }
+
+    fn notices(&mut self) -> Vec<String> {
+        std::mem::take(&mut self.notices)
+    }
+}

@@ -1,0 +1,322 @@
+//! Both arms over the panel: how they stand at a pair of positions, or why they cannot.
+
+use std::f64::consts::{PI, TAU};
+
+use echolake_schema::Rig;
+use echolake_schema::robots::{RobotCell, Rod};
+use rs_opw_kinematics::glam::{DQuat, DVec3};
+use rs_opw_kinematics::kinematic_traits::Pose;
+
+use super::arm::{Arm, Capsule, Joints, Part, Tool, from_home, home, in_range};
+use super::clearance::{Surroundings, touches_itself, touching};
+
+/// Inclinations of the microphone's rod that are tried, degrees from the vertical: its wrist then stays on its own
+/// side, and the speaker has room above the microphone.
+const TILTS_DEG: [f64; 5] = [45.0, 30.0, 60.0, 15.0, 75.0];
+const UPRIGHT_DEG: [f64; 1] = [0.0];
+/// Directions that the rod leans to, degrees from straight away from its arm.
+const TURNS_DEG: [f64; 7] = [0.0, -25.0, 25.0, -50.0, 50.0, -80.0, 80.0];
+/// Turns about the speaker's axis that are tried: the 45 degree mount may come from any side.
+const ROLLS: usize = 24;
+/// Standings of one arm that are tried against those of the other.
+const KEPT: usize = 48;
+
+/// Where the speaker looks.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Aim {
+    /// At the point of the panel where a mirror would reflect to the microphone.
+    Specular,
+    /// Half-way between that point and the one straight below.
+    Steeper,
+    /// Straight down.
+    Down,
+}
+
+impl Aim {
+    const ALL: [Self; 3] = [Self::Specular, Self::Steeper, Self::Down];
+
+    // The axis from `speaker` for a microphone at `microphone`, both in m over the mirror plane z = 0.
+    fn axis(self, microphone: DVec3, speaker: DVec3) -> DVec3 {
+        let share = speaker.z / (speaker.z + microphone.z);
+        let specular = speaker + (microphone - speaker) * share;
+        let foot = DVec3::new(speaker.x, speaker.y, 0.0);
+        let target = foot + (DVec3::new(specular.x, specular.y, 0.0) - foot) * self.towards();
+        (target - speaker).normalize()
+    }
+
+    fn towards(self) -> f64 {
+        match self {
+            Self::Specular => 1.0,
+            Self::Steeper => 0.5,
+            Self::Down => 0.0,
+        }
+    }
+}
+
+/// How both arms stand at a pair.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Standing {
+    /// Joints of the microphone's arm.
+    pub microphone: Joints,
+    /// Joints of the speaker's arm.
+    pub speaker: Joints,
+    /// Where the speaker looks.
+    pub aim: Aim,
+}
+
+impl Standing {
+    /// Both arms at home.
+    pub fn home() -> Self {
+        Self { microphone: home(), speaker: home(), aim: Aim::Down }
+    }
+}
+
+/// Why a pair cannot be reached.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, thiserror::Error)]
+pub enum Unreachable {
+    /// A position is not finite.
+    #[error("a position is not a number")]
+    NoPosition,
+    /// The wrist would have to be farther, or nearer, than the arm goes.
+    #[error("{} arm: out of reach", .0.name())]
+    OutOfReach(Tool),
+    /// Only with joints beyond their ranges.
+    #[error("{} arm: joints beyond their ranges", .0.name())]
+    Joints(Tool),
+    /// Only with the arm in the table, the panel or itself.
+    #[error("{} arm: would touch the panel, the table or itself", .0.name())]
+    Touches(Tool),
+    /// Both arms get there, but not at the same time.
+    #[error("the arms would touch: {0:?} of the microphone's and {1:?} of the speaker's")]
+    ArmsTouch(Part, Part),
+}
+
+impl Unreachable {
+    /// In words that last: what [`crate::rig::Error::Unreachable`] takes.
+    pub fn reason(&self) -> &'static str {
+        match self {
+            Self::NoPosition => "a position is not a number",
+            Self::OutOfReach(Tool::Microphone) => "the microphone's arm does not reach that far",
+            Self::OutOfReach(Tool::Speaker) => "the speaker's arm does not reach that far",
+            Self::Joints(Tool::Microphone) => "joints of the microphone's arm would leave their ranges",
+            Self::Joints(Tool::Speaker) => "joints of the speaker's arm would leave their ranges",
+            Self::Touches(Tool::Microphone) => "the microphone's arm would touch panel, table or itself",
+            Self::Touches(Tool::Speaker) => "the speaker's arm would touch panel, table or itself",
+            Self::ArmsTouch(..) => "the arms would touch",
+        }
+    }
+}
+
+/// Both arms and what is around them.
+pub struct Cell {
+    microphone: Arm,
+    speaker: Arm,
+    rod: Rod,
+    around: Surroundings,
+}
+
+/// One way for an arm to stand, with what it occupies.
+#[derive(Clone)]
+struct Way {
+    joints: Joints,
+    capsules: [Capsule; 6],
+    cost: f64,
+}
+
+/// Ways of an arm to stand somewhere, or the farthest that it got.
+#[derive(Clone)]
+pub struct Ways(Result<Vec<Way>, Unreachable>);
+
+impl Cell {
+    /// The arms over a panel with sides of `panel_mm`.
+    pub fn new(place: &RobotCell, panel_mm: f64) -> Self {
+        let metres = |mm: [f64; 3]| mm.map(|x| x / 1e3);
+        // Each faces the panel.
+        let heading = |foot: [f64; 3]| (-foot[1]).atan2(-foot[0]);
+        let arm = |tool, foot| Arm::new(tool, metres(foot), heading(foot));
+        Self {
+            microphone: arm(Tool::Microphone, place.microphone_foot_mm),
+            speaker: arm(Tool::Speaker, place.speaker_foot_mm),
+            rod: place.rod,
+            around: Surroundings {
+                half_m: panel_mm / 2e3,
+                relief_m: place.relief_mm / 1e3,
+                table_m: place.table_mm / 1e3,
+                margin_m: place.margin_mm / 1e3,
+            },
+        }
+    }
+
+    /// A rig's arms.
+    pub fn of(rig: &Rig) -> Self {
+        Self::new(&rig.robots, rig.panel.size_mm)
+    }
+
+    /// What is around the arms.
+    pub fn around(&self) -> &Surroundings {
+        &self.around
+    }
+
+    /// The arm that carries a tool.
+    pub fn arm(&self, tool: Tool) -> &Arm {
+        match tool {
+            Tool::Microphone => &self.microphone,
+            Tool::Speaker => &self.speaker,
+        }
+    }
+
+    /// Where microphone and speaker are for given joints, mm.
+    pub fn positions_mm(&self, microphone: &Joints, speaker: &Joints) -> [[f64; 3]; 2] {
+        [self.microphone.frames(microphone), self.speaker.frames(speaker)]
+            .map(|frames| (frames[7].translation * 1e3).to_array())
+    }
+
+    /// How the arms stand with the tools there.
+    ///
+    /// # Errors
+    /// [`Unreachable`], naming what stands in the way.
+    pub fn reach(&self, microphone_mm: [f64; 3], speaker_mm: [f64; 3]) -> Result<Standing, Unreachable> {
+        self.reach_with(&self.microphone_ways(microphone_mm), microphone_mm, speaker_mm)
+    }
+
+    /// As [`Self::reach`], with the microphone's ways found before: they do not depend on the speaker.
+    ///
+    /// # Errors
+    /// [`Unreachable`].
+    pub fn reach_with(
+        &self,
+        ways: &Ways,
+        microphone_mm: [f64; 3],
+        speaker_mm: [f64; 3],
+    ) -> Result<Standing, Unreachable> {
+        if !microphone_mm.iter().chain(&speaker_mm).all(|x| x.is_finite()) {
+            return Err(Unreachable::NoPosition);
+        }
+        let microphones = ways.0.as_ref().map_err(|e| *e)?;
+        let mut failure = None;
+        for aim in Aim::ALL {
+            match self.speaker_ways(microphone_mm, speaker_mm, aim).0 {
+                Err(e) => failure = failure.max(Some(e)),
+                Ok(speakers) => match self.together(microphones, &speakers) {
+                    Ok([microphone, speaker]) => return Ok(Standing { microphone, speaker, aim }),
+                    Err(e) => failure = failure.max(Some(e)),
+                },
+            }
+        }
+        Err(failure.unwrap_or(Unreachable::NoPosition))
+    }
+
+    /// Ways of the microphone's arm to a position.
+    pub fn microphone_ways(&self, position_mm: [f64; 3]) -> Ways {
+        if !position_mm.iter().all(|x| x.is_finite()) {
+            return Ways(Err(Unreachable::NoPosition));
+        }
+        let position = DVec3::from_array(position_mm) / 1e3;
+        let away = self.microphone.foot().transform_vector(DVec3::X);
+        let heading = away.y.atan2(away.x);
+        let tilts: &[f64] = match self.rod {
+            Rod::Leaning => &TILTS_DEG,
+            Rod::Upright => &UPRIGHT_DEG,
+        };
+        let poses = tilts.iter().flat_map(|tilt| TURNS_DEG.map(|turn| (tilt.to_radians(), turn.to_radians())));
+        let pose = |(tilt, turn): (f64, f64)| {
+            let turn = DQuat::from_rotation_z(heading + turn) * DQuat::from_rotation_y(PI - tilt);
+            Pose::from_parts(position, turn)
+        };
+        self.ways(&self.microphone, poses.map(pose))
+    }
+
+    fn speaker_ways(&self, microphone_mm: [f64; 3], speaker_mm: [f64; 3], aim: Aim) -> Ways {
+        let [microphone, speaker] = [microphone_mm, speaker_mm].map(|mm| DVec3::from_array(mm) / 1e3);
+        if speaker.z <= 0.0 || microphone.z <= 0.0 {
+            return Ways(Err(Unreachable::Touches(Tool::Speaker)));
+        }
+        let aimed = DQuat::from_rotation_arc(DVec3::Z, aim.axis(microphone, speaker));
+        let roll = |i: usize| aimed * DQuat::from_rotation_z(i as f64 * TAU / ROLLS as f64);
+        self.ways(&self.speaker, (0..ROLLS).map(|i| Pose::from_parts(speaker, roll(i))))
+    }
+
+    fn ways(&self, arm: &Arm, poses: impl Iterator<Item = Pose>) -> Ways {
+        let mut failure = Unreachable::OutOfReach(arm.tool());
+        let mut ways = Vec::new();
+        for joints in poses.flat_map(|pose| arm.solve(pose)) {
+            if !in_range(&joints) {
+                failure = failure.max(Unreachable::Joints(arm.tool()));
+                continue;
+            }
+            let capsules = arm.capsules(&joints);
+            if !self.around.is_clear(&capsules) || touches_itself(&capsules, self.around.margin_m) {
+                failure = failure.max(Unreachable::Touches(arm.tool()));
+                continue;
+            }
+            ways.push(Way { joints, capsules, cost: from_home(&joints) });
+        }
+        ways.sort_by(|a, b| a.cost.total_cmp(&b.cost));
+        ways.truncate(KEPT);
+        Ways(if ways.is_empty() { Err(failure) } else { Ok(ways) })
+    }
+
+    // The ways that are nearest to home together, of those in which the arms keep clear of each other.
+    fn together(&self, microphones: &[Way], speakers: &[Way]) -> Result<[Joints; 2], Unreachable> {
+        let mut best: Option<(f64, [Joints; 2])> = None;
+        let mut touch = None;
+        for a in microphones {
+            for b in speakers {
+                let cost = a.cost + b.cost;
+                if best.as_ref().is_some_and(|(least, _)| cost >= *least) {
+                    break;
+                }
+                match touching(&a.capsules, &b.capsules, self.around.margin_m) {
+                    None => best = Some((cost, [a.joints, b.joints])),
+                    Some((a, b)) => touch = touch.or(Some(Unreachable::ArmsTouch(a, b))),
+                }
+            }
+        }
+        best.map(|(_, joints)| joints).ok_or(touch.unwrap_or(Unreachable::NoPosition))
+    }
+
+    /// Whether both arms keep clear of each other and of what is around them.
+    pub fn is_clear(&self, microphone: &Joints, speaker: &Joints) -> bool {
+        let [a, b] = [self.microphone.capsules(microphone), self.speaker.capsules(speaker)];
+        let alone = |arm| self.around.is_clear(arm) && !touches_itself(arm, self.around.margin_m);
+        alone(&a) && alone(&b) && touching(&a, &b, self.around.margin_m).is_none()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn cell() -> Cell {
+        Cell::of(&Rig::paper())
+    }
+
+    #[test]
+    fn the_tools_are_where_they_were_told_to_be_and_the_speaker_aims() {
+        let (cell, microphone, speaker) = (cell(), [-37.5, 112.5, 124.0], [93.75, -93.75, 214.0]);
+        let stand = cell.reach(microphone, speaker).expect("within reach");
+        for (wanted, reached) in [microphone, speaker].iter().zip(cell.positions_mm(&stand.microphone, &stand.speaker))
+        {
+            assert!(wanted.iter().zip(reached).all(|(a, b)| (a - b).abs() < 1e-6), "{reached:?}");
+        }
+        assert_eq!(stand.aim, Aim::Specular);
+        // A ray along the axis, mirrored by the plane z = 0, meets the microphone.
+        let frame = cell.arm(Tool::Speaker).frames(&stand.speaker)[7];
+        let axis = frame.transform_vector(DVec3::Z);
+        let to_image = (DVec3::new(-0.0375, 0.1125, -0.124) - frame.translation).normalize();
+        assert!(axis.angle_between(to_image) < 1e-7);
+        assert!(cell.is_clear(&stand.microphone, &stand.speaker));
+    }
+
+    #[test]
+    fn what_cannot_be_reached_has_a_reason() {
+        let cell = cell();
+        let near = [-187.5, -187.5, 124.0];
+        let reason = |microphone, speaker| cell.reach(microphone, speaker).expect_err("out of reach");
+        assert_eq!(reason(near, [0.0, 0.0, 5_000.0]), Unreachable::OutOfReach(Tool::Speaker));
+        assert_eq!(reason([0.0, 2_000.0, 124.0], near), Unreachable::OutOfReach(Tool::Microphone));
+        assert_eq!(reason([f64::NAN, 0.0, 124.0], near), Unreachable::NoPosition);
+        assert_eq!(reason([0.0, 0.0, 10.0], near), Unreachable::Touches(Tool::Microphone));
+        assert!(matches!(reason(near, near), Unreachable::ArmsTouch(Part::Transducer, Part::Transducer)));
+    }
+}

@@ -1,0 +1,115 @@
+//! From one standing to the next without touching anything: at once, one arm after the other, or drawn back meanwhile.
+
+use super::arm::{Joints, SPEEDS_DEG, travel_secs};
+use super::cell::{Cell, Standing};
+
+/// Joints turn by at most this much between two looks, degrees: 850 mm of arm move 15 mm.
+const STEP_DEG: f64 = 1.0;
+/// Shoulder and elbow of an arm that is drawn back, degrees.
+const BACK_DEG: [f64; 2] = [-70.0, 130.0];
+
+/// How both arms get from one standing to another.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Course {
+    /// Both at once.
+    Together,
+    /// The microphone's arm, then the speaker's.
+    MicrophoneFirst,
+    /// The speaker's arm, then the microphone's.
+    SpeakerFirst,
+    /// The speaker's arm draws back, the microphone's moves, the speaker's comes out again.
+    SpeakerDrawnBack,
+    /// The microphone's arm draws back, the speaker's moves, the microphone's comes out again.
+    MicrophoneDrawnBack,
+    /// Both draw back, the speaker's first, and come out, the speaker's last.
+    SpeakerLast,
+    /// Both draw back, the microphone's first, and come out, the microphone's last.
+    MicrophoneLast,
+}
+
+impl Course {
+    /// All of them.
+    pub const ALL: [Self; 7] = [
+        Self::Together,
+        Self::MicrophoneFirst,
+        Self::SpeakerFirst,
+        Self::SpeakerDrawnBack,
+        Self::MicrophoneDrawnBack,
+        Self::SpeakerLast,
+        Self::MicrophoneLast,
+    ];
+
+    // The standings on the way, the last included.
+    fn by(self, from: &Pose, to: &Pose) -> Vec<Pose> {
+        let ([m0, s0], [m1, s1]) = (*from, *to);
+        let [mb0, sb0, mb1, sb1] = [m0, s0, m1, s1].map(drawn_back);
+        match self {
+            Self::Together => vec![*to],
+            Self::MicrophoneFirst => vec![[m1, s0], *to],
+            Self::SpeakerFirst => vec![[m0, s1], *to],
+            Self::SpeakerDrawnBack => vec![[m0, sb0], [m1, sb1], *to],
+            Self::MicrophoneDrawnBack => vec![[mb0, s0], [mb1, s1], *to],
+            Self::SpeakerLast => vec![[m0, sb0], [mb0, sb0], [mb1, sb1], [m1, sb1], *to],
+            Self::MicrophoneLast => vec![[mb0, s0], [mb0, sb0], [mb1, sb1], [mb1, s1], *to],
+        }
+    }
+}
+
+// Upper arm and forearm leant back over the foot: the tool goes up and away from the panel.
+fn drawn_back(mut joints: Joints) -> Joints {
+    (joints[1], joints[2]) = (BACK_DEG[0].to_radians(), BACK_DEG[1].to_radians());
+    joints
+}
+
+type Pose = [Joints; 2];
+
+/// A way from one standing to another.
+#[derive(Debug, Clone)]
+pub struct Motion {
+    /// What it is.
+    pub course: Course,
+    /// Joints of microphone's and speaker's arm at each stop, the last included.
+    pub stops: Vec<[Joints; 2]>,
+    /// Time that it takes at least, s: the data sheet's speeds, acceleration left out.
+    pub secs: f64,
+}
+
+/// The quickest course on which nothing touches; none where there is none among [`Course::ALL`].
+pub fn course(cell: &Cell, from: &Standing, to: &Standing) -> Option<Motion> {
+    let [from, to] = [from, to].map(|s| [s.microphone, s.speaker]);
+    let motion = |course: Course| {
+        let stops = course.by(&from, &to);
+        let secs = legs(&from, &stops).map(|(a, b)| leg_secs(a, b)).sum();
+        Motion { course, stops, secs }
+    };
+    let mut motions = Course::ALL.map(motion);
+    motions.sort_by(|a, b| a.secs.total_cmp(&b.secs));
+    motions.into_iter().find(|motion| legs(&from, &motion.stops).all(|(a, b)| is_clear(cell, a, b)))
+}
+
+fn legs<'a>(from: &'a Pose, stops: &'a [Pose]) -> impl Iterator<Item = (&'a Pose, &'a Pose)> {
+    std::iter::once(from).chain(stops).zip(stops)
+}
+
+/// Least time of both arms from one pose to another, s.
+fn leg_secs(from: &Pose, to: &Pose) -> f64 {
+    travel_secs(&from[0], &to[0]).max(travel_secs(&from[1], &to[1]))
+}
+
+// All joints start and arrive together, as a trajectory of two points is driven.
+fn is_clear(cell: &Cell, from: &Pose, to: &Pose) -> bool {
+    let widest = from.iter().flatten().zip(to.iter().flatten()).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
+    let steps = (widest.to_degrees() / STEP_DEG).ceil().max(1.0) as usize;
+    let between = |arm: usize, share: f64| -> Joints {
+        std::array::from_fn(|i| from[arm][i] + share * (to[arm][i] - from[arm][i]))
+    };
+    (0..=steps).map(|i| i as f64 / steps as f64).all(|share| cell.is_clear(&between(0, share), &between(1, share)))
+}
+
+/// A standing as twelve times, s: the greatest difference of two is the time between them.
+pub(super) fn as_secs(standing: &Standing) -> [f32; 12] {
+    std::array::from_fn(|i| {
+        let joints = if i < 6 { &standing.microphone } else { &standing.speaker };
+        (joints[i % 6].to_degrees() / SPEEDS_DEG[i % 6]) as f32
+    })
+}

@@ -1,0 +1,115 @@
+//! What a run's file holds: topics with their sizes, attachments, and an attachment's bytes.
+
+use std::collections::HashMap;
+use std::sync::Arc;
+
+use bytes::Bytes;
+use echolake_lake::{Lake, VisibleRun};
+use futures::{StreamExt as _, TryStreamExt as _};
+use mcap::records::{Record, op};
+use object_store::ObjectStoreExt as _;
+
+use super::chunk::{FRAME, LARGEST};
+use super::error::Fault;
+use super::file::{Attachment, Files, McapFile, Piece};
+use crate::Error;
+
+/// Message indexes that are read at once.
+const AT_ONCE: usize = 16;
+/// Of files with more bytes of message indexes than this, sizes are not told.
+const MOST_INDEXES: u64 = 64 << 20;
+
+/// A topic of a run's file.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Topic {
+    /// Its name.
+    pub topic: String,
+    /// Name of its schema.
+    pub schema: String,
+    /// How its messages are written.
+    pub encoding: String,
+    /// How many there are, where that is known.
+    pub messages: Option<u64>,
+    /// Their bytes before compression, where the file tells.
+    pub bytes: Option<u64>,
+}
+
+/// What a run's file holds.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Contents {
+    /// Its topics, the largest first.
+    pub topics: Vec<Topic>,
+    /// Its attachments.
+    pub attachments: Vec<Attachment>,
+}
+
+/// What the file of a run holds.
+pub(crate) async fn contents(run: &VisibleRun, files: &Arc<Files>) -> Result<Contents, Error> {
+    let file = files.open(&Lake::run_path(&run.surface, &run.run)).await?;
+    let bytes = sizes(&file, files).await?;
+    let topic = |(id, channel): (&u16, &super::file::Channel)| Topic {
+        topic: channel.topic.clone(),
+        schema: channel.schema.name.clone(),
+        encoding: channel.schema.messages.clone(),
+        messages: channel.messages,
+        bytes: bytes.as_ref().map(|bytes| bytes.get(id).copied().unwrap_or(0)),
+    };
+    let mut topics: Vec<_> = file.channels.iter().map(topic).collect();
+    topics.sort_by(|a, b| b.bytes.cmp(&a.bytes).then_with(|| a.topic.cmp(&b.topic)));
+    Ok(Contents { topics, attachments: file.attachments.clone() })
+}
+
+/// The bytes of the first attachment whose name ends so.
+pub(crate) async fn attachment(run: &VisibleRun, ending: &str, files: &Arc<Files>) -> Result<Option<Bytes>, Error> {
+    let file = files.open(&Lake::run_path(&run.surface, &run.run)).await?;
+    let Some(found) = file.attachments.iter().find(|a| a.name.ends_with(ending)) else { return Ok(None) };
+    let range = found.range.clone();
+    let damaged = |what: &str| Fault::Damaged { file: file.path.to_string(), offset: range.start, what: what.into() };
+    if range.end - range.start > LARGEST {
+        return Err(damaged("its attachment is larger than is read").into());
+    }
+    let read = files.store.get_range(&file.path, range.clone()).await;
+    let record = read.map_err(|source| Fault::Read { file: file.path.to_string(), source })?;
+    match record.get(FRAME..).map(|body| mcap::parse_record(op::ATTACHMENT, body)) {
+        Some(Ok(Record::Attachment { data, .. })) if record[0] == op::ATTACHMENT => Ok(Some(data.into_owned().into())),
+        _ => Err(damaged("there is no sound attachment where its index says").into()),
+    }
+}
+
+// Bytes by channel; None where the file does not tell.
+async fn sizes(file: &McapFile, files: &Files) -> Result<Option<HashMap<u16, u64>>, Fault> {
+    let told = file.indexed && file.pieces.iter().all(|p| p.index > 0);
+    if !told || file.pieces.iter().map(|p| p.index).sum::<u64>() > MOST_INDEXES {
+        return Ok(None);
+    }
+    let read = |piece: &Piece| {
+        let (range, plain) = (piece.range.end..piece.range.end + piece.index, piece.plain);
+        async move {
+            let bytes = files.store.get_range(&file.path, range).await;
+            let bytes = bytes.map_err(|source| Fault::Read { file: file.path.to_string(), source })?;
+            Ok::<_, Fault>((bytes, plain))
+        }
+    };
+    let reads: Vec<_> = file.pieces.iter().map(read).collect();
+    let mut reads = futures::stream::iter(reads).buffer_unordered(AT_ONCE);
+    let mut sizes = HashMap::new();
+    while let Some((bytes, plain)) = reads.try_next().await? {
+        add_sizes(&bytes, plain, &mut sizes);
+    }
+    Ok(Some(sizes))
+}
+
+// A message goes to where the next one begins, the last one to the chunk's end.
+fn add_sizes(index: &[u8], plain: u64, sizes: &mut HashMap<u16, u64>) {
+    let mut begins = Vec::new();
+    for record in mcap::read::LinearReader::sans_magic(index).map_while(Result::ok) {
+        if let Record::MessageIndex(index) = record {
+            begins.extend(index.records.iter().map(|entry| (entry.offset, index.channel_id)));
+        }
+    }
+    begins.sort_unstable();
+    for (i, (begin, channel)) in begins.iter().enumerate() {
+        let end = begins.get(i + 1).map_or(plain, |next| next.0);
+        *sizes.entry(*channel).or_insert(0) += end.saturating_sub(*begin);
+    }
+}

@@ -1,0 +1,83 @@
+//! How a rig's description places its two arms, and in which order they visit the grid.
+
+use serde::{Deserialize, Serialize};
+
+/// The `[robots]` section of a rig file. What it leaves out is [`RobotCell::default`].
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct RobotCell {
+    /// In which order pairs are visited.
+    pub order: VisitOrder,
+    /// Foot of the microphone's arm, mm from the panel's centre.
+    pub microphone_foot_mm: [f64; 3],
+    /// Foot of the speaker's arm, mm from the panel's centre.
+    pub speaker_foot_mm: [f64; 3],
+    /// How the microphone is held.
+    pub rod: Rod,
+    /// The relief's highest point over its mean plane, mm.
+    pub relief_mm: f64,
+    /// The table over the relief's mean plane, mm; negative, the panel stands on it.
+    pub table_mm: f64,
+    /// Least distance of anything from anything, mm.
+    pub margin_mm: f64,
+}
+
+/// In which order pairs are visited.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum VisitOrder {
+    /// By their numbers.
+    Numbered,
+    /// So that the arms travel little.
+    Planned,
+}
+
+/// How the microphone's rod may be held.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Rod {
+    /// Leaning towards its own arm.
+    Leaning,
+    /// Straight up.
+    Upright,
+}
+
+impl Default for RobotCell {
+    /// An arrangement in which the paper's whole grid is within reach. The paper prints no positions; these were
+    /// found by trying (`acquisition/examples/motion.rs` tells what is reached): the arms face each other over the
+    /// panel, the microphone's at lower x, because in a layer the microphone's point has the lower x. The relief's
+    /// top stands 29 mm over the mean plane (the paper's heights against those of the published data).
+    fn default() -> Self {
+        Self {
+            order: VisitOrder::Numbered,
+            microphone_foot_mm: [-560.0, 0.0, -100.0],
+            speaker_foot_mm: [560.0, 0.0, -100.0],
+            rod: Rod::Leaning,
+            relief_mm: 29.0,
+            table_mm: -100.0,
+            margin_mm: 5.0,
+        }
+    }
+}
+
+impl RobotCell {
+    /// Whether this is the default, which rig files leave out.
+    pub fn is_default(&self) -> bool {
+        *self == Self::default()
+    }
+
+    /// What contradicts itself, in words.
+    pub(crate) fn contradiction(&self) -> Option<String> {
+        let lengths = [self.relief_mm, self.table_mm, self.margin_mm];
+        let finite =
+            self.microphone_foot_mm.iter().chain(&self.speaker_foot_mm).chain(&lengths).all(|x| x.abs() <= 1e4);
+        match () {
+            () if !finite => Some("expected lengths within 10 m".into()),
+            () if self.table_mm >= self.relief_mm => {
+                Some(format!("table_mm = {} is not below relief_mm = {}", self.table_mm, self.relief_mm))
+            }
+            () if self.margin_mm < 0.0 => Some(format!("margin_mm = {} is negative", self.margin_mm)),
+            () => None,
+        }
+    }
+}

@@ -1,0 +1,237 @@
+//! Many readers of a served catalogue at once: errors, times, and what the server weighs.
+//!
+//! ```text
+//! cargo run --release --workspace --example readers -- 127.0.0.1:8080 --readers 200 --seconds 60 --ask all --pid PID
+//! ```
+//!
+//! `--ask` is `all` (what pages ask), `facets` (a new combination of filters each time) or `ir` (a WAV of another pair each
+//! time). Nothing of it comes out of a browser's cache; what the server keeps, it keeps.
+#![allow(clippy::print_stdout, reason = "its figures are what it is for")]
+
+use std::error::Error;
+use std::io::{BufRead as _, BufReader, Read as _, Write as _};
+use std::net::TcpStream;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::{Duration, Instant};
+
+use serde_json::Value;
+
+type Result<T> = std::result::Result<T, Box<dyn Error + Send + Sync>>;
+
+/// What a reader asks.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Kind {
+    All,
+    Facets,
+    Ir,
+}
+
+struct Args {
+    address: String,
+    readers: u64,
+    time: Duration,
+    kind: Kind,
+    pid: Option<u32>,
+}
+
+fn args() -> Result<Args> {
+    let mut given = std::env::args().skip(1);
+    let address = given.next().ok_or("no address; hint: 127.0.0.1:8080")?;
+    let mut args = Args { address, readers: 200, time: Duration::from_secs(60), kind: Kind::All, pid: None };
+    while let Some(name) = given.next() {
+        let value = given.next().ok_or_else(|| format!("{name} has no value"))?;
+        match (name.as_str(), value.as_str()) {
+            ("--readers", n) => args.readers = n.parse()?,
+            ("--seconds", n) => args.time = Duration::from_secs(n.parse()?),
+            ("--pid", n) => args.pid = Some(n.parse()?),
+            ("--ask", "all") => args.kind = Kind::All,
+            ("--ask", "facets") => args.kind = Kind::Facets,
+            ("--ask", "ir") => args.kind = Kind::Ir,
+            _ => return Err(format!("{name} {value} is nothing known").into()),
+        }
+    }
+    Ok(args)
+}
+
+/// A connection that is kept open.
+struct Connection {
+    address: String,
+    stream: BufReader<TcpStream>,
+}
+
+impl Connection {
+    fn open(address: &str) -> Result<Self> {
+        let stream = TcpStream::connect(address)?;
+        stream.set_nodelay(true)?;
+        stream.set_read_timeout(Some(Duration::from_secs(60)))?;
+        Ok(Self { address: address.to_owned(), stream: BufReader::new(stream) })
+    }
+
+    /// Asks; returns status and body.
+    fn get(&mut self, path: &str) -> Result<(u16, Vec<u8>)> {
+        let head = format!("GET {path} HTTP/1.1\r\nhost: {}\r\naccept: application/json, */*\r\n\r\n", self.address);
+        self.stream.get_mut().write_all(head.as_bytes())?;
+        let (mut status, mut length) = (0, None);
+        for line in (&mut self.stream).lines() {
+            let line = line?;
+            if line.is_empty() {
+                break;
+            }
+            if let Some(rest) = line.strip_prefix("HTTP/1.1 ") {
+                status = rest.split(' ').next().unwrap_or_default().parse()?;
+            }
+            if let Some((name, value)) = line.split_once(": ")
+                && name.eq_ignore_ascii_case("content-length")
+            {
+                length = Some(value.parse::<usize>()?);
+            }
+        }
+        let mut body = vec![0; length.ok_or("an answer without a length")?];
+        self.stream.read_exact(&mut body)?;
+        Ok((status, body))
+    }
+}
+
+/// What there is to ask about.
+struct Lake {
+    surfaces: Vec<String>,
+    facets: Vec<(String, String)>,
+    runs: Vec<String>,
+    pairs: u64,
+}
+
+impl Lake {
+    fn read(address: &str) -> Result<Self> {
+        let mut connection = Connection::open(address)?;
+        let mut json = |path: &str| -> Result<Value> { Ok(serde_json::from_slice(&connection.get(path)?.1)?) };
+        let text = |value: &Value| value.as_str().unwrap_or_default().to_owned();
+        let page = json("/api/v1/surfaces?limit=500")?;
+        let list = |value: &Value| value.as_array().cloned().unwrap_or_default();
+        let mut facets = Vec::new();
+        for facet in list(&page["facets"]) {
+            facets.extend(list(&facet["values"]).iter().map(|v| (text(&facet["name"]), encoded(&text(&v["value"])))));
+        }
+        for histogram in list(&page["histograms"]) {
+            let (name, prefix) = match text(&histogram["name"]).split_once(':') {
+                Some((name, band)) => (name.to_owned(), format!("{band}:")),
+                None => (text(&histogram["name"]), String::new()),
+            };
+            let bins = list(&histogram["bins"]);
+            facets.extend(bins.iter().map(|bin| (name.clone(), format!("{prefix}{}..{}", bin["from"], bin["to"]))));
+        }
+        let runs = json("/api/v1/runs?limit=500")?;
+        Ok(Self {
+            surfaces: list(&page["items"]).iter().map(|s| text(&s["surface_id"])).collect(),
+            facets,
+            runs: list(&runs["items"]).iter().map(|r| text(&r["run_id"])).collect(),
+            pairs: json("/api/v1/lake")?["counts"]["pairs"].as_u64().unwrap_or(1),
+        })
+    }
+
+    fn path(&self, kind: Kind, chance: &mut Chance) -> String {
+        let surface = &self.surfaces[chance.below(self.surfaces.len() as u64) as usize];
+        let pair = chance.below(self.pairs);
+        match (kind, chance.below(10)) {
+            (Kind::Facets, _) => {
+                let (name, value) = &self.facets[chance.below(self.facets.len() as u64) as usize];
+                // A different offset makes an address that nobody asked for yet.
+                format!("/api/v1/surfaces?{name}={value}&sort=level&offset={}", chance.below(100_000))
+            }
+            (Kind::Ir, _) => format!("/api/v1/surfaces/{surface}/pairs/{pair}/ir.wav?signal=measured"),
+            (Kind::All, 0) => "/".to_owned(),
+            (Kind::All, 1) => "/api/v1/surfaces".to_owned(),
+            (Kind::All, 2) => format!("/api/v1/surfaces/{surface}"),
+            (Kind::All, 3) => format!("/api/v1/surfaces/{surface}/grid?microphone={}", chance.below(10)),
+            (Kind::All, 4) => format!("/api/v1/surfaces/{surface}/curves?microphone={}", chance.below(10)),
+            (Kind::All, 5 | 6) => format!("/api/v1/surfaces/{surface}/thumbnail.png"),
+            (Kind::All, 7) => format!("/api/v1/surfaces/{surface}/pairs/{pair}"),
+            (Kind::All, 8) => format!("/api/v1/runs/{}", self.runs[chance.below(self.runs.len() as u64) as usize]),
+            (Kind::All, _) => "/api/v1/map".to_owned(),
+        }
+    }
+}
+
+fn encoded(text: &str) -> String {
+    text.bytes()
+        .map(|b| if b.is_ascii_alphanumeric() { (b as char).to_string() } else { format!("%{b:02x}") })
+        .collect()
+}
+
+/// Numbers that are the same each time (Marsaglia 2003, xorshift).
+struct Chance(u64);
+
+impl Chance {
+    fn below(&mut self, bound: u64) -> u64 {
+        self.0 ^= self.0 << 13;
+        self.0 ^= self.0 >> 7;
+        self.0 ^= self.0 << 17;
+        self.0 % bound.max(1)
+    }
+}
+
+fn resident_mb(pid: u32) -> Option<u64> {
+    let status = std::fs::read_to_string(format!("/proc/{pid}/status")).ok()?;
+    let line = status.lines().find_map(|l| l.strip_prefix("VmRSS:"))?;
+    Some(line.trim().trim_end_matches(" kB").parse::<u64>().ok()? / 1000)
+}
+
+fn main() -> Result<()> {
+    let args = Arc::new(args()?);
+    let lake = Arc::new(Lake::read(&args.address)?);
+    let (times, errors) = (Arc::new(Mutex::new(Vec::new())), Arc::new(AtomicU64::new(0)));
+    let end = Instant::now() + args.time;
+    let reader = |number: u64| {
+        let (args, lake, times, errors) = (args.clone(), lake.clone(), times.clone(), errors.clone());
+        std::thread::spawn(move || {
+            let mut chance = Chance(number.wrapping_mul(0x9e37_79b9_7f4a_7c15) | 1);
+            (0..10).for_each(|_| drop(chance.below(1)));
+            let mut own = Vec::new();
+            let mut connection = None;
+            while Instant::now() < end {
+                let path = lake.path(args.kind, &mut chance);
+                let begun = Instant::now();
+                let asked = match connection.take() {
+                    Some(open) => Ok(open),
+                    None => Connection::open(&args.address),
+                };
+                match asked.and_then(|mut open| open.get(&path).map(|answer| (open, answer))) {
+                    // Not every surface has every pair.
+                    Ok((open, (200 | 404, _))) => {
+                        own.push(begun.elapsed());
+                        connection = Some(open);
+                    }
+                    Ok((_, (status, body))) => {
+                        eprintln!("{path}: {status} {}", String::from_utf8_lossy(&body));
+                        errors.fetch_add(1, Ordering::Relaxed);
+                    }
+                    Err(why) => {
+                        eprintln!("{path}: {why}");
+                        errors.fetch_add(1, Ordering::Relaxed);
+                    }
+                }
+            }
+            times.lock().unwrap_or_else(PoisonError::into_inner).extend(own);
+        })
+    };
+    let readers: Vec<_> = (1..=args.readers).map(reader).collect();
+    let mut heaviest = 0;
+    while Instant::now() < end {
+        heaviest = heaviest.max(args.pid.and_then(resident_mb).unwrap_or(0));
+        std::thread::sleep(Duration::from_millis(200));
+    }
+    for reader in readers {
+        reader.join().map_err(|_| "a reader panicked")?;
+    }
+    let mut times = times.lock().unwrap_or_else(PoisonError::into_inner);
+    times.sort_unstable();
+    let at = |share: f64| times.get((share * times.len() as f64) as usize).map_or(f64::NAN, |t| t.as_secs_f64() * 1e3);
+    println!("{:?}: {} readers, {:.0} s", args.kind, args.readers, args.time.as_secs_f64());
+    println!("  answers {}, {:.0} a second", times.len(), times.len() as f64 / args.time.as_secs_f64());
+    println!("  errors {}", errors.load(Ordering::Relaxed));
+    println!("  p50 {:.1} ms, p95 {:.1} ms, p99 {:.1} ms", at(0.5), at(0.95), at(0.99));
+    if heaviest > 0 {
+        println!("  the server's memory at most {heaviest} MB");
+    }
+    Ok(())
+}

@@ -1,0 +1,93 @@
+//! `GET /api/v1/correlations`: how the reliefs' parameters and the bands' levels go together.
+
+use std::collections::BTreeMap;
+
+use echolake_dsp::correlation::pearson;
+use serde::Serialize;
+use serde_json::Value;
+
+use super::asked::Asked;
+use super::content::Content;
+use super::summary::Entry;
+use crate::fault::Fault;
+
+/// Fewer surfaces tell nothing: two are always on a line.
+const LEAST: usize = 3;
+/// Parameters that are answered.
+const MOST: usize = 500;
+/// References are no designs.
+const REFERENCE: &str = "reference";
+/// A number that says nothing of the relief.
+const SEED: &str = "seed";
+
+#[derive(Serialize)]
+struct Correlations {
+    method: &'static str,
+    items: Vec<Correlation>,
+    surfaces: usize,
+}
+
+#[derive(Serialize)]
+struct Correlation {
+    parameter: String,
+    unit: &'static str,
+    band: String,
+    r: Option<f64>,
+    n: usize,
+}
+
+/// Pearson's r of every numeric parameter with every band's level against Flat.
+pub(super) async fn correlations(asked: Asked) -> Result<Content, Fault> {
+    let summary = asked.summary().await?;
+    let typologies: Vec<_> = asked.params.all("typology").collect();
+    let is_chosen = |entry: &&Entry| {
+        let typology = entry.surface.typology.as_str();
+        typology != REFERENCE && (typologies.is_empty() || typologies.contains(&typology))
+    };
+    let chosen: Vec<_> = summary.entries.iter().filter(is_chosen).collect();
+    let mut items = Vec::new();
+    for (parameter, values) in columns(&chosen) {
+        for (b, band) in summary.bands.iter().enumerate() {
+            let both = values.iter().filter_map(|(i, value)| Some((*value, chosen[*i].surface.against_flat_db[b]?)));
+            let (x, y): (Vec<_>, Vec<_>) = both.unzip();
+            // They are equally long.
+            let r = if x.len() < LEAST { None } else { pearson(&x, &y).unwrap_or(None) };
+            let unit = unit(&parameter);
+            items.push(Correlation { parameter: parameter.clone(), unit, band: band.key.clone(), r, n: x.len() });
+        }
+    }
+    Content::json(&Correlations { method: "pearson", items, surfaces: chosen.len() })
+}
+
+// Each parameter's values, with the surface that has them.
+fn columns(chosen: &[&Entry]) -> BTreeMap<String, Vec<(usize, f64)>> {
+    let mut columns: BTreeMap<String, Vec<(usize, f64)>> = BTreeMap::new();
+    for (i, entry) in chosen.iter().enumerate() {
+        let own = [
+            ("relief_rms_mm", entry.surface.relief_rms_mm),
+            ("relief_range_mm", entry.relief_range_mm()),
+            ("reflection_factor", entry.reflection_factor),
+        ];
+        let given = entry.parameters.iter().map(|(name, value)| (name.as_str(), Value::as_f64(value)));
+        for (name, value) in own.into_iter().chain(given.filter(|(name, _)| *name != SEED)) {
+            if let Some(value) = value.filter(|v| v.is_finite())
+                && (columns.len() < MOST || columns.contains_key(name))
+            {
+                let column = columns.entry(name.to_owned()).or_default();
+                // A parameter of one of our own names does not count twice.
+                if column.last().is_none_or(|(last, _)| *last != i) {
+                    column.push((i, value));
+                }
+            }
+        }
+    }
+    columns
+}
+
+fn unit(parameter: &str) -> &'static str {
+    match parameter.rsplit('_').next() {
+        Some("mm") => "mm",
+        Some("deg") => "deg",
+        _ => "1",
+    }
+}

@@ -1,0 +1,147 @@
+//! NCE curves by band: means over pairs, of a surface and of its Flat, decimated for plots.
+
+use std::sync::Arc;
+
+use arrow::array::{ArrayRef, Float64Array};
+use arrow::record_batch::RecordBatch;
+use datafusion::common::ScalarValue;
+use echolake_schema::Rig;
+use serde::{Deserialize, Serialize};
+
+use super::asked::{Asked, number, text};
+use super::content::Content;
+use super::summary::Entry;
+use crate::fault::Fault;
+
+/// Curves of a surface beside those of its Flat.
+#[derive(Serialize)]
+pub(super) struct CurveSet {
+    pub(super) time_ms: Vec<f64>,
+    surface: Curves,
+    flat: Curves,
+}
+
+#[derive(Clone, Serialize)]
+struct Curves {
+    surface_id: String,
+    /// Measurements that the mean is over.
+    pairs: i64,
+    bands: Vec<Vec<f64>>,
+}
+
+#[derive(Deserialize)]
+struct Row {
+    surface_id: String,
+    pairs: i64,
+    bands: Vec<Option<Vec<f64>>>,
+}
+
+/// Which pairs a mean is over.
+pub(super) enum Over {
+    All,
+    Point(usize),
+    Pair(usize),
+}
+
+impl Over {
+    fn filter(&self) -> (&'static str, Option<ScalarValue>) {
+        match self {
+            Self::All => ("", None),
+            Self::Point(point) => (" and (microphone = $3 or speaker = $3)", Some(number(*point))),
+            Self::Pair(pair) => (" and pair_id = $3", Some(number(*pair))),
+        }
+    }
+}
+
+impl CurveSet {
+    /// # Errors
+    /// Those of its query.
+    pub(super) async fn read(asked: &Asked, entry: &Entry, over: Over, points: usize) -> Result<Self, Fault> {
+        let rig = asked.catalogue.lake().rig();
+        let (filter, value) = over.filter();
+        let means: Vec<_> = rig.band_names().iter().map(|band| format!("avg_list(nce_{band})")).collect();
+        let sql = format!(
+            "select surface_id, count(*) as pairs, make_array({}) as bands from nce \
+             where surface_id in ($1, $2){filter} group by surface_id",
+            means.join(", ")
+        );
+        let (id, flat) = (&entry.surface.surface_id, &entry.surface.flat_reference);
+        let values = [text(id), text(flat)].into_iter().chain(value).collect();
+        let rows: Vec<Row> = asked.rows(&sql, values).await?;
+        let kept = indices(rig.impulse_response.length, points);
+        let of = |surface: &str| curves(surface, rows.iter().find(|row| row.surface_id == surface), rig, &kept);
+        Ok(Self { time_ms: times_ms(rig, &kept), surface: of(id), flat: of(flat) })
+    }
+
+    /// Whether the surface itself has curves.
+    pub(super) fn is_there(&self) -> bool {
+        self.surface.pairs > 0
+    }
+
+    // A column of times and one a band of either surface.
+    fn batch(&self, rig: &Rig) -> Result<RecordBatch, Fault> {
+        let column = |values: &[f64]| -> ArrayRef {
+            let padded = (0..self.time_ms.len()).map(|i| values.get(i).copied());
+            Arc::new(padded.collect::<Float64Array>())
+        };
+        let mut columns = vec![("time_ms".to_owned(), column(&self.time_ms))];
+        for (name, curves) in [("nce", &self.surface), ("flat_nce", &self.flat)] {
+            for (band, values) in rig.band_names().iter().zip(&curves.bands) {
+                columns.push((format!("{name}_{band}"), column(values)));
+            }
+        }
+        RecordBatch::try_from_iter_with_nullable(columns.into_iter().map(|(name, values)| (name, values, true)))
+            .map_err(|e| {
+                eprintln!("curves make no batch: {e}");
+                Fault::Internal
+            })
+    }
+}
+
+fn curves(surface: &str, row: Option<&Row>, rig: &Rig, kept: &[usize]) -> Curves {
+    let thin = |curve: &Option<Vec<f64>>| {
+        let curve = curve.as_deref().unwrap_or_default();
+        kept.iter().filter_map(|i| curve.get(*i).copied()).collect()
+    };
+    let bands =
+        row.map_or_else(|| vec![Vec::new(); rig.band_names().len()], |row| row.bands.iter().map(thin).collect());
+    Curves { surface_id: surface.to_owned(), pairs: row.map_or(0, |row| row.pairs), bands }
+}
+
+// First and last sample are always kept.
+fn indices(length: usize, points: usize) -> Vec<usize> {
+    if length <= points {
+        return (0..length).collect();
+    }
+    let step = (length - 1) as f64 / (points - 1) as f64;
+    (0..points).map(|i| (i as f64 * step).round() as usize).collect()
+}
+
+fn times_ms(rig: &Rig, kept: &[usize]) -> Vec<f64> {
+    kept.iter().map(|i| 1000.0 * *i as f64 / rig.sweep.rate_hz.get()).collect()
+}
+
+/// `GET /api/v1/surfaces/{surface_id}/curves`.
+pub(super) async fn curves_of(asked: Asked) -> Result<Content, Fault> {
+    let entry = asked.surface().await?;
+    let over = asked.microphone()?.map_or(Over::All, Over::Point);
+    let points = asked.params.whole("points", 16..=4096)?.unwrap_or(192);
+    let set = CurveSet::read(&asked, entry, over, points).await?;
+    match asked.as_arrow {
+        true => Content::arrow(&set.batch(asked.catalogue.lake().rig())?),
+        false => Content::json(&set),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn decimation_keeps_both_ends() {
+        assert_eq!(indices(4, 16), [0, 1, 2, 3]);
+        let kept = indices(384, 192);
+        assert_eq!((kept.len(), kept[0], kept[191]), (192, 0, 383));
+        assert!(kept.windows(2).all(|two| two[0] < two[1]));
+    }
+}

@@ -1,0 +1,350 @@
+//! `GET /api/v1/surfaces`: a page of surfaces, with facets and histograms that leave their own filter out. All of it comes
+//! from the summary in memory, in one pass a request.
+
+use std::cmp::Ordering;
+use std::collections::BTreeMap;
+use std::ops::RangeInclusive;
+
+use serde::Serialize;
+
+use super::asked::Asked;
+use super::content::Content;
+use super::params::{Params, range};
+use super::summary::{Entry, Summary, Surface};
+use crate::fault::Fault;
+
+/// Values of a facet that are answered, the most frequent ones.
+const MOST_VALUES: usize = 200;
+const BINS: usize = 24;
+/// A bin is never narrower, so that one value makes a bin and not a division by nothing.
+const LEAST_WIDTH: f64 = 1e-9;
+/// How what is not known is called as a facet's value.
+const UNKNOWN: &str = "\u{2014}";
+
+/// A text that surfaces are told apart by: parameter, title, and where it stands.
+type Facet = (&'static str, &'static str, fn(&Surface) -> Option<&str>);
+
+const FACETS: [Facet; 6] = [
+    ("typology", "Typology", |s| Some(&s.typology)),
+    ("macrostructure", "Macrostructure", |s| s.macrostructure.as_deref()),
+    ("mesostructure", "Mesostructure", |s| s.mesostructure.as_deref()),
+    ("material", "Material", |s| Some(&s.material)),
+    ("flat_reference", "Flat reference", |s| Some(&s.flat_reference)),
+    ("origin", "Origin", |s| Some(&s.origin)),
+];
+
+#[derive(Serialize)]
+struct Page<'a> {
+    total: usize,
+    offset: usize,
+    items: Vec<&'a Surface>,
+    facets: Vec<FacetCounts<'a>>,
+    histograms: Vec<Histogram>,
+    counts: &'static str,
+}
+
+#[derive(Serialize)]
+struct FacetCounts<'a> {
+    name: &'static str,
+    label: &'static str,
+    values: Vec<FacetValue<'a>>,
+}
+
+#[derive(Serialize)]
+struct FacetValue<'a> {
+    value: &'a str,
+    count: usize,
+}
+
+#[derive(Serialize)]
+struct Histogram {
+    name: String,
+    label: String,
+    unit: &'static str,
+    bins: Vec<Bin>,
+}
+
+#[derive(Serialize)]
+struct Bin {
+    from: f64,
+    to: f64,
+    count: usize,
+}
+
+/// A number that surfaces are told apart by.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Measure {
+    /// Against Flat, of the band at this place.
+    Level(usize),
+    Relief,
+    Started,
+}
+
+impl Measure {
+    fn of(self, entry: &Entry) -> Option<f64> {
+        let value = match self {
+            Self::Level(band) => entry.surface.against_flat_db[band],
+            Self::Relief => entry.surface.relief_rms_mm,
+            Self::Started => entry.day,
+        };
+        value.filter(|v| v.is_finite())
+    }
+}
+
+/// One filter; all must let a surface through.
+enum Filter<'a> {
+    Words(Vec<String>),
+    Facet(usize, Vec<&'a str>),
+    Measure(Measure, Vec<RangeInclusive<f64>>),
+}
+
+impl Filter<'_> {
+    fn passes(&self, entry: &Entry) -> bool {
+        match self {
+            Self::Words(words) => words.iter().all(|word| entry.words.contains(word)),
+            Self::Facet(facet, wanted) => wanted.contains(&value(*facet, &entry.surface)),
+            Self::Measure(measure, ranges) => {
+                measure.of(entry).is_some_and(|value| ranges.iter().any(|range| range.contains(&value)))
+            }
+        }
+    }
+
+    fn is_of_facet(&self, facet: usize) -> bool {
+        matches!(self, Self::Facet(own, _) if *own == facet)
+    }
+
+    fn is_of(&self, measure: Measure) -> bool {
+        matches!(self, Self::Measure(own, _) if *own == measure)
+    }
+}
+
+fn value(facet: usize, surface: &Surface) -> &str {
+    (FACETS[facet].2)(surface).unwrap_or(UNKNOWN)
+}
+
+fn filters<'a>(params: &'a Params, summary: &Summary) -> Result<Vec<Filter<'a>>, Fault> {
+    let mut filters = Vec::new();
+    let words: Vec<_> = params.one("q")?.unwrap_or_default().split_whitespace().map(str::to_lowercase).collect();
+    if !words.is_empty() {
+        filters.push(Filter::Words(words));
+    }
+    for (i, (name, ..)) in FACETS.iter().enumerate() {
+        let wanted: Vec<_> = params.all(name).collect();
+        if !wanted.is_empty() {
+            filters.push(Filter::Facet(i, wanted));
+        }
+    }
+    for (name, measure) in [("started", Measure::Started), ("relief", Measure::Relief)] {
+        if let Some(text) = params.one(name)? {
+            filters.push(Filter::Measure(measure, vec![range(name, text)?]));
+        }
+    }
+    let mut levels: BTreeMap<usize, Vec<_>> = BTreeMap::new();
+    for text in params.all("level") {
+        let (key, span) = text.split_once(':').unwrap_or((text, ""));
+        levels.entry(band(summary, "level", key)?).or_default().push(range("level", span)?);
+    }
+    filters.extend(levels.into_iter().map(|(band, ranges)| Filter::Measure(Measure::Level(band), ranges)));
+    Ok(filters)
+}
+
+fn band(summary: &Summary, name: &str, key: &str) -> Result<usize, Fault> {
+    summary.bands.iter().position(|band| band.key == key).ok_or_else(|| {
+        let keys: Vec<_> = summary.bands.iter().map(|band| band.key.as_str()).collect();
+        Fault::request(format!("`{name}` names no band of the lake; hint: {}", keys.join(", ")))
+    })
+}
+
+/// Which filters keep a surface out.
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum Standing {
+    In,
+    /// This one alone.
+    But(usize),
+    Out,
+}
+
+fn standing(filters: &[Filter<'_>], entry: &Entry) -> Standing {
+    let mut against = filters.iter().enumerate().filter(|(_, filter)| !filter.passes(entry));
+    match (against.next(), against.next()) {
+        (None, _) => Standing::In,
+        (Some((only, _)), None) => Standing::But(only),
+        _ => Standing::Out,
+    }
+}
+
+/// A page of surfaces.
+pub(super) async fn surfaces(asked: Asked) -> Result<Content, Fault> {
+    let (summary, params) = (asked.summary().await?, &asked.params);
+    let filters = filters(params, summary)?;
+    let order = order(params, summary)?;
+    let offset = params.whole("offset", 0..=usize::MAX)?.unwrap_or(0);
+    let limit = params.whole("limit", 1..=500)?.unwrap_or(60);
+    let all: Vec<_> = summary.entries.iter().map(|entry| (entry, standing(&filters, entry))).collect();
+    let mut left: Vec<_> =
+        all.iter().filter(|(_, standing)| *standing == Standing::In).map(|(entry, _)| *entry).collect();
+    left.sort_by(|a, b| order.compare(a, b));
+    Content::json(&Page {
+        total: left.len(),
+        offset,
+        items: left.into_iter().skip(offset).take(limit).map(|entry| &entry.surface).collect(),
+        facets: (0..FACETS.len()).map(|facet| counts(facet, &filters, &all)).collect(),
+        histograms: histograms(summary, &filters, &all),
+        counts: "exact",
+    })
+}
+
+fn counts<'a>(facet: usize, filters: &[Filter<'_>], all: &[(&'a Entry, Standing)]) -> FacetCounts<'a> {
+    let own = filters.iter().position(|f| f.is_of_facet(facet));
+    let mut counts: BTreeMap<&str, usize> = BTreeMap::new();
+    for (entry, standing) in all {
+        *counts.entry(value(facet, &entry.surface)).or_default() += usize::from(counted(*standing, own));
+    }
+    let mut values: Vec<_> = counts.into_iter().map(|(value, count)| FacetValue { value, count }).collect();
+    values.sort_by(|a, b| b.count.cmp(&a.count).then_with(|| a.value.cmp(b.value)));
+    values.truncate(MOST_VALUES);
+    FacetCounts { name: FACETS[facet].0, label: FACETS[facet].1, values }
+}
+
+// Whether a surface is let through by all filters but one's own.
+fn counted(standing: Standing, own: Option<usize>) -> bool {
+    match standing {
+        Standing::In => true,
+        Standing::But(only) => Some(only) == own,
+        Standing::Out => false,
+    }
+}
+
+fn histograms(summary: &Summary, filters: &[Filter<'_>], all: &[(&Entry, Standing)]) -> Vec<Histogram> {
+    let levels = summary.bands.iter().enumerate().map(|(i, band)| {
+        (Measure::Level(i), format!("level:{}", band.key), format!("{} against Flat", band.label), "dB")
+    });
+    let others = [
+        (Measure::Relief, "relief".to_owned(), "Relief, rms".to_owned(), "mm"),
+        (Measure::Started, "started".to_owned(), "Measured".to_owned(), "day"),
+    ];
+    let all = levels.chain(others).filter_map(|(measure, name, label, unit)| {
+        let own = filters.iter().position(|f| f.is_of(measure));
+        let values = all.iter().filter_map(|(entry, standing)| Some((measure.of(entry)?, counted(*standing, own))));
+        Some(Histogram { name, label, unit, bins: bins(&values.collect::<Vec<_>>())? })
+    });
+    all.collect()
+}
+
+// Bins over all values, which do not move when something is filtered; counts of those that are left.
+fn bins(values: &[(f64, bool)]) -> Option<Vec<Bin>> {
+    let low = values.iter().map(|v| v.0).min_by(f64::total_cmp)?;
+    let high = values.iter().map(|v| v.0).max_by(f64::total_cmp)?;
+    let width = ((high - low) / BINS as f64).max(LEAST_WIDTH);
+    let mut counts = [0; BINS];
+    for (value, _) in values.iter().filter(|(_, counted)| *counted) {
+        counts[(((value - low) / width) as usize).min(BINS - 1)] += 1;
+    }
+    let edge = |i: usize| low + i as f64 * width;
+    Some(counts.into_iter().enumerate().map(|(i, count)| Bin { from: edge(i), to: edge(i + 1), count }).collect())
+}
+
+/// In which order surfaces come.
+struct Order {
+    by: Option<By>,
+    descends: bool,
+}
+
+/// What surfaces are sorted by, where it is not their name.
+enum By {
+    Measure(Measure),
+    Spread(usize),
+}
+
+fn order(params: &Params, summary: &Summary) -> Result<Order, Fault> {
+    let band = match params.one("sort_band")? {
+        Some(key) => band(summary, "sort_band", key)?,
+        None => summary.bands.len() - 1,
+    };
+    let by = match params.choice("sort", &["surface_id", "started", "relief", "spread", "level"])? {
+        "started" => Some(By::Measure(Measure::Started)),
+        "relief" => Some(By::Measure(Measure::Relief)),
+        "spread" => Some(By::Spread(band)),
+        "level" => Some(By::Measure(Measure::Level(band))),
+        _ => None,
+    };
+    Ok(Order { by, descends: params.choice("order", &["asc", "desc"])? == "desc" })
+}
+
+impl Order {
+    fn compare(&self, a: &Entry, b: &Entry) -> Ordering {
+        let turned = |ordering: Ordering| if self.descends { ordering.reverse() } else { ordering };
+        let value = |entry: &Entry| match self.by.as_ref()? {
+            By::Measure(measure) => measure.of(entry),
+            By::Spread(band) => entry.surface.spread_db[*band],
+        };
+        let names = || natural(&a.surface.surface_id, &b.surface.surface_id);
+        match (self.by.is_some(), value(a), value(b)) {
+            (false, ..) => turned(names()),
+            (true, Some(x), Some(y)) => turned(x.total_cmp(&y)).then_with(names),
+            // What is not known comes last, whichever way.
+            (true, x, y) => y.is_some().cmp(&x.is_some()).then_with(names),
+        }
+    }
+}
+
+// Digits by the number that they make: `panel_9` before `panel_10`.
+fn natural(a: &str, b: &str) -> Ordering {
+    let (mut a, mut b) = (a, b);
+    loop {
+        let (digits_a, digits_b) = (leading_digits(a), leading_digits(b));
+        let ordering = match (digits_a.is_empty() || digits_b.is_empty(), a.chars().next(), b.chars().next()) {
+            (false, ..) => {
+                let number = |text: &str| text.trim_start_matches('0').to_owned();
+                let (x, y) = (number(digits_a), number(digits_b));
+                x.len().cmp(&y.len()).then_with(|| x.cmp(&y)).then_with(|| digits_a.len().cmp(&digits_b.len()))
+            }
+            (true, None, None) => return Ordering::Equal,
+            (true, x, y) => x.cmp(&y),
+        };
+        if ordering != Ordering::Equal {
+            return ordering;
+        }
+        let step = |text: &str, digits: &str| if digits.is_empty() { first_len(text) } else { digits.len() };
+        let (step_a, step_b) = (step(a, digits_a), step(b, digits_b));
+        (a, b) = (&a[step_a..], &b[step_b..]);
+    }
+}
+
+fn leading_digits(text: &str) -> &str {
+    &text[..text.bytes().take_while(u8::is_ascii_digit).count()]
+}
+
+fn first_len(text: &str) -> usize {
+    text.chars().next().map_or(0, char::len_utf8)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn names_sort_as_people_count() {
+        let mut names = ["p10", "p9", "flat", "p9b", "0015_0", "15_0", "p", "é2", "é10"];
+        names.sort_by(|a, b| natural(a, b));
+        assert_eq!(names, ["15_0", "0015_0", "flat", "p", "p9", "p9b", "p10", "é2", "é10"]);
+    }
+
+    #[test]
+    fn bins_hold_what_is_counted() {
+        let values: Vec<_> = (0..48).map(|i| (f64::from(i), i % 2 == 0)).collect();
+        let bins = bins(&values).expect("bins");
+        assert_eq!(bins.len(), BINS);
+        assert_eq!(bins.iter().map(|b| b.count).sum::<usize>(), 24);
+        assert!((bins[BINS - 1].to - 47.0).abs() < 1e-9);
+        assert!(super::bins(&[]).is_none());
+        assert_eq!(super::bins(&[(3.0, true)]).expect("one value")[0].count, 1);
+    }
+
+    #[test]
+    fn a_facet_leaves_its_own_filter_out() {
+        assert!(counted(Standing::In, None) && counted(Standing::But(2), Some(2)));
+        assert!(!counted(Standing::But(2), Some(1)) && !counted(Standing::But(0), None));
+        assert!(!counted(Standing::Out, Some(0)));
+    }
+}

@@ -1,0 +1,131 @@
+//! `GET /api/v1/lake`: what the lake holds, its rig, bands and grid.
+
+use echolake_schema::Rig;
+use serde::{Deserialize, Serialize};
+
+use super::asked::Asked;
+use super::content::Content;
+use crate::fault::Fault;
+
+/// A band, or the total, which has no centre.
+#[derive(Debug, Serialize)]
+pub(super) struct Band {
+    /// As in column names.
+    pub(super) key: String,
+    centre_hz: Option<f64>,
+    pub(super) label: String,
+}
+
+/// Name of what has no band.
+pub(super) const TOTAL: &str = "total";
+
+/// The rig's bands, the total last.
+pub(super) fn bands(rig: &Rig) -> Vec<Band> {
+    let label = |hz: f64| if hz >= 1000.0 { format!("{} kHz", hz / 1000.0) } else { format!("{hz} Hz") };
+    let named = rig.band_names().into_iter().zip(&rig.bands.centres_hz);
+    let bands = named.map(|(key, hz)| Band { key, centre_hz: Some(*hz), label: label(*hz) });
+    bands.chain([Band { key: TOTAL.into(), centre_hz: None, label: "Total".into() }]).collect()
+}
+
+/// A column for each of the rig's bands and the total, as one list.
+///
+/// Names of bands come from `lake.toml`, and are digits.
+pub(super) fn band_list(rig: &Rig, column: impl Fn(&str) -> String) -> String {
+    let names = rig.band_names();
+    let columns: Vec<_> = names
+        .iter()
+        .map(String::as_str)
+        .chain([TOTAL])
+        .map(|band| format!("cast({} as double)", column(band)))
+        .collect();
+    format!("make_array({})", columns.join(", "))
+}
+
+/// Energies over Flat's as levels; none of what has no energy.
+pub(super) fn levels_db(linear: &[Option<f64>]) -> Vec<Option<f64>> {
+    linear.iter().map(|x| x.filter(|x| *x > 0.0).map(|x| 10.0 * x.log10())).collect()
+}
+
+#[derive(Serialize)]
+struct Lake<'a> {
+    name: &'a str,
+    version: &'a str,
+    software: &'static str,
+    bands: Vec<Band>,
+    rate_hz: f64,
+    low_hz: f64,
+    high_hz: f64,
+    ir_length: usize,
+    reference_temperature_c: f64,
+    panel_size_mm: f64,
+    panel_depth_mm: f64,
+    layers: i32,
+    points: Vec<Point>,
+    counts: Counts,
+    simulated: bool,
+}
+
+#[derive(Deserialize, Serialize)]
+struct Point {
+    point_id: i32,
+    layer: i32,
+    gridx: i32,
+    gridy: i32,
+    x_mm: f64,
+    y_mm: f64,
+    z_mm: f64,
+}
+
+#[derive(Serialize)]
+struct Counts {
+    surfaces: usize,
+    runs: i64,
+    measurements: i64,
+    pairs: usize,
+}
+
+#[derive(Deserialize)]
+struct Runs {
+    runs: i64,
+    measurements: Option<i64>,
+}
+
+/// What the lake holds.
+pub(super) async fn lake(asked: Asked) -> Result<Content, Fault> {
+    let lake = asked.catalogue.lake();
+    let rig = lake.rig();
+    let points: Vec<Point> = asked
+        .rows("select point_id, layer, gridx, gridy, x_mm, y_mm, z_mm from points order by point_id", Vec::new())
+        .await?;
+    let runs: Vec<Runs> =
+        asked.rows("select count(*) as runs, sum(measurements) as measurements from runs", Vec::new()).await?;
+    let summary = asked.summary().await?;
+    let counts = Counts {
+        surfaces: summary.entries.len(),
+        runs: runs.first().map_or(0, |r| r.runs),
+        measurements: runs.first().and_then(|r| r.measurements).unwrap_or(0),
+        pairs: lake.grid().pairs().len(),
+    };
+    Content::json(&Lake {
+        name: name(lake.location()),
+        version: &asked.view.version,
+        software: concat!("echolake ", env!("CARGO_PKG_VERSION")),
+        bands: bands(rig),
+        rate_hz: rig.sweep.rate_hz.get(),
+        low_hz: rig.sweep.low_hz,
+        high_hz: rig.sweep.high_hz,
+        ir_length: rig.impulse_response.length,
+        reference_temperature_c: rig.impulse_response.reference_temperature_c.get(),
+        panel_size_mm: rig.panel.size_mm,
+        panel_depth_mm: rig.panel.depth_mm,
+        layers: points.iter().map(|p| p.layer + 1).max().unwrap_or(0),
+        points,
+        counts,
+        simulated: !summary.entries.is_empty() && summary.entries.iter().all(|e| e.surface.origin == "simulated"),
+    })
+}
+
+// Where it stands on the server's disk is nobody's matter.
+fn name(location: &str) -> &str {
+    location.split(['/', '\\']).rfind(|part| !part.is_empty()).unwrap_or("lake")
+}

@@ -1,0 +1,182 @@
+//! All surfaces in short, read once a snapshot and held in memory: what facets, map and correlations begin with.
+
+use std::collections::HashMap;
+
+use serde::{Deserialize, Serialize};
+use serde_json::{Map, Value};
+
+use super::asked::Asked;
+use super::lake::{Band, bands};
+use crate::fault::Fault;
+
+/// Nanoseconds of a day.
+const DAY_NS: f64 = 86_400e9;
+
+/// A surface as the pages know it.
+#[derive(Debug, Serialize)]
+pub(super) struct Surface {
+    pub(super) surface_id: String,
+    pub(super) run_id: Option<String>,
+    panel: String,
+    side: Option<i32>,
+    pub(super) typology: String,
+    pub(super) macrostructure: Option<String>,
+    pub(super) mesostructure: Option<String>,
+    microstructure: Option<String>,
+    pub(super) material: String,
+    pub(super) flat_reference: String,
+    foam_reference: String,
+    pub(super) origin: String,
+    started: Option<String>,
+    relief_min_mm: Option<f64>,
+    relief_max_mm: Option<f64>,
+    pub(super) relief_rms_mm: Option<f64>,
+    level_db: Vec<Option<f64>>,
+    pub(super) against_flat_db: Vec<Option<f64>>,
+    pub(super) spread_db: Vec<Option<f64>>,
+}
+
+/// A surface, and what it is found and compared by.
+pub(super) struct Entry {
+    pub(super) surface: Surface,
+    /// Of its relief's generator.
+    pub(super) parameters: Map<String, Value>,
+    pub(super) mesh_triangles: Option<i64>,
+    pub(super) mesh_watertight: Option<bool>,
+    pub(super) reflection_factor: Option<f64>,
+    /// Start of its run, days since 1970.
+    pub(super) day: Option<f64>,
+    /// What the search looks in, in small letters.
+    pub(super) words: String,
+}
+
+impl Entry {
+    /// From the lowest to the highest point.
+    pub(super) fn relief_range_mm(&self) -> Option<f64> {
+        Some(self.surface.relief_max_mm? - self.surface.relief_min_mm?)
+    }
+}
+
+/// All surfaces, by name.
+pub(super) struct Summary {
+    pub(super) bands: Vec<Band>,
+    pub(super) entries: Vec<Entry>,
+    places: HashMap<String, usize>,
+}
+
+#[derive(Deserialize)]
+struct Row {
+    surface_id: String,
+    run_id: Option<String>,
+    panel: String,
+    side: Option<i32>,
+    typology: String,
+    macrostructure: Option<String>,
+    mesostructure: Option<String>,
+    microstructure: Option<String>,
+    material: Option<String>,
+    flat_reference: String,
+    foam_reference: String,
+    parameters: Option<String>,
+    mesh_triangles: Option<i64>,
+    mesh_watertight: Option<bool>,
+    reflection_factor: Option<f64>,
+    relief_min_mm: Option<f64>,
+    relief_max_mm: Option<f64>,
+    relief_rms_mm: Option<f64>,
+    origin: String,
+    started: Option<String>,
+    started_ns: Option<f64>,
+}
+
+#[derive(Deserialize)]
+struct Stat {
+    surface_id: String,
+    band: String,
+    p90_mean_db: Option<f64>,
+    spread_db: Option<f64>,
+}
+
+/// Level and spread of a surface by band.
+type Stats = HashMap<String, HashMap<String, (Option<f64>, Option<f64>)>>;
+
+const SURFACES: &str = "select s.surface_id, s.run_id, s.panel, s.side, s.typology, s.macrostructure, s.mesostructure, \
+    s.microstructure, s.material, s.flat_reference, s.foam_reference, s.parameters, s.mesh_triangles, s.mesh_watertight, \
+    s.reflection_factor, s.relief_min_mm, s.relief_max_mm, s.relief_rms_mm, s.origin, r.started, r.started_ns \
+    from surfaces s left join runs r on r.run_id = s.run_id order by s.surface_id, s.run_id";
+const STATS: &str = "select surface_id, band, p90_mean_db, spread_db from surface_stats order by surface_id, run_id";
+
+impl Summary {
+    /// # Errors
+    /// Those of its queries.
+    pub(super) async fn read(asked: &Asked) -> Result<Self, Fault> {
+        let (rows, stats) =
+            tokio::try_join!(asked.rows::<Row>(SURFACES, Vec::new()), asked.rows::<Stat>(STATS, Vec::new()))?;
+        let mut levels = Stats::new();
+        for stat in stats {
+            levels.entry(stat.surface_id).or_default().insert(stat.band, (stat.p90_mean_db, stat.spread_db));
+        }
+        let bands = bands(asked.catalogue.lake().rig());
+        // The newest of several rows counts, as run names sort by time.
+        let newest: HashMap<_, _> = rows.into_iter().map(|row| (row.surface_id.clone(), row)).collect();
+        let mut entries: Vec<_> = newest.into_values().map(|row| entry(row, &levels, &bands)).collect();
+        entries.sort_by(|a, b| a.surface.surface_id.cmp(&b.surface.surface_id));
+        let places = entries.iter().enumerate().map(|(i, e)| (e.surface.surface_id.clone(), i)).collect();
+        Ok(Self { bands, entries, places })
+    }
+
+    /// The surface of a name.
+    pub(super) fn entry(&self, surface: &str) -> Option<&Entry> {
+        self.places.get(surface).map(|place| &self.entries[*place])
+    }
+}
+
+fn entry(row: Row, levels: &Stats, bands: &[Band]) -> Entry {
+    let of = |surface: &str| -> Vec<_> {
+        let own = levels.get(surface);
+        bands.iter().map(|band| own.and_then(|own| own.get(&band.key)).copied().unwrap_or_default()).collect()
+    };
+    let (own, flat) = (of(&row.surface_id), of(&row.flat_reference));
+    let against = own.iter().zip(&flat).map(|(own, flat)| Some(own.0? - flat.0?)).collect();
+    let parameters = row.parameters.unwrap_or_default();
+    let some = |text: &Option<String>| text.clone().unwrap_or_default();
+    let words = [
+        &row.surface_id,
+        &row.panel,
+        &row.typology,
+        &some(&row.macrostructure),
+        &some(&row.mesostructure),
+        &some(&row.microstructure),
+        &some(&row.material),
+        &parameters,
+    ];
+    Entry {
+        words: words.map(|w| w.to_lowercase()).join(" "),
+        parameters: serde_json::from_str(&parameters).unwrap_or_default(),
+        mesh_triangles: row.mesh_triangles,
+        mesh_watertight: row.mesh_watertight,
+        reflection_factor: row.reflection_factor,
+        day: row.started_ns.map(|ns| ns / DAY_NS),
+        surface: Surface {
+            surface_id: row.surface_id,
+            run_id: row.run_id,
+            panel: row.panel,
+            side: row.side,
+            typology: row.typology,
+            macrostructure: row.macrostructure,
+            mesostructure: row.mesostructure,
+            microstructure: row.microstructure,
+            material: row.material.unwrap_or_default(),
+            flat_reference: row.flat_reference,
+            foam_reference: row.foam_reference,
+            origin: row.origin,
+            started: row.started,
+            relief_min_mm: row.relief_min_mm,
+            relief_max_mm: row.relief_max_mm,
+            relief_rms_mm: row.relief_rms_mm,
+            level_db: own.iter().map(|own| own.0).collect(),
+            against_flat_db: against,
+            spread_db: own.iter().map(|own| own.1).collect(),
+        },
+    }
+}

@@ -1,0 +1,73 @@
+//! `GET /api/v1/surfaces/{surface_id}/pairs/{pair_id}/ir.wav`: a response to listen to, slowed down to full scale.
+
+use super::asked::Asked;
+use super::content::Content;
+use super::pair::{measurement, reflected};
+use crate::fault::Fault;
+
+/// The panels are a tenth of the walls that they stand for: so are the wavelengths.
+const SCALE: usize = 10;
+/// IEEE floats, in WAVE's words.
+const FLOATS: u16 = 3;
+const SAMPLE_BYTES: u16 = 4;
+/// From the file's beginning to its samples: RIFF, `fmt ` with an empty extension, `fact`, `data`.
+const HEAD: usize = 58;
+
+/// The response as 32-bit float WAV, whose rate is the rig's over `slowdown`.
+pub(super) async fn wav(asked: Asked) -> Result<Content, Fault> {
+    let entry = asked.surface().await?;
+    let signal = asked.params.choice("signal", &["reflected", "measured"])?;
+    let slowdown = asked.params.whole("slowdown", 1..=100)?.unwrap_or(SCALE);
+    let (pair, measurement) = measurement(&asked, entry).await?;
+    let id = &entry.surface.surface_id;
+    let samples = match signal {
+        "measured" => Some(measurement.ir),
+        _ => {
+            let [own, _] = reflected(&asked, entry, pair).await?;
+            own
+        }
+    };
+    let hint = "its Foam is missing; ask for signal=measured";
+    let what = || format!("pair {pair} of surface `{id}`");
+    let samples = samples.ok_or_else(|| Fault::NoData { what: what(), data: "reflected response", hint })?;
+    let rate_hz = asked.catalogue.lake().rig().sweep.rate_hz.get() / slowdown as f64;
+    Ok(Content::new("audio/wav", file(&samples, rate_hz.round() as u32)).named(format!("{id}-{pair}-{signal}.wav")))
+}
+
+fn file(samples: &[f64], rate_hz: u32) -> Vec<u8> {
+    let data = samples.len() as u32 * u32::from(SAMPLE_BYTES);
+    let mut file = Vec::with_capacity(HEAD + data as usize);
+    file.extend(b"RIFF");
+    file.extend((HEAD as u32 - 8 + data).to_le_bytes());
+    file.extend(b"WAVEfmt ");
+    file.extend(18_u32.to_le_bytes());
+    file.extend(FLOATS.to_le_bytes());
+    file.extend(1_u16.to_le_bytes());
+    file.extend(rate_hz.to_le_bytes());
+    file.extend((rate_hz * u32::from(SAMPLE_BYTES)).to_le_bytes());
+    file.extend(SAMPLE_BYTES.to_le_bytes());
+    file.extend((8 * SAMPLE_BYTES).to_le_bytes());
+    file.extend(0_u16.to_le_bytes());
+    file.extend(b"fact");
+    file.extend(4_u32.to_le_bytes());
+    file.extend((samples.len() as u32).to_le_bytes());
+    file.extend(b"data");
+    file.extend(data.to_le_bytes());
+    samples.iter().for_each(|sample| file.extend((*sample as f32).to_le_bytes()));
+    file
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_file_says_what_is_in_it() {
+        let file = file(&[0.5, -0.25], 9600);
+        assert_eq!(file.len(), HEAD + 8);
+        let number = |at: usize| u32::from_le_bytes(file[at..at + 4].try_into().expect("four bytes"));
+        assert_eq!((number(4) as usize, number(24), number(28)), (file.len() - 8, 9600, 38_400));
+        assert_eq!((&file[50..54], number(54)), (b"data".as_slice(), 8));
+        assert_eq!(file[HEAD..HEAD + 4], 0.5_f32.to_le_bytes());
+    }
+}

@@ -1,0 +1,36 @@
+//! `POST /api/v1/session`: a token becomes a cookie, because pictures and downloads of a page can send no header.
+
+use axum::extract::State;
+use axum::extract::rejection::BytesRejection;
+use axum::http::{StatusCode, header};
+use axum::response::IntoResponse;
+use bytes::Bytes;
+use serde::Deserialize;
+
+use super::guard::COOKIE;
+use super::problem::Problem;
+use crate::fault::Fault;
+use crate::service::Service;
+use crate::sessions::LIFETIME;
+
+/// Bytes of a request: a token is short.
+const LARGEST: usize = 4096;
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Shown {
+    token: String,
+}
+
+/// Begins a session.
+pub(super) async fn post(
+    State(service): State<Service>,
+    body: Result<Bytes, BytesRejection>,
+) -> Result<impl IntoResponse, Problem> {
+    let body = body.ok().filter(|b| b.len() <= LARGEST).ok_or(Fault::TooLarge { limit: LARGEST })?;
+    let Shown { token } = serde_json::from_slice(&body)
+        .map_err(|_| Fault::request("the body is not as expected; hint: {\"token\": \"echolake_...\"}"))?;
+    let secret = service.access().begin_session(&token).inspect_err(|f| service.metrics().failed(f.code()))?;
+    let cookie = format!("{COOKIE}={secret}; HttpOnly; SameSite=Strict; Path=/; Max-Age={}", LIFETIME.as_secs());
+    Ok((StatusCode::NO_CONTENT, [(header::SET_COOKIE, cookie)]))
+}

@@ -1,0 +1,66 @@
+//! Sessions of browsers: a secret in a cookie stands for the token that was shown once, because pictures and downloads of
+//! a page can send no `Authorization` header. Kept in memory, as hashes, for half a day.
+
+use std::io;
+use std::sync::{Mutex, PoisonError};
+use std::time::{Duration, Instant};
+
+use sha2::{Digest as _, Sha256};
+
+use crate::random;
+
+/// How long a session is good for.
+pub(crate) const LIFETIME: Duration = Duration::from_secs(12 * 3600);
+/// Sessions that are kept; the oldest goes first.
+const MOST: usize = 1000;
+
+/// The sessions of a server.
+#[derive(Default)]
+pub(crate) struct Sessions(Mutex<Vec<Session>>);
+
+struct Session {
+    // A hash tells nothing by the time that its comparison takes.
+    hash: [u8; 32],
+    holder: usize,
+    begun: Instant,
+}
+
+impl Sessions {
+    /// Begins a session of the holder of a token; returns its secret.
+    ///
+    /// # Errors
+    /// Where the system gives no random bytes.
+    pub(crate) fn begin(&self, holder: usize) -> io::Result<String> {
+        let secret = random::hex(&random::bytes::<32>()?);
+        let mut sessions = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        sessions.retain(|s| s.begun.elapsed() < LIFETIME);
+        if sessions.len() >= MOST {
+            sessions.remove(0);
+        }
+        sessions.push(Session { hash: Sha256::digest(&secret).into(), holder, begun: Instant::now() });
+        Ok(secret)
+    }
+
+    /// Whose session it is.
+    pub(crate) fn holder(&self, secret: &str) -> Option<usize> {
+        let hash: [u8; 32] = Sha256::digest(secret).into();
+        let sessions = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        sessions.iter().find(|s| s.hash == hash && s.begun.elapsed() < LIFETIME).map(|s| s.holder)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_oldest_goes_first() {
+        let sessions = Sessions::default();
+        let first = sessions.begin(1).expect("random bytes");
+        assert_eq!((sessions.holder(&first), sessions.holder("")), (Some(1), None));
+        for _ in 0..MOST {
+            sessions.begin(2).expect("random bytes");
+        }
+        assert_eq!(sessions.holder(&first), None);
+    }
+}

@@ -1,0 +1,171 @@
+//! Hostile input against a server: changed SQL, changed bytes of each protocol, changed run files. Whatever comes, the
+//! process goes on, nothing in it panics, and it answers the next client.
+
+use std::path::Path;
+use std::time::Duration;
+
+use rand::{Rng as _, SeedableRng as _};
+use rand_chacha::ChaCha8Rng;
+
+use super::SMALL_RIG;
+use super::serve::http::Request;
+use super::serve::server::Served;
+
+mod bytes;
+mod sql;
+
+/// How long one changed query may take, and what it may hold.
+const LIMITS: &str = "seconds = 2\nmemory_mb = 200\nrows = 100000\n";
+/// How long a server may take to close a connection that sends nonsense.
+const PATIENCE: Duration = Duration::from_secs(1);
+
+/// What is changed.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Target {
+    /// The text of queries, over HTTP.
+    Sql,
+    /// The bytes of HTTP, Flight SQL and Postgres' protocol.
+    Wire,
+    /// A run's file, which queries then read in place.
+    Mcap,
+}
+
+impl Target {
+    /// All targets.
+    pub(crate) const ALL: [Self; 3] = [Self::Sql, Self::Wire, Self::Mcap];
+
+    /// Its name on a command line.
+    pub(crate) fn name(self) -> &'static str {
+        match self {
+            Self::Sql => "sql",
+            Self::Wire => "wire",
+            Self::Mcap => "mcap",
+        }
+    }
+}
+
+/// How a campaign went.
+#[derive(Debug, Default)]
+pub(crate) struct Outcome {
+    pub(crate) rounds: usize,
+    /// Rounds whose query was answered with rows.
+    pub(crate) answered: usize,
+    /// Most that the process weighed after a round, KiB.
+    pub(crate) resident_kib: u64,
+}
+
+/// A server and what is thrown at it.
+pub(crate) struct Campaign {
+    folder: tempfile::TempDir,
+    server: Served,
+    token: String,
+    random: ChaCha8Rng,
+    run: Vec<u8>,
+}
+
+impl Campaign {
+    /// Measures a surface, ingests it, and serves the lake.
+    pub(crate) fn new(binary: &Path, seed: u64) -> Self {
+        let folder = tempfile::tempdir().expect("a folder");
+        let path = |name: &str| folder.path().join(name);
+        std::fs::write(path("rig.toml"), SMALL_RIG).expect("written");
+        let run = |args: &[&str]| {
+            let output = std::process::Command::new(binary)
+                .args(["--lake", "lake"])
+                .args(args)
+                .current_dir(folder.path())
+                .env_remove("ECHOLAKE_LAKE")
+                .output()
+                .expect("the command starts");
+            assert!(output.status.success(), "{args:?}: {}", String::from_utf8_lossy(&output.stderr));
+            output
+        };
+        run(&["acquire", "--surface", "flat", "--rig", "rig.toml"]);
+        run(&["ingest"]);
+        let made = run(&["token", "fuzz"]);
+        let token = String::from_utf8_lossy(&made.stderr).lines().next().expect("a token").to_owned();
+        let entry = String::from_utf8(made.stdout).expect("text");
+        std::fs::write(path("tokens.toml"), format!("{entry}{LIMITS}")).expect("written");
+        let server = Served::start(binary, folder.path(), &["--tokens", "tokens.toml", "--memory", "1000"]);
+        let file = run_file(&path("lake/runs/flat"));
+        let bytes = std::fs::read(file).expect("a run");
+        Self { server, token, random: ChaCha8Rng::seed_from_u64(seed), run: bytes, folder }
+    }
+
+    /// Throws one thing after the other for as long as `go_on` says.
+    ///
+    /// # Panics
+    /// Where the server is harmed; the text has the input.
+    pub(crate) fn throw(&mut self, target: Target, go_on: &mut dyn FnMut(&Outcome) -> bool) -> Outcome {
+        let mut outcome = Outcome::default();
+        while go_on(&outcome) {
+            let (thrown, answered) = match target {
+                Target::Sql => self.sql(),
+                Target::Wire => self.wire(),
+                Target::Mcap => self.mcap(),
+            };
+            outcome.rounds += 1;
+            outcome.answered += usize::from(answered);
+            self.is_well(&thrown);
+            outcome.resident_kib = outcome.resident_kib.max(self.server.resident_kib());
+        }
+        outcome
+    }
+
+    fn is_well(&mut self, thrown: &str) {
+        assert!(self.server.is_up(), "the server ended by: {thrown}");
+        let said = self.server.said();
+        assert!(!said.iter().any(|line| line.contains("panicked")), "{thrown}: {said:?}");
+        let answer = self.ask("select 41 + 1 as n");
+        assert_eq!((answer.0, answer.1.trim()), (200, r#"[{"n":42}]"#), "after: {thrown}");
+    }
+
+    fn ask(&self, query: &str) -> (u16, String) {
+        let answer = Request::post("/api/v1/sql", query)
+            .with("content-type", "text/plain")
+            .with("authorization", &format!("Bearer {}", self.token))
+            .send(&self.server);
+        (answer.status, String::from_utf8_lossy(&answer.body).into_owned())
+    }
+
+    fn asked(&self, query: &str) -> bool {
+        let (status, body) = self.ask(query);
+        // Out of time, of memory, or of rows is what limits are for.
+        assert!(status < 500 || status == 503 || status == 504, "{status} by {query:?}: {body}");
+        status == 200
+    }
+
+    fn sql(&mut self) -> (String, bool) {
+        let query = sql::changed(&mut self.random);
+        let answered = self.asked(&query);
+        (query, answered)
+    }
+
+    fn wire(&mut self) -> (String, bool) {
+        let (name, address, bytes) = match self.random.random_range(0..3) {
+            0 => ("HTTP", &self.server.http, bytes::http(&mut self.random, &self.token)),
+            1 => ("Postgres", &self.server.postgres, bytes::postgres(&mut self.random, &self.token)),
+            _ => ("Flight SQL", &self.server.flight_sql, bytes::http2(&mut self.random)),
+        };
+        let heard = bytes::send(address, &bytes, PATIENCE);
+        (format!("{name}: {}", bytes.escape_ascii()), heard > 0)
+    }
+
+    fn mcap(&mut self) -> (String, bool) {
+        let mut changed = self.run.clone();
+        let changes = bytes::change(&mut self.random, &mut changed);
+        let file = run_file(&self.folder.path().join("lake/runs/flat"));
+        std::fs::write(&file, &changed).expect("written");
+        let function =
+            ["mcap_topics('flat')", "mcap_messages('flat')", "mcap('flat', '/ir')", "mcap('flat', '/sweep')"]
+                [self.random.random_range(0..4)];
+        let answered = self.asked(&format!("select * from {function} limit 100"));
+        std::fs::write(&file, &self.run).expect("written");
+        (format!("{function} with {changes}"), answered)
+    }
+}
+
+fn run_file(folder: &Path) -> std::path::PathBuf {
+    let mut entries = std::fs::read_dir(folder).expect("a folder").flatten().map(|e| e.path());
+    entries.find(|p| p.extension().is_some_and(|e| e == "mcap")).expect("a run's file")
+}

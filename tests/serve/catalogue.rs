@@ -1,0 +1,339 @@
+//! The catalogue over HTTP: the contract, files in ranges, what is kept, sessions, and what must stay data.
+
+use serde_json::Value;
+
+use super::contract::Contract;
+use super::http::{Answer, Request};
+use super::served;
+use super::server::Served;
+use crate::Place;
+
+/// Reliefs with both references, so that every answer has something in it.
+fn lake() -> Place {
+    let place = Place::new();
+    for surface in ["flat", "foam", "brick"] {
+        place.acquire(surface, &["--ir-only"]);
+    }
+    place.ok(&["ingest"]);
+    place
+}
+
+fn get(server: &Served, path: &str) -> Answer {
+    Request::get(path).send(server)
+}
+
+fn json(answer: &Answer) -> Value {
+    serde_json::from_slice(&answer.body).unwrap_or_else(|e| panic!("{e}: {}", String::from_utf8_lossy(&answer.body)))
+}
+
+fn run_of(server: &Served, surface: &str) -> String {
+    let runs = json(&get(server, &format!("/api/v1/runs?surface_id={surface}")));
+    runs["items"][0]["run_id"].as_str().expect("a run").to_owned()
+}
+
+/// The path with its parts filled in.
+fn filled(template: &str, surface: &str, run: &str, file: &str) -> String {
+    let parts =
+        [("{surface_id}", surface), ("{run_id}", run), ("{pair_id}", "7"), ("{table}", "points"), ("{file}", file)];
+    let path = parts.into_iter().fold(template.to_owned(), |path, (name, value)| path.replace(name, value));
+    if path.ends_with("/grid") { format!("{path}?microphone=0") } else { path }
+}
+
+#[test]
+fn every_path_keeps_the_contract() {
+    let place = lake();
+    let server = served(&place, &[]);
+    let contract = Contract::read();
+    let run = run_of(&server, "brick");
+    let files = json(&get(&server, "/api/v1/tables/points"));
+    let file = files[0]["file"].as_str().expect("a file");
+    let check = |template: &str, path: &str, status: u16| {
+        let answer = get(&server, path);
+        let media_type = answer.header("content-type").unwrap_or_default();
+        let objections = contract.objections(template, answer.status, media_type, &answer.body);
+        assert!(objections.is_empty(), "{path}: {objections:?}");
+        assert_eq!(answer.status, status, "{path}: {}", String::from_utf8_lossy(&answer.body));
+        assert_eq!(answer.header("x-content-type-options"), Some("nosniff"));
+    };
+    for template in contract.gets() {
+        check(template, &filled(template, "brick", &run, file), 200);
+        for (surface, run, file) in [("none", "none", "none"), ("..%2F..%2Fetc", "%00", "..%2F..%2Flake.toml")] {
+            if template.contains("{surface_id}") || template.contains("{run_id}") || template.contains("{file}") {
+                check(template, &filled(template, surface, run, file), 404);
+            }
+        }
+    }
+    for (template, path) in [
+        ("/api/v1/surfaces", "/api/v1/surfaces?level=nonsense:1..2"),
+        ("/api/v1/surfaces", "/api/v1/surfaces?level=2500:a..b"),
+        ("/api/v1/surfaces", "/api/v1/surfaces?limit=0"),
+        ("/api/v1/surfaces", "/api/v1/surfaces?limit=501"),
+        ("/api/v1/surfaces", "/api/v1/surfaces?sort=surface_id;drop"),
+        ("/api/v1/runs", "/api/v1/runs?order=up"),
+        ("/api/v1/surfaces/{surface_id}/grid", "/api/v1/surfaces/brick/grid?microphone=10"),
+        ("/api/v1/surfaces/{surface_id}/grid", "/api/v1/surfaces/brick/grid"),
+        ("/api/v1/surfaces/{surface_id}/pairs/{pair_id}", "/api/v1/surfaces/brick/pairs/-1"),
+        ("/api/v1/map", "/api/v1/map?neighbours=21"),
+    ] {
+        check(template, path, 400);
+    }
+}
+
+#[test]
+fn curves_and_responses_come_as_arrow_too() {
+    let place = lake();
+    let server = served(&place, &[]);
+    for path in ["/api/v1/surfaces/brick/curves", "/api/v1/surfaces/brick/pairs/7"] {
+        let arrow = Request::get(path).with("accept", "application/vnd.apache.arrow.stream").send(&server);
+        assert_eq!(arrow.header("content-type"), Some("application/vnd.apache.arrow.stream"));
+        assert_eq!(arrow.body[..4], [0xff; 4], "a stream's first message");
+        let plain = get(&server, path);
+        assert_eq!(plain.header("content-type"), Some("application/json"));
+        assert_ne!(plain.header("etag"), arrow.header("etag"));
+    }
+}
+
+#[test]
+fn numbers_are_those_of_sql() {
+    let place = lake();
+    let server = served(&place, &[]);
+    let grid = json(&get(&server, "/api/v1/surfaces/brick/grid?microphone=3&over=flat-band"));
+    let rows = place.sql(
+        "select case when microphone = 3 then speaker else microphone end as point, microphone <> 3 as swapped, pair_id, \
+         10 * log10(tnce_band_10000) as level from tnce where surface_id = 'brick' and (microphone = 3 or speaker = 3)",
+    );
+    assert!(rows.len() > 5, "{rows:?}");
+    for row in &rows {
+        let point = row["point"].as_u64().expect("a point") as usize;
+        assert_eq!((&grid["pairs"][point], &grid["swapped"][point]), (&row["pair_id"], &row["swapped"]));
+        let level = grid["bands"][2][point].as_f64().expect("a level");
+        assert!((level - row["level"].as_f64().expect("a level")).abs() < 1e-5, "{row:?} {level}");
+    }
+    let pair = json(&get(&server, "/api/v1/surfaces/brick/pairs/7"));
+    let ir = &place.sql("select ir from measurements where surface_id = 'brick' and pair_id = 7")[0]["ir"];
+    assert_eq!(&pair["measured"], ir);
+    let map = json(&get(&server, "/api/v1/map"));
+    let placed = map["points"].as_array().expect("points").len() + map["left_out"].as_array().expect("names").len();
+    assert_eq!(placed, 3, "{map}");
+    let wav = get(&server, "/api/v1/surfaces/brick/pairs/7/ir.wav?signal=measured");
+    assert_eq!(wav.body[..4], *b"RIFF");
+    assert_eq!(wav.body.len(), 58 + 4 * ir.as_array().expect("samples").len());
+    let png = get(&server, "/api/v1/surfaces/brick/thumbnail.png");
+    assert_eq!(png.body[1..4], *b"PNG");
+    let glb = get(&server, "/api/v1/surfaces/brick/mesh.glb");
+    assert_eq!(glb.body[..4], *b"glTF");
+    let heights = get(&server, "/api/v1/surfaces/brick/heightmap");
+    let cells = place.number("select max(cells) from heightmaps") as usize;
+    assert_eq!(heights.body.len(), 4 * cells * cells);
+    let run = json(&get(&server, &format!("/api/v1/runs/{}", run_of(&server, "brick"))));
+    let topic = run["topics"].as_array().expect("topics").iter().find(|t| t["topic"] == "/ir").expect("responses");
+    assert_eq!(topic["messages"], 45);
+    assert!(topic["bytes"].as_u64() > Some(45 * 384 * 4), "{topic}");
+}
+
+#[test]
+fn facets_leave_their_own_filter_out() {
+    let place = lake();
+    let server = served(&place, &[]);
+    let counts = |page: &Value, facet: &str| -> Vec<(String, u64)> {
+        let facet = page["facets"].as_array().expect("facets").iter().find(|f| f["name"] == facet).expect("a facet");
+        let pair = |v: &Value| (v["value"].as_str().expect("text").to_owned(), v["count"].as_u64().expect("a count"));
+        facet["values"].as_array().expect("values").iter().map(pair).collect()
+    };
+    let all = json(&get(&server, "/api/v1/surfaces"));
+    let typologies = counts(&all, "typology");
+    assert_eq!((all["total"].as_u64(), typologies.iter().map(|t| t.1).sum::<u64>()), (Some(3), 3));
+    let one = json(&get(&server, "/api/v1/surfaces?typology=reference"));
+    assert_eq!(counts(&one, "typology"), typologies, "its own filter is left out");
+    assert_eq!(one["total"].as_u64(), typologies.iter().find(|t| t.0 == "reference").map(|t| t.1));
+    assert_eq!(counts(&one, "origin").iter().map(|o| o.1).sum::<u64>(), one["total"].as_u64().expect("a count"));
+    let nothing = json(&get(&server, "/api/v1/surfaces?q=no+such+relief"));
+    assert_eq!((&nothing["total"], nothing["items"].as_array().map(Vec::len)), (&Value::from(0), Some(0)));
+    let sorted = json(&get(&server, "/api/v1/surfaces?sort=level&order=desc&limit=2&offset=1"));
+    assert_eq!(sorted["items"].as_array().map(Vec::len), Some(2));
+}
+
+#[test]
+fn answers_are_kept_until_the_lake_changes() {
+    let place = lake();
+    let server = served(&place, &[]);
+    let before = get(&server, "/api/v1/surfaces");
+    let tag = before.header("etag").expect("a tag").to_owned();
+    let again = Request::get("/api/v1/surfaces").with("if-none-match", &tag).send(&server);
+    assert_eq!((again.status, again.body.len()), (304, 0));
+    let packed = Request::get("/api/v1/surfaces").with("accept-encoding", "gzip").send(&server);
+    assert_eq!(packed.header("content-encoding"), Some("gzip"));
+    assert!(packed.body.len() < before.body.len() / 2);
+    place.acquire("wavy", &["--ir-only"]);
+    place.ok(&["ingest"]);
+    let after = Request::get("/api/v1/surfaces").with("if-none-match", &tag).send(&server);
+    assert_eq!((after.status, json(&after)["total"].as_u64()), (200, Some(4)));
+    assert_ne!(after.header("etag"), Some(tag.as_str()));
+}
+
+#[test]
+fn run_files_come_in_ranges_to_viewers_of_elsewhere() {
+    let place = lake();
+    let server = served(&place, &[]);
+    let run = run_of(&server, "brick");
+    let path = format!("/api/v1/runs/{run}/file.mcap");
+    let file = std::fs::read(place.path(&format!("lake/runs/brick/{run}.mcap"))).expect("the file");
+    let foreign = || Request::get(&path).with("origin", "https://viewer.example").with("sec-fetch-site", "cross-site");
+    // A viewer begins with a plain GET and breaks it off once it has seen the headers.
+    drop(foreign().begin(&server));
+    let whole = foreign().send(&server);
+    assert_eq!((whole.status, &whole.body), (200, &file));
+    for (name, value) in [
+        ("access-control-allow-origin", "*"),
+        ("accept-ranges", "bytes"),
+        ("cross-origin-resource-policy", "cross-origin"),
+        ("content-length", &file.len().to_string()),
+    ] {
+        assert_eq!(whole.header(name), Some(value), "{name}");
+    }
+    let exposed = whole.header("access-control-expose-headers").expect("a list").to_ascii_lowercase();
+    for name in ["accept-ranges", "content-length", "content-range", "etag"] {
+        assert!(exposed.contains(name), "{name} in {exposed}");
+    }
+    assert!(whole.header("access-control-allow-credentials").is_none());
+    let tag = whole.header("etag").expect("a tag").to_owned();
+    let last = file.len() - 1;
+    let part = |range: &str| foreign().with("range", range).send(&server);
+    for (range, from, to) in
+        [("bytes=0-7", 0, 7), ("bytes=-8", last - 7, last), (&*format!("bytes={}-", last), last, last)]
+    {
+        let answer = part(range);
+        assert_eq!((answer.status, &answer.body[..]), (206, &file[from..=to]), "{range}");
+        assert_eq!(answer.header("content-range"), Some(&*format!("bytes {from}-{to}/{}", file.len())));
+    }
+    let beyond = part(&format!("bytes={}-", file.len()));
+    assert_eq!((beyond.status, json(&beyond)["code"].as_str()), (416, Some("range_not_satisfiable")));
+    assert_eq!(beyond.header("content-range"), Some(&*format!("bytes */{}", file.len())));
+    assert_eq!(foreign().with("if-none-match", &tag).send(&server).status, 304);
+    let ranged = |known: &str| foreign().with("range", "bytes=0-7").with("if-range", known).send(&server).status;
+    assert_eq!((ranged(&tag), ranged("\"other\"")), (206, 200));
+    let asked = Request::options(&path)
+        .with("origin", "https://viewer.example")
+        .with("access-control-request-method", "GET")
+        .with("access-control-request-headers", "range")
+        .with("access-control-request-private-network", "true")
+        .send(&server);
+    assert_eq!(asked.status, 200);
+    assert!(asked.header("access-control-allow-headers").is_some_and(|h| h.contains("range")));
+    assert_eq!(asked.header("access-control-allow-private-network"), Some("true"));
+    // All else is for the server's own pages.
+    let other = |path: &str| Request::get(path).with("origin", "https://viewer.example").send(&server);
+    assert_eq!(other("/api/v1/runs").status, 403);
+    assert_eq!(other("/api/v1/tables/points").status, 403);
+}
+
+#[test]
+fn what_is_asked_stays_data() {
+    let place = lake();
+    let server = served(&place, &[]);
+    for text in [
+        "'%20or%201=1--",
+        "brick'%20union%20select%20*%20from%20runs--",
+        "%3Cimg%20src=x%20onerror=alert(1)%3E",
+        "%24%7B7*7%7D",
+        "..%2f..%2flake.toml",
+        "%00",
+        "brick%0d%0aset-cookie:%20a=b",
+        "%F0%9F%A7%B1",
+    ] {
+        for path in [
+            "/api/v1/surfaces/X",
+            "/api/v1/surfaces/X/grid?microphone=0",
+            "/api/v1/runs/X",
+            "/api/v1/runs/X/file.mcap",
+            "/api/v1/tables/X",
+            "/api/v1/tables/runs/X",
+        ] {
+            let answer = get(&server, &path.replace('X', text));
+            assert_eq!(
+                (answer.status, answer.header("content-type")),
+                (404, Some("application/problem+json")),
+                "{path} {text}"
+            );
+            assert_eq!(answer.header("set-cookie"), None);
+        }
+        for path in [
+            "/api/v1/surfaces?q=X",
+            "/api/v1/surfaces?typology=X",
+            "/api/v1/runs?q=X",
+            "/api/v1/runs?surface_id=X",
+            "/api/v1/correlations?typology=X",
+        ] {
+            let answer = get(&server, &path.replace('X', text));
+            assert_eq!(answer.status, 200, "{path} {text}");
+            let (total, surfaces) = (json(&answer)["total"].as_u64(), json(&answer)["surfaces"].as_u64());
+            assert_eq!(total.or(surfaces), Some(0), "{path} {text}");
+        }
+        for path in
+            ["/api/v1/surfaces?sort=X", "/api/v1/surfaces?sort_band=X", "/api/v1/runs?sort=X", "/api/v1/runs?offset=X"]
+        {
+            assert_eq!(get(&server, &path.replace('X', text)).status, 400, "{path} {text}");
+        }
+    }
+    // Bytes that are no text.
+    assert_eq!(get(&server, "/api/v1/surfaces/%ff").status, 400);
+    let wrong = Request::post("/api/v1/lake", "").send(&server);
+    assert_eq!((wrong.status, json(&wrong)["code"].as_str()), (405, Some("method_not_allowed")));
+    assert!(wrong.header("allow").is_some_and(|methods| methods.contains("GET")), "{:?}", wrong.header("allow"));
+}
+
+#[test]
+fn a_session_stands_for_a_token() {
+    let place = lake();
+    let open = served(&place, &[]);
+    let shown = |server: &Served, token: &str| {
+        let body = serde_json::json!({ "token": token }).to_string();
+        Request::post("/api/v1/session", &body).with("content-type", "application/json").send(server)
+    };
+    assert_eq!(shown(&open, "x").status, 404, "no tokens, no sessions");
+    let made = place.run(&["token", "reader"]);
+    let token = crate::stderr(&made).lines().next().expect("a token").to_owned();
+    std::fs::write(place.path("tokens.toml"), &made.stdout).expect("written");
+    let server = served(&place, &["--tokens", "tokens.toml"]);
+    assert_eq!(get(&server, "/api/v1/surfaces").status, 401);
+    assert_eq!(shown(&server, "wrong").status, 401);
+    let begun = shown(&server, &token);
+    assert_eq!(begun.status, 204);
+    let cookie = begun.header("set-cookie").expect("a cookie");
+    assert!(cookie.contains("; HttpOnly") && cookie.contains("; SameSite=Strict"), "{cookie}");
+    assert!(!cookie.contains(&token), "the token itself is kept nowhere");
+    let cookie = cookie.split(';').next().expect("name and value");
+    let with = |name: &str, value: &str| {
+        Request::get("/api/v1/surfaces").with("cookie", cookie).with(name, value).send(&server).status
+    };
+    assert_eq!(with("sec-fetch-site", "same-origin"), 200);
+    assert_eq!(with("sec-fetch-site", "same-site"), 403, "a page on another port of this machine");
+    assert_eq!(with("origin", "http://localhost:1"), 403);
+    assert_eq!(Request::get("/api/v1/surfaces").with("cookie", "echolake=00").send(&server).status, 401);
+    // What was kept for one is not given to another who may not ask.
+    assert_eq!(get(&server, "/api/v1/surfaces").status, 401);
+}
+
+#[cfg(feature = "web")]
+#[test]
+fn pages_are_part_of_the_program() {
+    let place = lake();
+    let server = served(&place, &[]);
+    for address in ["/", "/surfaces/brick", "/sql?q=select%201"] {
+        // A link on another page leads here.
+        let page = Request::get(address).with("sec-fetch-site", "cross-site").send(&server);
+        assert_eq!((page.status, page.header("content-type")), (200, Some("text/html; charset=utf-8")), "{address}");
+        let policy = page.header("content-security-policy").expect("a policy");
+        assert!(policy.contains("script-src 'self'") && !policy.contains("unsafe"), "{policy}");
+    }
+    let page = get(&server, "/").text();
+    let script = page.split('"').find(|part| part.starts_with("/assets/") && part.ends_with(".js")).expect("a script");
+    let packed = Request::get(script).with("accept-encoding", "gzip, br").send(&server);
+    assert_eq!(packed.header("content-encoding"), Some("br"));
+    assert!(packed.header("cache-control").is_some_and(|c| c.contains("immutable")));
+    assert!(packed.body.len() < get(&server, script).body.len());
+    let tag = packed.header("etag").expect("a tag").to_owned();
+    assert_eq!(Request::get(script).with("if-none-match", &tag).send(&server).status, 304);
+    assert_eq!(get(&server, "/assets/none.js").status, 404);
+    assert_eq!(get(&server, "/favicon.ico").status, 404);
+}

@@ -1,0 +1,107 @@
+//! The catalogue in a browser, and its contract under Schemathesis, against the command itself.
+//!
+//! What these need beside cargo is installed where that is possible: packages of npm in `web/node_modules`, of PyPI in
+//! the target folder, Chromium by apt-get where the test runs as root. Where it is not, a test is skipped and says so;
+//! with `ECHOLAKE_NO_SKIP` set it fails instead.
+
+use std::env;
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::Command;
+
+use super::Place;
+use super::serve::served;
+
+const NO_SKIP: &str = "ECHOLAKE_NO_SKIP";
+const SCHEMATHESIS: &str = "schemathesis==4.32.5";
+
+fn web() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("web")
+}
+
+/// Runs a program to its end; what it said where it failed.
+fn run(command: &mut Command) -> Result<String, String> {
+    let output = command.output().map_err(|e| format!("{command:?}: {e}"))?;
+    let said = [output.stdout, output.stderr].map(|bytes| String::from_utf8_lossy(&bytes).into_owned()).concat();
+    if output.status.success() { Ok(said) } else { Err(format!("{command:?}: {}\n{said}", output.status)) }
+}
+
+/// What could be made ready; None, said aloud, where it could not.
+fn or_skip<T>(test: &str, ready: Result<T, String>) -> Option<T> {
+    match ready {
+        Ok(ready) => Some(ready),
+        Err(why) if env::var_os(NO_SKIP).is_some() => panic!("{test} cannot run: {why}"),
+        Err(why) => {
+            eprintln!("SKIPPED {test}: {why}");
+            None
+        }
+    }
+}
+
+/// The browser; the packages that drive it are installed then.
+fn browser() -> Result<PathBuf, String> {
+    if !web().join("node_modules/playwright-core").exists() {
+        run(Command::new("npm").args(["ci", "--no-audit", "--no-fund"]).current_dir(web()))?;
+    }
+    let known = || {
+        let named = env::var_os("CHROMIUM").map(PathBuf::from);
+        named.into_iter().chain(["/usr/bin/chromium".into()]).find(|path| path.exists())
+    };
+    if let Some(path) = known() {
+        return Ok(path);
+    }
+    run(Command::new("apt-get").args(["install", "-y", "--no-install-recommends", "chromium"]))?;
+    known().ok_or_else(|| "there is no Chromium; hint: name it in $CHROMIUM".to_owned())
+}
+
+fn schemathesis() -> Result<PathBuf, String> {
+    let folder = Path::new(env!("CARGO_TARGET_TMPDIR")).join("schemathesis");
+    let program = folder.join("bin/schemathesis");
+    if !program.exists() {
+        run(Command::new("python3").args(["-m", "venv"]).arg(&folder))?;
+        run(Command::new(folder.join("bin/pip")).args(["install", "--quiet", SCHEMATHESIS]))?;
+    }
+    Ok(program)
+}
+
+/// A lake of the paper's rig: the demo's, without sweeps.
+fn demo() -> Place {
+    let place = Place::new();
+    place.ok(&["demo", "--ir-only", "--no-serve"]);
+    place
+}
+
+#[test]
+fn the_pages_do_what_they_must_in_a_browser() {
+    let Some(browser) = or_skip("the catalogue in a browser", browser()) else { return };
+    let place = demo();
+    let server = served(&place, &[]);
+    let base = format!("http://{}", server.http);
+    let shots = place.path("shots");
+    let shots = shots.to_str().expect("a path");
+    for script in
+        [&["tests/contract.mjs", &base][..], &["tests/behaviour.mjs", &base], &["tests/pages.mjs", &base, shots]]
+    {
+        let done = run(Command::new("node").args(script).current_dir(web()).env("CHROMIUM", &browser));
+        eprintln!("{}", done.unwrap_or_else(|why| panic!("{why}")));
+    }
+    let pictures = fs::read_dir(shots).expect("pictures").count();
+    assert!(pictures >= 7 * 2, "{pictures} pictures of seven pages in two themes");
+}
+
+#[test]
+fn schemathesis_finds_no_breach_of_the_contract() {
+    let Some(program) = or_skip("Schemathesis", schemathesis()) else { return };
+    let place = Place::new();
+    for surface in ["flat", "foam", "brick"] {
+        place.acquire(surface, &["--ir-only"]);
+    }
+    place.ok(&["ingest"]);
+    let server = served(&place, &[]);
+    let done = run(Command::new(program)
+        .args(["run", &format!("http://{}/api/v1/openapi.json", server.http)])
+        .args(["--phases", "examples,coverage,fuzzing", "--checks", "all", "--max-examples", "30", "--seed", "1"])
+        .args(["--suppress-health-check", "all", "--no-color"])
+        .current_dir(place.path("")));
+    eprintln!("{}", done.unwrap_or_else(|why| panic!("{why}")));
+}

@@ -1,0 +1,25 @@
+//! The README's pictures: `node tests/pictures.mjs http://127.0.0.1:8080 ../docs`. PNG with a palette would be smaller, and
+//! Chromium makes none, so each is of one part of a page.
+import { mkdir, stat } from 'node:fs/promises'
+import { chromium } from 'playwright-core'
+
+const [base, folder = '../docs'] = process.argv.slice(2)
+const MOST_BYTES = 200_000
+const get = async (path) => (await fetch(base + path)).json()
+const { items } = await get('/api/v1/surfaces?limit=500')
+const id = (items.find((s) => s.surface_id === 'brick') ?? items.find((s) => s.typology !== 'reference')).surface_id
+const PICTURES = [['wall', '/?sort=level'], ['surface', `/surfaces/${id}?microphone=14&over=flat-band`], ['response', `/surfaces/${id}/pairs/159`]]
+
+await mkdir(folder, { recursive: true })
+const browser = await chromium.launch({ executablePath: process.env.CHROMIUM ?? '/usr/bin/chromium', args: ['--no-sandbox', '--enable-unsafe-swiftshader', '--disable-dev-shm-usage'] })
+const page = await (await browser.newContext({ viewport: { width: 1280, height: 800 }, colorScheme: 'light' })).newPage()
+for (const [name, path] of PICTURES) {
+  await page.goto(base + path, { waitUntil: 'networkidle' })
+  await page.waitForTimeout(1200)
+  const file = `${folder}/${name}.png`
+  await page.screenshot({ path: file })
+  const { size } = await stat(file)
+  process.stdout.write(`${file} ${size} bytes\n`)
+  if (size > MOST_BYTES) throw new Error(`${file} has more than ${MOST_BYTES} bytes`)
+}
+await browser.close()
