@@ -37,7 +37,8 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
          0 lost, 0 doubled, every file whole",
         outcome.killed,
         if power { "power cuts" } else { "kills" },
-        outcome.before_the_file, outcome.runs,
+        outcome.before_the_file,
+        outcome.runs,
         outcome.acknowledged
     )?;
     Ok(())

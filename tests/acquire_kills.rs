@@ -177,11 +177,14 @@ impl Campaign {
         for key in &acknowledged {
             assert!(read.contains_key(key), "{key:?} was acknowledged and is lost");
         }
-        let mut accepted: Vec<_> = read.keys().filter(|(.., v)| v == "accepted").map(|(pair, ..)| *pair as usize).collect();
+        let mut accepted: Vec<_> =
+            read.keys().filter(|(.., v)| v == "accepted").map(|(pair, ..)| *pair as usize).collect();
         accepted.sort_unstable();
         assert_eq!(accepted, (0..PAIRS).collect::<Vec<_>>(), "every pair is accepted once");
         self.ok(&["ingest"]);
-        let count = text(&self.ok(&["sql", "--format", "csv", "select count(*), count(distinct pair_id) from measurements"]).stdout);
+        let count = text(
+            &self.ok(&["sql", "--format", "csv", "select count(*), count(distinct pair_id) from measurements"]).stdout,
+        );
         assert!(count.contains(&format!("{PAIRS},{PAIRS}")), "{count}");
         let state = text(&self.ok(&["sql", "--format", "csv", "select damaged from runs"]).stdout);
         assert!(state.lines().last().is_some_and(|n| n.trim() == "0"), "{state}");
@@ -267,7 +270,9 @@ mod tests {
 
     #[test]
     fn a_few_power_cuts_lose_nothing() {
-        let Some(mut campaign) = Campaign::with_power_cuts(Path::new(env!("CARGO_BIN_EXE_echolake")), 7) else { return };
+        let Some(mut campaign) = Campaign::with_power_cuts(Path::new(env!("CARGO_BIN_EXE_echolake")), 7) else {
+            return;
+        };
         let outcome = campaign.kills(6, &mut |_| {});
         assert_eq!(outcome.killed, 6);
         assert!(outcome.acknowledged >= PAIRS);

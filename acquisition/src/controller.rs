@@ -272,12 +272,7 @@ impl<'a> RunController<'a> {
         error
     }
 
-    fn measure(
-        &mut self,
-        run: &mut Running<'_>,
-        pair: Pair,
-        observe: &mut dyn FnMut(Event<'_>),
-    ) -> Result<(), Error> {
+    fn measure(&mut self, run: &mut Running<'_>, pair: Pair, observe: &mut dyn FnMut(Event<'_>)) -> Result<(), Error> {
         let before = run.tried.get(&pair.id.0).map_or(0, |t| t.attempts);
         let mut objections = Vec::new();
         for attempt in 1..=self.rig.validation.attempts {

@@ -116,6 +116,8 @@ mod tests {
         let folder = Path::new("/data");
         assert_eq!(room(folder, 100, 100), None);
         let finding = room(folder, 99_000_000, 700_000_000).expect("a finding").to_string();
-        assert!(finding.contains("99.0 MB are left") && finding.contains("about 700.0") && finding.contains("--ir-only"));
+        assert!(
+            finding.contains("99.0 MB are left") && finding.contains("about 700.0") && finding.contains("--ir-only")
+        );
     }
 }

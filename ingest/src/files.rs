@@ -107,7 +107,11 @@ pub async fn adopt_cut_off(lake: &Lake) -> Result<Vec<Path>> {
             continue;
         };
         let to = inbox.join(name);
-        if !name.ends_with(".mcap") || to.exists() || is_being_recorded(&partial) || is_made_whole_otherwise(&partial).await {
+        if !name.ends_with(".mcap")
+            || to.exists()
+            || is_being_recorded(&partial)
+            || is_made_whole_otherwise(&partial).await
+        {
             continue;
         }
         let failed = |e: std::io::Error| Error::read(partial.display(), e);

@@ -232,13 +232,7 @@ fn persistently<T>(mut ask: impl FnMut() -> Result<T, RigError>) -> Result<T, Ri
     ask()
 }
 
-fn verdict_on(
-    pair: Pair,
-    attempt: u32,
-    verdict: Verdict,
-    objections: &[Objection],
-    reading: &Reading,
-) -> Measurement {
+fn verdict_on(pair: Pair, attempt: u32, verdict: Verdict, objections: &[Objection], reading: &Reading) -> Measurement {
     Measurement {
         pair_id: pair.id.0,
         attempt,

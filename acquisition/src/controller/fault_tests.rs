@@ -89,8 +89,8 @@ fn rig() -> Rig {
 
 fn simulated(rig: &Rig, fault: Fault, start: Timestamp, seed: u64) -> (Devices, Shared) {
     let relief = Relief::Flat.height_field(60);
-    let inner =
-        devices(&Simulation { rig, relief: &relief, reflection_factor: 0.83, start, seed, arms: None }).expect("devices");
+    let inner = devices(&Simulation { rig, relief: &relief, reflection_factor: 0.83, start, seed, arms: None })
+        .expect("devices");
     let shared = Shared { fault, takes: Arc::default(), moves: Arc::default(), mended: Arc::default() };
     let faulty = Devices {
         robots: Box::new(Arms(inner.robots, shared.clone())),
@@ -140,12 +140,7 @@ fn check(fault: Fault, expected: &str) -> (Vec<Measurement>, Vec<String>) {
     };
     let nothing = BTreeMap::new();
     let mut recorder = begun(&path, &rig);
-    let broken = controller.run(
-        &mut recorder,
-        &Work { pairs: &pairs, before: &nothing, options },
-        &control,
-        &mut note,
-    );
+    let broken = controller.run(&mut recorder, &Work { pairs: &pairs, before: &nothing, options }, &control, &mut note);
     let error = broken.expect_err(expected).to_string();
     assert!(error.contains(expected), "{error}");
     drop(recorder);
@@ -276,10 +271,9 @@ fn an_overrun_is_taken_again() {
     let outcome = controller.run(&mut recorder, &work, &Control::default(), &mut |_| {}).expect("a run");
     assert_eq!(outcome.end.accepted, PAIRS as u64);
     let file = std::fs::read(recorder.finish(&outcome.end).expect("finished")).expect("the file");
-    let lost = mcap::MessageStream::new(&file)
-        .expect("an MCAP file")
-        .map(|m| m.expect("whole"))
-        .filter(|m| String::from_utf8_lossy(&m.data).contains("a take was lost, and made again: audio interface: overrun"));
+    let lost = mcap::MessageStream::new(&file).expect("an MCAP file").map(|m| m.expect("whole")).filter(|m| {
+        String::from_utf8_lossy(&m.data).contains("a take was lost, and made again: audio interface: overrun")
+    });
     assert_eq!(lost.count() as u64, outcome.end.attempts / 3, "every fourth of them");
 }
 

@@ -299,7 +299,8 @@ fn an_attempt_is_recorded_before_its_verdict() {
     let rig = quick();
     let run = record(&rig, simulated(&rig, 0.83, 3), 2, Keep::Sweeps, usize::MAX);
     let recorded = run.topics();
-    let places = |topic: &str| recorded.iter().enumerate().filter(|(_, t)| *t == topic).map(|(i, _)| i).collect::<Vec<_>>();
+    let places =
+        |topic: &str| recorded.iter().enumerate().filter(|(_, t)| *t == topic).map(|(i, _)| i).collect::<Vec<_>>();
     for rests_on in [topics::SWEEP, topics::SWEEP_AUDIO, topics::IR, topics::TF, topics::ENVIRONMENT] {
         let (before, verdicts) = (places(rests_on), places(topics::MEASUREMENT));
         assert_eq!(before.len(), 2, "{rests_on}");

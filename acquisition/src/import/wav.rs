@@ -139,7 +139,8 @@ impl Import<'_> {
         if judged.snr_db.is_nan() {
             judged.snr_db = f64::INFINITY;
         }
-        let reasons: Vec<_> = judged.objections(&rig.validation, f64::NEG_INFINITY).iter().map(ToString::to_string).collect();
+        let reasons: Vec<_> =
+            judged.objections(&rig.validation, f64::NEG_INFINITY).iter().map(ToString::to_string).collect();
         let sample_rate_hz = rig.sweep.rate_hz.get();
         recorder.poses(at, m, s)?;
         recorder.environment(

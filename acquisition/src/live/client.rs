@@ -25,7 +25,10 @@ pub(super) fn serve(stream: TcpStream, shared: &Shared, queue: &Queue) {
 }
 
 #[expect(clippy::result_large_err, reason = "tungstenite's own type")]
-fn choose(request: &Request, mut response: Response) -> Result<Response, tungstenite::handshake::server::ErrorResponse> {
+fn choose(
+    request: &Request,
+    mut response: Response,
+) -> Result<Response, tungstenite::handshake::server::ErrorResponse> {
     let offered = request.headers().get_all("Sec-WebSocket-Protocol").iter().filter_map(|v| v.to_str().ok());
     match protocol::choose(offered) {
         Some(chosen) => {
@@ -53,7 +56,11 @@ fn talk(stream: TcpStream, shared: &Shared, queue: &Queue) -> Result<(), Box<dyn
     while !shared.has_ended() {
         listen(&mut socket, shared, queue)?;
         while let Some((subscription, message)) = queue.pop() {
-            socket.write(Message::binary(protocol::message_data(subscription, message.log_time_nanos, &message.data)))?;
+            socket.write(Message::binary(protocol::message_data(
+                subscription,
+                message.log_time_nanos,
+                &message.data,
+            )))?;
         }
         socket.flush()?;
     }

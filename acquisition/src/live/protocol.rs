@@ -25,9 +25,13 @@ pub(super) enum Wish {
 #[derive(Deserialize)]
 #[serde(tag = "op", rename_all = "camelCase")]
 enum FromClient {
-    Subscribe { subscriptions: Vec<Subscription> },
+    Subscribe {
+        subscriptions: Vec<Subscription>,
+    },
     #[serde(rename_all = "camelCase")]
-    Unsubscribe { subscription_ids: Vec<u32> },
+    Unsubscribe {
+        subscription_ids: Vec<u32>,
+    },
 }
 
 #[derive(Deserialize)]

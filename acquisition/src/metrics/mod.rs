@@ -136,13 +136,23 @@ impl Numbers {
             ("recorded_messages_total", Counter, "Messages recorded.", self.cost.messages as f64),
             ("checkpoints_total", Counter, "Checkpoints.", self.cost.checkpoints as f64),
             ("recorder_busy_seconds_total", Counter, "Time spent recording.", self.cost.busy.as_secs_f64()),
-            ("recorder_sync_seconds_total", Counter, "Time of it spent waiting for the disk.", self.cost.waited.as_secs_f64()),
+            (
+                "recorder_sync_seconds_total",
+                Counter,
+                "Time of it spent waiting for the disk.",
+                self.cost.waited.as_secs_f64(),
+            ),
         ];
         if let Some(m) = &self.last {
             metrics.extend([
                 ("snr_db", Gauge, "Signal-to-noise ratio of the last take, dB.", m.snr_db),
                 ("loopback_dbfs", Gauge, "Level of its loopback, dB re full scale.", m.loopback_level_dbfs),
-                ("arrival_error_us", Gauge, "Its direct sound's arrival minus the expected one, us.", m.arrival_error_us),
+                (
+                    "arrival_error_us",
+                    Gauge,
+                    "Its direct sound's arrival minus the expected one, us.",
+                    m.arrival_error_us,
+                ),
                 ("clipped_samples", Gauge, "Its samples at full scale.", f64::from(m.clipped_samples)),
                 ("outside_level_db", Gauge, "Sound pressure level outside, dB re 20 uPa.", m.outside_level_db),
                 ("temperature_c", Gauge, "Temperature of the air, C.", m.temperature_c),

@@ -28,7 +28,10 @@ fn a_pair_counts_when_it_is_safe() {
     assert_eq!((value("pairs_accepted"), value("snr_db")), (Some(100.0), Some(61.5)));
     metrics.observe(&Event::Safe { verdicts: &[], accepted: 101, cost: Cost { checkpoints: 1, ..Cost::default() } });
     metrics.observe(&Event::Paused);
-    assert_eq!((value("pairs_accepted"), value("checkpoints_total"), value("paused")), (Some(101.0), Some(1.0), Some(1.0)));
+    assert_eq!(
+        (value("pairs_accepted"), value("checkpoints_total"), value("paused")),
+        (Some(101.0), Some(1.0), Some(1.0))
+    );
     assert_eq!(value("disk_free_bytes"), None);
     metrics.disk_free(5);
     metrics.broke_off();
@@ -71,7 +74,8 @@ fn targets_are_read_or_named() {
     assert_eq!("udp://lab:8089".parse(), Ok(udp));
     let http = Target::Http { host: "lab:8428".into(), path: "/write?db=lab".into() };
     assert_eq!("http://lab:8428/write?db=lab".parse(), Ok(http));
-    for wrong in ["lab:8089", "udp://lab", "http://lab:8428", "https://lab:1/write", "http://lab:1/a b", "http://:1/a"] {
+    for wrong in ["lab:8089", "udp://lab", "http://lab:8428", "https://lab:1/write", "http://lab:1/a b", "http://:1/a"]
+    {
         let error = wrong.parse::<Target>().expect_err(wrong).to_string();
         assert!(error.contains(wrong) && error.contains("hint"), "{error}");
     }

@@ -57,7 +57,8 @@ impl Recorder {
         let (schema, encoding, text) = STRING_SCHEMA;
         let channels = self.writer.mcap.add_schema(schema, encoding, text).and_then(|schema| {
             let none = Default::default();
-            let description = self.writer.mcap.add_channel(schema, topics::ROBOT_DESCRIPTION, STRING_ENCODING, &none)?;
+            let description =
+                self.writer.mcap.add_channel(schema, topics::ROBOT_DESCRIPTION, STRING_ENCODING, &none)?;
             let mut joints = |topic| foxglove_channel::<fg::JointStates>(&mut self.writer.mcap, topic);
             Ok((description, [joints(topics::MICROPHONE_JOINTS)?, joints(topics::SPEAKER_JOINTS)?]))
         });

@@ -91,8 +91,7 @@ fn own_channel<M: RunMessage>(writer: &mut Writer<BufWriter<File>>, topic: &str)
 
 pub(super) fn foxglove_topic<M: Encode>(channel: u16, topic: &str) -> Topic {
     let schema = M::get_schema();
-    let (name, encoding, data) =
-        schema.map(|s| (s.name, s.encoding, s.data.into_owned())).unwrap_or_default();
+    let (name, encoding, data) = schema.map(|s| (s.name, s.encoding, s.data.into_owned())).unwrap_or_default();
     Topic {
         channel,
         topic: topic.into(),

@@ -144,9 +144,9 @@ fn rebuild(from: &Path, to: &Path, report: &Report) -> Result<(), Error> {
         ("defect", report.defect.clone().unwrap_or_default()),
     ];
     let metadata = record.map(|(key, value)| (key.to_owned(), value)).into();
-    let noted = writer.end_all().and_then(|()| {
-        writer.mcap.write_metadata(&Metadata { name: topics::RECOVERY_METADATA.to_owned(), metadata })
-    });
+    let noted = writer
+        .end_all()
+        .and_then(|()| writer.mcap.write_metadata(&Metadata { name: topics::RECOVERY_METADATA.to_owned(), metadata }));
     noted.and_then(|()| writer.finish()).map_err(failed)
 }
 

@@ -187,7 +187,8 @@ fn a_run_is_gone_on_with_behind_what_is_safe() {
         // What stood in the file of pairs without a verdict is not there twice.
         let all: Vec<u32> = (0..PAIRS).collect();
         assert_eq!(pairs(&path), [all.clone(), all], "{cut}");
-        let names: Vec<_> = std::fs::read_dir(folder.path()).expect("listed").flatten().map(|e| e.file_name()).collect();
+        let names: Vec<_> =
+            std::fs::read_dir(folder.path()).expect("listed").flatten().map(|e| e.file_name()).collect();
         assert_eq!(names, ["run.mcap"], "nothing else is left");
         let held = Held::read(&path).expect("the finished run");
         assert_eq!((held.accepted(), held.attempts), (PAIRS as usize, u64::from(PAIRS)));

@@ -1,4 +1,4 @@
 //! Implementations of the rig's traits.
 
-pub mod simulated;
 pub(crate) mod paced;
+pub mod simulated;

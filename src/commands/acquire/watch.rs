@@ -49,7 +49,8 @@ impl Watcher {
         self.metrics.observe(event);
         match event {
             Event::Pair(pair) => {
-                self.pair = format!("pair {} (microphone {}, speaker {})", pair.id.0, pair.microphone.0, pair.speaker.0);
+                self.pair =
+                    format!("pair {} (microphone {}, speaker {})", pair.id.0, pair.microphone.0, pair.speaker.0);
             }
             Event::Attempt(m) => {
                 self.snr_db = m.snr_db;

@@ -87,8 +87,7 @@ impl Specimen {
         let grid = rig.grid()?;
         let nothing = BTreeMap::new();
         let work = Work { pairs: grid.pairs(), before: &nothing, options };
-        let outcome =
-            RunController::new(rig, devices)?.run(&mut recorder, &work, &Control::default(), &mut |_| {})?;
+        let outcome = RunController::new(rig, devices)?.run(&mut recorder, &work, &Control::default(), &mut |_| {})?;
         Self::map(name, &recorder.finish(&outcome.end)?)
     }
 
