@@ -4,7 +4,6 @@ use std::path::PathBuf;
 
 use clap::{Args, Parser, Subcommand};
 use echolake_acquisition::collection::LARGEST;
-use echolake_acquisition::simulate::CHECKPOINT_EVERY;
 use echolake_lake::{KEEP_HOURS, TARGET_BYTES};
 use echolake_schema::SurfaceId;
 
@@ -123,9 +122,10 @@ pub(crate) struct AcquireArgs {
     /// Record no sweeps, only impulse responses.
     #[arg(long)]
     pub(crate) ir_only: bool,
-    /// Pairs between two checkpoints: what a power cut costs at most, and how late a pair is told to be safe.
-    #[arg(long, value_name = "PAIRS", default_value_t = CHECKPOINT_EVERY as u32, value_parser = clap::value_parser!(u32).range(1..))]
-    pub(crate) checkpoint_every: u32,
+    /// Pairs between two checkpoints: what a power cut costs at most, and how late a pair is told to be safe. By default 1
+    /// on a real rig, 200 on the simulated one.
+    #[arg(long, value_name = "PAIRS", value_parser = clap::value_parser!(u32).range(1..))]
+    pub(crate) checkpoint_every: Option<u32>,
     /// Seconds that a simulated take lasts at least; a real rig's are 12.3.
     #[arg(long, value_name = "SECS", default_value_t = 0.0)]
     pub(crate) pace: f64,

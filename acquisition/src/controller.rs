@@ -15,7 +15,7 @@ use std::time::Duration;
 use echolake_dsp::chain::raw_len;
 use echolake_dsp::deconvolution::{DeconvolutionParams, DeconvolutionPlan, DeconvolutionScratch, TransformLength};
 use echolake_dsp::sweep::LinearSweep;
-use echolake_schema::manifest::RunEnd;
+use echolake_schema::manifest::{Origin, RunEnd};
 use echolake_schema::messages::{Measurement, Verdict};
 use echolake_schema::{Grid, Pair, Rig, Timestamp};
 
@@ -182,6 +182,11 @@ impl<'a> RunController<'a> {
     /// The rig.
     pub fn rig(&self) -> &'a Rig {
         self.rig
+    }
+
+    /// Whether its devices are real.
+    pub fn origin(&self) -> Origin {
+        self.devices.origin
     }
 
     /// Measures the pairs in their order, and tells `observe` what happens. When `control` says so the run waits or ends

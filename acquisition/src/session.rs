@@ -14,6 +14,7 @@ use crate::preflight::{self, Finding};
 use crate::recorder::{Recorder, Tap, Tried};
 use crate::relief::HeightField;
 use crate::robots::Choreography;
+use crate::simulate::CHECKPOINT_EVERY;
 
 /// Who supervises a run, and how.
 pub struct Session<'a> {
@@ -25,8 +26,9 @@ pub struct Session<'a> {
     pub tap: Option<Box<dyn Tap>>,
     /// Whether it is looked over first.
     pub preflight: Preflight,
-    /// Pairs between two checkpoints.
-    pub checkpoint_every: usize,
+    /// Pairs between two checkpoints; where nothing is said, 1 on a real rig, whose pairs take 12 s each, and 200 on the
+    /// simulated one.
+    pub checkpoint_every: Option<usize>,
     /// How long a take lasts where it is simulated.
     pub pace: Pace,
 }
@@ -73,9 +75,8 @@ pub(crate) struct Job<'a> {
     pub(crate) keep: Keep,
     pub(crate) before: &'a BTreeMap<u32, Tried>,
     pub(crate) started: Timestamp,
-    /// How the arms stand, where that is known.
+    /// How the arms go about, where the rig's are known.
     pub(crate) arms: Option<Arc<Choreography>>,
-    pub(crate) origin: Origin,
 }
 
 impl Job<'_> {
@@ -96,17 +97,17 @@ impl Job<'_> {
         mut recorder: Recorder,
         session: Session<'_>,
     ) -> Result<Measured, controller::Error> {
-        let grid = self.rig.grid()?;
-        let mut pairs = grid.pairs().to_vec();
+        let origin = controller.origin();
+        let mut pairs = self.rig.grid()?.pairs().to_vec();
         if let Some(arms) = &self.arms {
-            let name = if self.origin == Origin::Simulated { "simulated_rig" } else { "rig" };
-            recorder.arms(self.started, arms.cell(), name)?;
+            recorder.arms(self.started, arms.cell(), name_of(origin))?;
             arms.sort(&mut pairs);
         }
         if let Some(tap) = session.tap {
             recorder.listen(tap, self.started, self.shape);
         }
-        let options = RunOptions { keep: self.keep, checkpoint_every: session.checkpoint_every };
+        let checkpoint_every = session.checkpoint_every.unwrap_or_else(|| checkpoint_every(origin));
+        let options = RunOptions { keep: self.keep, checkpoint_every };
         let work = Work { pairs: &pairs, before: self.before, options };
         let outcome = controller.run(&mut recorder, &work, session.control, session.observe)?;
         let path = match outcome.left {
@@ -114,5 +115,20 @@ impl Job<'_> {
             _ => recorder.partial().to_owned(),
         };
         Ok(Measured { path, outcome })
+    }
+}
+
+// A measured pair is 12 s of a rig's time.
+fn checkpoint_every(origin: Origin) -> usize {
+    match origin {
+        Origin::Simulated => CHECKPOINT_EVERY,
+        _ => 1,
+    }
+}
+
+fn name_of(origin: Origin) -> &'static str {
+    match origin {
+        Origin::Simulated => "simulated_rig",
+        _ => "rig",
     }
 }

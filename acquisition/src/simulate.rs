@@ -2,6 +2,7 @@
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use echolake_schema::manifest::{MeshFacts, Origin, RunEnd, RunManifest};
@@ -13,7 +14,7 @@ use crate::drivers;
 use crate::mesh::{self, Format, Mesh};
 use crate::plan::{PlannedSpecimen, RunPlan};
 use crate::preflight::Finding;
-use crate::recorder::{Held, OriginalFile, Recorder, Relief as RecordedRelief, RunStart, Tried, folder_of};
+use crate::recorder::{Held, OriginalFile, Recorder, Relief as RecordedRelief, RunStart, folder_of};
 use crate::recovery;
 use crate::relief::{HeightField, Relief};
 use crate::rig::Devices;
@@ -27,7 +28,7 @@ pub(crate) const MESH_CELLS: usize = 117;
 /// The back of a generated panel, mm.
 pub(crate) const BACK_MM: f32 = -30.0;
 /// Pairs between two checkpoints; a simulated run that is lost is made again.
-pub const CHECKPOINT_EVERY: usize = 200;
+pub(crate) const CHECKPOINT_EVERY: usize = 200;
 
 /// What is measured.
 #[derive(Debug, Clone)]
@@ -113,7 +114,7 @@ impl SimulatedRun<'_> {
             observe: &mut observe,
             tap: None,
             preflight: Preflight::Skip,
-            checkpoint_every: CHECKPOINT_EVERY,
+            checkpoint_every: None,
             pace: Pace::Fast,
         };
         let measured = self.begin(session, None)?;
@@ -135,15 +136,15 @@ impl SimulatedRun<'_> {
 
     fn begin(&self, session: Session<'_>, plan: Option<BTreeMap<String, String>>) -> Result<Measured, Error> {
         let prepared = self.prepare()?;
-        let devices = prepared.devices(self.rig, self.start, self.seed, session.pace)?;
-        let origin = devices.origin;
+        let arms = Choreography::of(self.rig)?;
+        let devices = prepared.devices(self.rig, self.start, self.seed, session.pace, arms.clone())?;
         let manifest = RunManifest {
             run_id: self.run_id()?,
             surface_id: self.surface.clone(),
             started: self.start,
             software: concat!("echolake ", env!("CARGO_PKG_VERSION")).to_owned(),
             rig: self.rig.name.clone(),
-            origin,
+            origin: devices.origin,
         };
         let original = prepared.original.as_ref().map(|(name, format, bytes)| OriginalFile {
             name,
@@ -155,8 +156,7 @@ impl SimulatedRun<'_> {
         let start = RunStart { manifest: &manifest, rig: self.rig, surface, relief, plan };
         let path = self.path()?;
         let nothing = BTreeMap::new();
-        let specimen = (&prepared, origin);
-        let job = job(specimen, self.rig, self.folder, self.keep, &nothing, self.start)?;
+        let job = prepared.job(self.rig, self.folder, self.keep, &nothing, self.start, arms);
         // What can be refused is refused before there is a file.
         let mut controller = RunController::new(self.rig, devices)?;
         fit(&job, &mut controller, session.preflight)?;
@@ -200,17 +200,22 @@ pub fn resume(partial: &Path, session: Session<'_>) -> Result<Measured, Error> {
         PlannedSpecimen::Relief(relief) => generated(relief),
         PlannedSpecimen::Mesh(path) => from_file(path, &held.rig)?,
     };
-    // Behind all that was recorded: the simulated clock runs ahead of ours.
-    let start = Timestamp::now().max(held.last.plus_secs(TAKE_SECS));
+    let now = Timestamp::now();
+    let start = match held.manifest.origin {
+        // Behind all that was recorded: the simulated clock runs ahead of ours.
+        Origin::Simulated => now.max(held.last.plus_secs(TAKE_SECS)),
+        _ if now < held.last => {
+            let back_secs = (held.last.0 - now.0) as f64 / 1e9;
+            return Err(controller::Error::Clock { before: held.last, now, back_secs }.into());
+        }
+        _ => now,
+    };
     // The same noise twice would be no noise.
     let seed = plan.seed.wrapping_add(held.attempts.wrapping_add(1).wrapping_mul(0x9E37_79B9));
-    let devices = prepared.devices(&held.rig, start, seed, session.pace)?;
-    let origin = devices.origin;
-    if held.manifest.origin != origin {
-        let reason = reason("the rig's devices are simulated now and were not, or the other way round".to_owned());
-        return Err(reason.into());
-    }
-    let job = job((&prepared, origin), &held.rig, folder_of(partial), plan.keep, &held.pairs, start)?;
+    let arms = Choreography::of(&held.rig)?;
+    let devices = prepared.devices(&held.rig, start, seed, session.pace, arms.clone())?;
+    let folder = folder_of(partial);
+    let job = prepared.job(&held.rig, folder, plan.keep, &held.pairs, start, arms);
     let mut controller = RunController::new(&held.rig, devices)?;
     fit(&job, &mut controller, session.preflight)?;
     let (recorder, _) = Recorder::resume(partial)?;
@@ -226,11 +231,19 @@ fn fit(job: &Job<'_>, controller: &mut RunController<'_>, preflight: Preflight) 
 }
 
 impl Prepared {
-    fn devices(&self, rig: &Rig, start: Timestamp, seed: u64, pace: Pace) -> Result<Devices, Error> {
+    // Those that the rig file names; where it names none, the simulated ones.
+    fn devices(
+        &self,
+        rig: &Rig,
+        start: Timestamp,
+        seed: u64,
+        pace: Pace,
+        arms: Option<Arc<Choreography>>,
+    ) -> Result<Devices, Error> {
         if let Some(real) = drivers::open(rig).map_err(controller::Error::from)? {
             return Ok(real);
         }
-        let (reflection_factor, arms) = (self.reflection_factor, Choreography::of(rig)?);
+        let reflection_factor = self.reflection_factor;
         let simulation = Simulation { rig, relief: &self.heights, reflection_factor, start, seed, arms };
         let devices = devices(&simulation).map_err(controller::Error::from)?;
         Ok(match pace {
@@ -238,18 +251,19 @@ impl Prepared {
             Pace::Secs(secs) => paced(devices, secs),
         })
     }
-}
 
-fn job<'a>(
-    (prepared, origin): (&'a Prepared, Origin),
-    rig: &'a Rig,
-    folder: &'a Path,
-    keep: Keep,
-    before: &'a BTreeMap<u32, Tried>,
-    started: Timestamp,
-) -> Result<Job<'a>, Error> {
-    let shape = Some(Shape { heights: &prepared.heights, mesh: &prepared.mesh });
-    Ok(Job { rig, folder, shape, keep, before, started, arms: Choreography::of(rig)?, origin })
+    fn job<'a>(
+        &'a self,
+        rig: &'a Rig,
+        folder: &'a Path,
+        keep: Keep,
+        before: &'a BTreeMap<u32, crate::recorder::Tried>,
+        started: Timestamp,
+        arms: Option<Arc<Choreography>>,
+    ) -> Job<'a> {
+        let shape = Some(Shape { heights: &self.heights, mesh: &self.mesh });
+        Job { rig, folder, shape, keep, before, started, arms }
+    }
 }
 
 fn generated(relief: &Relief) -> Prepared {

@@ -1,5 +1,4 @@
-//! `echolake acquire`: one surface measured, with the simulated rig or the devices that the rig file names; watched,
-//! paused, stopped and gone on with.
+//! `echolake acquire`: one surface measured, watched, paused, stopped and gone on with.
 
 mod acknowledge;
 mod specimen;
@@ -80,7 +79,7 @@ pub(crate) async fn run(args: &AcquireArgs, lake_url: &str) -> anyhow::Result<Do
     watch::obey(&control);
     let mut watcher = Watcher::new(&progress, &surface, planned, accepted, metrics.clone(), job.folder());
     let preflight = if args.skip_checks { Preflight::Skip } else { Preflight::Check };
-    let (checkpoint_every, tap) = (args.checkpoint_every as usize, live.as_ref().map(LiveServer::tap));
+    let (checkpoint_every, tap) = (args.checkpoint_every.map(|n| n as usize), live.as_ref().map(LiveServer::tap));
     let partial = job.partial()?;
     let measured = tokio::task::spawn_blocking(move || {
         let mut observe = |event: Event<'_>| {
@@ -174,13 +173,6 @@ fn unfinished(folder: &Path, surface: &str) -> Vec<PathBuf> {
 }
 
 impl Job {
-    fn rig(&self) -> &Rig {
-        match self {
-            Self::Fresh(fresh) => &fresh.rig,
-            Self::Resumed { held, .. } => &held.rig,
-        }
-    }
-
     fn folder(&self) -> PathBuf {
         match self {
             Self::Fresh(fresh) => fresh.folder.clone(),
@@ -191,13 +183,20 @@ impl Job {
         }
     }
 
+    fn rig(&self) -> &Rig {
+        match self {
+            Self::Fresh(fresh) => &fresh.rig,
+            Self::Resumed { held, .. } => &held.rig,
+        }
+    }
+
     // The surface, its pairs, and how many of them are measured already.
     fn size(&self) -> anyhow::Result<(String, u64, u64)> {
-        let (surface, rig, accepted) = match self {
-            Self::Fresh(fresh) => (&fresh.surface, &fresh.rig, 0),
-            Self::Resumed { held, .. } => (&held.manifest.surface_id, &held.rig, held.accepted() as u64),
+        let (surface, accepted) = match self {
+            Self::Fresh(fresh) => (&fresh.surface, 0),
+            Self::Resumed { held, .. } => (&held.manifest.surface_id, held.accepted() as u64),
         };
-        Ok((surface.to_string(), rig.grid()?.pairs().len() as u64, accepted))
+        Ok((surface.to_string(), self.rig().grid()?.pairs().len() as u64, accepted))
     }
 
     // What the recording is named until it is whole.

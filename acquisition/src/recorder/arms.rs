@@ -7,68 +7,68 @@ use echolake_schema::{Timestamp, topics};
 use foxglove::messages as fg;
 
 use super::channels::{foxglove_channel, foxglove_topic};
-use super::{Error, Recorder, Tap, Topic, scene};
+use super::{Error, Recorder, Topic, scene};
 use crate::robots::{Cell, Joints, Tool};
 
 /// The schema of `std_msgs/msg/String`, and how its messages are encoded: viewers look for URDF there.
 const STRING_SCHEMA: (&str, &str, &[u8]) = ("std_msgs/msg/String", "ros2msg", b"string data\n");
 const STRING_ENCODING: &str = "cdr";
 
-/// The arms, and their channels.
+/// The arms' channels.
 pub(super) struct Arms {
     cell: Arc<Cell>,
+    /// Channel of the description, and the message on it.
+    description: (u16, Vec<u8>),
     joints: [u16; 2],
-    description: u16,
-    /// The description's message.
-    text: Vec<u8>,
 }
 
 impl Arms {
-    /// Their topics, as readers need them.
+    /// What live views subscribe to.
     pub(super) fn topics(&self) -> Vec<Topic> {
-        let (schema, schema_encoding, data) = STRING_SCHEMA;
-        let description = Topic {
-            channel: self.description,
-            topic: topics::ROBOT_DESCRIPTION.to_owned(),
-            encoding: STRING_ENCODING.to_owned(),
-            schema: schema.to_owned(),
-            schema_encoding: schema_encoding.to_owned(),
-            schema_data: data.to_vec(),
-        };
+        let (schema, encoding, text) = STRING_SCHEMA;
         let [microphone, speaker] = self.joints;
         vec![
-            description,
+            Topic {
+                channel: self.description.0,
+                topic: topics::ROBOT_DESCRIPTION.to_owned(),
+                encoding: STRING_ENCODING.to_owned(),
+                schema: schema.to_owned(),
+                schema_encoding: encoding.to_owned(),
+                schema_data: text.to_vec(),
+            },
             foxglove_topic::<fg::JointStates>(microphone, topics::MICROPHONE_JOINTS),
             foxglove_topic::<fg::JointStates>(speaker, topics::SPEAKER_JOINTS),
         ]
     }
 
-    /// Shows their shape to who listens since.
-    pub(super) fn show(&self, at: Timestamp, tap: &mut dyn Tap) {
-        tap.message(self.description, u64::try_from(at.0).unwrap_or(0), &self.text);
+    /// The description's channel and message.
+    pub(super) fn description(&self) -> (u16, &[u8]) {
+        (self.description.0, &self.description.1)
     }
 }
 
 impl Recorder {
     /// Records the arms' shape, `/robot_description`; from now on [`Self::joints`] tells how they stand, and
-    /// [`Self::poses`] leaves `/tf` to it. `name` says what the arms are, and whether they are simulated. A run that is
-    /// gone on with has it once more.
+    /// [`Self::poses`] leaves `/tf` to it. `name` says what the arms are, and whether they are simulated.
     ///
     /// # Errors
     /// [`Error::Write`].
     pub fn arms(&mut self, at: Timestamp, cell: Arc<Cell>, name: &str) -> Result<(), Error> {
         let (schema, encoding, text) = STRING_SCHEMA;
-        let file = &mut self.writer.mcap;
-        let channels = file.add_schema(schema, encoding, text).and_then(|schema| {
+        let channels = self.writer.mcap.add_schema(schema, encoding, text).and_then(|schema| {
             let none = Default::default();
-            let description = file.add_channel(schema, topics::ROBOT_DESCRIPTION, STRING_ENCODING, &none)?;
-            let mut joints = |topic| foxglove_channel::<fg::JointStates>(file, topic);
+            let description =
+                self.writer.mcap.add_channel(schema, topics::ROBOT_DESCRIPTION, STRING_ENCODING, &none)?;
+            let mut joints = |topic| foxglove_channel::<fg::JointStates>(&mut self.writer.mcap, topic);
             Ok((description, [joints(topics::MICROPHONE_JOINTS)?, joints(topics::SPEAKER_JOINTS)?]))
         });
         let (description, joints) = channels.map_err(|e| self.failed(e.to_string()))?;
-        let text = cdr_string(&cell.urdf(name));
-        self.write(description, at, &text)?;
-        self.arms = Some(Arms { cell, joints, description, text });
+        let message = cdr_string(&cell.urdf(name));
+        // A run that is gone on with has it already.
+        if !self.is_resumed {
+            self.write(description, at, &message)?;
+        }
+        self.arms = Some(Arms { cell, description: (description, message), joints });
         Ok(())
     }
 

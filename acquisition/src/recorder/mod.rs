@@ -141,10 +141,12 @@ pub struct Recorder {
     channels: Channels,
     sequence: u32,
     encoded: Vec<u8>,
-    /// The arms, where their joints are known.
-    arms: Option<arms::Arms>,
     tap: Option<Box<dyn Tap>>,
     cost: Cost,
+    /// The run is gone on with: what stands in a file once is there.
+    is_resumed: bool,
+    /// The arms, where their joints are known.
+    arms: Option<arms::Arms>,
 }
 
 /// The name of a recording until it is whole.
@@ -197,17 +199,9 @@ impl Recorder {
     }
 
     fn with(writer: ChunkWriter, path: PathBuf, partial: PathBuf, channels: Channels, sequence: u32) -> Self {
-        Self {
-            writer,
-            path,
-            partial,
-            channels,
-            sequence,
-            encoded: Vec::new(),
-            arms: None,
-            tap: None,
-            cost: Cost::default(),
-        }
+        let is_resumed = sequence > 0;
+        let (encoded, tap, cost, arms) = (Vec::new(), None, Cost::default(), None);
+        Self { writer, path, partial, channels, sequence, encoded, tap, cost, is_resumed, arms }
     }
 
     // What the run is stands first, so that a reader knows it before the first chunk.
@@ -241,11 +235,10 @@ impl Recorder {
 
     /// Lets `tap` hear every message from now on, and shows it the panel, which is in the file since its head.
     pub(crate) fn listen(&mut self, mut tap: Box<dyn Tap>, at: Timestamp, shape: Option<Shape<'_>>) {
-        let mut topics = self.channels.topics();
-        topics.extend(self.arms.iter().flat_map(arms::Arms::topics));
-        tap.topics(topics);
-        if let Some(arms) = &self.arms {
-            arms.show(at, &mut *tap);
+        let arms = self.arms.as_ref();
+        tap.topics([self.channels.topics(), arms.map(arms::Arms::topics).unwrap_or_default()].concat());
+        if let Some((channel, description)) = arms.map(arms::Arms::description) {
+            tap.message(channel, u64::try_from(at.0).unwrap_or(0), description);
         }
         if let Some(Shape { heights, mesh }) = shape {
             let time = u64::try_from(at.0).unwrap_or(0);

@@ -27,4 +27,8 @@ impl AudioInterface for Paced {
         std::thread::sleep(self.pace.saturating_sub(begun.elapsed()));
         Ok(())
     }
+
+    fn notices(&mut self) -> Vec<String> {
+        self.inner.notices()
+    }
 }
