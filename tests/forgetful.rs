@@ -282,7 +282,9 @@ impl Filesystem for Disk {
         let mut tree = self.tree();
         let linked = match tree.child(parent.0, name) {
             Ok(_) => Err(Errno::EEXIST),
-            Err(_) => tree.folder(parent.0).map(|folder| drop(folder.insert(name.to_owned(), ino.0))),
+            Err(_) => tree.folder(parent.0).map(|folder| {
+                folder.insert(name.to_owned(), ino.0);
+            }),
         };
         let found = linked.and_then(|()| tree.attributes(ino.0));
         entry(reply, found);

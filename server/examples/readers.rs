@@ -185,7 +185,9 @@ fn main() -> Result<()> {
         let (args, lake, times, errors) = (args.clone(), lake.clone(), times.clone(), errors.clone());
         std::thread::spawn(move || {
             let mut chance = Chance(number.wrapping_mul(0x9e37_79b9_7f4a_7c15) | 1);
-            (0..10).for_each(|_| drop(chance.below(1)));
+            (0..10).for_each(|_| {
+                let _ = chance.below(1);
+            });
             let mut own = Vec::new();
             let mut connection = None;
             while Instant::now() < end {
