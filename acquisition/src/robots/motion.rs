@@ -5,8 +5,9 @@ use super::cell::{Cell, Standing};
 
 /// Joints turn by at most this much between two looks, degrees: 850 mm of arm move 15 mm.
 const STEP_DEG: f64 = 1.0;
-/// Shoulder and elbow of an arm that is drawn back, degrees.
-const BACK_DEG: [f64; 2] = [-70.0, 130.0];
+/// Shoulder and elbow of an arm that is drawn back, degrees: low over its foot, high, and half-way out; where one
+/// is in the way, another need not be.
+const BACKS_DEG: [[f64; 2]; 3] = [[-70.0, 130.0], [-30.0, 70.0], [-30.0, 115.0]];
 
 /// How both arms get from one standing to another.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -40,9 +41,9 @@ impl Course {
     ];
 
     // The standings on the way, the last included.
-    fn by(self, from: &Pose, to: &Pose) -> Vec<Pose> {
+    fn by(self, back_deg: [f64; 2], from: &Pose, to: &Pose) -> Vec<Pose> {
         let ([m0, s0], [m1, s1]) = (*from, *to);
-        let [mb0, sb0, mb1, sb1] = [m0, s0, m1, s1].map(drawn_back);
+        let [mb0, sb0, mb1, sb1] = [m0, s0, m1, s1].map(|joints| drawn_back(joints, back_deg));
         match self {
             Self::Together => vec![*to],
             Self::MicrophoneFirst => vec![[m1, s0], *to],
@@ -56,8 +57,8 @@ impl Course {
 }
 
 // Upper arm and forearm leant back over the foot: the tool goes up and away from the panel.
-fn drawn_back(mut joints: Joints) -> Joints {
-    (joints[1], joints[2]) = (BACK_DEG[0].to_radians(), BACK_DEG[1].to_radians());
+fn drawn_back(mut joints: Joints, [shoulder, elbow]: [f64; 2]) -> Joints {
+    (joints[1], joints[2]) = (shoulder.to_radians(), elbow.to_radians());
     joints
 }
 
@@ -77,12 +78,13 @@ pub struct Motion {
 /// The quickest course on which nothing touches; none where there is none among [`Course::ALL`].
 pub fn course(cell: &Cell, from: &Standing, to: &Standing) -> Option<Motion> {
     let [from, to] = [from, to].map(|s| [s.microphone, s.speaker]);
-    let motion = |course: Course| {
-        let stops = course.by(&from, &to);
+    let motion = |(course, back_deg): (Course, [f64; 2])| {
+        let stops = course.by(back_deg, &from, &to);
         let secs = legs(&from, &stops).map(|(a, b)| leg_secs(a, b)).sum();
         Motion { course, stops, secs }
     };
-    let mut motions = Course::ALL.map(motion);
+    let ways = BACKS_DEG.iter().flat_map(|back_deg| Course::ALL.map(|course| (course, *back_deg)));
+    let mut motions: Vec<_> = ways.map(motion).collect();
     motions.sort_by(|a, b| a.secs.total_cmp(&b.secs));
     motions.into_iter().find(|motion| legs(&from, &motion.stops).all(|(a, b)| is_clear(cell, a, b)))
 }
