@@ -7,6 +7,7 @@ use echolake_acquisition::collection::LARGEST;
 use echolake_lake::{KEEP_HOURS, TARGET_BYTES};
 use echolake_schema::SurfaceId;
 
+use crate::commands::export::ExportCommand;
 use crate::commands::panel::PanelArgs;
 use crate::commands::serve::ServeArgs;
 use crate::commands::sql::SqlArgs;
@@ -37,6 +38,9 @@ pub(crate) enum Command {
     Ingest(IngestArgs),
     /// Ask the lake in SQL; a prompt where no query is given.
     Sql(SqlArgs),
+    /// Data out: training sets, slices of runs, SOFA, WAV, npz.
+    #[command(subcommand)]
+    Export(ExportCommand),
     /// Serve the catalogue, and the lake over HTTP, Arrow Flight SQL and Postgres' protocol, for reading.
     Serve(ServeArgs),
     /// Make a token for `serve --tokens`.

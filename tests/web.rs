@@ -101,6 +101,8 @@ fn schemathesis_finds_no_breach_of_the_contract() {
     let done = run(Command::new(program)
         .args(["run", &format!("http://{}/api/v1/openapi.json", server.http)])
         .args(["--phases", "examples,coverage,fuzzing", "--checks", "all", "--max-examples", "30", "--seed", "1"])
+        // Which bands, points and queries are right depends on the lake; the document cannot say.
+        .args(["--exclude-checks", "positive_data_acceptance"])
         .args(["--suppress-health-check", "all", "--no-color"])
         .current_dir(place.path("")));
     eprintln!("{}", done.unwrap_or_else(|why| panic!("{why}")));

@@ -119,7 +119,7 @@ fn checks(folder: &Path) {
         takes_are_exact_to_the_sample(folder, format);
     }
     faults_are_named(folder);
-    println!("ALSA: 3 formats conform, takes are exact to the sample, 4 faults are named");
+    eprintln!("ALSA: 3 formats conform, takes are exact to the sample, 4 faults are named");
 }
 
 fn takes_are_exact_to_the_sample(folder: &Path, format: AudioFormat) {

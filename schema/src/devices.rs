@@ -44,7 +44,7 @@ pub enum RobotsParams {
     #[default]
     Simulated,
     /// Behind a rosbridge.
-    Rosbridge(RosbridgeParams),
+    Rosbridge(Box<RosbridgeParams>),
 }
 
 /// An ALSA device that plays and records at the same time.

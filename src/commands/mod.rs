@@ -3,6 +3,7 @@
 mod acquire;
 mod demo;
 mod doctor;
+pub(crate) mod export;
 mod import;
 mod ingest;
 mod optimize;
@@ -34,6 +35,7 @@ pub(crate) async fn run(cli: Cli) -> anyhow::Result<Done> {
         Command::Import(args) => import::run(args, lake).await,
         Command::Ingest(args) => ingest::run(args, lake).await,
         Command::Sql(args) => sql::run(args, lake).await.map(|()| Done::Whole),
+        Command::Export(args) => export::run(args, lake).await,
         Command::Serve(args) => serve::run(args, lake).await,
         Command::Token { name } => serve::token(name),
         Command::Recover(args) => recover::run(args),

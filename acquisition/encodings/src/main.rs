@@ -147,7 +147,7 @@ fn simulated() -> Result<Vec<Input>> {
     let heights = relief.height_field(FACETS);
     let reflection_factor = relief.material().reflection_factor;
     let start = Timestamp(1_767_600_000_000_000_000);
-    let simulation = Simulation { rig: &rig, relief: &heights, reflection_factor, start, seed: 1 };
+    let simulation = Simulation { rig: &rig, relief: &heights, reflection_factor, start, seed: 1, arms: None };
     let mut devices = devices(&simulation)?;
     let gain = 10f64.powf(rig.sweep.level_dbfs / 20.0);
     let sweep = LinearSweep {

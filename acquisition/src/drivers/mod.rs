@@ -6,6 +6,8 @@ mod alsa;
 pub mod audio;
 pub mod rosbridge;
 pub mod serial;
+#[cfg(test)]
+mod tests;
 
 use echolake_schema::Rig;
 use echolake_schema::devices::{AlsaParams, AudioParams, RobotsParams, SensorParams};

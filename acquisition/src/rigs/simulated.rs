@@ -169,7 +169,7 @@ impl Robots for SimulatedRobots {
         };
         // The model knows the roles that the grid gives.
         let known = self.arms.as_ref().filter(|_| world.grid.pair_id(a, b).is_some());
-        let joints = known.map(|arms| arms.joints(pair));
+        let joints = known.and_then(|arms| arms.standing(pair).ok()).map(|stand| [stand.microphone, stand.speaker]);
         world.stand = [microphone, speaker];
         // The arms repeat to 0.02 mm. The residual is told; the simulated sound does not know of it.
         let mut off = |mm: [f64; 3]| mm.map(|x| x + 0.01 * world.normal().clamp(-2.0, 2.0));

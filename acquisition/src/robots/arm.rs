@@ -174,12 +174,11 @@ impl Arm {
         [self.foot, a, b, c, d, e, f, self.tool.pose()]
     }
 
-    /// All joints that bring the tool to this pose, nearest to home first, whether or not they are in their ranges.
+    /// All joints that bring the tool to this pose, whether or not they are in their ranges.
     pub fn solve(&self, tool: Pose) -> Vec<Joints> {
         let flange = self.foot.inverse().compose(tool).compose(self.tool.pose().inverse());
         let mut found: Vec<Joints> = self.kinematics.inverse(&flange);
         found.iter_mut().flatten().for_each(|q| *q = wrapped(*q));
-        found.sort_by(|a, b| from_home(a).total_cmp(&from_home(b)));
         found
     }
 

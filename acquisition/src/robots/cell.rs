@@ -18,8 +18,8 @@ const UPRIGHT_DEG: [f64; 1] = [0.0];
 const TURNS_DEG: [f64; 7] = [0.0, -25.0, 25.0, -50.0, 50.0, -80.0, 80.0];
 /// Turns about the speaker's axis that are tried: the 45 degree mount may come from any side.
 const ROLLS: usize = 24;
-/// Standings of one arm that are tried against those of the other.
-const KEPT: usize = 48;
+/// Ways of the speaker's arm that are tried: few at first, because mostly the first will do.
+const TRIED: [usize; 2] = [6, usize::MAX];
 
 /// Where the speaker looks.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
@@ -195,12 +195,13 @@ impl Cell {
         let microphones = ways.0.as_ref().map_err(|e| *e)?;
         let mut failure = None;
         for aim in Aim::ALL {
-            match self.speaker_ways(microphone_mm, speaker_mm, aim).0 {
-                Err(e) => failure = failure.max(Some(e)),
-                Ok(speakers) => match self.together(microphones, &speakers) {
+            let solved = self.speaker_solutions(microphone_mm, speaker_mm, aim);
+            for most in TRIED {
+                let ways = self.clear_ways(&self.speaker, &solved, most).0;
+                match ways.and_then(|speakers| self.together(microphones, &speakers)) {
                     Ok([microphone, speaker]) => return Ok(Standing { microphone, speaker, aim }),
                     Err(e) => failure = failure.max(Some(e)),
-                },
+                }
             }
         }
         Err(failure.unwrap_or(Unreachable::NoPosition))
@@ -223,36 +224,39 @@ impl Cell {
             let turn = DQuat::from_rotation_z(heading + turn) * DQuat::from_rotation_y(PI - tilt);
             Pose::from_parts(position, turn)
         };
-        self.ways(&self.microphone, poses.map(pose))
+        self.clear_ways(&self.microphone, &solutions(&self.microphone, poses.map(pose)), usize::MAX)
     }
 
-    fn speaker_ways(&self, microphone_mm: [f64; 3], speaker_mm: [f64; 3], aim: Aim) -> Ways {
+    fn speaker_solutions(&self, microphone_mm: [f64; 3], speaker_mm: [f64; 3], aim: Aim) -> Vec<Joints> {
         let [microphone, speaker] = [microphone_mm, speaker_mm].map(|mm| DVec3::from_array(mm) / 1e3);
-        if speaker.z <= 0.0 || microphone.z <= 0.0 {
-            return Ways(Err(Unreachable::Touches(Tool::Speaker)));
-        }
-        let aimed = DQuat::from_rotation_arc(DVec3::Z, aim.axis(microphone, speaker));
+        // From below the panel's plane no mirror is seen; straight down will do, and is refused as what it is.
+        let axis = match speaker.z > 0.0 && microphone.z > 0.0 {
+            true => aim.axis(microphone, speaker),
+            false => -DVec3::Z,
+        };
+        let aimed = DQuat::from_rotation_arc(DVec3::Z, axis);
         let roll = |i: usize| aimed * DQuat::from_rotation_z(i as f64 * TAU / ROLLS as f64);
-        self.ways(&self.speaker, (0..ROLLS).map(|i| Pose::from_parts(speaker, roll(i))))
+        solutions(&self.speaker, (0..ROLLS).map(|i| Pose::from_parts(speaker, roll(i))))
     }
 
-    fn ways(&self, arm: &Arm, poses: impl Iterator<Item = Pose>) -> Ways {
-        let mut failure = Unreachable::OutOfReach(arm.tool());
+    // The first ways, nearest to home, in which an arm touches neither itself nor what is around it.
+    fn clear_ways(&self, arm: &Arm, solved: &[Joints], most: usize) -> Ways {
+        let mut failure = match solved.is_empty() {
+            true => Unreachable::OutOfReach(arm.tool()),
+            false => Unreachable::Joints(arm.tool()),
+        };
         let mut ways = Vec::new();
-        for joints in poses.flat_map(|pose| arm.solve(pose)) {
-            if !in_range(&joints) {
-                failure = failure.max(Unreachable::Joints(arm.tool()));
-                continue;
-            }
-            let capsules = arm.capsules(&joints);
+        for joints in solved.iter().filter(|joints| in_range(joints)) {
+            let capsules = arm.capsules(joints);
             if !self.around.is_clear(&capsules) || touches_itself(&capsules, self.around.margin_m) {
-                failure = failure.max(Unreachable::Touches(arm.tool()));
+                failure = Unreachable::Touches(arm.tool());
                 continue;
             }
-            ways.push(Way { joints, capsules, cost: from_home(&joints) });
+            ways.push(Way { joints: *joints, capsules, cost: from_home(joints) });
+            if ways.len() == most {
+                break;
+            }
         }
-        ways.sort_by(|a, b| a.cost.total_cmp(&b.cost));
-        ways.truncate(KEPT);
         Ways(if ways.is_empty() { Err(failure) } else { Ok(ways) })
     }
 
@@ -281,6 +285,13 @@ impl Cell {
         let alone = |arm| self.around.is_clear(arm) && !touches_itself(arm, self.around.margin_m);
         alone(&a) && alone(&b) && touching(&a, &b, self.around.margin_m).is_none()
     }
+}
+
+// All joints that bring an arm's tool to one of these poses, nearest to home first.
+fn solutions(arm: &Arm, poses: impl Iterator<Item = Pose>) -> Vec<Joints> {
+    let mut found: Vec<(f64, Joints)> = poses.flat_map(|pose| arm.solve(pose)).map(|q| (from_home(&q), q)).collect();
+    found.sort_by(|a, b| a.0.total_cmp(&b.0));
+    found.into_iter().map(|(_, joints)| joints).collect()
 }
 
 #[cfg(test)]

@@ -774,6 +774,11 @@ export interface components {
         };
         readonly Query: {
             readonly query: string;
+            /**
+             * @description Instead of the Accept header
+             * @enum {string}
+             */
+            readonly format?: "json" | "arrow" | "csv" | "parquet";
         };
     };
     responses: {
@@ -841,6 +846,7 @@ export interface operations {
                 /** @description `band:lo..hi`, dB against Flat */
                 readonly level?: readonly string[];
                 readonly sort?: "surface_id" | "started" | "relief" | "spread" | "level";
+                /** @description A band's key, as in `lake.bands` */
                 readonly sort_band?: string;
                 readonly order?: "asc" | "desc";
                 readonly offset?: number;
@@ -1394,7 +1400,10 @@ export interface operations {
     };
     readonly sql: {
         readonly parameters: {
-            readonly query?: never;
+            readonly query?: {
+                /** @description Instead of the Accept header */
+                readonly format?: "json" | "arrow" | "csv" | "parquet";
+            };
             readonly header?: never;
             readonly path?: never;
             readonly cookie?: never;
@@ -1402,6 +1411,8 @@ export interface operations {
         readonly requestBody: {
             readonly content: {
                 readonly "application/json": components["schemas"]["Query"];
+                readonly "application/sql": string;
+                readonly "text/plain": string;
             };
         };
         readonly responses: {

@@ -41,9 +41,9 @@ pub(super) fn locate(output: &[f32], recording: &[i32]) -> Delay {
     let square = |n: usize| f64::from(recording[n]).powi(2);
     let mut energy: f64 = (0..output.len()).map(square).sum();
     let mut best = Delay { at: 0, likeness: 0.0 };
-    for at in 0..=most {
+    for (at, alike) in correlation.iter().enumerate().take(most + 1) {
         let norm = (energy * energy_sent).sqrt();
-        let likeness = if norm > 0.0 { correlation[at] / len as f64 / norm } else { 0.0 };
+        let likeness = if norm > 0.0 { alike / len as f64 / norm } else { 0.0 };
         if likeness > best.likeness {
             best = Delay { at, likeness };
         }

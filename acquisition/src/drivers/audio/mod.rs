@@ -3,7 +3,7 @@
 
 mod delay;
 #[cfg(test)]
-mod tests;
+pub(super) mod tests;
 
 use echolake_schema::Timestamp;
 

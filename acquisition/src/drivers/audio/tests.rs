@@ -6,14 +6,14 @@ use crate::conformance;
 const DELAY: usize = 613;
 
 /// A duplex with its output looped back; faults are taken from the front.
-struct Cable {
+pub(in crate::drivers) struct Cable {
     faults: Vec<Fault>,
     now: Timestamp,
     gain: f64,
 }
 
 #[derive(Clone, Copy)]
-enum Fault {
+pub(in crate::drivers) enum Fault {
     Overrun,
     Dropped(usize),
     Unplugged,
@@ -48,7 +48,7 @@ impl Duplex for Cable {
     }
 }
 
-fn with(faults: &[Fault]) -> Aligned<Cable> {
+pub(in crate::drivers) fn with(faults: &[Fault]) -> Aligned<Cable> {
     Aligned::new(Cable { faults: faults.to_vec(), now: Timestamp(1_000), gain: 0.9 }, 0.05, 2)
 }
 

@@ -2,7 +2,7 @@
 
 pub mod line;
 #[cfg(test)]
-mod tests;
+pub(super) mod tests;
 
 use std::time::{Duration, Instant};
 

@@ -1,48 +1,64 @@
 //! The sensor over a pair of pseudo terminals, one end of which the test holds.
 
 use std::path::Path;
-use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex};
 use std::thread::JoinHandle;
 
 use super::*;
 use crate::conformance;
 
-const GOOD: &str = "T=21.50 RH=45.0 P=965.0 L=42.0\n";
+pub(in crate::drivers) const GOOD: &str = "T=21.50 RH=45.0 P=965.0 L=42.0\n";
 
 /// The sensor's end: sends a text again and again until it is dropped, which unplugs it.
-struct FakeSensor {
+pub(in crate::drivers) struct FakeSensor {
     path: String,
+    text: Arc<Mutex<&'static str>>,
     stop: Arc<AtomicBool>,
     thread: Option<JoinHandle<()>>,
 }
 
 impl FakeSensor {
-    fn sending(text: &'static str) -> Self {
+    pub(in crate::drivers) fn sending(text: &'static str) -> Self {
         let (ours, theirs) = SerialPort::pair().expect("a pair of pseudo terminals");
         let path = path_of(&theirs);
         let stop = Arc::new(AtomicBool::new(false));
         let stopped = stop.clone();
+        let text = Arc::new(Mutex::new(text));
+        let sent = text.clone();
         let thread = std::thread::spawn(move || {
             // The other end stays open, or the pair is gone before the driver opens it.
             let _held = theirs;
             while !stopped.load(Ordering::Relaxed) {
+                let text = *sent.lock().expect("a text");
                 let _ = ours.write_all(text.as_bytes());
                 std::thread::sleep(Duration::from_millis(50));
             }
         });
-        Self { path, stop, thread: Some(thread) }
+        Self { path, text, stop, thread: Some(thread) }
     }
 
-    fn params(&self) -> SerialParams {
+    pub(in crate::drivers) fn params(&self) -> SerialParams {
         SerialParams { path: self.path.clone(), timeout_secs: 1.0, ..SerialParams::default() }
+    }
+}
+
+impl FakeSensor {
+    /// Something else from now on.
+    pub(in crate::drivers) fn send(&self, text: &'static str) {
+        *self.text.lock().expect("a text") = text;
+    }
+
+    /// Its end of the line is gone.
+    pub(in crate::drivers) fn unplug(&mut self) {
+        self.stop.store(true, Ordering::Relaxed);
+        let _ = self.thread.take().map(JoinHandle::join);
     }
 }
 
 impl Drop for FakeSensor {
     fn drop(&mut self) {
-        self.stop.store(true, Ordering::Relaxed);
-        let _ = self.thread.take().map(JoinHandle::join);
+        self.unplug();
     }
 }
 

@@ -1,0 +1,121 @@
+//! Formats that acousticians exchange: SOFA and npz of a surface's responses, WAV of its recordings.
+
+mod npz;
+mod sofa;
+mod wav;
+
+use std::path::Path;
+
+use arrow::array::AsArray as _;
+use arrow::datatypes::{Float32Type, Float64Type, Int32Type, Int64Type};
+use echolake_lake::{Lake, Snapshot, VisibleRun};
+use echolake_schema::SurfaceId;
+use echolake_schema::tables::Table;
+
+use crate::error::{Error, Result};
+use crate::output::{PendingFolder, WrittenFile};
+use crate::rows;
+pub use wav::write_wav;
+
+/// The responses of one run, in the order of their pairs.
+struct Responses {
+    run: VisibleRun,
+    pairs: Vec<u32>,
+    log_time_ns: Vec<i64>,
+    celsius: Vec<f64>,
+    /// `[pairs x length]`
+    samples: Vec<f32>,
+    length: usize,
+}
+
+/// Which format a surface's responses are written in.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum ResponseFormat {
+    /// AES69 SOFA, convention SingleRoomSRIR 1.0: a file a surface.
+    Sofa,
+    /// NumPy archives as the GIR data set has them, which `import gir` takes back.
+    Npz,
+}
+
+/// Writes the responses of surfaces, of each its newest run, into a folder that is not there yet; of no names, of
+/// all surfaces. `progress` hears how many are done, of how many.
+///
+/// # Errors
+/// [`Error::Unknown`] for a surface that the lake does not have, and others; nothing is left behind.
+pub async fn write_responses(
+    lake: &Lake,
+    folder: &Path,
+    format: ResponseFormat,
+    surfaces: &[SurfaceId],
+    progress: &mut (dyn FnMut(usize, usize) + Send),
+) -> Result<Vec<WrittenFile>> {
+    let snapshot = lake.snapshot().await?;
+    let runs = newest_runs(&snapshot, surfaces)?;
+    let pending = PendingFolder::create(folder)?;
+    let mut files = Vec::new();
+    for (done, run) in runs.iter().enumerate() {
+        let responses = Responses::read(lake, &snapshot, run).await?;
+        match format {
+            ResponseFormat::Sofa => files.push(sofa::write(lake, &responses, &pending)?),
+            ResponseFormat::Npz => files.extend(npz::write(lake, &snapshot, &responses, &pending).await?),
+        }
+        progress(done + 1, runs.len());
+    }
+    if format == ResponseFormat::Npz {
+        files.extend(npz::describe(lake, &snapshot, &runs, &pending).await?);
+    }
+    pending.publish()?;
+    Ok(files)
+}
+
+// The newest run of each surface, by the surfaces' names.
+fn newest_runs(snapshot: &Snapshot, surfaces: &[SurfaceId]) -> Result<Vec<VisibleRun>> {
+    let mut newest: std::collections::BTreeMap<&SurfaceId, &VisibleRun> = std::collections::BTreeMap::new();
+    newest.extend(snapshot.runs().map(|run| (&run.surface, run)));
+    if let Some(unknown) = surfaces.iter().find(|s| !newest.contains_key(s)) {
+        let known = newest.keys().take(20).map(|s| s.as_str()).collect::<Vec<_>>().join(", ");
+        return Err(Error::Unknown { kind: "surface", name: unknown.to_string(), known });
+    }
+    if newest.is_empty() {
+        return Err(Error::Nothing { reason: "the lake has no runs; hint: `echolake ingest`".into() });
+    }
+    newest.retain(|surface, _| surfaces.is_empty() || surfaces.contains(surface));
+    Ok(newest.into_values().cloned().collect())
+}
+
+impl Responses {
+    async fn read(lake: &Lake, snapshot: &Snapshot, run: &VisibleRun) -> Result<Self> {
+        let columns = ["pair_id", "log_time_ns", "temperature_c", "ir"];
+        let batch = rows::of_run(lake, snapshot, Table::Measurements, &run.run, &columns).await?;
+        let damaged = |reason: String| Error::damaged(format!("measurements, run {}", run.run), reason);
+        let ids = rows::numbers::<Int32Type>(&batch, "pair_id")?;
+        let times = rows::numbers::<Int64Type>(&batch, "log_time_ns")?;
+        let temperatures = rows::numbers::<Float64Type>(&batch, "temperature_c")?;
+        let lists = batch.column_by_name("ir").and_then(|c| c.as_list_opt::<i32>());
+        let lists = lists.ok_or_else(|| damaged("no `ir`".into()))?;
+        let values = lists.values().as_primitive::<Float32Type>().values();
+        let length = lake.rig().impulse_response.length;
+        let mut order: Vec<usize> = (0..ids.len()).collect();
+        order.sort_by_key(|row| ids[*row]);
+        let mut samples = Vec::with_capacity(ids.len() * length);
+        for row in &order {
+            let (from, to) = (lists.value_offsets()[*row] as usize, lists.value_offsets()[row + 1] as usize);
+            if to - from != length {
+                return Err(damaged(format!("a response has {} samples, expected {length}", to - from)));
+            }
+            samples.extend_from_slice(&values[from..to]);
+        }
+        let pairs: Vec<u32> = order.iter().map(|row| u32::try_from(ids[*row]).unwrap_or(u32::MAX)).collect();
+        if let Some(pair) = pairs.iter().find(|p| **p as usize >= lake.grid().pairs().len()) {
+            return Err(damaged(format!("pair {pair}, which the rig does not have")));
+        }
+        Ok(Self {
+            run: run.clone(),
+            pairs,
+            log_time_ns: order.iter().map(|row| times[*row]).collect(),
+            celsius: order.iter().map(|row| temperatures[*row]).collect(),
+            samples,
+            length,
+        })
+    }
+}

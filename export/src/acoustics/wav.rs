@@ -1,0 +1,211 @@
+//! Recordings as WAV files, microphone and loopback in one, with a manifest that `import wav` takes back.
+
+use std::collections::BTreeMap;
+use std::io::{Cursor, Seek, Write};
+use std::path::Path;
+
+use echolake_lake::Lake;
+use echolake_schema::messages::{Measurement, SampleFormat, SweepRecording};
+use echolake_schema::{Timestamp, topics};
+use hound::{WavSpec, WavWriter};
+use prost::Message as _;
+
+use crate::error::{Error, Result};
+use crate::output::PendingFolder;
+use crate::slice::{Check, Measured, Taken, open_runs};
+
+/// The columns of the manifest, as `import wav` reads them.
+const COLUMNS: [&str; 10] = [
+    "surface",
+    "recording",
+    "loopback",
+    "microphone",
+    "speaker",
+    "temperature_c",
+    "humidity_pct",
+    "pressure_hpa",
+    "recorded_at",
+    "attempt",
+];
+
+/// Writes the recordings of measurements into a folder that is not there yet, and `manifest.csv` beside them; returns
+/// how many. `progress` hears how many are done, of how many.
+///
+/// # Errors
+/// [`Error::Nothing`] where a run was recorded without sweeps, and others; nothing is left behind.
+pub async fn write_wav(
+    lake: &Lake,
+    folder: &Path,
+    taken: &[Taken],
+    check: Check,
+    progress: &mut (dyn FnMut(usize, usize) + Send),
+) -> Result<usize> {
+    let mut runs = open_runs(lake, taken, check).await?;
+    let pending = PendingFolder::create(folder)?;
+    let mut manifest = csv::Writer::from_writer(Vec::new());
+    let failed = |e: csv::Error| Error::write(&pending.named("manifest.csv"), e);
+    manifest.write_record(COLUMNS).map_err(failed)?;
+    let mut done = 0;
+    for run in &mut runs {
+        while let Some(measured) = run.next().await? {
+            let recording = Recording::of(&measured)?;
+            let name = format!(
+                "{}/{}-p{:04}-a{}.wav",
+                run.surface(),
+                run.run(),
+                recording.sweep.pair_id,
+                recording.sweep.attempt
+            );
+            let bytes = recording
+                .wav()
+                .map_err(|reason| Error::damaged(run.file(), format!("pair {}: {reason}", recording.sweep.pair_id)))?;
+            pending.write(&name, &bytes)?;
+            let row = recording.row(lake, run.surface().as_str(), &name).ok_or_else(|| {
+                Error::damaged(run.file(), format!("pair {}, which the rig does not have", recording.sweep.pair_id))
+            })?;
+            manifest.write_record(COLUMNS.map(|c| row.get(c).map_or("", String::as_str))).map_err(failed)?;
+            done += 1;
+            progress(done, taken.len());
+        }
+    }
+    let manifest = manifest.into_inner().map_err(|e| Error::write(&pending.named("manifest.csv"), e))?;
+    pending.write("manifest.csv", &manifest)?;
+    pending.publish()?;
+    Ok(done)
+}
+
+/// What is kept of one measurement.
+struct Recording {
+    sweep: SweepRecording,
+    verdict: Measurement,
+    time_ns: i64,
+}
+
+impl Recording {
+    fn of(measured: &Measured) -> Result<Self> {
+        let damaged = |e: prost::DecodeError| Error::damaged(&measured.file, e);
+        let Some((time_ns, sweep)) = measured.message(topics::SWEEP) else {
+            let reason = format!(
+                "run {} was recorded without sweeps; hint: export sofa and export npz write its responses",
+                measured.run
+            );
+            return Err(Error::Nothing { reason });
+        };
+        let verdict = measured.message(topics::MEASUREMENT).map(|(_, data)| Measurement::decode(data)).transpose();
+        let sweep = SweepRecording::decode(sweep).map_err(damaged)?;
+        Ok(Self { sweep, verdict: verdict.map_err(damaged)?.unwrap_or_default(), time_ns })
+    }
+
+    fn row(&self, lake: &Lake, surface: &str, name: &str) -> Option<BTreeMap<&'static str, String>> {
+        let pair = lake.grid().pairs().get(self.sweep.pair_id as usize)?;
+        let [microphone, speaker] = [pair.microphone, pair.speaker].map(|id| lake.grid().points()[id.index()].label());
+        let known = |x: f64| if x.is_finite() { x.to_string() } else { String::new() };
+        Some(BTreeMap::from([
+            ("surface", surface.to_owned()),
+            ("recording", name.to_owned()),
+            ("loopback", format!("{name}#2")),
+            ("microphone", microphone),
+            ("speaker", speaker),
+            ("temperature_c", self.sweep.temperature_c.to_string()),
+            ("humidity_pct", known(self.verdict.humidity_pct)),
+            ("pressure_hpa", known(self.verdict.pressure_hpa)),
+            ("recorded_at", Timestamp(self.time_ns).to_string()),
+            ("attempt", self.sweep.attempt.to_string()),
+        ]))
+    }
+
+    // Both channels as they were recorded, to the bit.
+    fn wav(&self) -> std::result::Result<Vec<u8>, String> {
+        let format = self.sweep.format();
+        let width = format.bytes().ok_or("its sample format is unknown")?;
+        let count = self.sweep.sample_count as usize;
+        for channel in [&self.sweep.microphone, &self.sweep.loopback] {
+            if count.checked_mul(width) != Some(channel.len()) {
+                return Err(format!("it has {} bytes for {count} samples of {width}", channel.len()));
+            }
+        }
+        let float = format == SampleFormat::F32le;
+        let spec = WavSpec {
+            channels: 2,
+            sample_rate: self.sweep.sample_rate_hz.round() as u32,
+            bits_per_sample: 8 * width as u16,
+            sample_format: if float { hound::SampleFormat::Float } else { hound::SampleFormat::Int },
+        };
+        let mut bytes = Cursor::new(Vec::with_capacity(44 + 2 * count * width));
+        let written = WavWriter::new(&mut bytes, spec).and_then(|writer| self.interleave(writer, format, count));
+        written.map_err(|e| e.to_string())?;
+        Ok(bytes.into_inner())
+    }
+
+    fn interleave<W: Write + Seek>(
+        &self,
+        mut to: WavWriter<W>,
+        format: SampleFormat,
+        count: usize,
+    ) -> hound::Result<()> {
+        for i in 0..count {
+            for channel in [&self.sweep.microphone, &self.sweep.loopback] {
+                match format {
+                    SampleFormat::F32le => to.write_sample(f32::from_le_bytes(four(channel, 4 * i)))?,
+                    _ => to.write_sample(integer(format, channel, i, count))?,
+                }
+            }
+        }
+        to.finalize()
+    }
+}
+
+fn four(bytes: &[u8], at: usize) -> [u8; 4] {
+    [bytes[at], bytes[at + 1], bytes[at + 2], bytes[at + 3]]
+}
+
+// Sample i of a channel whose length was checked.
+fn integer(format: SampleFormat, b: &[u8], i: usize, count: usize) -> i32 {
+    match format {
+        SampleFormat::S16le => i32::from(i16::from_le_bytes([b[2 * i], b[2 * i + 1]])),
+        SampleFormat::S24le => i32::from_le_bytes([0, b[3 * i], b[3 * i + 1], b[3 * i + 2]]) >> 8,
+        SampleFormat::S24Split => i32::from_le_bytes([0, b[i], b[count + 2 * i], b[count + 2 * i + 1]]) >> 8,
+        _ => i32::from_le_bytes(four(b, 4 * i)),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use echolake_schema::samples::split_24;
+
+    use super::*;
+
+    #[test]
+    fn samples_are_kept_to_the_bit() {
+        let samples = [0, 1, -1, 8_388_607, -8_388_608, 123_456];
+        let packed: Vec<u8> = samples.iter().flat_map(|x: &i32| x.to_le_bytes()[..3].to_vec()).collect();
+        for (format, bytes) in [(SampleFormat::S24Split, split_24(&samples)), (SampleFormat::S24le, packed)] {
+            let sweep = SweepRecording {
+                sample_rate_hz: 96e3,
+                sample_count: 6,
+                format: format.into(),
+                microphone: bytes.clone().into(),
+                loopback: bytes.into(),
+                ..SweepRecording::default()
+            };
+            let recording = Recording { sweep, verdict: Measurement::default(), time_ns: 0 };
+            let wav = recording.wav().expect("a file");
+            let mut reader = hound::WavReader::new(Cursor::new(wav)).expect("a WAV file");
+            assert_eq!((reader.spec().bits_per_sample, reader.spec().sample_rate), (24, 96_000));
+            let read: Vec<i32> = reader.samples().map(|s| s.expect("a sample")).collect();
+            assert_eq!(read, samples.iter().flat_map(|x| [*x, *x]).collect::<Vec<_>>(), "{format:?}");
+        }
+    }
+
+    #[test]
+    fn lengths_that_the_bytes_do_not_bear_out_are_refused() {
+        let sweep = SweepRecording {
+            sample_count: 9,
+            format: SampleFormat::S24le.into(),
+            microphone: vec![0; 6].into(),
+            ..SweepRecording::default()
+        };
+        let recording = Recording { sweep, verdict: Measurement::default(), time_ns: 0 };
+        assert!(recording.wav().is_err_and(|e| e.contains("6 bytes for 9")));
+    }
+}

@@ -1,0 +1,97 @@
+//! What can go wrong with an export, by what the caller can do about it.
+
+use std::path::{Path, PathBuf};
+
+use echolake_schema::RunId;
+
+/// Why something is not exported. Nothing half-done stands under its final name.
+#[derive(Debug, thiserror::Error)]
+pub enum Error {
+    /// The output is there already.
+    #[error("`{}` is there already; hint: {hint}", path.display())]
+    Exists {
+        /// The file or folder.
+        path: PathBuf,
+        /// What to do.
+        hint: &'static str,
+    },
+    /// The system refused to write.
+    #[error("cannot write `{}`: {reason}; hint: is its folder there and writable, and its disk not full?", path.display())]
+    Write {
+        /// The file or folder.
+        path: PathBuf,
+        /// The system's words.
+        reason: String,
+    },
+    /// There is nothing to export.
+    #[error("nothing to export: {reason}")]
+    Nothing {
+        /// Why, and what would help.
+        reason: String,
+    },
+    /// A name that the lake does not have.
+    #[error("there is no {kind} `{name}`; hint: there are {known}")]
+    Unknown {
+        /// Column, topic or surface.
+        kind: &'static str,
+        /// What was asked for.
+        name: String,
+        /// What there is.
+        known: String,
+    },
+    /// The lake cannot be split that way.
+    #[error("the lake cannot be split {by}: {reason}")]
+    Split {
+        /// The way.
+        by: &'static str,
+        /// Why not, and what would help.
+        reason: String,
+    },
+    /// A file of the lake is not as its log says.
+    #[error("`{file}` is damaged: {reason}; hint: `echolake doctor` says what is")]
+    Damaged {
+        /// The file.
+        file: String,
+        /// What is wrong.
+        reason: String,
+    },
+    /// A run's file is not the one that was ingested.
+    #[error(
+        "`{file}` is not the file that run {run} was ingested from: {reason}; hint: bring the original back, `echolake doctor` lists all"
+    )]
+    Changed {
+        /// The run.
+        run: RunId,
+        /// Its file.
+        file: String,
+        /// What is different, expected and actual.
+        reason: String,
+    },
+    /// A run's file cannot be sliced.
+    #[error("run {run} cannot be cut: {reason}")]
+    Uncuttable {
+        /// The run.
+        run: RunId,
+        /// Why, and what would help.
+        reason: String,
+    },
+    /// The lake refused.
+    #[error(transparent)]
+    Lake(#[from] echolake_lake::Error),
+    /// A rig or id that is not valid.
+    #[error(transparent)]
+    Schema(#[from] echolake_schema::Error),
+}
+
+/// The result of an export.
+pub type Result<T> = std::result::Result<T, Error>;
+
+impl Error {
+    pub(crate) fn write(path: &Path, reason: impl ToString) -> Self {
+        Self::Write { path: path.to_owned(), reason: reason.to_string() }
+    }
+
+    pub(crate) fn damaged(file: impl ToString, reason: impl ToString) -> Self {
+        Self::Damaged { file: file.to_string(), reason: reason.to_string() }
+    }
+}

@@ -1,0 +1,221 @@
+//! What a training set says of itself: `README.md`, a card as hubs of data sets show it, and `surfaces.csv`.
+
+use std::fmt::Write as _;
+
+use arrow::datatypes::{DataType, Field};
+use echolake_lake::Lake;
+use echolake_schema::tables::{COMMENT, UNIT};
+
+use super::split::{Part, SplitBy};
+use super::{Exported, Plan, Shard, Symmetries, heights};
+use crate::error::{Error, Result};
+
+/// The paper that the rig, the bands and TNCE are of.
+pub(super) const PAPER: &str = "Rust, R. et al. (2021). A data acquisition setup for data driven acoustic design. \
+Building Acoustics 28(4), 345-360. https://doi.org/10.1177/1351010X20986901";
+
+/// What a card is about.
+pub(super) struct About<'a> {
+    pub(super) lake: &'a Lake,
+    pub(super) plan: &'a Plan,
+    pub(super) exported: &'a Exported,
+}
+
+impl About<'_> {
+    /// One sentence.
+    pub(super) fn summary(&self) -> String {
+        let rows: u64 = self.exported.parts.iter().map(|p| p.rows).sum();
+        let surfaces: usize = self.exported.parts.iter().map(|p| p.surfaces).sum();
+        let rate = self.lake.rig().sweep.rate_hz.get();
+        format!(
+            "{rows} acoustic reflections of {surfaces} relief surfaces: impulse responses at {rate} Hz between a microphone and a speaker over each surface, their energies by band over those of a flat plate, and the surfaces' height maps."
+        )
+    }
+
+    /// The origins of the surfaces: measured, simulated, imported.
+    pub(super) fn origins(&self) -> Vec<String> {
+        let mut origins: Vec<_> =
+            Part::ALL.iter().flat_map(|p| self.plan.of_part(*p)).map(|s| s.origin.clone()).collect();
+        origins.sort();
+        origins.dedup();
+        origins
+    }
+
+    fn split_words(&self) -> &'static str {
+        match self.plan.set.split.by {
+            SplitBy::Panel => "Physical panels were drawn; what is held out has never been seen.",
+            SplitBy::Typology => "Typologies were drawn; no held-out typology is in the training set.",
+            SplitBy::Macrostructure => "Macrostructures were drawn; none that is held out is in the training set.",
+            SplitBy::Nothing => "Nothing is held out.",
+        }
+    }
+}
+
+/// The card.
+pub(super) fn write(about: &About<'_>) -> String {
+    let mut text = front_matter(about);
+    let split = about.plan.set.split;
+    let _ = write!(text, "# Reflections of relief surfaces\n\n{}\n\n", about.summary());
+    let _ = writeln!(text, "Origin of the data: {}.", about.origins().join(", "));
+    if about.origins().iter().any(|o| o == "simulated") {
+        text.push_str("Simulated surfaces come from a Kirchhoff model of single reflections, not from a rig.\n");
+    }
+    let _ = writeln!(text, "\n## Splits\n\n{} (`{}`, seed {})", about.split_words(), split.by.name(), split.seed);
+    text.push_str(
+        "No physical panel (column `group`) is in two splits: neither a side of it, nor a repeated run, nor a symmetry.\nSurfaces that normalise others are for training always, because they are in every number anyway.\n\n",
+    );
+    text.push_str(
+        "| split | files | panels | surfaces | rows | height maps |\n| --- | ---: | ---: | ---: | ---: | ---: |\n",
+    );
+    for p in &about.exported.parts {
+        let _ = writeln!(
+            text,
+            "| {} | {} | {} | {} | {} | {} |",
+            p.part.name(),
+            p.files,
+            p.panels,
+            p.surfaces,
+            p.rows,
+            p.height_maps
+        );
+    }
+    if !about.exported.left_out.is_empty() {
+        let names: Vec<_> = about.exported.left_out.iter().map(|s| s.as_str()).collect();
+        let _ = writeln!(
+            text,
+            "\n{} surfaces are left out, because another side of their panel is held out: {}.",
+            names.len(),
+            names.join(", ")
+        );
+    }
+    if about.exported.waiting > 0 {
+        let _ = writeln!(text, "\n{} runs that wait for their references are left out.", about.exported.waiting);
+    }
+    files(&mut text, about);
+    let fields = about.plan.schema().fields();
+    let _ = writeln!(text, "\n## Columns of the measurements\n");
+    columns(&mut text, fields.iter().map(AsRef::as_ref));
+    if let Ok(schema) = heights::schema() {
+        let _ = writeln!(text, "\n## Columns of the height maps\n");
+        columns(&mut text, schema.fields().iter().map(AsRef::as_ref));
+    }
+    usage(&mut text);
+    let _ = writeln!(text, "\n## Reference\n\n{PAPER}");
+    text
+}
+
+fn front_matter(about: &About<'_>) -> String {
+    let mut text = String::from(
+        "---\npretty_name: Reflections of relief surfaces\ntags:\n- acoustics\n- impulse-response\nconfigs:\n",
+    );
+    let mut config = |name: &str, default: bool, path: &dyn Fn(Part) -> String, has: &dyn Fn(Part) -> bool| {
+        let _ =
+            write!(text, "- config_name: {name}\n{}  data_files:\n", if default { "  default: true\n" } else { "" });
+        for part in Part::ALL.into_iter().filter(|p| has(*p)) {
+            let _ = writeln!(text, "  - split: {}\n    path: {}", part.name(), path(part));
+        }
+    };
+    let of = |part| about.exported.parts.iter().find(|p| p.part == part);
+    config("measurements", true, &|p| format!("data/{}-*.parquet", p.name()), &|p| of(p).is_some());
+    if about.exported.parts.iter().any(|p| p.height_maps > 0) {
+        config("heightmaps", false, &|p| format!("heightmaps/{}.parquet", p.name()), &|p| {
+            of(p).is_some_and(|p| p.height_maps > 0)
+        });
+    }
+    text.push_str("---\n\n");
+    text
+}
+
+fn files(text: &mut String, about: &About<'_>) {
+    text.push_str(
+        "\n## Files\n\n- `data/<split>-*.parquet`: measurements. Whole surfaces in a file, one row group a surface, in a drawn order.\n- `heightmaps/<split>.parquet`: the surfaces' heights, joined by `surface_id` and `symmetry`.\n- `surfaces.csv`: every surface and run, its file, rows, and the digests of what its rows were derived from.\n- `croissant.json`: the same as Croissant metadata. `SHA256SUMS`: `sha256sum -c SHA256SUMS` checks all files.\n\n",
+    );
+    text.push_str(match about.plan.set.symmetries {
+        Symmetries::None => "Rows are as they were measured. The grid and the panel have the eight symmetries of a square; `echolake.torch.Measurements(symmetries=\"all\")` turns positions and height maps together while it loads.\n",
+        Symmetries::All => "Every measurement stands there under each of the square's eight symmetries: its positions are turned, its numbers are the same, and the height map of the same `symmetry` is turned with it. Where `swapped` is true, microphone and speaker changed places as well, which relies on reciprocity; leave these rows out where that is not wanted.\n",
+    });
+    let _ = writeln!(
+        text,
+        "Made by echolake {}; the same lake, arguments and version give the same bytes.",
+        env!("CARGO_PKG_VERSION")
+    );
+}
+
+fn columns<'a>(text: &mut String, fields: impl Iterator<Item = &'a Field>) {
+    text.push_str("| column | type | unit | meaning |\n| --- | --- | --- | --- |\n");
+    for field in fields {
+        let of = |key: &str| field.metadata().get(key).map_or("", String::as_str);
+        let _ = writeln!(text, "| `{}` | {} | {} | {} |", field.name(), kind(field), of(UNIT), of(COMMENT));
+    }
+}
+
+fn kind(field: &Field) -> String {
+    match field.data_type() {
+        DataType::FixedSizeList(_, length) => format!("{length} x float32"),
+        DataType::Utf8 => "string".into(),
+        other => other.to_string().to_lowercase(),
+    }
+}
+
+fn usage(text: &mut String) {
+    text.push_str(
+        r#"
+## Loading
+
+```python
+from datasets import load_dataset
+train = load_dataset("parquet", data_files="data/train-*.parquet", split="train", streaming=True)
+
+import polars as pl
+rows = pl.scan_parquet("data/train-*.parquet").select("surface_id", "tnce_total").collect()
+
+from echolake.torch import Measurements
+loader = Measurements(".", split="train", symmetries="all", heights=True)
+```
+"#,
+    );
+}
+
+/// `surfaces.csv`: what each surface's rows were made from.
+pub(super) fn sources(shards: &[(&Shard, Vec<u64>)]) -> Result<String> {
+    let mut csv = csv::Writer::from_writer(Vec::new());
+    let failed = |e: csv::Error| Error::damaged("surfaces.csv", e);
+    csv.write_record([
+        "surface_id",
+        "run_id",
+        "group",
+        "split",
+        "typology",
+        "macrostructure",
+        "origin",
+        "file",
+        "surface_rows",
+        "run_file_sha256",
+        "run_derivation",
+        "reference_derivation",
+    ])
+    .map_err(failed)?;
+    for (shard, rows) in shards {
+        for (surface, rows) in shard.surfaces.iter().zip(rows) {
+            for run in &surface.runs {
+                csv.write_record([
+                    surface.id.as_str(),
+                    run.visible.run.as_str(),
+                    surface.id.panel(),
+                    shard.part.name(),
+                    &surface.typology,
+                    surface.macrostructure.as_deref().unwrap_or_default(),
+                    &surface.origin,
+                    &shard.name,
+                    &rows.to_string(),
+                    &run.file_sha256,
+                    &run.visible.run_derivation,
+                    run.visible.reference_derivation.as_deref().unwrap_or_default(),
+                ])
+                .map_err(failed)?;
+            }
+        }
+    }
+    let bytes = csv.into_inner().map_err(|e| Error::damaged("surfaces.csv", e))?;
+    String::from_utf8(bytes).map_err(|e| Error::damaged("surfaces.csv", e))
+}

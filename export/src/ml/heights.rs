@@ -1,0 +1,77 @@
+//! Height maps of a training set: a row a surface and symmetry, joined by both.
+
+use std::sync::Arc;
+
+use arrow::array::{Array as _, ArrayRef, AsArray as _, StringArray};
+use arrow::compute::filter_record_batch;
+use arrow::datatypes::{DataType, Schema, SchemaRef};
+use arrow::record_batch::RecordBatch;
+use echolake_lake::{Lake, Snapshot};
+use echolake_schema::tables::Table;
+
+use super::columns::{field, list};
+use super::measurements::fixed;
+use super::split::Part;
+use super::surfaces::Surface;
+use crate::error::{Error, Result};
+use crate::rows;
+
+/// The schema of the files of height maps.
+pub(super) fn schema() -> Result<SchemaRef> {
+    Ok(Arc::new(Schema::new(vec![
+        field("surface_id", DataType::Utf8, "", "The surface"),
+        field("symmetry", DataType::Utf8, "", "What the map is turned by, as the measurements' column says"),
+        field("split", DataType::Utf8, "", "train, validation or test"),
+        field("group", DataType::Utf8, "", "Physical panel"),
+        field("size_mm", DataType::Float32, "mm", "Edge of the square"),
+        field(
+            "heights_mm",
+            list(Table::HEIGHTMAP_CELLS * Table::HEIGHTMAP_CELLS)?,
+            "mm",
+            "Mean height of each cell: 128 rows along y, each of 128 along x, both ascending",
+        ),
+    ])))
+}
+
+/// A surface's height maps under these symmetries; None where it has none.
+pub(super) async fn read(
+    lake: &Lake,
+    snapshot: &Snapshot,
+    surface: &Surface,
+    part: Part,
+    symmetries: &[&str],
+) -> Result<Option<RecordBatch>> {
+    let columns = ["symmetry", "size_mm", "heights_mm"];
+    for run in surface.runs.iter().rev() {
+        let batch = rows::of_run(lake, snapshot, Table::Heightmaps, &run.visible.run, &columns).await?;
+        let wanted = rows::texts(&batch, "symmetry").into_iter().map(|s| Some(symmetries.contains(&s))).collect();
+        let failed = |e: arrow::error::ArrowError| Error::damaged(format!("heightmaps, {}", surface.id), e);
+        let batch = filter_record_batch(&batch, &wanted).map_err(failed)?;
+        if batch.num_rows() > 0 {
+            return arranged(surface, part, &batch).map_err(failed).map(Some);
+        }
+    }
+    Ok(None)
+}
+
+fn arranged(
+    surface: &Surface,
+    part: Part,
+    batch: &RecordBatch,
+) -> std::result::Result<RecordBatch, arrow::error::ArrowError> {
+    let schema = schema().map_err(|e| arrow::error::ArrowError::SchemaError(e.to_string()))?;
+    let count = batch.num_rows();
+    let same = |text: &str| -> ArrayRef { Arc::new(StringArray::from_iter_values(std::iter::repeat_n(text, count))) };
+    let lists = batch.column(2).as_list::<i32>();
+    let (from, to) = (lists.value_offsets()[0] as usize, lists.value_offsets()[lists.len()] as usize);
+    let heights = fixed(lists.values().slice(from, to - from), schema.field(5).data_type())?;
+    let columns = vec![
+        same(surface.id.as_str()),
+        batch.column(0).clone(),
+        same(part.name()),
+        same(surface.id.panel()),
+        batch.column(1).clone(),
+        heights,
+    ];
+    RecordBatch::try_new(schema, columns)
+}

@@ -1,0 +1,171 @@
+//! Rows of one run for a training set: joined by pair, once for each symmetry.
+
+use std::collections::HashMap;
+use std::sync::Arc;
+
+use arrow::array::{
+    Array as _, ArrayRef, AsArray as _, BooleanArray, FixedSizeListArray, Float32Array, Int32Array, StringArray,
+    UInt32Array,
+};
+use arrow::compute::{cast, take};
+use arrow::datatypes::{DataType, FieldRef, Int32Type};
+use arrow::record_batch::RecordBatch;
+use echolake_lake::{Lake, Snapshot};
+use echolake_schema::symmetry::MovedPair;
+use echolake_schema::tables::Table;
+use echolake_schema::{Grid, PointId, Symmetry};
+
+use super::columns::Columns;
+use super::split::Part;
+use super::surfaces::{Run, Surface};
+use crate::error::{Error, Result};
+use crate::rows;
+
+/// The symmetries of a training set, and where each of the rig's pairs goes under them.
+pub(super) struct Moves(Vec<(Symmetry, Vec<MovedPair>)>);
+
+impl Moves {
+    /// All that the grid has, or the identity alone.
+    pub(super) fn of(grid: &Grid, symmetries: super::Symmetries) -> Self {
+        let wanted: &[Symmetry] = match symmetries {
+            super::Symmetries::None => &[Symmetry::Identity],
+            super::Symmetries::All => &Symmetry::ALL,
+        };
+        Self(wanted.iter().filter_map(|s| grid.moved_pairs(*s).map(|pairs| (*s, pairs))).collect())
+    }
+
+    /// Their names.
+    pub(super) fn names(&self) -> Vec<&'static str> {
+        self.0.iter().map(|(symmetry, _)| symmetry.name()).collect()
+    }
+}
+
+/// What rows are made with.
+pub(super) struct Maker<'a> {
+    pub(super) lake: &'a Lake,
+    pub(super) snapshot: &'a Snapshot,
+    pub(super) columns: &'a Columns,
+    pub(super) moves: &'a Moves,
+}
+
+/// Rows of a run before any symmetry, in the order of their pairs.
+pub(super) struct RunRows {
+    pairs: Vec<u32>,
+    values: Vec<ArrayRef>,
+}
+
+impl Maker<'_> {
+    /// Reads what a run has in all of the chosen tables.
+    pub(super) async fn read(&self, run: &Run) -> Result<RunRows> {
+        let mut tables = HashMap::new();
+        let mut pairs: Option<Vec<u32>> = None;
+        for table in [Table::Measurements, Table::Nce, Table::Tnce] {
+            let mut names = self.columns.of(table);
+            // Every row of a training set is one that references normalise, whatever is chosen of it.
+            if names.is_empty() && table != Table::Tnce {
+                continue;
+            }
+            names.push("pair_id");
+            let batch = rows::of_run(self.lake, self.snapshot, table, &run.visible.run, &names).await?;
+            let places = places(&batch, self.lake.grid().pairs().len())?;
+            let mut known: Vec<u32> = places.keys().copied().collect();
+            if let Some(others) = &pairs {
+                known.retain(|pair| others.binary_search(pair).is_ok());
+            }
+            known.sort_unstable();
+            pairs = Some(known);
+            tables.insert(table, (batch, places));
+        }
+        let pairs = pairs.unwrap_or_default();
+        let mut values = Vec::new();
+        for (table, field) in self.columns.chosen() {
+            let (batch, places) = &tables[table];
+            let order: UInt32Array = pairs.iter().map(|pair| places[pair]).collect();
+            values.push(
+                column(batch, field, &order)
+                    .map_err(|e| Error::damaged(format!("{}, {}", table.name(), run.visible.run), e))?,
+            );
+        }
+        Ok(RunRows { pairs, values })
+    }
+
+    /// The rows under each symmetry, one batch a symmetry.
+    pub(super) fn batches(&self, surface: &Surface, run: &Run, part: Part, rows: &RunRows) -> Result<Vec<RecordBatch>> {
+        self.moves.0.iter().map(|(symmetry, moved)| self.batch(surface, run, part, rows, (*symmetry, moved))).collect()
+    }
+
+    fn batch(
+        &self,
+        surface: &Surface,
+        run: &Run,
+        part: Part,
+        rows: &RunRows,
+        (symmetry, moved): (Symmetry, &[MovedPair]),
+    ) -> Result<RecordBatch> {
+        let count = rows.pairs.len();
+        let same =
+            |text: &str| -> ArrayRef { Arc::new(StringArray::from_iter_values(std::iter::repeat_n(text, count))) };
+        let moved: Vec<_> = rows.pairs.iter().map(|pair| moved[*pair as usize]).collect();
+        let points = |of: fn(&MovedPair) -> PointId| -> ArrayRef {
+            Arc::new(Int32Array::from_iter_values(moved.iter().map(|m| of(m).0 as i32)))
+        };
+        let macrostructure = surface.macrostructure.as_deref();
+        let mut columns: Vec<ArrayRef> = vec![
+            same(surface.id.as_str()),
+            same(run.visible.run.as_str()),
+            same(symmetry.name()),
+            same(part.name()),
+            same(surface.id.panel()),
+            same(&surface.typology),
+            Arc::new(StringArray::from_iter(std::iter::repeat_n(macrostructure, count))),
+            Arc::new(Int32Array::from_iter_values(rows.pairs.iter().map(|p| *p as i32))),
+            points(|m| m.pair.microphone),
+            points(|m| m.pair.speaker),
+            Arc::new(BooleanArray::from_iter(moved.iter().map(|m| Some(m.swapped)))),
+            self.positions("microphone_mm", &moved, |m| m.pair.microphone)?,
+            self.positions("speaker_mm", &moved, |m| m.pair.speaker)?,
+        ];
+        columns.extend(rows.values.iter().cloned());
+        RecordBatch::try_new(self.columns.schema().clone(), columns).map_err(|e| Error::damaged(&run.visible.run, e))
+    }
+
+    fn positions(&self, column: &str, moved: &[MovedPair], of: fn(&MovedPair) -> PointId) -> Result<ArrayRef> {
+        let points = self.lake.grid().points();
+        let values = moved.iter().flat_map(|m| points[of(m).index()].position_mm.map(|mm| mm as f32));
+        let values: ArrayRef = Arc::new(Float32Array::from_iter_values(values));
+        let kind = self.columns.schema().field_with_name(column).map(|f| f.data_type().clone());
+        kind.and_then(|kind| fixed(values, &kind)).map_err(|e| Error::damaged(column, e))
+    }
+}
+
+// Where each pair's row is. A pair stands once in a run; of several the last counts.
+fn places(batch: &RecordBatch, pairs: usize) -> Result<HashMap<u32, u32>> {
+    let ids = rows::numbers::<Int32Type>(batch, "pair_id")?;
+    let place =
+        |(row, id): (usize, &i32)| Some((u32::try_from(*id).ok().filter(|id| (*id as usize) < pairs)?, row as u32));
+    let all: Option<HashMap<_, _>> = ids.iter().enumerate().map(place).collect();
+    all.ok_or_else(|| Error::damaged("pair_id", "a pair that the rig does not have"))
+}
+
+fn column(batch: &RecordBatch, field: &FieldRef, order: &UInt32Array) -> std::result::Result<ArrayRef, String> {
+    let array = batch.column_by_name(field.name()).ok_or_else(|| format!("no column `{}`", field.name()))?;
+    let taken = take(array, order, None).map_err(|e| e.to_string())?;
+    match field.data_type() {
+        list @ DataType::FixedSizeList(_, length) => {
+            let lists = taken.as_list::<i32>();
+            let wrong = (0..lists.len()).find(|row| lists.value_length(*row) != *length || lists.is_null(*row));
+            if let Some(row) = wrong {
+                return Err(format!("`{}` has {} values, expected {length}", field.name(), lists.value_length(row)));
+            }
+            let (from, to) = (lists.value_offsets()[0], lists.value_offsets()[lists.len()]);
+            fixed(lists.values().slice(from as usize, (to - from) as usize), list).map_err(|e| e.to_string())
+        }
+        plain => cast(&taken, plain).map_err(|e| e.to_string()),
+    }
+}
+
+/// Values as lists of one length.
+pub(super) fn fixed(values: ArrayRef, kind: &DataType) -> std::result::Result<ArrayRef, arrow::error::ArrowError> {
+    let DataType::FixedSizeList(child, length) = kind else { return Ok(values) };
+    Ok(Arc::new(FixedSizeListArray::try_new(child.clone(), *length, values, None)?))
+}

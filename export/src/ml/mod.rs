@@ -1,0 +1,237 @@
+//! Training sets: whole surfaces in Parquet files that loaders read by themselves, split by physical panel.
+
+mod card;
+mod columns;
+mod croissant;
+mod heights;
+mod measurements;
+mod shard;
+mod split;
+mod surfaces;
+
+use std::path::Path;
+use std::sync::Arc;
+
+use arrow::datatypes::SchemaRef;
+use echolake_lake::{Lake, Snapshot};
+use echolake_schema::SurfaceId;
+use futures::StreamExt as _;
+
+use crate::error::{Error, Result};
+use crate::output::{PendingFolder, WrittenFile};
+use columns::Columns;
+use measurements::Moves;
+pub use split::{Part, Split, SplitBy};
+use surfaces::Surface;
+
+/// Least number of files of a split that has as many surfaces: loaders give whole files to their workers.
+pub const SHARDS: usize = 32;
+/// Most surfaces in a file: with one of 5 MB each, files stay in the hundreds of MB.
+const SURFACES_A_SHARD: usize = 64;
+
+/// Which of D4's symmetries the rows are turned by.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Symmetries {
+    /// Rows as they were measured; `echolake.torch` turns them while it loads.
+    None,
+    /// Every row eight times, as far as the grid has the symmetry.
+    All,
+}
+
+/// What a training set is made of.
+#[derive(Debug, Clone, PartialEq)]
+pub struct TrainingSet {
+    /// Its symmetries.
+    pub symmetries: Symmetries,
+    /// How it is split.
+    pub split: Split,
+    /// Columns of `measurements`, `nce` and `tnce`; the usual ones where it is empty.
+    pub columns: Vec<String>,
+}
+
+impl Default for TrainingSet {
+    fn default() -> Self {
+        Self { symmetries: Symmetries::None, split: Split::default(), columns: Vec::new() }
+    }
+}
+
+/// What was written.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Exported {
+    /// The parts, training first.
+    pub parts: Vec<PartCounts>,
+    /// Surfaces that are left out, because another side of their panel is held out.
+    pub left_out: Vec<SurfaceId>,
+    /// Runs that wait for references, and so are left out.
+    pub waiting: usize,
+    /// All files with their checksums, by name.
+    pub files: Vec<WrittenFile>,
+}
+
+/// What is in one part.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct PartCounts {
+    /// The part.
+    pub part: Part,
+    /// Files of measurements.
+    pub files: usize,
+    /// Physical panels.
+    pub panels: usize,
+    /// Surfaces.
+    pub surfaces: usize,
+    /// Rows of measurements.
+    pub rows: u64,
+    /// Surfaces that have height maps.
+    pub height_maps: usize,
+}
+
+/// Everything that is decided before the first row is read.
+struct Plan {
+    set: TrainingSet,
+    columns: Columns,
+    moves: Moves,
+    shards: Vec<Shard>,
+    left_out: Vec<SurfaceId>,
+    waiting: usize,
+}
+
+/// A file of measurements.
+#[derive(Debug, Clone)]
+struct Shard {
+    part: Part,
+    name: String,
+    surfaces: Vec<Surface>,
+}
+
+impl Plan {
+    async fn new(lake: &Lake, snapshot: &Snapshot, set: &TrainingSet) -> Result<Self> {
+        let columns = Columns::choose(lake.rig(), &set.columns)?;
+        let (surfaces, waiting) = surfaces::read(lake, snapshot).await?;
+        let parts = split::assign(&surfaces, set.split)?;
+        let mut left_out = Vec::new();
+        let mut of_part: [Vec<Surface>; 3] = Default::default();
+        for (surface, part) in surfaces.into_iter().zip(parts) {
+            match part.and_then(|part| Part::ALL.iter().position(|p| *p == part)) {
+                Some(at) => of_part[at].push(surface),
+                None => left_out.push(surface.id),
+            }
+        }
+        let shards =
+            Part::ALL.into_iter().zip(of_part).flat_map(|(part, of)| shards(part, of, set.split.seed)).collect();
+        let moves = Moves::of(lake.grid(), set.symmetries);
+        Ok(Self { set: set.clone(), columns, moves, shards, left_out, waiting })
+    }
+
+    fn of_part(&self, part: Part) -> impl Iterator<Item = &Surface> {
+        self.shards.iter().filter(move |s| s.part == part).flat_map(|s| &s.surfaces)
+    }
+
+    fn schema(&self) -> &SchemaRef {
+        self.columns.schema()
+    }
+}
+
+// Dealt like cards in a drawn order, so that every file has surfaces of every kind.
+fn shards(part: Part, mut surfaces: Vec<Surface>, seed: u64) -> Vec<Shard> {
+    surfaces.sort_by_cached_key(|s| split::digest(seed, s.id.as_str()));
+    let count = SHARDS.max(surfaces.len().div_ceil(SURFACES_A_SHARD)).min(surfaces.len());
+    let mut shards: Vec<_> = (0..count)
+        .map(|i| Shard {
+            part,
+            name: format!("data/{}-{i:05}-of-{count:05}.parquet", part.name()),
+            surfaces: Vec::new(),
+        })
+        .collect();
+    surfaces.into_iter().enumerate().for_each(|(i, surface)| shards[i % count].surfaces.push(surface));
+    shards
+}
+
+/// Writes a training set into a folder that is not there yet, or empty; `progress` hears how many surfaces are done,
+/// of how many. The same lake gives the same bytes.
+///
+/// # Errors
+/// [`crate::Error`]; nothing is left behind.
+pub async fn write_training_set(
+    lake: &Lake,
+    folder: &Path,
+    set: &TrainingSet,
+    progress: &mut dyn FnMut(usize, usize),
+) -> Result<Exported> {
+    let snapshot = lake.snapshot().await?;
+    let plan = Plan::new(lake, &snapshot, set).await?;
+    let pending = PendingFolder::create(folder)?;
+    let (mut parts, mut files) = (Vec::new(), Vec::new());
+    for part in Part::ALL {
+        if plan.of_part(part).next().is_some() {
+            let (written, height_maps) = shard::heights(lake, &snapshot, &plan, part, &pending).await?;
+            files.extend(written);
+            parts.push(counts(&plan, part, height_maps));
+        }
+    }
+    let job = Arc::new(Job { lake: lake.clone(), snapshot, plan, folder: pending });
+    let written = shards_of(&job, progress).await?;
+    let Job { plan, folder: pending, .. } = &*job;
+    let mut sources = Vec::new();
+    for (one, (file, rows)) in plan.shards.iter().zip(written) {
+        if let Some(counts) = parts.iter_mut().find(|p| p.part == one.part) {
+            counts.rows += rows.iter().sum::<u64>();
+        }
+        sources.push((one, rows));
+        files.push(file);
+    }
+    files.push(pending.write("surfaces.csv", card::sources(&sources)?.as_bytes())?);
+    let mut exported = Exported { parts, left_out: plan.left_out.clone(), waiting: plan.waiting, files };
+    let about = card::About { lake, plan, exported: &exported };
+    let (croissant, readme) = (croissant::write(&about)?, card::write(&about));
+    exported.files.push(pending.write("croissant.json", croissant.as_bytes())?);
+    exported.files.push(pending.write("README.md", readme.as_bytes())?);
+    exported.files.sort_by(|a, b| a.name.cmp(&b.name));
+    let sums: String = exported.files.iter().map(|f| format!("{}  {}\n", f.sha256, f.name)).collect();
+    pending.write("SHA256SUMS", sums.as_bytes())?;
+    let job = Arc::into_inner(job).ok_or_else(|| Error::write(folder, "a part of the export is still at work"))?;
+    job.folder.publish()?;
+    Ok(exported)
+}
+
+/// What all files are written with.
+struct Job {
+    lake: Lake,
+    snapshot: Snapshot,
+    plan: Plan,
+    folder: PendingFolder,
+}
+
+// A file a core at a time; of each what was written, and the rows of each of its surfaces.
+async fn shards_of(job: &Arc<Job>, progress: &mut dyn FnMut(usize, usize)) -> Result<Vec<(WrittenFile, Vec<u64>)>> {
+    let surfaces = |of: &Shard| of.surfaces.len();
+    let (mut done, total) = (0, job.plan.shards.iter().map(surfaces).sum());
+    let cores = std::thread::available_parallelism().map_or(1, usize::from);
+    let spawn = |at: usize| {
+        let job = job.clone();
+        tokio::spawn(async move { shard::write(&job, &job.plan.shards[at]).await })
+    };
+    let mut running = futures::stream::iter(0..job.plan.shards.len()).map(spawn).buffered(cores);
+    let (mut written, mut failed) = (Vec::new(), None);
+    // After a failure those at work come to their end, because the folder is theirs, too.
+    while let Some(ended) = running.next().await {
+        match ended.map_err(|e| Error::write(Path::new(&job.plan.shards[written.len()].name), e)).flatten() {
+            Ok(file) if failed.is_none() => {
+                done += surfaces(&job.plan.shards[written.len()]);
+                progress(done, total);
+                written.push(file);
+            }
+            Ok(_) => break,
+            Err(e) => {
+                failed.get_or_insert(e);
+                break;
+            }
+        }
+    }
+    failed.map_or(Ok(written), Err)
+}
+
+fn counts(plan: &Plan, part: Part, height_maps: usize) -> PartCounts {
+    let panels: std::collections::HashSet<_> = plan.of_part(part).map(|s| s.id.panel().to_owned()).collect();
+    let files = plan.shards.iter().filter(|s| s.part == part).count();
+    PartCounts { part, files, panels: panels.len(), surfaces: plan.of_part(part).count(), rows: 0, height_maps }
+}

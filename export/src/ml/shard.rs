@@ -1,0 +1,120 @@
+//! Parquet files of a training set: one row group a surface, the same bytes every time.
+
+use arrow::datatypes::{DataType, SchemaRef};
+use arrow::record_batch::RecordBatch;
+use echolake_lake::{Lake, Snapshot};
+use echolake_schema::tables::LIST_CHILD;
+use parquet::arrow::ArrowWriter;
+use parquet::basic::{Compression, Encoding, ZstdLevel};
+use parquet::file::properties::{EnabledStatistics, WriterProperties};
+use parquet::schema::types::ColumnPath;
+
+use super::measurements::Maker;
+use super::split::Part;
+use super::{Job, Plan, Shard, heights};
+use crate::error::{Error, Result};
+use crate::output::{HashedFile, PendingFolder, WrittenFile};
+
+/// zstd's level: a training set is written once and read often.
+const ZSTD_LEVEL: i32 = 3;
+/// Size of a data page.
+const PAGE_BYTES: usize = 256 * 1024;
+
+/// A file that is being written.
+struct ShardWriter<'a> {
+    writer: ArrowWriter<HashedFile>,
+    folder: &'a PendingFolder,
+    name: &'a str,
+}
+
+impl<'a> ShardWriter<'a> {
+    fn create(folder: &'a PendingFolder, name: &'a str, schema: &SchemaRef) -> Result<Self> {
+        let file = folder.file(name)?;
+        let writer = ArrowWriter::try_new(file, schema.clone(), Some(properties(schema)));
+        Ok(Self { writer: writer.map_err(|e| Error::write(&folder.named(name), e))?, folder, name })
+    }
+
+    fn write(&mut self, batch: &RecordBatch) -> Result<()> {
+        self.writer.write(batch).map_err(|e| Error::write(&self.folder.named(self.name), e))
+    }
+
+    fn end_row_group(&mut self) -> Result<()> {
+        self.writer.flush().map_err(|e| Error::write(&self.folder.named(self.name), e))
+    }
+
+    fn finish(self) -> Result<WrittenFile> {
+        let file = self.writer.into_inner().map_err(|e| Error::write(&self.folder.named(self.name), e))?;
+        file.finish()
+    }
+}
+
+/// Writes a file of measurements; returns it, and the rows of each surface.
+pub(super) async fn write(job: &Job, shard: &Shard) -> Result<(WrittenFile, Vec<u64>)> {
+    let Job { lake, snapshot, plan, folder } = job;
+    let mut writer = ShardWriter::create(folder, &shard.name, plan.schema())?;
+    let maker = Maker { lake, snapshot, columns: &plan.columns, moves: &plan.moves };
+    let mut counts = Vec::with_capacity(shard.surfaces.len());
+    for surface in &shard.surfaces {
+        let mut rows = 0;
+        for run in &surface.runs {
+            let of_run = maker.read(run).await?;
+            for batch in maker.batches(surface, run, shard.part, &of_run)? {
+                rows += batch.num_rows() as u64;
+                writer.write(&batch)?;
+            }
+        }
+        writer.end_row_group()?;
+        counts.push(rows);
+    }
+    Ok((writer.finish()?, counts))
+}
+
+/// Writes the height maps of a part; returns the file, where there are any, and how many surfaces have them.
+pub(super) async fn heights(
+    lake: &Lake,
+    snapshot: &Snapshot,
+    plan: &Plan,
+    part: Part,
+    folder: &PendingFolder,
+) -> Result<(Option<WrittenFile>, usize)> {
+    let name = format!("heightmaps/{}.parquet", part.name());
+    let symmetries = plan.moves.names();
+    let (mut writer, mut count) = (None, 0);
+    for surface in plan.of_part(part) {
+        let Some(batch) = heights::read(lake, snapshot, surface, part, &symmetries).await? else { continue };
+        if writer.is_none() {
+            writer = Some(ShardWriter::create(folder, &name, &heights::schema()?)?);
+        }
+        if let Some(writer) = &mut writer {
+            writer.write(&batch)?;
+            writer.end_row_group()?;
+        }
+        count += 1;
+    }
+    Ok((writer.map(ShardWriter::finish).transpose()?, count))
+}
+
+// Samples do not repeat, so a dictionary only costs; their bytes by significance compress best.
+fn properties(schema: &SchemaRef) -> WriterProperties {
+    let mut builder = WriterProperties::builder()
+        .set_compression(Compression::ZSTD(ZstdLevel::try_new(ZSTD_LEVEL).unwrap_or_default()))
+        .set_created_by(concat!("echolake ", env!("CARGO_PKG_VERSION")).to_owned())
+        .set_data_page_size_limit(PAGE_BYTES)
+        .set_max_row_group_row_count(None)
+        .set_statistics_enabled(EnabledStatistics::Page);
+    for field in schema.fields() {
+        let name = field.name().clone();
+        let column = match field.data_type() {
+            DataType::FixedSizeList(..) => ColumnPath::new(vec![name, "list".into(), LIST_CHILD.into()]),
+            DataType::Float32 => ColumnPath::new(vec![name]),
+            _ => continue,
+        };
+        builder = builder
+            .set_column_dictionary_enabled(column.clone(), false)
+            .set_column_encoding(column.clone(), Encoding::BYTE_STREAM_SPLIT);
+        if matches!(field.data_type(), DataType::FixedSizeList(..)) {
+            builder = builder.set_column_statistics_enabled(column, EnabledStatistics::None);
+        }
+    }
+    builder.build()
+}

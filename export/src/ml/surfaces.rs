@@ -1,0 +1,76 @@
+//! The surfaces of a lake that a training set can have.
+
+use std::collections::{BTreeMap, HashSet};
+
+use echolake_lake::{Lake, Snapshot, VisibleRun};
+use echolake_schema::SurfaceId;
+use echolake_schema::tables::Table;
+
+use crate::error::{Error, Result};
+use crate::rows;
+
+/// A surface, and its runs that are derived.
+#[derive(Debug, Clone)]
+pub(super) struct Surface {
+    pub(super) id: SurfaceId,
+    pub(super) typology: String,
+    pub(super) macrostructure: Option<String>,
+    pub(super) origin: String,
+    /// Whether others name it as their Flat or Foam.
+    pub(super) reference: bool,
+    pub(super) runs: Vec<Run>,
+}
+
+/// A run, and what its file is.
+#[derive(Debug, Clone)]
+pub(super) struct Run {
+    pub(super) visible: VisibleRun,
+    pub(super) file_sha256: String,
+}
+
+/// All surfaces that have a derived run, by name; and the runs that wait for references.
+pub(super) async fn read(lake: &Lake, snapshot: &Snapshot) -> Result<(Vec<Surface>, usize)> {
+    let mut surfaces = BTreeMap::new();
+    let mut references = HashSet::new();
+    let columns = ["surface_id", "typology", "macrostructure", "origin", "flat_reference", "foam_reference"];
+    for file in snapshot.files(Table::Surfaces) {
+        let batch = rows::of_file(lake, Table::Surfaces, file, &columns).await?;
+        for column in ["flat_reference", "foam_reference"] {
+            references.extend(rows::texts(&batch, column).into_iter().map(str::to_owned));
+        }
+        let (typologies, origins) = (rows::texts(&batch, "typology"), rows::texts(&batch, "origin"));
+        let macrostructures = rows::optional_texts(&batch, "macrostructure");
+        for (row, id) in rows::texts(&batch, "surface_id").into_iter().enumerate() {
+            let surface = Surface {
+                id: id.parse()?,
+                typology: typologies[row].to_owned(),
+                macrostructure: macrostructures[row].map(str::to_owned),
+                origin: origins[row].to_owned(),
+                reference: false,
+                runs: Vec::new(),
+            };
+            surfaces.insert(surface.id.clone(), surface);
+        }
+    }
+    let mut waiting = 0;
+    for visible in snapshot.runs() {
+        let Some(surface) = surfaces.get_mut(&visible.surface) else { continue };
+        if visible.reference_derivation.is_none() {
+            waiting += 1;
+            continue;
+        }
+        let row = rows::of_run(lake, snapshot, Table::Runs, &visible.run, &["file_sha256"]).await?;
+        let file_sha256 = rows::texts(&row, "file_sha256").first().copied().unwrap_or_default().to_owned();
+        surface.runs.push(Run { visible: visible.clone(), file_sha256 });
+    }
+    let mut surfaces: Vec<_> = surfaces.into_values().filter(|s| !s.runs.is_empty()).collect();
+    surfaces.iter_mut().for_each(|s| s.reference = references.contains(s.id.as_str()));
+    if surfaces.is_empty() {
+        let reason = match waiting {
+            0 => "the lake has no runs; hint: `echolake ingest`".to_owned(),
+            runs => format!("{runs} runs wait for their references; hint: `echolake doctor` says which"),
+        };
+        return Err(Error::Nothing { reason });
+    }
+    Ok((surfaces, waiting))
+}

@@ -1,0 +1,331 @@
+//! Slices of run files: the messages of just some measurements, as an MCAP file of their own.
+
+mod groups;
+mod source;
+mod writer;
+
+use std::cmp::Reverse;
+use std::collections::{BTreeMap, BTreeSet, BinaryHeap, HashSet, VecDeque};
+
+use bytes::Bytes;
+use echolake_lake::{Lake, Snapshot};
+use echolake_schema::{RunId, SurfaceId, topics};
+use futures::stream::{self, BoxStream, StreamExt as _};
+use mcap::records::Metadata;
+
+use crate::error::{Error, Result};
+use groups::Groups;
+use source::{Message, RunFile, Source};
+use writer::SliceWriter;
+
+/// Topics that stand in a run's file once, and in every slice of it.
+const ONCE: [&str; 3] = [topics::PANEL_SCENE, topics::PANEL_POINTS, "/robot_description"];
+/// Metadata record of a slice: what it was cut from.
+const SLICE_METADATA: &str = "echolake.slice";
+/// Metadata record of each of its runs: the run's own manifest. Under another name than in a run's file, so that no
+/// slice is ever taken for a run.
+const SLICE_RUN_METADATA: &str = "echolake.slice.run";
+
+/// A measurement that a slice is to have, as table `measurements` has it.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Taken {
+    /// Its run.
+    pub run: RunId,
+    /// Its pair.
+    pub pair: u32,
+    /// Its attempt.
+    pub attempt: u32,
+    /// Its time, ns since 1970.
+    pub log_time_ns: i64,
+}
+
+/// In which chunks messages stand.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Layout {
+    /// Heavy topics in chunks of their own, so that who reads poses by ranges does not fetch sweeps. Each chunk is
+    /// ascending in time, and the index tells which comes when.
+    #[default]
+    ByTopic,
+    /// All messages of the file ascend in time, for those who read it as it comes.
+    InTime,
+}
+
+/// How a run's file is compared with the one that was ingested.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Check {
+    /// Its size, its index and the run that it names; chunks that are read are checked by their CRCs.
+    Ends,
+    /// Its SHA-256 too: all of it is read.
+    #[default]
+    Whole,
+}
+
+/// What a slice is made of.
+#[derive(Debug, Clone, Default)]
+pub struct SliceParams {
+    /// The measurements.
+    pub taken: Vec<Taken>,
+    /// The topics; all, and the attachments, where it is empty.
+    pub topics: Vec<String>,
+    /// The layout.
+    pub layout: Layout,
+    /// How run files are checked.
+    pub check: Check,
+}
+
+/// The messages of one measurement.
+pub(crate) struct Measured {
+    /// Its run.
+    pub(crate) run: RunId,
+    /// The run's file.
+    pub(crate) file: String,
+    messages: Vec<Message>,
+}
+
+impl Measured {
+    /// Time and content of the first message of a topic.
+    pub(crate) fn message(&self, topic: &str) -> Option<(i64, Bytes)> {
+        let found = self.messages.iter().find(|m| m.channel.topic == topic)?;
+        Some((i64::try_from(found.log_time).unwrap_or(0), found.data.clone()))
+    }
+}
+
+/// A run whose wanted measurements are read one after the other.
+pub(crate) struct OpenedRun(Groups);
+
+impl OpenedRun {
+    pub(crate) async fn next(&mut self) -> Result<Option<Measured>> {
+        let (run, file) = (self.run().clone(), self.file().to_owned());
+        Ok(self.0.next().await?.map(|messages| Measured { run, file, messages }))
+    }
+
+    pub(crate) fn run(&self) -> &RunId {
+        &self.0.source.file.run
+    }
+
+    pub(crate) fn surface(&self) -> &SurfaceId {
+        &self.0.source.file.surface
+    }
+
+    pub(crate) fn file(&self) -> &str {
+        self.0.source.file.path.as_ref()
+    }
+}
+
+/// Opens the runs of measurements, each checked.
+pub(crate) async fn open_runs(lake: &Lake, taken: &[Taken], check: Check) -> Result<Vec<OpenedRun>> {
+    let mut opened = Vec::new();
+    for (file, taken) in files(lake, &lake.snapshot().await?, taken).await? {
+        let source = Source::open(lake.store(), file, check).await?;
+        opened.push(OpenedRun(Groups::new(source, &taken)));
+    }
+    Ok(opened)
+}
+
+// The runs of measurements with their files, by their start.
+async fn files(lake: &Lake, snapshot: &Snapshot, taken: &[Taken]) -> Result<Vec<(RunFile, Vec<Taken>)>> {
+    if taken.is_empty() {
+        return Err(Error::Nothing { reason: "no measurement is selected".into() });
+    }
+    let mut by_run: BTreeMap<RunId, Vec<Taken>> = BTreeMap::new();
+    taken.iter().for_each(|t| by_run.entry(t.run.clone()).or_default().push(t.clone()));
+    let mut runs = Vec::new();
+    for (run, taken) in by_run {
+        runs.push((RunFile::find(lake, snapshot, &run).await?, taken));
+    }
+    runs.sort_by_key(|(file, _)| file.started_ns);
+    Ok(runs)
+}
+
+/// A slice that is being cut. Its memory is bounded by a chunk a heavy topic and a measurement a run that is open.
+pub struct Slice {
+    lake: Lake,
+    params: SliceParams,
+    /// Runs that are still to be opened, by their start.
+    runs: VecDeque<(RunFile, Vec<Taken>)>,
+    open: Vec<OpenRun>,
+    several: bool,
+    waiting: BinaryHeap<Reverse<Waiting>>,
+    arrived: u64,
+    last_time: u64,
+    writer: Option<SliceWriter>,
+}
+
+/// A run whose next measurement is read.
+struct OpenRun {
+    groups: Groups,
+    next: Vec<Message>,
+}
+
+/// A message that goes out when nothing earlier can come.
+struct Waiting {
+    order: (u64, u64),
+    message: Message,
+}
+
+impl PartialEq for Waiting {
+    fn eq(&self, other: &Self) -> bool {
+        self.order == other.order
+    }
+}
+
+impl Eq for Waiting {}
+
+impl PartialOrd for Waiting {
+    fn partial_cmp(&self, other: &Self) -> Option<std::cmp::Ordering> {
+        Some(self.cmp(other))
+    }
+}
+
+impl Ord for Waiting {
+    fn cmp(&self, other: &Self) -> std::cmp::Ordering {
+        self.order.cmp(&other.order)
+    }
+}
+
+impl Slice {
+    /// Checks everything that can be known to fail: the runs' files, and the topics. A server gives the snapshot that it
+    /// has, because taking one costs more than the first bytes of a slice.
+    ///
+    /// # Errors
+    /// [`Error::Nothing`] without measurements, [`Error::Unknown`] for a topic that none of the runs has,
+    /// [`Error::Changed`] for a file that is not the ingested one.
+    pub async fn open(lake: &Lake, snapshot: &Snapshot, params: SliceParams) -> Result<Self> {
+        let (runs, mut known) = (files(lake, snapshot, &params.taken).await?, BTreeSet::new());
+        for (file, _) in &runs {
+            let source = Source::open(lake.store(), file.clone(), params.check).await?;
+            known.extend(source.channels.values().map(|c| c.topic.clone()));
+        }
+        if let Some(topic) = params.topics.iter().find(|t| !known.contains(*t)) {
+            let known = known.into_iter().collect::<Vec<_>>().join(", ");
+            return Err(Error::Unknown { kind: "topic", name: topic.clone(), known });
+        }
+        let mut writer = SliceWriter::new(params.layout)?;
+        writer.metadata(about(&runs, &params))?;
+        Ok(Self {
+            lake: lake.clone(),
+            several: runs.len() > 1,
+            runs: runs.into(),
+            params,
+            open: Vec::new(),
+            waiting: BinaryHeap::new(),
+            arrived: 0,
+            last_time: 0,
+            writer: Some(writer),
+        })
+    }
+
+    /// The next bytes of the file; None after the last.
+    ///
+    /// # Errors
+    /// [`Error`]; the file is not whole then.
+    pub async fn next(&mut self) -> Result<Option<Bytes>> {
+        loop {
+            let Some(writer) = &mut self.writer else { return Ok(None) };
+            if let Some(piece) = writer.take() {
+                return Ok(Some(piece));
+            }
+            if !self.advance().await? {
+                self.release(u64::MAX)?;
+                return self.writer.take().map(SliceWriter::finish).transpose();
+            }
+        }
+    }
+
+    /// The file as a stream, for those who send it.
+    pub fn into_stream(self) -> BoxStream<'static, Result<Bytes>> {
+        stream::try_unfold(self, |mut slice| async move { Ok(slice.next().await?.map(|piece| (piece, slice))) }).boxed()
+    }
+
+    // Goes on by one measurement; false after the last.
+    async fn advance(&mut self) -> Result<bool> {
+        let head = |run: &OpenRun| run.next.first().map_or(0, |m| m.log_time);
+        let earliest = (0..self.open.len()).min_by_key(|i| head(&self.open[*i]));
+        let at = earliest.map(|i| head(&self.open[i]));
+        let starts = self.runs.front().map(|(file, _)| file.started_ns);
+        match (earliest, starts) {
+            (None, None) => return Ok(false),
+            (Some(i), starts) if starts.is_none_or(|s| at.is_some_and(|at| at < s)) => {
+                self.release(at.unwrap_or(0))?;
+                let run = &mut self.open[i];
+                let group = std::mem::take(&mut run.next);
+                match run.groups.next().await? {
+                    Some(next) => run.next = next,
+                    None => drop(self.open.remove(i)),
+                }
+                group.into_iter().for_each(|message| self.wait(message));
+            }
+            _ => self.open_next().await?,
+        }
+        Ok(true)
+    }
+
+    async fn open_next(&mut self) -> Result<()> {
+        let Some((file, taken)) = self.runs.pop_front() else { return Ok(()) };
+        self.release(file.started_ns)?;
+        let source = Source::open(self.lake.store(), file, Check::Ends).await?;
+        if let Some(writer) = &mut self.writer {
+            writer.metadata(Metadata { name: SLICE_RUN_METADATA.into(), metadata: source.manifest.clone() })?;
+            let mut number = 0;
+            // They are attached where nothing is left out.
+            while let Some(mut attachment) = source.attachment(number).await?.filter(|_| self.params.topics.is_empty())
+            {
+                if self.several {
+                    attachment.name = format!("{}/{}", source.file.run, attachment.name);
+                }
+                writer.attach(&attachment)?;
+                number += 1;
+            }
+        }
+        let mut groups = Groups::new(source, &taken);
+        while let Some(messages) = groups.next_once().await? {
+            messages.into_iter().for_each(|message| self.wait(message));
+        }
+        if let Some(next) = groups.next().await? {
+            self.open.push(OpenRun { groups, next });
+        }
+        Ok(())
+    }
+
+    fn wait(&mut self, message: Message) {
+        if self.params.topics.is_empty() || self.params.topics.contains(&message.channel.topic) {
+            self.arrived += 1;
+            self.waiting.push(Reverse(Waiting { order: (message.log_time, self.arrived), message }));
+        }
+    }
+
+    // Writes what is earlier than anything that is still to come.
+    fn release(&mut self, until: u64) -> Result<()> {
+        let Some(writer) = &mut self.writer else { return Ok(()) };
+        while self.waiting.peek().is_some_and(|Reverse(w)| w.order.0 < until || until == u64::MAX) {
+            let Some(Reverse(Waiting { message, .. })) = self.waiting.pop() else { break };
+            if message.log_time < self.last_time {
+                let what = "its measurements are not in the order of time";
+                let runs: HashSet<_> = self.params.taken.iter().map(|t| t.run.clone()).collect();
+                let run = self.open.first().map(|o| o.groups.source.file.run.clone()).or(runs.into_iter().next());
+                return Err(run.map_or_else(
+                    || Error::Nothing { reason: what.into() },
+                    |run| Error::Uncuttable { run, reason: what.into() },
+                ));
+            }
+            self.last_time = message.log_time;
+            writer.write(message)?;
+        }
+        Ok(())
+    }
+}
+
+fn about(runs: &[(RunFile, Vec<Taken>)], params: &SliceParams) -> Metadata {
+    let mut metadata = BTreeMap::from([
+        ("format".to_owned(), "1".to_owned()),
+        ("software".to_owned(), concat!("echolake ", env!("CARGO_PKG_VERSION")).to_owned()),
+        ("measurements".to_owned(), params.taken.len().to_string()),
+        ("topics".to_owned(), params.topics.join(",")),
+    ]);
+    // What each run's file was, so that a slice can be checked against it.
+    metadata.extend(
+        runs.iter()
+            .map(|(file, taken)| (format!("run.{}", file.run), format!("{} of sha256:{}", taken.len(), file.sha256))),
+    );
+    Metadata { name: SLICE_METADATA.into(), metadata }
+}

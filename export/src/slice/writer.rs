@@ -1,0 +1,168 @@
+//! A slice as an MCAP file, given out in pieces as it grows.
+
+use std::collections::HashMap;
+use std::io::{self, Write};
+use std::sync::{Arc, Mutex, PoisonError};
+
+use bytes::Bytes;
+use echolake_schema::topics;
+use mcap::records::{MessageHeader, Metadata};
+use mcap::write::NoSeek;
+use mcap::{Attachment, McapError, WriteOptions, Writer};
+
+use super::Layout;
+use super::source::Message;
+use crate::error::{Error, Result};
+
+/// A chunk is ended at this size.
+const CHUNK_BYTES: usize = 1 << 20;
+/// Topics with messages of this size and more have chunks of their own.
+const HEAVY_BYTES: usize = 1 << 10;
+/// What is given out at a time, at least.
+const PIECE_BYTES: usize = 64 << 10;
+
+/// Where the MCAP writer writes to.
+#[derive(Debug, Clone, Default)]
+struct Shared(Arc<Mutex<Vec<u8>>>);
+
+impl Shared {
+    fn lock(&self) -> std::sync::MutexGuard<'_, Vec<u8>> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl Write for Shared {
+    fn write(&mut self, data: &[u8]) -> io::Result<usize> {
+        self.lock().extend_from_slice(data);
+        Ok(data.len())
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        Ok(())
+    }
+}
+
+/// Writes a slice.
+pub(super) struct SliceWriter {
+    writer: Writer<NoSeek<Shared>>,
+    out: Shared,
+    layout: Layout,
+    lanes: Vec<Lane>,
+    /// The lane of each topic.
+    lane_of: HashMap<String, usize>,
+    sequence: u32,
+    pub(super) messages: u64,
+}
+
+/// Messages on their way into one chunk.
+#[derive(Default)]
+struct Lane {
+    messages: Vec<(MessageHeader, Bytes)>,
+    bytes: usize,
+}
+
+impl SliceWriter {
+    pub(super) fn new(layout: Layout) -> Result<Self> {
+        let out = Shared::default();
+        let writer = WriteOptions::new()
+            .profile("")
+            .library(concat!("echolake ", env!("CARGO_PKG_VERSION")))
+            .chunk_size(None)
+            .disable_seeking(true)
+            .compression_threads(0)
+            .create(NoSeek::new(out.clone()))
+            .map_err(|e| failed(&e))?;
+        let lanes = vec![Lane::default()];
+        Ok(Self { writer, out, layout, lanes, lane_of: HashMap::new(), sequence: 0, messages: 0 })
+    }
+
+    /// What was written since, where that is worth sending.
+    pub(super) fn take(&mut self) -> Option<Bytes> {
+        let mut out = self.out.lock();
+        (out.len() >= PIECE_BYTES).then(|| std::mem::take(&mut *out).into())
+    }
+
+    pub(super) fn metadata(&mut self, metadata: Metadata) -> Result<()> {
+        self.flush_all()?;
+        self.writer.write_metadata(&metadata).map_err(|e| failed(&e))
+    }
+
+    pub(super) fn attach(&mut self, attachment: &Attachment<'_>) -> Result<()> {
+        self.flush_all()?;
+        self.writer.attach(attachment).map_err(|e| failed(&e))
+    }
+
+    /// Writes a message; they come by time.
+    pub(super) fn write(&mut self, message: Message) -> Result<()> {
+        let channel = &message.channel;
+        let schema = match &channel.schema {
+            Some(schema) => {
+                self.writer.add_schema(&schema.name, &schema.encoding, &schema.data).map_err(|e| failed(&e))?
+            }
+            None => 0,
+        };
+        let added = self.writer.add_channel(schema, &channel.topic, &channel.message_encoding, &channel.metadata);
+        let channel_id = added.map_err(|e| failed(&e))?;
+        self.sequence = self.sequence.wrapping_add(1);
+        self.messages += 1;
+        let lane = self.lane(&message);
+        let Message { log_time, publish_time, data, .. } = message;
+        let header = MessageHeader { channel_id, sequence: self.sequence, log_time, publish_time };
+        let of = &mut self.lanes[lane];
+        of.bytes += data.len();
+        of.messages.push((header, data));
+        if of.bytes >= CHUNK_BYTES { self.flush(lane) } else { Ok(()) }
+    }
+
+    // Light topics share a lane; one that turns out to be heavy gets its own.
+    fn lane(&mut self, message: &Message) -> usize {
+        if self.layout == Layout::InTime {
+            return 0;
+        }
+        // What is played is a copy of what was recorded, and next to it nearly free (a quarter of a run's size).
+        let topic = match message.channel.topic.as_str() {
+            topics::SWEEP_AUDIO => topics::SWEEP,
+            other => other,
+        };
+        if let Some(lane) = self.lane_of.get(topic) {
+            return *lane;
+        }
+        if message.data.len() < HEAVY_BYTES {
+            return 0;
+        }
+        self.lanes.push(Lane::default());
+        self.lane_of.insert(topic.to_owned(), self.lanes.len() - 1);
+        self.lanes.len() - 1
+    }
+
+    // A lane becomes a chunk.
+    fn flush(&mut self, lane: usize) -> Result<()> {
+        let Lane { messages, .. } = std::mem::take(&mut self.lanes[lane]);
+        if messages.is_empty() {
+            return Ok(());
+        }
+        for (header, data) in messages {
+            self.writer.write_to_known_channel(&header, &data).map_err(|e| failed(&e))?;
+        }
+        self.writer.flush().map_err(|e| failed(&e))
+    }
+
+    fn flush_all(&mut self) -> Result<()> {
+        let first = |lane: &Lane| lane.messages.first().map_or(u64::MAX, |(header, _)| header.log_time);
+        let mut order: Vec<_> = (0..self.lanes.len()).collect();
+        order.sort_by_key(|lane| first(&self.lanes[*lane]));
+        order.into_iter().try_for_each(|lane| self.flush(lane))
+    }
+
+    /// Ends the file; returns the rest of it.
+    pub(super) fn finish(mut self) -> Result<Bytes> {
+        self.flush_all()?;
+        self.writer.finish().map_err(|e| failed(&e))?;
+        Ok(std::mem::take(&mut *self.out.lock()).into())
+    }
+}
+
+// It writes to memory, so what fails is what it is given.
+fn failed(error: &McapError) -> Error {
+    Error::damaged("the slice", error)
+}

@@ -1,0 +1,79 @@
+"""A lake that the command makes and serves, and what it exports. ``ECHOLAKE`` names the command's binary; where it is
+missing, what needs it is skipped."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+
+@pytest.fixture(scope="session")
+def echolake() -> str:
+    found = os.environ.get("ECHOLAKE") or shutil.which("echolake")
+    if not found:
+        pytest.skip("no echolake binary; hint: ECHOLAKE=target/release/echolake")
+    return found
+
+
+@pytest.fixture(scope="session")
+def lake(echolake: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Twelve surfaces; ``ECHOLAKE_TEST_LAKE`` names one that is there already."""
+    if there := os.environ.get("ECHOLAKE_TEST_LAKE"):
+        return Path(there)
+    path = tmp_path_factory.mktemp("lake") / "lake"
+    subprocess.run(
+        [echolake, "--lake", str(path), "demo", "--no-serve", "--surfaces", "12", "--ir-only"], check=True, capture_output=True
+    )
+    return path
+
+
+@pytest.fixture(scope="session")
+def served(echolake: str, lake: Path) -> Iterator[str]:
+    """Its Flight SQL address."""
+    command = [echolake, "--lake", str(lake), "serve", "--listen", "127.0.0.1:0", "--flight-sql", "127.0.0.1:0"]
+    server = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    try:
+        assert server.stderr is not None
+        for line in server.stderr:
+            if found := re.search(r"grpc://(\S+:\d+)", line):
+                yield f"grpc://{found.group(1)}"
+                break
+        else:
+            pytest.fail("the server ended before it listened")
+    finally:
+        server.terminate()
+        server.wait(timeout=30)
+
+
+def export(echolake: str, lake: Path, *arguments: str) -> None:
+    subprocess.run([echolake, "--lake", str(lake), "export", *arguments], check=True, capture_output=True)
+
+
+@pytest.fixture(scope="session")
+def training_set(echolake: str, lake: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Rows as measured."""
+    path = tmp_path_factory.mktemp("ml") / "plain"
+    export(echolake, lake, "ml", "-o", str(path))
+    return path
+
+
+@pytest.fixture(scope="session")
+def turned_set(echolake: str, lake: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Rows under all symmetries, few columns."""
+    path = tmp_path_factory.mktemp("ml") / "turned"
+    export(echolake, lake, "ml", "-o", str(path), "--symmetries", "all", "--columns", "tnce_total")
+    return path
+
+
+@pytest.fixture(scope="session")
+def a_slice(echolake: str, lake: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Five measurements of one run."""
+    path = tmp_path_factory.mktemp("slices") / "five.mcap"
+    export(echolake, lake, "mcap", "--where", "surface_id = 'flat' and pair_id < 5", "-o", str(path))
+    return path

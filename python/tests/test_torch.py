@@ -1,0 +1,77 @@
+"""Loaders give every row once, whatever the workers, and turn maps and positions together."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch")
+from torch.utils.data import DataLoader  # noqa: E402
+
+from echolake.symmetry import NAMES, turn_heights, turn_positions  # noqa: E402
+from echolake.torch import Measurements  # noqa: E402
+
+
+def rows(dataset: Measurements, workers: int = 0) -> list[tuple[str, str, int]]:
+    found = []
+    for batch in DataLoader(dataset, batch_size=None, num_workers=workers):
+        for place, pair in zip(batch["surface"].tolist(), batch["pair_id"].tolist()):
+            found.append((batch["surface_ids"][place], batch["symmetries"][place], pair))
+    return found
+
+
+@pytest.mark.parametrize("workers", [0, 2, 4])
+def test_every_row_comes_once(training_set: Path, workers: int) -> None:
+    dataset = Measurements(training_set, columns=["pair_id"])
+    found = rows(dataset, workers)
+    assert len(found) == len(set(found)) == len(dataset)
+
+
+def test_ranks_share_the_rows(training_set: Path) -> None:
+    parts = [rows(Measurements(training_set, columns=["pair_id"], rank=rank, world_size=3)) for rank in range(3)]
+    assert all(parts)
+    assert sum(map(len, parts)) == len(set().union(*parts)) == len(Measurements(training_set))
+
+
+def test_shuffling_mixes_surfaces_and_is_repeatable(training_set: Path) -> None:
+    def first(epoch: int) -> list[tuple[str, str, int]]:
+        dataset = Measurements(training_set, columns=["pair_id"], batch_size=64)
+        dataset.set_epoch(epoch)
+        return rows(dataset)[:64]
+
+    assert first(0) == first(0) != first(1)
+    assert len({surface for surface, _, _ in first(0)}) > 1
+
+
+def test_turns_are_those_of_the_rows_as_measured(training_set: Path) -> None:
+    columns = ["microphone_mm", "speaker_mm", "ir"]
+    plain, maps = {}, {}
+    for batch in Measurements(training_set, columns=columns, shuffle=False, heights=True):
+        for row, place in enumerate(batch["surface"].tolist()):
+            surface = batch["surface_ids"][place]
+            maps[surface] = batch["heights"][place].numpy()
+            key = (surface, batch["ir"][row].numpy().tobytes())
+            plain[key] = batch["microphone_mm"][row].numpy(), batch["speaker_mm"][row].numpy()
+    seen = set()
+    for batch in Measurements(training_set, columns=columns, symmetries="all", heights=True, seed=3):
+        for place, (surface, symmetry) in enumerate(zip(batch["surface_ids"], batch["symmetries"])):
+            seen.add(symmetry)
+            assert np.array_equal(batch["heights"][place], turn_heights(maps[surface], symmetry))
+        for row in range(0, len(batch["surface"]), 97):
+            place = int(batch["surface"][row])
+            microphone, speaker = plain[batch["surface_ids"][place], batch["ir"][row].numpy().tobytes()]
+            symmetry = batch["symmetries"][place]
+            assert np.allclose(batch["microphone_mm"][row], turn_positions(microphone, symmetry))
+            assert np.allclose(batch["speaker_mm"][row], turn_positions(speaker, symmetry))
+    assert seen == set(NAMES)
+
+
+def test_mistakes_are_named(training_set: Path, turned_set: Path, tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match="echolake export ml"):
+        Measurements(tmp_path)
+    with pytest.raises(KeyError, match="tnce_total"):
+        Measurements(training_set, columns=["nope"])
+    with pytest.raises(KeyError):
+        Measurements(training_set, columns=["pair_id"], symmetries="random")
+    with pytest.raises(ValueError, match="its symmetries already"):
+        next(iter(Measurements(turned_set, columns=["tnce_total"], symmetries="all")))

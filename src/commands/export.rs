@@ -1,0 +1,292 @@
+//! `echolake export`: training sets, slices of runs, and the formats of acousticians.
+
+use std::path::PathBuf;
+
+use anyhow::Context as _;
+use arrow::array::AsArray as _;
+use arrow::datatypes::{Int32Type, Int64Type};
+use clap::{Args, Subcommand, ValueEnum};
+use echolake_export::{
+    Check, Exported, Layout, PendingFile, ResponseFormat, Slice, SliceParams, Split, SplitBy, Symmetries, Taken,
+    TrainingSet, WrittenFile, write_responses, write_training_set, write_wav,
+};
+use echolake_lake::Lake;
+use echolake_query::Session;
+use echolake_schema::SurfaceId;
+use serde_json::json;
+
+use crate::Done;
+use crate::progress::{Progress, Task};
+
+#[derive(Debug, Subcommand)]
+pub(crate) enum ExportCommand {
+    /// A training set: Parquet files split by physical panel, with a card, Croissant metadata and checksums.
+    Ml(MlArgs),
+    /// A slice: the messages of some measurements, as an MCAP file.
+    Mcap(McapArgs),
+    /// The responses of surfaces as SOFA, a file each (SingleRoomSRIR).
+    Sofa(ResponseArgs),
+    /// The responses of surfaces as the GIR data set has them; `import gir` takes them back.
+    Npz(ResponseArgs),
+    /// The recordings of some measurements as WAV files with a manifest; `import wav` takes them back.
+    Wav(WavArgs),
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct MlArgs {
+    /// The new folder.
+    #[arg(short, long, value_name = "DIR")]
+    output: PathBuf,
+    /// Rows as measured, or under all eight symmetries of the square.
+    #[arg(long, value_enum, default_value_t = SymmetriesArg::None)]
+    symmetries: SymmetriesArg,
+    /// What the validation and test sets hold out.
+    #[arg(long, value_enum, default_value_t = SplitArg::ByPanel)]
+    split: SplitArg,
+    /// Columns of measurements, nce and tnce, separated by commas; by default ir, temperature_c, snr_db and tnce_*.
+    #[arg(long, value_delimiter = ',')]
+    columns: Vec<String>,
+    /// Least share of the surfaces in the test set.
+    #[arg(long, default_value_t = 0.1)]
+    test: f64,
+    /// Least share of the surfaces in the validation set.
+    #[arg(long, default_value_t = 0.1)]
+    validation: f64,
+    /// Seed of the split and of the order of surfaces.
+    #[arg(long, default_value_t = 1)]
+    seed: u64,
+    /// Print what was written as JSON.
+    #[arg(long)]
+    json: bool,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+enum SymmetriesArg {
+    None,
+    All,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+enum SplitArg {
+    /// Physical panels.
+    ByPanel,
+    /// Typologies.
+    ByTypology,
+    /// Macrostructures.
+    ByMacrostructure,
+    /// Everything is for training.
+    None,
+}
+
+/// Which measurements are taken.
+#[derive(Debug, Args)]
+struct Selection {
+    /// Which measurements: an SQL predicate over the columns of table measurements.
+    #[arg(long = "where", value_name = "PREDICATE")]
+    predicate: String,
+    /// Do not read the runs' files whole to compare their SHA-256; sizes, indexes and the CRCs of what is read are
+    /// compared all the same.
+    #[arg(long)]
+    quick: bool,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct McapArgs {
+    #[command(flatten)]
+    selection: Selection,
+    /// Topics, separated by commas; by default all, and the attachments.
+    #[arg(long, value_delimiter = ',')]
+    topics: Vec<String>,
+    /// In which chunks messages stand.
+    #[arg(long, value_enum, default_value_t = LayoutArg::ByTopic)]
+    layout: LayoutArg,
+    /// The new file.
+    #[arg(short, long, value_name = "FILE")]
+    output: PathBuf,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+enum LayoutArg {
+    /// Heavy topics in chunks of their own: best for viewers, which read by ranges.
+    ByTopic,
+    /// One after the other: for those who read the file as it comes.
+    InTime,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct ResponseArgs {
+    /// Surfaces, separated by commas; by default all.
+    #[arg(long, value_delimiter = ',')]
+    surfaces: Vec<SurfaceId>,
+    /// The new folder.
+    #[arg(short, long, value_name = "DIR")]
+    output: PathBuf,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct WavArgs {
+    #[command(flatten)]
+    selection: Selection,
+    /// The new folder.
+    #[arg(short, long, value_name = "DIR")]
+    output: PathBuf,
+}
+
+pub(crate) async fn run(command: &ExportCommand, lake_url: &str) -> anyhow::Result<Done> {
+    let lake = Lake::open(lake_url).await?;
+    match command {
+        ExportCommand::Ml(args) => ml(&lake, args).await?,
+        ExportCommand::Mcap(args) => mcap(&lake, args).await?,
+        ExportCommand::Sofa(args) => responses(&lake, args, ResponseFormat::Sofa).await?,
+        ExportCommand::Npz(args) => responses(&lake, args, ResponseFormat::Npz).await?,
+        ExportCommand::Wav(args) => wav(&lake, args).await?,
+    }
+    Ok(Done::Whole)
+}
+
+async fn ml(lake: &Lake, args: &MlArgs) -> anyhow::Result<()> {
+    let by = match args.split {
+        SplitArg::ByPanel => SplitBy::Panel,
+        SplitArg::ByTypology => SplitBy::Typology,
+        SplitArg::ByMacrostructure => SplitBy::Macrostructure,
+        SplitArg::None => SplitBy::Nothing,
+    };
+    let symmetries = match args.symmetries {
+        SymmetriesArg::None => Symmetries::None,
+        SymmetriesArg::All => Symmetries::All,
+    };
+    let split = Split { by, test: args.test, validation: args.validation, seed: args.seed };
+    let set = TrainingSet { symmetries, split, columns: args.columns.clone() };
+    let (progress, mut task) = (Progress::new(), None);
+    let exported = write_training_set(lake, &args.output, &set, &mut |done, total| {
+        step(&progress, &mut task, "surfaces", done, total);
+    })
+    .await?;
+    let bytes: u64 = exported.files.iter().map(|f| f.bytes).sum();
+    finish(task, format!("{} files, {}", exported.files.len(), super::size(bytes)));
+    super::print(&if args.json { in_json(&exported)? } else { in_words(&exported) })?;
+    Ok(())
+}
+
+fn in_words(exported: &Exported) -> String {
+    let mut lines = vec![format!("{:<12} {:>6} {:>7} {:>9} {:>10}", "split", "files", "panels", "surfaces", "rows")];
+    lines.extend(
+        exported
+            .parts
+            .iter()
+            .map(|p| format!("{:<12} {:>6} {:>7} {:>9} {:>10}", p.part.name(), p.files, p.panels, p.surfaces, p.rows)),
+    );
+    if !exported.left_out.is_empty() {
+        let count = exported.left_out.len();
+        lines.push(format!("{count} surfaces left out: another side of their panel is held out"));
+    }
+    if exported.waiting > 0 {
+        lines.push(format!("{} runs left out: they wait for their references", exported.waiting));
+    }
+    lines.join("\n")
+}
+
+fn in_json(exported: &Exported) -> serde_json::Result<String> {
+    let parts: Vec<_> = exported
+        .parts
+        .iter()
+        .map(|p| {
+            json!({
+                "split": p.part.name(), "files": p.files, "panels": p.panels, "surfaces": p.surfaces, "rows": p.rows,
+                "height_maps": p.height_maps,
+            })
+        })
+        .collect();
+    let file = |f: &WrittenFile| json!({ "name": f.name, "bytes": f.bytes, "sha256": f.sha256 });
+    serde_json::to_string_pretty(&json!({
+        "splits": parts,
+        "left_out": exported.left_out,
+        "waiting": exported.waiting,
+        "files": exported.files.iter().map(file).collect::<Vec<_>>(),
+    }))
+}
+
+async fn mcap(lake: &Lake, args: &McapArgs) -> anyhow::Result<()> {
+    let mut file = PendingFile::create(&args.output)?;
+    let taken = taken(lake, &args.selection).await?;
+    let layout = match args.layout {
+        LayoutArg::ByTopic => Layout::ByTopic,
+        LayoutArg::InTime => Layout::InTime,
+    };
+    let count = taken.len();
+    let params = SliceParams { taken, topics: args.topics.clone(), layout, check: check(&args.selection) };
+    let mut slice = Slice::open(lake, &lake.snapshot().await?, params).await?;
+    let mut bytes = 0;
+    while let Some(piece) = slice.next().await? {
+        bytes += piece.len() as u64;
+        file.write(&piece)?;
+    }
+    file.publish()?;
+    eprintln!("{}: {count} measurements, {}", args.output.display(), super::size(bytes));
+    Ok(())
+}
+
+async fn responses(lake: &Lake, args: &ResponseArgs, format: ResponseFormat) -> anyhow::Result<()> {
+    let (progress, mut task) = (Progress::new(), None);
+    let files = write_responses(lake, &args.output, format, &args.surfaces, &mut |done, total| {
+        step(&progress, &mut task, "surfaces", done, total);
+    })
+    .await?;
+    let bytes: u64 = files.iter().map(|f| f.bytes).sum();
+    finish(task, format!("{} files, {}", files.len(), super::size(bytes)));
+    Ok(())
+}
+
+async fn wav(lake: &Lake, args: &WavArgs) -> anyhow::Result<()> {
+    let taken = taken(lake, &args.selection).await?;
+    let (progress, mut task) = (Progress::new(), None);
+    let count = write_wav(lake, &args.output, &taken, check(&args.selection), &mut |done, total| {
+        step(&progress, &mut task, "recordings", done, total);
+    })
+    .await?;
+    finish(task, format!("{count} recordings"));
+    eprintln!("next: echolake --lake NEW import wav {}", args.output.join("manifest.csv").display());
+    Ok(())
+}
+
+fn step(progress: &Progress, task: &mut Option<Task>, unit: &'static str, done: usize, total: usize) {
+    task.get_or_insert_with(|| progress.task("export", total as u64, unit)).at(done as u64);
+}
+
+fn finish(task: Option<Task>, what: String) {
+    if let Some(task) = task {
+        task.done(what);
+    }
+}
+
+fn check(selection: &Selection) -> Check {
+    if selection.quick { Check::Ends } else { Check::Whole }
+}
+
+// The line breaks keep a comment in the predicate from reaching further.
+async fn taken(lake: &Lake, selection: &Selection) -> anyhow::Result<Vec<Taken>> {
+    let sql =
+        format!("select run_id, pair_id, attempt, log_time_ns from measurements where (\n{}\n)", selection.predicate);
+    let session = Session::new(lake)?;
+    let mut answer = session.query(&sql).await.context("--where")?;
+    let mut taken = Vec::new();
+    while let Some(batch) = answer.next().await? {
+        let runs = arrow::compute::cast(batch.column(0), &arrow::datatypes::DataType::Utf8)?;
+        let numbers = |column: usize| batch.column(column).as_primitive::<Int32Type>();
+        let (pairs, attempts, times) = (numbers(1), numbers(2), batch.column(3).as_primitive::<Int64Type>());
+        for row in 0..batch.num_rows() {
+            taken.push(Taken {
+                run: runs.as_string::<i32>().value(row).parse()?,
+                pair: u32::try_from(pairs.value(row))?,
+                attempt: u32::try_from(attempts.value(row))?,
+                log_time_ns: times.value(row),
+            });
+        }
+    }
+    anyhow::ensure!(
+        !taken.is_empty(),
+        "`{}` selects no measurement; hint: `echolake sql` tries predicates",
+        selection.predicate
+    );
+    Ok(taken)
+}
