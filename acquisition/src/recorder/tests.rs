@@ -200,7 +200,8 @@ fn arms_are_shown_where_their_joints_are_known() {
         let mut recorder = recorder.expect("a recorder");
         recorder.arms(START, arms.cell(), "simulated & <odd>").expect("recorded");
         recorder.poses(at, MICROPHONE_MM, SPEAKER_MM).expect("recorded");
-        recorder.joints(at, &arms.joints(PairId(100))).expect("recorded");
+        let standing = arms.standing(PairId(100)).expect("within reach");
+        recorder.joints(at, &[standing.microphone, standing.speaker]).expect("recorded");
         recorder.finish(&end()).expect("finished");
     });
     let file = std::fs::read(&path).expect("the file");
