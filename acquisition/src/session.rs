@@ -1,6 +1,9 @@
 //! A run that somebody supervises: looked over before it begins, watched and stopped while it goes on, and gone on with
 //! afterwards.
 
+#[cfg(test)]
+mod tests;
+
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -77,6 +80,16 @@ pub(crate) struct Job<'a> {
     pub(crate) started: Timestamp,
     /// How the arms go about, where the rig's are known.
     pub(crate) arms: Option<Arc<Choreography>>,
+    pub(crate) when_stopped: WhenStopped,
+}
+
+/// What becomes of a run's file when it is stopped.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum WhenStopped {
+    /// It is ended with what it has: nobody can go on with it.
+    Ended,
+    /// It stays open, to be gone on with.
+    Open,
 }
 
 impl Job<'_> {
@@ -110,9 +123,9 @@ impl Job<'_> {
         let options = RunOptions { keep: self.keep, checkpoint_every };
         let work = Work { pairs: &pairs, before: self.before, options };
         let outcome = controller.run(&mut recorder, &work, session.control, session.observe)?;
-        let path = match outcome.left {
-            0 => recorder.finish(&outcome.end)?,
-            _ => recorder.partial().to_owned(),
+        let path = match (outcome.left, self.when_stopped) {
+            (0, _) | (_, WhenStopped::Ended) => recorder.finish(&outcome.end)?,
+            (_, WhenStopped::Open) => recorder.partial().to_owned(),
         };
         Ok(Measured { path, outcome })
     }

@@ -21,7 +21,7 @@ use crate::rig::Devices;
 use crate::rigs::paced::paced;
 use crate::rigs::simulated::{FACETS, Simulation, TAKE_SECS, devices};
 use crate::robots::Choreography;
-use crate::session::{Job, Measured, Pace, Preflight, Session, Shape};
+use crate::session::{Job, Measured, Pace, Preflight, Session, Shape, WhenStopped};
 
 /// Cells along each side of the recorded panel mesh.
 pub(crate) const MESH_CELLS: usize = 117;
@@ -95,7 +95,8 @@ struct Prepared {
 }
 
 impl SimulatedRun<'_> {
-    /// Measures all pairs, looked over by nobody; returns the run's file and how it ended.
+    /// Measures all pairs, looked over by nobody; returns the run's file and how it ended. Where `stop` becomes true it
+    /// ends with the pairs that it has.
     ///
     /// # Errors
     /// [`Error`]; a run that was begun leaves its `.partial` file.
@@ -156,7 +157,10 @@ impl SimulatedRun<'_> {
         let start = RunStart { manifest: &manifest, rig: self.rig, surface, relief, plan };
         let path = self.path()?;
         let nothing = BTreeMap::new();
-        let job = prepared.job(self.rig, self.folder, self.keep, &nothing, self.start, arms);
+        let mut job = prepared.job(self.rig, self.folder, self.keep, &nothing, self.start, arms);
+        if start.plan.is_none() {
+            job.when_stopped = WhenStopped::Ended;
+        }
         // What can be refused is refused before there is a file.
         let mut controller = RunController::new(self.rig, devices)?;
         fit(&job, &mut controller, session.preflight)?;
@@ -262,7 +266,8 @@ impl Prepared {
         arms: Option<Arc<Choreography>>,
     ) -> Job<'a> {
         let shape = Some(Shape { heights: &self.heights, mesh: &self.mesh });
-        Job { rig, folder, shape, keep, before, started, arms }
+        let when_stopped = WhenStopped::Open;
+        Job { rig, folder, shape, keep, before, started, arms, when_stopped }
     }
 }
 

@@ -16,11 +16,22 @@ from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from checks import Checks
 
 EXPECTED = ["/tf", "/panel/scene", "/panel/points", "/microphone/pose", "/speaker/pose", "/sweep", "/sweep/audio",
-            "/ir", "/environment", "/measurement", "/log"]
+            "/ir", "/environment", "/measurement", "/log", "/robot_description", "/robots/microphone/joint_states",
+            "/robots/speaker/joint_states"]
+
+
+class Text:
+    """A string as ROS 2 writes it: four bytes, its length, its letters, a zero."""
+
+    @staticmethod
+    def FromString(data):
+        return data[8:-1].decode()
 
 
 def message_class(channel):
-    """The class that decodes a channel's messages."""
+    """What decodes a channel's messages; text where they are no protobuf."""
+    if channel["encoding"] == "cdr":
+        return Text
     files = descriptor_pb2.FileDescriptorSet.FromString(base64.b64decode(channel["schema"]))
     pool = descriptor_pool.DescriptorPool()
     for file in files.file:
@@ -63,6 +74,7 @@ def main():
                      lambda n, t=topic: n > 0 or t == "/log")
     checks.holds("the panel is a GLB", lambda: messages["/panel/scene"][0].entities[0].models[0].data[:4],
                  lambda b: b == b"glTF")
+    checks.holds("the arms are a URDF", lambda: messages["/robot_description"][0][:200], lambda t: "<robot" in t)
     checks.holds("every sweep is as long as it says",
                  lambda: {len(s.microphone) / s.sample_count for s in messages["/sweep"]}, lambda w: w == {3.0})
     checks.holds("time goes on", lambda: times["/measurement"], lambda t: t == sorted(set(t)))

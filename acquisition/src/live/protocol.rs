@@ -74,7 +74,7 @@ pub(super) fn advertise(topics: &[Topic]) -> String {
             encoding: &t.encoding,
             schema_name: &t.schema,
             schema_encoding: &t.schema_encoding,
-            schema: base64(&t.schema_data),
+            schema: schema_text(t),
         })
         .collect();
     serde_json::json!({"op": "advertise", "channels": channels}).to_string()
@@ -100,7 +100,15 @@ pub(super) fn wish(text: &str) -> Option<Wish> {
     })
 }
 
-// RFC 4648, with padding: schemas are sent so.
+// Schemas of a binary encoding are sent in base64, those that are text as they are.
+fn schema_text(topic: &Topic) -> String {
+    match topic.schema_encoding.as_str() {
+        "protobuf" | "flatbuffer" => base64(&topic.schema_data),
+        _ => String::from_utf8_lossy(&topic.schema_data).into_owned(),
+    }
+}
+
+// RFC 4648, with padding.
 fn base64(bytes: &[u8]) -> String {
     const LETTERS: &[u8; 64] = b"ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789+/";
     let mut out = String::with_capacity(bytes.len().div_ceil(3) * 4);
@@ -133,6 +141,20 @@ mod tests {
             assert_eq!(base64(plain.as_bytes()), expected);
         }
         assert_eq!(base64(&[0xFB, 0xFF, 0xBF]), "+/+/");
+    }
+
+    #[test]
+    fn schemas_are_sent_as_their_encoding_wants_it() {
+        let topic = |schema_encoding: &str| Topic {
+            channel: 1,
+            topic: "/a".into(),
+            encoding: "cdr".into(),
+            schema: "a/B".into(),
+            schema_encoding: schema_encoding.into(),
+            schema_data: b"string data\n".to_vec(),
+        };
+        assert_eq!(schema_text(&topic("ros2msg")), "string data\n");
+        assert_eq!(schema_text(&topic("protobuf")), "c3RyaW5nIGRhdGEK");
     }
 
     #[test]

@@ -90,11 +90,12 @@ pub fn recover(from: &Path, to: &Path) -> Result<Report, Error> {
 // What there is to keep, without writing anything.
 fn survey(from: &Path) -> Result<Report, Error> {
     let mut walk = Walk::open(from)?;
-    let (mut messages, mut topics_by_id, mut has_head, mut has_end) = (Counts::new(), BTreeMap::new(), false, false);
+    let (mut messages, mut topics_by_id, mut has_manifest, mut has_end) =
+        (Counts::new(), BTreeMap::new(), false, false);
     while let Some(item) = walk.next()? {
         has_end |= is_end(&item);
         match item {
-            Item::Metadata(m) => has_head |= m.name == topics::RUN_METADATA,
+            Item::Metadata(m) => has_manifest |= m.name == topics::RUN_METADATA,
             Item::Attachment(_) => {}
             Item::Chunk(records) => {
                 for record in records {
@@ -111,9 +112,10 @@ fn survey(from: &Path) -> Result<Report, Error> {
             }
         }
     }
-    if !has_head {
+    // The first chunk has the topics, behind all that a run is described by.
+    if !has_manifest || topics_by_id.is_empty() {
         let found = walk.defect.clone().unwrap_or_else(|| "it ends".to_owned());
-        return Err(walk.headless(format!("{found}, before it says what it is")));
+        return Err(walk.headless(format!("{found}, before its first chunk is whole")));
     }
     // What follows the data can be made anew from them.
     let verified_bytes = if walk.ended { walk.size } else { walk.verified };

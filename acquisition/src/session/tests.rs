@@ -1,0 +1,84 @@
+//! Whole runs of the small rig: stopped, gone on with, and ended.
+
+use std::sync::atomic::{AtomicBool, Ordering};
+
+use super::*;
+use crate::recorder::Held;
+use crate::recovery::prove;
+use crate::relief::Relief;
+use crate::simulate::{SimulatedRun, Specimen, resume};
+
+const SMALL_RIG: &str = include_str!("../../../tests/fixtures/small_rig.toml");
+const PAIRS: u64 = 45;
+
+fn run<'a>(rig: &'a Rig, specimen: &'a Specimen, folder: &'a Path) -> SimulatedRun<'a> {
+    SimulatedRun {
+        rig,
+        surface: "flat".parse().expect("an id"),
+        specimen,
+        flat: None,
+        foam: None,
+        start: Timestamp(1_767_600_000_000_000_000),
+        seed: 1,
+        keep: Keep::Sweeps,
+        folder,
+    }
+}
+
+fn flat() -> Specimen {
+    Specimen::Relief(Relief::by_name("flat").expect("a relief"))
+}
+
+#[test]
+fn a_run_that_is_stopped_is_gone_on_with() {
+    let (rig, specimen) = (Rig::from_toml(SMALL_RIG).expect("a rig"), flat());
+    let folder = tempfile::tempdir().expect("a folder");
+    let mut left = Vec::new();
+    let mut partial = None;
+    loop {
+        let (control, mut tried) = (Control::default(), 0);
+        let mut observe = |event: Event<'_>| {
+            tried += usize::from(matches!(event, Event::Pair(_)));
+            control.stop.store(tried >= 20, Ordering::Relaxed);
+        };
+        let session = Session {
+            control: &control,
+            observe: &mut observe,
+            tap: None,
+            preflight: Preflight::Check,
+            checkpoint_every: Some(7),
+            pace: Pace::Fast,
+        };
+        let measured = match &partial {
+            None => run(&rig, &specimen, folder.path()).supervised(session),
+            Some(partial) => resume(partial, session),
+        };
+        let measured = measured.expect("a session");
+        left.push(measured.outcome.left);
+        if measured.outcome.left == 0 {
+            assert_eq!((measured.outcome.end.accepted, measured.outcome.end.rejected), (PAIRS, 0));
+            assert_eq!(prove(&measured.path), Ok(()));
+            assert_eq!(Held::read(&measured.path).expect("the run").accepted() as u64, PAIRS);
+            break;
+        }
+        assert!(measured.path.extension().is_some_and(|e| e == "partial"), "{measured:?}");
+        partial = Some(measured.path);
+    }
+    assert_eq!(left, [25, 5, 0]);
+    let names = std::fs::read_dir(folder.path()).expect("listed").count();
+    assert_eq!(names, 1, "nothing else is left");
+}
+
+#[test]
+fn a_run_that_nobody_goes_on_with_is_ended_where_it_is_stopped() {
+    let (rig, specimen) = (Rig::from_toml(SMALL_RIG).expect("a rig"), flat());
+    let folder = tempfile::tempdir().expect("a folder");
+    let stop = AtomicBool::new(false);
+    let measured = run(&rig, &specimen, folder.path()).measure(&stop, &mut |done| {
+        stop.store(done >= 3, Ordering::Relaxed);
+    });
+    let (path, end) = measured.expect("a run");
+    assert!(path.extension().is_some_and(|e| e == "mcap"), "{}", path.display());
+    assert!((3..=4).contains(&end.accepted), "{end:?}");
+    assert_eq!(prove(&path), Ok(()));
+}
