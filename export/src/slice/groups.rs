@@ -1,9 +1,10 @@
 //! The messages of wanted measurements, a measurement at a time.
 //!
 //! A recorder writes what an attempt rests on before its verdict: poses, air, sweep, response, verdict. So everything
-//! up to a verdict belongs to the attempt that the first message with a pair names, and nothing else is decoded.
+//! up to a verdict belongs to the attempt that the first message with a pair names, and nothing else is decoded. Where
+//! sweeps and responses have chunks of their own, that holds in each of these lanes.
 
-use std::collections::{BTreeSet, HashSet, VecDeque};
+use std::collections::{BTreeMap, BTreeSet, HashSet, VecDeque};
 
 use echolake_schema::topics;
 use mcap::records::ChunkIndex;
@@ -15,51 +16,67 @@ use crate::error::{Error, Result};
 /// Pair and attempt.
 type Key = (u32, u32);
 
-/// Reads a run's measurements in the order of its file.
+/// Reads a run's measurements, one after the other.
 pub(super) struct Groups {
     pub(super) source: Source,
-    chunks: VecDeque<ChunkIndex>,
     /// Chunks with topics that stand in the file once.
     once: VecDeque<ChunkIndex>,
-    wanted: HashSet<Key>,
+    wanted: Wanted,
     found: HashSet<Key>,
-    /// Where the chunk that was read last ends.
-    end: u64,
+    lanes: Vec<Lane>,
+}
+
+/// What is wanted.
+struct Wanted {
+    keys: HashSet<Key>,
+    /// The same by time, for messages that nothing else assigns.
+    times: BTreeMap<u64, Key>,
+}
+
+/// Topics that share chunks: a file has one lane, or sweeps, responses and everything else have one each.
+struct Lane {
+    /// Whether some of its topics name their pair.
+    keyed: bool,
+    /// Those with something wanted, in the file's order.
+    chunks: VecDeque<ChunkIndex>,
+    /// Where each of the lane's chunks begins, wanted or not.
+    starts: Vec<u64>,
+    /// Where the chunk that was read last begins.
+    last: Option<u64>,
     /// Messages whose attempt is not known yet.
     pending: Vec<Message>,
     open: Option<Open>,
-    ready: VecDeque<Vec<Message>>,
+    ready: VecDeque<Open>,
 }
 
-/// The attempt at hand.
+/// What a lane has of one attempt.
 struct Open {
     key: Key,
     messages: Vec<Message>,
+    /// Time of the message that named the attempt.
+    time: u64,
     /// Time of its verdict, once that is there.
     verdict: Option<u64>,
 }
 
 impl Groups {
-    pub(super) fn new(source: Source, taken: &[Taken]) -> Self {
-        let times: BTreeSet<u64> = taken.iter().map(|t| u64::try_from(t.log_time_ns).unwrap_or(0)).collect();
-        let has = |chunk: &&ChunkIndex| times.range(chunk.message_start_time..=chunk.message_end_time).next().is_some();
-        let of_once = |chunk: &&ChunkIndex| {
-            chunk.message_index_offsets.keys().any(|id| source.channels.get(id).is_some_and(|c| is_once(&c.topic)))
+    /// Reads the measurements of a run; lanes that have none of the topics are not read, where topics are named.
+    pub(super) fn new(source: Source, taken: &[Taken], topics: &[String]) -> Self {
+        let time = |t: &Taken| u64::try_from(t.log_time_ns).unwrap_or(0);
+        let wanted = Wanted {
+            keys: taken.iter().map(|t| (t.pair, t.attempt)).collect(),
+            times: taken.iter().map(|t| (time(t), (t.pair, t.attempt))).collect(),
         };
-        let sound = |chunk: &&ChunkIndex| chunk.message_start_time <= chunk.message_end_time;
-        let chunks = source.chunks.iter().filter(sound).filter(has).cloned().collect();
-        let once = source.chunks.iter().filter(of_once).cloned().collect();
-        Self {
-            chunks,
-            once,
-            wanted: taken.iter().map(|t| (t.pair, t.attempt)).collect(),
-            found: HashSet::new(),
-            end: 0,
-            pending: Vec::new(),
-            open: None,
-            ready: VecDeque::new(),
-            source,
-        }
+        let topic = |id: &u16| source.channels.get(id).map_or("", |c| c.topic.as_str());
+        let has_once = |chunk: &&ChunkIndex| chunk.message_index_offsets.keys().any(|id| is_once(topic(id)));
+        let once = source.chunks.iter().filter(has_once).cloned().collect();
+        let named = |id: &u16| topics.is_empty() || topics.iter().any(|t| t == topic(id));
+        let lanes = lanes(&source.chunks).into_iter().filter(|(channels, _)| channels.iter().any(named));
+        let lanes = lanes.map(|(channels, chunks)| {
+            let keyed = channels.iter().any(|id| names_pair(topic(id)));
+            Lane::new(keyed, chunks, &wanted)
+        });
+        Self { once, found: HashSet::new(), lanes: lanes.collect(), wanted, source }
     }
 
     /// The next messages of topics that stand in the file once; None after the last.
@@ -75,62 +92,93 @@ impl Groups {
     /// # Errors
     /// [`Error::Changed`] where one of them is not in the file.
     pub(super) async fn next(&mut self) -> Result<Option<Vec<Message>>> {
-        loop {
-            if let Some(mut group) = self.ready.pop_front() {
-                group.sort_by_key(|m| m.log_time);
-                return Ok(Some(group));
-            }
-            if self.found.len() == self.wanted.len() && self.open.is_none() {
-                return Ok(None);
-            }
-            match self.chunks.pop_front() {
-                Some(chunk) => self.read(&chunk).await?,
-                None => {
-                    self.close();
-                    if self.ready.is_empty() {
-                        return self.all_found().map(|()| None);
-                    }
-                }
+        for lane in &mut self.lanes {
+            lane.fill(&self.source, &self.wanted).await?;
+        }
+        let first = self.lanes.iter().filter_map(|lane| lane.ready.front()).min_by_key(|open| open.time);
+        let Some(key) = first.map(|open| open.key) else { return self.all_found().map(|()| None) };
+        self.found.insert(key);
+        let mut group = Vec::new();
+        for lane in &mut self.lanes {
+            if lane.ready.front().is_some_and(|open| open.key == key) {
+                group.extend(lane.ready.pop_front().into_iter().flat_map(|open| open.messages));
             }
         }
+        group.sort_by_key(|m| m.log_time);
+        Ok(Some(group))
     }
 
     fn all_found(&self) -> Result<()> {
-        let missing = self.wanted.len() - self.found.len();
+        let missing = self.wanted.keys.len() - self.found.len();
         if missing == 0 {
             return Ok(());
         }
-        let reason = format!("{missing} of {} measurements are not where the tables say", self.wanted.len());
+        let reason = format!("{missing} of {} measurements are not where the tables say", self.wanted.keys.len());
         let file = self.source.file.path.to_string();
         Err(Error::Changed { run: self.source.file.run.clone(), file, reason })
     }
+}
 
-    async fn read(&mut self, chunk: &ChunkIndex) -> Result<()> {
-        if chunk_gap(&self.source.chunks, self.end, chunk.chunk_start_offset) {
-            // What went before stands in chunks that have nothing wanted.
-            self.close();
-            self.pending.clear();
+// Channels that share a chunk, by way of others too, and their chunks in the file's order.
+fn lanes(chunks: &[ChunkIndex]) -> Vec<(BTreeSet<u16>, Vec<ChunkIndex>)> {
+    let mut lanes: Vec<(BTreeSet<u16>, Vec<ChunkIndex>)> = Vec::new();
+    for chunk in chunks.iter().filter(|c| c.message_start_time <= c.message_end_time) {
+        let mut merged = (chunk.message_index_offsets.keys().copied().collect::<BTreeSet<_>>(), vec![chunk.clone()]);
+        let (touched, rest) = lanes.into_iter().partition(|(channels, _)| !channels.is_disjoint(&merged.0));
+        lanes = rest;
+        for (channels, of) in touched {
+            merged.0.extend(channels);
+            merged.1.extend(of);
         }
-        self.end = chunk.chunk_start_offset + chunk.chunk_length;
-        for message in self.source.messages(chunk).await? {
-            if !is_once(&message.channel.topic) {
-                self.sort_in(message);
+        lanes.push(merged);
+    }
+    lanes.iter_mut().for_each(|(_, chunks)| chunks.sort_by_key(|c| c.chunk_start_offset));
+    lanes
+}
+
+impl Lane {
+    fn new(keyed: bool, chunks: Vec<ChunkIndex>, wanted: &Wanted) -> Self {
+        let starts = chunks.iter().map(|c| c.chunk_start_offset).collect();
+        let has = |c: &ChunkIndex| wanted.times.range(c.message_start_time..=c.message_end_time).next().is_some();
+        let chunks = chunks.into_iter().filter(has).collect();
+        Self { keyed, chunks, starts, last: None, pending: Vec::new(), open: None, ready: VecDeque::new() }
+    }
+
+    // Reads until the lane's next measurement is whole, or it has none.
+    async fn fill(&mut self, source: &Source, wanted: &Wanted) -> Result<()> {
+        while self.ready.is_empty() {
+            let Some(chunk) = self.chunks.pop_front() else {
+                self.close(wanted);
+                return Ok(());
+            };
+            let at = self.starts.binary_search(&chunk.chunk_start_offset).unwrap_or(0);
+            if self.last != at.checked_sub(1).map(|before| self.starts[before]) {
+                // What went before stands in chunks that have nothing wanted.
+                self.close(wanted);
+                self.pending.clear();
+            }
+            self.last = Some(chunk.chunk_start_offset);
+            for message in source.messages(&chunk).await? {
+                if !is_once(&message.channel.topic) {
+                    self.sort_in(message, wanted);
+                }
             }
         }
         Ok(())
     }
 
-    fn sort_in(&mut self, message: Message) {
-        let topic = message.channel.topic.as_str();
-        if let Some(key) = key_of(topic, &message.data) {
-            let verdict = (topic == topics::MEASUREMENT).then_some(message.log_time);
+    fn sort_in(&mut self, message: Message, wanted: &Wanted) {
+        let (topic, time) = (message.channel.topic.as_str(), message.log_time);
+        let key = if self.keyed { key_of(topic, &message.data) } else { wanted.times.get(&time).copied() };
+        if let Some(key) = key {
+            let verdict = (topic == topics::MEASUREMENT).then_some(time);
             if self.open.as_ref().is_none_or(|open| open.key != key) {
-                self.close();
-                self.open = Some(Open { key, messages: std::mem::take(&mut self.pending), verdict: None });
+                self.close(wanted);
+                self.open = Some(Open { key, messages: std::mem::take(&mut self.pending), time, verdict: None });
             }
             if let Some(open) = &mut self.open {
                 open.verdict = verdict.or(open.verdict);
-                if self.wanted.contains(&key) {
+                if wanted.keys.contains(&key) {
                     open.messages.push(message);
                 }
             }
@@ -139,18 +187,17 @@ impl Groups {
         // A line of the log behind a verdict, at its time, is about it.
         let of_open = |open: &&mut Open| match open.verdict {
             None => true,
-            Some(time) => topic == topics::LOG && message.log_time == time,
+            Some(of) => topic == topics::LOG && time == of,
         };
         match self.open.as_mut().filter(of_open) {
+            _ if !self.keyed => {}
             Some(open) => open.messages.push(message),
             None => self.pending.push(message),
         }
     }
 
-    fn close(&mut self) {
-        let Some(open) = self.open.take().filter(|open| self.wanted.contains(&open.key)) else { return };
-        self.found.insert(open.key);
-        self.ready.push_back(open.messages);
+    fn close(&mut self, wanted: &Wanted) {
+        self.ready.extend(self.open.take().filter(|open| wanted.keys.contains(&open.key)));
     }
 }
 
@@ -158,15 +205,14 @@ fn is_once(topic: &str) -> bool {
     ONCE.contains(&topic)
 }
 
-// Whether a chunk stands between two places of the file.
-fn chunk_gap(chunks: &[ChunkIndex], from: u64, to: u64) -> bool {
-    let first = chunks.partition_point(|c| c.chunk_start_offset < from);
-    chunks.get(first).is_some_and(|c| c.chunk_start_offset < to)
+// The topics whose messages begin with pair and attempt.
+fn names_pair(topic: &str) -> bool {
+    matches!(topic, topics::SWEEP | topics::IR | topics::MEASUREMENT)
 }
 
 // Pair and attempt of the messages that have them: fields 1 and 2, varints that are left out where they are 0.
 fn key_of(topic: &str, data: &[u8]) -> Option<Key> {
-    if !matches!(topic, topics::SWEEP | topics::IR | topics::MEASUREMENT) {
+    if !names_pair(topic) {
         return None;
     }
     let (mut key, mut rest) = ((0, 0), data);

@@ -19,7 +19,7 @@ use source::{Message, RunFile, Source};
 use writer::SliceWriter;
 
 /// Topics that stand in a run's file once, and in every slice of it.
-const ONCE: [&str; 3] = [topics::PANEL_SCENE, topics::PANEL_POINTS, "/robot_description"];
+const ONCE: [&str; 3] = [topics::PANEL_SCENE, topics::PANEL_POINTS, topics::ROBOT_DESCRIPTION];
 /// Metadata record of a slice: what it was cut from.
 const SLICE_METADATA: &str = "echolake.slice";
 /// Metadata record of each of its runs: the run's own manifest. Under another name than in a run's file, so that no
@@ -117,7 +117,7 @@ pub(crate) async fn open_runs(lake: &Lake, taken: &[Taken], check: Check) -> Res
     let mut opened = Vec::new();
     for (file, taken) in files(lake, &lake.snapshot().await?, taken).await? {
         let source = Source::open(lake.store(), file, check).await?;
-        opened.push(OpenedRun(Groups::new(source, &taken)));
+        opened.push(OpenedRun(Groups::new(source, &taken, &[])));
     }
     Ok(opened)
 }
@@ -277,7 +277,7 @@ impl Slice {
                 number += 1;
             }
         }
-        let mut groups = Groups::new(source, &taken);
+        let mut groups = Groups::new(source, &taken, &self.params.topics);
         while let Some(messages) = groups.next_once().await? {
             messages.into_iter().for_each(|message| self.wait(message));
         }
