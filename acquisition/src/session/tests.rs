@@ -34,7 +34,7 @@ fn a_run_that_is_stopped_is_gone_on_with() {
     let (rig, specimen) = (Rig::from_toml(SMALL_RIG).expect("a rig"), flat());
     let folder = tempfile::tempdir().expect("a folder");
     let mut left = Vec::new();
-    let mut partial = None;
+    let mut partial: Option<PathBuf> = None;
     loop {
         let (control, mut tried) = (Control::default(), 0);
         let mut observe = |event: Event<'_>| {
