@@ -142,10 +142,17 @@ fn panels_and_groups_that_cannot_be_made() {
     assert!(place.ok(&next("two.csv")).contains("projection_mm: 20 to 60 becomes 0 to 80."));
 }
 
+// A run's file that ends within its last chunk, which has the last verdicts.
+fn cut_off(whole: &[u8]) -> &[u8] {
+    let summary = mcap::Summary::read(whole).expect("sound").expect("a summary");
+    let last = summary.chunk_indexes.iter().map(|c| c.chunk_start_offset).max().expect("a chunk");
+    &whole[..last as usize + 10]
+}
+
 #[test]
 fn run_files_that_are_none_or_damaged() {
     let place = Place::new();
-    let run = place.acquire("flat", &[]);
+    let run = place.acquire("flat", &["--checkpoint-every", "5"]);
     let whole = std::fs::read(&run).expect("the run");
     std::fs::remove_file(&run).expect("removed");
     let ingest = |name: &str, bytes: &[u8], code: i32, expected: &str| {
@@ -160,7 +167,7 @@ fn run_files_that_are_none_or_damaged() {
     assert_eq!(place.number("select count(*) from runs"), 0.0);
 
     // Cut off near its end: what was complete is taken in.
-    ingest("cut.mcap", &whole[..whole.len() / 10 * 9], 3, "the file was cut off");
+    ingest("cut.mcap", cut_off(&whole), 3, "the file was cut off");
     let kept = place.number("select count(*) from measurements");
     assert!(kept > 0.0 && kept < 45.0, "{kept}");
     assert_eq!(place.sql("select state from runs")[0]["state"], "partial");
@@ -270,11 +277,11 @@ fn a_lake_that_is_read_only_can_be_read() {
 #[test]
 fn a_recording_whose_recorder_died_yields_what_was_complete() {
     let place = Place::new();
-    let run = place.acquire("flat", &["--ir-only"]);
+    let run = place.acquire("flat", &["--ir-only", "--checkpoint-every", "5"]);
     let whole = std::fs::read(&run).expect("read");
     let partial = run.with_extension("mcap.partial");
     std::fs::remove_file(&run).expect("removed");
-    std::fs::write(&partial, &whole[..whole.len() - whole.len() / 4]).expect("written");
+    std::fs::write(&partial, cut_off(&whole)).expect("written");
     // While somebody records, it is left alone.
     let recorder = std::fs::File::open(&partial).expect("open");
     recorder.lock().expect("locked");

@@ -102,7 +102,7 @@ async fn a_slice_has_the_messages_of_its_measurements_and_no_others() {
     let times: HashSet<u64> = some.iter().map(|t| t.log_time_ns as u64).collect();
     let mut expected: BTreeMap<(u64, String), Vec<Vec<u8>>> = BTreeMap::new();
     let runs: BTreeSet<_> = some.iter().map(|t| t.run.clone()).collect();
-    let once = [topics::PANEL_SCENE, topics::PANEL_POINTS];
+    let once = [topics::PANEL_SCENE, topics::PANEL_POINTS, topics::ROBOT_DESCRIPTION];
     for run in &runs {
         for (topic, time, data) in messages(&std::fs::read(run_file(&lake, run)).expect("the run")) {
             // Air is read a moment later than its measurement begins, and the log's lines are few: both by count below.

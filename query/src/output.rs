@@ -328,11 +328,13 @@ mod tests {
 
     #[test]
     fn a_long_parquet_answer_has_row_groups_of_a_bounded_size() {
-        let text: ArrayRef = Arc::new(StringArray::from_iter_values((0..4096).map(|n| format!("{n:0>2048}"))));
-        let batch = RecordBatch::try_from_iter([("text", text)]).expect("a batch");
+        let chance = |n: u32| f64::from(n.wrapping_mul(2_654_435_761)).sqrt();
+        let numbers =
+            |from: u32| Arc::new(arrow::array::Float64Array::from_iter_values((from..from + 100_000).map(chance)));
+        let batch = |from| RecordBatch::try_from_iter([("x", numbers(from) as ArrayRef)]).expect("a batch");
         let mut out = Vec::new();
-        let mut writer = AnswerWriter::new(Format::Parquet, &batch.schema(), &mut out).expect("begun");
-        (0..6).for_each(|_| writer.write(&batch).expect("written"));
+        let mut writer = AnswerWriter::new(Format::Parquet, &batch(0).schema(), &mut out).expect("begun");
+        (0..30).for_each(|n| writer.write(&batch(n * 100_000)).expect("written"));
         writer.finish().expect("finished");
         let reader = parquet::arrow::arrow_reader::ParquetRecordBatchReaderBuilder::try_new(bytes::Bytes::from(out));
         assert!(reader.expect("Parquet").metadata().num_row_groups() > 1);

@@ -8,7 +8,7 @@ use echolake_schema::manifest::RunManifest;
 use echolake_schema::{Rig, RunId, SurfaceRecord, Timestamp, topics};
 
 use super::audio::Aligned;
-use super::audio::tests::{Cable, Fault as AudioFault, with};
+use super::audio::tests::{Cable, Fault as AudioFault, since};
 use super::rosbridge::RosbridgeRobots;
 use super::rosbridge::fake::{FakeBridge, Fault};
 use super::serial::SerialSensor;
@@ -112,7 +112,7 @@ fn run(room: &mut Room, devices: Devices, progress: &mut dyn FnMut(&mut Room, us
 #[test]
 fn a_run_over_all_drivers_holds_what_they_told() {
     let mut room = Room::new();
-    let devices = room.devices(with(&[AudioFault::Overrun]));
+    let devices = room.devices(since(Timestamp::now(), &[AudioFault::Overrun]));
     let ended = run(&mut room, devices, &mut |_, _| ());
     assert_eq!(ended.outcome.as_ref().ok(), Some(&3), "{:?}", ended.outcome);
     for topic in [topics::TF, topics::MICROPHONE_JOINTS, topics::SPEAKER_JOINTS, topics::SWEEP, topics::MEASUREMENT] {
@@ -126,7 +126,7 @@ fn faults_in_mid_run_are_named_and_nothing_is_lost() {
     type Pull = fn(&mut Room);
     let check = |pull: Pull, expected: &str| {
         let mut room = Room::new();
-        let devices = room.devices(with(&[]));
+        let devices = room.devices(since(Timestamp::now(), &[]));
         let ended = run(&mut room, devices, &mut |room, done| {
             if done == 3 {
                 pull(room);

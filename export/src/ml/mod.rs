@@ -11,6 +11,7 @@ mod surfaces;
 
 use std::path::Path;
 use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 
 use arrow::datatypes::SchemaRef;
 use echolake_lake::{Lake, Snapshot};
@@ -210,7 +211,9 @@ async fn shards_of(job: &Arc<Job>, progress: &mut dyn FnMut(usize, usize)) -> Re
         let job = job.clone();
         tokio::spawn(async move { shard::write(&job, &job.plan.shards[at]).await })
     };
-    let mut running = futures::stream::iter(0..job.plan.shards.len()).map(spawn).buffered(cores);
+    let stop = AtomicBool::new(false);
+    let wanted = (0..job.plan.shards.len()).take_while(|_| !stop.load(Ordering::Relaxed));
+    let mut running = futures::stream::iter(wanted).map(spawn).buffered(cores);
     let (mut written, mut failed) = (Vec::new(), None);
     // After a failure those at work come to their end, because the folder is theirs, too.
     while let Some(ended) = running.next().await {
@@ -220,10 +223,10 @@ async fn shards_of(job: &Arc<Job>, progress: &mut dyn FnMut(usize, usize)) -> Re
                 progress(done, total);
                 written.push(file);
             }
-            Ok(_) => break,
+            Ok(_) => {}
             Err(e) => {
+                stop.store(true, Ordering::Relaxed);
                 failed.get_or_insert(e);
-                break;
             }
         }
     }

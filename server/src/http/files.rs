@@ -39,7 +39,12 @@ pub(super) fn for_viewers(catalogue: &Catalogue) -> Router {
         .allow_headers([header::RANGE, header::IF_RANGE, header::IF_NONE_MATCH, header::AUTHORIZATION])
         .expose_headers([header::ACCEPT_RANGES, header::CONTENT_LENGTH, header::CONTENT_RANGE, header::ETAG])
         .allow_private_network(true);
-    Router::new().route(RUN, get(run)).layer(cors).with_state(catalogue.clone())
+    // Here and not for all routes: a preflight must come to the layer.
+    Router::new()
+        .route(RUN, get(run))
+        .method_not_allowed_fallback(super::wrong_method)
+        .layer(cors)
+        .with_state(catalogue.clone())
 }
 
 /// The files that only the server's own pages and programs read.

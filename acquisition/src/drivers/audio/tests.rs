@@ -48,8 +48,13 @@ impl Duplex for Cable {
     }
 }
 
-pub(in crate::drivers) fn with(faults: &[Fault]) -> Aligned<Cable> {
-    Aligned::new(Cable { faults: faults.to_vec(), now: Timestamp(1_000), gain: 0.9 }, 0.05, 2)
+fn with(faults: &[Fault]) -> Aligned<Cable> {
+    since(Timestamp(1_000), faults)
+}
+
+/// A cable whose clock stands at `now`.
+pub(in crate::drivers) fn since(now: Timestamp, faults: &[Fault]) -> Aligned<Cable> {
+    Aligned::new(Cable { faults: faults.to_vec(), now, gain: 0.9 }, 0.05, 2)
 }
 
 fn sweep() -> Vec<f32> {

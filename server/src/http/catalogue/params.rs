@@ -60,7 +60,9 @@ impl Params {
 pub(super) fn range(name: &str, text: &str) -> Result<RangeInclusive<f64>, Fault> {
     let number = |text: &str| text.parse::<f64>().ok().filter(|n| n.is_finite());
     let bounds = text.split_once("..").and_then(|(low, high)| Some(number(low)?..=number(high)?));
-    bounds.ok_or_else(|| Fault::request(format!("`{name}` is `{text}`; hint: two numbers as -6..0.5")))
+    let bounds = bounds.filter(|b| b.start() <= b.end());
+    bounds
+        .ok_or_else(|| Fault::request(format!("`{name}` is `{text}`; hint: two numbers, the lower first, as -6..0.5")))
 }
 
 #[cfg(test)]
