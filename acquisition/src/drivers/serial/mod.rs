@@ -1,4 +1,4 @@
-//! The ambient sensor on a serial line. It sends lines by itself; [`line`] says what stands in them.
+//! The ambient sensor on a serial line. It sends lines by itself; [`mod@line`] says what stands in them.
 
 pub mod line;
 #[cfg(test)]
