@@ -142,10 +142,12 @@ fn panels_and_groups_that_cannot_be_made() {
     assert!(place.ok(&next("two.csv")).contains("projection_mm: 20 to 60 becomes 0 to 80."));
 }
 
-// A run's file that ends within its last chunk, which has the last verdicts.
+// A run's file that ends within the chunk of its last verdicts.
 fn cut_off(whole: &[u8]) -> &[u8] {
     let summary = mcap::Summary::read(whole).expect("sound").expect("a summary");
-    let last = summary.chunk_indexes.iter().map(|c| c.chunk_start_offset).max().expect("a chunk");
+    let verdicts = summary.channels.values().find(|c| c.topic == "/measurement").expect("verdicts").id;
+    let theirs = summary.chunk_indexes.iter().filter(|c| c.message_index_offsets.contains_key(&verdicts));
+    let last = theirs.map(|c| c.chunk_start_offset).max().expect("a chunk");
     &whole[..last as usize + 10]
 }
 
