@@ -41,10 +41,12 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     });
     writeln!(
         std::io::stdout(),
-        "{name}, seed {seed}: {} rounds in {:.0?}, {} answered, at most {} MiB; the server is well",
+        "{name}, seed {seed}: {} rounds in {:.0?}, {} answered, {} broke their own connection's decoder, at most {} MiB; the \
+         server is well",
         outcome.rounds,
         begun.elapsed(),
         outcome.answered,
+        outcome.broken,
         outcome.resident_kib >> 10
     )?;
     Ok(())

@@ -24,6 +24,8 @@ impl Served {
             .args(more)
             .current_dir(folder)
             .env_remove("ECHOLAKE_LAKE")
+            // Where something panics, who called it is told.
+            .env("RUST_BACKTRACE", "1")
             .stderr(Stdio::piped())
             .spawn()
             .expect("the command starts");
