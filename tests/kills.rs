@@ -69,11 +69,7 @@ impl Campaign {
     /// # Panics
     /// Where the tables are not those of an undisturbed ingest; the text names the round.
     pub(crate) fn rounds(&mut self, rounds: usize, told: &mut dyn FnMut(usize, &Outcome)) -> Outcome {
-        self.copy("undisturbed");
-        let begun = Instant::now();
-        self.run("undisturbed", &["ingest"]);
-        let whole = begun.elapsed();
-        let expected = self.tables("undisturbed");
+        let (whole, expected) = self.undisturbed();
         let mut outcome = Outcome::default();
         for round in 0..rounds {
             self.copy("round");
@@ -98,11 +94,7 @@ impl Campaign {
     /// # Panics
     /// As [`Self::rounds`].
     pub(crate) fn halves(&mut self, rounds: usize, told: &mut dyn FnMut(usize, &Outcome)) -> Outcome {
-        self.copy("undisturbed");
-        let begun = Instant::now();
-        self.run("undisturbed", &["ingest"]);
-        let whole = begun.elapsed();
-        let expected = self.tables("undisturbed");
+        let (whole, expected) = self.undisturbed();
         let mut outcome = Outcome::default();
         for round in 0..rounds {
             self.copy("round");
@@ -136,6 +128,14 @@ impl Campaign {
             told(round + 1, &outcome);
         }
         outcome
+    }
+
+    // How long an ingest takes that nobody disturbs, and its tables.
+    fn undisturbed(&self) -> (Duration, BTreeMap<&'static str, Vec<u8>>) {
+        self.copy("undisturbed");
+        let begun = Instant::now();
+        self.run("undisturbed", &["ingest"]);
+        (begun.elapsed(), self.tables("undisturbed"))
     }
 
     fn is_undisturbed(&self, round: usize, expected: &BTreeMap<&'static str, Vec<u8>>) {

@@ -1,119 +1,29 @@
 //! Ingest that dies at any step of its writing, and ingests side by side: the tables end as if nothing had happened.
 
 use std::collections::BTreeMap;
-use std::fmt;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
+use std::sync::atomic::{AtomicBool, Ordering};
 
-use async_trait::async_trait;
+use arrow::row::{RowConverter, SortField};
 use bytes::Bytes;
+use chrono::TimeDelta;
 use echolake_acquisition::controller::Keep;
 use echolake_acquisition::relief::Relief;
 use echolake_acquisition::simulate::{SimulatedRun, Specimen};
-use echolake_lake::{Lake, References};
+use echolake_lake::{Deletion, Lake, References};
 use echolake_schema::tables::Table;
 use echolake_schema::{Rig, Timestamp};
-use futures::stream::BoxStream;
+use futures::TryStreamExt as _;
 use object_store::memory::InMemory;
 use object_store::path::Path;
-use object_store::{
-    CopyOptions, Error as StoreError, GetOptions, GetResult, ListResult, MultipartUpload, ObjectMeta, ObjectStore,
-    ObjectStoreExt as _, PutMultipartOptions, PutOptions, PutPayload, PutResult, RenameOptions, Result as StoreResult,
-};
+use object_store::{ObjectStore, ObjectStoreExt as _};
+use parquet::arrow::arrow_reader::ParquetRecordBatchReaderBuilder;
 
+use crate::mortal::{Death, Mortal};
 use crate::{Ingest, Report, complete, pending};
 
 /// Ten points, so that a run takes milliseconds.
 const SMALL_RIG: &str = include_str!("../../tests/fixtures/small_rig.toml");
-
-/// Where a store dies.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Death {
-    /// The write is not made.
-    Before,
-    /// The write is made, and its author does not hear of it.
-    After,
-}
-
-/// A store that dies at its nth write; all that comes later fails.
-#[derive(Debug)]
-struct Mortal {
-    inner: Arc<InMemory>,
-    writes: AtomicUsize,
-    last: usize,
-    death: Death,
-}
-
-impl Mortal {
-    fn new(inner: Arc<InMemory>, last: usize, death: Death) -> Arc<Self> {
-        Arc::new(Self { inner, writes: AtomicUsize::new(0), last, death })
-    }
-
-    // Whether the write is made, and whether its author hears of it.
-    fn write(&self) -> (bool, bool) {
-        let number = self.writes.fetch_add(1, Ordering::SeqCst);
-        (number < self.last || (number == self.last && self.death == Death::After), number < self.last)
-    }
-
-    async fn mutate<T>(&self, work: impl Future<Output = StoreResult<T>>) -> StoreResult<T> {
-        let (made, heard) = self.write();
-        let done = if made { Some(work.await) } else { None };
-        done.filter(|_| heard).unwrap_or_else(|| Err(dead()))
-    }
-}
-
-fn dead() -> StoreError {
-    StoreError::Generic { store: "Mortal", source: "the power is gone".into() }
-}
-
-impl fmt::Display for Mortal {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str("Mortal")
-    }
-}
-
-#[async_trait]
-impl ObjectStore for Mortal {
-    async fn put_opts(&self, location: &Path, payload: PutPayload, opts: PutOptions) -> StoreResult<PutResult> {
-        self.mutate(self.inner.put_opts(location, payload, opts)).await
-    }
-
-    async fn put_multipart_opts(
-        &self,
-        location: &Path,
-        opts: PutMultipartOptions,
-    ) -> StoreResult<Box<dyn MultipartUpload>> {
-        self.mutate(self.inner.put_multipart_opts(location, opts)).await
-    }
-
-    async fn get_opts(&self, location: &Path, options: GetOptions) -> StoreResult<GetResult> {
-        self.inner.get_opts(location, options).await
-    }
-
-    fn delete_stream(&self, locations: BoxStream<'static, StoreResult<Path>>) -> BoxStream<'static, StoreResult<Path>> {
-        match self.write() {
-            (true, true) => self.inner.delete_stream(locations),
-            _ => Box::pin(futures::stream::once(async { Err(dead()) })),
-        }
-    }
-
-    fn list(&self, prefix: Option<&Path>) -> BoxStream<'static, StoreResult<ObjectMeta>> {
-        self.inner.list(prefix)
-    }
-
-    async fn list_with_delimiter(&self, prefix: Option<&Path>) -> StoreResult<ListResult> {
-        self.inner.list_with_delimiter(prefix).await
-    }
-
-    async fn copy_opts(&self, from: &Path, to: &Path, options: CopyOptions) -> StoreResult<()> {
-        self.mutate(self.inner.copy_opts(from, to, options)).await
-    }
-
-    // In one step, as a file system does it.
-    async fn rename_opts(&self, from: &Path, to: &Path, options: RenameOptions) -> StoreResult<()> {
-        self.mutate(self.inner.rename_opts(from, to, options)).await
-    }
-}
 
 fn rig() -> Rig {
     Rig::from_toml(SMALL_RIG).expect("a rig")
@@ -183,6 +93,30 @@ async fn tables(store: Arc<InMemory>) -> (BTreeMap<String, Bytes>, Vec<String>) 
     (seen, logged)
 }
 
+/// Merges all files that can be, and deletes what nothing names any more.
+async fn tidy(store: Arc<dyn ObjectStore>) -> echolake_lake::Result<()> {
+    let (lake, stop) = (lake(store).await?, AtomicBool::new(false));
+    lake.optimize(1 << 30, &stop, &mut |_| {}).await?;
+    lake.vacuum(TimeDelta::zero(), Deletion::Real, &mut |_, _| {}).await?;
+    Ok(())
+}
+
+/// All rows that readers see, sorted, by table.
+async fn rows(store: Arc<InMemory>) -> BTreeMap<&'static str, Vec<Vec<u8>>> {
+    let mut all: BTreeMap<_, Vec<_>> = BTreeMap::new();
+    for (path, bytes) in tables(store).await.0 {
+        let table = Table::ALL.into_iter().find(|t| path.starts_with(&format!("tables/{}/", t.name()))).expect(&path);
+        for batch in ParquetRecordBatchReaderBuilder::try_new(bytes).expect(&path).build().expect(&path) {
+            let batch = batch.expect(&path);
+            let fields = batch.schema().fields().iter().map(|f| SortField::new(f.data_type().clone())).collect();
+            let rows = RowConverter::new(fields).and_then(|c| c.convert_columns(batch.columns())).expect(&path);
+            all.entry(table.name()).or_default().extend(rows.iter().map(|row| row.as_ref().to_vec()));
+        }
+    }
+    all.values_mut().for_each(|rows| rows.sort_unstable());
+    all
+}
+
 // A death at each write, made or not: afterwards ingest is run once more, and the tables are those of an ingest that
 // nothing disturbed, byte for byte.
 #[tokio::test(flavor = "multi_thread")]
@@ -199,7 +133,7 @@ async fn a_death_at_any_write_is_repaired_by_running_again() {
             let inner = Arc::new(start.fork());
             let mortal = Mortal::new(inner.clone(), last, death);
             let first = ingest(mortal.clone()).await;
-            if mortal.writes.load(Ordering::SeqCst) <= last {
+            if !mortal.died() {
                 first.expect("it lived");
                 break;
             }
@@ -212,6 +146,86 @@ async fn a_death_at_any_write_is_repaired_by_running_again() {
     }
     // Each of three runs has nine files, each table a commit, each run's file a move.
     assert!(deaths > 2 * 35, "{deaths} deaths");
+}
+
+// A death at each write of a merge and of the clean-up behind it: readers see the same rows at once, and once it is run
+// again the files are those of one that nothing disturbed.
+#[tokio::test(flavor = "multi_thread")]
+async fn a_death_at_any_write_of_the_upkeep_changes_no_row() {
+    let start = with_inbox(&runs(&["flat", "foam", "wood"])).await;
+    ingest(start.clone()).await.expect("ingested");
+    let before = rows(Arc::new(start.fork())).await;
+    let undisturbed = Arc::new(start.fork());
+    tidy(undisturbed.clone()).await.expect("tidied");
+    assert!(rows(undisturbed.clone()).await == before, "other rows");
+    let files = async |store: Arc<InMemory>| {
+        let listed: Vec<_> = store.list(Some(&Path::from("tables"))).try_collect().await.expect("listed");
+        listed.iter().filter(|f| f.location.extension() == Some("parquet")).count()
+    };
+    let (expected, kept) = (tables(undisturbed.clone()).await, files(undisturbed).await);
+    assert!(kept < files(start.clone()).await, "files are merged");
+    let mut deaths = 0;
+    for death in [Death::Before, Death::After] {
+        for last in 0.. {
+            let inner = Arc::new(start.fork());
+            let mortal = Mortal::new(inner.clone(), last, death);
+            let first = tidy(mortal.clone()).await;
+            if !mortal.died() {
+                first.expect("it lived");
+                break;
+            }
+            deaths += 1;
+            assert!(rows(inner.clone()).await == before, "{death:?} write {last}: other rows");
+            // As if its time had run out.
+            inner.delete(&Path::from("tables/_maintenance.json")).await.ok();
+            tidy(inner.clone()).await.unwrap_or_else(|e| panic!("{death:?} write {last}: {e}"));
+            assert!(tables(inner.clone()).await == expected, "{death:?} write {last}: other files");
+            // What was written and never named stays for an hour, lest somebody is about to name it.
+            assert!(files(inner).await <= kept + 1, "{death:?} write {last}: files are left over");
+        }
+    }
+    // A merge of each of eight tables is a file and a commit; 24 files are deleted; two leases are taken and given back.
+    assert!(deaths > 2 * 40, "{deaths} deaths");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn upkeep_beside_ingest_loses_nothing_and_doubles_nothing() {
+    let surfaces = ["flat", "foam", "wood", "prd", "brick", "wavy", "flat_2", "wood_2"];
+    let runs = runs(&surfaces);
+    let undisturbed = with_inbox(&runs).await;
+    ingest(undisturbed.clone()).await.expect("ingested");
+    let expected = rows(undisturbed).await;
+    let store = with_inbox(&runs[..2]).await;
+    ingest(store.clone()).await.expect("ingested");
+    let done = Arc::new(AtomicBool::new(false));
+    let upkeep = tokio::spawn({
+        let (store, done) = (store.clone(), done.clone());
+        async move {
+            let mut rounds = 0;
+            while !done.load(Ordering::SeqCst) {
+                tidy(store.clone()).await.expect("tidied");
+                rounds += 1;
+            }
+            rounds
+        }
+    });
+    for (name, bytes) in &runs[2..] {
+        store.put(&Path::from(format!("inbox/{name}")), bytes.clone().into()).await.expect("written");
+        // Nothing is kept for readers here, so that ingest may find a file gone that was merged meanwhile: it is run again.
+        let mut tries = 0;
+        while let Err(e) = ingest(store.clone()).await {
+            tries += 1;
+            assert!(tries < 20, "{name}: {e}");
+        }
+    }
+    done.store(true, Ordering::SeqCst);
+    assert!(upkeep.await.expect("no panic") > 0);
+    ingest(store.clone()).await.expect("ingested");
+    let seen = rows(store).await;
+    for (table, rows) in &expected {
+        assert_eq!(seen.get(table).map(Vec::len), Some(rows.len()), "{table}");
+    }
+    assert!(seen == expected, "other rows");
 }
 
 #[tokio::test(flavor = "multi_thread")]

@@ -34,6 +34,8 @@ mod files;
 mod ingest;
 mod inspect;
 mod measure;
+#[cfg(test)]
+mod mortal;
 mod pipeline;
 mod read_back;
 mod record_shape;

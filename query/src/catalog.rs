@@ -21,7 +21,7 @@ use echolake_schema::tables::Table;
 use crate::as_of::{self, Past};
 use crate::mcap::{self, Contents};
 use crate::table::{LakeTable, Source};
-use crate::views::{Lookups, UnusedJoin, View};
+use crate::views::{Lookups, PairJoin, UnusedJoin, View};
 use crate::{Error, error};
 
 /// How long another layout of the same rows may go unseen; vacuum keeps replaced files an hour at least.
@@ -92,6 +92,7 @@ impl Catalog {
             context.register_table(TableReference::bare(past.name), provider).map_err(failed)?;
         }
         context.add_optimizer_rule(Arc::new(UnusedJoin));
+        context.add_optimizer_rule(Arc::new(PairJoin::new(&self.lookups)));
         mcap::register(context, &current.snapshot, &self.runs, statement).await
     }
 

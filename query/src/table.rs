@@ -91,6 +91,11 @@ impl LakeTable {
         self.files.len() == files.len() && self.files.iter().zip(files).all(|(a, b)| a.file == *b)
     }
 
+    /// Which table.
+    pub(crate) fn table(&self) -> Table {
+        self.table
+    }
+
     /// The columns of which no two rows have the same values, where a view joins by them.
     pub(crate) fn key(&self) -> Option<&'static [&'static str]> {
         match self.table {

@@ -15,6 +15,7 @@ pub mod devices;
 mod error;
 pub mod grid;
 pub mod ids;
+pub mod interchange;
 pub mod manifest;
 pub mod messages;
 pub mod quantities;

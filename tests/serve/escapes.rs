@@ -5,7 +5,7 @@
 mod attempts;
 
 use std::collections::BTreeMap;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use arrow_flight::error::FlightError;
 use arrow_flight::sql::client::FlightSqlServiceClient;
@@ -13,12 +13,11 @@ use arrow_flight::{Action, FlightDescriptor, FlightInfo, Ticket};
 use futures::TryStreamExt as _;
 use tonic::transport::{Channel, Endpoint};
 
+use attempts::{SECRET, files};
+
 use super::http::Request;
 use super::server::Served;
 use super::{Place, lake, postgres, served};
-
-/// What must never be in an answer.
-const SECRET: &str = "a4c1f0d2_nobody_may_read_this";
 
 /// A served lake with a secret beside it.
 struct Scene {
@@ -49,20 +48,6 @@ impl Scene {
         let said = self.server.said();
         assert!(!said.iter().any(|l| l.contains("panicked")), "{said:?}");
     }
-}
-
-fn files(folder: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
-    let mut all = BTreeMap::new();
-    let mut folders = vec![folder.to_owned()];
-    while let Some(folder) = folders.pop() {
-        for entry in std::fs::read_dir(&folder).expect("a folder").flatten() {
-            match entry.path() {
-                path if path.is_dir() => folders.push(path),
-                path => drop(all.insert(path.clone(), std::fs::read(path).expect("a file"))),
-            }
-        }
-    }
-    all
 }
 
 #[test]

@@ -8,6 +8,7 @@ use std::collections::HashMap;
 use std::fs::File;
 use std::path::{Path, PathBuf};
 
+use echolake_schema::interchange::{GIR_COMBINATIONS, GIR_PANEL_INFO};
 use echolake_schema::manifest::{MeshFacts, Origin, RunEnd, RunManifest};
 use echolake_schema::messages::{AmbientSample, ImpulseResponse, Measurement, Verdict};
 use echolake_schema::{Celsius, Grid, Pair, PairId, Rig, RunId, SurfaceId, SurfaceRecord};
@@ -261,9 +262,8 @@ fn visiting_order(path: &Path, grid: &Grid) -> Result<Option<Vec<Pair>>, Error> 
     if !path.exists() {
         return Ok(None);
     }
-    let names = ["combination", "mic_layer", "mic_x", "mic_y", "speaker_layer", "speaker_x", "speaker_y"];
     let mut pairs: Vec<Option<Pair>> = vec![None; grid.pairs().len()];
-    for (line, cells) in table(path, &names)? {
+    for (line, cells) in table(path, &GIR_COMBINATIONS)? {
         let place = format!("line {line}");
         let numbers: Option<Vec<usize>> = cells.iter().map(|c| c.parse().ok()).collect();
         let n = numbers.ok_or_else(|| wrong(path, place.clone(), cells.join(","), "whole numbers"))?;
@@ -287,17 +287,8 @@ fn panel_info(path: &Path) -> Result<HashMap<SurfaceId, SurfaceRecord>, Error> {
     if !path.exists() {
         return Ok(HashMap::new());
     }
-    let names = [
-        "panel id",
-        "flat reference",
-        "foam reference",
-        "macrostructure reference",
-        "mesostructure reference",
-        "sand type",
-        "binder type",
-    ];
     let mut info = HashMap::new();
-    for (line, c) in table(path, &names)? {
+    for (line, c) in table(path, &GIR_PANEL_INFO)? {
         let id = |text: &str| {
             text.parse::<SurfaceId>().map_err(|e| wrong(path, format!("line {line}"), e.to_string(), "a surface id"))
         };

@@ -49,7 +49,7 @@ pub enum Error {
         reason: String,
     },
     /// The manifest has a wrong header.
-    #[error("manifest `{}`: {what}; hint: the columns are {}", path.display(), wav_manifest::COLUMNS.join(", "))]
+    #[error("manifest `{}`: {what}; hint: the columns are {}", path.display(), echolake_schema::interchange::WAV_MANIFEST.join(", "))]
     Header {
         /// The manifest.
         path: PathBuf,

@@ -4,25 +4,14 @@ use std::collections::BTreeMap;
 use std::path::Path;
 
 use csv::StringRecord;
+use echolake_schema::interchange::WAV_MANIFEST;
 use echolake_schema::messages::SampleFormat;
 use echolake_schema::{Celsius, Grid, Pair, PairId, Rig, SurfaceId, Timestamp};
 
 use super::Error;
 use super::wav_file::{WavChannel, common_format};
 
-/// The manifest's columns; the first six are needed.
-pub(super) const COLUMNS: [&str; 10] = [
-    "surface",
-    "recording",
-    "loopback",
-    "microphone",
-    "speaker",
-    "temperature_c",
-    "humidity_pct",
-    "pressure_hpa",
-    "recorded_at",
-    "attempt",
-];
+/// How many of the columns are needed.
 const NEEDED: usize = 6;
 
 /// A row, checked.
@@ -52,12 +41,12 @@ fn open(path: &Path) -> Result<(csv::Reader<std::fs::File>, Vec<Option<usize>>),
     if header.is_empty() {
         return Err(wrong("it is empty".into()));
     }
-    if let Some(unknown) = header.iter().find(|h| !COLUMNS.contains(h)) {
+    if let Some(unknown) = header.iter().find(|h| !WAV_MANIFEST.contains(h)) {
         return Err(wrong(format!("unknown column `{unknown}`")));
     }
-    let places: Vec<_> = COLUMNS.iter().map(|c| header.iter().position(|h| h == *c)).collect();
+    let places: Vec<_> = WAV_MANIFEST.iter().map(|c| header.iter().position(|h| h == *c)).collect();
     match places[..NEEDED].iter().position(Option::is_none) {
-        Some(missing) => Err(wrong(format!("column `{}` is missing", COLUMNS[missing]))),
+        Some(missing) => Err(wrong(format!("column `{}` is missing", WAV_MANIFEST[missing]))),
         None => Ok((reader, places)),
     }
 }
@@ -112,7 +101,7 @@ struct Cells<'a> {
 
 impl Cells<'_> {
     fn get(&self, column: &'static str) -> Option<&str> {
-        let index = COLUMNS.iter().position(|c| *c == column)?;
+        let index = WAV_MANIFEST.iter().position(|c| *c == column)?;
         self.record.get(self.places[index]?).filter(|text| !text.is_empty())
     }
 

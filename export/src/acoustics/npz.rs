@@ -6,6 +6,7 @@ use std::io::Cursor;
 use arrow::array::AsArray as _;
 use arrow::datatypes::Float32Type;
 use echolake_lake::{Lake, Snapshot, VisibleRun};
+use echolake_schema::interchange::{GIR_COMBINATIONS, GIR_PANEL_INFO};
 use echolake_schema::tables::Table;
 use ndarray::{Array1, Array2};
 use ndarray_npy::NpzWriter;
@@ -86,16 +87,7 @@ pub(super) async fn describe(
     let combinations = combinations(lake).map_err(|e| Error::write(&folder.named("combinations.csv"), e))?;
     let mut info = csv::Writer::from_writer(Vec::new());
     let failed = |e: csv::Error| Error::write(&folder.named("panel_info.csv"), e);
-    let header = [
-        "panel id",
-        "flat reference",
-        "foam reference",
-        "macrostructure reference",
-        "mesostructure reference",
-        "sand type",
-        "binder type",
-    ];
-    info.write_record(header).map_err(failed)?;
+    info.write_record(GIR_PANEL_INFO).map_err(failed)?;
     let columns = ["surface_id", "typology", "macrostructure", "material", "flat_reference", "foam_reference"];
     for run in runs {
         let batch = rows::of_run(lake, snapshot, Table::Surfaces, &run.run, &columns).await?;
@@ -119,7 +111,7 @@ pub(super) async fn describe(
 // 1-based, as the data set counts them.
 fn combinations(lake: &Lake) -> std::result::Result<Vec<u8>, csv::Error> {
     let mut csv = csv::Writer::from_writer(Vec::new());
-    csv.write_record(["combination", "mic_layer", "mic_x", "mic_y", "speaker_layer", "speaker_x", "speaker_y"])?;
+    csv.write_record(GIR_COMBINATIONS)?;
     let points = lake.grid().points();
     for pair in lake.grid().pairs() {
         let (m, s) = (points[pair.microphone.index()], points[pair.speaker.index()]);

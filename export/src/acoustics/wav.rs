@@ -5,6 +5,7 @@ use std::io::{Cursor, Seek, Write};
 use std::path::Path;
 
 use echolake_lake::Lake;
+use echolake_schema::interchange::WAV_MANIFEST;
 use echolake_schema::messages::{Measurement, SampleFormat, SweepRecording};
 use echolake_schema::{Timestamp, topics};
 use hound::{WavSpec, WavWriter};
@@ -13,20 +14,6 @@ use prost::Message as _;
 use crate::error::{Error, Result};
 use crate::output::PendingFolder;
 use crate::slice::{Check, Measured, Taken, open_runs};
-
-/// The columns of the manifest, as `import wav` reads them.
-const COLUMNS: [&str; 10] = [
-    "surface",
-    "recording",
-    "loopback",
-    "microphone",
-    "speaker",
-    "temperature_c",
-    "humidity_pct",
-    "pressure_hpa",
-    "recorded_at",
-    "attempt",
-];
 
 /// Writes the recordings of measurements into a folder that is not there yet, and `manifest.csv` beside them; returns
 /// how many. `progress` hears how many are done, of how many.
@@ -44,7 +31,7 @@ pub async fn write_wav(
     let pending = PendingFolder::create(folder)?;
     let mut manifest = csv::Writer::from_writer(Vec::new());
     let failed = |e: csv::Error| Error::write(&pending.named("manifest.csv"), e);
-    manifest.write_record(COLUMNS).map_err(failed)?;
+    manifest.write_record(WAV_MANIFEST).map_err(failed)?;
     let mut done = 0;
     for run in &mut runs {
         while let Some(measured) = run.next().await? {
@@ -63,7 +50,7 @@ pub async fn write_wav(
             let row = recording.row(lake, run.surface().as_str(), &name).ok_or_else(|| {
                 Error::damaged(run.file(), format!("pair {}, which the rig does not have", recording.sweep.pair_id))
             })?;
-            manifest.write_record(COLUMNS.map(|c| row.get(c).map_or("", String::as_str))).map_err(failed)?;
+            manifest.write_record(WAV_MANIFEST.map(|c| row.get(c).map_or("", String::as_str))).map_err(failed)?;
             done += 1;
             progress(done, taken.len());
         }

@@ -1,6 +1,25 @@
 //! Three hundred ways to get out of the gate, made of what other systems were got out of by.
 
-use std::path::Path;
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+/// What must never be in an answer.
+pub(crate) const SECRET: &str = "a4c1f0d2_nobody_may_read_this";
+
+/// Every file below a folder, to see whether an attempt had an effect.
+pub(crate) fn files(folder: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
+    let mut all = BTreeMap::new();
+    let mut folders = vec![folder.to_owned()];
+    while let Some(folder) = folders.pop() {
+        for entry in std::fs::read_dir(&folder).expect("a folder").flatten() {
+            match entry.path() {
+                path if path.is_dir() => folders.push(path),
+                path => drop(all.insert(path.clone(), std::fs::read(path).expect("a file"))),
+            }
+        }
+    }
+    all
+}
 
 /// Attempts that would read `secret`, write under `outside`, or change the lake or another session.
 pub(crate) fn attempts(secret: &Path, outside: &Path) -> Vec<String> {

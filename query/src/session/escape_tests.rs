@@ -1,30 +1,10 @@
 //! Three hundred attempts to get out of the gate: none reads, writes or changes anything.
 
-use std::collections::BTreeMap;
-use std::path::{Path, PathBuf};
-
 use echolake_lake::{Lake, References};
 use echolake_schema::Rig;
 
-use super::attempts::attempts;
+use super::attempts::{SECRET, attempts, files};
 use super::*;
-
-/// What must never be in an answer.
-const SECRET: &str = "a4c1f0d2_nobody_may_read_this";
-
-fn files(folder: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
-    let mut all = BTreeMap::new();
-    let mut folders = vec![folder.to_owned()];
-    while let Some(folder) = folders.pop() {
-        for entry in std::fs::read_dir(&folder).expect("a folder").flatten() {
-            match entry.path() {
-                path if path.is_dir() => folders.push(path),
-                path => drop(all.insert(path.clone(), std::fs::read(path).expect("a file"))),
-            }
-        }
-    }
-    all
-}
 
 async fn answered(session: &Session, sql: &str) -> Result<String, Error> {
     let mut answer = session.query(sql).await?;

@@ -15,7 +15,11 @@ use echolake_schema::symmetry::MovedPair;
 use echolake_schema::{Grid, Symmetry};
 
 /// The lookup functions of a lake.
+#[derive(Debug, Clone)]
 pub(crate) struct Lookups(Vec<Arc<ScalarUDF>>);
+
+/// Before the name of a column of `pairs`: its lookup.
+const OF_PAIR: &str = "pair_";
 
 /// Values of all pairs, or of all pairs under each symmetry of D4, one symmetry after the other.
 #[derive(Debug)]
@@ -37,10 +41,15 @@ impl Lookups {
         let columns = pairs.schema();
         let own = columns.fields().iter().zip(pairs.columns()).skip(1);
         let mut all: Vec<_> = own
-            .map(|(field, values)| Lookup::new("pair_", field.name(), values.clone(), pairs.num_rows(), 1))
+            .map(|(field, values)| Lookup::new(OF_PAIR, field.name(), values.clone(), pairs.num_rows(), 1))
             .collect();
         all.extend(moved(lake.grid()));
         Ok(Self(all.into_iter().map(|lookup| Arc::new(ScalarUDF::from(lookup))).collect()))
+    }
+
+    /// What looks up a column of `pairs`.
+    pub(super) fn of_pair(&self, column: &str) -> Option<&Arc<ScalarUDF>> {
+        self.0.iter().find(|function| function.name().strip_prefix(OF_PAIR) == Some(column))
     }
 
     pub(super) fn register(&self, context: &SessionContext) {
@@ -130,7 +139,7 @@ impl ScalarUDFImpl for Lookup {
                 let symmetries = symmetries.as_primitive::<Int32Type>();
                 pairs.iter().zip(symmetries).map(|(p, s)| self.index(p, s)).collect()
             }
-            None => pairs.iter().map(|p| self.index(p, Some(0))).collect(),
+            None => pairs.unary_opt(|p| self.index(Some(p), Some(0))),
         };
         Ok(ColumnarValue::Array(take(&self.values, &indices, None)?))
     }

@@ -7,6 +7,7 @@ mod augmented;
 mod catalogue;
 mod ir;
 mod lookup;
+mod pair_join;
 mod tnce_db;
 mod unused_join;
 
@@ -24,6 +25,7 @@ use echolake_schema::tables::{COMMENT, Table, UNIT};
 use futures::FutureExt as _;
 
 pub(crate) use lookup::Lookups;
+pub(crate) use pair_join::PairJoin;
 pub(crate) use unused_join::UnusedJoin;
 
 /// A view.

@@ -232,3 +232,41 @@ async fn the_past_is_seen_until_it_is_vacuumed() {
     object_store::ObjectStoreExt::delete(lake.store().as_ref(), &file).await.expect("deleted");
     refused(&format!("tnce version as of {number}"), "1 of its 1 files then are deleted").await;
 }
+
+#[tokio::test]
+async fn pairs_are_looked_up_where_a_measurement_names_them() {
+    let (_folder, lake) = lake().await;
+    put(&lake, "0001_0", "r1").await;
+    let session = Session::new(&lake).expect("a session");
+    let looked_up = [
+        "select p.pair_id, incidence_deg, microphone_x_mm from tnce t join pairs p on t.pair_id = p.pair_id",
+        "select pair_id, incidence_deg, microphone_x_mm from pairs join tnce using (pair_id)",
+        "select t.pair_id, incidence_deg, microphone_x_mm from tnce t left join pairs p on p.pair_id = t.pair_id
+            where p.incidence_deg >= 0",
+        "select n.pair_id, incidence_deg, microphone_x_mm from (select pair_id from nce where pair_id < 9) n, pairs
+            where n.pair_id = pairs.pair_id",
+    ];
+    let own = lake.pairs().expect("pairs");
+    for sql in looked_up {
+        let answer = rows(&session, &format!("{sql} order by 1")).await;
+        assert!(!plan(&session, sql).await.contains("Join"), "{sql}");
+        assert_eq!(answer.num_rows(), PAIRS, "{sql}");
+        for (i, name) in ["pair_id", "incidence_deg", "microphone_x_mm"].into_iter().enumerate() {
+            let expected = own.column_by_name(name).expect(name).slice(0, PAIRS);
+            assert_eq!(answer.column(i).as_ref(), expected.as_ref(), "{sql}");
+            let field = own.schema().field_with_name(name).expect(name).clone();
+            assert_eq!(answer.schema().field(i).metadata(), field.metadata(), "{sql}");
+        }
+    }
+    // Where pairs are chosen, or the numbers may be no pairs, it is a join like any other.
+    let joined = [
+        ("select count(*) from tnce t join pairs p using (pair_id) where p.pair_id = 1 and p.direct_mm > 0", 1),
+        ("select count(*) from tnce t join pairs p on t.pair_id + 2950 = p.pair_id", 1),
+        ("select count(*) from (select attempt as pair_id from measurements) m join pairs p using (pair_id)", 3),
+        ("select count(*) from (values (1), (-7)) v(pair_id) join pairs p using (pair_id)", 1),
+    ];
+    for (sql, expected) in joined {
+        assert!(plan(&session, sql).await.contains("Join"), "{sql}");
+        assert_eq!(number(&session, sql).await, expected, "{sql}");
+    }
+}

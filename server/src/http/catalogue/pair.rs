@@ -38,14 +38,8 @@ struct Detail<'a> {
 #[derive(Serialize)]
 struct Pair {
     pair_id: usize,
-    microphone: i32,
-    speaker: i32,
-    microphone_mm: [f64; 3],
-    speaker_mm: [f64; 3],
-    direct_mm: f64,
-    image_mm: f64,
-    incidence_deg: f64,
-    specular_mm: [f64; 2],
+    #[serde(flatten)]
+    geometry: Geometry,
     fresnel: Vec<Fresnel>,
 }
 
@@ -56,7 +50,7 @@ struct Fresnel {
     minor_mm: f64,
 }
 
-#[derive(Deserialize)]
+#[derive(Deserialize, Serialize)]
 struct Geometry {
     microphone: i32,
     speaker: i32,
@@ -66,7 +60,9 @@ struct Geometry {
     image_mm: f64,
     incidence_deg: f64,
     specular_mm: [f64; 2],
+    #[serde(skip_serializing)]
     low_mm: [Option<f64>; 2],
+    #[serde(skip_serializing)]
     high_mm: [Option<f64>; 2],
 }
 
@@ -224,18 +220,8 @@ impl Geometry {
         let zone = |frequency_hz: f64, [major, minor]: [Option<f64>; 2]| {
             Some(Fresnel { frequency_hz, major_mm: major?, minor_mm: minor? })
         };
-        Pair {
-            pair_id,
-            microphone: self.microphone,
-            speaker: self.speaker,
-            microphone_mm: self.microphone_mm,
-            speaker_mm: self.speaker_mm,
-            direct_mm: self.direct_mm,
-            image_mm: self.image_mm,
-            incidence_deg: self.incidence_deg,
-            specular_mm: self.specular_mm,
-            fresnel: [zone(2000.0, self.low_mm), zone(40_000.0, self.high_mm)].into_iter().flatten().collect(),
-        }
+        let fresnel = [zone(2000.0, self.low_mm), zone(40_000.0, self.high_mm)].into_iter().flatten().collect();
+        Pair { pair_id, geometry: self, fresnel }
     }
 }
 

@@ -1,0 +1,115 @@
+//! An optimizer's rule: a join with table `pairs` by `pair_id` becomes lookups. Every pair of the rig is in `pairs` once
+//! and no measurement is of another, so the join neither drops nor doubles a row, and an array access is cheaper than
+//! a hash table.
+
+use datafusion::common::metadata::FieldMetadata;
+use datafusion::common::tree_node::Transformed;
+use datafusion::common::{Column, JoinType};
+use datafusion::datasource::source_as_provider;
+use datafusion::error::Result;
+use datafusion::logical_expr::logical_plan::{Join, Projection};
+use datafusion::logical_expr::{Expr, LogicalPlan};
+use datafusion::optimizer::optimizer::ApplyOrder;
+use datafusion::optimizer::{OptimizerConfig, OptimizerRule};
+use echolake_schema::tables::Table;
+
+use super::Lookups;
+use crate::table::LakeTable;
+
+const KEY: &str = "pair_id";
+
+/// The rule.
+#[derive(Debug)]
+pub(crate) struct PairJoin(Lookups);
+
+impl PairJoin {
+    /// The rule over a lake's lookups.
+    pub(crate) fn new(lookups: &Lookups) -> Self {
+        Self(lookups.clone())
+    }
+
+    // The same rows without the join; None where it has to stay.
+    fn without(&self, join: &Join) -> Option<Result<LogicalPlan>> {
+        let [(left, right)] = join.on.as_slice() else { return None };
+        let (left, right) = (left.try_as_col()?, right.try_as_col()?);
+        if join.filter.is_some() {
+            return None;
+        }
+        let (rows, key, pairs) = match join.join_type {
+            JoinType::Inner | JoinType::Left if is_pairs(&join.right, right) => (&join.left, left, &join.right),
+            JoinType::Inner | JoinType::Right if is_pairs(&join.left, left) => (&join.right, right, &join.left),
+            _ => return None,
+        };
+        if !is_measured(rows, key) {
+            return None;
+        }
+        let columns = join.schema.columns().into_iter();
+        let columns = columns.map(|column| match pairs.schema().has_column(&column) {
+            true => self.of(&column, key, pairs),
+            false => Some(Expr::Column(column)),
+        });
+        let columns: Vec<_> = columns.collect::<Option<_>>()?;
+        Some(Projection::try_new(columns, rows.clone()).map(LogicalPlan::Projection))
+    }
+
+    // A column of `pairs` by the pair that `key` names.
+    fn of(&self, column: &Column, key: &Column, pairs: &LogicalPlan) -> Option<Expr> {
+        let value = match column.name.as_str() {
+            KEY => Expr::Column(key.clone()),
+            name => self.0.of_pair(name)?.call(vec![Expr::Column(key.clone())]),
+        };
+        let (_, field) = pairs.schema().qualified_field_from_column(column).ok()?;
+        let metadata = Some(FieldMetadata::from(field.metadata()));
+        Some(value.alias_qualified_with_metadata(column.relation.clone(), &column.name, metadata))
+    }
+}
+
+impl OptimizerRule for PairJoin {
+    fn name(&self) -> &str {
+        "pair_join"
+    }
+
+    fn apply_order(&self) -> Option<ApplyOrder> {
+        Some(ApplyOrder::BottomUp)
+    }
+
+    fn rewrite(&self, plan: LogicalPlan, _config: &dyn OptimizerConfig) -> Result<Transformed<LogicalPlan>> {
+        match &plan {
+            LogicalPlan::Join(join) => match self.without(join) {
+                Some(without) => Ok(Transformed::yes(without?)),
+                None => Ok(Transformed::no(plan)),
+            },
+            _ => Ok(Transformed::no(plan)),
+        }
+    }
+}
+
+// Whether these are all rows of `pairs`, under the key's own name.
+fn is_pairs(plan: &LogicalPlan, key: &Column) -> bool {
+    key.name == KEY && scanned(plan, true) == Some(Table::Pairs)
+}
+
+// Whether the column is a table's own, and can hold nothing but the rig's pairs.
+fn is_measured(plan: &LogicalPlan, key: &Column) -> bool {
+    let measured = [Table::Measurements, Table::Nce, Table::Tnce, Table::TnceD4];
+    key.name == KEY && scanned(plan, false).is_some_and(|table| measured.contains(&table))
+}
+
+// The table whose rows and columns these are, under their own names: all of its rows, or some.
+fn scanned(plan: &LogicalPlan, all: bool) -> Option<Table> {
+    match plan {
+        LogicalPlan::TableScan(scan) => {
+            let provider = source_as_provider(&scan.source).ok()?;
+            let provider: &dyn std::any::Any = provider.as_ref();
+            let whole = scan.filters.is_empty() && scan.fetch.is_none();
+            provider.downcast_ref::<LakeTable>().map(LakeTable::table).filter(|_| whole || !all)
+        }
+        LogicalPlan::Filter(filter) if !all => scanned(&filter.input, all),
+        LogicalPlan::SubqueryAlias(alias) => scanned(&alias.input, all),
+        LogicalPlan::Projection(projection) => {
+            let plain = projection.expr.iter().all(|e| matches!(e, Expr::Column(_)));
+            scanned(&projection.input, all).filter(|_| plain)
+        }
+        _ => None,
+    }
+}

@@ -1,0 +1,28 @@
+//! Columns of the CSV files that imports read and exports write, so that what goes out comes back in.
+
+/// The manifest of WAV recordings; the first six are needed.
+pub const WAV_MANIFEST: [&str; 10] = [
+    "surface",
+    "recording",
+    "loopback",
+    "microphone",
+    "speaker",
+    "temperature_c",
+    "humidity_pct",
+    "pressure_hpa",
+    "recorded_at",
+    "attempt",
+];
+/// GIR's `combinations.csv`: the order of the matrix's rows, from 1.
+pub const GIR_COMBINATIONS: [&str; 7] =
+    ["combination", "mic_layer", "mic_x", "mic_y", "speaker_layer", "speaker_x", "speaker_y"];
+/// GIR's `panel_info.csv`: what each surface is.
+pub const GIR_PANEL_INFO: [&str; 7] = [
+    "panel id",
+    "flat reference",
+    "foam reference",
+    "macrostructure reference",
+    "mesostructure reference",
+    "sand type",
+    "binder type",
+];
