@@ -8,7 +8,7 @@ const MOST_BYTES = 200_000
 const get = async (path) => (await fetch(base + path)).json()
 const { items } = await get('/api/v1/surfaces?limit=500')
 const id = (items.find((s) => s.surface_id === 'brick') ?? items.find((s) => s.typology !== 'reference')).surface_id
-const PICTURES = [['wall', '/?sort=level'], ['surface', `/surfaces/${id}?microphone=14&over=flat-band`], ['response', `/surfaces/${id}/pairs/159`]]
+const PICTURES = [['wall', '/'], ['surface', `/surfaces/${id}?microphone=14&point=40&over=flat-band`], ['response', `/surfaces/${id}/pairs/159`]]
 
 await mkdir(folder, { recursive: true })
 const browser = await chromium.launch({ executablePath: process.env.CHROMIUM ?? '/usr/bin/chromium', args: ['--no-sandbox', '--enable-unsafe-swiftshader', '--disable-dev-shm-usage'] })
