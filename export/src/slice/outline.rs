@@ -75,16 +75,16 @@ impl Outline {
             }
         }
         let times: BTreeSet<_> = taken.iter().map(|t| u64::try_from(t.log_time_ns).unwrap_or(0)).collect();
-        // What a measurement rests on is before its verdict, in the same chunk.
-        let begins = |chunk: &&ChunkIndex| {
+        // Chunks that are read; a measurement's messages are not all of its very time.
+        let is_read = |chunk: &&ChunkIndex| {
             let once = |id: &u16| source.channels.get(id).is_some_and(|c| is_once(&c.topic) && named(&c.topic));
             times.range(chunk.message_start_time..=chunk.message_end_time).next().is_some()
                 || chunk.message_index_offsets.keys().any(once)
         };
-        let first = source.chunks.iter().filter(begins).map(|c| c.message_start_time).min();
-        let signed = |time: Option<u64>| time.and_then(|t| i64::try_from(t).ok());
-        self.start_ns = self.start_ns.min(signed(first).unwrap_or(0));
-        self.end_ns = self.end_ns.max(signed(times.last().copied()).unwrap_or(0)).max(self.start_ns);
+        let read = || source.chunks.iter().filter(is_read);
+        let signed = |time: Option<u64>| time.and_then(|t| i64::try_from(t).ok()).unwrap_or(0);
+        self.start_ns = self.start_ns.min(signed(read().map(|c| c.message_start_time).min()));
+        self.end_ns = self.end_ns.max(signed(read().map(|c| c.message_end_time).max()));
     }
 
     fn schema(&mut self, schema: OutlineSchema) -> usize {
