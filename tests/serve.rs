@@ -6,6 +6,7 @@ mod escapes;
 pub(crate) mod http;
 pub(crate) mod postgres;
 pub(crate) mod server;
+mod slices;
 
 use std::path::Path;
 use std::time::{Duration, Instant};

@@ -60,21 +60,10 @@ async fn taken(
     let snapshot = lake.snapshot().await?;
     let mut taken = Vec::new();
     for file in snapshot.files_of(Table::Measurements, run) {
-        let columns = ["pair_id", "log_time_ns", "attempt"];
-        let batches: Vec<_> = lake.rows(Table::Measurements, file, &columns, 0..file.rows).await?.try_collect().await?;
+        let batches: Vec<_> = lake.rows(Table::Measurements, file, &Taken::COLUMNS, 0..file.rows).await?.try_collect().await?;
         for batch in batches {
-            let (ids, times, attempts) = (
-                batch.column(0).as_primitive::<Int32Type>(),
-                batch.column(1).as_primitive::<Int64Type>(),
-                batch.column(2).as_primitive::<Int32Type>(),
-            );
-            let rows = (0..batch.num_rows()).filter(|row| pairs.contains(&ids.value(*row)));
-            taken.extend(rows.map(|row| Taken {
-                run: run.clone(),
-                pair: ids.value(row) as u32,
-                attempt: attempts.value(row) as u32,
-                log_time_ns: times.value(row),
-            }));
+            let range = pairs.start as u32..pairs.end as u32;
+            taken.extend(Taken::of_batch(&batch)?.into_iter().filter(|one| range.contains(&one.pair)));
         }
     }
     Ok(taken)

@@ -114,12 +114,17 @@ async fn a_slice_has_the_messages_of_its_measurements_and_no_others() {
             }
         }
     }
+    let snapshot = lake.snapshot().await.expect("a view");
+    let params = SliceParams { taken: some.clone(), ..SliceParams::default() };
+    let looked_over = outline(&lake, &snapshot, &params).await.expect("an outline");
     for layout in [Layout::InTime, Layout::ByTopic] {
         let file =
             cut(&lake, SliceParams { taken: some.clone(), layout, ..SliceParams::default() }).await.expect("a slice");
         let mut found: BTreeMap<(u64, String), Vec<Vec<u8>>> = BTreeMap::new();
-        let (mut last, mut air) = (0, 0);
+        let (mut last, mut air, mut named) = (0, 0, BTreeSet::new());
         for (topic, time, data) in messages(&file) {
+            named.insert(topic.clone());
+            assert!((looked_over.start_ns as u64..=looked_over.end_ns as u64).contains(&time), "{topic} at {time}");
             assert!(layout == Layout::ByTopic || time >= last, "{topic} at {time} after {last}");
             last = time;
             air += usize::from(topic == topics::ENVIRONMENT);
@@ -130,6 +135,8 @@ async fn a_slice_has_the_messages_of_its_measurements_and_no_others() {
         assert_eq!(found.keys().collect::<Vec<_>>(), expected.keys().collect::<Vec<_>>(), "{layout:?}");
         assert!(found == expected, "contents differ, {layout:?}");
         assert_eq!(air, some.len(), "{layout:?}");
+        let told: BTreeSet<_> = looked_over.topics.iter().map(|t| t.name.clone()).collect();
+        assert!(told.is_superset(&named) && told.len() == looked_over.topics.len(), "{told:?} {named:?}");
         let summary = mcap::Summary::read(&file).expect("sound").expect("a summary");
         assert_eq!(summary.attachment_indexes.len(), 4 * runs.len());
         assert!(summary.metadata_indexes.iter().all(|m| m.name != topics::RUN_METADATA), "a slice is no run");

@@ -34,21 +34,36 @@ def lake(echolake: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="session")
-def served(echolake: str, lake: Path) -> Iterator[str]:
-    """Its Flight SQL address."""
-    command = [echolake, "--lake", str(lake), "serve", "--listen", "127.0.0.1:0", "--flight-sql", "127.0.0.1:0"]
+def addresses(echolake: str, lake: Path) -> Iterator[dict[str, str]]:
+    """Where it is served, by scheme."""
+    anywhere = "127.0.0.1:0"
+    command = [echolake, "--lake", str(lake), "serve", "--listen", anywhere, "--flight-sql", anywhere, "--postgres", "off"]
     server = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
     try:
         assert server.stderr is not None
+        found: dict[str, str] = {}
         for line in server.stderr:
-            if found := re.search(r"grpc://(\S+:\d+)", line):
-                yield f"grpc://{found.group(1)}"
+            found |= {scheme: f"{scheme}://{host}" for scheme, host in re.findall(r"(http|grpc)://(\S+:\d+)", line)}
+            if len(found) == 2:
                 break
         else:
             pytest.fail("the server ended before it listened")
+        yield found
     finally:
         server.terminate()
         server.wait(timeout=30)
+
+
+@pytest.fixture(scope="session")
+def served(addresses: dict[str, str]) -> str:
+    """Its Flight SQL address."""
+    return addresses["grpc"]
+
+
+@pytest.fixture(scope="session")
+def served_http(addresses: dict[str, str]) -> str:
+    """Its HTTP address."""
+    return addresses["http"]
 
 
 def export(echolake: str, lake: Path, *arguments: str) -> None:

@@ -17,7 +17,7 @@ use datafusion::execution::session_state::{SessionState, SessionStateBuilder};
 use datafusion::logical_expr::Documentation;
 use datafusion::prelude::{SessionConfig, SessionContext};
 use echolake_lake::Lake;
-use tokio::sync::Semaphore;
+use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 
 use crate::catalog::Catalog;
 use crate::control::governor::{Running, govern, resident_bytes};
@@ -121,10 +121,20 @@ impl Client {
         &self.quota
     }
 
-    pub(crate) fn places(&self) -> Option<&Arc<Semaphore>> {
-        self.places.as_ref()
+    /// A place among what they may run at once, for a query or for other work that their requests cause.
+    ///
+    /// # Errors
+    /// [`Error::Busy`] where all are taken.
+    pub fn place(&self) -> Result<Place, Error> {
+        let Some(places) = &self.places else { return Ok(Place(None)) };
+        let busy = |_| Error::Busy { client: self.name.clone(), limit: self.quota.concurrent.unwrap_or(0) };
+        Ok(Place(Some(places.clone().try_acquire_owned().map_err(busy)?)))
     }
 }
+
+/// A place among what a client may run at once; dropped, it is free for the next.
+#[derive(Debug)]
+pub struct Place(#[expect(dead_code, reason = "it is held")] Option<OwnedSemaphorePermit>);
 
 /// What the queries of one client may use; None is as much as there is.
 #[derive(Debug, Clone, Default)]

@@ -22,14 +22,16 @@ mod functions;
 mod gate;
 mod mcap;
 pub mod output;
+mod predicate;
 mod session;
 mod small;
 mod table;
 mod views;
 
 pub use control::lanes::Threads;
-pub use engine::{Client, Engine, Function, Limits, Quota};
+pub use engine::{Client, Engine, Function, Limits, Place, Quota};
 pub use error::Error;
 pub use functions::Functions;
 pub use mcap::{Attachment, Contents, Topic};
+pub use predicate::Subqueries;
 pub use session::{Answer, CancelHandle, Extend, Prepared, Session};

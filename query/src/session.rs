@@ -24,7 +24,7 @@ use crate::control::lanes::Lane;
 use crate::control::pool::QueryPool;
 use crate::control::watched::watch;
 use crate::control::{Stop, Ticket};
-use crate::engine::{Client, Engine, Function, Limits, Quota};
+use crate::engine::{Client, Engine, Function, Limits, Place, Quota};
 use crate::mcap::Contents;
 use crate::{Error, as_of, gate};
 
@@ -221,13 +221,7 @@ impl Session {
 
     // A query's time begins here, with its waiting.
     fn start(&self) -> Result<Started, Error> {
-        let place = match self.client.places() {
-            None => None,
-            Some(places) => Some(places.clone().try_acquire_owned().map_err(|_| Error::Busy {
-                client: self.client.name().to_owned(),
-                limit: self.client.quota().concurrent.unwrap_or(0),
-            })?),
-        };
+        let place = self.client.place()?;
         let ticket = Arc::new(Ticket::new());
         self.engine.queries().add(&ticket);
         if let (Some(time), Some(threads)) = (self.client.quota().time, self.engine.watch().handle()) {
@@ -353,7 +347,7 @@ impl Session {
 /// A query that has begun, before it is planned.
 struct Started {
     ticket: Arc<Ticket>,
-    place: Option<OwnedSemaphorePermit>,
+    place: Place,
 }
 
 /// Work that nobody waits for any more ends where it next waits itself.
@@ -375,7 +369,7 @@ async fn drive(
     context: Arc<TaskContext>,
     send: mpsc::Sender<Result<RecordBatch, DataFusionError>>,
     ticket: Arc<Ticket>,
-    _places: (Option<OwnedSemaphorePermit>, Option<OwnedSemaphorePermit>),
+    _places: (Place, Option<OwnedSemaphorePermit>),
 ) {
     let mut batches = match execute_stream(plan, context) {
         Ok(batches) => batches,

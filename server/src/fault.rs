@@ -3,6 +3,7 @@
 
 use std::time::Duration;
 
+use echolake_export::Error as SliceError;
 use echolake_query::Error as QueryError;
 
 use crate::tokens::Scope;
@@ -32,6 +33,32 @@ pub(crate) enum Fault {
         what: String,
         /// What to do.
         hint: &'static str,
+    },
+    /// It was there, and is no more.
+    #[error("{what} is no longer there; hint: {hint}")]
+    Gone {
+        /// What was asked for.
+        what: &'static str,
+        /// What to do.
+        hint: &'static str,
+    },
+    /// A slice cannot be cut.
+    #[error(transparent)]
+    Slice(#[from] SliceError),
+    /// A slice of more measurements than are cut at once.
+    #[error("a slice has {limit} measurements at most; hint: ask for fewer runs at a time")]
+    SliceTooLarge {
+        /// How many are.
+        limit: usize,
+    },
+    /// There is no room on the server's disk for a slice that is asked for by ranges.
+    #[error(
+        "slices that are asked for by ranges are kept for a while, {limit} bytes of them and while the disk has room; \
+         hint: ask for fewer measurements or topics, or for all of it without a range"
+    )]
+    NoRoom {
+        /// Bytes that are kept.
+        limit: u64,
     },
     /// What is asked about is there, and has no such data.
     #[error("{what} has no {data}; hint: {hint}")]
@@ -113,6 +140,8 @@ pub(crate) enum Code {
     Request,
     Unsupported,
     NotFound,
+    Gone,
+    Changed,
     NoData,
     Method,
     Range,
@@ -130,7 +159,7 @@ pub(crate) enum Code {
 
 impl Code {
     /// All of them.
-    pub(crate) const ALL: [Self; 21] = [
+    pub(crate) const ALL: [Self; 23] = [
         Self::Query,
         Self::ReadOnly,
         Self::Execution,
@@ -139,6 +168,8 @@ impl Code {
         Self::Request,
         Self::Unsupported,
         Self::NotFound,
+        Self::Gone,
+        Self::Changed,
         Self::NoData,
         Self::Method,
         Self::Range,
@@ -165,6 +196,8 @@ impl Code {
             Self::Request => "request_invalid",
             Self::Unsupported => "unsupported",
             Self::NotFound => "not_found",
+            Self::Gone => "gone",
+            Self::Changed => "file_changed",
             Self::NoData => "no_data",
             Self::Method => "method_not_allowed",
             Self::Range => "range_not_satisfiable",
@@ -200,6 +233,10 @@ impl Fault {
             Self::Request { .. } => Code::Request,
             Self::Unsupported { .. } => Code::Unsupported,
             Self::NotFound { .. } => Code::NotFound,
+            Self::Gone { .. } => Code::Gone,
+            Self::Slice(error) => slice_code(error),
+            Self::SliceTooLarge { .. } => Code::TooLarge,
+            Self::NoRoom { .. } => Code::MemoryLimit,
             Self::NoData { .. } => Code::NoData,
             Self::Unreadable => Code::Lake,
             Self::Method => Code::Method,
@@ -213,6 +250,16 @@ impl Fault {
             Self::TooMany { .. } => Code::TooMany,
             Self::Internal => Code::Internal,
         }
+    }
+}
+
+fn slice_code(error: &SliceError) -> Code {
+    match error {
+        SliceError::Unknown { .. } => Code::Request,
+        SliceError::Nothing { .. } => Code::NoData,
+        SliceError::Changed { .. } => Code::Changed,
+        SliceError::Uncuttable { .. } => Code::Format,
+        _ => Code::Lake,
     }
 }
 

@@ -94,7 +94,8 @@ impl Service {
         self.session(&nobody).functions().into_iter().filter(|f| f.is_own).collect()
     }
 
-    fn spawn<T: Send + 'static>(&self, work: impl Future<Output = T> + Send + 'static) -> JoinSet<T> {
+    /// Begins work on the threads that encode answers; it ends where what this returns is dropped.
+    pub(crate) fn spawn<T: Send + 'static>(&self, work: impl Future<Output = T> + Send + 'static) -> JoinSet<T> {
         let mut task = JoinSet::new();
         if let Some(threads) = self.0.encoders.handle() {
             task.spawn_on(work, threads);

@@ -60,7 +60,7 @@ struct File {
 struct Line {
     name: String,
     sha256: String,
-    #[serde(default = "sql_alone")]
+    #[serde(default = "reading")]
     scopes: Vec<Scope>,
     seconds: Option<u64>,
     memory_mb: Option<usize>,
@@ -68,8 +68,10 @@ struct Line {
     concurrent: Option<usize>,
 }
 
-fn sql_alone() -> Vec<Scope> {
-    vec![Scope::Sql]
+// What a reader of the lake needs. Who may ask in SQL reads all rows, and the catalogue's pages show meshes and link to run
+// files: without files a signed-in browser would be refused in the middle of a page.
+fn reading() -> Vec<Scope> {
+    vec![Scope::Sql, Scope::Files]
 }
 
 impl Line {
@@ -162,7 +164,7 @@ pub fn fresh(name: &str) -> Result<Fresh, Error> {
     let hash = random::hex(&Sha256::digest(token.as_bytes()));
     let name = toml::Value::from(name);
     let lines = format!(
-        "[[token]]\nname = {name}\nsha256 = \"{hash}\"\nscopes = [\"sql\"]\n\
+        "[[token]]\nname = {name}\nsha256 = \"{hash}\"\nscopes = [\"sql\", \"files\"]\n\
          seconds = 60\nmemory_mb = 2000\nrows = 10_000_000\nconcurrent = 4\n"
     );
     Ok(Fresh { token, lines })
@@ -281,10 +283,12 @@ mod tests {
         let client = access.client(Some(&fresh.token), Scope::Sql).expect("let in");
         assert_eq!(client.name(), "a \"quoted\" name");
         assert_eq!(client.quota().time, Some(Duration::from_secs(60)));
-        assert!(matches!(access.client(Some(&fresh.token), Scope::Files), Err(Fault::Forbidden { .. })));
+        assert!(access.client(Some(&fresh.token), Scope::Files).is_ok(), "pages show meshes and link to files");
+        assert!(matches!(access.client(Some(&fresh.token), Scope::Metrics), Err(Fault::Forbidden { .. })));
         let secret = access.begin_session(&fresh.token).expect("a session");
         assert_eq!(access.client_of_session(&secret, Scope::Sql).expect("let in").name(), client.name());
-        assert!(matches!(access.client_of_session(&secret, Scope::Files), Err(Fault::Forbidden { .. })));
+        assert!(access.client_of_session(&secret, Scope::Files).is_ok());
+        assert!(matches!(access.client_of_session(&secret, Scope::Metrics), Err(Fault::Forbidden { .. })));
         assert!(matches!(access.client_of_session(&fresh.token, Scope::Sql), Err(Fault::Unauthenticated)));
         assert!(matches!(access.begin_session(&secret), Err(Fault::Unauthenticated)));
         let other = super::fresh("b").expect("a token").token;
@@ -292,6 +296,19 @@ mod tests {
         for wrong in [None, Some(""), Some(other.as_str()), Some(cut)] {
             assert!(matches!(access.client(wrong, Scope::Sql), Err(Fault::Unauthenticated)), "{wrong:?}");
         }
+    }
+
+    #[test]
+    fn scopes_are_those_that_a_line_names() {
+        let hash = random::hex(&Sha256::digest("x"));
+        let allowed = |scopes: &str| {
+            let file = Tokens::parse(&format!("[[token]]\nname = 'a'\nsha256 = '{hash}'\n{scopes}")).expect("tokens");
+            let access = Access::new(Some(file));
+            [Scope::Sql, Scope::Files, Scope::Metrics].map(|scope| access.client(Some("x"), scope).is_ok())
+        };
+        assert_eq!(allowed(""), [true, true, false]);
+        assert_eq!(allowed("scopes = ['sql']"), [true, false, false]);
+        assert_eq!(allowed("scopes = ['metrics']"), [false, false, true]);
     }
 
     #[test]

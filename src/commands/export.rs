@@ -3,15 +3,13 @@
 use std::path::PathBuf;
 
 use anyhow::Context as _;
-use arrow::array::AsArray as _;
-use arrow::datatypes::{Int32Type, Int64Type};
 use clap::{Args, Subcommand, ValueEnum};
 use echolake_export::{
     Check, Exported, Layout, PendingFile, ResponseFormat, Slice, SliceParams, Split, SplitBy, Symmetries, Taken,
     TrainingSet, WrittenFile, write_responses, write_training_set, write_wav,
 };
 use echolake_lake::Lake;
-use echolake_query::Session;
+use echolake_query::{Session, Subqueries};
 use echolake_schema::SurfaceId;
 use serde_json::json;
 
@@ -263,25 +261,14 @@ fn check(selection: &Selection) -> Check {
     if selection.quick { Check::Ends } else { Check::Whole }
 }
 
-// The line breaks keep a comment in the predicate from reaching further.
 async fn taken(lake: &Lake, selection: &Selection) -> anyhow::Result<Vec<Taken>> {
-    let sql =
-        format!("select run_id, pair_id, attempt, log_time_ns from measurements where (\n{}\n)", selection.predicate);
     let session = Session::new(lake)?;
+    let select = format!("select {} from measurements where", Taken::COLUMNS.join(", "));
+    let sql = session.selecting(&select, &selection.predicate, Subqueries::Allowed).context("--where")?;
     let mut answer = session.query(&sql).await.context("--where")?;
     let mut taken = Vec::new();
     while let Some(batch) = answer.next().await? {
-        let runs = arrow::compute::cast(batch.column(0), &arrow::datatypes::DataType::Utf8)?;
-        let numbers = |column: usize| batch.column(column).as_primitive::<Int32Type>();
-        let (pairs, attempts, times) = (numbers(1), numbers(2), batch.column(3).as_primitive::<Int64Type>());
-        for row in 0..batch.num_rows() {
-            taken.push(Taken {
-                run: runs.as_string::<i32>().value(row).parse()?,
-                pair: u32::try_from(pairs.value(row))?,
-                attempt: u32::try_from(attempts.value(row))?,
-                log_time_ns: times.value(row),
-            });
-        }
+        taken.extend(Taken::of_batch(&batch)?);
     }
     anyhow::ensure!(
         !taken.is_empty(),

@@ -118,7 +118,12 @@ impl Campaign {
     // Returns how many connections broke their decoder so far.
     fn is_well(&mut self, thrown: &str) -> usize {
         assert!(self.server.is_up(), "the server ended by: {thrown}");
-        let answer = self.ask("select 41 + 1 as n");
+        let asked = std::time::Instant::now();
+        let mut answer = self.ask("select 41 + 1 as n");
+        // A machine that others keep busy is no harm.
+        while answer.0 == 408 && asked.elapsed() < PATIENCE {
+            answer = self.ask("select 41 + 1 as n");
+        }
         assert_eq!((answer.0, answer.1.trim()), (200, r#"[{"n":42}]"#), "after: {thrown}");
         let counts = || {
             let said = self.server.said();

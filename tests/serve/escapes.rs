@@ -77,6 +77,30 @@ fn none_over_http() {
     scene.unharmed();
 }
 
+// As the predicate of a slice, which stands in a query of the server's.
+#[test]
+fn none_by_slices() {
+    let scene = Scene::new();
+    let run = scene.place.sql("select run_id from runs")[0]["run_id"].as_str().expect("a run").to_owned();
+    for (number, attempt) in scene.attempts().iter().enumerate() {
+        let encoded: String = attempt.bytes().map(|b| format!("%{b:02x}")).collect();
+        let more = ["", "&layout=in-time", &format!("&run={run}"), "&topics=/ir"][number % 4];
+        for path in ["slices.mcap", "foxglove/manifest"] {
+            let answer = Request::get(&format!("/api/v1/{path}?where={encoded}{more}")).send(&scene.server);
+            assert!((400..500).contains(&answer.status), "{attempt}: {}", answer.status);
+            assert!(!String::from_utf8_lossy(&answer.body).contains(SECRET), "{attempt}");
+        }
+    }
+    // Such that are an expression once they stand in parentheses.
+    for attempt in scene.attempts().iter().filter(|a| a.starts_with("select")) {
+        let encoded: String = format!("exists ({attempt})").bytes().map(|b| format!("%{b:02x}")).collect();
+        let answer = Request::get(&format!("/api/v1/slices.mcap?where={encoded}")).send(&scene.server);
+        assert!(answer.status < 500, "{attempt}: {}", answer.status);
+        assert!(!String::from_utf8_lossy(&answer.body).contains(SECRET), "{attempt}");
+    }
+    scene.unharmed();
+}
+
 #[test]
 fn none_over_postgres() {
     let scene = Scene::new();

@@ -30,6 +30,10 @@ impl Request {
         Self { method: "GET", path: path.to_owned(), host: None, headers: String::new(), body: String::new() }
     }
 
+    pub(crate) fn head(path: &str) -> Self {
+        Self { method: "HEAD", ..Self::get(path) }
+    }
+
     pub(crate) fn options(path: &str) -> Self {
         Self { method: "OPTIONS", ..Self::get(path) }
     }

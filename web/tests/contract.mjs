@@ -14,7 +14,7 @@ const surfaces = (await get('/api/v1/surfaces?limit=500')).items
 const runs = (await get('/api/v1/runs?limit=1')).items
 const measured = surfaces.find((s) => s.typology !== 'reference') ?? surfaces[0]
 /** Servers for developing pages leave these out. */
-const OPTIONAL = new Set(['/api/v1/tables/{table}', '/api/v1/tables/{table}/{file}', '/metrics'])
+const OPTIONAL = new Set(['/api/v1/files', '/api/v1/foxglove/manifest', '/api/v1/layout.json', '/api/v1/slices.mcap', '/api/v1/tables/{table}', '/api/v1/tables/{table}/{file}', '/metrics'])
 
 let failures = 0
 let asked = 0
@@ -39,7 +39,7 @@ async function check(path, template, expected = 200) {
 
 for (const [template, { get: operation }] of Object.entries(api.paths)) {
   if (!operation) continue
-  const query = (operation.parameters ?? []).filter((p) => p.in === 'query' && p.required).map((p) => `${p.name}=${p.schema.minimum ?? 0}`).join('&')
+  const query = (operation.parameters ?? []).filter((p) => p.in === 'query' && (p.required || p.example)).map((p) => `${p.name}=${encodeURIComponent(p.example ?? p.schema.minimum ?? 0)}`).join('&')
   const fill = (surface) => template.replace('{surface_id}', encodeURIComponent(surface)).replace('{pair_id}', '159').replace('{run_id}', runs[0].run_id).replace('{table}', 'points').replace('{file}', 'none.parquet') + (query ? `?${query}` : '')
   await check(fill(measured.surface_id), template)
   if (template.includes('{surface_id}')) for (const reference of surfaces.filter((s) => s.typology === 'reference')) if (!template.includes('wav')) await check(fill(reference.surface_id), template)

@@ -201,7 +201,8 @@ impl Lane {
     }
 }
 
-fn is_once(topic: &str) -> bool {
+/// Whether a topic stands in a run's file once.
+pub(super) fn is_once(topic: &str) -> bool {
     ONCE.contains(&topic)
 }
 

@@ -1,12 +1,17 @@
 //! Slices of run files: the messages of just some measurements, as an MCAP file of their own.
 
 mod groups;
+mod outline;
 mod source;
 mod writer;
 
 use std::cmp::Reverse;
-use std::collections::{BTreeMap, BTreeSet, BinaryHeap, HashSet, VecDeque};
+use std::collections::{BTreeMap, BTreeSet, BinaryHeap, VecDeque};
 
+use arrow::array::AsArray as _;
+use arrow::compute::cast;
+use arrow::datatypes::{DataType, Int32Type, Int64Type};
+use arrow::record_batch::RecordBatch;
 use bytes::Bytes;
 use echolake_lake::{Lake, Snapshot};
 use echolake_schema::{RunId, SurfaceId, topics};
@@ -14,7 +19,9 @@ use futures::stream::{self, BoxStream, StreamExt as _};
 use mcap::records::Metadata;
 
 use crate::error::{Error, Result};
+use crate::rows;
 use groups::Groups;
+pub use outline::{Outline, OutlineSchema, OutlineTopic, outline};
 use source::{Message, RunFile, Source};
 use writer::SliceWriter;
 
@@ -37,6 +44,29 @@ pub struct Taken {
     pub attempt: u32,
     /// Its time, ns since 1970.
     pub log_time_ns: i64,
+}
+
+impl Taken {
+    /// The columns of `measurements` that [`Taken::of_batch`] wants.
+    pub const COLUMNS: [&str; 4] = ["run_id", "pair_id", "attempt", "log_time_ns"];
+
+    /// The measurements of rows with [`Taken::COLUMNS`].
+    ///
+    /// # Errors
+    /// [`Error::Damaged`] where a column is missing or another's.
+    pub fn of_batch(batch: &RecordBatch) -> Result<Vec<Self>> {
+        let runs = batch.column_by_name(Self::COLUMNS[0]).and_then(|c| cast(c, &DataType::Utf8).ok());
+        let runs = runs.ok_or_else(|| Error::damaged("measurements", "no column run_id"))?;
+        let number = |value: i32| u32::try_from(value).unwrap_or(0);
+        let pairs = rows::numbers::<Int32Type>(batch, Self::COLUMNS[1])?;
+        let attempts = rows::numbers::<Int32Type>(batch, Self::COLUMNS[2])?;
+        let times = rows::numbers::<Int64Type>(batch, Self::COLUMNS[3])?;
+        let row = |(row, run): (usize, Option<&str>)| {
+            let (pair, attempt) = (number(pairs[row]), number(attempts[row]));
+            Ok(Self { run: run.unwrap_or_default().parse()?, pair, attempt, log_time_ns: times[row] })
+        };
+        runs.as_string::<i32>().iter().enumerate().map(row).collect()
+    }
 }
 
 /// In which chunks messages stand.
@@ -122,7 +152,7 @@ pub(crate) async fn open_runs(lake: &Lake, taken: &[Taken], check: Check) -> Res
     Ok(opened)
 }
 
-// The runs of measurements with their files, by their start.
+// The runs of measurements with their files, by their start; at least one.
 async fn files(lake: &Lake, snapshot: &Snapshot, taken: &[Taken]) -> Result<Vec<(RunFile, Vec<Taken>)>> {
     if taken.is_empty() {
         return Err(Error::Nothing { reason: "no measurement is selected".into() });
@@ -143,6 +173,10 @@ pub struct Slice {
     params: SliceParams,
     /// Runs that are still to be opened, by their start.
     runs: VecDeque<(RunFile, Vec<Taken>)>,
+    /// The first of them, which most slices have no others beside, is opened already.
+    first: Option<Source>,
+    /// Its name.
+    lead: RunId,
     open: Vec<OpenRun>,
     several: bool,
     waiting: BinaryHeap<Reverse<Waiting>>,
@@ -190,22 +224,25 @@ impl Slice {
     /// # Errors
     /// [`Error::Nothing`] without measurements, [`Error::Unknown`] for a topic that none of the runs has,
     /// [`Error::Changed`] for a file that is not the ingested one.
-    pub async fn open(lake: &Lake, snapshot: &Snapshot, params: SliceParams) -> Result<Self> {
+    pub async fn open(lake: &Lake, snapshot: &Snapshot, mut params: SliceParams) -> Result<Self> {
         let (runs, mut known) = (files(lake, snapshot, &params.taken).await?, BTreeSet::new());
+        let (mut first, lead) = (None, runs[0].0.run.clone());
         for (file, _) in &runs {
             let source = Source::open(lake.store(), file.clone(), params.check).await?;
             known.extend(source.channels.values().map(|c| c.topic.clone()));
+            first.get_or_insert(source);
         }
-        if let Some(topic) = params.topics.iter().find(|t| !known.contains(*t)) {
-            let known = known.into_iter().collect::<Vec<_>>().join(", ");
-            return Err(Error::Unknown { kind: "topic", name: topic.clone(), known });
-        }
+        check_topics(&params.topics, &known)?;
         let mut writer = SliceWriter::new(params.layout)?;
         writer.metadata(about(&runs, &params))?;
+        // The runs have them now.
+        params.taken = Vec::new();
         Ok(Self {
             lake: lake.clone(),
             several: runs.len() > 1,
             runs: runs.into(),
+            first,
+            lead,
             params,
             open: Vec::new(),
             waiting: BinaryHeap::new(),
@@ -263,7 +300,10 @@ impl Slice {
     async fn open_next(&mut self) -> Result<()> {
         let Some((file, taken)) = self.runs.pop_front() else { return Ok(()) };
         self.release(file.started_ns)?;
-        let source = Source::open(self.lake.store(), file, Check::Ends).await?;
+        let source = match self.first.take() {
+            Some(source) => source,
+            None => Source::open(self.lake.store(), file, Check::Ends).await?,
+        };
         if let Some(writer) = &mut self.writer {
             writer.metadata(Metadata { name: SLICE_RUN_METADATA.into(), metadata: source.manifest.clone() })?;
             let mut number = 0;
@@ -300,19 +340,20 @@ impl Slice {
         while self.waiting.peek().is_some_and(|Reverse(w)| w.order.0 < until || until == u64::MAX) {
             let Some(Reverse(Waiting { message, .. })) = self.waiting.pop() else { break };
             if message.log_time < self.last_time {
-                let what = "its measurements are not in the order of time";
-                let runs: HashSet<_> = self.params.taken.iter().map(|t| t.run.clone()).collect();
-                let run = self.open.first().map(|o| o.groups.source.file.run.clone()).or(runs.into_iter().next());
-                return Err(run.map_or_else(
-                    || Error::Nothing { reason: what.into() },
-                    |run| Error::Uncuttable { run, reason: what.into() },
-                ));
+                let run = self.open.first().map_or(&self.lead, |open| &open.groups.source.file.run).clone();
+                return Err(Error::Uncuttable { run, reason: "its measurements are not in the order of time".into() });
             }
             self.last_time = message.log_time;
             writer.write(message)?;
         }
         Ok(())
     }
+}
+
+fn check_topics(topics: &[String], known: &BTreeSet<String>) -> Result<()> {
+    let Some(missing) = topics.iter().find(|t| !known.contains(*t)) else { return Ok(()) };
+    let known = known.iter().map(String::as_str).collect::<Vec<_>>().join(", ");
+    Err(Error::Unknown { kind: "topic", name: missing.clone(), known })
 }
 
 fn about(runs: &[(RunFile, Vec<Taken>)], params: &SliceParams) -> Metadata {

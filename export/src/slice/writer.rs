@@ -16,10 +16,10 @@ use crate::error::{Error, Result};
 
 /// A chunk is ended at this size.
 const CHUNK_BYTES: usize = 1 << 20;
+/// A lane's first chunk is ended at this size, and each next one at twice as much: the first bytes come early.
+const FIRST_CHUNK_BYTES: usize = 64 << 10;
 /// Topics with messages of this size and more have chunks of their own.
 const HEAVY_BYTES: usize = 1 << 10;
-/// What is given out at a time, at least.
-const PIECE_BYTES: usize = 64 << 10;
 
 /// Where the MCAP writer writes to.
 #[derive(Debug, Clone, Default)]
@@ -52,13 +52,22 @@ pub(super) struct SliceWriter {
     lane_of: HashMap<String, usize>,
     sequence: u32,
     pub(super) messages: u64,
+    /// Whether there is more than what a file begins with.
+    has_more: bool,
 }
 
 /// Messages on their way into one chunk.
-#[derive(Default)]
 struct Lane {
     messages: Vec<(MessageHeader, Bytes)>,
     bytes: usize,
+    /// The size that its chunk is ended at.
+    enough: usize,
+}
+
+impl Default for Lane {
+    fn default() -> Self {
+        Self { messages: Vec::new(), bytes: 0, enough: FIRST_CHUNK_BYTES }
+    }
 }
 
 impl SliceWriter {
@@ -73,13 +82,12 @@ impl SliceWriter {
             .create(NoSeek::new(out.clone()))
             .map_err(|e| failed(&e))?;
         let lanes = vec![Lane::default()];
-        Ok(Self { writer, out, layout, lanes, lane_of: HashMap::new(), sequence: 0, messages: 0 })
+        Ok(Self { writer, out, layout, lanes, lane_of: HashMap::new(), sequence: 0, messages: 0, has_more: false })
     }
 
-    /// What was written since, where that is worth sending.
+    /// What was written since, where a chunk or an attachment is in it.
     pub(super) fn take(&mut self) -> Option<Bytes> {
-        let mut out = self.out.lock();
-        (out.len() >= PIECE_BYTES).then(|| std::mem::take(&mut *out).into())
+        std::mem::take(&mut self.has_more).then(|| std::mem::take(&mut *self.out.lock()).into())
     }
 
     pub(super) fn metadata(&mut self, metadata: Metadata) -> Result<()> {
@@ -89,6 +97,7 @@ impl SliceWriter {
 
     pub(super) fn attach(&mut self, attachment: &Attachment<'_>) -> Result<()> {
         self.flush_all()?;
+        self.has_more = true;
         self.writer.attach(attachment).map_err(|e| failed(&e))
     }
 
@@ -111,7 +120,7 @@ impl SliceWriter {
         let of = &mut self.lanes[lane];
         of.bytes += data.len();
         of.messages.push((header, data));
-        if of.bytes >= CHUNK_BYTES { self.flush(lane) } else { Ok(()) }
+        if of.bytes >= of.enough { self.flush(lane) } else { Ok(()) }
     }
 
     // Light topics share a lane; one that turns out to be heavy gets its own.
@@ -137,10 +146,13 @@ impl SliceWriter {
 
     // A lane becomes a chunk.
     fn flush(&mut self, lane: usize) -> Result<()> {
-        let Lane { messages, .. } = std::mem::take(&mut self.lanes[lane]);
+        let Lane { messages, enough, .. } = std::mem::take(&mut self.lanes[lane]);
+        self.lanes[lane].enough = enough;
         if messages.is_empty() {
             return Ok(());
         }
+        self.lanes[lane].enough = (enough * 2).min(CHUNK_BYTES);
+        self.has_more = true;
         for (header, data) in messages {
             self.writer.write_to_known_channel(&header, &data).map_err(|e| failed(&e))?;
         }

@@ -11,6 +11,7 @@ use echolake_schema::Rig;
 use echolake_schema::tables::Table;
 
 use super::*;
+use crate::Subqueries;
 
 async fn lake() -> (tempfile::TempDir, Lake) {
     let folder = tempfile::tempdir().expect("a folder");
@@ -50,6 +51,50 @@ async fn tables_are_asked_and_joined() {
     assert!(!rows(&session, "show tables").await.is_empty());
     assert!(!rows(&session, "describe measurements").await.is_empty());
     assert!(!rows(&session, "explain select * from runs").await.is_empty());
+}
+
+#[tokio::test]
+async fn a_predicate_stays_within_its_parentheses() {
+    let (_folder, lake) = lake().await;
+    let session = Session::new(&lake).expect("a session");
+    let select = "select pair_id from pairs where pair_id < 10 and";
+    let count = async |predicate: &str| {
+        let sql = session.selecting(select, predicate, Subqueries::Allowed)?;
+        Ok::<_, Error>(rows(&session, &sql).await.iter().map(|b| b.num_rows()).sum::<usize>())
+    };
+    for (predicate, expected) in [
+        ("true", 10),
+        ("pair_id > 6 -- the last", 3),
+        ("pair_id = 1 or pair_id = 20", 1),
+        ("pair_id in (select pair_id from pairs where pair_id % 2 = 0)", 5),
+        ("(pair_id = 3) and (true)", 1),
+        ("exists (select 1) /* ) */", 10),
+    ] {
+        assert_eq!(count(predicate).await.expect(predicate), expected, "{predicate}");
+    }
+    for wrong in [
+        "",
+        "true) or (true",
+        "true) or true and (true",
+        "true) union all (select 1 where true",
+        "true) union all select run_id from runs where (true",
+        "true) limit 5 --",
+        "true); drop table runs; --",
+        "true; select 1",
+        "true) group by pair_id having (true",
+        "true) and (select 1) = (1",
+        "order by 1",
+        "selec",
+        "a b",
+        "1,2",
+    ] {
+        assert!(matches!(count(wrong).await, Err(Error::Query { .. })), "{wrong}");
+    }
+    let alone = |predicate: &str| session.selecting(select, predicate, Subqueries::Refused).is_ok();
+    assert!(alone("pair_id between 1 and 3"));
+    for asking in ["exists (select 1)", "pair_id in (select 1)", "abs((select min(pair_id) from pairs)) = 1"] {
+        assert!(!alone(asking), "{asking}");
+    }
 }
 
 #[tokio::test]

@@ -20,10 +20,10 @@ fn grpc(code: Code) -> Grpc {
     match code {
         Code::Query | Code::Request | Code::Format | Code::Method => Grpc::InvalidArgument,
         Code::ReadOnly | Code::Forbidden | Code::Foreign => Grpc::PermissionDenied,
-        Code::Execution => Grpc::FailedPrecondition,
+        Code::Execution | Code::Changed => Grpc::FailedPrecondition,
         Code::Lake => Grpc::Unavailable,
         Code::Unsupported => Grpc::Unimplemented,
-        Code::NotFound | Code::NoData => Grpc::NotFound,
+        Code::NotFound | Code::Gone | Code::NoData => Grpc::NotFound,
         Code::Range => Grpc::OutOfRange,
         Code::Unauthenticated => Grpc::Unauthenticated,
         Code::Cancelled => Grpc::Cancelled,

@@ -68,7 +68,7 @@ impl FromRequestParts<Service> for MaySeeMetrics {
 pub(super) async fn own_pages_only(State(service): State<Service>, request: Request, next: Next) -> Response {
     // With tokens there is nothing that a page could use without having one.
     if service.access().is_open()
-        && let Err(fault) = is_own(&request)
+        && let Err(fault) = is_own(request.headers())
     {
         service.metrics().failed(fault.code());
         return Problem(fault).into_response();
@@ -76,8 +76,11 @@ pub(super) async fn own_pages_only(State(service): State<Service>, request: Requ
     next.run(request).await
 }
 
-fn is_own(request: &Request) -> Result<(), Fault> {
-    let headers = request.headers();
+/// Whether a request comes from this machine's own programs and pages.
+///
+/// # Errors
+/// [`Fault::Foreign`] where it does not.
+pub(super) fn is_own(headers: &HeaderMap) -> Result<(), Fault> {
     // HTTP/1.1 wants one Host; with two, they who check and they who route may look at different ones.
     let host = match (headers.get_all(header::HOST).iter().count(), text(headers, &header::HOST)) {
         (1, Some(host)) => host,
@@ -164,7 +167,7 @@ mod tests {
     fn pages_of_elsewhere_are_refused() {
         let check = |headers: &[(&str, &str)]| {
             let request = headers.iter().fold(Request::builder(), |r, (name, value)| r.header(*name, *value));
-            is_own(&request.body(Body::empty()).expect("a request")).is_ok()
+            is_own(request.body(Body::empty()).expect("a request").headers()).is_ok()
         };
         let own = ("host", "localhost:8080");
         assert!(check(&[own]));

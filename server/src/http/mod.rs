@@ -6,11 +6,15 @@ mod files;
 mod format;
 mod guard;
 mod health;
+mod layout;
+mod manifest;
 mod openapi;
 #[cfg(feature = "web")]
 mod pages;
 mod problem;
+mod ranges;
 mod session;
+mod slices;
 mod sql;
 
 use axum::Router;
@@ -46,6 +50,7 @@ fn router(service: Service) -> Router {
         .with_state(service.clone())
         .merge(catalogue.router())
         .merge(files::for_own(&catalogue))
+        .merge(manifest::for_own(&catalogue))
         .layer(from_fn_with_state(service, guard::own_pages_only));
     #[cfg(feature = "web")]
     let rest = pages::fallback;
@@ -54,6 +59,8 @@ fn router(service: Service) -> Router {
     Router::new()
         .merge(own)
         .merge(files::for_viewers(&catalogue))
+        .merge(slices::for_viewers(&catalogue))
+        .merge(layout::for_viewers())
         .fallback(rest)
         .method_not_allowed_fallback(wrong_method)
         .layer(CatchPanicLayer::custom(|_| Problem(Fault::Internal).answer()))

@@ -276,6 +276,57 @@ export interface paths {
         readonly patch?: never;
         readonly trace?: never;
     };
+    readonly "/api/v1/slices.mcap": {
+        readonly parameters: {
+            readonly query?: never;
+            readonly header?: never;
+            readonly path?: never;
+            readonly cookie?: never;
+        };
+        /** The messages of some measurements as an MCAP file. Streamed as it is cut; who sends Range, HEAD or Origin is told its length, and it is cut to its end first. CORS as for run files. The same measurements, topics and layout are the same bytes and the same ETag. Needs the scopes sql and files */
+        readonly get: operations["slice"];
+        readonly put?: never;
+        readonly post?: never;
+        readonly delete?: never;
+        readonly options?: never;
+        readonly head?: never;
+        readonly patch?: never;
+        readonly trace?: never;
+    };
+    readonly "/api/v1/foxglove/manifest": {
+        readonly parameters: {
+            readonly query?: never;
+            readonly header?: never;
+            readonly path?: never;
+            readonly cookie?: never;
+        };
+        /** The manifest of Foxglove's remote data loader. Runs without where and topics are static files; all else is streamed, ascending in time */
+        readonly get: operations["foxglove_manifest"];
+        readonly put?: never;
+        readonly post?: never;
+        readonly delete?: never;
+        readonly options?: never;
+        readonly head?: never;
+        readonly patch?: never;
+        readonly trace?: never;
+    };
+    readonly "/api/v1/layout.json": {
+        readonly parameters: {
+            readonly query?: never;
+            readonly header?: never;
+            readonly path?: never;
+            readonly cookie?: never;
+        };
+        /** A layout for Foxglove and Lichtblick: panel and arms, response, air, measurement, log */
+        readonly get: operations["layout"];
+        readonly put?: never;
+        readonly post?: never;
+        readonly delete?: never;
+        readonly options?: never;
+        readonly head?: never;
+        readonly patch?: never;
+        readonly trace?: never;
+    };
     readonly "/api/v1/tables": {
         readonly parameters: {
             readonly query?: never;
@@ -285,6 +336,23 @@ export interface paths {
         };
         /** Tables, columns, units, meanings; for completion. Functions: select distinct routine_name from information_schema.routines */
         readonly get: operations["tables"];
+        readonly put?: never;
+        readonly post?: never;
+        readonly delete?: never;
+        readonly options?: never;
+        readonly head?: never;
+        readonly patch?: never;
+        readonly trace?: never;
+    };
+    readonly "/api/v1/files": {
+        readonly parameters: {
+            readonly query?: never;
+            readonly header?: never;
+            readonly path?: never;
+            readonly cookie?: never;
+        };
+        /** The Parquet files of the lake's snapshot as URLs, for loaders that take a list of them. Needs the scope files */
+        readonly get: operations["files"];
         readonly put?: never;
         readonly post?: never;
         readonly delete?: never;
@@ -422,7 +490,7 @@ export interface components {
             readonly title: string;
             readonly status: number;
             /** @enum {string} */
-            readonly code: "query_invalid" | "read_only" | "query_failed" | "format_impossible" | "lake_unreadable" | "request_invalid" | "unsupported" | "not_found" | "no_data" | "method_not_allowed" | "range_not_satisfiable" | "request_too_large" | "unauthenticated" | "forbidden" | "foreign_origin" | "cancelled" | "time_limit" | "memory_limit" | "row_limit" | "too_many" | "internal";
+            readonly code: "query_invalid" | "read_only" | "query_failed" | "format_impossible" | "lake_unreadable" | "request_invalid" | "unsupported" | "not_found" | "gone" | "file_changed" | "no_data" | "method_not_allowed" | "range_not_satisfiable" | "request_too_large" | "unauthenticated" | "forbidden" | "foreign_origin" | "cancelled" | "time_limit" | "memory_limit" | "row_limit" | "too_many" | "internal";
             /** @description What is wrong; what to do follows after `; hint: ` */
             readonly detail?: string;
             readonly instance?: string;
@@ -1346,6 +1414,149 @@ export interface operations {
             readonly default: components["responses"]["Problem"];
         };
     };
+    readonly slice: {
+        readonly parameters: {
+            readonly query: {
+                /**
+                 * @description An SQL predicate over the columns of table measurements
+                 * @example pair_id < 5
+                 */
+                readonly where: string;
+                /** @description The runs that the measurements are of; a page of elsewhere has to name them */
+                readonly run?: readonly string[];
+                /** @description Topics, separated by commas; all, and the attachments, where there are none */
+                readonly topics?: string;
+                /** @description Heavy topics in chunks of their own, or all messages in the order of time */
+                readonly layout?: "by-topic" | "in-time";
+                /** @description The slice's ETag without quotes; where it is another by now, 410 */
+                readonly id?: string;
+            };
+            readonly header?: {
+                readonly Range?: string;
+            };
+            readonly path?: never;
+            readonly cookie?: never;
+        };
+        readonly requestBody?: never;
+        readonly responses: {
+            /** @description The slice */
+            readonly 200: {
+                headers: {
+                    readonly ETag?: string;
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "application/octet-stream": string;
+                };
+            };
+            /** @description The range */
+            readonly 206: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "application/octet-stream": string;
+                };
+            };
+            /** @description Not changed since the ETag of If-None-Match */
+            readonly 304: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content?: never;
+            };
+            readonly 416: components["responses"]["Problem"];
+            readonly default: components["responses"]["Problem"];
+        };
+    };
+    readonly foxglove_manifest: {
+        readonly parameters: {
+            readonly query?: {
+                /**
+                 * @description An SQL predicate over the columns of table measurements
+                 * @example pair_id < 5
+                 */
+                readonly where?: string;
+                /** @description The runs that the measurements are of; a page of elsewhere has to name them */
+                readonly run?: readonly string[];
+                /** @description Topics, separated by commas; all, and the attachments, where there are none */
+                readonly topics?: string;
+            };
+            readonly header?: never;
+            readonly path?: never;
+            readonly cookie?: never;
+        };
+        readonly requestBody?: never;
+        readonly responses: {
+            /** @description OK */
+            readonly 200: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "application/json": {
+                        readonly name: string;
+                        readonly sources: readonly ({
+                            readonly url: string;
+                            /** @enum {boolean} */
+                            readonly supportsRangeRequests: true;
+                        } | {
+                            readonly url: string;
+                            readonly id: string;
+                            readonly topics: readonly {
+                                readonly name: string;
+                                readonly messageEncoding: string;
+                                readonly schemaId?: number;
+                            }[];
+                            readonly schemas: readonly {
+                                readonly id: number;
+                                readonly name: string;
+                                readonly encoding: string;
+                                readonly data: string;
+                            }[];
+                            /** Format: date-time */
+                            readonly startTime: string;
+                            /** Format: date-time */
+                            readonly endTime: string;
+                        })[];
+                    };
+                };
+            };
+            readonly default: components["responses"]["Problem"];
+        };
+    };
+    readonly layout: {
+        readonly parameters: {
+            readonly query?: never;
+            readonly header?: never;
+            readonly path?: never;
+            readonly cookie?: never;
+        };
+        readonly requestBody?: never;
+        readonly responses: {
+            /** @description OK */
+            readonly 200: {
+                headers: {
+                    readonly ETag?: string;
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "application/json": {
+                        readonly configById: Record<string, never>;
+                        readonly layout: Record<string, never>;
+                    };
+                };
+            };
+            /** @description Not changed since the ETag of If-None-Match */
+            readonly 304: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content?: never;
+            };
+            readonly default: components["responses"]["Problem"];
+        };
+    };
     readonly tables: {
         readonly parameters: {
             readonly query?: never;
@@ -1363,6 +1574,51 @@ export interface operations {
                 };
                 content: {
                     readonly "application/json": readonly components["schemas"]["Table"][];
+                };
+            };
+            /** @description Not changed since the ETag of If-None-Match */
+            readonly 304: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content?: never;
+            };
+            readonly default: components["responses"]["Problem"];
+        };
+    };
+    readonly files: {
+        readonly parameters: {
+            readonly query?: {
+                /** @description Only of these tables */
+                readonly table?: readonly string[];
+            };
+            readonly header?: never;
+            readonly path?: never;
+            readonly cookie?: never;
+        };
+        readonly requestBody?: never;
+        readonly responses: {
+            /** @description OK */
+            readonly 200: {
+                headers: {
+                    readonly ETag?: string;
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "application/json": {
+                        /** @description Of the snapshot */
+                        readonly version: string;
+                        readonly files: readonly {
+                            readonly table: string;
+                            /** Format: uri */
+                            readonly url: string;
+                            readonly bytes: number;
+                            /** @description Rows that the snapshot shows */
+                            readonly rows: number;
+                            /** @description Rows that stand in the file too and are replaced by newer ones of their runs; the next ingest writes it anew */
+                            readonly superseded_rows: number;
+                        }[];
+                    };
                 };
             };
             /** @description Not changed since the ETag of If-None-Match */

@@ -32,6 +32,7 @@ use axum::http::{HeaderMap, HeaderValue, StatusCode, Uri, header};
 use axum::response::{IntoResponse as _, Response};
 use axum::routing::get;
 use echolake_lake::Lake;
+use echolake_schema::tables::Table;
 
 use super::format;
 use super::guard;
@@ -41,9 +42,9 @@ use crate::service::Service;
 use crate::tokens::Scope;
 pub(super) use asked::{Asked, run, text};
 use content::Content;
-use params::Params;
+pub(super) use params::Params;
 pub(super) use tables::table;
-pub(super) use view::View;
+pub(super) use view::{Shown, View};
 use view::Views;
 
 /// What an endpoint does.
@@ -120,6 +121,11 @@ impl Catalogue {
     /// The lake as it is now, with what was computed of it already.
     pub(super) async fn view(&self) -> Result<Arc<View>, Fault> {
         self.0.views.current(&self.0.service).await
+    }
+
+    /// A table's file of this name, of the lake as it is or as it was while the server ran.
+    pub(super) fn shown(&self, view: &View, table: Table, name: &str) -> Option<Shown> {
+        self.0.views.shown(view, table, name)
     }
 
     async fn respond(

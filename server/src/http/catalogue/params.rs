@@ -9,23 +9,28 @@ use crate::fault::Fault;
 
 /// What stands behind a path's `?`.
 #[derive(Default)]
-pub(super) struct Params(Vec<(String, String)>);
+pub(in super::super) struct Params(Vec<(String, String)>);
 
 impl Params {
     /// # Errors
     /// [`Fault::Request`] where it is not form-encoded.
-    pub(super) fn of(uri: &Uri) -> Result<Self, Fault> {
+    pub(in super::super) fn of(uri: &Uri) -> Result<Self, Fault> {
         let Query(pairs) = Query::try_from_uri(uri).map_err(|_| Fault::request("the parameters are not UTF-8"))?;
         Ok(Self(pairs))
     }
 
+    /// The names, as often as they are there.
+    pub(in super::super) fn names(&self) -> impl Iterator<Item = &str> {
+        self.0.iter().map(|(name, _)| name.as_str())
+    }
+
     /// All values of a name.
-    pub(super) fn all<'a>(&'a self, name: &str) -> impl Iterator<Item = &'a str> {
+    pub(in super::super) fn all<'a>(&'a self, name: &str) -> impl Iterator<Item = &'a str> {
         self.0.iter().filter(move |(n, _)| n == name).map(|(_, value)| value.as_str())
     }
 
     /// The value of a name that may be there once.
-    pub(super) fn one(&self, name: &str) -> Result<Option<&str>, Fault> {
+    pub(in super::super) fn one(&self, name: &str) -> Result<Option<&str>, Fault> {
         let mut values = self.all(name);
         match (values.next(), values.next()) {
             (value, None) => Ok(value),
@@ -46,7 +51,7 @@ impl Params {
     }
 
     /// One of a few words, the first where none is given.
-    pub(super) fn choice(&self, name: &str, words: &'static [&'static str]) -> Result<&'static str, Fault> {
+    pub(in super::super) fn choice(&self, name: &str, words: &'static [&'static str]) -> Result<&'static str, Fault> {
         let Some(text) = self.one(name)? else { return Ok(words[0]) };
         let known = words.iter().copied().find(|word| *word == text);
         known.ok_or_else(|| Fault::request(format!("`{name}` is `{text}`; hint: {}", words.join(", "))))

@@ -1,0 +1,82 @@
+//! `GET /api/v1/layout.json`: how Foxglove and Lichtblick show a run or a slice. It says nothing of the lake, so it is given
+//! to whoever asks.
+
+use axum::Router;
+use axum::http::{HeaderMap, StatusCode, header};
+use axum::response::{IntoResponse as _, Response};
+use axum::routing::get;
+
+use super::catalogue::is_known;
+use super::ranges::cors;
+
+/// The panel with the arms, the response that was heard last, the air, verdicts, the log.
+const LAYOUT: &str = include_str!("layout.json");
+/// Changes with the program.
+const ETAG: &str = concat!("\"layout-", env!("CARGO_PKG_VERSION"), "\"");
+
+/// Where the layout is.
+pub(super) fn for_viewers() -> Router {
+    Router::new()
+        .route("/api/v1/layout.json", get(layout))
+        .method_not_allowed_fallback(super::wrong_method)
+        .layer(cors())
+}
+
+async fn layout(headers: HeaderMap) -> Response {
+    let common = [
+        (header::CONTENT_TYPE.as_str(), "application/json"),
+        (header::CACHE_CONTROL.as_str(), "no-cache"),
+        (header::ETAG.as_str(), ETAG),
+        ("cross-origin-resource-policy", "cross-origin"),
+    ];
+    match is_known(&headers, ETAG) {
+        true => (StatusCode::NOT_MODIFIED, common).into_response(),
+        false => (common, LAYOUT).into_response(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::BTreeSet;
+
+    use echolake_schema::topics;
+    use serde_json::Value;
+
+    use super::*;
+
+    // What a mosaic's leaves name.
+    fn panels(tree: &Value, found: &mut BTreeSet<String>) {
+        match tree {
+            Value::String(panel) => drop(found.insert(panel.clone())),
+            _ => ["first", "second"].iter().for_each(|side| panels(&tree[*side], found)),
+        }
+    }
+
+    #[test]
+    fn every_panel_is_set_up_and_shows_what_a_run_has() {
+        let layout: Value = serde_json::from_str(LAYOUT).expect("JSON");
+        let mut shown = BTreeSet::new();
+        panels(&layout["layout"], &mut shown);
+        let set_up = layout["configById"].as_object().expect("panels");
+        assert_eq!(shown, set_up.keys().cloned().collect());
+        let known = [
+            topics::TF,
+            topics::PANEL_SCENE,
+            topics::PANEL_POINTS,
+            topics::MICROPHONE_POSE,
+            topics::SPEAKER_POSE,
+            topics::IR,
+            topics::ENVIRONMENT,
+            topics::MEASUREMENT,
+            topics::LOG,
+            topics::ROBOT_DESCRIPTION,
+        ];
+        let text = LAYOUT.to_owned();
+        let named: BTreeSet<_> = text.split('"').filter(|t| t.starts_with('/')).collect();
+        for name in &named {
+            let topic = name.split('.').next().expect("a topic");
+            assert!(known.contains(&topic), "{name}");
+        }
+        assert!(named.contains("/ir.samples[:]"));
+    }
+}

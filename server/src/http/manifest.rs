@@ -1,0 +1,74 @@
+//! `GET /api/v1/files`: the Parquet files of the lake's snapshot as URLs, so that loaders of training sets take a list and
+//! read by ranges, without a copy.
+
+use axum::Router;
+use axum::extract::State;
+use axum::http::{HeaderMap, StatusCode, Uri, header};
+use axum::response::{IntoResponse as _, Response};
+use axum::routing::get;
+use echolake_lake::DataFile;
+use echolake_schema::tables::Table;
+use serde::Serialize;
+
+use super::catalogue::{self, Catalogue, Params, is_known};
+use super::guard;
+use super::problem::Problem;
+use super::ranges::forwarded_origin;
+use crate::fault::Fault;
+use crate::tokens::Scope;
+
+#[derive(Serialize)]
+struct Manifest<'a> {
+    /// Of the snapshot; another one, another version.
+    version: &'a str,
+    files: Vec<File>,
+}
+
+#[derive(Serialize)]
+struct File {
+    table: &'static str,
+    url: String,
+    bytes: u64,
+    /// Those that the snapshot shows.
+    rows: u64,
+    /// Those that stand in the file too, and that newer rows of the same runs have replaced.
+    superseded_rows: u64,
+}
+
+/// Where the list is.
+pub(super) fn for_own(catalogue: &Catalogue) -> Router {
+    Router::new().route("/api/v1/files", get(files)).with_state(catalogue.clone())
+}
+
+async fn files(State(catalogue): State<Catalogue>, uri: Uri, headers: HeaderMap) -> Result<Response, Problem> {
+    guard::client(catalogue.service(), &headers, Scope::Files)?;
+    let params = Params::of(&uri)?;
+    let tables = params.all("table").map(catalogue::table).collect::<Result<Vec<_>, Fault>>()?;
+    let view = catalogue.view().await?;
+    let origin = forwarded_origin(&headers);
+    let etag = format!("\"{}\"", view.version);
+    let validators = [(header::ETAG, etag.as_str()), (header::CACHE_CONTROL, "private, no-cache"), (header::VARY, "Host")];
+    if is_known(&headers, &etag) {
+        return Ok((StatusCode::NOT_MODIFIED, validators).into_response());
+    }
+    let all = Table::ALL.into_iter().filter(|table| tables.is_empty() || tables.contains(table));
+    let files = all.flat_map(|table| {
+        let origin = &origin;
+        view.snapshot.files(table).iter().filter_map(move |file| File::of(origin, table, file))
+    });
+    let manifest = Manifest { version: &view.version, files: files.collect() };
+    Ok((validators, axum::Json(manifest)).into_response())
+}
+
+impl File {
+    fn of(origin: &str, table: Table, file: &DataFile) -> Option<Self> {
+        let (name, rows) = (file.path.filename()?, file.visible_rows());
+        Some(Self {
+            table: table.name(),
+            url: format!("{origin}/api/v1/tables/{}/{name}", table.name()),
+            bytes: file.bytes,
+            rows,
+            superseded_rows: file.rows - rows,
+        })
+    }
+}

@@ -1,0 +1,193 @@
+//! Files over HTTP: what part of one is asked for, and the headers that viewers of elsewhere need.
+
+use std::ops::Range;
+
+use axum::body::Body;
+use axum::http::{HeaderMap, HeaderName, HeaderValue, Method, StatusCode, header};
+use axum::response::{IntoResponse as _, Response};
+use tower_http::cors::{Any, CorsLayer};
+
+use super::catalogue::is_known;
+use super::problem::Problem;
+use crate::fault::Fault;
+
+const POLICY: HeaderName = HeaderName::from_static("cross-origin-resource-policy");
+const FORWARDED_PROTO: HeaderName = HeaderName::from_static("x-forwarded-proto");
+const FETCH_MODE: HeaderName = HeaderName::from_static("sec-fetch-mode");
+
+/// For what pages of elsewhere may read: from anywhere, without credentials, and told what ranges need.
+pub(super) fn cors() -> CorsLayer {
+    CorsLayer::new()
+        .allow_origin(Any)
+        .allow_methods([Method::GET, Method::HEAD])
+        .allow_headers([header::RANGE, header::IF_RANGE, header::IF_NONE_MATCH, header::AUTHORIZATION])
+        .expose_headers([header::ACCEPT_RANGES, header::CONTENT_LENGTH, header::CONTENT_RANGE, header::ETAG])
+        .allow_private_network(true)
+}
+
+/// Whether who asks has to be told a file's length: for a part of it, or as viewers in a browser do before they ask for
+/// parts.
+pub(super) fn needs_length(method: &Method, headers: &HeaderMap) -> bool {
+    let is_script = headers.get(FETCH_MODE).is_some_and(|mode| mode == "cors") || headers.contains_key(header::ORIGIN);
+    method == Method::HEAD || headers.contains_key(header::RANGE) || is_script
+}
+
+/// What a URL of this server begins with, as who asks sees it: behind a proxy with TLS, `https`.
+pub(super) fn forwarded_origin(headers: &HeaderMap) -> String {
+    let text = |name: HeaderName| headers.get(name).and_then(|v| v.to_str().ok());
+    let scheme = match text(FORWARDED_PROTO) {
+        Some("https") => "https",
+        _ => "http",
+    };
+    format!("{scheme}://{}", text(header::HOST).unwrap_or_default())
+}
+
+/// A file that never changes, as its answers describe it.
+pub(super) struct Described {
+    pub(super) etag: String,
+    pub(super) media_type: &'static str,
+    /// Who may embed it.
+    pub(super) policy: &'static str,
+}
+
+/// What is to be answered.
+pub(super) enum Asked {
+    /// This, without any of the file's bytes.
+    Answer(Response),
+    /// These bytes.
+    Part(Part),
+}
+
+/// Bytes of a file.
+pub(super) struct Part {
+    pub(super) range: Range<u64>,
+    /// The file's bytes, where these are not all.
+    of: Option<u64>,
+}
+
+impl Described {
+    /// What a request is for, of a file of so many bytes.
+    pub(super) fn asked(&self, headers: &HeaderMap, bytes: u64) -> Asked {
+        if let Some(known) = self.known(headers) {
+            return Asked::Answer(known);
+        }
+        match self.wanted(headers, bytes) {
+            Wanted::Whole => Asked::Part(Part { range: 0..bytes, of: None }),
+            Wanted::Part(range) => Asked::Part(Part { range, of: Some(bytes) }),
+            Wanted::Nothing => Asked::Answer(self.nothing(bytes)),
+        }
+    }
+
+    /// The answer to who has it already.
+    pub(super) fn known(&self, headers: &HeaderMap) -> Option<Response> {
+        is_known(headers, &self.etag).then(|| self.with_headers(StatusCode::NOT_MODIFIED.into_response()))
+    }
+
+    /// Bytes as they were asked for.
+    pub(super) fn part(&self, part: &Part, body: Body) -> Response {
+        let status = if part.of.is_some() { StatusCode::PARTIAL_CONTENT } else { StatusCode::OK };
+        let mut response = self.with_headers((status, body).into_response());
+        let (out, range) = (response.headers_mut(), &part.range);
+        out.insert(header::CONTENT_LENGTH, (range.end - range.start).into());
+        if let Some(bytes) = part.of {
+            insert(out, header::CONTENT_RANGE, &format!("bytes {}-{}/{bytes}", range.start, range.end - 1));
+        }
+        response
+    }
+
+    /// All bytes, as they come.
+    pub(super) fn stream(&self, body: Body) -> Response {
+        self.with_headers(body.into_response())
+    }
+
+    fn nothing(&self, bytes: u64) -> Response {
+        let mut response = Problem(Fault::Range { bytes }).into_response();
+        insert(response.headers_mut(), header::CONTENT_RANGE, &format!("bytes */{bytes}"));
+        insert(response.headers_mut(), POLICY, self.policy);
+        response
+    }
+
+    fn with_headers(&self, mut response: Response) -> Response {
+        let out = response.headers_mut();
+        for (name, value) in [
+            (header::CONTENT_TYPE, self.media_type),
+            (header::ACCEPT_RANGES, "bytes"),
+            (header::ETAG, &self.etag),
+            // Ranges are of the file as it is.
+            (header::CACHE_CONTROL, "private, no-cache, no-transform"),
+            (POLICY, self.policy),
+        ] {
+            insert(out, name, value);
+        }
+        response
+    }
+
+    fn wanted(&self, headers: &HeaderMap, bytes: u64) -> Wanted {
+        let text = |name: HeaderName| headers.get(name).and_then(|v| v.to_str().ok());
+        // A range of what the file no longer is would be none of it.
+        if text(header::IF_RANGE).is_some_and(|known| known != self.etag) {
+            return Wanted::Whole;
+        }
+        text(header::RANGE).map_or(Wanted::Whole, |range| Wanted::of(range, bytes))
+    }
+}
+
+fn insert(headers: &mut HeaderMap, name: HeaderName, value: &str) {
+    if let Ok(value) = HeaderValue::from_str(value) {
+        headers.insert(name, value);
+    }
+}
+
+/// What part of a file is wanted.
+#[derive(Debug, PartialEq, Eq)]
+enum Wanted {
+    Whole,
+    Part(Range<u64>),
+    /// None that it has.
+    Nothing,
+}
+
+impl Wanted {
+    // RFC 9110, section 14: a header that makes no sense, and several ranges at once, are answered by the whole file.
+    fn of(range: &str, bytes: u64) -> Self {
+        let Some((first, last)) = range.strip_prefix("bytes=").and_then(|r| r.trim().split_once('-')) else {
+            return Self::Whole;
+        };
+        let number = |text: &str| text.bytes().all(|b| b.is_ascii_digit()).then(|| text.parse::<u64>().ok()).flatten();
+        let range = match (first.is_empty(), number(first), last.is_empty(), number(last)) {
+            (true, _, false, Some(length)) => bytes.saturating_sub(length)..bytes,
+            (false, Some(first), true, _) => first..bytes,
+            (false, Some(first), false, Some(last)) if first <= last => first..last.saturating_add(1).min(bytes),
+            _ => return Self::Whole,
+        };
+        if range.start >= range.end { Self::Nothing } else { Self::Part(range) }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn ranges_are_as_the_standard_has_them() {
+        for (range, expected) in [
+            ("bytes=0-99", Wanted::Part(0..100)),
+            ("bytes=990-", Wanted::Part(990..1000)),
+            ("bytes=-10", Wanted::Part(990..1000)),
+            ("bytes=-5000", Wanted::Part(0..1000)),
+            ("bytes=500-5000", Wanted::Part(500..1000)),
+            ("bytes=1000-", Wanted::Nothing),
+            ("bytes=-0", Wanted::Nothing),
+            ("bytes=5-4", Wanted::Whole),
+            ("bytes=0-1,5-6", Wanted::Whole),
+            ("bytes=a-b", Wanted::Whole),
+            ("bytes=-", Wanted::Whole),
+            ("bytes=+1-2", Wanted::Whole),
+            ("lines=1-2", Wanted::Whole),
+            ("bytes=0-18446744073709551615", Wanted::Part(0..1000)),
+            ("bytes=99999999999999999999-", Wanted::Whole),
+        ] {
+            assert_eq!(Wanted::of(range, 1000), expected, "{range}");
+        }
+    }
+}

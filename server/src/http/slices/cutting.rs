@@ -1,0 +1,84 @@
+//! A slice that is being cut, on the threads that encode answers. Dropping it ends the work.
+
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use bytes::Bytes;
+use echolake_export::{Slice, SliceParams};
+use echolake_lake::Snapshot;
+use echolake_query::{Client, Error as QueryError};
+use tokio::sync::{OwnedSemaphorePermit, mpsc};
+use tokio::task::JoinSet;
+
+use crate::fault::Fault;
+use crate::metrics::Protocol;
+use crate::running::{WAITING, finish};
+use crate::service::Service;
+
+/// How long a slice waits for its reader to take the next piece.
+const PATIENCE: Duration = Duration::from_secs(60);
+
+/// A slice that is being cut.
+pub(super) struct Cutting {
+    pieces: mpsc::Receiver<Bytes>,
+    task: JoinSet<Result<(), Fault>>,
+}
+
+impl Cutting {
+    /// Begins, in one of its client's places.
+    ///
+    /// # Errors
+    /// [`Fault::Query`] where the client has none left.
+    pub(super) fn begin(
+        service: &Service,
+        client: &Arc<Client>,
+        snapshot: Arc<Snapshot>,
+        params: SliceParams,
+        room: OwnedSemaphorePermit,
+    ) -> Result<Self, Fault> {
+        let place = client.place()?;
+        let (to, pieces) = mpsc::channel(WAITING);
+        let (of, limit) = (service.clone(), client.quota().time);
+        let task = service.spawn(async move {
+            let _held = (room, place, of.metrics().begin(Protocol::Http));
+            cut(&of, &snapshot, params, limit, to).await.inspect_err(|fault| of.metrics().failed(fault.code()))
+        });
+        Ok(Self { pieces, task })
+    }
+
+    /// The next bytes; None after the last.
+    ///
+    /// # Errors
+    /// Why the slice cannot be cut, or not to its end.
+    pub(super) async fn next(&mut self) -> Result<Option<Bytes>, Fault> {
+        match self.pieces.recv().await {
+            Some(piece) => Ok(Some(piece)),
+            None => finish(&mut self.task).await.map(|()| None),
+        }
+    }
+}
+
+async fn cut(
+    service: &Service,
+    snapshot: &Snapshot,
+    params: SliceParams,
+    limit: Option<Duration>,
+    to: mpsc::Sender<Bytes>,
+) -> Result<(), Fault> {
+    let mut begun = Instant::now();
+    let mut worked = Duration::ZERO;
+    let mut slice = Slice::open(service.lake(), snapshot, params).await?;
+    while let Some(piece) = slice.next().await? {
+        // The reader's time is not the server's.
+        worked += begun.elapsed();
+        if let Some(limit) = limit.filter(|limit| worked > *limit) {
+            return Err(QueryError::TimeLimit { limit }.into());
+        }
+        // Nobody is there any more where sending fails.
+        match tokio::time::timeout(PATIENCE, to.send(piece)).await {
+            Ok(Ok(())) => begun = Instant::now(),
+            _ => return Err(Fault::Cancelled),
+        }
+    }
+    Ok(())
+}

@@ -1,0 +1,153 @@
+//! Foxglove's remote data loader: what there is to load, as its manifest says it (`manifest_schema.json` of the SDK's
+//! conformance suite). Runs that are named and not narrowed down are static files, read by ranges; all else is a source
+//! that streams, ascending in time. Who may read is asked here and again where the data are.
+
+use axum::extract::State;
+use axum::http::{HeaderMap, Uri};
+use axum::response::{IntoResponse as _, Response};
+use chrono::{DateTime, SecondsFormat};
+use echolake_export::{Layout, OutlineSchema, OutlineTopic, outline};
+use echolake_schema::RunId;
+use serde::Serialize;
+
+use super::super::files::RUN;
+use super::super::problem::Problem;
+use super::{Question, Request, SLICE, Slices};
+use crate::fault::Fault;
+
+/// The manifest.
+pub(super) const MANIFEST: &str = "/api/v1/foxglove/manifest";
+
+#[derive(Serialize)]
+struct Manifest {
+    name: String,
+    sources: Vec<Source>,
+}
+
+#[derive(Serialize)]
+#[serde(untagged, rename_all_fields = "camelCase")]
+enum Source {
+    Static {
+        url: String,
+        supports_range_requests: bool,
+    },
+    Streamed {
+        url: String,
+        /// The key that the loader keeps the data by, for everybody.
+        id: String,
+        topics: Vec<Topic>,
+        schemas: Vec<Schema>,
+        start_time: String,
+        end_time: String,
+    },
+}
+
+#[derive(Serialize)]
+#[serde(rename_all = "camelCase")]
+struct Topic {
+    name: String,
+    message_encoding: String,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    schema_id: Option<u16>,
+}
+
+#[derive(Serialize)]
+struct Schema {
+    id: u16,
+    name: String,
+    encoding: String,
+    data: String,
+}
+
+/// Answers with the manifest of what is asked for.
+pub(super) async fn manifest(State(slices): State<Slices>, uri: Uri, headers: HeaderMap) -> Result<Response, Problem> {
+    let request = slices.request(&uri, &headers).await?;
+    let manifest = match request.question.is_of_whole_runs() {
+        true => whole_runs(&request.question),
+        false => streamed(&slices, request).await?,
+    };
+    Ok(axum::Json(manifest).into_response())
+}
+
+fn whole_runs(question: &Question) -> Manifest {
+    let url = |run: &RunId| RUN.replace("{run_id}", run.as_str());
+    let source = |run: &RunId| Source::Static { url: url(run), supports_range_requests: true };
+    let names: Vec<_> = question.runs.iter().map(RunId::as_str).collect();
+    Manifest { name: names.join(", "), sources: question.runs.iter().map(source).collect() }
+}
+
+async fn streamed(slices: &Slices, mut request: Request) -> Result<Manifest, Fault> {
+    // Its data are read as they come, so they have to ascend.
+    request.question.layout = Layout::InTime;
+    let selection = slices.selection(&request).await?;
+    let service = slices.0.catalogue.service();
+    let (params, lake, snapshot) =
+        (Slices::params(&request, &selection), service.lake().clone(), request.view.snapshot.clone());
+    let found = service.plan(async move { Ok(outline(&lake, &snapshot, &params).await?) }).await?;
+    let number = |index: usize| u16::try_from(index + 1).ok();
+    let topic = |topic: OutlineTopic| Topic {
+        name: topic.name,
+        message_encoding: topic.message_encoding,
+        schema_id: topic.schema.and_then(number),
+    };
+    let schema = |(index, schema): (usize, OutlineSchema)| {
+        let OutlineSchema { name, encoding, data } = schema;
+        Some(Schema { id: number(index)?, name, encoding, data: base64(&data) })
+    };
+    let source = Source::Streamed {
+        url: format!("{SLICE}?{}&id={}", request.question.query(), selection.digest),
+        id: format!("echolake-{}", selection.digest),
+        topics: found.topics.into_iter().map(topic).collect(),
+        schemas: found.schemas.into_iter().enumerate().filter_map(schema).collect(),
+        start_time: time(found.start_ns),
+        end_time: time(found.end_ns),
+    };
+    let runs = selection.taken.chunk_by(|a, b| a.run == b.run).count();
+    Ok(Manifest { name: format!("{} measurements of {runs} runs", selection.taken.len()), sources: vec![source] })
+}
+
+fn time(nanos: i64) -> String {
+    DateTime::from_timestamp_nanos(nanos).to_rfc3339_opts(SecondsFormat::Nanos, true)
+}
+
+// RFC 4648, section 4.
+fn base64(bytes: &[u8]) -> String {
+    const DIGITS: &[u8; 64] = b"ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789+/";
+    let mut text = String::with_capacity(bytes.len().div_ceil(3) * 4);
+    for part in bytes.chunks(3) {
+        let byte = |i: usize| u32::from(part.get(i).copied().unwrap_or(0));
+        let bits = byte(0) << 16 | byte(1) << 8 | byte(2);
+        for digit in 0..4 {
+            let value = (bits >> (18 - 6 * digit)) & 63;
+            text.push(if digit <= part.len() { DIGITS[value as usize] as char } else { '=' });
+        }
+    }
+    text
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn base64_is_as_the_standard_has_it() {
+        // RFC 4648, section 10.
+        for (bytes, text) in [
+            ("", ""),
+            ("f", "Zg=="),
+            ("fo", "Zm8="),
+            ("foo", "Zm9v"),
+            ("foob", "Zm9vYg=="),
+            ("fooba", "Zm9vYmE="),
+            ("foobar", "Zm9vYmFy"),
+        ] {
+            assert_eq!(base64(bytes.as_bytes()), text);
+        }
+        assert_eq!(base64(&[0xfb, 0xff, 0xfe]), "+//+");
+    }
+
+    #[test]
+    fn times_keep_their_nanoseconds() {
+        assert_eq!(time(1_767_758_400_000_000_001), "2026-01-07T04:00:00.000000001Z");
+    }
+}

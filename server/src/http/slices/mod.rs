@@ -1,0 +1,159 @@
+//! Slices of run files over HTTP: cut while they are sent, or, for who reads by ranges, cut once and kept for a while.
+//!
+//! A slice's bytes follow from its measurements, topics and layout alone, so its ETag is a digest of these, and it may be
+//! cut as often as somebody asks: whoever reads it to its end gets it as it is cut, in memory that is bounded. Ranges, HEAD
+//! and a script's plain GET need its length, so for them it is cut to its end first, into a file without a name.
+
+mod cutting;
+mod foxglove;
+mod question;
+mod selection;
+mod spool;
+
+use std::sync::Arc;
+
+use axum::Router;
+use axum::body::Body;
+use axum::extract::State;
+use axum::http::{HeaderMap, Method, Uri};
+use axum::response::Response;
+use axum::routing::get;
+use echolake_export::{Check, SliceParams};
+use echolake_query::Client;
+use futures::stream;
+use tokio::sync::Semaphore;
+
+use super::catalogue::{Catalogue, View};
+use super::guard;
+use super::problem::Problem;
+use super::ranges::{self, Asked, Described, needs_length};
+use crate::fault::Fault;
+use crate::tokens::Scope;
+use cutting::Cutting;
+use question::Question;
+use selection::{Selection, Selections};
+use spool::Spool;
+
+/// A slice.
+pub(super) const SLICE: &str = "/api/v1/slices.mcap";
+/// Slices that are cut at once: each holds a few MB.
+const MOST: usize = 256;
+
+/// What slices share.
+#[derive(Clone)]
+struct Slices(Arc<Inner>);
+
+struct Inner {
+    catalogue: Catalogue,
+    selections: Selections,
+    spool: Spool,
+    places: Arc<Semaphore>,
+}
+
+/// Slices, and what viewers need around them; pages of elsewhere may ask for them.
+pub(super) fn for_viewers(catalogue: &Catalogue) -> Router {
+    let slices = Slices(Arc::new(Inner {
+        catalogue: catalogue.clone(),
+        selections: Selections::default(),
+        spool: Spool::default(),
+        places: Arc::new(Semaphore::new(MOST)),
+    }));
+    Router::new()
+        .route(SLICE, get(slice))
+        .route(foxglove::MANIFEST, get(foxglove::manifest))
+        .method_not_allowed_fallback(super::wrong_method)
+        .layer(ranges::cors())
+        .with_state(slices)
+}
+
+/// Somebody who may ask for slices, and what they ask.
+struct Request {
+    client: Arc<Client>,
+    view: Arc<View>,
+    question: Question,
+}
+
+impl Slices {
+    // A slice holds what files do, and is chosen by SQL.
+    async fn request(&self, uri: &Uri, headers: &HeaderMap) -> Result<Request, Fault> {
+        let service = self.0.catalogue.service();
+        guard::client(service, headers, Scope::Files)?;
+        let client = guard::client(service, headers, Scope::Sql)?;
+        let question = Question::of(uri)?;
+        let view = self.0.catalogue.view().await?;
+        // Without tokens a page of elsewhere may read the runs whose names it knows, and ask nothing of others.
+        let is_foreign = service.access().is_open() && guard::is_own(headers).is_err();
+        if is_foreign && question.runs.is_empty() {
+            guard::is_own(headers)?;
+        }
+        for run in &question.runs {
+            super::catalogue::run(&view, run.as_str())?;
+        }
+        Ok(Request { client, view, question: question.asked_by(is_foreign) })
+    }
+
+    async fn selection(&self, request: &Request) -> Result<Arc<Selection>, Fault> {
+        self.0.selections.of(&self.0.catalogue, request).await
+    }
+
+    fn params(request: &Request, selection: &Selection) -> SliceParams {
+        SliceParams {
+            taken: selection.taken.clone(),
+            topics: request.question.topics.clone(),
+            layout: request.question.layout,
+            // Reading a run whole takes longer than a viewer waits; what is read is checked by its CRCs.
+            check: Check::Ends,
+        }
+    }
+
+    fn cut(&self, request: &Request, selection: &Selection) -> Result<Cutting, Fault> {
+        let params = Self::params(request, selection);
+        let places = self.0.places.clone();
+        let place = places.try_acquire_owned().map_err(|_| Fault::TooMany { what: "slices", limit: MOST })?;
+        Cutting::begin(self.0.catalogue.service(), &request.client, request.view.snapshot.clone(), params, place)
+    }
+}
+
+async fn slice(
+    State(slices): State<Slices>,
+    method: Method,
+    uri: Uri,
+    headers: HeaderMap,
+) -> Result<Response, Problem> {
+    let request = slices.request(&uri, &headers).await?;
+    let selection = slices.selection(&request).await.inspect_err(|f| slices.0.catalogue.service().metrics().failed(f.code()))?;
+    if request.question.id.as_ref().is_some_and(|id| *id != selection.digest) {
+        return Err(Fault::Gone { what: "this slice", hint: "ask for the manifest again" }.into());
+    }
+    let described = Described {
+        etag: format!("\"{}\"", selection.digest),
+        media_type: "application/octet-stream",
+        policy: "cross-origin",
+    };
+    if let Some(known) = described.known(&headers) {
+        return Ok(known);
+    }
+    if !needs_length(&method, &headers) {
+        let mut cutting = slices.cut(&request, &selection)?;
+        // What fails at once still has a status to say so with.
+        let first = cutting.next().await?;
+        return Ok(described.stream(Body::from_stream(rest(first, cutting))));
+    }
+    let cut = || slices.cut(&request, &selection);
+    let whole = slices.0.spool.once(&selection.digest, cut).await?;
+    Ok(match described.asked(&headers, whole.bytes()) {
+        Asked::Answer(answer) => answer,
+        Asked::Part(part) => described.part(&part, Body::from_stream(whole.read(part.range.clone()))),
+    })
+}
+
+// A failure on the way breaks the connection off: a short slice would look like a whole one.
+fn rest(first: Option<bytes::Bytes>, cutting: Cutting) -> impl stream::Stream<Item = Result<bytes::Bytes, Fault>> + Send {
+    stream::try_unfold((first, cutting), |(first, mut cutting)| async move {
+        let piece = match first {
+            Some(piece) => Some(piece),
+            None => cutting.next().await?,
+        };
+        Ok(piece.map(|piece| (piece, (None, cutting))))
+    })
+}

@@ -1,0 +1,163 @@
+//! Slices that are read by ranges: cut once, kept in files without names, so many bytes of them, the oldest going first.
+
+use std::collections::{HashMap, VecDeque};
+use std::fs::File;
+use std::io::Write as _;
+use std::ops::Range;
+use std::os::unix::fs::FileExt as _;
+use std::sync::{Arc, Mutex, PoisonError};
+
+use bytes::Bytes;
+use futures::stream::{self, Stream};
+use tokio::sync::OnceCell;
+
+use super::Cutting;
+use crate::fault::Fault;
+
+/// Bytes of all slices that are kept, and of one.
+const MOST_BYTES: u64 = 2 << 30;
+/// What is read at a time.
+const BLOCK: u64 = 256 << 10;
+
+/// Slices that are kept, by what they are.
+#[derive(Clone, Default)]
+pub(super) struct Spool(Arc<Mutex<Kept>>);
+
+#[derive(Default)]
+struct Kept {
+    slices: HashMap<String, Arc<OnceCell<Arc<Spooled>>>>,
+    /// Those that are whole, the one that was asked for last at the end.
+    order: VecDeque<String>,
+    /// Of all files that are open, kept or not.
+    bytes: u64,
+}
+
+/// A slice that is whole.
+pub(super) struct Spooled {
+    file: Counted,
+}
+
+/// A file without a name: it is gone when nobody has it open, however that comes.
+struct Counted {
+    file: File,
+    bytes: u64,
+    spool: Spool,
+}
+
+impl Drop for Counted {
+    fn drop(&mut self) {
+        self.spool.kept().bytes -= self.bytes;
+    }
+}
+
+/// Somebody who waits for a slice. The last one who leaves without any leaves nothing behind.
+struct Waiting<'a> {
+    spool: &'a Spool,
+    cell: Arc<OnceCell<Arc<Spooled>>>,
+    key: &'a str,
+}
+
+impl Drop for Waiting<'_> {
+    fn drop(&mut self) {
+        let mut kept = self.spool.kept();
+        // Two: the map's and this one.
+        if !self.cell.initialized() && Arc::strong_count(&self.cell) <= 2 {
+            kept.slices.remove(self.key);
+        }
+    }
+}
+
+impl Spool {
+    /// The slice of this name; it is cut where nobody has it yet, and nobody else is at it. Who leaves ends the work,
+    /// and another who waits begins it anew.
+    ///
+    /// # Errors
+    /// Those of cutting, and [`Fault::NoRoom`].
+    pub(super) async fn once(
+        &self,
+        key: &str,
+        cut: impl FnOnce() -> Result<Cutting, Fault>,
+    ) -> Result<Arc<Spooled>, Fault> {
+        let cell = self.kept().slices.entry(key.to_owned()).or_default().clone();
+        let waiting = Waiting { spool: self, cell, key };
+        let spooled = waiting.cell.get_or_try_init(|| async { self.fill(cut()?).await.map(Arc::new) }).await?.clone();
+        self.touch(key, &waiting.cell);
+        Ok(spooled)
+    }
+
+    async fn fill(&self, mut cutting: Cutting) -> Result<Spooled, Fault> {
+        let file = tempfile::tempfile().map_err(no_room)?;
+        let mut file = Counted { file, bytes: 0, spool: self.clone() };
+        while let Some(piece) = cutting.next().await? {
+            self.make_room(piece.len() as u64)?;
+            file.bytes += piece.len() as u64;
+            file.file.write_all(&piece).map_err(no_room)?;
+        }
+        Ok(Spooled { file })
+    }
+
+    // Counts bytes that are about to be written, and lets the oldest slices go for them.
+    fn make_room(&self, bytes: u64) -> Result<(), Fault> {
+        let mut gone = Vec::new();
+        let has_room = loop {
+            let mut kept = self.kept();
+            if kept.bytes + bytes <= MOST_BYTES {
+                kept.bytes += bytes;
+                break true;
+            }
+            let Some(oldest) = kept.order.pop_front() else { break false };
+            gone.extend(kept.slices.remove(&oldest));
+            drop(kept);
+            // Its bytes are free once it is dropped, unless somebody reads it; dropping takes the lock.
+            gone.clear();
+        };
+        if has_room { Ok(()) } else { Err(Fault::NoRoom { limit: MOST_BYTES }) }
+    }
+
+    fn touch(&self, key: &str, cell: &Arc<OnceCell<Arc<Spooled>>>) {
+        let mut kept = self.kept();
+        // It may have had to go meanwhile.
+        if kept.slices.get(key).is_some_and(|known| Arc::ptr_eq(known, cell)) {
+            kept.order.retain(|known| known != key);
+            kept.order.push_back(key.to_owned());
+        }
+    }
+
+    fn kept(&self) -> std::sync::MutexGuard<'_, Kept> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+fn no_room(error: std::io::Error) -> Fault {
+    eprintln!("a slice cannot be kept in `{}`: {error}", std::env::temp_dir().display());
+    Fault::NoRoom { limit: MOST_BYTES }
+}
+
+impl Spooled {
+    /// Its length.
+    pub(super) fn bytes(&self) -> u64 {
+        self.file.bytes
+    }
+
+    /// Bytes of it, a block at a time.
+    pub(super) fn read(self: &Arc<Self>, range: Range<u64>) -> impl Stream<Item = Result<Bytes, Fault>> + Send + use<> {
+        stream::try_unfold((self.clone(), range), |(slice, range)| async move {
+            if range.is_empty() {
+                return Ok(None);
+            }
+            let end = range.end.min(range.start + BLOCK);
+            let (from, reading) = (range.start, slice.clone());
+            let read = tokio::task::spawn_blocking(move || {
+                let mut block = vec![0; (end - from) as usize];
+                reading.file.file.read_exact_at(&mut block, from).map(|()| Bytes::from(block))
+            });
+            match read.await {
+                Ok(Ok(block)) => Ok(Some((block, (slice, end..range.end)))),
+                failed => {
+                    eprintln!("a kept slice cannot be read: {failed:?}");
+                    Err(Fault::Internal)
+                }
+            }
+        })
+    }
+}
