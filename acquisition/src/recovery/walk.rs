@@ -53,8 +53,15 @@ impl Walk {
         let failed = |source| Error::Read { path: path.to_owned(), source };
         let file = File::open(path).map_err(failed)?;
         let size = file.metadata().map_err(failed)?.len();
-        let mut walk =
-            Self { file: BufReader::new(file), path: path.to_owned(), size, verified: 0, item: 0, ended: false, defect: None };
+        let mut walk = Self {
+            file: BufReader::new(file),
+            path: path.to_owned(),
+            size,
+            verified: 0,
+            item: 0,
+            ended: false,
+            defect: None,
+        };
         let mut magic = [0; MAGIC.len()];
         if size < magic.len() as u64 || walk.fill(&mut magic).is_err() || magic != MAGIC {
             return Err(walk.headless(format!("it is no MCAP file, or only {size} bytes of one")));

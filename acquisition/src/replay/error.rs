@@ -28,17 +28,6 @@ pub enum Error {
         /// Why.
         reason: &'static str,
     },
-    /// Two recordings are of the same time.
-    #[error(
-        "`{}` begins before `{}` ends, and one time line has both; hint: replay one after the other",
-        later.display(), earlier.display()
-    )]
-    Overlap {
-        /// The recording that begins first.
-        earlier: PathBuf,
-        /// The one that begins before the other ends.
-        later: PathBuf,
-    },
     /// The address cannot be listened on.
     #[error("cannot replay at {address}; hint: is the port taken?")]
     Listen {

@@ -1,6 +1,7 @@
 //! Recordings shown again: a WebSocket server that Foxglove controls (play, pause, speed, seek) and Lichtblick looks at.
 //!
-//! Several recordings are shown one after the other; what lies between them is left out. Only chunks with topics that
+//! Several recordings are shown one after the other; what lies between them is left out, and where one begins before the
+//! other ends, time goes back. Only chunks with topics that
 //! somebody wants are read, one after the other. Playback stands while nobody looks on, and waits while all viewers have
 //! enough to read; where one is slower than another, it loses its oldest messages.
 
@@ -67,18 +68,15 @@ impl ReplayServer {
     /// Listens; port 0 takes a free one. Recordings are shown in the order of their times.
     ///
     /// # Errors
-    /// [`Error::Overlap`] or [`Error::Listen`]; [`Error::Nothing`] where there is no recording, or where there are more
+    /// [`Error::Listen`], or [`Error::Nothing`] where there is no recording, or where there are more
     /// topics than channels.
     pub fn start(address: SocketAddr, mut recordings: Vec<Recording>, options: ReplayOptions) -> Result<Self, Error> {
         recordings.sort_by_key(|r| r.range().0);
-        if let Some(pair) = recordings.windows(2).find(|pair| pair[1].range().0 <= pair[0].range().1) {
-            let [earlier, later] = [0, 1].map(|i: usize| pair[i].path().to_owned());
-            return Err(Error::Overlap { earlier, later });
-        }
         let (commands, obeyed) = mpsc::sync_channel(COMMANDS);
         let nothing = |reason| Error::Nothing { reason };
-        let (first, last) = recordings.first().zip(recordings.last()).ok_or_else(|| nothing("there is no recording"))?;
-        let range = (first.range().0, last.range().1);
+        let (first, last) =
+            recordings.first().zip(recordings.last()).ok_or_else(|| nothing("there is no recording"))?;
+        let range = recordings.iter().fold(first.range(), |all, r| (all.0, all.1.max(r.range().1)));
         let playback = Playback { range, commands };
         let length_secs = recordings.iter().map(player::secs).sum();
         let topics = player::Topics::of(&recordings).ok_or_else(|| nothing("there are more topics than channels"))?;

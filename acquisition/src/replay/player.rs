@@ -203,9 +203,9 @@ impl Player {
         for command in commands {
             seeks_left -= usize::from(seeks(&command));
             match command {
-                Command::Subscribed(queue, channel) => match new.iter_mut().find(|(q, _)| Arc::ptr_eq(q, &queue)) {
-                    Some((_, channels)) => drop(channels.insert(channel)),
-                    None => new.push((queue, [channel].into())),
+                Command::Subscribed(queue, wanted) => match new.iter_mut().find(|(q, _)| Arc::ptr_eq(q, &queue)) {
+                    Some((_, channels)) => channels.extend(wanted),
+                    None => new.push((queue, wanted)),
                 },
                 Command::Playback(request) => self.control(request, seeks_left == 0),
             }
@@ -217,6 +217,8 @@ impl Player {
     }
 
     fn control(&mut self, request: PlaybackRequest, is_shown: bool) {
+        // The next step lets it go again; the answer is of now.
+        self.clock.go(false);
         if let Some(time) = request.seek {
             self.seek(time);
         }
@@ -224,7 +226,6 @@ impl Player {
         // Behind the end there is only seeking.
         if self.status != PlaybackStatus::Ended {
             self.status = if request.plays { PlaybackStatus::Playing } else { PlaybackStatus::Paused };
-            self.clock.go(request.plays && !self.shared.wanted().is_empty());
         }
         let did_seek = request.seek.is_some();
         let clients = self.shared.clients();
@@ -238,10 +239,13 @@ impl Player {
         }
     }
 
-    // To a time, or to where the next recording begins, if none is of it.
+    // To a time in this recording, or in the first that ends behind it; where none is of that time, to its beginning.
     fn seek(&mut self, time: u64) {
-        let found = self.recordings.iter().position(|r| time <= r.range().1);
-        self.number = found.unwrap_or(self.recordings.len() - 1);
+        let here = self.recordings[self.number].range();
+        if !(here.0..=here.1).contains(&time) {
+            let found = self.recordings.iter().position(|r| time <= r.range().1);
+            self.number = found.unwrap_or(self.recordings.len() - 1);
+        }
         let (start, end) = self.recordings[self.number].range();
         self.put(time.clamp(start, end));
         if self.status == PlaybackStatus::Ended {
@@ -269,7 +273,7 @@ impl Player {
             })
             .collect();
         for (queue, wanted) in to {
-            queue.prime(wanted, &known);
+            self.shared.prime(queue, wanted, &known);
         }
         self.note(damages);
     }

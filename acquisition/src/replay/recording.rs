@@ -80,7 +80,9 @@ impl Recording {
         let Some(range) = range else {
             let reason = match defect {
                 Some(defect) => format!("{defect}, and nothing before it is whole"),
-                None => "it has no chunks with messages; hint: files without chunks are to be rewritten with".to_owned(),
+                None => {
+                    "it has no chunks with messages; hint: files without chunks are to be rewritten with".to_owned()
+                }
             };
             return Err(Error::Unplayable { path: path.to_owned(), reason });
         };

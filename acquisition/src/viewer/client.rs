@@ -86,9 +86,7 @@ fn listen(socket: &mut WebSocket<TcpStream>, shared: &Shared, queue: &Arc<Queue>
         Err(error) => return Err(error),
     };
     match wish {
-        Some(Wish::Subscribe(wishes)) => {
-            wishes.into_iter().for_each(|(id, channel)| shared.subscribe(queue, channel, id));
-        }
+        Some(Wish::Subscribe(wishes)) => shared.subscribe(queue, &wishes),
         Some(Wish::Unsubscribe(ids)) => shared.unsubscribe(queue, &ids),
         Some(Wish::Playback(request)) => shared.control(queue, request),
         None => {}

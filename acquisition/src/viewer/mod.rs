@@ -38,8 +38,8 @@ pub(crate) struct Playback {
 
 /// What clients want of a player.
 pub(crate) enum Command {
-    /// A client wants a channel, and first what is known of it.
-    Subscribed(Arc<Queue>, u16),
+    /// A client wants channels, and first what is known of them.
+    Subscribed(Arc<Queue>, BTreeSet<u16>),
     /// Play, pause, seek.
     Playback(PlaybackRequest),
 }
@@ -138,15 +138,21 @@ impl Shared {
         self.wishes.load(Ordering::Acquire)
     }
 
-    /// The channels that somebody wants.
+    /// The channels whose messages go to somebody now.
     pub(crate) fn wanted(&self) -> BTreeSet<u16> {
-        self.state().clients.iter().flat_map(|client| client.wanted()).collect()
+        self.state().clients.iter().flat_map(|client| client.receiving()).collect()
+    }
+
+    /// Tells a client what is known of channels; what is new follows from here on.
+    pub(crate) fn prime(&self, queue: &Queue, channels: &BTreeSet<u16>, known: &[Waiting]) {
+        queue.prime(channels, known);
+        self.wishes.fetch_add(1, Ordering::Release);
     }
 
     /// Whether all who want something have enough to read: then nobody is served by more.
     pub(crate) fn all_are_busy(&self) -> bool {
         let state = self.state();
-        let mut watching = state.clients.iter().filter(|client| client.wants_any()).peekable();
+        let mut watching = state.clients.iter().filter(|client| !client.receiving().is_empty()).peekable();
         watching.peek().is_some() && watching.all(|client| client.is_busy())
     }
 
@@ -166,21 +172,23 @@ impl Shared {
         }
     }
 
-    /// A client wants a channel from now on, and first what is known of it.
-    fn subscribe(&self, queue: &Arc<Queue>, channel: u16, subscription: u32) {
+    /// A client wants channels from now on, and first what is known of them.
+    fn subscribe(&self, queue: &Arc<Queue>, wishes: &[(u32, u16)]) {
+        let channels: BTreeSet<u16> = wishes.iter().map(|(_, channel)| *channel).collect();
+        // Nothing new comes between what is known and what follows.
+        let state = self.state();
+        wishes.iter().for_each(|(subscription, channel)| queue.subscribe(*channel, *subscription));
         match &self.playback {
             Some(playback) => {
-                queue.subscribe(channel, subscription);
+                drop(state);
                 // A player that is gone has nobody left to tell.
-                let _ = playback.commands.send(Command::Subscribed(queue.clone(), channel));
+                let _ = playback.commands.send(Command::Subscribed(queue.clone(), channels));
             }
             None => {
-                let state = self.state();
-                queue.subscribe(channel, subscription);
-                queue.prime(&[channel].into(), state.last.get(&channel).map_or(&[], std::slice::from_ref));
+                let known: Vec<_> = channels.iter().filter_map(|channel| state.last.get(channel)).cloned().collect();
+                self.prime(queue, &channels, &known);
             }
         }
-        self.wishes.fetch_add(1, Ordering::Release);
     }
 
     fn unsubscribe(&self, queue: &Queue, subscriptions: &[u32]) {

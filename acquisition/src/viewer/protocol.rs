@@ -274,12 +274,10 @@ mod tests {
             did_seek: true,
             request_id: "i".into(),
         };
-        assert_eq!(
-            state.encode(),
-            [5, 3, 0x39, 0x30, 0, 0, 0, 0, 0, 0, 0, 0, 0x80, 0x3f, 1, 1, 0, 0, 0, b'i']
-        );
+        assert_eq!(state.encode(), [5, 3, 0x39, 0x30, 0, 0, 0, 0, 0, 0, 0, 0, 0x80, 0x3f, 1, 1, 0, 0, 0, b'i']);
         assert_eq!(time(1), [2, 1, 0, 0, 0, 0, 0, 0, 0]);
-        let info: serde_json::Value = serde_json::from_str(&server_info(Some((1_000_000, 2_000_000_005)))).expect("JSON");
+        let info: serde_json::Value =
+            serde_json::from_str(&server_info(Some((1_000_000, 2_000_000_005)))).expect("JSON");
         assert_eq!(info["dataStartTime"], serde_json::json!({"sec": 0, "nsec": 1_000_000}));
         assert_eq!(info["dataEndTime"], serde_json::json!({"sec": 2, "nsec": 5}));
     }

@@ -74,8 +74,9 @@ impl Queue {
         self.inner().wanted.keys().copied().collect()
     }
 
-    pub(super) fn wants_any(&self) -> bool {
-        !self.inner().wanted.is_empty()
+    /// Those of them whose messages go to it now.
+    pub(super) fn receiving(&self) -> Vec<u16> {
+        self.inner().wanted.iter().filter(|(_, wanted)| wanted.primed).map(|(channel, _)| *channel).collect()
     }
 
     /// Whether messages of a channel go to it now.
