@@ -74,8 +74,7 @@ impl ReplayServer {
         recordings.sort_by_key(|r| r.range().0);
         let (commands, obeyed) = mpsc::sync_channel(COMMANDS);
         let nothing = |reason| Error::Nothing { reason };
-        let (first, last) =
-            recordings.first().zip(recordings.last()).ok_or_else(|| nothing("there is no recording"))?;
+        let first = recordings.first().ok_or_else(|| nothing("there is no recording"))?;
         let range = recordings.iter().fold(first.range(), |all, r| (all.0, all.1.max(r.range().1)));
         let playback = Playback { range, commands };
         let length_secs = recordings.iter().map(player::secs).sum();

@@ -34,7 +34,10 @@ pub(crate) struct Queue {
 #[derive(Default)]
 struct Inner {
     entries: VecDeque<Entry>,
+    /// Of messages that may be lost.
     bytes: usize,
+    /// Of those that may not.
+    kept: usize,
     wanted: BTreeMap<u16, Wanted>,
     /// The client controls playback, so it understands states.
     controls: bool,
@@ -63,6 +66,13 @@ impl Entry {
             _ => 0,
         }
     }
+
+    fn kept(&self) -> usize {
+        match self {
+            Self::Kept(waiting) => waiting.data.len(),
+            _ => 0,
+        }
+    }
 }
 
 impl Queue {
@@ -86,7 +96,8 @@ impl Queue {
 
     /// Whether it has enough to read for now.
     pub(super) fn is_busy(&self) -> bool {
-        self.inner().bytes >= WAITING_BYTES / 2
+        let inner = self.inner();
+        inner.bytes + inner.kept >= WAITING_BYTES / 2
     }
 
     /// Bytes of messages that wait.
@@ -111,10 +122,15 @@ impl Queue {
     pub(crate) fn prime(&self, channels: &BTreeSet<u16>, known: &[Waiting]) {
         let mut inner = self.inner();
         inner.wanted.iter_mut().filter(|(id, _)| channels.contains(id)).for_each(|(_, wanted)| wanted.primed = true);
-        // Whoever has not read yet how things stood need not know any more.
-        inner.entries.retain(|e| !matches!(e, Entry::Kept(waiting) if channels.contains(&waiting.channel)));
-        let known = known.iter().filter(|waiting| channels.contains(&waiting.channel));
-        inner.entries.extend(known.cloned().map(Entry::Kept));
+        let known: Vec<_> = known.iter().filter(|waiting| channels.contains(&waiting.channel)).cloned().collect();
+        let new: usize = known.iter().map(|waiting| waiting.data.len()).sum();
+        if inner.kept + new > WAITING_BYTES {
+            // Whoever has not read for so long how things stood need not know any more.
+            inner.entries.retain(|e| !matches!(e, Entry::Kept(waiting) if channels.contains(&waiting.channel)));
+            inner.kept = inner.entries.iter().map(Entry::kept).sum();
+        }
+        inner.kept += new;
+        inner.entries.extend(known.into_iter().map(Entry::Kept));
     }
 
     /// A new message; returns how many old ones are lost by it.
@@ -155,7 +171,7 @@ impl Queue {
     pub(crate) fn forget(&self) {
         let mut inner = self.inner();
         inner.entries.retain(|entry| matches!(entry, Entry::State(_)));
-        inner.bytes = 0;
+        (inner.bytes, inner.kept) = (0, 0);
         inner.wanted.values_mut().for_each(|wanted| wanted.primed = false);
     }
 
@@ -165,6 +181,7 @@ impl Queue {
         loop {
             let entry = inner.entries.pop_front()?;
             inner.bytes -= entry.bytes();
+            inner.kept -= entry.kept();
             match entry {
                 Entry::Time(nanos) => return Some(Outgoing::Time(nanos)),
                 Entry::State(encoded) => return Some(Outgoing::State(encoded)),
@@ -229,6 +246,12 @@ mod tests {
         queue.prime(&[1].into(), &[waiting(1, 3, 1), waiting(2, 3, 1), waiting(1, 3, 1)]);
         queue.tell_time(3);
         queue.tell_time(4);
-        assert_eq!(drained(&queue), [(0, 0), (1, 3), (1, 3), (0, 4)]);
+        assert_eq!(drained(&queue), [(0, 0), (1, 2), (1, 3), (1, 3), (0, 4)]);
+        // What nobody reads does not grow without bounds.
+        for time in 0..9 {
+            queue.prime(&[1].into(), &[waiting(1, time, WAITING_BYTES / 2)]);
+            assert!(queue.is_busy());
+        }
+        assert_eq!(drained(&queue), [(1, 8)]);
     }
 }
