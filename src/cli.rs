@@ -41,6 +41,8 @@ pub(crate) enum Command {
     /// Data out: training sets, slices of runs, SOFA, WAV, npz.
     #[command(subcommand)]
     Export(ExportCommand),
+    /// Show runs again to Foxglove, which plays, pauses and seeks, and to Lichtblick.
+    Replay(ReplayArgs),
     /// Serve the catalogue, and the lake over HTTP, Arrow Flight SQL and Postgres' protocol, for reading.
     Serve(ServeArgs),
     /// Make a token for `serve --tokens`.
@@ -177,6 +179,39 @@ pub(crate) enum ImportCommand {
         #[arg(long)]
         rig: Option<PathBuf>,
     },
+    /// Responses as SOFA files (SingleRoomSRIR), one a surface.
+    Sofa {
+        /// The files.
+        #[arg(required = true, value_name = "FILE")]
+        files: Vec<PathBuf>,
+        /// The rig; by default the lake's, or the paper's for a new lake.
+        #[arg(long)]
+        rig: Option<PathBuf>,
+        /// Temperature of files that do not tell it.
+        #[arg(long, value_name = "C", allow_negative_numbers = true)]
+        temperature_c: Option<f64>,
+    },
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct ReplayArgs {
+    /// Names of runs, surfaces (of each its newest run), or .mcap files; they are shown one after the other.
+    #[arg(required = true, value_name = "RUN")]
+    pub(crate) runs: Vec<String>,
+    /// Where to listen; who reaches it can look on.
+    #[arg(long, value_name = "ADDR", default_value = "127.0.0.1:8765")]
+    pub(crate) listen: std::net::SocketAddr,
+    /// Speed at first, as a factor of real time.
+    #[arg(long, value_name = "X", default_value_t = 1.0, value_parser = speed)]
+    pub(crate) speed: f32,
+    /// Wait for a viewer's play button; without it playback begins with the first viewer.
+    #[arg(long)]
+    pub(crate) paused: bool,
+}
+
+fn speed(text: &str) -> Result<f32, String> {
+    let speed = text.parse().ok().filter(|x| (0.01..=1e6).contains(x));
+    speed.ok_or_else(|| "expected a number from 0.01 to 1000000".to_owned())
 }
 
 #[derive(Debug, Args)]

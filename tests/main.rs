@@ -9,7 +9,9 @@ mod kills;
 mod load;
 mod maintenance;
 mod real_data;
+mod replay;
 mod serve;
+mod sofa;
 #[cfg(feature = "web")]
 mod web;
 

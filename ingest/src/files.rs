@@ -134,7 +134,8 @@ fn is_being_recorded(partial: &FsPath) -> bool {
 async fn is_made_whole_otherwise(partial: &FsPath) -> bool {
     let Ok(path) = absolute(partial) else { return false };
     let opened = Opened { store: Arc::new(LocalFileSystem::new()), path, name: partial.display().to_string() };
-    let is = |head: Head| head.has_plan || matches!(head.origin, Origin::ImportedWav | Origin::ImportedGir);
+    let imported = |origin| matches!(origin, Origin::ImportedWav | Origin::ImportedGir | Origin::ImportedSofa);
+    let is = |head: Head| head.has_plan || imported(head.origin);
     Head::read(&opened).await.is_some_and(is)
 }
 

@@ -38,6 +38,8 @@ pub enum Origin {
     ImportedWav,
     /// Imported from the published GIR data set.
     ImportedGir,
+    /// Made of a SOFA file.
+    ImportedSofa,
 }
 
 /// Metadata `echolake.run.end`: how a run ended.
@@ -100,11 +102,13 @@ impl Origin {
             Self::Simulated => "simulated",
             Self::ImportedWav => "imported_wav",
             Self::ImportedGir => "imported_gir",
+            Self::ImportedSofa => "imported_sofa",
         }
     }
 
     fn parse(text: &str) -> Option<Self> {
-        [Self::Measured, Self::Simulated, Self::ImportedWav, Self::ImportedGir].into_iter().find(|o| o.label() == text)
+        let all = [Self::Measured, Self::Simulated, Self::ImportedWav, Self::ImportedGir, Self::ImportedSofa];
+        all.into_iter().find(|o| o.label() == text)
     }
 }
 
@@ -204,7 +208,7 @@ impl RunManifest {
                 record: record.name,
                 key: "origin",
                 actual: origin.to_owned(),
-                expected: "measured, simulated, imported_wav or imported_gir",
+                expected: "measured, simulated, imported_wav, imported_gir or imported_sofa",
             })?,
         })
     }

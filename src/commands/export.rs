@@ -33,7 +33,7 @@ pub(crate) enum ExportCommand {
 #[derive(Debug, Args)]
 pub(crate) struct MlArgs {
     /// The new folder.
-    #[arg(short, long, value_name = "DIR")]
+    #[arg(short, long, value_name = "DIR", value_parser = local)]
     output: PathBuf,
     /// Rows as measured, or under all eight symmetries of the square.
     #[arg(long, value_enum, default_value_t = SymmetriesArg::None)]
@@ -56,6 +56,17 @@ pub(crate) struct MlArgs {
     /// Print what was written as JSON.
     #[arg(long)]
     json: bool,
+}
+
+// Without this, a URL would become folders of its name.
+fn local(text: &str) -> Result<PathBuf, String> {
+    match text.split_once("://") {
+        None => Ok(text.into()),
+        Some(("file", path)) if path.starts_with('/') => Ok(path.into()),
+        Some(_) => Err("exports are written to this machine's disks only; hint: name a path, and copy it from there, \
+                        as with `aws s3 cp --recursive`"
+            .into()),
+    }
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
@@ -99,7 +110,7 @@ pub(crate) struct McapArgs {
     #[arg(long, value_enum, default_value_t = LayoutArg::ByTopic)]
     layout: LayoutArg,
     /// The new file.
-    #[arg(short, long, value_name = "FILE")]
+    #[arg(short, long, value_name = "FILE", value_parser = local)]
     output: PathBuf,
 }
 
@@ -117,7 +128,7 @@ pub(crate) struct ResponseArgs {
     #[arg(long, value_delimiter = ',')]
     surfaces: Vec<SurfaceId>,
     /// The new folder.
-    #[arg(short, long, value_name = "DIR")]
+    #[arg(short, long, value_name = "DIR", value_parser = local)]
     output: PathBuf,
 }
 
@@ -126,7 +137,7 @@ pub(crate) struct WavArgs {
     #[command(flatten)]
     selection: Selection,
     /// The new folder.
-    #[arg(short, long, value_name = "DIR")]
+    #[arg(short, long, value_name = "DIR", value_parser = local)]
     output: PathBuf,
 }
 

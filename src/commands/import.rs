@@ -1,10 +1,11 @@
 //! `echolake import`: existing measurements become runs.
 
 use echolake_acquisition::import::{
-    Error, GIR_IR_LEN, ImportOptions, ImportedRun, import_gir, import_wav, sampling_rate_of,
+    Error, GIR_IR_LEN, ImportOptions, ImportedRun, check_sofa, check_wav, import_gir, import_sofa, import_wav,
+    sampling_rate_of,
 };
 use echolake_lake::{Lake, References};
-use echolake_schema::{Rig, Timestamp};
+use echolake_schema::{Celsius, Rig, Timestamp};
 
 use crate::Done;
 use crate::cli::ImportCommand;
@@ -25,6 +26,7 @@ pub(crate) async fn run(args: &ImportCommand, lake_url: &str) -> anyhow::Result<
             given
         }
         ImportCommand::Gir { rig, .. } => super::rig_or(rig.as_deref(), lake_url, gir_rig).await?,
+        ImportCommand::Sofa { rig, .. } => super::rig_or(rig.as_deref(), lake_url, Rig::paper).await?,
     };
     // All is checked and written beside the lake's tables before a lake is made for it.
     let existing = match Lake::open(lake_url).await {
@@ -35,10 +37,16 @@ pub(crate) async fn run(args: &ImportCommand, lake_url: &str) -> anyhow::Result<
         Err(echolake_lake::Error::NoLake { .. }) => None,
         Err(e) => return Err(e.into()),
     };
-    if existing.is_none()
-        && let ImportCommand::Wav { manifest, .. } = args
-    {
-        echolake_acquisition::import::check_wav(manifest, &rig)?;
+    let celsius = match args {
+        ImportCommand::Sofa { temperature_c, .. } => temperature_c.map(Celsius::new).transpose()?,
+        _ => None,
+    };
+    if existing.is_none() {
+        match args {
+            ImportCommand::Wav { manifest, .. } => check_wav(manifest, &rig)?,
+            ImportCommand::Sofa { files, .. } => check_sofa(files, &rig, celsius)?,
+            ImportCommand::Gir { .. } => {}
+        }
     }
     let lake = Lake::open_or_create(lake_url, &rig, &References::default()).await?;
     let folder = super::inbox(&lake)?;
@@ -53,6 +61,9 @@ pub(crate) async fn run(args: &ImportCommand, lake_url: &str) -> anyhow::Result<
             import_wav(manifest, &rig, options, &mut |d, t| step("recordings", d, t))
         }
         ImportCommand::Gir { folder, .. } => import_gir(folder, &rig, options, &mut |d, t| step("surfaces", d, t)),
+        ImportCommand::Sofa { files, .. } => {
+            import_sofa(files, &rig, celsius, options, &mut |d, t| step("surfaces", d, t))
+        }
     });
     let runs = runs?;
     finish(task, &runs);

@@ -9,6 +9,7 @@ mod ingest;
 mod optimize;
 pub(crate) mod panel;
 mod recover;
+mod replay;
 pub(crate) mod serve;
 pub(crate) mod sql;
 mod vacuum;
@@ -37,6 +38,7 @@ pub(crate) async fn run(cli: Cli) -> anyhow::Result<Done> {
         Command::Sql(args) => sql::run(args, lake).await.map(|()| Done::Whole),
         Command::Export(args) => export::run(args, lake).await,
         Command::Serve(args) => serve::run(args, lake).await,
+        Command::Replay(args) => replay::run(args, lake).await,
         Command::Token { name } => serve::token(name),
         Command::Recover(args) => recover::run(args),
         Command::Doctor(args) => doctor::run(args, lake).await,

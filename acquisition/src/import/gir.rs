@@ -222,7 +222,7 @@ fn temperatures(file: &Path, rows: usize) -> Result<Vec<Celsius>, Error> {
 }
 
 fn wrong(path: &Path, place: impl Into<String>, actual: impl Into<String>, expected: impl Into<String>) -> Error {
-    Error::Gir { path: path.to_owned(), place: place.into(), actual: actual.into(), expected: expected.into() }
+    Error::Content { path: path.to_owned(), place: place.into(), actual: actual.into(), expected: expected.into() }
 }
 
 // Every .npz that is no height map.

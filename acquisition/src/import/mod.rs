@@ -1,7 +1,9 @@
-//! Existing measurements become runs: WAV files listed in a manifest, and the published GIR data set.
+//! Existing measurements become runs: WAV files listed in a manifest, the published GIR data set, SOFA files.
 
 mod batch;
 mod gir;
+mod sofa;
+mod sofa_file;
 mod wav;
 mod wav_file;
 mod wav_manifest;
@@ -11,6 +13,7 @@ use std::path::{Path, PathBuf};
 use echolake_schema::{RunId, SurfaceId, Timestamp};
 
 pub use gir::{GIR_IR_LEN, import_gir};
+pub use sofa::{check_sofa, import_sofa};
 pub use wav::{check_wav, import_wav, sampling_rate_of};
 
 /// A run made of somebody's files.
@@ -68,12 +71,12 @@ pub enum Error {
         /// What is wrong, expected and actual.
         what: String,
     },
-    /// A file of the GIR data set is not as it should be.
+    /// A file is not as it should be.
     #[error("`{}`: {place}: {actual}, expected {expected}", path.display())]
-    Gir {
+    Content {
         /// The file.
         path: PathBuf,
-        /// The array or line.
+        /// The array, variable or line.
         place: String,
         /// What is there.
         actual: String,

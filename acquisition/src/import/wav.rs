@@ -73,8 +73,10 @@ impl Import<'_> {
         batch: &mut Batch,
         done: &mut dyn FnMut(),
     ) -> Result<ImportedRun, Error> {
-        let times: Vec<_> = (0u32..).zip(rows).map(|(i, r)| self.time(r, i)).collect();
-        let started = times.iter().copied().min().unwrap_or(self.options.started);
+        // A run's file is in the order of time, however the manifest's rows are.
+        let mut timed: Vec<_> = (0u32..).zip(rows).map(|(i, row)| (self.time(row, i), row)).collect();
+        timed.sort_by_key(|(time, _)| *time);
+        let started = timed.first().map_or(self.options.started, |(time, _)| *time);
         let run_id = RunId::compose(started, &surface, tag)?;
         let run = RunManifest {
             run_id: run_id.clone(),
@@ -90,12 +92,12 @@ impl Import<'_> {
         let mut recorder = batch.create(&path, &start)?;
         recorder.log(started, LogLevel::Info, NAME, &format!("{} recordings", rows.len()))?;
         let mut warnings = Vec::new();
-        for (row, at) in rows.iter().zip(&times) {
+        for (at, row) in &timed {
             warnings.extend(self.row(&mut recorder, row, *at)?);
             done();
         }
         let count = rows.len() as u64;
-        let ended = times.iter().copied().max().unwrap_or(started);
+        let ended = timed.last().map_or(started, |(time, _)| *time);
         batch.seal(recorder, &RunEnd { ended, accepted: count, rejected: 0, attempts: count })?;
         Ok(ImportedRun { path, run_id, surface, measurements: rows.len(), warnings })
     }

@@ -1,11 +1,15 @@
 //! A client of another make than the server looks on while a simulated run goes on.
 
+use std::net::TcpStream;
 use std::time::{Duration, Instant};
 
 use tungstenite::Message;
 use tungstenite::client::IntoClientRequest as _;
 
 use super::*;
+
+/// Bytes that wait for one client at most.
+const WAITING_BYTES: usize = 16 << 20;
 
 fn topic(channel: u16, name: &str) -> Topic {
     Topic {
@@ -86,7 +90,7 @@ fn a_client_that_sleeps_loses_the_oldest_and_stops_nobody() {
     json(&mut socket);
     socket.send(Message::text(r#"{"op":"subscribe","subscriptions":[{"id":1,"channelId":2}]}"#)).expect("sent");
     let begun = Instant::now();
-    while !server.shared.state().clients.iter().any(|c| c.wants(2)) {
+    while !server.0.shared().clients().iter().any(|c| c.receives(2)) {
         assert!(begun.elapsed() < Duration::from_secs(10), "the subscription arrives");
         std::thread::sleep(Duration::from_millis(5));
     }
@@ -94,7 +98,7 @@ fn a_client_that_sleeps_loses_the_oldest_and_stops_nobody() {
     for time in 0..200 {
         tap.message(2, time, &vec![0; 1 << 20]);
     }
-    let waiting = server.shared.state().clients[0].inner().bytes;
+    let waiting = server.0.shared().clients()[0].bytes();
     assert!(waiting <= WAITING_BYTES, "{waiting}");
     let mut last = 0;
     while last != 199 {

@@ -19,7 +19,7 @@ use crate::recorder::chunks::ChunkWriter;
 use crate::recorder::{folder_of, lock, sync};
 pub(crate) use copy::{Copy, Counts, is_end};
 pub use error::Error;
-pub(crate) use walk::{Item, Walk};
+pub(crate) use walk::{Item, Walk, chunk};
 
 /// Bytes that are read at a time when a file is proven.
 const BLOCK: usize = 1 << 20;

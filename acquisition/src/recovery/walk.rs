@@ -36,6 +36,8 @@ pub(crate) struct Walk {
     pub(crate) size: u64,
     /// Where the verified prefix ends.
     pub(crate) verified: u64,
+    /// Where the last item begins.
+    pub(crate) item: u64,
     /// The data are over, as in a file that was closed.
     pub(crate) ended: bool,
     /// What stands behind the verified prefix, in words; nothing where it is the whole file.
@@ -51,8 +53,15 @@ impl Walk {
         let failed = |source| Error::Read { path: path.to_owned(), source };
         let file = File::open(path).map_err(failed)?;
         let size = file.metadata().map_err(failed)?.len();
-        let mut walk =
-            Self { file: BufReader::new(file), path: path.to_owned(), size, verified: 0, ended: false, defect: None };
+        let mut walk = Self {
+            file: BufReader::new(file),
+            path: path.to_owned(),
+            size,
+            verified: 0,
+            item: 0,
+            ended: false,
+            defect: None,
+        };
         let mut magic = [0; MAGIC.len()];
         if size < magic.len() as u64 || walk.fill(&mut magic).is_err() || magic != MAGIC {
             return Err(walk.headless(format!("it is no MCAP file, or only {size} bytes of one")));
@@ -87,6 +96,7 @@ impl Walk {
             self.fill(&mut body)?;
             match whole(code, &body) {
                 Ok(found) => {
+                    self.item = self.verified;
                     self.verified += FRAME + length;
                     match found {
                         Found::Item(item) => return Ok(Some(item)),
@@ -144,8 +154,8 @@ fn whole(code: u8, body: &[u8]) -> Result<Found, String> {
     }
 }
 
-// A chunk's records, once its CRC is known to be right: what is damaged must not say how much memory is asked for.
-fn chunk(body: &[u8]) -> Result<Vec<Record<'static>>, String> {
+/// A chunk's records, once its CRC is known to be right: what is damaged must not say how much memory is asked for.
+pub(crate) fn chunk(body: &[u8]) -> Result<Vec<Record<'static>>, String> {
     let failed = |e: mcap::McapError| e.to_string();
     let options = LinearReaderOptions::default()
         .with_skip_start_magic(true)

@@ -95,3 +95,20 @@ fn somebody_elses_file_under_a_runs_name_is_left_alone() {
     assert_eq!(place.left().len(), 1, "{:?}", place.left());
     assert_eq!(std::fs::read(path).expect("the file"), b"someone else's");
 }
+
+#[test]
+fn messages_are_in_the_order_of_time_however_the_rows_are() {
+    let place = Place::new(0.5);
+    let rows = "surface,recording,loopback,microphone,speaker,temperature_c,recorded_at\n\
+                a,good.wav,good.wav,0/0/0,0/0/1,20,2026-01-05T08:00:30Z\n\
+                a,last.wav,good.wav,0/0/0,0/0/2,20,2026-01-05T08:00:10Z\n\
+                a,last.wav,good.wav,0/0/0,0/0/3,20,2026-01-05T08:00:20Z\n";
+    std::fs::write(place.manifest(), rows).expect("written");
+    let runs = place.import(&mut |_, _| {}).expect("imported");
+    let file = std::fs::read(&runs[0].path).expect("the run");
+    let messages = mcap::MessageStream::new(&file).expect("an MCAP file").map(|m| m.expect("whole"));
+    let mut times = std::collections::BTreeMap::<String, Vec<u64>>::new();
+    messages.for_each(|m| times.entry(m.channel.topic.clone()).or_default().push(m.log_time));
+    assert_eq!(times["/measurement"].len(), 3);
+    assert!(times.values().all(|of_topic| of_topic.is_sorted()), "{times:?}");
+}

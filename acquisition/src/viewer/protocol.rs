@@ -1,5 +1,6 @@
 //! What is said over the wire: Foxglove's WebSocket protocol, as far as a server needs it that only shows
-//! (<https://github.com/foxglove/ws-protocol/blob/main/docs/spec.md>).
+//! (<https://github.com/foxglove/ws-protocol/blob/main/docs/spec.md>), and playback control, which Foxglove's SDK adds to
+//! it (<https://github.com/foxglove/foxglove-sdk>, `rust/foxglove/src/protocol`).
 
 use std::fmt::Write as _;
 
@@ -12,14 +13,59 @@ use crate::recorder::Topic;
 const SUBPROTOCOLS: [&str; 2] = ["foxglove.sdk.v1", "foxglove.websocket.v1"];
 /// Opcode of a message on a subscription.
 const MESSAGE_DATA: u8 = 0x01;
+/// Opcode of the server's time.
+const TIME: u8 = 0x02;
+/// Opcode of the state of playback.
+const PLAYBACK_STATE: u8 = 0x05;
+/// A client's opcode of a wish to control playback.
+const PLAYBACK_CONTROL: u8 = 0x03;
+const NANOS: u64 = 1_000_000_000;
 
 /// What a client wants.
-#[derive(Debug, PartialEq, Eq)]
+#[derive(Debug, PartialEq)]
 pub(super) enum Wish {
     /// Subscriptions and their channels.
     Subscribe(Vec<(u32, u16)>),
     /// Subscriptions.
     Unsubscribe(Vec<u32>),
+    /// How playback goes on.
+    Playback(PlaybackRequest),
+}
+
+/// How a client wants playback to go on.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) struct PlaybackRequest {
+    /// Whether it plays or is paused.
+    pub(crate) plays: bool,
+    /// As a factor of real time.
+    pub(crate) speed: f32,
+    /// The time to go to first, ns since 1970.
+    pub(crate) seek: Option<u64>,
+    /// What the answer names.
+    pub(crate) id: String,
+}
+
+/// What a player does.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum PlaybackStatus {
+    Playing = 0,
+    Paused = 1,
+    // 2 is buffering, which is not told: what is behind an index is there at once.
+    Ended = 3,
+}
+
+/// How playback stands.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) struct PlaybackState {
+    pub(crate) status: PlaybackStatus,
+    /// ns since 1970.
+    pub(crate) current_time: u64,
+    /// As a factor of real time.
+    pub(crate) speed: f32,
+    /// Time went elsewhere: what is on show is to be cleared.
+    pub(crate) did_seek: bool,
+    /// Of the request that this answers; empty where it answers none.
+    pub(crate) request_id: String,
 }
 
 #[derive(Deserialize)]
@@ -58,10 +104,18 @@ pub(super) fn choose<'a>(offered: impl Iterator<Item = &'a str>) -> Option<&'sta
     SUBPROTOCOLS.into_iter().find(|p| offered.contains(p))
 }
 
-/// The first thing that is said.
-pub(super) fn server_info() -> String {
+/// The first thing that is said; `range` is first and last time where playback can be controlled.
+pub(super) fn server_info(range: Option<(u64, u64)>) -> String {
     let name = concat!("echolake ", env!("CARGO_PKG_VERSION"));
-    serde_json::json!({"op": "serverInfo", "name": name, "capabilities": []}).to_string()
+    let mut info = serde_json::json!({"op": "serverInfo", "name": name, "capabilities": []});
+    if let Some((from, to)) = range {
+        // In two numbers, because JSON's have 53 bits.
+        let time = |nanos: u64| serde_json::json!({"sec": nanos / NANOS, "nsec": nanos % NANOS});
+        info["capabilities"] = serde_json::json!(["playbackControl", "time"]);
+        info["dataStartTime"] = time(from);
+        info["dataEndTime"] = time(to);
+    }
+    info.to_string()
 }
 
 /// What there is to subscribe to.
@@ -88,6 +142,45 @@ pub(super) fn message_data(subscription: u32, log_time_nanos: u64, data: &[u8]) 
     out.extend(log_time_nanos.to_le_bytes());
     out.extend(data);
     out
+}
+
+/// What the time is.
+pub(super) fn time(nanos: u64) -> Vec<u8> {
+    [&[TIME][..], &nanos.to_le_bytes()].concat()
+}
+
+impl PlaybackState {
+    /// As it is sent: status, time, speed, whether time went elsewhere, length and letters of the request's name.
+    pub(crate) fn encode(&self) -> Vec<u8> {
+        let mut out = vec![PLAYBACK_STATE, self.status as u8];
+        out.extend(self.current_time.to_le_bytes());
+        out.extend(self.speed.to_le_bytes());
+        out.push(u8::from(self.did_seek));
+        out.extend((self.request_id.len() as u32).to_le_bytes());
+        out.extend(self.request_id.as_bytes());
+        out
+    }
+}
+
+/// A client's wish to control playback: command, speed, whether it seeks, whereto, length and letters of its name.
+pub(super) fn playback_request(bytes: &[u8]) -> Option<PlaybackRequest> {
+    let (opcode, rest) = bytes.split_first()?;
+    let (command, rest) = rest.split_first().filter(|_| *opcode == PLAYBACK_CONTROL)?;
+    let (speed, rest) = rest.split_first_chunk()?;
+    let (seeks, rest) = rest.split_first()?;
+    let (seek, rest) = rest.split_first_chunk()?;
+    let (length, rest) = rest.split_first_chunk()?;
+    let name = rest.get(..u32::from_le_bytes(*length) as usize)?;
+    Some(PlaybackRequest {
+        plays: match command {
+            0 => true,
+            1 => false,
+            _ => return None,
+        },
+        speed: f32::from_le_bytes(*speed),
+        seek: (*seeks != 0).then(|| u64::from_le_bytes(*seek)),
+        id: std::str::from_utf8(name).ok()?.to_owned(),
+    })
 }
 
 /// What a client says; nothing where it is of no interest to a server that only shows.
@@ -155,6 +248,38 @@ mod tests {
         };
         assert_eq!(schema_text(&topic("ros2msg")), "string data\n");
         assert_eq!(schema_text(&topic("protobuf")), "c3RyaW5nIGRhdGEK");
+    }
+
+    // The bytes are those that Foxglove's SDK writes.
+    #[test]
+    fn playback_is_spoken_as_the_sdk_does() {
+        let mut bytes = vec![3, 0];
+        bytes.extend(1.5f32.to_le_bytes());
+        bytes.push(1);
+        bytes.extend(100_500_000_000u64.to_le_bytes());
+        bytes.extend(7u32.to_le_bytes());
+        bytes.extend(b"some-id");
+        let request =
+            PlaybackRequest { plays: true, speed: 1.5, seek: Some(100_500_000_000), id: "some-id".to_owned() };
+        assert_eq!(playback_request(&bytes), Some(request));
+        for cut in 0..bytes.len() {
+            assert_eq!(playback_request(&bytes[..cut]), None, "{cut} bytes");
+        }
+        bytes[1] = 2;
+        assert_eq!(playback_request(&bytes), None, "an unknown command");
+        let state = PlaybackState {
+            status: PlaybackStatus::Ended,
+            current_time: 12_345,
+            speed: 1.0,
+            did_seek: true,
+            request_id: "i".into(),
+        };
+        assert_eq!(state.encode(), [5, 3, 0x39, 0x30, 0, 0, 0, 0, 0, 0, 0, 0, 0x80, 0x3f, 1, 1, 0, 0, 0, b'i']);
+        assert_eq!(time(1), [2, 1, 0, 0, 0, 0, 0, 0, 0]);
+        let info: serde_json::Value =
+            serde_json::from_str(&server_info(Some((1_000_000, 2_000_000_005)))).expect("JSON");
+        assert_eq!(info["dataStartTime"], serde_json::json!({"sec": 0, "nsec": 1_000_000}));
+        assert_eq!(info["dataEndTime"], serde_json::json!({"sec": 2, "nsec": 5}));
     }
 
     #[test]

@@ -1,6 +1,7 @@
-//! One client of the live view, on a thread of its own.
+//! One client of a server, on a thread of its own.
 
 use std::net::TcpStream;
+use std::sync::Arc;
 use std::time::Duration;
 
 use tungstenite::handshake::server::{Request, Response};
@@ -9,6 +10,7 @@ use tungstenite::protocol::WebSocketConfig;
 use tungstenite::{Message, WebSocket};
 
 use super::protocol::{self, Wish};
+use super::queue::Outgoing;
 use super::{Queue, Shared};
 
 /// How often it is looked whether the client says something.
@@ -18,8 +20,8 @@ const PATIENCE: Duration = Duration::from_secs(10);
 /// What a client says is short.
 const LARGEST_WISH: usize = 1 << 20;
 
-/// Serves a client until it or the run is gone.
-pub(super) fn serve(stream: TcpStream, shared: &Shared, queue: &Queue) {
+/// Serves a client until it or the server is gone.
+pub(super) fn serve(stream: TcpStream, shared: &Shared, queue: &Arc<Queue>) {
     // Whatever goes wrong here, the client is gone, and comes again if it likes.
     let _ = talk(stream, shared, queue);
 }
@@ -44,23 +46,25 @@ fn choose(
     }
 }
 
-fn talk(stream: TcpStream, shared: &Shared, queue: &Queue) -> Result<(), Box<dyn std::error::Error>> {
+fn talk(stream: TcpStream, shared: &Shared, queue: &Arc<Queue>) -> Result<(), Box<dyn std::error::Error>> {
     stream.set_nodelay(true)?;
     stream.set_read_timeout(Some(PATIENCE))?;
     stream.set_write_timeout(Some(PATIENCE))?;
     let config = WebSocketConfig::default().max_message_size(Some(LARGEST_WISH)).max_frame_size(Some(LARGEST_WISH));
     let mut socket = tungstenite::accept_hdr_with_config(stream, choose, Some(config)).map_err(|e| e.to_string())?;
     socket.get_ref().set_read_timeout(Some(LOOKS))?;
-    socket.send(Message::text(protocol::server_info()))?;
+    socket.send(Message::text(protocol::server_info(shared.playback.as_ref().map(|p| p.range))))?;
     socket.send(Message::text(protocol::advertise(&shared.topics())))?;
     while !shared.has_ended() {
         listen(&mut socket, shared, queue)?;
-        while let Some((subscription, message)) = queue.pop() {
-            socket.write(Message::binary(protocol::message_data(
-                subscription,
-                message.log_time_nanos,
-                &message.data,
-            )))?;
+        while let Some(outgoing) = queue.pop() {
+            socket.write(Message::binary(match outgoing {
+                Outgoing::Message(subscription, message) => {
+                    protocol::message_data(subscription, message.log_time_nanos, &message.data)
+                }
+                Outgoing::Time(nanos) => protocol::time(nanos),
+                Outgoing::State(encoded) => encoded,
+            }))?;
         }
         socket.flush()?;
     }
@@ -69,24 +73,23 @@ fn talk(stream: TcpStream, shared: &Shared, queue: &Queue) -> Result<(), Box<dyn
     Ok(socket.flush()?)
 }
 
-fn listen(socket: &mut WebSocket<TcpStream>, shared: &Shared, queue: &Queue) -> Result<(), tungstenite::Error> {
-    match socket.read() {
-        Ok(Message::Text(text)) => {
-            match protocol::wish(&text) {
-                Some(Wish::Subscribe(wishes)) => {
-                    wishes.into_iter().for_each(|(id, channel)| shared.subscribe(queue, channel, id));
-                }
-                Some(Wish::Unsubscribe(ids)) => queue.unsubscribe(&ids),
-                None => {}
-            }
-            Ok(())
-        }
-        Ok(_) => Ok(()),
+fn listen(socket: &mut WebSocket<TcpStream>, shared: &Shared, queue: &Arc<Queue>) -> Result<(), tungstenite::Error> {
+    let wish = match socket.read() {
+        Ok(Message::Text(text)) => protocol::wish(&text),
+        Ok(Message::Binary(bytes)) => protocol::playback_request(&bytes).map(Wish::Playback),
+        Ok(_) => None,
         Err(tungstenite::Error::Io(e))
             if matches!(e.kind(), std::io::ErrorKind::WouldBlock | std::io::ErrorKind::TimedOut) =>
         {
-            Ok(())
+            None
         }
-        Err(error) => Err(error),
+        Err(error) => return Err(error),
+    };
+    match wish {
+        Some(Wish::Subscribe(wishes)) => shared.subscribe(queue, &wishes),
+        Some(Wish::Unsubscribe(ids)) => shared.unsubscribe(queue, &ids),
+        Some(Wish::Playback(request)) => shared.control(queue, request),
+        None => {}
     }
+    Ok(())
 }

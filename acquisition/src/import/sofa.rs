@@ -1,0 +1,408 @@
+//! Responses as SOFA files (AES69, convention SingleRoomSRIR) become runs, one a file.
+//!
+//! What `export sofa` wrote says that it is on the time axis of the lake's reference temperature. Files of others are at
+//! the room's temperature, which ingest corrects.
+
+#[cfg(test)]
+mod tests;
+
+use std::collections::HashSet;
+use std::path::{Path, PathBuf};
+
+use echolake_dsp::temperature::{TemperatureCorrection, resampling_ratio};
+use echolake_schema::manifest::{Origin, RunEnd, RunManifest};
+use echolake_schema::messages::{AmbientSample, ImpulseResponse, Measurement, Verdict};
+use echolake_schema::{Celsius, Grid, Pair, PairId, Rig, RunId, SurfaceId, SurfaceRecord, Timestamp};
+
+use super::batch::Batch;
+use super::sofa_file::{SofaFile, Variable};
+use super::{Error, ImportOptions, ImportedRun};
+use crate::recorder::{LogLevel, Recorder, RunStart};
+
+/// Who speaks in the log.
+const NAME: &str = "import sofa";
+/// What our own export says of itself.
+const OURS: &str = "echolake";
+/// Time of one measurement (Rust et al. 2021), s, where a file has none.
+const TAKE_SECS: f64 = 12.3;
+/// Between measurements whose file says the same time of both: it counts in seconds.
+const STEP_NANOS: i64 = 1_000;
+const KELVIN: f64 = 273.15;
+/// Positions nearer than that are one, m; a file's own rounding is far below.
+const SAME_METRES: f64 = 5e-4;
+
+/// Imports SOFA files; `progress` hears how many are done, of how many. `celsius` is the temperature of files that have
+/// none.
+///
+/// # Errors
+/// [`Error`], naming the file and the variable; every file is checked before the first is imported, and a refused
+/// import leaves nothing behind.
+pub fn import_sofa(
+    files: &[PathBuf],
+    rig: &Rig,
+    celsius: Option<Celsius>,
+    options: ImportOptions<'_>,
+    progress: &mut dyn FnMut(usize, usize),
+) -> Result<Vec<ImportedRun>, Error> {
+    let grid = rig.grid()?;
+    let (mut runs, mut batch, mut surfaces) = (Vec::new(), Batch::default(), HashSet::new());
+    for (number, path) in (0u16..).zip(files) {
+        let sofa = Sofa::read(path, rig, &grid, celsius)?;
+        if !surfaces.insert(sofa.surface.clone()) {
+            let what = format!("a second file of surface {}", sofa.surface);
+            return Err(wrong(path, "Title", what, "one file a surface"));
+        }
+        // Each without times ten hours after the one before, as they would be measured.
+        let fallback = options.started.plus_secs(f64::from(number) * 36_600.0);
+        runs.push(sofa.record(&Import { rig, grid: &grid, options, number, fallback }, &mut batch)?);
+        progress(runs.len(), files.len());
+    }
+    batch.publish()?;
+    Ok(runs)
+}
+
+/// Checks SOFA files, and imports nothing.
+///
+/// # Errors
+/// As [`import_sofa`].
+pub fn check_sofa(files: &[PathBuf], rig: &Rig, celsius: Option<Celsius>) -> Result<(), Error> {
+    let grid = rig.grid()?;
+    files.iter().try_for_each(|path| Sofa::read(path, rig, &grid, celsius).map(drop))
+}
+
+struct Import<'a> {
+    rig: &'a Rig,
+    grid: &'a Grid,
+    options: ImportOptions<'a>,
+    number: u16,
+    /// Time of the first measurement where the file has none.
+    fallback: Timestamp,
+}
+
+/// What a file holds.
+struct Sofa {
+    surface: SurfaceId,
+    /// In the order of their times.
+    measurements: Vec<Measured>,
+    length: usize,
+    samples: Vec<f32>,
+    is_corrected: bool,
+    has_times: bool,
+}
+
+struct Measured {
+    /// Row of its response.
+    row: usize,
+    pair: Pair,
+    celsius: Celsius,
+    /// ns since 1970.
+    time: Option<i64>,
+}
+
+impl Sofa {
+    fn read(path: &Path, rig: &Rig, grid: &Grid, celsius: Option<Celsius>) -> Result<Self, Error> {
+        let file = SofaFile::open(path)
+            .map_err(|reason| Error::Read { path: path.to_owned(), reason: format!("it is no HDF5 file: {reason}") })?;
+        let reader = Reader { path, file };
+        let is_ours = reader.file.text("APIName") == OURS;
+        reader.expect_text("SOFAConventions", "SingleRoomSRIR")?;
+        reader.expect_text("DataType", "FIR")?;
+        let responses = reader.needed("Data.IR")?;
+        let &[count, 1, length] = responses.shape.as_slice() else {
+            let expected = "measurements x 1 receiver x samples";
+            return Err(wrong(path, "Data.IR", format!("{:?}", responses.shape), expected));
+        };
+        if count == 0 {
+            return Err(wrong(path, "Data.IR", "no measurement", "one at least"));
+        }
+        reader.expect_rate(rig)?;
+        for of_device in ["ReceiverPosition", "EmitterPosition", "Data.Delay"] {
+            reader.expect_zeros(of_device)?;
+        }
+        let finite = responses.values.iter().position(|x| !(*x as f32).is_finite());
+        if let Some(at) = finite {
+            let place = format!("Data.IR[{}, 0, {}]", at / length, at % length);
+            return Err(wrong(path, place, format!("{:e}", responses.values[at]), "a finite f32"));
+        }
+        let celsius = reader.temperatures(count, celsius)?;
+        let reference = rig.impulse_response.reference_temperature_c.get();
+        let least = celsius.iter().map(|c| least_length(rig, *c, is_ours)).max().unwrap_or(0);
+        if length < least {
+            let expected = format!("{least} at least, for the lake's responses of {}", rig.impulse_response.length);
+            return Err(wrong(path, "Data.IR", format!("{length} samples"), expected));
+        }
+        let off = celsius.iter().find(|c| is_ours && (c.get() - reference).abs() > 1e-6);
+        if let Some(off) = off {
+            let actual = format!("responses at {} C", off.get());
+            return Err(wrong(path, "RoomTemperature", actual, format!("those at the rig's {reference} C")));
+        }
+        let pairs = reader.pairs(count, grid)?;
+        let times = reader.times(count)?;
+        let row = |row: usize| Measured {
+            row,
+            pair: pairs[row],
+            celsius: celsius[row],
+            time: times.as_ref().map(|times| times[row]),
+        };
+        let mut measurements: Vec<_> = (0..count).map(row).collect();
+        measurements.sort_by_key(|m| m.time);
+        Ok(Self {
+            surface: reader.surface(is_ours)?,
+            measurements,
+            length,
+            // Ours were singles before they were doubles, so that nothing is lost.
+            samples: responses.values.iter().map(|x| *x as f32).collect(),
+            is_corrected: is_ours,
+            has_times: times.is_some(),
+        })
+    }
+
+    fn record(&self, import: &Import<'_>, batch: &mut Batch) -> Result<ImportedRun, Error> {
+        let times = self.times(import.fallback);
+        let (started, ended) = (times[0], times[times.len() - 1]);
+        let run_id = RunId::compose(started, &self.surface, import.number)?;
+        let manifest = RunManifest {
+            run_id: run_id.clone(),
+            surface_id: self.surface.clone(),
+            started,
+            software: concat!("echolake ", env!("CARGO_PKG_VERSION")).to_owned(),
+            rig: import.rig.name.clone(),
+            origin: Origin::ImportedSofa,
+        };
+        let record = SurfaceRecord { typology: "imported".into(), ..SurfaceRecord::default() };
+        let path = import.options.folder.join(format!("{run_id}.mcap"));
+        let start = RunStart { manifest: &manifest, rig: import.rig, surface: &record, relief: None, plan: None };
+        let mut recorder = batch.create(&path, &start)?;
+        if !self.has_times {
+            recorder.log(started, LogLevel::Info, NAME, "times are made up: the file has none")?;
+        }
+        for (measured, at) in self.measurements.iter().zip(times) {
+            self.measurement(&mut recorder, import, measured, at)?;
+        }
+        let count = self.measurements.len();
+        let end = RunEnd { ended, accepted: count as u64, rejected: 0, attempts: count as u64 };
+        batch.seal(recorder, &end)?;
+        let surface = self.surface.clone();
+        Ok(ImportedRun { path, run_id, surface, measurements: count, warnings: Vec::new() })
+    }
+
+    // Those of the file, each later than the one before.
+    fn times(&self, fallback: Timestamp) -> Vec<Timestamp> {
+        let mut last = i64::MIN;
+        let at = |(i, measured): (u32, &Measured)| {
+            let told = measured.time.map(Timestamp).unwrap_or_else(|| fallback.plus_secs(f64::from(i) * TAKE_SECS));
+            last = told.0.max(last.saturating_add(STEP_NANOS));
+            Timestamp(last)
+        };
+        (0u32..).zip(&self.measurements).map(at).collect()
+    }
+
+    fn measurement(
+        &self,
+        recorder: &mut Recorder,
+        import: &Import<'_>,
+        measured: &Measured,
+        at: Timestamp,
+    ) -> Result<(), Error> {
+        let (unknown, celsius, pair) = (f64::NAN, measured.celsius.get(), measured.pair);
+        let [m, s] = [pair.microphone, pair.speaker].map(|id| import.grid.points()[id.index()].position_mm);
+        let samples = self.samples[measured.row * self.length..][..self.length].to_vec();
+        recorder.poses(at, m, s)?;
+        recorder.environment(
+            at,
+            &AmbientSample {
+                temperature_c: celsius,
+                humidity_pct: unknown,
+                pressure_hpa: unknown,
+                outside_level_db: unknown,
+            },
+        )?;
+        recorder.ir(
+            at,
+            &ImpulseResponse {
+                pair_id: pair.id.0,
+                attempt: 1,
+                sample_rate_hz: import.rig.sweep.rate_hz.get(),
+                samples,
+                temperature_c: celsius,
+                temperature_corrected: self.is_corrected,
+            },
+        )?;
+        recorder.measurement(
+            at,
+            &Measurement {
+                pair_id: pair.id.0,
+                attempt: 1,
+                microphone: pair.microphone.0,
+                speaker: pair.speaker.0,
+                verdict: Verdict::Accepted.into(),
+                snr_db: unknown,
+                loopback_level_dbfs: unknown,
+                arrival_error_us: unknown,
+                outside_level_db: unknown,
+                temperature_c: celsius,
+                humidity_pct: unknown,
+                pressure_hpa: unknown,
+                microphone_residual_mm: unknown,
+                speaker_residual_mm: unknown,
+                ..Measurement::default()
+            },
+        )?;
+        Ok(())
+    }
+}
+
+/// A file on its way into a [`Sofa`].
+struct Reader<'a> {
+    path: &'a Path,
+    file: SofaFile,
+}
+
+impl Reader<'_> {
+    fn variable(&self, name: &str) -> Result<Option<Variable>, Error> {
+        self.file.variable(name).map_err(|actual| wrong(self.path, name, actual, "numbers"))
+    }
+
+    fn needed(&self, name: &str) -> Result<Variable, Error> {
+        let found = self.variable(name)?;
+        found.ok_or_else(|| wrong(self.path, name, "it is missing", "what SingleRoomSRIR asks for"))
+    }
+
+    fn expect_text(&self, name: &str, expected: &str) -> Result<(), Error> {
+        match self.file.text(name) {
+            actual if actual == expected => Ok(()),
+            actual => Err(wrong(self.path, name, format!("`{actual}`"), format!("`{expected}`"))),
+        }
+    }
+
+    fn expect_rate(&self, rig: &Rig) -> Result<(), Error> {
+        let (rate, expected) = (self.needed("Data.SamplingRate")?, rig.sweep.rate_hz.get());
+        match rate.values.iter().find(|x| **x != expected) {
+            None => Ok(()),
+            Some(actual) => {
+                let expected = format!("the rig's {expected} Hz; hint: sweep.rate_hz in the rig file");
+                Err(wrong(self.path, "Data.SamplingRate", format!("{actual} Hz"), expected))
+            }
+        }
+    }
+
+    // One microphone and one speaker, each where its listener or source is, and nothing delayed.
+    fn expect_zeros(&self, name: &str) -> Result<(), Error> {
+        let Some(found) = self.variable(name)? else { return Ok(()) };
+        match found.values.iter().find(|x| x.is_nan() || x.abs() > SAME_METRES) {
+            None => Ok(()),
+            Some(actual) => Err(wrong(self.path, name, actual.to_string(), "zeros")),
+        }
+    }
+
+    // Of each measurement.
+    fn temperatures(&self, count: usize, otherwise: Option<Celsius>) -> Result<Vec<Celsius>, Error> {
+        let name = "RoomTemperature";
+        let Some(found) = self.variable(name)? else {
+            let expected = "temperatures; hint: --temperature-c says what it was";
+            return otherwise.map(|c| vec![c; count]).ok_or_else(|| wrong(self.path, name, "it is missing", expected));
+        };
+        let zero = match self.file.text_of(name, "Units").to_ascii_lowercase().as_str() {
+            "kelvin" | "k" | "" => KELVIN,
+            "celsius" | "degree celsius" | "degrees celsius" | "c" => 0.0,
+            other => return Err(wrong(self.path, name, format!("units `{other}`"), "kelvin or degree celsius")),
+        };
+        let rows = self.rows(name, &found, count, 1)?;
+        let celsius = rows.into_iter().map(|row| Celsius::new(to_nano(row[0] - zero)));
+        let checked: Result<Vec<_>, _> = celsius.collect();
+        checked.map_err(|e| wrong(self.path, name, e.to_string(), "a temperature"))
+    }
+
+    // ns since 1970.
+    fn times(&self, count: usize) -> Result<Option<Vec<i64>>, Error> {
+        let name = "MeasurementDate";
+        let Some(found) = self.variable(name)?.filter(|v| v.values.len() == count) else { return Ok(None) };
+        if let Some(bad) = found.values.iter().find(|s| !(0.0..4e9).contains(*s)) {
+            return Err(wrong(self.path, name, bad.to_string(), "seconds since 1970"));
+        }
+        // Zeros are how tools say that they know nothing.
+        let known = found.values.iter().any(|s| *s > 0.0);
+        Ok(known.then(|| found.values.iter().map(|s| (s * 1e9).round() as i64).collect()))
+    }
+
+    fn pairs(&self, count: usize, grid: &Grid) -> Result<Vec<Pair>, Error> {
+        let [microphones, speakers] = ["ListenerPosition", "SourcePosition"].map(|name| self.positions(name, count));
+        let (microphones, speakers) = (microphones?, speakers?);
+        let (mut pairs, mut seen) = (Vec::with_capacity(count), HashSet::new());
+        for row in 0..count {
+            let point = |name: &str, [x, y, z]: [f64; 3]| {
+                let found = grid.parse_point(&format!("{x} {y} {z}"));
+                found.map_err(|e| wrong(self.path, format!("{name}[{row}]"), e.to_string(), "a point of the rig"))
+            };
+            let microphone = point("ListenerPosition", microphones[row])?;
+            let speaker = point("SourcePosition", speakers[row])?;
+            let place = format!("measurement {row}");
+            let PairId(id) = grid
+                .parse_pair(microphone, speaker)
+                .map_err(|e| wrong(self.path, place.clone(), e.to_string(), "a pair of the rig"))?;
+            if !seen.insert(id) {
+                return Err(wrong(self.path, place, "a second response of its pair", "one of each"));
+            }
+            pairs.push(grid.pairs()[id as usize]);
+        }
+        Ok(pairs)
+    }
+
+    // Of each measurement, mm.
+    fn positions(&self, name: &str, count: usize) -> Result<Vec<[f64; 3]>, Error> {
+        let found = self.needed(name)?;
+        let kind = self.file.text_of(name, "Type");
+        let rows = self.rows(name, &found, count, 3)?;
+        let position = |row: &[f64]| -> Option<[f64; 3]> {
+            let [a, b, c] = *row.first_chunk()?;
+            match kind.as_str() {
+                "cartesian" | "" => Some([a, b, c]),
+                // Azimuth and elevation in degrees, then the distance.
+                "spherical" => {
+                    let (azimuth, elevation) = (a.to_radians(), b.to_radians());
+                    let flat = c * elevation.cos();
+                    Some([flat * azimuth.cos(), flat * azimuth.sin(), c * elevation.sin()])
+                }
+                _ => None,
+            }
+        };
+        let metres: Option<Vec<_>> = rows.into_iter().map(position).collect();
+        let metres =
+            metres.ok_or_else(|| wrong(self.path, name, format!("type `{kind}`"), "cartesian or spherical"))?;
+        Ok(metres.into_iter().map(|p| p.map(|m| to_nano(m * 1e3))).collect())
+    }
+
+    // One row a measurement, or the same for all.
+    fn rows<'v>(&self, name: &str, v: &'v Variable, count: usize, width: usize) -> Result<Vec<&'v [f64]>, Error> {
+        let rows: Vec<_> = v.values.chunks_exact(width).collect();
+        match rows.len() {
+            n if n == count && v.values.len() == count * width => Ok(rows),
+            1 if v.values.len() == width => Ok(vec![rows[0]; count]),
+            _ => Err(wrong(self.path, name, format!("{:?}", v.shape), format!("[{count}, {width}] or [1, {width}]"))),
+        }
+    }
+
+    // Others' titles are for people; their files' names must do.
+    fn surface(&self, is_ours: bool) -> Result<SurfaceId, Error> {
+        let stem = self.path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
+        Ok(if is_ours { self.file.text("Title") } else { stem }.parse()?)
+    }
+}
+
+// What it takes to bring a response to the reference temperature.
+fn least_length(rig: &Rig, celsius: Celsius, is_corrected: bool) -> usize {
+    let ratio = resampling_ratio(celsius.get(), rig.impulse_response.reference_temperature_c.get());
+    match rig.impulse_response.length {
+        length if is_corrected || ratio == 1.0 => length,
+        length => TemperatureCorrection::<f64>::input_len_for(length, ratio),
+    }
+}
+
+// What metres or kelvin have behind the ninth place is their conversion's.
+fn to_nano(x: f64) -> f64 {
+    (x * 1e9).round() / 1e9
+}
+
+fn wrong(path: &Path, place: impl Into<String>, actual: impl Into<String>, expected: impl Into<String>) -> Error {
+    Error::Content { path: path.to_owned(), place: place.into(), actual: actual.into(), expected: expected.into() }
+}

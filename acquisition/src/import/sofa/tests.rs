@@ -1,0 +1,192 @@
+//! SOFA files of another make than our export's: what is taken of them, and what is wrong with them by name.
+
+use echolake_schema::topics;
+use prost::Message as _;
+use rust_hdf5::VarLenUnicode;
+
+use super::*;
+
+const LENGTH: usize = 512;
+
+/// Three points, thus three pairs.
+fn rig() -> Rig {
+    let points = "[grid]\npoints_mm = [[0.0, 0.0, 124.0], [150.0, 0.0, 124.0], [0.0, 150.0, 304.0]]\n";
+    Rig::from_toml(&format!("impulse_response.length = 384\n{points}")).expect("a rig")
+}
+
+/// A file's content, to be changed before it is written.
+struct Made {
+    texts: Vec<(&'static str, String)>,
+    /// Name, shape, numbers, attributes.
+    variables: Vec<(&'static str, Vec<usize>, Vec<f64>, Vec<(&'static str, &'static str)>)>,
+}
+
+impl Made {
+    /// Two pairs of the rig, positions of the speaker spherical, times the other way round.
+    fn new() -> Self {
+        let text = |name, value: &str| (name, value.to_owned());
+        let away = 150f64.hypot(124.0) / 1e3;
+        let elevation = 124f64.atan2(150.0).to_degrees();
+        Self {
+            texts: vec![
+                text("Conventions", "SOFA"),
+                text("SOFAConventions", "SingleRoomSRIR"),
+                text("DataType", "FIR"),
+                text("APIName", "somebody"),
+                text("Title", "for people, with spaces"),
+            ],
+            variables: vec![
+                ("Data.IR", vec![2, 1, LENGTH], (0..2 * LENGTH).map(|i| i as f64 / 1e4).collect(), vec![]),
+                ("Data.SamplingRate", vec![1], vec![96_000.0], vec![("Units", "hertz")]),
+                ("Data.Delay", vec![1, 1], vec![0.0], vec![]),
+                ("ListenerPosition", vec![1, 3], vec![0.0, 0.0, 0.124], vec![("Type", "cartesian")]),
+                (
+                    "SourcePosition",
+                    vec![2, 3],
+                    [[0.0, elevation, away], [90.0, 304f64.atan2(150.0).to_degrees(), 150f64.hypot(304.0) / 1e3]]
+                        .concat(),
+                    vec![("Type", "spherical")],
+                ),
+                ("ReceiverPosition", vec![1, 3, 1], vec![0.0; 3], vec![]),
+                ("RoomTemperature", vec![1], vec![294.65], vec![("Units", "kelvin")]),
+                ("MeasurementDate", vec![2], vec![1_767_600_012.0, 1_767_600_000.0], vec![]),
+            ],
+        }
+    }
+
+    fn with(mut self, name: &str, shape: &[usize], values: &[f64]) -> Self {
+        let found = self.variables.iter_mut().find(|v| v.0 == name).expect("a variable");
+        (found.1, found.2) = (shape.to_vec(), values.to_vec());
+        self
+    }
+
+    fn without(mut self, name: &str) -> Self {
+        self.variables.retain(|v| v.0 != name);
+        self
+    }
+
+    fn text(mut self, name: &str, value: &str) -> Self {
+        self.texts.iter_mut().find(|t| t.0 == name).expect("an attribute").1 = value.to_owned();
+        self
+    }
+
+    fn write(&self, path: &Path) {
+        let file = rust_hdf5::H5File::create(path).expect("a file");
+        for (name, value) in &self.texts {
+            file.set_attr_string(name, value).expect("written");
+        }
+        for (name, shape, values, attributes) in &self.variables {
+            let dataset = file.new_dataset::<f64>().shape(shape).create(name).expect("a variable");
+            dataset.write_raw(values).expect("written");
+            for (key, value) in attributes {
+                let attribute = dataset.new_attr::<VarLenUnicode>().shape(()).create(key).expect("an attribute");
+                attribute.write_string(value).expect("written");
+            }
+        }
+        file.close().expect("closed");
+    }
+}
+
+struct Place(tempfile::TempDir);
+
+impl Place {
+    fn new() -> Self {
+        let place = Self(tempfile::tempdir().expect("a folder"));
+        std::fs::create_dir(place.inbox()).expect("a folder");
+        place
+    }
+
+    fn inbox(&self) -> PathBuf {
+        self.0.path().join("inbox")
+    }
+
+    fn import(&self, made: &[(&str, Made)], celsius: Option<f64>) -> Result<Vec<ImportedRun>, Error> {
+        let files: Vec<_> = made
+            .iter()
+            .map(|(name, made)| {
+                let path = self.0.path().join(name);
+                made.write(&path);
+                path
+            })
+            .collect();
+        let (started, inbox) = (Timestamp(1_767_700_000_000_000_000), self.inbox());
+        let options = ImportOptions { started, folder: &inbox };
+        let celsius = celsius.map(|c| Celsius::new(c).expect("a temperature"));
+        import_sofa(&files, &rig(), celsius, options, &mut |_, _| {})
+    }
+}
+
+fn irs(run: &ImportedRun) -> Vec<(u64, ImpulseResponse)> {
+    let file = std::fs::read(&run.path).expect("the run");
+    let messages = mcap::MessageStream::new(&file).expect("an MCAP file").map(|m| m.expect("whole"));
+    let of_irs = messages.filter(|m| m.channel.topic == topics::IR);
+    of_irs.map(|m| (m.log_time, ImpulseResponse::decode(&m.data[..]).expect("a response"))).collect()
+}
+
+#[test]
+fn responses_of_others_come_at_their_own_temperature_and_in_the_order_of_time() {
+    let place = Place::new();
+    let runs = place.import(&[("0007_1.sofa", Made::new())], None).expect("imported");
+    assert_eq!((runs.len(), runs[0].measurements, runs[0].surface.as_str()), (1, 2, "0007_1"));
+    let irs = irs(&runs[0]);
+    assert_eq!(irs.iter().map(|(time, _)| *time / 1_000_000_000).collect::<Vec<_>>(), [1_767_600_000, 1_767_600_012]);
+    // Points 0 and 2, then 0 and 1: as the rig counts its pairs.
+    let grid = rig().grid().expect("a grid");
+    let pair = |speaker: usize| grid.parse_pair(&grid.points()[0], &grid.points()[speaker]).expect("a pair").0;
+    assert_eq!(irs.iter().map(|(_, ir)| ir.pair_id).collect::<Vec<_>>(), [pair(2), pair(1)]);
+    for (number, (_, ir)) in irs.iter().enumerate() {
+        assert_eq!((ir.temperature_c, ir.temperature_corrected), (21.5, false));
+        let first = (1 - number) * LENGTH;
+        let expected: Vec<f32> = (first..first + LENGTH).map(|i| (i as f64 / 1e4) as f32).collect();
+        assert_eq!(ir.samples, expected);
+    }
+}
+
+#[test]
+fn what_a_file_does_not_tell_is_made_up_or_asked_for() {
+    let place = Place::new();
+    let silent = || Made::new().without("MeasurementDate").without("RoomTemperature").without("Data.Delay");
+    let error = place.import(&[("a.sofa", silent())], None).expect_err("no temperature").to_string();
+    assert!(error.contains("RoomTemperature") && error.contains("--temperature-c"), "{error}");
+    let runs = place.import(&[("b.sofa", silent())], Some(18.0)).expect("imported");
+    let irs = irs(&runs[0]);
+    assert!(irs[0].0 < irs[1].0 && irs[0].0 >= 1_767_700_000_000_000_000);
+    assert_eq!(irs[0].1.temperature_c, 18.0);
+}
+
+#[test]
+fn what_is_wrong_is_named_and_nothing_is_left() {
+    let refused = |made: Made, expected: &str| {
+        let place = Place::new();
+        // The first file is good: it must not be left behind alone.
+        let error = place.import(&[("good.sofa", Made::new()), ("b.sofa", made)], None).expect_err(expected);
+        let error = error.to_string();
+        assert!(error.contains(expected) && error.contains("b.sofa"), "{error}");
+        assert_eq!(std::fs::read_dir(place.inbox()).expect("a folder").count(), 0, "{expected}");
+    };
+    refused(
+        Made::new().text("SOFAConventions", "SimpleFreeFieldHRIR"),
+        "`SimpleFreeFieldHRIR`, expected `SingleRoomSRIR`",
+    );
+    refused(Made::new().text("DataType", "TF"), "expected `FIR`");
+    refused(Made::new().without("Data.IR"), "Data.IR: it is missing");
+    refused(Made::new().with("Data.IR", &[2, 2, LENGTH], &vec![0.0; 4 * LENGTH]), "1 receiver");
+    refused(Made::new().with("Data.IR", &[2, 1, 100], &[0.0; 200]), "100 samples");
+    let mut broken = vec![0.0; 2 * LENGTH];
+    broken[LENGTH + 7] = f64::NAN;
+    refused(Made::new().with("Data.IR", &[2, 1, LENGTH], &broken), "Data.IR[1, 0, 7]");
+    refused(Made::new().with("Data.SamplingRate", &[1], &[48_000.0]), "48000 Hz, expected the rig's 96000 Hz");
+    refused(Made::new().with("Data.Delay", &[1, 1], &[12.0]), "Data.Delay: 12");
+    refused(Made::new().with("ReceiverPosition", &[1, 3, 1], &[0.0, 0.09, 0.0]), "ReceiverPosition: 0.09");
+    refused(Made::new().with("ListenerPosition", &[1, 3], &[0.0, 0.0, 0.2]), "the nearest is");
+    refused(Made::new().with("ListenerPosition", &[5, 3], &[0.0; 15]), "[5, 3], expected [2, 3] or [1, 3]");
+    let same = [0.0, 124f64.atan2(150.0).to_degrees(), 150f64.hypot(124.0) / 1e3];
+    refused(Made::new().with("SourcePosition", &[1, 3], &same), "a second response of its pair");
+    refused(Made::new().with("RoomTemperature", &[1], &[20.0]), "RoomTemperature");
+    refused(Made::new().with("MeasurementDate", &[2], &[-1.0, 1.0]), "seconds since 1970");
+    let place = Place::new();
+    let path = place.0.path().join("text.sofa");
+    std::fs::write(&path, "no HDF5 at all").expect("written");
+    let error = check_sofa(&[path], &rig(), None).expect_err("text").to_string();
+    assert!(error.contains("no HDF5 file") && error.contains("text.sofa"), "{error}");
+}

@@ -1,0 +1,85 @@
+//! The time of a replay: goes on at its speed, stands, is put elsewhere.
+
+use std::time::{Duration, Instant};
+
+/// Slower is paused, faster is more than any disk gives.
+const SPEEDS: (f32, f32) = (0.01, 1e6);
+
+/// A clock that shows the time of what is played, ns since 1970.
+#[derive(Debug)]
+pub(super) struct Clock {
+    /// What it showed when it was last set, stopped or started.
+    shown: u64,
+    /// Since when it goes; nothing where it stands.
+    since: Option<Instant>,
+    speed: f32,
+}
+
+impl Clock {
+    /// Stands at a time.
+    pub(super) fn new(at: u64, speed: f32) -> Self {
+        Self { shown: at, since: None, speed: speed.clamp(SPEEDS.0, SPEEDS.1) }
+    }
+
+    pub(super) fn now(&self) -> u64 {
+        let gone = self.since.map_or(0.0, |since| since.elapsed().as_nanos() as f64 * f64::from(self.speed));
+        self.shown.saturating_add(gone as u64)
+    }
+
+    pub(super) fn speed(&self) -> f32 {
+        self.speed
+    }
+
+    /// Puts it to a time; it goes on, if it went.
+    pub(super) fn set(&mut self, at: u64) {
+        self.shown = at;
+        self.since = self.since.map(|_| Instant::now());
+    }
+
+    /// Changes its speed; what is no speed changes nothing.
+    pub(super) fn set_speed(&mut self, speed: f32) {
+        if speed.is_finite() && speed > 0.0 {
+            self.set(self.now());
+            self.speed = speed.clamp(SPEEDS.0, SPEEDS.1);
+        }
+    }
+
+    /// Lets it go or stand.
+    pub(super) fn go(&mut self, goes: bool) {
+        if goes != self.since.is_some() {
+            self.shown = self.now();
+            self.since = goes.then(Instant::now);
+        }
+    }
+
+    /// How long it takes until it shows a time.
+    pub(super) fn until(&self, at: u64) -> Duration {
+        Duration::from_secs_f64(at.saturating_sub(self.now()) as f64 / 1e9 / f64::from(self.speed))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn it_stands_goes_and_is_put_elsewhere() {
+        let mut clock = Clock::new(1_000, 1e9);
+        assert_eq!(clock.speed(), SPEEDS.1);
+        assert_eq!(clock.now(), 1_000);
+        clock.go(true);
+        std::thread::sleep(Duration::from_millis(2));
+        assert!(clock.now() >= 1_000 + 2_000_000 * 1_000_000);
+        clock.go(false);
+        let stood = clock.now();
+        assert_eq!(clock.now(), stood);
+        clock.set(5);
+        for speed in [f32::NAN, f32::INFINITY, 0.0, -1.0] {
+            clock.set_speed(speed);
+            assert_eq!(clock.speed(), SPEEDS.1, "{speed} is no speed");
+        }
+        clock.set_speed(2.0);
+        assert_eq!((clock.now(), clock.until(2_000_000_005)), (5, Duration::from_secs(1)));
+        assert_eq!(clock.until(0), Duration::ZERO);
+    }
+}

@@ -1,0 +1,133 @@
+//! The messages of a recording in the order of time, from anywhere in it. In memory are the chunks that overlap where it
+//! stands, and of these what is wanted.
+
+use std::collections::{BTreeMap, BTreeSet, VecDeque};
+
+use super::recording::{Key, Message, Recording};
+
+/// Bytes of messages in memory at most: of a file whose chunks all overlap, no order could be given.
+const OVERLAP: usize = 512 << 20;
+
+/// Damage that was met: where in the file, and what it is.
+pub(super) type Damage = (u64, String);
+
+/// A place in a recording.
+#[derive(Debug, Default)]
+pub(super) struct Cursor {
+    wanted: BTreeSet<u16>,
+    /// What was given out, or lies before where it was put.
+    passed: Key,
+    next_chunk: usize,
+    open: Vec<VecDeque<Message>>,
+    bytes: usize,
+}
+
+impl Cursor {
+    /// Right behind `passed`, with these of the file's channels.
+    pub(super) fn behind(passed: Key, wanted: BTreeSet<u16>) -> Self {
+        Self { wanted, passed, ..Self::default() }
+    }
+
+    /// Where it stands.
+    pub(super) fn passed(&self) -> Key {
+        self.passed
+    }
+
+    /// All up to this place was given out, or is not wanted.
+    pub(super) fn pass(&mut self, upto: Key) {
+        self.passed = self.passed.max(upto);
+    }
+
+    /// The time of the next message; None behind the last.
+    pub(super) fn peek(&mut self, recording: &mut Recording, damages: &mut Vec<Damage>) -> Option<u64> {
+        self.fill(recording, damages);
+        self.first().map(|(_, key)| key.0)
+    }
+
+    /// The next message, where one was seen.
+    pub(super) fn pop(&mut self) -> Option<Message> {
+        let (at, key) = self.first()?;
+        let message = self.open[at].pop_front()?;
+        if self.open[at].is_empty() {
+            self.open.swap_remove(at);
+        }
+        self.bytes -= message.data.len();
+        self.passed = key;
+        Some(message)
+    }
+
+    fn first(&self) -> Option<(usize, Key)> {
+        let heads = self.open.iter().enumerate().filter_map(|(at, chunk)| Some((at, chunk.front()?.key)));
+        heads.min_by_key(|(_, key)| *key)
+    }
+
+    // Opens chunks until none that is closed can have an earlier message than the next.
+    fn fill(&mut self, recording: &mut Recording, damages: &mut Vec<Damage>) {
+        while let Some(chunk) = recording.chunks.get(self.next_chunk) {
+            if self.first().is_some_and(|(_, key)| key.0 < chunk.start) {
+                return;
+            }
+            self.next_chunk += 1;
+            if chunk.end < self.passed.0 || !chunk.has_any(&self.wanted) {
+                continue;
+            }
+            let chunk = chunk.clone();
+            match recording.messages(&chunk, &self.wanted) {
+                Ok(messages) => {
+                    let ahead: VecDeque<_> = messages.into_iter().filter(|m| m.key > self.passed).collect();
+                    let bytes: usize = ahead.iter().map(|m| m.data.len()).sum();
+                    if self.bytes + bytes > OVERLAP {
+                        let what = format!("its chunks overlap by more than {OVERLAP} bytes; hint: sort it by time");
+                        damages.push((chunk.offset, what));
+                    } else if !ahead.is_empty() {
+                        self.bytes += bytes;
+                        self.open.push(ahead);
+                    }
+                }
+                Err(what) => damages.push((chunk.offset, what)),
+            }
+        }
+    }
+}
+
+/// Where things stand at a place: of each channel the messages of its latest time up to there, by time.
+pub(super) fn standing(
+    recording: &mut Recording,
+    upto: Key,
+    channels: &BTreeSet<u16>,
+    damages: &mut Vec<Damage>,
+) -> Vec<Message> {
+    let mut found: BTreeMap<u16, Vec<Message>> = BTreeMap::new();
+    let mut chunks: Vec<_> = recording.chunks.iter().filter(|c| c.start <= upto.0).cloned().collect();
+    // From what reaches farthest; a chunk that ends before what is known cannot know better.
+    chunks.sort_by_key(|c| std::cmp::Reverse((c.end.min(upto.0), c.start, c.offset)));
+    for chunk in chunks {
+        let open: BTreeSet<u16> = channels
+            .iter()
+            .copied()
+            .filter(|c| found.get(c).and_then(|m| m.last()).is_none_or(|m| m.key.0 <= chunk.end))
+            .collect();
+        if open.is_empty() {
+            break;
+        }
+        if !chunk.has_any(&open) {
+            continue;
+        }
+        let messages = recording.messages(&chunk, &open).unwrap_or_else(|what| {
+            damages.push((chunk.offset, what));
+            Vec::new()
+        });
+        for message in messages.into_iter().filter(|m| m.key <= upto) {
+            let known = found.entry(message.channel).or_default();
+            let at = known.last().map(|m| m.key.0);
+            match at {
+                Some(at) if at > message.key.0 => {}
+                Some(at) if at == message.key.0 => known.push(message),
+                _ => *known = vec![message],
+            }
+        }
+    }
+    let mut all: Vec<_> = found.into_values().flatten().collect();
+    all.sort_by_key(|m| m.key);
+    all
+}

@@ -1,0 +1,332 @@
+//! Plays recordings: sends each message when its time has come, and obeys those who look on.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::sync::mpsc::{Receiver, RecvTimeoutError};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::Duration;
+
+use super::clock::Clock;
+use super::cursor::{Cursor, Damage, standing};
+use super::recording::{Key, Recording};
+use super::{ReplayOptions, Standing};
+use crate::recorder::Topic;
+use crate::viewer::{Command, PlaybackRequest, PlaybackState, PlaybackStatus, Queue, Shared, Waiting};
+
+/// Clients are told the time so often.
+const TICK: Duration = Duration::from_millis(33);
+/// How long it waits for clients that have enough to read.
+const BREATH: Duration = Duration::from_millis(3);
+/// Messages between two looks at what clients want.
+const STRIDE: usize = 256;
+
+/// Length of a recording, s.
+pub(super) fn secs(recording: &Recording) -> f64 {
+    (recording.range().1 - recording.range().0) as f64 / 1e9
+}
+
+/// The topics of all recordings, each once.
+pub(super) struct Topics {
+    /// With the channels that clients know.
+    pub(super) all: Vec<Topic>,
+    /// Of each recording: the clients' channel by the file's.
+    of: Vec<BTreeMap<u16, u16>>,
+}
+
+impl Topics {
+    /// None where there are more than channels.
+    pub(super) fn of(recordings: &[Recording]) -> Option<Self> {
+        let (mut all, mut of) = (Vec::<Topic>::new(), Vec::new());
+        for recording in recordings {
+            let mut channels = BTreeMap::new();
+            for (id, topic) in &recording.topics {
+                let same = |known: &Topic| Topic { channel: known.channel, ..topic.clone() } == *known;
+                let channel = match all.iter().find(|known| same(known)) {
+                    Some(known) => known.channel,
+                    None => {
+                        let channel = u16::try_from(all.len() + 1).ok()?;
+                        all.push(Topic { channel, ..topic.clone() });
+                        channel
+                    }
+                };
+                channels.insert(*id, channel);
+            }
+            of.push(channels);
+        }
+        Some(Self { all, of })
+    }
+}
+
+/// A player.
+pub(super) struct Player {
+    recordings: Vec<Recording>,
+    topics: Topics,
+    shared: Arc<Shared>,
+    told: Arc<Mutex<Standing>>,
+    clock: Clock,
+    status: PlaybackStatus,
+    /// The recording that is played.
+    number: usize,
+    cursor: Cursor,
+    /// What was wanted when the cursor was made.
+    wishes: u64,
+    /// Damage that is known.
+    damaged: BTreeSet<(usize, u64)>,
+}
+
+impl Player {
+    pub(super) fn new(
+        recordings: Vec<Recording>,
+        topics: Topics,
+        options: ReplayOptions,
+        shared: Arc<Shared>,
+        told: Arc<Mutex<Standing>>,
+    ) -> Self {
+        let start = recordings.first().map_or(0, |r| r.range().0);
+        let status = if options.paused { PlaybackStatus::Paused } else { PlaybackStatus::Playing };
+        Self {
+            recordings,
+            topics,
+            shared,
+            told,
+            clock: Clock::new(start, options.speed),
+            status,
+            number: 0,
+            cursor: Cursor::behind(at_all_of(start), BTreeSet::new()),
+            wishes: 0,
+            damaged: BTreeSet::new(),
+        }
+    }
+
+    /// Plays until the server has ended.
+    pub(super) fn run(mut self, commands: &Receiver<Command>) {
+        while !self.shared.has_ended() {
+            let wait = self.step();
+            self.tell();
+            match commands.recv_timeout(wait) {
+                Ok(first) => self.obey([first].into_iter().chain(commands.try_iter()).collect()),
+                Err(RecvTimeoutError::Timeout) => {}
+                Err(RecvTimeoutError::Disconnected) => return,
+            }
+        }
+    }
+
+    // Sends what is due; returns how long nothing more is.
+    fn step(&mut self) -> Duration {
+        self.keep_to_wishes();
+        let is_watched = !self.shared.wanted().is_empty();
+        self.clock.go(self.status == PlaybackStatus::Playing && is_watched);
+        if self.status != PlaybackStatus::Playing || !is_watched {
+            return TICK;
+        }
+        for _ in 0..STRIDE {
+            let Some(next) = self.peek() else { return self.end_recording() };
+            if next > self.clock.now() {
+                return self.wait_for(next);
+            }
+            if self.shared.all_are_busy() {
+                // What comes later comes later; nobody is flooded to catch up.
+                self.clock.set(next);
+                return BREATH;
+            }
+            if let Some(message) = self.cursor.pop()
+                && let Some(channel) = self.topics.of[self.number].get(&message.channel)
+            {
+                self.shared.send(*channel, message.key.0, &message.data, false);
+            }
+        }
+        self.tell_time();
+        Duration::ZERO
+    }
+
+    fn peek(&mut self) -> Option<u64> {
+        let mut damages = Vec::new();
+        let next = self.cursor.peek(&mut self.recordings[self.number], &mut damages);
+        self.note(damages);
+        next
+    }
+
+    // On to the next recording, or to the end; what is wanted of this one is over before it is.
+    fn end_recording(&mut self) -> Duration {
+        let end = self.recordings[self.number].range().1;
+        if self.clock.now() < end {
+            return self.wait_for(end);
+        }
+        if self.number + 1 < self.recordings.len() {
+            self.number += 1;
+            let start = self.recordings[self.number].range().0;
+            self.put(start);
+            self.tell_state(true, String::new());
+            self.show_to(&self.shared.clients());
+        } else {
+            self.clock.set(end);
+            self.clock.go(false);
+            self.status = PlaybackStatus::Ended;
+            self.tell_state(false, String::new());
+        }
+        TICK.min(BREATH)
+    }
+
+    // Nothing is due before a time.
+    fn wait_for(&mut self, next: u64) -> Duration {
+        // Who subscribes now is shown what is now.
+        let now = self.clock.now().min(next.saturating_sub(1));
+        self.cursor.pass(at_all_of(now));
+        self.tell_time();
+        self.clock.until(next).min(TICK)
+    }
+
+    fn put(&mut self, time: u64) {
+        self.clock.set(time);
+        self.wishes = self.shared.wishes();
+        self.cursor = Cursor::behind(at_all_of(time), self.wanted());
+    }
+
+    // Channels of the file that somebody wants.
+    fn wanted(&self) -> BTreeSet<u16> {
+        let wanted = self.shared.wanted();
+        self.topics.of[self.number].iter().filter(|(_, to)| wanted.contains(to)).map(|(from, _)| *from).collect()
+    }
+
+    fn keep_to_wishes(&mut self) {
+        let wishes = self.shared.wishes();
+        if wishes != self.wishes {
+            self.wishes = wishes;
+            self.cursor = Cursor::behind(self.cursor.passed(), self.wanted());
+        }
+    }
+
+    fn obey(&mut self, commands: Vec<Command>) {
+        let mut new: Vec<(Arc<Queue>, BTreeSet<u16>)> = Vec::new();
+        let seeks = |c: &Command| matches!(c, Command::Playback(request) if request.seek.is_some());
+        // Who drags a slider seeks faster than anything can be shown.
+        let mut seeks_left = commands.iter().filter(|c| seeks(c)).count();
+        for command in commands {
+            seeks_left -= usize::from(seeks(&command));
+            match command {
+                Command::Subscribed(queue, wanted) => match new.iter_mut().find(|(q, _)| Arc::ptr_eq(q, &queue)) {
+                    Some((_, channels)) => channels.extend(wanted),
+                    None => new.push((queue, wanted)),
+                },
+                Command::Playback(request) => self.control(request, seeks_left == 0),
+            }
+        }
+        for (queue, mut channels) in new {
+            channels.retain(|channel| !queue.receives(*channel));
+            self.show(&[(queue, channels)]);
+        }
+    }
+
+    fn control(&mut self, request: PlaybackRequest, is_shown: bool) {
+        // The next step lets it go again; the answer is of now.
+        self.clock.go(false);
+        if let Some(time) = request.seek {
+            self.seek(time);
+        }
+        self.clock.set_speed(request.speed);
+        // Behind the end there is only seeking.
+        if self.status != PlaybackStatus::Ended {
+            self.status = if request.plays { PlaybackStatus::Playing } else { PlaybackStatus::Paused };
+        }
+        let did_seek = request.seek.is_some();
+        let clients = self.shared.clients();
+        if did_seek {
+            clients.iter().for_each(|client| client.forget());
+        }
+        self.tell_state(did_seek, request.id);
+        if did_seek && is_shown {
+            self.show_to(&clients);
+            self.tell_time();
+        }
+    }
+
+    // To a time in this recording, or in the first that ends behind it; where none is of that time, to its beginning.
+    fn seek(&mut self, time: u64) {
+        let here = self.recordings[self.number].range();
+        if !(here.0..=here.1).contains(&time) {
+            let found = self.recordings.iter().position(|r| time <= r.range().1);
+            self.number = found.unwrap_or(self.recordings.len() - 1);
+        }
+        let (start, end) = self.recordings[self.number].range();
+        self.put(time.clamp(start, end));
+        if self.status == PlaybackStatus::Ended {
+            self.status = PlaybackStatus::Paused;
+        }
+    }
+
+    // Shows clients where all stands that they want.
+    fn show_to(&mut self, clients: &[Arc<Queue>]) {
+        let all: Vec<_> = clients.iter().map(|c| (c.clone(), c.wanted().into_iter().collect())).collect();
+        self.show(&all);
+    }
+
+    fn show(&mut self, to: &[(Arc<Queue>, BTreeSet<u16>)]) {
+        let channels = &self.topics.of[self.number];
+        let asked = |to_channel: &u16| to.iter().any(|(_, wanted)| wanted.contains(to_channel));
+        let of_file = channels.iter().filter(|(_, to)| asked(to)).map(|(from, _)| *from).collect();
+        let mut damages = Vec::new();
+        let messages = standing(&mut self.recordings[self.number], self.cursor.passed(), &of_file, &mut damages);
+        let known: Vec<Waiting> = messages
+            .into_iter()
+            .filter_map(|m| {
+                let channel = *channels.get(&m.channel)?;
+                Some(Waiting { channel, log_time_nanos: m.key.0, data: m.data.into() })
+            })
+            .collect();
+        for (queue, wanted) in to {
+            self.shared.prime(queue, wanted, &known);
+        }
+        self.note(damages);
+    }
+
+    fn current_time(&self) -> u64 {
+        let (start, end) = self.recordings[self.number].range();
+        self.clock.now().clamp(start, end)
+    }
+
+    fn tell_time(&self) {
+        let time = self.current_time();
+        self.shared.clients().iter().for_each(|client| client.tell_time(time));
+    }
+
+    fn tell_state(&self, did_seek: bool, request_id: String) {
+        let state = PlaybackState {
+            status: self.status,
+            current_time: self.current_time(),
+            speed: self.clock.speed(),
+            did_seek,
+            request_id,
+        };
+        self.shared.clients().iter().for_each(|client| client.tell_state(state.encode()));
+    }
+
+    // What is behind the replay's own interface.
+    fn tell(&self) {
+        let recording = &self.recordings[self.number];
+        let before: f64 = self.recordings[..self.number].iter().map(secs).sum();
+        let within = (self.current_time() - recording.range().0) as f64 / 1e9;
+        let (viewers, lost) = (self.shared.clients().len(), self.shared.lost());
+        let mut told = self.told.lock().unwrap_or_else(PoisonError::into_inner);
+        if told.recording != recording.path() {
+            told.recording = recording.path().to_owned();
+        }
+        told.shown_secs = before + within;
+        told.is_playing = self.status == PlaybackStatus::Playing;
+        told.speed = self.clock.speed();
+        (told.viewers, told.lost) = (viewers, lost);
+    }
+
+    fn note(&mut self, damages: Vec<Damage>) {
+        for (offset, what) in damages {
+            if self.damaged.insert((self.number, offset)) {
+                let path = self.recordings[self.number].path().display();
+                let line = format!("`{path}` is damaged at byte {offset}: {what}; what stands there is left out");
+                self.told.lock().unwrap_or_else(PoisonError::into_inner).damages.push(line);
+            }
+        }
+    }
+}
+
+// Behind all messages of a time.
+fn at_all_of(time: u64) -> Key {
+    (time, u64::MAX, u32::MAX)
+}

@@ -1,0 +1,236 @@
+//! A recording as a replay reads it: its index in memory, its chunks one at a time.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::fs::File;
+use std::io::{Read as _, Seek as _, SeekFrom};
+use std::path::{Path, PathBuf};
+
+use mcap::records::{ChunkIndex, Record};
+use mcap::sans_io::{SummaryReadEvent, SummaryReader, SummaryReaderOptions};
+use mcap::{Channel, Summary};
+
+use super::error::Error;
+use crate::recorder::Topic;
+use crate::recovery::{self, Item, Walk};
+
+/// Opcode and length in front of every record.
+const FRAME: u64 = 9;
+/// Largest chunk that is read, packed or not.
+const LARGEST: u64 = 256 << 20;
+
+/// An MCAP file that can be replayed.
+pub struct Recording {
+    path: PathBuf,
+    file: File,
+    /// By channel of the file.
+    pub(super) topics: BTreeMap<u16, Topic>,
+    /// Those with messages, by the time of their first.
+    pub(super) chunks: Vec<Stretch>,
+    /// First and last time, ns since 1970.
+    pub(super) range: (u64, u64),
+    defect: Option<String>,
+}
+
+/// What is known of a chunk without reading it.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(super) struct Stretch {
+    pub(super) start: u64,
+    pub(super) end: u64,
+    pub(super) offset: u64,
+    pub(super) length: u64,
+    /// Nothing where the index does not tell.
+    channels: Option<BTreeSet<u16>>,
+}
+
+/// Where a message stands in the order of a recording: its time, its chunk, its place there.
+pub(super) type Key = (u64, u64, u32);
+
+/// A message of a recording.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(super) struct Message {
+    pub(super) key: Key,
+    pub(super) channel: u16,
+    pub(super) data: Vec<u8>,
+}
+
+impl Recording {
+    /// Opens a file and reads its index. One without, because it was cut off, is walked through, and what is whole of it
+    /// is replayed.
+    ///
+    /// # Errors
+    /// [`Error::Read`], or [`Error::Unplayable`] where there is not one whole message.
+    pub fn open(path: &Path) -> Result<Self, Error> {
+        let unread = |source| Error::Read { path: path.to_owned(), source };
+        let mut file = File::open(path).map_err(unread)?;
+        let summary = match summary(&mut file) {
+            Ok(found) => found.filter(|s| !s.chunk_indexes.is_empty()),
+            Err(Unread::System(source)) => return Err(unread(source)),
+            // The walk says what is wrong.
+            Err(Unread::Damaged) => None,
+        };
+        let (topics, mut chunks, defect) = match summary {
+            Some(summary) => {
+                let chunks = summary.chunk_indexes.iter().filter_map(Stretch::of_index).collect();
+                (topics_of(summary.channels.values().map(|c| c.as_ref())), chunks, None)
+            }
+            None => walked(path)?,
+        };
+        chunks.sort_by_key(|c: &Stretch| (c.start, c.offset));
+        let range = chunks.first().map(|first| (first.start, chunks.iter().map(|c| c.end).fold(first.end, u64::max)));
+        let Some(range) = range else {
+            let reason = match defect {
+                Some(defect) => format!("{defect}, and nothing before it is whole"),
+                None => {
+                    "it has no chunks with messages; hint: files without chunks are to be rewritten with".to_owned()
+                }
+            };
+            return Err(Error::Unplayable { path: path.to_owned(), reason });
+        };
+        Ok(Self { path: path.to_owned(), file, topics, chunks, range, defect })
+    }
+
+    /// Where it is.
+    pub fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// What is wrong with it as a whole, in words; damage within it shows when it is played.
+    pub fn defect(&self) -> Option<&str> {
+        self.defect.as_deref()
+    }
+
+    /// First and last time, ns since 1970.
+    pub fn range(&self) -> (u64, u64) {
+        self.range
+    }
+
+    /// The messages of a chunk by their time, of some channels; in words where it is damaged.
+    pub(super) fn messages(&mut self, chunk: &Stretch, channels: &BTreeSet<u16>) -> Result<Vec<Message>, String> {
+        let body = self.body(chunk)?;
+        // What it unpacks to stands behind its two times.
+        let unpacked = body.get(16..24).and_then(|b| b.try_into().ok()).map_or(0, u64::from_le_bytes);
+        if unpacked > LARGEST {
+            return Err(format!("a chunk of {unpacked} bytes, more than {LARGEST}"));
+        }
+        let mut messages = Vec::new();
+        for (place, record) in (0..).zip(recovery::chunk(&body)?) {
+            if let Record::Message { header, data } = record
+                && channels.contains(&header.channel_id)
+            {
+                let key = (header.log_time, chunk.offset, place);
+                messages.push(Message { key, channel: header.channel_id, data: data.into_owned() });
+            }
+        }
+        messages.sort_by_key(|m| m.key);
+        Ok(messages)
+    }
+
+    fn body(&mut self, chunk: &Stretch) -> Result<Vec<u8>, String> {
+        if !(FRAME..=LARGEST).contains(&chunk.length) {
+            return Err(format!("a chunk of {} bytes", chunk.length));
+        }
+        let mut body = vec![0; (chunk.length - FRAME) as usize];
+        let read = self.file.seek(SeekFrom::Start(chunk.offset.saturating_add(FRAME)));
+        read.and_then(|_| self.file.read_exact(&mut body)).map_err(|e| e.to_string())?;
+        Ok(body)
+    }
+}
+
+impl Stretch {
+    fn of_index(index: &ChunkIndex) -> Option<Self> {
+        let (start, end) = (index.message_start_time, index.message_end_time);
+        let channels: BTreeSet<u16> = index.message_index_offsets.keys().copied().collect();
+        // That is how a chunk without messages looks.
+        let is_empty = channels.is_empty() && start == 0 && end == 0;
+        let channels = Some(channels).filter(|c| !c.is_empty());
+        let (offset, length) = (index.chunk_start_offset, index.chunk_length);
+        (!is_empty && start <= end).then_some(Self { start, end, offset, length, channels })
+    }
+
+    /// Whether it may have messages of one of these channels.
+    pub(super) fn has_any(&self, channels: &BTreeSet<u16>) -> bool {
+        self.channels.as_ref().is_none_or(|has| !has.is_disjoint(channels))
+    }
+}
+
+/// Why a summary is not read.
+enum Unread {
+    System(std::io::Error),
+    Damaged,
+}
+
+fn summary(file: &mut File) -> Result<Option<Summary>, Unread> {
+    let options = SummaryReaderOptions::default().with_record_length_limit(LARGEST as usize);
+    let mut reader = SummaryReader::new_with_options(options);
+    while let Some(event) = reader.next_event() {
+        match event.map_err(|_| Unread::Damaged)? {
+            SummaryReadEvent::SeekRequest(to) => {
+                // An offset that no file has is damage.
+                let at = file.seek(to).map_err(|_| Unread::Damaged)?;
+                reader.notify_seeked(at);
+            }
+            SummaryReadEvent::ReadRequest(count) => {
+                let read = file.read(reader.insert(count)).map_err(Unread::System)?;
+                reader.notify_read(read);
+            }
+        }
+    }
+    Ok(reader.finish())
+}
+
+type Walked = (BTreeMap<u16, Topic>, Vec<Stretch>, Option<String>);
+
+// The index of a file that has none.
+fn walked(path: &Path) -> Result<Walked, Error> {
+    let unplayable = |e: recovery::Error| match e {
+        recovery::Error::Read { path, source } => Error::Read { path, source },
+        recovery::Error::Headless { path, reason } => Error::Unplayable { path, reason },
+        other => Error::Unplayable { path: path.to_owned(), reason: other.to_string() },
+    };
+    let mut walk = Walk::open(path).map_err(unplayable)?;
+    let (mut schemas, mut topics, mut chunks) = (BTreeMap::new(), BTreeMap::new(), Vec::new());
+    while let Some(item) = walk.next().map_err(unplayable)? {
+        let Item::Chunk(records) = item else { continue };
+        let (mut times, mut channels) = (Vec::new(), BTreeSet::new());
+        for record in records {
+            match record {
+                Record::Schema { header, data } => drop(schemas.insert(header.id, (header, data.into_owned()))),
+                Record::Channel(channel) => {
+                    let schema = schemas.get(&channel.schema_id);
+                    topics.entry(channel.id).or_insert_with(|| Topic {
+                        channel: channel.id,
+                        topic: channel.topic,
+                        encoding: channel.message_encoding,
+                        schema: schema.map(|(h, _)| h.name.clone()).unwrap_or_default(),
+                        schema_encoding: schema.map(|(h, _)| h.encoding.clone()).unwrap_or_default(),
+                        schema_data: schema.map(|(_, data)| data.clone()).unwrap_or_default(),
+                    });
+                }
+                Record::Message { header, .. } => {
+                    times.push(header.log_time);
+                    channels.insert(header.channel_id);
+                }
+                _ => {}
+            }
+        }
+        if let (Some(start), Some(end)) = (times.iter().copied().min(), times.iter().copied().max()) {
+            let (offset, length) = (walk.item, walk.verified - walk.item);
+            chunks.push(Stretch { start, end, offset, length, channels: Some(channels) });
+        }
+    }
+    // What was closed, yet has no chunks, is of another make, not damaged.
+    let defect = walk.defect.take().or_else(|| (!chunks.is_empty()).then(|| "it has no index".to_owned()));
+    Ok((topics, chunks, defect))
+}
+
+fn topics_of<'a>(channels: impl Iterator<Item = &'a Channel<'static>>) -> BTreeMap<u16, Topic> {
+    let topic = |channel: &Channel<'_>| Topic {
+        channel: channel.id,
+        topic: channel.topic.clone(),
+        encoding: channel.message_encoding.clone(),
+        schema: channel.schema.as_ref().map(|s| s.name.clone()).unwrap_or_default(),
+        schema_encoding: channel.schema.as_ref().map(|s| s.encoding.clone()).unwrap_or_default(),
+        schema_data: channel.schema.as_ref().map(|s| s.data.to_vec()).unwrap_or_default(),
+    };
+    channels.map(|channel| (channel.id, topic(channel))).collect()
+}

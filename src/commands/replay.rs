@@ -1,0 +1,118 @@
+//! `echolake replay`: runs shown again to Foxglove, as fast and from where its user likes.
+
+use std::path::{Path, PathBuf};
+use std::sync::atomic::Ordering;
+use std::time::Duration;
+
+use anyhow::Context as _;
+use echolake_acquisition::replay::{Recording, ReplayOptions, ReplayServer, Standing};
+use echolake_lake::Lake;
+use echolake_schema::{RunId, SurfaceId};
+
+use crate::Done;
+use crate::cli::ReplayArgs;
+use crate::progress::{Progress, Task};
+
+/// How often it is looked how the replay stands.
+const LOOK_EVERY: Duration = Duration::from_millis(200);
+/// Names that an error lists.
+const LISTED: usize = 20;
+
+pub(crate) async fn run(args: &ReplayArgs, lake_url: &str) -> anyhow::Result<Done> {
+    let paths = paths(&args.runs, lake_url).await?;
+    let stop = super::stop_on_interrupt();
+    let progress = Progress::new();
+    let opened = tokio::task::block_in_place(|| paths.iter().map(|path| Recording::open(path)).collect::<Vec<_>>());
+    let (mut recordings, mut lost) = (Vec::new(), false);
+    for recording in opened {
+        match recording {
+            Ok(recording) => {
+                if let Some(defect) = recording.defect() {
+                    lost = true;
+                    let path = recording.path().display();
+                    progress.say(format!("warning: `{path}` is not whole: {defect}; what is whole of it is shown"));
+                }
+                recordings.push(recording);
+            }
+            Err(error) => {
+                lost = true;
+                progress.say(format!("error: {:#}", anyhow::Error::from(error)));
+            }
+        }
+    }
+    anyhow::ensure!(!recordings.is_empty(), "none of the recordings can be replayed");
+    recordings.sort_by_key(|recording| recording.range().0);
+    for pair in recordings.windows(2).filter(|pair| pair[1].range().0 <= pair[0].range().1) {
+        let [earlier, later] = [&pair[0], &pair[1]].map(|recording| recording.path().display());
+        progress.say(format!("warning: `{later}` begins before `{earlier}` ends; time goes back between them"));
+    }
+    let count = recordings.len();
+    let options = ReplayOptions { speed: args.speed, paused: args.paused };
+    let server = ReplayServer::start(args.listen, recordings, options)?;
+    let address = server.address().unwrap_or(args.listen);
+    progress.say(format!("replay: open ws://{address} in Foxglove or Lichtblick; Ctrl-C ends it"));
+    if !address.ip().is_loopback() {
+        progress.say("warning: whoever reaches this address can look on");
+    }
+    let mut task = progress.task("replay", server.length_secs().ceil() as u64, "s");
+    let mut said = 0;
+    while !stop.load(Ordering::Relaxed) {
+        tokio::time::sleep(LOOK_EVERY).await;
+        let standing = server.standing();
+        show(&mut task, &standing, &mut said);
+    }
+    let standing = server.standing();
+    show(&mut task, &standing, &mut said);
+    tokio::task::block_in_place(|| drop(server));
+    task.done(format!("{count} recordings, {:.0} s shown last", standing.shown_secs));
+    Ok(if lost || !standing.damages.is_empty() { Done::WithLoss } else { Done::Whole })
+}
+
+fn show(task: &mut Task, standing: &Standing, said: &mut usize) {
+    for damage in &standing.damages[*said..] {
+        task.say(&format!("warning: {damage}"));
+    }
+    *said = standing.damages.len();
+    let state = if standing.is_playing { "" } else { ", stands" };
+    let lost = if standing.lost == 0 { String::new() } else { format!(", {} lost", standing.lost) };
+    let name = standing.recording.file_stem().unwrap_or_default().to_string_lossy();
+    task.note(format!("{name}, speed {}{state}, {} viewers{lost}", standing.speed, standing.viewers));
+    task.at(standing.shown_secs as u64);
+}
+
+// Files by their paths, runs and surfaces by the lake's tables.
+async fn paths(names: &[String], lake_url: &str) -> anyhow::Result<Vec<PathBuf>> {
+    let (mut paths, mut lake) = (Vec::new(), None);
+    for name in names {
+        let path = Path::new(name);
+        if name.ends_with(".mcap") || name.ends_with(".mcap.partial") || path.is_file() {
+            paths.push(path.to_owned());
+            continue;
+        }
+        if lake.is_none() {
+            lake = Some(Lake::open(lake_url).await?);
+        }
+        if let Some(lake) = &lake {
+            paths.push(run_file(lake, name).await?);
+        }
+    }
+    Ok(paths)
+}
+
+// Of a surface its newest run.
+async fn run_file(lake: &Lake, name: &str) -> anyhow::Result<PathBuf> {
+    let folder =
+        lake.folder().context("a replay needs a lake in a folder; hint: --lake FOLDER, or name .mcap files")?;
+    let snapshot = lake.snapshot().await?;
+    let (run, surface) = (name.parse::<RunId>().ok(), name.parse::<SurfaceId>().ok());
+    let of_run = run.and_then(|run| snapshot.run(&run).cloned());
+    let found = of_run.or_else(|| snapshot.runs().rfind(|r| Some(&r.surface) == surface.as_ref()).cloned());
+    let found = found.with_context(|| {
+        let mut known: Vec<_> = snapshot.runs().map(|run| run.surface.to_string()).collect();
+        known.dedup();
+        let more = if known.len() > LISTED { ", ..." } else { "" };
+        known.truncate(LISTED);
+        format!("there is no run, surface or file `{name}`; hint: there are surfaces {}{more}", known.join(", "))
+    })?;
+    Ok(folder.join(Lake::run_path(&found.surface, &found.run).as_ref()))
+}

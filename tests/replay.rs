@@ -1,0 +1,55 @@
+//! The replay as its users start and end it; what a viewer sees is tested where the player is.
+
+use std::io::{BufRead as _, BufReader, Read as _};
+use std::process::{Command, Stdio};
+
+use super::Place;
+
+/// Replays until it listens, then ends it by Ctrl-C; its exit code, and what it said.
+fn replayed(place: &Place, runs: &[&str]) -> (Option<i32>, String) {
+    let mut child = Command::new(env!("CARGO_BIN_EXE_echolake"))
+        .args(["--lake", "lake", "replay", "--listen", "127.0.0.1:0"])
+        .args(runs)
+        .current_dir(place.folder.path())
+        .env_remove("ECHOLAKE_LAKE")
+        .stderr(Stdio::piped())
+        .spawn()
+        .expect("the command starts");
+    let mut stderr = BufReader::new(child.stderr.take().expect("stderr"));
+    let mut said = String::new();
+    while !said.contains("ws://127.0.0.1:") {
+        assert_ne!(stderr.read_line(&mut said).expect("a line"), 0, "it ended: {said}");
+    }
+    let told = Command::new("kill").args(["-INT", &child.id().to_string()]).status().expect("kill starts");
+    assert!(told.success());
+    stderr.read_to_string(&mut said).expect("the rest");
+    (child.wait().expect("its end").code(), said)
+}
+
+#[test]
+fn runs_are_named_in_every_way_and_damage_is_told() {
+    let place = Place::new();
+    let path = place.acquire("flat", &["--seed", "1"]);
+    place.ok(&["ingest"]);
+    let run = place.sql("select run_id from runs")[0]["run_id"].as_str().expect("a name").to_owned();
+    for name in ["flat", run.as_str(), &format!("lake/runs/flat/{run}.mcap")] {
+        let (code, said) = replayed(&place, &[name]);
+        assert_eq!(code, Some(0), "{name}: {said}");
+        assert!(said.contains("1 recordings"), "{said}");
+    }
+    // A second one that was cut off is shown as far as it is whole; a third is none.
+    let second = place.acquire("foam", &["--seed", "2"]);
+    assert_ne!(path, second);
+    let whole = std::fs::read(&second).expect("the run");
+    std::fs::write(place.path("cut.mcap"), &whole[..whole.len() * 2 / 3]).expect("written");
+    std::fs::write(place.path("none.mcap"), "nothing").expect("written");
+    let (code, said) = replayed(&place, &["flat", "cut.mcap", "none.mcap"]);
+    assert_eq!(code, Some(3), "{said}");
+    assert!(said.contains("`cut.mcap` is not whole") && said.contains("`none.mcap`"), "{said}");
+
+    place.fails(1, &["replay", "nobody"], "hint: there are surfaces flat");
+    place.fails(1, &["replay", "none.mcap"], "none of the recordings can be replayed");
+    place.fails(1, &["replay", "missing.mcap"], "missing.mcap");
+    place.fails(2, &["replay", "flat", "--speed", "0"], "from 0.01");
+    place.fails(2, &["replay"], "RUN");
+}
