@@ -5,8 +5,6 @@
 use std::path::Path;
 use std::time::Instant;
 
-use arrow::array::AsArray as _;
-use arrow::datatypes::{Int32Type, Int64Type};
 use echolake_export::{Check, PendingFile, ResponseFormat, Slice, SliceParams, Taken, write_responses, write_wav};
 use echolake_schema::{RunId, Table};
 use futures::TryStreamExt as _;
@@ -60,7 +58,8 @@ async fn taken(
     let snapshot = lake.snapshot().await?;
     let mut taken = Vec::new();
     for file in snapshot.files_of(Table::Measurements, run) {
-        let batches: Vec<_> = lake.rows(Table::Measurements, file, &Taken::COLUMNS, 0..file.rows).await?.try_collect().await?;
+        let batches: Vec<_> =
+            lake.rows(Table::Measurements, file, &Taken::COLUMNS, 0..file.rows).await?.try_collect().await?;
         for batch in batches {
             let range = pairs.start as u32..pairs.end as u32;
             taken.extend(Taken::of_batch(&batch)?.into_iter().filter(|one| range.contains(&one.pair)));

@@ -76,6 +76,11 @@ def test_a_file_that_is_not_there_is_said(served_http: str) -> None:
         get(f"{served_http}/api/v1/tables/tnce/none.parquet")
 
 
+def a_run(served_http: str) -> str:
+    run: str = json.loads(get(f"{served_http}/api/v1/runs?limit=1")[0])["items"][0]["run_id"]
+    return run
+
+
 def slice_url(served_http: str, predicate: str, **more: str) -> str:
     return f"{served_http}/api/v1/slices.mcap?{urllib.parse.urlencode({'where': predicate} | more)}"
 
@@ -98,7 +103,7 @@ def test_slices_pass_the_doctor(served_http: str, tmp_path: Path) -> None:
 
 def test_the_manifest_is_what_its_data_hold(served_http: str, tmp_path: Path) -> None:
     reader = pytest.importorskip("mcap.reader")
-    manifest = json.loads(get(f"{served_http}/api/v1/foxglove/manifest?where=pair_id%3C3")[0])
+    manifest = json.loads(get(f"{served_http}/api/v1/foxglove/manifest?where=pair_id%3C3&run={a_run(served_http)}")[0])
     (source,) = manifest["sources"]
     assert set(source) == {"url", "id", "topics", "schemas", "startTime", "endTime"}
     assert all(re.fullmatch(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\.\d{9}Z", source[time]) for time in ("startTime", "endTime"))

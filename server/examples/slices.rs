@@ -96,9 +96,13 @@ fn path(run: &str, pairs: std::ops::Range<u64>, more: &str) -> String {
 fn main() -> Result<()> {
     let args = Arc::new(args()?);
     let milliseconds = |time: Duration| time.as_secs_f64() * 1e3;
-    for (name, share, more) in
-        [("1 %", 100, ""), ("10 %", 10, ""), ("100 %", 1, ""), ("poses of 1 %", 100, POSES), ("poses of 100 %", 1, POSES)]
-    {
+    for (name, share, more) in [
+        ("1 %", 100, ""),
+        ("10 %", 10, ""),
+        ("100 %", 1, ""),
+        ("poses of 1 %", 100, POSES),
+        ("poses of 100 %", 1, POSES),
+    ] {
         let path = path(&args.run, 0..(args.pairs / share).max(1), more);
         let mut tries = (0..5).map(|_| read(&args.address, &path)).collect::<Result<Vec<_>>>()?;
         tries.sort_by_key(|took| took.first);

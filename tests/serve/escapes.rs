@@ -81,10 +81,10 @@ fn none_over_http() {
 #[test]
 fn none_by_slices() {
     let scene = Scene::new();
-    let run = scene.place.sql("select run_id from runs")[0]["run_id"].as_str().expect("a run").to_owned();
+    let of_a_run = format!("&run={}", scene.place.sql("select run_id from runs")[0]["run_id"].as_str().expect("a run"));
     for (number, attempt) in scene.attempts().iter().enumerate() {
         let encoded: String = attempt.bytes().map(|b| format!("%{b:02x}")).collect();
-        let more = ["", "&layout=in-time", &format!("&run={run}"), "&topics=/ir"][number % 4];
+        let more = ["", "&layout=in-time", &of_a_run, "&topics=/ir"][number % 4];
         for path in ["slices.mcap", "foxglove/manifest"] {
             let answer = Request::get(&format!("/api/v1/{path}?where={encoded}{more}")).send(&scene.server);
             assert!((400..500).contains(&answer.status), "{attempt}: {}", answer.status);

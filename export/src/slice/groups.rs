@@ -68,9 +68,10 @@ impl Groups {
             times: taken.iter().map(|t| (time(t), (t.pair, t.attempt))).collect(),
         };
         let topic = |id: &u16| source.channels.get(id).map_or("", |c| c.topic.as_str());
-        let has_once = |chunk: &&ChunkIndex| chunk.message_index_offsets.keys().any(|id| is_once(topic(id)));
-        let once = source.chunks.iter().filter(has_once).cloned().collect();
         let named = |id: &u16| topics.is_empty() || topics.iter().any(|t| t == topic(id));
+        let has_once =
+            |chunk: &&ChunkIndex| chunk.message_index_offsets.keys().any(|id| is_once(topic(id)) && named(id));
+        let once = source.chunks.iter().filter(has_once).cloned().collect();
         let lanes = lanes(&source.chunks).into_iter().filter(|(channels, _)| channels.iter().any(named));
         let lanes = lanes.map(|(channels, chunks)| {
             let keyed = channels.iter().any(|id| names_pair(topic(id)));

@@ -306,16 +306,10 @@ impl Slice {
         };
         if let Some(writer) = &mut self.writer {
             writer.metadata(Metadata { name: SLICE_RUN_METADATA.into(), metadata: source.manifest.clone() })?;
-            let mut number = 0;
-            // They are attached where nothing is left out.
-            while let Some(mut attachment) = source.attachment(number).await?.filter(|_| self.params.topics.is_empty())
-            {
-                if self.several {
-                    attachment.name = format!("{}/{}", source.file.run, attachment.name);
-                }
-                writer.attach(&attachment)?;
-                number += 1;
-            }
+        }
+        // They are attached where nothing is left out.
+        if self.params.topics.is_empty() {
+            self.attach_all(&source).await?;
         }
         let mut groups = Groups::new(source, &taken, &self.params.topics);
         while let Some(messages) = groups.next_once().await? {
@@ -323,6 +317,18 @@ impl Slice {
         }
         if let Some(next) = groups.next().await? {
             self.open.push(OpenRun { groups, next });
+        }
+        Ok(())
+    }
+
+    async fn attach_all(&mut self, source: &Source) -> Result<()> {
+        let mut number = 0;
+        while let (Some(mut attachment), Some(writer)) = (source.attachment(number).await?, &mut self.writer) {
+            if self.several {
+                attachment.name = format!("{}/{}", source.file.run, attachment.name);
+            }
+            writer.attach(&attachment)?;
+            number += 1;
         }
         Ok(())
     }

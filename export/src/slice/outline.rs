@@ -50,7 +50,8 @@ pub struct OutlineSchema {
 /// # Errors
 /// As [`super::Slice::open`].
 pub async fn outline(lake: &Lake, snapshot: &Snapshot, params: &SliceParams) -> Result<Outline> {
-    let (mut outline, mut known) = (Outline { start_ns: i64::MAX, end_ns: i64::MIN, ..Outline::default() }, BTreeSet::new());
+    let (mut outline, mut known) =
+        (Outline { start_ns: i64::MAX, end_ns: i64::MIN, ..Outline::default() }, BTreeSet::new());
     for (file, taken) in files(lake, snapshot, &params.taken).await? {
         let source = Source::open(lake.store(), file, params.check).await?;
         known.extend(source.channels.values().map(|c| c.topic.clone()));

@@ -108,7 +108,9 @@ impl Stored {
     async fn answer(&self, lake: &Lake, headers: &HeaderMap) -> Result<Response, Fault> {
         let store = lake.store();
         let unread = |e: object_store::Error| match e {
-            object_store::Error::NotFound { .. } => Fault::Gone { what: "this file", hint: "ask for the list of files again" },
+            object_store::Error::NotFound { .. } => {
+                Fault::Gone { what: "this file", hint: "ask for the list of files again" }
+            }
             other => {
                 eprintln!("a file cannot be read: {other}");
                 Fault::Unreadable

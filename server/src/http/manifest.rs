@@ -47,7 +47,8 @@ async fn files(State(catalogue): State<Catalogue>, uri: Uri, headers: HeaderMap)
     let view = catalogue.view().await?;
     let origin = forwarded_origin(&headers);
     let etag = format!("\"{}\"", view.version);
-    let validators = [(header::ETAG, etag.as_str()), (header::CACHE_CONTROL, "private, no-cache"), (header::VARY, "Host")];
+    let validators =
+        [(header::ETAG, etag.as_str()), (header::CACHE_CONTROL, "private, no-cache"), (header::VARY, "Host")];
     if is_known(&headers, &etag) {
         return Ok((StatusCode::NOT_MODIFIED, validators).into_response());
     }

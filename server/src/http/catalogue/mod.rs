@@ -44,8 +44,8 @@ pub(super) use asked::{Asked, run, text};
 use content::Content;
 pub(super) use params::Params;
 pub(super) use tables::table;
-pub(super) use view::{Shown, View};
 use view::Views;
+pub(super) use view::{Shown, View};
 
 /// What an endpoint does.
 type Answering = Pin<Box<dyn Future<Output = Result<Content, Fault>> + Send>>;

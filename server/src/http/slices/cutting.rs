@@ -16,7 +16,7 @@ use crate::running::{WAITING, finish};
 use crate::service::Service;
 
 /// How long a slice waits for its reader to take the next piece.
-const PATIENCE: Duration = Duration::from_secs(60);
+const PATIENCE: Duration = Duration::from_secs(300);
 
 /// A slice that is being cut.
 pub(super) struct Cutting {

@@ -1,17 +1,19 @@
 //! Foxglove's remote data loader: what there is to load, as its manifest says it (`manifest_schema.json` of the SDK's
 //! conformance suite). Runs that are named and not narrowed down are static files, read by ranges; all else is a source
-//! that streams, ascending in time. Who may read is asked here and again where the data are.
+//! that streams a run's slice, ascending in time. Who may read is asked here and again where the data are.
 
 use axum::extract::State;
 use axum::http::{HeaderMap, Uri};
 use axum::response::{IntoResponse as _, Response};
 use chrono::{DateTime, SecondsFormat};
-use echolake_export::{Layout, OutlineSchema, OutlineTopic, outline};
+use echolake_export::{Layout, OutlineSchema, OutlineTopic, Taken, outline};
 use echolake_schema::RunId;
 use serde::Serialize;
 
 use super::super::files::RUN;
 use super::super::problem::Problem;
+use super::question::MOST_RUNS;
+use super::selection::digest;
 use super::{Question, Request, SLICE, Slices};
 use crate::fault::Fault;
 
@@ -76,13 +78,26 @@ fn whole_runs(question: &Question) -> Manifest {
     Manifest { name: names.join(", "), sources: question.runs.iter().map(source).collect() }
 }
 
+// A source a run: within a run a topic has one schema, and what is added to the lake leaves the other runs' keys alone.
 async fn streamed(slices: &Slices, mut request: Request) -> Result<Manifest, Fault> {
     // Its data are read as they come, so they have to ascend.
     request.question.layout = Layout::InTime;
     let selection = slices.selection(&request).await?;
+    let runs: Vec<_> = selection.taken.chunk_by(|a, b| a.run == b.run).collect();
+    if runs.len() > MOST_RUNS {
+        return Err(Fault::request(format!("{} runs are selected, {MOST_RUNS} may be; hint: run=RUN", runs.len())));
+    }
+    let mut sources = Vec::new();
+    for taken in &runs {
+        sources.push(source(slices, &request, taken).await?);
+    }
+    Ok(Manifest { name: format!("{} measurements of {} runs", selection.taken.len(), runs.len()), sources })
+}
+
+async fn source(slices: &Slices, request: &Request, taken: &[Taken]) -> Result<Source, Fault> {
     let service = slices.0.catalogue.service();
     let (params, lake, snapshot) =
-        (Slices::params(&request, &selection), service.lake().clone(), request.view.snapshot.clone());
+        (Slices::params(request, taken.to_vec()), service.lake().clone(), request.view.snapshot.clone());
     let found = service.plan(async move { Ok(outline(&lake, &snapshot, &params).await?) }).await?;
     let number = |index: usize| u16::try_from(index + 1).ok();
     let topic = |topic: OutlineTopic| Topic {
@@ -94,16 +109,15 @@ async fn streamed(slices: &Slices, mut request: Request) -> Result<Manifest, Fau
         let OutlineSchema { name, encoding, data } = schema;
         Some(Schema { id: number(index)?, name, encoding, data: base64(&data) })
     };
-    let source = Source::Streamed {
-        url: format!("{SLICE}?{}&id={}", request.question.query(), selection.digest),
-        id: format!("echolake-{}", selection.digest),
+    let digest = digest(&request.view, &request.question, taken);
+    Ok(Source::Streamed {
+        url: format!("{SLICE}?{}&id={digest}", request.question.query_of(&taken[0].run)),
+        id: format!("echolake-{digest}"),
         topics: found.topics.into_iter().map(topic).collect(),
         schemas: found.schemas.into_iter().enumerate().filter_map(schema).collect(),
         start_time: time(found.start_ns),
         end_time: time(found.end_ns),
-    };
-    let runs = selection.taken.chunk_by(|a, b| a.run == b.run).count();
-    Ok(Manifest { name: format!("{} measurements of {runs} runs", selection.taken.len()), sources: vec![source] })
+    })
 }
 
 fn time(nanos: i64) -> String {

@@ -18,7 +18,7 @@ use axum::extract::State;
 use axum::http::{HeaderMap, Method, Uri};
 use axum::response::Response;
 use axum::routing::get;
-use echolake_export::{Check, SliceParams};
+use echolake_export::{Check, SliceParams, Taken};
 use echolake_query::Client;
 use futures::stream;
 use tokio::sync::Semaphore;
@@ -96,9 +96,9 @@ impl Slices {
         self.0.selections.of(&self.0.catalogue, request).await
     }
 
-    fn params(request: &Request, selection: &Selection) -> SliceParams {
+    fn params(request: &Request, taken: Vec<Taken>) -> SliceParams {
         SliceParams {
-            taken: selection.taken.clone(),
+            taken,
             topics: request.question.topics.clone(),
             layout: request.question.layout,
             // Reading a run whole takes longer than a viewer waits; what is read is checked by its CRCs.
@@ -107,7 +107,7 @@ impl Slices {
     }
 
     fn cut(&self, request: &Request, selection: &Selection) -> Result<Cutting, Fault> {
-        let params = Self::params(request, selection);
+        let params = Self::params(request, selection.taken.clone());
         let places = self.0.places.clone();
         let place = places.try_acquire_owned().map_err(|_| Fault::TooMany { what: "slices", limit: MOST })?;
         Cutting::begin(self.0.catalogue.service(), &request.client, request.view.snapshot.clone(), params, place)
@@ -121,7 +121,7 @@ async fn slice(
     headers: HeaderMap,
 ) -> Result<Response, Problem> {
     let request = slices.request(&uri, &headers).await?;
-    let selection = slices.selection(&request).await.inspect_err(|f| slices.0.catalogue.service().metrics().failed(f.code()))?;
+    let selection = slices.selection(&request).await?;
     if request.question.id.as_ref().is_some_and(|id| *id != selection.digest) {
         return Err(Fault::Gone { what: "this slice", hint: "ask for the manifest again" }.into());
     }
@@ -148,7 +148,10 @@ async fn slice(
 }
 
 // A failure on the way breaks the connection off: a short slice would look like a whole one.
-fn rest(first: Option<bytes::Bytes>, cutting: Cutting) -> impl stream::Stream<Item = Result<bytes::Bytes, Fault>> + Send {
+fn rest(
+    first: Option<bytes::Bytes>,
+    cutting: Cutting,
+) -> impl stream::Stream<Item = Result<bytes::Bytes, Fault>> + Send {
     stream::try_unfold((first, cutting), |(first, mut cutting)| async move {
         let piece = match first {
             Some(piece) => Some(piece),

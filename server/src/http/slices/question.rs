@@ -8,8 +8,8 @@ use echolake_schema::RunId;
 use super::super::catalogue::Params;
 use crate::fault::Fault;
 
-/// Runs that may be named.
-const MOST_RUNS: usize = 100;
+/// Runs that may be named, and sources of a manifest.
+pub(super) const MOST_RUNS: usize = 100;
 /// What may stand behind the path's `?`.
 const NAMES: [&str; 5] = ["where", "run", "topics", "layout", "id"];
 
@@ -82,11 +82,11 @@ impl Question {
         self.predicate.is_none() && self.topics.is_empty()
     }
 
-    /// It as it stands behind a path's `?`.
-    pub(super) fn query(&self) -> String {
+    /// It, of one run, as it stands behind a path's `?`.
+    pub(super) fn query_of(&self, run: &RunId) -> String {
         let mut pairs = vec![("layout", self.layout_name())];
         pairs.extend(self.predicate.as_deref().map(|predicate| ("where", predicate)));
-        pairs.extend(self.runs.iter().map(|run| ("run", run.as_str())));
+        pairs.push(("run", run.as_str()));
         pairs.extend(self.topics.iter().map(|topic| ("topics", topic.as_str())));
         pairs.iter().map(|(name, value)| format!("{name}={}", encoded(value))).collect::<Vec<_>>().join("&")
     }
@@ -121,18 +121,24 @@ mod tests {
 
     #[test]
     fn a_question_comes_back_as_it_was() {
-        let asked = question("where=snr_db%20%3C%2035%20and%20'%C3%A9%26'%3D'%2B'&topics=/tf,/ir&topics=/tf&run=b&run=a");
+        let asked =
+            question("where=snr_db%20%3C%2035%20and%20'%C3%A9%26'%3D'%2B'&topics=/tf,/ir&topics=/tf&run=b&run=a");
         let asked = asked.unwrap_or_else(|e| panic!("{e}"));
         assert_eq!(asked.predicate.as_deref(), Some("snr_db < 35 and '\u{e9}&'='+'"));
         assert_eq!((&asked.topics[..], asked.layout), (&["/ir".to_owned(), "/tf".to_owned()][..], Layout::ByTopic));
         assert!(asked.select().ends_with("where run_id in ('a', 'b') and"), "{}", asked.select());
-        let again = question(&asked.query()).unwrap_or_else(|e| panic!("{e}"));
-        assert_eq!((again.query(), again.predicate), (asked.query(), asked.predicate));
+        let again = question(&asked.query_of(&asked.runs[1])).unwrap_or_else(|e| panic!("{e}"));
+        assert_eq!(
+            (&again.predicate, &again.topics, &again.runs[..]),
+            (&asked.predicate, &asked.topics, &asked.runs[1..])
+        );
     }
 
     #[test]
     fn what_is_not_right_is_refused() {
-        for wrong in ["", "where=a&where=b", "topic=/tf&where=a", "where=a&layout=x", "run=a'b", "run=..%2f", "topics=/tf"] {
+        for wrong in
+            ["", "where=a&where=b", "topic=/tf&where=a", "where=a&layout=x", "run=a'b", "run=..%2f", "topics=/tf"]
+        {
             assert!(question(wrong).is_err(), "{wrong}");
         }
         let many: String = (0..=MOST_RUNS).map(|i| format!("&run=r{i}")).collect();

@@ -69,7 +69,8 @@ impl Selections {
         let mut kept = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         kept.push_back((key, selection.clone()));
         // One that is small weighs something too.
-        let weight = |kept: &VecDeque<(Key, Arc<Selection>)>| kept.iter().map(|(_, s)| s.taken.len() + 100).sum::<usize>();
+        let weight =
+            |kept: &VecDeque<(Key, Arc<Selection>)>| kept.iter().map(|(_, s)| s.taken.len() + 100).sum::<usize>();
         while weight(&kept) > KEPT && kept.len() > 1 {
             kept.pop_front();
         }
@@ -100,8 +101,9 @@ async fn taken(catalogue: &Catalogue, request: &Request) -> Result<Vec<Taken>, F
     }
 }
 
+/// Says which slice measurements make: they are sorted by run, time and pair.
 // A run's derivation is a digest of its file, among others.
-fn digest(view: &View, question: &Question, taken: &[Taken]) -> String {
+pub(super) fn digest(view: &View, question: &Question, taken: &[Taken]) -> String {
     let mut digest = Sha256::new();
     let mut add = |text: &str| {
         digest.update((text.len() as u64).to_le_bytes());
