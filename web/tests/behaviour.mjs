@@ -157,6 +157,18 @@ await check('a WAV, a picture and numbers can be saved', async () => {
   }
 })
 
+await check('the console shows rows of every table, integers of 64 bits to the last digit', async () => {
+  const tables = await get('/api/v1/tables')
+  assert.ok(tables.length > 10, `${tables.length} tables`)
+  for (const { name } of tables) {
+    await open(`/sql?q=${encodeURIComponent(`select * from ${name} limit 3`)}`)
+    await page.locator('.rows tbody tr').first().waitFor({ timeout: 10_000 }).catch(() => assert.fail(`no rows of ${name} are shown: ${said.join(' ')}`))
+  }
+  const odd = 'select 1767718800000000001 as ns, arrow_cast(9007199254740993, \'UInt64\') as large, [9007199254740993] as list, to_timestamp_seconds(9000000000000) as late, named_struct(\'n\', -5) as s'
+  await open(`/sql?q=${encodeURIComponent(odd)}`)
+  assert.deepEqual(await page.locator('.rows tbody td').allInnerTexts(), ['1767718800000000001', '9007199254740993', '9007199254740993', 'out of range', '{"n":-5}'])
+})
+
 await check('names from the lake stay text', async () => {
   await page.route('**/api/v1/surfaces?*', async (route) => {
     const answer = await (await route.fetch()).json()

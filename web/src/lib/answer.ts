@@ -25,7 +25,8 @@ export async function readAnswer(response: Response, stop: () => void): Promise<
   let at = 0
   for (const part of parts) { whole.set(part, at); at += part.length }
   if (bytes === 0) return { columns: [], rows: 0, bytes }
-  const table = tableFromIPC(whole)
+  // Times in ns are larger than a number holds exactly: integers of 64 bits come as BigInt.
+  const table = tableFromIPC(whole, { useBigInt: true })
   return {
     rows: table.numRows, bytes,
     columns: table.schema.fields.map((field, i) => {
@@ -43,12 +44,13 @@ const LONG = 6
 /** A value as a cell shows it. */
 export function cellText(value: unknown): string {
   if (value === null || value === undefined) return ''
-  if (value instanceof Date) return value.toISOString().replace('T', ' ').replace(/\.?0*Z$/, '')
+  if (value instanceof Date) return Number.isNaN(value.getTime()) ? 'out of range' : value.toISOString().replace('T', ' ').replace(/\.?0*Z$/, '')
+  if (typeof value === 'bigint') return String(value).replace('-', '\u2212')
   if (typeof value === 'number') return (Number.isInteger(value) ? String(value) : String(Number(value.toPrecision(7)))).replace('-', '\u2212')
   if (ArrayBuffer.isView(value) || Array.isArray(value)) {
     const list = Array.from(value as ArrayLike<unknown>)
     return `${list.slice(0, LONG).map(cellText).join(', ')}${list.length > LONG ? `, … ${list.length} values` : ''}`
   }
-  if (typeof value === 'object') return JSON.stringify(value)
+  if (typeof value === 'object') return JSON.stringify(value, (_, inner: unknown) => (typeof inner === 'bigint' ? Number(inner) : inner))
   return String(value)
 }
