@@ -119,6 +119,11 @@ impl Job<'_> {
         if let Some(tap) = session.tap {
             recorder.listen(tap, self.started, self.shape);
         }
+        // The devices were tried there, if anywhere.
+        let first = self.arms.as_ref().and_then(|arms| arms.standing(pairs.first()?.id).ok());
+        if let Some(stand) = first {
+            recorder.stand(self.started, &[stand.microphone, stand.speaker])?;
+        }
         let checkpoint_every = session.checkpoint_every.unwrap_or_else(|| checkpoint_every(origin));
         let options = RunOptions { keep: self.keep, checkpoint_every };
         let work = Work { pairs: &pairs, before: self.before, options };

@@ -28,8 +28,8 @@ pub fn pearson<T: Real>(x: &[T], y: &[T]) -> Result<Option<f64>, Error> {
         yy += dy * dy;
         xy += dx * dy;
     }
-    // Of equal values, the mean's rounding alone is left, and its square.
-    let varies = |sum: f64, mean: f64| sum.is_finite() && sum > count * (f64::EPSILON * mean).powi(2);
+    // Of equal values, the rounding of their sum alone is left, up to count times that of one.
+    let varies = |sum: f64, mean: f64| sum.is_finite() && sum > count * (count * f64::EPSILON * mean).powi(2);
     if !(varies(xx, mean_x) && varies(yy, mean_y)) {
         return Ok(None);
     }

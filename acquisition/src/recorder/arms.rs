@@ -72,6 +72,18 @@ impl Recorder {
         Ok(())
     }
 
+    /// Records `/tf` of both arms' links alone, at the beginning of a run: without it viewers have no place for anything
+    /// until the first pair is measured. A run that is gone on with has it already.
+    ///
+    /// # Errors
+    /// [`Error::Write`].
+    pub fn stand(&mut self, at: Timestamp, joints: &[Joints; 2]) -> Result<(), Error> {
+        let Some(cell) = self.arms.as_ref().filter(|_| !self.is_resumed).map(|arms| arms.cell.clone()) else {
+            return Ok(());
+        };
+        self.foxglove(self.channels.tf, at, &scene::arm_frames(at, &cell, joints))
+    }
+
     /// Records the joints of the microphone's and the speaker's arm, rad, and `/tf` of both arms' links. Without
     /// [`Self::arms`] it records nothing.
     ///

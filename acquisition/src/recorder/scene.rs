@@ -16,6 +16,9 @@ const HOLDER_M: f64 = 0.15;
 /// Points along each side of `/panel/points`.
 const POINTS_A_SIDE: usize = 137;
 
+/// Fields of a point's colour, as rerun, Foxglove and Lichtblick know them.
+const COLOURS: [&str; 4] = ["red", "green", "blue", "alpha"];
+
 const NO_TURN: Quaternion = Quaternion { x: 0.0, y: 0.0, z: 0.0, w: 1.0 };
 
 /// `/tf`: the panel in the world, and each arm's flange and tool over the panel.
@@ -101,26 +104,38 @@ pub(super) fn panel(at: Timestamp, glb: Vec<u8>) -> SceneUpdate {
     SceneUpdate { deletions: Vec::new(), entities: vec![entity] }
 }
 
-/// `/panel/points`: the relief, thinned out.
+/// `/panel/points`: the relief, thinned out, its low cells dark and its high ones light: points have no shading.
 pub(super) fn points(at: Timestamp, heights: &HeightField) -> PointCloud {
     let step = heights.cells().div_ceil(POINTS_A_SIDE);
+    let extremes = |(low, high): (f32, f32), h: &f32| (low.min(*h), high.max(*h));
+    let (low_mm, high_mm) = heights.heights_mm().iter().fold((f32::INFINITY, f32::NEG_INFINITY), extremes);
     let mut data = Vec::new();
     for iy in (0..heights.cells()).step_by(step) {
         for ix in (0..heights.cells()).step_by(step) {
-            let mm = [heights.centre_mm(ix), heights.centre_mm(iy), f64::from(heights.at(ix, iy))];
+            let height_mm = heights.at(ix, iy);
+            let mm = [heights.centre_mm(ix), heights.centre_mm(iy), f64::from(height_mm)];
             data.extend(mm.into_iter().flat_map(|x| ((x / 1e3) as f32).to_le_bytes()));
+            data.extend(colour((height_mm - low_mm) / (high_mm - low_mm).max(f32::MIN_POSITIVE)));
         }
     }
     let field =
-        |name: &str, offset| PackedElementField { name: name.into(), offset, r#type: NumericType::Float32 as i32 };
+        |name: &str, offset, kind: NumericType| PackedElementField { name: name.into(), offset, r#type: kind as i32 };
+    let place = ["x", "y", "z"].into_iter().zip([0, 4, 8]).map(|(name, at)| field(name, at, NumericType::Float32));
+    let shade = COLOURS.into_iter().zip(12..).map(|(name, at)| field(name, at, NumericType::Uint8));
     PointCloud {
         timestamp: Some(time(at)),
         frame_id: "panel".into(),
         pose: Some(Pose { position: Some(Vector3 { x: 0.0, y: 0.0, z: 0.0 }), orientation: Some(NO_TURN) }),
-        point_stride: 12,
-        fields: vec![field("x", 0), field("y", 4), field("z", 8)],
+        point_stride: 16,
+        fields: place.chain(shade).collect(),
         data: data.into(),
     }
+}
+
+// Dark blue to light blue: the arms are yellow.
+fn colour(share: f32) -> [u8; 4] {
+    let between = |low: f32, high: f32| (low + share * (high - low)) as u8;
+    [between(20.0, 130.0), between(60.0, 190.0), between(140.0, 240.0), u8::MAX]
 }
 
 /// `/sweep/audio`.
