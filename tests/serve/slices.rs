@@ -376,7 +376,7 @@ fn the_manifest_says_what_comes() {
     assert_eq!(get(&server, &data).status, 200);
     refused(&get(&server, &data.replace("7%20or", "8%20or")), 410, "gone");
     // A layout says nothing of the lake.
-    let layout = Request::get("/api/v1/layout.json").with("origin", "https://viewer.example").send(&server);
+    let layout = Request::get("/api/v1/layouts/echolake.json").with("origin", "https://viewer.example").send(&server);
     assert_eq!((layout.status, layout.header("access-control-allow-origin")), (200, Some("*")));
     assert!(json(&layout)["configById"].is_object());
 }
