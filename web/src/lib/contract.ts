@@ -300,7 +300,7 @@ export interface paths {
             readonly path?: never;
             readonly cookie?: never;
         };
-        /** The manifest of Foxglove's remote data loader. Runs without where and topics are static files; all else is streamed, ascending in time */
+        /** The manifest of Foxglove's remote data loader. Runs without where and topics are static files; all else is a streamed source a run, ascending in time */
         readonly get: operations["foxglove_manifest"];
         readonly put?: never;
         readonly post?: never;
