@@ -145,7 +145,8 @@ impl Campaign {
         let answer = Request::post("/api/v1/sql", query)
             .with("content-type", "text/plain")
             .with("authorization", &format!("Bearer {}", self.token))
-            .send(&self.server);
+            .attempt(&self.server);
+        let answer = answer.unwrap_or_else(|| panic!("no answer to {query:?}; the server said: {:?}", self.server.said()));
         (answer.status, String::from_utf8_lossy(&answer.body).into_owned())
     }
 

@@ -70,6 +70,11 @@ impl Request {
     }
 
     pub(crate) fn send(self, server: &Served) -> Answer {
+        self.attempt(server).expect("headers")
+    }
+
+    /// None where the connection ended before an answer began.
+    pub(crate) fn attempt(self, server: &Served) -> Option<Answer> {
         let mut stream = self.begin(server);
         let mut bytes = Vec::new();
         // A connection that is broken off ends in an error, after what came.
@@ -79,8 +84,8 @@ impl Request {
 }
 
 impl Answer {
-    fn read(bytes: &[u8]) -> Self {
-        let end = bytes.windows(4).position(|w| w == b"\r\n\r\n").expect("headers");
+    fn read(bytes: &[u8]) -> Option<Self> {
+        let end = bytes.windows(4).position(|w| w == b"\r\n\r\n")?;
         let head = std::str::from_utf8(&bytes[..end]).expect("text");
         let mut lines = head.lines();
         let status = lines.next().and_then(|l| l.split(' ').nth(1)).and_then(|s| s.parse().ok()).expect("a status");
@@ -89,7 +94,7 @@ impl Answer {
         let rest = &bytes[end + 4..];
         let chunked = headers.iter().any(|(name, value)| name == "transfer-encoding" && value == "chunked");
         let (body, is_whole) = if chunked { unchunked(rest) } else { (rest.to_vec(), true) };
-        Self { status, headers, body, is_whole }
+        Some(Self { status, headers, body, is_whole })
     }
 
     pub(crate) fn header(&self, name: &str) -> Option<&str> {

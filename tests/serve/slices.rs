@@ -376,7 +376,7 @@ fn the_manifest_says_what_comes() {
     assert_eq!(get(&server, &data).status, 200);
     refused(&get(&server, &data.replace("7%20or", "8%20or")), 410, "gone");
     // A layout says nothing of the lake.
-    let layout = Request::get("/api/v1/layout.json").with("origin", "https://viewer.example").send(&server);
+    let layout = Request::get("/api/v1/layouts/echolake.json").with("origin", "https://viewer.example").send(&server);
     assert_eq!((layout.status, layout.header("access-control-allow-origin")), (200, Some("*")));
     assert!(json(&layout)["configById"].is_object());
 }
@@ -386,10 +386,10 @@ fn the_lakes_files_are_urls_that_outlive_what_replaces_them() {
     let place = lake();
     let server = served(&place, &[]);
     let list = |query: &str| json(&get(&server, &format!("/api/v1/files{query}")));
-    let before = list("?table=measurements&table=tnce");
+    let before = list("?table=measurements&table=environment");
     let files = before["files"].as_array().expect("files").clone();
     let tables: BTreeSet<_> = files.iter().filter_map(|f| f["table"].as_str()).collect();
-    assert_eq!(tables, BTreeSet::from(["measurements", "tnce"]));
+    assert_eq!(tables, BTreeSet::from(["environment", "measurements"]));
     assert!(list("")["files"].as_array().expect("files").len() > files.len());
     let base = format!("http://{}", server.http);
     let path =

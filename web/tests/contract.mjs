@@ -14,7 +14,7 @@ const surfaces = (await get('/api/v1/surfaces?limit=500')).items
 const runs = (await get('/api/v1/runs?limit=1')).items
 const measured = surfaces.find((s) => s.typology !== 'reference') ?? surfaces[0]
 /** Servers for developing pages leave these out. */
-const OPTIONAL = new Set(['/api/v1/files', '/api/v1/foxglove/manifest', '/api/v1/layout.json', '/api/v1/slices.mcap', '/api/v1/tables/{table}', '/api/v1/tables/{table}/{file}', '/metrics'])
+const OPTIONAL = new Set(['/api/v1/files', '/api/v1/foxglove/manifest', '/api/v1/layouts/echolake.json', '/api/v1/slices.mcap', '/api/v1/tables/{table}', '/api/v1/tables/{table}/{file}', '/metrics'])
 
 let failures = 0
 let asked = 0

@@ -1,4 +1,4 @@
-//! `GET /api/v1/layout.json`: how Foxglove and Lichtblick show a run or a slice. It says nothing of the lake, so it is given
+//! `GET /api/v1/layouts/echolake.json`: how Foxglove and Lichtblick show a run or a slice. It says nothing of the lake, so it is given
 //! to whoever asks.
 
 use axum::Router;
@@ -14,10 +14,10 @@ const LAYOUT: &str = include_str!("layout.json");
 /// Changes with the program.
 const ETAG: &str = concat!("\"layout-", env!("CARGO_PKG_VERSION"), "\"");
 
-/// Where the layout is.
+/// Where the layout is. Lichtblick names what it takes from a URL by the file's name, in place of its own of that name.
 pub(super) fn for_viewers() -> Router {
     Router::new()
-        .route("/api/v1/layout.json", get(layout))
+        .route("/api/v1/layouts/echolake.json", get(layout))
         .method_not_allowed_fallback(super::wrong_method)
         .layer(cors())
 }

@@ -310,7 +310,7 @@ export interface paths {
         readonly patch?: never;
         readonly trace?: never;
     };
-    readonly "/api/v1/layout.json": {
+    readonly "/api/v1/layouts/echolake.json": {
         readonly parameters: {
             readonly query?: never;
             readonly header?: never;

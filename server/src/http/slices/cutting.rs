@@ -7,7 +7,7 @@ use bytes::Bytes;
 use echolake_export::{Slice, SliceParams};
 use echolake_lake::Snapshot;
 use echolake_query::{Client, Error as QueryError};
-use tokio::sync::{OwnedSemaphorePermit, mpsc};
+use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc};
 use tokio::task::JoinSet;
 
 use crate::fault::Fault;
@@ -24,6 +24,13 @@ pub(super) struct Cutting {
     task: JoinSet<Result<(), Fault>>,
 }
 
+/// What a slice takes up of the server.
+pub(super) struct Room {
+    pub(super) place: OwnedSemaphorePermit,
+    /// Those who are worked at have one.
+    pub(super) turns: Arc<Semaphore>,
+}
+
 impl Cutting {
     /// Begins, in one of its client's places.
     ///
@@ -34,14 +41,16 @@ impl Cutting {
         client: &Arc<Client>,
         snapshot: Arc<Snapshot>,
         params: SliceParams,
-        room: OwnedSemaphorePermit,
+        room: Room,
     ) -> Result<Self, Fault> {
         let place = client.place()?;
         let (to, pieces) = mpsc::channel(WAITING);
         let (of, limit) = (service.clone(), client.quota().time);
         let task = service.spawn(async move {
-            let _held = (room, place, of.metrics().begin(Protocol::Http));
-            cut(&of, &snapshot, params, limit, to).await.inspect_err(|fault| of.metrics().failed(fault.code()))
+            let _held = (room.place, place, of.metrics().begin(Protocol::Http));
+            cut(&of, &snapshot, params, limit, &room.turns, to)
+                .await
+                .inspect_err(|fault| of.metrics().failed(fault.code()))
         });
         Ok(Self { pieces, task })
     }
@@ -63,12 +72,15 @@ async fn cut(
     snapshot: &Snapshot,
     params: SliceParams,
     limit: Option<Duration>,
+    turns: &Semaphore,
     to: mpsc::Sender<Bytes>,
 ) -> Result<(), Fault> {
     let mut begun = Instant::now();
     let mut worked = Duration::ZERO;
     let mut slice = Slice::open(service.lake(), snapshot, params).await?;
+    let mut turn = None;
     while let Some(piece) = slice.next().await? {
+        drop(turn.take());
         // The reader's time is not the server's.
         worked += begun.elapsed();
         if let Some(limit) = limit.filter(|limit| worked > *limit) {
@@ -76,9 +88,12 @@ async fn cut(
         }
         // Nobody is there any more where sending fails.
         match tokio::time::timeout(PATIENCE, to.send(piece)).await {
-            Ok(Ok(())) => begun = Instant::now(),
+            Ok(Ok(())) => {}
             _ => return Err(Fault::Cancelled),
         }
+        // Never closed; a slice begins without a turn, so that its first bytes are early.
+        turn = turns.acquire().await.ok();
+        begun = Instant::now();
     }
     Ok(())
 }

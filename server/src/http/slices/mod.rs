@@ -29,15 +29,18 @@ use super::problem::Problem;
 use super::ranges::{self, Asked, Described, needs_length};
 use crate::fault::Fault;
 use crate::tokens::Scope;
-use cutting::Cutting;
+use cutting::{Cutting, Room};
 use question::Question;
 use selection::{Selection, Selections};
 use spool::Spool;
 
 /// A slice.
 pub(super) const SLICE: &str = "/api/v1/slices.mcap";
-/// Slices that are cut at once: each holds a few MB.
-const MOST: usize = 256;
+/// Slices that are open at once: each holds some 8 MB.
+const MOST: usize = 128;
+/// Slices that are worked at, at any moment, beside those that begin: a few a thread, so that one that begins does not
+/// wait for all that have.
+const TURNS: usize = 4;
 
 /// What slices share.
 #[derive(Clone)]
@@ -48,6 +51,7 @@ struct Inner {
     selections: Selections,
     spool: Spool,
     places: Arc<Semaphore>,
+    turns: Arc<Semaphore>,
 }
 
 /// Slices, and what viewers need around them; pages of elsewhere may ask for them.
@@ -57,6 +61,7 @@ pub(super) fn for_viewers(catalogue: &Catalogue) -> Router {
         selections: Selections::default(),
         spool: Spool::default(),
         places: Arc::new(Semaphore::new(MOST)),
+        turns: Arc::new(Semaphore::new(TURNS)),
     }));
     Router::new()
         .route(SLICE, get(slice))
@@ -110,7 +115,8 @@ impl Slices {
         let params = Self::params(request, selection.taken.clone());
         let places = self.0.places.clone();
         let place = places.try_acquire_owned().map_err(|_| Fault::TooMany { what: "slices", limit: MOST })?;
-        Cutting::begin(self.0.catalogue.service(), &request.client, request.view.snapshot.clone(), params, place)
+        let room = Room { place, turns: self.0.turns.clone() };
+        Cutting::begin(self.0.catalogue.service(), &request.client, request.view.snapshot.clone(), params, room)
     }
 }
 
