@@ -22,34 +22,12 @@ pub(crate) async fn run(args: &ReplayArgs, lake_url: &str) -> anyhow::Result<Don
     let paths = paths(&args.runs, lake_url).await?;
     let stop = super::stop_on_interrupt();
     let progress = Progress::new();
-    let opened = tokio::task::block_in_place(|| paths.iter().map(|path| Recording::open(path)).collect::<Vec<_>>());
-    let (mut recordings, mut lost) = (Vec::new(), false);
-    for recording in opened {
-        match recording {
-            Ok(recording) => {
-                if let Some(defect) = recording.defect() {
-                    lost = true;
-                    let path = recording.path().display();
-                    progress.say(format!("warning: `{path}` is not whole: {defect}; what is whole of it is shown"));
-                }
-                recordings.push(recording);
-            }
-            Err(error) => {
-                lost = true;
-                progress.say(format!("error: {:#}", anyhow::Error::from(error)));
-            }
-        }
-    }
+    let (recordings, lost) = tokio::task::block_in_place(|| open(&paths, &progress));
     anyhow::ensure!(!recordings.is_empty(), "none of the recordings can be replayed");
-    recordings.sort_by_key(|recording| recording.range().0);
-    for pair in recordings.windows(2).filter(|pair| pair[1].range().0 <= pair[0].range().1) {
-        let [earlier, later] = [&pair[0], &pair[1]].map(|recording| recording.path().display());
-        progress.say(format!("warning: `{later}` begins before `{earlier}` ends; time goes back between them"));
-    }
     let count = recordings.len();
     let options = ReplayOptions { speed: args.speed, paused: args.paused };
     let server = ReplayServer::start(args.listen, recordings, options)?;
-    let address = server.address().unwrap_or(args.listen);
+    let address = server.address();
     progress.say(format!("replay: open ws://{address} in Foxglove or Lichtblick; Ctrl-C ends it"));
     if !address.ip().is_loopback() {
         progress.say("warning: whoever reaches this address can look on");
@@ -66,6 +44,33 @@ pub(crate) async fn run(args: &ReplayArgs, lake_url: &str) -> anyhow::Result<Don
     tokio::task::block_in_place(|| drop(server));
     task.done(format!("{count} recordings, {:.0} s shown last", standing.shown_secs));
     Ok(if lost || !standing.damages.is_empty() { Done::WithLoss } else { Done::Whole })
+}
+
+// By their times; and whether something is not whole.
+fn open(paths: &[PathBuf], progress: &Progress) -> (Vec<Recording>, bool) {
+    let (mut recordings, mut lost) = (Vec::new(), false);
+    for opened in paths.iter().map(|path| Recording::open(path)) {
+        match opened {
+            Ok(recording) => {
+                if let Some(defect) = recording.defect() {
+                    lost = true;
+                    let path = recording.path().display();
+                    progress.say(format!("warning: `{path}` is not whole: {defect}; what is whole of it is shown"));
+                }
+                recordings.push(recording);
+            }
+            Err(error) => {
+                lost = true;
+                progress.say(format!("error: {:#}", anyhow::Error::from(error)));
+            }
+        }
+    }
+    recordings.sort_by_key(|recording| recording.range().0);
+    for pair in recordings.windows(2).filter(|pair| pair[1].range().0 <= pair[0].range().1) {
+        let [earlier, later] = [&pair[0], &pair[1]].map(|recording| recording.path().display());
+        progress.say(format!("warning: `{later}` begins before `{earlier}` ends; time goes back between them"));
+    }
+    (recordings, lost)
 }
 
 fn show(task: &mut Task, standing: &Standing, said: &mut usize) {

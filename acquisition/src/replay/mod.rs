@@ -57,9 +57,10 @@ pub struct Standing {
 
 /// A server that replays recordings. Dropped, it lets its clients go.
 pub struct ReplayServer {
-    server: Option<Server>,
+    // Dropped before the thread is waited for, because the server's end is the player's.
+    server: Server,
+    _thread: PlayerThread,
     standing: Arc<Mutex<Standing>>,
-    thread: Option<JoinHandle<()>>,
     length_secs: f64,
     range: (u64, u64),
 }
@@ -91,13 +92,13 @@ impl ReplayServer {
             damages: Vec::new(),
         }));
         let player = Player::new(recordings, topics, options, server.shared().clone(), standing.clone());
-        let thread = std::thread::spawn(move || player.run(&obeyed));
-        Ok(Self { server: Some(server), standing, thread: Some(thread), length_secs, range })
+        let thread = PlayerThread(Some(std::thread::spawn(move || player.run(&obeyed))));
+        Ok(Self { server, _thread: thread, standing, length_secs, range })
     }
 
     /// Where it listens.
-    pub fn address(&self) -> Option<SocketAddr> {
-        self.server.as_ref().map(Server::address)
+    pub fn address(&self) -> SocketAddr {
+        self.server.address()
     }
 
     /// First and last time, ns since 1970.
@@ -116,10 +117,13 @@ impl ReplayServer {
     }
 }
 
-impl Drop for ReplayServer {
+/// The player's thread; dropped, it is waited for.
+struct PlayerThread(Option<JoinHandle<()>>);
+
+impl Drop for PlayerThread {
     fn drop(&mut self) {
-        drop(self.server.take());
-        if let Some(thread) = self.thread.take() {
+        if let Some(thread) = self.0.take() {
+            // One that panicked has told why.
             let _ = thread.join();
         }
     }
