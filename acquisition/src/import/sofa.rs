@@ -101,8 +101,9 @@ struct Measured {
 
 impl Sofa {
     fn read(path: &Path, rig: &Rig, grid: &Grid, celsius: Option<Celsius>) -> Result<Self, Error> {
-        let file = SofaFile::open(path)
-            .map_err(|reason| Error::Read { path: path.to_owned(), reason: format!("it is no HDF5 file: {reason}") })?;
+        let unread = |reason| Error::Read { path: path.to_owned(), reason };
+        std::fs::File::open(path).map_err(|e| unread(e.to_string()))?;
+        let file = SofaFile::open(path).map_err(|reason| unread(format!("it is no HDF5 file: {reason}")))?;
         let reader = Reader { path, file };
         let is_ours = reader.file.text("APIName") == OURS;
         reader.expect_text("SOFAConventions", "SingleRoomSRIR")?;

@@ -189,4 +189,6 @@ fn what_is_wrong_is_named_and_nothing_is_left() {
     std::fs::write(&path, "no HDF5 at all").expect("written");
     let error = check_sofa(&[path], &rig(), None).expect_err("text").to_string();
     assert!(error.contains("no HDF5 file") && error.contains("text.sofa"), "{error}");
+    let error = check_sofa(&[place.0.path().join("none.sofa")], &rig(), None).expect_err("none").to_string();
+    assert!(error.contains("cannot read") && error.contains("No such file"), "{error}");
 }
