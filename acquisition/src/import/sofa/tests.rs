@@ -14,11 +14,13 @@ fn rig() -> Rig {
     Rig::from_toml(&format!("impulse_response.length = 384\n{points}")).expect("a rig")
 }
 
+/// Name, shape, numbers and attributes of a variable.
+type Written = (&'static str, Vec<usize>, Vec<f64>, Vec<(&'static str, &'static str)>);
+
 /// A file's content, to be changed before it is written.
 struct Made {
     texts: Vec<(&'static str, String)>,
-    /// Name, shape, numbers, attributes.
-    variables: Vec<(&'static str, Vec<usize>, Vec<f64>, Vec<(&'static str, &'static str)>)>,
+    variables: Vec<Written>,
 }
 
 impl Made {
