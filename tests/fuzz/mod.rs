@@ -146,7 +146,8 @@ impl Campaign {
             .with("content-type", "text/plain")
             .with("authorization", &format!("Bearer {}", self.token))
             .attempt(&self.server);
-        let answer = answer.unwrap_or_else(|| panic!("no answer to {query:?}; the server said: {:?}", self.server.said()));
+        let answer =
+            answer.unwrap_or_else(|| panic!("no answer to {query:?}; the server said: {:?}", self.server.said()));
         (answer.status, String::from_utf8_lossy(&answer.body).into_owned())
     }
 
