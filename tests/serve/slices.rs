@@ -259,10 +259,12 @@ fn a_slice_ends_with_its_reader() {
     let mut start = [0; 12];
     unread.read_exact(&mut start).expect("a status");
     assert_eq!(&start, b"HTTP/1.1 200");
-    assert_eq!(running(), 1.0, "it waits for its reader");
+    wait_until("it waits for its reader", || running() == 1.0);
+    let pause = std::time::Duration::from_millis(500);
+    std::thread::sleep(pause);
     let before = server.resident_kib();
-    std::thread::sleep(std::time::Duration::from_millis(300));
-    assert!(server.resident_kib() < before + 20_000, "what waits does not grow");
+    std::thread::sleep(pause);
+    assert!(running() == 1.0 && server.resident_kib() < before + 20_000, "what waits does not grow");
     refused(&ask(&slice("pair_id = 1", "")).send(&server), 429, "too_many");
     drop(unread);
     wait_until("it ends with its reader", || running() == 0.0);

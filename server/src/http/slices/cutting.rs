@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 use bytes::Bytes;
 use echolake_export::{Slice, SliceParams};
 use echolake_lake::Snapshot;
-use echolake_query::{Client, Error as QueryError};
+use echolake_query::{Client, Error as QueryError, Place};
 use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc};
 use tokio::task::JoinSet;
 
@@ -17,6 +17,9 @@ use crate::service::Service;
 
 /// How long a slice waits for its reader to take the next piece.
 const PATIENCE: Duration = Duration::from_secs(300);
+
+/// How long a slice waits for a place among what its client runs.
+const HANDOVER: Duration = Duration::from_secs(1);
 
 /// A slice that is being cut.
 pub(super) struct Cutting {
@@ -33,26 +36,24 @@ pub(super) struct Room {
 
 impl Cutting {
     /// Begins, in one of its client's places.
-    ///
-    /// # Errors
-    /// [`Fault::Query`] where the client has none left.
     pub(super) fn begin(
         service: &Service,
         client: &Arc<Client>,
         snapshot: Arc<Snapshot>,
         params: SliceParams,
         room: Room,
-    ) -> Result<Self, Fault> {
-        let place = client.place()?;
+    ) -> Self {
         let (to, pieces) = mpsc::channel(WAITING);
-        let (of, limit) = (service.clone(), client.quota().time);
+        let (of, client) = (service.clone(), client.clone());
+        let Room { place: room, turns } = room;
         let task = service.spawn(async move {
-            let _held = (room.place, place, of.metrics().begin(Protocol::Http));
-            cut(&of, &snapshot, params, limit, &room.turns, to)
-                .await
-                .inspect_err(|fault| of.metrics().failed(fault.code()))
+            let work = async {
+                let _held = (place(&client).await?, room, of.metrics().begin(Protocol::Http));
+                cut(&of, &snapshot, params, client.quota().time, &turns, to).await
+            };
+            work.await.inspect_err(|fault| of.metrics().failed(fault.code()))
         });
-        Ok(Self { pieces, task })
+        Self { pieces, task }
     }
 
     /// The next bytes; None after the last.
@@ -63,6 +64,17 @@ impl Cutting {
         match self.pieces.recv().await {
             Some(piece) => Ok(Some(piece)),
             None => finish(&mut self.task).await.map(|()| None),
+        }
+    }
+}
+
+// The query that found the measurements gives its place back a moment after its last row.
+async fn place(client: &Client) -> Result<Place, Fault> {
+    let begun = Instant::now();
+    loop {
+        match client.place() {
+            Err(QueryError::Busy { .. }) if begun.elapsed() < HANDOVER => tokio::time::sleep(HANDOVER / 100).await,
+            other => return Ok(other?),
         }
     }
 }

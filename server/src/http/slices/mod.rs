@@ -116,7 +116,7 @@ impl Slices {
         let places = self.0.places.clone();
         let place = places.try_acquire_owned().map_err(|_| Fault::TooMany { what: "slices", limit: MOST })?;
         let room = Room { place, turns: self.0.turns.clone() };
-        Cutting::begin(self.0.catalogue.service(), &request.client, request.view.snapshot.clone(), params, room)
+        Ok(Cutting::begin(self.0.catalogue.service(), &request.client, request.view.snapshot.clone(), params, room))
     }
 }
 
