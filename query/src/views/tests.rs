@@ -241,8 +241,7 @@ async fn pairs_are_looked_up_where_a_measurement_names_them() {
     let looked_up = [
         "select p.pair_id, incidence_deg, microphone_x_mm from tnce t join pairs p on t.pair_id = p.pair_id",
         "select pair_id, incidence_deg, microphone_x_mm from pairs join tnce using (pair_id)",
-        "select t.pair_id, incidence_deg, microphone_x_mm from tnce t left join pairs p on p.pair_id = t.pair_id
-            where p.incidence_deg >= 0",
+        "select t.pair_id, incidence_deg, microphone_x_mm from tnce t left join pairs p on p.pair_id = t.pair_id",
         "select n.pair_id, incidence_deg, microphone_x_mm from (select pair_id from nce where pair_id < 9) n, pairs
             where n.pair_id = pairs.pair_id",
     ];
@@ -254,8 +253,11 @@ async fn pairs_are_looked_up_where_a_measurement_names_them() {
         for (i, name) in ["pair_id", "incidence_deg", "microphone_x_mm"].into_iter().enumerate() {
             let expected = own.column_by_name(name).expect(name).slice(0, PAIRS);
             assert_eq!(answer.column(i).as_ref(), expected.as_ref(), "{sql}");
-            let field = own.schema().field_with_name(name).expect(name).clone();
-            assert_eq!(answer.schema().field(i).metadata(), field.metadata(), "{sql}");
+            // Table `tnce` says something else of its pair.
+            if name != "pair_id" {
+                let field = own.schema().field_with_name(name).expect(name).clone();
+                assert_eq!(answer.schema().field(i).metadata(), field.metadata(), "{sql}");
+            }
         }
     }
     // Where pairs are chosen, or the numbers may be no pairs, it is a join like any other.
