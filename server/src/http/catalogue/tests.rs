@@ -11,7 +11,17 @@ use super::ENDPOINTS;
 fn paths_are_those_of_the_contract() {
     let document: Value = serde_json::from_str(openapi::DOCUMENT).expect("JSON");
     let contract: BTreeSet<_> = document["paths"].as_object().expect("paths").keys().map(String::as_str).collect();
-    let others = ["/api/v1/sql", "/api/v1/session", "/api/v1/openapi.json", "/metrics", "/health"];
+    let others = [
+        "/api/v1/sql",
+        "/api/v1/session",
+        "/api/v1/openapi.json",
+        "/api/v1/files",
+        "/api/v1/slices.mcap",
+        "/api/v1/foxglove/manifest",
+        "/api/v1/layouts/echolake.json",
+        "/metrics",
+        "/health",
+    ];
     let routed: BTreeSet<_> =
         ENDPOINTS.iter().map(|e| e.path).chain([files::RUN, files::TABLE]).chain(others).collect();
     assert_eq!(routed, contract);
