@@ -164,6 +164,13 @@ impl Connection {
         self.session.get().ok_or(Fault::Unauthenticated)
     }
 
+    /// Waits until somebody has logged in.
+    pub(super) async fn logged_in(&self) {
+        while self.session.get().is_none() {
+            tokio::time::sleep(LOOK).await;
+        }
+    }
+
     /// Marks it as doing something.
     pub(super) fn busy(&self) -> Busy<'_> {
         self.busy.fetch_add(1, Ordering::Relaxed);

@@ -84,7 +84,7 @@ async fn attend(socket: TcpStream, connection: Arc<Connection>, mut stopping: wa
     tokio::select! {
         // A client that breaks the protocol is its own affair.
         _ = process_socket(socket, None, Handlers(connection.clone())) => {}
-        () = gone(&watched) => {}
+        () = gone(&watched, &connection) => {}
         () = idle => {}
     }
 }
@@ -96,7 +96,7 @@ fn twice(socket: TcpStream) -> io::Result<(TcpStream, TcpStream)> {
 }
 
 // While a query runs nobody reads from the connection, so that its end must be watched for.
-async fn gone(socket: &TcpStream) {
+async fn gone(socket: &TcpStream, connection: &Connection) {
     loop {
         match socket.ready(Interest::READABLE).await {
             Ok(ready) if !ready.is_read_closed() => {
@@ -104,7 +104,8 @@ async fn gone(socket: &TcpStream) {
                 let _ =
                     socket.try_io(Interest::READABLE, || -> io::Result<()> { Err(io::ErrorKind::WouldBlock.into()) });
             }
-            _ => return,
+            // Who sends a CancelRequest hangs up behind it, and it is read all the same: nothing runs before a login.
+            _ => return connection.logged_in().await,
         }
     }
 }
