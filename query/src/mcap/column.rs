@@ -124,7 +124,7 @@ impl<T: ArrowPrimitiveType> Numbers<T> {
     }
 
     fn finish(&mut self) -> PrimitiveArray<T> {
-        PrimitiveArray::new(ScalarBuffer::from(std::mem::take(&mut self.values)), self.nulls.finish())
+        PrimitiveArray::new(ScalarBuffer::from(take(&mut self.values)), self.nulls.finish())
     }
 }
 
@@ -150,7 +150,7 @@ impl Strings {
     }
 
     fn take(&mut self) -> (OffsetBuffer<i32>, Vec<u8>, Option<NullBuffer>) {
-        (offsets(&mut self.offsets), std::mem::take(&mut self.bytes), self.nulls.finish())
+        (offsets(&mut self.offsets), take(&mut self.bytes), self.nulls.finish())
     }
 }
 
@@ -324,5 +324,13 @@ fn offset(length: usize) -> i32 {
 }
 
 fn offsets(taken: &mut Vec<i32>) -> OffsetBuffer<i32> {
-    OffsetBuffer::new(ScalarBuffer::from(std::mem::replace(taken, vec![0])))
+    let ends = take(taken);
+    taken.push(0);
+    OffsetBuffer::new(ScalarBuffer::from(ends))
+}
+
+// The next batch is about as large, and does not have to grow to it.
+fn take<T>(values: &mut Vec<T>) -> Vec<T> {
+    let next = Vec::with_capacity(values.len());
+    std::mem::replace(values, next)
 }
