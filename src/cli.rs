@@ -4,6 +4,7 @@ use std::path::PathBuf;
 
 use clap::{Args, Parser, Subcommand};
 use echolake_acquisition::collection::LARGEST;
+use echolake_acquisition::replay::SPEEDS;
 use echolake_lake::{KEEP_HOURS, TARGET_BYTES};
 use echolake_schema::SurfaceId;
 
@@ -210,8 +211,8 @@ pub(crate) struct ReplayArgs {
 }
 
 fn speed(text: &str) -> Result<f32, String> {
-    let speed = text.parse().ok().filter(|x| (0.01..=1e6).contains(x));
-    speed.ok_or_else(|| "expected a number from 0.01 to 1000000".to_owned())
+    let speed = text.parse().ok().filter(|x| SPEEDS.contains(x));
+    speed.ok_or_else(|| format!("expected a number from {} to {}", SPEEDS.start(), SPEEDS.end()))
 }
 
 #[derive(Debug, Args)]

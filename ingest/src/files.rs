@@ -5,7 +5,6 @@ use std::sync::Arc;
 
 use echolake_lake::{Lake, StoreError};
 use echolake_schema::RunId;
-use echolake_schema::manifest::Origin;
 use futures::TryStreamExt as _;
 use object_store::local::LocalFileSystem;
 use object_store::path::Path;
@@ -134,8 +133,7 @@ fn is_being_recorded(partial: &FsPath) -> bool {
 async fn is_made_whole_otherwise(partial: &FsPath) -> bool {
     let Ok(path) = absolute(partial) else { return false };
     let opened = Opened { store: Arc::new(LocalFileSystem::new()), path, name: partial.display().to_string() };
-    let imported = |origin| matches!(origin, Origin::ImportedWav | Origin::ImportedGir | Origin::ImportedSofa);
-    let is = |head: Head| head.has_plan || imported(head.origin);
+    let is = |head: Head| head.has_plan || head.origin.is_imported();
     Head::read(&opened).await.is_some_and(is)
 }
 

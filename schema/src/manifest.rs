@@ -26,6 +26,9 @@ pub struct RunManifest {
     pub origin: Origin,
 }
 
+/// The labels of [`Origin`], for people.
+pub(crate) const ORIGINS: &str = "measured, simulated, imported_wav, imported_gir or imported_sofa";
+
 /// Where a run's signals come from.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
@@ -103,6 +106,14 @@ impl Origin {
             Self::ImportedWav => "imported_wav",
             Self::ImportedGir => "imported_gir",
             Self::ImportedSofa => "imported_sofa",
+        }
+    }
+
+    /// Whether somebody else's software wrote what it was made of, so that times and rigs may not be as ours are.
+    pub fn is_imported(self) -> bool {
+        match self {
+            Self::ImportedWav | Self::ImportedGir | Self::ImportedSofa => true,
+            Self::Measured | Self::Simulated => false,
         }
     }
 
@@ -208,7 +219,7 @@ impl RunManifest {
                 record: record.name,
                 key: "origin",
                 actual: origin.to_owned(),
-                expected: "measured, simulated, imported_wav, imported_gir or imported_sofa",
+                expected: ORIGINS,
             })?,
         })
     }

@@ -5,6 +5,10 @@ use std::path::Path;
 use std::sync::Arc;
 use std::time::Duration;
 
+use base64::Engine as _;
+use base64::alphabet::STANDARD;
+use base64::engine::GeneralPurpose;
+use base64::engine::general_purpose::NO_PAD;
 use echolake_query::{Client, Quota};
 use serde::Deserialize;
 use sha2::{Digest as _, Sha256};
@@ -13,6 +17,9 @@ use subtle::{Choice, ConstantTimeEq as _};
 use crate::fault::Fault;
 use crate::sessions::Sessions;
 use crate::{Error, random};
+
+/// Of basic credentials; padding is cut off before, since gRPC's clients leave it out.
+const BASE64: GeneralPurpose = GeneralPurpose::new(&STANDARD, NO_PAD.with_decode_allow_trailing_bits(true));
 
 /// What tokens begin with, so that they are found where they leaked.
 const PREFIX: &str = "echolake_";
@@ -243,32 +250,8 @@ pub(crate) fn of_header(value: &str) -> Option<String> {
     if !scheme.eq_ignore_ascii_case("basic") {
         return None;
     }
-    let pair = String::from_utf8(base64(rest.trim())?).ok()?;
+    let pair = String::from_utf8(BASE64.decode(rest.trim().trim_end_matches('=')).ok()?).ok()?;
     Some(pair.split_once(':')?.1.to_owned())
-}
-
-// RFC 4648, section 4; padding may be missing, as gRPC's clients leave it out.
-fn base64(text: &str) -> Option<Vec<u8>> {
-    let value = |c: u8| match c {
-        b'A'..=b'Z' => Some(c - b'A'),
-        b'a'..=b'z' => Some(c - b'a' + 26),
-        b'0'..=b'9' => Some(c - b'0' + 52),
-        b'+' => Some(62),
-        b'/' => Some(63),
-        _ => None,
-    };
-    let mut bytes = Vec::with_capacity(text.len() * 3 / 4);
-    let (mut bits, mut count) = (0_u32, 0);
-    for c in text.trim_end_matches('=').bytes() {
-        bits = (bits << 6) | u32::from(value(c)?);
-        count += 6;
-        if count >= 8 {
-            count -= 8;
-            bytes.push((bits >> count) as u8);
-            bits &= (1 << count) - 1;
-        }
-    }
-    Some(bytes)
 }
 
 #[cfg(test)]

@@ -129,12 +129,13 @@ fn faults_in_mid_run_are_named_and_nothing_is_lost() {
         let mut room = Room::new();
         let devices = room.devices(since(Timestamp::now(), &[]));
         let ended = run(&mut room, devices, &mut |room, done| {
-            if done == 3 {
+            // Good lines may be waiting yet: only the pair after the next is measured without one.
+            if done == 2 {
                 pull(room);
             }
         });
         assert!(ended.said().contains(expected), "{expected}: {}", ended.said());
-        assert!(ended.count(topics::MEASUREMENT) >= 2, "{expected}: what was measured before is kept");
+        assert!(ended.count(topics::MEASUREMENT) >= 1, "{expected}: what was measured before is kept");
     };
     check(|room| room.bridge.set_fault(Fault::Refuses), "refuses the target");
     check(|room| room.bridge.set_fault(Fault::NoPower), "the safety chain is open");

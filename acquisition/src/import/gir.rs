@@ -9,23 +9,22 @@ use std::fs::File;
 use std::path::{Path, PathBuf};
 
 use echolake_schema::interchange::{GIR_COMBINATIONS, GIR_PANEL_INFO};
-use echolake_schema::manifest::{MeshFacts, Origin, RunEnd, RunManifest};
-use echolake_schema::messages::{AmbientSample, ImpulseResponse, Measurement, Verdict};
-use echolake_schema::{Celsius, Grid, Pair, PairId, Rig, RunId, SurfaceId, SurfaceRecord};
+use echolake_schema::manifest::{MeshFacts, Origin, RunEnd};
+use echolake_schema::{Celsius, Grid, Pair, PairId, Rig, SurfaceId, SurfaceRecord};
 use ndarray::{Array1, Array2, Ix1, Ix2};
 use ndarray_npy::{NpzReader, ReadableElement};
 
 use super::batch::Batch;
-use super::{Error, ImportOptions, ImportedRun};
+use super::response::Response;
+use super::{Error, ImportOptions, ImportedRun, RUN_SECS, wrong};
 use crate::mesh::Mesh;
-use crate::recorder::{LogLevel, Recorder, Relief, RunStart};
+use crate::recorder::{LogLevel, Relief, RunStart};
 use crate::relief::HeightField;
+use crate::rigs::simulated::TAKE_SECS;
 use crate::simulate::{BACK_MM, MESH_CELLS};
 
 /// Samples of the published responses.
 pub const GIR_IR_LEN: usize = 400;
-/// Time of one measurement (Rust et al. 2021), s: the data set has no times of its own.
-const TAKE_SECS: f64 = 12.3;
 /// Who speaks in the log.
 const NAME: &str = "import gir";
 
@@ -44,7 +43,7 @@ pub fn import_gir(
     let info = panel_info(&folder.join("panel_info.csv"))?;
     let files = surfaces(folder)?;
     let (mut runs, mut batch) = (Vec::new(), Batch::default());
-    for (number, file) in (0u32..).zip(&files) {
+    for (number, file) in (0u16..).zip(&files) {
         let surface: SurfaceId = file.file_stem().unwrap_or_default().to_string_lossy().parse()?;
         let import = Import { rig, order: order.as_ref(), grid: &grid, options, number };
         runs.push(import.surface(file, surface.clone(), info.get(&surface), &mut batch)?);
@@ -59,7 +58,7 @@ struct Import<'a> {
     order: Option<&'a Vec<Pair>>,
     grid: &'a Grid,
     options: ImportOptions<'a>,
-    number: u32,
+    number: u16,
 }
 
 impl Import<'_> {
@@ -83,18 +82,9 @@ impl Import<'_> {
             watertight: true,
             relief_mm: h.extent_mm().map(f64::from),
         });
-        // Each surface ten hours after the one before, as they would be measured.
-        let started = self.options.started.plus_secs(f64::from(self.number) * 36_600.0);
-        let run_id = RunId::compose(started, &surface, self.number as u16)?;
-        let manifest = RunManifest {
-            run_id: run_id.clone(),
-            surface_id: surface.clone(),
-            started,
-            software: concat!("echolake ", env!("CARGO_PKG_VERSION")).to_owned(),
-            rig: self.rig.name.clone(),
-            origin: Origin::ImportedGir,
-        };
-        let path = self.options.folder.join(format!("{run_id}.mcap"));
+        let started = self.options.started.plus_secs(f64::from(self.number) * RUN_SECS);
+        let manifest = super::manifest(Origin::ImportedGir, &surface, self.rig, started, self.number)?;
+        let path = self.options.folder.join(format!("{}.mcap", manifest.run_id));
         let relief =
             heights.as_ref().zip(mesh.as_ref()).map(|(heights, mesh)| Relief { heights, mesh, original: None });
         let start = RunStart { manifest: &manifest, rig: self.rig, surface: &record, relief, plan: None };
@@ -109,65 +99,12 @@ impl Import<'_> {
         for ((row, pair), celsius) in pairs.iter().enumerate().zip(&temperatures) {
             at = at.plus_secs(TAKE_SECS);
             let samples = matrix.row(row).iter().map(|x| *x as f32).collect();
-            self.record(&mut recorder, *pair, at, celsius.get(), samples)?;
+            let response = Response { pair: *pair, at, celsius: *celsius, samples, is_corrected: true };
+            response.record(&mut recorder, self.rig, self.grid)?;
         }
         let count = pairs.len() as u64;
         batch.seal(recorder, &RunEnd { ended: at, accepted: count, rejected: 0, attempts: count })?;
-        Ok(ImportedRun { path, run_id, surface, measurements: pairs.len(), warnings: Vec::new() })
-    }
-
-    fn record(
-        &self,
-        recorder: &mut Recorder,
-        pair: Pair,
-        at: echolake_schema::Timestamp,
-        celsius: f64,
-        samples: Vec<f32>,
-    ) -> Result<(), Error> {
-        let unknown = f64::NAN;
-        let [m, s] = [pair.microphone, pair.speaker].map(|id| self.grid.points()[id.index()].position_mm);
-        recorder.poses(at, m, s)?;
-        recorder.environment(
-            at,
-            &AmbientSample {
-                temperature_c: celsius,
-                humidity_pct: unknown,
-                pressure_hpa: unknown,
-                outside_level_db: unknown,
-            },
-        )?;
-        recorder.ir(
-            at,
-            &ImpulseResponse {
-                pair_id: pair.id.0,
-                attempt: 1,
-                sample_rate_hz: self.rig.sweep.rate_hz.get(),
-                samples,
-                temperature_c: celsius,
-                temperature_corrected: true,
-            },
-        )?;
-        recorder.measurement(
-            at,
-            &Measurement {
-                pair_id: pair.id.0,
-                attempt: 1,
-                microphone: pair.microphone.0,
-                speaker: pair.speaker.0,
-                verdict: Verdict::Accepted.into(),
-                snr_db: unknown,
-                loopback_level_dbfs: unknown,
-                arrival_error_us: unknown,
-                outside_level_db: unknown,
-                temperature_c: celsius,
-                humidity_pct: unknown,
-                pressure_hpa: unknown,
-                microphone_residual_mm: unknown,
-                speaker_residual_mm: unknown,
-                ..Measurement::default()
-            },
-        )?;
-        Ok(())
+        Ok(ImportedRun { path, run_id: manifest.run_id, surface, measurements: pairs.len(), warnings: Vec::new() })
     }
 
     fn matrix(&self, file: &Path, rows: usize) -> Result<Array2<f64>, Error> {
@@ -219,10 +156,6 @@ fn temperatures(file: &Path, rows: usize) -> Result<Vec<Celsius>, Error> {
         Celsius::new(*celsius).map_err(|e| wrong(file, place, e.to_string(), "a temperature"))
     });
     checked.collect()
-}
-
-fn wrong(path: &Path, place: impl Into<String>, actual: impl Into<String>, expected: impl Into<String>) -> Error {
-    Error::Content { path: path.to_owned(), place: place.into(), actual: actual.into(), expected: expected.into() }
 }
 
 // Every .npz that is no height map.

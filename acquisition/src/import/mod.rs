@@ -2,6 +2,7 @@
 
 mod batch;
 mod gir;
+mod response;
 mod sofa;
 mod sofa_file;
 mod wav;
@@ -10,11 +11,15 @@ mod wav_manifest;
 
 use std::path::{Path, PathBuf};
 
-use echolake_schema::{RunId, SurfaceId, Timestamp};
+use echolake_schema::manifest::{Origin, RunManifest};
+use echolake_schema::{Rig, RunId, SurfaceId, Timestamp};
 
 pub use gir::{GIR_IR_LEN, import_gir};
 pub use sofa::{check_sofa, import_sofa};
 pub use wav::{check_wav, import_wav, sampling_rate_of};
+
+/// Between the beginnings of runs whose files have no times, s: as they would be measured.
+const RUN_SECS: f64 = 36_600.0;
 
 /// A run made of somebody's files.
 #[derive(Debug, Clone, PartialEq)]
@@ -97,4 +102,26 @@ pub enum Error {
     /// A name or rig is not valid.
     #[error(transparent)]
     Schema(#[from] echolake_schema::Error),
+}
+
+fn wrong(path: &Path, place: impl Into<String>, actual: impl Into<String>, expected: impl Into<String>) -> Error {
+    Error::Content { path: path.to_owned(), place: place.into(), actual: actual.into(), expected: expected.into() }
+}
+
+/// What an imported run says of itself; `number` tells runs of one import apart.
+fn manifest(
+    origin: Origin,
+    surface: &SurfaceId,
+    rig: &Rig,
+    started: Timestamp,
+    number: u16,
+) -> Result<RunManifest, Error> {
+    Ok(RunManifest {
+        run_id: RunId::compose(started, surface, number)?,
+        surface_id: surface.clone(),
+        started,
+        software: concat!("echolake ", env!("CARGO_PKG_VERSION")).to_owned(),
+        rig: rig.name.clone(),
+        origin,
+    })
 }

@@ -10,21 +10,20 @@ use std::collections::HashSet;
 use std::path::{Path, PathBuf};
 
 use echolake_dsp::temperature::{TemperatureCorrection, resampling_ratio};
-use echolake_schema::manifest::{Origin, RunEnd, RunManifest};
-use echolake_schema::messages::{AmbientSample, ImpulseResponse, Measurement, Verdict};
-use echolake_schema::{Celsius, Grid, Pair, PairId, Rig, RunId, SurfaceId, SurfaceRecord, Timestamp};
+use echolake_schema::manifest::{Origin, RunEnd};
+use echolake_schema::{Celsius, Grid, Pair, PairId, Rig, SurfaceId, SurfaceRecord, Timestamp};
 
 use super::batch::Batch;
+use super::response::Response;
 use super::sofa_file::{SofaFile, Variable};
-use super::{Error, ImportOptions, ImportedRun};
-use crate::recorder::{LogLevel, Recorder, RunStart};
+use super::{Error, ImportOptions, ImportedRun, RUN_SECS, wrong};
+use crate::recorder::{LogLevel, RunStart};
+use crate::rigs::simulated::TAKE_SECS;
 
 /// Who speaks in the log.
 const NAME: &str = "import sofa";
 /// What our own export says of itself.
 const OURS: &str = "echolake";
-/// Time of one measurement (Rust et al. 2021), s, where a file has none.
-const TAKE_SECS: f64 = 12.3;
 /// Between measurements whose file says the same time of both: it counts in seconds.
 const STEP_NANOS: i64 = 1_000;
 const KELVIN: f64 = 273.15;
@@ -35,8 +34,7 @@ const SAME_METRES: f64 = 5e-4;
 /// none.
 ///
 /// # Errors
-/// [`Error`], naming the file and the variable; every file is checked before the first is imported, and a refused
-/// import leaves nothing behind.
+/// [`Error`], naming the file and the variable; a refused import leaves nothing behind.
 pub fn import_sofa(
     files: &[PathBuf],
     rig: &Rig,
@@ -45,18 +43,12 @@ pub fn import_sofa(
     progress: &mut dyn FnMut(usize, usize),
 ) -> Result<Vec<ImportedRun>, Error> {
     let grid = rig.grid()?;
-    let (mut runs, mut batch, mut surfaces) = (Vec::new(), Batch::default(), HashSet::new());
-    for (number, path) in (0u16..).zip(files) {
-        let sofa = Sofa::read(path, rig, &grid, celsius)?;
-        if !surfaces.insert(sofa.surface.clone()) {
-            let what = format!("a second file of surface {}", sofa.surface);
-            return Err(wrong(path, "Title", what, "one file a surface"));
-        }
-        // Each without times ten hours after the one before, as they would be measured.
-        let fallback = options.started.plus_secs(f64::from(number) * 36_600.0);
-        runs.push(sofa.record(&Import { rig, grid: &grid, options, number, fallback }, &mut batch)?);
+    let (mut runs, mut batch) = (Vec::new(), Batch::default());
+    each(files, rig, &grid, celsius, |sofa, number| {
+        runs.push(sofa.record(&Import { rig, grid: &grid, options, number }, &mut batch)?);
         progress(runs.len(), files.len());
-    }
+        Ok(())
+    })?;
     batch.publish()?;
     Ok(runs)
 }
@@ -66,8 +58,27 @@ pub fn import_sofa(
 /// # Errors
 /// As [`import_sofa`].
 pub fn check_sofa(files: &[PathBuf], rig: &Rig, celsius: Option<Celsius>) -> Result<(), Error> {
-    let grid = rig.grid()?;
-    files.iter().try_for_each(|path| Sofa::read(path, rig, &grid, celsius).map(drop))
+    each(files, rig, &rig.grid()?, celsius, |_, _| Ok(()))
+}
+
+// Reads the files, one in memory at a time.
+fn each(
+    files: &[PathBuf],
+    rig: &Rig,
+    grid: &Grid,
+    celsius: Option<Celsius>,
+    mut then: impl FnMut(&Sofa, u16) -> Result<(), Error>,
+) -> Result<(), Error> {
+    let mut surfaces = HashSet::new();
+    for (number, path) in (0u16..).zip(files) {
+        let sofa = Sofa::read(path, rig, grid, celsius)?;
+        if !surfaces.insert(sofa.surface.clone()) {
+            let what = format!("a second file of surface {}", sofa.surface);
+            return Err(wrong(path, "Title", what, "one file a surface"));
+        }
+        then(&sofa, number)?;
+    }
+    Ok(())
 }
 
 struct Import<'a> {
@@ -75,8 +86,6 @@ struct Import<'a> {
     grid: &'a Grid,
     options: ImportOptions<'a>,
     number: u16,
-    /// Time of the first measurement where the file has none.
-    fallback: Timestamp,
 }
 
 /// What a file holds.
@@ -87,7 +96,6 @@ struct Sofa {
     length: usize,
     samples: Vec<f32>,
     is_corrected: bool,
-    has_times: bool,
 }
 
 struct Measured {
@@ -154,36 +162,30 @@ impl Sofa {
             // Ours were singles before they were doubles, so that nothing is lost.
             samples: responses.values.iter().map(|x| *x as f32).collect(),
             is_corrected: is_ours,
-            has_times: times.is_some(),
         })
     }
 
     fn record(&self, import: &Import<'_>, batch: &mut Batch) -> Result<ImportedRun, Error> {
-        let times = self.times(import.fallback);
+        let times = self.times(import.options.started.plus_secs(f64::from(import.number) * RUN_SECS));
         let (started, ended) = (times[0], times[times.len() - 1]);
-        let run_id = RunId::compose(started, &self.surface, import.number)?;
-        let manifest = RunManifest {
-            run_id: run_id.clone(),
-            surface_id: self.surface.clone(),
-            started,
-            software: concat!("echolake ", env!("CARGO_PKG_VERSION")).to_owned(),
-            rig: import.rig.name.clone(),
-            origin: Origin::ImportedSofa,
-        };
+        let manifest = super::manifest(Origin::ImportedSofa, &self.surface, import.rig, started, import.number)?;
         let record = SurfaceRecord { typology: "imported".into(), ..SurfaceRecord::default() };
-        let path = import.options.folder.join(format!("{run_id}.mcap"));
+        let path = import.options.folder.join(format!("{}.mcap", manifest.run_id));
         let start = RunStart { manifest: &manifest, rig: import.rig, surface: &record, relief: None, plan: None };
         let mut recorder = batch.create(&path, &start)?;
-        if !self.has_times {
+        if self.measurements.iter().all(|m| m.time.is_none()) {
             recorder.log(started, LogLevel::Info, NAME, "times are made up: the file has none")?;
         }
         for (measured, at) in self.measurements.iter().zip(times) {
-            self.measurement(&mut recorder, import, measured, at)?;
+            let samples = self.samples[measured.row * self.length..][..self.length].to_vec();
+            let Measured { pair, celsius, .. } = *measured;
+            let response = Response { pair, at, celsius, samples, is_corrected: self.is_corrected };
+            response.record(&mut recorder, import.rig, import.grid)?;
         }
         let count = self.measurements.len();
         let end = RunEnd { ended, accepted: count as u64, rejected: 0, attempts: count as u64 };
         batch.seal(recorder, &end)?;
-        let surface = self.surface.clone();
+        let (run_id, surface) = (manifest.run_id, manifest.surface_id);
         Ok(ImportedRun { path, run_id, surface, measurements: count, warnings: Vec::new() })
     }
 
@@ -196,60 +198,6 @@ impl Sofa {
             Timestamp(last)
         };
         (0u32..).zip(&self.measurements).map(at).collect()
-    }
-
-    fn measurement(
-        &self,
-        recorder: &mut Recorder,
-        import: &Import<'_>,
-        measured: &Measured,
-        at: Timestamp,
-    ) -> Result<(), Error> {
-        let (unknown, celsius, pair) = (f64::NAN, measured.celsius.get(), measured.pair);
-        let [m, s] = [pair.microphone, pair.speaker].map(|id| import.grid.points()[id.index()].position_mm);
-        let samples = self.samples[measured.row * self.length..][..self.length].to_vec();
-        recorder.poses(at, m, s)?;
-        recorder.environment(
-            at,
-            &AmbientSample {
-                temperature_c: celsius,
-                humidity_pct: unknown,
-                pressure_hpa: unknown,
-                outside_level_db: unknown,
-            },
-        )?;
-        recorder.ir(
-            at,
-            &ImpulseResponse {
-                pair_id: pair.id.0,
-                attempt: 1,
-                sample_rate_hz: import.rig.sweep.rate_hz.get(),
-                samples,
-                temperature_c: celsius,
-                temperature_corrected: self.is_corrected,
-            },
-        )?;
-        recorder.measurement(
-            at,
-            &Measurement {
-                pair_id: pair.id.0,
-                attempt: 1,
-                microphone: pair.microphone.0,
-                speaker: pair.speaker.0,
-                verdict: Verdict::Accepted.into(),
-                snr_db: unknown,
-                loopback_level_dbfs: unknown,
-                arrival_error_us: unknown,
-                outside_level_db: unknown,
-                temperature_c: celsius,
-                humidity_pct: unknown,
-                pressure_hpa: unknown,
-                microphone_residual_mm: unknown,
-                speaker_residual_mm: unknown,
-                ..Measurement::default()
-            },
-        )?;
-        Ok(())
     }
 }
 
@@ -402,8 +350,4 @@ fn least_length(rig: &Rig, celsius: Celsius, is_corrected: bool) -> usize {
 // What metres or kelvin have behind the ninth place is their conversion's.
 fn to_nano(x: f64) -> f64 {
     (x * 1e9).round() / 1e9
-}
-
-fn wrong(path: &Path, place: impl Into<String>, actual: impl Into<String>, expected: impl Into<String>) -> Error {
-    Error::Content { path: path.to_owned(), place: place.into(), actual: actual.into(), expected: expected.into() }
 }

@@ -9,9 +9,9 @@ use echolake_dsp::chain::raw_len;
 use echolake_dsp::deconvolution::{DeconvolutionParams, DeconvolutionPlan, TransformLength};
 use echolake_dsp::geometry::direct_mm;
 use echolake_dsp::temperature::speed_of_sound;
-use echolake_schema::manifest::{Origin, RunEnd, RunManifest};
+use echolake_schema::manifest::{Origin, RunEnd};
 use echolake_schema::messages::{AmbientSample, ImpulseResponse, Measurement, SweepRecording, Verdict};
-use echolake_schema::{Grid, Rig, RunId, SampleRate, SurfaceId, SurfaceRecord, Timestamp};
+use echolake_schema::{Grid, Rig, SampleRate, SurfaceId, SurfaceRecord, Timestamp};
 
 use super::batch::Batch;
 use super::wav_manifest::{self, Row};
@@ -77,18 +77,10 @@ impl Import<'_> {
         let mut timed: Vec<_> = (0u32..).zip(rows).map(|(i, row)| (self.time(row, i), row)).collect();
         timed.sort_by_key(|(time, _)| *time);
         let started = timed.first().map_or(self.options.started, |(time, _)| *time);
-        let run_id = RunId::compose(started, &surface, tag)?;
-        let run = RunManifest {
-            run_id: run_id.clone(),
-            surface_id: surface.clone(),
-            started,
-            software: concat!("echolake ", env!("CARGO_PKG_VERSION")).to_owned(),
-            rig: self.rig.name.clone(),
-            origin: Origin::ImportedWav,
-        };
+        let manifest = super::manifest(Origin::ImportedWav, &surface, self.rig, started, tag)?;
         let record = SurfaceRecord { typology: "imported".into(), ..SurfaceRecord::default() };
-        let path = self.options.folder.join(format!("{run_id}.mcap"));
-        let start = RunStart { manifest: &run, rig: self.rig, surface: &record, relief: None, plan: None };
+        let path = self.options.folder.join(format!("{}.mcap", manifest.run_id));
+        let start = RunStart { manifest: &manifest, rig: self.rig, surface: &record, relief: None, plan: None };
         let mut recorder = batch.create(&path, &start)?;
         recorder.log(started, LogLevel::Info, NAME, &format!("{} recordings", rows.len()))?;
         let mut warnings = Vec::new();
@@ -99,7 +91,7 @@ impl Import<'_> {
         let count = rows.len() as u64;
         let ended = timed.last().map_or(started, |(time, _)| *time);
         batch.seal(recorder, &RunEnd { ended, accepted: count, rejected: 0, attempts: count })?;
-        Ok(ImportedRun { path, run_id, surface, measurements: rows.len(), warnings })
+        Ok(ImportedRun { path, run_id: manifest.run_id, surface, measurements: rows.len(), warnings })
     }
 
     fn time(&self, row: &Row, index: u32) -> Timestamp {

@@ -1,9 +1,10 @@
 //! The time of a replay: goes on at its speed, stands, is put elsewhere.
 
+use std::ops::RangeInclusive;
 use std::time::{Duration, Instant};
 
-/// Slower is paused, faster is more than any disk gives.
-const SPEEDS: (f32, f32) = (0.01, 1e6);
+/// Speeds of a replay, as factors of real time: slower is paused, faster is more than any disk gives.
+pub const SPEEDS: RangeInclusive<f32> = 0.01..=1e6;
 
 /// A clock that shows the time of what is played, ns since 1970.
 #[derive(Debug)]
@@ -18,7 +19,7 @@ pub(super) struct Clock {
 impl Clock {
     /// Stands at a time.
     pub(super) fn new(at: u64, speed: f32) -> Self {
-        Self { shown: at, since: None, speed: speed.clamp(SPEEDS.0, SPEEDS.1) }
+        Self { shown: at, since: None, speed: speed.clamp(*SPEEDS.start(), *SPEEDS.end()) }
     }
 
     pub(super) fn now(&self) -> u64 {
@@ -40,7 +41,7 @@ impl Clock {
     pub(super) fn set_speed(&mut self, speed: f32) {
         if speed.is_finite() && speed > 0.0 {
             self.set(self.now());
-            self.speed = speed.clamp(SPEEDS.0, SPEEDS.1);
+            self.speed = speed.clamp(*SPEEDS.start(), *SPEEDS.end());
         }
     }
 
@@ -65,7 +66,7 @@ mod tests {
     #[test]
     fn it_stands_goes_and_is_put_elsewhere() {
         let mut clock = Clock::new(1_000, 1e9);
-        assert_eq!(clock.speed(), SPEEDS.1);
+        assert_eq!(clock.speed(), *SPEEDS.end());
         assert_eq!(clock.now(), 1_000);
         clock.go(true);
         std::thread::sleep(Duration::from_millis(2));
@@ -76,7 +77,7 @@ mod tests {
         clock.set(5);
         for speed in [f32::NAN, f32::INFINITY, 0.0, -1.0] {
             clock.set_speed(speed);
-            assert_eq!(clock.speed(), SPEEDS.1, "{speed} is no speed");
+            assert_eq!(clock.speed(), *SPEEDS.end(), "{speed} is no speed");
         }
         clock.set_speed(2.0);
         assert_eq!((clock.now(), clock.until(2_000_000_005)), (5, Duration::from_secs(1)));

@@ -39,7 +39,7 @@ impl Cursor {
     }
 
     /// The time of the next message; None behind the last.
-    pub(super) fn peek(&mut self, recording: &mut Recording, damages: &mut Vec<Damage>) -> Option<u64> {
+    pub(super) fn peek(&mut self, recording: &Recording, damages: &mut Vec<Damage>) -> Option<u64> {
         self.fill(recording, damages);
         self.first().map(|(_, key)| key.0)
     }
@@ -62,7 +62,7 @@ impl Cursor {
     }
 
     // Opens chunks until none that is closed can have an earlier message than the next.
-    fn fill(&mut self, recording: &mut Recording, damages: &mut Vec<Damage>) {
+    fn fill(&mut self, recording: &Recording, damages: &mut Vec<Damage>) {
         while let Some(chunk) = recording.chunks.get(self.next_chunk) {
             if self.first().is_some_and(|(_, key)| key.0 < chunk.start) {
                 return;
@@ -71,8 +71,7 @@ impl Cursor {
             if chunk.end < self.passed.0 || !chunk.has_any(&self.wanted) {
                 continue;
             }
-            let chunk = chunk.clone();
-            match recording.messages(&chunk, &self.wanted) {
+            match recording.messages(chunk, &self.wanted) {
                 Ok(messages) => {
                     let ahead: VecDeque<_> = messages.into_iter().filter(|m| m.key > self.passed).collect();
                     let bytes: usize = ahead.iter().map(|m| m.data.len()).sum();
@@ -92,13 +91,13 @@ impl Cursor {
 
 /// Where things stand at a place: of each channel the messages of its latest time up to there, by time.
 pub(super) fn standing(
-    recording: &mut Recording,
+    recording: &Recording,
     upto: Key,
     channels: &BTreeSet<u16>,
     damages: &mut Vec<Damage>,
 ) -> Vec<Message> {
     let mut found: BTreeMap<u16, Vec<Message>> = BTreeMap::new();
-    let mut chunks: Vec<_> = recording.chunks.iter().filter(|c| c.start <= upto.0).cloned().collect();
+    let mut chunks: Vec<_> = recording.chunks.iter().filter(|c| c.start <= upto.0).collect();
     // From what reaches farthest; a chunk that ends before what is known cannot know better.
     chunks.sort_by_key(|c| std::cmp::Reverse((c.end.min(upto.0), c.start, c.offset)));
     for chunk in chunks {
@@ -113,7 +112,7 @@ pub(super) fn standing(
         if !chunk.has_any(&open) {
             continue;
         }
-        let messages = recording.messages(&chunk, &open).unwrap_or_else(|what| {
+        let messages = recording.messages(chunk, &open).unwrap_or_else(|what| {
             damages.push((chunk.offset, what));
             Vec::new()
         });

@@ -1,9 +1,9 @@
 //! Recordings shown again: a WebSocket server that Foxglove controls (play, pause, speed, seek) and Lichtblick looks at.
 //!
 //! Several recordings are shown one after the other; what lies between them is left out, and where one begins before the
-//! other ends, time goes back. Only chunks with topics that
-//! somebody wants are read, one after the other. Playback stands while nobody looks on, and waits while all viewers have
-//! enough to read; where one is slower than another, it loses its oldest messages.
+//! other ends, time goes back. Only chunks with topics that somebody wants are read, one after the other. Playback stands
+//! while nobody looks on, and waits while all viewers have enough to read; where one is slower than another, it loses its
+//! oldest messages.
 
 mod clock;
 mod cursor;
@@ -20,6 +20,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::JoinHandle;
 
 use crate::viewer::{Playback, Server};
+pub use clock::SPEEDS;
 pub use error::Error;
 use player::Player;
 pub use recording::Recording;

@@ -40,7 +40,7 @@ impl Topics {
             let mut channels = BTreeMap::new();
             for (id, topic) in &recording.topics {
                 let same = |known: &Topic| Topic { channel: known.channel, ..topic.clone() } == *known;
-                let channel = match all.iter().find(|known| same(known)) {
+                let channel = match all.iter().find(|known| known.topic == topic.topic && same(known)) {
                     Some(known) => known.channel,
                     None => {
                         let channel = u16::try_from(all.len() + 1).ok()?;
@@ -140,7 +140,7 @@ impl Player {
 
     fn peek(&mut self) -> Option<u64> {
         let mut damages = Vec::new();
-        let next = self.cursor.peek(&mut self.recordings[self.number], &mut damages);
+        let next = self.cursor.peek(&self.recordings[self.number], &mut damages);
         self.note(damages);
         next
     }
@@ -163,7 +163,7 @@ impl Player {
             self.status = PlaybackStatus::Ended;
             self.tell_state(false, String::new());
         }
-        TICK.min(BREATH)
+        BREATH
     }
 
     // Nothing is due before a time.
@@ -264,7 +264,7 @@ impl Player {
         let asked = |to_channel: &u16| to.iter().any(|(_, wanted)| wanted.contains(to_channel));
         let of_file = channels.iter().filter(|(_, to)| asked(to)).map(|(from, _)| *from).collect();
         let mut damages = Vec::new();
-        let messages = standing(&mut self.recordings[self.number], self.cursor.passed(), &of_file, &mut damages);
+        let messages = standing(&self.recordings[self.number], self.cursor.passed(), &of_file, &mut damages);
         let known: Vec<Waiting> = messages
             .into_iter()
             .filter_map(|m| {

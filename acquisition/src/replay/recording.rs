@@ -80,9 +80,7 @@ impl Recording {
         let Some(range) = range else {
             let reason = match defect {
                 Some(defect) => format!("{defect}, and nothing before it is whole"),
-                None => {
-                    "it has no chunks with messages; hint: files without chunks are to be rewritten with".to_owned()
-                }
+                None => "it has no chunks with messages; hint: `mcap recover` writes a file in chunks".to_owned(),
             };
             return Err(Error::Unplayable { path: path.to_owned(), reason });
         };
@@ -105,7 +103,7 @@ impl Recording {
     }
 
     /// The messages of a chunk by their time, of some channels; in words where it is damaged.
-    pub(super) fn messages(&mut self, chunk: &Stretch, channels: &BTreeSet<u16>) -> Result<Vec<Message>, String> {
+    pub(super) fn messages(&self, chunk: &Stretch, channels: &BTreeSet<u16>) -> Result<Vec<Message>, String> {
         let body = self.body(chunk)?;
         // What it unpacks to stands behind its two times.
         let unpacked = body.get(16..24).and_then(|b| b.try_into().ok()).map_or(0, u64::from_le_bytes);
@@ -125,13 +123,14 @@ impl Recording {
         Ok(messages)
     }
 
-    fn body(&mut self, chunk: &Stretch) -> Result<Vec<u8>, String> {
+    fn body(&self, chunk: &Stretch) -> Result<Vec<u8>, String> {
         if !(FRAME..=LARGEST).contains(&chunk.length) {
             return Err(format!("a chunk of {} bytes", chunk.length));
         }
         let mut body = vec![0; (chunk.length - FRAME) as usize];
-        let read = self.file.seek(SeekFrom::Start(chunk.offset.saturating_add(FRAME)));
-        read.and_then(|_| self.file.read_exact(&mut body)).map_err(|e| e.to_string())?;
+        let mut file = &self.file;
+        let read = file.seek(SeekFrom::Start(chunk.offset.saturating_add(FRAME)));
+        read.and_then(|_| file.read_exact(&mut body)).map_err(|e| e.to_string())?;
         Ok(body)
     }
 }

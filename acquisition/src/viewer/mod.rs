@@ -152,7 +152,7 @@ impl Shared {
     /// Whether all who want something have enough to read: then nobody is served by more.
     pub(crate) fn all_are_busy(&self) -> bool {
         let state = self.state();
-        let mut watching = state.clients.iter().filter(|client| !client.receiving().is_empty()).peekable();
+        let mut watching = state.clients.iter().filter(|client| client.is_receiving()).peekable();
         watching.peek().is_some() && watching.all(|client| client.is_busy())
     }
 

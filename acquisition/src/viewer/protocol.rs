@@ -2,8 +2,8 @@
 //! (<https://github.com/foxglove/ws-protocol/blob/main/docs/spec.md>), and playback control, which Foxglove's SDK adds to
 //! it (<https://github.com/foxglove/foxglove-sdk>, `rust/foxglove/src/protocol`).
 
-use std::fmt::Write as _;
-
+use base64::Engine as _;
+use base64::prelude::BASE64_STANDARD as BASE64;
 use serde::{Deserialize, Serialize};
 
 use crate::recorder::Topic;
@@ -196,45 +196,14 @@ pub(super) fn wish(text: &str) -> Option<Wish> {
 // Schemas of a binary encoding are sent in base64, those that are text as they are.
 fn schema_text(topic: &Topic) -> String {
     match topic.schema_encoding.as_str() {
-        "protobuf" | "flatbuffer" => base64(&topic.schema_data),
+        "protobuf" | "flatbuffer" => BASE64.encode(&topic.schema_data),
         _ => String::from_utf8_lossy(&topic.schema_data).into_owned(),
     }
-}
-
-// RFC 4648, with padding.
-fn base64(bytes: &[u8]) -> String {
-    const LETTERS: &[u8; 64] = b"ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789+/";
-    let mut out = String::with_capacity(bytes.len().div_ceil(3) * 4);
-    for three in bytes.chunks(3) {
-        let bits = three.iter().enumerate().fold(0u32, |bits, (i, b)| bits | u32::from(*b) << (16 - 8 * i));
-        for letter in 0..4 {
-            let index = (bits >> (18 - 6 * letter)) as usize & 63;
-            let _ = out.write_char(if letter <= three.len() { char::from(LETTERS[index]) } else { '=' });
-        }
-    }
-    out
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    // The vectors of RFC 4648, section 10.
-    #[test]
-    fn base64_is_that_of_the_rfc() {
-        for (plain, expected) in [
-            ("", ""),
-            ("f", "Zg=="),
-            ("fo", "Zm8="),
-            ("foo", "Zm9v"),
-            ("foob", "Zm9vYg=="),
-            ("fooba", "Zm9vYmE="),
-            ("foobar", "Zm9vYmFy"),
-        ] {
-            assert_eq!(base64(plain.as_bytes()), expected);
-        }
-        assert_eq!(base64(&[0xFB, 0xFF, 0xBF]), "+/+/");
-    }
 
     #[test]
     fn schemas_are_sent_as_their_encoding_wants_it() {

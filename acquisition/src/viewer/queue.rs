@@ -89,6 +89,11 @@ impl Queue {
         self.inner().wanted.iter().filter(|(_, wanted)| wanted.primed).map(|(channel, _)| *channel).collect()
     }
 
+    /// Whether messages of some channel go to it now.
+    pub(super) fn is_receiving(&self) -> bool {
+        self.inner().wanted.values().any(|wanted| wanted.primed)
+    }
+
     /// Whether messages of a channel go to it now.
     pub(crate) fn receives(&self, channel: u16) -> bool {
         self.inner().wanted.get(&channel).is_some_and(|w| w.primed)

@@ -2,6 +2,7 @@
 
 use super::Table;
 use super::column::Column;
+use crate::manifest::ORIGINS;
 
 /// The columns of a table in a lake whose bands have these names.
 pub(super) fn columns(table: Table, bands: &[String]) -> Vec<Column> {
@@ -80,7 +81,7 @@ fn surfaces() -> Vec<Column> {
         Column::float("relief_min_mm", "mm", "Lowest point of the relief over the panel's reference plane").or_null(),
         Column::float("relief_max_mm", "mm", "Highest point of the relief over the panel's reference plane").or_null(),
         Column::float("relief_rms_mm", "mm", "Root mean square height of the relief about its mean").or_null(),
-        Column::text("origin", "measured, simulated, imported_wav, imported_gir or imported_sofa"),
+        Column::text("origin", ORIGINS),
         code_version(),
     ]);
     columns
@@ -91,7 +92,7 @@ fn runs() -> Vec<Column> {
     columns.extend([
         Column::text("state", "complete; waiting: references are missing; partial: the file was cut off"),
         Column::text("missing", "References that are missing, separated by commas; empty where none is"),
-        Column::text("origin", "measured, simulated, imported_wav, imported_gir or imported_sofa"),
+        Column::text("origin", ORIGINS),
         Column::text("rig", "Name of the rig"),
         Column::long("started_ns", "ns", "Start since 1970-01-01 UTC"),
         Column::time("started", "Start, UTC"),

@@ -1,5 +1,6 @@
 //! SOFA files of another make than our export's: what is taken of them, and what is wrong with them by name.
 
+use echolake_schema::messages::ImpulseResponse;
 use echolake_schema::topics;
 use prost::Message as _;
 use rust_hdf5::VarLenUnicode;

@@ -5,6 +5,8 @@
 use axum::extract::State;
 use axum::http::{HeaderMap, Uri};
 use axum::response::{IntoResponse as _, Response};
+use base64::Engine as _;
+use base64::prelude::BASE64_STANDARD as BASE64;
 use chrono::{DateTime, SecondsFormat};
 use echolake_export::{Layout, OutlineSchema, OutlineTopic, Taken, outline};
 use echolake_schema::RunId;
@@ -98,7 +100,7 @@ async fn source(slices: &Slices, request: &Request, taken: &[Taken]) -> Result<S
     let service = slices.0.catalogue.service();
     let (params, lake, snapshot) =
         (Slices::params(request, taken.to_vec()), service.lake().clone(), request.view.snapshot.clone());
-    let found = service.plan(async move { Ok(outline(&lake, &snapshot, &params).await?) }).await?;
+    let found = service.plan(async move { Ok(outline(&lake, &snapshot, params).await?) }).await?;
     let number = |index: usize| u16::try_from(index + 1).ok();
     let topic = |topic: OutlineTopic| Topic {
         name: topic.name,
@@ -107,7 +109,7 @@ async fn source(slices: &Slices, request: &Request, taken: &[Taken]) -> Result<S
     };
     let schema = |(index, schema): (usize, OutlineSchema)| {
         let OutlineSchema { name, encoding, data } = schema;
-        Some(Schema { id: number(index)?, name, encoding, data: base64(&data) })
+        Some(Schema { id: number(index)?, name, encoding, data: BASE64.encode(&data) })
     };
     let digest = digest(&request.view, &request.question, taken);
     Ok(Source::Streamed {
@@ -124,41 +126,9 @@ fn time(nanos: i64) -> String {
     DateTime::from_timestamp_nanos(nanos).to_rfc3339_opts(SecondsFormat::Nanos, true)
 }
 
-// RFC 4648, section 4.
-fn base64(bytes: &[u8]) -> String {
-    const DIGITS: &[u8; 64] = b"ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789+/";
-    let mut text = String::with_capacity(bytes.len().div_ceil(3) * 4);
-    for part in bytes.chunks(3) {
-        let byte = |i: usize| u32::from(part.get(i).copied().unwrap_or(0));
-        let bits = byte(0) << 16 | byte(1) << 8 | byte(2);
-        for digit in 0..4 {
-            let value = (bits >> (18 - 6 * digit)) & 63;
-            text.push(if digit <= part.len() { DIGITS[value as usize] as char } else { '=' });
-        }
-    }
-    text
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn base64_is_as_the_standard_has_it() {
-        // RFC 4648, section 10.
-        for (bytes, text) in [
-            ("", ""),
-            ("f", "Zg=="),
-            ("fo", "Zm8="),
-            ("foo", "Zm9v"),
-            ("foob", "Zm9vYg=="),
-            ("fooba", "Zm9vYmE="),
-            ("foobar", "Zm9vYmFy"),
-        ] {
-            assert_eq!(base64(bytes.as_bytes()), text);
-        }
-        assert_eq!(base64(&[0xfb, 0xff, 0xfe]), "+//+");
-    }
 
     #[test]
     fn times_keep_their_nanoseconds() {

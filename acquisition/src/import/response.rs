@@ -1,0 +1,66 @@
+//! One response of somebody else's as a run records it: where, when and how warm it was; the rest nobody has told.
+
+use echolake_schema::messages::{AmbientSample, ImpulseResponse, Measurement, Verdict};
+use echolake_schema::{Celsius, Grid, Pair, Rig, Timestamp};
+
+use crate::recorder::{Error, Recorder};
+
+/// A response that is taken as it is given.
+pub(super) struct Response {
+    pub(super) pair: Pair,
+    pub(super) at: Timestamp,
+    pub(super) celsius: Celsius,
+    pub(super) samples: Vec<f32>,
+    /// Whether it is on the time axis of the rig's reference temperature.
+    pub(super) is_corrected: bool,
+}
+
+impl Response {
+    /// Records it as the pair's first attempt, accepted.
+    pub(super) fn record(self, recorder: &mut Recorder, rig: &Rig, grid: &Grid) -> Result<(), Error> {
+        let Self { pair, at, celsius, samples, is_corrected } = self;
+        let (unknown, celsius) = (f64::NAN, celsius.get());
+        let [m, s] = [pair.microphone, pair.speaker].map(|id| grid.points()[id.index()].position_mm);
+        recorder.poses(at, m, s)?;
+        recorder.environment(
+            at,
+            &AmbientSample {
+                temperature_c: celsius,
+                humidity_pct: unknown,
+                pressure_hpa: unknown,
+                outside_level_db: unknown,
+            },
+        )?;
+        recorder.ir(
+            at,
+            &ImpulseResponse {
+                pair_id: pair.id.0,
+                attempt: 1,
+                sample_rate_hz: rig.sweep.rate_hz.get(),
+                samples,
+                temperature_c: celsius,
+                temperature_corrected: is_corrected,
+            },
+        )?;
+        recorder.measurement(
+            at,
+            &Measurement {
+                pair_id: pair.id.0,
+                attempt: 1,
+                microphone: pair.microphone.0,
+                speaker: pair.speaker.0,
+                verdict: Verdict::Accepted.into(),
+                snr_db: unknown,
+                loopback_level_dbfs: unknown,
+                arrival_error_us: unknown,
+                outside_level_db: unknown,
+                temperature_c: celsius,
+                humidity_pct: unknown,
+                pressure_hpa: unknown,
+                microphone_residual_mm: unknown,
+                speaker_residual_mm: unknown,
+                ..Measurement::default()
+            },
+        )
+    }
+}
