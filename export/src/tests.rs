@@ -116,7 +116,7 @@ async fn a_slice_has_the_messages_of_its_measurements_and_no_others() {
     }
     let snapshot = lake.snapshot().await.expect("a view");
     let params = SliceParams { taken: some.clone(), ..SliceParams::default() };
-    let looked_over = outline(&lake, &snapshot, &params).await.expect("an outline");
+    let looked_over = outline(&lake, &snapshot, params).await.expect("an outline");
     for layout in [Layout::InTime, Layout::ByTopic] {
         let file =
             cut(&lake, SliceParams { taken: some.clone(), layout, ..SliceParams::default() }).await.expect("a slice");

@@ -13,6 +13,7 @@ use bytes::Bytes;
 use datafusion::common::TableReference;
 use datafusion::datasource::TableProvider;
 use datafusion::error::DataFusionError;
+use datafusion::optimizer::OptimizerRule;
 use datafusion::prelude::SessionContext;
 use datafusion::sql::parser::Statement;
 use echolake_lake::{DataFile, Lake, Moment, Snapshot, VisibleRun};
@@ -75,6 +76,11 @@ impl Catalog {
         })
     }
 
+    /// The optimizer's rules for plans over these tables and views, the same for every view of the lake.
+    pub(crate) fn rules(&self) -> [Arc<dyn OptimizerRule + Send + Sync>; 2] {
+        [Arc::new(UnusedJoin), Arc::new(PairJoin::new(&self.lookups))]
+    }
+
     /// Registers what `statement` may name, all of one view of the lake. The statement is known before its plan, since
     /// what it names may have to be looked up, and planning cannot wait.
     ///
@@ -91,8 +97,6 @@ impl Catalog {
             let provider = self.at(&past).await?;
             context.register_table(TableReference::bare(past.name), provider).map_err(failed)?;
         }
-        context.add_optimizer_rule(Arc::new(UnusedJoin));
-        context.add_optimizer_rule(Arc::new(PairJoin::new(&self.lookups)));
         mcap::register(context, &current.snapshot, &self.runs, statement).await
     }
 

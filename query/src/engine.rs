@@ -15,6 +15,7 @@ use datafusion::execution::object_store::{DefaultObjectStoreRegistry, ObjectStor
 use datafusion::execution::runtime_env::{RuntimeEnv, RuntimeEnvBuilder};
 use datafusion::execution::session_state::{SessionState, SessionStateBuilder};
 use datafusion::logical_expr::Documentation;
+use datafusion::optimizer::OptimizerRule;
 use datafusion::prelude::{SessionConfig, SessionContext};
 use echolake_lake::Lake;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};
@@ -127,8 +128,25 @@ impl Client {
     /// [`Error::Busy`] where all are taken.
     pub fn place(&self) -> Result<Place, Error> {
         let Some(places) = &self.places else { return Ok(Place(None)) };
-        let busy = |_| Error::Busy { client: self.name.clone(), limit: self.quota.concurrent.unwrap_or(0) };
-        Ok(Place(Some(places.clone().try_acquire_owned().map_err(busy)?)))
+        let place = places.clone().try_acquire_owned().map_err(|_| self.busy())?;
+        Ok(Place(Some(place)))
+    }
+
+    /// The same for who waits a while where all are taken; who came first is served first.
+    ///
+    /// # Errors
+    /// [`Error::Busy`] where all are taken for as long as `wait`.
+    pub async fn place_within(&self, wait: Duration) -> Result<Place, Error> {
+        let Some(places) = &self.places else { return Ok(Place(None)) };
+        match tokio::time::timeout(wait, places.clone().acquire_owned()).await {
+            Ok(Ok(place)) => Ok(Place(Some(place))),
+            // They are never closed, so it is the time that is over.
+            _ => Err(self.busy()),
+        }
+    }
+
+    fn busy(&self) -> Error {
+        Error::Busy { client: self.name.clone(), limit: self.quota.concurrent.unwrap_or(0) }
     }
 }
 
@@ -162,9 +180,10 @@ impl Engine {
         let reader = Arc::new(CachedParquetFileReaderFactory::new(lake.store(), metadata));
         let functions = Functions::all(lake.rig()).map_err(|e| Error::Execution { message: e.to_string() })?;
         let threads = |e: std::io::Error| Error::Execution { message: format!("no threads for queries: {e}") };
+        let catalog = Catalog::new(lake, Source { url, reader, small: Arc::new(SmallTables::new(lake)) })?;
         let inner = Inner {
-            template: template(runtime, &functions),
-            catalog: Catalog::new(lake, Source { url, reader, small: Arc::new(SmallTables::new(lake)) })?,
+            template: template(runtime, &functions, catalog.rules()),
+            catalog,
             lanes: Lanes::new(limits.heavy.max(1)).map_err(threads)?,
             running: Arc::default(),
             limits,
@@ -237,8 +256,8 @@ impl Engine {
         &self.0.template
     }
 
-    // A new one a query: the tables are those of one snapshot, and nothing a query does outlives it. Functions are
-    // looked up once an engine.
+    // A new one a query: the tables are those of one snapshot, and nothing a query does outlives it. Functions and
+    // optimizer's rules are those of the template.
     pub(crate) fn context(&self) -> SessionContext {
         let names = &self.0.template.config_options().catalog;
         let catalog = MemoryCatalogProvider::new();
@@ -260,9 +279,13 @@ impl Engine {
     }
 }
 
-fn template(runtime: Arc<RuntimeEnv>, functions: &Functions) -> SessionState {
-    let mut state =
-        SessionStateBuilder::new().with_config(config()).with_runtime_env(runtime).with_default_features().build();
+fn template(
+    runtime: Arc<RuntimeEnv>,
+    functions: &Functions,
+    rules: impl IntoIterator<Item = Arc<dyn OptimizerRule + Send + Sync>>,
+) -> SessionState {
+    let builder = SessionStateBuilder::new().with_config(config()).with_runtime_env(runtime).with_default_features();
+    let mut state = rules.into_iter().fold(builder, SessionStateBuilder::with_optimizer_rule).build();
     let asked: Vec<_> = state.scalar_functions().values().filter_map(guarded).collect();
     // The new ones replace those of their names and aliases; only a registry that is closed refuses.
     for function in asked.into_iter().chain(functions.scalar().iter().cloned()) {

@@ -96,9 +96,9 @@ impl LakeTable {
         self.table
     }
 
-    /// The columns of which no two rows have the same values, where a view joins by them.
-    pub(crate) fn key(&self) -> Option<&'static [&'static str]> {
-        match self.table {
+    /// The columns of which no two rows of a table have the same values, where a view joins by them.
+    pub(crate) fn key(table: Table) -> Option<&'static [&'static str]> {
+        match table {
             Table::Nce | Table::Tnce | Table::Measurements => Some(&["run_id", "pair_id"]),
             Table::Heightmaps => Some(&["surface_id", "symmetry"]),
             Table::Surfaces => Some(&["surface_id"]),

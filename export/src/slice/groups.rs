@@ -10,7 +10,7 @@ use echolake_schema::topics;
 use mcap::records::ChunkIndex;
 
 use super::source::{Message, Source};
-use super::{ONCE, Taken};
+use super::{ONCE, Taken, is_named};
 use crate::error::{Error, Result};
 
 /// Pair and attempt.
@@ -62,13 +62,12 @@ struct Open {
 impl Groups {
     /// Reads the measurements of a run; lanes that have none of the topics are not read, where topics are named.
     pub(super) fn new(source: Source, taken: &[Taken], topics: &[String]) -> Self {
-        let time = |t: &Taken| u64::try_from(t.log_time_ns).unwrap_or(0);
         let wanted = Wanted {
             keys: taken.iter().map(|t| (t.pair, t.attempt)).collect(),
-            times: taken.iter().map(|t| (time(t), (t.pair, t.attempt))).collect(),
+            times: taken.iter().map(|t| (t.time(), (t.pair, t.attempt))).collect(),
         };
         let topic = |id: &u16| source.channels.get(id).map_or("", |c| c.topic.as_str());
-        let named = |id: &u16| topics.is_empty() || topics.iter().any(|t| t == topic(id));
+        let named = |id: &u16| is_named(topics, topic(id));
         let has_once =
             |chunk: &&ChunkIndex| chunk.message_index_offsets.keys().any(|id| is_once(topic(id)) && named(id));
         let once = source.chunks.iter().filter(has_once).cloned().collect();

@@ -53,19 +53,30 @@ impl Taken {
     /// The measurements of rows with [`Taken::COLUMNS`].
     ///
     /// # Errors
-    /// [`Error::Damaged`] where a column is missing or another's.
+    /// [`Error::Damaged`] where a column is missing or another's, or a number is below 0.
     pub fn of_batch(batch: &RecordBatch) -> Result<Vec<Self>> {
-        let runs = batch.column_by_name(Self::COLUMNS[0]).and_then(|c| cast(c, &DataType::Utf8).ok());
-        let runs = runs.ok_or_else(|| Error::damaged("measurements", "no column run_id"))?;
-        let number = |value: i32| u32::try_from(value).unwrap_or(0);
-        let pairs = rows::numbers::<Int32Type>(batch, Self::COLUMNS[1])?;
-        let attempts = rows::numbers::<Int32Type>(batch, Self::COLUMNS[2])?;
-        let times = rows::numbers::<Int64Type>(batch, Self::COLUMNS[3])?;
+        let [run, pair, attempt, time] = Self::COLUMNS;
+        let damaged = |reason: String| Error::damaged("measurements", reason);
+        let negative = |column: &str, value: i64| damaged(format!("{column} is {value}"));
+        let runs = batch.column_by_name(run).and_then(|c| cast(c, &DataType::Utf8).ok());
+        let runs = runs.ok_or_else(|| damaged(format!("no column {run}")))?;
+        let pairs = rows::numbers::<Int32Type>(batch, pair)?;
+        let attempts = rows::numbers::<Int32Type>(batch, attempt)?;
+        let times = rows::numbers::<Int64Type>(batch, time)?;
+        if let Some(early) = times.iter().find(|time| **time < 0) {
+            return Err(negative(time, *early));
+        }
+        let number = |column: &str, value: i32| u32::try_from(value).map_err(|_| negative(column, value.into()));
         let row = |(row, run): (usize, Option<&str>)| {
-            let (pair, attempt) = (number(pairs[row]), number(attempts[row]));
+            let (pair, attempt) = (number(pair, pairs[row])?, number(attempt, attempts[row])?);
             Ok(Self { run: run.unwrap_or_default().parse()?, pair, attempt, log_time_ns: times[row] })
         };
         runs.as_string::<i32>().iter().enumerate().map(row).collect()
+    }
+
+    // As messages have it.
+    fn time(&self) -> u64 {
+        u64::try_from(self.log_time_ns).unwrap_or(0)
     }
 }
 
@@ -145,7 +156,7 @@ impl OpenedRun {
 /// Opens the runs of measurements, each checked.
 pub(crate) async fn open_runs(lake: &Lake, taken: &[Taken], check: Check) -> Result<Vec<OpenedRun>> {
     let mut opened = Vec::new();
-    for (file, taken) in files(lake, &lake.snapshot().await?, taken).await? {
+    for (file, taken) in files(lake, &lake.snapshot().await?, taken.to_vec()).await? {
         let source = Source::open(lake.store(), file, check).await?;
         opened.push(OpenedRun(Groups::new(source, &taken, &[])));
     }
@@ -153,12 +164,17 @@ pub(crate) async fn open_runs(lake: &Lake, taken: &[Taken], check: Check) -> Res
 }
 
 // The runs of measurements with their files, by their start; at least one.
-async fn files(lake: &Lake, snapshot: &Snapshot, taken: &[Taken]) -> Result<Vec<(RunFile, Vec<Taken>)>> {
+async fn files(lake: &Lake, snapshot: &Snapshot, taken: Vec<Taken>) -> Result<Vec<(RunFile, Vec<Taken>)>> {
     if taken.is_empty() {
         return Err(Error::Nothing { reason: "no measurement is selected".into() });
     }
     let mut by_run: BTreeMap<RunId, Vec<Taken>> = BTreeMap::new();
-    taken.iter().for_each(|t| by_run.entry(t.run.clone()).or_default().push(t.clone()));
+    for one in taken {
+        match by_run.get_mut(&one.run) {
+            Some(of_run) => of_run.push(one),
+            None => drop(by_run.insert(one.run.clone(), vec![one])),
+        }
+    }
     let mut runs = Vec::new();
     for (run, taken) in by_run {
         runs.push((RunFile::find(lake, snapshot, &run).await?, taken));
@@ -170,7 +186,8 @@ async fn files(lake: &Lake, snapshot: &Snapshot, taken: &[Taken]) -> Result<Vec<
 /// A slice that is being cut. Its memory is bounded by a chunk a heavy topic and a measurement a run that is open.
 pub struct Slice {
     lake: Lake,
-    params: SliceParams,
+    /// All where none are named.
+    topics: Vec<String>,
     /// Runs that are still to be opened, by their start.
     runs: VecDeque<(RunFile, Vec<Taken>)>,
     /// The first of them, which most slices have no others beside, is opened already.
@@ -218,32 +235,31 @@ impl Ord for Waiting {
 }
 
 impl Slice {
-    /// Checks everything that can be known to fail: the runs' files, and the topics. A server gives the snapshot that it
-    /// has, because taking one costs more than the first bytes of a slice.
+    /// Checks everything that can be known to fail: the runs' files, and the topics. A server gives the snapshot that
+    /// it has, because taking one costs more than the first bytes of a slice.
     ///
     /// # Errors
     /// [`Error::Nothing`] without measurements, [`Error::Unknown`] for a topic that none of the runs has,
     /// [`Error::Changed`] for a file that is not the ingested one.
-    pub async fn open(lake: &Lake, snapshot: &Snapshot, mut params: SliceParams) -> Result<Self> {
-        let (runs, mut known) = (files(lake, snapshot, &params.taken).await?, BTreeSet::new());
+    pub async fn open(lake: &Lake, snapshot: &Snapshot, params: SliceParams) -> Result<Self> {
+        let SliceParams { taken, topics, layout, check } = params;
+        let (runs, mut known) = (files(lake, snapshot, taken).await?, BTreeSet::new());
         let (mut first, lead) = (None, runs[0].0.run.clone());
         for (file, _) in &runs {
-            let source = Source::open(lake.store(), file.clone(), params.check).await?;
+            let source = Source::open(lake.store(), file.clone(), check).await?;
             known.extend(source.channels.values().map(|c| c.topic.clone()));
             first.get_or_insert(source);
         }
-        check_topics(&params.topics, &known)?;
-        let mut writer = SliceWriter::new(params.layout)?;
-        writer.metadata(about(&runs, &params))?;
-        // The runs have them now.
-        params.taken = Vec::new();
+        check_topics(&topics, &known)?;
+        let mut writer = SliceWriter::new(layout)?;
+        writer.metadata(about(&runs, &topics))?;
         Ok(Self {
             lake: lake.clone(),
             several: runs.len() > 1,
             runs: runs.into(),
             first,
             lead,
-            params,
+            topics,
             open: Vec::new(),
             waiting: BinaryHeap::new(),
             arrived: 0,
@@ -308,10 +324,10 @@ impl Slice {
             writer.metadata(Metadata { name: SLICE_RUN_METADATA.into(), metadata: source.manifest.clone() })?;
         }
         // They are attached where nothing is left out.
-        if self.params.topics.is_empty() {
+        if self.topics.is_empty() {
             self.attach_all(&source).await?;
         }
-        let mut groups = Groups::new(source, &taken, &self.params.topics);
+        let mut groups = Groups::new(source, &taken, &self.topics);
         while let Some(messages) = groups.next_once().await? {
             messages.into_iter().for_each(|message| self.wait(message));
         }
@@ -334,7 +350,7 @@ impl Slice {
     }
 
     fn wait(&mut self, message: Message) {
-        if self.params.topics.is_empty() || self.params.topics.contains(&message.channel.topic) {
+        if is_named(&self.topics, &message.channel.topic) {
             self.arrived += 1;
             self.waiting.push(Reverse(Waiting { order: (message.log_time, self.arrived), message }));
         }
@@ -356,18 +372,24 @@ impl Slice {
     }
 }
 
+// Whether a topic is among those of a slice; where none are named, all are.
+fn is_named(topics: &[String], topic: &str) -> bool {
+    topics.is_empty() || topics.iter().any(|named| named == topic)
+}
+
 fn check_topics(topics: &[String], known: &BTreeSet<String>) -> Result<()> {
     let Some(missing) = topics.iter().find(|t| !known.contains(*t)) else { return Ok(()) };
     let known = known.iter().map(String::as_str).collect::<Vec<_>>().join(", ");
     Err(Error::Unknown { kind: "topic", name: missing.clone(), known })
 }
 
-fn about(runs: &[(RunFile, Vec<Taken>)], params: &SliceParams) -> Metadata {
+fn about(runs: &[(RunFile, Vec<Taken>)], topics: &[String]) -> Metadata {
+    let measurements: usize = runs.iter().map(|(_, taken)| taken.len()).sum();
     let mut metadata = BTreeMap::from([
         ("format".to_owned(), "1".to_owned()),
         ("software".to_owned(), concat!("echolake ", env!("CARGO_PKG_VERSION")).to_owned()),
-        ("measurements".to_owned(), params.taken.len().to_string()),
-        ("topics".to_owned(), params.topics.join(",")),
+        ("measurements".to_owned(), measurements.to_string()),
+        ("topics".to_owned(), topics.join(",")),
     ]);
     // What each run's file was, so that a slice can be checked against it.
     metadata.extend(

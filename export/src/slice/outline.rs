@@ -7,7 +7,7 @@ use mcap::records::ChunkIndex;
 
 use super::groups::is_once;
 use super::source::Source;
-use super::{SliceParams, Taken, check_topics, files};
+use super::{SliceParams, Taken, check_topics, files, is_named};
 use crate::error::Result;
 
 /// What a slice will hold.
@@ -49,23 +49,23 @@ pub struct OutlineSchema {
 ///
 /// # Errors
 /// As [`super::Slice::open`].
-pub async fn outline(lake: &Lake, snapshot: &Snapshot, params: &SliceParams) -> Result<Outline> {
+pub async fn outline(lake: &Lake, snapshot: &Snapshot, params: SliceParams) -> Result<Outline> {
+    let SliceParams { taken, topics, check, .. } = params;
     let (mut outline, mut known) =
         (Outline { start_ns: i64::MAX, end_ns: i64::MIN, ..Outline::default() }, BTreeSet::new());
-    for (file, taken) in files(lake, snapshot, &params.taken).await? {
-        let source = Source::open(lake.store(), file, params.check).await?;
+    for (file, taken) in files(lake, snapshot, taken).await? {
+        let source = Source::open(lake.store(), file, check).await?;
         known.extend(source.channels.values().map(|c| c.topic.clone()));
-        outline.add(&source, &taken, &params.topics);
+        outline.add(&source, &taken, &topics);
     }
-    check_topics(&params.topics, &known)?;
+    check_topics(&topics, &known)?;
     outline.topics.sort_by(|a, b| a.name.cmp(&b.name));
     Ok(outline)
 }
 
 impl Outline {
     fn add(&mut self, source: &Source, taken: &[Taken], topics: &[String]) {
-        let named = |topic: &str| topics.is_empty() || topics.iter().any(|t| t == topic);
-        for channel in source.channels.values().filter(|c| named(&c.topic)) {
+        for channel in source.channels.values().filter(|c| is_named(topics, &c.topic)) {
             let schema = channel.schema.as_ref().map(|s| {
                 self.schema(OutlineSchema { name: s.name.clone(), encoding: s.encoding.clone(), data: s.data.to_vec() })
             });
@@ -75,10 +75,11 @@ impl Outline {
                 self.topics.push(topic);
             }
         }
-        let times: BTreeSet<_> = taken.iter().map(|t| u64::try_from(t.log_time_ns).unwrap_or(0)).collect();
+        let times: BTreeSet<_> = taken.iter().map(Taken::time).collect();
         // Chunks that are read; a measurement's messages are not all of its very time.
         let is_read = |chunk: &&ChunkIndex| {
-            let once = |id: &u16| source.channels.get(id).is_some_and(|c| is_once(&c.topic) && named(&c.topic));
+            let once =
+                |id: &u16| source.channels.get(id).is_some_and(|c| is_once(&c.topic) && is_named(topics, &c.topic));
             times.range(chunk.message_start_time..=chunk.message_end_time).next().is_some()
                 || chunk.message_index_offsets.keys().any(once)
         };

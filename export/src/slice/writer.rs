@@ -146,14 +146,14 @@ impl SliceWriter {
 
     // A lane becomes a chunk.
     fn flush(&mut self, lane: usize) -> Result<()> {
-        let Lane { messages, enough, .. } = std::mem::take(&mut self.lanes[lane]);
-        self.lanes[lane].enough = enough;
-        if messages.is_empty() {
+        let of = &mut self.lanes[lane];
+        if of.messages.is_empty() {
             return Ok(());
         }
-        self.lanes[lane].enough = (enough * 2).min(CHUNK_BYTES);
+        of.bytes = 0;
+        of.enough = (of.enough * 2).min(CHUNK_BYTES);
         self.has_more = true;
-        for (header, data) in messages {
+        for (header, data) in of.messages.drain(..) {
             self.writer.write_to_known_channel(&header, &data).map_err(|e| failed(&e))?;
         }
         self.writer.flush().map_err(|e| failed(&e))

@@ -1,6 +1,6 @@
-//! An optimizer's rule: a join with table `pairs` by `pair_id` becomes lookups. Every pair of the rig is in `pairs` once
-//! and no measurement is of another, so the join neither drops nor doubles a row, and an array access is cheaper than
-//! a hash table.
+//! An optimizer's rule: a join with table `pairs` by `pair_id` becomes lookups. Every pair of the rig is in `pairs`
+//! once and no measurement is of another, so the join neither drops nor doubles a row, and an array access is cheaper
+//! than a hash table.
 
 use datafusion::common::metadata::FieldMetadata;
 use datafusion::common::tree_node::Transformed;
@@ -95,8 +95,8 @@ fn is_measured(plan: &LogicalPlan, key: &Column) -> bool {
     key.name == KEY && scanned(plan, false).is_some_and(|table| measured.contains(&table))
 }
 
-// The table whose rows and columns these are, under their own names: all of its rows, or some.
-fn scanned(plan: &LogicalPlan, all: bool) -> Option<Table> {
+/// The table whose rows and columns these are, under their own names: `all` of its rows, or some.
+pub(super) fn scanned(plan: &LogicalPlan, all: bool) -> Option<Table> {
     match plan {
         LogicalPlan::TableScan(scan) => {
             let provider = source_as_provider(&scan.source).ok()?;

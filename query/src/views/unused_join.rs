@@ -1,18 +1,18 @@
-//! An optimizer's rule: a left join that nothing is taken from, and that finds one row at most, changes nothing and goes.
-//! It lets a view offer columns of tables that most of its queries do not need.
+//! An optimizer's rule: a left join that nothing is taken from, and that finds one row at most, changes nothing and
+//! goes. It lets a view offer columns of tables that most of its queries do not need.
 
 use std::collections::HashSet;
 use std::sync::Arc;
 
 use datafusion::common::tree_node::Transformed;
 use datafusion::common::{Column, JoinType};
-use datafusion::datasource::source_as_provider;
 use datafusion::error::Result;
 use datafusion::logical_expr::logical_plan::{Aggregate, Join, Projection};
 use datafusion::logical_expr::{Expr, LogicalPlan};
 use datafusion::optimizer::optimizer::ApplyOrder;
 use datafusion::optimizer::{OptimizerConfig, OptimizerRule};
 
+use super::pair_join::scanned;
 use crate::table::LakeTable;
 
 /// The rule.
@@ -83,23 +83,6 @@ fn changes_nothing(join: &Join, used: &HashSet<Column>) -> bool {
 
 fn finds_one(right: &LogicalPlan, on: &[(Expr, Expr)]) -> bool {
     let keys: HashSet<_> = on.iter().filter_map(|(_, key)| key.try_as_col()).map(|key| key.name.as_str()).collect();
-    key_of(right).is_some_and(|key| key.iter().all(|column| keys.contains(column)))
-}
-
-// The columns of which no two rows have the same values, where they have their own names still.
-fn key_of(plan: &LogicalPlan) -> Option<&'static [&'static str]> {
-    match plan {
-        LogicalPlan::TableScan(scan) => {
-            let provider = source_as_provider(&scan.source).ok()?;
-            let provider: &dyn std::any::Any = provider.as_ref();
-            provider.downcast_ref::<LakeTable>()?.key()
-        }
-        LogicalPlan::Filter(filter) => key_of(&filter.input),
-        LogicalPlan::SubqueryAlias(alias) => key_of(&alias.input),
-        LogicalPlan::Projection(projection) => {
-            let plain = projection.expr.iter().all(|e| matches!(e, Expr::Column(_)));
-            key_of(&projection.input).filter(|_| plain)
-        }
-        _ => None,
-    }
+    let key = scanned(right, false).and_then(LakeTable::key);
+    key.is_some_and(|key| key.iter().all(|column| keys.contains(column)))
 }

@@ -13,6 +13,7 @@ use axum::response::{IntoResponse as _, Response};
 use echolake_query::Client;
 
 use super::problem::Problem;
+use super::ranges::POLICY;
 use crate::fault::Fault;
 use crate::service::Service;
 use crate::tokens::{Scope, of_header};
@@ -127,7 +128,7 @@ pub(super) async fn security_headers(mut response: Response) -> Response {
         (header::X_FRAME_OPTIONS, "DENY"),
         (header::REFERRER_POLICY, "no-referrer"),
         (header::CONTENT_SECURITY_POLICY, "default-src 'none'; frame-ancestors 'none'"),
-        (HeaderName::from_static("cross-origin-resource-policy"), "same-origin"),
+        (POLICY, "same-origin"),
         (header::CACHE_CONTROL, "no-store"),
     ] {
         headers.entry(name).or_insert(HeaderValue::from_static(value));

@@ -1,5 +1,5 @@
-//! `GET /api/v1/layouts/echolake.json`: how Foxglove and Lichtblick show a run or a slice. It says nothing of the lake, so it is given
-//! to whoever asks.
+//! `GET /api/v1/layouts/echolake.json`: how Foxglove and Lichtblick show a run or a slice. It says nothing of the lake,
+//! so it is given to whoever asks.
 
 use axum::Router;
 use axum::http::{HeaderMap, StatusCode, header};
@@ -7,7 +7,7 @@ use axum::response::{IntoResponse as _, Response};
 use axum::routing::get;
 
 use super::catalogue::is_known;
-use super::ranges::cors;
+use super::ranges::{POLICY, cors};
 
 /// The panel with the arms, the response that was heard last, the air, verdicts, the log.
 const LAYOUT: &str = include_str!("layout.json");
@@ -24,10 +24,10 @@ pub(super) fn for_viewers() -> Router {
 
 async fn layout(headers: HeaderMap) -> Response {
     let common = [
-        (header::CONTENT_TYPE.as_str(), "application/json"),
-        (header::CACHE_CONTROL.as_str(), "no-cache"),
-        (header::ETAG.as_str(), ETAG),
-        ("cross-origin-resource-policy", "cross-origin"),
+        (header::CONTENT_TYPE, "application/json"),
+        (header::CACHE_CONTROL, "no-cache"),
+        (header::ETAG, ETAG),
+        (POLICY, "cross-origin"),
     ];
     match is_known(&headers, ETAG) {
         true => (StatusCode::NOT_MODIFIED, common).into_response(),

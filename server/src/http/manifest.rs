@@ -1,9 +1,9 @@
-//! `GET /api/v1/files`: the Parquet files of the lake's snapshot as URLs, so that loaders of training sets take a list and
-//! read by ranges, without a copy.
+//! `GET /api/v1/files`: the Parquet files of the lake's snapshot as URLs, so that loaders of training sets take a list
+//! and read by ranges, without a copy.
 
 use axum::Router;
 use axum::extract::State;
-use axum::http::{HeaderMap, StatusCode, Uri, header};
+use axum::http::{HeaderMap, HeaderName, StatusCode, Uri, header};
 use axum::response::{IntoResponse as _, Response};
 use axum::routing::get;
 use echolake_lake::DataFile;
@@ -13,9 +13,10 @@ use serde::Serialize;
 use super::catalogue::{self, Catalogue, Params, is_known};
 use super::guard;
 use super::problem::Problem;
-use super::ranges::forwarded_origin;
 use crate::fault::Fault;
 use crate::tokens::Scope;
+
+const FORWARDED_PROTO: HeaderName = HeaderName::from_static("x-forwarded-proto");
 
 #[derive(Serialize)]
 struct Manifest<'a> {
@@ -45,10 +46,13 @@ async fn files(State(catalogue): State<Catalogue>, uri: Uri, headers: HeaderMap)
     let params = Params::of(&uri)?;
     let tables = params.all("table").map(catalogue::table).collect::<Result<Vec<_>, Fault>>()?;
     let view = catalogue.view().await?;
-    let origin = forwarded_origin(&headers);
+    let origin = origin(&headers);
     let etag = format!("\"{}\"", view.version);
-    let validators =
-        [(header::ETAG, etag.as_str()), (header::CACHE_CONTROL, "private, no-cache"), (header::VARY, "Host")];
+    let validators = [
+        (header::ETAG, etag.as_str()),
+        (header::CACHE_CONTROL, "private, no-cache"),
+        (header::VARY, "Host, X-Forwarded-Proto"),
+    ];
     if is_known(&headers, &etag) {
         return Ok((StatusCode::NOT_MODIFIED, validators).into_response());
     }
@@ -59,6 +63,16 @@ async fn files(State(catalogue): State<Catalogue>, uri: Uri, headers: HeaderMap)
     });
     let manifest = Manifest { version: &view.version, files: files.collect() };
     Ok((validators, axum::Json(manifest)).into_response())
+}
+
+// What a URL of this server begins with, as who asks sees it: behind a proxy with TLS, `https`.
+fn origin(headers: &HeaderMap) -> String {
+    let text = |name: HeaderName| headers.get(name).and_then(|v| v.to_str().ok());
+    let scheme = match text(FORWARDED_PROTO) {
+        Some("https") => "https",
+        _ => "http",
+    };
+    format!("{scheme}://{}", text(header::HOST).unwrap_or_default())
 }
 
 impl File {

@@ -11,8 +11,8 @@ use super::catalogue::is_known;
 use super::problem::Problem;
 use crate::fault::Fault;
 
-const POLICY: HeaderName = HeaderName::from_static("cross-origin-resource-policy");
-const FORWARDED_PROTO: HeaderName = HeaderName::from_static("x-forwarded-proto");
+/// Who may embed an answer.
+pub(super) const POLICY: HeaderName = HeaderName::from_static("cross-origin-resource-policy");
 const FETCH_MODE: HeaderName = HeaderName::from_static("sec-fetch-mode");
 
 /// For what pages of elsewhere may read: from anywhere, without credentials, and told what ranges need.
@@ -30,16 +30,6 @@ pub(super) fn cors() -> CorsLayer {
 pub(super) fn needs_length(method: &Method, headers: &HeaderMap) -> bool {
     let is_script = headers.get(FETCH_MODE).is_some_and(|mode| mode == "cors") || headers.contains_key(header::ORIGIN);
     method == Method::HEAD || headers.contains_key(header::RANGE) || is_script
-}
-
-/// What a URL of this server begins with, as who asks sees it: behind a proxy with TLS, `https`.
-pub(super) fn forwarded_origin(headers: &HeaderMap) -> String {
-    let text = |name: HeaderName| headers.get(name).and_then(|v| v.to_str().ok());
-    let scheme = match text(FORWARDED_PROTO) {
-        Some("https") => "https",
-        _ => "http",
-    };
-    format!("{scheme}://{}", text(header::HOST).unwrap_or_default())
 }
 
 /// A file that never changes, as its answers describe it.

@@ -11,7 +11,7 @@ use datafusion_pg_catalog::sql::PostgresCompatibilityParser;
 use echolake_query::{Client, Session};
 use pgwire::api::Type;
 use pgwire::messages::startup::SecretKey;
-use tokio::sync::OwnedSemaphorePermit;
+use tokio::sync::{OwnedSemaphorePermit, SetOnce};
 
 use super::catalog::PgCatalog;
 use super::cursor::Cursor;
@@ -65,8 +65,8 @@ impl Shared {
 pub(super) struct Connection {
     shared: Arc<Shared>,
     place: Option<OwnedSemaphorePermit>,
-    session: OnceLock<Arc<Session>>,
-    key: OnceLock<(i32, Bytes)>,
+    session: SetOnce<Arc<Session>>,
+    key: OnceLock<BackendKey>,
     current: Arc<Mutex<Stop>>,
     cursors: Mutex<HashMap<String, Arc<Cursor>>>,
     kept: Mutex<HashSet<(Kept, String)>>,
@@ -120,7 +120,7 @@ impl Connection {
         Self {
             shared,
             place,
-            session: OnceLock::new(),
+            session: SetOnce::new(),
             key: OnceLock::new(),
             current: Arc::new(Mutex::new(Stop::new())),
             cursors: Mutex::default(),
@@ -166,9 +166,7 @@ impl Connection {
 
     /// Waits until somebody has logged in.
     pub(super) async fn logged_in(&self) {
-        while self.session.get().is_none() {
-            tokio::time::sleep(LOOK).await;
-        }
+        self.session.wait().await;
     }
 
     /// Marks it as doing something.

@@ -95,18 +95,15 @@ fn twice(socket: TcpStream) -> io::Result<(TcpStream, TcpStream)> {
     Ok((TcpStream::from_std(socket)?, TcpStream::from_std(watched)?))
 }
 
-// While a query runs nobody reads from the connection, so that its end must be watched for.
+// While a query runs nobody reads from the connection, so that its end must be watched for. Nothing runs before a
+// login, and who sends a CancelRequest hangs up behind it: it is read all the same.
 async fn gone(socket: &TcpStream, connection: &Connection) {
-    loop {
-        match socket.ready(Interest::READABLE).await {
-            Ok(ready) if !ready.is_read_closed() => {
-                // Takes the readiness back, so that the next wait is for news.
-                let _ =
-                    socket.try_io(Interest::READABLE, || -> io::Result<()> { Err(io::ErrorKind::WouldBlock.into()) });
-            }
-            // Who sends a CancelRequest hangs up behind it, and it is read all the same: nothing runs before a login.
-            _ => return connection.logged_in().await,
-        }
+    connection.logged_in().await;
+    while let Ok(ready) = socket.ready(Interest::READABLE).await
+        && !ready.is_read_closed()
+    {
+        // Takes the readiness back, so that the next wait is for news.
+        let _ = socket.try_io(Interest::READABLE, || -> io::Result<()> { Err(io::ErrorKind::WouldBlock.into()) });
     }
 }
 

@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 use bytes::Bytes;
 use echolake_export::{Slice, SliceParams};
 use echolake_lake::Snapshot;
-use echolake_query::{Client, Error as QueryError, Place};
+use echolake_query::{Client, Error as QueryError};
 use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc};
 use tokio::task::JoinSet;
 
@@ -18,7 +18,8 @@ use crate::service::Service;
 /// How long a slice waits for its reader to take the next piece.
 const PATIENCE: Duration = Duration::from_secs(300);
 
-/// How long a slice waits for a place among what its client runs.
+/// How long a slice waits for a place among what its client runs: work that was broken off gives its own back a moment
+/// later.
 const HANDOVER: Duration = Duration::from_secs(1);
 
 /// A slice that is being cut.
@@ -48,7 +49,7 @@ impl Cutting {
         let Room { place: room, turns } = room;
         let task = service.spawn(async move {
             let work = async {
-                let _held = (place(&client).await?, room, of.metrics().begin(Protocol::Http));
+                let _held = (client.place_within(HANDOVER).await?, room, of.metrics().begin(Protocol::Http));
                 cut(&of, &snapshot, params, client.quota().time, &turns, to).await
             };
             work.await.inspect_err(|fault| of.metrics().failed(fault.code()))
@@ -64,17 +65,6 @@ impl Cutting {
         match self.pieces.recv().await {
             Some(piece) => Ok(Some(piece)),
             None => finish(&mut self.task).await.map(|()| None),
-        }
-    }
-}
-
-// The query that found the measurements gives its place back a moment after its last row.
-async fn place(client: &Client) -> Result<Place, Fault> {
-    let begun = Instant::now();
-    loop {
-        match client.place() {
-            Err(QueryError::Busy { .. }) if begun.elapsed() < HANDOVER => tokio::time::sleep(HANDOVER / 100).await,
-            other => return Ok(other?),
         }
     }
 }

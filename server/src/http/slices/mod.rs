@@ -1,8 +1,9 @@
 //! Slices of run files over HTTP: cut while they are sent, or, for who reads by ranges, cut once and kept for a while.
 //!
-//! A slice's bytes follow from its measurements, topics and layout alone, so its ETag is a digest of these, and it may be
-//! cut as often as somebody asks: whoever reads it to its end gets it as it is cut, in memory that is bounded. Ranges, HEAD
-//! and a script's plain GET need its length, so for them it is cut to its end first, into a file without a name.
+//! A slice's bytes follow from its measurements, topics and layout alone, so its ETag is a digest of these, and it may
+//! be cut as often as somebody asks: whoever reads it to its end gets it as it is cut, in memory that is bounded.
+//! Ranges, HEAD and a script's plain GET need its length, so for them it is cut to its end first, into a file without a
+//! name.
 
 mod cutting;
 mod foxglove;
@@ -19,7 +20,7 @@ use axum::http::{HeaderMap, Method, Uri};
 use axum::response::Response;
 use axum::routing::get;
 use echolake_export::{Check, SliceParams, Taken};
-use echolake_query::Client;
+use echolake_query::{Client, Subqueries};
 use futures::stream;
 use tokio::sync::Semaphore;
 
@@ -84,17 +85,21 @@ impl Slices {
         let service = self.0.catalogue.service();
         guard::client(service, headers, Scope::Files)?;
         let client = guard::client(service, headers, Scope::Sql)?;
-        let question = Question::of(uri)?;
+        let mut question = Question::of(uri)?;
         let view = self.0.catalogue.view().await?;
         // Without tokens a page of elsewhere may read the runs whose names it knows, and ask nothing of others.
-        let is_foreign = service.access().is_open() && guard::is_own(headers).is_err();
-        if is_foreign && question.runs.is_empty() {
-            guard::is_own(headers)?;
+        if service.access().is_open()
+            && let Err(foreign) = guard::is_own(headers)
+        {
+            if question.runs.is_empty() {
+                return Err(foreign);
+            }
+            question.subqueries = Subqueries::Refused;
         }
         for run in &question.runs {
             super::catalogue::run(&view, run.as_str())?;
         }
-        Ok(Request { client, view, question: question.asked_by(is_foreign) })
+        Ok(Request { client, view, question })
     }
 
     async fn selection(&self, request: &Request) -> Result<Arc<Selection>, Fault> {

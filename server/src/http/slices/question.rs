@@ -16,7 +16,7 @@ const NAMES: [&str; 5] = ["where", "run", "topics", "layout", "id"];
 /// A question.
 pub(super) struct Question {
     /// The predicate; None where all measurements of the runs are wanted.
-    pub(super) predicate: Option<String>,
+    predicate: Option<String>,
     /// None, or the runs that the measurements are of.
     pub(super) runs: Vec<RunId>,
     /// The topics, sorted; all where there are none.
@@ -63,10 +63,9 @@ impl Question {
         Ok(Self { predicate, runs, topics, layout, id, subqueries: Subqueries::Allowed })
     }
 
-    /// The same of a page of elsewhere, or not: what such a page may ask is of the runs that it names alone.
-    pub(super) fn asked_by(self, foreign: bool) -> Self {
-        let subqueries = if foreign { Subqueries::Refused } else { Subqueries::Allowed };
-        Self { subqueries, ..self }
+    /// The predicate; a true one where none was given.
+    pub(super) fn predicate(&self) -> &str {
+        self.predicate.as_deref().unwrap_or("true")
     }
 
     /// The query's beginning, which the predicate stands behind.

@@ -1,4 +1,5 @@
-//! The measurements of a slice: found by the engine, within the limits of who asks, and kept for the ranges that follow.
+//! The measurements of a slice: found by the engine, within the limits of who asks, and kept for the ranges that
+//! follow.
 
 use std::collections::VecDeque;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -45,8 +46,7 @@ impl Selections {
     /// What is wrong with the predicate, or ended its query; [`Fault::NoData`] where it selects nothing.
     pub(super) async fn of(&self, catalogue: &Catalogue, request: &Request) -> Result<Arc<Selection>, Fault> {
         let Request { client, view, question } = request;
-        let predicate = question.predicate.as_deref().unwrap_or("true");
-        let asked = format!("{:?} {} {predicate}", question.subqueries, question.select());
+        let asked = format!("{:?} {} {}", question.subqueries, question.select(), question.predicate());
         let described = format!("{} {} {asked}", question.layout_name(), question.topics.join(","));
         let key = (client.name().to_owned(), view.version.clone(), described);
         if let Some(known) = self.known(&key) {
@@ -79,7 +79,7 @@ impl Selections {
 
 async fn taken(catalogue: &Catalogue, request: &Request) -> Result<Vec<Taken>, Fault> {
     let Request { client, question, .. } = request;
-    let (service, predicate) = (catalogue.service(), question.predicate.as_deref().unwrap_or("true").to_owned());
+    let (service, predicate) = (catalogue.service(), question.predicate().to_owned());
     let session = Arc::new(service.session(client));
     let (asking, select, subqueries) = (session.clone(), question.select(), question.subqueries);
     let sql = service.plan(async move { Ok(asking.selecting(&select, &predicate, subqueries)?) }).await?;

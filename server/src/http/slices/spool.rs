@@ -1,8 +1,9 @@
-//! Slices that are read by ranges: cut once, kept in files without names, so many bytes of them, the oldest going first.
+//! Slices that are read by ranges: cut once, kept in files without names, so many bytes of them, the oldest going
+//! first. Disks are waited for on threads of their own.
 
 use std::collections::{HashMap, VecDeque};
 use std::fs::File;
-use std::io::Write as _;
+use std::io::{self, Write as _};
 use std::ops::Range;
 use std::os::unix::fs::FileExt as _;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -32,19 +33,15 @@ struct Kept {
     bytes: u64,
 }
 
-/// A slice that is whole.
+/// A slice in a file without a name: it is gone when nobody has it open, however that comes.
 pub(super) struct Spooled {
-    file: Counted,
-}
-
-/// A file without a name: it is gone when nobody has it open, however that comes.
-struct Counted {
     file: File,
+    /// Those that are counted in its spool.
     bytes: u64,
     spool: Spool,
 }
 
-impl Drop for Counted {
+impl Drop for Spooled {
     fn drop(&mut self) {
         self.spool.kept().bytes -= self.bytes;
     }
@@ -86,14 +83,16 @@ impl Spool {
     }
 
     async fn fill(&self, mut cutting: Cutting) -> Result<Spooled, Fault> {
-        let file = tempfile::tempfile().map_err(no_room)?;
-        let mut file = Counted { file, bytes: 0, spool: self.clone() };
+        let file = on_disk(tempfile::tempfile).await.map_err(no_room)?;
+        let mut slice = Spooled { file, bytes: 0, spool: self.clone() };
         while let Some(piece) = cutting.next().await? {
             self.make_room(piece.len() as u64)?;
-            file.bytes += piece.len() as u64;
-            file.file.write_all(&piece).map_err(no_room)?;
+            slice.bytes += piece.len() as u64;
+            // It goes along: whoever leaves meanwhile, it is counted for as long as it is written to.
+            let written = on_disk(move || slice.file.write_all(&piece).map(|()| slice)).await;
+            slice = written.map_err(no_room)?;
         }
-        Ok(Spooled { file })
+        Ok(slice)
     }
 
     // Counts bytes that are about to be written, and lets the oldest slices go for them.
@@ -128,7 +127,12 @@ impl Spool {
     }
 }
 
-fn no_room(error: std::io::Error) -> Fault {
+// Away from the threads that answer connections.
+async fn on_disk<T: Send + 'static>(work: impl FnOnce() -> io::Result<T> + Send + 'static) -> io::Result<T> {
+    tokio::task::spawn_blocking(work).await?
+}
+
+fn no_room(error: io::Error) -> Fault {
     eprintln!("a slice cannot be kept in `{}`: {error}", std::env::temp_dir().display());
     Fault::NoRoom { limit: MOST_BYTES }
 }
@@ -136,7 +140,7 @@ fn no_room(error: std::io::Error) -> Fault {
 impl Spooled {
     /// Its length.
     pub(super) fn bytes(&self) -> u64 {
-        self.file.bytes
+        self.bytes
     }
 
     /// Bytes of it, a block at a time.
@@ -147,14 +151,14 @@ impl Spooled {
             }
             let end = range.end.min(range.start + BLOCK);
             let (from, reading) = (range.start, slice.clone());
-            let read = tokio::task::spawn_blocking(move || {
+            let read = on_disk(move || {
                 let mut block = vec![0; (end - from) as usize];
-                reading.file.file.read_exact_at(&mut block, from).map(|()| Bytes::from(block))
+                reading.file.read_exact_at(&mut block, from).map(|()| Bytes::from(block))
             });
             match read.await {
-                Ok(Ok(block)) => Ok(Some((block, (slice, end..range.end)))),
-                failed => {
-                    eprintln!("a kept slice cannot be read: {failed:?}");
+                Ok(block) => Ok(Some((block, (slice, end..range.end)))),
+                Err(failed) => {
+                    eprintln!("a kept slice cannot be read: {failed}");
                     Err(Fault::Internal)
                 }
             }
