@@ -75,6 +75,27 @@ fn a_clipped_recording_is_kept_and_said() {
 }
 
 #[test]
+fn sofa_files_that_are_none() {
+    let place = Place::new();
+    std::fs::write(place.path("a.sofa"), "no HDF5").expect("written");
+    place.fails(1, &["import", "sofa", "a.sofa", "--rig", "rig.toml"], "it is no HDF5 file");
+    place.fails(1, &["import", "sofa", "b.sofa", "--rig", "rig.toml"], "b.sofa");
+    assert!(!place.path("lake").exists(), "no lake is made for it");
+}
+
+#[test]
+fn exports_to_what_is_no_disk() {
+    let place = Place::new();
+    let refused = |args: &[&str]| place.fails(2, &[&["export"], args].concat(), "hint: name a path");
+    refused(&["ml", "-o", "https://example.org/set"]);
+    refused(&["mcap", "--where", "true", "-o", "s3://bucket/some.mcap"]);
+    refused(&["sofa", "-o", "s3://bucket/sofa"]);
+    refused(&["npz", "-o", "gs://bucket/npz"]);
+    refused(&["wav", "--where", "true", "-o", "s3://bucket/wav"]);
+    assert_eq!(files(&place.path("")), 1, "the rig file alone, no folder that is called as a URL begins");
+}
+
+#[test]
 fn meshes_and_surfaces() {
     let place = Place::new();
     let acquire = |mesh: &str| {

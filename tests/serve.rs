@@ -11,6 +11,8 @@ mod slices;
 use std::path::Path;
 use std::time::{Duration, Instant};
 
+use serde_json::Value;
+
 use super::Place;
 use http::{Answer, Request};
 use server::Served;
@@ -36,8 +38,27 @@ fn sql(server: &Served, query: &str) -> Answer {
     Request::post("/api/v1/sql", query).with("content-type", "text/plain").send(server)
 }
 
+fn get(server: &Served, path: &str) -> Answer {
+    Request::get(path).send(server)
+}
+
+fn json(answer: &Answer) -> Value {
+    serde_json::from_slice(&answer.body).unwrap_or_else(|e| panic!("{e}: {}", String::from_utf8_lossy(&answer.body)))
+}
+
+fn refused(answer: &Answer, status: u16, code: &str) {
+    let problem = json(answer);
+    assert_eq!(answer.header("content-type"), Some("application/problem+json"), "{problem}");
+    assert_eq!((answer.status, problem["code"].as_str()), (status, Some(code)), "{problem}");
+    assert_eq!(problem["status"], status);
+}
+
 fn running(server: &Served) -> f64 {
-    let text = Request::get("/metrics").send(server).text();
+    running_of(&get(server, "/metrics"))
+}
+
+fn running_of(metrics: &Answer) -> f64 {
+    let text = metrics.text();
     let line = text.lines().find_map(|l| l.strip_prefix("echolake_running_queries ")).expect("a figure");
     line.parse().expect("a number")
 }
@@ -62,8 +83,8 @@ fn answers_in_every_format() {
     let csv = Request::post("/api/v1/sql?format=csv", query).with("content-type", "application/sql").send(&server);
     assert_eq!(csv.text(), "pair_id,direct_mm\n0,120.0\n1,240.0\n");
     let body = serde_json::json!({ "query": query, "format": "csv" }).to_string();
-    let json = Request::post("/api/v1/sql", &body).with("content-type", "application/json").send(&server);
-    assert_eq!(json.text(), csv.text());
+    let wrapped = Request::post("/api/v1/sql", &body).with("content-type", "application/json").send(&server);
+    assert_eq!(wrapped.text(), csv.text());
     let arrow = Request::post("/api/v1/sql", query)
         .with("content-type", "text/plain")
         .with("accept", "application/vnd.apache.arrow.stream")
@@ -71,54 +92,47 @@ fn answers_in_every_format() {
     assert_eq!(&arrow.body[..4], [0xff; 4], "a stream's first message");
     let parquet = Request::post("/api/v1/sql?format=parquet", query).with("content-type", "text/plain").send(&server);
     assert!(parquet.body.starts_with(b"PAR1") && parquet.body.ends_with(b"PAR1"));
-    let tables: serde_json::Value =
-        serde_json::from_str(&Request::get("/api/v1/tables").send(&server).text()).expect("JSON");
+    let tables = json(&get(&server, "/api/v1/tables"));
     let pairs = tables.as_array().expect("a list").iter().find(|t| t["name"] == "pairs").expect("pairs");
     let direct = pairs["columns"].as_array().expect("a list").iter().find(|c| c["name"] == "direct_mm");
     assert_eq!(direct.expect("a column")["unit"], "mm");
-    assert_eq!(Request::get("/health").send(&server).status, 200);
+    assert_eq!(get(&server, "/health").status, 200);
 }
 
 #[test]
 fn what_is_wrong_has_a_code() {
     let place = lake();
     let server = served(&place, &[]);
-    let check = |answer: Answer, status: u16, code: &str| {
-        let problem: serde_json::Value = serde_json::from_str(&answer.text()).expect("JSON");
-        assert_eq!(answer.header("content-type"), Some("application/problem+json"), "{problem}");
-        assert_eq!((answer.status, problem["code"].as_str()), (status, Some(code)), "{problem}");
-        assert_eq!(problem["status"], status);
-    };
-    check(sql(&server, "select nonsense from runs"), 400, "query_invalid");
-    check(sql(&server, "drop table runs"), 403, "read_only");
-    check(sql(&server, "copy (select 1) to '/tmp/echolake-out.csv'"), 403, "read_only");
-    check(sql(&server, "select 1/(value - 1) from generate_series(1, 2)"), 422, "query_failed");
-    check(sql(&server, &"-".repeat(3 << 20)), 413, "request_too_large");
+    refused(&sql(&server, "select nonsense from runs"), 400, "query_invalid");
+    refused(&sql(&server, "drop table runs"), 403, "read_only");
+    refused(&sql(&server, "copy (select 1) to '/tmp/echolake-out.csv'"), 403, "read_only");
+    refused(&sql(&server, "select 1/(value - 1) from generate_series(1, 2)"), 422, "query_failed");
+    refused(&sql(&server, &"-".repeat(3 << 20)), 413, "request_too_large");
     let post = |body: &str| Request::post("/api/v1/sql", body);
-    check(post("select 1").send(&server), 400, "request_invalid");
-    check(
-        post("select 1").with("content-type", "text/plain").with("accept", "text/html").send(&server),
+    refused(&post("select 1").send(&server), 400, "request_invalid");
+    refused(
+        &post("select 1").with("content-type", "text/plain").with("accept", "text/html").send(&server),
         400,
         "request_invalid",
     );
-    check(post("{\"sql\": 1}").with("content-type", "application/json").send(&server), 400, "request_invalid");
-    check(
-        Request::post("/api/v1/sql?format=xlsx", "select 1").with("content-type", "text/plain").send(&server),
+    refused(&post("{\"sql\": 1}").with("content-type", "application/json").send(&server), 400, "request_invalid");
+    refused(
+        &Request::post("/api/v1/sql?format=xlsx", "select 1").with("content-type", "text/plain").send(&server),
         400,
         "request_invalid",
     );
-    check(Request::get("/api/v1/sql").send(&server), 405, "method_not_allowed");
-    check(Request::get("/api/v1/nothing").send(&server), 404, "not_found");
+    refused(&get(&server, "/api/v1/sql"), 405, "method_not_allowed");
+    refused(&get(&server, "/api/v1/nothing"), 404, "not_found");
     // A page of elsewhere, and a name that points here.
     for (name, value) in [("origin", "http://evil.example"), ("origin", "null"), ("sec-fetch-site", "cross-site")] {
-        check(
-            post("select 1").with("content-type", "text/plain").with(name, value).send(&server),
+        refused(
+            &post("select 1").with("content-type", "text/plain").with(name, value).send(&server),
             403,
             "foreign_origin",
         );
     }
-    check(Request::get("/api/v1/tables").host("evil.example").send(&server), 403, "foreign_origin");
-    check(Request::get("/health").host("evil.example").send(&server), 403, "foreign_origin");
+    refused(&Request::get("/api/v1/tables").host("evil.example").send(&server), 403, "foreign_origin");
+    refused(&Request::get("/health").host("evil.example").send(&server), 403, "foreign_origin");
 }
 
 #[test]

@@ -117,6 +117,29 @@ async fn rows(store: Arc<InMemory>) -> BTreeMap<&'static str, Vec<Vec<u8>>> {
     all
 }
 
+/// Dies at each write of `work`, made or not, and hands over what is left each time; returns how many deaths there were.
+async fn each_death<T, E: std::fmt::Debug>(
+    start: &InMemory,
+    work: impl AsyncFn(Arc<dyn ObjectStore>) -> Result<T, E>,
+    check: impl AsyncFn(Arc<InMemory>, String),
+) -> usize {
+    let mut deaths = 0;
+    for death in [Death::Before, Death::After] {
+        for last in 0.. {
+            let inner = Arc::new(start.fork());
+            let mortal = Mortal::new(inner.clone(), last, death);
+            let first = work(mortal.clone()).await;
+            if !mortal.died() {
+                first.expect("it lived");
+                break;
+            }
+            deaths += 1;
+            check(inner, format!("{death:?} write {last}")).await;
+        }
+    }
+    deaths
+}
+
 // A death at each write, made or not: afterwards ingest is run once more, and the tables are those of an ingest that
 // nothing disturbed, byte for byte.
 #[tokio::test(flavor = "multi_thread")]
@@ -127,23 +150,13 @@ async fn a_death_at_any_write_is_repaired_by_running_again() {
     ingest(undisturbed.clone()).await.expect("ingested");
     let expected = tables(undisturbed).await;
     assert_eq!(expected.0.keys().cloned().collect::<Vec<_>>(), expected.1, "nothing but what is seen is in the logs");
-    let mut deaths = 0;
-    for death in [Death::Before, Death::After] {
-        for last in 0.. {
-            let inner = Arc::new(start.fork());
-            let mortal = Mortal::new(inner.clone(), last, death);
-            let first = ingest(mortal.clone()).await;
-            if !mortal.died() {
-                first.expect("it lived");
-                break;
-            }
-            deaths += 1;
-            ingest(inner.clone()).await.unwrap_or_else(|e| panic!("{death:?} write {last}: {e}"));
-            let (seen, logged) = tables(inner).await;
-            assert_eq!(logged, expected.1, "{death:?} write {last}");
-            assert!(seen == expected.0, "{death:?} write {last}: other bytes");
-        }
-    }
+    let deaths = each_death(&start, ingest, async |inner, death| {
+        ingest(inner.clone()).await.unwrap_or_else(|e| panic!("{death}: {e}"));
+        let (seen, logged) = tables(inner).await;
+        assert_eq!(logged, expected.1, "{death}");
+        assert!(seen == expected.0, "{death}: other bytes");
+    })
+    .await;
     // Each of three runs has nine files, each table a commit, each run's file a move.
     assert!(deaths > 2 * 35, "{deaths} deaths");
 }
@@ -164,26 +177,16 @@ async fn a_death_at_any_write_of_the_upkeep_changes_no_row() {
     };
     let (expected, kept) = (tables(undisturbed.clone()).await, files(undisturbed).await);
     assert!(kept < files(start.clone()).await, "files are merged");
-    let mut deaths = 0;
-    for death in [Death::Before, Death::After] {
-        for last in 0.. {
-            let inner = Arc::new(start.fork());
-            let mortal = Mortal::new(inner.clone(), last, death);
-            let first = tidy(mortal.clone()).await;
-            if !mortal.died() {
-                first.expect("it lived");
-                break;
-            }
-            deaths += 1;
-            assert!(rows(inner.clone()).await == before, "{death:?} write {last}: other rows");
-            // As if its time had run out.
-            inner.delete(&Path::from("tables/_maintenance.json")).await.ok();
-            tidy(inner.clone()).await.unwrap_or_else(|e| panic!("{death:?} write {last}: {e}"));
-            assert!(tables(inner.clone()).await == expected, "{death:?} write {last}: other files");
-            // What was written and never named stays for an hour, lest somebody is about to name it.
-            assert!(files(inner).await <= kept + 1, "{death:?} write {last}: files are left over");
-        }
-    }
+    let deaths = each_death(&start, tidy, async |inner, death| {
+        assert!(rows(inner.clone()).await == before, "{death}: other rows");
+        // As if its time had run out.
+        inner.delete(&Path::from("tables/_maintenance.json")).await.ok();
+        tidy(inner.clone()).await.unwrap_or_else(|e| panic!("{death}: {e}"));
+        assert!(tables(inner.clone()).await == expected, "{death}: other files");
+        // What was written and never named stays for an hour, lest somebody is about to name it.
+        assert!(files(inner).await <= kept + 1, "{death}: files are left over");
+    })
+    .await;
     // A merge of each of eight tables is a file and a commit; 24 files are deleted; two leases are taken and given back.
     assert!(deaths > 2 * 40, "{deaths} deaths");
 }

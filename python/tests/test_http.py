@@ -16,13 +16,14 @@ from typing import Any
 import pytest
 
 
-def get(url: str, **headers: str) -> tuple[bytes, Any]:
-    with urllib.request.urlopen(urllib.request.Request(url, headers=headers)) as answer:
-        return answer.read(), answer.headers
+def get(url: str) -> bytes:
+    with urllib.request.urlopen(url) as answer:
+        body: bytes = answer.read()
+        return body
 
 
 def files(served_http: str, table: str) -> list[dict[str, Any]]:
-    found: list[dict[str, Any]] = json.loads(get(f"{served_http}/api/v1/files?table={table}")[0])["files"]
+    found: list[dict[str, Any]] = json.loads(get(f"{served_http}/api/v1/files?table={table}"))["files"]
     assert found and all(file["table"] == table and file["superseded_rows"] == 0 for file in found)
     return found
 
@@ -77,7 +78,7 @@ def test_a_file_that_is_not_there_is_said(served_http: str) -> None:
 
 
 def a_run(served_http: str) -> str:
-    run: str = json.loads(get(f"{served_http}/api/v1/runs?limit=1")[0])["items"][0]["run_id"]
+    run: str = json.loads(get(f"{served_http}/api/v1/runs?limit=1"))["items"][0]["run_id"]
     return run
 
 
@@ -95,7 +96,7 @@ def test_slices_pass_the_doctor(served_http: str, tmp_path: Path) -> None:
         ]
     ):
         path = tmp_path / f"{number}.mcap"
-        path.write_bytes(get(slice_url(served_http, predicate, **more))[0])
+        path.write_bytes(get(slice_url(served_http, predicate, **more)))
         command = [str(Path(sys.executable).with_name("pymcap-cli")), "doctor", str(path)]
         checked = subprocess.run(command, capture_output=True, text=True, check=False)
         assert checked.returncode == 0, checked.stdout + checked.stderr
@@ -103,14 +104,14 @@ def test_slices_pass_the_doctor(served_http: str, tmp_path: Path) -> None:
 
 def test_the_manifest_is_what_its_data_hold(served_http: str, tmp_path: Path) -> None:
     reader = pytest.importorskip("mcap.reader")
-    manifest = json.loads(get(f"{served_http}/api/v1/foxglove/manifest?where=pair_id%3C3&run={a_run(served_http)}")[0])
+    manifest = json.loads(get(f"{served_http}/api/v1/foxglove/manifest?where=pair_id%3C3&run={a_run(served_http)}"))
     (source,) = manifest["sources"]
     assert set(source) == {"url", "id", "topics", "schemas", "startTime", "endTime"}
     assert all(re.fullmatch(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\.\d{9}Z", source[time]) for time in ("startTime", "endTime"))
     schemas = {schema["id"]: schema for schema in source["schemas"]}
     told = {topic["name"]: (topic["messageEncoding"], schemas[topic["schemaId"]]) for topic in source["topics"]}
     path = tmp_path / "data.mcap"
-    path.write_bytes(get(served_http + source["url"])[0])
+    path.write_bytes(get(served_http + source["url"]))
     last = 0
     with path.open("rb") as file:
         # It does not seek: messages come as they stand.

@@ -8,6 +8,8 @@
 //! time). Nothing of it comes out of a browser's cache; what the server keeps, it keeps.
 #![allow(clippy::print_stdout, reason = "its figures are what it is for")]
 
+mod memory;
+
 use std::error::Error;
 use std::io::{BufRead as _, BufReader, Read as _, Write as _};
 use std::net::TcpStream;
@@ -16,6 +18,8 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use serde_json::Value;
+
+use memory::resident_mib;
 
 type Result<T> = std::result::Result<T, Box<dyn Error + Send + Sync>>;
 
@@ -170,12 +174,6 @@ impl Chance {
     }
 }
 
-fn resident_mb(pid: u32) -> Option<u64> {
-    let status = std::fs::read_to_string(format!("/proc/{pid}/status")).ok()?;
-    let line = status.lines().find_map(|l| l.strip_prefix("VmRSS:"))?;
-    Some(line.trim().trim_end_matches(" kB").parse::<u64>().ok()? / 1000)
-}
-
 fn main() -> Result<()> {
     let args = Arc::new(args()?);
     let lake = Arc::new(Lake::read(&args.address)?);
@@ -219,7 +217,7 @@ fn main() -> Result<()> {
     let readers: Vec<_> = (1..=args.readers).map(reader).collect();
     let mut heaviest = 0;
     while Instant::now() < end {
-        heaviest = heaviest.max(args.pid.and_then(resident_mb).unwrap_or(0));
+        heaviest = heaviest.max(args.pid.and_then(resident_mib).unwrap_or(0));
         std::thread::sleep(Duration::from_millis(200));
     }
     for reader in readers {
@@ -233,7 +231,7 @@ fn main() -> Result<()> {
     println!("  errors {}", errors.load(Ordering::Relaxed));
     println!("  p50 {:.1} ms, p95 {:.1} ms, p99 {:.1} ms", at(0.5), at(0.95), at(0.99));
     if heaviest > 0 {
-        println!("  the server's memory at most {heaviest} MB");
+        println!("  the server's memory at most {heaviest} MiB");
     }
     Ok(())
 }

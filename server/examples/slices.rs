@@ -7,12 +7,16 @@
 //! Bytes are those on the wire, the first byte is the first of the body. `RUN`'s pairs are 0 to `--pairs` (2951).
 #![allow(clippy::print_stdout, reason = "its figures are what it is for")]
 
+mod memory;
+
 use std::error::Error;
 use std::io::{Read as _, Write as _};
 use std::net::TcpStream;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
+
+use memory::resident_mib;
 
 type Result<T> = std::result::Result<T, Box<dyn Error + Send + Sync>>;
 
@@ -83,12 +87,6 @@ fn read(address: &str, path: &str) -> Result<Took> {
     Ok(Took { bytes, first: first.unwrap_or_default(), all: begun.elapsed() })
 }
 
-fn resident_mb(pid: u32) -> Option<u64> {
-    let status = std::fs::read_to_string(format!("/proc/{pid}/status")).ok()?;
-    let line = status.lines().find_map(|l| l.strip_prefix("VmRSS:"))?;
-    Some(line.trim().trim_end_matches(" kB").parse::<u64>().ok()? / 1000)
-}
-
 fn path(run: &str, pairs: std::ops::Range<u64>, more: &str) -> String {
     format!("/api/v1/slices.mcap?run={run}&where=pair_id%20between%20{}%20and%20{}{more}", pairs.start, pairs.end - 1)
 }
@@ -115,7 +113,7 @@ fn main() -> Result<()> {
             milliseconds(median.all)
         );
     }
-    let (before, done) = (args.pid.and_then(resident_mb).unwrap_or(0), Arc::new(AtomicBool::new(false)));
+    let (before, done) = (args.pid.and_then(resident_mib).unwrap_or(0), Arc::new(AtomicBool::new(false)));
     let begun = Instant::now();
     let reader = |number: u64| {
         let args = args.clone();
@@ -131,7 +129,7 @@ fn main() -> Result<()> {
         std::thread::spawn(move || {
             let mut heaviest = 0;
             while !done.load(Ordering::Relaxed) {
-                heaviest = heaviest.max(args.pid.and_then(resident_mb).unwrap_or(0));
+                heaviest = heaviest.max(args.pid.and_then(resident_mib).unwrap_or(0));
                 std::thread::sleep(Duration::from_millis(50));
             }
             heaviest
@@ -154,7 +152,7 @@ fn main() -> Result<()> {
         milliseconds(all[all.len() - 1].first)
     );
     if heaviest > 0 {
-        println!("the server's memory: {before} MB before, at most {heaviest} MB");
+        println!("the server's memory: {before} MiB before, at most {heaviest} MiB");
     }
     Ok(())
 }

@@ -109,14 +109,19 @@ def main(url):
     for command in PSQL:
         ran = lambda: subprocess.run(["psql", "-X", url, "-c", command], capture_output=True, text=True)
         checks.holds(f"psql {command}", lambda: (r := ran()).stdout + r.stderr, lambda text: "ERROR" not in text)
+
+    def row_count(query):
+        """How many; 0 of a statement that has none."""
+        answer = connection.execute(query)
+        return len(answer.fetchall()) if answer.description else 0
+
+    # Clients look up the numbers of what they show.
+    schema = str(one("select oid from pg_catalog.pg_namespace where nspname = 'public'"))
+    table = str(one("select oid from pg_catalog.pg_class where relname = 'pairs'"))
     for name, queries in ("Grafana", GRAFANA), ("DBeaver", DBEAVER):
         for query in queries:
-            # Clients look up the numbers of what they show.
-            schema = one("select oid from pg_catalog.pg_namespace where nspname = 'public'")
-            table = one("select oid from pg_catalog.pg_class where relname = 'pairs'")
-            asked = query.replace("{schema}", str(schema)).replace("{table}", str(table))
-            rows = lambda: len(connection.execute(asked).fetchall()) if connection.execute(asked).description else 0
-            checks.holds(f"{name}: {query[:60]}", rows, lambda n: (n == 0) == query.startswith(EMPTY))
+            asked = query.replace("{schema}", schema).replace("{table}", table)
+            checks.holds(f"{name}: {query[:60]}", lambda: row_count(asked), lambda n: (n == 0) == query.startswith(EMPTY))
 
     count = one("select count(*) from measurements")
     checks.same("psycopg: parameters", 7, lambda: one("select count(*) from pairs where pair_id < %s and direct_mm > %s", (7, 0.5)))

@@ -7,10 +7,10 @@ use std::time::Duration;
 use rand::{Rng as _, RngCore as _};
 use rand_chacha::ChaCha8Rng;
 
-/// What lengths and counts are changed to.
+/// What four bytes are replaced by: lengths and counts at their edges.
 const EXTREMES: [u32; 8] = [0, 1, 3, 0x7f, 0xffff, 0x7fff_ffff, 0x8000_0000, 0xffff_ffff];
 
-/// Changes some bytes, cuts or doubles a part; says what it did.
+/// Turns, replaces, removes or doubles some bytes, or cuts off the end; says what it did.
 pub(super) fn change(random: &mut ChaCha8Rng, bytes: &mut Vec<u8>) -> String {
     let mut said = Vec::new();
     for _ in 0..random.random_range(1..=4) {
@@ -94,7 +94,7 @@ pub(super) fn postgres(random: &mut ChaCha8Rng, token: &str) -> Vec<u8> {
     parts.push(message(b'Q', b"copy pairs to stdout with (format csv)\0"));
     parts.push(message(b'd', b"1,2\n"));
     parts.push(message(b'X', b""));
-    // The log-in stays whole mostly, or nothing gets behind it.
+    // Mostly the log-in stays whole, because nothing behind a broken one is read.
     let first = if random.random_ratio(4, 5) { 2 } else { 0 };
     let at = random.random_range(first..parts.len());
     change(random, &mut parts[at]);
@@ -103,7 +103,7 @@ pub(super) fn postgres(random: &mut ChaCha8Rng, token: &str) -> Vec<u8> {
     parts.concat()
 }
 
-/// HTTP/2's beginning and some frames, changed.
+/// HTTP/2's preface, and frames of chance whose lengths are right unless they are changed too.
 pub(super) fn http2(random: &mut ChaCha8Rng) -> Vec<u8> {
     let mut frames = Vec::new();
     for _ in 0..random.random_range(1..6) {
@@ -120,7 +120,8 @@ pub(super) fn http2(random: &mut ChaCha8Rng) -> Vec<u8> {
     [&b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n\0\0\0\x04\0\0\0\0\0"[..], &frames].concat()
 }
 
-/// Sends bytes and ends the connection's own side; returns how many came back until the server did so too.
+/// Sends bytes and ends this side of the connection; returns how many came back until the server ended its own, or sent
+/// nothing for as long as `patience`.
 pub(super) fn send(address: &str, bytes: &[u8], patience: Duration) -> usize {
     let mut stream = TcpStream::connect(address).expect("connected");
     stream.set_read_timeout(Some(patience)).expect("a time");

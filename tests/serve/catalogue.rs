@@ -3,9 +3,9 @@
 use serde_json::Value;
 
 use super::contract::Contract;
-use super::http::{Answer, Request};
-use super::served;
+use super::http::Request;
 use super::server::Served;
+use super::{get, json, refused, served};
 use crate::Place;
 
 /// Reliefs with both references, so that every answer has something in it.
@@ -16,14 +16,6 @@ fn lake() -> Place {
     }
     place.ok(&["ingest"]);
     place
-}
-
-fn get(server: &Served, path: &str) -> Answer {
-    Request::get(path).send(server)
-}
-
-fn json(answer: &Answer) -> Value {
-    serde_json::from_slice(&answer.body).unwrap_or_else(|e| panic!("{e}: {}", String::from_utf8_lossy(&answer.body)))
 }
 
 fn run_of(server: &Served, surface: &str) -> String {
@@ -211,7 +203,7 @@ fn run_files_come_in_ranges_to_viewers_of_elsewhere() {
         assert_eq!(answer.header("content-range"), Some(&*format!("bytes {from}-{to}/{}", file.len())));
     }
     let beyond = part(&format!("bytes={}-", file.len()));
-    assert_eq!((beyond.status, json(&beyond)["code"].as_str()), (416, Some("range_not_satisfiable")));
+    refused(&beyond, 416, "range_not_satisfiable");
     assert_eq!(beyond.header("content-range"), Some(&*format!("bytes */{}", file.len())));
     assert_eq!(foreign().with("if-none-match", &tag).send(&server).status, 304);
     let ranged = |known: &str| foreign().with("range", "bytes=0-7").with("if-range", known).send(&server).status;
@@ -282,7 +274,7 @@ fn what_is_asked_stays_data() {
     // Bytes that are no text.
     assert_eq!(get(&server, "/api/v1/surfaces/%ff").status, 400);
     let wrong = Request::post("/api/v1/lake", "").send(&server);
-    assert_eq!((wrong.status, json(&wrong)["code"].as_str()), (405, Some("method_not_allowed")));
+    refused(&wrong, 405, "method_not_allowed");
     assert!(wrong.header("allow").is_some_and(|methods| methods.contains("GET")), "{:?}", wrong.header("allow"));
 }
 

@@ -17,7 +17,8 @@ use attempts::{SECRET, files};
 
 use super::http::Request;
 use super::server::Served;
-use super::{Place, lake, postgres, served};
+use super::slices::{encoded, slice};
+use super::{Place, get, lake, postgres, served};
 
 /// A served lake with a secret beside it.
 struct Scene {
@@ -71,7 +72,7 @@ fn none_over_http() {
         "/api/v1/sql?format=csv&query=select%201",
         "/lake.toml",
     ] {
-        let answer = Request::get(path).send(&scene.server);
+        let answer = get(&scene.server, path);
         assert!(!String::from_utf8_lossy(&answer.body).contains(SECRET), "{path}");
     }
     scene.unharmed();
@@ -83,18 +84,17 @@ fn none_by_slices() {
     let scene = Scene::new();
     let of_a_run = format!("&run={}", scene.place.sql("select run_id from runs")[0]["run_id"].as_str().expect("a run"));
     for (number, attempt) in scene.attempts().iter().enumerate() {
-        let encoded: String = attempt.bytes().map(|b| format!("%{b:02x}")).collect();
         let more = ["", "&layout=in-time", &of_a_run, "&topics=/ir"][number % 4];
-        for path in ["slices.mcap", "foxglove/manifest"] {
-            let answer = Request::get(&format!("/api/v1/{path}?where={encoded}{more}")).send(&scene.server);
+        let manifest = format!("/api/v1/foxglove/manifest?where={}{more}", encoded(attempt));
+        for path in [slice(attempt, more), manifest] {
+            let answer = get(&scene.server, &path);
             assert!((400..500).contains(&answer.status), "{attempt}: {}", answer.status);
             assert!(!String::from_utf8_lossy(&answer.body).contains(SECRET), "{attempt}");
         }
     }
     // Such that are an expression once they stand in parentheses.
     for attempt in scene.attempts().iter().filter(|a| a.starts_with("select")) {
-        let encoded: String = format!("exists ({attempt})").bytes().map(|b| format!("%{b:02x}")).collect();
-        let answer = Request::get(&format!("/api/v1/slices.mcap?where={encoded}")).send(&scene.server);
+        let answer = get(&scene.server, &slice(&format!("exists ({attempt})"), ""));
         assert!(answer.status < 500, "{attempt}: {}", answer.status);
         assert!(!String::from_utf8_lossy(&answer.body).contains(SECRET), "{attempt}");
     }

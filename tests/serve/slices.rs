@@ -1,13 +1,13 @@
-//! Slices over HTTP as viewers, loaders and hostile clients ask for them, Foxglove's manifest, and the lake's files as URLs.
+//! Slices over HTTP as viewers, loaders and hostile clients ask for them, Foxglove's manifest, and the lake's files as
+//! URLs.
 
 use std::collections::BTreeSet;
 use std::io::Read as _;
 
 use serde_json::Value;
 
-use super::http::{Answer, Request};
-use super::server::Served;
-use super::{ENDLESS, running, served, wait_until};
+use super::http::Request;
+use super::{ENDLESS, get, json, refused, running, running_of, served, wait_until};
 use crate::Place;
 
 /// Sweeps of two seconds: 45 of them are more than sockets hold.
@@ -23,27 +23,13 @@ fn lake() -> Place {
 }
 
 /// The path of a slice.
-fn slice(predicate: &str, more: &str) -> String {
+pub(super) fn slice(predicate: &str, more: &str) -> String {
     format!("/api/v1/slices.mcap?where={}{more}", encoded(predicate))
 }
 
-fn encoded(text: &str) -> String {
+pub(super) fn encoded(text: &str) -> String {
     let one = |b: u8| if b.is_ascii_alphanumeric() { (b as char).to_string() } else { format!("%{b:02x}") };
     text.bytes().map(one).collect()
-}
-
-fn get(server: &Served, path: &str) -> Answer {
-    Request::get(path).send(server)
-}
-
-fn json(answer: &Answer) -> Value {
-    serde_json::from_slice(&answer.body).unwrap_or_else(|e| panic!("{e}: {}", String::from_utf8_lossy(&answer.body)))
-}
-
-fn refused(answer: &Answer, status: u16, code: &str) {
-    let problem = json(answer);
-    assert_eq!(answer.header("content-type"), Some("application/problem+json"), "{problem}");
-    assert_eq!((answer.status, problem["code"].as_str()), (status, Some(code)), "{problem}");
 }
 
 fn run_of(place: &Place, surface: &str) -> String {
@@ -250,11 +236,7 @@ fn a_slice_ends_with_its_reader() {
     let server = served(&place, &["--tokens", "tokens.toml"]);
     let bearer = format!("Bearer {token}");
     let ask = |path: &str| Request::get(path).with("authorization", &bearer);
-    let running = || {
-        let text = ask("/metrics").send(&server).text();
-        let line = text.lines().find_map(|l| l.strip_prefix("echolake_running_queries ")).expect("a figure");
-        line.parse::<f64>().expect("a number")
-    };
+    let running = || running_of(&ask("/metrics").send(&server));
     let mut unread = ask(&slice("true", "")).begin(&server);
     let mut start = [0; 12];
     unread.read_exact(&mut start).expect("a status");

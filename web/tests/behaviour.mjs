@@ -1,6 +1,6 @@
 //! What the pages must do, tried in a browser: `node tests/behaviour.mjs http://127.0.0.1:8420`.
 import assert from 'node:assert/strict'
-import { chromium } from 'playwright-core'
+import { launch } from './browser.mjs'
 
 const base = process.argv[2]
 const get = async (path) => (await fetch(base + path)).json()
@@ -8,7 +8,7 @@ const sql = async (query) => (await fetch(base + '/api/v1/sql', { method: 'POST'
 const lake = await get('/api/v1/lake')
 const all = await get('/api/v1/surfaces?limit=500')
 const id = all.items.find((s) => s.typology !== 'reference').surface_id
-const browser = await chromium.launch({ executablePath: process.env.CHROMIUM ?? '/usr/bin/chromium', args: ['--no-sandbox', '--enable-unsafe-swiftshader', '--disable-dev-shm-usage'] })
+const browser = await launch()
 const context = await browser.newContext({ viewport: { width: 1280, height: 900 }, deviceScaleFactor: 1, acceptDownloads: true })
 const page = await context.newPage()
 const said = []

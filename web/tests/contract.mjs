@@ -12,7 +12,7 @@ const get = async (path) => (await fetch(base + path)).json()
 const post = (query, accept) => fetch(`${base}/api/v1/sql`, { method: 'POST', headers: { 'content-type': 'application/json', accept }, body: JSON.stringify({ query }) })
 const surfaces = (await get('/api/v1/surfaces?limit=500')).items
 const runs = (await get('/api/v1/runs?limit=1')).items
-const measured = surfaces.find((s) => s.typology !== 'reference') ?? surfaces[0]
+const measured = surfaces.find((s) => s.typology !== 'reference')
 /** Servers for developing pages leave these out. */
 const OPTIONAL = new Set(['/api/v1/files', '/api/v1/foxglove/manifest', '/api/v1/layouts/echolake.json', '/api/v1/slices.mcap', '/api/v1/tables/{table}', '/api/v1/tables/{table}/{file}', '/metrics'])
 

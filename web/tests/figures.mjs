@@ -1,9 +1,8 @@
 //! How fast and how heavy the pages are on a lake of any size: `node tests/figures.mjs http://127.0.0.1:8080 [rounds]`. It
 //! prints and judges nothing, because times are those of a machine and of what else runs on it.
-import { readFile } from 'node:fs/promises'
 import { loadavg } from 'node:os'
 import { gzipSync } from 'node:zlib'
-import { chromium } from 'playwright-core'
+import { launch } from './browser.mjs'
 
 const [base, rounds = '3'] = process.argv.slice(2)
 const CLICKS = 60
@@ -11,14 +10,14 @@ const get = async (path) => (await fetch(base + path)).json()
 const { items, total } = await get('/api/v1/surfaces?limit=500')
 const { items: runs } = await get('/api/v1/runs?limit=1')
 const measured = items.filter((s) => s.typology !== 'reference')
-const id = (measured[0] ?? items[0]).surface_id
+const id = measured[0].surface_id
 const VIEWS = {
   wall: '/', surface: `/surfaces/${id}?microphone=14&point=40`, response: `/surfaces/${id}/pairs/159`,
   compare: `/compare?s=${items.slice(0, 8).map((s) => s.surface_id).join(',')}`, map: `/map?at=${id}`, runs: '/runs', run: `/runs/${runs[0].run_id}`,
   sql: `/sql?q=${encodeURIComponent('select surface_id, microphone, speaker, tnce_total from tnce limit 5000')}`,
 }
 
-const browser = await chromium.launch({ executablePath: process.env.CHROMIUM ?? '/usr/bin/chromium', args: ['--no-sandbox', '--enable-unsafe-swiftshader', '--disable-dev-shm-usage'] })
+const browser = await launch()
 const say = (text) => process.stdout.write(`${text}\n`)
 const fresh = async () => (await browser.newContext({ viewport: { width: 1280, height: 900 } })).newPage()
 const sorted = (times) => times.toSorted((a, b) => a - b)

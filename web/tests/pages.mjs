@@ -2,7 +2,7 @@
 //! empty or axe finds a violation: `node tests/pages.mjs http://127.0.0.1:8420 shots [only]`.
 import { mkdir, readFile } from 'node:fs/promises'
 import { createRequire } from 'node:module'
-import { chromium } from 'playwright-core'
+import { launch } from './browser.mjs'
 
 const [base, folder = 'shots', only = ''] = process.argv.slice(2)
 const axe = await readFile(createRequire(import.meta.url).resolve('axe-core/axe.min.js'), 'utf8')
@@ -10,7 +10,7 @@ const get = async (path) => (await fetch(base + path)).json()
 const { items } = await get('/api/v1/surfaces?limit=500')
 const { items: runs } = await get('/api/v1/runs?limit=1')
 const measured = items.filter((s) => s.typology !== 'reference')
-const id = (measured[0] ?? items[0]).surface_id
+const id = measured[0].surface_id
 const query = "select p.incidence_deg, 10 * log10(t.tnce_10000) as level_db from tnce t join pairs p using (pair_id) where t.surface_id = '" + id + "' order by p.incidence_deg limit 400"
 
 const PAGES = {
@@ -24,7 +24,7 @@ const PAGES = {
 const MOST_JUMP = 0.1
 
 await mkdir(folder, { recursive: true })
-const browser = await chromium.launch({ executablePath: process.env.CHROMIUM ?? '/usr/bin/chromium', args: ['--no-sandbox', '--enable-unsafe-swiftshader', '--disable-dev-shm-usage'] })
+const browser = await launch()
 let failures = 0
 const fail = (text) => { failures += 1; process.stdout.write(`FAIL ${text}\n`) }
 for (const theme of ['light', 'dark']) {

@@ -1,7 +1,7 @@
 //! The README's pictures: `node tests/pictures.mjs http://127.0.0.1:8080 ../docs`. JPEG, because PNG of shaded reliefs is
 //! four times as large.
 import { mkdir, stat } from 'node:fs/promises'
-import { chromium } from 'playwright-core'
+import { launch } from './browser.mjs'
 
 const [base, folder = '../docs'] = process.argv.slice(2)
 const MOST_BYTES = 200_000
@@ -11,7 +11,7 @@ const id = (items.find((s) => s.surface_id === 'brick') ?? items.find((s) => s.t
 const PICTURES = [['wall', '/'], ['surface', `/surfaces/${id}?microphone=14&point=40&over=flat-band`], ['response', `/surfaces/${id}/pairs/159`]]
 
 await mkdir(folder, { recursive: true })
-const browser = await chromium.launch({ executablePath: process.env.CHROMIUM ?? '/usr/bin/chromium', args: ['--no-sandbox', '--enable-unsafe-swiftshader', '--disable-dev-shm-usage'] })
+const browser = await launch()
 const page = await (await browser.newContext({ viewport: { width: 1200, height: 720 }, colorScheme: 'light' })).newPage()
 for (const [name, path] of PICTURES) {
   await page.goto(base + path, { waitUntil: 'networkidle' })

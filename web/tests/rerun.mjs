@@ -7,7 +7,7 @@ import { mkdir, readFile, writeFile } from 'node:fs/promises'
 import { createServer } from 'node:http'
 import { basename, dirname, extname, join } from 'node:path'
 import { fileURLToPath } from 'node:url'
-import { chromium } from 'playwright-core'
+import { launch } from './browser.mjs'
 
 const [base, folder = 'shots', wanted] = process.argv.slice(2)
 const { items } = await (await fetch(`${base}/api/v1/runs?limit=1`)).json()
@@ -38,7 +38,7 @@ const elsewhere = createServer(async (request, response) => {
 await new Promise((resolve) => elsewhere.listen(0, '127.0.0.1', resolve))
 
 await mkdir(folder, { recursive: true })
-const browser = await chromium.launch({ executablePath: process.env.CHROMIUM ?? '/usr/bin/chromium', args: ['--no-sandbox', '--enable-unsafe-swiftshader', '--ignore-gpu-blocklist', '--disable-dev-shm-usage'] })
+const browser = await launch('--ignore-gpu-blocklist')
 const page = await (await browser.newContext({ viewport: { width: 1400, height: 900 } })).newPage()
 const said = []
 // What it says of this browser's graphics, and of windows that a page does not have.
