@@ -22,7 +22,7 @@ use echolake_schema::tables::Table;
 use crate::as_of::{self, Past};
 use crate::mcap::{self, Contents};
 use crate::table::{LakeTable, Source};
-use crate::views::{Lookups, PairJoin, UnusedJoin, View};
+use crate::views::{Lookups, PairJoin, SortedNulls, UnusedJoin, View};
 use crate::{Error, error};
 
 /// How long another layout of the same rows may go unseen; vacuum keeps replaced files an hour at least.
@@ -77,8 +77,8 @@ impl Catalog {
     }
 
     /// The optimizer's rules for plans over these tables and views, the same for every view of the lake.
-    pub(crate) fn rules(&self) -> [Arc<dyn OptimizerRule + Send + Sync>; 2] {
-        [Arc::new(UnusedJoin), Arc::new(PairJoin::new(&self.lookups))]
+    pub(crate) fn rules(&self) -> [Arc<dyn OptimizerRule + Send + Sync>; 3] {
+        [Arc::new(UnusedJoin), Arc::new(PairJoin::new(&self.lookups)), Arc::new(SortedNulls)]
     }
 
     /// Registers what `statement` may name, all of one view of the lake. The statement is known before its plan, since

@@ -8,6 +8,7 @@ mod catalogue;
 mod ir;
 mod lookup;
 mod pair_join;
+mod sorted_nulls;
 mod tnce_db;
 mod unused_join;
 
@@ -26,6 +27,7 @@ use futures::FutureExt as _;
 
 pub(crate) use lookup::Lookups;
 pub(crate) use pair_join::PairJoin;
+pub(crate) use sorted_nulls::SortedNulls;
 pub(crate) use unused_join::UnusedJoin;
 
 /// A view.

@@ -272,3 +272,16 @@ async fn pairs_are_looked_up_where_a_measurement_names_them() {
         assert_eq!(number(&session, sql).await, expected, "{sql}");
     }
 }
+
+#[tokio::test]
+async fn nulls_that_cannot_be_stand_last() {
+    let (_folder, lake) = lake().await;
+    put(&lake, "0001_0", "r1").await;
+    let session = Session::new(&lake).expect("a session");
+    let never = plan(&session, "select pair_id from tnce order by tnce_total desc, pair_id limit 2").await;
+    assert!(never.contains("DESC NULLS LAST"), "{never}");
+    let may = plan(&session, "select pair_id from measurements order by snr_db desc limit 2").await;
+    assert!(!may.contains("DESC NULLS LAST"), "{may}");
+    let answer = rows(&session, "select pair_id from tnce order by tnce_total desc, pair_id desc limit 2").await;
+    assert_eq!(answer.num_rows(), 2);
+}
