@@ -1,7 +1,8 @@
 //! A run from its URL in rerun's web viewer, on a page of elsewhere, as whoever embeds it would have it:
-//! `node tests/rerun.mjs http://127.0.0.1:8080 shots [run]`. Needs `npm install --no-save @rerun-io/web-viewer`, which is
-//! no dependency because it weighs 47 MB. Keeps a picture of the run's beginning, middle and end, and fails where the
-//! viewer complains, arms or panel are not in the picture, or the arms do not move. The run needs arms (`docs/devices.md`).
+//! `node tests/rerun.mjs http://127.0.0.1:8080 shots [run [predicate]]`; with a predicate, the run's slice. Needs
+//! `npm install --no-save @rerun-io/web-viewer`, which is no dependency because it weighs 47 MB. Keeps a picture of the
+//! beginning, the middle and the end, and fails where the viewer complains, arms or panel are not in the picture, or the
+//! arms do not move. The run needs arms (`docs/devices.md`).
 import assert from 'node:assert/strict'
 import { mkdir, readFile, writeFile } from 'node:fs/promises'
 import { createServer } from 'node:http'
@@ -9,10 +10,12 @@ import { basename, dirname, extname, join } from 'node:path'
 import { fileURLToPath } from 'node:url'
 import { launch } from './browser.mjs'
 
-const [base, folder = 'shots', wanted] = process.argv.slice(2)
+const [base, folder = 'shots', wanted, predicate] = process.argv.slice(2)
 const { items } = await (await fetch(`${base}/api/v1/runs?limit=1`)).json()
 const run = wanted ?? items[0].run_id
-const source = `${base}/api/v1/runs/${encodeURIComponent(run)}/file.mcap`
+const source = predicate === undefined
+  ? `${base}/api/v1/runs/${encodeURIComponent(run)}/file.mcap`
+  : `${base}/api/v1/slices.mcap?${new URLSearchParams({ run, where: predicate })}`
 const viewer = dirname(fileURLToPath(import.meta.resolve('@rerun-io/web-viewer')))
 const { version } = JSON.parse(await readFile(join(viewer, 'package.json'), 'utf8'))
 
@@ -59,8 +62,12 @@ process.stdout.write(`rerun ${version}: ${run}, ${((range.max - range.min) / 1e9
 /** The moment's picture is kept; which pixels of it are strongly coloured, and whether in the arms' yellow. */
 async function at(name, share) {
   await page.evaluate(([timeline, time]) => viewer.set_current_time(opened[0], timeline, time), [TIMELINE, range.min + share * (range.max - range.min)])
-  await page.waitForTimeout(4000)
-  const picture = await page.screenshot()
+  // Drawn when two pictures are the same.
+  let [before, picture] = [null, await page.screenshot()]
+  for (let i = 0; i < 20 && !(before?.equals(picture) ?? false); i++) {
+    await page.waitForTimeout(2000)
+    ;[before, picture] = [picture, await page.screenshot()]
+  }
   await writeFile(join(folder, `rerun-${name}.png`), picture)
   return page.evaluate(async (base64) => {
     const image = await createImageBitmap(new Blob([Uint8Array.from(atob(base64), (c) => c.charCodeAt(0))]))
