@@ -1,11 +1,14 @@
 //! Whole runs over the drivers, with something that is not hardware at the other end of each.
 
 use std::collections::BTreeMap;
+use std::path::Path;
 use std::sync::Arc;
 
 use echolake_schema::devices::RosbridgeParams;
-use echolake_schema::manifest::RunManifest;
+use echolake_schema::manifest::{RunEnd, RunManifest};
+use echolake_schema::messages::Measurement;
 use echolake_schema::{Rig, RunId, SurfaceRecord, Timestamp, topics};
+use prost::Message as _;
 
 use super::audio::Aligned;
 use super::audio::tests::{Cable, Fault as AudioFault, since};
@@ -15,7 +18,7 @@ use super::serial::SerialSensor;
 use super::serial::tests::{FakeSensor, GOOD};
 use super::*;
 use crate::controller::{Control, Error as RunError, Event, Keep, RunController, RunOptions, Work};
-use crate::recorder::{Recorder, RunStart};
+use crate::recorder::{Recorder, RunStart, Tried};
 
 // A cable is no air: its sound comes at the wrong time for any distance.
 const RIG: &str = "sweep.duration_secs = 0.1\nvalidation.attempts = 1\nvalidation.arrival_us = 1e6\n[grid]\nclearance_mm = 0\npoints_mm = \
@@ -72,10 +75,8 @@ impl Ended {
     }
 }
 
-// `progress` is called before each pair, and may pull plugs.
-fn run(room: &mut Room, devices: Devices, progress: &mut dyn FnMut(&mut Room, usize)) -> Ended {
-    let folder = tempfile::tempdir().expect("a folder");
-    let (rig, start) = (room.rig.clone(), Timestamp::now());
+fn begun(room: &Room, folder: &Path) -> Recorder {
+    let (rig, start) = (&room.rig, Timestamp::now());
     let surface = "flat".parse().expect("an id");
     let manifest = RunManifest {
         run_id: RunId::compose(start, &surface, 1).expect("an id"),
@@ -83,17 +84,27 @@ fn run(room: &mut Room, devices: Devices, progress: &mut dyn FnMut(&mut Room, us
         started: start,
         software: "test".into(),
         rig: rig.name.clone(),
-        origin: devices.origin,
+        origin: Origin::Measured,
     };
-    let begin =
-        RunStart { manifest: &manifest, rig: &rig, surface: &SurfaceRecord::default(), relief: None, plan: None };
-    let path = folder.path().join("run.mcap");
-    let mut recorder = Recorder::create(&path, &begin).expect("a recorder");
-    recorder.arms(start, Arc::new(Cell::of(&rig)), "rig").expect("recorded");
+    let (surface, plan) = (SurfaceRecord::default(), Some(BTreeMap::new()));
+    let begin = RunStart { manifest: &manifest, rig, surface: &surface, relief: None, plan };
+    let mut recorder = Recorder::create(&folder.join("run.mcap"), &begin).expect("a recorder");
+    recorder.arms(start, Arc::new(Cell::of(rig)), "rig").expect("recorded");
+    recorder
+}
+
+// `progress` is called before each pair, and may pull plugs.
+fn measure(
+    room: &mut Room,
+    devices: Devices,
+    recorder: &mut Recorder,
+    before: &BTreeMap<u32, Tried>,
+    progress: &mut dyn FnMut(&mut Room, usize),
+) -> Result<RunEnd, RunError> {
+    let rig = room.rig.clone();
     let grid = rig.grid().expect("a grid");
     let mut controller = RunController::new(&rig, devices).expect("a plan");
     let options = RunOptions { keep: Keep::Sweeps, checkpoint_every: 1 };
-    let work = Work { pairs: grid.pairs(), before: &BTreeMap::new(), options };
     let mut begun = 0;
     let mut observe = |event: Event<'_>| {
         if let Event::Pair(_) = event {
@@ -101,13 +112,24 @@ fn run(room: &mut Room, devices: Devices, progress: &mut dyn FnMut(&mut Room, us
             progress(room, begun);
         }
     };
-    let outcome = controller.run(&mut recorder, &work, &Control::default(), &mut observe);
+    let work = Work { pairs: grid.pairs(), before, options };
+    let outcome = controller.run(recorder, &work, &Control::default(), &mut observe);
     let _ = recorder.checkpoint();
-    let file = std::fs::read(recorder.partial()).expect("the file");
+    outcome.map(|outcome| outcome.end)
+}
+
+fn messages(path: &Path) -> Vec<(String, Vec<u8>)> {
+    let file = std::fs::read(path).expect("the file");
     let cut_off = mcap::read::Options::IgnoreEndMagic.into();
     let messages = mcap::MessageStream::new_with_options(&file, cut_off).expect("an MCAP file").map_while(|m| m.ok());
-    let messages = messages.map(|m| (m.channel.topic.clone(), m.data.to_vec())).collect();
-    Ended { outcome: outcome.map(|outcome| outcome.end.attempts), messages }
+    messages.map(|m| (m.channel.topic.clone(), m.data.to_vec())).collect()
+}
+
+fn run(room: &mut Room, devices: Devices, progress: &mut dyn FnMut(&mut Room, usize)) -> Ended {
+    let folder = tempfile::tempdir().expect("a folder");
+    let mut recorder = begun(room, folder.path());
+    let outcome = measure(room, devices, &mut recorder, &BTreeMap::new(), progress);
+    Ended { outcome: outcome.map(|end| end.attempts), messages: messages(recorder.partial()) }
 }
 
 #[test]
@@ -142,4 +164,34 @@ fn faults_in_mid_run_are_named_and_nothing_is_lost() {
     check(|room| room.bridge.set_fault(Fault::HangsUp), "robots: lost `ws://");
     check(|room| room.sensor.unplug(), "ambient sensor: lost `/dev/pts/");
     check(|room| room.sensor.send("~~~\n"), "ambient sensor: nothing but nonsense");
+}
+
+#[test]
+fn a_run_that_lost_a_driver_is_gone_on_with() {
+    let mut room = Room::new();
+    let folder = tempfile::tempdir().expect("a folder");
+    let mut recorder = begun(&room, folder.path());
+    let devices = room.devices(since(Timestamp::now(), &[]));
+    let broken = measure(&mut room, devices, &mut recorder, &BTreeMap::new(), &mut |room, done| {
+        if done == 2 {
+            room.bridge.set_fault(Fault::HangsUp);
+        }
+    });
+    assert!(broken.is_err_and(|e| e.to_string().contains("robots: lost `ws://")));
+    let partial = recorder.partial().to_owned();
+    drop(recorder);
+
+    let mut room = Room::new();
+    let (mut recorder, held) = Recorder::resume(&partial).expect("gone on with");
+    assert!((1..3).contains(&held.pairs.len()), "{:?}", held.pairs);
+    let devices = room.devices(since(Timestamp::now(), &[]));
+    let end = measure(&mut room, devices, &mut recorder, &held.pairs, &mut |_, _| ()).expect("a whole run");
+    assert_eq!((end.accepted, end.rejected, end.attempts), (3, 0, 3));
+    let path = recorder.finish(&end).expect("finished");
+    crate::recovery::prove(&path).expect("a sound file");
+    let verdicts = messages(&path).into_iter().filter(|(topic, _)| topic == topics::MEASUREMENT);
+    let mut pairs: Vec<_> =
+        verdicts.map(|(_, data)| Measurement::decode(data.as_slice()).expect("a verdict").pair_id).collect();
+    pairs.sort_unstable();
+    assert_eq!(pairs, [0, 1, 2], "every pair once");
 }
