@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use clap::{Args, Parser, Subcommand};
+use clap::{Args, Parser, Subcommand, ValueEnum};
 use echolake_acquisition::collection::LARGEST;
 use echolake_acquisition::replay::SPEEDS;
 use echolake_lake::{KEEP_HOURS, TARGET_BYTES};
@@ -89,13 +89,19 @@ pub(crate) struct DemoArgs {
     pub(crate) seed: u64,
 }
 
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub(crate) enum MeshSide {
+    Front,
+    Back,
+}
+
 #[derive(Debug, Args)]
 pub(crate) struct AcquireArgs {
     /// Name of the measured surface, as 0015_0.
     #[arg(long, required_unless_present = "resume")]
     pub(crate) surface: Option<SurfaceId>,
     /// Go on with a run that was stopped or cut off: its `.mcap.partial`. What is safe in it is not measured again.
-    #[arg(long, value_name = "FILE", conflicts_with_all = ["surface", "panel", "parameters", "set", "mesh", "rig", "flat", "foam", "seed", "ir_only"])]
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["surface", "panel", "parameters", "set", "mesh", "side", "rig", "flat", "foam", "seed", "ir_only"])]
     pub(crate) resume: Option<PathBuf>,
     /// What the simulated rig measures, as `echolake panel --list` names it; by default what the surface's name begins
     /// with.
@@ -110,6 +116,9 @@ pub(crate) struct AcquireArgs {
     /// A mesh to measure instead: GLB, STL, OBJ or PLY.
     #[arg(long)]
     pub(crate) mesh: Option<PathBuf>,
+    /// The side of the mesh that is measured: the back is seen when the panel is turned over about its y axis.
+    #[arg(long, value_enum, requires = "mesh")]
+    pub(crate) side: Option<MeshSide>,
     /// The rig; by default the lake's, or that of the paper for a new lake.
     #[arg(long)]
     pub(crate) rig: Option<PathBuf>,

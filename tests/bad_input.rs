@@ -131,8 +131,18 @@ fn meshes_and_surfaces() {
     place.fails(1, &["acquire", "--surface", "brick", "--set", "colour=red"], "no parameter `colour`");
     place.ok(&["panel", "wavy", "-o", "wavy.stl"]);
     place.acquire("from_file", &["--mesh", "wavy.stl"]);
+    place.fails(2, &["acquire", "--surface", "x", "--rig", "rig.toml", "--side", "back"], "--mesh");
+    place.ok(&["panel", "flat", "--back", "wavy", "--cells", "64", "-o", "two.stl"]);
+    place.acquire("two_0", &["--mesh", "two.stl"]);
+    place.acquire("two_1", &["--mesh", "two.stl", "--side", "back"]);
     place.ok(&["ingest"]);
-    assert_eq!(place.sql("select mesh_file from surfaces")[0]["mesh_file"], "wavy.stl");
+    let of = |surface: &str, column: &str| {
+        place.sql(&format!("select {column} x from surfaces where surface_id = '{surface}'"))[0]["x"].clone()
+    };
+    assert_eq!(of("from_file", "mesh_file"), "wavy.stl");
+    assert_eq!(of("two_0", "relief_max_mm"), 0.0);
+    let height = |surface: &str| of(surface, "relief_max_mm").as_f64().expect("a height");
+    assert!(height("two_1") > 1.0 && (height("two_1") - height("from_file")).abs() < 0.5, "the back is the wavy one");
 }
 
 #[test]

@@ -8,6 +8,8 @@ pub(crate) mod postgres;
 pub(crate) mod server;
 mod slices;
 
+use std::io::Read as _;
+use std::net::TcpStream;
 use std::path::Path;
 use std::time::{Duration, Instant};
 
@@ -210,6 +212,8 @@ fn postgres_answers_and_refuses() {
     assert_eq!(client.query("select [1.5, 2.5]::float[]"), one("{1.5,2.5}"));
     assert_eq!(client.query("show server_version_num"), one("160006"));
     assert_eq!(client.query("select relname from pg_class where relname = 'pairs'"), one("pairs"));
+    assert_eq!(client.query("select user"), one("postgres"));
+    assert_eq!(client.query("select name from pg_timezone_names"), one("UTC"));
     for (sql, state) in [
         ("drop table runs", "25006"),
         ("copy pairs to '/tmp/echolake-out'", "25006"),
@@ -233,6 +237,52 @@ fn postgres_answers_and_refuses() {
     client.send_raw(b"Q\xff\xff\xff\xff");
     let mut other = postgres::Client::connect(&server, None);
     assert_eq!(other.query("select 4 as four"), one("4"));
+}
+
+// Drivers find out about tables in words of Postgres, and unnest keys.
+#[test]
+fn postgres_knows_keys_and_types_by_its_own_names() {
+    let place = lake();
+    let server = served(&place, &[]);
+    let mut client = postgres::Client::connect(&server, None);
+    let rows = |rows: &[&[&str]]| -> postgres::Rows {
+        Ok(rows.iter().map(|row| row.iter().map(|value| Some((*value).to_owned())).collect()).collect())
+    };
+    let keys = "select unnest(indkey) as number, generate_subscripts(indkey, 1) as place from pg_index";
+    assert_eq!(client.query(&format!("{keys} where indrelid = 'pairs'::regclass")), rows(&[]));
+    // An index of the catalogue's own, over two columns.
+    assert_eq!(client.query(&format!("{keys} where indexrelid = 2837")), rows(&[&["1", "1"], &["2", "2"]]));
+    let kinds = "select column_name, data_type from information_schema.columns where table_name = 'measurements' \
+                 and column_name in ('ir', 'log_time', 'pair_id', 'snr_db', 'surface_id') order by 1";
+    let expected: [&[&str]; 5] = [
+        &["ir", "ARRAY"],
+        &["log_time", "timestamp with time zone"],
+        &["pair_id", "integer"],
+        &["snr_db", "real"],
+        &["surface_id", "text"],
+    ];
+    assert_eq!(client.query(kinds), rows(&expected));
+    assert!(sql(&server, kinds).text().contains("Float32"), "Arrow's names over HTTP");
+    assert!(client.query("show columns from pairs").is_ok_and(|columns| columns.len() > 1));
+    assert!(client.query("select table_name from information_schema.tables").is_ok_and(|tables| tables.len() > 12));
+}
+
+#[test]
+fn flight_sql_has_so_many_places() {
+    let place = lake();
+    let server = served(&place, &[]);
+    let connect = || TcpStream::connect(&server.flight_sql).expect("connected");
+    // Who has a place is greeted at once, by the head of a frame of HTTP/2.
+    let greeted = |stream: &mut TcpStream, patience: Duration| {
+        stream.set_read_timeout(Some(patience)).expect("a limit of time");
+        stream.read_exact(&mut [0; 9]).is_ok()
+    };
+    let mut open: Vec<_> = (0..128).map(|_| connect()).collect();
+    assert!(open.iter_mut().all(|stream| greeted(stream, SOON)));
+    let mut more = connect();
+    assert!(!greeted(&mut more, Duration::from_millis(200)), "all places are taken");
+    open.pop();
+    assert!(greeted(&mut more, SOON), "one is free again");
 }
 
 #[test]

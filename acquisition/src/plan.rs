@@ -4,12 +4,14 @@ use std::collections::BTreeMap;
 use std::path::PathBuf;
 
 use crate::controller::Keep;
+use crate::mesh::Side;
 use crate::relief::Relief;
 
 const KEEP: &str = "keep";
 const SEED: &str = "seed";
 const RELIEF: &str = "relief";
 const MESH: &str = "mesh";
+const SIDE: &str = "side";
 const SWEEPS: &str = "sweeps";
 const RESPONSES: &str = "responses";
 
@@ -21,29 +23,30 @@ pub struct RunPlan {
     /// Seed of the simulation.
     pub seed: u64,
     /// What is measured.
-    pub specimen: PlannedSpecimen,
+    pub specimen: Specimen,
 }
 
 /// What is measured.
 #[derive(Debug, Clone, PartialEq)]
-pub enum PlannedSpecimen {
+pub enum Specimen {
     /// A generated relief.
     Relief(Relief),
-    /// Somebody's mesh, where it was.
-    Mesh(PathBuf),
+    /// A side of somebody's mesh, of coated print, and where the mesh is.
+    Mesh(PathBuf, Side),
 }
 
 impl RunPlan {
     /// As the metadata record's key and value pairs.
     pub fn to_metadata(&self) -> BTreeMap<String, String> {
         let keep = if self.keep == Keep::Sweeps { SWEEPS } else { RESPONSES };
-        let (kind, specimen) = match &self.specimen {
-            PlannedSpecimen::Relief(relief) => (RELIEF, relief.to_json().to_string()),
-            PlannedSpecimen::Mesh(path) => (MESH, path.to_string_lossy().into_owned()),
-        };
-        [(KEEP, keep.to_owned()), (SEED, self.seed.to_string()), (kind, specimen)]
-            .map(|(key, value)| (key.to_owned(), value))
-            .into()
+        let mut record = vec![(KEEP, keep.to_owned()), (SEED, self.seed.to_string())];
+        match &self.specimen {
+            Specimen::Relief(relief) => record.push((RELIEF, relief.to_json().to_string())),
+            Specimen::Mesh(path, side) => {
+                record.extend([(MESH, path.to_string_lossy().into_owned()), (SIDE, side.name().to_owned())]);
+            }
+        }
+        record.into_iter().map(|(key, value)| (key.to_owned(), value)).collect()
     }
 
     /// From the metadata record.
@@ -60,8 +63,14 @@ impl RunPlan {
         let seed = text(SEED)?;
         let seed = seed.parse().map_err(|_| format!("its plan has the seed `{seed}`, expected a whole number"))?;
         let specimen = match text(RELIEF) {
-            Ok(json) => PlannedSpecimen::Relief(Relief::from_json(json).map_err(|e| e.to_string())?),
-            Err(_) => PlannedSpecimen::Mesh(text(MESH)?.into()),
+            Ok(json) => Specimen::Relief(Relief::from_json(json).map_err(|e| e.to_string())?),
+            Err(_) => {
+                // Once there was but one.
+                let side = record.get(SIDE).map_or(Side::Front.name(), String::as_str);
+                let known = Side::ALL.into_iter().find(|s| s.name() == side);
+                let side = known.ok_or_else(|| format!("its plan has the side `{side}`, expected front or back"))?;
+                Specimen::Mesh(text(MESH)?.into(), side)
+            }
         };
         Ok(Self { keep, seed, specimen })
     }
@@ -75,8 +84,8 @@ mod tests {
     fn a_plan_comes_back_as_it_was() {
         let relief = Relief::by_name("brick").expect("a relief");
         for (keep, specimen) in [
-            (Keep::Sweeps, PlannedSpecimen::Relief(relief)),
-            (Keep::ResponsesOnly, PlannedSpecimen::Mesh("panels/0015.glb".into())),
+            (Keep::Sweeps, Specimen::Relief(relief)),
+            (Keep::ResponsesOnly, Specimen::Mesh("panels/0015.glb".into(), Side::Back)),
         ] {
             let plan = RunPlan { keep, seed: u64::MAX, specimen };
             assert_eq!(RunPlan::from_metadata(&plan.to_metadata()), Ok(plan));

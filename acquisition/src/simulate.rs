@@ -11,8 +11,9 @@ use echolake_schema::{Rig, RunId, SurfaceId, SurfaceRecord, Timestamp};
 
 use crate::controller::{self, Control, Event, Keep, RunController};
 use crate::drivers;
-use crate::mesh::{self, Format, Mesh};
-use crate::plan::{PlannedSpecimen, RunPlan};
+use crate::mesh::{self, Format, Mesh, Side};
+use crate::plan::RunPlan;
+pub use crate::plan::Specimen;
 use crate::preflight::Finding;
 use crate::recorder::{Held, OriginalFile, Recorder, Relief as RecordedRelief, RunStart, folder_of};
 use crate::recovery;
@@ -29,15 +30,6 @@ pub(crate) const MESH_CELLS: usize = 117;
 pub(crate) const BACK_MM: f32 = -30.0;
 /// Pairs between two checkpoints; a simulated run that is lost is made again.
 pub(crate) const CHECKPOINT_EVERY: usize = 200;
-
-/// What is measured.
-#[derive(Debug, Clone)]
-pub enum Specimen {
-    /// A generated relief.
-    Relief(Relief),
-    /// Somebody's mesh, of coated print.
-    Mesh(PathBuf),
-}
 
 /// A run to be simulated.
 #[derive(Debug, Clone)]
@@ -127,11 +119,7 @@ impl SimulatedRun<'_> {
     /// # Errors
     /// [`Error`]; a run that was begun leaves its `.partial` file.
     pub fn supervised(&self, session: Session<'_>) -> Result<Measured, Error> {
-        let specimen = match self.specimen {
-            Specimen::Relief(relief) => PlannedSpecimen::Relief(relief.clone()),
-            Specimen::Mesh(path) => PlannedSpecimen::Mesh(path.clone()),
-        };
-        let plan = RunPlan { keep: self.keep, seed: self.seed, specimen };
+        let plan = RunPlan { keep: self.keep, seed: self.seed, specimen: self.specimen.clone() };
         self.begin(session, Some(plan.to_metadata()))
     }
 
@@ -182,10 +170,7 @@ impl SimulatedRun<'_> {
     }
 
     fn prepare(&self) -> Result<Prepared, Error> {
-        let mut prepared = match self.specimen {
-            Specimen::Relief(relief) => generated(relief),
-            Specimen::Mesh(path) => from_file(path, self.rig)?,
-        };
+        let mut prepared = Prepared::of(self.specimen, self.rig)?;
         prepared.record.flat_reference = self.flat.clone();
         prepared.record.foam_reference = self.foam.clone();
         Ok(prepared)
@@ -200,10 +185,7 @@ pub fn resume(partial: &Path, session: Session<'_>) -> Result<Measured, Error> {
     let held = Held::read(partial)?;
     let reason = |reason: String| recovery::Error::NoPlan { path: partial.to_owned(), reason };
     let plan = RunPlan::from_metadata(&held.plan).map_err(reason)?;
-    let prepared = match &plan.specimen {
-        PlannedSpecimen::Relief(relief) => generated(relief),
-        PlannedSpecimen::Mesh(path) => from_file(path, &held.rig)?,
-    };
+    let prepared = Prepared::of(&plan.specimen, &held.rig)?;
     let now = Timestamp::now();
     let start = match held.manifest.origin {
         // Behind all that was recorded: the simulated clock runs ahead of ours.
@@ -235,6 +217,13 @@ fn fit(job: &Job<'_>, controller: &mut RunController<'_>, preflight: Preflight) 
 }
 
 impl Prepared {
+    fn of(specimen: &Specimen, rig: &Rig) -> Result<Self, Error> {
+        match specimen {
+            Specimen::Relief(relief) => Ok(generated(relief)),
+            Specimen::Mesh(path, side) => from_file(path, *side, rig),
+        }
+    }
+
     // Those that the rig file names; where it names none, the simulated ones.
     fn devices(
         &self,
@@ -304,9 +293,9 @@ fn generated(relief: &Relief) -> Prepared {
     }
 }
 
-fn from_file(path: &Path, rig: &Rig) -> Result<Prepared, Error> {
+fn from_file(path: &Path, side: Side, rig: &Rig) -> Result<Prepared, Error> {
     let format = Format::of(path)?;
-    let mesh = Mesh::read(path)?.check(rig.panel.size_mm, rig.panel.depth_mm, path)?;
+    let mesh = Mesh::read(path)?.seen_from(side).check(rig.panel.size_mm, rig.panel.depth_mm, path)?;
     let heights = mesh.to_height_field(FACETS, rig.panel.size_mm, rig.panel.depth_mm, path)?;
     let bytes = std::fs::read(path).map_err(|source| mesh::Error::Read { path: path.to_owned(), source })?;
     let name = path.file_name().map_or_else(|| "panel".to_owned(), |n| n.to_string_lossy().into_owned());
@@ -323,6 +312,8 @@ fn from_file(path: &Path, rig: &Rig) -> Result<Prepared, Error> {
             typology: "mesh".to_owned(),
             material: Some(material.name.to_owned()),
             reflection_factor: Some(material.reflection_factor),
+            // The attached file is the producer's, which shows its front.
+            parameters: serde_json::json!({ "side": side.name() }),
             mesh: Some(facts),
             ..SurfaceRecord::default()
         },

@@ -17,6 +17,7 @@ mod fault;
 mod flight;
 mod http;
 mod metrics;
+mod places;
 mod postgres;
 mod random;
 mod running;

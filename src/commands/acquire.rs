@@ -130,8 +130,8 @@ fn go_on(partial: &Path, lake_url: &str) {
 async fn fresh(args: &AcquireArgs, lake_url: &str, progress: &Progress) -> anyhow::Result<Job> {
     let specimen = specimen::of(args)?;
     let rig = super::rig_or(args.rig.as_deref(), lake_url, Rig::paper).await?;
-    if let Specimen::Mesh(path) = &specimen {
-        Mesh::read(path)?.check(rig.panel.size_mm, rig.panel.depth_mm, path)?;
+    if let Specimen::Mesh(path, side) = &specimen {
+        Mesh::read(path)?.seen_from(*side).check(rig.panel.size_mm, rig.panel.depth_mm, path)?;
     }
     let lake = Lake::open_or_create(lake_url, &rig, &References::default()).await?;
     let folder = super::inbox(&lake)?;

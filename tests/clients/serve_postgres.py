@@ -5,6 +5,7 @@ asyncpg, duckdb and duckdb-extension-postgres-scanner of duckdb's version. What 
 is asked in their place. Prints a line a check, exits with 1 where one fails.
 """
 import asyncio
+import datetime
 import glob
 import os
 import subprocess
@@ -123,6 +124,13 @@ def main(url):
             asked = query.replace("{schema}", schema).replace("{table}", table)
             checks.holds(f"{name}: {query[:60]}", lambda: row_count(asked), lambda n: (n == 0) == query.startswith(EMPTY))
 
+    kinds = lambda table: dict(connection.execute("select column_name, data_type from information_schema.columns where table_name = %s", (table,)).fetchall())
+    some = {"surface_id": "text", "log_time": "timestamp with time zone", "pair_id": "integer", "snr_db": "real", "ir": "ARRAY"}
+    checks.same("information_schema: types", some, lambda: {name: kind for name, kind in kinds("measurements").items() if name in some})
+    checks.same("information_schema: numbers", "double precision", lambda: kinds("pairs")["direct_mm"])
+    checks.same("user", ["postgres"] * 3, lambda: [one(f"select {name}") for name in ("user", "session_user", "current_user")])
+    checks.same("time zones", [("UTC", datetime.timedelta(0), False)], lambda: connection.execute("select name, utc_offset, is_dst from pg_timezone_names").fetchall())
+
     count = one("select count(*) from measurements")
     checks.same("psycopg: parameters", 7, lambda: one("select count(*) from pairs where pair_id < %s and direct_mm > %s", (7, 0.5)))
     checks.same("psycopg: NULL", 0, lambda: one("select count(*) from runs where run_id = %s", (None,)))
@@ -179,7 +187,24 @@ def main(url):
     inspected = lambda: sqlalchemy.inspect(engine)
     checks.holds("SQLAlchemy: tables", lambda: inspected().get_table_names(), lambda names: "measurements" in names)
     checks.holds("SQLAlchemy: columns", lambda: inspected().get_columns("pairs"), lambda columns: columns[0]["name"] == "pair_id")
-    checks.holds("SQLAlchemy: reflection", lambda: sqlalchemy.Table("measurements", sqlalchemy.MetaData(), autoload_with=engine).columns.keys())
+
+    def reflected():
+        table = sqlalchemy.Table("measurements", sqlalchemy.MetaData(), autoload_with=engine)
+        with engine.connect() as own:
+            rows = own.execute(sqlalchemy.select(table.c.pair_id, table.c.ir).limit(3)).all()
+        kinds = [type(table.c[name].type).__name__ for name in ("pair_id", "snr_db", "log_time")]
+        return len(rows), kinds, len(table.primary_key), len(table.indexes), len(table.foreign_keys)
+
+    checks.same("SQLAlchemy: reflection", (3, ["INTEGER", "REAL", "TIMESTAMP"], 0, 0, 0), reflected)
+
+    def all_reflected():
+        known = sqlalchemy.MetaData()
+        known.reflect(engine)
+        return sorted(known.tables)
+
+    checks.holds("SQLAlchemy: reflection of all", all_reflected, lambda names: names == sorted(inspected().get_table_names()))
+    constraints = lambda own: own.get_unique_constraints("pairs") + own.get_check_constraints("pairs") + own.get_foreign_keys("pairs")
+    checks.same("SQLAlchemy: constraints", [], lambda: constraints(inspected()))
     checks.same("pandas", (3, 2), lambda: pandas.read_sql("select pair_id, direct_mm from pairs limit 3", engine).shape)
 
     rows = "select surface_id, pair_id, snr_db, ir from measurements"

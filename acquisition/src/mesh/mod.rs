@@ -23,6 +23,28 @@ pub struct Mesh {
     pub triangles: Vec<[u32; 3]>,
 }
 
+/// A side of a panel, which is turned over about its y axis to see its back.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Side {
+    /// The upper one in its mesh.
+    Front,
+    /// The lower one.
+    Back,
+}
+
+impl Side {
+    /// Both.
+    pub const ALL: [Self; 2] = [Self::Front, Self::Back];
+
+    /// Its name in arguments and files.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Front => "front",
+            Self::Back => "back",
+        }
+    }
+}
+
 /// A file format, told by the file's extension.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Format {

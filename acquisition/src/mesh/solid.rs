@@ -3,7 +3,7 @@
 use std::collections::HashMap;
 use std::path::Path;
 
-use super::{Error, Mesh};
+use super::{Error, Mesh, Side};
 use crate::relief::{HeightField, RELIEF_MM};
 use crate::rigs::simulated::FACETS;
 
@@ -20,6 +20,17 @@ impl Mesh {
     /// so that the deepest reliefs leave 20 mm between them. The panel is turned over about its y axis to see its back.
     pub fn double_sided(front: &HeightField, back: &HeightField) -> Self {
         Self::between(front, |x, y| (-CORE_MM - back.height_at(-x, y)) as f32)
+    }
+
+    /// The mesh with a side above: its back as the front, where a panel of ours has its front's plane.
+    #[must_use]
+    pub fn seen_from(mut self, side: Side) -> Self {
+        if side == Side::Back {
+            for [x, _, z] in &mut self.vertices_mm {
+                (*x, *z) = (-*x, -*z - CORE_MM as f32);
+            }
+        }
+        self
     }
 
     fn between(relief: &HeightField, below: impl Fn(f64, f64) -> f32) -> Self {
@@ -260,6 +271,24 @@ mod tests {
         let lowest = panel.vertices_mm.iter().copied().min_by(|a, b| a[2].total_cmp(&b[2])).expect("vertices");
         assert!(lowest[0] < 0.0 && lowest[2] < -44.0, "{lowest:?}");
         assert_eq!(panel.check(PANEL_SIZE_MM, 40.0, Path::new("panel")).map(drop), Ok(()));
+    }
+
+    #[test]
+    fn a_panel_that_is_turned_over_shows_its_back() {
+        let of = |name: &str| Relief::by_name(name).expect("a relief").height_field(100);
+        let (front, back) = (of("brick"), of("wavy"));
+        let path = Path::new("panel");
+        let panel = Mesh::double_sided(&front, &back).seen_from(Side::Back);
+        assert_eq!(panel.check(PANEL_SIZE_MM, 40.0, path).map(drop), Ok(()), "it is closed, its outside outside");
+        assert!(panel.volume_mm3() > 0.0);
+        let seen = panel.to_height_field(100, PANEL_SIZE_MM, 40.0, path).expect("heights");
+        let off = |field: &HeightField| {
+            field.heights_mm().iter().zip(seen.heights_mm()).fold(0.0f32, |m, (a, b)| m.max((a - b).abs()))
+        };
+        assert!(off(&back) < 0.25, "{} mm", off(&back));
+        assert!(off(&front) > 1.0);
+        let front_again = Mesh::double_sided(&front, &back).seen_from(Side::Front);
+        assert_eq!(front_again, Mesh::double_sided(&front, &back));
     }
 
     #[test]

@@ -1,6 +1,7 @@
 //! Arrow Flight SQL: queries, prepared statements and the catalogue, as ADBC and JDBC drivers ask for them.
 
 mod answer;
+mod connections;
 mod info;
 mod service;
 mod statements;
@@ -12,7 +13,6 @@ use std::time::Duration;
 use arrow_flight::flight_service_server::FlightServiceServer;
 use tokio::net::TcpListener;
 use tonic::transport::Server;
-use tonic::transport::server::TcpIncoming;
 
 use crate::Error;
 use crate::service::Service;
@@ -33,7 +33,7 @@ pub(crate) async fn serve(
         .http2_keepalive_interval(Some(KEEPALIVE))
         .max_concurrent_streams(Some(STREAMS))
         .add_service(FlightServiceServer::new(flight))
-        .serve_with_incoming_shutdown(TcpIncoming::from(listener).with_nodelay(Some(true)), stop)
+        .serve_with_incoming_shutdown(connections::incoming(listener), stop)
         .await
         .map_err(|e| Error::Transport(Box::new(e)))
 }

@@ -1,7 +1,6 @@
 //! HTTP connections: so many at once, each of which must say what it wants in time.
 
 use std::pin::pin;
-use std::sync::Arc;
 use std::time::Duration;
 
 use axum::Router;
@@ -9,24 +8,24 @@ use hyper::server::conn::http1;
 use hyper_util::rt::{TokioIo, TokioTimer};
 use hyper_util::service::TowerToHyperService;
 use tokio::net::{TcpListener, TcpStream};
-use tokio::sync::{OwnedSemaphorePermit, Semaphore, watch};
+use tokio::sync::watch;
 use tokio::task::JoinSet;
+
+use crate::places::{Place, Places};
 
 /// Connections at once; more wait until one ends. Systems often allow a process 1024 open files.
 const MOST: usize = 512;
 /// How long a request's head may take, and how long a connection may stand idle between two.
 const HEAD: Duration = Duration::from_secs(30);
-/// How long to wait where the system has no more sockets.
-const PAUSE: Duration = Duration::from_millis(100);
 
 /// Answers connections until `stop`, then lets those that are at it end.
 pub(super) async fn serve(listener: TcpListener, router: Router, stop: impl Future<Output = ()>) {
-    let (places, stopping) = (Arc::new(Semaphore::new(MOST)), watch::Sender::new(false));
+    let (places, stopping) = (Places::new(listener, MOST), watch::Sender::new(false));
     let (mut stop, mut open) = (pin!(stop), JoinSet::new());
     loop {
         let (stream, place) = tokio::select! {
             () = &mut stop => break,
-            accepted = accept(&listener, &places) => accepted,
+            accepted = places.next() => accepted,
             Some(_) = open.join_next() => continue,
         };
         open.spawn(answer(stream, place, router.clone(), stopping.subscribe()));
@@ -35,26 +34,7 @@ pub(super) async fn serve(listener: TcpListener, router: Router, stop: impl Futu
     while open.join_next().await.is_some() {}
 }
 
-async fn accept(listener: &TcpListener, places: &Arc<Semaphore>) -> (TcpStream, Option<OwnedSemaphorePermit>) {
-    // Never closed, so there is always one to come.
-    let place = places.clone().acquire_owned().await.ok();
-    loop {
-        match listener.accept().await {
-            Ok((stream, _)) => return (stream, place),
-            // Who broke off already is no trouble; that there are no more sockets passes.
-            Err(_) => tokio::time::sleep(PAUSE).await,
-        }
-    }
-}
-
-async fn answer(
-    stream: TcpStream,
-    _place: Option<OwnedSemaphorePermit>,
-    router: Router,
-    mut stopping: watch::Receiver<bool>,
-) {
-    // Answers are written whole: waiting for more of them only delays.
-    let _ = stream.set_nodelay(true);
+async fn answer(stream: TcpStream, _place: Place, router: Router, mut stopping: watch::Receiver<bool>) {
     let connection = http1::Builder::new()
         .timer(TokioTimer::new())
         .header_read_timeout(HEAD)

@@ -8,12 +8,14 @@ use arrow::array::{ArrayRef, AsArray as _, Int32Array, RecordBatch, StringArray}
 use arrow::compute::cast;
 use arrow::datatypes::{DataType, Field, Int32Type, Schema, SchemaRef};
 use async_trait::async_trait;
+use datafusion::catalog::information_schema::INFORMATION_SCHEMA;
 use datafusion::catalog::{MemTable, SchemaProvider, TableProvider};
 use datafusion::common::ScalarValue;
 use datafusion::datasource::{TableType, ViewTable, provider_as_source};
 use datafusion::error::DataFusionError;
 use datafusion::execution::session_state::SessionStateBuilder;
-use datafusion::logical_expr::{LogicalPlanBuilder, ScalarUDF, cast as cast_to, ident, lit};
+use datafusion::functions_nested::string::string_to_array_udf;
+use datafusion::logical_expr::{Expr, LogicalPlanBuilder, ScalarUDF, cast as cast_to, ident, lit};
 use datafusion::prelude::SessionContext;
 use datafusion_pg_catalog::pg_catalog::catalog_info::CatalogInfo;
 use datafusion_pg_catalog::pg_catalog::context::{PgCatalogContextProvider, Role};
@@ -23,6 +25,7 @@ use datafusion_pg_catalog::pg_catalog::{ArrowTable, PgCatalogSchemaProvider, PgC
 use echolake_query::{Extend, Function};
 
 use super::functions;
+use super::information::Information;
 use super::rewrite::OWN_TABLES;
 use super::settings::Settings;
 use crate::Error;
@@ -37,8 +40,8 @@ const OWN_SCHEMA: &str = "own_schema";
 /// The function of Postgres that the field's are like.
 const LIKE: &str = "upper";
 const KEYWORDS: &str = "pg_get_keywords";
-/// The only role; `pg_get_userbyid` and `session_user` say the same.
-const ROLE: &str = "postgres";
+/// The only role; `pg_get_userbyid`, `session_user` and `user` say the same.
+pub(super) const ROLE: &str = "postgres";
 
 /// What every session is extended by.
 #[derive(Clone)]
@@ -72,16 +75,20 @@ impl PgCatalog {
     fn register(&self, context: &SessionContext, own: &[Arc<ScalarUDF>]) -> Result<(), DataFusionError> {
         let catalog = context.catalog(CATALOG);
         let missing = || DataFusionError::Internal(format!("no catalogue `{CATALOG}`"));
-        catalog.ok_or_else(missing)?.register_schema(PG_CATALOG, self.schema.clone())?;
+        let lake = catalog.ok_or_else(missing)?;
+        lake.register_schema(PG_CATALOG, self.schema.clone())?;
         for function in self.functions.iter().chain(own) {
             context.register_udf(function.as_ref().clone());
         }
         context.register_udtf(KEYWORDS, self.keywords.clone());
         // Types such as regclass are known to this planner of types.
-        let state = context.state_ref();
-        let known = context.state();
-        *state.write() =
+        let (state, known) = (context.state_ref(), context.state());
+        lake.register_schema(INFORMATION_SCHEMA, Arc::new(Information::of(&known)))?;
+        let mut extended =
             SessionStateBuilder::new_from_existing(known).with_type_planner(Arc::new(PgOidTypePlanner)).build();
+        // Where this is on, DataFusion's own stands before the one that is registered.
+        extended.config_mut().options_mut().catalog.information_schema = false;
+        *state.write() = extended;
         CoerceIntArgsToBigInt::widen(context);
         Ok(())
     }
@@ -120,6 +127,8 @@ impl<S: SchemaProvider> SchemaProvider for Complete<S> {
     async fn table(&self, name: &str) -> Result<Option<Arc<dyn TableProvider>>, DataFusionError> {
         match (name, self.inner.table(name).await?) {
             ("pg_indexes", _) => Ok(Some(no_indexes()?)),
+            ("pg_timezone_names", _) => Ok(Some(only_utc()?)),
+            ("pg_index", Some(table)) => Ok(Some(with_vectors(name, table)?)),
             ("pg_class", Some(table)) => Ok(Some(with_nothing(name, table, &["relacl", "reloptions"])?)),
             ("pg_attribute", Some(table)) => Ok(Some(with_nothing(name, table, &["attacl"])?)),
             ("pg_proc", Some(table)) => match self.inner.table("pg_namespace").await? {
@@ -140,6 +149,14 @@ fn no_indexes() -> Result<Arc<dyn TableProvider>, DataFusionError> {
     let fields = names.map(|name| Field::new(name, DataType::Utf8, true));
     let schema = Arc::new(Schema::new(fields.to_vec()));
     Ok(Arc::new(MemTable::try_new(schema, vec![Vec::new()])?))
+}
+
+// Sessions may set another zone, which changes nothing.
+fn only_utc() -> Result<Arc<dyn TableProvider>, DataFusionError> {
+    let offset = ScalarValue::new_interval_mdn(0, 0, 0);
+    let columns = [("name", lit("UTC")), ("abbrev", lit("UTC")), ("utc_offset", lit(offset)), ("is_dst", lit(false))];
+    let plan = LogicalPlanBuilder::empty(true).project(columns.map(|(name, value)| value.alias(name)))?.build()?;
+    Ok(Arc::new(ViewTable::new(plan, None)))
 }
 
 fn own_functions(functions: &[Function]) -> Result<Arc<dyn TableProvider>, DataFusionError> {
@@ -186,9 +203,31 @@ fn with_nothing(
     let own = table.schema();
     let kept = own.fields().iter().filter(|f| !lists.contains(&f.name().as_str())).map(|f| ident(f.name()));
     let lists = lists.iter().map(|list| lit(nothing.clone()).alias(*list));
-    let plan = LogicalPlanBuilder::scan(name, provider_as_source(table), None)?
-        .project(kept.chain(lists).collect::<Vec<_>>())?
-        .build()?;
+    view(name, table, kept.chain(lists))
+}
+
+// Postgres' vectors of numbers are texts there, with spaces between the numbers; clients unnest them.
+fn with_vectors(name: &str, table: Arc<dyn TableProvider>) -> Result<Arc<dyn TableProvider>, DataFusionError> {
+    let own = table.schema();
+    let columns = own.fields().iter().map(|field| {
+        let numbers = match field.name().as_str() {
+            "indkey" | "indoption" => DataType::Int16,
+            "indclass" | "indcollation" => DataType::Int32,
+            _ => return ident(field.name()),
+        };
+        let words = string_to_array_udf().call(vec![ident(field.name()), lit(" ")]);
+        cast_to(words, DataType::new_list(numbers, true)).alias(field.name())
+    });
+    view(name, table, columns)
+}
+
+/// These columns of a table, in its place.
+pub(super) fn view(
+    name: &str,
+    table: Arc<dyn TableProvider>,
+    columns: impl IntoIterator<Item = Expr>,
+) -> Result<Arc<dyn TableProvider>, DataFusionError> {
+    let plan = LogicalPlanBuilder::scan(name, provider_as_source(table), None)?.project(columns)?.build()?;
     Ok(Arc::new(ViewTable::new(plan, None)))
 }
 

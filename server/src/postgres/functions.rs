@@ -16,6 +16,7 @@ use datafusion::logical_expr::{
 use datafusion::prelude::create_udf;
 use datafusion_pg_catalog::pg_catalog as pg;
 
+use super::catalog::ROLE;
 use super::settings::{Settings, VERSION};
 
 /// Functions that are the same in all sessions.
@@ -49,6 +50,7 @@ pub(super) fn fixed() -> Vec<Arc<ScalarUDF>> {
         pg::array_bounds_udf::create_array_lower_udf(),
     ];
     let texts = [
+        ("user", Some(ROLE.to_owned())),
         ("version", Some(format!("PostgreSQL {VERSION}"))),
         ("pg_client_encoding", Some("UTF8".to_owned())),
         ("pg_get_function_result", Some(String::new())),

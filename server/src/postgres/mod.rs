@@ -7,6 +7,7 @@ mod copy;
 mod cursor;
 mod extended;
 mod functions;
+mod information;
 mod rewrite;
 mod rows;
 mod settings;

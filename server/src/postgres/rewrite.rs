@@ -21,7 +21,7 @@ const NOTHING: [&str; 3] = ["pg_attrdef", "pg_collation", "pg_sequence"];
 const NONE: &str = "-";
 
 /// Tables of `pg_catalog` that are found without its name, beside those that `datafusion-pg-catalog` knows.
-pub(super) const OWN_TABLES: [&str; 1] = ["pg_indexes"];
+pub(super) const OWN_TABLES: [&str; 2] = ["pg_indexes", "pg_timezone_names"];
 const PG_CATALOG: &str = "pg_catalog";
 
 /// Adapts a statement; `types` are those that its client gives its placeholders.
@@ -47,7 +47,7 @@ impl Adapt<'_> {
         if told.is_none_or(|told| matches!(*told, Type::UNKNOWN | Type::TEXT | Type::VARCHAR)) {
             let unquoted = format!("replace(replace(btrim({placeholder}, '{{}}'), '\"', ''), ', ', ',')");
             let sql = format!("string_to_array({unquoted}, ',')");
-            *array = Parser::new(&PostgreSqlDialect {}).try_with_sql(&sql).ok()?.parse_expr().ok()?;
+            *array = parsed(&sql)?;
         }
         Some(())
     }
@@ -69,7 +69,7 @@ impl VisitorMut for Adapt<'_> {
         if is_whole_table(expr) {
             *expr = Expr::value(Value::Boolean(true));
         }
-        if let Some(better) = array_of_query(expr) {
+        if let Some(better) = array_of_query(expr).or_else(|| subscripts(expr)) {
             *expr = better;
         }
         if let Expr::Subquery(query) = expr
@@ -138,6 +138,17 @@ fn array_of_query(expr: &Expr) -> Option<Expr> {
     select.projection = vec![SelectItem::UnnamedExpr(call("array_agg", item.clone(), function))];
     let body = Box::new(SetExpr::Select(select));
     Some(Expr::Subquery(Box::new(Query { body, order_by: None, ..query.as_ref().clone() })))
+}
+
+// generate_subscripts(list, dimension): a row for each place of a list.
+fn subscripts(expr: &Expr) -> Option<Expr> {
+    let Expr::Function(Function { name, args: FunctionArguments::List(args), .. }) = expr else { return None };
+    let asked = name.to_string().eq_ignore_ascii_case("generate_subscripts");
+    asked.then(|| parsed(&format!("unnest(generate_series(1, array_length({args})))"))).flatten()
+}
+
+fn parsed(sql: &str) -> Option<Expr> {
+    Parser::new(&PostgreSqlDialect {}).try_with_sql(sql).ok()?.parse_expr().ok()
 }
 
 fn call(name: &str, argument: Expr, like: &Function) -> Expr {
@@ -245,6 +256,10 @@ mod tests {
             "SELECT 1 FROM t WHERE ctid BETWEEN '(1,0)'::tid AND '(4294967295,0)'::tid",
         );
         check("SELECT array(SELECT 'a' || x FROM unnest(t.o) x) FROM t", "SELECT NULL FROM t");
+        check(
+            "SELECT unnest(i.k), generate_subscripts(i.k, $1::INT) AS n FROM i",
+            "SELECT unnest(i.k), unnest(generate_series(1, array_length(i.k, $1::INT))) AS n FROM i",
+        );
         check("SELECT x <> 0, ARRAY[1] FROM t", "SELECT x <> 0, ARRAY[1] FROM t");
     }
 }

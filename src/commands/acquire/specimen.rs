@@ -3,18 +3,25 @@
 use std::path::Path;
 
 use anyhow::Context as _;
+use echolake_acquisition::mesh::Side;
 use echolake_acquisition::relief::Relief;
 use echolake_acquisition::simulate::Specimen;
 use echolake_schema::SurfaceId;
 
-use crate::cli::AcquireArgs;
+use crate::cli::{AcquireArgs, MeshSide};
 
 /// What the arguments name.
 pub(super) fn of(args: &AcquireArgs) -> anyhow::Result<Specimen> {
     let surface = args.surface.as_ref().context("no surface is named; hint: --surface NAME")?;
     Ok(match (&args.mesh, &args.parameters) {
         // Absolute, so that a run can be gone on with from another folder.
-        (Some(mesh), _) => Specimen::Mesh(std::path::absolute(mesh).unwrap_or_else(|_| mesh.clone())),
+        (Some(mesh), _) => {
+            let side = args.side.map_or(Side::Front, |side| match side {
+                MeshSide::Front => Side::Front,
+                MeshSide::Back => Side::Back,
+            });
+            Specimen::Mesh(std::path::absolute(mesh).unwrap_or_else(|_| mesh.clone()), side)
+        }
         (None, Some(file)) => {
             let mut relief = relief_of_file(file)?;
             set_all(&mut relief, &args.set)?;
