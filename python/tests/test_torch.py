@@ -1,5 +1,6 @@
 """Loaders give every row once, whatever the workers, and turn maps and positions together."""
 
+import pickle
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,7 @@ torch = pytest.importorskip("torch")
 from torch.utils.data import DataLoader  # noqa: E402
 
 from echolake.symmetry import NAMES, turn_heights, turn_positions  # noqa: E402
-from echolake.torch import Measurements  # noqa: E402
+from echolake.torch import Batch, Measurements  # noqa: E402
 
 
 def rows(dataset: Measurements, workers: int = 0) -> list[tuple[str, str, int]]:
@@ -64,6 +65,56 @@ def test_turns_are_those_of_the_rows_as_measured(training_set: Path) -> None:
             assert np.allclose(batch["microphone_mm"][row], turn_positions(microphone, symmetry))
             assert np.allclose(batch["speaker_mm"][row], turn_positions(speaker, symmetry))
     assert seen == set(NAMES)
+
+
+def contents(batch: Batch) -> dict[str, object]:
+    return {name: value.numpy().copy() if isinstance(value, torch.Tensor) else value for name, value in batch.items()}
+
+
+def same(one: dict[str, object], other: dict[str, object]) -> bool:
+    return list(one) == list(other) and all(np.array_equal(one[name], other[name]) for name in one)
+
+
+# More are kept than a worker has memory for again and again: none may change when the next ones come.
+def test_a_worker_sends_what_is_read_without_one(training_set: Path) -> None:
+    dataset = Measurements(training_set, heights=True, symmetries="random", batch_size=128)
+    expected = [contents(batch) for batch in dataset]
+    kept = list(DataLoader(dataset, batch_size=None, num_workers=1))
+    assert len(kept) == len(expected) > 40
+    assert all(same(contents(batch), other) for batch, other in zip(kept, expected))
+    assert kept[0]["ir"].is_contiguous()
+
+
+@pytest.mark.parametrize("start", ["fork", "spawn"])
+def test_memory_is_used_again_only_when_nothing_points_to_it(training_set: Path, start: str) -> None:
+    dataset = Measurements(training_set, columns=["ir"], batch_size=128)
+    expected = [batch["ir"].clone() for batch in dataset]
+    loader = DataLoader(dataset, batch_size=None, num_workers=1, multiprocessing_context=start, persistent_workers=True)
+    for _ in range(2):
+        kept = {number: batch["ir"][5:] for number, batch in enumerate(loader) if number % 7 == 0}
+        assert all(torch.equal(rows, expected[number][5:]) for number, rows in kept.items())
+
+
+def scaled(batch: Batch) -> Batch:
+    batch["ir"] = batch["ir"] * 2
+    batch["peak"] = batch["ir"].abs().amax(1)
+    del batch["surface_ids"]
+    return batch
+
+
+def test_what_a_collate_function_does_arrives(training_set: Path) -> None:
+    dataset = Measurements(training_set, columns=["ir", "tnce_total"])
+    plain = next(iter(dataset))
+    batch = next(iter(DataLoader(dataset, batch_size=None, num_workers=1, collate_fn=scaled)))
+    assert list(batch) == ["ir", "tnce_total", "surface", "symmetries", "peak"]
+    assert torch.equal(batch["ir"], plain["ir"] * 2)
+    assert torch.equal(batch["tnce_total"], plain["tnce_total"])
+
+
+def test_batches_are_kept_by_pickle(training_set: Path) -> None:
+    for workers in (0, 1):
+        batch = next(iter(DataLoader(Measurements(training_set), batch_size=None, num_workers=workers)))
+        assert same(contents(pickle.loads(pickle.dumps(batch))), contents(batch))
 
 
 def test_mistakes_are_named(training_set: Path, turned_set: Path, tmp_path: Path) -> None:

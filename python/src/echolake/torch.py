@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -16,41 +16,14 @@ import torch
 from numpy.typing import NDArray
 from torch.utils.data import IterableDataset, get_worker_info
 
+from echolake._batch import Batch, Memory
 from echolake.symmetry import NAMES, turn_heights, turn_positions
 
 __all__ = ["Batch", "Measurements"]
 
-_ALIGNMENT = 64
-
-
-class Batch(dict[str, Any]):
-    """Tensors by column; ``surface_ids`` and ``symmetries`` are lists that ``surface`` points into.
-
-    The tensors of its columns are views of one piece of memory. Between processes that piece travels alone: handing over
-    a tensor costs most of a millisecond, whatever its size.
-    """
-
-    def __init__(self, packed: torch.Tensor, layout: list[_Place], others: dict[str, Any]) -> None:
-        super().__init__({place.name: place.view(packed) for place in layout} | others)
-        self._parts = packed, layout, others
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return Batch, self._parts
-
-
-@dataclass(frozen=True)
-class _Place:
-    """Where a column stands in a batch's memory."""
-
-    name: str
-    start: int
-    shape: tuple[int, ...]
-    dtype: torch.dtype
-
-    def view(self, packed: torch.Tensor) -> torch.Tensor:
-        count = int(np.prod(self.shape)) * self.dtype.itemsize
-        return packed[self.start : self.start + count].view(self.dtype).view(self.shape)
-
+_READERS = 2
+_AT_ONCE = 1024
+"""Rows to decode at once: few enough to be copied before they leave the processor's cache."""
 _POSITIONS = ("microphone_mm", "speaker_mm")
 _MEASURED = ("pair_id", "microphone", "speaker", "swapped")
 """What names points and pairs of the grid; after a turn on the fly only positions are told."""
@@ -62,7 +35,30 @@ class _Item:
 
     file: Path
     row_group: int
+    rows: int
     symmetry: str
+
+
+@dataclass
+class _Block:
+    """Surfaces that are shuffled together: rows by column, and what column ``surface`` points into."""
+
+    columns: dict[str, NDArray[Any]]
+    surface_ids: list[str]
+    symmetries: list[str]
+
+
+@dataclass
+class _Surfaces:
+    """What was read at once is of these; ``of_row`` says which."""
+
+    surface_ids: list[str]
+    symmetries: list[str]
+    of_row: NDArray[np.int64]
+
+
+_Room = dict[str, NDArray[Any]]
+"""Memory of a block's columns, kept for the next block."""
 
 
 class Measurements(IterableDataset[Batch]):
@@ -117,12 +113,15 @@ class Measurements(IterableDataset[Batch]):
         if not 0 <= self.rank < self.world_size:
             raise ValueError(f"rank {self.rank} of {self.world_size}")
         self.epoch = 0
-        self._groups = [(file, pq.read_metadata(file).num_row_groups) for file in self.files]
+        self._groups = [(file, _rows(pq.read_metadata(file))) for file in self.files]
+        self._kinds = {name: _kind(schema.field(name)) for name in self.columns} | {"surface": (np.dtype(np.int64), ())}
         self._heights: dict[str, NDArray[np.float32]] | None = None
+        self._metadata: dict[Path, pq.FileMetaData] = {}
+        self._memory: Memory | None = None
 
     def __len__(self) -> int:
         """Rows of one epoch, of all ranks and workers."""
-        rows = sum(int(pq.read_metadata(file).num_rows) for file in self.files)
+        rows = sum(sum(counts) for _, counts in self._groups)
         return rows * (len(NAMES) if self.symmetries == "all" else 1)
 
     def set_epoch(self, epoch: int) -> None:
@@ -136,13 +135,17 @@ class Measurements(IterableDataset[Batch]):
         if not blocks:
             return
         own = np.random.default_rng([self.seed, self.epoch, *self._place()])
-        with ThreadPoolExecutor(max_workers=1) as ahead:
-            coming = ahead.submit(self._read, blocks[0])
+        if self._memory is None or get_worker_info() is None:
+            self._memory = Memory()
+        # One block is dealt out while the next one is read; both places are filled again and again.
+        rooms: tuple[_Room, _Room] = {}, {}
+        with ThreadPoolExecutor(max_workers=_READERS) as readers:
+            coming = self._submit(readers, blocks[0], rooms[0])
             for number in range(len(blocks)):
                 block = coming.result()
                 if number + 1 < len(blocks):
-                    coming = ahead.submit(self._read, blocks[number + 1])
-                yield from self._batches(block, own)
+                    coming = self._submit(readers, blocks[number + 1], rooms[(number + 1) % 2])
+                yield from self._batches(block, own, self._memory)
 
     def _place(self) -> tuple[int, int]:
         info = get_worker_info()
@@ -157,9 +160,9 @@ class Measurements(IterableDataset[Batch]):
             groups = [groups[i] for i in random.permutation(len(groups))]
         if len(groups) >= places:
             groups = groups[place::places]
-            mine = [(file, group) for file, count in groups for group in range(count)]
+            mine = [(file, group, rows) for file, counts in groups for group, rows in enumerate(counts)]
         else:
-            mine = [(file, group) for file, count in groups for group in range(count)][place::places]
+            mine = [(file, group, rows) for file, counts in groups for group, rows in enumerate(counts)][place::places]
         if self.shuffle:
             ranked = [(random.random(), random.random()) for _ in mine]
             taken: dict[Path, int] = {}
@@ -171,64 +174,73 @@ class Measurements(IterableDataset[Batch]):
             mine = [mine[i] for _, _, i in sorted(order)]
         names = {"none": ["identity"], "all": list(NAMES)}.get(self.symmetries)
         items = [
-            _Item(file, group, symmetry)
-            for file, group in mine
+            _Item(file, group, rows, symmetry)
+            for file, group, rows in mine
             for symmetry in (names or [NAMES[int(random.integers(len(NAMES)))]])
         ]
         if self.shuffle and self.symmetries == "all":
             items = [items[i] for i in random.permutation(len(items))]
         return items
 
-    def _read(self, items: list[_Item]) -> dict[str, Any]:
-        parts: list[dict[str, NDArray[Any]]] = []
-        surface_ids: list[str] = []
-        symmetries: list[str] = []
-        for item in items:
-            names = [*self.columns, "surface_id", "symmetry"]
-            table = pq.ParquetFile(item.file, memory_map=True).read_row_group(item.row_group, columns=names)
-            arrays = {name: _numpy(table.column(name)) for name in self.columns}
-            arrays["surface"] = self._surfaces(table, item, surface_ids, symmetries)
-            if item.symmetry != "identity":
-                _turn(arrays, item.symmetry)
-            parts.append(arrays)
-        block: dict[str, Any] = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-        block["surface_ids"], block["symmetries"] = surface_ids, symmetries
-        return block
+    # Tasks begin in this order: when what waits for the parts begins, all of them are under way.
+    def _submit(self, readers: ThreadPoolExecutor, items: list[_Item], room: _Room) -> Future[_Block]:
+        starts = np.cumsum([0, *(item.rows for item in items)])
+        columns = self._columns(int(starts[-1]), room)
+        parts = []
+        for item, start, stop in zip(items, starts, starts[1:]):
+            part = {name: values[start:stop] for name, values in columns.items()}
+            parts.append(readers.submit(self._read, item, part))
+        return readers.submit(lambda: _Block(columns, *_numbered([part.result() for part in parts])))
 
-    # Which entry of the block's surfaces each row is of; in a set with all symmetries a row group has several.
-    def _surfaces(
-        self,
-        table: pa.Table,
-        item: _Item,
-        surface_ids: list[str],
-        symmetries: list[str],
-    ) -> NDArray[np.int64]:
+    # Where a block goes: over the one before last, as far as there is room.
+    def _columns(self, rows: int, room: _Room) -> dict[str, NDArray[Any]]:
+        for name, (dtype, shape) in self._kinds.items():
+            if name not in room or len(room[name]) < rows:
+                room[name] = np.empty((rows, *shape), dtype)
+        return {name: values[:rows] for name, values in room.items()}
+
+    def _read(self, item: _Item, columns: dict[str, NDArray[Any]]) -> _Surfaces:
+        names = [*self.columns, "surface_id", "symmetry"]
+        told: list[pa.RecordBatch] = []
+        start = 0
+        # Nearly all of a row group is one column; readers side by side do more than threads within one.
+        for rows in self._open(item.file).iter_batches(_AT_ONCE, [item.row_group], names, use_threads=False):
+            for name in self.columns:
+                columns[name][start : start + rows.num_rows] = _numpy(rows.column(name))
+            told.append(rows.select(["surface_id", "symmetry"]))
+            start += rows.num_rows
+        if item.symmetry != "identity":
+            _turn(columns, item.symmetry)
+        return self._surfaces(pa.Table.from_batches(told), item, columns["surface"])
+
+    def _open(self, file: Path) -> pq.ParquetFile:
+        opened = pq.ParquetFile(file, memory_map=True, metadata=self._metadata.get(file))
+        self._metadata[file] = opened.metadata
+        return opened
+
+    # Which of the surfaces read each row is of; in a set with all symmetries a row group has several.
+    def _surfaces(self, table: pa.Table, item: _Item, of_row: NDArray[np.int64]) -> _Surfaces:
         coded = table.column("symmetry").combine_chunks().dictionary_encode()
         names = coded.dictionary.to_pylist()
         if names != ["identity"] and self.symmetries != "none":
             raise ValueError("the training set has its symmetries already; take symmetries=\"none\"")
-        start = len(surface_ids)
-        surface_ids.extend([table.column("surface_id")[0].as_py()] * len(names))
-        symmetries.extend([item.symmetry] if names == ["identity"] else names)
-        of_row: NDArray[np.int64] = coded.indices.to_numpy().astype(np.int64) + start
-        return of_row
+        of_row[:] = coded.indices.to_numpy()
+        surface_ids = [table.column("surface_id")[0].as_py()] * len(names)
+        return _Surfaces(surface_ids, [item.symmetry] if names == ["identity"] else names, of_row)
 
-    def _batches(self, block: dict[str, Any], random: np.random.Generator) -> Iterator[Batch]:
-        rows = len(block["surface"])
-        order = random.permutation(rows) if self.shuffle else None
-        maps = self._maps(block["surface_ids"], block["symmetries"]) if self.with_heights else None
+    def _batches(self, block: _Block, random: np.random.Generator, memory: Memory) -> Iterator[Batch]:
+        rows = len(block.columns["surface"])
+        order = random.permutation(rows) if self.shuffle else np.arange(rows)
+        whole = {"heights": self._maps(block)} if self.with_heights else {}
         for start in range(0, rows, self.batch_size):
-            stop = min(start + self.batch_size, rows)
-            chosen = np.arange(start, stop) if order is None else order[start:stop]
-            others: dict[str, Any] = {name: block[name] for name in ("surface_ids", "symmetries")}
-            if maps is not None:
-                others["heights"] = maps
-            yield _packed({name: values for name, values in block.items() if isinstance(values, np.ndarray)}, chosen, others)
+            batch = memory.batch(block.columns, order[start : start + self.batch_size], whole)
+            batch["surface_ids"], batch["symmetries"] = block.surface_ids, block.symmetries
+            yield batch
 
-    def _maps(self, surface_ids: list[str], symmetries: list[str]) -> torch.Tensor:
+    def _maps(self, block: _Block) -> NDArray[np.float32]:
         known = self._known_heights()
-        turned = [turn_heights(known[surface], symmetry) for surface, symmetry in zip(surface_ids, symmetries)]
-        return torch.from_numpy(np.stack(turned))
+        pairs = zip(block.surface_ids, block.symmetries)
+        return np.stack([turn_heights(known[surface], symmetry) for surface, symmetry in pairs])
 
     def _known_heights(self) -> dict[str, NDArray[np.float32]]:
         if self._heights is None:
@@ -243,19 +255,27 @@ class Measurements(IterableDataset[Batch]):
         return self._heights
 
 
-# The chosen rows of all columns, each written straight to its place.
-def _packed(columns: dict[str, NDArray[Any]], chosen: NDArray[np.int64], others: dict[str, Any]) -> Batch:
-    layout, end = [], 0
-    for name, values in columns.items():
-        dtype = torch.from_numpy(values[:0]).dtype
-        layout.append(_Place(name, end, (len(chosen), *values.shape[1:]), dtype))
-        size = len(chosen) * int(np.prod(values.shape[1:])) * dtype.itemsize
-        end += -(-size // _ALIGNMENT) * _ALIGNMENT
-    packed = torch.empty(end, dtype=torch.uint8)
-    batch = Batch(packed, layout, others)
-    for name, values in columns.items():
-        np.take(values, chosen, axis=0, out=batch[name].numpy(), mode="clip")
-    return batch
+# All surfaces of a block in one row.
+def _numbered(parts: list[_Surfaces]) -> tuple[list[str], list[str]]:
+    surface_ids: list[str] = []
+    symmetries: list[str] = []
+    for part in parts:
+        part.of_row += len(surface_ids)
+        surface_ids += part.surface_ids
+        symmetries += part.symmetries
+    return surface_ids, symmetries
+
+
+# Type and shape of a row; where a number may be missing, it has to be one that can be NaN.
+def _kind(field: pa.Field) -> tuple[np.dtype[Any], tuple[int, ...]]:
+    if pa.types.is_fixed_size_list(field.type):
+        return np.dtype(field.type.value_type.to_pandas_dtype()), (field.type.list_size,)
+    dtype = np.dtype(field.type.to_pandas_dtype())
+    return (np.dtype(np.float64) if field.nullable and dtype.kind != "f" else dtype), ()
+
+
+def _rows(metadata: pq.FileMetaData) -> list[int]:
+    return [metadata.row_group(group).num_rows for group in range(metadata.num_row_groups)]
 
 
 def _numeric(schema: pa.Schema, columns: Sequence[str] | None, without: Sequence[str]) -> list[str]:
@@ -269,11 +289,10 @@ def _numeric(schema: pa.Schema, columns: Sequence[str] | None, without: Sequence
 
 
 # Numbers of a column, without a copy where Arrow has them in one piece.
-def _numpy(column: pa.ChunkedArray) -> NDArray[Any]:
-    array = column.combine_chunks() if column.num_chunks != 1 else column.chunk(0)
+def _numpy(column: pa.Array | pa.ChunkedArray) -> NDArray[Any]:
+    array = column.combine_chunks() if isinstance(column, pa.ChunkedArray) else column
     if pa.types.is_fixed_size_list(array.type):
-        length = array.type.list_size
-        values: NDArray[Any] = array.flatten().to_numpy(zero_copy_only=False).reshape(-1, length)
+        values: NDArray[Any] = array.flatten().to_numpy(zero_copy_only=False).reshape(-1, array.type.list_size)
         return values
     plain: NDArray[Any] = array.to_numpy(zero_copy_only=False)
     return plain
@@ -282,4 +301,4 @@ def _numpy(column: pa.ChunkedArray) -> NDArray[Any]:
 def _turn(arrays: dict[str, NDArray[Any]], symmetry: str) -> None:
     for name in _POSITIONS:
         if name in arrays:
-            arrays[name] = turn_positions(arrays[name], symmetry)
+            arrays[name][:] = turn_positions(arrays[name], symmetry)
