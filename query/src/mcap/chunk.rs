@@ -30,6 +30,8 @@ pub(super) struct Records {
 
 /// Where records come from.
 enum Source {
+    /// A chunk that is unpacked at once, when its first record is asked for.
+    Packed(Bytes),
     /// A chunk as it was before it was compressed, and how far it is read.
     Whole(Bytes, usize),
     /// Anything else, by the mcap crate's reader.
@@ -74,8 +76,8 @@ impl Records {
                 let (header, data) = chunk(&bytes)?;
                 let largest = header.uncompressed_size.max(bytes.len() as u64);
                 let memory = usize::try_from(largest).map_err(|e| e.to_string())?;
-                if let Some(whole) = whole(&header, data, &bytes)? {
-                    return Ok(Self { source: Source::Whole(whole, 0), memory });
+                if is_unpacked_at_once(&header, data) {
+                    return Ok(Self { source: Source::Packed(bytes), memory });
                 }
                 largest
             }
@@ -97,7 +99,12 @@ impl Records {
         &mut self,
         sink: &mut impl FnMut(Record<'_>) -> Result<Step, E>,
     ) -> Result<Progress, Stop<E>> {
+        if let Source::Packed(bytes) = &self.source {
+            self.source = Source::Whole(unpacked(bytes).map_err(Stop::Damage)?, 0);
+        }
         match &mut self.source {
+            // It became a whole one.
+            Source::Packed(_) => Ok(Progress::Done),
             Source::Whole(records, at) => read_whole(records, at, sink),
             Source::Stream(reader, bytes, given) => read_stream(reader, bytes, given, sink),
         }
@@ -176,12 +183,21 @@ thread_local! {
     static DECOMPRESSOR: RefCell<Option<Decompressor<'static>>> = const { RefCell::new(None) };
 }
 
-// The chunk before it was compressed, its CRC checked: at once where that is sound, None where the reader has to do it.
-fn whole(header: &ChunkHeader, data: &[u8], of: &Bytes) -> Result<Option<Bytes>, String> {
+fn is_unpacked_at_once(header: &ChunkHeader, data: &[u8]) -> bool {
+    match header.compression.as_str() {
+        "" => true,
+        "zstd" => header.uncompressed_size / USUAL_RATIO <= data.len() as u64,
+        _ => false,
+    }
+}
+
+// A chunk before it was compressed, its CRC checked.
+fn unpacked(bytes: &Bytes) -> Result<Bytes, String> {
+    let (header, data) = chunk(bytes)?;
     let size = header.uncompressed_size;
     let whole = match header.compression.as_str() {
-        "" => of.slice_ref(data),
-        "zstd" if size / USUAL_RATIO <= data.len() as u64 => {
+        "" => bytes.slice_ref(data),
+        _ => {
             let unpacked = DECOMPRESSOR.with_borrow_mut(|kept| {
                 let decompressor = match kept.take() {
                     Some(decompressor) => decompressor,
@@ -191,7 +207,6 @@ fn whole(header: &ChunkHeader, data: &[u8], of: &Bytes) -> Result<Option<Bytes>,
             });
             unpacked.map_err(|e| format!("its chunk does not decompress: {e}"))?.into()
         }
-        _ => return Ok(None),
     };
     if whole.len() as u64 != size {
         return Err(format!("its chunk has {} bytes, expected {size}", whole.len()));
@@ -200,7 +215,7 @@ fn whole(header: &ChunkHeader, data: &[u8], of: &Bytes) -> Result<Option<Bytes>,
     if expected != 0 && crc != expected {
         return Err(format!("its chunk's CRC is {crc:08x}, expected {expected:08x}"));
     }
-    Ok(Some(whole))
+    Ok(whole)
 }
 
 // A chunk's header and data, where they are sound and their sizes are bearable.
