@@ -2,8 +2,9 @@
 
 use std::path::PathBuf;
 
-use clap::{Args, Parser, Subcommand, ValueEnum};
+use clap::{Args, Parser, Subcommand};
 use echolake_acquisition::collection::LARGEST;
+use echolake_acquisition::mesh::Side;
 use echolake_acquisition::replay::SPEEDS;
 use echolake_lake::{KEEP_HOURS, TARGET_BYTES};
 use echolake_schema::SurfaceId;
@@ -89,12 +90,6 @@ pub(crate) struct DemoArgs {
     pub(crate) seed: u64,
 }
 
-#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
-pub(crate) enum MeshSide {
-    Front,
-    Back,
-}
-
 #[derive(Debug, Args)]
 pub(crate) struct AcquireArgs {
     /// Name of the measured surface, as 0015_0.
@@ -117,8 +112,8 @@ pub(crate) struct AcquireArgs {
     #[arg(long)]
     pub(crate) mesh: Option<PathBuf>,
     /// The side of the mesh that is measured: the back is seen when the panel is turned over about its y axis.
-    #[arg(long, value_enum, requires = "mesh")]
-    pub(crate) side: Option<MeshSide>,
+    #[arg(long, value_name = "front|back", value_parser = side, requires = "mesh")]
+    pub(crate) side: Option<Side>,
     /// The rig; by default the lake's, or that of the paper for a new lake.
     #[arg(long)]
     pub(crate) rig: Option<PathBuf>,
@@ -217,6 +212,10 @@ pub(crate) struct ReplayArgs {
     /// Wait for a viewer's play button; without it playback begins with the first viewer.
     #[arg(long)]
     pub(crate) paused: bool,
+}
+
+fn side(text: &str) -> Result<Side, String> {
+    Side::parse(text).ok_or_else(|| "expected front or back".to_owned())
 }
 
 fn speed(text: &str) -> Result<f32, String> {

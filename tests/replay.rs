@@ -29,7 +29,7 @@ fn replayed(place: &Place, runs: &[&str]) -> (Option<i32>, String) {
 #[test]
 fn runs_are_named_in_every_way_and_damage_is_told() {
     let place = Place::new();
-    place.acquire("flat", &["--seed", "1"]);
+    let path = place.acquire("flat", &["--seed", "1"]);
     place.ok(&["ingest"]);
     let run = place.sql("select run_id from runs")[0]["run_id"].as_str().expect("a name").to_owned();
     for name in ["flat", run.as_str(), &format!("lake/runs/flat/{run}.mcap")] {
@@ -39,6 +39,7 @@ fn runs_are_named_in_every_way_and_damage_is_told() {
     }
     // A second one that was cut off is shown as far as it is whole; a third is none.
     let second = place.acquire("foam", &["--seed", "2"]);
+    assert_ne!(path, second);
     let whole = std::fs::read(&second).expect("the run");
     std::fs::write(place.path("cut.mcap"), &whole[..whole.len() * 9 / 10]).expect("written");
     std::fs::write(place.path("none.mcap"), "nothing").expect("written");

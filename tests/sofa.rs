@@ -26,4 +26,12 @@ fn sofa_out_and_in_again() {
     let late = "select max(abs(log_time_ns - floor(log_time_ns / 1e9) * 1e9)) from measurements";
     assert!(other.number(late) < 1e6, "whole seconds, and a microsecond where two would be one");
     assert_eq!(other.sql("select distinct origin from runs")[0]["origin"], "imported_sofa");
+
+    // Two files of a surface are refused before there is a lake.
+    let third = Place::new();
+    for copy in ["a.sofa", "b.sofa"] {
+        std::fs::copy(other.path("out/flat.sofa"), third.path(copy)).expect("copied");
+    }
+    third.fails(1, &["import", "sofa", "--rig", "rig.toml", "a.sofa", "b.sofa"], "a second file of surface flat");
+    assert!(!third.path("lake").exists());
 }

@@ -67,8 +67,8 @@ impl RunPlan {
             Err(_) => {
                 // Once there was but one.
                 let side = record.get(SIDE).map_or(Side::Front.name(), String::as_str);
-                let known = Side::ALL.into_iter().find(|s| s.name() == side);
-                let side = known.ok_or_else(|| format!("its plan has the side `{side}`, expected front or back"))?;
+                let side = Side::parse(side)
+                    .ok_or_else(|| format!("its plan has the side `{side}`, expected front or back"))?;
                 Specimen::Mesh(text(MESH)?.into(), side)
             }
         };

@@ -33,15 +33,17 @@ pub enum Side {
 }
 
 impl Side {
-    /// Both.
-    pub const ALL: [Self; 2] = [Self::Front, Self::Back];
-
     /// Its name in arguments and files.
     pub fn name(self) -> &'static str {
         match self {
             Self::Front => "front",
             Self::Back => "back",
         }
+    }
+
+    /// The side of a name.
+    pub fn parse(name: &str) -> Option<Self> {
+        [Self::Front, Self::Back].into_iter().find(|side| side.name() == name)
     }
 }
 

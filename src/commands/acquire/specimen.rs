@@ -8,7 +8,7 @@ use echolake_acquisition::relief::Relief;
 use echolake_acquisition::simulate::Specimen;
 use echolake_schema::SurfaceId;
 
-use crate::cli::{AcquireArgs, MeshSide};
+use crate::cli::AcquireArgs;
 
 /// What the arguments name.
 pub(super) fn of(args: &AcquireArgs) -> anyhow::Result<Specimen> {
@@ -16,11 +16,8 @@ pub(super) fn of(args: &AcquireArgs) -> anyhow::Result<Specimen> {
     Ok(match (&args.mesh, &args.parameters) {
         // Absolute, so that a run can be gone on with from another folder.
         (Some(mesh), _) => {
-            let side = args.side.map_or(Side::Front, |side| match side {
-                MeshSide::Front => Side::Front,
-                MeshSide::Back => Side::Back,
-            });
-            Specimen::Mesh(std::path::absolute(mesh).unwrap_or_else(|_| mesh.clone()), side)
+            let path = std::path::absolute(mesh).unwrap_or_else(|_| mesh.clone());
+            Specimen::Mesh(path, args.side.unwrap_or(Side::Front))
         }
         (None, Some(file)) => {
             let mut relief = relief_of_file(file)?;
