@@ -11,7 +11,7 @@ use futures::TryStreamExt as _;
 use serde::Serialize;
 use sha2::{Digest as _, Sha256};
 
-use crate::lease::Lease;
+use crate::tables::lease::Lease;
 use crate::{
     Commit, Committed, DataFile, Effect, Error, FileEncoder, FileName, Lake, Part, Replaces, Result, Snapshot,
 };

@@ -10,8 +10,8 @@ use object_store::path::Path;
 use object_store::{ObjectStore as _, ObjectStoreExt as _};
 use serde::Serialize;
 
-use crate::delta::folder;
-use crate::lease::Lease;
+use crate::tables::delta::folder;
+use crate::tables::lease::Lease;
 use crate::{Error, History, Lake, Result};
 
 /// Hours for which a file is kept after it went out of its table, where nothing else is said, and at most: Delta's

@@ -23,8 +23,8 @@ use uuid::Uuid;
 use self::actions::{AddFile, FileFormat, LogLine, TableMetadata};
 use self::log_folder::{CommitAttempt, LogFolder, own_protocol};
 use self::table_state::TableState;
-use crate::snapshot::{decode_parts, encode_parts, is_merged};
-use crate::versions;
+use crate::tables::snapshot::{decode_parts, encode_parts, is_merged};
+use crate::tables::versions;
 use crate::{
     Commit, CommitLog, Committed, DataFile, Effect, Error, FileStats, History, NewFile, Part, Result, TableVersion,
 };

@@ -14,7 +14,7 @@ use super::actions::LogLine;
 use super::checkpoint::{decode_checkpoint, encode_checkpoint};
 use super::folder;
 use super::table_state::TableState;
-use crate::versions::{commit_name, commit_number};
+use crate::tables::versions::{commit_name, commit_number};
 use crate::{Error, Result};
 
 /// The newest version of the protocol that this reads.

@@ -12,7 +12,7 @@ use object_store::path::Path;
 use object_store::{GetOptions, GetRange, ObjectStore};
 use serde_json::Value;
 
-use crate::delta::folder;
+use crate::tables::delta::folder;
 use crate::{Error, Lake, Result, Snapshot};
 
 /// Bytes of a commit that are read for its time, which writers put first.

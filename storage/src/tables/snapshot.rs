@@ -318,7 +318,7 @@ mod tests {
     use super::*;
 
     fn file(table: Table, name: &str, modified: i64) -> DataFile {
-        let path = crate::delta::folder(table).join(name);
+        let path = crate::tables::delta::folder(table).join(name);
         let modified = DateTime::from_timestamp(modified, 0).expect("a time");
         DataFile { path, bytes: 1, rows: 1, modified, stats: None, parts: Vec::new(), hidden: Vec::new() }
     }
