@@ -6,6 +6,7 @@ mod watch;
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
+use std::sync::atomic::Ordering;
 use std::time::Duration;
 
 use anyhow::Context as _;
@@ -52,6 +53,8 @@ pub(crate) async fn run(args: &AcquireArgs, lake_url: &str) -> anyhow::Result<Do
     // What can be refused is refused before anything is made for it.
     let influx = args.influx.as_deref().map(str::parse::<Target>).transpose()?;
     let pace = if args.pace > 0.0 { Pace::Secs(args.pace) } else { Pace::Fast };
+    let control = Arc::new(Control::default());
+    watch::obey(&control)?;
     let progress = Progress::new();
     let job = match &args.resume {
         Some(partial) => Job::Resumed { partial: partial.clone(), held: Box::new(Held::read(partial)?) },
@@ -75,12 +78,11 @@ pub(crate) async fn run(args: &AcquireArgs, lake_url: &str) -> anyhow::Result<Do
     let pushed = influx.map(|target| {
         InfluxPush::start(target, metrics.clone(), TOLD_EVERY, |e| eprintln!("warning: metrics were not taken: {e}"))
     });
-    let control = Arc::new(Control::default());
-    watch::obey(&control);
     let mut watcher = Watcher::new(&progress, &surface, planned, accepted, metrics.clone(), job.folder());
     let preflight = if args.skip_checks { Preflight::Skip } else { Preflight::Check };
     let (checkpoint_every, tap) = (args.checkpoint_every.map(|n| n as usize), live.as_ref().map(LiveServer::tap));
     let partial = job.partial()?;
+    anyhow::ensure!(!control.stop.load(Ordering::Relaxed), "stopped before anything was measured");
     let measured = tokio::task::spawn_blocking(move || {
         let mut observe = |event: Event<'_>| {
             if let Some(acknowledgements) = &mut acknowledgements {
