@@ -12,6 +12,7 @@ mod maintenance;
 mod real_data;
 mod replay;
 mod serve;
+mod signals;
 mod sofa;
 #[cfg(feature = "web")]
 mod web;

@@ -6,7 +6,6 @@ mod watch;
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use std::sync::atomic::Ordering;
 use std::time::Duration;
 
 use anyhow::Context as _;
@@ -82,7 +81,6 @@ pub(crate) async fn run(args: &AcquireArgs, lake_url: &str) -> anyhow::Result<Do
     let preflight = if args.skip_checks { Preflight::Skip } else { Preflight::Check };
     let (checkpoint_every, tap) = (args.checkpoint_every.map(|n| n as usize), live.as_ref().map(LiveServer::tap));
     let partial = job.partial()?;
-    anyhow::ensure!(!control.stop.load(Ordering::Relaxed), "stopped before anything was measured");
     let measured = tokio::task::spawn_blocking(move || {
         let mut observe = |event: Event<'_>| {
             if let Some(acknowledgements) = &mut acknowledgements {
