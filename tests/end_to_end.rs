@@ -4,6 +4,27 @@ use super::Place;
 
 const PAIRS: f64 = 45.0;
 
+// In a build with debug assertions, clap looks over the arguments of each.
+#[test]
+fn every_command_explains_itself() {
+    let place = Place::new();
+    let help = place.ok(&["--help"]);
+    let commands = |help: &str| -> Vec<String> {
+        let listed = help.lines().skip_while(|line| *line != "Commands:").skip(1).take_while(|line| !line.is_empty());
+        let entries = listed.filter(|line| !line.starts_with("   "));
+        entries.filter_map(|line| line.split_whitespace().next().map(str::to_owned)).collect()
+    };
+    let all = commands(&help);
+    assert!(all.len() > 14 && all.iter().any(|name| name == "serve"), "{help}");
+    for name in all.iter().filter(|name| *name != "help") {
+        let own = place.ok(&[name, "--help"]);
+        assert!(own.contains("Usage: echolake"), "{name}: {own}");
+        for part in commands(&own).iter().filter(|part| *part != "help") {
+            assert!(place.ok(&[name, part, "--help"]).contains("Usage: echolake"), "{name} {part}");
+        }
+    }
+}
+
 #[test]
 fn references_complete_what_waits_and_the_physics_holds() {
     let place = Place::new();

@@ -9,6 +9,7 @@ mod fuzz;
 mod kills;
 mod load;
 mod maintenance;
+mod prompt;
 mod real_data;
 mod replay;
 mod serve;
