@@ -72,7 +72,7 @@ pub struct FileStats {
     pub max: Map<String, Value>,
 }
 
-/// A file about to be registered; its bytes are already in the store. Its name is its application transaction.
+/// A file about to be registered; its bytes are already in the store.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct NewFile {
     /// Name in the table's folder.

@@ -1,31 +1,30 @@
 //! The commit log as Delta, reader version 1 and writer version 2, so that every Delta reader reads it.
 
+mod actions;
+mod checkpoint;
+mod log_folder;
+mod table_state;
+
 use std::collections::{BTreeSet, HashMap, HashSet};
 use std::sync::Arc;
 
 use arrow::datatypes::{DataType as ArrowType, Field, SchemaRef};
 use async_trait::async_trait;
 use chrono::{DateTime, Utc};
-use deltalake_core::kernel::transaction::{CommitBuilder, CommitConflictError, CommitProperties, TransactionError};
-use deltalake_core::kernel::{
-    Action, Add, ArrayType, DataType, LogicalFileView, MetadataValue, Remove, StructField, Transaction,
-};
-use deltalake_core::logstore::{LogStoreRef, StorageConfig, default_logstore};
-use deltalake_core::operations::create::CreateBuilder;
-use deltalake_core::protocol::{DeltaOperation, SaveMode};
-use deltalake_core::{DeltaTable, DeltaTableError};
 use echolake_schema::Rig;
 use echolake_schema::tables::Table;
-use futures::TryStreamExt as _;
+use object_store::ObjectStore;
 use object_store::path::Path;
-use object_store::prefix::PrefixStore;
-use object_store::{ObjectStore, ObjectStoreExt as _};
-use serde_json::{Map, Value};
+use percent_encoding::percent_decode_str;
+use serde_json::{Map, Value, json};
 use tokio::sync::Mutex;
-use url::Url;
+use uuid::Uuid;
 
+use self::actions::{AddFile, FileFormat, LogLine, TableMetadata};
+use self::log_folder::{CommitAttempt, LogFolder, own_protocol};
+use self::table_state::TableState;
 use crate::snapshot::{decode_parts, encode_parts, is_merged};
-use crate::versions::{self, commit_name};
+use crate::versions;
 use crate::{
     Commit, CommitLog, Committed, DataFile, Effect, Error, FileStats, History, NewFile, Part, Result, TableVersion,
 };
@@ -34,63 +33,45 @@ use crate::{
 const COMMIT_TRIES: usize = 50;
 /// The tag of a merged file's Add that holds its parts.
 const PARTS: &str = "echolake.parts";
-/// The application of all commits that take files away. Delta does not compare Removes that change no data with
-/// those of others, so that two merges at once would double rows; of two commits of one application it tells.
-const REMOVALS: &str = "echolake.removals";
 
 /// The tables' Delta logs under `tables/`.
 #[derive(Debug)]
 pub(crate) struct DeltaLog {
-    url: Url,
-    root: Arc<dyn ObjectStore>,
     store: Arc<dyn ObjectStore>,
     rig: Rig,
     /// Loaded tables; a later look reads only what has come since.
-    loaded: Mutex<HashMap<Table, DeltaTable>>,
+    loaded: Mutex<HashMap<Table, Arc<TableState>>>,
 }
 
 impl DeltaLog {
-    pub(crate) fn new(url: Url, root: Arc<dyn ObjectStore>, store: Arc<dyn ObjectStore>, rig: Rig) -> Self {
-        Self { url, root, store, rig, loaded: Mutex::default() }
+    pub(crate) fn new(store: Arc<dyn ObjectStore>, rig: Rig) -> Self {
+        Self { store, rig, loaded: Mutex::default() }
     }
 
-    fn log_store(&self, table: Table) -> Result<LogStoreRef> {
-        let folder = folder(table);
-        let url = self
-            .url
-            .join(&format!("{folder}/"))
-            .map_err(|e| Error::Location { location: self.url.to_string(), reason: e.to_string() })?;
-        let prefixed = Arc::new(PrefixStore::new(self.store.clone(), folder));
-        Ok(default_logstore(prefixed, self.root.clone(), &url, &StorageConfig::default()))
+    fn log_folder(&self, table: Table) -> LogFolder<'_> {
+        LogFolder::new(table, self.store.as_ref())
     }
 
-    /// The table as of now, or None where there is none.
-    async fn load(&self, table: Table) -> Result<Option<DeltaTable>> {
-        let mut loaded = self.loaded.lock().await;
-        let known = loaded.remove(&table);
-        let mut delta = match known {
-            Some(delta) => delta,
-            None => DeltaTable::new(self.log_store(table)?),
+    /// The table as of now, or None if it has no log.
+    async fn load(&self, table: Table) -> Result<Option<Arc<TableState>>> {
+        let log = self.log_folder(table);
+        let known = self.loaded.lock().await.get(&table).cloned();
+        let mut state = match known {
+            Some(state) => log.advance(state).await?,
+            None => None,
         };
-        match delta.update_state().await {
-            Ok(()) => {
-                loaded.insert(table, delta.clone());
-                Ok(Some(delta))
-            }
-            Err(DeltaTableError::NotATable(_) | DeltaTableError::InvalidVersion(_)) => Ok(None),
-            Err(e) if self.is_absent(&delta).await => {
-                drop(e);
-                Ok(None)
-            }
-            Err(e) => Err(Error::log(table.name(), "read", e)),
+        if state.is_none() {
+            state = log.load(None).await?.map(Arc::new);
         }
+        let mut loaded = self.loaded.lock().await;
+        match &state {
+            Some(state) => drop(loaded.insert(table, state.clone())),
+            None => drop(loaded.remove(&table)),
+        }
+        Ok(state)
     }
 
-    async fn is_absent(&self, delta: &DeltaTable) -> bool {
-        matches!(delta.verify_deltatable_existence().await, Ok(false))
-    }
-
-    async fn require(&self, table: Table) -> Result<DeltaTable> {
+    async fn require(&self, table: Table) -> Result<Arc<TableState>> {
         self.load(table).await?.ok_or_else(|| Error::Log {
             table: table.name(),
             action: "read",
@@ -98,45 +79,20 @@ impl DeltaLog {
         })
     }
 
-    async fn names(&self, table: Table, delta: &DeltaTable) -> Result<HashSet<String>> {
-        let broken = |e| Error::log(table.name(), "read", e);
-        let log_store = delta.log_store();
-        let views = delta.snapshot().map_err(broken)?.snapshot().file_views(log_store.as_ref(), None);
-        views.map_ok(|f| f.path().into_owned()).try_collect().await.map_err(broken)
-    }
-
-    async fn try_commit(&self, delta: &DeltaTable, change: &Change<'_>) -> std::result::Result<(), DeltaTableError> {
-        let now = Utc::now().timestamp_millis();
-        let effect = change.effect;
-        let mut actions: Vec<_> = change.add.iter().map(|f| Action::Add(add(f, now, effect))).collect();
-        actions.extend(change.remove.iter().map(|name| Action::Remove(remove(name, now, effect))));
-        // The ids only record. They make Delta tell of a conflict with a commit of the same ones; what is in the log
-        // already is ours to see before each try.
-        let mut properties = CommitProperties::default();
-        for file in &change.add {
-            properties = properties.with_application_transaction(Transaction::new(&file.name, 1));
-            if let Some(prefix) = file.replaces.as_ref().and_then(|r| r.prefix.as_ref()) {
-                properties = properties.with_application_transaction(Transaction::new(prefix, 1));
-            }
+    // Written against one version, so that it takes effect only if that is still the newest.
+    async fn try_commit(&self, table: Table, state: &Arc<TableState>, change: &Change<'_>) -> Result<CommitAttempt> {
+        let log = self.log_folder(table);
+        log.check_writable(state)?;
+        let now = Utc::now();
+        let lines = change.log_lines(state, now.timestamp_millis());
+        let attempt = log.write_commit(state.version + 1, &lines).await?;
+        if attempt == CommitAttempt::Written {
+            let mut state = TableState::clone(state);
+            state.apply(state.version + 1, lines);
+            // The commit is done; a checkpoint only spares readers some work, and the next one makes up for it.
+            let _ = log.maintain(&state, now).await;
         }
-        if !change.remove.is_empty() {
-            properties = properties.with_application_transaction(Transaction::new(REMOVALS, 1));
-        }
-        // Without a predicate Delta would not compare our Removes with what others add.
-        let predicate = (!change.remove.is_empty()).then(|| "true".to_owned());
-        let mode = if predicate.is_some() { SaveMode::Overwrite } else { SaveMode::Append };
-        let operation = match effect {
-            Effect::Rows => DeltaOperation::Write { mode, partition_by: None, predicate },
-            Effect::Layout => {
-                let bytes = change.add.iter().map(|f| f.bytes).max().unwrap_or(0);
-                DeltaOperation::Optimize { predicate: None, target_size: i64::try_from(bytes).unwrap_or(i64::MAX) }
-            }
-        };
-        CommitBuilder::from(properties)
-            .with_actions(actions)
-            .build(Some(delta.snapshot()?), delta.log_store(), operation)
-            .await
-            .map(drop)
+        Ok(attempt)
     }
 }
 
@@ -169,6 +125,23 @@ impl<'a> Change<'a> {
         change
     }
 
+    /// The commit's lines, against the version whose state is given.
+    fn log_lines(&self, state: &TableState, now_millis: i64) -> Vec<LogLine> {
+        let data_change = self.effect == Effect::Rows;
+        let largest = self.add.iter().map(|f| f.bytes).max().unwrap_or(0);
+        let (operation, parameters) = match self.effect {
+            Effect::Rows if self.remove.is_empty() => ("WRITE", json!({ "mode": "Append" })),
+            Effect::Rows => ("WRITE", json!({ "mode": "Overwrite" })),
+            Effect::Layout => ("OPTIMIZE", json!({ "targetSize": largest.to_string() })),
+        };
+        let removed = state.files.values().filter(|f| self.remove.contains(&file_name(&f.path)));
+        let removed =
+            removed.map(|f| LogLine { remove: Some(f.removed_at(now_millis, data_change)), ..LogLine::default() });
+        let added =
+            self.add.iter().map(|f| LogLine { add: Some(add_file(f, now_millis, data_change)), ..LogLine::default() });
+        std::iter::once(commit_info(operation, parameters, now_millis)).chain(added).chain(removed).collect()
+    }
+
     fn outcome(&self, file: &NewFile, names: &HashSet<String>) -> Committed {
         if names.contains(&file.name) {
             return Committed::Before;
@@ -194,38 +167,39 @@ impl CommitLog for DeltaLog {
         if self.load(table).await?.is_some() {
             return Ok(());
         }
-        let made = CreateBuilder::new()
-            .with_log_store(self.log_store(table)?)
-            .with_table_name(table.name())
-            .with_columns(delta_columns(&table.schema(&self.rig)))
-            .with_save_mode(SaveMode::Ignore)
-            .await;
-        match made {
-            Ok(_) => Ok(()),
-            // Somebody else made it at the same moment.
-            Err(_) if self.load(table).await?.is_some() => Ok(()),
-            Err(e) => Err(Error::log(table.name(), "written", e)),
-        }
+        let now_millis = Utc::now().timestamp_millis();
+        let metadata = TableMetadata {
+            id: Uuid::new_v4().to_string(),
+            name: Some(table.name().to_owned()),
+            description: None,
+            format: FileFormat { provider: "parquet".to_owned(), options: actions::TextMap::new() },
+            schema_string: delta_schema(&table.schema(&self.rig)).to_string(),
+            partition_columns: Vec::new(),
+            configuration: actions::TextMap::new(),
+            created_time: Some(now_millis),
+        };
+        let lines = [
+            commit_info("CREATE TABLE", json!({ "mode": "ErrorIfExists" }), now_millis),
+            LogLine { protocol: Some(own_protocol()), ..LogLine::default() },
+            LogLine { meta_data: Some(metadata), ..LogLine::default() },
+        ];
+        // If the number is taken, somebody else made the table at the same moment.
+        self.log_folder(table).write_commit(0, &lines).await.map(drop)
     }
 
     async fn files(&self, table: Table) -> Result<Vec<DataFile>> {
         match self.load(table).await? {
-            Some(delta) => files_of(table, &delta).await,
+            Some(state) => data_files(table, &state),
             None => Ok(Vec::new()),
         }
     }
 
     async fn version(&self, table: Table) -> Result<Option<u64>> {
-        Ok(self.load(table).await?.and_then(|delta| delta.version()))
+        Ok(self.load(table).await?.map(|state| state.version))
     }
 
     async fn has_after(&self, table: Table, version: u64) -> Result<bool> {
-        let next = folder(table).join("_delta_log").join(commit_name(version + 1));
-        match self.store.head(&next).await {
-            Ok(_) => Ok(true),
-            Err(object_store::Error::NotFound { .. }) => Ok(false),
-            Err(e) => Err(Error::store("read", next, e)),
-        }
+        self.log_folder(table).has_version(version + 1).await
     }
 
     async fn versions(&self, table: Table) -> Result<Vec<TableVersion>> {
@@ -233,43 +207,34 @@ impl CommitLog for DeltaLog {
     }
 
     async fn files_at(&self, table: Table, version: u64) -> Result<Vec<DataFile>> {
-        let mut delta = DeltaTable::new(self.log_store(table)?);
-        delta.load_version(version).await.map_err(|e| Error::log(table.name(), "read", e))?;
-        files_of(table, &delta).await
+        match self.log_folder(table).load(Some(version)).await? {
+            Some(state) => data_files(table, &state),
+            None => Ok(Vec::new()),
+        }
     }
 
     async fn has(&self, table: Table, name: &str) -> Result<bool> {
-        match self.load(table).await? {
-            Some(delta) => Ok(self.names(table, &delta).await?.contains(name)),
-            None => Ok(false),
-        }
+        Ok(self.load(table).await?.is_some_and(|state| file_names(&state).contains(name)))
     }
 
     async fn history(&self, table: Table) -> Result<Option<History>> {
-        let Some(delta) = self.load(table).await? else { return Ok(None) };
-        let mut history = History { current: self.names(table, &delta).await?, ..History::default() };
-        let broken = |e| Error::log(table.name(), "read", e);
-        let log_store = delta.log_store();
-        let mut gone = delta.snapshot().map_err(broken)?.all_tombstones(log_store.as_ref());
-        while let Some(tombstone) = gone.try_next().await.map_err(broken)? {
-            let at = tombstone.deletion_timestamp().and_then(DateTime::from_timestamp_millis);
-            let known = history.removed.entry(tombstone.path().into_owned()).or_default();
-            *known = at.unwrap_or_default().max(*known);
-        }
-        Ok(Some(history))
+        let Some(state) = self.load(table).await? else { return Ok(None) };
+        let removed = state.removed.values().map(|remove| {
+            let at = remove.deletion_timestamp.and_then(DateTime::from_timestamp_millis);
+            (file_name(&remove.path), at.unwrap_or_default())
+        });
+        Ok(Some(History { current: file_names(&state), removed: removed.collect() }))
     }
 
     async fn commit(&self, table: Table, commit: &Commit) -> Result<Vec<Committed>> {
         for _ in 0..COMMIT_TRIES {
-            let delta = self.require(table).await?;
-            let change = Change::of(commit, self.names(table, &delta).await?);
+            let state = self.require(table).await?;
+            let change = Change::of(commit, file_names(&state));
             if change.add.is_empty() && change.remove.is_empty() {
                 return Ok(change.outcomes);
             }
-            match self.try_commit(&delta, &change).await {
-                Ok(()) => return Ok(change.outcomes),
-                Err(e) if is_conflict(&e) => {}
-                Err(e) => return Err(Error::log(table.name(), "written", e)),
+            if self.try_commit(table, &state, &change).await? == CommitAttempt::Written {
+                return Ok(change.outcomes);
             }
         }
         let reason = format!("{COMMIT_TRIES} tries lost to other writers; hint: run the command again");
@@ -277,107 +242,109 @@ impl CommitLog for DeltaLog {
     }
 }
 
-async fn files_of(table: Table, delta: &DeltaTable) -> Result<Vec<DataFile>> {
-    let broken = |e| Error::log(table.name(), "read", e);
-    let state = delta.snapshot().map_err(broken)?;
-    let log_store = delta.log_store();
-    let views = state.snapshot().file_views(log_store.as_ref(), None);
-    let views: Vec<_> = views.try_collect().await.map_err(broken)?;
-    let mut files = Vec::with_capacity(views.len());
-    for view in views {
-        files.push(DataFile {
-            path: folder(table).join(view.path().as_ref()),
-            bytes: u64::try_from(view.size()).unwrap_or(0),
-            rows: view.num_records().unwrap_or(0) as u64,
-            modified: view.modification_datetime().unwrap_or(DateTime::UNIX_EPOCH),
-            stats: view.stats().as_deref().and_then(parse_stats),
-            parts: if is_merged(&view.path()) { parts(table, &view)? } else { Vec::new() },
-            hidden: Vec::new(),
-        });
-    }
+fn data_files(table: Table, state: &TableState) -> Result<Vec<DataFile>> {
+    let mut files = state.files.values().map(|add| data_file(table, add)).collect::<Result<Vec<_>>>()?;
     files.sort_by(|a, b| a.path.cmp(&b.path));
     Ok(files)
 }
 
-fn is_conflict(error: &DeltaTableError) -> bool {
-    match error {
-        DeltaTableError::VersionAlreadyExists(_) => true,
-        DeltaTableError::Transaction { source } => match source {
-            TransactionError::CommitConflict(conflict) => matches!(
-                conflict,
-                CommitConflictError::ConcurrentAppend
-                    | CommitConflictError::ConcurrentDeleteRead
-                    | CommitConflictError::ConcurrentDeleteDelete
-                    | CommitConflictError::ConcurrentTransaction
-            ),
-            TransactionError::VersionAlreadyExists(_) | TransactionError::MaxCommitAttempts(_) => true,
-            _ => false,
-        },
-        _ => false,
-    }
+fn data_file(table: Table, add: &AddFile) -> Result<DataFile> {
+    let name = file_name(&add.path);
+    let stats = add.stats.as_deref().and_then(|json| serde_json::from_str::<Map<String, Value>>(json).ok());
+    let rows = stats.as_ref().and_then(|stats| stats.get("numRecords")?.as_u64());
+    Ok(DataFile {
+        bytes: u64::try_from(add.size).unwrap_or(0),
+        rows: rows.unwrap_or(0),
+        modified: DateTime::from_timestamp_millis(add.modification_time).unwrap_or(DateTime::UNIX_EPOCH),
+        stats: stats.map(file_stats),
+        parts: if is_merged(&name) { parts(table, add)? } else { Vec::new() },
+        hidden: Vec::new(),
+        path: folder(table).join(name),
+    })
 }
 
-// The view has no other way to a file's tags.
-#[expect(deprecated)]
-fn parts(table: Table, view: &LogicalFileView) -> Result<Vec<Part>> {
-    let tags = view.add_action().tags.unwrap_or_default();
-    let text = tags.get(PARTS).cloned().flatten();
+fn file_names(state: &TableState) -> HashSet<String> {
+    state.files.keys().map(|path| file_name(path)).collect()
+}
+
+/// A file's name of its path in the log.
+fn file_name(path: &str) -> String {
+    percent_decode_str(path).decode_utf8_lossy().into_owned()
+}
+
+fn parts(table: Table, add: &AddFile) -> Result<Vec<Part>> {
+    let text = add.tags.as_ref().and_then(|tags| tags.get(PARTS).cloned().flatten());
     text.and_then(|text| decode_parts(&text)).ok_or_else(|| {
         let reason = format!(
             "`{}` has lost the list of its parts; hint: delete the table's folder, `echolake ingest` makes it anew",
-            view.path()
+            add.path
         );
         Error::Log { table: table.name(), action: "read", reason }
     })
 }
 
-fn add(file: &NewFile, now_millis: i64, effect: Effect) -> Add {
+// Readers of a commit's time take it from its first line.
+fn commit_info(operation: &str, parameters: Value, now_millis: i64) -> LogLine {
+    let info = json!({
+        "timestamp": now_millis,
+        "operation": operation,
+        "operationParameters": parameters,
+        "engineInfo": concat!("echolake/", env!("CARGO_PKG_VERSION")),
+    });
+    LogLine { commit_info: Some(info), ..LogLine::default() }
+}
+
+// Names of ours have no character that Delta would percent-encode.
+fn add_file(file: &NewFile, now_millis: i64, data_change: bool) -> AddFile {
     let parts = (!file.parts.is_empty()).then(|| encode_parts(&file.parts));
-    Add {
+    AddFile {
         path: file.name.clone(),
+        partition_values: actions::TextMap::new(),
         size: i64::try_from(file.bytes).unwrap_or(i64::MAX),
         modification_time: now_millis,
-        data_change: effect == Effect::Rows,
+        data_change,
         stats: Some(file.stats.clone()),
-        tags: parts.map(|parts| HashMap::from([(PARTS.to_owned(), Some(parts))])),
-        ..Add::default()
+        tags: parts.map(|parts| actions::TextMap::from([(PARTS.to_owned(), Some(parts))])),
     }
 }
 
-fn remove(name: &str, now_millis: i64, effect: Effect) -> Remove {
-    let data_change = effect == Effect::Rows;
-    Remove { path: name.to_owned(), data_change, deletion_timestamp: Some(now_millis), ..Remove::default() }
-}
-
-fn parse_stats(json: &str) -> Option<FileStats> {
-    let mut stats: Map<String, Value> = serde_json::from_str(json).ok()?;
+fn file_stats(mut stats: Map<String, Value>) -> FileStats {
     let mut take = |key| match stats.remove(key) {
         Some(Value::Object(values)) => values,
         _ => Map::new(),
     };
-    Some(FileStats { min: take("minValues"), max: take("maxValues") })
+    FileStats { min: take("minValues"), max: take("maxValues") }
 }
 
-fn delta_columns(schema: &SchemaRef) -> Vec<StructField> {
-    schema.fields().iter().map(|f| delta_column(f)).collect()
+fn delta_schema(schema: &SchemaRef) -> Value {
+    let fields: Vec<_> = schema.fields().iter().map(|f| delta_column(f)).collect();
+    json!({ "type": "struct", "fields": fields })
 }
 
-fn delta_column(field: &Field) -> StructField {
-    let metadata = field.metadata().iter().map(|(k, v)| (k.clone(), MetadataValue::String(v.clone())));
-    StructField::new(field.name().clone(), delta_type(field.data_type()), field.is_nullable()).with_metadata(metadata)
+fn delta_column(field: &Field) -> Value {
+    json!({
+        "name": field.name(),
+        "type": delta_type(field.data_type()),
+        "nullable": field.is_nullable(),
+        "metadata": field.metadata(),
+    })
 }
 
 // The types that `echolake_schema::tables` uses; all others would be text to a reader.
-fn delta_type(data_type: &ArrowType) -> DataType {
+fn delta_type(data_type: &ArrowType) -> Value {
     match data_type {
-        ArrowType::Boolean => DataType::BOOLEAN,
-        ArrowType::Int32 => DataType::INTEGER,
-        ArrowType::Int64 => DataType::LONG,
-        ArrowType::Float32 => DataType::FLOAT,
-        ArrowType::Float64 => DataType::DOUBLE,
-        ArrowType::Timestamp(..) => DataType::TIMESTAMP,
-        ArrowType::List(child) => ArrayType::new(delta_type(child.data_type()), child.is_nullable()).into(),
-        _ => DataType::STRING,
+        ArrowType::Boolean => json!("boolean"),
+        ArrowType::Int32 => json!("integer"),
+        ArrowType::Int64 => json!("long"),
+        ArrowType::Float32 => json!("float"),
+        ArrowType::Float64 => json!("double"),
+        ArrowType::Timestamp(..) => json!("timestamp"),
+        ArrowType::List(child) => json!({
+            "type": "array",
+            "elementType": delta_type(child.data_type()),
+            "containsNull": child.is_nullable(),
+        }),
+        _ => json!("string"),
     }
 }
 

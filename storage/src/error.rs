@@ -1,7 +1,5 @@
 //! What can go wrong with a lake.
 
-use deltalake_core::DeltaTableError;
-
 /// What a lake could not do, by what the caller can do about it.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
@@ -80,7 +78,7 @@ pub enum Error {
         table: &'static str,
         /// What was tried.
         action: &'static str,
-        /// Delta's own words.
+        /// What is wrong with it.
         reason: String,
     },
     /// Rows could not be encoded.
@@ -153,15 +151,6 @@ pub struct StoreError(pub object_store::Error);
 impl Error {
     pub(crate) fn store(action: &'static str, path: impl ToString, source: object_store::Error) -> Self {
         Self::Store { action, path: path.to_string(), cause: StoreError(source) }
-    }
-
-    pub(crate) fn log(table: &'static str, action: &'static str, source: DeltaTableError) -> Self {
-        match source {
-            DeltaTableError::ObjectStore { source } => {
-                Self::store(action, format!("tables/{table}/_delta_log"), source)
-            }
-            other => Self::Log { table, action, reason: other.to_string() },
-        }
     }
 }
 

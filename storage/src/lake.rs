@@ -81,7 +81,7 @@ impl Lake {
         rig: &Rig,
         references: &References,
     ) -> Result<Self> {
-        Self::open_or_create_at(Location::store(name, store)?, rig, references).await
+        Self::open_or_create_at(Location::store(name, store), rig, references).await
     }
 
     async fn open_or_create_at(location: Location, rig: &Rig, references: &References) -> Result<Self> {
@@ -98,8 +98,7 @@ impl Lake {
 
     fn assemble(location: Location, config: LakeConfig) -> Result<Self> {
         let grid = config.rig.grid()?;
-        let log =
-            DeltaLog::new(location.url.clone(), location.root.clone(), location.store.clone(), config.rig.clone());
+        let log = DeltaLog::new(location.store.clone(), config.rig.clone());
         Ok(Self(Arc::new(Inner { location, config, grid, log })))
     }
 

@@ -17,12 +17,8 @@ use crate::{Error, Result};
 pub(crate) struct Location {
     /// As the user wrote it.
     pub(crate) text: String,
-    /// As a URL with a slash at its end.
-    pub(crate) url: Url,
     /// The folder, where it is one.
     pub(crate) folder: Option<PathBuf>,
-    /// Everything that the URL's scheme reaches.
-    pub(crate) root: Arc<dyn ObjectStore>,
     /// The lake alone.
     pub(crate) store: Arc<dyn ObjectStore>,
 }
@@ -39,16 +35,14 @@ impl Location {
         let url = Url::parse(text).map_err(|e| wrong(&e.to_string()))?;
         match url.scheme() {
             "file" => Self::folder(text, &url.to_file_path().map_err(|()| wrong("it names no local folder"))?),
-            "memory" => Self::store(text, Arc::new(InMemory::new())),
+            "memory" => Ok(Self::store(text, Arc::new(InMemory::new()))),
             scheme => Err(wrong(&format!("this build does not reach `{scheme}://`"))),
         }
     }
 
     /// A store that holds nothing but the lake.
-    pub(crate) fn store(text: &str, store: Arc<dyn ObjectStore>) -> Result<Self> {
-        let wrong = |e: url::ParseError| Error::Location { location: text.to_owned(), reason: e.to_string() };
-        let url = Url::parse("memory:///").map_err(wrong)?;
-        Ok(Self { text: text.to_owned(), url, folder: None, root: store.clone(), store })
+    pub(crate) fn store(text: &str, store: Arc<dyn ObjectStore>) -> Self {
+        Self { text: text.to_owned(), folder: None, store }
     }
 
     fn folder(text: &str, path: &Path) -> Result<Self> {
@@ -57,11 +51,9 @@ impl Location {
         if absolute.exists() && !absolute.is_dir() {
             return Err(wrong("it is a file".to_owned()));
         }
-        let url = Url::from_directory_path(&absolute).map_err(|()| wrong("it makes no URL".to_owned()))?;
         let prefix = ObjectPath::from_absolute_path(&absolute).map_err(|e| wrong(e.to_string()))?;
-        let root: Arc<dyn ObjectStore> = Arc::new(DurableFileSystem::new());
-        let store = Arc::new(PrefixStore::new(root.clone(), prefix));
-        Ok(Self { text: text.to_owned(), url, folder: Some(absolute), root, store })
+        let store = Arc::new(PrefixStore::new(DurableFileSystem::new(), prefix));
+        Ok(Self { text: text.to_owned(), folder: Some(absolute), store })
     }
 }
 
@@ -81,7 +73,8 @@ mod tests {
     fn folders_and_file_urls_are_the_same() {
         let folder = tempfile::tempdir().expect("a folder");
         let plain = Location::parse(&folder.path().display().to_string()).expect("a folder");
-        let url = Location::parse(plain.url.as_str()).expect("its URL");
+        let url = Url::from_directory_path(folder.path()).expect("its URL");
+        let url = Location::parse(url.as_str()).expect("a folder");
         assert_eq!(plain.folder, url.folder);
     }
 }

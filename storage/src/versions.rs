@@ -15,7 +15,7 @@ use serde_json::Value;
 use crate::delta::folder;
 use crate::{Error, Lake, Result, Snapshot};
 
-/// Bytes of a commit that are read for its time, which delta-rs writes first.
+/// Bytes of a commit that are read for its time, which writers put first.
 const COMMIT_HEAD: u64 = 4096;
 /// Formats of times beside RFC 3339.
 const TIMES: [&str; 4] = ["%Y-%m-%dT%H:%M:%S%.f", "%Y-%m-%d %H:%M:%S%.f", "%Y-%m-%dT%H:%M", "%Y-%m-%d %H:%M"];
@@ -139,8 +139,11 @@ fn no_moment(moment: Moment, versions: &[TableVersion]) -> Error {
 pub(crate) async fn listed(store: &dyn ObjectStore, table: Table) -> Result<Vec<TableVersion>> {
     let folder = folder(table).join("_delta_log");
     let there = store.list_with_delimiter(Some(&folder)).await.map_err(|e| Error::store("list", &folder, e))?;
-    let mut commits: Vec<_> =
-        there.objects.into_iter().filter_map(|o| Some((number(&o.location)?, o.location, o.last_modified))).collect();
+    let mut commits: Vec<_> = there
+        .objects
+        .into_iter()
+        .filter_map(|o| Some((commit_number(&o.location)?, o.location, o.last_modified)))
+        .collect();
     commits.sort_by_key(|c| c.0);
     let times = futures::stream::iter(commits).map(|(version, path, modified)| async move {
         Ok::<_, Error>((version, commit_time(store, &path).await?.unwrap_or(modified)))
@@ -159,7 +162,8 @@ pub(crate) fn commit_name(version: u64) -> String {
     format!("{version:020}.json")
 }
 
-fn number(path: &Path) -> Option<u64> {
+/// The version of a commit's file; None if it is none.
+pub(crate) fn commit_number(path: &Path) -> Option<u64> {
     let digits = path.filename()?.strip_suffix(".json")?;
     (digits.len() == 20).then(|| digits.parse().ok()).flatten()
 }
@@ -214,10 +218,10 @@ mod tests {
 
     #[test]
     fn commits_are_told_from_checkpoints() {
-        let check = |name: &str, expected| assert_eq!(number(&Path::from(name)), expected, "{name}");
+        let check = |name: &str, expected| assert_eq!(commit_number(&Path::from(name)), expected, "{name}");
         check("tables/runs/_delta_log/00000000000000000012.json", Some(12));
         check("tables/runs/_delta_log/00000000000000000010.checkpoint.parquet", None);
         check("tables/runs/_delta_log/_commits/x.json", None);
-        assert_eq!(number(&Path::from(commit_name(7))), Some(7));
+        assert_eq!(commit_number(&Path::from(commit_name(7))), Some(7));
     }
 }

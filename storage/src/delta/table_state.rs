@@ -1,0 +1,117 @@
+//! A table as its log tells it up to a version: the actions, reconciled.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+
+use super::actions::{AddFile, ApplicationTransaction, LogLine, ProtocolVersions, RemoveFile, TableMetadata};
+
+/// How long a checkpoint keeps a removed file's tombstone: Delta's default, a week.
+const TOMBSTONE_MILLIS: i64 = 7 * 24 * 3600 * 1000;
+
+/// What the log tells of a table up to a version. Files are by their paths as the log spells them.
+#[derive(Debug, Clone, Default)]
+pub(super) struct TableState {
+    /// The newest version that was applied.
+    pub(super) version: u64,
+    pub(super) protocol: Option<ProtocolVersions>,
+    pub(super) metadata: Option<TableMetadata>,
+    pub(super) files: BTreeMap<String, Arc<AddFile>>,
+    pub(super) removed: BTreeMap<String, Arc<RemoveFile>>,
+    transactions: BTreeMap<String, ApplicationTransaction>,
+}
+
+impl TableState {
+    /// Applies the actions of a version, or of a checkpoint.
+    pub(super) fn apply(&mut self, version: u64, lines: Vec<LogLine>) {
+        self.version = version;
+        for line in lines {
+            self.apply_line(line);
+        }
+    }
+
+    fn apply_line(&mut self, line: LogLine) {
+        if let Some(add) = line.add {
+            self.removed.remove(&add.path);
+            self.files.insert(add.path.clone(), Arc::new(add));
+        }
+        if let Some(remove) = line.remove {
+            self.files.remove(&remove.path);
+            self.removed.insert(remove.path.clone(), Arc::new(remove));
+        }
+        if let Some(transaction) = line.txn {
+            self.transactions.insert(transaction.app_id.clone(), transaction);
+        }
+        self.protocol = line.protocol.or(self.protocol.take());
+        self.metadata = line.meta_data.or(self.metadata.take());
+    }
+
+    /// The rows of a checkpoint of this version.
+    pub(super) fn checkpoint_lines(&self, now_millis: i64) -> Vec<LogLine> {
+        let line = LogLine::default;
+        let header = [
+            LogLine { protocol: self.protocol.clone(), ..line() },
+            LogLine { meta_data: self.metadata.clone(), ..line() },
+        ];
+        let transactions = self.transactions.values().map(|txn| LogLine { txn: Some(txn.clone()), ..line() });
+        let added = self.files.values().map(|add| {
+            let add = AddFile { data_change: false, ..add.as_ref().clone() };
+            LogLine { add: Some(add), ..line() }
+        });
+        let kept = self
+            .removed
+            .values()
+            .filter(|r| r.deletion_timestamp.is_some_and(|at| now_millis.saturating_sub(at) < TOMBSTONE_MILLIS));
+        let removed = kept.map(|remove| {
+            let remove = RemoveFile { data_change: false, ..remove.as_ref().clone() };
+            LogLine { remove: Some(remove), ..line() }
+        });
+        header.into_iter().chain(transactions).chain(added).chain(removed).collect()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn line(json: &str) -> LogLine {
+        serde_json::from_str(json).expect("a line")
+    }
+
+    #[test]
+    fn later_actions_win_and_a_checkpoint_says_the_same() {
+        let mut state = TableState::default();
+        state.apply(
+            0,
+            vec![
+                line(r#"{"commitInfo":{"timestamp":1}}"#),
+                line(r#"{"protocol":{"minReaderVersion":1,"minWriterVersion":2}}"#),
+                line(r#"{"metaData":{"id":"x","format":{"provider":"parquet","options":{}},"schemaString":"{}"}}"#),
+                line(r#"{"add":{"path":"a","partitionValues":{},"size":1,"modificationTime":1,"dataChange":true}}"#),
+                line(r#"{"add":{"path":"b","partitionValues":{},"size":2,"modificationTime":1,"dataChange":true}}"#),
+            ],
+        );
+        state.apply(
+            1,
+            vec![
+                line(r#"{"remove":{"path":"a","deletionTimestamp":1000,"dataChange":true}}"#),
+                line(r#"{"remove":{"path":"b","deletionTimestamp":1000,"dataChange":true}}"#),
+                line(r#"{"txn":{"appId":"spark","version":7}}"#),
+                line(r#"{"unknown":{"to":"this version"}}"#),
+            ],
+        );
+        let again = r#"{"add":{"path":"b","partitionValues":{},"size":3,"modificationTime":2,"dataChange":true}}"#;
+        state.apply(2, vec![line(again)]);
+        let check = |state: &TableState, removed: &[&str]| {
+            assert_eq!(state.files.values().map(|f| (f.path.as_str(), f.size)).collect::<Vec<_>>(), [("b", 3)]);
+            assert_eq!(state.removed.keys().map(String::as_str).collect::<Vec<_>>(), removed);
+            assert_eq!(state.transactions["spark"].version, 7);
+            assert!(state.protocol.is_some() && state.metadata.is_some());
+        };
+        check(&state, &["a"]);
+        for (now, removed) in [(1000 + TOMBSTONE_MILLIS - 1, &["a"][..]), (1000 + TOMBSTONE_MILLIS, &[])] {
+            let mut from_checkpoint = TableState::default();
+            from_checkpoint.apply(2, state.checkpoint_lines(now));
+            check(&from_checkpoint, removed);
+        }
+    }
+}
