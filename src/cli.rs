@@ -265,13 +265,3 @@ pub(crate) struct VacuumArgs {
     #[arg(long)]
     pub(crate) json: bool,
 }
-
-#[cfg(test)]
-mod tests {
-    use clap::CommandFactory as _;
-
-    #[test]
-    fn the_arguments_are_consistent() {
-        super::Cli::command().debug_assert();
-    }
-}

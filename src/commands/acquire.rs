@@ -52,6 +52,8 @@ pub(crate) async fn run(args: &AcquireArgs, lake_url: &str) -> anyhow::Result<Do
     // What can be refused is refused before anything is made for it.
     let influx = args.influx.as_deref().map(str::parse::<Target>).transpose()?;
     let pace = if args.pace > 0.0 { Pace::Secs(args.pace) } else { Pace::Fast };
+    let control = Arc::new(Control::default());
+    watch::obey(&control)?;
     let progress = Progress::new();
     let job = match &args.resume {
         Some(partial) => Job::Resumed { partial: partial.clone(), held: Box::new(Held::read(partial)?) },
@@ -75,8 +77,6 @@ pub(crate) async fn run(args: &AcquireArgs, lake_url: &str) -> anyhow::Result<Do
     let pushed = influx.map(|target| {
         InfluxPush::start(target, metrics.clone(), TOLD_EVERY, |e| eprintln!("warning: metrics were not taken: {e}"))
     });
-    let control = Arc::new(Control::default());
-    watch::obey(&control);
     let mut watcher = Watcher::new(&progress, &surface, planned, accepted, metrics.clone(), job.folder());
     let preflight = if args.skip_checks { Preflight::Skip } else { Preflight::Check };
     let (checkpoint_every, tap) = (args.checkpoint_every.map(|n| n as usize), live.as_ref().map(LiveServer::tap));

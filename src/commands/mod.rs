@@ -15,8 +15,6 @@ pub(crate) mod sql;
 mod vacuum;
 
 use std::path::Path;
-use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
 
 use anyhow::Context as _;
 use clap::CommandFactory as _;
@@ -25,6 +23,7 @@ use echolake_schema::Rig;
 
 use crate::Done;
 use crate::cli::{Cli, Command};
+use crate::signals::StopRequest;
 
 /// Runs the command's verb.
 pub(crate) async fn run(cli: Cli) -> anyhow::Result<Done> {
@@ -93,18 +92,7 @@ fn inbox(lake: &Lake) -> anyhow::Result<std::path::PathBuf> {
     Ok(folder)
 }
 
-/// Becomes true at the first Ctrl-C, so that work ends at a clean place; the second one ends at once.
-fn stop_on_interrupt() -> Arc<AtomicBool> {
-    let stop = Arc::new(AtomicBool::new(false));
-    let flag = stop.clone();
-    tokio::spawn(async move {
-        if tokio::signal::ctrl_c().await.is_ok() {
-            flag.store(true, Ordering::Relaxed);
-            eprintln!("stopping at the next clean place; Ctrl-C again stops at once");
-        }
-        if tokio::signal::ctrl_c().await.is_ok() {
-            std::process::exit(130);
-        }
-    });
-    stop
+/// Listens for a request to stop work that ends at a clean place.
+fn stop_request() -> anyhow::Result<StopRequest> {
+    StopRequest::listen("stopping at the next clean place; Ctrl-C again stops at once")
 }

@@ -1,7 +1,6 @@
 //! `echolake replay`: runs shown again to Foxglove, as fast and from where its user likes.
 
 use std::path::{Path, PathBuf};
-use std::sync::atomic::Ordering;
 use std::time::Duration;
 
 use anyhow::Context as _;
@@ -19,8 +18,8 @@ const LOOK_EVERY: Duration = Duration::from_millis(200);
 const LISTED: usize = 20;
 
 pub(crate) async fn run(args: &ReplayArgs, lake_url: &str) -> anyhow::Result<Done> {
+    let stop = super::stop_request()?;
     let paths = paths(&args.runs, lake_url).await?;
-    let stop = super::stop_on_interrupt();
     let progress = Progress::new();
     let (recordings, lost) = tokio::task::block_in_place(|| open(&paths, &progress));
     anyhow::ensure!(!recordings.is_empty(), "none of the recordings can be replayed");
@@ -34,8 +33,9 @@ pub(crate) async fn run(args: &ReplayArgs, lake_url: &str) -> anyhow::Result<Don
     }
     let mut task = progress.task("replay", server.length_secs().ceil() as u64, "s");
     let mut said = 0;
-    while !stop.load(Ordering::Relaxed) {
-        tokio::time::sleep(LOOK_EVERY).await;
+    while !stop.is_made() {
+        // The time that runs out is the usual end of this wait.
+        let _ = tokio::time::timeout(LOOK_EVERY, stop.wait()).await;
         let standing = server.standing();
         show(&mut task, &standing, &mut said);
     }
