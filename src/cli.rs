@@ -65,6 +65,12 @@ pub(crate) enum Command {
         /// The shell.
         shell: clap_complete::Shell,
     },
+    /// Write the man pages, one for each command.
+    #[command(hide = true)]
+    Man {
+        /// The folder they go to.
+        folder: PathBuf,
+    },
 }
 
 #[derive(Debug, Args)]
@@ -237,6 +243,9 @@ pub(crate) struct IngestArgs {
 
 #[derive(Debug, Args)]
 pub(crate) struct DoctorArgs {
+    /// Report what this installation can do instead: pages, audio, formats, disk, ports. The lake's data are not read.
+    #[arg(long = "self")]
+    pub(crate) installation: bool,
     /// Print the report as JSON.
     #[arg(long)]
     pub(crate) json: bool,

@@ -5,6 +5,7 @@ mod bad_input;
 mod end_to_end;
 mod forgetful;
 mod fuzz;
+mod installation;
 mod kills;
 mod load;
 mod maintenance;

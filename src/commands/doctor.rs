@@ -1,5 +1,7 @@
 //! `echolake doctor`: what is in the lake, what is missing and what is damaged.
 
+mod installation;
+
 use std::fmt::Write as _;
 
 use echolake_ingest::doctor::{Finding, Report, Severity, examine};
@@ -10,6 +12,9 @@ use crate::cli::DoctorArgs;
 use crate::progress::Progress;
 
 pub(crate) async fn run(args: &DoctorArgs, lake_url: &str) -> anyhow::Result<Done> {
+    if args.installation {
+        return installation::run(args.json, lake_url).await;
+    }
     let lake = Lake::open(lake_url).await?;
     let progress = Progress::new();
     let mut task = None;

@@ -48,6 +48,12 @@ pub(crate) async fn run(cli: Cli) -> anyhow::Result<Done> {
             clap_complete::generate(*shell, &mut Cli::command(), "echolake", &mut std::io::stdout());
             Ok(Done::Whole)
         }
+        Command::Man { folder } => {
+            let written =
+                std::fs::create_dir_all(folder).and_then(|()| clap_mangen::generate_to(Cli::command(), folder));
+            written.with_context(|| format!("cannot write man pages to `{}`", folder.display()))?;
+            Ok(Done::Whole)
+        }
     }
 }
 
