@@ -1,5 +1,6 @@
-//! Builds the catalogue's pages and lists them for `src/http/pages.rs`, so that a build of the program is whole. It works
-//! in a copy below the target folder, which keeps the checkout clean, and does nothing where no source of theirs changed.
+//! Embeds the catalogue's pages: lists their files for `src/http/pages.rs`. Pages that come with the sources, as in the
+//! archive of a release, are taken as they are. Else npm builds them in a copy below the target folder, which keeps the
+//! checkout clean. Without Node the program is built without pages, and says so.
 #![allow(clippy::print_stdout, reason = "that is how a build script speaks to cargo")]
 
 use std::env;
@@ -21,9 +22,16 @@ const SOURCES: [&str; 8] = [
     "tsconfig.json",
     "vite.config.ts",
 ];
+/// Built pages in `web/` of a source archive; a checkout has none.
+const PREBUILT: &str = "prebuilt";
+/// What `engines` in `web/package.json` asks for.
+const NODE: &str = "Node 20.19 (or 22.12) or newer with npm";
+/// If one of these is set, a build without pages is an error: its tests would skip the pages.
+const STRICT: [&str; 2] = ["ECHOLAKE_NO_SKIP", "CI"];
 /// What was installed for; the packages are installed anew where it changes.
 const LOCK: &str = "package-lock.json";
 const INSTALLED: &str = "installed.json";
+const NPM: &str = if cfg!(windows) { "npm.cmd" } else { "npm" };
 const TYPES: [(&str, &str); 8] = [
     ("html", "text/html; charset=utf-8"),
     ("js", "text/javascript; charset=utf-8"),
@@ -37,37 +45,92 @@ const TYPES: [(&str, &str); 8] = [
 
 fn main() -> ExitCode {
     println!("cargo::rerun-if-changed=build.rs");
+    println!("cargo::rustc-check-cfg=cfg(pages_not_built)");
     if env::var_os("CARGO_FEATURE_WEB").is_none() {
         return ExitCode::SUCCESS;
     }
-    match pages() {
+    match embed_pages() {
         Ok(()) => ExitCode::SUCCESS,
         Err(why) => {
             println!("cargo::error=the catalogue's pages cannot be built: {why}");
-            println!(
-                "cargo::error=hint: they need Node 20.19 or newer with npm; --no-default-features leaves them out"
-            );
+            println!("cargo::error=hint: they need {NODE}; --no-default-features leaves them out");
             ExitCode::FAILURE
         }
     }
 }
 
-fn pages() -> Result<(), String> {
+fn embed_pages() -> Result<(), String> {
     let web = variable("CARGO_MANIFEST_DIR")?.join("../web");
     let out = variable("OUT_DIR")?;
-    let copy = out.join("web");
+    let prebuilt = web.join(PREBUILT);
+    if prebuilt.is_dir() {
+        println!("cargo::rerun-if-changed={}", prebuilt.display());
+        return write_list(&prebuilt, &out);
+    }
     for source in SOURCES {
         println!("cargo::rerun-if-changed={}", web.join(source).display());
     }
-    copy_sources(&web, &copy).map_err(|e| format!("their sources cannot be copied to {}: {e}", copy.display()))?;
+    match find_node() {
+        Ok(()) => write_list(&build_pages(&web, &out)?, &out),
+        Err(why) => leave_out_pages(&why),
+    }
+}
+
+fn write_list(pages: &Path, out: &Path) -> Result<(), String> {
+    let list = list(pages).map_err(|e| format!("the pages in {} cannot be listed: {e}", pages.display()))?;
+    fs::write(out.join("pages.rs"), list).map_err(|e| e.to_string())
+}
+
+/// Returns the folder of the built pages.
+fn build_pages(web: &Path, out: &Path) -> Result<PathBuf, String> {
+    let copy = out.join("web");
+    copy_sources(web, &copy).map_err(|e| format!("their sources cannot be copied to {}: {e}", copy.display()))?;
     let lock = fs::read(copy.join(LOCK)).map_err(|e| format!("there is no {LOCK}: {e}"))?;
     if fs::read(copy.join(INSTALLED)).ok().as_ref() != Some(&lock) {
         npm(&copy, &["ci", "--no-audit", "--no-fund"])?;
         fs::write(copy.join(INSTALLED), &lock).map_err(|e| e.to_string())?;
     }
     npm(&copy, &["run", "build"])?;
-    let list = list(&copy.join("dist")).map_err(|e| format!("what was built cannot be listed: {e}"))?;
-    fs::write(out.join("pages.rs"), list).map_err(|e| e.to_string())
+    Ok(copy.join("dist"))
+}
+
+/// Checks that npm is there and Node is new enough; the error says what was found.
+fn find_node() -> Result<(), String> {
+    let version = output_of("node", &["--version"])?;
+    let mut numbers =
+        version.trim().trim_start_matches('v').split('.').map(|number| number.parse::<u32>().unwrap_or(0));
+    let major = numbers.next().unwrap_or(0);
+    let minor = numbers.next().unwrap_or(0);
+    if !matches!((major, minor), (20, 19..) | (22, 12..) | (23.., _)) {
+        return Err(format!("Node is {}", version.trim()));
+    }
+    output_of(NPM, &["--version"]).map(drop)
+}
+
+fn output_of(program: &str, args: &[&str]) -> Result<String, String> {
+    let output = Command::new(program).args(args).output().map_err(|e| format!("`{program}` does not start: {e}"))?;
+    let failed = || format!("`{program} {}` ended with {}", args.join(" "), output.status);
+    output.status.success().then(|| String::from_utf8_lossy(&output.stdout).into_owned()).ok_or_else(failed)
+}
+
+/// Builds the program without pages; it tells its users how to get them.
+fn leave_out_pages(why: &str) -> Result<(), String> {
+    for name in STRICT {
+        println!("cargo::rerun-if-env-changed={name}");
+    }
+    if let Some(name) = STRICT.into_iter().find(|name| env::var_os(name).is_some()) {
+        return Err(format!("{why}, and ${name} is set"));
+    }
+    // Once Node is installed, the next build finds it: its folder has changed.
+    let folders = env::var_os("PATH").map(|path| env::split_paths(&path).collect::<Vec<_>>()).unwrap_or_default();
+    println!("cargo::rerun-if-env-changed=PATH");
+    for folder in folders.iter().filter(|folder| folder.is_dir()) {
+        println!("cargo::rerun-if-changed={}", folder.display());
+    }
+    println!("cargo::rustc-cfg=pages_not_built");
+    println!("cargo::warning=built without the catalogue's pages: {why}");
+    println!("cargo::warning=hint: install {NODE} and build again, or `pip install echolake`");
+    Ok(())
 }
 
 fn variable(name: &str) -> Result<PathBuf, String> {
@@ -100,8 +163,7 @@ fn copy_all(from: &Path, to: &Path) -> io::Result<()> {
 }
 
 fn npm(folder: &Path, args: &[&str]) -> Result<(), String> {
-    let name = if cfg!(windows) { "npm.cmd" } else { "npm" };
-    let output = Command::new(name).args(args).current_dir(folder).output().map_err(|e| format!("npm: {e}"))?;
+    let output = Command::new(NPM).args(args).current_dir(folder).output().map_err(|e| format!("npm: {e}"))?;
     if output.status.success() {
         return Ok(());
     }

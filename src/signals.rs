@@ -48,6 +48,7 @@ impl StopRequest {
     }
 
     /// Becomes true with the request, for work on threads that look at it now and then.
+    #[cfg(feature = "lake")]
     pub(crate) fn flag(&self) -> &Arc<AtomicBool> {
         &self.flag
     }

@@ -6,6 +6,7 @@ mod child;
 mod end_to_end;
 mod forgetful;
 mod fuzz;
+mod installation;
 mod kills;
 mod load;
 mod maintenance;

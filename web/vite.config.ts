@@ -10,11 +10,28 @@ const TEXT = /\.(html|js|css|svg|txt|json)$/
 /** Smaller files fit a packet. */
 const WORTH_PACKING = 1000
 
+/** Licences of all packages that are part of the pages, and served with them. */
+const LICENCES = 'licences.json'
+
+/** Fonts and styles are no modules, so Vite's list of licences leaves their packages out. */
+async function withFontLicences(path: string) {
+  const listed: { name: string }[] = JSON.parse(await readFile(path, 'utf8'))
+  const { dependencies } = JSON.parse(await readFile('package.json', 'utf8'))
+  for (const name of Object.keys(dependencies).filter(name => !listed.some(entry => entry.name === name))) {
+    const folder = join('node_modules', name)
+    const { version, license: identifier } = JSON.parse(await readFile(join(folder, 'package.json'), 'utf8'))
+    const entry = { name, version, identifier, text: await readFile(join(folder, 'LICENSE'), 'utf8') }
+    listed.push(entry)
+  }
+  await writeFile(path, JSON.stringify(listed, null, 1))
+}
+
 function packed(): Plugin {
   return {
     name: 'packed', apply: 'build',
     async closeBundle() {
       const folder = join(import.meta.dirname, 'dist')
+      await withFontLicences(join(folder, LICENCES))
       for (const name of await readdir(folder, { recursive: true })) {
         if (!TEXT.test(name)) continue
         const bytes = await readFile(join(folder, name))
@@ -28,5 +45,8 @@ function packed(): Plugin {
 
 export default defineConfig({
   plugins: [svelte(), packed()],
-  build: { target: 'es2022', assetsInlineLimit: 0, modulePreload: { polyfill: false }, reportCompressedSize: true, chunkSizeWarningLimit: 900 },
+  build: {
+    target: 'es2022', assetsInlineLimit: 0, modulePreload: { polyfill: false }, reportCompressedSize: true,
+    chunkSizeWarningLimit: 900, license: { fileName: LICENCES },
+  },
 })

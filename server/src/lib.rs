@@ -12,6 +12,7 @@
 //! # }
 //! ```
 
+mod catalogue_pages;
 mod error;
 mod fault;
 mod flight;
@@ -26,5 +27,6 @@ mod service;
 mod sessions;
 pub mod tokens;
 
+pub use catalogue_pages::CataloguePages;
 pub use error::Error;
 pub use serve::{Server, Settings};

@@ -136,13 +136,8 @@ async fn fresh(args: &AcquireArgs, lake_url: &str, progress: &Progress) -> anyho
     let lake = Lake::open_or_create(lake_url, &rig, &References::default()).await?;
     let folder = super::inbox(&lake)?;
     let surface = args.surface.clone().context("no surface is named; hint: --surface NAME")?;
-    // Its references may well come later: its rows wait for them. Whoever measures by mistake without any is told.
-    let snapshot = lake.snapshot().await?;
-    for named in [&args.flat, &args.foam].into_iter().flatten() {
-        if *named != surface && !snapshot.runs().any(|run| run.surface == *named) {
-            progress.say(format!("warning: reference `{named}` is not measured yet; rows of `{surface}` wait for it"));
-        }
-    }
+    #[cfg(feature = "lake")]
+    warn_of_missing_references(args, &lake, &surface, progress).await?;
     for unfinished in unfinished(&folder, surface.as_str()) {
         progress.say(format!(
             "note: `{}` is unfinished; hint: `echolake acquire --resume` goes on with it",
@@ -160,6 +155,23 @@ async fn fresh(args: &AcquireArgs, lake_url: &str, progress: &Progress) -> anyho
         seed: args.seed,
         keep: if args.ir_only { Keep::ResponsesOnly } else { Keep::Sweeps },
     })))
+}
+
+// References may well come later: the rows wait for them. Whoever measures by mistake without any is told.
+#[cfg(feature = "lake")]
+async fn warn_of_missing_references(
+    args: &AcquireArgs,
+    lake: &Lake,
+    surface: &SurfaceId,
+    progress: &Progress,
+) -> anyhow::Result<()> {
+    let snapshot = lake.snapshot().await?;
+    for named in [&args.flat, &args.foam].into_iter().flatten() {
+        if named != surface && !snapshot.runs().any(|run| run.surface == *named) {
+            progress.say(format!("warning: reference `{named}` is not measured yet; rows of `{surface}` wait for it"));
+        }
+    }
+    Ok(())
 }
 
 // Recordings of the surface that were not ended: names of runs have the surface behind their time.

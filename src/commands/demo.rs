@@ -49,7 +49,7 @@ pub(crate) async fn run(args: &DemoArgs, lake_url: &str) -> anyhow::Result<Done>
     tokio::task::spawn_blocking(move || campaign.measure(measuring.flag(), &progress)).await??;
     ensure_wanted(&stop)?;
     if args.no_ingest {
-        eprintln!("the runs are in inbox/. Next:\n  cargo run --release -- {}ingest", lake_flag(lake_url));
+        eprintln!("the runs are in inbox/. Next:\n  {} {}ingest", program(), lake_flag(lake_url));
         return Ok(Done::Whole);
     }
     let sources = pending(&lake).await?;
@@ -88,6 +88,11 @@ async fn rig(file: Option<&Path>, lake_url: &str) -> anyhow::Result<Rig> {
     Ok(rig)
 }
 
+// How to call this program again; cargo sets the variable for what it runs.
+fn program() -> &'static str {
+    if std::env::var_os("CARGO_MANIFEST_DIR").is_some() { "cargo run --release --" } else { "echolake" }
+}
+
 fn lake_flag(lake_url: &str) -> String {
     if lake_url == "lake" { String::new() } else { format!("--lake {lake_url} ") }
 }
@@ -104,7 +109,7 @@ fn print_next(lake_url: &str, example: &str) {
         "ingest",
         "doctor",
     ] {
-        eprintln!("  cargo run --release -- {flag}{next}");
+        eprintln!("  {} {flag}{next}", program());
     }
 }
 

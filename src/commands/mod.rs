@@ -1,17 +1,24 @@
 //! The verbs, a file each.
 
 mod acquire;
+#[cfg(feature = "lake")]
 mod demo;
 mod doctor;
+#[cfg(feature = "lake")]
 pub(crate) mod export;
 mod import;
+#[cfg(feature = "lake")]
 mod ingest;
+#[cfg(feature = "lake")]
 mod optimize;
 pub(crate) mod panel;
 mod recover;
 mod replay;
+#[cfg(feature = "lake")]
 pub(crate) mod serve;
+#[cfg(feature = "lake")]
 pub(crate) mod sql;
+#[cfg(feature = "lake")]
 mod vacuum;
 
 use std::path::Path;
@@ -22,6 +29,8 @@ use echolake_lake::{Error as LakeError, Lake};
 use echolake_schema::Rig;
 
 use crate::Done;
+#[cfg(feature = "lake")]
+use crate::cli::LakeCommand;
 use crate::cli::{Cli, Command};
 use crate::signals::StopRequest;
 
@@ -29,24 +38,39 @@ use crate::signals::StopRequest;
 pub(crate) async fn run(cli: Cli) -> anyhow::Result<Done> {
     let lake = &cli.lake;
     match &cli.command {
-        Command::Demo(args) => demo::run(args, lake).await,
+        #[cfg(feature = "lake")]
+        Command::Lake(command) => run_lake(command, lake).await,
         Command::Acquire(args) => acquire::run(args, lake).await,
         Command::Panel(args) => panel::run(args),
         Command::Import(args) => import::run(args, lake).await,
-        Command::Ingest(args) => ingest::run(args, lake).await,
-        Command::Sql(args) => sql::run(args, lake).await.map(|()| Done::Whole),
-        Command::Export(args) => export::run(args, lake).await,
-        Command::Serve(args) => serve::run(args, lake).await,
         Command::Replay(args) => replay::run(args, lake).await,
-        Command::Token { name } => serve::token(name),
         Command::Recover(args) => recover::run(args),
         Command::Doctor(args) => doctor::run(args, lake).await,
-        Command::Optimize(args) => optimize::run(args, lake).await,
-        Command::Vacuum(args) => vacuum::run(args, lake).await,
         Command::Completions { shell } => {
             clap_complete::generate(*shell, &mut Cli::command(), "echolake", &mut std::io::stdout());
             Ok(Done::Whole)
         }
+        Command::Man { folder } => {
+            let written =
+                std::fs::create_dir_all(folder).and_then(|()| clap_mangen::generate_to(Cli::command(), folder));
+            written.with_context(|| format!("cannot write man pages to `{}`", folder.display()))?;
+            Ok(Done::Whole)
+        }
+    }
+}
+
+/// Runs a verb that needs the lake's tables.
+#[cfg(feature = "lake")]
+async fn run_lake(command: &LakeCommand, lake: &str) -> anyhow::Result<Done> {
+    match command {
+        LakeCommand::Demo(args) => demo::run(args, lake).await,
+        LakeCommand::Ingest(args) => ingest::run(args, lake).await,
+        LakeCommand::Sql(args) => sql::run(args, lake).await.map(|()| Done::Whole),
+        LakeCommand::Export(args) => export::run(args, lake).await,
+        LakeCommand::Serve(args) => serve::run(args, lake).await,
+        LakeCommand::Token { name } => serve::token(name),
+        LakeCommand::Optimize(args) => optimize::run(args, lake).await,
+        LakeCommand::Vacuum(args) => vacuum::run(args, lake).await,
     }
 }
 

@@ -7,7 +7,7 @@ use std::str::FromStr;
 use echolake_lake::Lake;
 use echolake_query::Limits;
 use echolake_server::tokens::{self, Tokens};
-use echolake_server::{Error, Server, Settings};
+use echolake_server::{CataloguePages, Error, Server, Settings};
 
 use crate::Done;
 use crate::signals::StopRequest;
@@ -106,6 +106,9 @@ fn limits(memory_mib: u32, heavy: u32) -> Limits {
 }
 
 async fn answer(server: Server, stop: &StopRequest) -> anyhow::Result<Done> {
+    if let Some(problem) = CataloguePages::THIS_BUILD.problem() {
+        eprintln!("note: this program was {problem}");
+    }
     for address in server.addresses() {
         eprintln!("  {address}");
     }

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from types import TracebackType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import adbc_driver_flightsql.dbapi as flight_sql
-import pyarrow as pa
+if TYPE_CHECKING:
+    import pyarrow as pa
 
 __all__ = ["Lake", "connect"]
 
@@ -64,5 +64,10 @@ def connect(url: str = "grpc://127.0.0.1:8081", token: str | None = None) -> Lak
     """
     if not url.startswith(("grpc://", "grpc+tls://", "grpc+tcp://", "grpc+unix://")):
         raise ValueError(f"`{url}` is no Flight SQL address; expected grpc://host:port")
+    try:
+        import adbc_driver_flightsql.dbapi as flight_sql
+        import pyarrow  # noqa: F401
+    except ImportError as missing:
+        raise ImportError(f"{missing}; hint: pip install 'echolake[client]'") from missing
     options = {_BEARER: f"Bearer {token}"} if token is not None else {}
     return Lake(flight_sql.connect(url, db_kwargs=options, autocommit=True))

@@ -30,7 +30,17 @@ struct Page {
     brotli: Option<&'static [u8]>,
 }
 
+#[cfg(not(pages_not_built))]
 static PAGES: &[Page] = include!(concat!(env!("OUT_DIR"), "/pages.rs"));
+/// The only page of a program that was built without Node.
+#[cfg(pages_not_built)]
+static PAGES: &[Page] = &[Page {
+    path: INDEX,
+    media_type: "text/html; charset=utf-8",
+    bytes: include_bytes!("pages_not_built.html"),
+    gzip: None,
+    brotli: None,
+}];
 
 /// A page, each with its digest.
 static TAGGED: LazyLock<Vec<(&Page, String)>> = LazyLock::new(|| {
@@ -105,6 +115,12 @@ mod tests {
         for missing in ["/api", "/api/v1/nothing", "/assets/none.js", "/assets", "/favicon.ico", "/a/../b.js"] {
             assert_eq!(path(missing), None, "{missing}");
         }
+    }
+
+    #[cfg(not(pages_not_built))]
+    #[test]
+    fn scripts_are_there_and_packed() {
+        let path = |asked: &str| page(asked).map(|(page, _)| page.path);
         assert_eq!(path("/theme.js"), Some("/theme.js"));
         let script = PAGES.iter().find(|p| p.path.starts_with("/assets/index-") && p.path.ends_with(".js"));
         let script = script.expect("a script");

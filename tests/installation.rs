@@ -1,0 +1,89 @@
+//! What packages need of the command: its report about itself, man pages and completions.
+
+use std::fs;
+
+use serde::Deserialize;
+
+use super::Place;
+
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Report {
+    version: String,
+    commit: Option<String>,
+    program: String,
+    facts: Vec<Fact>,
+}
+
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Fact {
+    name: String,
+    state: String,
+    found: String,
+    hint: Option<String>,
+}
+
+#[test]
+fn doctor_reports_the_installation_and_leaves_nothing_behind() {
+    let place = Place::new();
+    let before = fs::read_dir(place.path("")).expect("a folder").count();
+    let report: Report = serde_json::from_str(&place.ok(&["doctor", "--self", "--json"])).expect("JSON");
+    assert_eq!(report.version, env!("CARGO_PKG_VERSION"));
+    assert!(report.program.ends_with("echolake"), "{}", report.program);
+    assert!(report.commit.is_none_or(|commit| !commit.is_empty()));
+    for fact in &report.facts {
+        assert!(["ok", "note"].contains(&fact.state.as_str()), "{fact:?}");
+        assert!(!fact.found.is_empty(), "{fact:?}");
+        assert_eq!(fact.hint.is_some(), fact.state == "note", "{fact:?}");
+    }
+    let names: Vec<_> = report.facts.iter().map(|fact| fact.name.as_str()).collect();
+    let expected = [
+        "pages",
+        "audio",
+        "formats",
+        "system",
+        "processor",
+        "memory",
+        "lake",
+        "lake's disk",
+        "lake's files",
+        "temporary files",
+        "port 8080",
+        "port 8081",
+        "port 5433",
+    ];
+    assert_eq!(names, expected);
+    let pages = &report.facts[0];
+    let is_remedy_named = pages.hint.as_ref().is_some_and(|hint| hint.contains("pip install echolake"));
+    assert!(pages.state == "ok" || is_remedy_named, "{pages:?}");
+    assert_eq!(fs::read_dir(place.path("")).expect("a folder").count(), before);
+    let text = place.ok(&["doctor", "--self"]);
+    assert!(expected.iter().all(|name| text.contains(name)), "{text}");
+}
+
+#[test]
+fn a_lake_that_cannot_be_is_a_failure() {
+    let place = Place::new();
+    fs::write(place.path("lake"), "no folder").expect("written");
+    let output = place.run(&["doctor", "--self"]);
+    assert_eq!(output.status.code(), Some(1));
+    let said = super::stderr(&output);
+    assert!(said.contains("this installation cannot do its job here: lake"), "{said}");
+    assert!(String::from_utf8_lossy(&output.stdout).contains("it is a file"));
+}
+
+#[test]
+fn packages_get_man_pages_and_completions() {
+    let place = Place::new();
+    place.ok(&["man", "man"]);
+    for (page, expected) in
+        [("echolake.1", "doctor"), ("echolake-serve.1", "flight"), ("echolake-import-wav.1", "manifest")]
+    {
+        let text = fs::read_to_string(place.path("man").join(page)).expect(page);
+        assert!(text.contains(expected), "{page}");
+    }
+    for shell in ["bash", "zsh", "fish"] {
+        assert!(place.ok(&["completions", shell]).contains("echolake"), "{shell}");
+    }
+}
