@@ -26,7 +26,7 @@ use crate::control::guard::guarded;
 use crate::control::lanes::{Lanes, Threads};
 use crate::small::SmallTables;
 use crate::table::Source;
-use crate::{Error, Functions, Session};
+use crate::{Error, Functions, Opaque, Session};
 
 /// Where the lake's store is registered; no other store is, so no query reaches a file outside of the lake.
 const STORE: &str = "echolake://lake/";
@@ -47,7 +47,7 @@ const OVER: f64 = 0.1;
 
 /// Answers the queries of many sessions on one lake.
 #[derive(Clone)]
-pub struct Engine(Arc<Inner>);
+pub struct Engine(Opaque<Inner>);
 
 struct Inner {
     template: SessionState,
@@ -190,7 +190,7 @@ impl Engine {
             own: functions.names().map(str::to_owned).collect(),
             watch: Threads::new("query-watch", 1).map_err(threads)?,
         };
-        let engine = Self(Arc::new(inner));
+        let engine = Self(Opaque::new(inner));
         engine.start_governor();
         Ok(engine)
     }

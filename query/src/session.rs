@@ -26,7 +26,7 @@ use crate::control::watched::watch;
 use crate::control::{Stop, Ticket};
 use crate::engine::{Client, Engine, Function, Limits, Place, Quota};
 use crate::mcap::Contents;
-use crate::{Error, as_of, gate};
+use crate::{Error, Opaque, as_of, gate};
 
 /// Batches that wait for a slow reader.
 const AHEAD: usize = 2;
@@ -45,8 +45,8 @@ pub type Extend = Arc<dyn Fn(&SessionContext) -> Result<(), DataFusionError> + S
 /// A query that is planned and may be run again and again with other values. It keeps the view of the lake it was
 /// planned on.
 pub struct Prepared {
-    state: Arc<SessionState>,
-    plan: LogicalPlan,
+    state: Opaque<SessionState>,
+    plan: Opaque<LogicalPlan>,
     sql: String,
 }
 
@@ -180,7 +180,7 @@ impl Session {
     pub async fn query(&self, sql: &str) -> Result<Answer, Error> {
         let started = self.start()?;
         let prepared = self.plan(sql, self.parse(sql)?, &started.ticket).await?;
-        self.run(&prepared, prepared.plan.clone(), started).await
+        self.run(&prepared, LogicalPlan::clone(&prepared.plan), started).await
     }
 
     /// Plans a query.
@@ -205,7 +205,8 @@ impl Session {
     /// # Errors
     /// [`Error::Query`] where values are missing or of the wrong type; else as [`Session::query`].
     pub async fn execute(&self, prepared: &Prepared, values: ParamValues) -> Result<Answer, Error> {
-        let plan = prepared.plan.clone().with_param_values(values).map_err(|e| Error::plan(&prepared.sql, &e))?;
+        let plan =
+            LogicalPlan::clone(&prepared.plan).with_param_values(values).map_err(|e| Error::plan(&prepared.sql, &e))?;
         self.run(prepared, plan, self.start()?).await
     }
 
@@ -251,7 +252,7 @@ impl Session {
             // `SELECT INTO` reads by its first word and makes a table by its plan.
             let reading = SQLOptions::new().with_allow_ddl(false).with_allow_dml(false).with_allow_statements(false);
             reading.verify_plan(&plan).map_err(|_| Error::NotReading { statement: plan.display().to_string() })?;
-            Ok(Prepared { state: Arc::new(context.state()), plan, sql })
+            Ok(Prepared { state: Opaque::new(context.state()), plan: Opaque::new(plan), sql })
         };
         self.on_threads(ticket, plan).await
     }

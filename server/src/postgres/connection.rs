@@ -9,6 +9,8 @@ use bytes::Bytes;
 use datafusion::common::ParamValues;
 use datafusion_pg_catalog::sql::PostgresCompatibilityParser;
 use echolake_query::{Client, Session};
+use futures::FutureExt as _;
+use futures::future::BoxFuture;
 use pgwire::api::Type;
 use pgwire::messages::startup::SecretKey;
 use tokio::sync::{OwnedSemaphorePermit, SetOnce};
@@ -189,26 +191,29 @@ impl Connection {
         Run { stop, limit: self.settings.statement_timeout().map(Limit::of) }
     }
 
-    /// Parses and plans.
-    pub(super) async fn statements(
-        &self,
-        sql: &str,
-        types: &[Option<Type>],
-        run: &Run,
-    ) -> Result<Vec<Statement>, Fault> {
-        if sql.len() > LARGEST {
-            return Err(Fault::TooLarge { limit: LARGEST });
-        }
-        let (shared, session) = (self.shared.clone(), self.session()?.clone());
-        let (sql, types): (Arc<str>, _) = (sql.into(), types.to_vec());
-        self.planned(run, async move {
-            let mut statements = Vec::new();
-            for parsed in statement::parse(&shared.parser, &session, &sql, &types)? {
-                statements.push(statement::plan(&session, &sql, parsed).await?);
+    /// Parses and plans. Boxed for the same reason as [`echolake_query::Opaque`].
+    pub(super) fn statements<'a>(
+        &'a self,
+        sql: &'a str,
+        types: &'a [Option<Type>],
+        run: &'a Run,
+    ) -> BoxFuture<'a, Result<Vec<Statement>, Fault>> {
+        let statements = async move {
+            if sql.len() > LARGEST {
+                return Err(Fault::TooLarge { limit: LARGEST });
             }
-            Ok(statements)
-        })
-        .await
+            let (shared, session) = (self.shared.clone(), self.session()?.clone());
+            let (sql, types): (Arc<str>, _) = (sql.into(), types.to_vec());
+            let work = async move {
+                let mut statements = Vec::new();
+                for parsed in statement::parse(&shared.parser, &session, &sql, &types)? {
+                    statements.push(statement::plan(&session, &sql, parsed).await?);
+                }
+                Ok(statements)
+            };
+            self.planned(run, work).await
+        };
+        statements.boxed()
     }
 
     async fn planned<T: Send + 'static>(

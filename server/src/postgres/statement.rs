@@ -11,7 +11,7 @@ use datafusion::sql::sqlparser::ast::{
 use datafusion::sql::sqlparser::dialect::PostgreSqlDialect;
 use datafusion::sql::sqlparser::parser::Parser;
 use datafusion_pg_catalog::sql::PostgresCompatibilityParser;
-use echolake_query::{Error as QueryError, Prepared, Session};
+use echolake_query::{Error as QueryError, Opaque, Prepared, Session};
 use pgwire::api::Type;
 
 use super::copy::{self, CopyAs};
@@ -25,19 +25,19 @@ const TOGETHER: usize = 100;
 pub(super) struct Planned {
     pub(super) prepared: Arc<Prepared>,
     pub(super) at: Instant,
-    statement: Parsed,
+    statement: Opaque<Parsed>,
     sql: Arc<str>,
 }
 
 impl Planned {
     async fn new(session: &Session, sql: &Arc<str>, statement: Parsed) -> Result<Arc<Self>, Fault> {
         let prepared = Arc::new(session.prepare_statement(sql, statement.clone()).await?);
-        Ok(Arc::new(Self { prepared, at: Instant::now(), statement, sql: sql.clone() }))
+        Ok(Arc::new(Self { prepared, at: Instant::now(), statement: Opaque::new(statement), sql: sql.clone() }))
     }
 
     /// The same on today's lake.
     pub(super) async fn again(&self, session: &Session) -> Result<Prepared, QueryError> {
-        session.prepare_statement(&self.sql, self.statement.clone()).await
+        session.prepare_statement(&self.sql, Parsed::clone(&self.statement)).await
     }
 }
 
