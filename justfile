@@ -29,8 +29,8 @@ package:
     packaging/package.sh HEAD
 
 # An image of dist/'s Debian package, by buildah or podman.
-container:
-    "$(command -v buildah || command -v podman)" build --tag echolake --file packaging/Containerfile .
+container *OPTIONS:
+    "$(command -v buildah || command -v podman)" build --format docker --tag echolake --file packaging/Containerfile {{ OPTIONS }} .
 
 # Cuts the changelog, sets the version, commits, makes dist/ and tags; publishes nothing.
 release VERSION:
