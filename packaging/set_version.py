@@ -19,7 +19,7 @@ def main() -> None:
     if numbers(version) <= numbers(old):
         sys.exit(f"error: {version} is not newer than {old}")
     replace(manifest, rf'(^\[workspace\.package\]\nversion = "){old}"', version + '"', times=1)
-    replace(folder / "Cargo.lock", rf'(^name = "echolake(?:-[a-z]+)?"\nversion = "){old}"', version + '"')
+    replace(folder / "Cargo.lock", rf'(^name = "echolake(?:-[a-z-]+)?"\nversion = "){old}"', version + '"')
     replace(folder / "web/package.json", rf'(^  "version": "){old}"', version + '"', times=1)
     replace(folder / "web/package-lock.json", rf'(^ +"name": "echolake-web",\n +"version": "){old}"', version + '"')
     cut_changelog(folder / "CHANGELOG.md", version)

@@ -1,18 +1,18 @@
 //! The arguments, and nothing else.
 
+#[cfg(feature = "lake")]
+mod lake;
+
 use std::path::PathBuf;
 
 use clap::{Args, Parser, Subcommand};
-use echolake_acquisition::collection::LARGEST;
 use echolake_acquisition::mesh::Side;
 use echolake_acquisition::replay::SPEEDS;
-use echolake_lake::{KEEP_HOURS, TARGET_BYTES};
 use echolake_schema::SurfaceId;
 
-use crate::commands::export::ExportCommand;
 use crate::commands::panel::PanelArgs;
-use crate::commands::serve::ServeArgs;
-use crate::commands::sql::SqlArgs;
+#[cfg(feature = "lake")]
+pub(crate) use lake::{DemoArgs, IngestArgs, LakeCommand, OptimizeArgs, VacuumArgs};
 
 /// A data lake and catalogue for sweep measurements.
 #[derive(Debug, Parser)]
@@ -27,8 +27,9 @@ pub(crate) struct Cli {
 
 #[derive(Debug, Subcommand)]
 pub(crate) enum Command {
-    /// Measure a few surfaces with the simulated rig, ingest them, print the paper's tables and serve the catalogue.
-    Demo(DemoArgs),
+    #[cfg(feature = "lake")]
+    #[command(flatten)]
+    Lake(LakeCommand),
     /// Measure one surface with the simulated rig: one run, one MCAP file.
     Acquire(AcquireArgs),
     /// Write a generated relief as a mesh, heights or a picture; make groups of them.
@@ -36,30 +37,12 @@ pub(crate) enum Command {
     /// Turn existing measurements into runs.
     #[command(subcommand)]
     Import(ImportCommand),
-    /// Turn runs into rows.
-    Ingest(IngestArgs),
-    /// Ask the lake in SQL; a prompt where no query is given.
-    Sql(SqlArgs),
-    /// Data out: training sets, slices of runs, SOFA, WAV, npz.
-    #[command(subcommand)]
-    Export(ExportCommand),
     /// Show runs again to Foxglove, which plays, pauses and seeks, and to Lichtblick.
     Replay(ReplayArgs),
-    /// Serve the catalogue, and the lake over HTTP, Arrow Flight SQL and Postgres' protocol, for reading.
-    Serve(ServeArgs),
-    /// Make a token for `serve --tokens`.
-    Token {
-        /// Whose it is.
-        name: String,
-    },
     /// Rebuild a recording that was cut off or damaged, as far as every checksum is right.
     Recover(RecoverArgs),
     /// Say what is in the lake, what is missing and what is damaged.
     Doctor(DoctorArgs),
-    /// Merge the tables' small files into large ones; ingest and queries may go on.
-    Optimize(OptimizeArgs),
-    /// Delete files that are in no table any more, and what crashes left behind.
-    Vacuum(VacuumArgs),
     /// Print a completion script for a shell.
     Completions {
         /// The shell.
@@ -71,29 +54,6 @@ pub(crate) enum Command {
         /// The folder they go to.
         folder: PathBuf,
     },
-}
-
-#[derive(Debug, Args)]
-pub(crate) struct DemoArgs {
-    /// Measure this many surfaces instead: the references, then panels of every typology with random parameters.
-    /// Those that are measured already are not measured again.
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=LARGEST as i64))]
-    pub(crate) surfaces: Option<u32>,
-    /// Record no sweeps, only impulse responses: a tenth of the space.
-    #[arg(long)]
-    pub(crate) ir_only: bool,
-    /// Do not serve the catalogue afterwards.
-    #[arg(long)]
-    pub(crate) no_serve: bool,
-    /// Leave the runs in the lake's inbox/.
-    #[arg(long, hide = true)]
-    pub(crate) no_ingest: bool,
-    /// The rig; by default that of the paper with sweeps of 0.05 s.
-    #[arg(long)]
-    pub(crate) rig: Option<PathBuf>,
-    /// Seed of the simulation: the same seed gives the same lake.
-    #[arg(long, default_value_t = 1)]
-    pub(crate) seed: u64,
 }
 
 #[derive(Debug, Args)]
@@ -230,18 +190,6 @@ fn speed(text: &str) -> Result<f32, String> {
 }
 
 #[derive(Debug, Args)]
-pub(crate) struct IngestArgs {
-    /// Run files, or names of runs in the lake; by default all that are not in the tables yet.
-    pub(crate) runs: Vec<String>,
-    /// Go on: take in what comes into the lake's inbox, until Ctrl-C.
-    #[arg(long, conflicts_with_all = ["runs", "json"])]
-    pub(crate) watch: bool,
-    /// Print what was done as JSON.
-    #[arg(long)]
-    pub(crate) json: bool,
-}
-
-#[derive(Debug, Args)]
 pub(crate) struct DoctorArgs {
     /// Report what this installation can do instead: pages, audio, formats, disk, ports. The lake's data are not read.
     #[arg(long = "self")]
@@ -249,38 +197,4 @@ pub(crate) struct DoctorArgs {
     /// Print the report as JSON.
     #[arg(long)]
     pub(crate) json: bool,
-}
-
-#[derive(Debug, Args)]
-pub(crate) struct OptimizeArgs {
-    /// Size of the merged files in MB; files of half of it and more are left alone.
-    #[arg(long, value_name = "MB", default_value_t = TARGET_BYTES >> 20, value_parser = clap::value_parser!(u64).range(1..=1024))]
-    pub(crate) target_mb: u64,
-    /// Print what was done as JSON.
-    #[arg(long)]
-    pub(crate) json: bool,
-}
-
-#[derive(Debug, Args)]
-pub(crate) struct VacuumArgs {
-    /// Keep files that went out of their table less than this long ago: longer than any query runs. 168 at most,
-    /// because a table's log forgets after a week when that was.
-    #[arg(long, value_name = "HOURS", default_value_t = KEEP_HOURS, value_parser = clap::value_parser!(u32).range(0..=KEEP_HOURS as i64))]
-    pub(crate) keep_hours: u32,
-    /// Only say what would be deleted.
-    #[arg(long)]
-    pub(crate) dry_run: bool,
-    /// Print what was done as JSON.
-    #[arg(long)]
-    pub(crate) json: bool,
-}
-
-#[cfg(test)]
-mod tests {
-    use clap::CommandFactory as _;
-
-    #[test]
-    fn the_arguments_are_consistent() {
-        super::Cli::command().debug_assert();
-    }
 }

@@ -1,8 +1,10 @@
 //! Bad input: a clear error that names the place, and nothing half-written.
 
 use std::path::Path;
+use std::process::Command;
 
-use super::Place;
+use super::child::run_command;
+use super::{Place, stderr};
 
 fn files(folder: &Path) -> usize {
     std::fs::read_dir(folder).map_or(0, Iterator::count)
@@ -241,7 +243,7 @@ impl Disk {
     fn mounted(at: &Path, kib: u64) -> Option<Self> {
         std::fs::create_dir(at).expect("made");
         let size = format!("size={kib}k");
-        let done = std::process::Command::new("mount").args(["-t", "tmpfs", "-o", &size, "tmpfs"]).arg(at).output();
+        let done = run_command(Command::new("mount").args(["-t", "tmpfs", "-o", &size, "tmpfs"]).arg(at));
         match done {
             Ok(output) if output.status.success() => Some(Self(at.to_owned())),
             _ => {
@@ -253,14 +255,14 @@ impl Disk {
 
     fn remount(&self, option: &str) {
         let option = format!("remount,{option}");
-        let done = std::process::Command::new("mount").args(["-o", &option]).arg(&self.0).status();
-        assert!(done.expect("mount starts").success(), "{option}");
+        let done = run_command(Command::new("mount").args(["-o", &option]).arg(&self.0)).expect("mount starts");
+        assert!(done.status.success(), "{option}: {}", stderr(&done));
     }
 }
 
 impl Drop for Disk {
     fn drop(&mut self) {
-        let _ = std::process::Command::new("umount").arg(&self.0).status();
+        let _ = run_command(Command::new("umount").arg(&self.0));
     }
 }
 
@@ -273,7 +275,7 @@ fn a_full_disk_stops_everything_cleanly_and_with_space_it_goes_on() {
     }
     // As much space as two of the runs' tables need, less than all.
     let used = || {
-        let output = std::process::Command::new("du").arg("-sk").arg(&disk.0).output().expect("du starts");
+        let output = run_command(Command::new("du").arg("-sk").arg(&disk.0)).expect("du starts");
         String::from_utf8(output.stdout).expect("text").split_whitespace().next().and_then(|n| n.parse::<u64>().ok())
     };
     let before = used().expect("a number");

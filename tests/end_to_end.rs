@@ -4,6 +4,27 @@ use super::Place;
 
 const PAIRS: f64 = 45.0;
 
+// In a build with debug assertions, clap looks over the arguments of each.
+#[test]
+fn every_command_explains_itself() {
+    let place = Place::new();
+    let help = place.ok(&["--help"]);
+    let commands = |help: &str| -> Vec<String> {
+        let listed = help.lines().skip_while(|line| *line != "Commands:").skip(1).take_while(|line| !line.is_empty());
+        let entries = listed.filter(|line| !line.starts_with("   "));
+        entries.filter_map(|line| line.split_whitespace().next().map(str::to_owned)).collect()
+    };
+    let all = commands(&help);
+    assert!(all.len() > 14 && all.iter().any(|name| name == "serve"), "{help}");
+    for name in all.iter().filter(|name| *name != "help") {
+        let own = place.ok(&[name, "--help"]);
+        assert!(own.contains("Usage: echolake"), "{name}: {own}");
+        for part in commands(&own).iter().filter(|part| *part != "help") {
+            assert!(place.ok(&[name, part, "--help"]).contains("Usage: echolake"), "{name} {part}");
+        }
+    }
+}
+
 #[test]
 fn references_complete_what_waits_and_the_physics_holds() {
     let place = Place::new();
@@ -141,14 +162,13 @@ fn a_gir_folder_becomes_runs_with_references_of_their_own() {
 // The long form is the example `kills`.
 #[test]
 fn a_killed_ingest_is_repaired_by_running_it_again() {
-    let outcome =
-        super::kills::Campaign::new(std::path::Path::new(env!("CARGO_BIN_EXE_echolake")), 1).rounds(4, &mut |_, _| {});
+    let outcome = super::kills::Campaign::new(std::path::Path::new(super::ECHOLAKE), 1).rounds(4, &mut |_, _| {});
     assert!(outcome.killed > 0, "{outcome:?}");
 }
 
 // Its long form is the same example with `halves`.
 #[test]
 fn two_processes_ingest_half_of_the_runs_each() {
-    let binary = std::path::Path::new(env!("CARGO_BIN_EXE_echolake"));
+    let binary = std::path::Path::new(super::ECHOLAKE);
     super::kills::Campaign::of(binary, 1, 12).halves(2, &mut |_, _| {});
 }

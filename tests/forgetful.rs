@@ -12,12 +12,12 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, SystemTime};
 
 use fuser::{
-    BackgroundSession, BsdFileFlags, Config, Errno, FileAttr, FileHandle, FileType, Filesystem, FopenFlags, Generation,
-    INodeNo, LockOwner, MountOption, OpenFlags, RenameFlags, ReplyAttr, ReplyCreate, ReplyData, ReplyDirectory,
-    ReplyEmpty, ReplyEntry, ReplyStatfs, ReplyWrite, Request, TimeOrNow, WriteFlags,
+    BackgroundSession, FileAttr, FileType, Filesystem, MountOption, ReplyAttr, ReplyCreate, ReplyData, ReplyDirectory,
+    ReplyEmpty, ReplyEntry, ReplyStatfs, ReplyWrite, Request, TimeOrNow,
 };
 use rand::Rng as _;
 use rand_chacha::ChaCha8Rng;
+use rustix::io::Errno;
 
 /// What is written as a whole or not at all.
 const SECTOR: usize = 512;
@@ -55,9 +55,8 @@ impl ForgetfulDisk {
 
     /// Mounts the disk; nothing where this machine does not let us.
     pub(crate) fn mount(&self, at: &Path) -> Option<Mounted> {
-        let mut config = Config::default();
-        config.mount_options = vec![MountOption::FSName("forgetful".into())];
-        match fuser::spawn_mount(Disk(self.0.clone()), at, &config) {
+        let options = [MountOption::FSName("forgetful".into())];
+        match fuser::spawn_mount2(Disk(self.0.clone()), at, &options) {
             Ok(session) => Some(Mounted { _session: session }),
             Err(error) => {
                 eprintln!("skipped: no file system can be mounted here: {error}");
@@ -106,26 +105,26 @@ impl Tree {
     fn folder(&mut self, ino: u64) -> Result<&mut Entries, Errno> {
         match self.nodes.get_mut(&ino) {
             Some(Node::Folder { now, .. }) => Ok(now),
-            Some(Node::File { .. }) => Err(Errno::ENOTDIR),
-            None => Err(Errno::ENOENT),
+            Some(Node::File { .. }) => Err(Errno::NOTDIR),
+            None => Err(Errno::NOENT),
         }
     }
 
     fn file(&mut self, ino: u64) -> Result<&mut Vec<u8>, Errno> {
         match self.nodes.get_mut(&ino) {
             Some(Node::File { now, .. }) => Ok(now),
-            Some(Node::Folder { .. }) => Err(Errno::EISDIR),
-            None => Err(Errno::ENOENT),
+            Some(Node::Folder { .. }) => Err(Errno::ISDIR),
+            None => Err(Errno::NOENT),
         }
     }
 
     fn child(&mut self, parent: u64, name: &OsStr) -> Result<u64, Errno> {
-        self.folder(parent)?.get(name).copied().ok_or(Errno::ENOENT)
+        self.folder(parent)?.get(name).copied().ok_or(Errno::NOENT)
     }
 
     fn add(&mut self, parent: u64, name: &OsStr, node: Node) -> Result<FileAttr, Errno> {
         if self.child(parent, name).is_ok() {
-            return Err(Errno::EEXIST);
+            return Err(Errno::EXIST);
         }
         let ino = self.next;
         self.folder(parent)?.insert(name.to_owned(), ino);
@@ -136,11 +135,11 @@ impl Tree {
 
     // Whatever is removed stays in memory: a cut may bring its name back.
     fn remove(&mut self, parent: u64, name: &OsStr) -> Result<(), Errno> {
-        self.folder(parent)?.remove(name).map(drop).ok_or(Errno::ENOENT)
+        self.folder(parent)?.remove(name).map(drop).ok_or(Errno::NOENT)
     }
 
     fn sync(&mut self, ino: u64) -> Result<(), Errno> {
-        match self.nodes.get_mut(&ino).ok_or(Errno::ENOENT)? {
+        match self.nodes.get_mut(&ino).ok_or(Errno::NOENT)? {
             Node::File { now, safe } => safe.clone_from(now),
             Node::Folder { now, safe } => safe.clone_from(now),
         }
@@ -148,13 +147,13 @@ impl Tree {
     }
 
     fn attributes(&self, ino: u64) -> Result<FileAttr, Errno> {
-        let (kind, size, perm) = match self.nodes.get(&ino).ok_or(Errno::ENOENT)? {
+        let (kind, size, perm) = match self.nodes.get(&ino).ok_or(Errno::NOENT)? {
             Node::File { now, .. } => (FileType::RegularFile, now.len() as u64, 0o644),
             Node::Folder { .. } => (FileType::Directory, 0, 0o755),
         };
         let time = SystemTime::UNIX_EPOCH;
         Ok(FileAttr {
-            ino: INodeNo(ino),
+            ino,
             size,
             blocks: size.div_ceil(SECTOR as u64),
             atime: time,
@@ -183,40 +182,40 @@ impl Disk {
 
 fn entry(reply: ReplyEntry, found: Result<FileAttr, Errno>) {
     match found {
-        Ok(attributes) => reply.entry(&NO_TIME, &attributes, Generation(0)),
-        Err(error) => reply.error(error),
+        Ok(attributes) => reply.entry(&NO_TIME, &attributes, 0),
+        Err(error) => reply.error(error.raw_os_error()),
     }
 }
 
 fn empty(reply: ReplyEmpty, done: Result<(), Errno>) {
     match done {
         Ok(()) => reply.ok(),
-        Err(error) => reply.error(error),
+        Err(error) => reply.error(error.raw_os_error()),
     }
 }
 
 fn attributes(reply: ReplyAttr, found: Result<FileAttr, Errno>) {
     match found {
         Ok(attributes) => reply.attr(&NO_TIME, &attributes),
-        Err(error) => reply.error(error),
+        Err(error) => reply.error(error.raw_os_error()),
     }
 }
 
 impl Filesystem for Disk {
-    fn lookup(&self, _: &Request, parent: INodeNo, name: &OsStr, reply: ReplyEntry) {
+    fn lookup(&mut self, _: &Request<'_>, parent: u64, name: &OsStr, reply: ReplyEntry) {
         let mut tree = self.tree();
-        let found = tree.child(parent.0, name).and_then(|ino| tree.attributes(ino));
+        let found = tree.child(parent, name).and_then(|ino| tree.attributes(ino));
         entry(reply, found);
     }
 
-    fn getattr(&self, _: &Request, ino: INodeNo, _: Option<FileHandle>, reply: ReplyAttr) {
-        attributes(reply, self.tree().attributes(ino.0));
+    fn getattr(&mut self, _: &Request<'_>, ino: u64, _: Option<u64>, reply: ReplyAttr) {
+        attributes(reply, self.tree().attributes(ino));
     }
 
     fn setattr(
-        &self,
-        _: &Request,
-        ino: INodeNo,
+        &mut self,
+        _: &Request<'_>,
+        ino: u64,
         _mode: Option<u32>,
         _uid: Option<u32>,
         _gid: Option<u32>,
@@ -224,151 +223,151 @@ impl Filesystem for Disk {
         _atime: Option<TimeOrNow>,
         _mtime: Option<TimeOrNow>,
         _ctime: Option<SystemTime>,
-        _fh: Option<FileHandle>,
+        _fh: Option<u64>,
         _crtime: Option<SystemTime>,
         _chgtime: Option<SystemTime>,
         _bkuptime: Option<SystemTime>,
-        _flags: Option<BsdFileFlags>,
+        _flags: Option<u32>,
         reply: ReplyAttr,
     ) {
         let mut tree = self.tree();
         let resized = match size {
-            Some(size) => tree.file(ino.0).map(|file| file.resize(size as usize, 0)),
+            Some(size) => tree.file(ino).map(|file| file.resize(size as usize, 0)),
             None => Ok(()),
         };
-        let found = resized.and_then(|()| tree.attributes(ino.0));
+        let found = resized.and_then(|()| tree.attributes(ino));
         attributes(reply, found);
     }
 
-    fn mkdir(&self, _: &Request, parent: INodeNo, name: &OsStr, _: u32, _: u32, reply: ReplyEntry) {
+    fn mkdir(&mut self, _: &Request<'_>, parent: u64, name: &OsStr, _: u32, _: u32, reply: ReplyEntry) {
         let node = Node::Folder { now: Entries::new(), safe: Entries::new() };
-        entry(reply, self.tree().add(parent.0, name, node));
+        entry(reply, self.tree().add(parent, name, node));
     }
 
-    fn unlink(&self, _: &Request, parent: INodeNo, name: &OsStr, reply: ReplyEmpty) {
-        empty(reply, self.tree().remove(parent.0, name));
+    fn unlink(&mut self, _: &Request<'_>, parent: u64, name: &OsStr, reply: ReplyEmpty) {
+        empty(reply, self.tree().remove(parent, name));
     }
 
-    fn rmdir(&self, _: &Request, parent: INodeNo, name: &OsStr, reply: ReplyEmpty) {
+    fn rmdir(&mut self, _: &Request<'_>, parent: u64, name: &OsStr, reply: ReplyEmpty) {
         let mut tree = self.tree();
-        let is_empty = tree.child(parent.0, name).and_then(|ino| tree.folder(ino).map(|f| f.is_empty()));
+        let is_empty = tree.child(parent, name).and_then(|ino| tree.folder(ino).map(|f| f.is_empty()));
         let removed = match is_empty {
-            Ok(true) => tree.remove(parent.0, name),
-            Ok(false) => Err(Errno::ENOTEMPTY),
+            Ok(true) => tree.remove(parent, name),
+            Ok(false) => Err(Errno::NOTEMPTY),
             Err(error) => Err(error),
         };
         empty(reply, removed);
     }
 
     fn rename(
-        &self,
-        _: &Request,
-        parent: INodeNo,
+        &mut self,
+        _: &Request<'_>,
+        parent: u64,
         name: &OsStr,
-        to: INodeNo,
+        to: u64,
         new_name: &OsStr,
-        _: RenameFlags,
+        _: u32,
         reply: ReplyEmpty,
     ) {
         let mut tree = self.tree();
-        let renamed = tree.child(parent.0, name).and_then(|ino| {
-            tree.folder(to.0)?.insert(new_name.to_owned(), ino);
-            if (parent.0, name) != (to.0, new_name) { tree.remove(parent.0, name) } else { Ok(()) }
+        let renamed = tree.child(parent, name).and_then(|ino| {
+            tree.folder(to)?.insert(new_name.to_owned(), ino);
+            if (parent, name) != (to, new_name) { tree.remove(parent, name) } else { Ok(()) }
         });
         empty(reply, renamed);
     }
 
-    fn link(&self, _: &Request, ino: INodeNo, parent: INodeNo, name: &OsStr, reply: ReplyEntry) {
+    fn link(&mut self, _: &Request<'_>, ino: u64, parent: u64, name: &OsStr, reply: ReplyEntry) {
         let mut tree = self.tree();
-        let linked = match tree.child(parent.0, name) {
-            Ok(_) => Err(Errno::EEXIST),
-            Err(_) => tree.folder(parent.0).map(|folder| {
-                folder.insert(name.to_owned(), ino.0);
+        let linked = match tree.child(parent, name) {
+            Ok(_) => Err(Errno::EXIST),
+            Err(_) => tree.folder(parent).map(|folder| {
+                folder.insert(name.to_owned(), ino);
             }),
         };
-        let found = linked.and_then(|()| tree.attributes(ino.0));
+        let found = linked.and_then(|()| tree.attributes(ino));
         entry(reply, found);
     }
 
-    fn create(&self, _: &Request, parent: INodeNo, name: &OsStr, _: u32, _: u32, _: i32, reply: ReplyCreate) {
-        match self.tree().add(parent.0, name, Node::File { now: Vec::new(), safe: Vec::new() }) {
-            Ok(made) => reply.created(&NO_TIME, &made, Generation(0), FileHandle(0), FopenFlags::empty()),
-            Err(error) => reply.error(error),
+    fn create(&mut self, _: &Request<'_>, parent: u64, name: &OsStr, _: u32, _: u32, _: i32, reply: ReplyCreate) {
+        match self.tree().add(parent, name, Node::File { now: Vec::new(), safe: Vec::new() }) {
+            Ok(made) => reply.created(&NO_TIME, &made, 0, 0, 0),
+            Err(error) => reply.error(error.raw_os_error()),
         }
     }
 
     fn read(
-        &self,
-        _: &Request,
-        ino: INodeNo,
-        _: FileHandle,
-        offset: u64,
+        &mut self,
+        _: &Request<'_>,
+        ino: u64,
+        _: u64,
+        offset: i64,
         size: u32,
-        _: OpenFlags,
-        _: Option<LockOwner>,
+        _: i32,
+        _: Option<u64>,
         reply: ReplyData,
     ) {
-        match self.tree().file(ino.0) {
+        match self.tree().file(ino) {
             Ok(file) => {
                 let from = (offset as usize).min(file.len());
                 reply.data(&file[from..(from + size as usize).min(file.len())]);
             }
-            Err(error) => reply.error(error),
+            Err(error) => reply.error(error.raw_os_error()),
         }
     }
 
     fn write(
-        &self,
-        _: &Request,
-        ino: INodeNo,
-        _: FileHandle,
-        offset: u64,
+        &mut self,
+        _: &Request<'_>,
+        ino: u64,
+        _: u64,
+        offset: i64,
         data: &[u8],
-        _: WriteFlags,
-        _: OpenFlags,
-        _: Option<LockOwner>,
+        _: u32,
+        _: i32,
+        _: Option<u64>,
         reply: ReplyWrite,
     ) {
-        match self.tree().file(ino.0) {
+        match self.tree().file(ino) {
             Ok(file) => {
                 let (from, to) = (offset as usize, offset as usize + data.len());
                 file.resize(file.len().max(to), 0);
                 file[from..to].copy_from_slice(data);
                 reply.written(data.len() as u32);
             }
-            Err(error) => reply.error(error),
+            Err(error) => reply.error(error.raw_os_error()),
         }
     }
 
     // Called at every close, which promises nothing.
-    fn flush(&self, _: &Request, _: INodeNo, _: FileHandle, _: LockOwner, reply: ReplyEmpty) {
+    fn flush(&mut self, _: &Request<'_>, _: u64, _: u64, _: u64, reply: ReplyEmpty) {
         reply.ok();
     }
 
-    fn fsync(&self, _: &Request, ino: INodeNo, _: FileHandle, _: bool, reply: ReplyEmpty) {
-        empty(reply, self.tree().sync(ino.0));
+    fn fsync(&mut self, _: &Request<'_>, ino: u64, _: u64, _: bool, reply: ReplyEmpty) {
+        empty(reply, self.tree().sync(ino));
     }
 
-    fn fsyncdir(&self, _: &Request, ino: INodeNo, _: FileHandle, _: bool, reply: ReplyEmpty) {
-        empty(reply, self.tree().sync(ino.0));
+    fn fsyncdir(&mut self, _: &Request<'_>, ino: u64, _: u64, _: bool, reply: ReplyEmpty) {
+        empty(reply, self.tree().sync(ino));
     }
 
-    fn readdir(&self, _: &Request, ino: INodeNo, _: FileHandle, offset: u64, mut reply: ReplyDirectory) {
+    fn readdir(&mut self, _: &Request<'_>, ino: u64, _: u64, offset: i64, mut reply: ReplyDirectory) {
         let mut tree = self.tree();
-        let entries: Vec<_> = match tree.folder(ino.0) {
+        let entries: Vec<_> = match tree.folder(ino) {
             Ok(entries) => entries.iter().map(|(name, ino)| (name.clone(), *ino)).collect(),
-            Err(error) => return reply.error(error),
+            Err(error) => return reply.error(error.raw_os_error()),
         };
         for (index, (name, child)) in entries.iter().enumerate().skip(offset as usize) {
             let kind = tree.attributes(*child).map_or(FileType::RegularFile, |a| a.kind);
-            if reply.add(INodeNo(*child), index as u64 + 1, kind, name) {
+            if reply.add(*child, index as i64 + 1, kind, name) {
                 break;
             }
         }
         reply.ok();
     }
 
-    fn statfs(&self, _: &Request, _: INodeNo, reply: ReplyStatfs) {
+    fn statfs(&mut self, _: &Request<'_>, _: u64, reply: ReplyStatfs) {
         // 4 GiB, all free.
         reply.statfs(1 << 20, 1 << 20, 1 << 20, 1 << 20, 1 << 20, 4096, 255, 4096);
     }

@@ -2,6 +2,7 @@
 
 mod acquire_kills;
 mod bad_input;
+mod child;
 mod end_to_end;
 mod forgetful;
 mod fuzz;
@@ -9,9 +10,11 @@ mod installation;
 mod kills;
 mod load;
 mod maintenance;
+mod prompt;
 mod real_data;
 mod replay;
 mod serve;
+mod signals;
 mod sofa;
 #[cfg(feature = "web")]
 mod web;
@@ -19,6 +22,8 @@ mod web;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
+/// The command under test.
+const ECHOLAKE: &str = env!("CARGO_BIN_EXE_echolake");
 /// A rig that measures in milliseconds.
 const SMALL_RIG: &str = include_str!("fixtures/small_rig.toml");
 
@@ -38,14 +43,14 @@ impl Place {
         self.folder.path().join(name)
     }
 
+    fn command(&self, args: &[&str]) -> Command {
+        let mut command = Command::new(ECHOLAKE);
+        command.args(["--lake", "lake"]).args(args).current_dir(self.folder.path()).env_remove("ECHOLAKE_LAKE");
+        command
+    }
+
     fn run(&self, args: &[&str]) -> Output {
-        Command::new(env!("CARGO_BIN_EXE_echolake"))
-            .args(["--lake", "lake"])
-            .args(args)
-            .current_dir(self.folder.path())
-            .env_remove("ECHOLAKE_LAKE")
-            .output()
-            .expect("the command starts")
+        child::run_command(&mut self.command(args)).expect("the command starts")
     }
 
     /// Runs what must succeed; returns stdout.

@@ -1,29 +1,16 @@
 //! The replay as its users start and end it; what a viewer sees is tested where the player is.
 
-use std::io::{BufRead as _, BufReader, Read as _};
-use std::process::{Command, Stdio};
-
-use super::Place;
+use super::child::ChildProcess;
+use super::{Place, stderr};
 
 /// Replays until it listens, then ends it by Ctrl-C; its exit code, and what it said.
 fn replayed(place: &Place, runs: &[&str]) -> (Option<i32>, String) {
-    let mut child = Command::new(env!("CARGO_BIN_EXE_echolake"))
-        .args(["--lake", "lake", "replay", "--listen", "127.0.0.1:0"])
-        .args(runs)
-        .current_dir(place.folder.path())
-        .env_remove("ECHOLAKE_LAKE")
-        .stderr(Stdio::piped())
-        .spawn()
-        .expect("the command starts");
-    let mut stderr = BufReader::new(child.stderr.take().expect("stderr"));
-    let mut said = String::new();
-    while !said.contains("ws://127.0.0.1:") {
-        assert_ne!(stderr.read_line(&mut said).expect("a line"), 0, "it ended: {said}");
-    }
-    let told = Command::new("kill").args(["-INT", &child.id().to_string()]).status().expect("kill starts");
-    assert!(told.success());
-    stderr.read_to_string(&mut said).expect("the rest");
-    (child.wait().expect("its end").code(), said)
+    let args = [&["replay", "--listen", "127.0.0.1:0"], runs].concat();
+    let mut replay = ChildProcess::start(&mut place.command(&args)).expect("the command starts");
+    replay.wait_for_line("ws://127.0.0.1:");
+    replay.signal("INT");
+    let output = replay.wait();
+    (output.status.code(), stderr(&output))
 }
 
 #[test]

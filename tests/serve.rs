@@ -22,8 +22,10 @@ use server::Served;
 /// Runs for hours where nothing ends it.
 const ENDLESS: &str = "select count(*) from generate_series(1, 1000000) a cross join generate_series(1, 1000000) b \
                        where a.value + b.value = 7";
-/// How soon a query must have ended whose client is gone.
-const SOON: Duration = Duration::from_secs(5);
+/// How long to wait for what the server does by itself; a busy machine may take its time.
+const EVENT_LIMIT: Duration = Duration::from_secs(60);
+/// How long to wait for what must not come.
+const SILENCE: Duration = Duration::from_millis(200);
 
 fn lake() -> Place {
     let place = Place::new();
@@ -33,7 +35,7 @@ fn lake() -> Place {
 }
 
 pub(crate) fn served(place: &Place, more: &[&str]) -> Served {
-    Served::start(Path::new(env!("CARGO_BIN_EXE_echolake")), &place.path(""), more)
+    Served::start(Path::new(super::ECHOLAKE), &place.path(""), more)
 }
 
 fn sql(server: &Served, query: &str) -> Answer {
@@ -68,7 +70,7 @@ fn running_of(metrics: &Answer) -> f64 {
 fn wait_until(what: &str, mut done: impl FnMut() -> bool) {
     let begun = Instant::now();
     while !done() {
-        assert!(begun.elapsed() < SOON, "{what}");
+        assert!(begun.elapsed() < EVENT_LIMIT, "{what}");
         std::thread::sleep(Duration::from_millis(20));
     }
 }
@@ -271,18 +273,18 @@ fn postgres_knows_keys_and_types_by_its_own_names() {
 fn flight_sql_has_so_many_places() {
     let place = lake();
     let server = served(&place, &[]);
-    let connect = || TcpStream::connect(&server.flight_sql).expect("connected");
+    let connect = || Served::connect(&server.flight_sql);
     // Who has a place is greeted at once, by the head of a frame of HTTP/2.
     let greeted = |stream: &mut TcpStream, patience: Duration| {
         stream.set_read_timeout(Some(patience)).expect("a limit of time");
         stream.read_exact(&mut [0; 9]).is_ok()
     };
     let mut open: Vec<_> = (0..128).map(|_| connect()).collect();
-    assert!(open.iter_mut().all(|stream| greeted(stream, SOON)));
+    assert!(open.iter_mut().all(|stream| greeted(stream, EVENT_LIMIT)));
     let mut more = connect();
-    assert!(!greeted(&mut more, Duration::from_millis(200)), "all places are taken");
+    assert!(!greeted(&mut more, SILENCE), "all places are taken");
     open.pop();
-    assert!(greeted(&mut more, SOON), "one is free again");
+    assert!(greeted(&mut more, EVENT_LIMIT), "one is free again");
 }
 
 #[test]
@@ -299,7 +301,7 @@ fn it_stops_when_told() {
 fn changed_input_harms_nothing() {
     use super::fuzz::{Campaign, Target};
     for target in Target::ALL {
-        let mut campaign = Campaign::new(Path::new(env!("CARGO_BIN_EXE_echolake")), 1);
+        let mut campaign = Campaign::new(Path::new(super::ECHOLAKE), 1);
         let outcome = campaign.throw(target, &mut |so_far| so_far.rounds < 100);
         assert!(outcome.answered > 0, "{}: some are right all the same", target.name());
     }

@@ -9,8 +9,9 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-use super::Place;
+use super::child::run_long_command;
 use super::serve::served;
+use super::{Place, stderr};
 
 const NO_SKIP: &str = "ECHOLAKE_NO_SKIP";
 const SCHEMATHESIS: &str = "schemathesis==4.32.5";
@@ -21,7 +22,7 @@ fn web() -> PathBuf {
 
 /// Runs a program to its end; what it said where it failed.
 fn run(command: &mut Command) -> Result<String, String> {
-    let output = command.output().map_err(|e| format!("{command:?}: {e}"))?;
+    let output = run_long_command(command).map_err(|e| format!("{command:?}: {e}"))?;
     let said = [output.stdout, output.stderr].map(|bytes| String::from_utf8_lossy(&bytes).into_owned()).concat();
     if output.status.success() { Ok(said) } else { Err(format!("{command:?}: {}\n{said}", output.status)) }
 }
@@ -67,7 +68,8 @@ fn schemathesis() -> Result<PathBuf, String> {
 /// A lake of the paper's rig: the demo's, without sweeps.
 fn demo() -> Place {
     let place = Place::new();
-    place.ok(&["demo", "--ir-only", "--no-serve"]);
+    let output = run_long_command(&mut place.command(&["demo", "--ir-only", "--no-serve"])).expect("it starts");
+    assert!(output.status.success(), "{}", stderr(&output));
     place
 }
 

@@ -52,6 +52,8 @@ pub(crate) async fn run(args: &AcquireArgs, lake_url: &str) -> anyhow::Result<Do
     // What can be refused is refused before anything is made for it.
     let influx = args.influx.as_deref().map(str::parse::<Target>).transpose()?;
     let pace = if args.pace > 0.0 { Pace::Secs(args.pace) } else { Pace::Fast };
+    let control = Arc::new(Control::default());
+    watch::obey(&control)?;
     let progress = Progress::new();
     let job = match &args.resume {
         Some(partial) => Job::Resumed { partial: partial.clone(), held: Box::new(Held::read(partial)?) },
@@ -75,8 +77,6 @@ pub(crate) async fn run(args: &AcquireArgs, lake_url: &str) -> anyhow::Result<Do
     let pushed = influx.map(|target| {
         InfluxPush::start(target, metrics.clone(), TOLD_EVERY, |e| eprintln!("warning: metrics were not taken: {e}"))
     });
-    let control = Arc::new(Control::default());
-    watch::obey(&control);
     let mut watcher = Watcher::new(&progress, &surface, planned, accepted, metrics.clone(), job.folder());
     let preflight = if args.skip_checks { Preflight::Skip } else { Preflight::Check };
     let (checkpoint_every, tap) = (args.checkpoint_every.map(|n| n as usize), live.as_ref().map(LiveServer::tap));
@@ -136,13 +136,8 @@ async fn fresh(args: &AcquireArgs, lake_url: &str, progress: &Progress) -> anyho
     let lake = Lake::open_or_create(lake_url, &rig, &References::default()).await?;
     let folder = super::inbox(&lake)?;
     let surface = args.surface.clone().context("no surface is named; hint: --surface NAME")?;
-    // Its references may well come later: its rows wait for them. Whoever measures by mistake without any is told.
-    let snapshot = lake.snapshot().await?;
-    for named in [&args.flat, &args.foam].into_iter().flatten() {
-        if *named != surface && !snapshot.runs().any(|run| run.surface == *named) {
-            progress.say(format!("warning: reference `{named}` is not measured yet; rows of `{surface}` wait for it"));
-        }
-    }
+    #[cfg(feature = "lake")]
+    warn_of_missing_references(args, &lake, &surface, progress).await?;
     for unfinished in unfinished(&folder, surface.as_str()) {
         progress.say(format!(
             "note: `{}` is unfinished; hint: `echolake acquire --resume` goes on with it",
@@ -160,6 +155,23 @@ async fn fresh(args: &AcquireArgs, lake_url: &str, progress: &Progress) -> anyho
         seed: args.seed,
         keep: if args.ir_only { Keep::ResponsesOnly } else { Keep::Sweeps },
     })))
+}
+
+// References may well come later: the rows wait for them. Whoever measures by mistake without any is told.
+#[cfg(feature = "lake")]
+async fn warn_of_missing_references(
+    args: &AcquireArgs,
+    lake: &Lake,
+    surface: &SurfaceId,
+    progress: &Progress,
+) -> anyhow::Result<()> {
+    let snapshot = lake.snapshot().await?;
+    for named in [&args.flat, &args.foam].into_iter().flatten() {
+        if named != surface && !snapshot.runs().any(|run| run.surface == *named) {
+            progress.say(format!("warning: reference `{named}` is not measured yet; rows of `{surface}` wait for it"));
+        }
+    }
+    Ok(())
 }
 
 // Recordings of the surface that were not ended: names of runs have the surface behind their time.

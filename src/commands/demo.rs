@@ -3,7 +3,6 @@
 mod measure;
 
 use std::path::Path;
-use std::sync::atomic::Ordering;
 use std::time::Instant;
 
 use echolake_acquisition::collection::{Member, collection};
@@ -17,6 +16,7 @@ use echolake_schema::Rig;
 use crate::Done;
 use crate::cli::DemoArgs;
 use crate::progress::Progress;
+use crate::signals::StopRequest;
 use measure::Campaign;
 
 /// The surfaces, in the order in which they are measured: name and relief are the same.
@@ -28,6 +28,7 @@ const SWEEP_SECS: f64 = 0.05;
 
 pub(crate) async fn run(args: &DemoArgs, lake_url: &str) -> anyhow::Result<Done> {
     let begun = Instant::now();
+    let stop = super::stop_request()?;
     let surfaces = match args.surfaces {
         Some(count) => collection(args.seed, count as usize)?,
         None => few_surfaces()?,
@@ -36,7 +37,6 @@ pub(crate) async fn run(args: &DemoArgs, lake_url: &str) -> anyhow::Result<Done>
     let lake = Lake::open_or_create(lake_url, &rig, &References::default()).await?;
     let progress = Progress::new();
     progress.say("simulated rig: nothing here is measured");
-    let stop = super::stop_on_interrupt();
     let campaign = Campaign {
         rig,
         surfaces,
@@ -46,16 +46,15 @@ pub(crate) async fn run(args: &DemoArgs, lake_url: &str) -> anyhow::Result<Done>
         known: lake.snapshot().await?.runs().map(|r| r.run.to_string()).collect(),
     };
     let measuring = stop.clone();
-    tokio::task::spawn_blocking(move || campaign.measure(&measuring, &progress)).await??;
-    if stop.load(Ordering::Relaxed) {
-        anyhow::bail!("stopped; hint: the same command goes on where this one ended");
-    }
+    tokio::task::spawn_blocking(move || campaign.measure(measuring.flag(), &progress)).await??;
+    ensure_wanted(&stop)?;
     if args.no_ingest {
         eprintln!("the runs are in inbox/. Next:\n  {} {}ingest", program(), lake_flag(lake_url));
         return Ok(Done::Whole);
     }
     let sources = pending(&lake).await?;
-    super::ingest::take_in(&lake, sources, &stop, &Progress::new()).await?;
+    super::ingest::take_in(&lake, sources, stop.flag(), &Progress::new()).await?;
+    ensure_wanted(&stop)?;
     let example = match args.surfaces {
         Some(_) => print_typologies(&lake).await?,
         None => print_tables(&lake).await?,
@@ -66,7 +65,12 @@ pub(crate) async fn run(args: &DemoArgs, lake_url: &str) -> anyhow::Result<Done>
         return Ok(Done::Whole);
     }
     eprintln!();
-    super::serve::catalogue(&lake).await
+    super::serve::catalogue(&lake, &stop).await
+}
+
+fn ensure_wanted(stop: &StopRequest) -> anyhow::Result<()> {
+    anyhow::ensure!(!stop.is_made(), "stopped; hint: the same command goes on where this one ended");
+    Ok(())
 }
 
 fn few_surfaces() -> anyhow::Result<Vec<Member>> {

@@ -1,54 +1,18 @@
-//! `echolake doctor`: what is in the lake, what is missing and what is damaged.
+//! `echolake doctor`: what is in the lake, what is missing and what is damaged; and what the installation can do.
 
 mod installation;
-
-use std::fmt::Write as _;
-
-use echolake_ingest::doctor::{Finding, Report, Severity, examine};
-use echolake_lake::Lake;
+#[cfg(feature = "lake")]
+mod lake;
 
 use crate::Done;
 use crate::cli::DoctorArgs;
-use crate::progress::Progress;
 
 pub(crate) async fn run(args: &DoctorArgs, lake_url: &str) -> anyhow::Result<Done> {
     if args.installation {
         return installation::run(args.json, lake_url).await;
     }
-    let lake = Lake::open(lake_url).await?;
-    let progress = Progress::new();
-    let mut task = None;
-    let report = examine(&lake, &mut |step| {
-        task.get_or_insert_with(|| progress.task("check", step.total as u64, "files")).at(step.done as u64);
-    })
-    .await?;
-    if let Some(task) = task {
-        task.done(format!("{} runs", report.runs));
-    }
-    match args.json {
-        true => super::print(&serde_json::to_string_pretty(&report)?)?,
-        false => super::print(&text(&lake, &report))?,
-    }
-    Ok(if report.is_damaged() { Done::WithLoss } else { Done::Whole })
-}
-
-fn text(lake: &Lake, report: &Report) -> String {
-    let mut out = format!("lake {}, rig {}\n", lake.location(), lake.rig().name);
-    let _ = writeln!(out, "{} runs, {} in run files\n", report.runs, super::size(report.run_bytes));
-    let _ = writeln!(out, "{:<14} {:>6} {:>10} {:>10}", "table", "files", "rows", "size");
-    for t in &report.tables {
-        let _ = writeln!(out, "{:<14} {:>6} {:>10} {:>10}", t.table, t.files, t.rows, super::size(t.bytes));
-    }
-    for Finding { severity, subject, what } in &report.findings {
-        let word = match severity {
-            Severity::Damaged => "damaged",
-            Severity::Missing => "missing",
-            Severity::Note => "note",
-        };
-        let _ = write!(out, "\n{word}: {subject}: {what}");
-    }
-    if report.findings.is_empty() {
-        let _ = write!(out, "\nnothing is missing or damaged");
-    }
-    out
+    #[cfg(feature = "lake")]
+    return lake::run(args.json, lake_url).await;
+    #[cfg(not(feature = "lake"))]
+    anyhow::bail!("this program has no tables to look into; hint: `echolake doctor --self` looks at the program itself")
 }

@@ -3,7 +3,7 @@
 use std::collections::HashMap;
 use std::path::Path;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::AtomicBool;
 use std::time::Duration;
 
 use anyhow::Context as _;
@@ -17,6 +17,7 @@ use serde_json::json;
 use crate::Done;
 use crate::cli::IngestArgs;
 use crate::progress::Progress;
+use crate::signals::StopRequest;
 
 /// Time between two looks at the inbox.
 const LOOK_EVERY: Duration = Duration::from_secs(2);
@@ -46,9 +47,9 @@ impl Summary {
 }
 
 pub(crate) async fn run(args: &IngestArgs, lake_url: &str) -> anyhow::Result<Done> {
+    let stop = super::stop_request()?;
     let lake = Lake::open(lake_url).await?;
     lake.ensure_tables().await?;
-    let stop = super::stop_on_interrupt();
     let progress = Progress::new();
     if args.watch {
         return watch(&lake, &stop, &progress).await;
@@ -58,7 +59,7 @@ pub(crate) async fn run(args: &IngestArgs, lake_url: &str) -> anyhow::Result<Don
         names => sources_of(&lake, names).await?,
     };
     let nothing = sources.is_empty();
-    let summary = take_in(&lake, sources, &stop, &progress).await?;
+    let summary = take_in(&lake, sources, stop.flag(), &progress).await?;
     if args.json {
         super::print(&serde_json::to_string_pretty(&summary.as_json())?)?;
     }
@@ -131,11 +132,11 @@ pub(crate) async fn take_in(
 
 // What comes into the inbox, until Ctrl-C. A file that somebody copies there grows while we look; one that is as it
 // was at the last look is whole.
-async fn watch(lake: &Lake, stop: &Arc<AtomicBool>, progress: &Progress) -> anyhow::Result<Done> {
+async fn watch(lake: &Lake, stop: &StopRequest, progress: &Progress) -> anyhow::Result<Done> {
     eprintln!("watching `{}/inbox`; Ctrl-C ends it", lake.location());
     let mut before: HashMap<ObjectPath, (u64, chrono::DateTime<chrono::Utc>)> = HashMap::new();
     let mut lost = false;
-    while !stop.load(Ordering::Relaxed) {
+    while !stop.is_made() {
         let mut settled = Vec::new();
         let mut now = HashMap::new();
         for source in all_pending(lake).await? {
@@ -151,20 +152,25 @@ async fn watch(lake: &Lake, stop: &Arc<AtomicBool>, progress: &Progress) -> anyh
         }
         before = now;
         if settled.is_empty() {
-            tokio::time::sleep(LOOK_EVERY).await;
+            pause(LOOK_EVERY, stop).await;
             continue;
         }
-        match take_in(lake, settled, stop, progress).await {
+        match take_in(lake, settled, stop.flag(), progress).await {
             Ok(summary) => lost |= summary.lost(),
-            Err(e) if stop.load(Ordering::Relaxed) => drop(e),
+            Err(e) if stop.is_made() => drop(e),
             // A full disk or an absent store passes; the files are still there.
             Err(e) => {
                 eprintln!("error: {e:#}; trying again in {} s", RETRY_AFTER.as_secs());
-                tokio::time::sleep(RETRY_AFTER).await;
+                pause(RETRY_AFTER, stop).await;
             }
         }
     }
     Ok(if lost { Done::WithLoss } else { Done::Whole })
+}
+
+// Ends early if a stop is requested.
+async fn pause(time: Duration, stop: &StopRequest) {
+    let _ = tokio::time::timeout(time, stop.wait()).await;
 }
 
 fn say(progress: &Progress, taken: &Taken) {

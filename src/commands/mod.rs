@@ -1,22 +1,27 @@
 //! The verbs, a file each.
 
 mod acquire;
+#[cfg(feature = "lake")]
 mod demo;
 mod doctor;
+#[cfg(feature = "lake")]
 pub(crate) mod export;
 mod import;
+#[cfg(feature = "lake")]
 mod ingest;
+#[cfg(feature = "lake")]
 mod optimize;
 pub(crate) mod panel;
 mod recover;
 mod replay;
+#[cfg(feature = "lake")]
 pub(crate) mod serve;
+#[cfg(feature = "lake")]
 pub(crate) mod sql;
+#[cfg(feature = "lake")]
 mod vacuum;
 
 use std::path::Path;
-use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
 
 use anyhow::Context as _;
 use clap::CommandFactory as _;
@@ -24,26 +29,23 @@ use echolake_lake::{Error as LakeError, Lake};
 use echolake_schema::Rig;
 
 use crate::Done;
+#[cfg(feature = "lake")]
+use crate::cli::LakeCommand;
 use crate::cli::{Cli, Command};
+use crate::signals::StopRequest;
 
 /// Runs the command's verb.
 pub(crate) async fn run(cli: Cli) -> anyhow::Result<Done> {
     let lake = &cli.lake;
     match &cli.command {
-        Command::Demo(args) => demo::run(args, lake).await,
+        #[cfg(feature = "lake")]
+        Command::Lake(command) => run_lake(command, lake).await,
         Command::Acquire(args) => acquire::run(args, lake).await,
         Command::Panel(args) => panel::run(args),
         Command::Import(args) => import::run(args, lake).await,
-        Command::Ingest(args) => ingest::run(args, lake).await,
-        Command::Sql(args) => sql::run(args, lake).await.map(|()| Done::Whole),
-        Command::Export(args) => export::run(args, lake).await,
-        Command::Serve(args) => serve::run(args, lake).await,
         Command::Replay(args) => replay::run(args, lake).await,
-        Command::Token { name } => serve::token(name),
         Command::Recover(args) => recover::run(args),
         Command::Doctor(args) => doctor::run(args, lake).await,
-        Command::Optimize(args) => optimize::run(args, lake).await,
-        Command::Vacuum(args) => vacuum::run(args, lake).await,
         Command::Completions { shell } => {
             clap_complete::generate(*shell, &mut Cli::command(), "echolake", &mut std::io::stdout());
             Ok(Done::Whole)
@@ -54,6 +56,21 @@ pub(crate) async fn run(cli: Cli) -> anyhow::Result<Done> {
             written.with_context(|| format!("cannot write man pages to `{}`", folder.display()))?;
             Ok(Done::Whole)
         }
+    }
+}
+
+/// Runs a verb that needs the lake's tables.
+#[cfg(feature = "lake")]
+async fn run_lake(command: &LakeCommand, lake: &str) -> anyhow::Result<Done> {
+    match command {
+        LakeCommand::Demo(args) => demo::run(args, lake).await,
+        LakeCommand::Ingest(args) => ingest::run(args, lake).await,
+        LakeCommand::Sql(args) => sql::run(args, lake).await.map(|()| Done::Whole),
+        LakeCommand::Export(args) => export::run(args, lake).await,
+        LakeCommand::Serve(args) => serve::run(args, lake).await,
+        LakeCommand::Token { name } => serve::token(name),
+        LakeCommand::Optimize(args) => optimize::run(args, lake).await,
+        LakeCommand::Vacuum(args) => vacuum::run(args, lake).await,
     }
 }
 
@@ -99,18 +116,7 @@ fn inbox(lake: &Lake) -> anyhow::Result<std::path::PathBuf> {
     Ok(folder)
 }
 
-/// Becomes true at the first Ctrl-C, so that work ends at a clean place; the second one ends at once.
-fn stop_on_interrupt() -> Arc<AtomicBool> {
-    let stop = Arc::new(AtomicBool::new(false));
-    let flag = stop.clone();
-    tokio::spawn(async move {
-        if tokio::signal::ctrl_c().await.is_ok() {
-            flag.store(true, Ordering::Relaxed);
-            eprintln!("stopping at the next clean place; Ctrl-C again stops at once");
-        }
-        if tokio::signal::ctrl_c().await.is_ok() {
-            std::process::exit(130);
-        }
-    });
-    stop
+/// Listens for a request to stop work that ends at a clean place.
+fn stop_request() -> anyhow::Result<StopRequest> {
+    StopRequest::listen("stopping at the next clean place; Ctrl-C again stops at once")
 }

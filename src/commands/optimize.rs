@@ -7,12 +7,12 @@ use crate::cli::OptimizeArgs;
 use crate::progress::Progress;
 
 pub(crate) async fn run(args: &OptimizeArgs, lake_url: &str) -> anyhow::Result<Done> {
+    let stop = super::stop_request()?;
     let lake = Lake::open(lake_url).await?;
-    let stop = super::stop_on_interrupt();
     let progress = Progress::new();
     let mut task = None;
     let done = lake
-        .optimize(args.target_mb << 20, &stop, &mut |at| {
+        .optimize(args.target_mb << 20, stop.flag(), &mut |at| {
             task.get_or_insert_with(|| progress.task("optimize", at.total as u64, "files")).at(at.done as u64);
         })
         .await;

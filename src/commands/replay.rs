@@ -1,12 +1,13 @@
 //! `echolake replay`: runs shown again to Foxglove, as fast and from where its user likes.
 
 use std::path::{Path, PathBuf};
-use std::sync::atomic::Ordering;
 use std::time::Duration;
 
+#[cfg(feature = "lake")]
 use anyhow::Context as _;
 use echolake_acquisition::replay::{Recording, ReplayOptions, ReplayServer, Standing};
 use echolake_lake::Lake;
+#[cfg(feature = "lake")]
 use echolake_schema::{RunId, SurfaceId};
 
 use crate::Done;
@@ -16,11 +17,12 @@ use crate::progress::{Progress, Task};
 /// How often it is looked how the replay stands.
 const LOOK_EVERY: Duration = Duration::from_millis(200);
 /// Names that an error lists.
+#[cfg(feature = "lake")]
 const LISTED: usize = 20;
 
 pub(crate) async fn run(args: &ReplayArgs, lake_url: &str) -> anyhow::Result<Done> {
+    let stop = super::stop_request()?;
     let paths = paths(&args.runs, lake_url).await?;
-    let stop = super::stop_on_interrupt();
     let progress = Progress::new();
     let (recordings, lost) = tokio::task::block_in_place(|| open(&paths, &progress));
     anyhow::ensure!(!recordings.is_empty(), "none of the recordings can be replayed");
@@ -34,8 +36,9 @@ pub(crate) async fn run(args: &ReplayArgs, lake_url: &str) -> anyhow::Result<Don
     }
     let mut task = progress.task("replay", server.length_secs().ceil() as u64, "s");
     let mut said = 0;
-    while !stop.load(Ordering::Relaxed) {
-        tokio::time::sleep(LOOK_EVERY).await;
+    while !stop.is_made() {
+        // The time that runs out is the usual end of this wait.
+        let _ = tokio::time::timeout(LOOK_EVERY, stop.wait()).await;
         let standing = server.standing();
         show(&mut task, &standing, &mut said);
     }
@@ -105,6 +108,7 @@ async fn paths(names: &[String], lake_url: &str) -> anyhow::Result<Vec<PathBuf>>
 }
 
 // Of a surface its newest run.
+#[cfg(feature = "lake")]
 async fn run_file(lake: &Lake, name: &str) -> anyhow::Result<PathBuf> {
     let folder =
         lake.folder().context("a replay needs a lake in a folder; hint: --lake FOLDER, or name .mcap files")?;
@@ -120,4 +124,11 @@ async fn run_file(lake: &Lake, name: &str) -> anyhow::Result<PathBuf> {
         format!("there is no run, surface or file `{name}`; hint: there are surfaces {}{more}", known.join(", "))
     })?;
     Ok(folder.join(Lake::run_path(&found.surface, &found.run).as_ref()))
+}
+
+// Only the tables tell which file is a surface's newest run.
+#[cfg(not(feature = "lake"))]
+#[expect(clippy::unused_async, reason = "the other build's function waits")]
+async fn run_file(_: &Lake, name: &str) -> anyhow::Result<PathBuf> {
+    anyhow::bail!("there is no file `{name}`; hint: this program has no tables to look it up in, name .mcap files")
 }

@@ -4,14 +4,13 @@ use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 use std::path::PathBuf;
 use std::str::FromStr;
 
-use anyhow::Context as _;
 use echolake_lake::Lake;
 use echolake_query::Limits;
 use echolake_server::tokens::{self, Tokens};
 use echolake_server::{CataloguePages, Error, Server, Settings};
-use tokio::signal::unix::{SignalKind, signal};
 
 use crate::Done;
+use crate::signals::StopRequest;
 
 /// Memory for queries, and how many of them may be heavy, if nobody says otherwise.
 const MEMORY_MIB: u32 = 4096;
@@ -70,6 +69,7 @@ impl Listen {
 const HTTP: SocketAddr = SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 8080);
 
 pub(crate) async fn run(args: &ServeArgs, lake_url: &str) -> anyhow::Result<Done> {
+    let stop = StopRequest::listen("stopping: answers may go on for five seconds; Ctrl-C again stops at once")?;
     let lake = Lake::open(lake_url).await?;
     let settings = Settings {
         http: args.listen.address(),
@@ -81,11 +81,11 @@ pub(crate) async fn run(args: &ServeArgs, lake_url: &str) -> anyhow::Result<Done
     let server = Server::bind(&lake, settings).await?;
     anyhow::ensure!(!server.addresses().is_empty(), "nothing to listen on; hint: all three are off");
     eprintln!("lake {}", lake.location());
-    answer(server).await
+    answer(server, &stop).await
 }
 
 /// Serves the catalogue alone, where others look for it or, if somebody else is there, on any port that is free.
-pub(crate) async fn catalogue(lake: &Lake) -> anyhow::Result<Done> {
+pub(crate) async fn catalogue(lake: &Lake, stop: &StopRequest) -> anyhow::Result<Done> {
     let settings = |http| Settings {
         http: Some(http),
         flight_sql: None,
@@ -98,29 +98,21 @@ pub(crate) async fn catalogue(lake: &Lake) -> anyhow::Result<Done> {
         bound => bound?,
     };
     eprintln!("the catalogue, until Ctrl-C:");
-    answer(server).await
+    answer(server, stop).await
 }
 
 fn limits(memory_mib: u32, heavy: u32) -> Limits {
     Limits { memory: Some((memory_mib as usize) << 20), heavy: heavy as usize }
 }
 
-async fn answer(server: Server) -> anyhow::Result<Done> {
+async fn answer(server: Server, stop: &StopRequest) -> anyhow::Result<Done> {
     if let Some(problem) = CataloguePages::THIS_BUILD.problem() {
         eprintln!("note: this program was {problem}");
     }
     for address in server.addresses() {
         eprintln!("  {address}");
     }
-    let mut terminate = signal(SignalKind::terminate()).context("cannot listen for SIGTERM")?;
-    let stop = async {
-        tokio::select! {
-            _ = tokio::signal::ctrl_c() => {}
-            _ = terminate.recv() => {}
-        }
-        eprintln!("stopping: answers may go on for five seconds");
-    };
-    server.run(stop).await?;
+    server.run(stop.wait()).await?;
     Ok(Done::Whole)
 }
 

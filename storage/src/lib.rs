@@ -16,31 +16,23 @@
 //! # Ok::<(), Box<dyn std::error::Error>>(())
 //! ```
 
-mod commit_log;
 mod config;
-mod data_file;
-mod delta;
 mod durable;
 mod error;
 mod lake;
-mod lease;
 mod location;
-mod optimize;
-mod rig_tables;
-mod rows;
-mod snapshot;
-mod vacuum;
-mod versions;
+#[cfg(feature = "tables")]
+mod tables;
 
-pub use commit_log::{Commit, CommitLog, Committed, DataFile, Effect, FileStats, History, NewFile, Part, Replaces};
 pub use config::{LAKE_FORMAT, LakeConfig, References};
-pub use data_file::{EncodedFile, FileEncoder, encode};
 pub use error::{Error, StoreError};
-pub use lake::{Lake, Staged};
-pub use optimize::{Merging, Optimized, TARGET_BYTES, TableOptimized};
-pub use snapshot::{FileName, Snapshot, VisibleRun};
-pub use vacuum::{Deletion, Freed, KEEP_HOURS, Vacuumed};
-pub use versions::{Moment, NoMoment, TableVersion};
+pub use lake::Lake;
+#[cfg(feature = "tables")]
+pub use tables::{
+    Commit, CommitLog, Committed, DataFile, Deletion, Effect, EncodedFile, FileEncoder, FileName, FileStats, Freed,
+    History, KEEP_HOURS, Merging, Moment, NewFile, NoMoment, Optimized, Part, Replaces, Snapshot, Staged, TARGET_BYTES,
+    TableOptimized, TableVersion, Vacuumed, VisibleRun, encode,
+};
 
 /// The result of what a lake does.
 pub type Result<T> = std::result::Result<T, Error>;

@@ -2,10 +2,13 @@
 
 use std::io::{Read as _, Write as _};
 use std::net::{Shutdown, TcpStream};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use rand::{Rng as _, RngCore as _};
 use rand_chacha::ChaCha8Rng;
+
+/// No answer to changed bytes goes on for so long.
+const LONGEST_ANSWER: Duration = Duration::from_secs(300);
 
 /// What four bytes are replaced by: lengths and counts at their edges.
 const EXTREMES: [u32; 8] = [0, 1, 3, 0x7f, 0xffff, 0x7fff_ffff, 0x8000_0000, 0xffff_ffff];
@@ -130,8 +133,10 @@ pub(super) fn send(address: &str, bytes: &[u8], patience: Duration) -> usize {
     let _ = stream.write_all(bytes);
     let _ = stream.shutdown(Shutdown::Write);
     let (mut heard, mut buffer) = (0, [0; 4096]);
+    let end = Instant::now() + LONGEST_ANSWER;
     while let Ok(count @ 1..) = stream.read(&mut buffer) {
         heard += count;
+        assert!(Instant::now() < end, "an answer without an end: {heard} bytes");
     }
     heard
 }

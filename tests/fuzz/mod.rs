@@ -9,6 +9,7 @@ use rand::{Rng as _, SeedableRng as _};
 use rand_chacha::ChaCha8Rng;
 
 use super::SMALL_RIG;
+use super::child::run_command;
 use super::serve::http::Request;
 use super::serve::server::Served;
 
@@ -17,8 +18,10 @@ mod sql;
 
 /// What a query may take of time and memory, and how many rows it may have.
 const LIMITS: &str = "seconds = 2\nmemory_mb = 200\nrows = 100000\n";
-/// How long to wait for more of an answer to changed bytes, and for the rest of a backtrace.
+/// How long to wait for more of an answer to changed bytes: many are the beginning of a request, and get none.
 const PATIENCE: Duration = Duration::from_secs(1);
+/// How long to wait for the rest of a backtrace.
+const BACKTRACE_LIMIT: Duration = Duration::from_secs(60);
 /// A server on which a plain query runs out of time for so long is harmed.
 const BUSY: Duration = Duration::from_secs(60);
 
@@ -75,13 +78,9 @@ impl Campaign {
         let path = |name: &str| folder.path().join(name);
         std::fs::write(path("rig.toml"), SMALL_RIG).expect("written");
         let run = |args: &[&str]| {
-            let output = std::process::Command::new(binary)
-                .args(["--lake", "lake"])
-                .args(args)
-                .current_dir(folder.path())
-                .env_remove("ECHOLAKE_LAKE")
-                .output()
-                .expect("the command starts");
+            let mut command = std::process::Command::new(binary);
+            command.args(["--lake", "lake"]).args(args).current_dir(folder.path()).env_remove("ECHOLAKE_LAKE");
+            let output = run_command(&mut command).expect("the command starts");
             assert!(output.status.success(), "{args:?}: {}", String::from_utf8_lossy(&output.stderr));
             output
         };
@@ -134,7 +133,7 @@ impl Campaign {
         };
         let told = std::time::Instant::now();
         // A panic's backtrace comes line by line.
-        while counts()[0] != counts()[1] && told.elapsed() < PATIENCE {
+        while counts()[0] != counts()[1] && told.elapsed() < BACKTRACE_LIMIT {
             std::thread::sleep(Duration::from_millis(20));
         }
         let [panics, broken] = counts();

@@ -16,7 +16,7 @@ use tonic::transport::{Channel, Endpoint};
 use attempts::{SECRET, files};
 
 use super::http::Request;
-use super::server::Served;
+use super::server::{ANSWER_LIMIT, Served};
 use super::slices::{encoded, slice};
 use super::{Place, get, lake, postgres, served};
 
@@ -131,14 +131,19 @@ fn none_over_postgres() {
 #[tokio::test(flavor = "multi_thread")]
 async fn none_over_flight_sql() {
     let scene = Scene::new();
-    let channel = Endpoint::from_shared(format!("http://{}", scene.server.flight_sql)).expect("a URL").connect().await;
+    let endpoint = Endpoint::from_shared(format!("http://{}", scene.server.flight_sql)).expect("a URL");
+    // Limits each request that is asked below without a limit of its own.
+    let channel = endpoint.connect_timeout(ANSWER_LIMIT).timeout(ANSWER_LIMIT).connect().await;
     let mut client = FlightSqlServiceClient::new(channel.expect("connected"));
     for (number, attempt) in scene.attempts().iter().enumerate() {
-        let said = match number % 3 {
-            0 => flight(&mut client, attempt).await,
-            1 => prepared(&mut client, attempt).await,
-            _ => client.execute_update(attempt.clone(), None).await.map(|n| n.to_string()),
+        let answer = async {
+            match number % 3 {
+                0 => flight(&mut client, attempt).await,
+                1 => prepared(&mut client, attempt).await,
+                _ => client.execute_update(attempt.clone(), None).await.map(|n| n.to_string()),
+            }
         };
+        let said = tokio::time::timeout(ANSWER_LIMIT, answer).await.unwrap_or_else(|_| panic!("{attempt}: no answer"));
         let said = format!("{said:?}");
         assert!(!said.contains(SECRET) && !said.contains("defect"), "{attempt}: {said}");
     }

@@ -1,10 +1,10 @@
 //! As much of an HTTP client as these tests need, so that they see what is on the wire.
 
 use std::fmt::Write as _;
-use std::io::{Read as _, Write as _};
+use std::io::{ErrorKind, Read as _, Write as _};
 use std::net::TcpStream;
 
-use super::server::Served;
+use super::server::{ANSWER_LIMIT, Served};
 
 /// A request.
 pub(crate) struct Request {
@@ -54,7 +54,7 @@ impl Request {
 
     /// Sends it and does not wait.
     pub(crate) fn begin(self, server: &Served) -> TcpStream {
-        let mut stream = TcpStream::connect(&server.http).expect("connected");
+        let mut stream = Served::connect(&server.http);
         let host = self.host.as_ref().unwrap_or(&server.http);
         let head = format!(
             "{} {} HTTP/1.1\r\nhost: {host}\r\nconnection: close\r\ncontent-length: {}\r\n{}\r\n",
@@ -75,10 +75,14 @@ impl Request {
 
     /// None where the connection ended before an answer began.
     pub(crate) fn attempt(self, server: &Served) -> Option<Answer> {
+        let name = format!("{} {}", self.method, self.path);
         let mut stream = self.begin(server);
         let mut bytes = Vec::new();
-        // A connection that is broken off ends in an error, after what came.
-        let _ = stream.read_to_end(&mut bytes);
+        // A connection that is broken off ends in an error, after what came; one that hangs is a failure.
+        if let Err(error) = stream.read_to_end(&mut bytes) {
+            let is_late = matches!(error.kind(), ErrorKind::WouldBlock | ErrorKind::TimedOut);
+            assert!(!is_late, "{name}: nothing more for {ANSWER_LIMIT:?}, after {} bytes", bytes.len());
+        }
         Answer::read(&bytes)
     }
 }

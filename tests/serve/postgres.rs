@@ -18,7 +18,7 @@ pub(crate) type Rows = Result<Vec<Vec<Option<String>>>, String>;
 impl Client {
     /// Connects; where no token is asked for, the session has begun.
     pub(crate) fn connect(server: &Served, options: Option<&str>) -> Self {
-        let mut stream = TcpStream::connect(&server.postgres).expect("connected");
+        let mut stream = Served::connect(&server.postgres);
         let mut body = 196_608_i32.to_be_bytes().to_vec();
         for (name, value) in
             [("user", "me"), ("database", "datafusion")].into_iter().chain(options.map(|o| ("options", o)))
@@ -68,7 +68,7 @@ impl Client {
 
     /// Ends what runs, as a second connection does.
     pub(crate) fn cancel(&self, server: &Served) {
-        let mut stream = TcpStream::connect(&server.postgres).expect("connected");
+        let mut stream = Served::connect(&server.postgres);
         let mut packet = ((8 + self.key.len()) as i32).to_be_bytes().to_vec();
         packet.extend(80_877_102_i32.to_be_bytes());
         packet.extend(&self.key);

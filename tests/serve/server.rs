@@ -1,14 +1,18 @@
 //! A server of the test's own, on ports that are free.
 
-use std::io::{BufRead as _, BufReader};
+use std::net::TcpStream;
 use std::path::Path;
-use std::process::{Child, Command, Stdio};
-use std::sync::{Arc, Mutex};
+use std::process::Command;
+use std::time::Duration;
+
+use super::super::child::ChildProcess;
+
+/// How long a client waits for the next bytes of an answer, or until it may send more of a request.
+pub(crate) const ANSWER_LIMIT: Duration = Duration::from_secs(120);
 
 /// A server; dropping it ends it.
 pub(crate) struct Served {
-    child: Child,
-    said: Arc<Mutex<Vec<String>>>,
+    child: ChildProcess,
     /// `host:port` of each protocol.
     pub(crate) http: String,
     pub(crate) flight_sql: String,
@@ -19,38 +23,40 @@ impl Served {
     /// Serves the lake `lake` of a folder.
     pub(crate) fn start(binary: &Path, folder: &Path, more: &[&str]) -> Self {
         let any = "127.0.0.1:0";
-        let mut child = Command::new(binary)
+        let mut command = Command::new(binary);
+        command
             .args(["--lake", "lake", "serve", "--listen", any, "--flight-sql", any, "--postgres", any])
             .args(more)
             .current_dir(folder)
             .env_remove("ECHOLAKE_LAKE")
             // Where something panics, who called it is told.
-            .env("RUST_BACKTRACE", "1")
-            .stderr(Stdio::piped())
-            .spawn()
-            .expect("the command starts");
-        let mut lines = BufReader::new(child.stderr.take().expect("stderr")).lines().map(|l| l.expect("a line"));
+            .env("RUST_BACKTRACE", "1");
+        let mut child = ChildProcess::start(&mut command).expect("the command starts");
         let mut address = |scheme: &str| {
-            let line = lines.find(|l| l.contains(scheme)).unwrap_or_else(|| panic!("no {scheme} is served"));
+            let line = child.wait_for_line(scheme);
             let rest = line.split_once("://").expect("a URL").1;
             rest.split('/').next().expect("host and port").to_owned()
         };
         let (http, flight_sql, postgres) = (address("http://"), address("grpc://"), address("postgresql://"));
-        // What it says later must not fill the pipe.
-        let said = Arc::new(Mutex::new(Vec::new()));
-        let heard = said.clone();
-        std::thread::spawn(move || lines.for_each(|line| heard.lock().expect("lines").push(line)));
-        Self { child, said, http, flight_sql, postgres }
+        Self { child, http, flight_sql, postgres }
     }
 
-    /// What it said on stderr since it listens.
+    /// A connection to one of its addresses, on which nothing is waited for without a limit.
+    pub(crate) fn connect(address: &str) -> TcpStream {
+        let stream = TcpStream::connect(address).expect("connected");
+        stream.set_read_timeout(Some(ANSWER_LIMIT)).expect("a limit of time");
+        stream.set_write_timeout(Some(ANSWER_LIMIT)).expect("a limit of time");
+        stream
+    }
+
+    /// What it said on stderr so far.
     pub(crate) fn said(&self) -> Vec<String> {
-        self.said.lock().expect("lines").clone()
+        self.child.stderr().lines().map(str::to_owned).collect()
     }
 
     /// Whether its process is there.
     pub(crate) fn is_up(&mut self) -> bool {
-        self.child.try_wait().expect("its state").is_none()
+        self.child.is_running()
     }
 
     /// What its process weighs.
@@ -62,16 +68,7 @@ impl Served {
 
     /// Tells it to stop; returns its exit code.
     pub(crate) fn terminate(&mut self) -> Option<i32> {
-        let told = Command::new("kill").arg(self.child.id().to_string()).status().expect("kill starts");
-        assert!(told.success());
-        self.child.wait().expect("its end").code()
-    }
-}
-
-impl Drop for Served {
-    fn drop(&mut self) {
-        // It may have ended already.
-        let _ = self.child.kill();
-        let _ = self.child.wait();
+        self.child.signal("TERM");
+        self.child.wait().status.code()
     }
 }

@@ -1,6 +1,6 @@
 //! What the pages must do, tried in a browser: `node tests/behaviour.mjs http://127.0.0.1:8420`.
 import assert from 'node:assert/strict'
-import { launch } from './browser.mjs'
+import { contextOf, eventually, launch } from './browser.mjs'
 
 const base = process.argv[2]
 const get = async (path) => (await fetch(base + path)).json()
@@ -9,7 +9,7 @@ const lake = await get('/api/v1/lake')
 const all = await get('/api/v1/surfaces?limit=500')
 const id = all.items.find((s) => s.typology !== 'reference').surface_id
 const browser = await launch()
-const context = await browser.newContext({ viewport: { width: 1280, height: 900 }, deviceScaleFactor: 1, acceptDownloads: true })
+const context = await contextOf(browser, { viewport: { width: 1280, height: 900 }, deviceScaleFactor: 1, acceptDownloads: true })
 const page = await context.newPage()
 const said = []
 page.on('console', (message) => { if (!message.text().includes('GPU stall due to ReadPixels')) said.push(message.text()) })
@@ -50,12 +50,15 @@ await check('the grid plot’s pixels have the colours that SQL says', async () 
       db: row[band.key], what: `point ${row.point}, band ${band.key}`,
     }))
   })
-  const colours = await page.evaluate((places) => {
+  const drawn = () => page.evaluate((places) => {
     const canvas = document.querySelector('.cells canvas')
     const { data } = canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height)
     return places.map(({ x, y }) => [...data.slice(4 * (y * canvas.width + x), 4 * (y * canvas.width + x) + 3)])
   }, wanted)
-  wanted.forEach((cell, i) => assert.deepEqual(colours[i], expected(cell.db), `${cell.what}, ${cell.db} dB`))
+  await eventually(async () => {
+    const colours = await drawn()
+    wanted.forEach((cell, i) => assert.deepEqual(colours[i], expected(cell.db), `${cell.what}, ${cell.db} dB`))
+  })
   const seen = wanted.length
   assert.ok(seen > 300, `${seen} cells`)
 })
@@ -66,14 +69,17 @@ await check('a facet click changes the address and the counts, and a fresh link 
   const facet = all.facets.find((f) => f.name === 'typology').values[0]
   await page.locator('button.value', { hasText: facet.value.replaceAll('_', ' ') }).first().click()
   await page.waitForFunction((text) => document.querySelector('h1').innerText !== text, before)
+  await page.waitForURL(new RegExp(`typology=${facet.value}`))
   await settled()
-  assert.match(page.url(), new RegExp(`typology=${facet.value}`))
-  const shown = await page.locator('h1').innerText()
-  assert.ok(shown.startsWith(String(facet.count)), shown)
-  const cards = await page.locator('.sheet li').allInnerTexts()
+  const heading = () => page.locator('h1').innerText()
+  await eventually(async () => assert.ok((await heading()).startsWith(String(facet.count)), await heading()))
+  const shown = await heading()
+  const sheet = () => page.locator('.sheet li').allInnerTexts()
+  await page.waitForFunction(() => document.querySelector('.sheet').ariaBusy === 'false')
+  const cards = await sheet()
   await open(page.url().slice(base.length))
-  assert.equal(await page.locator('h1').innerText(), shown)
-  assert.deepEqual(await page.locator('.sheet li').allInnerTexts(), cards)
+  await eventually(async () => assert.equal(await heading(), shown))
+  await eventually(async () => assert.deepEqual(await sheet(), cards))
   await page.goBack()
 })
 
@@ -92,13 +98,16 @@ await check('the relief is not blank, and shows more once a pair is chosen', asy
     return { colours: colours.size, orange }
   })
   await open(`/surfaces/${id}?microphone=14`)
-  await page.waitForTimeout(900)
-  const alone = await kinds()
-  assert.ok(alone.colours > 50, `${alone.colours} colours`)
+  const alone = await eventually(async () => {
+    const seen = await kinds()
+    assert.ok(seen.colours > 50, `${seen.colours} colours`)
+    return seen
+  })
   await open(`/surfaces/${id}?microphone=14&point=40`)
-  await page.waitForTimeout(900)
-  const pair = await kinds()
-  assert.ok(pair.orange > alone.orange + 50, `${pair.orange} pixels of the speaker and its path`)
+  await eventually(async () => {
+    const pair = await kinds()
+    assert.ok(pair.orange > alone.orange + 50, `${pair.orange} pixels of the speaker and its path`)
+  })
 })
 
 await check('a click makes a point the microphone, another chooses the pair', async () => {
@@ -106,21 +115,23 @@ await check('a click makes a point the microphone, another chooses the pair', as
   await settled()
   const box = await page.locator('.cells').boundingBox()
   await page.mouse.click(box.x + 58 + 8, box.y + 22 + 8)
+  await page.waitForURL(/microphone=5(&|$)/)
   await settled()
-  assert.match(page.url(), /microphone=5(&|$)/)
   await page.mouse.click(box.x + 58 + 60, box.y + 22 + 60)
-  await settled()
-  assert.match(page.url(), /microphone=5&point=\d+/)
+  await page.waitForURL(/microphone=5&point=\d+/)
   await page.locator('a', { hasText: 'Open impulse response' }).waitFor()
 })
 
 await check('the keyboard alone reaches an impulse response from the wall', async () => {
   await open('/')
+  await page.locator('.sheet li').first().waitFor()
   for (let i = 0; i < 120; i += 1) {
     await page.keyboard.press('Tab')
     if (await page.evaluate((wanted) => document.activeElement?.dataset?.id !== undefined && wanted !== '', id)) break
   }
-  while (await page.evaluate((wanted) => document.activeElement?.dataset?.id !== wanted, id)) await page.keyboard.press('ArrowRight')
+  const isFocused = () => page.evaluate((wanted) => document.activeElement?.dataset?.id === wanted, id)
+  for (let i = 0; i < all.items.length && !(await isFocused()); i += 1) await page.keyboard.press('ArrowRight')
+  assert.ok(await isFocused(), 'the arrows reach the surface')
   await page.keyboard.press('Enter')
   await page.waitForURL(`**/surfaces/${id}`)
   await settled()
@@ -162,10 +173,11 @@ await check('the console shows rows of every table, integers of 64 bits to the l
   assert.ok(tables.length > 10, `${tables.length} tables`)
   for (const { name } of tables) {
     await open(`/sql?q=${encodeURIComponent(`select * from ${name} limit 3`)}`)
-    await page.locator('.rows tbody tr').first().waitFor({ timeout: 10_000 }).catch(() => assert.fail(`no rows of ${name} are shown: ${said.join(' ')}`))
+    await page.locator('.rows tbody tr').first().waitFor().catch(() => assert.fail(`no rows of ${name} are shown: ${said.join(' ')}`))
   }
   const odd = 'select 1767718800000000001 as ns, arrow_cast(9007199254740993, \'UInt64\') as large, [9007199254740993] as list, to_timestamp_seconds(9000000000000) as late, named_struct(\'n\', -5) as s'
   await open(`/sql?q=${encodeURIComponent(odd)}`)
+  await page.locator('.rows tbody td').first().waitFor()
   assert.deepEqual(await page.locator('.rows tbody td').allInnerTexts(), ['1767718800000000001', '9007199254740993', '9007199254740993', 'out of range', '{"n":-5}'])
 })
 
@@ -183,7 +195,7 @@ await check('names from the lake stay text', async () => {
 })
 
 await check('what the first view costs', async () => {
-  const fresh = await browser.newContext({ viewport: { width: 1280, height: 900 } })
+  const fresh = await contextOf(browser, { viewport: { width: 1280, height: 900 } })
   const first = await fresh.newPage()
   let script = 0
   first.on('response', async (response) => { if (response.url().endsWith('.js')) script += Number(response.headers()['content-length'] ?? 0) })

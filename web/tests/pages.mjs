@@ -2,7 +2,7 @@
 //! empty or axe finds a violation: `node tests/pages.mjs http://127.0.0.1:8420 shots [only]`.
 import { mkdir, readFile } from 'node:fs/promises'
 import { createRequire } from 'node:module'
-import { launch } from './browser.mjs'
+import { contextOf, launch } from './browser.mjs'
 
 const [base, folder = 'shots', only = ''] = process.argv.slice(2)
 const axe = await readFile(createRequire(import.meta.url).resolve('axe-core/axe.min.js'), 'utf8')
@@ -29,7 +29,7 @@ let failures = 0
 const fail = (text) => { failures += 1; process.stdout.write(`FAIL ${text}\n`) }
 for (const theme of ['light', 'dark']) {
   for (const width of [1280, 390]) {
-    const context = await browser.newContext({ viewport: { width, height: width === 390 ? 844 : 900 }, colorScheme: theme, hasTouch: width === 390, bypassCSP: false })
+    const context = await contextOf(browser, { viewport: { width, height: width === 390 ? 844 : 900 }, colorScheme: theme, hasTouch: width === 390, bypassCSP: false })
     const page = await context.newPage()
     await page.addInitScript(() => {
       globalThis.jumps = []

@@ -15,7 +15,7 @@ use super::audio::tests::{Cable, Fault as AudioFault, since};
 use super::rosbridge::RosbridgeRobots;
 use super::rosbridge::fake::{FakeBridge, Fault};
 use super::serial::SerialSensor;
-use super::serial::tests::{FakeSensor, GOOD};
+use super::serial::tests::{FakeSensor, GOOD, IMPATIENT_SECS, PATIENT_SECS};
 use super::*;
 use crate::controller::{Control, Error as RunError, Event, Keep, RunController, RunOptions, Work};
 use crate::recorder::{Recorder, RunStart, Tried};
@@ -45,12 +45,17 @@ impl Room {
     }
 
     fn devices(&self, audio: Aligned<Cable>) -> Devices {
-        let params = RosbridgeParams { url: self.bridge.url(), speed: 1.0, timeout_secs: 1.0, ..Default::default() };
+        self.devices_with_sensor_timeout(audio, PATIENT_SECS)
+    }
+
+    fn devices_with_sensor_timeout(&self, audio: Aligned<Cable>, sensor_secs: f64) -> Devices {
+        let params =
+            RosbridgeParams { url: self.bridge.url(), speed: 1.0, timeout_secs: PATIENT_SECS, ..Default::default() };
         let robots = RosbridgeRobots::connect(&params, Cell::of(&self.rig)).expect("connected");
         Devices {
             robots: Box::new(robots),
             audio: Box::new(audio),
-            sensor: Box::new(SerialSensor::open(&self.sensor.params()).expect("open")),
+            sensor: Box::new(SerialSensor::open(&self.sensor.params(sensor_secs)).expect("open")),
             origin: Origin::Measured,
         }
     }
@@ -153,7 +158,7 @@ fn faults_in_mid_run_are_named_and_nothing_is_lost() {
     type Pull = fn(&mut Room);
     let check = |pull: Pull, expected: &str| {
         let mut room = Room::of(&RIG.replace("[0.0, 0.0, 304.0]", "[0.0, 0.0, 304.0], [-62.5, -62.5, 214.0]"));
-        let devices = room.devices(since(Timestamp::now(), &[]));
+        let devices = room.devices_with_sensor_timeout(since(Timestamp::now(), &[]), IMPATIENT_SECS);
         let ended = run(&mut room, devices, &mut |room, done| {
             // Good lines may be waiting yet: only the pair after this one is measured without any.
             if done == 3 {

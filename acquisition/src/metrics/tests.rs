@@ -8,6 +8,9 @@ use echolake_schema::messages::{Measurement, Verdict};
 
 use super::*;
 
+/// How long the other side may take; a busy machine needs some of it.
+const ANSWER_LIMIT: Duration = Duration::from_secs(60);
+
 fn told() -> RunMetrics {
     let metrics = RunMetrics::new("0015_0", 2951, 100);
     let attempt = |verdict: Verdict, snr_db| Measurement { verdict: verdict.into(), snr_db, ..Measurement::default() };
@@ -43,6 +46,7 @@ fn prometheus_asks_and_gets_an_answer() {
     let server = MetricsServer::start(([127, 0, 0, 1], 0).into(), told()).expect("a server");
     let ask = |request: &str| {
         let mut stream = TcpStream::connect(server.address()).expect("connected");
+        stream.set_read_timeout(Some(ANSWER_LIMIT)).expect("a limit of time");
         stream.write_all(format!("{request}\r\nHost: a\r\n\r\n").as_bytes()).expect("sent");
         let mut answer = String::new();
         stream.read_to_string(&mut answer).expect("an answer");
@@ -84,7 +88,7 @@ fn targets_are_read_or_named() {
 #[test]
 fn a_store_is_told_a_last_time_at_the_end() {
     let socket = UdpSocket::bind("127.0.0.1:0").expect("a socket");
-    socket.set_read_timeout(Some(Duration::from_secs(10))).expect("set");
+    socket.set_read_timeout(Some(ANSWER_LIMIT)).expect("set");
     let host = socket.local_addr().expect("an address").to_string();
     let (metrics, hour) = (told(), Duration::from_secs(3_600));
     drop(InfluxPush::start(Target::Udp { host }, metrics, hour, |e| panic!("{e}")));
@@ -100,10 +104,12 @@ fn a_store_that_refuses_is_told_of() {
     let answers = std::thread::spawn(move || {
         ["204 No Content", "400 Bad Request"].map(|status| {
             let (mut stream, _) = listener.accept().expect("a client");
+            stream.set_read_timeout(Some(ANSWER_LIMIT)).expect("a limit of time");
             let mut request = Vec::new();
             let mut part = [0; 4096];
             while !request.ends_with(b"\n") || request.ends_with(b"\r\n\r\n") {
                 let read = stream.read(&mut part).expect("a request");
+                assert_ne!(read, 0, "it ends early: {}", String::from_utf8_lossy(&request));
                 request.extend(&part[..read]);
             }
             write!(stream, "HTTP/1.1 {status}\r\nContent-Length: 0\r\n\r\n").expect("answered");

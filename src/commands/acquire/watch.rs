@@ -6,6 +6,7 @@ use std::sync::Arc;
 use std::sync::atomic::Ordering;
 use std::time::Instant;
 
+use anyhow::Context as _;
 use echolake_acquisition::controller::{Control, Event};
 use echolake_acquisition::metrics::RunMetrics;
 use echolake_acquisition::recorder::{Cost, free_bytes};
@@ -14,6 +15,7 @@ use echolake_schema::messages::Verdict;
 use tokio::signal::unix::{SignalKind, signal};
 
 use crate::progress::{Progress, Task};
+use crate::signals::StopRequest;
 
 /// The progress of one run.
 pub(super) struct Watcher {
@@ -93,27 +95,22 @@ impl Watcher {
     }
 }
 
-/// Lets signals and the terminal control a run: Ctrl-C and SIGTERM stop it after the current pair, a second Ctrl-C at
-/// once; SIGUSR1, or `p` and Enter on a terminal, pauses it and lets it go on.
-pub(super) fn obey(control: &Arc<Control>) {
+/// Lets signals and the terminal control a run from now on: Ctrl-C and SIGTERM stop it after the current pair, a second
+/// one at once; SIGUSR1, or `p` and Enter on a terminal, pauses it and lets it go on.
+///
+/// # Errors
+/// The system refused a handler.
+pub(super) fn obey(control: &Arc<Control>) -> anyhow::Result<()> {
+    let stop = StopRequest::listen("stopping after the current pair; Ctrl-C again stops at once")?;
+    let mut pauses = signal(SignalKind::user_defined1()).context("cannot listen to SIGUSR1")?;
     let stopped = control.clone();
     tokio::spawn(async move {
-        // Without a handler the signal ends the process at once, which loses nothing that is safe.
-        let Ok(mut terminated) = signal(SignalKind::terminate()) else { return };
-        tokio::select! {
-            _ = tokio::signal::ctrl_c() => {}
-            _ = terminated.recv() => {}
-        }
+        stop.wait().await;
         stopped.stop.store(true, Ordering::Relaxed);
-        eprintln!("stopping after the current pair; Ctrl-C again stops at once");
-        if tokio::signal::ctrl_c().await.is_ok() {
-            std::process::exit(130);
-        }
     });
     let paused = control.clone();
     tokio::spawn(async move {
-        let Ok(mut asked) = signal(SignalKind::user_defined1()) else { return };
-        while asked.recv().await.is_some() {
+        while pauses.recv().await.is_some() {
             toggle(&paused);
         }
     });
@@ -127,6 +124,7 @@ pub(super) fn obey(control: &Arc<Control>) {
             }
         });
     }
+    Ok(())
 }
 
 fn toggle(control: &Control) {

@@ -12,6 +12,7 @@ use std::process::Command;
 use clap::CommandFactory as _;
 use echolake_acquisition::recorder::free_bytes;
 use echolake_lake::{Error as LakeError, LAKE_FORMAT, Lake};
+#[cfg(feature = "lake")]
 use echolake_server::CataloguePages;
 use serde::Serialize;
 
@@ -113,12 +114,19 @@ fn text(report: &InstallationReport) -> String {
     out
 }
 
+#[cfg(feature = "lake")]
 fn pages() -> InstallationFact {
     let name = "pages";
     match CataloguePages::THIS_BUILD.problem().map(|problem| problem.split_once("; hint: ").unwrap_or((problem, ""))) {
         None => InstallationFact::ok(name, "the catalogue's pages are part of the program"),
         Some((problem, hint)) => InstallationFact::note(name, problem, hint),
     }
+}
+
+#[cfg(not(feature = "lake"))]
+fn pages() -> InstallationFact {
+    let hint = "ingest, SQL and the catalogue need a build with the feature `lake`";
+    InstallationFact::note("pages", "built for the rig alone, without tables and server", hint)
 }
 
 fn audio() -> InstallationFact {
@@ -300,6 +308,7 @@ mod tests {
     }
 
     #[test]
+    #[cfg(feature = "lake")]
     fn serve_has_three_ports() {
         let names: Vec<_> = ports().into_iter().map(|fact| fact.name).collect();
         assert_eq!(names, ["port 8080", "port 8081", "port 5433"]);

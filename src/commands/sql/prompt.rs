@@ -18,6 +18,7 @@ use rustyline::error::ReadlineError;
 use rustyline::history::DefaultHistory;
 use rustyline::{CompletionType, Editor};
 
+use crate::signals::interrupt_signal;
 use command::{Command, HELP};
 use words::Words;
 
@@ -44,6 +45,8 @@ pub(super) async fn run(session: &Session, lake: &Lake) -> anyhow::Result<()> {
         // A first session has none.
         let _ = editor.load_history(file);
     }
+    // Held from before the greeting on, so that Ctrl-C never ends the prompt.
+    let _interrupts = interrupt_signal()?;
     eprintln!("lake {}; \\? for help", lake.location());
     let mut settings = Settings { format: Format::Table, output: None, timing: false, pager: true };
     let mut begun = String::new();
@@ -117,15 +120,21 @@ fn on_or_off(is_on: bool) -> &'static str {
 // An error or an interrupt ends the query, not the prompt.
 async fn answer(session: &Session, sql: &str, settings: &mut Settings) {
     let begun = Instant::now();
-    let outcome = tokio::select! {
-        outcome = give(session, sql, settings) => outcome,
-        _ = tokio::signal::ctrl_c() => Err(anyhow::anyhow!("stopped")),
-    };
+    let outcome = interrupted_or_given(session, sql, settings).await;
     settings.output = None;
     match outcome {
         Ok(rows) if settings.timing => eprintln!("{rows} rows, {:.3} s", begun.elapsed().as_secs_f64()),
         Ok(rows) => eprintln!("{rows} rows"),
         Err(e) => eprintln!("error: {e:#}"),
+    }
+}
+
+// A fresh listener hears no interrupt from before the query.
+async fn interrupted_or_given(session: &Session, sql: &str, settings: &Settings) -> anyhow::Result<usize> {
+    let mut interrupts = interrupt_signal()?;
+    tokio::select! {
+        outcome = give(session, sql, settings) => outcome,
+        _ = interrupts.recv() => Err(anyhow::anyhow!("stopped")),
     }
 }
 

@@ -17,6 +17,8 @@ use crate::robots::{Joints, Standing};
 const TICK: Duration = Duration::from_millis(20);
 /// One wait for a client's message.
 const PAUSE: Duration = Duration::from_millis(5);
+/// A client that takes longer over its handshake, or takes nothing for so long, is gone.
+const CLIENT_LIMIT: Duration = Duration::from_secs(30);
 /// Namespaces of the two arms.
 const NAMES: [&str; 2] = ["/microphone", "/speaker"];
 
@@ -137,7 +139,11 @@ struct Client {
 
 impl Client {
     fn serve(stream: TcpStream, world: &Mutex<World>, stop: &AtomicBool) {
-        let set = stream.set_nonblocking(false).and_then(|()| stream.set_nodelay(true));
+        let set = stream
+            .set_nonblocking(false)
+            .and_then(|()| stream.set_nodelay(true))
+            .and_then(|()| stream.set_read_timeout(Some(CLIENT_LIMIT)))
+            .and_then(|()| stream.set_write_timeout(Some(CLIENT_LIMIT)));
         let Ok(socket) = set.map_err(drop).and_then(|()| tungstenite::accept(stream).map_err(drop)) else { return };
         if socket.get_ref().set_read_timeout(Some(PAUSE)).is_err() {
             return;

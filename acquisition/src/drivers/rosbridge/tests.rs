@@ -6,6 +6,10 @@ use super::fake::{FakeBridge, Fault};
 use super::*;
 use crate::conformance;
 
+/// For answers that come: a busy machine needs some of it.
+const PATIENT_SECS: f64 = 60.0;
+/// For answers that never come, which is what the test is about.
+const IMPATIENT_SECS: f64 = 1.0;
 const NEAR: [[f64; 3]; 2] = [[-62.5, 62.5, 124.0], [62.5, -62.5, 214.0]];
 
 fn bridge() -> FakeBridge {
@@ -13,7 +17,8 @@ fn bridge() -> FakeBridge {
 }
 
 fn connected(bridge: &FakeBridge) -> RosbridgeRobots {
-    let params = RosbridgeParams { url: bridge.url(), speed: 1.0, timeout_secs: 1.0, ..RosbridgeParams::default() };
+    let params =
+        RosbridgeParams { url: bridge.url(), speed: 1.0, timeout_secs: PATIENT_SECS, ..RosbridgeParams::default() };
     RosbridgeRobots::connect(&params, Cell::of(&Rig::paper())).expect("connected")
 }
 
@@ -48,7 +53,9 @@ fn faults_are_named() {
         let mut robots = connected(&bridge);
         robots.power(Power::On).expect("a switch");
         bridge.set_fault(fault);
+        robots.params.timeout_secs = IMPATIENT_SECS;
         let error = robots.move_to(NEAR[0], NEAR[1]).expect_err(expected).to_string();
+        robots.params.timeout_secs = PATIENT_SECS;
         assert!(error.starts_with("robots: ") && error.contains(expected), "{fault:?}: {error}");
         // Back to normal, the next try does; after a lost connection the motors have to be switched on again.
         bridge.set_fault(Fault::None);
@@ -79,6 +86,7 @@ fn nonsense_is_told_of() {
     let bridge = bridge();
     let mut robots = connected(&bridge);
     bridge.set_fault(Fault::Nonsense);
+    robots.params.timeout_secs = IMPATIENT_SECS;
     let _ = robots.current();
     assert!(robots.notices().iter().any(|n| n.contains("no JSON")));
 }

@@ -2,10 +2,7 @@
 
 use std::path::PathBuf;
 
-use clap::ValueEnum as _;
 use echolake_query::output::Format;
-
-use super::super::FormatArg;
 
 /// What `\?` prints.
 pub(super) const HELP: &str = "\
@@ -52,9 +49,9 @@ pub(super) fn parse(line: &str) -> Option<Result<Command, String>> {
         "\\?" | "\\h" | "help" if name.is_none() => Command::Help,
         "\\timing" => Command::Timing,
         "\\pager" | "\\pset" => Command::Pager,
-        "\\f" | "\\format" => match FormatArg::from_str(rest, true) {
-            Ok(format) => Command::Format(format.into()),
-            Err(_) => return Some(Err(format!("no format `{rest}`; hint: table, csv, json, parquet or arrow"))),
+        "\\f" | "\\format" => match Format::ALL.into_iter().find(|f| f.name().eq_ignore_ascii_case(rest)) {
+            Some(format) => Command::Format(format),
+            None => return Some(Err(format!("no format `{rest}`; hint: table, csv, json, parquet or arrow"))),
         },
         "\\o" => Command::Output(name.map(PathBuf::from)),
         "\\d" | "\\dt" | "\\d+" => name.map_or(Command::Tables, Command::Columns),

@@ -1,0 +1,56 @@
+//! Throws changed SQL, changed bytes of each protocol, or changed run files at `echolake serve`, and ends with an error
+//! at the first that harms it.
+
+use std::io::Write as _;
+use std::time::{Duration, Instant};
+
+use anyhow::Result;
+
+use super::fuzz::{Campaign, Target};
+
+/// Between two lines about how far it is.
+const TELL_EVERY: Duration = Duration::from_secs(30);
+
+#[derive(Debug, clap::Args)]
+pub(crate) struct FuzzArgs {
+    /// What is changed: sql, wire or mcap.
+    #[arg(value_parser = parse_target)]
+    target: Target,
+    /// How long it goes on.
+    #[arg(default_value_t = 60)]
+    seconds: u64,
+    /// Seed of the changes.
+    #[arg(default_value_t = 1)]
+    seed: u64,
+}
+
+fn parse_target(name: &str) -> Result<Target, String> {
+    let known = Target::ALL.into_iter().find(|target| target.name() == name);
+    known.ok_or_else(|| "hint: sql, wire or mcap".to_owned())
+}
+
+pub(crate) fn run(args: &FuzzArgs) -> Result<()> {
+    let FuzzArgs { target, seconds, seed } = *args;
+    let binary = super::echolake_path()?;
+    let (begun, mut told) = (Instant::now(), Instant::now());
+    let outcome = Campaign::new(&binary, seed).throw(target, &mut |so_far| {
+        if told.elapsed() > TELL_EVERY {
+            told = Instant::now();
+            // Progress is not worth an error.
+            let _ = writeln!(std::io::stderr(), "{} rounds in {:.0?}", so_far.rounds, begun.elapsed());
+        }
+        begun.elapsed() < Duration::from_secs(seconds)
+    });
+    writeln!(
+        std::io::stdout(),
+        "{}, seed {seed}: {} rounds in {:.0?}, {} answered, {} broke their own connection's decoder, at most {} MiB; the \
+         server is well",
+        target.name(),
+        outcome.rounds,
+        begun.elapsed(),
+        outcome.answered,
+        outcome.broken,
+        outcome.resident_kib >> 10
+    )?;
+    Ok(())
+}

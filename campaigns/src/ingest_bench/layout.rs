@@ -1,0 +1,110 @@
+//! Other ways to write the same files: size, speed, and what a reader of one response fetches.
+
+use std::time::Instant;
+
+use anyhow::{Context as _, Result, ensure};
+use bytes::Bytes;
+use echolake_schema::tables::Table;
+use parquet::basic::Compression;
+use parquet::file::metadata::{PageIndexPolicy, ParquetMetaDataReader};
+use parquet::file::properties::WriterPropertiesBuilder;
+
+use super::IngestBenchArgs;
+use super::parquet_files::{LEVEL, Numbers, PAGE_BYTES, Rows, Stored, builder_as, read_all, zstd};
+use super::report::Report;
+
+/// Page sizes that are compared.
+const PAGES: [usize; 4] = [64 << 10, 128 << 10, 256 << 10, 1 << 20];
+
+/// One way to write a file.
+struct Layout {
+    name: &'static str,
+    numbers: Numbers,
+    compression: Compression,
+}
+
+pub(crate) fn measure(args: &IngestBenchArgs, files: &[Stored], rows: &[Rows], report: &mut Report) -> Result<()> {
+    for table in [Table::Measurements, Table::Nce] {
+        // Much of what is derived of the references is zero.
+        let file = files.iter().rfind(|f| f.table == table && !f.of_reference).context("no file of a table")?;
+        let rows = rows.iter().rfind(|r| r.table == table && !r.of_reference).context("no rows of a table")?;
+        report.title(&format!(
+            "One file of `{}` in other layouts, {:.1} MB of raw numbers; the best of {} repeats on one thread",
+            table.name(),
+            rows.raw as f64 / 1e6,
+            args.repeats()
+        ))?;
+        layouts(args, &file.bytes, rows, report)?;
+        pages(&file.bytes, rows, report)?;
+    }
+    Ok(())
+}
+
+fn layouts(args: &IngestBenchArgs, file: &Bytes, rows: &Rows, report: &mut Report) -> Result<()> {
+    let layout = |name, numbers, compression| Layout { name, numbers, compression };
+    let metadata = ParquetMetaDataReader::new().parse_and_finish(file)?;
+    let candidates = [
+        layout("as stored: byte stream split, zstd 1", Numbers::AsStored, zstd(LEVEL)),
+        layout("byte stream split, zstd 3", Numbers::AsStored, zstd(3)),
+        layout("byte stream split, snappy", Numbers::AsStored, Compression::SNAPPY),
+        layout("byte stream split, uncompressed", Numbers::AsStored, Compression::UNCOMPRESSED),
+        layout("plain, zstd 1", Numbers::Plain, zstd(LEVEL)),
+        layout("dictionary, zstd 1", Numbers::Dictionary, zstd(LEVEL)),
+    ];
+    report.line(&format!("{:<40} {:>10} {:>12} {:>12}", "layout", "of raw", "write MB/s", "read MB/s"))?;
+    for Layout { name, numbers, compression } in candidates {
+        let properties = builder_as(&metadata, numbers).set_data_page_size_limit(PAGE_BYTES);
+        let properties = properties.set_compression(compression).build();
+        let (mut size, mut write, mut read) = (0, f64::INFINITY, f64::INFINITY);
+        for _ in 0..args.repeats() {
+            let begun = Instant::now();
+            let written = Bytes::from(rows.write(&properties)?);
+            write = write.min(begun.elapsed().as_secs_f64());
+            let begun = Instant::now();
+            let back = read_all(&written)?;
+            read = read.min(begun.elapsed().as_secs_f64());
+            let expected: usize = rows.batches.iter().map(|b| b.num_rows()).sum();
+            ensure!(back == expected, "{back} rows read back of {expected}");
+            size = written.len();
+        }
+        let raw = rows.raw as f64;
+        let (ratio, write, read) = (100.0 * size as f64 / raw, raw / 1e6 / write, raw / 1e6 / read);
+        report.line(&format!("{name:<40} {ratio:>8.1} % {write:>12.0} {read:>12.0}"))?;
+    }
+    Ok(())
+}
+
+// What a reader that knows the file's indices fetches for one row of its first list column.
+fn pages(file: &Bytes, rows: &Rows, report: &mut Report) -> Result<()> {
+    let metadata = ParquetMetaDataReader::new().parse_and_finish(file)?;
+    report.line(&format!("{:<40} {:>10} {:>12} {:>12}", "page size", "of raw", "row fetched", "page index"))?;
+    for bytes in PAGES {
+        let limit = |builder: WriterPropertiesBuilder| builder.set_data_page_size_limit(bytes).build();
+        let written = Bytes::from(rows.write(&limit(builder_as(&metadata, Numbers::AsStored)))?);
+        let (page, index) = point_lookup(&written)?;
+        let ratio = 100.0 * written.len() as f64 / rows.raw as f64;
+        let name = format!("{} KiB", bytes >> 10);
+        report.line(&format!("{name:<40} {ratio:>8.1} % {:>9.1} KiB {:>9.1} KiB", page / 1024.0, index / 1024.0))?;
+    }
+    Ok(())
+}
+
+// Mean compressed size of a page of the first list column, and size of all page indices of the file.
+fn point_lookup(file: &Bytes) -> Result<(f64, f64)> {
+    let reader = ParquetMetaDataReader::new().with_page_index_policy(PageIndexPolicy::Required);
+    let metadata = reader.parse_and_finish(file)?;
+    let columns = metadata.file_metadata().schema_descr().columns();
+    let list = columns.iter().position(|c| c.max_rep_level() > 0).context("no list column")?;
+    let offsets = metadata.offset_index().context("no page index")?;
+    let pages: Vec<_> = offsets
+        .iter()
+        .flat_map(|group| group[list].page_locations())
+        .map(|p| f64::from(p.compressed_page_size))
+        .collect();
+    let indices = metadata
+        .row_groups()
+        .iter()
+        .flat_map(|g| g.columns())
+        .map(|c| f64::from(c.offset_index_length().unwrap_or(0)) + f64::from(c.column_index_length().unwrap_or(0)));
+    Ok((pages.iter().sum::<f64>() / pages.len().max(1) as f64, indices.sum()))
+}

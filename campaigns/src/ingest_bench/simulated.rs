@@ -1,0 +1,164 @@
+//! Runs of the simulated rig to ingest, and their ingest into a fresh lake.
+
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
+
+use anyhow::{Context as _, Result, ensure};
+use echolake_acquisition::collection::{Member, collection};
+use echolake_acquisition::controller::Keep;
+use echolake_acquisition::simulate::{SimulatedRun, Specimen};
+use echolake_ingest::{Ingest, Report as Told, complete, pending};
+use echolake_lake::{Lake, References};
+use echolake_schema::manifest::RunEnd;
+use echolake_schema::{Rig, Timestamp};
+
+use super::meter::{Cost, Meter, forget_peak, peak_mib};
+
+/// 2026-01-05 08:00 UTC, and a run every eleven hours.
+const FIRST_START: Timestamp = Timestamp(1_767_600_000_000_000_000);
+const RUN_EVERY_SECS: f64 = 39_600.0;
+
+/// The first surfaces of a collection, Flat and Foam: their rows are derived in a second pass, because the references
+/// are not there when they are taken in.
+pub(crate) const REFERENCES: usize = 2;
+
+/// Runs' files.
+pub(crate) struct Runs {
+    /// In the collection's order.
+    pub(crate) files: Vec<PathBuf>,
+    /// All of them.
+    pub(crate) all: Counts,
+    /// Those that are no references.
+    pub(crate) panels: Counts,
+}
+
+/// How much is in some runs.
+#[derive(Debug, Clone, Copy, Default)]
+pub(crate) struct Counts {
+    pub(crate) attempts: u64,
+    pub(crate) accepted: u64,
+    pub(crate) bytes: u64,
+}
+
+/// Runs to be made.
+pub(crate) struct Order<'a> {
+    pub(crate) count: usize,
+    pub(crate) keep: Keep,
+    /// Pairs after which each run is stopped.
+    pub(crate) pairs: usize,
+    pub(crate) seed: u64,
+    pub(crate) folder: &'a Path,
+}
+
+/// A lake that has just taken in runs.
+pub(crate) struct Ingested {
+    pub(crate) lake: Lake,
+    pub(crate) folder: PathBuf,
+    /// Of all runs.
+    pub(crate) whole: Cost,
+    /// Of those that are no references, with the references there.
+    pub(crate) panels: Cost,
+    pub(crate) peak_mib: f64,
+}
+
+impl Order<'_> {
+    /// Makes them, on all cores.
+    pub(crate) fn make(&self) -> Result<Runs> {
+        std::fs::create_dir_all(self.folder)?;
+        let members = collection(self.seed, self.count)?;
+        let cores = std::thread::available_parallelism().map_or(1, usize::from);
+        let next = AtomicUsize::new(0);
+        let work = || -> Result<Vec<_>> {
+            let mut made = Vec::new();
+            loop {
+                let number = next.fetch_add(1, Ordering::Relaxed);
+                let Some(member) = members.get(number) else { return Ok(made) };
+                made.push(self.run(number, member)?);
+            }
+        };
+        let done: Vec<_> = std::thread::scope(|scope| {
+            let threads: Vec<_> = (0..cores).map(|_| scope.spawn(work)).collect();
+            threads.into_iter().map(|t| t.join().ok().context("a thread panicked").flatten()).collect::<Result<_>>()
+        })?;
+        let mut done: Vec<_> = done.into_iter().flatten().collect();
+        // Their names begin with the time of their start.
+        done.sort_by(|a, b| a.0.cmp(&b.0));
+        let mut runs = Runs { files: Vec::new(), all: Counts::default(), panels: Counts::default() };
+        for (number, (file, end)) in done.into_iter().enumerate() {
+            let bytes = file.metadata()?.len();
+            runs.all.add(&end, bytes);
+            if number >= REFERENCES {
+                runs.panels.add(&end, bytes);
+            }
+            runs.files.push(file);
+        }
+        Ok(runs)
+    }
+
+    fn run(&self, number: usize, member: &Member) -> Result<(PathBuf, RunEnd)> {
+        let run = SimulatedRun {
+            rig: &Rig::paper(),
+            surface: member.surface.clone(),
+            specimen: &Specimen::Relief(member.relief.clone()),
+            flat: None,
+            foam: None,
+            start: FIRST_START.plus_secs(number as f64 * RUN_EVERY_SECS),
+            seed: self.seed.wrapping_mul(1_000).wrapping_add(number as u64),
+            keep: self.keep,
+            folder: self.folder,
+        };
+        let stop = AtomicBool::new(false);
+        let made = run.measure(&stop, &mut |done| stop.store(done >= self.pairs, Ordering::Relaxed));
+        made.with_context(|| format!("surface {}", member.surface))
+    }
+}
+
+impl Runs {
+    /// Ingests them into a lake of its own, which takes the place of the one before.
+    pub(crate) async fn ingest(&self, folder: &Path) -> Result<Ingested> {
+        if folder.exists() {
+            std::fs::remove_dir_all(folder)?;
+        }
+        let lake = Lake::open_or_create(&folder.display().to_string(), &Rig::paper(), &References::default()).await?;
+        let stop = Arc::new(AtomicBool::new(false));
+        let (mut accepted, mut refused) = (0, Vec::new());
+        let mut report = |told| match told {
+            Told::Taken(taken) => accepted += taken.measurements as u64,
+            other => refused.push(format!("{other:?}")),
+        };
+        forget_peak();
+        let mut costs = [Cost::NONE; 2];
+        let (references, panels) = self.files.split_at(REFERENCES);
+        for (files, cost) in [references, panels].into_iter().zip(&mut costs) {
+            put_into_inbox(files, folder)?;
+            let meter = Meter::start()?;
+            Ingest::new(&lake, stop.clone()).take_in(pending(&lake).await?, &mut report).await?;
+            complete(&lake, &stop, &mut |_| {}).await?;
+            *cost = meter.stop()?;
+        }
+        ensure!(refused.is_empty(), "refused: {}", refused.join("; "));
+        ensure!(accepted == self.all.accepted, "{accepted} measurements ingested of {}", self.all.accepted);
+        let [references, panels] = costs;
+        let whole = references.plus(panels);
+        Ok(Ingested { lake, folder: folder.to_owned(), whole, panels, peak_mib: peak_mib()? })
+    }
+}
+
+impl Counts {
+    fn add(&mut self, end: &RunEnd, bytes: u64) {
+        self.attempts += end.attempts;
+        self.accepted += end.accepted;
+        self.bytes += bytes;
+    }
+}
+
+fn put_into_inbox(files: &[PathBuf], lake: &Path) -> Result<()> {
+    let inbox = lake.join("inbox");
+    std::fs::create_dir_all(&inbox)?;
+    for file in files {
+        // Ingest renames, so the file itself stays what it is.
+        std::fs::hard_link(file, inbox.join(file.file_name().context("a run's file has a name")?))?;
+    }
+    Ok(())
+}

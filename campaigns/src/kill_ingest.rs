@@ -1,0 +1,53 @@
+//! Kills `echolake ingest` at random moments, many times, and compares its tables with those of an undisturbed one.
+
+use std::io::Write as _;
+
+use anyhow::Result;
+
+use super::kills::{Campaign, Outcome};
+
+/// Runs of the lake that two processes ingest at once.
+const SHARED_RUNS: usize = 40;
+
+#[derive(Debug, clap::Args)]
+pub(crate) struct KillIngestArgs {
+    /// Rounds, with up to three kills each.
+    #[arg(default_value_t = 200)]
+    rounds: usize,
+    /// Seed of the moments.
+    #[arg(default_value_t = 1)]
+    seed: u64,
+    /// How ingest is disturbed.
+    #[arg(value_enum, default_value_t = Disturbance::Kills)]
+    disturbance: Disturbance,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
+enum Disturbance {
+    /// It is killed.
+    Kills,
+    /// Two processes ingest half of 40 runs each; one of them is killed in every second round.
+    Halves,
+}
+
+pub(crate) fn run(args: &KillIngestArgs) -> Result<()> {
+    let KillIngestArgs { rounds, seed, disturbance } = *args;
+    let binary = super::echolake_path()?;
+    let mut tell = |round: usize, so_far: &Outcome| {
+        if round % 10 == 0 {
+            // Progress is not worth an error.
+            let _ = writeln!(std::io::stderr(), "{round} of {rounds} rounds, {} killed", so_far.killed);
+        }
+    };
+    let outcome = match disturbance {
+        Disturbance::Kills => Campaign::new(&binary, seed).rounds(rounds, &mut tell),
+        Disturbance::Halves => Campaign::of(&binary, seed, SHARED_RUNS).halves(rounds, &mut tell),
+    };
+    writeln!(
+        std::io::stdout(),
+        "{rounds} rounds, seed {seed}: {} kills while ingest worked, {} after its end; all tables equal",
+        outcome.killed,
+        outcome.ended
+    )?;
+    Ok(())
+}

@@ -1,0 +1,113 @@
+//! Long forms of what the tests try in short, and benchmarks: a subcommand each of one program. The test command does
+//! not build it, because no test needs it.
+
+#[path = "../../tests/acquire_kills.rs"]
+mod acquire_kills;
+#[allow(dead_code, reason = "the tests' helper, of which this wants a part")]
+#[path = "../../tests/child.rs"]
+mod child;
+mod experiments;
+mod flips;
+#[path = "../../tests/forgetful.rs"]
+mod forgetful;
+mod functions_bench;
+#[path = "../../tests/fuzz/mod.rs"]
+mod fuzz;
+mod fuzz_server;
+mod ingest_bench;
+mod kill_acquire;
+mod kill_ingest;
+#[path = "../../tests/kills.rs"]
+mod kills;
+mod limits;
+mod mcap_bench;
+mod memory;
+mod motion;
+mod query_bench;
+mod readers;
+#[allow(dead_code, reason = "the tests' clients, of which this wants a part")]
+#[path = "../../tests/serve"]
+mod serve {
+    pub(crate) mod http;
+    pub(crate) mod server;
+}
+mod slices;
+
+use std::path::PathBuf;
+
+use anyhow::{Context as _, Result};
+use clap::Parser as _;
+
+// As in the `echolake` command, so that it is measured as it is used.
+#[global_allocator]
+static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;
+
+/// A rig that measures in milliseconds.
+const SMALL_RIG: &str = include_str!("../../tests/fixtures/small_rig.toml");
+
+/// Campaigns and benchmarks of echolake.
+#[derive(Debug, clap::Parser)]
+#[command(name = "campaign", max_term_width = 100)]
+struct Cli {
+    #[command(subcommand)]
+    campaign: Campaign,
+}
+
+#[derive(Debug, clap::Subcommand)]
+enum Campaign {
+    /// Damage run files; ingest must keep what is whole and report the rest.
+    Flips(flips::FlipsArgs),
+    /// Kill ingests, or let two processes ingest at once; the tables must be those of an undisturbed ingest.
+    Kills(kill_ingest::KillIngestArgs),
+    /// Kill `acquire`, with or without the power, recover and resume; nothing acknowledged may be lost.
+    AcquireKills(kill_acquire::KillAcquireArgs),
+    /// Throw changed SQL, bytes of each protocol or run files at `serve`.
+    Fuzz(fuzz_server::FuzzArgs),
+    /// Measure ingest beside bare transforms, the reference pipeline and the parquet crate alone.
+    IngestBench(ingest_bench::IngestBenchArgs),
+    /// Measure twelve queries beside DuckDB on the same files.
+    QueryBench(query_bench::QueryBenchArgs),
+    /// Measure how soon hostile queries end, and what is left for others.
+    Limits(limits::LimitsArgs),
+    /// Measure `mcap()` beside Python's mcap.
+    McapBench(mcap_bench::McapBenchArgs),
+    /// Measure many readers of a served catalogue at once.
+    Readers(readers::ReadersArgs),
+    /// Measure slices of a served run, for one reader and for many.
+    Slices(slices::SlicesArgs),
+    /// Measure SQL's list functions beside plain loops.
+    FunctionsBench,
+    /// Repeat the paper's three experiments on simulated panels.
+    Experiments(experiments::ExperimentsArgs),
+    /// Compare orders in which the arms visit the grid, and show what they cannot reach.
+    Motion(motion::MotionArgs),
+}
+
+fn main() -> Result<()> {
+    match Cli::parse().campaign {
+        Campaign::Flips(args) => block_on(flips::run(&args)),
+        Campaign::Kills(args) => kill_ingest::run(&args),
+        Campaign::AcquireKills(args) => kill_acquire::run(&args),
+        Campaign::Fuzz(args) => fuzz_server::run(&args),
+        Campaign::IngestBench(args) => ingest_bench::run(&args),
+        Campaign::QueryBench(args) => block_on(query_bench::run(&args)),
+        Campaign::Limits(args) => block_on(limits::run(&args)),
+        Campaign::McapBench(args) => block_on(mcap_bench::run(&args)),
+        Campaign::Readers(args) => readers::run(&args),
+        Campaign::Slices(args) => slices::run(&args),
+        Campaign::FunctionsBench => functions_bench::run(),
+        Campaign::Experiments(args) => experiments::run(&args),
+        Campaign::Motion(args) => motion::run(&args),
+    }
+}
+
+fn block_on<T>(work: impl Future<Output = Result<T>>) -> Result<T> {
+    tokio::runtime::Builder::new_multi_thread().enable_all().build()?.block_on(work)
+}
+
+/// Returns the path of the `echolake` command, which is built beside this program.
+fn echolake_path() -> Result<PathBuf> {
+    let path = std::env::current_exe().context("this program has no path")?.with_file_name("echolake");
+    anyhow::ensure!(path.exists(), "`{}` is missing; hint: cargo build --release", path.display());
+    Ok(path)
+}

@@ -1,0 +1,143 @@
+//! Slices of a run from a server: bytes and times for parts of it, and for many readers at once.
+//!
+//! Bytes are those on the wire, the first byte is the first of the body.
+#![allow(clippy::print_stdout, reason = "its figures are what it is for")]
+
+use std::io::{Read as _, Write as _};
+use std::net::TcpStream;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
+
+use anyhow::{Result, anyhow, bail};
+
+use super::memory::resident_mib;
+
+/// Topics that tell where everything stood.
+const POSES: &str = "&topics=/microphone/pose,/speaker/pose,/tf";
+
+#[derive(Debug, Clone, clap::Args)]
+pub(crate) struct SlicesArgs {
+    /// Where the catalogue is served, as 127.0.0.1:8080.
+    address: String,
+    /// The run that is sliced.
+    run: String,
+    /// Its pairs, from 0 on.
+    #[arg(long, value_name = "N", default_value_t = 2951)]
+    pairs: u64,
+    /// Readers at once.
+    #[arg(long, value_name = "N", default_value_t = 100)]
+    readers: u64,
+    /// The server's process, whose memory is watched then.
+    #[arg(long)]
+    pid: Option<u32>,
+}
+
+/// What reading a slice took.
+struct Took {
+    bytes: u64,
+    first: Duration,
+    all: Duration,
+}
+
+/// Reads a slice to its end; it is an error where that does not come.
+fn read(address: &str, path: &str) -> Result<Took> {
+    let begun = Instant::now();
+    let mut stream = TcpStream::connect(address)?;
+    stream.write_all(format!("GET {path} HTTP/1.1\r\nhost: {address}\r\nconnection: close\r\n\r\n").as_bytes())?;
+    let (mut head, mut first, mut bytes, mut block, mut end) = (Vec::new(), None, 0, vec![0; 64 << 10], Vec::new());
+    loop {
+        let count = stream.read(&mut block)?;
+        if count == 0 {
+            break;
+        }
+        end.extend_from_slice(&block[..count]);
+        end.drain(..end.len().saturating_sub(7));
+        if first.is_some() {
+            bytes += count as u64;
+            continue;
+        }
+        head.extend_from_slice(&block[..count]);
+        if let Some(at) = head.windows(4).position(|w| w == b"\r\n\r\n").filter(|at| head.len() > at + 4) {
+            first = Some(begun.elapsed());
+            bytes = (head.len() - at - 4) as u64;
+        }
+    }
+    if !head.starts_with(b"HTTP/1.1 200") {
+        bail!("{}", String::from_utf8_lossy(&head));
+    }
+    if !end.ends_with(b"\r\n0\r\n\r\n") {
+        bail!("{path} broke off after {bytes} bytes");
+    }
+    Ok(Took { bytes, first: first.unwrap_or_default(), all: begun.elapsed() })
+}
+
+fn path(run: &str, pairs: std::ops::Range<u64>, more: &str) -> String {
+    format!("/api/v1/slices.mcap?run={run}&where=pair_id%20between%20{}%20and%20{}{more}", pairs.start, pairs.end - 1)
+}
+
+pub(crate) fn run(args: &SlicesArgs) -> Result<()> {
+    let args = Arc::new(args.clone());
+    let milliseconds = |time: Duration| time.as_secs_f64() * 1e3;
+    for (name, share, more) in [
+        ("1 %", 100, ""),
+        ("10 %", 10, ""),
+        ("100 %", 1, ""),
+        ("poses of 1 %", 100, POSES),
+        ("poses of 100 %", 1, POSES),
+    ] {
+        let path = path(&args.run, 0..(args.pairs / share).max(1), more);
+        let mut tries = (0..5).map(|_| read(&args.address, &path)).collect::<Result<Vec<_>>>()?;
+        tries.sort_by_key(|took| took.first);
+        let (median, slowest) = (&tries[2], &tries[4]);
+        println!(
+            "{name}: {} bytes, first after {:.1} ms (at most {:.1}), all after {:.1} ms",
+            median.bytes,
+            milliseconds(median.first),
+            milliseconds(slowest.first),
+            milliseconds(median.all)
+        );
+    }
+    let (before, done) = (args.pid.and_then(resident_mib).unwrap_or(0), Arc::new(AtomicBool::new(false)));
+    let begun = Instant::now();
+    let reader = |number: u64| {
+        let args = args.clone();
+        std::thread::spawn(move || {
+            // Each another tenth of the run, so that none is like another.
+            let from = number * 7 % (args.pairs * 9 / 10).max(1);
+            read(&args.address, &path(&args.run, from..from + (args.pairs / 10).max(1), ""))
+        })
+    };
+    let readers: Vec<_> = (0..args.readers).map(reader).collect();
+    let watch = {
+        let (args, done) = (args.clone(), done.clone());
+        std::thread::spawn(move || {
+            let mut heaviest = 0;
+            while !done.load(Ordering::Relaxed) {
+                heaviest = heaviest.max(args.pid.and_then(resident_mib).unwrap_or(0));
+                std::thread::sleep(Duration::from_millis(50));
+            }
+            heaviest
+        })
+    };
+    let mut all = Vec::new();
+    for reader in readers {
+        all.push(reader.join().map_err(|_| anyhow!("a reader panicked"))??);
+    }
+    let took = begun.elapsed();
+    done.store(true, Ordering::Relaxed);
+    let heaviest = watch.join().map_err(|_| anyhow!("the watch panicked"))?;
+    all.sort_by_key(|took| took.first);
+    let bytes: u64 = all.iter().map(|took| took.bytes).sum();
+    println!(
+        "{} readers of 10 % each: {bytes} bytes in {:.1} s; first after {:.1} ms (median), {:.1} ms (last)",
+        args.readers,
+        took.as_secs_f64(),
+        milliseconds(all[all.len() / 2].first),
+        milliseconds(all[all.len() - 1].first)
+    );
+    if heaviest > 0 {
+        println!("the server's memory: {before} MiB before, at most {heaviest} MiB");
+    }
+    Ok(())
+}

@@ -1,0 +1,49 @@
+//! `echolake doctor`: the lake examined, every run file to its last CRC.
+
+use std::fmt::Write as _;
+
+use echolake_ingest::doctor::{Finding, Report, Severity, examine};
+use echolake_lake::Lake;
+
+use crate::Done;
+use crate::commands::{print, size};
+use crate::progress::Progress;
+
+pub(super) async fn run(json: bool, lake_url: &str) -> anyhow::Result<Done> {
+    let lake = Lake::open(lake_url).await?;
+    let progress = Progress::new();
+    let mut task = None;
+    let report = examine(&lake, &mut |step| {
+        task.get_or_insert_with(|| progress.task("check", step.total as u64, "files")).at(step.done as u64);
+    })
+    .await?;
+    if let Some(task) = task {
+        task.done(format!("{} runs", report.runs));
+    }
+    match json {
+        true => print(&serde_json::to_string_pretty(&report)?)?,
+        false => print(&text(&lake, &report))?,
+    }
+    Ok(if report.is_damaged() { Done::WithLoss } else { Done::Whole })
+}
+
+fn text(lake: &Lake, report: &Report) -> String {
+    let mut out = format!("lake {}, rig {}\n", lake.location(), lake.rig().name);
+    let _ = writeln!(out, "{} runs, {} in run files\n", report.runs, size(report.run_bytes));
+    let _ = writeln!(out, "{:<14} {:>6} {:>10} {:>10}", "table", "files", "rows", "size");
+    for t in &report.tables {
+        let _ = writeln!(out, "{:<14} {:>6} {:>10} {:>10}", t.table, t.files, t.rows, size(t.bytes));
+    }
+    for Finding { severity, subject, what } in &report.findings {
+        let word = match severity {
+            Severity::Damaged => "damaged",
+            Severity::Missing => "missing",
+            Severity::Note => "note",
+        };
+        let _ = write!(out, "\n{word}: {subject}: {what}");
+    }
+    if report.findings.is_empty() {
+        let _ = write!(out, "\nnothing is missing or damaged");
+    }
+    out
+}

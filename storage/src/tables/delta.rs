@@ -1,0 +1,403 @@
+//! The commit log as Delta, reader version 1 and writer version 2, so that every Delta reader reads it.
+
+mod actions;
+mod checkpoint;
+mod log_folder;
+mod table_state;
+
+use std::collections::{BTreeSet, HashMap, HashSet};
+use std::sync::Arc;
+
+use arrow::datatypes::{DataType as ArrowType, Field, SchemaRef};
+use async_trait::async_trait;
+use chrono::{DateTime, Utc};
+use echolake_schema::Rig;
+use echolake_schema::tables::Table;
+use object_store::ObjectStore;
+use object_store::path::Path;
+use percent_encoding::percent_decode_str;
+use serde_json::{Map, Value, json};
+use tokio::sync::Mutex;
+use uuid::Uuid;
+
+use self::actions::{AddFile, FileFormat, LogLine, TableMetadata};
+use self::log_folder::{CommitAttempt, LogFolder, own_protocol};
+use self::table_state::TableState;
+use crate::tables::snapshot::{decode_parts, encode_parts, is_merged};
+use crate::tables::versions;
+use crate::{
+    Commit, CommitLog, Committed, DataFile, Effect, Error, FileStats, History, NewFile, Part, Result, TableVersion,
+};
+
+/// Tries of one commit against other writers; each loses to a commit that went through.
+const COMMIT_TRIES: usize = 50;
+/// The tag of a merged file's Add that holds its parts.
+const PARTS: &str = "echolake.parts";
+
+/// The tables' Delta logs under `tables/`.
+#[derive(Debug)]
+pub(crate) struct DeltaLog {
+    store: Arc<dyn ObjectStore>,
+    rig: Rig,
+    /// Loaded tables; a later look reads only what has come since.
+    loaded: Mutex<HashMap<Table, Arc<TableState>>>,
+}
+
+impl DeltaLog {
+    pub(crate) fn new(store: Arc<dyn ObjectStore>, rig: Rig) -> Self {
+        Self { store, rig, loaded: Mutex::default() }
+    }
+
+    fn log_folder(&self, table: Table) -> LogFolder<'_> {
+        LogFolder::new(table, self.store.as_ref())
+    }
+
+    /// The table as of now, or None if it has no log.
+    async fn load(&self, table: Table) -> Result<Option<Arc<TableState>>> {
+        let log = self.log_folder(table);
+        let known = self.loaded.lock().await.get(&table).cloned();
+        let mut state = match known {
+            Some(state) => log.advance(state).await?,
+            None => None,
+        };
+        if state.is_none() {
+            state = log.load(None).await?.map(Arc::new);
+        }
+        let mut loaded = self.loaded.lock().await;
+        match &state {
+            Some(state) => drop(loaded.insert(table, state.clone())),
+            None => drop(loaded.remove(&table)),
+        }
+        Ok(state)
+    }
+
+    async fn require(&self, table: Table) -> Result<Arc<TableState>> {
+        self.load(table).await?.ok_or_else(|| Error::Log {
+            table: table.name(),
+            action: "read",
+            reason: "it has no log; hint: `echolake ingest` makes it anew from the runs".into(),
+        })
+    }
+
+    // Written against one version, so that it takes effect only if that is still the newest.
+    async fn try_commit(&self, table: Table, state: &Arc<TableState>, change: &Change<'_>) -> Result<CommitAttempt> {
+        let log = self.log_folder(table);
+        log.check_writable(state)?;
+        let now = Utc::now();
+        let lines = change.log_lines(state, now.timestamp_millis());
+        let attempt = log.write_commit(state.version + 1, &lines).await?;
+        if attempt == CommitAttempt::Written {
+            let mut state = TableState::clone(state);
+            state.apply(state.version + 1, lines);
+            // The commit is done; a checkpoint only spares readers some work, and the next one makes up for it.
+            let _ = log.maintain(&state, now).await;
+        }
+        Ok(attempt)
+    }
+}
+
+/// What is left to do of a commit in one version of a table.
+struct Change<'a> {
+    outcomes: Vec<Committed>,
+    add: Vec<&'a NewFile>,
+    remove: BTreeSet<String>,
+    effect: Effect,
+}
+
+impl<'a> Change<'a> {
+    fn of(commit: &'a Commit, mut names: HashSet<String>) -> Self {
+        let gone = commit.remove.iter().filter_map(Path::filename).filter(|n| names.contains(*n));
+        let remove = gone.map(str::to_owned).collect();
+        let mut change = Self { outcomes: Vec::new(), add: Vec::new(), remove, effect: commit.effect };
+        for file in &commit.add {
+            let outcome = change.outcome(file, &names);
+            if outcome == Committed::Now {
+                if let Some(replaces) = &file.replaces {
+                    names.retain(|name| !replaces.names.contains(name));
+                    change.remove.extend(replaces.names.iter().cloned());
+                }
+                names.insert(file.name.clone());
+                change.remove.remove(&file.name);
+                change.add.push(file);
+            }
+            change.outcomes.push(outcome);
+        }
+        change
+    }
+
+    /// The commit's lines, against the version whose state is given.
+    fn log_lines(&self, state: &TableState, now_millis: i64) -> Vec<LogLine> {
+        let data_change = self.effect == Effect::Rows;
+        let largest = self.add.iter().map(|f| f.bytes).max().unwrap_or(0);
+        let (operation, parameters) = match self.effect {
+            Effect::Rows if self.remove.is_empty() => ("WRITE", json!({ "mode": "Append" })),
+            Effect::Rows => ("WRITE", json!({ "mode": "Overwrite" })),
+            Effect::Layout => ("OPTIMIZE", json!({ "targetSize": largest.to_string() })),
+        };
+        let removed = state.files.values().filter(|f| self.remove.contains(&file_name(&f.path)));
+        let removed =
+            removed.map(|f| LogLine { remove: Some(f.removed_at(now_millis, data_change)), ..LogLine::default() });
+        let added =
+            self.add.iter().map(|f| LogLine { add: Some(add_file(f, now_millis, data_change)), ..LogLine::default() });
+        std::iter::once(commit_info(operation, parameters, now_millis)).chain(added).chain(removed).collect()
+    }
+
+    fn outcome(&self, file: &NewFile, names: &HashSet<String>) -> Committed {
+        if names.contains(&file.name) {
+            return Committed::Before;
+        }
+        let Some(replaces) = &file.replaces else { return Committed::Now };
+        let expected = replaces.names.iter().all(|n| names.contains(n));
+        let alone = replaces
+            .prefix
+            .as_ref()
+            .is_none_or(|prefix| names.iter().filter(|n| n.starts_with(prefix)).count() == replaces.names.len());
+        if expected && alone { Committed::Now } else { Committed::Outdated }
+    }
+}
+
+/// A table's folder in the lake.
+pub(crate) fn folder(table: Table) -> Path {
+    Path::from(format!("tables/{}", table.name()))
+}
+
+#[async_trait]
+impl CommitLog for DeltaLog {
+    async fn ensure(&self, table: Table) -> Result<()> {
+        if self.load(table).await?.is_some() {
+            return Ok(());
+        }
+        let now_millis = Utc::now().timestamp_millis();
+        let metadata = TableMetadata {
+            id: Uuid::new_v4().to_string(),
+            name: Some(table.name().to_owned()),
+            description: None,
+            format: FileFormat { provider: "parquet".to_owned(), options: actions::TextMap::new() },
+            schema_string: delta_schema(&table.schema(&self.rig)).to_string(),
+            partition_columns: Vec::new(),
+            configuration: actions::TextMap::new(),
+            created_time: Some(now_millis),
+        };
+        let lines = [
+            commit_info("CREATE TABLE", json!({ "mode": "ErrorIfExists" }), now_millis),
+            LogLine { protocol: Some(own_protocol()), ..LogLine::default() },
+            LogLine { meta_data: Some(metadata), ..LogLine::default() },
+        ];
+        // If the number is taken, somebody else made the table at the same moment.
+        self.log_folder(table).write_commit(0, &lines).await.map(drop)
+    }
+
+    async fn files(&self, table: Table) -> Result<Vec<DataFile>> {
+        match self.load(table).await? {
+            Some(state) => data_files(table, &state),
+            None => Ok(Vec::new()),
+        }
+    }
+
+    async fn version(&self, table: Table) -> Result<Option<u64>> {
+        Ok(self.load(table).await?.map(|state| state.version))
+    }
+
+    async fn has_after(&self, table: Table, version: u64) -> Result<bool> {
+        self.log_folder(table).has_version(version + 1).await
+    }
+
+    async fn versions(&self, table: Table) -> Result<Vec<TableVersion>> {
+        versions::listed(self.store.as_ref(), table).await
+    }
+
+    async fn files_at(&self, table: Table, version: u64) -> Result<Vec<DataFile>> {
+        match self.log_folder(table).load(Some(version)).await? {
+            Some(state) => data_files(table, &state),
+            None => Ok(Vec::new()),
+        }
+    }
+
+    async fn has(&self, table: Table, name: &str) -> Result<bool> {
+        Ok(self.load(table).await?.is_some_and(|state| file_names(&state).contains(name)))
+    }
+
+    async fn history(&self, table: Table) -> Result<Option<History>> {
+        let Some(state) = self.load(table).await? else { return Ok(None) };
+        let removed = state.removed.values().map(|remove| {
+            let at = remove.deletion_timestamp.and_then(DateTime::from_timestamp_millis);
+            (file_name(&remove.path), at.unwrap_or_default())
+        });
+        Ok(Some(History { current: file_names(&state), removed: removed.collect() }))
+    }
+
+    async fn commit(&self, table: Table, commit: &Commit) -> Result<Vec<Committed>> {
+        for _ in 0..COMMIT_TRIES {
+            let state = self.require(table).await?;
+            let change = Change::of(commit, file_names(&state));
+            if change.add.is_empty() && change.remove.is_empty() {
+                return Ok(change.outcomes);
+            }
+            if self.try_commit(table, &state, &change).await? == CommitAttempt::Written {
+                return Ok(change.outcomes);
+            }
+        }
+        let reason = format!("{COMMIT_TRIES} tries lost to other writers; hint: run the command again");
+        Err(Error::Log { table: table.name(), action: "written", reason })
+    }
+}
+
+fn data_files(table: Table, state: &TableState) -> Result<Vec<DataFile>> {
+    let mut files = state.files.values().map(|add| data_file(table, add)).collect::<Result<Vec<_>>>()?;
+    files.sort_by(|a, b| a.path.cmp(&b.path));
+    Ok(files)
+}
+
+fn data_file(table: Table, add: &AddFile) -> Result<DataFile> {
+    let name = file_name(&add.path);
+    let stats = add.stats.as_deref().and_then(|json| serde_json::from_str::<Map<String, Value>>(json).ok());
+    let rows = stats.as_ref().and_then(|stats| stats.get("numRecords")?.as_u64());
+    Ok(DataFile {
+        bytes: u64::try_from(add.size).unwrap_or(0),
+        rows: rows.unwrap_or(0),
+        modified: DateTime::from_timestamp_millis(add.modification_time).unwrap_or(DateTime::UNIX_EPOCH),
+        stats: stats.map(file_stats),
+        parts: if is_merged(&name) { parts(table, add)? } else { Vec::new() },
+        hidden: Vec::new(),
+        path: folder(table).join(name),
+    })
+}
+
+fn file_names(state: &TableState) -> HashSet<String> {
+    state.files.keys().map(|path| file_name(path)).collect()
+}
+
+/// A file's name of its path in the log.
+fn file_name(path: &str) -> String {
+    percent_decode_str(path).decode_utf8_lossy().into_owned()
+}
+
+fn parts(table: Table, add: &AddFile) -> Result<Vec<Part>> {
+    let text = add.tags.as_ref().and_then(|tags| tags.get(PARTS).cloned().flatten());
+    text.and_then(|text| decode_parts(&text)).ok_or_else(|| {
+        let reason = format!(
+            "`{}` has lost the list of its parts; hint: delete the table's folder, `echolake ingest` makes it anew",
+            add.path
+        );
+        Error::Log { table: table.name(), action: "read", reason }
+    })
+}
+
+// Readers of a commit's time take it from its first line.
+fn commit_info(operation: &str, parameters: Value, now_millis: i64) -> LogLine {
+    let info = json!({
+        "timestamp": now_millis,
+        "operation": operation,
+        "operationParameters": parameters,
+        "engineInfo": concat!("echolake/", env!("CARGO_PKG_VERSION")),
+    });
+    LogLine { commit_info: Some(info), ..LogLine::default() }
+}
+
+// Names of ours have no character that Delta would percent-encode.
+fn add_file(file: &NewFile, now_millis: i64, data_change: bool) -> AddFile {
+    let parts = (!file.parts.is_empty()).then(|| encode_parts(&file.parts));
+    AddFile {
+        path: file.name.clone(),
+        partition_values: actions::TextMap::new(),
+        size: i64::try_from(file.bytes).unwrap_or(i64::MAX),
+        modification_time: now_millis,
+        data_change,
+        stats: Some(file.stats.clone()),
+        tags: parts.map(|parts| actions::TextMap::from([(PARTS.to_owned(), Some(parts))])),
+    }
+}
+
+fn file_stats(mut stats: Map<String, Value>) -> FileStats {
+    let mut take = |key| match stats.remove(key) {
+        Some(Value::Object(values)) => values,
+        _ => Map::new(),
+    };
+    FileStats { min: take("minValues"), max: take("maxValues") }
+}
+
+fn delta_schema(schema: &SchemaRef) -> Value {
+    let fields: Vec<_> = schema.fields().iter().map(|f| delta_column(f)).collect();
+    json!({ "type": "struct", "fields": fields })
+}
+
+fn delta_column(field: &Field) -> Value {
+    json!({
+        "name": field.name(),
+        "type": delta_type(field.data_type()),
+        "nullable": field.is_nullable(),
+        "metadata": field.metadata(),
+    })
+}
+
+// The types that `echolake_schema::tables` uses; all others would be text to a reader.
+fn delta_type(data_type: &ArrowType) -> Value {
+    match data_type {
+        ArrowType::Boolean => json!("boolean"),
+        ArrowType::Int32 => json!("integer"),
+        ArrowType::Int64 => json!("long"),
+        ArrowType::Float32 => json!("float"),
+        ArrowType::Float64 => json!("double"),
+        ArrowType::Timestamp(..) => json!("timestamp"),
+        ArrowType::List(child) => json!({
+            "type": "array",
+            "elementType": delta_type(child.data_type()),
+            "containsNull": child.is_nullable(),
+        }),
+        _ => json!("string"),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::Replaces;
+
+    fn file(name: &str, replaces: Option<(&str, &[&str])>) -> NewFile {
+        let replaces = replaces.map(|(prefix, names)| Replaces {
+            prefix: Some(prefix.to_owned()).filter(|p| !p.is_empty()),
+            names: names.iter().map(|n| (*n).to_owned()).collect(),
+        });
+        NewFile { name: name.into(), bytes: 1, stats: "{}".into(), replaces, parts: Vec::new() }
+    }
+
+    fn names(names: &[&str]) -> HashSet<String> {
+        names.iter().map(|n| (*n).to_owned()).collect()
+    }
+
+    #[test]
+    fn what_is_there_is_not_added_again_and_what_is_gone_not_removed() {
+        let commit = Commit {
+            add: vec![file("a", None), file("b", None), file("b", None)],
+            remove: vec![Path::from("tables/runs/c"), Path::from("tables/runs/d")],
+            effect: Effect::Rows,
+        };
+        let change = Change::of(&commit, names(&["a", "c"]));
+        assert_eq!(change.outcomes, [Committed::Before, Committed::Now, Committed::Before]);
+        assert_eq!(change.add.iter().map(|f| f.name.as_str()).collect::<Vec<_>>(), ["b"]);
+        assert_eq!(change.remove.iter().collect::<Vec<_>>(), ["c"]);
+    }
+
+    #[test]
+    fn a_file_takes_the_place_of_what_it_expects_there_and_of_nothing_else() {
+        let outcomes = |add: Vec<NewFile>, there: &[&str]| {
+            let commit = Commit { add, ..Commit::default() };
+            let change = Change::of(&commit, names(there));
+            (change.outcomes.clone(), change.remove.into_iter().collect::<Vec<_>>())
+        };
+        let new = || file("x.2", Some(("x.", &["x.1"])));
+        assert_eq!(outcomes(vec![new()], &["x.1", "y.1"]), (vec![Committed::Now], vec!["x.1".to_owned()]));
+        assert_eq!(outcomes(vec![new()], &["x.3"]), (vec![Committed::Outdated], vec![]));
+        assert_eq!(outcomes(vec![new()], &["x.1", "x.3"]), (vec![Committed::Outdated], vec![]));
+        assert_eq!(outcomes(vec![new()], &["x.2"]), (vec![Committed::Before], vec![]));
+        let merged = || file("m", Some(("", &["x.1", "y.1"])));
+        let gone = vec!["x.1".to_owned(), "y.1".to_owned()];
+        assert_eq!(outcomes(vec![merged()], &["x.1", "y.1", "x.2"]), (vec![Committed::Now], gone));
+        assert_eq!(outcomes(vec![merged()], &["x.1", "y.2"]), (vec![Committed::Outdated], vec![]));
+        let first = |name| file(name, Some(("x.", &[])));
+        assert_eq!(
+            outcomes(vec![first("x.1"), first("x.2")], &[]),
+            (vec![Committed::Now, Committed::Outdated], vec![])
+        );
+    }
+}

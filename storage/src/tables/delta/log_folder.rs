@@ -1,0 +1,402 @@
+//! The files of one table's `_delta_log`: a JSON file per version, and checkpoints.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::sync::Arc;
+
+use chrono::{DateTime, TimeDelta, Utc};
+use echolake_schema::tables::Table;
+use futures::{StreamExt as _, TryStreamExt as _};
+use object_store::path::Path;
+use object_store::{ObjectStore, ObjectStoreExt as _, PutMode};
+use serde_json::json;
+
+use super::actions::LogLine;
+use super::checkpoint::{decode_checkpoint, encode_checkpoint};
+use super::folder;
+use super::table_state::TableState;
+use crate::tables::versions::{commit_name, commit_number};
+use crate::{Error, Result};
+
+/// The newest version of the protocol that this reads.
+const READER_VERSION: i32 = 1;
+/// The newest version of the protocol that this writes.
+const WRITER_VERSION: i32 = 2;
+/// Versions from one checkpoint to the next.
+const CHECKPOINT_INTERVAL: u64 = 100;
+/// How long versions before a checkpoint are kept: Delta's default, 30 days.
+const LOG_RETENTION: TimeDelta = TimeDelta::days(30);
+/// Commits that are read at once.
+const CONCURRENT_READS: usize = 16;
+/// The file that tells readers which checkpoint is the newest.
+const LAST_CHECKPOINT: &str = "_last_checkpoint";
+
+/// One table's log folder.
+pub(super) struct LogFolder<'a> {
+    table: Table,
+    path: Path,
+    store: &'a dyn ObjectStore,
+}
+
+/// What became of an attempt to write a version.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum CommitAttempt {
+    /// The version is ours.
+    Written,
+    /// Another writer has taken the number.
+    Taken,
+}
+
+/// What stands in a log folder.
+#[derive(Debug, Default)]
+struct LogListing {
+    commits: BTreeSet<u64>,
+    /// The parts of each checkpoint, and how many there should be.
+    checkpoints: BTreeMap<u64, CheckpointFiles>,
+    modified: BTreeMap<Path, DateTime<Utc>>,
+}
+
+#[derive(Debug, Default)]
+struct CheckpointFiles {
+    files: BTreeSet<Path>,
+    expected: usize,
+}
+
+impl<'a> LogFolder<'a> {
+    pub(super) fn new(table: Table, store: &'a dyn ObjectStore) -> Self {
+        Self { table, path: folder(table).join("_delta_log"), store }
+    }
+
+    /// The table at its newest version, or at the given one; None if it has no log.
+    pub(super) async fn load(&self, at: Option<u64>) -> Result<Option<TableState>> {
+        let listing = self.list().await?;
+        let Some(newest) = listing.newest() else { return Ok(None) };
+        let last = at.unwrap_or(newest).min(newest);
+        let mut state = TableState::default();
+        let mut next = 0;
+        if let Some((version, checkpoint)) = listing.checkpoint_before(last) {
+            for file in &checkpoint.files {
+                state.apply(version, self.read_checkpoint(file).await?);
+            }
+            next = version + 1;
+        }
+        let commits = futures::stream::iter(next..=last).map(|version| async move {
+            let lines = self.read_commit(version).await?;
+            let missing = || self.damaged(&format!("version {version} is missing, `{}`", commit_name(version)));
+            Ok::<_, Error>((version, lines.ok_or_else(missing)?))
+        });
+        let mut commits = commits.buffered(CONCURRENT_READS);
+        while let Some((version, lines)) = commits.try_next().await? {
+            state.apply(version, lines);
+        }
+        self.check_readable(&state)?;
+        Ok(Some(state))
+    }
+
+    /// Brings a state up to the newest version. Returns None if the log was cleaned up beyond it, so that it must be
+    /// loaded anew.
+    pub(super) async fn advance(&self, mut state: Arc<TableState>) -> Result<Option<Arc<TableState>>> {
+        let from = state.version;
+        while let Some(lines) = self.read_commit(state.version + 1).await? {
+            let next = state.version + 1;
+            Arc::make_mut(&mut state).apply(next, lines);
+        }
+        if state.version == from && !self.has_version(from).await? {
+            return Ok(None);
+        }
+        self.check_readable(&state)?;
+        Ok(Some(state))
+    }
+
+    pub(super) async fn has_version(&self, version: u64) -> Result<bool> {
+        let path = self.path.clone().join(commit_name(version));
+        match self.store.head(&path).await {
+            Ok(_) => Ok(true),
+            Err(object_store::Error::NotFound { .. }) => Ok(false),
+            Err(e) => Err(Error::store("read", path, e)),
+        }
+    }
+
+    /// Writes a version, unless another writer has taken its number.
+    pub(super) async fn write_commit(&self, version: u64, lines: &[LogLine]) -> Result<CommitAttempt> {
+        let mut text = Vec::new();
+        for line in lines {
+            serde_json::to_writer(&mut text, line).map_err(|e| self.failed("written", e.to_string()))?;
+            text.push(b'\n');
+        }
+        let path = self.path.clone().join(commit_name(version));
+        match self.store.put_opts(&path, text.into(), PutMode::Create.into()).await {
+            Ok(_) => Ok(CommitAttempt::Written),
+            Err(object_store::Error::AlreadyExists { .. }) => Ok(CommitAttempt::Taken),
+            Err(e) => Err(Error::store("write", path, e)),
+        }
+    }
+
+    /// Writes a checkpoint and deletes what is older than the log's retention, if this version is due for it.
+    pub(super) async fn maintain(&self, state: &TableState, now: DateTime<Utc>) -> Result<()> {
+        if !state.version.is_multiple_of(CHECKPOINT_INTERVAL) || state.version == 0 {
+            return Ok(());
+        }
+        self.write_checkpoint(state, now).await?;
+        self.delete_expired(now).await
+    }
+
+    async fn write_checkpoint(&self, state: &TableState, now: DateTime<Utc>) -> Result<()> {
+        let lines = state.checkpoint_lines(now.timestamp_millis());
+        let file = encode_checkpoint(&lines).map_err(|e| self.failed("written", e.to_string()))?;
+        let hint = json!({ "version": state.version, "size": lines.len(), "sizeInBytes": file.len(),
+            "numOfAddFiles": state.files.len() });
+        let path = self.path.clone().join(checkpoint_name(state.version));
+        self.store.put(&path, file.into()).await.map_err(|e| Error::store("write", path, e))?;
+        let path = self.path.clone().join(LAST_CHECKPOINT);
+        self.store.put(&path, hint.to_string().into()).await.map_err(|e| Error::store("write", path, e))?;
+        Ok(())
+    }
+
+    // What stands before the newest checkpoint that is itself older than the retention.
+    async fn delete_expired(&self, now: DateTime<Utc>) -> Result<()> {
+        let listing = self.list().await?;
+        let is_old = |version: &&u64| {
+            let path = self.path.clone().join(checkpoint_name(**version));
+            listing.modified.get(&path).is_some_and(|modified| now - *modified > LOG_RETENTION)
+        };
+        let Some(first_kept) = listing.checkpoints.keys().rev().find(is_old).copied() else { return Ok(()) };
+        let commits = listing.commits.range(..first_kept).map(|v| self.path.clone().join(commit_name(*v)));
+        let checkpoints = listing.checkpoints.range(..first_kept).flat_map(|(_, c)| c.files.iter().cloned());
+        for path in commits.chain(checkpoints) {
+            match self.store.delete(&path).await {
+                Ok(()) | Err(object_store::Error::NotFound { .. }) => {}
+                Err(e) => return Err(Error::store("delete", path, e)),
+            }
+        }
+        Ok(())
+    }
+
+    async fn list(&self) -> Result<LogListing> {
+        let there = self.store.list_with_delimiter(Some(&self.path)).await;
+        let there = there.map_err(|e| Error::store("list", &self.path, e))?;
+        let mut listing = LogListing::default();
+        for object in there.objects {
+            if let Some(version) = commit_number(&object.location) {
+                listing.commits.insert(version);
+            } else if let Some((version, expected)) = checkpoint_number(&object.location) {
+                let checkpoint = listing.checkpoints.entry(version).or_default();
+                checkpoint.expected = expected;
+                checkpoint.files.insert(object.location.clone());
+            }
+            listing.modified.insert(object.location, object.last_modified);
+        }
+        listing.checkpoints.retain(|_, checkpoint| checkpoint.files.len() == checkpoint.expected);
+        Ok(listing)
+    }
+
+    async fn read_commit(&self, version: u64) -> Result<Option<Vec<LogLine>>> {
+        let path = self.path.clone().join(commit_name(version));
+        let Some(bytes) = self.read(&path).await? else { return Ok(None) };
+        let mut lines = Vec::new();
+        for (number, line) in bytes.split(|b| *b == b'\n').enumerate().filter(|(_, line)| !line.trim_ascii().is_empty())
+        {
+            let line = serde_json::from_slice(line).map_err(|e| {
+                self.damaged(&format!("`{}` line {}: expected an action, {e}", commit_name(version), number + 1))
+            })?;
+            lines.push(line);
+        }
+        Ok(Some(lines))
+    }
+
+    async fn read_checkpoint(&self, path: &Path) -> Result<Vec<LogLine>> {
+        let name = path.filename().unwrap_or_default();
+        let bytes = self.read(path).await?.ok_or_else(|| self.damaged(&format!("`{name}` is gone")))?;
+        decode_checkpoint(bytes).map_err(|e| self.damaged(&format!("`{name}`: {e}")))
+    }
+
+    async fn read(&self, path: &Path) -> Result<Option<bytes::Bytes>> {
+        let read = async { self.store.get(path).await?.bytes().await };
+        match read.await {
+            Ok(bytes) => Ok(Some(bytes)),
+            Err(object_store::Error::NotFound { .. }) => Ok(None),
+            Err(e) => Err(Error::store("read", path, e)),
+        }
+    }
+
+    fn check_readable(&self, state: &TableState) -> Result<()> {
+        let Some(protocol) = &state.protocol else { return Err(self.damaged("it names no version of the protocol")) };
+        let needed = protocol.min_reader_version;
+        if needed <= READER_VERSION {
+            return Ok(());
+        }
+        let reason = format!(
+            "another program has raised it to Delta's reader version {needed}, echolake reads version {READER_VERSION}; \
+             hint: delete the table's folder, `echolake ingest` makes it anew"
+        );
+        Err(self.failed("read", reason))
+    }
+
+    /// Refuses a table whose other writers rely on what this one does not do.
+    pub(super) fn check_writable(&self, state: &TableState) -> Result<()> {
+        let needed = state.protocol.as_ref().map_or(0, |p| p.min_writer_version);
+        if needed <= WRITER_VERSION {
+            return Ok(());
+        }
+        let reason = format!(
+            "another program has raised it to Delta's writer version {needed}, echolake writes version {WRITER_VERSION}; \
+             hint: delete the table's folder, `echolake ingest` makes it anew"
+        );
+        Err(self.failed("written", reason))
+    }
+
+    fn damaged(&self, what: &str) -> Error {
+        self.failed("read", format!("{what}; hint: delete the table's folder, `echolake ingest` makes it anew"))
+    }
+
+    fn failed(&self, action: &'static str, reason: String) -> Error {
+        Error::Log { table: self.table.name(), action, reason }
+    }
+}
+
+/// The versions of the protocol that a table of ours needs.
+pub(super) fn own_protocol() -> super::actions::ProtocolVersions {
+    super::actions::ProtocolVersions { min_reader_version: READER_VERSION, min_writer_version: WRITER_VERSION }
+}
+
+impl LogListing {
+    fn newest(&self) -> Option<u64> {
+        self.commits.last().copied().max(self.checkpoints.last_key_value().map(|(version, _)| *version))
+    }
+
+    fn checkpoint_before(&self, version: u64) -> Option<(u64, &CheckpointFiles)> {
+        self.checkpoints.range(..=version).next_back().map(|(version, files)| (*version, files))
+    }
+}
+
+fn checkpoint_name(version: u64) -> String {
+    format!("{version:020}.checkpoint.parquet")
+}
+
+/// The version of a checkpoint's file, and how many files the checkpoint has.
+fn checkpoint_number(path: &Path) -> Option<(u64, usize)> {
+    let (version, rest) = path.filename()?.split_once(".checkpoint.")?;
+    let version = (version.len() == 20).then(|| version.parse().ok()).flatten()?;
+    match rest.split('.').collect::<Vec<_>>()[..] {
+        ["parquet"] => Some((version, 1)),
+        [_, parts, "parquet"] => Some((version, parts.parse().ok()?)),
+        _ => None,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use object_store::memory::InMemory;
+
+    use super::*;
+
+    const PROTOCOL: &str = r#"{"protocol":{"minReaderVersion":1,"minWriterVersion":2}}"#;
+
+    fn add(name: &str) -> LogLine {
+        let json = format!(
+            r#"{{"add":{{"path":"{name}","partitionValues":{{}},"size":1,"modificationTime":1,"dataChange":true}}}}"#
+        );
+        serde_json::from_str(&json).expect("a line")
+    }
+
+    fn path(name: &str) -> Path {
+        folder(Table::Nce).join("_delta_log").join(name)
+    }
+
+    async fn put(store: &InMemory, name: &str, text: impl Into<Vec<u8>>) {
+        store.put(&path(name), text.into().into()).await.expect("written");
+    }
+
+    /// A log of `versions` versions with a file each, written as ingest does, checkpoints included.
+    async fn write_log(store: &InMemory, versions: u64) -> TableState {
+        let log = LogFolder::new(Table::Nce, store);
+        let mut state = TableState::default();
+        for version in 0..versions {
+            let mut lines = vec![add(&version.to_string())];
+            if version == 0 {
+                lines.push(serde_json::from_str(PROTOCOL).expect("a line"));
+            }
+            assert_eq!(log.write_commit(version, &lines).await.expect("written"), CommitAttempt::Written);
+            state.apply(version, lines);
+            log.maintain(&state, Utc::now()).await.expect("maintained");
+        }
+        state
+    }
+
+    async fn load_error(store: &InMemory) -> String {
+        LogFolder::new(Table::Nce, store).load(None).await.expect_err("refused").to_string()
+    }
+
+    #[tokio::test]
+    async fn every_version_is_read_with_and_without_a_checkpoint() {
+        let store = InMemory::new();
+        assert!(LogFolder::new(Table::Nce, &store).load(None).await.expect("read").is_none(), "no log yet");
+        write_log(&store, 205).await;
+        let log = LogFolder::new(Table::Nce, &store);
+        for version in [0, 1, 99, 100, 101, 150, 200, 204] {
+            let state = log.load(Some(version)).await.expect("read").expect("a table");
+            assert_eq!((state.version, state.files.len() as u64), (version, version + 1));
+        }
+        // Before a checkpoint, commits may be cleaned up.
+        for version in 0..150 {
+            store.delete(&path(&commit_name(version))).await.expect("deleted");
+        }
+        assert_eq!(log.load(None).await.expect("read").expect("a table").files.len(), 205);
+        store.delete(&path(&commit_name(202))).await.expect("deleted");
+        let error = load_error(&store).await;
+        assert!(error.contains("version 202 is missing") && error.contains("hint"), "{error}");
+    }
+
+    #[tokio::test]
+    async fn a_number_is_written_once_and_a_state_follows_the_log_or_says_that_it_cannot() {
+        let store = InMemory::new();
+        let state = Arc::new(write_log(&store, 3).await);
+        let log = LogFolder::new(Table::Nce, &store);
+        assert_eq!(log.write_commit(2, &[add("late")]).await.expect("tried"), CommitAttempt::Taken);
+        log.write_commit(3, &[add("new")]).await.expect("written");
+        let advanced = log.advance(state.clone()).await.expect("read").expect("followed");
+        assert_eq!((advanced.version, advanced.files.len()), (3, 4));
+        // A log that was cleaned up beyond what is known has neither that version nor the next.
+        for version in 0..4 {
+            store.delete(&path(&commit_name(version))).await.expect("deleted");
+        }
+        assert!(log.advance(state).await.expect("read").is_none());
+    }
+
+    #[tokio::test]
+    async fn only_old_versions_before_an_old_checkpoint_are_deleted() {
+        let store = InMemory::new();
+        let state = write_log(&store, 205).await;
+        let log = LogFolder::new(Table::Nce, &store);
+        log.delete_expired(Utc::now() + LOG_RETENTION - TimeDelta::minutes(1)).await.expect("nothing is old");
+        assert!(log.has_version(0).await.expect("looked"));
+        log.delete_expired(Utc::now() + LOG_RETENTION + TimeDelta::minutes(1)).await.expect("deleted");
+        assert!(!log.has_version(199).await.expect("looked") && log.has_version(200).await.expect("looked"));
+        assert!(store.head(&path(&checkpoint_name(100))).await.is_err());
+        let loaded = log.load(None).await.expect("read").expect("a table");
+        assert!(loaded.files.keys().eq(state.files.keys()));
+    }
+
+    #[tokio::test]
+    async fn damage_and_newer_protocols_are_refused_with_their_place() {
+        let store = InMemory::new();
+        put(&store, &commit_name(0), format!("{PROTOCOL}\n{{\"add\": 3}}\n")).await;
+        let error = load_error(&store).await;
+        assert!(error.contains("`00000000000000000000.json` line 2") && error.contains("hint"), "{error}");
+        put(&store, &commit_name(0), r#"{"protocol":{"minReaderVersion":3,"minWriterVersion":7}}"#).await;
+        let error = load_error(&store).await;
+        assert!(error.contains("reader version 3") && error.contains("hint"), "{error}");
+        put(&store, &commit_name(0), PROTOCOL).await;
+        put(&store, &checkpoint_name(0), "PAR1, but cut off").await;
+        assert!(load_error(&store).await.contains("checkpoint.parquet`"));
+        // Of a checkpoint in parts one is missing: it does not count.
+        store.delete(&path(&checkpoint_name(0))).await.expect("deleted");
+        let part = format!("{:020}.checkpoint.0000000001.0000000002.parquet", 0);
+        put(&store, &part, "one of two").await;
+        let log = LogFolder::new(Table::Nce, &store);
+        let state = log.load(None).await.expect("read").expect("a table");
+        log.check_writable(&state).expect("ours");
+        put(&store, &commit_name(1), r#"{"protocol":{"minReaderVersion":1,"minWriterVersion":7}}"#).await;
+        let state = log.load(None).await.expect("read").expect("a table");
+        assert!(log.check_writable(&state).expect_err("newer").to_string().contains("writer version 7"));
+    }
+}

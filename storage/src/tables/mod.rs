@@ -1,0 +1,209 @@
+//! A lake's tables: rows in, and a view of them.
+
+mod commit_log;
+mod data_file;
+pub(crate) mod delta;
+mod lease;
+mod optimize;
+mod rig_tables;
+mod rows;
+mod snapshot;
+mod vacuum;
+mod versions;
+
+pub use commit_log::{Commit, CommitLog, Committed, DataFile, Effect, FileStats, History, NewFile, Part, Replaces};
+pub use data_file::{EncodedFile, FileEncoder, encode};
+pub use optimize::{Merging, Optimized, TARGET_BYTES, TableOptimized};
+pub use snapshot::{FileName, Snapshot, VisibleRun};
+pub use vacuum::{Deletion, Freed, KEEP_HOURS, Vacuumed};
+pub use versions::{Moment, NoMoment, TableVersion};
+
+use arrow::record_batch::RecordBatch;
+use echolake_schema::tables::{Source, Table};
+use futures::future::join_all;
+use object_store::ObjectStoreExt as _;
+
+use self::delta::folder;
+use crate::{Error, LAKE_FORMAT, Lake, Result};
+
+/// A file in the store that no commit names yet.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Staged {
+    pub(crate) table: Table,
+    pub(crate) file: NewFile,
+}
+
+impl Staged {
+    /// Makes a run's row take the place of the rows that are there, which are these files or none. Where others stand
+    /// there by the time of the commit, it is [`Committed::Outdated`].
+    #[must_use]
+    pub fn replacing<'a>(mut self, run: &VisibleRun, old: impl IntoIterator<Item = &'a DataFile>) -> Self {
+        let names = old.into_iter().filter_map(|f| f.path.filename()).map(str::to_owned).collect();
+        self.file.replaces = Some(Replaces { prefix: Some(run.prefix()), names });
+        self
+    }
+}
+
+impl Lake {
+    /// Makes the tables that are missing, and the rows that come from the rig alone.
+    ///
+    /// # Errors
+    /// What the store says.
+    pub async fn ensure_tables(&self) -> Result<()> {
+        for table in Table::ALL {
+            self.log().ensure(table).await?;
+        }
+        let grid = self.grid();
+        let derivation = || FileName::Rig { derivation: format!("v{LAKE_FORMAT}") };
+        for table in Table::ALL.into_iter().filter(|t| t.source() == Source::Rig) {
+            let rows = match table {
+                Table::Points => rig_tables::points(self.rig(), grid)?,
+                _ => self.pairs()?,
+            };
+            self.append_rows(table, &derivation(), &[rows]).await?;
+        }
+        Ok(())
+    }
+
+    /// The rows of table `pairs`, which follow from the rig: row i is pair i.
+    ///
+    /// # Errors
+    /// [`Error::Encode`] where the rig has no such columns, which is a mistake in this crate.
+    pub fn pairs(&self) -> Result<RecordBatch> {
+        rig_tables::pairs(self.rig(), self.grid())
+    }
+
+    /// A frozen view of what readers may see.
+    ///
+    /// # Errors
+    /// [`Error::Log`] where a table's log is damaged.
+    pub async fn snapshot(&self) -> Result<Snapshot> {
+        Snapshot::take(self.log()).await
+    }
+
+    /// Puts a file's bytes into the store, for a commit to name. Nobody sees them before that.
+    ///
+    /// # Errors
+    /// What the store says.
+    pub async fn stage(&self, table: Table, name: &FileName, file: EncodedFile) -> Result<Staged> {
+        let name = name.compose();
+        let path = folder(table).join(name.as_str());
+        let (bytes, stats) = (file.bytes.len() as u64, file.stats);
+        self.store().put(&path, file.bytes.into()).await.map_err(|e| Error::store("write", &path, e))?;
+        Ok(Staged { table, file: NewFile { name, bytes, stats, replaces: None, parts: Vec::new() } })
+    }
+
+    /// Whether a file of this name is in the table.
+    ///
+    /// # Errors
+    /// [`Error::Log`] where the table's log is damaged.
+    pub async fn has(&self, table: Table, name: &FileName) -> Result<bool> {
+        self.log().has(table, &name.compose()).await
+    }
+
+    /// Commits staged files, each of their tables once, all of them side by side but `runs`, which is last: from that commit on readers see them.
+    /// Returns what became of each file, in the given order. The same files again add nothing.
+    ///
+    /// # Errors
+    /// What the store says. Tables that were committed before stay so, seen by nobody; the same call goes on.
+    pub async fn commit(&self, staged: &[Staged]) -> Result<Vec<Committed>> {
+        let mut outcomes = vec![Committed::Before; staged.len()];
+        let (pointers, others): (Vec<_>, Vec<_>) = Table::ALL.into_iter().partition(|table| *table == Table::Runs);
+        for tables in [others, pointers] {
+            // Each is brought to its end, whatever becomes of the others.
+            for done in join_all(tables.into_iter().map(|table| self.commit_table(table, staged))).await {
+                done?.into_iter().for_each(|(i, outcome)| outcomes[i] = outcome);
+            }
+        }
+        Ok(outcomes)
+    }
+
+    // What became of the files of one table, each with its place among all.
+    async fn commit_table(&self, table: Table, staged: &[Staged]) -> Result<Vec<(usize, Committed)>> {
+        let of: Vec<_> = (0..staged.len()).filter(|i| staged[*i].table == table).collect();
+        if of.is_empty() {
+            return Ok(Vec::new());
+        }
+        let add = of.iter().map(|i| staged[*i].file.clone()).collect();
+        let done = self.log().commit(table, &Commit { add, ..Commit::default() }).await?;
+        Ok(of.into_iter().zip(done).collect())
+    }
+
+    /// Puts rows into a table, once: the same name again adds nothing.
+    ///
+    /// # Errors
+    /// [`Error::Encode`] where the rows do not fit the table, or what the store says.
+    pub async fn append_rows(&self, table: Table, name: &FileName, batches: &[RecordBatch]) -> Result<Committed> {
+        if self.has(table, name).await? {
+            return Ok(Committed::Before);
+        }
+        let staged = self.stage(table, name, encode(table, &table.schema(self.rig()), batches)?).await?;
+        Ok(self.commit(&[staged]).await?[0])
+    }
+
+    /// Takes out of the logs what no run's row names any more; merged files are written anew without it. The files
+    /// stay for readers that hold older views.
+    ///
+    /// # Errors
+    /// What the store says.
+    pub async fn remove_superseded(&self) -> Result<usize> {
+        let snapshot = self.snapshot().await?;
+        let mut count = 0;
+        for table in Table::ALL {
+            let remove: Vec<_> = snapshot.superseded(table).iter().map(|f| f.path.clone()).collect();
+            if !remove.is_empty() {
+                count += remove.len();
+                self.log().commit(table, &Commit { remove, ..Commit::default() }).await?;
+            }
+            for file in snapshot.outgrown(table) {
+                self.rewrite(table, file).await?;
+                count += 1;
+            }
+        }
+        Ok(count)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use echolake_schema::Rig;
+
+    use super::*;
+    use crate::References;
+
+    async fn paper(url: &str) -> Result<Lake> {
+        Lake::open_or_create(url, &Rig::paper(), &References::default()).await
+    }
+
+    #[tokio::test]
+    async fn the_same_rows_twice_are_added_once() {
+        let lake = paper("memory://").await.expect("made");
+        let grid = lake.rig().grid().expect("a grid");
+        let rows = || vec![rig_tables::points(lake.rig(), &grid).expect("rows")];
+        let name = || FileName::Rig { derivation: "test".into() };
+        assert_eq!(lake.append_rows(Table::Points, &name(), &rows()).await.expect("added"), Committed::Now);
+        assert_eq!(lake.append_rows(Table::Points, &name(), &rows()).await.expect("known"), Committed::Before);
+        assert_eq!(lake.log().files(Table::Points).await.expect("files").len(), 2);
+    }
+
+    #[tokio::test]
+    async fn two_writers_lose_nothing() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let url = folder.path().join("lake").display().to_string();
+        let lakes = [paper(&url).await.expect("made"), paper(&url).await.expect("opened")];
+        let grid = lakes[0].rig().grid().expect("a grid");
+        let write = |lake: Lake, writer: usize| {
+            let rows = rig_tables::points(lake.rig(), &grid).expect("rows");
+            tokio::spawn(async move {
+                for i in 0..10 {
+                    let name = FileName::Rig { derivation: format!("{writer}x{i}") };
+                    lake.append_rows(Table::Points, &name, std::slice::from_ref(&rows)).await.expect("committed");
+                }
+            })
+        };
+        let [a, b] = lakes.clone();
+        let (a, b) = tokio::join!(write(a, 0), write(b, 1));
+        a.and(b).expect("both done");
+        assert_eq!(lakes[0].log().files(Table::Points).await.expect("files").len(), 21);
+    }
+}

@@ -1,0 +1,220 @@
+//! Merges small files of a table into large ones. What readers see does not change, nor does how rows are stored.
+//!
+//! A merged file's Add lists its parts, (surface, run, derivation) each with its number of rows; a snapshot decides
+//! over every part as it would over a file of its own. `runs` and `surfaces` stay a file a run: ingest reads them by
+//! name and by their statistics, and all of them together are small.
+
+use std::sync::atomic::{AtomicBool, Ordering};
+
+use echolake_schema::tables::{Source, Table};
+use futures::TryStreamExt as _;
+use serde::Serialize;
+use sha2::{Digest as _, Sha256};
+
+use crate::tables::lease::Lease;
+use crate::{
+    Commit, Committed, DataFile, Effect, Error, FileEncoder, FileName, Lake, Part, Replaces, Result, Snapshot,
+};
+
+/// Size that files are merged to where nothing else is said: few enough for a million responses, small enough to be
+/// held in memory.
+pub const TARGET_BYTES: u64 = 128 << 20;
+/// Hex digits that a name keeps of its digest.
+const DIGEST_DIGITS: usize = 16;
+
+/// How far the work has come.
+#[derive(Debug, Clone, Copy)]
+pub struct Merging {
+    /// The table at work.
+    pub table: Table,
+    /// Files merged, of all tables.
+    pub done: usize,
+    /// Files to merge, of all tables.
+    pub total: usize,
+}
+
+/// What became of the lake.
+#[derive(Debug, Clone, Default, Serialize)]
+pub struct Optimized {
+    /// The tables that were changed.
+    pub tables: Vec<TableOptimized>,
+    /// It was stopped before its end.
+    pub stopped: bool,
+}
+
+/// What became of a table.
+#[derive(Debug, Clone, Serialize)]
+pub struct TableOptimized {
+    /// Its name.
+    pub table: &'static str,
+    /// Files that were merged.
+    pub merged: usize,
+    /// Their bytes.
+    pub bytes_before: u64,
+    /// Files that stand in their place.
+    pub files: usize,
+    /// Their bytes.
+    pub bytes_after: u64,
+    /// Merges that were dropped because ingest replaced one of the files meanwhile.
+    pub outdated: usize,
+}
+
+impl Lake {
+    /// Merges small files under the maintenance lease. Ingest and readers may go on.
+    ///
+    /// # Errors
+    /// [`Error::Maintained`] where somebody else is at it, [`Error::LeaseLost`], [`Error::DataFile`], or what the
+    /// store says. What was merged before stays so.
+    pub async fn optimize(
+        &self,
+        target_bytes: u64,
+        stop: &AtomicBool,
+        progress: &mut (dyn FnMut(Merging) + Send),
+    ) -> Result<Optimized> {
+        let mut lease = Lease::take(self).await?;
+        let done = self.merge_all(target_bytes, stop, progress, &mut lease).await;
+        let released = lease.release().await;
+        done.and_then(|report| released.map(|()| report))
+    }
+
+    async fn merge_all(
+        &self,
+        target_bytes: u64,
+        stop: &AtomicBool,
+        progress: &mut (dyn FnMut(Merging) + Send),
+        lease: &mut Lease,
+    ) -> Result<Optimized> {
+        self.remove_superseded().await?;
+        let snapshot = self.snapshot().await?;
+        let plans: Vec<_> = Table::ALL.into_iter().map(|table| (table, plan(&snapshot, table, target_bytes))).collect();
+        let total = plans.iter().flat_map(|(_, groups)| groups).map(Vec::len).sum();
+        let (mut report, mut done) = (Optimized::default(), 0);
+        for (table, groups) in plans.into_iter().filter(|(_, groups)| !groups.is_empty()) {
+            let name = table.name();
+            let mut of =
+                TableOptimized { table: name, merged: 0, bytes_before: 0, files: 0, bytes_after: 0, outdated: 0 };
+            for group in &groups {
+                progress(Merging { table, done, total });
+                if stop.load(Ordering::Relaxed) {
+                    report.stopped = true;
+                    break;
+                }
+                match self.merge(table, group, Effect::Layout, Some(&mut *lease)).await? {
+                    (Committed::Outdated, _) => of.outdated += 1,
+                    (_, bytes) => {
+                        of.merged += group.len();
+                        of.bytes_before += group.iter().map(|f| f.bytes).sum::<u64>();
+                        of.files += 1;
+                        of.bytes_after += bytes;
+                    }
+                }
+                done += group.len();
+            }
+            report.tables.push(of);
+        }
+        Ok(report)
+    }
+
+    /// Writes a merged file anew without what is superseded in it. Where another did so meanwhile, nothing changes.
+    pub(crate) async fn rewrite(&self, table: Table, file: &DataFile) -> Result<Committed> {
+        let (outcome, _) = self.merge(table, std::slice::from_ref(file), Effect::Rows, None).await?;
+        Ok(outcome)
+    }
+
+    // One file in the place of several; returns its size, too.
+    async fn merge(
+        &self,
+        table: Table,
+        files: &[DataFile],
+        effect: Effect,
+        mut lease: Option<&mut Lease>,
+    ) -> Result<(Committed, u64)> {
+        let mut slices: Vec<_> = files.iter().flat_map(slices).collect();
+        slices.sort_by(|a, b| key(&a.part).cmp(&key(&b.part)));
+        let mut encoder = FileEncoder::new(table, table.schema(self.rig()));
+        for slice in &slices {
+            if let Some(lease) = lease.as_deref_mut() {
+                lease.keep().await?;
+            }
+            let mut batches = self.rows(table, slice.file, &[], slice.rows.clone()).await?;
+            let mut rows = 0;
+            while let Some(batch) = batches.try_next().await? {
+                rows += batch.num_rows() as u64;
+                encoder.write(&batch)?;
+            }
+            if rows != slice.part.rows {
+                let reason = format!("{rows} rows were read of {} of run {}", slice.part.rows, slice.part.run);
+                return Err(Error::DataFile { file: slice.file.path.to_string(), reason });
+            }
+        }
+        let parts: Vec<_> = slices.into_iter().map(|s| s.part).collect();
+        let mut staged = self.stage(table, &name(&parts), encoder.finish()?).await?;
+        let names = files.iter().filter_map(|f| f.path.filename()).map(str::to_owned).collect();
+        staged.file.replaces = Some(Replaces { prefix: None, names });
+        staged.file.parts = parts;
+        if let Some(lease) = lease {
+            lease.keep().await?;
+        }
+        let bytes = staged.file.bytes;
+        let commit = Commit { add: vec![staged.file], effect, ..Commit::default() };
+        let outcome = self.log().commit(table, &commit).await?;
+        Ok((outcome[0], bytes))
+    }
+}
+
+/// A run's rows, and where they stand.
+struct Slice<'a> {
+    file: &'a DataFile,
+    part: Part,
+    rows: std::ops::Range<u64>,
+}
+
+fn slices(file: &DataFile) -> Vec<Slice<'_>> {
+    if let Some(FileName::Rows { surface, run, derivation }) = FileName::parse(&file.path) {
+        let part = Part { surface, run, derivation, rows: file.rows };
+        return vec![Slice { file, rows: 0..file.rows, part }];
+    }
+    file.visible_parts().map(|(part, rows)| Slice { file, part: part.clone(), rows }).collect()
+}
+
+fn key(part: &Part) -> (&str, &str) {
+    (part.surface.as_str(), part.run.as_str())
+}
+
+fn name(parts: &[Part]) -> FileName {
+    let mut sha = Sha256::new();
+    for part in parts {
+        sha.update(part.file_name().compose());
+        sha.update("\n");
+    }
+    let digits: String = sha.finalize().iter().map(|byte| format!("{byte:02x}")).collect();
+    FileName::Merged { digest: digits[..DIGEST_DIGITS].to_owned() }
+}
+
+// Neighbours by surface and run in groups of about the wanted size, so that a query for a surface opens few files.
+fn plan(snapshot: &Snapshot, table: Table, target_bytes: u64) -> Vec<Vec<DataFile>> {
+    let merges = matches!(table.source(), Source::Run | Source::References) && table != Table::Surfaces;
+    if !merges {
+        return Vec::new();
+    }
+    let is_small = |f: &&DataFile| f.bytes < target_bytes / 2 && f.hidden.is_empty();
+    let first = |f: &DataFile| slices(f).first().map(|s| (s.part.surface.clone(), s.part.run.clone()));
+    let mut small: Vec<_> = snapshot.files(table).iter().filter(is_small).cloned().collect();
+    small.sort_by_cached_key(first);
+    let (mut groups, mut bytes) = (vec![Vec::new()], 0);
+    for file in small {
+        if bytes + file.bytes > target_bytes {
+            groups.push(Vec::new());
+            bytes = 0;
+        }
+        bytes += file.bytes;
+        if let Some(group) = groups.last_mut() {
+            group.push(file);
+        }
+    }
+    groups.retain(|group| group.len() > 1);
+    groups
+}
+
+#[cfg(test)]
+mod tests;

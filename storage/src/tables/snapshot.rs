@@ -1,0 +1,435 @@
+//! What a reader may see: a frozen view of every table, cut down to what `runs` names.
+//!
+//! Delta commits one table at a time, so a run's rows are committed before its `runs` row. The file of that
+//! row carries in its name the derivations that are current; files of other derivations are not seen.
+
+use std::collections::{BTreeMap, HashMap, HashSet};
+
+use chrono::{DateTime, Utc};
+use echolake_schema::tables::{Source, Table};
+use echolake_schema::{RunId, SurfaceId};
+use object_store::path::Path;
+use serde_json::{Value, json};
+
+use crate::{CommitLog, DataFile, Part, Result};
+
+/// What the name of a file in `tables/` says.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum FileName {
+    /// Rows that come from the rig alone.
+    Rig {
+        /// Digest of what they were made from.
+        derivation: String,
+    },
+    /// Rows of one run.
+    Rows {
+        /// The run's surface.
+        surface: SurfaceId,
+        /// The run.
+        run: RunId,
+        /// Digest of what they were made from.
+        derivation: String,
+    },
+    /// A run's row in `runs`.
+    Pointer(VisibleRun),
+    /// Rows of several runs, which the log lists.
+    Merged {
+        /// Digest of the list.
+        digest: String,
+    },
+}
+
+/// A run that readers see, and which derivations of its rows.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct VisibleRun {
+    /// The run's surface.
+    pub surface: SurfaceId,
+    /// The run.
+    pub run: RunId,
+    /// Derivation of the rows that come from the run alone.
+    pub run_derivation: String,
+    /// Derivation of the rows that need references; None while they are missing.
+    pub reference_derivation: Option<String>,
+}
+
+impl VisibleRun {
+    /// What the names of all of the run's rows in `runs` begin with.
+    pub(crate) fn prefix(&self) -> String {
+        format!("{}.{}.", self.surface, self.run)
+    }
+}
+
+/// A frozen view of all tables.
+#[derive(Debug, Clone, Default)]
+pub struct Snapshot {
+    files: HashMap<Table, Vec<DataFile>>,
+    runs: BTreeMap<RunId, Current>,
+    hidden: HashMap<Table, Vec<DataFile>>,
+    outgrown: HashMap<Table, Vec<DataFile>>,
+    versions: HashMap<Table, u64>,
+}
+
+/// A run's row in `runs`, and when it was committed.
+#[derive(Debug, Clone)]
+struct Current {
+    run: VisibleRun,
+    since: DateTime<Utc>,
+}
+
+const EXTENSION: &str = ".parquet";
+const WITHOUT: &str = "none";
+const MERGED: &str = "merged";
+
+impl FileName {
+    /// The name.
+    pub fn compose(&self) -> String {
+        match self {
+            Self::Rig { derivation } => format!("rig.{derivation}{EXTENSION}"),
+            Self::Merged { digest } => format!("{MERGED}.{digest}{EXTENSION}"),
+            Self::Rows { surface, run, derivation } => format!("{surface}.{run}.{derivation}{EXTENSION}"),
+            Self::Pointer(VisibleRun { surface, run, run_derivation, reference_derivation }) => {
+                let references = reference_derivation.as_deref().unwrap_or(WITHOUT);
+                format!("{surface}.{run}.{run_derivation}.{references}{EXTENSION}")
+            }
+        }
+    }
+
+    /// Reads a name; None where it is none of ours.
+    pub fn parse(path: &Path) -> Option<Self> {
+        let parts: Vec<_> = path.filename()?.strip_suffix(EXTENSION)?.split('.').collect();
+        match parts[..] {
+            ["rig", derivation] => Some(Self::Rig { derivation: derivation.into() }),
+            [MERGED, digest] => Some(Self::Merged { digest: digest.into() }),
+            [surface, run, derivation] => Some(Self::Rows {
+                surface: surface.parse().ok()?,
+                run: run.parse().ok()?,
+                derivation: derivation.into(),
+            }),
+            [surface, run, run_derivation, references] => Some(Self::Pointer(VisibleRun {
+                surface: surface.parse().ok()?,
+                run: run.parse().ok()?,
+                run_derivation: run_derivation.into(),
+                reference_derivation: (references != WITHOUT).then(|| references.into()),
+            })),
+            _ => None,
+        }
+    }
+}
+
+impl Snapshot {
+    /// Takes a view. `runs` is read first, so that whatever it names was committed before.
+    pub(crate) async fn take(log: &dyn CommitLog) -> Result<Self> {
+        // Versions are read before files, so that a commit between the two is taken for one that is yet to be seen.
+        let mut versions = HashMap::new();
+        versions.extend(log.version(Table::Runs).await?.map(|v| (Table::Runs, v)));
+        let pointers = log.files(Table::Runs).await?;
+        let mut snapshot = Self { runs: current_runs(&pointers), ..Self::default() };
+        for table in Table::ALL.into_iter().filter(|t| *t != Table::Runs) {
+            versions.extend(log.version(table).await?.map(|v| (table, v)));
+            snapshot.sort_in(table, log.files(table).await?);
+        }
+        snapshot.sort_in(Table::Runs, pointers);
+        snapshot.versions = versions;
+        Ok(snapshot)
+    }
+
+    /// The view of one table that a version of `runs` gives, its files as the log had them then.
+    pub(crate) fn of(pointers: &[DataFile], table: Table, files: Vec<DataFile>) -> Self {
+        let mut snapshot = Self { runs: current_runs(pointers), ..Self::default() };
+        snapshot.sort_in(table, files);
+        snapshot
+    }
+
+    /// The version of a table's log that the view was taken of, or a little before it; that of `runs` is the lake's.
+    /// None where there was no table, and for views of the past.
+    pub fn version(&self, table: Table) -> Option<u64> {
+        self.versions.get(&table).copied()
+    }
+
+    /// The files of a table that readers see.
+    pub fn files(&self, table: Table) -> &[DataFile] {
+        self.files.get(&table).map_or(&[], Vec::as_slice)
+    }
+
+    /// The files of a table that belong to a run that readers see, but are no longer seen themselves. Those that are
+    /// newer than the run's row may be about to be named by another ingest, and are none of them.
+    pub fn superseded(&self, table: Table) -> &[DataFile] {
+        self.hidden.get(&table).map_or(&[], Vec::as_slice)
+    }
+
+    /// Merged files of a table that readers see in part, and whose other parts are superseded.
+    pub(crate) fn outgrown(&self, table: Table) -> &[DataFile] {
+        self.outgrown.get(&table).map_or(&[], Vec::as_slice)
+    }
+
+    /// The runs that readers see, by name and so by time.
+    pub fn runs(&self) -> impl DoubleEndedIterator<Item = &VisibleRun> {
+        self.runs.values().map(|current| &current.run)
+    }
+
+    /// One run.
+    pub fn run(&self, run: &RunId) -> Option<&VisibleRun> {
+        self.runs.get(run).map(|current| &current.run)
+    }
+
+    /// The files of one run in a table, and the merged ones that show its rows.
+    pub fn files_of<'a>(&'a self, table: Table, run: &'a RunId) -> impl Iterator<Item = &'a DataFile> {
+        self.files(table).iter().filter(move |f| match FileName::parse(&f.path) {
+            Some(FileName::Rows { run: of, .. }) => of == *run,
+            Some(FileName::Pointer(pointer)) => pointer.run == *run,
+            _ => f.visible_parts().any(|(part, _)| part.run == *run),
+        })
+    }
+
+    fn sort_in(&mut self, table: Table, files: Vec<DataFile>) {
+        let (merged, single): (Vec<_>, Vec<_>) = files.into_iter().partition(|f| !f.parts.is_empty());
+        let mut sorted = Sorted::default();
+        merged.into_iter().for_each(|file| self.sort_merged(table, file, &mut sorted));
+        for file in single {
+            match self.sees(table, &file) {
+                // An ingest that did not know of the merge has added the same rows once more.
+                Some(true) if run_of(&file).is_some_and(|run| sorted.shown.contains(&run)) => sorted.hidden.push(file),
+                Some(true) => sorted.seen.push(file),
+                Some(false) if self.is_older_than_its_run(&file) => sorted.hidden.push(file),
+                Some(false) | None => {}
+            }
+        }
+        sorted.seen.sort_by(|a, b| a.path.cmp(&b.path));
+        self.files.insert(table, sorted.seen);
+        self.hidden.insert(table, sorted.hidden);
+        self.outgrown.insert(table, sorted.outgrown);
+    }
+
+    // What is merged was seen before; what is no longer seen of it is superseded, whatever its age.
+    fn sort_merged(&self, table: Table, mut file: DataFile, sorted: &mut Sorted) {
+        let mut superseded = 0;
+        for part in &file.parts {
+            match self.sees_rows(table, &part.surface, &part.run, &part.derivation) {
+                Some(true) if sorted.shown.insert(part.run.clone()) => continue,
+                Some(_) => superseded += 1,
+                None => {}
+            }
+            file.hidden.push(part.run.clone());
+        }
+        if superseded == file.parts.len() {
+            sorted.hidden.push(file);
+        } else if file.hidden.len() < file.parts.len() {
+            sorted.outgrown.extend((superseded > 0).then(|| file.clone()));
+            sorted.seen.push(file);
+        }
+    }
+
+    // None for what belongs to no run that is seen: another ingest may be about to name it.
+    fn sees(&self, table: Table, file: &DataFile) -> Option<bool> {
+        match FileName::parse(&file.path)? {
+            FileName::Rig { .. } => Some(table.source() == Source::Rig),
+            FileName::Pointer(pointer) => Some(self.run(&pointer.run) == Some(&pointer)),
+            FileName::Rows { surface, run, derivation } => self.sees_rows(table, &surface, &run, &derivation),
+            FileName::Merged { .. } => None,
+        }
+    }
+
+    fn sees_rows(&self, table: Table, surface: &SurfaceId, run: &RunId, derivation: &str) -> Option<bool> {
+        let current = self.run(run)?;
+        let names = match table.source() {
+            Source::References => current.reference_derivation.as_deref() == Some(derivation),
+            _ => current.run_derivation == derivation,
+        };
+        Some(names && (!one_a_surface(table) || self.latest(surface) == Some(run)))
+    }
+
+    fn is_older_than_its_run(&self, file: &DataFile) -> bool {
+        let current = run_of(file).and_then(|run| self.runs.get(&run));
+        current.is_some_and(|current| file.modified <= current.since)
+    }
+
+    fn latest(&self, surface: &SurfaceId) -> Option<&RunId> {
+        self.runs().rev().find(|r| r.surface == *surface).map(|r| &r.run)
+    }
+}
+
+/// A table's files on their way into a snapshot.
+#[derive(Default)]
+struct Sorted {
+    seen: Vec<DataFile>,
+    hidden: Vec<DataFile>,
+    outgrown: Vec<DataFile>,
+    /// The runs that merged files show.
+    shown: HashSet<RunId>,
+}
+
+fn run_of(file: &DataFile) -> Option<RunId> {
+    match FileName::parse(&file.path)? {
+        FileName::Rows { run, .. } => Some(run),
+        FileName::Pointer(pointer) => Some(pointer.run),
+        FileName::Rig { .. } | FileName::Merged { .. } => None,
+    }
+}
+
+/// Whether a file of this name was merged from several.
+pub(crate) fn is_merged(name: &str) -> bool {
+    matches!(FileName::parse(&Path::from(name)), Some(FileName::Merged { .. }))
+}
+
+/// Parts as text: the name that each had as a file of its own, and its rows.
+pub(crate) fn encode_parts(parts: &[Part]) -> String {
+    let one = |part: &Part| json!([part.file_name().compose(), part.rows]);
+    Value::Array(parts.iter().map(one).collect()).to_string()
+}
+
+/// The parts of such a text; None where it is none.
+pub(crate) fn decode_parts(text: &str) -> Option<Vec<Part>> {
+    let parts: Vec<(String, u64)> = serde_json::from_str(text).ok()?;
+    let one = |(name, rows): (String, u64)| match FileName::parse(&Path::from(name))? {
+        FileName::Rows { surface, run, derivation } => Some(Part { surface, run, derivation, rows }),
+        _ => None,
+    };
+    parts.into_iter().map(one).collect::<Option<Vec<_>>>().filter(|parts| !parts.is_empty())
+}
+
+impl Part {
+    /// The name of a file with these rows alone.
+    pub fn file_name(&self) -> FileName {
+        let Self { surface, run, derivation, .. } = self.clone();
+        FileName::Rows { surface, run, derivation }
+    }
+}
+
+// A surface that was measured twice is still one surface: its newest run tells what it is.
+fn one_a_surface(table: Table) -> bool {
+    matches!(table, Table::Surfaces | Table::Heightmaps)
+}
+
+// A crash between a run's new row and the removal of its old one leaves two; the newer one counts.
+fn current_runs(pointers: &[DataFile]) -> BTreeMap<RunId, Current> {
+    let mut by_age: Vec<_> = pointers.iter().collect();
+    by_age.sort_by_key(|f| (f.modified, f.path.clone()));
+    let parsed = by_age.into_iter().filter_map(|f| match FileName::parse(&f.path) {
+        Some(FileName::Pointer(run)) => Some((run.run.clone(), Current { run, since: f.modified })),
+        _ => None,
+    });
+    parsed.collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use chrono::DateTime;
+
+    use super::*;
+
+    fn file(table: Table, name: &str, modified: i64) -> DataFile {
+        let path = crate::tables::delta::folder(table).join(name);
+        let modified = DateTime::from_timestamp(modified, 0).expect("a time");
+        DataFile { path, bytes: 1, rows: 1, modified, stats: None, parts: Vec::new(), hidden: Vec::new() }
+    }
+
+    fn view(files: &[(Table, &str, i64)]) -> Snapshot {
+        let of = |table| files.iter().filter(|f| f.0 == table).map(|f| file(f.0, f.1, f.2)).collect::<Vec<_>>();
+        let mut snapshot = Snapshot { runs: current_runs(&of(Table::Runs)), ..Snapshot::default() };
+        Table::ALL.into_iter().for_each(|table| snapshot.sort_in(table, of(table)));
+        snapshot
+    }
+
+    fn names(files: &[DataFile]) -> Vec<&str> {
+        files.iter().filter_map(|f| f.path.filename()).collect()
+    }
+
+    #[test]
+    fn names_round_trip() {
+        for name in [
+            "rig.ab.parquet",
+            "0015_0.20260105T080000Z-0015_0-7c1e.ab.parquet",
+            "flat.r.ab.none.parquet",
+            "flat.r.ab.cd.parquet",
+            "merged.ab.parquet",
+        ] {
+            let parsed = FileName::parse(&Path::from(name)).expect(name);
+            assert_eq!(parsed.compose(), name);
+        }
+        for foreign in ["part-00000.parquet", "a.b.c.d.e.parquet", "a.b.c", "..parquet"] {
+            assert_eq!(FileName::parse(&Path::from(foreign)), None, "{foreign}");
+        }
+    }
+
+    #[test]
+    fn rows_are_seen_once_runs_names_them() {
+        let before = view(&[(Table::Measurements, "flat.r1.ab.parquet", 1)]);
+        assert!(before.files(Table::Measurements).is_empty());
+        assert!(before.superseded(Table::Measurements).is_empty(), "its ingest may still be going on");
+        let after = view(&[
+            (Table::Measurements, "flat.r1.ab.parquet", 1),
+            (Table::Nce, "flat.r1.cd.parquet", 1),
+            (Table::Nce, "flat.r1.old.parquet", 0),
+            (Table::Nce, "flat.r1.ef.parquet", 3),
+            (Table::Runs, "flat.r1.ab.cd.parquet", 2),
+        ]);
+        assert_eq!(names(after.files(Table::Measurements)), ["flat.r1.ab.parquet"]);
+        assert_eq!(names(after.files(Table::Nce)), ["flat.r1.cd.parquet"]);
+        assert_eq!(names(after.superseded(Table::Nce)), ["flat.r1.old.parquet"]);
+    }
+
+    #[test]
+    fn the_newer_of_two_pointers_counts() {
+        let both = view(&[
+            (Table::Runs, "flat.r1.ab.none.parquet", 1),
+            (Table::Runs, "flat.r1.ab.cd.parquet", 2),
+            (Table::Tnce, "flat.r1.cd.parquet", 2),
+        ]);
+        assert_eq!(names(both.files(Table::Runs)), ["flat.r1.ab.cd.parquet"]);
+        assert_eq!(names(both.superseded(Table::Runs)), ["flat.r1.ab.none.parquet"]);
+        assert_eq!(names(both.files(Table::Tnce)), ["flat.r1.cd.parquet"]);
+    }
+
+    #[test]
+    fn a_surface_has_one_row_however_often_it_was_measured() {
+        let twice = view(&[
+            (Table::Runs, "flat.r1.ab.none.parquet", 1),
+            (Table::Runs, "flat.r2.cd.none.parquet", 2),
+            (Table::Surfaces, "flat.r1.ab.parquet", 1),
+            (Table::Surfaces, "flat.r2.cd.parquet", 2),
+            (Table::Measurements, "flat.r1.ab.parquet", 1),
+            (Table::Measurements, "flat.r2.cd.parquet", 2),
+        ]);
+        assert_eq!(names(twice.files(Table::Surfaces)), ["flat.r2.cd.parquet"]);
+        assert_eq!(twice.files(Table::Measurements).len(), 2);
+    }
+
+    fn merged(table: Table, modified: i64, parts: &[(&str, u64)]) -> DataFile {
+        let text = serde_json::to_string(parts).expect("text");
+        let parts = decode_parts(&text).expect("parts");
+        assert_eq!(encode_parts(&parts), text);
+        DataFile { rows: parts.iter().map(|p| p.rows).sum(), parts, ..file(table, "merged.aa.parquet", modified) }
+    }
+
+    #[test]
+    fn parts_are_seen_and_superseded_as_files_were() {
+        let runs = |wood: &str| {
+            let pointers = ["flat.r1.ab.cd.parquet".to_owned(), format!("wood.r2.ab.{wood}.parquet")];
+            let mut snapshot = Snapshot {
+                runs: current_runs(&pointers.map(|name| file(Table::Runs, &name, 5))),
+                ..Snapshot::default()
+            };
+            let files = vec![
+                file(Table::Nce, "flat.r1.cd.parquet", 9),
+                merged(Table::Nce, 9, &[("flat.r1.cd.parquet", 4), ("wood.r2.ef.parquet", 3)]),
+                file(Table::Nce, "wood.r2.gh.parquet", 9),
+            ];
+            snapshot.sort_in(Table::Nce, files);
+            snapshot
+        };
+        let (r1, r2) = ("r1".parse().expect("a run"), "r2".parse().expect("a run"));
+        let both = runs("ef");
+        assert_eq!(names(both.files(Table::Nce)), ["merged.aa.parquet"]);
+        assert_eq!(both.files(Table::Nce)[0].visible_rows(), 7);
+        assert_eq!(names(both.superseded(Table::Nce)), ["flat.r1.cd.parquet"], "the same rows once more");
+        assert!(both.outgrown(Table::Nce).is_empty());
+        assert_eq!(both.files_of(Table::Nce, &r2).count(), 1);
+
+        let replaced = runs("gh");
+        assert_eq!(names(replaced.files(Table::Nce)), ["merged.aa.parquet", "wood.r2.gh.parquet"]);
+        let partly = &replaced.files(Table::Nce)[0];
+        assert_eq!((partly.visible_rows(), &partly.hidden), (4, &vec![r2]));
+        assert_eq!(partly.visible_parts().map(|(p, rows)| (p.run.clone(), rows)).collect::<Vec<_>>(), [(r1, 0..4)]);
+        assert_eq!(names(replaced.outgrown(Table::Nce)), ["merged.aa.parquet"]);
+    }
+}

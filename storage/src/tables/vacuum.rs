@@ -1,0 +1,201 @@
+//! Deletes files that no log names any more and no reader can hold any more.
+
+use std::path::{Path as FsPath, PathBuf};
+use std::time::SystemTime;
+
+use chrono::{DateTime, TimeDelta, Utc};
+use echolake_schema::tables::Table;
+use futures::TryStreamExt as _;
+use object_store::path::Path;
+use object_store::{ObjectStore as _, ObjectStoreExt as _};
+use serde::Serialize;
+
+use crate::tables::delta::folder;
+use crate::tables::lease::Lease;
+use crate::{Error, History, Lake, Result};
+
+/// Hours for which a file is kept after it went out of its table, where nothing else is said, and at most: Delta's
+/// log forgets after a week when that was.
+pub const KEEP_HOURS: u32 = 168;
+/// What no log ever named may be about to be named: an ingest writes files first and commits them within minutes.
+const BEFORE_COMMIT: TimeDelta = TimeDelta::hours(1);
+/// Folder of recordings that are copied in.
+const INBOX: &str = "inbox";
+
+/// Whether files are deleted.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Deletion {
+    /// They are.
+    Real,
+    /// They are only told.
+    Pretended,
+}
+
+/// What was deleted, or would be.
+#[derive(Debug, Clone, Default, Serialize)]
+pub struct Vacuumed {
+    /// The files.
+    pub files: Vec<Freed>,
+    /// Their bytes.
+    pub bytes: u64,
+}
+
+/// One file that was deleted.
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Serialize)]
+pub struct Freed {
+    /// Path in the lake.
+    pub path: String,
+    /// Size.
+    pub bytes: u64,
+    #[serde(skip)]
+    place: Place,
+}
+
+/// How a file is reached.
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
+enum Place {
+    Store(Path),
+    /// The store does not list a local write's temporary file.
+    Local(PathBuf),
+}
+
+impl Lake {
+    /// Deletes, under the maintenance lease, files of tables that went out of their table longer ago than `keep`,
+    /// and what crashes left behind. `runs/` is not looked at.
+    ///
+    /// # Errors
+    /// [`Error::Maintained`] where somebody else is at it, [`Error::LeaseLost`], [`Error::Log`] where a log is
+    /// damaged, or what the store says. What was deleted before is so.
+    pub async fn vacuum(
+        &self,
+        keep: TimeDelta,
+        deletion: Deletion,
+        deleted: &mut (dyn FnMut(usize, usize) + Send),
+    ) -> Result<Vacuumed> {
+        if deletion == Deletion::Pretended {
+            return self.left_over(keep).await;
+        }
+        let mut lease = Lease::take(self).await?;
+        let done = self.delete_left_over(keep, deleted, &mut lease).await;
+        let released = lease.release().await;
+        done.and_then(|report| released.map(|()| report))
+    }
+
+    async fn delete_left_over(
+        &self,
+        keep: TimeDelta,
+        deleted: &mut (dyn FnMut(usize, usize) + Send),
+        lease: &mut Lease,
+    ) -> Result<Vacuumed> {
+        let report = self.left_over(keep).await?;
+        for (done, file) in report.files.iter().enumerate() {
+            lease.keep().await?;
+            match &file.place {
+                Place::Store(path) => match self.store().delete(path).await {
+                    Err(e) if !matches!(e, object_store::Error::NotFound { .. }) => {
+                        return Err(Error::store("delete", path, e));
+                    }
+                    _ => {}
+                },
+                // Its writer may have taken it away.
+                Place::Local(path) => drop(std::fs::remove_file(path)),
+            }
+            deleted(done + 1, report.files.len());
+        }
+        Ok(report)
+    }
+
+    // The store is listed before the logs are read, so that whatever is committed meanwhile is named.
+    async fn left_over(&self, keep: TimeDelta) -> Result<Vacuumed> {
+        let (now, mut files) = (Utc::now(), Vec::new());
+        let old = |modified| is_over(modified, None, now, keep);
+        for table in Table::ALL {
+            let there = self.store().list_with_delimiter(Some(&folder(table))).await;
+            let there = there.map_err(|e| Error::store("list", folder(table), e))?;
+            // Without a log nothing tells what the files are.
+            let Some(history) = self.log().history(table).await? else { continue };
+            for meta in there.objects {
+                if is_left_over(&history, &meta.location, |gone| is_over(meta.last_modified, gone, now, keep)) {
+                    files.push(Freed::stored(meta.location, meta.size));
+                }
+            }
+        }
+        let inbox: Vec<_> = self
+            .store()
+            .list(Some(&Path::from(INBOX)))
+            .try_collect()
+            .await
+            .map_err(|e| Error::store("list", INBOX, e))?;
+        let copying = inbox.into_iter().filter(|m| m.location.extension() == Some("copying") && old(m.last_modified));
+        files.extend(copying.map(|meta| Freed::stored(meta.location, meta.size)));
+        if let Some(lake) = self.folder() {
+            let mut temporaries = Vec::new();
+            ["tables", INBOX].iter().for_each(|name| find_temporaries(&lake.join(name), &mut temporaries));
+            let old = temporaries.into_iter().filter(|(_, modified, _)| old(DateTime::<Utc>::from(*modified)));
+            files.extend(old.map(|(path, _, bytes)| {
+                let within = path.strip_prefix(lake).unwrap_or(&path).display().to_string();
+                Freed { path: within, bytes, place: Place::Local(path) }
+            }));
+        }
+        files.sort();
+        Ok(Vacuumed { bytes: files.iter().map(|f| f.bytes).sum(), files })
+    }
+}
+
+impl Freed {
+    fn stored(path: Path, bytes: u64) -> Self {
+        Self { path: path.to_string(), bytes, place: Place::Store(path) }
+    }
+}
+
+fn is_left_over(history: &History, path: &Path, is_over: impl Fn(Option<DateTime<Utc>>) -> bool) -> bool {
+    let Some(name) = path.filename() else { return false };
+    path.extension() == Some("parquet")
+        && !history.current.contains(name)
+        && is_over(history.removed.get(name).copied())
+}
+
+// A file that is younger than its removal was written anew, for a commit that is still to come.
+fn is_over(modified: DateTime<Utc>, gone: Option<DateTime<Utc>>, now: DateTime<Utc>, keep: TimeDelta) -> bool {
+    match gone {
+        Some(gone) if gone >= modified => now - gone >= keep,
+        _ => now - modified >= keep.max(BEFORE_COMMIT),
+    }
+}
+
+// `name#123`: what a local write has not brought to its end. Folders that cannot be read hold none of ours.
+fn find_temporaries(folder: &FsPath, found: &mut Vec<(PathBuf, SystemTime, u64)>) {
+    for entry in std::fs::read_dir(folder).into_iter().flatten().flatten() {
+        let (path, name) = (entry.path(), entry.file_name());
+        let Ok(meta) = entry.metadata() else { continue };
+        if meta.is_dir() {
+            find_temporaries(&path, found);
+            continue;
+        }
+        let name = name.to_string_lossy();
+        let number = name.rsplit_once('#').map(|(_, number)| number);
+        if let (Some(number), Ok(modified)) = (number, meta.modified())
+            && !number.is_empty()
+            && number.bytes().all(|b| b.is_ascii_digit())
+        {
+            found.push((path, modified, meta.len()));
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn files_are_kept_from_their_removal_on_and_new_ones_until_they_are_committed() {
+        let at = |hour: i64| DateTime::from_timestamp(hour * 3600, 0).expect("a time");
+        let over =
+            |modified, gone: Option<i64>, keep| is_over(at(modified), gone.map(at), at(100), TimeDelta::hours(keep));
+        assert!(over(0, Some(50), 50) && !over(0, Some(51), 50), "counted from the removal");
+        assert!(over(0, Some(100), 0), "gone, and nobody waits");
+        assert!(over(99, None, 0) && !over(100, None, 0), "an ingest may be about to name it");
+        assert!(over(50, None, 50) && !over(51, None, 50));
+        assert!(!over(100, Some(50), 0), "written anew");
+    }
+}

@@ -1,0 +1,227 @@
+//! Looking back: which versions a table's log still holds, and the lake as it was at one of them.
+//!
+//! The lake's version is that of its table `runs`, because that is what tells the rest. The other tables are seen as of
+//! the time of that version; whatever it names was committed before it.
+
+use std::str::FromStr;
+
+use chrono::{DateTime, NaiveDate, NaiveDateTime, SecondsFormat, Utc};
+use echolake_schema::tables::Table;
+use futures::{StreamExt as _, TryStreamExt as _};
+use object_store::path::Path;
+use object_store::{GetOptions, GetRange, ObjectStore};
+use serde_json::Value;
+
+use crate::tables::delta::folder;
+use crate::{Error, Lake, Result, Snapshot};
+
+/// Bytes of a commit that are read for its time, which writers put first.
+const COMMIT_HEAD: u64 = 4096;
+/// Formats of times beside RFC 3339.
+const TIMES: [&str; 4] = ["%Y-%m-%dT%H:%M:%S%.f", "%Y-%m-%d %H:%M:%S%.f", "%Y-%m-%dT%H:%M", "%Y-%m-%d %H:%M"];
+/// Commits that are looked at together.
+const TOGETHER: usize = 16;
+
+/// One version of a table, and when it was committed.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct TableVersion {
+    /// Its number.
+    pub version: u64,
+    /// When it was committed, or any version before it where a writer's clock was ahead.
+    pub committed: DateTime<Utc>,
+}
+
+/// A moment of a lake.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum Moment {
+    /// A version of the lake, that of its table `runs`.
+    Version(u64),
+    /// What was current at a time.
+    Time(DateTime<Utc>),
+}
+
+impl std::fmt::Display for Moment {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self {
+            Self::Version(version) => write!(f, "version {version}"),
+            Self::Time(time) => f.write_str(&time.to_rfc3339_opts(SecondsFormat::AutoSi, true)),
+        }
+    }
+}
+
+/// A text that is no moment.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("`{text}` is neither a version nor a time")]
+pub struct NoMoment {
+    /// The text.
+    pub text: String,
+}
+
+impl FromStr for Moment {
+    type Err = NoMoment;
+
+    /// Reads a version, or a time as in RFC 3339; without a zone it is UTC, without a time of day midnight.
+    fn from_str(text: &str) -> std::result::Result<Self, NoMoment> {
+        let text = text.trim();
+        if let Ok(version) = text.parse() {
+            return Ok(Self::Version(version));
+        }
+        let zoned = DateTime::parse_from_rfc3339(text).ok().map(|t| t.to_utc());
+        let naive = || TIMES.iter().find_map(|format| NaiveDateTime::parse_from_str(text, format).ok());
+        let day = || NaiveDate::parse_from_str(text, "%Y-%m-%d").ok()?.and_hms_opt(0, 0, 0);
+        let time = zoned.or_else(|| naive().or_else(day).map(|t| t.and_utc()));
+        time.map(Self::Time).ok_or_else(|| NoMoment { text: text.to_owned() })
+    }
+}
+
+impl Lake {
+    /// The versions of the lake that its log still holds, oldest first.
+    ///
+    /// # Errors
+    /// What the store says.
+    pub async fn versions(&self) -> Result<Vec<TableVersion>> {
+        self.log().versions(Table::Runs).await
+    }
+
+    /// One table as readers saw it at a moment.
+    ///
+    /// # Errors
+    /// [`Error::NoMoment`] where the log does not hold it, [`Error::Vacuumed`] where files of it are deleted.
+    pub async fn snapshot_at(&self, moment: Moment, table: Table) -> Result<Snapshot> {
+        let versions = self.versions().await?;
+        let found = match moment {
+            Moment::Version(number) => versions.iter().find(|v| v.version == number),
+            Moment::Time(time) => versions.iter().rfind(|v| v.committed <= time),
+        };
+        let found = found.ok_or_else(|| no_moment(moment, &versions))?;
+        let pointers = self.log().files_at(Table::Runs, found.version).await?;
+        let files = match table {
+            Table::Runs => pointers.clone(),
+            _ => {
+                let then = self.log().versions(table).await?;
+                match then.iter().rfind(|v| v.committed <= found.committed) {
+                    Some(version) => self.log().files_at(table, version.version).await?,
+                    None => Vec::new(),
+                }
+            }
+        };
+        let snapshot = Snapshot::of(&pointers, table, files);
+        self.are_there(moment, table, &snapshot).await?;
+        Ok(snapshot)
+    }
+
+    async fn are_there(&self, moment: Moment, table: Table, snapshot: &Snapshot) -> Result<()> {
+        let folder = folder(table);
+        let there = self.store().list_with_delimiter(Some(&folder)).await;
+        let there = there.map_err(|e| Error::store("list", &folder, e))?;
+        let there: std::collections::HashSet<_> = there.objects.into_iter().map(|o| o.location).collect();
+        let files = snapshot.files(table);
+        let missing = files.iter().filter(|f| !there.contains(&f.path)).count();
+        if missing == 0 {
+            return Ok(());
+        }
+        Err(Error::Vacuumed { moment: moment.to_string(), table: table.name(), missing, files: files.len() })
+    }
+}
+
+fn no_moment(moment: Moment, versions: &[TableVersion]) -> Error {
+    let text = |v: &TableVersion| {
+        format!("version {} of {}", v.version, v.committed.to_rfc3339_opts(SecondsFormat::AutoSi, true))
+    };
+    let held = match (versions.first(), versions.last()) {
+        (Some(first), Some(last)) => format!("its log holds {} to {}", text(first), text(last)),
+        _ => "its log holds no version".to_owned(),
+    };
+    Error::NoMoment { moment: moment.to_string(), held }
+}
+
+/// The versions whose commits stand in a table's log folder, oldest first.
+pub(crate) async fn listed(store: &dyn ObjectStore, table: Table) -> Result<Vec<TableVersion>> {
+    let folder = folder(table).join("_delta_log");
+    let there = store.list_with_delimiter(Some(&folder)).await.map_err(|e| Error::store("list", &folder, e))?;
+    let mut commits: Vec<_> = there
+        .objects
+        .into_iter()
+        .filter_map(|o| Some((commit_number(&o.location)?, o.location, o.last_modified)))
+        .collect();
+    commits.sort_by_key(|c| c.0);
+    let times = futures::stream::iter(commits).map(|(version, path, modified)| async move {
+        Ok::<_, Error>((version, commit_time(store, &path).await?.unwrap_or(modified)))
+    });
+    let times: Vec<_> = times.buffered(TOGETHER).try_collect().await?;
+    let mut latest = DateTime::<Utc>::MIN_UTC;
+    let monotonic = times.into_iter().map(|(version, time)| {
+        latest = latest.max(time);
+        TableVersion { version, committed: latest }
+    });
+    Ok(monotonic.collect())
+}
+
+/// Name of a version's commit in the log folder.
+pub(crate) fn commit_name(version: u64) -> String {
+    format!("{version:020}.json")
+}
+
+/// The version of a commit's file; None if it is none.
+pub(crate) fn commit_number(path: &Path) -> Option<u64> {
+    let digits = path.filename()?.strip_suffix(".json")?;
+    (digits.len() == 20).then(|| digits.parse().ok()).flatten()
+}
+
+// The first line of a commit; one that is longer than what is read is searched as text.
+async fn commit_time(store: &dyn ObjectStore, path: &Path) -> Result<Option<DateTime<Utc>>> {
+    let range = Some(GetRange::Bounded(0..COMMIT_HEAD));
+    let head = store.get_opts(path, GetOptions { range, ..GetOptions::default() }).await;
+    let head = head.map_err(|e| Error::store("read", path, e))?;
+    let bytes = head.bytes().await.map_err(|e| Error::store("read", path, e))?;
+    let text = String::from_utf8_lossy(&bytes);
+    let millis = text.lines().find_map(millis_of);
+    Ok(millis.and_then(DateTime::from_timestamp_millis))
+}
+
+fn millis_of(line: &str) -> Option<i64> {
+    let after = line.strip_prefix("{\"commitInfo\":")?;
+    if let Some(whole) = after.strip_suffix('}')
+        && let Ok(Value::Object(whole)) = serde_json::from_str::<Value>(whole)
+    {
+        return whole.get("timestamp")?.as_i64();
+    }
+    let (_, from) = after.split_once("\"timestamp\":")?;
+    let digits: String = from.trim_start().chars().take_while(char::is_ascii_digit).collect();
+    digits.parse().ok()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn times_of_commits_are_found_in_whole_and_cut_lines() {
+        let check = |line: &str, expected: Option<i64>| assert_eq!(millis_of(line), expected, "{line}");
+        check(r#"{"commitInfo":{"timestamp":1795256318599,"operation":"WRITE"}}"#, Some(1_795_256_318_599));
+        check(r#"{"commitInfo":{"operation":"x","timestamp":5}}"#, Some(5));
+        check(r#"{"commitInfo":{"timestamp":17,"operation":"CREATE TABLE","operationPar"#, Some(17));
+        check(r#"{"add":{"path":"x"}}"#, None);
+    }
+
+    #[test]
+    fn times_without_a_zone_are_utc() {
+        let ten = "2026-11-21T10:00:00Z".parse().expect("a time");
+        for text in ["2026-11-21T10:00:00Z", "2026-11-21 10:00:00", "2026-11-21 10:00", "2026-11-21T11:00:00+01:00"] {
+            assert_eq!(text.parse(), Ok(Moment::Time(ten)), "{text}");
+        }
+        assert_eq!("12".parse(), Ok(Moment::Version(12)));
+        for text in ["yesterday", "-1", "", "2026-13-01"] {
+            assert!(text.parse::<Moment>().is_err(), "{text}");
+        }
+    }
+
+    #[test]
+    fn commits_are_told_from_checkpoints() {
+        let check = |name: &str, expected| assert_eq!(commit_number(&Path::from(name)), expected, "{name}");
+        check("tables/runs/_delta_log/00000000000000000012.json", Some(12));
+        check("tables/runs/_delta_log/00000000000000000010.checkpoint.parquet", None);
+        check("tables/runs/_delta_log/_commits/x.json", None);
+        assert_eq!(commit_number(&Path::from(commit_name(7))), Some(7));
+    }
+}
