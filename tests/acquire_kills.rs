@@ -95,9 +95,10 @@ impl Campaign {
     fn undisturbed(&mut self) -> Duration {
         let begun = Instant::now();
         let output = run_command(&mut self.acquire(None)).expect("it starts");
+        let whole = begun.elapsed();
         assert!(output.status.success(), "{}", text(&output.stderr));
         self.check_the_run();
-        begun.elapsed()
+        whole
     }
 
     fn run_through(&mut self, whole: &mut Duration, kills: usize, outcome: &mut Outcome) {

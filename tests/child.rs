@@ -250,36 +250,47 @@ fn text(bytes: &[u8]) -> String {
 
 #[cfg(test)]
 mod tests {
+    use std::panic::{AssertUnwindSafe, catch_unwind};
+    use std::path::Path;
+
     use super::*;
 
+    /// A shell with this script, which has said that it is ready.
     fn shell(script: &str) -> ChildProcess {
-        let mut command = Command::new("sh");
-        ChildProcess::spawn(command.args(["-c", script]).process_group(0), Duration::from_millis(300), true)
-            .expect("a shell")
+        let mut shell = ChildProcess::start_group(Command::new("sh").args(["-c", script])).expect("a shell");
+        shell.wait_for_line("ready");
+        shell
     }
 
-    fn failure(wait: impl FnOnce() + std::panic::UnwindSafe) -> String {
-        *std::panic::catch_unwind(wait).expect_err("no limit").downcast::<String>().expect("a text")
+    fn failure<T>(wait: impl FnOnce() -> T) -> String {
+        let Err(panic) = catch_unwind(AssertUnwindSafe(wait)) else { panic!("it did not fail") };
+        *panic.downcast::<String>().expect("a text")
     }
 
     #[test]
-    fn a_program_that_does_not_end_fails_the_test_with_its_words() {
-        let said = failure(|| drop(shell("echo begun >&2; exec sleep 600").wait()));
-        assert!(said.contains("no end within 300ms") && said.contains("begun"), "{said}");
-        let said = failure(|| drop(shell("echo begun >&2; exec sleep 600").wait_for_line("done")));
-        assert!(said.contains("no line with `done`") && said.contains("begun"), "{said}");
+    fn waiting_too_long_fails_with_what_was_said() {
+        let mut shell = shell("echo ready >&2; exec sleep 600");
+        shell.limit = Duration::from_millis(50);
+        let said = failure(|| shell.wait());
+        assert!(said.contains("no end within 50ms") && said.contains("ready"), "{said}");
+        let said = failure(|| shell.wait_for_line("done"));
+        assert!(said.contains("no line with `done`") && said.contains("ready"), "{said}");
     }
 
-    // The pipe stays open in the second shell's hands.
     #[test]
-    fn a_grandchild_that_keeps_the_pipe_is_killed_with_its_group() {
-        let mut parent = shell("sh -c 'echo $$ >&2; echo ready >&2; sleep 600; true' & wait");
-        parent.wait_for_line("ready");
-        let grandchild = parent.stderr().lines().next().expect("an id").to_owned();
-        drop(parent);
-        let is_gone = || !std::path::Path::new("/proc").join(&grandchild).join("cwd").exists();
-        let end = Instant::now() + KILL_LIMIT;
-        while !is_gone() {
+    fn an_early_end_is_not_waited_for() {
+        let said = failure(|| shell("echo ready >&2").wait_for_line("done"));
+        assert!(said.contains("ended without a line with `done`") && said.contains("ready"), "{said}");
+    }
+
+    // The second shell holds the pipe that the first one was given.
+    #[test]
+    fn a_grandchild_is_killed_with_its_group() {
+        let shell = shell("sh -c 'echo $$ >&2; echo ready >&2; sleep 600; true' & wait");
+        let grandchild = shell.stderr().lines().next().expect("an id").to_owned();
+        drop(shell);
+        let end = Instant::now() + COMMAND_LIMIT;
+        while Path::new("/proc").join(&grandchild).join("cwd").exists() {
             assert!(Instant::now() < end, "process {grandchild} is still there");
             std::thread::sleep(POLL_EVERY);
         }
@@ -288,11 +299,7 @@ mod tests {
     #[test]
     fn output_and_exit_code_are_those_of_the_program() {
         let output = run_command(Command::new("sh").args(["-c", "echo out; echo err >&2; exit 3"])).expect("a shell");
-        assert_eq!(
-            (output.status.code(), &output.stdout[..], &output.stderr[..]),
-            (Some(3), &b"out\n"[..], &b"err\n"[..])
-        );
-        let said = failure(|| drop(shell("echo early >&2").wait_for_line("late")));
-        assert!(said.contains("ended without a line with `late`") && said.contains("early"), "{said}");
+        let said = [&output.stdout, &output.stderr].map(|bytes| text(bytes));
+        assert_eq!((output.status.code(), said), (Some(3), ["out\n".to_owned(), "err\n".to_owned()]));
     }
 }

@@ -159,14 +159,14 @@ fn a_gir_folder_becomes_runs_with_references_of_their_own() {
     );
 }
 
-// The long form is the example `kills`.
+// The long form is the campaign `kills`.
 #[test]
 fn a_killed_ingest_is_repaired_by_running_it_again() {
     let outcome = super::kills::Campaign::new(std::path::Path::new(super::ECHOLAKE), 1).rounds(4, &mut |_, _| {});
     assert!(outcome.killed > 0, "{outcome:?}");
 }
 
-// Its long form is the same example with `halves`.
+// Its long form is the same campaign with `halves`.
 #[test]
 fn two_processes_ingest_half_of_the_runs_each() {
     let binary = std::path::Path::new(super::ECHOLAKE);

@@ -296,7 +296,7 @@ fn it_stops_when_told() {
     assert_eq!(server.terminate(), Some(0));
 }
 
-// Long form: example `fuzz`.
+// Long form: campaign `fuzz`.
 #[test]
 fn changed_input_harms_nothing() {
     use super::fuzz::{Campaign, Target};

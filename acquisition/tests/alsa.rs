@@ -3,6 +3,10 @@
 //!
 //! libasound reads its configuration where the environment says, so the program starts itself once more with that set.
 
+#[allow(dead_code, unused_imports, reason = "the tests' helper, of which this wants a part")]
+#[path = "../../tests/child.rs"]
+mod child;
+
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
@@ -23,11 +27,12 @@ fn main() {
         None => {
             let folder = tempfile::tempdir().expect("a folder");
             std::fs::write(folder.path().join("asound.conf"), configuration(folder.path())).expect("written");
-            let status = Command::new(std::env::current_exe().expect("this program"))
-                .env(FOLDER, folder.path())
-                .env("ALSA_CONFIG_PATH", folder.path().join("asound.conf"))
-                .status();
-            assert!(status.expect("started").success(), "the checks failed");
+            let mut command = Command::new(std::env::current_exe().expect("this program"));
+            command.env(FOLDER, folder.path()).env("ALSA_CONFIG_PATH", folder.path().join("asound.conf"));
+            let output = child::run_command(&mut command).expect("started");
+            let said = String::from_utf8_lossy(&output.stderr);
+            assert!(output.status.success(), "the checks failed: {said}");
+            eprint!("{said}");
         }
     }
 }

@@ -1,6 +1,6 @@
 //! Data out of the lake: training sets, slices of run files, and the formats that acousticians expect.
 //!
-//! ```no_run
+//! ```no_run,standalone_crate
 //! # async fn example() -> Result<(), Box<dyn std::error::Error>> {
 //! use echolake_export::{TrainingSet, write_training_set};
 //!

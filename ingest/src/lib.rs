@@ -3,7 +3,7 @@
 //! A run's rows are committed first and its row in `runs` last: from that commit on readers see them. Then
 //! [`complete()`] derives again what used references that are no longer the current ones, and nothing else.
 //!
-//! ```no_run
+//! ```no_run,standalone_crate
 //! use echolake_ingest::{Ingest, Report, complete, pending};
 //! # async fn example() -> Result<(), Box<dyn std::error::Error>> {
 //! let lake = echolake_lake::Lake::open("lake").await?;

@@ -1,6 +1,6 @@
 //! SQL over the lake's tables: reading only, one frozen view of the lake a query.
 //!
-//! ```no_run
+//! ```no_run,standalone_crate
 //! # async fn example() -> Result<(), Box<dyn std::error::Error>> {
 //! let lake = echolake_lake::Lake::open("lake").await?;
 //! let session = echolake_query::Session::new(&lake)?;

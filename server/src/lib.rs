@@ -1,6 +1,6 @@
 //! The lake over HTTP, Arrow Flight SQL and Postgres wire: three doors to one query engine, which only reads.
 //!
-//! ```no_run
+//! ```no_run,standalone_crate
 //! # async fn example() -> Result<(), Box<dyn std::error::Error>> {
 //! let lake = echolake_lake::Lake::open("lake").await?;
 //! let server = echolake_server::Server::bind(&lake, echolake_server::Settings::default()).await?;

@@ -59,7 +59,7 @@ mod tests {
         let waited = tokio::time::timeout(Duration::from_millis(50), places.next()).await;
         assert!(waited.is_err(), "both places are taken");
         drop(one);
-        let (third, _) = places.next().await;
+        let (third, _) = tokio::time::timeout(Duration::from_secs(60), places.next()).await.expect("a free place");
         assert_eq!(third.peer_addr().ok(), clients[2].local_addr().ok());
     }
 }

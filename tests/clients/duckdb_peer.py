@@ -1,4 +1,4 @@
-"""DuckDB as the peer of example `query-bench`: one JSON object a line in, one a line out.
+"""DuckDB as the peer of benchmark `query-bench`: one JSON object a line in, one a line out.
 
 First {"tables": {name: [files]}, "threads": n}, then {"sql": text} for each query, which is answered by its time up to
 the last row in Arrow, its number of rows, and of each column the sum of its numbers or of its texts' lengths.
