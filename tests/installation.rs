@@ -1,10 +1,13 @@
 //! What packages need of the command: its report about itself, man pages and completions.
 
 use std::fs;
+use std::net::TcpListener;
+use std::process::Command;
 
 use serde::Deserialize;
 
-use super::Place;
+use super::child::run_command;
+use super::{ECHOLAKE, Place, stderr};
 
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -24,11 +27,22 @@ struct Fact {
     hint: Option<String>,
 }
 
+impl Report {
+    fn of(command: &mut Command) -> Self {
+        let output = run_command(command).expect("the command starts");
+        serde_json::from_slice(&output.stdout).unwrap_or_else(|e| panic!("{e}: {}", stderr(&output)))
+    }
+
+    fn fact(&self, name: &str) -> &Fact {
+        self.facts.iter().find(|fact| fact.name == name).unwrap_or_else(|| panic!("no {name} in {self:?}"))
+    }
+}
+
 #[test]
 fn doctor_reports_the_installation_and_leaves_nothing_behind() {
     let place = Place::new();
     let before = fs::read_dir(place.path("")).expect("a folder").count();
-    let report: Report = serde_json::from_str(&place.ok(&["doctor", "--self", "--json"])).expect("JSON");
+    let report = Report::of(&mut place.command(&["doctor", "--self", "--json"]));
     assert_eq!(report.version, env!("CARGO_PKG_VERSION"));
     assert!(report.program.ends_with("echolake"), "{}", report.program);
     assert!(report.commit.is_none_or(|commit| !commit.is_empty()));
@@ -63,12 +77,37 @@ fn doctor_reports_the_installation_and_leaves_nothing_behind() {
 }
 
 #[test]
+fn facts_are_those_of_the_place() {
+    let place = Place::new();
+    let own = ["doctor", "--self", "--json"];
+    // Whoever has the port, this test or another program.
+    let _taken = TcpListener::bind("127.0.0.1:5433");
+    let report = Report::of(&mut place.command(&own));
+    let port = report.fact("port 5433");
+    assert_eq!(port.state, "note", "{port:?}");
+    let formats = &report.fact("formats").found;
+    for name in ["mcap", "parquet", "arrow", "datafusion"] {
+        let version = formats.split(", ").find_map(|part| part.strip_prefix(&format!("{name} ")));
+        assert!(version.is_some_and(|version| version.contains('.')), "{name} in {formats}");
+    }
+    // There is no lake yet, so that its disk is that of the folder above.
+    let disk = &report.fact("lake's disk").found;
+    let folder = place.path("").canonicalize().expect("a folder").display().to_string();
+    assert!(disk.ends_with(folder.trim_end_matches('/')), "{disk}, not {folder}");
+    let no_folder = Report::of(Command::new(ECHOLAKE).args(["--lake", "memory://"]).args(own));
+    assert!(no_folder.facts.iter().all(|fact| fact.name != "lake's disk"), "{no_folder:?}");
+    let no_files = Report::of(place.command(&own).env("TMPDIR", "/dev/null"));
+    let files = no_files.fact("temporary files");
+    assert!(files.state == "failed" && files.found.starts_with("cannot make a folder in /dev/null"), "{files:?}");
+}
+
+#[test]
 fn a_lake_that_cannot_be_is_a_failure() {
     let place = Place::new();
     fs::write(place.path("lake"), "no folder").expect("written");
     let output = place.run(&["doctor", "--self"]);
     assert_eq!(output.status.code(), Some(1));
-    let said = super::stderr(&output);
+    let said = stderr(&output);
     assert!(said.contains("this installation cannot do its job here: lake"), "{said}");
     assert!(String::from_utf8_lossy(&output.stdout).contains("it is a file"));
 }
