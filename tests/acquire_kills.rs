@@ -16,7 +16,7 @@ use super::child::{ChildProcess, run_command};
 use super::forgetful::{ForgetfulDisk, Mounted};
 
 /// Pairs of the small rig.
-const PAIRS: usize = 45;
+pub(crate) const PAIRS: usize = 45;
 /// Seconds of a take: kills then come at all moments of a run, not only while it begins.
 const PACE: &str = "0.008";
 
@@ -257,27 +257,4 @@ fn verdicts(path: &Path) -> BTreeMap<Key, usize> {
         }
     }
     found
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn a_few_kills_lose_nothing() {
-        let mut campaign = Campaign::new(Path::new(crate::ECHOLAKE), 7);
-        let outcome = campaign.kills(6, &mut |_| {});
-        assert_eq!(outcome.killed, 6);
-        assert!(outcome.acknowledged >= PAIRS);
-    }
-
-    #[test]
-    fn a_few_power_cuts_lose_nothing() {
-        let Some(mut campaign) = Campaign::with_power_cuts(Path::new(crate::ECHOLAKE), 7) else {
-            return;
-        };
-        let outcome = campaign.kills(6, &mut |_| {});
-        assert_eq!(outcome.killed, 6);
-        assert!(outcome.acknowledged >= PAIRS);
-    }
 }

@@ -172,3 +172,20 @@ fn two_processes_ingest_half_of_the_runs_each() {
     let binary = std::path::Path::new(super::ECHOLAKE);
     super::kills::Campaign::of(binary, 1, 12).halves(2, &mut |_, _| {});
 }
+
+#[test]
+fn acquires_that_are_killed_lose_nothing_acknowledged() {
+    let mut campaign = super::acquire_kills::Campaign::new(std::path::Path::new(super::ECHOLAKE), 7);
+    let outcome = campaign.kills(6, &mut |_| {});
+    assert_eq!(outcome.killed, 6);
+    assert!(outcome.acknowledged >= super::acquire_kills::PAIRS);
+}
+
+#[test]
+fn acquires_whose_power_is_cut_lose_nothing_acknowledged() {
+    let echolake = std::path::Path::new(super::ECHOLAKE);
+    let Some(mut campaign) = super::acquire_kills::Campaign::with_power_cuts(echolake, 7) else { return };
+    let outcome = campaign.kills(6, &mut |_| {});
+    assert_eq!(outcome.killed, 6);
+    assert!(outcome.acknowledged >= super::acquire_kills::PAIRS);
+}

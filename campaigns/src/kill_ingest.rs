@@ -34,7 +34,7 @@ pub(crate) fn run(args: &KillIngestArgs) -> Result<()> {
     let KillIngestArgs { rounds, seed, disturbance } = *args;
     let binary = super::echolake_path()?;
     let mut tell = |round: usize, so_far: &Outcome| {
-        if round % 10 == 0 {
+        if round.is_multiple_of(10) {
             // Progress is not worth an error.
             let _ = writeln!(std::io::stderr(), "{round} of {rounds} rounds, {} killed", so_far.killed);
         }
