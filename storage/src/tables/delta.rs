@@ -21,7 +21,7 @@ use tokio::sync::Mutex;
 use uuid::Uuid;
 
 use self::actions::{AddFile, FileFormat, LogLine, TableMetadata};
-use self::log_folder::{CommitAttempt, LogFolder, own_protocol};
+use self::log_folder::{CommitAttempt, LogFolder, REBUILD_HINT, own_protocol};
 use self::table_state::TableState;
 use crate::tables::snapshot::{decode_parts, encode_parts, is_merged};
 use crate::tables::versions;
@@ -91,6 +91,7 @@ impl DeltaLog {
             state.apply(state.version + 1, lines);
             // The commit is done; a checkpoint only spares readers some work, and the next one makes up for it.
             let _ = log.maintain(&state, now).await;
+            self.loaded.lock().await.insert(table, Arc::new(state));
         }
         Ok(attempt)
     }
@@ -275,10 +276,7 @@ fn file_name(path: &str) -> String {
 fn parts(table: Table, add: &AddFile) -> Result<Vec<Part>> {
     let text = add.tags.as_ref().and_then(|tags| tags.get(PARTS).cloned().flatten());
     text.and_then(|text| decode_parts(&text)).ok_or_else(|| {
-        let reason = format!(
-            "`{}` has lost the list of its parts; hint: delete the table's folder, `echolake ingest` makes it anew",
-            add.path
-        );
+        let reason = format!("`{}` has lost the list of its parts; {REBUILD_HINT}", add.path);
         Error::Log { table: table.name(), action: "read", reason }
     })
 }

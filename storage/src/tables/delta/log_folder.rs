@@ -27,6 +27,8 @@ const CHECKPOINT_INTERVAL: u64 = 100;
 const LOG_RETENTION: TimeDelta = TimeDelta::days(30);
 /// Commits that are read at once.
 const CONCURRENT_READS: usize = 16;
+/// The way out of a log that cannot be read: all tables can be derived again.
+pub(super) const REBUILD_HINT: &str = "hint: delete the table's folder, `echolake ingest` makes it anew";
 /// The file that tells readers which checkpoint is the newest.
 const LAST_CHECKPOINT: &str = "_last_checkpoint";
 
@@ -220,32 +222,28 @@ impl<'a> LogFolder<'a> {
 
     fn check_readable(&self, state: &TableState) -> Result<()> {
         let Some(protocol) = &state.protocol else { return Err(self.damaged("it names no version of the protocol")) };
-        let needed = protocol.min_reader_version;
-        if needed <= READER_VERSION {
-            return Ok(());
-        }
-        let reason = format!(
-            "another program has raised it to Delta's reader version {needed}, echolake reads version {READER_VERSION}; \
-             hint: delete the table's folder, `echolake ingest` makes it anew"
-        );
-        Err(self.failed("read", reason))
+        self.check_protocol("read", "reader", "reads", protocol.min_reader_version, READER_VERSION)
     }
 
     /// Refuses a table whose other writers rely on what this one does not do.
     pub(super) fn check_writable(&self, state: &TableState) -> Result<()> {
         let needed = state.protocol.as_ref().map_or(0, |p| p.min_writer_version);
-        if needed <= WRITER_VERSION {
+        self.check_protocol("written", "writer", "writes", needed, WRITER_VERSION)
+    }
+
+    fn check_protocol(&self, action: &'static str, role: &str, verb: &str, needed: i32, supported: i32) -> Result<()> {
+        if needed <= supported {
             return Ok(());
         }
         let reason = format!(
-            "another program has raised it to Delta's writer version {needed}, echolake writes version {WRITER_VERSION}; \
-             hint: delete the table's folder, `echolake ingest` makes it anew"
+            "another program has raised it to Delta's {role} version {needed}, echolake {verb} version {supported}; \
+             {REBUILD_HINT}"
         );
-        Err(self.failed("written", reason))
+        Err(self.failed(action, reason))
     }
 
     fn damaged(&self, what: &str) -> Error {
-        self.failed("read", format!("{what}; hint: delete the table's folder, `echolake ingest` makes it anew"))
+        self.failed("read", format!("{what}; {REBUILD_HINT}"))
     }
 
     fn failed(&self, action: &'static str, reason: String) -> Error {
