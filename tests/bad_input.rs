@@ -98,56 +98,6 @@ fn exports_to_what_is_no_disk() {
 }
 
 #[test]
-fn meshes_and_surfaces() {
-    let place = Place::new();
-    let acquire = |mesh: &str| {
-        vec![
-            "acquire".to_owned(),
-            "--surface".into(),
-            "x".into(),
-            "--rig".into(),
-            "rig.toml".into(),
-            "--mesh".into(),
-            mesh.into(),
-        ]
-    };
-    let check = |mesh: &str, expected: &str| {
-        let args = acquire(mesh);
-        place.fails(1, &args.iter().map(String::as_str).collect::<Vec<_>>(), expected);
-        assert!(!place.path("lake").exists(), "no lake is made for it: {mesh}");
-    };
-    std::fs::write(place.path("empty.obj"), "v 0 0 0\n").expect("written");
-    std::fs::write(place.path("open.obj"), "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n").expect("written");
-    std::fs::write(
-        place.path("large.obj"),
-        "v 0 0 0\nv 1000 0 0\nv 0 1000 0\nv 0 0 1\nf 1 2 3\nf 1 2 4\nf 2 3 4\nf 1 3 4\n",
-    )
-    .expect("written");
-    check("empty.obj", "is empty");
-    check("open.obj", "is open: 3 edges");
-    check("large.obj", "larger than the panel");
-    check("missing.stl", "cannot read mesh");
-    check("panel.step", "no mesh file that is known");
-    place.fails(1, &["acquire", "--surface", "mystery", "--rig", "rig.toml"], "unknown surface `mystery`");
-    place.fails(2, &["acquire", "--surface", "../x", "--rig", "rig.toml"], "not a valid surface id");
-    place.fails(1, &["acquire", "--surface", "brick", "--set", "colour=red"], "no parameter `colour`");
-    place.ok(&["panel", "wavy", "-o", "wavy.stl"]);
-    place.acquire("from_file", &["--mesh", "wavy.stl"]);
-    place.fails(2, &["acquire", "--surface", "x", "--rig", "rig.toml", "--side", "back"], "--mesh");
-    place.ok(&["panel", "flat", "--back", "wavy", "--cells", "64", "-o", "two.stl"]);
-    place.acquire("two_0", &["--mesh", "two.stl"]);
-    place.acquire("two_1", &["--mesh", "two.stl", "--side", "back"]);
-    place.ok(&["ingest"]);
-    let of = |surface: &str, column: &str| {
-        place.sql(&format!("select {column} x from surfaces where surface_id = '{surface}'"))[0]["x"].clone()
-    };
-    assert_eq!(of("from_file", "mesh_file"), "wavy.stl");
-    assert_eq!(of("two_0", "relief_max_mm"), 0.0);
-    let height = |surface: &str| of(surface, "relief_max_mm").as_f64().expect("a height");
-    assert!(height("two_1") > 1.0 && (height("two_1") - height("from_file")).abs() < 0.5, "the back is the wavy one");
-}
-
-#[test]
 fn panels_and_groups_that_cannot_be_made() {
     let place = Place::new();
     place.fails(1, &["panel", "marble", "-o", "x.stl"], "no relief; hint: flat");
@@ -329,4 +279,61 @@ fn a_recording_whose_recorder_died_yields_what_was_complete() {
     place.fails(3, &["ingest"], "");
     assert_eq!(place.number("select count(*) from runs where state = 'partial'"), 1.0);
     assert!(partial.exists(), "the original is as it was");
+}
+
+mod slow {
+    use super::*;
+
+    #[test]
+    fn meshes_and_surfaces() {
+        let place = Place::new();
+        let acquire = |mesh: &str| {
+            vec![
+                "acquire".to_owned(),
+                "--surface".into(),
+                "x".into(),
+                "--rig".into(),
+                "rig.toml".into(),
+                "--mesh".into(),
+                mesh.into(),
+            ]
+        };
+        let check = |mesh: &str, expected: &str| {
+            let args = acquire(mesh);
+            place.fails(1, &args.iter().map(String::as_str).collect::<Vec<_>>(), expected);
+            assert!(!place.path("lake").exists(), "no lake is made for it: {mesh}");
+        };
+        std::fs::write(place.path("empty.obj"), "v 0 0 0\n").expect("written");
+        std::fs::write(place.path("open.obj"), "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n").expect("written");
+        std::fs::write(
+            place.path("large.obj"),
+            "v 0 0 0\nv 1000 0 0\nv 0 1000 0\nv 0 0 1\nf 1 2 3\nf 1 2 4\nf 2 3 4\nf 1 3 4\n",
+        )
+        .expect("written");
+        check("empty.obj", "is empty");
+        check("open.obj", "is open: 3 edges");
+        check("large.obj", "larger than the panel");
+        check("missing.stl", "cannot read mesh");
+        check("panel.step", "no mesh file that is known");
+        place.fails(1, &["acquire", "--surface", "mystery", "--rig", "rig.toml"], "unknown surface `mystery`");
+        place.fails(2, &["acquire", "--surface", "../x", "--rig", "rig.toml"], "not a valid surface id");
+        place.fails(1, &["acquire", "--surface", "brick", "--set", "colour=red"], "no parameter `colour`");
+        place.ok(&["panel", "wavy", "-o", "wavy.stl"]);
+        place.acquire("from_file", &["--mesh", "wavy.stl"]);
+        place.fails(2, &["acquire", "--surface", "x", "--rig", "rig.toml", "--side", "back"], "--mesh");
+        place.ok(&["panel", "flat", "--back", "wavy", "--cells", "64", "-o", "two.stl"]);
+        place.acquire("two_0", &["--mesh", "two.stl"]);
+        place.acquire("two_1", &["--mesh", "two.stl", "--side", "back"]);
+        place.ok(&["ingest"]);
+        let of = |surface: &str, column: &str| {
+            place.sql(&format!("select {column} x from surfaces where surface_id = '{surface}'"))[0]["x"].clone()
+        };
+        assert_eq!(of("from_file", "mesh_file"), "wavy.stl");
+        assert_eq!(of("two_0", "relief_max_mm"), 0.0);
+        let height = |surface: &str| of(surface, "relief_max_mm").as_f64().expect("a height");
+        assert!(
+            height("two_1") > 1.0 && (height("two_1") - height("from_file")).abs() < 0.5,
+            "the back is the wavy one"
+        );
+    }
 }

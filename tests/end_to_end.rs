@@ -159,18 +159,24 @@ fn a_gir_folder_becomes_runs_with_references_of_their_own() {
     );
 }
 
-// The long form is the campaign `kills`.
-#[test]
-fn a_killed_ingest_is_repaired_by_running_it_again() {
-    let outcome = super::kills::Campaign::new(std::path::Path::new(super::ECHOLAKE), 1).rounds(4, &mut |_, _| {});
-    assert!(outcome.killed > 0, "{outcome:?}");
-}
+mod slow {
+    use std::path::Path;
 
-// Its long form is the same campaign with `halves`.
-#[test]
-fn two_processes_ingest_half_of_the_runs_each() {
-    let binary = std::path::Path::new(super::ECHOLAKE);
-    super::kills::Campaign::of(binary, 1, 12).halves(2, &mut |_, _| {});
+    use crate::ECHOLAKE;
+    use crate::kills::Campaign;
+
+    // The long form is the campaign `kills`.
+    #[test]
+    fn a_killed_ingest_is_repaired_by_running_it_again() {
+        let outcome = Campaign::new(Path::new(ECHOLAKE), 1).rounds(4, &mut |_, _| {});
+        assert!(outcome.killed > 0, "{outcome:?}");
+    }
+
+    // Its long form is the same campaign with `halves`.
+    #[test]
+    fn two_processes_ingest_half_of_the_runs_each() {
+        Campaign::of(Path::new(ECHOLAKE), 1, 12).halves(2, &mut |_, _| {});
+    }
 }
 
 #[test]

@@ -19,8 +19,10 @@ mod sofa;
 #[cfg(feature = "web")]
 mod web;
 
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
+use std::sync::OnceLock;
 
 /// The command under test.
 const ECHOLAKE: &str = env!("CARGO_BIN_EXE_echolake");
@@ -85,6 +87,49 @@ impl Place {
         let args = [&["acquire", "--surface", surface, "--rig", "rig.toml"], more].concat();
         self.folder.path().join(self.ok(&args).trim())
     }
+}
+
+/// A folder that several tests begin with: its files, once one of them has made it.
+struct PlaceTemplate(OnceLock<BTreeMap<PathBuf, Vec<u8>>>);
+
+impl PlaceTemplate {
+    const fn new() -> Self {
+        Self(OnceLock::new())
+    }
+
+    /// A folder of the test's own, as `make` leaves a new one.
+    fn place(&self, make: impl FnOnce(&Place)) -> Place {
+        let files = self.0.get_or_init(|| {
+            let place = Place::new();
+            make(&place);
+            files_below(place.folder.path())
+        });
+        let place = Place::new();
+        for (path, bytes) in files {
+            let path = place.folder.path().join(path);
+            std::fs::create_dir_all(path.parent().expect("a folder")).expect("made");
+            std::fs::write(path, bytes).expect("written");
+        }
+        place
+    }
+}
+
+/// Every file below a folder, by its path from there.
+fn files_below(folder: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
+    let mut files = BTreeMap::new();
+    let mut folders = vec![folder.to_owned()];
+    while let Some(next) = folders.pop() {
+        for entry in std::fs::read_dir(&next).expect("listed") {
+            let path = entry.expect("an entry").path();
+            if path.is_dir() {
+                folders.push(path);
+            } else {
+                let name = path.strip_prefix(folder).expect("below it").to_owned();
+                files.insert(name, std::fs::read(path).expect("read"));
+            }
+        }
+    }
+    files
 }
 
 fn stderr(output: &Output) -> String {

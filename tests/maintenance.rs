@@ -32,83 +32,6 @@ fn age(file: &Path, hours: u64) {
 }
 
 #[test]
-fn readers_see_the_same_before_and_after() {
-    let place = Place::new();
-    for (surface, seed) in [("flat", "1"), ("foam", "2"), ("flat_b", "3"), ("wood", "4"), ("prd", "5")] {
-        place.acquire(surface, &["--seed", seed, "--ir-only"]);
-    }
-    // Its rows do not change when the others' Flat does, and stay in merged files of which the rest goes.
-    place.acquire("wavy", &["--seed", "6", "--ir-only", "--flat", "flat_b"]);
-    place.ok(&["ingest"]);
-    let before = tables(&place);
-    let report: serde_json::Value = serde_json::from_str(&place.ok(&["optimize", "--json"])).expect("JSON");
-    let merged: Vec<_> =
-        report["tables"].as_array().expect("a list").iter().map(|t| (&t["table"], &t["merged"])).collect();
-    assert_eq!(merged.len(), 8, "{report}");
-    assert!(merged.iter().all(|(_, count)| **count == 6), "{report}");
-    same(&tables(&place), &before, "after optimize");
-    assert_eq!(place.number("select count(*) from tnce_d4"), 6.0 * 45.0 * 8.0);
-    assert_eq!(place.number("select count(*) from nce where surface_id = 'wavy'"), 45.0);
-    place.fails(0, &["optimize"], "nothing to merge");
-    let doctor: serde_json::Value = serde_json::from_str(&place.ok(&["doctor", "--json"])).expect("JSON");
-    let findings = doctor["findings"].as_array().expect("a list");
-    assert!(findings.iter().all(|f| f["severity"] == "note"), "{findings:?}");
-
-    // The responses of merged runs are read back, and derived with two Flats now.
-    place.acquire("flat", &["--seed", "9", "--ir-only"]);
-    place.ok(&["ingest"]);
-    let versions = place.sql("select distinct flat_version from tnce where surface_id <> 'wavy'");
-    assert_eq!(versions.len(), 1, "{versions:?}");
-    assert!(versions[0]["flat_version"].as_str().expect("text").starts_with("flat:2:"), "{versions:?}");
-    let replaced = tables(&place);
-    place.ok(&["optimize"]);
-    same(&tables(&place), &replaced, "after the second optimize");
-    let kept = parquet_files(&place.path("lake/tables/nce")).len();
-    assert!(place.ok(&["vacuum"]).starts_with("0 files"), "readers may hold what was merged today");
-    let freed = place.ok(&["vacuum", "--keep-hours", "0"]);
-    assert!(!freed.starts_with("0 files") && freed.contains("freed"), "{freed}");
-    assert!(kept > 1 && parquet_files(&place.path("lake/tables/nce")).len() == 1);
-    same(&tables(&place), &replaced, "after vacuum");
-
-    // The runs are the truth: an ingest of them into no tables at all has the same rows.
-    std::fs::remove_dir_all(place.path("lake/tables")).expect("removed");
-    place.ok(&["ingest"]);
-    same(&tables(&place), &replaced, "made anew from the runs");
-}
-
-#[test]
-fn vacuum_takes_what_crashes_left_and_nothing_else() {
-    let place = Place::new();
-    place.acquire("flat", &["--ir-only"]);
-    place.ok(&["ingest"]);
-    let before = tables(&place);
-    let old = [
-        "tables/nce/flat.r.ab.parquet",
-        "tables/nce/x.parquet#12000001",
-        "tables/nce/_delta_log/00.json#1",
-        "inbox/r.mcap.copying",
-    ];
-    let new = ["tables/nce/foam.r.ab.parquet", "inbox/s.mcap.copying", "tables/nce/notes.txt", "runs/flat/r.mcap#3"];
-    for file in old.iter().chain(&new) {
-        std::fs::write(place.path("lake").join(file), "half").expect("written");
-    }
-    let ancient = [&old[..], &new[2..]].concat();
-    ancient.iter().for_each(|file| age(&place.path("lake").join(file), 24 * 8));
-    let there = |file: &str| place.path("lake").join(file).exists();
-
-    let told = place.ok(&["vacuum", "--dry-run"]);
-    assert!(old.iter().all(|file| told.contains(file) && there(file)), "{told}");
-    assert!(told.ends_with("4 files, 0.0 kB would be freed\n"), "{told}");
-    let report: serde_json::Value = serde_json::from_str(&place.ok(&["vacuum", "--json"])).expect("JSON");
-    assert_eq!((report["files"].as_array().map(Vec::len), &report["bytes"]), (Some(4), &16.into()), "{report}");
-    assert!(!old.iter().any(|file| there(file)));
-    place.ok(&["vacuum", "--keep-hours", "0"]);
-    assert!(new.iter().all(|file| there(file)), "young, foreign, or a run's");
-    same(&tables(&place), &before, "after vacuum");
-    place.fails(2, &["vacuum", "--keep-hours", "169"], "0..=168");
-}
-
-#[test]
 fn one_maintains_at_a_time_and_the_second_is_told_who() {
     let place = Place::new();
     place.acquire("flat", &["--ir-only"]);
@@ -130,4 +53,86 @@ fn one_maintains_at_a_time_and_the_second_is_told_who() {
     place.ok(&["optimize"]);
     assert!(!lease.exists(), "given back");
     place.ok(&["vacuum"]);
+}
+
+mod slow {
+    use super::*;
+
+    #[test]
+    fn readers_see_the_same_before_and_after() {
+        let place = Place::new();
+        for (surface, seed) in [("flat", "1"), ("foam", "2"), ("flat_b", "3"), ("wood", "4"), ("prd", "5")] {
+            place.acquire(surface, &["--seed", seed, "--ir-only"]);
+        }
+        // Its rows do not change when the others' Flat does, and stay in merged files of which the rest goes.
+        place.acquire("wavy", &["--seed", "6", "--ir-only", "--flat", "flat_b"]);
+        place.ok(&["ingest"]);
+        let before = tables(&place);
+        let report: serde_json::Value = serde_json::from_str(&place.ok(&["optimize", "--json"])).expect("JSON");
+        let merged: Vec<_> =
+            report["tables"].as_array().expect("a list").iter().map(|t| (&t["table"], &t["merged"])).collect();
+        assert_eq!(merged.len(), 8, "{report}");
+        assert!(merged.iter().all(|(_, count)| **count == 6), "{report}");
+        same(&tables(&place), &before, "after optimize");
+        assert_eq!(place.number("select count(*) from tnce_d4"), 6.0 * 45.0 * 8.0);
+        assert_eq!(place.number("select count(*) from nce where surface_id = 'wavy'"), 45.0);
+        place.fails(0, &["optimize"], "nothing to merge");
+        let doctor: serde_json::Value = serde_json::from_str(&place.ok(&["doctor", "--json"])).expect("JSON");
+        let findings = doctor["findings"].as_array().expect("a list");
+        assert!(findings.iter().all(|f| f["severity"] == "note"), "{findings:?}");
+
+        // The responses of merged runs are read back, and derived with two Flats now.
+        place.acquire("flat", &["--seed", "9", "--ir-only"]);
+        place.ok(&["ingest"]);
+        let versions = place.sql("select distinct flat_version from tnce where surface_id <> 'wavy'");
+        assert_eq!(versions.len(), 1, "{versions:?}");
+        assert!(versions[0]["flat_version"].as_str().expect("text").starts_with("flat:2:"), "{versions:?}");
+        let replaced = tables(&place);
+        place.ok(&["optimize"]);
+        same(&tables(&place), &replaced, "after the second optimize");
+        let kept = parquet_files(&place.path("lake/tables/nce")).len();
+        assert!(place.ok(&["vacuum"]).starts_with("0 files"), "readers may hold what was merged today");
+        let freed = place.ok(&["vacuum", "--keep-hours", "0"]);
+        assert!(!freed.starts_with("0 files") && freed.contains("freed"), "{freed}");
+        assert!(kept > 1 && parquet_files(&place.path("lake/tables/nce")).len() == 1);
+        same(&tables(&place), &replaced, "after vacuum");
+
+        // The runs are the truth: an ingest of them into no tables at all has the same rows.
+        std::fs::remove_dir_all(place.path("lake/tables")).expect("removed");
+        place.ok(&["ingest"]);
+        same(&tables(&place), &replaced, "made anew from the runs");
+    }
+
+    #[test]
+    fn vacuum_takes_what_crashes_left_and_nothing_else() {
+        let place = Place::new();
+        place.acquire("flat", &["--ir-only"]);
+        place.ok(&["ingest"]);
+        let before = tables(&place);
+        let old = [
+            "tables/nce/flat.r.ab.parquet",
+            "tables/nce/x.parquet#12000001",
+            "tables/nce/_delta_log/00.json#1",
+            "inbox/r.mcap.copying",
+        ];
+        let new =
+            ["tables/nce/foam.r.ab.parquet", "inbox/s.mcap.copying", "tables/nce/notes.txt", "runs/flat/r.mcap#3"];
+        for file in old.iter().chain(&new) {
+            std::fs::write(place.path("lake").join(file), "half").expect("written");
+        }
+        let ancient = [&old[..], &new[2..]].concat();
+        ancient.iter().for_each(|file| age(&place.path("lake").join(file), 24 * 8));
+        let there = |file: &str| place.path("lake").join(file).exists();
+
+        let told = place.ok(&["vacuum", "--dry-run"]);
+        assert!(old.iter().all(|file| told.contains(file) && there(file)), "{told}");
+        assert!(told.ends_with("4 files, 0.0 kB would be freed\n"), "{told}");
+        let report: serde_json::Value = serde_json::from_str(&place.ok(&["vacuum", "--json"])).expect("JSON");
+        assert_eq!((report["files"].as_array().map(Vec::len), &report["bytes"]), (Some(4), &16.into()), "{report}");
+        assert!(!old.iter().any(|file| there(file)));
+        place.ok(&["vacuum", "--keep-hours", "0"]);
+        assert!(new.iter().all(|file| there(file)), "young, foreign, or a run's");
+        same(&tables(&place), &before, "after vacuum");
+        place.fails(2, &["vacuum", "--keep-hours", "169"], "0..=168");
+    }
 }

@@ -1,6 +1,6 @@
 //! `echolake serve` as its clients see it: answers, refusals, queries that end with who asked, and its own end.
 
-mod catalogue;
+pub(crate) mod catalogue;
 mod contract;
 mod escapes;
 pub(crate) mod http;
@@ -15,7 +15,7 @@ use std::time::{Duration, Instant};
 
 use serde_json::Value;
 
-use super::Place;
+use super::{Place, PlaceTemplate};
 use http::{Answer, Request};
 use server::Served;
 
@@ -27,11 +27,13 @@ const EVENT_LIMIT: Duration = Duration::from_secs(60);
 /// How long to wait for what must not come.
 const SILENCE: Duration = Duration::from_millis(200);
 
+/// One run without sweeps.
 fn lake() -> Place {
-    let place = Place::new();
-    place.acquire("flat", &["--ir-only"]);
-    place.ok(&["ingest"]);
-    place
+    static ONE_RUN: PlaceTemplate = PlaceTemplate::new();
+    ONE_RUN.place(|place| {
+        place.acquire("flat", &["--ir-only"]);
+        place.ok(&["ingest"]);
+    })
 }
 
 pub(crate) fn served(place: &Place, more: &[&str]) -> Served {
@@ -296,13 +298,19 @@ fn it_stops_when_told() {
     assert_eq!(server.terminate(), Some(0));
 }
 
-// Long form: campaign `fuzz`.
-#[test]
-fn changed_input_harms_nothing() {
-    use super::fuzz::{Campaign, Target};
-    for target in Target::ALL {
-        let mut campaign = Campaign::new(Path::new(super::ECHOLAKE), 1);
-        let outcome = campaign.throw(target, &mut |so_far| so_far.rounds < 100);
-        assert!(outcome.answered > 0, "{}: some are right all the same", target.name());
+mod slow {
+    use std::path::Path;
+
+    use crate::ECHOLAKE;
+    use crate::fuzz::{Campaign, Target};
+
+    // Long form: campaign `fuzz`.
+    #[test]
+    fn changed_input_harms_nothing() {
+        for target in Target::ALL {
+            let mut campaign = Campaign::new(Path::new(ECHOLAKE), 1);
+            let outcome = campaign.throw(target, &mut |so_far| so_far.rounds < 100);
+            assert!(outcome.answered > 0, "{}: some are right all the same", target.name());
+        }
     }
 }

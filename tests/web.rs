@@ -10,7 +10,7 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 
 use super::child::run_long_command;
-use super::serve::served;
+use super::serve::{catalogue::lake, served};
 use super::{Place, stderr};
 
 const NO_SKIP: &str = "ECHOLAKE_NO_SKIP";
@@ -73,39 +73,39 @@ fn demo() -> Place {
     place
 }
 
-#[test]
-fn the_pages_do_what_they_must_in_a_browser() {
-    let Some(browser) = or_skip("the catalogue in a browser", browser()) else { return };
-    let place = demo();
-    let server = served(&place, &[]);
-    let base = format!("http://{}", server.http);
-    let shots = place.path("shots");
-    let shots = shots.to_str().expect("a path");
-    for script in
-        [&["tests/contract.mjs", &base][..], &["tests/behaviour.mjs", &base], &["tests/pages.mjs", &base, shots]]
-    {
-        let done = run(Command::new("node").args(script).current_dir(web()).env("CHROMIUM", &browser));
+mod slow {
+    use super::*;
+
+    #[test]
+    fn the_pages_do_what_they_must_in_a_browser() {
+        let Some(browser) = or_skip("the catalogue in a browser", browser()) else { return };
+        let place = demo();
+        let server = served(&place, &[]);
+        let base = format!("http://{}", server.http);
+        let shots = place.path("shots");
+        let shots = shots.to_str().expect("a path");
+        for script in
+            [&["tests/contract.mjs", &base][..], &["tests/behaviour.mjs", &base], &["tests/pages.mjs", &base, shots]]
+        {
+            let done = run(Command::new("node").args(script).current_dir(web()).env("CHROMIUM", &browser));
+            eprintln!("{}", done.unwrap_or_else(|why| panic!("{why}")));
+        }
+        let pictures = fs::read_dir(shots).expect("pictures").count();
+        assert!(pictures >= 7 * 2, "{pictures} pictures of seven pages in two themes");
+    }
+
+    #[test]
+    fn schemathesis_finds_no_breach_of_the_contract() {
+        let Some(program) = or_skip("Schemathesis", schemathesis()) else { return };
+        let place = lake();
+        let server = served(&place, &[]);
+        let done = run(Command::new(program)
+            .args(["run", &format!("http://{}/api/v1/openapi.json", server.http)])
+            .args(["--phases", "examples,coverage,fuzzing", "--checks", "all", "--max-examples", "30", "--seed", "1"])
+            // Which bands, points and queries are right depends on the lake; the document cannot say.
+            .args(["--exclude-checks", "positive_data_acceptance"])
+            .args(["--suppress-health-check", "all", "--no-color"])
+            .current_dir(place.path("")));
         eprintln!("{}", done.unwrap_or_else(|why| panic!("{why}")));
     }
-    let pictures = fs::read_dir(shots).expect("pictures").count();
-    assert!(pictures >= 7 * 2, "{pictures} pictures of seven pages in two themes");
-}
-
-#[test]
-fn schemathesis_finds_no_breach_of_the_contract() {
-    let Some(program) = or_skip("Schemathesis", schemathesis()) else { return };
-    let place = Place::new();
-    for surface in ["flat", "foam", "brick"] {
-        place.acquire(surface, &["--ir-only"]);
-    }
-    place.ok(&["ingest"]);
-    let server = served(&place, &[]);
-    let done = run(Command::new(program)
-        .args(["run", &format!("http://{}/api/v1/openapi.json", server.http)])
-        .args(["--phases", "examples,coverage,fuzzing", "--checks", "all", "--max-examples", "30", "--seed", "1"])
-        // Which bands, points and queries are right depends on the lake; the document cannot say.
-        .args(["--exclude-checks", "positive_data_acceptance"])
-        .args(["--suppress-health-check", "all", "--no-color"])
-        .current_dir(place.path("")));
-    eprintln!("{}", done.unwrap_or_else(|why| panic!("{why}")));
 }

@@ -140,57 +140,6 @@ async fn each_death<T, E: std::fmt::Debug>(
     deaths
 }
 
-// A death at each write, made or not: afterwards ingest is run once more, and the tables are those of an ingest that
-// nothing disturbed, byte for byte.
-#[tokio::test(flavor = "multi_thread")]
-async fn a_death_at_any_write_is_repaired_by_running_again() {
-    let runs = runs(&["flat", "foam", "wood"]);
-    let start = with_inbox(&runs).await;
-    let undisturbed = Arc::new(start.fork());
-    ingest(undisturbed.clone()).await.expect("ingested");
-    let expected = tables(undisturbed).await;
-    assert_eq!(expected.0.keys().cloned().collect::<Vec<_>>(), expected.1, "nothing but what is seen is in the logs");
-    let deaths = each_death(&start, ingest, async |inner, death| {
-        ingest(inner.clone()).await.unwrap_or_else(|e| panic!("{death}: {e}"));
-        let (seen, logged) = tables(inner).await;
-        assert_eq!(logged, expected.1, "{death}");
-        assert!(seen == expected.0, "{death}: other bytes");
-    })
-    .await;
-    // Each of three runs has nine files, each table a commit, each run's file a move.
-    assert!(deaths > 2 * 35, "{deaths} deaths");
-}
-
-// A death at each write of a merge and of the clean-up behind it: readers see the same rows at once, and once it is run
-// again the files are those of one that nothing disturbed.
-#[tokio::test(flavor = "multi_thread")]
-async fn a_death_at_any_write_of_the_upkeep_changes_no_row() {
-    let start = with_inbox(&runs(&["flat", "foam", "wood"])).await;
-    ingest(start.clone()).await.expect("ingested");
-    let before = rows(Arc::new(start.fork())).await;
-    let undisturbed = Arc::new(start.fork());
-    tidy(undisturbed.clone()).await.expect("tidied");
-    assert!(rows(undisturbed.clone()).await == before, "other rows");
-    let files = async |store: Arc<InMemory>| {
-        let listed: Vec<_> = store.list(Some(&Path::from("tables"))).try_collect().await.expect("listed");
-        listed.iter().filter(|f| f.location.extension() == Some("parquet")).count()
-    };
-    let (expected, kept) = (tables(undisturbed.clone()).await, files(undisturbed).await);
-    assert!(kept < files(start.clone()).await, "files are merged");
-    let deaths = each_death(&start, tidy, async |inner, death| {
-        assert!(rows(inner.clone()).await == before, "{death}: other rows");
-        // As if its time had run out.
-        inner.delete(&Path::from("tables/_maintenance.json")).await.ok();
-        tidy(inner.clone()).await.unwrap_or_else(|e| panic!("{death}: {e}"));
-        assert!(tables(inner.clone()).await == expected, "{death}: other files");
-        // What was written and never named stays for an hour, lest somebody is about to name it.
-        assert!(files(inner).await <= kept + 1, "{death}: files are left over");
-    })
-    .await;
-    // A merge of each of eight tables is a file and a commit; 24 files are deleted; two leases are taken and given back.
-    assert!(deaths > 2 * 40, "{deaths} deaths");
-}
-
 #[tokio::test(flavor = "multi_thread")]
 async fn upkeep_beside_ingest_loses_nothing_and_doubles_nothing() {
     let surfaces = ["flat", "foam", "wood", "prd", "brick", "wavy", "flat_2", "wood_2"];
@@ -229,25 +178,6 @@ async fn upkeep_beside_ingest_loses_nothing_and_doubles_nothing() {
         assert_eq!(seen.get(table).map(Vec::len), Some(rows.len()), "{table}");
     }
     assert!(seen == expected, "other rows");
-}
-
-#[tokio::test(flavor = "multi_thread")]
-async fn two_ingests_at_once_lose_nothing_and_double_nothing() {
-    let runs = runs(&["flat", "foam", "wood", "prd", "brick", "wavy", "flat_2", "wood_2"]);
-    let undisturbed = with_inbox(&runs).await;
-    ingest(undisturbed.clone()).await.expect("ingested");
-    let expected = tables(undisturbed).await;
-    for _ in 0..5 {
-        let store = with_inbox(&runs).await;
-        let (a, b) = (tokio::spawn(ingest(store.clone())), tokio::spawn(ingest(store.clone())));
-        a.await.expect("no panic").expect("ingested");
-        b.await.expect("no panic").expect("ingested");
-        // Each completes what it saw; the last one to end has seen everything.
-        ingest(store.clone()).await.expect("ingested");
-        let (seen, logged) = tables(store).await;
-        assert_eq!(logged, expected.1);
-        assert!(seen == expected.0, "other bytes");
-    }
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -303,4 +233,82 @@ async fn refused_files_go_to_quarantine_with_the_reason_and_the_rest_goes_on() {
     let foam = taken.iter().find(|t| t.0 == "foam").expect("the cut run");
     assert!(!foam.1 && foam.2 < 45, "{foam:?}");
     assert!(ingest(store).await.expect("ingested").is_empty(), "nothing is left in the inbox");
+}
+
+mod slow {
+    use super::*;
+
+    // A death at each write, made or not: afterwards ingest is run once more, and the tables are those of an ingest that
+    // nothing disturbed, byte for byte.
+    #[tokio::test(flavor = "multi_thread")]
+    async fn a_death_at_any_write_is_repaired_by_running_again() {
+        let runs = runs(&["flat", "foam", "wood"]);
+        let start = with_inbox(&runs).await;
+        let undisturbed = Arc::new(start.fork());
+        ingest(undisturbed.clone()).await.expect("ingested");
+        let expected = tables(undisturbed).await;
+        assert_eq!(
+            expected.0.keys().cloned().collect::<Vec<_>>(),
+            expected.1,
+            "nothing but what is seen is in the logs"
+        );
+        let deaths = each_death(&start, ingest, async |inner, death| {
+            ingest(inner.clone()).await.unwrap_or_else(|e| panic!("{death}: {e}"));
+            let (seen, logged) = tables(inner).await;
+            assert_eq!(logged, expected.1, "{death}");
+            assert!(seen == expected.0, "{death}: other bytes");
+        })
+        .await;
+        // Each of three runs has nine files, each table a commit, each run's file a move.
+        assert!(deaths > 2 * 35, "{deaths} deaths");
+    }
+
+    // A death at each write of a merge and of the clean-up behind it: readers see the same rows at once, and once it is run
+    // again the files are those of one that nothing disturbed.
+    #[tokio::test(flavor = "multi_thread")]
+    async fn a_death_at_any_write_of_the_upkeep_changes_no_row() {
+        let start = with_inbox(&runs(&["flat", "foam", "wood"])).await;
+        ingest(start.clone()).await.expect("ingested");
+        let before = rows(Arc::new(start.fork())).await;
+        let undisturbed = Arc::new(start.fork());
+        tidy(undisturbed.clone()).await.expect("tidied");
+        assert!(rows(undisturbed.clone()).await == before, "other rows");
+        let files = async |store: Arc<InMemory>| {
+            let listed: Vec<_> = store.list(Some(&Path::from("tables"))).try_collect().await.expect("listed");
+            listed.iter().filter(|f| f.location.extension() == Some("parquet")).count()
+        };
+        let (expected, kept) = (tables(undisturbed.clone()).await, files(undisturbed).await);
+        assert!(kept < files(start.clone()).await, "files are merged");
+        let deaths = each_death(&start, tidy, async |inner, death| {
+            assert!(rows(inner.clone()).await == before, "{death}: other rows");
+            // As if its time had run out.
+            inner.delete(&Path::from("tables/_maintenance.json")).await.ok();
+            tidy(inner.clone()).await.unwrap_or_else(|e| panic!("{death}: {e}"));
+            assert!(tables(inner.clone()).await == expected, "{death}: other files");
+            // What was written and never named stays for an hour, lest somebody is about to name it.
+            assert!(files(inner).await <= kept + 1, "{death}: files are left over");
+        })
+        .await;
+        // A merge of each of eight tables is a file and a commit; 24 files are deleted; two leases are taken and given back.
+        assert!(deaths > 2 * 40, "{deaths} deaths");
+    }
+
+    #[tokio::test(flavor = "multi_thread")]
+    async fn two_ingests_at_once_lose_nothing_and_double_nothing() {
+        let runs = runs(&["flat", "foam", "wood", "prd", "brick", "wavy", "flat_2", "wood_2"]);
+        let undisturbed = with_inbox(&runs).await;
+        ingest(undisturbed.clone()).await.expect("ingested");
+        let expected = tables(undisturbed).await;
+        for _ in 0..5 {
+            let store = with_inbox(&runs).await;
+            let (a, b) = (tokio::spawn(ingest(store.clone())), tokio::spawn(ingest(store.clone())));
+            a.await.expect("no panic").expect("ingested");
+            b.await.expect("no panic").expect("ingested");
+            // Each completes what it saw; the last one to end has seen everything.
+            ingest(store.clone()).await.expect("ingested");
+            let (seen, logged) = tables(store).await;
+            assert_eq!(logged, expected.1);
+            assert!(seen == expected.0, "other bytes");
+        }
+    }
 }

@@ -7,10 +7,14 @@ import os
 import re
 import shutil
 import subprocess
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+
+#: How long a command may take; a busy machine may need some of it.
+LIMIT_SECS = 1800
 
 
 @pytest.fixture(scope="session")
@@ -28,7 +32,10 @@ def lake(echolake: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
         return Path(there)
     path = tmp_path_factory.mktemp("lake") / "lake"
     subprocess.run(
-        [echolake, "--lake", str(path), "demo", "--no-serve", "--surfaces", "12", "--ir-only"], check=True, capture_output=True
+        [echolake, "--lake", str(path), "demo", "--no-serve", "--surfaces", "12", "--ir-only"],
+        check=True,
+        capture_output=True,
+        timeout=LIMIT_SECS,
     )
     return path
 
@@ -38,7 +45,10 @@ def addresses(echolake: str, lake: Path) -> Iterator[dict[str, str]]:
     """Where it is served, by scheme."""
     anywhere = "127.0.0.1:0"
     command = [echolake, "--lake", str(lake), "serve", "--listen", anywhere, "--flight-sql", anywhere, "--postgres", "off"]
-    server = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    server = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True)
+    # Reading its lines has no limit of its own: a server that says nothing is killed, and they end.
+    silence = threading.Timer(LIMIT_SECS, server.kill)
+    silence.start()
     try:
         assert server.stderr is not None
         found: dict[str, str] = {}
@@ -48,10 +58,19 @@ def addresses(echolake: str, lake: Path) -> Iterator[dict[str, str]]:
                 break
         else:
             pytest.fail("the server ended before it listened")
+        silence.cancel()
+        # What it says later must not fill the pipe.
+        threading.Thread(target=server.stderr.read, daemon=True).start()
         yield found
     finally:
+        silence.cancel()
         server.terminate()
-        server.wait(timeout=30)
+        try:
+            server.wait(timeout=60)
+        except subprocess.TimeoutExpired:
+            server.kill()
+            server.wait(timeout=60)
+            raise
 
 
 @pytest.fixture(scope="session")
@@ -67,7 +86,8 @@ def served_http(addresses: dict[str, str]) -> str:
 
 
 def export(echolake: str, lake: Path, *arguments: str) -> None:
-    subprocess.run([echolake, "--lake", str(lake), "export", *arguments], check=True, capture_output=True)
+    command = [echolake, "--lake", str(lake), "export", *arguments]
+    subprocess.run(command, check=True, capture_output=True, timeout=LIMIT_SECS)
 
 
 @pytest.fixture(scope="session")

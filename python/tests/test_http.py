@@ -98,7 +98,7 @@ def test_slices_pass_the_doctor(served_http: str, tmp_path: Path) -> None:
         path = tmp_path / f"{number}.mcap"
         path.write_bytes(get(slice_url(served_http, predicate, **more)))
         command = [str(Path(sys.executable).with_name("pymcap-cli")), "doctor", str(path)]
-        checked = subprocess.run(command, capture_output=True, text=True, check=False)
+        checked = subprocess.run(command, capture_output=True, text=True, check=False, timeout=300)
         assert checked.returncode == 0, checked.stdout + checked.stderr
 
 

@@ -8,18 +8,19 @@ use serde_json::Value;
 
 use super::http::Request;
 use super::{ENDLESS, get, json, refused, running, running_of, served, wait_until};
-use crate::Place;
+use crate::{Place, PlaceTemplate};
 
 /// Sweeps of two seconds: 45 of them are more than sockets hold.
 const LONG_SWEEPS: &str = "duration_secs = 2.0";
 
 /// One run with sweeps, one without.
 fn lake() -> Place {
-    let place = Place::new();
-    place.acquire("flat", &[]);
-    place.acquire("brick", &["--ir-only"]);
-    place.ok(&["ingest"]);
-    place
+    static TWO_RUNS: PlaceTemplate = PlaceTemplate::new();
+    TWO_RUNS.place(|place| {
+        place.acquire("flat", &[]);
+        place.acquire("brick", &["--ir-only"]);
+        place.ok(&["ingest"]);
+    })
 }
 
 /// The path of a slice.

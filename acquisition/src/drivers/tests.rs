@@ -154,28 +154,6 @@ fn a_run_over_all_drivers_holds_what_they_told() {
 }
 
 #[test]
-fn faults_in_mid_run_are_named_and_nothing_is_lost() {
-    type Pull = fn(&mut Room);
-    let check = |pull: Pull, expected: &str| {
-        let mut room = Room::of(&RIG.replace("[0.0, 0.0, 304.0]", "[0.0, 0.0, 304.0], [-62.5, -62.5, 214.0]"));
-        let devices = room.devices_with_sensor_timeout(since(Timestamp::now(), &[]), IMPATIENT_SECS);
-        let ended = run(&mut room, devices, &mut |room, done| {
-            // Good lines may be waiting yet: only the pair after this one is measured without any.
-            if done == 3 {
-                pull(room);
-            }
-        });
-        assert!(ended.said().contains(expected), "{expected}: {}", ended.said());
-        assert!(ended.count(topics::MEASUREMENT) >= 2, "{expected}: what was measured before is kept");
-    };
-    check(|room| room.bridge.set_fault(Fault::Refuses), "refuses the target");
-    check(|room| room.bridge.set_fault(Fault::NoPower), "the safety chain is open");
-    check(|room| room.bridge.set_fault(Fault::HangsUp), "robots: lost `ws://");
-    check(|room| room.sensor.unplug(), "ambient sensor: lost `/dev/pts/");
-    check(|room| room.sensor.send("~~~\n"), "ambient sensor: nothing but nonsense");
-}
-
-#[test]
 fn a_run_that_lost_a_driver_is_gone_on_with() {
     let mut room = Room::new();
     let folder = tempfile::tempdir().expect("a folder");
@@ -203,4 +181,30 @@ fn a_run_that_lost_a_driver_is_gone_on_with() {
         verdicts.map(|(_, data)| Measurement::decode(data.as_slice()).expect("a verdict").pair_id).collect();
     pairs.sort_unstable();
     assert_eq!(pairs, [0, 1, 2], "every pair once");
+}
+
+mod slow {
+    use super::*;
+
+    #[test]
+    fn faults_in_mid_run_are_named_and_nothing_is_lost() {
+        type Pull = fn(&mut Room);
+        let check = |pull: Pull, expected: &str| {
+            let mut room = Room::of(&RIG.replace("[0.0, 0.0, 304.0]", "[0.0, 0.0, 304.0], [-62.5, -62.5, 214.0]"));
+            let devices = room.devices_with_sensor_timeout(since(Timestamp::now(), &[]), IMPATIENT_SECS);
+            let ended = run(&mut room, devices, &mut |room, done| {
+                // Good lines may be waiting yet: only the pair after this one is measured without any.
+                if done == 3 {
+                    pull(room);
+                }
+            });
+            assert!(ended.said().contains(expected), "{expected}: {}", ended.said());
+            assert!(ended.count(topics::MEASUREMENT) >= 2, "{expected}: what was measured before is kept");
+        };
+        check(|room| room.bridge.set_fault(Fault::Refuses), "refuses the target");
+        check(|room| room.bridge.set_fault(Fault::NoPower), "the safety chain is open");
+        check(|room| room.bridge.set_fault(Fault::HangsUp), "robots: lost `ws://");
+        check(|room| room.sensor.unplug(), "ambient sensor: lost `/dev/pts/");
+        check(|room| room.sensor.send("~~~\n"), "ambient sensor: nothing but nonsense");
+    }
 }

@@ -178,73 +178,6 @@ mod tests {
         high - low
     }
 
-    // Ranges are chosen so that everything fits: all parameters at their greatest, under every large shape, with
-    // every joint and every solid.
-    #[test]
-    fn every_combination_fits_the_relief() {
-        for mesostructure in Mesostructure::ALL {
-            let mut greatest = Relief::Layered(Layered::new(mesostructure));
-            let parameters = greatest.describe();
-            for parameter in &parameters {
-                match parameter.domain {
-                    Domain::Number { high, .. } => greatest.set(parameter.key, &high.to_string()).expect("in range"),
-                    Domain::Whole { .. } => greatest.set(parameter.key, "7").expect("in range"),
-                    Domain::Choice { .. } => {}
-                }
-            }
-            for parameter in &parameters {
-                let Domain::Choice { options, .. } = parameter.domain else { continue };
-                for option in options {
-                    let mut relief = greatest.clone();
-                    relief.set("macrostructure", "convex").expect("a shape");
-                    relief.set(parameter.key, option).expect("an option");
-                    let [low, high] = relief.height_field(40).extent_mm().map(f64::from);
-                    let fits = low >= RELIEF_MM[0] - 1e-4 && high <= RELIEF_MM[1] + 1e-4;
-                    assert!(fits, "{} {}={option}: {low} to {high}", relief.name(), parameter.key);
-                }
-            }
-        }
-    }
-
-    #[test]
-    fn parameters_move_what_their_names_say() {
-        let flat_bricks = [("projection_mm", "0"), ("lean_mm", "0")];
-        let bricks = |more: &[(&str, &str)]| wall("stretcher_bond", &[&flat_bricks, more].concat());
-        // A cell of the 512 is 1.14 mm: joints of 30 mm are 3 mm here, and some cells lie wholly in them.
-        let deep = |mm| {
-            let [low, high] = bricks(&[("joint_width_mm", "30"), ("joint_depth_mm", mm)]).height_field(512).extent_mm();
-            high - low
-        };
-        assert_eq!(deep("0"), 0.0);
-        assert!((deep("10") - 1.0).abs() < 1e-5 && (deep("30") - 3.0).abs() < 1e-5, "{} {}", deep("10"), deep("30"));
-        assert_eq!(depth(&bricks(&[("joint_shape", "flush")])), 0.0);
-        let mean_square = |relief: &Relief| {
-            let heights = relief.height_field(512);
-            heights.heights_mm().iter().map(|h| f64::from(h * h)).sum::<f64>()
-        };
-        // Heights' mean is 0, so their mean square says how much of the wall lies how deep.
-        let wide = |mm| mean_square(&bricks(&[("joint_width_mm", mm)]));
-        assert!(wide("20") > 1.5 * wide("10"));
-        let shape = |name| mean_square(&bricks(&[("joint_width_mm", "30"), ("joint_shape", name)]));
-        assert!(shape("recessed") > shape("concave") && shape("concave") > shape("v"), "a v is the shallowest");
-        let rough = |mm| mean_square(&wall("macrostructure", &[("macrostructure", "flat"), ("roughness_mm", mm)]));
-        assert!(rough("0") == 0.0 && rough("5") > 0.0);
-        assert!((rough("10") / rough("5") - 4.0).abs() < 1e-2, "twice as rough");
-        let large = |mm| depth(&wall("macrostructure", &[("macrostructure", "convex"), ("macro_depth_mm", mm)]));
-        assert!((large("100") - 10.0).abs() < 0.2 && (large("200") - 20.0).abs() < 0.4);
-        for (name, key, low, high) in [
-            ("coursed_ashlar", "projection_mm", "0", "80"),
-            ("slated_stone", "lean_mm", "0", "30"),
-            ("polygonal_rubble", "bulge_mm", "0", "40"),
-            ("river_rock", "bulge_mm", "20", "120"),
-            ("primitives", "primitive_height_mm", "20", "150"),
-            ("primitive_root", "well_depth_mm", "20", "150"),
-        ] {
-            let [less, more] = [low, high].map(|value| depth(&wall(name, &[(key, value)])));
-            assert!(more > less + 1.0, "{name} {key}: {less} {more}");
-        }
-    }
-
     #[test]
     fn layers_add_up() {
         let bricks = wall("stretcher_bond", &[]).height_field(64);
@@ -322,6 +255,87 @@ mod tests {
         assert!(matches!(Relief::from_json(deep), Err(Error::Value { .. })));
         for text in ["", "[]", "{}", r#"{"relief": "flat"}"#] {
             assert!(matches!(Relief::from_json(text), Err(Error::Text { .. })), "{text}");
+        }
+    }
+
+    mod slow {
+        use super::*;
+
+        #[test]
+        fn parameters_move_what_their_names_say() {
+            let flat_bricks = [("projection_mm", "0"), ("lean_mm", "0")];
+            let bricks = |more: &[(&str, &str)]| wall("stretcher_bond", &[&flat_bricks, more].concat());
+            // A cell of the 512 is 1.14 mm: joints of 30 mm are 3 mm here, and some cells lie wholly in them.
+            let deep = |mm| {
+                let [low, high] =
+                    bricks(&[("joint_width_mm", "30"), ("joint_depth_mm", mm)]).height_field(512).extent_mm();
+                high - low
+            };
+            assert_eq!(deep("0"), 0.0);
+            assert!(
+                (deep("10") - 1.0).abs() < 1e-5 && (deep("30") - 3.0).abs() < 1e-5,
+                "{} {}",
+                deep("10"),
+                deep("30")
+            );
+            assert_eq!(depth(&bricks(&[("joint_shape", "flush")])), 0.0);
+            let mean_square = |relief: &Relief| {
+                let heights = relief.height_field(512);
+                heights.heights_mm().iter().map(|h| f64::from(h * h)).sum::<f64>()
+            };
+            // Heights' mean is 0, so their mean square says how much of the wall lies how deep.
+            let wide = |mm| mean_square(&bricks(&[("joint_width_mm", mm)]));
+            assert!(wide("20") > 1.5 * wide("10"));
+            let shape = |name| mean_square(&bricks(&[("joint_width_mm", "30"), ("joint_shape", name)]));
+            let [recessed, concave, v] = ["recessed", "concave", "v"].map(shape);
+            assert!(recessed > concave && concave > v, "a v is the shallowest");
+            let rough = |mm| mean_square(&wall("macrostructure", &[("macrostructure", "flat"), ("roughness_mm", mm)]));
+            let [smooth, single, double] = ["0", "5", "10"].map(rough);
+            assert!(smooth == 0.0 && single > 0.0);
+            assert!((double / single - 4.0).abs() < 1e-2, "twice as rough");
+            let large = |mm| depth(&wall("macrostructure", &[("macrostructure", "convex"), ("macro_depth_mm", mm)]));
+            assert!((large("100") - 10.0).abs() < 0.2 && (large("200") - 20.0).abs() < 0.4);
+            for (name, key, low, high) in [
+                ("coursed_ashlar", "projection_mm", "0", "80"),
+                ("slated_stone", "lean_mm", "0", "30"),
+                ("polygonal_rubble", "bulge_mm", "0", "40"),
+                ("river_rock", "bulge_mm", "20", "120"),
+                ("primitives", "primitive_height_mm", "20", "150"),
+                ("primitive_root", "well_depth_mm", "20", "150"),
+            ] {
+                let [less, more] = [low, high].map(|value| depth(&wall(name, &[(key, value)])));
+                assert!(more > less + 1.0, "{name} {key}: {less} {more}");
+            }
+        }
+
+        // Ranges are chosen so that everything fits: all parameters at their greatest, under every large shape, with
+        // every joint and every solid.
+        #[test]
+        fn every_combination_fits_the_relief() {
+            for mesostructure in Mesostructure::ALL {
+                let mut greatest = Relief::Layered(Layered::new(mesostructure));
+                let parameters = greatest.describe();
+                for parameter in &parameters {
+                    match parameter.domain {
+                        Domain::Number { high, .. } => {
+                            greatest.set(parameter.key, &high.to_string()).expect("in range")
+                        }
+                        Domain::Whole { .. } => greatest.set(parameter.key, "7").expect("in range"),
+                        Domain::Choice { .. } => {}
+                    }
+                }
+                for parameter in &parameters {
+                    let Domain::Choice { options, .. } = parameter.domain else { continue };
+                    for option in options {
+                        let mut relief = greatest.clone();
+                        relief.set("macrostructure", "convex").expect("a shape");
+                        relief.set(parameter.key, option).expect("an option");
+                        let [low, high] = relief.height_field(40).extent_mm().map(f64::from);
+                        let fits = low >= RELIEF_MM[0] - 1e-4 && high <= RELIEF_MM[1] + 1e-4;
+                        assert!(fits, "{} {}={option}: {low} to {high}", relief.name(), parameter.key);
+                    }
+                }
+            }
         }
     }
 }

@@ -19,16 +19,24 @@ const SECOND: u64 = 1_000_000_000;
 /// 2026-01-06, 00:00.
 const START: u64 = 1_767_657_600 * SECOND;
 
-async fn lake() -> Lake {
-    Lake::open_or_create("memory://", &Rig::paper(), &References::default()).await.expect("a lake")
+/// A lake in memory, and one session for all that is asked of it: to make one takes longer than most queries.
+struct TestLake {
+    lake: Lake,
+    session: Session,
 }
 
-async fn put(lake: &Lake, path: &str, file: Vec<u8>) {
-    lake.store().put(&Path::from(path), file.into()).await.expect("written");
+async fn lake() -> TestLake {
+    let lake = Lake::open_or_create("memory://", &Rig::paper(), &References::default()).await.expect("a lake");
+    let session = Session::new(&lake).expect("a session");
+    TestLake { lake, session }
 }
 
-async fn try_rows(lake: &Lake, sql: &str) -> Result<Vec<RecordBatch>, Error> {
-    let mut answer = Session::new(lake)?.query(sql).await?;
+async fn put(lake: &TestLake, path: &str, file: Vec<u8>) {
+    lake.lake.store().put(&Path::from(path), file.into()).await.expect("written");
+}
+
+async fn try_rows(lake: &TestLake, sql: &str) -> Result<Vec<RecordBatch>, Error> {
+    let mut answer = lake.session.query(sql).await?;
     let mut batches = Vec::new();
     while let Some(batch) = answer.next().await? {
         batches.push(batch);
@@ -36,16 +44,16 @@ async fn try_rows(lake: &Lake, sql: &str) -> Result<Vec<RecordBatch>, Error> {
     Ok(batches)
 }
 
-async fn rows(lake: &Lake, sql: &str) -> Vec<RecordBatch> {
+async fn rows(lake: &TestLake, sql: &str) -> Vec<RecordBatch> {
     try_rows(lake, sql).await.unwrap_or_else(|e| panic!("{sql}: {e}"))
 }
 
-async fn number(lake: &Lake, sql: &str) -> i64 {
+async fn number(lake: &TestLake, sql: &str) -> i64 {
     rows(lake, sql).await[0].column(0).as_primitive::<Int64Type>().value(0)
 }
 
 /// Checks an answer as it is printed, the frame aside.
-async fn check(lake: &Lake, sql: &str, expected: &[&str]) {
+async fn check(lake: &TestLake, sql: &str, expected: &[&str]) {
     let printed = pretty_format_batches(&rows(lake, sql).await).expect("printed").to_string();
     let lines: Vec<_> = printed.lines().filter(|l| l.starts_with('|')).skip(1).collect();
     let lines: Vec<String> =
@@ -53,7 +61,7 @@ async fn check(lake: &Lake, sql: &str, expected: &[&str]) {
     assert_eq!(lines, expected, "{sql}\n{printed}");
 }
 
-async fn refused(lake: &Lake, sql: &str, expected: &[&str]) {
+async fn refused(lake: &TestLake, sql: &str, expected: &[&str]) {
     let error = try_rows(lake, sql).await.map(|b| b.len()).expect_err(sql).to_string();
     for text in expected {
         assert!(error.contains(text), "{sql}: {error}");
@@ -97,13 +105,13 @@ fn json_file(options: WriteOptions, seconds: u64) -> Vec<u8> {
 }
 
 /// Makes a run that readers see out of a file.
-async fn put_run(lake: &Lake, surface: &str, run: &str, file: Vec<u8>) {
+async fn put_run(lake: &TestLake, surface: &str, run: &str, file: Vec<u8>) {
     use arrow::array::{ArrayRef, Int64Array, StringArray};
     use std::sync::Arc;
     let (surface, run) = (surface.parse().expect("an id"), run.parse().expect("an id"));
     put(lake, Lake::run_path(&surface, &run).as_ref(), file).await;
     let pointer = VisibleRun { surface, run, run_derivation: "d".into(), reference_derivation: None };
-    let schema = Table::Runs.schema(lake.rig());
+    let schema = Table::Runs.schema(lake.lake.rig());
     let column = |field: &Arc<arrow::datatypes::Field>| -> ArrayRef {
         let text = match field.name().as_str() {
             "surface_id" => pointer.surface.as_str(),
@@ -117,8 +125,8 @@ async fn put_run(lake: &Lake, surface: &str, run: &str, file: Vec<u8>) {
     };
     let batch = RecordBatch::try_new(schema.clone(), schema.fields().iter().map(column).collect()).expect("a row");
     let file = encode(Table::Runs, &schema, &[batch]).expect("encoded");
-    let staged = lake.stage(Table::Runs, &FileName::Pointer(pointer.clone()), file).await.expect("staged");
-    lake.commit(&[staged]).await.expect("committed");
+    let staged = lake.lake.stage(Table::Runs, &FileName::Pointer(pointer.clone()), file).await.expect("staged");
+    lake.lake.commit(&[staged]).await.expect("committed");
 }
 
 #[tokio::test]
@@ -187,7 +195,7 @@ async fn runs_are_asked_by_surface_run_and_pattern() {
 }
 
 /// A metric of EXPLAIN ANALYZE.
-async fn metric(lake: &Lake, sql: &str, name: &str) -> u64 {
+async fn metric(lake: &TestLake, sql: &str, name: &str) -> u64 {
     let plan =
         pretty_format_batches(&rows(lake, &format!("explain analyze {sql}")).await).expect("printed").to_string();
     let (_, behind) = plan.split_once(&format!("{name}=")).unwrap_or_else(|| panic!("no {name} in {plan}"));
@@ -266,33 +274,6 @@ async fn files_that_are_cut_off_give_what_they_have() {
             Err(e) => assert!(length < 8, "{length}: {e}"),
         }
     }
-}
-
-#[tokio::test]
-async fn a_flipped_bit_is_an_error_or_harmless() {
-    let whole = json_file(options(Some(Compression::Zstd)), 5);
-    let lake = lake().await;
-    let mut state: u64 = 7;
-    let (mut errors, mut fine) = (0, 0);
-    for _ in 0..600 {
-        // A linear congruential generator: Knuth, MMIX.
-        state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
-        let mut file = whole.clone();
-        let at = (state >> 16) as usize % file.len();
-        file[at] ^= 1 << ((state >> 8) % 8);
-        put(&lake, "inbox/flip.mcap", file).await;
-        match try_rows(&lake, "select count(*), sum(x) from mcap('inbox/flip.mcap', '/point')").await {
-            Ok(batches) => {
-                fine += 1;
-                assert_eq!(batches[0].column(0).as_primitive::<Int64Type>().value(0), 50, "byte {at}");
-            }
-            Err(e) => {
-                errors += 1;
-                assert!(e.to_string().contains("inbox/flip.mcap"), "byte {at}: {e}");
-            }
-        }
-    }
-    assert!(errors > 100 && fine > 100, "{errors} errors, {fine} harmless");
 }
 
 /// Encodes a ROS 2 message: values aligned to their size behind a header of four bytes.
@@ -394,4 +375,35 @@ async fn messages_that_do_not_fit_their_schema_are_named() {
     lies[24..28].copy_from_slice(&u32::MAX.to_le_bytes());
     put(&lake, "inbox/r.mcap", ros_file(&[lies])).await;
     refused(&lake, "select * from mcap('inbox/r.mcap', '/state')", &["ends within a value"]).await;
+}
+
+mod slow {
+    use super::*;
+
+    #[tokio::test]
+    async fn a_flipped_bit_is_an_error_or_harmless() {
+        let whole = json_file(options(Some(Compression::Zstd)), 5);
+        let lake = lake().await;
+        let mut state: u64 = 7;
+        let (mut errors, mut fine) = (0, 0);
+        for _ in 0..600 {
+            // A linear congruential generator: Knuth, MMIX.
+            state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+            let mut file = whole.clone();
+            let at = (state >> 16) as usize % file.len();
+            file[at] ^= 1 << ((state >> 8) % 8);
+            put(&lake, "inbox/flip.mcap", file).await;
+            match try_rows(&lake, "select count(*), sum(x) from mcap('inbox/flip.mcap', '/point')").await {
+                Ok(batches) => {
+                    fine += 1;
+                    assert_eq!(batches[0].column(0).as_primitive::<Int64Type>().value(0), 50, "byte {at}");
+                }
+                Err(e) => {
+                    errors += 1;
+                    assert!(e.to_string().contains("inbox/flip.mcap"), "byte {at}: {e}");
+                }
+            }
+        }
+        assert!(errors > 100 && fine > 100, "{errors} errors, {fine} harmless");
+    }
 }

@@ -47,30 +47,6 @@ fn joints_are_those_that_the_arms_told() {
 }
 
 #[test]
-fn faults_are_named() {
-    let check = |fault, expected: &str| {
-        let bridge = bridge();
-        let mut robots = connected(&bridge);
-        robots.power(Power::On).expect("a switch");
-        bridge.set_fault(fault);
-        robots.params.timeout_secs = IMPATIENT_SECS;
-        let error = robots.move_to(NEAR[0], NEAR[1]).expect_err(expected).to_string();
-        robots.params.timeout_secs = PATIENT_SECS;
-        assert!(error.starts_with("robots: ") && error.contains(expected), "{fault:?}: {error}");
-        // Back to normal, the next try does; after a lost connection the motors have to be switched on again.
-        bridge.set_fault(Fault::None);
-        robots.power(Power::On).expect("a switch");
-        robots.move_to(NEAR[0], NEAR[1]).unwrap_or_else(|e| panic!("{fault:?}: {e}"));
-    };
-    check(Fault::Refuses, "the bridge refuses the target: the target is outside of the joints' ranges");
-    check(Fault::StopsHalfWay, "degrees off; hint: are the motors on");
-    check(Fault::EmergencyStop, "refuses to move: emergency stop");
-    check(Fault::Silent, "no joint states on `/microphone/joint_states`");
-    check(Fault::HangsUp, "is the controller still on");
-    check(Fault::Nonsense, "no joint states on");
-}
-
-#[test]
 fn motors_that_stay_off_are_named() {
     let bridge = bridge();
     let mut robots = connected(&bridge);
@@ -96,4 +72,32 @@ fn a_bridge_that_is_not_there_is_named() {
     let params = RosbridgeParams { url: "ws://127.0.0.1:1".into(), ..RosbridgeParams::default() };
     let error = RosbridgeRobots::connect(&params, Cell::of(&Rig::paper())).err().expect("nobody").to_string();
     assert!(error.contains("cannot reach `ws://127.0.0.1:1`") && error.contains("is rosbridge running"), "{error}");
+}
+
+mod slow {
+    use super::*;
+
+    #[test]
+    fn faults_are_named() {
+        let check = |fault, expected: &str| {
+            let bridge = bridge();
+            let mut robots = connected(&bridge);
+            robots.power(Power::On).expect("a switch");
+            bridge.set_fault(fault);
+            robots.params.timeout_secs = IMPATIENT_SECS;
+            let error = robots.move_to(NEAR[0], NEAR[1]).expect_err(expected).to_string();
+            robots.params.timeout_secs = PATIENT_SECS;
+            assert!(error.starts_with("robots: ") && error.contains(expected), "{fault:?}: {error}");
+            // Back to normal, the next try does; after a lost connection the motors have to be switched on again.
+            bridge.set_fault(Fault::None);
+            robots.power(Power::On).expect("a switch");
+            robots.move_to(NEAR[0], NEAR[1]).unwrap_or_else(|e| panic!("{fault:?}: {e}"));
+        };
+        check(Fault::Refuses, "the bridge refuses the target: the target is outside of the joints' ranges");
+        check(Fault::StopsHalfWay, "degrees off; hint: are the motors on");
+        check(Fault::EmergencyStop, "refuses to move: emergency stop");
+        check(Fault::Silent, "no joint states on `/microphone/joint_states`");
+        check(Fault::HangsUp, "is the controller still on");
+        check(Fault::Nonsense, "no joint states on");
+    }
 }
