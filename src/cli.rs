@@ -12,7 +12,7 @@ use echolake_schema::SurfaceId;
 
 use crate::commands::panel::PanelArgs;
 #[cfg(feature = "lake")]
-pub(crate) use lake::{DemoArgs, IngestArgs, LakeCommand, OptimizeArgs, VacuumArgs};
+pub(crate) use lake::{DemoArgs, ImportCommand, IngestArgs, LakeCommand, OptimizeArgs, VacuumArgs};
 
 /// A data lake and catalogue for sweep measurements.
 #[derive(Debug, Parser)]
@@ -34,9 +34,6 @@ pub(crate) enum Command {
     Acquire(AcquireArgs),
     /// Write a generated relief as a mesh, heights or a picture; make groups of them.
     Panel(PanelArgs),
-    /// Turn existing measurements into runs.
-    #[command(subcommand)]
-    Import(ImportCommand),
     /// Show runs again to Foxglove, which plays, pauses and seeks, and to Lichtblick.
     Replay(ReplayArgs),
     /// Rebuild a recording that was cut off or damaged, as far as every checksum is right.
@@ -130,38 +127,6 @@ pub(crate) struct RecoverArgs {
     /// Print what was done as JSON.
     #[arg(long)]
     pub(crate) json: bool,
-}
-
-#[derive(Debug, Subcommand)]
-pub(crate) enum ImportCommand {
-    /// Recordings and loopbacks as WAV files, listed in a CSV manifest.
-    Wav {
-        /// The manifest.
-        manifest: PathBuf,
-        /// The rig that made them: sweep range, response length, bands, grid.
-        #[arg(long)]
-        rig: Option<PathBuf>,
-    },
-    /// A folder of the published GIR data set.
-    Gir {
-        /// The folder.
-        folder: PathBuf,
-        /// The rig; by default the lake's, or the paper's with responses of 400 samples for a new lake.
-        #[arg(long)]
-        rig: Option<PathBuf>,
-    },
-    /// Responses as SOFA files (SingleRoomSRIR), one a surface.
-    Sofa {
-        /// The files.
-        #[arg(required = true, value_name = "FILE")]
-        files: Vec<PathBuf>,
-        /// The rig; by default the lake's, or the paper's for a new lake.
-        #[arg(long)]
-        rig: Option<PathBuf>,
-        /// Temperature of files that do not tell it.
-        #[arg(long, value_name = "C", allow_negative_numbers = true)]
-        temperature_c: Option<f64>,
-    },
 }
 
 #[derive(Debug, Args)]

@@ -13,8 +13,8 @@ pub mod collection;
 pub mod conformance;
 pub mod controller;
 pub mod drivers;
+#[cfg(feature = "import")]
 pub mod import;
-pub mod kirchhoff;
 pub mod live;
 pub mod mesh;
 pub mod metrics;

@@ -13,9 +13,9 @@
 use std::io::Write as _;
 
 use anyhow::Result;
-use echolake_acquisition::kirchhoff::KirchhoffPlan;
 use echolake_acquisition::relief::{HeightField, PANEL_SIZE_MM, Relief};
 use echolake_dsp::filter_bank::gain;
+use echolake_dsp::kirchhoff::KirchhoffPlan;
 use echolake_dsp::level::{p90_mean, power_to_db};
 use echolake_schema::{Grid, Rig};
 use realfft::RealFftPlanner;

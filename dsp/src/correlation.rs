@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use realfft::num_complex::Complex;
-use realfft::{ComplexToReal, RealFftPlanner, RealToComplex};
+use realfft::{ComplexToReal, RealToComplex};
 
 use crate::energy::energy;
 use crate::error::check_len;
@@ -61,8 +61,8 @@ impl<T: Real> CorrelationPlan<T> {
         if len == 0 {
             return Err(Error::Setting { what: "the signal's length", actual: "0".into(), expected: "1 or more" });
         }
-        let (padded, mut planner) = (padded_len(2 * len - 1), RealFftPlanner::new());
-        Ok(Self { len, forward: planner.plan_fft_forward(padded), inverse: planner.plan_fft_inverse(padded) })
+        let padded = padded_len(2 * len - 1);
+        Ok(Self { len, forward: T::plan_real_forward(padded), inverse: T::plan_real_inverse(padded) })
     }
 
     /// Buffers for [`Self::similarity`]; one a thread.

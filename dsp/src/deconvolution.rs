@@ -4,7 +4,7 @@ use std::ops::{Range, RangeInclusive};
 use std::sync::Arc;
 
 use realfft::num_complex::Complex;
-use rustfft::{Fft, FftPlanner};
+use rustfft::{Fft, FftDirection};
 
 use crate::aligned::Aligned;
 use crate::error::check_len;
@@ -97,13 +97,12 @@ impl<T: Real> DeconvolutionPlan<T> {
             let range = format!("{} to {} Hz at {} Hz", params.low_hz, params.high_hz, params.rate_hz);
             return setting("the sweep's range", range, "one that holds a frequency of the transform");
         }
-        let mut planner = FftPlanner::new();
         Ok(Self {
             recording_len: params.recording_len,
             output_len: params.output_len,
             len: n,
-            forward: planner.plan_fft_forward(n),
-            inverse: PrunedInverse::new(n, params.output_len, &mut planner),
+            forward: T::plan_fft(n, FftDirection::Forward),
+            inverse: PrunedInverse::new(n, params.output_len),
             in_range: first..=last,
             floor: 10f64.powf(params.floor_db / 10.0),
         })

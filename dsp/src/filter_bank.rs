@@ -4,9 +4,9 @@ use std::f64::consts::PI;
 use std::ops::Range;
 use std::sync::Arc;
 
+use realfft::RealToComplex;
 use realfft::num_complex::Complex;
-use realfft::{RealFftPlanner, RealToComplex};
-use rustfft::{Fft, FftPlanner};
+use rustfft::{Fft, FftDirection};
 
 use crate::error::check_len;
 use crate::{Error, Real};
@@ -96,8 +96,8 @@ impl<T: Real> FilterBankPlan<T> {
             bands: bands.len(),
             gains: bands.iter().copied().flat_map(gains).collect(),
             couples: bands.chunks(2).map(couple).collect(),
-            forward: RealFftPlanner::new().plan_fft_forward(len),
-            inverse: FftPlanner::new().plan_fft_inverse(len),
+            forward: T::plan_real_forward(len),
+            inverse: T::plan_fft(len, FftDirection::Inverse),
         })
     }
 

@@ -42,8 +42,10 @@ pub mod fresnel;
 pub mod geometry;
 #[cfg(test)]
 mod golden;
+pub mod height_field;
 pub mod heights;
 mod joint;
+pub mod kirchhoff;
 pub mod level;
 pub mod mean;
 pub mod png;

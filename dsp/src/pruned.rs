@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use realfft::num_complex::Complex;
-use rustfft::{Fft, FftPlanner};
+use rustfft::{Fft, FftDirection};
 
 use crate::Real;
 
@@ -25,7 +25,7 @@ pub(crate) struct PrunedInverse<T: Real> {
 }
 
 impl<T: Real> PrunedInverse<T> {
-    pub(crate) fn new(n: usize, output_len: usize, planner: &mut FftPlanner<T>) -> Self {
+    pub(crate) fn new(n: usize, output_len: usize) -> Self {
         let strand_len = strand_len(n, output_len);
         let turn = |m: usize| {
             let (im, re) = (std::f64::consts::TAU * m as f64 / n as f64).sin_cos();
@@ -34,7 +34,7 @@ impl<T: Real> PrunedInverse<T> {
         Self {
             strands: n / strand_len,
             strand_len,
-            inverse: planner.plan_fft_inverse(strand_len),
+            inverse: T::plan_fft(strand_len, FftDirection::Inverse),
             turns: (0..output_len.min(n)).map(turn).collect(),
         }
     }
@@ -134,7 +134,7 @@ mod tests {
                 Complex::new(((k * 37) % 19) as f64 - 9.0, if edge { 0.0 } else { ((k * 53) % 23) as f64 - 11.0 })
             };
             let bins: Vec<_> = (0..=n / 2).map(spectrum).collect();
-            let plan = PrunedInverse::new(n, output_len, &mut FftPlanner::new());
+            let plan = PrunedInverse::new(n, output_len);
             let mut strands = vec![Complex::new(f64::NAN, f64::NAN); plan.spectrum_len()];
             // In two pieces, the later one first.
             let half = bins.len() / 2;

@@ -1,8 +1,14 @@
 //! The two kinds of sample: f32 for the product, f64 for its oracle.
 
-use realfft::FftNum;
+use std::sync::Arc;
+
+use realfft::{ComplexToReal, FftNum, RealFftPlanner, RealToComplex};
+use rustfft::{Fft, FftDirection, FftPlanner};
 
 /// A sample.
+///
+/// Transforms are planned here and nowhere else: rustfft's planner is generic, and each crate that calls it compiles all
+/// of rustfft's kernels once more (20 s of a first build).
 pub trait Real: FftNum + PartialOrd + Default {
     /// Nearest to an f64.
     fn of(value: f64) -> Self;
@@ -12,6 +18,12 @@ pub trait Real: FftNum + PartialOrd + Default {
     fn epsilon() -> f64;
     /// The largest that is finite.
     fn max_value() -> Self;
+    /// Plans the transform of `len` complex samples.
+    fn plan_fft(len: usize, direction: FftDirection) -> Arc<dyn Fft<Self>>;
+    /// Plans the transform of `len` real samples.
+    fn plan_real_forward(len: usize) -> Arc<dyn RealToComplex<Self>>;
+    /// Plans the transform back to `len` real samples, not divided by `len`.
+    fn plan_real_inverse(len: usize) -> Arc<dyn ComplexToReal<Self>>;
 }
 
 impl Real for f32 {
@@ -30,6 +42,18 @@ impl Real for f32 {
     fn max_value() -> Self {
         Self::MAX
     }
+
+    fn plan_fft(len: usize, direction: FftDirection) -> Arc<dyn Fft<Self>> {
+        FftPlanner::new().plan_fft(len, direction)
+    }
+
+    fn plan_real_forward(len: usize) -> Arc<dyn RealToComplex<Self>> {
+        RealFftPlanner::new().plan_fft_forward(len)
+    }
+
+    fn plan_real_inverse(len: usize) -> Arc<dyn ComplexToReal<Self>> {
+        RealFftPlanner::new().plan_fft_inverse(len)
+    }
 }
 
 impl Real for f64 {
@@ -47,5 +71,17 @@ impl Real for f64 {
 
     fn max_value() -> Self {
         Self::MAX
+    }
+
+    fn plan_fft(len: usize, direction: FftDirection) -> Arc<dyn Fft<Self>> {
+        FftPlanner::new().plan_fft(len, direction)
+    }
+
+    fn plan_real_forward(len: usize) -> Arc<dyn RealToComplex<Self>> {
+        RealFftPlanner::new().plan_fft_forward(len)
+    }
+
+    fn plan_real_inverse(len: usize) -> Arc<dyn ComplexToReal<Self>> {
+        RealFftPlanner::new().plan_fft_inverse(len)
     }
 }

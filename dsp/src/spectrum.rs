@@ -2,8 +2,8 @@
 
 use std::sync::Arc;
 
+use realfft::RealToComplex;
 use realfft::num_complex::Complex;
-use realfft::{RealFftPlanner, RealToComplex};
 
 use crate::error::check_len;
 use crate::{Error, Real};
@@ -44,7 +44,7 @@ impl<T: Real> SpectrumPlan<T> {
         if len == 0 {
             return Err(Error::Setting { what: "the signal's length", actual: "0".into(), expected: "1 or more" });
         }
-        Ok(Self { len, forward: RealFftPlanner::new().plan_fft_forward(len) })
+        Ok(Self { len, forward: T::plan_real_forward(len) })
     }
 
     /// Buffers for [`Self::levels_db`]; one a thread.

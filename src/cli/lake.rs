@@ -14,6 +14,9 @@ use crate::commands::sql::SqlArgs;
 pub(crate) enum LakeCommand {
     /// Measure a few surfaces with the simulated rig, ingest them, print the paper's tables and serve the catalogue.
     Demo(DemoArgs),
+    /// Turn existing measurements into runs.
+    #[command(subcommand)]
+    Import(ImportCommand),
     /// Turn runs into rows.
     Ingest(IngestArgs),
     /// Ask the lake in SQL; a prompt where no query is given.
@@ -55,6 +58,38 @@ pub(crate) struct DemoArgs {
     /// Seed of the simulation: the same seed gives the same lake.
     #[arg(long, default_value_t = 1)]
     pub(crate) seed: u64,
+}
+
+#[derive(Debug, Subcommand)]
+pub(crate) enum ImportCommand {
+    /// Recordings and loopbacks as WAV files, listed in a CSV manifest.
+    Wav {
+        /// The manifest.
+        manifest: PathBuf,
+        /// The rig that made them: sweep range, response length, bands, grid.
+        #[arg(long)]
+        rig: Option<PathBuf>,
+    },
+    /// A folder of the published GIR data set.
+    Gir {
+        /// The folder.
+        folder: PathBuf,
+        /// The rig; by default the lake's, or the paper's with responses of 400 samples for a new lake.
+        #[arg(long)]
+        rig: Option<PathBuf>,
+    },
+    /// Responses as SOFA files (SingleRoomSRIR), one a surface.
+    Sofa {
+        /// The files.
+        #[arg(required = true, value_name = "FILE")]
+        files: Vec<PathBuf>,
+        /// The rig; by default the lake's, or the paper's for a new lake.
+        #[arg(long)]
+        rig: Option<PathBuf>,
+        /// Temperature of files that do not tell it.
+        #[arg(long, value_name = "C", allow_negative_numbers = true)]
+        temperature_c: Option<f64>,
+    },
 }
 
 #[derive(Debug, Args)]

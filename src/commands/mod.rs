@@ -6,6 +6,7 @@ mod demo;
 mod doctor;
 #[cfg(feature = "lake")]
 pub(crate) mod export;
+#[cfg(feature = "lake")]
 mod import;
 #[cfg(feature = "lake")]
 mod ingest;
@@ -42,7 +43,6 @@ pub(crate) async fn run(cli: Cli) -> anyhow::Result<Done> {
         Command::Lake(command) => run_lake(command, lake).await,
         Command::Acquire(args) => acquire::run(args, lake).await,
         Command::Panel(args) => panel::run(args),
-        Command::Import(args) => import::run(args, lake).await,
         Command::Replay(args) => replay::run(args, lake).await,
         Command::Recover(args) => recover::run(args),
         Command::Doctor(args) => doctor::run(args, lake).await,
@@ -64,6 +64,7 @@ pub(crate) async fn run(cli: Cli) -> anyhow::Result<Done> {
 async fn run_lake(command: &LakeCommand, lake: &str) -> anyhow::Result<Done> {
     match command {
         LakeCommand::Demo(args) => demo::run(args, lake).await,
+        LakeCommand::Import(args) => import::run(args, lake).await,
         LakeCommand::Ingest(args) => ingest::run(args, lake).await,
         LakeCommand::Sql(args) => sql::run(args, lake).await.map(|()| Done::Whole),
         LakeCommand::Export(args) => export::run(args, lake).await,

@@ -1,5 +1,11 @@
 //! What can go wrong with a lake.
 
+/// The commands of this build that make a lake where there is none, as words of a hint.
+#[cfg(feature = "tables")]
+const LAKE_MAKERS: &str = "`echolake demo`, `echolake acquire` and `echolake import` make one";
+#[cfg(not(feature = "tables"))]
+const LAKE_MAKERS: &str = "`echolake acquire` makes one";
+
 /// What a lake could not do, by what the caller can do about it.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
@@ -14,9 +20,7 @@ pub enum Error {
         reason: String,
     },
     /// There is no lake there.
-    #[error(
-        "no lake at `{location}`: it has no lake.toml; hint: `echolake demo`, `echolake acquire` and `echolake import` make one"
-    )]
+    #[error("no lake at `{location}`: it has no lake.toml; hint: {LAKE_MAKERS}")]
     NoLake {
         /// The location.
         location: String,

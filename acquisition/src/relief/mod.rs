@@ -4,7 +4,6 @@ mod bricks;
 mod chance;
 mod courses;
 pub mod group;
-mod height_field;
 mod layered;
 mod macrostructure;
 mod masonry;
@@ -12,7 +11,6 @@ mod mesostructure;
 mod microstructure;
 mod model;
 mod parameter;
-mod picture;
 mod primitive_root;
 mod primitives;
 mod random;
@@ -22,13 +20,13 @@ mod wavy;
 mod wells;
 
 pub use bricks::{Bond, Bricks};
-pub use height_field::HeightField;
 pub use layered::{FULL_SCALE, Layered};
 pub use mesostructure::Mesostructure;
 pub use parameter::{Domain, Layer, Parameter, Setting};
 pub use primitive_root::PrimitiveRootDiffuser;
 pub use wavy::Wavy;
 
+pub use echolake_dsp::height_field::HeightField;
 use serde::{Deserialize, Serialize};
 
 /// Edge of a panel, mm (Rust et al. 2021).

@@ -7,7 +7,9 @@
 use std::f64::consts::{PI, TAU};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
+use echolake_dsp::Real as _;
 use echolake_dsp::deconvolution::fast_length;
+use echolake_dsp::kirchhoff::{KirchhoffPlan, KirchhoffScratch};
 use echolake_dsp::temperature::speed_of_sound;
 use echolake_schema::manifest::Origin;
 use echolake_schema::{Grid, Rig, Timestamp};
@@ -15,9 +17,8 @@ use rand::{Rng as _, SeedableRng as _};
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution as _, StandardNormal};
 use realfft::num_complex::Complex;
-use realfft::{ComplexToReal, RealFftPlanner, RealToComplex};
+use realfft::{ComplexToReal, RealToComplex};
 
-use crate::kirchhoff::{KirchhoffPlan, KirchhoffScratch};
 use crate::relief::HeightField;
 use crate::rig::{AmbientSensor, AudioInterface, Devices, Error, Positions, Power, Reading, Robots, Take};
 use crate::robots::Choreography;
@@ -258,8 +259,7 @@ impl Played {
     fn new(output: &[f32], rate_hz: f64, response_len: usize) -> Self {
         // Room for the response and the converter's delay behind the output, so that nothing wraps around.
         let len = fast_length(output.len() + response_len + 2 * CONVERTER_DELAY as usize);
-        let mut planner = RealFftPlanner::new();
-        let (forward, inverse) = (planner.plan_fft_forward(len), planner.plan_fft_inverse(len));
+        let (forward, inverse) = (f32::plan_real_forward(len), f32::plan_real_inverse(len));
         let mut played = Self {
             output: output.to_vec(),
             loopback: Vec::new(),

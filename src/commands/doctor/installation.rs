@@ -197,7 +197,9 @@ async fn lake(lake_url: &str) -> Vec<InstallationFact> {
     let state = match &opened {
         Ok(_) => InstallationFact::ok("lake", format!("{lake_url} is a lake")),
         Err(LakeError::NoLake { .. }) => {
-            InstallationFact::note("lake", format!("{lake_url}: no lake yet"), "`echolake demo` makes one")
+            let maker =
+                if cfg!(feature = "lake") { "`echolake demo` makes one" } else { "`echolake acquire` makes one" };
+            InstallationFact::note("lake", format!("{lake_url}: no lake yet"), maker)
         }
         Err(error) => {
             InstallationFact::failed("lake", error.to_string(), "--lake FOLDER or $ECHOLAKE_LAKE names another")

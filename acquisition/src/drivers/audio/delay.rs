@@ -1,6 +1,6 @@
 //! Where in a recording an output begins: the delay at which both are most alike.
 
-use realfft::RealFftPlanner;
+use echolake_dsp::Real as _;
 use realfft::num_complex::Complex;
 
 /// Where an output begins in a recording.
@@ -21,8 +21,7 @@ pub(super) fn locate(output: &[f32], recording: &[i32]) -> Delay {
         return Delay { at: 0, likeness: 0.0 };
     };
     let len = (recording.len() + output.len()).next_power_of_two();
-    let mut planner = RealFftPlanner::<f64>::new();
-    let (forward, inverse) = (planner.plan_fft_forward(len), planner.plan_fft_inverse(len));
+    let (forward, inverse) = (f64::plan_real_forward(len), f64::plan_real_inverse(len));
     let spectrum = |samples: &mut dyn Iterator<Item = f64>| -> Vec<Complex<f64>> {
         let mut signal: Vec<f64> = samples.collect();
         signal.resize(len, 0.0);

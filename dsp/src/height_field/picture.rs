@@ -1,8 +1,7 @@
 //! Pictures of reliefs: what a raking lamp at the upper left shows, with the shade of what lies deep.
 
-use echolake_dsp::png;
-
 use super::HeightField;
+use crate::png;
 
 /// Towards the lamp: from the left, above, and 30 degrees over the wall.
 const LAMP: [f64; 3] = [-0.55, 0.67, 0.5];

@@ -9,11 +9,12 @@
 use std::f64::consts::PI;
 use std::sync::Arc;
 
-use echolake_dsp::{Error, Real as _};
 use realfft::num_complex::Complex;
-use realfft::{ComplexToReal, RealFftPlanner, RealToComplex};
+use realfft::{ComplexToReal, RealToComplex};
 
-use crate::relief::HeightField;
+use crate::error::check_len;
+use crate::height_field::HeightField;
+use crate::{Error, Real as _};
 
 /// Arrivals are gathered at this multiple of the sampling rate.
 const OVERSAMPLING: usize = 8;
@@ -56,7 +57,6 @@ pub struct KirchhoffScratch {
 impl KirchhoffPlan {
     /// For responses of `len` samples at `rate_hz`; positions in mm.
     pub fn new(relief: &HeightField, points_mm: &[[f64; 3]], rate_hz: f64, len: usize) -> Self {
-        let mut planner = RealFftPlanner::new();
         let wide = len * OVERSAMPLING;
         let shape = (0..len / 2 + 1).map(|k| shape(k as f64 / len as f64) as f32).collect();
         let pitch = relief.pitch_mm() / 1e3;
@@ -65,8 +65,8 @@ impl KirchhoffPlan {
             points: points_mm.iter().map(|p| Seen::from(*p, relief)).collect(),
             area: (pitch * pitch) as f32,
             len,
-            forward: planner.plan_fft_forward(wide),
-            inverse: planner.plan_fft_inverse(len),
+            forward: f32::plan_real_forward(wide),
+            inverse: f32::plan_real_inverse(len),
             shape,
         }
     }
@@ -202,10 +202,6 @@ impl Seen {
     }
 }
 
-fn check_len(what: &'static str, actual: usize, expected: usize) -> Result<(), Error> {
-    if actual == expected { Ok(()) } else { Err(Error::Length { what, actual, expected }) }
-}
-
 fn deposit(times: &mut [f32], at: f32, weight: f32) {
     let index = at as usize;
     if index + 1 < times.len() {
@@ -226,10 +222,17 @@ fn shape(frequency_over_rate: f64) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::relief::{PANEL_SIZE_MM, Relief};
 
+    const PANEL_SIZE_MM: f64 = 585.0;
     const RATE: f64 = 96e3;
     const C: f64 = 343.0;
+
+    fn waves(cells: usize, seen_from: impl Fn(f64, f64) -> [f64; 2]) -> HeightField {
+        HeightField::from_fn(PANEL_SIZE_MM, cells, |x, y| {
+            let [x, y] = seen_from(x, y);
+            5.0 * (x / 60.0).sin() + 3.0 * (y / 45.0).cos()
+        })
+    }
 
     fn spectrum_db(x: &[f32], hz: f64) -> f64 {
         let (mut re, mut im) = (0.0, 0.0);
@@ -274,7 +277,7 @@ mod tests {
 
     #[test]
     fn microphone_and_speaker_may_change_places() {
-        let relief = Relief::by_name("wavy").expect("a relief").height_field(137);
+        let relief = waves(137, |x, y| [x, y]);
         let points = [[-187.5, 37.5, 124.0], [125.0, -62.5, 304.0], [0.0, 0.0, 474.0]];
         let plan = KirchhoffPlan::new(&relief, &points, RATE, 512);
         for [a, b] in [[0, 1], [1, 2], [0, 2]] {
@@ -287,10 +290,8 @@ mod tests {
 
     #[test]
     fn a_turned_relief_under_turned_points_sounds_the_same() {
-        let height = |x: f64, y: f64| 5.0 * (x / 60.0).sin() + 3.0 * (y / 45.0).cos();
-        let relief = HeightField::from_fn(PANEL_SIZE_MM, 137, height);
         // A quarter turn takes (x, y) to (-y, x).
-        let turned = HeightField::from_fn(PANEL_SIZE_MM, 137, |x, y| height(y, -x));
+        let (relief, turned) = (waves(137, |x, y| [x, y]), waves(137, |x, y| [y, -x]));
         let points = [[-187.5, 37.5, 124.0], [125.0, -62.5, 304.0]];
         let plan = KirchhoffPlan::new(&relief, &points, RATE, 512);
         let plan_turned = KirchhoffPlan::new(&turned, &points.map(|[x, y, z]| [-y, x, z]), RATE, 512);

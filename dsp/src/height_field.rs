@@ -1,4 +1,6 @@
-//! A square field of heights.
+//! A square field of heights, its picture and its NumPy file.
+
+mod picture;
 
 /// Heights in mm over a square, at the centres of its cells; origin at the square's centre.
 #[derive(Debug, Clone, PartialEq)]
@@ -21,7 +23,7 @@ impl HeightField {
     }
 
     /// The same field, higher by this, mm.
-    pub(super) fn raised_by(mut self, mm: f64) -> Self {
+    pub fn raised_by(mut self, mm: f64) -> Self {
         self.heights_mm.iter_mut().for_each(|h| *h = (f64::from(*h) + mm) as f32);
         self
     }
