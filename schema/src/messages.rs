@@ -1,11 +1,11 @@
-//! The messages of `proto/echolake/v1`, compiled at build time, and their descriptors for MCAP schemas.
+//! The messages of `proto/echolake/v1`, as `schema/generate` compiles them, and their descriptors for MCAP schemas.
 
 #![allow(missing_docs, reason = "generated; the meaning of every field stands in proto/")]
 
-include!(concat!(env!("OUT_DIR"), "/echolake.v1.rs"));
+include!("messages/echolake.v1.rs");
 
 /// The `FileDescriptorSet` of all messages, as the data of an MCAP schema with encoding `protobuf`.
-pub const FILE_DESCRIPTOR_SET: &[u8] = include_bytes!(concat!(env!("OUT_DIR"), "/echolake.v1.fds"));
+pub const FILE_DESCRIPTOR_SET: &[u8] = include_bytes!("messages/echolake.v1.fds");
 
 /// A message that a run's file can hold.
 pub trait Message: prost::Message + Default {
