@@ -7,11 +7,11 @@ _list:
 test:
     cargo test --release --workspace --locked
 
-# Format, lints and unit tests: what to run between two edits.
+# Format, lints and all tests but the slow ones: what to run between two edits.
 quick:
     cargo fmt --all --check
     cargo clippy --release --workspace --all-targets --locked -- -D warnings
-    cargo test --release --workspace --lib --bins --locked
+    cargo test --release --workspace --tests --locked -- --skip slow
 
 # What a change must pass.
 ci:

@@ -5,6 +5,7 @@ mod checkpoint;
 mod log_folder;
 mod table_state;
 
+use std::borrow::Cow;
 use std::collections::{BTreeSet, HashMap, HashSet};
 use std::sync::Arc;
 
@@ -215,7 +216,7 @@ impl CommitLog for DeltaLog {
     }
 
     async fn has(&self, table: Table, name: &str) -> Result<bool> {
-        Ok(self.load(table).await?.is_some_and(|state| file_names(&state).contains(name)))
+        Ok(self.load(table).await?.is_some_and(|state| state.files.keys().any(|path| decoded_name(path) == name)))
     }
 
     async fn history(&self, table: Table) -> Result<Option<History>> {
@@ -270,7 +271,11 @@ fn file_names(state: &TableState) -> HashSet<String> {
 
 /// A file's name of its path in the log.
 fn file_name(path: &str) -> String {
-    percent_decode_str(path).decode_utf8_lossy().into_owned()
+    decoded_name(path).into_owned()
+}
+
+fn decoded_name(path: &str) -> Cow<'_, str> {
+    percent_decode_str(path).decode_utf8_lossy()
 }
 
 fn parts(table: Table, add: &AddFile) -> Result<Vec<Part>> {

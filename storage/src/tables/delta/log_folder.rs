@@ -198,7 +198,10 @@ impl<'a> LogFolder<'a> {
         for (number, line) in bytes.split(|b| *b == b'\n').enumerate().filter(|(_, line)| !line.trim_ascii().is_empty())
         {
             let line = serde_json::from_slice(line).map_err(|e| {
-                self.damaged(&format!("`{}` line {}: expected an action, {e}", commit_name(version), number + 1))
+                let (told, place) = (e.to_string(), format!("line {}, column {}", number + 1, e.column()));
+                // serde counts lines within this one.
+                let reason = told.split(" at line ").next().unwrap_or_default();
+                self.damaged(&format!("`{}` {place}: expected an action, {reason}", commit_name(version)))
             })?;
             lines.push(line);
         }
@@ -379,7 +382,8 @@ mod tests {
         let store = InMemory::new();
         put(&store, &commit_name(0), format!("{PROTOCOL}\n{{\"add\": 3}}\n")).await;
         let error = load_error(&store).await;
-        assert!(error.contains("`00000000000000000000.json` line 2") && error.contains("hint"), "{error}");
+        assert!(error.contains("`00000000000000000000.json` line 2, column ") && error.contains("hint"), "{error}");
+        assert!(!error.contains("line 1"), "{error}");
         put(&store, &commit_name(0), r#"{"protocol":{"minReaderVersion":3,"minWriterVersion":7}}"#).await;
         let error = load_error(&store).await;
         assert!(error.contains("reader version 3") && error.contains("hint"), "{error}");
