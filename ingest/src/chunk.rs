@@ -8,8 +8,8 @@ use bytes::Bytes;
 use mcap::records::Record;
 use zstd::bulk::Decompressor;
 
-/// Largest chunk that is decompressed; the recorder's are about 1 MiB, or one message where that is larger.
-const LARGEST: u64 = 1 << 30;
+use crate::record_shape::LARGEST_CHUNK;
+
 /// A chunk that claims to have shrunk more than this is decompressed piece by piece: nothing large is allocated for a
 /// size that its bytes do not bear out. Sweeps and responses shrink to about half.
 const USUAL_RATIO: u64 = 64;
@@ -73,8 +73,8 @@ impl Chunk {
         let Ok(Record::Chunk { header, data }) = mcap::parse_record(0x06, body) else {
             return Err("its header is damaged".into());
         };
-        if header.uncompressed_size > LARGEST {
-            return Err(format!("it claims {} bytes, more than {LARGEST}", header.uncompressed_size));
+        if header.uncompressed_size > LARGEST_CHUNK {
+            return Err(format!("it claims {} bytes, more than {LARGEST_CHUNK}", header.uncompressed_size));
         }
         let size = header.uncompressed_size as usize;
         let data = match header.compression.as_str() {

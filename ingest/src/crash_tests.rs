@@ -235,6 +235,29 @@ async fn refused_files_go_to_quarantine_with_the_reason_and_the_rest_goes_on() {
     assert!(ingest(store).await.expect("ingested").is_empty(), "nothing is left in the inbox");
 }
 
+// A sparse file costs its maker nothing, whatever its records claim.
+#[tokio::test(flavor = "multi_thread")]
+async fn a_record_that_is_too_large_is_passed_over_and_told() {
+    let mut runs = runs(&["flat"]);
+    let whole = runs[0].1.clone();
+    let header = 17 + u64::from_le_bytes(whole[9..17].try_into().expect("a length")) as usize;
+    let claimed = (256 << 20) + 1u64;
+    let mut file = whole[..header].to_vec();
+    file.push(0x09);
+    // Times, name, media type, data, CRC.
+    file.extend((16 + 4 + 4 + 8 + claimed + 4).to_le_bytes());
+    file.extend([0; 24]);
+    file.extend(claimed.to_le_bytes());
+    file.resize(file.len() + claimed as usize + 4, 0);
+    file.extend(&whole[header..]);
+    runs[0].1 = file.into();
+    let reports = ingest(with_inbox(&runs).await).await.expect("ingested");
+    let [Report::Taken(taken)] = reports.as_slice() else { panic!("{reports:?}") };
+    assert_eq!(taken.measurements, 45);
+    let place = format!("record of kind 0x09 at byte {header} has ");
+    assert!(taken.damaged.iter().any(|d| d.starts_with(&place) && d.contains("more than")), "{:?}", taken.damaged);
+}
+
 mod slow {
     use super::*;
 

@@ -7,6 +7,20 @@ pub(crate) const FRAME: usize = 9;
 /// The lengths inside of a record all stand in its first bytes; names that are longer do not occur.
 pub(crate) const PREFIX: usize = 64 << 10;
 
+/// Largest chunk that is read, as it is stored and decompressed. Queries over run files read no larger ones.
+pub(crate) const LARGEST_CHUNK: u64 = 256 << 20;
+
+/// Bytes of the largest record of a kind that is read as a whole. What a file claims is taken into memory only up to this:
+/// a sparse file of any size costs its maker nothing.
+pub(crate) fn largest(code: u8) -> Option<u64> {
+    match code {
+        opcode::CHUNK | opcode::ATTACHMENT => Some(LARGEST_CHUNK),
+        opcode::METADATA => Some(64 << 20),
+        opcode::SCHEMA | opcode::CHANNEL => Some(4 << 20),
+        _ => None,
+    }
+}
+
 /// Opcodes of the MCAP specification that the walk looks at.
 pub(crate) mod opcode {
     pub(crate) const FOOTER: u8 = 0x02;

@@ -8,6 +8,7 @@ use echolake_lake::Lake;
 use echolake_schema::manifest::{Origin, RunEnd, RunManifest};
 use echolake_schema::messages::{AmbientSample, Measurement, Verdict};
 use echolake_schema::{Rig, SurfaceId, SurfaceRecord, topics};
+use mcap::records::Metadata;
 
 use crate::chunk::{Chunk, Definitions};
 use crate::error::{Error, Result};
@@ -41,12 +42,15 @@ enum Measured {
     Elsewhere(Begun<Yield>),
 }
 
-/// What stands outside of chunks.
+/// What stands outside of chunks, as far as ingest needs it: a file may have any number of others.
 #[derive(Default)]
 struct Envelope {
     metadata: BTreeMap<String, BTreeMap<String, String>>,
     attachments: BTreeMap<String, Bytes>,
 }
+
+const NEEDED_METADATA: [&str; 3] = [topics::RUN_METADATA, topics::RUN_PLAN_METADATA, topics::RUN_END_METADATA];
+const NEEDED_ATTACHMENTS: [&str; 3] = [topics::RIG_ATTACHMENT, topics::SURFACE_ATTACHMENT, topics::HEIGHTS_ATTACHMENT];
 
 /// What a run says of itself before its first measurement.
 #[derive(Debug)]
@@ -66,8 +70,8 @@ impl Head {
         let mut envelope = Envelope::default();
         while let Ok(Some(item)) = reader.next().await {
             match item {
-                Item::Attachment { name, data } => drop(envelope.attachments.insert(name, data)),
-                Item::Metadata(record) => drop(envelope.metadata.insert(record.name, record.metadata)),
+                Item::Attachment { name, data } => envelope.keep_attachment(name, data),
+                Item::Metadata(record) => envelope.keep_metadata(record),
                 Item::Definition(_) => {}
                 Item::Chunk(_) => break,
             }
@@ -79,9 +83,6 @@ impl Head {
         Some(Self { surface: manifest.surface_id, references, origin: manifest.origin, has_plan })
     }
 }
-
-/// Largest attachment that ingest keeps; meshes that are larger stay in the run's file alone.
-const LARGEST_KEPT: usize = 64 << 20;
 
 impl RunContent {
     /// Reads a run; its chunks are measured on all cores while the next ones are fetched.
@@ -131,13 +132,8 @@ impl RunContent {
                         }
                     }
                 }
-                Item::Attachment { name, data } if data.len() <= LARGEST_KEPT => {
-                    envelope.attachments.entry(name).or_insert(data);
-                }
-                Item::Attachment { .. } => {}
-                Item::Metadata(record) => {
-                    envelope.metadata.entry(record.name).or_insert(record.metadata);
-                }
+                Item::Attachment { name, data } => envelope.keep_attachment(name, data),
+                Item::Metadata(record) => envelope.keep_metadata(record),
                 Item::Definition(record) => definitions.learn(&record),
             }
         }
@@ -200,6 +196,19 @@ impl RunContent {
 }
 
 impl Envelope {
+    // The first of a name counts.
+    fn keep_attachment(&mut self, name: String, data: Bytes) {
+        if NEEDED_ATTACHMENTS.contains(&name.as_str()) {
+            self.attachments.entry(name).or_insert(data);
+        }
+    }
+
+    fn keep_metadata(&mut self, record: Metadata) {
+        if NEEDED_METADATA.contains(&record.name.as_str()) {
+            self.metadata.entry(record.name).or_insert(record.metadata);
+        }
+    }
+
     // Other writers may put what the run is behind its first chunks.
     fn is_complete(&self) -> bool {
         self.metadata.contains_key(topics::RUN_METADATA) && self.attachments.contains_key(topics::RIG_ATTACHMENT)

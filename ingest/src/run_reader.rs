@@ -3,6 +3,7 @@
 //! The walk needs no summary, so a file that was cut off yields all that was complete. Where a record cannot be
 //! one, the next that can is searched byte by byte, so damage costs the records that it touches and no others.
 
+use std::borrow::Cow;
 use std::collections::HashSet;
 use std::sync::Arc;
 
@@ -175,6 +176,12 @@ impl RunReader {
         };
         let offset = self.offset;
         self.doubtful = Some(offset);
+        if let Some(most) = record_shape::largest(frame.code).filter(|most| frame.length > *most) {
+            let Frame { code, length } = frame;
+            self.damage
+                .push(format!("record of kind {code:#04x} at byte {offset} has {length} bytes, more than {most}"));
+            return self.pass(FRAME + length).await;
+        }
         match frame.code {
             opcode::CHUNK | opcode::ATTACHMENT | opcode::METADATA | opcode::SCHEMA | opcode::CHANNEL => {
                 self.fill(FRAME + frame.length).await?;
@@ -265,7 +272,11 @@ impl RunReader {
             Ok(Record::Attachment { header, data, crc }) => {
                 // Its CRC was checked, but 0 stands for none: it may be what now stands at its end.
                 self.doubtful = (crc == 0).then_some(offset);
-                Some(Item::Attachment { name: header.name, data: Bytes::copy_from_slice(&data) })
+                let data = match data {
+                    Cow::Borrowed(part) => body.slice_ref(part),
+                    Cow::Owned(copy) => copy.into(),
+                };
+                Some(Item::Attachment { name: header.name, data })
             }
             Ok(Record::Metadata(metadata)) => Some(Item::Metadata(metadata)),
             Ok(definition) => Some(Item::Definition(definition.into_owned())),

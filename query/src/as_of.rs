@@ -6,7 +6,9 @@
 
 use std::borrow::Cow;
 use std::collections::BTreeSet;
+use std::iter::Peekable;
 use std::ops::ControlFlow;
+use std::str::CharIndices;
 
 use datafusion::sql::parser::Statement;
 use datafusion::sql::sqlparser::ast::{
@@ -65,9 +67,9 @@ pub(crate) fn respelled(sql: &str) -> Cow<'_, str> {
         return unchanged;
     }
     let mut out = String::with_capacity(sql.len() + 2);
-    let mut done = 0;
+    let (mut offsets, mut done) = (ByteOffsets::of(sql), 0);
     for Clause { start, end, name } in found {
-        let (Some(from), Some(to)) = (offset(sql, start), offset(sql, end)) else { return unchanged };
+        let (from, to) = (offsets.advance(start), offsets.advance(end));
         let Some(between) = sql.get(done..from) else { continue };
         let Some(replaced) = sql.get(from..to) else { continue };
         out.push_str(between);
@@ -123,12 +125,30 @@ fn fill(out: &mut String, name: &str, replaced: &str) {
     }
 }
 
-fn offset(sql: &str, Location { line, column }: Location) -> Option<usize> {
-    let line = usize::try_from(line.checked_sub(1)?).ok()?;
-    let start = sql.split_inclusive('\n').take(line).map(str::len).sum::<usize>();
-    let column = usize::try_from(column.checked_sub(1)?).ok()?;
-    let text = &sql[start..];
-    Some(start + text.char_indices().nth(column).map_or(text.len(), |(i, _)| i))
+/// Byte offsets of places in a text, in one pass from its start to its end.
+struct ByteOffsets<'a> {
+    rest: Peekable<CharIndices<'a>>,
+    len: usize,
+    at: Location,
+}
+
+impl<'a> ByteOffsets<'a> {
+    fn of(text: &'a str) -> Self {
+        Self { rest: text.char_indices().peekable(), len: text.len(), at: Location { line: 1, column: 1 } }
+    }
+
+    /// The offset of a place that is not before the last one.
+    fn advance(&mut self, place: Location) -> usize {
+        while self.at < place
+            && let Some((_, c)) = self.rest.next()
+        {
+            match c {
+                '\n' => self.at = Location { line: self.at.line + 1, column: 1 },
+                _ => self.at.column += 1,
+            }
+        }
+        self.rest.peek().map_or(self.len, |(at, _)| *at)
+    }
 }
 
 /// The tables of the past that a statement names. Each that has no alias gets its plain name as one, so that

@@ -26,6 +26,7 @@ pub mod output;
 mod predicate;
 mod session;
 mod small;
+mod statement_bounds;
 mod table;
 mod views;
 
@@ -37,3 +38,4 @@ pub use mcap::{Attachment, Contents, Topic};
 pub use opaque::Opaque;
 pub use predicate::Subqueries;
 pub use session::{Answer, CancelHandle, Extend, Prepared, Session};
+pub use statement_bounds::check_statement_bounds;

@@ -15,6 +15,7 @@ use datafusion::logical_expr::LogicalPlan;
 use datafusion::physical_plan::{ExecutionPlan, execute_stream};
 use datafusion::prelude::SessionContext;
 use datafusion::sql::parser::Statement;
+use datafusion::sql::sqlparser::dialect::GenericDialect;
 use echolake_lake::{Lake, Snapshot, VisibleRun};
 use futures::StreamExt as _;
 use tokio::sync::{OwnedSemaphorePermit, mpsc};
@@ -26,6 +27,7 @@ use crate::control::watched::watch;
 use crate::control::{Stop, Ticket};
 use crate::engine::{Client, Engine, Function, Limits, Place, Quota};
 use crate::mcap::Contents;
+use crate::statement_bounds::check_statement_bounds;
 use crate::{Error, Opaque, as_of, gate};
 
 /// Batches that wait for a slow reader.
@@ -216,6 +218,8 @@ impl Session {
     /// [`Error::Query`] where it is none.
     pub fn parse(&self, sql: &str) -> Result<Statement, Error> {
         let state = self.engine.template();
+        // DataFusion's own dialect, unless somebody sets another.
+        check_statement_bounds(sql, &GenericDialect {})?;
         let sql = &as_of::respelled(sql);
         state.sql_to_statement(sql, &state.config().options().sql_parser.dialect).map_err(|e| Error::plan(sql, &e))
     }

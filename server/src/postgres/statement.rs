@@ -11,7 +11,7 @@ use datafusion::sql::sqlparser::ast::{
 use datafusion::sql::sqlparser::dialect::PostgreSqlDialect;
 use datafusion::sql::sqlparser::parser::Parser;
 use datafusion_pg_catalog::sql::PostgresCompatibilityParser;
-use echolake_query::{Error as QueryError, Opaque, Prepared, Session};
+use echolake_query::{Error as QueryError, Opaque, Prepared, Session, check_statement_bounds};
 use pgwire::api::Type;
 
 use super::copy::{self, CopyAs};
@@ -77,6 +77,7 @@ pub(super) fn parse(
     sql: &str,
     types: &[Option<Type>],
 ) -> Result<Vec<Parsed>, Fault> {
+    check_statement_bounds(sql, &PostgreSqlDialect {})?;
     let Ok(adapted) = parser.parse(sql) else {
         // DataFusion's own parser knows more, such as DESCRIBE, and says where an error is.
         return Ok(vec![session.parse(sql)?]);

@@ -1,0 +1,247 @@
+//! Refuses a statement by its tokens, before it is parsed, where its shape alone would cost what no answer is worth.
+//!
+//! The parser tries a call's arguments again for each way in which the call may be meant, so that time doubles or
+//! quadruples with every call in a call; and what parses and plans recurses along chains, so that thousands of `+` in a
+//! row exhaust a stack. Lists separated by commas (IN, VALUES) cost nothing but their length.
+
+use std::any::TypeId;
+
+use datafusion::sql::sqlparser::dialect::{Dialect, PostgreSqlDialect};
+use datafusion::sql::sqlparser::tokenizer::{Token, Tokenizer, Word};
+
+use crate::Error;
+
+/// Brackets in brackets.
+const MOST_NESTED: usize = 100;
+/// Operators, and whatever else is written behind an expression, of one expression; also set operators and joins of one
+/// query. Twice as many still do no harm.
+const MOST_CHAINED: usize = 2_000;
+/// Doublings of the parser's time: 2^14 tries are a few hundredths of a second.
+const MOST_DOUBLINGS: f64 = 14.0;
+/// Calls with a syntax of their own, which the parser tries up to five times.
+const TRIED_FIVE_TIMES: [&str; 20] = [
+    "ANY",
+    "CAST",
+    "CEIL",
+    "CONVERT",
+    "CURRENT_DATE",
+    "CURRENT_TIME",
+    "CURRENT_TIMESTAMP",
+    "EXTRACT",
+    "FLOOR",
+    "INTERVAL",
+    "LOCALTIME",
+    "LOCALTIMESTAMP",
+    "NOT",
+    "OVERLAY",
+    "POSITION",
+    "SAFE_CAST",
+    "SUBSTR",
+    "SUBSTRING",
+    "TRIM",
+    "TRY_CAST",
+];
+/// Words that stand between two expressions, or behind one.
+const OPERATORS: [&str; 15] = [
+    "AND", "AT", "BETWEEN", "COLLATE", "DIV", "ILIKE", "IS", "LIKE", "NOT", "OR", "OVERLAPS", "REGEXP", "RLIKE",
+    "SIMILAR", "XOR",
+];
+/// Words between two queries or tables; a comma does not end their chain.
+const QUERY_OPERATORS: [&str; 5] = ["EXCEPT", "INTERSECT", "JOIN", "MINUS", "UNION"];
+/// Functions whose strings are types, which nest by brackets as well.
+const TYPE_FUNCTIONS: [&str; 2] = ["ARROW_CAST", "ARROW_TRY_CAST"];
+
+/// What is open at a place in a statement.
+#[derive(Default)]
+struct OpenBracket {
+    /// Operators since the last comma.
+    operators: usize,
+    /// Set operators and joins.
+    query_operators: usize,
+    /// Doublings of the parser's time that the bracket adds.
+    doublings: f64,
+}
+
+/// Lets a statement pass whose shape is cheap to parse and plan.
+///
+/// # Errors
+/// [`Error::Query`] where it is not, with the limit.
+pub fn check_statement_bounds(sql: &str, dialect: &dyn Dialect) -> Result<(), Error> {
+    // What is no SQL is left to the parser's message; it makes tokens of all before it parses, too.
+    let Ok(tokens) = Tokenizer::new(dialect, sql).tokenize() else { return Ok(()) };
+    let call_doublings = if dialect.dialect() == TypeId::of::<PostgreSqlDialect>() { 1.0 } else { 0.0 };
+    let is_one_of = |word: &Word, words: &[&str]| {
+        word.quote_style.is_none() && words.iter().any(|w| word.value.eq_ignore_ascii_case(w))
+    };
+    let has_types = tokens.iter().any(|t| matches!(t, Token::Word(w) if is_one_of(w, &TYPE_FUNCTIONS)));
+    let mut open = vec![OpenBracket::default()];
+    let mut doublings = 0.0;
+    let mut before = &Token::EOF;
+    for token in tokens.iter().filter(|t| !matches!(t, Token::Whitespace(_))) {
+        let Some(innermost) = open.last_mut() else { break };
+        match token {
+            Token::LParen | Token::LBracket | Token::LBrace => {
+                // `x[1][1]...` is a chain, whatever its brackets hold.
+                innermost.operators += usize::from(*token == Token::LBracket);
+                let added = match before {
+                    Token::Word(word) if is_one_of(word, &TRIED_FIVE_TIMES) => 2.3,
+                    Token::Word(word) if word.value.eq_ignore_ascii_case("array") => 1.0,
+                    Token::Word(_) => call_doublings,
+                    _ => 0.0,
+                };
+                doublings += added;
+                open.push(OpenBracket { doublings: added, ..OpenBracket::default() });
+            }
+            Token::RParen | Token::RBracket | Token::RBrace => {
+                if open.len() > 1 {
+                    doublings -= open.pop().map_or(0.0, |closed| closed.doublings);
+                }
+            }
+            Token::Comma => innermost.operators = 0,
+            Token::SemiColon => *innermost = OpenBracket { doublings: innermost.doublings, ..OpenBracket::default() },
+            Token::Word(word) if is_one_of(word, &QUERY_OPERATORS) => innermost.query_operators += 1,
+            Token::Word(word) => innermost.operators += usize::from(is_one_of(word, &OPERATORS)),
+            Token::Number(..) | Token::Placeholder(_) => {}
+            literal if has_types && nested(literal) > MOST_NESTED => {
+                return refused("brackets in the name of a type", MOST_NESTED, "types that are less deep");
+            }
+            literal if is_string(literal) => {}
+            _ => innermost.operators += 1,
+        }
+        let innermost = open.last().map_or((0, 0), |bracket| (bracket.operators, bracket.query_operators));
+        if open.len() > MOST_NESTED {
+            return refused("brackets in brackets", MOST_NESTED, "WITH gives a name to what stands inside");
+        }
+        if doublings > MOST_DOUBLINGS {
+            let most = (MOST_DOUBLINGS / if call_doublings > 0.0 { 1.0 } else { 2.3 }) as usize;
+            return refused("calls in calls", most, "WITH gives a name to what stands inside");
+        }
+        if innermost.0 > MOST_CHAINED {
+            return refused("operators in one expression", MOST_CHAINED, "IN, or a join with VALUES, takes long lists");
+        }
+        if innermost.1 > MOST_CHAINED {
+            return refused("joins or unions in one query", MOST_CHAINED, "VALUES takes long lists");
+        }
+        before = token;
+    }
+    Ok(())
+}
+
+fn refused(what: &str, most: usize, hint: &str) -> Result<(), Error> {
+    Err(Error::Query {
+        message: format!("the query has more than {most} {what}"),
+        place: None,
+        hint: Some(hint.to_owned()),
+    })
+}
+
+fn is_string(token: &Token) -> bool {
+    text(token).is_some()
+}
+
+/// How deep the brackets of a literal nest.
+fn nested(token: &Token) -> usize {
+    let (mut now, mut most) = (0usize, 0);
+    for byte in text(token).unwrap_or_default().bytes() {
+        match byte {
+            b'(' | b'[' | b'<' => now += 1,
+            b')' | b']' | b'>' => now = now.saturating_sub(1),
+            _ => {}
+        }
+        most = most.max(now);
+    }
+    most
+}
+
+fn text(token: &Token) -> Option<&str> {
+    match token {
+        Token::SingleQuotedString(text)
+        | Token::DoubleQuotedString(text)
+        | Token::TripleSingleQuotedString(text)
+        | Token::TripleDoubleQuotedString(text)
+        | Token::SingleQuotedByteStringLiteral(text)
+        | Token::DoubleQuotedByteStringLiteral(text)
+        | Token::SingleQuotedRawStringLiteral(text)
+        | Token::DoubleQuotedRawStringLiteral(text)
+        | Token::NationalStringLiteral(text)
+        | Token::EscapedStringLiteral(text)
+        | Token::UnicodeStringLiteral(text)
+        | Token::HexStringLiteral(text) => Some(text),
+        Token::DollarQuotedString(text) => Some(&text.value),
+        _ => None,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use datafusion::sql::sqlparser::dialect::GenericDialect;
+    use datafusion::sql::sqlparser::parser::Parser;
+
+    use super::*;
+
+    fn passes(sql: &str) -> bool {
+        let [generic, postgres] =
+            [&GenericDialect {} as &dyn Dialect, &PostgreSqlDialect {}].map(|d| check_statement_bounds(sql, d).is_ok());
+        assert_eq!(generic, postgres, "{}", &sql[..sql.len().min(80)]);
+        generic
+    }
+
+    // The statements of which an unbounded server has died: a stack that was exhausted, or hours of parsing.
+    #[test]
+    fn statements_that_exhaust_a_stack_or_hours_are_refused() {
+        let chain = |first: &str, again: &str, times| format!("select {first}{}", again.repeat(times));
+        for sql in [
+            chain("1", "+1", 8_000),
+            format!("select cast(NULL as int{})", "[]".repeat(8_000)),
+            chain("'a'", "||'b'", 8_000),
+            chain("1", "::int", 8_000),
+            chain("1", " is null", 8_000),
+            chain("true", " and true", 8_000),
+            format!("select arrow_cast(NULL, '{}Int8{}')", "List(".repeat(8_000), ")".repeat(8_000)),
+            format!("select cast(NULL as {}int", "array<".repeat(8_000)),
+            format!("select cast(NULL as {}int", "struct<".repeat(8_000)),
+            chain("1", " union all select 1", 4_000),
+            chain("1 where 1=1", " or 1=1", 16_000),
+            chain("", "not ", 8_000),
+            chain("x", ".x", 8_000),
+            chain("* from runs", " natural join runs", 4_000),
+            format!("select {}!{}", "position(".repeat(22), " in 'x')".repeat(22)),
+            format!("select {}!{}", "cast(".repeat(22), " as int)".repeat(22)),
+            format!("select {}1{}", "(".repeat(101), ")".repeat(101)),
+            format!("select {}!{}", "array[".repeat(22), "]".repeat(22)),
+        ] {
+            assert!(!passes(&sql), "{}", &sql[..60]);
+        }
+    }
+
+    #[test]
+    fn long_lists_and_what_people_write_pass() {
+        let list = |one: &str| vec![one; 100_000].join(", ");
+        for sql in [
+            format!("select 1 where 1 in ({})", list("-1")),
+            format!("select * from (values {})", list("(1 + 1, 'a(((')")),
+            format!("select {}", list("a + b")),
+            format!("select {}1{}", "coalesce(".repeat(13), ")".repeat(13)),
+            format!("select {}1{}", "cast(".repeat(6), " as int)".repeat(6)),
+            format!("select 1 {}", "union all select 1 + 1 ".repeat(1_000)),
+            "select '(((' || x[1]['a'] from t where not (a is null or b between 1 and 2)".to_owned(),
+            "select 1)))) + 1".to_owned(),
+            "not sql at all '".to_owned(),
+        ] {
+            assert!(passes(&sql), "{}", &sql[..sql.len().min(60)]);
+        }
+    }
+
+    // Whatever passes is parsed in few tries: the limit is one of time, and nested calls are what costs it.
+    #[test]
+    fn as_many_nested_calls_as_pass_are_parsed_at_once() {
+        let postgres = PostgreSqlDialect {};
+        for call in ["f", "cast", "position", "current_date", "overlay", "array", "not"] {
+            let nested = |n| format!("select {}!{}", format!("{call}(").repeat(n), ")".repeat(n));
+            let most = (1..40).take_while(|n| check_statement_bounds(&nested(*n), &postgres).is_ok()).last();
+            let most = most.expect("one");
+            assert!((6..=14).contains(&most), "{call}: {most}");
+            Parser::parse_sql(&postgres, &nested(most)).expect_err("no SQL");
+        }
+    }
+}
