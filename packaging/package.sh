@@ -10,7 +10,8 @@ cd "$(dirname "$0")/.."
 commit=$(git rev-parse --verify "${1:-HEAD}^{commit}")
 version=$(git show "$commit:Cargo.toml" | sed -n '/^\[workspace.package\]/,/^$/s/^version = "\(.*\)"/\1/p')
 export CARGO_TARGET_DIR="${CARGO_TARGET_DIR:-$PWD/target}"
-SOURCE_DATE_EPOCH=$(git show -s --format=%ct "$commit")
+# The commit's day: where this variable changes, cc compiles C anew, and cargo all that is above it.
+SOURCE_DATE_EPOCH=$(($(git show -s --format=%ct "$commit") / 86400 * 86400))
 ECHOLAKE_COMMIT=${commit:0:12}
 export SOURCE_DATE_EPOCH ECHOLAKE_COMMIT
 unset ECHOLAKE_LAKE
