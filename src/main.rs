@@ -30,12 +30,15 @@ const DONE_WITH_LOSS: u8 = 3;
 fn main() -> ExitCode {
     // clap itself ends with 2 on wrong usage.
     let cli = cli::Cli::parse();
-    let outcome = tokio::runtime::Builder::new_multi_thread()
-        .enable_all()
-        // Files are read and written there; what computes has threads of its own.
-        .max_blocking_threads(BLOCKING_THREADS)
-        .build()
-        .map_err(anyhow::Error::from)
+    let runtime = || {
+        tokio::runtime::Builder::new_multi_thread()
+            .enable_all()
+            // Files are read and written there; what computes has threads of its own.
+            .max_blocking_threads(BLOCKING_THREADS)
+            .build()
+    };
+    let outcome = commands::confine(&cli)
+        .and_then(|()| Ok(runtime()?))
         .and_then(|runtime| runtime.block_on(commands::run(cli)));
     match outcome {
         Ok(Done::Whole) => ExitCode::SUCCESS,

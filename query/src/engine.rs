@@ -21,9 +21,8 @@ use echolake_lake::Lake;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 
 use crate::catalog::Catalog;
-use crate::control::governor::{Running, govern, resident_bytes};
-use crate::control::guard::guarded;
-use crate::control::lanes::{Lanes, Threads};
+use crate::control::RunningQueries;
+use crate::control::threads::Threads;
 use crate::small::SmallTables;
 use crate::table::Source;
 use crate::{Error, Functions, Opaque, Session};
@@ -40,10 +39,6 @@ const METADATA_BYTES: usize = 256 << 20;
 
 /// Disk that sorts and aggregations of all queries may use.
 const SPILL_BYTES: u64 = 16 << 30;
-/// Heavy queries at once, where nobody says how many.
-const HEAVY: usize = 2;
-/// What the process may weigh over what its queries may hold, before one of them is ended.
-const OVER: f64 = 0.1;
 
 /// Answers the queries of many sessions on one lake.
 #[derive(Clone)]
@@ -52,28 +47,20 @@ pub struct Engine(Opaque<Inner>);
 struct Inner {
     template: SessionState,
     catalog: Catalog,
-    lanes: Lanes,
-    running: Arc<Running>,
+    threads: Threads,
+    running: RunningQueries,
     limits: Limits,
     /// Names of the field's functions.
     own: BTreeSet<String>,
-    // Watches times and sizes whatever the queries do to their own threads.
+    // Watches times whatever the queries do to their own threads.
     watch: Threads,
 }
 
 /// What all queries of a process together may use.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone, Copy, Default)]
 pub struct Limits {
     /// Bytes that queries may hold; None for no limit.
     pub memory: Option<usize>,
-    /// Queries at once that read much or compare each row with each. Each may have its part of the memory; more wait.
-    pub heavy: usize,
-}
-
-impl Default for Limits {
-    fn default() -> Self {
-        Self { memory: None, heavy: HEAVY }
-    }
 }
 
 /// A function that queries may call.
@@ -184,15 +171,13 @@ impl Engine {
         let inner = Inner {
             template: template(runtime, &functions, catalog.rules()),
             catalog,
-            lanes: Lanes::new(limits.heavy.max(1)).map_err(threads)?,
-            running: Arc::default(),
+            threads: Threads::per_core("query").map_err(threads)?,
+            running: RunningQueries::default(),
             limits,
             own: functions.names().map(str::to_owned).collect(),
             watch: Threads::new("query-watch", 1).map_err(threads)?,
         };
-        let engine = Self(Opaque::new(inner));
-        engine.start_governor();
-        Ok(engine)
+        Ok(Self(Opaque::new(inner)))
     }
 
     /// A session of a client: one a connection.
@@ -203,6 +188,11 @@ impl Engine {
     /// Queries that run or wait now.
     pub fn running(&self) -> usize {
         self.0.running.count()
+    }
+
+    /// Returns the longest time for which work has continued after its query was ended; None if there is none.
+    pub fn overdue(&self) -> Option<Duration> {
+        self.0.running.overdue()
     }
 
     /// The functions, by name.
@@ -232,11 +222,12 @@ impl Engine {
         &self.0.catalog
     }
 
-    pub(crate) fn lanes(&self) -> &Lanes {
-        &self.0.lanes
+    /// Threads that plan and run.
+    pub(crate) fn threads(&self) -> &Threads {
+        &self.0.threads
     }
 
-    pub(crate) fn queries(&self) -> &Running {
+    pub(crate) fn queries(&self) -> &RunningQueries {
         &self.0.running
     }
 
@@ -247,8 +238,7 @@ impl Engine {
 
     /// Bytes that one query may hold, where there is a limit.
     pub(crate) fn memory(&self, quota: &Quota) -> usize {
-        let part = self.0.limits.memory.map_or(usize::MAX, |all| all / self.0.limits.heavy.max(1));
-        quota.memory.map_or(part, |own| own.min(part))
+        self.0.limits.memory.into_iter().chain(quota.memory).min().unwrap_or(usize::MAX)
     }
 
     /// What all contexts begin as; it knows no tables, and parses as they do.
@@ -270,13 +260,6 @@ impl Engine {
             .build();
         SessionContext::new_with_state(state)
     }
-
-    fn start_governor(&self) {
-        let (Some(memory), Some(threads)) = (self.0.limits.memory, self.0.watch.handle()) else { return };
-        let own = resident_bytes().unwrap_or(0);
-        let limit = own + memory + (memory as f64 * OVER) as usize;
-        threads.spawn(govern(Arc::downgrade(&self.0.running), limit));
-    }
 }
 
 fn template(
@@ -286,10 +269,9 @@ fn template(
 ) -> SessionState {
     let builder = SessionStateBuilder::new().with_config(config()).with_runtime_env(runtime).with_default_features();
     let mut state = rules.into_iter().fold(builder, SessionStateBuilder::with_optimizer_rule).build();
-    let asked: Vec<_> = state.scalar_functions().values().filter_map(guarded).collect();
     // The new ones replace those of their names and aliases; only a registry that is closed refuses.
-    for function in asked.into_iter().chain(functions.scalar().iter().cloned()) {
-        let _ = state.register_udf(function);
+    for function in functions.scalar() {
+        let _ = state.register_udf(function.clone());
     }
     for function in functions.aggregate() {
         let _ = state.register_udaf(function.clone());

@@ -111,7 +111,6 @@ impl Error {
     // An error that tells of a limit, not of the query.
     fn limit(error: &DataFusionError) -> Option<Self> {
         match error.find_root() {
-            DataFusionError::External(source) => source.downcast_ref::<Stop>().map(Self::stopped),
             DataFusionError::ResourcesExhausted(text) => Some(Self::MemoryLimit { message: text.clone() }),
             _ => None,
         }
@@ -122,9 +121,6 @@ impl Error {
         match why {
             Stop::Cancelled => Self::Cancelled,
             Stop::Time(limit) => Self::TimeLimit { limit: *limit },
-            Stop::Memory => {
-                Self::MemoryLimit { message: "the service was over its limit, and this query the largest".to_owned() }
-            }
         }
     }
 }

@@ -18,13 +18,11 @@ use datafusion::sql::parser::Statement;
 use datafusion::sql::sqlparser::dialect::GenericDialect;
 use echolake_lake::{Lake, Snapshot, VisibleRun};
 use futures::StreamExt as _;
-use tokio::sync::{OwnedSemaphorePermit, mpsc};
+use tokio::sync::mpsc;
 use tokio::task::JoinHandle;
 
-use crate::control::lanes::Lane;
 use crate::control::pool::QueryPool;
-use crate::control::watched::watch;
-use crate::control::{Stop, Ticket};
+use crate::control::{Stop, Ticket, WorkGuard};
 use crate::engine::{Client, Engine, Function, Limits, Place, Quota};
 use crate::mcap::Contents;
 use crate::statement_bounds::check_statement_bounds;
@@ -263,24 +261,15 @@ impl Session {
 
     async fn run(&self, prepared: &Prepared, plan: LogicalPlan, started: Started) -> Result<Answer, Error> {
         let Started { ticket, place } = started;
-        let (state, sql, asked) = (prepared.state.clone(), prepared.sql.clone(), ticket.clone());
-        let physical = async move {
-            let wrong = |e: DataFusionError| Error::plan(&sql, &e);
-            let plan = state.create_physical_plan(&plan).await.map_err(wrong)?;
-            let lane = Lane::of(&plan);
-            Ok((lane, watch(plan, &asked).map_err(wrong)?))
-        };
-        let (lane, plan) = self.on_threads(&ticket, physical).await?;
-        let room = tokio::select! {
-            room = self.engine.lanes().place(lane) => room,
-            why = ticket.stopped() => return Err(Error::stopped(&why)),
-        };
-        let Some(threads) = self.engine.lanes().threads(lane) else { return Err(ended()) };
+        let (state, sql) = (prepared.state.clone(), prepared.sql.clone());
+        let physical =
+            async move { state.create_physical_plan(&plan).await.map_err(|e| Error::plan(&sql, &e)) };
+        let plan = self.on_threads(&ticket, physical).await?;
+        let Some(threads) = self.engine.threads().handle() else { return Err(ended()) };
         let (send, batches) = mpsc::channel(AHEAD);
         let schema = plan.schema();
         let context = self.task_context(&prepared.state, &ticket);
-        let places = (place, room);
-        let query = threads.spawn(drive(plan, context, send, ticket.clone(), places));
+        let query = threads.spawn(drive(plan, context, send, ticket.begin_work(), place));
         Ok(Answer {
             schema,
             batches,
@@ -295,13 +284,18 @@ impl Session {
     // Constants are computed while a query is planned, so planning must not hold up the caller's threads either.
     async fn on_threads<T: Send + 'static>(
         &self,
-        ticket: &Ticket,
+        ticket: &Arc<Ticket>,
         work: impl Future<Output = Result<T, Error>> + Send + 'static,
     ) -> Result<T, Error> {
-        let Some(threads) = self.engine.lanes().threads(Lane::Light) else { return Err(ended()) };
-        let mut work = AbortOnDrop(threads.spawn(work));
+        let Some(threads) = self.engine.threads().handle() else { return Err(ended()) };
+        let guard = ticket.begin_work();
+        let work = threads.spawn(async move {
+            let _guard = guard;
+            work.await
+        });
+        let mut work = StopOnDrop { work, ticket: ticket.clone() };
         tokio::select! {
-            done = &mut work.0 => done.unwrap_or_else(|_| Err(Error::Execution { message: "a defect ended it".to_owned() })),
+            done = &mut work.work => done.unwrap_or_else(|_| Err(Error::Execution { message: "a defect ended it".to_owned() })),
             why = ticket.stopped() => Err(Error::stopped(&why)),
         }
     }
@@ -355,12 +349,18 @@ struct Started {
     place: Place,
 }
 
-/// Work that nobody waits for any more ends where it next waits itself.
-struct AbortOnDrop<T>(JoinHandle<T>);
+/// Planning that nobody waits for any more ends where it next waits itself; its query ends with it.
+struct StopOnDrop<T> {
+    work: JoinHandle<T>,
+    ticket: Arc<Ticket>,
+}
 
-impl<T> Drop for AbortOnDrop<T> {
+impl<T> Drop for StopOnDrop<T> {
     fn drop(&mut self) {
-        self.0.abort();
+        if !self.work.is_finished() {
+            self.ticket.stop(Stop::Cancelled);
+            self.work.abort();
+        }
     }
 }
 
@@ -368,13 +368,13 @@ fn ended() -> Error {
     Error::Execution { message: "the query service has ended".to_owned() }
 }
 
-// Runs a query on its lane's threads. It keeps its places until its operators are gone, whoever still waits for it.
+// Runs a query. It keeps its place until its operators are gone, whoever still waits for it.
 async fn drive(
     plan: Arc<dyn ExecutionPlan>,
     context: Arc<TaskContext>,
     send: mpsc::Sender<Result<RecordBatch, DataFusionError>>,
-    ticket: Arc<Ticket>,
-    _places: (Place, Option<OwnedSemaphorePermit>),
+    work: WorkGuard,
+    _place: Place,
 ) {
     let mut batches = match execute_stream(plan, context) {
         Ok(batches) => batches,
@@ -383,7 +383,7 @@ async fn drive(
     loop {
         let batch = tokio::select! {
             biased;
-            _ = ticket.stopped() => return,
+            _ = work.ticket().stopped() => return,
             batch = batches.next() => batch,
         };
         let Some(batch) = batch else { return };

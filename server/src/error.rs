@@ -43,6 +43,14 @@ pub enum Error {
     /// The system gives no random bytes.
     #[error("the system gives no random bytes")]
     Random(#[source] io::Error),
+    /// There is no folder for temporary files.
+    #[error("cannot make a folder for temporary files in `{}`; hint: --temp DIR", path.display())]
+    Temp {
+        /// Where.
+        path: PathBuf,
+        /// Why not.
+        source: io::Error,
+    },
     /// The system gives no threads or tasks to compute on, or takes a listener back.
     #[error("the server cannot go on")]
     System(#[source] io::Error),

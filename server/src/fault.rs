@@ -124,6 +124,12 @@ pub(crate) enum Fault {
         /// The limit.
         limit: usize,
     },
+    /// The process that ran the query ended, and not by its own decision alone: every other client's goes on.
+    #[error("the query ended the engine that ran it: {reason}; hint: ask for less at a time, or for fewer rows")]
+    EngineEnded {
+        /// What ended it.
+        reason: String,
+    },
     /// A defect. What it was stands in the server's log.
     #[error("the server failed; the query is ended, the server goes on")]
     Internal,
@@ -154,12 +160,13 @@ pub(crate) enum Code {
     MemoryLimit,
     RowLimit,
     TooMany,
+    EngineEnded,
     Internal,
 }
 
 impl Code {
     /// All of them.
-    pub(crate) const ALL: [Self; 23] = [
+    pub(crate) const ALL: [Self; 24] = [
         Self::Query,
         Self::ReadOnly,
         Self::Execution,
@@ -182,6 +189,7 @@ impl Code {
         Self::MemoryLimit,
         Self::RowLimit,
         Self::TooMany,
+        Self::EngineEnded,
         Self::Internal,
     ];
 
@@ -210,6 +218,7 @@ impl Code {
             Self::MemoryLimit => "memory_limit",
             Self::RowLimit => "row_limit",
             Self::TooMany => "too_many",
+            Self::EngineEnded => "query_ended_engine",
             Self::Internal => "internal",
         }
     }
@@ -248,6 +257,7 @@ impl Fault {
             Self::Cancelled => Code::Cancelled,
             Self::Timeout { .. } => Code::TimeLimit,
             Self::TooMany { .. } => Code::TooMany,
+            Self::EngineEnded { .. } => Code::EngineEnded,
             Self::Internal => Code::Internal,
         }
     }

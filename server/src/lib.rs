@@ -1,9 +1,10 @@
-//! The lake over HTTP, Arrow Flight SQL and Postgres wire: three doors to one query engine, which only reads.
+//! The lake over HTTP, Arrow Flight SQL and Postgres wire, reading only. A server is a door, which clients reach, and an
+//! engine process for each client, which parses and runs what it asks.
 //!
 //! ```no_run,standalone_crate
-//! # async fn example() -> Result<(), Box<dyn std::error::Error>> {
+//! # async fn example(settings: echolake_server::Settings) -> Result<(), Box<dyn std::error::Error>> {
 //! let lake = echolake_lake::Lake::open("lake").await?;
-//! let server = echolake_server::Server::bind(&lake, echolake_server::Settings::default()).await?;
+//! let server = echolake_server::Server::bind(&lake, settings).await?;
 //! for address in server.addresses() {
 //!     eprintln!("{address}");
 //! }
@@ -13,20 +14,21 @@
 //! ```
 
 mod catalogue_pages;
+mod client_identity;
+mod door;
+pub mod engine;
 mod error;
 mod fault;
 mod flight;
 mod http;
 mod metrics;
-mod places;
 mod postgres;
 mod random;
 mod running;
-mod serve;
 mod service;
 mod sessions;
 pub mod tokens;
 
 pub use catalogue_pages::CataloguePages;
 pub use error::Error;
-pub use serve::{Server, Settings};
+pub use door::{EngineSettings, Server, Settings};

@@ -82,7 +82,31 @@ impl Metrics {
         }
     }
 
-    /// All of it.
+    /// All counters, always in the same order; the gauge of running queries is the last.
+    pub(crate) fn counters(&self) -> Vec<u64> {
+        let all = self.queries.iter().chain(&self.failures).chain(&self.buckets);
+        let single = [&self.rows, &self.micros, &self.finished];
+        let counters = all.chain(single).map(|counter| counter.load(Ordering::Relaxed));
+        counters.chain([self.running.load(Ordering::Relaxed).unsigned_abs()]).collect()
+    }
+
+    /// Adds what another process has counted between two looks at its counters.
+    pub(crate) fn add(&self, before: &[u64], after: &[u64]) {
+        let all = self.queries.iter().chain(&self.failures).chain(&self.buckets);
+        let counters = all.chain([&self.rows, &self.micros, &self.finished]);
+        let difference = |at: usize| {
+            let value = |counters: &[u64]| counters.get(at).copied().unwrap_or(0);
+            value(after).wrapping_sub(value(before))
+        };
+        let mut last = 0;
+        for (at, counter) in counters.enumerate() {
+            counter.fetch_add(difference(at), Ordering::Relaxed);
+            last = at + 1;
+        }
+        self.running.fetch_add(difference(last).cast_signed(), Ordering::Relaxed);
+    }
+
+    /// All of it, in text.
     pub(crate) fn text(&self) -> String {
         let mut text = String::new();
         let get = |counter: &AtomicU64| counter.load(Ordering::Relaxed);
@@ -140,6 +164,20 @@ mod tests {
         drop(timed);
         let text = metrics.text();
         assert!(text.contains("echolake_running_queries 0\n") && text.contains("_bucket{le=\"+Inf\"} 1\n"), "{text}");
+    }
+
+    #[test]
+    fn counters_of_another_process_are_added() {
+        let (engine, all) = (Metrics::default(), Metrics::default());
+        let before = engine.counters();
+        let timed = engine.begin(Protocol::FlightSql);
+        engine.rows(7);
+        engine.failed(Code::TimeLimit);
+        let running = engine.counters();
+        all.add(&before, &running);
+        drop(timed);
+        all.add(&running, &engine.counters());
+        assert_eq!(all.counters(), engine.counters());
     }
 
     #[test]

@@ -1,20 +1,22 @@
-//! What the three protocols share: the engine, who may ask, threads to compute on, and figures.
+//! What the three protocols share: the query engine, whose it is, threads to compute on, and figures.
 
 use std::sync::Arc;
+use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::Duration;
 
 use arrow::datatypes::SchemaRef;
 use datafusion::common::ParamValues;
 use echolake_lake::Lake;
-use echolake_query::{Client, Engine, Function, Limits, Prepared, Quota, Session, Threads};
+use echolake_query::{Client, Engine, Function, Prepared, Quota, Session, Threads};
 use tokio::sync::{mpsc, oneshot};
 use tokio::task::JoinSet;
 
 use crate::Error;
+use crate::client_identity::ClientIdentity;
 use crate::fault::Fault;
 use crate::metrics::{Metrics, Protocol};
 use crate::running::{Encode, Limit, Running, Stop, WAITING, ended, finish, parts};
-use crate::tokens::{Access, Tokens};
+use crate::tokens::Scope;
 
 /// How long a plan is good for: it sees the lake as it was.
 pub(crate) const FRESH: Duration = Duration::from_secs(2);
@@ -29,7 +31,9 @@ pub(crate) struct Service(Arc<Inner>);
 struct Inner {
     lake: Lake,
     engine: Engine,
-    access: Access,
+    identity: ClientIdentity,
+    client: Arc<Client>,
+    activity: Activity,
     metrics: Metrics,
     // Answers are encoded on threads of their own: connections are answered, and queries cancelled, while all are busy.
     encoders: Threads,
@@ -54,12 +58,38 @@ pub(crate) struct Job {
     pub(crate) stop: Stop,
 }
 
+/// Counts requests, and work for them.
+#[derive(Clone, Default)]
+pub(crate) struct Activity(Arc<AtomicUsize>);
+
+/// One that is counted, until this is dropped.
+pub(crate) struct ActivityGuard(Activity);
+
+impl Drop for ActivityGuard {
+    fn drop(&mut self) {
+        self.0.0.fetch_sub(1, Ordering::Relaxed);
+    }
+}
+
+impl Activity {
+    pub(crate) fn enter(&self) -> ActivityGuard {
+        self.0.fetch_add(1, Ordering::Relaxed);
+        ActivityGuard(self.clone())
+    }
+
+    pub(crate) fn count(&self) -> usize {
+        self.0.load(Ordering::Relaxed)
+    }
+}
+
 impl Service {
-    pub(crate) fn new(lake: &Lake, tokens: Option<Tokens>, limits: Limits) -> Result<Self, Error> {
+    pub(crate) fn new(lake: &Lake, engine: Engine, identity: ClientIdentity) -> Result<Self, Error> {
         Ok(Self(Arc::new(Inner {
             lake: lake.clone(),
-            engine: Engine::new(lake, limits)?,
-            access: Access::new(tokens),
+            engine,
+            client: Arc::new(Client::new(identity.name.clone(), identity.quota())),
+            identity,
+            activity: Activity::default(),
             metrics: Metrics::default(),
             encoders: Threads::per_core("encode").map_err(Error::System)?,
         })))
@@ -69,8 +99,27 @@ impl Service {
         &self.0.lake
     }
 
-    pub(crate) fn access(&self) -> &Access {
-        &self.0.access
+    pub(crate) fn engine(&self) -> &Engine {
+        &self.0.engine
+    }
+
+    /// Whether the server has no tokens.
+    pub(crate) fn is_open(&self) -> bool {
+        self.0.identity.is_open
+    }
+
+    /// The client whose requests these are, if they may do this.
+    ///
+    /// # Errors
+    /// [`Fault::Forbidden`].
+    pub(crate) fn client(&self, scope: Scope) -> Result<Arc<Client>, Fault> {
+        self.0.identity.require(scope).inspect_err(|fault| self.0.metrics.failed(fault.code()))?;
+        Ok(self.0.client.clone())
+    }
+
+    /// Requests that are being answered.
+    pub(crate) fn activity(&self) -> &Activity {
+        &self.0.activity
     }
 
     pub(crate) fn metrics(&self) -> &Metrics {
@@ -97,7 +146,12 @@ impl Service {
     /// Begins work on the threads that encode answers; it ends where what this returns is dropped.
     pub(crate) fn spawn<T: Send + 'static>(&self, work: impl Future<Output = T> + Send + 'static) -> JoinSet<T> {
         let mut task = JoinSet::new();
+        let guard = self.0.activity.enter();
         if let Some(threads) = self.0.encoders.handle() {
+            let work = async move {
+                let _guard = guard;
+                work.await
+            };
             task.spawn_on(work, threads);
         }
         task
@@ -124,6 +178,11 @@ impl Service {
         &self,
         work: impl FnOnce() -> T + Send + 'static,
     ) -> Result<T, Fault> {
+        let guard = self.0.activity.enter();
+        let work = move || {
+            let _guard = guard;
+            work()
+        };
         let handle = self.0.encoders.handle().map(|threads| threads.spawn_blocking(work));
         let Some(handle) = handle else { return Err(Fault::Internal) };
         handle.await.map_err(|failed| {

@@ -3,17 +3,16 @@
 use std::fmt;
 use std::path::Path;
 use std::sync::Arc;
-use std::time::Duration;
 
 use base64::Engine as _;
 use base64::alphabet::STANDARD;
 use base64::engine::GeneralPurpose;
 use base64::engine::general_purpose::NO_PAD;
-use echolake_query::{Client, Quota};
-use serde::Deserialize;
+use serde::{Deserialize, Serialize};
 use sha2::{Digest as _, Sha256};
 use subtle::{Choice, ConstantTimeEq as _};
 
+use crate::client_identity::ClientIdentity;
 use crate::fault::Fault;
 use crate::sessions::Sessions;
 use crate::{Error, random};
@@ -25,7 +24,7 @@ const BASE64: GeneralPurpose = GeneralPurpose::new(&STANDARD, NO_PAD.with_decode
 const PREFIX: &str = "echolake_";
 
 /// What a token is for.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Scope {
     /// Queries, and what the tables are.
@@ -50,9 +49,8 @@ impl fmt::Display for Scope {
 pub struct Tokens(Vec<Entry>);
 
 struct Entry {
-    client: Arc<Client>,
+    client: Arc<ClientIdentity>,
     hash: [u8; 32],
-    scopes: Vec<Scope>,
 }
 
 #[derive(Deserialize)]
@@ -94,23 +92,16 @@ impl Line {
         at_least_one("memory_mb", self.memory_mb.map(|v| v as u64))?;
         at_least_one("rows", self.rows)?;
         at_least_one("concurrent", self.concurrent.map(|v| v as u64))?;
-        let quota = Quota {
-            time: self.seconds.map(Duration::from_secs),
-            memory: self.memory_mb.map(|mb| mb.saturating_mul(1_000_000)),
+        let client = ClientIdentity {
+            name: name.clone(),
+            is_open: false,
+            scopes: self.scopes.clone(),
+            seconds: self.seconds,
+            memory_bytes: self.memory_mb.map(|mb| mb.saturating_mul(1_000_000)),
             rows: self.rows,
             concurrent: self.concurrent,
         };
-        let client = Arc::new(Client::new(name.clone(), quota));
-        Ok(Entry { client, hash, scopes: self.scopes.clone() })
-    }
-}
-
-impl Entry {
-    fn allowed(&self, scope: Scope) -> Result<Arc<Client>, Fault> {
-        match self.scopes.contains(&scope) {
-            true => Ok(self.client.clone()),
-            false => Err(Fault::Forbidden { name: self.client.name().to_owned(), scope }),
-        }
+        Ok(Entry { client: Arc::new(client), hash })
     }
 }
 
@@ -129,8 +120,8 @@ impl Tokens {
         let file: File = toml::from_str(text).map_err(|e| e.to_string())?;
         let entries = file.token.iter().map(Line::entry).collect::<Result<Vec<_>, _>>()?;
         for (i, entry) in entries.iter().enumerate() {
-            if entries[..i].iter().any(|e| e.client.name() == entry.client.name() || e.hash == entry.hash) {
-                return Err(format!("`{}` is there twice", entry.client.name()));
+            if entries[..i].iter().any(|e| e.client.name == entry.client.name || e.hash == entry.hash) {
+                return Err(format!("`{}` is there twice", entry.client.name));
             }
         }
         if entries.is_empty() {
@@ -180,7 +171,7 @@ pub fn fresh(name: &str) -> Result<Fresh, Error> {
 /// Who is let in.
 pub(crate) enum Access {
     /// Everybody on this machine.
-    Open(Arc<Client>),
+    Open,
     /// Whoever has a token, or showed one to begin a session of a browser.
     Tokens(Tokens, Sessions),
 }
@@ -190,26 +181,30 @@ impl Access {
     pub(crate) fn new(tokens: Option<Tokens>) -> Self {
         match tokens {
             Some(tokens) => Self::Tokens(tokens, Sessions::default()),
-            None => Self::Open(Arc::new(Client::new("local", Quota::default()))),
+            None => Self::Open,
         }
     }
 
     /// Whether everybody is let in.
     pub(crate) fn is_open(&self) -> bool {
-        matches!(self, Self::Open(_))
+        matches!(self, Self::Open)
     }
 
-    /// Who holds this token.
+    /// Who holds this token; `local` makes the client of a server that has none.
     ///
     /// # Errors
-    /// [`Fault::Unauthenticated`], [`Fault::Forbidden`].
-    pub(crate) fn client(&self, token: Option<&str>, scope: Scope) -> Result<Arc<Client>, Fault> {
+    /// [`Fault::Unauthenticated`].
+    pub(crate) fn client(
+        &self,
+        token: Option<&str>,
+        local: impl FnOnce() -> ClientIdentity,
+    ) -> Result<Arc<ClientIdentity>, Fault> {
         let tokens = match self {
-            Self::Open(client) => return Ok(client.clone()),
+            Self::Open => return Ok(Arc::new(local())),
             Self::Tokens(tokens, _) => tokens,
         };
         let entry = token.and_then(|t| tokens.find(t)).ok_or(Fault::Unauthenticated)?;
-        tokens.0[entry].allowed(scope)
+        Ok(tokens.0[entry].client.clone())
     }
 
     /// Begins a browser's session; returns its secret.
@@ -227,17 +222,21 @@ impl Access {
         })
     }
 
-    /// Who holds the session of this secret.
+    /// Who holds the session of this secret; as [`Access::client`].
     ///
     /// # Errors
     /// As [`Access::client`].
-    pub(crate) fn client_of_session(&self, secret: &str, scope: Scope) -> Result<Arc<Client>, Fault> {
+    pub(crate) fn client_of_session(
+        &self,
+        secret: &str,
+        local: impl FnOnce() -> ClientIdentity,
+    ) -> Result<Arc<ClientIdentity>, Fault> {
         let (tokens, sessions) = match self {
-            Self::Open(client) => return Ok(client.clone()),
+            Self::Open => return Ok(Arc::new(local())),
             Self::Tokens(tokens, sessions) => (tokens, sessions),
         };
         let entry = sessions.holder(secret).and_then(|i| tokens.0.get(i)).ok_or(Fault::Unauthenticated)?;
-        entry.allowed(scope)
+        Ok(entry.client.clone())
     }
 }
 
@@ -263,21 +262,20 @@ mod tests {
         let fresh = fresh("a \"quoted\" name").expect("a token");
         assert!(!fresh.lines.contains(&fresh.token), "only its hash is kept");
         let access = Access::new(Some(Tokens::parse(&fresh.lines).expect("tokens")));
-        let client = access.client(Some(&fresh.token), Scope::Sql).expect("let in");
-        assert_eq!(client.name(), "a \"quoted\" name");
-        assert_eq!(client.quota().time, Some(Duration::from_secs(60)));
-        assert!(access.client(Some(&fresh.token), Scope::Files).is_ok(), "pages show meshes and link to files");
-        assert!(matches!(access.client(Some(&fresh.token), Scope::Metrics), Err(Fault::Forbidden { .. })));
+        let local = ClientIdentity::pages;
+        let client = access.client(Some(&fresh.token), local).expect("let in");
+        assert_eq!(client.name, "a \"quoted\" name");
+        assert_eq!(client.quota().time, Some(std::time::Duration::from_secs(60)));
+        assert!(client.require(Scope::Files).is_ok(), "pages show meshes and link to files");
+        assert!(matches!(client.require(Scope::Metrics), Err(Fault::Forbidden { .. })));
         let secret = access.begin_session(&fresh.token).expect("a session");
-        assert_eq!(access.client_of_session(&secret, Scope::Sql).expect("let in").name(), client.name());
-        assert!(access.client_of_session(&secret, Scope::Files).is_ok());
-        assert!(matches!(access.client_of_session(&secret, Scope::Metrics), Err(Fault::Forbidden { .. })));
-        assert!(matches!(access.client_of_session(&fresh.token, Scope::Sql), Err(Fault::Unauthenticated)));
+        assert_eq!(access.client_of_session(&secret, local).expect("let in"), client);
+        assert!(matches!(access.client_of_session(&fresh.token, local), Err(Fault::Unauthenticated)));
         assert!(matches!(access.begin_session(&secret), Err(Fault::Unauthenticated)));
         let other = super::fresh("b").expect("a token").token;
         let cut = &fresh.token[..fresh.token.len() - 1];
         for wrong in [None, Some(""), Some(other.as_str()), Some(cut)] {
-            assert!(matches!(access.client(wrong, Scope::Sql), Err(Fault::Unauthenticated)), "{wrong:?}");
+            assert!(matches!(access.client(wrong, local), Err(Fault::Unauthenticated)), "{wrong:?}");
         }
     }
 
@@ -287,7 +285,8 @@ mod tests {
         let allowed = |scopes: &str| {
             let file = Tokens::parse(&format!("[[token]]\nname = 'a'\nsha256 = '{hash}'\n{scopes}")).expect("tokens");
             let access = Access::new(Some(file));
-            [Scope::Sql, Scope::Files, Scope::Metrics].map(|scope| access.client(Some("x"), scope).is_ok())
+            let client = access.client(Some("x"), ClientIdentity::pages).expect("let in");
+            [Scope::Sql, Scope::Files, Scope::Metrics].map(|scope| client.require(scope).is_ok())
         };
         assert_eq!(allowed(""), [true, true, false]);
         assert_eq!(allowed("scopes = ['sql']"), [true, false, false]);

@@ -7,7 +7,7 @@ use echolake_acquisition::collection::LARGEST;
 use echolake_lake::{KEEP_HOURS, TARGET_BYTES};
 
 use crate::commands::export::ExportCommand;
-use crate::commands::serve::ServeArgs;
+use crate::commands::serve::{EngineArgs, ServeArgs};
 use crate::commands::sql::SqlArgs;
 
 #[derive(Debug, Subcommand)]
@@ -26,6 +26,9 @@ pub(crate) enum LakeCommand {
     Export(ExportCommand),
     /// Serve the catalogue, and the lake over HTTP, Arrow Flight SQL and Postgres' protocol, for reading.
     Serve(ServeArgs),
+    /// Answer one client's queries, as a child of `serve`.
+    #[command(hide = true)]
+    Engine(EngineArgs),
     /// Make a token for `serve --tokens`.
     Token {
         /// Whose it is.

@@ -35,6 +35,15 @@ use crate::cli::LakeCommand;
 use crate::cli::{Cli, Command};
 use crate::signals::StopRequest;
 
+/// Gives up what the command's verb does not need. To be called before there are threads.
+pub(crate) fn confine(cli: &Cli) -> anyhow::Result<()> {
+    match &cli.command {
+        #[cfg(feature = "lake")]
+        Command::Lake(LakeCommand::Engine(args)) => args.confine(),
+        _ => Ok(()),
+    }
+}
+
 /// Runs the command's verb.
 pub(crate) async fn run(cli: Cli) -> anyhow::Result<Done> {
     let lake = &cli.lake;
@@ -69,6 +78,7 @@ async fn run_lake(command: &LakeCommand, lake: &str) -> anyhow::Result<Done> {
         LakeCommand::Sql(args) => sql::run(args, lake).await.map(|()| Done::Whole),
         LakeCommand::Export(args) => export::run(args, lake).await,
         LakeCommand::Serve(args) => serve::run(args, lake).await,
+        LakeCommand::Engine(args) => serve::engine(args, lake).await,
         LakeCommand::Token { name } => serve::token(name),
         LakeCommand::Optimize(args) => optimize::run(args, lake).await,
         LakeCommand::Vacuum(args) => vacuum::run(args, lake).await,

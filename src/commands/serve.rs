@@ -4,17 +4,18 @@ use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 use std::path::PathBuf;
 use std::str::FromStr;
 
+use anyhow::Context as _;
 use echolake_lake::Lake;
-use echolake_query::Limits;
+use echolake_server::engine::{confinement, run_engine};
 use echolake_server::tokens::{self, Tokens};
-use echolake_server::{CataloguePages, Error, Server, Settings};
+use echolake_server::{CataloguePages, EngineSettings, Error, Server, Settings};
 
 use crate::Done;
 use crate::signals::StopRequest;
 
-/// Memory for queries, and how many of them may be heavy, if nobody says otherwise.
+/// Memory for queries, and engines at once, if nobody says otherwise.
 const MEMORY_MIB: u32 = 4096;
-const HEAVY: u32 = 2;
+const ENGINES: u32 = 16;
 
 #[derive(Debug, clap::Args)]
 pub(crate) struct ServeArgs {
@@ -30,12 +31,45 @@ pub(crate) struct ServeArgs {
     /// File of tokens, without which only this machine may ask; `echolake token` makes its lines.
     #[arg(long, value_name = "FILE")]
     tokens: Option<PathBuf>,
-    /// Memory that the queries may hold, all together.
+    /// Memory that the queries may hold, all together; if they hold more, the largest client's engine ends.
     #[arg(long, value_name = "MIB", default_value_t = MEMORY_MIB, value_parser = clap::value_parser!(u32).range(64..))]
     memory: u32,
-    /// Queries at once that read much; more of them wait, and each may hold its part of the memory.
-    #[arg(long, value_name = "N", default_value_t = HEAVY, value_parser = clap::value_parser!(u32).range(1..=64))]
-    heavy: u32,
+    /// Clients at once. The queries of each run in an engine, a process of their own; one that is idle makes room.
+    #[arg(long, value_name = "N", default_value_t = ENGINES, value_parser = clap::value_parser!(u32).range(1..=256))]
+    engines: u32,
+    /// Folder for temporary files, as of sorts that do not fit into memory; by default `temp` in the lake.
+    #[arg(long, value_name = "DIR")]
+    temp: Option<PathBuf>,
+}
+
+/// What `serve` starts its engines with.
+#[derive(Debug, clap::Args)]
+pub(crate) struct EngineArgs {
+    /// Folder for its sockets.
+    #[arg(long)]
+    sockets: PathBuf,
+    /// The lake's folder, where it is one: the system keeps the engine from all other files.
+    #[arg(long)]
+    confine_to: Option<PathBuf>,
+    /// Bytes that its queries may hold.
+    #[arg(long)]
+    memory_bytes: usize,
+}
+
+impl EngineArgs {
+    /// Gives up what an engine does not need. To be called before there are threads.
+    pub(crate) fn confine(&self) -> anyhow::Result<()> {
+        let Some(lake) = &self.confine_to else { return Ok(()) };
+        let temp = std::env::temp_dir();
+        confinement::confine_files(lake, &[&self.sockets, &temp]).context("the engine cannot be confined")
+    }
+}
+
+/// Answers one client's queries, until the door that started it ends.
+pub(crate) async fn engine(args: &EngineArgs, lake_url: &str) -> anyhow::Result<Done> {
+    let lake = Lake::open(lake_url).await?;
+    run_engine(&lake, &args.sockets, Some(args.memory_bytes)).await?;
+    Ok(Done::Whole)
 }
 
 /// Where to listen.
@@ -76,22 +110,26 @@ pub(crate) async fn run(args: &ServeArgs, lake_url: &str) -> anyhow::Result<Done
         flight_sql: args.flight_sql.address(),
         postgres: args.postgres.address(),
         tokens: args.tokens.as_deref().map(Tokens::read).transpose()?,
-        limits: limits(args.memory, args.heavy),
+        engines: engines(args.memory, args.engines, args.temp.clone())?,
     };
     let server = Server::bind(&lake, settings).await?;
     anyhow::ensure!(!server.addresses().is_empty(), "nothing to listen on; hint: all three are off");
     eprintln!("lake {}", lake.location());
+    if let Some(missing) = confinement::missing() {
+        eprintln!("note: {missing}");
+    }
     answer(server, &stop).await
 }
 
 /// Serves the catalogue alone, where others look for it or, if somebody else is there, on any port that is free.
 pub(crate) async fn catalogue(lake: &Lake, stop: &StopRequest) -> anyhow::Result<Done> {
+    let engines = engines(MEMORY_MIB, ENGINES, None)?;
     let settings = |http| Settings {
         http: Some(http),
         flight_sql: None,
         postgres: None,
         tokens: None,
-        limits: limits(MEMORY_MIB, HEAVY),
+        engines: engines.clone(),
     };
     let server = match Server::bind(lake, settings(HTTP)).await {
         Err(Error::Bind { .. }) => Server::bind(lake, settings(SocketAddr::new(HTTP.ip(), 0))).await?,
@@ -101,8 +139,9 @@ pub(crate) async fn catalogue(lake: &Lake, stop: &StopRequest) -> anyhow::Result
     answer(server, stop).await
 }
 
-fn limits(memory_mib: u32, heavy: u32) -> Limits {
-    Limits { memory: Some((memory_mib as usize) << 20), heavy: heavy as usize }
+fn engines(memory_mib: u32, count: u32, temp: Option<PathBuf>) -> anyhow::Result<EngineSettings> {
+    let program = std::env::current_exe().context("this program does not know its own path")?;
+    Ok(EngineSettings { program, memory: (memory_mib as usize) << 20, count: count as usize, temp })
 }
 
 async fn answer(server: Server, stop: &StopRequest) -> anyhow::Result<Done> {

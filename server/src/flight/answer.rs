@@ -52,16 +52,18 @@ pub(super) fn is_settled(schema: &Schema) -> bool {
     schema.fields().iter().all(|f| *f.data_type() != DataType::Null)
 }
 
-/// The rows of a run.
-pub(super) fn run(schema: SchemaRef, running: Running<RecordBatch>) -> Response<Data> {
-    let batches = stream::try_unfold(running, |mut running| async move {
-        match running.next().await {
-            Ok(Some(batch)) => Ok(Some((batch, running))),
-            Ok(None) => Ok(None),
-            Err(fault) => Err(FlightError::Tonic(Box::new(status(&fault)))),
-        }
+/// The rows of a run. The answer begins with the first of them: until then, the door may ask another engine.
+pub(super) async fn run(schema: SchemaRef, mut running: Running<RecordBatch>) -> Result<Response<Data>, Fault> {
+    let first = running.next().await?;
+    let batches = stream::try_unfold((first, running), |(first, mut running)| async move {
+        let batch = match first {
+            Some(batch) => Ok(Some(batch)),
+            None => running.next().await,
+        };
+        let batch = batch.map_err(|fault| FlightError::Tonic(Box::new(status(&fault))))?;
+        Ok(batch.map(|batch| (batch, (None, running))))
     });
-    send(schema, batches)
+    Ok(send(schema, batches))
 }
 
 /// The rows of a batch.

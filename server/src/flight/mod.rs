@@ -1,39 +1,37 @@
 //! Arrow Flight SQL: queries, prepared statements and the catalogue, as ADBC and JDBC drivers ask for them.
 
 mod answer;
-mod connections;
 mod info;
 mod service;
 mod statements;
 mod status;
 mod values;
 
-use std::time::Duration;
+use std::io;
 
 use arrow_flight::flight_service_server::FlightServiceServer;
-use tokio::net::TcpListener;
+use futures::stream;
+use tokio::net::{UnixListener, UnixStream};
 use tonic::transport::Server;
 
 use crate::Error;
 use crate::service::Service;
+pub(crate) use status::status;
 
-/// Silence after which a client is asked whether it still lives; its queries end when it does not.
-const KEEPALIVE: Duration = Duration::from_secs(20);
-/// Requests of one connection at once.
-const STREAMS: u32 = 64;
+/// Bytes of an answer that may be on their way to one request: the door holds them while its client reads slowly.
+pub(crate) const WINDOW_BYTES: u32 = 1 << 20;
 
-/// Answers Flight SQL until `stop`.
-pub(crate) async fn serve(
-    service: Service,
-    listener: TcpListener,
-    stop: impl Future<Output = ()> + Send + 'static,
-) -> Result<(), Error> {
+/// Answers Flight SQL on an engine's socket.
+pub(crate) async fn serve(service: Service, listener: UnixListener) -> Result<(), Error> {
     let flight = service::Flight::new(service).map_err(|e| Error::Transport(Box::new(e)))?;
     Server::builder()
-        .http2_keepalive_interval(Some(KEEPALIVE))
-        .max_concurrent_streams(Some(STREAMS))
         .add_service(FlightServiceServer::new(flight))
-        .serve_with_incoming_shutdown(connections::incoming(listener), stop)
+        .serve_with_incoming(stream::unfold(listener, next))
         .await
         .map_err(|e| Error::Transport(Box::new(e)))
+}
+
+async fn next(listener: UnixListener) -> Option<(io::Result<UnixStream>, UnixListener)> {
+    let accepted = listener.accept().await.map(|(stream, _)| stream);
+    Some((accepted, listener))
 }

@@ -59,13 +59,8 @@ impl Flight {
         Ok(Self { service, statements: Statements::default(), sql_info: info::sql_info()?, types: info::types()? })
     }
 
-    fn client<T>(&self, request: &Request<T>) -> Result<Arc<Client>, Status> {
-        let header = request.metadata().get("authorization").and_then(|v| v.to_str().ok());
-        let client = self.service.access().client(header.and_then(of_header).as_deref(), Scope::Sql);
-        client.map_err(|fault| {
-            self.service.metrics().failed(fault.code());
-            status(&fault)
-        })
+    fn client(&self) -> Result<Arc<Client>, Status> {
+        self.service.client(Scope::Sql).map_err(|fault| status(&fault))
     }
 
     async fn plan(&self, client: &Arc<Client>, sql: String) -> Result<Statement, Status> {
@@ -82,9 +77,21 @@ impl Flight {
         Ok(Arc::new(planned.map_err(|f| status(&f))?))
     }
 
+    // The statement of a handle. An engine that another one was before plans it anew, without the values that were bound.
+    async fn find(&self, client: &Arc<Client>, handle: &[u8]) -> Result<Statement, Status> {
+        let lost = match self.statements.find(client.name(), handle) {
+            Ok(found) => return Ok(found),
+            Err(fault) => status(&fault),
+        };
+        let sql = Statements::text(handle).ok_or(lost)?;
+        let statement = self.plan(client, sql).await?;
+        self.statements.keep_as(handle, statement.clone()).map_err(|f| status(&f))?;
+        Ok(statement)
+    }
+
     // A statement of a client's handle, for a run of its own on today's lake.
-    async fn prepared(&self, client: &Client, handle: &[u8]) -> Result<Statement, Status> {
-        let found = self.statements.find(client.name(), handle).map_err(|f| status(&f))?;
+    async fn prepared(&self, client: &Arc<Client>, handle: &[u8]) -> Result<Statement, Status> {
+        let found = self.find(client, handle).await?;
         let mut statement = Statement { stop: Stop::new(), ..found };
         if statement.planned.elapsed() >= FRESH {
             statement.prepared = self.prepare(&statement.session, &statement.sql).await?;
@@ -113,7 +120,8 @@ impl Flight {
         let given = told.clone();
         let begun = self.service.begin(job, move |schema| Ok(Told(given.unwrap_or_else(|| schema.clone())))).await;
         let running = begun.map_err(|f| status(&f))?;
-        Ok(answer::run(told.unwrap_or_else(|| running.schema.clone()), running))
+        let schema = told.unwrap_or_else(|| running.schema.clone());
+        answer::run(schema, running).await.map_err(|f| status(&f))
     }
 
     fn cancel(&self, client: &Client, info: &FlightInfo) -> Result<(), Status> {
@@ -154,7 +162,7 @@ impl FlightSqlService for Flight {
         &self,
         request: Request<Streaming<HandshakeRequest>>,
     ) -> Result<Response<Pin<Box<dyn Stream<Item = Result<HandshakeResponse, Status>> + Send>>>, Status> {
-        self.client(&request)?;
+        self.client()?;
         let token = request.metadata().get("authorization").and_then(|v| v.to_str().ok()).and_then(of_header);
         let token = token.unwrap_or_default();
         let payload = Bytes::from(token.clone().into_bytes());
@@ -171,7 +179,7 @@ impl FlightSqlService for Flight {
         query: CommandStatementQuery,
         request: Request<FlightDescriptor>,
     ) -> Result<Response<FlightInfo>, Status> {
-        let client = self.client(&request)?;
+        let client = self.client()?;
         let statement = self.plan(&client, query.query).await?;
         self.ticket(statement, request.into_inner())
     }
@@ -179,19 +187,19 @@ impl FlightSqlService for Flight {
     async fn do_get_statement(
         &self,
         ticket: TicketStatementQuery,
-        request: Request<Ticket>,
+        _: Request<Ticket>,
     ) -> Result<Response<<Self as FlightService>::DoGetStream>, Status> {
-        let client = self.client(&request)?;
-        let found = self.statements.find(client.name(), &ticket.statement_handle);
-        self.run(found.map_err(|f| status(&f))?).await
+        let client = self.client()?;
+        let found = self.find(&client, &ticket.statement_handle).await?;
+        self.run(found).await
     }
 
     async fn do_action_create_prepared_statement(
         &self,
         query: ActionCreatePreparedStatementRequest,
-        request: Request<Action>,
+        _: Request<Action>,
     ) -> Result<ActionCreatePreparedStatementResult, Status> {
-        let client = self.client(&request)?;
+        let client = self.client()?;
         let statement = self.plan(&client, query.query).await?;
         let parameters = values::parameter_schema(&statement.prepared).map_err(|f| status(&f))?;
         let dataset_schema = match is_settled(&statement.schema) {
@@ -210,9 +218,9 @@ impl FlightSqlService for Flight {
         query: CommandPreparedStatementQuery,
         request: Request<PeekableFlightDataStream>,
     ) -> Result<DoPutPreparedStatementResult, Status> {
-        let client = self.client(&request)?;
+        let client = self.client()?;
         let handle = query.prepared_statement_handle;
-        let statement = self.statements.find(client.name(), &handle).map_err(|f| status(&f))?;
+        let statement = self.find(&client, &handle).await?;
         let values = values::read(request.into_inner(), &statement.prepared).await.map_err(|f| status(&f))?;
         self.statements.bind(client.name(), &handle, values).map_err(|f| status(&f))?;
         Ok(DoPutPreparedStatementResult { prepared_statement_handle: Some(handle) })
@@ -223,7 +231,7 @@ impl FlightSqlService for Flight {
         query: CommandPreparedStatementQuery,
         request: Request<FlightDescriptor>,
     ) -> Result<Response<FlightInfo>, Status> {
-        let client = self.client(&request)?;
+        let client = self.client()?;
         let statement = self.prepared(&client, &query.prepared_statement_handle).await?;
         self.ticket(statement, request.into_inner())
     }
@@ -231,9 +239,9 @@ impl FlightSqlService for Flight {
     async fn do_get_prepared_statement(
         &self,
         query: CommandPreparedStatementQuery,
-        request: Request<Ticket>,
+        _: Request<Ticket>,
     ) -> Result<Response<<Self as FlightService>::DoGetStream>, Status> {
-        let client = self.client(&request)?;
+        let client = self.client()?;
         let statement = self.prepared(&client, &query.prepared_statement_handle).await?;
         self.run(statement).await
     }
@@ -241,9 +249,9 @@ impl FlightSqlService for Flight {
     async fn do_action_close_prepared_statement(
         &self,
         query: ActionClosePreparedStatementRequest,
-        request: Request<Action>,
+        _: Request<Action>,
     ) -> Result<(), Status> {
-        let client = self.client(&request)?;
+        let client = self.client()?;
         self.statements.forget(client.name(), &query.prepared_statement_handle);
         Ok(())
     }
@@ -251,9 +259,9 @@ impl FlightSqlService for Flight {
     async fn do_action_cancel_query(
         &self,
         query: ActionCancelQueryRequest,
-        request: Request<Action>,
+        _: Request<Action>,
     ) -> Result<ActionCancelQueryResult, Status> {
-        let client = self.client(&request)?;
+        let client = self.client()?;
         let info = FlightInfo::decode(query.info).map_err(|e| Status::invalid_argument(e.to_string()))?;
         self.cancel(&client, &info)?;
         Ok(ActionCancelQueryResult { result: CANCELLED })
@@ -263,7 +271,7 @@ impl FlightSqlService for Flight {
         &self,
         request: Request<Action>,
     ) -> Result<Response<<Self as FlightService>::DoActionStream>, Status> {
-        let client = self.client(&request)?;
+        let client = self.client()?;
         let action = request.into_inner();
         if action.r#type != CANCEL_FLIGHT_INFO {
             return Err(status(&Fault::unsupported(format!("the action `{}`", action.r#type))));
@@ -281,16 +289,16 @@ impl FlightSqlService for Flight {
         query: CommandGetCatalogs,
         request: Request<FlightDescriptor>,
     ) -> Result<Response<FlightInfo>, Status> {
-        self.client(&request)?;
+        self.client()?;
         batch_info(&query, &query.into_builder().schema(), request)
     }
 
     async fn do_get_catalogs(
         &self,
         query: CommandGetCatalogs,
-        request: Request<Ticket>,
+        _: Request<Ticket>,
     ) -> Result<Response<<Self as FlightService>::DoGetStream>, Status> {
-        self.client(&request)?;
+        self.client()?;
         let mut catalogs = query.into_builder();
         catalogs.append(CATALOG);
         answer::batch(catalogs.build())
@@ -301,16 +309,16 @@ impl FlightSqlService for Flight {
         query: CommandGetDbSchemas,
         request: Request<FlightDescriptor>,
     ) -> Result<Response<FlightInfo>, Status> {
-        self.client(&request)?;
+        self.client()?;
         batch_info(&query, &query.clone().into_builder().schema(), request)
     }
 
     async fn do_get_schemas(
         &self,
         query: CommandGetDbSchemas,
-        request: Request<Ticket>,
+        _: Request<Ticket>,
     ) -> Result<Response<<Self as FlightService>::DoGetStream>, Status> {
-        self.client(&request)?;
+        self.client()?;
         let mut schemas = query.into_builder();
         schemas.append(CATALOG, SCHEMA);
         answer::batch(schemas.build())
@@ -321,16 +329,16 @@ impl FlightSqlService for Flight {
         query: CommandGetTables,
         request: Request<FlightDescriptor>,
     ) -> Result<Response<FlightInfo>, Status> {
-        self.client(&request)?;
+        self.client()?;
         batch_info(&query, &query.clone().into_builder().schema(), request)
     }
 
     async fn do_get_tables(
         &self,
         query: CommandGetTables,
-        request: Request<Ticket>,
+        _: Request<Ticket>,
     ) -> Result<Response<<Self as FlightService>::DoGetStream>, Status> {
-        self.client(&request)?;
+        self.client()?;
         let mut tables = query.into_builder();
         for (name, schema) in self.service.tables() {
             tables.append(CATALOG, SCHEMA, name, TABLE, &schema).map_err(|e| Status::internal(e.to_string()))?;
@@ -343,16 +351,16 @@ impl FlightSqlService for Flight {
         query: CommandGetTableTypes,
         request: Request<FlightDescriptor>,
     ) -> Result<Response<FlightInfo>, Status> {
-        self.client(&request)?;
+        self.client()?;
         batch_info(&query, &query.into_builder().schema(), request)
     }
 
     async fn do_get_table_types(
         &self,
         query: CommandGetTableTypes,
-        request: Request<Ticket>,
+        _: Request<Ticket>,
     ) -> Result<Response<<Self as FlightService>::DoGetStream>, Status> {
-        self.client(&request)?;
+        self.client()?;
         let mut kinds = query.into_builder();
         kinds.append(TABLE);
         answer::batch(kinds.build())
@@ -363,16 +371,16 @@ impl FlightSqlService for Flight {
         query: CommandGetSqlInfo,
         request: Request<FlightDescriptor>,
     ) -> Result<Response<FlightInfo>, Status> {
-        self.client(&request)?;
+        self.client()?;
         batch_info(&query, &self.sql_info.schema(), request)
     }
 
     async fn do_get_sql_info(
         &self,
         query: CommandGetSqlInfo,
-        request: Request<Ticket>,
+        _: Request<Ticket>,
     ) -> Result<Response<<Self as FlightService>::DoGetStream>, Status> {
-        self.client(&request)?;
+        self.client()?;
         answer::batch(query.into_builder(&self.sql_info).build())
     }
 
@@ -381,16 +389,16 @@ impl FlightSqlService for Flight {
         query: CommandGetXdbcTypeInfo,
         request: Request<FlightDescriptor>,
     ) -> Result<Response<FlightInfo>, Status> {
-        self.client(&request)?;
+        self.client()?;
         batch_info(&query, &self.types.schema(), request)
     }
 
     async fn do_get_xdbc_type_info(
         &self,
         query: CommandGetXdbcTypeInfo,
-        request: Request<Ticket>,
+        _: Request<Ticket>,
     ) -> Result<Response<<Self as FlightService>::DoGetStream>, Status> {
-        self.client(&request)?;
+        self.client()?;
         answer::batch(query.into_builder(&self.types).build())
     }
 
@@ -399,16 +407,16 @@ impl FlightSqlService for Flight {
         query: CommandGetPrimaryKeys,
         request: Request<FlightDescriptor>,
     ) -> Result<Response<FlightInfo>, Status> {
-        self.client(&request)?;
+        self.client()?;
         batch_info(&query, &info::primary_key_schema(), request)
     }
 
     async fn do_get_primary_keys(
         &self,
         _: CommandGetPrimaryKeys,
-        request: Request<Ticket>,
+        _: Request<Ticket>,
     ) -> Result<Response<<Self as FlightService>::DoGetStream>, Status> {
-        self.client(&request)?;
+        self.client()?;
         answer::batch(Ok(arrow::array::RecordBatch::new_empty(answer::shared(info::primary_key_schema()))))
     }
 
@@ -417,16 +425,16 @@ impl FlightSqlService for Flight {
         query: CommandGetExportedKeys,
         request: Request<FlightDescriptor>,
     ) -> Result<Response<FlightInfo>, Status> {
-        self.client(&request)?;
+        self.client()?;
         batch_info(&query, &info::key_schema(), request)
     }
 
     async fn do_get_exported_keys(
         &self,
         _: CommandGetExportedKeys,
-        request: Request<Ticket>,
+        _: Request<Ticket>,
     ) -> Result<Response<<Self as FlightService>::DoGetStream>, Status> {
-        self.client(&request)?;
+        self.client()?;
         no_keys()
     }
 
@@ -435,16 +443,16 @@ impl FlightSqlService for Flight {
         query: CommandGetImportedKeys,
         request: Request<FlightDescriptor>,
     ) -> Result<Response<FlightInfo>, Status> {
-        self.client(&request)?;
+        self.client()?;
         batch_info(&query, &info::key_schema(), request)
     }
 
     async fn do_get_imported_keys(
         &self,
         _: CommandGetImportedKeys,
-        request: Request<Ticket>,
+        _: Request<Ticket>,
     ) -> Result<Response<<Self as FlightService>::DoGetStream>, Status> {
-        self.client(&request)?;
+        self.client()?;
         no_keys()
     }
 
@@ -453,25 +461,25 @@ impl FlightSqlService for Flight {
         query: CommandGetCrossReference,
         request: Request<FlightDescriptor>,
     ) -> Result<Response<FlightInfo>, Status> {
-        self.client(&request)?;
+        self.client()?;
         batch_info(&query, &info::key_schema(), request)
     }
 
     async fn do_get_cross_reference(
         &self,
         _: CommandGetCrossReference,
-        request: Request<Ticket>,
+        _: Request<Ticket>,
     ) -> Result<Response<<Self as FlightService>::DoGetStream>, Status> {
-        self.client(&request)?;
+        self.client()?;
         no_keys()
     }
 
     async fn do_put_statement_update(
         &self,
         query: CommandStatementUpdate,
-        request: Request<PeekableFlightDataStream>,
+        _: Request<PeekableFlightDataStream>,
     ) -> Result<i64, Status> {
-        let client = self.client(&request)?;
+        let client = self.client()?;
         // What is wrong with the statement itself is worth more than that updates are not for here.
         self.plan(&client, query.query).await?;
         Err(read_only())
@@ -480,27 +488,27 @@ impl FlightSqlService for Flight {
     async fn do_put_statement_ingest(
         &self,
         _: CommandStatementIngest,
-        request: Request<PeekableFlightDataStream>,
+        _: Request<PeekableFlightDataStream>,
     ) -> Result<i64, Status> {
-        self.client(&request)?;
+        self.client()?;
         Err(read_only())
     }
 
     async fn do_put_prepared_statement_update(
         &self,
         _: CommandPreparedStatementUpdate,
-        request: Request<PeekableFlightDataStream>,
+        _: Request<PeekableFlightDataStream>,
     ) -> Result<i64, Status> {
-        self.client(&request)?;
+        self.client()?;
         Err(read_only())
     }
 
     async fn do_action_begin_transaction(
         &self,
         _: ActionBeginTransactionRequest,
-        request: Request<Action>,
+        _: Request<Action>,
     ) -> Result<ActionBeginTransactionResult, Status> {
-        self.client(&request)?;
+        self.client()?;
         Err(status(&Fault::unsupported("a transaction (each query sees one frozen view of the lake)")))
     }
 

@@ -1,5 +1,5 @@
-//! Statements that clients hold handles of. A handle is random, belongs to the client that made it, and is forgotten
-//! when it is not used: a stolen or invented one leads to nothing.
+//! Statements that clients hold handles of. A handle begins with a random number, under which the statement is kept until
+//! it is not used any more, and goes on with its text, so that another engine of the same client can plan it anew.
 
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -14,6 +14,8 @@ use crate::fault::Fault;
 use crate::random;
 use crate::running::Stop;
 
+/// Bytes of a text up to which handles carry it.
+const CARRIED_BYTES: usize = 32 << 10;
 /// How long an unused handle is good for.
 const KEPT: Duration = Duration::from_secs(600);
 /// Handles of one client; the one not used for longest makes room.
@@ -54,6 +56,26 @@ impl Statements {
             eprintln!("no random bytes: {failed}");
             Fault::Internal
         })?;
+        let sql = Some(statement.sql.clone()).filter(|sql| sql.len() <= CARRIED_BYTES);
+        let whole = [&handle, sql.as_deref().unwrap_or_default().as_bytes()].concat();
+        self.insert(handle, statement);
+        Ok(whole.into())
+    }
+
+    /// Keeps a statement under a handle that another engine made.
+    pub(super) fn keep_as(&self, handle: &[u8], statement: Statement) -> Result<(), Fault> {
+        let (handle, _) = handle.split_first_chunk().ok_or_else(gone)?;
+        self.insert(*handle, statement);
+        Ok(())
+    }
+
+    /// The text that a handle carries.
+    pub(super) fn text(handle: &[u8]) -> Option<String> {
+        let (_, sql) = handle.split_first_chunk::<{ size_of::<Handle>() }>()?;
+        String::from_utf8(sql.to_vec()).ok().filter(|sql| !sql.is_empty())
+    }
+
+    fn insert(&self, handle: Handle, statement: Statement) {
         let mut all = self.lock();
         all.retain(|_, kept| kept.used.elapsed() < KEPT);
         let owner = statement.session.client().name();
@@ -67,7 +89,6 @@ impl Statements {
             all.remove(oldest);
         }
         all.insert(handle, Kept { statement, used: Instant::now() });
-        Ok(Bytes::copy_from_slice(&handle))
     }
 
     /// The statement of a client's handle.
@@ -83,15 +104,14 @@ impl Statements {
     /// Forgets it; what runs goes on.
     pub(super) fn forget(&self, client: &str, handle: &[u8]) {
         if self.find(client, handle).is_ok() {
-            self.lock().retain(|known, _| known[..] != *handle);
+            self.lock().retain(|known, _| !handle.starts_with(known));
         }
     }
 
     fn with<T>(&self, client: &str, handle: &[u8], act: impl FnOnce(&mut Kept) -> T) -> Result<T, Fault> {
-        let gone = || Fault::NotFound { what: "this statement".to_owned(), hint: "ask again: it may have expired" };
-        let handle = Handle::try_from(handle).map_err(|_| gone())?;
+        let (handle, _) = handle.split_first_chunk().ok_or_else(gone)?;
         let mut all = self.lock();
-        let kept = all.get_mut(&handle).filter(|kept| kept.statement.session.client().name() == client);
+        let kept = all.get_mut(handle).filter(|kept| kept.statement.session.client().name() == client);
         let kept = kept.filter(|kept| kept.used.elapsed() < KEPT).ok_or_else(gone)?;
         kept.used = Instant::now();
         Ok(act(kept))
@@ -100,4 +120,8 @@ impl Statements {
     fn lock(&self) -> MutexGuard<'_, HashMap<Handle, Kept>> {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
+}
+
+fn gone() -> Fault {
+    Fault::NotFound { what: "this statement".to_owned(), hint: "ask again: it may have expired" }
 }

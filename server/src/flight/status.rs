@@ -9,7 +9,7 @@ use crate::fault::{Code, Fault};
 const CODE: &str = "echolake-code";
 
 /// A failure as a status.
-pub(super) fn status(fault: &Fault) -> Status {
+pub(crate) fn status(fault: &Fault) -> Status {
     let code = fault.code();
     let mut metadata = MetadataMap::new();
     metadata.insert(CODE, MetadataValue::from_static(code.name()));
@@ -29,6 +29,7 @@ fn grpc(code: Code) -> Grpc {
         Code::Cancelled => Grpc::Cancelled,
         Code::TimeLimit => Grpc::DeadlineExceeded,
         Code::TooLarge | Code::TooMany | Code::MemoryLimit | Code::RowLimit => Grpc::ResourceExhausted,
+        Code::EngineEnded => Grpc::Aborted,
         Code::Internal => Grpc::Internal,
     }
 }

@@ -2,6 +2,8 @@
 
 use arrow::array::RecordBatch;
 use arrow::datatypes::{DataType, Field, Schema};
+use arrow::ipc::root_as_message;
+use arrow_flight::FlightData;
 use arrow_flight::decode::FlightRecordBatchStream;
 use arrow_flight::error::FlightError;
 use arrow_flight::sql::server::PeekableFlightDataStream;
@@ -20,10 +22,22 @@ pub(super) fn parameter_schema(prepared: &Prepared) -> Result<Schema, Fault> {
     Ok(Schema::new(fields.collect::<Vec<_>>()))
 }
 
+// What a compressed body says of its own length is believed, and allocated, before anything is unpacked.
+fn uncompressed(message: FlightData) -> Result<FlightData, FlightError> {
+    let header = root_as_message(&message.data_header).map_err(|e| FlightError::DecodeError(e.to_string()))?;
+    let batch = header.header_as_dictionary_batch().and_then(|dictionary| dictionary.data());
+    let batch = header.header_as_record_batch().or(batch);
+    match batch.and_then(|batch| batch.compression()) {
+        None => Ok(message),
+        Some(_) => Err(FlightError::DecodeError("their body is compressed; hint: one row needs no compression".to_owned())),
+    }
+}
+
 /// The values that a client puts.
 pub(super) async fn read(stream: PeekableFlightDataStream, prepared: &Prepared) -> Result<ParamValues, Fault> {
     let wrong = |e: FlightError| Fault::request(format!("the values cannot be read: {e}"));
     let data = stream.into_peekable().map_err(|status| FlightError::Tonic(Box::new(status)));
+    let data = data.and_then(async |message| uncompressed(message));
     let mut batches = FlightRecordBatchStream::new_from_flight_data(data);
     let mut row: Option<RecordBatch> = None;
     while let Some(batch) = batches.try_next().await.map_err(wrong)? {

@@ -18,9 +18,8 @@ use object_store::{GetOptions, GetRange, ObjectStore as _, ObjectStoreExt as _};
 use serde::Deserialize;
 
 use super::catalogue::{self, Asked as Asking, Catalogue, View, text};
-use super::guard;
 use super::problem::Problem;
-use super::ranges::{self, Asked, Described};
+use super::ranges::{Asked, Described};
 use crate::fault::Fault;
 use crate::tokens::Scope;
 
@@ -32,12 +31,7 @@ pub(super) const TABLE: &str = "/api/v1/tables/{table}/{file}";
 /// Viewers on other pages read run files, so whoever may ask for them may do so from anywhere: without credentials, and
 /// told what ranges need. A page of elsewhere finds out no run's name here.
 pub(super) fn for_viewers(catalogue: &Catalogue) -> Router {
-    // Here and not for all routes: a preflight must come to the layer.
-    Router::new()
-        .route(RUN, get(run))
-        .method_not_allowed_fallback(super::wrong_method)
-        .layer(ranges::cors())
-        .with_state(catalogue.clone())
+    Router::new().route(RUN, get(run)).with_state(catalogue.clone())
 }
 
 /// The files that only the server's own pages and programs read.
@@ -50,7 +44,7 @@ async fn run(
     path: Result<Path<String>, PathRejection>,
     headers: HeaderMap,
 ) -> Result<Response, Problem> {
-    guard::client(catalogue.service(), &headers, Scope::Files)?;
+    catalogue.service().client(Scope::Files)?;
     let Path(name) = path.map_err(|_| Fault::request("the path is not UTF-8"))?;
     let view = catalogue.view().await?;
     let run = catalogue::run(&view, &name)?;
@@ -70,7 +64,7 @@ async fn table(
     path: Result<Path<(String, String)>, PathRejection>,
     headers: HeaderMap,
 ) -> Result<Response, Problem> {
-    guard::client(catalogue.service(), &headers, Scope::Files)?;
+    catalogue.service().client(Scope::Files)?;
     let Path((table, name)) = path.map_err(|_| Fault::request("the path is not UTF-8"))?;
     let view = catalogue.view().await?;
     let hint = "GET /api/v1/tables/{table} lists what there is";

@@ -14,33 +14,55 @@ use echolake_query::Client;
 
 use super::problem::Problem;
 use super::ranges::POLICY;
+use crate::client_identity::ClientIdentity;
 use crate::fault::Fault;
 use crate::service::Service;
-use crate::tokens::{Scope, of_header};
+use crate::tokens::{Access, Scope, of_header};
 
 const FETCH_SITE: HeaderName = HeaderName::from_static("sec-fetch-site");
 
 /// Whoever may ask in SQL.
 pub(super) struct MayQuery(pub(super) Arc<Client>);
-/// Whoever may see the server's figures.
-pub(super) struct MaySeeMetrics;
 
 /// The cookie of a browser's session.
 pub(super) const COOKIE: &str = "echolake";
 
-/// Who asks, by token or by session.
+/// Who asks, by token or by session; `local` makes the client of a server that has no tokens.
 ///
 /// # Errors
-/// [`Fault::Unauthenticated`], [`Fault::Forbidden`], [`Fault::Foreign`].
-pub(super) fn client(service: &Service, headers: &HeaderMap, scope: Scope) -> Result<Arc<Client>, Fault> {
+/// [`Fault::Unauthenticated`], [`Fault::Foreign`].
+pub(crate) fn authenticate(
+    access: &Access,
+    headers: &HeaderMap,
+    local: impl FnOnce() -> ClientIdentity,
+) -> Result<Arc<ClientIdentity>, Fault> {
     let token = headers.get(header::AUTHORIZATION).and_then(|v| v.to_str().ok()).and_then(of_header);
-    let client = match (token, cookie(headers)) {
+    match (token, cookie(headers)) {
         // A browser sends the cookie along whichever page of this machine asks, on whatever port it was served.
         (None, Some(secret)) => is_same_origin(headers, &["http://", "https://"])
-            .and_then(|()| service.access().client_of_session(secret, scope)),
-        (token, _) => service.access().client(token.as_deref(), scope),
-    };
-    client.inspect_err(|fault| service.metrics().failed(fault.code()))
+            .and_then(|()| access.client_of_session(secret, local)),
+        (token, _) => access.client(token.as_deref(), local),
+    }
+}
+
+/// What stands behind a request, as its headers tell.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum RequestSite {
+    /// A page of elsewhere.
+    Foreign,
+    /// A page of this server.
+    OwnPage,
+    /// A program of this machine.
+    Program,
+}
+
+/// Tells what stands behind a request to a server without tokens.
+pub(crate) fn request_site(headers: &HeaderMap) -> RequestSite {
+    match (is_own(headers), headers.contains_key(FETCH_SITE)) {
+        (Err(_), _) => RequestSite::Foreign,
+        (Ok(()), true) => RequestSite::OwnPage,
+        (Ok(()), false) => RequestSite::Program,
+    }
 }
 
 fn cookie(headers: &HeaderMap) -> Option<&str> {
@@ -51,30 +73,18 @@ fn cookie(headers: &HeaderMap) -> Option<&str> {
 impl FromRequestParts<Service> for MayQuery {
     type Rejection = Problem;
 
-    async fn from_request_parts(parts: &mut Parts, service: &Service) -> Result<Self, Problem> {
-        Ok(Self(client(service, &parts.headers, Scope::Sql)?))
+    async fn from_request_parts(_: &mut Parts, service: &Service) -> Result<Self, Problem> {
+        Ok(Self(service.client(Scope::Sql)?))
     }
 }
 
-impl FromRequestParts<Service> for MaySeeMetrics {
-    type Rejection = Problem;
-
-    async fn from_request_parts(parts: &mut Parts, service: &Service) -> Result<Self, Problem> {
-        client(service, &parts.headers, Scope::Metrics)?;
-        Ok(Self)
-    }
-}
-
-/// Lets no page of elsewhere through.
-pub(super) async fn own_pages_only(State(service): State<Service>, request: Request, next: Next) -> Response {
+/// Lets no page of elsewhere through, where there are no tokens.
+pub(super) async fn own_pages_only(State(is_open): State<bool>, request: Request, next: Next) -> Response {
     // With tokens there is nothing that a page could use without having one.
-    if service.access().is_open()
-        && let Err(fault) = is_own(request.headers())
-    {
-        service.metrics().failed(fault.code());
-        return Problem(fault).into_response();
+    match is_own(request.headers()) {
+        Err(fault) if is_open => Problem(fault).into_response(),
+        _ => next.run(request).await,
     }
-    next.run(request).await
 }
 
 /// Whether a request comes from this machine's own programs and pages.

@@ -2,12 +2,15 @@
 
 use axum::Json;
 use axum::extract::State;
-use axum::http::header;
+use axum::http::{HeaderMap, header};
 use axum::response::IntoResponse;
 use serde_json::{Value, json};
 
-use super::guard::MaySeeMetrics;
-use crate::service::Service;
+use super::guard::authenticate;
+use super::problem::Problem;
+use crate::client_identity::ClientIdentity;
+use crate::door::Door;
+use crate::tokens::Scope;
 
 /// That it answers.
 pub(super) async fn health() -> Json<Value> {
@@ -15,6 +18,8 @@ pub(super) async fn health() -> Json<Value> {
 }
 
 /// The figures, in Prometheus' text format.
-pub(super) async fn metrics(State(service): State<Service>, _: MaySeeMetrics) -> impl IntoResponse {
-    ([(header::CONTENT_TYPE, "text/plain; version=0.0.4; charset=utf-8")], service.metrics().text())
+pub(super) async fn metrics(State(door): State<Door>, headers: HeaderMap) -> Result<impl IntoResponse, Problem> {
+    let client = authenticate(door.access(), &headers, ClientIdentity::pages);
+    client.and_then(|client| client.require(Scope::Metrics)).inspect_err(|f| door.metrics().failed(f.code()))?;
+    Ok(([(header::CONTENT_TYPE, "text/plain; version=0.0.4; charset=utf-8")], door.figures()))
 }

@@ -11,7 +11,6 @@ use echolake_schema::tables::Table;
 use serde::Serialize;
 
 use super::catalogue::{self, Catalogue, Params, is_known};
-use super::guard;
 use super::problem::Problem;
 use crate::fault::Fault;
 use crate::tokens::Scope;
@@ -42,7 +41,7 @@ pub(super) fn for_own(catalogue: &Catalogue) -> Router {
 }
 
 async fn files(State(catalogue): State<Catalogue>, uri: Uri, headers: HeaderMap) -> Result<Response, Problem> {
-    guard::client(catalogue.service(), &headers, Scope::Files)?;
+    catalogue.service().client(Scope::Files)?;
     let params = Params::of(&uri)?;
     let tables = params.all("table").map(catalogue::table).collect::<Result<Vec<_>, Fault>>()?;
     let view = catalogue.view().await?;

@@ -1,7 +1,7 @@
-//! HTTP: queries, the catalogue, the lake's files, the pages, health and figures.
+//! HTTP. An engine answers what reads the lake ([`serve`]): queries, the catalogue, files and slices. The door answers the
+//! rest ([`door_router`]): pages, sessions, health and figures.
 
 mod catalogue;
-mod connections;
 mod files;
 mod format;
 mod guard;
@@ -18,53 +18,75 @@ mod slices;
 mod sql;
 
 use axum::Router;
-use axum::middleware::from_fn_with_state;
-use axum::routing::{get, post};
-use tokio::net::TcpListener;
+use axum::middleware::{from_fn_with_state, map_response};
+use axum::routing::{any, get, post};
+use hyper::server::conn::http1;
+use hyper_util::rt::TokioIo;
+use hyper_util::service::TowerToHyperService;
+use tokio::net::UnixListener;
 use tower_http::catch_panic::CatchPanicLayer;
 
 use crate::Error;
+use crate::door::Door;
 use crate::fault::Fault;
 use crate::service::Service;
 use catalogue::Catalogue;
-use problem::Problem;
+pub(crate) use guard::{RequestSite, authenticate, request_site};
+pub(crate) use problem::Problem;
 
-/// Answers HTTP until `stop`.
-pub(crate) async fn serve(
-    service: Service,
-    listener: TcpListener,
-    stop: impl Future<Output = ()> + Send + 'static,
-) -> Result<(), Error> {
-    connections::serve(listener, router(service), stop).await;
-    Ok(())
+/// Answers HTTP on an engine's socket; a connection is one request.
+pub(crate) async fn serve(service: Service, listener: UnixListener) -> Result<(), Error> {
+    let router = engine_router(&service);
+    loop {
+        let (stream, _) = listener.accept().await.map_err(Error::System)?;
+        let answers = TowerToHyperService::new(router.clone());
+        let guard = service.activity().enter();
+        tokio::spawn(async move {
+            let _guard = guard;
+            // A connection that breaks off is the door's matter.
+            let _ = http1::Builder::new().serve_connection(TokioIo::new(stream), answers).await;
+        });
+    }
 }
 
-fn router(service: Service) -> Router {
+fn engine_router(service: &Service) -> Router {
     let catalogue = Catalogue::new(service.clone());
     let own = Router::new()
         .route("/api/v1/sql", post(sql::post))
-        .route("/api/v1/session", post(session::post))
-        .route("/api/v1/openapi.json", get(openapi::get))
-        .route("/metrics", get(health::metrics))
-        .route("/health", get(health::health))
         .with_state(service.clone())
         .merge(catalogue.router())
         .merge(files::for_own(&catalogue))
         .merge(manifest::for_own(&catalogue))
-        .layer(from_fn_with_state(service, guard::own_pages_only));
+        .layer(from_fn_with_state(service.is_open(), guard::own_pages_only));
+    let all = own.merge(files::for_viewers(&catalogue)).merge(slices::for_viewers(&catalogue)).fallback(nothing);
+    with_refusals(all)
+}
+
+/// The paths of the server: those of the door, and those that it forwards to the engine of who asks.
+pub(crate) fn door_router(door: &Door) -> Router {
+    let own = Router::new()
+        .route("/api/v1/session", post(session::post))
+        .route("/api/v1/openapi.json", get(openapi::get))
+        .route("/metrics", get(health::metrics))
+        .route("/health", get(health::health))
+        .layer(from_fn_with_state(door.access().is_open(), guard::own_pages_only));
+    let viewers = [files::RUN, slices::SLICE, slices::FOXGLOVE_MANIFEST];
+    // Here and not for all routes: a preflight must come to the layer.
+    let viewers = viewers.into_iter().fold(Router::new(), |router, path| router.route(path, any(Door::forward_http)));
+    let forwarded = Router::new().route("/api/{*path}", any(Door::forward_http)).merge(viewers.layer(ranges::cors()));
     #[cfg(feature = "web")]
     let rest = pages::fallback;
     #[cfg(not(feature = "web"))]
     let rest = nothing;
-    Router::new()
-        .merge(own)
-        .merge(files::for_viewers(&catalogue))
-        .merge(slices::for_viewers(&catalogue))
-        .merge(layout::for_viewers())
-        .fallback(rest)
+    let all = own.merge(forwarded).with_state(door.clone()).merge(layout::for_viewers()).fallback(rest);
+    with_refusals(all)
+}
+
+fn with_refusals(router: Router) -> Router {
+    router
         .method_not_allowed_fallback(wrong_method)
         .layer(CatchPanicLayer::custom(|_| Problem(Fault::Internal).answer()))
-        .layer(axum::middleware::map_response(guard::security_headers))
+        .layer(map_response(guard::security_headers))
 }
 
 async fn nothing() -> Problem {

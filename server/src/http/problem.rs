@@ -7,7 +7,7 @@ use serde::Serialize;
 use crate::fault::{Code, Fault};
 
 /// A failure, to be answered.
-pub(super) struct Problem(pub(super) Fault);
+pub(crate) struct Problem(pub(crate) Fault);
 
 #[derive(Serialize)]
 struct Body<'a> {
@@ -27,7 +27,7 @@ impl From<Fault> for Problem {
 
 impl Problem {
     /// It as a response.
-    pub(super) fn answer(&self) -> Response {
+    pub(crate) fn answer(&self) -> Response {
         let code = self.0.code();
         let (status, title) = status(code);
         let body = Body {
@@ -77,6 +77,7 @@ fn status(code: Code) -> (StatusCode, &'static str) {
         Code::MemoryLimit => (StatusCode::INSUFFICIENT_STORAGE, "There is not enough memory or disk"),
         Code::RowLimit => (StatusCode::UNPROCESSABLE_ENTITY, "The answer is too long"),
         Code::TooMany => (StatusCode::TOO_MANY_REQUESTS, "Too much at once"),
+        Code::EngineEnded => (StatusCode::INTERNAL_SERVER_ERROR, "The query ended its engine"),
         Code::Internal => (StatusCode::INTERNAL_SERVER_ERROR, "The server failed"),
     }
 }

@@ -9,8 +9,8 @@ use serde::Deserialize;
 
 use super::guard::COOKIE;
 use super::problem::Problem;
+use crate::door::Door;
 use crate::fault::Fault;
-use crate::service::Service;
 use crate::sessions::LIFETIME;
 
 /// Bytes of a request: a token is short.
@@ -24,13 +24,13 @@ struct Shown {
 
 /// Begins a session.
 pub(super) async fn post(
-    State(service): State<Service>,
+    State(door): State<Door>,
     body: Result<Bytes, BytesRejection>,
 ) -> Result<impl IntoResponse, Problem> {
     let body = body.ok().filter(|b| b.len() <= LARGEST).ok_or(Fault::TooLarge { limit: LARGEST })?;
     let Shown { token } = serde_json::from_slice(&body)
         .map_err(|_| Fault::request("the body is not as expected; hint: {\"token\": \"echolake_...\"}"))?;
-    let secret = service.access().begin_session(&token).inspect_err(|f| service.metrics().failed(f.code()))?;
+    let secret = door.access().begin_session(&token).inspect_err(|f| door.metrics().failed(f.code()))?;
     let cookie = format!("{COOKIE}={secret}; HttpOnly; SameSite=Strict; Path=/; Max-Age={}", LIFETIME.as_secs());
     Ok((StatusCode::NO_CONTENT, [(header::SET_COOKIE, cookie)]))
 }

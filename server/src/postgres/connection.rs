@@ -1,9 +1,8 @@
 //! A connection: its session, settings and cursors, and what runs on it.
 
 use std::collections::{HashMap, HashSet};
-use std::sync::atomic::{AtomicI32, AtomicUsize, Ordering};
+use std::sync::atomic::{AtomicI32, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
-use std::time::Duration;
 
 use bytes::Bytes;
 use datafusion::common::ParamValues;
@@ -13,7 +12,7 @@ use futures::FutureExt as _;
 use futures::future::BoxFuture;
 use pgwire::api::Type;
 use pgwire::messages::startup::SecretKey;
-use tokio::sync::{OwnedSemaphorePermit, SetOnce};
+use tokio::sync::SetOnce;
 
 use super::catalog::PgCatalog;
 use super::cursor::Cursor;
@@ -32,8 +31,6 @@ const CURSORS: usize = 16;
 const LARGEST: usize = 2 << 20;
 /// Prepared statements of a connection at once, and portals.
 const NAMED: usize = 500;
-/// How often a server that stops looks whether a connection is done.
-const LOOK: Duration = Duration::from_millis(50);
 
 /// What a client cancels by: the process's number and the secret that it was given.
 type BackendKey = (i32, Bytes);
@@ -66,13 +63,11 @@ impl Shared {
 /// A connection.
 pub(super) struct Connection {
     shared: Arc<Shared>,
-    place: Option<OwnedSemaphorePermit>,
     session: SetOnce<Arc<Session>>,
     key: OnceLock<BackendKey>,
     current: Arc<Mutex<Stop>>,
     cursors: Mutex<HashMap<String, Arc<Cursor>>>,
     kept: Mutex<HashSet<(Kept, String)>>,
-    busy: AtomicUsize,
     pub(super) settings: Arc<Settings>,
 }
 
@@ -81,15 +76,6 @@ impl Drop for Connection {
         if let Some(key) = self.key.get() {
             lock(&self.shared.running).remove(key);
         }
-    }
-}
-
-/// Something that is being done; a server that stops waits for it.
-pub(super) struct Busy<'a>(&'a AtomicUsize);
-
-impl Drop for Busy<'_> {
-    fn drop(&mut self) {
-        self.0.fetch_sub(1, Ordering::Relaxed);
     }
 }
 
@@ -117,28 +103,21 @@ pub(super) struct Run {
 }
 
 impl Connection {
-    /// A connection that nobody has logged in on; without a place it is one too many.
-    pub(super) fn new(shared: Arc<Shared>, place: Option<OwnedSemaphorePermit>) -> Self {
+    /// A connection that nobody has logged in on.
+    pub(super) fn new(shared: Arc<Shared>) -> Self {
         Self {
             shared,
-            place,
             session: SetOnce::new(),
             key: OnceLock::new(),
             current: Arc::new(Mutex::new(Stop::new())),
             cursors: Mutex::default(),
             kept: Mutex::default(),
-            busy: AtomicUsize::new(0),
             settings: Arc::default(),
         }
     }
 
     pub(super) fn shared(&self) -> &Shared {
         &self.shared
-    }
-
-    /// Whether there is a place for it.
-    pub(super) fn has_place(&self) -> bool {
-        self.place.is_some()
     }
 
     /// Logs a client in; returns what a CancelRequest must show. `wide` keys are of protocol 3.2.
@@ -169,19 +148,6 @@ impl Connection {
     /// Waits until somebody has logged in.
     pub(super) async fn logged_in(&self) {
         self.session.wait().await;
-    }
-
-    /// Marks it as doing something.
-    pub(super) fn busy(&self) -> Busy<'_> {
-        self.busy.fetch_add(1, Ordering::Relaxed);
-        Busy(&self.busy)
-    }
-
-    /// Waits until it does nothing.
-    pub(super) async fn idle(&self) {
-        while self.busy.load(Ordering::Relaxed) > 0 {
-            tokio::time::sleep(LOOK).await;
-        }
     }
 
     /// Begins a command: a CancelRequest ends this one from now on.

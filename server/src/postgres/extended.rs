@@ -124,7 +124,6 @@ impl ExtendedQueryHandler for Extended {
         C::Error: Debug,
         PgWireError: From<<C as Sink<PgWireBackendMessage>>::Error>,
     {
-        let _busy = self.connection.busy();
         let name = message.name.clone().unwrap_or_else(|| DEFAULT_NAME.to_owned());
         let parsed = StoredStatement::parse(client, &message, self.parser.clone()).await?;
         self.connection.remember(Kept::Statement, &name).map_err(|fault| error(&fault))?;
@@ -169,7 +168,6 @@ impl ExtendedQueryHandler for Extended {
         if !matches!(client.state(), PgWireConnectionState::ReadyForQuery) {
             return Err(PgWireError::NotReadyForQuery);
         }
-        let _busy = self.connection.busy();
         client.set_state(PgWireConnectionState::QueryInProgress);
         let name = message.name.as_deref().unwrap_or(DEFAULT_NAME);
         match client.portal_store().get_portal(name) {

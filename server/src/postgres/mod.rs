@@ -12,13 +12,12 @@ mod rewrite;
 mod rows;
 mod settings;
 mod simple;
-mod sqlstate;
+pub(crate) mod sqlstate;
 mod startup;
 mod statement;
 
 use std::io;
 use std::sync::Arc;
-use std::time::Duration;
 
 use async_trait::async_trait;
 use pgwire::api::PgWireServerHandlers;
@@ -26,79 +25,43 @@ use pgwire::api::auth::StartupHandler;
 use pgwire::api::cancel::CancelHandler;
 use pgwire::api::query::{ExtendedQueryHandler, SimpleQueryHandler};
 use pgwire::messages::cancel::CancelRequest;
-use pgwire::tokio::process_socket;
+use pgwire::tokio::process_socket_unix;
 use tokio::io::Interest;
-use tokio::net::{TcpListener, TcpStream};
-use tokio::sync::{Semaphore, watch};
-use tokio::task::JoinSet;
+use tokio::net::{UnixListener, UnixStream};
 
 use crate::Error;
 use crate::service::Service;
 use connection::Connection;
 use startup::Startup;
 
-/// Connections at once; one more is told so and closed.
-const CONNECTIONS: usize = 128;
-/// Pause after the system could not accept a connection, as when files run out.
-const PAUSE: Duration = Duration::from_millis(100);
-
-/// Answers Postgres' protocol until `stop`; then until the queries that run are answered.
-pub(crate) async fn serve(
-    service: Service,
-    listener: TcpListener,
-    stop: impl Future<Output = ()> + Send + 'static,
-) -> Result<(), Error> {
+/// Answers Postgres' protocol on an engine's socket.
+pub(crate) async fn serve(service: Service, listener: UnixListener) -> Result<(), Error> {
     let shared = Arc::new(connection::Shared::new(service)?);
-    let places = Arc::new(Semaphore::new(CONNECTIONS));
-    let stopping = watch::Sender::new(false);
-    let mut connections = JoinSet::new();
-    tokio::pin!(stop);
     loop {
-        tokio::select! {
-            () = &mut stop => break,
-            Some(_) = connections.join_next() => {}
-            accepted = listener.accept() => match accepted {
-                Ok((socket, _)) => {
-                    let place = places.clone().try_acquire_owned().ok();
-                    let connection = Arc::new(Connection::new(shared.clone(), place));
-                    connections.spawn(attend(socket, connection, stopping.subscribe()));
-                }
-                Err(failed) => {
-                    eprintln!("cannot accept a connection: {failed}");
-                    tokio::time::sleep(PAUSE).await;
-                }
-            },
-        }
+        let (socket, _) = listener.accept().await.map_err(Error::System)?;
+        tokio::spawn(attend(socket, Arc::new(Connection::new(shared.clone()))));
     }
-    stopping.send_replace(true);
-    while connections.join_next().await.is_some() {}
-    Ok(())
 }
 
 // What a connection asks ends with it: dropping the handlers drops the answers that they send.
-async fn attend(socket: TcpStream, connection: Arc<Connection>, mut stopping: watch::Receiver<bool>) {
+async fn attend(socket: UnixStream, connection: Arc<Connection>) {
     let Ok((socket, watched)) = twice(socket) else { return };
-    let idle = async {
-        let _ = stopping.wait_for(|stopping| *stopping).await;
-        connection.idle().await;
-    };
     tokio::select! {
-        // A client that breaks the protocol is its own affair.
-        _ = process_socket(socket, None, Handlers(connection.clone())) => {}
+        // What breaks the protocol is the client's own affair.
+        _ = process_socket_unix(socket, Handlers(connection.clone())) => {}
         () = gone(&watched, &connection) => {}
-        () = idle => {}
     }
 }
 
-fn twice(socket: TcpStream) -> io::Result<(TcpStream, TcpStream)> {
+fn twice(socket: UnixStream) -> io::Result<(UnixStream, UnixStream)> {
     let socket = socket.into_std()?;
     let watched = socket.try_clone()?;
-    Ok((TcpStream::from_std(socket)?, TcpStream::from_std(watched)?))
+    Ok((UnixStream::from_std(socket)?, UnixStream::from_std(watched)?))
 }
 
 // While a query runs nobody reads from the connection, so that its end must be watched for. Nothing runs before a
 // login, and who sends a CancelRequest hangs up behind it: it is read all the same.
-async fn gone(socket: &TcpStream, connection: &Connection) {
+async fn gone(socket: &UnixStream, connection: &Connection) {
     connection.logged_in().await;
     while let Ok(ready) = socket.ready(Interest::READABLE).await
         && !ready.is_read_closed()

@@ -42,7 +42,6 @@ impl SimpleQueryHandler for Simple {
         if !matches!(client.state(), PgWireConnectionState::ReadyForQuery) {
             return Err(PgWireError::NotReadyForQuery);
         }
-        let _busy = self.0.busy();
         client.set_state(PgWireConnectionState::QueryInProgress);
         let run = self.0.command();
         let statements = self.0.statements(&query.query, &[], &run).await.map_err(|fault| error(&fault))?;

@@ -6,12 +6,12 @@ use pgwire::error::{ErrorInfo, PgWireError};
 use crate::fault::{Code, Fault};
 
 /// A failure after which the connection goes on.
-pub(super) fn error(fault: &Fault) -> PgWireError {
+pub(crate) fn error(fault: &Fault) -> PgWireError {
     info("ERROR", fault)
 }
 
 /// A failure that ends the connection.
-pub(super) fn fatal(fault: &Fault) -> PgWireError {
+pub(crate) fn fatal(fault: &Fault) -> PgWireError {
     info("FATAL", fault)
 }
 
@@ -56,6 +56,7 @@ fn state(fault: &Fault) -> &'static str {
             Code::Unauthenticated => "28P01",
             Code::Forbidden | Code::Foreign => "42501",
             Code::Cancelled | Code::TimeLimit => "57014",
+            Code::EngineEnded => "58000",
             Code::Internal => "XX000",
         },
     }

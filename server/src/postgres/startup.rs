@@ -1,20 +1,18 @@
-//! Logging in: a token as password where there are tokens, and the settings that a client begins with.
+//! Startup of a connection: the door has checked who it is; the client's settings are those that it begins with.
 
 use std::fmt::Debug;
 use std::sync::Arc;
 
 use async_trait::async_trait;
-use futures::{Sink, SinkExt as _};
+use futures::Sink;
 use pgwire::api::auth::{
     DefaultServerParameterProvider, StartupHandler, finish_authentication, protocol_negotiation,
     save_startup_parameters_to_metadata,
 };
 use pgwire::api::{ClientInfo, METADATA_USER, PgWireConnectionState};
 use pgwire::error::{PgWireError, PgWireResult};
-use pgwire::messages::startup::Authentication;
 use pgwire::messages::{PgWireBackendMessage, PgWireFrontendMessage, ProtocolVersion};
 
-use super::CONNECTIONS;
 use super::connection::Connection;
 use super::settings::VERSION;
 use super::sqlstate::fatal;
@@ -34,22 +32,11 @@ impl StartupHandler for Startup {
     {
         match message {
             PgWireFrontendMessage::Startup(startup) => {
-                if !self.0.has_place() {
-                    return Err(fatal(&Fault::TooMany { what: "connections", limit: CONNECTIONS }));
-                }
                 protocol_negotiation(client, &startup).await?;
                 save_startup_parameters_to_metadata(client, &startup);
                 self.begin_with(client.metadata()).map_err(|fault| fatal(&fault))?;
                 client.set_state(PgWireConnectionState::AuthenticationInProgress);
-                if self.0.shared().service.access().is_open() {
-                    return self.let_in(client, None).await;
-                }
-                client.send(PgWireBackendMessage::Authentication(Authentication::CleartextPassword)).await?;
-                Ok(())
-            }
-            PgWireFrontendMessage::PasswordMessageFamily(password) => {
-                let password = password.into_password()?;
-                self.let_in(client, Some(&password.password)).await
+                self.let_in(client).await
             }
             _ => Err(fatal(&Fault::request("the protocol's startup is expected"))),
         }
@@ -57,17 +44,14 @@ impl StartupHandler for Startup {
 }
 
 impl Startup {
-    async fn let_in<C>(&self, client: &mut C, token: Option<&str>) -> PgWireResult<()>
+    async fn let_in<C>(&self, client: &mut C) -> PgWireResult<()>
     where
         C: ClientInfo + Sink<PgWireBackendMessage> + Unpin + Send + Sync,
         C::Error: Debug,
         PgWireError: From<<C as Sink<PgWireBackendMessage>>::Error>,
     {
         let service = &self.0.shared().service;
-        let who = service.access().client(token, Scope::Sql).map_err(|fault| {
-            service.metrics().failed(fault.code());
-            fatal(&fault)
-        })?;
+        let who = service.client(Scope::Sql).map_err(|fault| fatal(&fault))?;
         let wide = client.protocol_version() != ProtocolVersion::PROTOCOL3_0;
         let (pid, key) = self.0.log_in(&who, wide).map_err(|fault| fatal(&fault))?;
         client.set_pid_and_secret_key(pid, key);

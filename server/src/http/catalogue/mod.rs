@@ -35,7 +35,6 @@ use echolake_lake::Lake;
 use echolake_schema::tables::Table;
 
 use super::format;
-use super::guard;
 use super::problem::Problem;
 use crate::fault::Fault;
 use crate::service::Service;
@@ -135,7 +134,7 @@ impl Catalogue {
         uri: &Uri,
         headers: &HeaderMap,
     ) -> Result<Response, Fault> {
-        guard::client(self.service(), headers, endpoint.scope)?;
+        self.service().client(endpoint.scope)?;
         let path = path.map_err(|_| Fault::request("the path is not UTF-8"))?;
         let view = self.view().await?;
         let as_arrow = format::prefers_arrow(headers);

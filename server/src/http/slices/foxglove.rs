@@ -20,7 +20,7 @@ use super::{Question, Request, SLICE, Slices};
 use crate::fault::Fault;
 
 /// The manifest.
-pub(super) const MANIFEST: &str = "/api/v1/foxglove/manifest";
+pub(in crate::http) const MANIFEST: &str = "/api/v1/foxglove/manifest";
 
 #[derive(Serialize)]
 struct Manifest {

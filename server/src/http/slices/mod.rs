@@ -27,7 +27,7 @@ use tokio::sync::Semaphore;
 use super::catalogue::{Catalogue, View};
 use super::guard;
 use super::problem::Problem;
-use super::ranges::{self, Asked, Described, needs_length};
+use super::ranges::{Asked, Described, needs_length};
 use crate::fault::Fault;
 use crate::tokens::Scope;
 use cutting::{Cutting, Room};
@@ -35,8 +35,11 @@ use question::Question;
 use selection::{Selection, Selections};
 use spool::Spool;
 
+/// Foxglove's manifest of slices.
+pub(in crate::http) use foxglove::MANIFEST as FOXGLOVE_MANIFEST;
+
 /// A slice.
-pub(super) const SLICE: &str = "/api/v1/slices.mcap";
+pub(in crate::http) const SLICE: &str = "/api/v1/slices.mcap";
 /// Slices that are open at once: each holds some 8 MB.
 const MOST: usize = 128;
 /// Slices that are worked at, at any moment, beside those that begin: a few a thread, so that one that begins does not
@@ -68,7 +71,6 @@ pub(super) fn for_viewers(catalogue: &Catalogue) -> Router {
         .route(SLICE, get(slice))
         .route(foxglove::MANIFEST, get(foxglove::manifest))
         .method_not_allowed_fallback(super::wrong_method)
-        .layer(ranges::cors())
         .with_state(slices)
 }
 
@@ -83,12 +85,12 @@ impl Slices {
     // A slice holds what files do, and is chosen by SQL.
     async fn request(&self, uri: &Uri, headers: &HeaderMap) -> Result<Request, Fault> {
         let service = self.0.catalogue.service();
-        guard::client(service, headers, Scope::Files)?;
-        let client = guard::client(service, headers, Scope::Sql)?;
+        service.client(Scope::Files)?;
+        let client = service.client(Scope::Sql)?;
         let mut question = Question::of(uri)?;
         let view = self.0.catalogue.view().await?;
         // Without tokens a page of elsewhere may read the runs whose names it knows, and ask nothing of others.
-        if service.access().is_open()
+        if service.is_open()
             && let Err(foreign) = guard::is_own(headers)
         {
             if question.runs.is_empty() {

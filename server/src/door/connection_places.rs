@@ -1,0 +1,265 @@
+//! Places for connections: an address accepts no more than it has. If all are taken, a new connection takes the place of
+//! the one that has been waited for longest without a request or a login, so that who sends slowly locks nobody out.
+
+use std::io::{self, IoSlice};
+use std::net::IpAddr;
+use std::pin::Pin;
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::task::{Context, Poll};
+use std::time::Duration;
+
+use axum::body::Body;
+use bytes::Bytes;
+use hyper::body::{Frame, SizeHint};
+use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
+use tokio::net::{TcpListener, TcpStream};
+use tokio::sync::Notify;
+use tokio::time::Sleep;
+
+/// How long to wait where the system has no more sockets.
+const PAUSE: Duration = Duration::from_millis(100);
+/// How long a client may read nothing of an answer.
+const STALL: Duration = Duration::from_secs(300);
+
+/// An address, and its places.
+pub(super) struct ConnectionPlaces {
+    listener: TcpListener,
+    most: usize,
+    taken: Arc<TakenPlaces>,
+}
+
+#[derive(Default)]
+struct TakenPlaces {
+    // In the order in which they were taken.
+    all: Mutex<Vec<Arc<PlaceState>>>,
+    freed: Notify,
+}
+
+struct PlaceState {
+    address: IpAddr,
+    working: AtomicUsize,
+    evicted: Notify,
+}
+
+impl PlaceState {
+    fn is_idle(&self) -> bool {
+        self.working.load(Ordering::Relaxed) == 0
+    }
+}
+
+impl ConnectionPlaces {
+    /// Places of an address.
+    pub(super) fn new(listener: TcpListener, most: usize) -> Self {
+        Self { listener, most, taken: Arc::default() }
+    }
+
+    /// The next connection in its place. If all places are taken by connections that work, it waits.
+    pub(super) async fn next(&self) -> PlacedStream {
+        loop {
+            match self.listener.accept().await {
+                Ok((stream, peer)) => {
+                    // Answers are written whole: waiting for more of them only delays.
+                    let _ = stream.set_nodelay(true);
+                    if self.make_room(peer.ip()).await {
+                        return self.place(stream, peer.ip());
+                    }
+                }
+                // Who broke off already is no trouble; that there are no more sockets passes.
+                Err(_) => tokio::time::sleep(PAUSE).await,
+            }
+        }
+    }
+
+    fn place(&self, stream: TcpStream, address: IpAddr) -> PlacedStream {
+        let state = PlaceState { address, working: AtomicUsize::new(0), evicted: Notify::new() };
+        let state = Arc::new(state);
+        self.taken.lock().push(state.clone());
+        PlacedStream { stream, state, taken: self.taken.clone(), stalled: None }
+    }
+
+    // Another machine has half of the places at most; false where all of those work.
+    async fn make_room(&self, address: IpAddr) -> bool {
+        loop {
+            let freed = self.taken.freed.notified();
+            let is_crowd = |place: &&Arc<PlaceState>| place.address == address && !address.is_loopback();
+            {
+                let mut all = self.taken.lock();
+                if all.iter().filter(is_crowd).count() >= self.most / 2 {
+                    return evict(&mut all, |place| is_crowd(&place));
+                }
+                if all.len() < self.most || evict(&mut all, |_| true) {
+                    return true;
+                }
+            }
+            freed.await;
+        }
+    }
+}
+
+fn evict(all: &mut Vec<Arc<PlaceState>>, may: impl Fn(&Arc<PlaceState>) -> bool) -> bool {
+    let Some(oldest) = all.iter().position(|place| place.is_idle() && may(place)) else { return false };
+    all.remove(oldest).evicted.notify_one();
+    true
+}
+
+impl TakenPlaces {
+    fn lock(&self) -> MutexGuard<'_, Vec<Arc<PlaceState>>> {
+        self.all.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+/// A connection in its place. Writing fails if its client reads nothing for five minutes.
+pub(super) struct PlacedStream {
+    stream: TcpStream,
+    state: Arc<PlaceState>,
+    taken: Arc<TakenPlaces>,
+    stalled: Option<Pin<Box<Sleep>>>,
+}
+
+impl PlacedStream {
+    /// Ends if the connection must leave its place.
+    pub(super) fn evicted(&self) -> impl Future<Output = ()> + Send + 'static {
+        let state = self.state.clone();
+        async move { state.evicted.notified().await }
+    }
+
+    /// Marks the begin of work on the connection.
+    pub(super) fn work(&self) -> PlaceWork {
+        PlaceWork(self.state.clone())
+    }
+
+    fn watch(&mut self, context: &mut Context<'_>, written: Poll<io::Result<usize>>) -> Poll<io::Result<usize>> {
+        if written.is_ready() {
+            self.stalled = None;
+            return written;
+        }
+        let stalled = self.stalled.get_or_insert_with(|| Box::pin(tokio::time::sleep(STALL)));
+        stalled.as_mut().poll(context).map(|()| Err(io::ErrorKind::TimedOut.into()))
+    }
+}
+
+impl Drop for PlacedStream {
+    fn drop(&mut self) {
+        self.taken.lock().retain(|place| !Arc::ptr_eq(place, &self.state));
+        self.taken.freed.notify_one();
+    }
+}
+
+/// Marks a connection that works, which keeps its place.
+#[derive(Clone)]
+pub(super) struct PlaceWork(Arc<PlaceState>);
+
+impl PlaceWork {
+    pub(super) fn begin(&self) -> WorkingPlace {
+        self.0.working.fetch_add(1, Ordering::Relaxed);
+        WorkingPlace(self.0.clone())
+    }
+}
+
+/// Work on a connection, until this is dropped.
+pub(super) struct WorkingPlace(Arc<PlaceState>);
+
+impl Drop for WorkingPlace {
+    fn drop(&mut self) {
+        self.0.working.fetch_sub(1, Ordering::Relaxed);
+    }
+}
+
+impl WorkingPlace {
+    /// Works until the last of an answer is sent.
+    pub(super) fn until_sent(self, body: Body) -> Body {
+        Body::new(SentBody { body, _working: self })
+    }
+}
+
+struct SentBody {
+    body: Body,
+    _working: WorkingPlace,
+}
+
+impl hyper::body::Body for SentBody {
+    type Data = Bytes;
+    type Error = axum::Error;
+
+    fn poll_frame(
+        mut self: Pin<&mut Self>,
+        context: &mut Context<'_>,
+    ) -> Poll<Option<Result<Frame<Bytes>, axum::Error>>> {
+        Pin::new(&mut self.body).poll_frame(context)
+    }
+
+    fn is_end_stream(&self) -> bool {
+        self.body.is_end_stream()
+    }
+
+    fn size_hint(&self) -> SizeHint {
+        self.body.size_hint()
+    }
+}
+
+impl AsyncRead for PlacedStream {
+    fn poll_read(
+        mut self: Pin<&mut Self>,
+        context: &mut Context<'_>,
+        buffer: &mut ReadBuf<'_>,
+    ) -> Poll<io::Result<()>> {
+        Pin::new(&mut self.stream).poll_read(context, buffer)
+    }
+}
+
+impl AsyncWrite for PlacedStream {
+    fn poll_write(mut self: Pin<&mut Self>, context: &mut Context<'_>, bytes: &[u8]) -> Poll<io::Result<usize>> {
+        let written = Pin::new(&mut self.stream).poll_write(context, bytes);
+        self.watch(context, written)
+    }
+
+    fn poll_write_vectored(
+        mut self: Pin<&mut Self>,
+        context: &mut Context<'_>,
+        parts: &[IoSlice<'_>],
+    ) -> Poll<io::Result<usize>> {
+        let written = Pin::new(&mut self.stream).poll_write_vectored(context, parts);
+        self.watch(context, written)
+    }
+
+    fn is_write_vectored(&self) -> bool {
+        self.stream.is_write_vectored()
+    }
+
+    fn poll_flush(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<io::Result<()>> {
+        Pin::new(&mut self.stream).poll_flush(context)
+    }
+
+    fn poll_shutdown(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<io::Result<()>> {
+        Pin::new(&mut self.stream).poll_shutdown(context)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[tokio::test]
+    async fn one_more_takes_the_place_of_the_oldest_that_does_not_work() {
+        let listener = TcpListener::bind("127.0.0.1:0").await.expect("a free port");
+        let address = listener.local_addr().expect("its address");
+        let places = ConnectionPlaces::new(listener, 2);
+        let mut clients = Vec::new();
+        for _ in 0..4 {
+            clients.push(TcpStream::connect(address).await.expect("connected"));
+        }
+        let first = places.next().await;
+        let second = places.next().await;
+        let working = first.work().begin();
+        let third = places.next().await;
+        tokio::time::timeout(Duration::from_secs(60), second.evicted()).await.expect("it must leave its place");
+        let _third_works = third.work().begin();
+        let waited = tokio::time::timeout(Duration::from_millis(50), places.next()).await;
+        assert!(waited.is_err(), "all places are taken by connections that work");
+        drop((working, first));
+        clients.push(TcpStream::connect(address).await.expect("connected"));
+        let next = tokio::time::timeout(Duration::from_secs(60), places.next()).await.expect("a free place");
+        assert_eq!(Some(next.state.address), clients[4].local_addr().ok().map(|a| a.ip()));
+    }
+}

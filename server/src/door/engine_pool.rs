@@ -1,0 +1,286 @@
+//! The engines of a server: one for each client that asks, a spare that is ready for the next, and an end for those that
+//! are idle or take too much.
+
+use std::collections::HashMap;
+use std::fmt::Write as _;
+use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::{Duration, Instant};
+
+use echolake_lake::Lake;
+use tokio::sync::Notify;
+
+use super::EngineSettings;
+use super::engine_process::{EndReason, EngineLease, EngineProcess, EngineStart};
+use super::temp_folder::ServerFolders;
+use crate::Error;
+use crate::client_identity::ClientIdentity;
+use crate::fault::Fault;
+use crate::metrics::Metrics;
+
+/// Time without a request after which an engine ends.
+const IDLE: Duration = Duration::from_secs(300);
+/// Time between two looks at the memory of engines, while one answers and while none does.
+const LOOK: Duration = Duration::from_millis(20);
+const IDLE_LOOK: Duration = Duration::from_millis(250);
+/// How long a client without an engine waits for a place among the engines.
+const PLACE_WAIT: Duration = Duration::from_secs(10);
+/// Memory of an engine that is not of its queries: footers of files, small tables, what the allocator keeps.
+const CACHE_BYTES: usize = 96 << 20;
+/// Clients wait this long for a new engine after the second one that their queries ended, and twice as long each time.
+const FIRST_BACKOFF: Duration = Duration::from_millis(250);
+const LONGEST_BACKOFF: Duration = Duration::from_secs(30);
+/// Time without an end after which a client's earlier ones are forgotten.
+const FORGIVEN: Duration = Duration::from_secs(60);
+
+/// The engines.
+#[derive(Clone)]
+pub(super) struct EnginePool(Arc<Inner>);
+
+struct Inner {
+    settings: EngineSettings,
+    lake: Lake,
+    folders: ServerFolders,
+    metrics: Arc<Metrics>,
+    clients: Mutex<HashMap<String, Arc<ClientEngine>>>,
+    spare: Mutex<Option<Arc<EngineProcess>>>,
+    spare_taken: Notify,
+    freed: Notify,
+    started: AtomicUsize,
+    failed: AtomicU64,
+}
+
+/// A client's engine. The lock is held while one is started, so that a client's requests wait for the same.
+#[derive(Default)]
+struct ClientEngine {
+    state: tokio::sync::Mutex<ClientState>,
+    current: Mutex<Option<Arc<EngineProcess>>>,
+}
+
+#[derive(Default)]
+struct ClientState {
+    /// Engines in a row that ended while they answered.
+    ends: u32,
+    last_end: Option<Instant>,
+}
+
+impl EnginePool {
+    pub(super) fn new(lake: &Lake, settings: EngineSettings, metrics: Arc<Metrics>) -> Result<Self, Error> {
+        let folders = ServerFolders::new(lake, settings.temp.as_deref())?;
+        Ok(Self(Arc::new(Inner {
+            settings,
+            lake: lake.clone(),
+            folders,
+            metrics,
+            clients: Mutex::default(),
+            spare: Mutex::default(),
+            spare_taken: Notify::new(),
+            freed: Notify::new(),
+            started: AtomicUsize::new(0),
+            failed: AtomicU64::new(0),
+        })))
+    }
+
+    /// The engine of a client, for one request. It is started if there is none; a client whose engines end again and
+    /// again waits longer each time.
+    ///
+    /// # Errors
+    /// [`Fault::TooMany`] if other clients' engines are all answering; [`Fault::EngineEnded`].
+    pub(super) async fn lease(&self, client: &ClientIdentity) -> Result<EngineLease, Fault> {
+        let own = self.client(&client.name);
+        if let Some(lease) = own.live() {
+            return Ok(lease);
+        }
+        let mut state = own.state.lock().await;
+        // Whoever held the lock has started one.
+        if let Some(lease) = own.live() {
+            return Ok(lease);
+        }
+        self.count_end(&own, &mut state);
+        tokio::time::sleep(state.backoff()).await;
+        self.make_room(&own).await?;
+        let engine = self.take_spare().map_err(|failed| {
+            eprintln!("no engine can be started: {failed}");
+            Fault::Internal
+        })?;
+        if let Err(EndReason::Failed(reason)) = engine.assign(client).await {
+            state.ends += 1;
+            state.last_end = Some(Instant::now());
+            eprintln!("an engine did not start: {reason}");
+            return Err(Fault::EngineEnded { reason });
+        }
+        let lease = EngineLease::new(engine.clone());
+        *lock(&own.current) = Some(engine);
+        Ok(lease)
+    }
+
+    fn client(&self, name: &str) -> Arc<ClientEngine> {
+        lock(&self.0.clients).entry(name.to_owned()).or_default().clone()
+    }
+
+    fn count_end(&self, own: &ClientEngine, state: &mut ClientState) {
+        let ended = lock(&own.current).take();
+        if let Some(EndReason::Failed(reason)) = ended.as_deref().and_then(EngineProcess::end_reason) {
+            eprintln!("an engine ended: {reason}");
+            self.0.failed.fetch_add(1, Ordering::Relaxed);
+            if state.last_end.is_some_and(|at| at.elapsed() > FORGIVEN) {
+                state.ends = 0;
+            }
+            state.ends += 1;
+            state.last_end = Some(Instant::now());
+        }
+    }
+
+    // Waits until there is a place among the engines: the one that is idle for longest makes room.
+    async fn make_room(&self, own: &Arc<ClientEngine>) -> Result<(), Fault> {
+        let free = async {
+            loop {
+                let freed = self.0.freed.notified();
+                let live = self.live();
+                if live.len() < self.0.settings.count {
+                    return;
+                }
+                let idle = live.into_iter().filter(|e| e.requests() == 0).max_by_key(|e| e.idle_time());
+                match idle {
+                    Some(engine) => {
+                        engine.end(EndReason::Retired);
+                        engine.wait_for_end().await;
+                    }
+                    None => drop(tokio::time::timeout(LOOK, freed).await),
+                }
+            }
+        };
+        debug_assert!(lock(&own.current).is_none());
+        let limit = self.0.settings.count;
+        tokio::time::timeout(PLACE_WAIT, free).await.map_err(|_| Fault::TooMany { what: "clients", limit })
+    }
+
+    // The engines that have a client.
+    fn live(&self) -> Vec<Arc<EngineProcess>> {
+        let clients = lock(&self.0.clients);
+        let engines = clients.values().filter_map(|client| lock(&client.current).clone());
+        engines.filter(|engine| !engine.has_ended()).collect()
+    }
+
+    fn take_spare(&self) -> std::io::Result<Arc<EngineProcess>> {
+        let spare = lock(&self.0.spare).take().filter(|engine| !engine.has_ended());
+        self.0.spare_taken.notify_one();
+        spare.map_or_else(|| self.start(), Ok)
+    }
+
+    fn start(&self) -> std::io::Result<Arc<EngineProcess>> {
+        let name = format!("engine-{}", self.0.started.fetch_add(1, Ordering::Relaxed));
+        let start = EngineStart {
+            settings: &self.0.settings,
+            lake: self.0.lake.location(),
+            lake_folder: self.0.lake.folder(),
+            sockets: self.0.folders.sockets.path().join(&name),
+            spills: self.0.folders.spills.path().join(&name),
+        };
+        EngineProcess::start(start, self.0.metrics.clone())
+    }
+
+    /// Keeps a spare engine, ends idle ones, and those that take more memory than they may; never ends.
+    pub(super) async fn keep_up(self) {
+        tokio::join!(self.keep_spare(), self.watch_memory(), self.retire_idle());
+    }
+
+    async fn keep_spare(&self) {
+        loop {
+            let taken = self.0.spare_taken.notified();
+            if lock(&self.0.spare).as_ref().is_none_or(|spare| spare.has_ended()) {
+                match self.start() {
+                    Ok(engine) => *lock(&self.0.spare) = Some(engine),
+                    Err(failed) => {
+                        eprintln!("no spare engine can be started: {failed}");
+                        tokio::time::sleep(LONGEST_BACKOFF).await;
+                    }
+                }
+            }
+            taken.await;
+        }
+    }
+
+    async fn watch_memory(&self) {
+        loop {
+            let is_busy = self.live().iter().any(|engine| engine.requests() > 0);
+            tokio::time::sleep(if is_busy { LOOK } else { IDLE_LOOK }).await;
+            let size = |engine: &EngineProcess| engine.grown_bytes().saturating_sub(CACHE_BYTES);
+            let sizes: Vec<_> = self.live().into_iter().map(|engine| (size(&engine), engine)).collect();
+            let limit = self.0.settings.memory;
+            if sizes.iter().map(|(bytes, _)| bytes).sum::<usize>() > limit
+                && let Some((_, largest)) = sizes.iter().max_by_key(|(bytes, _)| *bytes)
+            {
+                let reason = format!("queries took more than {} MiB, and its client's the most", limit >> 20);
+                largest.end(EndReason::Failed(reason));
+            }
+        }
+    }
+
+    async fn retire_idle(&self) {
+        loop {
+            tokio::time::sleep(IDLE / 10).await;
+            for engine in self.live() {
+                if engine.requests() == 0 && engine.idle_time() > IDLE {
+                    engine.end(EndReason::Retired);
+                }
+            }
+            // Clients may come under any number of names.
+            lock(&self.0.clients).retain(|_, client| client.live().is_some() || Arc::strong_count(client) > 1);
+        }
+    }
+
+    /// Ends all engines.
+    pub(super) async fn end_all(&self) {
+        let spare = lock(&self.0.spare).take();
+        for engine in self.live().into_iter().chain(spare) {
+            engine.end(EndReason::Retired);
+            engine.wait_for_end().await;
+        }
+    }
+
+    /// Figures in Prometheus' text format.
+    pub(super) fn figures(&self) -> String {
+        let mut text = String::new();
+        let (engines, failed) = (self.live().len(), self.0.failed.load(Ordering::Relaxed));
+        for (name, kind, help, value) in [
+            ("echolake_engines", "gauge", "Engines that have a client.", engines as u64),
+            ("echolake_engine_failures_total", "counter", "Engines that ended while they had a client.", failed),
+        ] {
+            let _ = writeln!(text, "# HELP {name} {help}\n# TYPE {name} {kind}\n{name} {value}");
+        }
+        text
+    }
+}
+
+impl ClientEngine {
+    fn live(&self) -> Option<EngineLease> {
+        let current = lock(&self.current);
+        current.as_ref().filter(|engine| !engine.has_ended()).map(|engine| EngineLease::new(engine.clone()))
+    }
+}
+
+impl ClientState {
+    fn backoff(&self) -> Duration {
+        match self.ends {
+            0 | 1 => Duration::ZERO,
+            ends => LONGEST_BACKOFF.min(FIRST_BACKOFF * 2_u32.saturating_pow(ends - 2)),
+        }
+    }
+}
+
+fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn waits_grow_to_a_limit() {
+        let waits = |ends| ClientState { ends, last_end: None }.backoff();
+        assert_eq!([0, 1, 2, 3].map(waits), [0, 0, 250, 500].map(Duration::from_millis));
+        assert_eq!(waits(u32::MAX), LONGEST_BACKOFF);
+    }
+}

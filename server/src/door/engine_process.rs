@@ -1,0 +1,269 @@
+//! One engine: a child process, its folder with sockets, and how it ended.
+
+use std::ffi::OsStr;
+use std::io;
+use std::path::{Path, PathBuf};
+use std::process::Stdio;
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::{Arc, Mutex, OnceLock, PoisonError};
+use std::time::{Duration, Instant};
+
+use axum::body::Body;
+use hyper::client::conn::http2;
+use tokio::io::{AsyncBufReadExt as _, AsyncWriteExt as _, BufReader};
+use tokio::net::UnixStream;
+use tokio::process::{Child, ChildStdin, ChildStdout, Command};
+use tokio::sync::{Notify, OnceCell, SetOnce};
+
+use super::EngineSettings;
+use crate::client_identity::ClientIdentity;
+use crate::engine::EngineSocket;
+use crate::engine::report::EngineReport;
+use crate::metrics::Metrics;
+
+/// How long a request that lost its engine waits to learn why.
+const REASON_WAIT: Duration = Duration::from_secs(2);
+
+// What operators say they hold is less than what they do: queries that are refused more memory end alone, not their engine.
+fn counted_bytes(memory: usize) -> usize {
+    memory / 8 * 7
+}
+
+/// Why an engine ended.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(super) enum EndReason {
+    /// The door needed it no more.
+    Retired,
+    /// A query, or a defect.
+    Failed(String),
+}
+
+/// An engine.
+pub(super) struct EngineProcess {
+    pid: u32,
+    folder: PathBuf,
+    stdin: tokio::sync::Mutex<ChildStdin>,
+    requests: AtomicUsize,
+    last_used: Mutex<Instant>,
+    base_bytes: OnceLock<usize>,
+    ready: SetOnce<()>,
+    kill: Notify,
+    why_killed: OnceLock<EndReason>,
+    ended: SetOnce<EndReason>,
+    pub(super) flight: OnceCell<http2::SendRequest<Body>>,
+}
+
+/// What an engine is started with.
+pub(super) struct EngineStart<'a> {
+    pub(super) settings: &'a EngineSettings,
+    pub(super) lake: &'a str,
+    /// The lake's folder, where it is one.
+    pub(super) lake_folder: Option<&'a Path>,
+    /// Folders that are the engine's own.
+    pub(super) sockets: PathBuf,
+    pub(super) spills: PathBuf,
+}
+
+impl EngineProcess {
+    /// Starts a process that reads the lake and waits for its client.
+    ///
+    /// # Errors
+    /// The system gives no folder or process.
+    pub(super) fn start(start: EngineStart<'_>, metrics: Arc<Metrics>) -> io::Result<Arc<Self>> {
+        std::fs::create_dir(&start.sockets)?;
+        std::fs::create_dir(&start.spills)?;
+        let mut child = Command::new(&start.settings.program)
+            .args(["--lake", start.lake, "engine", "--sockets"])
+            .arg(&start.sockets)
+            .args(start.lake_folder.iter().flat_map(|folder| [OsStr::new("--confine-to"), folder.as_os_str()]))
+            .arg("--memory-bytes")
+            .arg(counted_bytes(start.settings.memory).to_string())
+            .env("TMPDIR", &start.spills)
+            // Memory that is reserved and not used would count against the limit.
+            .env("MIMALLOC_ARENA_EAGER_COMMIT", "0")
+            // Ctrl-C in a terminal is for the door, which lets answers end.
+            .process_group(0)
+            .stdin(Stdio::piped())
+            .stdout(Stdio::piped())
+            .kill_on_drop(true)
+            .spawn()?;
+        let (Some(stdin), Some(stdout), Some(pid)) = (child.stdin.take(), child.stdout.take(), child.id()) else {
+            return Err(io::Error::other("the engine has no pipes"));
+        };
+        let engine = Arc::new(Self {
+            pid,
+            folder: start.sockets,
+            stdin: tokio::sync::Mutex::new(stdin),
+            requests: AtomicUsize::new(0),
+            last_used: Mutex::new(Instant::now()),
+            base_bytes: OnceLock::new(),
+            ready: SetOnce::new(),
+            kill: Notify::new(),
+            why_killed: OnceLock::new(),
+            ended: SetOnce::new(),
+            flight: OnceCell::new(),
+        });
+        tokio::spawn(supervise(engine.clone(), child, stdout, start.spills, metrics));
+        Ok(engine)
+    }
+
+    /// Waits until it is ready, and tells it whose it is.
+    ///
+    /// # Errors
+    /// It ended before that.
+    pub(super) async fn assign(&self, client: &ClientIdentity) -> Result<(), EndReason> {
+        let failed = |e: io::Error| EndReason::Failed(format!("it could not be told whose it is: {e}"));
+        tokio::select! {
+            _ = self.ready.wait() => {}
+            reason = self.ended.wait() => return Err(reason.clone()),
+        }
+        let _ = self.base_bytes.set(private_bytes(self.pid).unwrap_or(0));
+        let mut line = serde_json::to_vec(client).map_err(|e| failed(e.into()))?;
+        line.push(b'\n');
+        self.stdin.lock().await.write_all(&line).await.map_err(failed)
+    }
+
+    /// Connects to one of its sockets.
+    ///
+    /// # Errors
+    /// The engine is not there any more.
+    pub(super) async fn connect(&self, socket: EngineSocket) -> io::Result<UnixStream> {
+        UnixStream::connect(socket.path(&self.folder)).await
+    }
+
+    /// Kills it; the first reason counts.
+    pub(super) fn end(&self, why: EndReason) {
+        let _ = self.why_killed.set(why);
+        self.kill.notify_one();
+    }
+
+    pub(super) fn has_ended(&self) -> bool {
+        self.ended.get().is_some()
+    }
+
+    /// How it ended, if it did.
+    pub(super) fn end_reason(&self) -> Option<&EndReason> {
+        self.ended.get()
+    }
+
+    /// Waits a moment for how it ended; None if it lives.
+    pub(super) async fn why_ended(&self) -> Option<EndReason> {
+        tokio::time::timeout(REASON_WAIT, self.ended.wait()).await.ok().cloned()
+    }
+
+    /// Waits until it has ended.
+    pub(super) async fn wait_for_end(&self) {
+        self.ended.wait().await;
+    }
+
+    /// Requests that it answers now.
+    pub(super) fn requests(&self) -> usize {
+        self.requests.load(Ordering::Relaxed)
+    }
+
+    /// Time since the last request.
+    pub(super) fn idle_time(&self) -> Duration {
+        self.last_used.lock().unwrap_or_else(PoisonError::into_inner).elapsed()
+    }
+
+    /// Bytes of memory that it occupies over what it did when it was assigned to its client.
+    pub(super) fn grown_bytes(&self) -> usize {
+        let base = self.base_bytes.get().copied().unwrap_or(0);
+        private_bytes(self.pid).unwrap_or(0).saturating_sub(base)
+    }
+}
+
+// Resident pages without those of files, which all engines share.
+fn private_bytes(pid: u32) -> Option<usize> {
+    let text = std::fs::read_to_string(Path::new("/proc").join(pid.to_string()).join("statm")).ok()?;
+    let mut pages = text.split(' ').skip(1).map_while(|n| n.parse::<usize>().ok());
+    let (resident, shared) = (pages.next()?, pages.next()?);
+    Some(resident.saturating_sub(shared) * rustix::param::page_size())
+}
+
+/// A request's hold on its engine.
+pub(super) struct EngineLease(Arc<EngineProcess>);
+
+impl EngineLease {
+    pub(super) fn new(engine: Arc<EngineProcess>) -> Self {
+        engine.requests.fetch_add(1, Ordering::Relaxed);
+        Self(engine)
+    }
+
+    pub(super) fn engine(&self) -> &Arc<EngineProcess> {
+        &self.0
+    }
+}
+
+impl Drop for EngineLease {
+    fn drop(&mut self) {
+        *self.0.last_used.lock().unwrap_or_else(PoisonError::into_inner) = Instant::now();
+        self.0.requests.fetch_sub(1, Ordering::Relaxed);
+    }
+}
+
+// Reads what the engine reports until it ends, and says then how.
+async fn supervise(
+    engine: Arc<EngineProcess>,
+    mut child: Child,
+    stdout: ChildStdout,
+    spills: PathBuf,
+    metrics: Arc<Metrics>,
+) {
+    let mut reports = EngineReports { metrics, counters: Vec::new(), why: None };
+    let mut lines = BufReader::new(stdout).lines();
+    loop {
+        tokio::select! {
+            () = engine.kill.notified() => {
+                // An engine that is gone already needs no kill.
+                let _ = child.start_kill();
+            }
+            line = lines.next_line() => match line {
+                Ok(Some(line)) => reports.take(&line, &engine),
+                _ => break,
+            },
+        }
+    }
+    // Its output has ended, so that it is ending, too, or was never meant to.
+    let _ = child.start_kill();
+    let status = child.wait().await;
+    reports.forget_running();
+    let found = || reports.why.clone().unwrap_or_else(|| status.map_or_else(|e| e.to_string(), |s| format!("it ended by {s}")));
+    let why = engine.why_killed.get().cloned().unwrap_or_else(|| EndReason::Failed(found()));
+    for folder in [&engine.folder, &spills] {
+        // The server's folder is removed at its end.
+        let _ = std::fs::remove_dir_all(folder);
+    }
+    let _ = engine.ended.set(why);
+}
+
+struct EngineReports {
+    metrics: Arc<Metrics>,
+    counters: Vec<u64>,
+    why: Option<String>,
+}
+
+impl EngineReports {
+    fn take(&mut self, line: &str, engine: &EngineProcess) {
+        match serde_json::from_str(line) {
+            Ok(EngineReport::Ready) => drop(engine.ready.set(())),
+            Ok(EngineReport::Ending(why)) => self.why = Some(why),
+            Ok(EngineReport::Counters(counters)) => {
+                self.metrics.add(&self.counters, &counters);
+                self.counters = counters;
+            }
+            Err(_) => eprintln!("an engine wrote `{line}`"),
+        }
+    }
+
+    // What it counted stays counted; what it ran does not run any more.
+    fn forget_running(&mut self) {
+        if let Some((running, counted)) = self.counters.split_last_mut() {
+            let mut after: Vec<u64> = counted.to_vec();
+            after.push(0);
+            let mut before = counted.to_vec();
+            before.push(*running);
+            self.metrics.add(&before, &after);
+        }
+    }
+}

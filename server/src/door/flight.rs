@@ -1,0 +1,87 @@
+//! Flight SQL's connections of the door: HTTP/2, whose requests are forwarded to the engine of who asks.
+
+use std::convert::Infallible;
+use std::pin::pin;
+use std::time::Duration;
+
+use axum::body::Body;
+use axum::http::{Request, Response, header};
+use hyper::body::Incoming;
+use hyper::server::conn::http2;
+use hyper::service::service_fn;
+use hyper_util::rt::{TokioExecutor, TokioIo, TokioTimer};
+use tokio::net::TcpListener;
+use tokio::sync::watch;
+use tokio::task::JoinSet;
+
+use super::Door;
+use super::connection_places::{ConnectionPlaces, PlacedStream};
+use super::forward::Wire;
+use crate::client_identity::ClientIdentity;
+use crate::fault::Fault;
+use crate::flight::{WINDOW_BYTES, status};
+use crate::tokens::of_header;
+
+/// Connections at once. With those of the other protocols they are within the 1024 files that systems often allow.
+const MOST: usize = 128;
+/// Silence after which a client is asked whether it still lives; its queries end when it does not.
+const KEEPALIVE: Duration = Duration::from_secs(20);
+/// Requests of one connection at once.
+const STREAMS: u32 = 64;
+/// Methods whose clients may wait for an answer before they end their request.
+const INTERACTIVE: [&str; 3] = ["DoPut", "DoExchange", "Handshake"];
+
+/// Answers connections until `stopping`, then lets those end that are at it.
+pub(super) async fn serve(door: Door, listener: TcpListener, stopping: watch::Receiver<bool>) {
+    let places = ConnectionPlaces::new(listener, MOST);
+    let mut stopped = stopping.clone();
+    let mut open = JoinSet::new();
+    loop {
+        tokio::select! {
+            _ = stopped.wait_for(|stopping| *stopping) => break,
+            stream = places.next() => drop(open.spawn(answer(stream, door.clone(), stopping.clone()))),
+            Some(_) = open.join_next() => {}
+        }
+    }
+    while open.join_next().await.is_some() {}
+}
+
+async fn answer(stream: PlacedStream, door: Door, mut stopping: watch::Receiver<bool>) {
+    let evicted = stream.evicted();
+    let work = stream.work();
+    let service = service_fn(move |request: Request<Incoming>| {
+        let (door, working) = (door.clone(), work.begin());
+        async move {
+            let response = door.answer_flight(request).await.unwrap_or_else(|fault| {
+                door.metrics().failed(fault.code());
+                status(&fault).into_http()
+            });
+            Ok::<_, Infallible>(response.map(|body| working.until_sent(body)))
+        }
+    });
+    let connection = http2::Builder::new(TokioExecutor::new())
+        .timer(TokioTimer::new())
+        .keep_alive_interval(KEEPALIVE)
+        .max_concurrent_streams(STREAMS)
+        .initial_stream_window_size(WINDOW_BYTES)
+        .serve_connection(TokioIo::new(stream), service);
+    let mut connection = pin!(connection);
+    // A connection that breaks off is its client's matter.
+    tokio::select! {
+        _ = connection.as_mut() => return,
+        () = evicted => return,
+        _ = stopping.wait_for(|stopping| *stopping) => connection.as_mut().graceful_shutdown(),
+    }
+    let _ = connection.await;
+}
+
+impl Door {
+    async fn answer_flight(&self, request: Request<Incoming>) -> Result<Response<Body>, Fault> {
+        let token = request.headers().get(header::AUTHORIZATION).and_then(|v| v.to_str().ok()).and_then(of_header);
+        let client = self.access().client(token.as_deref(), ClientIdentity::programs)?;
+        let is_interactive = INTERACTIVE.iter().any(|method| request.uri().path().ends_with(method));
+        let request = request.map(Body::new);
+        let response = self.engines().forward(&client, request, Wire::Grpc, is_interactive).await?;
+        Ok(response.map(Body::new))
+    }
+}

@@ -1,0 +1,248 @@
+//! Requests over HTTP on their way to an engine and back, for both versions of HTTP.
+
+use std::pin::Pin;
+use std::task::{Context, Poll};
+use std::time::Duration;
+
+use axum::body::{Body, BodyDataStream};
+use axum::http::request::Parts;
+use axum::http::{HeaderMap, HeaderName, Request, Response, header};
+use bytes::{Bytes, BytesMut};
+use futures::{Stream, StreamExt as _, TryStreamExt as _, stream};
+use hyper::body::{Frame, Incoming, SizeHint};
+use hyper::client::conn::{http1, http2};
+use hyper_util::rt::{TokioExecutor, TokioIo};
+use tokio::task::JoinSet;
+use tokio::time::Instant;
+
+use super::engine_pool::EnginePool;
+use super::engine_process::{EndReason, EngineLease, EngineProcess};
+use crate::client_identity::ClientIdentity;
+use crate::engine::EngineSocket;
+use crate::fault::Fault;
+use crate::flight::WINDOW_BYTES;
+
+/// Bytes of a request up to which it is kept, so that it can be sent again to a new engine.
+const KEPT_BYTES: usize = 64 << 10;
+/// Bytes of a request: axum's own limit, and gRPC's of one message.
+const LARGEST: usize = 4 << 20;
+/// How long the body of a request may take.
+const BODY_LIMIT: Duration = Duration::from_secs(30);
+/// Bytes of a frame of HTTP/2 between an engine and the door; the default of 16 KiB costs a wake-up each.
+const FRAME_BYTES: u32 = 256 << 10;
+/// Headers of one connection, not of the request (RFC 9110, section 7.6.1).
+const OF_CONNECTION: [HeaderName; 4] =
+    [header::CONNECTION, header::TRANSFER_ENCODING, header::UPGRADE, HeaderName::from_static("keep-alive")];
+
+/// How an engine is asked.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Wire {
+    /// HTTP/1.1, on a connection for each request.
+    Http,
+    /// HTTP/2, on one connection for all.
+    Grpc,
+}
+
+/// The body of a request.
+enum RequestBody {
+    Whole(Bytes),
+    /// One that is too long to be kept, or that its client ends only after an answer.
+    Streamed(Body),
+}
+
+impl EnginePool {
+    /// Answers a request by the engine of `client`. If the engine ends before its answer begins, a new one is asked once.
+    ///
+    /// # Errors
+    /// [`Fault::EngineEnded`], [`Fault::TooMany`], [`Fault::TooLarge`], [`Fault::Request`].
+    pub(super) async fn forward(
+        &self,
+        client: &ClientIdentity,
+        request: Request<Body>,
+        wire: Wire,
+        is_interactive: bool,
+    ) -> Result<Response<EngineBody>, Fault> {
+        let (mut parts, body) = request.into_parts();
+        for name in OF_CONNECTION {
+            parts.headers.remove(name);
+        }
+        let mut body = match is_interactive {
+            true => RequestBody::Streamed(Body::from_stream(in_time(body.into_data_stream(), Instant::now() + BODY_LIMIT))),
+            false => read_body(body, &parts.headers).await?,
+        };
+        loop {
+            let lease = self.lease(client).await?;
+            let (sent, again) = body.send();
+            let answer = EngineAnswer::fetch(lease.engine(), request_of(&parts, sent), wire).await;
+            match (answer, again) {
+                (Ok(answer), _) => return Ok(answer.with(lease)),
+                (Err(_), Some(again)) => {
+                    body = again;
+                    let _ = lease.engine().why_ended().await;
+                }
+                (Err(failed), None) => return Err(why(&lease, &failed).await),
+            }
+        }
+    }
+}
+
+impl RequestBody {
+    // What is sent, and what can be sent once more if that fails.
+    fn send(self) -> (Body, Option<Self>) {
+        match self {
+            Self::Whole(bytes) => (Body::from(bytes.clone()), Some(Self::Streamed(Body::from(bytes)))),
+            Self::Streamed(body) => (body, None),
+        }
+    }
+}
+
+fn request_of(parts: &Parts, body: Body) -> Request<Body> {
+    let mut request = Request::new(body);
+    *request.method_mut() = parts.method.clone();
+    *request.uri_mut() = parts.uri.clone();
+    *request.headers_mut() = parts.headers.clone();
+    request
+}
+
+async fn why(lease: &EngineLease, failed: &str) -> Fault {
+    match lease.engine().why_ended().await {
+        Some(EndReason::Failed(reason)) => Fault::EngineEnded { reason },
+        Some(EndReason::Retired) => Fault::EngineEnded { reason: "the server needed its place".to_owned() },
+        None => {
+            eprintln!("an engine does not answer: {failed}");
+            Fault::Internal
+        }
+    }
+}
+
+// Reads a short body to its end; of a long one, what is read goes before the rest.
+async fn read_body(body: Body, headers: &HeaderMap) -> Result<RequestBody, Fault> {
+    let declared = headers.get(header::CONTENT_LENGTH).and_then(|v| v.to_str().ok()?.parse::<usize>().ok());
+    if declared.is_some_and(|bytes| bytes > LARGEST) {
+        return Err(Fault::TooLarge { limit: LARGEST });
+    }
+    let mut rest = body.into_data_stream();
+    let mut read = BytesMut::new();
+    let end = Instant::now() + BODY_LIMIT;
+    while read.len() <= KEPT_BYTES {
+        let part = tokio::time::timeout_at(end, rest.try_next()).await;
+        let part = part.map_err(|_| Fault::request(format!("the body took longer than {BODY_LIMIT:?}")))?;
+        match part.map_err(|_| Fault::request("the request's body did not come whole"))? {
+            Some(part) => read.extend_from_slice(&part),
+            None => return Ok(RequestBody::Whole(read.freeze())),
+        }
+    }
+    let first = stream::once(async { Ok(read.freeze()) });
+    Ok(RequestBody::Streamed(Body::from_stream(first.chain(in_time(rest, end)))))
+}
+
+// An error where it takes too long: a body that just ended would look whole.
+fn in_time(rest: BodyDataStream, end: Instant) -> impl Stream<Item = Result<Bytes, axum::Error>> + Send {
+    stream::try_unfold(rest, move |mut rest| async move {
+        let part = tokio::time::timeout_at(end, rest.try_next()).await.map_err(axum::Error::new)??;
+        Ok(part.map(|part| (part, rest)))
+    })
+}
+
+struct EngineAnswer {
+    response: Response<Incoming>,
+    connection: JoinSet<()>,
+    wire: Wire,
+}
+
+impl EngineAnswer {
+    async fn fetch(engine: &EngineProcess, request: Request<Body>, wire: Wire) -> Result<Self, String> {
+        let mut connection = JoinSet::new();
+        let response = match wire {
+            Wire::Http => {
+                let stream = engine.connect(EngineSocket::Http).await.map_err(|e| e.to_string())?;
+                let (mut sender, driver) =
+                    http1::handshake(TokioIo::new(stream)).await.map_err(|e| e.to_string())?;
+                connection.spawn(async move { drop(driver.await) });
+                sender.send_request(request).await
+            }
+            Wire::Grpc => engine.flight_sender().await?.send_request(request).await,
+        };
+        let response = response.map_err(|e| e.to_string())?;
+        Ok(Self { response, connection, wire })
+    }
+
+    fn with(self, lease: EngineLease) -> Response<EngineBody> {
+        let Self { response, connection, wire } = self;
+        response.map(|incoming| EngineBody { incoming, wire, lease, _connection: connection, ended: false })
+    }
+}
+
+impl EngineProcess {
+    // The connection that all gRPC requests to the engine share.
+    async fn flight_sender(&self) -> Result<http2::SendRequest<Body>, String> {
+        let connect = async {
+            let stream = self.connect(EngineSocket::FlightSql).await.map_err(|e| e.to_string())?;
+            let handshake = http2::Builder::new(TokioExecutor::new())
+                .initial_stream_window_size(WINDOW_BYTES)
+                // Requests are held back each by its own window, never by another's.
+                .initial_connection_window_size(u32::MAX >> 1)
+                .max_frame_size(FRAME_BYTES)
+                .handshake(TokioIo::new(stream));
+            let (sender, driver) = handshake.await.map_err(|e| e.to_string())?;
+            // It ends with the engine.
+            tokio::spawn(driver);
+            Ok::<_, String>(sender)
+        };
+        self.flight.get_or_try_init(|| connect).await.cloned()
+    }
+}
+
+/// The body of an engine's answer. Dropping it ends the query.
+pub(super) struct EngineBody {
+    incoming: Incoming,
+    wire: Wire,
+    lease: EngineLease,
+    _connection: JoinSet<()>,
+    ended: bool,
+}
+
+impl EngineBody {
+    // gRPC says how an answer ended behind it, so that it can be told; HTTP/1.1 breaks the connection off.
+    fn failure(&self) -> Option<Frame<Bytes>> {
+        if self.wire == Wire::Http {
+            return None;
+        }
+        let reason = match self.lease.engine().end_reason() {
+            Some(EndReason::Failed(reason)) => reason.clone(),
+            _ => "it stopped answering".to_owned(),
+        };
+        let mut trailers = HeaderMap::new();
+        crate::flight::status(&Fault::EngineEnded { reason }).add_header(&mut trailers).ok()?;
+        Some(Frame::trailers(trailers))
+    }
+}
+
+impl hyper::body::Body for EngineBody {
+    type Data = Bytes;
+    type Error = hyper::Error;
+
+    fn poll_frame(
+        mut self: Pin<&mut Self>,
+        context: &mut Context<'_>,
+    ) -> Poll<Option<Result<Frame<Bytes>, hyper::Error>>> {
+        if self.ended {
+            return Poll::Ready(None);
+        }
+        match Pin::new(&mut self.incoming).poll_frame(context) {
+            Poll::Ready(Some(Err(failed))) => {
+                self.ended = true;
+                Poll::Ready(Some(self.failure().ok_or(failed)))
+            }
+            other => other,
+        }
+    }
+
+    fn is_end_stream(&self) -> bool {
+        self.ended || self.incoming.is_end_stream()
+    }
+
+    fn size_hint(&self) -> SizeHint {
+        hyper::body::Body::size_hint(&self.incoming)
+    }
+}

@@ -1,0 +1,90 @@
+//! HTTP connections of the door: so many at once, each of which must say what it wants in time.
+
+use std::pin::pin;
+use std::time::Duration;
+
+use axum::Router;
+use axum::body::Body;
+use axum::extract::{Request, State};
+use axum::response::{IntoResponse as _, Response};
+use hyper::server::conn::http1;
+use hyper_util::rt::{TokioIo, TokioTimer};
+use hyper_util::service::TowerToHyperService;
+use tokio::net::TcpListener;
+use tokio::sync::watch;
+use tokio::task::JoinSet;
+
+use super::Door;
+use super::connection_places::{ConnectionPlaces, PlacedStream};
+use super::forward::Wire;
+use crate::client_identity::ClientIdentity;
+use crate::fault::Fault;
+use crate::http::{Problem, RequestSite, authenticate, door_router, request_site};
+
+/// Connections at once. Systems often allow a process 1024 open files.
+const MOST: usize = 512;
+/// How long a request's head may take, and how long a connection may stand idle between two.
+const HEAD: Duration = Duration::from_secs(30);
+
+/// Answers connections until `stopping`, then lets those end that are at it.
+pub(super) async fn serve(door: Door, listener: TcpListener, stopping: watch::Receiver<bool>) {
+    let router = door_router(&door);
+    let places = ConnectionPlaces::new(listener, MOST);
+    let mut stopped = stopping.clone();
+    let mut open = JoinSet::new();
+    loop {
+        tokio::select! {
+            _ = stopped.wait_for(|stopping| *stopping) => break,
+            stream = places.next() => drop(open.spawn(answer(stream, router.clone(), stopping.clone()))),
+            Some(_) = open.join_next() => {}
+        }
+    }
+    while open.join_next().await.is_some() {}
+}
+
+async fn answer(stream: PlacedStream, router: Router, mut stopping: watch::Receiver<bool>) {
+    let evicted = stream.evicted();
+    let work = stream.work();
+    let answers = TowerToHyperService::new(router);
+    let service = hyper::service::service_fn(move |request| {
+        let answer = hyper::service::Service::call(&answers, request);
+        let working = work.begin();
+        async move {
+            let response: Result<Response, _> = answer.await;
+            response.map(|response| response.map(|body| working.until_sent(body)))
+        }
+    });
+    let connection = http1::Builder::new()
+        .timer(TokioTimer::new())
+        .header_read_timeout(HEAD)
+        .serve_connection(TokioIo::new(stream), service);
+    let mut connection = pin!(connection);
+    // A connection that breaks off is its client's matter.
+    tokio::select! {
+        _ = connection.as_mut() => return,
+        () = evicted => return,
+        _ = stopping.wait_for(|stopping| *stopping) => connection.as_mut().graceful_shutdown(),
+    }
+    let _ = connection.await;
+}
+
+impl Door {
+    /// Answers a request by the engine of who asks.
+    pub(crate) async fn forward_http(State(door): State<Self>, request: Request) -> Response {
+        door.answer_http(request).await.unwrap_or_else(|fault| {
+            door.metrics().failed(fault.code());
+            Problem(fault).into_response()
+        })
+    }
+
+    async fn answer_http(&self, request: Request) -> Result<Response, Fault> {
+        let local = || match request_site(request.headers()) {
+            RequestSite::Foreign => ClientIdentity::foreign(),
+            RequestSite::OwnPage => ClientIdentity::pages(),
+            RequestSite::Program => ClientIdentity::programs(),
+        };
+        let client = authenticate(self.access(), request.headers(), local)?;
+        let response = self.engines().forward(&client, request, Wire::Http, false).await?;
+        Ok(response.map(Body::new))
+    }
+}

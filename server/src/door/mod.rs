@@ -1,0 +1,172 @@
+//! The door: the process that clients reach. It holds connections, finds out who asks, and forwards requests to the engine
+//! of that client. It parses no SQL and decodes no file, so that no request can end it.
+
+mod connection_places;
+mod engine_pool;
+mod engine_process;
+mod flight;
+mod forward;
+mod http;
+mod postgres;
+mod temp_folder;
+
+use std::net::SocketAddr;
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::time::Duration;
+
+use echolake_lake::Lake;
+use tokio::net::TcpListener;
+use tokio::sync::watch;
+use tokio::task::JoinSet;
+
+use crate::Error;
+use crate::metrics::Metrics;
+use crate::tokens::{Access, Tokens};
+use engine_pool::EnginePool;
+
+/// How long answers may go on when the server is told to stop.
+const GRACE: Duration = Duration::from_secs(5);
+
+/// Where a server listens, whom it lets in, and what it gives them.
+pub struct Settings {
+    /// HTTP; None for none, as below. Port 0 for any that is free.
+    pub http: Option<SocketAddr>,
+    /// Arrow Flight SQL.
+    pub flight_sql: Option<SocketAddr>,
+    /// Postgres' protocol.
+    pub postgres: Option<SocketAddr>,
+    /// Who is let in; None for everybody, on loopback only.
+    pub tokens: Option<Tokens>,
+    /// The engines.
+    pub engines: EngineSettings,
+}
+
+/// What engines are started as, and what they may use.
+#[derive(Debug, Clone)]
+pub struct EngineSettings {
+    /// The program that has the command `engine`.
+    pub program: PathBuf,
+    /// Bytes of memory that queries may hold, those of one client as those of all together; if they hold more, the
+    /// largest engine ends.
+    pub memory: usize,
+    /// Engines at once, which is clients at once.
+    pub count: usize,
+    /// The folder for temporary files; None for one in the lake.
+    pub temp: Option<PathBuf>,
+}
+
+/// A server that listens and does not answer yet.
+pub struct Server {
+    door: Door,
+    http: Option<TcpListener>,
+    flight_sql: Option<TcpListener>,
+    postgres: Option<TcpListener>,
+}
+
+impl Server {
+    /// Listens.
+    ///
+    /// # Errors
+    /// [`Error::Open`], [`Error::Bind`], [`Error::Temp`].
+    pub async fn bind(lake: &Lake, settings: Settings) -> Result<Self, Error> {
+        let addresses = [settings.http, settings.flight_sql, settings.postgres];
+        if settings.tokens.is_none()
+            && let Some(address) = addresses.into_iter().flatten().find(|a| !a.ip().is_loopback())
+        {
+            return Err(Error::Open { address });
+        }
+        Ok(Self {
+            door: Door::new(lake, settings.tokens, settings.engines)?,
+            http: listen(settings.http).await?,
+            flight_sql: listen(settings.flight_sql).await?,
+            postgres: listen(settings.postgres).await?,
+        })
+    }
+
+    /// Where it listens, as URLs.
+    pub fn addresses(&self) -> Vec<String> {
+        let url = |scheme: &str, listener: &Option<TcpListener>, path: &str| {
+            let address = listener.as_ref()?.local_addr().ok()?;
+            Some(format!("{scheme}://{address}{path}"))
+        };
+        let all = [
+            url("http", &self.http, ""),
+            url("grpc", &self.flight_sql, ""),
+            url("postgresql", &self.postgres, "/datafusion"),
+        ];
+        all.into_iter().flatten().collect()
+    }
+
+    /// Answers until `stop`, then lets answers go on for five seconds.
+    ///
+    /// # Errors
+    /// [`Error::System`].
+    pub async fn run(self, stop: impl Future<Output = ()>) -> Result<(), Error> {
+        let stopping = watch::Sender::new(false);
+        let mut tasks = JoinSet::new();
+        let mut upkeep = JoinSet::new();
+        upkeep.spawn(self.door.0.engines.clone().keep_up());
+        if let Some(listener) = self.http {
+            tasks.spawn(http::serve(self.door.clone(), listener, stopping.subscribe()));
+        }
+        if let Some(listener) = self.flight_sql {
+            tasks.spawn(flight::serve(self.door.clone(), listener, stopping.subscribe()));
+        }
+        if let Some(listener) = self.postgres {
+            tasks.spawn(postgres::serve(self.door.clone(), listener, stopping.subscribe()));
+        }
+        tokio::select! {
+            () = stop => {}
+            Some(Err(failed)) = tasks.join_next() => return Err(Error::System(std::io::Error::other(failed))),
+        }
+        stopping.send_replace(true);
+        let rest = async { while tasks.join_next().await.is_some() {} };
+        // What is not done by then ends with the process.
+        let _ = tokio::time::timeout(GRACE, rest).await;
+        self.door.0.engines.end_all().await;
+        Ok(())
+    }
+}
+
+async fn listen(address: Option<SocketAddr>) -> Result<Option<TcpListener>, Error> {
+    match address {
+        None => Ok(None),
+        Some(address) => TcpListener::bind(address).await.map(Some).map_err(|source| Error::Bind { address, source }),
+    }
+}
+
+/// What all connections share.
+#[derive(Clone)]
+pub(crate) struct Door(Arc<Inner>);
+
+struct Inner {
+    access: Access,
+    metrics: Arc<Metrics>,
+    engines: EnginePool,
+}
+
+impl Door {
+    fn new(lake: &Lake, tokens: Option<Tokens>, settings: EngineSettings) -> Result<Self, Error> {
+        let metrics = Arc::new(Metrics::default());
+        let engines = EnginePool::new(lake, settings, metrics.clone())?;
+        Ok(Self(Arc::new(Inner { access: Access::new(tokens), metrics, engines })))
+    }
+
+    pub(crate) fn access(&self) -> &Access {
+        &self.0.access
+    }
+
+    pub(crate) fn metrics(&self) -> &Metrics {
+        &self.0.metrics
+    }
+
+    /// The figures of the door and of all engines, in Prometheus' text format.
+    pub(crate) fn figures(&self) -> String {
+        self.0.metrics.text() + &self.0.engines.figures()
+    }
+
+    fn engines(&self) -> &EnginePool {
+        &self.0.engines
+    }
+}

@@ -1,0 +1,66 @@
+//! Keys that clients cancel by. They are random and the door's own; an engine's are never told to a client.
+
+use std::collections::HashMap;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+
+use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
+
+use super::frames::cancel_message;
+use crate::door::engine_process::EngineProcess;
+use crate::engine::EngineSocket;
+use crate::random;
+
+/// The engine that a connection uses now, and the key of its connection there.
+#[derive(Clone)]
+pub(super) struct CancelTarget {
+    pub(super) engine: Arc<EngineProcess>,
+    pub(super) pid: i32,
+    pub(super) secret: Vec<u8>,
+}
+
+/// A connection's key.
+pub(super) struct CancelKey {
+    pub(super) pid: i32,
+    pub(super) secret: Vec<u8>,
+}
+
+/// The keys of all connections.
+#[derive(Default)]
+pub(super) struct CancelKeys(Mutex<HashMap<(i32, Vec<u8>), CancelTarget>>);
+
+impl CancelKeys {
+    /// A key of `bytes` random bytes: four in protocol 3.0, more in 3.2. None if the system gives none.
+    pub(super) fn make(bytes: usize) -> Option<CancelKey> {
+        let random: [u8; 36] = random::bytes().ok()?;
+        let (pid, secret) = random.split_first_chunk()?;
+        Some(CancelKey { pid: i32::from_be_bytes(*pid) & i32::MAX, secret: secret.get(..bytes.min(32))?.to_vec() })
+    }
+
+    /// What runs on this connection can be cancelled there from now on.
+    pub(super) fn set(&self, key: &CancelKey, target: CancelTarget) {
+        self.lock().insert((key.pid, key.secret.clone()), target);
+    }
+
+    /// It cannot be cancelled any more.
+    pub(super) fn remove(&self, key: &CancelKey) {
+        self.lock().remove(&(key.pid, key.secret.clone()));
+    }
+
+    /// Cancels what runs on the connection of a key; false if there is none.
+    pub(super) async fn cancel(&self, pid: i32, secret: &[u8]) -> bool {
+        let found = self.lock().get(&(pid, secret.to_vec())).cloned();
+        let Some(target) = found else { return false };
+        // An engine that is gone runs nothing.
+        if let Ok(mut stream) = target.engine.connect(EngineSocket::Postgres).await
+            && stream.write_all(&cancel_message(target.pid, &target.secret)).await.is_ok()
+        {
+            // The engine closes the connection behind it.
+            let _ = stream.read(&mut [0]).await;
+        }
+        true
+    }
+
+    fn lock(&self) -> MutexGuard<'_, HashMap<(i32, Vec<u8>), CancelTarget>> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}

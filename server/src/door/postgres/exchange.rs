@@ -1,0 +1,247 @@
+//! What a connection has asked and was answered, as far as it takes to ask again: the messages since the last statement
+//! that was answered, prepared statements, and settings. The door sees only types of messages and tags of commands.
+
+use std::collections::{BTreeMap, VecDeque};
+
+use super::frames::{FrameHeader, HEADER};
+
+/// Bytes of messages that are kept, of a statement that runs as of all that was prepared.
+const KEPT_BYTES: usize = 64 << 10;
+const PREPARED_BYTES: usize = 256 << 10;
+/// Tags of commands that change the session and nothing else.
+const SETTINGS: [&[u8]; 4] = [b"SET", b"RESET", b"DISCARD ALL", b"PREPARE"];
+/// The tag of a command whose rows are fetched later.
+const CURSOR: &[u8] = b"DECLARE CURSOR";
+
+/// A connection's exchange with its engine.
+#[derive(Default)]
+pub(super) struct Exchange {
+    /// Messages that are not answered, and where those end that ask for an answer.
+    asked: Vec<u8>,
+    ends: VecDeque<usize>,
+    /// Whether `asked` is all that was asked.
+    is_cut: bool,
+    /// Texts to be prepared, until the engine has done so.
+    parses: VecDeque<(Vec<u8>, Vec<u8>)>,
+    prepared: BTreeMap<Vec<u8>, Vec<u8>>,
+    prepared_bytes: usize,
+    settings: Vec<Vec<u8>>,
+    /// Whether all that was prepared and set is known.
+    is_forgetful: bool,
+    /// Answers to the statement that runs: messages that were passed on, and what was seen in them.
+    answered: usize,
+    has_rows: bool,
+    sets: Option<bool>,
+    pub(super) is_repeated: bool,
+    pub(super) in_transaction: bool,
+    pub(super) has_cursor: bool,
+}
+
+impl Exchange {
+    /// Takes note of a client's message, whole or as much as there is of a long one.
+    pub(super) fn ask(&mut self, header: FrameHeader, bytes: &[u8]) {
+        if bytes.len() < header.bytes || self.asked.len() + bytes.len() > KEPT_BYTES {
+            self.is_cut = true;
+        }
+        if !self.is_cut {
+            self.asked.extend_from_slice(bytes);
+        }
+        let body = bytes.get(HEADER..).unwrap_or_default();
+        match header.kind {
+            b'P' => self.parses.push_back((name(body).to_vec(), bytes.to_vec())),
+            b'C' if body.first() == Some(&b'S') => self.close(name(&body[1..])),
+            b'Q' | b'S' => self.ends.push_back(self.asked.len()),
+            _ => {}
+        }
+    }
+
+    /// Whether an answer is awaited.
+    pub(super) fn is_waiting(&self) -> bool {
+        !self.ends.is_empty() || !self.asked.is_empty() || self.is_cut
+    }
+
+    /// Whether the client has asked for an answer to the statement that runs, and not only sent its parts.
+    pub(super) fn has_end(&self) -> bool {
+        !self.ends.is_empty()
+    }
+
+    /// Takes note of an engine's message that is passed on.
+    pub(super) fn answer(&mut self, kind: u8, body: &[u8]) {
+        self.answered += 1;
+        match kind {
+            b'D' | b'd' => self.has_rows = true,
+            b'1' => self.prepare(),
+            b'C' => {
+                let tag = body.strip_suffix(b"\0").unwrap_or(body);
+                self.sets = Some(self.sets.unwrap_or(true) && SETTINGS.contains(&tag));
+                self.has_cursor |= tag == CURSOR;
+            }
+            b'Z' => {
+                self.in_transaction = body.first().is_some_and(|status| *status != b'I');
+                self.finish();
+            }
+            _ => {}
+        }
+    }
+
+    fn prepare(&mut self) {
+        let Some((name, message)) = self.parses.pop_front() else { return };
+        // The one without a name is for the statement that runs.
+        if name.is_empty() {
+            return;
+        }
+        self.close(&name);
+        self.prepared_bytes += message.len();
+        match self.prepared_bytes <= PREPARED_BYTES {
+            true => drop(self.prepared.insert(name, message)),
+            false => self.is_forgetful = true,
+        }
+    }
+
+    fn close(&mut self, name: &[u8]) {
+        if let Some(message) = self.prepared.remove(name) {
+            self.prepared_bytes -= message.len();
+        }
+    }
+
+    // The statement that ran is answered: what was asked after it remains.
+    fn finish(&mut self) {
+        let end = self.ends.pop_front().unwrap_or(self.asked.len());
+        let statement: Vec<u8> = self.asked.drain(..end).collect();
+        self.ends.iter_mut().for_each(|at| *at -= end);
+        if self.sets == Some(true) {
+            let kept: usize = self.settings.iter().map(Vec::len).sum();
+            match !self.is_cut && kept + statement.len() <= KEPT_BYTES {
+                true if !self.settings.contains(&statement) => self.settings.push(statement),
+                true => {}
+                false => self.is_forgetful = true,
+            }
+        }
+        if self.ends.is_empty() {
+            self.is_cut = false;
+            self.parses.clear();
+        }
+        self.begin_answer();
+        self.is_repeated = false;
+    }
+
+    fn begin_answer(&mut self) {
+        (self.answered, self.has_rows, self.sets) = (0, false, None);
+    }
+
+    /// Whether the statement that runs can be asked again as if nothing had happened.
+    pub(super) fn is_repeatable(&self) -> bool {
+        !self.is_cut && !self.has_rows && !self.is_repeated && !self.is_forgetful && !self.has_cursor
+    }
+
+    /// Whether a new engine can take the connection over.
+    pub(super) fn is_transferable(&self) -> bool {
+        !self.is_forgetful
+    }
+
+    /// Begins to ask again; returns how many messages of the new answer the client knows already.
+    pub(super) fn repeat(&mut self) -> usize {
+        self.is_repeated = true;
+        self.parses.clear();
+        std::mem::take(&mut self.answered)
+    }
+
+    /// Drops the statement that runs, after its failure was told.
+    pub(super) fn fail(&mut self) {
+        self.sets = None;
+        if self.is_cut {
+            // What came after it is not known.
+            let ends = self.ends.len().saturating_sub(1);
+            self.asked.clear();
+            self.ends = std::iter::repeat_n(0, ends).collect();
+            self.is_cut = ends > 0;
+            self.begin_answer();
+        } else {
+            self.finish();
+        }
+        self.has_cursor = false;
+        self.in_transaction = false;
+    }
+
+    /// What was set; each of these has an answer that ends by saying that the next is awaited.
+    pub(super) fn settings(&self) -> impl Iterator<Item = &[u8]> {
+        self.settings.iter().map(Vec::as_slice)
+    }
+
+    /// What was prepared.
+    pub(super) fn prepared(&self) -> impl Iterator<Item = &[u8]> {
+        self.prepared.values().map(Vec::as_slice)
+    }
+
+    /// Messages that are not answered.
+    pub(super) fn unanswered(&self) -> &[u8] {
+        &self.asked
+    }
+}
+
+// Up to the zero that ends it.
+fn name(body: &[u8]) -> &[u8] {
+    body.split(|byte| *byte == 0).next().unwrap_or_default()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn ask(exchange: &mut Exchange, kind: u8, body: &[u8]) -> Vec<u8> {
+        let mut message = vec![kind];
+        message.extend((body.len() as u32 + 4).to_be_bytes());
+        message.extend(body);
+        exchange.ask(FrameHeader { kind, bytes: message.len() }, &message);
+        message
+    }
+
+    #[test]
+    fn what_was_answered_is_not_asked_again() {
+        let mut exchange = Exchange::default();
+        let first = ask(&mut exchange, b'Q', b"select 1\0");
+        let second = ask(&mut exchange, b'Q', b"select 2\0");
+        assert_eq!(exchange.unanswered(), [first, second.clone()].concat());
+        exchange.answer(b'T', b"");
+        assert!(exchange.is_repeatable());
+        exchange.answer(b'D', b"");
+        assert!(!exchange.is_repeatable(), "rows are not sent twice");
+        exchange.answer(b'Z', b"I");
+        assert_eq!(exchange.unanswered(), second);
+        assert!(exchange.is_repeatable());
+        assert_eq!(exchange.repeat(), 0);
+        assert!(!exchange.is_repeatable(), "once is enough");
+        exchange.fail();
+        assert!(!exchange.is_waiting());
+    }
+
+    #[test]
+    fn settings_and_statements_are_prepared_again() {
+        let mut exchange = Exchange::default();
+        let set = ask(&mut exchange, b'Q', b"set timezone = 'UTC'\0");
+        exchange.answer(b'C', b"SET\0");
+        exchange.answer(b'Z', b"I");
+        ask(&mut exchange, b'Q', b"select 1\0");
+        exchange.answer(b'C', b"SELECT 1\0");
+        exchange.answer(b'Z', b"I");
+        let prepared = ask(&mut exchange, b'P', b"s1\0select 1\0\0\0");
+        let wrong = ask(&mut exchange, b'P', b"s2\0selec\0\0\0");
+        ask(&mut exchange, b'S', b"");
+        exchange.answer(b'1', b"");
+        exchange.answer(b'E', b"");
+        exchange.answer(b'Z', b"I");
+        assert_eq!(exchange.settings().collect::<Vec<_>>(), [set.as_slice()]);
+        assert_eq!(exchange.prepared().collect::<Vec<_>>(), [prepared.as_slice()], "and not {wrong:?}");
+        ask(&mut exchange, b'C', b"Ss1\0");
+        assert_eq!(exchange.prepared().count(), 0);
+    }
+
+    #[test]
+    fn long_messages_are_not_kept() {
+        let mut exchange = Exchange::default();
+        ask(&mut exchange, b'Q', &vec![b'x'; KEPT_BYTES]);
+        assert!(exchange.is_waiting() && !exchange.is_repeatable() && exchange.unanswered().is_empty());
+        exchange.answer(b'Z', b"I");
+        assert!(!exchange.is_waiting() && exchange.is_repeatable());
+    }
+}

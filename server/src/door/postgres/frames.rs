@@ -1,0 +1,180 @@
+//! Messages of Postgres' protocol as the door sees them: a type, a length, bytes. What they say is the engine's to know.
+
+use bytes::{Buf as _, BufMut as _, BytesMut};
+use pgwire::error::{ErrorInfo, PgWireError};
+use pgwire::messages::PgWireBackendMessage;
+
+use crate::fault::Fault;
+use crate::postgres::sqlstate;
+
+/// Bytes of a message's type and length.
+pub(super) const HEADER: usize = 5;
+/// Bytes of a text with its name and types.
+const TEXT: usize = (2 << 20) + (1 << 10);
+/// Bytes of the values of a statement.
+const VALUES: usize = 4 << 20;
+/// Bytes of what only names a statement or a portal.
+const NAMES: usize = 4 << 10;
+
+/// The first bytes of a message.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct FrameHeader {
+    pub(super) kind: u8,
+    /// Bytes of the whole message, with these.
+    pub(super) bytes: usize,
+}
+
+impl FrameHeader {
+    /// Reads it from the beginning of a buffer; None until there is enough.
+    ///
+    /// # Errors
+    /// [`Fault::Request`] if the length is impossible.
+    pub(super) fn peek(buffer: &[u8]) -> Result<Option<Self>, Fault> {
+        let Some((&[kind, a, b, c, d], _)) = buffer.split_first_chunk() else { return Ok(None) };
+        match i32::from_be_bytes([a, b, c, d]) {
+            length @ 4.. => Ok(Some(Self { kind, bytes: length.unsigned_abs() as usize + 1 })),
+            length => Err(Fault::request(format!("a message of {length} bytes; a length is 4 at least"))),
+        }
+    }
+
+    /// Checks a client's message before anything of it is kept.
+    ///
+    /// # Errors
+    /// [`Fault::TooLarge`], [`Fault::Request`].
+    pub(super) fn check(self) -> Result<(), Fault> {
+        let limit = match self.kind {
+            b'Q' | b'P' => TEXT,
+            b'B' => VALUES,
+            b'D' | b'C' | b'E' | b'H' | b'S' | b'X' | b'p' | b'c' | b'f' | b'd' | b'F' => NAMES,
+            other => return Err(Fault::request(format!("a message of the type {other:#04x}, which is none"))),
+        };
+        match self.bytes <= limit {
+            true => Ok(()),
+            false => Err(Fault::TooLarge { limit }),
+        }
+    }
+}
+
+/// A failure after which the connection goes on.
+pub(super) fn error_message(fault: &Fault) -> BytesMut {
+    encode_error(sqlstate::error(fault))
+}
+
+/// A failure that ends the connection.
+pub(super) fn fatal_message(fault: &Fault) -> BytesMut {
+    encode_error(sqlstate::fatal(fault))
+}
+
+fn encode_error(error: PgWireError) -> BytesMut {
+    let mut bytes = BytesMut::new();
+    // It is a message of a few hundred bytes, which is no reason for the library to refuse it.
+    let _ = PgWireBackendMessage::ErrorResponse(ErrorInfo::from(error).into()).encode(&mut bytes);
+    bytes
+}
+
+/// Says that the next statement is awaited, outside of a transaction.
+pub(super) const READY: [u8; 6] = [b'Z', 0, 0, 0, 5, b'I'];
+/// Asks for all answers so far.
+pub(super) const SYNC: [u8; 5] = [b'S', 0, 0, 0, 4];
+/// Asks for a password.
+pub(super) const PASSWORD_WANTED: [u8; 9] = [b'R', 0, 0, 0, 8, 0, 0, 0, 3];
+
+/// A key that a client may cancel by, as the server tells it.
+pub(super) fn key_message(pid: i32, secret: &[u8]) -> BytesMut {
+    let mut bytes = BytesMut::new();
+    bytes.put_u8(b'K');
+    bytes.put_i32(8 + i32::try_from(secret.len()).unwrap_or(0));
+    bytes.put_i32(pid);
+    bytes.put_slice(secret);
+    bytes
+}
+
+/// A request to cancel what runs on the connection of this key.
+pub(super) fn cancel_message(pid: i32, secret: &[u8]) -> BytesMut {
+    let mut bytes = BytesMut::new();
+    bytes.put_i32(12 + i32::try_from(secret.len()).unwrap_or(0));
+    bytes.put_i32(CANCEL);
+    bytes.put_i32(pid);
+    bytes.put_slice(secret);
+    bytes
+}
+
+/// Codes that stand where a startup packet has its protocol's version.
+const CANCEL: i32 = 80_877_102;
+const TLS: i32 = 80_877_103;
+const GSS: i32 = 80_877_104;
+
+/// What a client's first packet says.
+#[derive(Debug, PartialEq, Eq)]
+pub(super) enum StartupPacket {
+    /// It would rather speak encrypted.
+    Encryption,
+    /// It cancels what runs on another connection.
+    Cancel { pid: i32, secret: Vec<u8> },
+    /// It begins a session, as this user.
+    Session { user: String },
+}
+
+impl StartupPacket {
+    /// Reads the packet behind its length.
+    ///
+    /// # Errors
+    /// [`Fault::Request`].
+    pub(super) fn parse(mut packet: &[u8]) -> Result<Self, Fault> {
+        let wrong = || Fault::request("the protocol's startup is expected");
+        match packet.try_get_i32().map_err(|_| wrong())? {
+            TLS | GSS => Ok(Self::Encryption),
+            CANCEL => {
+                let pid = packet.try_get_i32().map_err(|_| wrong())?;
+                Ok(Self::Cancel { pid, secret: packet.to_vec() })
+            }
+            version if version >> 16 == 3 => {
+                let mut texts = packet.split(|byte| *byte == 0).map(String::from_utf8_lossy);
+                let mut user = String::new();
+                while let (Some(name), Some(value)) = (texts.next(), texts.next()) {
+                    if name == "user" {
+                        user = value.into_owned();
+                    }
+                }
+                Ok(Self::Session { user })
+            }
+            _ => Err(wrong()),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn lengths_are_checked_before_anything_is_kept() {
+        let header = |kind: u8, length: i32| {
+            let mut bytes = vec![kind];
+            bytes.extend(length.to_be_bytes());
+            FrameHeader::peek(&bytes)
+        };
+        assert_eq!(FrameHeader::peek(b"Q\0\0\0").expect("no harm"), None);
+        for length in [i32::MIN, -1, 0, 3] {
+            assert!(header(b'Q', length).is_err(), "{length}");
+        }
+        let check = |kind, length| header(kind, length).expect("a length").expect("whole").check();
+        assert!(check(b'Q', 2 << 20).is_ok() && check(b'B', 4 << 20).is_err() && check(b'S', 4).is_ok());
+        for (kind, length) in [(b'Q', 0x3fff_fff0), (b'P', i32::MAX), (b'E', 5000), (b'!', 4), (b'd', 1 << 20)] {
+            assert!(check(kind, length).is_err(), "{kind} {length}");
+        }
+    }
+
+    #[test]
+    fn startups_are_told_apart() {
+        let packet = |code: i32, rest: &[u8]| [&code.to_be_bytes(), rest].concat();
+        assert_eq!(StartupPacket::parse(&packet(TLS, b"")).expect("known"), StartupPacket::Encryption);
+        let session = StartupPacket::parse(&packet(3 << 16, b"database\0x\0user\0ann\0\0")).expect("known");
+        assert_eq!(session, StartupPacket::Session { user: "ann".to_owned() });
+        let cancel = StartupPacket::parse(&cancel_message(7, b"abcd")[4..]).expect("known");
+        assert_eq!(cancel, StartupPacket::Cancel { pid: 7, secret: b"abcd".to_vec() });
+        for wrong in [&b""[..], b"\0\0", &packet(2 << 16, b""), &packet(-1, b"x")] {
+            assert!(StartupPacket::parse(wrong).is_err(), "{wrong:?}");
+        }
+    }
+}

@@ -1,0 +1,72 @@
+//! Limits that the system holds an engine to: files by Landlock, where the kernel has it, and memory by a resource limit.
+
+use std::io;
+use std::path::{Path, PathBuf};
+
+use landlock::{
+    ABI, Access as _, AccessFs, AccessNet, CompatLevel, Compatible as _, Ruleset, RulesetAttr as _,
+    RulesetCreated, RulesetCreatedAttr as _, RulesetError, path_beneath_rules,
+};
+use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
+
+/// The newest version of Landlock that is used; of an older kernel, what it has.
+const LANDLOCK: ABI = ABI::V5;
+/// The process's own figures, those of the processors, and random bytes.
+const SYSTEM: [&str; 4] = ["/proc", "/sys/fs/cgroup", "/sys/devices/system/cpu", "/dev/urandom"];
+/// Address space over what queries may hold: code, stacks of threads, caches, what the allocator keeps. The door looks at
+/// what is really used, which is far less; this limit ends one huge allocation at once.
+const OVERHEAD_BYTES: u64 = 1 << 30;
+
+/// Returns what this machine lacks to confine engines, for people.
+pub fn missing() -> Option<&'static str> {
+    let tried = Ruleset::default()
+        .set_compatibility(CompatLevel::HardRequirement)
+        .handle_access(AccessFs::from_all(ABI::V1))
+        .and_then(Ruleset::create);
+    tried.is_err().then_some(
+        "this kernel has no Landlock: engines are kept from other files by the program alone, not by the system",
+    )
+}
+
+/// Lets the process read `lake`, read and write `own` folders, and nothing else; connect to nothing over TCP. To be called
+/// before there are threads. A kernel without Landlock leaves the process as it is.
+///
+/// # Errors
+/// The system refuses.
+pub fn confine_files(lake: &Path, own: &[&Path]) -> io::Result<()> {
+    let ruleset = || -> Result<RulesetCreated, RulesetError> {
+        let read = AccessFs::from_read(LANDLOCK) & !AccessFs::Execute;
+        Ruleset::default()
+            .handle_access(AccessFs::from_all(LANDLOCK))?
+            .handle_access(AccessNet::from_all(LANDLOCK))?
+            .create()?
+            .add_rules(path_beneath_rules([lake], read))?
+            .add_rules(path_beneath_rules(linked_folders(lake), read))?
+            .add_rules(path_beneath_rules(SYSTEM, read))?
+            .add_rules(path_beneath_rules(own, AccessFs::from_all(LANDLOCK)))
+    };
+    ruleset().and_then(RulesetCreated::restrict_self).map_err(io::Error::other)?;
+    // A core file would hold the lake's data, and takes seconds to write.
+    set_limit(Resource::Core, 0)
+}
+
+// Folders of a lake may be links to other disks.
+fn linked_folders(lake: &Path) -> Vec<PathBuf> {
+    let entries = std::fs::read_dir(lake).into_iter().flatten().flatten();
+    entries.filter(|entry| entry.file_type().is_ok_and(|kind| kind.is_symlink())).map(|entry| entry.path()).collect()
+}
+
+/// Limits what the process can allocate to `memory` bytes over what it has and needs besides.
+///
+/// # Errors
+/// The system refuses.
+pub(super) fn limit_memory(memory: Option<usize>) -> io::Result<()> {
+    let Some(memory) = memory else { return Ok(()) };
+    set_limit(Resource::Data, memory as u64 + OVERHEAD_BYTES)
+}
+
+// Never above what the process was started with, which only an administrator may raise.
+fn set_limit(resource: Resource, most: u64) -> io::Result<()> {
+    let maximum = getrlimit(resource).maximum.map_or(most, |maximum| maximum.min(most));
+    Ok(setrlimit(resource, Rlimit { current: Some(maximum), maximum: Some(maximum) })?)
+}

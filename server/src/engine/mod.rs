@@ -1,0 +1,99 @@
+//! An engine: the queries of one client, in a process of their own. It answers the three protocols on Unix sockets in a
+//! folder that only its user may enter; the door, which started it, is its only peer and has found out who asks.
+
+pub mod confinement;
+pub(crate) mod report;
+mod watchdog;
+
+use std::io::BufRead as _;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use echolake_lake::Lake;
+use echolake_query::{Client, Engine, Limits, Quota};
+use futures::FutureExt as _;
+use tokio::net::UnixListener;
+use tokio::sync::oneshot;
+
+use crate::client_identity::ClientIdentity;
+use crate::service::Service;
+use crate::{Error, flight, http, postgres};
+use report::EngineReport;
+
+/// A query that has a new engine read what every query reads.
+const WARM_UP: &str = "select count(*) from runs";
+
+/// A protocol, as an engine's sockets are named.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum EngineSocket {
+    Http,
+    FlightSql,
+    Postgres,
+}
+
+impl EngineSocket {
+    /// The path of this socket in an engine's folder.
+    pub(crate) fn path(self, folder: &Path) -> PathBuf {
+        folder.join(match self {
+            Self::Http => "http",
+            Self::FlightSql => "flight",
+            Self::Postgres => "postgres",
+        })
+    }
+
+    fn listen(self, folder: &Path) -> Result<UnixListener, Error> {
+        UnixListener::bind(self.path(folder)).map_err(Error::System)
+    }
+}
+
+/// Answers one client's requests until standard input ends, which the door holds.
+///
+/// It is a spare at first: it reads the lake, reports that it is ready, and learns whose engine it is by the first line
+/// of standard input.
+///
+/// # Errors
+/// [`Error::System`], [`Error::Query`], [`Error::Transport`].
+pub async fn run_engine(lake: &Lake, sockets: &Path, memory: Option<usize>) -> Result<(), Error> {
+    let assigned = read_assignment();
+    let http = EngineSocket::Http.listen(sockets)?;
+    let flight_sql = EngineSocket::FlightSql.listen(sockets)?;
+    let postgres = EngineSocket::Postgres.listen(sockets)?;
+    let engine = Engine::new(lake, Limits { memory })?;
+    warm_up(&engine).await?;
+    EngineReport::Ready.send();
+    // The door went away before it had a use for this engine.
+    let Ok(identity) = assigned.await else { return Ok(()) };
+    confinement::limit_memory(memory).map_err(Error::System)?;
+    let service = Service::new(lake, engine, identity)?;
+    watchdog::start(&service).map_err(Error::System)?;
+    tokio::select! {
+        failed = http::serve(service.clone(), http) => failed,
+        failed = flight::serve(service.clone(), flight_sql) => failed,
+        failed = postgres::serve(service, postgres) => failed,
+    }
+}
+
+// A thread of its own, so that an engine ends with its door whatever its other threads do.
+fn read_assignment() -> oneshot::Receiver<ClientIdentity> {
+    let (send, receive) = oneshot::channel();
+    std::thread::spawn(move || {
+        let mut send = Some(send);
+        for line in std::io::stdin().lock().lines().map_while(Result::ok) {
+            let identity = serde_json::from_str(&line).ok();
+            if let (Some(identity), Some(send)) = (identity, send.take()) {
+                // Nobody receives it where the engine has failed meanwhile.
+                let _ = send.send(identity);
+            }
+        }
+        std::process::exit(0);
+    });
+    receive
+}
+
+async fn warm_up(engine: &Engine) -> Result<(), Error> {
+    let session = engine.session(&Arc::new(Client::new("warm-up", Quota::default())));
+    // What is wrong with the lake is told to whoever asks it.
+    let answer = async { session.query(WARM_UP).await?.next().await };
+    drop(answer.boxed().await);
+    Ok(())
+}

@@ -1,0 +1,78 @@
+//! Ends its own process where work continues that nobody waits for any more: planning, a call of a function, an operator
+//! that does not return. The library cannot be interrupted there; the process is one client's, and its door starts another.
+
+use std::time::{Duration, Instant};
+
+use rustix::time::{ClockId, clock_gettime};
+
+use super::report::EngineReport;
+use crate::service::Service;
+
+/// Time between two looks; the door's figures are sent as often.
+const INTERVAL: Duration = Duration::from_millis(50);
+/// How long work may continue after its query was cancelled, ran out of time, or lost its client.
+const GRACE: Duration = Duration::from_millis(250);
+/// Part of one processor from which an engine without requests is not idle.
+const BUSY: f64 = 0.5;
+
+/// Starts a thread that looks on until the process ends.
+///
+/// # Errors
+/// The system gives no thread.
+pub(super) fn start(service: &Service) -> std::io::Result<()> {
+    let service = service.clone();
+    std::thread::Builder::new().name("watchdog".to_owned()).spawn(move || watch(&service))?;
+    Ok(())
+}
+
+fn watch(service: &Service) {
+    let mut idle = IdleWork::default();
+    let mut sent = Vec::new();
+    loop {
+        std::thread::sleep(INTERVAL);
+        if service.engine().overdue().is_some_and(|time| time > GRACE) {
+            end("a query that was ended did not stop");
+        }
+        if idle.look(service.activity().count() == 0) > GRACE {
+            end("work that nobody waits for did not stop");
+        }
+        let counters = service.metrics().counters();
+        if counters != sent {
+            EngineReport::Counters(counters.clone()).send();
+            sent = counters;
+        }
+    }
+}
+
+fn end(why: &str) -> ! {
+    EngineReport::Ending(why.to_owned()).send();
+    std::process::abort()
+}
+
+/// Time for which the process has computed without a request.
+#[derive(Default)]
+struct IdleWork {
+    last: Option<(Instant, Duration)>,
+    time: Duration,
+}
+
+impl IdleWork {
+    fn look(&mut self, is_idle: bool) -> Duration {
+        let (now, cpu) = (Instant::now(), cpu_time());
+        if let (Some((then, before)), true) = (self.last, is_idle)
+            && cpu.saturating_sub(before).as_secs_f64() > BUSY * (now - then).as_secs_f64()
+        {
+            self.time += now - then;
+        } else {
+            self.time = Duration::ZERO;
+        }
+        self.last = Some((now, cpu));
+        self.time
+    }
+}
+
+// Of all threads of the process.
+fn cpu_time() -> Duration {
+    let time = clock_gettime(ClockId::ProcessCPUTime);
+    Duration::new(time.tv_sec.unsigned_abs(), time.tv_nsec as u32)
+}
