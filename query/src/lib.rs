@@ -36,6 +36,6 @@ pub use error::Error;
 pub use functions::Functions;
 pub use mcap::{Attachment, Contents, Topic};
 pub use opaque::Opaque;
-pub use predicate::Subqueries;
+pub use predicate::PredicateForm;
 pub use session::{Answer, CancelHandle, Extend, Prepared, Session};
 pub use statement_bounds::check_statement_bounds;

@@ -1,21 +1,20 @@
 //! A predicate of somebody else's in a query of ours: it fills the parentheses that it was put into, and nothing more.
 
-use std::ops::ControlFlow;
-
 use datafusion::sql::parser::Statement;
-use datafusion::sql::sqlparser::ast::{
-    BinaryOperator, Expr, Query, SetExpr, Statement as Sql, Value, Visit as _, Visitor,
-};
+use datafusion::sql::sqlparser::ast::{BinaryOperator, Expr, Ident, SetExpr, Statement as Sql, UnaryOperator, Value};
 
 use crate::{Error, Session};
 
-/// Whether a predicate may ask other tables, or the same again.
+/// Bytes of a predicate of comparisons.
+const MOST_COMPARISON_BYTES: usize = 2048;
+
+/// What a predicate may consist of.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Subqueries {
-    /// It may.
-    Allowed,
-    /// It sees the row that it is asked of, and nothing more.
-    Refused,
+pub enum PredicateForm {
+    /// Any expression, with queries of other tables in it.
+    AnyExpression,
+    /// Comparisons of columns and literals, joined by AND, OR and NOT: work that a row bounds, whoever wrote it.
+    Comparisons,
 }
 
 impl Session {
@@ -23,39 +22,79 @@ impl Session {
     /// what it may read is for the gate to say; here it is only made sure that `predicate` is one expression.
     ///
     /// # Errors
-    /// [`Error::Query`] where the predicate is none, or has queries where it may not.
-    pub fn selecting(&self, select: &str, predicate: &str, subqueries: Subqueries) -> Result<String, Error> {
+    /// [`Error::Query`] if the predicate is none, or is not of the form.
+    pub fn selecting(&self, select: &str, predicate: &str, form: PredicateForm) -> Result<String, Error> {
+        if form == PredicateForm::Comparisons && predicate.len() > MOST_COMPARISON_BYTES {
+            let message = format!("the predicate has {} bytes, {MOST_COMPARISON_BYTES} may be here", predicate.len());
+            return Err(refused(message, "BETWEEN and IN are shorter than many comparisons"));
+        }
         // The line breaks keep a comment in the predicate from reaching further.
         let query = |predicate: &str| format!("{select} (\n{predicate}\n)");
         let given = query(predicate);
         let (mut asked, mut ours) = (self.parse(&given)?, self.parse(&query("true"))?);
-        let wrong = |message: &str, hint: &str| {
-            Err(Error::Query { message: message.to_owned(), place: None, hint: Some(hint.to_owned()) })
-        };
         match (emptied(&mut asked), emptied(&mut ours)) {
-            (Some(inner), Some(_)) if asked == ours => match subqueries == Subqueries::Refused && asks(&inner) {
-                true => wrong("the predicate may have no queries of its own here", "name columns of the table alone"),
-                false => Ok(given),
-            },
-            _ => wrong(
-                "the predicate is not one expression",
+            (Some(inner), Some(_)) if asked == ours => {
+                if form == PredicateForm::Comparisons {
+                    check_comparisons(&inner)?;
+                }
+                Ok(given)
+            }
+            _ => Err(refused(
+                "the predicate is not one expression".to_owned(),
                 "what may stand behind WHERE, as `snr_db < 35 and pair_id < 100`",
-            ),
+            )),
         }
     }
 }
 
-// Whether there are queries in an expression.
-fn asks(expression: &Expr) -> bool {
-    struct Found;
-    impl Visitor for Found {
-        type Break = ();
+fn refused(message: String, hint: &str) -> Error {
+    Error::Query { message, place: None, hint: Some(hint.to_owned()) }
+}
 
-        fn pre_visit_query(&mut self, _: &Query) -> ControlFlow<()> {
-            ControlFlow::Break(())
+// A list of what may be there, not of what may not, so that no expression of a later parser passes.
+fn check_comparisons(predicate: &Expr) -> Result<(), Error> {
+    use BinaryOperator::{And, Eq, Gt, GtEq, Lt, LtEq, NotEq, Or};
+    let mut pending = vec![predicate];
+    while let Some(expression) = pending.pop() {
+        match expression {
+            Expr::Identifier(name) if is_plain(name) => {}
+            literal if is_literal(literal) => {}
+            Expr::Nested(inner)
+            | Expr::UnaryOp { op: UnaryOperator::Not, expr: inner }
+            | Expr::IsNull(inner)
+            | Expr::IsNotNull(inner) => pending.push(inner),
+            Expr::BinaryOp { left, op: Eq | NotEq | Lt | LtEq | Gt | GtEq | And | Or, right } => {
+                pending.extend([&**left, &**right]);
+            }
+            Expr::Between { expr, low, high, .. } => pending.extend([&**expr, &**low, &**high]),
+            Expr::InList { expr, list, .. } if list.iter().all(is_literal) => pending.push(expr),
+            _ => {
+                return Err(refused(
+                    "the predicate has more than comparisons of columns and literals, which is all it may have here"
+                        .to_owned(),
+                    "=, <>, <, <=, >, >=, BETWEEN, IN, IS NULL, AND, OR and NOT, as `snr_db < 35 and pair_id < 100`",
+                ));
+            }
         }
     }
-    expression.visit(&mut Found).is_break()
+    Ok(())
+}
+
+// No `@variable`, and nothing that a table could be asked for by.
+fn is_plain(name: &Ident) -> bool {
+    name.value.bytes().all(|b| b.is_ascii_alphanumeric() || b == b'_')
+}
+
+fn is_literal(expression: &Expr) -> bool {
+    match expression {
+        Expr::UnaryOp { op: UnaryOperator::Minus, expr } => {
+            matches!(&**expr, Expr::Value(number) if matches!(number.value, Value::Number(..)))
+        }
+        Expr::Value(literal) => {
+            matches!(literal.value, Value::Number(..) | Value::SingleQuotedString(_) | Value::Boolean(_) | Value::Null)
+        }
+        _ => false,
+    }
 }
 
 // Takes what stands in the parentheses of the last condition out of a query.

@@ -9,7 +9,7 @@ use echolake_export::{
     TrainingSet, WrittenFile, write_responses, write_training_set, write_wav,
 };
 use echolake_lake::Lake;
-use echolake_query::{Session, Subqueries};
+use echolake_query::{PredicateForm, Session};
 use echolake_schema::SurfaceId;
 use serde_json::json;
 
@@ -275,7 +275,7 @@ fn check(selection: &Selection) -> Check {
 async fn taken(lake: &Lake, selection: &Selection) -> anyhow::Result<Vec<Taken>> {
     let session = Session::new(lake)?;
     let select = format!("select {} from measurements where", Taken::COLUMNS.join(", "));
-    let sql = session.selecting(&select, &selection.predicate, Subqueries::Allowed).context("--where")?;
+    let sql = session.selecting(&select, &selection.predicate, PredicateForm::AnyExpression).context("--where")?;
     let mut answer = session.query(&sql).await.context("--where")?;
     let mut taken = Vec::new();
     while let Some(batch) = answer.next().await? {

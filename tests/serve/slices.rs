@@ -154,10 +154,24 @@ fn a_page_of_elsewhere_asks_of_runs_that_it_knows_alone() {
     refused(&foreign("/api/v1/foxglove/manifest?where=true"), 403, "foreign_origin");
     refused(&Request::get(&slice("true", "")).host("evil.example").send(&server), 403, "foreign_origin");
     refused(&foreign(&slice("cast(run_id as int) = 1", "&run=guessed")), 404, "not_found");
-    for asking in ["pair_id in (select pair_id from tnce)", "exists (select * from runs)"] {
-        refused(&foreign(&slice(asking, &format!("&run={run}"))), 400, "query_invalid");
+    let of_the_run = format!("&run={run}");
+    for asking in [
+        "pair_id in (select pair_id from tnce)",
+        "exists (select * from runs)",
+        "abs(pair_id) = 1",
+        "pair_id + 1 = 2",
+        "cardinality(array_repeat(make_array(range(0, 30000000)), 3000000)) > pair_id",
+        &format!("{}!{}", "position(".repeat(22), " in 'x')".repeat(22)),
+        &format!("cast(null as int{}) is null", "[]".repeat(8_000)),
+        &format!("pair_id in ({}1)", "1,".repeat(1_500)),
+    ] {
+        refused(&foreign(&slice(asking, &of_the_run)), 400, "query_invalid");
+        let manifest = format!("/api/v1/foxglove/manifest?where={}{of_the_run}", encoded(asking));
+        refused(&foreign(&manifest), 400, "query_invalid");
     }
-    let own = foreign(&slice("pair_id = 1 or surface_id = 'flat'", &format!("&run={run}")));
+    let manifest = "/api/v1/foxglove/manifest?where=not%20pair_id%20between%205%20and%2099";
+    assert_eq!(foreign(&format!("{manifest}{of_the_run}")).status, 200);
+    let own = foreign(&slice("pair_id = 1 or surface_id = 'flat'", &of_the_run));
     assert_eq!((own.status, count(&messages(&own.body), "/ir")), (200, 1), "none of a run that it does not name");
 }
 

@@ -11,7 +11,7 @@ use echolake_schema::Rig;
 use echolake_schema::tables::Table;
 
 use super::*;
-use crate::Subqueries;
+use crate::PredicateForm;
 
 async fn lake() -> (tempfile::TempDir, Lake) {
     let folder = tempfile::tempdir().expect("a folder");
@@ -59,7 +59,7 @@ async fn a_predicate_stays_within_its_parentheses() {
     let session = Session::new(&lake).expect("a session");
     let select = "select pair_id from pairs where pair_id < 10 and";
     let count = async |predicate: &str| {
-        let sql = session.selecting(select, predicate, Subqueries::Allowed)?;
+        let sql = session.selecting(select, predicate, PredicateForm::AnyExpression)?;
         let (mut answer, mut count) = (session.query(&sql).await?, 0);
         while let Some(batch) = answer.next().await? {
             count += batch.num_rows();
@@ -94,10 +94,68 @@ async fn a_predicate_stays_within_its_parentheses() {
     ] {
         assert!(matches!(count(wrong).await, Err(Error::Query { .. })), "{wrong}");
     }
-    let alone = |predicate: &str| session.selecting(select, predicate, Subqueries::Refused).is_ok();
-    assert!(alone("pair_id between 1 and 3"));
-    for asking in ["exists (select 1)", "pair_id in (select 1)", "abs((select min(pair_id) from pairs)) = 1"] {
-        assert!(!alone(asking), "{asking}");
+}
+
+#[tokio::test]
+async fn a_predicate_of_comparisons_has_nothing_else() {
+    let (_folder, lake) = lake().await;
+    let session = Session::new(&lake).expect("a session");
+    let select = "select pair_id from pairs where run_id = 'a' and";
+    let selecting = |predicate: &str| session.selecting(select, predicate, PredicateForm::Comparisons);
+    let longest = format!("pair_id in ({})", "1,".repeat(1_017) + "1");
+    assert!(longest.len() <= 2_048);
+    for comparisons in [
+        "true",
+        "pair_id between 1 and 3",
+        "not (\"pair_id\" not between -1 and 3.5e1) and (snr_db < 35 or surface_id = 'flat')",
+        "surface_id <> 'it''s' and pair_id >= -5 and gain_db is not null or attempt is null and 3 <= pair_id",
+        "surface_id in ('flat', 'foam', null) and pair_id not in (1, -2) -- the rest",
+        &longest,
+    ] {
+        selecting(comparisons).expect(comparisons);
+    }
+    let too_long = format!("{longest} or pair_id = 123");
+    let chain = format!("pair_id{}", "+1".repeat(900));
+    for more in [
+        "exists (select 1)",
+        "pair_id in (select 1)",
+        "abs((select min(pair_id) from pairs)) = 1",
+        "pair_id in (1, abs(2))",
+        "pair_id in (1, pair_id)",
+        "pair_id = any(select 1)",
+        "abs(pair_id) = 1",
+        "pair_id + 1 = 2",
+        "pair_id % 2 = 0",
+        "- pair_id = 1",
+        "-(1) = pair_id",
+        "+1 = pair_id",
+        "pair_id::text = '1'",
+        "cast(pair_id as text) = '1'",
+        "surface_id like 'f%'",
+        "surface_id ilike 'f%'",
+        "surface_id ~ '(a+)+b'",
+        "surface_id similar to 'f%'",
+        "surface_id || 'x' = 'flatx'",
+        "case when true then true end",
+        "pairs.pair_id = 1",
+        "ir[1] = 0",
+        "array[1] = ir",
+        "(pair_id, 1) = (1, 1)",
+        "started = timestamp '2026-01-01'",
+        "started < current_date",
+        "started > interval '1 day'",
+        "pair_id is distinct from 1",
+        "true is true",
+        "pair_id xor true",
+        "pair_id = $1",
+        "@@version = 1",
+        "x'00' = surface_id",
+        "\"no plain name\" = 1",
+        "cardinality(array_repeat(make_array(range(0,30000000)),3000000)) > pair_id",
+        &chain,
+        &too_long,
+    ] {
+        assert!(matches!(selecting(more), Err(Error::Query { .. })), "{more}");
     }
 }
 

@@ -78,7 +78,7 @@ impl Door {
     }
 
     async fn answer_http(&self, request: Request) -> Result<Response, Fault> {
-        let local = || match request_site(request.headers()) {
+        let local = || match request_site(request.uri(), request.headers()) {
             RequestSite::Foreign => ClientIdentity::foreign(),
             RequestSite::OwnPage => ClientIdentity::pages(),
             RequestSite::Program => ClientIdentity::programs(),

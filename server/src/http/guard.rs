@@ -7,7 +7,8 @@ use std::sync::Arc;
 
 use axum::extract::{FromRequestParts, Request, State};
 use axum::http::request::Parts;
-use axum::http::{HeaderMap, HeaderName, HeaderValue, header};
+use axum::http::uri::Authority;
+use axum::http::{HeaderMap, HeaderName, HeaderValue, Uri, header};
 use axum::middleware::Next;
 use axum::response::{IntoResponse as _, Response};
 use echolake_query::Client;
@@ -57,8 +58,8 @@ pub(crate) enum RequestSite {
 }
 
 /// Tells what stands behind a request to a server without tokens.
-pub(crate) fn request_site(headers: &HeaderMap) -> RequestSite {
-    match (is_own(headers), headers.contains_key(FETCH_SITE)) {
+pub(crate) fn request_site(uri: &Uri, headers: &HeaderMap) -> RequestSite {
+    match (is_own(uri, headers), headers.contains_key(FETCH_SITE)) {
         (Err(_), _) => RequestSite::Foreign,
         (Ok(()), true) => RequestSite::OwnPage,
         (Ok(()), false) => RequestSite::Program,
@@ -81,7 +82,7 @@ impl FromRequestParts<Service> for MayQuery {
 /// Lets no page of elsewhere through, where there are no tokens.
 pub(super) async fn own_pages_only(State(is_open): State<bool>, request: Request, next: Next) -> Response {
     // With tokens there is nothing that a page could use without having one.
-    match is_own(request.headers()) {
+    match is_own(request.uri(), request.headers()) {
         Err(fault) if is_open => Problem(fault).into_response(),
         _ => next.run(request).await,
     }
@@ -91,7 +92,7 @@ pub(super) async fn own_pages_only(State(is_open): State<bool>, request: Request
 ///
 /// # Errors
 /// [`Fault::Foreign`] where it does not.
-pub(super) fn is_own(headers: &HeaderMap) -> Result<(), Fault> {
+pub(super) fn is_own(uri: &Uri, headers: &HeaderMap) -> Result<(), Fault> {
     // HTTP/1.1 wants one Host; with two, they who check and they who route may look at different ones.
     let host = match (headers.get_all(header::HOST).iter().count(), text(headers, &header::HOST)) {
         (1, Some(host)) => host,
@@ -99,6 +100,10 @@ pub(super) fn is_own(headers: &HeaderMap) -> Result<(), Fault> {
     };
     if !is_local(&host) {
         return Err(Fault::Foreign { what: "host", found: host });
+    }
+    // An address in absolute form goes before Host for whoever routes, so it must be the same.
+    if let Some(authority) = uri.authority().filter(|authority| authority.as_str() != host) {
+        return Err(Fault::Foreign { what: "address", found: authority.to_string() });
     }
     is_same_origin(headers, &["http://"])
 }
@@ -123,11 +128,15 @@ fn text(headers: &HeaderMap, name: &HeaderName) -> Option<String> {
 
 // A name or address that cannot be another machine's.
 fn is_local(host: &str) -> bool {
-    let name = match host.strip_prefix('[') {
-        Some(rest) => rest.split(']').next().unwrap_or_default(),
-        None => host.rsplit_once(':').map_or(host, |(name, _)| name),
-    };
-    name.eq_ignore_ascii_case("localhost") || name.parse::<IpAddr>().is_ok_and(|ip| ip.is_loopback())
+    let Ok(authority) = host.parse::<Authority>() else { return false };
+    let name = authority.host();
+    let behind = host.strip_prefix(name).map(|port| port.strip_prefix(':').unwrap_or(port));
+    // Nothing stands before the name (a user), nor behind it but a port.
+    if behind != Some(authority.port().as_ref().map_or("", |port| port.as_str())) {
+        return false;
+    }
+    let address = name.strip_prefix('[').and_then(|name| name.strip_suffix(']')).unwrap_or(name);
+    name.eq_ignore_ascii_case("localhost") || address.parse::<IpAddr>().is_ok_and(|ip| ip.is_loopback())
 }
 
 /// What every answer says to browsers, unless its route knows better.
@@ -169,6 +178,14 @@ mod tests {
             ("0.0.0.0", false),
             ("", false),
             ("localhost@evil.example", false),
+            ("localhost:1@evil.example", false),
+            ("evil.example@localhost", false),
+            ("[::1]evil.example", false),
+            ("[::1]:80evil.example", false),
+            ("localhost:80:80", false),
+            ("localhost:http", false),
+            ("localhost/", false),
+            ("[127.0.0.1", false),
         ] {
             assert_eq!(is_local(host), local, "{host}");
         }
@@ -178,7 +195,8 @@ mod tests {
     fn pages_of_elsewhere_are_refused() {
         let check = |headers: &[(&str, &str)]| {
             let request = headers.iter().fold(Request::builder(), |r, (name, value)| r.header(*name, *value));
-            is_own(request.body(Body::empty()).expect("a request").headers()).is_ok()
+            let request = request.body(Body::empty()).expect("a request");
+            is_own(request.uri(), request.headers()).is_ok()
         };
         let own = ("host", "localhost:8080");
         assert!(check(&[own]));
@@ -196,5 +214,16 @@ mod tests {
         ] {
             assert!(!check(foreign), "{foreign:?}");
         }
+    }
+
+    #[test]
+    fn an_address_in_absolute_form_is_that_of_the_host() {
+        let check = |address: &str| {
+            let request = Request::builder().uri(address).header("host", "localhost:8080").body(Body::empty());
+            let request = request.expect("a request");
+            is_own(request.uri(), request.headers()).is_ok()
+        };
+        assert!(check("/health") && check("http://localhost:8080/health"));
+        assert!(!check("http://evil.example/health") && !check("http://localhost:8081/health"));
     }
 }

@@ -20,7 +20,7 @@ use axum::http::{HeaderMap, Method, Uri};
 use axum::response::Response;
 use axum::routing::get;
 use echolake_export::{Check, SliceParams, Taken};
-use echolake_query::{Client, Subqueries};
+use echolake_query::{Client, PredicateForm};
 use futures::stream;
 use tokio::sync::Semaphore;
 
@@ -89,14 +89,15 @@ impl Slices {
         let client = service.client(Scope::Sql)?;
         let mut question = Question::of(uri)?;
         let view = self.0.catalogue.view().await?;
-        // Without tokens a page of elsewhere may read the runs whose names it knows, and ask nothing of others.
+        // Without tokens a page of elsewhere may read the runs whose names it knows, and ask nothing of others, nor
+        // anything that costs more than reading them.
         if service.is_open()
-            && let Err(foreign) = guard::is_own(headers)
+            && let Err(foreign) = guard::is_own(uri, headers)
         {
             if question.runs.is_empty() {
                 return Err(foreign);
             }
-            question.subqueries = Subqueries::Refused;
+            question.form = PredicateForm::Comparisons;
         }
         for run in &question.runs {
             super::catalogue::run(&view, run.as_str())?;

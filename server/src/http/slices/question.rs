@@ -2,7 +2,7 @@
 
 use axum::http::Uri;
 use echolake_export::{Layout, Taken};
-use echolake_query::Subqueries;
+use echolake_query::PredicateForm;
 use echolake_schema::RunId;
 
 use super::super::catalogue::Params;
@@ -25,8 +25,8 @@ pub(super) struct Question {
     pub(super) layout: Layout,
     /// The slice that is expected.
     pub(super) id: Option<String>,
-    /// What the predicate may ask beside.
-    pub(super) subqueries: Subqueries,
+    /// What the predicate may consist of.
+    pub(super) form: PredicateForm,
 }
 
 impl Question {
@@ -60,7 +60,7 @@ impl Question {
             _ => Layout::ByTopic,
         };
         let id = params.one("id")?.map(str::to_owned);
-        Ok(Self { predicate, runs, topics, layout, id, subqueries: Subqueries::Allowed })
+        Ok(Self { predicate, runs, topics, layout, id, form: PredicateForm::AnyExpression })
     }
 
     /// The predicate; a true one where none was given.

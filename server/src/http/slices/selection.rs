@@ -46,7 +46,7 @@ impl Selections {
     /// What is wrong with the predicate, or ended its query; [`Fault::NoData`] where it selects nothing.
     pub(super) async fn of(&self, catalogue: &Catalogue, request: &Request) -> Result<Arc<Selection>, Fault> {
         let Request { client, view, question } = request;
-        let asked = format!("{:?} {} {}", question.subqueries, question.select(), question.predicate());
+        let asked = format!("{:?} {} {}", question.form, question.select(), question.predicate());
         let described = format!("{} {} {asked}", question.layout_name(), question.topics.join(","));
         let key = (client.name().to_owned(), view.version.clone(), described);
         if let Some(known) = self.known(&key) {
@@ -81,8 +81,8 @@ async fn taken(catalogue: &Catalogue, request: &Request) -> Result<Vec<Taken>, F
     let Request { client, question, .. } = request;
     let (service, predicate) = (catalogue.service(), question.predicate().to_owned());
     let session = Arc::new(service.session(client));
-    let (asking, select, subqueries) = (session.clone(), question.select(), question.subqueries);
-    let sql = service.plan(async move { Ok(asking.selecting(&select, &predicate, subqueries)?) }).await?;
+    let (asking, select, form) = (session.clone(), question.select(), question.form);
+    let sql = service.plan(async move { Ok(asking.selecting(&select, &predicate, form)?) }).await?;
     let job = Job { protocol: Protocol::Http, session, work: Work::Sql(sql), limit: None, stop: Stop::new() };
     let mut running = service.begin(job, |_| Ok(Batches)).await?;
     let mut taken = Vec::new();
