@@ -48,6 +48,8 @@ pub struct SimulatedRun<'a> {
     pub start: Timestamp,
     /// Seed of room and noise.
     pub seed: u64,
+    /// Tag of the run's name.
+    pub tag: u64,
     /// What is recorded.
     pub keep: Keep,
     /// Folder of the run's file, which has the run's name.
@@ -165,8 +167,7 @@ impl SimulatedRun<'_> {
     }
 
     fn run_id(&self) -> Result<RunId, Error> {
-        let tag = (self.seed ^ (self.seed >> 16) ^ (self.seed >> 32)) as u16;
-        Ok(RunId::compose(self.start, &self.surface, tag)?)
+        Ok(RunId::compose(self.start, &self.surface, self.tag)?)
     }
 
     fn prepare(&self) -> Result<Prepared, Error> {

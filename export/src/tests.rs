@@ -42,6 +42,7 @@ async fn lake(home: &TempDir, keep: Keep) -> Lake {
             foam: None,
             start: Timestamp(1_767_600_000_000_000_000).plus_secs(number as f64 * 3_600.0),
             seed: number as u64 + 1,
+            tag: number as u64 + 1,
             keep,
             folder: &inbox,
         };

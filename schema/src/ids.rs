@@ -65,12 +65,18 @@ impl SurfaceId {
 }
 
 impl RunId {
-    /// The name of a run of `surface` that began at `start`; `tag` tells apart runs of the same second.
+    /// The name of a run of `surface` that began at `start`; `tag` tells apart runs of the same second, and if it is
+    /// random, nobody guesses the name.
     ///
     /// # Errors
     /// [`Error::Id`] where the parts make no valid name.
-    pub fn compose(start: crate::Timestamp, surface: &SurfaceId, tag: u16) -> Result<Self, Error> {
-        format!("{}-{surface}-{tag:04x}", start.compact()).parse()
+    pub fn compose(start: crate::Timestamp, surface: &SurfaceId, tag: u64) -> Result<Self, Error> {
+        format!("{}-{surface}-{tag:016x}", start.compact()).parse()
+    }
+
+    /// The name without its tag, which runs of the same surface and second share.
+    pub fn untagged(&self) -> &str {
+        self.0.rsplit_once('-').map_or(&self.0, |(untagged, _)| untagged)
     }
 
     /// The name as text.
@@ -187,7 +193,9 @@ mod tests {
         let surface = "flat".parse().expect("valid");
         let at = |nanos| RunId::compose(crate::Timestamp(nanos), &surface, 0x7c1e).expect("valid");
         let (early, late) = (at(1_767_600_000_000_000_000), at(1_767_600_001_000_000_000));
-        assert_eq!(early.as_str(), "20260105T080000Z-flat-7c1e");
+        assert_eq!(early.as_str(), "20260105T080000Z-flat-0000000000007c1e");
         assert!(early < late);
+        let shorter: RunId = "20260105T080000Z-flat-7c1e".parse().expect("a name of older versions");
+        assert_eq!(shorter.untagged(), early.untagged());
     }
 }

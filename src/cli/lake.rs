@@ -58,7 +58,7 @@ pub(crate) struct DemoArgs {
     /// The rig; by default that of the paper with sweeps of 0.05 s.
     #[arg(long)]
     pub(crate) rig: Option<PathBuf>,
-    /// Seed of the simulation: the same seed gives the same lake.
+    /// Seed of the simulation: the same seed gives the same data.
     #[arg(long, default_value_t = 1)]
     pub(crate) seed: u64,
 }

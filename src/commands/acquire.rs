@@ -13,7 +13,7 @@ use echolake_acquisition::controller::{Control, Event, Keep};
 use echolake_acquisition::live::LiveServer;
 use echolake_acquisition::mesh::Mesh;
 use echolake_acquisition::metrics::{InfluxPush, MetricsServer, RunMetrics, Target};
-use echolake_acquisition::recorder::{Held, partial_of};
+use echolake_acquisition::recorder::{Held, partial_of, random_tag};
 use echolake_acquisition::session::{Measured, Pace, Preflight, Session};
 use echolake_acquisition::simulate::{self, SimulatedRun, Specimen};
 use echolake_lake::{Lake, References};
@@ -45,6 +45,7 @@ struct Fresh {
     foam: Option<SurfaceId>,
     start: Timestamp,
     seed: u64,
+    tag: u64,
     keep: Keep,
 }
 
@@ -153,6 +154,7 @@ async fn fresh(args: &AcquireArgs, lake_url: &str, progress: &Progress) -> anyho
         foam: args.foam.clone(),
         start: Timestamp::now(),
         seed: args.seed,
+        tag: random_tag(),
         keep: if args.ir_only { Keep::ResponsesOnly } else { Keep::Sweeps },
     })))
 }
@@ -237,6 +239,7 @@ impl Fresh {
             foam: self.foam.clone(),
             start: self.start,
             seed: self.seed,
+            tag: self.tag,
             keep: self.keep,
             folder: &self.folder,
         }

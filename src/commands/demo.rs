@@ -43,7 +43,7 @@ pub(crate) async fn run(args: &DemoArgs, lake_url: &str) -> anyhow::Result<Done>
         keep: if args.ir_only { Keep::ResponsesOnly } else { Keep::Sweeps },
         seed: args.seed,
         folder: super::inbox(&lake)?,
-        known: lake.snapshot().await?.runs().map(|r| r.run.to_string()).collect(),
+        known: lake.snapshot().await?.runs().map(|r| r.run.untagged().to_owned()).collect(),
     };
     let measuring = stop.clone();
     tokio::task::spawn_blocking(move || campaign.measure(measuring.flag(), &progress)).await??;

@@ -83,7 +83,7 @@ impl Import<'_> {
             relief_mm: h.extent_mm().map(f64::from),
         });
         let started = self.options.started.plus_secs(f64::from(self.number) * RUN_SECS);
-        let manifest = super::manifest(Origin::ImportedGir, &surface, self.rig, started, self.number)?;
+        let manifest = super::manifest(Origin::ImportedGir, &surface, self.rig, started)?;
         let path = self.options.folder.join(format!("{}.mcap", manifest.run_id));
         let relief =
             heights.as_ref().zip(mesh.as_ref()).map(|(heights, mesh)| Relief { heights, mesh, original: None });

@@ -14,6 +14,8 @@ use std::path::{Path, PathBuf};
 use echolake_schema::manifest::{Origin, RunManifest};
 use echolake_schema::{Rig, RunId, SurfaceId, Timestamp};
 
+use crate::recorder::random_tag;
+
 pub use gir::{GIR_IR_LEN, import_gir};
 pub use sofa::{check_sofa, import_sofa};
 pub use wav::{check_wav, import_wav, sampling_rate_of};
@@ -108,16 +110,10 @@ fn wrong(path: &Path, place: impl Into<String>, actual: impl Into<String>, expec
     Error::Content { path: path.to_owned(), place: place.into(), actual: actual.into(), expected: expected.into() }
 }
 
-/// What an imported run says of itself; `number` tells runs of one import apart.
-fn manifest(
-    origin: Origin,
-    surface: &SurfaceId,
-    rig: &Rig,
-    started: Timestamp,
-    number: u16,
-) -> Result<RunManifest, Error> {
+/// What an imported run says of itself.
+fn manifest(origin: Origin, surface: &SurfaceId, rig: &Rig, started: Timestamp) -> Result<RunManifest, Error> {
     Ok(RunManifest {
-        run_id: RunId::compose(started, surface, number)?,
+        run_id: RunId::compose(started, surface, random_tag())?,
         surface_id: surface.clone(),
         started,
         software: concat!("echolake ", env!("CARGO_PKG_VERSION")).to_owned(),

@@ -168,7 +168,7 @@ impl Sofa {
     fn record(&self, import: &Import<'_>, batch: &mut Batch) -> Result<ImportedRun, Error> {
         let times = self.times(import.options.started.plus_secs(f64::from(import.number) * RUN_SECS));
         let (started, ended) = (times[0], times[times.len() - 1]);
-        let manifest = super::manifest(Origin::ImportedSofa, &self.surface, import.rig, started, import.number)?;
+        let manifest = super::manifest(Origin::ImportedSofa, &self.surface, import.rig, started)?;
         let record = SurfaceRecord { typology: "imported".into(), ..SurfaceRecord::default() };
         let path = import.options.folder.join(format!("{}.mcap", manifest.run_id));
         let start = RunStart { manifest: &manifest, rig: import.rig, surface: &record, relief: None, plan: None };

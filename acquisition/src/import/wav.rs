@@ -45,9 +45,9 @@ pub fn import_wav(
     let surfaces = wav_manifest::read(manifest, rig, &grid)?;
     let total = surfaces.values().map(Vec::len).sum();
     let (mut runs, mut batch, mut done) = (Vec::new(), Batch::default(), 0);
-    for (tag, (surface, rows)) in (0u16..).zip(surfaces) {
+    for (surface, rows) in surfaces {
         let import = Import { manifest, rig, grid: &grid, options };
-        let run = import.surface(surface, &rows, tag, &mut batch, &mut || {
+        let run = import.surface(surface, &rows, &mut batch, &mut || {
             done += 1;
             progress(done, total);
         })?;
@@ -69,7 +69,6 @@ impl Import<'_> {
         &self,
         surface: SurfaceId,
         rows: &[Row],
-        tag: u16,
         batch: &mut Batch,
         done: &mut dyn FnMut(),
     ) -> Result<ImportedRun, Error> {
@@ -77,7 +76,7 @@ impl Import<'_> {
         let mut timed: Vec<_> = (0u32..).zip(rows).map(|(i, row)| (self.time(row, i), row)).collect();
         timed.sort_by_key(|(time, _)| *time);
         let started = timed.first().map_or(self.options.started, |(time, _)| *time);
-        let manifest = super::manifest(Origin::ImportedWav, &surface, self.rig, started, tag)?;
+        let manifest = super::manifest(Origin::ImportedWav, &surface, self.rig, started)?;
         let record = SurfaceRecord { typology: "imported".into(), ..SurfaceRecord::default() };
         let path = self.options.folder.join(format!("{}.mcap", manifest.run_id));
         let start = RunStart { manifest: &manifest, rig: self.rig, surface: &record, relief: None, plan: None };

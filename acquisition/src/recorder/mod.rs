@@ -149,6 +149,11 @@ pub struct Recorder {
     arms: Option<arms::Arms>,
 }
 
+/// A tag for a new run's name: a page of elsewhere that knows the name may read the run, so nobody may guess it.
+pub fn random_tag() -> u64 {
+    rand::random()
+}
+
 /// The name of a recording until it is whole.
 pub fn partial_of(path: &Path) -> PathBuf {
     let mut name = path.as_os_str().to_owned();

@@ -35,6 +35,7 @@ fn run(folder: &Path, surface: &str, hours: f64) -> PathBuf {
         foam: None,
         start: Timestamp(START).plus_secs(hours * 3_600.0),
         seed: 1,
+        tag: 1,
         keep: Keep::Sweeps,
         folder,
     };

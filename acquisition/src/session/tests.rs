@@ -20,6 +20,7 @@ fn run<'a>(rig: &'a Rig, specimen: &'a Specimen, folder: &'a Path) -> SimulatedR
         foam: None,
         start: Timestamp(1_767_600_000_000_000_000),
         seed: 1,
+        tag: 1,
         keep: Keep::Sweeps,
         folder,
     }

@@ -105,6 +105,7 @@ impl Order<'_> {
             foam: None,
             start: FIRST_START.plus_secs(number as f64 * RUN_EVERY_SECS),
             seed: self.seed.wrapping_mul(1_000).wrapping_add(number as u64),
+            tag: number as u64,
             keep: self.keep,
             folder: self.folder,
         };

@@ -1,7 +1,7 @@
 //! The demo's measuring: surface after surface on the simulated rig, one on each core.
 
 use std::collections::HashSet;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::sync::{Mutex, PoisonError};
 use std::time::Instant;
@@ -9,15 +9,16 @@ use std::time::Instant;
 use anyhow::Context as _;
 use echolake_acquisition::collection::Member;
 use echolake_acquisition::controller::Keep;
+use echolake_acquisition::recorder::random_tag;
 use echolake_acquisition::simulate::{SimulatedRun, Specimen};
 use echolake_schema::manifest::RunEnd;
-use echolake_schema::{Rig, Timestamp};
+use echolake_schema::{Rig, RunId, Timestamp};
 
 use crate::progress::{Progress, Task};
 
-/// 2026-01-05 08:00 UTC, and eleven hours from run to run: a run takes ten.
+/// 2026-01-05 08:00 UTC for seed 1, and eleven hours from run to run: a run takes ten.
 const FIRST_START: Timestamp = Timestamp(1_767_600_000_000_000_000);
-const RUN_EVERY_SECS: f64 = 39_600.0;
+const RUN_EVERY_SECS: u32 = 39_600;
 /// With more surfaces than this, progress is told in surfaces.
 const TOLD_EACH: usize = 20;
 
@@ -30,7 +31,7 @@ pub(super) struct Campaign {
     pub(super) seed: u64,
     /// Where the runs go.
     pub(super) folder: PathBuf,
-    /// Names of the runs that the lake has already.
+    /// Names, without their tags, of the runs that are there already.
     pub(super) known: HashSet<String>,
 }
 
@@ -57,13 +58,14 @@ struct Made {
 
 impl Campaign {
     /// Measures what is not measured yet. When `stop` becomes true it ends behind the surfaces that are in hand.
-    pub(super) fn measure(&self, stop: &AtomicBool, progress: &Progress) -> anyhow::Result<()> {
+    pub(super) fn measure(mut self, stop: &AtomicBool, progress: &Progress) -> anyhow::Result<()> {
+        self.look_for_runs()?;
+        let campaign = &self;
         let cores = std::thread::available_parallelism().map_or(1, usize::from);
         let begun = Instant::now();
-        let count = self.surfaces.len();
+        let count = campaign.surfaces.len();
         let whole = (count > TOLD_EACH).then(|| Mutex::new((progress.task("measure", count as u64, "surfaces"), 0)));
-        let shared =
-            Shared { campaign: self, progress, stop, next: AtomicUsize::new(0), whole, made: Mutex::default() };
+        let shared = Shared { campaign, progress, stop, next: AtomicUsize::new(0), whole, made: Mutex::default() };
         std::thread::scope(|scope| {
             for _ in 0..cores.min(count) {
                 scope.spawn(|| shared.work());
@@ -84,6 +86,38 @@ impl Campaign {
             ));
         }
         Ok(())
+    }
+
+    // Adds the runs in the folder to those that are known, and removes what a demo that was killed left behind.
+    fn look_for_runs(&mut self) -> anyhow::Result<()> {
+        let ours = (0..self.surfaces.len()).map(|number| Ok(self.run_id(number, 0)?.untagged().to_owned()));
+        let ours: HashSet<String> = ours.collect::<anyhow::Result<_>>()?;
+        let unread = || format!("cannot read `{}`", self.folder.display());
+        for entry in std::fs::read_dir(&self.folder).with_context(unread)? {
+            let path = entry.with_context(unread)?.path();
+            let name = path.file_name().unwrap_or_default().to_string_lossy();
+            let Some((name, ending)) = name.split_once('.') else { continue };
+            let Some(untagged) = name.parse::<RunId>().ok().map(|run| run.untagged().to_owned()) else { continue };
+            match ending {
+                "mcap" => _ = self.known.insert(untagged),
+                "mcap.partial" if ours.contains(&untagged) => {
+                    std::fs::remove_file(&path).with_context(|| format!("cannot remove `{}`", path.display()))?;
+                }
+                _ => {}
+            }
+        }
+        Ok(())
+    }
+
+    fn run_id(&self, number: usize, tag: u64) -> Result<RunId, echolake_schema::Error> {
+        RunId::compose(self.start(number), &self.surfaces[number].surface, tag)
+    }
+
+    // Collections of different seeds begin at different seconds (before they repeat after 39,600 seeds), so that no run
+    // is taken for one of another seed.
+    fn start(&self, number: usize) -> Timestamp {
+        let offset_secs = (self.seed % u64::from(RUN_EVERY_SECS)) as f64 - 1.0;
+        FIRST_START.plus_secs(number as f64 * f64::from(RUN_EVERY_SECS) + offset_secs)
     }
 }
 
@@ -125,26 +159,25 @@ impl Shared<'_> {
     fn surface(&self, number: usize, member: &Member) -> anyhow::Result<Option<(RunEnd, u64)>> {
         let Campaign { rig, keep, seed, folder, known, .. } = self.campaign;
         let surface = &member.surface;
+        let tag = random_tag();
+        if known.contains(self.campaign.run_id(number, tag)?.untagged()) {
+            if self.whole.is_none() {
+                self.progress.say(format!("{surface}: measured before"));
+            }
+            return Ok(None);
+        }
         let run = SimulatedRun {
             rig,
             surface: surface.clone(),
             specimen: &Specimen::Relief(member.relief.clone()),
             flat: None,
             foam: None,
-            start: FIRST_START.plus_secs(number as f64 * RUN_EVERY_SECS),
+            start: self.campaign.start(number),
             seed: seed.wrapping_mul(1_000).wrapping_add(number as u64),
+            tag,
             keep: *keep,
             folder,
         };
-        let path = run.path()?;
-        let name = path.file_stem().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default();
-        if path.exists() || known.contains(&name) {
-            if self.whole.is_none() {
-                self.progress.say(format!("{surface}: measured before"));
-            }
-            return Ok(None);
-        }
-        remove_partial(&path)?;
         let pairs = rig.grid()?.pairs().len();
         let mut task = self.whole.is_none().then(|| self.progress.task(surface.to_string(), pairs as u64, "pairs"));
         let begun = Instant::now();
@@ -161,16 +194,5 @@ impl Shared<'_> {
         }
         let bytes = path.metadata().with_context(|| format!("cannot read `{}`", path.display()))?.len();
         Ok(Some((end, bytes)))
-    }
-}
-
-// What a demo that was killed left behind.
-fn remove_partial(path: &Path) -> anyhow::Result<()> {
-    let mut partial = path.as_os_str().to_owned();
-    partial.push(".partial");
-    let partial = PathBuf::from(partial);
-    match partial.exists() {
-        true => std::fs::remove_file(&partial).with_context(|| format!("cannot remove `{}`", partial.display())),
-        false => Ok(()),
     }
 }

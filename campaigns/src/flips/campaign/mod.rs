@@ -24,7 +24,7 @@ use specimen::Specimen;
 /// A round that takes longer hangs: they take milliseconds, and more on a busy machine.
 const HANGS: Duration = Duration::from_secs(120);
 /// What errors must name. A run's file has the run's name.
-const NAME: &str = "runs/0015_0/20260105T080000Z-0015_0-7c1e.mcap";
+const NAME: &str = "runs/0015_0/20260105T080000Z-0015_0-0000000000007c1e.mcap";
 
 static PANICS: AtomicUsize = AtomicUsize::new(0);
 
