@@ -6,6 +6,7 @@ mod lake;
 use std::path::PathBuf;
 
 use clap::{Args, Parser, Subcommand};
+use echolake_acquisition::ViewerAccess;
 use echolake_acquisition::mesh::Side;
 use echolake_acquisition::replay::SPEEDS;
 use echolake_schema::SurfaceId;
@@ -109,6 +110,8 @@ pub(crate) struct AcquireArgs {
     /// Show the run as it happens to Foxglove and Lichtblick, which open ws://ADDR.
     #[arg(long, value_name = "ADDR")]
     pub(crate) live: Option<std::net::SocketAddr>,
+    #[command(flatten)]
+    pub(crate) viewers: ViewerArgs,
     /// Serve metrics for Prometheus under http://ADDR/metrics.
     #[arg(long, value_name = "ADDR")]
     pub(crate) metrics: Option<std::net::SocketAddr>,
@@ -134,15 +137,43 @@ pub(crate) struct ReplayArgs {
     /// Names of runs, surfaces (of each its newest run), or .mcap files; they are shown one after the other.
     #[arg(required = true, value_name = "RUN")]
     pub(crate) runs: Vec<String>,
-    /// Where to listen; who reaches it can look on.
+    /// Where to listen.
     #[arg(long, value_name = "ADDR", default_value = "127.0.0.1:8765")]
     pub(crate) listen: std::net::SocketAddr,
+    #[command(flatten)]
+    pub(crate) viewers: ViewerArgs,
     /// Speed at first, as a factor of real time.
     #[arg(long, value_name = "X", default_value_t = 1.0, value_parser = speed)]
     pub(crate) speed: f32,
     /// Wait for a viewer's play button; without it playback begins with the first viewer.
     #[arg(long)]
     pub(crate) paused: bool,
+}
+
+/// Who may look on.
+#[derive(Debug, Args)]
+pub(crate) struct ViewerArgs {
+    /// Let a viewer that is a web page look on, beside pages of this machine, as https://app.foxglove.dev; repeatable.
+    #[arg(long = "allow-origin", value_name = "URL", value_parser = origin)]
+    pub(crate) allowed_origins: Vec<String>,
+    /// Let other machines look on without the token that is part of the printed address.
+    #[arg(long)]
+    pub(crate) open: bool,
+}
+
+impl ViewerArgs {
+    pub(crate) fn access(&self) -> ViewerAccess {
+        ViewerAccess { allowed_origins: self.allowed_origins.clone(), is_open: self.open }
+    }
+}
+
+// As browsers spell it.
+fn origin(text: &str) -> Result<String, String> {
+    let origin = text.trim_end_matches('/').to_ascii_lowercase();
+    let is_origin = origin.split_once("://").is_some_and(|(scheme, host)| {
+        !scheme.is_empty() && !host.is_empty() && !host.contains(['/', '?', '#', '@', ' '])
+    });
+    if is_origin { Ok(origin) } else { Err("expected scheme and host, as https://viewer.example:8080".to_owned()) }
 }
 
 fn side(text: &str) -> Result<Side, String> {

@@ -5,9 +5,13 @@ use super::{Place, stderr};
 
 /// Replays until it listens, then ends it by Ctrl-C; its exit code, and what it said.
 fn replayed(place: &Place, runs: &[&str]) -> (Option<i32>, String) {
-    let args = [&["replay", "--listen", "127.0.0.1:0"], runs].concat();
+    replayed_at(place, "127.0.0.1:0", runs)
+}
+
+fn replayed_at(place: &Place, address: &str, args: &[&str]) -> (Option<i32>, String) {
+    let args = [&["replay", "--listen", address], args].concat();
     let mut replay = ChildProcess::start(&mut place.command(&args)).expect("the command starts");
-    replay.wait_for_line("ws://127.0.0.1:");
+    replay.wait_for_line("ws://");
     replay.signal("INT");
     let output = replay.wait();
     (output.status.code(), stderr(&output))
@@ -39,4 +43,14 @@ fn runs_are_named_in_every_way_and_damage_is_told() {
     place.fails(1, &["replay", "missing.mcap"], "missing.mcap");
     place.fails(2, &["replay", "flat", "--speed", "0"], "from 0.01");
     place.fails(2, &["replay"], "RUN");
+    place.fails(2, &["replay", "flat", "--allow-origin", "viewer.example"], "scheme and host");
+
+    let (_, said) = replayed(&place, &["flat"]);
+    assert!(!said.contains("token") && said.contains("hint: a viewer on the web"), "{said}");
+    let named = ["flat", "--allow-origin", "https://viewer.example/"];
+    assert!(!replayed(&place, &named).1.contains("hint: a viewer on the web"));
+    let (_, said) = replayed_at(&place, "0.0.0.0:0", &["flat"]);
+    assert!(said.contains("/?token=") && !said.contains("warning: whoever"), "{said}");
+    let (_, said) = replayed_at(&place, "0.0.0.0:0", &["flat", "--open"]);
+    assert!(!said.contains("token") && said.contains("warning: whoever"), "{said}");
 }

@@ -31,3 +31,5 @@ pub mod robots;
 pub mod session;
 pub mod simulate;
 mod viewer;
+
+pub use viewer::ViewerAccess;

@@ -66,9 +66,10 @@ pub(crate) async fn run(args: &AcquireArgs, lake_url: &str) -> anyhow::Result<Do
     let (surface, planned, accepted) = job.size()?;
     let mut acknowledgements = args.acknowledge.as_deref().map(Acknowledgements::open).transpose()?;
     let metrics = RunMetrics::new(&surface, planned, accepted);
-    let live = args.live.map(LiveServer::start).transpose()?;
+    let live = args.live.map(|address| LiveServer::start(address, args.viewers.access())).transpose()?;
     if let Some(live) = &live {
-        progress.say(format!("live: open ws://{} in Foxglove or Lichtblick", live.address()));
+        progress.say(format!("live: open {} in Foxglove or Lichtblick", live.url()));
+        super::tell_access(&args.viewers, live.address(), &progress);
     }
     let served = args.metrics.map(|address| MetricsServer::start(address, metrics.clone()));
     let served = served.transpose().with_context(|| format!("cannot serve metrics at {:?}", args.metrics))?;

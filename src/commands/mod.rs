@@ -22,6 +22,7 @@ pub(crate) mod sql;
 #[cfg(feature = "lake")]
 mod vacuum;
 
+use std::net::SocketAddr;
 use std::path::Path;
 
 use anyhow::Context as _;
@@ -32,7 +33,8 @@ use echolake_schema::Rig;
 use crate::Done;
 #[cfg(feature = "lake")]
 use crate::cli::LakeCommand;
-use crate::cli::{Cli, Command};
+use crate::cli::{Cli, Command, ViewerArgs};
+use crate::progress::Progress;
 use crate::signals::StopRequest;
 
 /// Gives up what the command's verb does not need. To be called before there are threads.
@@ -125,6 +127,16 @@ fn inbox(lake: &Lake) -> anyhow::Result<std::path::PathBuf> {
         synced.with_context(|| format!("cannot sync `{}`", above.display()))?;
     }
     Ok(folder)
+}
+
+/// Tells who may look on at an address, and how others may.
+fn tell_access(viewers: &ViewerArgs, address: SocketAddr, progress: &Progress) {
+    if viewers.allowed_origins.is_empty() {
+        progress.say("hint: a viewer on the web needs its address: --allow-origin https://app.foxglove.dev");
+    }
+    if viewers.open && !address.ip().is_loopback() {
+        progress.say("warning: whoever reaches this address can look on");
+    }
 }
 
 /// Listens for a request to stop work that ends at a clean place.

@@ -28,12 +28,9 @@ pub(crate) async fn run(args: &ReplayArgs, lake_url: &str) -> anyhow::Result<Don
     anyhow::ensure!(!recordings.is_empty(), "none of the recordings can be replayed");
     let count = recordings.len();
     let options = ReplayOptions { speed: args.speed, paused: args.paused };
-    let server = ReplayServer::start(args.listen, recordings, options)?;
-    let address = server.address();
-    progress.say(format!("replay: open ws://{address} in Foxglove or Lichtblick; Ctrl-C ends it"));
-    if !address.ip().is_loopback() {
-        progress.say("warning: whoever reaches this address can look on");
-    }
+    let server = ReplayServer::start(args.listen, args.viewers.access(), recordings, options)?;
+    progress.say(format!("replay: open {} in Foxglove or Lichtblick; Ctrl-C ends it", server.url()));
+    super::tell_access(&args.viewers, server.address(), &progress);
     let mut task = progress.task("replay", server.length_secs().ceil() as u64, "s");
     let mut said = 0;
     while !stop.is_made() {

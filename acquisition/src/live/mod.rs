@@ -12,7 +12,7 @@ use std::sync::Arc;
 use echolake_schema::topics;
 
 use crate::recorder::{Tap, Topic};
-use crate::viewer::{Server, Shared};
+use crate::viewer::{Server, Shared, ViewerAccess};
 
 /// Why there is no live view.
 #[derive(Debug, thiserror::Error)]
@@ -35,13 +35,18 @@ impl LiveServer {
     ///
     /// # Errors
     /// [`Error::Listen`].
-    pub fn start(address: SocketAddr) -> Result<Self, Error> {
-        Server::start(address, Vec::new(), None).map(Self).map_err(|source| Error::Listen { address, source })
+    pub fn start(address: SocketAddr, access: ViewerAccess) -> Result<Self, Error> {
+        Server::start(address, access, Vec::new(), None).map(Self).map_err(|source| Error::Listen { address, source })
     }
 
     /// Where it listens.
     pub fn address(&self) -> SocketAddr {
         self.0.address()
+    }
+
+    /// What viewers open: the address, with the token if they need one.
+    pub fn url(&self) -> String {
+        self.0.url()
     }
 
     /// How many clients look on.

@@ -1,5 +1,6 @@
 //! A client of another make than the server looks on while a simulated run goes on.
 
+use std::io::{Read as _, Write as _};
 use std::net::TcpStream;
 use std::time::{Duration, Instant};
 
@@ -60,7 +61,7 @@ fn data(socket: &mut Socket) -> (u32, u64, Vec<u8>) {
 
 #[test]
 fn a_client_sees_what_it_subscribes_to_and_what_it_came_too_late_for() {
-    let server = LiveServer::start(([127, 0, 0, 1], 0).into()).expect("a server");
+    let server = LiveServer::start(([127, 0, 0, 1], 0).into(), ViewerAccess::default()).expect("a server");
     let mut tap = server.tap();
     tap.topics(vec![topic(1, "/panel/scene"), topic(2, "/sweep"), topic(3, "/log")]);
     tap.message(1, 10, b"the panel");
@@ -87,7 +88,7 @@ fn a_client_sees_what_it_subscribes_to_and_what_it_came_too_late_for() {
 
 #[test]
 fn a_client_that_sleeps_loses_the_oldest_and_stops_nobody() {
-    let server = LiveServer::start(([127, 0, 0, 1], 0).into()).expect("a server");
+    let server = LiveServer::start(([127, 0, 0, 1], 0).into(), ViewerAccess::default()).expect("a server");
     let mut tap = server.tap();
     tap.topics(vec![topic(2, "/sweep")]);
     let mut socket = connect(&server);
@@ -114,8 +115,7 @@ fn a_client_that_sleeps_loses_the_oldest_and_stops_nobody() {
 
 #[test]
 fn browsers_that_are_no_viewers_are_told() {
-    use std::io::{Read as _, Write as _};
-    let server = LiveServer::start(([127, 0, 0, 1], 0).into()).expect("a server");
+    let server = LiveServer::start(([127, 0, 0, 1], 0).into(), ViewerAccess::default()).expect("a server");
     let mut stream = TcpStream::connect(server.address()).expect("connected");
     stream.set_read_timeout(Some(ANSWER_LIMIT)).expect("a limit of time");
     let request = "GET / HTTP/1.1\r\nHost: a\r\nConnection: Upgrade\r\nUpgrade: websocket\r\n\
@@ -128,7 +128,57 @@ fn browsers_that_are_no_viewers_are_told() {
 
 #[test]
 fn an_address_that_is_taken_is_named() {
-    let server = LiveServer::start(([127, 0, 0, 1], 0).into()).expect("a server");
-    let error = LiveServer::start(server.address()).map(drop).expect_err("taken").to_string();
+    let server = LiveServer::start(([127, 0, 0, 1], 0).into(), ViewerAccess::default()).expect("a server");
+    let error = LiveServer::start(server.address(), ViewerAccess::default()).map(drop).expect_err("taken").to_string();
     assert!(error.contains(&server.address().to_string()) && error.contains("taken?"), "{error}");
+}
+
+/// The bytes of a handshake, without its end.
+fn handshake_start(path: &str, more: &str) -> String {
+    format!(
+        "GET {path} HTTP/1.1\r\nHost: a\r\nConnection: Upgrade\r\nUpgrade: websocket\r\nSec-WebSocket-Version: 13\r\n\
+         Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\nSec-WebSocket-Protocol: foxglove.sdk.v1\r\n{more}"
+    )
+}
+
+fn answer(server: &LiveServer, path: &str, more: &str) -> String {
+    let mut stream = TcpStream::connect(("127.0.0.1", server.address().port())).expect("connected");
+    stream.set_read_timeout(Some(ANSWER_LIMIT)).expect("a limit of time");
+    stream.write_all(format!("{}\r\n", handshake_start(path, more)).as_bytes()).expect("sent");
+    let mut answer = vec![0; 1 << 10];
+    let length = stream.read(&mut answer).expect("an answer");
+    String::from_utf8_lossy(&answer[..length]).into_owned()
+}
+
+#[test]
+fn pages_of_elsewhere_are_refused() {
+    let server = LiveServer::start(([127, 0, 0, 1], 0).into(), ViewerAccess::default()).expect("a server");
+    let refused = answer(&server, "/", "Origin: https://evil.example\r\n");
+    assert!(refused.starts_with("HTTP/1.1 403") && refused.contains("--allow-origin"), "{refused}");
+    assert!(answer(&server, "/", "Origin: http://localhost:8090\r\n").starts_with("HTTP/1.1 101"));
+}
+
+#[test]
+fn other_machines_need_the_token_of_the_address() {
+    let server = LiveServer::start(([0, 0, 0, 0], 0).into(), ViewerAccess::default()).expect("a server");
+    let refused = answer(&server, "/", "");
+    assert!(refused.starts_with("HTTP/1.1 403") && refused.contains("token"), "{refused}");
+    let url = server.url();
+    let (_, path) = url.split_at(format!("ws://{}", server.address()).len());
+    assert!(answer(&server, path, "").starts_with("HTTP/1.1 101"), "{url}");
+}
+
+#[test]
+fn handshakes_that_drip_lock_nobody_out() {
+    let server = LiveServer::start(([127, 0, 0, 1], 0).into(), ViewerAccess::default()).expect("a server");
+    let drip = |_| {
+        let mut stream = TcpStream::connect(server.address()).expect("connected");
+        stream.set_read_timeout(Some(ANSWER_LIMIT)).expect("a limit of time");
+        stream.write_all(handshake_start("/", "").as_bytes()).expect("sent");
+        stream
+    };
+    let mut dripping: Vec<_> = (0..40).map(drip).collect();
+    assert_eq!(json(&mut connect(&server))["op"], "serverInfo");
+    let ended = dripping[0].read(&mut [0]);
+    assert!(matches!(ended, Ok(0) | Err(_)), "the oldest goes for a new one: {ended:?}");
 }

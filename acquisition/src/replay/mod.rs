@@ -19,7 +19,7 @@ use std::sync::mpsc;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::JoinHandle;
 
-use crate::viewer::{Playback, Server};
+use crate::viewer::{Playback, Server, ViewerAccess};
 pub use clock::SPEEDS;
 pub use error::Error;
 use player::Player;
@@ -72,7 +72,12 @@ impl ReplayServer {
     /// # Errors
     /// [`Error::Listen`], or [`Error::Nothing`] where there is no recording, or where there are more
     /// topics than channels.
-    pub fn start(address: SocketAddr, mut recordings: Vec<Recording>, options: ReplayOptions) -> Result<Self, Error> {
+    pub fn start(
+        address: SocketAddr,
+        access: ViewerAccess,
+        mut recordings: Vec<Recording>,
+        options: ReplayOptions,
+    ) -> Result<Self, Error> {
         recordings.sort_by_key(|r| r.range().0);
         let (commands, obeyed) = mpsc::sync_channel(COMMANDS);
         let nothing = |reason| Error::Nothing { reason };
@@ -81,7 +86,7 @@ impl ReplayServer {
         let playback = Playback { range, commands };
         let length_secs = recordings.iter().map(player::secs).sum();
         let topics = player::Topics::of(&recordings).ok_or_else(|| nothing("there are more topics than channels"))?;
-        let server = Server::start(address, topics.all.clone(), Some(playback))
+        let server = Server::start(address, access, topics.all.clone(), Some(playback))
             .map_err(|source| Error::Listen { address, source })?;
         let standing = Arc::new(Mutex::new(Standing {
             recording: first.path().to_owned(),
@@ -100,6 +105,11 @@ impl ReplayServer {
     /// Where it listens.
     pub fn address(&self) -> SocketAddr {
         self.server.address()
+    }
+
+    /// What viewers open: the address, with the token if they need one.
+    pub fn url(&self) -> String {
+        self.server.url()
     }
 
     /// First and last time, ns since 1970.

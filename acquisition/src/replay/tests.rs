@@ -56,7 +56,7 @@ fn messages(path: &Path) -> Vec<Seen> {
 
 fn replay(paths: &[&Path], options: ReplayOptions) -> ReplayServer {
     let recordings = paths.iter().map(|path| Recording::open(path).expect("a recording")).collect();
-    ReplayServer::start(([127, 0, 0, 1], 0).into(), recordings, options).expect("a server")
+    ReplayServer::start(([127, 0, 0, 1], 0).into(), ViewerAccess::default(), recordings, options).expect("a server")
 }
 
 /// What a client hears.
@@ -313,7 +313,8 @@ fn damage_is_named_and_left_out() {
     std::fs::write(&path, &whole[..whole.len() * 3 / 4]).expect("written");
     let cut = Recording::open(&path).expect("most of it is there");
     assert!(cut.defect().is_some_and(|d| d.contains("ends within")), "{:?}", cut.defect());
-    let server = ReplayServer::start(([127, 0, 0, 1], 0).into(), vec![cut], FAST).expect("a server");
+    let server =
+        ReplayServer::start(([127, 0, 0, 1], 0).into(), ViewerAccess::default(), vec![cut], FAST).expect("a server");
     let mut client = Client::connect(&server);
     client.subscribe(&[topics::PANEL_POINTS]);
     assert_eq!(client.collect(1)[0].0, topics::PANEL_POINTS);
@@ -343,10 +344,11 @@ fn what_cannot_be_shown_is_refused() {
     let home = tempfile::tempdir().expect("a folder");
     let path = run(home.path(), "a", 0.0);
     let any = ([127, 0, 0, 1], 0).into();
-    let none = ReplayServer::start(any, Vec::new(), FAST).map(drop).expect_err("none").to_string();
+    let none =
+        ReplayServer::start(any, ViewerAccess::default(), Vec::new(), FAST).map(drop).expect_err("none").to_string();
     assert!(none.contains("nothing to replay"), "{none}");
     let server = replay(&[&path], FAST);
     let open = vec![Recording::open(&path).expect("a recording")];
-    let taken = ReplayServer::start(server.address(), open, FAST);
+    let taken = ReplayServer::start(server.address(), ViewerAccess::default(), open, FAST);
     assert!(taken.map(drop).expect_err("taken").to_string().contains("taken?"));
 }

@@ -1,14 +1,17 @@
 //! One client of a server, on a thread of its own.
+#![expect(clippy::result_large_err, reason = "tungstenite's own type")]
 
 use std::net::TcpStream;
 use std::sync::Arc;
 use std::time::Duration;
 
-use tungstenite::handshake::server::{Request, Response};
+use tungstenite::handshake::server::{ErrorResponse, Request, Response};
 use tungstenite::http::{HeaderValue, StatusCode};
 use tungstenite::protocol::WebSocketConfig;
 use tungstenite::{Message, WebSocket};
 
+use super::access::{AccessCheck, refusal};
+use super::handshakes::{LONGEST_HANDSHAKE, TimedStream};
 use super::protocol::{self, Wish};
 use super::queue::Outgoing;
 use super::{Queue, Shared};
@@ -21,38 +24,47 @@ const PATIENCE: Duration = Duration::from_secs(10);
 const LARGEST_WISH: usize = 1 << 20;
 
 /// Serves a client until it or the server is gone.
-pub(super) fn serve(stream: TcpStream, shared: &Shared, queue: &Arc<Queue>) {
+pub(super) fn serve(stream: TcpStream, shared: &Shared) {
     // Whatever goes wrong here, the client is gone, and comes again if it likes.
-    let _ = talk(stream, shared, queue);
+    let Ok(shaken) = shake_hands(stream, shared) else { return };
+    let Some(queue) = shared.join() else { return };
+    let _ = talk(shaken, shared, &queue);
+    shared.leave(&queue);
 }
 
-#[expect(clippy::result_large_err, reason = "tungstenite's own type")]
-fn choose(
-    request: &Request,
-    mut response: Response,
-) -> Result<Response, tungstenite::handshake::server::ErrorResponse> {
+fn choose(access: &AccessCheck, request: &Request, mut response: Response) -> Result<Response, ErrorResponse> {
+    access.check(request)?;
     let offered = request.headers().get_all("Sec-WebSocket-Protocol").iter().filter_map(|v| v.to_str().ok());
     match protocol::choose(offered) {
         Some(chosen) => {
             response.headers_mut().insert("Sec-WebSocket-Protocol", HeaderValue::from_static(chosen));
             Ok(response)
         }
-        None => {
-            let mut refused =
-                tungstenite::handshake::server::ErrorResponse::new(Some("open this address in Foxglove\n".into()));
-            *refused.status_mut() = StatusCode::BAD_REQUEST;
-            Err(refused)
-        }
+        None => Err(refusal(StatusCode::BAD_REQUEST, "open this address in Foxglove\n".to_owned())),
     }
 }
 
-fn talk(stream: TcpStream, shared: &Shared, queue: &Arc<Queue>) -> Result<(), Box<dyn std::error::Error>> {
+fn shake_hands(stream: TcpStream, shared: &Shared) -> Result<WebSocket<TimedStream>, Box<dyn std::error::Error>> {
     stream.set_nodelay(true)?;
-    stream.set_read_timeout(Some(PATIENCE))?;
     stream.set_write_timeout(Some(PATIENCE))?;
+    let stream = Arc::new(stream);
+    shared.handshakes.add(&stream)?;
     let config = WebSocketConfig::default().max_message_size(Some(LARGEST_WISH)).max_frame_size(Some(LARGEST_WISH));
-    let mut socket = tungstenite::accept_hdr_with_config(stream, choose, Some(config)).map_err(|e| e.to_string())?;
-    socket.get_ref().set_read_timeout(Some(LOOKS))?;
+    let choose = |request: &Request, response: Response| choose(&shared.access, request, response);
+    let shaken =
+        tungstenite::accept_hdr_with_config(TimedStream::new(stream.clone(), LONGEST_HANDSHAKE), choose, Some(config));
+    shared.handshakes.remove(&stream);
+    let mut socket = shaken.map_err(|e| e.to_string())?;
+    socket.get_mut().lift_deadline();
+    socket.get_ref().stream.set_read_timeout(Some(LOOKS))?;
+    Ok(socket)
+}
+
+fn talk(
+    mut socket: WebSocket<TimedStream>,
+    shared: &Shared,
+    queue: &Arc<Queue>,
+) -> Result<(), Box<dyn std::error::Error>> {
     socket.send(Message::text(protocol::server_info(shared.playback.as_ref().map(|p| p.range))))?;
     socket.send(Message::text(protocol::advertise(&shared.topics())))?;
     while !shared.has_ended() {
@@ -73,7 +85,7 @@ fn talk(stream: TcpStream, shared: &Shared, queue: &Arc<Queue>) -> Result<(), Bo
     Ok(socket.flush()?)
 }
 
-fn listen(socket: &mut WebSocket<TcpStream>, shared: &Shared, queue: &Arc<Queue>) -> Result<(), tungstenite::Error> {
+fn listen(socket: &mut WebSocket<TimedStream>, shared: &Shared, queue: &Arc<Queue>) -> Result<(), tungstenite::Error> {
     let wish = match socket.read() {
         Ok(Message::Text(text)) => protocol::wish(&text),
         Ok(Message::Binary(bytes)) => protocol::playback_request(&bytes).map(Wish::Playback),

@@ -3,7 +3,9 @@
 //! It never waits for a client. What waits for one is bounded; one that does not keep up loses its oldest messages, but
 //! never their order, and nothing that tells it where things stand.
 
+mod access;
 mod client;
+mod handshakes;
 mod protocol;
 mod queue;
 
@@ -15,6 +17,9 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::thread::JoinHandle;
 
 use crate::recorder::Topic;
+use access::AccessCheck;
+pub use access::ViewerAccess;
+use handshakes::PendingHandshakes;
 pub(crate) use protocol::{PlaybackRequest, PlaybackState, PlaybackStatus};
 pub(crate) use queue::{Queue, Waiting};
 
@@ -48,6 +53,8 @@ pub(crate) enum Command {
 pub(crate) struct Shared {
     state: Mutex<State>,
     playback: Option<Playback>,
+    access: AccessCheck,
+    handshakes: PendingHandshakes,
     ended: AtomicBool,
     /// Counts what changes the channels that are wanted.
     wishes: AtomicU64,
@@ -67,6 +74,7 @@ impl Server {
     /// Listens; port 0 takes a free one.
     pub(crate) fn start(
         address: SocketAddr,
+        access: ViewerAccess,
         topics: Vec<Topic>,
         playback: Option<Playback>,
     ) -> Result<Self, std::io::Error> {
@@ -75,6 +83,8 @@ impl Server {
         let shared = Arc::new(Shared {
             state: Mutex::new(State { topics, ..State::default() }),
             playback,
+            access: AccessCheck::new(access, address),
+            handshakes: PendingHandshakes::default(),
             ended: AtomicBool::new(false),
             wishes: AtomicU64::new(0),
             lost: AtomicU64::new(0),
@@ -88,6 +98,10 @@ impl Server {
 
     pub(crate) fn address(&self) -> SocketAddr {
         self.address
+    }
+
+    pub(crate) fn url(&self) -> String {
+        self.shared.access.url(self.address)
     }
 
     pub(crate) fn shared(&self) -> &Arc<Shared> {
@@ -225,12 +239,9 @@ fn accept(listener: &TcpListener, shared: &Arc<Shared>) {
             break;
         }
         threads.retain(|thread| !thread.is_finished());
-        let (Ok(stream), Some(queue)) = (stream, shared.join()) else { continue };
+        let Ok(stream) = stream else { continue };
         let shared = shared.clone();
-        threads.push(std::thread::spawn(move || {
-            client::serve(stream, &shared, &queue);
-            shared.leave(&queue);
-        }));
+        threads.push(std::thread::spawn(move || client::serve(stream, &shared)));
     }
     for thread in threads {
         // A client's thread that panicked is none of the run's business.
