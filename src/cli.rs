@@ -153,7 +153,7 @@ pub(crate) struct ReplayArgs {
 /// Who may look on.
 #[derive(Debug, Args)]
 pub(crate) struct ViewerArgs {
-    /// Let a viewer that is a web page look on, beside pages of this machine, as https://app.foxglove.dev; repeatable.
+    /// Let a viewer that is a web page look on, beside pages of this machine, as `https://app.foxglove.dev`; repeatable.
     #[arg(long = "allow-origin", value_name = "URL", value_parser = origin)]
     pub(crate) allowed_origins: Vec<String>,
     /// Let other machines look on without the token that is part of the printed address.
