@@ -2,9 +2,10 @@
 
 use std::path::Path;
 use std::process::Command;
+use std::time::Duration;
 
 use super::child::run_command;
-use super::{Place, stderr};
+use super::{ECHOLAKE, Place, stderr};
 
 fn files(folder: &Path) -> usize {
     std::fs::read_dir(folder).map_or(0, Iterator::count)
@@ -169,6 +170,32 @@ fn run_files_that_are_none_or_damaged() {
     other.fails(0, &["ingest"], "45 measurements");
 }
 
+// The system ends a process that writes larger files than it may: heights are as large, and flat ones are not.
+#[test]
+fn a_run_that_ends_ingest_is_passed_over_by_the_next_one() {
+    let place = Place::new();
+    for (surface, seed) in [("flat", "1"), ("brick", "1"), ("flat", "2")] {
+        place.acquire(surface, &["--seed", seed, "--ir-only"]);
+    }
+    let ingest = || {
+        let mut command = Command::new("sh");
+        command.args(["-c", "ulimit -c 0 -f 250; exec \"$0\" --lake lake ingest", ECHOLAKE]);
+        run_command(command.current_dir(place.path("")).env_remove("ECHOLAKE_LAKE")).expect("the command starts")
+    };
+    let first = ingest();
+    assert_eq!(first.status.code(), None, "{}", stderr(&first));
+    let second = ingest();
+    let said = stderr(&second);
+    assert_eq!(second.status.code(), Some(3), "{said}");
+    assert_eq!(said.matches("a process of its own takes it in").count(), 2, "{said}");
+    assert!(said.contains("-brick-0001.mcap` is passed over") && said.contains("SIGXFSZ"), "{said}");
+    assert_eq!(place.number("select count(*) from runs where surface_id = 'flat'"), 2.0);
+    place.fails(3, &["ingest"], "is passed over");
+    std::fs::remove_dir_all(place.path("lake/tables/_reading")).expect("removed");
+    place.ok(&["ingest"]);
+    assert_eq!(place.number("select count(*) from runs"), 3.0);
+}
+
 #[test]
 fn lakes_that_are_none_newer_or_someone_elses() {
     let place = Place::new();
@@ -283,6 +310,16 @@ fn a_recording_whose_recorder_died_yields_what_was_complete() {
 
 mod slow {
     use super::*;
+    use crate::hostile_files::{HostileCampaign, HostileSizes, MIB};
+
+    #[test]
+    fn the_rest_of_an_inbox_with_hostile_files_is_taken_in() {
+        let campaign = HostileCampaign::new(Path::new(ECHOLAKE), 1);
+        let sizes = HostileSizes { false_records: 1_000_000, bomb: 20 * MIB, sparse: 300 * MIB };
+        let outcome = campaign.round(Some(sizes), 0..20, Duration::from_secs(200));
+        assert!(outcome.good == outcome.good_expected && outcome.deaths.is_empty(), "{outcome:?}");
+        assert!(outcome.peak_mib < 600 && outcome.files > 40 && outcome.quarantined > 0, "{outcome:?}");
+    }
 
     #[test]
     fn meshes_and_surfaces() {

@@ -6,6 +6,7 @@ mod child;
 mod end_to_end;
 mod forgetful;
 mod fuzz;
+mod hostile_files;
 mod installation;
 mod kills;
 mod load;

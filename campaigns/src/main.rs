@@ -14,6 +14,9 @@ mod functions_bench;
 #[path = "../../tests/fuzz/mod.rs"]
 mod fuzz;
 mod fuzz_server;
+#[path = "../../tests/hostile_files.rs"]
+mod hostile_files;
+mod hostile_ingest;
 mod ingest_bench;
 mod kill_acquire;
 mod kill_ingest;
@@ -59,6 +62,8 @@ enum Campaign {
     Flips(flips::FlipsArgs),
     /// Kill ingests, or let two processes ingest at once; the tables must be those of an undisturbed ingest.
     Kills(kill_ingest::KillIngestArgs),
+    /// Put hostile and mutated run files into the inbox of `ingest --watch`; all others must be taken in.
+    HostileFiles(hostile_ingest::HostileFilesArgs),
     /// Kill `acquire`, with or without the power, recover and resume; nothing acknowledged may be lost.
     AcquireKills(kill_acquire::KillAcquireArgs),
     /// Throw changed SQL, bytes of each protocol or run files at `serve`.
@@ -87,6 +92,7 @@ fn main() -> Result<()> {
     match Cli::parse().campaign {
         Campaign::Flips(args) => block_on(flips::run(&args)),
         Campaign::Kills(args) => kill_ingest::run(&args),
+        Campaign::HostileFiles(args) => hostile_ingest::run(&args),
         Campaign::AcquireKills(args) => kill_acquire::run(&args),
         Campaign::Fuzz(args) => fuzz_server::run(&args),
         Campaign::IngestBench(args) => ingest_bench::run(&args),

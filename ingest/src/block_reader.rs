@@ -10,6 +10,8 @@ use bytes::Bytes;
 use object_store::path::Path;
 use object_store::{Error as StoreError, GetOptions, GetResultPayload, ObjectStore, ObjectStoreExt as _};
 
+use crate::run_reader::LARGE_RECORD;
+
 /// How much is fetched of a store at a time: a few chunks, as a request takes long.
 const FROM_STORE: u64 = 4 << 20;
 /// How much is read of a disk at a time where nothing more is needed. A chunk is read at once when its length is known,
@@ -53,8 +55,12 @@ impl BlockReader {
         }
         let read = read_at(file, range.start, &mut room[..count])
             .map_err(|e| StoreError::Generic { store: "file", source: Box::new(e) })?;
-        self.last = room.freeze();
-        Ok(self.last.slice(..read))
+        let block = room.freeze();
+        // Of a large record nothing is kept once it is dealt with.
+        if block.len() as u64 <= LARGE_RECORD {
+            self.last = block.clone();
+        }
+        Ok(block.slice(..read))
     }
 
     /// Some of the file's bytes, elsewhere than where the walk is.

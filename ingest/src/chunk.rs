@@ -3,6 +3,7 @@
 use std::cell::RefCell;
 use std::collections::HashMap;
 use std::io::Read as _;
+use std::sync::Arc;
 
 use bytes::Bytes;
 use mcap::records::Record;
@@ -15,6 +16,8 @@ use crate::record_shape::LARGEST_CHUNK;
 const USUAL_RATIO: u64 = 64;
 /// Opcode and length in front of every record.
 const FRAME: usize = 9;
+/// Longest name of a topic or schema that is kept. None that ingest knows is as long.
+const LONGEST_NAME: usize = 256;
 
 /// Channels by id: the topic and the schema's name.
 pub(crate) type Channels = HashMap<u16, Channel>;
@@ -48,7 +51,8 @@ pub(crate) struct Message<'a> {
 #[derive(Debug, Default, Clone)]
 pub(crate) struct Definitions {
     schemas: HashMap<u16, String>,
-    pub(crate) channels: Channels,
+    /// Chunks that are being measured share them.
+    pub(crate) channels: Arc<Channels>,
 }
 
 impl Definitions {
@@ -56,11 +60,14 @@ impl Definitions {
     pub(crate) fn learn(&mut self, record: &Record<'_>) {
         match record {
             Record::Schema { header, .. } => {
-                self.schemas.entry(header.id).or_insert_with(|| header.name.clone());
+                self.schemas.entry(header.id).or_insert_with(|| kept_name(&header.name));
             }
             Record::Channel(channel) => {
-                let schema = self.schemas.get(&channel.schema_id).cloned().unwrap_or_default();
-                self.channels.entry(channel.id).or_insert_with(|| Channel { topic: channel.topic.clone(), schema });
+                if !self.channels.contains_key(&channel.id) {
+                    let schema = self.schemas.get(&channel.schema_id).cloned().unwrap_or_default();
+                    let channels = Arc::make_mut(&mut self.channels);
+                    channels.insert(channel.id, Channel { topic: kept_name(&channel.topic), schema });
+                }
             }
             _ => {}
         }
@@ -69,17 +76,19 @@ impl Definitions {
 
 impl Chunk {
     /// Decompresses a chunk record's body. The text of an error says what is wrong with it.
-    pub(crate) fn decode(body: &[u8]) -> Result<Self, String> {
+    pub(crate) fn decode(body: &Bytes) -> Result<Self, String> {
         let Ok(Record::Chunk { header, data }) = mcap::parse_record(0x06, body) else {
             return Err("its header is damaged".into());
         };
-        if header.uncompressed_size > LARGEST_CHUNK {
-            return Err(format!("it claims {} bytes, more than {LARGEST_CHUNK}", header.uncompressed_size));
+        let stored = if header.compression.is_empty() { 0 } else { data.len() as u64 };
+        if header.uncompressed_size.saturating_add(stored) > LARGEST_CHUNK {
+            let claimed = header.uncompressed_size;
+            return Err(format!("it claims {claimed} bytes, with those that are stored more than {LARGEST_CHUNK}"));
         }
         let size = header.uncompressed_size as usize;
         let data = match header.compression.as_str() {
-            "" => data.into_owned(),
-            "zstd" => decompress(&data, size).map_err(|e| format!("it does not decompress: {e}"))?,
+            "" => body.slice_ref(&data),
+            "zstd" => decompress(&data, size).map_err(|e| format!("it does not decompress: {e}"))?.into(),
             other => return Err(format!("it is compressed with `{other}`, expected zstd")),
         };
         if data.len() != size {
@@ -89,7 +98,7 @@ impl Chunk {
         if header.uncompressed_crc != 0 && header.uncompressed_crc != crc {
             return Err(format!("its CRC is {crc:08x}, expected {:08x}", header.uncompressed_crc));
         }
-        Ok(Self { data: data.into(), crc })
+        Ok(Self { data, crc })
     }
 
     /// The same for two copies of one chunk.
@@ -137,6 +146,10 @@ impl Chunk {
             data: &body[22..],
         })
     }
+}
+
+fn kept_name(name: &str) -> String {
+    if name.len() <= LONGEST_NAME { name.to_owned() } else { String::new() }
 }
 
 thread_local! {

@@ -39,6 +39,14 @@ pub enum Error {
         /// What is wrong.
         cause: ManifestError,
     },
+    /// Its metadata may be damaged.
+    #[error("`{file}` cannot be taken in: {reason}")]
+    Doubtful {
+        /// The file.
+        file: String,
+        /// What speaks against it.
+        reason: String,
+    },
     /// An attachment that must be there is missing or damaged.
     #[error("`{file}`: attachment `{attachment}` {reason}")]
     Attachment {
@@ -74,6 +82,18 @@ pub enum Error {
     Gone {
         /// The file.
         file: String,
+    },
+    /// Processes end while they take it in.
+    #[error(
+        "`{file}` is passed over: processes that took in this file alone ended on the way ({endings}); hint: to have it tried again, move it back into `inbox/`, or delete `{mark}`"
+    )]
+    Deadly {
+        /// The file.
+        file: String,
+        /// How they ended.
+        endings: String,
+        /// Where that is kept.
+        mark: String,
     },
     /// A kernel refused.
     #[error("`{file}`: {cause}")]
@@ -116,7 +136,10 @@ impl Error {
         match self {
             Self::Read { .. } | Self::NotMcap { .. } | Self::Foreign { .. } | Self::Manifest { .. } => true,
             Self::Attachment { .. } | Self::OtherContent { .. } | Self::NoRun { .. } | Self::Gone { .. } => true,
-            Self::Kernel { .. } | Self::Lake(echolake_lake::Error::OtherRig { .. }) => true,
+            Self::Deadly { .. }
+            | Self::Doubtful { .. }
+            | Self::Kernel { .. }
+            | Self::Lake(echolake_lake::Error::OtherRig { .. }) => true,
             Self::DataFile { .. } | Self::Threads { .. } | Self::Stopped | Self::Lake(_) => false,
         }
     }

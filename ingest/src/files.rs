@@ -21,6 +21,8 @@ const RUNS: &str = "runs";
 const QUARANTINE: &str = "quarantine";
 /// What the name of a recording ends in until it is whole.
 const PARTIAL: &str = ".partial";
+/// Longest name of a refused file. File systems allow 255 bytes.
+const LONGEST_NAME: usize = 200;
 /// Bytes that are copied at a time.
 const PART: u64 = 8 << 20;
 
@@ -170,7 +172,10 @@ pub(crate) async fn quarantine(lake: &Lake, source: &Source, why: &Error) -> Res
         return Ok(None);
     }
     let store = lake.store();
-    let to = free_name(lake, from.filename().unwrap_or("run")).await?;
+    let name = from.filename().unwrap_or("run");
+    // The end of a long one, because the reason's name is longer.
+    let start = (name.len().saturating_sub(LONGEST_NAME)..name.len()).find(|at| name.is_char_boundary(*at));
+    let to = free_name(lake, &name[start.unwrap_or(0)..]).await?;
     let reason = Path::from(format!("{to}.reason.txt"));
     store.put(&reason, format!("{why}\n").into()).await.map_err(|e| written(&reason, e))?;
     match store.rename(from, &to).await {

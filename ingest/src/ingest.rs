@@ -8,12 +8,14 @@ use echolake_lake::{Committed, EncodedFile, Lake, VisibleRun, encode};
 use echolake_schema::tables::Table;
 use echolake_schema::{RunId, SurfaceId};
 use object_store::path::Path;
+use serde::{Deserialize, Serialize};
 
 use crate::CODE_VERSION;
 use crate::context::Context;
 use crate::derive::{Derivation, Responses};
 use crate::error::{Error, Result};
 use crate::files::{self, Source};
+use crate::marks::ReadingMark;
 use crate::measure::Measurer;
 use crate::pipeline::{self, Cores, Ready};
 use crate::read_back;
@@ -22,11 +24,13 @@ use crate::rows::{self, Keys};
 use crate::run_content::{Head, RunContent};
 
 /// What became of a run.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Taken {
     /// The run.
+    #[serde(rename = "run_id")]
     pub run: RunId,
     /// Its surface.
+    #[serde(rename = "surface_id")]
     pub surface: SurfaceId,
     /// Measurements in the table.
     pub measurements: usize,
@@ -35,6 +39,7 @@ pub struct Taken {
     /// References that are missing, separated by commas; empty where none is.
     pub missing: String,
     /// Whether it is new.
+    #[serde(rename = "added")]
     pub outcome: Outcome,
     /// What could not be read, in words.
     pub damaged: Vec<String>,
@@ -43,12 +48,25 @@ pub struct Taken {
 }
 
 /// Whether a run is new to the lake.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(from = "bool", into = "bool")]
 pub enum Outcome {
     /// It is in the lake now.
     Added,
     /// It was in the lake before; nothing was added.
     Known,
+}
+
+impl From<bool> for Outcome {
+    fn from(is_added: bool) -> Self {
+        if is_added { Self::Added } else { Self::Known }
+    }
+}
+
+impl From<Outcome> for bool {
+    fn from(outcome: Outcome) -> Self {
+        outcome == Outcome::Added
+    }
 }
 
 /// What became of a file.
@@ -115,8 +133,7 @@ impl<'a> Ingest<'a> {
         let mut refused = Vec::new();
         let ended = &mut |(source, done): pipeline::Ended<Source, Taken>| match done {
             Ok((taken, outcome)) => {
-                let known = outcome.is_none_or(|o| o != Committed::Now);
-                let outcome = if known { Outcome::Known } else { Outcome::Added };
+                let outcome = Outcome::from(outcome == Some(Committed::Now));
                 report(Report::Taken(Taken { outcome, ..taken }));
                 Ok(())
             }
@@ -147,6 +164,7 @@ impl<'a> Ingest<'a> {
         let mut names = BTreeSet::from([defaults.flat.clone(), defaults.foam.clone()]);
         let mut heads = Vec::with_capacity(sources.len());
         for source in sources {
+            let _mark = ReadingMark::new(self.lake, &source);
             let head = match source.open(self.lake) {
                 Ok(opened) => Head::read(&opened).await,
                 Err(_) => None,
@@ -164,6 +182,7 @@ impl<'a> Ingest<'a> {
 impl Work {
     async fn take_in(&self, source: &Source) -> Result<Ready<Taken>> {
         let Context { lake, cores, snapshot, finder } = &self.context;
+        let mut mark = ReadingMark::new(lake, source);
         let opened = source.open(lake)?;
         let content = Arc::new(RunContent::read(lake, &self.measurer, cores, &opened).await?);
         let keys = Keys { surface: content.manifest.surface_id.clone(), run: content.manifest.run_id.clone() };
@@ -172,7 +191,9 @@ impl Work {
         if let Some(known) = known {
             self.check_same(known, &content, &opened.name).await?;
         }
-        files::keep(lake, source, &Lake::run_path(&keys.surface, &keys.run), content.integrity.bytes).await?;
+        let place = Lake::run_path(&keys.surface, &keys.run);
+        files::keep(lake, source, &place, content.integrity.bytes).await?;
+        mark = mark.and_then(|mark| mark.follow(lake, &Source::Lake(place)));
         let names = Names::of(&content.surface, &lake.config().references);
         let wanted = finder.lock().await.wanted_by(names);
         let mut taken = Taken {
@@ -216,6 +237,7 @@ impl Work {
         };
         let row = rows::runs::row(lake, &keys, &content, &derivation, &references)?;
         staged.push(self.context.stage_pointer(run, &[row]).await?);
+        drop(mark);
         Ok(Ready { staged, report: taken })
     }
 

@@ -39,6 +39,7 @@ mod files;
 mod flips_tests;
 mod ingest;
 mod inspect;
+mod marks;
 mod measure;
 #[cfg(test)]
 mod mortal;
@@ -56,6 +57,7 @@ pub use files::{Source, adopt_cut_off, pending};
 pub use ingest::{Ingest, Outcome, Report, Taken};
 #[doc(hidden)]
 pub use inspect::{Inspected, Inspection, inspect};
+pub use marks::SuspectFile;
 pub use run_reader::Integrity;
 
 /// Version of the code that derives rows; it stands in every row.

@@ -1,6 +1,7 @@
 //! Messages of one chunk become impulse responses, verdicts, readings and log lines.
 
 use std::collections::{HashMap, HashSet};
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 
 use bytes::Bytes;
@@ -14,6 +15,22 @@ use echolake_schema::{Celsius, Rig, samples, topics};
 use prost::Message as _;
 
 use crate::chunk::{Channels, Chunk, Message};
+use crate::run_reader::list_damage;
+
+/// Memory for a run's messages beside those that its rig makes it have: a day's readings, or 200,000 lines of log.
+const SPARE_BYTES: u64 = 64 << 20;
+/// Samples of the longest recording, unless the rig's own are longer; and of all recordings whose plans are kept.
+const LONGEST_RECORDING: usize = 1 << 22;
+/// Memory of a chunk that holds nothing, with a line about its damage.
+const CHUNK_BYTES: u64 = 512;
+/// Memory of one more line.
+const LINE_BYTES: u64 = 256;
+/// Memory of a short message.
+const MESSAGE_BYTES: u64 = 64;
+/// How much larger a verdict is in memory: a reason of no letters takes 2 bytes of its message, and 24.
+const VERDICT_GROWTH: u64 = 12;
+/// Memory of a usual verdict.
+const VERDICT_BYTES: u64 = 4 << 10;
 
 /// Turns recordings into responses; one for all chunks of all runs.
 pub(crate) struct Measurer {
@@ -22,6 +39,23 @@ pub(crate) struct Measurer {
     /// Recordings of a run are of one length, those of an import may not be.
     plans: Mutex<HashMap<usize, Arc<Planned>>>,
     correction: TemperatureCorrection<f32>,
+}
+
+/// Memory that the messages of one run may still take: what a hostile file's chunks hold is up to thousands of times what
+/// is stored of them.
+#[derive(Debug)]
+pub(crate) struct RunBudget(AtomicU64);
+
+impl RunBudget {
+    /// Takes what is kept of any chunk.
+    pub(crate) fn take_chunk(&self) -> Result<(), String> {
+        self.take(CHUNK_BYTES)
+    }
+
+    fn take(&self, bytes: u64) -> Result<(), String> {
+        let taken = self.0.fetch_update(Ordering::Relaxed, Ordering::Relaxed, |left| left.checked_sub(bytes));
+        taken.map(drop).map_err(|_| "the run holds more than ingest has memory for".to_owned())
+    }
 }
 
 /// The plan of one length, and buffers that no thread uses now.
@@ -124,17 +158,41 @@ impl Measurer {
         }
     }
 
-    /// Reads all messages of a chunk. What is wrong with one of them is said, and the others go on.
-    pub(crate) fn process(&self, offset: u64, chunk: &Chunk, channels: &Channels) -> Yield {
+    /// Returns the budget of one run: every pair may have its attempts, each recorded and as a response.
+    pub(crate) fn run_budget(&self) -> RunBudget {
+        let attempts = u64::from(self.pairs) * u64::from(self.rig.validation.attempts);
+        RunBudget(AtomicU64::new(SPARE_BYTES + attempts * (2 * self.response_bytes() + VERDICT_BYTES)))
+    }
+
+    fn response_bytes(&self) -> u64 {
+        2 * MESSAGE_BYTES + 4 * self.rig.impulse_response.length as u64
+    }
+
+    /// Reads all messages of a chunk, as far as the run's budget goes. What is wrong with one of them is said, and the
+    /// others go on.
+    pub(crate) fn process(&self, offset: u64, chunk: &Chunk, channels: &Channels, budget: &RunBudget) -> Yield {
         let mut out = Yield { last_time_ns: i64::MIN, ..Yield::default() };
         let mut swept = HashSet::new();
         for message in chunk.messages() {
             out.last_time_ns = out.last_time_ns.max(message.log_time_ns);
             let Some(channel) = channels.get(&message.channel) else {
-                out.damaged.push(format!("a message of channel {}, which nothing introduces", message.channel));
+                // Its chunk waited for the summary, which has it as little.
+                if out.damaged.is_empty() || budget.take(LINE_BYTES).is_ok() {
+                    list_damage(&mut out.damaged, || {
+                        format!("a message of channel {}, which nothing introduces", message.channel)
+                    });
+                }
                 continue;
             };
-            let taken = match channel.topic.as_str() {
+            let length = message.data.len() as u64;
+            let memory = match channel.topic.as_str() {
+                topics::SWEEP | topics::IR => self.response_bytes(),
+                topics::MEASUREMENT => MESSAGE_BYTES + length * VERDICT_GROWTH,
+                topics::ENVIRONMENT => MESSAGE_BYTES,
+                topics::LOG => MESSAGE_BYTES + length,
+                _ => continue,
+            };
+            let taken = budget.take(memory).and_then(|()| match channel.topic.as_str() {
                 topics::SWEEP => decode::<SweepRecording>(&channel.schema, chunk.share(message.data))
                     .and_then(|s| self.sweep(offset, &message, &s))
                     .map(|response| {
@@ -153,9 +211,13 @@ impl Measurer {
                     .map_err(|e| e.to_string())
                     .map(|e| out.events.push((message.log_time_ns, e))),
                 _ => Ok(()),
-            };
-            if let Err(reason) = taken {
-                out.damaged.push(format!("a message of `{}` at {} ns: {reason}", channel.topic, message.log_time_ns));
+            });
+            if let Err(reason) = taken
+                && (out.damaged.is_empty() || budget.take(LINE_BYTES).is_ok())
+            {
+                list_damage(&mut out.damaged, || {
+                    format!("a message of `{}` at {} ns: {reason}", channel.topic, message.log_time_ns)
+                });
             }
         }
         out
@@ -243,9 +305,16 @@ impl Measurer {
     }
 
     fn plan(&self, recording_len: usize) -> Result<Arc<Planned>, String> {
+        let longest = LONGEST_RECORDING.max(4 * self.rig.recording_len());
+        if recording_len > longest {
+            return Err(format!("it has {recording_len} samples, more than {longest}"));
+        }
         let mut plans = self.plans.lock().unwrap_or_else(PoisonError::into_inner);
         if let Some(plan) = plans.get(&recording_len) {
             return Ok(plan.clone());
+        }
+        if plans.keys().sum::<usize>() + recording_len > longest {
+            plans.clear();
         }
         let plan = MeasurementPlan::new(&MeasurementParams {
             recording_len,

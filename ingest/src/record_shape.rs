@@ -7,7 +7,7 @@ pub(crate) const FRAME: usize = 9;
 /// The lengths inside of a record all stand in its first bytes; names that are longer do not occur.
 pub(crate) const PREFIX: usize = 64 << 10;
 
-/// Largest chunk that is read, as it is stored and decompressed. Queries over run files read no larger ones.
+/// Largest chunk that is read, as it is stored and decompressed together. Queries over run files read no larger ones.
 pub(crate) const LARGEST_CHUNK: u64 = 256 << 20;
 
 /// Bytes of the largest record of a kind that is read as a whole. What a file claims is taken into memory only up to this:
@@ -15,8 +15,7 @@ pub(crate) const LARGEST_CHUNK: u64 = 256 << 20;
 pub(crate) fn largest(code: u8) -> Option<u64> {
     match code {
         opcode::CHUNK | opcode::ATTACHMENT => Some(LARGEST_CHUNK),
-        opcode::METADATA => Some(64 << 20),
-        opcode::SCHEMA | opcode::CHANNEL => Some(4 << 20),
+        opcode::METADATA | opcode::SCHEMA | opcode::CHANNEL => Some(4 << 20),
         _ => None,
     }
 }
@@ -72,14 +71,10 @@ impl Frame {
         Self { code: bytes[0], length: u64::from_le_bytes(length) }
     }
 
-    /// Whether a search for records looks closer at this one, with `left` bytes of the file behind the frame.
-    pub(crate) fn is_worth_a_look(self, left: u64) -> bool {
-        self.length <= left && !parts(self.code).is_empty()
-    }
-
-    /// Whether the specification has such records, or leaves them to others.
+    /// Whether the specification has such records, or leaves them to others, with `left` bytes of the file behind the frame.
     pub(crate) fn is_possible(self, left: u64) -> bool {
-        self.is_worth_a_look(left) || (self.length <= left && matches!(self.code, opcode::MESSAGE | opcode::PRIVATE..))
+        let is_known = !parts(self.code).is_empty() || matches!(self.code, opcode::MESSAGE | opcode::PRIVATE..);
+        self.length <= left && is_known
     }
 
     /// What the first bytes behind the frame, at most [`PREFIX`], say of the record.

@@ -15,7 +15,7 @@ use crate::error::{Error, Result};
 use crate::files::Opened;
 use crate::measure::{Event, Measurer, Response, Yield};
 use crate::pipeline::{Begun, Cores};
-use crate::run_reader::{Integrity, Item, RawChunk, RunReader};
+use crate::run_reader::{Integrity, Item, RawChunk, RunReader, list_damage};
 
 /// A run, read.
 pub(crate) struct RunContent {
@@ -51,6 +51,10 @@ struct Envelope {
 
 const NEEDED_METADATA: [&str; 3] = [topics::RUN_METADATA, topics::RUN_PLAN_METADATA, topics::RUN_END_METADATA];
 const NEEDED_ATTACHMENTS: [&str; 3] = [topics::RIG_ATTACHMENT, topics::SURFACE_ATTACHMENT, topics::HEIGHTS_ATTACHMENT];
+/// Largest heights that are kept: those of 2048 by 2048 points.
+const LARGEST_HEIGHTS: usize = 16 << 20;
+/// Largest text that is kept; what it is parsed to is a multiple of it.
+const LARGEST_TEXT: usize = 1 << 20;
 
 /// What a run says of itself before its first measurement.
 #[derive(Debug)]
@@ -66,7 +70,7 @@ impl Head {
     /// None where the file does not begin as a run of ours does.
     pub(crate) async fn read(opened: &Opened) -> Option<Self> {
         let (store, path) = (opened.store.clone(), opened.path.clone());
-        let mut reader = RunReader::open(store, path, opened.name.clone()).await.ok()?;
+        let mut reader = RunReader::open(store, path, opened.name.clone()).await.ok()?.without_digest();
         let mut envelope = Envelope::default();
         while let Ok(Some(item)) = reader.next().await {
             match item {
@@ -94,6 +98,7 @@ impl RunContent {
         let mut whole = Yield { last_time_ns: i64::MIN, ..Yield::default() };
         let mut checked = false;
         let busy = cores.busy();
+        let budget = Arc::new(measurer.run_budget());
         let mut measured: Vec<Measured> = Vec::new();
         let mut seen = HashSet::new();
         // Chunks whose channels are not known yet: the chunk that introduces them is damaged, the summary has them too.
@@ -106,9 +111,11 @@ impl RunContent {
                         checked = true;
                     }
                     let (begin, length) = (raw.offset, raw.body.len() as u64);
-                    match decode(&raw) {
+                    match budget.take_chunk().and_then(|()| decode(&raw)) {
                         Ok((offset, chunk)) if !seen.insert(chunk.identity()) => {
-                            whole.damaged.push(format!("the chunk at byte {offset}: a copy of one before it"));
+                            list_damage(&mut whole.damaged, || {
+                                format!("the chunk at byte {offset}: a copy of one before it")
+                            });
                         }
                         Ok((offset, chunk)) => {
                             chunk.learn(&mut definitions);
@@ -117,7 +124,12 @@ impl RunContent {
                                 continue;
                             }
                             let (measurer, channels) = (measurer.clone(), definitions.channels.clone());
-                            let work = move || measurer.process(offset, &chunk, &channels);
+                            let (budget, permit) = (budget.clone(), raw.permit);
+                            let work = move || {
+                                let measured = measurer.process(offset, &chunk, &channels, &budget);
+                                drop((chunk, permit));
+                                measured
+                            };
                             // Another core would have to fetch what this one has in its cache, so it gets a chunk only
                             // where it has nothing else to do. That also bounds how many are in memory.
                             measured.push(match cores.is_one_idle() {
@@ -127,7 +139,7 @@ impl RunContent {
                             tokio::task::yield_now().await;
                         }
                         Err(reason) => {
-                            whole.damaged.push(reason);
+                            list_damage(&mut whole.damaged, || reason);
                             reader.look_into(begin).await?;
                         }
                     }
@@ -146,9 +158,10 @@ impl RunContent {
             });
         }
         for (offset, length) in waiting {
-            let (offset, chunk) = decode(&reader.again(offset, length).await?).map_err(|e| Error::read(name, e))?;
-            let (measurer, channels) = (measurer.clone(), definitions.channels.clone());
-            whole.append(cores.compute(move || measurer.process(offset, &chunk, &channels)).await);
+            let raw = reader.again(offset, length).await?;
+            let (offset, chunk) = decode(&raw).map_err(|e| Error::read(name, e))?;
+            let (measurer, channels, budget) = (measurer.clone(), definitions.channels.clone(), budget.clone());
+            whole.append(cores.compute(move || measurer.process(offset, &chunk, &channels, &budget)).await);
         }
         let integrity = reader.finish().await?;
         if !integrity.damage.is_empty() {
@@ -165,7 +178,9 @@ impl RunContent {
         name: &str,
     ) -> Result<Self> {
         let mut damaged = integrity.damage.clone();
-        damaged.extend(whole.damaged);
+        for line in whole.damaged {
+            list_damage(&mut damaged, || line);
+        }
         // How a run ended is no reason to refuse what it measured.
         let end = envelope.metadata.get(topics::RUN_END_METADATA).map(RunEnd::from_metadata);
         let end = end.and_then(|end| end.map_err(|cause| damaged.push(cause.to_string())).ok());
@@ -198,8 +213,10 @@ impl RunContent {
 impl Envelope {
     // The first of a name counts.
     fn keep_attachment(&mut self, name: String, data: Bytes) {
-        if NEEDED_ATTACHMENTS.contains(&name.as_str()) {
-            self.attachments.entry(name).or_insert(data);
+        let most = if name == topics::HEIGHTS_ATTACHMENT { LARGEST_HEIGHTS } else { LARGEST_TEXT };
+        if NEEDED_ATTACHMENTS.contains(&name.as_str()) && data.len() <= most {
+            // A copy: the bytes are part of whatever was fetched with them.
+            self.attachments.entry(name).or_insert_with(|| Bytes::copy_from_slice(&data));
         }
     }
 
@@ -251,7 +268,9 @@ impl Yield {
         self.verdicts.append(&mut other.verdicts);
         self.readings.append(&mut other.readings);
         self.events.append(&mut other.events);
-        self.damaged.append(&mut other.damaged);
+        for line in other.damaged {
+            list_damage(&mut self.damaged, || line);
+        }
         self.last_time_ns = self.last_time_ns.max(other.last_time_ns);
     }
 }
@@ -273,7 +292,7 @@ fn vouch(manifest: &RunManifest, name: &str) -> Result<()> {
          hint: if it is right, name the file after the run",
         manifest.surface_id, manifest.started
     );
-    Err(Error::read(name, reason))
+    Err(Error::Doubtful { file: name.to_owned(), reason })
 }
 
 // Where the walk is: it takes less than the digest of the same bytes, and to hand it to another thread as much again.
@@ -320,7 +339,9 @@ fn join(
     for (pair, verdict) in last {
         match responses.remove(&(pair, verdict.attempt)) {
             Some(response) => accepted.push((verdict, response)),
-            None => damaged.push(format!("pair {pair}, attempt {}: its response cannot be read", verdict.attempt)),
+            None => list_damage(damaged, || {
+                format!("pair {pair}, attempt {}: its response cannot be read", verdict.attempt)
+            }),
         }
     }
     accepted

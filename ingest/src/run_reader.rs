@@ -1,7 +1,8 @@
 //! Walks a run's MCAP file from its first byte to its last, in one pass that also hashes it.
 //!
 //! The walk needs no summary, so a file that was cut off yields all that was complete. Where a record cannot be
-//! one, the next that can is searched byte by byte, so damage costs the records that it touches and no others.
+//! one, the next that can is searched byte by byte, so damage costs the records that it touches and no others. Whatever
+//! a file holds, the walk takes time in proportion to its size, and one large record is in memory at a time.
 
 use std::borrow::Cow;
 use std::collections::HashSet;
@@ -13,6 +14,7 @@ use mcap::records::Record;
 use object_store::path::Path;
 use object_store::{ObjectStore, ObjectStoreExt as _};
 use sha2::{Digest as _, Sha256};
+use tokio::sync::{Semaphore, SemaphorePermit};
 
 use crate::block_reader::BlockReader;
 use crate::error::{Error, Result};
@@ -21,8 +23,19 @@ use crate::record_shape::{self, Frame, PREFIX, Shape, opcode};
 const MAGIC: &[u8; 8] = b"\x89MCAP0\r\n";
 /// Opcode and length in front of every record.
 const FRAME: u64 = record_shape::FRAME as u64;
-/// Most that is passed over at a time.
+/// Most that is passed over at a time, and what a search fetches at a time.
 const PASS: u64 = 1 << 20;
+/// How often the walk may go back over the file, all of its ways back together: false records that reach over each other
+/// would have it read the same bytes without end.
+const REWINDS: u64 = 4;
+/// Most chunks of one file: their places are kept.
+const MOST_CHUNKS: usize = 1 << 20;
+/// Most lines about one file's damage: a hostile file has millions.
+const MOST_DAMAGE: usize = 1000;
+/// Records of which one is in memory at a time, in all files together, are larger than this. A recorder's chunks have
+/// 1 MiB.
+pub(crate) const LARGE_RECORD: u64 = 8 << 20;
+static LARGE_RECORDS: Semaphore = Semaphore::const_new(1);
 /// Bytes from the footer's frame to the end of the file.
 const FOOTER: u64 = FRAME + 20 + MAGIC.len() as u64;
 
@@ -40,11 +53,16 @@ pub(crate) enum Item {
 }
 
 /// A chunk's body and where its record begins.
-#[derive(Debug, Clone)]
+#[derive(Debug)]
 pub(crate) struct RawChunk {
     pub(crate) offset: u64,
     pub(crate) body: Bytes,
+    /// Held by a large chunk until its messages are read.
+    pub(crate) permit: Option<LargeRecordPermit>,
 }
+
+/// Permits one large record to be in memory.
+pub(crate) type LargeRecordPermit = SemaphorePermit<'static>;
 
 /// What the walk found out about the whole file.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -70,11 +88,16 @@ pub(crate) struct RunReader {
     doubtful: Option<u64>,
     /// Where the chunks began that were given out.
     chunks: HashSet<u64>,
-    /// What is fetched of the file from `offset` on.
-    buffer: Bytes,
+    /// The bytes that were fetched last.
+    window: Bytes,
+    /// Where they begin; a search may begin before `offset`.
+    window_start: u64,
+    /// Bytes that searches went back over.
+    rewound: u64,
     /// How far the file is in the digest; a search may begin before it.
     hashed: u64,
     digest: Sha256,
+    has_digest: bool,
     crc: Crc32,
     in_summary: bool,
     /// The summary's own checksum, gathered while its records pass.
@@ -105,9 +128,12 @@ impl RunReader {
             offset: 0,
             doubtful: None,
             chunks: HashSet::new(),
-            buffer: Bytes::new(),
+            window: Bytes::new(),
+            window_start: 0,
+            rewound: 0,
             hashed: 0,
             digest: Sha256::new(),
+            has_digest: true,
             crc: Crc32::new(),
             in_summary: false,
             summary: Crc32::new(),
@@ -124,6 +150,11 @@ impl RunReader {
             return Err(Error::NotMcap { file: reader.name, actual });
         }
         Ok(reader)
+    }
+
+    /// Leaves out the bytes that are passed over, for a walk of which only the items matter.
+    pub(crate) fn without_digest(self) -> Self {
+        Self { has_digest: false, ..self }
     }
 
     /// The next item, or None at the end.
@@ -152,16 +183,20 @@ impl RunReader {
     /// The chunk that began at `offset` is damaged. Where bytes of it are missing it reached too far, so the walk
     /// goes on at the next whole record behind its first byte; no chunk comes twice.
     pub(crate) async fn look_into(&mut self, offset: u64) -> Result<()> {
-        self.doubtful = Some(offset);
         self.end = None;
-        self.search().await
+        match self.rewind(offset) {
+            true => self.search().await,
+            false => Ok(()),
+        }
     }
 
     /// A chunk that the walk came by earlier, once more.
     pub(crate) async fn again(&self, offset: u64, length: u64) -> Result<RawChunk> {
         let start = offset + FRAME;
+        // What it becomes is known only once it is read.
+        let permit = large_record_permit(LARGE_RECORD + 1).await;
         let body = self.file.range(start..start + length).await;
-        Ok(RawChunk { offset, body: body.map_err(|e| Error::read(&self.name, e))? })
+        Ok(RawChunk { offset, body: body.map_err(|e| Error::read(&self.name, e))?, permit })
     }
 
     // One record; None where it is of no interest.
@@ -169,28 +204,36 @@ impl RunReader {
         let frame = match self.frame().await? {
             Ok(frame) => frame,
             Err(what) => {
-                self.damage.push(format!("the file {what} at byte {}", self.offset));
+                let at = self.offset;
+                list_damage(&mut self.damage, || format!("the file {what} at byte {at}"));
                 self.search().await?;
                 return Ok(None);
             }
         };
         let offset = self.offset;
         self.doubtful = Some(offset);
-        if let Some(most) = record_shape::largest(frame.code).filter(|most| frame.length > *most) {
-            let Frame { code, length } = frame;
-            self.damage
-                .push(format!("record of kind {code:#04x} at byte {offset} has {length} bytes, more than {most}"));
+        let Frame { code, length } = frame;
+        let most = record_shape::largest(code).unwrap_or(u64::MAX);
+        let is_one_too_many = code == opcode::CHUNK && self.chunks.len() == MOST_CHUNKS;
+        if length > most || is_one_too_many {
+            list_damage(&mut self.damage, || match is_one_too_many {
+                true => format!("the chunk at byte {offset}: the file has more than {MOST_CHUNKS}"),
+                false => format!("record of kind {code:#04x} at byte {offset} has {length} bytes, more than {most}"),
+            });
+            // The lengths inside of it agree with its own: nothing is looked for in it.
+            self.doubtful = None;
             return self.pass(FRAME + length).await;
         }
-        match frame.code {
+        match code {
             opcode::CHUNK | opcode::ATTACHMENT | opcode::METADATA | opcode::SCHEMA | opcode::CHANNEL => {
-                self.fill(FRAME + frame.length).await?;
-                let mut record = self.skip(FRAME + frame.length, true);
+                let permit = large_record_permit(self.memory(frame)).await;
+                self.fill(FRAME + length).await?;
+                let mut record = self.skip(FRAME + length, true);
                 let body = record.split_off(FRAME as usize);
-                if frame.code == opcode::CHUNK {
-                    return Ok(self.chunks.insert(offset).then_some(Item::Chunk(RawChunk { offset, body })));
+                if code == opcode::CHUNK {
+                    return Ok(self.chunks.insert(offset).then_some(Item::Chunk(RawChunk { offset, body, permit })));
                 }
-                let item = self.item(frame.code, offset, &body);
+                let item = self.item(code, offset, &body);
                 if item.is_none() {
                     self.look_into(offset).await?;
                 }
@@ -198,8 +241,16 @@ impl RunReader {
             }
             opcode::DATA_END => self.data_end().await,
             opcode::FOOTER => self.footer().await,
-            _ => self.pass(FRAME + frame.length).await,
+            _ => self.pass(FRAME + length).await,
         }
+    }
+
+    // Bytes that a record takes: a chunk's also decompressed, which is its third number.
+    fn memory(&self, frame: Frame) -> u64 {
+        let at = FRAME as usize + 16;
+        let claimed = self.ahead().get(at..at + 8).filter(|_| frame.code == opcode::CHUNK);
+        let claimed = claimed.map_or(0, |bytes| u64::from_le_bytes(bytes.try_into().unwrap_or_default()));
+        frame.length.max(claimed)
     }
 
     // The frame at `offset`, or in words why no record begins there.
@@ -208,61 +259,74 @@ impl RunReader {
         if left < FRAME {
             return Ok(Err("ends within a record's frame".to_owned()));
         }
-        self.fill(left.min(FRAME + PREFIX as u64)).await?;
-        let frame = Frame::read(&self.buffer);
+        self.fill(FRAME).await?;
+        let frame = Frame::read(self.ahead());
         if frame.length > left - FRAME {
             return Ok(Err(format!("ends within a record of kind {:#04x} and {} bytes", frame.code, frame.length)));
         }
-        let prefix = frame.length.min(PREFIX as u64);
-        let sound = match frame.shape(&self.buffer[FRAME as usize..(FRAME + prefix) as usize]) {
-            Shape::Sound => frame.code != opcode::FOOTER || self.ends_with_footer(),
-            Shape::Unknown => self.goes_on(self.offset + FRAME + frame.length).await?,
+        self.fill(left.min(FRAME + frame.length.min(PREFIX as u64) + MAGIC.len() as u64)).await?;
+        let sound = match look(self.ahead(), left) {
+            Shape::Sound => true,
+            Shape::Unknown => self.goes_on(FRAME + frame.length).await?,
             Shape::Broken => false,
         };
         Ok(if sound { Ok(frame) } else { Err(format!("has no whole record of kind {:#04x}", frame.code)) })
     }
 
-    // Whether a record can begin at `offset`: that speaks for the one before it, where nothing else does.
-    async fn goes_on(&self, offset: u64) -> Result<bool> {
-        if self.size - offset < FRAME {
+    // Whether a record can begin `behind` this one's first byte: that speaks for this one, where nothing else does.
+    async fn goes_on(&mut self, behind: u64) -> Result<bool> {
+        let left = self.size - self.offset - behind;
+        if left < FRAME {
             return Ok(false);
         }
-        let bytes = self.file.range(offset..offset + FRAME).await;
-        let frame = Frame::read(&bytes.map_err(|e| Error::read(&self.name, e))?);
-        Ok(frame.is_possible(self.size - offset - FRAME))
+        let frame = if behind <= PREFIX as u64 {
+            self.fill(behind + FRAME).await?;
+            Frame::read(&self.ahead()[behind as usize..])
+        } else {
+            let start = self.offset + behind;
+            let bytes = self.file.range(start..start + FRAME).await;
+            Frame::read(&bytes.map_err(|e| Error::read(&self.name, e))?)
+        };
+        Ok(frame.is_possible(left - FRAME))
     }
 
-    // Whether the footer at `offset` is followed by the magic bytes and by nothing else.
-    fn ends_with_footer(&self) -> bool {
-        self.buffer[..].ends_with(MAGIC) && self.size - self.offset == FOOTER && self.buffer.len() as u64 == FOOTER
+    // Goes back to where a doubtful record began; false where the walk went back too much already.
+    fn rewind(&mut self, to: u64) -> bool {
+        self.doubtful = None;
+        let back = self.offset - to;
+        let may = self.rewound + back <= self.size.saturating_mul(REWINDS);
+        if may {
+            self.rewound += back;
+            self.offset = to;
+        }
+        may
     }
 
     // Goes on to the next bytes that can be a record. The record before may have swallowed it, where its length or
     // what is missing in it made it reach too far.
     async fn search(&mut self) -> Result<()> {
-        if let Some(doubtful) = self.doubtful.take() {
-            self.buffer.clear();
-            self.offset = doubtful;
+        if let Some(doubtful) = self.doubtful {
+            self.rewind(doubtful);
         }
-        loop {
+        if self.offset < self.size {
             self.fill(1).await?;
             self.skip(1, true);
+        }
+        loop {
             let left = self.size - self.offset;
             if left < FRAME {
                 self.end = Some(End::CutOff);
                 return Ok(());
             }
-            self.fill(FRAME).await?;
-            let last = self.buffer.len() - FRAME as usize;
-            let worth = |at: &usize| Frame::read(&self.buffer[*at..]).is_worth_a_look(left - FRAME - *at as u64);
-            match (0..=last).find(worth) {
-                None => drop(self.skip(last as u64, true)),
-                Some(at) => {
-                    self.skip(at as u64, true);
-                    if self.frame().await?.is_ok() {
-                        return Ok(());
-                    }
-                }
+            self.fetch(left.min(FRAME + PREFIX as u64), PASS).await?;
+            let ahead = self.ahead();
+            // All frames that can be judged by what is fetched.
+            let behind = if ahead.len() as u64 == left { FRAME as usize } else { FRAME as usize + PREFIX };
+            let count = ahead.len() - behind + 1;
+            let found = (0..count).find(|at| look(&ahead[*at..], left - *at as u64) == Shape::Sound);
+            self.skip(found.unwrap_or(count) as u64, true);
+            if found.is_some() {
+                return Ok(());
             }
         }
     }
@@ -281,7 +345,7 @@ impl RunReader {
             Ok(Record::Metadata(metadata)) => Some(Item::Metadata(metadata)),
             Ok(definition) => Some(Item::Definition(definition.into_owned())),
             Err(e) => {
-                self.damage.push(format!("record at byte {offset}: {e}"));
+                list_damage(&mut self.damage, || format!("record at byte {offset}: {e}"));
                 None
             }
         }
@@ -293,7 +357,9 @@ impl RunReader {
         let record = self.skip(FRAME + 4, true);
         let stored = u32_at(&record, FRAME as usize);
         if stored != 0 && stored != sum {
-            self.damage.push(format!("data section up to byte {at}: CRC is {sum:08x}, expected {stored:08x}"));
+            list_damage(&mut self.damage, || {
+                format!("data section up to byte {at}: CRC is {sum:08x}, expected {stored:08x}")
+            });
         }
         self.in_summary = true;
         Ok(None)
@@ -309,31 +375,46 @@ impl RunReader {
         let stored = u32_at(&record, 25);
         let has_summary = record[9..17] != [0; 8];
         if has_summary && stored != 0 && stored != sum {
-            self.damage.push(format!("summary before byte {at}: CRC is {sum:08x}, expected {stored:08x}"));
+            list_damage(&mut self.damage, || {
+                format!("summary before byte {at}: CRC is {sum:08x}, expected {stored:08x}")
+            });
         }
         self.end = Some(End::Closed);
         Ok(None)
     }
 
-    /// Fetches, so that the buffer has the next `count` bytes; the file has them. What was left of the buffer is fetched
-    /// once more: that is less than to copy all behind it.
+    // What is fetched of the file from `offset` on.
+    fn ahead(&self) -> &[u8] {
+        let from = self.offset.checked_sub(self.window_start).and_then(|from| usize::try_from(from).ok());
+        from.and_then(|from| self.window.get(from..)).unwrap_or_default()
+    }
+
+    // Fetches, so that the next `count` bytes are there; the file has them.
     async fn fill(&mut self, count: u64) -> Result<()> {
-        if (self.buffer.len() as u64) < count {
+        self.fetch(count, self.file.ahead()).await
+    }
+
+    // The same; where it must read, it reads `at_least` so much. What was left is fetched once more: that is less than to
+    // copy all behind it.
+    async fn fetch(&mut self, count: u64, at_least: u64) -> Result<()> {
+        if (self.ahead().len() as u64) < count {
             // Let go, so that its memory serves again.
-            self.buffer = Bytes::new();
-            let to = (self.offset + count.max(self.file.ahead())).min(self.size);
+            self.window = Bytes::new();
+            let to = (self.offset + count.max(at_least)).min(self.size);
             let fetched = self.file.block(self.offset..to).await;
-            self.buffer = fetched.map_err(|e| Error::read(&self.name, e))?;
+            self.window = fetched.map_err(|e| Error::read(&self.name, e))?;
+            self.window_start = self.offset;
         }
-        if (self.buffer.len() as u64) < count {
+        if (self.ahead().len() as u64) < count {
             return Err(Error::read(&self.name, "it became shorter while it was read"));
         }
         Ok(())
     }
 
-    /// Takes the next `count` bytes, which the buffer has.
+    /// Takes the next `count` bytes, which are fetched.
     fn skip(&mut self, count: u64, counts_in_crc: bool) -> Bytes {
-        let passed = self.buffer.split_to(count as usize);
+        let from = (self.offset - self.window_start) as usize;
+        let passed = self.window.slice(from..from + count as usize);
         self.offset += count;
         // What a search goes over once more is in the sums already.
         let fresh = self.offset.saturating_sub(self.hashed).min(count);
@@ -348,8 +429,12 @@ impl RunReader {
         passed
     }
 
-    // Passes over what may be larger than the buffer should become.
+    // Passes over what may be larger than the window should become.
     async fn pass(&mut self, count: u64) -> Result<Option<Item>> {
+        if !self.has_digest {
+            self.offset += count;
+            return Ok(None);
+        }
         let mut left = count;
         while left > 0 {
             let some = left.min(PASS);
@@ -358,6 +443,35 @@ impl RunReader {
             left -= some;
         }
         Ok(None)
+    }
+}
+
+// What can be said of the record that begins with `bytes`, which have its frame, the first [`PREFIX`] bytes behind it and
+// the file's last ones, where it has them; `left` bytes of the file are left.
+fn look(bytes: &[u8], left: u64) -> Shape {
+    let frame = Frame::read(bytes);
+    if !frame.is_possible(left - FRAME) {
+        return Shape::Broken;
+    }
+    let end = FRAME as usize + frame.length.min(PREFIX as u64) as usize;
+    match frame.shape(&bytes[FRAME as usize..end]) {
+        // The magic bytes and nothing else are behind a footer.
+        Shape::Sound if frame.code == opcode::FOOTER && (left != FOOTER || !bytes.ends_with(MAGIC)) => Shape::Broken,
+        shape => shape,
+    }
+}
+
+async fn large_record_permit(bytes: u64) -> Option<LargeRecordPermit> {
+    // Nobody closes the semaphore.
+    if bytes > LARGE_RECORD { LARGE_RECORDS.acquire().await.ok() } else { None }
+}
+
+/// Adds a line to what is said of a file's damage, up to a limit.
+pub(crate) fn list_damage(lines: &mut Vec<String>, line: impl FnOnce() -> String) {
+    match lines.len() {
+        0..MOST_DAMAGE => lines.push(line()),
+        MOST_DAMAGE => lines.push("more damage is not listed".to_owned()),
+        _ => {}
     }
 }
 

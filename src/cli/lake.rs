@@ -105,6 +105,9 @@ pub(crate) struct IngestArgs {
     /// Print what was done as JSON.
     #[arg(long)]
     pub(crate) json: bool,
+    /// Take in this file of the lake alone, for the ingest that started this one.
+    #[arg(long, hide = true, value_name = "PATH", conflicts_with_all = ["runs", "watch", "json"])]
+    pub(crate) suspect: Option<String>,
 }
 
 #[derive(Debug, Args)]

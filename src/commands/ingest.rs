@@ -1,18 +1,20 @@
 //! `echolake ingest`: runs become rows.
 
 use std::collections::HashMap;
+use std::io::Read as _;
 use std::path::Path;
+use std::process::{Command, Stdio};
 use std::sync::Arc;
-use std::sync::atomic::AtomicBool;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use anyhow::Context as _;
-use echolake_ingest::{Ingest, Outcome, Report, Source, Taken, adopt_cut_off, complete, pending, waiting};
+use echolake_ingest::{Ingest, Outcome, Report, Source, SuspectFile, Taken, adopt_cut_off, complete, pending, waiting};
 use echolake_lake::Lake;
 use futures::TryStreamExt as _;
 use object_store::ObjectStoreExt as _;
 use object_store::path::Path as ObjectPath;
-use serde_json::json;
+use serde::{Deserialize, Serialize};
 
 use crate::Done;
 use crate::cli::IngestArgs;
@@ -24,12 +26,23 @@ const LOOK_EVERY: Duration = Duration::from_secs(2);
 /// Time that a watch waits after an error.
 const RETRY_AFTER: Duration = Duration::from_secs(10);
 
+/// Exit code of a process that panicked.
+const PANICKED: i32 = 101;
+
 /// What became of all that was given.
-#[derive(Default)]
+#[derive(Default, Serialize, Deserialize)]
 pub(crate) struct Summary {
     pub(crate) taken: Vec<Taken>,
-    /// Files that cannot be taken in: the file, why, and where it is now.
-    refused: Vec<(String, String, Option<String>)>,
+    refused: Vec<RefusedFile>,
+}
+
+/// A file that cannot be taken in.
+#[derive(Serialize, Deserialize)]
+struct RefusedFile {
+    file: String,
+    reason: String,
+    /// Where it is now, if it was moved.
+    moved_to: Option<String>,
 }
 
 impl Summary {
@@ -37,12 +50,20 @@ impl Summary {
         !self.refused.is_empty() || self.taken.iter().any(|t| !t.whole || !t.damaged.is_empty())
     }
 
-    fn as_json(&self) -> serde_json::Value {
-        let refused = |(file, why, moved): &(String, String, Option<String>)| json!({ "file": file, "reason": why, "moved_to": moved });
-        json!({
-            "taken": self.taken.iter().map(as_json).collect::<Vec<_>>(),
-            "refused": self.refused.iter().map(refused).collect::<Vec<_>>(),
-        })
+    fn add(&mut self, report: Report, progress: &Progress) {
+        match report {
+            Report::Taken(taken) => {
+                say(progress, &taken);
+                self.taken.push(taken);
+            }
+            Report::Refused { source, why, moved } => {
+                let whereto = moved.as_ref().map(|m| format!(" (now at `{m}`)")).unwrap_or_default();
+                progress.say(format!("error: {why}{whereto}"));
+                let (file, reason, moved_to) = (source.to_string(), why.to_string(), moved.map(|m| m.to_string()));
+                self.refused.push(RefusedFile { file, reason, moved_to });
+            }
+            Report::Gone(source) => progress.say(format!("{source}: another ingest has taken it")),
+        }
     }
 }
 
@@ -51,6 +72,9 @@ pub(crate) async fn run(args: &IngestArgs, lake_url: &str) -> anyhow::Result<Don
     let lake = Lake::open(lake_url).await?;
     lake.ensure_tables().await?;
     let progress = Progress::new();
+    if let Some(path) = &args.suspect {
+        return take_in_suspect(&lake, path, stop.flag(), &progress).await;
+    }
     if args.watch {
         return watch(&lake, &stop, &progress).await;
     }
@@ -61,7 +85,7 @@ pub(crate) async fn run(args: &IngestArgs, lake_url: &str) -> anyhow::Result<Don
     let nothing = sources.is_empty();
     let summary = take_in(&lake, sources, stop.flag(), &progress).await?;
     if args.json {
-        super::print(&serde_json::to_string_pretty(&summary.as_json())?)?;
+        super::print(&serde_json::to_string_pretty(&summary)?)?;
     }
     if nothing && !args.json {
         eprintln!("nothing to ingest: every run of the lake is in its tables");
@@ -91,23 +115,20 @@ pub(crate) async fn take_in(
     let mut summary = Summary::default();
     let mut task = progress.task("ingest", sources.len() as u64, "runs");
     let mut ended = 0;
+    let (suspects, sources): (Vec<_>, Vec<_>) =
+        sources.into_iter().partition(|source| SuspectFile::from_source(lake, source).is_some());
     let mut report = |report: Report| {
         ended += 1;
-        match report {
-            Report::Taken(taken) => {
-                say(progress, &taken);
-                summary.taken.push(taken);
-            }
-            Report::Refused { source, why, moved } => {
-                let whereto = moved.as_ref().map(|m| format!(" (now at `{m}`)")).unwrap_or_default();
-                progress.say(format!("error: {why}{whereto}"));
-                summary.refused.push((source.to_string(), why.to_string(), moved.map(|m| m.to_string())));
-            }
-            Report::Gone(source) => progress.say(format!("{source}: another ingest has taken it")),
-        }
+        summary.add(report, progress);
         task.at(ended);
     };
-    let outcome = Ingest::new(lake, stop.clone()).take_in(sources, &mut report).await;
+    let mut outcome = Ingest::new(lake, stop.clone()).take_in(sources, &mut report).await.map_err(anyhow::Error::from);
+    // All others first: these may end the process of which this one is a part.
+    for suspect in suspects.iter().filter_map(|source| SuspectFile::from_source(lake, source)) {
+        if outcome.is_ok() {
+            outcome = watch_suspect(lake, &suspect, stop, &mut summary, progress).await;
+        }
+    }
     let added = || summary.taken.iter().filter(|t| t.outcome == Outcome::Added);
     let measurements: usize = added().map(|t| t.measurements).sum();
     let derived: usize = added().filter(|t| t.derived).map(|t| t.measurements).sum();
@@ -130,20 +151,84 @@ pub(crate) async fn take_in(
     Ok(summary)
 }
 
+// Has a file that an ingest was reading when it died taken in by a process of its own. If that ends as well, again and
+// again, it is the file's fault.
+async fn watch_suspect(
+    lake: &Lake,
+    suspect: &SuspectFile,
+    stop: &AtomicBool,
+    summary: &mut Summary,
+    progress: &Progress,
+) -> anyhow::Result<()> {
+    let file = suspect.source();
+    let Source::Lake(path) = file else { return Ok(()) };
+    loop {
+        if let Some(report) = suspect.refuse(lake).await? {
+            summary.add(report, progress);
+            return Ok(());
+        }
+        if stop.load(Ordering::Relaxed) {
+            return Err(echolake_ingest::Error::Stopped.into());
+        }
+        progress.say(format!("{file}: an ingest died while it read this; a process of its own takes it in"));
+        let mut command = Command::new(std::env::current_exe().context("this program has no path")?);
+        command.args(["--lake", lake.location(), "ingest", "--suspect", path.as_ref()]);
+        command.stdin(Stdio::piped()).stdout(Stdio::piped());
+        let run = move || {
+            let mut child = command.spawn()?;
+            // It ends when this pipe does, which is at the latest when this process ends.
+            let _pipe = child.stdin.take();
+            child.wait_with_output()
+        };
+        let output = tokio::task::spawn_blocking(run).await?.context("cannot start a process")?;
+        match output.status.code() {
+            Some(0) => {
+                let mut theirs: Summary = serde_json::from_slice(&output.stdout).context("a process said no JSON")?;
+                summary.taken.append(&mut theirs.taken);
+                summary.refused.append(&mut theirs.refused);
+                return Ok(());
+            }
+            _ if stop.load(Ordering::Relaxed) => return Err(echolake_ingest::Error::Stopped.into()),
+            None | Some(PANICKED) => suspect.add_death(&output.status.to_string())?,
+            Some(code) => anyhow::bail!("the process that took in `{file}` failed with exit code {code}"),
+        }
+    }
+}
+
+// Takes in one file for the ingest that started this process, and ends with it.
+async fn take_in_suspect(lake: &Lake, path: &str, stop: &Arc<AtomicBool>, progress: &Progress) -> anyhow::Result<Done> {
+    std::thread::spawn(|| {
+        let _ = std::io::stdin().read(&mut [0]);
+        std::process::exit(1);
+    });
+    let mut summary = Summary::default();
+    let source = Source::Lake(ObjectPath::parse(path)?);
+    Ingest::new(lake, stop.clone()).take_in(vec![source], &mut |report| summary.add(report, progress)).await?;
+    super::print(&serde_json::to_string(&summary)?)?;
+    Ok(Done::Whole)
+}
+
 // What comes into the inbox, until Ctrl-C. A file that somebody copies there grows while we look; one that is as it
 // was at the last look is whole.
 async fn watch(lake: &Lake, stop: &StopRequest, progress: &Progress) -> anyhow::Result<Done> {
     eprintln!("watching `{}/inbox`; Ctrl-C ends it", lake.location());
     let mut before: HashMap<ObjectPath, (u64, chrono::DateTime<chrono::Utc>)> = HashMap::new();
+    // Refused files that are still where they were.
+    let mut given_up = HashMap::new();
     let mut lost = false;
     while !stop.is_made() {
         let mut settled = Vec::new();
         let mut now = HashMap::new();
+        let mut states = HashMap::new();
         for source in all_pending(lake).await? {
             let Source::Lake(path) = &source else { continue };
             // It may be gone again.
             let Ok(meta) = lake.store().head(path).await else { continue };
             let state = (meta.size, meta.last_modified);
+            if given_up.get(path.as_ref()) == Some(&state) {
+                continue;
+            }
+            states.insert(path.to_string(), state);
             if before.get(path) == Some(&state) {
                 settled.push(source);
             } else {
@@ -156,7 +241,11 @@ async fn watch(lake: &Lake, stop: &StopRequest, progress: &Progress) -> anyhow::
             continue;
         }
         match take_in(lake, settled, stop.flag(), progress).await {
-            Ok(summary) => lost |= summary.lost(),
+            Ok(summary) => {
+                lost |= summary.lost();
+                let stay = summary.refused.iter().filter(|refused| refused.moved_to.is_none());
+                given_up.extend(stay.filter_map(|refused| states.remove_entry(&refused.file)));
+            }
             Err(e) if stop.is_made() => drop(e),
             // A full disk or an absent store passes; the files are still there.
             Err(e) => {
@@ -185,18 +274,6 @@ fn say(progress: &Progress, taken: &Taken) {
     for damage in &taken.damaged {
         progress.say(format!("{run}: warning: {damage}"));
     }
-}
-
-fn as_json(taken: &Taken) -> serde_json::Value {
-    json!({
-        "run_id": taken.run,
-        "surface_id": taken.surface,
-        "measurements": taken.measurements,
-        "added": taken.outcome == Outcome::Added,
-        "missing": taken.missing,
-        "whole": taken.whole,
-        "damaged": taken.damaged,
-    })
 }
 
 // A name that is a file is one; else it is looked for in the lake.

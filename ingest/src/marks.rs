@@ -1,0 +1,162 @@
+//! Marks on the files that ingests read, so that a file that ends the process is found by the next ingest.
+//!
+//! A mark is a locked file; the system releases the lock when the process ends, however it ends. A mark that nobody locks
+//! makes its file a suspect and proves nothing: several files are read at once, and a power cut or an operator's kill is no
+//! file's fault. Suspects are therefore taken in one at a time, each by a process of its own. Only what a living parent
+//! sees of that process counts against the file.
+
+use std::fs::{self, File, OpenOptions};
+use std::io::{ErrorKind, Write as _};
+use std::path::{Path, PathBuf};
+
+use echolake_lake::Lake;
+
+use crate::error::{Error, Result};
+use crate::files::{self, Source};
+use crate::ingest::Report;
+use crate::references::digest;
+
+/// Folder of the marks. Whoever deletes `tables/` begins anew.
+const FOLDER: &str = "tables/_reading";
+/// Processes that end while they take in a suspect before it is refused. One may be killed together with its parent.
+const MOST_DEATHS: usize = 2;
+
+/// A mark on a file that is being read. It stays if a panic ends the reading.
+pub(crate) struct ReadingMark {
+    path: PathBuf,
+    _lock: File,
+}
+
+impl ReadingMark {
+    /// Marks a file. None if it is not in the lake, if another ingest reads it, or if the disk is full: a mark is no
+    /// reason to fail.
+    pub(crate) fn new(lake: &Lake, source: &Source) -> Option<Self> {
+        let path = mark_path(lake, source)?;
+        fs::create_dir_all(path.parent()?).ok()?;
+        let lock = OpenOptions::new().append(true).create(true).open(&path).ok()?;
+        lock.try_lock().ok()?;
+        Some(Self { path, _lock: lock })
+    }
+
+    /// Marks the file under its new name.
+    pub(crate) fn follow(mut self, lake: &Lake, source: &Source) -> Option<Self> {
+        let path = mark_path(lake, source)?;
+        fs::rename(&self.path, &path).ok()?;
+        self.path = path;
+        Some(self)
+    }
+}
+
+impl Drop for ReadingMark {
+    fn drop(&mut self) {
+        if !std::thread::panicking() {
+            // A mark that stays costs a process of its own for its file.
+            let _ = fs::remove_file(&self.path);
+        }
+    }
+}
+
+/// A file that an ingest was reading when it died.
+#[derive(Debug)]
+pub struct SuspectFile {
+    source: Source,
+    /// How each process ended that took in this file alone, a line each.
+    mark: PathBuf,
+}
+
+impl SuspectFile {
+    /// Finds out whether a file is one. A file that is being read now is none.
+    pub fn from_source(lake: &Lake, source: &Source) -> Option<Self> {
+        let mark = mark_path(lake, source)?;
+        let is_read = File::open(&mark).ok()?.try_lock_shared().is_err();
+        (!is_read).then(|| Self { source: source.clone(), mark })
+    }
+
+    /// The file.
+    pub fn source(&self) -> &Source {
+        &self.source
+    }
+
+    /// Counts a process that ended while it took in this file alone; `ending` says how. A file that the process had brought
+    /// to its place is a suspect of that name from now on.
+    ///
+    /// # Errors
+    /// [`Error::Read`] if the mark cannot be written.
+    pub fn add_death(&self, ending: &str) -> Result<()> {
+        match OpenOptions::new().append(true).open(&self.mark).and_then(|mut mark| writeln!(mark, "{ending}")) {
+            Err(e) if e.kind() != ErrorKind::NotFound => Err(Error::read(self.mark.display(), e)),
+            _ => Ok(()),
+        }
+    }
+
+    /// Refuses the file if enough processes ended by it.
+    ///
+    /// # Errors
+    /// What the lake says.
+    pub async fn refuse(&self, lake: &Lake) -> Result<Option<Report>> {
+        let deaths = fs::read_to_string(&self.mark).unwrap_or_default();
+        let deaths: Vec<_> = deaths.lines().collect();
+        if deaths.len() < MOST_DEATHS {
+            return Ok(None);
+        }
+        let (file, mark) = (self.source.to_string(), self.mark.display().to_string());
+        let why = Error::Deadly { file, endings: deaths.join(", "), mark };
+        let moved = files::quarantine(lake, &self.source, &why).await?;
+        // The file of a run stays where it is, and its mark with it.
+        if moved.is_some() {
+            let _ = fs::remove_file(&self.mark);
+        }
+        Ok(Some(Report::Refused { source: self.source.clone(), why, moved }))
+    }
+}
+
+// By a digest: a path may be longer than a file's name.
+fn mark_path(lake: &Lake, source: &Source) -> Option<PathBuf> {
+    let Source::Lake(path) = source else { return None };
+    Some(lake.folder()?.join(Path::new(FOLDER)).join(digest(&[path.as_ref()])))
+}
+
+#[cfg(test)]
+mod tests {
+    use echolake_lake::References;
+    use echolake_schema::Rig;
+    use object_store::ObjectStoreExt as _;
+    use object_store::path::Path as ObjectPath;
+
+    use super::*;
+
+    #[tokio::test]
+    async fn only_a_file_by_which_two_processes_ended_is_refused() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let url = folder.path().join("lake").display().to_string();
+        let lake = Lake::open_or_create(&url, &Rig::paper(), &References::default()).await.expect("a lake");
+        // Too long for the name of its reason.
+        let name = format!("{}.mcap", "a".repeat(240));
+        let source = Source::Lake(ObjectPath::from(format!("inbox/{name}")));
+        lake.store().put(&ObjectPath::from(format!("inbox/{name}")), "x".into()).await.expect("written");
+        let is_suspect = || SuspectFile::from_source(&lake, &source).is_some();
+
+        let mark = ReadingMark::new(&lake, &source).expect("a mark");
+        assert!(ReadingMark::new(&lake, &source).is_none() && !is_suspect(), "another ingest is reading it");
+        drop(mark);
+        assert!(!is_suspect(), "its reading ended");
+
+        let mark = ReadingMark::new(&lake, &source).expect("a mark");
+        let died = std::thread::spawn(move || {
+            let _mark = mark;
+            panic!("the reading ends here");
+        });
+        assert!(died.join().is_err() && is_suspect());
+        let suspect = SuspectFile::from_source(&lake, &source).expect("a suspect");
+        assert!(suspect.refuse(&lake).await.expect("asked").is_none(), "nothing was seen of it yet");
+        suspect.add_death("signal: 6 (SIGABRT)").expect("written");
+        assert!(suspect.refuse(&lake).await.expect("asked").is_none(), "its parent may have been killed with it");
+        suspect.add_death("signal: 9 (SIGKILL)").expect("written");
+        let report = suspect.refuse(&lake).await.expect("asked").expect("refused");
+        let Report::Refused { moved: Some(moved), why, .. } = report else { panic!("{report:?}") };
+        assert!(why.to_string().contains("signal: 6 (SIGABRT), signal: 9 (SIGKILL)"), "{why}");
+        let reason = ObjectPath::from(format!("{moved}.reason.txt"));
+        assert!(lake.store().head(&moved).await.is_ok() && lake.store().head(&reason).await.is_ok(), "{moved}");
+        assert!(!is_suspect(), "who moves it back has it tried again");
+    }
+}
