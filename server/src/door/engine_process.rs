@@ -13,7 +13,7 @@ use hyper::client::conn::http2;
 use tokio::io::{AsyncBufReadExt as _, AsyncWriteExt as _, BufReader};
 use tokio::net::UnixStream;
 use tokio::process::{Child, ChildStdin, ChildStdout, Command};
-use tokio::sync::{Notify, OnceCell, SetOnce};
+use tokio::sync::{Notify, SetOnce};
 
 use super::EngineSettings;
 use crate::client_identity::ClientIdentity;
@@ -50,7 +50,7 @@ pub(super) struct EngineProcess {
     kill: Notify,
     why_killed: OnceLock<EndReason>,
     ended: SetOnce<EndReason>,
-    pub(super) flight: OnceCell<http2::SendRequest<Body>>,
+    pub(super) flight: tokio::sync::Mutex<Option<http2::SendRequest<Body>>>,
 }
 
 /// What an engine is started with.
@@ -101,7 +101,7 @@ impl EngineProcess {
             kill: Notify::new(),
             why_killed: OnceLock::new(),
             ended: SetOnce::new(),
-            flight: OnceCell::new(),
+            flight: tokio::sync::Mutex::default(),
         });
         tokio::spawn(supervise(engine.clone(), child, stdout, start.spills, metrics));
         Ok(engine)

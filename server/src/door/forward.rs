@@ -174,22 +174,26 @@ impl EngineAnswer {
 }
 
 impl EngineProcess {
-    // The connection that all gRPC requests to the engine share.
+    // The connection that all gRPC requests to the engine share, until one of both ends it.
     async fn flight_sender(&self) -> Result<http2::SendRequest<Body>, String> {
-        let connect = async {
-            let stream = self.connect(EngineSocket::FlightSql).await.map_err(|e| e.to_string())?;
-            let handshake = http2::Builder::new(TokioExecutor::new())
-                .initial_stream_window_size(WINDOW_BYTES)
-                // Requests are held back each by its own window, never by another's.
-                .initial_connection_window_size(u32::MAX >> 1)
-                .max_frame_size(FRAME_BYTES)
-                .handshake(TokioIo::new(stream));
-            let (sender, driver) = handshake.await.map_err(|e| e.to_string())?;
-            // It ends with the engine.
-            tokio::spawn(driver);
-            Ok::<_, String>(sender)
-        };
-        self.flight.get_or_try_init(|| connect).await.cloned()
+        let mut shared = self.flight.lock().await;
+        if let Some(sender) = shared.as_ref().filter(|sender| !sender.is_closed()) {
+            return Ok(sender.clone());
+        }
+        let stream = self.connect(EngineSocket::FlightSql).await.map_err(|e| e.to_string())?;
+        let handshake = http2::Builder::new(TokioExecutor::new())
+            .initial_stream_window_size(WINDOW_BYTES)
+            // Requests are held back each by its own window, never by another's.
+            .initial_connection_window_size(u32::MAX >> 1)
+            .max_frame_size(FRAME_BYTES)
+            .handshake(TokioIo::new(stream));
+        let (sender, driver) = handshake.await.map_err(|e| e.to_string())?;
+        tokio::spawn(async move {
+            if let Err(failed) = driver.await {
+                eprintln!("a connection to an engine ended: {failed:?}");
+            }
+        });
+        Ok(shared.insert(sender).clone())
     }
 }
 
