@@ -37,9 +37,8 @@ fn main() -> ExitCode {
             .max_blocking_threads(BLOCKING_THREADS)
             .build()
     };
-    let outcome = commands::confine(&cli)
-        .and_then(|()| Ok(runtime()?))
-        .and_then(|runtime| runtime.block_on(commands::run(cli)));
+    let outcome =
+        commands::confine(&cli).and_then(|()| Ok(runtime()?)).and_then(|runtime| runtime.block_on(commands::run(cli)));
     match outcome {
         Ok(Done::Whole) => ExitCode::SUCCESS,
         Ok(Done::WithLoss) => ExitCode::from(DONE_WITH_LOSS),

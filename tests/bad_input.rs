@@ -179,7 +179,7 @@ fn a_run_that_ends_ingest_is_passed_over_by_the_next_one() {
     }
     let ingest = || {
         let mut command = Command::new("sh");
-        command.args(["-c", "ulimit -c 0 -f 250; exec \"$0\" --lake lake ingest", ECHOLAKE]);
+        command.args(["-c", "ulimit -c 0; ulimit -f 250; exec \"$0\" --lake lake ingest", ECHOLAKE]);
         run_command(command.current_dir(place.path("")).env_remove("ECHOLAKE_LAKE")).expect("the command starts")
     };
     let first = ingest();

@@ -207,9 +207,12 @@ impl TemplateRun {
         let message_bomb = |channel: u16, data: &[u8]| {
             let message = message(channel, data);
             let count = bomb / message.len() as u64;
-            let packed = zstd(std::iter::repeat_n(message.as_slice(), count as usize));
             // Eight that are no copies of each other.
-            (0..8).flat_map(|left| chunk(count * message.len() as u64 - left, &packed)).collect::<Vec<_>>()
+            let one = |count: u64| {
+                let packed = zstd(std::iter::repeat_n(message.as_slice(), count as usize));
+                chunk(count * message.len() as u64, &packed)
+            };
+            (0..8).flat_map(|left| one(count - left)).collect::<Vec<_>>()
         };
         let ir = ImpulseResponse { sample_rate_hz: 96e3, temperature_c: 20.0, ..ImpulseResponse::default() };
         let verdict = Measurement { reasons: vec![String::new(); 200], ..Measurement::default() };

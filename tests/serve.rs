@@ -24,7 +24,6 @@ const ENDLESS: &str = "select count(*) from generate_series(1, 1000000) a cross 
                        where a.value + b.value = 7";
 /// How long to wait for what the server does by itself; a busy machine may take its time.
 const EVENT_LIMIT: Duration = Duration::from_secs(60);
-/// How long to wait for what must not come.
 
 /// One run without sweeps.
 fn lake() -> Place {

@@ -22,7 +22,6 @@ mod kill_acquire;
 mod kill_ingest;
 #[path = "../../tests/kills.rs"]
 mod kills;
-mod limits;
 mod mcap_bench;
 mod memory;
 mod motion;
@@ -72,8 +71,6 @@ enum Campaign {
     IngestBench(ingest_bench::IngestBenchArgs),
     /// Measure twelve queries beside DuckDB on the same files.
     QueryBench(query_bench::QueryBenchArgs),
-    /// Measure how soon hostile queries end, and what is left for others.
-    Limits(limits::LimitsArgs),
     /// Measure `mcap()` beside Python's mcap.
     McapBench(mcap_bench::McapBenchArgs),
     /// Measure many readers of a served catalogue at once.
@@ -97,7 +94,6 @@ fn main() -> Result<()> {
         Campaign::Fuzz(args) => fuzz_server::run(&args),
         Campaign::IngestBench(args) => ingest_bench::run(&args),
         Campaign::QueryBench(args) => block_on(query_bench::run(&args)),
-        Campaign::Limits(args) => block_on(limits::run(&args)),
         Campaign::McapBench(args) => block_on(mcap_bench::run(&args)),
         Campaign::Readers(args) => readers::run(&args),
         Campaign::Slices(args) => slices::run(&args),

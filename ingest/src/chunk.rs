@@ -2,7 +2,6 @@
 
 use std::cell::RefCell;
 use std::collections::HashMap;
-use std::io::Read as _;
 use std::sync::Arc;
 
 use bytes::Bytes;
@@ -11,9 +10,6 @@ use zstd::bulk::Decompressor;
 
 use crate::record_shape::LARGEST_CHUNK;
 
-/// A chunk that claims to have shrunk more than this is decompressed piece by piece: nothing large is allocated for a
-/// size that its bytes do not bear out. Sweeps and responses shrink to about half.
-const USUAL_RATIO: u64 = 64;
 /// Opcode and length in front of every record.
 const FRAME: usize = 9;
 /// Longest name of a topic or schema that is kept. None that ingest knows is as long.
@@ -62,12 +58,10 @@ impl Definitions {
             Record::Schema { header, .. } => {
                 self.schemas.entry(header.id).or_insert_with(|| kept_name(&header.name));
             }
-            Record::Channel(channel) => {
-                if !self.channels.contains_key(&channel.id) {
-                    let schema = self.schemas.get(&channel.schema_id).cloned().unwrap_or_default();
-                    let channels = Arc::make_mut(&mut self.channels);
-                    channels.insert(channel.id, Channel { topic: kept_name(&channel.topic), schema });
-                }
+            Record::Channel(channel) if !self.channels.contains_key(&channel.id) => {
+                let schema = self.schemas.get(&channel.schema_id).cloned().unwrap_or_default();
+                let channels = Arc::make_mut(&mut self.channels);
+                channels.insert(channel.id, Channel { topic: kept_name(&channel.topic), schema });
             }
             _ => {}
         }
@@ -88,7 +82,8 @@ impl Chunk {
         let size = header.uncompressed_size as usize;
         let data = match header.compression.as_str() {
             "" => body.slice_ref(&data),
-            "zstd" => decompress(&data, size).map_err(|e| format!("it does not decompress: {e}"))?.into(),
+            // Not copied, however much shorter than its claim it is.
+            "zstd" => Bytes::from_owner(decompress(&data, size).map_err(|e| format!("it does not decompress: {e}"))?),
             other => return Err(format!("it is compressed with `{other}`, expected zstd")),
         };
         if data.len() != size {
@@ -157,17 +152,13 @@ thread_local! {
     static DECOMPRESSOR: RefCell<Option<Decompressor<'static>>> = const { RefCell::new(None) };
 }
 
+// What is allocated for a claim that the bytes do not bear out is never touched, so it takes no memory.
 fn decompress(data: &[u8], size: usize) -> std::io::Result<Vec<u8>> {
-    if size as u64 / USUAL_RATIO <= data.len() as u64 {
-        return DECOMPRESSOR.with_borrow_mut(|kept| {
-            let decompressor = match kept.take() {
-                Some(decompressor) => decompressor,
-                None => Decompressor::new()?,
-            };
-            kept.insert(decompressor).decompress(data, size)
-        });
-    }
-    let mut out = Vec::new();
-    zstd::stream::read::Decoder::with_buffer(data)?.take(size as u64 + 1).read_to_end(&mut out)?;
-    Ok(out)
+    DECOMPRESSOR.with_borrow_mut(|kept| {
+        let decompressor = match kept.take() {
+            Some(decompressor) => decompressor,
+            None => Decompressor::new()?,
+        };
+        kept.insert(decompressor).decompress(data, size)
+    })
 }

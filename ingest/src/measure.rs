@@ -17,8 +17,9 @@ use prost::Message as _;
 use crate::chunk::{Channels, Chunk, Message};
 use crate::run_reader::list_damage;
 
-/// Memory for a run's messages beside those that its rig makes it have: a day's readings, or 200,000 lines of log.
-const SPARE_BYTES: u64 = 64 << 20;
+/// Memory for a run's messages beside those that its rig makes it have: five readings a second for a day, or 100,000
+/// lines of log.
+const SPARE_BYTES: u64 = 32 << 20;
 /// Samples of the longest recording, unless the rig's own are longer; and of all recordings whose plans are kept.
 const LONGEST_RECORDING: usize = 1 << 22;
 /// Memory of a chunk that holds nothing, with a line about its damage.

@@ -262,8 +262,7 @@ impl Session {
     async fn run(&self, prepared: &Prepared, plan: LogicalPlan, started: Started) -> Result<Answer, Error> {
         let Started { ticket, place } = started;
         let (state, sql) = (prepared.state.clone(), prepared.sql.clone());
-        let physical =
-            async move { state.create_physical_plan(&plan).await.map_err(|e| Error::plan(&sql, &e)) };
+        let physical = async move { state.create_physical_plan(&plan).await.map_err(|e| Error::plan(&sql, &e)) };
         let plan = self.on_threads(&ticket, physical).await?;
         let Some(threads) = self.engine.threads().handle() else { return Err(ended()) };
         let (send, batches) = mpsc::channel(AHEAD);

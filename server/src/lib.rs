@@ -30,5 +30,5 @@ mod sessions;
 pub mod tokens;
 
 pub use catalogue_pages::CataloguePages;
-pub use error::Error;
 pub use door::{EngineSettings, Server, Settings};
+pub use error::Error;

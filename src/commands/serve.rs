@@ -124,13 +124,8 @@ pub(crate) async fn run(args: &ServeArgs, lake_url: &str) -> anyhow::Result<Done
 /// Serves the catalogue alone, where others look for it or, if somebody else is there, on any port that is free.
 pub(crate) async fn catalogue(lake: &Lake, stop: &StopRequest) -> anyhow::Result<Done> {
     let engines = engines(MEMORY_MIB, ENGINES, None)?;
-    let settings = |http| Settings {
-        http: Some(http),
-        flight_sql: None,
-        postgres: None,
-        tokens: None,
-        engines: engines.clone(),
-    };
+    let settings =
+        |http| Settings { http: Some(http), flight_sql: None, postgres: None, tokens: None, engines: engines.clone() };
     let server = match Server::bind(lake, settings(HTTP)).await {
         Err(Error::Bind { .. }) => Server::bind(lake, settings(SocketAddr::new(HTTP.ip(), 0))).await?,
         bound => bound?,

@@ -50,12 +50,7 @@ impl Drop for WorkGuard {
 
 impl Ticket {
     pub(crate) fn new() -> Self {
-        Self {
-            stop: OnceLock::new(),
-            stopped: Notify::new(),
-            held: AtomicUsize::new(0),
-            working: AtomicUsize::new(0),
-        }
+        Self { stop: OnceLock::new(), stopped: Notify::new(), held: AtomicUsize::new(0), working: AtomicUsize::new(0) }
     }
 
     /// Ends the query; the first reason counts.

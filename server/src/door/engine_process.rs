@@ -228,7 +228,8 @@ async fn supervise(
     let _ = child.start_kill();
     let status = child.wait().await;
     reports.forget_running();
-    let found = || reports.why.clone().unwrap_or_else(|| status.map_or_else(|e| e.to_string(), |s| format!("it ended by {s}")));
+    let found =
+        || reports.why.clone().unwrap_or_else(|| status.map_or_else(|e| e.to_string(), |s| format!("it ended by {s}")));
     let why = engine.why_killed.get().cloned().unwrap_or_else(|| EndReason::Failed(found()));
     for folder in [&engine.folder, &spills] {
         // The server's folder is removed at its end.

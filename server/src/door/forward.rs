@@ -67,7 +67,9 @@ impl EnginePool {
             parts.headers.remove(name);
         }
         let mut body = match is_interactive {
-            true => RequestBody::Streamed(Body::from_stream(in_time(body.into_data_stream(), Instant::now() + BODY_LIMIT))),
+            true => {
+                RequestBody::Streamed(Body::from_stream(in_time(body.into_data_stream(), Instant::now() + BODY_LIMIT)))
+            }
             false => read_body(body, &parts.headers).await?,
         };
         loop {
@@ -156,8 +158,7 @@ impl EngineAnswer {
         let response = match wire {
             Wire::Http => {
                 let stream = engine.connect(EngineSocket::Http).await.map_err(|e| e.to_string())?;
-                let (mut sender, driver) =
-                    http1::handshake(TokioIo::new(stream)).await.map_err(|e| e.to_string())?;
+                let (mut sender, driver) = http1::handshake(TokioIo::new(stream)).await.map_err(|e| e.to_string())?;
                 connection.spawn(async move { drop(driver.await) });
                 sender.send_request(request).await
             }

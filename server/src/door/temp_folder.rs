@@ -14,7 +14,7 @@ const IN_LAKE: &str = "temp";
 /// What the folder of a server is called, before its process's number.
 const PREFIX: &str = "serve-";
 /// The number that statfs tells of a file system in memory (`TMPFS_MAGIC` in linux/magic.h).
-const TMPFS: i64 = 0x0102_1994;
+const TMPFS: u64 = 0x0102_1994;
 
 /// The folders of a server; they are removed when this is dropped.
 pub(super) struct ServerFolders {
@@ -46,7 +46,7 @@ impl ServerFolders {
             },
             (None, None) => spill_folder(&system).map_err(failed(&system))?,
         };
-        if statfs(spills.path()).is_ok_and(|system| i64::from(system.f_type) == TMPFS) {
+        if statfs(spills.path()).is_ok_and(|system| u64::try_from(system.f_type) == Ok(TMPFS)) {
             eprintln!("note: temporary files in `{}` are in memory; hint: --temp DIR", spills.path().display());
         }
         Ok(Self { sockets, spills })

@@ -29,7 +29,9 @@ fn uncompressed(message: FlightData) -> Result<FlightData, FlightError> {
     let batch = header.header_as_record_batch().or(batch);
     match batch.and_then(|batch| batch.compression()) {
         None => Ok(message),
-        Some(_) => Err(FlightError::DecodeError("their body is compressed; hint: one row needs no compression".to_owned())),
+        Some(_) => {
+            Err(FlightError::DecodeError("their body is compressed; hint: one row needs no compression".to_owned()))
+        }
     }
 }
 

@@ -40,8 +40,9 @@ pub(crate) fn authenticate(
     let token = headers.get(header::AUTHORIZATION).and_then(|v| v.to_str().ok()).and_then(of_header);
     match (token, cookie(headers)) {
         // A browser sends the cookie along whichever page of this machine asks, on whatever port it was served.
-        (None, Some(secret)) => is_same_origin(headers, &["http://", "https://"])
-            .and_then(|()| access.client_of_session(secret, local)),
+        (None, Some(secret)) => {
+            is_same_origin(headers, &["http://", "https://"]).and_then(|()| access.client_of_session(secret, local))
+        }
         (token, _) => access.client(token.as_deref(), local),
     }
 }

@@ -85,11 +85,7 @@ async fn log_in(stream: &mut PlacedStream, door: &Door, keys: &CancelKeys) -> Op
     }
 }
 
-async fn try_log_in(
-    stream: &mut PlacedStream,
-    door: &Door,
-    keys: &CancelKeys,
-) -> Result<Option<PostgresLogin>, Fault> {
+async fn try_log_in(stream: &mut PlacedStream, door: &Door, keys: &CancelKeys) -> Result<Option<PostgresLogin>, Fault> {
     loop {
         let Some(startup) = read_startup(stream).await? else { return Ok(None) };
         match StartupPacket::parse(&startup[4..])? {
