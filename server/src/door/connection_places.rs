@@ -9,9 +9,6 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::task::{Context, Poll};
 use std::time::Duration;
 
-use axum::body::Body;
-use bytes::Bytes;
-use hyper::body::{Frame, SizeHint};
 use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
 use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::Notify;
@@ -146,7 +143,7 @@ impl Drop for PlacedStream {
     }
 }
 
-/// Marks a connection that works, which keeps its place.
+/// Marks a connection that works, which keeps its place. A request works once it is whole and known whose it is.
 #[derive(Clone)]
 pub(super) struct PlaceWork(Arc<PlaceState>);
 
@@ -163,38 +160,6 @@ pub(super) struct WorkingPlace(Arc<PlaceState>);
 impl Drop for WorkingPlace {
     fn drop(&mut self) {
         self.0.working.fetch_sub(1, Ordering::Relaxed);
-    }
-}
-
-impl WorkingPlace {
-    /// Works until the last of an answer is sent.
-    pub(super) fn until_sent(self, body: Body) -> Body {
-        Body::new(SentBody { body, _working: self })
-    }
-}
-
-struct SentBody {
-    body: Body,
-    _working: WorkingPlace,
-}
-
-impl hyper::body::Body for SentBody {
-    type Data = Bytes;
-    type Error = axum::Error;
-
-    fn poll_frame(
-        mut self: Pin<&mut Self>,
-        context: &mut Context<'_>,
-    ) -> Poll<Option<Result<Frame<Bytes>, axum::Error>>> {
-        Pin::new(&mut self.body).poll_frame(context)
-    }
-
-    fn is_end_stream(&self) -> bool {
-        self.body.is_end_stream()
-    }
-
-    fn size_hint(&self) -> SizeHint {
-        self.body.size_hint()
     }
 }
 

@@ -15,7 +15,7 @@ use tokio::sync::watch;
 use tokio::task::JoinSet;
 
 use super::Door;
-use super::connection_places::{ConnectionPlaces, PlacedStream};
+use super::connection_places::{ConnectionPlaces, PlaceWork, PlacedStream};
 use super::forward::Wire;
 use crate::client_identity::ClientIdentity;
 use crate::fault::Fault;
@@ -50,13 +50,13 @@ async fn answer(stream: PlacedStream, door: Door, mut stopping: watch::Receiver<
     let evicted = stream.evicted();
     let work = stream.work();
     let service = service_fn(move |request: Request<Incoming>| {
-        let (door, working) = (door.clone(), work.begin());
+        let (door, work) = (door.clone(), work.clone());
         async move {
-            let response = door.answer_flight(request).await.unwrap_or_else(|fault| {
+            let response = door.answer_flight(request, &work).await.unwrap_or_else(|fault| {
                 door.metrics().failed(fault.code());
                 status(&fault).into_http()
             });
-            Ok::<_, Infallible>(response.map(|body| working.until_sent(body)))
+            Ok::<_, Infallible>(response)
         }
     });
     let connection = http2::Builder::new(TokioExecutor::new())
@@ -76,12 +76,12 @@ async fn answer(stream: PlacedStream, door: Door, mut stopping: watch::Receiver<
 }
 
 impl Door {
-    async fn answer_flight(&self, request: Request<Incoming>) -> Result<Response<Body>, Fault> {
+    async fn answer_flight(&self, request: Request<Incoming>, work: &PlaceWork) -> Result<Response<Body>, Fault> {
         let token = request.headers().get(header::AUTHORIZATION).and_then(|v| v.to_str().ok()).and_then(of_header);
         let client = self.access().client(token.as_deref(), ClientIdentity::programs)?;
         let is_interactive = INTERACTIVE.iter().any(|method| request.uri().path().ends_with(method));
-        let request = request.map(Body::new);
-        let response = self.engines().forward(&client, request, Wire::Grpc, is_interactive).await?;
+        let wire = if is_interactive { Wire::InteractiveGrpc } else { Wire::Grpc };
+        let response = self.engines().forward(&client, request.map(Body::new), wire, work).await?;
         Ok(response.map(Body::new))
     }
 }

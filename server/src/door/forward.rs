@@ -15,6 +15,7 @@ use hyper_util::rt::{TokioExecutor, TokioIo};
 use tokio::task::JoinSet;
 use tokio::time::Instant;
 
+use super::connection_places::{PlaceWork, WorkingPlace};
 use super::engine_pool::EnginePool;
 use super::engine_process::{EndReason, EngineLease, EngineProcess};
 use crate::client_identity::ClientIdentity;
@@ -41,6 +42,8 @@ pub(super) enum Wire {
     Http,
     /// HTTP/2, on one connection for all.
     Grpc,
+    /// The same for a client that may wait for an answer before it ends its request.
+    InteractiveGrpc,
 }
 
 /// The body of a request.
@@ -60,24 +63,26 @@ impl EnginePool {
         client: &ClientIdentity,
         request: Request<Body>,
         wire: Wire,
-        is_interactive: bool,
+        work: &PlaceWork,
     ) -> Result<Response<EngineBody>, Fault> {
         let (mut parts, body) = request.into_parts();
         for name in OF_CONNECTION {
             parts.headers.remove(name);
         }
-        let mut body = match is_interactive {
-            true => {
-                RequestBody::Streamed(Body::from_stream(in_time(body.into_data_stream(), Instant::now() + BODY_LIMIT)))
+        let mut body = match wire {
+            Wire::InteractiveGrpc => {
+                let rest = in_time(body.into_data_stream(), Instant::now() + BODY_LIMIT);
+                RequestBody::Streamed(Body::from_stream(rest))
             }
-            false => read_body(body, &parts.headers).await?,
+            Wire::Http | Wire::Grpc => read_body(body, &parts.headers).await?,
         };
+        let working = work.begin();
         loop {
             let lease = self.lease(client).await?;
             let (sent, again) = body.send();
             let answer = EngineAnswer::fetch(lease.engine(), request_of(&parts, sent), wire).await;
             match (answer, again) {
-                (Ok(answer), _) => return Ok(answer.with(lease)),
+                (Ok(answer), _) => return Ok(answer.with(lease, working)),
                 (Err(_), Some(again)) => {
                     body = again;
                     let _ = lease.engine().why_ended().await;
@@ -162,15 +167,18 @@ impl EngineAnswer {
                 connection.spawn(async move { drop(driver.await) });
                 sender.send_request(request).await
             }
-            Wire::Grpc => engine.flight_sender().await?.send_request(request).await,
+            Wire::Grpc | Wire::InteractiveGrpc => engine.flight_sender().await?.send_request(request).await,
         };
         let response = response.map_err(|e| e.to_string())?;
         Ok(Self { response, connection, wire })
     }
 
-    fn with(self, lease: EngineLease) -> Response<EngineBody> {
+    fn with(self, lease: EngineLease, working: WorkingPlace) -> Response<EngineBody> {
         let Self { response, connection, wire } = self;
-        response.map(|incoming| EngineBody { incoming, wire, lease, _connection: connection, ended: false })
+        response.map(|incoming| {
+            let is_ended = false;
+            EngineBody { incoming, wire, lease, _connection: connection, _working: working, is_ended }
+        })
     }
 }
 
@@ -204,7 +212,8 @@ pub(super) struct EngineBody {
     wire: Wire,
     lease: EngineLease,
     _connection: JoinSet<()>,
-    ended: bool,
+    _working: WorkingPlace,
+    is_ended: bool,
 }
 
 impl EngineBody {
@@ -231,12 +240,12 @@ impl hyper::body::Body for EngineBody {
         mut self: Pin<&mut Self>,
         context: &mut Context<'_>,
     ) -> Poll<Option<Result<Frame<Bytes>, hyper::Error>>> {
-        if self.ended {
+        if self.is_ended {
             return Poll::Ready(None);
         }
         match Pin::new(&mut self.incoming).poll_frame(context) {
             Poll::Ready(Some(Err(failed))) => {
-                self.ended = true;
+                self.is_ended = true;
                 Poll::Ready(Some(self.failure().ok_or(failed)))
             }
             other => other,
@@ -244,7 +253,7 @@ impl hyper::body::Body for EngineBody {
     }
 
     fn is_end_stream(&self) -> bool {
-        self.ended || self.incoming.is_end_stream()
+        self.is_ended || self.incoming.is_end_stream()
     }
 
     fn size_hint(&self) -> SizeHint {

@@ -7,7 +7,9 @@ use axum::Router;
 use axum::body::Body;
 use axum::extract::{Request, State};
 use axum::response::{IntoResponse as _, Response};
+use hyper::body::Incoming;
 use hyper::server::conn::http1;
+use hyper::service::{Service as _, service_fn};
 use hyper_util::rt::{TokioIo, TokioTimer};
 use hyper_util::service::TowerToHyperService;
 use tokio::net::TcpListener;
@@ -15,7 +17,7 @@ use tokio::sync::watch;
 use tokio::task::JoinSet;
 
 use super::Door;
-use super::connection_places::{ConnectionPlaces, PlacedStream};
+use super::connection_places::{ConnectionPlaces, PlaceWork, PlacedStream};
 use super::forward::Wire;
 use crate::client_identity::ClientIdentity;
 use crate::fault::Fault;
@@ -46,13 +48,9 @@ async fn answer(stream: PlacedStream, router: Router, mut stopping: watch::Recei
     let evicted = stream.evicted();
     let work = stream.work();
     let answers = TowerToHyperService::new(router);
-    let service = hyper::service::service_fn(move |request| {
-        let answer = hyper::service::Service::call(&answers, request);
-        let working = work.begin();
-        async move {
-            let response: Result<Response, _> = answer.await;
-            response.map(|response| response.map(|body| working.until_sent(body)))
-        }
+    let service = service_fn(move |mut request: hyper::Request<Incoming>| {
+        request.extensions_mut().insert(work.clone());
+        answers.call(request)
     });
     let connection = http1::Builder::new()
         .timer(TokioTimer::new())
@@ -78,13 +76,14 @@ impl Door {
     }
 
     async fn answer_http(&self, request: Request) -> Result<Response, Fault> {
+        let work = request.extensions().get::<PlaceWork>().cloned().ok_or(Fault::Internal)?;
         let local = || match request_site(request.uri(), request.headers()) {
             RequestSite::Foreign => ClientIdentity::foreign(),
             RequestSite::OwnPage => ClientIdentity::pages(),
             RequestSite::Program => ClientIdentity::programs(),
         };
         let client = authenticate(self.access(), request.headers(), local)?;
-        let response = self.engines().forward(&client, request, Wire::Http, false).await?;
+        let response = self.engines().forward(&client, request, Wire::Http, &work).await?;
         Ok(response.map(Body::new))
     }
 }

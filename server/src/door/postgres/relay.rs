@@ -241,8 +241,10 @@ impl Relay {
             }
             match self.connect(false).await {
                 Ok(mut link) => {
-                    link.known = self.exchange.repeat();
-                    link.outgoing.extend_from_slice(self.exchange.unanswered());
+                    if self.exchange.is_waiting() {
+                        link.known = self.exchange.repeat();
+                        link.outgoing.extend_from_slice(self.exchange.unanswered());
+                    }
                     return Ok(link);
                 }
                 Err(Some(failed)) => fault = failed,
