@@ -3,9 +3,12 @@
 
 #[path = "../../tests/acquire_kills.rs"]
 mod acquire_kills;
+mod attacks;
+mod cancels;
 #[allow(dead_code, reason = "the tests' helper, of which this wants a part")]
 #[path = "../../tests/child.rs"]
 mod child;
+mod engine_kills;
 mod experiments;
 mod flips;
 #[path = "../../tests/forgetful.rs"]
@@ -14,6 +17,7 @@ mod functions_bench;
 #[path = "../../tests/fuzz/mod.rs"]
 mod fuzz;
 mod fuzz_server;
+mod hostile_clients;
 #[path = "../../tests/hostile_files.rs"]
 mod hostile_files;
 mod hostile_ingest;
@@ -25,6 +29,8 @@ mod kills;
 mod mcap_bench;
 mod memory;
 mod motion;
+mod observed_server;
+mod percentile;
 mod query_bench;
 mod readers;
 #[allow(dead_code, reason = "the tests' clients, of which this wants a part")]
@@ -67,6 +73,14 @@ enum Campaign {
     AcquireKills(kill_acquire::KillAcquireArgs),
     /// Throw changed SQL, bytes of each protocol or run files at `serve`.
     Fuzz(fuzz_server::FuzzArgs),
+    /// Attack `serve` by statements and by bytes; other clients must not notice it.
+    Attacks(attacks::AttackArgs),
+    /// Let some of many clients be hostile; the others' answers must be right and soon.
+    HostileClients(hostile_clients::HostileClientsArgs),
+    /// Kill engines of `serve` while they answer; no short answer may look whole.
+    EngineKills(engine_kills::EngineKillsArgs),
+    /// Measure how soon the server is idle after a query is ended.
+    Cancels(cancels::CancelArgs),
     /// Measure ingest beside bare transforms, the reference pipeline and the parquet crate alone.
     IngestBench(ingest_bench::IngestBenchArgs),
     /// Measure twelve queries beside DuckDB on the same files.
@@ -92,6 +106,10 @@ fn main() -> Result<()> {
         Campaign::HostileFiles(args) => hostile_ingest::run(&args),
         Campaign::AcquireKills(args) => kill_acquire::run(&args),
         Campaign::Fuzz(args) => fuzz_server::run(&args),
+        Campaign::Attacks(args) => attacks::run(&args),
+        Campaign::HostileClients(args) => hostile_clients::run(&args),
+        Campaign::EngineKills(args) => engine_kills::run(&args),
+        Campaign::Cancels(args) => cancels::run(&args),
         Campaign::IngestBench(args) => ingest_bench::run(&args),
         Campaign::QueryBench(args) => block_on(query_bench::run(&args)),
         Campaign::McapBench(args) => block_on(mcap_bench::run(&args)),

@@ -55,18 +55,26 @@ impl Request {
     /// Sends it and does not wait.
     pub(crate) fn begin(self, server: &Served) -> TcpStream {
         let mut stream = Served::connect(&server.http);
-        let host = self.host.as_ref().unwrap_or(&server.http);
-        let head = format!(
-            "{} {} HTTP/1.1\r\nhost: {host}\r\nconnection: close\r\ncontent-length: {}\r\n{}\r\n",
-            self.method,
-            self.path,
-            self.body.len(),
-            self.headers
-        );
-        stream.write_all(head.as_bytes()).expect("sent");
+        stream.write_all(self.request_head(&server.http).as_bytes()).expect("sent");
         // A server that has read enough may close before it has all.
         let _ = stream.write_all(self.body.as_bytes());
         stream
+    }
+
+    /// Returns the request as it is sent to this address.
+    pub(crate) fn bytes(&self, address: &str) -> Vec<u8> {
+        [self.request_head(address).as_bytes(), self.body.as_bytes()].concat()
+    }
+
+    fn request_head(&self, address: &str) -> String {
+        format!(
+            "{} {} HTTP/1.1\r\nhost: {}\r\nconnection: close\r\ncontent-length: {}\r\n{}\r\n",
+            self.method,
+            self.path,
+            self.host.as_deref().unwrap_or(address),
+            self.body.len(),
+            self.headers
+        )
     }
 
     pub(crate) fn send(self, server: &Served) -> Answer {

@@ -49,6 +49,11 @@ impl Served {
         stream
     }
 
+    /// Its process id.
+    pub(crate) fn id(&self) -> u32 {
+        self.child.id()
+    }
+
     /// What it said on stderr so far.
     pub(crate) fn said(&self) -> Vec<String> {
         self.child.stderr().lines().map(str::to_owned).collect()

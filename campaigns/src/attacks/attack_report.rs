@@ -1,0 +1,159 @@
+//! What the attacks did, as a table or JSON, and which goals are missed.
+#![allow(clippy::print_stdout, reason = "figures are what it is for")]
+
+use std::collections::BTreeMap;
+use std::time::Duration;
+
+use anyhow::Result;
+use serde_json::{Value, json};
+
+use super::super::observed_server::{LightReport, MemoryPeak};
+use super::super::percentile::{millis, percentile};
+
+/// What other clients may notice.
+const LIGHT_GOAL: Duration = Duration::from_millis(300);
+const HEALTH_GOAL: Duration = Duration::from_millis(100);
+/// Memory beyond the idle server's and the client's limit.
+const MEMORY_GOAL_MIB: u64 = 200;
+const DOOR_GOAL_MIB: u64 = 300;
+/// Processor time of an idle server in a second.
+const IDLE_GOAL: Duration = Duration::from_millis(50);
+
+/// What became of the server.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) enum ServerFate {
+    Alive,
+    /// It ended; these are its last words.
+    Died(String),
+    /// It was killed because it took too much memory.
+    Capped,
+    /// It was replaced because it did not become idle.
+    Busy,
+}
+
+/// An attack over one protocol and what it did.
+#[derive(Debug, Clone)]
+pub(crate) struct AttackRow {
+    pub(super) family: &'static str,
+    pub(super) name: &'static str,
+    pub(super) protocol: &'static str,
+    /// How each of the attacker's connections ended.
+    pub(super) outcomes: Vec<String>,
+    pub(super) took: Duration,
+    pub(super) light: LightReport,
+    pub(super) peak: MemoryPeak,
+    /// Memory of all processes before.
+    pub(super) idle_mib: u64,
+    /// Memory that the attacker's queries may hold.
+    pub(super) limit_mib: u64,
+    /// Processor time in the second that begins half a second after the attack.
+    pub(super) idle_time: Duration,
+    pub(super) fate: ServerFate,
+}
+
+impl AttackRow {
+    /// Returns the goals that it misses.
+    pub(crate) fn missed_goals(&self) -> Vec<&'static str> {
+        let goals = [
+            ("the door lives", !matches!(self.fate, ServerFate::Died(_) | ServerFate::Capped)),
+            ("light queries are right", self.light.failures.is_empty()),
+            ("light queries within 300 ms", longest(&self.light.queries) <= LIGHT_GOAL),
+            ("/health within 100 ms", longest(&self.light.health) <= HEALTH_GOAL),
+            ("memory within limit + 200 MiB", self.peak.total_mib <= self.memory_goal_mib()),
+            ("door within 300 MiB", self.peak.door_mib <= DOOR_GOAL_MIB),
+            ("idle again", self.idle_time <= IDLE_GOAL && self.fate != ServerFate::Busy),
+        ];
+        goals.iter().filter(|(_, is_reached)| !is_reached).map(|(goal, _)| *goal).collect()
+    }
+
+    fn memory_goal_mib(&self) -> u64 {
+        self.idle_mib + self.limit_mib + MEMORY_GOAL_MIB
+    }
+
+    // Each outcome with how often it came.
+    fn outcome(&self) -> String {
+        let mut counts = BTreeMap::<&str, usize>::new();
+        self.outcomes.iter().for_each(|outcome| *counts.entry(outcome).or_default() += 1);
+        let counted = counts.iter().map(|(outcome, count)| format!("{outcome} x{count}"));
+        counted.collect::<Vec<_>>().join(", ")
+    }
+
+    fn fate_name(&self) -> &'static str {
+        match self.fate {
+            ServerFate::Alive => "alive",
+            ServerFate::Died(_) => "DIED",
+            ServerFate::Capped => "CAP",
+            ServerFate::Busy => "BUSY",
+        }
+    }
+
+    fn to_json(&self) -> Value {
+        json!({
+            "family": self.family,
+            "name": self.name,
+            "protocol": self.protocol,
+            "outcome": self.outcome(),
+            "seconds": self.took.as_secs_f64(),
+            "light_queries": self.light.queries.len(),
+            "light_failures": self.light.failures,
+            "light_p50_ms": millis(percentile(&self.light.queries, 0.5)),
+            "light_max_ms": millis(longest(&self.light.queries)),
+            "health_max_ms": millis(longest(&self.light.health)),
+            "door_max_mib": self.peak.door_mib,
+            "all_max_mib": self.peak.total_mib,
+            "all_before_mib": self.idle_mib,
+            "idle_after_ms": millis(self.idle_time),
+            "server": self.fate_name(),
+            "missed": self.missed_goals(),
+        })
+    }
+}
+
+fn longest(times: &[Duration]) -> Duration {
+    times.iter().max().copied().unwrap_or_default()
+}
+
+/// Prints rows of the table.
+pub(super) fn print_rows(rows: &[AttackRow]) {
+    for row in rows {
+        println!(
+            "{:42} {:17} light p50 {:6.0} max {:6.0} wrong {:2}, health {:6.0} ms, door {:5} all {:5} MiB, idle {:5.0} \
+             ms, {:5} {:4.1} s: {}",
+            row.name,
+            row.protocol,
+            millis(percentile(&row.light.queries, 0.5)),
+            millis(longest(&row.light.queries)),
+            row.light.failures.len(),
+            millis(longest(&row.light.health)),
+            row.peak.door_mib,
+            row.peak.total_mib,
+            millis(row.idle_time),
+            row.fate_name(),
+            row.took.as_secs_f64(),
+            row.outcome(),
+        );
+    }
+}
+
+/// Prints how many rows miss which goal; returns whether none does.
+pub(super) fn print_summary(rows: &[AttackRow], is_json: bool) -> Result<bool> {
+    let mut missed = BTreeMap::<&str, usize>::new();
+    rows.iter().flat_map(AttackRow::missed_goals).for_each(|goal| *missed.entry(goal).or_default() += 1);
+    if is_json {
+        let rows: Vec<_> = rows.iter().map(AttackRow::to_json).collect();
+        println!("{}", serde_json::to_string_pretty(&rows)?);
+        return Ok(missed.is_empty());
+    }
+    let count = |fate: &str| rows.iter().filter(|row| row.fate_name() == fate).count();
+    println!("{} attacks: {} died, {} capped, {} busy", rows.len(), count("DIED"), count("CAP"), count("BUSY"));
+    let light: Vec<_> = rows.iter().flat_map(|row| row.light.queries.iter().copied()).collect();
+    let health: Vec<_> = rows.iter().flat_map(|row| row.light.health.iter().copied()).collect();
+    for (name, times) in [("light queries", light), ("/health", health)] {
+        let at = |share| millis(percentile(&times, share));
+        println!("{name}: {}, p50 {:.0} ms, p99 {:.0} ms, max {:.0} ms", times.len(), at(0.5), at(0.99), at(1.0));
+    }
+    for (goal, rows) in &missed {
+        println!("missed: {goal}: {rows} rows");
+    }
+    Ok(missed.is_empty())
+}

@@ -1,0 +1,88 @@
+//! One attack: other clients ask meanwhile, memory is sampled, and afterwards the server must be idle.
+
+use std::sync::mpsc::channel;
+use std::time::{Duration, Instant};
+
+use super::super::observed_server::{LightLoad, MemoryWatch, ObservedServer, QueryClient};
+use super::attack_report::{AttackRow, ServerFate};
+use super::{AttackCase, HOSTILE_MEMORY_MB};
+
+/// Other clients ask for so long at least, even if an attack ends at once.
+const SHORTEST_TRIAL: Duration = Duration::from_secs(1);
+/// From the end of an attack until the server must be idle.
+const SETTLE_TIME: Duration = Duration::from_millis(500);
+/// Over which its processor time is measured then.
+const IDLE_TIME: Duration = Duration::from_secs(1);
+/// A server that still works so long after an attack is replaced, so that the next one meets an idle one.
+const IDLE_LIMIT: Duration = Duration::from_secs(20);
+
+/// A trial of an attack.
+pub(super) struct AttackTrial<'a> {
+    server: &'a mut ObservedServer,
+    attacker: QueryClient,
+}
+
+impl<'a> AttackTrial<'a> {
+    /// `number` says which of the hostile clients attacks.
+    pub(super) fn new(server: &'a mut ObservedServer, number: usize) -> Self {
+        let attacker = server.client("hostile", number);
+        Self { server, attacker }
+    }
+
+    pub(super) fn run(mut self, case: &AttackCase, seconds: f64) -> AttackRow {
+        let idle_mib = self.server.process_tree().memory().total_kib >> 10;
+        let watch = MemoryWatch::start(self.server.process_tree());
+        let light = LightLoad::start(self.server);
+        let begun = Instant::now();
+        let outcomes = self.attack(case, Duration::from_secs_f64(seconds));
+        let took = begun.elapsed();
+        std::thread::sleep(SHORTEST_TRIAL.saturating_sub(took));
+        light.pause();
+        std::thread::sleep(SETTLE_TIME);
+        let idle_time = self.server.process_tree().processor_time_over(IDLE_TIME);
+        let light = light.stop();
+        let peak = watch.peak();
+        drop(watch);
+        AttackRow {
+            family: case.family(),
+            name: case.name(),
+            protocol: case.protocol(),
+            outcomes,
+            took,
+            light,
+            peak,
+            idle_mib,
+            limit_mib: (HOSTILE_MEMORY_MB * 1_000_000) >> 20,
+            idle_time,
+            fate: self.settle(peak.is_capped),
+        }
+    }
+
+    // Closes the attacker's connections at the limit.
+    fn attack(&self, case: &AttackCase, limit: Duration) -> Vec<String> {
+        let case = *case;
+        let attacker = self.attacker.clone();
+        let (done, outcome) = channel();
+        let attack = std::thread::spawn(move || {
+            // Nobody listens any more after the limit; the outcome is returned, too.
+            let outcomes = case.run(&attacker);
+            let _ = done.send(());
+            outcomes
+        });
+        let _ = outcome.recv_timeout(limit);
+        self.attacker.connections.close_all();
+        attack.join().unwrap_or_else(|_| vec!["panicked".to_owned()])
+    }
+
+    // Leaves a server that lives and is idle.
+    fn settle(&mut self, is_capped: bool) -> ServerFate {
+        let fate = match self.server.is_alive() {
+            _ if is_capped => ServerFate::Capped,
+            false => ServerFate::Died(self.server.last_words()),
+            true if self.server.wait_until_idle(IDLE_LIMIT) => return ServerFate::Alive,
+            true => ServerFate::Busy,
+        };
+        self.server.restart();
+        fate
+    }
+}

@@ -1,0 +1,86 @@
+//! Attacks a server in every known way, and watches what other clients notice of it, what memory it takes, and whether
+//! it is idle soon after the attacker is gone.
+//!
+//! One row per attack and protocol. The server may die by any of them; it is started again then.
+
+mod attack_case;
+mod attack_report;
+mod attack_trial;
+mod sql;
+mod wire;
+
+use std::path::Path;
+
+use anyhow::{Result, ensure};
+
+use super::observed_server::{ClientGroup, ObservedServer};
+pub(crate) use attack_case::{AttackCase, all_cases, quick_cases};
+pub(crate) use attack_report::AttackRow;
+use attack_report::{print_rows, print_summary};
+use attack_trial::AttackTrial;
+
+/// Megabytes that a hostile client's queries may hold; those of its limits below.
+const HOSTILE_MEMORY_MB: u64 = 1000;
+/// Who attacks. There are many, so that what the server remembers of one does not weaken the next attack.
+pub(crate) const HOSTILE_CLIENTS: ClientGroup = ClientGroup {
+    name: "hostile",
+    count: 40,
+    limits: "seconds = 10\nmemory_mb = 1000\nrows = 10_000_000\nconcurrent = 4\n",
+};
+/// Who must not notice it.
+pub(crate) const LIGHT_CLIENTS: ClientGroup =
+    ClientGroup { name: "light", count: 3, limits: "seconds = 30\nmemory_mb = 200\nconcurrent = 4\n" };
+
+#[derive(Debug, clap::Args)]
+pub(crate) struct AttackArgs {
+    /// Only attacks with this text in `NAME PROTOCOL`.
+    #[arg(long, value_name = "SUBSTRING")]
+    only: Option<String>,
+    /// How long an attack goes on.
+    #[arg(long, value_name = "SECS", default_value_t = 15.0)]
+    seconds: f64,
+    /// Seed of which protocol a short selection takes for which attack.
+    #[arg(long, default_value_t = 1)]
+    seed: u64,
+    /// A short selection: two attacks of each family, over one protocol each.
+    #[arg(long)]
+    quick: bool,
+    /// Print the rows as JSON.
+    #[arg(long)]
+    json: bool,
+}
+
+pub(crate) fn run(args: &AttackArgs) -> Result<()> {
+    let mut cases = if args.quick { quick_cases(args.seed) } else { all_cases() };
+    cases.retain(|case| args.only.as_ref().is_none_or(|part| case.title().contains(part.as_str())));
+    ensure!(!cases.is_empty(), "no attack has this in `NAME PROTOCOL`");
+    let mut progress = |row: &AttackRow| {
+        if !args.json {
+            print_rows(std::slice::from_ref(row));
+        }
+    };
+    let rows = run_cases(&super::echolake_path()?, &cases, args.seconds, &mut progress)?;
+    let is_reached = print_summary(&rows, args.json)?;
+    ensure!(is_reached, "goals are missed");
+    Ok(())
+}
+
+/// Tries the attacks one after the other; `progress` sees each row.
+///
+/// # Errors
+/// The lake cannot be made.
+pub(crate) fn run_cases(
+    binary: &Path,
+    cases: &[AttackCase],
+    seconds: f64,
+    progress: &mut dyn FnMut(&AttackRow),
+) -> Result<Vec<AttackRow>> {
+    let mut server = ObservedServer::start(binary, &[HOSTILE_CLIENTS, LIGHT_CLIENTS])?;
+    let mut rows = Vec::new();
+    for (number, case) in cases.iter().enumerate() {
+        let row = AttackTrial::new(&mut server, number).run(case, seconds);
+        progress(&row);
+        rows.push(row);
+    }
+    Ok(rows)
+}

@@ -1,0 +1,163 @@
+//! Kills engines of a server, the processes below it that run queries, while clients read answers of known digests: every
+//! answer must be whole, or an error with its code, or be seen to be broken off.
+#![allow(clippy::print_stdout, reason = "figures are what it is for")]
+
+use std::collections::BTreeMap;
+use std::path::Path;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Mutex, PoisonError};
+use std::time::{Duration, Instant};
+
+use anyhow::{Result, ensure};
+use rand::seq::IndexedRandom as _;
+use rand::{Rng as _, SeedableRng as _};
+use rand_chacha::ChaCha8Rng;
+
+use super::observed_server::{
+    ClientGroup, LightLoad, LightReport, ObservedServer, QueryOutcome, QueryProtocol, RightAnswers, kill_process,
+    take_right_answers,
+};
+
+/// Clients at once.
+const READERS: usize = 8;
+/// Names that a reader takes turns with, because a client whose engines end again and again has to wait.
+const NAMES: usize = 4;
+const CLIENTS: ClientGroup =
+    ClientGroup { name: "reader", count: READERS * NAMES, limits: "seconds = 60\nmemory_mb = 400\nconcurrent = 4\n" };
+const LIGHT_CLIENTS: ClientGroup =
+    ClientGroup { name: "light", count: 3, limits: "seconds = 30\nmemory_mb = 200\nconcurrent = 4\n" };
+/// Answers of some megabytes, in an order, which take a while to come.
+const QUERIES: [&str; 3] = [
+    "select v, repeat('x', 50) as x from generate_series(1, 100000) t(v)",
+    "select v, v * 7 as w, 'text ' || v as x from generate_series(1, 200000) t(v) order by v",
+    "select m.pair_id, v, m.snr_db from measurements m, generate_series(1, 500) t(v) order by 1, 2, 3",
+];
+/// Between two kills, at most.
+const LONGEST_PAUSE: Duration = Duration::from_millis(500);
+/// How long to wait for an engine that can be killed.
+const ENGINE_LIMIT: Duration = Duration::from_secs(30);
+
+#[derive(Debug, clap::Args)]
+pub(crate) struct EngineKillsArgs {
+    /// How many engines are killed.
+    #[arg(default_value_t = 500)]
+    kills: usize,
+    /// Seed of the moments and of who is killed.
+    #[arg(long, default_value_t = 1)]
+    seed: u64,
+}
+
+/// What the readers got.
+#[derive(Debug, Default)]
+pub(crate) struct KillReport {
+    kills: usize,
+    pub(crate) whole: usize,
+    /// Answers that look whole and are not the right ones.
+    pub(crate) wrong: usize,
+    /// Errors by protocol and code.
+    errors: BTreeMap<(QueryProtocol, String), usize>,
+    /// Answers over HTTP that were broken off, which is how it shows an error after the first byte.
+    broken_off: usize,
+    /// Connections that ended without a code.
+    pub(crate) lost: BTreeMap<QueryProtocol, usize>,
+    light: LightReport,
+}
+
+pub(crate) fn run(args: &EngineKillsArgs) -> Result<()> {
+    let report = run_kills(&super::echolake_path()?, args.kills, args.seed)?;
+    println!(
+        "{} kills: {} answers whole, {} wrong, {} broken off",
+        report.kills, report.whole, report.wrong, report.broken_off
+    );
+    for ((protocol, code), count) in &report.errors {
+        println!("  {:17} {code}: {count}", protocol.name());
+    }
+    for (protocol, count) in &report.lost {
+        println!("  {:17} ended without a code: {count}", protocol.name());
+    }
+    let (light, failures) = (report.light.queries.len(), &report.light.failures);
+    println!("  other clients: {light} light queries, {} failed {failures:?}", failures.len());
+    ensure!(report.is_goal_reached(), "goals are missed: no wrong answer, and a code for each that is not whole");
+    Ok(())
+}
+
+/// Kills so many engines.
+///
+/// # Errors
+/// The lake cannot be made, the undisturbed server fails, or it has no engines.
+pub(crate) fn run_kills(binary: &Path, kills: usize, seed: u64) -> Result<KillReport> {
+    let mut server = ObservedServer::start(binary, &[CLIENTS, LIGHT_CLIENTS])?;
+    let right = take_right_answers(&server.client(CLIENTS.name, 0), &QUERIES)?;
+    let report = Mutex::new(KillReport::default());
+    let is_stopped = AtomicBool::new(false);
+    let light = LightLoad::start(&server);
+    let killed = std::thread::scope(|scope| {
+        for reader in 0..READERS {
+            let (server, right, report, is_stopped) = (&server, &right, &report, &is_stopped);
+            scope.spawn(move || read_answers(server, reader, right, seed, report, is_stopped));
+        }
+        let killed = kill_engines(&server, kills, seed);
+        is_stopped.store(true, Ordering::Relaxed);
+        killed
+    });
+    let mut report = report.into_inner().unwrap_or_else(PoisonError::into_inner);
+    report.light = light.stop();
+    report.kills = killed?;
+    ensure!(server.is_alive(), "the server died: {}", server.last_words());
+    Ok(report)
+}
+
+impl KillReport {
+    pub(crate) fn is_goal_reached(&self) -> bool {
+        self.wrong == 0 && self.lost.is_empty() && self.light.failures.is_empty()
+    }
+
+    fn add(&mut self, protocol: QueryProtocol, outcome: QueryOutcome, expected: &QueryOutcome) {
+        match outcome {
+            right if right == *expected => self.whole += 1,
+            QueryOutcome::Answer(_) => self.wrong += 1,
+            QueryOutcome::Refused(code) => *self.errors.entry((protocol, code)).or_default() += 1,
+            QueryOutcome::Truncated if protocol == QueryProtocol::Http => self.broken_off += 1,
+            _ => *self.lost.entry(protocol).or_default() += 1,
+        }
+    }
+}
+
+fn read_answers(
+    server: &ObservedServer,
+    reader: usize,
+    right: &RightAnswers,
+    seed: u64,
+    report: &Mutex<KillReport>,
+    is_stopped: &AtomicBool,
+) {
+    let mut random = ChaCha8Rng::seed_from_u64(seed + 1 + reader as u64);
+    let clients: Vec<_> = (0..NAMES).map(|name| server.client(CLIENTS.name, reader * NAMES + name)).collect();
+    let questions: Vec<_> = right.iter().collect();
+    while !is_stopped.load(Ordering::Relaxed) {
+        let Some(client) = clients.choose(&mut random) else { return };
+        let Some(((protocol, sql), expected)) = questions.choose(&mut random) else { return };
+        let outcome = client.query(*protocol, sql);
+        report.lock().unwrap_or_else(PoisonError::into_inner).add(*protocol, outcome, expected);
+    }
+}
+
+fn kill_engines(server: &ObservedServer, kills: usize, seed: u64) -> Result<usize> {
+    let mut random = ChaCha8Rng::seed_from_u64(seed);
+    for _ in 0..kills {
+        std::thread::sleep(LONGEST_PAUSE.mul_f64(random.random()));
+        kill_process(find_engine(server, &mut random)?);
+    }
+    Ok(kills)
+}
+
+fn find_engine(server: &ObservedServer, random: &mut ChaCha8Rng) -> Result<u32> {
+    let begun = Instant::now();
+    while begun.elapsed() < ENGINE_LIMIT {
+        if let Some(engine) = server.process_tree().children().choose(random) {
+            return Ok(*engine);
+        }
+        std::thread::sleep(Duration::from_millis(20));
+    }
+    anyhow::bail!("the server has had no engines, which are processes below it, for {ENGINE_LIMIT:?}")
+}

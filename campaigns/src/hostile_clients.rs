@@ -1,0 +1,234 @@
+//! Twenty clients of one server, of which some attack it: the others must get the right answers, about as soon as on a
+//! quiet server.
+#![allow(clippy::print_stdout, reason = "figures are what it is for")]
+
+use std::collections::BTreeMap;
+use std::net::Ipv4Addr;
+use std::path::Path;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Mutex, PoisonError};
+use std::time::{Duration, Instant};
+
+use anyhow::{Result, ensure};
+use rand::seq::IndexedRandom as _;
+use rand::{Rng as _, SeedableRng as _};
+use rand_chacha::ChaCha8Rng;
+
+use super::attacks::{AttackCase, all_cases};
+use super::observed_server::{
+    ClientGroup, MemoryWatch, ObservedServer, QueryClient, QueryOutcome, RightAnswers, take_right_answers,
+};
+use super::percentile::{millis, percentile};
+
+/// Clients that attack, one after the other what chance gives them.
+const ATTACKERS: ClientGroup = ClientGroup {
+    name: "hostile",
+    count: 5,
+    limits: "seconds = 10\nmemory_mb = 400\nrows = 10_000_000\nconcurrent = 4\n",
+};
+/// Clients that work.
+const WORKERS: ClientGroup =
+    ClientGroup { name: "light", count: 15, limits: "seconds = 60\nmemory_mb = 400\nconcurrent = 4\n" };
+/// What the workers ask: light queries, and some of tenths of a second. Their rows have an order.
+const QUERIES: [&str; 8] = [
+    "select count(*) as n from runs",
+    "select surface_id, count(*) as n from measurements group by surface_id order by 1",
+    "select pair_id, direct_mm from pairs order by pair_id",
+    "select surface_id, avg(tnce_total) as a from tnce group by surface_id order by 1",
+    "select pair_id, list_energy(ir) as e from measurements where surface_id = 'flat' order by pair_id",
+    "select sum(v % 7) as s from generate_series(1, 1000000) t(v)",
+    "select v % 1000 as k, count(*) as n from generate_series(1, 300000) t(v) group by 1 order by 1",
+    "select v from generate_series(1, 200000) t(v) order by v % 1000, v limit 10",
+];
+/// Between two queries of a worker, at most.
+const LONGEST_PAUSE: Duration = Duration::from_secs(2);
+/// How long an attack goes on.
+const ATTACK_LIMIT: Duration = Duration::from_secs(15);
+/// A query that takes longer is lost.
+const QUERY_LIMIT: Duration = Duration::from_secs(60);
+/// How many times as long a query may take under attack: p99.
+const SLOWDOWN_GOAL: f64 = 3.0;
+
+#[derive(Debug, clap::Args)]
+pub(crate) struct HostileClientsArgs {
+    /// How long they attack.
+    #[arg(long, value_name = "SECS", default_value_t = 3600)]
+    seconds: u64,
+    /// How long the server is quiet before.
+    #[arg(long, value_name = "SECS", default_value_t = 60)]
+    quiet_seconds: u64,
+    /// Seed of who asks what when.
+    #[arg(long, default_value_t = 1)]
+    seed: u64,
+}
+
+/// What the workers got.
+#[derive(Debug, Default)]
+pub(crate) struct WorkerReport {
+    /// Times of right answers.
+    pub(crate) times: Vec<Duration>,
+    pub(crate) wrong_answers: usize,
+    /// How often what came in place of an answer.
+    pub(crate) errors: BTreeMap<String, usize>,
+}
+
+/// The server quiet and under attack.
+#[derive(Debug)]
+pub(crate) struct HostileReport {
+    pub(crate) quiet: WorkerReport,
+    pub(crate) attacked: WorkerReport,
+    attacks: BTreeMap<String, usize>,
+    restarts: usize,
+}
+
+pub(crate) fn run(args: &HostileClientsArgs) -> Result<()> {
+    let quiet = Duration::from_secs(args.quiet_seconds);
+    let report = run_clients(&super::echolake_path()?, quiet, Duration::from_secs(args.seconds), args.seed)?;
+    print_report(&report);
+    ensure!(report.is_goal_reached(), "goals are missed: 0 wrong, 0 errors, p99 within {SLOWDOWN_GOAL} x quiet");
+    Ok(())
+}
+
+/// Lets the workers work alone, and then beside attackers.
+///
+/// # Errors
+/// The lake cannot be made, or the quiet server fails.
+pub(crate) fn run_clients(binary: &Path, quiet: Duration, attacked: Duration, seed: u64) -> Result<HostileReport> {
+    let mut server = ObservedServer::start(binary, &[ATTACKERS, WORKERS])?;
+    let right = take_right_answers(&server.client(WORKERS.name, 0), &QUERIES)?;
+    let quiet = run_phase(&mut server, &right, quiet, seed, &[]).0;
+    let (attacked, attacks) = run_phase(&mut server, &right, attacked, seed, &all_cases());
+    Ok(HostileReport { quiet, attacked, attacks, restarts: server.restarts })
+}
+
+impl HostileReport {
+    fn is_goal_reached(&self) -> bool {
+        self.is_right() && self.slowdown() <= SLOWDOWN_GOAL
+    }
+
+    /// Returns whether every answer was right and the server lives.
+    pub(crate) fn is_right(&self) -> bool {
+        self.attacked.wrong_answers == 0 && self.attacked.errors.is_empty() && self.restarts == 0
+    }
+
+    fn slowdown(&self) -> f64 {
+        let quiet = percentile(&self.quiet.times, 0.99).as_secs_f64();
+        percentile(&self.attacked.times, 0.99).as_secs_f64() / quiet.max(f64::MIN_POSITIVE)
+    }
+}
+
+fn print_report(report: &HostileReport) {
+    for (name, phase) in [("quiet", &report.quiet), ("attacked", &report.attacked)] {
+        println!(
+            "{name:8} {} answers, {} wrong, p50 {:.1} ms, p99 {:.1} ms, errors {:?}",
+            phase.times.len(),
+            phase.wrong_answers,
+            millis(percentile(&phase.times, 0.5)),
+            millis(percentile(&phase.times, 0.99)),
+            phase.errors,
+        );
+    }
+    println!("p99 under attack is {:.1} x quiet; the server died {} times", report.slowdown(), report.restarts);
+    println!("attacks: {:?}", report.attacks);
+}
+
+// Restarts the server if it dies. Returns what workers got and how attacks ended; without attacks nobody attacks.
+fn run_phase(
+    server: &mut ObservedServer,
+    right: &RightAnswers,
+    time: Duration,
+    seed: u64,
+    attacks: &[AttackCase],
+) -> (WorkerReport, BTreeMap<String, usize>) {
+    let phase = ClientPhase {
+        right,
+        attacks,
+        end: Instant::now() + time,
+        server_died: AtomicBool::new(false),
+        report: Mutex::default(),
+        outcomes: Mutex::default(),
+    };
+    while Instant::now() < phase.end {
+        phase.run_until_death(server, seed + 100 * server.restarts as u64);
+    }
+    let report = phase.report.into_inner().unwrap_or_else(PoisonError::into_inner);
+    (report, phase.outcomes.into_inner().unwrap_or_else(PoisonError::into_inner))
+}
+
+/// Clients at work, with or without attackers.
+struct ClientPhase<'a> {
+    right: &'a RightAnswers,
+    attacks: &'a [AttackCase],
+    end: Instant,
+    server_died: AtomicBool,
+    report: Mutex<WorkerReport>,
+    outcomes: Mutex<BTreeMap<String, usize>>,
+}
+
+impl ClientPhase<'_> {
+    // Until the end, or until the server dies; then it is restarted.
+    fn run_until_death(&self, server: &mut ObservedServer, seed: u64) {
+        self.server_died.store(false, Ordering::Relaxed);
+        let watch = MemoryWatch::start(server.process_tree());
+        std::thread::scope(|scope| {
+            for number in 0..WORKERS.count {
+                let client = numbered_client(server, WORKERS, number);
+                let random = ChaCha8Rng::seed_from_u64(seed + number as u64);
+                scope.spawn(move || self.work(&client, random));
+            }
+            for number in (0..ATTACKERS.count).filter(|_| !self.attacks.is_empty()) {
+                let client = numbered_client(server, ATTACKERS, number);
+                let random = ChaCha8Rng::seed_from_u64(seed + 50 + number as u64);
+                scope.spawn(move || self.attack(&client, random));
+            }
+            while Instant::now() < self.end && server.is_alive() {
+                std::thread::sleep(Duration::from_millis(50));
+            }
+            self.server_died.store(!server.is_alive(), Ordering::Relaxed);
+        });
+        drop(watch);
+        if !server.is_alive() {
+            server.restart();
+        }
+    }
+
+    fn is_over(&self) -> bool {
+        Instant::now() >= self.end || self.server_died.load(Ordering::Relaxed)
+    }
+
+    fn work(&self, client: &QueryClient, mut random: ChaCha8Rng) {
+        let questions: Vec<_> = self.right.iter().collect();
+        while !self.is_over() {
+            let Some(((protocol, sql), expected)) = questions.choose(&mut random) else { return };
+            let one = client.clone().with_source(client.connections.source());
+            let begun = Instant::now();
+            let answer = one.connections.close_after(QUERY_LIMIT, || one.query(*protocol, sql));
+            self.count_answer(answer, expected, begun.elapsed());
+            std::thread::sleep(LONGEST_PAUSE.mul_f64(random.random()));
+        }
+    }
+
+    fn count_answer(&self, answer: QueryOutcome, expected: &QueryOutcome, took: Duration) {
+        let mut report = self.report.lock().unwrap_or_else(PoisonError::into_inner);
+        match answer {
+            right if right == *expected => report.times.push(took),
+            QueryOutcome::Answer(_) => report.wrong_answers += 1,
+            other => *report.errors.entry(other.to_string()).or_default() += 1,
+        }
+    }
+
+    fn attack(&self, client: &QueryClient, mut random: ChaCha8Rng) {
+        while !self.is_over() {
+            let Some(case) = self.attacks.choose(&mut random) else { return };
+            let one = client.clone().with_source(client.connections.source());
+            let ends = one.connections.close_after(ATTACK_LIMIT, || case.run(&one));
+            let mut outcomes = self.outcomes.lock().unwrap_or_else(PoisonError::into_inner);
+            ends.into_iter().for_each(|end| *outcomes.entry(end).or_default() += 1);
+        }
+    }
+}
+
+fn numbered_client(server: &ObservedServer, group: ClientGroup, number: usize) -> QueryClient {
+    let network = if group.name == WORKERS.name { 2 } else { 1 };
+    server.client(group.name, number).with_source(Ipv4Addr::new(127, 0, network, 1 + number as u8))
+}

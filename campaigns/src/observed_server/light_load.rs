@@ -1,0 +1,128 @@
+//! What other clients of an attacked server notice: light queries and `/health`, each at a fixed pace.
+
+use std::io;
+use std::net::Ipv4Addr;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::thread::JoinHandle;
+use std::time::{Duration, Instant};
+
+use super::query_client::AnswerDigest;
+use super::{ObservedServer, QueryClient, QueryOutcome, QueryProtocol, http_query};
+use crate::serve::http::Request;
+
+/// Between the beginnings of two probes.
+const PROBE_EVERY: Duration = Duration::from_millis(200);
+/// A probe that takes longer is given up.
+const PROBE_LIMIT: Duration = Duration::from_secs(5);
+/// Other clients than the attackers come from another address.
+const LIGHT_SOURCE: Ipv4Addr = Ipv4Addr::new(127, 0, 0, 2);
+const LIGHT_QUERY: &str = "select count(*) from runs";
+
+/// A request that must be answered soon.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum LightProbe {
+    HttpQuery,
+    PostgresQuery,
+    Health,
+}
+
+/// What the probes found.
+#[derive(Debug, Clone, Default)]
+pub(crate) struct LightReport {
+    /// Times of light queries, those that failed included.
+    pub(crate) queries: Vec<Duration>,
+    /// Times of `/health`.
+    pub(crate) health: Vec<Duration>,
+    /// What was not the right answer.
+    pub(crate) failures: Vec<String>,
+}
+
+/// Threads that probe until they are stopped.
+pub(crate) struct LightLoad {
+    report: Arc<Mutex<LightReport>>,
+    is_stopped: Arc<AtomicBool>,
+    probes: Vec<JoinHandle<()>>,
+}
+
+impl LightLoad {
+    pub(crate) fn start(server: &ObservedServer) -> Self {
+        let report = Arc::<Mutex<LightReport>>::default();
+        let is_stopped = Arc::<AtomicBool>::default();
+        let kinds = [(LightProbe::HttpQuery, 0), (LightProbe::PostgresQuery, 1), (LightProbe::Health, 2)];
+        let probes = kinds.map(|(probe, number)| {
+            let client = server.client("light", number);
+            let runs = server.run_count();
+            let found = report.clone();
+            let stop = is_stopped.clone();
+            std::thread::spawn(move || run_probes(probe, &client, runs, &found, &stop))
+        });
+        Self { report, is_stopped, probes: probes.into() }
+    }
+
+    /// Begins no more probes.
+    pub(crate) fn pause(&self) {
+        self.is_stopped.store(true, Ordering::Relaxed);
+    }
+
+    /// Waits for the probes that run, and returns what all of them found.
+    pub(crate) fn stop(self) -> LightReport {
+        self.pause();
+        for probe in self.probes {
+            // A probe that panicked has its results in the report all the same.
+            let _ = probe.join();
+        }
+        self.report.lock().unwrap_or_else(PoisonError::into_inner).clone()
+    }
+}
+
+fn run_probes(
+    probe: LightProbe,
+    client: &QueryClient,
+    runs: usize,
+    report: &Mutex<LightReport>,
+    is_stopped: &AtomicBool,
+) {
+    while !is_stopped.load(Ordering::Relaxed) {
+        let begun = Instant::now();
+        let outcome = send_probe(probe, client);
+        let took = begun.elapsed();
+        let mut report = report.lock().unwrap_or_else(PoisonError::into_inner);
+        if !is_right(probe, &outcome, runs) {
+            report.failures.push(format!("{probe:?}: {outcome}"));
+        }
+        let times = if probe == LightProbe::Health { &mut report.health } else { &mut report.queries };
+        times.push(took);
+        drop(report);
+        std::thread::sleep(PROBE_EVERY.saturating_sub(took));
+    }
+}
+
+fn send_probe(probe: LightProbe, client: &QueryClient) -> QueryOutcome {
+    let client = client.clone().with_source(LIGHT_SOURCE);
+    client.connections.close_after(PROBE_LIMIT, || match probe {
+        LightProbe::HttpQuery => client.query(QueryProtocol::Http, LIGHT_QUERY),
+        LightProbe::PostgresQuery => client.query(QueryProtocol::PostgresSimple, LIGHT_QUERY),
+        LightProbe::Health => http_query::send_request(&client, Request::get("/health")),
+    })
+}
+
+fn is_right(probe: LightProbe, outcome: &QueryOutcome, runs: usize) -> bool {
+    let QueryOutcome::Answer(digest) = outcome else { return false };
+    match probe {
+        LightProbe::HttpQuery => *digest == digest_of(format!("count(*)\n{runs}\n").as_bytes()),
+        // One value with its length.
+        LightProbe::PostgresQuery => {
+            let value = runs.to_string();
+            *digest == digest_of(&[&[0, 1, 0, 0, 0, value.len() as u8], value.as_bytes()].concat())
+        }
+        LightProbe::Health => true,
+    }
+}
+
+fn digest_of(mut bytes: &[u8]) -> AnswerDigest {
+    let mut digest = AnswerDigest::default();
+    // Nothing is written anywhere.
+    let _ = io::copy(&mut bytes, &mut digest);
+    digest
+}

@@ -1,0 +1,69 @@
+//! Samples the memory of a server's processes, and kills them before they take what others on the machine need.
+
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::thread::JoinHandle;
+use std::time::Duration;
+
+use super::ProcessTree;
+
+/// Between two samples.
+const SAMPLE_EVERY: Duration = Duration::from_millis(50);
+/// Processes that take more together are killed.
+const MEMORY_CAP_MIB: u64 = 6 << 10;
+
+/// The most that was in memory, MiB.
+#[derive(Debug, Clone, Copy, Default)]
+pub(crate) struct MemoryPeak {
+    pub(crate) door_mib: u64,
+    pub(crate) total_mib: u64,
+    /// Whether the processes were killed because they took too much.
+    pub(crate) is_capped: bool,
+}
+
+/// A thread that samples until it is stopped.
+pub(crate) struct MemoryWatch {
+    peak: Arc<Mutex<MemoryPeak>>,
+    is_stopped: Arc<AtomicBool>,
+    sampler: Option<JoinHandle<()>>,
+}
+
+impl MemoryWatch {
+    pub(crate) fn start(tree: ProcessTree) -> Self {
+        let peak = Arc::new(Mutex::new(MemoryPeak::default()));
+        let is_stopped = Arc::new(AtomicBool::new(false));
+        let sampled = peak.clone();
+        let stop = is_stopped.clone();
+        let sampler = std::thread::spawn(move || {
+            while !stop.load(Ordering::Relaxed) {
+                take_sample(tree, &sampled);
+                std::thread::sleep(SAMPLE_EVERY);
+            }
+        });
+        Self { peak, is_stopped, sampler: Some(sampler) }
+    }
+
+    /// Returns the peak so far.
+    pub(crate) fn peak(&self) -> MemoryPeak {
+        *self.peak.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl Drop for MemoryWatch {
+    fn drop(&mut self) {
+        self.is_stopped.store(true, Ordering::Relaxed);
+        // A sampler that panicked has nothing more to say.
+        let _ = self.sampler.take().map(JoinHandle::join);
+    }
+}
+
+fn take_sample(tree: ProcessTree, peak: &Mutex<MemoryPeak>) {
+    let memory = tree.memory();
+    let mut peak = peak.lock().unwrap_or_else(PoisonError::into_inner);
+    peak.door_mib = peak.door_mib.max(memory.door_kib >> 10);
+    peak.total_mib = peak.total_mib.max(memory.total_kib >> 10);
+    if memory.total_kib >> 10 > MEMORY_CAP_MIB {
+        peak.is_capped = true;
+        tree.kill();
+    }
+}

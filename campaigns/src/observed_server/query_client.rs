@@ -1,0 +1,145 @@
+//! A client that asks in SQL over any of the protocols, and tells a whole answer from an error and from neither.
+
+use std::fmt::{self, Write as _};
+use std::io;
+use std::net::Ipv4Addr;
+use std::sync::Arc;
+
+use super::{ClientConnections, ServerAddresses, flight_query, http_query, postgres_query};
+
+/// A way to ask in SQL.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, clap::ValueEnum)]
+pub(crate) enum QueryProtocol {
+    Http,
+    PostgresSimple,
+    PostgresExtended,
+    FlightSql,
+    /// As `where` of a slice over HTTP.
+    SliceFilter,
+}
+
+impl QueryProtocol {
+    pub(crate) const ALL: [Self; 5] =
+        [Self::Http, Self::PostgresSimple, Self::PostgresExtended, Self::FlightSql, Self::SliceFilter];
+    /// Those that answer with the rows of any query.
+    pub(crate) const ROWS: [Self; 4] = [Self::Http, Self::PostgresSimple, Self::PostgresExtended, Self::FlightSql];
+
+    pub(crate) fn name(self) -> &'static str {
+        match self {
+            Self::Http => "http",
+            Self::PostgresSimple => "postgres-simple",
+            Self::PostgresExtended => "postgres-extended",
+            Self::FlightSql => "flight-sql",
+            Self::SliceFilter => "slice-where",
+        }
+    }
+}
+
+/// How a query ended.
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
+pub(crate) enum QueryOutcome {
+    /// A whole answer.
+    Answer(AnswerDigest),
+    /// An error with its code: that of the problem, of the metadata `echolake-code`, or the SQLSTATE.
+    Refused(String),
+    /// The connection ended in the middle of an answer, which shows that it is not whole.
+    Truncated,
+    /// The connection ended, or was refused, before an answer began.
+    Disconnected,
+    /// The client closed its connections before the query ended.
+    Abandoned,
+}
+
+/// What tells an answer from another: its size and a hash of it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Default)]
+pub(crate) struct AnswerDigest {
+    pub(crate) bytes: u64,
+    hash: u64,
+}
+
+impl AnswerDigest {
+    pub(crate) fn update(&mut self, bytes: &[u8]) {
+        self.bytes += bytes.len() as u64;
+        for byte in bytes {
+            // FNV-1a (Fowler, Noll, Vo), which does not depend on how the bytes are cut.
+            self.hash = (self.hash ^ u64::from(*byte)).wrapping_mul(0x0100_0000_01b3);
+        }
+    }
+}
+
+impl io::Write for AnswerDigest {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        self.update(bytes);
+        Ok(bytes.len())
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        Ok(())
+    }
+}
+
+impl fmt::Display for QueryOutcome {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::Answer(_) => "answer",
+            Self::Refused(code) => code,
+            Self::Truncated => "truncated",
+            Self::Disconnected => "connection closed",
+            Self::Abandoned => "time limit",
+        })
+    }
+}
+
+/// A client of a server. Every query has a connection of its own.
+#[derive(Clone)]
+pub(crate) struct QueryClient {
+    pub(crate) addresses: ServerAddresses,
+    pub(crate) token: String,
+    pub(crate) run: String,
+    pub(crate) connections: Arc<ClientConnections>,
+}
+
+impl QueryClient {
+    pub(crate) fn new(addresses: ServerAddresses, token: &str, run: &str) -> Self {
+        let connections = Arc::new(ClientConnections::new(Ipv4Addr::LOCALHOST));
+        Self { addresses, token: token.to_owned(), run: run.to_owned(), connections }
+    }
+
+    /// Lets it come from another address.
+    pub(crate) fn with_source(mut self, source: Ipv4Addr) -> Self {
+        self.connections = Arc::new(ClientConnections::new(source));
+        self
+    }
+
+    /// Asks a query and reads its answer to the end.
+    pub(crate) fn query(&self, protocol: QueryProtocol, sql: &str) -> QueryOutcome {
+        let outcome = match protocol {
+            QueryProtocol::Http => http_query::query(self, sql),
+            QueryProtocol::SliceFilter => http_query::query_slice(self, &slice_filter(sql)),
+            QueryProtocol::PostgresSimple => postgres_query::query_simple(self, sql),
+            QueryProtocol::PostgresExtended => postgres_query::query_extended(self, sql),
+            QueryProtocol::FlightSql => flight_query::query(self, sql),
+        };
+        let is_lost = matches!(outcome, QueryOutcome::Truncated | QueryOutcome::Disconnected);
+        if is_lost && self.connections.is_closed() { QueryOutcome::Abandoned } else { outcome }
+    }
+}
+
+// A predicate that needs the query's rows.
+fn slice_filter(sql: &str) -> String {
+    format!("exists ({sql})")
+}
+
+/// Encodes all that RFC 3986 reserves.
+pub(crate) fn percent_encoded(text: &str) -> String {
+    let mut encoded = String::new();
+    for byte in text.bytes() {
+        match byte {
+            b'A'..=b'Z' | b'a'..=b'z' | b'0'..=b'9' | b'-' | b'.' | b'_' | b'~' => encoded.push(byte as char),
+            other => {
+                let _ = write!(encoded, "%{other:02X}");
+            }
+        }
+    }
+    encoded
+}
