@@ -54,27 +54,26 @@ impl Request {
 
     /// Sends it and does not wait.
     pub(crate) fn begin(self, server: &Served) -> TcpStream {
+        let bytes = self.bytes(&server.http);
+        let (head, body) = bytes.split_at(bytes.len() - self.body.len());
         let mut stream = Served::connect(&server.http);
-        stream.write_all(self.request_head(&server.http).as_bytes()).expect("sent");
+        stream.write_all(head).expect("sent");
         // A server that has read enough may close before it has all.
-        let _ = stream.write_all(self.body.as_bytes());
+        let _ = stream.write_all(body);
         stream
     }
 
     /// Returns the request as it is sent to this address.
     pub(crate) fn bytes(&self, address: &str) -> Vec<u8> {
-        [self.request_head(address).as_bytes(), self.body.as_bytes()].concat()
-    }
-
-    fn request_head(&self, address: &str) -> String {
-        format!(
+        let head = format!(
             "{} {} HTTP/1.1\r\nhost: {}\r\nconnection: close\r\ncontent-length: {}\r\n{}\r\n",
             self.method,
             self.path,
             self.host.as_deref().unwrap_or(address),
             self.body.len(),
             self.headers
-        )
+        );
+        [head.as_bytes(), self.body.as_bytes()].concat()
     }
 
     pub(crate) fn send(self, server: &Served) -> Answer {

@@ -41,8 +41,12 @@ impl<'a> AttackTrial<'a> {
         std::thread::sleep(SETTLE_TIME);
         let idle_time = self.server.process_tree().processor_time_over(IDLE_TIME);
         let light = light.stop();
+        let fate = self.settle(&watch);
         let peak = watch.peak();
         drop(watch);
+        if fate != ServerFate::Alive {
+            self.server.restart();
+        }
         AttackRow {
             family: case.family(),
             name: case.name(),
@@ -54,7 +58,7 @@ impl<'a> AttackTrial<'a> {
             idle_mib,
             limit_mib: (HOSTILE_MEMORY_MB * 1_000_000) >> 20,
             idle_time,
-            fate: self.settle(peak.is_capped),
+            fate,
         }
     }
 
@@ -74,15 +78,14 @@ impl<'a> AttackTrial<'a> {
         attack.join().unwrap_or_else(|_| vec!["panicked".to_owned()])
     }
 
-    // Leaves a server that lives and is idle.
-    fn settle(&mut self, is_capped: bool) -> ServerFate {
-        let fate = match self.server.is_alive() {
-            _ if is_capped => ServerFate::Capped,
+    // An attack may go on after its end, and kill the server then: it is watched until it is idle.
+    fn settle(&mut self, watch: &MemoryWatch) -> ServerFate {
+        let is_idle = self.server.wait_until_idle(IDLE_LIMIT);
+        match self.server.is_alive() {
+            _ if watch.peak().is_capped => ServerFate::Capped,
             false => ServerFate::Died(self.server.last_words()),
-            true if self.server.wait_until_idle(IDLE_LIMIT) => return ServerFate::Alive,
+            true if is_idle => ServerFate::Alive,
             true => ServerFate::Busy,
-        };
-        self.server.restart();
-        fate
+        }
     }
 }

@@ -45,4 +45,22 @@ pub(super) const ATTACKS: &[SqlAttack] = &[
     attack("names of 1 MB", || format!("select 1 as \"{0}\", 2 as \"{0}b\"", "n".repeat(900_000))),
     attack("columns", || format!("select {} from pairs", numbered("pair_id + {} as c{}", ",", 20_000))),
     attack("statements", || numbered("select {} as n", ";", 50_000)),
+    // The same, of sizes that a server may well take.
+    attack("1900 plus", || format!("select {}", numbered("1", "+", 1900))),
+    attack("1900 casts", || format!("select 1{} x", "::int".repeat(1900))),
+    attack("1900 concatenations", || format!("select {} x", numbered("'a'", "||", 1900))),
+    attack("1900 or", || format!("select 1 from pairs where {}", numbered("pair_id={}", " or ", 1900))),
+    attack("1900 is null", || format!("select 1{} x", " is null".repeat(1900))),
+    attack("1900 unions", || numbered("select {} as n", " union all ", 1900)),
+    attack("1900 unions of distinct rows", || numbered("select {} as n", " union ", 1900)),
+    attack("1900 subscripts", || format!("select [1]{} x", "[1]".repeat(950))),
+    attack("90 parentheses", || format!("select {} x", nested("(", "1", ")", 90))),
+    attack("90 cases", || format!("select {} x", nested("case when 1=1 then ", "1", " else 0 end", 90))),
+    attack("90 subqueries", || format!("select {} x", nested("(select ", "1", ")", 90))),
+    attack("12 calls", || format!("select {} x", nested("abs(", "1", ")", 12))),
+    attack("5 positions", || format!("select {}!{}", "position(".repeat(5), " in 'x')".repeat(5))),
+    attack("many small bombs", || {
+        let bomb = format!("{}!{}", "position(".repeat(5), " in 'x')".repeat(5));
+        format!("select {}", vec![bomb.as_str(); 20_000].join(","))
+    }),
 ];
