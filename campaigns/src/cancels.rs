@@ -15,6 +15,10 @@ const IDLE_GOAL: Duration = Duration::from_millis(500);
 const IDLE_LIMIT: Duration = Duration::from_secs(15);
 /// How long a query runs before it is ended: longer than it takes to be parsed.
 const RUN_TIME: Duration = Duration::from_millis(1000);
+/// The last part of it, in which the server is looked at: it must work then, or the query has ended by itself.
+const LOOK_TIME: Duration = Duration::from_millis(200);
+/// Processor time of a server that works, in that part; a busy machine leaves it a tenth.
+const WORK_TIME: Duration = Duration::from_millis(20);
 
 /// Whose queries run into no limit, and whose end after a second.
 const CLIENTS: [ClientGroup; 2] = [
@@ -52,11 +56,14 @@ pub(crate) const ENDLESS_QUERIES: [EndlessQuery; 7] = [
     },
     EndlessQuery {
         name: "one call",
-        text: || "select levenshtein(repeat(run_id, 40000), repeat(surface_id, 200000)) from runs".into(),
+        text: || {
+            "select sum(strpos(repeat('a',100000000) || v, repeat('a',50000000) || 'b')) from generate_series(1,9) t(v)"
+                .into()
+        },
     },
     EndlessQuery {
         name: "one call that allocates",
-        text: || "select cardinality(array_resize([''], 1000, repeat('x',100000000))) x".into(),
+        text: || "select length(translate(repeat('a',250000000), 'a', 'bb')) x".into(),
     },
     EndlessQuery {
         name: "sort",
@@ -67,7 +74,9 @@ pub(crate) const ENDLESS_QUERIES: [EndlessQuery; 7] = [
     EndlessQuery {
         name: "regular expression",
         text: || {
-            "select regexp_count(repeat('a', 50000000 + v), '(a{1,50}){1,50}b') from generate_series(1,9) t(v)".into()
+            "select count(*) from generate_series(1,10000000) t(v) where regexp_like('aaaa', '(' || v || \
+             '|a{1,200}){1,9}')"
+                .into()
         },
     },
 ];
@@ -103,19 +112,33 @@ pub(crate) struct CancelArgs {
     only: Option<String>,
 }
 
+/// What came of ending a query.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum IdleOutcome {
+    /// It had ended by itself, or never begun: nothing is measured.
+    EndedBefore,
+    /// The server was idle after this time.
+    IdleAfter(Duration),
+    /// The server worked on at the limit.
+    NeverIdle,
+}
+
 /// A query and an end of it.
 #[derive(Debug)]
 pub(crate) struct CancelRow {
     pub(crate) title: String,
-    /// From the end until the server was idle; the limit if it was not.
-    pub(crate) times: Vec<Duration>,
+    /// From the end until the server was idle.
+    times: Vec<Duration>,
+    /// How often the query was not running when it should have been ended.
+    ended_before: usize,
     /// How often the server worked on at the limit, or died.
     pub(crate) failures: usize,
 }
 
 impl CancelRow {
-    pub(crate) fn is_goal_reached(&self) -> bool {
-        self.failures == 0 && percentile(&self.times, 0.99) <= IDLE_GOAL
+    // A row without times shows nothing.
+    fn is_goal_reached(&self) -> bool {
+        self.failures == 0 && !self.times.is_empty() && percentile(&self.times, 0.99) <= IDLE_GOAL
     }
 }
 
@@ -166,8 +189,15 @@ pub(crate) fn run_cancels(
 
 fn print_row(row: &CancelRow) {
     let at = |share| millis(percentile(&row.times, share));
-    let failures = if row.failures > 0 { format!(", {} not idle or dead", row.failures) } else { String::new() };
-    println!("{:52} p50 {:6.0} ms, p99 {:6.0} ms{failures}", row.title, at(0.5), at(0.99));
+    println!(
+        "{:56} {:3} times: p50 {:6.0} ms, p99 {:6.0} ms; {} not idle or dead, {} ended before",
+        row.title,
+        row.times.len(),
+        at(0.5),
+        at(0.99),
+        row.failures,
+        row.ended_before,
+    );
 }
 
 fn measure_row(
@@ -177,13 +207,17 @@ fn measure_row(
     end: QueryEnd,
     rounds: usize,
 ) -> CancelRow {
-    let mut row = CancelRow { title, times: Vec::new(), failures: 0 };
+    let mut row = CancelRow { title, times: Vec::new(), ended_before: 0, failures: 0 };
     for round in 0..rounds {
         let group = if matches!(end, QueryEnd::TokenSeconds(_)) { "limited" } else { "light" };
         let client = server.client(group, round);
-        let idle = end_query(server, &client, end, &(query.text)());
-        row.times.push(idle.unwrap_or(IDLE_LIMIT));
-        if idle.is_none() || !server.is_alive() {
+        let outcome = end_query(server, &client, end, &(query.text)());
+        match outcome {
+            IdleOutcome::EndedBefore => row.ended_before += 1,
+            IdleOutcome::IdleAfter(time) => row.times.push(time),
+            IdleOutcome::NeverIdle => {}
+        }
+        if outcome == IdleOutcome::NeverIdle || !server.is_alive() {
             row.failures += 1;
             server.restart();
         }
@@ -191,31 +225,51 @@ fn measure_row(
     row
 }
 
-// None if the server works on at the limit. The connections are closed in any case before this returns.
-fn end_query(server: &ObservedServer, client: &QueryClient, end: QueryEnd, sql: &str) -> Option<Duration> {
-    let idle = match end {
-        QueryEnd::CancelRequest | QueryEnd::StatementTimeout => end_in_session(server, client, end, sql),
+// The connections are closed in any case before this returns, and the next query meets an idle server.
+fn end_query(server: &ObservedServer, client: &QueryClient, end: QueryEnd, sql: &str) -> IdleOutcome {
+    let outcome = match end {
+        QueryEnd::CancelRequest | QueryEnd::StatementTimeout => {
+            end_in_session(server, client, end, sql).unwrap_or(IdleOutcome::EndedBefore)
+        }
         QueryEnd::TokenSeconds(protocol) => end_outside(server, client, protocol, sql, &|| ()),
         QueryEnd::ClosedConnection(protocol) => {
             end_outside(server, client, protocol, sql, &|| client.connections.close_all())
         }
     };
     client.connections.close_all();
-    idle
+    match server.wait_until_idle(IDLE_LIMIT) {
+        true => outcome,
+        false => IdleOutcome::NeverIdle,
+    }
 }
 
-fn end_in_session(server: &ObservedServer, client: &QueryClient, end: QueryEnd, sql: &str) -> Option<Duration> {
+// None if the server does not begin the session.
+fn end_in_session(server: &ObservedServer, client: &QueryClient, end: QueryEnd, sql: &str) -> Option<IdleOutcome> {
     let mut session = PostgresClient::log_in(client).ok()?.ok()?;
     if end == QueryEnd::StatementTimeout {
         session.begin_query(&format!("set statement_timeout = '{}ms'", RUN_TIME.as_millis())).ok()?;
         session.read_answer();
     }
     session.begin_query(sql).ok()?;
-    std::thread::sleep(RUN_TIME);
+    let is_running = is_working_after_run(server);
     if end == QueryEnd::CancelRequest {
         session.send_cancel(client).ok()?;
     }
-    server.process_tree().time_until_idle(Instant::now(), IDLE_LIMIT)
+    Some(idle_outcome(server, is_running))
+}
+
+// Lets a query run; a server that has stopped working by then has ended it.
+fn is_working_after_run(server: &ObservedServer) -> bool {
+    std::thread::sleep(RUN_TIME - LOOK_TIME);
+    server.process_tree().processor_time_over(LOOK_TIME) >= WORK_TIME
+}
+
+fn idle_outcome(server: &ObservedServer, is_running: bool) -> IdleOutcome {
+    match server.process_tree().time_until_idle(Instant::now(), IDLE_LIMIT) {
+        _ if !is_running => IdleOutcome::EndedBefore,
+        Some(time) => IdleOutcome::IdleAfter(time),
+        None => IdleOutcome::NeverIdle,
+    }
 }
 
 // What comes of the query is not looked at.
@@ -225,13 +279,13 @@ fn end_outside(
     protocol: QueryProtocol,
     sql: &str,
     end: &dyn Fn(),
-) -> Option<Duration> {
+) -> IdleOutcome {
     std::thread::scope(|scope| {
         scope.spawn(|| client.query(protocol, sql));
-        std::thread::sleep(RUN_TIME);
+        let is_running = is_working_after_run(server);
         end();
-        let idle = server.process_tree().time_until_idle(Instant::now(), IDLE_LIMIT);
+        let outcome = idle_outcome(server, is_running);
         client.connections.close_all();
-        idle
+        outcome
     })
 }
