@@ -188,7 +188,7 @@ fn a_run_that_ends_ingest_is_passed_over_by_the_next_one() {
     let said = stderr(&second);
     assert_eq!(second.status.code(), Some(3), "{said}");
     assert_eq!(said.matches("a process of its own takes it in").count(), 2, "{said}");
-    assert!(said.contains("-brick-0001.mcap` is passed over") && said.contains("SIGXFSZ"), "{said}");
+    assert!(said.contains(".mcap` is passed over") && said.contains("-brick-") && said.contains("SIGXFSZ"), "{said}");
     assert_eq!(place.number("select count(*) from runs where surface_id = 'flat'"), 2.0);
     place.fails(3, &["ingest"], "is passed over");
     std::fs::remove_dir_all(place.path("lake/tables/_reading")).expect("removed");

@@ -60,8 +60,9 @@ impl Drop for ReadingMark {
 #[derive(Debug)]
 pub struct SuspectFile {
     source: Source,
-    /// How each process ended that took in this file alone, a line each.
     mark: PathBuf,
+    /// How each process ended that took in this file alone.
+    endings: Vec<String>,
 }
 
 impl SuspectFile {
@@ -69,7 +70,8 @@ impl SuspectFile {
     pub fn from_source(lake: &Lake, source: &Source) -> Option<Self> {
         let mark = mark_path(lake, source)?;
         let is_read = File::open(&mark).ok()?.try_lock_shared().is_err();
-        (!is_read).then(|| Self { source: source.clone(), mark })
+        let endings = fs::read_to_string(&mark).unwrap_or_default().lines().map(str::to_owned).collect();
+        (!is_read).then(|| Self { source: source.clone(), mark, endings })
     }
 
     /// The file.
@@ -82,8 +84,11 @@ impl SuspectFile {
     ///
     /// # Errors
     /// [`Error::Read`] if the mark cannot be written.
-    pub fn add_death(&self, ending: &str) -> Result<()> {
-        match OpenOptions::new().append(true).open(&self.mark).and_then(|mut mark| writeln!(mark, "{ending}")) {
+    pub fn add_death(&mut self, ending: &str) -> Result<()> {
+        self.endings.push(ending.to_owned());
+        // All of them, because the process has made the mark anew.
+        let mark = OpenOptions::new().write(true).truncate(true).open(&self.mark);
+        match mark.and_then(|mut mark| writeln!(mark, "{}", self.endings.join("\n"))) {
             Err(e) if e.kind() != ErrorKind::NotFound => Err(Error::read(self.mark.display(), e)),
             _ => Ok(()),
         }
@@ -94,13 +99,11 @@ impl SuspectFile {
     /// # Errors
     /// What the lake says.
     pub async fn refuse(&self, lake: &Lake) -> Result<Option<Report>> {
-        let deaths = fs::read_to_string(&self.mark).unwrap_or_default();
-        let deaths: Vec<_> = deaths.lines().collect();
-        if deaths.len() < MOST_DEATHS {
+        if self.endings.len() < MOST_DEATHS {
             return Ok(None);
         }
         let (file, mark) = (self.source.to_string(), self.mark.display().to_string());
-        let why = Error::Deadly { file, endings: deaths.join(", "), mark };
+        let why = Error::Deadly { file, endings: self.endings.join(", "), mark };
         let moved = files::quarantine(lake, &self.source, &why).await?;
         // The file of a run stays where it is, and its mark with it.
         if moved.is_some() {
@@ -143,12 +146,15 @@ mod tests {
         assert!(!is_suspect(), "its reading ended");
 
         // As a process leaves it that died.
-        fs::write(mark_path(&lake, &source).expect("a lake in a folder"), "").expect("written");
-        assert!(is_suspect());
-        let suspect = SuspectFile::from_source(&lake, &source).expect("a suspect");
+        let die = || fs::write(mark_path(&lake, &source).expect("a lake in a folder"), "").expect("written");
+        die();
+        let mut suspect = SuspectFile::from_source(&lake, &source).expect("a suspect");
         assert!(suspect.refuse(&lake).await.expect("asked").is_none(), "nothing was seen of it yet");
         suspect.add_death("signal: 6 (SIGABRT)").expect("written");
         assert!(suspect.refuse(&lake).await.expect("asked").is_none(), "its parent may have been killed with it");
+        // The next process looked at the file, then began to read it.
+        drop(ReadingMark::new(&lake, &source));
+        die();
         suspect.add_death("signal: 9 (SIGKILL)").expect("written");
         let report = suspect.refuse(&lake).await.expect("asked").expect("refused");
         let Report::Refused { moved: Some(moved), why, .. } = report else { panic!("{report:?}") };

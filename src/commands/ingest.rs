@@ -124,9 +124,9 @@ pub(crate) async fn take_in(
     };
     let mut outcome = Ingest::new(lake, stop.clone()).take_in(sources, &mut report).await.map_err(anyhow::Error::from);
     // All others first: these may end the process of which this one is a part.
-    for suspect in suspects.iter().filter_map(|source| SuspectFile::from_source(lake, source)) {
+    for mut suspect in suspects.iter().filter_map(|source| SuspectFile::from_source(lake, source)) {
         if outcome.is_ok() {
-            outcome = watch_suspect(lake, &suspect, stop, &mut summary, progress).await;
+            outcome = watch_suspect(lake, &mut suspect, stop, &mut summary, progress).await;
         }
     }
     let added = || summary.taken.iter().filter(|t| t.outcome == Outcome::Added);
@@ -155,13 +155,13 @@ pub(crate) async fn take_in(
 // again, it is the file's fault.
 async fn watch_suspect(
     lake: &Lake,
-    suspect: &SuspectFile,
+    suspect: &mut SuspectFile,
     stop: &AtomicBool,
     summary: &mut Summary,
     progress: &Progress,
 ) -> anyhow::Result<()> {
-    let file = suspect.source();
-    let Source::Lake(path) = file else { return Ok(()) };
+    let file = suspect.source().clone();
+    let Source::Lake(path) = &file else { return Ok(()) };
     loop {
         if let Some(report) = suspect.refuse(lake).await? {
             summary.add(report, progress);
