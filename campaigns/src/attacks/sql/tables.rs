@@ -12,7 +12,7 @@ pub(super) const ATTACKS: &[SqlAttack] = &[
     attack("mcap of a path outside", || "select * from mcap('../../../../etc/passwd', '/sweep')".into()),
     attack("mcap with a long name", || format!("select * from mcap('{}', '/sweep')", "a/".repeat(500_000))),
     attack("versions", || {
-        let tables = numbered("(select pair_id from nce version as of {} limit 1)", " union all ", 300);
+        let tables = numbered("(select pair_id + {} from nce version as of 1)", " union all ", 300);
         format!("select count(*) from ({tables})")
     }),
     attack("version without an end", || format!("select * from nce version as of {}", "9".repeat(100_000))),
@@ -34,7 +34,8 @@ pub(super) const ATTACKS: &[SqlAttack] = &[
          cross join tnce_d4 d"
             .into()
     }),
-    attack("descriptions of all", || {
-        numbered("select * from pg_catalog.pg_class a{}", " cross join pg_catalog.pg_attribute ", 4)
+    attack("descriptions joined with themselves", || {
+        let tables = numbered("pg_catalog.pg_attribute a{}", " cross join ", 6);
+        format!("select count(*) from {tables} where a0.attnum + a1.attnum < -100000")
     }),
 ];
