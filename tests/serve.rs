@@ -1,5 +1,6 @@
 //! `echolake serve` as its clients see it: answers, refusals, queries that end with who asked, and its own end.
 
+mod attacks;
 pub(crate) mod catalogue;
 mod contract;
 mod escapes;
