@@ -74,7 +74,7 @@ async fn time_rows_and_places_are_limited() {
 
 #[tokio::test]
 async fn memory_is_limited() {
-    let (_folder, engine) = engine(Limits { memory: Some(64 << 20) }).await;
+    let (_folder, engine) = engine(Limits { memory: Some(32 << 20) }).await;
     let session = session(&engine, Quota::default());
     let sql = "select count(distinct x || 'abcdefghijklmnopqrstuvwxyz') from generate_series(1, 10000000) t(x)";
     assert!(matches!(outcome(&session, sql).await, Err(Error::MemoryLimit { .. })));
