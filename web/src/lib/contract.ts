@@ -490,7 +490,7 @@ export interface components {
             readonly title: string;
             readonly status: number;
             /** @enum {string} */
-            readonly code: "query_invalid" | "read_only" | "query_failed" | "format_impossible" | "lake_unreadable" | "request_invalid" | "unsupported" | "not_found" | "gone" | "file_changed" | "no_data" | "method_not_allowed" | "range_not_satisfiable" | "request_too_large" | "unauthenticated" | "forbidden" | "foreign_origin" | "cancelled" | "time_limit" | "memory_limit" | "row_limit" | "too_many" | "internal";
+            readonly code: "query_invalid" | "read_only" | "query_failed" | "format_impossible" | "lake_unreadable" | "request_invalid" | "unsupported" | "not_found" | "gone" | "file_changed" | "no_data" | "method_not_allowed" | "range_not_satisfiable" | "request_too_large" | "unauthenticated" | "forbidden" | "foreign_origin" | "cancelled" | "time_limit" | "memory_limit" | "row_limit" | "too_many" | "query_ended_engine" | "internal";
             /** @description What is wrong; what to do follows after `; hint: ` */
             readonly detail?: string;
             readonly instance?: string;
