@@ -228,9 +228,19 @@ fn end_of(sql: &str) -> Option<(u64, u64)> {
     Some((text.lines().count() as u64, last.chars().count() as u64 + 1))
 }
 
+/// How much of a line is shown before and behind a marked place.
+const MARKED_CHARS: usize = 60;
+
 fn mark(sql: &str, line: u64, column: u64) -> Option<String> {
     let text = sql.lines().nth(usize::try_from(line.checked_sub(1)?).ok()?)?;
-    let column = usize::try_from(column.checked_sub(1)?).ok()?.min(text.chars().count());
+    let length = text.chars().count();
+    let column = usize::try_from(column.checked_sub(1)?).ok()?.min(length);
+    // Of a long line, such as a program writes, what is around the place.
+    let begin = column.saturating_sub(MARKED_CHARS);
+    let around: String = text.chars().skip(begin).take(2 * MARKED_CHARS).collect();
+    let (cut, column) = if begin > 0 { ("...", column - begin + 3) } else { ("", column) };
+    let end = if length > begin + 2 * MARKED_CHARS { "..." } else { "" };
+    let text = format!("{cut}{around}{end}");
     // Tabs stay tabs, so that the mark stands under its place however wide they are shown.
     let blank: String = text.chars().take(column).map(|c| if c == '\t' { '\t' } else { ' ' }).collect();
     Some(format!("\n  {text}\n  {blank}^"))
@@ -249,6 +259,9 @@ mod tests {
         assert_eq!(mark("select\nfrom x", 2, 6).as_deref(), Some("\n  from x\n       ^"));
         assert_eq!(mark("\tx", 1, 2).as_deref(), Some("\n  \tx\n  \t^"));
         assert_eq!(mark("select", 9, 1), None);
+        let long = format!("{}x{}", "a".repeat(100), "b".repeat(100));
+        let around = format!("\n  ...{}x{}...\n  {}^", "a".repeat(60), "b".repeat(59), " ".repeat(63));
+        assert_eq!(mark(&long, 1, 101), Some(around));
     }
 
     #[test]

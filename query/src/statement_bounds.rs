@@ -15,7 +15,7 @@ use crate::Error;
 const MOST_NESTED: usize = 100;
 /// Operators, and whatever else is written behind an expression, of one expression; also set operators and joins of one
 /// query. Twice as many still do no harm.
-const MOST_CHAINED: usize = 2_000;
+const MOST_CHAINED: usize = 1_000;
 /// Doublings of the parser's time: 2^14 tries are a few hundredths of a second.
 const MOST_DOUBLINGS: f64 = 14.0;
 /// Calls with a syntax of their own, which the parser tries up to five times.

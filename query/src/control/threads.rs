@@ -4,8 +4,8 @@ use std::time::Duration;
 
 use tokio::runtime::{Builder, Handle, Runtime};
 
-/// Stack of a thread that plans and runs: queries may nest deeply.
-const STACK: usize = 8 << 20;
+/// Stack of a thread that plans and runs: twice what the longest chain of operators takes that is let in.
+pub const STACK_BYTES: usize = 16 << 20;
 
 /// A runtime that may be dropped anywhere.
 pub struct Threads(Option<Runtime>);
@@ -19,7 +19,7 @@ impl Threads {
         let runtime = Builder::new_multi_thread()
             .worker_threads(count)
             .thread_name(name)
-            .thread_stack_size(STACK)
+            .thread_stack_size(STACK_BYTES)
             .max_blocking_threads(16)
             .thread_keep_alive(Duration::from_secs(60))
             .enable_all()

@@ -2,10 +2,12 @@
 
 use std::time::{Duration, Instant};
 
+use datafusion::sql::sqlparser::dialect::GenericDialect;
 use echolake_lake::{Lake, References};
 use echolake_schema::Rig;
 
 use super::*;
+use crate::statement_bounds::check_statement_bounds;
 
 /// How long a query may take to end that is told to; a busy machine needs some of it.
 const END_LIMIT: Duration = Duration::from_secs(120);
@@ -108,4 +110,39 @@ async fn an_answer_outlives_its_session() {
         rows += batch.num_rows();
     }
     assert_eq!(rows, 2951);
+}
+
+mod slow {
+    use super::*;
+
+    // A stack that is too small ends the whole process, and this test with it.
+    #[tokio::test]
+    async fn the_longest_chains_that_pass_fit_the_stacks() {
+        let (_folder, engine) = engine(Limits::default()).await;
+        let session = session(&engine, Quota::default());
+        for (again, end) in [
+            ("1 + ", "1"),
+            ("x + ", "1"),
+            ("x = 1 and ", "true"),
+            ("x > 7 or ", "true"),
+            ("'a' || ", "x"),
+            ("cast(x as int) :: text || ", "x"),
+            ("x union all select ", "1"),
+        ] {
+            let most = (1..1100).rev().find(|times| {
+                check_statement_bounds(&format!("select {}{end}", again.repeat(*times)), &GenericDialect {}).is_ok()
+            });
+            let sql =
+                format!("select {}{end} from generate_series(1, 2) t(x)", again.repeat(most.expect("one passes")));
+            let ended =
+                outcome(&session, &sql.replace("x union all", "x from generate_series(1, 2) t(x) union all")).await;
+            assert!(ended.is_ok(), "{again}: {:.200}", format!("{ended:?}"));
+        }
+        // What stands behind its operand.
+        for again in [" is null", "::bigint"] {
+            let sql = format!("select x{} from generate_series(1, 2) t(x)", again.repeat(999));
+            let ended = outcome(&session, &sql).await;
+            assert!(ended.is_ok(), "{again}: {:.200}", format!("{ended:?}"));
+        }
+    }
 }

@@ -3,6 +3,7 @@
 use std::io;
 use std::path::{Path, PathBuf};
 
+use echolake_query::STACK_BYTES;
 use landlock::{
     ABI, Access as _, AccessFs, AccessNet, CompatLevel, Compatible as _, Ruleset, RulesetAttr as _, RulesetCreated,
     RulesetCreatedAttr as _, RulesetError, path_beneath_rules,
@@ -13,8 +14,8 @@ use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
 const LANDLOCK: ABI = ABI::V5;
 /// The process's own figures, those of the processors, and random bytes.
 const SYSTEM: [&str; 4] = ["/proc", "/sys/fs/cgroup", "/sys/devices/system/cpu", "/dev/urandom"];
-/// Address space over what queries may hold: code, stacks of threads, caches, what the allocator keeps. The door looks at
-/// what is really used, which is far less; this limit ends one huge allocation at once.
+/// Address space over what queries and stacks may hold: code, caches, what the allocator keeps. The door looks at what is
+/// really used, which is far less; this limit ends one huge allocation at once.
 const OVERHEAD_BYTES: u64 = 1 << 30;
 
 /// Returns what this machine lacks to confine engines, for people.
@@ -62,7 +63,9 @@ fn linked_folders(lake: &Path) -> Vec<PathBuf> {
 /// The system refuses.
 pub(super) fn limit_memory(memory: Option<usize>) -> io::Result<()> {
     let Some(memory) = memory else { return Ok(()) };
-    set_limit(Resource::Data, memory as u64 + OVERHEAD_BYTES)
+    // Queries and answers have threads for each core.
+    let threads = 2 * std::thread::available_parallelism().map_or(1, usize::from);
+    set_limit(Resource::Data, (memory + threads * STACK_BYTES) as u64 + OVERHEAD_BYTES)
 }
 
 // Never above what the process was started with, which only an administrator may raise.
