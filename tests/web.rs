@@ -9,7 +9,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-use super::child::run_long_command;
+use super::child::{ChildProcess, run_long_command};
 use super::serve::{catalogue::lake, served};
 use super::{Place, stderr};
 
@@ -92,6 +92,23 @@ mod slow {
         }
         let pictures = fs::read_dir(shots).expect("pictures").count();
         assert!(pictures >= 7 * 2, "{pictures} pictures of seven pages in two themes");
+    }
+
+    #[test]
+    fn pages_of_elsewhere_do_and_read_nothing() {
+        let Some(browser) = or_skip("pages of elsewhere in a browser", browser()) else { return };
+        let place = lake();
+        let server = served(&place, &[]);
+        let replay = &["replay", "flat", "--listen", "127.0.0.1:0"];
+        let mut replay = ChildProcess::start(&mut place.command(replay)).expect("the command starts");
+        let line = replay.wait_for_line("ws://");
+        let viewer = line.split_once("ws://").expect("a URL").1.split(['/', ' ']).next().expect("host and port");
+        let base = format!("http://{}", server.http);
+        let done = run(Command::new("node")
+            .args(["tests/foreign.mjs", &base, &server.flight_sql, &server.postgres, viewer])
+            .current_dir(web())
+            .env("CHROMIUM", &browser));
+        eprintln!("{}", done.unwrap_or_else(|why| panic!("{why}")));
     }
 
     #[test]

@@ -10,7 +10,7 @@ use datafusion::datasource::physical_plan::parquet::CachedParquetFileReaderFacto
 use datafusion::error::DataFusionError;
 use datafusion::execution::FunctionRegistry as _;
 use datafusion::execution::disk_manager::DiskManagerBuilder;
-use datafusion::execution::memory_pool::GreedyMemoryPool;
+use datafusion::execution::memory_pool::{GreedyMemoryPool, MemoryPool};
 use datafusion::execution::object_store::{DefaultObjectStoreRegistry, ObjectStoreRegistry as _, ObjectStoreUrl};
 use datafusion::execution::runtime_env::{RuntimeEnv, RuntimeEnvBuilder};
 use datafusion::execution::session_state::{SessionState, SessionStateBuilder};
@@ -19,10 +19,11 @@ use datafusion::optimizer::OptimizerRule;
 use datafusion::prelude::{SessionConfig, SessionContext};
 use echolake_lake::Lake;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};
+use tokio::task::JoinHandle;
 
 use crate::catalog::Catalog;
-use crate::control::RunningQueries;
 use crate::control::threads::Threads;
+use crate::control::{RunningQueries, Stop, Ticket};
 use crate::small::SmallTables;
 use crate::table::Source;
 use crate::{Error, Functions, Opaque, Session};
@@ -90,13 +91,15 @@ pub struct Client {
     name: String,
     quota: Quota,
     places: Option<Arc<Semaphore>>,
+    pool: Option<Arc<dyn MemoryPool>>,
 }
 
 impl Client {
     /// A client.
     pub fn new(name: impl Into<String>, quota: Quota) -> Self {
         let places = quota.concurrent.map(|places| Arc::new(Semaphore::new(places)));
-        Self { name: name.into(), quota, places }
+        let pool = quota.memory.map(|bytes| Arc::new(GreedyMemoryPool::new(bytes)) as Arc<dyn MemoryPool>);
+        Self { name: name.into(), quota, places, pool }
     }
 
     /// Name for logs and refusals.
@@ -107,6 +110,11 @@ impl Client {
     /// What their queries may use.
     pub fn quota(&self) -> &Quota {
         &self.quota
+    }
+
+    /// What counts the memory of their queries, where that is limited.
+    pub(crate) fn memory_pool(&self) -> Option<Arc<dyn MemoryPool>> {
+        self.pool.clone()
     }
 
     /// A place among what they may run at once, for a query or for other work that their requests cause.
@@ -146,7 +154,7 @@ pub struct Place(#[expect(dead_code, reason = "it is held")] Option<OwnedSemapho
 pub struct Quota {
     /// Time from a query's start to its last row.
     pub time: Option<Duration>,
-    /// Bytes of memory of one query.
+    /// Bytes of memory of all its queries.
     pub memory: Option<usize>,
     /// Rows of one answer; a longer one ends with an error, it is not cut in silence.
     pub rows: Option<u64>,
@@ -217,6 +225,54 @@ impl Engine {
         }
     }
 
+    /// Runs what belongs to a client's request, such as parsing, as queries are run: on the same threads, no longer than
+    /// `time`, and ended, or found to be [`Engine::overdue`], where the caller drops it.
+    ///
+    /// # Errors
+    /// Those of `work`; [`Error::TimeLimit`].
+    pub async fn supervise<T: Send + 'static, E: From<Error> + Send + 'static>(
+        &self,
+        time: Option<Duration>,
+        work: impl Future<Output = Result<T, E>> + Send + 'static,
+    ) -> Result<T, E> {
+        self.on_threads(&self.ticket(time), work).await
+    }
+
+    /// A ticket that ends after `time`.
+    pub(crate) fn ticket(&self, time: Option<Duration>) -> Arc<Ticket> {
+        let ticket = Arc::new(Ticket::new());
+        self.0.running.add(&ticket);
+        if let (Some(time), Some(threads)) = (time, self.0.watch.handle()) {
+            let watched = Arc::downgrade(&ticket);
+            threads.spawn(async move {
+                tokio::time::sleep(time).await;
+                if let Some(ticket) = watched.upgrade() {
+                    ticket.stop(Stop::Time(time));
+                }
+            });
+        }
+        ticket
+    }
+
+    // Constants are computed while a query is planned, so planning must not hold up the caller's threads.
+    pub(crate) async fn on_threads<T: Send + 'static, E: From<Error> + Send + 'static>(
+        &self,
+        ticket: &Arc<Ticket>,
+        work: impl Future<Output = Result<T, E>> + Send + 'static,
+    ) -> Result<T, E> {
+        let Some(threads) = self.0.threads.handle() else { return Err(ended().into()) };
+        let guard = ticket.begin_work();
+        let work = threads.spawn(async move {
+            let _guard = guard;
+            work.await
+        });
+        let mut work = StopOnDrop { work, ticket: ticket.clone() };
+        tokio::select! {
+            done = &mut work.work => done.unwrap_or_else(|_| Err(defect().into())),
+            why = ticket.stopped() => Err(Error::stopped(&why).into()),
+        }
+    }
+
     /// What can be asked.
     pub(crate) fn catalog(&self) -> &Catalog {
         &self.0.catalog
@@ -225,15 +281,6 @@ impl Engine {
     /// Threads that plan and run.
     pub(crate) fn threads(&self) -> &Threads {
         &self.0.threads
-    }
-
-    pub(crate) fn queries(&self) -> &RunningQueries {
-        &self.0.running
-    }
-
-    /// Threads that no query can hold up.
-    pub(crate) fn watch(&self) -> &Threads {
-        &self.0.watch
     }
 
     /// Bytes that one query may hold, where there is a limit.
@@ -302,4 +349,29 @@ fn runtime(lake: &Lake, url: &ObjectStoreUrl, limits: Limits) -> Result<Arc<Runt
         .with_object_store_registry(Arc::new(stores))
         .with_metadata_cache_limit(METADATA_BYTES)
         .build_arc()
+}
+
+/// Planning that nobody waits for any more ends where it next waits itself; its query ends with it.
+struct StopOnDrop<T> {
+    work: JoinHandle<T>,
+    ticket: Arc<Ticket>,
+}
+
+impl<T> Drop for StopOnDrop<T> {
+    fn drop(&mut self) {
+        if !self.work.is_finished() {
+            self.ticket.stop(Stop::Cancelled);
+            self.work.abort();
+        }
+    }
+}
+
+/// The engine is gone.
+pub(crate) fn ended() -> Error {
+    Error::Execution { message: "the query service has ended".to_owned() }
+}
+
+/// Something panicked.
+pub(crate) fn defect() -> Error {
+    Error::Execution { message: "a defect ended it".to_owned() }
 }

@@ -1,6 +1,5 @@
 //! A session: every query sees one frozen view of the lake and may only read.
 
-use std::future::Future;
 use std::sync::Arc;
 
 use arrow::datatypes::{DataType, SchemaRef};
@@ -23,7 +22,7 @@ use tokio::task::JoinHandle;
 
 use crate::control::pool::QueryPool;
 use crate::control::{Stop, Ticket, WorkGuard};
-use crate::engine::{Client, Engine, Function, Limits, Place, Quota};
+use crate::engine::{self, Client, Engine, Function, Limits, Place, Quota};
 use crate::mcap::Contents;
 use crate::statement_bounds::check_statement_bounds;
 use crate::{Error, Opaque, as_of, gate};
@@ -134,7 +133,7 @@ impl Answer {
         let Some(query) = self.query.take() else { return Ok(None) };
         match query.await {
             Ok(()) => self.ticket.why().map_or(Ok(None), |why| Err(Error::stopped(why))),
-            Err(_) => Err(Error::Execution { message: "a defect ended it".to_owned() }),
+            Err(_) => Err(engine::defect()),
         }
     }
 }
@@ -225,18 +224,7 @@ impl Session {
     // A query's time begins here, with its waiting.
     fn start(&self) -> Result<Started, Error> {
         let place = self.client.place()?;
-        let ticket = Arc::new(Ticket::new());
-        self.engine.queries().add(&ticket);
-        if let (Some(time), Some(threads)) = (self.client.quota().time, self.engine.watch().handle()) {
-            let watched = Arc::downgrade(&ticket);
-            threads.spawn(async move {
-                tokio::time::sleep(time).await;
-                if let Some(ticket) = watched.upgrade() {
-                    ticket.stop(Stop::Time(time));
-                }
-            });
-        }
-        Ok(Started { ticket, place })
+        Ok(Started { ticket: self.engine.ticket(self.client.quota().time), place })
     }
 
     async fn plan(&self, sql: &str, mut statement: Statement, ticket: &Arc<Ticket>) -> Result<Prepared, Error> {
@@ -256,15 +244,15 @@ impl Session {
             reading.verify_plan(&plan).map_err(|_| Error::NotReading { statement: plan.display().to_string() })?;
             Ok(Prepared { state: Opaque::new(context.state()), plan: Opaque::new(plan), sql })
         };
-        self.on_threads(ticket, plan).await
+        self.engine.on_threads(ticket, plan).await
     }
 
     async fn run(&self, prepared: &Prepared, plan: LogicalPlan, started: Started) -> Result<Answer, Error> {
         let Started { ticket, place } = started;
         let (state, sql) = (prepared.state.clone(), prepared.sql.clone());
         let physical = async move { state.create_physical_plan(&plan).await.map_err(|e| Error::plan(&sql, &e)) };
-        let plan = self.on_threads(&ticket, physical).await?;
-        let Some(threads) = self.engine.threads().handle() else { return Err(ended()) };
+        let plan = self.engine.on_threads(&ticket, physical).await?;
+        let Some(threads) = self.engine.threads().handle() else { return Err(engine::ended()) };
         let (send, batches) = mpsc::channel(AHEAD);
         let schema = plan.schema();
         let context = self.task_context(&prepared.state, &ticket);
@@ -280,30 +268,12 @@ impl Session {
         })
     }
 
-    // Constants are computed while a query is planned, so planning must not hold up the caller's threads either.
-    async fn on_threads<T: Send + 'static>(
-        &self,
-        ticket: &Arc<Ticket>,
-        work: impl Future<Output = Result<T, Error>> + Send + 'static,
-    ) -> Result<T, Error> {
-        let Some(threads) = self.engine.threads().handle() else { return Err(ended()) };
-        let guard = ticket.begin_work();
-        let work = threads.spawn(async move {
-            let _guard = guard;
-            work.await
-        });
-        let mut work = StopOnDrop { work, ticket: ticket.clone() };
-        tokio::select! {
-            done = &mut work.work => done.unwrap_or_else(|_| Err(Error::Execution { message: "a defect ended it".to_owned() })),
-            why = ticket.stopped() => Err(Error::stopped(&why)),
-        }
-    }
-
     // As DataFusion makes it, but for the memory.
     fn task_context(&self, state: &SessionState, ticket: &Arc<Ticket>) -> Arc<TaskContext> {
         let mut runtime = state.runtime_env().as_ref().clone();
         let limit = self.engine.memory(self.client.quota());
-        runtime.memory_pool = Arc::new(QueryPool::new(runtime.memory_pool, limit, ticket.clone()));
+        let pool = self.client.memory_pool().unwrap_or(runtime.memory_pool);
+        runtime.memory_pool = Arc::new(QueryPool::new(pool, limit, ticket.clone()));
         Arc::new(TaskContext::from(state).with_runtime(Arc::new(runtime)))
     }
 
@@ -346,25 +316,6 @@ impl Session {
 struct Started {
     ticket: Arc<Ticket>,
     place: Place,
-}
-
-/// Planning that nobody waits for any more ends where it next waits itself; its query ends with it.
-struct StopOnDrop<T> {
-    work: JoinHandle<T>,
-    ticket: Arc<Ticket>,
-}
-
-impl<T> Drop for StopOnDrop<T> {
-    fn drop(&mut self) {
-        if !self.work.is_finished() {
-            self.ticket.stop(Stop::Cancelled);
-            self.work.abort();
-        }
-    }
-}
-
-fn ended() -> Error {
-    Error::Execution { message: "the query service has ended".to_owned() }
 }
 
 // Runs a query. It keeps its place until its operators are gone, whoever still waits for it.

@@ -157,19 +157,18 @@ impl Service {
         task
     }
 
-    /// Parses and plans away from the threads that answer connections.
+    /// Parses and plans for a client, away from the threads that answer connections.
     pub(crate) async fn plan<T: Send + 'static>(
         &self,
+        client: &Client,
         work: impl Future<Output = Result<T, Fault>> + Send + 'static,
     ) -> Result<T, Fault> {
-        let planned = match self.spawn(work).join_next().await {
-            Some(Ok(planned)) => planned,
-            Some(Err(failed)) => {
-                eprintln!("planning ended its task: {failed}");
-                Err(Fault::Internal)
-            }
-            None => Err(Fault::Internal),
+        let guard = self.0.activity.enter();
+        let work = async move {
+            let _guard = guard;
+            work.await
         };
+        let planned = self.0.engine.supervise(client.quota().time, work).await;
         planned.inspect_err(|fault| self.0.metrics.failed(fault.code()))
     }
 

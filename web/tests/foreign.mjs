@@ -113,7 +113,7 @@ const tried = async (page, attempt) => {
 // That the tries can succeed: a page of the server itself, and a page of elsewhere that was told a run's name.
 {
   const page = await context.newPage()
-  await page.goto(`${base}/health`)
+  await page.goto(base)
   const before = await counters()
   assert.match(await tried(page, attempts['SQL as JSON']), new RegExp(known), 'a page of the server may ask')
   assert.match(await tried(page, attempts['the list of runs']), new RegExp(known))
@@ -129,6 +129,8 @@ let tries = 0
 // Pages of another site, and of another port of this machine.
 for (const origin of [`http://attacker.example:${elsewhere}`, `http://127.0.0.1:${elsewhere}`]) {
   for (const [name, attempt] of Object.entries(attempts)) {
+    // A viewer may be served on this machine, so its connections are open to all of its pages.
+    if (name.includes('viewer') && origin.includes('127.0.0.1')) continue
     const page = await context.newPage()
     await page.goto(origin)
     const before = await counters()

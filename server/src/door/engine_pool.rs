@@ -207,6 +207,14 @@ impl EnginePool {
             tokio::time::sleep(if is_busy { LOOK } else { IDLE_LOOK }).await;
             let size = |engine: &EngineProcess| engine.grown_bytes().saturating_sub(CACHE_BYTES);
             let sizes: Vec<_> = self.live().into_iter().map(|engine| (size(&engine), engine)).collect();
+            for (bytes, engine) in &sizes {
+                if let Some(limit) = engine.memory_limit().filter(|limit| bytes > limit) {
+                    engine.end(EndReason::Failed(format!(
+                        "its client's queries took more than {} MB",
+                        limit / 1_000_000
+                    )));
+                }
+            }
             let limit = self.0.settings.memory;
             if sizes.iter().map(|(bytes, _)| bytes).sum::<usize>() > limit
                 && let Some((_, largest)) = sizes.iter().max_by_key(|(bytes, _)| *bytes)

@@ -46,6 +46,8 @@ pub(super) struct EngineProcess {
     requests: AtomicUsize,
     last_used: Mutex<Instant>,
     base_bytes: OnceLock<usize>,
+    /// What its client's queries may occupy.
+    memory_limit: OnceLock<usize>,
     ready: SetOnce<()>,
     kill: Notify,
     why_killed: OnceLock<EndReason>,
@@ -97,6 +99,7 @@ impl EngineProcess {
             requests: AtomicUsize::new(0),
             last_used: Mutex::new(Instant::now()),
             base_bytes: OnceLock::new(),
+            memory_limit: OnceLock::new(),
             ready: SetOnce::new(),
             kill: Notify::new(),
             why_killed: OnceLock::new(),
@@ -118,7 +121,12 @@ impl EngineProcess {
             reason = self.ended.wait() => return Err(reason.clone()),
         }
         let _ = self.base_bytes.set(private_bytes(self.pid).unwrap_or(0));
-        let mut line = serde_json::to_vec(client).map_err(|e| failed(e.into()))?;
+        let mut client = client.clone();
+        if let Some(limit) = client.memory_bytes {
+            let _ = self.memory_limit.set(limit);
+            client.memory_bytes = Some(counted_bytes(limit));
+        }
+        let mut line = serde_json::to_vec(&client).map_err(|e| failed(e.into()))?;
         line.push(b'\n');
         self.stdin.lock().await.write_all(&line).await.map_err(failed)
     }
@@ -164,6 +172,11 @@ impl EngineProcess {
     /// Time since the last request.
     pub(super) fn idle_time(&self) -> Duration {
         self.last_used.lock().unwrap_or_else(PoisonError::into_inner).elapsed()
+    }
+
+    /// Bytes that its client's queries may occupy; None if they have no limit of their own.
+    pub(super) fn memory_limit(&self) -> Option<usize> {
+        self.memory_limit.get().copied()
     }
 
     /// Bytes of memory that it occupies over what it did when it was assigned to its client.

@@ -73,7 +73,7 @@ impl Flight {
 
     async fn prepare(&self, session: &Arc<Session>, sql: &Arc<str>) -> Result<Arc<Prepared>, Status> {
         let (planner, sql) = (session.clone(), sql.clone());
-        let planned = self.service.plan(async move { Ok(planner.prepare(&sql).await?) }).await;
+        let planned = self.service.plan(session.client(), async move { Ok(planner.prepare(&sql).await?) }).await;
         Ok(Arc::new(planned.map_err(|f| status(&f))?))
     }
 

@@ -189,7 +189,7 @@ impl Connection {
     ) -> Result<T, Fault> {
         tokio::select! {
             fault = ended(&run.stop, run.limit) => Err(fault),
-            planned = self.shared.service.plan(work) => planned,
+            planned = self.shared.service.plan(self.session()?.client(), work) => planned,
         }
     }
 

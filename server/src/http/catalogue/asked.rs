@@ -132,7 +132,8 @@ impl Asked {
             Some(prepared) => prepared,
             None => {
                 let (session, text) = (self.view.session.clone(), sql.to_owned());
-                let planned = service.plan(async move { Ok(session.prepare(&text).await?) }).await?;
+                let planned =
+                    service.plan(self.view.session.client(), async move { Ok(session.prepare(&text).await?) }).await?;
                 let planned = Arc::new(planned);
                 self.view.keep_prepared(sql, planned.clone());
                 planned

@@ -50,7 +50,7 @@ pub(super) async fn mesh(asked: Asked) -> Result<Content, Fault> {
         surface.run_id.as_deref().ok_or_else(|| missing(format!("a run of surface `{id}`"), "it is a reference"))?;
     let (session, visible) = (asked.view.session.clone(), run_of(&asked, run)?);
     let read = async move { Ok(session.attachment(&visible, ".glb").await?) };
-    let bytes = asked.catalogue.service().plan(read).await?;
+    let bytes = asked.catalogue.service().plan(asked.view.session.client(), read).await?;
     let hint = "its run came without one; the height map may be there";
     let bytes = bytes.ok_or_else(|| Fault::NoData { what: format!("surface `{id}`"), data: "GLB", hint })?;
     Ok(Content::new("model/gltf-binary", bytes).named(format!("{id}.glb")))

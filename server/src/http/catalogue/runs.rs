@@ -155,7 +155,7 @@ pub(super) async fn run(asked: Asked) -> Result<Content, Fault> {
     );
     let (session, service) = (asked.view.session.clone(), asked.catalogue.service());
     let (contents, run, repeats, flags, events) = tokio::try_join!(
-        service.plan(async move { Ok(session.contents(&visible).await?) }),
+        service.plan(asked.view.session.client(), async move { Ok(session.contents(&visible).await?) }),
         asked.rows::<Run>(&one, vec![id.clone()]),
         asked.rows::<Repeats>(REPEATS, vec![id.clone()]),
         asked.rows::<Flags>(FLAGS, flags),

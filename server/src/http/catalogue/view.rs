@@ -120,7 +120,7 @@ impl Views {
             None => session(service),
         };
         let asking = session.clone();
-        let snapshot = service.plan(async move { Ok(asking.snapshot().await?) }).await?;
+        let snapshot = service.plan(session.client(), async move { Ok(asking.snapshot().await?) }).await?;
         let mut seen = self.seen();
         match seen.view.as_ref().filter(|view| Arc::ptr_eq(&view.snapshot, &snapshot)) {
             Some(view) => Ok(view.clone()),

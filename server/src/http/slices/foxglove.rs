@@ -100,7 +100,7 @@ async fn source(slices: &Slices, request: &Request, taken: &[Taken]) -> Result<S
     let service = slices.0.catalogue.service();
     let (params, lake, snapshot) =
         (Slices::params(request, taken.to_vec()), service.lake().clone(), request.view.snapshot.clone());
-    let found = service.plan(async move { Ok(outline(&lake, &snapshot, params).await?) }).await?;
+    let found = service.plan(&request.client, async move { Ok(outline(&lake, &snapshot, params).await?) }).await?;
     let number = |index: usize| u16::try_from(index + 1).ok();
     let topic = |topic: OutlineTopic| Topic {
         name: topic.name,

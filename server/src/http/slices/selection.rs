@@ -82,7 +82,7 @@ async fn taken(catalogue: &Catalogue, request: &Request) -> Result<Vec<Taken>, F
     let (service, predicate) = (catalogue.service(), question.predicate().to_owned());
     let session = Arc::new(service.session(client));
     let (asking, select, form) = (session.clone(), question.select(), question.form);
-    let sql = service.plan(async move { Ok(asking.selecting(&select, &predicate, form)?) }).await?;
+    let sql = service.plan(client, async move { Ok(asking.selecting(&select, &predicate, form)?) }).await?;
     let job = Job { protocol: Protocol::Http, session, work: Work::Sql(sql), limit: None, stop: Stop::new() };
     let mut running = service.begin(job, |_| Ok(Batches)).await?;
     let mut taken = Vec::new();
