@@ -14,8 +14,7 @@ use rand::{Rng as _, SeedableRng as _};
 use rand_chacha::ChaCha8Rng;
 
 use super::observed_server::{
-    ClientGroup, LightLoad, LightReport, ObservedServer, QueryOutcome, QueryProtocol, RightAnswers, kill_process,
-    take_right_answers,
+    ClientGroup, ObservedServer, QueryOutcome, QueryProtocol, RightAnswers, kill_process, take_right_answers,
 };
 
 /// Clients at once.
@@ -24,8 +23,6 @@ const READERS: usize = 8;
 const NAMES: usize = 4;
 const CLIENTS: ClientGroup =
     ClientGroup { name: "reader", count: READERS * NAMES, limits: "seconds = 60\nmemory_mb = 400\nconcurrent = 4\n" };
-const LIGHT_CLIENTS: ClientGroup =
-    ClientGroup { name: "light", count: 3, limits: "seconds = 30\nmemory_mb = 200\nconcurrent = 4\n" };
 /// Answers of some megabytes, in an order, which take a while to come.
 const QUERIES: [&str; 3] = [
     "select v, repeat('x', 50) as x from generate_series(1, 100000) t(v)",
@@ -60,7 +57,6 @@ pub(crate) struct KillReport {
     broken_off: usize,
     /// Connections that ended without a code.
     pub(crate) lost: BTreeMap<QueryProtocol, usize>,
-    light: LightReport,
 }
 
 pub(crate) fn run(args: &EngineKillsArgs) -> Result<()> {
@@ -75,8 +71,6 @@ pub(crate) fn run(args: &EngineKillsArgs) -> Result<()> {
     for (protocol, count) in &report.lost {
         println!("  {:17} ended without a code: {count}", protocol.name());
     }
-    let (light, failures) = (report.light.queries.len(), &report.light.failures);
-    println!("  other clients: {light} light queries, {} failed {failures:?}", failures.len());
     ensure!(report.is_goal_reached(), "goals are missed: no wrong answer, and a code for each that is not whole");
     Ok(())
 }
@@ -86,11 +80,10 @@ pub(crate) fn run(args: &EngineKillsArgs) -> Result<()> {
 /// # Errors
 /// The lake cannot be made, the undisturbed server fails, or it has no engines.
 pub(crate) fn run_kills(binary: &Path, kills: usize, seed: u64) -> Result<KillReport> {
-    let mut server = ObservedServer::start(binary, &[CLIENTS, LIGHT_CLIENTS])?;
+    let mut server = ObservedServer::start(binary, &[CLIENTS])?;
     let right = take_right_answers(&server.client(CLIENTS.name, 0), &QUERIES)?;
     let report = Mutex::new(KillReport::default());
     let is_stopped = AtomicBool::new(false);
-    let light = LightLoad::start(&server);
     let killed = std::thread::scope(|scope| {
         for reader in 0..READERS {
             let (server, right, report, is_stopped) = (&server, &right, &report, &is_stopped);
@@ -101,7 +94,6 @@ pub(crate) fn run_kills(binary: &Path, kills: usize, seed: u64) -> Result<KillRe
         killed
     });
     let mut report = report.into_inner().unwrap_or_else(PoisonError::into_inner);
-    report.light = light.stop();
     report.kills = killed?;
     ensure!(server.is_alive(), "the server died: {}", server.last_words());
     Ok(report)
@@ -109,7 +101,7 @@ pub(crate) fn run_kills(binary: &Path, kills: usize, seed: u64) -> Result<KillRe
 
 impl KillReport {
     pub(crate) fn is_goal_reached(&self) -> bool {
-        self.wrong == 0 && self.lost.is_empty() && self.light.failures.is_empty()
+        self.wrong == 0 && self.lost.is_empty()
     }
 
     fn add(&mut self, protocol: QueryProtocol, outcome: QueryOutcome, expected: &QueryOutcome) {
