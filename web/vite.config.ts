@@ -4,7 +4,7 @@ import { readdir, readFile, writeFile } from 'node:fs/promises'
 import { join } from 'node:path'
 import { brotliCompressSync, gzipSync } from 'node:zlib'
 import { svelte } from '@sveltejs/vite-plugin-svelte'
-import { defineConfig, type Plugin } from 'vite'
+import { defineConfig, type Plugin, type ProxyOptions } from 'vite'
 
 const TEXT = /\.(html|js|css|svg|txt|json)$/
 /** Smaller files fit a packet. */
@@ -43,8 +43,21 @@ function packed(): Plugin {
   }
 }
 
+/** The server that answers while the pages are worked on. */
+const SERVER = process.env.ECHOLAKE ?? 'http://127.0.0.1:8080'
+
+/** Passes requests on to it. To the server, pages of this port are elsewhere; they alone are made its own. */
+const toServer: ProxyOptions = {
+  target: SERVER,
+  changeOrigin: true,
+  configure: (proxy) => proxy.on('proxyReq', (passed, request) => {
+    if (request.headers.origin === `http://${request.headers.host}`) passed.setHeader('origin', SERVER)
+  }),
+}
+
 export default defineConfig({
   plugins: [svelte(), packed()],
+  server: { proxy: { '/api': toServer, '/health': toServer, '/metrics': toServer } },
   build: {
     target: 'es2022', assetsInlineLimit: 0, modulePreload: { polyfill: false }, reportCompressedSize: true,
     chunkSizeWarningLimit: 900, license: { fileName: LICENCES },

@@ -111,7 +111,7 @@ impl HashedFile {
     pub(crate) fn finish(mut self) -> Result<WrittenFile> {
         let synced = self.file.flush().and_then(|()| self.file.get_ref().sync_all());
         synced.map_err(|e| Error::write(&self.named, e))?;
-        Ok(WrittenFile { name: self.name, bytes: self.bytes, sha256: hex(&self.sha.finalize()) })
+        Ok(WrittenFile { name: self.name, bytes: self.bytes, sha256: hex::encode(self.sha.finalize()) })
     }
 }
 
@@ -190,11 +190,6 @@ impl Drop for PendingFile {
         // After publishing there is no such file; before, the failure that led here is the one to tell.
         let _ = fs::remove_file(&self.partial);
     }
-}
-
-/// Lower-case hexadecimal.
-pub(crate) fn hex(bytes: &[u8]) -> String {
-    bytes.iter().map(|b| format!("{b:02x}")).collect()
 }
 
 fn partial_of(path: &Path) -> PathBuf {

@@ -13,7 +13,6 @@ use crate::CODE_VERSION;
 use crate::derive::{Flats, Means, derivation_plan};
 use crate::error::{Error, Result};
 use crate::read_back;
-use crate::run_reader::hex;
 
 /// Hex digits that a version keeps of its digest.
 const VERSION_DIGITS: usize = 12;
@@ -200,5 +199,5 @@ pub(crate) fn digest(parts: &[impl AsRef<str>]) -> String {
         sha.update(part.as_ref());
         sha.update("\n");
     }
-    hex(&sha.finalize())[..VERSION_DIGITS].to_owned()
+    hex::encode(sha.finalize())[..VERSION_DIGITS].to_owned()
 }

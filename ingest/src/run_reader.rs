@@ -174,7 +174,7 @@ impl RunReader {
         self.pass(self.size - self.offset).await?;
         Ok(Integrity {
             bytes: self.size,
-            sha256: hex(&self.digest.finalize()),
+            sha256: hex::encode(self.digest.finalize()),
             closed: self.end == Some(End::Closed),
             damage: self.damage,
         })
@@ -489,6 +489,3 @@ fn u32_at(bytes: &[u8], at: usize) -> u32 {
     u32::from_le_bytes([bytes[at], bytes[at + 1], bytes[at + 2], bytes[at + 3]])
 }
 
-pub(crate) fn hex(bytes: &[u8]) -> String {
-    bytes.iter().map(|b| format!("{b:02x}")).collect()
-}

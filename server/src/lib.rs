@@ -23,7 +23,6 @@ mod flight;
 mod http;
 mod metrics;
 mod postgres;
-mod random;
 mod running;
 mod service;
 mod sessions;

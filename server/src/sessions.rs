@@ -7,7 +7,6 @@ use std::time::{Duration, Instant};
 
 use sha2::{Digest as _, Sha256};
 
-use crate::random;
 
 /// How long a session is good for.
 pub(crate) const LIFETIME: Duration = Duration::from_secs(12 * 3600);
@@ -31,7 +30,9 @@ impl Sessions {
     /// # Errors
     /// Where the system gives no random bytes.
     pub(crate) fn begin(&self, holder: usize) -> io::Result<String> {
-        let secret = random::hex(&random::bytes::<32>()?);
+        let mut random = [0; 32];
+        getrandom::fill(&mut random)?;
+        let secret = hex::encode(random);
         let mut sessions = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         sessions.retain(|s| s.begun.elapsed() < LIFETIME);
         if sessions.len() >= MOST {

@@ -15,7 +15,7 @@ use subtle::{Choice, ConstantTimeEq as _};
 use crate::client_identity::ClientIdentity;
 use crate::fault::Fault;
 use crate::sessions::Sessions;
-use crate::{Error, random};
+use crate::{Error};
 
 /// Of basic credentials; padding is cut off before, since gRPC's clients leave it out.
 const BASE64: GeneralPurpose = GeneralPurpose::new(&STANDARD, NO_PAD.with_decode_allow_trailing_bits(true));
@@ -82,8 +82,9 @@ fn reading() -> Vec<Scope> {
 impl Line {
     fn entry(&self) -> Result<Entry, String> {
         let name = &self.name;
-        let hash = random::unhex(&self.sha256)
-            .ok_or_else(|| format!("the sha256 of `{name}` is not 64 hexadecimal digits"))?;
+        let mut hash = [0; 32];
+        hex::decode_to_slice(&self.sha256, &mut hash)
+            .map_err(|_| format!("the sha256 of `{name}` is not 64 hexadecimal digits"))?;
         let at_least_one = |what: &str, value: Option<u64>| match value {
             Some(0) => Err(format!("{what} of `{name}` is 0; hint: leave it out where there is no limit")),
             _ => Ok(()),
@@ -157,9 +158,10 @@ pub struct Fresh {
 /// # Errors
 /// [`Error::Random`].
 pub fn fresh(name: &str) -> Result<Fresh, Error> {
-    let secret: [u8; 32] = random::bytes().map_err(Error::Random)?;
-    let token = format!("{PREFIX}{}", random::hex(&secret));
-    let hash = random::hex(&Sha256::digest(token.as_bytes()));
+    let mut secret = [0; 32];
+    getrandom::fill(&mut secret).map_err(|failed| Error::Random(failed.into()))?;
+    let token = format!("{PREFIX}{}", hex::encode(secret));
+    let hash = hex::encode(Sha256::digest(token.as_bytes()));
     let name = toml::Value::from(name);
     let lines = format!(
         "[[token]]\nname = {name}\nsha256 = \"{hash}\"\nscopes = [\"sql\", \"files\"]\n\
@@ -281,7 +283,7 @@ mod tests {
 
     #[test]
     fn scopes_are_those_that_a_line_names() {
-        let hash = random::hex(&Sha256::digest("x"));
+        let hash = hex::encode(Sha256::digest("x"));
         let allowed = |scopes: &str| {
             let file = Tokens::parse(&format!("[[token]]\nname = 'a'\nsha256 = '{hash}'\n{scopes}")).expect("tokens");
             let access = Access::new(Some(file));

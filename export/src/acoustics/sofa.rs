@@ -8,7 +8,7 @@ use sha2::{Digest as _, Sha256};
 
 use super::Responses;
 use crate::error::{Error, Result};
-use crate::output::{PendingFolder, WrittenFile, hex};
+use crate::output::{PendingFolder, WrittenFile};
 
 /// What netCDF calls a dimension that has no coordinates.
 const NO_VARIABLE: &str = "This is a netCDF dimension but not a netCDF variable.";
@@ -26,7 +26,7 @@ pub(super) fn write(lake: &Lake, responses: &Responses, folder: &PendingFolder) 
     fill(&file, lake, responses).map_err(failed)?;
     file.close().map_err(failed)?;
     let bytes = std::fs::read(&path).map_err(|e| Error::write(&folder.named(&name), e))?;
-    Ok(WrittenFile { name, bytes: bytes.len() as u64, sha256: hex(&Sha256::digest(&bytes)) })
+    Ok(WrittenFile { name, bytes: bytes.len() as u64, sha256: hex::encode(Sha256::digest(&bytes)) })
 }
 
 fn fill(file: &H5File, lake: &Lake, responses: &Responses) -> std::result::Result<(), Hdf5Error> {

@@ -8,6 +8,7 @@ use std::collections::{BTreeMap, BTreeSet, HashSet, VecDeque};
 
 use echolake_schema::topics;
 use mcap::records::ChunkIndex;
+use prost::Message as _;
 
 use super::source::{Message, Source};
 use super::{ONCE, Taken, is_named};
@@ -211,47 +212,27 @@ fn names_pair(topic: &str) -> bool {
     matches!(topic, topics::SWEEP | topics::IR | topics::MEASUREMENT)
 }
 
-// Pair and attempt of the messages that have them: fields 1 and 2, varints that are left out where they are 0.
+/// The fields with which these messages begin.
+#[derive(Clone, PartialEq, prost::Message)]
+struct PairAttempt {
+    #[prost(uint32, tag = "1")]
+    pair_id: u32,
+    #[prost(uint32, tag = "2")]
+    attempt: u32,
+}
+
 fn key_of(topic: &str, data: &[u8]) -> Option<Key> {
     if !names_pair(topic) {
         return None;
     }
-    let (mut key, mut rest) = ((0, 0), data);
-    while !rest.is_empty() {
-        let tag = varint(&mut rest)?;
-        match (tag >> 3, tag & 7) {
-            (1, 0) => key.0 = u32::try_from(varint(&mut rest)?).ok()?,
-            (2, 0) => key.1 = u32::try_from(varint(&mut rest)?).ok()?,
-            (_, 0) => drop(varint(&mut rest)?),
-            (_, 1) => rest = rest.get(8..)?,
-            (_, 2) => {
-                let length = usize::try_from(varint(&mut rest)?).ok()?;
-                rest = rest.get(length..)?;
-            }
-            (_, 5) => rest = rest.get(4..)?,
-            _ => return None,
-        }
-    }
-    Some(key)
-}
-
-fn varint(rest: &mut &[u8]) -> Option<u64> {
-    let mut value = 0u64;
-    for shift in (0..64).step_by(7) {
-        let (byte, behind) = rest.split_first()?;
-        *rest = behind;
-        value |= u64::from(byte & 0x7f) << shift;
-        if byte & 0x80 == 0 {
-            return Some(value);
-        }
-    }
-    None
+    let PairAttempt { pair_id, attempt } = PairAttempt::decode(data).ok()?;
+    Some((pair_id, attempt))
 }
 
 #[cfg(test)]
 mod tests {
     use echolake_schema::messages::{ImpulseResponse, Measurement, SampleFormat, SweepRecording};
-    use prost::Message as _;
+
 
     use super::*;
 

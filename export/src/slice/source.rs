@@ -20,7 +20,6 @@ use sha2::{Digest as _, Sha256};
 
 use super::Check;
 use crate::error::{Error, Result};
-use crate::output::hex;
 use crate::rows;
 
 /// Opcode and length in front of every record.
@@ -114,7 +113,7 @@ impl Source {
         for start in (0..self.file.bytes).step_by(BLOCK as usize) {
             sha.update(self.read(start..(start + BLOCK).min(self.file.bytes)).await?);
         }
-        let actual = hex(&sha.finalize());
+        let actual = hex::encode(sha.finalize());
         match actual == self.file.sha256 {
             true => Ok(()),
             false => Err(self.file.changed(format!("its SHA-256 is {actual}, expected {}", self.file.sha256))),

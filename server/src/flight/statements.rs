@@ -11,7 +11,6 @@ use datafusion::common::ParamValues;
 use echolake_query::{Prepared, Session};
 
 use crate::fault::Fault;
-use crate::random;
 use crate::running::Stop;
 
 /// Bytes of a text up to which handles carry it.
@@ -52,7 +51,8 @@ struct Kept {
 impl Statements {
     /// Keeps a statement.
     pub(super) fn keep(&self, statement: Statement) -> Result<Bytes, Fault> {
-        let handle: Handle = random::bytes().map_err(|failed| {
+        let mut handle = Handle::default();
+        getrandom::fill(&mut handle).map_err(|failed| {
             eprintln!("no random bytes: {failed}");
             Fault::Internal
         })?;

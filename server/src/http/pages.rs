@@ -10,7 +10,6 @@ use super::catalogue::is_known;
 use super::format::takes;
 use super::problem::Problem;
 use crate::fault::Fault;
-use crate::random;
 
 /// Nothing inline, nothing from elsewhere.
 const POLICY: &str = "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob:; font-src 'self'; \
@@ -44,7 +43,7 @@ static PAGES: &[Page] = &[Page {
 
 /// A page, each with its digest.
 static TAGGED: LazyLock<Vec<(&Page, String)>> = LazyLock::new(|| {
-    let tag = |page: &Page| format!("\"{}\"", random::hex(&Sha256::digest(page.bytes)[..8]));
+    let tag = |page: &Page| format!("\"{}\"", hex::encode(&Sha256::digest(page.bytes)[..8]));
     PAGES.iter().map(|page| (page, tag(page))).collect()
 });
 

@@ -21,7 +21,6 @@ use super::statement::{self, Planned, Statement};
 use crate::Error;
 use crate::fault::Fault;
 use crate::metrics::Protocol;
-use crate::random;
 use crate::running::{Encode, Limit, Running, Stop, ended};
 use crate::service::{FRESH, Job, Service, Work};
 
@@ -122,7 +121,8 @@ impl Connection {
 
     /// Logs a client in; returns what a CancelRequest must show. `wide` keys are of protocol 3.2.
     pub(super) fn log_in(&self, client: &Arc<Client>, wide: bool) -> Result<(i32, SecretKey), Fault> {
-        let secret: [u8; 32] = random::bytes().map_err(|failed| {
+        let mut secret = [0; 32];
+        getrandom::fill(&mut secret).map_err(|failed| {
             eprintln!("no random bytes: {failed}");
             Fault::Internal
         })?;

@@ -187,8 +187,7 @@ fn name(parts: &[Part]) -> FileName {
         sha.update(part.file_name().compose());
         sha.update("\n");
     }
-    let digits: String = sha.finalize().iter().map(|byte| format!("{byte:02x}")).collect();
-    FileName::Merged { digest: digits[..DIGEST_DIGITS].to_owned() }
+    FileName::Merged { digest: hex::encode(sha.finalize())[..DIGEST_DIGITS].to_owned() }
 }
 
 // Neighbours by surface and run in groups of about the wanted size, so that a query for a surface opens few files.

@@ -8,7 +8,6 @@ use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
 use super::frames::cancel_message;
 use crate::door::engine_process::EngineProcess;
 use crate::engine::EngineSocket;
-use crate::random;
 
 /// The engine that a connection uses now, and the key of its connection there.
 #[derive(Clone)]
@@ -31,7 +30,8 @@ pub(super) struct CancelKeys(Mutex<HashMap<(i32, Vec<u8>), CancelTarget>>);
 impl CancelKeys {
     /// A key of `bytes` random bytes: four in protocol 3.0, more in 3.2. None if the system gives none.
     pub(super) fn make(bytes: usize) -> Option<CancelKey> {
-        let random: [u8; 36] = random::bytes().ok()?;
+        let mut random = [0; 36];
+        getrandom::fill(&mut random).ok()?;
         let (pid, secret) = random.split_first_chunk()?;
         Some(CancelKey { pid: i32::from_be_bytes(*pid) & i32::MAX, secret: secret.get(..bytes.min(32))?.to_vec() })
     }

@@ -15,7 +15,6 @@ use super::kept::Answers;
 use super::map::Places;
 use super::summary::Summary;
 use crate::fault::Fault;
-use crate::random;
 use crate::service::Service;
 
 /// What the catalogue's own queries may take: they read a surface at most, and all surfaces once a snapshot.
@@ -75,7 +74,7 @@ fn version(snapshot: &Snapshot) -> String {
             digest.update(file.visible_rows().to_le_bytes());
         }
     }
-    random::hex(&digest.finalize()[..VERSION_BYTES])
+    hex::encode(&digest.finalize()[..VERSION_BYTES])
 }
 
 /// A file of a table.

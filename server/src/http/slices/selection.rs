@@ -11,7 +11,6 @@ use super::super::catalogue::{Catalogue, View};
 use super::{Question, Request};
 use crate::fault::Fault;
 use crate::metrics::Protocol;
-use crate::random;
 use crate::running::{Batches, Stop};
 use crate::service::{Job, Work};
 
@@ -120,5 +119,5 @@ pub(super) fn digest(view: &View, question: &Question, taken: &[Taken]) -> Strin
             add(&format!("{} {} {}", one.pair, one.attempt, one.log_time_ns));
         }
     }
-    random::hex(&digest.finalize()[..DIGEST_BYTES])
+    hex::encode(&digest.finalize()[..DIGEST_BYTES])
 }
