@@ -17,7 +17,9 @@ use crate::preflight::{self, Finding};
 use crate::recorder::{Recorder, Tap, Tried};
 use crate::relief::HeightField;
 use crate::robots::Choreography;
-use crate::simulate::CHECKPOINT_EVERY;
+
+/// Pairs between two checkpoints of a simulated run; one that is lost is made again.
+const SIMULATED_CHECKPOINT_EVERY: usize = 200;
 
 /// Who supervises a run, and how.
 pub struct Session<'a> {
@@ -139,7 +141,7 @@ impl Job<'_> {
 // A measured pair is 12 s of a rig's time.
 fn checkpoint_every(origin: Origin) -> usize {
     match origin {
-        Origin::Simulated => CHECKPOINT_EVERY,
+        Origin::Simulated => SIMULATED_CHECKPOINT_EVERY,
         _ => 1,
     }
 }

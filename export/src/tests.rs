@@ -11,7 +11,8 @@ use arrow::record_batch::RecordBatch;
 use echolake_acquisition::controller::Keep;
 use echolake_acquisition::import::{ImportOptions, import_gir, import_wav};
 use echolake_acquisition::relief::Relief;
-use echolake_acquisition::simulate::{SimulatedRun, Specimen};
+use echolake_acquisition::run::{RunRequest, Specimen};
+use echolake_acquisition::simulate::simulate;
 use echolake_ingest::{Ingest, complete, pending};
 use echolake_lake::{Lake, References};
 use echolake_schema::{Rig, RunId, Table, Timestamp, topics};
@@ -34,7 +35,7 @@ async fn lake(home: &TempDir, keep: Keep) -> Lake {
     for (number, surface) in SURFACES.into_iter().enumerate() {
         let name = if number < 2 { surface } else { "wavy" };
         let specimen = Specimen::Relief(Relief::by_name(name).expect("a relief"));
-        let run = SimulatedRun {
+        let run = RunRequest {
             rig: &rig,
             surface: surface.parse().expect("an id"),
             specimen: &specimen,
@@ -46,7 +47,7 @@ async fn lake(home: &TempDir, keep: Keep) -> Lake {
             keep,
             folder: &inbox,
         };
-        run.measure(&AtomicBool::new(false), &mut |_| {}).expect("a run");
+        simulate(&run, &AtomicBool::new(false), &mut |_| {}).expect("a run");
     }
     let stop = Arc::new(AtomicBool::new(false));
     let sources = pending(&lake).await.expect("runs");

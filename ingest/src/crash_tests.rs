@@ -9,7 +9,8 @@ use bytes::Bytes;
 use chrono::TimeDelta;
 use echolake_acquisition::controller::Keep;
 use echolake_acquisition::relief::Relief;
-use echolake_acquisition::simulate::{SimulatedRun, Specimen};
+use echolake_acquisition::run::{RunRequest, Specimen};
+use echolake_acquisition::simulate::simulate;
 use echolake_lake::{Deletion, Lake, References};
 use echolake_schema::tables::Table;
 use echolake_schema::{Rig, Timestamp};
@@ -35,7 +36,7 @@ fn runs(surfaces: &[&str]) -> Vec<(String, Bytes)> {
     let one = |(number, surface): (usize, &&str)| {
         let relief = surface.split('_').next().expect("a name");
         let specimen = Specimen::Relief(Relief::by_name(relief).expect("a relief"));
-        let run = SimulatedRun {
+        let run = RunRequest {
             rig: &rig,
             surface: surface.parse().expect("an id"),
             specimen: &specimen,
@@ -47,7 +48,7 @@ fn runs(surfaces: &[&str]) -> Vec<(String, Bytes)> {
             keep: Keep::ResponsesOnly,
             folder: folder.path(),
         };
-        let (path, _) = run.measure(&AtomicBool::new(false), &mut |_| {}).expect("a run");
+        let (path, _) = simulate(&run, &AtomicBool::new(false), &mut |_| {}).expect("a run");
         let name = path.file_name().expect("a name").to_string_lossy().into_owned();
         (name, Bytes::from(std::fs::read(path).expect("read")))
     };

@@ -488,4 +488,3 @@ pub(crate) fn list_damage(lines: &mut Vec<String>, line: impl FnOnce() -> String
 fn u32_at(bytes: &[u8], at: usize) -> u32 {
     u32::from_le_bytes([bytes[at], bytes[at + 1], bytes[at + 2], bytes[at + 3]])
 }
-

@@ -7,7 +7,6 @@ use std::time::{Duration, Instant};
 
 use sha2::{Digest as _, Sha256};
 
-
 /// How long a session is good for.
 pub(crate) const LIFETIME: Duration = Duration::from_secs(12 * 3600);
 /// Sessions that are kept; the oldest goes first.

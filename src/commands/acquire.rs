@@ -14,8 +14,8 @@ use echolake_acquisition::live::LiveServer;
 use echolake_acquisition::mesh::Mesh;
 use echolake_acquisition::metrics::{InfluxPush, MetricsServer, RunMetrics, Target};
 use echolake_acquisition::recorder::{Held, partial_of, random_tag};
+use echolake_acquisition::run::{self, RunRequest, Specimen};
 use echolake_acquisition::session::{Measured, Pace, Preflight, Session};
-use echolake_acquisition::simulate::{self, SimulatedRun, Specimen};
 use echolake_lake::{Lake, References};
 use echolake_schema::{Rig, SurfaceId, Timestamp};
 
@@ -217,22 +217,22 @@ impl Job {
     // What the recording is named until it is whole.
     fn partial(&self) -> anyhow::Result<PathBuf> {
         match self {
-            Self::Fresh(fresh) => Ok(partial_of(&fresh.run().path()?)),
+            Self::Fresh(fresh) => Ok(partial_of(&fresh.request().path()?)),
             Self::Resumed { partial, .. } => Ok(partial.clone()),
         }
     }
 
-    fn measure(&self, session: Session<'_>) -> Result<Measured, simulate::Error> {
+    fn measure(&self, session: Session<'_>) -> Result<Measured, run::Error> {
         match self {
-            Self::Fresh(fresh) => fresh.run().supervised(session),
-            Self::Resumed { partial, .. } => simulate::resume(partial, session),
+            Self::Fresh(fresh) => fresh.request().measure(session),
+            Self::Resumed { partial, .. } => run::resume(partial, session),
         }
     }
 }
 
 impl Fresh {
-    fn run(&self) -> SimulatedRun<'_> {
-        SimulatedRun {
+    fn request(&self) -> RunRequest<'_> {
+        RunRequest {
             rig: &self.rig,
             surface: self.surface.clone(),
             specimen: &self.specimen,

@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context as _, bail};
 use clap::Args;
-use echolake_acquisition::mesh::{Format, Mesh};
+use echolake_acquisition::mesh::{BACK_MM, Format, Mesh};
 use echolake_acquisition::relief::{HeightField, Relief};
 
 use crate::Done;
@@ -19,8 +19,6 @@ const FINE_CELLS: usize = 585;
 const FIELD_CELLS: usize = 512;
 /// Cells along each side of a picture; two make a pixel.
 const PICTURE_CELLS: usize = 1600;
-/// The back of a panel with one side, mm.
-const BACK_MM: f32 = -30.0;
 
 /// Arguments of `echolake panel`.
 #[derive(Debug, Args)]

@@ -10,22 +10,38 @@ pub mod serial;
 mod tests;
 
 use echolake_schema::Rig;
-use echolake_schema::devices::{AlsaParams, AudioParams, RobotsParams, SensorParams};
+use echolake_schema::devices::{AlsaParams, AudioParams, DeviceParams, RobotsParams, SensorParams};
 use echolake_schema::manifest::Origin;
 
 use crate::rig::{AudioInterface, Devices, Error};
 use crate::robots::Cell;
 
-/// A rig's devices; none where they are simulated.
+/// Opens a rig's devices; None if all of them are simulated.
 ///
 /// # Errors
-/// [`Error::Device`] where one does not answer, or is not built in.
+/// [`Error::Device`] if one does not answer, is not built in, or is simulated beside real ones.
 pub fn open(rig: &Rig) -> Result<Option<Devices>, Error> {
-    let devices = &rig.devices;
-    let (AudioParams::Alsa(audio), SensorParams::Serial(sensor), RobotsParams::Rosbridge(robots)) =
-        (&devices.audio, &devices.sensor, &devices.robots)
-    else {
-        return Ok(None);
+    let DeviceParams { audio, sensor, robots } = &rig.devices;
+    // Every kind is named, so that a new one cannot become a simulation.
+    let audio = match audio {
+        AudioParams::Simulated => None,
+        AudioParams::Alsa(params) => Some(params),
+    };
+    let sensor = match sensor {
+        SensorParams::Simulated => None,
+        SensorParams::Serial(params) => Some(params),
+    };
+    let robots = match robots {
+        RobotsParams::Simulated => None,
+        RobotsParams::Rosbridge(params) => Some(params),
+    };
+    let (audio, sensor, robots) = match (audio, sensor, robots) {
+        (None, None, None) => return Ok(None),
+        (Some(audio), Some(sensor), Some(robots)) => (audio, sensor, robots),
+        _ => {
+            let reason = "has simulated devices beside real ones; hint: audio, sensor and robots all need a `kind`";
+            return Err(Error::Device { device: "rig", reason: reason.to_owned() });
+        }
     };
     Ok(Some(Devices {
         audio: audio_interface(audio, rig.sweep.rate_hz.get())?,

@@ -17,11 +17,10 @@ use ndarray_npy::{NpzReader, ReadableElement};
 use super::batch::Batch;
 use super::response::Response;
 use super::{Error, ImportOptions, ImportedRun, RUN_SECS, wrong};
-use crate::mesh::Mesh;
+use crate::mesh::{BACK_MM, MESH_CELLS, Mesh};
 use crate::recorder::{LogLevel, Relief, RunStart};
 use crate::relief::HeightField;
 use crate::rigs::simulated::TAKE_SECS;
-use crate::simulate::{BACK_MM, MESH_CELLS};
 
 /// Samples of the published responses.
 pub const GIR_IR_LEN: usize = 400;

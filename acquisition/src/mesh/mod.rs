@@ -14,6 +14,11 @@ use std::path::Path;
 /// Largest mesh file that is read: ten times the published panels'.
 const LARGEST_FILE: u64 = 1 << 30;
 
+/// Cells along each side of a mesh that is recorded beside a height field.
+pub(crate) const MESH_CELLS: usize = 117;
+/// The back of a panel with one side, mm.
+pub const BACK_MM: f32 = -30.0;
+
 /// Triangles over shared vertices, in mm; x and y along the panel, z up from it.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Mesh {

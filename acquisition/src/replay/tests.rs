@@ -13,7 +13,8 @@ use tungstenite::client::IntoClientRequest as _;
 use super::*;
 use crate::controller::Keep;
 use crate::relief::Relief;
-use crate::simulate::{SimulatedRun, Specimen};
+use crate::run::{RunRequest, Specimen};
+use crate::simulate::simulate;
 
 const SMALL_RIG: &str = include_str!("../../../tests/fixtures/small_rig.toml");
 const START: i64 = 1_767_600_000_000_000_000;
@@ -27,7 +28,7 @@ const ONCE: [&str; 3] = [topics::PANEL_SCENE, topics::PANEL_POINTS, topics::ROBO
 fn run(folder: &Path, surface: &str, hours: f64) -> PathBuf {
     let rig = Rig::from_toml(SMALL_RIG).expect("a rig");
     let specimen = Specimen::Relief(Relief::by_name("flat").expect("a relief"));
-    let run = SimulatedRun {
+    let run = RunRequest {
         rig: &rig,
         surface: surface.parse().expect("an id"),
         specimen: &specimen,
@@ -39,7 +40,7 @@ fn run(folder: &Path, surface: &str, hours: f64) -> PathBuf {
         keep: Keep::Sweeps,
         folder,
     };
-    run.measure(&AtomicBool::new(false), &mut |_| {}).expect("a run").0
+    simulate(&run, &AtomicBool::new(false), &mut |_| {}).expect("a run").0
 }
 
 /// Topic, time and content.

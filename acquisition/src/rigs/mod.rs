@@ -1,4 +1,57 @@
-//! Implementations of the rig's traits.
+//! A rig's devices: those that its file names, or simulated ones.
 
 pub(crate) mod paced;
 pub mod simulated;
+
+use std::sync::Arc;
+
+use echolake_schema::{Rig, Timestamp};
+
+use crate::drivers;
+use crate::prepared_panel::PreparedPanel;
+use crate::rig::{Devices, Error};
+use crate::robots::Choreography;
+use crate::session::Pace;
+use paced::paced;
+use simulated::{Simulation, devices};
+
+/// What devices are opened for.
+pub(crate) struct DeviceRequest<'a> {
+    pub(crate) rig: &'a Rig,
+    /// What simulated devices measure, with their clock's start and their seed.
+    pub(crate) panel: &'a PreparedPanel,
+    pub(crate) start: Timestamp,
+    pub(crate) seed: u64,
+    /// How the arms stand at each pair, if a model of them is known.
+    pub(crate) arms: Option<Arc<Choreography>>,
+}
+
+/// Opens the devices that the rig file names; simulated ones only if it says so for all of them.
+///
+/// # Errors
+/// [`Error::Device`] if one does not answer, or is not built in.
+pub(crate) fn open_devices(request: &DeviceRequest<'_>, pace: Pace) -> Result<Devices, Error> {
+    match drivers::open(request.rig)? {
+        Some(real) => Ok(real),
+        None => simulated_devices(request, pace),
+    }
+}
+
+/// Makes simulated devices.
+///
+/// # Errors
+/// [`Error::Device`] if the rig's grid has no points.
+pub(crate) fn simulated_devices(request: &DeviceRequest<'_>, pace: Pace) -> Result<Devices, Error> {
+    let devices = devices(&Simulation {
+        rig: request.rig,
+        relief: &request.panel.heights,
+        reflection_factor: request.panel.reflection_factor,
+        start: request.start,
+        seed: request.seed,
+        arms: request.arms.clone(),
+    })?;
+    Ok(match pace {
+        Pace::Fast => devices,
+        Pace::Secs(secs) => paced(devices, secs),
+    })
+}

@@ -6,13 +6,14 @@ use super::*;
 use crate::recorder::Held;
 use crate::recovery::prove;
 use crate::relief::Relief;
-use crate::simulate::{SimulatedRun, Specimen, resume};
+use crate::run::{RunRequest, Specimen, resume};
+use crate::simulate::simulate;
 
 const SMALL_RIG: &str = include_str!("../../../tests/fixtures/small_rig.toml");
 const PAIRS: u64 = 45;
 
-fn run<'a>(rig: &'a Rig, specimen: &'a Specimen, folder: &'a Path) -> SimulatedRun<'a> {
-    SimulatedRun {
+fn run<'a>(rig: &'a Rig, specimen: &'a Specimen, folder: &'a Path) -> RunRequest<'a> {
+    RunRequest {
         rig,
         surface: "flat".parse().expect("an id"),
         specimen,
@@ -51,7 +52,7 @@ fn a_run_that_is_stopped_is_gone_on_with() {
             pace: Pace::Fast,
         };
         let measured = match &partial {
-            None => run(&rig, &specimen, folder.path()).supervised(session),
+            None => run(&rig, &specimen, folder.path()).measure(session),
             Some(partial) => resume(partial, session),
         };
         let measured = measured.expect("a session");
@@ -75,7 +76,7 @@ fn a_run_that_nobody_goes_on_with_is_ended_where_it_is_stopped() {
     let (rig, specimen) = (Rig::from_toml(SMALL_RIG).expect("a rig"), flat());
     let folder = tempfile::tempdir().expect("a folder");
     let stop = AtomicBool::new(false);
-    let measured = run(&rig, &specimen, folder.path()).measure(&stop, &mut |done| {
+    let measured = simulate(&run(&rig, &specimen, folder.path()), &stop, &mut |done| {
         stop.store(done >= 3, Ordering::Relaxed);
     });
     let (path, end) = measured.expect("a run");

@@ -7,7 +7,8 @@ use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use anyhow::{Context as _, Result, ensure};
 use echolake_acquisition::collection::{Member, collection};
 use echolake_acquisition::controller::Keep;
-use echolake_acquisition::simulate::{SimulatedRun, Specimen};
+use echolake_acquisition::run::{RunRequest, Specimen};
+use echolake_acquisition::simulate::simulate;
 use echolake_ingest::{Ingest, Report as Told, complete, pending};
 use echolake_lake::{Lake, References};
 use echolake_schema::manifest::RunEnd;
@@ -97,7 +98,7 @@ impl Order<'_> {
     }
 
     fn run(&self, number: usize, member: &Member) -> Result<(PathBuf, RunEnd)> {
-        let run = SimulatedRun {
+        let run = RunRequest {
             rig: &Rig::paper(),
             surface: member.surface.clone(),
             specimen: &Specimen::Relief(member.relief.clone()),
@@ -110,7 +111,7 @@ impl Order<'_> {
             folder: self.folder,
         };
         let stop = AtomicBool::new(false);
-        let made = run.measure(&stop, &mut |done| stop.store(done >= self.pairs, Ordering::Relaxed));
+        let made = simulate(&run, &stop, &mut |done| stop.store(done >= self.pairs, Ordering::Relaxed));
         made.with_context(|| format!("surface {}", member.surface))
     }
 }

@@ -233,7 +233,6 @@ fn key_of(topic: &str, data: &[u8]) -> Option<Key> {
 mod tests {
     use echolake_schema::messages::{ImpulseResponse, Measurement, SampleFormat, SweepRecording};
 
-
     use super::*;
 
     #[test]

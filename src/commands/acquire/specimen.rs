@@ -5,7 +5,7 @@ use std::path::Path;
 use anyhow::Context as _;
 use echolake_acquisition::mesh::Side;
 use echolake_acquisition::relief::Relief;
-use echolake_acquisition::simulate::Specimen;
+use echolake_acquisition::run::Specimen;
 use echolake_schema::SurfaceId;
 
 use crate::cli::AcquireArgs;

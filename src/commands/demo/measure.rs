@@ -10,7 +10,8 @@ use anyhow::Context as _;
 use echolake_acquisition::collection::Member;
 use echolake_acquisition::controller::Keep;
 use echolake_acquisition::recorder::random_tag;
-use echolake_acquisition::simulate::{SimulatedRun, Specimen};
+use echolake_acquisition::run::{RunRequest, Specimen};
+use echolake_acquisition::simulate::simulate;
 use echolake_schema::manifest::RunEnd;
 use echolake_schema::{Rig, RunId, Timestamp};
 
@@ -166,7 +167,7 @@ impl Shared<'_> {
             }
             return Ok(None);
         }
-        let run = SimulatedRun {
+        let run = RunRequest {
             rig,
             surface: surface.clone(),
             specimen: &Specimen::Relief(member.relief.clone()),
@@ -182,7 +183,7 @@ impl Shared<'_> {
         let mut task = self.whole.is_none().then(|| self.progress.task(surface.to_string(), pairs as u64, "pairs"));
         let begun = Instant::now();
         // A demo's run takes seconds, so it is whole or there is none: only the next one is not begun.
-        let measured = run.measure(&AtomicBool::new(false), &mut |done| {
+        let measured = simulate(&run, &AtomicBool::new(false), &mut |done| {
             if let Some(task) = &mut task {
                 task.at(done as u64);
             }

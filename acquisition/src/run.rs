@@ -1,0 +1,184 @@
+//! A run, from a specimen and a rig's devices to a closed MCAP file.
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use echolake_schema::manifest::{Origin, RunManifest};
+use echolake_schema::{Rig, RunId, SurfaceId, Timestamp};
+
+use crate::controller::{self, Keep, RunController};
+use crate::plan::RunPlan;
+pub use crate::plan::Specimen;
+use crate::preflight::Finding;
+use crate::prepared_panel::PreparedPanel;
+use crate::recorder::{Held, Recorder, Relief as RecordedRelief, RunStart, Tried, folder_of};
+use crate::rig::Devices;
+use crate::rigs::simulated::TAKE_SECS;
+use crate::rigs::{DeviceRequest, open_devices};
+use crate::robots::Choreography;
+use crate::session::{Job, Measured, Preflight, Session, Shape, WhenStopped};
+use crate::{mesh, recovery};
+
+/// A run that is to be measured.
+#[derive(Debug, Clone)]
+pub struct RunRequest<'a> {
+    /// The rig.
+    pub rig: &'a Rig,
+    /// Name of the surface.
+    pub surface: SurfaceId,
+    /// What is measured.
+    pub specimen: &'a Specimen,
+    /// The surface that normalises it, if it is not the lake's.
+    pub flat: Option<SurfaceId>,
+    /// The surface whose direct sound is subtracted from it, if it is not the lake's.
+    pub foam: Option<SurfaceId>,
+    /// When it begins.
+    pub start: Timestamp,
+    /// Seed of room and noise of simulated devices.
+    pub seed: u64,
+    /// Tag of the run's name.
+    pub tag: u64,
+    /// What is recorded.
+    pub keep: Keep,
+    /// Folder of the run's file, which has the run's name.
+    pub folder: &'a Path,
+}
+
+/// Why a run cannot be measured.
+#[derive(Debug, thiserror::Error)]
+pub enum Error {
+    /// The mesh cannot be used.
+    #[error(transparent)]
+    Mesh(#[from] mesh::Error),
+    /// A device cannot be used, or measuring failed.
+    #[error(transparent)]
+    Run(#[from] controller::Error),
+    /// A name is not valid.
+    #[error(transparent)]
+    Schema(#[from] echolake_schema::Error),
+    /// The run cannot be resumed.
+    #[error(transparent)]
+    Resume(#[from] recovery::Error),
+    /// The preflight check found something, and nothing was begun.
+    #[error("not fit to measure: {}", findings.iter().map(ToString::to_string).collect::<Vec<_>>().join("\n  and: "))]
+    Unfit {
+        /// What it found.
+        findings: Vec<Finding>,
+    },
+}
+
+impl RunRequest<'_> {
+    /// Measures all pairs with the devices that the rig file names. A run that is stopped or interrupted can be resumed.
+    ///
+    /// # Errors
+    /// [`Error`]; a run that was begun leaves its `.partial` file.
+    pub fn measure(&self, session: Session<'_>) -> Result<Measured, Error> {
+        let panel = PreparedPanel::new(self.specimen, self.rig)?;
+        let arms = Choreography::of(self.rig)?;
+        let request =
+            DeviceRequest { rig: self.rig, panel: &panel, start: self.start, seed: self.seed, arms: arms.clone() };
+        let devices = open_devices(&request, session.pace).map_err(controller::Error::from)?;
+        let plan = RunPlan { keep: self.keep, seed: self.seed, specimen: self.specimen.clone() };
+        self.measure_with(devices, &panel, arms, session, Some(plan.to_metadata()))
+    }
+
+    /// Measures all pairs with these devices. Only a run with a plan can be resumed; without one it is closed when it is
+    /// stopped.
+    pub(crate) fn measure_with(
+        &self,
+        devices: Devices,
+        panel: &PreparedPanel,
+        arms: Option<Arc<Choreography>>,
+        session: Session<'_>,
+        plan: Option<BTreeMap<String, String>>,
+    ) -> Result<Measured, Error> {
+        let manifest = RunManifest {
+            run_id: self.run_id()?,
+            surface_id: self.surface.clone(),
+            started: self.start,
+            software: concat!("echolake ", env!("CARGO_PKG_VERSION")).to_owned(),
+            rig: self.rig.name.clone(),
+            origin: devices.origin,
+        };
+        let mut surface = panel.record.clone();
+        surface.flat_reference = self.flat.clone();
+        surface.foam_reference = self.foam.clone();
+        let relief = RecordedRelief { heights: &panel.heights, mesh: &panel.mesh, original: panel.original() };
+        let start = RunStart { manifest: &manifest, rig: self.rig, surface: &surface, relief: Some(relief), plan };
+        let none = BTreeMap::new();
+        let mut job = job(panel, self.rig, self.folder, self.keep, &none, self.start, arms);
+        if start.plan.is_none() {
+            job.when_stopped = WhenStopped::Ended;
+        }
+        // What can be refused is refused before there is a file.
+        let mut controller = RunController::new(self.rig, devices)?;
+        check_fitness(&job, &mut controller, session.preflight)?;
+        let recorder = Recorder::create(&self.path()?, &start).map_err(controller::Error::from)?;
+        Ok(job.measure(&mut controller, recorder, session)?)
+    }
+
+    /// The run's file.
+    ///
+    /// # Errors
+    /// [`Error::Schema`] if the surface's name is too long for a run's.
+    pub fn path(&self) -> Result<PathBuf, Error> {
+        Ok(self.folder.join(format!("{}.mcap", self.run_id()?)))
+    }
+
+    fn run_id(&self) -> Result<RunId, Error> {
+        Ok(RunId::compose(self.start, &self.surface, self.tag)?)
+    }
+}
+
+/// Resumes a run that was stopped or interrupted: what is safe in its file is not measured again.
+///
+/// # Errors
+/// [`Error::Resume`] if it cannot be resumed; the file is as it was.
+pub fn resume(partial: &Path, session: Session<'_>) -> Result<Measured, Error> {
+    let held = Held::read(partial)?;
+    let reason = |reason: String| recovery::Error::NoPlan { path: partial.to_owned(), reason };
+    let plan = RunPlan::from_metadata(&held.plan).map_err(reason)?;
+    let panel = PreparedPanel::new(&plan.specimen, &held.rig)?;
+    let now = Timestamp::now();
+    let start = match held.manifest.origin {
+        // Behind all that was recorded: the simulated clock runs ahead of ours.
+        Origin::Simulated => now.max(held.last.plus_secs(TAKE_SECS)),
+        _ if now < held.last => {
+            let back_secs = (held.last.0 - now.0) as f64 / 1e9;
+            return Err(controller::Error::Clock { before: held.last, now, back_secs }.into());
+        }
+        _ => now,
+    };
+    // The same noise twice would be no noise.
+    let seed = plan.seed.wrapping_add(held.attempts.wrapping_add(1).wrapping_mul(0x9E37_79B9));
+    let arms = Choreography::of(&held.rig)?;
+    let request = DeviceRequest { rig: &held.rig, panel: &panel, start, seed, arms: arms.clone() };
+    let devices = open_devices(&request, session.pace).map_err(controller::Error::from)?;
+    let job = job(&panel, &held.rig, folder_of(partial), plan.keep, &held.pairs, start, arms);
+    let mut controller = RunController::new(&held.rig, devices)?;
+    check_fitness(&job, &mut controller, session.preflight)?;
+    let (recorder, _) = Recorder::resume(partial)?;
+    Ok(job.measure(&mut controller, recorder, session)?)
+}
+
+fn check_fitness(job: &Job<'_>, controller: &mut RunController<'_>, preflight: Preflight) -> Result<(), Error> {
+    if preflight == Preflight::Skip {
+        return Ok(());
+    }
+    let findings = job.look_over(controller, job.rig.grid()?.pairs());
+    if findings.is_empty() { Ok(()) } else { Err(Error::Unfit { findings }) }
+}
+
+fn job<'a>(
+    panel: &'a PreparedPanel,
+    rig: &'a Rig,
+    folder: &'a Path,
+    keep: Keep,
+    before: &'a BTreeMap<u32, Tried>,
+    started: Timestamp,
+    arms: Option<Arc<Choreography>>,
+) -> Job<'a> {
+    let shape = Some(Shape { heights: &panel.heights, mesh: &panel.mesh });
+    Job { rig, folder, shape, keep, before, started, arms, when_stopped: WhenStopped::Open }
+}
