@@ -30,7 +30,7 @@ mod statement_bounds;
 mod table;
 mod views;
 
-pub use control::threads::{STACK_BYTES, Threads};
+pub use control::threads::Threads;
 pub use engine::{Client, Engine, Function, Limits, Place, Quota};
 pub use error::Error;
 pub use functions::Functions;

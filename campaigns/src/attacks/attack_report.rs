@@ -132,6 +132,8 @@ pub(super) fn print_rows(rows: &[AttackRow]) {
             row.took.as_secs_f64(),
             row.outcome(),
         );
+        row.missed_goals().iter().for_each(|goal| println!("  missed: {goal}"));
+        row.light.failures.iter().for_each(|failure| println!("  light query {failure}"));
     }
 }
 

@@ -5,7 +5,7 @@ use std::time::Duration;
 use tokio::runtime::{Builder, Handle, Runtime};
 
 /// Stack of a thread that plans and runs: twice what the longest chain of operators takes that is let in.
-pub const STACK_BYTES: usize = 16 << 20;
+const STACK_BYTES: usize = 16 << 20;
 
 /// A runtime that may be dropped anywhere.
 pub struct Threads(Option<Runtime>);

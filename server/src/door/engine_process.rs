@@ -16,18 +16,13 @@ use tokio::process::{Child, ChildStdin, ChildStdout, Command};
 use tokio::sync::{Notify, SetOnce};
 
 use super::EngineSettings;
-use crate::client_identity::ClientIdentity;
+use crate::client_identity::{ClientIdentity, counted_bytes};
 use crate::engine::EngineSocket;
 use crate::engine::report::EngineReport;
 use crate::metrics::Metrics;
 
 /// How long a request that lost its engine waits to learn why.
 const REASON_WAIT: Duration = Duration::from_secs(2);
-
-// What operators say they hold is less than what they do: queries that are refused more memory end alone, not their engine.
-fn counted_bytes(memory: usize) -> usize {
-    memory / 8 * 7
-}
 
 /// Why an engine ended.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -121,12 +116,10 @@ impl EngineProcess {
             reason = self.ended.wait() => return Err(reason.clone()),
         }
         let _ = self.base_bytes.set(private_bytes(self.pid).unwrap_or(0));
-        let mut client = client.clone();
         if let Some(limit) = client.memory_bytes {
             let _ = self.memory_limit.set(limit);
-            client.memory_bytes = Some(counted_bytes(limit));
         }
-        let mut line = serde_json::to_vec(&client).map_err(|e| failed(e.into()))?;
+        let mut line = serde_json::to_vec(client).map_err(|e| failed(e.into()))?;
         line.push(b'\n');
         self.stdin.lock().await.write_all(&line).await.map_err(failed)
     }

@@ -3,7 +3,6 @@
 use std::io;
 use std::path::{Path, PathBuf};
 
-use echolake_query::STACK_BYTES;
 use landlock::{
     ABI, Access as _, AccessFs, AccessNet, CompatLevel, Compatible as _, Ruleset, RulesetAttr as _, RulesetCreated,
     RulesetCreatedAttr as _, RulesetError, path_beneath_rules,
@@ -14,9 +13,11 @@ use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
 const LANDLOCK: ABI = ABI::V5;
 /// The process's own figures, those of the processors, and random bytes.
 const SYSTEM: [&str; 4] = ["/proc", "/sys/fs/cgroup", "/sys/devices/system/cpu", "/dev/urandom"];
-/// Address space over what queries and stacks may hold: code, caches, what the allocator keeps. The door looks at what is
-/// really used, which is far less; this limit ends one huge allocation at once.
-const OVERHEAD_BYTES: u64 = 1 << 30;
+/// Address space over what queries may hold, for a process that is running: stacks of threads that are still to come,
+/// caches, what the allocator keeps. The door looks at what is really used; this limit ends one huge allocation at once.
+const OVERHEAD_BYTES: u64 = 256 << 20;
+/// Place of the writable address space in `/proc/PID/statm`, in pages.
+const STATM_DATA: usize = 5;
 
 /// Returns what this machine lacks to confine engines, for people.
 pub fn missing() -> Option<&'static str> {
@@ -57,15 +58,15 @@ fn linked_folders(lake: &Path) -> Vec<PathBuf> {
     entries.filter(|entry| entry.file_type().is_ok_and(|kind| kind.is_symlink())).map(|entry| entry.path()).collect()
 }
 
-/// Limits what the process can allocate to `memory` bytes over what it has and needs besides.
+/// Limits what the process can allocate from now on to the `memory` bytes that its queries may hold, and a little besides.
 ///
 /// # Errors
-/// The system refuses.
-pub(super) fn limit_memory(memory: Option<usize>) -> io::Result<()> {
-    let Some(memory) = memory else { return Ok(()) };
-    // Queries and answers have threads for each core.
-    let threads = 2 * std::thread::available_parallelism().map_or(1, usize::from);
-    set_limit(Resource::Data, (memory + threads * STACK_BYTES) as u64 + OVERHEAD_BYTES)
+/// The system does not tell what the process has, or refuses.
+pub(super) fn limit_memory(memory: usize) -> io::Result<()> {
+    let statm = std::fs::read_to_string("/proc/self/statm")?;
+    let pages = statm.split_whitespace().nth(STATM_DATA).and_then(|pages| pages.parse::<u64>().ok());
+    let pages = pages.ok_or_else(|| io::Error::other(format!("/proc/self/statm is `{statm}`")))?;
+    set_limit(Resource::Data, pages * rustix::param::page_size() as u64 + memory as u64 + OVERHEAD_BYTES)
 }
 
 // Never above what the process was started with, which only an administrator may raise.

@@ -63,8 +63,10 @@ pub async fn run_engine(lake: &Lake, sockets: &Path, memory: Option<usize>) -> R
     EngineReport::Ready.send();
     // The door went away before it had a use for this engine.
     let Ok(identity) = assigned.await else { return Ok(()) };
-    confinement::limit_memory(memory).map_err(Error::System)?;
+    let limit = identity.memory_bytes.into_iter().chain(memory).min();
     let service = Service::new(lake, engine, identity)?;
+    // Behind the start of its threads, whose stacks count.
+    limit.map(confinement::limit_memory).transpose().map_err(Error::System)?;
     watchdog::start(&service).map_err(Error::System)?;
     tokio::select! {
         failed = http::serve(service.clone(), http) => failed,
