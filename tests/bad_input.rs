@@ -126,6 +126,29 @@ fn panels_and_groups_that_cannot_be_made() {
     assert!(place.ok(&next("two.csv")).contains("projection_mm: 20 to 60 becomes 0 to 80."));
 }
 
+#[test]
+fn rigs_whose_devices_are_unknown_or_absent() {
+    let place = Place::new();
+    let rig = std::fs::read_to_string(place.path("rig.toml")).expect("the rig");
+    let [audio, sensor, robots] = [
+        "[devices.audio]\nkind = \"alsa\"\ncapture = \"no_such_pcm\"\nplayback = \"no_such_pcm\"\n",
+        "[devices.sensor]\nkind = \"serial\"\npath = \"/dev/no_such_line\"\n",
+        "[devices.robots]\nkind = \"rosbridge\"\nurl = \"ws://127.0.0.1:1\"\n",
+    ];
+    for (devices, expected) in [
+        (audio.replace("alsa", "tape"), "unknown variant `tape`"),
+        (sensor.replace("serial", "parallel"), "unknown variant `parallel`"),
+        (robots.replace("rosbridge", "puppets"), "unknown variant `puppets`"),
+        (audio.to_owned(), "simulated devices beside real ones"),
+        ([sensor, robots].concat(), "simulated devices beside real ones"),
+        ([audio, sensor, robots].concat(), "no_such_pcm"),
+    ] {
+        std::fs::write(place.path("rig.toml"), format!("{rig}\n{devices}")).expect("written");
+        place.fails(1, &["acquire", "--surface", "flat", "--rig", "rig.toml"], expected);
+        assert_eq!(files(&place.path("lake/inbox")), 0, "no run file: {expected}");
+    }
+}
+
 // A run's file that ends within the chunk of its last verdicts.
 fn cut_off(whole: &[u8]) -> &[u8] {
     let summary = mcap::Summary::read(whole).expect("sound").expect("a summary");

@@ -12,6 +12,7 @@ pub mod assessment;
 pub mod collection;
 pub mod conformance;
 pub mod controller;
+pub mod disk;
 pub mod drivers;
 #[cfg(feature = "import")]
 pub mod import;

@@ -7,7 +7,7 @@ use echolake_schema::{Pair, Rig};
 
 use crate::controller::watch::KEPT_FREE;
 use crate::controller::{Keep, RunController, implausible};
-use crate::recorder::free_bytes;
+use crate::disk::free_bytes;
 
 /// Bytes of a recorded sample of both channels and audio, compressed: 4.92 in a simulated run with sweeps of 0.5 s.
 const SWEEP_BYTES_A_SAMPLE: f64 = 5.0;

@@ -8,16 +8,17 @@ use echolake_schema::manifest::{Origin, RunManifest};
 use echolake_schema::{Rig, RunId, SurfaceId, Timestamp};
 
 use crate::controller::{self, Keep, RunController};
+use crate::disk::folder_of;
 use crate::plan::RunPlan;
 pub use crate::plan::Specimen;
 use crate::preflight::Finding;
 use crate::prepared_panel::PreparedPanel;
-use crate::recorder::{Held, Recorder, Relief as RecordedRelief, RunStart, Tried, folder_of};
+use crate::recorder::{Held, Recorder, Relief as RecordedRelief, RunStart, Shape, Tried};
 use crate::rig::Devices;
 use crate::rigs::simulated::TAKE_SECS;
 use crate::rigs::{DeviceRequest, open_devices};
 use crate::robots::Choreography;
-use crate::session::{Job, Measured, Preflight, Session, Shape, WhenStopped};
+use crate::session::{Job, Measured, Preflight, Session, WhenStopped};
 use crate::{mesh, recovery};
 
 /// A run that is to be measured.

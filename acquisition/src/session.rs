@@ -12,10 +12,8 @@ use echolake_schema::manifest::Origin;
 use echolake_schema::{Pair, Rig, Timestamp};
 
 use crate::controller::{self, Control, Event, Keep, Outcome, RunController, RunOptions, Work};
-use crate::mesh::Mesh;
 use crate::preflight::{self, Finding};
-use crate::recorder::{Recorder, Tap, Tried};
-use crate::relief::HeightField;
+use crate::recorder::{Recorder, Shape, Tap, Tried};
 use crate::robots::Choreography;
 
 /// Pairs between two checkpoints of a simulated run; one that is lost is made again.
@@ -63,13 +61,6 @@ pub struct Measured {
     pub path: PathBuf,
     /// How it ended.
     pub outcome: Outcome,
-}
-
-/// A panel that is shown.
-#[derive(Clone, Copy)]
-pub(crate) struct Shape<'a> {
-    pub(crate) heights: &'a HeightField,
-    pub(crate) mesh: &'a Mesh,
 }
 
 /// What is to be done, apart from the recorder.

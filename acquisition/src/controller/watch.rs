@@ -6,8 +6,8 @@ use std::path::{Path, PathBuf};
 use echolake_schema::Timestamp;
 
 use super::Error;
+use crate::disk::{folder_of, free_bytes};
 use crate::objection::Objection;
-use crate::recorder::{folder_of, free_bytes};
 
 /// Pairs that are given up in a row before the run is: one may be bad luck, with its attempts three are none.
 const LASTING: usize = 3;

@@ -8,7 +8,6 @@ mod error;
 mod resume;
 mod scene;
 mod sealed;
-mod space;
 #[cfg(test)]
 mod tests;
 mod tidy;
@@ -27,23 +26,27 @@ use foxglove::Encode;
 use mcap::Attachment;
 use mcap::records::{MessageHeader, Metadata};
 
+use crate::disk::{folder_of, sync};
 use crate::mesh::Mesh;
 use crate::relief::HeightField;
-use crate::session::Shape;
 use channels::Channels;
 use chunks::{ChunkWriter, Part};
 pub use error::Error;
-pub(crate) use resume::lock;
 pub use resume::{Held, Tried};
 pub use sealed::Sealed;
-pub(crate) use sealed::{folder_of, sync};
-pub use space::free_bytes;
 
 /// `/sweep/audio` is played this many times slower: at a scale of 1:10, 2-40 kHz become 200 Hz to 4 kHz.
 const SLOWER: f64 = 10.0;
 
 /// A run with more of them has chunks of a pair each, which cost every reader a request each.
 const MANY_CHECKPOINTS: u64 = 64;
+
+/// A panel as viewers show it.
+#[derive(Clone, Copy)]
+pub(crate) struct Shape<'a> {
+    pub(crate) heights: &'a HeightField,
+    pub(crate) mesh: &'a Mesh,
+}
 
 /// What is known when a run starts.
 pub struct RunStart<'a> {

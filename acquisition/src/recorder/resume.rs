@@ -1,7 +1,7 @@
 //! A recording that is gone on with: what is safe in it, and a recorder that writes behind that.
 
 use std::collections::{BTreeMap, HashSet};
-use std::fs::{File, OpenOptions, TryLockError};
+use std::fs::OpenOptions;
 use std::path::{Path, PathBuf};
 
 use echolake_schema::manifest::RunManifest;
@@ -10,10 +10,11 @@ use echolake_schema::{Rig, Timestamp, topics};
 use mcap::records::Record;
 use prost::Message as _;
 
+use super::Recorder;
 use super::channels::Channels;
 use super::chunks::{ChunkWriter, Part};
-use super::{Recorder, folder_of, sync};
-use crate::recovery::{Copy, Error, Item, Walk, is_end};
+use crate::disk::{folder_of, sync};
+use crate::recovery::{Copy, Error, Item, Walk, is_end, lock};
 
 /// What the name of a recording ends in until it is whole.
 const PARTIAL: &str = "partial";
@@ -179,15 +180,5 @@ impl Recorder {
         std::fs::rename(copy, partial).map_err(|e| failed(e.to_string()))?;
         sync(folder_of(partial)).map_err(failed)?;
         Ok(Self::with(writer, path.to_owned(), PathBuf::from(partial), channels, sequence))
-    }
-}
-
-/// Takes a recording for oneself, until the file is dropped: its recorder holds a lock as long as it lives.
-pub(crate) fn lock(partial: &Path) -> Result<File, Error> {
-    let file = File::open(partial).map_err(|source| Error::Read { path: partial.to_owned(), source })?;
-    match file.try_lock() {
-        Err(TryLockError::WouldBlock) => Err(Error::Busy { path: partial.to_owned() }),
-        // A file system without locks cannot tell.
-        _ => Ok(file),
     }
 }

@@ -5,7 +5,7 @@ use std::fs::OpenOptions;
 use std::path::Path;
 
 use super::chunks::ChunkWriter;
-use super::{folder_of, free_bytes, sync};
+use crate::disk::{folder_of, free_bytes, sync};
 use crate::recovery::{Copy, Walk, prove};
 
 /// Puts a whole recording's messages into larger chunks. Until the copy is proven and on the disk the recording is as

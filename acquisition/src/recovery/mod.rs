@@ -7,7 +7,7 @@ mod tests;
 mod walk;
 
 use std::collections::BTreeMap;
-use std::fs::{File, OpenOptions};
+use std::fs::{File, OpenOptions, TryLockError};
 use std::path::{Path, PathBuf};
 
 use echolake_schema::topics;
@@ -15,8 +15,8 @@ use mcap::records::Metadata;
 use mcap::sans_io::linear_reader::{LinearReadEvent, LinearReader, LinearReaderOptions};
 use serde::Serialize;
 
+use crate::disk::{folder_of, sync};
 use crate::recorder::chunks::ChunkWriter;
-use crate::recorder::{folder_of, lock, sync};
 pub(crate) use copy::{Copy, Counts, is_end};
 pub use error::Error;
 pub(crate) use walk::{Item, Walk, chunk};
@@ -203,4 +203,17 @@ pub fn prove(path: &Path) -> Result<(), String> {
         }
     }
     if has_summary { Ok(()) } else { Err("it has no summary".to_owned()) }
+}
+
+/// Locks a recording until the file is dropped; its recorder holds a lock as long as it lives.
+///
+/// # Errors
+/// [`Error::Busy`] if somebody else holds the lock.
+pub(crate) fn lock(partial: &Path) -> Result<File, Error> {
+    let file = File::open(partial).map_err(|source| Error::Read { path: partial.to_owned(), source })?;
+    match file.try_lock() {
+        Err(TryLockError::WouldBlock) => Err(Error::Busy { path: partial.to_owned() }),
+        // A file system without locks cannot tell.
+        _ => Ok(file),
+    }
 }

@@ -2,11 +2,11 @@
 
 use super::PANEL_SIZE_MM;
 use super::chance::Chance;
-use super::layered::Settings;
-use super::mesostructure::{SEED, Spot, Stones};
 use super::microstructure::{JOINT_SHAPE, joint_depth, joint_width};
 use super::parameter::{Layer, Parameter};
+use super::settings::Settings;
 use super::stone::{Faces, bulge, lean, pillow, projection};
+use super::stones::{SEED, Spot, Stones};
 
 const MESO: Layer = Layer::Mesostructure;
 /// Bulging stones are level from this distance to their edges on, as a share of their smaller side.

@@ -3,18 +3,16 @@
 //! Parameters are full-scale: the panel is a tenth of the wall. Every parameter's range is such that all of them at
 //! their greatest still fit the relief's 40 mm, so that each combination can be made.
 
-use std::collections::BTreeMap;
-
 use serde::{Deserialize, Serialize};
 
 use super::macrostructure::{self, Macrostructure};
-use super::mesostructure::{Mesostructure, SEED};
+use super::mesostructure::Mesostructure;
 use super::microstructure::{GRAIN, JOINT_DEPTH, JOINT_SHAPE, JOINT_WIDTH, Microstructure, ROUGHNESS};
 use super::parameter::{Domain, Parameter, Setting};
+use super::settings::Settings;
+use super::stones::SEED;
 use super::{Error, HeightField, PANEL_SIZE_MM, RELIEF_MM};
 
-/// The wall is this many times as large as the panel (Rust et al. 2021).
-pub const FULL_SCALE: f64 = 10.0;
 /// Heights of a cell are the mean of those this far apart or less, mm: a joint is 1 mm wide.
 const DETAIL_MM: f64 = 0.4;
 
@@ -24,35 +22,6 @@ pub struct Layered {
     mesostructure: Mesostructure,
     #[serde(flatten)]
     settings: Settings,
-}
-
-/// What parameters are set to; those that are not have their defaults.
-#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
-#[serde(transparent)]
-pub(super) struct Settings(BTreeMap<String, Setting>);
-
-impl Settings {
-    pub(super) fn number(&self, parameter: &Parameter) -> f64 {
-        match (self.0.get(parameter.key), parameter.domain) {
-            (Some(Setting::Number(x)), _) => *x,
-            (Some(Setting::Whole(x)), _) => *x as f64,
-            (_, Domain::Number { default, .. }) => default,
-            _ => 0.0,
-        }
-    }
-
-    /// A full-scale length as the panel's.
-    pub(super) fn model_mm(&self, parameter: &Parameter) -> f64 {
-        self.number(parameter) / FULL_SCALE
-    }
-
-    pub(super) fn word(&self, parameter: &Parameter) -> &str {
-        match (self.0.get(parameter.key), parameter.domain) {
-            (Some(Setting::Word(word)), _) => word,
-            (_, Domain::Choice { default, .. }) => default,
-            _ => "",
-        }
-    }
 }
 
 impl Layered {

@@ -2,8 +2,8 @@
 
 use super::PANEL_SIZE_MM;
 use super::chance::cosine_of_turns;
-use super::layered::Settings;
 use super::parameter::{Layer, Parameter};
+use super::settings::Settings;
 
 pub(super) const SHAPE: Parameter = Parameter::choice(
     "macrostructure",

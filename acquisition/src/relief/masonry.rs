@@ -2,11 +2,11 @@
 
 use super::Bond;
 use super::chance::Chance;
-use super::layered::Settings;
-use super::mesostructure::{SEED, Spot, Stones};
 use super::microstructure::{JOINT_DEPTH, JOINT_SHAPE, JOINT_WIDTH};
 use super::parameter::{Layer, Parameter};
+use super::settings::Settings;
 use super::stone::{Faces, lean, projection};
+use super::stones::{SEED, Spot, Stones};
 
 const LENGTH: Parameter = Parameter::mm(
     "brick_length_mm",

@@ -1,23 +1,9 @@
-//! The stones of a wall: one trait for every way they lie, and the list of the ways.
+//! How a wall is made: the list of the ways in which its stones lie.
 
-use super::layered::Settings;
-use super::parameter::{Layer, Parameter};
+use super::parameter::Parameter;
+use super::settings::Settings;
+use super::stones::Stones;
 use super::{courses, masonry, primitives, voronoi, wells};
-
-/// A place on a wall of stones, model mm.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) struct Spot {
-    /// To the middle of the nearest joint, 0 or more.
-    pub(super) to_joint: f64,
-    /// Height of the stone's face over the wall's plane, 0 or more; what lies in the joint is not seen.
-    pub(super) face: f64,
-}
-
-/// Where the stones of a wall lie.
-pub(super) trait Stones {
-    /// The stone at a place; `half_joint` is half a joint's width, model mm.
-    fn spot(&self, x: f64, y: f64, half_joint: f64) -> Spot;
-}
 
 /// How a wall is made.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
@@ -42,10 +28,6 @@ pub enum Mesostructure {
     /// Wells of a 2D primitive-root diffuser.
     PrimitiveRoot,
 }
-
-/// Numbers of a seed's kind.
-pub(super) const SEED: Parameter =
-    Parameter::whole("seed", Layer::Mesostructure, [0, 9_007_199_254_740_991, 1], "which wall of this kind");
 
 impl Mesostructure {
     /// All of them.

@@ -1,8 +1,8 @@
 //! The skin of a wall: its joints' profile, and how rough it is.
 
 use super::chance::Chance;
-use super::layered::Settings;
 use super::parameter::{Layer, Parameter};
+use super::settings::Settings;
 
 const LAYER: Layer = Layer::Microstructure;
 

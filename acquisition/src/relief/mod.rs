@@ -14,16 +14,19 @@ mod parameter;
 mod primitive_root;
 mod primitives;
 mod random;
+mod settings;
 mod stone;
+mod stones;
 mod voronoi;
 mod wavy;
 mod wells;
 
 pub use bricks::{Bond, Bricks};
-pub use layered::{FULL_SCALE, Layered};
+pub use layered::Layered;
 pub use mesostructure::Mesostructure;
 pub use parameter::{Domain, Layer, Parameter, Setting};
 pub use primitive_root::PrimitiveRootDiffuser;
+pub use settings::FULL_SCALE;
 pub use wavy::Wavy;
 
 pub use echolake_dsp::height_field::HeightField;

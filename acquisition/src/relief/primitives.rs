@@ -1,10 +1,10 @@
 //! Solids of geometry on a square lattice.
 
 use super::chance::Chance;
-use super::layered::Settings;
-use super::mesostructure::{SEED, Spot, Stones};
 use super::microstructure::{JOINT_SHAPE, joint_depth, joint_width};
 use super::parameter::{Layer, Parameter};
+use super::settings::Settings;
+use super::stones::{SEED, Spot, Stones};
 
 const MESO: Layer = Layer::Mesostructure;
 

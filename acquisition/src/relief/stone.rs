@@ -1,8 +1,8 @@
 //! What stones of every kind have in common: they stand out, lean and bulge.
 
 use super::chance::Chance;
-use super::layered::Settings;
 use super::parameter::{Layer, Parameter};
+use super::settings::Settings;
 
 /// How far stones stand out.
 pub(super) const fn projection(high: f64, default: f64) -> Parameter {

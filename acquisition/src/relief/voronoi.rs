@@ -2,11 +2,11 @@
 
 use super::PANEL_SIZE_MM;
 use super::chance::Chance;
-use super::layered::Settings;
-use super::mesostructure::{SEED, Spot, Stones};
 use super::microstructure::{JOINT_SHAPE, joint_depth, joint_width};
 use super::parameter::{Layer, Parameter};
+use super::settings::Settings;
 use super::stone::{Faces, bulge, lean, pillow, projection};
+use super::stones::{SEED, Spot, Stones};
 
 const MESO: Layer = Layer::Mesostructure;
 /// Round stones leave this share of the way to their middle to the joint: it widens in the corners.

@@ -1,9 +1,9 @@
 //! The wells of a 2D primitive-root diffuser as a wall's stones.
 
-use super::layered::Settings;
-use super::mesostructure::{Spot, Stones};
 use super::microstructure::{JOINT_SHAPE, joint_depth, joint_width};
 use super::parameter::{Layer, Parameter};
+use super::settings::Settings;
+use super::stones::{Spot, Stones};
 use super::{PANEL_SIZE_MM, PrimitiveRootDiffuser};
 
 const PRIME: Parameter = Parameter::choice(

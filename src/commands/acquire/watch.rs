@@ -8,8 +8,9 @@ use std::time::Instant;
 
 use anyhow::Context as _;
 use echolake_acquisition::controller::{Control, Event};
+use echolake_acquisition::disk::free_bytes;
 use echolake_acquisition::metrics::RunMetrics;
-use echolake_acquisition::recorder::{Cost, free_bytes};
+use echolake_acquisition::recorder::Cost;
 use echolake_schema::manifest::RunEnd;
 use echolake_schema::messages::Verdict;
 use tokio::signal::unix::{SignalKind, signal};

@@ -10,7 +10,7 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 
 use clap::CommandFactory as _;
-use echolake_acquisition::recorder::free_bytes;
+use echolake_acquisition::disk::free_bytes;
 use echolake_lake::{Error as LakeError, LAKE_FORMAT, Lake};
 #[cfg(feature = "lake")]
 use echolake_server::CataloguePages;

@@ -1,0 +1,39 @@
+//! What a disk is asked for: free space, and that something is really on it.
+
+use std::fs::File;
+use std::io;
+use std::path::Path;
+
+/// Bytes that this process may still write where `path` stands.
+///
+/// # Errors
+/// What the system says where `path` is not there.
+pub fn free_bytes(path: &Path) -> io::Result<u64> {
+    let stat = rustix::fs::statvfs(path)?;
+    Ok(stat.f_bavail.saturating_mul(stat.f_frsize))
+}
+
+/// Waits until a file's content, or a folder's entries, are on the disk.
+pub(crate) fn sync(path: &Path) -> Result<(), String> {
+    File::open(path).and_then(|f| f.sync_all()).map_err(|e| e.to_string())
+}
+
+/// The folder that a file stands in. A bare name's parent is the empty path, which nobody can open.
+pub(crate) fn folder_of(path: &Path) -> &Path {
+    match path.parent() {
+        Some(folder) if !folder.as_os_str().is_empty() => folder,
+        _ => Path::new("."),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_file_has_a_folder_that_can_be_synced() {
+        for (path, folder) in [("run.mcap", "."), ("a/run.mcap", "a"), ("/run.mcap", "/")] {
+            assert_eq!(folder_of(Path::new(path)), Path::new(folder), "{path}");
+        }
+    }
+}
