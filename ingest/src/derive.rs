@@ -1,14 +1,13 @@
 //! From a run's impulse responses and its references to reflected responses, curves and energies, and their files.
 
-use std::collections::HashMap;
 use std::sync::Arc;
 
-use echolake_dsp::chain::{DerivationPlan, Derived, FlatEnergies};
 use echolake_lake::{EncodedFile, FileEncoder, Lake, Staged, encode};
 use echolake_schema::Rig;
 use echolake_schema::tables::Table;
 
 use crate::context::Context;
+use crate::derived_values::{DerivedRows, Flats, Means, Responses, derivation_plan};
 use crate::error::{Error, Result};
 use crate::references::{SharedFinder, Wanted};
 use crate::rows::derived::Versions;
@@ -18,50 +17,6 @@ use crate::rows::{self, Keys};
 /// Measurements that are derived and encoded at a time: memory is bounded by them, not by the run.
 const SLICE: usize = 256;
 
-/// Mean impulse response of each pair of a reference.
-pub(crate) type Means = HashMap<u32, Vec<f32>>;
-
-/// Energies of each pair of Flat, its Foam subtracted.
-pub(crate) type Flats = HashMap<u32, FlatEnergies>;
-
-/// The plan of a rig's responses.
-pub(crate) fn derivation_plan(rig: &Rig) -> std::result::Result<DerivationPlan<f32>, echolake_dsp::Error> {
-    DerivationPlan::new(rig.impulse_response.length, rig.sweep.rate_hz.get(), &rig.bands.centres_hz)
-}
-
-/// A run's impulse responses.
-#[derive(Debug, Clone, Default)]
-pub(crate) struct Responses {
-    pub(crate) pairs: Vec<u32>,
-    /// `[pairs x length]`.
-    pub(crate) irs: Vec<f32>,
-}
-
-/// What is derived of some of a run's measurements.
-#[derive(Debug, Clone, Default)]
-pub(crate) struct DerivedRows {
-    bands: usize,
-    pub(crate) pairs: Vec<u32>,
-    /// `[pairs x length]`.
-    reflected: Vec<f32>,
-    /// `[bands][pairs x length]`.
-    curves: Vec<Vec<f32>>,
-    /// `[pairs x bands]`.
-    energies: Vec<f64>,
-    tnce: Vec<f64>,
-    tnce_over_band: Vec<f64>,
-}
-
-/// Responses and curves of [`DerivedRows`].
-#[derive(Debug, Clone, Default)]
-pub(crate) struct DerivedLists {
-    pub(crate) pairs: Vec<u32>,
-    /// `[pairs x length]`.
-    pub(crate) reflected: Vec<f32>,
-    /// `[bands][pairs x length]`.
-    pub(crate) curves: Vec<Vec<f32>>,
-}
-
 /// References, loaded, and the name of what is derived with them.
 pub(crate) struct Derivation {
     pub(crate) name: String,
@@ -69,57 +24,6 @@ pub(crate) struct Derivation {
     foam_version: String,
     flat: Arc<Flats>,
     foam: Arc<Means>,
-}
-
-impl DerivedRows {
-    fn new(bands: usize) -> Self {
-        Self { bands, curves: vec![Vec::new(); bands], ..Self::default() }
-    }
-
-    fn push(&mut self, pair: u32, derived: &Derived<f32>) {
-        self.pairs.push(pair);
-        self.reflected.extend_from_slice(&derived.reflected);
-        let length = derived.reflected.len();
-        for (all, curve) in self.curves.iter_mut().zip(derived.curves.chunks_exact(length)) {
-            all.extend_from_slice(curve);
-        }
-        self.energies.extend_from_slice(&derived.energies);
-        self.tnce.extend_from_slice(&derived.tnce);
-        self.tnce_over_band.extend_from_slice(&derived.tnce_over_band);
-    }
-
-    /// Responses and curves, which are left empty here.
-    fn take_lists(&mut self) -> DerivedLists {
-        DerivedLists {
-            pairs: self.pairs.clone(),
-            reflected: std::mem::take(&mut self.reflected),
-            curves: std::mem::take(&mut self.curves),
-        }
-    }
-
-    /// Values of every column from `tnce_*` to `energy_total`, in the tables' order.
-    pub(crate) fn energy_columns(&self) -> Vec<Vec<f64>> {
-        let mut columns = self.tnce_columns();
-        columns.extend((0..self.bands).map(|b| self.column(&self.tnce_over_band, b)));
-        columns.extend((0..self.bands).map(|b| self.column(&self.energies, b)));
-        columns.push(self.totals(&self.energies));
-        columns
-    }
-
-    /// Values of `tnce_*` and `tnce_total`.
-    pub(crate) fn tnce_columns(&self) -> Vec<Vec<f64>> {
-        let mut columns: Vec<_> = (0..self.bands).map(|b| self.column(&self.tnce, b)).collect();
-        columns.push(self.totals(&self.tnce));
-        columns
-    }
-
-    fn column(&self, values: &[f64], band: usize) -> Vec<f64> {
-        values.iter().skip(band).step_by(self.bands).copied().collect()
-    }
-
-    fn totals(&self, values: &[f64]) -> Vec<f64> {
-        values.chunks_exact(self.bands).map(|row| row.iter().sum()).collect()
-    }
 }
 
 impl Derivation {

@@ -12,7 +12,8 @@ use serde::{Deserialize, Serialize};
 
 use crate::CODE_VERSION;
 use crate::context::Context;
-use crate::derive::{Derivation, Responses};
+use crate::derive::Derivation;
+use crate::derived_values::Responses;
 use crate::error::{Error, Result};
 use crate::files::{self, Source};
 use crate::marks::ReadingMark;

@@ -32,6 +32,7 @@ mod context;
 #[cfg(test)]
 mod crash_tests;
 mod derive;
+mod derived_values;
 pub mod doctor;
 mod error;
 mod files;

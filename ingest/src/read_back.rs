@@ -12,7 +12,7 @@ use object_store::ObjectStoreExt as _;
 use parquet::arrow::ProjectionMask;
 use parquet::arrow::arrow_reader::{ArrowReaderOptions, ParquetRecordBatchReaderBuilder};
 
-use crate::derive::Responses;
+use crate::derived_values::Responses;
 use crate::error::{Error, Result};
 
 /// A run's impulse responses as they stand in `measurements`.

@@ -10,7 +10,7 @@ use sha2::{Digest as _, Sha256};
 use tokio::sync::Mutex;
 
 use crate::CODE_VERSION;
-use crate::derive::{Flats, Means, derivation_plan};
+use crate::derived_values::{Flats, Means, derivation_plan};
 use crate::error::{Error, Result};
 use crate::read_back;
 

@@ -7,7 +7,7 @@ use echolake_schema::{Grid, PairId, Rig, Symmetry};
 
 use super::{Columns, Keys};
 use crate::CODE_VERSION;
-use crate::derive::{DerivedLists, DerivedRows};
+use crate::derived_values::{DerivedLists, DerivedRows};
 use crate::error::Result;
 
 /// Which references the rows used.
