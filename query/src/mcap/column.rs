@@ -14,6 +14,11 @@ use arrow::datatypes::{
 };
 use arrow::error::ArrowError;
 
+/// Columns of one message type, nested ones included; no table has more.
+pub(super) const MOST_LEAVES: usize = 4096;
+/// How deep messages are taken apart.
+pub(super) const DEEPEST: usize = 16;
+
 /// Times are UTC.
 pub(super) const UTC: &str = "UTC";
 

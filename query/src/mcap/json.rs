@@ -8,9 +8,8 @@ use arrow::datatypes::{DataType, Field, Fields};
 use echolake_schema::tables::LIST_CHILD;
 use serde_json::{Map, Value};
 
-use super::column::{Column, Record, width};
+use super::column::{Column, DEEPEST, MOST_LEAVES, Record, width};
 use super::error::{Malformed, Spent};
-use super::schema::{DEEPEST, MOST_LEAVES, text};
 
 /// A parsed value takes about this many bytes for each byte of its text, at worst.
 const PARSED: usize = 16;
@@ -26,7 +25,7 @@ pub(super) enum Shape {
 
 /// The columns that a JSON schema describes.
 pub(super) fn columns(schema: &[u8]) -> Result<(Fields, Shape), String> {
-    let whole = || (Fields::from(vec![text("json")]), Shape::Text);
+    let whole = || (Fields::from(vec![Field::new("json", DataType::Utf8, true)]), Shape::Text);
     if schema.iter().all(u8::is_ascii_whitespace) {
         return Ok(whole());
     }

@@ -9,9 +9,8 @@ use arrow::datatypes::{DataType, Field, Fields};
 use echolake_schema::tables::LIST_CHILD;
 use prost_reflect::{DescriptorPool, FieldDescriptor, Kind as ProtoKind, MessageDescriptor};
 
-use super::column::{Column, List, Record, duration_type, time_type, width};
+use super::column::{Column, DEEPEST, List, MOST_LEAVES, Record, duration_type, time_type, width};
 use super::error::{Malformed, Spent};
-use super::schema::{DEEPEST, MOST_LEAVES};
 
 const NANOS: i64 = 1_000_000_000;
 /// Field numbers up to here are looked up in a table, others in a map.

@@ -6,9 +6,8 @@ use std::sync::Arc;
 use arrow::datatypes::{DataType, Field, Fields};
 use echolake_schema::tables::LIST_CHILD;
 
-use super::column::{Column, Record, duration_type, time_type, width};
+use super::column::{Column, DEEPEST, MOST_LEAVES, Record, duration_type, time_type, width};
 use super::error::{Malformed, Spent};
-use super::schema::{DEEPEST, MOST_LEAVES};
 
 const NANOS: i64 = 1_000_000_000;
 /// Longest array of fixed length: it stands in no message, so nothing else bounds it.

@@ -1,17 +1,12 @@
 //! What a channel's schema says of its messages: their columns, and the decoder that fills them.
 
 use arrow::array::ArrayRef;
-use arrow::datatypes::{DataType, Field, Fields};
+use arrow::datatypes::Fields;
 use arrow::error::ArrowError;
 use prost_reflect::MessageDescriptor;
 
 use super::error::Malformed;
 use super::{json, protobuf, ros2};
-
-/// Columns of one message type, nested ones included; no table has more.
-pub(super) const MOST_LEAVES: usize = 4096;
-/// How deep messages are taken apart.
-pub(super) const DEEPEST: usize = 16;
 
 /// A channel's schema as it stands in the file.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, Default)]
@@ -115,9 +110,4 @@ impl Decoder {
         };
         columns.iter_mut().map(super::column::Column::finish).collect()
     }
-}
-
-/// A text column.
-pub(super) fn text(name: &str) -> Field {
-    Field::new(name, DataType::Utf8, true)
 }
