@@ -25,8 +25,9 @@ use crate::flight::WINDOW_BYTES;
 
 /// Bytes of a request up to which it is kept, so that it can be sent again to a new engine.
 const KEPT_BYTES: usize = 64 << 10;
-/// Bytes of a request: axum's own limit, and gRPC's of one message.
-const LARGEST: usize = 4 << 20;
+/// Bytes of a request: that of HTTP's endpoints, which answer sooner than they have read more, and gRPC's of one message.
+const LARGEST_HTTP: usize = 2 << 20;
+const LARGEST_GRPC: usize = 4 << 20;
 /// How long the body of a request may take.
 const BODY_LIMIT: Duration = Duration::from_secs(30);
 /// Bytes of a frame of HTTP/2 between an engine and the door; the default of 16 KiB costs a wake-up each.
@@ -74,7 +75,8 @@ impl EnginePool {
                 let rest = in_time(body.into_data_stream(), Instant::now() + BODY_LIMIT);
                 RequestBody::Streamed(Body::from_stream(rest))
             }
-            Wire::Http | Wire::Grpc => read_body(body, &parts.headers).await?,
+            Wire::Http => read_body(body, &parts.headers, LARGEST_HTTP).await?,
+            Wire::Grpc => read_body(body, &parts.headers, LARGEST_GRPC).await?,
         };
         let working = work.begin();
         loop {
@@ -123,10 +125,10 @@ async fn why(lease: &EngineLease, failed: &str) -> Fault {
 }
 
 // Reads a short body to its end; of a long one, what is read goes before the rest.
-async fn read_body(body: Body, headers: &HeaderMap) -> Result<RequestBody, Fault> {
+async fn read_body(body: Body, headers: &HeaderMap, limit: usize) -> Result<RequestBody, Fault> {
     let declared = headers.get(header::CONTENT_LENGTH).and_then(|v| v.to_str().ok()?.parse::<usize>().ok());
-    if declared.is_some_and(|bytes| bytes > LARGEST) {
-        return Err(Fault::TooLarge { limit: LARGEST });
+    if declared.is_some_and(|bytes| bytes > limit) {
+        return Err(Fault::TooLarge { limit });
     }
     let mut rest = body.into_data_stream();
     let mut read = BytesMut::new();
