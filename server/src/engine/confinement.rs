@@ -15,7 +15,7 @@ const LANDLOCK: ABI = ABI::V5;
 const SYSTEM: [&str; 4] = ["/proc", "/sys/fs/cgroup", "/sys/devices/system/cpu", "/dev/urandom"];
 /// Address space over what queries may hold, for a process that is running: stacks of threads that are still to come,
 /// caches, what the allocator keeps. The door looks at what is really used; this limit ends one huge allocation at once.
-const OVERHEAD_BYTES: u64 = 256 << 20;
+const OVERHEAD_BYTES: u64 = 1 << 30;
 /// Place of the writable address space in `/proc/PID/statm`, in pages.
 const STATM_DATA: usize = 5;
 
