@@ -2,6 +2,7 @@
 
 use std::collections::BTreeSet;
 use std::sync::Arc;
+use std::sync::atomic::AtomicUsize;
 use std::time::Duration;
 
 use datafusion::catalog::{CatalogProvider as _, CatalogProviderList as _};
@@ -22,6 +23,7 @@ use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 use tokio::task::JoinHandle;
 
 use crate::catalog::Catalog;
+use crate::control::pool::PartialPool;
 use crate::control::threads::Threads;
 use crate::control::{RunningQueries, Stop, Ticket};
 use crate::small::SmallTables;
@@ -91,15 +93,15 @@ pub struct Client {
     name: String,
     quota: Quota,
     places: Option<Arc<Semaphore>>,
-    pool: Option<Arc<dyn MemoryPool>>,
+    /// Bytes that operators of its queries say they hold.
+    held: Arc<AtomicUsize>,
 }
 
 impl Client {
     /// A client.
     pub fn new(name: impl Into<String>, quota: Quota) -> Self {
         let places = quota.concurrent.map(|places| Arc::new(Semaphore::new(places)));
-        let pool = quota.memory.map(|bytes| Arc::new(GreedyMemoryPool::new(bytes)) as Arc<dyn MemoryPool>);
-        Self { name: name.into(), quota, places, pool }
+        Self { name: name.into(), quota, places, held: Arc::default() }
     }
 
     /// Name for logs and refusals.
@@ -112,9 +114,12 @@ impl Client {
         &self.quota
     }
 
-    /// What counts the memory of their queries, where that is limited.
-    pub(crate) fn memory_pool(&self) -> Option<Arc<dyn MemoryPool>> {
-        self.pool.clone()
+    /// Their part of the pool of all queries.
+    pub(crate) fn memory_pool(&self, all: Arc<dyn MemoryPool>) -> Arc<dyn MemoryPool> {
+        match self.quota.memory {
+            Some(limit) => Arc::new(PartialPool::new(all, "the client's queries hold", limit, self.held.clone())),
+            None => all,
+        }
     }
 
     /// A place among what they may run at once, for a query or for other work that their requests cause.

@@ -20,7 +20,7 @@ use futures::StreamExt as _;
 use tokio::sync::mpsc;
 use tokio::task::JoinHandle;
 
-use crate::control::pool::QueryPool;
+use crate::control::pool::PartialPool;
 use crate::control::{Stop, Ticket, WorkGuard};
 use crate::engine::{self, Client, Engine, Function, Limits, Place, Quota};
 use crate::mcap::Contents;
@@ -272,8 +272,8 @@ impl Session {
     fn task_context(&self, state: &SessionState, ticket: &Arc<Ticket>) -> Arc<TaskContext> {
         let mut runtime = state.runtime_env().as_ref().clone();
         let limit = self.engine.memory(self.client.quota());
-        let pool = self.client.memory_pool().unwrap_or(runtime.memory_pool);
-        runtime.memory_pool = Arc::new(QueryPool::new(pool, limit, ticket.clone()));
+        let pool = self.client.memory_pool(runtime.memory_pool);
+        runtime.memory_pool = Arc::new(PartialPool::new(pool, "the query holds", limit, ticket.held().clone()));
         Arc::new(TaskContext::from(state).with_runtime(Arc::new(runtime)))
     }
 

@@ -28,7 +28,7 @@ pub(crate) struct Ticket {
     stop: OnceLock<(Stop, Instant)>,
     stopped: Notify,
     /// Bytes that its operators say they hold.
-    held: AtomicUsize,
+    held: Arc<AtomicUsize>,
     /// Guards of work that is being done for it.
     working: AtomicUsize,
 }
@@ -50,7 +50,7 @@ impl Drop for WorkGuard {
 
 impl Ticket {
     pub(crate) fn new() -> Self {
-        Self { stop: OnceLock::new(), stopped: Notify::new(), held: AtomicUsize::new(0), working: AtomicUsize::new(0) }
+        Self { stop: OnceLock::new(), stopped: Notify::new(), held: Arc::default(), working: AtomicUsize::new(0) }
     }
 
     /// Ends the query; the first reason counts.
@@ -76,8 +76,9 @@ impl Ticket {
         }
     }
 
-    pub(crate) fn held(&self) -> usize {
-        self.held.load(Ordering::Relaxed)
+    /// Bytes that its operators say they hold.
+    pub(crate) fn held(&self) -> &Arc<AtomicUsize> {
+        &self.held
     }
 
     /// Marks the begin of work for the query.
@@ -95,7 +96,7 @@ impl Ticket {
 
 impl fmt::Debug for Ticket {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.debug_struct("Ticket").field("stop", &self.why()).field("held", &self.held()).finish_non_exhaustive()
+        f.debug_struct("Ticket").field("stop", &self.why()).field("held", &self.held).finish_non_exhaustive()
     }
 }
 

@@ -1,48 +1,49 @@
-//! Memory that a query's operators hold, counted against its own limit and that of all queries together.
+//! Memory that operators hold, counted against the limits of their query, of their client, and of all queries together.
 
 use std::sync::Arc;
-use std::sync::atomic::Ordering;
+use std::sync::atomic::{AtomicUsize, Ordering};
 
 use datafusion::common::Result;
 use datafusion::error::DataFusionError;
 use datafusion::execution::memory_pool::{MemoryConsumer, MemoryLimit, MemoryPool, MemoryReservation};
 
-use super::Ticket;
-
-/// The part of the common pool that one query may have. What would pass the limit is refused: sorts and
-/// aggregations then go to disk, all else fails.
+/// The part of another pool that one query, or all queries of a client, may have. Allocations beyond the limit are
+/// refused: sorts and aggregations then go to disk, all else fails.
 #[derive(Debug)]
-pub(crate) struct QueryPool {
+pub(crate) struct PartialPool {
     all: Arc<dyn MemoryPool>,
+    /// Whose part it is, in words.
+    holder: &'static str,
     limit: usize,
-    ticket: Arc<Ticket>,
+    held: Arc<AtomicUsize>,
 }
 
-impl QueryPool {
-    pub(crate) fn new(all: Arc<dyn MemoryPool>, limit: usize, ticket: Arc<Ticket>) -> Self {
-        Self { all, limit, ticket }
+impl PartialPool {
+    pub(crate) fn new(all: Arc<dyn MemoryPool>, holder: &'static str, limit: usize, held: Arc<AtomicUsize>) -> Self {
+        Self { all, holder, limit, held }
     }
 
     fn refused(&self, consumer: &str, bytes: usize, held: usize) -> DataFusionError {
         let mib = |bytes: usize| bytes.div_ceil(1 << 20);
         DataFusionError::ResourcesExhausted(format!(
-            "{consumer} needs {} MiB more; the query holds {} of its {} MiB",
+            "{consumer} needs {} MiB more; {} {} of its {} MiB",
             mib(bytes),
+            self.holder,
             mib(held),
             mib(self.limit)
         ))
     }
 }
 
-impl std::fmt::Display for QueryPool {
+impl std::fmt::Display for PartialPool {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        write!(f, "query({} of {})", self.ticket.held(), self.limit)
+        write!(f, "{}({} of {})", self.holder, self.reserved(), self.limit)
     }
 }
 
-impl MemoryPool for QueryPool {
+impl MemoryPool for PartialPool {
     fn name(&self) -> &str {
-        "query"
+        self.holder
     }
 
     fn register(&self, consumer: &MemoryConsumer) {
@@ -54,30 +55,59 @@ impl MemoryPool for QueryPool {
     }
 
     fn grow(&self, reservation: &MemoryReservation, additional: usize) {
-        self.ticket.held.fetch_add(additional, Ordering::Relaxed);
+        self.held.fetch_add(additional, Ordering::Relaxed);
         self.all.grow(reservation, additional);
     }
 
     fn shrink(&self, reservation: &MemoryReservation, shrink: usize) {
-        self.ticket.held.fetch_sub(shrink, Ordering::Relaxed);
+        self.held.fetch_sub(shrink, Ordering::Relaxed);
         self.all.shrink(reservation, shrink);
     }
 
     fn try_grow(&self, reservation: &MemoryReservation, additional: usize) -> Result<()> {
         let within = |held: usize| held.checked_add(additional).filter(|sum| *sum <= self.limit);
         let consumer = reservation.consumer().name();
-        let counted = self.ticket.held.fetch_update(Ordering::Relaxed, Ordering::Relaxed, within);
+        let counted = self.held.fetch_update(Ordering::Relaxed, Ordering::Relaxed, within);
         counted.map_err(|held| self.refused(consumer, additional, held))?;
         self.all.try_grow(reservation, additional).inspect_err(|_| {
-            self.ticket.held.fetch_sub(additional, Ordering::Relaxed);
+            self.held.fetch_sub(additional, Ordering::Relaxed);
         })
     }
 
     fn reserved(&self) -> usize {
-        self.ticket.held()
+        self.held.load(Ordering::Relaxed)
     }
 
     fn memory_limit(&self) -> MemoryLimit {
         MemoryLimit::Finite(self.limit)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use datafusion::execution::memory_pool::GreedyMemoryPool;
+
+    use super::*;
+
+    #[test]
+    fn queries_share_what_their_client_and_all_may_hold() {
+        let all: Arc<dyn MemoryPool> = Arc::new(GreedyMemoryPool::new(25));
+        let client_held = Arc::<AtomicUsize>::default();
+        let reserve = |held: &Arc<AtomicUsize>| {
+            let client = Arc::new(PartialPool::new(all.clone(), "the client's queries hold", 10, held.clone()));
+            let query: Arc<dyn MemoryPool> = Arc::new(PartialPool::new(client, "the query holds", 8, Arc::default()));
+            MemoryConsumer::new("sort").register(&query)
+        };
+        let (first, second, other) = (reserve(&client_held), reserve(&client_held), reserve(&Arc::default()));
+        let refused = first.try_grow(9).expect_err("more than a query's").to_string();
+        assert!(refused.contains("the query holds"), "{refused}");
+        first.try_grow(6).expect("within all three");
+        let refused = second.try_grow(6).expect_err("more than the client's").to_string();
+        assert!(refused.contains("the client's queries hold"), "{refused}");
+        assert_eq!(second.size(), 0, "nothing is counted that was refused");
+        other.try_grow(8).expect("another client has its own part");
+        first.free();
+        second.try_grow(6).expect("what is given back is free");
+        assert_eq!(all.reserved(), 14);
     }
 }
