@@ -112,7 +112,10 @@ fn what_is_wrong_has_a_code() {
     refused(&sql(&server, "drop table runs"), 403, "read_only");
     refused(&sql(&server, "copy (select 1) to '/tmp/echolake-out.csv'"), 403, "read_only");
     refused(&sql(&server, "select 1/(value - 1) from generate_series(1, 2)"), 422, "query_failed");
-    refused(&sql(&server, &"-".repeat(3 << 20)), 413, "request_too_large");
+    let long = "-".repeat(3 << 20);
+    refused(&sql(&server, &long), 413, "request_too_large");
+    let unknown_length = Request::post("/api/v1/sql", &long).with("content-type", "application/sql").chunked();
+    refused(&unknown_length.send(&server), 413, "request_too_large");
     let post = |body: &str| Request::post("/api/v1/sql", body);
     refused(&post("select 1").send(&server), 400, "request_invalid");
     refused(

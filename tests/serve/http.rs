@@ -13,6 +13,7 @@ pub(crate) struct Request {
     host: Option<String>,
     headers: String,
     body: String,
+    is_chunked: bool,
 }
 
 /// An answer.
@@ -27,7 +28,8 @@ pub(crate) struct Answer {
 
 impl Request {
     pub(crate) fn get(path: &str) -> Self {
-        Self { method: "GET", path: path.to_owned(), host: None, headers: String::new(), body: String::new() }
+        let (headers, body) = (String::new(), String::new());
+        Self { method: "GET", path: path.to_owned(), host: None, headers, body, is_chunked: false }
     }
 
     pub(crate) fn head(path: &str) -> Self {
@@ -52,6 +54,13 @@ impl Request {
         self
     }
 
+    /// Sends the body as one chunk, so that its length is not known before its end.
+    pub(crate) fn chunked(mut self) -> Self {
+        self.body = format!("{:x}\r\n{}\r\n0\r\n\r\n", self.body.len(), self.body);
+        self.is_chunked = true;
+        self
+    }
+
     /// Sends it and does not wait.
     pub(crate) fn begin(self, server: &Served) -> TcpStream {
         let bytes = self.bytes(&server.http);
@@ -65,12 +74,15 @@ impl Request {
 
     /// Returns the request as it is sent to this address.
     pub(crate) fn bytes(&self, address: &str) -> Vec<u8> {
+        let length = match self.is_chunked {
+            true => "transfer-encoding: chunked".to_owned(),
+            false => format!("content-length: {}", self.body.len()),
+        };
         let head = format!(
-            "{} {} HTTP/1.1\r\nhost: {}\r\nconnection: close\r\ncontent-length: {}\r\n{}\r\n",
+            "{} {} HTTP/1.1\r\nhost: {}\r\nconnection: close\r\n{length}\r\n{}\r\n",
             self.method,
             self.path,
             self.host.as_deref().unwrap_or(address),
-            self.body.len(),
             self.headers
         );
         [head.as_bytes(), self.body.as_bytes()].concat()

@@ -88,15 +88,15 @@ impl EnginePool {
     /// [`Fault::TooMany`] if other clients' engines are all answering; [`Fault::EngineEnded`].
     pub(super) async fn lease(&self, client: &ClientIdentity) -> Result<EngineLease, Fault> {
         let own = self.client(&client.name);
-        if let Some(lease) = own.live() {
+        if let Some(lease) = own.lease() {
             return Ok(lease);
         }
         let mut state = own.state.lock().await;
         // Whoever held the lock has started one.
-        if let Some(lease) = own.live() {
+        if let Some(lease) = own.lease() {
             return Ok(lease);
         }
-        self.count_end(&own, &mut state);
+        self.count_end(&own, &mut state).await;
         tokio::time::sleep(state.backoff()).await;
         self.make_room(&own).await?;
         let engine = self.take_spare().map_err(|failed| {
@@ -109,7 +109,7 @@ impl EnginePool {
             eprintln!("an engine did not start: {reason}");
             return Err(Fault::EngineEnded { reason });
         }
-        let lease = EngineLease::new(engine.clone());
+        let lease = engine.lease().ok_or_else(|| Fault::EngineEnded { reason: "it ended at once".to_owned() })?;
         *lock(&own.current) = Some(engine);
         Ok(lease)
     }
@@ -118,9 +118,10 @@ impl EnginePool {
         lock(&self.0.clients).entry(name.to_owned()).or_default().clone()
     }
 
-    fn count_end(&self, own: &ClientEngine, state: &mut ClientState) {
+    async fn count_end(&self, own: &ClientEngine, state: &mut ClientState) {
         let ended = lock(&own.current).take();
-        if let Some(EndReason::Failed(reason)) = ended.as_deref().and_then(EngineProcess::end_reason) {
+        let Some(ended) = ended else { return };
+        if let Some(EndReason::Failed(reason)) = ended.why_ended().await {
             eprintln!("an engine ended: {reason}");
             self.0.failed.fetch_add(1, Ordering::Relaxed);
             if state.last_end.is_some_and(|at| at.elapsed() > FORGIVEN) {
@@ -141,11 +142,9 @@ impl EnginePool {
                     return;
                 }
                 let idle = live.into_iter().filter(|e| e.requests() == 0).max_by_key(|e| e.idle_time());
-                match idle {
-                    Some(engine) => {
-                        engine.end(EndReason::Retired);
-                        engine.wait_for_end().await;
-                    }
+                // One that is asked something meanwhile stays.
+                match idle.filter(|engine| engine.retire_after(Duration::ZERO)) {
+                    Some(engine) => engine.wait_for_end().await,
                     None => drop(tokio::time::timeout(LOOK, freed).await),
                 }
             }
@@ -218,6 +217,8 @@ impl EnginePool {
             let limit = self.0.settings.memory;
             if sizes.iter().map(|(bytes, _)| bytes).sum::<usize>() > limit
                 && let Some((_, largest)) = sizes.iter().max_by_key(|(bytes, _)| *bytes)
+                // One that only keeps what it once had has done nothing wrong.
+                && !largest.retire_after(Duration::ZERO)
             {
                 let reason = format!("queries took more than {} MiB, and its client's the most", limit >> 20);
                 largest.end(EndReason::Failed(reason));
@@ -229,12 +230,10 @@ impl EnginePool {
         loop {
             tokio::time::sleep(IDLE / 10).await;
             for engine in self.live() {
-                if engine.requests() == 0 && engine.idle_time() > IDLE {
-                    engine.end(EndReason::Retired);
-                }
+                engine.retire_after(IDLE);
             }
             // Clients may come under any number of names.
-            lock(&self.0.clients).retain(|_, client| client.live().is_some() || Arc::strong_count(client) > 1);
+            lock(&self.0.clients).retain(|_, client| client.has_engine() || Arc::strong_count(client) > 1);
         }
     }
 
@@ -262,9 +261,12 @@ impl EnginePool {
 }
 
 impl ClientEngine {
-    fn live(&self) -> Option<EngineLease> {
-        let current = lock(&self.current);
-        current.as_ref().filter(|engine| !engine.has_ended()).map(|engine| EngineLease::new(engine.clone()))
+    fn lease(&self) -> Option<EngineLease> {
+        lock(&self.current).as_ref().and_then(EngineProcess::lease)
+    }
+
+    fn has_engine(&self) -> bool {
+        lock(&self.current).as_ref().is_some_and(|engine| !engine.has_ended())
     }
 }
 

@@ -4,8 +4,7 @@ use std::ffi::OsStr;
 use std::io;
 use std::path::{Path, PathBuf};
 use std::process::Stdio;
-use std::sync::atomic::{AtomicUsize, Ordering};
-use std::sync::{Arc, Mutex, OnceLock, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
 use std::time::{Duration, Instant};
 
 use axum::body::Body;
@@ -38,8 +37,7 @@ pub(super) struct EngineProcess {
     pid: u32,
     folder: PathBuf,
     stdin: tokio::sync::Mutex<ChildStdin>,
-    requests: AtomicUsize,
-    last_used: Mutex<Instant>,
+    usage: Mutex<EngineUsage>,
     base_bytes: OnceLock<usize>,
     /// What its client's queries may occupy.
     memory_limit: OnceLock<usize>,
@@ -48,6 +46,12 @@ pub(super) struct EngineProcess {
     why_killed: OnceLock<EndReason>,
     ended: SetOnce<EndReason>,
     pub(super) flight: tokio::sync::Mutex<Option<http2::SendRequest<Body>>>,
+}
+
+struct EngineUsage {
+    requests: usize,
+    last_used: Instant,
+    is_ending: bool,
 }
 
 /// What an engine is started with.
@@ -91,8 +95,7 @@ impl EngineProcess {
             pid,
             folder: start.sockets,
             stdin: tokio::sync::Mutex::new(stdin),
-            requests: AtomicUsize::new(0),
-            last_used: Mutex::new(Instant::now()),
+            usage: Mutex::new(EngineUsage { requests: 0, last_used: Instant::now(), is_ending: false }),
             base_bytes: OnceLock::new(),
             memory_limit: OnceLock::new(),
             ready: SetOnce::new(),
@@ -132,14 +135,42 @@ impl EngineProcess {
         UnixStream::connect(socket.path(&self.folder)).await
     }
 
+    /// Holds it for one request; None if it is ending.
+    pub(super) fn lease(self: &Arc<Self>) -> Option<EngineLease> {
+        let mut usage = self.usage();
+        if usage.is_ending || self.has_ended() {
+            return None;
+        }
+        usage.requests += 1;
+        Some(EngineLease(self.clone()))
+    }
+
     /// Kills it; the first reason counts.
     pub(super) fn end(&self, why: EndReason) {
+        self.usage().is_ending = true;
         let _ = self.why_killed.set(why);
         self.kill.notify_one();
     }
 
+    /// Kills it if it has answered nothing for longer than `time`, and answers nothing now.
+    pub(super) fn retire_after(&self, time: Duration) -> bool {
+        let mut usage = self.usage();
+        if usage.requests > 0 || usage.last_used.elapsed() < time {
+            return false;
+        }
+        usage.is_ending = true;
+        drop(usage);
+        self.end(EndReason::Retired);
+        true
+    }
+
+    /// Whether its process is gone.
     pub(super) fn has_ended(&self) -> bool {
         self.ended.get().is_some()
+    }
+
+    fn usage(&self) -> MutexGuard<'_, EngineUsage> {
+        self.usage.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     /// How it ended, if it did.
@@ -159,12 +190,12 @@ impl EngineProcess {
 
     /// Requests that it answers now.
     pub(super) fn requests(&self) -> usize {
-        self.requests.load(Ordering::Relaxed)
+        self.usage().requests
     }
 
     /// Time since the last request.
     pub(super) fn idle_time(&self) -> Duration {
-        self.last_used.lock().unwrap_or_else(PoisonError::into_inner).elapsed()
+        self.usage().last_used.elapsed()
     }
 
     /// Bytes that its client's queries may occupy; None if they have no limit of their own.
@@ -191,11 +222,6 @@ fn private_bytes(pid: u32) -> Option<usize> {
 pub(super) struct EngineLease(Arc<EngineProcess>);
 
 impl EngineLease {
-    pub(super) fn new(engine: Arc<EngineProcess>) -> Self {
-        engine.requests.fetch_add(1, Ordering::Relaxed);
-        Self(engine)
-    }
-
     pub(super) fn engine(&self) -> &Arc<EngineProcess> {
         &self.0
     }
@@ -203,8 +229,9 @@ impl EngineLease {
 
 impl Drop for EngineLease {
     fn drop(&mut self) {
-        *self.0.last_used.lock().unwrap_or_else(PoisonError::into_inner) = Instant::now();
-        self.0.requests.fetch_sub(1, Ordering::Relaxed);
+        let mut usage = self.0.usage();
+        usage.requests -= 1;
+        usage.last_used = Instant::now();
     }
 }
 

@@ -1,6 +1,8 @@
 //! Requests over HTTP on their way to an engine and back, for both versions of HTTP.
 
+use std::io;
 use std::pin::Pin;
+use std::sync::{Arc, Mutex, PoisonError};
 use std::task::{Context, Poll};
 use std::time::Duration;
 
@@ -8,7 +10,7 @@ use axum::body::{Body, BodyDataStream};
 use axum::http::request::Parts;
 use axum::http::{HeaderMap, HeaderName, Request, Response, header};
 use bytes::{Bytes, BytesMut};
-use futures::{Stream, StreamExt as _, TryStreamExt as _, stream};
+use futures::{TryStreamExt as _, stream};
 use hyper::body::{Frame, Incoming, SizeHint};
 use hyper::client::conn::{http1, http2};
 use hyper_util::rt::{TokioExecutor, TokioIo};
@@ -25,9 +27,10 @@ use crate::flight::WINDOW_BYTES;
 
 /// Bytes of a request up to which it is kept, so that it can be sent again to a new engine.
 const KEPT_BYTES: usize = 64 << 10;
-/// Bytes of a request: that of HTTP's endpoints, which answer sooner than they have read more, and gRPC's of one message.
+/// Bytes of a request: that of HTTP's endpoints, which answer sooner than they have read more, and gRPC's of one message
+/// with its length.
 const LARGEST_HTTP: usize = 2 << 20;
-const LARGEST_GRPC: usize = 4 << 20;
+const LARGEST_GRPC: usize = (4 << 20) + 5;
 /// How long the body of a request may take.
 const BODY_LIMIT: Duration = Duration::from_secs(30);
 /// Bytes of a frame of HTTP/2 between an engine and the door; the default of 16 KiB costs a wake-up each.
@@ -51,8 +54,11 @@ pub(super) enum Wire {
 enum RequestBody {
     Whole(Bytes),
     /// One that is too long to be kept, or that its client ends only after an answer.
-    Streamed(Body),
+    Streamed(Body, BodyFault),
 }
+
+/// What was wrong with a body that was passed on, once that is known.
+type BodyFault = Arc<Mutex<Option<Fault>>>;
 
 impl EnginePool {
     /// Answers a request by the engine of `client`. If the engine ends before its answer begins, a new one is asked once.
@@ -72,8 +78,7 @@ impl EnginePool {
         }
         let mut body = match wire {
             Wire::InteractiveGrpc => {
-                let rest = in_time(body.into_data_stream(), Instant::now() + BODY_LIMIT);
-                RequestBody::Streamed(Body::from_stream(rest))
+                RequestBody::stream(Bytes::new(), body.into_data_stream(), Instant::now() + BODY_LIMIT, usize::MAX)
             }
             Wire::Http => read_body(body, &parts.headers, LARGEST_HTTP).await?,
             Wire::Grpc => read_body(body, &parts.headers, LARGEST_GRPC).await?,
@@ -81,7 +86,7 @@ impl EnginePool {
         let working = work.begin();
         loop {
             let lease = self.lease(client).await?;
-            let (sent, again) = body.send();
+            let (sent, fault, again) = body.send();
             let answer = EngineAnswer::fetch(lease.engine(), request_of(&parts, sent), wire).await;
             match (answer, again) {
                 (Ok(answer), _) => return Ok(answer.with(lease, working)),
@@ -89,18 +94,55 @@ impl EnginePool {
                     body = again;
                     let _ = lease.engine().why_ended().await;
                 }
-                (Err(failed), None) => return Err(why(&lease, &failed).await),
+                (Err(failed), None) => {
+                    let fault = fault.lock().unwrap_or_else(PoisonError::into_inner).take();
+                    return Err(match fault {
+                        Some(fault) => fault,
+                        None => why(&lease, &failed).await,
+                    });
+                }
             }
         }
     }
 }
 
 impl RequestBody {
+    // The rest of a body behind what was read of it. It fails where it is too long or takes too long: one that just ended
+    // would look whole.
+    fn stream(read: Bytes, rest: BodyDataStream, end: Instant, most: usize) -> Self {
+        let fault = BodyFault::default();
+        let found = fault.clone();
+        let stream = stream::try_unfold((read, rest, most), move |(read, mut rest, left)| {
+            let found = found.clone();
+            async move {
+                let part = match read.is_empty() {
+                    false => Ok(Some(read)),
+                    true => next_part(&mut rest, end).await,
+                };
+                let fault = match part {
+                    Ok(None) => return Ok(None),
+                    Ok(Some(part)) => match left.checked_sub(part.len()) {
+                        Some(left) => return Ok(Some((part, (Bytes::new(), rest, left)))),
+                        None => Fault::TooLarge { limit: most },
+                    },
+                    Err(fault) => fault,
+                };
+                let failed = io::Error::other(fault.to_string());
+                *found.lock().unwrap_or_else(PoisonError::into_inner) = Some(fault);
+                Err(failed)
+            }
+        });
+        Self::Streamed(Body::from_stream(stream), fault)
+    }
+
     // What is sent, and what can be sent once more if that fails.
-    fn send(self) -> (Body, Option<Self>) {
+    fn send(self) -> (Body, BodyFault, Option<Self>) {
         match self {
-            Self::Whole(bytes) => (Body::from(bytes.clone()), Some(Self::Streamed(Body::from(bytes)))),
-            Self::Streamed(body) => (body, None),
+            Self::Whole(bytes) => {
+                let again = Self::Streamed(Body::from(bytes.clone()), BodyFault::default());
+                (Body::from(bytes), BodyFault::default(), Some(again))
+            }
+            Self::Streamed(body, fault) => (body, fault, None),
         }
     }
 }
@@ -134,23 +176,18 @@ async fn read_body(body: Body, headers: &HeaderMap, limit: usize) -> Result<Requ
     let mut read = BytesMut::new();
     let end = Instant::now() + BODY_LIMIT;
     while read.len() <= KEPT_BYTES {
-        let part = tokio::time::timeout_at(end, rest.try_next()).await;
-        let part = part.map_err(|_| Fault::request(format!("the body took longer than {BODY_LIMIT:?}")))?;
-        match part.map_err(|_| Fault::request("the request's body did not come whole"))? {
+        match next_part(&mut rest, end).await? {
             Some(part) => read.extend_from_slice(&part),
             None => return Ok(RequestBody::Whole(read.freeze())),
         }
     }
-    let first = stream::once(async { Ok(read.freeze()) });
-    Ok(RequestBody::Streamed(Body::from_stream(first.chain(in_time(rest, end)))))
+    Ok(RequestBody::stream(read.freeze(), rest, end, limit))
 }
 
-// An error where it takes too long: a body that just ended would look whole.
-fn in_time(rest: BodyDataStream, end: Instant) -> impl Stream<Item = Result<Bytes, axum::Error>> + Send {
-    stream::try_unfold(rest, move |mut rest| async move {
-        let part = tokio::time::timeout_at(end, rest.try_next()).await.map_err(axum::Error::new)??;
-        Ok(part.map(|part| (part, rest)))
-    })
+async fn next_part(rest: &mut BodyDataStream, end: Instant) -> Result<Option<Bytes>, Fault> {
+    let part = tokio::time::timeout_at(end, rest.try_next()).await;
+    let part = part.map_err(|_| Fault::request(format!("the body took longer than {BODY_LIMIT:?}")))?;
+    part.map_err(|_| Fault::request("the request's body did not come whole"))
 }
 
 struct EngineAnswer {

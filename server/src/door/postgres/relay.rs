@@ -167,6 +167,9 @@ impl Relay {
             if header.kind == b'X' {
                 return Err(RelayEnd::Client);
             }
+            if link.lease.is_none() && !self.is_skipping {
+                link.lease = Some(link.engine.lease().ok_or(RelayEnd::Engine)?);
+            }
             let bytes = self.incoming.split_to(there);
             (self.rest, self.is_rest_dropped) = (header.bytes - there, self.is_skipping);
             if self.is_skipping {
@@ -178,7 +181,6 @@ impl Relay {
             }
             self.exchange.ask(header, &bytes);
             link.outgoing.extend_from_slice(&bytes);
-            link.lease.get_or_insert_with(|| EngineLease::new(link.engine.clone()));
         }
     }
 
@@ -280,13 +282,21 @@ impl Relay {
 
     // Begins a session on the client's engine; one that is not the first is brought to where the last one was.
     async fn connect(&mut self, is_first: bool) -> Result<EngineLink, Option<Fault>> {
-        let lease = self.door.engines().lease(&self.login.client).await.map_err(Some)?;
-        let engine = lease.engine().clone();
-        let started = self.start_session(lease, is_first).await;
-        match started {
-            Ok(Some(link)) => Ok(link),
-            Ok(None) => Err(None),
-            Err(_) => Err(Some(engine_fault(&engine).await)),
+        let told = self.outgoing.len();
+        let mut is_repeated = false;
+        loop {
+            let lease = self.door.engines().lease(&self.login.client).await.map_err(Some)?;
+            let engine = lease.engine().clone();
+            match self.start_session(lease, is_first).await {
+                Ok(Some(link)) => return Ok(link),
+                Ok(None) => return Err(None),
+                Err(_) if is_repeated => return Err(Some(engine_fault(&engine).await)),
+                Err(_) => {
+                    self.outgoing.truncate(told);
+                    is_repeated = true;
+                    let _ = engine.why_ended().await;
+                }
+            }
         }
     }
 
