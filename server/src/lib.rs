@@ -4,7 +4,7 @@
 //! ```no_run,standalone_crate
 //! # async fn example(settings: echolake_server::Settings) -> Result<(), Box<dyn std::error::Error>> {
 //! let lake = echolake_lake::Lake::open("lake").await?;
-//! let server = echolake_server::Server::bind(&lake, settings).await?;
+//! let server = echolake_server::Server::bind(&lake, settings)?;
 //! for address in server.addresses() {
 //!     eprintln!("{address}");
 //! }

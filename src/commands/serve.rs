@@ -112,7 +112,7 @@ pub(crate) async fn run(args: &ServeArgs, lake_url: &str) -> anyhow::Result<Done
         tokens: args.tokens.as_deref().map(Tokens::read).transpose()?,
         engines: engines(args.memory, args.engines, args.temp.clone())?,
     };
-    let server = Server::bind(&lake, settings).await?;
+    let server = Server::bind(&lake, settings)?;
     anyhow::ensure!(!server.addresses().is_empty(), "nothing to listen on; hint: all three are off");
     eprintln!("lake {}", lake.location());
     if let Some(missing) = confinement::missing() {
@@ -126,8 +126,8 @@ pub(crate) async fn catalogue(lake: &Lake, stop: &StopRequest) -> anyhow::Result
     let engines = engines(MEMORY_MIB, ENGINES, None)?;
     let settings =
         |http| Settings { http: Some(http), flight_sql: None, postgres: None, tokens: None, engines: engines.clone() };
-    let server = match Server::bind(lake, settings(HTTP)).await {
-        Err(Error::Bind { .. }) => Server::bind(lake, settings(SocketAddr::new(HTTP.ip(), 0))).await?,
+    let server = match Server::bind(lake, settings(HTTP)) {
+        Err(Error::Bind { .. }) => Server::bind(lake, settings(SocketAddr::new(HTTP.ip(), 0)))?,
         bound => bound?,
     };
     eprintln!("the catalogue, until Ctrl-C:");

@@ -16,6 +16,11 @@ use tokio::time::Sleep;
 
 /// How long to wait where the system has no more sockets.
 const PAUSE: Duration = Duration::from_millis(100);
+/// Bytes that a connection reads before it is the turn of others. A frame of HTTP/2 may have nine and no answer.
+const TURN_BYTES: usize = 16 << 10;
+/// Bytes that a connection may send of what is no request. Each of a flood of frames is little, and costs as much as one
+/// that says something.
+const IDLE_BYTES: usize = 1 << 20;
 /// How long a client may read nothing of an answer.
 const STALL: Duration = Duration::from_secs(300);
 
@@ -72,7 +77,7 @@ impl ConnectionPlaces {
         let state = PlaceState { address, working: AtomicUsize::new(0), evicted: Notify::new() };
         let state = Arc::new(state);
         self.taken.lock().push(state.clone());
-        PlacedStream { stream, state, taken: self.taken.clone(), stalled: None }
+        PlacedStream { stream, state, taken: self.taken.clone(), turn_bytes: 0, idle_bytes: 0, stalled: None }
     }
 
     // Another machine has half of the places at most; false where all of those work.
@@ -111,6 +116,8 @@ pub(super) struct PlacedStream {
     stream: TcpStream,
     state: Arc<PlaceState>,
     taken: Arc<TakenPlaces>,
+    turn_bytes: usize,
+    idle_bytes: usize,
     stalled: Option<Pin<Box<Sleep>>>,
 }
 
@@ -169,7 +176,20 @@ impl AsyncRead for PlacedStream {
         context: &mut Context<'_>,
         buffer: &mut ReadBuf<'_>,
     ) -> Poll<io::Result<()>> {
-        Pin::new(&mut self.stream).poll_read(context, buffer)
+        if self.turn_bytes >= TURN_BYTES {
+            self.turn_bytes = 0;
+            context.waker().wake_by_ref();
+            return Poll::Pending;
+        }
+        let before = buffer.filled().len();
+        let read = Pin::new(&mut self.stream).poll_read(context, buffer);
+        let bytes = buffer.filled().len() - before;
+        self.turn_bytes = if read.is_ready() { self.turn_bytes + bytes } else { 0 };
+        self.idle_bytes = if self.state.is_idle() { self.idle_bytes + bytes } else { 0 };
+        if self.idle_bytes > IDLE_BYTES {
+            return Poll::Ready(Err(io::Error::other("too much was sent without a request")));
+        }
+        read
     }
 }
 

@@ -16,7 +16,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use echolake_lake::Lake;
-use tokio::net::TcpListener;
+use tokio::net::{TcpListener, TcpSocket};
 use tokio::sync::watch;
 use tokio::task::JoinSet;
 
@@ -27,6 +27,9 @@ use engine_pool::EnginePool;
 
 /// How long answers may go on when the server is told to stop.
 const GRACE: Duration = Duration::from_secs(5);
+/// Bytes that the system keeps for a connection until they are read, and connections until they are accepted.
+const RECEIVED_BYTES: u32 = 128 << 10;
+const BACKLOG: u32 = 1024;
 
 /// Where a server listens, whom it lets in, and what it gives them.
 pub struct Settings {
@@ -69,7 +72,7 @@ impl Server {
     ///
     /// # Errors
     /// [`Error::Open`], [`Error::Bind`], [`Error::Temp`].
-    pub async fn bind(lake: &Lake, settings: Settings) -> Result<Self, Error> {
+    pub fn bind(lake: &Lake, settings: Settings) -> Result<Self, Error> {
         let addresses = [settings.http, settings.flight_sql, settings.postgres];
         if settings.tokens.is_none()
             && let Some(address) = addresses.into_iter().flatten().find(|a| !a.ip().is_loopback())
@@ -78,9 +81,9 @@ impl Server {
         }
         Ok(Self {
             door: Door::new(lake, settings.tokens, settings.engines)?,
-            http: listen(settings.http).await?,
-            flight_sql: listen(settings.flight_sql).await?,
-            postgres: listen(settings.postgres).await?,
+            http: listen(settings.http)?,
+            flight_sql: listen(settings.flight_sql)?,
+            postgres: listen(settings.postgres)?,
         })
     }
 
@@ -129,11 +132,20 @@ impl Server {
     }
 }
 
-async fn listen(address: Option<SocketAddr>) -> Result<Option<TcpListener>, Error> {
+fn listen(address: Option<SocketAddr>) -> Result<Option<TcpListener>, Error> {
     match address {
         None => Ok(None),
-        Some(address) => TcpListener::bind(address).await.map(Some).map_err(|source| Error::Bind { address, source }),
+        Some(address) => bind(address).map(Some).map_err(|source| Error::Bind { address, source }),
     }
+}
+
+fn bind(address: SocketAddr) -> std::io::Result<TcpListener> {
+    let socket = if address.is_ipv4() { TcpSocket::new_v4() } else { TcpSocket::new_v6() }?;
+    socket.set_reuseaddr(true)?;
+    // Connections have what their listener has.
+    socket.set_recv_buffer_size(RECEIVED_BYTES)?;
+    socket.bind(address)?;
+    socket.listen(BACKLOG)
 }
 
 /// What all connections share.

@@ -3,6 +3,8 @@
 
 use std::collections::{BTreeMap, VecDeque};
 
+use bytes::BytesMut;
+
 use super::frames::{FrameHeader, HEADER};
 
 /// Bytes of messages that are kept, of a statement that runs as of all that was prepared.
@@ -16,9 +18,10 @@ const CURSOR: &[u8] = b"DECLARE CURSOR";
 /// A connection's exchange with its engine.
 #[derive(Default)]
 pub(super) struct Exchange {
-    /// Messages that are not answered, and where those end that ask for an answer.
-    asked: Vec<u8>,
-    ends: VecDeque<usize>,
+    /// Messages that are not answered, the bytes of each part that asks for an answer, and those of all such parts.
+    asked: BytesMut,
+    parts: VecDeque<usize>,
+    part_bytes: usize,
     /// Whether `asked` is all that was asked.
     is_cut: bool,
     /// Texts to be prepared, until the engine has done so.
@@ -50,19 +53,22 @@ impl Exchange {
         match header.kind {
             b'P' => self.parses.push_back((name(body).to_vec(), bytes.to_vec())),
             b'C' if body.first() == Some(&b'S') => self.close(name(&body[1..])),
-            b'Q' | b'S' => self.ends.push_back(self.asked.len()),
+            b'Q' | b'S' => {
+                self.parts.push_back(self.asked.len() - self.part_bytes);
+                self.part_bytes = self.asked.len();
+            }
             _ => {}
         }
     }
 
     /// Whether an answer is awaited.
     pub(super) fn is_waiting(&self) -> bool {
-        !self.ends.is_empty() || !self.asked.is_empty() || self.is_cut
+        !self.parts.is_empty() || !self.asked.is_empty() || self.is_cut
     }
 
     /// Whether the client has asked for an answer to the statement that runs, and not only sent its parts.
     pub(super) fn has_end(&self) -> bool {
-        !self.ends.is_empty()
+        !self.parts.is_empty()
     }
 
     /// Takes note of an engine's message that is passed on.
@@ -106,18 +112,18 @@ impl Exchange {
 
     // The statement that ran is answered: what was asked after it remains.
     fn finish(&mut self) {
-        let end = self.ends.pop_front().unwrap_or(self.asked.len());
-        let statement: Vec<u8> = self.asked.drain(..end).collect();
-        self.ends.iter_mut().for_each(|at| *at -= end);
+        let bytes = self.parts.pop_front().unwrap_or(self.asked.len());
+        let statement = self.asked.split_to(bytes);
+        self.part_bytes = self.part_bytes.saturating_sub(bytes);
         if self.sets == Some(true) {
             let kept: usize = self.settings.iter().map(Vec::len).sum();
             match !self.is_cut && kept + statement.len() <= KEPT_BYTES {
-                true if !self.settings.contains(&statement) => self.settings.push(statement),
-                true => {}
+                true if self.settings.iter().any(|known| *known == statement) => {}
+                true => self.settings.push(statement.to_vec()),
                 false => self.is_forgetful = true,
             }
         }
-        if self.ends.is_empty() {
+        if self.parts.is_empty() {
             self.is_cut = false;
             self.parses.clear();
         }
@@ -151,10 +157,11 @@ impl Exchange {
         self.sets = None;
         if self.is_cut {
             // What came after it is not known.
-            let ends = self.ends.len().saturating_sub(1);
+            let parts = self.parts.len().saturating_sub(1);
             self.asked.clear();
-            self.ends = std::iter::repeat_n(0, ends).collect();
-            self.is_cut = ends > 0;
+            self.part_bytes = 0;
+            self.parts = std::iter::repeat_n(0, parts).collect();
+            self.is_cut = parts > 0;
             self.begin_answer();
         } else {
             self.finish();
