@@ -16,6 +16,8 @@ const MOST_NESTED: usize = 100;
 /// Operators, and whatever else is written behind an expression, of one expression; also set operators and joins of one
 /// query. Twice as many still do no harm.
 const MOST_CHAINED: usize = 1_000;
+/// Statements of one text.
+const MOST_STATEMENTS: usize = 1_000;
 /// Doublings of the parser's time: 2^14 tries are a few hundredths of a second.
 const MOST_DOUBLINGS: f64 = 14.0;
 /// Calls with a syntax of their own, which the parser tries up to five times.
@@ -76,6 +78,7 @@ pub fn check_statement_bounds(sql: &str, dialect: &dyn Dialect) -> Result<(), Er
     let has_types = tokens.iter().any(|t| matches!(t, Token::Word(w) if is_one_of(w, &TYPE_FUNCTIONS)));
     let mut open = vec![OpenBracket::default()];
     let mut doublings = 0.0;
+    let mut statements = 0;
     let mut before = &Token::EOF;
     for token in tokens.iter().filter(|t| !matches!(t, Token::Whitespace(_))) {
         let Some(innermost) = open.last_mut() else { break };
@@ -98,7 +101,10 @@ pub fn check_statement_bounds(sql: &str, dialect: &dyn Dialect) -> Result<(), Er
                 }
             }
             Token::Comma => innermost.operators = 0,
-            Token::SemiColon => *innermost = OpenBracket { doublings: innermost.doublings, ..OpenBracket::default() },
+            Token::SemiColon => {
+                statements += 1;
+                *innermost = OpenBracket { doublings: innermost.doublings, ..OpenBracket::default() };
+            }
             Token::Word(word) if is_one_of(word, &QUERY_OPERATORS) => innermost.query_operators += 1,
             Token::Word(word) => innermost.operators += usize::from(is_one_of(word, &OPERATORS)),
             Token::Number(..) | Token::Placeholder(_) => {}
@@ -121,6 +127,9 @@ pub fn check_statement_bounds(sql: &str, dialect: &dyn Dialect) -> Result<(), Er
         }
         if innermost.1 > MOST_CHAINED {
             return refused("joins or unions in one query", MOST_CHAINED, "VALUES takes long lists");
+        }
+        if statements > MOST_STATEMENTS {
+            return refused("statements", MOST_STATEMENTS, "send them one after the other");
         }
         before = token;
     }
@@ -209,6 +218,7 @@ mod tests {
             format!("select {}!{}", "cast(".repeat(22), " as int)".repeat(22)),
             format!("select {}1{}", "(".repeat(101), ")".repeat(101)),
             format!("select {}!{}", "array[".repeat(22), "]".repeat(22)),
+            "select 1 as n;".repeat(50_000),
         ] {
             assert!(!passes(&sql), "{}", &sql[..60]);
         }
@@ -226,6 +236,7 @@ mod tests {
             format!("select 1 {}", "union all select 1 + 1 ".repeat(1_000)),
             "select '(((' || x[1]['a'] from t where not (a is null or b between 1 and 2)".to_owned(),
             "select 1)))) + 1".to_owned(),
+            "select 1 + 1;".repeat(1_000),
             "not sql at all '".to_owned(),
         ] {
             assert!(passes(&sql), "{}", &sql[..sql.len().min(60)]);

@@ -31,6 +31,9 @@ const KEPT_BYTES: usize = 64 << 10;
 /// with its length.
 const LARGEST_HTTP: usize = 2 << 20;
 const LARGEST_GRPC: usize = (4 << 20) + 5;
+/// Parts of a body beyond which they must have so many bytes on average: each costs as much as one that says something.
+const FREE_PARTS: usize = 4_096;
+const LEAST_PART_BYTES: usize = 16;
 /// How long the body of a request may take.
 const BODY_LIMIT: Duration = Duration::from_secs(30);
 /// Bytes of a frame of HTTP/2 between an engine and the door; the default of 16 KiB costs a wake-up each.
@@ -77,9 +80,7 @@ impl EnginePool {
             parts.headers.remove(name);
         }
         let mut body = match wire {
-            Wire::InteractiveGrpc => {
-                RequestBody::stream(Bytes::new(), body.into_data_stream(), Instant::now() + BODY_LIMIT, usize::MAX)
-            }
+            Wire::InteractiveGrpc => RequestBody::stream(Bytes::new(), BodyReader::new(body, 1), usize::MAX),
             Wire::Http => read_body(body, &parts.headers, LARGEST_HTTP).await?,
             Wire::Grpc => read_body(body, &parts.headers, LARGEST_GRPC).await?,
         };
@@ -107,22 +108,19 @@ impl EnginePool {
 }
 
 impl RequestBody {
-    // The rest of a body behind what was read of it. It fails where it is too long or takes too long: one that just ended
+    // The body behind what was read of it, in pieces. It fails where it is too long or takes too long: one that just ended
     // would look whole.
-    fn stream(read: Bytes, rest: BodyDataStream, end: Instant, most: usize) -> Self {
+    fn stream(read: Bytes, rest: BodyReader, most: usize) -> Self {
         let fault = BodyFault::default();
         let found = fault.clone();
         let stream = stream::try_unfold((read, rest, most), move |(read, mut rest, left)| {
             let found = found.clone();
             async move {
-                let part = match read.is_empty() {
-                    false => Ok(Some(read)),
-                    true => next_part(&mut rest, end).await,
-                };
-                let fault = match part {
-                    Ok(None) => return Ok(None),
-                    Ok(Some(part)) => match left.checked_sub(part.len()) {
-                        Some(left) => return Ok(Some((part, (Bytes::new(), rest, left)))),
+                let piece = if read.is_empty() { rest.next_piece().await } else { Ok(read) };
+                let fault = match piece {
+                    Ok(piece) if piece.is_empty() => return Ok(None),
+                    Ok(piece) => match left.checked_sub(piece.len()) {
+                        Some(left) => return Ok(Some((piece, (Bytes::new(), rest, left)))),
                         None => Fault::TooLarge { limit: most },
                     },
                     Err(fault) => fault,
@@ -172,22 +170,56 @@ async fn read_body(body: Body, headers: &HeaderMap, limit: usize) -> Result<Requ
     if declared.is_some_and(|bytes| bytes > limit) {
         return Err(Fault::TooLarge { limit });
     }
-    let mut rest = body.into_data_stream();
-    let mut read = BytesMut::new();
-    let end = Instant::now() + BODY_LIMIT;
-    while read.len() <= KEPT_BYTES {
-        match next_part(&mut rest, end).await? {
-            Some(part) => read.extend_from_slice(&part),
-            None => return Ok(RequestBody::Whole(read.freeze())),
-        }
+    let mut rest = BodyReader::new(body, KEPT_BYTES);
+    let read = rest.next_piece().await?;
+    match rest.is_ended {
+        true => Ok(RequestBody::Whole(read)),
+        false => Ok(RequestBody::stream(read, rest, limit)),
     }
-    Ok(RequestBody::stream(read.freeze(), rest, end, limit))
 }
 
-async fn next_part(rest: &mut BodyDataStream, end: Instant) -> Result<Option<Bytes>, Fault> {
-    let part = tokio::time::timeout_at(end, rest.try_next()).await;
-    let part = part.map_err(|_| Fault::request(format!("the body took longer than {BODY_LIMIT:?}")))?;
-    part.map_err(|_| Fault::request("the request's body did not come whole"))
+/// A client's body, which may come a byte at a time and has to come in time.
+struct BodyReader {
+    parts: BodyDataStream,
+    end: Instant,
+    piece_bytes: usize,
+    part_count: usize,
+    bytes: usize,
+    is_ended: bool,
+}
+
+impl BodyReader {
+    /// Reads pieces of at least so many bytes, but for the last.
+    fn new(body: Body, piece_bytes: usize) -> Self {
+        let (parts, end) = (body.into_data_stream(), Instant::now() + BODY_LIMIT);
+        Self { parts, end, piece_bytes, part_count: 0, bytes: 0, is_ended: false }
+    }
+
+    // Empty at the end.
+    async fn next_piece(&mut self) -> Result<Bytes, Fault> {
+        let mut piece = BytesMut::new();
+        let filled = tokio::time::timeout_at(self.end, self.fill(&mut piece)).await;
+        filled.map_err(|_| Fault::request(format!("the body took longer than {BODY_LIMIT:?}")))??;
+        Ok(piece.freeze())
+    }
+
+    async fn fill(&mut self, piece: &mut BytesMut) -> Result<(), Fault> {
+        while !self.is_ended && piece.len() < self.piece_bytes {
+            let part = self.parts.try_next().await;
+            match part.map_err(|_| Fault::request("the request's body did not come whole"))? {
+                Some(part) => {
+                    self.part_count += 1;
+                    self.bytes += part.len();
+                    piece.extend_from_slice(&part);
+                }
+                None => self.is_ended = true,
+            }
+            if self.part_count > FREE_PARTS && self.bytes < self.part_count * LEAST_PART_BYTES {
+                return Err(Fault::request(format!("the body comes in parts of less than {LEAST_PART_BYTES} bytes")));
+            }
+        }
+        Ok(())
+    }
 }
 
 struct EngineAnswer {
