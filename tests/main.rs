@@ -9,6 +9,7 @@ mod fuzz;
 mod hostile_files;
 mod installation;
 mod kills;
+mod large_chunk;
 mod load;
 mod maintenance;
 mod prompt;

@@ -5,18 +5,17 @@ use std::sync::Arc;
 
 use arrow::record_batch::RecordBatch;
 use echolake_lake::{DataFile, FileName, Lake, Snapshot};
+use echolake_recording::{DecodedChunk, ResyncItem, ResyncReader};
 use echolake_schema::tables::Table;
 use futures::TryStreamExt as _;
 use object_store::ObjectStore as _;
 use object_store::path::Path;
 use serde::Serialize;
 
-use crate::chunk::Chunk;
 use crate::error::{Error, Result};
 use crate::read_back;
 use crate::references::Finder;
 use crate::rows::runs::text_of;
-use crate::run_reader::{Item, RunReader};
 
 /// What a lake was found to be.
 #[derive(Debug, Clone, Default, Serialize)]
@@ -171,15 +170,15 @@ async fn check_run(lake: &Lake, snapshot: &Arc<Snapshot>, row: &RecordBatch, rep
 
 /// What is wrong with a run's file, in words.
 async fn check_run_file(lake: &Lake, path: &Path, sha256: &str, report: &mut Report) -> Result<Vec<String>> {
-    let mut reader = match RunReader::open(lake.store(), path.clone(), path.to_string()).await {
+    let mut reader = match ResyncReader::open(lake.store(), path.clone(), path.to_string()).await {
         Ok(reader) => reader,
         Err(e) => return Ok(vec![e.to_string()]),
     };
     let mut wrong = Vec::new();
-    while let Some(item) = reader.next().await? {
-        if let Item::Chunk(raw) = item {
+    while let Some(item) = reader.next_item().await? {
+        if let ResyncItem::Chunk(raw) = item {
             let offset = raw.offset;
-            if let Err(reason) = Chunk::decode(&raw.body) {
+            if let Err(reason) = DecodedChunk::decode(&raw.body) {
                 wrong.push(format!("the chunk at byte {offset}: {reason}"));
                 reader.look_into(offset).await?;
             }

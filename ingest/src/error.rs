@@ -1,5 +1,6 @@
 //! What can go wrong between a run's file and the tables.
 
+use echolake_recording::ResyncError;
 use echolake_schema::manifest::ManifestError;
 
 /// Why a run could not be taken in.
@@ -125,6 +126,16 @@ pub enum Error {
     /// The lake refused.
     #[error(transparent)]
     Lake(#[from] echolake_lake::Error),
+}
+
+impl From<ResyncError> for Error {
+    fn from(error: ResyncError) -> Self {
+        match error {
+            ResyncError::Read { file, reason } => Self::Read { file, reason },
+            ResyncError::Gone { file } => Self::Gone { file },
+            ResyncError::NotMcap { file, actual } => Self::NotMcap { file, actual },
+        }
+    }
 }
 
 /// The result of a step of ingest.

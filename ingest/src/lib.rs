@@ -25,8 +25,6 @@
 #[cfg(test)]
 extern crate self as echolake_ingest;
 
-mod block_reader;
-mod chunk;
 mod complete;
 mod context;
 #[cfg(test)]
@@ -46,20 +44,19 @@ mod measure;
 mod mortal;
 mod pipeline;
 mod read_back;
-mod record_shape;
 mod references;
 mod rows;
+mod run_channels;
 mod run_content;
-mod run_reader;
 
 pub use complete::{Completed, complete, waiting};
+pub use echolake_recording::FileIntegrity;
 pub use error::{Error, Result};
 pub use files::{Source, adopt_cut_off, pending};
 pub use ingest::{Ingest, Outcome, Report, Taken};
 #[doc(hidden)]
 pub use inspect::{Inspected, Inspection, inspect};
 pub use marks::SuspectFile;
-pub use run_reader::Integrity;
 
 /// Version of the code that derives rows; it stands in every row.
 pub const CODE_VERSION: &str = concat!("echolake ", env!("CARGO_PKG_VERSION"));

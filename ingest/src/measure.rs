@@ -8,14 +8,14 @@ use bytes::Bytes;
 use echolake_dsp::chain::{MeasurementParams, MeasurementPlan, MeasurementScratch};
 use echolake_dsp::temperature::{TemperatureCorrection, resampling_ratio};
 use echolake_lake::Lake;
+use echolake_recording::{ChunkMessage, DecodedChunk, list_damage};
 use echolake_schema::messages::{
     AmbientSample, ImpulseResponse, Measurement, Message as RunMessage, SampleFormat, SweepRecording,
 };
 use echolake_schema::{Celsius, Rig, samples, topics};
 use prost::Message as _;
 
-use crate::chunk::{Channels, Chunk, Message};
-use crate::run_reader::list_damage;
+use crate::run_channels::RunChannels;
 
 /// Memory for a run's messages beside those that its rig makes it have: five readings a second for a day, or 100,000
 /// lines of log.
@@ -171,7 +171,13 @@ impl Measurer {
 
     /// Reads all messages of a chunk, as far as the run's budget goes. What is wrong with one of them is said, and the
     /// others go on.
-    pub(crate) fn process(&self, offset: u64, chunk: &Chunk, channels: &Channels, budget: &RunBudget) -> Yield {
+    pub(crate) fn process(
+        &self,
+        offset: u64,
+        chunk: &DecodedChunk,
+        channels: &RunChannels,
+        budget: &RunBudget,
+    ) -> Yield {
         let mut out = Yield { last_time_ns: i64::MIN, ..Yield::default() };
         let mut swept = HashSet::new();
         for message in chunk.messages() {
@@ -228,7 +234,7 @@ impl Measurer {
     fn sweep(
         &self,
         chunk_offset: u64,
-        message: &Message<'_>,
+        message: &ChunkMessage<'_>,
         sweep: &SweepRecording,
     ) -> Result<Option<Response>, String> {
         self.known_pair(sweep.pair_id)?;
@@ -268,7 +274,7 @@ impl Measurer {
     fn ir(
         &self,
         chunk_offset: u64,
-        message: &Message<'_>,
+        message: &ChunkMessage<'_>,
         given: &ImpulseResponse,
         swept: &HashSet<(u32, u32)>,
     ) -> Result<Option<Response>, String> {

@@ -5,17 +5,16 @@ use std::sync::Arc;
 
 use bytes::Bytes;
 use echolake_lake::Lake;
+use echolake_recording::{DecodedChunk, FileIntegrity, Metadata, RawChunk, ResyncItem, ResyncReader, list_damage};
 use echolake_schema::manifest::{Origin, RunEnd, RunManifest};
 use echolake_schema::messages::{AmbientSample, Measurement, Verdict};
 use echolake_schema::{Rig, SurfaceId, SurfaceRecord, topics};
-use mcap::records::Metadata;
 
-use crate::chunk::{Chunk, Definitions};
 use crate::error::{Error, Result};
 use crate::files::Opened;
 use crate::measure::{Event, Measurer, Response, Yield};
 use crate::pipeline::{Begun, Cores};
-use crate::run_reader::{Integrity, Item, RawChunk, RunReader, list_damage};
+use crate::run_channels::RunDefinitions;
 
 /// A run, read.
 pub(crate) struct RunContent {
@@ -31,7 +30,7 @@ pub(crate) struct RunContent {
     pub(crate) readings: Vec<(i64, AmbientSample)>,
     pub(crate) events: Vec<(i64, Event)>,
     pub(crate) last_time_ns: i64,
-    pub(crate) integrity: Integrity,
+    pub(crate) integrity: FileIntegrity,
     /// What could not be read, in words.
     pub(crate) damaged: Vec<String>,
 }
@@ -70,14 +69,14 @@ impl Head {
     /// None where the file does not begin as a run of ours does.
     pub(crate) async fn read(opened: &Opened) -> Option<Self> {
         let (store, path) = (opened.store.clone(), opened.path.clone());
-        let mut reader = RunReader::open(store, path, opened.name.clone()).await.ok()?.without_digest();
+        let mut reader = ResyncReader::open(store, path, opened.name.clone()).await.ok()?.without_digest();
         let mut envelope = Envelope::default();
-        while let Ok(Some(item)) = reader.next().await {
+        while let Ok(Some(item)) = reader.next_item().await {
             match item {
-                Item::Attachment { name, data } => envelope.keep_attachment(name, data),
-                Item::Metadata(record) => envelope.keep_metadata(record),
-                Item::Definition(_) => {}
-                Item::Chunk(_) => break,
+                ResyncItem::Attachment { name, data } => envelope.keep_attachment(name, data),
+                ResyncItem::Metadata(record) => envelope.keep_metadata(record),
+                ResyncItem::Definition(_) => {}
+                ResyncItem::Chunk(_) => break,
             }
         }
         let manifest = RunManifest::from_metadata(envelope.metadata.get(topics::RUN_METADATA)?).ok()?;
@@ -92,9 +91,9 @@ impl RunContent {
     /// Reads a run; its chunks are measured on all cores while the next ones are fetched.
     pub(crate) async fn read(lake: &Lake, measurer: &Arc<Measurer>, cores: &Cores, opened: &Opened) -> Result<Self> {
         let name = opened.name.as_str();
-        let mut reader = RunReader::open(opened.store.clone(), opened.path.clone(), name.to_owned()).await?;
+        let mut reader = ResyncReader::open(opened.store.clone(), opened.path.clone(), name.to_owned()).await?;
         let mut envelope = Envelope::default();
-        let mut definitions = Definitions::default();
+        let mut definitions = RunDefinitions::default();
         let mut whole = Yield { last_time_ns: i64::MIN, ..Yield::default() };
         let mut checked = false;
         let busy = cores.busy();
@@ -103,9 +102,9 @@ impl RunContent {
         let mut seen = HashSet::new();
         // Chunks whose channels are not known yet: the chunk that introduces them is damaged, the summary has them too.
         let mut waiting = Vec::new();
-        while let Some(item) = reader.next().await? {
+        while let Some(item) = reader.next_item().await? {
             match item {
-                Item::Chunk(raw) => {
+                ResyncItem::Chunk(raw) => {
                     if !checked && envelope.is_complete() {
                         envelope.check(lake, name)?;
                         checked = true;
@@ -118,8 +117,8 @@ impl RunContent {
                             });
                         }
                         Ok((offset, chunk)) => {
-                            chunk.learn(&mut definitions);
-                            if !chunk.is_known_to(&definitions.channels) {
+                            definitions.learn_chunk(&chunk);
+                            if !definitions.knows(&chunk) {
                                 waiting.push((offset, length));
                                 continue;
                             }
@@ -144,9 +143,9 @@ impl RunContent {
                         }
                     }
                 }
-                Item::Attachment { name, data } => envelope.keep_attachment(name, data),
-                Item::Metadata(record) => envelope.keep_metadata(record),
-                Item::Definition(record) => definitions.learn(&record),
+                ResyncItem::Attachment { name, data } => envelope.keep_attachment(name, data),
+                ResyncItem::Metadata(record) => envelope.keep_metadata(record),
+                ResyncItem::Definition(record) => definitions.learn(&record),
             }
         }
         let manifest = envelope.check(lake, name)?;
@@ -174,7 +173,7 @@ impl RunContent {
         manifest: RunManifest,
         envelope: Envelope,
         whole: Yield,
-        integrity: Integrity,
+        integrity: FileIntegrity,
         name: &str,
     ) -> Result<Self> {
         let mut damaged = integrity.damage.clone();
@@ -296,8 +295,9 @@ fn vouch(manifest: &RunManifest, name: &str) -> Result<()> {
 }
 
 // Where the walk is: it takes less than the digest of the same bytes, and to hand it to another thread as much again.
-fn decode(raw: &RawChunk) -> std::result::Result<(u64, Chunk), String> {
-    let chunk = Chunk::decode(&raw.body).map_err(|reason| format!("the chunk at byte {}: {reason}", raw.offset))?;
+fn decode(raw: &RawChunk) -> std::result::Result<(u64, DecodedChunk), String> {
+    let chunk = DecodedChunk::decode(&raw.body);
+    let chunk = chunk.map_err(|reason| format!("the chunk at byte {}: {reason}", raw.offset))?;
     Ok((raw.offset, chunk))
 }
 

@@ -156,7 +156,7 @@ fn check(fault: Fault, expected: &str) -> (Vec<Measurement>, Vec<String>) {
     let outcome = controller.run(&mut recorder, &work, &control, &mut note).expect("a whole run");
     assert_eq!((outcome.left, outcome.end.accepted, outcome.end.rejected), (0, PAIRS as u64, 0));
     let path = recorder.finish(&outcome.end).expect("finished");
-    crate::recovery::prove(&path).expect("a sound file");
+    echolake_recording::prove_file(&path).expect("a sound file");
 
     let file = std::fs::read(path).expect("the file");
     let (mut verdicts, mut lines) = (Vec::new(), Vec::new());

@@ -175,7 +175,7 @@ fn a_run_that_lost_a_driver_is_gone_on_with() {
     let end = measure(&mut room, devices, &mut recorder, &held.pairs, &mut |_, _| ()).expect("a whole run");
     assert_eq!((end.accepted, end.rejected, end.attempts), (3, 0, 3));
     let path = recorder.finish(&end).expect("finished");
-    crate::recovery::prove(&path).expect("a sound file");
+    echolake_recording::prove_file(&path).expect("a sound file");
     let verdicts = messages(&path).into_iter().filter(|(topic, _)| topic == topics::MEASUREMENT);
     let mut pairs: Vec<_> =
         verdicts.map(|(_, data)| Measurement::decode(data.as_slice()).expect("a verdict").pair_id).collect();

@@ -3,15 +3,14 @@
 use std::fs::File;
 use std::io::BufWriter;
 
+use echolake_recording::{ChunkLane, McapResult, Writer};
 use echolake_schema::messages::{
     AmbientSample, FILE_DESCRIPTOR_SET, ImpulseResponse, Measurement, Message as RunMessage, SweepRecording,
 };
 use echolake_schema::topics;
 use foxglove::Encode;
-use mcap::Writer;
 
 use super::Topic;
-use super::chunks::Part;
 
 /// Channels of the topics, in the order of their registration.
 #[derive(Default)]
@@ -31,11 +30,11 @@ pub(super) struct Channels {
 
 impl Channels {
     /// Which chunks a channel's messages go to.
-    pub(super) fn part(&self, channel: u16) -> Part {
+    pub(super) fn part(&self, channel: u16) -> ChunkLane {
         match channel {
-            c if c == self.sweep || c == self.audio => Part::Sweeps,
-            c if c == self.ir => Part::Responses,
-            _ => Part::Light,
+            c if c == self.sweep || c == self.audio => ChunkLane::Sweeps,
+            c if c == self.ir => ChunkLane::Responses,
+            _ => ChunkLane::Light,
         }
     }
 
@@ -58,7 +57,7 @@ impl Channels {
     }
 
     /// Declares every topic, so that a reader knows all of them whatever the run holds.
-    pub(super) fn register(writer: &mut Writer<BufWriter<File>>) -> mcap::McapResult<Self> {
+    pub(super) fn register(writer: &mut Writer<BufWriter<File>>) -> McapResult<Self> {
         use foxglove::messages as fg;
         Ok(Self {
             tf: foxglove_channel::<fg::FrameTransforms>(writer, topics::TF)?,
@@ -76,7 +75,7 @@ impl Channels {
     }
 }
 
-pub(super) fn foxglove_channel<M: Encode>(writer: &mut Writer<BufWriter<File>>, topic: &str) -> mcap::McapResult<u16> {
+pub(super) fn foxglove_channel<M: Encode>(writer: &mut Writer<BufWriter<File>>, topic: &str) -> McapResult<u16> {
     let schema = match M::get_schema() {
         Some(schema) => writer.add_schema(&schema.name, &schema.encoding, &schema.data)?,
         None => 0,
@@ -84,7 +83,7 @@ pub(super) fn foxglove_channel<M: Encode>(writer: &mut Writer<BufWriter<File>>, 
     writer.add_channel(schema, topic, &M::get_message_encoding(), &Default::default())
 }
 
-fn own_channel<M: RunMessage>(writer: &mut Writer<BufWriter<File>>, topic: &str) -> mcap::McapResult<u16> {
+fn own_channel<M: RunMessage>(writer: &mut Writer<BufWriter<File>>, topic: &str) -> McapResult<u16> {
     let schema = writer.add_schema(M::FULL_NAME, "protobuf", FILE_DESCRIPTOR_SET)?;
     writer.add_channel(schema, topic, "protobuf", &Default::default())
 }

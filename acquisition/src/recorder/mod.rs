@@ -3,7 +3,6 @@
 
 mod arms;
 mod channels;
-pub(crate) mod chunks;
 mod error;
 mod resume;
 mod scene;
@@ -17,20 +16,18 @@ use std::fs::{File, OpenOptions};
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
+use echolake_recording::{Attachment, ChunkLane, ChunkWriter, MessageHeader, Metadata};
 use echolake_schema::manifest::{RunEnd, RunManifest};
 use echolake_schema::messages::{
     AmbientSample, ImpulseResponse, Measurement, Message as RunMessage, SampleFormat, SweepRecording,
 };
 use echolake_schema::{Rig, SurfaceRecord, Timestamp, samples, topics};
 use foxglove::Encode;
-use mcap::Attachment;
-use mcap::records::{MessageHeader, Metadata};
 
 use crate::disk::{folder_of, sync};
 use crate::mesh::Mesh;
 use crate::relief::HeightField;
 use channels::Channels;
-use chunks::{ChunkWriter, Part};
 pub use error::Error;
 pub use resume::{Held, Tried};
 pub use sealed::Sealed;
@@ -288,19 +285,19 @@ impl Recorder {
         self.own(self.channels.sweep, at, recording)?;
         let rate = (recording.sample_rate_hz / SLOWER).round() as u32;
         self.foxglove(self.channels.audio, at, &scene::audio(at, top_16_bits(recording), rate))?;
-        self.end_large(Part::Sweeps)
+        self.end_large(ChunkLane::Sweeps)
     }
 
     /// Records an impulse response.
     pub fn ir(&mut self, at: Timestamp, ir: &ImpulseResponse) -> Result<(), Error> {
         self.own(self.channels.ir, at, ir)?;
-        self.end_large(Part::Responses)
+        self.end_large(ChunkLane::Responses)
     }
 
     /// Records what became of an attempt.
     pub fn measurement(&mut self, at: Timestamp, measurement: &Measurement) -> Result<(), Error> {
         self.own(self.channels.measurement, at, measurement)?;
-        self.end_large(Part::Light)
+        self.end_large(ChunkLane::Light)
     }
 
     /// Records a line of the log.
@@ -387,7 +384,7 @@ impl Recorder {
         Ok(())
     }
 
-    fn end_large(&mut self, part: Part) -> Result<(), Error> {
+    fn end_large(&mut self, part: ChunkLane) -> Result<(), Error> {
         let begun = Instant::now();
         let ended = self.writer.end_large(part).map_err(|e| self.failed(e.to_string()));
         self.cost.busy += begun.elapsed();

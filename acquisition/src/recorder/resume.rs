@@ -4,17 +4,16 @@ use std::collections::{BTreeMap, HashSet};
 use std::fs::OpenOptions;
 use std::path::{Path, PathBuf};
 
+use echolake_recording::{ChunkLane, ChunkWriter, MessageHeader, PrefixItem, PrefixReader, Record};
 use echolake_schema::manifest::RunManifest;
 use echolake_schema::messages::{Measurement, Verdict};
 use echolake_schema::{Rig, Timestamp, topics};
-use mcap::records::Record;
 use prost::Message as _;
 
 use super::Recorder;
 use super::channels::Channels;
-use super::chunks::{ChunkWriter, Part};
 use crate::disk::{folder_of, sync};
-use crate::recovery::{Copy, Error, Item, Walk, is_end, lock};
+use crate::recovery::{Copy, Error, is_end, lock};
 
 /// What the name of a recording ends in until it is whole.
 const PARTIAL: &str = "partial";
@@ -56,21 +55,22 @@ impl Held {
     /// [`Error::Headless`] where it was broken off before its first checkpoint, [`Error::NoPlan`] where it was not
     /// begun as a run that can be gone on with.
     pub fn read(partial: &Path) -> Result<Self, Error> {
-        let mut walk = Walk::open(partial)?;
+        let mut walk = PrefixReader::open(partial)?;
         let mut seen = Seen::default();
-        while let Some(item) = walk.next()? {
+        while let Some(item) = walk.next_item()? {
             match item {
-                Item::Chunk(records) => records.iter().for_each(|record| seen.learn(record)),
-                Item::Metadata(m) => drop(seen.metadata.insert(m.name, m.metadata)),
-                Item::Attachment(a) if a.name == topics::RIG_ATTACHMENT => seen.rig = Some(a.data.into_owned()),
-                Item::Attachment(_) => {}
+                PrefixItem::Chunk(records) => records.iter().for_each(|record| seen.learn(record)),
+                PrefixItem::Metadata(m) => drop(seen.metadata.insert(m.name, m.metadata)),
+                PrefixItem::Attachment(a) if a.name == topics::RIG_ATTACHMENT => seen.rig = Some(a.data.into_owned()),
+                PrefixItem::Attachment(_) => {}
             }
         }
-        let begins = |what: &str| walk.headless(format!("it has no {what}"));
+        let headless = |reason: String| Error::Headless { path: partial.to_owned(), reason };
+        let begins = |what: &str| headless(format!("it has no {what}"));
         let record = seen.metadata.get(topics::RUN_METADATA).ok_or_else(|| begins("manifest"))?;
-        let manifest = RunManifest::from_metadata(record).map_err(|e| walk.headless(e.to_string()))?;
+        let manifest = RunManifest::from_metadata(record).map_err(|e| headless(e.to_string()))?;
         let rig = seen.rig.and_then(|bytes| String::from_utf8(bytes).ok()).ok_or_else(|| begins("rig"))?;
-        let rig = Rig::from_toml(&rig).map_err(|e| walk.headless(e.to_string()))?;
+        let rig = Rig::from_toml(&rig).map_err(|e| headless(e.to_string()))?;
         if !seen.channels.values().any(|topic| topic == topics::MEASUREMENT) {
             return Err(begins("chunk that is whole"));
         }
@@ -164,12 +164,11 @@ impl Recorder {
         // As in Recorder::create.
         let _ = file.try_lock();
         let mut writer = ChunkWriter::new(file).map_err(|e| failed(e.to_string()))?;
-        let mut walk = Walk::open(partial)?;
+        let mut walk = PrefixReader::open(partial)?;
         let mut taken = Copy::new(&mut writer);
-        let acknowledged = |part: Part, header: &mcap::records::MessageHeader| {
-            part == Part::Light || held.times.contains(&header.log_time)
-        };
-        while let Some(item) = walk.next()? {
+        let acknowledged =
+            |part: ChunkLane, header: &MessageHeader| part == ChunkLane::Light || held.times.contains(&header.log_time);
+        while let Some(item) = walk.next_item()? {
             if !is_end(&item) {
                 taken.take(item, &acknowledged).map_err(|e| failed(e.to_string()))?;
             }

@@ -14,8 +14,8 @@ use prost::Message as _;
 use rs_opw_kinematics::glam;
 
 use super::*;
-use crate::recovery::{Item, Walk};
 use crate::robots::Choreography;
+use echolake_recording::{PrefixItem, PrefixReader};
 
 const START: Timestamp = Timestamp(1_767_600_000_123_456_789);
 const MICROPHONE_MM: [f64; 3] = [-187.5, 37.5, 124.0];
@@ -337,7 +337,7 @@ fn a_flipped_bit_is_noticed() {
         let mut flipped = file.clone();
         flipped[(chunk.chunk_start_offset + chunk.chunk_length / 2) as usize] ^= 0x10;
         std::fs::write(&path, &flipped).expect("written");
-        assert!(crate::recovery::prove(&path).is_err(), "the chunk at {}", chunk.chunk_start_offset);
+        assert!(echolake_recording::prove_file(&path).is_err(), "the chunk at {}", chunk.chunk_start_offset);
     }
 }
 
@@ -487,17 +487,17 @@ fn heavy_topics_have_chunks_of_their_own_before_their_verdicts() {
     let of = |topic: &str| chunks.iter().filter(|c| c.contains(topic)).count();
     assert_eq!((of(topics::SWEEP), of(topics::IR), of(topics::MEASUREMENT)), (4, 2, 2), "{chunks:?}");
     for chunk in &chunks {
-        let parts: std::collections::BTreeSet<_> = chunk.iter().map(|t| Part::of(t)).collect();
+        let parts: std::collections::BTreeSet<_> = chunk.iter().map(|t| ChunkLane::from_topic(t)).collect();
         assert_eq!(parts.len(), 1, "{chunk:?}");
     }
     // Whatever byte the file is cut at: what is read has no verdict without its sweep and its response.
     let cut_off = folder.path().join("cut.mcap");
     for cut in (0..file.len()).step_by(file.len() / 41) {
         std::fs::write(&cut_off, &file[..cut]).expect("written");
-        let Ok(mut walk) = Walk::open(&cut_off) else { continue };
+        let Ok(mut walk) = PrefixReader::open(&cut_off) else { continue };
         let (mut names, mut seen) = (BTreeMap::new(), std::collections::BTreeSet::new());
-        while let Some(item) = walk.next().expect("readable") {
-            let Item::Chunk(records) = item else { continue };
+        while let Some(item) = walk.next_item().expect("readable") {
+            let PrefixItem::Chunk(records) = item else { continue };
             for record in records {
                 match record {
                     Record::Channel(channel) => drop(names.insert(channel.id, channel.topic)),
@@ -527,7 +527,7 @@ fn a_checkpoint_after_every_pair_makes_no_small_chunks_in_the_end() {
         }
         recorder.finish(&end()).expect("finished");
     });
-    assert_eq!(crate::recovery::prove(&path), Ok(()));
+    assert_eq!(echolake_recording::prove_file(&path), Ok(()));
     let file = std::fs::read(&path).expect("the file");
     let chunks = topics_of_chunks(&file);
     assert!(chunks.len() < 8, "{}", chunks.len());

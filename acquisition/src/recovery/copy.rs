@@ -2,12 +2,8 @@
 
 use std::collections::{BTreeMap, HashMap};
 
+use echolake_recording::{ChunkLane, ChunkWriter, McapResult, MessageHeader, PrefixItem, Record};
 use echolake_schema::topics;
-use mcap::McapResult;
-use mcap::records::{MessageHeader, Record};
-
-use super::walk::Item;
-use crate::recorder::chunks::{ChunkWriter, Part};
 
 /// Messages of each topic.
 pub(crate) type Counts = BTreeMap<String, u64>;
@@ -15,7 +11,7 @@ pub(crate) type Counts = BTreeMap<String, u64>;
 /// A copy that is being made.
 pub(crate) struct Copy<'a> {
     out: &'a mut ChunkWriter,
-    channels: HashMap<u16, (String, Part)>,
+    channels: HashMap<u16, (String, ChunkLane)>,
     /// What was copied so far.
     pub(crate) counts: Counts,
     /// The highest number of a message.
@@ -32,27 +28,33 @@ impl<'a> Copy<'a> {
     ///
     /// # Errors
     /// The writer's.
-    pub(crate) fn take(&mut self, item: Item, keep: &dyn Fn(Part, &MessageHeader) -> bool) -> McapResult<()> {
+    pub(crate) fn take(
+        &mut self,
+        item: PrefixItem,
+        keep: &dyn Fn(ChunkLane, &MessageHeader) -> bool,
+    ) -> McapResult<()> {
         match item {
-            Item::Chunk(records) => {
+            PrefixItem::Chunk(records) => {
                 for record in records {
                     self.record(record, keep)?;
                 }
                 // In the order of their parts as soon as one is large: a verdict never gets ahead of its recording.
-                [Part::Sweeps, Part::Responses, Part::Light].into_iter().try_for_each(|p| self.out.end_large(p))
+                [ChunkLane::Sweeps, ChunkLane::Responses, ChunkLane::Light]
+                    .into_iter()
+                    .try_for_each(|p| self.out.end_large(p))
             }
-            Item::Attachment(attachment) => {
+            PrefixItem::Attachment(attachment) => {
                 self.out.end_all()?;
                 self.out.mcap.attach(&attachment)
             }
-            Item::Metadata(metadata) => {
+            PrefixItem::Metadata(metadata) => {
                 self.out.end_all()?;
                 self.out.mcap.write_metadata(&metadata)
             }
         }
     }
 
-    fn record(&mut self, record: Record<'_>, keep: &dyn Fn(Part, &MessageHeader) -> bool) -> McapResult<()> {
+    fn record(&mut self, record: Record<'_>, keep: &dyn Fn(ChunkLane, &MessageHeader) -> bool) -> McapResult<()> {
         match record {
             Record::Schema { header, data } => {
                 self.out.mcap.add_schema_with_id(header.id, &header.name, &header.encoding, &data)?;
@@ -61,7 +63,7 @@ impl<'a> Copy<'a> {
                 let (topic, encoding) = (&channel.topic, &channel.message_encoding);
                 let (id, schema) = (channel.id, channel.schema_id);
                 self.out.mcap.add_channel_with_id(id, schema, topic, encoding, &channel.metadata)?;
-                self.channels.insert(id, (topic.clone(), Part::of(topic)));
+                self.channels.insert(id, (topic.clone(), ChunkLane::from_topic(topic)));
             }
             Record::Message { header, data } => {
                 let Some((topic, part)) = self.channels.get(&header.channel_id) else { return Ok(()) };
@@ -78,6 +80,6 @@ impl<'a> Copy<'a> {
 }
 
 /// Whether a metadata record says how the run ended.
-pub(crate) fn is_end(item: &Item) -> bool {
-    matches!(item, Item::Metadata(m) if m.name == topics::RUN_END_METADATA)
+pub(crate) fn is_end(item: &PrefixItem) -> bool {
+    matches!(item, PrefixItem::Metadata(m) if m.name == topics::RUN_END_METADATA)
 }

@@ -3,6 +3,8 @@
 use std::io;
 use std::path::PathBuf;
 
+use echolake_recording::PrefixError;
+
 /// Why a recording cannot be recovered or gone on with. The recording itself is as it was.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
@@ -58,4 +60,15 @@ pub enum Error {
         /// What differs.
         reason: String,
     },
+}
+
+impl From<PrefixError> for Error {
+    fn from(error: PrefixError) -> Self {
+        match error {
+            PrefixError::Read { path, source } => Self::Read { path, source },
+            PrefixError::Headless { path, bytes } => {
+                Self::Headless { path, reason: format!("it is no MCAP file, or only {bytes} bytes of one") }
+            }
+        }
+    }
 }

@@ -4,25 +4,18 @@ mod copy;
 mod error;
 #[cfg(test)]
 mod tests;
-mod walk;
 
 use std::collections::BTreeMap;
 use std::fs::{File, OpenOptions, TryLockError};
 use std::path::{Path, PathBuf};
 
+use echolake_recording::{ChunkWriter, McapError, Metadata, PrefixItem, PrefixReader, Record, prove_file};
 use echolake_schema::topics;
-use mcap::records::Metadata;
-use mcap::sans_io::linear_reader::{LinearReadEvent, LinearReader, LinearReaderOptions};
 use serde::Serialize;
 
 use crate::disk::{folder_of, sync};
-use crate::recorder::chunks::ChunkWriter;
 pub(crate) use copy::{Copy, Counts, is_end};
 pub use error::Error;
-pub(crate) use walk::{Item, Walk, chunk};
-
-/// Bytes that are read at a time when a file is proven.
-const BLOCK: usize = 1 << 20;
 
 /// What became of a recording.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
@@ -67,7 +60,7 @@ pub fn recover(from: &Path, to: &Path) -> Result<Report, Error> {
     // What is being recorded goes on growing behind the copy.
     let _lock = lock(from)?;
     let mut report = survey(from)?;
-    if report.defect.is_none() && prove(from).is_ok() {
+    if report.defect.is_none() && prove_file(from).is_ok() {
         return Ok(report);
     }
     if to.exists() {
@@ -89,19 +82,19 @@ pub fn recover(from: &Path, to: &Path) -> Result<Report, Error> {
 
 // What there is to keep, without writing anything.
 fn survey(from: &Path) -> Result<Report, Error> {
-    let mut walk = Walk::open(from)?;
+    let mut walk = PrefixReader::open(from)?;
     let (mut messages, mut topics_by_id, mut has_manifest, mut has_end) =
         (Counts::new(), BTreeMap::new(), false, false);
-    while let Some(item) = walk.next()? {
+    while let Some(item) = walk.next_item()? {
         has_end |= is_end(&item);
         match item {
-            Item::Metadata(m) => has_manifest |= m.name == topics::RUN_METADATA,
-            Item::Attachment(_) => {}
-            Item::Chunk(records) => {
+            PrefixItem::Metadata(m) => has_manifest |= m.name == topics::RUN_METADATA,
+            PrefixItem::Attachment(_) => {}
+            PrefixItem::Chunk(records) => {
                 for record in records {
                     match record {
-                        mcap::records::Record::Channel(c) => drop(topics_by_id.insert(c.id, c.topic)),
-                        mcap::records::Record::Message { header, .. } => {
+                        Record::Channel(c) => drop(topics_by_id.insert(c.id, c.topic)),
+                        Record::Message { header, .. } => {
                             if let Some(topic) = topics_by_id.get(&header.channel_id) {
                                 *messages.entry(topic.clone()).or_default() += 1;
                             }
@@ -115,7 +108,8 @@ fn survey(from: &Path) -> Result<Report, Error> {
     // The first chunk has the topics, behind all that a run is described by.
     if !has_manifest || topics_by_id.is_empty() {
         let found = walk.defect.clone().unwrap_or_else(|| "it ends".to_owned());
-        return Err(walk.headless(format!("{found}, before its first chunk is whole")));
+        let reason = format!("{found}, before its first chunk is whole");
+        return Err(Error::Headless { path: from.to_owned(), reason });
     }
     // What follows the data can be made anew from them.
     let verified_bytes = if walk.ended { walk.size } else { walk.verified };
@@ -129,13 +123,13 @@ pub(crate) fn messages(path: &Path) -> Result<Counts, Error> {
 }
 
 fn rebuild(from: &Path, to: &Path, report: &Report) -> Result<(), Error> {
-    let failed = |e: mcap::McapError| Error::Write { path: to.to_owned(), reason: e.to_string() };
+    let failed = |e: McapError| Error::Write { path: to.to_owned(), reason: e.to_string() };
     let file = OpenOptions::new().write(true).create(true).truncate(true).open(to);
     let file = file.map_err(|e| failed(e.into()))?;
     let mut writer = ChunkWriter::new(file).map_err(failed)?;
-    let mut walk = Walk::open(from)?;
+    let mut walk = PrefixReader::open(from)?;
     let mut copy = Copy::new(&mut writer);
-    while let Some(item) = walk.next()? {
+    while let Some(item) = walk.next_item()? {
         copy.take(item, &|_, _| true).map_err(failed)?;
     }
     let record = [
@@ -156,7 +150,7 @@ fn rebuild(from: &Path, to: &Path, report: &Report) -> Result<(), Error> {
 // what it holds.
 fn compare(written: &Path, expected: &Report) -> Result<(), Error> {
     let unproven = |reason: String| Error::Unproven { path: written.to_owned(), reason };
-    prove(written).map_err(unproven)?;
+    prove_file(written).map_err(unproven)?;
     let found = survey(written)?;
     if found.messages != expected.messages || found.has_end != expected.has_end {
         return Err(unproven(format!("it has {:?}, read were {:?}", found.messages, expected.messages)));
@@ -171,38 +165,6 @@ fn publish(staged: &Path, to: &Path) -> Result<(), Error> {
     }
     std::fs::rename(staged, to).map_err(|e| failed(e.to_string()))?;
     sync(folder_of(to)).map_err(failed)
-}
-
-/// Whether a file is closed and all of its checksums are right: chunks, attachments, data and summary.
-///
-/// # Errors
-/// What is wrong with it, in words.
-pub fn prove(path: &Path) -> Result<(), String> {
-    use std::io::Read as _;
-    let mut file = File::open(path).map_err(|e| e.to_string())?;
-    let options = LinearReaderOptions::default()
-        .with_prevalidate_chunk_crcs(true)
-        .with_validate_data_section_crc(true)
-        .with_validate_summary_section_crc(true)
-        .with_check_finishes_after_end_magic(true)
-        .with_record_length_limit(walk::LARGEST as usize);
-    let mut reader = LinearReader::new_with_options(options);
-    let mut has_summary = false;
-    while let Some(event) = reader.next_event() {
-        match event.map_err(|e| e.to_string())? {
-            LinearReadEvent::ReadRequest(wanted) => {
-                let buffer = reader.insert(wanted.max(BLOCK));
-                let read = file.read(buffer).map_err(|e| e.to_string())?;
-                reader.notify_read(read);
-            }
-            LinearReadEvent::Record { data, opcode } => {
-                // Attachments' sums are compared where they are parsed.
-                let record = mcap::parse_record(opcode, data).map_err(|e| e.to_string())?;
-                has_summary |= matches!(record, mcap::records::Record::Statistics(_));
-            }
-        }
-    }
-    if has_summary { Ok(()) } else { Err("it has no summary".to_owned()) }
 }
 
 /// Locks a recording until the file is dropped; its recorder holds a lock as long as it lives.

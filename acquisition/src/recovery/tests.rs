@@ -88,7 +88,7 @@ fn a_file_cut_at_any_byte_keeps_every_checkpoint_before_it() {
             Ok(report) => {
                 assert_eq!((report.bytes, report.verified_bytes <= cut), (cut, true));
                 assert_eq!(report.to.as_deref(), Some(out.as_path()));
-                assert_eq!(prove(&out), Ok(()), "cut at {cut}");
+                assert_eq!(prove_file(&out), Ok(()), "cut at {cut}");
                 let [verdicts, responses] = pairs(&out);
                 // A chunk is whole a little before its indexes, and with them the checkpoint.
                 assert!(verdicts == safe || verdicts == (0..=safe.len() as u32).collect::<Vec<_>>(), "cut at {cut}");
@@ -183,7 +183,7 @@ fn a_run_is_gone_on_with_behind_what_is_safe() {
         }
         let finished = recorder.finish(&end()).expect("finished");
         assert_eq!(finished, path);
-        assert_eq!(prove(&path), Ok(()));
+        assert_eq!(prove_file(&path), Ok(()));
         // What stood in the file of pairs without a verdict is not there twice.
         let all: Vec<u32> = (0..PAIRS).collect();
         assert_eq!(pairs(&path), [all.clone(), all], "{cut}");

@@ -2,21 +2,21 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs::File;
-use std::io::{Read as _, Seek as _, SeekFrom};
+use std::io::{self, Read as _, Seek as _, SeekFrom};
+use std::ops::Range;
 use std::path::{Path, PathBuf};
 
-use mcap::records::{ChunkIndex, Record};
-use mcap::sans_io::{SummaryReadEvent, SummaryReader, SummaryReaderOptions};
-use mcap::{Channel, Summary};
+use bytes::Bytes;
+use echolake_recording::limits::LARGEST_CHUNK;
+use echolake_recording::{
+    Channel, ChannelDefinitions, ChunkIndex, DecodedChunk, FRAME_BYTES, PrefixError, PrefixItem, PrefixReader, Record,
+    RunSummary, summary_range, tail_range,
+};
 
 use super::error::Error;
 use crate::recorder::Topic;
-use crate::recovery::{self, Item, Walk};
 
-/// Opcode and length in front of every record.
-const FRAME: u64 = 9;
-/// Largest chunk that is read, packed or not.
-const LARGEST: u64 = 256 << 20;
+const FRAME: u64 = FRAME_BYTES as u64;
 
 /// An MCAP file that can be replayed.
 pub struct Recording {
@@ -104,34 +104,32 @@ impl Recording {
 
     /// The messages of a chunk by their time, of some channels; in words where it is damaged.
     pub(super) fn messages(&self, chunk: &Stretch, channels: &BTreeSet<u16>) -> Result<Vec<Message>, String> {
-        let body = self.body(chunk)?;
-        // What it unpacks to stands behind its two times.
-        let unpacked = body.get(16..24).and_then(|b| b.try_into().ok()).map_or(0, u64::from_le_bytes);
-        if unpacked > LARGEST {
-            return Err(format!("a chunk of {unpacked} bytes, more than {LARGEST}"));
-        }
+        let decoded = DecodedChunk::decode(&self.body(chunk)?).map_err(|e| format!("a chunk is damaged: {e}"))?;
+        let mut records = decoded.into_cursor();
         let mut messages = Vec::new();
-        for (place, record) in (0..).zip(recovery::chunk(&body)?) {
+        let mut place = 0;
+        while let Some(record) = records.next_record().map_err(|e| e.to_string())? {
             if let Record::Message { header, data } = record
                 && channels.contains(&header.channel_id)
             {
                 let key = (header.log_time, chunk.offset, place);
                 messages.push(Message { key, channel: header.channel_id, data: data.into_owned() });
             }
+            place += 1;
         }
         messages.sort_by_key(|m| m.key);
         Ok(messages)
     }
 
-    fn body(&self, chunk: &Stretch) -> Result<Vec<u8>, String> {
-        if !(FRAME..=LARGEST).contains(&chunk.length) {
+    fn body(&self, chunk: &Stretch) -> Result<Bytes, String> {
+        if !(FRAME..=FRAME + LARGEST_CHUNK).contains(&chunk.length) {
             return Err(format!("a chunk of {} bytes", chunk.length));
         }
         let mut body = vec![0; (chunk.length - FRAME) as usize];
         let mut file = &self.file;
         let read = file.seek(SeekFrom::Start(chunk.offset.saturating_add(FRAME)));
         read.and_then(|_| file.read_exact(&mut body)).map_err(|e| e.to_string())?;
-        Ok(body)
+        Ok(body.into())
     }
 }
 
@@ -158,58 +156,43 @@ enum Unread {
     Damaged,
 }
 
-fn summary(file: &mut File) -> Result<Option<Summary>, Unread> {
-    let options = SummaryReaderOptions::default().with_record_length_limit(LARGEST as usize);
-    let mut reader = SummaryReader::new_with_options(options);
-    while let Some(event) = reader.next_event() {
-        match event.map_err(|_| Unread::Damaged)? {
-            SummaryReadEvent::SeekRequest(to) => {
-                // An offset that no file has is damage.
-                let at = file.seek(to).map_err(|_| Unread::Damaged)?;
-                reader.notify_seeked(at);
-            }
-            SummaryReadEvent::ReadRequest(count) => {
-                let read = file.read(reader.insert(count)).map_err(Unread::System)?;
-                reader.notify_read(read);
-            }
-        }
-    }
-    Ok(reader.finish())
+fn summary(file: &mut File) -> Result<Option<RunSummary>, Unread> {
+    let bytes = file.metadata().map_err(Unread::System)?.len();
+    let tail = read_range(file, tail_range(bytes)).map_err(Unread::System)?;
+    let Some(range) = summary_range(&tail, bytes) else { return Ok(None) };
+    let summary = read_range(file, range).map_err(Unread::System)?;
+    RunSummary::parse(&summary).map(Some).map_err(|_| Unread::Damaged)
+}
+
+fn read_range(file: &mut File, range: Range<u64>) -> io::Result<Vec<u8>> {
+    let mut bytes = vec![0; (range.end - range.start) as usize];
+    file.seek(SeekFrom::Start(range.start))?;
+    file.read_exact(&mut bytes)?;
+    Ok(bytes)
 }
 
 type Walked = (BTreeMap<u16, Topic>, Vec<Stretch>, Option<String>);
 
 // The index of a file that has none.
 fn walked(path: &Path) -> Result<Walked, Error> {
-    let unplayable = |e: recovery::Error| match e {
-        recovery::Error::Read { path, source } => Error::Read { path, source },
-        recovery::Error::Headless { path, reason } => Error::Unplayable { path, reason },
-        other => Error::Unplayable { path: path.to_owned(), reason: other.to_string() },
+    let unplayable = |e: PrefixError| match e {
+        PrefixError::Read { path, source } => Error::Read { path, source },
+        PrefixError::Headless { path, bytes } => {
+            Error::Unplayable { path, reason: format!("it is no MCAP file, or only {bytes} bytes of one") }
+        }
     };
-    let mut walk = Walk::open(path).map_err(unplayable)?;
-    let (mut schemas, mut topics, mut chunks) = (BTreeMap::new(), BTreeMap::new(), Vec::new());
-    while let Some(item) = walk.next().map_err(unplayable)? {
-        let Item::Chunk(records) = item else { continue };
-        let (mut times, mut channels) = (Vec::new(), BTreeSet::new());
+    let mut walk = PrefixReader::open(path).map_err(unplayable)?;
+    let mut definitions = ChannelDefinitions::default();
+    let mut chunks = Vec::new();
+    while let Some(item) = walk.next_item().map_err(unplayable)? {
+        let PrefixItem::Chunk(records) = item else { continue };
+        let mut times = Vec::new();
+        let mut channels = BTreeSet::new();
         for record in records {
-            match record {
-                Record::Schema { header, data } => drop(schemas.insert(header.id, (header, data.into_owned()))),
-                Record::Channel(channel) => {
-                    let schema = schemas.get(&channel.schema_id);
-                    topics.entry(channel.id).or_insert_with(|| Topic {
-                        channel: channel.id,
-                        topic: channel.topic,
-                        encoding: channel.message_encoding,
-                        schema: schema.map(|(h, _)| h.name.clone()).unwrap_or_default(),
-                        schema_encoding: schema.map(|(h, _)| h.encoding.clone()).unwrap_or_default(),
-                        schema_data: schema.map(|(_, data)| data.clone()).unwrap_or_default(),
-                    });
-                }
-                Record::Message { header, .. } => {
-                    times.push(header.log_time);
-                    channels.insert(header.channel_id);
-                }
-                _ => {}
+            definitions.learn(&record);
+            if let Record::Message { header, .. } = record {
+                times.push(header.log_time);
+                channels.insert(header.channel_id);
             }
         }
         if let (Some(start), Some(end)) = (times.iter().copied().min(), times.iter().copied().max()) {
@@ -219,7 +202,7 @@ fn walked(path: &Path) -> Result<Walked, Error> {
     }
     // What was closed, yet has no chunks, is of another make, not damaged.
     let defect = walk.defect.take().or_else(|| (!chunks.is_empty()).then(|| "it has no index".to_owned()));
-    Ok((topics, chunks, defect))
+    Ok((topics_of(definitions.into_channels().values().map(|c| c.as_ref())), chunks, defect))
 }
 
 fn topics_of<'a>(channels: impl Iterator<Item = &'a Channel<'static>>) -> BTreeMap<u16, Topic> {

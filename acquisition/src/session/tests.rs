@@ -4,10 +4,10 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use super::*;
 use crate::recorder::Held;
-use crate::recovery::prove;
 use crate::relief::Relief;
 use crate::run::{RunRequest, Specimen, resume};
 use crate::simulate::simulate;
+use echolake_recording::prove_file;
 
 const SMALL_RIG: &str = include_str!("../../../tests/fixtures/small_rig.toml");
 const PAIRS: u64 = 45;
@@ -59,7 +59,7 @@ fn a_run_that_is_stopped_is_gone_on_with() {
         left.push(measured.outcome.left);
         if measured.outcome.left == 0 {
             assert_eq!((measured.outcome.end.accepted, measured.outcome.end.rejected), (PAIRS, 0));
-            assert_eq!(prove(&measured.path), Ok(()));
+            assert_eq!(prove_file(&measured.path), Ok(()));
             assert_eq!(Held::read(&measured.path).expect("the run").accepted() as u64, PAIRS);
             break;
         }
@@ -82,5 +82,5 @@ fn a_run_that_nobody_goes_on_with_is_ended_where_it_is_stopped() {
     let (path, end) = measured.expect("a run");
     assert!(path.extension().is_some_and(|e| e == "mcap"), "{}", path.display());
     assert!((3..=4).contains(&end.accepted), "{end:?}");
-    assert_eq!(prove(&path), Ok(()));
+    assert_eq!(prove_file(&path), Ok(()));
 }

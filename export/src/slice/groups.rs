@@ -6,8 +6,8 @@
 
 use std::collections::{BTreeMap, BTreeSet, HashSet, VecDeque};
 
+use echolake_recording::ChunkIndex;
 use echolake_schema::topics;
-use mcap::records::ChunkIndex;
 use prost::Message as _;
 
 use super::source::{Message, Source};

@@ -14,9 +14,9 @@ use arrow::datatypes::{DataType, Int32Type, Int64Type};
 use arrow::record_batch::RecordBatch;
 use bytes::Bytes;
 use echolake_lake::{Lake, Snapshot};
+use echolake_recording::Metadata;
 use echolake_schema::{RunId, SurfaceId, topics};
 use futures::stream::{self, BoxStream, StreamExt as _};
-use mcap::records::Metadata;
 
 use crate::error::{Error, Result};
 use crate::rows;

@@ -3,7 +3,7 @@
 use std::collections::BTreeSet;
 
 use echolake_lake::{Lake, Snapshot};
-use mcap::records::ChunkIndex;
+use echolake_recording::ChunkIndex;
 
 use super::groups::is_once;
 use super::source::Source;

@@ -7,13 +7,12 @@ use std::sync::Arc;
 use arrow::datatypes::Int64Type;
 use bytes::Bytes;
 use echolake_lake::{Lake, Snapshot};
+use echolake_recording::{
+    Attachment, Channel, ChunkIndex, DecodedChunk, McapError, Record, RecordCursor, RecordError, RunSummary,
+    chunk_body, describe, summary_range, tail_range,
+};
 use echolake_schema::tables::Table;
 use echolake_schema::{RunId, SurfaceId, topics};
-use mcap::records::{ChunkIndex, Record};
-use mcap::sans_io::{
-    LinearReadEvent, LinearReader, LinearReaderOptions, SummaryReadEvent, SummaryReader, SummaryReaderOptions,
-};
-use mcap::{Attachment, Channel, McapError};
 use object_store::path::Path;
 use object_store::{ObjectStore, ObjectStoreExt as _};
 use sha2::{Digest as _, Sha256};
@@ -22,15 +21,8 @@ use super::Check;
 use crate::error::{Error, Result};
 use crate::rows;
 
-/// Opcode and length in front of every record.
-const FRAME: usize = 9;
-/// What is read of a file's end at first: summaries of most runs fit.
-const TAIL: u64 = 1 << 20;
 /// What is read at a time of a file whose checksum is taken.
 const BLOCK: u64 = 4 << 20;
-/// Largest record that is read, as everywhere.
-const LARGEST: usize = 256 << 20;
-
 /// What the lake says of a run's file.
 #[derive(Debug, Clone)]
 pub(super) struct RunFile {
@@ -126,37 +118,18 @@ impl Source {
 
     async fn read_summary(&mut self) -> Result<()> {
         let bytes = self.file.bytes;
-        let options = SummaryReaderOptions::default().with_file_size(bytes).with_record_length_limit(LARGEST);
-        let mut reader = SummaryReader::new_with_options(options);
-        let (mut at, tail_start) = (0u64, bytes.saturating_sub(TAIL));
-        let tail = self.read(tail_start..bytes).await?;
-        while let Some(event) = reader.next_event() {
-            match event.map_err(|e| self.damaged(&e))? {
-                SummaryReadEvent::SeekRequest(to) => {
-                    at = match to {
-                        std::io::SeekFrom::Start(to) => to,
-                        std::io::SeekFrom::End(by) => bytes.saturating_add_signed(by),
-                        std::io::SeekFrom::Current(by) => at.saturating_add_signed(by),
-                    };
-                    reader.notify_seeked(at);
-                }
-                SummaryReadEvent::ReadRequest(count) => {
-                    let end = (at + count as u64).min(bytes);
-                    let part = match at.checked_sub(tail_start) {
-                        Some(from) => tail.slice(from as usize..(end - tail_start) as usize),
-                        None => self.read(at..end).await?,
-                    };
-                    reader.insert(part.len()).copy_from_slice(&part);
-                    reader.notify_read(part.len());
-                    at = end;
-                }
-            }
-        }
-        let Some(summary) = reader.finish() else {
+        let tail = self.read(tail_range(bytes)).await?;
+        let Some(range) = summary_range(&tail, bytes) else {
             let reason = "its file has no index, because it was cut off while it was recorded".to_owned();
             return Err(Error::Uncuttable { run: self.file.run.clone(), reason });
         };
-        self.channels = summary.channels.into_iter().collect();
+        let from_end = (bytes - range.start) as usize;
+        let summary = match tail.len().checked_sub(from_end) {
+            Some(start) => tail.slice(start..),
+            None => self.read(range).await?,
+        };
+        let summary = RunSummary::parse(&summary).map_err(|e| self.damaged(&e))?;
+        self.channels = summary.channels;
         self.chunks = summary.chunk_indexes;
         self.chunks.sort_by_key(|chunk| chunk.chunk_start_offset);
         self.attachments =
@@ -164,7 +137,7 @@ impl Source {
         let manifest = summary.metadata_indexes.iter().find(|m| m.name == topics::RUN_METADATA);
         if let Some(index) = manifest {
             let record = self.read(index.offset..index.offset.saturating_add(index.length)).await?;
-            if let Ok(Record::Metadata(found)) = parse(&record) {
+            if let Ok(Some(Record::Metadata(found))) = RecordCursor::new(record).next_record() {
                 self.manifest = found.metadata;
             }
         }
@@ -175,21 +148,25 @@ impl Source {
     }
 
     pub(super) fn damaged(&self, error: &McapError) -> Error {
-        let cause = std::error::Error::source(error).map(|cause| format!(": {cause}")).unwrap_or_default();
-        Error::damaged(&self.file.path, format!("{error}{cause}"))
+        Error::damaged(&self.file.path, describe(error))
+    }
+
+    fn damaged_record(&self, error: &RecordError) -> Error {
+        Error::damaged(&self.file.path, error)
     }
 
     /// What is attached to the file, one at a time.
     pub(super) async fn attachment(&self, number: usize) -> Result<Option<Attachment<'static>>> {
         let Some(range) = self.attachments.get(number) else { return Ok(None) };
         let record = self.read(range.clone()).await?;
-        match parse(&record).map_err(|e| self.damaged(&e))?.into_owned() {
-            Record::Attachment { header, data, .. } => Ok(Some(Attachment {
+        let mut record = RecordCursor::new(record);
+        match record.next_record().map_err(|e| self.damaged_record(&e))? {
+            Some(Record::Attachment { header, data, .. }) => Ok(Some(Attachment {
                 log_time: header.log_time,
                 create_time: header.create_time,
                 name: header.name,
                 media_type: header.media_type,
-                data,
+                data: data.into_owned().into(),
             })),
             _ => Err(Error::damaged(&self.file.path, "there is no attachment where its index says")),
         }
@@ -199,49 +176,23 @@ impl Source {
     pub(super) async fn messages(&self, chunk: &ChunkIndex) -> Result<Vec<Message>> {
         let record =
             self.read(chunk.chunk_start_offset..chunk.chunk_start_offset.saturating_add(chunk.chunk_length)).await?;
-        let options = LinearReaderOptions::default()
-            .with_skip_start_magic(true)
-            .with_skip_end_magic(true)
-            .with_prevalidate_chunk_crcs(true)
-            .with_record_length_limit(LARGEST);
-        let mut reader = LinearReader::new_with_options(options);
-        let (mut given, mut messages) = (0, Vec::new());
-        while let Some(event) = reader.next_event() {
-            match event.map_err(|e| self.damaged(&e))? {
-                LinearReadEvent::ReadRequest(_) if given == record.len() => break,
-                LinearReadEvent::ReadRequest(_) => {
-                    reader.insert(record.len()).copy_from_slice(&record);
-                    reader.notify_read(record.len());
-                    given = record.len();
-                }
-                LinearReadEvent::Record { opcode, data } => {
-                    if opcode != mcap::records::op::MESSAGE {
-                        continue;
-                    }
-                    let Record::Message { header, data } =
-                        mcap::parse_record(opcode, data).map_err(|e| self.damaged(&e))?
-                    else {
-                        continue;
-                    };
-                    let channel = self.channels.get(&header.channel_id).cloned().ok_or_else(|| {
-                        Error::damaged(&self.file.path, format!("no channel {} in its index", header.channel_id))
-                    })?;
-                    messages.push(Message {
-                        channel,
-                        log_time: header.log_time,
-                        publish_time: header.publish_time,
-                        data: Bytes::copy_from_slice(&data),
-                    });
-                }
-            }
+        let chunk_damaged = |what: String| Error::damaged(&self.file.path, what);
+        let body = chunk_body(&record).map_err(chunk_damaged)?;
+        let decoded = DecodedChunk::decode(&body).map_err(|e| chunk_damaged(format!("a chunk is damaged: {e}")))?;
+        let mut records = decoded.into_cursor();
+        let mut messages = Vec::new();
+        while let Some(record) = records.next_record().map_err(|e| self.damaged_record(&e))? {
+            let Record::Message { header, data } = record else { continue };
+            let channel = self.channels.get(&header.channel_id).cloned();
+            let channel =
+                channel.ok_or_else(|| chunk_damaged(format!("no channel {} in its index", header.channel_id)))?;
+            messages.push(Message {
+                channel,
+                log_time: header.log_time,
+                publish_time: header.publish_time,
+                data: Bytes::copy_from_slice(&data),
+            });
         }
         Ok(messages)
-    }
-}
-
-fn parse(record: &[u8]) -> mcap::McapResult<Record<'_>> {
-    match record.split_at_checked(FRAME) {
-        Some((frame, body)) => mcap::parse_record(frame[0], body),
-        None => Err(McapError::UnexpectedEof),
     }
 }

@@ -5,10 +5,8 @@ use std::io::{self, Write};
 use std::sync::{Arc, Mutex, PoisonError};
 
 use bytes::Bytes;
+use echolake_recording::{Attachment, McapError, MessageHeader, Metadata, StreamWriter, stream_writer};
 use echolake_schema::topics;
-use mcap::records::{MessageHeader, Metadata};
-use mcap::write::NoSeek;
-use mcap::{Attachment, McapError, WriteOptions, Writer};
 
 use super::Layout;
 use super::source::Message;
@@ -44,7 +42,7 @@ impl Write for Shared {
 
 /// Writes a slice.
 pub(super) struct SliceWriter {
-    writer: Writer<NoSeek<Shared>>,
+    writer: StreamWriter<Shared>,
     out: Shared,
     layout: Layout,
     lanes: Vec<Lane>,
@@ -73,14 +71,7 @@ impl Default for Lane {
 impl SliceWriter {
     pub(super) fn new(layout: Layout) -> Result<Self> {
         let out = Shared::default();
-        let writer = WriteOptions::new()
-            .profile("")
-            .library(concat!("echolake ", env!("CARGO_PKG_VERSION")))
-            .chunk_size(None)
-            .disable_seeking(true)
-            .compression_threads(0)
-            .create(NoSeek::new(out.clone()))
-            .map_err(|e| failed(&e))?;
+        let writer = stream_writer(out.clone()).map_err(|e| failed(&e))?;
         let lanes = vec![Lane::default()];
         Ok(Self { writer, out, layout, lanes, lane_of: HashMap::new(), sequence: 0, messages: 0, has_more: false })
     }

@@ -5,11 +5,11 @@ use std::sync::Arc;
 
 use bytes::Bytes;
 use echolake_lake::{Lake, VisibleRun};
+use echolake_recording::limits::LARGEST_CHUNK;
+use echolake_recording::{FRAME_BYTES, Record, RecordCursor, opcode, parse_record};
 use futures::{StreamExt as _, TryStreamExt as _};
-use mcap::records::{Record, op};
 use object_store::ObjectStoreExt as _;
 
-use super::chunk::{FRAME, LARGEST};
 use super::error::Fault;
 use super::file::{Attachment, Files, McapFile, Piece};
 use crate::Error;
@@ -65,13 +65,15 @@ pub(crate) async fn attachment(run: &VisibleRun, ending: &str, files: &Arc<Files
     let Some(found) = file.attachments.iter().find(|a| a.name.ends_with(ending)) else { return Ok(None) };
     let range = found.range.clone();
     let damaged = |what: &str| Fault::Damaged { file: file.path.to_string(), offset: range.start, what: what.into() };
-    if range.end - range.start > LARGEST {
+    if range.end - range.start > LARGEST_CHUNK {
         return Err(damaged("its attachment is larger than is read").into());
     }
     let read = files.store.get_range(&file.path, range.clone()).await;
     let record = read.map_err(|source| Fault::Read { file: file.path.to_string(), source })?;
-    match record.get(FRAME..).map(|body| mcap::parse_record(op::ATTACHMENT, body)) {
-        Some(Ok(Record::Attachment { data, .. })) if record[0] == op::ATTACHMENT => Ok(Some(data.into_owned().into())),
+    match record.get(FRAME_BYTES..).map(|body| parse_record(opcode::ATTACHMENT, body)) {
+        Some(Ok(Record::Attachment { data, .. })) if record[0] == opcode::ATTACHMENT => {
+            Ok(Some(data.into_owned().into()))
+        }
         _ => Err(damaged("there is no sound attachment where its index says").into()),
     }
 }
@@ -94,15 +96,16 @@ async fn sizes(file: &McapFile, files: &Files) -> Result<Option<HashMap<u16, u64
     let mut reads = futures::stream::iter(reads).buffer_unordered(AT_ONCE);
     let mut sizes = HashMap::new();
     while let Some((bytes, plain)) = reads.try_next().await? {
-        add_sizes(&bytes, plain, &mut sizes);
+        add_sizes(bytes, plain, &mut sizes);
     }
     Ok(Some(sizes))
 }
 
 // A message goes to where the next one begins, the last one to the chunk's end.
-fn add_sizes(index: &[u8], plain: u64, sizes: &mut HashMap<u16, u64>) {
+fn add_sizes(index: Bytes, plain: u64, sizes: &mut HashMap<u16, u64>) {
     let mut begins = Vec::new();
-    for record in mcap::read::LinearReader::sans_magic(index).map_while(Result::ok) {
+    let mut records = RecordCursor::new(index);
+    while let Ok(Some(record)) = records.next_record() {
         if let Record::MessageIndex(index) = record {
             begins.extend(index.records.iter().map(|entry| (entry.offset, index.channel_id)));
         }

@@ -8,29 +8,23 @@ use std::ops::Range;
 use std::sync::{Arc, Mutex, PoisonError};
 
 use bytes::Bytes;
-use mcap::records::{Record, op};
-use mcap::sans_io::{LinearReadEvent, LinearReader, LinearReaderOptions};
-use mcap::{MAGIC, McapError};
+use echolake_recording::{
+    ChannelDefinitions, FRAME_BYTES, MAGIC, Record, RecordSplitter, RunSummary, SplitRecord, describe, opcode,
+    parse_record, summary_range, tail_range,
+};
 use object_store::path::Path;
 use object_store::{ObjectMeta, ObjectStore, ObjectStoreExt as _};
 
-use super::chunk::{FRAME, Kind, LARGEST, Records, Step, Stop, words};
+use super::chunk::{PieceKind, PieceRecords, ReadStep, ReadStop};
 use super::error::Fault;
 use super::schema::RawSchema;
 
-/// What is read of a file's end at first: the summary of a run of a hundred measurements fits.
-const TAIL: u64 = 64 << 10;
-/// The footer: its frame, two places and a CRC; magic bytes follow.
-const FOOTER: usize = FRAME + 20;
 /// What is read at a time of a file that is walked.
 const BLOCK: u64 = 4 << 20;
 /// Messages that stand in no chunk are read in pieces of this size.
 const PIECE: u64 = 1 << 20;
 /// Summaries that are kept for the next query, in bytes.
 const KEPT: usize = 64 << 20;
-/// A record that ends the data section and has no CRC: behind it the reader checks that of the summary.
-const DATA_END: [u8; FRAME + 4] = [op::DATA_END, 4, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0];
-
 /// What is known of a file before any message is read.
 #[derive(Debug)]
 pub(super) struct McapFile {
@@ -71,7 +65,7 @@ pub(super) struct Channel {
 /// A chunk, or a run of messages in none.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct Piece {
-    pub(super) kind: Kind,
+    pub(super) kind: PieceKind,
     pub(super) range: Range<u64>,
     /// Times of its earliest and latest message, ns.
     pub(super) times: (u64, u64),
@@ -147,15 +141,17 @@ struct Opening<'a> {
 
 impl Opening<'_> {
     async fn file(&self) -> Result<McapFile, Fault> {
-        let tail = self.read(self.bytes.saturating_sub(TAIL)..self.bytes).await?;
-        if let Some(start) = summary_start(&tail, self.bytes) {
+        let tail = self.read(tail_range(self.bytes)).await?;
+        if let Some(range) = summary_range(&tail, self.bytes) {
+            let start = range.start;
             let from_end = self.bytes - start;
             let summary = match tail.len() as u64 >= from_end {
                 true => tail.slice(tail.len() - from_end as usize..),
-                false => self.read(start..self.bytes).await?,
+                false => self.read(range).await?,
             };
             // One that makes no sense is none.
-            if let Some(found) = self.summary(&summary, start).ok().flatten() {
+            if let Some(found) = RunSummary::parse(&summary).ok().and_then(|summary| self.indexed_file(summary, start))
+            {
                 return Ok(found);
             }
         }
@@ -170,45 +166,18 @@ impl Opening<'_> {
         read.map_err(|source| Fault::Read { file: self.path.to_string(), source })
     }
 
-    // None where the summary does not tell where all messages are.
-    fn summary(&self, summary: &[u8], start: u64) -> Result<Option<McapFile>, McapError> {
-        let mut definitions = Definitions::default();
-        let (mut statistics, mut indexes, mut attachments) = (None, Vec::new(), Vec::new());
-        let options = LinearReaderOptions::default()
-            .with_skip_start_magic(true)
-            .with_skip_end_magic(true)
-            .with_validate_summary_section_crc(true)
-            .with_record_length_limit(summary.len());
-        let mut reader = LinearReader::new_with_options(options);
-        let mut rest = DATA_END.as_slice();
-        let mut behind = Some(summary);
-        while let Some(event) = reader.next_event() {
-            match event? {
-                LinearReadEvent::ReadRequest(_) => {
-                    if rest.is_empty() {
-                        rest = behind.take().ok_or(McapError::UnexpectedEof)?;
-                    }
-                    reader.insert(rest.len()).copy_from_slice(rest);
-                    reader.notify_read(rest.len());
-                    rest = &[];
-                }
-                LinearReadEvent::Record { opcode, data } => match mcap::parse_record(opcode, data)? {
-                    Record::Statistics(found) => statistics = Some(found),
-                    Record::ChunkIndex(index) => indexes.push(index),
-                    Record::AttachmentIndex(index) => attachments.push(index),
-                    other => definitions.learn(&other),
-                },
-            }
-        }
-        let Some(statistics) = statistics.filter(|s| s.chunk_count as usize == indexes.len()) else { return Ok(None) };
+    // None if the summary does not tell where all messages are.
+    fn indexed_file(&self, summary: RunSummary, start: u64) -> Option<McapFile> {
+        let indexes = summary.chunk_indexes;
+        let statistics = summary.statistics.filter(|s| s.chunk_count as usize == indexes.len())?;
         if indexes.is_empty() && statistics.message_count > 0 {
-            return Ok(None);
+            return None;
         }
         let pieces = indexes.into_iter().map(|index| {
             let end = index.chunk_start_offset.checked_add(index.chunk_length).filter(|end| *end <= start)?;
             let channels = index.message_index_offsets.keys().copied().collect::<Box<[_]>>();
             Some(Piece {
-                kind: Kind::Chunk,
+                kind: PieceKind::Chunk,
                 range: index.chunk_start_offset..end,
                 times: (index.message_start_time, index.message_end_time),
                 // A writer may make no message indexes.
@@ -217,25 +186,25 @@ impl Opening<'_> {
                 plain: index.uncompressed_size,
             })
         });
-        let Some(mut pieces) = pieces.collect::<Option<Vec<_>>>() else { return Ok(None) };
+        let mut pieces = pieces.collect::<Option<Vec<_>>>()?;
         pieces.sort_by_key(|p| p.range.start);
         let overlap = pieces.windows(2).any(|two| two[0].range.end > two[1].range.start);
-        let short = pieces.iter().any(|p| p.range.end - p.range.start < FRAME as u64);
+        let short = pieces.iter().any(|p| p.range.end - p.range.start < FRAME_BYTES as u64);
         let all: BTreeSet<u16> = pieces.iter().flat_map(|p| p.channels.iter().flatten().copied()).collect();
-        let mut channels = definitions.channels();
+        let mut channels = with_raw_schemas(&summary.channels);
         if overlap || short || !all.iter().all(|id| channels.contains_key(id)) {
-            return Ok(None);
+            return None;
         }
         for (id, channel) in &mut channels {
             channel.messages = Some(statistics.channel_message_counts.get(id).copied().unwrap_or(0));
         }
-        let attachments = attachments.into_iter().filter_map(|index| {
+        let attachments = summary.attachment_indexes.into_iter().filter_map(|index| {
             let end = index.offset.checked_add(index.length).filter(|end| *end <= start)?;
             let range = index.offset..end;
             Some(Attachment { name: index.name, media_type: index.media_type, bytes: index.data_size, range })
         });
         let attachments = attachments.collect();
-        Ok(Some(McapFile { path: self.path.clone(), bytes: self.bytes, indexed: true, channels, pieces, attachments }))
+        Some(McapFile { path: self.path.clone(), bytes: self.bytes, indexed: true, channels, pieces, attachments })
     }
 
     fn damaged(&self, offset: u64, what: impl Into<String>) -> Fault {
@@ -248,34 +217,22 @@ impl Opening<'_> {
         if start[..] != *MAGIC {
             return Err(self.damaged(0, "it does not begin as an MCAP file does"));
         }
-        let options = LinearReaderOptions::default()
-            .with_skip_start_magic(true)
-            .with_skip_end_magic(true)
-            .with_emit_chunks(true)
-            .with_record_length_limit(LARGEST as usize);
-        let mut reader = LinearReader::new_with_options(options);
-        let mut walk = Walk { at: MAGIC.len() as u64, ..Walk::default() };
-        let mut read = walk.at;
+        let mut splitter = RecordSplitter::new(MAGIC.len() as u64);
+        let mut walk = Walk::default();
+        let mut read = splitter.offset();
         loop {
-            match reader.next_event() {
-                Some(Ok(LinearReadEvent::ReadRequest(count))) => {
-                    if read == self.bytes {
-                        break;
-                    }
-                    // Much is read at a time, but never more than the record at hand needs is kept for long.
-                    let block = self.read(read..(read + BLOCK.max(count as u64).min(LARGEST)).min(self.bytes)).await?;
-                    reader.insert(block.len()).copy_from_slice(&block);
-                    reader.notify_read(block.len());
+            let offset = splitter.offset();
+            match splitter.next_record().map_err(|what| self.damaged(offset, what))? {
+                Ok(SplitRecord { code: opcode::DATA_END | opcode::FOOTER, .. }) => break,
+                Ok(record) => walk.record(&record).map_err(|what| self.damaged(offset, what))?,
+                // A record that was cut off is none.
+                Err(_) if read == self.bytes => break,
+                Err(missing) => {
+                    let block = self.read(read..(read + BLOCK.max(missing)).min(self.bytes)).await?;
                     read += block.len() as u64;
+                    splitter.push(&block);
                     tokio::task::yield_now().await;
                 }
-                Some(Ok(LinearReadEvent::Record { opcode: op::DATA_END | op::FOOTER, .. })) | None => break,
-                Some(Ok(LinearReadEvent::Record { opcode, data })) => {
-                    let at = walk.at;
-                    walk.record(opcode, data).map_err(|what| self.damaged(at, what))?;
-                }
-                // Behind the last whole record of a file that was cut off something may stand that is none.
-                Some(Err(e)) => return Err(self.damaged(walk.at, words(&e))),
             }
         }
         let attachments = std::mem::take(&mut walk.attachments);
@@ -284,62 +241,25 @@ impl Opening<'_> {
     }
 }
 
-// Where the footer says that the summary begins.
-fn summary_start(tail: &[u8], bytes: u64) -> Option<u64> {
-    let footer = tail.strip_suffix(MAGIC)?;
-    let footer = footer.get(footer.len().checked_sub(FOOTER)?..)?;
-    if footer[0] != op::FOOTER {
-        return None;
-    }
-    let Ok(Record::Footer(footer)) = mcap::parse_record(op::FOOTER, &footer[FRAME..]) else { return None };
-    let inside = MAGIC.len() as u64..bytes - (FOOTER + MAGIC.len()) as u64;
-    (inside.contains(&footer.summary_start) && bytes - footer.summary_start <= LARGEST).then_some(footer.summary_start)
-}
-
-/// Schemas and channels as they come.
-#[derive(Debug, Default)]
-struct Definitions {
-    schemas: HashMap<u16, RawSchema>,
-    channels: BTreeMap<u16, mcap::records::Channel>,
-}
-
-impl Definitions {
-    // The first of an id counts; a second one repeats it.
-    fn learn(&mut self, record: &Record<'_>) {
-        match record {
-            Record::Schema { header, data } => {
-                self.schemas.entry(header.id).or_insert_with(|| RawSchema {
-                    name: header.name.clone(),
-                    encoding: header.encoding.clone(),
-                    messages: String::new(),
-                    data: data.to_vec(),
-                });
-            }
-            Record::Channel(channel) => {
-                self.channels.entry(channel.id).or_insert_with(|| channel.clone());
-            }
-            _ => {}
-        }
-    }
-
-    fn channels(self) -> BTreeMap<u16, Channel> {
-        let schema = |channel: &mcap::records::Channel| {
-            let schema = self.schemas.get(&channel.schema_id).cloned().unwrap_or_default();
-            Arc::new(RawSchema { messages: channel.message_encoding.clone(), ..schema })
-        };
-        let one = |(id, channel): (&u16, &mcap::records::Channel)| {
-            (*id, Channel { topic: channel.topic.clone(), schema: schema(channel), messages: None, times: None })
-        };
-        self.channels.iter().map(one).collect()
-    }
+fn with_raw_schemas(channels: &BTreeMap<u16, Arc<echolake_recording::Channel<'static>>>) -> BTreeMap<u16, Channel> {
+    let raw = |channel: &echolake_recording::Channel<'_>| {
+        let messages = channel.message_encoding.clone();
+        let schema = channel.schema.as_ref().map(|schema| RawSchema {
+            name: schema.name.clone(),
+            encoding: schema.encoding.clone(),
+            messages: String::new(),
+            data: schema.data.to_vec(),
+        });
+        let schema = Arc::new(RawSchema { messages, ..schema.unwrap_or_default() });
+        Channel { topic: channel.topic.clone(), schema, messages: None, times: None }
+    };
+    channels.iter().map(|(id, channel)| (*id, raw(channel))).collect()
 }
 
 /// What a walk has come by.
 #[derive(Debug, Default)]
 struct Walk {
-    /// Where the record at hand begins.
-    at: u64,
-    definitions: Definitions,
+    definitions: ChannelDefinitions,
     /// Messages of each channel, and the times of the first and last.
     seen: BTreeMap<u16, (u64, (u64, u64))>,
     pieces: Vec<Piece>,
@@ -349,23 +269,22 @@ struct Walk {
 }
 
 impl Walk {
-    fn record(&mut self, opcode: u8, data: &[u8]) -> Result<(), String> {
-        let range = self.at..self.at + (FRAME + data.len()) as u64;
-        self.at = range.end;
-        match opcode {
-            op::CHUNK => self.chunk(range, data),
-            op::MESSAGE | op::SCHEMA | op::CHANNEL => {
-                let record = mcap::parse_record(opcode, data).map_err(|e| words(&e))?;
+    fn record(&mut self, record: &SplitRecord) -> Result<(), String> {
+        let range = record.offset..record.end();
+        match record.code {
+            opcode::CHUNK => self.chunk(range, record.body.clone()),
+            opcode::MESSAGE | opcode::SCHEMA | opcode::CHANNEL => {
+                let parsed = parse_record(record.code, &record.body).map_err(|e| describe(&e))?;
                 let mut seen = Seen::default();
-                self.see(&record, &mut seen);
-                if opcode == op::MESSAGE {
+                self.see(&parsed, &mut seen);
+                if record.code == opcode::MESSAGE {
                     self.message(range, seen);
                 }
                 Ok(())
             }
-            op::ATTACHMENT => {
+            opcode::ATTACHMENT => {
                 self.open = false;
-                if let Ok(Record::Attachment { header, data, .. }) = mcap::parse_record(opcode, data) {
+                if let Ok(Record::Attachment { header, data, .. }) = parse_record(record.code, &record.body) {
                     let bytes = data.len() as u64;
                     let (name, media_type) = (header.name, header.media_type);
                     self.attachments.push(Attachment { name, media_type, bytes, range });
@@ -379,24 +298,20 @@ impl Walk {
         }
     }
 
-    fn chunk(&mut self, range: Range<u64>, data: &[u8]) -> Result<(), String> {
+    fn chunk(&mut self, range: Range<u64>, body: Bytes) -> Result<(), String> {
         self.open = false;
-        let mut whole = Vec::with_capacity(FRAME + data.len());
-        whole.push(op::CHUNK);
-        whole.extend_from_slice(&(data.len() as u64).to_le_bytes());
-        whole.extend_from_slice(data);
         let mut seen = Seen::default();
         let mut sink = |record: Record<'_>| {
             self.see(&record, &mut seen);
-            Ok::<_, std::convert::Infallible>(Step::Go)
+            Ok::<_, std::convert::Infallible>(ReadStep::Continue)
         };
-        match Records::new(whole.into(), Kind::Chunk)?.read(&mut sink) {
+        match PieceRecords::from_chunk(body)?.read(&mut sink) {
             Ok(_) => {}
-            Err(Stop::Damage(what)) => return Err(what),
-            Err(Stop::Sink(never)) => match never {},
+            Err(ReadStop::Damage(what)) => return Err(what),
+            Err(ReadStop::Sink(never)) => match never {},
         }
         if let Some(times) = seen.times {
-            self.pieces.push(seen.piece(Kind::Chunk, range, times));
+            self.pieces.push(seen.piece(PieceKind::Chunk, range, times));
         }
         Ok(())
     }
@@ -411,7 +326,7 @@ impl Walk {
             let channels: BTreeSet<u16> = channels.collect();
             piece.channels = Some(channels.into_iter().collect());
         } else {
-            self.pieces.push(seen.piece(Kind::Loose, range, times));
+            self.pieces.push(seen.piece(PieceKind::Loose, range, times));
             self.open = true;
         }
     }
@@ -429,7 +344,7 @@ impl Walk {
     }
 
     fn finish(self) -> (BTreeMap<u16, Channel>, Vec<Piece>) {
-        let mut channels = self.definitions.channels();
+        let mut channels = with_raw_schemas(&self.definitions.into_channels());
         for (id, channel) in &mut channels {
             let seen = self.seen.get(id);
             channel.messages = Some(seen.map_or(0, |(count, _)| *count));
@@ -447,7 +362,7 @@ struct Seen {
 }
 
 impl Seen {
-    fn piece(self, kind: Kind, range: Range<u64>, times: (u64, u64)) -> Piece {
+    fn piece(self, kind: PieceKind, range: Range<u64>, times: (u64, u64)) -> Piece {
         Piece { kind, range, times, channels: Some(self.channels.into_iter().collect()), index: 0, plain: 0 }
     }
 }

@@ -7,7 +7,7 @@ use arrow::array::{ArrayRef, new_null_array};
 use arrow::datatypes::{DataType, Field, SchemaRef};
 use arrow::error::ArrowError;
 use arrow::record_batch::{RecordBatch, RecordBatchOptions};
-use mcap::records::MessageHeader;
+use echolake_recording::MessageHeader;
 
 use super::column::{Column, time_type};
 use super::error::Malformed;

@@ -20,12 +20,12 @@ use datafusion::physical_plan::stream::RecordBatchStreamAdapter;
 use datafusion::physical_plan::{
     DisplayAs, DisplayFormatType, ExecutionPlan, Partitioning, PlanProperties, ReplaceChildrenOptions,
 };
+use echolake_recording::Record;
 use futures::stream::{self, BoxStream};
 use futures::{StreamExt as _, TryStreamExt as _};
-use mcap::records::Record;
 use object_store::ObjectStoreExt as _;
 
-use super::chunk::{Progress, Records, Step, Stop};
+use super::chunk::{PieceRecords, ReadProgress, ReadStep, ReadStop};
 use super::error::Fault;
 use super::file::Piece;
 use super::rows::{Message, Rows};
@@ -235,7 +235,7 @@ struct Fetched {
 struct Current {
     source: usize,
     offset: u64,
-    records: Records,
+    records: PieceRecords,
 }
 
 impl Scanner {
@@ -279,7 +279,7 @@ impl Scanner {
             let (source, offset) = (fetched.source, piece.range.start);
             let bytes =
                 fetched.bytes.slice((offset - fetched.start) as usize..(piece.range.end - fetched.start) as usize);
-            let records = Records::new(bytes, piece.kind).map_err(|what| self.damaged(source, offset, what))?;
+            let records = PieceRecords::new(bytes, piece.kind).map_err(|what| self.damaged(source, offset, what))?;
             self.memory.try_resize(records.memory)?;
             self.chunks.add(1);
             self.current = Some(Current { source, offset, records });
@@ -296,10 +296,10 @@ impl Scanner {
         let (rows, left, times) = (&mut self.rows, &mut self.left, &self.scan.times);
         let offset = current.offset;
         let mut sink = |record: Record<'_>| {
-            let Record::Message { header, data } = &record else { return Ok(Step::Go) };
-            let Some((topic, mapping)) = source.channels.get(&header.channel_id) else { return Ok(Step::Go) };
+            let Record::Message { header, data } = &record else { return Ok(ReadStep::Continue) };
+            let Some((topic, mapping)) = source.channels.get(&header.channel_id) else { return Ok(ReadStep::Continue) };
             if !times.contains(&i64::try_from(header.log_time).unwrap_or(i64::MAX)) {
-                return Ok(Step::Go);
+                return Ok(ReadStep::Continue);
             }
             let message = Message { run: source.run.as_ref(), topic, header, data };
             let mapping = parts.mappings.as_ref().map(|all| (*mapping, &all[*mapping]));
@@ -311,19 +311,19 @@ impl Scanner {
                 what,
             })?;
             *left -= 1;
-            Ok::<_, DataFusionError>(if ready || *left == 0 { Step::Pause } else { Step::Go })
+            Ok::<_, DataFusionError>(if ready || *left == 0 { ReadStep::Pause } else { ReadStep::Continue })
         };
         match current.records.read(&mut sink) {
-            Ok(Progress::Paused) => Ok(()),
-            Ok(Progress::Done) => {
+            Ok(ReadProgress::Paused) => Ok(()),
+            Ok(ReadProgress::Done) => {
                 self.current = None;
                 Ok(())
             }
-            Err(Stop::Damage(what)) => {
+            Err(ReadStop::Damage(what)) => {
                 let source = current.source;
                 Err(self.damaged(source, offset, what).into())
             }
-            Err(Stop::Sink(e)) => Err(e),
+            Err(ReadStop::Sink(e)) => Err(e),
         }
     }
 

@@ -6,10 +6,11 @@ use std::sync::Arc;
 use arrow::array::{ArrayRef, BooleanArray, Int64Array, StringArray, TimestampNanosecondArray};
 use arrow::datatypes::{DataType, Field, Schema};
 use arrow::record_batch::RecordBatch;
+use bytes::Bytes;
 use datafusion::catalog::TableProvider;
 use datafusion::datasource::MemTable;
+use echolake_recording::{Record, RecordCursor};
 use futures::{StreamExt as _, TryStreamExt as _};
-use mcap::records::Record;
 use object_store::ObjectStoreExt as _;
 
 use super::column::{UTC, time_type};
@@ -161,7 +162,7 @@ impl Indexes<'_> {
             } else {
                 let path = &self.file.path;
                 let bytes = self.files.store.get_range(path, at..at + piece.index).await;
-                index_times(&bytes.map_err(|source| Fault::Read { file: path.to_string(), source })?)
+                index_times(bytes.map_err(|source| Fault::Read { file: path.to_string(), source })?)
             };
             self.read.insert(at, times);
         }
@@ -169,9 +170,10 @@ impl Indexes<'_> {
     }
 }
 
-fn index_times(bytes: &[u8]) -> HashMap<u16, (u64, u64)> {
+fn index_times(bytes: Bytes) -> HashMap<u16, (u64, u64)> {
     let mut times = HashMap::new();
-    for record in mcap::read::LinearReader::sans_magic(bytes).map_while(Result::ok) {
+    let mut records = RecordCursor::new(bytes);
+    while let Ok(Some(record)) = records.next_record() {
         if let Record::MessageIndex(index) = record {
             let all = || index.records.iter().map(|entry| entry.log_time);
             if let (Some(first), Some(last)) = (all().min(), all().max()) {

@@ -10,19 +10,17 @@ use std::sync::Arc;
 
 use bytes::Bytes;
 use crc32fast::Hasher as Crc32;
-use mcap::records::Record;
+use mcap::MAGIC;
+use mcap::records::{Metadata, Record, op};
 use object_store::path::Path;
 use object_store::{ObjectStore, ObjectStoreExt as _};
 use sha2::{Digest as _, Sha256};
 use tokio::sync::{Semaphore, SemaphorePermit};
 
 use crate::block_reader::BlockReader;
-use crate::error::{Error, Result};
-use crate::record_shape::{self, Frame, PREFIX, Shape, opcode};
+use crate::record_frame::{FRAME_BYTES, PREFIX_BYTES, RecordFrame, RecordShape, largest_record};
 
-const MAGIC: &[u8; 8] = b"\x89MCAP0\r\n";
-/// Opcode and length in front of every record.
-const FRAME: u64 = record_shape::FRAME as u64;
+const FRAME: u64 = FRAME_BYTES as u64;
 /// Most that is passed over at a time, and what a search fetches at a time.
 const PASS: u64 = 1 << 20;
 /// How often the walk may go back over the file, all of its ways back together: false records that reach over each other
@@ -39,34 +37,74 @@ static LARGE_RECORDS: Semaphore = Semaphore::const_new(1);
 /// Bytes from the footer's frame to the end of the file.
 const FOOTER: u64 = FRAME + 20 + MAGIC.len() as u64;
 
-/// Something that the walk came by.
+/// Why a file cannot be read.
+#[derive(Debug, thiserror::Error)]
+pub enum ResyncError {
+    /// The store does not give it.
+    #[error("cannot read `{file}`: {reason}")]
+    Read {
+        /// The file.
+        file: String,
+        /// The store's reason.
+        reason: String,
+    },
+    /// No file of this name.
+    #[error("`{file}` is gone")]
+    Gone {
+        /// The file.
+        file: String,
+    },
+    /// Not an MCAP file at all.
+    #[error("`{file}` is not an MCAP file: it begins with {actual}")]
+    NotMcap {
+        /// The file.
+        file: String,
+        /// Its first bytes.
+        actual: String,
+    },
+}
+
+impl ResyncError {
+    fn read(file: &str, reason: impl ToString) -> Self {
+        Self::Read { file: file.to_owned(), reason: reason.to_string() }
+    }
+}
+
+/// A record that matters to ingest.
 #[derive(Debug)]
-pub(crate) enum Item {
+pub enum ResyncItem {
     /// A chunk, still compressed.
     Chunk(RawChunk),
     /// An attachment whose CRC is right.
-    Attachment { name: String, data: Bytes },
+    Attachment {
+        /// Its name.
+        name: String,
+        /// Its content.
+        data: Bytes,
+    },
     /// A metadata record.
-    Metadata(mcap::records::Metadata),
+    Metadata(Metadata),
     /// A schema or channel of the summary.
     Definition(Record<'static>),
 }
 
 /// A chunk's body and where its record begins.
 #[derive(Debug)]
-pub(crate) struct RawChunk {
-    pub(crate) offset: u64,
-    pub(crate) body: Bytes,
+pub struct RawChunk {
+    /// Byte of the file at which the record begins.
+    pub offset: u64,
+    /// The record behind its frame.
+    pub body: Bytes,
     /// Held by a large chunk until its messages are read.
-    pub(crate) permit: Option<LargeRecordPermit>,
+    pub permit: Option<LargeRecordPermit>,
 }
 
 /// Permits one large record to be in memory.
-pub(crate) type LargeRecordPermit = SemaphorePermit<'static>;
+pub type LargeRecordPermit = SemaphorePermit<'static>;
 
-/// What the walk found out about the whole file.
+/// The state of a whole file.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Integrity {
+pub struct FileIntegrity {
     /// Size.
     pub bytes: u64,
     /// Digest, lower-case hex.
@@ -77,8 +115,8 @@ pub struct Integrity {
     pub damage: Vec<String>,
 }
 
-/// A walk over one file.
-pub(crate) struct RunReader {
+/// Reads one file from its first byte to its last.
+pub struct ResyncReader {
     file: BlockReader,
     name: String,
     size: u64,
@@ -102,24 +140,24 @@ pub(crate) struct RunReader {
     in_summary: bool,
     /// The summary's own checksum, gathered while its records pass.
     summary: Crc32,
-    end: Option<End>,
+    end: Option<FileEnd>,
     damage: Vec<String>,
 }
 
-/// Why the walk is over.
+/// The end of a walk.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum End {
+enum FileEnd {
     Closed,
     CutOff,
 }
 
-impl RunReader {
+impl ResyncReader {
     /// Opens a file and checks its first bytes.
-    pub(crate) async fn open(store: Arc<dyn ObjectStore>, path: Path, name: String) -> Result<Self> {
+    pub async fn open(store: Arc<dyn ObjectStore>, path: Path, name: String) -> Result<Self, ResyncError> {
         let size = match store.head(&path).await {
             Ok(meta) => meta.size,
-            Err(object_store::Error::NotFound { .. }) => return Err(Error::Gone { file: name }),
-            Err(e) => return Err(Error::read(&name, e)),
+            Err(object_store::Error::NotFound { .. }) => return Err(ResyncError::Gone { file: name }),
+            Err(e) => return Err(ResyncError::read(&name, e)),
         };
         let mut reader = Self {
             file: BlockReader::open(store, path).await,
@@ -147,18 +185,18 @@ impl RunReader {
             let actual = start.iter().map(|b| format!("{b:02x}")).collect::<Vec<_>>().join(" ");
             let actual =
                 if actual.is_empty() { "nothing (the file is empty)".to_owned() } else { format!("`{actual}`") };
-            return Err(Error::NotMcap { file: reader.name, actual });
+            return Err(ResyncError::NotMcap { file: reader.name, actual });
         }
         Ok(reader)
     }
 
     /// Leaves out the bytes that are passed over, for a walk of which only the items matter.
-    pub(crate) fn without_digest(self) -> Self {
+    pub fn without_digest(self) -> Self {
         Self { has_digest: false, ..self }
     }
 
     /// The next item, or None at the end.
-    pub(crate) async fn next(&mut self) -> Result<Option<Item>> {
+    pub async fn next_item(&mut self) -> Result<Option<ResyncItem>, ResyncError> {
         loop {
             if self.end.is_some() {
                 return Ok(None);
@@ -169,20 +207,20 @@ impl RunReader {
         }
     }
 
-    /// What is known of the whole file, once [`Self::next`] returned None.
-    pub(crate) async fn finish(mut self) -> Result<Integrity> {
+    /// Returns the state of the whole file, once [`Self::next_item`] returned None.
+    pub async fn finish(mut self) -> Result<FileIntegrity, ResyncError> {
         self.pass(self.size - self.offset).await?;
-        Ok(Integrity {
+        Ok(FileIntegrity {
             bytes: self.size,
             sha256: hex::encode(self.digest.finalize()),
-            closed: self.end == Some(End::Closed),
+            closed: self.end == Some(FileEnd::Closed),
             damage: self.damage,
         })
     }
 
     /// The chunk that began at `offset` is damaged. Where bytes of it are missing it reached too far, so the walk
     /// goes on at the next whole record behind its first byte; no chunk comes twice.
-    pub(crate) async fn look_into(&mut self, offset: u64) -> Result<()> {
+    pub async fn look_into(&mut self, offset: u64) -> Result<(), ResyncError> {
         self.end = None;
         match self.rewind(offset) {
             true => self.search().await,
@@ -191,16 +229,16 @@ impl RunReader {
     }
 
     /// A chunk that the walk came by earlier, once more.
-    pub(crate) async fn again(&self, offset: u64, length: u64) -> Result<RawChunk> {
+    pub async fn again(&self, offset: u64, length: u64) -> Result<RawChunk, ResyncError> {
         let start = offset + FRAME;
         // What it becomes is known only once it is read.
         let permit = large_record_permit(LARGE_RECORD + 1).await;
         let body = self.file.range(start..start + length).await;
-        Ok(RawChunk { offset, body: body.map_err(|e| Error::read(&self.name, e))?, permit })
+        Ok(RawChunk { offset, body: body.map_err(|e| ResyncError::read(&self.name, e))?, permit })
     }
 
     // One record; None where it is of no interest.
-    async fn record(&mut self) -> Result<Option<Item>> {
+    async fn record(&mut self) -> Result<Option<ResyncItem>, ResyncError> {
         let frame = match self.frame().await? {
             Ok(frame) => frame,
             Err(what) => {
@@ -212,9 +250,9 @@ impl RunReader {
         };
         let offset = self.offset;
         self.doubtful = Some(offset);
-        let Frame { code, length } = frame;
-        let most = record_shape::largest(code).unwrap_or(u64::MAX);
-        let is_one_too_many = code == opcode::CHUNK && self.chunks.len() == MOST_CHUNKS;
+        let RecordFrame { code, length } = frame;
+        let most = largest_record(code).unwrap_or(u64::MAX);
+        let is_one_too_many = code == op::CHUNK && self.chunks.len() == MOST_CHUNKS;
         if length > most || is_one_too_many {
             list_damage(&mut self.damage, || match is_one_too_many {
                 true => format!("the chunk at byte {offset}: the file has more than {MOST_CHUNKS}"),
@@ -225,13 +263,17 @@ impl RunReader {
             return self.pass(FRAME + length).await;
         }
         match code {
-            opcode::CHUNK | opcode::ATTACHMENT | opcode::METADATA | opcode::SCHEMA | opcode::CHANNEL => {
+            op::CHUNK | op::ATTACHMENT | op::METADATA | op::SCHEMA | op::CHANNEL => {
                 let permit = large_record_permit(self.memory(frame)).await;
                 self.fill(FRAME + length).await?;
                 let mut record = self.skip(FRAME + length, true);
                 let body = record.split_off(FRAME as usize);
-                if code == opcode::CHUNK {
-                    return Ok(self.chunks.insert(offset).then_some(Item::Chunk(RawChunk { offset, body, permit })));
+                if code == op::CHUNK {
+                    return Ok(self.chunks.insert(offset).then_some(ResyncItem::Chunk(RawChunk {
+                        offset,
+                        body,
+                        permit,
+                    })));
                 }
                 let item = self.item(code, offset, &body);
                 if item.is_none() {
@@ -239,53 +281,53 @@ impl RunReader {
                 }
                 Ok(item)
             }
-            opcode::DATA_END => self.data_end().await,
-            opcode::FOOTER => self.footer().await,
+            op::DATA_END => self.data_end().await,
+            op::FOOTER => self.footer().await,
             _ => self.pass(FRAME + length).await,
         }
     }
 
     // Bytes that a record takes: a chunk's also decompressed, which is its third number.
-    fn memory(&self, frame: Frame) -> u64 {
+    fn memory(&self, frame: RecordFrame) -> u64 {
         let at = FRAME as usize + 16;
-        let claimed = self.ahead().get(at..at + 8).filter(|_| frame.code == opcode::CHUNK);
+        let claimed = self.ahead().get(at..at + 8).filter(|_| frame.code == op::CHUNK);
         let claimed = claimed.map_or(0, |bytes| u64::from_le_bytes(bytes.try_into().unwrap_or_default()));
         frame.length.max(claimed)
     }
 
     // The frame at `offset`, or in words why no record begins there.
-    async fn frame(&mut self) -> Result<std::result::Result<Frame, String>> {
+    async fn frame(&mut self) -> Result<Result<RecordFrame, String>, ResyncError> {
         let left = self.size - self.offset;
         if left < FRAME {
             return Ok(Err("ends within a record's frame".to_owned()));
         }
         self.fill(FRAME).await?;
-        let frame = Frame::read(self.ahead());
+        let frame = RecordFrame::read(self.ahead());
         if frame.length > left - FRAME {
             return Ok(Err(format!("ends within a record of kind {:#04x} and {} bytes", frame.code, frame.length)));
         }
-        self.fill(left.min(FRAME + frame.length.min(PREFIX as u64) + MAGIC.len() as u64)).await?;
+        self.fill(left.min(FRAME + frame.length.min(PREFIX_BYTES as u64) + MAGIC.len() as u64)).await?;
         let sound = match look(self.ahead(), left) {
-            Shape::Sound => true,
-            Shape::Unknown => self.goes_on(FRAME + frame.length).await?,
-            Shape::Broken => false,
+            RecordShape::Sound => true,
+            RecordShape::Unknown => self.goes_on(FRAME + frame.length).await?,
+            RecordShape::Broken => false,
         };
         Ok(if sound { Ok(frame) } else { Err(format!("has no whole record of kind {:#04x}", frame.code)) })
     }
 
     // Whether a record can begin `behind` this one's first byte: that speaks for this one, where nothing else does.
-    async fn goes_on(&mut self, behind: u64) -> Result<bool> {
+    async fn goes_on(&mut self, behind: u64) -> Result<bool, ResyncError> {
         let left = self.size - self.offset - behind;
         if left < FRAME {
             return Ok(false);
         }
-        let frame = if behind <= PREFIX as u64 {
+        let frame = if behind <= PREFIX_BYTES as u64 {
             self.fill(behind + FRAME).await?;
-            Frame::read(&self.ahead()[behind as usize..])
+            RecordFrame::read(&self.ahead()[behind as usize..])
         } else {
             let start = self.offset + behind;
             let bytes = self.file.range(start..start + FRAME).await;
-            Frame::read(&bytes.map_err(|e| Error::read(&self.name, e))?)
+            RecordFrame::read(&bytes.map_err(|e| ResyncError::read(&self.name, e))?)
         };
         Ok(frame.is_possible(left - FRAME))
     }
@@ -304,7 +346,7 @@ impl RunReader {
 
     // Goes on to the next bytes that can be a record. The record before may have swallowed it, where its length or
     // what is missing in it made it reach too far.
-    async fn search(&mut self) -> Result<()> {
+    async fn search(&mut self) -> Result<(), ResyncError> {
         if let Some(doubtful) = self.doubtful {
             self.rewind(doubtful);
         }
@@ -319,18 +361,19 @@ impl RunReader {
         loop {
             let left = self.size - self.offset;
             if left < FRAME {
-                self.end = Some(End::CutOff);
+                self.end = Some(FileEnd::CutOff);
                 return Ok(());
             }
-            self.fetch(left.min(FRAME + PREFIX as u64), PASS).await?;
+            self.fetch(left.min(FRAME + PREFIX_BYTES as u64), PASS).await?;
             let ahead = self.ahead();
             // All frames that can be judged by what is fetched.
-            let behind = if ahead.len() as u64 == left { FRAME as usize } else { FRAME as usize + PREFIX };
+            let behind = if ahead.len() as u64 == left { FRAME as usize } else { FRAME as usize + PREFIX_BYTES };
             let count = ahead.len() - behind + 1;
             let mut at = 0;
             // Most bytes are no record's code; a plain loop passes over them fast in every profile.
             while at < count
-                && !(matches!(ahead[at], 1..=opcode::DATA_END) && look(&ahead[at..], left - at as u64) == Shape::Sound)
+                && !(matches!(ahead[at], 1..=op::DATA_END)
+                    && look(&ahead[at..], left - at as u64) == RecordShape::Sound)
             {
                 at += 1;
             }
@@ -341,7 +384,7 @@ impl RunReader {
         }
     }
 
-    fn item(&mut self, code: u8, offset: u64, body: &Bytes) -> Option<Item> {
+    fn item(&mut self, code: u8, offset: u64, body: &Bytes) -> Option<ResyncItem> {
         match mcap::parse_record(code, body) {
             Ok(Record::Attachment { header, data, crc }) => {
                 // Its CRC was checked, but 0 stands for none: it may be what now stands at its end.
@@ -350,10 +393,10 @@ impl RunReader {
                     Cow::Borrowed(part) => body.slice_ref(part),
                     Cow::Owned(copy) => copy.into(),
                 };
-                Some(Item::Attachment { name: header.name, data })
+                Some(ResyncItem::Attachment { name: header.name, data })
             }
-            Ok(Record::Metadata(metadata)) => Some(Item::Metadata(metadata)),
-            Ok(definition) => Some(Item::Definition(definition.into_owned())),
+            Ok(Record::Metadata(metadata)) => Some(ResyncItem::Metadata(metadata)),
+            Ok(definition) => Some(ResyncItem::Definition(definition.into_owned())),
             Err(e) => {
                 list_damage(&mut self.damage, || format!("record at byte {offset}: {e}"));
                 None
@@ -361,7 +404,7 @@ impl RunReader {
         }
     }
 
-    async fn data_end(&mut self) -> Result<Option<Item>> {
+    async fn data_end(&mut self) -> Result<Option<ResyncItem>, ResyncError> {
         let sum = self.crc.clone().finalize();
         let at = self.offset;
         let record = self.skip(FRAME + 4, true);
@@ -375,7 +418,7 @@ impl RunReader {
         Ok(None)
     }
 
-    async fn footer(&mut self) -> Result<Option<Item>> {
+    async fn footer(&mut self) -> Result<Option<ResyncItem>, ResyncError> {
         let at = self.offset;
         let record = self.skip(FOOTER, false);
         // The summary's CRC covers all of it up to the CRC itself, the footer's frame and offsets included.
@@ -389,7 +432,7 @@ impl RunReader {
                 format!("summary before byte {at}: CRC is {sum:08x}, expected {stored:08x}")
             });
         }
-        self.end = Some(End::Closed);
+        self.end = Some(FileEnd::Closed);
         Ok(None)
     }
 
@@ -400,23 +443,23 @@ impl RunReader {
     }
 
     // Fetches, so that the next `count` bytes are there; the file has them.
-    async fn fill(&mut self, count: u64) -> Result<()> {
+    async fn fill(&mut self, count: u64) -> Result<(), ResyncError> {
         self.fetch(count, self.file.ahead()).await
     }
 
     // The same; where it must read, it reads `at_least` so much. What was left is fetched once more: that is less than to
     // copy all behind it.
-    async fn fetch(&mut self, count: u64, at_least: u64) -> Result<()> {
+    async fn fetch(&mut self, count: u64, at_least: u64) -> Result<(), ResyncError> {
         if (self.ahead().len() as u64) < count {
             // Let go, so that its memory serves again.
             self.window = Bytes::new();
             let to = (self.offset + count.max(at_least)).min(self.size);
             let fetched = self.file.block(self.offset..to).await;
-            self.window = fetched.map_err(|e| Error::read(&self.name, e))?;
+            self.window = fetched.map_err(|e| ResyncError::read(&self.name, e))?;
             self.window_start = self.offset;
         }
         if (self.ahead().len() as u64) < count {
-            return Err(Error::read(&self.name, "it became shorter while it was read"));
+            return Err(ResyncError::read(&self.name, "it became shorter while it was read"));
         }
         Ok(())
     }
@@ -440,7 +483,7 @@ impl RunReader {
     }
 
     // Passes over what may be larger than the window should become.
-    async fn pass(&mut self, count: u64) -> Result<Option<Item>> {
+    async fn pass(&mut self, count: u64) -> Result<Option<ResyncItem>, ResyncError> {
         if !self.has_digest {
             self.offset += count;
             return Ok(None);
@@ -456,17 +499,19 @@ impl RunReader {
     }
 }
 
-// What can be said of the record that begins with `bytes`, which have its frame, the first [`PREFIX`] bytes behind it and
+// What can be said of the record that begins with `bytes`, which have its frame, the first [`PREFIX_BYTES`] bytes behind it and
 // the file's last ones, where it has them; `left` bytes of the file are left.
-fn look(bytes: &[u8], left: u64) -> Shape {
-    let frame = Frame::read(bytes);
+fn look(bytes: &[u8], left: u64) -> RecordShape {
+    let frame = RecordFrame::read(bytes);
     if !frame.is_possible(left - FRAME) {
-        return Shape::Broken;
+        return RecordShape::Broken;
     }
-    let end = FRAME as usize + frame.length.min(PREFIX as u64) as usize;
+    let end = FRAME as usize + frame.length.min(PREFIX_BYTES as u64) as usize;
     match frame.shape(&bytes[FRAME as usize..end]) {
         // The magic bytes and nothing else are behind a footer.
-        Shape::Sound if frame.code == opcode::FOOTER && (left != FOOTER || !bytes.ends_with(MAGIC)) => Shape::Broken,
+        RecordShape::Sound if frame.code == op::FOOTER && (left != FOOTER || !bytes.ends_with(MAGIC)) => {
+            RecordShape::Broken
+        }
         shape => shape,
     }
 }
@@ -477,7 +522,7 @@ async fn large_record_permit(bytes: u64) -> Option<LargeRecordPermit> {
 }
 
 /// Adds a line to what is said of a file's damage, up to a limit.
-pub(crate) fn list_damage(lines: &mut Vec<String>, line: impl FnOnce() -> String) {
+pub fn list_damage(lines: &mut Vec<String>, line: impl FnOnce() -> String) {
     match lines.len() {
         0..MOST_DAMAGE => lines.push(line()),
         MOST_DAMAGE => lines.push("more damage is not listed".to_owned()),

@@ -2,19 +2,20 @@
 //! verdict's chunk only behind those of what it rests on.
 
 use std::fs::File;
-use std::io::BufWriter;
+use std::io::{BufWriter, Write};
 use std::ops::Range;
 
 use echolake_schema::topics;
 use mcap::records::MessageHeader;
+use mcap::write::NoSeek;
 use mcap::{McapResult, WriteOptions, Writer};
 
 /// A chunk is ended at this size; a message never straddles two.
 const CHUNK_BYTES: usize = 1 << 20;
 
-/// Which chunks a message goes to. The order is that in which they are written at a checkpoint.
+/// The chunks that a message goes to. Lanes are written in this order at a checkpoint.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-pub(crate) enum Part {
+pub enum ChunkLane {
     /// Sweeps and their audio, which zstd finds again in the sweep.
     Sweeps,
     /// Impulse responses.
@@ -23,11 +24,11 @@ pub(crate) enum Part {
     Light,
 }
 
-impl Part {
+impl ChunkLane {
     const ALL: [Self; 3] = [Self::Sweeps, Self::Responses, Self::Light];
 
-    /// Where a topic's messages go.
-    pub(crate) fn of(topic: &str) -> Self {
+    /// Returns the lane of a topic's messages.
+    pub fn from_topic(topic: &str) -> Self {
         match topic {
             topics::SWEEP | topics::SWEEP_AUDIO => Self::Sweeps,
             topics::IR => Self::Responses,
@@ -36,75 +37,69 @@ impl Part {
     }
 }
 
-/// An MCAP writer whose chunks are sorted by [`Part`].
-pub(crate) struct ChunkWriter {
-    pub(crate) mcap: Writer<BufWriter<File>>,
+/// An MCAP writer whose chunks are sorted by [`ChunkLane`].
+pub struct ChunkWriter {
+    /// The library's writer, for channels, attachments and metadata.
+    pub mcap: Writer<BufWriter<File>>,
     /// The same open file, for what is no writing: syncs.
     file: File,
-    pending: [Pending; 3],
+    pending: [PendingMessages; 3],
 }
 
 /// Messages that wait for their chunk's end.
 #[derive(Default)]
-struct Pending {
+struct PendingMessages {
     messages: Vec<(MessageHeader, Range<usize>)>,
     bytes: Vec<u8>,
 }
 
 impl ChunkWriter {
     /// Begins a file.
-    pub(crate) fn new(file: File) -> McapResult<Self> {
+    pub fn new(file: File) -> McapResult<Self> {
         let kept = file.try_clone()?;
-        let mcap = WriteOptions::new()
-            .profile("")
-            .library(concat!("echolake ", env!("CARGO_PKG_VERSION")))
-            // Chunks end where this file says.
-            .chunk_size(None)
-            // One thread: the same run gives the same bytes, and runs are recorded side by side.
-            .compression_threads(0)
-            .create(BufWriter::new(file))?;
+        let mcap = write_options().create(BufWriter::new(file))?;
         Ok(Self { mcap, file: kept, pending: Default::default() })
     }
 
     /// Takes a message; it is written with its chunk.
-    pub(crate) fn push(&mut self, part: Part, header: MessageHeader, data: &[u8]) {
-        let Pending { messages, bytes } = &mut self.pending[part as usize];
+    pub fn push(&mut self, part: ChunkLane, header: MessageHeader, data: &[u8]) {
+        let PendingMessages { messages, bytes } = &mut self.pending[part as usize];
         let begin = bytes.len();
         bytes.extend_from_slice(data);
         messages.push((header, begin..bytes.len()));
     }
 
     /// Ends a part's chunk where it is large enough, and before it the chunks of what it rests on.
-    pub(crate) fn end_large(&mut self, part: Part) -> McapResult<()> {
+    pub fn end_large(&mut self, part: ChunkLane) -> McapResult<()> {
         match self.pending[part as usize].bytes.len() >= CHUNK_BYTES {
-            true if part == Part::Light => self.end_all(),
+            true if part == ChunkLane::Light => self.end_all(),
             true => self.end(part),
             false => Ok(()),
         }
     }
 
     /// Ends all chunks and hands them to the system.
-    pub(crate) fn end_all(&mut self) -> McapResult<()> {
-        for part in Part::ALL {
+    pub fn end_all(&mut self) -> McapResult<()> {
+        for part in ChunkLane::ALL {
             self.end(part)?;
         }
         self.mcap.flush()
     }
 
     /// Ends all chunks and waits until they are on the disk.
-    pub(crate) fn sync(&mut self) -> McapResult<()> {
+    pub fn sync(&mut self) -> McapResult<()> {
         self.end_all()?;
         Ok(self.file.sync_data()?)
     }
 
     /// Writes the summary and waits until the whole file is on the disk.
-    pub(crate) fn finish(&mut self) -> McapResult<()> {
+    pub fn finish(&mut self) -> McapResult<()> {
         self.end_all()?;
         self.mcap.finish()?;
         Ok(self.file.sync_all()?)
     }
 
-    fn end(&mut self, part: Part) -> McapResult<()> {
+    fn end(&mut self, part: ChunkLane) -> McapResult<()> {
         // Taken out, so that what could not be written is not written behind its own half.
         let mut pending = std::mem::take(&mut self.pending[part as usize]);
         for (header, range) in &pending.messages {
@@ -118,6 +113,27 @@ impl ChunkWriter {
         self.pending[part as usize] = pending;
         Ok(())
     }
+}
+
+/// A writer of a file that is given out while it grows.
+pub type StreamWriter<W> = Writer<NoSeek<W>>;
+
+/// Begins a file that is only appended to. Its chunks end at each flush.
+///
+/// # Errors
+/// Those of `out`.
+pub fn stream_writer<W: Write>(out: W) -> McapResult<StreamWriter<W>> {
+    write_options().disable_seeking(true).create(NoSeek::new(out))
+}
+
+fn write_options() -> WriteOptions {
+    WriteOptions::new()
+        .profile("")
+        .library(concat!("echolake ", env!("CARGO_PKG_VERSION")))
+        // Chunks end where their writer says.
+        .chunk_size(None)
+        // One thread: the same run gives the same bytes, and runs are recorded side by side.
+        .compression_threads(0)
 }
 
 impl Drop for ChunkWriter {

@@ -10,7 +10,7 @@ use bytes::Bytes;
 use object_store::path::Path;
 use object_store::{Error as StoreError, GetOptions, GetResultPayload, ObjectStore, ObjectStoreExt as _};
 
-use crate::run_reader::LARGE_RECORD;
+use crate::resync_reader::LARGE_RECORD;
 
 /// How much is fetched of a store at a time: a few chunks, as a request takes long.
 const FROM_STORE: u64 = 4 << 20;
