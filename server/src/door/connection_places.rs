@@ -1,6 +1,9 @@
-//! Places for connections: an address accepts no more than it has. If all are taken, a new connection takes the place of
-//! the one that has been waited for longest without a request or a login, so that who sends slowly locks nobody out.
+//! Places for connections: a listener accepts no more than it has. If all are taken, a new connection takes the place of the
+//! oldest one without a request or a login, of the address that has the most: whoever sends slowly, or opens many, locks
+//! nobody else out.
 
+use std::cmp::Reverse;
+use std::collections::HashMap;
 use std::io::{self, IoSlice};
 use std::net::IpAddr;
 use std::pin::Pin;
@@ -99,8 +102,13 @@ impl ConnectionPlaces {
     }
 }
 
+// Evicts the oldest idle connection of the address that has the most: a crowd pushes out its own.
 fn evict(all: &mut Vec<Arc<PlaceState>>, may: impl Fn(&Arc<PlaceState>) -> bool) -> bool {
-    let Some(oldest) = all.iter().position(|place| place.is_idle() && may(place)) else { return false };
+    let mut counts = HashMap::new();
+    all.iter().for_each(|place| *counts.entry(place.address).or_insert(0_usize) += 1);
+    let idle = all.iter().enumerate().filter(|(_, place)| place.is_idle() && may(place));
+    let oldest = idle.max_by_key(|(index, place)| (counts.get(&place.address), Reverse(*index)));
+    let Some((oldest, _)) = oldest else { return false };
     all.remove(oldest).evicted.notify_one();
     true
 }
@@ -223,6 +231,8 @@ impl AsyncWrite for PlacedStream {
 
 #[cfg(test)]
 mod tests {
+    use tokio::net::TcpSocket;
+
     use super::*;
 
     #[tokio::test]
@@ -246,5 +256,23 @@ mod tests {
         clients.push(TcpStream::connect(address).await.expect("connected"));
         let next = tokio::time::timeout(Duration::from_secs(60), places.next()).await.expect("a free place");
         assert_eq!(Some(next.state.address), clients[4].local_addr().ok().map(|a| a.ip()));
+    }
+
+    #[tokio::test]
+    async fn a_crowd_pushes_out_its_own() {
+        let listener = TcpListener::bind("127.0.0.1:0").await.expect("a free port");
+        let address = listener.local_addr().expect("its address");
+        let places = ConnectionPlaces::new(listener, 3);
+        let mut clients = Vec::new();
+        let mut taken = Vec::new();
+        for source in ["127.0.0.2:0", "127.0.0.3:0", "127.0.0.3:0", "127.0.0.3:0"] {
+            let socket = TcpSocket::new_v4().expect("a socket");
+            socket.bind(source.parse().expect("an address")).expect("bound");
+            clients.push(socket.connect(address).await.expect("connected"));
+            taken.push(places.next().await);
+        }
+        tokio::time::timeout(Duration::from_secs(60), taken[1].evicted()).await.expect("it must leave its place");
+        let stays = tokio::time::timeout(Duration::from_millis(50), taken[0].evicted()).await;
+        assert!(stays.is_err(), "the only one of its address stays, though it is the oldest");
     }
 }
