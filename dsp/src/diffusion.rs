@@ -1,4 +1,4 @@
-//! How evenly a surface spreads sound over receivers.
+//! Diffusion coefficient of a surface: evenness of the levels at its receivers.
 
 /// Sums that the directional diffusion coefficient needs, kept relative to the loudest so that no level overflows.
 ///

@@ -62,7 +62,7 @@ pub fn tnce<T: Real>(curves: &[T], len: usize, out: &mut [f64]) -> f64 {
     total
 }
 
-/// Energy of each band over Flat's of the same band. Where Flat has none, the value is not finite.
+/// Energy of each band over Flat's of the same band. If Flat has none, the value is not finite.
 ///
 /// energies, flat_energies, out  `[bands]`
 pub fn tnce_over_band(energies: &[f64], flat_energies: &[f64], out: &mut [f64]) {

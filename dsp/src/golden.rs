@@ -31,7 +31,7 @@ struct Golden {
 }
 
 fn golden() -> Golden {
-    // Tests run in their package's folder. A path fixed at compile time would be that of another checkout where both
+    // Tests run in their package's folder. A path fixed at compile time would be that of another checkout if both
     // share a target folder.
     let path = "../tests/fixtures/golden.parquet";
     let bytes = Bytes::from(std::fs::read(path).expect("the fixture is committed"));

@@ -149,7 +149,7 @@ fn dot<T: Real>(x: &[T; TAPS], taps: &[T; TAPS]) -> T {
     (sums[0] + sums[1]) + (sums[2] + sums[3])
 }
 
-/// The first samples, with zeros where there are fewer.
+/// The first samples, with zeros if there are fewer.
 pub fn crop<T: Real>(from: &[T], to: &mut [T]) {
     let kept = from.len().min(to.len());
     to[..kept].copy_from_slice(&from[..kept]);
