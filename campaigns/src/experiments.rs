@@ -32,11 +32,11 @@ const SPEED_M_S: f64 = 343.0;
 /// Levels of the five bands and of their total.
 const COLUMNS: usize = CENTRES_HZ.len() + 1;
 
-/// What can be set beside it (Rust et al. 2021).
+/// Published results for comparison (Rust et al. 2021).
 const PAPER: &str = "The paper's tables give totals of -0.4, -2.3 and +1.6 dB over Flat for its measured 0015_1, 0013_1 \
     and 0005_1.\nTheir parameters are not known here: what can be compared is which bands change, not by how much.";
 
-/// What is compared; the first panel is what the others are compared with.
+/// Panels that are compared with the first of them.
 struct Experiment {
     title: &'static str,
     claim: &'static str,
@@ -137,7 +137,7 @@ struct Lab {
     points_mm: Vec<[f64; 3]>,
     pairs: Vec<[usize; 2]>,
     direct: KirchhoffPlan,
-    /// What each bin adds to each band's energy.
+    /// Weight of each bin in each band's energy.
     weights: Vec<[f64; COLUMNS]>,
 }
 
@@ -190,7 +190,7 @@ impl Lab {
     }
 }
 
-// The squared gains of the bank where the sweep has sound; their sum for the total.
+// The squared gains of the bank within the sweep's range; their sum for the total.
 fn weights(bin: usize) -> [f64; COLUMNS] {
     let frequency_hz = bin as f64 * RATE_HZ / SAMPLES as f64;
     let mut weights = [0.0; COLUMNS];

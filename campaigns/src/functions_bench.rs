@@ -1,4 +1,4 @@
-//! What the list functions cost through SQL's machinery against a plain loop over the same samples, side by side in one
+//! Cost of the list functions through SQL's machinery against a plain loop over the same samples, side by side in one
 //! run.
 
 use std::hint::black_box;

@@ -68,7 +68,7 @@ impl<'a> AttackTrial<'a> {
         let attacker = self.attacker.clone();
         let (done, outcome) = channel();
         let attack = std::thread::spawn(move || {
-            // Nobody listens any more after the limit; the outcome is returned, too.
+            // After the limit there is no receiver any more; the outcome is returned, too.
             let outcomes = case.run(&attacker);
             let _ = done.send(());
             outcomes

@@ -34,7 +34,7 @@ pub(crate) struct Runs {
     pub(crate) panels: Counts,
 }
 
-/// How much is in some runs.
+/// Attempts, accepted measurements and bytes of some runs.
 #[derive(Debug, Clone, Copy, Default)]
 pub(crate) struct Counts {
     pub(crate) attempts: u64,

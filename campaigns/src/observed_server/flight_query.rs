@@ -31,7 +31,7 @@ pub(super) fn query(client: &QueryClient, sql: &str) -> QueryOutcome {
 /// Connects with the client's token.
 ///
 /// # Errors
-/// Nobody accepts the connection.
+/// The connection is not accepted.
 pub(crate) async fn flight_client(client: &QueryClient) -> Result<FlightClient, tonic::transport::Error> {
     let endpoint = Endpoint::from_shared(format!("http://{}", client.addresses.flight_sql))?;
     let channel = endpoint.local_address(Some(client.connections.source().into())).connect().await?;

@@ -12,7 +12,7 @@ const LARGEST_PROBLEM: u64 = 64 << 10;
 /// Bytes of an answer's head.
 const LARGEST_HEAD: u64 = 64 << 10;
 
-/// What an answer's head says.
+/// Parsed head of an answer.
 struct AnswerHead {
     status: u16,
     /// None if it comes in chunks.

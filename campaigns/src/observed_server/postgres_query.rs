@@ -11,7 +11,7 @@ use super::{QueryClient, QueryOutcome};
 const LARGEST_MESSAGE: u64 = 1 << 20;
 /// Protocol 3.0.
 const PROTOCOL_VERSION: i32 = 196_608;
-/// What a CancelRequest has in place of a version.
+/// Code of a CancelRequest, in place of a version.
 const CANCEL_CODE: i32 = 80_877_102;
 
 /// A session.
@@ -30,7 +30,7 @@ impl io::Read for StreamReader {
     }
 }
 
-/// How a session begins.
+/// First message of a session.
 pub(crate) fn startup_message() -> Vec<u8> {
     let body = [&PROTOCOL_VERSION.to_be_bytes()[..], b"user\0me\0database\0datafusion\0\0"].concat();
     [&message_length(&body)[..], &body].concat()

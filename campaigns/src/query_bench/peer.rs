@@ -9,7 +9,7 @@ use serde_json::{Value, json};
 
 use super::digest::Digest;
 
-/// Where the script stands.
+/// Path of the script.
 const SCRIPT: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../tests/clients/duckdb_peer.py");
 
 /// A running DuckDB.
