@@ -272,7 +272,7 @@ fn idle_outcome(server: &ObservedServer, is_running: bool) -> IdleOutcome {
     }
 }
 
-// What comes of the query is not looked at.
+// The query's own outcome is ignored.
 fn end_outside(
     server: &ObservedServer,
     client: &QueryClient,

@@ -25,7 +25,7 @@ const RATE_HZ: f64 = 96e3;
 const SAMPLES: usize = 384;
 const SWEEP_HZ: [f64; 2] = [2e3, 40e3];
 const CENTRES_HZ: [f64; 5] = [2.5e3, 5e3, 10e3, 20e3, 40e3];
-/// The response is computed longer than it is looked at, so that its end does not ring into it.
+/// The response is computed longer than it is evaluated, so that its end does not ring into it.
 const COMPUTED: usize = 1024;
 const SPEED_M_S: f64 = 343.0;
 

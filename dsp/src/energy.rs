@@ -103,7 +103,7 @@ pub(crate) fn accumulate<T: Real>(band: &[T], factor: f64, curve: &mut [T]) -> f
 mod tests {
     use super::*;
 
-    // Two bands of three samples with squares that are exact: every number below follows by hand.
+    // Two bands of three samples with squares that are exact: every number below can be checked on paper.
     const BANDS: [f64; 6] = [1.0, 2.0, 2.0, 0.0, -1.0, 3.0];
 
     #[test]

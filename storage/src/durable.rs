@@ -67,8 +67,8 @@ impl ObjectStore for DurableFileSystem {
         self.inner.get_opts(location, options).await
     }
 
-    // All of them with the file open once, and nothing between them; the trait's own would ask for each by itself and
-    // read what lies between two that are near.
+    // Reads all ranges with the file open once, and nothing between them; the trait's default would request each by
+    // itself and read the bytes between near ones.
     async fn get_ranges(&self, location: &Path, ranges: &[Range<u64>]) -> Result<Vec<Bytes>> {
         self.inner.get_ranges(location, ranges).await
     }

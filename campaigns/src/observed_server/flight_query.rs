@@ -17,7 +17,7 @@ const LARGEST_MESSAGE: usize = 2 << 30;
 /// A client of Flight SQL.
 pub(crate) type FlightClient = FlightSqlServiceClient<Channel>;
 
-/// Asks a query; rows are compared as CSV, which does not depend on how they are cut into batches.
+/// Runs a query; rows are compared as CSV, which does not depend on how they are cut into batches.
 pub(super) fn query(client: &QueryClient, sql: &str) -> QueryOutcome {
     let mut digest = AnswerDigest::default();
     let answer = client.connections.run(fetch_rows(client, sql, &mut digest));

@@ -19,7 +19,7 @@ struct AnswerHead {
     length: Option<u64>,
 }
 
-/// Asks a query; the answer is CSV.
+/// Runs a query; the answer is CSV.
 pub(super) fn query(client: &QueryClient, sql: &str) -> QueryOutcome {
     let request = Request::post("/api/v1/sql?format=csv", sql).with("content-type", "text/plain");
     send_request(client, request)

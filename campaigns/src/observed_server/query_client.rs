@@ -7,7 +7,7 @@ use std::sync::Arc;
 
 use super::{ClientConnections, ServerAddresses, flight_query, http_query, postgres_query};
 
-/// A way to ask in SQL.
+/// A protocol for queries in SQL.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, clap::ValueEnum)]
 pub(crate) enum QueryProtocol {
     Http,
@@ -111,7 +111,7 @@ impl QueryClient {
         self
     }
 
-    /// Asks a query and reads its answer to the end.
+    /// Runs a query and reads its answer to the end.
     pub(crate) fn query(&self, protocol: QueryProtocol, sql: &str) -> QueryOutcome {
         let outcome = match protocol {
             QueryProtocol::Http => http_query::query(self, sql),

@@ -1,4 +1,4 @@
-//! The peer: DuckDB in a Python process, asked over its pipes.
+//! The peer: DuckDB in a Python process, queried over its pipes.
 
 use std::io::{BufRead as _, BufReader, Write as _};
 use std::path::Path;

@@ -110,7 +110,7 @@ pub fn encode(table: Table, schema: &SchemaRef, batches: &[RecordBatch]) -> Resu
 // Samples do not repeat, so a dictionary only costs; their bytes by significance compress best
 // (measured on dB spectra: 0.74 of raw f32 against 1.00 with the defaults).
 //
-// Numbers that stand alone and do not repeat (zstd makes them an eighth smaller) are not compressed: a reader makes a
+// Single numbers that do not repeat (zstd makes them an eighth smaller) are not compressed: a reader makes a
 // decompressor for each column of each file, which takes longer than reading three thousand of them.
 fn properties(table: Table, schema: &SchemaRef, first: &RecordBatch) -> WriterProperties {
     let (rows, bytes) = (first.num_rows(), first.get_array_memory_size());

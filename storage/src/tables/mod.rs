@@ -111,7 +111,7 @@ impl Lake {
         let mut outcomes = vec![Committed::Before; staged.len()];
         let (pointers, others): (Vec<_>, Vec<_>) = Table::ALL.into_iter().partition(|table| *table == Table::Runs);
         for tables in [others, pointers] {
-            // Each is brought to its end, whatever becomes of the others.
+            // Each runs to its end, even if another fails.
             for done in join_all(tables.into_iter().map(|table| self.commit_table(table, staged))).await {
                 done?.into_iter().for_each(|(i, outcome)| outcomes[i] = outcome);
             }
@@ -119,7 +119,7 @@ impl Lake {
         Ok(outcomes)
     }
 
-    // What became of the files of one table, each with its place among all.
+    // Returns the outcome of each file of one table, with its index among all.
     async fn commit_table(&self, table: Table, staged: &[Staged]) -> Result<Vec<(usize, Committed)>> {
         let of: Vec<_> = (0..staged.len()).filter(|i| staged[*i].table == table).collect();
         if of.is_empty() {
@@ -142,8 +142,8 @@ impl Lake {
         Ok(self.commit(&[staged]).await?[0])
     }
 
-    /// Takes out of the logs what no run's row names any more; merged files are written anew without it. The files
-    /// stay for readers that hold older views.
+    /// Removes from the logs all files that no run's row names any more; merged files are rewritten without such rows.
+    /// The files themselves stay for readers that hold older views.
     ///
     /// # Errors
     /// What the store says.

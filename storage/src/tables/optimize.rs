@@ -1,8 +1,8 @@
 //! Merges small files of a table into large ones. Neither the rows that readers see nor their storage format changes.
 //!
 //! A merged file's Add lists its parts, (surface, run, derivation) each with its number of rows; a snapshot decides
-//! over every part as it would over a file of its own. `runs` and `surfaces` stay a file a run: ingest reads them by
-//! name and by their statistics, and all of them together are small.
+//! over every part as it would over a file of its own. `runs` and `surfaces` keep one file per run: ingest reads them
+//! by name and by their statistics, and all of them together are small.
 
 use std::sync::atomic::{AtomicBool, Ordering};
 

@@ -60,8 +60,8 @@ enum Place {
 }
 
 impl Lake {
-    /// Deletes, under the maintenance lease, files of tables that went out of their table longer ago than `keep`,
-    /// and what crashes left behind. `runs/` is not looked at.
+    /// Deletes, under the maintenance lease, files that left their table longer ago than `keep`, and temporary and
+    /// uncommitted files that crashes left behind. Files in `runs/` are not touched.
     ///
     /// # Errors
     /// [`Error::Maintained`] if another process holds the lease, [`Error::LeaseLost`], [`Error::Log`] if a log is
@@ -155,7 +155,7 @@ fn is_left_over(history: &History, path: &Path, is_over: impl Fn(Option<DateTime
         && is_over(history.removed.get(name).copied())
 }
 
-// A file that is younger than its removal was written anew, for a commit that is still to come.
+// A file that was modified after its removal was rewritten, for a commit that is still pending.
 fn is_over(modified: DateTime<Utc>, gone: Option<DateTime<Utc>>, now: DateTime<Utc>, keep: TimeDelta) -> bool {
     match gone {
         Some(gone) if gone >= modified => now - gone >= keep,

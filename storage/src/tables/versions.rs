@@ -19,7 +19,7 @@ use crate::{Error, Lake, Result, Snapshot};
 const COMMIT_HEAD: u64 = 4096;
 /// Formats of times beside RFC 3339.
 const TIMES: [&str; 4] = ["%Y-%m-%dT%H:%M:%S%.f", "%Y-%m-%d %H:%M:%S%.f", "%Y-%m-%dT%H:%M", "%Y-%m-%d %H:%M"];
-/// Commits that are looked at together.
+/// Commits that are read concurrently.
 const TOGETHER: usize = 16;
 
 /// One version of a table, and when it was committed.

@@ -198,7 +198,7 @@ impl Damaged {
         self.pieces.len()
     }
 
-    // Flips bytes of messages in one chunk, and makes its record anew.
+    // Flips bytes of messages in one chunk, and rebuilds its record.
     fn seal(&mut self, specimen: &Specimen, rng: &mut impl Rng) -> Result<()> {
         let range = specimen.chunks.choose(rng).context("there are chunks")?.range.clone();
         let body = &specimen.bytes[range.start + FRAME..range.end];
