@@ -13,14 +13,14 @@ use super::percentile::{millis, percentile};
 const IDLE_GOAL: Duration = Duration::from_millis(500);
 /// A server that works for longer is replaced.
 const IDLE_LIMIT: Duration = Duration::from_secs(15);
-/// How long a query runs before it is ended: longer than it takes to be parsed.
+/// Time for which a query runs before it is ended: longer than parsing takes.
 const RUN_TIME: Duration = Duration::from_millis(1000);
-/// The last part of it, in which the server is looked at: it must work then, or the query has ended by itself.
+/// The last part of it, in which the server is observed: it must work then, or the query has ended by itself.
 const LOOK_TIME: Duration = Duration::from_millis(200);
 /// Processor time of a server that works, in that part; a busy machine leaves it a tenth.
 const WORK_TIME: Duration = Duration::from_millis(20);
 
-/// Whose queries run into no limit, and whose end after a second.
+/// Clients whose queries run into no limit, and clients whose queries end after a second.
 const CLIENTS: [ClientGroup; 2] = [
     ClientGroup { name: "light", count: 16, limits: "seconds = 60\nmemory_mb = 1000\nconcurrent = 4\n" },
     ClientGroup { name: "limited", count: 16, limits: "seconds = 1\nmemory_mb = 1000\nconcurrent = 4\n" },
@@ -104,7 +104,7 @@ pub(crate) const QUERY_ENDS: [QueryEnd; 8] = [
 
 #[derive(Debug, clap::Args)]
 pub(crate) struct CancelArgs {
-    /// How often each query is ended in each way.
+    /// Times that each query is ended in each way.
     #[arg(default_value_t = 10)]
     rounds: usize,
     /// Only rows with this text in `QUERY END`.
@@ -112,7 +112,7 @@ pub(crate) struct CancelArgs {
     only: Option<String>,
 }
 
-/// What came of ending a query.
+/// Outcome of ending a query.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum IdleOutcome {
     /// It had ended by itself, or never begun: nothing is measured.
@@ -129,9 +129,9 @@ pub(crate) struct CancelRow {
     pub(crate) title: String,
     /// From the end until the server was idle.
     times: Vec<Duration>,
-    /// How often the query was not running when it should have been ended.
+    /// Number of times that the query was not running when it should have been ended.
     ended_before: usize,
-    /// How often the server worked on at the limit, or died.
+    /// Number of times that the server still worked at the limit, or died.
     pub(crate) failures: usize,
 }
 
@@ -272,7 +272,7 @@ fn idle_outcome(server: &ObservedServer, is_running: bool) -> IdleOutcome {
     }
 }
 
-// What comes of the query is not looked at.
+// The query's own outcome is ignored.
 fn end_outside(
     server: &ObservedServer,
     client: &QueryClient,

@@ -31,12 +31,12 @@ const QUERIES: [&str; 3] = [
 ];
 /// Between two kills, at most.
 const LONGEST_PAUSE: Duration = Duration::from_millis(500);
-/// How long to wait for an engine that can be killed.
+/// Longest wait for an engine that can be killed.
 const ENGINE_LIMIT: Duration = Duration::from_secs(30);
 
 #[derive(Debug, clap::Args)]
 pub(crate) struct EngineKillsArgs {
-    /// How many engines are killed.
+    /// Number of engines that are killed.
     #[arg(default_value_t = 500)]
     kills: usize,
     /// Seed of the moments and of who is killed.
@@ -44,7 +44,7 @@ pub(crate) struct EngineKillsArgs {
     seed: u64,
 }
 
-/// What the readers got.
+/// Answers and errors that the readers got.
 #[derive(Debug, Default)]
 pub(crate) struct KillReport {
     kills: usize,

@@ -25,18 +25,18 @@ const RATE_HZ: f64 = 96e3;
 const SAMPLES: usize = 384;
 const SWEEP_HZ: [f64; 2] = [2e3, 40e3];
 const CENTRES_HZ: [f64; 5] = [2.5e3, 5e3, 10e3, 20e3, 40e3];
-/// The response is computed longer than it is looked at, so that its end does not ring into it.
+/// The response is computed longer than it is evaluated, so that its end does not ring into it.
 const COMPUTED: usize = 1024;
 const SPEED_M_S: f64 = 343.0;
 
 /// Levels of the five bands and of their total.
 const COLUMNS: usize = CENTRES_HZ.len() + 1;
 
-/// What can be set beside it (Rust et al. 2021).
+/// Published results for comparison (Rust et al. 2021).
 const PAPER: &str = "The paper's tables give totals of -0.4, -2.3 and +1.6 dB over Flat for its measured 0015_1, 0013_1 \
     and 0005_1.\nTheir parameters are not known here: what can be compared is which bands change, not by how much.";
 
-/// What is compared; the first panel is what the others are compared with.
+/// Panels that are compared with the first of them.
 struct Experiment {
     title: &'static str,
     claim: &'static str,
@@ -137,7 +137,7 @@ struct Lab {
     points_mm: Vec<[f64; 3]>,
     pairs: Vec<[usize; 2]>,
     direct: KirchhoffPlan,
-    /// What each bin adds to each band's energy.
+    /// Weight of each bin in each band's energy.
     weights: Vec<[f64; COLUMNS]>,
 }
 
@@ -190,7 +190,7 @@ impl Lab {
     }
 }
 
-// The squared gains of the bank where the sweep has sound; their sum for the total.
+// The squared gains of the bank within the sweep's range; their sum for the total.
 fn weights(bin: usize) -> [f64; COLUMNS] {
     let frequency_hz = bin as f64 * RATE_HZ / SAMPLES as f64;
     let mut weights = [0.0; COLUMNS];

@@ -1,4 +1,4 @@
-//! What the list functions cost through SQL's machinery against a plain loop over the same samples, side by side in one
+//! Cost of the list functions through SQL's machinery against a plain loop over the same samples, side by side in one
 //! run.
 
 use std::hint::black_box;
@@ -31,7 +31,7 @@ const CENTRES_HZ: [f64; 5] = [2_500.0, 5_000.0, 10_000.0, 20_000.0, 40_000.0];
 /// Rounds in which function and loop take turns; the best of each counts.
 const ROUNDS: usize = 15;
 
-/// The functions, and what they are asked.
+/// The functions, and their input.
 struct Bench {
     functions: Functions,
     samples: Vec<f32>,

@@ -13,10 +13,10 @@ const TELL_EVERY: Duration = Duration::from_secs(30);
 
 #[derive(Debug, clap::Args)]
 pub(crate) struct FuzzArgs {
-    /// What is changed: sql, wire or mcap.
+    /// Kind of input that is changed: sql, wire or mcap.
     #[arg(value_parser = parse_target)]
     target: Target,
-    /// How long it goes on.
+    /// Duration in seconds.
     #[arg(default_value_t = 60)]
     seconds: u64,
     /// Seed of the changes.

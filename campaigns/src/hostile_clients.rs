@@ -29,7 +29,7 @@ const ATTACKERS: ClientGroup = ClientGroup {
 /// Clients that work.
 const WORKERS: ClientGroup =
     ClientGroup { name: "light", count: 15, limits: "seconds = 60\nmemory_mb = 400\nconcurrent = 4\n" };
-/// What the workers ask: light queries, and some of tenths of a second. Their rows have an order.
+/// Queries of the workers: light ones, and some of tenths of a second. Their rows have an order.
 const QUERIES: [&str; 8] = [
     "select count(*) as n from runs",
     "select surface_id, count(*) as n from measurements group by surface_id order by 1",
@@ -42,33 +42,33 @@ const QUERIES: [&str; 8] = [
 ];
 /// Between two queries of a worker, at most.
 const LONGEST_PAUSE: Duration = Duration::from_secs(2);
-/// How long an attack goes on.
+/// Duration of an attack.
 const ATTACK_LIMIT: Duration = Duration::from_secs(15);
 /// A query that takes longer is lost.
 const QUERY_LIMIT: Duration = Duration::from_secs(60);
-/// How many times as long a query may take under attack: p99.
+/// Largest ratio of a query's time under attack to its time without: p99.
 const SLOWDOWN_GOAL: f64 = 3.0;
 
 #[derive(Debug, clap::Args)]
 pub(crate) struct HostileClientsArgs {
-    /// How long they attack.
+    /// Duration of the attacks, in seconds.
     #[arg(long, value_name = "SECS", default_value_t = 3600)]
     seconds: u64,
-    /// How long the server is quiet before.
+    /// Duration for which the server is quiet before, in seconds.
     #[arg(long, value_name = "SECS", default_value_t = 60)]
     quiet_seconds: u64,
-    /// Seed of who asks what when.
+    /// Seed of the clients' queries and their times.
     #[arg(long, default_value_t = 1)]
     seed: u64,
 }
 
-/// What the workers got.
+/// Answers and errors that the workers got.
 #[derive(Debug, Default)]
 pub(crate) struct WorkerReport {
     /// Times of right answers.
     pub(crate) times: Vec<Duration>,
     pub(crate) wrong_answers: usize,
-    /// How often what came in place of an answer.
+    /// Number of each kind of error that came in place of an answer.
     pub(crate) errors: BTreeMap<String, usize>,
 }
 
@@ -132,7 +132,7 @@ fn print_report(report: &HostileReport) {
     println!("attacks: {:?}", report.attacks);
 }
 
-// Restarts the server if it dies. Returns what workers got and how attacks ended; without attacks nobody attacks.
+// Restarts the server if it dies. Returns what workers got and how attacks ended; without attacks, only workers run.
 fn run_phase(
     server: &mut ObservedServer,
     right: &RightAnswers,

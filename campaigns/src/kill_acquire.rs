@@ -15,7 +15,7 @@ pub(crate) struct KillAcquireArgs {
     /// Seed of the moments.
     #[arg(default_value_t = 1)]
     seed: u64,
-    /// What is cut off.
+    /// Part that is killed.
     #[arg(value_enum, default_value_t = KilledPart::Process)]
     part: KilledPart,
 }

@@ -17,7 +17,7 @@ pub(crate) struct KillIngestArgs {
     /// Seed of the moments.
     #[arg(default_value_t = 1)]
     seed: u64,
-    /// How ingest is disturbed.
+    /// Kind of disturbance of ingest.
     #[arg(value_enum, default_value_t = Disturbance::Kills)]
     disturbance: Disturbance,
 }

@@ -1,4 +1,4 @@
-//! Scans topics of runs with `mcap()` and with Python's `mcap`, side by side, and tells how many bytes each topic took.
+//! Scans topics of runs with `mcap()` and with Python's `mcap`, side by side, and prints the bytes of each topic.
 //!
 //! The Python of `--python` needs the packages `mcap` and `mcap-protobuf-support`.
 

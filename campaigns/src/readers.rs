@@ -1,4 +1,4 @@
-//! Many readers of a served catalogue at once: errors, times, and what the server weighs.
+//! Many readers of a served catalogue at once: errors, times, and the server's memory.
 //!
 //! Nothing of it comes out of a browser's cache; what the server keeps, it keeps.
 #![allow(clippy::print_stdout, reason = "its figures are what it is for")]
@@ -14,10 +14,10 @@ use serde_json::Value;
 
 use super::memory::resident_mib;
 
-/// What a reader asks.
+/// Kind of requests that a reader sends.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
 enum QuestionKind {
-    /// What pages ask.
+    /// All requests that pages send.
     All,
     /// A new combination of filters each time.
     Facets,
@@ -27,15 +27,15 @@ enum QuestionKind {
 
 #[derive(Debug, Clone, clap::Args)]
 pub(crate) struct ReadersArgs {
-    /// Where the catalogue is served, as 127.0.0.1:8080.
+    /// Address of the served catalogue, as 127.0.0.1:8080.
     address: String,
     /// Readers at once.
     #[arg(long, value_name = "N", default_value_t = 200)]
     readers: u64,
-    /// How long they read.
+    /// Duration of reading, in seconds.
     #[arg(long, value_name = "SECS", default_value_t = 60)]
     seconds: u64,
-    /// What they ask.
+    /// Kind of requests that they send.
     #[arg(long = "ask", value_name = "KIND", value_enum, default_value_t = QuestionKind::All)]
     kind: QuestionKind,
     /// The server's process, whose memory is watched then.
@@ -82,7 +82,7 @@ impl Connection {
     }
 }
 
-/// What there is to ask about.
+/// Surfaces, facets, runs and pairs that requests name.
 struct Lake {
     surfaces: Vec<String>,
     facets: Vec<(String, String)>,
@@ -124,7 +124,7 @@ impl Lake {
         match (kind, chance.below(10)) {
             (QuestionKind::Facets, _) => {
                 let (name, value) = &self.facets[chance.below(self.facets.len() as u64) as usize];
-                // A different offset makes an address that nobody asked for yet.
+                // A different offset makes an address that was not requested before.
                 format!("/api/v1/surfaces?{name}={value}&sort=level&offset={}", chance.below(100_000))
             }
             (QuestionKind::Ir, _) => format!("/api/v1/surfaces/{surface}/pairs/{pair}/ir.wav?signal=measured"),

@@ -13,12 +13,12 @@ use anyhow::{Result, anyhow, bail};
 
 use super::memory::resident_mib;
 
-/// Topics that tell where everything stood.
+/// Topics with the poses of microphone and speaker, and the frames.
 const POSES: &str = "&topics=/microphone/pose,/speaker/pose,/tf";
 
 #[derive(Debug, Clone, clap::Args)]
 pub(crate) struct SlicesArgs {
-    /// Where the catalogue is served, as 127.0.0.1:8080.
+    /// Address of the served catalogue, as 127.0.0.1:8080.
     address: String,
     /// The run that is sliced.
     run: String,
@@ -33,14 +33,14 @@ pub(crate) struct SlicesArgs {
     pid: Option<u32>,
 }
 
-/// What reading a slice took.
+/// Bytes and times of reading a slice.
 struct Took {
     bytes: u64,
     first: Duration,
     all: Duration,
 }
 
-/// Reads a slice to its end; it is an error where that does not come.
+/// Reads a slice to its end; it is an error if the end does not come.
 fn read(address: &str, path: &str) -> Result<Took> {
     let begun = Instant::now();
     let mut stream = TcpStream::connect(address)?;

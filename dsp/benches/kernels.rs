@@ -1,4 +1,4 @@
-//! What the chain costs against the transforms it cannot do without, side by side in one run:
+//! Cost of the chain against the transforms it cannot do without, side by side in one run:
 //! `cargo bench -p echolake-dsp`.
 
 use std::hint::black_box;

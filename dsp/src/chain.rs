@@ -8,7 +8,7 @@ use crate::foam::subtract;
 use crate::temperature::{TemperatureCorrection, resampling_ratio};
 use crate::{Error, Real};
 
-/// Coldest and warmest air that a plan is made for, C: as far as a temperature is taken at all.
+/// Coldest and warmest air that a plan is made for, C: the range of all temperatures that are accepted.
 const TEMPERATURES: [f64; 2] = [-60.0, 80.0];
 
 /// Settings of a [`MeasurementPlan`].
@@ -69,7 +69,7 @@ impl<T: Real> MeasurementPlan<T> {
         })
     }
 
-    /// Buffers for [`Self::ir`]; one a thread.
+    /// Buffers for [`Self::ir`]; one per thread.
     pub fn scratch(&self) -> MeasurementScratch<T> {
         let raw = vec![T::default(); self.deconvolution.output_len()];
         MeasurementScratch { deconvolution: self.deconvolution.scratch(), raw }
@@ -111,7 +111,7 @@ fn check_celsius(what: &'static str, celsius: f64) -> Result<(), Error> {
     Err(Error::Setting { what, actual: celsius.to_string(), expected: "-60 to 80" })
 }
 
-/// What is derived of one response.
+/// Results that are derived from one response.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Derived<T> {
     /// `[len]`: the response without the direct sound.
@@ -120,7 +120,7 @@ pub struct Derived<T> {
     pub curves: Vec<T>,
     /// `[bands]`: energy.
     pub energies: Vec<f64>,
-    /// `[bands]`: TNCE, over Flat's total energy; NaN or infinite where Flat has none.
+    /// `[bands]`: TNCE, over Flat's total energy; NaN or infinite if Flat has none.
     pub tnce: Vec<f64>,
     /// The sum of `tnce`.
     pub total: f64,
@@ -128,7 +128,7 @@ pub struct Derived<T> {
     pub tnce_over_band: Vec<f64>,
 }
 
-/// What Flat's response of a pair lends to all responses of that pair.
+/// Energies of Flat's response of a pair, which normalise all responses of that pair.
 #[derive(Debug, Clone, PartialEq)]
 pub struct FlatEnergies {
     /// Energy of the whole response.
@@ -158,7 +158,7 @@ impl<T: Real> DerivationPlan<T> {
         Ok(Self { bank: FilterBankPlan::new(len, rate_hz, centres_hz)? })
     }
 
-    /// Buffers for [`Self::run`]; one a thread.
+    /// Buffers for [`Self::run`]; one per thread.
     pub fn scratch(&self) -> DerivationScratch<T> {
         let (bands, len) = (self.bank.bands(), self.bank.len());
         DerivationScratch {
@@ -181,8 +181,8 @@ impl<T: Real> DerivationPlan<T> {
         }
     }
 
-    /// What [`Self::run_over`] needs of a pair's Flat, Foam subtracted already: once a pair, as every response of
-    /// that pair is put over the same.
+    /// Computes the energies that [`Self::run_over`] needs of a pair's Flat, Foam subtracted already: once per pair,
+    /// because every response of that pair is normalised by the same.
     ///
     /// # Errors
     /// [`Error::Length`] or [`Error::NotFinite`].

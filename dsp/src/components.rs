@@ -7,7 +7,7 @@ use crate::error::check_len;
 /// to be computed many at a time.
 const BLOCK: usize = 64;
 const LANES: usize = 8;
-/// Steps of the power iteration, where it does not settle earlier.
+/// Steps of the power iteration, if it does not converge earlier.
 const STEPS: usize = 500;
 /// Change of a component's direction that counts as none.
 const SETTLED: f64 = 1e-10;
@@ -32,7 +32,7 @@ impl Components {
     /// rows  `[rows][features]`
     ///
     /// # Errors
-    /// [`Error::Length`] where the rows are not equally long.
+    /// [`Error::Length`] if the rows are not equally long.
     pub fn of(rows: &mut [Vec<f32>], count: usize) -> Result<Self, Error> {
         let length = rows.first().map_or(0, Vec::len);
         for row in rows.iter() {
@@ -63,26 +63,26 @@ impl Components {
         self.features
     }
 
-    /// Share of the variance by component; 0 where nothing varies.
+    /// Share of the variance by component; 0 if nothing varies.
     pub fn explained(&self) -> Vec<f64> {
         let all: f64 = (0..self.rows).map(|i| self.gram[i * self.rows + i]).sum();
         self.values.iter().map(|value| if all > 0.0 { value / all } else { 0.0 }).collect()
     }
 
-    /// Where a row is along the components.
+    /// Coordinates of a row along the components.
     ///
     /// # Panics
-    /// Where there is no such row.
+    /// If there is no such row.
     pub fn position(&self, row: usize) -> Vec<f64> {
         let scale = (self.features.max(1) as f64).sqrt();
         let along = |(value, vector): (&f64, &Vec<f64>)| vector[row] * value.max(0.0).sqrt() / scale;
         self.values.iter().zip(&self.vectors).map(along).collect()
     }
 
-    /// How far two rows are apart.
+    /// Distance of two rows, root mean square over the features.
     ///
     /// # Panics
-    /// Where there are no such rows.
+    /// If there are no such rows.
     pub fn distance(&self, one: usize, other: usize) -> f64 {
         let at = |i: usize, j: usize| self.gram[i * self.rows + j];
         let square = at(one, one) + at(other, other) - 2.0 * at(one, other);

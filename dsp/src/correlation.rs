@@ -1,4 +1,4 @@
-//! How alike two signals are.
+//! Similarity of two signals.
 
 use std::sync::Arc;
 
@@ -9,13 +9,13 @@ use crate::energy::energy;
 use crate::error::check_len;
 use crate::{Error, Real};
 
-/// Pearson's coefficient of correlation, -1 to 1. None where one does not vary, where there are fewer than two values,
-/// or where one is not finite.
+/// Pearson's coefficient of correlation, -1 to 1. None if one does not vary, if there are fewer than two values, or if
+/// one is not finite.
 ///
 /// x, y  `[n]`
 ///
 /// # Errors
-/// [`Error::Length`] where they are not equally long.
+/// [`Error::Length`] if they are not equally long.
 pub fn pearson<T: Real>(x: &[T], y: &[T]) -> Result<Option<f64>, Error> {
     check_len("the second signal", y.len(), x.len())?;
     let count = x.len() as f64;
@@ -65,7 +65,7 @@ impl<T: Real> CorrelationPlan<T> {
         Ok(Self { len, forward: T::plan_real_forward(padded), inverse: T::plan_real_inverse(padded) })
     }
 
-    /// Buffers for [`Self::similarity`]; one a thread.
+    /// Buffers for [`Self::similarity`]; one per thread.
     pub fn scratch(&self) -> CorrelationScratch<T> {
         let work = self.forward.get_scratch_len().max(self.inverse.get_scratch_len());
         CorrelationScratch {
@@ -75,8 +75,8 @@ impl<T: Real> CorrelationPlan<T> {
         }
     }
 
-    /// max over m of sum_n x\[n\] y\[n + m\], over the root of both energies: 1 where one is the other, later or
-    /// louder; at least 0 but for signals of a single sample. None where one has no energy.
+    /// max over m of sum_n x\[n\] y\[n + m\], over the root of both energies: 1 if one is the other, later or
+    /// louder; at least 0 but for signals of a single sample. None if one has no energy.
     ///
     /// # Errors
     /// [`Error::Length`] or [`Error::NotFinite`].
@@ -102,7 +102,7 @@ impl<T: Real> CorrelationPlan<T> {
         Ok(Some((greatest / signal.len() as f64).clamp(-1.0, 1.0)))
     }
 
-    // What brings a signal to an energy of 1; None where it has none.
+    // Factor that scales a signal to an energy of 1; None if it has none.
     fn scale(&self, what: &'static str, signal: &[T]) -> Result<Option<f64>, Error> {
         check_len(what, signal.len(), self.len)?;
         let energy = energy(signal);
@@ -131,7 +131,7 @@ mod tests {
         let falling: Vec<f64> = x.iter().map(|x| -0.5 * x).collect();
         assert!((pearson(&x, &y).expect("equally long").expect("one") - 1.0).abs() < 1e-12);
         assert!((pearson(&x, &falling).expect("equally long").expect("one") + 1.0).abs() < 1e-12);
-        // By hand: deviations -1.5 -0.5 0.5 1.5 and -1 1 -1 1 give 2 / sqrt(5 x 4).
+        // Worked out on paper: deviations -1.5 -0.5 0.5 1.5 and -1 1 -1 1 give 2 / sqrt(5 x 4).
         let r = pearson(&[1.0, 2.0, 3.0, 4.0], &[0.0f32, 2.0, 0.0, 2.0]).expect("equally long");
         assert!((r.expect("one") - 2.0 / 20f64.sqrt()).abs() < 1e-12);
     }

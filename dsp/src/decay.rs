@@ -1,9 +1,10 @@
-//! How the energy of a response runs out.
+//! Decay of a response's energy.
 
 use crate::Real;
 
 /// Schroeder's backward integration: the energy from each sample to the end over all of it, dB. The first is 0 dB;
-/// where nothing is left, minus infinity. False, and all of `curve` so, where the response has no finite energy.
+/// once nothing is left, minus infinity. If the response has no finite energy, returns false and all of `curve` is
+/// minus infinity.
 ///
 /// ir, curve  `[n]`, summed up in f64
 ///
@@ -30,7 +31,7 @@ pub fn energy_decay_db<T: Real>(ir: &[T], curve: &mut [T]) -> bool {
 mod tests {
     use super::*;
 
-    // x = e^(-a n): what is left falls by the same number of dB a sample, but for what the end cuts off.
+    // x = e^(-a n): the energy left falls by the same number of dB per sample, except for what the end cuts off.
     #[test]
     fn an_exponential_decays_on_a_line() {
         let (decay, len) = (0.05f64, 2_000);

@@ -34,7 +34,7 @@ pub struct DeconvolutionParams {
 /// Length of the transforms.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum TransformLength {
-    /// That of the recording, as in the reference; slow where it has large prime factors.
+    /// That of the recording, as in the reference; slow if it has large prime factors.
     Exact,
     /// Padded with zeros to the next even length without prime factors above 5.
     Fast,
@@ -68,7 +68,7 @@ pub struct DeconvolutionPlan<T: Real> {
 pub struct DeconvolutionScratch<T> {
     /// `[len + 1]`: the transform of both signals, and its first bin again as the mirror image of itself.
     joint: Aligned<Complex<T>>,
-    /// What the transforms need; between them, the quotient. One buffer, as the cache has no room for two.
+    /// Scratch of the transforms; between them, the quotient. One buffer, as the cache has no room for two.
     work: Aligned<Complex<T>>,
     sums: Vec<Complex<T>>,
 }
@@ -77,7 +77,7 @@ impl<T: Real> DeconvolutionPlan<T> {
     /// Plans the transforms.
     ///
     /// # Errors
-    /// [`Error::Setting`] where there is nothing to transform or the range is empty.
+    /// [`Error::Setting`] if there is nothing to transform or the range is empty.
     pub fn new(params: DeconvolutionParams) -> Result<Self, Error> {
         let setting = |what, actual: String, expected| Err(Error::Setting { what, actual, expected });
         if params.recording_len < 2 {
@@ -108,7 +108,7 @@ impl<T: Real> DeconvolutionPlan<T> {
         })
     }
 
-    /// Buffers for [`Self::run`]; one a thread.
+    /// Buffers for [`Self::run`]; one per thread.
     pub fn scratch(&self) -> DeconvolutionScratch<T> {
         let work = self.forward.get_inplace_scratch_len();
         let work = work.max(self.inverse.spectrum_len() + self.inverse.scratch_len());
@@ -158,7 +158,7 @@ impl<T: Real> DeconvolutionPlan<T> {
         joint[self.len] = joint[0];
     }
 
-    // Lays X / S for the inverse transform: first where there is no floor, which is where the floor follows from.
+    // Lays X / S for the inverse transform: first the bins without a floor, because the floor follows from them.
     fn divide(&self, joint: &[Complex<T>], rounding: f64, quotient: &mut [Complex<T>]) -> Result<(), Error> {
         let (first, end) = (*self.in_range.start(), *self.in_range.end() + 1);
         let power = self.divide_bins(first..end, T::default(), joint, quotient);
@@ -176,7 +176,7 @@ impl<T: Real> DeconvolutionPlan<T> {
         Ok(())
     }
 
-    // Divides where the divisor's power is raised to `floor`; the power is that before it is raised, times 4.
+    // Divides with the divisor's power raised to `floor`; returns the power before it is raised, times 4.
     fn divide_bins(&self, bins: Range<usize>, floor: T, joint: &[Complex<T>], quotient: &mut [Complex<T>]) -> Power<T> {
         let (mut piece, mut powers) = ([Complex::default(); PIECE], [T::default(); PIECE]);
         let mut total = Power::none();
@@ -331,7 +331,7 @@ mod tests {
         }
     }
 
-    // Zeros follow where more is asked for than the transform holds.
+    // Zeros follow if more is requested than the transform holds.
     #[test]
     fn what_is_longer_than_the_transform_ends_in_zeros() {
         let plan = DeconvolutionPlan::<f64>::new(DeconvolutionParams {

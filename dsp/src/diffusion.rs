@@ -1,8 +1,8 @@
-//! How evenly a surface spreads sound over receivers.
+//! Diffusion coefficient of a surface: evenness of the levels at its receivers.
 
 /// Sums that the directional diffusion coefficient needs, kept relative to the loudest so that no level overflows.
 ///
-/// d = ((sum e)^2 - sum e^2) / ((n - 1) sum e^2), e = 10^(L/10), over n receivers: 1 where all levels are equal, 0 where
+/// d = ((sum e)^2 - sum e^2) / ((n - 1) sum e^2), e = 10^(L/10), over n receivers: 1 if all levels are equal, 0 if
 /// all energy is at one. The autocorrelation coefficient of ISO 17497-2:2012, all receivers of equal weight. That
 /// standard asks for receivers in the far field; on the grid of a rig they are in the near field, and the number
 /// compares surfaces measured alike, no more.

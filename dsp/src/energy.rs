@@ -62,7 +62,7 @@ pub fn tnce<T: Real>(curves: &[T], len: usize, out: &mut [f64]) -> f64 {
     total
 }
 
-/// Energy of each band over Flat's of the same band. Where Flat has none, the value is not finite.
+/// Energy of each band over Flat's of the same band. If Flat has none, the value is not finite.
 ///
 /// energies, flat_energies, out  `[bands]`
 pub fn tnce_over_band(energies: &[f64], flat_energies: &[f64], out: &mut [f64]) {
@@ -103,7 +103,7 @@ pub(crate) fn accumulate<T: Real>(band: &[T], factor: f64, curve: &mut [T]) -> f
 mod tests {
     use super::*;
 
-    // Two bands of three samples with squares that are exact: every number below follows by hand.
+    // Two bands of three samples with squares that are exact: every number below can be checked on paper.
     const BANDS: [f64; 6] = [1.0, 2.0, 2.0, 0.0, -1.0, 3.0];
 
     #[test]

@@ -1,26 +1,26 @@
-//! Why a kernel refuses.
+//! Errors of the kernels.
 
-/// What is wrong with a plan's settings or a kernel's input.
+/// An invalid setting of a plan, or an invalid input of a kernel.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum Error {
     /// A slice has the wrong length.
     #[error("{what} has {actual} samples, expected {expected}")]
     Length {
-        /// Which slice.
+        /// Name of the slice.
         what: &'static str,
         /// Its length.
         actual: usize,
-        /// The plan's.
+        /// The expected length.
         expected: usize,
     },
     /// A setting that makes no plan.
     #[error("{what} is {actual}, expected {expected}")]
     Setting {
-        /// Which setting.
+        /// Name of the setting.
         what: &'static str,
-        /// What was given.
+        /// The given value.
         actual: String,
-        /// What is taken.
+        /// The accepted values.
         expected: &'static str,
     },
     /// The loopback holds nothing to divide by.
@@ -29,7 +29,7 @@ pub enum Error {
     /// A signal with NaN or infinity in it.
     #[error("{what} has samples that are not finite")]
     NotFinite {
-        /// Which signal.
+        /// Name of the signal.
         what: &'static str,
     },
 }

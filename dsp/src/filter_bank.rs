@@ -46,9 +46,9 @@ pub struct FilterBankPlan<T: Real> {
     inverse: Arc<dyn Fft<T>>,
 }
 
-/// Two bands that are transformed as one; the second is empty where the number of bands is odd.
+/// Two bands that are transformed as one; the second is empty if the number of bands is odd.
 struct Couple<T> {
-    /// Where one of them has a gain, up to half of the rate.
+    /// Bins in which at least one of them has a gain, up to half of the rate.
     bins: Range<usize>,
     /// `[bins]`: first + i second, over the number of samples.
     gains: Vec<Complex<T>>,
@@ -67,7 +67,7 @@ impl<T: Real> FilterBankPlan<T> {
     /// Plans for signals of `len` samples; the centres are an octave apart, ascending.
     ///
     /// # Errors
-    /// [`Error::Setting`] where they are not, or there are none.
+    /// [`Error::Setting`] if they are not, or there are none.
     pub fn new(len: usize, rate_hz: f64, centres_hz: &[f64]) -> Result<Self, Error> {
         let octaves = centres_hz.windows(2).all(|w| (w[1] / w[0] - 2.0).abs() < 1e-6);
         if !octaves || !centres_hz.first().is_some_and(|hz| *hz > 0.0 && hz.is_finite()) {
@@ -112,7 +112,7 @@ impl<T: Real> FilterBankPlan<T> {
         self.len
     }
 
-    /// Buffers for [`Self::run`]; one a thread.
+    /// Buffers for [`Self::run`]; one per thread.
     pub fn scratch(&self) -> FilterBankScratch<T> {
         let work = self.forward.get_scratch_len().max(self.inverse.get_inplace_scratch_len());
         FilterBankScratch {
@@ -157,7 +157,7 @@ impl<T: Real> FilterBankPlan<T> {
         Ok(())
     }
 
-    // A bin stands for its mirror image too, but for 0 Hz and, where the length is even, the last one.
+    // A bin counts for its mirror image too, except 0 Hz and, if the length is even, the last one.
     fn weight(&self, bin: usize) -> f64 {
         if bin == 0 || 2 * bin == self.len { 1.0 } else { 2.0 }
     }
@@ -193,7 +193,7 @@ impl<T: Real> Couple<T> {
         let bins = spectrum[start..end].iter().zip(&self.gains);
         low[start..end].iter_mut().zip(bins.clone()).for_each(|(out, (x, gain))| *out = x * gain);
         high.fill(Complex::default());
-        // The first bin has no mirror image; nor has the last where the length is even, and `high` ends before it.
+        // The first bin has no mirror image; nor has the last if the length is even, and `high` ends before it.
         let images = high.iter_mut().rev().skip(start.saturating_sub(1));
         images.zip(bins.skip(usize::from(start == 0))).for_each(|(out, (x, gain))| *out = x.conj() * gain);
     }

@@ -13,8 +13,8 @@ pub struct FresnelZone {
     pub semi_minor_mm: f64,
 }
 
-/// The first Fresnel zone: where a path by the plane is at most half a wavelength longer than the reflection's,
-/// the section of the spheroid with the speaker and the microphone's image as foci.
+/// The first Fresnel zone: the points of the plane over which a path is at most half a wavelength longer than the
+/// reflection's, the section of the spheroid with the speaker and the microphone's image as foci.
 ///
 /// The paper's own four diameters fit no definition exactly; this one gives 227.6 to 535.5 mm at 2 kHz and
 /// 47.3 to 162.3 mm at 40 kHz over the measured pairs.

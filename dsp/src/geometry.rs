@@ -15,7 +15,7 @@ pub fn incidence_deg(microphone: [f64; 3], speaker: [f64; 3]) -> f64 {
     across(microphone, speaker).atan2(microphone[2] + speaker[2]).to_degrees()
 }
 
-/// Where that path meets the plane, mm.
+/// Point at which that path meets the plane, mm.
 pub fn specular_point(microphone: [f64; 3], speaker: [f64; 3]) -> [f64; 2] {
     let share = speaker[2] / (speaker[2] + microphone[2]);
     [0, 1].map(|i| speaker[i] + share * (microphone[i] - speaker[i]))

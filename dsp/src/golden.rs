@@ -31,7 +31,7 @@ struct Golden {
 }
 
 fn golden() -> Golden {
-    // Tests run in their package's folder. A path fixed at compile time would be that of another checkout where both
+    // Tests run in their package's folder. A path fixed at compile time would be that of another checkout if both
     // share a target folder.
     let path = "../tests/fixtures/golden.parquet";
     let bytes = Bytes::from(std::fs::read(path).expect("the fixture is committed"));
@@ -130,8 +130,8 @@ fn responses() {
     check_responses::<f64>(1e-3);
 }
 
-// The reference resamples by a fraction, which puts the last samples up to 1.7e-5 of a sample beside where the
-// exact ratio does: a relative error of 3.8e-6, past the README's 1e-6. With its fraction we are at 1.6e-7.
+// The reference resamples by a fraction, which puts the last samples up to 1.7e-5 of a sample beside the
+// exact ratio's: a relative error of 3.8e-6, past the README's 1e-6. With its fraction we are at 1.6e-7.
 #[test]
 fn responses_in_f64_without_padding() {
     let (mut worst_exact, mut worst_fraction) = (0.0f64, 0.0f64);

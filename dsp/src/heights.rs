@@ -4,12 +4,12 @@ use echolake_schema::Symmetry;
 
 use crate::Error;
 
-/// Moves a square map of heights as [`Symmetry::apply`] moves points about its centre: what stood at p stands at M p.
+/// Moves a square map of heights as [`Symmetry::apply`] moves points about its centre: the height at p moves to M p.
 ///
 /// heights, out  `[side x side]`, row by row along x, y ascending
 ///
 /// # Errors
-/// [`Error::Setting`] where they are no square, [`Error::Length`] where `out` is not as long.
+/// [`Error::Setting`] if they are no square, [`Error::Length`] if `out` is not as long.
 pub fn moved<T: Copy>(heights: &[T], symmetry: Symmetry, out: &mut [T]) -> Result<(), Error> {
     let side = heights.len().isqrt();
     if side * side != heights.len() {
@@ -51,7 +51,7 @@ const GREYS: [f32; 2] = [18.0, 250.0];
 /// returns  `[side x side]`  grey, rows from the top
 ///
 /// # Errors
-/// [`Error::Setting`] where they are no square.
+/// [`Error::Setting`] if they are no square.
 pub fn shaded(heights: &[f32], pitch_mm: f32) -> Result<Vec<u8>, Error> {
     let side = heights.len().isqrt();
     if side * side != heights.len() {

@@ -7,7 +7,7 @@ const LANES: usize = 8;
 /// Samples that levels are taken from, of each eight times as many.
 const BLOCK: usize = 64;
 
-/// How loud the two signals are, from an eighth of their samples.
+/// Levels of the two signals, from an eighth of their samples.
 pub(crate) struct Levels {
     /// Power of two that brings the loopback to the recording's level: in one transform, the rounding of the louder
     /// signal is noise in the other.

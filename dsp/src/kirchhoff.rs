@@ -40,7 +40,7 @@ struct Seen {
     position_m: [f64; 3],
     /// Distance, m.
     distance: Vec<f32>,
-    /// Cosine against the un-normalised normal over the distance, 1/m; 0 where the facet faces away.
+    /// Cosine against the un-normalised normal over the distance, 1/m; 0 if the facet faces away.
     cosine_over_distance: Vec<f32>,
 }
 
@@ -77,7 +77,7 @@ impl KirchhoffPlan {
         self.len
     }
 
-    /// Buffers for [`Self::response`]; one a thread.
+    /// Buffers for [`Self::response`]; one per thread.
     pub fn scratch(&self) -> KirchhoffScratch {
         let wide = self.len * OVERSAMPLING;
         KirchhoffScratch {
@@ -95,7 +95,7 @@ impl KirchhoffPlan {
     /// out `[len]`
     ///
     /// # Errors
-    /// [`Error::Length`] where `out` or `scratch` is not the plan's, [`Error::Setting`] where a point is none of its;
+    /// [`Error::Length`] if `out` or `scratch` is not the plan's, [`Error::Setting`] if a point is none of its;
     /// `out` is left as it was.
     pub fn response(
         &self,

@@ -32,7 +32,7 @@ pub fn percentile(sorted: &[f64], percent: f64) -> f64 {
     sorted[below] + (sorted[above] - sorted[below]) * (position - below as f64)
 }
 
-/// Mean of the values up to their 90th percentile, as in the paper's tables; None of none, NaN where one is.
+/// Mean of the values up to their 90th percentile, as in the paper's tables; None of none, NaN if one is.
 pub fn p90_mean(values: &[f64], scratch: &mut Vec<f64>) -> Option<f64> {
     scratch.clear();
     scratch.extend_from_slice(values);

@@ -14,7 +14,7 @@ impl Mean {
     /// Adds a signal; the first decides the length.
     ///
     /// # Errors
-    /// [`Error::Length`] where it is not as long as those before.
+    /// [`Error::Length`] if it is not as long as those before.
     pub fn add<T: Real>(&mut self, signal: &[T]) -> Result<(), Error> {
         self.fit(signal.len())?;
         self.sums.iter_mut().zip(signal).for_each(|(sum, x)| *sum += x.f64());
@@ -41,7 +41,7 @@ impl Mean {
         &self.sums
     }
 
-    /// How many signals there were.
+    /// Number of signals added.
     pub fn count(&self) -> u64 {
         self.count
     }
@@ -64,7 +64,7 @@ impl Mean {
 /// x, y, out  `[n]`
 ///
 /// # Errors
-/// [`Error::Length`] where they are not equally long.
+/// [`Error::Length`] if they are not equally long.
 pub fn multiply<T: Real>(x: &[T], y: &[T], out: &mut [T]) -> Result<(), Error> {
     check_len("the second list", y.len(), x.len())?;
     check_len("the product", out.len(), x.len())?;

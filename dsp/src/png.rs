@@ -12,7 +12,7 @@ const COMPRESSION: u8 = 6;
 /// pixels  `[height x width]`, rows from the top, 0 black
 ///
 /// # Panics
-/// Where `width` is 0.
+/// If `width` is 0.
 pub fn grey(pixels: &[u8], width: usize) -> Vec<u8> {
     let mut rows = Vec::with_capacity(pixels.len() + pixels.len() / width);
     let mut above = vec![0; width];

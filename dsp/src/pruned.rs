@@ -63,7 +63,7 @@ impl<T: Real> PrunedInverse<T> {
         }
     }
 
-    // Bin q of strands r and on; where a strand is not kept, its bin stands for its mirror image, n - k.
+    // Bin q of strands r and on; the bin of a strand that is not kept counts for its mirror image, n - k.
     fn lay_across(&self, q: usize, r: usize, bins: &[Complex<T>], spectrum: &mut [Complex<T>]) {
         let (p, row, last) = (self.strands, self.strand_len + GAP, self.strand_len - 1);
         let direct = spectrum.chunks_exact_mut(row).skip(r);

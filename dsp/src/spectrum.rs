@@ -47,7 +47,7 @@ impl<T: Real> SpectrumPlan<T> {
         Ok(Self { len, forward: T::plan_real_forward(len) })
     }
 
-    /// Buffers for [`Self::levels_db`]; one a thread.
+    /// Buffers for [`Self::levels_db`]; one per thread.
     pub fn scratch(&self) -> SpectrumScratch<T> {
         SpectrumScratch {
             signal: self.forward.make_input_vec(),

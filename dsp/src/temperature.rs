@@ -149,7 +149,7 @@ fn dot<T: Real>(x: &[T; TAPS], taps: &[T; TAPS]) -> T {
     (sums[0] + sums[1]) + (sums[2] + sums[3])
 }
 
-/// The first samples, with zeros where there are fewer.
+/// The first samples, with zeros if there are fewer.
 pub fn crop<T: Real>(from: &[T], to: &mut [T]) {
     let kept = from.len().min(to.len());
     to[..kept].copy_from_slice(&from[..kept]);
@@ -157,7 +157,7 @@ pub fn crop<T: Real>(from: &[T], to: &mut [T]) {
 }
 
 fn kernel(u: f64) -> f64 {
-    // Just past the edge the window goes on smoothly, which the interpolation of the last lobe needs.
+    // Just past the edge the window continues smoothly, which the interpolation of the last lobe needs.
     let window = 1.0 - (u / LOBES).powi(2);
     let sinc = if u == 0.0 { 1.0 } else { (PI * u).sin() / (PI * u) };
     sinc * bessel_i0(KAISER_BETA * KAISER_BETA * window) / bessel_i0(KAISER_BETA * KAISER_BETA)

@@ -1,4 +1,4 @@
-//! Which devices a rig has: the `[devices]` section of a rig file. Without it the rig is simulated.
+//! The devices of a rig: the `[devices]` section of a rig file. Without it the rig is simulated.
 
 use serde::{Deserialize, Serialize};
 
@@ -55,7 +55,7 @@ pub struct AlsaParams {
     pub playback: String,
     /// Name of the PCM that records, as `arecord -L` lists it.
     pub capture: String,
-    /// How samples are passed.
+    /// Sample format of both PCMs.
     pub format: AudioFormat,
     /// Channels of the PCM that plays.
     pub outputs: u32,
@@ -72,7 +72,7 @@ pub struct AlsaParams {
     pub period_frames: u32,
     /// Most that a recording may begin after the output, s: converters, buffers, and a late start.
     pub latency_secs: f64,
-    /// How often a take with a gap is repeated before that is an error.
+    /// Most repetitions of a take with a gap before it fails.
     pub repeats: u32,
 }
 
@@ -94,7 +94,7 @@ impl Default for AlsaParams {
     }
 }
 
-/// How samples are passed to and from an audio interface, little-endian.
+/// Sample format for exchange with an audio interface, little-endian.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum AudioFormat {
@@ -112,9 +112,9 @@ pub enum AudioFormat {
 pub struct SerialParams {
     /// The line's device.
     pub path: String,
-    /// Bits a second.
+    /// Bits per second.
     pub baud: u32,
-    /// Longest wait for a reading, s, in which a lost line is opened again and again.
+    /// Longest wait for a reading, s, in which a lost line is reopened repeatedly.
     pub timeout_secs: f64,
 }
 
@@ -138,9 +138,9 @@ pub struct RosbridgeParams {
     pub joint_names: [String; 6],
     /// Share of the data sheet's speeds that moves use.
     pub speed: f64,
-    /// Farthest that a joint may stand from its target, degrees.
+    /// Largest difference of a joint from its target, degrees.
     pub tolerance_deg: f64,
-    /// Longest wait for an answer, or for an arm to stand after its time, s.
+    /// Longest wait for an answer, or for an arm to come to rest after its planned time, s.
     pub timeout_secs: f64,
 }
 
@@ -159,12 +159,12 @@ impl Default for RosbridgeParams {
 }
 
 impl DeviceParams {
-    /// Whether all of it is simulated, which rig files leave out.
+    /// Returns whether all devices are simulated, the default that rig files leave out.
     pub fn are_simulated(&self) -> bool {
         *self == Self::default()
     }
 
-    /// What contradicts itself, in words.
+    /// Describes the first contradiction among the settings.
     pub(crate) fn contradiction(&self) -> Option<String> {
         let simulated = [
             self.audio == AudioParams::Simulated,

@@ -1,4 +1,4 @@
-//! What can be wrong with a value that somebody gave us.
+//! Errors for values from outside: names, numbers, rig descriptions, points, pairs and samples.
 
 /// A value that is not what its type promises.
 #[derive(Debug, thiserror::Error, Clone, PartialEq)]
@@ -6,21 +6,21 @@ pub enum Error {
     /// Not a name that a surface, run or file can have.
     #[error("`{value}` is not a valid {kind}: {reason}")]
     Id {
-        /// What it was to be.
+        /// Kind of name that was expected.
         kind: &'static str,
-        /// What was given.
+        /// The given value.
         value: String,
-        /// What is wrong with it.
+        /// The rule that it breaks.
         reason: &'static str,
     },
     /// A number outside of what is physically sensible.
     #[error("{quantity} is {actual}, expected {expected}")]
     Quantity {
-        /// Which quantity, with its unit.
+        /// The quantity, with its unit.
         quantity: &'static str,
-        /// What was given.
+        /// The given number.
         actual: String,
-        /// The range that is taken.
+        /// The accepted range.
         expected: &'static str,
     },
     /// A rig description that contradicts itself.
@@ -30,7 +30,7 @@ pub enum Error {
         rig: String,
         /// The field, as in the TOML.
         field: &'static str,
-        /// What is wrong with it.
+        /// Description of the contradiction.
         reason: String,
     },
     /// Text that is no rig description.
@@ -42,11 +42,11 @@ pub enum Error {
     /// A point that the rig's grid does not have.
     #[error("{given} is not a point of the rig's grid ({expected}){}", nearest.as_deref().map(|n| format!("; the nearest is {n}")).unwrap_or_default())]
     Point {
-        /// What was given.
+        /// The given point.
         given: String,
-        /// What points there are.
+        /// Number of points, and the forms in which one is given.
         expected: String,
-        /// The nearest point, where there is one.
+        /// The nearest point, if the given one was a position.
         nearest: Option<String>,
     },
     /// Two points that the rig does not measure as a pair.
@@ -56,9 +56,9 @@ pub enum Error {
         microphone: String,
         /// Speaker point.
         speaker: String,
-        /// How many pairs there are.
+        /// Number of pairs that the rig measures.
         pairs: usize,
-        /// What would be one.
+        /// A hint at the cause.
         hint: &'static str,
     },
     /// Samples in a format that this version does not know.
@@ -67,9 +67,9 @@ pub enum Error {
     /// Bytes that are not the samples they should be.
     #[error("it has {actual} bytes for {samples} samples of {width}")]
     SampleBytes {
-        /// How many bytes there are.
+        /// Number of bytes found.
         actual: usize,
-        /// How many samples there should be.
+        /// Number of samples expected.
         samples: usize,
         /// Bytes of one sample.
         width: usize,
@@ -77,9 +77,9 @@ pub enum Error {
     /// A sample that is no number.
     #[error("sample {index} is {value}")]
     Sample {
-        /// Which, 0-based.
+        /// Index of the sample, 0-based.
         index: usize,
-        /// What it is.
+        /// Its value.
         value: f32,
     },
 }

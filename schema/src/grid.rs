@@ -1,4 +1,4 @@
-//! The points that microphone and speaker stand on, and the pairs of them that are measured.
+//! The grid points for microphone and speaker, and the pairs of points that are measured.
 
 use std::collections::HashMap;
 
@@ -29,17 +29,17 @@ pub struct Point {
 pub struct Pair {
     /// Its number.
     pub id: PairId,
-    /// Where the microphone stands.
+    /// Point of the microphone.
     pub microphone: PointId,
-    /// Where the speaker stands.
+    /// Point of the speaker.
     pub speaker: PointId,
 }
 
-/// How a rig describes its grid: square layers, or single points.
+/// Description of a rig's grid: square layers, or single points.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(from = "GridText")]
 pub struct GridParams {
-    /// Which pairs are measured.
+    /// Rule for the pairs that are measured.
     pub pairs: PairRule,
     /// Points of different layers below the topmost, horizontally nearer than this, cannot be a pair, mm.
     pub clearance_mm: f64,
@@ -87,7 +87,7 @@ pub struct Layer {
     pub height_mm: f64,
 }
 
-/// Which pairs of points are measured.
+/// Rule for the pairs of points that are measured.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum PairRule {
@@ -125,7 +125,7 @@ impl GridParams {
     /// Lays out the points and pairs.
     ///
     /// # Errors
-    /// [`Error::Quantity`] where there are no points, too many, or one is not finite.
+    /// [`Error::Quantity`] if there are fewer than 2 points, more than [`Self::MAX_POINTS`], or one is not within 1 km.
     pub fn build(&self) -> Result<Grid, Error> {
         let count = self.layers.iter().map(|l| (l.points_per_side as usize).saturating_pow(2)).sum::<usize>();
         let count = count.saturating_add(self.points_mm.len());
@@ -179,7 +179,7 @@ impl GridParams {
         pairs
     }
 
-    // One end-effector would stand over the other; the topmost layer hangs high enough.
+    // The end-effector at one point would be above that at the other; the topmost layer is high enough.
     fn collide(&self, a: &Point, b: &Point, top: f64) -> bool {
         let [dx, dy, dz] = [0, 1, 2].map(|i| a.position_mm[i] - b.position_mm[i]);
         dz != 0.0 && a.position_mm[2].max(b.position_mm[2]) < top && dx.hypot(dy) < self.clearance_mm
@@ -225,7 +225,7 @@ impl Grid {
     /// Reads `layer/x/y` or millimetres `x y z`.
     ///
     /// # Errors
-    /// [`Error::Point`] where it is neither, or the grid has no such point; it names the nearest.
+    /// [`Error::Point`] if it is neither, or the grid has no such point; a position gets the nearest point as a hint.
     pub fn parse_point(&self, text: &str) -> Result<&Point, Error> {
         let numbers = |separator: char| -> Option<Vec<f64>> {
             let parts = text.split(separator).map(str::trim).filter(|p| !p.is_empty());
@@ -242,10 +242,10 @@ impl Grid {
         found.ok_or_else(|| self.no_point(text, numbers(' ')))
     }
 
-    /// The pair of two points.
+    /// Returns the number of the pair of two points, in these roles.
     ///
     /// # Errors
-    /// [`Error::Pair`] where the rig does not measure it; it says so where the roles are exchanged.
+    /// [`Error::Pair`] if the rig does not measure it; the hint says if it does so with the roles exchanged.
     pub fn parse_pair(&self, microphone: &Point, speaker: &Point) -> Result<PairId, Error> {
         self.pair_id(microphone.id, speaker.id).ok_or_else(|| Error::Pair {
             microphone: microphone.label(),

@@ -38,7 +38,7 @@ impl SurfaceId {
         self.split().map_or(&self.0, |(panel, _)| panel)
     }
 
-    /// The side, 0 or 1, where the name follows the panels' pattern.
+    /// The side, 0 or 1, if the name follows the panels' pattern.
     pub fn side(&self) -> Option<u8> {
         self.split().map(|(_, side)| side)
     }
@@ -65,11 +65,11 @@ impl SurfaceId {
 }
 
 impl RunId {
-    /// The name of a run of `surface` that began at `start`; `tag` tells apart runs of the same second, and if it is
-    /// random, nobody guesses the name.
+    /// Composes the name of a run of `surface` that began at `start`. `tag` distinguishes runs of the same second; if
+    /// it is random, the name cannot be guessed.
     ///
     /// # Errors
-    /// [`Error::Id`] where the parts make no valid name.
+    /// [`Error::Id`] if the parts make no valid name.
     pub fn compose(start: crate::Timestamp, surface: &SurfaceId, tag: u64) -> Result<Self, Error> {
         format!("{}-{surface}-{tag:016x}", start.compact()).parse()
     }

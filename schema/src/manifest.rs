@@ -1,4 +1,4 @@
-//! What a run's file says of itself: the manifest in its metadata, and the record of its surface.
+//! Metadata of a run's file: the run's manifest, its end, and the record of its surface.
 
 use std::collections::BTreeMap;
 
@@ -9,27 +9,27 @@ use crate::{Error, RunId, SurfaceId, Timestamp};
 /// Format of run files that this version writes, and the newest that it reads.
 pub const RUN_FORMAT: u32 = 1;
 
-/// Metadata `echolake.run`: what a run is.
+/// Metadata `echolake.run`: name, surface, start, software, rig and origin of a run.
 #[derive(Debug, Clone, PartialEq)]
 pub struct RunManifest {
     /// The run's name.
     pub run_id: RunId,
     /// The measured surface.
     pub surface_id: SurfaceId,
-    /// When it began.
+    /// Time of its start.
     pub started: Timestamp,
     /// Name and version of the program that wrote it.
     pub software: String,
     /// Name of the rig.
     pub rig: String,
-    /// Where its signals come from.
+    /// Origin of its signals.
     pub origin: Origin,
 }
 
 /// The labels of [`Origin`], for people.
 pub(crate) const ORIGINS: &str = "measured, simulated, imported_wav, imported_gir or imported_sofa";
 
-/// Where a run's signals come from.
+/// Origin of a run's signals.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Origin {
@@ -37,7 +37,7 @@ pub enum Origin {
     Measured,
     /// Computed by the simulated rig.
     Simulated,
-    /// Imported from somebody's WAV files.
+    /// Imported from WAV files of other software.
     ImportedWav,
     /// Imported from the published GIR data set.
     ImportedGir,
@@ -45,10 +45,10 @@ pub enum Origin {
     ImportedSofa,
 }
 
-/// Metadata `echolake.run.end`: how a run ended.
+/// Metadata `echolake.run.end`: time and counts at the end of a run.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct RunEnd {
-    /// When.
+    /// Time of its end.
     pub ended: Timestamp,
     /// Measurements accepted.
     pub accepted: u64,
@@ -58,7 +58,7 @@ pub struct RunEnd {
     pub attempts: u64,
 }
 
-/// Attachment `surface.json`: what is known of a surface.
+/// Attachment `surface.json`: description of a surface.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, Default)]
 #[serde(default)]
 pub struct SurfaceRecord {
@@ -74,9 +74,9 @@ pub struct SurfaceRecord {
     pub material: Option<String>,
     /// Pressure reflection factor that a simulation used.
     pub reflection_factor: Option<f64>,
-    /// The surface that normalises this one; the lake's choice where none is given.
+    /// The surface that normalises this one; if none is given, the lake chooses.
     pub flat_reference: Option<SurfaceId>,
-    /// The surface whose direct sound is subtracted from this one; the lake's choice where none is given.
+    /// The surface whose direct sound is subtracted from this one; if none is given, the lake chooses.
     pub foam_reference: Option<SurfaceId>,
     /// Parameters of the relief's generator.
     pub parameters: serde_json::Value,
@@ -91,7 +91,7 @@ pub struct MeshFacts {
     pub file: String,
     /// Triangles.
     pub triangles: u64,
-    /// Whether every edge has two triangles.
+    /// True if every edge has two triangles.
     pub watertight: bool,
     /// Lowest and highest point of the relief, mm.
     pub relief_mm: [f64; 2],
@@ -109,7 +109,7 @@ impl Origin {
         }
     }
 
-    /// Whether somebody else's software wrote what it was made of, so that times and rigs may not be as ours are.
+    /// Returns whether the run was made of data of other software, whose times and rigs may differ from ours.
     pub fn is_imported(self) -> bool {
         match self {
             Self::ImportedWav | Self::ImportedGir | Self::ImportedSofa => true,
@@ -123,7 +123,7 @@ impl Origin {
     }
 }
 
-/// Why metadata is not that of a run.
+/// Error of metadata that is not that of a run.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum ManifestError {
     /// A key is missing.
@@ -141,9 +141,9 @@ pub enum ManifestError {
         record: &'static str,
         /// The key.
         key: &'static str,
-        /// What stands there.
+        /// The value found.
         actual: String,
-        /// What should.
+        /// Description of a valid value.
         expected: &'static str,
     },
     /// Written by a later version.

@@ -42,7 +42,7 @@ impl Verdict {
 }
 
 impl SampleFormat {
-    /// Bytes of one sample; None where the format is unknown.
+    /// Bytes of one sample; None if the format is unknown.
     pub fn bytes(self) -> Option<usize> {
         match self {
             Self::Unspecified => None,

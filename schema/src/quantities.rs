@@ -7,12 +7,12 @@ use serde::{Deserialize, Serialize};
 
 use crate::Error;
 
-/// Temperature of air in degrees Celsius, -60 to 80: what a sensor in a room or a cold store can mean.
+/// Temperature of air in degrees Celsius, -60 to 80: the range of a sensor in a room or a cold store.
 #[derive(Debug, Clone, Copy, PartialEq, PartialOrd, Serialize, Deserialize)]
 #[serde(try_from = "f64", into = "f64")]
 pub struct Celsius(f64);
 
-/// Samples a second, 1 Hz to 10 MHz.
+/// Samples per second, 1 Hz to 10 MHz.
 #[derive(Debug, Clone, Copy, PartialEq, PartialOrd, Serialize, Deserialize)]
 #[serde(try_from = "f64", into = "f64")]
 pub struct SampleRate(f64);
@@ -25,7 +25,7 @@ impl Celsius {
     /// Checks the number.
     ///
     /// # Errors
-    /// [`Error::Quantity`] where it is not finite or outside of -60 to 80.
+    /// [`Error::Quantity`] if it is not finite or outside of -60 to 80.
     pub fn new(value: f64) -> Result<Self, Error> {
         if (-60.0..=80.0).contains(&value) {
             return Ok(Self(value));
@@ -47,7 +47,7 @@ impl SampleRate {
     /// Checks the number.
     ///
     /// # Errors
-    /// [`Error::Quantity`] where it is not finite or outside of 1 Hz to 10 MHz.
+    /// [`Error::Quantity`] if it is not finite or outside of 1 Hz to 10 MHz.
     pub fn new(value: f64) -> Result<Self, Error> {
         if (1.0..=1e7).contains(&value) {
             return Ok(Self(value));
@@ -100,7 +100,7 @@ impl Timestamp {
     /// Reads an RFC 3339 time.
     ///
     /// # Errors
-    /// [`Error::Quantity`] where it is none.
+    /// [`Error::Quantity`] if it is none, or outside of 1678 to 2261.
     pub fn parse(text: &str) -> Result<Self, Error> {
         let wrong = || Error::Quantity {
             quantity: "time",

@@ -7,7 +7,7 @@ use crate::grid::{Grid, GridParams};
 use crate::robots::RobotCell;
 use crate::{Celsius, Error, SampleRate};
 
-/// A rig, as its TOML describes it. What the TOML leaves out is as in Rust et al. 2021
+/// A rig, as its TOML describes it. Settings that the TOML omits are those of Rust et al. 2021
 /// ("A data acquisition setup for data driven acoustic design", Building Acoustics 28(4)).
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
@@ -16,17 +16,17 @@ pub struct Rig {
     pub name: String,
     /// The excitation.
     pub sweep: Sweep,
-    /// What is kept of each response.
+    /// Length and corrections of each impulse response.
     pub impulse_response: ImpulseResponse,
     /// The filter bank.
     pub bands: Bands,
     /// The measured object.
     pub panel: Panel,
-    /// When a measurement is good enough.
+    /// Limits that a measurement must meet.
     pub validation: Validation,
     /// The points and pairs.
     pub grid: GridParams,
-    /// Where the arms stand and how they go about.
+    /// Placement of the arms, and the order of their visits.
     #[serde(skip_serializing_if = "RobotCell::is_default")]
     pub robots: RobotCell,
     /// Its devices.
@@ -54,7 +54,7 @@ pub struct Sweep {
     pub level_dbfs: f64,
 }
 
-/// What is kept of each impulse response.
+/// Length and corrections of each impulse response.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct ImpulseResponse {
@@ -84,11 +84,11 @@ pub struct Panel {
     pub depth_mm: f64,
 }
 
-/// When a measurement is good enough, and how often it is tried.
+/// Limits that a measurement must meet, and the number of attempts.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Validation {
-    /// Tries at one pair.
+    /// Attempts per pair.
     pub attempts: u32,
     /// Least signal-to-noise ratio in the sweep's band, dB.
     pub snr_db: f64,
@@ -96,7 +96,7 @@ pub struct Validation {
     pub loopback_dbfs: f64,
     /// Highest sound pressure level outside, dB re 20 uPa.
     pub outside_level_db: f64,
-    /// Most that the direct sound may arrive off the time that geometry gives, us.
+    /// Largest difference of the direct sound's arrival from the time that geometry gives, us.
     pub arrival_us: f64,
 }
 
@@ -163,8 +163,7 @@ impl Rig {
     /// Reads a TOML description and checks it.
     ///
     /// # Errors
-    /// [`Error::RigSyntax`] where it is no such TOML, [`Error::Rig`] or [`Error::Quantity`] where it
-    /// contradicts itself.
+    /// [`Error::RigSyntax`] if it is no such TOML, [`Error::Rig`] or [`Error::Quantity`] if it contradicts itself.
     pub fn from_toml(text: &str) -> Result<Self, Error> {
         let rig: Self = toml::from_str(text).map_err(|e| Error::RigSyntax { message: e.to_string() })?;
         rig.check()?;
@@ -179,7 +178,7 @@ impl Rig {
     /// The points and pairs.
     ///
     /// # Errors
-    /// [`Error::Quantity`] where there are no points or too many.
+    /// [`Error::Quantity`] if there are too few points or too many.
     pub fn grid(&self) -> Result<Grid, Error> {
         self.grid.build()
     }

@@ -1,28 +1,28 @@
-//! How a rig's description places its two arms, and in which order they visit the grid.
+//! Placement of a rig's two arms, and the order in which they visit the grid.
 
 use serde::{Deserialize, Serialize};
 
-/// The `[robots]` section of a rig file. What it leaves out is [`RobotCell::default`].
+/// The `[robots]` section of a rig file. Omitted settings are those of [`RobotCell::default`].
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct RobotCell {
-    /// In which order pairs are visited.
+    /// Order in which pairs are visited.
     pub order: VisitOrder,
     /// Foot of the microphone's arm, mm from the panel's centre.
     pub microphone_foot_mm: [f64; 3],
     /// Foot of the speaker's arm, mm from the panel's centre.
     pub speaker_foot_mm: [f64; 3],
-    /// How the microphone is held.
+    /// Tilt of the microphone's rod.
     pub rod: Rod,
     /// The relief's highest point over its mean plane, mm.
     pub relief_mm: f64,
-    /// The table over the relief's mean plane, mm; negative, the panel stands on it.
+    /// The table over the relief's mean plane, mm; negative, the panel lies on it.
     pub table_mm: f64,
     /// Least distance of anything from anything, mm.
     pub margin_mm: f64,
 }
 
-/// In which order pairs are visited.
+/// Order in which pairs are visited.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum VisitOrder {
@@ -32,7 +32,7 @@ pub enum VisitOrder {
     Planned,
 }
 
-/// How the microphone's rod may be held.
+/// Tilt of the microphone's rod.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Rod {
@@ -44,9 +44,9 @@ pub enum Rod {
 
 impl Default for RobotCell {
     /// An arrangement in which the paper's whole grid is within reach. The paper prints no positions; these were
-    /// found by trying (`campaigns/src/motion.rs` tells what is reached): the arms face each other over the
+    /// found by trial (`campaigns/src/motion.rs` prints the reach): the arms face each other over the
     /// panel, the microphone's at lower x, because in a layer the microphone's point has the lower x. The relief's
-    /// top stands 29 mm over the mean plane (the paper's heights against those of the published data).
+    /// top is 29 mm over the mean plane (the paper's heights against those of the published data).
     fn default() -> Self {
         Self {
             order: VisitOrder::Numbered,
@@ -61,12 +61,12 @@ impl Default for RobotCell {
 }
 
 impl RobotCell {
-    /// Whether this is the default, which rig files leave out.
+    /// Returns whether this is the default, which rig files leave out.
     pub fn is_default(&self) -> bool {
         *self == Self::default()
     }
 
-    /// What contradicts itself, in words.
+    /// Describes the first contradiction among the settings.
     pub(crate) fn contradiction(&self) -> Option<String> {
         let lengths = [self.relief_mm, self.table_mm, self.margin_mm];
         let finite =

@@ -25,7 +25,7 @@ pub fn split_24(samples: &[i32]) -> Vec<u8> {
     bytes
 }
 
-/// The upper 16 bits of samples in [`SampleFormat::S24Split`], as [`SampleFormat::S16le`]: they stand there as such.
+/// The upper 16 bits of samples in [`SampleFormat::S24Split`], as [`SampleFormat::S16le`]: a slice, without a copy.
 pub fn upper_16(split: &[u8]) -> &[u8] {
     &split[split.len() / 3..]
 }
@@ -34,8 +34,8 @@ pub fn upper_16(split: &[u8]) -> &[u8] {
 /// for 32.
 ///
 /// # Errors
-/// [`Error::SampleFormat`] where the format is unknown, [`Error::SampleBytes`] where there are not just as many bytes
-/// as `out` takes, [`Error::Sample`] where one is not a finite number; `out` has no meaning then.
+/// [`Error::SampleFormat`] if the format is unknown, [`Error::SampleBytes`] if the number of bytes is not the one that
+/// `out` takes, [`Error::Sample`] if a sample is not a finite number; `out` is unspecified after an error.
 pub fn decode(format: SampleFormat, bytes: &[u8], out: &mut [f32]) -> Result<(), Error> {
     let width = format.bytes().ok_or(Error::SampleFormat)?;
     if out.len().checked_mul(width) != Some(bytes.len()) {
@@ -98,7 +98,7 @@ mod tests {
         assert_eq!(of(SampleFormat::S24Split, &split_24(&SAMPLES)), of(SampleFormat::S24le, &packed));
     }
 
-    // A file that was written stays readable, so the bytes stand here.
+    // Files that were written must stay readable, so the test spells out the bytes.
     #[test]
     fn low_bytes_come_first_and_upper_ones_are_16_bit() {
         let bytes = split_24(&[0x12_3456, -2]);

@@ -27,7 +27,7 @@ pub enum Symmetry {
     MirrorAnti,
 }
 
-/// Where a pair goes under a symmetry.
+/// Image of a pair under a symmetry.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct MovedPair {
     /// The measured pair that it becomes.
@@ -85,12 +85,12 @@ impl Symmetry {
 }
 
 impl Grid {
-    /// Where each point goes: point i to point `[i]`. None where the grid lacks the symmetry.
+    /// Maps points: point i moves to point `[i]`. None if the grid lacks the symmetry.
     pub fn permutation(&self, symmetry: Symmetry) -> Option<Vec<PointId>> {
         self.points().iter().map(|p| self.point_at(symmetry.apply(p.position_mm)).map(|q| q.id)).collect()
     }
 
-    /// Where each pair goes: pair i to `[i]`. None where the grid or its set of pairs lacks the symmetry.
+    /// Maps pairs: pair i moves to `[i]`. None if the grid or its set of pairs lacks the symmetry.
     pub fn moved_pairs(&self, symmetry: Symmetry) -> Option<Vec<MovedPair>> {
         let to = self.permutation(symmetry)?;
         self.pairs().iter().map(|pair| self.moved(*pair, &to)).collect()

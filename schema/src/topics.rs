@@ -23,17 +23,17 @@ pub const MEASUREMENT: &str = "/measurement";
 /// The run's log.
 pub const LOG: &str = "/log";
 
-/// The arms as URDF, once, where their joints are known.
+/// The arms as URDF, once, if their joints are known.
 pub const ROBOT_DESCRIPTION: &str = "/robot_description";
 /// Joints of the arm that carries the microphone, at each measurement.
 pub const MICROPHONE_JOINTS: &str = "/robots/microphone/joint_states";
 /// Joints of the arm that carries the speaker.
 pub const SPEAKER_JOINTS: &str = "/robots/speaker/joint_states";
 
-/// Metadata record written first: what the run is.
+/// Metadata record written first: the run's manifest.
 pub const RUN_METADATA: &str = "echolake.run";
-/// Metadata record written behind it where a run can be gone on with: what that takes. Such a recording is no run yet
-/// while it is unfinished, however its recorder ended.
+/// Metadata record written after it if a run can be resumed: the plan that resuming needs. While such a recording is
+/// unfinished it is no run yet, however its recorder ended.
 pub const RUN_PLAN_METADATA: &str = "echolake.run.plan";
 /// Metadata record of a file that was rebuilt: from what, and what was lost.
 pub const RECOVERY_METADATA: &str = "echolake.recovery";

@@ -8,7 +8,7 @@ use crate::{Error, Result};
 /// Format of lakes that this version writes, and the newest that it reads.
 pub const LAKE_FORMAT: u32 = 1;
 
-/// What `lake.toml` says.
+/// Contents of `lake.toml`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct LakeConfig {
@@ -37,7 +37,7 @@ impl Default for References {
     }
 }
 
-/// The part of any version's `lake.toml` that tells its format.
+/// The part of any version's `lake.toml` that holds its format.
 #[derive(Deserialize)]
 struct FormatOnly {
     format: u32,

@@ -20,7 +20,7 @@ use object_store::{
     PutMultipartOptions, PutOptions, PutPayload, PutResult, RenameOptions, Result,
 };
 
-/// Tells apart the temporary files of one process.
+/// Distinguishes the temporary files of one process.
 static NEXT_TEMPORARY: AtomicU64 = AtomicU64::new(0);
 
 /// The whole local file system; paths are absolute.
@@ -67,8 +67,8 @@ impl ObjectStore for DurableFileSystem {
         self.inner.get_opts(location, options).await
     }
 
-    // All of them with the file open once, and nothing between them; the trait's own would ask for each by itself and
-    // read what lies between two that are near.
+    // Reads all ranges with the file open once, and nothing between them; the trait's default would request each by
+    // itself and read the bytes between near ones.
     async fn get_ranges(&self, location: &Path, ranges: &[Range<u64>]) -> Result<Vec<Bytes>> {
         self.inner.get_ranges(location, ranges).await
     }
@@ -108,7 +108,7 @@ async fn blocking(work: impl FnOnce() -> io::Result<()> + Send + 'static, locati
     })
 }
 
-// Data, then name, then folder: at no moment does the name stand for less than the whole file.
+// Data, then name, then folder: at no moment does the name refer to less than the whole file.
 fn write(path: &FsPath, payload: &PutPayload, publish: fn(PathBuf, PathBuf) -> io::Result<()>) -> io::Result<()> {
     let folder = path.parent().ok_or(ErrorKind::InvalidInput)?;
     create_folders(folder)?;
@@ -120,13 +120,13 @@ fn write(path: &FsPath, payload: &PutPayload, publish: fn(PathBuf, PathBuf) -> i
         publish(temporary.clone(), path.to_owned())
     })();
     if written.is_err() {
-        // The first error is the one to tell.
+        // The first error is the one to report.
         let _ = fs::remove_file(&temporary);
     }
     written.and_then(|()| sync_folder(path))
 }
 
-// A hard link fails where the name is taken, which a rename does not.
+// A hard link fails if the name is taken, a rename does not.
 fn link(from: PathBuf, to: PathBuf) -> io::Result<()> {
     fs::hard_link(&from, to)?;
     fs::remove_file(from)

@@ -1,12 +1,12 @@
-//! What can go wrong with a lake.
+//! Errors of a lake.
 
-/// The commands of this build that make a lake where there is none, as words of a hint.
+/// The commands of this build that make a missing lake, as words of a hint.
 #[cfg(feature = "tables")]
 const LAKE_MAKERS: &str = "`echolake demo`, `echolake acquire` and `echolake import` make one";
 #[cfg(not(feature = "tables"))]
 const LAKE_MAKERS: &str = "`echolake acquire` makes one";
 
-/// What a lake could not do, by what the caller can do about it.
+/// An operation that a lake could not do, by what the caller can do about it.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
     /// The location is no path and no URL that this build reaches.
@@ -14,9 +14,9 @@ pub enum Error {
         "`{location}` is not a lake's location: {reason}; hint: give a folder, or file:///... (object stores are not in this build)"
     )]
     Location {
-        /// What was given.
+        /// The given location.
         location: String,
-        /// What is wrong with it.
+        /// Description of the fault.
         reason: String,
     },
     /// There is no lake there.
@@ -36,7 +36,7 @@ pub enum Error {
     Config {
         /// The lake's location.
         location: String,
-        /// What is wrong with it.
+        /// Description of the damage.
         reason: String,
     },
     /// A later version wrote the lake.
@@ -68,11 +68,11 @@ pub enum Error {
     /// The store refused.
     #[error("cannot {action} `{path}`: {}{}", reason(cause), hint(cause))]
     Store {
-        /// What was tried.
+        /// The attempted operation.
         action: &'static str,
-        /// On what.
+        /// Path of the object.
         path: String,
-        /// Why not; no `source`, because the text above already says it.
+        /// The store's error; no `source`, because the text above already prints it.
         cause: StoreError,
     },
     /// The commit log of a table is damaged or unreadable.
@@ -80,9 +80,9 @@ pub enum Error {
     Log {
         /// The table.
         table: &'static str,
-        /// What was tried.
+        /// The attempted operation.
         action: &'static str,
-        /// What is wrong with it.
+        /// Description of the fault.
         reason: String,
     },
     /// Rows could not be encoded.
@@ -90,7 +90,7 @@ pub enum Error {
     Encode {
         /// The table.
         table: &'static str,
-        /// Why not.
+        /// Description of the fault.
         reason: String,
     },
     /// A file of a table cannot be read.
@@ -98,10 +98,10 @@ pub enum Error {
     DataFile {
         /// The file.
         file: String,
-        /// What is wrong with it.
+        /// Description of the damage.
         reason: String,
     },
-    /// Somebody else is at work on the lake's files.
+    /// Another process holds the maintenance lease.
     #[error(
         "`{location}` is being maintained by process {pid} on {host} (lease until {until}); hint: wait for it; where it has died, its lease ends by itself"
     )]
@@ -112,10 +112,10 @@ pub enum Error {
         host: String,
         /// The process there.
         pid: u32,
-        /// When the lease ends, where it is not renewed.
+        /// End of the lease if it is not renewed.
         until: String,
     },
-    /// Somebody else has taken the lease, because it was not renewed in time.
+    /// Another process has taken the lease, because it was not renewed in time.
     #[error("the maintenance lease of `{location}` was lost; hint: nothing is half-done, run the command again")]
     LeaseLost {
         /// The lake's location.
@@ -126,7 +126,7 @@ pub enum Error {
     NoMoment {
         /// The moment.
         moment: String,
-        /// What is there instead.
+        /// The versions that the log holds.
         held: String,
     },
     /// Files of that moment are deleted.

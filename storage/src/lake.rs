@@ -28,7 +28,7 @@ struct OpenLake {
 const CONFIG: &str = "lake.toml";
 
 impl Lake {
-    /// Opens a lake that is there.
+    /// Opens an existing lake.
     ///
     /// # Errors
     /// [`Error::NoLake`], [`Error::Newer`], [`Error::Config`], or what the store says.
@@ -40,12 +40,12 @@ impl Lake {
         }
     }
 
-    /// Opens a lake, or makes one for this rig where the place is empty; then makes the tables that are missing, in a build
-    /// that has tables.
+    /// Opens a lake, or makes one for this rig if the location is empty; then makes the tables that are missing, in a
+    /// build that has tables.
     ///
     /// # Errors
-    /// As [`Lake::open`]; [`Error::OtherRig`] where the lake is there and was made for another rig, and
-    /// [`Error::Occupied`] where other files are.
+    /// As [`Lake::open`]; [`Error::OtherRig`] if the lake exists and was made for another rig, and
+    /// [`Error::Occupied`] if other files do.
     pub async fn open_or_create(url: &str, rig: &Rig, references: &References) -> Result<Self> {
         Self::open_or_create_at(Location::parse(url)?, rig, references).await
     }
@@ -90,10 +90,10 @@ impl Lake {
         })))
     }
 
-    /// Whether runs of this rig may stand beside those that are here.
+    /// Checks that runs of this rig fit the lake: that its tables' numbers would mean the same.
     ///
     /// # Errors
-    /// [`Error::OtherRig`] where they may not, with what differs.
+    /// [`Error::OtherRig`] if they do not, with the differences.
     pub fn fits(&self, rig: &Rig) -> Result<()> {
         let differences = self.rig().differences(rig);
         if differences.is_empty() {
@@ -113,7 +113,7 @@ impl Lake {
         &self.0.location.text
     }
 
-    /// The lake's folder, where it is one.
+    /// The lake's folder, if it is one.
     pub fn folder(&self) -> Option<&FsPath> {
         self.0.location.folder.as_deref()
     }
@@ -123,7 +123,7 @@ impl Lake {
         self.0.location.store.clone()
     }
 
-    /// What `lake.toml` says.
+    /// Contents of `lake.toml`.
     pub fn config(&self) -> &LakeConfig {
         &self.0.config
     }
@@ -144,7 +144,7 @@ impl Lake {
         &self.0.log
     }
 
-    /// Where a run's file stands.
+    /// Path of a run's file.
     pub fn run_path(surface: &SurfaceId, run: &RunId) -> Path {
         Path::from(format!("runs/{surface}/{run}.mcap"))
     }
@@ -174,7 +174,7 @@ async fn create_config(location: &Location, rig: &Rig, references: &References) 
     let text = config.to_toml()?;
     match location.store.put_opts(&Path::from(CONFIG), text.into(), PutMode::Create.into()).await {
         Ok(_) => Ok(config),
-        // Somebody else made the lake at the same moment; theirs counts.
+        // Another process made the lake at the same moment; its configuration counts.
         Err(object_store::Error::AlreadyExists { .. }) => {
             read_config(location).await?.ok_or_else(|| Error::NoLake { location: location.text.clone() })
         }

@@ -1,4 +1,4 @@
-//! The lake: where it is, what it is configured for, its commit log, and what a reader may see of it.
+//! The lake: its location, its configuration, its commit log, and the part of it that a reader may see.
 //!
 //! ```
 //! use echolake_lake::{Lake, References};

@@ -17,7 +17,7 @@ use crate::{Error, Result};
 pub(crate) struct Location {
     /// As the user wrote it.
     pub(crate) text: String,
-    /// The folder, where it is one.
+    /// The folder, if it is one.
     pub(crate) folder: Option<PathBuf>,
     /// The lake alone.
     pub(crate) store: Arc<dyn ObjectStore>,

@@ -4,7 +4,7 @@ use super::super::observed_server::{QueryClient, QueryProtocol};
 use super::sql::{SQL_FAMILIES, SqlAttack};
 use super::wire::{UPLOADS, UploadAttack, WIRE_FAMILIES, WireAttack};
 
-/// Connections that ask a hostile statement at once; more than processors here, as many as a client may.
+/// Connections that send a hostile statement at once; more than processors here, as many as a client may open.
 const SQL_CONNECTIONS: usize = 4;
 /// Attacks of each family in a short selection.
 const QUICK_ATTACKS: usize = 2;

@@ -1,4 +1,4 @@
-//! What the attacks did, as a table or JSON, and which goals are missed.
+//! Results of the attacks, as a table or JSON, and the goals that they miss.
 #![allow(clippy::print_stdout, reason = "figures are what it is for")]
 
 use std::collections::BTreeMap;
@@ -10,7 +10,7 @@ use serde_json::{Value, json};
 use super::super::observed_server::{LightReport, MemoryPeak};
 use super::super::percentile::{millis, percentile};
 
-/// What other clients may notice.
+/// Longest times that other clients may measure.
 const LIGHT_GOAL: Duration = Duration::from_millis(300);
 const HEALTH_GOAL: Duration = Duration::from_millis(100);
 /// Memory beyond the idle server's and the client's limit.
@@ -19,7 +19,7 @@ const DOOR_GOAL_MIB: u64 = 300;
 /// Processor time of an idle server in a second.
 const IDLE_GOAL: Duration = Duration::from_millis(50);
 
-/// What became of the server.
+/// Fate of the server after an attack.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) enum ServerFate {
     Alive,
@@ -37,7 +37,7 @@ pub(crate) struct AttackRow {
     pub(super) family: &'static str,
     pub(super) name: &'static str,
     pub(super) protocol: &'static str,
-    /// How each of the attacker's connections ended.
+    /// Outcome of each of the attacker's connections.
     pub(super) outcomes: Vec<String>,
     pub(super) took: Duration,
     pub(super) light: LightReport,

@@ -1,4 +1,4 @@
-//! One attack: other clients ask meanwhile, memory is sampled, and afterwards the server must be idle.
+//! One attack: other clients query meanwhile, memory is sampled, and afterwards the server must be idle.
 
 use std::sync::mpsc::channel;
 use std::time::{Duration, Instant};
@@ -7,7 +7,7 @@ use super::super::observed_server::{LightLoad, MemoryWatch, ObservedServer, Quer
 use super::attack_report::{AttackRow, ServerFate};
 use super::{AttackCase, HOSTILE_MEMORY_MB};
 
-/// Other clients ask for so long at least, even if an attack ends at once.
+/// Other clients query for so long at least, even if an attack ends at once.
 const SHORTEST_TRIAL: Duration = Duration::from_secs(1);
 /// From the end of an attack until the server must be idle.
 const SETTLE_TIME: Duration = Duration::from_millis(500);
@@ -68,7 +68,7 @@ impl<'a> AttackTrial<'a> {
         let attacker = self.attacker.clone();
         let (done, outcome) = channel();
         let attack = std::thread::spawn(move || {
-            // Nobody listens any more after the limit; the outcome is returned, too.
+            // After the limit there is no receiver any more; the outcome is returned, too.
             let outcomes = case.run(&attacker);
             let _ = done.send(());
             outcomes
@@ -78,7 +78,7 @@ impl<'a> AttackTrial<'a> {
         attack.join().unwrap_or_else(|_| vec!["panicked".to_owned()])
     }
 
-    // An attack may go on after its end, and kill the server then: it is watched until it is idle.
+    // An attack may have effects after its end, and kill the server then: it is watched until it is idle.
     fn settle(&mut self, watch: &MemoryWatch) -> ServerFate {
         let is_idle = self.server.wait_until_idle(IDLE_LIMIT);
         match self.server.is_alive() {

@@ -21,13 +21,13 @@ use attack_trial::AttackTrial;
 
 /// Megabytes that a hostile client's queries may hold; those of its limits below.
 const HOSTILE_MEMORY_MB: u64 = 1000;
-/// Who attacks. There are many, so that what the server remembers of one does not weaken the next attack.
+/// The attacking clients. There are many, so that the server's memory of one does not weaken the next attack.
 pub(crate) const HOSTILE_CLIENTS: ClientGroup = ClientGroup {
     name: "hostile",
     count: 40,
     limits: "seconds = 10\nmemory_mb = 1000\nrows = 10_000_000\nconcurrent = 4\n",
 };
-/// Who must not notice it.
+/// The clients that must not notice the attacks.
 pub(crate) const LIGHT_CLIENTS: ClientGroup =
     ClientGroup { name: "light", count: 3, limits: "seconds = 30\nmemory_mb = 200\nconcurrent = 4\n" };
 
@@ -36,7 +36,7 @@ pub(crate) struct AttackArgs {
     /// Only attacks with this text in `NAME PROTOCOL`.
     #[arg(long, value_name = "SUBSTRING")]
     only: Option<String>,
-    /// How long an attack goes on.
+    /// Duration of an attack, in seconds.
     #[arg(long, value_name = "SECS", default_value_t = 15.0)]
     seconds: f64,
     /// Seed of which protocol a short selection takes for which attack.

@@ -87,7 +87,7 @@ fn sum(a: Tally, b: Tally) -> Tally {
     }
 }
 
-/// The most memory that this process had at a time, KiB, where the system tells it.
+/// The peak memory of this process, KiB, if the system reports it.
 fn memory() -> Option<u64> {
     let status = std::fs::read_to_string("/proc/self/status").ok()?;
     let line = status.lines().find_map(|l| l.strip_prefix("VmHWM:"))?;

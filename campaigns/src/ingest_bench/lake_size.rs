@@ -1,4 +1,4 @@
-//! How large a lake's tables are against the same numbers without any encoding.
+//! Size of a lake's tables against the same numbers without any encoding.
 
 use std::path::Path;
 

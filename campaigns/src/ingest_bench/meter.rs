@@ -1,4 +1,4 @@
-//! CPU time, wall time and peak memory of this process, as Linux tells them.
+//! CPU time, wall time and peak memory of this process, as Linux reports them.
 
 use std::time::Instant;
 
@@ -44,9 +44,9 @@ impl Meter {
     }
 }
 
-/// Forgets the peak of memory so far, where the system lets it.
+/// Resets the peak of memory, if the system allows it.
 pub(crate) fn forget_peak() {
-    // Where it is refused, the peak is only higher than need be.
+    // If it is refused, the peak is only higher than need be.
     let _ = std::fs::write("/proc/self/clear_refs", "5");
 }
 

@@ -1,5 +1,5 @@
-//! What ingest costs beside what it cannot do without, side by side in one run: the bare transforms, the reference
-//! pipeline in NumPy, the parquet crate alone; and how large a lake becomes.
+//! Cost of ingest beside that of its unavoidable parts, side by side in one run: the bare transforms, the reference
+//! pipeline in NumPy, the parquet crate alone; and the size of a lake.
 //!
 //! With `--quick` it takes less than a minute. Ratios are of CPU time, the least of a few repeats that take turns, so that
 //! other programs disturb them little.
@@ -39,7 +39,7 @@ pub(crate) struct IngestBenchArgs {
     /// Folder of `pipeline.py`.
     #[arg(long, value_name = "DIR", default_value = "../shared/reference")]
     reference: PathBuf,
-    /// Where a temporary folder is made; it should be the disk that the lake would be on.
+    /// Parent of the temporary folder; it should be on the disk that the lake would be on.
     #[arg(long, value_name = "DIR")]
     folder: Option<PathBuf>,
     /// Seed of the simulated rig.

@@ -15,7 +15,7 @@ use parquet::errors::Result as ParquetResult;
 use parquet::file::metadata::ParquetMetaData;
 use parquet::file::properties::{EnabledStatistics, WriterProperties, WriterPropertiesBuilder};
 
-/// The lake's level of zstd and its page size, which its files do not tell.
+/// The lake's level of zstd and its page size, which its files do not record.
 pub(crate) const LEVEL: i32 = 1;
 pub(crate) const PAGE_BYTES: usize = 128 * 1024;
 /// Rows in a batch, about as many as ingest encodes at a time.
@@ -42,7 +42,7 @@ pub(crate) struct Rows {
     pub(crate) raw: u64,
 }
 
-/// How columns of numbers are encoded.
+/// Encoding of columns of numbers.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Numbers {
     /// As in the file.
@@ -112,7 +112,7 @@ pub(crate) fn raw_bytes(metadata: &ParquetMetaData) -> u64 {
     raw.sum()
 }
 
-/// What a file says of how it was written, its numbers' encoding apart; compressed as the lake's files are.
+/// Writer properties as a file records them, its numbers' encoding apart; compressed as the lake's files are.
 pub(crate) fn builder_as(metadata: &ParquetMetaData, numbers: Numbers) -> WriterPropertiesBuilder {
     let mut builder =
         WriterProperties::builder().set_compression(zstd(LEVEL)).set_statistics_enabled(EnabledStatistics::Page);

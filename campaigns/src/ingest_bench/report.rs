@@ -4,7 +4,7 @@ use std::io::Write as _;
 
 use anyhow::Result;
 
-/// What a figure should be.
+/// Limit that a figure should meet.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) enum Goal {
     AtLeast(f64),

@@ -34,7 +34,7 @@ pub(crate) struct Runs {
     pub(crate) panels: Counts,
 }
 
-/// How much is in some runs.
+/// Attempts, accepted measurements and bytes of some runs.
 #[derive(Debug, Clone, Copy, Default)]
 pub(crate) struct Counts {
     pub(crate) attempts: u64,
@@ -117,7 +117,7 @@ impl Order<'_> {
 }
 
 impl Runs {
-    /// Ingests them into a lake of its own, which takes the place of the one before.
+    /// Ingests them into a lake of its own, which replaces the one before.
     pub(crate) async fn ingest(&self, folder: &Path) -> Result<Ingested> {
         if folder.exists() {
             std::fs::remove_dir_all(folder)?;

@@ -25,7 +25,7 @@ const RUNS: usize = 4;
 const SAMPLED: usize = 60;
 /// Samples of a sweep of 0.5 s alone; recordings have a tail.
 const SWEEP_LEN: usize = 48_000;
-/// The clock's ticks are coarse, so the bare transforms go on for this long.
+/// The clock's ticks are coarse, so the bare transforms are repeated for this long.
 const BARE_SECS: f64 = 1.0;
 const PROCESS: &str = include_str!("process.py");
 
@@ -130,7 +130,7 @@ fn transforms(recordings: &[Recording], length: usize) -> Result<f64> {
     Ok(meter.stop()?.cpu / done as f64)
 }
 
-// CPU seconds that the reference pipeline takes a recording, on one core.
+// CPU seconds that the reference pipeline takes per recording, on one core.
 fn reference(args: &IngestBenchArgs, folder: &Path, recordings: &[Recording]) -> Result<f64> {
     let pipeline = args.reference.join("pipeline.py");
     ensure!(pipeline.is_file(), "no `{}`; hint: --reference DIR", pipeline.display());

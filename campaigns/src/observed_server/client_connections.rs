@@ -9,7 +9,7 @@ use std::time::Duration;
 use tokio::runtime::Runtime;
 use tokio::sync::watch;
 
-/// How long a server may take to accept a connection.
+/// Longest time in which a server must accept a connection.
 const CONNECT_LIMIT: Duration = Duration::from_secs(5);
 
 /// Runs what is asynchronous in the clients of all threads.
@@ -42,14 +42,14 @@ impl ClientConnections {
     /// Opens a connection, on which reading and writing have no limit until [`Self::close_all`].
     ///
     /// # Errors
-    /// Nobody accepts it, or all are closed already.
+    /// The connection is not accepted, or all are closed already.
     pub(crate) fn connect(&self, address: &str) -> io::Result<Arc<TcpStream>> {
         if self.is_closed() {
             return Err(io::ErrorKind::ConnectionAborted.into());
         }
         let stream = Arc::new(CLIENT_RUNTIME.block_on(connect_from(self.source, address))?);
         let mut streams = self.streams.lock().unwrap_or_else(PoisonError::into_inner);
-        // Those that nobody else holds are done with.
+        // Drops the streams that only this list still holds.
         streams.retain(|open| Arc::strong_count(open) > 1);
         streams.push(stream.clone());
         // It may have been closed meanwhile.

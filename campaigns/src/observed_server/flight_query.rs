@@ -17,7 +17,7 @@ const LARGEST_MESSAGE: usize = 2 << 30;
 /// A client of Flight SQL.
 pub(crate) type FlightClient = FlightSqlServiceClient<Channel>;
 
-/// Asks a query; rows are compared as CSV, which does not depend on how they are cut into batches.
+/// Runs a query; rows are compared as CSV, which does not depend on how they are cut into batches.
 pub(super) fn query(client: &QueryClient, sql: &str) -> QueryOutcome {
     let mut digest = AnswerDigest::default();
     let answer = client.connections.run(fetch_rows(client, sql, &mut digest));
@@ -31,7 +31,7 @@ pub(super) fn query(client: &QueryClient, sql: &str) -> QueryOutcome {
 /// Connects with the client's token.
 ///
 /// # Errors
-/// Nobody accepts the connection.
+/// The connection is not accepted.
 pub(crate) async fn flight_client(client: &QueryClient) -> Result<FlightClient, tonic::transport::Error> {
     let endpoint = Endpoint::from_shared(format!("http://{}", client.addresses.flight_sql))?;
     let channel = endpoint.local_address(Some(client.connections.source().into())).connect().await?;

@@ -12,14 +12,14 @@ const LARGEST_PROBLEM: u64 = 64 << 10;
 /// Bytes of an answer's head.
 const LARGEST_HEAD: u64 = 64 << 10;
 
-/// What an answer's head says.
+/// Parsed head of an answer.
 struct AnswerHead {
     status: u16,
     /// None if it comes in chunks.
     length: Option<u64>,
 }
 
-/// Asks a query; the answer is CSV.
+/// Runs a query; the answer is CSV.
 pub(super) fn query(client: &QueryClient, sql: &str) -> QueryOutcome {
     let request = Request::post("/api/v1/sql?format=csv", sql).with("content-type", "text/plain");
     send_request(client, request)

@@ -1,4 +1,4 @@
-//! What other clients of an attacked server notice: light queries and `/health`, each at a fixed pace.
+//! Requests of other clients of an attacked server: light queries and `/health`, each at a fixed pace.
 
 use std::io;
 use std::net::Ipv4Addr;
@@ -27,14 +27,14 @@ enum LightProbe {
     Health,
 }
 
-/// What the probes found.
+/// Times and failures of the probes.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct LightReport {
     /// Times of light queries, those that failed included.
     pub(crate) queries: Vec<Duration>,
     /// Times of `/health`.
     pub(crate) health: Vec<Duration>,
-    /// What was not the right answer.
+    /// Answers that were not the right ones.
     pub(crate) failures: Vec<String>,
 }
 

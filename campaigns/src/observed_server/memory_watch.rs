@@ -17,7 +17,7 @@ const MEMORY_CAP_MIB: u64 = 6 << 10;
 pub(crate) struct MemoryPeak {
     pub(crate) door_mib: u64,
     pub(crate) total_mib: u64,
-    /// Whether the processes were killed because they took too much.
+    /// True if the processes were killed because they took too much.
     pub(crate) is_capped: bool,
 }
 

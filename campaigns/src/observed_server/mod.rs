@@ -54,7 +54,7 @@ struct ClientToken {
     token: String,
 }
 
-/// Where each protocol is served.
+/// Addresses of the protocols.
 #[derive(Debug, Clone)]
 pub(crate) struct ServerAddresses {
     pub(crate) http: String,
@@ -69,7 +69,7 @@ pub(crate) struct ObservedServer {
     tokens: Vec<ClientToken>,
     served: Served,
     runs: Vec<String>,
-    /// How often it was restarted.
+    /// Number of restarts.
     pub(crate) restarts: usize,
 }
 

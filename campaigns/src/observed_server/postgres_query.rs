@@ -11,7 +11,7 @@ use super::{QueryClient, QueryOutcome};
 const LARGEST_MESSAGE: u64 = 1 << 20;
 /// Protocol 3.0.
 const PROTOCOL_VERSION: i32 = 196_608;
-/// What a CancelRequest has in place of a version.
+/// Code of a CancelRequest, in place of a version.
 const CANCEL_CODE: i32 = 80_877_102;
 
 /// A session.
@@ -30,7 +30,7 @@ impl io::Read for StreamReader {
     }
 }
 
-/// How a session begins.
+/// First message of a session.
 pub(crate) fn startup_message() -> Vec<u8> {
     let body = [&PROTOCOL_VERSION.to_be_bytes()[..], b"user\0me\0database\0datafusion\0\0"].concat();
     [&message_length(&body)[..], &body].concat()
@@ -82,7 +82,7 @@ impl PostgresClient {
         self.send(&tagged_message(b'Q', &[sql.as_bytes(), b"\0"].concat()))
     }
 
-    /// Reads the answer of what was asked, up to the next ReadyForQuery.
+    /// Reads the answer of the sent messages, up to the next ReadyForQuery.
     pub(crate) fn read_answer(&mut self) -> QueryOutcome {
         let mut digest = AnswerDigest::default();
         let mut failed = None;
@@ -126,12 +126,12 @@ impl PostgresClient {
     }
 }
 
-/// Asks a query by the simple protocol.
+/// Runs a query by the simple protocol.
 pub(super) fn query_simple(client: &QueryClient, sql: &str) -> QueryOutcome {
     query(client, &tagged_message(b'Q', &[sql.as_bytes(), b"\0"].concat()))
 }
 
-/// Asks a query by the extended protocol: Parse, Bind, Describe, Execute, Sync.
+/// Runs a query by the extended protocol: Parse, Bind, Describe, Execute, Sync.
 pub(super) fn query_extended(client: &QueryClient, sql: &str) -> QueryOutcome {
     let messages = [
         tagged_message(b'P', &[b"\0", sql.as_bytes(), b"\0\0\0"].concat()),

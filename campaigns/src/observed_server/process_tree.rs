@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 
 use crate::child::run_command;
 
-/// One clock tick of `/proc/PID/stat`; Linux reports a hundred a second to programs on every machine.
+/// One clock tick of `/proc/PID/stat`; Linux reports a hundred per second to programs on every machine.
 const CLOCK_TICK: Duration = Duration::from_millis(10);
 
 /// A process and all below it.
@@ -134,7 +134,7 @@ fn all_processes() -> Vec<ProcessEntry> {
 
 fn read_process(pid: u32) -> Option<ProcessEntry> {
     let stat = std::fs::read_to_string(format!("/proc/{pid}/stat")).ok()?;
-    // The command's name stands in parentheses and may hold anything.
+    // The command's name is in parentheses and may hold anything.
     let fields: Vec<_> = stat.rsplit_once(')')?.1.split_whitespace().collect();
     let number = |place: usize| fields.get(place).and_then(|field| field.parse::<u64>().ok());
     Some(ProcessEntry {

@@ -1,4 +1,4 @@
-//! A client that asks in SQL over any of the protocols, and tells a whole answer from an error and from neither.
+//! A client that queries in SQL over any of the protocols, and distinguishes a whole answer, an error, and neither.
 
 use std::fmt::{self, Write as _};
 use std::io;
@@ -7,7 +7,7 @@ use std::sync::Arc;
 
 use super::{ClientConnections, ServerAddresses, flight_query, http_query, postgres_query};
 
-/// A way to ask in SQL.
+/// A protocol for queries in SQL.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, clap::ValueEnum)]
 pub(crate) enum QueryProtocol {
     Http,
@@ -35,7 +35,7 @@ impl QueryProtocol {
     }
 }
 
-/// How a query ended.
+/// Outcome of a query.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
 pub(crate) enum QueryOutcome {
     /// A whole answer.
@@ -50,7 +50,7 @@ pub(crate) enum QueryOutcome {
     Abandoned,
 }
 
-/// What tells an answer from another: its size and a hash of it.
+/// Digest that distinguishes answers: size and hash.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Default)]
 pub(crate) struct AnswerDigest {
     pub(crate) bytes: u64,
@@ -111,7 +111,7 @@ impl QueryClient {
         self
     }
 
-    /// Asks a query and reads its answer to the end.
+    /// Runs a query and reads its answer to the end.
     pub(crate) fn query(&self, protocol: QueryProtocol, sql: &str) -> QueryOutcome {
         let outcome = match protocol {
             QueryProtocol::Http => http_query::query(self, sql),

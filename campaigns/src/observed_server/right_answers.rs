@@ -1,4 +1,4 @@
-//! Answers of a server that nobody disturbs, with which later ones are compared.
+//! Answers of an undisturbed server, with which later ones are compared.
 
 use std::collections::BTreeMap;
 

@@ -1,4 +1,4 @@
-//! What an answer holds, in a few numbers that do not depend on the order of its rows.
+//! Contents of an answer in a few numbers that do not depend on the order of its rows.
 
 use anyhow::Result;
 use arrow::array::{Array, ArrayRef, AsArray as _};
@@ -6,7 +6,7 @@ use arrow::compute::{cast, sum};
 use arrow::datatypes::{DataType, Float64Type, Int32Type, Int64Type};
 use arrow::record_batch::RecordBatch;
 
-/// How far sums of floats in different orders may differ, relatively.
+/// Relative tolerance for sums of floats in different orders.
 const TOLERANCE: f64 = 1e-9;
 
 /// Rows, and of each column the sum of its numbers or of its texts' lengths.
@@ -29,7 +29,7 @@ impl Digest {
         Ok(Self { rows, sums })
     }
 
-    /// Whether two answers are the same but for rounding.
+    /// Returns whether two answers are the same but for rounding.
     pub(crate) fn agrees(&self, other: &Self) -> bool {
         let near = |a: &f64, b: &f64| (a - b).abs() <= TOLERANCE * a.abs().max(b.abs()).max(1.0);
         self.rows == other.rows

@@ -1,4 +1,4 @@
-//! The peer: DuckDB in a Python process, asked over its pipes.
+//! The peer: DuckDB in a Python process, queried over its pipes.
 
 use std::io::{BufRead as _, BufReader, Write as _};
 use std::path::Path;
@@ -9,7 +9,7 @@ use serde_json::{Value, json};
 
 use super::digest::Digest;
 
-/// Where the script stands.
+/// Path of the script.
 const SCRIPT: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../tests/clients/duckdb_peer.py");
 
 /// A running DuckDB.

@@ -4,9 +4,9 @@
 pub(crate) struct Query {
     /// Short name.
     pub(crate) name: &'static str,
-    /// What echolake is asked.
+    /// Query for echolake.
     pub(crate) sql: String,
-    /// What DuckDB is asked, where its tables need other words for the same rows.
+    /// Query for DuckDB, if its tables need other words for the same rows.
     pub(crate) peer: Option<String>,
 }
 

@@ -23,7 +23,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let descriptors = protox::compile(FILES, [schema.join("proto")])?;
     let compiled = tempfile::tempdir()?;
     std::fs::write(compiled.path().join("echolake.v1.fds"), descriptors.encode_to_vec())?;
-    // Samples stay where they are in what a message is decoded from.
+    // Decoded samples share the buffer that a message is decoded from.
     prost_build::Config::new().bytes(["."]).out_dir(compiled.path()).compile_fds(descriptors)?;
     for entry in std::fs::read_dir(compiled.path())? {
         let new = entry?;

@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use arrow_schema::{DataType, Field, TimeUnit};
 
-/// Key of a field's metadata: the unit, empty where the column has none.
+/// Key of a field's metadata: the unit, empty if the column has none.
 pub const UNIT: &str = "unit";
 /// Key of a field's metadata: what the column means. Spark and Delta show it as the column's comment.
 pub const COMMENT: &str = "comment";

@@ -17,29 +17,29 @@ use crate::Rig;
 /// A table of the lake.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum Table {
-    /// A row a surface and run of it.
+    /// One row per run, with its record of the surface.
     Surfaces,
-    /// A row a run; what it names is what readers see.
+    /// One row per run; readers see only the rows of runs that it names.
     Runs,
-    /// A row a grid point.
+    /// One row per grid point.
     Points,
-    /// A row a pair.
+    /// One row per pair.
     Pairs,
-    /// A row an accepted measurement, with its impulse response.
+    /// One row per accepted measurement, with its impulse response.
     Measurements,
-    /// A row a measurement: its reflected response and its cumulative energy curves.
+    /// One row per measurement: its reflected response and its cumulative energy curves.
     Nce,
-    /// A row a measurement: its energies.
+    /// One row per measurement: its energies.
     Tnce,
-    /// A row a measurement and symmetry: its energies, moved.
+    /// One row per measurement and symmetry: energies with transformed positions.
     TnceD4,
-    /// A row a surface and symmetry.
+    /// One row per surface and symmetry.
     Heightmaps,
-    /// A row a reading of the ambient sensor.
+    /// One row per reading of the ambient sensor.
     Environment,
-    /// A row a line of a run's log.
+    /// One row per line of a run's log.
     Events,
-    /// A row a surface and band.
+    /// One row per surface and band.
     SurfaceStats,
 }
 
@@ -83,7 +83,7 @@ impl Table {
         Self::ALL.into_iter().find(|t| t.name() == name)
     }
 
-    /// Where its rows come from.
+    /// Source of its rows.
     pub fn source(self) -> Source {
         match self {
             Self::Points | Self::Pairs => Source::Rig,
@@ -103,16 +103,16 @@ impl Table {
     pub const HEIGHTMAP_CELLS: usize = 128;
 }
 
-/// Where a table's rows come from, and so when they change.
+/// Source of a table's rows, which decides when they change.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Source {
-    /// The rig alone: written once a lake.
+    /// The rig alone: written once per lake.
     Rig,
     /// One run alone.
     Run,
-    /// One run and the references of its surface: written anew when a reference changes.
+    /// One run and the references of its surface: rewritten when a reference changes.
     References,
-    /// The table that says what of the others is visible.
+    /// The table that decides which rows of the others are visible.
     Pointer,
 }
 

@@ -1,4 +1,4 @@
-//! What the lake asks of a commit log. Delta stands behind it; see `delta.rs`.
+//! Commit log of a lake's tables, as a trait. Delta implements it; see `delta.rs`.
 
 use std::collections::{HashMap, HashSet};
 use std::ops::Range;
@@ -21,11 +21,11 @@ pub struct DataFile {
     pub bytes: u64,
     /// Rows.
     pub rows: u64,
-    /// When it was made.
+    /// Time at which it was made.
     pub modified: DateTime<Utc>,
-    /// Least and greatest values, where the log has them.
+    /// Least and greatest values, if the log has them.
     pub stats: Option<FileStats>,
-    /// Where it was merged from files of several runs: those, in the order of their rows, which are contiguous.
+    /// If it was merged from files of several runs: their parts, in the order of their rows, which are contiguous.
     pub parts: Vec<Part>,
     /// The runs of parts that a snapshot does not show; empty as the log gives it.
     pub hidden: Vec<RunId>,
@@ -40,7 +40,7 @@ pub struct Part {
     pub run: RunId,
     /// Digest of what the rows were made from.
     pub derivation: String,
-    /// How many they are.
+    /// Number of its rows.
     pub rows: u64,
 }
 
@@ -51,7 +51,7 @@ impl DataFile {
         self.rows.saturating_sub(hidden)
     }
 
-    /// The parts that readers see, each with where its rows stand in the file.
+    /// The parts that readers see, each with the range of its rows in the file.
     pub fn visible_parts(&self) -> impl Iterator<Item = (&Part, Range<u64>)> {
         let mut end = 0;
         let placed = self.parts.iter().map(move |part| {
@@ -81,28 +81,28 @@ pub struct NewFile {
     pub bytes: u64,
     /// Delta's statistics, JSON.
     pub stats: String,
-    /// What it takes the place of, where it does.
+    /// The files that it replaces, if it replaces any.
     pub replaces: Option<Replaces>,
-    /// What it was merged from, where it was.
+    /// The parts that it was merged from, if it was merged.
     pub parts: Vec<Part>,
 }
 
-/// The files that a new one takes the place of. Where others stand there by now, it is not added.
+/// The files that a new one replaces. If other files have taken their place, the new one is not added.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Replaces {
-    /// What the names of all files in that place begin with; None where the names alone are the place.
+    /// Beginning of the names of all files in that place; None if the names alone are the place.
     pub prefix: Option<String>,
     /// The names that are expected there; they go with the same commit.
     pub names: Vec<String>,
 }
 
-/// What a commit is to a reader that follows a table.
+/// Effect of a commit on a reader that follows a table.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Effect {
     /// Rows come or go.
     #[default]
     Rows,
-    /// The same rows stand in other files.
+    /// The same rows are in other files.
     Layout,
 }
 
@@ -113,7 +113,7 @@ pub struct Commit {
     pub add: Vec<NewFile>,
     /// Files that go; one that is already gone is passed over.
     pub remove: Vec<Path>,
-    /// What it is to readers.
+    /// Its effect on readers.
     pub effect: Effect,
 }
 
@@ -126,7 +126,7 @@ pub struct History {
     pub removed: HashMap<String, DateTime<Utc>>,
 }
 
-/// What became of a new file.
+/// Outcome of adding a new file.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Committed {
     /// It is in the log now.
@@ -140,23 +140,23 @@ pub enum Committed {
 /// A log of each table's files, with atomic commits of one table.
 #[async_trait]
 pub trait CommitLog: Send + Sync + std::fmt::Debug {
-    /// Makes the table where it is missing.
+    /// Makes the table if it is missing.
     async fn ensure(&self, table: Table) -> Result<()>;
-    /// The table's files as of now; none where there is no table.
+    /// The table's files as of now; none if there is no table.
     async fn files(&self, table: Table) -> Result<Vec<DataFile>>;
-    /// The table's newest version; None where there is no table.
+    /// The table's newest version; None if there is no table.
     async fn version(&self, table: Table) -> Result<Option<u64>>;
-    /// Whether there is a version after this one. One look at the store; where the log was cleaned up since, it may
-    /// not see what [`CommitLog::version`] sees.
+    /// Returns whether there is a version after this one, in one request to the store; if the log was cleaned up since,
+    /// it may not see what [`CommitLog::version`] sees.
     async fn has_after(&self, table: Table, version: u64) -> Result<bool>;
     /// The versions that the log still holds, oldest first.
     async fn versions(&self, table: Table) -> Result<Vec<TableVersion>>;
     /// The table's files as of a version that the log still holds.
     async fn files_at(&self, table: Table, version: u64) -> Result<Vec<DataFile>>;
-    /// Whether a file of this name is in the log.
+    /// Returns whether a file of this name is in the log.
     async fn has(&self, table: Table, name: &str) -> Result<bool>;
-    /// What the log names and named; None where there is no log.
+    /// Names of the current and the removed files; None if there is no log.
     async fn history(&self, table: Table) -> Result<Option<History>>;
-    /// Makes a change; says for each new file, in order, what became of it. The same change again adds nothing.
+    /// Makes a change; returns the outcome of each new file, in order. Repeating the same change adds nothing.
     async fn commit(&self, table: Table, commit: &Commit) -> Result<Vec<Committed>>;
 }

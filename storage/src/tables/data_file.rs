@@ -57,7 +57,7 @@ impl FileEncoder {
     /// Adds rows.
     ///
     /// # Errors
-    /// [`Error::Encode`] where the batch does not have the table's schema.
+    /// [`Error::Encode`] if the batch does not have the table's schema.
     pub fn write(&mut self, batch: &RecordBatch) -> Result<()> {
         let table = self.table;
         self.stats.add(batch);
@@ -97,10 +97,10 @@ fn failed(table: Table, error: ParquetError) -> Error {
     Error::Encode { table: table.name(), reason: error.to_string() }
 }
 
-/// Encodes rows that are all there.
+/// Encodes rows that are all in memory.
 ///
 /// # Errors
-/// [`Error::Encode`] where the batches do not have the table's schema.
+/// [`Error::Encode`] if the batches do not have the table's schema.
 pub fn encode(table: Table, schema: &SchemaRef, batches: &[RecordBatch]) -> Result<EncodedFile> {
     let mut encoder = FileEncoder::new(table, schema.clone());
     batches.iter().try_for_each(|batch| encoder.write(batch))?;
@@ -110,7 +110,7 @@ pub fn encode(table: Table, schema: &SchemaRef, batches: &[RecordBatch]) -> Resu
 // Samples do not repeat, so a dictionary only costs; their bytes by significance compress best
 // (measured on dB spectra: 0.74 of raw f32 against 1.00 with the defaults).
 //
-// Numbers that stand alone and do not repeat (zstd makes them an eighth smaller) are not compressed: a reader makes a
+// Single numbers that do not repeat (zstd makes them an eighth smaller) are not compressed: a reader makes a
 // decompressor for each column of each file, which takes longer than reading three thousand of them.
 fn properties(table: Table, schema: &SchemaRef, first: &RecordBatch) -> WriterProperties {
     let (rows, bytes) = (first.num_rows(), first.get_array_memory_size());
@@ -163,7 +163,7 @@ struct ColumnStats {
     nulls: usize,
     /// None before the first batch with a value.
     extremes: Option<(Value, Value)>,
-    /// A batch had no extremes that can be told, so the file has none either.
+    /// A batch had no extremes that are known, so the file has none either.
     unknown: bool,
 }
 

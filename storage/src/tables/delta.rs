@@ -98,7 +98,7 @@ impl DeltaLog {
     }
 }
 
-/// What is left to do of a commit in one version of a table.
+/// The rest of a commit that one version of a table still lacks.
 struct Change<'a> {
     outcomes: Vec<Committed>,
     add: Vec<&'a NewFile>,
@@ -185,7 +185,7 @@ impl CommitLog for DeltaLog {
             LogLine { protocol: Some(own_protocol()), ..LogLine::default() },
             LogLine { meta_data: Some(metadata), ..LogLine::default() },
         ];
-        // If the number is taken, somebody else made the table at the same moment.
+        // If the number is taken, another process made the table at the same moment.
         self.log_folder(table).write_commit(0, &lines).await.map(drop)
     }
 

@@ -1,7 +1,7 @@
-//! The maintenance lease: one object that says who is at work on the lake's files.
+//! The maintenance lease: one object that names the process at work on the lake's files.
 //!
-//! It keeps two from doing the same work, and tells the second one who the first is. That no row is lost or doubled
-//! does not rest on it: a merge is a commit of its own, which fails where another was faster.
+//! It keeps two processes from doing the same work, and the error of the second one names the first. Correctness does
+//! not depend on it: a merge is a commit of its own, which fails if another was faster.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -13,9 +13,9 @@ use serde::{Deserialize, Serialize};
 
 use crate::{Error, Lake, Result};
 
-/// Where it stands.
+/// Path of the lease's object.
 const PATH: &str = "tables/_maintenance.json";
-/// How long it holds after its last renewal. A dead holder blocks others that long.
+/// Time that it holds after its last renewal. A dead holder blocks others that long.
 const HOLDS: TimeDelta = TimeDelta::minutes(10);
 /// Time between two renewals.
 const RENEW_EVERY: Duration = Duration::from_secs(60);
@@ -29,10 +29,10 @@ pub(crate) struct Lease {
     renewed: Instant,
 }
 
-/// What stands in the object.
+/// Contents of the object.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 struct Record {
-    /// Tells apart all that ever held it.
+    /// Distinguishes all that ever held it.
     holder: String,
     host: String,
     pid: u32,
@@ -53,10 +53,10 @@ impl Record {
 }
 
 impl Lease {
-    /// Takes it; one that has run out is taken over.
+    /// Acquires the lease; an expired one is taken over.
     ///
     /// # Errors
-    /// [`Error::Maintained`] where somebody else holds it, or what the store says.
+    /// [`Error::Maintained`] if another process holds it, or what the store says.
     pub(crate) async fn take(lake: &Lake) -> Result<Self> {
         let (store, location, record) = (lake.store(), lake.location().to_owned(), Record::new());
         let path = Path::from(PATH);
@@ -82,10 +82,10 @@ impl Lease {
         }
     }
 
-    /// Makes sure that it is still held, and renews it now and then.
+    /// Checks that it is still held, and renews it if [`RENEW_EVERY`] has passed.
     ///
     /// # Errors
-    /// [`Error::LeaseLost`] where somebody else has taken it over, or what the store says.
+    /// [`Error::LeaseLost`] if another process has taken it over, or what the store says.
     pub(crate) async fn keep(&mut self) -> Result<()> {
         let held = read(self.store.as_ref()).await?;
         if held.is_none_or(|held| held.holder != self.record.holder) {

@@ -34,8 +34,8 @@ pub struct Staged {
 }
 
 impl Staged {
-    /// Makes a run's row take the place of the rows that are there, which are these files or none. Where others stand
-    /// there by the time of the commit, it is [`Committed::Outdated`].
+    /// Makes a run's row replace its present rows, which are these files or none. If there are others by the time of
+    /// the commit, the outcome is [`Committed::Outdated`].
     #[must_use]
     pub fn replacing<'a>(mut self, run: &VisibleRun, old: impl IntoIterator<Item = &'a DataFile>) -> Self {
         let names = old.into_iter().filter_map(|f| f.path.filename()).map(str::to_owned).collect();
@@ -68,7 +68,7 @@ impl Lake {
     /// The rows of table `pairs`, which follow from the rig: row i is pair i.
     ///
     /// # Errors
-    /// [`Error::Encode`] where the rig has no such columns, which is a mistake in this crate.
+    /// [`Error::Encode`] if the rig has no such columns, which is a mistake in this crate.
     pub fn pairs(&self) -> Result<RecordBatch> {
         rig_tables::pairs(self.rig(), self.grid())
     }
@@ -76,12 +76,12 @@ impl Lake {
     /// A frozen view of what readers may see.
     ///
     /// # Errors
-    /// [`Error::Log`] where a table's log is damaged.
+    /// [`Error::Log`] if a table's log is damaged.
     pub async fn snapshot(&self) -> Result<Snapshot> {
         Snapshot::take(self.log()).await
     }
 
-    /// Puts a file's bytes into the store, for a commit to name. Nobody sees them before that.
+    /// Puts a file's bytes into the store, for a commit to name. No reader sees them before that.
     ///
     /// # Errors
     /// What the store says.
@@ -93,24 +93,25 @@ impl Lake {
         Ok(Staged { table, file: NewFile { name, bytes, stats, replaces: None, parts: Vec::new() } })
     }
 
-    /// Whether a file of this name is in the table.
+    /// Returns whether a file of this name is in the table.
     ///
     /// # Errors
-    /// [`Error::Log`] where the table's log is damaged.
+    /// [`Error::Log`] if the table's log is damaged.
     pub async fn has(&self, table: Table, name: &FileName) -> Result<bool> {
         self.log().has(table, &name.compose()).await
     }
 
-    /// Commits staged files, each of their tables once, all of them side by side but `runs`, which is last: from that commit on readers see them.
-    /// Returns what became of each file, in the given order. The same files again add nothing.
+    /// Commits staged files, once per table. All tables commit concurrently except `runs`, which is last: from that
+    /// commit on readers see the files. Returns the outcome of each file, in the given order. Repeating the call adds
+    /// nothing.
     ///
     /// # Errors
-    /// What the store says. Tables that were committed before stay so, seen by nobody; the same call goes on.
+    /// What the store says. Tables that were committed before stay so, unseen by readers; repeating the call resumes.
     pub async fn commit(&self, staged: &[Staged]) -> Result<Vec<Committed>> {
         let mut outcomes = vec![Committed::Before; staged.len()];
         let (pointers, others): (Vec<_>, Vec<_>) = Table::ALL.into_iter().partition(|table| *table == Table::Runs);
         for tables in [others, pointers] {
-            // Each is brought to its end, whatever becomes of the others.
+            // Each runs to its end, even if another fails.
             for done in join_all(tables.into_iter().map(|table| self.commit_table(table, staged))).await {
                 done?.into_iter().for_each(|(i, outcome)| outcomes[i] = outcome);
             }
@@ -118,7 +119,7 @@ impl Lake {
         Ok(outcomes)
     }
 
-    // What became of the files of one table, each with its place among all.
+    // Returns the outcome of each file of one table, with its index among all.
     async fn commit_table(&self, table: Table, staged: &[Staged]) -> Result<Vec<(usize, Committed)>> {
         let of: Vec<_> = (0..staged.len()).filter(|i| staged[*i].table == table).collect();
         if of.is_empty() {
@@ -129,10 +130,10 @@ impl Lake {
         Ok(of.into_iter().zip(done).collect())
     }
 
-    /// Puts rows into a table, once: the same name again adds nothing.
+    /// Puts rows into a table, once: repeating it with the same name adds nothing.
     ///
     /// # Errors
-    /// [`Error::Encode`] where the rows do not fit the table, or what the store says.
+    /// [`Error::Encode`] if the rows do not fit the table, or what the store says.
     pub async fn append_rows(&self, table: Table, name: &FileName, batches: &[RecordBatch]) -> Result<Committed> {
         if self.has(table, name).await? {
             return Ok(Committed::Before);
@@ -141,8 +142,8 @@ impl Lake {
         Ok(self.commit(&[staged]).await?[0])
     }
 
-    /// Takes out of the logs what no run's row names any more; merged files are written anew without it. The files
-    /// stay for readers that hold older views.
+    /// Removes from the logs all files that no run's row names any more; merged files are rewritten without such rows.
+    /// The files themselves stay for readers that hold older views.
     ///
     /// # Errors
     /// What the store says.

@@ -1,8 +1,8 @@
-//! Merges small files of a table into large ones. What readers see does not change, nor does how rows are stored.
+//! Merges small files of a table into large ones. Neither the rows that readers see nor their storage format changes.
 //!
 //! A merged file's Add lists its parts, (surface, run, derivation) each with its number of rows; a snapshot decides
-//! over every part as it would over a file of its own. `runs` and `surfaces` stay a file a run: ingest reads them by
-//! name and by their statistics, and all of them together are small.
+//! over every part as it would over a file of its own. `runs` and `surfaces` keep one file per run: ingest reads them
+//! by name and by their statistics, and all of them together are small.
 
 use std::sync::atomic::{AtomicBool, Ordering};
 
@@ -16,13 +16,12 @@ use crate::{
     Commit, Committed, DataFile, Effect, Error, FileEncoder, FileName, Lake, Part, Replaces, Result, Snapshot,
 };
 
-/// Size that files are merged to where nothing else is said: few enough for a million responses, small enough to be
-/// held in memory.
+/// Default size that files are merged to: few enough for a million responses, small enough to be held in memory.
 pub const TARGET_BYTES: u64 = 128 << 20;
 /// Hex digits that a name keeps of its digest.
 const DIGEST_DIGITS: usize = 16;
 
-/// How far the work has come.
+/// Progress of a merge.
 #[derive(Debug, Clone, Copy)]
 pub struct Merging {
     /// The table at work.
@@ -33,7 +32,7 @@ pub struct Merging {
     pub total: usize,
 }
 
-/// What became of the lake.
+/// Report of merging a lake's files.
 #[derive(Debug, Clone, Default, Serialize)]
 pub struct Optimized {
     /// The tables that were changed.
@@ -42,7 +41,7 @@ pub struct Optimized {
     pub stopped: bool,
 }
 
-/// What became of a table.
+/// Report of merging a table's files.
 #[derive(Debug, Clone, Serialize)]
 pub struct TableOptimized {
     /// Its name.
@@ -51,7 +50,7 @@ pub struct TableOptimized {
     pub merged: usize,
     /// Their bytes.
     pub bytes_before: u64,
-    /// Files that stand in their place.
+    /// Files that replaced them.
     pub files: usize,
     /// Their bytes.
     pub bytes_after: u64,
@@ -60,10 +59,10 @@ pub struct TableOptimized {
 }
 
 impl Lake {
-    /// Merges small files under the maintenance lease. Ingest and readers may go on.
+    /// Merges small files under the maintenance lease. Ingest and readers may continue.
     ///
     /// # Errors
-    /// [`Error::Maintained`] where somebody else is at it, [`Error::LeaseLost`], [`Error::DataFile`], or what the
+    /// [`Error::Maintained`] if another process holds the lease, [`Error::LeaseLost`], [`Error::DataFile`], or what the
     /// store says. What was merged before stays so.
     pub async fn optimize(
         &self,
@@ -115,7 +114,7 @@ impl Lake {
         Ok(report)
     }
 
-    /// Writes a merged file anew without what is superseded in it. Where another did so meanwhile, nothing changes.
+    /// Rewrites a merged file without its superseded rows. If another writer did so meanwhile, nothing changes.
     pub(crate) async fn rewrite(&self, table: Table, file: &DataFile) -> Result<Committed> {
         let (outcome, _) = self.merge(table, std::slice::from_ref(file), Effect::Rows, None).await?;
         Ok(outcome)
@@ -162,7 +161,7 @@ impl Lake {
     }
 }
 
-/// A run's rows, and where they stand.
+/// A run's rows, and their range in a file.
 struct Slice<'a> {
     file: &'a DataFile,
     part: Part,

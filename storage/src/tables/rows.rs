@@ -19,7 +19,7 @@ use parquet::file::metadata::{PageIndexPolicy, ParquetMetaData, ParquetMetaDataR
 
 use crate::{DataFile, Error, Lake, Result};
 
-/// Rows a batch: those of six curves of 384 samples each make 9 MB.
+/// Rows per batch: those of six curves of 384 samples each make 9 MB.
 const BATCH_ROWS: usize = 1024;
 /// Bytes of a file's end that are read at once: footer and page index of most files.
 const FOOTER_BYTES: usize = 64 * 1024;
@@ -55,7 +55,7 @@ impl Lake {
     /// Rows of a file, by their places in it, with the named columns or all. Pages of other rows are not fetched.
     ///
     /// # Errors
-    /// [`Error::DataFile`] where the file is not what its log says, also in the stream.
+    /// [`Error::DataFile`] if the file is not what its log says, also in the stream.
     pub async fn rows(
         &self,
         table: Table,

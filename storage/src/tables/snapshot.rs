@@ -1,4 +1,4 @@
-//! What a reader may see: a frozen view of every table, cut down to what `runs` names.
+//! The part of a lake that a reader may see: a frozen view of every table, cut down to what `runs` names.
 //!
 //! Delta commits one table at a time, so a run's rows are committed before its `runs` row. The file of that
 //! row carries in its name the derivations that are current; files of other derivations are not seen.
@@ -13,7 +13,7 @@ use serde_json::{Value, json};
 
 use crate::{CommitLog, DataFile, Part, Result};
 
-/// What the name of a file in `tables/` says.
+/// Parsed name of a file in `tables/`.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum FileName {
     /// Rows that come from the rig alone.
@@ -53,7 +53,7 @@ pub struct VisibleRun {
 }
 
 impl VisibleRun {
-    /// What the names of all of the run's rows in `runs` begin with.
+    /// Common beginning of the names of all of the run's rows in `runs`.
     pub(crate) fn prefix(&self) -> String {
         format!("{}.{}.", self.surface, self.run)
     }
@@ -94,7 +94,7 @@ impl FileName {
         }
     }
 
-    /// Reads a name; None where it is none of ours.
+    /// Parses a name; None if it is not one of ours.
     pub fn parse(path: &Path) -> Option<Self> {
         let parts: Vec<_> = path.filename()?.strip_suffix(EXTENSION)?.split('.').collect();
         match parts[..] {
@@ -141,7 +141,7 @@ impl Snapshot {
     }
 
     /// The version of a table's log that the view was taken of, or a little before it; that of `runs` is the lake's.
-    /// None where there was no table, and for views of the past.
+    /// None if there was no table, and for views of the past.
     pub fn version(&self, table: Table) -> Option<u64> {
         self.versions.get(&table).copied()
     }
@@ -151,8 +151,8 @@ impl Snapshot {
         self.files.get(&table).map_or(&[], Vec::as_slice)
     }
 
-    /// The files of a table that belong to a run that readers see, but are no longer seen themselves. Those that are
-    /// newer than the run's row may be about to be named by another ingest, and are none of them.
+    /// The files of a table that belong to a run that readers see, but are no longer seen themselves. Excludes files
+    /// newer than the run's row: a concurrent ingest may be about to commit them.
     pub fn superseded(&self, table: Table) -> &[DataFile] {
         self.hidden.get(&table).map_or(&[], Vec::as_slice)
     }
@@ -266,7 +266,7 @@ fn run_of(file: &DataFile) -> Option<RunId> {
     }
 }
 
-/// Whether a file of this name was merged from several.
+/// Returns whether a file of this name was merged from several.
 pub(crate) fn is_merged(name: &str) -> bool {
     matches!(FileName::parse(&Path::from(name)), Some(FileName::Merged { .. }))
 }
@@ -277,7 +277,7 @@ pub(crate) fn encode_parts(parts: &[Part]) -> String {
     Value::Array(parts.iter().map(one).collect()).to_string()
 }
 
-/// The parts of such a text; None where it is none.
+/// Decodes the parts from such a text; None if it is none.
 pub(crate) fn decode_parts(text: &str) -> Option<Vec<Part>> {
     let parts: Vec<(String, u64)> = serde_json::from_str(text).ok()?;
     let one = |(name, rows): (String, u64)| match FileName::parse(&Path::from(name))? {
@@ -295,7 +295,7 @@ impl Part {
     }
 }
 
-// A surface that was measured twice is still one surface: its newest run tells what it is.
+// A surface that was measured twice is still one surface: its newest run describes it.
 fn one_a_surface(table: Table) -> bool {
     matches!(table, Table::Surfaces | Table::Heightmaps)
 }

@@ -14,24 +14,24 @@ use crate::tables::delta::folder;
 use crate::tables::lease::Lease;
 use crate::{Error, History, Lake, Result};
 
-/// Hours for which a file is kept after it went out of its table, where nothing else is said, and at most: Delta's
-/// log forgets after a week when that was.
+/// Hours for which a file is kept after it left its table, by default and at most: Delta's log forgets the time of
+/// removal after a week.
 pub const KEEP_HOURS: u32 = 168;
-/// What no log ever named may be about to be named: an ingest writes files first and commits them within minutes.
+/// Least age for deleting a file that no log ever named: an ingest writes files first and commits them within minutes.
 const BEFORE_COMMIT: TimeDelta = TimeDelta::hours(1);
 /// Folder of recordings that are copied in.
 const INBOX: &str = "inbox";
 
-/// Whether files are deleted.
+/// Choice between deleting files and listing them.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Deletion {
-    /// They are.
+    /// Files are deleted.
     Real,
-    /// They are only told.
+    /// Files are only reported.
     Pretended,
 }
 
-/// What was deleted, or would be.
+/// The files that were deleted, or would be.
 #[derive(Debug, Clone, Default, Serialize)]
 pub struct Vacuumed {
     /// The files.
@@ -51,7 +51,7 @@ pub struct Freed {
     place: Place,
 }
 
-/// How a file is reached.
+/// Access to a file: by the store or by the local file system.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
 enum Place {
     Store(Path),
@@ -60,11 +60,11 @@ enum Place {
 }
 
 impl Lake {
-    /// Deletes, under the maintenance lease, files of tables that went out of their table longer ago than `keep`,
-    /// and what crashes left behind. `runs/` is not looked at.
+    /// Deletes, under the maintenance lease, files that left their table longer ago than `keep`, and temporary and
+    /// uncommitted files that crashes left behind. Files in `runs/` are not touched.
     ///
     /// # Errors
-    /// [`Error::Maintained`] where somebody else is at it, [`Error::LeaseLost`], [`Error::Log`] where a log is
+    /// [`Error::Maintained`] if another process holds the lease, [`Error::LeaseLost`], [`Error::Log`] if a log is
     /// damaged, or what the store says. What was deleted before is so.
     pub async fn vacuum(
         &self,
@@ -112,7 +112,7 @@ impl Lake {
         for table in Table::ALL {
             let there = self.store().list_with_delimiter(Some(&folder(table))).await;
             let there = there.map_err(|e| Error::store("list", folder(table), e))?;
-            // Without a log nothing tells what the files are.
+            // Without a log, nothing says what the files are.
             let Some(history) = self.log().history(table).await? else { continue };
             for meta in there.objects {
                 if is_left_over(&history, &meta.location, |gone| is_over(meta.last_modified, gone, now, keep)) {
@@ -155,7 +155,7 @@ fn is_left_over(history: &History, path: &Path, is_over: impl Fn(Option<DateTime
         && is_over(history.removed.get(name).copied())
 }
 
-// A file that is younger than its removal was written anew, for a commit that is still to come.
+// A file that was modified after its removal was rewritten, for a commit that is still pending.
 fn is_over(modified: DateTime<Utc>, gone: Option<DateTime<Utc>>, now: DateTime<Utc>, keep: TimeDelta) -> bool {
     match gone {
         Some(gone) if gone >= modified => now - gone >= keep,

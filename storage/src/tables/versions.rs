@@ -1,6 +1,6 @@
-//! Looking back: which versions a table's log still holds, and the lake as it was at one of them.
+//! Time travel: the versions that a table's log still holds, and the lake as it was at one of them.
 //!
-//! The lake's version is that of its table `runs`, because that is what tells the rest. The other tables are seen as of
+//! The lake's version is that of its table `runs`, because `runs` decides the rest. The other tables are seen as of
 //! the time of that version; whatever it names was committed before it.
 
 use std::str::FromStr;
@@ -19,7 +19,7 @@ use crate::{Error, Lake, Result, Snapshot};
 const COMMIT_HEAD: u64 = 4096;
 /// Formats of times beside RFC 3339.
 const TIMES: [&str; 4] = ["%Y-%m-%dT%H:%M:%S%.f", "%Y-%m-%d %H:%M:%S%.f", "%Y-%m-%dT%H:%M", "%Y-%m-%d %H:%M"];
-/// Commits that are looked at together.
+/// Commits that are read concurrently.
 const TOGETHER: usize = 16;
 
 /// One version of a table, and when it was committed.
@@ -27,7 +27,7 @@ const TOGETHER: usize = 16;
 pub struct TableVersion {
     /// Its number.
     pub version: u64,
-    /// When it was committed, or any version before it where a writer's clock was ahead.
+    /// Time of its commit, or of an earlier version's if that writer's clock was ahead.
     pub committed: DateTime<Utc>,
 }
 
@@ -36,7 +36,7 @@ pub struct TableVersion {
 pub enum Moment {
     /// A version of the lake, that of its table `runs`.
     Version(u64),
-    /// What was current at a time.
+    /// The newest version at a time.
     Time(DateTime<Utc>),
 }
 
@@ -86,7 +86,7 @@ impl Lake {
     /// One table as readers saw it at a moment.
     ///
     /// # Errors
-    /// [`Error::NoMoment`] where the log does not hold it, [`Error::Vacuumed`] where files of it are deleted.
+    /// [`Error::NoMoment`] if the log does not hold it, [`Error::Vacuumed`] if files of it are deleted.
     pub async fn snapshot_at(&self, moment: Moment, table: Table) -> Result<Snapshot> {
         let versions = self.versions().await?;
         let found = match moment {
@@ -135,7 +135,7 @@ fn no_moment(moment: Moment, versions: &[TableVersion]) -> Error {
     Error::NoMoment { moment: moment.to_string(), held }
 }
 
-/// The versions whose commits stand in a table's log folder, oldest first.
+/// The versions whose commits are in a table's log folder, oldest first.
 pub(crate) async fn listed(store: &dyn ObjectStore, table: Table) -> Result<Vec<TableVersion>> {
     let folder = folder(table).join("_delta_log");
     let there = store.list_with_delimiter(Some(&folder)).await.map_err(|e| Error::store("list", &folder, e))?;

@@ -1,4 +1,4 @@
-//! Single calls that take long: nothing asks in their midst whether they may go on.
+//! Single calls that take long: they do not check for cancellation while they run.
 
 use super::{SqlAttack, attack, numbered};
 

@@ -1,4 +1,4 @@
-//! The lake's own tables, catalogues and run files, asked again and again in one statement.
+//! The lake's own tables, catalogues and run files, read many times in one statement.
 
 use super::{SqlAttack, attack, numbered};
 

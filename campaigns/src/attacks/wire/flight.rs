@@ -1,4 +1,4 @@
-//! Attacks on gRPC and the HTTP/2 below it. Frames are made by hand, because clients do not send such ones.
+//! Attacks on gRPC and the HTTP/2 below it. The frames are built here, because client libraries send no invalid ones.
 
 use super::super::super::observed_server::QueryClient;
 use super::{WireAttack, WireFlow, WirePort};

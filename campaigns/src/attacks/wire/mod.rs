@@ -15,10 +15,10 @@ pub(crate) use uploads::UploadAttack;
 
 /// Between two bytes of those that come slowly.
 const DRIP_EVERY: Duration = Duration::from_millis(100);
-/// Bytes of an answer that are kept, to tell what it is.
+/// Bytes of an answer that are kept, to classify it.
 const KEPT_BYTES: usize = 4096;
 
-/// Which protocol is attacked.
+/// The attacked protocol.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum WirePort {
     Http,
@@ -31,7 +31,7 @@ type BytesMaker = fn(&QueryClient) -> Vec<u8>;
 /// Makes the block of a number.
 type BlockMaker = fn(&QueryClient, usize) -> Vec<u8>;
 
-/// What follows the first bytes of a connection.
+/// Traffic that follows the first bytes of a connection.
 #[derive(Debug, Clone, Copy)]
 pub(crate) enum WireFlow {
     /// The answer is read to its end.

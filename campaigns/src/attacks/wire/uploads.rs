@@ -18,11 +18,11 @@ use prost::Message as _;
 
 use super::super::super::observed_server::{FlightClient, QueryClient, flight_client};
 
-/// What is not the length of anything in memory.
+/// A length that nothing in memory has.
 const LYING_LENGTH: i64 = 1 << 62;
 /// Bytes of a text that packs well.
 const LONG_TEXT_BYTES: usize = 1 << 29;
-/// Numbers that stand in for what a header says.
+/// Numbers that replace fields of a header.
 const EXTREMES: [u32; 4] = [0x7fff_ffff, 0xffff_fff0, 0x8000_0000, 0x00ff_ffff];
 
 /// Parameters for a statement.
@@ -31,7 +31,7 @@ pub(crate) struct UploadAttack {
     pub(crate) name: &'static str,
     /// Makes the uploads, each the messages of one DoPut.
     uploads: fn() -> Result<Vec<Vec<FlightData>>, ArrowError>,
-    /// How often the last message of an upload is sent.
+    /// Number of times that the last message of an upload is sent.
     repeats: usize,
 }
 

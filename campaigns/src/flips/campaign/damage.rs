@@ -17,7 +17,7 @@ const NEAR: usize = 64;
 /// Channel, number and two times in front of a message's own bytes.
 const MESSAGE_HEAD: usize = 22;
 
-/// How a file is damaged.
+/// Kind of damage to a file.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Kind {
     /// 1 to 8 bytes anywhere.
@@ -89,7 +89,7 @@ impl Damaged {
     /// Damages a specimen.
     ///
     /// # Errors
-    /// Where the specimen itself is not as expected.
+    /// If the specimen itself is not as expected.
     pub(crate) fn new(specimen: &Specimen, kind: Kind, rng: &mut impl Rng) -> Result<Self> {
         let mut damaged = Self { pieces: vec![Piece::Intact(0..specimen.bytes.len())] };
         match kind {
@@ -117,7 +117,7 @@ impl Damaged {
         bytes.into()
     }
 
-    /// Whether these bytes of the undamaged file still stand in one piece somewhere.
+    /// Returns whether these bytes of the undamaged file are still somewhere in one piece.
     pub(crate) fn keeps(&self, part: &Range<usize>) -> bool {
         self.pieces.iter().any(|p| matches!(p, Piece::Intact(r) if r.start <= part.start && part.end <= r.end))
     }
@@ -198,7 +198,7 @@ impl Damaged {
         self.pieces.len()
     }
 
-    // Flips bytes of messages in one chunk, and makes its record anew.
+    // Flips bytes of messages in one chunk, and rebuilds its record.
     fn seal(&mut self, specimen: &Specimen, rng: &mut impl Rng) -> Result<()> {
         let range = specimen.chunks.choose(rng).context("there are chunks")?.range.clone();
         let body = &specimen.bytes[range.start + FRAME..range.end];
@@ -251,7 +251,7 @@ impl Piece {
     }
 }
 
-/// Where the messages' own bytes stand in a chunk's records.
+/// Ranges of the messages' own bytes in a chunk's records.
 fn messages(records: &[u8]) -> Result<Vec<Range<usize>>> {
     let (mut at, mut found) = (0, Vec::new());
     while at + FRAME <= records.len() {

@@ -23,12 +23,12 @@ use specimen::Specimen;
 
 /// A round that takes longer hangs: they take milliseconds, and more on a busy machine.
 const HANGS: Duration = Duration::from_secs(120);
-/// What errors must name. A run's file has the run's name.
+/// File name that errors must contain. A run's file has the run's name.
 const NAME: &str = "runs/0015_0/20260105T080000Z-0015_0-0000000000007c1e.mcap";
 
 static PANICS: AtomicUsize = AtomicUsize::new(0);
 
-/// What is tried.
+/// Rounds and seed of a campaign.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Settings {
     /// Rounds.
@@ -39,7 +39,7 @@ pub(crate) struct Settings {
     pub(crate) first: u64,
 }
 
-/// What became of the rounds of one kind.
+/// Outcomes of the rounds of one kind.
 #[derive(Debug, Clone, Copy, Default)]
 pub(crate) struct Tally {
     pub(crate) rounds: u64,
@@ -61,11 +61,11 @@ pub(crate) struct Tally {
     pub(crate) unnoticed: u64,
 }
 
-/// What became of all rounds.
+/// Outcomes of all rounds.
 #[derive(Debug)]
 pub(crate) struct Summary {
     pub(crate) by_kind: Vec<(&'static str, Tally)>,
-    /// What must not be, with the round.
+    /// Descriptions of the violations, with the round.
     pub(crate) failures: Vec<String>,
     pub(crate) slowest: Duration,
     /// Name, bytes, chunks and measurements of each specimen.
@@ -76,14 +76,14 @@ pub(crate) struct Summary {
 struct Subject {
     specimen: Specimen,
     whole: Inspection,
-    /// What it makes of the recorded responses: they are taken where their sweeps cannot be read.
+    /// Results of ingest from the recorded responses: they are taken if their sweeps cannot be read.
     from_responses: Vec<Inspected>,
 }
 
-/// Runs the campaign; `progress` hears of each round.
+/// Runs the campaign; `progress` is called after each round.
 ///
 /// # Errors
-/// Where the specimens cannot be made; what the rounds find is in the summary.
+/// If the specimens cannot be made; what the rounds find is in the summary.
 pub(crate) async fn run(settings: Settings, progress: &mut dyn FnMut(u64)) -> Result<Summary> {
     count_panics();
     let rig = specimen::rig();
@@ -190,7 +190,7 @@ impl Subject {
         self.untouched(damaged, &inspection, tally)
     }
 
-    /// What is returned must be what was measured, bit for bit and once.
+    /// Checks that all returned measurements and readings are the measured ones, bit for bit and once.
     fn unaltered(&self, inspection: &Inspection) -> Result<()> {
         let mut pairs = BTreeSet::new();
         for measured in &inspection.measurements {
@@ -209,7 +209,7 @@ impl Subject {
         Ok(())
     }
 
-    /// What stands in chunks that the damage does not touch, verdict and sweep or response, must be returned.
+    /// Checks that measurements in chunks without damage, verdict and sweep or response, are returned.
     fn untouched(&self, damaged: &Damaged, inspection: &Inspection, tally: &mut Tally) -> Result<()> {
         let whole = || self.specimen.chunks.iter().filter(|c| damaged.keeps(&c.range));
         let returned: BTreeSet<_> = inspection.measurements.iter().map(|m| (m.pair, m.attempt)).collect();
@@ -219,7 +219,7 @@ impl Subject {
         };
         let missing = self.whole.measurements.iter().filter(expected);
         let missing: Vec<_> = missing.map(|m| (m.pair, m.attempt)).filter(|m| !returned.contains(m)).collect();
-        // Messages carry a channel's number only, and what it means stands in two places.
+        // Messages carry a channel's number only, and its definition is in two places.
         if !whole().any(|c| c.defines) && !self.specimen.definitions.iter().all(|d| damaged.keeps(d)) {
             tally.undefined += u64::from(!missing.is_empty());
             tally.unnamed += missing.len() as u64;
@@ -234,7 +234,7 @@ impl Subject {
     }
 }
 
-/// All that can be asked where the CRC vouches for damaged bytes.
+/// Makes the checks that are left if the CRC vouches for damaged bytes.
 fn plausible(inspection: &Inspection) -> Result<()> {
     let length = specimen::rig().impulse_response.length;
     for m in &inspection.measurements {

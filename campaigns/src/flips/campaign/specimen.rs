@@ -1,4 +1,4 @@
-//! The run files that are damaged, and what stands where in them.
+//! The run files that are damaged, and the positions of their parts.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::ops::Range;
@@ -33,7 +33,7 @@ pub(crate) struct Specimen {
     /// All records, frames included.
     pub(crate) records: Vec<Range<usize>>,
     pub(crate) chunks: Vec<ChunkFacts>,
-    /// What a file cannot be taken in without: magic bytes, manifest, rig, surface.
+    /// Parts without which ingest refuses a file: magic bytes, manifest, rig, surface.
     pub(crate) envelope: Vec<Range<usize>>,
     /// The summary's schemas and channels.
     pub(crate) definitions: Vec<Range<usize>>,
@@ -46,7 +46,7 @@ pub(crate) struct ChunkFacts {
     pub(crate) verdicts: BTreeSet<(u32, u32)>,
     /// Pair and attempt of each sweep and response.
     pub(crate) responses: BTreeSet<(u32, u32)>,
-    /// Whether schemas and channels stand in it.
+    /// True if it holds schemas and channels.
     pub(crate) defines: bool,
 }
 

@@ -72,7 +72,7 @@ pub(super) struct FileFormat {
     pub(super) options: TextMap,
 }
 
-/// How far an application says it is.
+/// Progress that an application records of itself.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "camelCase")]
 pub(super) struct ApplicationTransaction {

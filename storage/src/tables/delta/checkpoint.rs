@@ -16,7 +16,7 @@ use parquet::file::properties::WriterProperties;
 
 use super::actions::LogLine;
 
-/// What is wrong with a checkpoint.
+/// Errors of reading or writing a checkpoint.
 #[derive(Debug, thiserror::Error)]
 pub(super) enum CheckpointError {
     #[error(transparent)]

@@ -23,13 +23,13 @@ const READER_VERSION: i32 = 1;
 const WRITER_VERSION: i32 = 2;
 /// Versions from one checkpoint to the next.
 const CHECKPOINT_INTERVAL: u64 = 100;
-/// How long versions before a checkpoint are kept: Delta's default, 30 days.
+/// Time for which versions before a checkpoint are kept: Delta's default, 30 days.
 const LOG_RETENTION: TimeDelta = TimeDelta::days(30);
 /// Commits that are read at once.
 const CONCURRENT_READS: usize = 16;
 /// The way out of a log that cannot be read: all tables can be derived again.
 pub(super) const REBUILD_HINT: &str = "hint: delete the table's folder, `echolake ingest` makes it anew";
-/// The file that tells readers which checkpoint is the newest.
+/// The file that names the newest checkpoint for readers.
 const LAST_CHECKPOINT: &str = "_last_checkpoint";
 
 /// One table's log folder.
@@ -39,7 +39,7 @@ pub(super) struct LogFolder<'a> {
     store: &'a dyn ObjectStore,
 }
 
-/// What became of an attempt to write a version.
+/// Outcome of an attempt to write a version.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum CommitAttempt {
     /// The version is ours.
@@ -48,7 +48,7 @@ pub(super) enum CommitAttempt {
     Taken,
 }
 
-/// What stands in a log folder.
+/// Contents of a log folder.
 #[derive(Debug, Default)]
 struct LogListing {
     commits: BTreeSet<u64>,
@@ -95,7 +95,7 @@ impl<'a> LogFolder<'a> {
     }
 
     /// Brings a state up to the newest version. Returns None if the log was cleaned up beyond it, so that it must be
-    /// loaded anew.
+    /// loaded again.
     pub(super) async fn advance(&self, mut state: Arc<TableState>) -> Result<Option<Arc<TableState>>> {
         let from = state.version;
         while let Some(lines) = self.read_commit(state.version + 1).await? {
@@ -154,7 +154,7 @@ impl<'a> LogFolder<'a> {
         Ok(())
     }
 
-    // What stands before the newest checkpoint that is itself older than the retention.
+    // Deletes everything before the newest checkpoint that is itself older than the retention.
     async fn delete_expired(&self, now: DateTime<Utc>) -> Result<()> {
         let listing = self.list().await?;
         let is_old = |version: &&u64| {
@@ -228,7 +228,7 @@ impl<'a> LogFolder<'a> {
         self.check_protocol("read", "reader", "reads", protocol.min_reader_version, READER_VERSION)
     }
 
-    /// Refuses a table whose other writers rely on what this one does not do.
+    /// Refuses a table whose other writers rely on features that this one does not implement.
     pub(super) fn check_writable(&self, state: &TableState) -> Result<()> {
         let needed = state.protocol.as_ref().map_or(0, |p| p.min_writer_version);
         self.check_protocol("written", "writer", "writes", needed, WRITER_VERSION)

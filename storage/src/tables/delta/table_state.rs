@@ -1,14 +1,14 @@
-//! A table as its log tells it up to a version: the actions, reconciled.
+//! A table's state in its log up to a version: the actions, reconciled.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use super::actions::{AddFile, ApplicationTransaction, LogLine, ProtocolVersions, RemoveFile, TableMetadata};
 
-/// How long a checkpoint keeps a removed file's tombstone: Delta's default, a week.
+/// Time for which a checkpoint keeps a removed file's tombstone: Delta's default, a week.
 const TOMBSTONE_MILLIS: i64 = 7 * 24 * 3600 * 1000;
 
-/// What the log tells of a table up to a version. Files are by their paths as the log spells them.
+/// A table's state up to a version of its log. Files are keyed by their paths as the log spells them.
 #[derive(Debug, Clone, Default)]
 pub(super) struct TableState {
     /// The newest version that was applied.

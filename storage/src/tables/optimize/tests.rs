@@ -57,7 +57,7 @@ fn visible(surface: &str, run: &str, derivation: &str) -> VisibleRun {
     }
 }
 
-/// Adds a run's derived rows, or others in their place, and its row in `runs`.
+/// Adds a run's derived rows, or replaces them, and its row in `runs`.
 async fn put(lake: &Lake, surface: &str, run: &str, derivation: &str, value: usize) {
     let pointer = visible(surface, run, derivation);
     let part = FileName::Rows {
