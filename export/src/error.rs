@@ -1,18 +1,18 @@
-//! What can go wrong with an export, by what the caller can do about it.
+//! Errors of an export, by what the caller can do about them.
 
 use std::path::{Path, PathBuf};
 
 use echolake_schema::RunId;
 
-/// Why something is not exported. Nothing half-done stands under its final name.
+/// An error of an export. No partial output is left under its final name.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
-    /// The output is there already.
+    /// The output exists already.
     #[error("`{}` is there already; hint: {hint}", path.display())]
     Exists {
         /// The file or folder.
         path: PathBuf,
-        /// What to do.
+        /// Advice for the user.
         hint: &'static str,
     },
     /// The system refused to write.
@@ -20,13 +20,13 @@ pub enum Error {
     Write {
         /// The file or folder.
         path: PathBuf,
-        /// The system's words.
+        /// The system's error text.
         reason: String,
     },
     /// There is nothing to export.
     #[error("nothing to export: {reason}")]
     Nothing {
-        /// Why, and what would help.
+        /// The reason, and advice for the user.
         reason: String,
     },
     /// A name that the lake does not have.
@@ -34,25 +34,25 @@ pub enum Error {
     Unknown {
         /// Column, topic or surface.
         kind: &'static str,
-        /// What was asked for.
+        /// The requested name.
         name: String,
-        /// What there is.
+        /// The known names.
         known: String,
     },
     /// The lake cannot be split that way.
     #[error("the lake cannot be split {by}: {reason}")]
     Split {
-        /// The way.
+        /// The kind of split.
         by: &'static str,
-        /// Why not, and what would help.
+        /// The reason, and advice for the user.
         reason: String,
     },
-    /// A file of the lake is not as its log says.
+    /// A file of the lake does not agree with its commit log.
     #[error("`{file}` is damaged: {reason}; hint: `echolake doctor` says what is")]
     Damaged {
         /// The file.
         file: String,
-        /// What is wrong.
+        /// Description of the damage.
         reason: String,
     },
     /// A run's file is not the one that was ingested.
@@ -64,7 +64,7 @@ pub enum Error {
         run: RunId,
         /// Its file.
         file: String,
-        /// What is different, expected and actual.
+        /// The difference: expected and actual.
         reason: String,
     },
     /// A run's file cannot be sliced.
@@ -72,10 +72,10 @@ pub enum Error {
     Uncuttable {
         /// The run.
         run: RunId,
-        /// Why, and what would help.
+        /// The reason, and advice for the user.
         reason: String,
     },
-    /// The lake refused.
+    /// An error of the lake.
     #[error(transparent)]
     Lake(#[from] echolake_lake::Error),
     /// A rig or id that is not valid.

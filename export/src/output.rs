@@ -1,4 +1,4 @@
-//! Files and folders that stand under their name only when they are whole and on the disk.
+//! Files and folders that get their final name only once they are complete and synced to disk.
 
 use std::fs::{self, File, OpenOptions};
 use std::io::{self, BufWriter, Write};
@@ -8,11 +8,11 @@ use sha2::{Digest as _, Sha256};
 
 use crate::error::{Error, Result};
 
-/// Size of the buffer before a file.
+/// Size of a file's write buffer, bytes.
 const BUFFER: usize = 256 * 1024;
 const TAKEN: &str = "another export is at work there, or one was killed: then delete it";
 
-/// A folder on its way. Dropped before [`PendingFolder::publish`], it is removed.
+/// A folder that is being written. Dropped before [`PendingFolder::publish`], it is removed.
 #[derive(Debug)]
 pub(crate) struct PendingFolder {
     path: PathBuf,
@@ -21,7 +21,7 @@ pub(crate) struct PendingFolder {
 }
 
 impl PendingFolder {
-    /// Begins a folder that will stand at `path`, where nothing or an empty folder is.
+    /// Creates a partial folder for `path`, where nothing or an empty folder may exist.
     pub(crate) fn create(path: &Path) -> Result<Self> {
         let empty = fs::read_dir(path).is_ok_and(|mut entries| entries.next().is_none());
         if path.symlink_metadata().is_ok() && !empty {
@@ -35,7 +35,7 @@ impl PendingFolder {
         }
     }
 
-    /// Begins a file in it; `name` may have folders.
+    /// Creates a file in the folder; `name` may contain folders.
     pub(crate) fn file(&self, name: &str) -> Result<HashedFile> {
         let path = self.partial.join(name);
         if let Some(folder) = path.parent() {
@@ -51,17 +51,17 @@ impl PendingFolder {
         file.finish()
     }
 
-    /// Where a file of it will stand, for messages.
+    /// Returns the final path of a file, for messages.
     pub(crate) fn named(&self, name: &str) -> PathBuf {
         self.path.join(name)
     }
 
-    /// Where a file of it stands meanwhile.
+    /// Returns the path of a file while the folder is being written.
     pub(crate) fn meanwhile(&self, name: &str) -> PathBuf {
         self.partial.join(name)
     }
 
-    /// Gives it its name.
+    /// Syncs the folder and renames it to its final name.
     pub(crate) fn publish(mut self) -> Result<()> {
         let named = sync_tree(&self.partial).and_then(|()| fs::rename(&self.partial, &self.path));
         named.and_then(|()| sync_parent(&self.path)).map_err(|e| Error::write(&self.path, e))?;
@@ -73,13 +73,13 @@ impl PendingFolder {
 impl Drop for PendingFolder {
     fn drop(&mut self) {
         if !self.published {
-            // The failure that led here is the one to tell.
+            // The caller reports the first failure; this one would hide it.
             let _ = fs::remove_dir_all(&self.partial);
         }
     }
 }
 
-/// A file on its way, hashed as it is written.
+/// A file that is being written, hashed on the way.
 #[derive(Debug)]
 pub(crate) struct HashedFile {
     file: BufWriter<File>,
@@ -89,7 +89,7 @@ pub(crate) struct HashedFile {
     bytes: u64,
 }
 
-/// A file that is written.
+/// A file that was written.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct WrittenFile {
     /// Its name in the folder.
@@ -107,7 +107,7 @@ impl HashedFile {
         Ok(Self { file, named: named.to_owned(), name: name.to_owned(), sha: Sha256::new(), bytes: 0 })
     }
 
-    /// Ends the file; it is on the disk.
+    /// Flushes the file and syncs it to disk.
     pub(crate) fn finish(mut self) -> Result<WrittenFile> {
         let synced = self.file.flush().and_then(|()| self.file.get_ref().sync_all());
         synced.map_err(|e| Error::write(&self.named, e))?;
@@ -128,7 +128,7 @@ impl Write for HashedFile {
     }
 }
 
-/// A file on its way that stands alone. Dropped before [`PendingFile::publish`], it is removed.
+/// A single file that is being written. Dropped before [`PendingFile::publish`], it is removed.
 #[derive(Debug)]
 pub struct PendingFile {
     file: Option<BufWriter<File>>,
@@ -137,7 +137,7 @@ pub struct PendingFile {
 }
 
 impl PendingFile {
-    /// Begins a file that will stand at `path`, where nothing is.
+    /// Creates a partial file for `path`, where nothing may exist.
     ///
     /// # Errors
     /// [`Error::Exists`] or [`Error::Write`].
@@ -156,12 +156,12 @@ impl PendingFile {
         }
     }
 
-    /// Where it stands meanwhile, for libraries that open files themselves.
+    /// Returns the path while the file is being written, for libraries that open files themselves.
     pub fn meanwhile(&self) -> &Path {
         &self.partial
     }
 
-    /// Writes.
+    /// Appends data to the file.
     ///
     /// # Errors
     /// [`Error::Write`].
@@ -170,7 +170,7 @@ impl PendingFile {
         file.write_all(data).map_err(|e| Error::write(&self.path, e))
     }
 
-    /// Gives it its name; it is whole and on the disk.
+    /// Syncs the file to disk and renames it to its final name.
     ///
     /// # Errors
     /// [`Error::Write`].
@@ -187,7 +187,7 @@ impl PendingFile {
 
 impl Drop for PendingFile {
     fn drop(&mut self) {
-        // After publishing there is no such file; before, the failure that led here is the one to tell.
+        // After publishing there is no such file; before it, the caller reports the first failure.
         let _ = fs::remove_file(&self.partial);
     }
 }
@@ -209,7 +209,7 @@ fn sync_tree(folder: &Path) -> io::Result<()> {
     File::open(folder)?.sync_all()
 }
 
-// A bare name's parent is the empty path, which nobody can open.
+// A bare name's parent is the empty path, which cannot be opened.
 fn sync_parent(path: &Path) -> io::Result<()> {
     let parent = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
     File::open(parent)?.sync_all()

@@ -1,4 +1,4 @@
-//! Rows of one run, read straight from the files that a snapshot shows.
+//! Rows of one run, read directly from the files of a snapshot.
 
 use arrow::array::{Array as _, AsArray as _};
 use arrow::compute::concat_batches;
@@ -12,7 +12,7 @@ use std::sync::Arc;
 
 use crate::error::{Error, Result};
 
-/// The named columns of a run's rows in a table, in the table's order of columns.
+/// Reads the named columns of a run's rows in a table, in the table's order of columns.
 pub(crate) async fn of_run(
     lake: &Lake,
     snapshot: &Snapshot,
@@ -28,7 +28,7 @@ pub(crate) async fn of_run(
     together(lake, table, columns, &batches).map_err(|e| Error::damaged(format!("{}, run {run}", table.name()), e))
 }
 
-/// The named columns of a whole file.
+/// Reads the named columns of a whole file.
 pub(crate) async fn of_file(lake: &Lake, table: Table, file: &DataFile, columns: &[&str]) -> Result<RecordBatch> {
     let batches: Vec<_> = lake.rows(table, file, columns, 0..file.rows).await?.try_collect().await?;
     together(lake, table, columns, &batches).map_err(|e| Error::damaged(&file.path, e))
@@ -45,18 +45,18 @@ fn together(
     concat_batches(&Arc::new(Schema::new(fields)), batches)
 }
 
-/// Texts of a column that has no nulls; empty where it is missing.
+/// Returns the texts of a column without nulls; empty if the column is missing.
 pub(crate) fn texts<'a>(batch: &'a RecordBatch, column: &str) -> Vec<&'a str> {
     optional_texts(batch, column).into_iter().map(Option::unwrap_or_default).collect()
 }
 
-/// Texts of a column.
+/// Returns the texts of a column.
 pub(crate) fn optional_texts<'a>(batch: &'a RecordBatch, column: &str) -> Vec<Option<&'a str>> {
     let found = batch.column_by_name(column).and_then(|c| c.as_string_opt::<i32>());
     found.map(|array| array.iter().collect()).unwrap_or_default()
 }
 
-/// Numbers of a column.
+/// Returns the numbers of a column.
 pub(crate) fn numbers<'a, T: ArrowPrimitiveType>(batch: &'a RecordBatch, column: &str) -> Result<&'a [T::Native]> {
     let found = batch.column_by_name(column).and_then(|c| c.as_primitive_opt::<T>());
     let found = found.filter(|array| array.null_count() == 0);

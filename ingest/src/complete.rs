@@ -1,4 +1,4 @@
-//! Derives what needs references, for every run whose references are there and are not the ones its rows used.
+//! Derives the rows that need references, for every run whose references exist and differ from those its rows used.
 
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
@@ -15,10 +15,10 @@ use crate::read_back;
 use crate::references::{Finder, Wanted};
 use crate::rows::{self, Keys};
 
-/// Looks at the lake again after another ingest was faster; each sees what that one did.
+/// Maximum number of retries with a new snapshot after another ingest committed first.
 const ROUNDS: usize = 20;
 
-/// A run whose derived rows are new.
+/// A run with new derived rows.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Completed {
     /// The run.
@@ -29,11 +29,11 @@ pub struct Completed {
     pub measurements: usize,
 }
 
-/// Brings every run's derived rows up to date; returns how many runs were changed. A run whose rows used the
-/// current references is left alone.
+/// Brings every run's derived rows up to date; returns the number of changed runs. A run whose rows used the current
+/// references is left alone.
 ///
 /// # Errors
-/// [`crate::Error`]; what was completed before stays, and the same call goes on.
+/// [`crate::Error`]; runs completed before stay so, and the same call resumes with the rest.
 pub async fn complete(lake: &Lake, stop: &AtomicBool, done: &mut (dyn FnMut(&Completed) + Send)) -> Result<usize> {
     let (cores, mut count) = (Cores::all()?, 0);
     for _ in 0..ROUNDS {
@@ -47,10 +47,10 @@ pub async fn complete(lake: &Lake, stop: &AtomicBool, done: &mut (dyn FnMut(&Com
     Ok(count)
 }
 
-/// The runs that wait for references, and which, in words.
+/// Lists the runs that wait for references, with the names of the missing references.
 ///
 /// # Errors
-/// [`crate::Error::Lake`] where the lake cannot be read.
+/// [`crate::Error::Lake`] if the lake cannot be read.
 pub async fn waiting(lake: &Lake) -> Result<Vec<(RunId, String)>> {
     let snapshot = Arc::new(lake.snapshot().await?);
     let finder = Finder::new(lake, snapshot.clone());
@@ -58,7 +58,7 @@ pub async fn waiting(lake: &Lake) -> Result<Vec<(RunId, String)>> {
     Ok(snapshot.runs().map(missing).filter(|(_, missing)| !missing.is_empty()).collect())
 }
 
-// How many runs were changed, and whether another ingest changed one of them meanwhile.
+// Returns the number of changed runs, and whether another ingest changed one of them meanwhile.
 async fn round(
     lake: &Lake,
     cores: &Cores,

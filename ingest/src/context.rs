@@ -1,4 +1,4 @@
-//! What all workers of an ingest share: the lake as it was at the beginning, and how a run's files are staged in it.
+//! State shared by all workers of an ingest: one snapshot of the lake, and the staging of a run's files.
 
 use std::sync::Arc;
 
@@ -12,7 +12,7 @@ use crate::pipeline::Cores;
 use crate::references::{Finder, SharedFinder};
 use crate::rows::Keys;
 
-/// The lake in one view of it. Cheap to clone.
+/// The lake with one snapshot of it. Cheap to clone.
 #[derive(Clone)]
 pub(crate) struct Context {
     pub(crate) lake: Lake,
@@ -22,7 +22,7 @@ pub(crate) struct Context {
 }
 
 impl Context {
-    /// The lake as of now.
+    /// Returns a context with the current snapshot of the lake.
     pub(crate) async fn now(lake: &Lake, cores: &Cores) -> Result<Self> {
         let snapshot = Arc::new(lake.snapshot().await?);
         let finder = Finder::shared(lake, snapshot.clone());
@@ -38,13 +38,13 @@ impl Context {
     ) -> Result<Vec<Staged>> {
         let Keys { surface, run } = keys.clone();
         let name = FileName::Rows { surface, run, derivation: derivation.to_owned() };
-        // Each waits for the disk by itself.
+        // In parallel, because each file waits for the disk by itself.
         let staged = join_all(files.into_iter().map(|(table, file)| self.lake.stage(table, &name, file))).await;
         Ok(staged.into_iter().collect::<std::result::Result<_, _>>()?)
     }
 
-    /// Stages a run's row of `runs`, in place of those that the view has. From its commit on readers see what it names,
-    /// and nothing else of the run.
+    /// Stages a run's row of `runs`, which replaces the rows in the snapshot. After its commit readers see the files
+    /// that the row names, and nothing else of the run.
     pub(crate) async fn stage_pointer(&self, run: VisibleRun, row: &[RecordBatch]) -> Result<Staged> {
         let file = encode(Table::Runs, &Table::Runs.schema(self.lake.rig()), row)?;
         let staged = self.lake.stage(Table::Runs, &FileName::Pointer(run.clone()), file).await?;

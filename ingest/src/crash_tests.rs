@@ -306,11 +306,11 @@ mod slow {
         assert!(kept < files(start.clone()).await, "files are merged");
         let deaths = each_death(&start, tidy, async |inner, death| {
             assert!(rows(inner.clone()).await == before, "{death}: other rows");
-            // As if its time had run out.
+            // As if the lease had expired.
             inner.delete(&Path::from("tables/_maintenance.json")).await.ok();
             tidy(inner.clone()).await.unwrap_or_else(|e| panic!("{death}: {e}"));
             assert!(tables(inner.clone()).await == expected, "{death}: other files");
-            // What was written and never named stays for an hour, lest somebody is about to name it.
+            // Unnamed files stay for an hour, because a concurrent ingest may be about to commit them.
             assert!(files(inner).await <= kept + 1, "{death}: files are left over");
         })
         .await;

@@ -1,4 +1,5 @@
-//! From a run's impulse responses and its references to reflected responses, curves and energies, and their files.
+//! Derives reflected responses, curves and energies from a run's impulse responses and references, and stages the
+//! files.
 
 use std::sync::Arc;
 
@@ -14,10 +15,10 @@ use crate::rows::derived::Versions;
 use crate::rows::runs::References;
 use crate::rows::{self, Keys};
 
-/// Measurements that are derived and encoded at a time: memory is bounded by them, not by the run.
+/// Number of measurements derived and encoded at a time: it bounds memory independently of the run's length.
 const SLICE: usize = 256;
 
-/// References, loaded, and the name of what is derived with them.
+/// Loaded references, and the name of the derivation with them.
 pub(crate) struct Derivation {
     pub(crate) name: String,
     flat_version: String,
@@ -27,7 +28,7 @@ pub(crate) struct Derivation {
 }
 
 impl Derivation {
-    /// With the references that are wanted; None while one is missing.
+    /// Loads the wanted references; None if one is missing.
     pub(crate) async fn new(run_derivation: &str, wanted: &Wanted, finder: &SharedFinder) -> Result<Option<Self>> {
         let (Some((flat_version, foam_version)), Some(name)) = (wanted.versions(), wanted.derivation(run_derivation))
         else {
@@ -37,7 +38,7 @@ impl Derivation {
         Ok(Some(Self { name, flat_version, foam_version, flat, foam }))
     }
 
-    /// Derives all of a run that both references have, and stages its files. Returns what the run's row says of it.
+    /// Derives every pair that both references have, and stages the files. Returns them and the run row's references.
     pub(crate) async fn stage(
         self,
         context: &Context,
@@ -57,7 +58,7 @@ impl Derivation {
         Ok((staged, references))
     }
 
-    // The files, and how many pairs a reference lacks.
+    // Returns the files, and the number of pairs that a reference lacks.
     fn encode(&self, lake: &Lake, keys: &Keys, responses: &Responses) -> Result<(Vec<(Table, EncodedFile)>, usize)> {
         let (rig, grid) = (lake.rig(), lake.grid());
         let moved = rows::derived::Moved::of(grid);
@@ -71,7 +72,7 @@ impl Derivation {
             totals.iter_mut().zip(slice.tnce_columns()).for_each(|(all, some)| all.extend(some));
             let [nce, tnce, tnce_d4] = &mut encoders;
             let lists = slice.take_lists();
-            // Lists are most of it, and the rest is for another core that has nothing else to do.
+            // Lists take most of the time; an idle core can encode the rest meanwhile.
             let (first, second) = rayon::join(
                 || Ok(nce.1.write(&rows::derived::nce(rig, grid, keys, lists, of)?)?),
                 || {

@@ -1,4 +1,4 @@
-//! What is computed of impulse responses: of references, means and energies; of runs, responses, curves and energies.
+//! Values computed from impulse responses: means and energies of references; responses, curves and energies of runs.
 
 use std::collections::HashMap;
 
@@ -8,10 +8,10 @@ use echolake_schema::Rig;
 /// Mean impulse response of each pair of a reference.
 pub(crate) type Means = HashMap<u32, Vec<f32>>;
 
-/// Energies of each pair of Flat, its Foam subtracted.
+/// Energies of each pair of Flat, with its Foam subtracted.
 pub(crate) type Flats = HashMap<u32, FlatEnergies>;
 
-/// The plan of a rig's responses.
+/// Returns the derivation plan for a rig's responses.
 pub(crate) fn derivation_plan(rig: &Rig) -> std::result::Result<DerivationPlan<f32>, echolake_dsp::Error> {
     DerivationPlan::new(rig.impulse_response.length, rig.sweep.rate_hz.get(), &rig.bands.centres_hz)
 }
@@ -24,7 +24,7 @@ pub(crate) struct Responses {
     pub(crate) irs: Vec<f32>,
 }
 
-/// What is derived of some of a run's measurements.
+/// Values derived from some of a run's measurements.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct DerivedRows {
     bands: usize,
@@ -50,12 +50,12 @@ pub(crate) struct DerivedLists {
 }
 
 impl DerivedRows {
-    /// Rows of so many bands, none yet.
+    /// Returns an empty set of rows with this number of bands.
     pub(crate) fn new(bands: usize) -> Self {
         Self { bands, curves: vec![Vec::new(); bands], ..Self::default() }
     }
 
-    /// Adds a measurement.
+    /// Appends the values of one measurement.
     pub(crate) fn push(&mut self, pair: u32, derived: &Derived<f32>) {
         self.pairs.push(pair);
         self.reflected.extend_from_slice(&derived.reflected);
@@ -68,7 +68,7 @@ impl DerivedRows {
         self.tnce_over_band.extend_from_slice(&derived.tnce_over_band);
     }
 
-    /// Responses and curves, which are left empty here.
+    /// Moves out the responses and curves, which are empty afterwards.
     pub(crate) fn take_lists(&mut self) -> DerivedLists {
         DerivedLists {
             pairs: self.pairs.clone(),
@@ -77,7 +77,7 @@ impl DerivedRows {
         }
     }
 
-    /// Values of every column from `tnce_*` to `energy_total`, in the tables' order.
+    /// Returns the values of every column from `tnce_*` to `energy_total`, in the tables' order.
     pub(crate) fn energy_columns(&self) -> Vec<Vec<f64>> {
         let mut columns = self.tnce_columns();
         columns.extend((0..self.bands).map(|b| self.column(&self.tnce_over_band, b)));
@@ -86,7 +86,7 @@ impl DerivedRows {
         columns
     }
 
-    /// Values of `tnce_*` and `tnce_total`.
+    /// Returns the values of `tnce_*` and `tnce_total`.
     pub(crate) fn tnce_columns(&self) -> Vec<Vec<f64>> {
         let mut columns: Vec<_> = (0..self.bands).map(|b| self.column(&self.tnce, b)).collect();
         columns.push(self.totals(&self.tnce));

@@ -1,4 +1,4 @@
-//! Looks a lake over: what is in it, what is missing, and what is damaged, to the last CRC.
+//! Checks a lake for contents, missing parts and damage, down to the last CRC.
 
 use std::collections::BTreeSet;
 use std::sync::Arc;
@@ -17,7 +17,7 @@ use crate::read_back;
 use crate::references::Finder;
 use crate::rows::runs::text_of;
 
-/// What a lake was found to be.
+/// Result of a check of a lake.
 #[derive(Debug, Clone, Default, Serialize)]
 pub struct Report {
     /// The tables, in order.
@@ -26,11 +26,11 @@ pub struct Report {
     pub runs: usize,
     /// Bytes of run files.
     pub run_bytes: u64,
-    /// What there is to see to, worst first.
+    /// Problems and notes, worst first.
     pub findings: Vec<Finding>,
 }
 
-/// What a table was found to be.
+/// Counts of one table.
 #[derive(Debug, Clone, Serialize)]
 pub struct TableReport {
     /// Its name.
@@ -43,33 +43,33 @@ pub struct TableReport {
     pub bytes: u64,
 }
 
-/// Something to see to.
+/// A problem or note.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Serialize)]
 pub struct Finding {
-    /// How bad it is.
+    /// Its severity.
     pub severity: Severity,
     /// The file or run.
     pub subject: String,
-    /// What it is, with a hint.
+    /// Description with a hint.
     pub what: String,
 }
 
-/// How bad a finding is, worst first.
+/// Severity of a finding, worst first.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Severity {
     /// Data are damaged or lost.
     Damaged,
-    /// Something is not there yet.
+    /// Something is missing so far.
     Missing,
-    /// Worth knowing.
+    /// For information.
     Note,
 }
 
-/// How far the check has come.
+/// Progress of the check.
 #[derive(Debug, Clone, Copy)]
 pub struct Step<'a> {
-    /// What is checked now.
+    /// The file that is being checked.
     pub subject: &'a str,
     /// Files done.
     pub done: usize,
@@ -78,7 +78,7 @@ pub struct Step<'a> {
 }
 
 impl Report {
-    /// Whether data are damaged or lost.
+    /// Returns whether data are damaged or lost.
     pub fn is_damaged(&self) -> bool {
         self.findings.iter().any(|f| f.severity == Severity::Damaged)
     }
@@ -91,7 +91,7 @@ impl Report {
 /// Checks a lake: every file of every table is decoded, and every run file read to its last CRC.
 ///
 /// # Errors
-/// [`Error`] where the lake itself cannot be read; damage in it is a finding.
+/// [`Error`] if the lake itself cannot be read; damage in it is a finding.
 pub async fn examine(lake: &Lake, progress: &mut dyn FnMut(Step<'_>)) -> Result<Report> {
     let snapshot = Arc::new(lake.snapshot().await?);
     let mut report = Report { runs: snapshot.runs().count(), ..Report::default() };
@@ -119,7 +119,7 @@ pub async fn examine(lake: &Lake, progress: &mut dyn FnMut(Step<'_>)) -> Result<
         done += 1;
         match read_back::run_row(lake, &file).await {
             Ok(row) => check_run(lake, &snapshot, &row, &mut report).await?,
-            // Said above, where the table's files were decoded.
+            // Reported above, when the table's files were decoded.
             Err(_) => continue,
         }
     }
@@ -168,7 +168,7 @@ async fn check_run(lake: &Lake, snapshot: &Arc<Snapshot>, row: &RecordBatch, rep
     Ok(())
 }
 
-/// What is wrong with a run's file, in words.
+/// Returns descriptions of the damage in a run's file.
 async fn check_run_file(lake: &Lake, path: &Path, sha256: &str, report: &mut Report) -> Result<Vec<String>> {
     let mut reader = match ResyncReader::open(lake.store(), path.clone(), path.to_string()).await {
         Ok(reader) => reader,
@@ -193,7 +193,7 @@ async fn check_run_file(lake: &Lake, path: &Path, sha256: &str, report: &mut Rep
     Ok(wrong)
 }
 
-// Files that nothing names: not yet taken in, refused, or left behind by a crash.
+// Files that no row names: not yet ingested, refused, or left behind by a crash.
 async fn find_strays(lake: &Lake, snapshot: &Snapshot, report: &mut Report) -> Result<()> {
     let named: BTreeSet<Path> = Table::ALL
         .iter()

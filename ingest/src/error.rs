@@ -1,9 +1,9 @@
-//! What can go wrong between a run's file and the tables.
+//! Errors between a run's file and the tables.
 
 use echolake_recording::ResyncError;
 use echolake_schema::manifest::ManifestError;
 
-/// Why a run could not be taken in.
+/// An error of an ingest.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
     /// The file cannot be read.
@@ -11,7 +11,7 @@ pub enum Error {
     Read {
         /// The file.
         file: String,
-        /// Why not.
+        /// The cause.
         reason: String,
     },
     /// The file is no MCAP file at all.
@@ -37,7 +37,7 @@ pub enum Error {
     Manifest {
         /// The file.
         file: String,
-        /// What is wrong.
+        /// The cause.
         cause: ManifestError,
     },
     /// Its metadata may be damaged.
@@ -45,7 +45,7 @@ pub enum Error {
     Doubtful {
         /// The file.
         file: String,
-        /// What speaks against it.
+        /// The evidence against it.
         reason: String,
     },
     /// An attachment that must be there is missing or damaged.
@@ -55,7 +55,7 @@ pub enum Error {
         file: String,
         /// The attachment.
         attachment: &'static str,
-        /// What is wrong with it.
+        /// Description of the damage.
         reason: String,
     },
     /// Another run of this name is in the lake.
@@ -75,25 +75,25 @@ pub enum Error {
     /// No such run.
     #[error("no run at `{given}`: it is neither a file nor the name of a run in the lake's inbox or runs")]
     NoRun {
-        /// What was given.
+        /// The given argument.
         given: String,
     },
-    /// The file was there and is no more.
+    /// The file has disappeared since it was listed.
     #[error("`{file}` is gone: another ingest has taken it")]
     Gone {
         /// The file.
         file: String,
     },
-    /// Processes end while they take it in.
+    /// Processes end while they ingest it.
     #[error(
         "`{file}` is passed over: processes that took in this file alone ended on the way ({endings}); hint: to have it tried again, move it back into `inbox/`, or delete `{mark}`"
     )]
     Deadly {
         /// The file.
         file: String,
-        /// How they ended.
+        /// Their exit statuses or signals.
         endings: String,
-        /// Where that is kept.
+        /// Path of the mark that records them.
         mark: String,
     },
     /// A kernel refused.
@@ -101,7 +101,7 @@ pub enum Error {
     Kernel {
         /// The file.
         file: String,
-        /// Why.
+        /// The kernel's error.
         cause: echolake_dsp::Error,
     },
     /// A data file of the lake cannot be read.
@@ -111,19 +111,19 @@ pub enum Error {
     DataFile {
         /// The file.
         file: String,
-        /// Why not.
+        /// The cause.
         reason: String,
     },
     /// The machine gives no more threads.
     #[error("cannot start the threads that compute: {reason}; hint: is a limit of processes reached?")]
     Threads {
-        /// Why not.
+        /// The cause.
         reason: String,
     },
     /// The ingest was stopped.
     #[error("stopped; hint: the same command goes on where this one ended")]
     Stopped,
-    /// The lake refused.
+    /// An error of the lake.
     #[error(transparent)]
     Lake(#[from] echolake_lake::Error),
 }
@@ -142,7 +142,7 @@ impl From<ResyncError> for Error {
 pub type Result<T> = std::result::Result<T, Error>;
 
 impl Error {
-    /// Whether it is this one file that cannot be taken in, so that others may still be.
+    /// Returns whether the error concerns this one file alone, so that others can still be ingested.
     pub fn is_refusal(&self) -> bool {
         match self {
             Self::Read { .. } | Self::NotMcap { .. } | Self::Foreign { .. } | Self::Manifest { .. } => true,

@@ -1,4 +1,4 @@
-//! Where run files stand: found in the inbox, kept under `runs/`, refused ones under `quarantine/`.
+//! Places of run files: new ones in `inbox/`, ingested ones under `runs/`, refused ones under `quarantine/`.
 
 use std::path::{Path as FsPath, PathBuf};
 use std::sync::Arc;
@@ -13,20 +13,20 @@ use object_store::{ObjectStore, ObjectStoreExt as _, WriteMultipart};
 use crate::error::{Error, Result};
 use crate::run_content::Head;
 
-/// Folder of runs that are not taken in yet.
+/// Folder of runs that are not ingested yet.
 const INBOX: &str = "inbox";
 /// Folder of closed runs.
 const RUNS: &str = "runs";
 /// Folder of refused files.
 const QUARANTINE: &str = "quarantine";
-/// What the name of a recording ends in until it is whole.
+/// Suffix of a recording's name until the file is complete.
 const PARTIAL: &str = ".partial";
-/// Longest name of a refused file. File systems allow 255 bytes.
+/// Maximum length of a refused file's name, bytes. File systems allow 255.
 const LONGEST_NAME: usize = 200;
-/// Bytes that are copied at a time.
+/// Bytes per copied part.
 const PART: u64 = 8 << 20;
 
-/// Where a run's file is.
+/// Location of a run's file.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Source {
     /// In the lake: under `inbox/` or `runs/`.
@@ -44,11 +44,11 @@ impl std::fmt::Display for Source {
     }
 }
 
-/// A source as something to read.
+/// A source that is opened for reading.
 pub(crate) struct Opened {
     pub(crate) store: Arc<dyn ObjectStore>,
     pub(crate) path: Path,
-    /// For people.
+    /// Name for messages.
     pub(crate) name: String,
 }
 
@@ -70,10 +70,10 @@ impl Source {
     }
 }
 
-/// The run files of the lake that are in no table yet: all of `inbox/`, and those of `runs/` that `runs` does not name.
+/// Lists the run files that are in no table yet: all of `inbox/`, and those of `runs/` that table `runs` does not name.
 ///
 /// # Errors
-/// [`Error::Lake`] where the lake cannot be listed.
+/// [`Error::Lake`] if the snapshot cannot be read, [`Error::Read`] if a folder cannot be listed.
 pub async fn pending(lake: &Lake) -> Result<Vec<Source>> {
     let snapshot = lake.snapshot().await?;
     let mut found = Vec::new();
@@ -91,12 +91,12 @@ pub async fn pending(lake: &Lake) -> Result<Vec<Source>> {
     Ok(found.into_iter().map(Source::Lake).collect())
 }
 
-/// Makes runs of the recordings in the inbox whose recorder died, so that ingest takes in what was complete; returns
-/// them. Those that are still being recorded stay, those that can be gone on with, and those of imports, which are made
-/// again from their files.
+/// Renames the recordings in the inbox whose recorder died, so that ingest accepts their complete part; returns them.
+/// Recordings that are still being written, that can be resumed, or that come from imports (which are repeated from
+/// their files) are left alone.
 ///
 /// # Errors
-/// [`Error::Read`] where the inbox cannot be changed.
+/// [`Error::Read`] if the inbox cannot be changed.
 pub async fn adopt_cut_off(lake: &Lake) -> Result<Vec<Path>> {
     let Some(inbox) = lake.folder().map(|folder| folder.join(INBOX)).filter(|inbox| inbox.is_dir()) else {
         return Ok(Vec::new());
@@ -123,7 +123,7 @@ pub async fn adopt_cut_off(lake: &Lake) -> Result<Vec<Path>> {
     Ok(adopted)
 }
 
-// Its recorder holds a lock as long as it lives. What cannot be asked counts as alive.
+// The recorder holds a lock as long as it lives. A file that cannot be opened counts as being recorded.
 fn is_being_recorded(partial: &FsPath) -> bool {
     match std::fs::File::open(partial) {
         Ok(file) => file.try_lock_shared().is_err(),
@@ -131,7 +131,7 @@ fn is_being_recorded(partial: &FsPath) -> bool {
     }
 }
 
-// A run that is gone on with becomes a better one than its first part; an import is made again.
+// A resumed run is better than its first part; an import is repeated.
 async fn is_made_whole_otherwise(partial: &FsPath) -> bool {
     let Ok(path) = absolute(partial) else { return false };
     let opened = Opened { store: Arc::new(LocalFileSystem::new()), path, name: partial.display().to_string() };
@@ -139,7 +139,7 @@ async fn is_made_whole_otherwise(partial: &FsPath) -> bool {
     Head::read(&opened).await.is_some_and(is)
 }
 
-/// Brings a run's file to its place, before any row names it.
+/// Moves or copies a run's file to its place, before any row names it.
 pub(crate) async fn keep(lake: &Lake, source: &Source, to: &Path, bytes: u64) -> Result<()> {
     let store = lake.store();
     let failed = |e: object_store::Error| written(to, e);
@@ -150,7 +150,7 @@ pub(crate) async fn keep(lake: &Lake, source: &Source, to: &Path, bytes: u64) ->
     };
     match source {
         Source::Lake(from) if from == to => Ok(()),
-        // Where it is gone, another ingest has brought it there.
+        // If it has disappeared, another ingest has moved it there.
         Source::Lake(from) if there => match store.delete(from).await {
             Err(e) if !matches!(e, object_store::Error::NotFound { .. }) => Err(failed(e)),
             _ => Ok(()),
@@ -164,16 +164,17 @@ pub(crate) async fn keep(lake: &Lake, source: &Source, to: &Path, bytes: u64) ->
     }
 }
 
-/// Puts a refused file of the inbox aside, the reason first; returns where it is. Other people's files stay.
+/// Moves a refused file of the inbox to `quarantine/`, the reason first; returns its path. Files outside the inbox
+/// stay.
 pub(crate) async fn quarantine(lake: &Lake, source: &Source, why: &Error) -> Result<Option<Path>> {
     let Source::Lake(from) = source else { return Ok(None) };
-    // What cannot be read now may be readable later.
+    // A file that cannot be read now may be readable later.
     if !source.is_in_inbox() || matches!(why, Error::Read { .. }) {
         return Ok(None);
     }
     let store = lake.store();
     let name = from.filename().unwrap_or("run");
-    // The end of a long one, because the reason's name is longer.
+    // Only the end of a long name, because the name of the reason's file is longer.
     let start = (name.len().saturating_sub(LONGEST_NAME)..name.len()).find(|at| name.is_char_boundary(*at));
     let to = free_name(lake, &name[start.unwrap_or(0)..]).await?;
     let reason = Path::from(format!("{to}.reason.txt"));
@@ -200,7 +201,7 @@ async fn free_name(lake: &Lake, name: &str) -> Result<Path> {
     }
 }
 
-// Under another name first, so that a run is under its own name whole or not at all.
+// Under another name first, so that a run's own name never holds a partial file.
 async fn copy_in(lake: &Lake, from: &FsPath, to: &Path) -> Result<()> {
     let store = lake.store();
     let failed = |e: object_store::Error| written(to, e);
@@ -221,7 +222,7 @@ async fn copy_in(lake: &Lake, from: &FsPath, to: &Path) -> Result<()> {
     store.rename(&staged, to).await.map_err(failed)
 }
 
-// The lake itself cannot be written, which is no fault of the run.
+// The lake itself cannot be written: an error of the lake, not of the run.
 fn written(path: &Path, cause: object_store::Error) -> Error {
     let cause = StoreError(cause);
     Error::Lake(echolake_lake::Error::Store { action: "write", path: path.to_string(), cause })

@@ -1,4 +1,4 @@
-//! Runs' files become rows: read, measured, derived, staged, and committed in groups.
+//! Turns run files into rows: reads, measures, derives, stages, and commits in groups.
 
 use std::collections::BTreeSet;
 use std::sync::Arc;
@@ -24,7 +24,7 @@ use crate::references::{Names, digest};
 use crate::rows::{self, Keys};
 use crate::run_content::{Head, RunContent};
 
-/// What became of a run.
+/// Result of the ingest of one run.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Taken {
     /// The run.
@@ -35,20 +35,20 @@ pub struct Taken {
     pub surface: SurfaceId,
     /// Measurements in the table.
     pub measurements: usize,
-    /// Whether its derived rows are there, too.
+    /// True if its derived rows are in the lake, too.
     pub derived: bool,
-    /// References that are missing, separated by commas; empty where none is.
+    /// Missing references, separated by commas; empty if none is missing.
     pub missing: String,
-    /// Whether it is new.
+    /// Its outcome; in JSON the boolean `added`.
     #[serde(rename = "added")]
     pub outcome: Outcome,
-    /// What could not be read, in words.
+    /// Descriptions of what could not be read.
     pub damaged: Vec<String>,
-    /// The file was closed and says how the run ended.
+    /// True if the file was closed and records how the run ended.
     pub whole: bool,
 }
 
-/// Whether a run is new to the lake.
+/// Outcome of an ingest: the run is new, or was in the lake before.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(from = "bool", into = "bool")]
 pub enum Outcome {
@@ -70,32 +70,32 @@ impl From<Outcome> for bool {
     }
 }
 
-/// What became of a file.
+/// Report on one file.
 #[derive(Debug)]
 pub enum Report {
     /// It is in the tables.
     Taken(Taken),
-    /// It cannot be taken in, now or later.
+    /// It cannot be ingested, now or later.
     Refused {
         /// The file.
         source: Source,
-        /// Why not.
+        /// The cause.
         why: Error,
-        /// Where it is now, where it was moved.
+        /// Its new path, if it was moved.
         moved: Option<Path>,
     },
-    /// Another ingest has taken it meanwhile.
+    /// Another ingest has moved it meanwhile.
     Gone(Source),
 }
 
-/// Takes runs into a lake.
+/// Ingests runs into a lake.
 #[derive(Debug, Clone)]
 pub struct Ingest<'a> {
     lake: &'a Lake,
     stop: Arc<AtomicBool>,
 }
 
-/// All that the workers share.
+/// State shared by the workers.
 #[derive(Clone)]
 struct Work {
     context: Context,
@@ -103,17 +103,17 @@ struct Work {
 }
 
 impl<'a> Ingest<'a> {
-    /// Into this lake, until `stop` is set: then what is under way is brought to its end.
+    /// Creates an ingest into this lake. Once `stop` is set, no run is started; runs in progress are completed.
     pub fn new(lake: &'a Lake, stop: Arc<AtomicBool>) -> Self {
         Self { lake, stop }
     }
 
-    /// Takes in runs, references first so that the others are derived with them at once. The same runs again add
-    /// nothing. `report` hears of each file once it is done with.
+    /// Ingests runs, references first so that the others are derived with them at once. It is idempotent: runs that are
+    /// in the lake add nothing. `report` is called for each file when it is finished.
     ///
     /// # Errors
-    /// [`Error::Stopped`], or what the lake says. Files that are not reported yet are not seen by readers; the same
-    /// call goes on with them.
+    /// [`Error::Stopped`], or an error of the lake. Readers do not see files that are not reported yet; the same call
+    /// resumes with them.
     pub async fn take_in(&self, sources: Vec<Source>, report: &mut (dyn FnMut(Report) + Send)) -> Result<()> {
         let (references, others) = self.in_order(sources).await?;
         let (cores, measurer) = (Cores::all()?, Arc::new(Measurer::new(self.lake)));
@@ -158,8 +158,8 @@ impl<'a> Ingest<'a> {
         done
     }
 
-    // Runs of surfaces that others name as references, and the rest. It is for speed alone: what was derived with
-    // references that change is derived again.
+    // Runs of surfaces that others name as references, and the rest. The order only saves time: rows are derived again
+    // if their references change.
     async fn in_order(&self, sources: Vec<Source>) -> Result<(Vec<Source>, Vec<Source>)> {
         let defaults = &self.lake.config().references;
         let mut names = BTreeSet::from([defaults.flat.clone(), defaults.foam.clone()]);
@@ -254,7 +254,7 @@ impl Work {
     }
 }
 
-// The rows that come from the run alone.
+// The rows that do not depend on references.
 fn encode_run(lake: &Lake, keys: &Keys, content: &RunContent) -> Result<Vec<(Table, EncodedFile)>> {
     let rig = lake.rig();
     let origin = content.manifest.origin.label();
@@ -276,7 +276,7 @@ fn encode_run(lake: &Lake, keys: &Keys, content: &RunContent) -> Result<Vec<(Tab
 }
 
 impl RunContent {
-    /// The responses alone, sorted by pair.
+    /// Returns the responses alone, sorted by pair.
     fn responses(&self) -> Responses {
         Responses {
             pairs: self.accepted.iter().map(|(m, _)| m.pair_id).collect(),

@@ -1,4 +1,4 @@
-//! What ingest would take in of a run's file, without taking it in: for checks of the reader against damaged files.
+//! A dry run of ingest on one run file: for tests of the reader against damaged files.
 
 use std::sync::Arc;
 
@@ -13,20 +13,20 @@ use crate::measure::Measurer;
 use crate::pipeline::Cores;
 use crate::run_content::RunContent;
 
-/// A run's file, read.
+/// The contents of a run's file.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Inspection {
-    /// The run that the file says it is.
+    /// The run's id in the file.
     pub run: RunId,
-    /// The surface that it says was measured.
+    /// The surface's id in the file.
     pub surface: SurfaceId,
     /// Accepted measurements by pair.
     pub measurements: Vec<Inspected>,
-    /// Times of the ambient sensor's readings, ns since 1970, as they came.
+    /// Times of the ambient sensor's readings, ns since 1970, in file order.
     pub readings_ns: Vec<i64>,
-    /// Whether the file was closed and says how the run ended.
+    /// True if the file was closed and records how the run ended.
     pub whole: bool,
-    /// What could not be read, in words.
+    /// Descriptions of what could not be read.
     pub damaged: Vec<String>,
 }
 
@@ -44,7 +44,7 @@ pub struct Inspected {
 /// Reads a run's file as ingest does, and writes nothing.
 ///
 /// # Errors
-/// [`Error`](crate::Error) where ingest would refuse the whole file, naming it.
+/// [`Error`](crate::Error) if ingest would refuse the whole file; the message names it.
 pub async fn inspect(lake: &Lake, store: Arc<dyn ObjectStore>, path: &Path, name: &str) -> Result<Inspection> {
     let opened = Opened { store, path: path.clone(), name: name.to_owned() };
     let content = RunContent::read(lake, &Arc::new(Measurer::new(lake)), &Cores::all()?, &opened).await?;

@@ -1,7 +1,7 @@
 //! From a run's MCAP file to rows.
 //!
-//! A run's rows are committed first and its row in `runs` last: from that commit on readers see them. Then
-//! [`complete()`] derives again what used references that are no longer the current ones, and nothing else.
+//! A run's rows are committed first and its row in `runs` last: after that commit readers see them. Then
+//! [`complete()`] derives again the rows that used outdated references, and nothing else.
 //!
 //! ```no_run,standalone_crate
 //! use echolake_ingest::{Ingest, Report, complete, pending};
@@ -21,7 +21,7 @@
 //! # }
 //! ```
 
-// The campaign of `flips_tests` names this crate as any other does.
+// The campaign of `flips_tests` refers to this crate by its external name.
 #[cfg(test)]
 extern crate self as echolake_ingest;
 
@@ -58,5 +58,5 @@ pub use ingest::{Ingest, Outcome, Report, Taken};
 pub use inspect::{Inspected, Inspection, inspect};
 pub use marks::SuspectFile;
 
-/// Version of the code that derives rows; it stands in every row.
+/// Version of the code that derives rows; every row has it.
 pub const CODE_VERSION: &str = concat!("echolake ", env!("CARGO_PKG_VERSION"));

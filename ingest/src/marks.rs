@@ -1,9 +1,9 @@
 //! Marks on the files that ingests read, so that a file that ends the process is found by the next ingest.
 //!
-//! A mark is a locked file; the system releases the lock when the process ends, however it ends. A mark that nobody locks
-//! makes its file a suspect and proves nothing: several files are read at once, and a power cut or an operator's kill is no
-//! file's fault. Suspects are therefore taken in one at a time, each by a process of its own. Only what a living parent
-//! sees of that process counts against the file.
+//! A mark is a locked file; the system releases the lock when the process ends, however it ends. A mark without a lock
+//! makes its file a suspect and proves nothing: several files are read at once, and a power cut or an operator's kill
+//! is not the fault of a file. Suspects are therefore ingested one at a time, each by a process of its own. Only deaths
+//! of that process that a living parent observes count against the file.
 
 use std::fs::{self, File, OpenOptions};
 use std::io::{ErrorKind, Write as _};
@@ -16,9 +16,9 @@ use crate::files::{self, Source};
 use crate::ingest::Report;
 use crate::references::digest;
 
-/// Folder of the marks. Whoever deletes `tables/` begins anew.
+/// Folder of the marks. Deleting `tables/` deletes them, too.
 const FOLDER: &str = "tables/_reading";
-/// Processes that end while they take in a suspect before it is refused. One may be killed together with its parent.
+/// Number of processes that must die of a suspect before it is refused. One may be killed together with its parent.
 const MOST_DEATHS: usize = 2;
 
 /// A mark on a file that is being read. It stays if a panic ends the reading.
@@ -28,8 +28,8 @@ pub(crate) struct ReadingMark {
 }
 
 impl ReadingMark {
-    /// Marks a file. None if it is not in the lake, if another ingest reads it, or if the disk is full: a mark is no
-    /// reason to fail.
+    /// Marks a file. None if it is not in the lake, if another ingest reads it, or if the disk is full: a missing mark
+    /// must not fail the ingest.
     pub(crate) fn new(lake: &Lake, source: &Source) -> Option<Self> {
         let path = mark_path(lake, source)?;
         fs::create_dir_all(path.parent()?).ok()?;
@@ -50,7 +50,7 @@ impl ReadingMark {
 impl Drop for ReadingMark {
     fn drop(&mut self) {
         if !std::thread::panicking() {
-            // A mark that stays costs a process of its own for its file.
+            // A mark that stays only costs a separate process for its file.
             let _ = fs::remove_file(&self.path);
         }
     }
@@ -61,12 +61,12 @@ impl Drop for ReadingMark {
 pub struct SuspectFile {
     source: Source,
     mark: PathBuf,
-    /// How each process ended that took in this file alone.
+    /// Endings of the processes that ingested this file alone.
     endings: Vec<String>,
 }
 
 impl SuspectFile {
-    /// Finds out whether a file is one. A file that is being read now is none.
+    /// Returns the suspect if the file has an unlocked mark; None for a file that is being read now.
     pub fn from_source(lake: &Lake, source: &Source) -> Option<Self> {
         let mark = mark_path(lake, source)?;
         let is_read = File::open(&mark).ok()?.try_lock_shared().is_err();
@@ -79,14 +79,14 @@ impl SuspectFile {
         &self.source
     }
 
-    /// Counts a process that ended while it took in this file alone; `ending` says how. A file that the process had brought
-    /// to its place is a suspect of that name from now on.
+    /// Records the death of a process that ingested this file alone; `ending` describes it. A file that the process had
+    /// already moved to its place is a suspect under its new name from now on.
     ///
     /// # Errors
     /// [`Error::Read`] if the mark cannot be written.
     pub fn add_death(&mut self, ending: &str) -> Result<()> {
         self.endings.push(ending.to_owned());
-        // All of them, because the process has made the mark anew.
+        // Writes all endings, because the process has recreated the mark.
         let mark = OpenOptions::new().write(true).truncate(true).open(&self.mark);
         match mark.and_then(|mut mark| writeln!(mark, "{}", self.endings.join("\n"))) {
             Err(e) if e.kind() != ErrorKind::NotFound => Err(Error::read(self.mark.display(), e)),
@@ -94,10 +94,10 @@ impl SuspectFile {
         }
     }
 
-    /// Refuses the file if enough processes ended by it.
+    /// Refuses the file if enough processes died of it.
     ///
     /// # Errors
-    /// What the lake says.
+    /// Errors of the lake.
     pub async fn refuse(&self, lake: &Lake) -> Result<Option<Report>> {
         if self.endings.len() < MOST_DEATHS {
             return Ok(None);
@@ -105,7 +105,7 @@ impl SuspectFile {
         let (file, mark) = (self.source.to_string(), self.mark.display().to_string());
         let why = Error::Deadly { file, endings: self.endings.join(", "), mark };
         let moved = files::quarantine(lake, &self.source, &why).await?;
-        // The file of a run stays where it is, and its mark with it.
+        // The file of an ingested run is not moved, and its mark stays.
         if moved.is_some() {
             let _ = fs::remove_file(&self.mark);
         }
@@ -113,7 +113,7 @@ impl SuspectFile {
     }
 }
 
-// By a digest: a path may be longer than a file's name.
+// Named by a digest, because a path may be longer than a file name.
 fn mark_path(lake: &Lake, source: &Source) -> Option<PathBuf> {
     let Source::Lake(path) = source else { return None };
     Some(lake.folder()?.join(Path::new(FOLDER)).join(digest(&[path.as_ref()])))
@@ -133,7 +133,7 @@ mod tests {
         let folder = tempfile::tempdir().expect("a folder");
         let url = folder.path().join("lake").display().to_string();
         let lake = Lake::open_or_create(&url, &Rig::paper(), &References::default()).await.expect("a lake");
-        // Too long for the name of its reason.
+        // Too long for the name of the reason's file.
         let name = format!("{}.mcap", "a".repeat(240));
         let source = Source::Lake(ObjectPath::from(format!("inbox/{name}")));
         let inbox = folder.path().join("lake/inbox");
@@ -145,7 +145,7 @@ mod tests {
         drop(mark);
         assert!(!is_suspect(), "its reading ended");
 
-        // As a process leaves it that died.
+        // The state that a dead process leaves behind.
         let die = || fs::write(mark_path(&lake, &source).expect("a lake in a folder"), "").expect("written");
         die();
         let mut suspect = SuspectFile::from_source(&lake, &source).expect("a suspect");

@@ -1,4 +1,4 @@
-//! Messages of one chunk become impulse responses, verdicts, readings and log lines.
+//! Turns the messages of one chunk into impulse responses, verdicts, readings and log lines.
 
 use std::collections::{HashMap, HashSet};
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -17,38 +17,38 @@ use prost::Message as _;
 
 use crate::run_channels::RunChannels;
 
-/// Memory for a run's messages beside those that its rig makes it have: five readings a second for a day, or 100,000
+/// Memory for a run's messages beyond those that its rig implies, bytes: five readings a second for a day, or 100,000
 /// lines of log.
 const SPARE_BYTES: u64 = 32 << 20;
-/// Samples of the longest recording, unless the rig's own are longer; and of all recordings whose plans are kept.
+/// Maximum samples of a recording, unless the rig's own are longer; also of all recordings whose plans are cached.
 const LONGEST_RECORDING: usize = 1 << 22;
-/// Memory of a chunk that holds nothing, with a line about its damage.
+/// Memory of an empty chunk with a line about its damage, bytes.
 const CHUNK_BYTES: u64 = 512;
-/// Memory of one more line.
+/// Memory of one more line, bytes.
 const LINE_BYTES: u64 = 256;
-/// Memory of a short message.
+/// Memory of a short message, bytes.
 const MESSAGE_BYTES: u64 = 64;
-/// How much larger a verdict is in memory: a reason of no letters takes 2 bytes of its message, and 24.
+/// Growth of a verdict in memory: an empty reason takes 2 bytes in its message and 24 in memory.
 const VERDICT_GROWTH: u64 = 12;
-/// Memory of a usual verdict.
+/// Memory of a usual verdict, bytes.
 const VERDICT_BYTES: u64 = 4 << 10;
 
 /// Turns recordings into responses; one for all chunks of all runs.
 pub(crate) struct Measurer {
     rig: Rig,
     pairs: u32,
-    /// Recordings of a run are of one length, those of an import may not be.
+    /// Cache of plans by recording length: a run has one length, an import may have several.
     plans: Mutex<HashMap<usize, Arc<Planned>>>,
     correction: TemperatureCorrection<f32>,
 }
 
-/// Memory that the messages of one run may still take: what a hostile file's chunks hold is up to thousands of times what
-/// is stored of them.
+/// Memory that the messages of one run may still take, bytes: the chunks of a hostile file can decompress to thousands
+/// of times their size.
 #[derive(Debug)]
 pub(crate) struct RunBudget(AtomicU64);
 
 impl RunBudget {
-    /// Takes what is kept of any chunk.
+    /// Takes the memory of an empty chunk.
     pub(crate) fn take_chunk(&self) -> Result<(), String> {
         self.take(CHUNK_BYTES)
     }
@@ -59,7 +59,7 @@ impl RunBudget {
     }
 }
 
-/// The plan of one length, and buffers that no thread uses now.
+/// The plan of one recording length, and a pool of idle buffers.
 struct Planned {
     plan: MeasurementPlan<f32>,
     idle: Mutex<Vec<Buffers>>,
@@ -86,14 +86,14 @@ impl Planned {
     }
 }
 
-/// All that a chunk yields.
+/// Results of one chunk.
 #[derive(Debug, Default)]
 pub(crate) struct Yield {
     pub(crate) responses: Vec<Response>,
     pub(crate) verdicts: Vec<(i64, Measurement)>,
     pub(crate) readings: Vec<(i64, AmbientSample)>,
     pub(crate) events: Vec<(i64, Event)>,
-    /// What could not be read, in words.
+    /// Descriptions of what could not be read.
     pub(crate) damaged: Vec<String>,
     pub(crate) last_time_ns: i64,
 }
@@ -110,7 +110,7 @@ pub(crate) struct Response {
     pub(crate) ir: Vec<f32>,
 }
 
-/// What a response was made from; the greater is preferred.
+/// Origin of a response; the greater is preferred.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub(crate) enum Source {
     Corrected,
@@ -128,7 +128,7 @@ impl Source {
     }
 }
 
-/// A line of the log: the fields of foxglove.Log that the tables keep, with its field numbers.
+/// A log line: the fields of foxglove.Log that the tables store, with their field numbers.
 #[derive(Clone, PartialEq, prost::Message)]
 pub(crate) struct Event {
     #[prost(int32, tag = "2")]
@@ -140,7 +140,7 @@ pub(crate) struct Event {
 }
 
 impl Event {
-    /// The names of foxglove.Log's levels.
+    /// Returns the name of the line's foxglove.Log level.
     pub(crate) fn level_name(&self) -> &'static str {
         ["unknown", "debug", "info", "warning", "error", "fatal"]
             .get(usize::try_from(self.level).unwrap_or(0))
@@ -169,8 +169,7 @@ impl Measurer {
         2 * MESSAGE_BYTES + 4 * self.rig.impulse_response.length as u64
     }
 
-    /// Reads all messages of a chunk, as far as the run's budget goes. What is wrong with one of them is said, and the
-    /// others go on.
+    /// Reads all messages of a chunk, within the run's budget. A damaged message is reported and skipped.
     pub(crate) fn process(
         &self,
         offset: u64,
@@ -183,7 +182,7 @@ impl Measurer {
         for message in chunk.messages() {
             out.last_time_ns = out.last_time_ns.max(message.log_time_ns);
             let Some(channel) = channels.get(&message.channel) else {
-                // Its chunk waited for the summary, which has it as little.
+                // Its chunk waited for the summary, which does not have the channel either.
                 if out.damaged.is_empty() || budget.take(LINE_BYTES).is_ok() {
                     list_damage(&mut out.damaged, || {
                         format!("a message of channel {}, which nothing introduces", message.channel)
@@ -230,7 +229,7 @@ impl Measurer {
         out
     }
 
-    // None where the loopback is silent: the recording is as it was, and its attempt was rejected for that.
+    // None if the loopback is silent: the recording is intact, and its attempt was rejected for the silence.
     fn sweep(
         &self,
         chunk_offset: u64,
@@ -270,7 +269,7 @@ impl Measurer {
         }))
     }
 
-    // None where the chunk has its recording, too, which is preferred: then there is nothing left but to check it.
+    // None if the chunk has its recording, too, which is preferred: then the response is only checked.
     fn ir(
         &self,
         chunk_offset: u64,
@@ -347,7 +346,7 @@ impl Measurer {
     }
 }
 
-// Samples stay where they are in the chunk.
+// Does not copy the samples: they stay in the chunk.
 fn decode<M: RunMessage>(schema: &str, data: Bytes) -> Result<M, String> {
     if schema != M::FULL_NAME {
         return Err(format!("its schema is `{schema}`, expected `{}`", M::FULL_NAME));
@@ -355,7 +354,7 @@ fn decode<M: RunMessage>(schema: &str, data: Bytes) -> Result<M, String> {
     M::decode(data).map_err(|e| e.to_string())
 }
 
-// The count comes from the file: nothing is allocated for one that its bytes do not bear out.
+// The count comes from the file: checked against the bytes before anything is allocated for it.
 fn check_bytes(format: SampleFormat, count: usize, bytes: &[u8]) -> Result<(), String> {
     let width = format.bytes().ok_or("its sample format is unknown")?;
     match count.checked_mul(width) == Some(bytes.len()) {

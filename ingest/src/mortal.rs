@@ -1,4 +1,4 @@
-//! A store in memory that dies at one of its writes, to try what a crash leaves behind.
+//! A store in memory that dies at one of its writes, for crash tests.
 
 use std::fmt;
 use std::sync::Arc;
@@ -13,16 +13,16 @@ use object_store::{
     PutMultipartOptions, PutOptions, PutPayload, PutResult, RenameOptions, Result as StoreResult,
 };
 
-/// Where a store dies.
+/// The moment of a store's death.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Death {
     /// The write is not made.
     Before,
-    /// The write is made, and its author does not hear of it.
+    /// The write is made, and its author gets an error.
     After,
 }
 
-/// A store that dies at its nth write; all that comes later fails.
+/// A store that dies at its nth write; all later writes fail.
 #[derive(Debug)]
 pub(crate) struct Mortal {
     inner: Arc<InMemory>,
@@ -36,12 +36,12 @@ impl Mortal {
         Arc::new(Self { inner, writes: AtomicUsize::new(0), last, death })
     }
 
-    /// Whether it came to its end.
+    /// Returns whether the store has died.
     pub(crate) fn died(&self) -> bool {
         self.writes.load(Ordering::SeqCst) > self.last
     }
 
-    // Whether the write is made, and whether its author hears of it.
+    // Returns (made, acknowledged): whether the write is made, and whether its author gets its result.
     fn write(&self) -> (bool, bool) {
         let number = self.writes.fetch_add(1, Ordering::SeqCst);
         (number < self.last || (number == self.last && self.death == Death::After), number < self.last)
@@ -101,7 +101,7 @@ impl ObjectStore for Mortal {
         self.mutate(self.inner.copy_opts(from, to, options)).await
     }
 
-    // In one step, as a file system does it.
+    // Atomic, as in a file system.
     async fn rename_opts(&self, from: &Path, to: &Path, options: RenameOptions) -> StoreResult<()> {
         self.mutate(self.inner.rename_opts(from, to, options)).await
     }

@@ -1,8 +1,8 @@
-//! Jobs done by a few workers at once, and their files committed in groups.
+//! Runs jobs on a few workers at once, and commits their files in groups.
 //!
-//! A commit costs the same for one run as for many, and a table's log grows with every commit; so what becomes ready
-//! within a short time is committed together. Queues are bounded: what waits in memory is a few
-//! lists of staged files, not rows.
+//! A commit costs the same for one run as for many, and a table's log grows with every commit; so jobs that become
+//! ready within a short time are committed together. Queues are bounded: a few lists of staged files wait in memory,
+//! not rows.
 
 use std::collections::VecDeque;
 use std::panic::{AssertUnwindSafe, catch_unwind, resume_unwind};
@@ -18,26 +18,26 @@ use tokio::time::{Instant, timeout_at};
 
 use crate::error::{Error, Result};
 
-/// Jobs whose files go into one commit at most: a crash loses that much work, and nothing else.
+/// Maximum number of jobs per commit: a crash loses that much work, and nothing else.
 const GROUP: usize = 16;
 
-/// How long a job waits for others to be committed with: every commit is a file in each table's log, which all readers
-/// read.
+/// Time that a job waits for others to share its commit: every commit adds a file to each table's log, which all
+/// readers read.
 const GATHER: Duration = Duration::from_secs(2);
 
-/// The machine's cores, shared by all that computes: a thread each, whose memory is used again and again. Tokio's own
-/// pool would spread the work, and what it frees, over hundreds.
+/// A pool of one thread per core, shared by all computations; each thread reuses its memory. Tokio's blocking pool
+/// would spread the work, and the memory it frees, over hundreds of threads.
 #[derive(Debug, Clone)]
 pub(crate) struct Cores {
     pool: Arc<ThreadPool>,
-    /// How many are at work, here and elsewhere.
+    /// Number of busy cores, in the pool and elsewhere.
     busy: Arc<AtomicUsize>,
 }
 
-/// A core at work, for as long as this lives.
+/// A guard that counts a core as busy until it is dropped.
 pub(crate) struct Busy(Arc<AtomicUsize>);
 
-/// Something that a core computes.
+/// Handle of a computation on a core.
 pub(crate) struct Begun<T>(oneshot::Receiver<std::thread::Result<T>>);
 
 impl Drop for Busy {
@@ -46,14 +46,14 @@ impl Drop for Busy {
     }
 }
 
-/// What a job brings to the commit.
+/// A finished job, ready for the commit.
 pub(crate) struct Ready<R> {
-    /// Files in the store; the last one decides over the job.
+    /// Files in the store; the last one decides the job's outcome.
     pub(crate) staged: Vec<Staged>,
     pub(crate) report: R,
 }
 
-/// A job, with what came of it: its report and what became of its last file, None where it had no files.
+/// A job with its result: its report, and the outcome of its last file (None if it had no files).
 pub(crate) type Ended<J, R> = (J, Result<(R, Option<Committed>)>);
 
 impl Cores {
@@ -67,54 +67,54 @@ impl Cores {
         self.pool.current_num_threads()
     }
 
-    /// Counts the caller as a core at work.
+    /// Counts the caller as a busy core.
     pub(crate) fn busy(&self) -> Busy {
         self.busy.fetch_add(1, Ordering::Relaxed);
         Busy(self.busy.clone())
     }
 
-    /// Whether there is a core that would begin at once.
+    /// Returns whether a core is idle.
     pub(crate) fn is_one_idle(&self) -> bool {
         self.busy.load(Ordering::Relaxed) < self.count()
     }
 
-    /// Begins to compute on a core of its own, once one is free: in the order of the calls.
+    /// Starts a computation on a core of its own once one is free, in the order of the calls.
     pub(crate) fn begin<T: Send + 'static>(&self, work: impl FnOnce() -> T + Send + 'static) -> Begun<T> {
         let (sender, done) = oneshot::channel();
         let busy = self.busy();
         self.pool.spawn_fifo(move || {
             let done = catch_unwind(AssertUnwindSafe(work));
             drop(busy);
-            // Nobody waits any more where the whole ingest was given up.
+            // The receiver is gone if the whole ingest was cancelled.
             let _ = sender.send(done);
         });
         Begun(done)
     }
 
-    /// Computes on a core of its own, as [`Self::begin`] does.
+    /// Computes on a core of its own, as [`Self::begin`] does, and waits for the result.
     pub(crate) async fn compute<T: Send + 'static>(&self, work: impl FnOnce() -> T + Send + 'static) -> T {
         self.begin(work).done().await
     }
 }
 
 impl<T> Begun<T> {
-    /// What was computed.
+    /// Waits for the result; a panic of the computation is resumed here.
     pub(crate) async fn done(self) -> T {
         match self.0.await {
             Ok(Ok(done)) => done,
             Ok(Err(panic)) => resume_unwind(panic),
-            // The pool sends always, and lives as long as we do.
+            // Unreachable: the pool always sends, and outlives the handle.
             Err(_) => std::future::pending().await,
         }
     }
 }
 
-/// Does all jobs, one a core at a time and one more that reads meanwhile. `ended` hears of each once its files are
-/// committed, or that it failed; an error that it returns ends everything. What is under way when `stop` is set is
-/// brought to its end.
+/// Runs all jobs, one per core at a time and one more that reads meanwhile. `ended` is called for each job when its
+/// files are committed or it failed; an error that it returns ends everything. Jobs in progress when `stop` is set are
+/// completed.
 ///
 /// # Errors
-/// [`Error::Stopped`] where jobs are left, what `ended` returned, or what the lake says to a commit.
+/// [`Error::Stopped`] if jobs are left, an error that `ended` returned, or the lake's error in a commit.
 pub(crate) async fn run<J, R, W, F>(
     lake: &Lake,
     cores: &Cores,
@@ -152,7 +152,7 @@ where
         commit(lake, group, ended).await?;
         halt.store(stop.load(Ordering::Relaxed), Ordering::Relaxed);
     }
-    // A worker that panicked has left its job undone.
+    // A worker that panicked has not finished its job.
     while let Some(worker) = workers.join_next().await {
         if let Err(e) = worker
             && e.is_panic()
@@ -163,7 +163,7 @@ where
     if next(&queue).is_some() { Err(Error::Stopped) } else { Ok(()) }
 }
 
-// What is ready, until it is enough for a commit or has waited long enough; None once no more will come.
+// Collects ready jobs until there are enough for a commit or the timeout is over; None once no more will come.
 async fn gather<T>(ready: &mut mpsc::Receiver<T>) -> Option<Vec<T>> {
     let mut group = vec![ready.recv().await?];
     let deadline = Instant::now() + GATHER;

@@ -1,4 +1,4 @@
-//! Rows that are in the lake, read back by ingest itself.
+//! Reads rows back from the lake, for ingest itself.
 
 use arrow::array::{Array as _, AsArray as _};
 use arrow::compute::concat_batches;
@@ -15,7 +15,7 @@ use parquet::arrow::arrow_reader::{ArrowReaderOptions, ParquetRecordBatchReaderB
 use crate::derived_values::Responses;
 use crate::error::{Error, Result};
 
-/// A run's impulse responses as they stand in `measurements`.
+/// Reads a run's impulse responses from `measurements`.
 pub(crate) async fn responses(lake: &Lake, snapshot: &Snapshot, run: &RunId) -> Result<Responses> {
     let mut out = Responses::default();
     let files: Vec<_> = snapshot.files_of(Table::Measurements, run).cloned().collect();
@@ -36,7 +36,7 @@ pub(crate) async fn responses(lake: &Lake, snapshot: &Snapshot, run: &RunId) -> 
     Ok(out)
 }
 
-// A file of the run alone is read whole, and with it its checks; of a merged one the run's pages are.
+// A file of this run alone is read and checked as a whole; of a merged file only the run's pages are read.
 async fn responses_in(lake: &Lake, file: &DataFile, run: &RunId) -> Result<Vec<RecordBatch>> {
     let columns = ["pair_id", "ir"];
     let place = file.visible_parts().find(|(part, _)| part.run == *run).map(|(_, rows)| rows);
@@ -46,14 +46,14 @@ async fn responses_in(lake: &Lake, file: &DataFile, run: &RunId) -> Result<Vec<R
     }
 }
 
-/// A run's row of `runs`.
+/// Reads a run's row of `runs`.
 pub(crate) async fn run_row(lake: &Lake, file: &DataFile) -> Result<RecordBatch> {
     let batches = batches(lake, Table::Runs, file, &[]).await?;
     concat_batches(&Table::Runs.schema(lake.rig()), &batches)
         .map_err(|e| Error::DataFile { file: file.path.to_string(), reason: e.to_string() })
 }
 
-/// The named columns of a file, or all.
+/// Reads the named columns of a file; all if `columns` is empty.
 pub(crate) async fn batches(lake: &Lake, table: Table, file: &DataFile, columns: &[&str]) -> Result<Vec<RecordBatch>> {
     let damaged = |reason: String| Error::DataFile { file: file.path.to_string(), reason };
     let found = lake.store().get(&file.path).await.map_err(|e| damaged(e.to_string()))?;

@@ -1,4 +1,4 @@
-//! The references that a surface names: which runs they are, their version, and their mean responses.
+//! The references that a surface names: their runs, their versions, and their mean responses.
 
 use std::collections::{BTreeSet, HashMap};
 use std::sync::Arc;
@@ -14,22 +14,22 @@ use crate::derived_values::{Flats, Means, derivation_plan};
 use crate::error::{Error, Result};
 use crate::read_back;
 
-/// Hex digits that a version keeps of its digest.
+/// Number of hex digits of a digest in a version.
 const VERSION_DIGITS: usize = 12;
 
-/// Finds references in one snapshot, and keeps what it loaded.
+/// Finds references in one snapshot, and caches their responses.
 pub(crate) struct Finder {
     lake: Lake,
     snapshot: Arc<Snapshot>,
     /// The references that each surface's row names.
     names: HashMap<SurfaceId, Names>,
     versions: HashMap<SurfaceId, String>,
-    /// By version: means change with the runs, and then so does the version.
+    /// Keyed by version: the means change with the runs, and so does the version.
     means: HashMap<String, Arc<Means>>,
     flats: HashMap<String, Arc<Flats>>,
 }
 
-/// One finder for all workers: what one has loaded, the others use.
+/// One finder for all workers: they share its cache.
 pub(crate) type SharedFinder = Arc<Mutex<Finder>>;
 
 /// The surfaces that a surface names as its references.
@@ -40,7 +40,7 @@ pub(crate) struct Names {
 }
 
 impl Names {
-    /// Those that a run's surface gives, else the lake's.
+    /// Returns the names that a run's surface gives, else the lake's.
     pub(crate) fn of(surface: &SurfaceRecord, references: &References) -> Self {
         Self {
             flat: surface.flat_reference.clone().unwrap_or_else(|| references.flat.clone()),
@@ -49,7 +49,7 @@ impl Names {
     }
 }
 
-/// The references of a surface, as far as they are there.
+/// The references of a surface, as far as the lake has them.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct Wanted {
     pub(crate) flat: Found,
@@ -62,7 +62,7 @@ pub(crate) struct Wanted {
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct Found {
     pub(crate) surface: SurfaceId,
-    /// None where no run carries the name.
+    /// None if the lake has no run of the surface.
     pub(crate) version: Option<String>,
 }
 
@@ -72,7 +72,7 @@ impl Finder {
         for run in snapshot.runs() {
             runs.entry(run.surface.clone()).or_default().push(format!("{}.{}", run.run, run.run_derivation));
         }
-        // `flat:2:1f00ab...`: the surface, how many runs, and a digest of what their rows were made from.
+        // `flat:2:1f00ab...`: the surface, the number of runs, and a digest of their derivations.
         let version = |(surface, runs): (SurfaceId, Vec<String>)| {
             let version = format!("{surface}:{}:{}", runs.len(), digest(&runs));
             (surface, version)
@@ -87,18 +87,18 @@ impl Finder {
         Arc::new(Mutex::new(Self::new(lake, snapshot)))
     }
 
-    /// What the surface's rows are to be derived with.
+    /// Returns the references with which the surface's rows must be derived.
     pub(crate) fn wanted(&self, surface: &SurfaceId) -> Wanted {
         self.wanted_by(self.names(surface))
     }
 
-    /// The same for a surface that names these.
+    /// The same for a surface with these names.
     pub(crate) fn wanted_by(&self, Names { flat, foam }: Names) -> Wanted {
         let flat_foam = self.names(&flat).foam;
         Wanted { flat: self.found(flat), foam: self.found(foam), flat_foam: self.found(flat_foam) }
     }
 
-    /// Mean responses of Foam, and energies of Flat's with its Foam subtracted; None where one is missing.
+    /// Loads the mean responses of Foam and the energies of Flat with its Foam subtracted; None if one is missing.
     pub(crate) async fn load(&mut self, wanted: &Wanted) -> Result<Option<(Arc<Means>, Arc<Flats>)>> {
         let Some((version, _)) = wanted.versions() else { return Ok(None) };
         let foam = self.mean(&wanted.foam).await?;
@@ -139,7 +139,7 @@ impl Finder {
         Found { version: self.versions.get(&surface).cloned(), surface }
     }
 
-    // The lake's for a surface that is not there.
+    // The lake's defaults for an unknown surface.
     fn names(&self, surface: &SurfaceId) -> Names {
         let references = &self.lake.config().references;
         let defaults = || Names { flat: references.flat.clone(), foam: references.foam.clone() };
@@ -147,7 +147,7 @@ impl Finder {
     }
 }
 
-// The names that a surface's row gives, which stand in its file's statistics.
+// The names in a surface's row, taken from its file's statistics.
 fn names(file: &DataFile, references: &References) -> Option<(SurfaceId, Names)> {
     let Some(FileName::Rows { surface, .. }) = FileName::parse(&file.path) else { return None };
     let text = |column: &str| file.stats.as_ref()?.min.get(column)?.as_str()?.parse().ok();
@@ -172,19 +172,19 @@ fn flats(rig: &Rig, flat: &Means, foam: &Means) -> Result<Flats> {
 }
 
 impl Wanted {
-    /// Flat's version and Foam's; None while one is missing. Flat's numbers depend on what was subtracted from it, too.
+    /// Returns Flat's version and Foam's; None if one is missing. Flat's version includes that of its own Foam.
     pub(crate) fn versions(&self) -> Option<(String, String)> {
         let (flat, flat_foam) = (self.flat.version.as_ref()?, self.flat_foam.version.as_ref()?);
         Some((format!("{flat}-{}", digest(&[flat_foam])), self.foam.version.clone()?))
     }
 
-    /// The name of what is derived with them of a run.
+    /// Returns the derivation's name for a run with these references.
     pub(crate) fn derivation(&self, run_derivation: &str) -> Option<String> {
         let (flat, foam) = self.versions()?;
         Some(digest(&[run_derivation, &flat, &foam, CODE_VERSION]))
     }
 
-    /// The surfaces that have no run, for people.
+    /// Returns the names of the missing references, for messages.
     pub(crate) fn missing(&self) -> String {
         let absent = [&self.flat, &self.foam, &self.flat_foam].into_iter().filter(|f| f.version.is_none());
         let names: BTreeSet<_> = absent.map(|f| f.surface.as_str()).collect();
@@ -192,7 +192,7 @@ impl Wanted {
     }
 }
 
-/// A short digest of parts, none of which holds a line break.
+/// Returns a short digest of parts, none of which contains a line break.
 pub(crate) fn digest(parts: &[impl AsRef<str>]) -> String {
     let mut sha = Sha256::new();
     for part in parts {

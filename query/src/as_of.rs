@@ -1,8 +1,8 @@
-//! `AS OF`: tables as they were. `nce VERSION AS OF 12` is spelled `"nce@12"`, which every parser takes, and the
-//! catalogue gives tables of such names.
+//! `AS OF`: past versions of tables. `nce VERSION AS OF 12` is rewritten to `"nce@12"`, which every parser accepts, and
+//! the catalogue resolves such names.
 //!
-//! The parser knows `AS OF` in some dialects only, and the planner in none, so the text is respelled before it is
-//! parsed; what follows keeps its line and column, so that errors still point at the place.
+//! The parser supports `AS OF` in some dialects only, and the planner in none, so the text is rewritten before it is
+//! parsed; the rest keeps its line and column, so that errors still point at the place.
 
 use std::borrow::Cow;
 use std::collections::BTreeSet;
@@ -20,7 +20,7 @@ use echolake_lake::Moment;
 
 use crate::Error;
 
-/// What stands between a table's name and the moment.
+/// Separator between a table's name and the moment.
 const MARK: char = '@';
 /// A table or view at a moment.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
@@ -39,10 +39,10 @@ impl Past {
         Some(Self { name: name.to_owned(), table: table.to_owned(), at: at.to_owned() })
     }
 
-    /// The moment.
+    /// Parses the moment.
     ///
     /// # Errors
-    /// [`Error::Query`] where it is neither a version nor a time.
+    /// [`Error::Query`] if it is neither a version nor a time.
     pub(crate) fn moment(&self) -> Result<Moment, Error> {
         self.at.parse().map_err(|_| Error::Query {
             message: format!("`{}` is neither a version nor a time", self.at),
@@ -52,14 +52,14 @@ impl Past {
     }
 }
 
-/// The query with its `AS OF` respelled: after a table's name `[FOR] VERSION AS OF n`, `[FOR] TIMESTAMP AS OF 't'` or
-/// `FOR SYSTEM_TIME AS OF 't'`.
+/// Returns the query with its `AS OF` clauses rewritten: after a table's name `[FOR] VERSION AS OF n`,
+/// `[FOR] TIMESTAMP AS OF 't'` or `FOR SYSTEM_TIME AS OF 't'`.
 pub(crate) fn respelled(sql: &str) -> Cow<'_, str> {
     let unchanged = Cow::Borrowed(sql);
     if !sql.as_bytes().windows(2).any(|two| two.eq_ignore_ascii_case(b"of")) {
         return unchanged;
     }
-    // What is no SQL is left to the parser's message.
+    // Invalid SQL is left to the parser's message.
     let Ok(tokens) = Tokenizer::new(&GenericDialect {}, sql).tokenize_with_location() else { return unchanged };
     let tokens: Vec<_> = tokens.into_iter().filter(|t| !matches!(t.token, Token::Whitespace(_))).collect();
     let found: Vec<_> = (0..tokens.len()).filter_map(|i| clause(&tokens, i)).collect();
@@ -80,7 +80,7 @@ pub(crate) fn respelled(sql: &str) -> Cow<'_, str> {
     Cow::Owned(out)
 }
 
-/// `nce VERSION AS OF 12`, and what takes its place.
+/// A clause `nce VERSION AS OF 12` and its replacement.
 struct Clause {
     start: Location,
     end: Location,
@@ -115,7 +115,7 @@ fn is_word(token: &TokenWithSpan, word: &str) -> bool {
     matches!(&token.token, Token::Word(w) if w.quote_style.is_none() && w.value.eq_ignore_ascii_case(word))
 }
 
-// The name is shorter than what it replaces; the rest is filled, so that what follows stays where it was.
+// The name is shorter than the clause; blanks fill the rest, so that the following text keeps its place.
 fn fill(out: &mut String, name: &str, replaced: &str) {
     out.push_str(name);
     let blank = |c: char| if c == '\n' { '\n' } else { ' ' };
@@ -137,7 +137,7 @@ impl<'a> ByteOffsets<'a> {
         Self { rest: text.char_indices().peekable(), len: text.len(), at: Location { line: 1, column: 1 } }
     }
 
-    /// The offset of a place that is not before the last one.
+    /// Returns the offset of a place, which must not be before the previous one.
     fn advance(&mut self, place: Location) -> usize {
         while self.at < place
             && let Some((_, c)) = self.rest.next()
@@ -151,8 +151,8 @@ impl<'a> ByteOffsets<'a> {
     }
 }
 
-/// The tables of the past that a statement names. Each that has no alias gets its plain name as one, so that
-/// `nce.pair_id` means what it says.
+/// Returns the past tables that a statement names. Each one without an alias gets its plain name as alias, so that
+/// `nce.pair_id` refers to it.
 pub(crate) fn named(statement: &mut Statement) -> BTreeSet<Past> {
     match statement {
         Statement::Statement(sql) => named_in(sql),

@@ -1,8 +1,9 @@
-//! The catalogue of one query: tables and views of one frozen view of the lake, and what the query names beside them.
+//! The catalogue of one query: tables and views of one snapshot of the lake, and the past tables and run files that the
+//! query names.
 //!
-//! Taking a view reads twelve logs, so the last one is kept for as long as `runs` has no newer version: a run's rows
-//! are seen when its row in `runs` is. What `optimize` does is not seen by that, and need not be at once, because the
-//! files that it replaces stay for as long as `vacuum` keeps them; so all logs are looked at now and then.
+//! Taking a snapshot reads twelve logs, so the last one is cached until `runs` has a newer version: a run's rows become
+//! visible together with its row in `runs`. That check does not detect commits of `optimize`. They are not urgent,
+//! because `vacuum` keeps replaced files for a while; so all logs are checked periodically.
 
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -25,21 +26,21 @@ use crate::table::{LakeTable, Source};
 use crate::views::{Lookups, PairJoin, SortedNulls, UnusedJoin, View};
 use crate::{Error, error};
 
-/// How long another layout of the same rows may go unseen; vacuum keeps replaced files an hour at least.
+/// Time for which a new layout of the same rows may go undetected; vacuum keeps replaced files for an hour at least.
 const LAYOUT_SEEN: Duration = Duration::from_secs(30);
-/// Tables of the past that are kept.
+/// Maximum number of cached past tables.
 const PAST_KEPT: usize = 32;
 
-/// Makes the tables of a lake known to a query's context.
+/// Registers the tables of a lake in a query's context.
 pub(crate) struct Catalog {
     lake: Lake,
     source: Source,
     lookups: Lookups,
     names: Vec<(&'static str, SchemaRef)>,
     current: Mutex<Option<Arc<Current>>>,
-    /// One takes a new view, the others wait for it.
+    /// Held while one query takes a new snapshot; the others wait for it.
     taking: tokio::sync::Mutex<()>,
-    /// Tables of the past, which do not change. The oldest goes first.
+    /// Cache of past tables, which do not change. The oldest is evicted first.
     past: Mutex<Vec<PastTable>>,
     runs: Arc<mcap::Files>,
 }
@@ -47,7 +48,7 @@ pub(crate) struct Catalog {
 /// A table as it was at a moment.
 type PastTable = ((Moment, Table), Arc<LakeTable>);
 
-/// One view of the lake.
+/// One snapshot of the lake with its tables and views.
 struct Current {
     snapshot: Arc<Snapshot>,
     tables: HashMap<Table, Arc<LakeTable>>,
@@ -57,7 +58,7 @@ struct Current {
 
 impl Catalog {
     /// # Errors
-    /// [`Error::Lake`] where the rig cannot be laid out, [`Error::Execution`] where a view does not fit its tables.
+    /// [`Error::Lake`] if the rig cannot be laid out, [`Error::Execution`] if a view does not fit its tables.
     pub(crate) fn new(lake: &Lake, source: Source) -> Result<Self, Error> {
         let lookups = Lookups::of(lake)?;
         let mut names: Vec<_> = Table::ALL.into_iter().map(|t| (t.name(), t.schema(lake.rig()))).collect();
@@ -76,17 +77,17 @@ impl Catalog {
         })
     }
 
-    /// The optimizer's rules for plans over these tables and views, the same for every view of the lake.
+    /// Returns the optimizer rules for plans over these tables and views, the same for every snapshot.
     pub(crate) fn rules(&self) -> [Arc<dyn OptimizerRule + Send + Sync>; 3] {
         [Arc::new(UnusedJoin), Arc::new(PairJoin::new(&self.lookups)), Arc::new(SortedNulls)]
     }
 
-    /// Registers what `statement` may name, all of one view of the lake. The statement is known before its plan, since
-    /// what it names may have to be looked up, and planning cannot wait.
+    /// Registers everything that `statement` may name, all of one snapshot of the lake. It is called before planning,
+    /// because the lookup of these names is asynchronous and planning is not.
     ///
     /// # Errors
-    /// [`Error::Lake`] where the lake cannot be read, or not as of the moment that the statement wants;
-    /// [`Error::Query`] where that is none.
+    /// [`Error::Lake`] if the lake cannot be read, or not as of the moment that the statement names;
+    /// [`Error::Query`] if that is no moment.
     pub(crate) async fn register(&self, context: &SessionContext, statement: &mut Statement) -> Result<(), Error> {
         let past = as_of::named(statement);
         let current = self.current().await?;
@@ -100,23 +101,23 @@ impl Catalog {
         mcap::register(context, &current.snapshot, &self.runs, statement).await
     }
 
-    /// The view of the lake that a query of now sees; the same one for as long as nothing changes.
+    /// Returns the current snapshot of the lake, which a query started now would see; cached until something changes.
     ///
     /// # Errors
-    /// [`Error::Lake`] where the lake cannot be read.
+    /// [`Error::Lake`] if the lake cannot be read.
     pub(crate) async fn snapshot(&self) -> Result<Arc<Snapshot>, Error> {
         Ok(self.current().await?.snapshot.clone())
     }
 
-    /// What a run's file holds.
+    /// Returns the contents of a run's file, from its summary and message indexes.
     ///
     /// # Errors
-    /// [`Error::Execution`] where the file cannot be read.
+    /// [`Error::Execution`] if the file cannot be read.
     pub(crate) async fn contents(&self, run: &VisibleRun) -> Result<Contents, Error> {
         mcap::contents(run, &self.runs).await
     }
 
-    /// The bytes of the first attachment of a run's file whose name ends so; None where there is none.
+    /// Returns the bytes of the first attachment of a run's file whose name has this ending; None if there is none.
     ///
     /// # Errors
     /// As [`Catalog::contents`].
@@ -124,7 +125,7 @@ impl Catalog {
         mcap::attachment(run, ending, &self.runs).await
     }
 
-    /// The tables and views and their schemas.
+    /// Returns the tables and views with their schemas.
     pub(crate) fn tables(&self) -> impl Iterator<Item = (&'static str, SchemaRef)> {
         self.names.iter().cloned()
     }
@@ -137,7 +138,7 @@ impl Catalog {
             return Ok(current.clone());
         }
         let _taking = self.taking.lock().await;
-        // Somebody else may have taken one meanwhile, but before what this query may expect to see.
+        // Another query may have taken a snapshot meanwhile; it is used only if it is still fresh.
         let newer = self.known();
         if let Some(newer) = &newer
             && known.as_ref().is_none_or(|known| !Arc::ptr_eq(known, newer))
@@ -227,7 +228,7 @@ impl Catalog {
         }
         let snapshot = self.lake.snapshot_at(moment, table).await?;
         let provider = self.table(table, snapshot.files(table))?;
-        // What a later time shows is not settled yet.
+        // Only versions are cached: the result for a time may still change.
         if matches!(moment, Moment::Version(_)) {
             let mut past = self.past.lock().unwrap_or_else(PoisonError::into_inner);
             if past.len() >= PAST_KEPT {

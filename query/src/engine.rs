@@ -1,4 +1,4 @@
-//! The engine: what all sessions of a process share, a lake, its files' footers, memory and limits.
+//! The engine: the lake, cached file footers, memory and limits that all sessions of a process share.
 
 use std::collections::BTreeSet;
 use std::sync::Arc;
@@ -30,17 +30,17 @@ use crate::small::SmallTables;
 use crate::table::Source;
 use crate::{Error, Functions, Opaque, Session};
 
-/// Where the lake's store is registered; no other store is, so no query reaches a file outside of the lake.
+/// URL of the lake's store. No other store is registered, so no query can reach a file outside of the lake.
 const STORE: &str = "echolake://lake/";
-/// The store that DataFusion registers by itself: the whole machine.
+/// URL of the store that DataFusion registers by default: the whole machine.
 const MACHINE: &str = "file:///";
-/// Rows a batch: 384 samples each make 3 MB of responses.
+/// Rows per batch: at 384 samples each, 3 MB of responses.
 const BATCH_ROWS: usize = 2048;
-/// Memory for the files' footers and page indexes. A session asks the same files again and again, and those of a
-/// thousand runs are more than DataFusion's 50 MiB.
+/// Cache size for the files' footers and page indexes, bytes. Queries read the same files again and again, and a
+/// thousand runs need more than DataFusion's default of 50 MiB.
 const METADATA_BYTES: usize = 256 << 20;
 
-/// Disk that sorts and aggregations of all queries may use.
+/// Disk space that sorts and aggregations of all queries may use, bytes.
 const SPILL_BYTES: u64 = 16 << 30;
 
 /// Answers the queries of many sessions on one lake.
@@ -53,13 +53,13 @@ struct Inner {
     threads: Threads,
     running: RunningQueries,
     limits: Limits,
-    /// Names of the field's functions.
+    /// Names of echolake's own functions.
     own: BTreeSet<String>,
-    // Watches times whatever the queries do to their own threads.
+    // A thread for timeouts, which busy query threads cannot delay.
     watch: Threads,
 }
 
-/// What all queries of a process together may use.
+/// Limits on all queries of a process together.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct Limits {
     /// Bytes that queries may hold; None for no limit.
@@ -71,50 +71,50 @@ pub struct Limits {
 pub struct Function {
     /// Its name.
     pub name: String,
-    /// How it is called.
+    /// Its call syntax.
     pub syntax: String,
-    /// What it does.
+    /// Its description.
     pub description: String,
-    /// Whether it is of the field and not of SQL at large.
+    /// True for echolake's own functions, false for those of DataFusion.
     pub is_own: bool,
 }
 
 impl Function {
-    /// What it is given, as its call names it.
+    /// Returns the arguments in the call syntax, without the parentheses.
     pub fn arguments(&self) -> &str {
         let inner = self.syntax.split_once('(').map_or("", |(_, rest)| rest);
         inner.rsplit_once(')').map_or(inner, |(inner, _)| inner)
     }
 }
 
-/// Who asks, and how much they may have. One for all sessions of a token.
+/// A client with its quota. All sessions of a token share one.
 #[derive(Debug)]
 pub struct Client {
     name: String,
     quota: Quota,
     places: Option<Arc<Semaphore>>,
-    /// Bytes that operators of its queries say they hold.
+    /// Bytes that operators of its queries have reserved.
     held: Arc<AtomicUsize>,
 }
 
 impl Client {
-    /// A client.
+    /// Creates a client.
     pub fn new(name: impl Into<String>, quota: Quota) -> Self {
         let places = quota.concurrent.map(|places| Arc::new(Semaphore::new(places)));
         Self { name: name.into(), quota, places, held: Arc::default() }
     }
 
-    /// Name for logs and refusals.
+    /// Returns the name for logs and error messages.
     pub fn name(&self) -> &str {
         &self.name
     }
 
-    /// What their queries may use.
+    /// Returns the limits on the client's queries.
     pub fn quota(&self) -> &Quota {
         &self.quota
     }
 
-    /// Their part of the pool of all queries.
+    /// Returns the client's share of the memory pool of all queries.
     pub(crate) fn memory_pool(&self, all: Arc<dyn MemoryPool>) -> Arc<dyn MemoryPool> {
         match self.quota.memory {
             Some(limit) => Arc::new(PartialPool::new(all, "the client's queries hold", limit, self.held.clone())),
@@ -122,25 +122,25 @@ impl Client {
         }
     }
 
-    /// A place among what they may run at once, for a query or for other work that their requests cause.
+    /// Acquires one of the client's concurrency permits, for a query or for other work that its requests cause.
     ///
     /// # Errors
-    /// [`Error::Busy`] where all are taken.
+    /// [`Error::Busy`] if all are taken.
     pub fn place(&self) -> Result<Place, Error> {
         let Some(places) = &self.places else { return Ok(Place(None)) };
         let place = places.clone().try_acquire_owned().map_err(|_| self.busy())?;
         Ok(Place(Some(place)))
     }
 
-    /// The same for who waits a while where all are taken; who came first is served first.
+    /// Acquires a permit like [`Client::place`], but waits up to `wait` if all are taken; first come, first served.
     ///
     /// # Errors
-    /// [`Error::Busy`] where all are taken for as long as `wait`.
+    /// [`Error::Busy`] if none becomes free within `wait`.
     pub async fn place_within(&self, wait: Duration) -> Result<Place, Error> {
         let Some(places) = &self.places else { return Ok(Place(None)) };
         match tokio::time::timeout(wait, places.clone().acquire_owned()).await {
             Ok(Ok(place)) => Ok(Place(Some(place))),
-            // They are never closed, so it is the time that is over.
+            // The semaphore is never closed, so this is the timeout.
             _ => Err(self.busy()),
         }
     }
@@ -150,28 +150,28 @@ impl Client {
     }
 }
 
-/// A place among what a client may run at once; dropped, it is free for the next.
+/// A permit for one of the queries that a client may run at once; released on drop.
 #[derive(Debug)]
 pub struct Place(#[expect(dead_code, reason = "it is held")] Option<OwnedSemaphorePermit>);
 
-/// What the queries of one client may use; None is as much as there is.
+/// Limits on the queries of one client; None means no limit.
 #[derive(Debug, Clone, Default)]
 pub struct Quota {
-    /// Time from a query's start to its last row.
+    /// Maximum time from a query's start to its last row.
     pub time: Option<Duration>,
-    /// Bytes of memory of all its queries.
+    /// Maximum memory of all its queries, bytes.
     pub memory: Option<usize>,
-    /// Rows of one answer; a longer one ends with an error, it is not cut in silence.
+    /// Maximum rows of one answer; a longer one ends with an error, it is not silently truncated.
     pub rows: Option<u64>,
-    /// Queries that run at once; more are refused.
+    /// Maximum number of concurrent queries; more are refused.
     pub concurrent: Option<usize>,
 }
 
 impl Engine {
-    /// An engine on a lake.
+    /// Creates an engine on a lake.
     ///
     /// # Errors
-    /// [`Error::Execution`] where DataFusion cannot be set up.
+    /// [`Error::Execution`] if DataFusion cannot be set up.
     pub fn new(lake: &Lake, limits: Limits) -> Result<Self, Error> {
         let failed = |e: DataFusionError| Error::execution(&e);
         let url = ObjectStoreUrl::parse(STORE).map_err(failed)?;
@@ -193,12 +193,12 @@ impl Engine {
         Ok(Self(Opaque::new(inner)))
     }
 
-    /// A session of a client: one a connection.
+    /// Creates a session of a client, one per connection.
     pub fn session(&self, client: &Arc<Client>) -> Session {
         Session::of(self.clone(), client.clone())
     }
 
-    /// Queries that run or wait now.
+    /// Returns the number of queries that run or wait now.
     pub fn running(&self) -> usize {
         self.0.running.count()
     }
@@ -208,7 +208,7 @@ impl Engine {
         self.0.running.overdue()
     }
 
-    /// The functions, by name.
+    /// Returns the functions, sorted by name.
     pub(crate) fn functions(&self) -> Vec<Function> {
         let state = &self.0.template;
         let scalar = state.scalar_functions().iter().map(|(name, f)| (name, f.documentation()));
@@ -230,8 +230,8 @@ impl Engine {
         }
     }
 
-    /// Runs what belongs to a client's request, such as parsing, as queries are run: on the same threads, no longer than
-    /// `time`, and ended, or found to be [`Engine::overdue`], where the caller drops it.
+    /// Runs other work of a client's request, such as parsing, in the same way as queries: on the same threads and with
+    /// a timeout of `time`. If the caller drops it, the work is ended or reported by [`Engine::overdue`].
     ///
     /// # Errors
     /// Those of `work`; [`Error::TimeLimit`].
@@ -243,7 +243,7 @@ impl Engine {
         self.on_threads(&self.ticket(time), work).await
     }
 
-    /// A ticket that ends after `time`.
+    /// Creates a ticket with a timeout of `time`.
     pub(crate) fn ticket(&self, time: Option<Duration>) -> Arc<Ticket> {
         let ticket = Arc::new(Ticket::new());
         self.0.running.add(&ticket);
@@ -259,7 +259,7 @@ impl Engine {
         ticket
     }
 
-    // Constants are computed while a query is planned, so planning must not hold up the caller's threads.
+    // Constants are computed while a query is planned, so planning must not block the caller's threads.
     pub(crate) async fn on_threads<T: Send + 'static, E: From<Error> + Send + 'static>(
         &self,
         ticket: &Arc<Ticket>,
@@ -278,32 +278,32 @@ impl Engine {
         }
     }
 
-    /// What can be asked.
+    /// Returns the catalogue of tables and views.
     pub(crate) fn catalog(&self) -> &Catalog {
         &self.0.catalog
     }
 
-    /// Threads that plan and run.
+    /// Returns the threads that plan and run queries.
     pub(crate) fn threads(&self) -> &Threads {
         &self.0.threads
     }
 
-    /// Bytes that one query may hold, where there is a limit.
+    /// Returns the memory limit of one query, bytes; `usize::MAX` if there is none.
     pub(crate) fn memory(&self, quota: &Quota) -> usize {
         self.0.limits.memory.into_iter().chain(quota.memory).min().unwrap_or(usize::MAX)
     }
 
-    /// What all contexts begin as; it knows no tables, and parses as they do.
+    /// Returns the state from which all contexts are built: without tables, with the same parser options.
     pub(crate) fn template(&self) -> &SessionState {
         &self.0.template
     }
 
-    // A new one a query: the tables are those of one snapshot, and nothing a query does outlives it. Functions and
-    // optimizer's rules are those of the template.
+    // One new context per query: its tables are of one snapshot, and nothing a query does outlives it. Functions and
+    // optimizer rules are those of the template.
     pub(crate) fn context(&self) -> SessionContext {
         let names = &self.0.template.config_options().catalog;
         let catalog = MemoryCatalogProvider::new();
-        // New ones take any name.
+        // A new catalogue accepts any name.
         let _ = catalog.register_schema(&names.default_schema, Arc::new(MemorySchemaProvider::new()));
         let catalogs = MemoryCatalogProviderList::new();
         catalogs.register_catalog(names.default_catalog.clone(), Arc::new(catalog));
@@ -321,7 +321,7 @@ fn template(
 ) -> SessionState {
     let builder = SessionStateBuilder::new().with_config(config()).with_runtime_env(runtime).with_default_features();
     let mut state = rules.into_iter().fold(builder, SessionStateBuilder::with_optimizer_rule).build();
-    // The new ones replace those of their names and aliases; only a registry that is closed refuses.
+    // They replace functions with the same names and aliases; only a closed registry would refuse.
     for function in functions.scalar() {
         let _ = state.register_udf(function.clone());
     }
@@ -336,7 +336,7 @@ fn config() -> SessionConfig {
     let mut config = SessionConfig::new().with_information_schema(true).with_batch_size(BATCH_ROWS);
     let options = config.options_mut();
     options.sql_parser.collect_spans = true;
-    // Files hold plain strings, and so do the formats that answers are written in.
+    // Files contain plain strings, and so do the output formats of answers.
     options.execution.parquet.schema_force_view_types = false;
     config
 }
@@ -356,7 +356,7 @@ fn runtime(lake: &Lake, url: &ObjectStoreUrl, limits: Limits) -> Result<Arc<Runt
         .build_arc()
 }
 
-/// Planning that nobody waits for any more ends where it next waits itself; its query ends with it.
+/// Cancels the query and aborts its planning when the waiting caller is dropped; the task ends at its next await.
 struct StopOnDrop<T> {
     work: JoinHandle<T>,
     ticket: Arc<Ticket>,
@@ -371,12 +371,12 @@ impl<T> Drop for StopOnDrop<T> {
     }
 }
 
-/// The engine is gone.
+/// Returns the error for an engine that has ended.
 pub(crate) fn ended() -> Error {
     Error::Execution { message: "the query service has ended".to_owned() }
 }
 
-/// Something panicked.
+/// Returns the error for a panic.
 pub(crate) fn defect() -> Error {
     Error::Execution { message: "a defect ended it".to_owned() }
 }

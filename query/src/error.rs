@@ -1,4 +1,4 @@
-//! Why a query has no answer, said so that its author finds the place.
+//! Errors of queries, with the place in the text and hints.
 
 use std::cmp::Reverse;
 use std::collections::BTreeSet;
@@ -13,24 +13,24 @@ use echolake_schema::tables::Table;
 
 use crate::control::Stop;
 
-/// How alike two names must be for one to be suggested: half of the letters, as in DataFusion's own suggestions.
+/// Minimum similarity of a suggested name: half of the letters, as in DataFusion's own suggestions.
 const ALIKE: f64 = 0.5;
-/// Names that a hint lists.
+/// Maximum number of names in a suggestion.
 const SUGGESTED: usize = 3;
-/// Columns that a hint lists where no name is near.
+/// Maximum number of columns in a hint if no name is similar.
 const LISTED: usize = 12;
 
-/// What went wrong with a query.
+/// An error of a query.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
-    /// The query is not right.
+    /// The query is invalid.
     #[error("{message}{}{}", place.as_deref().unwrap_or_default(), hint_line(hint.as_deref()))]
     Query {
-        /// What is wrong.
+        /// Description of the error.
         message: String,
         /// The line, with a mark under the place.
         place: Option<String>,
-        /// What might be meant.
+        /// A suggestion.
         hint: Option<String>,
     },
     /// The query would change something.
@@ -39,13 +39,13 @@ pub enum Error {
         /// The refused statement's name.
         statement: String,
     },
-    /// The query was right, and failed on its way.
+    /// The query is valid, and failed while it ran.
     #[error("the query failed: {message}")]
     Execution {
-        /// Why.
+        /// The cause.
         message: String,
     },
-    /// Whoever asked does not want it any more.
+    /// The client cancelled it.
     #[error("the query was cancelled")]
     Cancelled,
     /// It took longer than its client may.
@@ -57,10 +57,10 @@ pub enum Error {
     /// It needed more memory than there is for it.
     #[error("the query needs more memory than it may have: {message}; hint: ask for less, or for fewer columns")]
     MemoryLimit {
-        /// What ran out.
+        /// The exhausted limit.
         message: String,
     },
-    /// Its answer is longer than its client may have.
+    /// Its answer has more rows than its client's limit.
     #[error("the answer has more than {limit} rows; hint: LIMIT, or a WHERE that asks for less")]
     RowLimit {
         /// Rows that the client may have.
@@ -69,9 +69,9 @@ pub enum Error {
     /// The client runs as many queries as it may.
     #[error("`{client}` already runs {limit} queries, as many as it may; hint: wait for one, or cancel it")]
     Busy {
-        /// Who.
+        /// The client's name.
         client: String,
-        /// How many.
+        /// The client's limit.
         limit: usize,
     },
     /// The answer cannot be written.
@@ -79,7 +79,7 @@ pub enum Error {
     Format {
         /// The format.
         format: &'static str,
-        /// Why not.
+        /// The cause.
         message: String,
     },
     /// The answer's destination refused.
@@ -91,7 +91,7 @@ pub enum Error {
 }
 
 impl Error {
-    /// An error of parsing or planning `sql`.
+    /// Converts an error of parsing or planning `sql`.
     pub(crate) fn plan(sql: &str, error: &DataFusionError) -> Self {
         if let Some(limit) = Self::limit(error) {
             return limit;
@@ -103,12 +103,12 @@ impl Error {
         Self::Query { message, place, hint }
     }
 
-    /// An error of running a query.
+    /// Converts an error of running a query.
     pub(crate) fn execution(error: &DataFusionError) -> Self {
         Self::limit(error).unwrap_or_else(|| Self::Execution { message: explain(error).0 })
     }
 
-    // An error that tells of a limit, not of the query.
+    // An error about a limit, not about the query.
     fn limit(error: &DataFusionError) -> Option<Self> {
         match error.find_root() {
             DataFusionError::ResourcesExhausted(text) => Some(Self::MemoryLimit { message: text.clone() }),
@@ -116,7 +116,7 @@ impl Error {
         }
     }
 
-    /// What a stopped query's client is told.
+    /// Returns the error for a query that was stopped.
     pub(crate) fn stopped(why: &Stop) -> Self {
         match why {
             Stop::Cancelled => Self::Cancelled,
@@ -129,7 +129,7 @@ fn hint_line(hint: Option<&str>) -> String {
     hint.map_or_else(String::new, |hint| format!("\nhint: {hint}"))
 }
 
-// What is wrong in words without the name of the layer that said them, and a hint.
+// Returns the message without the name of the layer that raised it, and a hint.
 fn explain(error: &DataFusionError) -> (String, Option<String>) {
     match error.find_root() {
         DataFusionError::SchemaError(schema, _) => match schema.as_ref() {
@@ -169,13 +169,13 @@ fn arrow_message(error: &ArrowError) -> String {
     }
 }
 
-/// The error of a query that names a table that is not there.
+/// Returns the error of a query that names an unknown table.
 pub(crate) fn missing(name: &str) -> Error {
     let (message, hint) = missing_table(name);
     Error::Query { message, place: None, hint }
 }
 
-// DataFusion spells the catalogue and schema out, which nobody wrote.
+// DataFusion adds the catalogue and schema, which the query does not contain.
 fn missing_table(qualified: &str) -> (String, Option<String>) {
     let name = qualified.strip_prefix("datafusion.public.").unwrap_or(qualified);
     let tables = Table::ALL.map(Table::name);
@@ -208,7 +208,7 @@ fn did_you_mean(name: &str, names: &[&str]) -> Option<String> {
     })
 }
 
-// The parser puts the place into its text, `... at Line: 1, Column: 8`, except at the end of the query.
+// The parser appends the place to its message, `... at Line: 1, Column: 8`, except at the end of the query.
 fn without_place(sql: &str, message: &str) -> (String, Option<(u64, u64)>) {
     if let Some(expected) = message.strip_suffix(", found: EOF") {
         return (format!("{expected}, found the end of the query"), end_of(sql));
@@ -228,20 +228,20 @@ fn end_of(sql: &str) -> Option<(u64, u64)> {
     Some((text.lines().count() as u64, last.chars().count() as u64 + 1))
 }
 
-/// How much of a line is shown before and behind a marked place.
+/// Characters of a line shown before and after a marked place.
 const MARKED_CHARS: usize = 60;
 
 fn mark(sql: &str, line: u64, column: u64) -> Option<String> {
     let text = sql.lines().nth(usize::try_from(line.checked_sub(1)?).ok()?)?;
     let length = text.chars().count();
     let column = usize::try_from(column.checked_sub(1)?).ok()?.min(length);
-    // Of a long line, such as a program writes, what is around the place.
+    // Shows only the surroundings of the place in a long line, such as programs generate.
     let begin = column.saturating_sub(MARKED_CHARS);
     let around: String = text.chars().skip(begin).take(2 * MARKED_CHARS).collect();
     let (cut, column) = if begin > 0 { ("...", column - begin + 3) } else { ("", column) };
     let end = if length > begin + 2 * MARKED_CHARS { "..." } else { "" };
     let text = format!("{cut}{around}{end}");
-    // Tabs stay tabs, so that the mark stands under its place however wide they are shown.
+    // Tabs stay tabs, so that the mark is under its place at any tab width.
     let blank: String = text.chars().take(column).map(|c| if c == '\t' { '\t' } else { ' ' }).collect();
     Some(format!("\n  {text}\n  {blank}^"))
 }

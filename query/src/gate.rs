@@ -1,11 +1,11 @@
-//! Which statements may pass: those that read. All others are named in the refusal before anything is planned.
+//! The gate for statements: only those that read may pass. All others are refused by name before planning.
 
 use datafusion::sql::parser::Statement;
 use datafusion::sql::sqlparser::ast::Statement as Sql;
 
 use crate::Error;
 
-/// Lets a reading statement pass.
+/// Accepts statements that only read.
 ///
 /// # Errors
 /// [`Error::NotReading`] for all others.
@@ -18,7 +18,7 @@ pub(crate) fn check(statement: &Statement) -> Result<(), Error> {
     if reads { Ok(()) } else { Err(Error::NotReading { statement: name(&statement.to_string()) }) }
 }
 
-// A list of what may pass, so that what a newer parser learns is refused until somebody has looked at it.
+// An allow list, so that new statements of a newer parser are refused until they have been reviewed.
 fn reads(statement: &Sql) -> bool {
     match statement {
         Sql::Explain { statement, .. } => reads(statement),
@@ -32,7 +32,7 @@ fn reads(statement: &Sql) -> bool {
     }
 }
 
-// `CREATE EXTERNAL TABLE x ...` is called so: the words before the first that is no keyword in capitals.
+// The name of `CREATE EXTERNAL TABLE x ...`: up to three words before the first that is not in capitals.
 fn name(statement: &str) -> String {
     let is_keyword = |word: &&str| !word.is_empty() && word.chars().all(|c| c.is_ascii_uppercase());
     statement.split_whitespace().take_while(is_keyword).take(3).collect::<Vec<_>>().join(" ")

@@ -1,4 +1,4 @@
-//! SQL over the lake's tables: reading only, one frozen view of the lake a query.
+//! SQL over the lake's tables: read-only, one snapshot of the lake per query.
 //!
 //! ```no_run,standalone_crate
 //! # async fn example() -> Result<(), Box<dyn std::error::Error>> {

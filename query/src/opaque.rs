@@ -1,13 +1,13 @@
-//! A shared value that the compiler does not look into.
+//! A shared value that hides its type from the compiler's auto trait checks.
 
 use std::ops::Deref;
 use std::sync::Arc;
 
-/// A shared value behind a trait object, so that it is known to be `Send` and `Sync` without a proof.
+/// A shared value behind a trait object, so that the compiler knows it to be `Send` and `Sync` without a proof.
 ///
 /// DataFusion's plans and sqlparser's statements are recursive types of hundreds of parts. Every method of an
-/// `async_trait` proves anew that what it reaches is `Send`, which took three seconds of compilation for each of
-/// thirty methods of the server as long as it reached one of those types.
+/// `async_trait` proves again that all types it reaches are `Send`. For each of thirty methods of the server that
+/// reached one of those types, this took three seconds of compilation.
 pub struct Opaque<T: ?Sized>(Arc<dyn Deref<Target = T> + Send + Sync>);
 
 impl<T: Send + Sync + 'static> Opaque<T> {

@@ -1,4 +1,4 @@
-//! Answers as text and files: table, CSV, JSON, Parquet and Arrow, written as they come.
+//! Answers as text and files: table, CSV, JSON, Parquet and Arrow, written as batches arrive.
 
 use std::collections::HashSet;
 use std::fmt::Write as _;
@@ -17,18 +17,18 @@ use parquet::file::properties::WriterProperties;
 
 use crate::Error;
 
-/// Values of a list that a table shows.
+/// Number of list values shown in a table.
 const SHOWN: usize = 3;
-/// Rows that a table shows: all of them are held until their widths are known.
+/// Maximum rows of a table: all of them are buffered to compute the column widths.
 pub const TABLE_ROWS: usize = 10_000;
 
-/// Size that a row group of a Parquet answer grows to: all of it is held until it ends.
+/// Maximum size of a row group of a Parquet answer, bytes: a row group is buffered until it ends.
 const ROW_GROUP_BYTES: usize = 16 << 20;
 
 /// A format of answers.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Format {
-    /// For people: lists are cut short, and rows after [`TABLE_ROWS`] are counted only.
+    /// Text for people: lists are shortened, and rows after [`TABLE_ROWS`] are only counted.
     Table,
     /// Comma-separated, lists as JSON.
     Csv,
@@ -44,7 +44,7 @@ impl Format {
     /// All formats.
     pub const ALL: [Self; 5] = [Self::Table, Self::Csv, Self::Json, Self::Parquet, Self::Arrow];
 
-    /// Its name.
+    /// Returns its name.
     pub fn name(self) -> &'static str {
         match self {
             Self::Table => "table",
@@ -55,7 +55,7 @@ impl Format {
         }
     }
 
-    /// Whether its bytes are no text.
+    /// Returns whether its output is binary.
     pub fn is_binary(self) -> bool {
         matches!(self, Self::Parquet | Self::Arrow)
     }
@@ -78,7 +78,7 @@ enum Inner<W: Write + Send> {
 }
 
 impl<W: Write + Send> AnswerWriter<W> {
-    /// Begins an answer of this schema.
+    /// Creates a writer for an answer of this schema.
     ///
     /// # Errors
     /// [`Error::Format`] or [`Error::Write`].
@@ -90,7 +90,7 @@ impl<W: Write + Send> AnswerWriter<W> {
             Format::Table => Inner::Table(to, Vec::new()),
             Format::Csv => {
                 let (mut to, mut text) = (to, Vec::new());
-                // A header even where no row comes.
+                // A header even if there are no rows.
                 write_csv(&mut to, &mut text, &RecordBatch::new_empty(flat_schema(schema)), true)?;
                 Inner::Csv(to, text)
             }
@@ -153,7 +153,7 @@ impl<W: Write + Send> AnswerWriter<W> {
                 writeln!(to)?;
                 to.flush()?;
             }
-            // It flushes, and unlike into_inner it keeps the system's error.
+            // `finish` flushes, and unlike `into_inner` it keeps the system's error.
             Inner::Parquet(mut writer) => writer.finish().map(drop).map_err(parquet_error)?,
             Inner::Arrow(writer) => writer.into_inner().map_err(failed)?.flush()?,
         }
@@ -161,7 +161,7 @@ impl<W: Write + Send> AnswerWriter<W> {
     }
 }
 
-// By way of memory: arrow's writer makes a text of the system's error, and a closed pipe would not be known.
+// Through a buffer: arrow's writer turns the system's error into text, and a closed pipe could not be recognised.
 fn write_csv(to: &mut impl Write, text: &mut Vec<u8>, batch: &RecordBatch, header: bool) -> Result<(), Error> {
     text.clear();
     arrow::csv::WriterBuilder::new()
@@ -172,7 +172,7 @@ fn write_csv(to: &mut impl Write, text: &mut Vec<u8>, batch: &RecordBatch, heade
     Ok(to.write_all(text)?)
 }
 
-// Readers of objects and of Parquet find columns by name.
+// Readers of JSON objects and of Parquet find columns by name.
 fn one_name_each(format: Format, schema: &SchemaRef) -> Result<(), Error> {
     let mut seen = HashSet::new();
     match schema.fields().iter().find(|field| !seen.insert(field.name())) {
@@ -184,7 +184,7 @@ fn one_name_each(format: Format, schema: &SchemaRef) -> Result<(), Error> {
     }
 }
 
-// The system's own error is kept as one, so that a closed pipe is known for what it is.
+// Keeps the system's own error, so that a closed pipe can be recognised.
 fn arrow_error(format: Format, error: ArrowError) -> Error {
     match error {
         ArrowError::IoError(_, source) => Error::Write(source),
@@ -210,7 +210,7 @@ fn flat_schema(schema: &SchemaRef) -> SchemaRef {
     Arc::new(Schema::new(fields.collect::<Vec<_>>()))
 }
 
-// The batch with each nested column as text.
+// Returns the batch with each nested column as text.
 fn flat(
     batch: &RecordBatch,
     text: fn(&ArrayRef) -> Result<Vec<String>, ArrowError>,

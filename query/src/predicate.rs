@@ -1,25 +1,25 @@
-//! A predicate of somebody else's in a query of ours: it fills the parentheses that it was put into, and nothing more.
+//! Predicates of a client inside a query of the server: the predicate must be one expression within its parentheses.
 
 use datafusion::sql::parser::Statement;
 use datafusion::sql::sqlparser::ast::{BinaryOperator, Expr, Ident, SetExpr, Statement as Sql, UnaryOperator, Value};
 
 use crate::{Error, Session};
 
-/// Bytes of a predicate of comparisons.
+/// Maximum length of a predicate of comparisons, bytes.
 const MOST_COMPARISON_BYTES: usize = 2048;
 
-/// What a predicate may consist of.
+/// Forms of predicates.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum PredicateForm {
     /// Any expression, with queries of other tables in it.
     AnyExpression,
-    /// Comparisons of columns and literals, joined by AND, OR and NOT: work that a row bounds, whoever wrote it.
+    /// Comparisons of columns and literals, joined by AND, OR and NOT: bounded work per row, even in hostile ones.
     Comparisons,
 }
 
 impl Session {
-    /// The query `select` with a predicate: `select` ends in `where`, or in `and` behind it. The query is not run, and
-    /// what it may read is for the gate to say; here it is only made sure that `predicate` is one expression.
+    /// Returns the query `select` with a predicate appended: `select` ends in `where`, or in `and` after it. The query
+    /// is not run, and its permissions are left to the gate; this only checks that `predicate` is one expression.
     ///
     /// # Errors
     /// [`Error::Query`] if the predicate is none, or is not of the form.
@@ -51,7 +51,7 @@ fn refused(message: String, hint: &str) -> Error {
     Error::Query { message, place: None, hint: Some(hint.to_owned()) }
 }
 
-// A list of what may be there, not of what may not, so that no expression of a later parser passes.
+// An allow list, so that no expression of a newer parser passes.
 fn check_comparisons(predicate: &Expr) -> Result<(), Error> {
     use BinaryOperator::{And, Eq, Gt, GtEq, Lt, LtEq, NotEq, Or};
     let mut pending = vec![predicate];
@@ -80,7 +80,7 @@ fn check_comparisons(predicate: &Expr) -> Result<(), Error> {
     Ok(())
 }
 
-// No `@variable`, and nothing that a table could be asked for by.
+// No `@variable`, and no name that could refer to a table.
 fn is_plain(name: &Ident) -> bool {
     name.value.bytes().all(|b| b.is_ascii_alphanumeric() || b == b'_')
 }
@@ -97,7 +97,7 @@ fn is_literal(expression: &Expr) -> bool {
     }
 }
 
-// Takes what stands in the parentheses of the last condition out of a query.
+// Takes the expression in the parentheses of the last condition out of a query.
 fn emptied(statement: &mut Statement) -> Option<Expr> {
     let Statement::Statement(sql) = statement else { return None };
     let Sql::Query(query) = sql.as_mut() else { return None };

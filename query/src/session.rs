@@ -1,4 +1,4 @@
-//! A session: every query sees one frozen view of the lake and may only read.
+//! A session: every query sees one snapshot of the lake and may only read.
 
 use std::sync::Arc;
 
@@ -27,10 +27,10 @@ use crate::mcap::Contents;
 use crate::statement_bounds::check_statement_bounds;
 use crate::{Error, Opaque, as_of, gate};
 
-/// Batches that wait for a slow reader.
+/// Capacity of the queue of batches to a slow reader.
 const AHEAD: usize = 2;
 
-/// Asks a lake in SQL: one a connection. Clones are the same session.
+/// Runs SQL queries on a lake, one session per connection. Clones are the same session.
 #[derive(Clone)]
 pub struct Session {
     engine: Engine,
@@ -41,8 +41,8 @@ pub struct Session {
 /// Adds a protocol's own tables and functions to the context of every query.
 pub type Extend = Arc<dyn Fn(&SessionContext) -> Result<(), DataFusionError> + Send + Sync>;
 
-/// A query that is planned and may be run again and again with other values. It keeps the view of the lake it was
-/// planned on.
+/// A planned query that can be run repeatedly with other values. It keeps the snapshot of the lake on which it was
+/// planned.
 pub struct Prepared {
     state: Opaque<SessionState>,
     plan: Opaque<LogicalPlan>,
@@ -50,15 +50,15 @@ pub struct Prepared {
 }
 
 impl Prepared {
-    /// The columns of its answers.
+    /// Returns the schema of its answers.
     pub fn schema(&self) -> SchemaRef {
         Arc::new(self.plan.schema().as_arrow().clone())
     }
 
-    /// Types of its placeholders `$1`, `$2`, ... in this order; None where the query does not tell.
+    /// Returns the types of its placeholders `$1`, `$2`, ... in this order; None if the query does not determine one.
     ///
     /// # Errors
-    /// [`Error::Query`] where a placeholder is not a number.
+    /// [`Error::Query`] if a placeholder is not a number.
     pub fn parameters(&self) -> Result<Vec<Option<DataType>>, Error> {
         let types = self.plan.get_parameter_types().map_err(|e| Error::plan(&self.sql, &e))?;
         let number = |name: &str| name.strip_prefix('$').and_then(|n| n.parse::<usize>().ok()).filter(|n| *n > 0);
@@ -77,7 +77,7 @@ impl Prepared {
     }
 }
 
-/// An answer, as it comes. Dropping it ends its query.
+/// A stream of answer batches. Dropping it cancels the query.
 pub struct Answer {
     /// Its columns.
     pub schema: SchemaRef,
@@ -86,27 +86,27 @@ pub struct Answer {
     ticket: Arc<Ticket>,
     rows: u64,
     limit: Option<u64>,
-    // Its threads run the query for as long as somebody reads, though its session is gone.
+    // Keeps the query's threads alive while the answer is read, even if the session is dropped.
     _engine: Engine,
 }
 
-/// Ends a query from elsewhere.
+/// Cancels a query from another task.
 #[derive(Clone)]
 pub struct CancelHandle(Arc<Ticket>);
 
 impl CancelHandle {
-    /// Ends the query; its answer fails with [`Error::Cancelled`]. Nothing happens where it is at its end.
+    /// Cancels the query; its answer fails with [`Error::Cancelled`]. Has no effect on a finished query.
     pub fn cancel(&self) {
         self.0.stop(Stop::Cancelled);
     }
 }
 
 impl Answer {
-    /// The next rows; None after the last.
+    /// Returns the next rows; None after the last.
     ///
     /// # Errors
-    /// [`Error::Execution`] where the query fails on its way, [`Error::Cancelled`], [`Error::TimeLimit`],
-    /// [`Error::MemoryLimit`] or [`Error::RowLimit`] where it may not go on.
+    /// [`Error::Execution`] if the query fails while it runs; [`Error::Cancelled`], [`Error::TimeLimit`],
+    /// [`Error::MemoryLimit`] or [`Error::RowLimit`] if it may not continue.
     pub async fn next(&mut self) -> Result<Option<RecordBatch>, Error> {
         let batch = tokio::select! {
             biased;
@@ -123,12 +123,12 @@ impl Answer {
         Ok(Some(batch))
     }
 
-    /// Ends this answer's query from elsewhere.
+    /// Returns a handle that cancels this answer's query.
     pub fn cancel_handle(&self) -> CancelHandle {
         CancelHandle(self.ticket.clone())
     }
 
-    // Without this an answer whose query died would look like one that is whole.
+    // Without this, an answer whose query panicked would look complete.
     async fn end(&mut self) -> Result<Option<RecordBatch>, Error> {
         let Some(query) = self.query.take() else { return Ok(None) };
         match query.await {
@@ -145,10 +145,10 @@ impl Drop for Answer {
 }
 
 impl Session {
-    /// A session on a lake that nobody else asks, without limits.
+    /// Creates a session with an engine of its own, without limits.
     ///
     /// # Errors
-    /// [`Error::Execution`] where DataFusion cannot be set up.
+    /// [`Error::Execution`] if DataFusion cannot be set up.
     pub fn new(lake: &Lake) -> Result<Self, Error> {
         let client = Client::new("local", Quota::default());
         Ok(Engine::new(lake, Limits::default())?.session(&Arc::new(client)))
@@ -158,24 +158,23 @@ impl Session {
         Self { engine, client, extend: None }
     }
 
-    /// The same with a protocol's own tables and functions.
+    /// Adds a protocol's own tables and functions to the session.
     #[must_use]
     pub fn extended(mut self, extend: Extend) -> Self {
         self.extend = Some(extend);
         self
     }
 
-    /// Who asks.
+    /// Returns the client.
     pub fn client(&self) -> &Arc<Client> {
         &self.client
     }
 
-    /// Answers a query.
+    /// Plans and runs a query.
     ///
     /// # Errors
-    /// [`Error::Query`] where it is not right, [`Error::NotReading`] where it would change something,
-    /// [`Error::Lake`] where the lake cannot be read, [`Error::Busy`] and those of [`Answer::next`] where it may not
-    /// go on.
+    /// [`Error::Query`] if it is invalid, [`Error::NotReading`] if it would change something, [`Error::Lake`] if the
+    /// lake cannot be read, [`Error::Busy`] if the client has no permit left, and those of [`Answer::next`].
     pub async fn query(&self, sql: &str) -> Result<Answer, Error> {
         let started = self.start()?;
         let prepared = self.plan(sql, self.parse(sql)?, &started.ticket).await?;
@@ -199,10 +198,10 @@ impl Session {
         self.plan(sql, statement, &started.ticket).await
     }
 
-    /// Answers a planned query with values for its placeholders.
+    /// Runs a planned query with values for its placeholders.
     ///
     /// # Errors
-    /// [`Error::Query`] where values are missing or of the wrong type; else as [`Session::query`].
+    /// [`Error::Query`] if values are missing or of the wrong type; else as [`Session::query`].
     pub async fn execute(&self, prepared: &Prepared, values: ParamValues) -> Result<Answer, Error> {
         let plan =
             LogicalPlan::clone(&prepared.plan).with_param_values(values).map_err(|e| Error::plan(&prepared.sql, &e))?;
@@ -212,16 +211,16 @@ impl Session {
     /// Parses one statement.
     ///
     /// # Errors
-    /// [`Error::Query`] where it is none.
+    /// [`Error::Query`] if it is not a statement.
     pub fn parse(&self, sql: &str) -> Result<Statement, Error> {
         let state = self.engine.template();
-        // DataFusion's own dialect, unless somebody sets another.
+        // DataFusion's default dialect; nothing sets another.
         check_statement_bounds(sql, &GenericDialect {})?;
         let sql = &as_of::respelled(sql);
         state.sql_to_statement(sql, &state.config().options().sql_parser.dialect).map_err(|e| Error::plan(sql, &e))
     }
 
-    // A query's time begins here, with its waiting.
+    // The query's timeout starts here and includes waiting.
     fn start(&self) -> Result<Started, Error> {
         let place = self.client.place()?;
         Ok(Started { ticket: self.engine.ticket(self.client.quota().time), place })
@@ -268,7 +267,7 @@ impl Session {
         })
     }
 
-    // As DataFusion makes it, but for the memory.
+    // As DataFusion builds it, except for the memory pool.
     fn task_context(&self, state: &SessionState, ticket: &Arc<Ticket>) -> Arc<TaskContext> {
         let mut runtime = state.runtime_env().as_ref().clone();
         let limit = self.engine.memory(self.client.quota());
@@ -277,23 +276,23 @@ impl Session {
         Arc::new(TaskContext::from(state).with_runtime(Arc::new(runtime)))
     }
 
-    /// The view of the lake that a query of now sees; the same one for as long as nothing changes.
+    /// Returns the current snapshot of the lake, which a query started now would see; cached until something changes.
     ///
     /// # Errors
-    /// [`Error::Lake`] where the lake cannot be read.
+    /// [`Error::Lake`] if the lake cannot be read.
     pub async fn snapshot(&self) -> Result<Arc<Snapshot>, Error> {
         self.engine.catalog().snapshot().await
     }
 
-    /// What a run's file holds, of its summary and message indexes.
+    /// Returns the contents of a run's file, from its summary and message indexes.
     ///
     /// # Errors
-    /// [`Error::Execution`] where the file cannot be read.
+    /// [`Error::Execution`] if the file cannot be read.
     pub async fn contents(&self, run: &VisibleRun) -> Result<Contents, Error> {
         self.engine.catalog().contents(run).await
     }
 
-    /// The bytes of the first attachment of a run's file whose name ends so; None where there is none.
+    /// Returns the bytes of the first attachment of a run's file whose name has this ending; None if there is none.
     ///
     /// # Errors
     /// As [`Session::contents`].
@@ -301,24 +300,24 @@ impl Session {
         self.engine.catalog().attachment(run, ending).await
     }
 
-    /// The functions, by name.
+    /// Returns the functions, sorted by name.
     pub fn functions(&self) -> Vec<Function> {
         self.engine.functions()
     }
 
-    /// The tables and their schemas.
+    /// Returns the tables and views with their schemas.
     pub fn tables(&self) -> impl Iterator<Item = (&'static str, SchemaRef)> {
         self.engine.catalog().tables()
     }
 }
 
-/// A query that has begun, before it is planned.
+/// A started query with its permit, before it is planned.
 struct Started {
     ticket: Arc<Ticket>,
     place: Place,
 }
 
-// Runs a query. It keeps its place until its operators are gone, whoever still waits for it.
+// Runs a query. It holds its permit until its operators are dropped, even if the reader is gone.
 async fn drive(
     plan: Arc<dyn ExecutionPlan>,
     context: Arc<TaskContext>,
@@ -338,7 +337,7 @@ async fn drive(
         };
         let Some(batch) = batch else { return };
         let is_last = batch.is_err();
-        // Nobody listens any more: the answer was dropped.
+        // An error of `send` means that the answer was dropped.
         if send.send(batch).await.is_err() || is_last {
             return;
         }

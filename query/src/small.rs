@@ -1,5 +1,5 @@
-//! Rows of small tables, kept in memory: `runs` and `surfaces` have one row a file, and most questions begin with them.
-//! A file never changes, so its rows are read once a process.
+//! Cache of the rows of small tables: `runs` and `surfaces` have one row per file, and most queries read them. A file
+//! never changes, so its rows are read once per process.
 
 use std::collections::HashMap;
 use std::sync::{Mutex, PoisonError};
@@ -13,12 +13,12 @@ use echolake_schema::tables::Table;
 use futures::{StreamExt as _, TryStreamExt as _};
 use object_store::path::Path;
 
-/// Rows up to which a table is small: some ten megabytes of the widest one.
+/// Maximum rows of a small table: some ten megabytes of the widest one.
 const SMALL_ROWS: u64 = 20_000;
-/// Files that are read together.
+/// Number of files that are read concurrently.
 const TOGETHER: usize = 16;
 
-/// What is kept.
+/// The cached rows by table and file.
 #[derive(Debug)]
 pub(crate) struct SmallTables {
     lake: Lake,
@@ -30,17 +30,17 @@ impl SmallTables {
         Self { lake: lake.clone(), files: Mutex::default() }
     }
 
-    /// Whether a table is kept in memory: few rows without lists, all of which readers see.
+    /// Returns whether a table is cached: few rows, no lists, no hidden rows.
     pub(crate) fn keeps<'a>(schema: &SchemaRef, mut files: impl Iterator<Item = &'a DataFile>) -> bool {
         let narrow = !schema.fields().iter().any(|f| f.data_type().is_nested());
         let rows = files.try_fold(0, |rows, file| file.hidden.is_empty().then_some(rows + file.rows));
         narrow && rows.is_some_and(|rows| rows <= SMALL_ROWS)
     }
 
-    /// The rows of these files, which are all of the table's.
+    /// Returns the rows of these files, which must be all files of the table.
     ///
     /// # Errors
-    /// Where a file is not what its log says.
+    /// If a file does not agree with its log.
     pub(crate) async fn rows(&self, table: Table, schema: &SchemaRef, files: &[&DataFile]) -> Result<RecordBatch> {
         let mut rows: HashMap<Path, RecordBatch> = {
             let known = self.files.lock().unwrap_or_else(PoisonError::into_inner);
@@ -55,8 +55,8 @@ impl SmallTables {
         let all = concat_batches(schema, files.iter().filter_map(|f| rows.get(&f.path)))?;
         let mut known = self.files.lock().unwrap_or_else(PoisonError::into_inner);
         let known = known.entry(table).or_default();
-        // What has gone from the table goes from memory too, once it is as much again: views of the past take turns
-        // with the present.
+        // Evicts removed files once they outnumber the table's files; not sooner, because queries of past versions
+        // alternate with those of the current one.
         if known.len() > 2 * files.len() {
             known.clear();
         }

@@ -1,8 +1,8 @@
-//! Refuses a statement by its tokens, before it is parsed, where its shape alone would cost what no answer is worth.
+//! Refuses a statement by its tokens, before it is parsed, if its shape alone makes it too expensive.
 //!
-//! The parser tries a call's arguments again for each way in which the call may be meant, so that time doubles or
-//! quadruples with every call in a call; and what parses and plans recurses along chains, so that thousands of `+` in a
-//! row exhaust a stack. Lists separated by commas (IN, VALUES) cost nothing but their length.
+//! The parser backtracks: it tries a call's arguments again for each possible syntax of the call, so that time doubles
+//! or quadruples with every nested call. Parser and planner recurse along chains, so that thousands of `+` in a row
+//! exhaust a stack. Lists separated by commas (IN, VALUES) cost nothing but their length.
 
 use std::any::TypeId;
 
@@ -11,14 +11,14 @@ use datafusion::sql::sqlparser::tokenizer::{Token, Tokenizer, Word};
 
 use crate::Error;
 
-/// Brackets in brackets.
+/// Maximum nesting of brackets.
 const MOST_NESTED: usize = 100;
-/// Operators, and whatever else is written behind an expression, of one expression; also set operators and joins of one
-/// query. Twice as many still do no harm.
+/// Maximum number of operators and suffixes of one expression; also of set operators and joins of one query. Twice as
+/// many are still harmless.
 const MOST_CHAINED: usize = 1_000;
-/// Statements of one text.
+/// Maximum number of statements in one text.
 const MOST_STATEMENTS: usize = 1_000;
-/// Doublings of the parser's time: 2^14 tries are a few hundredths of a second.
+/// Maximum doublings of the parser's time: 2^14 tries take a few hundredths of a second.
 const MOST_DOUBLINGS: f64 = 14.0;
 /// Calls with a syntax of their own, which the parser tries up to five times.
 const TRIED_FIVE_TIMES: [&str; 20] = [
@@ -43,7 +43,7 @@ const TRIED_FIVE_TIMES: [&str; 20] = [
     "TRIM",
     "TRY_CAST",
 ];
-/// Words that stand between two expressions, or behind one.
+/// Words between two expressions, or after one.
 const OPERATORS: [&str; 15] = [
     "AND", "AT", "BETWEEN", "COLLATE", "DIV", "ILIKE", "IS", "LIKE", "NOT", "OR", "OVERLAPS", "REGEXP", "RLIKE",
     "SIMILAR", "XOR",
@@ -53,7 +53,7 @@ const QUERY_OPERATORS: [&str; 5] = ["EXCEPT", "INTERSECT", "JOIN", "MINUS", "UNI
 /// Functions whose strings are types, which nest by brackets as well.
 const TYPE_FUNCTIONS: [&str; 2] = ["ARROW_CAST", "ARROW_TRY_CAST"];
 
-/// What is open at a place in a statement.
+/// Counts within an open bracket of a statement.
 #[derive(Default)]
 struct OpenBracket {
     /// Operators since the last comma.
@@ -64,12 +64,12 @@ struct OpenBracket {
     doublings: f64,
 }
 
-/// Lets a statement pass whose shape is cheap to parse and plan.
+/// Accepts statements whose shape is cheap to parse and plan.
 ///
 /// # Errors
-/// [`Error::Query`] where it is not, with the limit.
+/// [`Error::Query`] with the exceeded limit for all others.
 pub fn check_statement_bounds(sql: &str, dialect: &dyn Dialect) -> Result<(), Error> {
-    // What is no SQL is left to the parser's message; it makes tokens of all before it parses, too.
+    // Invalid SQL is left to the parser's message; the parser also tokenizes everything before it parses.
     let Ok(tokens) = Tokenizer::new(dialect, sql).tokenize() else { return Ok(()) };
     let call_doublings = if dialect.dialect() == TypeId::of::<PostgreSqlDialect>() { 1.0 } else { 0.0 };
     let is_one_of = |word: &Word, words: &[&str]| {
@@ -84,7 +84,7 @@ pub fn check_statement_bounds(sql: &str, dialect: &dyn Dialect) -> Result<(), Er
         let Some(innermost) = open.last_mut() else { break };
         match token {
             Token::LParen | Token::LBracket | Token::LBrace => {
-                // `x[1][1]...` is a chain, whatever its brackets hold.
+                // `x[1][1]...` is a chain, whatever is in its brackets.
                 innermost.operators += usize::from(*token == Token::LBracket);
                 let added = match before {
                     Token::Word(word) if is_one_of(word, &TRIED_FIVE_TIMES) => 2.3,
@@ -148,7 +148,7 @@ fn is_string(token: &Token) -> bool {
     text(token).is_some()
 }
 
-/// How deep the brackets of a literal nest.
+/// Returns the maximum nesting of brackets in a literal.
 fn nested(token: &Token) -> usize {
     let (mut now, mut most) = (0usize, 0);
     for byte in text(token).unwrap_or_default().bytes() {

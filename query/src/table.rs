@@ -1,4 +1,4 @@
-//! A table of the lake as DataFusion sees it: a plain Parquet scan over the files of one snapshot.
+//! A table of the lake for DataFusion: a plain Parquet scan over the files of one snapshot.
 
 use std::collections::BTreeSet;
 use std::sync::Arc;
@@ -35,13 +35,13 @@ use tokio::sync::OnceCell;
 
 use crate::small::SmallTables;
 
-/// Delta's writers cut texts in statistics to 32 characters; a shorter one is whole, whoever wrote it.
+/// Delta writers truncate texts in statistics to 32 characters; a shorter text is complete.
 const WHOLE_TEXT: usize = 32;
 /// The column that tells the runs of a merged file apart.
 const RUN: &str = "run_id";
-/// Files whose statistics are summed up for a plan; those of all files are summed up once.
+/// Maximum number of files whose statistics are merged for each plan; those of all files are merged once.
 const FEW: usize = 8;
-/// Rows a batch of a scan without lists: what the engine's kernels are fastest with.
+/// Rows per batch of a scan without lists: the engine's kernels are fastest with it.
 const NARROW_BATCH_ROWS: usize = 8192;
 
 /// Files of one table in one snapshot.
@@ -53,11 +53,11 @@ pub(crate) struct LakeTable {
     files: Vec<ScanFile>,
     all: Statistics,
     source: Source,
-    /// All rows, where the table is small and was asked.
+    /// All rows, if the table is small and was queried.
     rows: OnceCell<RecordBatch>,
 }
 
-/// A file, and how a scan names it.
+/// A file with its entry in a scan and its statistics.
 #[derive(Debug)]
 struct ScanFile {
     file: DataFile,
@@ -65,20 +65,20 @@ struct ScanFile {
     known: Arc<Statistics>,
 }
 
-/// How files are read.
+/// Readers of data files, shared by all tables.
 #[derive(Debug, Clone)]
 pub(crate) struct Source {
-    /// Where the lake's store is registered.
+    /// URL of the lake's store.
     pub(crate) url: ObjectStoreUrl,
-    /// Reads footers once a session.
+    /// Caches footers for all sessions.
     pub(crate) reader: Arc<dyn ParquetFileReaderFactory>,
-    /// Keeps the rows of small tables.
+    /// Caches the rows of small tables.
     pub(crate) small: Arc<SmallTables>,
 }
 
 impl LakeTable {
     /// # Errors
-    /// Where the schema names a column twice.
+    /// If the schema names a column twice.
     pub(crate) fn new(table: Table, schema: SchemaRef, files: Vec<DataFile>, source: Source) -> Result<Self> {
         let columns = DFSchema::try_from(schema.clone())?;
         let files: Vec<_> = files.into_iter().map(|file| ScanFile::new(file, &schema)).collect();
@@ -86,17 +86,17 @@ impl LakeTable {
         Ok(Self { table, schema, columns, files, all, source, rows: OnceCell::new() })
     }
 
-    /// Whether the table has just these files.
+    /// Returns whether the table consists of exactly these files.
     pub(crate) fn is_of(&self, files: &[DataFile]) -> bool {
         self.files.len() == files.len() && self.files.iter().zip(files).all(|(a, b)| a.file == *b)
     }
 
-    /// Which table.
+    /// Returns which table it is.
     pub(crate) fn table(&self) -> Table {
         self.table
     }
 
-    /// The columns of which no two rows of a table have the same values, where a view joins by them.
+    /// Returns a table's unique key, if views join by it.
     pub(crate) fn key(table: Table) -> Option<&'static [&'static str]> {
         match table {
             Table::Nce | Table::Tnce | Table::Measurements => Some(&["run_id", "pair_id"]),
@@ -109,8 +109,8 @@ impl LakeTable {
         }
     }
 
-    // The files that may have rows that pass the filters, by what the log knows of them. DataFusion would find the
-    // same when it comes to each file; a query for one surface should not come to the others at all.
+    // Prunes files by their statistics in the log. DataFusion would prune them, too, but only after opening each; a
+    // query for one surface should not open the files of others.
     fn kept(&self, state: &dyn Session, filters: &[Expr]) -> Result<Vec<&ScanFile>> {
         let all = || self.files.iter().collect();
         let Some(filter) = conjunction(filters.iter().cloned()) else { return Ok(all()) };
@@ -122,7 +122,7 @@ impl LakeTable {
         Ok(self.files.iter().zip(may).filter(|(_, may)| *may).map(|(file, _)| file).collect())
     }
 
-    // A plain scan of files, in groups of about the same size; a file is split further by DataFusion where that pays.
+    // A plain scan of files, in groups of about the same size; DataFusion splits files further if that pays.
     fn scan_files(
         &self,
         files: &[&ScanFile],
@@ -162,8 +162,8 @@ impl LakeTable {
         Ok(known)
     }
 
-    // Merged files with runs that are replaced since: the same scan without their rows. The limit counts rows that
-    // stay, so it is not the scan's.
+    // A scan of merged files without the rows of runs that have been replaced since. The limit counts the remaining
+    // rows, so it is not passed to the scan.
     fn partly_hidden(
         &self,
         files: &[&ScanFile],
@@ -185,7 +185,8 @@ impl LakeTable {
         Ok(Arc::new(filter))
     }
 
-    // Lists are decoded for the rows that a filter leaves. Scans of narrow columns alone would only lose by it.
+    // With pushed-down filters, lists are decoded only for the remaining rows. Scans of narrow columns would get
+    // slower.
     fn reads_lists(&self, projection: Option<&Vec<usize>>) -> bool {
         let nested = |i: usize| self.schema.field(i).data_type().is_nested();
         match projection {
@@ -210,7 +211,7 @@ impl ScanFile {
     }
 }
 
-// What the log knows of a file, so that a query for one surface does not open the files of the others.
+// Statistics of a file from the log, so that a query for one surface does not open the files of others.
 fn known(file: &DataFile, schema: &SchemaRef) -> Statistics {
     let mut known = Statistics::new_unknown(schema);
     known.num_rows = Precision::Exact(file.rows as usize);
@@ -230,7 +231,8 @@ fn known(file: &DataFile, schema: &SchemaRef) -> Statistics {
     known
 }
 
-// Keys are integers and texts. JSON does not keep every float, so those are left to the file's own statistics.
+// Only for integers and texts, as keys are. JSON does not represent every float exactly, so the file's own statistics
+// serve for those.
 fn scalar(kind: &DataType, text: Option<&str>, int: Option<i64>) -> Option<ScalarValue> {
     match kind {
         DataType::Utf8 => text.filter(|t| t.chars().count() < WHOLE_TEXT).map(ScalarValue::from),
@@ -261,8 +263,8 @@ impl TableProvider for LakeTable {
         TableType::Base
     }
 
-    // DataFusion keeps its filter, and its physical optimizer hands it to the Parquet reader, which leaves out row
-    // groups and pages by statistics, and rows where lists are read.
+    // DataFusion keeps its filter, and its physical optimizer pushes it down to the Parquet reader, which prunes row
+    // groups and pages by statistics, and filters rows if lists are read.
     fn supports_filters_pushdown(&self, filters: &[&Expr]) -> Result<Vec<TableProviderFilterPushDown>> {
         Ok(vec![TableProviderFilterPushDown::Inexact; filters.len()])
     }

@@ -28,17 +28,17 @@ struct Responses {
     length: usize,
 }
 
-/// Which format a surface's responses are written in.
+/// File format of a surface's responses.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum ResponseFormat {
-    /// AES69 SOFA, convention SingleRoomSRIR 1.0: a file a surface.
+    /// AES69 SOFA, convention SingleRoomSRIR 1.0: one file per surface.
     Sofa,
-    /// NumPy archives as the GIR data set has them, which `import gir` takes back.
+    /// NumPy archives in the layout of the GIR data set, which `import gir` reads.
     Npz,
 }
 
-/// Writes the responses of surfaces, of each its newest run, into a folder that is not there yet; of no names, of
-/// all surfaces. `progress` hears how many are done, of how many.
+/// Writes the responses of each surface's newest run into a new folder; an empty list of surfaces means all of them.
+/// `progress` is called with the number of surfaces done and their total.
 ///
 /// # Errors
 /// [`Error::Unknown`] for a surface that the lake does not have, and others; nothing is left behind.
@@ -68,7 +68,7 @@ pub async fn write_responses(
     Ok(files)
 }
 
-// The newest run of each surface, by the surfaces' names.
+// The newest run of each surface, sorted by surface id.
 fn newest_runs(snapshot: &Snapshot, surfaces: &[SurfaceId]) -> Result<Vec<VisibleRun>> {
     let mut newest: std::collections::BTreeMap<&SurfaceId, &VisibleRun> = std::collections::BTreeMap::new();
     newest.extend(snapshot.runs().map(|run| (&run.surface, run)));

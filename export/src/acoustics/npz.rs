@@ -1,5 +1,5 @@
-//! Responses and heights as the GIR data set has them: `<surface>.npz`, `<surface>_mat.npz`, `combinations.csv` and
-//! `panel_info.csv`.
+//! Responses and heights in the layout of the GIR data set: `<surface>.npz`, `<surface>_mat.npz`, `combinations.csv`
+//! and `panel_info.csv`.
 
 use std::io::Cursor;
 
@@ -77,7 +77,7 @@ async fn heights(lake: &Lake, snapshot: &Snapshot, responses: &Responses) -> Res
     Array2::from_shape_vec((side, side), values).map(Some).map_err(|e| Error::damaged(format!("heightmaps, {run}"), e))
 }
 
-/// Writes what the matrices' rows and the surfaces are.
+/// Writes `combinations.csv` (the pair of each matrix row) and `panel_info.csv` (one row per surface).
 pub(super) async fn describe(
     lake: &Lake,
     snapshot: &Snapshot,
@@ -108,7 +108,7 @@ pub(super) async fn describe(
     Ok(vec![folder.write("combinations.csv", &combinations)?, folder.write("panel_info.csv", &info)?])
 }
 
-// 1-based, as the data set counts them.
+// 1-based, as in the data set.
 fn combinations(lake: &Lake) -> std::result::Result<Vec<u8>, csv::Error> {
     let mut csv = csv::Writer::from_writer(Vec::new());
     csv.write_record(GIR_COMBINATIONS)?;

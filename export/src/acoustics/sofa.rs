@@ -1,5 +1,5 @@
-//! A surface's responses as SOFA (AES69-2022), convention SingleRoomSRIR 1.0: one measurement a pair, the microphone as
-//! listener and the speaker as source, in metres over the panel.
+//! A surface's responses as SOFA (AES69-2022), convention SingleRoomSRIR 1.0: one measurement per pair, the microphone
+//! as listener and the speaker as source, in metres over the panel.
 
 use echolake_lake::Lake;
 use echolake_schema::{Point, Timestamp};
@@ -10,7 +10,7 @@ use super::Responses;
 use crate::error::{Error, Result};
 use crate::output::{PendingFolder, WrittenFile};
 
-/// What netCDF calls a dimension that has no coordinates.
+/// Label that netCDF gives a dimension without coordinates; the size follows it.
 const NO_VARIABLE: &str = "This is a netCDF dimension but not a netCDF variable.";
 const KELVIN: f64 = 273.15;
 

@@ -15,11 +15,11 @@ use crate::error::{Error, Result};
 use crate::output::PendingFolder;
 use crate::slice::{Check, Measured, Taken, open_runs};
 
-/// Writes the recordings of measurements into a folder that is not there yet, and `manifest.csv` beside them; returns
-/// how many. `progress` hears how many are done, of how many.
+/// Writes the recordings of measurements and a `manifest.csv` into a new folder; returns the number of recordings.
+/// `progress` is called with the number of recordings done and their total.
 ///
 /// # Errors
-/// [`Error::Nothing`] where a run was recorded without sweeps, and others; nothing is left behind.
+/// [`Error::Nothing`] if a run was recorded without sweeps, and others; nothing is left behind.
 pub async fn write_wav(
     lake: &Lake,
     folder: &Path,
@@ -61,7 +61,7 @@ pub async fn write_wav(
     Ok(done)
 }
 
-/// What is kept of one measurement.
+/// One measurement's sweep recording and verdict, decoded.
 struct Recording {
     sweep: SweepRecording,
     verdict: Measurement,
@@ -101,7 +101,7 @@ impl Recording {
         ]))
     }
 
-    // Both channels as they were recorded, to the bit.
+    // Both channels bit for bit as they were recorded.
     fn wav(&self) -> std::result::Result<Vec<u8>, String> {
         let format = self.sweep.format();
         let width = format.bytes().ok_or("its sample format is unknown")?;

@@ -1,4 +1,4 @@
-//! What a training set says of itself: `README.md`, a card as hubs of data sets show it, and `surfaces.csv`.
+//! Documentation files of a training set: `README.md`, a dataset card for hubs, and `surfaces.csv`.
 
 use std::fmt::Write as _;
 
@@ -14,7 +14,7 @@ use crate::error::{Error, Result};
 pub(super) const PAPER: &str = "Rust, R. et al. (2021). A data acquisition setup for data driven acoustic design. \
 Building Acoustics 28(4), 345-360. https://doi.org/10.1177/1351010X20986901";
 
-/// What a card is about.
+/// Contents of a card: the lake, the plan, and the export's counts.
 pub(super) struct About<'a> {
     pub(super) lake: &'a Lake,
     pub(super) plan: &'a Plan,
@@ -22,7 +22,7 @@ pub(super) struct About<'a> {
 }
 
 impl About<'_> {
-    /// One sentence.
+    /// Returns a summary of one sentence.
     pub(super) fn summary(&self) -> String {
         let rows: u64 = self.exported.parts.iter().map(|p| p.rows).sum();
         let surfaces: usize = self.exported.parts.iter().map(|p| p.surfaces).sum();
@@ -32,7 +32,7 @@ impl About<'_> {
         )
     }
 
-    /// The origins of the surfaces: measured, simulated, imported.
+    /// Returns the origins of the surfaces: measured, simulated, imported.
     pub(super) fn origins(&self) -> Vec<String> {
         let mut origins: Vec<_> =
             Part::ALL.iter().flat_map(|p| self.plan.of_part(*p)).map(|s| s.origin.clone()).collect();
@@ -51,7 +51,7 @@ impl About<'_> {
     }
 }
 
-/// The card.
+/// Returns the text of the card.
 pub(super) fn write(about: &About<'_>) -> String {
     let mut text = front_matter(about);
     let split = about.plan.set.split;
@@ -176,7 +176,7 @@ loader = Measurements(".", split="train", symmetries="all", heights=True)
     );
 }
 
-/// `surfaces.csv`: what each surface's rows were made from.
+/// Returns the text of `surfaces.csv`: the run file and the derivations behind each surface's rows.
 pub(super) fn sources(shards: &[(&Shard, Vec<u64>)]) -> Result<String> {
     let mut csv = csv::Writer::from_writer(Vec::new());
     let failed = |e: csv::Error| Error::damaged("surfaces.csv", e);

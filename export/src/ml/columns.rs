@@ -1,4 +1,4 @@
-//! The columns of a training set: its keys, and what is chosen of the lake's tables.
+//! The columns of a training set: its keys, and the columns chosen from the lake's tables.
 
 use std::collections::HashMap;
 use std::sync::Arc;
@@ -9,9 +9,9 @@ use echolake_schema::tables::{COMMENT, LIST_CHILD, Table, UNIT};
 
 use crate::error::{Error, Result};
 
-/// Tables whose columns can be chosen; the first that has a name gives it.
+/// Tables whose columns can be chosen; the first one that has a name provides the column.
 const TABLES: [Table; 3] = [Table::Measurements, Table::Nce, Table::Tnce];
-/// Columns that are keys here already, or say what `surfaces.csv` says.
+/// Columns that are keys here already, or repeat `surfaces.csv`.
 const NOT_CHOSEN: [&str; 10] = [
     "surface_id",
     "run_id",
@@ -33,7 +33,7 @@ pub(super) struct Columns {
     schema: SchemaRef,
 }
 
-/// Chosen where nothing else is: the response, its temperature and quality, and TNCE.
+/// The default columns: the response, its temperature and quality, and TNCE.
 fn defaults(rig: &Rig) -> Vec<String> {
     let mut names: Vec<String> = ["temperature_c", "snr_db", "ir"].map(str::to_owned).into();
     names.extend(rig.band_names().iter().map(|band| format!("tnce_{band}")));
@@ -42,7 +42,7 @@ fn defaults(rig: &Rig) -> Vec<String> {
 }
 
 impl Columns {
-    /// The columns of these names; of none, the usual ones.
+    /// Chooses the columns of these names; the defaults if there are no names.
     pub(super) fn choose(rig: &Rig, names: &[String]) -> Result<Self> {
         let tables: Vec<_> = TABLES.into_iter().map(|table| (table, table.schema(rig))).collect();
         let usual = defaults(rig);
@@ -86,7 +86,7 @@ fn unknown(name: &str, tables: &[(Table, SchemaRef)]) -> Error {
     Error::Unknown { kind: "column", name: name.to_owned(), known: known.join(", ") }
 }
 
-// Numbers in single precision, which is what a network takes; lists of the length that all of them have.
+// Numbers in single precision, as networks take them; lists of the rig's fixed length.
 fn narrowed(field: &Field, rig: &Rig) -> Result<Field> {
     let data_type = match field.data_type() {
         DataType::Float64 => DataType::Float32,
@@ -96,13 +96,13 @@ fn narrowed(field: &Field, rig: &Rig) -> Result<Field> {
     Ok(field.clone().with_data_type(data_type))
 }
 
-/// A list of this many f32.
+/// Returns the type of a list of `length` f32.
 pub(super) fn list(length: usize) -> Result<DataType> {
     let length = i32::try_from(length).map_err(|e| Error::damaged("lake.toml", e))?;
     Ok(DataType::FixedSizeList(Arc::new(Field::new(LIST_CHILD, DataType::Float32, false)), length))
 }
 
-/// A field that says its unit and meaning.
+/// Returns a field with its unit and meaning as metadata.
 pub(super) fn field(name: &str, data_type: DataType, unit: &str, comment: &str) -> FieldRef {
     let metadata = HashMap::from([(UNIT.to_owned(), unit.to_owned()), (COMMENT.to_owned(), comment.to_owned())]);
     Arc::new(Field::new(name, data_type, name == "macrostructure").with_metadata(metadata))

@@ -74,7 +74,7 @@ fn file_set(id: &str, includes: &str, description: &str) -> Value {
     })
 }
 
-// The names of the splits, which every row's `split` is one of.
+// The names of the splits, to which the field `split` of every row refers.
 fn splits() -> Value {
     let data: Vec<_> = Part::ALL
         .iter()

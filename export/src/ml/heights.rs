@@ -1,4 +1,4 @@
-//! Height maps of a training set: a row a surface and symmetry, joined by both.
+//! Height maps of a training set: one row per surface and symmetry, joined by both.
 
 use std::sync::Arc;
 
@@ -33,7 +33,7 @@ pub(super) fn schema() -> Result<SchemaRef> {
     ])))
 }
 
-/// A surface's height maps under these symmetries; None where it has none.
+/// Reads a surface's height maps under these symmetries; None if it has none.
 pub(super) async fn read(
     lake: &Lake,
     snapshot: &Snapshot,

@@ -1,4 +1,4 @@
-//! Rows of one run for a training set: joined by pair, once for each symmetry.
+//! Rows of one run for a training set: joined by pair, and repeated for each symmetry.
 
 use std::collections::HashMap;
 use std::sync::Arc;
@@ -21,11 +21,11 @@ use super::surfaces::{Run, Surface};
 use crate::error::{Error, Result};
 use crate::rows;
 
-/// The symmetries of a training set, and where each of the rig's pairs goes under them.
+/// The symmetries of a training set, and the image of each of the rig's pairs under them.
 pub(super) struct Moves(Vec<(Symmetry, Vec<MovedPair>)>);
 
 impl Moves {
-    /// All that the grid has, or the identity alone.
+    /// Returns all symmetries of the grid, or the identity alone.
     pub(super) fn of(grid: &Grid, symmetries: super::Symmetries) -> Self {
         let wanted: &[Symmetry] = match symmetries {
             super::Symmetries::None => &[Symmetry::Identity],
@@ -34,13 +34,13 @@ impl Moves {
         Self(wanted.iter().filter_map(|s| grid.moved_pairs(*s).map(|pairs| (*s, pairs))).collect())
     }
 
-    /// Their names.
+    /// Returns the names of the symmetries.
     pub(super) fn names(&self) -> Vec<&'static str> {
         self.0.iter().map(|(symmetry, _)| symmetry.name()).collect()
     }
 }
 
-/// What rows are made with.
+/// Builds the rows of runs from a snapshot of the lake.
 pub(super) struct Maker<'a> {
     pub(super) lake: &'a Lake,
     pub(super) snapshot: &'a Snapshot,
@@ -55,13 +55,13 @@ pub(super) struct RunRows {
 }
 
 impl Maker<'_> {
-    /// Reads what a run has in all of the chosen tables.
+    /// Reads the chosen columns of the pairs that the run has in all of the chosen tables.
     pub(super) async fn read(&self, run: &Run) -> Result<RunRows> {
         let mut tables = HashMap::new();
         let mut pairs: Option<Vec<u32>> = None;
         for table in [Table::Measurements, Table::Nce, Table::Tnce] {
             let mut names = self.columns.of(table);
-            // Every row of a training set is one that references normalise, whatever is chosen of it.
+            // Rows need TNCE values even if no column of `tnce` is chosen: every row must be normalised by references.
             if names.is_empty() && table != Table::Tnce {
                 continue;
             }
@@ -89,7 +89,7 @@ impl Maker<'_> {
         Ok(RunRows { pairs, values })
     }
 
-    /// The rows under each symmetry, one batch a symmetry.
+    /// Returns the rows under each symmetry, one batch per symmetry.
     pub(super) fn batches(&self, surface: &Surface, run: &Run, part: Part, rows: &RunRows) -> Result<Vec<RecordBatch>> {
         self.moves.0.iter().map(|(symmetry, moved)| self.batch(surface, run, part, rows, (*symmetry, moved))).collect()
     }
@@ -138,7 +138,7 @@ impl Maker<'_> {
     }
 }
 
-// Where each pair's row is. A pair stands once in a run; of several the last counts.
+// The row of each pair. A pair occurs once in a run; of duplicates the last one wins.
 fn places(batch: &RecordBatch, pairs: usize) -> Result<HashMap<u32, u32>> {
     let ids = rows::numbers::<Int32Type>(batch, "pair_id")?;
     let place =
@@ -164,7 +164,7 @@ fn column(batch: &RecordBatch, field: &FieldRef, order: &UInt32Array) -> std::re
     }
 }
 
-/// Values as lists of one length.
+/// Returns the values as lists of one length.
 pub(super) fn fixed(values: ArrayRef, kind: &DataType) -> std::result::Result<ArrayRef, arrow::error::ArrowError> {
     let DataType::FixedSizeList(child, length) = kind else { return Ok(values) };
     Ok(Arc::new(FixedSizeListArray::try_new(child.clone(), *length, values, None)?))

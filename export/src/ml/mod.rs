@@ -1,4 +1,4 @@
-//! Training sets: whole surfaces in Parquet files that loaders read by themselves, split by physical panel.
+//! Training sets: Parquet files of whole surfaces that each load independently, split by physical panel.
 
 mod card;
 mod columns;
@@ -25,12 +25,12 @@ use measurements::Moves;
 pub use split::{Part, Split, SplitBy};
 use surfaces::Surface;
 
-/// Least number of files of a split that has as many surfaces: loaders give whole files to their workers.
+/// Minimum number of files per split, if it has that many surfaces: loaders give whole files to their workers.
 pub const SHARDS: usize = 32;
-/// Most surfaces in a file: with one of 5 MB each, files stay in the hundreds of MB.
+/// Maximum number of surfaces per file: at 5 MB per surface, files stay in the hundreds of MB.
 const SURFACES_A_SHARD: usize = 64;
 
-/// Which of D4's symmetries the rows are turned by.
+/// The D4 symmetries by which rows are repeated.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Symmetries {
     /// Rows as they were measured; `echolake.torch` turns them while it loads.
@@ -39,14 +39,14 @@ pub enum Symmetries {
     All,
 }
 
-/// What a training set is made of.
+/// Parameters of a training set.
 #[derive(Debug, Clone, PartialEq)]
 pub struct TrainingSet {
     /// Its symmetries.
     pub symmetries: Symmetries,
-    /// How it is split.
+    /// Its split into parts.
     pub split: Split,
-    /// Columns of `measurements`, `nce` and `tnce`; the usual ones where it is empty.
+    /// Columns of `measurements`, `nce` and `tnce`; the default columns if empty.
     pub columns: Vec<String>,
 }
 
@@ -56,20 +56,20 @@ impl Default for TrainingSet {
     }
 }
 
-/// What was written.
+/// Result of an export of a training set.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Exported {
     /// The parts, training first.
     pub parts: Vec<PartCounts>,
-    /// Surfaces that are left out, because another side of their panel is held out.
+    /// Surfaces that are left out because another side of their panel is held out.
     pub left_out: Vec<SurfaceId>,
-    /// Runs that wait for references, and so are left out.
+    /// Runs that are left out because they wait for references.
     pub waiting: usize,
     /// All files with their checksums, by name.
     pub files: Vec<WrittenFile>,
 }
 
-/// What is in one part.
+/// Counts of one part.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct PartCounts {
     /// The part.
@@ -86,7 +86,7 @@ pub struct PartCounts {
     pub height_maps: usize,
 }
 
-/// Everything that is decided before the first row is read.
+/// The plan of an export, complete before the first row is read.
 struct Plan {
     set: TrainingSet,
     columns: Columns,
@@ -147,8 +147,8 @@ fn shards(part: Part, mut surfaces: Vec<Surface>, seed: u64) -> Vec<Shard> {
     shards
 }
 
-/// Writes a training set into a folder that is not there yet, or empty; `progress` hears how many surfaces are done,
-/// of how many. The same lake gives the same bytes.
+/// Writes a training set into a new or empty folder; `progress` is called with the number of surfaces done and their
+/// total. The same lake gives the same bytes.
 ///
 /// # Errors
 /// [`crate::Error`]; nothing is left behind.
@@ -194,7 +194,7 @@ pub async fn write_training_set(
     Ok(exported)
 }
 
-/// What all files are written with.
+/// State shared by the tasks that write files.
 struct Job {
     lake: Lake,
     snapshot: Snapshot,
@@ -202,7 +202,7 @@ struct Job {
     folder: PendingFolder,
 }
 
-// A file a core at a time; of each what was written, and the rows of each of its surfaces.
+// One file per core at a time; returns each written file with the rows of each of its surfaces.
 async fn shards_of(job: &Arc<Job>, progress: &mut dyn FnMut(usize, usize)) -> Result<Vec<(WrittenFile, Vec<u64>)>> {
     let surfaces = |of: &Shard| of.surfaces.len();
     let (mut done, total) = (0, job.plan.shards.iter().map(surfaces).sum());
@@ -215,7 +215,7 @@ async fn shards_of(job: &Arc<Job>, progress: &mut dyn FnMut(usize, usize)) -> Re
     let wanted = (0..job.plan.shards.len()).take_while(|_| !stop.load(Ordering::Relaxed));
     let mut running = futures::stream::iter(wanted).map(spawn).buffered(cores);
     let (mut written, mut failed) = (Vec::new(), None);
-    // After a failure those at work come to their end, because the folder is theirs, too.
+    // After a failure the running tasks are awaited, because they still write into the folder.
     while let Some(ended) = running.next().await {
         match ended.map_err(|e| Error::write(Path::new(&job.plan.shards[written.len()].name), e)).flatten() {
             Ok(file) if failed.is_none() => {

@@ -1,4 +1,4 @@
-//! Parquet files of a training set: one row group a surface, the same bytes every time.
+//! Parquet files of a training set: one row group per surface, reproducible byte for byte.
 
 use arrow::datatypes::{DataType, SchemaRef};
 use arrow::record_batch::RecordBatch;
@@ -69,7 +69,7 @@ pub(super) async fn write(job: &Job, shard: &Shard) -> Result<(WrittenFile, Vec<
     Ok((writer.finish()?, counts))
 }
 
-/// Writes the height maps of a part; returns the file, where there are any, and how many surfaces have them.
+/// Writes the height maps of a part; returns the file, if there are any, and the number of surfaces that have them.
 pub(super) async fn heights(
     lake: &Lake,
     snapshot: &Snapshot,
@@ -94,7 +94,7 @@ pub(super) async fn heights(
     Ok((writer.map(ShardWriter::finish).transpose()?, count))
 }
 
-// Samples do not repeat, so a dictionary only costs; their bytes by significance compress best.
+// Samples do not repeat, so a dictionary only costs; byte stream split compresses them best.
 fn properties(schema: &SchemaRef) -> WriterProperties {
     let mut builder = WriterProperties::builder()
         .set_compression(Compression::ZSTD(ZstdLevel::try_new(ZSTD_LEVEL).unwrap_or_default()))

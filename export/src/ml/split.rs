@@ -1,4 +1,4 @@
-//! Who is in which part of a training set: whole physical panels, so that nothing of a panel leaks.
+//! Assigns surfaces to the parts of a training set: whole physical panels, so that no panel leaks.
 
 use std::collections::BTreeMap;
 
@@ -7,7 +7,7 @@ use sha2::{Digest as _, Sha256};
 use super::surfaces::Surface;
 use crate::error::{Error, Result};
 
-/// What is held out of training.
+/// The kind of group that is held out of training.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum SplitBy {
     /// Panels that were never seen.
@@ -32,16 +32,16 @@ impl SplitBy {
     }
 }
 
-/// How a lake is split.
+/// Parameters of the split.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Split {
-    /// What is held out.
+    /// The kind of group that is held out.
     pub by: SplitBy,
-    /// Least share of the surfaces in the test set, 0 to 1.
+    /// Minimum share of the surfaces in the test set, 0 to 1.
     pub test: f64,
-    /// Least share of the surfaces in the validation set, 0 to 1.
+    /// Minimum share of the surfaces in the validation set, 0 to 1.
     pub validation: f64,
-    /// Seed of the draw, and of the order of surfaces in the files.
+    /// Seed of the random draw and of the order of surfaces in the files.
     pub seed: u64,
 }
 
@@ -76,8 +76,8 @@ impl Part {
     }
 }
 
-/// The part of each surface, in the given order; None for one that is left out, because another side of its panel is
-/// in a rarer part.
+/// Returns the part of each surface, in the given order; None for a surface that is left out because another side of
+/// its panel is in a rarer part.
 pub(super) fn assign(surfaces: &[Surface], split: Split) -> Result<Vec<Option<Part>>> {
     let drawn = draw(surfaces, split)?;
     let own = |surface: &Surface| match (surface.reference, drawn.get(&category(surface, split.by))) {
@@ -105,7 +105,7 @@ pub(super) fn assign(surfaces: &[Surface], split: Split) -> Result<Vec<Option<Pa
     Ok(surfaces.iter().map(part).collect())
 }
 
-// Which part each category is drawn for: those that come first by a digest fill the test set, the next validation.
+// Draws a part for each category: sorted by digest, the first fill the test set, the next the validation set.
 fn draw(surfaces: &[Surface], split: Split) -> Result<BTreeMap<String, Part>> {
     let mut counts: BTreeMap<String, usize> = BTreeMap::new();
     surfaces.iter().filter(|s| !s.reference).for_each(|s| *counts.entry(category(s, split.by)).or_default() += 1);
@@ -131,7 +131,7 @@ fn draw(surfaces: &[Surface], split: Split) -> Result<BTreeMap<String, Part>> {
     let mut order = order.into_iter();
     let mut drawn = BTreeMap::new();
     for (number, (part, share)) in wanted.into_iter().enumerate() {
-        // Every part that is still to come gets one at least.
+        // Leaves at least one category for every part that is still to be filled.
         let later = wanted[number + 1..].iter().filter(|(_, share)| *share > 0.0).count() + 1;
         let mut have = 0;
         while (have as f64) < share * total as f64 && left > later {
@@ -153,7 +153,7 @@ fn category(surface: &Surface, by: SplitBy) -> String {
     }
 }
 
-/// A draw that is the same on every machine.
+/// Returns a digest for a pseudorandom order that is the same on every machine.
 pub(super) fn digest(seed: u64, name: &str) -> [u8; 32] {
     let mut sha = Sha256::new();
     sha.update(seed.to_le_bytes());

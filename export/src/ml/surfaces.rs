@@ -16,19 +16,19 @@ pub(super) struct Surface {
     pub(super) typology: String,
     pub(super) macrostructure: Option<String>,
     pub(super) origin: String,
-    /// Whether others name it as their Flat or Foam.
+    /// True if other surfaces name it as their Flat or Foam.
     pub(super) reference: bool,
     pub(super) runs: Vec<Run>,
 }
 
-/// A run, and what its file is.
+/// A run and the digest of its file.
 #[derive(Debug, Clone)]
 pub(super) struct Run {
     pub(super) visible: VisibleRun,
     pub(super) file_sha256: String,
 }
 
-/// All surfaces that have a derived run, by name; and the runs that wait for references.
+/// Reads all surfaces that have a derived run, sorted by name, and the number of runs that wait for references.
 pub(super) async fn read(lake: &Lake, snapshot: &Snapshot) -> Result<(Vec<Surface>, usize)> {
     let mut surfaces = BTreeMap::new();
     let mut references = HashSet::new();

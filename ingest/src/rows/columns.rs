@@ -1,4 +1,4 @@
-//! Gathers the columns of a batch in order, and checks them against the table's schema at the end.
+//! Collects the columns of a batch in order, and checks them against the table's schema at the end.
 
 use std::sync::Arc;
 
@@ -15,7 +15,7 @@ use echolake_schema::{Rig, RunId, SurfaceId, Timestamp};
 
 use crate::error::Result;
 
-/// What every row of a run begins with.
+/// Key columns of every row of a run.
 #[derive(Debug, Clone)]
 pub(crate) struct Keys {
     pub(crate) surface: SurfaceId,
@@ -34,7 +34,7 @@ impl Columns {
         Self { table, rows, arrays: Vec::new() }
     }
 
-    /// The columns of a run's table, its keys in front.
+    /// Returns columns that begin with the run's keys.
     pub(crate) fn of_run(table: Table, rows: usize, keys: &Keys) -> Self {
         let mut columns = Self::new(table, rows);
         columns.same(keys.surface.as_str()).same(keys.run.as_str());
@@ -46,7 +46,7 @@ impl Columns {
         self
     }
 
-    /// The same text in every row.
+    /// Appends a column with the same text in every row.
     pub(crate) fn same(&mut self, text: &str) -> &mut Self {
         let rows = self.rows;
         self.push(Arc::new(StringArray::from_iter_values(std::iter::repeat_n(text, rows))))
@@ -80,7 +80,7 @@ impl Columns {
         self.push(Arc::new(values.into_iter().collect::<Float64Array>()))
     }
 
-    /// Two columns: nanoseconds, and the time cut to microseconds.
+    /// Appends two columns: nanoseconds, and the time truncated to microseconds.
     pub(crate) fn times(&mut self, nanos: impl IntoIterator<Item = i64>) -> &mut Self {
         let nanos: Vec<i64> = nanos.into_iter().collect();
         let micros = nanos.iter().map(|ns| Timestamp(*ns).micros());
@@ -88,7 +88,7 @@ impl Columns {
         self.push(Arc::new(Int64Array::from(nanos))).push(Arc::new(micros))
     }
 
-    /// Lists of one length, from all their values in a row.
+    /// Appends a column of lists of equal length, from their concatenated values.
     pub(crate) fn lists(&mut self, values: Vec<f32>) -> &mut Self {
         let each = values.len().checked_div(self.rows).unwrap_or(0);
         let child = Arc::new(Field::new(LIST_CHILD, DataType::Float32, false));
@@ -96,7 +96,7 @@ impl Columns {
         self.push(Arc::new(ListArray::new(child, offsets, Arc::new(Float32Array::from(values)), None)))
     }
 
-    /// The batch.
+    /// Returns the batch.
     pub(crate) fn finish(&mut self, rig: &Rig) -> Result<RecordBatch> {
         let arrays = std::mem::take(&mut self.arrays);
         let made = RecordBatch::try_new(self.table.schema(rig), arrays);
@@ -104,7 +104,7 @@ impl Columns {
     }
 }
 
-/// Not a number is no value.
+/// Returns None for NaN and infinities.
 pub(super) fn finite(value: f64) -> Option<f64> {
     value.is_finite().then_some(value)
 }

@@ -10,14 +10,14 @@ use crate::CODE_VERSION;
 use crate::derived_values::{DerivedLists, DerivedRows};
 use crate::error::Result;
 
-/// Which references the rows used.
+/// Versions of the references that the rows used.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Versions<'a> {
     pub(crate) flat: &'a str,
     pub(crate) foam: &'a str,
 }
 
-/// Where each pair goes under each symmetry that the grid has.
+/// The image of each pair under each symmetry that the grid has.
 pub(crate) struct Moved(Vec<(Symmetry, Vec<MovedPair>)>);
 
 impl Moved {
@@ -27,7 +27,7 @@ impl Moved {
     }
 }
 
-/// Rows of `nce`.
+/// Builds rows of `nce`.
 pub(crate) fn nce(rig: &Rig, grid: &Grid, keys: &Keys, derived: DerivedLists, of: Versions<'_>) -> Result<RecordBatch> {
     let mut columns = Columns::of_run(Table::Nce, derived.pairs.len(), keys);
     pair_columns(&mut columns, grid, &derived.pairs);
@@ -39,7 +39,7 @@ pub(crate) fn nce(rig: &Rig, grid: &Grid, keys: &Keys, derived: DerivedLists, of
     columns.finish(rig)
 }
 
-/// Rows of `tnce`.
+/// Builds rows of `tnce`.
 pub(crate) fn tnce(
     rig: &Rig,
     grid: &Grid,
@@ -54,7 +54,7 @@ pub(crate) fn tnce(
     columns.finish(rig)
 }
 
-/// Rows of `tnce_d4`, the eight of a pair one after the other. Symmetries that the grid lacks are left out.
+/// Builds rows of `tnce_d4`, grouped by pair, one per symmetry. Symmetries that the grid lacks are left out.
 pub(crate) fn tnce_d4(
     rig: &Rig,
     grid: &Grid,
@@ -97,7 +97,7 @@ fn pair_columns(columns: &mut Columns, grid: &Grid, pairs: &[u32]) {
         .ints(pairs.iter().map(|p| pair(p).map(|p| p.speaker.0 as i32)));
 }
 
-// Each measurement's numbers stand in `each` rows.
+// Repeats each measurement's numbers in `each` rows.
 fn energy_columns(columns: &mut Columns, derived: &DerivedRows, each: usize) {
     for values in derived.energy_columns() {
         columns.doubles(values.into_iter().flat_map(|x| std::iter::repeat_n(Some(x), each)));

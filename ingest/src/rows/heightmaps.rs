@@ -11,7 +11,7 @@ use crate::error::{Error, Result};
 
 const CELLS: usize = Table::HEIGHTMAP_CELLS;
 
-/// A row a symmetry; none where the heights are no square.
+/// Builds one row per symmetry; None if the heights are not a square.
 pub(crate) fn rows(rig: &Rig, keys: &Keys, heights_mm: &[f32]) -> Result<Option<RecordBatch>> {
     let side = heights_mm.len().isqrt();
     if side == 0 || side * side != heights_mm.len() {
@@ -33,7 +33,7 @@ pub(crate) fn rows(rig: &Rig, keys: &Keys, heights_mm: &[f32]) -> Result<Option<
     columns.finish(rig).map(Some)
 }
 
-// Each small cell is the mean of what it covers, first along x, then along y.
+// Each small cell is the mean of the area it covers, first along x, then along y.
 fn area_mean(heights: &[f32], side: usize) -> Vec<f32> {
     let weights = weights(side);
     let narrow: Vec<f32> = heights.chunks_exact(side).flat_map(|row| shrink(row, &weights)).collect();
@@ -47,7 +47,7 @@ fn area_mean(heights: &[f32], side: usize) -> Vec<f32> {
     small
 }
 
-/// For each small cell: the first large cell that it covers, and how much of each.
+/// Returns for each small cell the first large cell that it covers, and the weight of each covered cell.
 fn weights(side: usize) -> Vec<(usize, Vec<f64>)> {
     let scale = side as f64 / CELLS as f64;
     let weights = |cell: usize| {

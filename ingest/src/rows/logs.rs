@@ -10,7 +10,7 @@ use crate::CODE_VERSION;
 use crate::error::Result;
 use crate::measure::Event;
 
-/// A row a reading.
+/// Builds one row per reading.
 pub(crate) fn environment(rig: &Rig, keys: &Keys, readings: &[(i64, AmbientSample)]) -> Result<RecordBatch> {
     let mut columns = Columns::of_run(Table::Environment, readings.len(), keys);
     columns
@@ -23,7 +23,7 @@ pub(crate) fn environment(rig: &Rig, keys: &Keys, readings: &[(i64, AmbientSampl
     columns.finish(rig)
 }
 
-/// A row a line of the log.
+/// Builds one row per log line.
 pub(crate) fn events(rig: &Rig, keys: &Keys, events: &[(i64, Event)]) -> Result<RecordBatch> {
     let mut columns = Columns::of_run(Table::Events, events.len(), keys);
     columns

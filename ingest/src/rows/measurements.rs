@@ -11,10 +11,10 @@ use crate::CODE_VERSION;
 use crate::error::Result;
 use crate::measure::Response;
 
-/// Values of the list column in a batch, which is encoded before the next one is made.
+/// Number of list values per batch; each batch is encoded before the next one is built.
 const LIST_VALUES: usize = 1 << 18;
 
-/// A row a measurement, sorted by pair.
+/// Encodes one row per measurement, in the given order, which is by pair.
 pub(crate) fn encode(rig: &Rig, grid: &Grid, keys: &Keys, accepted: &[(Measurement, Response)]) -> Result<EncodedFile> {
     let rows_a_batch = (LIST_VALUES / rig.impulse_response.length).max(1);
     let mut encoder = FileEncoder::new(Table::Measurements, Table::Measurements.schema(rig));

@@ -1,4 +1,4 @@
-//! The row of table `runs`, and how it changes when references come.
+//! The row of table `runs`, and its update when references arrive.
 
 use std::sync::Arc;
 
@@ -12,24 +12,24 @@ use crate::CODE_VERSION;
 use crate::error::{Error, Result};
 use crate::run_content::RunContent;
 
-/// What a run's row says of its references.
+/// The columns of a run's row about its references.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub(crate) struct References {
-    /// What is missing, in words; empty where nothing is.
+    /// Description of missing references; empty if none is missing.
     pub(crate) missing: String,
     pub(crate) derivation: Option<String>,
     pub(crate) flat_version: Option<String>,
     pub(crate) foam_version: Option<String>,
 }
 
-/// State of a run all of whose rows are there.
+/// State of a run with all of its rows.
 const COMPLETE: &str = "complete";
 /// State of a run whose references are missing.
 const WAITING: &str = "waiting";
 /// State of a run whose file was cut off or is damaged.
 const PARTIAL: &str = "partial";
 
-/// The row of a run as it comes in.
+/// Builds the row of a newly ingested run.
 pub(crate) fn row(
     lake: &Lake,
     keys: &Keys,
@@ -74,7 +74,7 @@ pub(crate) fn row(
     columns.finish(lake.rig())
 }
 
-/// The row of a run that is there, with other references.
+/// Returns a run's row with other references.
 pub(crate) fn with_references(row: &RecordBatch, references: &References) -> Result<RecordBatch> {
     let was_partial = text_of(row, "state").as_deref() == Some(PARTIAL);
     let mut columns = row.columns().to_vec();
@@ -93,7 +93,7 @@ pub(crate) fn with_references(row: &RecordBatch, references: &References) -> Res
     RecordBatch::try_new(row.schema(), columns).map_err(damaged)
 }
 
-/// A text of the row.
+/// Returns a text of the row.
 pub(crate) fn text_of(row: &RecordBatch, column: &str) -> Option<String> {
     use arrow::array::{Array as _, AsArray as _};
     let array = row.column_by_name(column)?.as_string_opt::<i32>()?;

@@ -11,7 +11,7 @@ use super::{Columns, Keys};
 use crate::CODE_VERSION;
 use crate::error::Result;
 
-/// What a row says of one band's TNCE values over the pairs.
+/// Statistics of one band's TNCE values over the pairs.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 struct Stats {
     p90_mean_db: Option<f64>,
@@ -23,7 +23,7 @@ struct Stats {
     spread_db: Option<f64>,
 }
 
-/// A row a band, and one for the total, from the TNCE values of each over all pairs.
+/// Builds one row per band and one for the total, from the TNCE values of each over all pairs.
 pub(crate) fn rows(rig: &Rig, keys: &Keys, tnce: &[Vec<f64>], of: Versions<'_>) -> Result<RecordBatch> {
     let names = rig.band_names();
     let pairs = tnce.first().map_or(0, Vec::len);

@@ -9,7 +9,7 @@ use super::{Columns, Keys};
 use crate::CODE_VERSION;
 use crate::error::Result;
 
-/// The run's surface; references that it does not name are the lake's.
+/// Builds the row of a run's surface; references that it does not name default to the lake's.
 pub(crate) fn row(
     rig: &Rig,
     keys: &Keys,
@@ -47,7 +47,7 @@ pub(crate) fn row(
     columns.finish(rig)
 }
 
-// Least, greatest and root mean square height about the mean.
+// Minimum, maximum and root mean square height about the mean.
 fn relief(heights_mm: &[f32]) -> Option<[f32; 3]> {
     if heights_mm.is_empty() {
         return None;

@@ -1,8 +1,8 @@
-//! Limits of queries: a [`Ticket`] says whether a query may continue, [`pool`] counts the memory of its operators.
+//! Limits of queries: a [`Ticket`] signals whether a query may continue, [`pool`] counts the memory of its operators.
 //!
-//! DataFusion ends a query only where it waits, and allocates between two looks at its pool. What does not end soon after
-//! its ticket was stopped is found here ([`RunningQueries::overdue`]); a server then ends the whole process, which is one
-//! client's alone.
+//! DataFusion ends a query only at an await, and allocates between two checks of its pool. [`RunningQueries::overdue`]
+//! finds work that does not end soon after its ticket was stopped; a server then ends the whole process, which serves
+//! one client alone.
 
 pub(crate) mod pool;
 pub(crate) mod threads;
@@ -14,26 +14,26 @@ use std::time::{Duration, Instant};
 
 use tokio::sync::Notify;
 
-/// Why a query was ended before its end.
+/// Reason for which a query was stopped.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) enum Stop {
-    /// Whoever asked does not want it any more.
+    /// The client cancelled it.
     Cancelled,
     /// It took too long.
     Time(Duration),
 }
 
-/// Whether one query may go on.
+/// Cancellation state and accounting of one query.
 pub(crate) struct Ticket {
     stop: OnceLock<(Stop, Instant)>,
     stopped: Notify,
-    /// Bytes that its operators say they hold.
+    /// Bytes that its operators have reserved.
     held: Arc<AtomicUsize>,
-    /// Guards of work that is being done for it.
+    /// Number of live work guards.
     working: AtomicUsize,
 }
 
-/// Work that is being done for a query, until this is dropped on the thread that does it.
+/// A guard for work on a query, dropped on the thread that does the work.
 pub(crate) struct WorkGuard(Arc<Ticket>);
 
 impl WorkGuard {
@@ -53,13 +53,13 @@ impl Ticket {
         Self { stop: OnceLock::new(), stopped: Notify::new(), held: Arc::default(), working: AtomicUsize::new(0) }
     }
 
-    /// Ends the query; the first reason counts.
+    /// Stops the query; the first reason counts.
     pub(crate) fn stop(&self, why: Stop) {
         let _ = self.stop.set((why, Instant::now()));
         self.stopped.notify_waiters();
     }
 
-    /// Why the query ends, if it does.
+    /// Returns the reason for which the query was stopped, if it was.
     pub(crate) fn why(&self) -> Option<&Stop> {
         self.stop.get().map(|(why, _)| why)
     }
@@ -67,7 +67,7 @@ impl Ticket {
     /// Waits until the query must end.
     pub(crate) async fn stopped(&self) -> Stop {
         loop {
-            // Listening begins before the look, or a stop between them would be missed.
+            // Subscribes before the check, or a stop between them would be missed.
             let stopped = self.stopped.notified();
             if let Some(why) = self.why() {
                 return why.clone();
@@ -76,12 +76,12 @@ impl Ticket {
         }
     }
 
-    /// Bytes that its operators say they hold.
+    /// Bytes that its operators have reserved.
     pub(crate) fn held(&self) -> &Arc<AtomicUsize> {
         &self.held
     }
 
-    /// Marks the begin of work for the query.
+    /// Registers work for the query.
     pub(crate) fn begin_work(self: &Arc<Self>) -> WorkGuard {
         self.working.fetch_add(1, Ordering::Relaxed);
         WorkGuard(self.clone())

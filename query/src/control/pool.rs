@@ -7,12 +7,12 @@ use datafusion::common::Result;
 use datafusion::error::DataFusionError;
 use datafusion::execution::memory_pool::{MemoryConsumer, MemoryLimit, MemoryPool, MemoryReservation};
 
-/// The part of another pool that one query, or all queries of a client, may have. Allocations beyond the limit are
-/// refused: sorts and aggregations then go to disk, all else fails.
+/// The share of another pool that one query, or all queries of a client, may use. Allocations beyond the limit are
+/// refused: sorts and aggregations then spill to disk, all other operators fail.
 #[derive(Debug)]
 pub(crate) struct PartialPool {
     all: Arc<dyn MemoryPool>,
-    /// Whose part it is, in words.
+    /// The holder of the share, for error messages.
     holder: &'static str,
     limit: usize,
     held: Arc<AtomicUsize>,

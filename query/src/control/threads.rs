@@ -1,20 +1,20 @@
-//! Threads that plan and run queries, apart from those that answer connections.
+//! Threads that plan and run queries, separate from those that serve connections.
 
 use std::time::Duration;
 
 use tokio::runtime::{Builder, Handle, Runtime};
 
-/// Stack of a thread that plans and runs: twice what the longest chain of operators takes that is let in.
+/// Stack size of a thread, bytes: twice the need of the longest accepted chain of operators.
 const STACK_BYTES: usize = 16 << 20;
 
-/// A runtime that may be dropped anywhere.
+/// A Tokio runtime that may be dropped anywhere, even in asynchronous code.
 pub struct Threads(Option<Runtime>);
 
 impl Threads {
-    /// `count` threads of a name.
+    /// Starts `count` threads with this name.
     ///
     /// # Errors
-    /// Where the system gives no threads.
+    /// If the system cannot start the threads.
     pub fn new(name: &str, count: usize) -> std::io::Result<Self> {
         let runtime = Builder::new_multi_thread()
             .worker_threads(count)
@@ -27,7 +27,7 @@ impl Threads {
         Ok(Self(Some(runtime)))
     }
 
-    /// One thread a core.
+    /// Starts one thread per core.
     ///
     /// # Errors
     /// As [`Threads::new`].
@@ -35,7 +35,7 @@ impl Threads {
         Self::new(name, std::thread::available_parallelism().map_or(1, usize::from))
     }
 
-    /// Where work is given to them; None while they end.
+    /// Returns the handle for spawning work; None during shutdown.
     pub fn handle(&self) -> Option<&Handle> {
         self.0.as_ref().map(Runtime::handle)
     }

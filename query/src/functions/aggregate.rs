@@ -1,4 +1,4 @@
-//! One function of many rows as DataFusion takes it, over one group or many at once.
+//! Adapter from an aggregate function to DataFusion, over one group or many at once.
 
 use std::fmt::{self, Debug};
 use std::hash::{Hash, Hasher};
@@ -18,43 +18,43 @@ use super::description::Description;
 
 /// A function of the values of many rows. Null rows do not count.
 pub(super) trait Aggregate: Send + Sync + Clone + 'static {
-    /// What is kept of a group's rows.
+    /// State of one group.
     type Group: Default + Debug + Send + Sync;
 
-    /// What it says of itself.
+    /// Returns the function's description.
     fn description(&self) -> &'static Description;
 
-    /// The type of its answer; the arguments' types are right.
+    /// Returns the type of its answer; the arguments' types are already checked.
     fn returns(&self, arguments: &[DataType]) -> DataType;
 
-    /// Name and type of what is kept, as it is sent between the steps of a query.
+    /// Returns names and types of the state's columns, which are passed between the steps of a query.
     fn state(&self) -> Vec<(&'static str, DataType)>;
 
-    /// Adds rows.
+    /// Adds a batch of rows to the groups.
     ///
     /// # Errors
-    /// Where a value makes no sense, with its row.
+    /// If a value is invalid; the error names its row.
     fn update(&self, arguments: &Arguments<'_>, groups: &mut Groups<'_, Self>) -> Result<()>;
 
-    /// Adds rows of what was kept elsewhere.
+    /// Merges states of other partial aggregations into the groups.
     ///
     /// # Errors
-    /// Where it does not fit what is kept here.
+    /// If a state does not fit the one here.
     fn merge(&self, states: &[ArrayRef], groups: &mut Groups<'_, Self>) -> Result<()>;
 
-    /// What is kept, a row a group.
+    /// Returns the states, one row per group.
     ///
     /// # Errors
-    /// Where it is more than an array takes.
+    /// If there are more values than an array can hold.
     fn keep(&self, groups: &[Self::Group]) -> Result<Vec<ArrayRef>>;
 
-    /// The answer, a row a group.
+    /// Returns the answers, one row per group.
     ///
     /// # Errors
-    /// Where it is more than an array takes.
+    /// If there are more values than an array can hold.
     fn answer(&self, groups: &[Self::Group], returns: &DataType) -> Result<ArrayRef>;
 
-    /// Bytes that a group holds beside its own.
+    /// Returns the bytes that a group holds on the heap.
     fn heap(_group: &Self::Group) -> usize {
         0
     }
@@ -64,13 +64,13 @@ pub(super) trait Aggregate: Send + Sync + Clone + 'static {
 pub(super) struct Groups<'a, A: Aggregate> {
     all: &'a mut [A::Group],
     heap: &'a mut usize,
-    /// None: all to the first.
+    /// Index of each row's group; None if all rows belong to the first.
     of: Option<&'a [usize]>,
     filter: Option<&'a BooleanArray>,
 }
 
 impl<A: Aggregate> Groups<'_, A> {
-    /// Changes the group of a row, if the row counts.
+    /// Updates the group of a row, unless the filter excludes the row.
     pub(super) fn at(&mut self, row: usize, change: impl FnOnce(&mut A::Group) -> Result<()>) -> Result<()> {
         if self.filter.is_some_and(|filter| !filter.value(row) || arrow::array::Array::is_null(filter, row)) {
             return Ok(());
@@ -83,14 +83,14 @@ impl<A: Aggregate> Groups<'_, A> {
     }
 }
 
-/// An [`Aggregate`] with what DataFusion asks of it.
+/// Adapts an [`Aggregate`] to DataFusion's trait.
 struct Adapter<A> {
     function: A,
     signature: Signature,
     documentation: Documentation,
 }
 
-/// Groups in the making; a single one where there is no GROUP BY.
+/// Accumulator of groups; a single group if there is no GROUP BY.
 struct Accumulated<A: Aggregate> {
     function: A,
     returns: DataType,
@@ -98,7 +98,7 @@ struct Accumulated<A: Aggregate> {
     heap: usize,
 }
 
-/// Makes it known to DataFusion.
+/// Wraps the function for DataFusion.
 pub(super) fn udaf(function: impl Aggregate) -> AggregateUDF {
     let documentation = function.description().documentation();
     AggregateUDF::new_from_impl(Adapter {
@@ -262,7 +262,7 @@ impl<A: Aggregate> Debug for Adapter<A> {
     }
 }
 
-// As for functions of a row.
+// Compared by name, like scalar functions.
 impl<A: Aggregate> PartialEq for Adapter<A> {
     fn eq(&self, other: &Self) -> bool {
         self.name() == other.name()

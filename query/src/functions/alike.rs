@@ -1,4 +1,4 @@
-//! `pearson` and `similarity`: how alike two lists are.
+//! `pearson` and `similarity`: similarity measures of two lists.
 
 use arrow::array::ArrayRef;
 use arrow::datatypes::DataType;

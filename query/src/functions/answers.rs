@@ -1,4 +1,4 @@
-//! Answers as Arrow takes them, built row by row; null where an argument is.
+//! Builds answers as Arrow arrays row by row; null if an argument is null.
 
 use std::sync::Arc;
 
@@ -10,7 +10,7 @@ use datafusion::error::{DataFusionError, Result};
 
 use super::arguments::{Arguments, Element};
 
-/// A number a row; None is null.
+/// Builds one number per row; None is null.
 pub(super) fn numbers(
     arguments: &Arguments<'_>,
     mut number: impl FnMut(usize) -> Result<Option<f64>>,
@@ -25,8 +25,8 @@ pub(super) fn numbers(
     Ok(Arc::new(Float64Array::new(values.into(), valid.finish())))
 }
 
-/// A list a row, with room for `room` values in all. `list` appends a row's values; where it returns false the row is
-/// null.
+/// Builds one list per row, with a capacity of `room` values in all. `list` appends a row's values; if it returns
+/// false, the row is null.
 pub(super) fn lists<T: Element>(
     arguments: &Arguments<'_>,
     room: usize,
@@ -48,7 +48,7 @@ pub(super) fn lists<T: Element>(
     Ok(Arc::new(list_array::<T>(values, offsets, valid.finish())?))
 }
 
-/// Lists of the kind that [`super::arguments::list_of`] names.
+/// Builds lists of the type that [`super::arguments::list_of`] returns.
 pub(super) fn list_array<T: Element>(
     values: Vec<T>,
     offsets: Vec<i32>,
@@ -60,7 +60,7 @@ pub(super) fn list_array<T: Element>(
     Ok(ListArray::try_new(Arc::new(field), offsets, Arc::new(values), nulls)?)
 }
 
-/// Numbers with names a row. `numbers` fills them; where it returns false the row is null.
+/// Builds one struct of numbers per row. `numbers` fills them; if it returns false, the row is null.
 pub(super) fn structs(
     arguments: &Arguments<'_>,
     fields: &Fields,
@@ -77,18 +77,18 @@ pub(super) fn structs(
         }
     }
     let nulls = valid.finish();
-    // A field taken out of a null struct is null because its own array says so.
+    // The fields' own arrays need the nulls, too: a field taken out of a null struct must be null.
     let column = |values: Vec<f64>| -> ArrayRef { Arc::new(Float64Array::new(values.into(), nulls.clone())) };
     let columns = columns.into_iter().map(column).collect();
     Ok(Arc::new(StructArray::try_new_with_length(fields.clone(), columns, nulls, arguments.rows())?))
 }
 
-/// Fields of a struct of numbers.
+/// Returns the fields of a struct of numbers.
 pub(super) fn number_fields<'a>(names: impl IntoIterator<Item = &'a str>) -> Fields {
     names.into_iter().map(|name| Field::new(name, DataType::Float64, true)).collect()
 }
 
-/// More values at the end of a list in the making.
+/// Appends `by` default values and returns them.
 pub(super) fn grow<T: Element>(values: &mut Vec<T>, by: usize) -> &mut [T] {
     let start = values.len();
     values.resize(start + by, T::default());

@@ -1,4 +1,4 @@
-//! Arguments as kernels take them: slices of samples, numbers and texts out of Arrow arrays, checked.
+//! Converts Arrow arrays to the arguments of kernels: checked slices of samples, numbers and texts.
 
 use std::fmt::Debug;
 use std::sync::Arc;
@@ -12,7 +12,7 @@ use echolake_dsp::Real;
 
 use super::description::{Description, Kind, Parameter};
 
-/// A sample that Arrow knows too.
+/// A sample type with an Arrow type.
 pub(super) trait Element: Real + ArrowNativeType {
     type Arrow: ArrowPrimitiveType<Native = Self>;
 }
@@ -25,12 +25,12 @@ impl Element for f64 {
     type Arrow = Float64Type;
 }
 
-/// The arguments of one call: arrays of as many rows, or of a single value for all of them.
+/// The arguments of one call: arrays with one value per row, or with a single value for all rows.
 pub(super) struct Arguments<'a> {
     description: &'a Description,
     columns: Vec<Column>,
     rows: usize,
-    /// Where one of them is null.
+    /// Rows in which an argument is null.
     nulls: Option<NullBuffer>,
 }
 
@@ -55,13 +55,13 @@ pub(super) struct Numbers<'a, N> {
     constant: bool,
 }
 
-/// Texts.
+/// Returns an argument as texts.
 pub(super) struct Texts<'a> {
     values: &'a StringArray,
     constant: bool,
 }
 
-/// The types that a call's arguments are cast to. What cannot be is left as it is: [`check`] says why.
+/// Returns the types to which a call's arguments are cast. Unsuitable types are kept: [`check`] refuses them.
 pub(super) fn coerced(description: &Description, types: &[DataType]) -> Vec<DataType> {
     let kind = |i: usize| description.parameters.get(i).map(|p| p.kind);
     let samples = types.iter().enumerate().filter(|(i, _)| kind(*i) == Some(Kind::Samples));
@@ -111,12 +111,12 @@ pub(super) fn check(description: &Description, types: &[DataType]) -> Result<()>
     Ok(())
 }
 
-/// A list as our functions return it.
+/// Returns the list type of our functions' answers.
 pub(super) fn list_of(element: DataType) -> DataType {
     DataType::List(Arc::new(Field::new_list_field(element, true)))
 }
 
-/// What the elements of a list are.
+/// Returns the element type of a list.
 pub(super) fn element(list: &DataType) -> Option<&DataType> {
     match list {
         DataType::List(child)
@@ -140,7 +140,7 @@ fn is_text(kind: &DataType) -> bool {
 }
 
 impl<'a> Arguments<'a> {
-    /// Of a call of scalar functions; constants are kept as one value.
+    /// Arguments of a call of a scalar function; constants are kept as one value.
     pub(super) fn new(description: &'a Description, values: &[ColumnarValue], rows: usize) -> Result<Self> {
         let column = |value: &ColumnarValue| match value {
             ColumnarValue::Array(array) => Ok(Column { array: array.clone(), constant: false }),
@@ -149,7 +149,7 @@ impl<'a> Arguments<'a> {
         Ok(Self::of(description, values.iter().map(column).collect::<Result<_>>()?, rows))
     }
 
-    /// Of a batch of an aggregate's input.
+    /// Arguments from a batch of an aggregate's input.
     pub(super) fn columns(description: &'a Description, arrays: &[ArrayRef]) -> Self {
         let rows = arrays.first().map_or(0, |a| a.len());
         let column = |array: &ArrayRef| Column { array: array.clone(), constant: false };
@@ -165,22 +165,22 @@ impl<'a> Arguments<'a> {
         Self { description, columns, rows, nulls }
     }
 
-    /// Rows of the answer.
+    /// Returns the number of rows of the answer.
     pub(super) fn rows(&self) -> usize {
         self.rows
     }
 
-    /// How many arguments were given.
+    /// Returns the number of given arguments.
     pub(super) fn given(&self) -> usize {
         self.columns.len()
     }
 
-    /// Whether an argument of the row is null, and its answer with it.
+    /// Returns whether an argument of the row is null, and so its answer.
     pub(super) fn is_null(&self, row: usize) -> bool {
         self.nulls.as_ref().is_some_and(|nulls| nulls.is_null(row))
     }
 
-    /// Lists of `T`.
+    /// Returns an argument as lists of `T`.
     pub(super) fn samples<T: Element>(&self, argument: usize) -> Result<Samples<'_, T>> {
         let Column { array, constant } = &self.columns[argument];
         let list = array.as_list_opt::<i32>().ok_or_else(|| self.other_type(argument))?;
@@ -195,35 +195,35 @@ impl<'a> Arguments<'a> {
         })
     }
 
-    /// Numbers.
+    /// Returns an argument as numbers.
     pub(super) fn numbers(&self, argument: usize) -> Result<Numbers<'_, f64>> {
         let Column { array, constant } = &self.columns[argument];
         let values = array.as_primitive_opt::<Float64Type>().ok_or_else(|| self.other_type(argument))?;
         Ok(Numbers { values: values.values(), constant: *constant })
     }
 
-    /// Whole numbers.
+    /// Returns an argument as whole numbers.
     pub(super) fn integers(&self, argument: usize) -> Result<Numbers<'_, i64>> {
         let Column { array, constant } = &self.columns[argument];
         let values = array.as_primitive_opt::<Int64Type>().ok_or_else(|| self.other_type(argument))?;
         Ok(Numbers { values: values.values(), constant: *constant })
     }
 
-    /// Texts.
+    /// Returns an argument as texts.
     pub(super) fn texts(&self, argument: usize) -> Result<Texts<'_>> {
         let Column { array, constant } = &self.columns[argument];
         let values = array.as_string_opt::<i32>().ok_or_else(|| self.other_type(argument))?;
         Ok(Texts { values, constant: *constant })
     }
 
-    /// What is wrong with an argument of a row, and what would be right.
+    /// Returns the error for an invalid argument of a row, with a hint.
     pub(super) fn wrong(&self, argument: usize, row: usize, is: impl Debug, hint: &str) -> DataFusionError {
         let (name, parameter) = (self.description.name, self.description.parameters[argument].name);
         let row = row + 1;
         DataFusionError::Execution(format!("`{name}`: `{parameter}` is {is:?} in row {row} of its batch; hint: {hint}"))
     }
 
-    /// What a kernel said of a row.
+    /// Returns the error for a row that a kernel refused.
     pub(super) fn refused(&self, row: usize, error: &echolake_dsp::Error) -> DataFusionError {
         let hint = match error {
             echolake_dsp::Error::Length { .. } => "the lists of a row must be equally long",
@@ -236,7 +236,7 @@ impl<'a> Arguments<'a> {
         DataFusionError::Execution(format!("`{name}`, row {row} of its batch: {error}; hint: {hint}"))
     }
 
-    // Planning casts to the right types, so that only a plan made by hand gets here.
+    // Planning casts to the right types, so only plans built without it get here.
     fn other_type(&self, argument: usize) -> DataFusionError {
         let (name, kind) = (self.description.name, self.columns[argument].array.data_type());
         DataFusionError::Execution(format!(
@@ -248,7 +248,7 @@ impl<'a> Arguments<'a> {
 }
 
 impl<'a, T> Samples<'a, T> {
-    /// The samples of a row that is not null.
+    /// Returns the samples of a row that is not null.
     pub(super) fn at(&self, row: usize) -> Result<&'a [T]> {
         let row = if self.constant { 0 } else { row };
         let offsets = self.list.value_offsets();
@@ -259,7 +259,7 @@ impl<'a, T> Samples<'a, T> {
         }
     }
 
-    /// Samples of all rows, about: how much room an answer of as many needs.
+    /// Returns the approximate number of samples of all rows, as capacity for an answer of the same size.
     pub(super) fn room(&self, rows: usize) -> usize {
         let offsets = self.list.value_offsets();
         let whole = (offsets[offsets.len() - 1] - offsets[0]) as usize;
@@ -277,14 +277,14 @@ impl<'a, T> Samples<'a, T> {
 }
 
 impl<N: Copy> Numbers<'_, N> {
-    /// The number of a row that is not null.
+    /// Returns the number of a row that is not null.
     pub(super) fn at(&self, row: usize) -> N {
         self.values[if self.constant { 0 } else { row }]
     }
 }
 
 impl Texts<'_> {
-    /// The text of a row that is not null.
+    /// Returns the text of a row that is not null.
     pub(super) fn at(&self, row: usize) -> &str {
         self.values.value(if self.constant { 0 } else { row })
     }

@@ -54,7 +54,7 @@ impl BandEnergy {
         Self { facts: facts.clone(), fields: number_fields(names.iter().map(String::as_str)) }
     }
 
-    /// A function that puts a row's energies into a slice; false where the row has no samples.
+    /// Returns a function that writes a row's energies into a slice; it returns false if the row has no samples.
     fn energies<'a, T: Element>(
         &'a self,
         arguments: &'a Arguments<'_>,

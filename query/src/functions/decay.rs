@@ -1,4 +1,4 @@
-//! `edc` and `arrival`: how a response ends, and when it begins.
+//! `edc` and `arrival`: the energy decay curve of a response, and its onset.
 
 use std::sync::Arc;
 
@@ -14,7 +14,7 @@ use super::description::{Description, Family, Kind, Parameter};
 use super::rig::Facts;
 use super::scalar::Scalar;
 
-/// Level that counts as the arrival where none is given, dB re the greatest sample; see [`first_arrival`].
+/// Default level of the arrival, dB re the greatest sample; see [`first_arrival`].
 const ARRIVAL_DB: f64 = -20.0;
 
 /// `edc`.
@@ -105,7 +105,7 @@ impl Scalar for Arrival {
     }
 }
 
-// A response without sound has no answer; one with NaN in it has none that could be trusted, and is said so.
+// A silent response has no answer; one with NaN would have a wrong answer, and is an error.
 fn require_finite<T: Element>(arguments: &Arguments<'_>, row: usize, ir: &[T]) -> Result<()> {
     if ir.iter().all(|x| x.f64().is_finite()) {
         return Ok(());

@@ -1,4 +1,4 @@
-//! What a function says of itself, once: for planning, for `SHOW FUNCTIONS` and for the manual.
+//! Description of a function, in one place for planning, `SHOW FUNCTIONS` and the manual.
 
 use datafusion::logical_expr::{DocSection, Documentation};
 
@@ -7,14 +7,14 @@ use datafusion::logical_expr::{DocSection, Documentation};
 pub(super) struct Description {
     pub(super) name: &'static str,
     pub(super) family: Family,
-    /// What it gives, with the unit.
+    /// Its result, with the unit.
     pub(super) about: &'static str,
     pub(super) parameters: &'static [Parameter],
-    /// How many of the last arguments may be left out.
+    /// Number of trailing arguments that are optional.
     pub(super) optional: usize,
     /// A query on a small lake.
     pub(super) example: &'static str,
-    /// What it answers; a test compares.
+    /// The answer to the example; a test compares it.
     pub(super) answer: &'static str,
     pub(super) related: &'static [&'static str],
 }
@@ -35,11 +35,11 @@ pub(super) enum Family {
 pub(super) struct Parameter {
     pub(super) name: &'static str,
     pub(super) kind: Kind,
-    /// What it means, with the unit.
+    /// Its meaning, with the unit.
     pub(super) about: &'static str,
 }
 
-/// What an argument may be.
+/// Kinds of arguments.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Kind {
     /// A list of numbers, f32 or f64 in the kernel.
@@ -57,7 +57,7 @@ impl Family {
     pub(super) const ALL: [Self; 6] =
         [Self::Levels, Self::Responses, Self::Comparison, Self::Geometry, Self::Lists, Self::Aggregates];
 
-    /// Its heading.
+    /// Returns its heading.
     pub(super) fn title(self) -> &'static str {
         match self {
             Self::Levels => "Levels",
@@ -71,7 +71,7 @@ impl Family {
 }
 
 impl Kind {
-    /// In words, for errors and the manual.
+    /// Returns a description for errors and the manual.
     pub(super) fn words(self) -> &'static str {
         match self {
             Self::Samples => "a list of numbers",
@@ -83,7 +83,7 @@ impl Kind {
 }
 
 impl Description {
-    /// As it is written, `nce(ir, flat_energy[, centre_hz])`.
+    /// Returns the call syntax, `nce(ir, flat_energy[, centre_hz])`.
     pub(super) fn syntax(&self) -> String {
         let required = self.parameters.len() - self.optional;
         let mut text = format!("{}(", self.name);
@@ -99,7 +99,7 @@ impl Description {
         text + &"]".repeat(self.optional) + ")"
     }
 
-    /// As DataFusion keeps it.
+    /// Returns DataFusion's form of the description.
     pub(super) fn documentation(&self) -> Documentation {
         let section = DocSection { include: true, label: self.family.title(), description: None };
         let example = format!("```sql\n> {};\n{}\n```", self.example, self.answer);

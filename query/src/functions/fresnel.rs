@@ -12,7 +12,7 @@ use super::arguments::{Arguments, Element};
 use super::description::{Description, Family, Kind, Parameter};
 use super::scalar::Scalar;
 
-/// Speed of sound where none is given, m/s: that of table `pairs`.
+/// Default speed of sound, m/s: that of table `pairs`.
 const SPEED_OF_SOUND: f64 = 343.0;
 
 /// `fresnel`.

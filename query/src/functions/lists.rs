@@ -71,7 +71,7 @@ static RMS: Description = Description {
     related: &["list_energy", "spl"],
 };
 
-/// A list of the same element.
+/// Returns the type of a list with the same element type.
 pub(super) fn like(list: &DataType) -> DataType {
     list_of(element(list).cloned().unwrap_or(DataType::Float64))
 }

@@ -1,4 +1,4 @@
-//! The manual's page of functions, `docs/functions.md`, made from what they say of themselves.
+//! The manual's page of functions, `docs/functions.md`, generated from their descriptions.
 
 use std::fmt::Write as _;
 
@@ -8,7 +8,7 @@ use echolake_schema::Rig;
 use super::Functions;
 use super::description::Family;
 
-/// Where the page stands; tests run in their package's folder.
+/// Path of the page; tests run in their package's folder.
 const PAGE: &str = "../docs/functions.md";
 /// Set to write the page.
 const RENEW: &str = "ECHOLAKE_RENEW";

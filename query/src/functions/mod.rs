@@ -41,10 +41,10 @@ pub struct Functions {
 }
 
 impl Functions {
-    /// The functions for a lake of this rig, which gives the sampling rate, the bands and the grid.
+    /// Creates the functions for a lake of this rig, from its sampling rate, bands and grid.
     ///
     /// # Errors
-    /// [`echolake_schema::Error`] where the rig has no grid.
+    /// [`echolake_schema::Error`] if the rig has no grid.
     pub fn all(rig: &Rig) -> Result<Self, echolake_schema::Error> {
         let facts = Arc::new(Facts::of(rig)?);
         let scalar = vec![
@@ -78,17 +78,17 @@ impl Functions {
         })
     }
 
-    /// Functions of the values of one row.
+    /// Returns the functions of the values of one row.
     pub fn scalar(&self) -> &[Arc<ScalarUDF>] {
         &self.scalar
     }
 
-    /// Names of all.
+    /// Returns the names of all functions.
     pub fn names(&self) -> impl Iterator<Item = &str> {
         self.scalar.iter().map(|f| f.name()).chain(self.aggregate.iter().map(|f| f.name()))
     }
 
-    /// Functions of the values of many rows.
+    /// Returns the functions of the values of many rows.
     pub fn aggregate(&self) -> &[Arc<AggregateUDF>] {
         &self.aggregate
     }

@@ -1,4 +1,4 @@
-//! `p90_mean`: the mean that the paper's tables and table `surface_stats` are made of.
+//! `p90_mean`: the mean that the paper's tables and table `surface_stats` use.
 
 use std::sync::Arc;
 

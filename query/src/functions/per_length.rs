@@ -1,16 +1,16 @@
-//! Plans of kernels for the lengths that the rows of one batch have.
+//! Cache of kernel plans for the lengths in the rows of one batch.
 
 use std::collections::HashMap;
 
 use datafusion::error::{DataFusionError, Result};
 
-/// Lengths that are planned for at once; responses of a lake have one.
+/// Maximum number of cached plans; the responses of a lake have one length.
 const KEPT: usize = 8;
-/// The longest signal that is transformed: over a second at 96 kHz, a whole sweep. A longer one would take memory that
-/// no query's limit counts.
+/// Maximum samples of a signal: over a second at 96 kHz, a whole sweep. A longer one would need memory that no limit of
+/// queries counts.
 const LONGEST: usize = 1 << 17;
 
-/// A plan, and the buffers that go with it, of each length met.
+/// Cache of plans with their buffers by length.
 pub(super) struct PerLength<P> {
     function: &'static str,
     plans: HashMap<usize, P>,
@@ -21,7 +21,7 @@ impl<P> PerLength<P> {
         Self { function, plans: HashMap::new() }
     }
 
-    /// The plan for a length.
+    /// Returns the plan for a length.
     pub(super) fn get(
         &mut self,
         len: usize,

@@ -1,14 +1,14 @@
-//! What functions need to know of the lake's rig.
+//! Facts of the lake's rig that functions need.
 
 use echolake_schema::symmetry::MovedPair;
 use echolake_schema::{Error, Grid, PointId, Rig, Symmetry};
 
-/// Rate, bands and grid of a rig, with what the symmetries do to it.
+/// Rate, bands and grid of a rig, with the images of points and pairs under the symmetries.
 pub(super) struct Facts {
     pub(super) rate_hz: f64,
     pub(super) centres_hz: Vec<f64>,
     pub(super) band_names: Vec<String>,
-    /// By symmetry, in the order of [`Symmetry::ALL`]; None where the grid lacks it.
+    /// By symmetry, in the order of [`Symmetry::ALL`]; None if the grid lacks it.
     points: Vec<Option<Vec<PointId>>>,
     pairs: Vec<Option<Vec<MovedPair>>>,
 }
@@ -25,22 +25,22 @@ impl Facts {
         })
     }
 
-    /// The band of a centre, as near as decimals write it.
+    /// Returns the band with this centre, within the rounding of decimals.
     pub(super) fn band(&self, centre_hz: f64) -> Option<usize> {
         self.centres_hz.iter().position(|hz| (hz / centre_hz - 1.0).abs() < 1e-3)
     }
 
-    /// The centres, for a hint.
+    /// Returns the centres, for a hint.
     pub(super) fn bands_hint(&self) -> String {
         format!("the lake's bands are at {} Hz", self.band_names.join(", "))
     }
 
-    /// Where each point goes.
+    /// Returns the image of each point.
     pub(super) fn moved_points(&self, symmetry: Symmetry) -> Option<&[PointId]> {
         self.points[symmetry as usize].as_deref()
     }
 
-    /// Where each pair goes.
+    /// Returns the image of each pair.
     pub(super) fn moved_pairs(&self, symmetry: Symmetry) -> Option<&[MovedPair]> {
         self.pairs[symmetry as usize].as_deref()
     }

@@ -1,4 +1,4 @@
-//! One function of a row as DataFusion takes it: planning, documentation and constants for all, a kernel call for each.
+//! Adapter from a scalar function to DataFusion: shared planning, documentation and constants, one kernel call each.
 
 use std::fmt::{self, Debug};
 use std::hash::{Hash, Hasher};
@@ -14,29 +14,29 @@ use datafusion::logical_expr::{
 use super::arguments::{Arguments, Element, check, coerced, element};
 use super::description::Description;
 
-/// A function of the values of one row. Null in any of them makes null.
+/// A function of the values of one row. A null argument makes the answer null.
 pub(super) trait Scalar: Send + Sync + 'static {
-    /// What it says of itself.
+    /// Returns the function's description.
     fn description(&self) -> &'static Description;
 
-    /// The type of its answer; the arguments' types are right.
+    /// Returns the type of its answer; the arguments' types are already checked.
     fn returns(&self, arguments: &[DataType]) -> DataType;
 
-    /// Answers for a batch; `T` is the element of its first list, or f64.
+    /// Computes the answers for a batch; `T` is the element type of its first list, or f64.
     ///
     /// # Errors
-    /// Where a value makes no sense, with its row.
+    /// If a value is invalid; the error names its row.
     fn call<T: Element>(&self, arguments: &Arguments<'_>) -> Result<ArrayRef>;
 }
 
-/// A [`Scalar`] with what DataFusion asks of it.
+/// Adapts a [`Scalar`] to DataFusion's trait.
 struct Adapter<F> {
     function: F,
     signature: Signature,
     documentation: Documentation,
 }
 
-/// Makes it known to DataFusion.
+/// Wraps the function for DataFusion.
 pub(super) fn udf(function: impl Scalar) -> ScalarUDF {
     let documentation = function.description().documentation();
     ScalarUDF::new_from_impl(Adapter {
@@ -93,7 +93,7 @@ impl<F: Scalar> Debug for Adapter<F> {
     }
 }
 
-// An engine has one function of a name, and its plans know no other engine's.
+// Compared by name: names are unique in an engine, and its plans never contain functions of another engine.
 impl<F: Scalar> PartialEq for Adapter<F> {
     fn eq(&self, other: &Self) -> bool {
         self.name() == other.name()

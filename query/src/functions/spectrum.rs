@@ -14,7 +14,7 @@ use super::per_length::PerLength;
 use super::rig::Facts;
 use super::scalar::Scalar;
 
-/// Samples whose frequencies are listed at most, which is more than `spectrum` takes.
+/// Maximum number of samples for `spectrum_frequencies`, more than `spectrum` accepts.
 const MOST: i64 = 1 << 20;
 
 /// `spectrum`.

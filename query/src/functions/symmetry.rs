@@ -1,4 +1,4 @@
-//! `d4` and its kin: positions, points, pairs and height maps under the symmetries of the square.
+//! `d4` and related functions: positions, points, pairs and height maps under the symmetries of the square.
 
 use std::sync::{Arc, LazyLock};
 
@@ -117,14 +117,14 @@ static D4_HEIGHTMAP: Description = Description {
     related: &["d4"],
 };
 
-/// The symmetry of a row.
+/// Returns the symmetry of a row.
 fn symmetry(arguments: &Arguments<'_>, texts: &Texts<'_>, argument: usize, row: usize) -> Result<Symmetry> {
     let name = texts.at(row);
     let found = Symmetry::ALL.into_iter().find(|s| s.name() == name);
     found.ok_or_else(|| arguments.wrong(argument, row, name, SYMMETRY.about))
 }
 
-/// What a point or pair of a row becomes, out of what all become.
+/// Returns the image of a row's point or pair, out of the images of all.
 fn of_all<'a, M>(arguments: &Arguments<'_>, row: usize, id: i64, all: Option<&'a [M]>) -> Result<&'a M> {
     let Some(all) = all else {
         return Err(arguments.wrong(1, row, "no symmetry of the lake's grid", "table points lists the grid"));

@@ -52,7 +52,7 @@ impl Small {
         arrow::compute::concat_batches(&batches[0].schema(), &batches).expect("one schema")
     }
 
-    /// The numbers of the first column, those of lists one after the other; NaN for null.
+    /// Returns the numbers of the first column, lists concatenated; NaN for null.
     async fn numbers(&self, sql: &str) -> Vec<f64> {
         let column = self.rows(sql).await.column(0).clone();
         let flat = match column.as_list_opt::<i32>() {
@@ -94,7 +94,7 @@ fn golden() -> Vec<RecordBatch> {
     reader.map(|batch| batch.expect("a batch")).collect()
 }
 
-/// A run whose measurements are the golden cases, pair 0 the first of them.
+/// Adds a run whose measurements are the golden cases, starting at pair 0.
 async fn put(lake: &Lake, surface: &str, golden: &[RecordBatch], ir: &str, reflected: &str) {
     let pointer = VisibleRun {
         surface: surface.parse().expect("an id"),
@@ -149,7 +149,7 @@ async fn put(lake: &Lake, surface: &str, golden: &[RecordBatch], ir: &str, refle
     lake.commit(&staged).await.expect("committed");
 }
 
-/// Energy of each case in a band, from the golden bands of the panel; of Flat, which has none, that of the whole.
+/// Energy of each case in a band, from the golden bands of the panel; for Flat, which has none, the total energy.
 fn energies(golden: &[RecordBatch], reflected: &str, band: usize) -> Float64Array {
     let name = if reflected == "reflected_ir" { "bands" } else { reflected };
     let cases = golden.iter().flat_map(|b| numbers_of(b.column_by_name(name).expect("a column")));
@@ -224,7 +224,7 @@ async fn bands_and_curves_are_the_golden_ones() {
 #[tokio::test]
 async fn a_decay_a_spectrum_and_an_arrival_that_are_known() {
     let small = Small::new().await;
-    // x = 0.9^n falls by 20 log10(0.9) dB a sample.
+    // x = 0.9^n falls by 20 log10(0.9) dB per sample.
     let decay = "select edc(array_agg(power(0.9, n) order by n)) from (select unnest(range(2000)) as n)";
     for (n, level) in small.numbers(decay).await.iter().enumerate().take(500) {
         assert!((level - 20.0 * 0.9f64.log10() * n as f64).abs() < 1e-6, "{n}: {level}");
@@ -304,7 +304,7 @@ async fn aggregates_are_the_same_however_rows_are_divided() {
     let mean = one.iter().sum::<f64>() / one.len() as f64;
     let ours = small.numbers(&sql).await;
     assert!(close(ours[0], mean) && close(ours[1], -mean) && ours[2] == 1.0, "{ours:?}");
-    // One group a row, filters, and windows.
+    // One group per row, filters, and windows.
     assert_eq!(
         small
             .number(&format!(
@@ -485,7 +485,7 @@ async fn hostile_arguments_are_refused_in_words_or_null() {
         }
     }
     assert!(wrong.is_empty(), "{wrong}");
-    // More lengths than plans are kept for, in one batch.
+    // More lengths than cached plans, in one batch.
     let lengths = "select count(spectrum(array_repeat(1, n))) from (select unnest(range(1, 300)) as n)";
     assert_eq!(small.number(lengths).await, 299.0);
     assert!(small.number("select db('nan'::double)").await.is_nan());

@@ -1,12 +1,12 @@
-//! Three hundred ways to get out of the gate, made of what other systems were got out of by.
+//! Three hundred attempts to bypass the gate, modelled on known escapes from other systems.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-/// What must never be in an answer.
+/// Text that must never be in an answer.
 pub(crate) const SECRET: &str = "a4c1f0d2_nobody_may_read_this";
 
-/// Every file below a folder, to see whether an attempt had an effect.
+/// Reads every file below a folder, to detect effects of an attempt.
 pub(crate) fn files(folder: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
     let mut all = BTreeMap::new();
     let mut folders = vec![folder.to_owned()];
@@ -202,7 +202,7 @@ fn settings(outside: &str) -> Vec<String> {
     all
 }
 
-// Names of surfaces, runs and topics that are paths, patterns that are no patterns, quotes that do not hold.
+// Names of surfaces, runs and topics that are paths, invalid patterns, broken quotes.
 fn patterns(secret: &str) -> Vec<String> {
     let mut all = Vec::new();
     for name in [
@@ -229,7 +229,7 @@ fn patterns(secret: &str) -> Vec<String> {
     all
 }
 
-// The same behind something that reads.
+// The same after a statement that reads.
 fn wrapped(attempt: &str) -> [String; 4] {
     [
         format!("select 1; {attempt}"),

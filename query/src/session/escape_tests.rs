@@ -1,4 +1,4 @@
-//! Three hundred attempts to get out of the gate: none reads, writes or changes anything.
+//! Three hundred attempts to bypass the gate: none reads, writes or changes anything.
 
 use echolake_lake::{Lake, References};
 use echolake_schema::Rig;

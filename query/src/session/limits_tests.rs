@@ -1,4 +1,4 @@
-//! Queries that must end: by their client, their time, their rows, their memory, and by dropping what reads them.
+//! Queries that must end: cancelled, over their time, row or memory limit, or because the answer was dropped.
 
 use std::time::{Duration, Instant};
 
@@ -9,11 +9,11 @@ use echolake_schema::Rig;
 use super::*;
 use crate::statement_bounds::check_statement_bounds;
 
-/// How long a query may take to end that is told to; a busy machine needs some of it.
+/// Timeout for a stopped query to end; a busy machine needs some of it.
 const END_LIMIT: Duration = Duration::from_secs(120);
 /// Never ends by itself.
 const ENDLESS: &str = "with recursive r as (select 1 n union all select n + 1 from r) select count(*) from r";
-/// A join that finds nothing for hours.
+/// A join that runs for hours without a row.
 const BARREN: &str = "select count(*) from generate_series(1, 1000000) a(x) join generate_series(1, 1000000) b(y) \
                       on a.x > b.y + 2000000";
 
@@ -78,7 +78,7 @@ async fn time_rows_and_places_are_limited() {
 async fn memory_is_limited() {
     let (_folder, engine) = engine(Limits { memory: Some(32 << 20) }).await;
     let session = session(&engine, Quota::default());
-    // One list of all values, which nothing can write to disk.
+    // One list of all values, which cannot be spilled to disk.
     let sql = "select array_agg(x || 'abcdefghijklmnopqrstuvwxyz') from generate_series(1, 10000000) t(x)";
     let ended = outcome(&session, sql).await;
     assert!(matches!(ended, Err(Error::MemoryLimit { .. })), "{ended:?}");
@@ -138,7 +138,7 @@ mod slow {
                 outcome(&session, &sql.replace("x union all", "x from generate_series(1, 2) t(x) union all")).await;
             assert!(ended.is_ok(), "{again}: {:.200}", format!("{ended:?}"));
         }
-        // What stands behind its operand.
+        // Postfix operators.
         for again in [" is null", "::bigint"] {
             let sql = format!("select x{} from generate_series(1, 2) t(x)", again.repeat(999));
             let ended = outcome(&session, &sql).await;

@@ -1,4 +1,4 @@
-//! Sessions on a small lake: answers, refusals, and what an error says.
+//! Sessions on a small lake: answers, refusals, and error texts.
 
 use std::sync::atomic::AtomicBool;
 
@@ -278,7 +278,7 @@ async fn replaced_rows_of_a_merged_file_are_not_seen() {
     assert_eq!(all.iter().map(RecordBatch::num_rows).sum::<usize>(), 12);
     assert_eq!(all[0].schema().fields().len(), Table::Events.schema(lake.rig()).fields().len());
 
-    // Rows that stand in a file of their own once more are seen once.
+    // Rows that are in a file of their own again are seen once.
     put_events(&lake, "foam", "r2", "old", 5).await;
     put_events(&lake, "wood", "r3", "empty", 0).await;
     assert_eq!(number("select count(*) from events").await, 8);

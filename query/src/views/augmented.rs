@@ -1,5 +1,5 @@
-//! `augmented`: a row a measurement and symmetry of D4, with the points where it moves them, the responses, which do not
-//! change, and the height map that lies beneath them then.
+//! `augmented`: one row per measurement and symmetry of D4, with the transformed points, the unchanged responses, and
+//! the height map under the same symmetry.
 
 use echolake_schema::{Grid, Symmetry};
 
@@ -14,7 +14,7 @@ pub(super) fn sql(grid: &Grid) -> String {
         [("swapped", "swapped"), ("pair_id", "d4_pair_id"), ("microphone", "d4_microphone"), ("speaker", "d4_speaker")];
     let ids = ids.into_iter().map(|(name, column)| moved(name, column));
     let columns: Vec<_> = ids.chain(ends.map(|name| moved(&name, &name))).collect();
-    // The symmetries stand first: what stands first is held in memory, the other side streams.
+    // The symmetries come first: the first side is held in memory, the other side streams.
     format!(
         "SELECT m.surface_id, m.run_id, m.pair_id, m.microphone, m.speaker, d.symmetry, {}, m.ir, n.reflected_ir, \
          h.heights_mm \

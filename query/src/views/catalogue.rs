@@ -1,4 +1,4 @@
-//! `catalogue`: a row a surface, with its newest run and the levels that it reached there.
+//! `catalogue`: one row per surface, with its newest run and that run's levels.
 
 use std::collections::HashMap;
 
@@ -6,7 +6,7 @@ use echolake_schema::Rig;
 
 use super::note;
 
-// What a column of `surface_stats` is called here, and what it is.
+// Column of `surface_stats`, name of its columns here, unit and meaning.
 const STATS: [(&str, &str, &str, &str); 4] = [
     ("p90_mean_db", "level", "dB re Flat", "Mean of the TNCE values up to their 90th percentile"),
     ("p5_db", "p5", "dB re Flat", "5th percentile of TNCE"),

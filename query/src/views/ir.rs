@@ -1,7 +1,7 @@
-//! `ir`: a row a measurement, with both points, the path's geometry, and the response before and after Foam is
+//! `ir`: one row per measurement, with both points, the path's geometry, and the response before and after Foam is
 //! subtracted.
 
-/// Columns of table `pairs` that the views of measurements show, but for its keys.
+/// Columns of table `pairs` in the views of measurements, without its keys.
 pub(super) const GEOMETRY: [&str; 11] = [
     "microphone_x_mm",
     "microphone_y_mm",
@@ -16,7 +16,7 @@ pub(super) const GEOMETRY: [&str; 11] = [
     "specular_y_mm",
 ];
 
-/// The geometry of the pair of a row of `table`.
+/// Returns the SQL of the geometry columns for the pair of a row of `table`.
 pub(super) fn geometry(table: &str) -> String {
     let column = |name: &&str| format!("pair_{name}({table}.pair_id) AS {name}");
     GEOMETRY.iter().map(column).collect::<Vec<_>>().join(", ")

@@ -1,5 +1,5 @@
-//! What follows from the rig alone is looked up by pair, and by symmetry, instead of joined: `pair_incidence_deg(pair_id)`,
-//! `d4_pair_id(pair_id, symmetry_id)`. One array access a row; a join would hold up what could stream.
+//! Lookup functions for values that depend on the rig alone, by pair and symmetry: `pair_incidence_deg(pair_id)`,
+//! `d4_pair_id(pair_id, symmetry_id)`. They cost one array access per row and stream; a join would not.
 
 use std::hash::{Hash, Hasher};
 use std::sync::Arc;
@@ -18,7 +18,7 @@ use echolake_schema::{Grid, Symmetry};
 #[derive(Debug, Clone)]
 pub(crate) struct Lookups(Vec<Arc<ScalarUDF>>);
 
-/// Before the name of a column of `pairs`: its lookup.
+/// Prefix of the lookup functions for columns of `pairs`.
 const OF_PAIR: &str = "pair_";
 
 /// Values of all pairs, or of all pairs under each symmetry of D4, one symmetry after the other.
@@ -32,10 +32,10 @@ struct Lookup {
 }
 
 impl Lookups {
-    /// The functions.
+    /// Creates the functions.
     ///
     /// # Errors
-    /// Where the rig's pairs cannot be laid out.
+    /// If the rig's pairs cannot be laid out.
     pub(crate) fn of(lake: &Lake) -> echolake_lake::Result<Self> {
         let pairs = lake.pairs()?;
         let columns = pairs.schema();
@@ -47,7 +47,7 @@ impl Lookups {
         Ok(Self(all.into_iter().map(|lookup| Arc::new(ScalarUDF::from(lookup))).collect()))
     }
 
-    /// What looks up a column of `pairs`.
+    /// Returns the lookup function of a column of `pairs`.
     pub(super) fn of_pair(&self, column: &str) -> Option<&Arc<ScalarUDF>> {
         self.0.iter().find(|function| function.name().strip_prefix(OF_PAIR) == Some(column))
     }
@@ -60,7 +60,7 @@ impl Lookups {
 }
 
 fn moved(grid: &Grid) -> Vec<Lookup> {
-    // A symmetry that the grid lacks is in no view; its place is kept, so that ids stay.
+    // A symmetry that the grid lacks is in no view; nulls fill its place, so that the ids stay the same.
     let moved: Vec<Option<MovedPair>> = Symmetry::ALL
         .into_iter()
         .flat_map(|s| match grid.moved_pairs(s) {
@@ -102,7 +102,7 @@ impl Lookup {
     }
 }
 
-// The same name over other values is another lake's.
+// The same name with other values belongs to another lake.
 impl PartialEq for Lookup {
     fn eq(&self, other: &Self) -> bool {
         self.name == other.name && Arc::ptr_eq(&self.values, &other.values)

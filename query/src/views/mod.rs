@@ -1,7 +1,7 @@
-//! Views that read well: what most questions join, joined. Computed by each query, never stored.
+//! Views with the joins that most queries need. Computed by each query, never stored.
 //!
-//! Each is SQL over the lake's tables, planned once a snapshot and merged into the queries that name it, so that their
-//! filters and columns reach the scans beneath.
+//! Each is SQL over the lake's tables, planned once per snapshot and merged into the queries that name it, so that
+//! their filters and columns reach the scans beneath.
 
 mod augmented;
 mod catalogue;
@@ -33,24 +33,24 @@ pub(crate) use unused_join::UnusedJoin;
 /// A view.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum View {
-    /// A row a measurement: geometry and samples.
+    /// One row per measurement: geometry and samples.
     Ir,
-    /// A row a measurement: TNCE in dB, with geometry.
+    /// One row per measurement: TNCE in dB, with geometry.
     TnceDb,
-    /// A row a measurement and symmetry: moved geometry, samples, moved height map.
+    /// One row per measurement and symmetry: transformed geometry, samples, transformed height map.
     Augmented,
-    /// A row a surface: what it is and what was measured.
+    /// One row per surface: its description and its measurements.
     Catalogue,
 }
 
-/// What columns mean, by name: the metadata of their fields.
+/// Metadata of columns by name: unit and meaning.
 type Notes = HashMap<String, HashMap<String, String>>;
 
 impl View {
     /// All views.
     pub(crate) const ALL: [Self; 4] = [Self::Ir, Self::TnceDb, Self::Augmented, Self::Catalogue];
 
-    /// Its name in SQL.
+    /// Returns its name in SQL.
     pub(crate) fn name(self) -> &'static str {
         match self {
             Self::Ir => "ir",
@@ -60,12 +60,12 @@ impl View {
         }
     }
 
-    /// The view of a name.
+    /// Returns the view with this name.
     pub(crate) fn by_name(name: &str) -> Option<Self> {
         Self::ALL.into_iter().find(|v| v.name() == name)
     }
 
-    /// The tables that it reads.
+    /// Returns the tables that it reads.
     pub(crate) fn tables(self) -> &'static [Table] {
         match self {
             Self::Ir => &[Table::Measurements, Table::Nce],
@@ -84,7 +84,7 @@ impl View {
         }
     }
 
-    // What the tables' own columns mean goes with them; these are the others.
+    // Columns taken from the tables keep their own metadata; these are the others.
     fn notes(self, lake: &Lake) -> Notes {
         match self {
             Self::Ir => notes_of(Table::Pairs, lake),
@@ -97,7 +97,7 @@ impl View {
     /// Plans the view over tables, which are those of [`View::tables`].
     ///
     /// # Errors
-    /// Where the view does not fit the tables, which is a mistake in this crate.
+    /// If the view does not fit the tables, which is a bug in this crate.
     pub(crate) fn over(
         self,
         lake: &Lake,
@@ -110,14 +110,14 @@ impl View {
         }
         lookups.register(&context);
         let sql = self.sql(lake);
-        // Tables in memory are all that planning asks for, so it does not wait.
+        // Planning only needs tables in memory, so it does not wait.
         let plan = context.state().create_logical_plan(&sql).now_or_never().ok_or_else(|| {
             DataFusionError::Internal(format!("planning the view {} waits for something", self.name()))
         })??;
         Ok(ViewTable::new(annotated(plan, &self.notes(lake))?, Some(sql)))
     }
 
-    /// Its columns.
+    /// Returns its schema.
     ///
     /// # Errors
     /// As [`View::over`].

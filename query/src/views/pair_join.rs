@@ -1,6 +1,6 @@
-//! An optimizer's rule: a join with table `pairs` by `pair_id` becomes lookups. Every pair of the rig is in `pairs`
-//! once and no measurement is of another, so the join neither drops nor doubles a row, and an array access is cheaper
-//! than a hash table.
+//! An optimizer rule: replaces a join with table `pairs` by `pair_id` with lookups. `pairs` has every pair of the rig
+//! once and measurements have no other pairs, so the join neither drops nor duplicates a row, and an array access is
+//! cheaper than a hash table.
 
 use datafusion::common::metadata::FieldMetadata;
 use datafusion::common::tree_node::Transformed;
@@ -23,12 +23,12 @@ const KEY: &str = "pair_id";
 pub(crate) struct PairJoin(Lookups);
 
 impl PairJoin {
-    /// The rule over a lake's lookups.
+    /// Creates the rule with a lake's lookups.
     pub(crate) fn new(lookups: &Lookups) -> Self {
         Self(lookups.clone())
     }
 
-    // The same rows without the join; None where it has to stay.
+    // Returns the same rows without the join; None if the join is needed.
     fn without(&self, join: &Join) -> Option<Result<LogicalPlan>> {
         let [(left, right)] = join.on.as_slice() else { return None };
         let (left, right) = (left.try_as_col()?, right.try_as_col()?);
@@ -52,7 +52,7 @@ impl PairJoin {
         Some(Projection::try_new(columns, rows.clone()).map(LogicalPlan::Projection))
     }
 
-    // A column of `pairs` by the pair that `key` names.
+    // Returns a column of `pairs` as a lookup by `key`.
     fn of(&self, column: &Column, key: &Column, pairs: &LogicalPlan) -> Option<Expr> {
         let value = match column.name.as_str() {
             KEY => Expr::Column(key.clone()),
@@ -84,18 +84,18 @@ impl OptimizerRule for PairJoin {
     }
 }
 
-// Whether these are all rows of `pairs`, under the key's own name.
+// Returns whether the plan has all rows of `pairs`, with the key under its own name.
 fn is_pairs(plan: &LogicalPlan, key: &Column) -> bool {
     key.name == KEY && scanned(plan, true) == Some(Table::Pairs)
 }
 
-// Whether the column is a table's own, and can hold nothing but the rig's pairs.
+// Returns whether the column is `pair_id` of a table of measurements, so that it has only pairs of the rig.
 fn is_measured(plan: &LogicalPlan, key: &Column) -> bool {
     let measured = [Table::Measurements, Table::Nce, Table::Tnce, Table::TnceD4];
     key.name == KEY && scanned(plan, false).is_some_and(|table| measured.contains(&table))
 }
 
-/// The table whose rows and columns these are, under their own names: `all` of its rows, or some.
+/// Returns the table whose rows the plan has, with columns under their own names: `all` of its rows, or some.
 pub(super) fn scanned(plan: &LogicalPlan, all: bool) -> Option<Table> {
     match plan {
         LogicalPlan::TableScan(scan) => {

@@ -1,5 +1,5 @@
-//! An optimizer's rule: where a sort's key has no nulls, they stand last. It changes no answer, and it lets the scan
-//! beneath a `limit` pass over files: first, as `desc` has it, every file might hold one.
+//! An optimizer rule: sorts nulls last if a sort key has none. It changes no answer, and it lets the scan beneath a
+//! `limit` skip files: with nulls first, the default of `desc`, every file might contain one.
 
 use datafusion::common::tree_node::Transformed;
 use datafusion::error::Result;

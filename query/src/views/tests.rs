@@ -1,4 +1,4 @@
-//! Views on a lake with a few measurements: what they hold, that their filters reach the scans, and the past.
+//! Views on a lake with a few measurements: their contents, filter pushdown, and past versions.
 
 use std::sync::Arc;
 
@@ -16,7 +16,7 @@ use crate::{Error, Session};
 
 /// Pairs that each run of the lake measures.
 const PAIRS: usize = 3;
-/// Tables with a row a pair here; the others have as many rows as they have.
+/// Tables with rows in these tests.
 const TABLES: [Table; 6] =
     [Table::Surfaces, Table::Measurements, Table::Nce, Table::Tnce, Table::Heightmaps, Table::Runs];
 
@@ -253,14 +253,14 @@ async fn pairs_are_looked_up_where_a_measurement_names_them() {
         for (i, name) in ["pair_id", "incidence_deg", "microphone_x_mm"].into_iter().enumerate() {
             let expected = own.column_by_name(name).expect(name).slice(0, PAIRS);
             assert_eq!(answer.column(i).as_ref(), expected.as_ref(), "{sql}");
-            // Table `tnce` says something else of its pair.
+            // Table `tnce` has other metadata for its `pair_id`.
             if name != "pair_id" {
                 let field = own.schema().field_with_name(name).expect(name).clone();
                 assert_eq!(answer.schema().field(i).metadata(), field.metadata(), "{sql}");
             }
         }
     }
-    // Where pairs are chosen, or the numbers may be no pairs, it is a join like any other.
+    // If pairs are filtered, or the numbers may not be pairs, the join stays.
     let joined = [
         ("select count(*) from tnce t join pairs p using (pair_id) where p.pair_id = 1 and p.direct_mm > 0", 1),
         ("select count(*) from tnce t join pairs p on t.pair_id + 2950 = p.pair_id", 1),

@@ -1,4 +1,4 @@
-//! `tnce_db`: a row a measurement, the TNCE columns as levels, with both points and the path's geometry.
+//! `tnce_db`: one row per measurement, the TNCE columns as levels, with both points and the path's geometry.
 
 use std::collections::HashMap;
 
@@ -7,7 +7,7 @@ use echolake_schema::Rig;
 use super::ir::geometry;
 use super::note;
 
-// Linear column, its level's column, and what the level is over.
+// Linear column, the column of its level, and the level's description.
 fn levels(rig: &Rig) -> Vec<(String, String, String)> {
     let bands = rig.band_names();
     let over_total = bands.iter().map(|b| (format!("tnce_{b}"), format!("of the band at {b} Hz over Flat's total")));
@@ -20,7 +20,7 @@ fn levels(rig: &Rig) -> Vec<(String, String, String)> {
         .collect()
 }
 
-// No energy has no level.
+// Zero energy has no level: null.
 pub(super) fn sql(rig: &Rig) -> String {
     let level = |(column, name, _): &(String, String, String)| format!("10 * log10(nullif(t.{column}, 0)) AS {name}");
     let levels: Vec<_> = levels(rig).iter().map(level).collect();

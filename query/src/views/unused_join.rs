@@ -1,5 +1,5 @@
-//! An optimizer's rule: a left join that nothing is taken from, and that finds one row at most, changes nothing and
-//! goes. It lets a view offer columns of tables that most of its queries do not need.
+//! An optimizer rule: removes a left join that finds one row at most and of which no column is used. It lets a view
+//! offer columns of tables that most of its queries do not need.
 
 use std::collections::HashSet;
 use std::sync::Arc;
@@ -57,7 +57,7 @@ impl OptimizerRule for UnusedJoin {
     }
 }
 
-// What stands left of such a join, where `input` is one. Several may stand on each other.
+// Returns the left side of such a join, if `input` is one. Several may be nested.
 fn left_of<'a>(input: &Arc<LogicalPlan>, used: impl Iterator<Item = &'a Expr>) -> Option<Arc<LogicalPlan>> {
     let mut columns = HashSet::new();
     for expr in used {
