@@ -1,4 +1,4 @@
-//! Two arms of air behind a rosbridge, to try clients and rig files with: `fake-rosbridge 127.0.0.1:9090`. It says its
+//! Two fake arms behind a rosbridge, to try clients and rig files with: `fake-rosbridge 127.0.0.1:9090`. It says its
 //! address and ends when its input is closed.
 //!
 //! ```text

@@ -1,4 +1,4 @@
-//! How good a recording is: signal to noise, clipping, loopback, and the direct sound's arrival.
+//! Quality of a recording: signal-to-noise ratio, clipping, loopback level, and arrival of the direct sound.
 
 use echolake_dsp::deconvolution::{DeconvolutionParams, DeconvolutionPlan, DeconvolutionScratch, TransformLength};
 use echolake_dsp::level::power_to_db;
@@ -8,27 +8,28 @@ use echolake_schema::rig::Validation;
 
 use crate::objection::Objection;
 
-/// Outside of the sweep's range the assessed response is put down by this, dB: only the range counts.
+/// Attenuation of the assessed response outside of the sweep's range, dB: only the range counts.
 const OUT_OF_RANGE_DB: f64 = 60.0;
-/// The direct sound is looked for this near its time, samples: the first echo is nine samples behind it at least.
+/// Half width of the search window around the direct sound's expected time, samples: the first echo follows it by nine
+/// samples at least.
 const ARRIVAL_WINDOW: f64 = 5.0;
-/// What stands at that time is the direct sound only if nothing before it reaches this share of the strongest, and
-/// it does itself: the ringing of a band-limited arrival stays under 0.22, a reflection under the direct sound or,
-/// focused, not far over it.
+/// Least share of the strongest sample at which an arrival counts: a peak at the expected time is the direct sound only
+/// if it reaches this share itself and nothing before it does. The ringing of a band-limited arrival stays under 0.22,
+/// a reflection under the direct sound or, focused, not far over it.
 const ARRIVAL_SHARE: f32 = 0.3;
 
-/// What was found of one recording.
+/// Assessment of one recording.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Assessment {
-    /// Mean power of the response's first part over that of its noise, in the sweep's range, dB; NaN where the
-    /// recording is too short to tell.
+    /// Mean power of the response's first part over that of its noise, in the sweep's range, dB; NaN if the recording
+    /// is too short to tell.
     pub snr_db: f64,
     /// Samples at full scale, both channels.
     pub clipped_samples: u32,
     /// Level of the loopback, dB re full scale.
     pub loopback_dbfs: f64,
-    /// Direct sound's arrival minus the expected one, us; NaN where the expected one is outside of the response. Where
-    /// no direct sound stands at its time, the arrival is the first strong one, wherever that is.
+    /// Direct sound's arrival minus the expected one, us; NaN if the expected one is outside of the response. If there
+    /// is no direct sound at the expected time, the arrival is the first strong one, at any time.
     pub arrival_error_us: f64,
 }
 
@@ -42,7 +43,7 @@ pub struct Assessor {
 }
 
 impl Assessor {
-    /// For recordings of `recording_len` samples of this rig.
+    /// Plans for recordings of `recording_len` samples of this rig.
     ///
     /// # Errors
     /// As [`DeconvolutionPlan::new`].
@@ -125,7 +126,7 @@ impl Assessor {
 }
 
 impl Assessment {
-    /// Why the rig would not accept it; empty where it would.
+    /// Returns the rig's reasons against the recording; empty if it would accept it.
     pub fn objections(&self, limits: &Validation, outside_level_db: f64) -> Vec<Objection> {
         let mut reasons = Vec::new();
         if self.clipped_samples > 0 {

@@ -1,4 +1,4 @@
-//! A simulated collection of panels, as large as is wanted: the references, then both sides of panel after panel.
+//! A simulated collection of panels of any size: the references, then both sides of panel after panel.
 
 use echolake_schema::{Error, SurfaceId};
 
@@ -6,7 +6,7 @@ use crate::relief::Relief;
 
 /// The references, which are measured first.
 const REFERENCES: [(&str, Relief); 3] = [("flat", Relief::Flat), ("foam", Relief::Foam), ("wood", Relief::Wood)];
-/// Surfaces of the largest collection: four digits number its panels.
+/// Number of surfaces of the largest collection: four digits number its panels.
 pub const LARGEST: usize = REFERENCES.len() + 2 * 9_999;
 
 /// One surface of a collection.
@@ -14,14 +14,14 @@ pub const LARGEST: usize = REFERENCES.len() + 2 * 9_999;
 pub struct Member {
     /// Its name: `flat`, `foam`, `wood`, then `0001_0`, `0001_1`, `0002_0`, ...
     pub surface: SurfaceId,
-    /// What it is.
+    /// Its geometry and material.
     pub relief: Relief,
 }
 
-/// The first `count` surfaces of the collection that `seed` names; a larger one begins with the smaller one.
+/// Returns the first `count` surfaces of the collection that `seed` names; a larger one begins with the smaller one.
 ///
 /// # Errors
-/// [`Error::Quantity`] where there are more than [`LARGEST`].
+/// [`Error::Quantity`] if there are more than [`LARGEST`].
 pub fn collection(seed: u64, count: usize) -> Result<Vec<Member>, Error> {
     if count > LARGEST {
         let (quantity, expected) = ("number of surfaces", "20001 at most, as panels have four digits");

@@ -1,13 +1,13 @@
-//! Checks that every implementation of the rig's traits passes; they panic where it does not, as tests do.
+//! Checks that every implementation of the rig's traits passes; they panic on a failure, as tests do.
 
 use echolake_schema::Timestamp;
 
 use crate::rig::{AmbientSensor, AudioInterface, Power, Robots, Take};
 
-/// The arms go where they are told and refuse what they cannot reach.
+/// Checks that the arms reach their targets and refuse positions out of reach.
 ///
 /// # Panics
-/// Where they do not.
+/// If they do not.
 pub fn robots(robots: &mut dyn Robots, reachable: [[f64; 3]; 2], unreachable: [[f64; 3]; 2]) {
     let [microphone, speaker] = reachable;
     assert!(robots.power(Power::On).is_ok(), "the drives switch on");
@@ -25,10 +25,10 @@ pub fn robots(robots: &mut dyn Robots, reachable: [[f64; 3]; 2], unreachable: [[
     assert!(robots.power(Power::On).is_ok(), "the drives switch on again");
 }
 
-/// Takes are as long as the output, the loopback carries the output, and time goes on.
+/// Checks that takes are as long as the output, that the loopback carries the output, and that time advances.
 ///
 /// # Panics
-/// Where they are not.
+/// If a check fails.
 pub fn audio(audio: &mut dyn AudioInterface) {
     assert!(audio.rate_hz() > 0.0);
     // Its frequency rises, so that it resembles itself at one delay only.
@@ -65,10 +65,10 @@ fn likeness(output: &[f32], loopback: &[i32]) -> f64 {
     (0..output.len() / 4).map(at).fold(0.0, f64::max) / whole
 }
 
-/// Readings are finite, plausible, and in the order of time.
+/// Checks that readings are finite, plausible, and in the order of time.
 ///
 /// # Panics
-/// Where they are not.
+/// If a check fails.
 pub fn sensor(sensor: &mut dyn AmbientSensor) {
     let mut last = Timestamp(i64::MIN);
     for _ in 0..10 {

@@ -26,12 +26,12 @@ pub(crate) use attempt::implausible;
 pub use error::Error;
 use watch::Watch;
 
-/// Who speaks in the log.
+/// Source name of the controller's log entries.
 const NAME: &str = "controller";
-/// How often a paused run looks whether it may go on.
+/// Interval at which a paused run checks whether to continue.
 const PAUSE_LOOKS: Duration = Duration::from_millis(50);
 
-/// What a run records.
+/// Choice of the messages that a run records.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Keep {
     /// Sweeps and impulse responses.
@@ -40,27 +40,27 @@ pub enum Keep {
     ResponsesOnly,
 }
 
-/// How a run is recorded.
+/// Recording settings of a run.
 #[derive(Debug, Clone, Copy)]
 pub struct RunOptions {
-    /// What is recorded.
+    /// Recorded messages.
     pub keep: Keep,
-    /// Pairs between two checkpoints: what a power cut may cost. A real rig takes 1, 12 s each.
+    /// Pairs between two checkpoints: a power cut may cost these. A real rig takes 1, 12 s each.
     pub checkpoint_every: usize,
 }
 
-/// What a run is to measure.
+/// Pairs and settings of a run.
 #[derive(Debug, Clone, Copy)]
 pub struct Work<'a> {
     /// The pairs, in their order.
     pub pairs: &'a [Pair],
-    /// What is known of pairs from before, where the run is gone on with: those that were accepted are left out.
+    /// Earlier attempts by pair id, if the run is resumed: accepted pairs are skipped.
     pub before: &'a BTreeMap<u32, Tried>,
-    /// How it is recorded.
+    /// Recording settings.
     pub options: RunOptions,
 }
 
-/// What whoever watches a run can do to it, from any thread.
+/// Flags with which any thread can stop or pause a run.
 #[derive(Debug, Default)]
 pub struct Control {
     /// The run ends after the current pair.
@@ -69,33 +69,33 @@ pub struct Control {
     pub pause: AtomicBool,
 }
 
-/// What happens in a run.
+/// An event in a run, as the observer gets it.
 #[derive(Debug, Clone, Copy)]
 pub enum Event<'a> {
     /// The arms go to a pair.
     Pair(Pair),
     /// An attempt was made; it is not on the disk yet.
     Attempt(&'a Measurement),
-    /// These verdicts are on the disk, with all they rest on: they survive a power cut. Only from here on may anybody
-    /// be told that they were measured.
+    /// These verdicts are on the disk, with all they rest on: they survive a power cut. A measurement may be
+    /// acknowledged only from here on.
     Safe {
         /// The verdicts since the checkpoint before.
         verdicts: &'a [Measurement],
         /// Pairs with an accepted measurement, those from before among them.
         accepted: u64,
-        /// What recording has cost so far.
+        /// Cost of recording so far.
         cost: crate::recorder::Cost,
     },
-    /// The run waits.
+    /// The run is paused.
     Paused,
-    /// The run goes on.
+    /// The run continues.
     Continued,
 }
 
-/// How a run ended.
+/// Result of a run.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Outcome {
-    /// What its file says of it.
+    /// Counts and end time, as written to its file.
     pub end: RunEnd,
     /// Pairs that were not tried, because it was stopped.
     pub left: usize,
@@ -116,7 +116,7 @@ pub struct RunController<'a> {
     ir: Vec<f32>,
 }
 
-/// A run while it goes on.
+/// State of a run in progress.
 struct Running<'r> {
     recorder: &'r mut Recorder,
     options: RunOptions,
@@ -134,8 +134,7 @@ impl<'a> RunController<'a> {
     /// Plans for this rig.
     ///
     /// # Errors
-    /// [`Error::Plan`] where its settings contradict each other, [`Error::Rate`] where the interface's rate is not
-    /// the rig's.
+    /// [`Error::Plan`] if its settings contradict each other, [`Error::Rate`] if the interface's rate is not the rig's.
     pub fn new(rig: &'a Rig, devices: Devices) -> Result<Self, Error> {
         let failed = |cause| Error::Plan { rig: rig.name.clone(), cause };
         let (sweep, recording_len) = (&rig.sweep, rig.recording_len());
@@ -184,13 +183,14 @@ impl<'a> RunController<'a> {
         self.rig
     }
 
-    /// Whether its devices are real.
+    /// Returns the origin of the devices' data: measured or simulated.
     pub fn origin(&self) -> Origin {
         self.devices.origin
     }
 
-    /// Measures the pairs in their order, and tells `observe` what happens. When `control` says so the run waits or ends
-    /// after the current pair; all that was measured is on the disk then. Finishing the recording is the caller's.
+    /// Measures the pairs in their order, and passes events to `observe`. On a request through `control` the run pauses
+    /// or ends after the current pair; all that was measured is on the disk then. Finishing the recording is the
+    /// caller's.
     ///
     /// # Errors
     /// [`Error`]; what was recorded before is kept, the log says at which pair it broke off, and the drives are off if
@@ -236,7 +236,7 @@ impl<'a> RunController<'a> {
         Ok(Outcome { end, left: 0 })
     }
 
-    // Waits where the run is paused.
+    // Waits while the run is paused.
     fn is_to_stop(
         &mut self,
         run: &mut Running<'_>,
@@ -265,7 +265,7 @@ impl<'a> RunController<'a> {
         error: Error,
         observe: &mut dyn FnMut(Event<'_>),
     ) -> Error {
-        // The caller must hear of the first failure; that these fail behind it too would only hide it.
+        // The caller must get the first failure; that these fail after it too would only hide it.
         let _ = self.devices.robots.power(Power::Off);
         let told = run.say(LogLevel::Error, &format!("broken off at pair {}: {error}", pair.id.0));
         let _ = told.and_then(|()| run.checkpoint(observe));
@@ -324,7 +324,7 @@ impl Running<'_> {
         self.watch.disk()
     }
 
-    // Nobody hears of a verdict before the disk has it.
+    // A verdict is reported only after the disk has it.
     fn checkpoint(&mut self, observe: &mut dyn FnMut(Event<'_>)) -> Result<(), Error> {
         self.recorder.checkpoint()?;
         self.unsafe_pairs = 0;

@@ -1,13 +1,13 @@
-//! What a disk is asked for: free space, and that something is really on it.
+//! Disk primitives: free space, and sync.
 
 use std::fs::File;
 use std::io;
 use std::path::Path;
 
-/// Bytes that this process may still write where `path` stands.
+/// Returns the bytes that this process may still write in the file system of `path`.
 ///
 /// # Errors
-/// What the system says where `path` is not there.
+/// The system's error if there is no `path`.
 pub fn free_bytes(path: &Path) -> io::Result<u64> {
     let stat = rustix::fs::statvfs(path)?;
     Ok(stat.f_bavail.saturating_mul(stat.f_frsize))
@@ -18,7 +18,7 @@ pub(crate) fn sync(path: &Path) -> Result<(), String> {
     File::open(path).and_then(|f| f.sync_all()).map_err(|e| e.to_string())
 }
 
-/// The folder that a file stands in. A bare name's parent is the empty path, which nobody can open.
+/// Returns a file's folder. A bare name's parent is the empty path, which cannot be opened.
 pub(crate) fn folder_of(path: &Path) -> &Path {
     match path.parent() {
         Some(folder) if !folder.as_os_str().is_empty() => folder,

@@ -1,4 +1,4 @@
-//! From a rig, or from somebody's files, to a run's MCAP file.
+//! Acquisition: from a rig, or from files of another origin, to a run's MCAP file.
 //!
 //! ```
 //! use echolake_acquisition::relief::Relief;

@@ -1,12 +1,12 @@
-//! Why a take is not accepted, and what whoever runs the rig can do about it.
+//! Reasons to reject a take, with advice for the rig's operator.
 
-/// Why a take is not accepted. Its text stands in the verdict.
+/// A reason to reject a take. Its text is recorded in the verdict.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum Objection {
     /// Samples at full scale.
     #[error("{samples} samples clipped")]
     Clipped {
-        /// How many, both channels.
+        /// Number of samples, both channels.
         samples: u32,
     },
     /// The loopback is too soft.
@@ -28,7 +28,7 @@ pub enum Objection {
     /// The direct sound comes at another time than geometry and temperature give.
     #[error("direct sound {off_us:.1} us off, most {most_us:.1}")]
     Arrival {
-        /// How far off, us.
+        /// The difference, us.
         off_us: f64,
         /// The rig's limit.
         most_us: f64,
@@ -44,15 +44,15 @@ pub enum Objection {
     /// A quantity that must be known is not.
     #[error("{what} unknown")]
     Unknown {
-        /// Which.
+        /// The quantity.
         what: &'static str,
     },
-    /// The sensor says what no room is.
+    /// The sensor's value is not plausible in a room.
     #[error("{what} of {value} {unit} is not plausible, expected {least} to {most}")]
     Implausible {
-        /// Which quantity.
+        /// The quantity.
         what: &'static str,
-        /// What the sensor says.
+        /// The sensor's value.
         value: f64,
         /// Its unit.
         unit: &'static str,
@@ -64,19 +64,19 @@ pub enum Objection {
     /// The take cannot be deconvolved.
     #[error("{reason}")]
     Broken {
-        /// Why.
+        /// The cause.
         reason: String,
     },
     /// The arms do not go there.
     #[error("{refusal}")]
     Refused {
-        /// What the robots say.
+        /// The robots' error.
         refusal: crate::rig::Error,
     },
 }
 
 impl Objection {
-    /// What to look at when it stays.
+    /// Returns advice for an objection that persists.
     pub fn hint(&self) -> &'static str {
         match self {
             Self::Clipped { .. } => "lower the gain, or `sweep.level_dbfs` in the rig file",

@@ -1,4 +1,4 @@
-//! What it takes to go on with a run: metadata `echolake.run.plan` of its file.
+//! The plan that is needed to resume a run: metadata `echolake.run.plan` of its file.
 
 use std::collections::BTreeMap;
 use std::path::PathBuf;
@@ -15,28 +15,28 @@ const SIDE: &str = "side";
 const SWEEPS: &str = "sweeps";
 const RESPONSES: &str = "responses";
 
-/// What was planned, apart from what manifest and rig say.
+/// The plan of a run, apart from the settings in manifest and rig.
 #[derive(Debug, Clone, PartialEq)]
 pub struct RunPlan {
-    /// What is recorded.
+    /// Recorded messages.
     pub keep: Keep,
     /// Seed of the simulation.
     pub seed: u64,
-    /// What is measured.
+    /// The measured panel.
     pub specimen: Specimen,
 }
 
-/// What is measured.
+/// A panel to be measured.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Specimen {
     /// A generated relief.
     Relief(Relief),
-    /// A side of somebody's mesh, of coated print, and where the mesh is.
+    /// A side of the mesh in a file, as a coated print.
     Mesh(PathBuf, Side),
 }
 
 impl RunPlan {
-    /// As the metadata record's key and value pairs.
+    /// Returns the metadata record's key and value pairs.
     pub fn to_metadata(&self) -> BTreeMap<String, String> {
         let keep = if self.keep == Keep::Sweeps { SWEEPS } else { RESPONSES };
         let mut record = vec![(KEEP, keep.to_owned()), (SEED, self.seed.to_string())];
@@ -49,10 +49,10 @@ impl RunPlan {
         record.into_iter().map(|(key, value)| (key.to_owned(), value)).collect()
     }
 
-    /// From the metadata record.
+    /// Parses the metadata record.
     ///
     /// # Errors
-    /// What is wrong with it, in words.
+    /// A text that names the wrong or missing key.
     pub fn from_metadata(record: &BTreeMap<String, String>) -> Result<Self, String> {
         let text = |key: &str| record.get(key).map(String::as_str).ok_or_else(|| format!("its plan has no `{key}`"));
         let keep = match text(KEEP)? {
@@ -65,7 +65,7 @@ impl RunPlan {
         let specimen = match text(RELIEF) {
             Ok(json) => Specimen::Relief(Relief::from_json(json).map_err(|e| e.to_string())?),
             Err(_) => {
-                // Once there was but one.
+                // Earlier plans have no side: there was only the front.
                 let side = record.get(SIDE).map_or(Side::Front.name(), String::as_str);
                 let side = Side::parse(side)
                     .ok_or_else(|| format!("its plan has the side `{side}`, expected front or back"))?;

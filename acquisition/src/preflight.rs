@@ -1,4 +1,4 @@
-//! What is looked at before a run begins: room on the disk, the air, and a take at the first pair.
+//! Preflight checks before a run begins: room on the disk, the air, and a take at the first pair.
 
 use std::path::Path;
 
@@ -9,28 +9,28 @@ use crate::controller::watch::KEPT_FREE;
 use crate::controller::{Keep, RunController, implausible};
 use crate::disk::free_bytes;
 
-/// Bytes of a recorded sample of both channels and audio, compressed: 4.92 in a simulated run with sweeps of 0.5 s.
+/// Bytes per recorded sample of both channels and audio, compressed: 4.92 in a simulated run with sweeps of 0.5 s.
 const SWEEP_BYTES_A_SAMPLE: f64 = 5.0;
-/// Bytes of a sample of an impulse response, which hardly compresses.
+/// Bytes per sample of an impulse response, which hardly compresses.
 const RESPONSE_BYTES_A_SAMPLE: f64 = 4.0;
-/// Bytes of a pair's poses, readings and verdict, compressed, with their indexes.
+/// Bytes per pair of poses, readings and verdict, compressed, with their indexes.
 const PAIR_BYTES: f64 = 600.0;
-/// Bytes of panel, heights, summary, once a run.
+/// Bytes per run of panel, heights, summary.
 const RUN_BYTES: f64 = 2.5e6;
-/// Attempts over pairs: more is a rig that needs looking after.
+/// Attempts per pair: a rig that needs more needs maintenance.
 const REPEATS: f64 = 1.1;
 
-/// Something that is not fit.
+/// A preflight check that failed.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Finding {
-    /// What it is.
+    /// The problem.
     pub what: String,
-    /// What to do.
+    /// Advice.
     pub hint: String,
 }
 
 impl Finding {
-    /// A finding.
+    /// Makes a finding of a problem and advice.
     pub fn new(what: impl Into<String>, hint: impl Into<String>) -> Self {
         Self { what: what.into(), hint: hint.into() }
     }
@@ -42,7 +42,7 @@ impl std::fmt::Display for Finding {
     }
 }
 
-/// About how large the file of a run of so many pairs becomes, bytes.
+/// Estimates the file size of a run of so many pairs, bytes.
 pub fn expected_bytes(rig: &Rig, keep: Keep, pairs: usize) -> u64 {
     let reference = rig.impulse_response.reference_temperature_c.get();
     let response = raw_len(rig.impulse_response.length, reference) as f64 * RESPONSE_BYTES_A_SAMPLE;
@@ -53,9 +53,9 @@ pub fn expected_bytes(rig: &Rig, keep: Keep, pairs: usize) -> u64 {
     (RUN_BYTES + (sweep + response + PAIR_BYTES) * REPEATS * pairs as f64) as u64
 }
 
-/// Whether the disk has room for a run of so many pairs.
+/// Checks that the disk has room for a run of so many pairs.
 pub fn disk(folder: &Path, rig: &Rig, keep: Keep, pairs: usize) -> Option<Finding> {
-    // A file system that does not tell is no reason to refuse.
+    // A file system that does not report its free space is no reason to refuse.
     let free = free_bytes(folder).ok()?;
     room(folder, free, expected_bytes(rig, keep, pairs) + KEPT_FREE)
 }
@@ -73,8 +73,8 @@ fn room(folder: &Path, free: u64, needed: u64) -> Option<Finding> {
     })
 }
 
-/// Whether sensor, loopback, level and room are fit: a reading, and a take at a pair that is not recorded. A single take
-/// may be spoiled, so it is made again as often as the rig allows.
+/// Checks sensor, loopback, level and room: a reading, and a take at a pair that is not recorded. A single take may be
+/// spoiled, so it is repeated as often as the rig allows.
 pub fn devices(controller: &mut RunController<'_>, pair: Pair) -> Vec<Finding> {
     let failed = |error: crate::rig::Error| {
         vec![Finding::new(error.to_string(), "is it plugged in, switched on, and named rightly in the rig file?")]

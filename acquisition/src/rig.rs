@@ -1,8 +1,8 @@
-//! What a rig can do, as traits: robots, audio interface, ambient sensor. Every implementation passes the checks of
+//! Traits of a rig's devices: robots, audio interface, ambient sensor. Every implementation passes the checks of
 //! [`crate::conformance`].
 //!
-//! One clock: take and reading carry the time of the same clock, and it never goes backwards. Every call blocks
-//! until it is done; nothing goes on behind the caller's back.
+//! One clock: take and reading carry the time of the same clock, and it never goes backwards. Every call blocks until
+//! it is done; no work continues in the background.
 
 use echolake_schema::Timestamp;
 use echolake_schema::manifest::Origin;
@@ -11,8 +11,9 @@ use crate::robots::Joints;
 
 /// Two arms: one carries the microphone, one the speaker. Positions in mm over the panel.
 pub trait Robots: Send {
-    /// Moves both and waits until they stand; returns where. A position that cannot be reached or is not finite, two
-    /// positions too near each other, and any move without power are refused, and then nothing has moved.
+    /// Moves both and waits until they stand still; returns their positions. A position that cannot be reached or is
+    /// not finite, two positions too near each other, and any move without power are refused, and then nothing has
+    /// moved.
     ///
     /// # Errors
     /// [`Error::Unreachable`] or [`Error::Device`].
@@ -25,20 +26,20 @@ pub trait Robots: Send {
     /// [`Error::Device`].
     fn power(&mut self, power: Power) -> Result<(), Error>;
 
-    /// What was not right since the last call, though it was dealt with: for the run's log.
+    /// Returns the problems that were handled since the last call, for the run's log.
     fn notices(&mut self) -> Vec<String> {
         Vec::new()
     }
 }
 
-/// Where the arms stand, mm.
+/// Positions of the arms, mm.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Positions {
     /// The microphone.
     pub microphone_mm: [f64; 3],
     /// The speaker.
     pub speaker_mm: [f64; 3],
-    /// Joints of the microphone's and the speaker's arm, rad, where they are known.
+    /// Joints of the microphone's and the speaker's arm, rad, if they are known.
     pub joints: Option<[Joints; 2]>,
 }
 
@@ -57,14 +58,14 @@ pub trait AudioInterface: Send {
     fn rate_hz(&self) -> f64;
 
     /// Plays `output` (1.0 is full scale) and records as many samples of microphone and loopback; blocks until it is
-    /// over. A take with a gap or an overrun is an error, never a take. What `take` held before is gone; its buffers
-    /// are used again. `started` is set, and later than that of the take before.
+    /// over. A take with a gap or an overrun is an error, never a take. The earlier content of `take` is replaced; its
+    /// buffers are reused. `started` is set, and later than that of the take before.
     ///
     /// # Errors
     /// [`Error::Device`].
     fn play_and_record(&mut self, output: &[f32], take: &mut Take) -> Result<(), Error>;
 
-    /// What was not right since the last call, though it was dealt with: for the run's log.
+    /// Returns the problems that were handled since the last call, for the run's log.
     fn notices(&mut self) -> Vec<String> {
         Vec::new()
     }
@@ -73,7 +74,7 @@ pub trait AudioInterface: Send {
 /// One recording: signed 24-bit samples, full scale 2^23.
 #[derive(Debug, Clone, Default)]
 pub struct Take {
-    /// When its first sample was taken.
+    /// Time of its first sample.
     pub started: Option<Timestamp>,
     /// The measurement microphone.
     pub microphone: Vec<i32>,
@@ -89,16 +90,16 @@ pub trait AmbientSensor: Send {
     /// [`Error::Device`].
     fn read(&mut self) -> Result<Reading, Error>;
 
-    /// What was not right since the last call, though it was dealt with: for the run's log.
+    /// Returns the problems that were handled since the last call, for the run's log.
     fn notices(&mut self) -> Vec<String> {
         Vec::new()
     }
 }
 
-/// One reading.
+/// One reading of the ambient sensor.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Reading {
-    /// When.
+    /// Time of the reading.
     pub at: Timestamp,
     /// Temperature, C.
     pub temperature_c: f64,
@@ -118,12 +119,12 @@ pub struct Devices {
     pub audio: Box<dyn AudioInterface>,
     /// The ambient sensor.
     pub sensor: Box<dyn AmbientSensor>,
-    /// Whether they are real.
+    /// Origin of their data: measured or simulated.
     pub origin: Origin,
 }
 
 impl Devices {
-    /// What was not right since the last call, and with which device.
+    /// Returns the problems that were handled since the last call, each with its device.
     pub fn notices(&mut self) -> Vec<(&'static str, String)> {
         let of = |device, notices: Vec<String>| notices.into_iter().map(move |notice| (device, notice));
         let (robots, audio) = (self.robots.notices(), self.audio.notices());
@@ -131,7 +132,7 @@ impl Devices {
     }
 }
 
-/// Why a device did not do what it was told.
+/// A failure of a device.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum Error {
     /// The arms cannot go there.
@@ -141,15 +142,15 @@ pub enum Error {
         microphone_mm: [f64; 3],
         /// The speaker's position.
         speaker_mm: [f64; 3],
-        /// Why.
+        /// The reason.
         reason: &'static str,
     },
     /// The device failed.
     #[error("{device}: {reason}")]
     Device {
-        /// Which.
+        /// Name of the device.
         device: &'static str,
-        /// What it says.
+        /// The device's error.
         reason: String,
     },
 }

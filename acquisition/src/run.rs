@@ -28,25 +28,25 @@ pub struct RunRequest<'a> {
     pub rig: &'a Rig,
     /// Name of the surface.
     pub surface: SurfaceId,
-    /// What is measured.
+    /// The panel to measure.
     pub specimen: &'a Specimen,
     /// The surface that normalises it, if it is not the lake's.
     pub flat: Option<SurfaceId>,
     /// The surface whose direct sound is subtracted from it, if it is not the lake's.
     pub foam: Option<SurfaceId>,
-    /// When it begins.
+    /// Time of its begin.
     pub start: Timestamp,
     /// Seed of room and noise of simulated devices.
     pub seed: u64,
     /// Tag of the run's name.
     pub tag: u64,
-    /// What is recorded.
+    /// Messages to record.
     pub keep: Keep,
     /// Folder of the run's file, which has the run's name.
     pub folder: &'a Path,
 }
 
-/// Why a run cannot be measured.
+/// An error of measuring or resuming a run.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
     /// The mesh cannot be used.
@@ -64,7 +64,7 @@ pub enum Error {
     /// The preflight check found something, and nothing was begun.
     #[error("not fit to measure: {}", findings.iter().map(ToString::to_string).collect::<Vec<_>>().join("\n  and: "))]
     Unfit {
-        /// What it found.
+        /// The failed checks.
         findings: Vec<Finding>,
     },
 }
@@ -84,8 +84,8 @@ impl RunRequest<'_> {
         self.measure_with(devices, &panel, arms, session, Some(plan.to_metadata()))
     }
 
-    /// Measures all pairs with these devices. Only a run with a plan can be resumed; without one it is closed when it is
-    /// stopped.
+    /// Measures all pairs with these devices. Only a run with a plan can be resumed; without one it is closed when it
+    /// is stopped.
     pub(crate) fn measure_with(
         &self,
         devices: Devices,
@@ -112,7 +112,7 @@ impl RunRequest<'_> {
         if start.plan.is_none() {
             job.when_stopped = WhenStopped::Ended;
         }
-        // What can be refused is refused before there is a file.
+        // Requests that can be refused are refused before there is a file.
         let mut controller = RunController::new(self.rig, devices)?;
         check_fitness(&job, &mut controller, session.preflight)?;
         let recorder = Recorder::create(&self.path()?, &start).map_err(controller::Error::from)?;
@@ -132,7 +132,7 @@ impl RunRequest<'_> {
     }
 }
 
-/// Resumes a run that was stopped or interrupted: what is safe in its file is not measured again.
+/// Resumes a run that was stopped or interrupted: measurements that are safe in its file are not repeated.
 ///
 /// # Errors
 /// [`Error::Resume`] if it cannot be resumed; the file is as it was.
@@ -143,7 +143,7 @@ pub fn resume(partial: &Path, session: Session<'_>) -> Result<Measured, Error> {
     let panel = PreparedPanel::new(&plan.specimen, &held.rig)?;
     let now = Timestamp::now();
     let start = match held.manifest.origin {
-        // Behind all that was recorded: the simulated clock runs ahead of ours.
+        // After everything recorded: the simulated clock runs ahead of ours.
         Origin::Simulated => now.max(held.last.plus_secs(TAKE_SECS)),
         _ if now < held.last => {
             let back_secs = (held.last.0 - now.0) as f64 / 1e9;
@@ -151,7 +151,7 @@ pub fn resume(partial: &Path, session: Session<'_>) -> Result<Measured, Error> {
         }
         _ => now,
     };
-    // The same noise twice would be no noise.
+    // A repeated seed would give the same noise again.
     let seed = plan.seed.wrapping_add(held.attempts.wrapping_add(1).wrapping_mul(0x9E37_79B9));
     let arms = Choreography::of(&held.rig)?;
     let request = DeviceRequest { rig: &held.rig, panel: &panel, start, seed, arms: arms.clone() };

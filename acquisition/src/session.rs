@@ -1,5 +1,4 @@
-//! A run that somebody supervises: looked over before it begins, watched and stopped while it goes on, and gone on with
-//! afterwards.
+//! A supervised run: preflight checks, monitoring, stop, and resume.
 
 #[cfg(test)]
 mod tests;
@@ -19,51 +18,51 @@ use crate::robots::Choreography;
 /// Pairs between two checkpoints of a simulated run; one that is lost is made again.
 const SIMULATED_CHECKPOINT_EVERY: usize = 200;
 
-/// Who supervises a run, and how.
+/// Supervision of a run: its control, its observers and its settings.
 pub struct Session<'a> {
-    /// Stops it or lets it wait.
+    /// Stops or pauses it.
     pub control: &'a Control,
-    /// Hears what happens.
+    /// Gets its events.
     pub observe: &'a mut dyn FnMut(Event<'_>),
-    /// Hears every message.
+    /// Gets every message.
     pub tap: Option<Box<dyn Tap>>,
-    /// Whether it is looked over first.
+    /// Choice to run the preflight checks first.
     pub preflight: Preflight,
-    /// Pairs between two checkpoints; where nothing is said, 1 on a real rig, whose pairs take 12 s each, and 200 on the
-    /// simulated one.
+    /// Pairs between two checkpoints; by default 1 on a real rig, whose pairs take 12 s each, and 200 on the simulated
+    /// one.
     pub checkpoint_every: Option<usize>,
-    /// How long a take lasts where it is simulated.
+    /// Duration of a simulated take.
     pub pace: Pace,
 }
 
-/// Whether a run is looked over before it begins.
+/// Choice to run preflight checks before a run begins.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Preflight {
-    /// It is, and refused where something is not fit.
+    /// They are run, and the run is refused if one fails.
     Check,
-    /// It is not.
+    /// They are skipped.
     Skip,
 }
 
-/// How long a simulated take lasts.
+/// Duration of a simulated take.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Pace {
-    /// As long as it takes to compute it.
+    /// Time of its computation, without a wait.
     Fast,
-    /// So many seconds at least.
+    /// At least this many seconds.
     Secs(f64),
 }
 
-/// What a session left.
+/// Result of a session.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Measured {
-    /// The run's file; its `.partial` where it was stopped.
+    /// The run's file; its `.partial` if it was stopped.
     pub path: PathBuf,
-    /// How it ended.
+    /// Counts, and the pairs that are left.
     pub outcome: Outcome,
 }
 
-/// What is to be done, apart from the recorder.
+/// A run to measure, apart from its recorder.
 pub(crate) struct Job<'a> {
     pub(crate) rig: &'a Rig,
     pub(crate) folder: &'a Path,
@@ -71,22 +70,22 @@ pub(crate) struct Job<'a> {
     pub(crate) keep: Keep,
     pub(crate) before: &'a BTreeMap<u32, Tried>,
     pub(crate) started: Timestamp,
-    /// How the arms go about, where the rig's are known.
+    /// Joints of the arms at each pair, if the arms are known.
     pub(crate) arms: Option<Arc<Choreography>>,
     pub(crate) when_stopped: WhenStopped,
 }
 
-/// What becomes of a run's file when it is stopped.
+/// Treatment of a run's file when the run is stopped.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum WhenStopped {
-    /// It is ended with what it has: nobody can go on with it.
+    /// It is ended with the pairs that it has, and cannot be resumed.
     Ended,
-    /// It stays open, to be gone on with.
+    /// It stays open, to be resumed.
     Open,
 }
 
 impl Job<'_> {
-    /// What is not fit.
+    /// Runs the preflight checks; returns those that failed.
     pub(crate) fn look_over(&self, controller: &mut RunController<'_>, pairs: &[Pair]) -> Vec<Finding> {
         let todo: Vec<_> = pairs.iter().filter(|p| !self.before.get(&p.id.0).is_some_and(|t| t.accepted)).collect();
         let mut findings: Vec<_> = preflight::disk(self.folder, self.rig, self.keep, todo.len()).into_iter().collect();
@@ -96,7 +95,7 @@ impl Job<'_> {
         findings
     }
 
-    /// Measures what is left to a file that is begun. Where it was stopped the file stays `.partial`.
+    /// Measures the pairs that are left, with a recorder that has begun. If it is stopped the file stays `.partial`.
     pub(crate) fn measure(
         &self,
         controller: &mut RunController<'_>,
@@ -112,7 +111,7 @@ impl Job<'_> {
         if let Some(tap) = session.tap {
             recorder.listen(tap, self.started, self.shape);
         }
-        // The devices were tried there, if anywhere.
+        // The preflight check moved the arms to the first pair, if it ran.
         let first = self.arms.as_ref().and_then(|arms| arms.standing(pairs.first()?.id).ok());
         if let Some(stand) = first {
             recorder.stand(self.started, &[stand.microphone, stand.speaker])?;

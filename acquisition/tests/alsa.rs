@@ -1,7 +1,7 @@
 //! The ALSA driver through the real libasound, without a sound card: ALSA's `file` PCM over its `null` PCM. What is
 //! played ends in a file, what is recorded comes from another; the test is the cable between them.
 //!
-//! libasound reads its configuration where the environment says, so the program starts itself once more with that set.
+//! libasound finds its configuration by the environment, so the program starts itself once more with that set.
 
 #[allow(dead_code, unused_imports, reason = "the tests' helper, of which this wants a part")]
 #[path = "../../tests/child.rs"]
@@ -46,7 +46,7 @@ fn configuration(folder: &Path) -> String {
     )
 }
 
-/// The cable: what is going to be played stands in the file that is going to be recorded, later and softer.
+/// The cable: the output is written to the file that is going to be recorded, later and softer.
 struct Rewired {
     inner: Box<dyn AudioInterface>,
     folder: PathBuf,

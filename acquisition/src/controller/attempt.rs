@@ -14,27 +14,27 @@ use crate::rig::{Error as RigError, Positions, Power, Reading};
 
 /// Full scale of a take's samples.
 const FULL_SCALE: f32 = 8_388_608.0;
-/// A device that fails is asked so often before the run ends: an overrun, or a line of a sensor that was cut short,
-/// is over at once.
+/// Number of tries of a device that fails before the run ends: an overrun, or a line of a sensor that was cut short, is
+/// over at once.
 const TRIES: usize = 3;
-/// What readings of rooms lie within; what is outside is the sensor's or its line's fault.
+/// Plausible range of readings in rooms; a value outside is the fault of the sensor or its line.
 const TEMPERATURE_C: [f64; 2] = [-20.0, 60.0];
 const HUMIDITY_PCT: [f64; 2] = [0.0, 100.0];
 const PRESSURE_HPA: [f64; 2] = [300.0, 1_100.0];
 const LEVEL_DB: [f64; 2] = [0.0, 150.0];
 
-/// One attempt, as it was measured.
+/// One attempt with its measurement.
 pub(super) struct Attempt {
     pub(super) at: Timestamp,
     pub(super) measurement: Measurement,
     pub(super) objections: Vec<Objection>,
     reading: Reading,
-    /// Where the arms stand; nothing where they refused.
+    /// Positions of the arms; None if they refused.
     reached: Option<Positions>,
     response: Response,
 }
 
-/// Whether an attempt gave a response.
+/// State of the response buffer after an attempt.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Response {
     /// It is in the controller's buffer.
@@ -43,7 +43,7 @@ enum Response {
     Missing,
 }
 
-/// What was found of a take.
+/// Assessment of a take, with the objections to it.
 struct Judged {
     assessment: Assessment,
     response: Response,
@@ -62,7 +62,7 @@ impl RunController<'_> {
         self.devices.robots.power(Power::On)?;
         let reached = match self.devices.robots.move_to(microphone, speaker) {
             Ok(reached) => reached,
-            // To ask again would not change it; the other pairs may be reached.
+            // A retry would not change it; the other pairs may be reached.
             Err(refusal @ RigError::Unreachable { .. }) => {
                 self.devices.robots.power(Power::Off)?;
                 return self.refused(pair, number, refusal);
@@ -92,7 +92,7 @@ impl RunController<'_> {
         Ok(Attempt { at, measurement, objections, reading, reached: Some(reached), response })
     }
 
-    /// A take at a pair, judged and not recorded: whether the rig is fit to begin.
+    /// Makes a take at a pair and judges it without recording it: a check of the rig before a run.
     pub(crate) fn trial(&mut self, pair: Pair) -> Result<(Assessment, Vec<Objection>), RigError> {
         let [microphone, speaker] = self.positions(pair);
         self.devices.robots.power(Power::On)?;
@@ -104,12 +104,12 @@ impl RunController<'_> {
         Ok((judged.assessment, judged.objections))
     }
 
-    /// The air, asked more than once where the sensor fails.
+    /// Reads the air, with retries if the sensor fails.
     pub(crate) fn air(&mut self) -> Result<Reading, RigError> {
         persistently(|| self.devices.sensor.read())
     }
 
-    // An interface that lost samples is asked again: nothing of that take is kept.
+    // An interface that lost samples is retried: nothing of that take is kept.
     fn take(&mut self, run: &mut Running<'_>) -> Result<(), Error> {
         let mut lost = Vec::new();
         let taken = persistently(|| {
@@ -165,7 +165,7 @@ impl RunController<'_> {
         self.assessor.assess(&self.microphone, &self.loopback, arrival_secs, clipped)
     }
 
-    // The order within an attempt is kept for live views. In the file a verdict stands behind what it rests on because
+    // The order within an attempt is kept for live views. In the file a verdict follows its messages because
     // the recorder writes its chunk last.
     pub(super) fn record(&mut self, run: &mut Running<'_>, made: &Attempt) -> Result<(), Error> {
         let (at, m, reading) = (made.at, &made.measurement, &made.reading);
@@ -186,7 +186,7 @@ impl RunController<'_> {
         for (device, notice) in self.devices.notices() {
             run.recorder.log(at, LogLevel::Warning, device, &notice)?;
         }
-        // Without a temperature nobody could use them; the verdict says what the sensor said.
+        // Without a temperature they are useless; the verdict has the sensor's values.
         let is_usable = made.reached.is_some() && Celsius::new(reading.temperature_c).is_ok();
         if run.options.keep == Keep::Sweeps && is_usable {
             let recording = SweepRecording {
@@ -222,7 +222,7 @@ impl RunController<'_> {
     }
 }
 
-// A device that fails is asked again, a few times.
+// Retries a device that fails, a few times.
 fn persistently<T>(mut ask: impl FnMut() -> Result<T, RigError>) -> Result<T, RigError> {
     for _ in 1..TRIES {
         if let Ok(answer) = ask() {
@@ -248,7 +248,7 @@ fn verdict_on(pair: Pair, attempt: u32, verdict: Verdict, objections: &[Objectio
     }
 }
 
-// A comparison with NaN objects to nothing, and a take of which nothing is known is no good one.
+// A comparison with NaN raises no objection, and a take with unknown values is no good one.
 fn unknowns(found: &Assessment, reading: &Reading) -> Vec<Objection> {
     let values = [
         ("signal-to-noise ratio", found.snr_db),
@@ -260,7 +260,7 @@ fn unknowns(found: &Assessment, reading: &Reading) -> Vec<Objection> {
     values.into_iter().filter(|(_, x)| x.is_nan()).map(|(what, _)| Objection::Unknown { what }).collect()
 }
 
-/// What a reading says that no room is; what it leaves unknown is no objection here.
+/// Returns objections to values that no room has; values that the reading leaves unknown are not among them.
 pub(crate) fn implausible(reading: &Reading) -> Vec<Objection> {
     let values = [
         ("a temperature", reading.temperature_c, "C", TEMPERATURE_C),

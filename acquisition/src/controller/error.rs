@@ -1,6 +1,6 @@
-//! Why a run ended early.
+//! Errors that end a run early.
 
-/// Why a run ended early. What was acknowledged until then is safe, and the run can be gone on with.
+/// An error that ended a run early. Measurements acknowledged until then are safe, and the run can be resumed.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
     /// A device failed.
@@ -14,7 +14,7 @@ pub enum Error {
     Plan {
         /// The rig.
         rig: String,
-        /// Why.
+        /// The cause.
         cause: echolake_dsp::Error,
     },
     /// The rig's grid is not valid.
@@ -32,14 +32,14 @@ pub enum Error {
         /// The interface's, Hz.
         actual_hz: f64,
     },
-    /// Pair after pair was given up: to go on would only spoil more.
+    /// Too many pairs in a row were given up: continuing would only spoil more.
     #[error("{pairs} pairs in a row were given up, the last because of: {reasons}; hint: {hint}")]
     Lasting {
-        /// How many.
+        /// Number of pairs.
         pairs: usize,
         /// The last one's reasons.
         reasons: String,
-        /// What to do.
+        /// Advice.
         hint: &'static str,
     },
     /// The clock went backwards.
@@ -47,9 +47,9 @@ pub enum Error {
         "the clock went back by {back_secs:.1} s, to {now}; hint: set it right (is NTP on?), and go on when it is past {before}"
     )]
     Clock {
-        /// What it said before.
+        /// Last time before the jump.
         before: echolake_schema::Timestamp,
-        /// What it says now.
+        /// Time after the jump.
         now: echolake_schema::Timestamp,
         /// The difference, s.
         back_secs: f64,
@@ -59,9 +59,9 @@ pub enum Error {
     DiskNearlyFull {
         /// The folder of the recording.
         folder: std::path::PathBuf,
-        /// What is left, MB.
+        /// Free space, MB.
         free_mb: f64,
-        /// What there should be, MB.
+        /// Space to be kept free, MB.
         needed_mb: f64,
     },
 }

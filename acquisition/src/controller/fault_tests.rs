@@ -1,5 +1,5 @@
 //! Faults put into the simulated devices in mid-run: each is named, nothing that was acknowledged is lost, and the run
-//! is gone on with to its end.
+//! is resumed to its end.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -21,7 +21,7 @@ use crate::rigs::simulated::{Simulation, devices};
 const PAIRS: usize = 12;
 const AT: u32 = 6;
 
-/// What is wrong, as changes to what the devices say.
+/// A fault, as changes to the devices' answers.
 #[derive(Clone, Copy)]
 struct Fault {
     reading: fn(Result<Reading, RigError>) -> Result<Reading, RigError>,

@@ -1,5 +1,4 @@
-//! Notices what makes a whole run go wrong, as opposed to one take: lasting faults, a clock that goes back, a disk that
-//! fills up.
+//! Monitoring of a whole run, as opposed to one take: lasting faults, a clock that goes back, a disk that fills up.
 
 use std::path::{Path, PathBuf};
 
@@ -9,12 +8,12 @@ use super::Error;
 use crate::disk::{folder_of, free_bytes};
 use crate::objection::Objection;
 
-/// Pairs that are given up in a row before the run is: one may be bad luck, with its attempts three are none.
+/// Pairs given up in a row before the run is: one may be bad luck, three with all their attempts are not.
 const LASTING: usize = 3;
-/// Kept free, so that the log and the summary still fit.
+/// Bytes kept free, so that the log and the summary still fit.
 pub(crate) const KEPT_FREE: u64 = 1 << 20;
 
-/// What is known of the run as a whole.
+/// Monitoring state of a run.
 pub(super) struct Watch {
     folder: PathBuf,
     given_up: usize,
@@ -23,20 +22,20 @@ pub(super) struct Watch {
 }
 
 impl Watch {
-    /// Begins at a time, for a recording at `path`.
+    /// Starts at a time, for a recording at `path`.
     pub(super) fn new(path: &Path, last: Timestamp) -> Self {
         Self { folder: folder_of(path).to_owned(), given_up: 0, last, free: free_bytes }
     }
 
-    /// A pair was measured.
+    /// Records that a pair was accepted.
     pub(super) fn accepted(&mut self) {
         self.given_up = 0;
     }
 
-    /// A pair was given up.
+    /// Records that a pair was given up.
     ///
     /// # Errors
-    /// [`Error::Lasting`] where too many were in a row.
+    /// [`Error::Lasting`] if too many were in a row.
     pub(super) fn given_up(&mut self, reasons: &[Objection]) -> Result<(), Error> {
         self.given_up += 1;
         if self.given_up < LASTING {
@@ -47,10 +46,10 @@ impl Watch {
         Err(Error::Lasting { pairs: self.given_up, reasons: text.join("; "), hint })
     }
 
-    /// Something happened at this time.
+    /// Records the time of an event.
     ///
     /// # Errors
-    /// [`Error::Clock`] where that is before what happened last.
+    /// [`Error::Clock`] if it is before that of the last event.
     pub(super) fn at(&mut self, now: Timestamp) -> Result<(), Error> {
         if now < self.last {
             let back_secs = (self.last.0 - now.0) as f64 / 1e9;
@@ -60,12 +59,12 @@ impl Watch {
         Ok(())
     }
 
-    /// Looks at the disk.
+    /// Checks the free space of the disk.
     ///
     /// # Errors
     /// [`Error::DiskNearlyFull`].
     pub(super) fn disk(&self) -> Result<(), Error> {
-        // A file system that does not tell will refuse to write in the end.
+        // A file system that does not report it will refuse to write in the end.
         let Ok(free) = (self.free)(&self.folder) else { return Ok(()) };
         if free >= KEPT_FREE {
             return Ok(());

@@ -1,7 +1,7 @@
-//! ALSA: one PCM that plays and one that records, started together where the device can link them.
+//! ALSA: one PCM that plays and one that records, started together if the device can link them.
 //!
-//! PCMs are opened for each take and closed behind it: a device that was plugged in again is found, and no buffer
-//! holds what an earlier take left.
+//! PCMs are opened for each take and closed after it: a device that was plugged in again is found, and no buffer holds
+//! remains of an earlier take.
 
 use alsa::pcm::{Access, Format, HwParams, PCM};
 use alsa::{Direction, ValueOr};
@@ -11,9 +11,9 @@ use echolake_schema::devices::{AlsaParams, AudioFormat};
 use super::audio::{DEVICE, Duplex, Recorded, Trouble};
 use crate::rig::Error;
 
-/// Periods that the device's buffers hold; one is filled or emptied while the others pass.
+/// Periods per buffer of the device; one is filled or emptied while the others pass.
 const PERIODS: usize = 4;
-/// What the kernel says of an overrun or underrun: EPIPE and ESTRPIPE.
+/// Error numbers of an overrun or underrun: EPIPE and ESTRPIPE.
 const LATE: [i32; 2] = [32, 86];
 /// Full scale of 24 bits.
 const FULL_SCALE: f64 = 8_388_608.0;
@@ -25,10 +25,10 @@ pub(super) struct AlsaDuplex {
 }
 
 impl AlsaDuplex {
-    /// Opens the device once to see that it can do what it will be asked to.
+    /// Opens the device once to check that it supports the rate, the format and the channels.
     ///
     /// # Errors
-    /// [`Error::Device`] where it is not there, or does not know the rate, the format or the channels.
+    /// [`Error::Device`] if it is not there, or does not support the rate, the format or the channels.
     pub(super) fn open(params: &AlsaParams, rate_hz: f64) -> Result<Self, Error> {
         let failed = |reason| Error::Device { device: DEVICE, reason };
         if rate_hz.fract() != 0.0 || !(1.0..=1e6).contains(&rate_hz) {
@@ -76,7 +76,7 @@ impl AlsaDuplex {
     fn run(&self, played: &[u8], captured: &mut [u8]) -> Result<Timestamp, Trouble> {
         let [player, recorder] = [self.pcm(Direction::Playback), self.pcm(Direction::Capture)];
         let (player, recorder) = (player.map_err(Trouble::Gone)?, recorder.map_err(Trouble::Gone)?);
-        // What cannot be linked is started one after the other; the loopback tells by how much.
+        // PCMs that cannot be linked are started one after the other; the loopback shows the difference.
         let linked = recorder.link(&player).is_ok();
         let [out_frame, in_frame] = [self.params.outputs, self.params.inputs].map(|n| n as usize * self.sample_bytes());
         let period = self.params.period_frames as usize;
@@ -100,7 +100,7 @@ impl AlsaDuplex {
                 written += write(&player, &played[written * out_frame..], period * out_frame)?;
             }
         }
-        // What is left in the buffers is silence.
+        // The rest in the buffers is silence.
         let _ = player.drop();
         let _ = recorder.drop();
         Ok(began)

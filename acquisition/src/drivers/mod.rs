@@ -1,5 +1,5 @@
 //! Drivers of real devices behind the rig's traits, chosen by the rig file's `[devices]` section. `docs/devices.md`
-//! says what each of them speaks.
+//! describes the protocol of each.
 
 #[cfg(feature = "alsa")]
 mod alsa;
@@ -54,7 +54,7 @@ pub fn open(rig: &Rig) -> Result<Option<Devices>, Error> {
 /// An interface through ALSA.
 ///
 /// # Errors
-/// [`Error::Device`] where it is not there, cannot do what it is asked to, or this build has no ALSA.
+/// [`Error::Device`] if it is not there, does not support the request, or this build has no ALSA.
 #[cfg(feature = "alsa")]
 pub fn audio_interface(params: &AlsaParams, rate_hz: f64) -> Result<Box<dyn AudioInterface>, Error> {
     let pcm = alsa::AlsaDuplex::open(params, rate_hz)?;

@@ -61,7 +61,7 @@ impl Room {
     }
 }
 
-/// How a run ended, and the topics and contents of its file.
+/// Result of a run, and the topics and contents of its file.
 struct Ended {
     outcome: Result<u64, RunError>,
     messages: Vec<(String, Vec<u8>)>,
@@ -77,7 +77,7 @@ impl Ended {
         lines.map(|(_, data)| String::from_utf8_lossy(data).into_owned()).collect()
     }
 
-    // What ended it, and what its log says: a target that is refused ends no run.
+    // The error that ended it, and the text of its log: a target that is refused ends no run.
     fn said(&self) -> String {
         let ended = self.outcome.as_ref().err().map(ToString::to_string).unwrap_or_default();
         ended + &self.log()

@@ -1,4 +1,4 @@
-//! The runs of one import stand under their names together, or none of them does.
+//! The runs of one import get their names together, or none of them does.
 
 use std::path::{Path, PathBuf};
 
@@ -30,14 +30,14 @@ impl Batch {
 
     /// Gives all runs their names.
     pub(super) fn publish(mut self) -> Result<(), Error> {
-        // What can be known to fail is known before the first has its name.
+        // Conflicts that can be known are found before the first run has its name.
         if let Some(taken) = self.sealed.iter().find(|run| run.path().exists()) {
             return Err(Error::Exists { path: taken.path().to_owned() });
         }
         for run in std::mem::take(&mut self.sealed) {
             let path = run.path().to_owned();
             let named = run.publish();
-            // A name that was taken meanwhile is somebody else's file.
+            // A name that was taken meanwhile is another program's file.
             if !matches!(named, Err(Error::Exists { .. })) {
                 self.ours.push(path);
             }
@@ -51,7 +51,7 @@ impl Batch {
 impl Drop for Batch {
     fn drop(&mut self) {
         for path in &self.ours {
-            // Most partial files have been renamed; what cannot be removed, the import's own error explains.
+            // Most partial files have been renamed; if one cannot be removed, the import's own error explains it.
             let _ = std::fs::remove_file(path);
         }
     }

@@ -1,5 +1,5 @@
-//! A folder of the published GIR data set becomes runs, one a surface. Its responses are temperature-corrected
-//! already, and say so.
+//! Import of a folder of the published GIR data set, one run per surface. Its responses are temperature-corrected
+//! already, and are recorded as such.
 
 #[cfg(test)]
 mod tests;
@@ -24,10 +24,10 @@ use crate::rigs::simulated::TAKE_SECS;
 
 /// Samples of the published responses.
 pub const GIR_IR_LEN: usize = 400;
-/// Who speaks in the log.
+/// Source name of the import's log entries.
 const NAME: &str = "import gir";
 
-/// Imports every `<surface>.npz` of a folder; `progress` hears how many surfaces are done, of how many.
+/// Imports every `<surface>.npz` of a folder; `progress` gets the number of surfaces done and of all.
 ///
 /// # Errors
 /// [`Error`], naming the file and the place; a refused import leaves nothing behind.
@@ -120,7 +120,7 @@ impl Import<'_> {
         Ok(matrix)
     }
 
-    // Heights in the file count from anywhere, in mm, or in m where all are under 1; their mean becomes 0.
+    // Heights in the file may count from any level, in mm, or in m if all are under 1; their mean becomes 0.
     fn heights(&self, file: &Path, surface: &SurfaceId) -> Result<Option<HeightField>, Error> {
         let file = file.with_file_name(format!("{surface}_mat.npz"));
         if !file.exists() {
@@ -144,7 +144,7 @@ fn smaller(heights: &HeightField) -> HeightField {
     HeightField::from_fn(heights.size_mm(), MESH_CELLS, |x, y| heights.height_at(x, y))
 }
 
-// One a row of the matrix.
+// One per row of the matrix.
 fn temperatures(file: &Path, rows: usize) -> Result<Vec<Celsius>, Error> {
     let values: Array1<f64> = array::<Ix1>(file, "temperatures")?;
     if values.len() != rows {
@@ -214,7 +214,7 @@ fn visiting_order(path: &Path, grid: &Grid) -> Result<Option<Vec<Pair>>, Error> 
     whole.map(Some).ok_or_else(|| wrong(path, "its rows", format!("{count} combinations"), expected.to_string()))
 }
 
-// What is known of each surface.
+// Reads the facts of each surface.
 fn panel_info(path: &Path) -> Result<HashMap<SurfaceId, SurfaceRecord>, Error> {
     if !path.exists() {
         return Ok(HashMap::new());

@@ -1,4 +1,4 @@
-//! Existing measurements become runs: WAV files listed in a manifest, the published GIR data set, SOFA files.
+//! Import of existing measurements as runs: WAV files listed in a manifest, the published GIR data set, SOFA files.
 
 mod batch;
 mod gir;
@@ -20,10 +20,10 @@ pub use gir::{GIR_IR_LEN, import_gir};
 pub use sofa::{check_sofa, import_sofa};
 pub use wav::{check_wav, import_wav, sampling_rate_of};
 
-/// Between the beginnings of runs whose files have no times, s: as they would be measured.
+/// Interval between the beginnings of runs whose files have no times, s: as they would be measured.
 const RUN_SECS: f64 = 36_600.0;
 
-/// A run made of somebody's files.
+/// A run made of imported files.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ImportedRun {
     /// Its file.
@@ -34,20 +34,20 @@ pub struct ImportedRun {
     pub surface: SurfaceId,
     /// Measurements in it.
     pub measurements: usize,
-    /// What is not as it should be, in words; it was imported all the same.
+    /// Faults of the imported files, as texts; they were imported all the same.
     pub warnings: Vec<String>,
 }
 
-/// How an import is made.
+/// Settings of an import.
 #[derive(Debug, Clone, Copy)]
 pub struct ImportOptions<'a> {
-    /// Time of what has none of its own.
+    /// Time of measurements without one.
     pub started: Timestamp,
     /// Folder of the runs' files.
     pub folder: &'a Path,
 }
 
-/// Why an import is not made. Nothing of it is left behind.
+/// An error that refuses an import. Nothing of it is left behind.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
     /// The system refused.
@@ -55,7 +55,7 @@ pub enum Error {
     Read {
         /// The file.
         path: PathBuf,
-        /// Why.
+        /// The reason.
         reason: String,
     },
     /// The manifest has a wrong header.
@@ -63,7 +63,7 @@ pub enum Error {
     Header {
         /// The manifest.
         path: PathBuf,
-        /// What is wrong.
+        /// The fault.
         what: String,
     },
     /// A row of the manifest is wrong.
@@ -75,19 +75,19 @@ pub enum Error {
         line: u64,
         /// The column.
         column: &'static str,
-        /// What is wrong, expected and actual.
+        /// The fault, with expected and actual value.
         what: String,
     },
-    /// A file is not as it should be.
+    /// The content of a file is wrong.
     #[error("`{}`: {place}: {actual}, expected {expected}", path.display())]
     Content {
         /// The file.
         path: PathBuf,
         /// The array, variable or line.
         place: String,
-        /// What is there.
+        /// The actual content.
         actual: String,
-        /// What should be.
+        /// The expected content.
         expected: String,
     },
     /// The run cannot be recorded.
@@ -98,7 +98,7 @@ pub enum Error {
     Plan {
         /// The rig.
         rig: String,
-        /// Why.
+        /// The cause.
         cause: echolake_dsp::Error,
     },
     /// A name or rig is not valid.
@@ -110,7 +110,7 @@ fn wrong(path: &Path, place: impl Into<String>, actual: impl Into<String>, expec
     Error::Content { path: path.to_owned(), place: place.into(), actual: actual.into(), expected: expected.into() }
 }
 
-/// What an imported run says of itself.
+/// Makes the manifest of an imported run.
 fn manifest(origin: Origin, surface: &SurfaceId, rig: &Rig, started: Timestamp) -> Result<RunManifest, Error> {
     Ok(RunManifest {
         run_id: RunId::compose(started, surface, random_tag())?,

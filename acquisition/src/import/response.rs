@@ -1,17 +1,17 @@
-//! One response of somebody else's as a run records it: where, when and how warm it was; the rest nobody has told.
+//! One imported response as a run records it: its pair, time and temperature; everything else is unknown.
 
 use echolake_schema::messages::{AmbientSample, ImpulseResponse, Measurement, Verdict};
 use echolake_schema::{Celsius, Grid, Pair, Rig, Timestamp};
 
 use crate::recorder::{Error, Recorder};
 
-/// A response that is taken as it is given.
+/// A response, recorded as the file has it.
 pub(super) struct Response {
     pub(super) pair: Pair,
     pub(super) at: Timestamp,
     pub(super) celsius: Celsius,
     pub(super) samples: Vec<f32>,
-    /// Whether it is on the time axis of the rig's reference temperature.
+    /// True if it is on the time axis of the rig's reference temperature.
     pub(super) is_corrected: bool,
 }
 

@@ -1,7 +1,7 @@
-//! Responses as SOFA files (AES69, convention SingleRoomSRIR) become runs, one a file.
+//! Import of responses as SOFA files (AES69, convention SingleRoomSRIR), one run per file.
 //!
-//! What `export sofa` wrote says that it is on the time axis of the lake's reference temperature. Files of others are at
-//! the room's temperature, which ingest corrects.
+//! Files of `export sofa` are on the time axis of the lake's reference temperature, and say so. Other files are at the
+//! room's temperature, which ingest corrects.
 
 #[cfg(test)]
 mod tests;
@@ -20,18 +20,18 @@ use super::{Error, ImportOptions, ImportedRun, RUN_SECS, wrong};
 use crate::recorder::{LogLevel, RunStart};
 use crate::rigs::simulated::TAKE_SECS;
 
-/// Who speaks in the log.
+/// Source name of the import's log entries.
 const NAME: &str = "import sofa";
-/// What our own export says of itself.
+/// Attribute `APIName` of files of our own export.
 const OURS: &str = "echolake";
-/// Between measurements whose file says the same time of both: it counts in seconds.
+/// Least interval between two measurements, ns: files count time in seconds, so that two may have the same.
 const STEP_NANOS: i64 = 1_000;
 const KELVIN: f64 = 273.15;
-/// Positions nearer than that are one, m; a file's own rounding is far below.
+/// Least distance of two positions, m: nearer ones are the same; a file's own rounding is far below.
 const SAME_METRES: f64 = 5e-4;
 
-/// Imports SOFA files; `progress` hears how many are done, of how many. `celsius` is the temperature of files that have
-/// none.
+/// Imports SOFA files; `progress` gets the number of files done and of all. `celsius` is the temperature of files that
+/// have none.
 ///
 /// # Errors
 /// [`Error`], naming the file and the variable; a refused import leaves nothing behind.
@@ -53,7 +53,7 @@ pub fn import_sofa(
     Ok(runs)
 }
 
-/// Checks SOFA files, and imports nothing.
+/// Checks SOFA files without importing them.
 ///
 /// # Errors
 /// As [`import_sofa`].
@@ -88,7 +88,7 @@ struct Import<'a> {
     number: u16,
 }
 
-/// What a file holds.
+/// Content of a file, checked.
 struct Sofa {
     surface: SurfaceId,
     /// In the order of their times.
@@ -189,7 +189,7 @@ impl Sofa {
         Ok(ImportedRun { path, run_id, surface, measurements: count, warnings: Vec::new() })
     }
 
-    // Those of the file, each later than the one before.
+    // Returns the file's times, each later than the one before.
     fn times(&self, fallback: Timestamp) -> Vec<Timestamp> {
         let mut last = i64::MIN;
         let at = |(i, measured): (u32, &Measured)| {
@@ -201,7 +201,7 @@ impl Sofa {
     }
 }
 
-/// A file on its way into a [`Sofa`].
+/// A reader that checks a file into a [`Sofa`].
 struct Reader<'a> {
     path: &'a Path,
     file: SofaFile,
@@ -235,7 +235,7 @@ impl Reader<'_> {
         }
     }
 
-    // One microphone and one speaker, each where its listener or source is, and nothing delayed.
+    // One microphone and one speaker, each at its listener or source, and nothing delayed.
     fn expect_zeros(&self, name: &str) -> Result<(), Error> {
         let Some(found) = self.variable(name)? else { return Ok(()) };
         match found.values.iter().find(|x| x.is_nan() || x.abs() > SAME_METRES) {

@@ -26,19 +26,19 @@ impl SofaFile {
         H5File::open(path).map(Self).map_err(|e| e.to_string())
     }
 
-    /// An attribute of the file; empty where it is missing.
+    /// Returns an attribute of the file; empty if it is missing.
     pub(super) fn text(&self, name: &str) -> String {
         // Fixed lengths are filled up with zeros.
         self.0.attr_string(name).map(|text| text.trim_end_matches('\0').to_owned()).unwrap_or_default()
     }
 
-    /// An attribute of a variable; empty where it is missing.
+    /// Returns an attribute of a variable; empty if it is missing.
     pub(super) fn text_of(&self, variable: &str, name: &str) -> String {
         let read = self.0.dataset(variable).and_then(|d| d.attr(name)?.read_string());
         read.map(|text| text.trim_end_matches('\0').to_owned()).unwrap_or_default()
     }
 
-    /// A variable; None where it is missing.
+    /// Reads a variable; None if it is missing.
     pub(super) fn variable(&self, name: &str) -> Result<Option<Variable>, String> {
         if !self.0.dataset_names().iter().any(|known| known == name) {
             return Ok(None);
@@ -140,7 +140,7 @@ fn unpacked(mut bytes: Vec<u8>, filters: &[Filter], mask: u32, width: usize, siz
     }
 }
 
-// First bytes of all numbers stand first, then the second ones, and so on.
+// The first bytes of all numbers come first, then the second ones, and so on.
 fn unshuffled(bytes: &[u8], width: usize) -> Vec<u8> {
     let count = bytes.len() / width;
     (0..count * width).map(|i| bytes[i % width * count + i / width]).collect()

@@ -1,4 +1,4 @@
-//! WAV files become runs, one a surface. One row at a time is in memory.
+//! Import of WAV files, one run per surface. One row at a time is in memory.
 
 #[cfg(test)]
 mod tests;
@@ -19,10 +19,10 @@ use super::{Error, ImportOptions, ImportedRun};
 use crate::assessment::Assessor;
 use crate::recorder::{LogLevel, Recorder, RunStart};
 
-/// Who speaks in the log.
+/// Source name of the import's log entries.
 const NAME: &str = "import wav";
 
-/// The sampling rate of a manifest's first recording.
+/// Returns the sampling rate of a manifest's first recording.
 ///
 /// # Errors
 /// [`Error`], naming the manifest and the place.
@@ -30,7 +30,7 @@ pub fn sampling_rate_of(manifest: &Path) -> Result<SampleRate, Error> {
     Ok(SampleRate::new(f64::from(wav_manifest::first_recording(manifest)?.spec.sample_rate))?)
 }
 
-/// Imports all rows of a manifest; `progress` hears how many are done, of how many.
+/// Imports all rows of a manifest; `progress` gets the number of rows done and of all.
 ///
 /// # Errors
 /// [`Error`], naming the place; every row is checked before the first is imported, and a refused import leaves nothing
@@ -97,7 +97,7 @@ impl Import<'_> {
         row.recorded_at.unwrap_or_else(|| self.options.started.plus_secs(f64::from(index)))
     }
 
-    // Import keeps what it is given: what the rig would not accept becomes words, not a refusal.
+    // Import keeps all it is given: objections of the rig become warnings, not refusals.
     fn row(&self, recorder: &mut Recorder, row: &Row, at: Timestamp) -> Result<Option<String>, Error> {
         let unread = |column, what| Error::Row { path: self.manifest.to_owned(), line: row.line, column, what };
         let microphone = row.recording.read(row.format).map_err(|e| unread("recording", e))?;
@@ -125,8 +125,9 @@ impl Import<'_> {
         let assessment = Assessor::new(rig, len)
             .and_then(|mut a| a.assess(&microphone.fractions, &loopback.fractions, arrival, clipped))
             .map_err(planned)?;
-        // Where a foreign rig stands is known less well than its files say, and nobody listened outside: the arrival
-        // is told, not judged, and so is a signal-to-noise ratio that a long response leaves no room for.
+        // The geometry of a foreign rig is known less well than its files say, and the level outside was not recorded:
+        // the arrival is recorded, not judged, and so is a signal-to-noise ratio that a long response leaves no room
+        // for.
         let mut judged = assessment;
         judged.arrival_error_us = 0.0;
         if judged.snr_db.is_nan() {
@@ -199,7 +200,7 @@ impl Import<'_> {
     }
 }
 
-/// Checks all rows of a manifest and the files that they name, and imports nothing.
+/// Checks all rows of a manifest and the files that they name, without importing them.
 ///
 /// # Errors
 /// As [`import_wav`].

@@ -25,7 +25,7 @@ pub(super) struct Samples {
 }
 
 impl WavChannel {
-    /// Opens `file.wav`, or `file.wav#2` for its second channel. The text of an error says what is wrong.
+    /// Opens `file.wav`, or `file.wav#2` for its second channel. The text of an error names the fault.
     pub(super) fn open(folder: &Path, reference: &str) -> Result<Self, String> {
         let (name, channel) = match reference.rsplit_once('#') {
             Some((name, number)) => {
@@ -43,7 +43,7 @@ impl WavChannel {
         let reader = WavReader::open(&path).map_err(|e| format!("`{shown}` is no WAV file that can be read: {e}"))?;
         let (spec, samples) = (reader.spec(), reader.duration());
         drop(reader);
-        // The header is believed by hound; a file that was cut off is shorter than it says.
+        // hound does not check the header's length; a file that was cut off is shorter than it says.
         let (start, declared) = data_chunk(&path).map_err(|e| format!("`{shown}`: {e}"))?;
         if size < start + declared {
             let there = size.saturating_sub(start);
@@ -68,7 +68,7 @@ impl WavChannel {
         }
     }
 
-    /// The format that loses nothing of it.
+    /// Returns the format that stores its samples without loss.
     pub(super) fn format(&self) -> Option<SampleFormat> {
         match (self.spec.sample_format, self.spec.bits_per_sample) {
             (WavFormat::Int, 16) => Some(SampleFormat::S16le),
@@ -117,7 +117,7 @@ impl WavChannel {
     }
 }
 
-/// The wider of two formats, where one holds the other's samples exactly.
+/// Returns the wider of two formats, if one holds the other's samples exactly.
 pub(super) fn common_format(a: SampleFormat, b: SampleFormat) -> Option<SampleFormat> {
     match (a == b, a == SampleFormat::F32le || b == SampleFormat::F32le) {
         (true, _) => Some(a),
@@ -132,7 +132,7 @@ pub(super) fn common_format(a: SampleFormat, b: SampleFormat) -> Option<SampleFo
     }
 }
 
-// Where the `data` chunk's content begins, and how long its header says it is.
+// Returns the begin of the `data` chunk's content, and its length by its header.
 fn data_chunk(path: &Path) -> Result<(u64, u64), String> {
     let mut file = BufReader::new(File::open(path).map_err(|e| e.to_string())?);
     let mut at = 12;

@@ -11,10 +11,10 @@ use echolake_schema::{Celsius, Grid, Pair, PairId, Rig, SurfaceId, Timestamp};
 use super::Error;
 use super::wav_file::{WavChannel, common_format};
 
-/// How many of the columns are needed.
+/// Number of required columns, which come first.
 const NEEDED: usize = 6;
 
-/// A row, checked.
+/// A row of the manifest, checked.
 #[derive(Debug, Clone)]
 pub(super) struct Row {
     pub(super) line: u64,

@@ -1,7 +1,7 @@
 //! A live view of a run: a WebSocket server that Foxglove and Lichtblick open, with every topic as it is recorded.
 //!
-//! What is sent is not yet on the disk. A client that does not keep up loses its oldest messages; the run never waits
-//! for it.
+//! Messages are sent before they are on the disk. A client that does not keep up loses its oldest messages; the run
+//! never waits for it.
 
 #[cfg(test)]
 mod tests;
@@ -14,7 +14,7 @@ use echolake_schema::topics;
 use crate::recorder::{Tap, Topic};
 use crate::viewer::{Server, Shared, ViewerAccess};
 
-/// Why there is no live view.
+/// An error that prevents the live view.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
     /// The address cannot be listened on.
@@ -27,7 +27,7 @@ pub enum Error {
     },
 }
 
-/// A server that shows one run. Dropped, it lets its clients go.
+/// A server that shows one run. Dropped, it disconnects its clients.
 pub struct LiveServer(Server);
 
 impl LiveServer {
@@ -39,22 +39,22 @@ impl LiveServer {
         Server::start(address, access, Vec::new(), None).map(Self).map_err(|source| Error::Listen { address, source })
     }
 
-    /// Where it listens.
+    /// Returns the address of its listener.
     pub fn address(&self) -> SocketAddr {
         self.0.address()
     }
 
-    /// What viewers open: the address, with the token if they need one.
+    /// Returns the URL for viewers: the address, with the token if they need one.
     pub fn url(&self) -> String {
         self.0.url()
     }
 
-    /// How many clients look on.
+    /// Returns the number of connected clients.
     pub fn clients(&self) -> usize {
         self.0.shared().clients().len()
     }
 
-    /// What a recorder tells it through.
+    /// Returns the tap through which a recorder sends its messages.
     pub fn tap(&self) -> Box<dyn Tap> {
         Box::new(LiveTap { shared: self.0.shared().clone(), light: Vec::new() })
     }
@@ -62,7 +62,7 @@ impl LiveServer {
 
 struct LiveTap {
     shared: Arc<Shared>,
-    /// Channels whose last message is shown to those who come late.
+    /// Channels whose last message is sent to new clients.
     light: Vec<u16>,
 }
 

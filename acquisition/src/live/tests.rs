@@ -11,9 +11,9 @@ use super::*;
 
 /// Bytes that wait for one client at most.
 const WAITING_BYTES: usize = 16 << 20;
-/// Messages of a megabyte that nobody reads: more than wait for a client and than two sockets hold.
+/// Messages of a megabyte that are not read: more than a client's queue and two sockets hold.
 const UNREAD: u64 = 60;
-/// How long the other side may take; a busy machine needs some of it.
+/// Timeout of the other side; a busy machine needs some of it.
 const ANSWER_LIMIT: Duration = Duration::from_secs(60);
 
 fn topic(channel: u16, name: &str) -> Topic {

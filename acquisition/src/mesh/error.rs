@@ -1,9 +1,9 @@
-//! What can be wrong with a mesh or its file.
+//! Errors of a mesh or its file.
 
 use std::io;
 use std::path::PathBuf;
 
-/// Why a mesh cannot be used.
+/// A mesh that cannot be used.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
     /// The system refused.
@@ -11,10 +11,10 @@ pub enum Error {
     Read {
         /// The file.
         path: PathBuf,
-        /// Why.
+        /// The system's reason.
         source: io::Error,
     },
-    /// The extension tells no format.
+    /// The extension names no known format.
     #[error("`{}` is no mesh file that is known; hint: .glb, .stl, .obj or .ply", path.display())]
     Format {
         /// The file.
@@ -25,11 +25,11 @@ pub enum Error {
     Syntax {
         /// The file.
         path: PathBuf,
-        /// Where.
+        /// Place in the file.
         place: String,
-        /// What is there.
+        /// Actual content.
         actual: String,
-        /// What should be.
+        /// Expected content.
         expected: &'static str,
     },
     /// The mesh has no triangle.
@@ -43,7 +43,7 @@ pub enum Error {
     Open {
         /// The file.
         path: PathBuf,
-        /// How many.
+        /// Number of edges.
         edges: usize,
         /// One end of one of them.
         place: [f32; 3],

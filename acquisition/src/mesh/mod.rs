@@ -52,7 +52,7 @@ impl Side {
     }
 }
 
-/// A file format, told by the file's extension.
+/// A file format, chosen by the file's extension.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Format {
     /// glTF 2.0, binary.
@@ -66,7 +66,7 @@ pub enum Format {
 }
 
 impl Format {
-    /// The format of a path's extension.
+    /// Returns the format of a path's extension.
     ///
     /// # Errors
     /// [`Error::Format`], which lists the formats.

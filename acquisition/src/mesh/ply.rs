@@ -165,7 +165,7 @@ fn split(bytes: &[u8]) -> Option<(&[u8], &[u8])> {
     None
 }
 
-// What is wrong is told as what is there and what should be.
+// An error has the actual and the expected content.
 fn read_row(element: &Element, body: &mut Body<'_>, mesh: &mut Mesh) -> Result<(), (String, &'static str)> {
     let no_number = || ("no number".to_owned(), "as many as the header counts");
     let mut position = [f32::NAN; 3];

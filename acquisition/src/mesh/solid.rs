@@ -22,7 +22,7 @@ impl Mesh {
         Self::between(front, |x, y| (-CORE_MM - back.height_at(-x, y)) as f32)
     }
 
-    /// The mesh with a side above: its back as the front, where a panel of ours has its front's plane.
+    /// Returns the mesh with a side above: the back is turned over, to the height of the front of our panels.
     #[must_use]
     pub fn seen_from(mut self, side: Side) -> Self {
         if side == Side::Back {
@@ -118,7 +118,7 @@ impl Mesh {
         }
         let [low, high] = self.bounds_mm();
         let size = [0, 1, 2].map(|i| f64::from(high[i]) - f64::from(low[i]));
-        // A tenth of a millimetre is what exporters lose.
+        // Exporters lose up to a tenth of a millimetre.
         if size[0].max(size[1]) > panel_mm + 0.1 {
             return Err(Error::TooLarge {
                 path: path.to_owned(),
@@ -150,11 +150,11 @@ impl Mesh {
         (open.len(), open.first().map_or([0.0; 3], |(a, _)| self.vertices_mm[*a as usize]))
     }
 
-    /// The surface seen from above, as heights; the mesh is centred over the panel, and where it does not lie
+    /// The surface seen from above, as heights; the mesh is centred over the panel, and if it does not lie
     /// within the relief's range its top is moved so that its mean is 0.
     ///
     /// # Errors
-    /// [`Error::TooLarge`] where the relief is deeper than `depth_mm`, [`Error::Syntax`] where there is no surface: a
+    /// [`Error::TooLarge`] if the relief is deeper than `depth_mm`, [`Error::Syntax`] if there is no surface: a
     /// hole, or a mesh smaller than the panel.
     pub fn to_height_field(
         &self,
@@ -297,7 +297,7 @@ mod tests {
         let mesh = Mesh::from_height_field(&field, -20.0);
         let again = mesh.to_height_field(100, PANEL_SIZE_MM, 40.0, Path::new("wavy")).expect("heights");
         let off = field.heights_mm().iter().zip(again.heights_mm()).fold(0.0f32, |m, (a, b)| m.max((a - b).abs()));
-        // Corners of the mesh stand between the cells: twice a linear interpolation, and level at the rim.
+        // Corners of the mesh are between the cells: twice a linear interpolation, and level at the rim.
         assert!(off < 0.25, "{off} mm");
     }
 

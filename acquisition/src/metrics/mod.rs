@@ -1,4 +1,4 @@
-//! What a run's course is in numbers: for Prometheus, which asks, and for InfluxDB, which is told.
+//! Metrics of a run in progress: Prometheus scrapes them, InfluxDB gets them pushed.
 
 mod push;
 mod serve;
@@ -37,7 +37,7 @@ struct Numbers {
     disk_free_bytes: Option<u64>,
 }
 
-/// Whether a number only grows.
+/// Kind of a metric: a counter only grows.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Kind {
     Counter,
@@ -53,17 +53,17 @@ impl Kind {
     }
 }
 
-/// A number, its name without `echolake_`, and what it is.
+/// A metric: its name without `echolake_`, its kind, its help text, its value.
 type Metric = (&'static str, Kind, &'static str, f64);
 
 impl RunMetrics {
-    /// Of a run over `planned` pairs, `accepted` of which are measured already.
+    /// Metrics of a run over `planned` pairs, `accepted` of which are measured already.
     pub fn new(surface: &str, planned: u64, accepted: u64) -> Self {
         let numbers = Numbers { planned, accepted, ..Numbers::default() };
         Self { surface: surface.to_owned(), inner: Arc::new(Mutex::new(numbers)) }
     }
 
-    /// Takes in what happens.
+    /// Counts an event of the run.
     pub fn observe(&self, event: &Event<'_>) {
         let mut numbers = self.numbers();
         match event {
@@ -77,24 +77,24 @@ impl RunMetrics {
                 }
                 numbers.last = Some((*m).clone());
             }
-            // What is counted is on the disk.
+            // These pairs are on the disk.
             Event::Safe { accepted, cost, .. } => (numbers.accepted, numbers.cost) = (*accepted, *cost),
             Event::Paused => numbers.paused = true,
             Event::Continued => numbers.paused = false,
         }
     }
 
-    /// Bytes left on the recording's disk.
+    /// Sets the bytes left on the recording's disk.
     pub fn disk_free(&self, bytes: u64) {
         self.numbers().disk_free_bytes = Some(bytes);
     }
 
-    /// The run broke off.
+    /// Records that the run broke off.
     pub fn broke_off(&self) {
         self.numbers().broken_off = true;
     }
 
-    /// In Prometheus' text format 0.0.4.
+    /// Returns the metrics in Prometheus' text format 0.0.4.
     pub fn prometheus(&self) -> String {
         let mut out = String::new();
         // Backslash, quote and line break are no part of a surface's name.
@@ -106,7 +106,8 @@ impl RunMetrics {
         out
     }
 
-    /// As one line of InfluxDB's line protocol, at this time in ns since 1970. Unknown numbers are left out: it has no NaN.
+    /// Returns the metrics as one line of InfluxDB's line protocol, at this time in ns since 1970. Unknown numbers are
+    /// left out: it has no NaN.
     pub fn influx(&self, at_nanos: i64) -> String {
         let metrics = self.numbers().metrics();
         let fields: Vec<_> =

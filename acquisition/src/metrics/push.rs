@@ -1,4 +1,4 @@
-//! Tells InfluxDB, or whatever takes its line protocol, how a run goes: by UDP, or by HTTP without encryption.
+//! Push of a run's metrics to InfluxDB, or any store of its line protocol: by UDP, or by HTTP without encryption.
 
 use std::io::{self, Read as _, Write as _};
 use std::net::{TcpStream, ToSocketAddrs as _, UdpSocket};
@@ -10,18 +10,18 @@ use echolake_schema::Timestamp;
 
 use super::RunMetrics;
 
-/// A store that does not answer is left alone until the next time.
+/// Timeout of a store; after it the next interval is waited for.
 const PATIENCE: Duration = Duration::from_secs(5);
 
-/// Where lines go.
+/// Destination of metrics.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Target {
-    /// One datagram each.
+    /// One datagram per line.
     Udp {
         /// `host:port`.
         host: String,
     },
-    /// A POST each.
+    /// One POST per line.
     Http {
         /// `host:port`.
         host: String,
@@ -30,11 +30,11 @@ pub enum Target {
     },
 }
 
-/// Why an address is no target.
+/// An address that is no destination of metrics.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("`{given}` takes no metrics; hint: udp://HOST:PORT or http://HOST:PORT/write?db=NAME")]
 pub struct TargetError {
-    /// What was given.
+    /// The given address.
     pub given: String,
 }
 
@@ -43,7 +43,7 @@ impl std::str::FromStr for Target {
 
     fn from_str(given: &str) -> Result<Self, TargetError> {
         let wrong = || TargetError { given: given.to_owned() };
-        // What could end a request's line early is no part of an address.
+        // Characters that could end a request's line early are no part of an address.
         if given.chars().any(|c| c.is_whitespace() || c.is_control()) {
             return Err(wrong());
         }
@@ -102,14 +102,14 @@ fn post(host: &str, path: &str, line: &str) -> io::Result<()> {
     }
 }
 
-/// Tells a target every so often. Dropped, it tells it a last time.
+/// A thread that pushes metrics at an interval. Dropped, it pushes them a last time.
 pub struct InfluxPush {
     end: Option<Sender<()>>,
     thread: Option<JoinHandle<()>>,
 }
 
 impl InfluxPush {
-    /// Begins; `failed` hears of the first failure, and of the first after each success.
+    /// Starts the thread; `failed` gets the first failure, and the first after each success.
     pub fn start(
         target: Target,
         metrics: RunMetrics,

@@ -9,7 +9,7 @@ use std::time::Duration;
 
 use super::RunMetrics;
 
-/// A request that is larger, or slower, is none.
+/// Limits of a request: a larger or slower one gets no answer.
 const LARGEST_REQUEST: usize = 8 << 10;
 const PATIENCE: Duration = Duration::from_secs(2);
 
@@ -36,7 +36,7 @@ impl MetricsServer {
                     if ended.load(Ordering::Relaxed) {
                         return;
                     }
-                    // Who does not get an answer asks again.
+                    // A client without an answer asks again.
                     let _ = stream.and_then(|stream| answer(stream, &metrics));
                 }
             }
@@ -44,7 +44,7 @@ impl MetricsServer {
         Ok(Self { address, ended, thread: Some(thread) })
     }
 
-    /// Where it listens.
+    /// Returns the address of its listener.
     pub fn address(&self) -> SocketAddr {
         self.address
     }
@@ -53,7 +53,7 @@ impl MetricsServer {
 impl Drop for MetricsServer {
     fn drop(&mut self) {
         self.ended.store(true, Ordering::Relaxed);
-        // Its accept waits for somebody to come.
+        // Its accept waits for a connection.
         let _ = TcpStream::connect(self.address);
         if let Some(thread) = self.thread.take() {
             let _ = thread.join();

@@ -8,7 +8,7 @@ use echolake_schema::messages::{Measurement, Verdict};
 
 use super::*;
 
-/// How long the other side may take; a busy machine needs some of it.
+/// Timeout of the other side; a busy machine needs some of it.
 const ANSWER_LIMIT: Duration = Duration::from_secs(60);
 
 fn told() -> RunMetrics {

@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Bricks {
-    /// How the bricks lie.
+    /// Bond of the wall.
     pub bond: Bond,
     /// Length of a stretcher, mm; a header is half as long, less half a joint.
     pub length_mm: f64,
@@ -18,15 +18,15 @@ pub struct Bricks {
     pub joint_width_mm: f64,
     /// Depth of the joints, mm.
     pub joint_depth_mm: f64,
-    /// Bricks stand out by up to this, mm.
+    /// Largest height of a brick over or under the wall's plane, mm.
     pub jitter_mm: f64,
-    /// Bricks tilt by up to this, degrees.
+    /// Largest tilt of a brick, degrees.
     pub tilt_deg: f64,
-    /// Which wall of this kind.
+    /// Seed of the wall's random draws.
     pub seed: u64,
 }
 
-/// How bricks lie.
+/// Bond of a brick wall: the order of its bricks.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Bond {
@@ -36,7 +36,7 @@ pub enum Bond {
     Flemish,
 }
 
-/// One brick: what is said of it, and where the place asked for lies in it.
+/// One brick, and the position of the queried point in it.
 struct Brick {
     column: i64,
     course: i64,

@@ -1,5 +1,5 @@
-//! Groups of panels: parameters spread over ranges, and the ranges of the next group from how alike the last one's
-//! results were.
+//! Groups of panels: parameters spread over ranges, and the ranges of the next group from the spread of the last one's
+//! results.
 //!
 //! Results that are alike say that the group was made too narrow, so its ranges widen; results that lie far apart say
 //! that something between them was missed, so the ranges narrow about their middles. One group is made, printed and
@@ -12,26 +12,26 @@ use serde::{Deserialize, Serialize};
 use super::chance::Chance;
 use super::{Domain, Error as ReliefError, Parameter, Relief};
 
-/// What a group is drawn from; `ranges.toml`.
+/// Ranges that a group is drawn from; `ranges.toml`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Ranges {
     /// The relief.
     pub relief: String,
-    /// Which draw.
+    /// Seed of the draw.
     #[serde(default)]
     pub seed: u64,
-    /// How far the results of a group should lie apart, dB: standard deviation over surfaces, mean over bands.
+    /// Wanted spread of a group's results, dB: standard deviation over surfaces, mean over bands.
     #[serde(default = "default_target")]
     pub target_spread_db: f64,
-    /// Parameters that all of the group share.
+    /// Parameters with one value for the whole group.
     #[serde(default)]
     pub fixed: BTreeMap<String, toml::Value>,
-    /// Parameters that vary: `[low, high]`, or the words that are taken in turn.
+    /// Parameters that vary: `[low, high]`, or words, which are taken in turn.
     pub ranges: BTreeMap<String, Range>,
 }
 
-/// What one parameter varies over.
+/// Range of one parameter.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(untagged)]
 pub enum Range {
@@ -53,20 +53,20 @@ pub struct BandLevel {
     pub level_db: f64,
 }
 
-/// The ranges that follow, and why.
+/// Ranges of the next group, with the reasons.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Step {
     /// The next group's.
     pub ranges: Ranges,
-    /// How far the results lay apart, dB.
+    /// Spread of the results, dB.
     pub spread_db: f64,
-    /// By how much the ranges became wider; below 1 narrower.
+    /// Factor by which the ranges became wider; below 1 narrower.
     pub factor: f64,
     /// One sentence for the step and one for each parameter.
     pub reasons: Vec<String>,
 }
 
-/// Why a group cannot be made.
+/// An error of making a group.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum Error {
     /// The relief or one of its parameters is refused.
@@ -75,35 +75,35 @@ pub enum Error {
     /// The file of ranges is not one.
     #[error("these are no ranges: {reason}; hint: relief = \"NAME\", then [ranges] with key = [low, high]")]
     Text {
-        /// What is wrong with it.
+        /// The fault.
         reason: String,
     },
-    /// A range that is none.
+    /// A range outside of the parameter's domain, or an empty one.
     #[error("range of `{key}` is {given}, expected {expected}; hint: low and high within it, low below high")]
     Range {
         /// The parameter.
         key: String,
-        /// What was given.
+        /// The given range.
         given: String,
-        /// What the parameter may be.
+        /// The parameter's domain.
         expected: String,
     },
-    /// Results that say nothing about how alike they are.
+    /// Results that give no spread.
     #[error("{actual} cannot say how alike a group is, expected {expected}; hint: {RESULTS_HINT}")]
     Results {
-        /// What was given.
+        /// The given results.
         actual: String,
-        /// What would do.
+        /// The expected results.
         expected: &'static str,
     },
 }
 
-/// Where results come from.
+/// Hint with the query for results.
 const RESULTS_HINT: &str =
     "echolake sql --format csv \"select surface_id, band, p90_mean_db from surface_stats where surface_id like '...'\"";
-/// No step makes ranges more than twice as wide, or less than half.
+/// Largest factor of a step; its inverse is the smallest.
 const LARGEST_STEP: f64 = 2.0;
-/// Parameters are rounded to this, so that they read as somebody's choice.
+/// Parameters are rounded to the inverse of this, so that they are easy to read.
 const ROUNDING: f64 = 10.0;
 
 fn default_target() -> f64 {
@@ -111,7 +111,7 @@ fn default_target() -> f64 {
 }
 
 impl Ranges {
-    /// Ranges out of TOML, checked.
+    /// Parses ranges from TOML and checks them.
     ///
     /// # Errors
     /// [`Error`].
@@ -142,10 +142,10 @@ impl Ranges {
 
     /// `count` reliefs whose parameters fill the ranges evenly: each parameter's range is cut into `count` parts, and
     /// every part has one relief (Latin hypercube; McKay, Beckman, Conover 1979). The same seed draws the same.
-    /// Where no seed of the wall is given, each relief has its own.
+    /// If the seed of the wall is not given, each relief has its own.
     ///
     /// # Errors
-    /// [`Error`], where a parameter is none of the relief's, or is refused.
+    /// [`Error`], if a parameter is none of the relief's, or is refused.
     pub fn draw(&self, count: usize) -> Result<Vec<Relief>, Error> {
         let mut shared = Relief::by_name(&self.relief)?;
         for (key, value) in &self.fixed {
@@ -171,7 +171,7 @@ impl Ranges {
         Ok(drawn)
     }
 
-    /// The next group's ranges from this one's results.
+    /// Computes the next group's ranges from this one's results.
     ///
     /// # Errors
     /// [`Error::Results`] for fewer than two surfaces or levels that are no numbers, else as [`Self::draw`].
@@ -206,7 +206,7 @@ impl Ranges {
 }
 
 impl Range {
-    /// The value at a share of the range, or the `place`-th word.
+    /// Returns the value at a share of the range, or the `place`-th word.
     fn value(&self, key: &str, known: &[Parameter], share: f64, place: usize) -> Result<String, Error> {
         match self {
             Self::Words(words) if !words.is_empty() => Ok(words[place % words.len()].clone()),
@@ -249,7 +249,7 @@ fn limits(key: &str, known: &[Parameter]) -> Option<[f64; 2]> {
     })
 }
 
-// About its middle, and within its limits; what is cut off on one side is not added on the other.
+// Widens about the middle, within the limits; a part that is cut off on one side is not added on the other.
 fn stretched([from, to]: [f64; 2], factor: f64, [low, high]: [f64; 2]) -> [f64; 2] {
     let (middle, half) = ((from + to) / 2.0, (to - from) / 2.0 * factor);
     let rounding = if to - from < 10.0 { 100.0 * ROUNDING } else { ROUNDING };
@@ -330,7 +330,7 @@ mod tests {
     #[test]
     fn alike_results_widen_and_different_ones_narrow() {
         let ranges = Ranges::from_toml(TEXT).expect("ranges");
-        // Standard deviation 0.5 dB where 1 is wanted: twice as wide.
+        // Standard deviation 0.5 dB, 1 is wanted: twice as wide.
         let wider = ranges.next(&results([0.0, 0.5, 1.0])).expect("a step");
         assert_eq!((wider.spread_db, wider.factor), (0.5, 2.0));
         assert_eq!(wider.ranges.ranges["joint_depth_mm"], Range::Numbers([5.0, 25.0]));

@@ -36,7 +36,7 @@ impl Layered {
         Self { mesostructure, settings }
     }
 
-    /// How its stones lie.
+    /// Returns the arrangement of its stones.
     pub fn mesostructure(&self) -> Mesostructure {
         self.mesostructure
     }
@@ -60,12 +60,12 @@ impl Layered {
         }
     }
 
-    /// Its parameters and what they are set to.
+    /// Returns its parameters with their values.
     pub fn settings(&self) -> impl Iterator<Item = (&str, &Setting)> {
         self.settings.0.iter().map(|(key, setting)| (key.as_str(), setting))
     }
 
-    /// Makes what the parameter is set to here its default.
+    /// Makes the parameter's value here its default.
     pub(super) fn name_default(&self, parameter: &mut Parameter) {
         if let Domain::Choice { options, default } = &mut parameter.domain {
             let set = self.settings.word(&Parameter::choice(parameter.key, parameter.layer, options, ""));
@@ -85,7 +85,7 @@ impl Layered {
         Ok(())
     }
 
-    /// Its heights, each the mean over its cell. Their mean is 0 where that keeps them within the relief.
+    /// Its heights, each the mean over its cell. Their mean is 0 if that keeps them within the relief.
     pub(super) fn height_field(&self, cells: usize) -> HeightField {
         let settings = &self.settings;
         let seed = match settings.0.get(SEED.key) {

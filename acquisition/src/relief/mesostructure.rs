@@ -1,11 +1,11 @@
-//! How a wall is made: the list of the ways in which its stones lie.
+//! Mesostructures of walls: the list of all arrangements of stones.
 
 use super::parameter::Parameter;
 use super::settings::Settings;
 use super::stones::Stones;
 use super::{courses, masonry, primitives, voronoi, wells};
 
-/// How a wall is made.
+/// Mesostructure of a wall: the arrangement of its stones.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Mesostructure {
@@ -87,7 +87,7 @@ impl Mesostructure {
         }
     }
 
-    /// Its stones; none where it has none.
+    /// Returns its stones; None if it has none.
     pub(super) fn stones(self, settings: &Settings, seed: u64) -> Option<Box<dyn Stones>> {
         Some(match self {
             Self::Macrostructure => return None,

@@ -74,12 +74,12 @@ impl Microstructure {
         }
     }
 
-    /// How far a place lies within its stone, model mm: below 0 in the joint.
+    /// Distance of a point from its stone's edge, model mm: below 0 in the joint.
     pub(super) fn inside(&self, to_middle_of_joint: f64) -> f64 {
         to_middle_of_joint - self.half_width
     }
 
-    /// Height of the joint where `inside` is below 0, under the wall's plane.
+    /// Returns the height of the joint under the wall's plane, if `inside` is below 0.
     pub(super) fn joint(&self, inside: f64, x: f64, y: f64) -> f64 {
         // 0 at the joint's edges, 1 in its middle.
         let in_joint = (-inside / self.half_width).clamp(0.0, 1.0);

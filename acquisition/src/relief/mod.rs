@@ -44,7 +44,7 @@ pub const RELIEF_MM: [f64; 2] = [-11.0, 29.0];
 pub enum Relief {
     /// A plane print.
     Flat,
-    /// A plane absorber: what remains is the direct sound.
+    /// A plane absorber: only the direct sound remains.
     Foam,
     /// A plane board.
     Wood,
@@ -60,7 +60,7 @@ pub enum Relief {
     Layered(Layered),
 }
 
-/// What a surface is made of.
+/// Material of a surface.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Material {
     /// Its name.
@@ -69,13 +69,13 @@ pub struct Material {
     pub reflection_factor: f64,
 }
 
-/// Why a relief cannot be made.
+/// An error of making a relief.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum Error {
     /// No such relief.
     #[error("`{given}` is no relief; hint: {}", Relief::NAMES.join(", "))]
     Name {
-        /// What was given.
+        /// The given name.
         given: String,
     },
     /// No such parameter.
@@ -83,9 +83,9 @@ pub enum Error {
     Parameter {
         /// The relief.
         relief: &'static str,
-        /// What was given.
+        /// The given name.
         given: String,
-        /// What it has.
+        /// The names that it has.
         valid: String,
     },
     /// A value that makes no such relief.
@@ -95,17 +95,17 @@ pub enum Error {
         relief: &'static str,
         /// The parameter.
         key: String,
-        /// What was given.
+        /// The given value.
         given: String,
-        /// What is taken.
+        /// The expected value.
         expected: String,
-        /// What the parameter means.
+        /// The parameter's meaning.
         hint: &'static str,
     },
-    /// Text that says no relief.
+    /// Text without a relief.
     #[error("these are no parameters of a relief: {reason}; hint: `echolake panel NAME -o FILE.json` writes some")]
     Text {
-        /// What is wrong with it.
+        /// The fault.
         reason: String,
     },
 }
@@ -151,13 +151,12 @@ impl Relief {
         })
     }
 
-    /// The relief that a surface's name begins with: the longest of the names that it does.
+    /// Returns the relief that a surface's name begins with: the longest name that matches.
     pub fn guess(surface: &str) -> Option<&'static str> {
         Self::NAMES.into_iter().filter(|name| surface.starts_with(name)).max_by_key(|name| name.len())
     }
 
-    /// A relief out of what [`Relief::to_json`] wrote; every parameter is checked, those that are missing have their
-    /// defaults.
+    /// Parses the text of [`Relief::to_json`]; every parameter is checked, those that are missing have their defaults.
     ///
     /// # Errors
     /// [`Error`], as for the names and values themselves.
@@ -176,8 +175,7 @@ impl Relief {
         Ok(relief)
     }
 
-    /// All that says what the relief is: its name, its kind, the length that parameters in mm count in, and the
-    /// parameters.
+    /// Returns the relief as JSON: its name, its kind, the scale of its parameters in mm, and the parameters.
     pub fn to_json(&self) -> serde_json::Value {
         serde_json::json!({
             "relief": self.name(),
@@ -187,7 +185,7 @@ impl Relief {
         })
     }
 
-    /// What may be set, with ranges and defaults.
+    /// Returns the parameters, with ranges and defaults.
     pub fn describe(&self) -> Vec<Parameter> {
         match self {
             Self::Layered(wall) => {
@@ -203,7 +201,7 @@ impl Relief {
     /// Sets a parameter.
     ///
     /// # Errors
-    /// [`Error::Parameter`] or [`Error::Value`], which say what would do.
+    /// [`Error::Parameter`] or [`Error::Value`], which name the valid ones.
     pub fn set(&mut self, key: &str, value: &str) -> Result<(), Error> {
         if let Self::Layered(wall) = self {
             return wall.set(key, value);
@@ -262,7 +260,7 @@ impl Relief {
         }
     }
 
-    /// What it is made of. Flat reflects 29.3 % less energy than Wood (Rust et al. 2021), hence 0.83.
+    /// Returns its material. Flat reflects 29.3 % less energy than Wood (Rust et al. 2021), hence 0.83.
     pub fn material(&self) -> Material {
         match self {
             Self::Foam => Material { name: "melamine foam", reflection_factor: 0.05 },

@@ -28,7 +28,7 @@ const WAVES: [Parameter; 4] = [
     SEED,
 ];
 
-/// What may be set of a relief.
+/// Returns the parameters of a relief.
 pub(super) fn parameters(relief: &str) -> &'static [Parameter] {
     match relief {
         "brick" | "flemish" => &BRICKS,

@@ -1,10 +1,10 @@
-//! Parameters of reliefs: what each is called, means and may be.
+//! Parameters of reliefs: their names, meanings and domains.
 
 use serde::{Deserialize, Serialize};
 
 use super::Error;
 
-/// What a parameter shapes.
+/// Layer of the wall that a parameter shapes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Layer {
@@ -18,7 +18,7 @@ pub enum Layer {
     Whole,
 }
 
-/// What a parameter may be, and is where nobody says otherwise.
+/// Domain and default of a parameter.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Domain {
@@ -28,7 +28,7 @@ pub enum Domain {
         low: f64,
         /// Greatest.
         high: f64,
-        /// Where none is set.
+        /// Default.
         default: f64,
     },
     /// A whole number.
@@ -37,14 +37,14 @@ pub enum Domain {
         low: u64,
         /// Greatest.
         high: u64,
-        /// Where none is set.
+        /// Default.
         default: u64,
     },
     /// One of some words.
     Choice {
         /// The words.
         options: &'static [&'static str],
-        /// Where none is set.
+        /// Default.
         default: &'static str,
     },
 }
@@ -54,17 +54,17 @@ pub enum Domain {
 pub struct Parameter {
     /// Its name, as in `--set`.
     pub key: &'static str,
-    /// What it shapes.
+    /// The layer that it shapes.
     pub layer: Layer,
     /// Its unit; empty for words and counts.
     pub unit: &'static str,
-    /// What it may be.
+    /// Its domain.
     pub domain: Domain,
-    /// What it means.
+    /// Its meaning.
     pub about: &'static str,
 }
 
-/// What a parameter is set to.
+/// Value of a parameter.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(untagged)]
 pub enum Setting {
@@ -118,7 +118,7 @@ impl Parameter {
         Self { key, layer, unit: "", domain: Domain::Whole { low, high, default }, about }
     }
 
-    /// What it is where nobody says otherwise.
+    /// Returns its default.
     pub fn default_setting(&self) -> Setting {
         match self.domain {
             Domain::Number { default, .. } => Setting::Number(default),
@@ -127,10 +127,10 @@ impl Parameter {
         }
     }
 
-    /// A setting of it from text; `relief` is for messages.
+    /// Parses a value of it; `relief` is for messages.
     ///
     /// # Errors
-    /// [`Error::Value`], which says what would do.
+    /// [`Error::Value`], which names the domain.
     pub fn parse(&self, relief: &'static str, text: &str) -> Result<Setting, Error> {
         let setting = match self.domain {
             Domain::Number { low, high, .. } => {

@@ -7,7 +7,7 @@ use super::PANEL_SIZE_MM;
 /// A 2D primitive-root diffuser of p - 1 wells in a rectangle.
 ///
 /// Well k is g^k mod p deep, in units of the greatest depth over p; the sequence goes along the rectangle's
-/// diagonal, which by the Chinese remainder theorem meets every well once where the sides have no common factor.
+/// diagonal, which by the Chinese remainder theorem meets every well once if the sides have no common factor.
 /// Source: Cox and D'Antonio, Acoustic Absorbers and Diffusers, chapter on Schroeder diffusers.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
@@ -77,7 +77,7 @@ impl PrimitiveRootDiffuser {
         self.depth_mm / 2.0 - depth + 9.0
     }
 
-    // g is a root where no power g^((p-1)/q), q a prime factor of p - 1, is 1.
+    // g is a root if no power g^((p-1)/q), q a prime factor of p - 1, is 1.
     fn is_root(&self, g: u64) -> bool {
         let order = self.prime - 1;
         prime_factors(order).into_iter().all(|q| power(g, order / q, self.prime) != 1)

@@ -11,7 +11,7 @@ const PRIMES: [u64; 11] = [31, 43, 73, 157, 211, 241, 307, 421, 463, 601, 757];
 /// The generators' streams: those of the decks lie apart from those of the reliefs.
 const DECKS: u64 = 1 << 63;
 
-/// What a relief is drawn from.
+/// Kinds of reliefs that are drawn.
 #[derive(Debug, Clone, Copy)]
 enum Typology {
     Stretcher,
@@ -71,7 +71,7 @@ fn waves(rng: &mut ChaCha8Rng) -> Wavy {
     }
 }
 
-// Parameters are rounded, so that they read as somebody's choice and survive being written as text.
+// Parameters are rounded, so that they are easy to read and survive being written as text.
 fn tenths(rng: &mut ChaCha8Rng, low: f64, high: f64) -> f64 {
     (rng.random_range(low..=high) * 10.0).round() / 10.0
 }

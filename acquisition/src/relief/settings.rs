@@ -1,4 +1,4 @@
-//! What a wall's parameters are set to.
+//! Values of a wall's parameters.
 
 use std::collections::BTreeMap;
 
@@ -8,7 +8,7 @@ use super::parameter::{Domain, Parameter, Setting};
 
 /// The wall is this many times as large as the panel (Rust et al. 2021).
 pub const FULL_SCALE: f64 = 10.0;
-/// What parameters are set to; those that are not have their defaults.
+/// Values by parameter name; parameters without one have their defaults.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 #[serde(transparent)]
 pub(super) struct Settings(pub(super) BTreeMap<String, Setting>);

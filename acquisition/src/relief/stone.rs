@@ -1,22 +1,22 @@
-//! What stones of every kind have in common: they stand out, lean and bulge.
+//! Shape shared by stones of every kind: they stand out, lean and bulge.
 
 use super::chance::Chance;
 use super::parameter::{Layer, Parameter};
 use super::settings::Settings;
 
-/// How far stones stand out.
+/// Makes the parameter for the stones' height over the wall.
 pub(super) const fn projection(high: f64, default: f64) -> Parameter {
     let about = "stones stand out of the wall by up to this";
     Parameter::mm("projection_mm", Layer::Mesostructure, [0.0, high, default], about)
 }
 
-/// How far stones lean.
+/// Makes the parameter for the stones' lean.
 pub(super) const fn lean(default: f64) -> Parameter {
     let about = "one edge or corner of a stone stands out over its opposite by up to this";
     Parameter::mm("lean_mm", Layer::Mesostructure, [0.0, 30.0, default], about)
 }
 
-/// How round faces are.
+/// Makes the parameter for the bulge of the stones' faces.
 pub(super) const fn bulge(high: f64, default: f64) -> Parameter {
     let about = "the middle of a stone's face stands out over its edges by this";
     Parameter::mm("bulge_mm", Layer::Mesostructure, [0.0, high, default], about)

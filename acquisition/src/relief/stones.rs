@@ -1,8 +1,8 @@
-//! The stones of a wall: one trait for every way they lie.
+//! The stones of a wall: one trait for all their arrangements.
 
 use super::parameter::{Layer, Parameter};
 
-/// Numbers of a seed's kind.
+/// Seed of the wall; its range is that of whole numbers that a double holds exactly.
 pub(super) const SEED: Parameter =
     Parameter::whole("seed", Layer::Mesostructure, [0, 9_007_199_254_740_991, 1], "which wall of this kind");
 
@@ -11,11 +11,11 @@ pub(super) const SEED: Parameter =
 pub(super) struct Spot {
     /// To the middle of the nearest joint, 0 or more.
     pub(super) to_joint: f64,
-    /// Height of the stone's face over the wall's plane, 0 or more; what lies in the joint is not seen.
+    /// Height of the stone's face over the wall's plane, 0 or more; unused inside the joint.
     pub(super) face: f64,
 }
 
-/// Where the stones of a wall lie.
+/// Arrangement of a wall's stones.
 pub(super) trait Stones {
     /// The stone at a place; `half_joint` is half a joint's width, model mm.
     fn spot(&self, x: f64, y: f64, half_joint: f64) -> Spot;

@@ -1,4 +1,4 @@
-//! Stones around scattered points, each having what is nearest to its own: polygonal rubble and river rock.
+//! Stones around scattered points, each of the places nearest to its own: polygonal rubble and river rock.
 
 use super::PANEL_SIZE_MM;
 use super::chance::Chance;
@@ -55,7 +55,7 @@ pub(super) const RIVER_ROCK: [Parameter; 9] = [
     joint_depth(20.0),
 ];
 
-/// How stones end.
+/// Outline of stones.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Outline {
     /// Halfway to the next.
@@ -131,7 +131,7 @@ impl Cells {
         let distances = self.around(place).filter(|n| *n != own).map(distance);
         match self.outline {
             Outline::Polygons => distances.fold(f64::INFINITY, f64::min),
-            // Like the least of them, but smooth where two are alike.
+            // Like the least of them, but smooth if two are alike.
             Outline::Round => 1.0 / distances.map(|d| 1.0 / (d * d)).sum::<f64>().sqrt(),
         }
     }

@@ -16,7 +16,7 @@ pub struct Wavy {
     pub wavelength_mm: f64,
     /// Height of the sum's crest over its trough at most, mm.
     pub depth_mm: f64,
-    /// Which wall of this kind.
+    /// Seed of the wall's random draws.
     pub seed: u64,
 }
 

@@ -1,4 +1,4 @@
-//! The time of a replay: goes on at its speed, stands, is put elsewhere.
+//! The clock of a replay: runs at its speed, stops, is set.
 
 use std::ops::RangeInclusive;
 use std::time::{Duration, Instant};
@@ -6,18 +6,18 @@ use std::time::{Duration, Instant};
 /// Speeds of a replay, as factors of real time: slower is paused, faster is more than any disk gives.
 pub const SPEEDS: RangeInclusive<f32> = 0.01..=1e6;
 
-/// A clock that shows the time of what is played, ns since 1970.
+/// A clock that shows the time of the played messages, ns since 1970.
 #[derive(Debug)]
 pub(super) struct Clock {
-    /// What it showed when it was last set, stopped or started.
+    /// Its time when it was last set, stopped or started.
     shown: u64,
-    /// Since when it goes; nothing where it stands.
+    /// Start of the current run; None while it is stopped.
     since: Option<Instant>,
     speed: f32,
 }
 
 impl Clock {
-    /// Stands at a time.
+    /// Makes a clock that is stopped at a time.
     pub(super) fn new(at: u64, speed: f32) -> Self {
         Self { shown: at, since: None, speed: speed.clamp(*SPEEDS.start(), *SPEEDS.end()) }
     }
@@ -31,13 +31,13 @@ impl Clock {
         self.speed
     }
 
-    /// Puts it to a time; it goes on, if it went.
+    /// Sets its time; a running clock goes on running.
     pub(super) fn set(&mut self, at: u64) {
         self.shown = at;
         self.since = self.since.map(|_| Instant::now());
     }
 
-    /// Changes its speed; what is no speed changes nothing.
+    /// Changes its speed; values that are no speed change nothing.
     pub(super) fn set_speed(&mut self, speed: f32) {
         if speed.is_finite() && speed > 0.0 {
             self.set(self.now());
@@ -45,7 +45,7 @@ impl Clock {
         }
     }
 
-    /// Lets it go or stand.
+    /// Starts or stops it.
     pub(super) fn go(&mut self, goes: bool) {
         if goes != self.since.is_some() {
             self.shown = self.now();
@@ -53,7 +53,7 @@ impl Clock {
         }
     }
 
-    /// How long it takes until it shows a time.
+    /// Returns the wait until it shows a time.
     pub(super) fn until(&self, at: u64) -> Duration {
         Duration::from_secs_f64(at.saturating_sub(self.now()) as f64 / 1e9 / f64::from(self.speed))
     }

@@ -1,21 +1,21 @@
-//! The messages of a recording in the order of time, from anywhere in it. In memory are the chunks that overlap where it
-//! stands, and of these what is wanted.
+//! The messages of a recording in the order of time, from any place in it. In memory are the chunks that overlap its
+//! place, and of these the messages of the wanted channels.
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 
 use super::recording::{Key, Message, Recording};
 
-/// Bytes of messages in memory at most: of a file whose chunks all overlap, no order could be given.
+/// Limit of messages in memory, bytes: a file whose chunks all overlap cannot be put into order.
 const OVERLAP: usize = 512 << 20;
 
-/// Damage that was met: where in the file, and what it is.
+/// Damage in the file: its offset, and a text.
 pub(super) type Damage = (u64, String);
 
 /// A place in a recording.
 #[derive(Debug, Default)]
 pub(super) struct Cursor {
     wanted: BTreeSet<u16>,
-    /// What was given out, or lies before where it was put.
+    /// Key of the last message that was given out or skipped.
     passed: Key,
     next_chunk: usize,
     open: Vec<VecDeque<Message>>,
@@ -23,28 +23,28 @@ pub(super) struct Cursor {
 }
 
 impl Cursor {
-    /// Right behind `passed`, with these of the file's channels.
+    /// Starts right behind `passed`, with these of the file's channels.
     pub(super) fn behind(passed: Key, wanted: BTreeSet<u16>) -> Self {
         Self { wanted, passed, ..Self::default() }
     }
 
-    /// Where it stands.
+    /// Returns the key of the last message that was given out or skipped.
     pub(super) fn passed(&self) -> Key {
         self.passed
     }
 
-    /// All up to this place was given out, or is not wanted.
+    /// Skips all messages up to this key.
     pub(super) fn pass(&mut self, upto: Key) {
         self.passed = self.passed.max(upto);
     }
 
-    /// The time of the next message; None behind the last.
+    /// Returns the time of the next message; None behind the last.
     pub(super) fn peek(&mut self, recording: &Recording, damages: &mut Vec<Damage>) -> Option<u64> {
         self.fill(recording, damages);
         self.first().map(|(_, key)| key.0)
     }
 
-    /// The next message, where one was seen.
+    /// Returns the next message, if [`Self::peek`] saw one.
     pub(super) fn pop(&mut self) -> Option<Message> {
         let (at, key) = self.first()?;
         let message = self.open[at].pop_front()?;
@@ -89,7 +89,7 @@ impl Cursor {
     }
 }
 
-/// Where things stand at a place: of each channel the messages of its latest time up to there, by time.
+/// Returns the state at a place: of each channel the messages of its latest time up to there, by time.
 pub(super) fn standing(
     recording: &Recording,
     upto: Key,
@@ -98,7 +98,7 @@ pub(super) fn standing(
 ) -> Vec<Message> {
     let mut found: BTreeMap<u16, Vec<Message>> = BTreeMap::new();
     let mut chunks: Vec<_> = recording.chunks.iter().filter(|c| c.start <= upto.0).collect();
-    // From what reaches farthest; a chunk that ends before what is known cannot know better.
+    // From the chunk that reaches farthest; a chunk that ends before the known messages has no later ones.
     chunks.sort_by_key(|c| std::cmp::Reverse((c.end.min(upto.0), c.start, c.offset)));
     for chunk in chunks {
         let open: BTreeSet<u16> = channels

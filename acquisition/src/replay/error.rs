@@ -1,9 +1,9 @@
-//! Why recordings are not replayed.
+//! Errors of replays.
 
 use std::net::SocketAddr;
 use std::path::PathBuf;
 
-/// Why recordings are not replayed.
+/// An error that prevents a replay.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
     /// The system refused.
@@ -14,18 +14,18 @@ pub enum Error {
         /// The system's reason.
         source: std::io::Error,
     },
-    /// There is nothing to replay in it.
+    /// The file has no messages that can be replayed.
     #[error("`{}` cannot be replayed: {reason}", path.display())]
     Unplayable {
         /// The file.
         path: PathBuf,
-        /// Why, and what would help.
+        /// The reason, with a hint.
         reason: String,
     },
     /// There is nothing to replay.
     #[error("nothing to replay: {reason}")]
     Nothing {
-        /// Why.
+        /// The reason.
         reason: &'static str,
     },
     /// The address cannot be listened on.

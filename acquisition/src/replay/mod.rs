@@ -1,8 +1,8 @@
-//! Recordings shown again: a WebSocket server that Foxglove controls (play, pause, speed, seek) and Lichtblick looks at.
+//! Replay of recordings: a WebSocket server that Foxglove controls (play, pause, speed, seek) and Lichtblick shows.
 //!
-//! Several recordings are shown one after the other; what lies between them is left out, and where one begins before the
-//! other ends, time goes back. Only chunks with topics that somebody wants are read, one after the other. Playback stands
-//! while nobody looks on, and waits while all viewers have enough to read; where one is slower than another, it loses its
+//! Several recordings are shown one after the other; the time between them is left out, and if one begins before the
+//! other ends, time goes back. Only chunks with subscribed topics are read, one after the other. Playback stops while
+//! there is no viewer, and waits while all viewers have enough to read; if one is slower than another, it loses its
 //! oldest messages.
 
 mod clock;
@@ -25,38 +25,38 @@ pub use error::Error;
 use player::Player;
 pub use recording::Recording;
 
-/// Commands that wait for the player; clients with more wait, too.
+/// Limit of pending commands for the player; clients with more wait.
 const COMMANDS: usize = 256;
 
-/// How a replay begins.
+/// Settings of a replay's begin.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ReplayOptions {
     /// As a factor of real time; a client may change it.
     pub speed: f32,
-    /// Whether it waits for a client's command to play, instead of for its first subscription.
+    /// True to wait for a client's command to play, instead of for its first subscription.
     pub paused: bool,
 }
 
-/// How a replay stands.
+/// State of a replay.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Standing {
     /// The recording that is shown.
     pub recording: PathBuf,
-    /// Time of what is shown since the first recording began, without what lies between them, s.
+    /// Played time since the begin of the first recording, without the gaps between recordings, s.
     pub shown_secs: f64,
-    /// Whether it goes on.
+    /// True while it plays.
     pub is_playing: bool,
     /// As a factor of real time.
     pub speed: f32,
-    /// Clients that look on.
+    /// Connected clients.
     pub viewers: usize,
-    /// Messages that some client lost because it did not keep up.
+    /// Messages that clients lost because they did not keep up.
     pub lost: u64,
-    /// What was found damaged, in words that name file and place.
+    /// Damage found so far, as texts that name file and place.
     pub damages: Vec<String>,
 }
 
-/// A server that replays recordings. Dropped, it lets its clients go.
+/// A server that replays recordings. Dropped, it disconnects its clients.
 pub struct ReplayServer {
     // Dropped before the thread is waited for, because the server's end is the player's.
     server: Server,
@@ -70,8 +70,7 @@ impl ReplayServer {
     /// Listens; port 0 takes a free one. Recordings are shown in the order of their times.
     ///
     /// # Errors
-    /// [`Error::Listen`], or [`Error::Nothing`] where there is no recording, or where there are more
-    /// topics than channels.
+    /// [`Error::Listen`], or [`Error::Nothing`] if there is no recording, or if there are more topics than channels.
     pub fn start(
         address: SocketAddr,
         access: ViewerAccess,
@@ -102,12 +101,12 @@ impl ReplayServer {
         Ok(Self { server, _thread: thread, standing, length_secs, range })
     }
 
-    /// Where it listens.
+    /// Returns the address of its listener.
     pub fn address(&self) -> SocketAddr {
         self.server.address()
     }
 
-    /// What viewers open: the address, with the token if they need one.
+    /// Returns the URL for viewers: the address, with the token if they need one.
     pub fn url(&self) -> String {
         self.server.url()
     }
@@ -122,19 +121,19 @@ impl ReplayServer {
         self.length_secs
     }
 
-    /// How it stands.
+    /// Returns its current state.
     pub fn standing(&self) -> Standing {
         self.standing.lock().unwrap_or_else(PoisonError::into_inner).clone()
     }
 }
 
-/// The player's thread; dropped, it is waited for.
+/// The player's thread; dropping it joins the thread.
 struct PlayerThread(Option<JoinHandle<()>>);
 
 impl Drop for PlayerThread {
     fn drop(&mut self) {
         if let Some(thread) = self.0.take() {
-            // One that panicked has told why.
+            // A thread that panicked has printed the reason.
             let _ = thread.join();
         }
     }

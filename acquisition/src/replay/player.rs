@@ -1,4 +1,4 @@
-//! Plays recordings: sends each message when its time has come, and obeys those who look on.
+//! The player of recordings: sends each message when it is due, and obeys clients' commands.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::mpsc::{Receiver, RecvTimeoutError};
@@ -12,11 +12,11 @@ use super::{ReplayOptions, Standing};
 use crate::recorder::Topic;
 use crate::viewer::{Command, PlaybackRequest, PlaybackState, PlaybackStatus, Queue, Shared, Waiting};
 
-/// Clients are told the time so often.
+/// Interval at which clients get the time.
 const TICK: Duration = Duration::from_millis(33);
-/// How long it waits for clients that have enough to read.
+/// Wait for clients that have enough to read.
 const BREATH: Duration = Duration::from_millis(3);
-/// Messages between two looks at what clients want.
+/// Messages between two checks for commands.
 const STRIDE: usize = 256;
 
 /// Length of a recording, s.
@@ -33,7 +33,7 @@ pub(super) struct Topics {
 }
 
 impl Topics {
-    /// None where there are more than channels.
+    /// None if there are more topics than channels.
     pub(super) fn of(recordings: &[Recording]) -> Option<Self> {
         let (mut all, mut of) = (Vec::<Topic>::new(), Vec::new());
         for recording in recordings {
@@ -56,7 +56,7 @@ impl Topics {
     }
 }
 
-/// A player.
+/// The player of a replay: its recordings, its clock and its place in them.
 pub(super) struct Player {
     recordings: Vec<Recording>,
     topics: Topics,
@@ -67,9 +67,9 @@ pub(super) struct Player {
     /// The recording that is played.
     number: usize,
     cursor: Cursor,
-    /// What was wanted when the cursor was made.
+    /// Counter of subscription changes when the cursor was made.
     wishes: u64,
-    /// Damage that is known.
+    /// Damage that was reported already.
     damaged: BTreeSet<(usize, u64)>,
 }
 
@@ -110,7 +110,7 @@ impl Player {
         }
     }
 
-    // Sends what is due; returns how long nothing more is.
+    // Sends the messages that are due; returns the wait until the next one.
     fn step(&mut self) -> Duration {
         self.keep_to_wishes();
         let is_watched = !self.shared.wanted().is_empty();
@@ -124,7 +124,7 @@ impl Player {
                 return self.wait_for(next);
             }
             if self.shared.all_are_busy() {
-                // What comes later comes later; nobody is flooded to catch up.
+                // A late message stays late; clients are not flooded to catch up.
                 self.clock.set(next);
                 return BREATH;
             }
@@ -168,7 +168,7 @@ impl Player {
 
     // Nothing is due before a time.
     fn wait_for(&mut self, next: u64) -> Duration {
-        // Who subscribes now is shown what is now.
+        // New subscribers get the state at the current time.
         let now = self.clock.now().min(next.saturating_sub(1));
         self.cursor.pass(at_all_of(now));
         self.tell_time();
@@ -181,7 +181,7 @@ impl Player {
         self.cursor = Cursor::behind(at_all_of(time), self.wanted());
     }
 
-    // Channels of the file that somebody wants.
+    // Channels of the file with a subscription.
     fn wanted(&self) -> BTreeSet<u16> {
         let wanted = self.shared.wanted();
         self.topics.of[self.number].iter().filter(|(_, to)| wanted.contains(to)).map(|(from, _)| *from).collect()
@@ -239,7 +239,7 @@ impl Player {
         }
     }
 
-    // To a time in this recording, or in the first that ends behind it; where none is of that time, to its beginning.
+    // To a time in this recording, or in the first that ends behind it; if none has that time, to its beginning.
     fn seek(&mut self, time: u64) {
         let here = self.recordings[self.number].range();
         if !(here.0..=here.1).contains(&time) {
@@ -253,7 +253,7 @@ impl Player {
         }
     }
 
-    // Shows clients where all stands that they want.
+    // Sends clients the current state of their channels.
     fn show_to(&mut self, clients: &[Arc<Queue>]) {
         let all: Vec<_> = clients.iter().map(|c| (c.clone(), c.wanted().into_iter().collect())).collect();
         self.show(&all);

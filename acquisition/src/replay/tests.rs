@@ -20,7 +20,7 @@ const SMALL_RIG: &str = include_str!("../../../tests/fixtures/small_rig.toml");
 const START: i64 = 1_767_600_000_000_000_000;
 /// Fast enough for a test; a run of the small rig lasts minutes.
 const FAST: ReplayOptions = ReplayOptions { speed: 1e6, paused: false };
-/// How long the other side may take; a busy machine needs some of it.
+/// Timeout of the other side; a busy machine needs some of it.
 const ANSWER_LIMIT: Duration = Duration::from_secs(120);
 const ONCE: [&str; 3] = [topics::PANEL_SCENE, topics::PANEL_POINTS, topics::ROBOT_DESCRIPTION];
 
@@ -60,12 +60,12 @@ fn replay(paths: &[&Path], options: ReplayOptions) -> ReplayServer {
     ReplayServer::start(([127, 0, 0, 1], 0).into(), ViewerAccess::default(), recordings, options).expect("a server")
 }
 
-/// What a client hears.
+/// A message or event at a client.
 #[derive(Debug, PartialEq)]
 enum Heard {
     Message(Seen),
     Time(u64),
-    /// Status, time, whether it went elsewhere, the request.
+    /// Status, time, whether it was set, the request.
     State(u8, u64, bool, String),
 }
 
@@ -156,7 +156,7 @@ impl Client {
         all
     }
 
-    /// What comes until the answer to a request: the answer, and the messages before it.
+    /// Waits for the answer to a request; returns it, and the messages before it.
     fn answer(&mut self, id: &str) -> (Heard, Vec<Seen>) {
         let mut before = Vec::new();
         loop {
@@ -206,7 +206,7 @@ fn playback_is_paused_put_elsewhere_and_ended() {
     let server = replay(&[&path], ReplayOptions { speed: 1.0, paused: true });
     let mut client = Client::connect(&server);
     client.subscribe(&[]);
-    // What stands in the file once is shown before anything plays.
+    // Messages that are in the file once are sent before anything plays.
     let at_start: Vec<_> = expected.iter().filter(|(_, time, _)| *time == start).cloned().collect();
     assert!(ONCE[..2].iter().all(|topic| at_start.iter().any(|(t, ..)| t == topic)));
     assert!(by_content(client.collect(at_start.len())) == by_content(at_start));
@@ -214,7 +214,7 @@ fn playback_is_paused_put_elsewhere_and_ended() {
     assert!(matches!(client.answer("play").0, Heard::State(0, _, false, _)));
     client.control(false, 2.0, None, "pause");
     let (Heard::State(1, paused, false, _), _) = client.answer("pause") else { panic!("it pauses") };
-    // Elsewhere: of every topic what was last said there, and nothing of later.
+    // After a seek: of every topic the last messages up to there, and none of later.
     let verdicts: Vec<u64> = expected.iter().filter(|m| m.0 == topics::MEASUREMENT).map(|m| m.1).collect();
     let middle = verdicts[verdicts.len() / 2];
     assert!(paused < middle);
@@ -227,7 +227,7 @@ fn playback_is_paused_put_elsewhere_and_ended() {
     let shown = client.collect(known.len());
     assert!(shown.windows(2).all(|pair| pair[0].1 <= pair[1].1));
     assert!(by_content(shown) == by_content(known));
-    // On to the end, then nothing plays before somebody seeks.
+    // On to the end, then nothing plays before a seek.
     client.control(true, 1e6, None, "on");
     let later: Vec<_> = expected.iter().filter(|m| m.1 > middle).cloned().collect();
     let (answer, mut rest) = client.answer("on");

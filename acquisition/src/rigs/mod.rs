@@ -15,14 +15,14 @@ use crate::session::Pace;
 use paced::paced;
 use simulated::{Simulation, devices};
 
-/// What devices are opened for.
+/// Inputs for opening a rig's devices.
 pub(crate) struct DeviceRequest<'a> {
     pub(crate) rig: &'a Rig,
-    /// What simulated devices measure, with their clock's start and their seed.
+    /// Panel that simulated devices measure; `start` and `seed` are of their clock and noise.
     pub(crate) panel: &'a PreparedPanel,
     pub(crate) start: Timestamp,
     pub(crate) seed: u64,
-    /// How the arms stand at each pair, if a model of them is known.
+    /// Joints of the arms at each pair, if a model of them is known.
     pub(crate) arms: Option<Arc<Choreography>>,
 }
 

@@ -1,10 +1,11 @@
-//! A simulated rig that takes its time: for live views, and for what recording costs at a real rig's pace.
+//! A simulated rig whose takes last a given time: for live views, and to measure the cost of recording at a real rig's
+//! pace.
 
 use std::time::{Duration, Instant};
 
 use crate::rig::{AudioInterface, Devices, Error, Take};
 
-/// The devices, with takes that last so long at least, s.
+/// Wraps devices so that takes last at least `secs`.
 pub(crate) fn paced(mut devices: Devices, secs: f64) -> Devices {
     let pace = Duration::try_from_secs_f64(secs).unwrap_or_default();
     devices.audio = Box::new(Paced { inner: devices.audio, pace });

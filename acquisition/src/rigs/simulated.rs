@@ -1,4 +1,4 @@
-//! The simulated rig: computed, never measured, and said to be so in every run it makes ([`Origin::Simulated`]).
+//! The simulated rig: computed, never measured, and marked as such in every run it makes ([`Origin::Simulated`]).
 //!
 //! The room's air drifts over the simulated hours; the panel reflects as [`KirchhoffPlan`] says, times its
 //! material's factor; the direct sound goes as 1/d; both channels pass the converter; noise is added, and now and
@@ -25,7 +25,7 @@ use crate::robots::Choreography;
 
 /// Facets along each side: 2.14 mm, a quarter of the wavelength at 40 kHz.
 pub const FACETS: usize = 274;
-/// Samples that a response goes on for behind its farthest echo: the band limit rings.
+/// Samples of a response beyond its farthest echo: the band limit rings.
 const RINGING: f64 = 32.0;
 /// Time of one measurement (Rust et al. 2021): moving, settling, sweep.
 pub(crate) const TAKE_SECS: f64 = 12.3;
@@ -45,7 +45,7 @@ const SPOILED_NOISE: f64 = 3e-3;
 /// Full scale of 24 bits.
 const FULL_SCALE: f64 = 8_388_608.0;
 
-/// What is simulated.
+/// Settings of a simulation.
 #[derive(Debug, Clone)]
 pub struct Simulation<'a> {
     /// The rig.
@@ -54,21 +54,21 @@ pub struct Simulation<'a> {
     pub relief: &'a HeightField,
     /// Its pressure reflection factor.
     pub reflection_factor: f64,
-    /// When the first take begins.
+    /// Time at which its clock begins.
     pub start: Timestamp,
-    /// Which room, drift and noise.
+    /// Seed of drift and noise.
     pub seed: u64,
-    /// How the arms stand at each pair, where a model of them is wanted.
+    /// Joints of the arms at each pair, if a model of them is known.
     pub arms: Option<Arc<Choreography>>,
 }
 
-/// What the devices share.
+/// State that the devices share.
 struct World {
     grid: Grid,
     now: Timestamp,
     start: Timestamp,
     power: Power,
-    /// Where microphone and speaker stand, as points of the grid.
+    /// Microphone's and speaker's position, as indices of the grid's points.
     stand: [usize; 2],
     air: Air,
     rng: ChaCha8Rng,
@@ -76,7 +76,7 @@ struct World {
     outside_level_db: f64,
 }
 
-/// The air's slow course.
+/// The air's slow drift.
 struct Air {
     phase: f64,
     walk: f64,
@@ -87,7 +87,7 @@ type Shared = Arc<Mutex<World>>;
 /// The devices of a simulated rig.
 ///
 /// # Errors
-/// [`Error::Device`] where the rig's grid has no points.
+/// [`Error::Device`] if the rig's grid has no points.
 pub fn devices(simulation: &Simulation<'_>) -> Result<Devices, Error> {
     let failed = |e: echolake_schema::Error| Error::Device { device: "simulated rig", reason: e.to_string() };
     let grid = simulation.rig.grid().map_err(failed)?;
@@ -172,7 +172,7 @@ impl Robots for SimulatedRobots {
         let known = self.arms.as_ref().filter(|_| world.grid.pair_id(a, b).is_some());
         let joints = known.and_then(|arms| arms.standing(pair).ok()).map(|stand| [stand.microphone, stand.speaker]);
         world.stand = [microphone, speaker];
-        // The arms repeat to 0.02 mm. The residual is told; the simulated sound does not know of it.
+        // The arms repeat to 0.02 mm. The residual is returned; the simulated sound does not depend on it.
         let mut off = |mm: [f64; 3]| mm.map(|x| x + 0.01 * world.normal().clamp(-2.0, 2.0));
         Ok(Positions { microphone_mm: off(microphone_mm), speaker_mm: off(speaker_mm), joints })
     }
@@ -208,7 +208,7 @@ struct SimulatedAudio {
     plan: KirchhoffPlan,
     scratch: KirchhoffScratch,
     response: Vec<f32>,
-    /// What was prepared for the output that was played last: a run plays one sweep.
+    /// Cache for the last output: a run plays one sweep.
     output: Option<Played>,
 }
 
@@ -301,7 +301,7 @@ impl Played {
     }
 }
 
-// 24 bits with noise; what is louder than full scale is clipped.
+// 24 bits with noise; samples over full scale are clipped.
 fn quantise(signal: &[f32], gain: f64, noise: f64, world: &mut World, out: &mut Vec<i32>) {
     out.clear();
     out.extend(signal.iter().map(|x| {

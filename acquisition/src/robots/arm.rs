@@ -1,4 +1,5 @@
-//! One Stäubli TX2-60L with a tool: where its links are for given joints, and which joints bring the tool somewhere.
+//! One Stäubli TX2-60L with a tool: forward kinematics from joints to links, inverse kinematics from the tool's pose to
+//! joints.
 //!
 //! Lengths in m, angles in rad. Closed-form solutions are those of the crate rs-opw-kinematics.
 
@@ -15,7 +16,7 @@ pub type Joints = [f64; 6];
 pub const SHOULDER_M: f64 = 0.375;
 /// From shoulder to elbow, m.
 pub const UPPER_ARM_M: f64 = 0.400;
-/// The elbow stands this much aside, m.
+/// Sideways offset of the elbow, m.
 pub const ELBOW_ASIDE_M: f64 = 0.020;
 /// From elbow to wrist, m.
 pub const FOREARM_M: f64 = 0.450;
@@ -28,14 +29,15 @@ pub const RANGES_DEG: [[f64; 2]; 6] =
 /// Highest speeds of the joints, degrees a second (the same source).
 pub const SPEEDS_DEG: [f64; 6] = [435.0, 385.0, 500.0, 995.0, 1065.0, 1445.0];
 
-/// Joints of an arm that waits for work, degrees: elbow up, wrist over the panel's near edge.
+/// Joints of an idle arm, degrees: elbow up, wrist over the panel's near edge.
 const HOME_DEG: Joints = [0.0, -10.0, 110.0, 0.0, 50.0, 0.0];
-/// What a joint's distance from home counts: a turn of the big joints changes more.
+/// Weights of the joints in the distance from home: a turn of the big joints moves the arm more.
 const WEIGHTS: Joints = [1.0, 1.0, 1.0, 0.3, 0.3, 0.05];
-/// A capsule of the wrist is this thick, m; so are the others. Radii enclose the castings as the drawings show them.
+/// Radii of the capsules of column, upper arm, forearm and wrist, m. They enclose the castings as the drawings show
+/// them.
 pub(super) const RADII_M: [f64; 4] = [0.095, 0.075, 0.060, 0.045];
 
-/// What an arm carries.
+/// The tool of an arm.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Tool {
     /// A microphone at the end of a thin rod.
@@ -113,7 +115,7 @@ pub enum Part {
 /// All points nearer to a segment than a radius, m.
 #[derive(Debug, Clone, Copy)]
 pub struct Capsule {
-    /// Which part it encloses.
+    /// The part that it encloses.
     pub part: Part,
     /// One end.
     pub from: DVec3,
@@ -131,7 +133,7 @@ pub struct Arm {
 }
 
 impl Arm {
-    /// An arm that stands at `foot_m` over the panel, turned by `heading` about the vertical.
+    /// Makes an arm with its foot at `foot_m` over the panel, turned by `heading` about the vertical.
     pub fn new(tool: Tool, foot_m: [f64; 3], heading: f64) -> Self {
         let parameters = Parameters {
             a1: 0.0,
@@ -149,12 +151,12 @@ impl Arm {
         Self { kinematics: OPWKinematics::new(parameters), foot, tool }
     }
 
-    /// What it carries.
+    /// Returns its tool.
     pub fn tool(&self) -> Tool {
         self.tool
     }
 
-    /// Where it stands.
+    /// Returns the pose of its foot.
     pub fn foot(&self) -> Pose {
         self.foot
     }
@@ -174,7 +176,7 @@ impl Arm {
         [self.foot, a, b, c, d, e, f, self.tool.pose()]
     }
 
-    /// All joints that bring the tool to this pose, whether or not they are in their ranges.
+    /// Returns all joints that bring the tool to this pose, in their ranges or not.
     pub fn solve(&self, tool: Pose) -> Vec<Joints> {
         let flange = self.foot.inverse().compose(tool).compose(self.tool.pose().inverse());
         let mut found: Vec<Joints> = self.kinematics.inverse(&flange);
@@ -199,7 +201,7 @@ impl Arm {
         ]
     }
 
-    // Where the holder ends and the transducer begins, as a share of the length along the flange's axis.
+    // End of the holder and begin of the transducer, as a share of the length along the flange's axis.
     fn straight(&self) -> f64 {
         match self.tool {
             Tool::Microphone => 0.8,
@@ -222,23 +224,23 @@ fn steps(q: &Joints) -> [Pose; 6] {
     ]
 }
 
-/// Where an arm waits.
+/// Returns the joints of an idle arm.
 pub fn home() -> Joints {
     HOME_DEG.map(f64::to_radians)
 }
 
-/// How far joints are from home; the solver prefers what is near.
+/// Weighted squared distance of joints from home; the solver prefers small ones.
 pub(super) fn from_home(joints: &Joints) -> f64 {
     let home = home();
     (0..6).map(|i| WEIGHTS[i] * (joints[i] - home[i]).powi(2)).sum()
 }
 
-/// Whether all joints are in their ranges.
+/// Returns whether all joints are in their ranges.
 pub fn in_range(joints: &Joints) -> bool {
     joints.iter().zip(RANGES_DEG).all(|(q, [low, high])| (low..=high).contains(&q.to_degrees()))
 }
 
-/// Least time for the joints from one standing to another, s, at the data sheet's speeds; acceleration left out.
+/// Least time for the joints from one pose to another, s, at the data sheet's speeds; acceleration left out.
 pub fn travel_secs(from: &Joints, to: &Joints) -> f64 {
     (0..6).map(|i| (from[i] - to[i]).abs().to_degrees() / SPEEDS_DEG[i]).fold(0.0, f64::max)
 }

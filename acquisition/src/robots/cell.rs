@@ -1,4 +1,4 @@
-//! Both arms over the panel: how they stand at a pair of positions, or why they cannot.
+//! Both arms over the panel: joints for a pair of positions, or the reason why there are none.
 
 use std::f64::consts::{PI, TAU};
 
@@ -21,7 +21,7 @@ const ROLLS: usize = 24;
 /// Ways of the speaker's arm that are tried: few at first, because mostly the first will do.
 const TRIED: [usize; 2] = [6, usize::MAX];
 
-/// Where the speaker looks.
+/// Direction of the speaker's axis.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Aim {
     /// At the point of the panel where a mirror would reflect to the microphone.
@@ -53,14 +53,14 @@ impl Aim {
     }
 }
 
-/// How both arms stand at a pair.
+/// Joints of both arms at a pair.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Standing {
     /// Joints of the microphone's arm.
     pub microphone: Joints,
     /// Joints of the speaker's arm.
     pub speaker: Joints,
-    /// Where the speaker looks.
+    /// Direction of the speaker's axis.
     pub aim: Aim,
 }
 
@@ -71,7 +71,7 @@ impl Standing {
     }
 }
 
-/// Why a pair cannot be reached.
+/// The reason why a pair cannot be reached.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, thiserror::Error)]
 pub enum Unreachable {
     /// A position is not finite.
@@ -92,7 +92,7 @@ pub enum Unreachable {
 }
 
 impl Unreachable {
-    /// In words that last: what [`crate::rig::Error::Unreachable`] takes.
+    /// Returns the reason as a static text, for [`crate::rig::Error::Unreachable`].
     pub fn reason(&self) -> &'static str {
         match self {
             Self::NoPosition => "a position is not a number",
@@ -107,7 +107,7 @@ impl Unreachable {
     }
 }
 
-/// Both arms and what is around them.
+/// Both arms and their surroundings.
 pub struct Cell {
     microphone: Arm,
     speaker: Arm,
@@ -115,7 +115,7 @@ pub struct Cell {
     around: Surroundings,
 }
 
-/// One way for an arm to stand, with what it occupies.
+/// One solution for an arm, with the space that it occupies.
 #[derive(Clone)]
 struct Way {
     joints: Joints,
@@ -123,7 +123,7 @@ struct Way {
     cost: f64,
 }
 
-/// Ways of an arm to stand somewhere, or the farthest that it got.
+/// Solutions for an arm at a position, or the reason why there are none.
 #[derive(Clone)]
 pub struct Ways(Result<Vec<Way>, Unreachable>);
 
@@ -152,7 +152,7 @@ impl Cell {
         Self::new(&rig.robots, rig.panel.size_mm)
     }
 
-    /// What is around the arms.
+    /// Returns the arms' surroundings.
     pub fn around(&self) -> &Surroundings {
         &self.around
     }
@@ -165,16 +165,16 @@ impl Cell {
         }
     }
 
-    /// Where microphone and speaker are for given joints, mm.
+    /// Returns the positions of microphone and speaker for given joints, mm.
     pub fn positions_mm(&self, microphone: &Joints, speaker: &Joints) -> [[f64; 3]; 2] {
         [self.microphone.frames(microphone), self.speaker.frames(speaker)]
             .map(|frames| (frames[7].translation * 1e3).to_array())
     }
 
-    /// How the arms stand with the tools there.
+    /// Returns joints of both arms that bring the tools to these positions.
     ///
     /// # Errors
-    /// [`Unreachable`], naming what stands in the way.
+    /// [`Unreachable`], with the obstacle.
     pub fn reach(&self, microphone_mm: [f64; 3], speaker_mm: [f64; 3]) -> Result<Standing, Unreachable> {
         self.reach_with(&self.microphone_ways(microphone_mm), microphone_mm, speaker_mm)
     }
@@ -207,7 +207,7 @@ impl Cell {
         Err(failure.unwrap_or(Unreachable::NoPosition))
     }
 
-    /// Ways of the microphone's arm to a position.
+    /// Returns the solutions of the microphone's arm for a position.
     pub fn microphone_ways(&self, position_mm: [f64; 3]) -> Ways {
         if !position_mm.iter().all(|x| x.is_finite()) {
             return Ways(Err(Unreachable::NoPosition));
@@ -239,7 +239,7 @@ impl Cell {
         solutions(&self.speaker, (0..ROLLS).map(|i| Pose::from_parts(speaker, roll(i))))
     }
 
-    // The first ways, nearest to home, in which an arm touches neither itself nor what is around it.
+    // The first ways, nearest to home, in which an arm touches neither itself nor its surroundings.
     fn clear_ways(&self, arm: &Arm, solved: &[Joints], most: usize) -> Ways {
         let mut failure = match solved.is_empty() {
             true => Unreachable::OutOfReach(arm.tool()),
@@ -279,7 +279,7 @@ impl Cell {
         best.map(|(_, joints)| joints).ok_or(touch.unwrap_or(Unreachable::NoPosition))
     }
 
-    /// Whether both arms keep clear of each other and of what is around them.
+    /// Returns whether both arms keep clear of each other and of their surroundings.
     pub fn is_clear(&self, microphone: &Joints, speaker: &Joints) -> bool {
         let [a, b] = [self.microphone.capsules(microphone), self.speaker.capsules(speaker)];
         let alone = |arm| self.around.is_clear(arm) && !touches_itself(arm, self.around.margin_m);

@@ -1,4 +1,4 @@
-//! How both arms stand at every pair of a rig's grid, each worked out once.
+//! Joints of both arms at every pair of a rig's grid, each solved once.
 
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, OnceLock, PoisonError};
@@ -9,19 +9,19 @@ use echolake_schema::{Error, Grid, Pair, PairId, Rig};
 use super::cell::{Cell, Standing, Unreachable, Ways};
 use super::plan::{PlanParams, plan};
 
-/// The last one that was worked out: a lake's runs have one rig, and working it out takes a second.
+/// The last one that was computed: a lake's runs have one rig, and computing it takes a second.
 static LAST: Mutex<Option<(Key, Option<Arc<Choreography>>)>> = Mutex::new(None);
 
-/// What a choreography depends on, as text.
+/// All settings that a choreography depends on, as text.
 type Key = String;
 
-/// Standings of all pairs of a grid, each worked out when it is first asked for.
+/// Joints of both arms at all pairs of a grid, each solved when it is first needed.
 pub struct Choreography {
     cell: Arc<Cell>,
     grid: Grid,
     ways: Vec<OnceLock<Ways>>,
     standings: Vec<OnceLock<Result<Standing, Unreachable>>>,
-    /// Each pair's turn, where the rig wants its pairs in a planned order.
+    /// Each pair's turn, if the rig visits its pairs in a planned order.
     turns: Option<HashMap<PairId, usize>>,
 }
 
@@ -30,7 +30,7 @@ pub struct Choreography {
 pub struct Missing {
     /// The pair.
     pub pair: Pair,
-    /// Why.
+    /// The reason.
     pub why: Unreachable,
 }
 
@@ -45,10 +45,10 @@ impl std::fmt::Debug for Choreography {
 }
 
 impl Choreography {
-    /// A rig's; none where the arms cannot reach all of its pairs, as on a grid that is no panel's.
+    /// Returns a rig's; None if the arms cannot reach all of its pairs, as on a grid that is no panel's.
     ///
     /// # Errors
-    /// [`Error::Quantity`] where the grid is not valid.
+    /// [`Error::Quantity`] if the grid is not valid.
     pub fn of(rig: &Rig) -> Result<Option<Arc<Self>>, Error> {
         let key = key(rig);
         let mut last = LAST.lock().unwrap_or_else(PoisonError::into_inner);
@@ -56,7 +56,7 @@ impl Choreography {
             return Ok(found.clone());
         }
         let mut arms = Self::new(rig)?;
-        // All of the paper's grid is within reach: a test says so, and runs need not wait for it.
+        // The paper's whole grid is within reach: a test checks it, and runs need not wait for it.
         let found = match key == self::key(&Rig::paper()) || arms.missing().is_empty() {
             true => {
                 arms.turns = (rig.robots.order == VisitOrder::Planned).then(|| arms.planned());
@@ -68,10 +68,10 @@ impl Choreography {
         Ok(found)
     }
 
-    /// A rig's, whether or not the arms reach all of its pairs, and in the order of their numbers.
+    /// Makes a rig's, even if the arms do not reach all of its pairs, and in the order of their numbers.
     ///
     /// # Errors
-    /// [`Error::Quantity`] where the grid is not valid.
+    /// [`Error::Quantity`] if the grid is not valid.
     pub fn new(rig: &Rig) -> Result<Self, Error> {
         let grid = rig.grid()?;
         Ok(Self {
@@ -83,7 +83,7 @@ impl Choreography {
         })
     }
 
-    /// The pairs that the arms cannot reach, and why.
+    /// Returns the pairs that the arms cannot reach, with the reasons.
     pub fn missing(&self) -> Vec<Missing> {
         let missing = |pair: &Pair| self.standing(pair.id).err().map(|why| Missing { pair: *pair, why });
         self.grid.pairs().iter().filter_map(missing).collect()
@@ -95,12 +95,12 @@ impl Choreography {
         plan(&standings, PlanParams::default()).into_iter().map(|at| pairs[at]).zip(0..).collect()
     }
 
-    /// The arms.
+    /// Returns the model of the arms.
     pub fn cell(&self) -> Arc<Cell> {
         self.cell.clone()
     }
 
-    /// How the arms stand at a pair of the grid.
+    /// Returns the joints of both arms at a pair of the grid.
     ///
     /// # Errors
     /// [`Unreachable`].
@@ -116,7 +116,7 @@ impl Choreography {
         })
     }
 
-    /// Brings pairs into the order that the rig wants them visited in.
+    /// Sorts pairs into the rig's visiting order.
     pub fn sort(&self, pairs: &mut [Pair]) {
         if let Some(turns) = &self.turns {
             pairs.sort_by_key(|pair| turns.get(&pair.id));

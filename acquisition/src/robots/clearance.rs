@@ -4,7 +4,7 @@ use rs_opw_kinematics::glam::DVec3;
 
 use super::arm::{Capsule, Part};
 
-/// What the arms have to stay away from beside each other.
+/// Obstacles around the arms, beside each other.
 #[derive(Debug, Clone, Copy)]
 pub struct Surroundings {
     /// Half the panel's side, m.
@@ -17,7 +17,7 @@ pub struct Surroundings {
     pub margin_m: f64,
 }
 
-/// Distance of two capsules' surfaces, m; negative where they overlap.
+/// Distance of two capsules' surfaces, m; negative if they overlap.
 pub fn distance(a: &Capsule, b: &Capsule) -> f64 {
     between(a.from, a.to, b.from, b.to) - a.radius - b.radius
 }
@@ -28,13 +28,13 @@ pub fn touching(a: &[Capsule; 6], b: &[Capsule; 6], margin_m: f64) -> Option<(Pa
     a.iter().rev().find_map(|a| b.iter().rev().find(|b| near(&a, b)).map(|b| (a.part, b.part)))
 }
 
-/// Whether an arm touches itself: wrist and tool with column and upper arm. Neighbours touch always.
+/// Returns whether an arm touches itself: wrist and tool with column and upper arm. Neighbours touch always.
 pub fn touches_itself(arm: &[Capsule; 6], margin_m: f64) -> bool {
     arm[3..].iter().any(|outer| arm[..2].iter().any(|inner| distance(outer, inner) < margin_m))
 }
 
 impl Surroundings {
-    /// Whether an arm that stands on the table keeps away from the table and the panel.
+    /// Returns whether an arm that stands on the table keeps away from the table and the panel.
     pub fn is_clear(&self, arm: &[Capsule; 6]) -> bool {
         arm[1..].iter().all(|c| self.over_table(c) && self.over_panel(c))
     }

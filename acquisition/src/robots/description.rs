@@ -10,7 +10,7 @@ use super::arm::{
 };
 use super::cell::Cell;
 
-/// The panel's mean plane stands this high over the floor, m: a table's height.
+/// Height of the panel's mean plane over the floor, m: a table's height.
 pub const PANEL_M: f64 = 0.8;
 /// Sides of the table, m, and how thick it is.
 const TABLE_M: [f64; 3] = [1.6, 1.2, 0.02];

@@ -1,15 +1,16 @@
-//! From one standing to the next without touching anything: at once, one arm after the other, or drawn back meanwhile.
+//! Motions from one pose of the arms to the next without touching anything: at once, one arm after the other, or with
+//! arms drawn back meanwhile.
 
 use super::arm::{Joints, SPEEDS_DEG, travel_secs};
 use super::cell::{Cell, Standing};
 
-/// Joints turn by at most this much between two looks, degrees: 850 mm of arm move 15 mm.
+/// Largest turn of a joint between two collision checks, degrees: 850 mm of arm move 15 mm.
 const STEP_DEG: f64 = 1.0;
-/// Shoulder and elbow of an arm that is drawn back, degrees: low over its foot, high, and half-way out; where one
-/// is in the way, another need not be.
+/// Shoulder and elbow of an arm that is drawn back, degrees: low over its foot, high, and half-way out; if one is
+/// blocked, another need not be.
 const BACKS_DEG: [[f64; 2]; 3] = [[-70.0, 130.0], [-30.0, 70.0], [-30.0, 115.0]];
 
-/// How both arms get from one standing to another.
+/// Order in which both arms get from one pose to another.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Course {
     /// Both at once.
@@ -40,7 +41,7 @@ impl Course {
         Self::MicrophoneLast,
     ];
 
-    // The standings on the way, the last included.
+    // The poses on the way, the last included.
     fn by(self, back_deg: [f64; 2], from: &Pose, to: &Pose) -> Vec<Pose> {
         let ([m0, s0], [m1, s1]) = (*from, *to);
         let [mb0, sb0, mb1, sb1] = [m0, s0, m1, s1].map(|joints| drawn_back(joints, back_deg));
@@ -64,10 +65,10 @@ fn drawn_back(mut joints: Joints, [shoulder, elbow]: [f64; 2]) -> Joints {
 
 type Pose = [Joints; 2];
 
-/// A way from one standing to another.
+/// A motion from one pose of both arms to another.
 #[derive(Debug, Clone)]
 pub struct Motion {
-    /// What it is.
+    /// Order of its moves.
     pub course: Course,
     /// Joints of microphone's and speaker's arm at each stop, the last included.
     pub stops: Vec<[Joints; 2]>,
@@ -75,7 +76,7 @@ pub struct Motion {
     pub secs: f64,
 }
 
-/// The quickest course on which nothing touches; none where there is none among [`Course::ALL`].
+/// Returns the quickest course on which nothing touches; None if there is none among [`Course::ALL`].
 pub fn course(cell: &Cell, from: &Standing, to: &Standing) -> Option<Motion> {
     let [from, to] = [from, to].map(|s| [s.microphone, s.speaker]);
     let motion = |(course, back_deg): (Course, [f64; 2])| {
@@ -108,7 +109,7 @@ fn is_clear(cell: &Cell, from: &Pose, to: &Pose) -> bool {
     (0..=steps).map(|i| i as f64 / steps as f64).all(|share| cell.is_clear(&between(0, share), &between(1, share)))
 }
 
-/// A standing as twelve times, s: the greatest difference of two is the time between them.
+/// Returns a pose as twelve times, s: the greatest difference of two is the time between them.
 pub(super) fn as_secs(standing: &Standing) -> [f32; 12] {
     std::array::from_fn(|i| {
         let joints = if i < 6 { &standing.microphone } else { &standing.speaker };

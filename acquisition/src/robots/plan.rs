@@ -1,5 +1,5 @@
-//! An order of standings that shortens travel: nearest neighbour, 2-opt, then swaps of neighbouring stretches that are
-//! kept where they help (iterated local search). Same seed, same order.
+//! An order of poses that shortens travel: nearest neighbour, 2-opt, then swaps of neighbouring stretches that are kept
+//! if they help (iterated local search). Same seed, same order.
 
 use rand::{Rng as _, SeedableRng as _};
 use rand_chacha::ChaCha8Rng;
@@ -7,17 +7,17 @@ use rand_chacha::ChaCha8Rng;
 use super::cell::Standing;
 use super::motion::as_secs;
 
-/// Standings near each one that 2-opt looks at.
+/// Nearest poses that 2-opt tries for each one.
 const NEIGHBOURS: usize = 10;
 /// Longest stretch that is swapped.
 const STRETCH: usize = 40;
 
-/// How hard to look.
+/// Effort of the search.
 #[derive(Debug, Clone, Copy)]
 pub struct PlanParams {
     /// Swaps that are tried; 100,000 take about a second.
     pub swaps: usize,
-    /// Which of them.
+    /// Seed of the random swaps.
     pub seed: u64,
 }
 
@@ -27,7 +27,7 @@ impl Default for PlanParams {
     }
 }
 
-/// Places in `standings`, in the order in which they are best visited, beginning at home.
+/// Returns indices of `standings`, in the order in which they are best visited, beginning at home.
 pub fn plan(standings: &[Standing], params: PlanParams) -> Vec<usize> {
     let mut tour = Tour::nearest(standings);
     tour.settle((0..tour.places.len()).collect());

@@ -1,4 +1,4 @@
-//! Whole runs of the small rig: stopped, gone on with, and ended.
+//! Whole runs of the small rig: stopped, resumed, and ended.
 
 use std::sync::atomic::{AtomicBool, Ordering};
 

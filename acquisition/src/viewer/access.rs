@@ -1,5 +1,6 @@
-//! Who may look on: programs, pages of this machine, pages that its user names; and from other machines, whoever has the
-//! token. A browser lets every page of the web open a WebSocket on loopback, and says which page it is.
+//! Access control of viewers: programs, pages of this machine, and pages that its user names may connect; clients on
+//! other machines need the token. A browser lets every page of the web open a WebSocket on loopback, and sends the
+//! page's origin.
 
 use std::net::SocketAddr;
 
@@ -8,19 +9,19 @@ use tungstenite::handshake::server::{ErrorResponse, Request};
 use tungstenite::http::StatusCode;
 use tungstenite::http::header::ORIGIN;
 
-/// The origin of viewers that are installed: to their browser (Electron) they are files of this machine.
+/// Origin of installed viewers: to their browser (Electron) they are files of this machine.
 const INSTALLED_VIEWER: &str = "file://";
 
-/// Who may look on beside programs and pages of this machine.
+/// Access beside programs and pages of this machine.
 #[derive(Debug, Clone, Default)]
 pub struct ViewerAccess {
     /// Origins of other pages, as `https://viewer.example`.
     pub allowed_origins: Vec<String>,
-    /// Whether other machines may look on without a token.
+    /// True if other machines need no token.
     pub is_open: bool,
 }
 
-/// What handshakes are checked by.
+/// Rules that handshakes are checked against.
 pub(super) struct AccessCheck {
     allowed_origins: Vec<String>,
     /// None if none is needed.
@@ -35,7 +36,7 @@ impl AccessCheck {
         Self { allowed_origins: access.allowed_origins, token }
     }
 
-    /// What a viewer opens.
+    /// Returns the URL for viewers, with the token.
     pub(super) fn url(&self, address: SocketAddr) -> String {
         let token = self.token.as_ref().map(|token| format!("/?token={token}")).unwrap_or_default();
         format!("ws://{address}{token}")

@@ -16,16 +16,16 @@ use super::protocol::{self, Wish};
 use super::queue::Outgoing;
 use super::{Queue, Shared};
 
-/// How often it is looked whether the client says something.
+/// Timeout of one wait for the client's messages.
 const LOOKS: Duration = Duration::from_millis(10);
-/// A client that takes nothing for so long is gone.
+/// Timeout of writes: a client that reads nothing for so long is disconnected.
 const PATIENCE: Duration = Duration::from_secs(10);
-/// What a client says is short.
+/// Limit of a client's message, bytes: requests are short.
 const LARGEST_WISH: usize = 1 << 20;
 
 /// Serves a client until it or the server is gone.
 pub(super) fn serve(stream: TcpStream, shared: &Shared) {
-    // Whatever goes wrong here, the client is gone, and comes again if it likes.
+    // After any error here the client is disconnected, and may connect again.
     let Ok(shaken) = shake_hands(stream, shared) else { return };
     let Some(queue) = shared.join() else { return };
     let _ = talk(shaken, shared, &queue);
@@ -80,7 +80,7 @@ fn talk(
         }
         socket.flush()?;
     }
-    // What came last is still shown.
+    // The last messages are still delivered.
     socket.close(None)?;
     Ok(socket.flush()?)
 }

@@ -1,19 +1,19 @@
-//! Handshakes that are not done yet. Each has a time limit in all, and each address a number of them, so that clients
-//! that never finish theirs keep nobody out: the oldest of their address goes for a new one.
+//! Pending handshakes. Each has a time limit in all, and each address a number of them, so that clients that never
+//! finish theirs keep no other client out: the oldest of their address is ended for a new one.
 
 use std::io::{self, Read, Write};
 use std::net::{IpAddr, Shutdown, TcpStream};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
-/// How long a handshake takes at most.
+/// Time limit of a handshake.
 pub(super) const LONGEST_HANDSHAKE: Duration = Duration::from_secs(5);
-/// Handshakes of one address at a time.
+/// Limit of pending handshakes per address.
 const MOST_OF_ADDRESS: usize = 8;
-/// Handshakes at a time.
+/// Limit of pending handshakes in all.
 const MOST_OF_ALL: usize = 64;
 
-/// Handshakes that are not done yet, oldest first.
+/// Handshakes in progress, oldest first.
 #[derive(Default)]
 pub(super) struct PendingHandshakes(Mutex<Vec<(IpAddr, Arc<TcpStream>)>>);
 
@@ -43,7 +43,7 @@ impl PendingHandshakes {
     }
 }
 
-/// A client's connection, whose reads end when the handshake's time is over, however slowly it drips.
+/// A client's connection, whose reads time out at the handshake's deadline, however slowly it drips.
 pub(super) struct TimedStream {
     pub(super) stream: Arc<TcpStream>,
     deadline: Option<Instant>,

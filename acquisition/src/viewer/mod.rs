@@ -1,7 +1,7 @@
-//! A Foxglove WebSocket server on plain threads: what live views and replays have in common.
+//! A Foxglove WebSocket server on plain threads, shared by live views and replays.
 //!
-//! It never waits for a client. What waits for one is bounded; one that does not keep up loses its oldest messages, but
-//! never their order, and nothing that tells it where things stand.
+//! It never waits for a client. A client's queue is bounded; a client that does not keep up loses its oldest messages,
+//! but never their order, and no message that tells it the current state.
 
 mod access;
 mod client;
@@ -23,40 +23,40 @@ use handshakes::PendingHandshakes;
 pub(crate) use protocol::{PlaybackRequest, PlaybackState, PlaybackStatus};
 pub(crate) use queue::{Queue, Waiting};
 
-/// Clients at a time.
+/// Limit of connected clients.
 const CLIENTS: usize = 16;
 
-/// A server. Dropped, it lets its clients go.
+/// A server. Dropped, it disconnects its clients.
 pub(crate) struct Server {
     address: SocketAddr,
     shared: Arc<Shared>,
     thread: Option<JoinHandle<()>>,
 }
 
-/// What may be controlled, where something may.
+/// Playback that clients may control.
 pub(crate) struct Playback {
     /// First and last time of the data, ns since 1970.
     pub(crate) range: (u64, u64),
-    /// Who obeys.
+    /// Queue of the player's commands.
     pub(crate) commands: SyncSender<Command>,
 }
 
-/// What clients want of a player.
+/// Requests of clients to a player.
 pub(crate) enum Command {
-    /// A client wants channels, and first what is known of them.
+    /// A client subscribed to channels, and first needs their current state.
     Subscribed(Arc<Queue>, BTreeSet<u16>),
     /// Play, pause, seek.
     Playback(PlaybackRequest),
 }
 
-/// What the server's threads share.
+/// State that the server's threads share.
 pub(crate) struct Shared {
     state: Mutex<State>,
     playback: Option<Playback>,
     access: AccessCheck,
     handshakes: PendingHandshakes,
     ended: AtomicBool,
-    /// Counts what changes the channels that are wanted.
+    /// Counts changes of the wanted channels.
     wishes: AtomicU64,
     /// Messages that clients lost.
     lost: AtomicU64,
@@ -65,7 +65,7 @@ pub(crate) struct Shared {
 #[derive(Default)]
 struct State {
     topics: Vec<Topic>,
-    /// The last message of each channel that is kept: who comes late sees where things stand.
+    /// The last message of each retained channel: new clients get it.
     last: BTreeMap<u16, Waiting>,
     clients: Vec<Arc<Queue>>,
 }
@@ -112,7 +112,7 @@ impl Server {
 impl Drop for Server {
     fn drop(&mut self) {
         self.shared.ended.store(true, Ordering::Relaxed);
-        // Its accept waits for somebody to come.
+        // Its accept waits for a connection.
         let _ = TcpStream::connect(self.address);
         if let Some(thread) = self.thread.take() {
             let _ = thread.join();
@@ -137,7 +137,7 @@ impl Shared {
         self.state().topics = topics;
     }
 
-    /// Those who look on.
+    /// Returns the connected clients.
     pub(crate) fn clients(&self) -> Vec<Arc<Queue>> {
         self.state().clients.clone()
     }
@@ -147,34 +147,34 @@ impl Shared {
         self.lost.load(Ordering::Relaxed)
     }
 
-    /// Changes whenever the wanted channels may have.
+    /// Returns a counter that changes whenever the wanted channels may have.
     pub(crate) fn wishes(&self) -> u64 {
         self.wishes.load(Ordering::Acquire)
     }
 
-    /// The channels whose messages go to somebody now.
+    /// Returns the channels whose messages go to any client now.
     pub(crate) fn wanted(&self) -> BTreeSet<u16> {
         self.state().clients.iter().flat_map(|client| client.receiving()).collect()
     }
 
-    /// Tells a client what is known of channels; what is new follows from here on.
+    /// Sends a client the current state of channels; new messages follow from here on.
     pub(crate) fn prime(&self, queue: &Queue, channels: &BTreeSet<u16>, known: &[Waiting]) {
         queue.prime(channels, known);
         self.wishes.fetch_add(1, Ordering::Release);
     }
 
-    /// Whether all who want something have enough to read: then nobody is served by more.
+    /// Returns whether all subscribed clients have enough to read: then more messages help none of them.
     pub(crate) fn all_are_busy(&self) -> bool {
         let state = self.state();
         let mut watching = state.clients.iter().filter(|client| client.is_receiving()).peekable();
         watching.peek().is_some() && watching.all(|client| client.is_busy())
     }
 
-    /// Sends a message to all who want it; keeps it for those who come late, where that is wished.
+    /// Sends a message to all its subscribers; retains it for new clients, if `is_kept`.
     pub(crate) fn send(&self, channel: u16, log_time_nanos: u64, data: &[u8], is_kept: bool) {
         let mut state = self.state();
         let wanted: Vec<_> = state.clients.iter().filter(|c| c.receives(channel)).cloned().collect();
-        // Nothing is copied for nobody.
+        // Without a receiver nothing is copied.
         if wanted.is_empty() && !is_kept {
             return;
         }
@@ -186,16 +186,16 @@ impl Shared {
         }
     }
 
-    /// A client wants channels from now on, and first what is known of them.
+    /// Subscribes a client to channels; it first gets their current state.
     fn subscribe(&self, queue: &Arc<Queue>, wishes: &[(u32, u16)]) {
         let channels: BTreeSet<u16> = wishes.iter().map(|(_, channel)| *channel).collect();
-        // Nothing new comes between what is known and what follows.
+        // No new message comes between the current state and those that follow.
         let state = self.state();
         wishes.iter().for_each(|(subscription, channel)| queue.subscribe(*channel, *subscription));
         match &self.playback {
             Some(playback) => {
                 drop(state);
-                // A player that is gone has nobody left to tell.
+                // A player that is gone has no use for it.
                 let _ = playback.commands.send(Command::Subscribed(queue.clone(), channels));
             }
             None => {
@@ -244,7 +244,7 @@ fn accept(listener: &TcpListener, shared: &Arc<Shared>) {
         threads.push(std::thread::spawn(move || client::serve(stream, &shared)));
     }
     for thread in threads {
-        // A client's thread that panicked is none of the run's business.
+        // A panic in a client's thread does not end the run.
         let _ = thread.join();
     }
 }

@@ -1,6 +1,6 @@
-//! What is said over the wire: Foxglove's WebSocket protocol, as far as a server needs it that only shows
-//! (<https://github.com/foxglove/ws-protocol/blob/main/docs/spec.md>), and playback control, which Foxglove's SDK adds to
-//! it (<https://github.com/foxglove/foxglove-sdk>, `rust/foxglove/src/protocol`).
+//! Messages of Foxglove's WebSocket protocol, as far as a server needs them that only shows data
+//! (<https://github.com/foxglove/ws-protocol/blob/main/docs/spec.md>), and playback control, which Foxglove's SDK adds
+//! to it (<https://github.com/foxglove/foxglove-sdk>, `rust/foxglove/src/protocol`).
 
 use base64::Engine as _;
 use base64::prelude::BASE64_STANDARD as BASE64;
@@ -8,8 +8,8 @@ use serde::{Deserialize, Serialize};
 
 use crate::recorder::Topic;
 
-/// The subprotocols that are spoken; for what is used here they are the same. The first that a client offers, too, is
-/// taken.
+/// The supported subprotocols; for the messages used here they are the same. The first that a client offers, too, is
+/// chosen.
 const SUBPROTOCOLS: [&str; 2] = ["foxglove.sdk.v1", "foxglove.websocket.v1"];
 /// Opcode of a message on a subscription.
 const MESSAGE_DATA: u8 = 0x01;
@@ -17,44 +17,44 @@ const MESSAGE_DATA: u8 = 0x01;
 const TIME: u8 = 0x02;
 /// Opcode of the state of playback.
 const PLAYBACK_STATE: u8 = 0x05;
-/// A client's opcode of a wish to control playback.
+/// Opcode of a client's playback request.
 const PLAYBACK_CONTROL: u8 = 0x03;
 const NANOS: u64 = 1_000_000_000;
 
-/// What a client wants.
+/// A client's request.
 #[derive(Debug, PartialEq)]
 pub(super) enum Wish {
     /// Subscriptions and their channels.
     Subscribe(Vec<(u32, u16)>),
     /// Subscriptions.
     Unsubscribe(Vec<u32>),
-    /// How playback goes on.
+    /// A playback request.
     Playback(PlaybackRequest),
 }
 
-/// How a client wants playback to go on.
+/// A request to control playback.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct PlaybackRequest {
-    /// Whether it plays or is paused.
+    /// True to play, false to pause.
     pub(crate) plays: bool,
     /// As a factor of real time.
     pub(crate) speed: f32,
     /// The time to go to first, ns since 1970.
     pub(crate) seek: Option<u64>,
-    /// What the answer names.
+    /// Identifier that the answer repeats.
     pub(crate) id: String,
 }
 
-/// What a player does.
+/// Status of a player.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum PlaybackStatus {
     Playing = 0,
     Paused = 1,
-    // 2 is buffering, which is not told: what is behind an index is there at once.
+    // 2 is buffering, which is not used: messages behind an index are there at once.
     Ended = 3,
 }
 
-/// How playback stands.
+/// State of playback.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct PlaybackState {
     pub(crate) status: PlaybackStatus,
@@ -62,9 +62,9 @@ pub(crate) struct PlaybackState {
     pub(crate) current_time: u64,
     /// As a factor of real time.
     pub(crate) speed: f32,
-    /// Time went elsewhere: what is on show is to be cleared.
+    /// Time was set: viewers clear their data.
     pub(crate) did_seek: bool,
-    /// Of the request that this answers; empty where it answers none.
+    /// Id of the request that this answers; empty if it answers none.
     pub(crate) request_id: String,
 }
 
@@ -98,13 +98,13 @@ struct Advertised<'a> {
     schema: String,
 }
 
-/// The subprotocol for a client that offers these headers.
+/// Returns the subprotocol for a client that offers these headers.
 pub(super) fn choose<'a>(offered: impl Iterator<Item = &'a str>) -> Option<&'static str> {
     let offered: Vec<_> = offered.flat_map(|header| header.split(',')).map(str::trim).collect();
     SUBPROTOCOLS.into_iter().find(|p| offered.contains(p))
 }
 
-/// The first thing that is said; `range` is first and last time where playback can be controlled.
+/// Returns the first message to a client; `range` is first and last time if playback can be controlled.
 pub(super) fn server_info(range: Option<(u64, u64)>) -> String {
     let name = concat!("echolake ", env!("CARGO_PKG_VERSION"));
     let mut info = serde_json::json!({"op": "serverInfo", "name": name, "capabilities": []});
@@ -118,7 +118,7 @@ pub(super) fn server_info(range: Option<(u64, u64)>) -> String {
     info.to_string()
 }
 
-/// What there is to subscribe to.
+/// Returns the message that advertises the channels.
 pub(super) fn advertise(topics: &[Topic]) -> String {
     let channels: Vec<_> = topics
         .iter()
@@ -134,7 +134,7 @@ pub(super) fn advertise(topics: &[Topic]) -> String {
     serde_json::json!({"op": "advertise", "channels": channels}).to_string()
 }
 
-/// A message on a subscription.
+/// Returns a message on a subscription.
 pub(super) fn message_data(subscription: u32, log_time_nanos: u64, data: &[u8]) -> Vec<u8> {
     let mut out = Vec::with_capacity(13 + data.len());
     out.push(MESSAGE_DATA);
@@ -144,13 +144,13 @@ pub(super) fn message_data(subscription: u32, log_time_nanos: u64, data: &[u8]) 
     out
 }
 
-/// What the time is.
+/// Returns the message that tells the time.
 pub(super) fn time(nanos: u64) -> Vec<u8> {
     [&[TIME][..], &nanos.to_le_bytes()].concat()
 }
 
 impl PlaybackState {
-    /// As it is sent: status, time, speed, whether time went elsewhere, length and letters of the request's name.
+    /// Encodes it: status, time, speed, whether time was set, length and bytes of the request's id.
     pub(crate) fn encode(&self) -> Vec<u8> {
         let mut out = vec![PLAYBACK_STATE, self.status as u8];
         out.extend(self.current_time.to_le_bytes());
@@ -162,7 +162,7 @@ impl PlaybackState {
     }
 }
 
-/// A client's wish to control playback: command, speed, whether it seeks, whereto, length and letters of its name.
+/// Decodes a client's playback request: command, speed, whether it seeks, its target time, length and bytes of its id.
 pub(super) fn playback_request(bytes: &[u8]) -> Option<PlaybackRequest> {
     let (opcode, rest) = bytes.split_first()?;
     let (command, rest) = rest.split_first().filter(|_| *opcode == PLAYBACK_CONTROL)?;
@@ -183,7 +183,7 @@ pub(super) fn playback_request(bytes: &[u8]) -> Option<PlaybackRequest> {
     })
 }
 
-/// What a client says; nothing where it is of no interest to a server that only shows.
+/// Parses a client's request; None if it does not concern a server that only shows data.
 pub(super) fn wish(text: &str) -> Option<Wish> {
     Some(match serde_json::from_str(text).ok()? {
         FromClient::Subscribe { subscriptions } => {

@@ -1,12 +1,12 @@
-//! What waits for one client.
+//! Queue of messages for one client.
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
-/// Bytes that wait for one client at most: two minutes of a real rig's sweeps.
+/// Limit of pending messages for one client, bytes: two minutes of a real rig's sweeps.
 pub(super) const WAITING_BYTES: usize = 16 << 20;
 
-/// A message on its way.
+/// A pending message.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct Waiting {
     pub(crate) channel: u16,
@@ -14,7 +14,7 @@ pub(crate) struct Waiting {
     pub(crate) data: Arc<[u8]>,
 }
 
-/// What is sent.
+/// The next item to send to a client.
 #[derive(Debug, PartialEq, Eq)]
 pub(crate) enum Outgoing {
     /// A message and its subscription.
@@ -25,7 +25,7 @@ pub(crate) enum Outgoing {
     State(Vec<u8>),
 }
 
-/// What waits for one client.
+/// Pending messages of one client.
 #[derive(Default)]
 pub(crate) struct Queue {
     inner: Mutex<Inner>,
@@ -34,9 +34,9 @@ pub(crate) struct Queue {
 #[derive(Default)]
 struct Inner {
     entries: VecDeque<Entry>,
-    /// Of messages that may be lost.
+    /// Bytes of messages that may be dropped.
     bytes: usize,
-    /// Of those that may not.
+    /// Bytes of messages that may not.
     kept: usize,
     wanted: BTreeMap<u16, Wanted>,
     /// The client controls playback, so it understands states.
@@ -46,14 +46,14 @@ struct Inner {
 /// A subscription.
 struct Wanted {
     subscription: u32,
-    /// Whether it was told what is known, so that what is new may follow.
+    /// True after it got the current state, so that new messages may follow.
     primed: bool,
 }
 
 enum Entry {
-    /// May be lost.
+    /// May be dropped.
     Message(Waiting),
-    /// Tells where things stand: only a later one of its channel takes its place.
+    /// Current state of its channel, which is not dropped.
     Kept(Waiting),
     Time(u64),
     State(Vec<u8>),
@@ -84,28 +84,28 @@ impl Queue {
         self.inner().wanted.keys().copied().collect()
     }
 
-    /// Those of them whose messages go to it now.
+    /// Returns the subscribed channels whose messages go to it now.
     pub(super) fn receiving(&self) -> Vec<u16> {
         self.inner().wanted.iter().filter(|(_, wanted)| wanted.primed).map(|(channel, _)| *channel).collect()
     }
 
-    /// Whether messages of some channel go to it now.
+    /// Returns whether messages of any channel go to it now.
     pub(super) fn is_receiving(&self) -> bool {
         self.inner().wanted.values().any(|wanted| wanted.primed)
     }
 
-    /// Whether messages of a channel go to it now.
+    /// Returns whether messages of a channel go to it now.
     pub(crate) fn receives(&self, channel: u16) -> bool {
         self.inner().wanted.get(&channel).is_some_and(|w| w.primed)
     }
 
-    /// Whether it has enough to read for now.
+    /// Returns whether it has enough to read for now.
     pub(super) fn is_busy(&self) -> bool {
         let inner = self.inner();
         inner.bytes + inner.kept >= WAITING_BYTES / 2
     }
 
-    /// Bytes of messages that wait.
+    /// Returns the bytes of pending messages.
     #[cfg(test)]
     pub(crate) fn bytes(&self) -> usize {
         self.inner().bytes
@@ -123,14 +123,14 @@ impl Queue {
         self.inner().controls = true;
     }
 
-    /// Tells what is known of channels, by time; what is new follows from here on.
+    /// Queues the current state of channels, by time; new messages follow from here on.
     pub(crate) fn prime(&self, channels: &BTreeSet<u16>, known: &[Waiting]) {
         let mut inner = self.inner();
         inner.wanted.iter_mut().filter(|(id, _)| channels.contains(id)).for_each(|(_, wanted)| wanted.primed = true);
         let known: Vec<_> = known.iter().filter(|waiting| channels.contains(&waiting.channel)).cloned().collect();
         let new: usize = known.iter().map(|waiting| waiting.data.len()).sum();
         if inner.kept + new > WAITING_BYTES {
-            // Whoever has not read for so long how things stood need not know any more.
+            // A client that has not read the older state for so long does not need it any more.
             inner.entries.retain(|e| !matches!(e, Entry::Kept(waiting) if channels.contains(&waiting.channel)));
             inner.kept = inner.entries.iter().map(Entry::kept).sum();
         }
@@ -138,7 +138,7 @@ impl Queue {
         inner.entries.extend(known.into_iter().map(Entry::Kept));
     }
 
-    /// A new message; returns how many old ones are lost by it.
+    /// Queues a new message; returns how many old ones are dropped for it.
     pub(super) fn push(&self, message: Waiting) -> u64 {
         let mut inner = self.inner();
         inner.bytes += message.data.len();
@@ -146,7 +146,7 @@ impl Queue {
         let mut lost = 0;
         while inner.bytes > WAITING_BYTES {
             let oldest = inner.entries.iter().position(|entry| matches!(entry, Entry::Message(_)));
-            // The newest is sent however large it is.
+            // The newest is sent, whatever its size.
             let Some(oldest) = oldest.filter(|at| at + 1 < inner.entries.len()) else { break };
             inner.bytes -= inner.entries.remove(oldest).map_or(0, |entry| entry.bytes());
             lost += 1;
@@ -154,7 +154,7 @@ impl Queue {
         lost
     }
 
-    /// What the time is; only the latest of times that wait together matters.
+    /// Queues the time; of several pending times only the latest matters.
     pub(crate) fn tell_time(&self, nanos: u64) {
         let mut inner = self.inner();
         if let Some(Entry::Time(_)) = inner.entries.back() {
@@ -163,7 +163,7 @@ impl Queue {
         inner.entries.push_back(Entry::Time(nanos));
     }
 
-    /// How playback stands, for those who control it.
+    /// Queues the state of playback, if the client controls it.
     pub(crate) fn tell_state(&self, encoded: Vec<u8>) {
         let mut inner = self.inner();
         if inner.controls {
@@ -171,8 +171,8 @@ impl Queue {
         }
     }
 
-    /// Forgets what waits, because it is of another time; states are answers and stay. Channels want to be told anew what
-    /// is known.
+    /// Drops pending messages, because they are of another time; states are answers and stay. Channels need their
+    /// current state anew.
     pub(crate) fn forget(&self) {
         let mut inner = self.inner();
         inner.entries.retain(|entry| matches!(entry, Entry::State(_)));
@@ -180,7 +180,7 @@ impl Queue {
         inner.wanted.values_mut().for_each(|wanted| wanted.primed = false);
     }
 
-    /// The next that is sent.
+    /// Returns the next item to send.
     pub(crate) fn pop(&self) -> Option<Outgoing> {
         let mut inner = self.inner();
         loop {
@@ -252,7 +252,7 @@ mod tests {
         queue.tell_time(3);
         queue.tell_time(4);
         assert_eq!(drained(&queue), [(0, 0), (1, 2), (1, 3), (1, 3), (0, 4)]);
-        // What nobody reads does not grow without bounds.
+        // A queue that is not read does not grow without bounds.
         for time in 0..9 {
             queue.prime(&[1].into(), &[waiting(1, time, WAITING_BYTES / 2)]);
             assert!(queue.is_busy());

@@ -1,21 +1,21 @@
-//! Where in a recording an output begins: the delay at which both are most alike.
+//! Delay of an output in a recording: the one of highest correlation.
 
 use echolake_dsp::Real as _;
 use realfft::num_complex::Complex;
 
-/// Where an output begins in a recording.
+/// Position of an output in a recording.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Delay {
-    /// Samples.
+    /// First sample of the output.
     pub(super) at: usize,
     /// Correlation there, -1 to 1.
     pub(super) likeness: f64,
 }
 
-/// Finds an output in a recording that is longer than it. A recording that holds nothing has a likeness of 0.
+/// Finds an output in a recording that is longer than it. A silent recording has a likeness of 0.
 ///
 /// output     `[n]`      full scale 1.0
-/// recording  `[n + m]`  any scale; delays 0 to m are looked at
+/// recording  `[n + m]`  any scale; delays 0 to m are tried
 pub(super) fn locate(output: &[f32], recording: &[i32]) -> Delay {
     let (Some(most), false) = (recording.len().checked_sub(output.len()), output.is_empty()) else {
         return Delay { at: 0, likeness: 0.0 };

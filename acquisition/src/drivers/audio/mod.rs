@@ -1,5 +1,5 @@
-//! What every audio interface needs above its system's calls: takes that begin with the output to the sample, gaps
-//! that are noticed, takes that are repeated. [`Duplex`] is what a system provides.
+//! Alignment common to all audio interfaces, above the system's calls: takes that begin with the output to the sample,
+//! detection of gaps, retries. [`Duplex`] is the part of a system.
 
 mod delay;
 #[cfg(test)]
@@ -11,11 +11,11 @@ use crate::rig::{AudioInterface, Error, Take};
 use delay::{Delay, locate};
 
 pub(crate) const DEVICE: &str = "audio interface";
-/// Least likeness of loopback and output, -1 to 1: below it the loopback is something else.
+/// Least correlation of loopback and output, -1 to 1: below it the loopback carries something else.
 const LIKENESS: f64 = 0.5;
-/// An output below this has no start that could be found, rms re full scale.
+/// Least level of an output whose start can be found, rms re full scale.
 const SILENCE: f64 = 1e-5;
-/// Parts of an output shorter than this are not looked for by themselves.
+/// Shortest part of an output that is searched by itself, samples.
 const SHORTEST_PART: usize = 512;
 
 /// Plays and records at the same time; the start of one against the other is not known.
@@ -40,10 +40,10 @@ pub struct Recorded {
     pub loopback: Vec<i32>,
 }
 
-/// Why nothing whole was recorded.
+/// A transfer that gave no complete recording.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Trouble {
-    /// The computer was too late to fetch or to bring samples; another try may do.
+    /// The computer was too late to fetch or to bring samples; a retry may succeed.
     Late(String),
     /// The device is gone or refuses.
     Gone(String),
@@ -93,7 +93,7 @@ impl<D: Duplex> Aligned<D> {
         if found.likeness < LIKENESS {
             return Err(Failure::Final(self.no_loopback(&found)));
         }
-        // A gap moves what comes behind it, and no counter need have noticed.
+        // A gap moves the samples behind it, and the system's counters may miss it.
         let part = output.len() / 3;
         if part >= SHORTEST_PART {
             let ends = [0, output.len() - part].map(|from| {
@@ -118,7 +118,7 @@ impl<D: Duplex> Aligned<D> {
     }
 }
 
-/// Whether another try may do.
+/// A failed attempt: `Again` may be retried, `Final` not.
 enum Failure {
     Again(String),
     Final(String),

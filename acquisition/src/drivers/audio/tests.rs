@@ -1,4 +1,4 @@
-//! Takes over a duplex with a cable, and with everything that can happen to one.
+//! Takes over a duplex with a cable, and with every fault that can happen to one.
 
 use super::*;
 use crate::conformance;
@@ -52,7 +52,7 @@ fn with(faults: &[Fault]) -> Aligned<Cable> {
     since(Timestamp(1_000), faults)
 }
 
-/// A cable whose clock stands at `now`.
+/// A cable whose clock begins at `now`.
 pub(in crate::drivers) fn since(now: Timestamp, faults: &[Fault]) -> Aligned<Cable> {
     Aligned::new(Cable { faults: faults.to_vec(), now, gain: 0.9 }, 0.05, 2)
 }

@@ -1,5 +1,5 @@
-//! A rosbridge with two arms behind it that are made of air: for tests, and for trying clients out. It speaks protocol
-//! v2 over WebSocket: `subscribe`, `advertise`, `publish`, `call_service`.
+//! A rosbridge with two fake arms behind it: for tests, and for trying clients out. It speaks protocol v2 over
+//! WebSocket: `subscribe`, `advertise`, `publish`, `call_service`.
 
 use std::io::ErrorKind;
 use std::net::{SocketAddr, TcpListener, TcpStream};
@@ -13,33 +13,33 @@ use tungstenite::{Message, WebSocket};
 
 use crate::robots::{Joints, Standing};
 
-/// Between two joint states.
+/// Interval between two joint states.
 const TICK: Duration = Duration::from_millis(20);
-/// One wait for a client's message.
+/// Timeout of one wait for a client's message.
 const PAUSE: Duration = Duration::from_millis(5);
-/// A client that takes longer over its handshake, or takes nothing for so long, is gone.
+/// Timeout of a client's handshake and of writes to it.
 const CLIENT_LIMIT: Duration = Duration::from_secs(30);
 /// Namespaces of the two arms.
 const NAMES: [&str; 2] = ["/microphone", "/speaker"];
 
-/// What the arms do wrong.
+/// A fault of the fake arms or their bridge.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Fault {
     /// Nothing.
     None,
-    /// Trajectories are answered by a complaint of the bridge.
+    /// The bridge answers trajectories with an error.
     Refuses,
     /// Arms stop half-way.
     StopsHalfWay,
-    /// Somebody has pressed the emergency stop.
+    /// The emergency stop is pressed.
     EmergencyStop,
-    /// Joint states do not come any more.
+    /// Joint states stop.
     Silent,
     /// Motors cannot be switched on.
     NoPower,
     /// The connection is closed at the next message.
     HangsUp,
-    /// What comes is no JSON.
+    /// Messages are not JSON.
     Nonsense,
 }
 
@@ -56,7 +56,7 @@ struct World {
     fault: Fault,
 }
 
-/// An arm on its way from one standing to another.
+/// An arm on its way from one pose to another.
 struct Arm {
     from: Joints,
     to: Joints,
@@ -96,12 +96,12 @@ impl FakeBridge {
         format!("ws://{}", self.address)
     }
 
-    /// What the arms do wrong from now on.
+    /// Sets the fault from now on.
     pub fn set_fault(&self, fault: Fault) {
         lock(&self.world).fault = fault;
     }
 
-    /// Whether both arms' motors are on.
+    /// Returns whether both arms' motors are on.
     pub fn has_power(&self) -> bool {
         lock(&self.world).arms.iter().all(|arm| arm.power)
     }
@@ -229,7 +229,7 @@ impl Client {
     }
 }
 
-// Sends an arm on its way; complains where it does not go.
+// Starts an arm's move; returns a complaint if it is refused.
 fn follow(topic: &str, message: &Value, world: &mut World) -> Option<&'static str> {
     let Some(i) = NAMES.iter().position(|n| topic.strip_prefix(n) == Some("/joint_path_command")) else {
         return Some("nobody listens to this topic");

@@ -1,5 +1,5 @@
-//! Both arms behind a rosbridge (WebSocket, JSON): trajectories out, joint states in, motors on and off. Where the
-//! arms stand for a pair, and how they get there without touching, is decided here, by [`crate::robots`].
+//! Both arms behind a rosbridge (WebSocket, JSON): trajectories out, joint states in, motors on and off. The joints for
+//! a pair, and the way there without touching, are computed here, by [`crate::robots`].
 
 pub mod fake;
 #[cfg(test)]
@@ -18,13 +18,13 @@ use crate::robots::{Aim, Cell, Joints, Standing, course};
 use wire::{Incoming, Side};
 
 const DEVICE: &str = "robots";
-/// One wait for a message.
+/// Timeout of one wait for a message.
 const PAUSE: Duration = Duration::from_millis(2);
-/// Longest time in which messages that are waiting are cleared away.
+/// Longest time in which pending messages are discarded.
 const CLEARING: Duration = Duration::from_millis(500);
-/// A move takes this long at least, s: an arm does not start at once.
+/// Least duration of a move, s: an arm does not start at once.
 const LEAST_SECS: f64 = 0.05;
-/// A target counts as reached where this many joint states in a row say so.
+/// Joint states in a row that have to be near the target before it counts as reached.
 const STANDS: usize = 3;
 
 type Socket = WebSocket<MaybeTlsStream<TcpStream>>;
@@ -42,10 +42,10 @@ pub struct RosbridgeRobots {
 }
 
 impl RosbridgeRobots {
-    /// Connects, and waits until both arms tell where they stand. The motors stay as they are.
+    /// Connects, and waits until both arms have sent their joints. The motors stay as they are.
     ///
     /// # Errors
-    /// [`Error::Device`] where the bridge or an arm does not answer.
+    /// [`Error::Device`] if the bridge or an arm does not answer.
     pub fn connect(params: &RosbridgeParams, cell: Cell) -> Result<Self, Error> {
         let mut robots = Self {
             params: params.clone(),
@@ -115,14 +115,14 @@ impl RosbridgeRobots {
         }
     }
 
-    // The next call connects anew; until then nobody knows whether the motors are on.
+    // The next call connects anew; until then the state of the motors is unknown.
     fn lost(&mut self, why: &str) -> Error {
         self.socket = None;
         self.power = Power::Off;
         failure(format!("lost `{}`: {why}; hint: is the controller still on, the cable plugged in?", self.params.url))
     }
 
-    // What is there is old; each arm's next joint states are waited for.
+    // Pending messages are old; each arm's next joint states are waited for.
     fn current(&mut self) -> Result<[Joints; 2], Error> {
         let cleared = Instant::now() + CLEARING;
         while self.receive()?.is_some() && Instant::now() < cleared {}

@@ -1,11 +1,11 @@
-//! rosbridge's JSON (protocol v2): what is sent, and what of the answers matters here.
+//! rosbridge's JSON (protocol v2): the messages that are sent, and the answers as far as the driver needs them.
 
 use echolake_schema::devices::RosbridgeParams;
 use serde_json::{Value, json};
 
 use crate::robots::Joints;
 
-/// Which arm.
+/// One of the two arms.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Side {
     /// The microphone's.
@@ -32,19 +32,19 @@ impl Side {
 pub enum Incoming {
     /// An arm's joints.
     Joints(Side, Joints),
-    /// An arm has stopped for a reason of its own.
+    /// An arm has stopped by itself, with the reason.
     Fault(Side, String),
-    /// An arm is well.
+    /// An arm has no fault.
     Well(Side),
-    /// An answer to a call: its id, whether it succeeded, and words.
+    /// An answer to a call: its id, whether it succeeded, and its text.
     Answer(String, bool, String),
-    /// The bridge complains.
+    /// The bridge reports an error.
     Complaint(String),
-    /// Nothing that matters here.
+    /// A message without use here.
     Other,
 }
 
-/// What is said at the beginning: joints and states are wanted, trajectories will come.
+/// Returns the messages that open a session: subscriptions to joints and states, announcement of trajectories.
 pub fn greeting(params: &RosbridgeParams) -> Vec<Value> {
     let topics = |side: Side| {
         let name = side.namespace(params);
@@ -61,7 +61,7 @@ pub fn greeting(params: &RosbridgeParams) -> Vec<Value> {
     warnings.into_iter().chain(Side::BOTH.into_iter().flat_map(topics)).collect()
 }
 
-/// A trajectory of one point, from where the arm stands.
+/// Returns a trajectory of one point, from the arm's current joints.
 pub fn trajectory(params: &RosbridgeParams, side: Side, target: &Joints, secs: f64) -> Value {
     let still: Joints = [0.0; 6];
     let point = json!({
@@ -83,7 +83,7 @@ pub fn trigger(params: &RosbridgeParams, side: Side, service: &str, id: &str) ->
 /// Reads a message.
 ///
 /// # Errors
-/// What is wrong with it.
+/// A text that names the fault in the message.
 pub fn read(text: &str, params: &RosbridgeParams) -> Result<Incoming, String> {
     let value: Value = serde_json::from_str(text).map_err(|e| format!("no JSON: {e}"))?;
     let word = |value: &Value| value.as_str().unwrap_or_default().to_owned();
@@ -91,7 +91,7 @@ pub fn read(text: &str, params: &RosbridgeParams) -> Result<Incoming, String> {
         Some("publish") => published(&value["topic"], &value["msg"], params),
         Some("service_response") => {
             let said = &value["values"];
-            // The bridge says whether the call came through, the service whether it did what it was told.
+            // The bridge reports whether the call came through, the service whether it succeeded.
             let done = value["result"].as_bool().unwrap_or(true) && said["success"].as_bool().unwrap_or(true);
             let words = if said.is_string() { word(said) } else { word(&said["message"]) };
             Ok(Incoming::Answer(word(&value["id"]), done, words))

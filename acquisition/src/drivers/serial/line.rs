@@ -1,6 +1,7 @@
-//! One line of the ambient sensor: `T=21.53 RH=45.2 P=965.1 L=42.0`, with `*hh` behind it where the sensor sends a sum.
+//! One line of the ambient sensor: `T=21.53 RH=45.2 P=965.1 L=42.0`, with `*hh` behind it if the sensor sends a
+//! checksum.
 
-/// What a line says.
+/// Values of one line.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Line {
     /// Temperature, C.
@@ -18,7 +19,7 @@ const VALUES: [(&str, f64, f64); 4] =
     [("T", -40.0, 85.0), ("RH", 0.0, 100.0), ("P", 300.0, 1_100.0), ("L", 0.0, 150.0)];
 
 impl Line {
-    /// Reads a line without its end. None where it is empty or a comment, which begins with `#`.
+    /// Reads a line without its end. None if it is empty or a comment, which begins with `#`.
     ///
     /// # Errors
     /// What is wrong with it.

@@ -1,4 +1,4 @@
-//! The ambient sensor on a serial line. It sends lines by itself; [`mod@line`] says what stands in them.
+//! The ambient sensor on a serial line. It sends lines by itself; [`mod@line`] has their format.
 
 pub mod line;
 #[cfg(test)]
@@ -14,26 +14,26 @@ use crate::rig::{AmbientSensor, Error, Reading};
 use line::Line;
 
 const DEVICE: &str = "ambient sensor";
-/// One wait for bytes; what comes without a pause of this length is taken together.
+/// Timeout of one wait for bytes; bytes without a pause of this length are taken together.
 const PAUSE: Duration = Duration::from_millis(30);
-/// Between two tries to open a lost line.
+/// Interval between two tries to open a lost line.
 const RETRY: Duration = Duration::from_millis(100);
-/// A line without an end is not kept beyond this.
+/// Most bytes of a line, end excluded.
 const LONGEST_LINE: usize = 1024;
 
 /// A sensor on a serial line.
 pub struct SerialSensor {
     params: SerialParams,
     port: Option<SerialPort>,
-    /// What came since the last end of a line.
+    /// Bytes since the last end of a line.
     bytes: Vec<u8>,
-    /// Whether a line's end was seen since the line was opened: what stands before the first one was cut off.
+    /// True after the first end of a line since the line was opened: the text before it was cut off.
     in_step: bool,
     last: Timestamp,
     notices: Vec<String>,
 }
 
-/// What was taken in while one reading was waited for.
+/// Lines received while waiting for one reading.
 #[derive(Default)]
 struct Taken {
     line: Option<Line>,
@@ -46,7 +46,7 @@ impl SerialSensor {
     /// Opens the line.
     ///
     /// # Errors
-    /// [`Error::Device`] where that fails.
+    /// [`Error::Device`] if that fails.
     pub fn open(params: &SerialParams) -> Result<Self, Error> {
         let mut sensor = Self {
             params: params.clone(),
@@ -73,7 +73,7 @@ impl SerialSensor {
         Ok(())
     }
 
-    // What is there already, or comes until a pause. An error means that the line is gone.
+    // Reads the bytes that are there already, or come until a pause. An error means that the line is gone.
     fn take(&mut self, taken: &mut Taken) -> std::io::Result<()> {
         let mut buffer = [0; 512];
         loop {

@@ -8,9 +8,9 @@ use std::thread::JoinHandle;
 use super::*;
 use crate::conformance;
 
-/// For lines that come: a busy machine needs some of it.
+/// Timeout for lines that come: a busy machine needs some of it.
 pub(in crate::drivers) const PATIENT_SECS: f64 = 60.0;
-/// For lines that never come, which is what the test is about.
+/// Timeout for lines that never come, as these tests want it.
 pub(in crate::drivers) const IMPATIENT_SECS: f64 = 1.0;
 pub(in crate::drivers) const GOOD: &str = "T=21.50 RH=45.0 P=965.0 L=42.0\n";
 
@@ -18,7 +18,7 @@ pub(in crate::drivers) const GOOD: &str = "T=21.50 RH=45.0 P=965.0 L=42.0\n";
 pub(in crate::drivers) struct FakeSensor {
     path: String,
     text: Arc<Mutex<&'static str>>,
-    /// How often the text was sent.
+    /// Number of times that the text was sent.
     count: Arc<AtomicUsize>,
     stop: Arc<AtomicBool>,
     thread: Option<JoinHandle<()>>,

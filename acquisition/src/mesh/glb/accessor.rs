@@ -10,7 +10,7 @@ pub(super) struct File<'a> {
     pub(super) bin: &'a [u8],
 }
 
-/// What an accessor leads to.
+/// Bytes of an accessor's elements.
 struct Elements<'a> {
     kind: u64,
     bytes: &'a [u8],
@@ -42,7 +42,7 @@ fn number_or(value: &Value, default: usize) -> Option<usize> {
 }
 
 impl<'a> File<'a> {
-    /// How many elements an accessor says that it has.
+    /// Returns the number of elements that an accessor declares.
     pub(super) fn count(&self, accessor: &Value) -> Option<usize> {
         number(&self.accessor(accessor)?["count"])
     }
@@ -66,7 +66,7 @@ impl<'a> File<'a> {
         list(&self.document["accessors"]).get(number(index)?)
     }
 
-    // None where the accessor leads out of the file, or is sparse: that kind is not read.
+    // None if the accessor leads out of the file, or is sparse: that kind is not read.
     fn elements(&self, accessor: &Value, shape: &str, width: usize) -> Option<Elements<'a>> {
         let accessor = self.accessor(accessor)?;
         let view = list(&self.document["bufferViews"]).get(number(&accessor["bufferView"])?)?;

@@ -19,7 +19,7 @@ const MOST: usize = 6_000_000;
 /// As messages say it.
 const AT_MOST: &str = "up to 6 million vertices and as many triangles in all instances";
 
-/// Reads positions and triangles of every mesh in the file's scene, each where its nodes place it.
+/// Reads positions and triangles of every mesh in the file's scene, each transformed by its nodes.
 pub(crate) fn parse(bytes: &[u8], path: &Path) -> Result<Mesh, Error> {
     read(bytes).map_err(|Wrong { place, actual, expected }| Error::Syntax {
         path: path.to_owned(),
@@ -47,7 +47,7 @@ fn read(bytes: &[u8]) -> Result<Mesh, Wrong> {
     Ok(mesh)
 }
 
-// The chunks of the file: its JSON, and its numbers where it has any.
+// The chunks of the file: its JSON, and its numbers, if any.
 fn open(bytes: &[u8]) -> Result<File<'_>, Wrong> {
     let word = |at: usize| Some(u32::from_le_bytes(bytes.get(at..at + 4)?.try_into().ok()?) as usize);
     if bytes.get(..4) != Some(MAGIC) || word(4) != Some(2) {
@@ -66,7 +66,7 @@ fn open(bytes: &[u8]) -> Result<File<'_>, Wrong> {
     Ok(File { document, bin })
 }
 
-// Adds a primitive where its node stands; what is wrong is told as what is there and what should be.
+// Adds a primitive with its node's transform; an error has the actual and the expected content.
 fn append(
     mesh: &mut Mesh,
     file: &File<'_>,

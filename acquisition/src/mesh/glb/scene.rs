@@ -1,4 +1,4 @@
-//! Where a GLB file's meshes stand: the transforms along its tree of nodes.
+//! Positions of a GLB file's meshes: the transforms along its tree of nodes.
 
 use serde_json::Value;
 
@@ -8,15 +8,15 @@ use super::accessor::{list, number};
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Transform([[f64; 4]; 3]);
 
-/// A mesh and where it stands.
+/// A mesh and its transform.
 #[derive(Debug, PartialEq)]
 pub(super) struct Instance {
-    /// Its place in `meshes`.
+    /// Its index in `meshes`.
     pub(super) mesh: usize,
     pub(super) transform: Transform,
 }
 
-/// What is wrong with a scene.
+/// A fault of a scene.
 #[derive(Debug, PartialEq)]
 pub(super) struct Wrong {
     pub(super) place: String,
@@ -32,7 +32,7 @@ impl Transform {
         self.0.map(|[a, b, c, d]| (a * p[0] + b * p[1] + c * p[2] + d) as f32)
     }
 
-    /// Whether it turns the inside of a solid out.
+    /// Returns whether it turns the inside of a solid out.
     pub(super) fn mirrors(&self) -> bool {
         let [[a, b, c, _], [d, e, f, _], [g, h, i, _]] = self.0;
         a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g) < 0.0
@@ -62,7 +62,7 @@ impl Transform {
     }
 }
 
-// As many finite numbers; the default where there is nothing.
+// Reads N finite numbers; the default if there are none.
 fn numbers<const N: usize>(value: &Value, default: [f64; N]) -> Option<[f64; N]> {
     if value.is_null() {
         return Some(default);
@@ -71,8 +71,8 @@ fn numbers<const N: usize>(value: &Value, default: [f64; N]) -> Option<[f64; N]>
     found?.try_into().ok()
 }
 
-/// The meshes of the file's scene, in the order of its tree. A file without nodes is a library of meshes: each stands
-/// where it is.
+/// The meshes of the file's scene, in the order of its tree. A file without nodes is a library of meshes: each
+/// keeps its place.
 pub(super) fn instances(document: &Value) -> Result<Vec<Instance>, Wrong> {
     let (nodes, meshes) = (list(&document["nodes"]), list(&document["meshes"]).len());
     if nodes.is_empty() {
@@ -101,7 +101,7 @@ pub(super) fn instances(document: &Value) -> Result<Vec<Instance>, Wrong> {
     Ok(found)
 }
 
-// The nodes of the scene that is to be shown; without scenes, all that are nobody's children.
+// The nodes of the default scene; without scenes, all that have no parent.
 fn roots(document: &Value, nodes: &[Value]) -> Result<Vec<usize>, Wrong> {
     let scenes = list(&document["scenes"]);
     if !scenes.is_empty() {
