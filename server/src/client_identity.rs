@@ -1,4 +1,4 @@
-//! Who asks: what the door found out about a client, and an engine is told.
+//! The identity of a client: the door determines it and passes it to the client's engine.
 
 use std::time::Duration;
 
@@ -8,16 +8,16 @@ use serde::{Deserialize, Serialize};
 use crate::fault::Fault;
 use crate::tokens::Scope;
 
-/// Name of the client that stands for the server's own pages, where there are no tokens.
+/// Name of the client for requests of the server's own pages, if there are no tokens.
 const PAGES: &str = "pages";
-/// Name of the client that stands for all pages of elsewhere.
+/// Name of the client for requests of pages from other origins.
 const FOREIGN: &str = "foreign pages";
 
-/// Name of the client that stands for all programs of this machine that ask over HTTP or Flight SQL.
+/// Name of the client for all programs of this machine that send requests over HTTP or Flight SQL.
 const PROGRAMS: &str = "programs";
 
-/// Returns how much of a limit of memory operators may count, who say that they hold less than they do: queries that are
-/// refused more memory end alone, not their engine.
+/// Returns the part of a memory limit that operators may account for. They report less than they hold; with this
+/// margin, a query that is refused more memory fails alone and does not end its engine.
 pub(crate) fn counted_bytes(memory: usize) -> usize {
     memory / 8 * 7
 }
@@ -27,7 +27,7 @@ pub(crate) fn counted_bytes(memory: usize) -> usize {
 pub(crate) struct ClientIdentity {
     /// Name for logs and refusals; each has an engine of its own.
     pub(crate) name: String,
-    /// Whether the server has no tokens, so that requests of foreign pages must be told from others.
+    /// True if the server has no tokens, so that requests of foreign pages must be distinguished from others.
     pub(crate) is_open: bool,
     pub(crate) scopes: Vec<Scope>,
     /// Limits, as [`Quota`] has them.

@@ -1,5 +1,5 @@
-//! Why a request has no answer, with a code that stays the same over versions and protocols. Each protocol says it in
-//! its own words in one place: `http/problem.rs`, `flight/status.rs`, `postgres/sqlstate.rs`.
+//! Failures of requests, each with a code that is stable over versions and protocols. Each protocol encodes them in one
+//! place: `http/problem.rs`, `flight/status.rs`, `postgres/sqlstate.rs`.
 
 use std::time::Duration;
 
@@ -8,7 +8,7 @@ use echolake_query::Error as QueryError;
 
 use crate::tokens::Scope;
 
-/// Why a request has no answer.
+/// The failure of a request.
 #[derive(Debug, thiserror::Error)]
 pub(crate) enum Fault {
     /// The query, or its run.
@@ -17,29 +17,29 @@ pub(crate) enum Fault {
     /// The request is not one that this server understands.
     #[error("{message}")]
     Request {
-        /// What is wrong with it, and what would be right.
+        /// The defect of the request, and the expected form.
         message: String,
     },
     /// It is understood, and is no part of what this server does.
     #[error("{what} is not supported here")]
     Unsupported {
-        /// What was asked for.
+        /// The requested feature.
         what: String,
     },
     /// It asks for something that is not there, or not any more.
     #[error("{what} is not there; hint: {hint}")]
     NotFound {
-        /// What was asked for.
+        /// The requested item.
         what: String,
-        /// What to do.
+        /// A remedy for the client.
         hint: &'static str,
     },
     /// It was there, and is no more.
     #[error("{what} is no longer there; hint: {hint}")]
     Gone {
-        /// What was asked for.
+        /// The requested item.
         what: &'static str,
-        /// What to do.
+        /// A remedy for the client.
         hint: &'static str,
     },
     /// A slice cannot be cut.
@@ -48,7 +48,7 @@ pub(crate) enum Fault {
     /// A slice of more measurements than are cut at once.
     #[error("a slice has {limit} measurements at most; hint: ask for fewer runs at a time")]
     SliceTooLarge {
-        /// How many are.
+        /// Maximal number of measurements.
         limit: usize,
     },
     /// There is no room on the server's disk for a slice that is asked for by ranges.
@@ -60,17 +60,17 @@ pub(crate) enum Fault {
         /// Bytes that are kept.
         limit: u64,
     },
-    /// What is asked about is there, and has no such data.
+    /// The requested item exists, but has no such data.
     #[error("{what} has no {data}; hint: {hint}")]
     NoData {
-        /// What was asked about.
+        /// The requested item.
         what: String,
-        /// What it lacks.
+        /// The missing data.
         data: &'static str,
-        /// What to do.
+        /// A remedy for the client.
         hint: &'static str,
     },
-    /// The lake's store does not give a file. Why not stands in the server's log.
+    /// The lake's store does not give a file. The cause is in the server's log.
     #[error("the lake's store does not give the file; hint: ask again")]
     Unreadable,
     /// The path is there, for other methods.
@@ -79,13 +79,13 @@ pub(crate) enum Fault {
     /// A part of a file that it does not have.
     #[error("the file has {bytes} bytes; hint: ask for a range within them")]
     Range {
-        /// How many there are.
+        /// Length of the file.
         bytes: u64,
     },
     /// The request is larger than is read.
     #[error("the request is larger than {limit} bytes")]
     TooLarge {
-        /// What is read.
+        /// Maximal size in bytes.
         limit: usize,
     },
     /// No token, or a wrong one.
@@ -96,18 +96,18 @@ pub(crate) enum Fault {
     Forbidden {
         /// The token's name.
         name: String,
-        /// What it is not for.
+        /// The missing scope.
         scope: Scope,
     },
-    /// A web page elsewhere, or a name that is not this machine's, stands behind the request.
+    /// The request comes from a web page of another origin, or names a host that is not this machine.
     #[error("{what} `{found}` is not this server's; hint: without tokens only http://localhost is answered")]
     Foreign {
-        /// Which header.
+        /// Part of the request: host, address, origin or fetch site.
         what: &'static str,
-        /// What it says.
+        /// Its value.
         found: String,
     },
-    /// Somebody ended the query.
+    /// The query was cancelled.
     #[error("the query was cancelled")]
     Cancelled,
     /// The session's own limit of time.
@@ -124,18 +124,18 @@ pub(crate) enum Fault {
         /// The limit.
         limit: usize,
     },
-    /// The process that ran the query ended, and not by its own decision alone: every other client's goes on.
+    /// The engine process that ran the query ended. Queries of other clients continue.
     #[error("the query ended the engine that ran it: {reason}; hint: ask for less at a time, or for fewer rows")]
     EngineEnded {
-        /// What ended it.
+        /// The cause of its end.
         reason: String,
     },
-    /// A defect. What it was stands in the server's log.
+    /// A defect. Its cause is in the server's log.
     #[error("the server failed; the query is ended, the server goes on")]
     Internal,
 }
 
-/// What a client's code can tell failures apart by; never renamed.
+/// Codes by which a client's program distinguishes failures; never renamed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Code {
     Query,

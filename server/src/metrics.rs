@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 
 use crate::fault::Code;
 
-/// How a query came.
+/// The protocol of a query.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Protocol {
     Http,

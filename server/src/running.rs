@@ -19,13 +19,13 @@ pub(crate) const WAITING: usize = 2;
 
 /// Makes of rows what a protocol sends.
 pub(crate) trait Encode: Send + 'static {
-    /// What is sent.
+    /// The encoded unit that is sent.
     type Item: Send + 'static;
 
     /// Encodes rows.
     fn batch(&mut self, batch: RecordBatch) -> Result<Vec<Self::Item>, Fault>;
 
-    /// What comes after the last row.
+    /// Encodes the end of the answer, after the last row.
     fn end(self) -> Result<Vec<Self::Item>, Fault>;
 }
 
@@ -58,7 +58,7 @@ impl Stop {
         self.0.send_replace(true);
     }
 
-    /// Waits until somebody did.
+    /// Waits until the query is stopped.
     pub(crate) async fn stopped(&self) {
         // The sender lives in `self`, so there is no error to come.
         let _ = self.0.subscribe().wait_for(|stopped| *stopped).await;
@@ -112,7 +112,7 @@ impl<T: Send + 'static> Running<T> {
     }
 }
 
-/// Waits until somebody ends the query, or its session's time is over.
+/// Waits until the query is stopped or its session's time limit is reached; returns the matching fault.
 pub(crate) async fn ended(stop: &Stop, limit: Option<Limit>) -> Fault {
     match limit {
         None => {
@@ -126,7 +126,7 @@ pub(crate) async fn ended(stop: &Stop, limit: Option<Limit>) -> Fault {
     }
 }
 
-/// How a task ended that sends nothing more.
+/// Returns the result of a task that sends nothing more.
 pub(crate) async fn finish(task: &mut JoinSet<Result<(), Fault>>) -> Result<(), Fault> {
     match task.join_next().await {
         None => Ok(()),

@@ -1,4 +1,4 @@
-//! What the three protocols share: the query engine, whose it is, threads to compute on, and figures.
+//! State shared by the three protocols: the query engine, its client, encoder threads, and metrics.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
@@ -18,13 +18,13 @@ use crate::metrics::{Metrics, Protocol};
 use crate::running::{Encode, Limit, Running, Stop, WAITING, ended, finish, parts};
 use crate::tokens::Scope;
 
-/// How long a plan is good for: it sees the lake as it was.
+/// Maximal age of a plan, which sees the lake as of its planning.
 pub(crate) const FRESH: Duration = Duration::from_secs(2);
 /// The catalogue and schema of the lake's tables, as DataFusion calls them.
 pub(crate) const CATALOG: &str = "datafusion";
 pub(crate) const SCHEMA: &str = "public";
 
-/// What the three protocols share.
+/// State shared by the three protocols.
 #[derive(Clone)]
 pub(crate) struct Service(Arc<Inner>);
 
@@ -39,11 +39,11 @@ struct Inner {
     encoders: Threads,
 }
 
-/// What to run.
+/// The query text or plan to run.
 pub(crate) enum Work {
     /// A text.
     Sql(String),
-    /// What was planned before, with values for its placeholders.
+    /// A prepared plan, with values for its placeholders.
     Prepared(Arc<Prepared>, ParamValues),
 }
 
@@ -103,7 +103,7 @@ impl Service {
         &self.0.engine
     }
 
-    /// Whether the server has no tokens.
+    /// Returns whether the server has no tokens.
     pub(crate) fn is_open(&self) -> bool {
         self.0.identity.is_open
     }
@@ -126,7 +126,7 @@ impl Service {
         &self.0.metrics
     }
 
-    /// A session: one a connection, or a request where connections are not known.
+    /// Begins a session: one per connection, or one per request if the protocol has no connections.
     pub(crate) fn session(&self, client: &Arc<Client>) -> Session {
         self.0.engine.session(client)
     }
@@ -143,7 +143,7 @@ impl Service {
         self.session(&nobody).functions().into_iter().filter(|f| f.is_own).collect()
     }
 
-    /// Begins work on the threads that encode answers; it ends where what this returns is dropped.
+    /// Spawns work on the encoder threads; dropping the returned task aborts it.
     pub(crate) fn spawn<T: Send + 'static>(&self, work: impl Future<Output = T> + Send + 'static) -> JoinSet<T> {
         let mut task = JoinSet::new();
         let guard = self.0.activity.enter();
@@ -235,7 +235,7 @@ async fn run<E: Encode>(
         Work::Prepared(prepared, values) => job.session.execute(&prepared, values).await?,
     };
     let mut encoder = encode(&answer.schema)?;
-    // Nobody listens any more where sending fails, here and below: the query ends by being dropped.
+    // If sending fails, here and below, the receiver is gone: the query ends by being dropped.
     if columns.send(answer.schema.clone()).is_err() {
         return Ok(());
     }

@@ -1,5 +1,5 @@
-//! Sessions of browsers: a secret in a cookie stands for the token that was shown once, because pictures and downloads of
-//! a page can send no `Authorization` header. Kept in memory, as hashes, for half a day.
+//! Browser sessions: a secret in a cookie replaces the token that was sent once, because pictures and downloads of a
+//! page can send no `Authorization` header. Kept in memory, as hashes, for half a day.
 
 use std::io;
 use std::sync::{Mutex, PoisonError};
@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 
 use sha2::{Digest as _, Sha256};
 
-/// How long a session is good for.
+/// Lifetime of a session.
 pub(crate) const LIFETIME: Duration = Duration::from_secs(12 * 3600);
 /// Sessions that are kept; the oldest goes first.
 const MOST: usize = 1000;
@@ -27,7 +27,7 @@ impl Sessions {
     /// Begins a session of the holder of a token; returns its secret.
     ///
     /// # Errors
-    /// Where the system gives no random bytes.
+    /// The system gives no random bytes.
     pub(crate) fn begin(&self, holder: usize) -> io::Result<String> {
         let mut random = [0; 32];
         getrandom::fill(&mut random)?;
@@ -41,7 +41,7 @@ impl Sessions {
         Ok(secret)
     }
 
-    /// Whose session it is.
+    /// Returns the holder of the session with this secret.
     pub(crate) fn holder(&self, secret: &str) -> Option<usize> {
         let hash: [u8; 32] = Sha256::digest(secret).into();
         let sessions = self.0.lock().unwrap_or_else(PoisonError::into_inner);

@@ -1,4 +1,4 @@
-//! Who may ask: tokens, kept as hashes in a file, each with scopes and quotas.
+//! Access control: tokens, stored as hashes in a file, each with scopes and quotas.
 
 use std::fmt;
 use std::path::Path;
@@ -20,10 +20,10 @@ use crate::sessions::Sessions;
 /// Of basic credentials; padding is cut off before, since gRPC's clients leave it out.
 const BASE64: GeneralPurpose = GeneralPurpose::new(&STANDARD, NO_PAD.with_decode_allow_trailing_bits(true));
 
-/// What tokens begin with, so that they are found where they leaked.
+/// Prefix of all tokens, so that leaked ones can be found by searching.
 const PREFIX: &str = "echolake_";
 
-/// What a token is for.
+/// A permission of a token.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Scope {
@@ -73,8 +73,8 @@ struct Line {
     concurrent: Option<usize>,
 }
 
-// What a reader of the lake needs. Who may ask in SQL reads all rows, and the catalogue's pages show meshes and link to run
-// files: without files a signed-in browser would be refused in the middle of a page.
+// What a reader of the lake needs. A client with SQL reads all rows, and the catalogue's pages show meshes and link to
+// run files: without files a signed-in browser would be refused in the middle of a page.
 fn reading() -> Vec<Scope> {
     vec![Scope::Sql, Scope::Files]
 }
@@ -170,7 +170,7 @@ pub fn fresh(name: &str) -> Result<Fresh, Error> {
     Ok(Fresh { token, lines })
 }
 
-/// Who is let in.
+/// The access rule of a server.
 pub(crate) enum Access {
     /// Everybody on this machine.
     Open,
@@ -179,7 +179,7 @@ pub(crate) enum Access {
 }
 
 impl Access {
-    /// Who may ask: by tokens where there are some.
+    /// Access by `tokens`, or open access without them.
     pub(crate) fn new(tokens: Option<Tokens>) -> Self {
         match tokens {
             Some(tokens) => Self::Tokens(tokens, Sessions::default()),
@@ -187,12 +187,12 @@ impl Access {
         }
     }
 
-    /// Whether everybody is let in.
+    /// Returns whether no token is required.
     pub(crate) fn is_open(&self) -> bool {
         matches!(self, Self::Open)
     }
 
-    /// Who holds this token; `local` makes the client of a server that has none.
+    /// Returns the client of a token; on a server without tokens, the client that `local` makes.
     ///
     /// # Errors
     /// [`Fault::Unauthenticated`].
@@ -212,7 +212,7 @@ impl Access {
     /// Begins a browser's session; returns its secret.
     ///
     /// # Errors
-    /// [`Fault::Unauthenticated`]; [`Fault::NotFound`] where there are no tokens.
+    /// [`Fault::Unauthenticated`]; [`Fault::NotFound`] if there are no tokens.
     pub(crate) fn begin_session(&self, token: &str) -> Result<String, Fault> {
         let Self::Tokens(tokens, sessions) = self else {
             let hint = "this server has no tokens, ask right away";
@@ -224,7 +224,7 @@ impl Access {
         })
     }
 
-    /// Who holds the session of this secret; as [`Access::client`].
+    /// Returns the client of the session with this secret; as [`Access::client`].
     ///
     /// # Errors
     /// As [`Access::client`].

@@ -1,5 +1,5 @@
-//! Ends its own process where work continues that nobody waits for any more: planning, a call of a function, an operator
-//! that does not return. The library cannot be interrupted there; the process is one client's, and its door starts another.
+//! Ends its own process if work continues after its query has ended: planning, a call of a function, an operator that
+//! does not return. The library cannot be interrupted there; the process is one client's, and its door starts another.
 
 use std::time::{Duration, Instant};
 
@@ -10,7 +10,7 @@ use crate::service::Service;
 
 /// Time between two looks; the door's figures are sent as often.
 const INTERVAL: Duration = Duration::from_millis(50);
-/// How long work may continue after its query was cancelled, ran out of time, or lost its client.
+/// Time for which work may continue after its query was cancelled, ran out of time, or lost its client.
 const GRACE: Duration = Duration::from_millis(250);
 /// Part of one processor from which an engine without requests is not idle.
 const BUSY: f64 = 0.5;
