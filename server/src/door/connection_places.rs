@@ -1,5 +1,5 @@
-//! Places for connections: an address accepts no more than it has. If all are taken, a new connection takes the place of
-//! the one that has been waited for longest without a request or a login, so that who sends slowly locks nobody out.
+//! Places for connections: an address accepts no more than it has. If all are taken, a new connection evicts the one
+//! that has waited longest without a request or a login, so that slow senders lock out no other client.
 
 use std::io::{self, IoSlice};
 use std::net::IpAddr;
@@ -14,14 +14,14 @@ use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::Notify;
 use tokio::time::Sleep;
 
-/// How long to wait where the system has no more sockets.
+/// Time to wait if the system has no more sockets.
 const PAUSE: Duration = Duration::from_millis(100);
 /// Bytes that a connection reads before it is the turn of others. A frame of HTTP/2 may have nine and no answer.
 const TURN_BYTES: usize = 16 << 10;
 /// Bytes that a connection may send of what is no request. Each of a flood of frames is little, and costs as much as one
 /// that says something.
 const IDLE_BYTES: usize = 1 << 20;
-/// How long a client may read nothing of an answer.
+/// Time for which a client may read nothing of an answer.
 const STALL: Duration = Duration::from_secs(300);
 
 /// An address, and its places.
@@ -67,7 +67,7 @@ impl ConnectionPlaces {
                         return self.place(stream, peer.ip());
                     }
                 }
-                // Who broke off already is no trouble; that there are no more sockets passes.
+                // A client that hung up already is no problem; a lack of sockets passes.
                 Err(_) => tokio::time::sleep(PAUSE).await,
             }
         }
@@ -80,7 +80,7 @@ impl ConnectionPlaces {
         PlacedStream { stream, state, taken: self.taken.clone(), turn_bytes: 0, idle_bytes: 0, stalled: None }
     }
 
-    // Another machine has half of the places at most; false where all of those work.
+    // Another machine has half of the places at most; false if all of those work.
     async fn make_room(&self, address: IpAddr) -> bool {
         loop {
             let freed = self.taken.freed.notified();

@@ -23,7 +23,7 @@ const IDLE: Duration = Duration::from_secs(300);
 /// Time between two looks at the memory of engines, while one answers and while none does.
 const LOOK: Duration = Duration::from_millis(20);
 const IDLE_LOOK: Duration = Duration::from_millis(250);
-/// How long a client without an engine waits for a place among the engines.
+/// Time for which a client without an engine waits for a place among the engines.
 const PLACE_WAIT: Duration = Duration::from_secs(10);
 /// Memory of an engine that is not of its queries: footers of files, small tables, what the allocator keeps.
 const CACHE_BYTES: usize = 96 << 20;

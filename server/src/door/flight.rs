@@ -1,4 +1,4 @@
-//! Flight SQL's connections of the door: HTTP/2, whose requests are forwarded to the engine of who asks.
+//! Flight SQL connections of the door: HTTP/2, whose requests are forwarded to the client's engine.
 
 use std::convert::Infallible;
 use std::pin::pin;

@@ -34,7 +34,7 @@ const LARGEST_GRPC: usize = (4 << 20) + 5;
 /// Parts of a body beyond which they must have so many bytes on average: each costs as much as one that says something.
 const FREE_PARTS: usize = 4_096;
 const LEAST_PART_BYTES: usize = 16;
-/// How long the body of a request may take.
+/// Time limit for the body of a request.
 const BODY_LIMIT: Duration = Duration::from_secs(30);
 /// Bytes of a frame of HTTP/2 between an engine and the door; the default of 16 KiB costs a wake-up each.
 const FRAME_BYTES: u32 = 256 << 10;
@@ -42,7 +42,7 @@ const FRAME_BYTES: u32 = 256 << 10;
 const OF_CONNECTION: [HeaderName; 4] =
     [header::CONNECTION, header::TRANSFER_ENCODING, header::UPGRADE, HeaderName::from_static("keep-alive")];
 
-/// How an engine is asked.
+/// The protocol to an engine.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Wire {
     /// HTTP/1.1, on a connection for each request.
@@ -60,7 +60,7 @@ enum RequestBody {
     Streamed(Body, BodyFault),
 }
 
-/// What was wrong with a body that was passed on, once that is known.
+/// The fault of a streamed body, once it is known.
 type BodyFault = Arc<Mutex<Option<Fault>>>;
 
 impl EnginePool {
@@ -288,7 +288,8 @@ pub(super) struct EngineBody {
 }
 
 impl EngineBody {
-    // gRPC says how an answer ended behind it, so that it can be told; HTTP/1.1 breaks the connection off.
+    // gRPC reports a failure in trailers behind the answer, so that the client sees it; HTTP/1.1 breaks the connection
+    // off.
     fn failure(&self) -> Option<Frame<Bytes>> {
         if self.wire == Wire::Http {
             return None;

@@ -25,7 +25,7 @@ use crate::http::{Problem, RequestSite, authenticate, door_router, request_site}
 
 /// Connections at once. Systems often allow a process 1024 open files.
 const MOST: usize = 512;
-/// How long a request's head may take, and how long a connection may stand idle between two.
+/// Time limit for a request's head, and for an idle connection between two requests.
 const HEAD: Duration = Duration::from_secs(30);
 
 /// Answers connections until `stopping`, then lets those end that are at it.
@@ -67,7 +67,7 @@ async fn answer(stream: PlacedStream, router: Router, mut stopping: watch::Recei
 }
 
 impl Door {
-    /// Answers a request by the engine of who asks.
+    /// Forwards a request to the client's engine.
     pub(crate) async fn forward_http(State(door): State<Self>, request: Request) -> Response {
         door.answer_http(request).await.unwrap_or_else(|fault| {
             door.metrics().failed(fault.code());

@@ -25,13 +25,13 @@ use crate::metrics::Metrics;
 use crate::tokens::{Access, Tokens};
 use engine_pool::EnginePool;
 
-/// How long answers may go on when the server is told to stop.
+/// Time for which answers may continue after the server was asked to stop.
 const GRACE: Duration = Duration::from_secs(5);
 /// Bytes that the system keeps for a connection until they are read, and connections until they are accepted.
 const RECEIVED_BYTES: u32 = 128 << 10;
 const BACKLOG: u32 = 1024;
 
-/// Where a server listens, whom it lets in, and what it gives them.
+/// Addresses, access rules and engine limits of a server.
 pub struct Settings {
     /// HTTP; None for none, as below. Port 0 for any that is free.
     pub http: Option<SocketAddr>,
@@ -39,13 +39,13 @@ pub struct Settings {
     pub flight_sql: Option<SocketAddr>,
     /// Postgres' protocol.
     pub postgres: Option<SocketAddr>,
-    /// Who is let in; None for everybody, on loopback only.
+    /// The accepted tokens; None for open access, on loopback only.
     pub tokens: Option<Tokens>,
     /// The engines.
     pub engines: EngineSettings,
 }
 
-/// What engines are started as, and what they may use.
+/// The engines' program and their limits.
 #[derive(Debug, Clone)]
 pub struct EngineSettings {
     /// The program that has the command `engine`.
@@ -87,7 +87,7 @@ impl Server {
         })
     }
 
-    /// Where it listens, as URLs.
+    /// Returns the listening addresses, as URLs.
     pub fn addresses(&self) -> Vec<String> {
         let url = |scheme: &str, listener: &Option<TcpListener>, path: &str| {
             let address = listener.as_ref()?.local_addr().ok()?;
@@ -101,7 +101,7 @@ impl Server {
         all.into_iter().flatten().collect()
     }
 
-    /// Answers until `stop`, then lets answers go on for five seconds.
+    /// Answers until `stop`, then lets answers continue for five seconds.
     ///
     /// # Errors
     /// [`Error::System`].
@@ -148,7 +148,7 @@ fn bind(address: SocketAddr) -> std::io::Result<TcpListener> {
     socket.listen(BACKLOG)
 }
 
-/// What all connections share.
+/// State shared by all connections.
 #[derive(Clone)]
 pub(crate) struct Door(Arc<Inner>);
 

@@ -1,4 +1,4 @@
-//! Keys that clients cancel by. They are random and the door's own; an engine's are never told to a client.
+//! Keys by which clients cancel. They are random and the door's own; an engine's keys are never sent to a client.
 
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -36,7 +36,7 @@ impl CancelKeys {
         Some(CancelKey { pid: i32::from_be_bytes(*pid) & i32::MAX, secret: secret.get(..bytes.min(32))?.to_vec() })
     }
 
-    /// What runs on this connection can be cancelled there from now on.
+    /// Lets this key cancel queries of the target's connection from now on.
     pub(super) fn set(&self, key: &CancelKey, target: CancelTarget) {
         self.lock().insert((key.pid, key.secret.clone()), target);
     }

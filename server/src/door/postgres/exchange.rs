@@ -1,5 +1,5 @@
-//! What a connection has asked and was answered, as far as it takes to ask again: the messages since the last statement
-//! that was answered, prepared statements, and settings. The door sees only types of messages and tags of commands.
+//! A connection's requests and answers, as far as they are needed to retry: the messages since the last statement that
+//! was answered, prepared statements, and settings. The door sees only types of messages and tags of commands.
 
 use std::collections::{BTreeMap, VecDeque};
 
@@ -22,14 +22,14 @@ pub(super) struct Exchange {
     asked: BytesMut,
     parts: VecDeque<usize>,
     part_bytes: usize,
-    /// Whether `asked` is all that was asked.
+    /// True if a part of the messages was too long to keep in `asked`.
     is_cut: bool,
     /// Texts to be prepared, until the engine has done so.
     parses: VecDeque<(Vec<u8>, Vec<u8>)>,
     prepared: BTreeMap<Vec<u8>, Vec<u8>>,
     prepared_bytes: usize,
     settings: Vec<Vec<u8>>,
-    /// Whether all that was prepared and set is known.
+    /// True if a prepared statement or setting was too long to keep, so that the session cannot be rebuilt.
     is_forgetful: bool,
     /// Answers to the statement that runs: messages that were passed on, and what was seen in them.
     answered: usize,
@@ -61,12 +61,12 @@ impl Exchange {
         }
     }
 
-    /// Whether an answer is awaited.
+    /// Returns whether an answer is pending.
     pub(super) fn is_waiting(&self) -> bool {
         !self.parts.is_empty() || !self.asked.is_empty() || self.is_cut
     }
 
-    /// Whether the client has asked for an answer to the statement that runs, and not only sent its parts.
+    /// Returns whether the client has requested an answer to the running statement, and not only sent its parts.
     pub(super) fn has_end(&self) -> bool {
         !self.parts.is_empty()
     }
@@ -135,12 +135,12 @@ impl Exchange {
         (self.answered, self.has_rows, self.sets) = (0, false, None);
     }
 
-    /// Whether the statement that runs can be asked again as if nothing had happened.
+    /// Returns whether the running statement can be retried without the client seeing it.
     pub(super) fn is_repeatable(&self) -> bool {
         !self.is_cut && !self.has_rows && !self.is_repeated && !self.is_forgetful && !self.has_cursor
     }
 
-    /// Whether a new engine can take the connection over.
+    /// Returns whether a new engine can take the connection over.
     pub(super) fn is_transferable(&self) -> bool {
         !self.is_forgetful
     }
@@ -152,7 +152,7 @@ impl Exchange {
         std::mem::take(&mut self.answered)
     }
 
-    /// Drops the statement that runs, after its failure was told.
+    /// Drops the running statement, after its failure was sent to the client.
     pub(super) fn fail(&mut self) {
         self.sets = None;
         if self.is_cut {
@@ -170,12 +170,12 @@ impl Exchange {
         self.in_transaction = false;
     }
 
-    /// What was set; each of these has an answer that ends by saying that the next is awaited.
+    /// Returns the messages that set settings; the answer to each ends with ReadyForQuery.
     pub(super) fn settings(&self) -> impl Iterator<Item = &[u8]> {
         self.settings.iter().map(Vec::as_slice)
     }
 
-    /// What was prepared.
+    /// Returns the messages that prepared the named statements.
     pub(super) fn prepared(&self) -> impl Iterator<Item = &[u8]> {
         self.prepared.values().map(Vec::as_slice)
     }

@@ -55,7 +55,7 @@ impl FrameHeader {
     }
 }
 
-/// A failure after which the connection goes on.
+/// A failure that leaves the connection open.
 pub(super) fn error_message(fault: &Fault) -> BytesMut {
     encode_error(sqlstate::error(fault))
 }
@@ -99,12 +99,12 @@ pub(super) fn cancel_message(pid: i32, secret: &[u8]) -> BytesMut {
     bytes
 }
 
-/// Codes that stand where a startup packet has its protocol's version.
+/// Request codes in the place of a startup packet's protocol version.
 const CANCEL: i32 = 80_877_102;
 const TLS: i32 = 80_877_103;
 const GSS: i32 = 80_877_104;
 
-/// What a client's first packet says.
+/// The content of a client's first packet.
 #[derive(Debug, PartialEq, Eq)]
 pub(super) enum StartupPacket {
     /// It would rather speak encrypted.

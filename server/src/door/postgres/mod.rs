@@ -1,5 +1,5 @@
-//! Postgres' connections of the door. It logs clients in, checks the lengths of messages, and passes them on; where an
-//! engine ends, it says so on the connection, which goes on with the next engine.
+//! Postgres connections of the door. It logs clients in, checks the lengths of messages, and passes them on; if an
+//! engine ends, it reports that on the connection, which continues with the next engine.
 
 mod cancel_keys;
 mod exchange;
@@ -26,11 +26,11 @@ use relay::Relay;
 
 /// Connections at once.
 const MOST: usize = 128;
-/// How long a login may take.
+/// Time limit for a login.
 const LOGIN: Duration = Duration::from_secs(10);
 /// Bytes of a startup packet, as in Postgres, and of a password.
 const STARTUP: usize = 10_000;
-/// How long who shows a wrong key is kept waiting.
+/// Delay of the answer to a wrong cancel key.
 const WRONG_KEY: Duration = Duration::from_secs(1);
 
 /// Answers connections until `stopping`, then until their statements are answered.
@@ -71,13 +71,13 @@ struct PostgresLogin {
     startup: BytesMut,
 }
 
-// None where the connection has nothing more to say.
+// None if the connection has nothing more to say.
 async fn log_in(stream: &mut PlacedStream, door: &Door, keys: &CancelKeys) -> Option<PostgresLogin> {
     match try_log_in(stream, door, keys).await {
         Ok(login) => login,
         Err(fault) => {
             door.metrics().failed(fault.code());
-            // Who hangs up needs no reason.
+            // A client that hangs up needs no reason.
             let _ = stream.write_all(&fatal_message(&fault)).await;
             let _ = stream.shutdown().await;
             None

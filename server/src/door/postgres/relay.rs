@@ -1,4 +1,4 @@
-//! Passes messages between a client and its engine, and keeps the connection where the engine ends.
+//! Passes messages between a client and its engine, and keeps the connection if the engine ends.
 
 use std::io;
 use std::sync::Arc;
@@ -37,7 +37,7 @@ pub(super) struct Relay {
     /// Bytes of a long message that are still to come, and whether they are passed on.
     rest: usize,
     is_rest_dropped: bool,
-    /// Whether messages are passed over up to the next Sync, as after any error.
+    /// True if messages are skipped up to the next Sync, as after any error.
     is_skipping: bool,
     exchange: Exchange,
 }
@@ -56,7 +56,7 @@ struct EngineLink {
     known: usize,
 }
 
-/// Why passing on ends.
+/// The reason for which passing on ends.
 enum RelayEnd {
     Client,
     Engine,
@@ -96,12 +96,12 @@ impl Relay {
             self.door.metrics().failed(fault.code());
             self.outgoing.extend_from_slice(&fatal_message(&fault));
         }
-        // Who hangs up needs no last word.
+        // A client that hangs up needs no last message.
         let _ = self.write.write_all_buf(&mut self.outgoing).await;
         let _ = self.write.shutdown().await;
     }
 
-    // The error is what the client is told last; None where it is gone, or was told already.
+    // The error is the last message to the client; None if the client is gone, or has it already.
     async fn converse(&mut self, mut stopping: watch::Receiver<bool>) -> Result<(), Option<Fault>> {
         let mut link = self.connect(true).await?;
         loop {
@@ -280,7 +280,7 @@ impl Relay {
         Ok(())
     }
 
-    // Begins a session on the client's engine; one that is not the first is brought to where the last one was.
+    // Begins a session on the client's engine; one that is not the first is brought to the state of the last one.
     async fn connect(&mut self, is_first: bool) -> Result<EngineLink, Option<Fault>> {
         let told = self.outgoing.len();
         let mut is_repeated = false;
@@ -300,7 +300,7 @@ impl Relay {
         }
     }
 
-    // None where the engine refuses the session, which the client is told in its words.
+    // None if the engine refuses the session; its error message is passed on to the client.
     async fn start_session(&mut self, lease: EngineLease, is_first: bool) -> io::Result<Option<EngineLink>> {
         let stream: UnixStream = lease.engine().connect(EngineSocket::Postgres).await?;
         let (read, write) = stream.into_split();
