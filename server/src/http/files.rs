@@ -28,8 +28,8 @@ pub(super) const RUN: &str = "/api/v1/runs/{run_id}/file.mcap";
 /// A table's file.
 pub(super) const TABLE: &str = "/api/v1/tables/{table}/{file}";
 
-/// Viewers on other pages read run files, so whoever may ask for them may do so from anywhere: without credentials, and
-/// told what ranges need. A page of elsewhere finds out no run's name here.
+/// Routes that viewers on other pages use: run files may be requested from any origin, without credentials, and with
+/// the headers that ranges need. A page of another origin learns no run's name here.
 pub(super) fn for_viewers(catalogue: &Catalogue) -> Router {
     Router::new().route(RUN, get(run)).with_state(catalogue.clone())
 }

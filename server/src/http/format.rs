@@ -1,4 +1,4 @@
-//! Which format an answer has, and its bytes.
+//! Formats of answers: their negotiation and their encoding.
 
 use std::io::{self, Write};
 use std::mem::take;
@@ -50,13 +50,13 @@ pub(super) fn accepted(accept: &str) -> Result<Format, Fault> {
     })
 }
 
-/// Whether an Arrow stream is liked better than JSON.
+/// Returns whether an Arrow stream is preferred to JSON.
 pub(super) fn prefers_arrow(headers: &HeaderMap) -> bool {
     let accept = headers.get(header::ACCEPT).and_then(|v| v.to_str().ok()).unwrap_or_default();
     accepted(accept).is_ok_and(|format| format == Format::Arrow)
 }
 
-/// Whether an encoding of HTTP is taken.
+/// Returns whether the client accepts an encoding of HTTP.
 pub(super) fn takes(headers: &HeaderMap, encoding: &str) -> bool {
     let accepted = headers.get(header::ACCEPT_ENCODING).and_then(|v| v.to_str().ok()).unwrap_or_default();
     accepted.split(',').any(|one| {

@@ -1,6 +1,6 @@
-//! Who may speak HTTP to the server: holders of a token, or, where none are set, this machine's own programs and
-//! pages. A browser lets every page of the web send requests to loopback, and a name that its owner points there
-//! (DNS rebinding) lets it read the answers too; so without tokens `Host` and `Origin` must be this machine's.
+//! Access control of HTTP: for holders of a token, or, if none are set, for this machine's own programs and pages. A
+//! browser lets every page of the web send requests to loopback, and a name that its owner points there (DNS rebinding)
+//! lets it read the answers too; so without tokens `Host` and `Origin` must be this machine's.
 
 use std::net::IpAddr;
 use std::sync::Arc;
@@ -28,7 +28,7 @@ pub(super) struct MayQuery(pub(super) Arc<Client>);
 /// The cookie of a browser's session.
 pub(super) const COOKIE: &str = "echolake";
 
-/// Who asks, by token or by session; `local` makes the client of a server that has no tokens.
+/// Authenticates a client by token or by session; `local` makes the client of a server that has no tokens.
 ///
 /// # Errors
 /// [`Fault::Unauthenticated`], [`Fault::Foreign`].
@@ -47,7 +47,7 @@ pub(crate) fn authenticate(
     }
 }
 
-/// What stands behind a request, as its headers tell.
+/// The origin of a request, according to its headers.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum RequestSite {
     /// A page of elsewhere.
@@ -58,7 +58,7 @@ pub(crate) enum RequestSite {
     Program,
 }
 
-/// Tells what stands behind a request to a server without tokens.
+/// Determines the origin of a request to a server without tokens.
 pub(crate) fn request_site(uri: &Uri, headers: &HeaderMap) -> RequestSite {
     match (is_own(uri, headers), headers.contains_key(FETCH_SITE)) {
         (Err(_), _) => RequestSite::Foreign,
@@ -80,7 +80,7 @@ impl FromRequestParts<Service> for MayQuery {
     }
 }
 
-/// Lets no page of elsewhere through, where there are no tokens.
+/// Refuses requests of pages from other origins, if there are no tokens.
 pub(super) async fn own_pages_only(State(is_open): State<bool>, request: Request, next: Next) -> Response {
     // With tokens there is nothing that a page could use without having one.
     match is_own(request.uri(), request.headers()) {
@@ -89,12 +89,12 @@ pub(super) async fn own_pages_only(State(is_open): State<bool>, request: Request
     }
 }
 
-/// Whether a request comes from this machine's own programs and pages.
+/// Checks that a request comes from this machine's own programs and pages.
 ///
 /// # Errors
-/// [`Fault::Foreign`] where it does not.
+/// [`Fault::Foreign`] if it does not.
 pub(super) fn is_own(uri: &Uri, headers: &HeaderMap) -> Result<(), Fault> {
-    // HTTP/1.1 wants one Host; with two, they who check and they who route may look at different ones.
+    // HTTP/1.1 wants one Host; with two, the check and the routing may use different ones.
     let host = match (headers.get_all(header::HOST).iter().count(), text(headers, &header::HOST)) {
         (1, Some(host)) => host,
         (_, host) => return Err(Fault::Foreign { what: "host", found: host.unwrap_or_default() }),
@@ -109,7 +109,7 @@ pub(super) fn is_own(uri: &Uri, headers: &HeaderMap) -> Result<(), Fault> {
     is_same_origin(headers, &["http://"])
 }
 
-// That no page of elsewhere stands behind a request, as browsers tell.
+// Checks by the headers of browsers that a request is not made by a page of another origin.
 fn is_same_origin(headers: &HeaderMap, schemes: &[&str]) -> Result<(), Fault> {
     let host = text(headers, &header::HOST).unwrap_or_default();
     if let Some(origin) = text(headers, &header::ORIGIN)
@@ -132,7 +132,7 @@ fn is_local(host: &str) -> bool {
     let Ok(authority) = host.parse::<Authority>() else { return false };
     let name = authority.host();
     let behind = host.strip_prefix(name).map(|port| port.strip_prefix(':').unwrap_or(port));
-    // Nothing stands before the name (a user), nor behind it but a port.
+    // There is nothing before the name (a user), nor behind it but a port.
     if behind != Some(authority.port().as_ref().map_or("", |port| port.as_str())) {
         return false;
     }
@@ -140,7 +140,7 @@ fn is_local(host: &str) -> bool {
     name.eq_ignore_ascii_case("localhost") || address.parse::<IpAddr>().is_ok_and(|ip| ip.is_loopback())
 }
 
-/// What every answer says to browsers, unless its route knows better.
+/// Adds the security headers that every answer has, unless its route set its own.
 pub(super) async fn security_headers(mut response: Response) -> Response {
     let headers = response.headers_mut();
     for (name, value) in [

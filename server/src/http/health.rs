@@ -1,4 +1,4 @@
-//! `GET /health` and `GET /metrics`: for those who look after the server.
+//! `GET /health` and `GET /metrics`, for operators of the server.
 
 use axum::Json;
 use axum::extract::State;

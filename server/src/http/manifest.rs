@@ -31,11 +31,11 @@ struct File {
     bytes: u64,
     /// Those that the snapshot shows.
     rows: u64,
-    /// Those that stand in the file too, and that newer rows of the same runs have replaced.
+    /// Rows that are in the file, too, but were replaced by newer rows of the same runs.
     superseded_rows: u64,
 }
 
-/// Where the list is.
+/// The route of the list.
 pub(super) fn for_own(catalogue: &Catalogue) -> Router {
     Router::new().route("/api/v1/files", get(files)).with_state(catalogue.clone())
 }
@@ -64,7 +64,7 @@ async fn files(State(catalogue): State<Catalogue>, uri: Uri, headers: HeaderMap)
     Ok((validators, axum::Json(manifest)).into_response())
 }
 
-// What a URL of this server begins with, as who asks sees it: behind a proxy with TLS, `https`.
+// The origin of this server's URLs as the client sees it: behind a proxy with TLS, `https`.
 fn origin(headers: &HeaderMap) -> String {
     let text = |name: HeaderName| headers.get(name).and_then(|v| v.to_str().ok());
     let scheme = match text(FORWARDED_PROTO) {

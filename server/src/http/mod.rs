@@ -62,7 +62,7 @@ fn engine_router(service: &Service) -> Router {
     with_refusals(all)
 }
 
-/// The paths of the server: those of the door, and those that it forwards to the engine of who asks.
+/// The paths of the server: those of the door, and those that it forwards to the client's engine.
 pub(crate) fn door_router(door: &Door) -> Router {
     let own = Router::new()
         .route("/api/v1/session", post(session::post))

@@ -15,7 +15,7 @@ use crate::fault::Fault;
 const POLICY: &str = "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob:; font-src 'self'; \
      media-src 'self' blob:; connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'";
 const INDEX: &str = "/index.html";
-/// What stands there has a digest in its name.
+/// Path of files that have a digest in their name.
 const ASSETS: &str = "/assets/";
 /// Paths that are no page's.
 const OTHERS: [&str; 4] = ["/api", "/assets", "/health", "/metrics"];

@@ -1,4 +1,4 @@
-//! Files over HTTP: what part of one is asked for, and the headers that viewers of elsewhere need.
+//! Files over HTTP: parsing of ranges, and the headers that viewers of other origins need.
 
 use std::ops::Range;
 
@@ -11,11 +11,11 @@ use super::catalogue::is_known;
 use super::problem::Problem;
 use crate::fault::Fault;
 
-/// Who may embed an answer.
+/// The header that says which origins may embed an answer.
 pub(super) const POLICY: HeaderName = HeaderName::from_static("cross-origin-resource-policy");
 const FETCH_MODE: HeaderName = HeaderName::from_static("sec-fetch-mode");
 
-/// For what pages of elsewhere may read: from anywhere, without credentials, and told what ranges need.
+/// The CORS headers of routes that other origins may read: from anywhere, without credentials, with what ranges need.
 pub(super) fn cors() -> CorsLayer {
     CorsLayer::new()
         .allow_origin(Any)
@@ -25,8 +25,8 @@ pub(super) fn cors() -> CorsLayer {
         .allow_private_network(true)
 }
 
-/// Whether who asks has to be told a file's length: for a part of it, or as viewers in a browser do before they ask for
-/// parts.
+/// Returns whether the answer must state the file's length: for ranges, or because viewers in a browser read it before
+/// they request ranges.
 pub(super) fn needs_length(method: &Method, headers: &HeaderMap) -> bool {
     let is_script = headers.get(FETCH_MODE).is_some_and(|mode| mode == "cors") || headers.contains_key(header::ORIGIN);
     method == Method::HEAD || headers.contains_key(header::RANGE) || is_script
@@ -36,11 +36,11 @@ pub(super) fn needs_length(method: &Method, headers: &HeaderMap) -> bool {
 pub(super) struct Described {
     pub(super) etag: String,
     pub(super) media_type: &'static str,
-    /// Who may embed it.
+    /// The origins that may embed it, as `Cross-Origin-Resource-Policy` has them.
     pub(super) policy: &'static str,
 }
 
-/// What is to be answered.
+/// The kind of answer to a request.
 pub(super) enum Asked {
     /// This, without any of the file's bytes.
     Answer(Response),
@@ -51,12 +51,12 @@ pub(super) enum Asked {
 /// Bytes of a file.
 pub(super) struct Part {
     pub(super) range: Range<u64>,
-    /// The file's bytes, where these are not all.
+    /// The file's length, if these are not all of its bytes.
     of: Option<u64>,
 }
 
 impl Described {
-    /// What a request is for, of a file of so many bytes.
+    /// Determines the answer to a request, for a file of `bytes` bytes.
     pub(super) fn asked(&self, headers: &HeaderMap, bytes: u64) -> Asked {
         if let Some(known) = self.known(headers) {
             return Asked::Answer(known);
@@ -68,7 +68,7 @@ impl Described {
         }
     }
 
-    /// The answer to who has it already.
+    /// Returns the answer to a client that has this version already, which is 304.
     pub(super) fn known(&self, headers: &HeaderMap) -> Option<Response> {
         is_known(headers, &self.etag).then(|| self.with_headers(StatusCode::NOT_MODIFIED.into_response()))
     }
@@ -128,7 +128,7 @@ fn insert(headers: &mut HeaderMap, name: HeaderName, value: &str) {
     }
 }
 
-/// What part of a file is wanted.
+/// The requested part of a file.
 #[derive(Debug, PartialEq, Eq)]
 enum Wanted {
     Whole,

@@ -23,7 +23,7 @@ use crate::service::{Job, Service, Work};
 /// Bytes of a request, axum's own limit.
 const LARGEST: usize = 2 << 20;
 
-/// What stands behind the path's `?`.
+/// The parameters after the path's `?`.
 #[derive(Deserialize)]
 pub(super) struct Params {
     format: Option<String>,

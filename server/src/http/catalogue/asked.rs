@@ -1,4 +1,4 @@
-//! What an endpoint is asked, and how it asks the lake: values are bound or validated, never part of a text.
+//! A request to an endpoint, and its queries of the lake: values are bound or validated, never part of a text.
 
 use std::collections::HashMap;
 use std::sync::Arc;
@@ -31,7 +31,7 @@ pub(in super::super) struct Asked {
     /// The path's parts that have a name.
     pub(super) path: HashMap<String, String>,
     pub(super) params: Params,
-    /// Whether an Arrow stream is liked better than JSON.
+    /// True if an Arrow stream is preferred to JSON.
     pub(super) as_arrow: bool,
 }
 
@@ -88,7 +88,7 @@ impl Asked {
         run(&self.view, self.part("run_id"))
     }
 
-    /// The grid point of a parameter, where it is given.
+    /// Returns the grid point of the parameter `microphone`, if it is given.
     pub(super) fn microphone(&self) -> Result<Option<usize>, Fault> {
         self.params.whole("microphone", 0..=self.catalogue.lake().grid().points().len().saturating_sub(1))
     }
@@ -156,7 +156,7 @@ pub(in super::super) fn run<'a>(view: &'a View, name: &str) -> Result<&'a Visibl
     found.ok_or_else(|| missing(format!("run `{name}`"), "GET /api/v1/runs lists what there is"))
 }
 
-/// What is not there.
+/// The fault for a missing item.
 pub(super) fn missing(what: String, hint: &'static str) -> Fault {
     Fault::NotFound { what, hint }
 }

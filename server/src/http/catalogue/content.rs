@@ -23,7 +23,7 @@ const GZIP_HEAD: [u8; 10] = [0x1f, 0x8b, 8, 0, 0, 0, 0, 0, 0, 255];
 pub(super) struct Content {
     pub(super) media_type: &'static str,
     pub(super) bytes: Bytes,
-    /// What a browser is to save it as.
+    /// File name under which a browser saves it.
     pub(super) name: Option<String>,
     packed: OnceLock<Bytes>,
 }
@@ -44,7 +44,7 @@ impl Content {
     /// A value as JSON; what is not finite becomes null.
     ///
     /// # Errors
-    /// [`Fault::Internal`] where it cannot be written, which is a defect.
+    /// [`Fault::Internal`] if it cannot be written, which is a defect.
     pub(super) fn json(value: &impl Serialize) -> Result<Self, Fault> {
         let bytes = serde_json::to_vec(value).map_err(|e| {
             eprintln!("an answer makes no JSON: {e}");
@@ -70,7 +70,7 @@ impl Content {
         Ok(Self::new(ARROW, bytes))
     }
 
-    /// What it weighs in memory.
+    /// Returns its size in memory, in bytes.
     pub(super) fn weight(&self) -> usize {
         self.bytes.len() + self.packed.get().map_or(0, Bytes::len) + self.name.as_ref().map_or(0, String::len)
     }

@@ -36,7 +36,7 @@ struct Row {
     bands: Vec<Option<Vec<f64>>>,
 }
 
-/// Which pairs a mean is over.
+/// The pairs of which a mean is taken.
 pub(super) enum Over {
     All,
     Point(usize),
@@ -73,7 +73,7 @@ impl CurveSet {
         Ok(Self { time_ms: times_ms(rig, &kept), surface: of(id), flat: of(flat) })
     }
 
-    /// Whether the surface itself has curves.
+    /// Returns whether the surface itself has curves.
     pub(super) fn is_there(&self) -> bool {
         self.surface.pairs > 0
     }

@@ -18,10 +18,10 @@ const MOST_VALUES: usize = 200;
 const BINS: usize = 24;
 /// A bin is never narrower, so that one value makes a bin and not a division by nothing.
 const LEAST_WIDTH: f64 = 1e-9;
-/// How what is not known is called as a facet's value.
+/// The facet value of surfaces for which it is not known.
 const UNKNOWN: &str = "\u{2014}";
 
-/// A text that surfaces are told apart by: parameter, title, and where it stands.
+/// A text by which surfaces are distinguished: parameter, title, and getter.
 type Facet = (&'static str, &'static str, fn(&Surface) -> Option<&str>);
 
 const FACETS: [Facet; 6] = [
@@ -71,7 +71,7 @@ struct Bin {
     count: usize,
 }
 
-/// A number that surfaces are told apart by.
+/// A number by which surfaces are distinguished.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Measure {
     /// Against Flat, of the band at this place.
@@ -155,7 +155,7 @@ fn band(summary: &Summary, name: &str, key: &str) -> Result<usize, Fault> {
     })
 }
 
-/// Which filters keep a surface out.
+/// The filters that keep a surface out: none, exactly one, or more.
 #[derive(Clone, Copy, PartialEq, Eq)]
 enum Standing {
     In,
@@ -250,7 +250,7 @@ struct Order {
     descends: bool,
 }
 
-/// What surfaces are sorted by, where it is not their name.
+/// The sort key of surfaces, if it is not their name.
 enum By {
     Measure(Measure),
     Spread(usize),

@@ -1,4 +1,4 @@
-//! Answers that were given: each is computed once, however many ask at the same time, and the oldest go first.
+//! Cache of answers: each is computed once for all concurrent requests, and the oldest are evicted first.
 
 use std::collections::{HashMap, VecDeque};
 use std::future::Future;
@@ -21,7 +21,7 @@ pub(super) type Key = (String, bool);
 #[derive(Default)]
 pub(super) struct Answers(Mutex<Kept>);
 
-/// Somebody who waits for an answer. The last one who leaves without any leaves nothing behind.
+/// A request that waits for an answer. The last one that is dropped without an answer removes the empty entry.
 struct Place<'a> {
     answers: &'a Answers,
     cell: Arc<OnceCell<Arc<Content>>>,
@@ -46,7 +46,7 @@ struct Kept {
 }
 
 impl Answers {
-    /// The answer to a question; `make` is run where nobody has it yet, and nobody else is at it.
+    /// Returns the answer for a key; `make` runs if it is neither cached nor being made by another request.
     ///
     /// # Errors
     /// Those of `make`, which are not kept.

@@ -90,7 +90,7 @@ struct Runs {
     measurements: Option<i64>,
 }
 
-/// What the lake holds.
+/// The contents of the lake.
 pub(super) async fn lake(asked: Asked) -> Result<Content, Fault> {
     let lake = asked.catalogue.lake();
     let rig = lake.rig();
@@ -125,7 +125,7 @@ pub(super) async fn lake(asked: Asked) -> Result<Content, Fault> {
     })
 }
 
-// Where it stands on the server's disk is nobody's matter.
+// The lake's path on the server's disk is not disclosed.
 fn name(location: &str) -> &str {
     location.split(['/', '\\']).rfind(|part| !part.is_empty()).unwrap_or("lake")
 }

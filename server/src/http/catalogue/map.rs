@@ -1,4 +1,4 @@
-//! `GET /api/v1/map`: surfaces as points, near where they reflect alike. Found once a snapshot.
+//! `GET /api/v1/map`: surfaces as points, close together if they reflect alike. Computed once per snapshot.
 
 use arrow::array::AsArray as _;
 use arrow::datatypes::{Float32Type, Int32Type};
@@ -110,7 +110,7 @@ fn numbered(columns: &[String]) -> Vec<String> {
     columns.iter().enumerate().map(|(i, column)| format!("{column} as band_{i}")).collect()
 }
 
-/// A surface's levels, pair by pair and band by band; NaN where there is none.
+/// A surface's levels, pair by pair and band by band; NaN if there is none.
 struct Vectors {
     places: HashMap<String, usize>,
     rows: Vec<Vec<f32>>,

@@ -1,4 +1,4 @@
-//! The catalogue: what the pages show, each a question to the lake, answered once a snapshot and kept.
+//! The catalogue: the data of the pages, each a query of the lake, answered once per snapshot and cached.
 //!
 //! [`ENDPOINTS`] is the table of them; `web/openapi.json` is their contract.
 
@@ -46,7 +46,7 @@ pub(super) use tables::table;
 use view::Views;
 pub(super) use view::{Shown, View};
 
-/// What an endpoint does.
+/// The pending answer of an endpoint.
 type Answering = Pin<Box<dyn Future<Output = Result<Content, Fault>> + Send>>;
 
 /// An address of the catalogue.
@@ -83,7 +83,7 @@ const ENDPOINTS: [Endpoint; 17] = [
     endpoint!("/api/v1/tables/{table}", Sql, tables::files),
 ];
 
-/// What the endpoints share.
+/// State shared by the endpoints.
 #[derive(Clone)]
 pub(super) struct Catalogue(Arc<Inner>);
 
@@ -153,7 +153,7 @@ impl Catalogue {
     }
 }
 
-/// Whether who asks has it already.
+/// Returns whether the client has this version already.
 pub(super) fn is_known(headers: &HeaderMap, etag: &str) -> bool {
     let tags = headers.get_all(header::IF_NONE_MATCH).iter().filter_map(|v| v.to_str().ok());
     tags.flat_map(|v| v.split(',')).map(str::trim).any(|tag| tag == "*" || tag.trim_start_matches("W/") == etag)

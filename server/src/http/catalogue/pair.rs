@@ -15,7 +15,7 @@ use super::runs::Event;
 use super::summary::Entry;
 use crate::fault::Fault;
 
-/// How much of the air's history stands around a measurement, before it and after it.
+/// Length of the air's history that is shown before and after a measurement.
 const AROUND_NS: i64 = 900_000_000_000;
 
 #[derive(Serialize)]
@@ -155,7 +155,7 @@ impl Asked {
 /// The newest measurement of the pair that the path names.
 ///
 /// # Errors
-/// [`Fault::NotFound`] where there is none.
+/// [`Fault::NotFound`] if there is none.
 pub(super) async fn measurement(asked: &Asked, entry: &Entry) -> Result<(usize, Measurement), Fault> {
     let pair = asked.pair()?;
     let id = &entry.surface.surface_id;
@@ -164,7 +164,7 @@ pub(super) async fn measurement(asked: &Asked, entry: &Entry) -> Result<(usize, 
     Ok((pair, found.ok_or_else(|| missing(what(), "its run may be partial; another pair may be there"))?))
 }
 
-/// The responses of a surface and of its Flat after Foam's were subtracted, where they are known.
+/// The responses of a surface and of its Flat after Foam's were subtracted, if they are known.
 pub(super) async fn reflected(asked: &Asked, entry: &Entry, pair: usize) -> Result<[Option<Vec<f64>>; 2], Fault> {
     let (id, flat) = (&entry.surface.surface_id, &entry.surface.flat_reference);
     let rows: Vec<Reflected> = asked.rows(REFLECTED, vec![text(id), text(flat), number(pair)]).await?;

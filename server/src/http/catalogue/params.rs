@@ -1,4 +1,4 @@
-//! A request's parameters: what is not as the contract wants it is refused with what would be right.
+//! A request's parameters: a value that violates the contract is refused with a hint of what is allowed.
 
 use std::ops::RangeInclusive;
 
@@ -7,13 +7,13 @@ use axum::http::Uri;
 
 use crate::fault::Fault;
 
-/// What stands behind a path's `?`.
+/// The query part of a URL, after the `?`.
 #[derive(Default)]
 pub(in super::super) struct Params(Vec<(String, String)>);
 
 impl Params {
     /// # Errors
-    /// [`Fault::Request`] where it is not form-encoded.
+    /// [`Fault::Request`] if it is not form-encoded.
     pub(in super::super) fn of(uri: &Uri) -> Result<Self, Fault> {
         let Query(pairs) = Query::try_from_uri(uri).map_err(|_| Fault::request("the parameters are not UTF-8"))?;
         Ok(Self(pairs))
@@ -50,7 +50,7 @@ impl Params {
         })
     }
 
-    /// One of a few words, the first where none is given.
+    /// Returns one of a few words, the first if none is given.
     pub(in super::super) fn choice(&self, name: &str, words: &'static [&'static str]) -> Result<&'static str, Fault> {
         let Some(text) = self.one(name)? else { return Ok(words[0]) };
         let known = words.iter().copied().find(|word| *word == text);
@@ -61,7 +61,7 @@ impl Params {
 /// Reads `lo..hi`.
 ///
 /// # Errors
-/// [`Fault::Request`] where it is not that.
+/// [`Fault::Request`] if it is not that.
 pub(super) fn range(name: &str, text: &str) -> Result<RangeInclusive<f64>, Fault> {
     let number = |text: &str| text.parse::<f64>().ok().filter(|n| n.is_finite());
     let bounds = text.split_once("..").and_then(|(low, high)| Some(number(low)?..=number(high)?));

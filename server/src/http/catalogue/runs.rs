@@ -39,7 +39,7 @@ struct Run {
     code_version: String,
 }
 
-/// What somebody or something said during a run.
+/// A log message of a run.
 #[derive(Deserialize, Serialize)]
 pub(super) struct Event {
     log_time: String,
@@ -51,7 +51,7 @@ pub(super) struct Event {
 const COLUMNS: &str = "surface_id, run_id, state, missing, origin, rig, started, ended, measurements, rejected, \
     attempts, damaged, temperature_min_c, temperature_max_c, humidity_min_pct, humidity_max_pct, pressure_min_hpa, \
     pressure_max_hpa, file, file_bytes, file_sha256, recorded_by, flat_version, foam_version, code_version";
-/// An empty text stands for what is not asked for.
+/// An empty text switches its condition off.
 const CHOSEN: &str = "($1 = '' or strpos(lower(concat(run_id, ' ', surface_id, ' ', state)), $1) > 0) \
     and ($2 = '' or surface_id = $2) and ($3 = '' or state = $3)";
 
@@ -67,7 +67,7 @@ struct Count {
     total: i64,
 }
 
-/// A page of runs, the newest first where nothing else is asked for.
+/// A page of runs, the newest first by default.
 pub(super) async fn runs(asked: Asked) -> Result<Content, Fault> {
     let params = &asked.params;
     let column = match params.choice("sort", &["started", "surface_id", "attempts", "file_bytes"])? {

@@ -46,7 +46,7 @@ pub(super) struct Entry {
     pub(super) reflection_factor: Option<f64>,
     /// Start of its run, days since 1970.
     pub(super) day: Option<f64>,
-    /// What the search looks in, in small letters.
+    /// The searched text, in lower case.
     pub(super) words: String,
 }
 

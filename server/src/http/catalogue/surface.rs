@@ -101,7 +101,7 @@ struct Cell {
     energies: Vec<Option<f64>>,
 }
 
-/// What the total is over is Flat's total either way.
+/// The normalisation of the bands. The total is always normalised by Flat's total.
 const OVER: [&str; 2] = ["flat-total", "flat-band"];
 
 /// TNCE over the grid for one microphone point; a pair that was measured the other way round is used by reciprocity.
@@ -120,7 +120,7 @@ pub(super) async fn grid(asked: Asked) -> Result<Content, Fault> {
          where surface_id = $1 and (microphone = $2 or speaker = $2) group by pair_id, microphone, speaker"
     );
     let mut cells: Vec<Cell> = asked.rows(&sql, vec![text(&entry.surface.surface_id), number(microphone)]).await?;
-    // Where both directions were measured, the one that was asked for counts.
+    // If both directions were measured, the requested one counts.
     cells.sort_by_key(|cell| cell.microphone == microphone);
     let points = asked.catalogue.lake().grid().points().len();
     let bands = asked.summary().await?.bands.len();

@@ -17,7 +17,7 @@ use super::summary::Summary;
 use crate::fault::Fault;
 use crate::service::Service;
 
-/// What the catalogue's own queries may take: they read a surface at most, and all surfaces once a snapshot.
+/// Time limit of the catalogue's own queries: they read a surface at most, and all surfaces once per snapshot.
 const LONGEST: Duration = Duration::from_secs(60);
 /// Files of earlier snapshots that are remembered.
 const EARLIER: usize = 20_000;
@@ -102,8 +102,8 @@ pub(super) struct Views(Mutex<Seen>);
 #[derive(Default)]
 struct Seen {
     view: Option<Arc<View>>,
-    /// Files that earlier snapshots showed: they stay until `vacuum` removes them, and who reads by a manifest of then
-    /// goes on.
+    /// Files that earlier snapshots showed: they stay until `vacuum` removes them, and clients that read by a manifest
+    /// of that time can continue.
     earlier: VecDeque<Shown>,
 }
 
@@ -111,7 +111,7 @@ impl Views {
     /// The lake as it is now.
     ///
     /// # Errors
-    /// Where it cannot be read.
+    /// The snapshot cannot be read.
     pub(super) async fn current(&self, service: &Service) -> Result<Arc<View>, Fault> {
         let known = self.seen().view.clone();
         let session = match &known {
@@ -158,7 +158,7 @@ fn gone(before: &Snapshot, after: &Snapshot) -> Vec<Shown> {
     gone
 }
 
-// Who may ask was found out before; how much their queries of their own may take is no matter of these.
+// The client was authorised before; the quota of its own queries does not apply to these.
 fn session(service: &Service) -> Arc<Session> {
     let quota = Quota { time: Some(LONGEST), ..Quota::default() };
     Arc::new(service.session(&Arc::new(Client::new("catalogue", quota))))

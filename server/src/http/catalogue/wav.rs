@@ -5,7 +5,7 @@ use super::content::Content;
 use super::pair::{measurement, reflected};
 use crate::fault::Fault;
 
-/// The panels are a tenth of the walls that they stand for: so are the wavelengths.
+/// The panels are models of walls at a tenth of their size: the wavelengths are a tenth, too.
 const SCALE: usize = 10;
 /// IEEE floats, in WAVE's words.
 const FLOATS: u16 = 3;

@@ -15,11 +15,10 @@ use crate::metrics::Protocol;
 use crate::running::{WAITING, finish};
 use crate::service::Service;
 
-/// How long a slice waits for its reader to take the next piece.
+/// Time for which a slice waits for its reader to take the next piece.
 const PATIENCE: Duration = Duration::from_secs(300);
 
-/// How long a slice waits for a place among what its client runs: work that was broken off gives its own back a moment
-/// later.
+/// Time for which a slice waits for a query permit of its client: cancelled work releases its own a moment later.
 const HANDOVER: Duration = Duration::from_secs(1);
 
 /// A slice that is being cut.
@@ -28,10 +27,10 @@ pub(super) struct Cutting {
     task: JoinSet<Result<(), Fault>>,
 }
 
-/// What a slice takes up of the server.
+/// Server resources that a slice occupies.
 pub(super) struct Room {
     pub(super) place: OwnedSemaphorePermit,
-    /// Those who are worked at have one.
+    /// The permits of slices that are being worked on.
     pub(super) turns: Arc<Semaphore>,
 }
 
@@ -88,7 +87,7 @@ async fn cut(
         if let Some(limit) = limit.filter(|limit| worked > *limit) {
             return Err(QueryError::TimeLimit { limit }.into());
         }
-        // Nobody is there any more where sending fails.
+        // If sending fails, the reader is gone.
         match tokio::time::timeout(PATIENCE, to.send(piece)).await {
             Ok(Ok(())) => {}
             _ => return Err(Fault::Cancelled),

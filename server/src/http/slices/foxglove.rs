@@ -1,6 +1,6 @@
-//! Foxglove's remote data loader: what there is to load, as its manifest says it (`manifest_schema.json` of the SDK's
-//! conformance suite). Runs that are named and not narrowed down are static files, read by ranges; all else is a source
-//! that streams a run's slice, ascending in time. Who may read is asked here and again where the data are.
+//! Foxglove's remote data loader: the manifest of what can be loaded (`manifest_schema.json` of the SDK's conformance
+//! suite). Named runs without a narrower selection are static files, read by ranges; all else is a source that streams
+//! a run's slice, ascending in time. Access is checked here and again when the data are requested.
 
 use axum::extract::State;
 use axum::http::{HeaderMap, Uri};

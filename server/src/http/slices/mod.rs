@@ -1,9 +1,8 @@
-//! Slices of run files over HTTP: cut while they are sent, or, for who reads by ranges, cut once and kept for a while.
+//! Slices of run files over HTTP: cut while they are sent, or, for clients that read by ranges, cut once and cached.
 //!
 //! A slice's bytes follow from its measurements, topics and layout alone, so its ETag is a digest of these, and it may
-//! be cut as often as somebody asks: whoever reads it to its end gets it as it is cut, in memory that is bounded.
-//! Ranges, HEAD and a script's plain GET need its length, so for them it is cut to its end first, into a file without a
-//! name.
+//! be cut any number of times: a client that reads it to its end gets it as it is cut, in bounded memory. Ranges, HEAD
+//! and a script's plain GET need its length, so for them it is cut to its end first, into a file without a name.
 
 mod cutting;
 mod foxglove;
@@ -46,7 +45,7 @@ const MOST: usize = 128;
 /// wait for all that have.
 const TURNS: usize = 4;
 
-/// What slices share.
+/// State shared by slices.
 #[derive(Clone)]
 struct Slices(Arc<Inner>);
 
@@ -74,7 +73,7 @@ pub(super) fn for_viewers(catalogue: &Catalogue) -> Router {
         .with_state(slices)
 }
 
-/// Somebody who may ask for slices, and what they ask.
+/// An authorised request for a slice.
 struct Request {
     client: Arc<Client>,
     view: Arc<View>,

@@ -1,4 +1,4 @@
-//! What a slice is asked for by: a predicate over measurements, and what of them is wanted.
+//! The parameters of a slice request: a predicate over measurements, and the wanted topics and layout.
 
 use axum::http::Uri;
 use echolake_export::{Layout, Taken};
@@ -10,28 +10,28 @@ use crate::fault::Fault;
 
 /// Runs that may be named, and sources of a manifest.
 pub(super) const MOST_RUNS: usize = 100;
-/// What may stand behind the path's `?`.
+/// Parameters that are allowed after the path's `?`.
 const NAMES: [&str; 5] = ["where", "run", "topics", "layout", "id"];
 
 /// A question.
 pub(super) struct Question {
-    /// The predicate; None where all measurements of the runs are wanted.
+    /// The predicate; None if all measurements of the runs are wanted.
     predicate: Option<String>,
     /// None, or the runs that the measurements are of.
     pub(super) runs: Vec<RunId>,
-    /// The topics, sorted; all where there are none.
+    /// The topics, sorted; all if there are none.
     pub(super) topics: Vec<String>,
-    /// In which chunks messages stand.
+    /// The distribution of messages over chunks.
     pub(super) layout: Layout,
     /// The slice that is expected.
     pub(super) id: Option<String>,
-    /// What the predicate may consist of.
+    /// The syntax that is allowed in the predicate.
     pub(super) form: PredicateForm,
 }
 
 impl Question {
     /// # Errors
-    /// [`Fault::Request`] where it is not right.
+    /// [`Fault::Request`] if it is not right.
     pub(super) fn of(uri: &Uri) -> Result<Self, Fault> {
         let params = Params::of(uri)?;
         if let Some(unknown) = params.names().find(|name| !NAMES.contains(name)) {
@@ -63,12 +63,12 @@ impl Question {
         Ok(Self { predicate, runs, topics, layout, id, form: PredicateForm::AnyExpression })
     }
 
-    /// The predicate; a true one where none was given.
+    /// The predicate; a true one if none was given.
     pub(super) fn predicate(&self) -> &str {
         self.predicate.as_deref().unwrap_or("true")
     }
 
-    /// The query's beginning, which the predicate stands behind.
+    /// The beginning of the query, which the predicate completes.
     pub(super) fn select(&self) -> String {
         // Names of runs have letters, digits, `_` and `-` alone.
         let named: Vec<_> = self.runs.iter().map(|run| format!("'{run}'")).collect();
@@ -76,12 +76,12 @@ impl Question {
         format!("select {} from measurements where{runs}", Taken::COLUMNS.join(", "))
     }
 
-    /// Whether it is for all of the runs that it names.
+    /// Returns whether it selects all of the runs that it names.
     pub(super) fn is_of_whole_runs(&self) -> bool {
         self.predicate.is_none() && self.topics.is_empty()
     }
 
-    /// It, of one run, as it stands behind a path's `?`.
+    /// Returns its parameters for one run, as the query part of a URL.
     pub(super) fn query_of(&self, run: &RunId) -> String {
         let mut pairs = vec![("layout", self.layout_name())];
         pairs.extend(self.predicate.as_deref().map(|predicate| ("where", predicate)));

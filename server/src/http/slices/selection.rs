@@ -1,5 +1,4 @@
-//! The measurements of a slice: found by the engine, within the limits of who asks, and kept for the ranges that
-//! follow.
+//! The measurements of a slice: found by the engine, within the client's limits, and cached for the ranges that follow.
 
 use std::collections::VecDeque;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -23,7 +22,7 @@ const DIGEST_BYTES: usize = 16;
 /// Changes with what slices of the same measurements are.
 const FORMAT: &str = concat!("slice 1, echolake ", env!("CARGO_PKG_VERSION"));
 
-/// What a slice is cut from.
+/// The input of a slice.
 pub(super) struct Selection {
     /// By run, time and pair.
     pub(super) taken: Vec<Taken>,
@@ -31,7 +30,7 @@ pub(super) struct Selection {
     pub(super) digest: String,
 }
 
-/// Who asks, the lake's version, and the question with all that is in it.
+/// The client's name, the lake's version, and the question with all that is in it.
 type Key = (String, String, String);
 
 /// Selections of the last questions.
@@ -42,7 +41,7 @@ impl Selections {
     /// The measurements that a request is for.
     ///
     /// # Errors
-    /// What is wrong with the predicate, or ended its query; [`Fault::NoData`] where it selects nothing.
+    /// A defect of the predicate, or what ended its query; [`Fault::NoData`] if it selects nothing.
     pub(super) async fn of(&self, catalogue: &Catalogue, request: &Request) -> Result<Arc<Selection>, Fault> {
         let Request { client, view, question } = request;
         let asked = format!("{:?} {} {}", question.form, question.select(), question.predicate());

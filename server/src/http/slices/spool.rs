@@ -17,7 +17,7 @@ use crate::fault::Fault;
 
 /// Bytes of all slices that are kept, and of one.
 const MOST_BYTES: u64 = 2 << 30;
-/// What is read at a time.
+/// Bytes that are read at a time.
 const BLOCK: u64 = 256 << 10;
 
 /// Slices that are kept, by what they are.
@@ -33,7 +33,7 @@ struct Kept {
     bytes: u64,
 }
 
-/// A slice in a file without a name: it is gone when nobody has it open, however that comes.
+/// A slice in a file without a name: the system deletes it when it is closed, even by a crash.
 pub(super) struct Spooled {
     file: File,
     /// Those that are counted in its spool.
@@ -47,7 +47,7 @@ impl Drop for Spooled {
     }
 }
 
-/// Somebody who waits for a slice. The last one who leaves without any leaves nothing behind.
+/// A request that waits for a slice. The last one that is dropped without a slice removes the empty entry.
 struct Waiting<'a> {
     spool: &'a Spool,
     cell: Arc<OnceCell<Arc<Spooled>>>,
@@ -65,8 +65,8 @@ impl Drop for Waiting<'_> {
 }
 
 impl Spool {
-    /// The slice of this name; it is cut where nobody has it yet, and nobody else is at it. Who leaves ends the work,
-    /// and another who waits begins it anew.
+    /// Returns the slice of this name; it is cut if it is neither cached nor being cut by another request. If that
+    /// request is dropped, the work is cancelled, and another waiting one starts it again.
     ///
     /// # Errors
     /// Those of cutting, and [`Fault::NoRoom`].
@@ -107,7 +107,7 @@ impl Spool {
             let Some(oldest) = kept.order.pop_front() else { break false };
             gone.extend(kept.slices.remove(&oldest));
             drop(kept);
-            // Its bytes are free once it is dropped, unless somebody reads it; dropping takes the lock.
+            // Its bytes are free once it is dropped, unless it is being read; dropping takes the lock.
             gone.clear();
         };
         if has_room { Ok(()) } else { Err(Fault::NoRoom { limit: MOST_BYTES }) }
