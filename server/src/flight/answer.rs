@@ -21,10 +21,11 @@ use super::status::status;
 use crate::fault::Fault;
 use crate::running::{Encode, Running};
 
-/// What DoGet sends.
+/// The stream that DoGet sends.
 pub(super) type Data = Pin<Box<dyn Stream<Item = Result<FlightData, Status>> + Send>>;
 
-/// Rows in the columns that were told before: the plan's, which may differ from those of its run in what may be null.
+/// Encodes rows with the columns that were announced: the plan's, which may differ from those of its run in
+/// nullability.
 pub(super) struct Told(pub(super) SchemaRef);
 
 impl Encode for Told {
@@ -47,7 +48,7 @@ impl Encode for Told {
     }
 }
 
-/// Whether these columns can be told: a placeholder without a value has no type yet.
+/// Returns whether these columns can be announced: a placeholder without a value has no type yet.
 pub(super) fn is_settled(schema: &Schema) -> bool {
     schema.fields().iter().all(|f| *f.data_type() != DataType::Null)
 }
@@ -81,7 +82,7 @@ fn send(
     Response::new(data.map_err(Status::from).boxed())
 }
 
-/// Where an answer is fetched.
+/// The ticket and the columns with which an answer is fetched.
 pub(super) fn info(
     schema: Option<&Schema>,
     ticket: &impl ProstMessageExt,

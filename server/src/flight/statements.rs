@@ -1,5 +1,6 @@
-//! Statements that clients hold handles of. A handle begins with a random number, under which the statement is kept until
-//! it is not used any more, and goes on with its text, so that another engine of the same client can plan it anew.
+//! Statements that clients hold handles of. A handle begins with a random number, under which the statement is kept
+//! until it is not used any more, and continues with its text, so that another engine of the same client can plan it
+//! again.
 
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -15,23 +16,23 @@ use crate::running::Stop;
 
 /// Bytes of a text up to which handles carry it.
 const CARRIED_BYTES: usize = 32 << 10;
-/// How long an unused handle is good for.
+/// Time after which an unused handle expires.
 const KEPT: Duration = Duration::from_secs(600);
 /// Handles of one client; the one not used for longest makes room.
 const HELD: usize = 256;
 
 type Handle = [u8; 16];
 
-/// What a handle stands for.
+/// The statement of a handle.
 #[derive(Clone)]
 pub(super) struct Statement {
     /// The session it was planned in; its client owns the handle.
     pub(super) session: Arc<Session>,
     pub(super) sql: Arc<str>,
     pub(super) prepared: Arc<Prepared>,
-    /// When: it sees the lake as it was then.
+    /// Time of planning: it sees the lake as of then.
     pub(super) planned: Instant,
-    /// Columns as they were told to the client.
+    /// Columns as they were announced to the client.
     pub(super) schema: SchemaRef,
     /// Values of its placeholders.
     pub(super) values: ParamValues,
@@ -101,7 +102,7 @@ impl Statements {
         self.with(client, handle, |kept| kept.statement.values = values)
     }
 
-    /// Forgets it; what runs goes on.
+    /// Forgets it; a running query continues.
     pub(super) fn forget(&self, client: &str, handle: &[u8]) {
         if self.find(client, handle).is_ok() {
             self.lock().retain(|known, _| !handle.starts_with(known));

@@ -43,7 +43,7 @@ const KEYWORDS: &str = "pg_get_keywords";
 /// The only role; `pg_get_userbyid`, `session_user` and `user` say the same.
 pub(super) const ROLE: &str = "postgres";
 
-/// What every session is extended by.
+/// Tables and functions of `pg_catalog` that extend every session.
 #[derive(Clone)]
 pub(super) struct PgCatalog {
     schema: Arc<dyn SchemaProvider>,
@@ -86,7 +86,7 @@ impl PgCatalog {
         lake.register_schema(INFORMATION_SCHEMA, Arc::new(Information::of(&known)))?;
         let mut extended =
             SessionStateBuilder::new_from_existing(known).with_type_planner(Arc::new(PgOidTypePlanner)).build();
-        // Where this is on, DataFusion's own stands before the one that is registered.
+        // If this is on, DataFusion's own takes precedence over the one that is registered.
         extended.config_mut().options_mut().catalog.information_schema = false;
         *state.write() = extended;
         CoerceIntArgsToBigInt::widen(context);

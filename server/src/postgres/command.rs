@@ -26,7 +26,7 @@ use crate::running::{Batches, Running};
 /// Columns of `SHOW ALL`.
 const ALL: [&str; 2] = ["name", "setting"];
 
-/// What is sent for a statement.
+/// The answer to a statement.
 pub(super) enum Reply {
     Rows(QueryResponse),
     Copy(CopyAs, Running<Vec<CopyData>>),

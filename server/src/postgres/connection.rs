@@ -31,10 +31,10 @@ const LARGEST: usize = 2 << 20;
 /// Prepared statements of a connection at once, and portals.
 const NAMED: usize = 500;
 
-/// What a client cancels by: the process's number and the secret that it was given.
+/// The key by which a client cancels: the process's number and the secret that it was given.
 type BackendKey = (i32, Bytes);
 
-/// What all connections share.
+/// State shared by all connections.
 pub(super) struct Shared {
     pub(super) service: Service,
     pub(super) parser: PostgresCompatibilityParser,
@@ -78,7 +78,7 @@ impl Drop for Connection {
     }
 }
 
-/// What clients keep by name.
+/// Kinds of named objects that clients keep.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub(super) enum Kept {
     Statement,
@@ -94,7 +94,7 @@ impl Kept {
     }
 }
 
-/// What a command runs under.
+/// Stop signal and time limit of a command.
 #[derive(Clone)]
 pub(super) struct Run {
     pub(super) stop: Stop,
@@ -102,7 +102,7 @@ pub(super) struct Run {
 }
 
 impl Connection {
-    /// A connection that nobody has logged in on.
+    /// A connection without a login.
     pub(super) fn new(shared: Arc<Shared>) -> Self {
         Self {
             shared,
@@ -145,7 +145,7 @@ impl Connection {
         self.session.get().ok_or(Fault::Unauthenticated)
     }
 
-    /// Waits until somebody has logged in.
+    /// Waits for the login.
     pub(super) async fn logged_in(&self) {
         self.session.wait().await;
     }
@@ -193,7 +193,7 @@ impl Connection {
         }
     }
 
-    /// Runs what was planned, anew where the plan is old.
+    /// Runs a planned statement; plans it again if the plan is old.
     pub(super) async fn run<E: Encode>(
         &self,
         run: &Run,

@@ -26,12 +26,12 @@ use super::sqlstate::error;
 use crate::fault::Fault;
 use crate::running::{Encode, Running};
 
-/// What a binary copy begins with: signature, no flags, no extension.
+/// Header of a binary copy: signature, no flags, no extension.
 const BINARY_HEADER: &[u8] = b"PGCOPY\n\xff\r\n\0\0\0\0\0\0\0\0\0";
-/// And ends with.
+/// Trailer of a binary copy.
 const BINARY_END: &[u8] = &[0xff, 0xff];
 
-/// How rows are copied.
+/// The format of a copy.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) enum CopyAs {
     Binary,
@@ -51,7 +51,7 @@ struct Options {
 /// The query that is copied, and how.
 ///
 /// # Errors
-/// Where it is copied to a file or a program, or in a way that is not known.
+/// It is copied to a file or a program, or in a way that is not known.
 pub(super) fn read(
     source: CopySource,
     target: &CopyTarget,
@@ -142,7 +142,7 @@ impl CopyAs {
         if *self == Self::Binary { Format::UnifiedBinary } else { Format::UnifiedText }
     }
 
-    // Names of columns, where they are wanted.
+    // Names of columns, if they are wanted.
     fn first_line(&self, fields: &[FieldInfo]) -> Option<Bytes> {
         let names = |delimiter: &str, quoted: &dyn Fn(&str) -> String| {
             let names: Vec<_> = fields.iter().map(|f| quoted(f.name())).collect();

@@ -21,7 +21,7 @@ use crate::running::Running;
 pub(super) struct Cursor {
     /// Its columns.
     pub(super) schema: SchemaRef,
-    /// Whether it outlives its transaction.
+    /// True if it outlives its transaction (WITH HOLD).
     pub(super) held: bool,
     rows: Arc<Mutex<Left>>,
 }

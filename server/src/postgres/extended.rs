@@ -64,7 +64,7 @@ impl QueryParser for Planner {
 
     fn get_parameter_types(&self, statement: &Statement) -> PgWireResult<Vec<Type>> {
         let kinds = kinds(statement).map_err(|fault| error(&fault))?;
-        // Where the query does not tell, Postgres takes a text.
+        // If the query does not determine the type, Postgres takes a text.
         let one = |kind: Option<DataType>| kind.map_or(Ok(Type::TEXT), |kind| into_pg_type(&kind));
         kinds.into_iter().map(one).collect()
     }
@@ -95,7 +95,7 @@ fn values(portal: &Portal<Statement>) -> Result<ParamValues, Fault> {
     {
         return Err(Fault::request(format!("{} formats for {given} values", codes.len())));
     }
-    // Where neither side tells the type, it is the text that was advertised.
+    // If neither side gives the type, it is the text that was advertised.
     let told = |i: usize| {
         portal.statement.parameter_types.get(i).is_some_and(|t| t.as_ref().is_some_and(|t| *t != Type::UNKNOWN))
     };

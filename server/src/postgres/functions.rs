@@ -112,7 +112,7 @@ pub(super) fn arguments(of: HashMap<i32, String>) -> Arc<ScalarUDF> {
     Arc::new(create_udf(name, vec![DataType::Int32], DataType::Utf8, Volatility::Stable, Arc::new(find)))
 }
 
-/// `to_regtype(name)`: the number of a type; NULL where there is none.
+/// `to_regtype(name)`: the number of a type; NULL if there is none.
 pub(super) fn to_regtype(types: HashMap<String, i32>) -> Arc<ScalarUDF> {
     let find = move |args: &[ColumnarValue]| {
         let names = ColumnarValue::values_to_arrays(args)?;

@@ -59,8 +59,8 @@ fn twice(socket: UnixStream) -> io::Result<(UnixStream, UnixStream)> {
     Ok((UnixStream::from_std(socket)?, UnixStream::from_std(watched)?))
 }
 
-// While a query runs nobody reads from the connection, so that its end must be watched for. Nothing runs before a
-// login, and who sends a CancelRequest hangs up behind it: it is read all the same.
+// While a query runs, the connection is not read, so that its end must be watched for. Nothing runs before a login, and
+// a client that sends a CancelRequest hangs up behind it: it is read all the same.
 async fn gone(socket: &UnixStream, connection: &Connection) {
     connection.logged_in().await;
     while let Ok(ready) = socket.ready(Interest::READABLE).await

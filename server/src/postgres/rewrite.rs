@@ -1,4 +1,4 @@
-//! What clients' own questions to the catalogue need beyond what `datafusion-pg-catalog` adapts.
+//! Adaptations of clients' catalogue queries beyond those of `datafusion-pg-catalog`.
 
 use std::ops::ControlFlow;
 
@@ -17,7 +17,7 @@ const FUNCTIONS: [&str; 6] = ["typinput", "typoutput", "typreceive", "typsend", 
 const AGGREGATES: [&str; 8] = ["array_agg", "avg", "bool_or", "count", "max", "min", "string_agg", "sum"];
 /// Tables about what no column of the lake has.
 const NOTHING: [&str; 3] = ["pg_attrdef", "pg_collation", "pg_sequence"];
-/// How such a column says that there is none.
+/// The value of such a column that names no function.
 const NONE: &str = "-";
 
 /// Tables of `pg_catalog` that are found without its name, beside those that `datafusion-pg-catalog` knows.
@@ -91,7 +91,7 @@ impl VisitorMut for Adapt<'_> {
     }
 }
 
-// DuckDB reads a table by ranges of places; where `pg_class` says that it has one page, there is one range, of all rows.
+// DuckDB reads a table by ranges of `ctid`; if `pg_class` reports one page, there is one range, of all rows.
 fn is_whole_table(expr: &Expr) -> bool {
     let is_place = |expr: &Expr, place: &str| {
         matches!(expr, Expr::Cast { expr, data_type, .. }

@@ -35,7 +35,7 @@ pub(super) fn fields(schema: &Schema, format: &Format) -> Result<Arc<Vec<FieldIn
     Ok(Arc::new(fields.into_iter().map(settled).collect()))
 }
 
-/// What cannot be sent to a Postgres client.
+/// The fault for a value that cannot be sent to a Postgres client.
 pub(super) fn encoding(error: &PgWireError) -> Fault {
     let message = match error {
         PgWireError::UserError(info) => info.message.clone(),

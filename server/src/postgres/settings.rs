@@ -7,12 +7,12 @@ use std::time::Duration;
 
 use crate::fault::Fault;
 
-/// What the server says it is; the first word is what clients compare.
+/// The server's version as shown to clients, which compare the first word.
 pub(super) const VERSION: &str = concat!("16.6 (echolake ", env!("CARGO_PKG_VERSION"), ")");
 /// Characters of a setting.
 const LONGEST: usize = 1000;
 
-/// What may be done with a setting.
+/// The allowed changes of a setting.
 #[derive(Debug, Clone, Copy)]
 enum May {
     /// Nothing: it is a fact.
@@ -94,7 +94,7 @@ impl Settings {
         Ok(())
     }
 
-    /// Who logged in, by their own word.
+    /// Stores the user name, as the client gave it at login.
     pub(super) fn set_user(&self, user: &str) {
         let user = user.chars().take(LONGEST).collect();
         self.0.lock().unwrap_or_else(PoisonError::into_inner).insert("session_authorization", user);

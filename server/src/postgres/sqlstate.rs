@@ -5,7 +5,7 @@ use pgwire::error::{ErrorInfo, PgWireError};
 
 use crate::fault::{Code, Fault};
 
-/// A failure after which the connection goes on.
+/// A failure that leaves the connection open.
 pub(crate) fn error(fault: &Fault) -> PgWireError {
     info("ERROR", fault)
 }

@@ -72,7 +72,7 @@ impl Startup {
         if let Some(user) = given.get(METADATA_USER) {
             settings.set_user(user);
         }
-        // What a driver always sends counts where it is known, and is no reason to turn it away.
+        // A setting that a driver always sends is applied if it is known, and is no reason to refuse the client.
         for (name, value) in given {
             let _ = settings.set(name, value);
         }

@@ -41,7 +41,7 @@ impl Planned {
     }
 }
 
-/// What a client may ask.
+/// A statement that a client may run.
 #[derive(Clone)]
 pub(super) enum Statement {
     Query(Arc<Planned>),
@@ -70,7 +70,7 @@ pub(super) enum Statement {
     Deallocate(Option<String>),
 }
 
-/// The statements of a text, whose placeholders have these types where their client tells.
+/// Parses the statements of a text, whose placeholders have these types if the client gives them.
 pub(super) fn parse(
     parser: &PostgresCompatibilityParser,
     session: &Session,
@@ -79,13 +79,13 @@ pub(super) fn parse(
 ) -> Result<Vec<Parsed>, Fault> {
     check_statement_bounds(sql, &PostgreSqlDialect {})?;
     let Ok(adapted) = parser.parse(sql) else {
-        // DataFusion's own parser knows more, such as DESCRIBE, and says where an error is.
+        // DataFusion's own parser knows more, such as DESCRIBE, and gives the position of an error.
         return Ok(vec![session.parse(sql)?]);
     };
     if adapted.len() > TOGETHER {
         return Err(Fault::TooMany { what: "statements in one text", limit: TOGETHER });
     }
-    // The adapted ones have lost their places; where nothing but places differs, these keep them.
+    // The adapted ones have lost their positions; if nothing but positions differs, these keep them.
     let placed = Parser::parse_sql(&PostgreSqlDialect {}, sql).unwrap_or_default();
     let placed: Vec<_> = placed.into_iter().map(|s| parser.rewrite(s)).collect();
     let statements = if placed == adapted { placed } else { adapted };
