@@ -21,7 +21,7 @@ pub(crate) struct Task {
     bar: Option<ProgressBar>,
     begun: Instant,
     last_line: Instant,
-    /// What else there is to say, behind the bar or in the line.
+    /// A remark behind the bar or in the line.
     note: String,
 }
 

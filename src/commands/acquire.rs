@@ -1,4 +1,4 @@
-//! `echolake acquire`: one surface measured, watched, paused, stopped and gone on with.
+//! `echolake acquire`: measures one surface, with progress, pause, stop and resume.
 
 mod acknowledge;
 mod specimen;
@@ -26,10 +26,10 @@ use acknowledge::Acknowledgements;
 pub(super) use specimen::{relief_of_file, set_all};
 use watch::Watcher;
 
-/// How often a time-series store is told.
+/// Time between two pushes of metrics to a time-series store.
 const TOLD_EVERY: Duration = Duration::from_secs(10);
 
-/// A run that is about to begin, or to be gone on with.
+/// A run to begin or to resume.
 enum Job {
     Fresh(Box<Fresh>),
     Resumed { partial: PathBuf, held: Box<Held> },
@@ -99,7 +99,7 @@ pub(crate) async fn run(args: &AcquireArgs, lake_url: &str) -> anyhow::Result<Do
         measured
     });
     let measured = measured.await?;
-    // The last numbers are told, and viewers are let go, before the command ends.
+    // The last metrics are sent, and viewers are disconnected, before the command ends.
     drop((pushed, served, live));
     match measured {
         Ok(measured) => tell(&measured, lake_url),
@@ -112,7 +112,7 @@ pub(crate) async fn run(args: &AcquireArgs, lake_url: &str) -> anyhow::Result<Do
     }
 }
 
-// Where the run's file is, and what to do next.
+// Reports the path of the run's file, and the next step.
 fn tell(measured: &Measured, lake_url: &str) -> anyhow::Result<Done> {
     let Measured { path, outcome } = measured;
     if outcome.left > 0 {
@@ -160,7 +160,7 @@ async fn fresh(args: &AcquireArgs, lake_url: &str, progress: &Progress) -> anyho
     })))
 }
 
-// References may well come later: the rows wait for them. Whoever measures by mistake without any is told.
+// References may be measured later: the rows wait for them. This warns users who forgot them.
 #[cfg(feature = "lake")]
 async fn warn_of_missing_references(
     args: &AcquireArgs,

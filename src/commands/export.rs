@@ -38,7 +38,7 @@ pub(crate) struct MlArgs {
     /// Rows as measured, or under all eight symmetries of the square.
     #[arg(long, value_enum, default_value_t = SymmetriesArg::None)]
     symmetries: SymmetriesArg,
-    /// What the validation and test sets hold out.
+    /// Unit that the validation and test sets hold out.
     #[arg(long, value_enum, default_value_t = SplitArg::ByPanel)]
     split: SplitArg,
     /// Columns of measurements, nce and tnce, separated by commas; by default ir, temperature_c, snr_db and tnce_*.
@@ -87,10 +87,10 @@ enum SplitArg {
     None,
 }
 
-/// Which measurements are taken.
+/// A selection of measurements.
 #[derive(Debug, Args)]
 struct Selection {
-    /// Which measurements: an SQL predicate over the columns of table measurements.
+    /// The measurements: an SQL predicate over the columns of table measurements.
     #[arg(long = "where", value_name = "PREDICATE")]
     predicate: String,
     /// Do not read the runs' files whole to compare their SHA-256; sizes, indexes and the CRCs of what is read are

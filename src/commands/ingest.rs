@@ -29,7 +29,7 @@ const RETRY_AFTER: Duration = Duration::from_secs(10);
 /// Exit code of a process that panicked.
 const PANICKED: i32 = 101;
 
-/// What became of all that was given.
+/// The results of all files.
 #[derive(Default, Serialize, Deserialize)]
 pub(crate) struct Summary {
     pub(crate) taken: Vec<Taken>,
@@ -41,7 +41,7 @@ pub(crate) struct Summary {
 struct RefusedFile {
     file: String,
     reason: String,
-    /// Where it is now, if it was moved.
+    /// Its new path, if it was moved.
     moved_to: Option<String>,
 }
 
@@ -90,7 +90,7 @@ pub(crate) async fn run(args: &IngestArgs, lake_url: &str) -> anyhow::Result<Don
     if nothing && !args.json {
         eprintln!("nothing to ingest: every run of the lake is in its tables");
     }
-    // Files that were named are the whole job; where none of them could be taken in, it failed.
+    // Files that were named are the whole job; if none of them could be taken in, it failed.
     if !args.runs.is_empty() && summary.taken.is_empty() && !summary.refused.is_empty() {
         anyhow::bail!("nothing was taken in");
     }
@@ -208,8 +208,8 @@ async fn take_in_suspect(lake: &Lake, path: &str, stop: &Arc<AtomicBool>, progre
     Ok(Done::Whole)
 }
 
-// What comes into the inbox, until Ctrl-C. A file that somebody copies there grows while we look; one that is as it
-// was at the last look is whole.
+// Takes in new files of the inbox, until Ctrl-C. A file that is being copied there grows between two looks; one that is
+// as it was at the last look is whole.
 async fn watch(lake: &Lake, stop: &StopRequest, progress: &Progress) -> anyhow::Result<Done> {
     eprintln!("watching `{}/inbox`; Ctrl-C ends it", lake.location());
     let mut before: HashMap<ObjectPath, (u64, chrono::DateTime<chrono::Utc>)> = HashMap::new();

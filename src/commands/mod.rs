@@ -1,4 +1,4 @@
-//! The verbs, a file each.
+//! The verbs, one file each.
 
 mod acquire;
 #[cfg(feature = "lake")]
@@ -120,7 +120,7 @@ async fn rig_or(file: Option<&Path>, lake_url: &str, otherwise: impl FnOnce() ->
 fn inbox(lake: &Lake) -> anyhow::Result<std::path::PathBuf> {
     let folder = lake.folder().context("recordings need a lake in a folder; hint: --lake FOLDER")?.join("inbox");
     std::fs::create_dir_all(&folder).with_context(|| format!("cannot make `{}`", folder.display()))?;
-    // A recording that is on the disk is of no use where its folder's name is not, or the lake's.
+    // A synced recording is of no use if its folder's name, or the lake's, is not synced.
     for above in folder.ancestors().skip(1).take(2) {
         let above = if above.as_os_str().is_empty() { Path::new(".") } else { above };
         let synced = std::fs::File::open(above).and_then(|opened| opened.sync_all());
@@ -129,7 +129,7 @@ fn inbox(lake: &Lake) -> anyhow::Result<std::path::PathBuf> {
     Ok(folder)
 }
 
-/// Tells who may look on at an address, and how others may.
+/// Prints which viewers have access at an address, and how to let in others.
 fn tell_access(viewers: &ViewerArgs, address: SocketAddr, progress: &Progress) {
     if viewers.allowed_origins.is_empty() {
         progress.say("hint: a viewer on the web needs its address: --allow-origin https://app.foxglove.dev");

@@ -95,7 +95,7 @@ pub(crate) fn run(args: &PanelArgs) -> anyhow::Result<Done> {
     Ok(Done::Whole)
 }
 
-/// What a file is to hold.
+/// The content of an output file.
 #[derive(Debug, Clone, Copy)]
 enum Kind {
     Mesh(Format),

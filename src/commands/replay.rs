@@ -1,4 +1,4 @@
-//! `echolake replay`: runs shown again to Foxglove, as fast and from where its user likes.
+//! `echolake replay`: replays runs to Foxglove, with speed and position under its user's control.
 
 use std::path::{Path, PathBuf};
 use std::time::Duration;
@@ -14,7 +14,7 @@ use crate::Done;
 use crate::cli::ReplayArgs;
 use crate::progress::{Progress, Task};
 
-/// How often it is looked how the replay stands.
+/// Time between two looks at the state of the replay.
 const LOOK_EVERY: Duration = Duration::from_millis(200);
 /// Names that an error lists.
 #[cfg(feature = "lake")]

@@ -1,4 +1,4 @@
-//! `echolake serve` and `echolake token`: the lake over HTTP, Flight SQL and Postgres, for those who may.
+//! `echolake serve` and `echolake token`: the lake over HTTP, Flight SQL and Postgres, with access control.
 
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 use std::path::PathBuf;
@@ -13,7 +13,7 @@ use echolake_server::{CataloguePages, EngineSettings, Error, Server, Settings};
 use crate::Done;
 use crate::signals::StopRequest;
 
-/// Memory for queries, and engines at once, if nobody says otherwise.
+/// Memory for queries, and engines at once, by default.
 const MEMORY_MIB: u32 = 4096;
 const ENGINES: u32 = 16;
 
@@ -42,7 +42,7 @@ pub(crate) struct ServeArgs {
     temp: Option<PathBuf>,
 }
 
-/// What `serve` starts its engines with.
+/// Arguments with which `serve` starts its engines.
 #[derive(Debug, clap::Args)]
 pub(crate) struct EngineArgs {
     /// Folder for its sockets.
@@ -72,7 +72,7 @@ pub(crate) async fn engine(args: &EngineArgs, lake_url: &str) -> anyhow::Result<
     Ok(Done::Whole)
 }
 
-/// Where to listen.
+/// A listening address, or none.
 #[derive(Debug, Clone, Copy)]
 enum Listen {
     Off,
@@ -99,7 +99,7 @@ impl Listen {
     }
 }
 
-/// Where HTTP is served if nobody says otherwise.
+/// The default address of HTTP.
 const HTTP: SocketAddr = SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 8080);
 
 pub(crate) async fn run(args: &ServeArgs, lake_url: &str) -> anyhow::Result<Done> {
@@ -121,7 +121,7 @@ pub(crate) async fn run(args: &ServeArgs, lake_url: &str) -> anyhow::Result<Done
     answer(server, &stop).await
 }
 
-/// Serves the catalogue alone, where others look for it or, if somebody else is there, on any port that is free.
+/// Serves the catalogue alone, at the default address or, if that is taken, on any free port.
 pub(crate) async fn catalogue(lake: &Lake, stop: &StopRequest) -> anyhow::Result<Done> {
     let engines = engines(MEMORY_MIB, ENGINES, None)?;
     let settings =

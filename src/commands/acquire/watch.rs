@@ -1,4 +1,4 @@
-//! What whoever runs the rig sees and can do: progress, pause, stop.
+//! Progress and control of a run for its operator: pause, stop.
 
 use std::io::{BufRead as _, IsTerminal as _};
 use std::path::PathBuf;
@@ -97,7 +97,7 @@ impl Watcher {
 }
 
 /// Lets signals and the terminal control a run from now on: Ctrl-C and SIGTERM stop it after the current pair, a second
-/// one at once; SIGUSR1, or `p` and Enter on a terminal, pauses it and lets it go on.
+/// one at once; SIGUSR1, or `p` and Enter on a terminal, pauses or resumes it.
 ///
 /// # Errors
 /// The system refused a handler.

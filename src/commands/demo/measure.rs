@@ -20,34 +20,34 @@ use crate::progress::{Progress, Task};
 /// 2026-01-05 08:00 UTC for seed 1, and eleven hours from run to run: a run takes ten.
 const FIRST_START: Timestamp = Timestamp(1_767_600_000_000_000_000);
 const RUN_EVERY_SECS: u32 = 39_600;
-/// With more surfaces than this, progress is told in surfaces.
+/// With more surfaces than this, progress counts surfaces.
 const TOLD_EACH: usize = 20;
 
-/// What is to be measured.
+/// A collection of surfaces to measure.
 pub(super) struct Campaign {
     pub(super) rig: Rig,
     /// In the order in which they are measured.
     pub(super) surfaces: Vec<Member>,
     pub(super) keep: Keep,
     pub(super) seed: u64,
-    /// Where the runs go.
+    /// Folder of the recordings.
     pub(super) folder: PathBuf,
     /// Names, without their tags, of the runs that are there already.
     pub(super) known: HashSet<String>,
 }
 
-/// What the threads of a campaign share.
+/// State shared by the threads of a campaign.
 struct Shared<'a> {
     campaign: &'a Campaign,
     progress: &'a Progress,
     stop: &'a AtomicBool,
     next: AtomicUsize,
-    /// Of all surfaces, where they are not told one by one.
+    /// Progress over all surfaces, if they are not shown one by one.
     whole: Option<Mutex<(Task, u64)>>,
     made: Mutex<Made>,
 }
 
-/// What was measured, as opposed to found.
+/// Totals of the new measurements, without those that were there before.
 #[derive(Default)]
 struct Made {
     runs: u64,
@@ -156,7 +156,7 @@ impl Shared<'_> {
         }
     }
 
-    // How the run ended and its size; nothing where it was measured before.
+    // Returns how the run ended and its size; nothing if it was measured before.
     fn surface(&self, number: usize, member: &Member) -> anyhow::Result<Option<(RunEnd, u64)>> {
         let Campaign { rig, keep, seed, folder, known, .. } = self.campaign;
         let surface = &member.surface;

@@ -25,12 +25,12 @@ const LOCK_FILE: &str = include_str!("../../../Cargo.lock");
 const FORMAT_CRATES: [&str; 4] = ["mcap", "parquet", "arrow", "datafusion"];
 /// The release sets it; a build in a checkout does not know its commit.
 const COMMIT: Option<&str> = option_env!("ECHOLAKE_COMMIT");
-/// What the demo writes.
+/// Disk space that the demo needs.
 const DEMO_BYTES: u64 = 900_000_000;
-/// What `serve` keeps of slices in temporary files, at most.
+/// Disk space that `serve` uses for temporary files of slices, at most.
 const SLICE_BYTES: u64 = 2 << 30;
 
-/// What an installation can do.
+/// The capabilities of an installation.
 #[derive(Debug, Serialize)]
 struct InstallationReport {
     version: &'static str,
@@ -270,7 +270,7 @@ fn try_files_in(scratch: &Path) -> Result<(), (&'static str, io::Error)> {
     file.try_lock().map_err(|e| ("lock a file", e.into()))?;
     fs::rename(&first, &second).map_err(|e| ("rename a file", e))?;
     fs::hard_link(&second, &third).map_err(|e| ("link a file", e))?;
-    // A commit counts on it: who comes second is refused.
+    // Commits rely on this: the second writer of a name is refused.
     if fs::hard_link(&second, &third).is_ok() {
         return Err(("rely on links", io::Error::other("a name was given twice")));
     }

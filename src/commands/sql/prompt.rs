@@ -25,10 +25,10 @@ use words::Words;
 /// Lines of history that are kept.
 const HISTORY: usize = 10_000;
 
-/// How answers are given.
+/// The form of answers.
 struct Settings {
     format: Format,
-    /// Where to, instead of the terminal; the next answer alone.
+    /// File for the next answer alone, instead of the terminal.
     output: Option<PathBuf>,
     timing: bool,
     pager: bool,

@@ -1,10 +1,10 @@
-//! What a line of the prompt orders when it is no SQL.
+//! Commands of the prompt: lines that are not SQL.
 
 use std::path::PathBuf;
 
 use echolake_query::output::Format;
 
-/// What `\?` prints.
+/// The text that `\?` prints.
 pub(super) const HELP: &str = "\
 a query ends with ;
 \\d          the tables               \\d TABLE      its columns, with units
@@ -38,7 +38,7 @@ pub(super) enum Command {
     Functions(Option<String>),
 }
 
-/// The order of a line; None where it is SQL.
+/// Parses the command of a line; None if it is SQL.
 pub(super) fn parse(line: &str) -> Option<Result<Command, String>> {
     let line = line.trim();
     let (word, rest) = line.split_once(char::is_whitespace).unwrap_or((line, ""));

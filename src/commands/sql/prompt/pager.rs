@@ -3,7 +3,7 @@
 use std::io::{IsTerminal as _, Write};
 use std::process::{Child, Command, Stdio};
 
-/// Leaves at once where all fits on the screen, and what was shown stays there; long lines are not folded.
+/// Exits at once if all fits on the screen, and leaves the text there; long lines are not folded.
 const PAGER: &str = "less -FRSX";
 
 /// Somewhere to write an answer for people.
@@ -15,7 +15,7 @@ pub(super) enum Page {
 }
 
 impl Page {
-    /// The pager where one is wanted and there, else the terminal.
+    /// The pager if one is wanted and available, else the terminal.
     pub(super) fn open(is_wanted: bool) -> Self {
         let terminal = std::io::stdout();
         if !is_wanted || !terminal.is_terminal() {

@@ -52,7 +52,7 @@ const COMMANDS: [&str; 9] = ["\\?", "\\d", "\\df", "\\f", "\\o", "\\pager", "\\q
 /// Words after which a table is named.
 const BEFORE_TABLE: [&str; 5] = ["from", "join", "describe", "\\d", "\\d+"];
 
-/// What may be meant by a word that is begun.
+/// Completions of a word.
 #[derive(Helper, Highlighter, Hinter, Validator)]
 pub(super) struct Words {
     tables: BTreeMap<String, Vec<String>>,
@@ -93,7 +93,7 @@ impl Words {
         found
     }
 
-    // Columns of the tables that the line names; of all, where it names none yet.
+    // Columns of the tables that the line names; of all, if it names none yet.
     fn columns<'a>(&'a self, line: &'a str) -> impl Iterator<Item = &'a String> {
         let words: Vec<_> = line.split(|c: char| !is_part(c)).collect();
         let is_named = |table: &String| words.iter().any(|w| w.eq_ignore_ascii_case(table));
