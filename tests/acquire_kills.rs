@@ -1,5 +1,5 @@
-//! `acquire` killed at random moments, with or without the power, recovered and gone on with: nothing that was
-//! acknowledged is lost, nothing is there twice, and the run is whole in the end.
+//! `acquire` killed at random moments, with or without the power, recovered and resumed: nothing that was acknowledged
+//! is lost, nothing is there twice, and the run is whole in the end.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -23,7 +23,7 @@ const PACE: &str = "0.008";
 /// A run that is never killed within so many tries shows that the moments are wrong.
 const RUNS_PER_KILL: usize = 50;
 
-/// How a campaign went.
+/// Counts of a campaign.
 #[derive(Debug, Default)]
 pub(crate) struct Outcome {
     /// Processes that were killed while they worked.
@@ -41,7 +41,7 @@ pub(crate) struct Campaign {
     folder: tempfile::TempDir,
     binary: PathBuf,
     random: ChaCha8Rng,
-    /// What the lake is on, where the power is cut, too.
+    /// The lake's disk, if the power is cut, too.
     disk: Option<(ForgetfulDisk, Option<Mounted>)>,
 }
 
@@ -56,7 +56,7 @@ impl Campaign {
         Self { folder, binary: binary.to_owned(), random: ChaCha8Rng::seed_from_u64(seed), disk: None }
     }
 
-    /// With a disk that forgets at each kill what was not synced; nothing where this machine mounts none.
+    /// With a disk that forgets at each kill what was not synced; nothing if this machine cannot mount one.
     pub(crate) fn with_power_cuts(binary: &Path, seed: u64) -> Option<Self> {
         let mut campaign = Self::new(binary, seed);
         let disk = ForgetfulDisk::new();
@@ -75,10 +75,11 @@ impl Campaign {
         }
     }
 
-    /// Kills `acquire` so many times; run after run is begun, and each is brought to its end. `told` hears of each run.
+    /// Kills `acquire` so many times; run after run is begun, and each is brought to its end. `told` is called with the
+    /// counts after each run.
     ///
     /// # Panics
-    /// Where a measurement is lost or doubled; the text names it.
+    /// A measurement is lost or doubled; the text names it.
     pub(crate) fn kills(&mut self, kills: usize, told: &mut dyn FnMut(&Outcome)) -> Outcome {
         let mut whole = self.undisturbed();
         let mut outcome = Outcome::default();
@@ -91,7 +92,7 @@ impl Campaign {
         outcome
     }
 
-    // How long a run takes that nobody kills.
+    // Returns the time of a run that is not killed.
     fn undisturbed(&mut self) -> Duration {
         let begun = Instant::now();
         let output = run_command(&mut self.acquire(None)).expect("it starts");
@@ -236,7 +237,7 @@ fn text(bytes: &[u8]) -> String {
     String::from_utf8_lossy(bytes).into_owned()
 }
 
-/// How often each verdict is in a file; each has its response and its sweep before it.
+/// Counts each verdict of a file; each has its response and its sweep before it.
 fn verdicts(path: &Path) -> BTreeMap<Key, usize> {
     let file = std::fs::read(path).expect("read");
     let (mut found, mut behind) = (BTreeMap::new(), BTreeMap::new());

@@ -239,7 +239,7 @@ fn lakes_that_are_none_newer_or_someone_elses() {
 struct Disk(std::path::PathBuf);
 
 impl Disk {
-    // None where we may not mount, as outside of containers and for anyone but root.
+    // None if the test may not mount, as outside of containers and for other users than root.
     fn mounted(at: &Path, kib: u64) -> Option<Self> {
         std::fs::create_dir(at).expect("made");
         let size = format!("size={kib}k");
@@ -317,13 +317,13 @@ fn a_recording_whose_recorder_died_yields_what_was_complete() {
     let partial = run.with_extension("mcap.partial");
     std::fs::remove_file(&run).expect("removed");
     std::fs::write(&partial, cut_off(&whole)).expect("written");
-    // While somebody records, it is left alone.
+    // While it is being recorded, it is left alone.
     let recorder = std::fs::File::open(&partial).expect("open");
     recorder.lock().expect("locked");
     place.fails(0, &["ingest"], "nothing to ingest");
     place.fails(1, &["recover", &partial.to_string_lossy()], "is being recorded");
     drop(recorder);
-    // It could be gone on with, so nobody takes it for a run but on request.
+    // It could be resumed, so it is taken for a run only on request.
     place.fails(0, &["ingest"], "nothing to ingest");
     place.fails(3, &["recover", &partial.to_string_lossy()], "read back and compared");
     place.fails(3, &["ingest"], "");

@@ -19,7 +19,7 @@ use rand::Rng as _;
 use rand_chacha::ChaCha8Rng;
 use rustix::io::Errno;
 
-/// What is written as a whole or not at all.
+/// Unit that is written as a whole or not at all, in bytes.
 const SECTOR: usize = 512;
 /// Nothing is cached: the kernel asks each time.
 const NO_TIME: Duration = Duration::ZERO;
@@ -53,7 +53,7 @@ impl ForgetfulDisk {
         Self(Arc::new(Mutex::new(Tree { nodes: BTreeMap::from([(ROOT, root)]), next: ROOT + 1 })))
     }
 
-    /// Mounts the disk; nothing where this machine does not let us.
+    /// Mounts the disk; nothing if this machine does not allow it.
     pub(crate) fn mount(&self, at: &Path) -> Option<Mounted> {
         let options = [MountOption::FSName("forgetful".into())];
         match fuser::spawn_mount2(Disk(self.0.clone()), at, &options) {
@@ -65,7 +65,7 @@ impl ForgetfulDisk {
         }
     }
 
-    /// The power is cut. Nobody may have the disk mounted.
+    /// Cuts the power. The disk must not be mounted.
     pub(crate) fn cut(&self, random: &mut ChaCha8Rng) {
         let mut tree = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         for node in tree.nodes.values_mut() {
@@ -94,7 +94,7 @@ fn torn(now: &[u8], safe: &[u8], random: &mut ChaCha8Rng) -> Vec<u8> {
     let mut left = Vec::with_capacity(length);
     while left.len() < length {
         let range = left.len()..(left.len() + SECTOR).min(length);
-        // Zeros where neither reaches; of a sector that was synced and not written since, both are the same.
+        // Zeros if neither reaches so far; of a sector that was synced and not written since, both are the same.
         let sector = |of: &[u8]| -> Vec<u8> { range.clone().map(|i| of.get(i).copied().unwrap_or(0)).collect() };
         left.extend(if random.random_bool(0.5) { sector(now) } else { sector(safe) });
     }

@@ -1,4 +1,4 @@
-//! What packages need of the command: its report about itself, man pages and completions.
+//! The command as packages use it: its report about itself, man pages and completions.
 
 use std::fs;
 use std::net::TcpListener;

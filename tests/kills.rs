@@ -30,7 +30,7 @@ pub(crate) const TABLES: [(&str, &str); 12] = [
     ("surface_stats", "surface_id, band, run_id"),
 ];
 
-/// How a campaign went.
+/// Counts of a campaign.
 #[derive(Debug, Default)]
 pub(crate) struct Outcome {
     /// Processes that were killed while they worked.
@@ -65,10 +65,11 @@ impl Campaign {
         campaign
     }
 
-    /// Kills ingest once to three times in each round, lets it run through, and compares. `told` hears of each round.
+    /// Kills ingest once to three times in each round, lets it run through, and compares. `told` is called with the
+    /// counts after each round.
     ///
     /// # Panics
-    /// Where the tables are not those of an undisturbed ingest; the text names the round.
+    /// The tables are not those of an undisturbed ingest; the text names the round.
     pub(crate) fn rounds(&mut self, rounds: usize, told: &mut dyn FnMut(usize, &Outcome)) -> Outcome {
         let (mut whole, expected) = self.undisturbed();
         let mut outcome = Outcome::default();
@@ -134,7 +135,7 @@ impl Campaign {
         outcome
     }
 
-    // How long an ingest takes that nobody disturbs, and its tables.
+    // Returns the time of an ingest that is not disturbed, and its tables.
     fn undisturbed(&self) -> (Duration, BTreeMap<&'static str, Vec<u8>>) {
         self.copy("undisturbed");
         let begun = Instant::now();

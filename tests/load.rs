@@ -1,4 +1,4 @@
-//! `demo --surfaces N`: a collection as large as is wanted, stopped and gone on with, the same for the same seed.
+//! `demo --surfaces N`: a collection as large as is wanted, stopped and resumed, the same for the same seed.
 
 use std::collections::{BTreeMap, BTreeSet};
 

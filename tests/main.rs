@@ -137,7 +137,7 @@ fn stderr(output: &Output) -> String {
     String::from_utf8_lossy(&output.stderr).into_owned()
 }
 
-/// Real data beside the checkout; tests that want it skip where it is absent, and say so.
+/// Real data beside the checkout; tests that need it are skipped if it is absent, and say so.
 fn shared_data(name: &str) -> Option<PathBuf> {
     let path = Path::new("../shared/data").join(name);
     if !path.exists() {

@@ -1,4 +1,4 @@
-//! Real data, where it is beside the checkout: a room's recording and the published combinations.
+//! Real data, if it is beside the checkout: a room's recording and the published combinations.
 
 use super::{Place, shared_data};
 

@@ -1,4 +1,4 @@
-//! The replay as its users start and end it; what a viewer sees is tested where the player is.
+//! Start and end of a replay by its users; the content that a viewer sees is tested beside the player.
 
 use super::child::ChildProcess;
 use super::{Place, stderr};

@@ -1,4 +1,4 @@
-//! `echolake serve` as its clients see it: answers, refusals, queries that end with who asked, and its own end.
+//! `echolake serve` as its clients see it: answers, refusals, queries that end with their client, and its own end.
 
 mod attacks;
 pub(crate) mod catalogue;
@@ -20,10 +20,10 @@ use super::{Place, PlaceTemplate};
 use http::{Answer, Request};
 use server::Served;
 
-/// Runs for hours where nothing ends it.
+/// Runs for hours unless it is ended.
 const ENDLESS: &str = "select count(*) from generate_series(1, 1000000) a cross join generate_series(1, 1000000) b \
                        where a.value + b.value = 7";
-/// How long to wait for what the server does by itself; a busy machine may take its time.
+/// Time to wait for an action of the server; a busy machine may be slow.
 const EVENT_LIMIT: Duration = Duration::from_secs(60);
 
 /// One run without sweeps.
@@ -278,7 +278,7 @@ fn flight_sql_has_so_many_places() {
     let place = lake();
     let server = served(&place, &[]);
     let connect = || Served::connect(&server.flight_sql);
-    // Who has a place is greeted at once, by the head of a frame of HTTP/2.
+    // A client that has a place is greeted at once, by the head of a frame of HTTP/2.
     let greeted = |stream: &mut TcpStream, patience: Duration| {
         stream.set_read_timeout(Some(patience)).expect("a limit of time");
         stream.read_exact(&mut [0; 9]).is_ok()

@@ -1,5 +1,5 @@
-//! Ctrl-C and SIGTERM at the first moment that somebody could send them: when a command has just announced itself. The
-//! parent ignores Ctrl-C, as shells do for background jobs and some build services for all they start.
+//! Ctrl-C and SIGTERM at the first moment at which a user could send them: when a command has just announced itself.
+//! The parent ignores Ctrl-C, as shells do for background jobs and some build services for all they start.
 
 use std::process::Command;
 

@@ -16,16 +16,16 @@ use super::serve::server::Served;
 mod bytes;
 mod sql;
 
-/// What a query may take of time and memory, and how many rows it may have.
+/// Limits of a query: time, memory, and rows.
 const LIMITS: &str = "seconds = 2\nmemory_mb = 200\nrows = 100000\n";
-/// How long to wait for more of an answer to changed bytes: many are the beginning of a request, and get none.
+/// Time to wait for more of an answer to changed bytes: many are the beginning of a request, and get none.
 const PATIENCE: Duration = Duration::from_secs(1);
-/// How long to wait for the rest of a backtrace.
+/// Time to wait for the rest of a backtrace.
 const BACKTRACE_LIMIT: Duration = Duration::from_secs(60);
 /// A server on which a plain query runs out of time for so long is harmed.
 const BUSY: Duration = Duration::from_secs(60);
 
-/// What is changed.
+/// The input that is changed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Target {
     /// The text of queries, over HTTP.
@@ -50,7 +50,7 @@ impl Target {
     }
 }
 
-/// How a campaign went.
+/// Counts of a campaign.
 #[derive(Debug, Default)]
 pub(crate) struct Outcome {
     pub(crate) rounds: usize,
@@ -100,7 +100,7 @@ impl Campaign {
     /// Throws one thing after the other for as long as `go_on` says.
     ///
     /// # Panics
-    /// Where the server is harmed; the text says by what.
+    /// The server is harmed; the text names the cause.
     pub(crate) fn throw(&mut self, target: Target, go_on: &mut dyn FnMut(&Outcome) -> bool) -> Outcome {
         let mut outcome = Outcome::default();
         while go_on(&outcome) {
@@ -153,7 +153,7 @@ impl Campaign {
 
     fn asked(&self, query: &str) -> bool {
         let (status, body) = self.ask(query);
-        // 507 is the limit of memory; 503 comes where `version as of` names a version that the lake does not have.
+        // 507 is the limit of memory; 503 is the answer if `version as of` names a version that the lake does not have.
         assert!(status < 500 || status == 503 || status == 507, "{status} by {query:?}: {body}");
         status == 200
     }

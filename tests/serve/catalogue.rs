@@ -307,7 +307,7 @@ fn a_session_stands_for_a_token() {
     assert_eq!(with("sec-fetch-site", "same-site"), 403, "a page on another port of this machine");
     assert_eq!(with("origin", "http://localhost:1"), 403);
     assert_eq!(Request::get("/api/v1/surfaces").with("cookie", "echolake=00").send(&server).status, 401);
-    // What was kept for one is not given to another who may not ask.
+    // A cached answer is not given to a client that is not authorised for it.
     assert_eq!(get(&server, "/api/v1/surfaces").status, 401);
 }
 

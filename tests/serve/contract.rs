@@ -16,7 +16,7 @@ impl Contract {
         paths.iter().filter(|(_, methods)| methods.get("get").is_some()).map(|(path, _)| path.as_str())
     }
 
-    /// What is wrong with an answer to GET.
+    /// Returns the defects of an answer to GET.
     pub(super) fn objections(&self, path: &str, status: u16, media_type: &str, body: &[u8]) -> Vec<String> {
         let responses = &self.0["paths"][path]["get"]["responses"];
         let own = responses.get(status.to_string());

@@ -78,7 +78,7 @@ fn none_over_http() {
     scene.unharmed();
 }
 
-// As the predicate of a slice, which stands in a query of the server's.
+// As the predicate of a slice, which is part of a query of the server's.
 #[test]
 fn none_by_slices() {
     let scene = Scene::new();
@@ -92,7 +92,7 @@ fn none_by_slices() {
             assert!(!String::from_utf8_lossy(&answer.body).contains(SECRET), "{attempt}");
         }
     }
-    // Such that are an expression once they stand in parentheses.
+    // Those that are an expression once they are in parentheses.
     for attempt in scene.attempts().iter().filter(|a| a.starts_with("select")) {
         let answer = get(&scene.server, &slice(&format!("exists ({attempt})"), ""));
         assert!(answer.status < 500, "{attempt}: {}", answer.status);

@@ -22,7 +22,7 @@ pub(crate) struct Answer {
     pub(crate) status: u16,
     headers: Vec<(String, String)>,
     pub(crate) body: Vec<u8>,
-    /// Whether its end came.
+    /// True if its end was received.
     pub(crate) is_whole: bool,
 }
 
@@ -92,7 +92,7 @@ impl Request {
         self.attempt(server).expect("headers")
     }
 
-    /// None where the connection ended before an answer began.
+    /// None if the connection ended before an answer began.
     pub(crate) fn attempt(self, server: &Served) -> Option<Answer> {
         let name = format!("{} {}", self.method, self.path);
         let mut stream = self.begin(server);

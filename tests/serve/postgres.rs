@@ -16,7 +16,7 @@ pub(crate) struct Client {
 pub(crate) type Rows = Result<Vec<Vec<Option<String>>>, String>;
 
 impl Client {
-    /// Connects; where no token is asked for, the session has begun.
+    /// Connects; if no token is required, the session has begun.
     pub(crate) fn connect(server: &Served, options: Option<&str>) -> Self {
         let mut stream = Served::connect(&server.postgres);
         let mut body = 196_608_i32.to_be_bytes().to_vec();

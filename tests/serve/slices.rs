@@ -111,7 +111,7 @@ fn a_viewer_of_elsewhere_reads_a_slice_by_ranges() {
         assert!(value("access-control-expose-headers").contains(name), "{name}");
     }
     let (length, tag) = (value("content-length").parse::<usize>().expect("a length"), value("etag"));
-    // It begins with the end, where the index is.
+    // It begins with the end, which holds the index.
     let (mut file, block) = (vec![0; length], 100_000);
     let mut starts: Vec<_> = (0..length).step_by(block).collect();
     starts.reverse();
