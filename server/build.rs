@@ -187,7 +187,8 @@ fn list(dist: &Path) -> io::Result<String> {
         };
         let _ = writeln!(
             list,
-            "Page {{ path: {:?}, media_type: {media_type:?}, bytes: include_bytes!({file:?}), gzip: {}, brotli: {} }},",
+            "PageFile {{ path: {:?}, media_type: {media_type:?}, bytes: include_bytes!({file:?}), \
+             gzip: {}, brotli: {} }},",
             format!("/{name}"),
             packed("gz"),
             packed("br")

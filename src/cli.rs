@@ -18,16 +18,16 @@ pub(crate) use lake::{DemoArgs, ImportCommand, IngestArgs, LakeCommand, Optimize
 /// A data lake and catalogue for sweep measurements.
 #[derive(Debug, Parser)]
 #[command(version, max_term_width = 100)]
-pub(crate) struct Cli {
+pub(crate) struct CliArguments {
     /// The lake: a folder or a file:// URL.
     #[arg(long, global = true, env = "ECHOLAKE_LAKE", default_value = "lake", value_name = "URL")]
     pub(crate) lake: String,
     #[command(subcommand)]
-    pub(crate) command: Command,
+    pub(crate) command: CliCommand,
 }
 
 #[derive(Debug, Subcommand)]
-pub(crate) enum Command {
+pub(crate) enum CliCommand {
     #[cfg(feature = "lake")]
     #[command(flatten)]
     Lake(LakeCommand),

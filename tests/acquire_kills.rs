@@ -13,7 +13,7 @@ use rand_chacha::ChaCha8Rng;
 
 use super::SMALL_RIG;
 use super::child::{ChildProcess, run_command};
-use super::forgetful::{ForgetfulDisk, Mounted};
+use super::forgetful::{DiskMount, ForgetfulDisk};
 
 /// Pairs of the small rig.
 pub(crate) const PAIRS: usize = 45;
@@ -25,7 +25,7 @@ const RUNS_PER_KILL: usize = 50;
 
 /// Counts of a campaign.
 #[derive(Debug, Default)]
-pub(crate) struct Outcome {
+pub(crate) struct AcquireKillCounts {
     /// Processes that were killed while they worked.
     pub(crate) killed: usize,
     /// Of these, before there was a recording.
@@ -37,18 +37,18 @@ pub(crate) struct Outcome {
 }
 
 /// A campaign in a folder of its own.
-pub(crate) struct Campaign {
+pub(crate) struct AcquireKillCampaign {
     folder: tempfile::TempDir,
     binary: PathBuf,
     random: ChaCha8Rng,
     /// The lake's disk, if the power is cut, too.
-    disk: Option<(ForgetfulDisk, Option<Mounted>)>,
+    disk: Option<(ForgetfulDisk, Option<DiskMount>)>,
 }
 
 /// A verdict's pair, attempt and name.
-type Key = (u32, u32, String);
+type VerdictKey = (u32, u32, String);
 
-impl Campaign {
+impl AcquireKillCampaign {
     pub(crate) fn new(binary: &Path, seed: u64) -> Self {
         let folder = tempfile::tempdir().expect("a folder");
         std::fs::write(folder.path().join("rig.toml"), SMALL_RIG).expect("written");
@@ -80,9 +80,9 @@ impl Campaign {
     ///
     /// # Panics
     /// A measurement is lost or doubled; the text names it.
-    pub(crate) fn kills(&mut self, kills: usize, told: &mut dyn FnMut(&Outcome)) -> Outcome {
+    pub(crate) fn kills(&mut self, kills: usize, told: &mut dyn FnMut(&AcquireKillCounts)) -> AcquireKillCounts {
         let mut whole = self.undisturbed();
-        let mut outcome = Outcome::default();
+        let mut outcome = AcquireKillCounts::default();
         while outcome.killed < kills {
             self.run_through(&mut whole, kills, &mut outcome);
             outcome.runs += 1;
@@ -102,7 +102,7 @@ impl Campaign {
         whole
     }
 
-    fn run_through(&mut self, whole: &mut Duration, kills: usize, outcome: &mut Outcome) {
+    fn run_through(&mut self, whole: &mut Duration, kills: usize, outcome: &mut AcquireKillCounts) {
         loop {
             let partial = self.inbox().into_iter().find(|p| p.extension().is_some_and(|e| e == "partial"));
             let begun = Instant::now();
@@ -159,7 +159,7 @@ impl Campaign {
                 }
                 true
             }
-            // Killed while the head was written: nothing was measured, and the next one begins anew.
+            // Killed while the head was written: nothing was measured, and the next one starts again.
             Some(1) if text(&output.stderr).contains("holds no run") => {
                 assert!(self.acknowledged().is_empty(), "{}", text(&output.stderr));
                 std::fs::remove_file(&partial).expect("removed");
@@ -201,7 +201,7 @@ impl Campaign {
     }
 
     // The last line may have been cut off with its process.
-    fn acknowledged(&self) -> Vec<Key> {
+    fn acknowledged(&self) -> Vec<VerdictKey> {
         let list = std::fs::read_to_string(self.folder.path().join("acknowledged.txt")).unwrap_or_default();
         let lines = list.split_inclusive('\n').filter(|line| line.ends_with('\n'));
         let key = |line: &str| {
@@ -215,7 +215,7 @@ impl Campaign {
 
     fn inbox(&self) -> Vec<PathBuf> {
         let entries = std::fs::read_dir(self.folder.path().join("disk/lake/inbox"));
-        // What a dead resume left half-made is made anew by the next one.
+        // A file that a killed resume left incomplete is written again by the next one.
         let is_left = |p: &PathBuf| p.extension().is_none_or(|e| e != "resuming");
         entries.into_iter().flatten().map(|e| e.expect("an entry").path()).filter(is_left).collect()
     }
@@ -238,7 +238,7 @@ fn text(bytes: &[u8]) -> String {
 }
 
 /// Counts each verdict of a file; each has its response and its sweep before it.
-fn verdicts(path: &Path) -> BTreeMap<Key, usize> {
+fn verdicts(path: &Path) -> BTreeMap<VerdictKey, usize> {
     let file = std::fs::read(path).expect("read");
     let (mut found, mut behind) = (BTreeMap::new(), BTreeMap::new());
     for message in mcap::MessageStream::new(&file).expect("an MCAP file") {

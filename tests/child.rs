@@ -26,12 +26,12 @@ pub(crate) struct ChildProcess {
     has_group: bool,
     /// True if its exit status was read: from then on its id may be another process's.
     is_reaped: bool,
-    transcript: Arc<Transcript>,
+    transcript: Arc<OutputTranscript>,
 }
 
 /// The output of a program so far, and a condition that is notified when there is more.
 #[derive(Default)]
-struct Transcript {
+struct OutputTranscript {
     pipes: Mutex<[PipeText; 2]>,
     news: Condvar,
 }
@@ -81,7 +81,7 @@ impl ChildProcess {
     fn spawn(command: &mut Command, limit: Duration, has_group: bool) -> io::Result<Self> {
         let name = format!("{command:?}");
         let mut child = command.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn()?;
-        let transcript = Arc::new(Transcript::default());
+        let transcript = Arc::new(OutputTranscript::default());
         transcript.lock().iter_mut().for_each(|pipe| pipe.is_open = true);
         // These threads are never joined: a process that this one knows nothing of may hold a pipe open for ever.
         spawn_reader(child.stdout.take().expect("stdout is piped"), STDOUT, &transcript);
@@ -220,13 +220,13 @@ impl Drop for ChildProcess {
     }
 }
 
-impl Transcript {
+impl OutputTranscript {
     fn lock(&self) -> MutexGuard<'_, [PipeText; 2]> {
         self.pipes.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
-fn spawn_reader(mut pipe: impl Read + Send + 'static, number: usize, transcript: &Arc<Transcript>) {
+fn spawn_reader(mut pipe: impl Read + Send + 'static, number: usize, transcript: &Arc<OutputTranscript>) {
     let transcript = transcript.clone();
     std::thread::spawn(move || {
         let mut block = [0; 8 << 10];

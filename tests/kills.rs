@@ -32,7 +32,7 @@ pub(crate) const TABLES: [(&str, &str); 12] = [
 
 /// Counts of a campaign.
 #[derive(Debug, Default)]
-pub(crate) struct Outcome {
+pub(crate) struct KillCounts {
     /// Processes that were killed while they worked.
     pub(crate) killed: usize,
     /// Processes that ended before their moment came.
@@ -40,13 +40,13 @@ pub(crate) struct Outcome {
 }
 
 /// A campaign in a folder of its own.
-pub(crate) struct Campaign {
+pub(crate) struct KillCampaign {
     folder: tempfile::TempDir,
     binary: PathBuf,
     random: ChaCha8Rng,
 }
 
-impl Campaign {
+impl KillCampaign {
     /// Measures the runs of the lake that every round begins with.
     pub(crate) fn new(binary: &Path, seed: u64) -> Self {
         Self::of(binary, seed, SURFACES.len())
@@ -70,9 +70,9 @@ impl Campaign {
     ///
     /// # Panics
     /// The tables are not those of an undisturbed ingest; the text names the round.
-    pub(crate) fn rounds(&mut self, rounds: usize, told: &mut dyn FnMut(usize, &Outcome)) -> Outcome {
+    pub(crate) fn rounds(&mut self, rounds: usize, told: &mut dyn FnMut(usize, &KillCounts)) -> KillCounts {
         let (mut whole, expected) = self.undisturbed();
-        let mut outcome = Outcome::default();
+        let mut outcome = KillCounts::default();
         for round in 0..rounds {
             self.copy("round");
             let kills = self.random.random_range(1..=3);
@@ -101,9 +101,9 @@ impl Campaign {
     ///
     /// # Panics
     /// As [`Self::rounds`].
-    pub(crate) fn halves(&mut self, rounds: usize, told: &mut dyn FnMut(usize, &Outcome)) -> Outcome {
+    pub(crate) fn halves(&mut self, rounds: usize, told: &mut dyn FnMut(usize, &KillCounts)) -> KillCounts {
         let (whole, expected) = self.undisturbed();
-        let mut outcome = Outcome::default();
+        let mut outcome = KillCounts::default();
         for round in 0..rounds {
             self.copy("round");
             let mut runs = self.inbox("round");

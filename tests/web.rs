@@ -11,7 +11,7 @@ use std::process::Command;
 
 use super::child::{ChildProcess, run_long_command};
 use super::serve::{catalogue::lake, served};
-use super::{Place, stderr};
+use super::{TestFolder, stderr};
 
 const NO_SKIP: &str = "ECHOLAKE_NO_SKIP";
 const SCHEMATHESIS: &str = "schemathesis==4.32.5";
@@ -66,8 +66,8 @@ fn schemathesis() -> Result<PathBuf, String> {
 }
 
 /// A lake of the paper's rig: the demo's, without sweeps.
-fn demo() -> Place {
-    let place = Place::new();
+fn demo() -> TestFolder {
+    let place = TestFolder::new();
     let output = run_long_command(&mut place.command(&["demo", "--ir-only", "--no-serve"])).expect("it starts");
     assert!(output.status.success(), "{}", stderr(&output));
     place

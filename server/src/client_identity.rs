@@ -5,8 +5,8 @@ use std::time::Duration;
 use echolake_query::Quota;
 use serde::{Deserialize, Serialize};
 
-use crate::fault::Fault;
-use crate::tokens::Scope;
+use crate::fault::RequestFault;
+use crate::tokens::TokenScope;
 
 /// Name of the client for requests of the server's own pages, if there are no tokens.
 const PAGES: &str = "pages";
@@ -29,7 +29,7 @@ pub(crate) struct ClientIdentity {
     pub(crate) name: String,
     /// True if the server has no tokens, so that requests of foreign pages must be distinguished from others.
     pub(crate) is_open: bool,
-    pub(crate) scopes: Vec<Scope>,
+    pub(crate) scopes: Vec<TokenScope>,
     /// Limits, as [`Quota`] has them.
     pub(crate) seconds: Option<u64>,
     pub(crate) memory_bytes: Option<usize>,
@@ -40,7 +40,7 @@ pub(crate) struct ClientIdentity {
 impl ClientIdentity {
     /// A client of a server without tokens.
     pub(crate) fn local(name: impl Into<String>) -> Self {
-        let scopes = vec![Scope::Sql, Scope::Files, Scope::Metrics];
+        let scopes = vec![TokenScope::Sql, TokenScope::Files, TokenScope::Metrics];
         let (seconds, memory_bytes, rows, concurrent) = (None, None, None, None);
         Self { name: name.into(), is_open: true, scopes, seconds, memory_bytes, rows, concurrent }
     }
@@ -60,7 +60,7 @@ impl ClientIdentity {
         Self::local(format!("user {name}"))
     }
 
-    /// Pages of elsewhere.
+    /// Pages of other origins.
     pub(crate) fn foreign() -> Self {
         Self::local(FOREIGN)
     }
@@ -78,11 +78,11 @@ impl ClientIdentity {
     /// Checks that the client may do this.
     ///
     /// # Errors
-    /// [`Fault::Forbidden`].
-    pub(crate) fn require(&self, scope: Scope) -> Result<(), Fault> {
+    /// [`RequestFault::Forbidden`].
+    pub(crate) fn require(&self, scope: TokenScope) -> Result<(), RequestFault> {
         match self.scopes.contains(&scope) {
             true => Ok(()),
-            false => Err(Fault::Forbidden { name: self.name.clone(), scope }),
+            false => Err(RequestFault::Forbidden { name: self.name.clone(), scope }),
         }
     }
 }

@@ -1,4 +1,4 @@
-//! Errors that keep a server from starting or running. A failed request has a [`crate::fault::Fault`].
+//! Errors that keep a server from starting or running. A failed request has a [`crate::fault::RequestFault`].
 
 use std::io;
 use std::net::SocketAddr;

@@ -6,11 +6,11 @@ use std::time::Duration;
 use echolake_export::Error as SliceError;
 use echolake_query::Error as QueryError;
 
-use crate::tokens::Scope;
+use crate::tokens::TokenScope;
 
 /// The failure of a request.
 #[derive(Debug, thiserror::Error)]
-pub(crate) enum Fault {
+pub(crate) enum RequestFault {
     /// The query, or its run.
     #[error(transparent)]
     Query(#[from] QueryError),
@@ -20,13 +20,13 @@ pub(crate) enum Fault {
         /// The defect of the request, and the expected form.
         message: String,
     },
-    /// It is understood, and is no part of what this server does.
+    /// The request is understood, but not supported by this server.
     #[error("{what} is not supported here")]
     Unsupported {
         /// The requested feature.
         what: String,
     },
-    /// It asks for something that is not there, or not any more.
+    /// The requested item does not exist, or not any more.
     #[error("{what} is not there; hint: {hint}")]
     NotFound {
         /// The requested item.
@@ -34,7 +34,7 @@ pub(crate) enum Fault {
         /// A remedy for the client.
         hint: &'static str,
     },
-    /// It was there, and is no more.
+    /// The requested item existed, and was removed.
     #[error("{what} is no longer there; hint: {hint}")]
     Gone {
         /// The requested item.
@@ -73,7 +73,7 @@ pub(crate) enum Fault {
     /// The lake's store does not give a file. The cause is in the server's log.
     #[error("the lake's store does not give the file; hint: ask again")]
     Unreadable,
-    /// The path is there, for other methods.
+    /// The path exists for other methods.
     #[error("this path is not for this method; hint: the header `Allow` lists those it is for")]
     Method,
     /// A part of a file that it does not have.
@@ -97,7 +97,7 @@ pub(crate) enum Fault {
         /// The token's name.
         name: String,
         /// The missing scope.
-        scope: Scope,
+        scope: TokenScope,
     },
     /// The request comes from a web page of another origin, or names a host that is not this machine.
     #[error("{what} `{found}` is not this server's; hint: without tokens only http://localhost is answered")]
@@ -137,7 +137,7 @@ pub(crate) enum Fault {
 
 /// Codes by which a client's program distinguishes failures; never renamed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Code {
+pub(crate) enum FaultCode {
     Query,
     ReadOnly,
     Execution,
@@ -164,7 +164,7 @@ pub(crate) enum Code {
     Internal,
 }
 
-impl Code {
+impl FaultCode {
     /// All of them.
     pub(crate) const ALL: [Self; 24] = [
         Self::Query,
@@ -224,7 +224,7 @@ impl Code {
     }
 }
 
-impl Fault {
+impl RequestFault {
     /// A request that is not understood.
     pub(crate) fn request(message: impl Into<String>) -> Self {
         Self::Request { message: message.into() }
@@ -236,54 +236,54 @@ impl Fault {
     }
 
     /// Its code.
-    pub(crate) fn code(&self) -> Code {
+    pub(crate) fn code(&self) -> FaultCode {
         match self {
             Self::Query(error) => query_code(error),
-            Self::Request { .. } => Code::Request,
-            Self::Unsupported { .. } => Code::Unsupported,
-            Self::NotFound { .. } => Code::NotFound,
-            Self::Gone { .. } => Code::Gone,
+            Self::Request { .. } => FaultCode::Request,
+            Self::Unsupported { .. } => FaultCode::Unsupported,
+            Self::NotFound { .. } => FaultCode::NotFound,
+            Self::Gone { .. } => FaultCode::Gone,
             Self::Slice(error) => slice_code(error),
-            Self::SliceTooLarge { .. } => Code::TooLarge,
-            Self::NoRoom { .. } => Code::MemoryLimit,
-            Self::NoData { .. } => Code::NoData,
-            Self::Unreadable => Code::Lake,
-            Self::Method => Code::Method,
-            Self::Range { .. } => Code::Range,
-            Self::TooLarge { .. } => Code::TooLarge,
-            Self::Unauthenticated => Code::Unauthenticated,
-            Self::Forbidden { .. } => Code::Forbidden,
-            Self::Foreign { .. } => Code::Foreign,
-            Self::Cancelled => Code::Cancelled,
-            Self::Timeout { .. } => Code::TimeLimit,
-            Self::TooMany { .. } => Code::TooMany,
-            Self::EngineEnded { .. } => Code::EngineEnded,
-            Self::Internal => Code::Internal,
+            Self::SliceTooLarge { .. } => FaultCode::TooLarge,
+            Self::NoRoom { .. } => FaultCode::MemoryLimit,
+            Self::NoData { .. } => FaultCode::NoData,
+            Self::Unreadable => FaultCode::Lake,
+            Self::Method => FaultCode::Method,
+            Self::Range { .. } => FaultCode::Range,
+            Self::TooLarge { .. } => FaultCode::TooLarge,
+            Self::Unauthenticated => FaultCode::Unauthenticated,
+            Self::Forbidden { .. } => FaultCode::Forbidden,
+            Self::Foreign { .. } => FaultCode::Foreign,
+            Self::Cancelled => FaultCode::Cancelled,
+            Self::Timeout { .. } => FaultCode::TimeLimit,
+            Self::TooMany { .. } => FaultCode::TooMany,
+            Self::EngineEnded { .. } => FaultCode::EngineEnded,
+            Self::Internal => FaultCode::Internal,
         }
     }
 }
 
-fn slice_code(error: &SliceError) -> Code {
+fn slice_code(error: &SliceError) -> FaultCode {
     match error {
-        SliceError::Unknown { .. } => Code::Request,
-        SliceError::Nothing { .. } => Code::NoData,
-        SliceError::Changed { .. } => Code::Changed,
-        SliceError::Uncuttable { .. } => Code::Format,
-        _ => Code::Lake,
+        SliceError::Unknown { .. } => FaultCode::Request,
+        SliceError::Nothing { .. } => FaultCode::NoData,
+        SliceError::Changed { .. } => FaultCode::Changed,
+        SliceError::Uncuttable { .. } => FaultCode::Format,
+        _ => FaultCode::Lake,
     }
 }
 
-fn query_code(error: &QueryError) -> Code {
+fn query_code(error: &QueryError) -> FaultCode {
     match error {
-        QueryError::Query { .. } => Code::Query,
-        QueryError::NotReading { .. } => Code::ReadOnly,
-        QueryError::Execution { .. } => Code::Execution,
-        QueryError::Cancelled => Code::Cancelled,
-        QueryError::TimeLimit { .. } => Code::TimeLimit,
-        QueryError::MemoryLimit { .. } => Code::MemoryLimit,
-        QueryError::RowLimit { .. } => Code::RowLimit,
-        QueryError::Busy { .. } => Code::TooMany,
-        QueryError::Format { .. } => Code::Format,
-        QueryError::Write(_) | QueryError::Lake(_) => Code::Lake,
+        QueryError::Query { .. } => FaultCode::Query,
+        QueryError::NotReading { .. } => FaultCode::ReadOnly,
+        QueryError::Execution { .. } => FaultCode::Execution,
+        QueryError::Cancelled => FaultCode::Cancelled,
+        QueryError::TimeLimit { .. } => FaultCode::TimeLimit,
+        QueryError::MemoryLimit { .. } => FaultCode::MemoryLimit,
+        QueryError::RowLimit { .. } => FaultCode::RowLimit,
+        QueryError::Busy { .. } => FaultCode::TooMany,
+        QueryError::Format { .. } => FaultCode::Format,
+        QueryError::Write(_) | QueryError::Lake(_) => FaultCode::Lake,
     }
 }

@@ -14,16 +14,16 @@ const MOST: usize = 1000;
 
 /// The sessions of a server.
 #[derive(Default)]
-pub(crate) struct Sessions(Mutex<Vec<Session>>);
+pub(crate) struct BrowserSessions(Mutex<Vec<BrowserSession>>);
 
-struct Session {
-    // A hash tells nothing by the time that its comparison takes.
+struct BrowserSession {
+    // The time of comparing hashes reveals nothing of the secret.
     hash: [u8; 32],
     holder: usize,
     begun: Instant,
 }
 
-impl Sessions {
+impl BrowserSessions {
     /// Begins a session of the holder of a token; returns its secret.
     ///
     /// # Errors
@@ -37,7 +37,7 @@ impl Sessions {
         if sessions.len() >= MOST {
             sessions.remove(0);
         }
-        sessions.push(Session { hash: Sha256::digest(&secret).into(), holder, begun: Instant::now() });
+        sessions.push(BrowserSession { hash: Sha256::digest(&secret).into(), holder, begun: Instant::now() });
         Ok(secret)
     }
 
@@ -55,7 +55,7 @@ mod tests {
 
     #[test]
     fn the_oldest_goes_first() {
-        let sessions = Sessions::default();
+        let sessions = BrowserSessions::default();
         let first = sessions.begin(1).expect("random bytes");
         assert_eq!((sessions.holder(&first), sessions.holder("")), (Some(1), None));
         for _ in 0..MOST {

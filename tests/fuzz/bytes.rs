@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 use rand::{Rng as _, RngCore as _};
 use rand_chacha::ChaCha8Rng;
 
-/// No answer to changed bytes goes on for so long.
+/// Time after which an answer to changed bytes is taken for endless.
 const LONGEST_ANSWER: Duration = Duration::from_secs(300);
 
 /// Replacements of four bytes: lengths and counts at their edges.

@@ -3,9 +3,9 @@
 use serde_json::Value;
 
 /// The document that server and pages agree on.
-pub(super) struct Contract(Value);
+pub(super) struct ApiContract(Value);
 
-impl Contract {
+impl ApiContract {
     pub(super) fn read() -> Self {
         Self(serde_json::from_str(include_str!("../../web/openapi.json")).expect("JSON"))
     }

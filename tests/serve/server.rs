@@ -11,7 +11,7 @@ use super::super::child::ChildProcess;
 pub(crate) const ANSWER_LIMIT: Duration = Duration::from_secs(120);
 
 /// A server; dropping it ends it.
-pub(crate) struct Served {
+pub(crate) struct ServedLake {
     child: ChildProcess,
     /// `host:port` of each protocol.
     pub(crate) http: String,
@@ -19,7 +19,7 @@ pub(crate) struct Served {
     pub(crate) postgres: String,
 }
 
-impl Served {
+impl ServedLake {
     /// Serves the lake `lake` of a folder.
     pub(crate) fn start(binary: &Path, folder: &Path, more: &[&str]) -> Self {
         let any = "127.0.0.1:0";
@@ -71,7 +71,7 @@ impl Served {
         line.and_then(|l| l.trim().split(' ').next()).and_then(|n| n.parse().ok()).unwrap_or(0)
     }
 
-    /// Tells it to stop; returns its exit code.
+    /// Stops it; returns its exit code.
     pub(crate) fn terminate(&mut self) -> Option<i32> {
         self.child.signal("TERM");
         self.child.wait().status.code()

@@ -150,7 +150,7 @@ impl Drop for PlacedStream {
     }
 }
 
-/// Marks a connection that works, which keeps its place. A request works once it is whole and known whose it is.
+/// Marks a connection that works, which keeps its place. A request works once it is whole and authenticated.
 #[derive(Clone)]
 pub(super) struct PlaceWork(Arc<PlaceState>);
 

@@ -18,7 +18,7 @@ use super::EngineSettings;
 use crate::client_identity::{ClientIdentity, counted_bytes};
 use crate::engine::EngineSocket;
 use crate::engine::report::EngineReport;
-use crate::metrics::Metrics;
+use crate::metrics::ServerMetrics;
 
 /// Time for which a request that lost its engine waits for the reason.
 const REASON_WAIT: Duration = Duration::from_secs(2);
@@ -70,7 +70,7 @@ impl EngineProcess {
     ///
     /// # Errors
     /// The system gives no folder or process.
-    pub(super) fn start(start: EngineStart<'_>, metrics: Arc<Metrics>) -> io::Result<Arc<Self>> {
+    pub(super) fn start(start: EngineStart<'_>, metrics: Arc<ServerMetrics>) -> io::Result<Arc<Self>> {
         std::fs::create_dir(&start.sockets)?;
         std::fs::create_dir(&start.spills)?;
         let mut child = Command::new(&start.settings.program)
@@ -108,7 +108,7 @@ impl EngineProcess {
         Ok(engine)
     }
 
-    /// Waits until it is ready, and tells it whose it is.
+    /// Waits until it is ready, and assigns it to a client.
     ///
     /// # Errors
     /// It ended before that.
@@ -241,7 +241,7 @@ async fn supervise(
     mut child: Child,
     stdout: ChildStdout,
     spills: PathBuf,
-    metrics: Arc<Metrics>,
+    metrics: Arc<ServerMetrics>,
 ) {
     let mut reports = EngineReports { metrics, counters: Vec::new(), why: None };
     let mut lines = BufReader::new(stdout).lines();
@@ -272,7 +272,7 @@ async fn supervise(
 }
 
 struct EngineReports {
-    metrics: Arc<Metrics>,
+    metrics: Arc<ServerMetrics>,
     counters: Vec<u64>,
     why: Option<String>,
 }

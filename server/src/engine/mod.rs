@@ -16,7 +16,7 @@ use tokio::net::UnixListener;
 use tokio::sync::oneshot;
 
 use crate::client_identity::ClientIdentity;
-use crate::service::Service;
+use crate::service::QueryService;
 use crate::{Error, flight, http, postgres};
 use report::EngineReport;
 
@@ -64,7 +64,7 @@ pub async fn run_engine(lake: &Lake, sockets: &Path, memory: Option<usize>) -> R
     // The door went away before it had a use for this engine.
     let Ok(identity) = assigned.await else { return Ok(()) };
     let limit = identity.memory_bytes.into_iter().chain(memory).min();
-    let service = Service::new(lake, engine, identity)?;
+    let service = QueryService::new(lake, engine, identity)?;
     // Behind the start of its threads, whose stacks count.
     limit.map(confinement::limit_memory).transpose().map_err(Error::System)?;
     watchdog::start(&service).map_err(Error::System)?;

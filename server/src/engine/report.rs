@@ -12,7 +12,7 @@ pub(crate) enum EngineReport {
     Ready,
     /// It ends itself, for this reason.
     Ending(String),
-    /// Its counters, as [`crate::metrics::Metrics::counters`] lists them.
+    /// Its counters, as [`crate::metrics::ServerMetrics::counters`] lists them.
     Counters(Vec<u64>),
 }
 

@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 use rustix::time::{ClockId, clock_gettime};
 
 use super::report::EngineReport;
-use crate::service::Service;
+use crate::service::QueryService;
 
 /// Time between two looks; the door's figures are sent as often.
 const INTERVAL: Duration = Duration::from_millis(50);
@@ -19,13 +19,13 @@ const BUSY: f64 = 0.5;
 ///
 /// # Errors
 /// The system gives no thread.
-pub(super) fn start(service: &Service) -> std::io::Result<()> {
+pub(super) fn start(service: &QueryService) -> std::io::Result<()> {
     let service = service.clone();
     std::thread::Builder::new().name("watchdog".to_owned()).spawn(move || watch(&service))?;
     Ok(())
 }
 
-fn watch(service: &Service) {
+fn watch(service: &QueryService) {
     let mut idle = IdleWork::default();
     let mut sent = Vec::new();
     loop {

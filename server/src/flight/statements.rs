@@ -11,8 +11,8 @@ use bytes::Bytes;
 use datafusion::common::ParamValues;
 use echolake_query::{Prepared, Session};
 
-use crate::fault::Fault;
-use crate::running::Stop;
+use crate::fault::RequestFault;
+use crate::running::StopSignal;
 
 /// Bytes of a text up to which handles carry it.
 const CARRIED_BYTES: usize = 32 << 10;
@@ -21,11 +21,11 @@ const KEPT: Duration = Duration::from_secs(600);
 /// Handles of one client; the one not used for longest makes room.
 const HELD: usize = 256;
 
-type Handle = [u8; 16];
+type StatementHandle = [u8; 16];
 
 /// The statement of a handle.
 #[derive(Clone)]
-pub(super) struct Statement {
+pub(super) struct HeldStatement {
     /// The session it was planned in; its client owns the handle.
     pub(super) session: Arc<Session>,
     pub(super) sql: Arc<str>,
@@ -37,25 +37,25 @@ pub(super) struct Statement {
     /// Values of its placeholders.
     pub(super) values: ParamValues,
     /// Ends its run.
-    pub(super) stop: Stop,
+    pub(super) stop: StopSignal,
 }
 
 /// The statements of all clients.
 #[derive(Default)]
-pub(super) struct Statements(Mutex<HashMap<Handle, Kept>>);
+pub(super) struct HeldStatements(Mutex<HashMap<StatementHandle, StatementEntry>>);
 
-struct Kept {
-    statement: Statement,
+struct StatementEntry {
+    statement: HeldStatement,
     used: Instant,
 }
 
-impl Statements {
+impl HeldStatements {
     /// Keeps a statement.
-    pub(super) fn keep(&self, statement: Statement) -> Result<Bytes, Fault> {
-        let mut handle = Handle::default();
+    pub(super) fn keep(&self, statement: HeldStatement) -> Result<Bytes, RequestFault> {
+        let mut handle = StatementHandle::default();
         getrandom::fill(&mut handle).map_err(|failed| {
             eprintln!("no random bytes: {failed}");
-            Fault::Internal
+            RequestFault::Internal
         })?;
         let sql = Some(statement.sql.clone()).filter(|sql| sql.len() <= CARRIED_BYTES);
         let whole = [&handle, sql.as_deref().unwrap_or_default().as_bytes()].concat();
@@ -64,7 +64,7 @@ impl Statements {
     }
 
     /// Keeps a statement under a handle that another engine made.
-    pub(super) fn keep_as(&self, handle: &[u8], statement: Statement) -> Result<(), Fault> {
+    pub(super) fn keep_as(&self, handle: &[u8], statement: HeldStatement) -> Result<(), RequestFault> {
         let (handle, _) = handle.split_first_chunk().ok_or_else(gone)?;
         self.insert(*handle, statement);
         Ok(())
@@ -72,11 +72,11 @@ impl Statements {
 
     /// The text that a handle carries.
     pub(super) fn text(handle: &[u8]) -> Option<String> {
-        let (_, sql) = handle.split_first_chunk::<{ size_of::<Handle>() }>()?;
+        let (_, sql) = handle.split_first_chunk::<{ size_of::<StatementHandle>() }>()?;
         String::from_utf8(sql.to_vec()).ok().filter(|sql| !sql.is_empty())
     }
 
-    fn insert(&self, handle: Handle, statement: Statement) {
+    fn insert(&self, handle: StatementHandle, statement: HeldStatement) {
         let mut all = self.lock();
         all.retain(|_, kept| kept.used.elapsed() < KEPT);
         let owner = statement.session.client().name();
@@ -89,16 +89,16 @@ impl Statements {
         for (_, oldest) in own.iter().take((own.len() + 1).saturating_sub(HELD)) {
             all.remove(oldest);
         }
-        all.insert(handle, Kept { statement, used: Instant::now() });
+        all.insert(handle, StatementEntry { statement, used: Instant::now() });
     }
 
     /// The statement of a client's handle.
-    pub(super) fn find(&self, client: &str, handle: &[u8]) -> Result<Statement, Fault> {
+    pub(super) fn find(&self, client: &str, handle: &[u8]) -> Result<HeldStatement, RequestFault> {
         self.with(client, handle, |kept| kept.statement.clone())
     }
 
     /// Sets the values of its placeholders.
-    pub(super) fn bind(&self, client: &str, handle: &[u8], values: ParamValues) -> Result<(), Fault> {
+    pub(super) fn bind(&self, client: &str, handle: &[u8], values: ParamValues) -> Result<(), RequestFault> {
         self.with(client, handle, |kept| kept.statement.values = values)
     }
 
@@ -109,7 +109,12 @@ impl Statements {
         }
     }
 
-    fn with<T>(&self, client: &str, handle: &[u8], act: impl FnOnce(&mut Kept) -> T) -> Result<T, Fault> {
+    fn with<T>(
+        &self,
+        client: &str,
+        handle: &[u8],
+        act: impl FnOnce(&mut StatementEntry) -> T,
+    ) -> Result<T, RequestFault> {
         let (handle, _) = handle.split_first_chunk().ok_or_else(gone)?;
         let mut all = self.lock();
         let kept = all.get_mut(handle).filter(|kept| kept.statement.session.client().name() == client);
@@ -118,11 +123,11 @@ impl Statements {
         Ok(act(kept))
     }
 
-    fn lock(&self) -> MutexGuard<'_, HashMap<Handle, Kept>> {
+    fn lock(&self) -> MutexGuard<'_, HashMap<StatementHandle, StatementEntry>> {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
-fn gone() -> Fault {
-    Fault::NotFound { what: "this statement".to_owned(), hint: "ask again: it may have expired" }
+fn gone() -> RequestFault {
+    RequestFault::NotFound { what: "this statement".to_owned(), hint: "ask again: it may have expired" }
 }

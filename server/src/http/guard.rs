@@ -13,16 +13,16 @@ use axum::middleware::Next;
 use axum::response::{IntoResponse as _, Response};
 use echolake_query::Client;
 
-use super::problem::Problem;
+use super::problem::ProblemResponse;
 use super::ranges::POLICY;
 use crate::client_identity::ClientIdentity;
-use crate::fault::Fault;
-use crate::service::Service;
-use crate::tokens::{Access, Scope, of_header};
+use crate::fault::RequestFault;
+use crate::service::QueryService;
+use crate::tokens::{TokenAccess, TokenScope, of_header};
 
 const FETCH_SITE: HeaderName = HeaderName::from_static("sec-fetch-site");
 
-/// Whoever may ask in SQL.
+/// A client that is authorised for SQL.
 pub(super) struct MayQuery(pub(super) Arc<Client>);
 
 /// The cookie of a browser's session.
@@ -31,12 +31,12 @@ pub(super) const COOKIE: &str = "echolake";
 /// Authenticates a client by token or by session; `local` makes the client of a server that has no tokens.
 ///
 /// # Errors
-/// [`Fault::Unauthenticated`], [`Fault::Foreign`].
+/// [`RequestFault::Unauthenticated`], [`RequestFault::Foreign`].
 pub(crate) fn authenticate(
-    access: &Access,
+    access: &TokenAccess,
     headers: &HeaderMap,
     local: impl FnOnce() -> ClientIdentity,
-) -> Result<Arc<ClientIdentity>, Fault> {
+) -> Result<Arc<ClientIdentity>, RequestFault> {
     let token = headers.get(header::AUTHORIZATION).and_then(|v| v.to_str().ok()).and_then(of_header);
     match (token, cookie(headers)) {
         // A browser sends the cookie along whichever page of this machine asks, on whatever port it was served.
@@ -50,7 +50,7 @@ pub(crate) fn authenticate(
 /// The origin of a request, according to its headers.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum RequestSite {
-    /// A page of elsewhere.
+    /// A page of another origin.
     Foreign,
     /// A page of this server.
     OwnPage,
@@ -72,11 +72,11 @@ fn cookie(headers: &HeaderMap) -> Option<&str> {
     all.flat_map(|v| v.split(';')).find_map(|pair| pair.trim().strip_prefix(COOKIE)?.strip_prefix('='))
 }
 
-impl FromRequestParts<Service> for MayQuery {
-    type Rejection = Problem;
+impl FromRequestParts<QueryService> for MayQuery {
+    type Rejection = ProblemResponse;
 
-    async fn from_request_parts(_: &mut Parts, service: &Service) -> Result<Self, Problem> {
-        Ok(Self(service.client(Scope::Sql)?))
+    async fn from_request_parts(_: &mut Parts, service: &QueryService) -> Result<Self, ProblemResponse> {
+        Ok(Self(service.client(TokenScope::Sql)?))
     }
 }
 
@@ -84,7 +84,7 @@ impl FromRequestParts<Service> for MayQuery {
 pub(super) async fn own_pages_only(State(is_open): State<bool>, request: Request, next: Next) -> Response {
     // With tokens there is nothing that a page could use without having one.
     match is_own(request.uri(), request.headers()) {
-        Err(fault) if is_open => Problem(fault).into_response(),
+        Err(fault) if is_open => ProblemResponse(fault).into_response(),
         _ => next.run(request).await,
     }
 }
@@ -92,33 +92,35 @@ pub(super) async fn own_pages_only(State(is_open): State<bool>, request: Request
 /// Checks that a request comes from this machine's own programs and pages.
 ///
 /// # Errors
-/// [`Fault::Foreign`] if it does not.
-pub(super) fn is_own(uri: &Uri, headers: &HeaderMap) -> Result<(), Fault> {
+/// [`RequestFault::Foreign`] if it does not.
+pub(super) fn is_own(uri: &Uri, headers: &HeaderMap) -> Result<(), RequestFault> {
     // HTTP/1.1 wants one Host; with two, the check and the routing may use different ones.
     let host = match (headers.get_all(header::HOST).iter().count(), text(headers, &header::HOST)) {
         (1, Some(host)) => host,
-        (_, host) => return Err(Fault::Foreign { what: "host", found: host.unwrap_or_default() }),
+        (_, host) => return Err(RequestFault::Foreign { what: "host", found: host.unwrap_or_default() }),
     };
     if !is_local(&host) {
-        return Err(Fault::Foreign { what: "host", found: host });
+        return Err(RequestFault::Foreign { what: "host", found: host });
     }
-    // An address in absolute form goes before Host for whoever routes, so it must be the same.
+    // An address in absolute form takes precedence over Host in routing, so it must be the same.
     if let Some(authority) = uri.authority().filter(|authority| authority.as_str() != host) {
-        return Err(Fault::Foreign { what: "address", found: authority.to_string() });
+        return Err(RequestFault::Foreign { what: "address", found: authority.to_string() });
     }
     is_same_origin(headers, &["http://"])
 }
 
 // Checks by the headers of browsers that a request is not made by a page of another origin.
-fn is_same_origin(headers: &HeaderMap, schemes: &[&str]) -> Result<(), Fault> {
+fn is_same_origin(headers: &HeaderMap, schemes: &[&str]) -> Result<(), RequestFault> {
     let host = text(headers, &header::HOST).unwrap_or_default();
     if let Some(origin) = text(headers, &header::ORIGIN)
         && !schemes.iter().any(|scheme| origin.strip_prefix(scheme) == Some(&host))
     {
-        return Err(Fault::Foreign { what: "origin", found: origin });
+        return Err(RequestFault::Foreign { what: "origin", found: origin });
     }
     match text(headers, &FETCH_SITE) {
-        Some(site) if site != "same-origin" && site != "none" => Err(Fault::Foreign { what: "site", found: site }),
+        Some(site) if site != "same-origin" && site != "none" => {
+            Err(RequestFault::Foreign { what: "site", found: site })
+        }
         _ => Ok(()),
     }
 }

@@ -7,10 +7,10 @@ use axum::response::IntoResponse;
 use serde_json::{Value, json};
 
 use super::guard::authenticate;
-use super::problem::Problem;
+use super::problem::ProblemResponse;
 use crate::client_identity::ClientIdentity;
-use crate::door::Door;
-use crate::tokens::Scope;
+use crate::door::ServerDoor;
+use crate::tokens::TokenScope;
 
 /// That it answers.
 pub(super) async fn health() -> Json<Value> {
@@ -18,8 +18,11 @@ pub(super) async fn health() -> Json<Value> {
 }
 
 /// The figures, in Prometheus' text format.
-pub(super) async fn metrics(State(door): State<Door>, headers: HeaderMap) -> Result<impl IntoResponse, Problem> {
+pub(super) async fn metrics(
+    State(door): State<ServerDoor>,
+    headers: HeaderMap,
+) -> Result<impl IntoResponse, ProblemResponse> {
     let client = authenticate(door.access(), &headers, ClientIdentity::pages);
-    client.and_then(|client| client.require(Scope::Metrics)).inspect_err(|f| door.metrics().failed(f.code()))?;
+    client.and_then(|client| client.require(TokenScope::Metrics)).inspect_err(|f| door.metrics().failed(f.code()))?;
     Ok(([(header::CONTENT_TYPE, "text/plain; version=0.0.4; charset=utf-8")], door.figures()))
 }

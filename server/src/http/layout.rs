@@ -1,5 +1,5 @@
 //! `GET /api/v1/layouts/echolake.json`: how Foxglove and Lichtblick show a run or a slice. It says nothing of the lake,
-//! so it is given to whoever asks.
+//! so it needs no token.
 
 use axum::Router;
 use axum::http::{HeaderMap, StatusCode, header};

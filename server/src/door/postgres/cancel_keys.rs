@@ -41,12 +41,12 @@ impl CancelKeys {
         self.lock().insert((key.pid, key.secret.clone()), target);
     }
 
-    /// It cannot be cancelled any more.
+    /// Removes a key.
     pub(super) fn remove(&self, key: &CancelKey) {
         self.lock().remove(&(key.pid, key.secret.clone()));
     }
 
-    /// Cancels what runs on the connection of a key; false if there is none.
+    /// Cancels the query on the connection of a key; false if there is none.
     pub(super) async fn cancel(&self, pid: i32, secret: &[u8]) -> bool {
         let found = self.lock().get(&(pid, secret.to_vec())).cloned();
         let Some(target) = found else { return false };

@@ -17,8 +17,8 @@ const CURSOR: &[u8] = b"DECLARE CURSOR";
 
 /// A connection's exchange with its engine.
 #[derive(Default)]
-pub(super) struct Exchange {
-    /// Messages that are not answered, the bytes of each part that asks for an answer, and those of all such parts.
+pub(super) struct MessageExchange {
+    /// Unanswered messages, the bytes of each part that requests an answer, and those of all such parts.
     asked: BytesMut,
     parts: VecDeque<usize>,
     part_bytes: usize,
@@ -40,8 +40,8 @@ pub(super) struct Exchange {
     pub(super) has_cursor: bool,
 }
 
-impl Exchange {
-    /// Takes note of a client's message, whole or as much as there is of a long one.
+impl MessageExchange {
+    /// Records a client's message, whole or as much as there is of a long one.
     pub(super) fn ask(&mut self, header: FrameHeader, bytes: &[u8]) {
         if bytes.len() < header.bytes || self.asked.len() + bytes.len() > KEPT_BYTES {
             self.is_cut = true;
@@ -71,7 +71,7 @@ impl Exchange {
         !self.parts.is_empty()
     }
 
-    /// Takes note of an engine's message that is passed on.
+    /// Records an engine's message that is passed on.
     pub(super) fn answer(&mut self, kind: u8, body: &[u8]) {
         self.answered += 1;
         match kind {
@@ -145,7 +145,7 @@ impl Exchange {
         !self.is_forgetful
     }
 
-    /// Begins to ask again; returns how many messages of the new answer the client knows already.
+    /// Begins a retry; returns the number of messages of the new answer that the client has already.
     pub(super) fn repeat(&mut self) -> usize {
         self.is_repeated = true;
         self.parses.clear();
@@ -180,7 +180,7 @@ impl Exchange {
         self.prepared.values().map(Vec::as_slice)
     }
 
-    /// Messages that are not answered.
+    /// Returns the messages that are not answered.
     pub(super) fn unanswered(&self) -> &[u8] {
         &self.asked
     }
@@ -195,7 +195,7 @@ fn name(body: &[u8]) -> &[u8] {
 mod tests {
     use super::*;
 
-    fn ask(exchange: &mut Exchange, kind: u8, body: &[u8]) -> Vec<u8> {
+    fn ask(exchange: &mut MessageExchange, kind: u8, body: &[u8]) -> Vec<u8> {
         let mut message = vec![kind];
         message.extend((body.len() as u32 + 4).to_be_bytes());
         message.extend(body);
@@ -205,7 +205,7 @@ mod tests {
 
     #[test]
     fn what_was_answered_is_not_asked_again() {
-        let mut exchange = Exchange::default();
+        let mut exchange = MessageExchange::default();
         let first = ask(&mut exchange, b'Q', b"select 1\0");
         let second = ask(&mut exchange, b'Q', b"select 2\0");
         assert_eq!(exchange.unanswered(), [first, second.clone()].concat());
@@ -224,7 +224,7 @@ mod tests {
 
     #[test]
     fn settings_and_statements_are_prepared_again() {
-        let mut exchange = Exchange::default();
+        let mut exchange = MessageExchange::default();
         let set = ask(&mut exchange, b'Q', b"set timezone = 'UTC'\0");
         exchange.answer(b'C', b"SET\0");
         exchange.answer(b'Z', b"I");
@@ -245,7 +245,7 @@ mod tests {
 
     #[test]
     fn long_messages_are_not_kept() {
-        let mut exchange = Exchange::default();
+        let mut exchange = MessageExchange::default();
         ask(&mut exchange, b'Q', &vec![b'x'; KEPT_BYTES]);
         assert!(exchange.is_waiting() && !exchange.is_repeatable() && exchange.unanswered().is_empty());
         exchange.answer(b'Z', b"I");

@@ -5,8 +5,8 @@ use echolake_export::{Layout, Taken};
 use echolake_query::PredicateForm;
 use echolake_schema::RunId;
 
-use super::super::catalogue::Params;
-use crate::fault::Fault;
+use super::super::catalogue::RequestParams;
+use crate::fault::RequestFault;
 
 /// Runs that may be named, and sources of a manifest.
 pub(super) const MOST_RUNS: usize = 100;
@@ -14,7 +14,7 @@ pub(super) const MOST_RUNS: usize = 100;
 const NAMES: [&str; 5] = ["where", "run", "topics", "layout", "id"];
 
 /// A question.
-pub(super) struct Question {
+pub(super) struct SliceQuery {
     /// The predicate; None if all measurements of the runs are wanted.
     predicate: Option<String>,
     /// None, or the runs that the measurements are of.
@@ -29,18 +29,21 @@ pub(super) struct Question {
     pub(super) form: PredicateForm,
 }
 
-impl Question {
+impl SliceQuery {
     /// # Errors
-    /// [`Fault::Request`] if it is not right.
-    pub(super) fn of(uri: &Uri) -> Result<Self, Fault> {
-        let params = Params::of(uri)?;
+    /// [`RequestFault::Request`] if it is not right.
+    pub(super) fn of(uri: &Uri) -> Result<Self, RequestFault> {
+        let params = RequestParams::of(uri)?;
         if let Some(unknown) = params.names().find(|name| !NAMES.contains(name)) {
-            return Err(Fault::request(format!("there is no parameter `{unknown}`; hint: {}", NAMES.join(", "))));
+            return Err(RequestFault::request(format!(
+                "there is no parameter `{unknown}`; hint: {}",
+                NAMES.join(", ")
+            )));
         }
         let mut runs = Vec::new();
         for name in params.all("run") {
             let hint = "GET /api/v1/runs lists what there is";
-            runs.push(name.parse().map_err(|_| Fault::NotFound { what: format!("run `{name}`"), hint })?);
+            runs.push(name.parse().map_err(|_| RequestFault::NotFound { what: format!("run `{name}`"), hint })?);
         }
         let mut topics: Vec<_> = params.all("topics").flat_map(|t| t.split(',')).map(str::to_owned).collect();
         topics.retain(|topic| !topic.is_empty());
@@ -49,11 +52,11 @@ impl Question {
         runs.sort();
         runs.dedup();
         if runs.len() > MOST_RUNS {
-            return Err(Fault::request(format!("{} runs are named, {MOST_RUNS} may be", runs.len())));
+            return Err(RequestFault::request(format!("{} runs are named, {MOST_RUNS} may be", runs.len())));
         }
         let predicate = params.one("where")?.map(str::to_owned);
         if predicate.is_none() && runs.is_empty() {
-            return Err(Fault::request("`where` is missing; hint: where=surface_id='flat' and pair_id<100"));
+            return Err(RequestFault::request("`where` is missing; hint: where=surface_id='flat' and pair_id<100"));
         }
         let layout = match params.choice("layout", &["by-topic", "in-time"])? {
             "in-time" => Layout::InTime,
@@ -114,8 +117,8 @@ fn encoded(text: &str) -> String {
 mod tests {
     use super::*;
 
-    fn question(query: &str) -> Result<Question, Fault> {
-        Question::of(&format!("/x?{query}").parse().expect("a path"))
+    fn question(query: &str) -> Result<SliceQuery, RequestFault> {
+        SliceQuery::of(&format!("/x?{query}").parse().expect("a path"))
     }
 
     #[test]

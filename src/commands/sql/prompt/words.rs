@@ -54,12 +54,12 @@ const BEFORE_TABLE: [&str; 5] = ["from", "join", "describe", "\\d", "\\d+"];
 
 /// Completions of a word.
 #[derive(Helper, Highlighter, Hinter, Validator)]
-pub(super) struct Words {
+pub(super) struct WordCompleter {
     tables: BTreeMap<String, Vec<String>>,
     functions: Vec<String>,
 }
 
-impl Words {
+impl WordCompleter {
     /// The names that a session knows.
     pub(super) fn of(session: &Session) -> Self {
         let columns = |schema: &arrow::datatypes::Schema| schema.fields().iter().map(|f| f.name().clone()).collect();
@@ -107,7 +107,7 @@ fn is_part(c: char) -> bool {
     c.is_alphanumeric() || c == '_' || c == '\\' || c == '+' || c == '?'
 }
 
-impl Completer for Words {
+impl Completer for WordCompleter {
     type Candidate = Pair;
 
     fn complete(&self, line: &str, pos: usize, _: &Context<'_>) -> rustyline::Result<(usize, Vec<Pair>)> {
@@ -122,9 +122,9 @@ impl Completer for Words {
 mod tests {
     use super::*;
 
-    fn words() -> Words {
+    fn words() -> WordCompleter {
         let table = |name: &str, columns: &[&str]| (name.to_owned(), columns.iter().map(|c| (*c).to_owned()).collect());
-        Words {
+        WordCompleter {
             tables: [table("runs", &["run_id", "started"]), table("pairs", &["pair_id", "path_mm"])].into(),
             functions: vec!["round".to_owned(), "p90_mean".to_owned()],
         }
