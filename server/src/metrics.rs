@@ -55,19 +55,19 @@ impl Drop for QueryTimer<'_> {
 }
 
 impl ServerMetrics {
-    /// A query begins.
+    /// Counts a query that begins; its time is measured until the timer is dropped.
     pub(crate) fn begin(&self, protocol: ServerProtocol) -> QueryTimer<'_> {
         self.queries[protocol as usize].fetch_add(1, Ordering::Relaxed);
         self.running.fetch_add(1, Ordering::Relaxed);
         QueryTimer { metrics: self, begun: Instant::now() }
     }
 
-    /// It gave rows.
+    /// Counts rows of an answer.
     pub(crate) fn rows(&self, rows: usize) {
         self.rows.fetch_add(rows as u64, Ordering::Relaxed);
     }
 
-    /// A request failed.
+    /// Counts a failed request.
     pub(crate) fn failed(&self, code: FaultCode) {
         self.failures[code as usize].fetch_add(1, Ordering::Relaxed);
     }
@@ -90,7 +90,7 @@ impl ServerMetrics {
         counters.chain([self.running.load(Ordering::Relaxed).unsigned_abs()]).collect()
     }
 
-    /// Adds what another process has counted between two looks at its counters.
+    /// Adds what another process counted between two readings of its counters.
     pub(crate) fn add(&self, before: &[u64], after: &[u64]) {
         let all = self.queries.iter().chain(&self.failures).chain(&self.buckets);
         let counters = all.chain([&self.rows, &self.micros, &self.finished]);
@@ -106,7 +106,7 @@ impl ServerMetrics {
         self.running.fetch_add(difference(last).cast_signed(), Ordering::Relaxed);
     }
 
-    /// All of it, in text.
+    /// Returns all counters in Prometheus' text format.
     pub(crate) fn text(&self) -> String {
         let mut text = String::new();
         let get = |counter: &AtomicU64| counter.load(Ordering::Relaxed);

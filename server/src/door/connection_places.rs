@@ -18,7 +18,7 @@ use tokio::time::Sleep;
 const PAUSE: Duration = Duration::from_millis(100);
 /// Bytes that a connection reads before it is the turn of others. A frame of HTTP/2 may have nine and no answer.
 const TURN_BYTES: usize = 16 << 10;
-/// Bytes that a connection may send of what is no request. Each of a flood of frames is little, and costs as much as one
+/// Bytes that a connection may send outside of requests. Each of a flood of frames is small, and costs as much as one
 /// that says something.
 const IDLE_BYTES: usize = 1 << 20;
 /// Time for which a client may read nothing of an answer.

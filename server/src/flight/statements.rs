@@ -18,7 +18,7 @@ use crate::running::StopSignal;
 const CARRIED_BYTES: usize = 32 << 10;
 /// Time after which an unused handle expires.
 const KEPT: Duration = Duration::from_secs(600);
-/// Handles of one client; the one not used for longest makes room.
+/// Handles of one client; the least recently used is evicted.
 const HELD: usize = 256;
 
 type StatementHandle = [u8; 16];

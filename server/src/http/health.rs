@@ -12,7 +12,7 @@ use crate::client_identity::ClientIdentity;
 use crate::door::ServerDoor;
 use crate::tokens::TokenScope;
 
-/// That it answers.
+/// Answers that the server is up, with its version.
 pub(super) async fn health() -> Json<Value> {
     Json(json!({ "status": "ok", "version": env!("CARGO_PKG_VERSION") }))
 }

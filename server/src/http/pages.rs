@@ -47,7 +47,7 @@ static TAGGED: LazyLock<Vec<(&PageFile, String)>> = LazyLock::new(|| {
     PAGES.iter().map(|page| (page, tag(page))).collect()
 });
 
-/// Answers what is no other path. The pages find out themselves what an address shows, so every one of them has the same
+/// Answers all other paths. The pages decide themselves what an address shows, so every one of them has the same
 /// file.
 pub(super) async fn fallback(method: Method, uri: Uri, headers: HeaderMap) -> Response {
     let Some((page, tag)) = page(uri.path()) else { return super::nothing().await.into_response() };

@@ -26,7 +26,7 @@ impl From<RequestFault> for ProblemResponse {
 }
 
 impl ProblemResponse {
-    /// It as a response.
+    /// Returns the failure as a response.
     pub(crate) fn answer(&self) -> Response {
         let code = self.0.code();
         let (status, title) = status(code);

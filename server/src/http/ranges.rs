@@ -133,7 +133,7 @@ fn insert(headers: &mut HeaderMap, name: HeaderName, value: &str) {
 enum WantedRange {
     Whole,
     Part(Range<u64>),
-    /// None that it has.
+    /// A range outside of the file.
     Nothing,
 }
 

@@ -11,13 +11,13 @@ use super::content::AnswerContent;
 use super::summary::SurfaceEntry;
 use crate::fault::RequestFault;
 
-/// Fewer surfaces tell nothing: two are always on a line.
+/// Fewer surfaces have no meaningful correlation: two are always on a line.
 const LEAST: usize = 3;
 /// Parameters that are answered.
 const MOST: usize = 500;
-/// References are no designs.
+/// Typology of references, which are not designs and are left out.
 const REFERENCE: &str = "reference";
-/// A number that says nothing of the relief.
+/// A parameter without meaning for the shape of a relief.
 const SEED: &str = "seed";
 
 #[derive(Serialize)]

@@ -17,7 +17,7 @@ const LARGEST: usize = 8 << 20;
 /// An address with its parameters, and whether the answer is an Arrow stream.
 pub(super) type AnswerKey = (String, bool);
 
-/// Answers that are kept.
+/// Cache of answers of one snapshot.
 #[derive(Default)]
 pub(super) struct AnswerCache(Mutex<CachedAnswers>);
 
@@ -49,7 +49,7 @@ impl AnswerCache {
     /// Returns the answer for a key; `make` runs if it is neither cached nor being made by another request.
     ///
     /// # Errors
-    /// Those of `make`, which are not kept.
+    /// Errors of `make`, which are not cached.
     pub(super) async fn once(
         &self,
         key: AnswerKey,

@@ -10,13 +10,13 @@ use crate::fault::RequestFault;
 /// A band, or the total, which has no centre.
 #[derive(Debug, Serialize)]
 pub(super) struct BandDescription {
-    /// As in column names.
+    /// Name of the band in column names.
     pub(super) key: String,
     centre_hz: Option<f64>,
     pub(super) label: String,
 }
 
-/// Name of what has no band.
+/// Name of the total over all bands.
 pub(super) const TOTAL: &str = "total";
 
 /// The rig's bands, the total last.

@@ -164,7 +164,7 @@ fn response(content: &AnswerContent, headers: &HeaderMap, etag: String) -> Respo
     let mut response =
         ([(header::CONTENT_TYPE, content.media_type), (header::VARY, "Accept, Accept-Encoding")], body).into_response();
     let out = response.headers_mut();
-    // Asked again each time, and answered by 304 for as long as nothing changes; no cache between keeps what a token opened.
+    // Revalidated each time, by 304 for as long as nothing changes; no cache in between keeps what needed a token.
     out.insert(header::CACHE_CONTROL, HeaderValue::from_static("private, no-cache"));
     if packed {
         out.insert(header::CONTENT_ENCODING, HeaderValue::from_static("gzip"));

@@ -39,7 +39,7 @@ pub(super) struct SurfaceSummary {
 /// A surface, and what it is found and compared by.
 pub(super) struct SurfaceEntry {
     pub(super) surface: SurfaceSummary,
-    /// Of its relief's generator.
+    /// Parameters of its relief's generator.
     pub(super) parameters: Map<String, Value>,
     pub(super) mesh_triangles: Option<i64>,
     pub(super) mesh_watertight: Option<bool>,

@@ -33,7 +33,7 @@ pub(in super::super) struct SnapshotView {
     pub(super) answers: AnswerCache,
     pub(super) summary: OnceCell<CatalogueSummary>,
     pub(super) places: OnceCell<SurfacePositions>,
-    /// By their text, of which there are few: values are bound.
+    /// Prepared queries by their text; there are few texts, because values are bound.
     prepared: Mutex<HashMap<String, Arc<Prepared>>>,
 }
 

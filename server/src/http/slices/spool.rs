@@ -1,4 +1,4 @@
-//! Slices that are read by ranges: cut once, kept in files without names, so many bytes of them, the oldest going
+//! Slices that are read by ranges: cut once, cached in files without names up to a number of bytes, the oldest evicted
 //! first. Disks are waited for on threads of their own.
 
 use std::collections::{HashMap, VecDeque};
@@ -20,16 +20,16 @@ const MOST_BYTES: u64 = 2 << 30;
 /// Bytes that are read at a time.
 const BLOCK: u64 = 256 << 10;
 
-/// Slices that are kept, by what they are.
+/// Cache of slices, by their digest.
 #[derive(Clone, Default)]
 pub(super) struct SliceSpool(Arc<Mutex<SpoolState>>);
 
 #[derive(Default)]
 struct SpoolState {
     slices: HashMap<String, Arc<OnceCell<Arc<SpooledSlice>>>>,
-    /// Those that are whole, the one that was asked for last at the end.
+    /// Keys of complete slices, the most recently used last.
     order: VecDeque<String>,
-    /// Of all files that are open, kept or not.
+    /// Bytes of all open files, cached or not.
     bytes: u64,
 }
 
@@ -95,7 +95,7 @@ impl SliceSpool {
         Ok(slice)
     }
 
-    // Counts bytes that are about to be written, and lets the oldest slices go for them.
+    // Counts bytes that are about to be written, and evicts the oldest slices for them.
     fn make_room(&self, bytes: u64) -> Result<(), RequestFault> {
         let mut gone = Vec::new();
         let has_room = loop {
