@@ -11,7 +11,7 @@ use std::io;
 use std::path::{Path, PathBuf};
 use std::process::{Command, ExitCode};
 
-/// What the pages are made of, in `web/`.
+/// Sources of the pages, in `web/`.
 const SOURCES: [&str; 8] = [
     "src",
     "public",
@@ -24,11 +24,11 @@ const SOURCES: [&str; 8] = [
 ];
 /// Built pages in `web/` of a source archive; a checkout has none.
 const PREBUILT: &str = "prebuilt";
-/// What `engines` in `web/package.json` asks for.
+/// The Node version that `engines` in `web/package.json` requires.
 const NODE: &str = "Node 20.19 (or 22.12) or newer with npm";
 /// If one of these is set, a build without pages is an error: its tests would skip the pages.
 const STRICT: [&str; 2] = ["ECHOLAKE_NO_SKIP", "CI"];
-/// What was installed for; the packages are installed anew where it changes.
+/// The lock file, and a copy of the one that the installed packages are of: if they differ, npm installs again.
 const LOCK: &str = "package-lock.json";
 const INSTALLED: &str = "installed.json";
 const NPM: &str = if cfg!(windows) { "npm.cmd" } else { "npm" };
@@ -187,7 +187,8 @@ fn list(dist: &Path) -> io::Result<String> {
         };
         let _ = writeln!(
             list,
-            "Page {{ path: {:?}, media_type: {media_type:?}, bytes: include_bytes!({file:?}), gzip: {}, brotli: {} }},",
+            "PageFile {{ path: {:?}, media_type: {media_type:?}, bytes: include_bytes!({file:?}), \
+             gzip: {}, brotli: {} }},",
             format!("/{name}"),
             packed("gz"),
             packed("br")

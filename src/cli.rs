@@ -18,16 +18,16 @@ pub(crate) use lake::{DemoArgs, ImportCommand, IngestArgs, LakeCommand, Optimize
 /// A data lake and catalogue for sweep measurements.
 #[derive(Debug, Parser)]
 #[command(version, max_term_width = 100)]
-pub(crate) struct Cli {
+pub(crate) struct CliArguments {
     /// The lake: a folder or a file:// URL.
     #[arg(long, global = true, env = "ECHOLAKE_LAKE", default_value = "lake", value_name = "URL")]
     pub(crate) lake: String,
     #[command(subcommand)]
-    pub(crate) command: Command,
+    pub(crate) command: CliCommand,
 }
 
 #[derive(Debug, Subcommand)]
-pub(crate) enum Command {
+pub(crate) enum CliCommand {
     #[cfg(feature = "lake")]
     #[command(flatten)]
     Lake(LakeCommand),
@@ -62,8 +62,8 @@ pub(crate) struct AcquireArgs {
     /// Go on with a run that was stopped or cut off: its `.mcap.partial`. What is safe in it is not measured again.
     #[arg(long, value_name = "FILE", conflicts_with_all = ["surface", "panel", "parameters", "set", "mesh", "side", "rig", "flat", "foam", "seed", "ir_only"])]
     pub(crate) resume: Option<PathBuf>,
-    /// What the simulated rig measures, as `echolake panel --list` names it; by default what the surface's name begins
-    /// with.
+    /// Relief for the simulated rig, by a name of `echolake panel --list`; by default the one that the surface's name
+    /// begins with.
     #[arg(long, value_name = "NAME", conflicts_with = "mesh")]
     pub(crate) panel: Option<String>,
     /// A JSON file of parameters, as `echolake panel` writes them, in place of a name.
@@ -124,7 +124,7 @@ pub(crate) struct AcquireArgs {
 pub(crate) struct RecoverArgs {
     /// The recording that was cut off or damaged; it is only read.
     pub(crate) file: PathBuf,
-    /// Where the rebuilt file goes; by default beside it, without `.partial`.
+    /// Path of the rebuilt file; by default beside it, without `.partial`.
     #[arg(short, long, value_name = "FILE")]
     pub(crate) output: Option<PathBuf>,
     /// Print what was done as JSON.
@@ -137,7 +137,7 @@ pub(crate) struct ReplayArgs {
     /// Names of runs, surfaces (of each its newest run), or .mcap files; they are shown one after the other.
     #[arg(required = true, value_name = "RUN")]
     pub(crate) runs: Vec<String>,
-    /// Where to listen.
+    /// Address to listen on.
     #[arg(long, value_name = "ADDR", default_value = "127.0.0.1:8765")]
     pub(crate) listen: std::net::SocketAddr,
     #[command(flatten)]
@@ -150,7 +150,7 @@ pub(crate) struct ReplayArgs {
     pub(crate) paused: bool,
 }
 
-/// Who may look on.
+/// Access of viewers.
 #[derive(Debug, Args)]
 pub(crate) struct ViewerArgs {
     /// Let a viewer that is a web page look on, beside pages of this machine, as `https://app.foxglove.dev`; repeatable.

@@ -13,9 +13,9 @@ use clap::Parser as _;
 #[global_allocator]
 static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;
 
-/// How a command that did not fail ended.
+/// The result of a command that did not fail.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Done {
+enum CommandOutcome {
     /// Everything was done.
     Whole,
     /// It was done, and data were lost on the way.
@@ -31,7 +31,7 @@ const DONE_WITH_LOSS: u8 = 3;
 
 fn main() -> ExitCode {
     // clap itself ends with 2 on wrong usage.
-    let cli = cli::Cli::parse();
+    let cli = cli::CliArguments::parse();
     let runtime = || {
         tokio::runtime::Builder::new_multi_thread()
             .enable_all()
@@ -44,8 +44,8 @@ fn main() -> ExitCode {
     let outcome =
         commands::confine(&cli).and_then(|()| Ok(runtime()?)).and_then(|runtime| runtime.block_on(commands::run(cli)));
     match outcome {
-        Ok(Done::Whole) => ExitCode::SUCCESS,
-        Ok(Done::WithLoss) => ExitCode::from(DONE_WITH_LOSS),
+        Ok(CommandOutcome::Whole) => ExitCode::SUCCESS,
+        Ok(CommandOutcome::WithLoss) => ExitCode::from(DONE_WITH_LOSS),
         Err(error) if is_broken_pipe(&error) => ExitCode::SUCCESS,
         Err(error) => {
             eprintln!("error: {error:#}");
@@ -54,7 +54,7 @@ fn main() -> ExitCode {
     }
 }
 
-// Whoever closed the pipe has seen enough.
+// The reader that closed the pipe wants no more.
 fn is_broken_pipe(error: &anyhow::Error) -> bool {
     let io = |e: &(dyn std::error::Error + 'static)| {
         e.downcast_ref::<std::io::Error>().is_some_and(|e| e.kind() == std::io::ErrorKind::BrokenPipe)

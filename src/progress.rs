@@ -9,35 +9,35 @@ use indicatif::{MultiProgress, ProgressBar, ProgressStyle};
 const LINE_EVERY: Duration = Duration::from_secs(10);
 
 /// The progress of all of a command's tasks.
-pub(crate) struct Progress {
+pub(crate) struct CommandProgress {
     bars: Option<MultiProgress>,
 }
 
 /// The progress of one task.
-pub(crate) struct Task {
+pub(crate) struct TaskProgress {
     name: String,
     unit: &'static str,
     total: u64,
     bar: Option<ProgressBar>,
     begun: Instant,
     last_line: Instant,
-    /// What else there is to say, behind the bar or in the line.
+    /// A remark behind the bar or in the line.
     note: String,
 }
 
-impl Progress {
+impl CommandProgress {
     pub(crate) fn new() -> Self {
         Self { bars: std::io::stderr().is_terminal().then(MultiProgress::new) }
     }
 
     /// A task of `total` units.
-    pub(crate) fn task(&self, name: impl Into<String>, total: u64, unit: &'static str) -> Task {
+    pub(crate) fn task(&self, name: impl Into<String>, total: u64, unit: &'static str) -> TaskProgress {
         let name = name.into();
         let bar = self.bars.as_ref().map(|bars| bars.add(bar(&name, total, unit)));
-        Task { name, unit, total, bar, begun: Instant::now(), last_line: Instant::now(), note: String::new() }
+        TaskProgress { name, unit, total, bar, begun: Instant::now(), last_line: Instant::now(), note: String::new() }
     }
 
-    /// A line among the bars.
+    /// Prints a line among the bars.
     pub(crate) fn say(&self, line: impl AsRef<str>) {
         match &self.bars {
             Some(bars) => bars.suspend(|| eprintln!("{}", line.as_ref())),
@@ -46,8 +46,8 @@ impl Progress {
     }
 }
 
-impl Task {
-    /// `done` units are done.
+impl TaskProgress {
+    /// Sets the number of units that are done.
     pub(crate) fn at(&mut self, done: u64) {
         match &self.bar {
             Some(bar) => bar.set_position(done),
@@ -60,7 +60,7 @@ impl Task {
         }
     }
 
-    /// A line that stays.
+    /// Prints a line that stays.
     pub(crate) fn say(&self, line: &str) {
         match &self.bar {
             Some(bar) => bar.suspend(|| eprintln!("{line}")),
@@ -68,7 +68,7 @@ impl Task {
         }
     }
 
-    /// Says something beside the numbers.
+    /// Shows a remark beside the numbers.
     pub(crate) fn note(&mut self, note: String) {
         if let Some(bar) = &self.bar {
             bar.set_message(note.clone());
@@ -76,7 +76,7 @@ impl Task {
         self.note = note;
     }
 
-    /// `done` units were done before it began: they do not count for the time that is left.
+    /// Sets the number of units that were done before the start: they do not count in the estimate of the time left.
     pub(crate) fn begin_at(&mut self, done: u64) {
         if let Some(bar) = &self.bar {
             bar.set_position(done);
@@ -84,7 +84,7 @@ impl Task {
         }
     }
 
-    /// The task is over; `what` came of it.
+    /// Ends the task, with `what` as its result.
     pub(crate) fn done(self, what: impl AsRef<str>) {
         if let Some(bar) = &self.bar {
             bar.finish_and_clear();

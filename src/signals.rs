@@ -47,7 +47,7 @@ impl StopRequest {
         Ok(request)
     }
 
-    /// Becomes true with the request, for work on threads that look at it now and then.
+    /// Returns a flag that becomes true with the request, for threads that poll it.
     #[cfg(feature = "lake")]
     pub(crate) fn flag(&self) -> &Arc<AtomicBool> {
         &self.flag

@@ -1,5 +1,5 @@
-//! `acquire` killed at random moments, with or without the power, recovered and gone on with: nothing that was
-//! acknowledged is lost, nothing is there twice, and the run is whole in the end.
+//! `acquire` killed at random moments, with or without the power, recovered and resumed: nothing that was acknowledged
+//! is lost, nothing is there twice, and the run is whole in the end.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -13,7 +13,7 @@ use rand_chacha::ChaCha8Rng;
 
 use super::SMALL_RIG;
 use super::child::{ChildProcess, run_command};
-use super::forgetful::{ForgetfulDisk, Mounted};
+use super::forgetful::{DiskMount, ForgetfulDisk};
 
 /// Pairs of the small rig.
 pub(crate) const PAIRS: usize = 45;
@@ -23,9 +23,9 @@ const PACE: &str = "0.008";
 /// A run that is never killed within so many tries shows that the moments are wrong.
 const RUNS_PER_KILL: usize = 50;
 
-/// How a campaign went.
+/// Counts of a campaign.
 #[derive(Debug, Default)]
-pub(crate) struct Outcome {
+pub(crate) struct AcquireKillCounts {
     /// Processes that were killed while they worked.
     pub(crate) killed: usize,
     /// Of these, before there was a recording.
@@ -37,18 +37,18 @@ pub(crate) struct Outcome {
 }
 
 /// A campaign in a folder of its own.
-pub(crate) struct Campaign {
+pub(crate) struct AcquireKillCampaign {
     folder: tempfile::TempDir,
     binary: PathBuf,
     random: ChaCha8Rng,
-    /// What the lake is on, where the power is cut, too.
-    disk: Option<(ForgetfulDisk, Option<Mounted>)>,
+    /// The lake's disk, if the power is cut, too.
+    disk: Option<(ForgetfulDisk, Option<DiskMount>)>,
 }
 
 /// A verdict's pair, attempt and name.
-type Key = (u32, u32, String);
+type VerdictKey = (u32, u32, String);
 
-impl Campaign {
+impl AcquireKillCampaign {
     pub(crate) fn new(binary: &Path, seed: u64) -> Self {
         let folder = tempfile::tempdir().expect("a folder");
         std::fs::write(folder.path().join("rig.toml"), SMALL_RIG).expect("written");
@@ -56,7 +56,7 @@ impl Campaign {
         Self { folder, binary: binary.to_owned(), random: ChaCha8Rng::seed_from_u64(seed), disk: None }
     }
 
-    /// With a disk that forgets at each kill what was not synced; nothing where this machine mounts none.
+    /// With a disk that forgets at each kill what was not synced; nothing if this machine cannot mount one.
     pub(crate) fn with_power_cuts(binary: &Path, seed: u64) -> Option<Self> {
         let mut campaign = Self::new(binary, seed);
         let disk = ForgetfulDisk::new();
@@ -75,13 +75,14 @@ impl Campaign {
         }
     }
 
-    /// Kills `acquire` so many times; run after run is begun, and each is brought to its end. `told` hears of each run.
+    /// Kills `acquire` so many times; run after run is begun, and each is brought to its end. `told` is called with the
+    /// counts after each run.
     ///
     /// # Panics
-    /// Where a measurement is lost or doubled; the text names it.
-    pub(crate) fn kills(&mut self, kills: usize, told: &mut dyn FnMut(&Outcome)) -> Outcome {
+    /// A measurement is lost or doubled; the text names it.
+    pub(crate) fn kills(&mut self, kills: usize, told: &mut dyn FnMut(&AcquireKillCounts)) -> AcquireKillCounts {
         let mut whole = self.undisturbed();
-        let mut outcome = Outcome::default();
+        let mut outcome = AcquireKillCounts::default();
         while outcome.killed < kills {
             self.run_through(&mut whole, kills, &mut outcome);
             outcome.runs += 1;
@@ -91,7 +92,7 @@ impl Campaign {
         outcome
     }
 
-    // How long a run takes that nobody kills.
+    // Returns the time of a run that is not killed.
     fn undisturbed(&mut self) -> Duration {
         let begun = Instant::now();
         let output = run_command(&mut self.acquire(None)).expect("it starts");
@@ -101,7 +102,7 @@ impl Campaign {
         whole
     }
 
-    fn run_through(&mut self, whole: &mut Duration, kills: usize, outcome: &mut Outcome) {
+    fn run_through(&mut self, whole: &mut Duration, kills: usize, outcome: &mut AcquireKillCounts) {
         loop {
             let partial = self.inbox().into_iter().find(|p| p.extension().is_some_and(|e| e == "partial"));
             let begun = Instant::now();
@@ -158,7 +159,7 @@ impl Campaign {
                 }
                 true
             }
-            // Killed while the head was written: nothing was measured, and the next one begins anew.
+            // Killed while the head was written: nothing was measured, and the next one starts again.
             Some(1) if text(&output.stderr).contains("holds no run") => {
                 assert!(self.acknowledged().is_empty(), "{}", text(&output.stderr));
                 std::fs::remove_file(&partial).expect("removed");
@@ -200,7 +201,7 @@ impl Campaign {
     }
 
     // The last line may have been cut off with its process.
-    fn acknowledged(&self) -> Vec<Key> {
+    fn acknowledged(&self) -> Vec<VerdictKey> {
         let list = std::fs::read_to_string(self.folder.path().join("acknowledged.txt")).unwrap_or_default();
         let lines = list.split_inclusive('\n').filter(|line| line.ends_with('\n'));
         let key = |line: &str| {
@@ -214,7 +215,7 @@ impl Campaign {
 
     fn inbox(&self) -> Vec<PathBuf> {
         let entries = std::fs::read_dir(self.folder.path().join("disk/lake/inbox"));
-        // What a dead resume left half-made is made anew by the next one.
+        // A file that a killed resume left incomplete is written again by the next one.
         let is_left = |p: &PathBuf| p.extension().is_none_or(|e| e != "resuming");
         entries.into_iter().flatten().map(|e| e.expect("an entry").path()).filter(is_left).collect()
     }
@@ -236,8 +237,8 @@ fn text(bytes: &[u8]) -> String {
     String::from_utf8_lossy(bytes).into_owned()
 }
 
-/// How often each verdict is in a file; each has its response and its sweep before it.
-fn verdicts(path: &Path) -> BTreeMap<Key, usize> {
+/// Counts each verdict of a file; each has its response and its sweep before it.
+fn verdicts(path: &Path) -> BTreeMap<VerdictKey, usize> {
     let file = std::fs::read(path).expect("read");
     let (mut found, mut behind) = (BTreeMap::new(), BTreeMap::new());
     for message in mcap::MessageStream::new(&file).expect("an MCAP file") {

@@ -5,7 +5,7 @@ use std::process::Command;
 use std::time::Duration;
 
 use super::child::run_command;
-use super::{ECHOLAKE, Place, stderr};
+use super::{ECHOLAKE, TestFolder, stderr};
 
 fn files(folder: &Path) -> usize {
     std::fs::read_dir(folder).map_or(0, Iterator::count)
@@ -27,7 +27,7 @@ const HEADER: &str = "surface,recording,loopback,microphone,speaker,temperature_
 
 #[test]
 fn manifests_and_wav_files() {
-    let place = Place::new();
+    let place = TestFolder::new();
     wav(&place.path("good.wav"), 96_000, &noise(4_000));
     wav(&place.path("short.wav"), 96_000, &noise(3_999));
     wav(&place.path("slow.wav"), 48_000, &noise(4_000));
@@ -65,7 +65,7 @@ fn manifests_and_wav_files() {
 
 #[test]
 fn a_clipped_recording_is_kept_and_said() {
-    let place = Place::new();
+    let place = TestFolder::new();
     let mut clipped = noise(4_000);
     clipped[100] = i16::MAX;
     wav(&place.path("clipped.wav"), 96_000, &clipped);
@@ -79,7 +79,7 @@ fn a_clipped_recording_is_kept_and_said() {
 
 #[test]
 fn sofa_files_that_are_none() {
-    let place = Place::new();
+    let place = TestFolder::new();
     std::fs::write(place.path("a.sofa"), "no HDF5").expect("written");
     place.fails(1, &["import", "sofa", "a.sofa", "--rig", "rig.toml"], "it is no HDF5 file");
     place.fails(1, &["import", "sofa", "b.sofa", "--rig", "rig.toml"], "b.sofa");
@@ -88,7 +88,7 @@ fn sofa_files_that_are_none() {
 
 #[test]
 fn exports_to_what_is_no_disk() {
-    let place = Place::new();
+    let place = TestFolder::new();
     let refused = |args: &[&str]| place.fails(2, &[&["export"], args].concat(), "hint: name a path");
     refused(&["ml", "-o", "https://example.org/set"]);
     refused(&["mcap", "--where", "true", "-o", "s3://bucket/some.mcap"]);
@@ -100,7 +100,7 @@ fn exports_to_what_is_no_disk() {
 
 #[test]
 fn panels_and_groups_that_cannot_be_made() {
-    let place = Place::new();
+    let place = TestFolder::new();
     place.fails(1, &["panel", "marble", "-o", "x.stl"], "no relief; hint: flat");
     place.fails(
         1,
@@ -128,7 +128,7 @@ fn panels_and_groups_that_cannot_be_made() {
 
 #[test]
 fn rigs_whose_devices_are_unknown_or_absent() {
-    let place = Place::new();
+    let place = TestFolder::new();
     let rig = std::fs::read_to_string(place.path("rig.toml")).expect("the rig");
     let [audio, sensor, robots] = [
         "[devices.audio]\nkind = \"alsa\"\ncapture = \"no_such_pcm\"\nplayback = \"no_such_pcm\"\n",
@@ -160,7 +160,7 @@ fn cut_off(whole: &[u8]) -> &[u8] {
 
 #[test]
 fn run_files_that_are_none_or_damaged() {
-    let place = Place::new();
+    let place = TestFolder::new();
     let run = place.acquire("flat", &["--checkpoint-every", "5"]);
     let whole = std::fs::read(&run).expect("the run");
     std::fs::remove_file(&run).expect("removed");
@@ -183,7 +183,7 @@ fn run_files_that_are_none_or_damaged() {
     // The whole file has other content under the same name.
     ingest("whole.mcap", &whole, 1, "already in the lake with other content");
 
-    let other = Place::new();
+    let other = TestFolder::new();
     other.acquire("wavy", &["--seed", "5"]);
     let mut flipped = whole.clone();
     let at = flipped.len() / 2;
@@ -196,7 +196,7 @@ fn run_files_that_are_none_or_damaged() {
 // The system ends a process that writes larger files than it may: heights are as large, and flat ones are not.
 #[test]
 fn a_run_that_ends_ingest_is_passed_over_by_the_next_one() {
-    let place = Place::new();
+    let place = TestFolder::new();
     for (surface, seed) in [("flat", "1"), ("brick", "1"), ("flat", "2")] {
         place.acquire(surface, &["--seed", seed, "--ir-only"]);
     }
@@ -221,7 +221,7 @@ fn a_run_that_ends_ingest_is_passed_over_by_the_next_one() {
 
 #[test]
 fn lakes_that_are_none_newer_or_someone_elses() {
-    let place = Place::new();
+    let place = TestFolder::new();
     place.fails(1, &["sql", "select 1"], "no lake at");
     place.acquire("flat", &[]);
     let config = place.path("lake/lake.toml");
@@ -236,10 +236,10 @@ fn lakes_that_are_none_newer_or_someone_elses() {
 }
 
 /// A small file system of its own; unmounted at the end.
-struct Disk(std::path::PathBuf);
+struct SmallDisk(std::path::PathBuf);
 
-impl Disk {
-    // None where we may not mount, as outside of containers and for anyone but root.
+impl SmallDisk {
+    // None if the test may not mount, as outside of containers and for other users than root.
     fn mounted(at: &Path, kib: u64) -> Option<Self> {
         std::fs::create_dir(at).expect("made");
         let size = format!("size={kib}k");
@@ -260,7 +260,7 @@ impl Disk {
     }
 }
 
-impl Drop for Disk {
+impl Drop for SmallDisk {
     fn drop(&mut self) {
         let _ = run_command(Command::new("umount").arg(&self.0));
     }
@@ -268,8 +268,8 @@ impl Drop for Disk {
 
 #[test]
 fn a_full_disk_stops_everything_cleanly_and_with_space_it_goes_on() {
-    let place = Place::new();
-    let Some(disk) = Disk::mounted(&place.path("lake"), 12 << 10) else { return };
+    let place = TestFolder::new();
+    let Some(disk) = SmallDisk::mounted(&place.path("lake"), 12 << 10) else { return };
     for (surface, seed) in [("flat", "1"), ("foam", "2"), ("wood", "3")] {
         place.acquire(surface, &["--seed", seed, "--ir-only"]);
     }
@@ -295,8 +295,8 @@ fn a_full_disk_stops_everything_cleanly_and_with_space_it_goes_on() {
 
 #[test]
 fn a_lake_that_is_read_only_can_be_read() {
-    let place = Place::new();
-    let Some(disk) = Disk::mounted(&place.path("lake"), 24 << 10) else { return };
+    let place = TestFolder::new();
+    let Some(disk) = SmallDisk::mounted(&place.path("lake"), 24 << 10) else { return };
     place.acquire("flat", &["--ir-only"]);
     place.ok(&["ingest"]);
     place.acquire("foam", &["--ir-only", "--seed", "2"]);
@@ -311,19 +311,19 @@ fn a_lake_that_is_read_only_can_be_read() {
 
 #[test]
 fn a_recording_whose_recorder_died_yields_what_was_complete() {
-    let place = Place::new();
+    let place = TestFolder::new();
     let run = place.acquire("flat", &["--ir-only", "--checkpoint-every", "5"]);
     let whole = std::fs::read(&run).expect("read");
     let partial = run.with_extension("mcap.partial");
     std::fs::remove_file(&run).expect("removed");
     std::fs::write(&partial, cut_off(&whole)).expect("written");
-    // While somebody records, it is left alone.
+    // While it is being recorded, it is left alone.
     let recorder = std::fs::File::open(&partial).expect("open");
     recorder.lock().expect("locked");
     place.fails(0, &["ingest"], "nothing to ingest");
     place.fails(1, &["recover", &partial.to_string_lossy()], "is being recorded");
     drop(recorder);
-    // It could be gone on with, so nobody takes it for a run but on request.
+    // It could be resumed, so it is taken for a run only on request.
     place.fails(0, &["ingest"], "nothing to ingest");
     place.fails(3, &["recover", &partial.to_string_lossy()], "read back and compared");
     place.fails(3, &["ingest"], "");
@@ -346,7 +346,7 @@ mod slow {
 
     #[test]
     fn meshes_and_surfaces() {
-        let place = Place::new();
+        let place = TestFolder::new();
         let acquire = |mesh: &str| {
             vec![
                 "acquire".to_owned(),

@@ -11,7 +11,7 @@ use std::time::{Duration, Instant};
 pub(crate) const COMMAND_LIMIT: Duration = Duration::from_secs(300);
 /// For programs that install packages, drive a browser, or measure the paper's whole rig.
 pub(crate) const LONG_LIMIT: Duration = Duration::from_secs(1800);
-/// How long a killed process may take to be gone. One that waits for a broken disk may never be.
+/// Time limit for a killed process to be gone. One that waits for a broken disk may never be.
 const KILL_LIMIT: Duration = Duration::from_secs(10);
 /// Between two looks at a process that has no pipe to hear its end from.
 const POLL_EVERY: Duration = Duration::from_millis(2);
@@ -24,14 +24,14 @@ pub(crate) struct ChildProcess {
     name: String,
     limit: Duration,
     has_group: bool,
-    /// From then on its id may be somebody else's.
+    /// True if its exit status was read: from then on its id may be another process's.
     is_reaped: bool,
-    transcript: Arc<Transcript>,
+    transcript: Arc<OutputTranscript>,
 }
 
-/// What a program wrote so far, and a bell that rings when there is more.
+/// The output of a program so far, and a condition that is notified when there is more.
 #[derive(Default)]
-struct Transcript {
+struct OutputTranscript {
     pipes: Mutex<[PipeText; 2]>,
     news: Condvar,
 }
@@ -81,9 +81,9 @@ impl ChildProcess {
     fn spawn(command: &mut Command, limit: Duration, has_group: bool) -> io::Result<Self> {
         let name = format!("{command:?}");
         let mut child = command.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn()?;
-        let transcript = Arc::new(Transcript::default());
+        let transcript = Arc::new(OutputTranscript::default());
         transcript.lock().iter_mut().for_each(|pipe| pipe.is_open = true);
-        // Nobody joins these threads: a process that this one knows nothing of may hold a pipe open for ever.
+        // These threads are never joined: a process that this one knows nothing of may hold a pipe open for ever.
         spawn_reader(child.stdout.take().expect("stdout is piped"), STDOUT, &transcript);
         spawn_reader(child.stderr.take().expect("stderr is piped"), STDERR, &transcript);
         Ok(Self { child, name, limit, has_group, is_reaped: false, transcript })
@@ -220,13 +220,13 @@ impl Drop for ChildProcess {
     }
 }
 
-impl Transcript {
+impl OutputTranscript {
     fn lock(&self) -> MutexGuard<'_, [PipeText; 2]> {
         self.pipes.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
-fn spawn_reader(mut pipe: impl Read + Send + 'static, number: usize, transcript: &Arc<Transcript>) {
+fn spawn_reader(mut pipe: impl Read + Send + 'static, number: usize, transcript: &Arc<OutputTranscript>) {
     let transcript = transcript.clone();
     std::thread::spawn(move || {
         let mut block = [0; 8 << 10];

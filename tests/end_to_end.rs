@@ -1,13 +1,13 @@
 //! From the simulated rig to answers, and what the physics must be.
 
-use super::Place;
+use super::TestFolder;
 
 const PAIRS: f64 = 45.0;
 
 // In a build with debug assertions, clap looks over the arguments of each.
 #[test]
 fn every_command_explains_itself() {
-    let place = Place::new();
+    let place = TestFolder::new();
     let help = place.ok(&["--help"]);
     let commands = |help: &str| -> Vec<String> {
         let listed = help.lines().skip_while(|line| *line != "Commands:").skip(1).take_while(|line| !line.is_empty());
@@ -27,7 +27,7 @@ fn every_command_explains_itself() {
 
 #[test]
 fn references_complete_what_waits_and_the_physics_holds() {
-    let place = Place::new();
+    let place = TestFolder::new();
     place.acquire("wood", &["--seed", "3"]);
     place.fails(0, &["ingest"], "waits for reference flat, foam");
     assert_eq!(place.number("select count(*) from measurements"), PAIRS);
@@ -72,12 +72,12 @@ fn references_complete_what_waits_and_the_physics_holds() {
 
 #[test]
 fn a_second_flat_run_rewrites_its_dependants_and_a_lost_table_is_made_anew() {
-    let place = Place::new();
+    let place = TestFolder::new();
     for (surface, seed) in [("flat", "1"), ("foam", "2"), ("wavy", "3")] {
         place.acquire(surface, &["--seed", seed]);
     }
     place.ok(&["ingest"]);
-    let version = |place: &Place| place.sql("select distinct flat_version from nce where surface_id = 'wavy'");
+    let version = |place: &TestFolder| place.sql("select distinct flat_version from nce where surface_id = 'wavy'");
     let first = version(&place);
     place.acquire("flat", &["--seed", "9"]);
     place.ok(&["ingest"]);
@@ -96,7 +96,7 @@ fn a_second_flat_run_rewrites_its_dependants_and_a_lost_table_is_made_anew() {
 
 #[test]
 fn answers_come_in_every_format_or_are_refused_clearly() {
-    let place = Place::new();
+    let place = TestFolder::new();
     place.acquire("flat", &[]);
     place.ok(&["ingest"]);
     for format in ["csv", "json", "parquet", "arrow", "table"] {
@@ -113,7 +113,7 @@ fn answers_come_in_every_format_or_are_refused_clearly() {
 // A folder as the published data set has them, of the small rig's size.
 #[test]
 fn a_gir_folder_becomes_runs_with_references_of_their_own() {
-    let place = Place::new();
+    let place = TestFolder::new();
     let folder = place.path("gir");
     std::fs::create_dir(&folder).expect("made");
     let write = |surface: &str, gain: f64, rows: usize, columns: usize| {
@@ -163,25 +163,25 @@ mod slow {
     use std::path::Path;
 
     use crate::ECHOLAKE;
-    use crate::kills::Campaign;
+    use crate::kills::KillCampaign;
 
     // The long form is the campaign `kills`.
     #[test]
     fn a_killed_ingest_is_repaired_by_running_it_again() {
-        let outcome = Campaign::new(Path::new(ECHOLAKE), 1).rounds(4, &mut |_, _| {});
+        let outcome = KillCampaign::new(Path::new(ECHOLAKE), 1).rounds(4, &mut |_, _| {});
         assert!(outcome.killed > 0, "{outcome:?}");
     }
 
     // Its long form is the same campaign with `halves`.
     #[test]
     fn two_processes_ingest_half_of_the_runs_each() {
-        Campaign::of(Path::new(ECHOLAKE), 1, 12).halves(2, &mut |_, _| {});
+        KillCampaign::of(Path::new(ECHOLAKE), 1, 12).halves(2, &mut |_, _| {});
     }
 }
 
 #[test]
 fn acquires_that_are_killed_lose_nothing_acknowledged() {
-    let mut campaign = super::acquire_kills::Campaign::new(std::path::Path::new(super::ECHOLAKE), 7);
+    let mut campaign = super::acquire_kills::AcquireKillCampaign::new(std::path::Path::new(super::ECHOLAKE), 7);
     let outcome = campaign.kills(6, &mut |_| {});
     check_acknowledged(&outcome);
 }
@@ -189,13 +189,13 @@ fn acquires_that_are_killed_lose_nothing_acknowledged() {
 #[test]
 fn acquires_whose_power_is_cut_lose_nothing_acknowledged() {
     let echolake = std::path::Path::new(super::ECHOLAKE);
-    let Some(mut campaign) = super::acquire_kills::Campaign::with_power_cuts(echolake, 7) else { return };
+    let Some(mut campaign) = super::acquire_kills::AcquireKillCampaign::with_power_cuts(echolake, 7) else { return };
     let outcome = campaign.kills(6, &mut |_| {});
     check_acknowledged(&outcome);
 }
 
 // A kill between a pair's checkpoint and its line keeps the pair and loses the line.
-fn check_acknowledged(outcome: &super::acquire_kills::Outcome) {
+fn check_acknowledged(outcome: &super::acquire_kills::AcquireKillCounts) {
     assert_eq!(outcome.killed, 6);
     assert!(outcome.acknowledged + outcome.killed >= super::acquire_kills::PAIRS, "{outcome:?}");
 }

@@ -19,7 +19,7 @@ use rand::Rng as _;
 use rand_chacha::ChaCha8Rng;
 use rustix::io::Errno;
 
-/// What is written as a whole or not at all.
+/// Unit that is written as a whole or not at all, in bytes.
 const SECTOR: usize = 512;
 /// Nothing is cached: the kernel asks each time.
 const NO_TIME: Duration = Duration::ZERO;
@@ -27,37 +27,37 @@ const ROOT: u64 = 1;
 
 /// The disk; clones share it.
 #[derive(Clone)]
-pub(crate) struct ForgetfulDisk(Arc<Mutex<Tree>>);
+pub(crate) struct ForgetfulDisk(Arc<Mutex<FileTree>>);
 
 /// A disk in use. Dropped, it is unmounted.
-pub(crate) struct Mounted {
+pub(crate) struct DiskMount {
     _session: BackgroundSession,
 }
 
-struct Tree {
-    nodes: BTreeMap<u64, Node>,
+struct FileTree {
+    nodes: BTreeMap<u64, DiskNode>,
     next: u64,
 }
 
 #[derive(Clone)]
-enum Node {
+enum DiskNode {
     File { now: Vec<u8>, safe: Vec<u8> },
-    Folder { now: Entries, safe: Entries },
+    Folder { now: FolderEntries, safe: FolderEntries },
 }
 
-type Entries = BTreeMap<OsString, u64>;
+type FolderEntries = BTreeMap<OsString, u64>;
 
 impl ForgetfulDisk {
     pub(crate) fn new() -> Self {
-        let root = Node::Folder { now: Entries::new(), safe: Entries::new() };
-        Self(Arc::new(Mutex::new(Tree { nodes: BTreeMap::from([(ROOT, root)]), next: ROOT + 1 })))
+        let root = DiskNode::Folder { now: FolderEntries::new(), safe: FolderEntries::new() };
+        Self(Arc::new(Mutex::new(FileTree { nodes: BTreeMap::from([(ROOT, root)]), next: ROOT + 1 })))
     }
 
-    /// Mounts the disk; nothing where this machine does not let us.
-    pub(crate) fn mount(&self, at: &Path) -> Option<Mounted> {
+    /// Mounts the disk; nothing if this machine does not allow it.
+    pub(crate) fn mount(&self, at: &Path) -> Option<DiskMount> {
         let options = [MountOption::FSName("forgetful".into())];
-        match fuser::spawn_mount2(Disk(self.0.clone()), at, &options) {
-            Ok(session) => Some(Mounted { _session: session }),
+        match fuser::spawn_mount2(DiskFileSystem(self.0.clone()), at, &options) {
+            Ok(session) => Some(DiskMount { _session: session }),
             Err(error) => {
                 eprintln!("skipped: no file system can be mounted here: {error}");
                 None
@@ -65,18 +65,18 @@ impl ForgetfulDisk {
         }
     }
 
-    /// The power is cut. Nobody may have the disk mounted.
+    /// Cuts the power. The disk must not be mounted.
     pub(crate) fn cut(&self, random: &mut ChaCha8Rng) {
         let mut tree = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         for node in tree.nodes.values_mut() {
             match node {
-                Node::Folder { now, safe } => {
+                DiskNode::Folder { now, safe } => {
                     if random.random_bool(0.5) {
                         now.clone_from(safe);
                     }
                     safe.clone_from(now);
                 }
-                Node::File { now, safe } => {
+                DiskNode::File { now, safe } => {
                     *now = torn(now, safe, random);
                     safe.clone_from(now);
                 }
@@ -94,26 +94,26 @@ fn torn(now: &[u8], safe: &[u8], random: &mut ChaCha8Rng) -> Vec<u8> {
     let mut left = Vec::with_capacity(length);
     while left.len() < length {
         let range = left.len()..(left.len() + SECTOR).min(length);
-        // Zeros where neither reaches; of a sector that was synced and not written since, both are the same.
+        // Zeros if neither reaches so far; of a sector that was synced and not written since, both are the same.
         let sector = |of: &[u8]| -> Vec<u8> { range.clone().map(|i| of.get(i).copied().unwrap_or(0)).collect() };
         left.extend(if random.random_bool(0.5) { sector(now) } else { sector(safe) });
     }
     left
 }
 
-impl Tree {
-    fn folder(&mut self, ino: u64) -> Result<&mut Entries, Errno> {
+impl FileTree {
+    fn folder(&mut self, ino: u64) -> Result<&mut FolderEntries, Errno> {
         match self.nodes.get_mut(&ino) {
-            Some(Node::Folder { now, .. }) => Ok(now),
-            Some(Node::File { .. }) => Err(Errno::NOTDIR),
+            Some(DiskNode::Folder { now, .. }) => Ok(now),
+            Some(DiskNode::File { .. }) => Err(Errno::NOTDIR),
             None => Err(Errno::NOENT),
         }
     }
 
     fn file(&mut self, ino: u64) -> Result<&mut Vec<u8>, Errno> {
         match self.nodes.get_mut(&ino) {
-            Some(Node::File { now, .. }) => Ok(now),
-            Some(Node::Folder { .. }) => Err(Errno::ISDIR),
+            Some(DiskNode::File { now, .. }) => Ok(now),
+            Some(DiskNode::Folder { .. }) => Err(Errno::ISDIR),
             None => Err(Errno::NOENT),
         }
     }
@@ -122,7 +122,7 @@ impl Tree {
         self.folder(parent)?.get(name).copied().ok_or(Errno::NOENT)
     }
 
-    fn add(&mut self, parent: u64, name: &OsStr, node: Node) -> Result<FileAttr, Errno> {
+    fn add(&mut self, parent: u64, name: &OsStr, node: DiskNode) -> Result<FileAttr, Errno> {
         if self.child(parent, name).is_ok() {
             return Err(Errno::EXIST);
         }
@@ -140,16 +140,16 @@ impl Tree {
 
     fn sync(&mut self, ino: u64) -> Result<(), Errno> {
         match self.nodes.get_mut(&ino).ok_or(Errno::NOENT)? {
-            Node::File { now, safe } => safe.clone_from(now),
-            Node::Folder { now, safe } => safe.clone_from(now),
+            DiskNode::File { now, safe } => safe.clone_from(now),
+            DiskNode::Folder { now, safe } => safe.clone_from(now),
         }
         Ok(())
     }
 
     fn attributes(&self, ino: u64) -> Result<FileAttr, Errno> {
         let (kind, size, perm) = match self.nodes.get(&ino).ok_or(Errno::NOENT)? {
-            Node::File { now, .. } => (FileType::RegularFile, now.len() as u64, 0o644),
-            Node::Folder { .. } => (FileType::Directory, 0, 0o755),
+            DiskNode::File { now, .. } => (FileType::RegularFile, now.len() as u64, 0o644),
+            DiskNode::Folder { .. } => (FileType::Directory, 0, 0o755),
         };
         let time = SystemTime::UNIX_EPOCH;
         Ok(FileAttr {
@@ -172,10 +172,10 @@ impl Tree {
     }
 }
 
-struct Disk(Arc<Mutex<Tree>>);
+struct DiskFileSystem(Arc<Mutex<FileTree>>);
 
-impl Disk {
-    fn tree(&self) -> MutexGuard<'_, Tree> {
+impl DiskFileSystem {
+    fn tree(&self) -> MutexGuard<'_, FileTree> {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
@@ -201,7 +201,7 @@ fn attributes(reply: ReplyAttr, found: Result<FileAttr, Errno>) {
     }
 }
 
-impl Filesystem for Disk {
+impl Filesystem for DiskFileSystem {
     fn lookup(&mut self, _: &Request<'_>, parent: u64, name: &OsStr, reply: ReplyEntry) {
         let mut tree = self.tree();
         let found = tree.child(parent, name).and_then(|ino| tree.attributes(ino));
@@ -240,7 +240,7 @@ impl Filesystem for Disk {
     }
 
     fn mkdir(&mut self, _: &Request<'_>, parent: u64, name: &OsStr, _: u32, _: u32, reply: ReplyEntry) {
-        let node = Node::Folder { now: Entries::new(), safe: Entries::new() };
+        let node = DiskNode::Folder { now: FolderEntries::new(), safe: FolderEntries::new() };
         entry(reply, self.tree().add(parent, name, node));
     }
 
@@ -290,7 +290,7 @@ impl Filesystem for Disk {
     }
 
     fn create(&mut self, _: &Request<'_>, parent: u64, name: &OsStr, _: u32, _: u32, _: i32, reply: ReplyCreate) {
-        match self.tree().add(parent, name, Node::File { now: Vec::new(), safe: Vec::new() }) {
+        match self.tree().add(parent, name, DiskNode::File { now: Vec::new(), safe: Vec::new() }) {
             Ok(made) => reply.created(&NO_TIME, &made, 0, 0, 0),
             Err(error) => reply.error(error.raw_os_error()),
         }

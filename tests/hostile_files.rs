@@ -29,18 +29,18 @@ const MOST_STARTS: usize = 20;
 const FRAME: usize = 9;
 pub(crate) const MIB: u64 = 1 << 20;
 
-/// How large the files are that are made.
+/// Sizes of the generated files, in bytes.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct HostileSizes {
     /// Files of records that only seem to be some.
     pub(crate) false_records: usize,
-    /// What a chunk is decompressed to that is just small enough to be read.
+    /// Decompressed size of a chunk that is just small enough to be read.
     pub(crate) bomb: u64,
     /// Sparse records that are too large.
     pub(crate) sparse: u64,
 }
 
-/// How a round went.
+/// Counts of a round.
 #[derive(Debug, Default)]
 pub(crate) struct HostileOutcome {
     /// Files in the inbox.
@@ -51,7 +51,7 @@ pub(crate) struct HostileOutcome {
     pub(crate) good_expected: usize,
     /// Files that were put aside.
     pub(crate) quarantined: usize,
-    /// How processes ended that were started again.
+    /// Exits of processes that were started again.
     pub(crate) deaths: Vec<String>,
     /// The most memory that a process had at a time.
     pub(crate) peak_mib: u64,
@@ -74,7 +74,7 @@ struct TemplateRun {
     run: String,
     /// All records, frames included.
     records: Vec<Range<usize>>,
-    /// Where the first chunk ends: the run's description and its channels are before it.
+    /// End of the first chunk: the run's description and its channels are before it.
     described: usize,
     log: u16,
     ir: u16,
@@ -230,7 +230,7 @@ impl TemplateRun {
         };
         let false_record = [&[0x06][..], &30u64.to_le_bytes(), &[1; 3]].concat();
         let false_records = |record: &[u8]| record.repeat(false_records / record.len());
-        // Each of these reaches to the same place, where nothing is.
+        // Each of these ends at the same offset, where there is no record.
         let nested = |code: u8, head: usize| {
             let count = sizes.false_records / (FRAME + head + 4);
             let one = |number: usize| {

@@ -1,4 +1,4 @@
-//! What packages need of the command: its report about itself, man pages and completions.
+//! The command as packages use it: its report about itself, man pages and completions.
 
 use std::fs;
 use std::net::TcpListener;
@@ -7,42 +7,42 @@ use std::process::Command;
 use serde::Deserialize;
 
 use super::child::run_command;
-use super::{ECHOLAKE, Place, stderr};
+use super::{ECHOLAKE, TestFolder, stderr};
 
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
-struct Report {
+struct SelfReport {
     version: String,
     commit: Option<String>,
     program: String,
-    facts: Vec<Fact>,
+    facts: Vec<ReportedFact>,
 }
 
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
-struct Fact {
+struct ReportedFact {
     name: String,
     state: String,
     found: String,
     hint: Option<String>,
 }
 
-impl Report {
+impl SelfReport {
     fn of(command: &mut Command) -> Self {
         let output = run_command(command).expect("the command starts");
         serde_json::from_slice(&output.stdout).unwrap_or_else(|e| panic!("{e}: {}", stderr(&output)))
     }
 
-    fn fact(&self, name: &str) -> &Fact {
+    fn fact(&self, name: &str) -> &ReportedFact {
         self.facts.iter().find(|fact| fact.name == name).unwrap_or_else(|| panic!("no {name} in {self:?}"))
     }
 }
 
 #[test]
 fn doctor_reports_the_installation_and_leaves_nothing_behind() {
-    let place = Place::new();
+    let place = TestFolder::new();
     let before = fs::read_dir(place.path("")).expect("a folder").count();
-    let report = Report::of(&mut place.command(&["doctor", "--self", "--json"]));
+    let report = SelfReport::of(&mut place.command(&["doctor", "--self", "--json"]));
     assert_eq!(report.version, env!("CARGO_PKG_VERSION"));
     assert!(report.program.ends_with("echolake"), "{}", report.program);
     assert!(report.commit.is_none_or(|commit| !commit.is_empty()));
@@ -78,11 +78,11 @@ fn doctor_reports_the_installation_and_leaves_nothing_behind() {
 
 #[test]
 fn facts_are_those_of_the_place() {
-    let place = Place::new();
+    let place = TestFolder::new();
     let own = ["doctor", "--self", "--json"];
-    // Whoever has the port, this test or another program.
+    // The port is taken, by this test or by another program.
     let _taken = TcpListener::bind("127.0.0.1:5433");
-    let report = Report::of(&mut place.command(&own));
+    let report = SelfReport::of(&mut place.command(&own));
     let port = report.fact("port 5433");
     assert_eq!(port.state, "note", "{port:?}");
     let formats = &report.fact("formats").found;
@@ -94,16 +94,16 @@ fn facts_are_those_of_the_place() {
     let disk = &report.fact("lake's disk").found;
     let folder = place.path("").canonicalize().expect("a folder").display().to_string();
     assert!(disk.ends_with(folder.trim_end_matches('/')), "{disk}, not {folder}");
-    let no_folder = Report::of(Command::new(ECHOLAKE).args(["--lake", "memory://"]).args(own));
+    let no_folder = SelfReport::of(Command::new(ECHOLAKE).args(["--lake", "memory://"]).args(own));
     assert!(no_folder.facts.iter().all(|fact| fact.name != "lake's disk"), "{no_folder:?}");
-    let no_files = Report::of(place.command(&own).env("TMPDIR", "/dev/null"));
+    let no_files = SelfReport::of(place.command(&own).env("TMPDIR", "/dev/null"));
     let files = no_files.fact("temporary files");
     assert!(files.state == "failed" && files.found.starts_with("cannot make a folder in /dev/null"), "{files:?}");
 }
 
 #[test]
 fn a_lake_that_cannot_be_is_a_failure() {
-    let place = Place::new();
+    let place = TestFolder::new();
     fs::write(place.path("lake"), "no folder").expect("written");
     let output = place.run(&["doctor", "--self"]);
     assert_eq!(output.status.code(), Some(1));
@@ -114,7 +114,7 @@ fn a_lake_that_cannot_be_is_a_failure() {
 
 #[test]
 fn packages_get_man_pages_and_completions() {
-    let place = Place::new();
+    let place = TestFolder::new();
     place.ok(&["man", "man"]);
     for (page, expected) in
         [("echolake.1", "doctor"), ("echolake-serve.1", "flight"), ("echolake-import-wav.1", "manifest")]

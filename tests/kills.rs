@@ -30,9 +30,9 @@ pub(crate) const TABLES: [(&str, &str); 12] = [
     ("surface_stats", "surface_id, band, run_id"),
 ];
 
-/// How a campaign went.
+/// Counts of a campaign.
 #[derive(Debug, Default)]
-pub(crate) struct Outcome {
+pub(crate) struct KillCounts {
     /// Processes that were killed while they worked.
     pub(crate) killed: usize,
     /// Processes that ended before their moment came.
@@ -40,13 +40,13 @@ pub(crate) struct Outcome {
 }
 
 /// A campaign in a folder of its own.
-pub(crate) struct Campaign {
+pub(crate) struct KillCampaign {
     folder: tempfile::TempDir,
     binary: PathBuf,
     random: ChaCha8Rng,
 }
 
-impl Campaign {
+impl KillCampaign {
     /// Measures the runs of the lake that every round begins with.
     pub(crate) fn new(binary: &Path, seed: u64) -> Self {
         Self::of(binary, seed, SURFACES.len())
@@ -65,13 +65,14 @@ impl Campaign {
         campaign
     }
 
-    /// Kills ingest once to three times in each round, lets it run through, and compares. `told` hears of each round.
+    /// Kills ingest once to three times in each round, lets it run through, and compares. `told` is called with the
+    /// counts after each round.
     ///
     /// # Panics
-    /// Where the tables are not those of an undisturbed ingest; the text names the round.
-    pub(crate) fn rounds(&mut self, rounds: usize, told: &mut dyn FnMut(usize, &Outcome)) -> Outcome {
+    /// The tables are not those of an undisturbed ingest; the text names the round.
+    pub(crate) fn rounds(&mut self, rounds: usize, told: &mut dyn FnMut(usize, &KillCounts)) -> KillCounts {
         let (mut whole, expected) = self.undisturbed();
-        let mut outcome = Outcome::default();
+        let mut outcome = KillCounts::default();
         for round in 0..rounds {
             self.copy("round");
             let kills = self.random.random_range(1..=3);
@@ -100,9 +101,9 @@ impl Campaign {
     ///
     /// # Panics
     /// As [`Self::rounds`].
-    pub(crate) fn halves(&mut self, rounds: usize, told: &mut dyn FnMut(usize, &Outcome)) -> Outcome {
+    pub(crate) fn halves(&mut self, rounds: usize, told: &mut dyn FnMut(usize, &KillCounts)) -> KillCounts {
         let (whole, expected) = self.undisturbed();
-        let mut outcome = Outcome::default();
+        let mut outcome = KillCounts::default();
         for round in 0..rounds {
             self.copy("round");
             let mut runs = self.inbox("round");
@@ -134,7 +135,7 @@ impl Campaign {
         outcome
     }
 
-    // How long an ingest takes that nobody disturbs, and its tables.
+    // Returns the time of an ingest that is not disturbed, and its tables.
     fn undisturbed(&self) -> (Duration, BTreeMap<&'static str, Vec<u8>>) {
         self.copy("undisturbed");
         let begun = Instant::now();

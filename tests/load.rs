@@ -1,8 +1,8 @@
-//! `demo --surfaces N`: a collection as large as is wanted, stopped and gone on with, the same for the same seed.
+//! `demo --surfaces N`: a collection as large as is wanted, stopped and resumed, the same for the same seed.
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use super::Place;
+use super::TestFolder;
 
 const PAIRS: f64 = 45.0;
 
@@ -11,7 +11,7 @@ fn demo<'a>(surfaces: &'a str, more: &[&'a str]) -> Vec<&'a str> {
 }
 
 /// The runs that wait, by the names of their surfaces.
-fn inbox(place: &Place) -> BTreeMap<String, Vec<u8>> {
+fn inbox(place: &TestFolder) -> BTreeMap<String, Vec<u8>> {
     let files = std::fs::read_dir(place.path("lake/inbox")).expect("the inbox");
     let named = files.map(|entry| {
         let path = entry.expect("an entry").path();
@@ -31,7 +31,7 @@ fn messages(run: &[u8]) -> Vec<(String, u64, Vec<u8>)> {
 
 #[test]
 fn a_collection_is_measured_once_and_ingested() {
-    let place = Place::new();
+    let place = TestFolder::new();
     place.ok(&demo("5", &["--no-ingest"]));
     let first = inbox(&place);
     let names: Vec<_> = first.keys().map(String::as_str).collect();
@@ -79,7 +79,7 @@ fn a_collection_is_measured_once_and_ingested() {
 
 #[test]
 fn another_seed_is_another_collection() {
-    let place = Place::new();
+    let place = TestFolder::new();
     place.ok(&demo("4", &["--no-ingest"]));
     place.ok(&demo("4", &["--no-ingest", "--seed", "2"]));
     let runs = std::fs::read_dir(place.path("lake/inbox")).expect("the inbox").count();

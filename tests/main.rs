@@ -32,11 +32,11 @@ const ECHOLAKE: &str = env!("CARGO_BIN_EXE_echolake");
 const SMALL_RIG: &str = include_str!("fixtures/small_rig.toml");
 
 /// A folder with a lake and a small rig.
-struct Place {
+struct TestFolder {
     folder: tempfile::TempDir,
 }
 
-impl Place {
+impl TestFolder {
     fn new() -> Self {
         let folder = tempfile::tempdir().expect("a folder");
         std::fs::write(folder.path().join("rig.toml"), SMALL_RIG).expect("written");
@@ -92,21 +92,21 @@ impl Place {
 }
 
 /// A folder that several tests begin with: its files, once one of them has made it.
-struct PlaceTemplate(OnceLock<BTreeMap<PathBuf, Vec<u8>>>);
+struct TestFolderTemplate(OnceLock<BTreeMap<PathBuf, Vec<u8>>>);
 
-impl PlaceTemplate {
+impl TestFolderTemplate {
     const fn new() -> Self {
         Self(OnceLock::new())
     }
 
     /// A folder of the test's own, as `make` leaves a new one.
-    fn place(&self, make: impl FnOnce(&Place)) -> Place {
+    fn place(&self, make: impl FnOnce(&TestFolder)) -> TestFolder {
         let files = self.0.get_or_init(|| {
-            let place = Place::new();
+            let place = TestFolder::new();
             make(&place);
             files_below(place.folder.path())
         });
-        let place = Place::new();
+        let place = TestFolder::new();
         for (path, bytes) in files {
             let path = place.folder.path().join(path);
             std::fs::create_dir_all(path.parent().expect("a folder")).expect("made");
@@ -138,7 +138,7 @@ fn stderr(output: &Output) -> String {
     String::from_utf8_lossy(&output.stderr).into_owned()
 }
 
-/// Real data beside the checkout; tests that want it skip where it is absent, and say so.
+/// Real data beside the checkout; tests that need it are skipped if it is absent, and say so.
 fn shared_data(name: &str) -> Option<PathBuf> {
     let path = Path::new("../shared/data").join(name);
     if !path.exists() {

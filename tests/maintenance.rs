@@ -4,10 +4,10 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, SystemTime};
 
-use super::Place;
+use super::TestFolder;
 use super::kills::TABLES;
 
-fn tables(place: &Place) -> BTreeMap<&'static str, String> {
+fn tables(place: &TestFolder) -> BTreeMap<&'static str, String> {
     let rows = |(table, order): &(&'static str, &str)| {
         (*table, place.ok(&["sql", "--format", "csv", &format!("select * from {table} order by {order}")]))
     };
@@ -33,7 +33,7 @@ fn age(file: &Path, hours: u64) {
 
 #[test]
 fn one_maintains_at_a_time_and_the_second_is_told_who() {
-    let place = Place::new();
+    let place = TestFolder::new();
     place.acquire("flat", &["--ir-only"]);
     place.ok(&["ingest"]);
     let lease = place.path("lake/tables/_maintenance.json");
@@ -60,7 +60,7 @@ mod slow {
 
     #[test]
     fn readers_see_the_same_before_and_after() {
-        let place = Place::new();
+        let place = TestFolder::new();
         for (surface, seed) in [("flat", "1"), ("foam", "2"), ("flat_b", "3"), ("wood", "4"), ("prd", "5")] {
             place.acquire(surface, &["--seed", seed, "--ir-only"]);
         }
@@ -105,7 +105,7 @@ mod slow {
 
     #[test]
     fn vacuum_takes_what_crashes_left_and_nothing_else() {
-        let place = Place::new();
+        let place = TestFolder::new();
         place.acquire("flat", &["--ir-only"]);
         place.ok(&["ingest"]);
         let before = tables(&place);

@@ -1,6 +1,6 @@
-//! Real data, where it is beside the checkout: a room's recording and the published combinations.
+//! Real data, if it is beside the checkout: a room's recording and the published combinations.
 
-use super::{Place, shared_data};
+use super::{TestFolder, shared_data};
 
 const ROOM_RIG: &str = r#"
 name = "room"
@@ -23,7 +23,7 @@ fn a_room_s_impulse_response_is_asked_for_in_sql() {
     else {
         return;
     };
-    let place = Place::new();
+    let place = TestFolder::new();
     std::fs::write(place.path("room.toml"), ROOM_RIG).expect("written");
     let manifest = format!(
         "surface,recording,loopback,microphone,speaker,temperature_c\nroom,{},{},0/0/0,0/1/0,20\n",

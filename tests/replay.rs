@@ -1,14 +1,14 @@
-//! The replay as its users start and end it; what a viewer sees is tested where the player is.
+//! Start and end of a replay by its users; the content that a viewer sees is tested beside the player.
 
 use super::child::ChildProcess;
-use super::{Place, stderr};
+use super::{TestFolder, stderr};
 
 /// Replays until it listens, then ends it by Ctrl-C; its exit code, and what it said.
-fn replayed(place: &Place, runs: &[&str]) -> (Option<i32>, String) {
+fn replayed(place: &TestFolder, runs: &[&str]) -> (Option<i32>, String) {
     replayed_at(place, "127.0.0.1:0", runs)
 }
 
-fn replayed_at(place: &Place, address: &str, args: &[&str]) -> (Option<i32>, String) {
+fn replayed_at(place: &TestFolder, address: &str, args: &[&str]) -> (Option<i32>, String) {
     let args = [&["replay", "--listen", address], args].concat();
     let mut replay = ChildProcess::start(&mut place.command(&args)).expect("the command starts");
     replay.wait_for_line("ws://");
@@ -19,7 +19,7 @@ fn replayed_at(place: &Place, address: &str, args: &[&str]) -> (Option<i32>, Str
 
 #[test]
 fn runs_are_named_in_every_way_and_damage_is_told() {
-    let place = Place::new();
+    let place = TestFolder::new();
     let path = place.acquire("flat", &["--seed", "1"]);
     place.ok(&["ingest"]);
     let run = place.sql("select run_id from runs")[0]["run_id"].as_str().expect("a name").to_owned();

@@ -1,4 +1,4 @@
-//! `echolake serve` as its clients see it: answers, refusals, queries that end with who asked, and its own end.
+//! `echolake serve` as its clients see it: answers, refusals, queries that end with their client, and its own end.
 
 mod attacks;
 pub(crate) mod catalogue;
@@ -16,53 +16,53 @@ use std::time::{Duration, Instant};
 
 use serde_json::Value;
 
-use super::{Place, PlaceTemplate};
-use http::{Answer, Request};
-use server::Served;
+use super::{TestFolder, TestFolderTemplate};
+use http::{HttpRequest, HttpResponse};
+use server::ServedLake;
 
-/// Runs for hours where nothing ends it.
+/// Runs for hours unless it is ended.
 const ENDLESS: &str = "select count(*) from generate_series(1, 1000000) a cross join generate_series(1, 1000000) b \
                        where a.value + b.value = 7";
-/// How long to wait for what the server does by itself; a busy machine may take its time.
+/// Time to wait for an action of the server; a busy machine may be slow.
 const EVENT_LIMIT: Duration = Duration::from_secs(60);
 
 /// One run without sweeps.
-fn lake() -> Place {
-    static ONE_RUN: PlaceTemplate = PlaceTemplate::new();
+fn lake() -> TestFolder {
+    static ONE_RUN: TestFolderTemplate = TestFolderTemplate::new();
     ONE_RUN.place(|place| {
         place.acquire("flat", &["--ir-only"]);
         place.ok(&["ingest"]);
     })
 }
 
-pub(crate) fn served(place: &Place, more: &[&str]) -> Served {
-    Served::start(Path::new(super::ECHOLAKE), &place.path(""), more)
+pub(crate) fn served(place: &TestFolder, more: &[&str]) -> ServedLake {
+    ServedLake::start(Path::new(super::ECHOLAKE), &place.path(""), more)
 }
 
-fn sql(server: &Served, query: &str) -> Answer {
-    Request::post("/api/v1/sql", query).with("content-type", "text/plain").send(server)
+fn sql(server: &ServedLake, query: &str) -> HttpResponse {
+    HttpRequest::post("/api/v1/sql", query).with("content-type", "text/plain").send(server)
 }
 
-fn get(server: &Served, path: &str) -> Answer {
-    Request::get(path).send(server)
+fn get(server: &ServedLake, path: &str) -> HttpResponse {
+    HttpRequest::get(path).send(server)
 }
 
-fn json(answer: &Answer) -> Value {
+fn json(answer: &HttpResponse) -> Value {
     serde_json::from_slice(&answer.body).unwrap_or_else(|e| panic!("{e}: {}", String::from_utf8_lossy(&answer.body)))
 }
 
-fn refused(answer: &Answer, status: u16, code: &str) {
+fn refused(answer: &HttpResponse, status: u16, code: &str) {
     let problem = json(answer);
     assert_eq!(answer.header("content-type"), Some("application/problem+json"), "{problem}");
     assert_eq!((answer.status, problem["code"].as_str()), (status, Some(code)), "{problem}");
     assert_eq!(problem["status"], status);
 }
 
-fn running(server: &Served) -> f64 {
+fn running(server: &ServedLake) -> f64 {
     running_of(&get(server, "/metrics"))
 }
 
-fn running_of(metrics: &Answer) -> f64 {
+fn running_of(metrics: &HttpResponse) -> f64 {
     let text = metrics.text();
     let line = text.lines().find_map(|l| l.strip_prefix("echolake_running_queries ")).expect("a figure");
     line.parse().expect("a number")
@@ -85,17 +85,18 @@ fn answers_in_every_format() {
     assert_eq!((answer.status, answer.header("content-type")), (200, Some("application/json")));
     assert_eq!(answer.text().trim(), r#"[{"pair_id":0,"direct_mm":120.0},{"pair_id":1,"direct_mm":240.0}]"#);
     assert_eq!(answer.header("x-content-type-options"), Some("nosniff"));
-    let csv = Request::post("/api/v1/sql?format=csv", query).with("content-type", "application/sql").send(&server);
+    let csv = HttpRequest::post("/api/v1/sql?format=csv", query).with("content-type", "application/sql").send(&server);
     assert_eq!(csv.text(), "pair_id,direct_mm\n0,120.0\n1,240.0\n");
     let body = serde_json::json!({ "query": query, "format": "csv" }).to_string();
-    let wrapped = Request::post("/api/v1/sql", &body).with("content-type", "application/json").send(&server);
+    let wrapped = HttpRequest::post("/api/v1/sql", &body).with("content-type", "application/json").send(&server);
     assert_eq!(wrapped.text(), csv.text());
-    let arrow = Request::post("/api/v1/sql", query)
+    let arrow = HttpRequest::post("/api/v1/sql", query)
         .with("content-type", "text/plain")
         .with("accept", "application/vnd.apache.arrow.stream")
         .send(&server);
     assert_eq!(&arrow.body[..4], [0xff; 4], "a stream's first message");
-    let parquet = Request::post("/api/v1/sql?format=parquet", query).with("content-type", "text/plain").send(&server);
+    let parquet =
+        HttpRequest::post("/api/v1/sql?format=parquet", query).with("content-type", "text/plain").send(&server);
     assert!(parquet.body.starts_with(b"PAR1") && parquet.body.ends_with(b"PAR1"));
     let tables = json(&get(&server, "/api/v1/tables"));
     let pairs = tables.as_array().expect("a list").iter().find(|t| t["name"] == "pairs").expect("pairs");
@@ -114,9 +115,9 @@ fn what_is_wrong_has_a_code() {
     refused(&sql(&server, "select 1/(value - 1) from generate_series(1, 2)"), 422, "query_failed");
     let long = "-".repeat(3 << 20);
     refused(&sql(&server, &long), 413, "request_too_large");
-    let unknown_length = Request::post("/api/v1/sql", &long).with("content-type", "application/sql").chunked();
+    let unknown_length = HttpRequest::post("/api/v1/sql", &long).with("content-type", "application/sql").chunked();
     refused(&unknown_length.send(&server), 413, "request_too_large");
-    let post = |body: &str| Request::post("/api/v1/sql", body);
+    let post = |body: &str| HttpRequest::post("/api/v1/sql", body);
     refused(&post("select 1").send(&server), 400, "request_invalid");
     refused(
         &post("select 1").with("content-type", "text/plain").with("accept", "text/html").send(&server),
@@ -125,13 +126,13 @@ fn what_is_wrong_has_a_code() {
     );
     refused(&post("{\"sql\": 1}").with("content-type", "application/json").send(&server), 400, "request_invalid");
     refused(
-        &Request::post("/api/v1/sql?format=xlsx", "select 1").with("content-type", "text/plain").send(&server),
+        &HttpRequest::post("/api/v1/sql?format=xlsx", "select 1").with("content-type", "text/plain").send(&server),
         400,
         "request_invalid",
     );
     refused(&get(&server, "/api/v1/sql"), 405, "method_not_allowed");
     refused(&get(&server, "/api/v1/nothing"), 404, "not_found");
-    // A page of elsewhere, and a name that points here.
+    // A page of another origin, and a name that points here.
     for (name, value) in [("origin", "http://evil.example"), ("origin", "null"), ("sec-fetch-site", "cross-site")] {
         refused(
             &post("select 1").with("content-type", "text/plain").with(name, value).send(&server),
@@ -139,8 +140,8 @@ fn what_is_wrong_has_a_code() {
             "foreign_origin",
         );
     }
-    refused(&Request::get("/api/v1/tables").host("evil.example").send(&server), 403, "foreign_origin");
-    refused(&Request::get("/health").host("evil.example").send(&server), 403, "foreign_origin");
+    refused(&HttpRequest::get("/api/v1/tables").host("evil.example").send(&server), 403, "foreign_origin");
+    refused(&HttpRequest::get("/health").host("evil.example").send(&server), 403, "foreign_origin");
 }
 
 #[test]
@@ -157,7 +158,7 @@ fn tokens_let_in_and_are_needed_beyond_this_machine() {
     std::fs::write(place.path("tokens.toml"), &lines).expect("written");
     let server = served(&place, &["--tokens", "tokens.toml"]);
     let ask = |header: Option<String>| {
-        let request = Request::post("/api/v1/sql", "select 1 as one").with("content-type", "text/plain");
+        let request = HttpRequest::post("/api/v1/sql", "select 1 as one").with("content-type", "text/plain");
         header.into_iter().fold(request, |request, value| request.with("authorization", &value)).send(&server)
     };
     assert_eq!(ask(Some(format!("Bearer {token}"))).text().trim(), r#"[{"one":1}]"#);
@@ -165,11 +166,11 @@ fn tokens_let_in_and_are_needed_beyond_this_machine() {
         let answer = ask(wrong);
         assert_eq!((answer.status, answer.header("www-authenticate").is_some()), (401, true));
     }
-    let metrics = Request::get("/metrics").with("authorization", &format!("Bearer {token}")).send(&server);
+    let metrics = HttpRequest::get("/metrics").with("authorization", &format!("Bearer {token}")).send(&server);
     assert_eq!(metrics.status, 403, "{}", metrics.text());
-    let mut postgres = postgres::Client::connect(&server, None);
+    let mut postgres = postgres::WireClient::connect(&server, None);
     assert_eq!(postgres.log_in("nonsense").as_deref(), Some("28P01"));
-    let mut postgres = postgres::Client::connect(&server, None);
+    let mut postgres = postgres::WireClient::connect(&server, None);
     assert_eq!(postgres.log_in(&token), None);
     assert_eq!(postgres.query("select 1 as one"), Ok(vec![vec![Some("1".to_owned())]]));
 }
@@ -178,16 +179,16 @@ fn tokens_let_in_and_are_needed_beyond_this_machine() {
 fn a_query_ends_with_its_client() {
     let place = lake();
     let server = served(&place, &[]);
-    let asked = Request::post("/api/v1/sql", ENDLESS).with("content-type", "text/plain").begin(&server);
+    let asked = HttpRequest::post("/api/v1/sql", ENDLESS).with("content-type", "text/plain").begin(&server);
     wait_until("it runs", || running(&server) == 1.0);
     drop(asked);
     wait_until("it ends with its connection", || running(&server) == 0.0);
-    let mut client = postgres::Client::connect(&server, None);
+    let mut client = postgres::WireClient::connect(&server, None);
     client.begin(ENDLESS);
     wait_until("it runs", || running(&server) == 1.0);
     drop(client);
     wait_until("it ends with its connection", || running(&server) == 0.0);
-    let mut client = postgres::Client::connect(&server, None);
+    let mut client = postgres::WireClient::connect(&server, None);
     client.begin(ENDLESS);
     wait_until("it runs", || running(&server) == 1.0);
     client.cancel(&server);
@@ -212,7 +213,7 @@ fn a_short_answer_does_not_look_whole() {
 fn postgres_answers_and_refuses() {
     let place = lake();
     let server = served(&place, &[]);
-    let mut client = postgres::Client::connect(&server, None);
+    let mut client = postgres::WireClient::connect(&server, None);
     let one = |text: &str| Ok(vec![vec![Some(text.to_owned())]]);
     assert_eq!(client.query("select count(*) from measurements"), one("45"));
     assert_eq!(client.query("select [1.5, 2.5]::float[]"), one("{1.5,2.5}"));
@@ -241,7 +242,7 @@ fn postgres_answers_and_refuses() {
     assert_eq!(client.query("rollback; select 3 as three"), one("3"));
     // What breaks the protocol breaks its own connection only.
     client.send_raw(b"Q\xff\xff\xff\xff");
-    let mut other = postgres::Client::connect(&server, None);
+    let mut other = postgres::WireClient::connect(&server, None);
     assert_eq!(other.query("select 4 as four"), one("4"));
 }
 
@@ -250,8 +251,8 @@ fn postgres_answers_and_refuses() {
 fn postgres_knows_keys_and_types_by_its_own_names() {
     let place = lake();
     let server = served(&place, &[]);
-    let mut client = postgres::Client::connect(&server, None);
-    let rows = |rows: &[&[&str]]| -> postgres::Rows {
+    let mut client = postgres::WireClient::connect(&server, None);
+    let rows = |rows: &[&[&str]]| -> postgres::TextRows {
         Ok(rows.iter().map(|row| row.iter().map(|value| Some((*value).to_owned())).collect()).collect())
     };
     let keys = "select unnest(indkey) as number, generate_subscripts(indkey, 1) as place from pg_index";
@@ -277,8 +278,8 @@ fn postgres_knows_keys_and_types_by_its_own_names() {
 fn flight_sql_has_so_many_places() {
     let place = lake();
     let server = served(&place, &[]);
-    let connect = || Served::connect(&server.flight_sql);
-    // Who has a place is greeted at once, by the head of a frame of HTTP/2.
+    let connect = || ServedLake::connect(&server.flight_sql);
+    // A client that has a place is greeted at once, by the head of a frame of HTTP/2.
     let greeted = |stream: &mut TcpStream, patience: Duration| {
         stream.set_read_timeout(Some(patience)).expect("a limit of time");
         stream.read_exact(&mut [0; 9]).is_ok()
@@ -297,7 +298,7 @@ fn flight_sql_has_so_many_places() {
 fn it_stops_when_told() {
     let place = lake();
     let mut server = served(&place, &[]);
-    let mut idle = postgres::Client::connect(&server, None);
+    let mut idle = postgres::WireClient::connect(&server, None);
     assert!(idle.query("select 1").is_ok());
     assert_eq!(server.terminate(), Some(0));
 }
@@ -306,13 +307,13 @@ mod slow {
     use std::path::Path;
 
     use crate::ECHOLAKE;
-    use crate::fuzz::{Campaign, Target};
+    use crate::fuzz::{FuzzCampaign, FuzzTarget};
 
     // Long form: campaign `fuzz`.
     #[test]
     fn changed_input_harms_nothing() {
-        for target in Target::ALL {
-            let mut campaign = Campaign::new(Path::new(ECHOLAKE), 1);
+        for target in FuzzTarget::ALL {
+            let mut campaign = FuzzCampaign::new(Path::new(ECHOLAKE), 1);
             let outcome = campaign.throw(target, &mut |so_far| so_far.rounds < 100);
             assert!(outcome.answered > 0, "{}: some are right all the same", target.name());
         }

@@ -1,15 +1,15 @@
-//! Ctrl-C and SIGTERM at the first moment that somebody could send them: when a command has just announced itself. The
-//! parent ignores Ctrl-C, as shells do for background jobs and some build services for all they start.
+//! Ctrl-C and SIGTERM at the first moment at which a user could send them: when a command has just announced itself.
+//! The parent ignores Ctrl-C, as shells do for background jobs and some build services for all they start.
 
 use std::process::Command;
 
 use super::child::ChildProcess;
-use super::{ECHOLAKE, Place, stderr};
+use super::{ECHOLAKE, TestFolder, stderr};
 
 const SIGNALS: [&str; 2] = ["INT", "TERM"];
 
 /// Starts the command by a shell that ignores Ctrl-C, and waits for a line of it.
-fn start_ignoring_interrupts(place: &Place, args: &[&str], line: &str) -> ChildProcess {
+fn start_ignoring_interrupts(place: &TestFolder, args: &[&str], line: &str) -> ChildProcess {
     let mut command = Command::new("sh");
     command.args(["-c", "trap '' INT; exec \"$0\" \"$@\"", ECHOLAKE, "--lake", "lake"]).args(args);
     command.current_dir(place.path("")).env_remove("ECHOLAKE_LAKE");
@@ -19,7 +19,7 @@ fn start_ignoring_interrupts(place: &Place, args: &[&str], line: &str) -> ChildP
 }
 
 /// Signals the command behind that line; it must end with this code, and say this.
-fn check(place: &Place, args: &[&str], line: &str, code: i32, expected: &str) {
+fn check(place: &TestFolder, args: &[&str], line: &str, code: i32, expected: &str) {
     for signal in SIGNALS {
         let mut child = start_ignoring_interrupts(place, args, line);
         child.signal(signal);
@@ -32,7 +32,7 @@ fn check(place: &Place, args: &[&str], line: &str, code: i32, expected: &str) {
 
 #[test]
 fn whoever_announces_itself_can_be_stopped() {
-    let place = Place::new();
+    let place = TestFolder::new();
     place.acquire("flat", &["--ir-only"]);
     place.ok(&["ingest"]);
     let any = "127.0.0.1:0";
@@ -49,13 +49,13 @@ fn whoever_announces_itself_can_be_stopped() {
 
 #[test]
 fn the_demo_can_be_stopped_while_it_serves() {
-    let place = Place::new();
+    let place = TestFolder::new();
     check(&place, &["demo", "--surfaces", "2", "--ir-only", "--rig", "rig.toml"], "http://", 0, "clean place");
 }
 
 #[test]
 fn a_second_signal_ends_at_once() {
-    let place = Place::new();
+    let place = TestFolder::new();
     // A take an hour: the current pair does not end.
     let acquire = ["acquire", "--surface", "flat", "--rig", "rig.toml", "--pace", "3600"];
     for (signal, code) in SIGNALS.into_iter().zip([130, 143]) {

@@ -1,10 +1,10 @@
 //! Responses out as SOFA and back: what the format holds is the same to the bit.
 
-use super::Place;
+use super::TestFolder;
 
 #[test]
 fn sofa_out_and_in_again() {
-    let (place, other) = (Place::new(), Place::new());
+    let (place, other) = (TestFolder::new(), TestFolder::new());
     for (surface, panel, seed) in [("flat", "flat", "1"), ("foam", "foam", "2"), ("0015_0", "wavy", "3")] {
         place.acquire(surface, &["--seed", seed, "--panel", panel, "--ir-only"]);
     }
@@ -28,7 +28,7 @@ fn sofa_out_and_in_again() {
     assert_eq!(other.sql("select distinct origin from runs")[0]["origin"], "imported_sofa");
 
     // Two files of a surface are refused before there is a lake.
-    let third = Place::new();
+    let third = TestFolder::new();
     for copy in ["a.sofa", "b.sofa"] {
         std::fs::copy(other.path("out/flat.sofa"), third.path(copy)).expect("copied");
     }

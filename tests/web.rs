@@ -1,8 +1,8 @@
 //! The catalogue in a browser, and its contract under Schemathesis, against the command itself.
 //!
-//! What these need beside cargo is installed where that is possible: packages of npm in `web/node_modules`, of PyPI in
-//! the target folder, Chromium by apt-get where the test runs as root. Where it is not, a test is skipped and says so;
-//! with `ECHOLAKE_NO_SKIP` set it fails instead.
+//! Their tools are installed if that is possible: packages of npm in `web/node_modules`, of PyPI in the target folder,
+//! Chromium by apt-get if the test runs as root. If it is not, a test is skipped and says so; with `ECHOLAKE_NO_SKIP`
+//! set it fails instead.
 
 use std::env;
 use std::fs;
@@ -11,7 +11,7 @@ use std::process::Command;
 
 use super::child::{ChildProcess, run_long_command};
 use super::serve::{catalogue::lake, served};
-use super::{Place, stderr};
+use super::{TestFolder, stderr};
 
 const NO_SKIP: &str = "ECHOLAKE_NO_SKIP";
 const SCHEMATHESIS: &str = "schemathesis==4.32.5";
@@ -20,14 +20,14 @@ fn web() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("web")
 }
 
-/// Runs a program to its end; what it said where it failed.
+/// Runs a program to its end; returns its output, as an error if it failed.
 fn run(command: &mut Command) -> Result<String, String> {
     let output = run_long_command(command).map_err(|e| format!("{command:?}: {e}"))?;
     let said = [output.stdout, output.stderr].map(|bytes| String::from_utf8_lossy(&bytes).into_owned()).concat();
     if output.status.success() { Ok(said) } else { Err(format!("{command:?}: {}\n{said}", output.status)) }
 }
 
-/// What could be made ready; None, said aloud, where it could not.
+/// Returns the prerequisite of a test; None, with a message, if it is missing.
 fn or_skip<T>(test: &str, ready: Result<T, String>) -> Option<T> {
     match ready {
         Ok(ready) => Some(ready),
@@ -66,8 +66,8 @@ fn schemathesis() -> Result<PathBuf, String> {
 }
 
 /// A lake of the paper's rig: the demo's, without sweeps.
-fn demo() -> Place {
-    let place = Place::new();
+fn demo() -> TestFolder {
+    let place = TestFolder::new();
     let output = run_long_command(&mut place.command(&["demo", "--ir-only", "--no-serve"])).expect("it starts");
     assert!(output.status.success(), "{}", stderr(&output));
     place

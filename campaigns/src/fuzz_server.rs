@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 
 use anyhow::Result;
 
-use super::fuzz::{Campaign, Target};
+use super::fuzz::{FuzzCampaign, FuzzTarget};
 
 /// Between two lines about how far it is.
 const TELL_EVERY: Duration = Duration::from_secs(30);
@@ -15,7 +15,7 @@ const TELL_EVERY: Duration = Duration::from_secs(30);
 pub(crate) struct FuzzArgs {
     /// Kind of input that is changed: sql, wire or mcap.
     #[arg(value_parser = parse_target)]
-    target: Target,
+    target: FuzzTarget,
     /// Duration in seconds.
     #[arg(default_value_t = 60)]
     seconds: u64,
@@ -24,8 +24,8 @@ pub(crate) struct FuzzArgs {
     seed: u64,
 }
 
-fn parse_target(name: &str) -> Result<Target, String> {
-    let known = Target::ALL.into_iter().find(|target| target.name() == name);
+fn parse_target(name: &str) -> Result<FuzzTarget, String> {
+    let known = FuzzTarget::ALL.into_iter().find(|target| target.name() == name);
     known.ok_or_else(|| "hint: sql, wire or mcap".to_owned())
 }
 
@@ -33,7 +33,7 @@ pub(crate) fn run(args: &FuzzArgs) -> Result<()> {
     let FuzzArgs { target, seconds, seed } = *args;
     let binary = super::echolake_path()?;
     let (begun, mut told) = (Instant::now(), Instant::now());
-    let outcome = Campaign::new(&binary, seed).throw(target, &mut |so_far| {
+    let outcome = FuzzCampaign::new(&binary, seed).throw(target, &mut |so_far| {
         if told.elapsed() > TELL_EVERY {
             told = Instant::now();
             // Progress is not worth an error.

@@ -5,7 +5,7 @@ use std::io::Write as _;
 
 use anyhow::{Context as _, Result};
 
-use super::acquire_kills::Campaign;
+use super::acquire_kills::AcquireKillCampaign;
 
 #[derive(Debug, clap::Args)]
 pub(crate) struct KillAcquireArgs {
@@ -32,8 +32,8 @@ pub(crate) fn run(args: &KillAcquireArgs) -> Result<()> {
     let KillAcquireArgs { kills, seed, part } = *args;
     let binary = super::echolake_path()?;
     let campaign = match part {
-        KilledPart::Power => Campaign::with_power_cuts(&binary, seed),
-        KilledPart::Process => Some(Campaign::new(&binary, seed)),
+        KilledPart::Power => AcquireKillCampaign::with_power_cuts(&binary, seed),
+        KilledPart::Process => Some(AcquireKillCampaign::new(&binary, seed)),
     };
     let mut campaign = campaign.context("no file system can be mounted here")?;
     let outcome = campaign.kills(kills, &mut |so_far| {

@@ -4,7 +4,7 @@ use std::io::Write as _;
 
 use anyhow::Result;
 
-use super::kills::{Campaign, Outcome};
+use super::kills::{KillCampaign, KillCounts};
 
 /// Runs of the lake that two processes ingest at once.
 const SHARED_RUNS: usize = 40;
@@ -33,15 +33,15 @@ enum Disturbance {
 pub(crate) fn run(args: &KillIngestArgs) -> Result<()> {
     let KillIngestArgs { rounds, seed, disturbance } = *args;
     let binary = super::echolake_path()?;
-    let mut tell = |round: usize, so_far: &Outcome| {
+    let mut tell = |round: usize, so_far: &KillCounts| {
         if round.is_multiple_of(10) {
             // Progress is not worth an error.
             let _ = writeln!(std::io::stderr(), "{round} of {rounds} rounds, {} killed", so_far.killed);
         }
     };
     let outcome = match disturbance {
-        Disturbance::Kills => Campaign::new(&binary, seed).rounds(rounds, &mut tell),
-        Disturbance::Halves => Campaign::of(&binary, seed, SHARED_RUNS).halves(rounds, &mut tell),
+        Disturbance::Kills => KillCampaign::new(&binary, seed).rounds(rounds, &mut tell),
+        Disturbance::Halves => KillCampaign::of(&binary, seed, SHARED_RUNS).halves(rounds, &mut tell),
     };
     writeln!(
         std::io::stdout(),

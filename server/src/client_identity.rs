@@ -1,23 +1,23 @@
-//! Who asks: what the door found out about a client, and an engine is told.
+//! The identity of a client: the door determines it and passes it to the client's engine.
 
 use std::time::Duration;
 
 use echolake_query::Quota;
 use serde::{Deserialize, Serialize};
 
-use crate::fault::Fault;
-use crate::tokens::Scope;
+use crate::fault::RequestFault;
+use crate::tokens::TokenScope;
 
-/// Name of the client that stands for the server's own pages, where there are no tokens.
+/// Name of the client for requests of the server's own pages, if there are no tokens.
 const PAGES: &str = "pages";
-/// Name of the client that stands for all pages of elsewhere.
+/// Name of the client for requests of pages from other origins.
 const FOREIGN: &str = "foreign pages";
 
-/// Name of the client that stands for all programs of this machine that ask over HTTP or Flight SQL.
+/// Name of the client for all programs of this machine that send requests over HTTP or Flight SQL.
 const PROGRAMS: &str = "programs";
 
-/// Returns how much of a limit of memory operators may count, who say that they hold less than they do: queries that are
-/// refused more memory end alone, not their engine.
+/// Returns the part of a memory limit that operators may account for. They report less than they hold; with this
+/// margin, a query that is refused more memory fails alone and does not end its engine.
 pub(crate) fn counted_bytes(memory: usize) -> usize {
     memory / 8 * 7
 }
@@ -27,9 +27,9 @@ pub(crate) fn counted_bytes(memory: usize) -> usize {
 pub(crate) struct ClientIdentity {
     /// Name for logs and refusals; each has an engine of its own.
     pub(crate) name: String,
-    /// Whether the server has no tokens, so that requests of foreign pages must be told from others.
+    /// True if the server has no tokens, so that requests of foreign pages must be distinguished from others.
     pub(crate) is_open: bool,
-    pub(crate) scopes: Vec<Scope>,
+    pub(crate) scopes: Vec<TokenScope>,
     /// Limits, as [`Quota`] has them.
     pub(crate) seconds: Option<u64>,
     pub(crate) memory_bytes: Option<usize>,
@@ -40,7 +40,7 @@ pub(crate) struct ClientIdentity {
 impl ClientIdentity {
     /// A client of a server without tokens.
     pub(crate) fn local(name: impl Into<String>) -> Self {
-        let scopes = vec![Scope::Sql, Scope::Files, Scope::Metrics];
+        let scopes = vec![TokenScope::Sql, TokenScope::Files, TokenScope::Metrics];
         let (seconds, memory_bytes, rows, concurrent) = (None, None, None, None);
         Self { name: name.into(), is_open: true, scopes, seconds, memory_bytes, rows, concurrent }
     }
@@ -60,7 +60,7 @@ impl ClientIdentity {
         Self::local(format!("user {name}"))
     }
 
-    /// Pages of elsewhere.
+    /// Pages of other origins.
     pub(crate) fn foreign() -> Self {
         Self::local(FOREIGN)
     }
@@ -78,11 +78,11 @@ impl ClientIdentity {
     /// Checks that the client may do this.
     ///
     /// # Errors
-    /// [`Fault::Forbidden`].
-    pub(crate) fn require(&self, scope: Scope) -> Result<(), Fault> {
+    /// [`RequestFault::Forbidden`].
+    pub(crate) fn require(&self, scope: TokenScope) -> Result<(), RequestFault> {
         match self.scopes.contains(&scope) {
             true => Ok(()),
-            false => Err(Fault::Forbidden { name: self.name.clone(), scope }),
+            false => Err(RequestFault::Forbidden { name: self.name.clone(), scope }),
         }
     }
 }

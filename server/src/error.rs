@@ -1,16 +1,16 @@
-//! Why a server cannot start or go on. What a request fails with is a [`crate::fault::Fault`].
+//! Errors that keep a server from starting or running. A failed request has a [`crate::fault::RequestFault`].
 
 use std::io;
 use std::net::SocketAddr;
 use std::path::PathBuf;
 
-/// Why a server cannot start or go on.
+/// An error that keeps a server from starting or running.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
     /// The address is not to be had.
     #[error("cannot listen on {address}; hint: another port, or 0 for any that is free")]
     Bind {
-        /// Where.
+        /// The requested address.
         address: SocketAddr,
         /// The system's refusal.
         source: io::Error,
@@ -21,7 +21,7 @@ pub enum Error {
          hint: --tokens FILE, which `echolake token NAME` helps to write, or an address of 127.0.0.1"
     )]
     Open {
-        /// Where it would listen.
+        /// The requested address.
         address: SocketAddr,
     },
     /// A file of tokens cannot be read.
@@ -29,7 +29,7 @@ pub enum Error {
     ReadTokens {
         /// The file.
         path: PathBuf,
-        /// Why not.
+        /// The cause.
         source: io::Error,
     },
     /// A file of tokens is not right.
@@ -37,7 +37,7 @@ pub enum Error {
     Tokens {
         /// The file.
         path: PathBuf,
-        /// What is wrong in it.
+        /// The defect in the file.
         message: String,
     },
     /// The system gives no random bytes.
@@ -46,18 +46,18 @@ pub enum Error {
     /// There is no folder for temporary files.
     #[error("cannot make a folder for temporary files in `{}`; hint: --temp DIR", path.display())]
     Temp {
-        /// Where.
+        /// The parent folder.
         path: PathBuf,
-        /// Why not.
+        /// The cause.
         source: io::Error,
     },
     /// The system gives no threads or tasks to compute on, or takes a listener back.
     #[error("the server cannot go on")]
     System(#[source] io::Error),
-    /// gRPC cannot go on.
+    /// The gRPC server failed.
     #[error("Flight SQL cannot go on")]
     Transport(#[source] Box<dyn std::error::Error + Send + Sync>),
-    /// What Postgres' clients ask about cannot be made.
+    /// The `pg_catalog` tables for Postgres clients cannot be built.
     #[error("the tables of `pg_catalog` cannot be made")]
     Catalog(#[from] datafusion::error::DataFusionError),
     /// The engine cannot be set up.

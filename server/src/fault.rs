@@ -1,45 +1,45 @@
-//! Why a request has no answer, with a code that stays the same over versions and protocols. Each protocol says it in
-//! its own words in one place: `http/problem.rs`, `flight/status.rs`, `postgres/sqlstate.rs`.
+//! Failures of requests, each with a code that is stable over versions and protocols. Each protocol encodes them in one
+//! place: `http/problem.rs`, `flight/status.rs`, `postgres/sqlstate.rs`.
 
 use std::time::Duration;
 
 use echolake_export::Error as SliceError;
 use echolake_query::Error as QueryError;
 
-use crate::tokens::Scope;
+use crate::tokens::TokenScope;
 
-/// Why a request has no answer.
+/// The failure of a request.
 #[derive(Debug, thiserror::Error)]
-pub(crate) enum Fault {
+pub(crate) enum RequestFault {
     /// The query, or its run.
     #[error(transparent)]
     Query(#[from] QueryError),
     /// The request is not one that this server understands.
     #[error("{message}")]
     Request {
-        /// What is wrong with it, and what would be right.
+        /// The defect of the request, and the expected form.
         message: String,
     },
-    /// It is understood, and is no part of what this server does.
+    /// The request is understood, but not supported by this server.
     #[error("{what} is not supported here")]
     Unsupported {
-        /// What was asked for.
+        /// The requested feature.
         what: String,
     },
-    /// It asks for something that is not there, or not any more.
+    /// The requested item does not exist, or not any more.
     #[error("{what} is not there; hint: {hint}")]
     NotFound {
-        /// What was asked for.
+        /// The requested item.
         what: String,
-        /// What to do.
+        /// A remedy for the client.
         hint: &'static str,
     },
-    /// It was there, and is no more.
+    /// The requested item existed, and was removed.
     #[error("{what} is no longer there; hint: {hint}")]
     Gone {
-        /// What was asked for.
+        /// The requested item.
         what: &'static str,
-        /// What to do.
+        /// A remedy for the client.
         hint: &'static str,
     },
     /// A slice cannot be cut.
@@ -48,7 +48,7 @@ pub(crate) enum Fault {
     /// A slice of more measurements than are cut at once.
     #[error("a slice has {limit} measurements at most; hint: ask for fewer runs at a time")]
     SliceTooLarge {
-        /// How many are.
+        /// Maximal number of measurements.
         limit: usize,
     },
     /// There is no room on the server's disk for a slice that is asked for by ranges.
@@ -60,32 +60,32 @@ pub(crate) enum Fault {
         /// Bytes that are kept.
         limit: u64,
     },
-    /// What is asked about is there, and has no such data.
+    /// The requested item exists, but has no such data.
     #[error("{what} has no {data}; hint: {hint}")]
     NoData {
-        /// What was asked about.
+        /// The requested item.
         what: String,
-        /// What it lacks.
+        /// The missing data.
         data: &'static str,
-        /// What to do.
+        /// A remedy for the client.
         hint: &'static str,
     },
-    /// The lake's store does not give a file. Why not stands in the server's log.
+    /// The lake's store does not give a file. The cause is in the server's log.
     #[error("the lake's store does not give the file; hint: ask again")]
     Unreadable,
-    /// The path is there, for other methods.
+    /// The path exists for other methods.
     #[error("this path is not for this method; hint: the header `Allow` lists those it is for")]
     Method,
     /// A part of a file that it does not have.
     #[error("the file has {bytes} bytes; hint: ask for a range within them")]
     Range {
-        /// How many there are.
+        /// Length of the file.
         bytes: u64,
     },
     /// The request is larger than is read.
     #[error("the request is larger than {limit} bytes")]
     TooLarge {
-        /// What is read.
+        /// Maximal size in bytes.
         limit: usize,
     },
     /// No token, or a wrong one.
@@ -96,18 +96,18 @@ pub(crate) enum Fault {
     Forbidden {
         /// The token's name.
         name: String,
-        /// What it is not for.
-        scope: Scope,
+        /// The missing scope.
+        scope: TokenScope,
     },
-    /// A web page elsewhere, or a name that is not this machine's, stands behind the request.
+    /// The request comes from a web page of another origin, or names a host that is not this machine.
     #[error("{what} `{found}` is not this server's; hint: without tokens only http://localhost is answered")]
     Foreign {
-        /// Which header.
+        /// Part of the request: host, address, origin or fetch site.
         what: &'static str,
-        /// What it says.
+        /// Its value.
         found: String,
     },
-    /// Somebody ended the query.
+    /// The query was cancelled.
     #[error("the query was cancelled")]
     Cancelled,
     /// The session's own limit of time.
@@ -124,20 +124,20 @@ pub(crate) enum Fault {
         /// The limit.
         limit: usize,
     },
-    /// The process that ran the query ended, and not by its own decision alone: every other client's goes on.
+    /// The engine process that ran the query ended. Queries of other clients continue.
     #[error("the query ended the engine that ran it: {reason}; hint: ask for less at a time, or for fewer rows")]
     EngineEnded {
-        /// What ended it.
+        /// The cause of its end.
         reason: String,
     },
-    /// A defect. What it was stands in the server's log.
+    /// A defect. Its cause is in the server's log.
     #[error("the server failed; the query is ended, the server goes on")]
     Internal,
 }
 
-/// What a client's code can tell failures apart by; never renamed.
+/// Codes by which a client's program distinguishes failures; never renamed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Code {
+pub(crate) enum FaultCode {
     Query,
     ReadOnly,
     Execution,
@@ -164,7 +164,7 @@ pub(crate) enum Code {
     Internal,
 }
 
-impl Code {
+impl FaultCode {
     /// All of them.
     pub(crate) const ALL: [Self; 24] = [
         Self::Query,
@@ -224,7 +224,7 @@ impl Code {
     }
 }
 
-impl Fault {
+impl RequestFault {
     /// A request that is not understood.
     pub(crate) fn request(message: impl Into<String>) -> Self {
         Self::Request { message: message.into() }
@@ -236,54 +236,54 @@ impl Fault {
     }
 
     /// Its code.
-    pub(crate) fn code(&self) -> Code {
+    pub(crate) fn code(&self) -> FaultCode {
         match self {
             Self::Query(error) => query_code(error),
-            Self::Request { .. } => Code::Request,
-            Self::Unsupported { .. } => Code::Unsupported,
-            Self::NotFound { .. } => Code::NotFound,
-            Self::Gone { .. } => Code::Gone,
+            Self::Request { .. } => FaultCode::Request,
+            Self::Unsupported { .. } => FaultCode::Unsupported,
+            Self::NotFound { .. } => FaultCode::NotFound,
+            Self::Gone { .. } => FaultCode::Gone,
             Self::Slice(error) => slice_code(error),
-            Self::SliceTooLarge { .. } => Code::TooLarge,
-            Self::NoRoom { .. } => Code::MemoryLimit,
-            Self::NoData { .. } => Code::NoData,
-            Self::Unreadable => Code::Lake,
-            Self::Method => Code::Method,
-            Self::Range { .. } => Code::Range,
-            Self::TooLarge { .. } => Code::TooLarge,
-            Self::Unauthenticated => Code::Unauthenticated,
-            Self::Forbidden { .. } => Code::Forbidden,
-            Self::Foreign { .. } => Code::Foreign,
-            Self::Cancelled => Code::Cancelled,
-            Self::Timeout { .. } => Code::TimeLimit,
-            Self::TooMany { .. } => Code::TooMany,
-            Self::EngineEnded { .. } => Code::EngineEnded,
-            Self::Internal => Code::Internal,
+            Self::SliceTooLarge { .. } => FaultCode::TooLarge,
+            Self::NoRoom { .. } => FaultCode::MemoryLimit,
+            Self::NoData { .. } => FaultCode::NoData,
+            Self::Unreadable => FaultCode::Lake,
+            Self::Method => FaultCode::Method,
+            Self::Range { .. } => FaultCode::Range,
+            Self::TooLarge { .. } => FaultCode::TooLarge,
+            Self::Unauthenticated => FaultCode::Unauthenticated,
+            Self::Forbidden { .. } => FaultCode::Forbidden,
+            Self::Foreign { .. } => FaultCode::Foreign,
+            Self::Cancelled => FaultCode::Cancelled,
+            Self::Timeout { .. } => FaultCode::TimeLimit,
+            Self::TooMany { .. } => FaultCode::TooMany,
+            Self::EngineEnded { .. } => FaultCode::EngineEnded,
+            Self::Internal => FaultCode::Internal,
         }
     }
 }
 
-fn slice_code(error: &SliceError) -> Code {
+fn slice_code(error: &SliceError) -> FaultCode {
     match error {
-        SliceError::Unknown { .. } => Code::Request,
-        SliceError::Nothing { .. } => Code::NoData,
-        SliceError::Changed { .. } => Code::Changed,
-        SliceError::Uncuttable { .. } => Code::Format,
-        _ => Code::Lake,
+        SliceError::Unknown { .. } => FaultCode::Request,
+        SliceError::Nothing { .. } => FaultCode::NoData,
+        SliceError::Changed { .. } => FaultCode::Changed,
+        SliceError::Uncuttable { .. } => FaultCode::Format,
+        _ => FaultCode::Lake,
     }
 }
 
-fn query_code(error: &QueryError) -> Code {
+fn query_code(error: &QueryError) -> FaultCode {
     match error {
-        QueryError::Query { .. } => Code::Query,
-        QueryError::NotReading { .. } => Code::ReadOnly,
-        QueryError::Execution { .. } => Code::Execution,
-        QueryError::Cancelled => Code::Cancelled,
-        QueryError::TimeLimit { .. } => Code::TimeLimit,
-        QueryError::MemoryLimit { .. } => Code::MemoryLimit,
-        QueryError::RowLimit { .. } => Code::RowLimit,
-        QueryError::Busy { .. } => Code::TooMany,
-        QueryError::Format { .. } => Code::Format,
-        QueryError::Write(_) | QueryError::Lake(_) => Code::Lake,
+        QueryError::Query { .. } => FaultCode::Query,
+        QueryError::NotReading { .. } => FaultCode::ReadOnly,
+        QueryError::Execution { .. } => FaultCode::Execution,
+        QueryError::Cancelled => FaultCode::Cancelled,
+        QueryError::TimeLimit { .. } => FaultCode::TimeLimit,
+        QueryError::MemoryLimit { .. } => FaultCode::MemoryLimit,
+        QueryError::RowLimit { .. } => FaultCode::RowLimit,
+        QueryError::Busy { .. } => FaultCode::TooMany,
+        QueryError::Format { .. } => FaultCode::Format,
+        QueryError::Write(_) | QueryError::Lake(_) => FaultCode::Lake,
     }
 }

@@ -2,9 +2,9 @@
 //! engine process for each client, which parses and runs what it asks.
 //!
 //! ```no_run,standalone_crate
-//! # async fn example(settings: echolake_server::Settings) -> Result<(), Box<dyn std::error::Error>> {
+//! # async fn example(settings: echolake_server::ServerSettings) -> Result<(), Box<dyn std::error::Error>> {
 //! let lake = echolake_lake::Lake::open("lake").await?;
-//! let server = echolake_server::Server::bind(&lake, settings)?;
+//! let server = echolake_server::LakeServer::bind(&lake, settings)?;
 //! for address in server.addresses() {
 //!     eprintln!("{address}");
 //! }
@@ -29,5 +29,5 @@ mod sessions;
 pub mod tokens;
 
 pub use catalogue_pages::CataloguePages;
-pub use door::{EngineSettings, Server, Settings};
+pub use door::{EngineSettings, LakeServer, ServerSettings};
 pub use error::Error;

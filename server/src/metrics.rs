@@ -4,17 +4,17 @@ use std::fmt::Write as _;
 use std::sync::atomic::{AtomicI64, AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
-use crate::fault::Code;
+use crate::fault::FaultCode;
 
-/// How a query came.
+/// The protocol of a query.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Protocol {
+pub(crate) enum ServerProtocol {
     Http,
     FlightSql,
     Postgres,
 }
 
-impl Protocol {
+impl ServerProtocol {
     const ALL: [Self; 3] = [Self::Http, Self::FlightSql, Self::Postgres];
 
     fn name(self) -> &'static str {
@@ -31,9 +31,9 @@ const BUCKETS: [u64; 7] = [3, 10, 30, 100, 300, 1_000, 10_000];
 
 /// Counters since the start.
 #[derive(Default)]
-pub(crate) struct Metrics {
-    queries: [AtomicU64; Protocol::ALL.len()],
-    failures: [AtomicU64; Code::ALL.len()],
+pub(crate) struct ServerMetrics {
+    queries: [AtomicU64; ServerProtocol::ALL.len()],
+    failures: [AtomicU64; FaultCode::ALL.len()],
     rows: AtomicU64,
     running: AtomicI64,
     micros: AtomicU64,
@@ -42,33 +42,33 @@ pub(crate) struct Metrics {
 }
 
 /// A query that runs; dropping it counts its time.
-pub(crate) struct Timed<'a> {
-    metrics: &'a Metrics,
+pub(crate) struct QueryTimer<'a> {
+    metrics: &'a ServerMetrics,
     begun: Instant,
 }
 
-impl Drop for Timed<'_> {
+impl Drop for QueryTimer<'_> {
     fn drop(&mut self) {
         self.metrics.running.fetch_sub(1, Ordering::Relaxed);
         self.metrics.took(self.begun.elapsed());
     }
 }
 
-impl Metrics {
-    /// A query begins.
-    pub(crate) fn begin(&self, protocol: Protocol) -> Timed<'_> {
+impl ServerMetrics {
+    /// Counts a query that begins; its time is measured until the timer is dropped.
+    pub(crate) fn begin(&self, protocol: ServerProtocol) -> QueryTimer<'_> {
         self.queries[protocol as usize].fetch_add(1, Ordering::Relaxed);
         self.running.fetch_add(1, Ordering::Relaxed);
-        Timed { metrics: self, begun: Instant::now() }
+        QueryTimer { metrics: self, begun: Instant::now() }
     }
 
-    /// It gave rows.
+    /// Counts rows of an answer.
     pub(crate) fn rows(&self, rows: usize) {
         self.rows.fetch_add(rows as u64, Ordering::Relaxed);
     }
 
-    /// A request failed.
-    pub(crate) fn failed(&self, code: Code) {
+    /// Counts a failed request.
+    pub(crate) fn failed(&self, code: FaultCode) {
         self.failures[code as usize].fetch_add(1, Ordering::Relaxed);
     }
 
@@ -90,7 +90,7 @@ impl Metrics {
         counters.chain([self.running.load(Ordering::Relaxed).unsigned_abs()]).collect()
     }
 
-    /// Adds what another process has counted between two looks at its counters.
+    /// Adds what another process counted between two readings of its counters.
     pub(crate) fn add(&self, before: &[u64], after: &[u64]) {
         let all = self.queries.iter().chain(&self.failures).chain(&self.buckets);
         let counters = all.chain([&self.rows, &self.micros, &self.finished]);
@@ -106,7 +106,7 @@ impl Metrics {
         self.running.fetch_add(difference(last).cast_signed(), Ordering::Relaxed);
     }
 
-    /// All of it, in text.
+    /// Returns all counters in Prometheus' text format.
     pub(crate) fn text(&self) -> String {
         let mut text = String::new();
         let get = |counter: &AtomicU64| counter.load(Ordering::Relaxed);
@@ -116,11 +116,11 @@ impl Metrics {
                 let _ = writeln!(text, "{name}{suffix} {value}");
             }
         };
-        let by_protocol = Protocol::ALL
+        let by_protocol = ServerProtocol::ALL
             .map(|p| (format!("{{protocol=\"{}\"}}", p.name()), get(&self.queries[p as usize]).to_string()));
         family("echolake_queries_total", "counter", "Queries that were begun.", &by_protocol);
         let by_code =
-            Code::ALL.map(|c| (format!("{{code=\"{}\"}}", c.name()), get(&self.failures[c as usize]).to_string()));
+            FaultCode::ALL.map(|c| (format!("{{code=\"{}\"}}", c.name()), get(&self.failures[c as usize]).to_string()));
         family("echolake_failures_total", "counter", "Requests that failed.", &by_code);
         let plain = |value: String| [(String::new(), value)];
         family("echolake_rows_total", "counter", "Rows of all answers.", &plain(get(&self.rows).to_string()));
@@ -146,10 +146,10 @@ mod tests {
 
     #[test]
     fn what_happened_is_counted() {
-        let metrics = Metrics::default();
-        let timed = metrics.begin(Protocol::Postgres);
+        let metrics = ServerMetrics::default();
+        let timed = metrics.begin(ServerProtocol::Postgres);
         metrics.rows(3);
-        metrics.failed(Code::ReadOnly);
+        metrics.failed(FaultCode::ReadOnly);
         let text = metrics.text();
         for line in [
             "echolake_queries_total{protocol=\"postgres\"} 1",
@@ -168,11 +168,11 @@ mod tests {
 
     #[test]
     fn counters_of_another_process_are_added() {
-        let (engine, all) = (Metrics::default(), Metrics::default());
+        let (engine, all) = (ServerMetrics::default(), ServerMetrics::default());
         let before = engine.counters();
-        let timed = engine.begin(Protocol::FlightSql);
+        let timed = engine.begin(ServerProtocol::FlightSql);
         engine.rows(7);
-        engine.failed(Code::TimeLimit);
+        engine.failed(FaultCode::TimeLimit);
         let running = engine.counters();
         all.add(&before, &running);
         drop(timed);
@@ -182,7 +182,7 @@ mod tests {
 
     #[test]
     fn counters_stand_where_their_code_says() {
-        for (i, code) in Code::ALL.into_iter().enumerate() {
+        for (i, code) in FaultCode::ALL.into_iter().enumerate() {
             assert_eq!(code as usize, i, "{}", code.name());
         }
     }

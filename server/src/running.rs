@@ -9,8 +9,8 @@ use tokio::sync::{mpsc, watch};
 use tokio::task::JoinSet;
 use tokio::time::Instant;
 
-use crate::fault::Fault;
-use crate::service::Service;
+use crate::fault::RequestFault;
+use crate::service::QueryService;
 
 /// Bytes of rows that are encoded at once: what an answer holds in memory is a few of these.
 const PART_BYTES: usize = 4 << 20;
@@ -18,37 +18,37 @@ const PART_BYTES: usize = 4 << 20;
 pub(crate) const WAITING: usize = 2;
 
 /// Makes of rows what a protocol sends.
-pub(crate) trait Encode: Send + 'static {
-    /// What is sent.
+pub(crate) trait AnswerEncoder: Send + 'static {
+    /// The encoded unit that is sent.
     type Item: Send + 'static;
 
     /// Encodes rows.
-    fn batch(&mut self, batch: RecordBatch) -> Result<Vec<Self::Item>, Fault>;
+    fn batch(&mut self, batch: RecordBatch) -> Result<Vec<Self::Item>, RequestFault>;
 
-    /// What comes after the last row.
-    fn end(self) -> Result<Vec<Self::Item>, Fault>;
+    /// Encodes the end of the answer, after the last row.
+    fn end(self) -> Result<Vec<Self::Item>, RequestFault>;
 }
 
 /// Rows as they are.
-pub(crate) struct Batches;
+pub(crate) struct BatchEncoder;
 
-impl Encode for Batches {
+impl AnswerEncoder for BatchEncoder {
     type Item = RecordBatch;
 
-    fn batch(&mut self, batch: RecordBatch) -> Result<Vec<RecordBatch>, Fault> {
+    fn batch(&mut self, batch: RecordBatch) -> Result<Vec<RecordBatch>, RequestFault> {
         Ok(vec![batch])
     }
 
-    fn end(self) -> Result<Vec<RecordBatch>, Fault> {
+    fn end(self) -> Result<Vec<RecordBatch>, RequestFault> {
         Ok(Vec::new())
     }
 }
 
-/// Ends a query from elsewhere.
+/// A signal that stops a query from another task.
 #[derive(Debug, Clone)]
-pub(crate) struct Stop(watch::Sender<bool>);
+pub(crate) struct StopSignal(watch::Sender<bool>);
 
-impl Stop {
+impl StopSignal {
     pub(crate) fn new() -> Self {
         Self(watch::Sender::new(false))
     }
@@ -58,7 +58,7 @@ impl Stop {
         self.0.send_replace(true);
     }
 
-    /// Waits until somebody did.
+    /// Waits until the query is stopped.
     pub(crate) async fn stopped(&self) {
         // The sender lives in `self`, so there is no error to come.
         let _ = self.0.subscribe().wait_for(|stopped| *stopped).await;
@@ -66,36 +66,36 @@ impl Stop {
 }
 
 /// A query that runs. Dropping it ends it.
-pub(crate) struct Running<T> {
+pub(crate) struct RunningQuery<T> {
     /// The columns.
     pub(crate) schema: SchemaRef,
     pub(crate) items: mpsc::Receiver<T>,
-    pub(crate) task: JoinSet<Result<(), Fault>>,
-    pub(crate) stop: Stop,
-    pub(crate) limit: Option<Limit>,
-    pub(crate) service: Service,
+    pub(crate) task: JoinSet<Result<(), RequestFault>>,
+    pub(crate) stop: StopSignal,
+    pub(crate) limit: Option<SessionTimeLimit>,
+    pub(crate) service: QueryService,
 }
 
 /// A session's own limit of time.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct Limit {
+pub(crate) struct SessionTimeLimit {
     time: Duration,
     end: Instant,
 }
 
-impl Limit {
+impl SessionTimeLimit {
     /// This long, from now.
     pub(crate) fn of(time: Duration) -> Self {
         Self { time, end: Instant::now() + time }
     }
 }
 
-impl<T: Send + 'static> Running<T> {
+impl<T: Send + 'static> RunningQuery<T> {
     /// The next part; None after the last.
     ///
     /// # Errors
     /// What ended the query before its end.
-    pub(crate) async fn next(&mut self) -> Result<Option<T>, Fault> {
+    pub(crate) async fn next(&mut self) -> Result<Option<T>, RequestFault> {
         let limit = self.limit;
         tokio::select! {
             biased;
@@ -112,28 +112,28 @@ impl<T: Send + 'static> Running<T> {
     }
 }
 
-/// Waits until somebody ends the query, or its session's time is over.
-pub(crate) async fn ended(stop: &Stop, limit: Option<Limit>) -> Fault {
+/// Waits until the query is stopped or its session's time limit is reached; returns the matching fault.
+pub(crate) async fn ended(stop: &StopSignal, limit: Option<SessionTimeLimit>) -> RequestFault {
     match limit {
         None => {
             stop.stopped().await;
-            Fault::Cancelled
+            RequestFault::Cancelled
         }
         Some(limit) => tokio::select! {
-            () = stop.stopped() => Fault::Cancelled,
-            () = tokio::time::sleep_until(limit.end) => Fault::Timeout { limit: limit.time },
+            () = stop.stopped() => RequestFault::Cancelled,
+            () = tokio::time::sleep_until(limit.end) => RequestFault::Timeout { limit: limit.time },
         },
     }
 }
 
-/// How a task ended that sends nothing more.
-pub(crate) async fn finish(task: &mut JoinSet<Result<(), Fault>>) -> Result<(), Fault> {
+/// Returns the result of a task that sends nothing more.
+pub(crate) async fn finish(task: &mut JoinSet<Result<(), RequestFault>>) -> Result<(), RequestFault> {
     match task.join_next().await {
         None => Ok(()),
         Some(Ok(done)) => done,
         Some(Err(failed)) => {
             eprintln!("a query ended its task: {failed}");
-            Err(Fault::Internal)
+            Err(RequestFault::Internal)
         }
     }
 }

@@ -1,4 +1,4 @@
-//! What the three protocols share: the query engine, whose it is, threads to compute on, and figures.
+//! State shared by the three protocols: the query engine, its client, encoder threads, and metrics.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
@@ -13,57 +13,57 @@ use tokio::task::JoinSet;
 
 use crate::Error;
 use crate::client_identity::ClientIdentity;
-use crate::fault::Fault;
-use crate::metrics::{Metrics, Protocol};
-use crate::running::{Encode, Limit, Running, Stop, WAITING, ended, finish, parts};
-use crate::tokens::Scope;
+use crate::fault::RequestFault;
+use crate::metrics::{ServerMetrics, ServerProtocol};
+use crate::running::{AnswerEncoder, RunningQuery, SessionTimeLimit, StopSignal, WAITING, ended, finish, parts};
+use crate::tokens::TokenScope;
 
-/// How long a plan is good for: it sees the lake as it was.
+/// Maximal age of a plan, which sees the lake as of its planning.
 pub(crate) const FRESH: Duration = Duration::from_secs(2);
 /// The catalogue and schema of the lake's tables, as DataFusion calls them.
 pub(crate) const CATALOG: &str = "datafusion";
 pub(crate) const SCHEMA: &str = "public";
 
-/// What the three protocols share.
+/// State shared by the three protocols.
 #[derive(Clone)]
-pub(crate) struct Service(Arc<Inner>);
+pub(crate) struct QueryService(Arc<ServiceState>);
 
-struct Inner {
+struct ServiceState {
     lake: Lake,
     engine: Engine,
     identity: ClientIdentity,
     client: Arc<Client>,
-    activity: Activity,
-    metrics: Metrics,
+    activity: ActivityCounter,
+    metrics: ServerMetrics,
     // Answers are encoded on threads of their own: connections are answered, and queries cancelled, while all are busy.
     encoders: Threads,
 }
 
-/// What to run.
-pub(crate) enum Work {
+/// The query text or plan to run.
+pub(crate) enum QueryWork {
     /// A text.
     Sql(String),
-    /// What was planned before, with values for its placeholders.
+    /// A prepared plan, with values for its placeholders.
     Prepared(Arc<Prepared>, ParamValues),
 }
 
 /// A query to run.
-pub(crate) struct Job {
-    pub(crate) protocol: Protocol,
+pub(crate) struct QueryJob {
+    pub(crate) protocol: ServerProtocol,
     pub(crate) session: Arc<Session>,
-    pub(crate) work: Work,
+    pub(crate) work: QueryWork,
     /// The session's own limit of time, beside its client's quota.
-    pub(crate) limit: Option<Limit>,
-    /// Ends it from elsewhere.
-    pub(crate) stop: Stop,
+    pub(crate) limit: Option<SessionTimeLimit>,
+    /// Stops it from another task.
+    pub(crate) stop: StopSignal,
 }
 
 /// Counts requests, and work for them.
 #[derive(Clone, Default)]
-pub(crate) struct Activity(Arc<AtomicUsize>);
+pub(crate) struct ActivityCounter(Arc<AtomicUsize>);
 
 /// One that is counted, until this is dropped.
-pub(crate) struct ActivityGuard(Activity);
+pub(crate) struct ActivityGuard(ActivityCounter);
 
 impl Drop for ActivityGuard {
     fn drop(&mut self) {
@@ -71,7 +71,7 @@ impl Drop for ActivityGuard {
     }
 }
 
-impl Activity {
+impl ActivityCounter {
     pub(crate) fn enter(&self) -> ActivityGuard {
         self.0.fetch_add(1, Ordering::Relaxed);
         ActivityGuard(self.clone())
@@ -82,15 +82,15 @@ impl Activity {
     }
 }
 
-impl Service {
+impl QueryService {
     pub(crate) fn new(lake: &Lake, engine: Engine, identity: ClientIdentity) -> Result<Self, Error> {
-        Ok(Self(Arc::new(Inner {
+        Ok(Self(Arc::new(ServiceState {
             lake: lake.clone(),
             engine,
             client: Arc::new(Client::new(identity.name.clone(), identity.quota())),
             identity,
-            activity: Activity::default(),
-            metrics: Metrics::default(),
+            activity: ActivityCounter::default(),
+            metrics: ServerMetrics::default(),
             encoders: Threads::per_core("encode").map_err(Error::System)?,
         })))
     }
@@ -103,7 +103,7 @@ impl Service {
         &self.0.engine
     }
 
-    /// Whether the server has no tokens.
+    /// Returns whether the server has no tokens.
     pub(crate) fn is_open(&self) -> bool {
         self.0.identity.is_open
     }
@@ -111,22 +111,22 @@ impl Service {
     /// The client whose requests these are, if they may do this.
     ///
     /// # Errors
-    /// [`Fault::Forbidden`].
-    pub(crate) fn client(&self, scope: Scope) -> Result<Arc<Client>, Fault> {
+    /// [`RequestFault::Forbidden`].
+    pub(crate) fn client(&self, scope: TokenScope) -> Result<Arc<Client>, RequestFault> {
         self.0.identity.require(scope).inspect_err(|fault| self.0.metrics.failed(fault.code()))?;
         Ok(self.0.client.clone())
     }
 
     /// Requests that are being answered.
-    pub(crate) fn activity(&self) -> &Activity {
+    pub(crate) fn activity(&self) -> &ActivityCounter {
         &self.0.activity
     }
 
-    pub(crate) fn metrics(&self) -> &Metrics {
+    pub(crate) fn metrics(&self) -> &ServerMetrics {
         &self.0.metrics
     }
 
-    /// A session: one a connection, or a request where connections are not known.
+    /// Begins a session: one per connection, or one per request if the protocol has no connections.
     pub(crate) fn session(&self, client: &Arc<Client>) -> Session {
         self.0.engine.session(client)
     }
@@ -143,7 +143,7 @@ impl Service {
         self.session(&nobody).functions().into_iter().filter(|f| f.is_own).collect()
     }
 
-    /// Begins work on the threads that encode answers; it ends where what this returns is dropped.
+    /// Spawns work on the encoder threads; dropping the returned task aborts it.
     pub(crate) fn spawn<T: Send + 'static>(&self, work: impl Future<Output = T> + Send + 'static) -> JoinSet<T> {
         let mut task = JoinSet::new();
         let guard = self.0.activity.enter();
@@ -161,8 +161,8 @@ impl Service {
     pub(crate) async fn plan<T: Send + 'static>(
         &self,
         client: &Client,
-        work: impl Future<Output = Result<T, Fault>> + Send + 'static,
-    ) -> Result<T, Fault> {
+        work: impl Future<Output = Result<T, RequestFault>> + Send + 'static,
+    ) -> Result<T, RequestFault> {
         let guard = self.0.activity.enter();
         let work = async move {
             let _guard = guard;
@@ -176,17 +176,17 @@ impl Service {
     pub(crate) async fn crunch<T: Send + 'static>(
         &self,
         work: impl FnOnce() -> T + Send + 'static,
-    ) -> Result<T, Fault> {
+    ) -> Result<T, RequestFault> {
         let guard = self.0.activity.enter();
         let work = move || {
             let _guard = guard;
             work()
         };
         let handle = self.0.encoders.handle().map(|threads| threads.spawn_blocking(work));
-        let Some(handle) = handle else { return Err(Fault::Internal) };
+        let Some(handle) = handle else { return Err(RequestFault::Internal) };
         handle.await.map_err(|failed| {
             eprintln!("computing ended its task: {failed}");
-            Fault::Internal
+            RequestFault::Internal
         })
     }
 
@@ -194,11 +194,11 @@ impl Service {
     ///
     /// # Errors
     /// What is wrong with the query, or ended it.
-    pub(crate) async fn begin<E: Encode>(
+    pub(crate) async fn begin<E: AnswerEncoder>(
         &self,
-        job: Job,
-        encode: impl FnOnce(&SchemaRef) -> Result<E, Fault> + Send + 'static,
-    ) -> Result<Running<E::Item>, Fault> {
+        job: QueryJob,
+        encode: impl FnOnce(&SchemaRef) -> Result<E, RequestFault> + Send + 'static,
+    ) -> Result<RunningQuery<E::Item>, RequestFault> {
         let (columns, known) = oneshot::channel();
         let (to, items) = mpsc::channel(WAITING);
         let (stop, limit) = (job.stop.clone(), job.limit);
@@ -215,27 +215,27 @@ impl Service {
                 Err(fault)
             }
             schema = known => match schema {
-                Ok(schema) => Ok(Running { schema, items, task, stop, limit, service: self.clone() }),
+                Ok(schema) => Ok(RunningQuery { schema, items, task, stop, limit, service: self.clone() }),
                 // It ended without having any: it says why.
-                Err(_) => finish(&mut task).await.and(Err(Fault::Internal)),
+                Err(_) => finish(&mut task).await.and(Err(RequestFault::Internal)),
             }
         }
     }
 }
 
-async fn run<E: Encode>(
-    metrics: &Metrics,
-    job: Job,
-    encode: impl FnOnce(&SchemaRef) -> Result<E, Fault>,
+async fn run<E: AnswerEncoder>(
+    metrics: &ServerMetrics,
+    job: QueryJob,
+    encode: impl FnOnce(&SchemaRef) -> Result<E, RequestFault>,
     columns: oneshot::Sender<SchemaRef>,
     to: mpsc::Sender<E::Item>,
-) -> Result<(), Fault> {
+) -> Result<(), RequestFault> {
     let mut answer = match job.work {
-        Work::Sql(sql) => job.session.query(&sql).await?,
-        Work::Prepared(prepared, values) => job.session.execute(&prepared, values).await?,
+        QueryWork::Sql(sql) => job.session.query(&sql).await?,
+        QueryWork::Prepared(prepared, values) => job.session.execute(&prepared, values).await?,
     };
     let mut encoder = encode(&answer.schema)?;
-    // Nobody listens any more where sending fails, here and below: the query ends by being dropped.
+    // If sending fails, here and below, the receiver is gone: the query ends by being dropped.
     if columns.send(answer.schema.clone()).is_err() {
         return Ok(());
     }

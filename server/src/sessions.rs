@@ -1,5 +1,5 @@
-//! Sessions of browsers: a secret in a cookie stands for the token that was shown once, because pictures and downloads of
-//! a page can send no `Authorization` header. Kept in memory, as hashes, for half a day.
+//! Browser sessions: a secret in a cookie replaces the token that was sent once, because pictures and downloads of a
+//! page can send no `Authorization` header. Kept in memory, as hashes, for half a day.
 
 use std::io;
 use std::sync::{Mutex, PoisonError};
@@ -7,27 +7,27 @@ use std::time::{Duration, Instant};
 
 use sha2::{Digest as _, Sha256};
 
-/// How long a session is good for.
+/// Lifetime of a session.
 pub(crate) const LIFETIME: Duration = Duration::from_secs(12 * 3600);
-/// Sessions that are kept; the oldest goes first.
+/// Sessions that are kept; the oldest is evicted first.
 const MOST: usize = 1000;
 
 /// The sessions of a server.
 #[derive(Default)]
-pub(crate) struct Sessions(Mutex<Vec<Session>>);
+pub(crate) struct BrowserSessions(Mutex<Vec<BrowserSession>>);
 
-struct Session {
-    // A hash tells nothing by the time that its comparison takes.
+struct BrowserSession {
+    // The time of comparing hashes reveals nothing of the secret.
     hash: [u8; 32],
     holder: usize,
     begun: Instant,
 }
 
-impl Sessions {
+impl BrowserSessions {
     /// Begins a session of the holder of a token; returns its secret.
     ///
     /// # Errors
-    /// Where the system gives no random bytes.
+    /// The system gives no random bytes.
     pub(crate) fn begin(&self, holder: usize) -> io::Result<String> {
         let mut random = [0; 32];
         getrandom::fill(&mut random)?;
@@ -37,11 +37,11 @@ impl Sessions {
         if sessions.len() >= MOST {
             sessions.remove(0);
         }
-        sessions.push(Session { hash: Sha256::digest(&secret).into(), holder, begun: Instant::now() });
+        sessions.push(BrowserSession { hash: Sha256::digest(&secret).into(), holder, begun: Instant::now() });
         Ok(secret)
     }
 
-    /// Whose session it is.
+    /// Returns the holder of the session with this secret.
     pub(crate) fn holder(&self, secret: &str) -> Option<usize> {
         let hash: [u8; 32] = Sha256::digest(secret).into();
         let sessions = self.0.lock().unwrap_or_else(PoisonError::into_inner);
@@ -55,7 +55,7 @@ mod tests {
 
     #[test]
     fn the_oldest_goes_first() {
-        let sessions = Sessions::default();
+        let sessions = BrowserSessions::default();
         let first = sessions.begin(1).expect("random bytes");
         assert_eq!((sessions.holder(&first), sessions.holder("")), (Some(1), None));
         for _ in 0..MOST {

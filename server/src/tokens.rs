@@ -1,4 +1,4 @@
-//! Who may ask: tokens, kept as hashes in a file, each with scopes and quotas.
+//! Access control: tokens, stored as hashes in a file, each with scopes and quotas.
 
 use std::fmt;
 use std::path::Path;
@@ -14,19 +14,19 @@ use subtle::{Choice, ConstantTimeEq as _};
 
 use crate::Error;
 use crate::client_identity::ClientIdentity;
-use crate::fault::Fault;
-use crate::sessions::Sessions;
+use crate::fault::RequestFault;
+use crate::sessions::BrowserSessions;
 
 /// Of basic credentials; padding is cut off before, since gRPC's clients leave it out.
 const BASE64: GeneralPurpose = GeneralPurpose::new(&STANDARD, NO_PAD.with_decode_allow_trailing_bits(true));
 
-/// What tokens begin with, so that they are found where they leaked.
+/// Prefix of all tokens, so that leaked ones can be found by searching.
 const PREFIX: &str = "echolake_";
 
-/// What a token is for.
+/// A permission of a token.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
-pub enum Scope {
+pub enum TokenScope {
     /// Queries, and what the tables are.
     Sql,
     /// The runs' and tables' files.
@@ -35,7 +35,7 @@ pub enum Scope {
     Metrics,
 }
 
-impl fmt::Display for Scope {
+impl fmt::Display for TokenScope {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(match self {
             Self::Sql => "SQL",
@@ -46,16 +46,16 @@ impl fmt::Display for Scope {
 }
 
 /// The tokens of a file.
-pub struct Tokens(Vec<Entry>);
+pub struct TokenFile(Vec<TokenEntry>);
 
-struct Entry {
+struct TokenEntry {
     client: Arc<ClientIdentity>,
     hash: [u8; 32],
 }
 
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
-struct File {
+struct TokenList {
     #[serde(default)]
     token: Vec<Line>,
 }
@@ -66,21 +66,21 @@ struct Line {
     name: String,
     sha256: String,
     #[serde(default = "reading")]
-    scopes: Vec<Scope>,
+    scopes: Vec<TokenScope>,
     seconds: Option<u64>,
     memory_mb: Option<usize>,
     rows: Option<u64>,
     concurrent: Option<usize>,
 }
 
-// What a reader of the lake needs. Who may ask in SQL reads all rows, and the catalogue's pages show meshes and link to run
-// files: without files a signed-in browser would be refused in the middle of a page.
-fn reading() -> Vec<Scope> {
-    vec![Scope::Sql, Scope::Files]
+// What a reader of the lake needs. A client with SQL reads all rows, and the catalogue's pages show meshes and link to
+// run files: without files a signed-in browser would be refused in the middle of a page.
+fn reading() -> Vec<TokenScope> {
+    vec![TokenScope::Sql, TokenScope::Files]
 }
 
 impl Line {
-    fn entry(&self) -> Result<Entry, String> {
+    fn entry(&self) -> Result<TokenEntry, String> {
         let name = &self.name;
         let mut hash = [0; 32];
         hex::decode_to_slice(&self.sha256, &mut hash)
@@ -102,11 +102,11 @@ impl Line {
             rows: self.rows,
             concurrent: self.concurrent,
         };
-        Ok(Entry { client: Arc::new(client), hash })
+        Ok(TokenEntry { client: Arc::new(client), hash })
     }
 }
 
-impl Tokens {
+impl TokenFile {
     /// Reads a file of tokens.
     ///
     /// # Errors
@@ -118,7 +118,7 @@ impl Tokens {
     }
 
     fn parse(text: &str) -> Result<Self, String> {
-        let file: File = toml::from_str(text).map_err(|e| e.to_string())?;
+        let file: TokenList = toml::from_str(text).map_err(|e| e.to_string())?;
         let entries = file.token.iter().map(Line::entry).collect::<Result<Vec<_>, _>>()?;
         for (i, entry) in entries.iter().enumerate() {
             if entries[..i].iter().any(|e| e.client.name == entry.client.name || e.hash == entry.hash) {
@@ -146,7 +146,7 @@ impl Tokens {
 }
 
 /// A new token, and the lines that let it in.
-pub struct Fresh {
+pub struct FreshToken {
     /// The token: it is nowhere else.
     pub token: String,
     /// Lines for the file of tokens.
@@ -157,7 +157,7 @@ pub struct Fresh {
 ///
 /// # Errors
 /// [`Error::Random`].
-pub fn fresh(name: &str) -> Result<Fresh, Error> {
+pub fn fresh(name: &str) -> Result<FreshToken, Error> {
     let mut secret = [0; 32];
     getrandom::fill(&mut secret).map_err(|failed| Error::Random(failed.into()))?;
     let token = format!("{PREFIX}{}", hex::encode(secret));
@@ -167,77 +167,77 @@ pub fn fresh(name: &str) -> Result<Fresh, Error> {
         "[[token]]\nname = {name}\nsha256 = \"{hash}\"\nscopes = [\"sql\", \"files\"]\n\
          seconds = 60\nmemory_mb = 2000\nrows = 10_000_000\nconcurrent = 4\n"
     );
-    Ok(Fresh { token, lines })
+    Ok(FreshToken { token, lines })
 }
 
-/// Who is let in.
-pub(crate) enum Access {
-    /// Everybody on this machine.
+/// The access rule of a server.
+pub(crate) enum TokenAccess {
+    /// All clients on this machine.
     Open,
-    /// Whoever has a token, or showed one to begin a session of a browser.
-    Tokens(Tokens, Sessions),
+    /// Holders of a token, or of a browser session that was begun with one.
+    Tokens(TokenFile, BrowserSessions),
 }
 
-impl Access {
-    /// Who may ask: by tokens where there are some.
-    pub(crate) fn new(tokens: Option<Tokens>) -> Self {
+impl TokenAccess {
+    /// Access by `tokens`, or open access without them.
+    pub(crate) fn new(tokens: Option<TokenFile>) -> Self {
         match tokens {
-            Some(tokens) => Self::Tokens(tokens, Sessions::default()),
+            Some(tokens) => Self::Tokens(tokens, BrowserSessions::default()),
             None => Self::Open,
         }
     }
 
-    /// Whether everybody is let in.
+    /// Returns whether no token is required.
     pub(crate) fn is_open(&self) -> bool {
         matches!(self, Self::Open)
     }
 
-    /// Who holds this token; `local` makes the client of a server that has none.
+    /// Returns the client of a token; on a server without tokens, the client that `local` makes.
     ///
     /// # Errors
-    /// [`Fault::Unauthenticated`].
+    /// [`RequestFault::Unauthenticated`].
     pub(crate) fn client(
         &self,
         token: Option<&str>,
         local: impl FnOnce() -> ClientIdentity,
-    ) -> Result<Arc<ClientIdentity>, Fault> {
+    ) -> Result<Arc<ClientIdentity>, RequestFault> {
         let tokens = match self {
             Self::Open => return Ok(Arc::new(local())),
             Self::Tokens(tokens, _) => tokens,
         };
-        let entry = token.and_then(|t| tokens.find(t)).ok_or(Fault::Unauthenticated)?;
+        let entry = token.and_then(|t| tokens.find(t)).ok_or(RequestFault::Unauthenticated)?;
         Ok(tokens.0[entry].client.clone())
     }
 
     /// Begins a browser's session; returns its secret.
     ///
     /// # Errors
-    /// [`Fault::Unauthenticated`]; [`Fault::NotFound`] where there are no tokens.
-    pub(crate) fn begin_session(&self, token: &str) -> Result<String, Fault> {
+    /// [`RequestFault::Unauthenticated`]; [`RequestFault::NotFound`] if there are no tokens.
+    pub(crate) fn begin_session(&self, token: &str) -> Result<String, RequestFault> {
         let Self::Tokens(tokens, sessions) = self else {
             let hint = "this server has no tokens, ask right away";
-            return Err(Fault::NotFound { what: "a session".to_owned(), hint });
+            return Err(RequestFault::NotFound { what: "a session".to_owned(), hint });
         };
-        sessions.begin(tokens.find(token).ok_or(Fault::Unauthenticated)?).map_err(|failed| {
+        sessions.begin(tokens.find(token).ok_or(RequestFault::Unauthenticated)?).map_err(|failed| {
             eprintln!("no session can begin: {failed}");
-            Fault::Internal
+            RequestFault::Internal
         })
     }
 
-    /// Who holds the session of this secret; as [`Access::client`].
+    /// Returns the client of the session with this secret; as [`TokenAccess::client`].
     ///
     /// # Errors
-    /// As [`Access::client`].
+    /// As [`TokenAccess::client`].
     pub(crate) fn client_of_session(
         &self,
         secret: &str,
         local: impl FnOnce() -> ClientIdentity,
-    ) -> Result<Arc<ClientIdentity>, Fault> {
+    ) -> Result<Arc<ClientIdentity>, RequestFault> {
         let (tokens, sessions) = match self {
             Self::Open => return Ok(Arc::new(local())),
             Self::Tokens(tokens, sessions) => (tokens, sessions),
         };
-        let entry = sessions.holder(secret).and_then(|i| tokens.0.get(i)).ok_or(Fault::Unauthenticated)?;
+        let entry = sessions.holder(secret).and_then(|i| tokens.0.get(i)).ok_or(RequestFault::Unauthenticated)?;
         Ok(entry.client.clone())
     }
 }
@@ -263,21 +263,21 @@ mod tests {
     fn a_fresh_token_lets_in_and_no_other_does() {
         let fresh = fresh("a \"quoted\" name").expect("a token");
         assert!(!fresh.lines.contains(&fresh.token), "only its hash is kept");
-        let access = Access::new(Some(Tokens::parse(&fresh.lines).expect("tokens")));
+        let access = TokenAccess::new(Some(TokenFile::parse(&fresh.lines).expect("tokens")));
         let local = ClientIdentity::pages;
         let client = access.client(Some(&fresh.token), local).expect("let in");
         assert_eq!(client.name, "a \"quoted\" name");
         assert_eq!(client.quota().time, Some(std::time::Duration::from_secs(60)));
-        assert!(client.require(Scope::Files).is_ok(), "pages show meshes and link to files");
-        assert!(matches!(client.require(Scope::Metrics), Err(Fault::Forbidden { .. })));
+        assert!(client.require(TokenScope::Files).is_ok(), "pages show meshes and link to files");
+        assert!(matches!(client.require(TokenScope::Metrics), Err(RequestFault::Forbidden { .. })));
         let secret = access.begin_session(&fresh.token).expect("a session");
         assert_eq!(access.client_of_session(&secret, local).expect("let in"), client);
-        assert!(matches!(access.client_of_session(&fresh.token, local), Err(Fault::Unauthenticated)));
-        assert!(matches!(access.begin_session(&secret), Err(Fault::Unauthenticated)));
+        assert!(matches!(access.client_of_session(&fresh.token, local), Err(RequestFault::Unauthenticated)));
+        assert!(matches!(access.begin_session(&secret), Err(RequestFault::Unauthenticated)));
         let other = super::fresh("b").expect("a token").token;
         let cut = &fresh.token[..fresh.token.len() - 1];
         for wrong in [None, Some(""), Some(other.as_str()), Some(cut)] {
-            assert!(matches!(access.client(wrong, local), Err(Fault::Unauthenticated)), "{wrong:?}");
+            assert!(matches!(access.client(wrong, local), Err(RequestFault::Unauthenticated)), "{wrong:?}");
         }
     }
 
@@ -285,10 +285,11 @@ mod tests {
     fn scopes_are_those_that_a_line_names() {
         let hash = hex::encode(Sha256::digest("x"));
         let allowed = |scopes: &str| {
-            let file = Tokens::parse(&format!("[[token]]\nname = 'a'\nsha256 = '{hash}'\n{scopes}")).expect("tokens");
-            let access = Access::new(Some(file));
+            let file =
+                TokenFile::parse(&format!("[[token]]\nname = 'a'\nsha256 = '{hash}'\n{scopes}")).expect("tokens");
+            let access = TokenAccess::new(Some(file));
             let client = access.client(Some("x"), ClientIdentity::pages).expect("let in");
-            [Scope::Sql, Scope::Files, Scope::Metrics].map(|scope| client.require(scope).is_ok())
+            [TokenScope::Sql, TokenScope::Files, TokenScope::Metrics].map(|scope| client.require(scope).is_ok())
         };
         assert_eq!(allowed(""), [true, true, false]);
         assert_eq!(allowed("scopes = ['sql']"), [true, false, false]);
@@ -305,7 +306,7 @@ mod tests {
             (format!("[[token]]\nname = 'a'\nsha256 = '{hash}'\nscopes = ['all']"), "unknown variant"),
             (format!("[[token]]\nname = 'a'\nsha256 = '{hash}'\n").repeat(2), "twice"),
         ] {
-            let error = Tokens::parse(&text).map(|_| ()).expect_err(&text);
+            let error = TokenFile::parse(&text).map(|_| ()).expect_err(&text);
             assert!(error.contains(expected), "{text}: {error}");
         }
     }

@@ -31,7 +31,7 @@ pub(crate) enum LakeCommand {
     Engine(EngineArgs),
     /// Make a token for `serve --tokens`.
     Token {
-        /// Whose it is.
+        /// Name of its holder.
         name: String,
     },
     /// Merge the tables' small files into large ones; ingest and queries may go on.

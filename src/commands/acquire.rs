@@ -1,4 +1,4 @@
-//! `echolake acquire`: one surface measured, watched, paused, stopped and gone on with.
+//! `echolake acquire`: measures one surface, with progress, pause, stop and resume.
 
 mod acknowledge;
 mod specimen;
@@ -19,24 +19,24 @@ use echolake_acquisition::session::{Measured, Pace, Preflight, Session};
 use echolake_lake::{Lake, References};
 use echolake_schema::{Rig, SurfaceId, Timestamp};
 
-use crate::Done;
+use crate::CommandOutcome;
 use crate::cli::AcquireArgs;
-use crate::progress::Progress;
-use acknowledge::Acknowledgements;
+use crate::progress::CommandProgress;
+use acknowledge::AcknowledgementWriter;
 pub(super) use specimen::{relief_of_file, set_all};
-use watch::Watcher;
+use watch::RunWatcher;
 
-/// How often a time-series store is told.
+/// Time between two pushes of metrics to a time-series store.
 const TOLD_EVERY: Duration = Duration::from_secs(10);
 
-/// A run that is about to begin, or to be gone on with.
-enum Job {
-    Fresh(Box<Fresh>),
+/// A run to begin or to resume.
+enum AcquireJob {
+    Fresh(Box<NewRun>),
     Resumed { partial: PathBuf, held: Box<Held> },
 }
 
 /// A run that is about to begin.
-struct Fresh {
+struct NewRun {
     rig: Rig,
     surface: SurfaceId,
     specimen: Specimen,
@@ -49,22 +49,22 @@ struct Fresh {
     keep: Keep,
 }
 
-pub(crate) async fn run(args: &AcquireArgs, lake_url: &str) -> anyhow::Result<Done> {
-    // What can be refused is refused before anything is made for it.
+pub(crate) async fn run(args: &AcquireArgs, lake_url: &str) -> anyhow::Result<CommandOutcome> {
+    // Wrong arguments are refused before anything is created.
     let influx = args.influx.as_deref().map(str::parse::<Target>).transpose()?;
     let pace = if args.pace > 0.0 { Pace::Secs(args.pace) } else { Pace::Fast };
     let control = Arc::new(Control::default());
     watch::obey(&control)?;
-    let progress = Progress::new();
+    let progress = CommandProgress::new();
     let job = match &args.resume {
-        Some(partial) => Job::Resumed { partial: partial.clone(), held: Box::new(Held::read(partial)?) },
+        Some(partial) => AcquireJob::Resumed { partial: partial.clone(), held: Box::new(Held::read(partial)?) },
         None => fresh(args, lake_url, &progress).await?,
     };
     if job.rig().devices.are_simulated() {
         progress.say("simulated rig: nothing here is measured");
     }
     let (surface, planned, accepted) = job.size()?;
-    let mut acknowledgements = args.acknowledge.as_deref().map(Acknowledgements::open).transpose()?;
+    let mut acknowledgements = args.acknowledge.as_deref().map(AcknowledgementWriter::open).transpose()?;
     let metrics = RunMetrics::new(&surface, planned, accepted);
     let live = args.live.map(|address| LiveServer::start(address, args.viewers.access())).transpose()?;
     if let Some(live) = &live {
@@ -79,7 +79,7 @@ pub(crate) async fn run(args: &AcquireArgs, lake_url: &str) -> anyhow::Result<Do
     let pushed = influx.map(|target| {
         InfluxPush::start(target, metrics.clone(), TOLD_EVERY, |e| eprintln!("warning: metrics were not taken: {e}"))
     });
-    let mut watcher = Watcher::new(&progress, &surface, planned, accepted, metrics.clone(), job.folder());
+    let mut watcher = RunWatcher::new(&progress, &surface, planned, accepted, metrics.clone(), job.folder());
     let preflight = if args.skip_checks { Preflight::Skip } else { Preflight::Check };
     let (checkpoint_every, tap) = (args.checkpoint_every.map(|n| n as usize), live.as_ref().map(LiveServer::tap));
     let partial = job.partial()?;
@@ -99,7 +99,7 @@ pub(crate) async fn run(args: &AcquireArgs, lake_url: &str) -> anyhow::Result<Do
         measured
     });
     let measured = measured.await?;
-    // The last numbers are told, and viewers are let go, before the command ends.
+    // The last metrics are sent, and viewers are disconnected, before the command ends.
     drop((pushed, served, live));
     match measured {
         Ok(measured) => tell(&measured, lake_url),
@@ -112,24 +112,24 @@ pub(crate) async fn run(args: &AcquireArgs, lake_url: &str) -> anyhow::Result<Do
     }
 }
 
-// Where the run's file is, and what to do next.
-fn tell(measured: &Measured, lake_url: &str) -> anyhow::Result<Done> {
+// Reports the path of the run's file, and the next step.
+fn tell(measured: &Measured, lake_url: &str) -> anyhow::Result<CommandOutcome> {
     let Measured { path, outcome } = measured;
     if outcome.left > 0 {
         eprintln!("stopped with {} pairs left; nothing that was measured is lost", outcome.left);
         go_on(path, lake_url);
-        return Ok(Done::Whole);
+        return Ok(CommandOutcome::Whole);
     }
     super::print(&path.display().to_string())?;
     eprintln!("next: echolake --lake {lake_url} ingest");
-    Ok(if outcome.end.rejected > 0 { Done::WithLoss } else { Done::Whole })
+    Ok(if outcome.end.rejected > 0 { CommandOutcome::WithLoss } else { CommandOutcome::Whole })
 }
 
 fn go_on(partial: &Path, lake_url: &str) {
     eprintln!("to go on: echolake --lake {lake_url} acquire --resume {}", partial.display());
 }
 
-async fn fresh(args: &AcquireArgs, lake_url: &str, progress: &Progress) -> anyhow::Result<Job> {
+async fn fresh(args: &AcquireArgs, lake_url: &str, progress: &CommandProgress) -> anyhow::Result<AcquireJob> {
     let specimen = specimen::of(args)?;
     let rig = super::rig_or(args.rig.as_deref(), lake_url, Rig::paper).await?;
     if let Specimen::Mesh(path, side) = &specimen {
@@ -146,7 +146,7 @@ async fn fresh(args: &AcquireArgs, lake_url: &str, progress: &Progress) -> anyho
             unfinished.display()
         ));
     }
-    Ok(Job::Fresh(Box::new(Fresh {
+    Ok(AcquireJob::Fresh(Box::new(NewRun {
         rig,
         surface,
         specimen,
@@ -160,13 +160,13 @@ async fn fresh(args: &AcquireArgs, lake_url: &str, progress: &Progress) -> anyho
     })))
 }
 
-// References may well come later: the rows wait for them. Whoever measures by mistake without any is told.
+// References may be measured later: the rows wait for them. This warns users who forgot them.
 #[cfg(feature = "lake")]
 async fn warn_of_missing_references(
     args: &AcquireArgs,
     lake: &Lake,
     surface: &SurfaceId,
-    progress: &Progress,
+    progress: &CommandProgress,
 ) -> anyhow::Result<()> {
     let snapshot = lake.snapshot().await?;
     for named in [&args.flat, &args.foam].into_iter().flatten() {
@@ -177,7 +177,7 @@ async fn warn_of_missing_references(
     Ok(())
 }
 
-// Recordings of the surface that were not ended: names of runs have the surface behind their time.
+// Unfinished recordings of the surface: names of runs have the surface behind their time.
 fn unfinished(folder: &Path, surface: &str) -> Vec<PathBuf> {
     let Ok(entries) = std::fs::read_dir(folder) else { return Vec::new() };
     let is_of = |path: &PathBuf| {
@@ -187,7 +187,7 @@ fn unfinished(folder: &Path, surface: &str) -> Vec<PathBuf> {
     entries.flatten().map(|entry| entry.path()).filter(is_of).collect()
 }
 
-impl Job {
+impl AcquireJob {
     fn folder(&self) -> PathBuf {
         match self {
             Self::Fresh(fresh) => fresh.folder.clone(),
@@ -214,7 +214,7 @@ impl Job {
         Ok((surface.to_string(), self.rig().grid()?.pairs().len() as u64, accepted))
     }
 
-    // What the recording is named until it is whole.
+    // The path of the recording until it is complete.
     fn partial(&self) -> anyhow::Result<PathBuf> {
         match self {
             Self::Fresh(fresh) => Ok(partial_of(&fresh.request().path()?)),
@@ -230,7 +230,7 @@ impl Job {
     }
 }
 
-impl Fresh {
+impl NewRun {
     fn request(&self) -> RunRequest<'_> {
         RunRequest {
             rig: &self.rig,

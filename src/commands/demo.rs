@@ -1,4 +1,4 @@
-//! `echolake demo`: the main job end to end, on the simulated rig: measure, record, ingest, ask, look.
+//! `echolake demo`: the main job end to end, on the simulated rig: measure, record, ingest, query, browse.
 
 mod measure;
 
@@ -13,11 +13,11 @@ use echolake_lake::{Lake, References};
 use echolake_query::Session;
 use echolake_schema::Rig;
 
-use crate::Done;
+use crate::CommandOutcome;
 use crate::cli::DemoArgs;
-use crate::progress::Progress;
+use crate::progress::CommandProgress;
 use crate::signals::StopRequest;
-use measure::Campaign;
+use measure::DemoCampaign;
 
 /// The surfaces, in the order in which they are measured: name and relief are the same.
 const SURFACES: [&str; 6] = ["flat", "foam", "wood", "prd", "brick", "wavy"];
@@ -26,7 +26,7 @@ const COMPARED: &str = "brick";
 /// Sweeps of 0.05 s instead of the paper's rig's 0.5 s: they fit a laptop's disk.
 const SWEEP_SECS: f64 = 0.05;
 
-pub(crate) async fn run(args: &DemoArgs, lake_url: &str) -> anyhow::Result<Done> {
+pub(crate) async fn run(args: &DemoArgs, lake_url: &str) -> anyhow::Result<CommandOutcome> {
     let begun = Instant::now();
     let stop = super::stop_request()?;
     let surfaces = match args.surfaces {
@@ -35,9 +35,9 @@ pub(crate) async fn run(args: &DemoArgs, lake_url: &str) -> anyhow::Result<Done>
     };
     let rig = rig(args.rig.as_deref(), lake_url).await?;
     let lake = Lake::open_or_create(lake_url, &rig, &References::default()).await?;
-    let progress = Progress::new();
+    let progress = CommandProgress::new();
     progress.say("simulated rig: nothing here is measured");
-    let campaign = Campaign {
+    let campaign = DemoCampaign {
         rig,
         surfaces,
         keep: if args.ir_only { Keep::ResponsesOnly } else { Keep::Sweeps },
@@ -50,10 +50,10 @@ pub(crate) async fn run(args: &DemoArgs, lake_url: &str) -> anyhow::Result<Done>
     ensure_wanted(&stop)?;
     if args.no_ingest {
         eprintln!("the runs are in inbox/. Next:\n  {} {}ingest", program(), lake_flag(lake_url));
-        return Ok(Done::Whole);
+        return Ok(CommandOutcome::Whole);
     }
     let sources = pending(&lake).await?;
-    super::ingest::take_in(&lake, sources, stop.flag(), &Progress::new()).await?;
+    super::ingest::take_in(&lake, sources, stop.flag(), &CommandProgress::new()).await?;
     ensure_wanted(&stop)?;
     let example = match args.surfaces {
         Some(_) => print_typologies(&lake).await?,
@@ -62,7 +62,7 @@ pub(crate) async fn run(args: &DemoArgs, lake_url: &str) -> anyhow::Result<Done>
     eprintln!("\ndone in {:.0} s. Next:", begun.elapsed().as_secs_f64());
     print_next(lake_url, example);
     if args.no_serve {
-        return Ok(Done::Whole);
+        return Ok(CommandOutcome::Whole);
     }
     eprintln!();
     super::serve::catalogue(&lake, &stop).await
@@ -88,7 +88,7 @@ async fn rig(file: Option<&Path>, lake_url: &str) -> anyhow::Result<Rig> {
     Ok(rig)
 }
 
-// How to call this program again; cargo sets the variable for what it runs.
+// The command line of this program for hints; cargo sets the variable for programs that it runs.
 fn program() -> &'static str {
     if std::env::var_os("CARGO_MANIFEST_DIR").is_some() { "cargo run --release --" } else { "echolake" }
 }
@@ -113,7 +113,7 @@ fn print_next(lake_url: &str, example: &str) {
     }
 }
 
-// The columns of a table with a column a band.
+// The columns of a table with one column per band.
 fn band_columns(lake: &Lake, value: impl Fn(&str) -> String) -> String {
     let bands = lake.rig().band_names();
     let column = |band: &str, name: &str| format!("{} as \"{name}\"", value(band));
@@ -122,7 +122,7 @@ fn band_columns(lake: &Lake, value: impl Fn(&str) -> String) -> String {
     columns.join(", ")
 }
 
-// One row a reference or typology: a large collection's surfaces are too many to print. Returns a surface to look at.
+// One row per reference or typology: a large collection has too many surfaces to print. Returns a surface to look at.
 async fn print_typologies(lake: &Lake) -> anyhow::Result<&'static str> {
     let session = Session::new(lake)?;
     let columns =

@@ -4,10 +4,10 @@ mod installation;
 #[cfg(feature = "lake")]
 mod lake;
 
-use crate::Done;
+use crate::CommandOutcome;
 use crate::cli::DoctorArgs;
 
-pub(crate) async fn run(args: &DoctorArgs, lake_url: &str) -> anyhow::Result<Done> {
+pub(crate) async fn run(args: &DoctorArgs, lake_url: &str) -> anyhow::Result<CommandOutcome> {
     if args.installation {
         return installation::run(args.json, lake_url).await;
     }

@@ -13,8 +13,8 @@ use echolake_query::{PredicateForm, Session};
 use echolake_schema::SurfaceId;
 use serde_json::json;
 
-use crate::Done;
-use crate::progress::{Progress, Task};
+use crate::CommandOutcome;
+use crate::progress::{CommandProgress, TaskProgress};
 
 #[derive(Debug, Subcommand)]
 pub(crate) enum ExportCommand {
@@ -38,7 +38,7 @@ pub(crate) struct MlArgs {
     /// Rows as measured, or under all eight symmetries of the square.
     #[arg(long, value_enum, default_value_t = SymmetriesArg::None)]
     symmetries: SymmetriesArg,
-    /// What the validation and test sets hold out.
+    /// Unit that the validation and test sets hold out.
     #[arg(long, value_enum, default_value_t = SplitArg::ByPanel)]
     split: SplitArg,
     /// Columns of measurements, nce and tnce, separated by commas; by default ir, temperature_c, snr_db and tnce_*.
@@ -87,10 +87,10 @@ enum SplitArg {
     None,
 }
 
-/// Which measurements are taken.
+/// A selection of measurements.
 #[derive(Debug, Args)]
-struct Selection {
-    /// Which measurements: an SQL predicate over the columns of table measurements.
+struct SelectionArgs {
+    /// The measurements: an SQL predicate over the columns of table measurements.
     #[arg(long = "where", value_name = "PREDICATE")]
     predicate: String,
     /// Do not read the runs' files whole to compare their SHA-256; sizes, indexes and the CRCs of what is read are
@@ -102,7 +102,7 @@ struct Selection {
 #[derive(Debug, Args)]
 pub(crate) struct McapArgs {
     #[command(flatten)]
-    selection: Selection,
+    selection: SelectionArgs,
     /// Topics, separated by commas; by default all, and the attachments.
     #[arg(long, value_delimiter = ',')]
     topics: Vec<String>,
@@ -135,13 +135,13 @@ pub(crate) struct ResponseArgs {
 #[derive(Debug, Args)]
 pub(crate) struct WavArgs {
     #[command(flatten)]
-    selection: Selection,
+    selection: SelectionArgs,
     /// The new folder.
     #[arg(short, long, value_name = "DIR", value_parser = local)]
     output: PathBuf,
 }
 
-pub(crate) async fn run(command: &ExportCommand, lake_url: &str) -> anyhow::Result<Done> {
+pub(crate) async fn run(command: &ExportCommand, lake_url: &str) -> anyhow::Result<CommandOutcome> {
     let lake = Lake::open(lake_url).await?;
     match command {
         ExportCommand::Ml(args) => ml(&lake, args).await?,
@@ -150,7 +150,7 @@ pub(crate) async fn run(command: &ExportCommand, lake_url: &str) -> anyhow::Resu
         ExportCommand::Npz(args) => responses(&lake, args, ResponseFormat::Npz).await?,
         ExportCommand::Wav(args) => wav(&lake, args).await?,
     }
-    Ok(Done::Whole)
+    Ok(CommandOutcome::Whole)
 }
 
 async fn ml(lake: &Lake, args: &MlArgs) -> anyhow::Result<()> {
@@ -166,7 +166,7 @@ async fn ml(lake: &Lake, args: &MlArgs) -> anyhow::Result<()> {
     };
     let split = Split { by, test: args.test, validation: args.validation, seed: args.seed };
     let set = TrainingSet { symmetries, split, columns: args.columns.clone() };
-    let (progress, mut task) = (Progress::new(), None);
+    let (progress, mut task) = (CommandProgress::new(), None);
     let exported = write_training_set(lake, &args.output, &set, &mut |done, total| {
         step(&progress, &mut task, "surfaces", done, total);
     })
@@ -236,7 +236,7 @@ async fn mcap(lake: &Lake, args: &McapArgs) -> anyhow::Result<()> {
 }
 
 async fn responses(lake: &Lake, args: &ResponseArgs, format: ResponseFormat) -> anyhow::Result<()> {
-    let (progress, mut task) = (Progress::new(), None);
+    let (progress, mut task) = (CommandProgress::new(), None);
     let files = write_responses(lake, &args.output, format, &args.surfaces, &mut |done, total| {
         step(&progress, &mut task, "surfaces", done, total);
     })
@@ -248,7 +248,7 @@ async fn responses(lake: &Lake, args: &ResponseArgs, format: ResponseFormat) -> 
 
 async fn wav(lake: &Lake, args: &WavArgs) -> anyhow::Result<()> {
     let taken = taken(lake, &args.selection).await?;
-    let (progress, mut task) = (Progress::new(), None);
+    let (progress, mut task) = (CommandProgress::new(), None);
     let count = write_wav(lake, &args.output, &taken, check(&args.selection), &mut |done, total| {
         step(&progress, &mut task, "recordings", done, total);
     })
@@ -258,21 +258,21 @@ async fn wav(lake: &Lake, args: &WavArgs) -> anyhow::Result<()> {
     Ok(())
 }
 
-fn step(progress: &Progress, task: &mut Option<Task>, unit: &'static str, done: usize, total: usize) {
+fn step(progress: &CommandProgress, task: &mut Option<TaskProgress>, unit: &'static str, done: usize, total: usize) {
     task.get_or_insert_with(|| progress.task("export", total as u64, unit)).at(done as u64);
 }
 
-fn finish(task: Option<Task>, what: String) {
+fn finish(task: Option<TaskProgress>, what: String) {
     if let Some(task) = task {
         task.done(what);
     }
 }
 
-fn check(selection: &Selection) -> Check {
+fn check(selection: &SelectionArgs) -> Check {
     if selection.quick { Check::Ends } else { Check::Whole }
 }
 
-async fn taken(lake: &Lake, selection: &Selection) -> anyhow::Result<Vec<Taken>> {
+async fn taken(lake: &Lake, selection: &SelectionArgs) -> anyhow::Result<Vec<Taken>> {
     let session = Session::new(lake)?;
     let select = format!("select {} from measurements where", Taken::COLUMNS.join(", "));
     let sql = session.selecting(&select, &selection.predicate, PredicateForm::AnyExpression).context("--where")?;

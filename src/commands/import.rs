@@ -7,11 +7,11 @@ use echolake_acquisition::import::{
 use echolake_lake::{Lake, References};
 use echolake_schema::{Celsius, Rig, Timestamp};
 
-use crate::Done;
+use crate::CommandOutcome;
 use crate::cli::ImportCommand;
-use crate::progress::{Progress, Task};
+use crate::progress::{CommandProgress, TaskProgress};
 
-pub(crate) async fn run(args: &ImportCommand, lake_url: &str) -> anyhow::Result<Done> {
+pub(crate) async fn run(args: &ImportCommand, lake_url: &str) -> anyhow::Result<CommandOutcome> {
     let rig = match args {
         ImportCommand::Wav { manifest, rig } => {
             let rate = sampling_rate_of(manifest)?;
@@ -50,7 +50,7 @@ pub(crate) async fn run(args: &ImportCommand, lake_url: &str) -> anyhow::Result<
     }
     let lake = Lake::open_or_create(lake_url, &rig, &References::default()).await?;
     let folder = super::inbox(&lake)?;
-    let progress = Progress::new();
+    let progress = CommandProgress::new();
     let mut task = None;
     let options = ImportOptions { started: Timestamp::now(), folder: &folder };
     let mut step = |unit: &'static str, done: usize, total: usize| {
@@ -74,10 +74,10 @@ pub(crate) async fn run(args: &ImportCommand, lake_url: &str) -> anyhow::Result<
         super::print(&run.path.display().to_string())?;
     }
     eprintln!("next: echolake --lake {lake_url} ingest");
-    Ok(Done::Whole)
+    Ok(CommandOutcome::Whole)
 }
 
-fn finish(task: Option<Task>, runs: &[ImportedRun]) {
+fn finish(task: Option<TaskProgress>, runs: &[ImportedRun]) {
     let measurements: usize = runs.iter().map(|r| r.measurements).sum();
     if let Some(task) = task {
         task.done(format!("{} runs, {measurements} measurements", runs.len()));

@@ -16,9 +16,9 @@ use object_store::ObjectStoreExt as _;
 use object_store::path::Path as ObjectPath;
 use serde::{Deserialize, Serialize};
 
-use crate::Done;
+use crate::CommandOutcome;
 use crate::cli::IngestArgs;
-use crate::progress::Progress;
+use crate::progress::CommandProgress;
 use crate::signals::StopRequest;
 
 /// Time between two looks at the inbox.
@@ -29,9 +29,9 @@ const RETRY_AFTER: Duration = Duration::from_secs(10);
 /// Exit code of a process that panicked.
 const PANICKED: i32 = 101;
 
-/// What became of all that was given.
+/// The results of all files.
 #[derive(Default, Serialize, Deserialize)]
-pub(crate) struct Summary {
+pub(crate) struct IngestSummary {
     pub(crate) taken: Vec<Taken>,
     refused: Vec<RefusedFile>,
 }
@@ -41,16 +41,16 @@ pub(crate) struct Summary {
 struct RefusedFile {
     file: String,
     reason: String,
-    /// Where it is now, if it was moved.
+    /// Its new path, if it was moved.
     moved_to: Option<String>,
 }
 
-impl Summary {
+impl IngestSummary {
     fn lost(&self) -> bool {
         !self.refused.is_empty() || self.taken.iter().any(|t| !t.whole || !t.damaged.is_empty())
     }
 
-    fn add(&mut self, report: Report, progress: &Progress) {
+    fn add(&mut self, report: Report, progress: &CommandProgress) {
         match report {
             Report::Taken(taken) => {
                 say(progress, &taken);
@@ -67,11 +67,11 @@ impl Summary {
     }
 }
 
-pub(crate) async fn run(args: &IngestArgs, lake_url: &str) -> anyhow::Result<Done> {
+pub(crate) async fn run(args: &IngestArgs, lake_url: &str) -> anyhow::Result<CommandOutcome> {
     let stop = super::stop_request()?;
     let lake = Lake::open(lake_url).await?;
     lake.ensure_tables().await?;
-    let progress = Progress::new();
+    let progress = CommandProgress::new();
     if let Some(path) = &args.suspect {
         return take_in_suspect(&lake, path, stop.flag(), &progress).await;
     }
@@ -90,14 +90,14 @@ pub(crate) async fn run(args: &IngestArgs, lake_url: &str) -> anyhow::Result<Don
     if nothing && !args.json {
         eprintln!("nothing to ingest: every run of the lake is in its tables");
     }
-    // Files that were named are the whole job; where none of them could be taken in, it failed.
+    // Files that were named are the whole job; if none of them could be taken in, it failed.
     if !args.runs.is_empty() && summary.taken.is_empty() && !summary.refused.is_empty() {
         anyhow::bail!("nothing was taken in");
     }
-    Ok(if summary.lost() { Done::WithLoss } else { Done::Whole })
+    Ok(if summary.lost() { CommandOutcome::WithLoss } else { CommandOutcome::Whole })
 }
 
-// With the recordings that a dead recorder left.
+// All pending files, with the recordings that a crashed recorder left.
 async fn all_pending(lake: &Lake) -> anyhow::Result<Vec<Source>> {
     for path in adopt_cut_off(lake).await? {
         eprintln!("`{path}` was cut off; what was complete is taken in");
@@ -105,14 +105,14 @@ async fn all_pending(lake: &Lake) -> anyhow::Result<Vec<Source>> {
     Ok(pending(lake).await?)
 }
 
-/// Takes in runs, then completes what waited for references.
+/// Ingests runs, then completes rows that waited for references.
 pub(crate) async fn take_in(
     lake: &Lake,
     sources: Vec<Source>,
     stop: &Arc<AtomicBool>,
-    progress: &Progress,
-) -> anyhow::Result<Summary> {
-    let mut summary = Summary::default();
+    progress: &CommandProgress,
+) -> anyhow::Result<IngestSummary> {
+    let mut summary = IngestSummary::default();
     let mut task = progress.task("ingest", sources.len() as u64, "runs");
     let mut ended = 0;
     let (suspects, sources): (Vec<_>, Vec<_>) =
@@ -157,8 +157,8 @@ async fn watch_suspect(
     lake: &Lake,
     suspect: &mut SuspectFile,
     stop: &AtomicBool,
-    summary: &mut Summary,
-    progress: &Progress,
+    summary: &mut IngestSummary,
+    progress: &CommandProgress,
 ) -> anyhow::Result<()> {
     let file = suspect.source().clone();
     let Source::Lake(path) = &file else { return Ok(()) };
@@ -183,7 +183,8 @@ async fn watch_suspect(
         let output = tokio::task::spawn_blocking(run).await?.context("cannot start a process")?;
         match output.status.code() {
             Some(0) => {
-                let mut theirs: Summary = serde_json::from_slice(&output.stdout).context("a process said no JSON")?;
+                let mut theirs: IngestSummary =
+                    serde_json::from_slice(&output.stdout).context("a process said no JSON")?;
                 summary.taken.append(&mut theirs.taken);
                 summary.refused.append(&mut theirs.refused);
                 return Ok(());
@@ -196,21 +197,26 @@ async fn watch_suspect(
 }
 
 // Takes in one file for the ingest that started this process, and ends with it.
-async fn take_in_suspect(lake: &Lake, path: &str, stop: &Arc<AtomicBool>, progress: &Progress) -> anyhow::Result<Done> {
+async fn take_in_suspect(
+    lake: &Lake,
+    path: &str,
+    stop: &Arc<AtomicBool>,
+    progress: &CommandProgress,
+) -> anyhow::Result<CommandOutcome> {
     std::thread::spawn(|| {
         let _ = std::io::stdin().read(&mut [0]);
         std::process::exit(1);
     });
-    let mut summary = Summary::default();
+    let mut summary = IngestSummary::default();
     let source = Source::Lake(ObjectPath::parse(path)?);
     Ingest::new(lake, stop.clone()).take_in(vec![source], &mut |report| summary.add(report, progress)).await?;
     super::print(&serde_json::to_string(&summary)?)?;
-    Ok(Done::Whole)
+    Ok(CommandOutcome::Whole)
 }
 
-// What comes into the inbox, until Ctrl-C. A file that somebody copies there grows while we look; one that is as it
-// was at the last look is whole.
-async fn watch(lake: &Lake, stop: &StopRequest, progress: &Progress) -> anyhow::Result<Done> {
+// Takes in new files of the inbox, until Ctrl-C. A file that is being copied there grows between two looks; one that is
+// as it was at the last look is whole.
+async fn watch(lake: &Lake, stop: &StopRequest, progress: &CommandProgress) -> anyhow::Result<CommandOutcome> {
     eprintln!("watching `{}/inbox`; Ctrl-C ends it", lake.location());
     let mut before: HashMap<ObjectPath, (u64, chrono::DateTime<chrono::Utc>)> = HashMap::new();
     // Refused files that are still where they were.
@@ -254,7 +260,7 @@ async fn watch(lake: &Lake, stop: &StopRequest, progress: &Progress) -> anyhow::
             }
         }
     }
-    Ok(if lost { Done::WithLoss } else { Done::Whole })
+    Ok(if lost { CommandOutcome::WithLoss } else { CommandOutcome::Whole })
 }
 
 // Ends early if a stop is requested.
@@ -262,7 +268,7 @@ async fn pause(time: Duration, stop: &StopRequest) {
     let _ = tokio::time::timeout(time, stop.wait()).await;
 }
 
-fn say(progress: &Progress, taken: &Taken) {
+fn say(progress: &CommandProgress, taken: &Taken) {
     let Taken { run, measurements, .. } = taken;
     match taken.outcome {
         Outcome::Known => progress.say(format!("{run}: is in the lake already, nothing added")),
@@ -276,7 +282,7 @@ fn say(progress: &Progress, taken: &Taken) {
     }
 }
 
-// A name that is a file is one; else it is looked for in the lake.
+// A name of an existing file is that file; any other is looked up in the lake.
 async fn sources_of(lake: &Lake, names: &[String]) -> anyhow::Result<Vec<Source>> {
     let mut sources = Vec::new();
     for name in names {

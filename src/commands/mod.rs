@@ -1,4 +1,4 @@
-//! The verbs, a file each.
+//! The verbs, one file each.
 
 mod acquire;
 #[cfg(feature = "lake")]
@@ -30,54 +30,54 @@ use clap::CommandFactory as _;
 use echolake_lake::{Error as LakeError, Lake};
 use echolake_schema::Rig;
 
-use crate::Done;
+use crate::CommandOutcome;
 #[cfg(feature = "lake")]
 use crate::cli::LakeCommand;
-use crate::cli::{Cli, Command, ViewerArgs};
-use crate::progress::Progress;
+use crate::cli::{CliArguments, CliCommand, ViewerArgs};
+use crate::progress::CommandProgress;
 use crate::signals::StopRequest;
 
 /// Gives up what the command's verb does not need. To be called before there are threads.
-pub(crate) fn confine(cli: &Cli) -> anyhow::Result<()> {
+pub(crate) fn confine(cli: &CliArguments) -> anyhow::Result<()> {
     match &cli.command {
         #[cfg(feature = "lake")]
-        Command::Lake(LakeCommand::Engine(args)) => args.confine(),
+        CliCommand::Lake(LakeCommand::Engine(args)) => args.confine(),
         _ => Ok(()),
     }
 }
 
 /// Runs the command's verb.
-pub(crate) async fn run(cli: Cli) -> anyhow::Result<Done> {
+pub(crate) async fn run(cli: CliArguments) -> anyhow::Result<CommandOutcome> {
     let lake = &cli.lake;
     match &cli.command {
         #[cfg(feature = "lake")]
-        Command::Lake(command) => run_lake(command, lake).await,
-        Command::Acquire(args) => acquire::run(args, lake).await,
-        Command::Panel(args) => panel::run(args),
-        Command::Replay(args) => replay::run(args, lake).await,
-        Command::Recover(args) => recover::run(args),
-        Command::Doctor(args) => doctor::run(args, lake).await,
-        Command::Completions { shell } => {
-            clap_complete::generate(*shell, &mut Cli::command(), "echolake", &mut std::io::stdout());
-            Ok(Done::Whole)
+        CliCommand::Lake(command) => run_lake(command, lake).await,
+        CliCommand::Acquire(args) => acquire::run(args, lake).await,
+        CliCommand::Panel(args) => panel::run(args),
+        CliCommand::Replay(args) => replay::run(args, lake).await,
+        CliCommand::Recover(args) => recover::run(args),
+        CliCommand::Doctor(args) => doctor::run(args, lake).await,
+        CliCommand::Completions { shell } => {
+            clap_complete::generate(*shell, &mut CliArguments::command(), "echolake", &mut std::io::stdout());
+            Ok(CommandOutcome::Whole)
         }
-        Command::Man { folder } => {
-            let written =
-                std::fs::create_dir_all(folder).and_then(|()| clap_mangen::generate_to(Cli::command(), folder));
+        CliCommand::Man { folder } => {
+            let written = std::fs::create_dir_all(folder)
+                .and_then(|()| clap_mangen::generate_to(CliArguments::command(), folder));
             written.with_context(|| format!("cannot write man pages to `{}`", folder.display()))?;
-            Ok(Done::Whole)
+            Ok(CommandOutcome::Whole)
         }
     }
 }
 
 /// Runs a verb that needs the lake's tables.
 #[cfg(feature = "lake")]
-async fn run_lake(command: &LakeCommand, lake: &str) -> anyhow::Result<Done> {
+async fn run_lake(command: &LakeCommand, lake: &str) -> anyhow::Result<CommandOutcome> {
     match command {
         LakeCommand::Demo(args) => demo::run(args, lake).await,
         LakeCommand::Import(args) => import::run(args, lake).await,
         LakeCommand::Ingest(args) => ingest::run(args, lake).await,
-        LakeCommand::Sql(args) => sql::run(args, lake).await.map(|()| Done::Whole),
+        LakeCommand::Sql(args) => sql::run(args, lake).await.map(|()| CommandOutcome::Whole),
         LakeCommand::Export(args) => export::run(args, lake).await,
         LakeCommand::Serve(args) => serve::run(args, lake).await,
         LakeCommand::Engine(args) => serve::engine(args, lake).await,
@@ -120,7 +120,7 @@ async fn rig_or(file: Option<&Path>, lake_url: &str, otherwise: impl FnOnce() ->
 fn inbox(lake: &Lake) -> anyhow::Result<std::path::PathBuf> {
     let folder = lake.folder().context("recordings need a lake in a folder; hint: --lake FOLDER")?.join("inbox");
     std::fs::create_dir_all(&folder).with_context(|| format!("cannot make `{}`", folder.display()))?;
-    // A recording that is on the disk is of no use where its folder's name is not, or the lake's.
+    // A synced recording is of no use if its folder's name, or the lake's, is not synced.
     for above in folder.ancestors().skip(1).take(2) {
         let above = if above.as_os_str().is_empty() { Path::new(".") } else { above };
         let synced = std::fs::File::open(above).and_then(|opened| opened.sync_all());
@@ -129,8 +129,8 @@ fn inbox(lake: &Lake) -> anyhow::Result<std::path::PathBuf> {
     Ok(folder)
 }
 
-/// Tells who may look on at an address, and how others may.
-fn tell_access(viewers: &ViewerArgs, address: SocketAddr, progress: &Progress) {
+/// Prints which viewers have access at an address, and how to let in others.
+fn tell_access(viewers: &ViewerArgs, address: SocketAddr, progress: &CommandProgress) {
     if viewers.allowed_origins.is_empty() {
         progress.say("hint: a viewer on the web needs its address: --allow-origin https://app.foxglove.dev");
     }

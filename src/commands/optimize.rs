@@ -2,14 +2,14 @@
 
 use echolake_lake::{Lake, TableOptimized};
 
-use crate::Done;
+use crate::CommandOutcome;
 use crate::cli::OptimizeArgs;
-use crate::progress::Progress;
+use crate::progress::CommandProgress;
 
-pub(crate) async fn run(args: &OptimizeArgs, lake_url: &str) -> anyhow::Result<Done> {
+pub(crate) async fn run(args: &OptimizeArgs, lake_url: &str) -> anyhow::Result<CommandOutcome> {
     let stop = super::stop_request()?;
     let lake = Lake::open(lake_url).await?;
-    let progress = Progress::new();
+    let progress = CommandProgress::new();
     let mut task = None;
     let done = lake
         .optimize(args.target_mb << 20, stop.flag(), &mut |at| {
@@ -30,7 +30,7 @@ pub(crate) async fn run(args: &OptimizeArgs, lake_url: &str) -> anyhow::Result<D
     if report.stopped {
         anyhow::bail!("stopped; what was merged stays so, and the same command goes on");
     }
-    Ok(Done::Whole)
+    Ok(CommandOutcome::Whole)
 }
 
 fn text(tables: &[TableOptimized]) -> String {

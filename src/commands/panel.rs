@@ -10,7 +10,7 @@ use clap::Args;
 use echolake_acquisition::mesh::{BACK_MM, Format, Mesh};
 use echolake_acquisition::relief::{HeightField, Relief};
 
-use crate::Done;
+use crate::CommandOutcome;
 
 /// Cells along each side of a mesh of the older reliefs, and of those whose joints are 1 mm wide.
 const CELLS: usize = 274;
@@ -68,7 +68,7 @@ pub(crate) struct PanelArgs {
     results: Option<PathBuf>,
 }
 
-pub(crate) fn run(args: &PanelArgs) -> anyhow::Result<Done> {
+pub(crate) fn run(args: &PanelArgs) -> anyhow::Result<CommandOutcome> {
     if args.list {
         return list::run(args.name.as_deref(), args.json);
     }
@@ -87,24 +87,24 @@ pub(crate) fn run(args: &PanelArgs) -> anyhow::Result<Done> {
     if let Some(back) = &mut back {
         super::acquire::set_all(back, &args.back_set)?;
     }
-    // What can be refused is refused before anything is written.
-    let kinds = args.output.iter().map(|path| Kind::of(path)).collect::<anyhow::Result<Vec<_>>>()?;
+    // Wrong arguments are refused before anything is written.
+    let kinds = args.output.iter().map(|path| OutputKind::of(path)).collect::<anyhow::Result<Vec<_>>>()?;
     for (path, kind) in args.output.iter().zip(kinds) {
         write_one(path, kind, &front, back.as_ref(), args.cells.map(|n| n as usize))?;
     }
-    Ok(Done::Whole)
+    Ok(CommandOutcome::Whole)
 }
 
-/// What a file is to hold.
+/// The content of an output file.
 #[derive(Debug, Clone, Copy)]
-enum Kind {
+enum OutputKind {
     Mesh(Format),
     Picture,
     Heights,
     Parameters,
 }
 
-impl Kind {
+impl OutputKind {
     fn of(path: &Path) -> anyhow::Result<Self> {
         Ok(match path.extension().and_then(|e| e.to_str()).map(str::to_ascii_lowercase).as_deref() {
             Some("png") => Self::Picture,
@@ -131,13 +131,13 @@ impl Kind {
 
 fn write_one(
     path: &Path,
-    kind: Kind,
+    kind: OutputKind,
     front: &Relief,
     back: Option<&Relief>,
     cells: Option<usize>,
 ) -> anyhow::Result<()> {
     match (kind, back) {
-        (Kind::Mesh(format), _) => {
+        (OutputKind::Mesh(format), _) => {
             let field = |relief: &Relief| -> HeightField { relief.height_field(cells.unwrap_or(mesh_cells(relief))) };
             let mesh = match back {
                 Some(back) => Mesh::double_sided(&field(front), &field(back)),

@@ -5,10 +5,10 @@ use std::path::Path;
 use anyhow::ensure;
 use echolake_acquisition::recovery::{Report, beside, recover};
 
-use crate::Done;
+use crate::CommandOutcome;
 use crate::cli::RecoverArgs;
 
-pub(crate) fn run(args: &RecoverArgs) -> anyhow::Result<Done> {
+pub(crate) fn run(args: &RecoverArgs) -> anyhow::Result<CommandOutcome> {
     let to = args.output.clone().unwrap_or_else(|| beside(&args.file));
     let is_same = || matches!((args.file.canonicalize(), to.canonicalize()), (Ok(a), Ok(b)) if a == b);
     ensure!(!is_same(), "`{}` would be overwritten; hint: give another name with -o", args.file.display());
@@ -17,7 +17,11 @@ pub(crate) fn run(args: &RecoverArgs) -> anyhow::Result<Done> {
         true => super::print(&serde_json::to_string_pretty(&report)?)?,
         false => tell(&report)?,
     }
-    Ok(if report.lost_bytes() > 0 || report.defect.is_some() { Done::WithLoss } else { Done::Whole })
+    Ok(if report.lost_bytes() > 0 || report.defect.is_some() {
+        CommandOutcome::WithLoss
+    } else {
+        CommandOutcome::Whole
+    })
 }
 
 fn tell(report: &Report) -> anyhow::Result<()> {

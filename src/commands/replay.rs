@@ -1,4 +1,4 @@
-//! `echolake replay`: runs shown again to Foxglove, as fast and from where its user likes.
+//! `echolake replay`: replays runs to Foxglove, with speed and position under its user's control.
 
 use std::path::{Path, PathBuf};
 use std::time::Duration;
@@ -10,20 +10,20 @@ use echolake_lake::Lake;
 #[cfg(feature = "lake")]
 use echolake_schema::{RunId, SurfaceId};
 
-use crate::Done;
+use crate::CommandOutcome;
 use crate::cli::ReplayArgs;
-use crate::progress::{Progress, Task};
+use crate::progress::{CommandProgress, TaskProgress};
 
-/// How often it is looked how the replay stands.
+/// Time between two looks at the state of the replay.
 const LOOK_EVERY: Duration = Duration::from_millis(200);
 /// Names that an error lists.
 #[cfg(feature = "lake")]
 const LISTED: usize = 20;
 
-pub(crate) async fn run(args: &ReplayArgs, lake_url: &str) -> anyhow::Result<Done> {
+pub(crate) async fn run(args: &ReplayArgs, lake_url: &str) -> anyhow::Result<CommandOutcome> {
     let stop = super::stop_request()?;
     let paths = paths(&args.runs, lake_url).await?;
-    let progress = Progress::new();
+    let progress = CommandProgress::new();
     let (recordings, lost) = tokio::task::block_in_place(|| open(&paths, &progress));
     anyhow::ensure!(!recordings.is_empty(), "none of the recordings can be replayed");
     let count = recordings.len();
@@ -43,11 +43,11 @@ pub(crate) async fn run(args: &ReplayArgs, lake_url: &str) -> anyhow::Result<Don
     show(&mut task, &standing, &mut said);
     tokio::task::block_in_place(|| drop(server));
     task.done(format!("{count} recordings, {:.0} s shown last", standing.shown_secs));
-    Ok(if lost || !standing.damages.is_empty() { Done::WithLoss } else { Done::Whole })
+    Ok(if lost || !standing.damages.is_empty() { CommandOutcome::WithLoss } else { CommandOutcome::Whole })
 }
 
-// By their times; and whether something is not whole.
-fn open(paths: &[PathBuf], progress: &Progress) -> (Vec<Recording>, bool) {
+// Opens recordings, sorted by time; returns also whether one is damaged.
+fn open(paths: &[PathBuf], progress: &CommandProgress) -> (Vec<Recording>, bool) {
     let (mut recordings, mut lost) = (Vec::new(), false);
     for opened in paths.iter().map(|path| Recording::open(path)) {
         match opened {
@@ -73,7 +73,7 @@ fn open(paths: &[PathBuf], progress: &Progress) -> (Vec<Recording>, bool) {
     (recordings, lost)
 }
 
-fn show(task: &mut Task, standing: &Standing, said: &mut usize) {
+fn show(task: &mut TaskProgress, standing: &Standing, said: &mut usize) {
     for damage in &standing.damages[*said..] {
         task.say(&format!("warning: {damage}"));
     }
@@ -104,7 +104,7 @@ async fn paths(names: &[String], lake_url: &str) -> anyhow::Result<Vec<PathBuf>>
     Ok(paths)
 }
 
-// Of a surface its newest run.
+// The file of a run, or of a surface's newest run.
 #[cfg(feature = "lake")]
 async fn run_file(lake: &Lake, name: &str) -> anyhow::Result<PathBuf> {
     let folder =

@@ -1,4 +1,4 @@
-//! `echolake serve` and `echolake token`: the lake over HTTP, Flight SQL and Postgres, for those who may.
+//! `echolake serve` and `echolake token`: the lake over HTTP, Flight SQL and Postgres, with access control.
 
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 use std::path::PathBuf;
@@ -7,13 +7,13 @@ use std::str::FromStr;
 use anyhow::Context as _;
 use echolake_lake::Lake;
 use echolake_server::engine::{confinement, run_engine};
-use echolake_server::tokens::{self, Tokens};
-use echolake_server::{CataloguePages, EngineSettings, Error, Server, Settings};
+use echolake_server::tokens::{self, TokenFile};
+use echolake_server::{CataloguePages, EngineSettings, Error, LakeServer, ServerSettings};
 
-use crate::Done;
+use crate::CommandOutcome;
 use crate::signals::StopRequest;
 
-/// Memory for queries, and engines at once, if nobody says otherwise.
+/// Memory for queries, and engines at once, by default.
 const MEMORY_MIB: u32 = 4096;
 const ENGINES: u32 = 16;
 
@@ -21,13 +21,13 @@ const ENGINES: u32 = 16;
 pub(crate) struct ServeArgs {
     /// Address for HTTP, `off` for none; port 0 for any that is free, and so below.
     #[arg(long, value_name = "ADDRESS", default_value = "127.0.0.1:8080")]
-    listen: Listen,
+    listen: ListenAddress,
     /// Address for Arrow Flight SQL.
     #[arg(long, value_name = "ADDRESS", default_value = "127.0.0.1:8081")]
-    flight_sql: Listen,
+    flight_sql: ListenAddress,
     /// Address for Postgres' protocol.
     #[arg(long, value_name = "ADDRESS", default_value = "127.0.0.1:5433")]
-    postgres: Listen,
+    postgres: ListenAddress,
     /// File of tokens, without which only this machine may ask; `echolake token` makes its lines.
     #[arg(long, value_name = "FILE")]
     tokens: Option<PathBuf>,
@@ -42,7 +42,7 @@ pub(crate) struct ServeArgs {
     temp: Option<PathBuf>,
 }
 
-/// What `serve` starts its engines with.
+/// Arguments with which `serve` starts its engines.
 #[derive(Debug, clap::Args)]
 pub(crate) struct EngineArgs {
     /// Folder for its sockets.
@@ -66,20 +66,20 @@ impl EngineArgs {
 }
 
 /// Answers one client's queries, until the door that started it ends.
-pub(crate) async fn engine(args: &EngineArgs, lake_url: &str) -> anyhow::Result<Done> {
+pub(crate) async fn engine(args: &EngineArgs, lake_url: &str) -> anyhow::Result<CommandOutcome> {
     let lake = Lake::open(lake_url).await?;
     run_engine(&lake, &args.sockets, Some(args.memory_bytes)).await?;
-    Ok(Done::Whole)
+    Ok(CommandOutcome::Whole)
 }
 
-/// Where to listen.
+/// A listening address, or none.
 #[derive(Debug, Clone, Copy)]
-enum Listen {
+enum ListenAddress {
     Off,
     On(SocketAddr),
 }
 
-impl FromStr for Listen {
+impl FromStr for ListenAddress {
     type Err = String;
 
     fn from_str(text: &str) -> Result<Self, String> {
@@ -90,7 +90,7 @@ impl FromStr for Listen {
     }
 }
 
-impl Listen {
+impl ListenAddress {
     fn address(self) -> Option<SocketAddr> {
         match self {
             Self::Off => None,
@@ -99,20 +99,20 @@ impl Listen {
     }
 }
 
-/// Where HTTP is served if nobody says otherwise.
+/// The default address of HTTP.
 const HTTP: SocketAddr = SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 8080);
 
-pub(crate) async fn run(args: &ServeArgs, lake_url: &str) -> anyhow::Result<Done> {
+pub(crate) async fn run(args: &ServeArgs, lake_url: &str) -> anyhow::Result<CommandOutcome> {
     let stop = StopRequest::listen("stopping: answers may go on for five seconds; Ctrl-C again stops at once")?;
     let lake = Lake::open(lake_url).await?;
-    let settings = Settings {
+    let settings = ServerSettings {
         http: args.listen.address(),
         flight_sql: args.flight_sql.address(),
         postgres: args.postgres.address(),
-        tokens: args.tokens.as_deref().map(Tokens::read).transpose()?,
+        tokens: args.tokens.as_deref().map(TokenFile::read).transpose()?,
         engines: engines(args.memory, args.engines, args.temp.clone())?,
     };
-    let server = Server::bind(&lake, settings)?;
+    let server = LakeServer::bind(&lake, settings)?;
     anyhow::ensure!(!server.addresses().is_empty(), "nothing to listen on; hint: all three are off");
     eprintln!("lake {}", lake.location());
     if let Some(missing) = confinement::missing() {
@@ -121,13 +121,18 @@ pub(crate) async fn run(args: &ServeArgs, lake_url: &str) -> anyhow::Result<Done
     answer(server, &stop).await
 }
 
-/// Serves the catalogue alone, where others look for it or, if somebody else is there, on any port that is free.
-pub(crate) async fn catalogue(lake: &Lake, stop: &StopRequest) -> anyhow::Result<Done> {
+/// Serves the catalogue alone, at the default address or, if that is taken, on any free port.
+pub(crate) async fn catalogue(lake: &Lake, stop: &StopRequest) -> anyhow::Result<CommandOutcome> {
     let engines = engines(MEMORY_MIB, ENGINES, None)?;
-    let settings =
-        |http| Settings { http: Some(http), flight_sql: None, postgres: None, tokens: None, engines: engines.clone() };
-    let server = match Server::bind(lake, settings(HTTP)) {
-        Err(Error::Bind { .. }) => Server::bind(lake, settings(SocketAddr::new(HTTP.ip(), 0)))?,
+    let settings = |http| ServerSettings {
+        http: Some(http),
+        flight_sql: None,
+        postgres: None,
+        tokens: None,
+        engines: engines.clone(),
+    };
+    let server = match LakeServer::bind(lake, settings(HTTP)) {
+        Err(Error::Bind { .. }) => LakeServer::bind(lake, settings(SocketAddr::new(HTTP.ip(), 0)))?,
         bound => bound?,
     };
     eprintln!("the catalogue, until Ctrl-C:");
@@ -139,7 +144,7 @@ fn engines(memory_mib: u32, count: u32, temp: Option<PathBuf>) -> anyhow::Result
     Ok(EngineSettings { program, memory: (memory_mib as usize) << 20, count: count as usize, temp })
 }
 
-async fn answer(server: Server, stop: &StopRequest) -> anyhow::Result<Done> {
+async fn answer(server: LakeServer, stop: &StopRequest) -> anyhow::Result<CommandOutcome> {
     if let Some(problem) = CataloguePages::THIS_BUILD.problem() {
         eprintln!("note: this program was {problem}");
     }
@@ -147,13 +152,13 @@ async fn answer(server: Server, stop: &StopRequest) -> anyhow::Result<Done> {
         eprintln!("  {address}");
     }
     server.run(stop.wait()).await?;
-    Ok(Done::Whole)
+    Ok(CommandOutcome::Whole)
 }
 
 /// Prints a new token to stderr, once, and its lines for the file of tokens to stdout.
-pub(crate) fn token(name: &str) -> anyhow::Result<Done> {
+pub(crate) fn token(name: &str) -> anyhow::Result<CommandOutcome> {
     let fresh = tokens::fresh(name)?;
     eprintln!("{}\nthis token is kept nowhere: only its hash is, in the lines for the file of --tokens", fresh.token);
     super::print(fresh.lines.trim_end())?;
-    Ok(Done::Whole)
+    Ok(CommandOutcome::Whole)
 }

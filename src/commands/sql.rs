@@ -95,7 +95,7 @@ async fn write(mut answer: Answer, format: Format, to: impl Write + Send) -> any
     Ok(rows)
 }
 
-// Beside its place first, so that a file is whole or not there. A device or a pipe is written as it is.
+// Written beside its path first, so that a file is whole or not there. A device or a pipe is written directly.
 async fn to_file(answer: Answer, format: Format, path: &Path) -> anyhow::Result<usize> {
     let failed = || format!("cannot write `{}`", path.display());
     if path.metadata().is_ok_and(|m| !m.is_file()) {
@@ -113,7 +113,7 @@ async fn to_file(answer: Answer, format: Format, path: &Path) -> anyhow::Result<
         Ok(rows)
     });
     if named.is_err() {
-        // The first error is the one to tell.
+        // The first error is the one to report.
         let _ = std::fs::remove_file(&partial);
     }
     named

@@ -3,14 +3,14 @@
 use chrono::TimeDelta;
 use echolake_lake::{Deletion, Lake};
 
-use crate::Done;
+use crate::CommandOutcome;
 use crate::cli::VacuumArgs;
-use crate::progress::Progress;
+use crate::progress::CommandProgress;
 
-pub(crate) async fn run(args: &VacuumArgs, lake_url: &str) -> anyhow::Result<Done> {
+pub(crate) async fn run(args: &VacuumArgs, lake_url: &str) -> anyhow::Result<CommandOutcome> {
     let lake = Lake::open(lake_url).await?;
     let deletion = if args.dry_run { Deletion::Pretended } else { Deletion::Real };
-    let progress = Progress::new();
+    let progress = CommandProgress::new();
     let mut task = None;
     let report = lake
         .vacuum(TimeDelta::hours(args.keep_hours.into()), deletion, &mut |done, total| {
@@ -22,7 +22,7 @@ pub(crate) async fn run(args: &VacuumArgs, lake_url: &str) -> anyhow::Result<Don
     }
     if args.json {
         super::print(&serde_json::to_string_pretty(&report)?)?;
-        return Ok(Done::Whole);
+        return Ok(CommandOutcome::Whole);
     }
     if args.dry_run {
         for file in &report.files {
@@ -31,5 +31,5 @@ pub(crate) async fn run(args: &VacuumArgs, lake_url: &str) -> anyhow::Result<Don
     }
     let would = if args.dry_run { "would be " } else { "" };
     super::print(&format!("{} files, {} {would}freed", report.files.len(), super::size(report.bytes)))?;
-    Ok(Done::Whole)
+    Ok(CommandOutcome::Whole)
 }

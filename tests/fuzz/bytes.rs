@@ -7,10 +7,10 @@ use std::time::{Duration, Instant};
 use rand::{Rng as _, RngCore as _};
 use rand_chacha::ChaCha8Rng;
 
-/// No answer to changed bytes goes on for so long.
+/// Time after which an answer to changed bytes is taken for endless.
 const LONGEST_ANSWER: Duration = Duration::from_secs(300);
 
-/// What four bytes are replaced by: lengths and counts at their edges.
+/// Replacements of four bytes: lengths and counts at their edges.
 const EXTREMES: [u32; 8] = [0, 1, 3, 0x7f, 0xffff, 0x7fff_ffff, 0x8000_0000, 0xffff_ffff];
 
 /// Turns, replaces, removes or doubles some bytes, or cuts off the end; says what it did.

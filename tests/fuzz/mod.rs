@@ -1,5 +1,5 @@
 //! Hostile input against a server: changed SQL, changed bytes of each protocol, changed run files. Whatever comes, the
-//! process goes on and answers the next client, and nothing in it panics but pgwire's decoder, which ends the connection
+//! process lives and answers the next client, and nothing in it panics but pgwire's decoder, which ends the connection
 //! that it decodes for.
 
 use std::path::Path;
@@ -10,24 +10,24 @@ use rand_chacha::ChaCha8Rng;
 
 use super::SMALL_RIG;
 use super::child::run_command;
-use super::serve::http::Request;
-use super::serve::server::Served;
+use super::serve::http::HttpRequest;
+use super::serve::server::ServedLake;
 
 mod bytes;
 mod sql;
 
-/// What a query may take of time and memory, and how many rows it may have.
+/// Limits of a query: time, memory, and rows.
 const LIMITS: &str = "seconds = 2\nmemory_mb = 200\nrows = 100000\n";
-/// How long to wait for more of an answer to changed bytes: many are the beginning of a request, and get none.
+/// Time to wait for more of an answer to changed bytes: many are the beginning of a request, and get none.
 const PATIENCE: Duration = Duration::from_secs(1);
-/// How long to wait for the rest of a backtrace.
+/// Time to wait for the rest of a backtrace.
 const BACKTRACE_LIMIT: Duration = Duration::from_secs(60);
 /// A server on which a plain query runs out of time for so long is harmed.
 const BUSY: Duration = Duration::from_secs(60);
 
-/// What is changed.
+/// The input that is changed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Target {
+pub(crate) enum FuzzTarget {
     /// The text of queries, over HTTP.
     Sql,
     /// The bytes of HTTP, Flight SQL and Postgres' protocol.
@@ -36,7 +36,7 @@ pub(crate) enum Target {
     Mcap,
 }
 
-impl Target {
+impl FuzzTarget {
     /// All targets.
     pub(crate) const ALL: [Self; 3] = [Self::Sql, Self::Wire, Self::Mcap];
 
@@ -50,9 +50,9 @@ impl Target {
     }
 }
 
-/// How a campaign went.
+/// Counts of a campaign.
 #[derive(Debug, Default)]
-pub(crate) struct Outcome {
+pub(crate) struct FuzzCounts {
     pub(crate) rounds: usize,
     /// Rounds whose query did not fail, or whose bytes got some back.
     pub(crate) answered: usize,
@@ -63,15 +63,15 @@ pub(crate) struct Outcome {
 }
 
 /// A server and what is thrown at it.
-pub(crate) struct Campaign {
+pub(crate) struct FuzzCampaign {
     folder: tempfile::TempDir,
-    server: Served,
+    server: ServedLake,
     token: String,
     random: ChaCha8Rng,
     run: Vec<u8>,
 }
 
-impl Campaign {
+impl FuzzCampaign {
     /// Measures a surface, ingests it, and serves the lake.
     pub(crate) fn new(binary: &Path, seed: u64) -> Self {
         let folder = tempfile::tempdir().expect("a folder");
@@ -91,7 +91,7 @@ impl Campaign {
         let entry = String::from_utf8(made.stdout).expect("text");
         let named = entry.split("seconds").next().expect("who it is");
         std::fs::write(path("tokens.toml"), format!("{named}{LIMITS}")).expect("written");
-        let server = Served::start(binary, folder.path(), &["--tokens", "tokens.toml", "--memory", "1000"]);
+        let server = ServedLake::start(binary, folder.path(), &["--tokens", "tokens.toml", "--memory", "1000"]);
         let file = run_file(&path("lake/runs/flat"));
         let bytes = std::fs::read(file).expect("a run");
         Self { server, token, random: ChaCha8Rng::seed_from_u64(seed), run: bytes, folder }
@@ -100,14 +100,14 @@ impl Campaign {
     /// Throws one thing after the other for as long as `go_on` says.
     ///
     /// # Panics
-    /// Where the server is harmed; the text says by what.
-    pub(crate) fn throw(&mut self, target: Target, go_on: &mut dyn FnMut(&Outcome) -> bool) -> Outcome {
-        let mut outcome = Outcome::default();
+    /// The server is harmed; the text names the cause.
+    pub(crate) fn throw(&mut self, target: FuzzTarget, go_on: &mut dyn FnMut(&FuzzCounts) -> bool) -> FuzzCounts {
+        let mut outcome = FuzzCounts::default();
         while go_on(&outcome) {
             let (thrown, answered) = match target {
-                Target::Sql => self.sql(),
-                Target::Wire => self.wire(),
-                Target::Mcap => self.mcap(),
+                FuzzTarget::Sql => self.sql(),
+                FuzzTarget::Wire => self.wire(),
+                FuzzTarget::Mcap => self.mcap(),
             };
             outcome.rounds += 1;
             outcome.answered += usize::from(answered);
@@ -142,7 +142,7 @@ impl Campaign {
     }
 
     fn ask(&self, query: &str) -> (u16, String) {
-        let answer = Request::post("/api/v1/sql", query)
+        let answer = HttpRequest::post("/api/v1/sql", query)
             .with("content-type", "text/plain")
             .with("authorization", &format!("Bearer {}", self.token))
             .attempt(&self.server);
@@ -153,7 +153,7 @@ impl Campaign {
 
     fn asked(&self, query: &str) -> bool {
         let (status, body) = self.ask(query);
-        // 507 is the limit of memory; 503 comes where `version as of` names a version that the lake does not have.
+        // 507 is the limit of memory; 503 is the answer if `version as of` names a version that the lake does not have.
         assert!(status < 500 || status == 503 || status == 507, "{status} by {query:?}: {body}");
         status == 200
     }

@@ -2,15 +2,15 @@
 
 use serde_json::Value;
 
-use super::contract::Contract;
-use super::http::Request;
-use super::server::Served;
+use super::contract::ApiContract;
+use super::http::HttpRequest;
+use super::server::ServedLake;
 use super::{get, json, refused, served};
-use crate::{Place, PlaceTemplate};
+use crate::{TestFolder, TestFolderTemplate};
 
 /// Reliefs with both references, so that every answer has something in it.
-pub(crate) fn lake() -> Place {
-    static THREE_RUNS: PlaceTemplate = PlaceTemplate::new();
+pub(crate) fn lake() -> TestFolder {
+    static THREE_RUNS: TestFolderTemplate = TestFolderTemplate::new();
     THREE_RUNS.place(|place| {
         for surface in ["flat", "foam", "brick"] {
             place.acquire(surface, &["--ir-only"]);
@@ -19,7 +19,7 @@ pub(crate) fn lake() -> Place {
     })
 }
 
-fn run_of(server: &Served, surface: &str) -> String {
+fn run_of(server: &ServedLake, surface: &str) -> String {
     let runs = json(&get(server, &format!("/api/v1/runs?surface_id={surface}")));
     runs["items"][0]["run_id"].as_str().expect("a run").to_owned()
 }
@@ -40,7 +40,7 @@ fn filled(template: &str, surface: &str, run: &str, file: &str) -> String {
 fn every_path_keeps_the_contract() {
     let place = lake();
     let server = served(&place, &[]);
-    let contract = Contract::read();
+    let contract = ApiContract::read();
     let run = run_of(&server, "brick");
     let files = json(&get(&server, "/api/v1/tables/points"));
     let file = files[0]["file"].as_str().expect("a file");
@@ -81,7 +81,7 @@ fn curves_and_responses_come_as_arrow_too() {
     let place = lake();
     let server = served(&place, &[]);
     for path in ["/api/v1/surfaces/brick/curves", "/api/v1/surfaces/brick/pairs/7"] {
-        let arrow = Request::get(path).with("accept", "application/vnd.apache.arrow.stream").send(&server);
+        let arrow = HttpRequest::get(path).with("accept", "application/vnd.apache.arrow.stream").send(&server);
         assert_eq!(arrow.header("content-type"), Some("application/vnd.apache.arrow.stream"));
         assert_eq!(arrow.body[..4], [0xff; 4], "a stream's first message");
         let plain = get(&server, path);
@@ -156,14 +156,14 @@ fn answers_are_kept_until_the_lake_changes() {
     let server = served(&place, &[]);
     let before = get(&server, "/api/v1/surfaces");
     let tag = before.header("etag").expect("a tag").to_owned();
-    let again = Request::get("/api/v1/surfaces").with("if-none-match", &tag).send(&server);
+    let again = HttpRequest::get("/api/v1/surfaces").with("if-none-match", &tag).send(&server);
     assert_eq!((again.status, again.body.len()), (304, 0));
-    let packed = Request::get("/api/v1/surfaces").with("accept-encoding", "gzip").send(&server);
+    let packed = HttpRequest::get("/api/v1/surfaces").with("accept-encoding", "gzip").send(&server);
     assert_eq!(packed.header("content-encoding"), Some("gzip"));
     assert!(packed.body.len() < before.body.len() / 2);
     place.acquire("wavy", &["--ir-only"]);
     place.ok(&["ingest"]);
-    let after = Request::get("/api/v1/surfaces").with("if-none-match", &tag).send(&server);
+    let after = HttpRequest::get("/api/v1/surfaces").with("if-none-match", &tag).send(&server);
     assert_eq!((after.status, json(&after)["total"].as_u64()), (200, Some(4)));
     assert_ne!(after.header("etag"), Some(tag.as_str()));
 }
@@ -175,7 +175,8 @@ fn run_files_come_in_ranges_to_viewers_of_elsewhere() {
     let run = run_of(&server, "brick");
     let path = format!("/api/v1/runs/{run}/file.mcap");
     let file = std::fs::read(place.path(&format!("lake/runs/brick/{run}.mcap"))).expect("the file");
-    let foreign = || Request::get(&path).with("origin", "https://viewer.example").with("sec-fetch-site", "cross-site");
+    let foreign =
+        || HttpRequest::get(&path).with("origin", "https://viewer.example").with("sec-fetch-site", "cross-site");
     // A viewer begins with a plain GET and breaks it off once it has seen the headers.
     drop(foreign().begin(&server));
     let whole = foreign().send(&server);
@@ -209,7 +210,7 @@ fn run_files_come_in_ranges_to_viewers_of_elsewhere() {
     assert_eq!(foreign().with("if-none-match", &tag).send(&server).status, 304);
     let ranged = |known: &str| foreign().with("range", "bytes=0-7").with("if-range", known).send(&server).status;
     assert_eq!((ranged(&tag), ranged("\"other\"")), (206, 200));
-    let asked = Request::options(&path)
+    let asked = HttpRequest::options(&path)
         .with("origin", "https://viewer.example")
         .with("access-control-request-method", "GET")
         .with("access-control-request-headers", "range")
@@ -219,7 +220,7 @@ fn run_files_come_in_ranges_to_viewers_of_elsewhere() {
     assert!(asked.header("access-control-allow-headers").is_some_and(|h| h.contains("range")));
     assert_eq!(asked.header("access-control-allow-private-network"), Some("true"));
     // All else is for the server's own pages.
-    let other = |path: &str| Request::get(path).with("origin", "https://viewer.example").send(&server);
+    let other = |path: &str| HttpRequest::get(path).with("origin", "https://viewer.example").send(&server);
     assert_eq!(other("/api/v1/runs").status, 403);
     assert_eq!(other("/api/v1/tables/points").status, 403);
 }
@@ -274,7 +275,7 @@ fn what_is_asked_stays_data() {
     }
     // Bytes that are no text.
     assert_eq!(get(&server, "/api/v1/surfaces/%ff").status, 400);
-    let wrong = Request::post("/api/v1/lake", "").send(&server);
+    let wrong = HttpRequest::post("/api/v1/lake", "").send(&server);
     refused(&wrong, 405, "method_not_allowed");
     assert!(wrong.header("allow").is_some_and(|methods| methods.contains("GET")), "{:?}", wrong.header("allow"));
 }
@@ -283,9 +284,9 @@ fn what_is_asked_stays_data() {
 fn a_session_stands_for_a_token() {
     let place = lake();
     let open = served(&place, &[]);
-    let shown = |server: &Served, token: &str| {
+    let shown = |server: &ServedLake, token: &str| {
         let body = serde_json::json!({ "token": token }).to_string();
-        Request::post("/api/v1/session", &body).with("content-type", "application/json").send(server)
+        HttpRequest::post("/api/v1/session", &body).with("content-type", "application/json").send(server)
     };
     assert_eq!(shown(&open, "x").status, 404, "no tokens, no sessions");
     let made = place.run(&["token", "reader"]);
@@ -301,13 +302,13 @@ fn a_session_stands_for_a_token() {
     assert!(!cookie.contains(&token), "the token itself is kept nowhere");
     let cookie = cookie.split(';').next().expect("name and value");
     let with = |name: &str, value: &str| {
-        Request::get("/api/v1/surfaces").with("cookie", cookie).with(name, value).send(&server).status
+        HttpRequest::get("/api/v1/surfaces").with("cookie", cookie).with(name, value).send(&server).status
     };
     assert_eq!(with("sec-fetch-site", "same-origin"), 200);
     assert_eq!(with("sec-fetch-site", "same-site"), 403, "a page on another port of this machine");
     assert_eq!(with("origin", "http://localhost:1"), 403);
-    assert_eq!(Request::get("/api/v1/surfaces").with("cookie", "echolake=00").send(&server).status, 401);
-    // What was kept for one is not given to another who may not ask.
+    assert_eq!(HttpRequest::get("/api/v1/surfaces").with("cookie", "echolake=00").send(&server).status, 401);
+    // A cached answer is not given to a client that is not authorised for it.
     assert_eq!(get(&server, "/api/v1/surfaces").status, 401);
 }
 
@@ -318,19 +319,19 @@ fn pages_are_part_of_the_program() {
     let server = served(&place, &[]);
     for address in ["/", "/surfaces/brick", "/sql?q=select%201"] {
         // A link on another page leads here.
-        let page = Request::get(address).with("sec-fetch-site", "cross-site").send(&server);
+        let page = HttpRequest::get(address).with("sec-fetch-site", "cross-site").send(&server);
         assert_eq!((page.status, page.header("content-type")), (200, Some("text/html; charset=utf-8")), "{address}");
         let policy = page.header("content-security-policy").expect("a policy");
         assert!(policy.contains("script-src 'self'") && !policy.contains("unsafe"), "{policy}");
     }
     let page = get(&server, "/").text();
     let script = page.split('"').find(|part| part.starts_with("/assets/") && part.ends_with(".js")).expect("a script");
-    let packed = Request::get(script).with("accept-encoding", "gzip, br").send(&server);
+    let packed = HttpRequest::get(script).with("accept-encoding", "gzip, br").send(&server);
     assert_eq!(packed.header("content-encoding"), Some("br"));
     assert!(packed.header("cache-control").is_some_and(|c| c.contains("immutable")));
     assert!(packed.body.len() < get(&server, script).body.len());
     let tag = packed.header("etag").expect("a tag").to_owned();
-    assert_eq!(Request::get(script).with("if-none-match", &tag).send(&server).status, 304);
+    assert_eq!(HttpRequest::get(script).with("if-none-match", &tag).send(&server).status, 304);
     assert_eq!(get(&server, "/assets/none.js").status, 404);
     assert_eq!(get(&server, "/favicon.ico").status, 404);
 }

@@ -3,9 +3,9 @@
 use serde_json::Value;
 
 /// The document that server and pages agree on.
-pub(super) struct Contract(Value);
+pub(super) struct ApiContract(Value);
 
-impl Contract {
+impl ApiContract {
     pub(super) fn read() -> Self {
         Self(serde_json::from_str(include_str!("../../web/openapi.json")).expect("JSON"))
     }
@@ -16,7 +16,7 @@ impl Contract {
         paths.iter().filter(|(_, methods)| methods.get("get").is_some()).map(|(path, _)| path.as_str())
     }
 
-    /// What is wrong with an answer to GET.
+    /// Returns the defects of an answer to GET.
     pub(super) fn objections(&self, path: &str, status: u16, media_type: &str, body: &[u8]) -> Vec<String> {
         let responses = &self.0["paths"][path]["get"]["responses"];
         let own = responses.get(status.to_string());

@@ -15,19 +15,19 @@ use tonic::transport::{Channel, Endpoint};
 
 use attempts::{SECRET, files};
 
-use super::http::Request;
-use super::server::{ANSWER_LIMIT, Served};
+use super::http::HttpRequest;
+use super::server::{ANSWER_LIMIT, ServedLake};
 use super::slices::{encoded, slice};
-use super::{Place, get, lake, postgres, served};
+use super::{TestFolder, get, lake, postgres, served};
 
 /// A served lake with a secret beside it.
-struct Scene {
-    place: Place,
-    server: Served,
+struct EscapeScene {
+    place: TestFolder,
+    server: ServedLake,
     before: BTreeMap<PathBuf, Vec<u8>>,
 }
 
-impl Scene {
+impl EscapeScene {
     fn new() -> Self {
         let place = lake();
         std::fs::write(place.path("secret.csv"), format!("a,b\n{SECRET},1\n")).expect("written");
@@ -53,10 +53,10 @@ impl Scene {
 
 #[test]
 fn none_over_http() {
-    let scene = Scene::new();
+    let scene = EscapeScene::new();
     for (number, attempt) in scene.attempts().iter().enumerate() {
         let format = ["json", "csv", "parquet", "arrow"][number % 4];
-        let answer = Request::post(&format!("/api/v1/sql?format={format}"), attempt)
+        let answer = HttpRequest::post(&format!("/api/v1/sql?format={format}"), attempt)
             .with("content-type", "text/plain")
             .send(&scene.server);
         assert!(answer.status < 500, "{attempt}: {}", answer.status);
@@ -78,10 +78,10 @@ fn none_over_http() {
     scene.unharmed();
 }
 
-// As the predicate of a slice, which stands in a query of the server's.
+// As the predicate of a slice, which is part of a query of the server's.
 #[test]
 fn none_by_slices() {
-    let scene = Scene::new();
+    let scene = EscapeScene::new();
     let of_a_run = format!("&run={}", scene.place.sql("select run_id from runs")[0]["run_id"].as_str().expect("a run"));
     for (number, attempt) in scene.attempts().iter().enumerate() {
         let more = ["", "&layout=in-time", &of_a_run, "&topics=/ir"][number % 4];
@@ -92,7 +92,7 @@ fn none_by_slices() {
             assert!(!String::from_utf8_lossy(&answer.body).contains(SECRET), "{attempt}");
         }
     }
-    // Such that are an expression once they stand in parentheses.
+    // Those that are an expression once they are in parentheses.
     for attempt in scene.attempts().iter().filter(|a| a.starts_with("select")) {
         let answer = get(&scene.server, &slice(&format!("exists ({attempt})"), ""));
         assert!(answer.status < 500, "{attempt}: {}", answer.status);
@@ -103,8 +103,8 @@ fn none_by_slices() {
 
 #[test]
 fn none_over_postgres() {
-    let scene = Scene::new();
-    let mut client = postgres::Client::connect(&scene.server, None);
+    let scene = EscapeScene::new();
+    let mut client = postgres::WireClient::connect(&scene.server, None);
     let outside = scene.place.path("outside").display().to_string();
     let own = [
         format!("copy pairs to '{outside}/own.csv' with (format csv)"),
@@ -130,7 +130,7 @@ fn none_over_postgres() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn none_over_flight_sql() {
-    let scene = Scene::new();
+    let scene = EscapeScene::new();
     let endpoint = Endpoint::from_shared(format!("http://{}", scene.server.flight_sql)).expect("a URL");
     // Limits each request that is asked below without a limit of its own.
     let channel = endpoint.connect_timeout(ANSWER_LIMIT).timeout(ANSWER_LIMIT).connect().await;
@@ -160,19 +160,19 @@ async fn none_over_flight_sql() {
     tokio::task::spawn_blocking(|| scene.unharmed()).await.expect("unharmed");
 }
 
-type Flight = FlightSqlServiceClient<Channel>;
+type FlightSqlClient = FlightSqlServiceClient<Channel>;
 
-async fn flight(client: &mut Flight, sql: &str) -> Result<String, FlightError> {
+async fn flight(client: &mut FlightSqlClient, sql: &str) -> Result<String, FlightError> {
     let info = client.execute(sql.to_owned(), None).await?;
     fetched(client, info).await
 }
 
-async fn prepared(client: &mut Flight, sql: &str) -> Result<String, FlightError> {
+async fn prepared(client: &mut FlightSqlClient, sql: &str) -> Result<String, FlightError> {
     let info = client.prepare(sql.to_owned(), None).await?.execute().await?;
     fetched(client, info).await
 }
 
-async fn fetched(client: &mut Flight, info: FlightInfo) -> Result<String, FlightError> {
+async fn fetched(client: &mut FlightSqlClient, info: FlightInfo) -> Result<String, FlightError> {
     let mut text = String::new();
     for ticket in info.endpoint.into_iter().filter_map(|e| e.ticket) {
         let batches: Vec<_> = client.do_get(ticket).await?.try_collect().await?;

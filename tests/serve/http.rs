@@ -4,10 +4,10 @@ use std::fmt::Write as _;
 use std::io::{ErrorKind, Read as _, Write as _};
 use std::net::TcpStream;
 
-use super::server::{ANSWER_LIMIT, Served};
+use super::server::{ANSWER_LIMIT, ServedLake};
 
 /// A request.
-pub(crate) struct Request {
+pub(crate) struct HttpRequest {
     method: &'static str,
     path: String,
     host: Option<String>,
@@ -18,15 +18,15 @@ pub(crate) struct Request {
 
 /// An answer.
 #[derive(Debug)]
-pub(crate) struct Answer {
+pub(crate) struct HttpResponse {
     pub(crate) status: u16,
     headers: Vec<(String, String)>,
     pub(crate) body: Vec<u8>,
-    /// Whether its end came.
+    /// True if its end was received.
     pub(crate) is_whole: bool,
 }
 
-impl Request {
+impl HttpRequest {
     pub(crate) fn get(path: &str) -> Self {
         let (headers, body) = (String::new(), String::new());
         Self { method: "GET", path: path.to_owned(), host: None, headers, body, is_chunked: false }
@@ -62,10 +62,10 @@ impl Request {
     }
 
     /// Sends it and does not wait.
-    pub(crate) fn begin(self, server: &Served) -> TcpStream {
+    pub(crate) fn begin(self, server: &ServedLake) -> TcpStream {
         let bytes = self.bytes(&server.http);
         let (head, body) = bytes.split_at(bytes.len() - self.body.len());
-        let mut stream = Served::connect(&server.http);
+        let mut stream = ServedLake::connect(&server.http);
         stream.write_all(head).expect("sent");
         // A server that has read enough may close before it has all.
         let _ = stream.write_all(body);
@@ -88,12 +88,12 @@ impl Request {
         [head.as_bytes(), self.body.as_bytes()].concat()
     }
 
-    pub(crate) fn send(self, server: &Served) -> Answer {
+    pub(crate) fn send(self, server: &ServedLake) -> HttpResponse {
         self.attempt(server).expect("headers")
     }
 
-    /// None where the connection ended before an answer began.
-    pub(crate) fn attempt(self, server: &Served) -> Option<Answer> {
+    /// None if the connection ended before an answer began.
+    pub(crate) fn attempt(self, server: &ServedLake) -> Option<HttpResponse> {
         let name = format!("{} {}", self.method, self.path);
         let mut stream = self.begin(server);
         let mut bytes = Vec::new();
@@ -102,11 +102,11 @@ impl Request {
             let is_late = matches!(error.kind(), ErrorKind::WouldBlock | ErrorKind::TimedOut);
             assert!(!is_late, "{name}: nothing more for {ANSWER_LIMIT:?}, after {} bytes", bytes.len());
         }
-        Answer::read(&bytes)
+        HttpResponse::read(&bytes)
     }
 }
 
-impl Answer {
+impl HttpResponse {
     fn read(bytes: &[u8]) -> Option<Self> {
         let end = bytes.windows(4).position(|w| w == b"\r\n\r\n")?;
         let head = std::str::from_utf8(&bytes[..end]).expect("text");

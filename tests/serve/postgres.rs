@@ -3,22 +3,22 @@
 use std::io::{Read as _, Write as _};
 use std::net::TcpStream;
 
-use super::server::Served;
+use super::server::ServedLake;
 
 /// A connection.
-pub(crate) struct Client {
+pub(crate) struct WireClient {
     stream: TcpStream,
     // What a CancelRequest must show.
     key: Vec<u8>,
 }
 
 /// Rows as texts, or the state of an error.
-pub(crate) type Rows = Result<Vec<Vec<Option<String>>>, String>;
+pub(crate) type TextRows = Result<Vec<Vec<Option<String>>>, String>;
 
-impl Client {
-    /// Connects; where no token is asked for, the session has begun.
-    pub(crate) fn connect(server: &Served, options: Option<&str>) -> Self {
-        let mut stream = Served::connect(&server.postgres);
+impl WireClient {
+    /// Connects; if no token is required, the session has begun.
+    pub(crate) fn connect(server: &ServedLake, options: Option<&str>) -> Self {
+        let mut stream = ServedLake::connect(&server.postgres);
         let mut body = 196_608_i32.to_be_bytes().to_vec();
         for (name, value) in
             [("user", "me"), ("database", "datafusion")].into_iter().chain(options.map(|o| ("options", o)))
@@ -43,7 +43,7 @@ impl Client {
         self.ready()
     }
 
-    pub(crate) fn query(&mut self, sql: &str) -> Rows {
+    pub(crate) fn query(&mut self, sql: &str) -> TextRows {
         self.begin(sql);
         self.rows()
     }
@@ -54,7 +54,7 @@ impl Client {
     }
 
     /// The rows of what was asked.
-    pub(crate) fn rows(&mut self) -> Rows {
+    pub(crate) fn rows(&mut self) -> TextRows {
         let (mut rows, mut failed) = (Vec::new(), None);
         loop {
             match self.message() {
@@ -67,8 +67,8 @@ impl Client {
     }
 
     /// Ends what runs, as a second connection does.
-    pub(crate) fn cancel(&self, server: &Served) {
-        let mut stream = Served::connect(&server.postgres);
+    pub(crate) fn cancel(&self, server: &ServedLake) {
+        let mut stream = ServedLake::connect(&server.postgres);
         let mut packet = ((8 + self.key.len()) as i32).to_be_bytes().to_vec();
         packet.extend(80_877_102_i32.to_be_bytes());
         packet.extend(&self.key);

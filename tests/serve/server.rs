@@ -7,11 +7,11 @@ use std::time::Duration;
 
 use super::super::child::ChildProcess;
 
-/// How long a client waits for the next bytes of an answer, or until it may send more of a request.
+/// Time for which a client waits for the next bytes of an answer, or until it may send more of a request.
 pub(crate) const ANSWER_LIMIT: Duration = Duration::from_secs(120);
 
 /// A server; dropping it ends it.
-pub(crate) struct Served {
+pub(crate) struct ServedLake {
     child: ChildProcess,
     /// `host:port` of each protocol.
     pub(crate) http: String,
@@ -19,7 +19,7 @@ pub(crate) struct Served {
     pub(crate) postgres: String,
 }
 
-impl Served {
+impl ServedLake {
     /// Serves the lake `lake` of a folder.
     pub(crate) fn start(binary: &Path, folder: &Path, more: &[&str]) -> Self {
         let any = "127.0.0.1:0";
@@ -29,7 +29,7 @@ impl Served {
             .args(more)
             .current_dir(folder)
             .env_remove("ECHOLAKE_LAKE")
-            // Where something panics, who called it is told.
+            // If something panics, its caller is printed.
             .env("RUST_BACKTRACE", "1");
         let mut child = ChildProcess::start(&mut command).expect("the command starts");
         let mut address = |scheme: &str| {
@@ -54,24 +54,24 @@ impl Served {
         self.child.id()
     }
 
-    /// What it said on stderr so far.
+    /// Returns the lines it wrote to stderr so far.
     pub(crate) fn said(&self) -> Vec<String> {
         self.child.stderr().lines().map(str::to_owned).collect()
     }
 
-    /// Whether its process is there.
+    /// Returns whether its process is running.
     pub(crate) fn is_up(&mut self) -> bool {
         self.child.is_running()
     }
 
-    /// What its process weighs.
+    /// Returns the resident memory of its process, in KiB.
     pub(crate) fn resident_kib(&self) -> u64 {
         let status = std::fs::read_to_string(format!("/proc/{}/status", self.id())).unwrap_or_default();
         let line = status.lines().find_map(|l| l.strip_prefix("VmRSS:"));
         line.and_then(|l| l.trim().split(' ').next()).and_then(|n| n.parse().ok()).unwrap_or(0)
     }
 
-    /// Tells it to stop; returns its exit code.
+    /// Stops it; returns its exit code.
     pub(crate) fn terminate(&mut self) -> Option<i32> {
         self.child.signal("TERM");
         self.child.wait().status.code()

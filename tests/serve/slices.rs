@@ -6,16 +6,16 @@ use std::io::Read as _;
 
 use serde_json::Value;
 
-use super::http::Request;
+use super::http::HttpRequest;
 use super::{ENDLESS, get, json, refused, running, running_of, served, wait_until};
-use crate::{Place, PlaceTemplate};
+use crate::{TestFolder, TestFolderTemplate};
 
 /// Sweeps of two seconds: 45 of them are more than sockets hold.
 const LONG_SWEEPS: &str = "duration_secs = 2.0";
 
 /// One run with sweeps, one without.
-fn lake() -> Place {
-    static TWO_RUNS: PlaceTemplate = PlaceTemplate::new();
+fn lake() -> TestFolder {
+    static TWO_RUNS: TestFolderTemplate = TestFolderTemplate::new();
     TWO_RUNS.place(|place| {
         place.acquire("flat", &[]);
         place.acquire("brick", &["--ir-only"]);
@@ -33,7 +33,7 @@ pub(super) fn encoded(text: &str) -> String {
     text.bytes().map(one).collect()
 }
 
-fn run_of(place: &Place, surface: &str) -> String {
+fn run_of(place: &TestFolder, surface: &str) -> String {
     let rows = place.sql(&format!("select run_id from runs where surface_id = '{surface}'"));
     rows[0]["run_id"].as_str().expect("a run").to_owned()
 }
@@ -90,7 +90,8 @@ fn a_viewer_of_elsewhere_reads_a_slice_by_ranges() {
     let server = served(&place, &[]);
     let run = run_of(&place, "flat");
     let path = slice("pair_id < 20", &format!("&run={run}"));
-    let foreign = || Request::get(&path).with("origin", "https://viewer.example").with("sec-fetch-site", "cross-site");
+    let foreign =
+        || HttpRequest::get(&path).with("origin", "https://viewer.example").with("sec-fetch-site", "cross-site");
     let mut first = foreign().begin(&server);
     let mut head = Vec::new();
     while !head.ends_with(b"\r\n\r\n") {
@@ -111,7 +112,7 @@ fn a_viewer_of_elsewhere_reads_a_slice_by_ranges() {
         assert!(value("access-control-expose-headers").contains(name), "{name}");
     }
     let (length, tag) = (value("content-length").parse::<usize>().expect("a length"), value("etag"));
-    // It begins with the end, where the index is.
+    // It begins with the end, which holds the index.
     let (mut file, block) = (vec![0; length], 100_000);
     let mut starts: Vec<_> = (0..length).step_by(block).collect();
     starts.reverse();
@@ -125,7 +126,7 @@ fn a_viewer_of_elsewhere_reads_a_slice_by_ranges() {
     assert_eq!(count(&messages(&file), "/sweep"), 20);
     let streamed = get(&server, &path);
     assert!(streamed.body == file && streamed.header("etag") == Some(tag.as_str()), "the same, however it is read");
-    let headed = Request::head(&path).send(&server);
+    let headed = HttpRequest::head(&path).send(&server);
     assert_eq!((headed.status, headed.header("content-length")), (200, Some(&*length.to_string())));
     assert_eq!(foreign().with("if-none-match", &tag).send(&server).status, 304);
     let ranged = |known: &str| foreign().with("range", "bytes=0-7").with("if-range", known).send(&server).status;
@@ -135,7 +136,7 @@ fn a_viewer_of_elsewhere_reads_a_slice_by_ranges() {
     place.acquire("wavy", &["--ir-only"]);
     place.ok(&["ingest"]);
     assert_eq!(foreign().with("if-none-match", &tag).send(&server).status, 304);
-    let asked = Request::options(&path)
+    let asked = HttpRequest::options(&path)
         .with("origin", "https://viewer.example")
         .with("access-control-request-method", "GET")
         .with("access-control-request-headers", "range,authorization")
@@ -149,10 +150,10 @@ fn a_page_of_elsewhere_asks_of_runs_that_it_knows_alone() {
     let place = lake();
     let server = served(&place, &[]);
     let run = run_of(&place, "brick");
-    let foreign = |path: &str| Request::get(path).with("origin", "https://evil.example").send(&server);
+    let foreign = |path: &str| HttpRequest::get(path).with("origin", "https://evil.example").send(&server);
     refused(&foreign(&slice("true", "")), 403, "foreign_origin");
     refused(&foreign("/api/v1/foxglove/manifest?where=true"), 403, "foreign_origin");
-    refused(&Request::get(&slice("true", "")).host("evil.example").send(&server), 403, "foreign_origin");
+    refused(&HttpRequest::get(&slice("true", "")).host("evil.example").send(&server), 403, "foreign_origin");
     refused(&foreign(&slice("cast(run_id as int) = 1", "&run=guessed")), 404, "not_found");
     let of_the_run = format!("&run={run}");
     for asking in [
@@ -200,10 +201,10 @@ fn what_cannot_be_cut_has_a_code() {
     ] {
         let answer = get(&server, &path);
         refused(&answer, status, code);
-        let ranged = Request::get(&path).with("range", "bytes=0-9").send(&server);
+        let ranged = HttpRequest::get(&path).with("range", "bytes=0-9").send(&server);
         refused(&ranged, status, code);
     }
-    refused(&Request::post(&slice("true", ""), "").send(&server), 405, "method_not_allowed");
+    refused(&HttpRequest::post(&slice("true", ""), "").send(&server), 405, "method_not_allowed");
 }
 
 #[test]
@@ -224,7 +225,7 @@ fn a_run_file_that_was_changed_or_moved_is_said() {
     std::fs::write(&file, &flipped).expect("changed");
     let answer = get(&server, &path);
     assert!(answer.status >= 400 || !answer.is_whole, "{} bytes look whole", answer.body.len());
-    let ranged = Request::get(&path).with("range", "bytes=0-9").send(&server);
+    let ranged = HttpRequest::get(&path).with("range", "bytes=0-9").send(&server);
     assert!([409, 503].contains(&ranged.status), "{}", ranged.status);
     std::fs::remove_file(&file).expect("moved");
     refused(&get(&server, &path), 409, "file_changed");
@@ -236,7 +237,7 @@ fn a_run_file_that_was_changed_or_moved_is_said() {
 
 #[test]
 fn a_slice_ends_with_its_reader() {
-    let place = Place::new();
+    let place = TestFolder::new();
     let rig = crate::SMALL_RIG.replace("duration_secs = 0.03", LONG_SWEEPS);
     std::fs::write(place.path("rig.toml"), rig).expect("written");
     let run = place.acquire("flat", &[]);
@@ -250,7 +251,7 @@ fn a_slice_ends_with_its_reader() {
     std::fs::write(place.path("tokens.toml"), lines).expect("written");
     let server = served(&place, &["--tokens", "tokens.toml"]);
     let bearer = format!("Bearer {token}");
-    let ask = |path: &str| Request::get(path).with("authorization", &bearer);
+    let ask = |path: &str| HttpRequest::get(path).with("authorization", &bearer);
     let running = || running_of(&ask("/metrics").send(&server));
     let mut unread = ask(&slice("true", "")).begin(&server);
     let mut start = [0; 12];
@@ -291,7 +292,7 @@ fn slices_need_a_token_for_sql_and_files() {
     std::fs::write(place.path("tokens.toml"), lines).expect("written");
     let server = served(&place, &["--tokens", "tokens.toml"]);
     let path = slice("surface_id = 'flat'", "");
-    let ask = |token: &str, path: &str| Request::get(path).with("authorization", token).send(&server);
+    let ask = |token: &str, path: &str| HttpRequest::get(path).with("authorization", token).send(&server);
     for path in [&path, "/api/v1/foxglove/manifest?where=surface_id='flat'", "/api/v1/files"] {
         refused(&get(&server, path), 401, "unauthenticated");
         assert_eq!(ask(&both, path).status, 200, "{path}");
@@ -300,13 +301,13 @@ fn slices_need_a_token_for_sql_and_files() {
     refused(&ask(&files, &path), 403, "forbidden");
     refused(&ask(&few, &path), 422, "row_limit");
     assert_eq!(ask(&few, &slice("surface_id = 'flat' and pair_id < 10", "")).status, 200);
-    // With a token a page of elsewhere may ask for all that its token is for; with a cookie it may not.
-    let elsewhere = Request::get(&path).with("origin", "https://viewer.example").with("authorization", &both);
+    // With a token, a page of another origin may request all that its token allows; with a cookie it may not.
+    let elsewhere = HttpRequest::get(&path).with("origin", "https://viewer.example").with("authorization", &both);
     assert_eq!(elsewhere.send(&server).status, 200);
     let body = serde_json::json!({ "token": both.trim_start_matches("Bearer ") }).to_string();
-    let begun = Request::post("/api/v1/session", &body).with("content-type", "application/json").send(&server);
+    let begun = HttpRequest::post("/api/v1/session", &body).with("content-type", "application/json").send(&server);
     let cookie = begun.header("set-cookie").and_then(|c| c.split(';').next()).expect("a cookie").to_owned();
-    let signed_in = |path: &str| Request::get(path).with("cookie", &cookie);
+    let signed_in = |path: &str| HttpRequest::get(path).with("cookie", &cookie);
     assert_eq!(signed_in(&path).send(&server).status, 200);
     assert_eq!(signed_in(&path).with("origin", "https://viewer.example").send(&server).status, 403);
     // What the pages show needs nothing more than a fresh token.
@@ -375,7 +376,8 @@ fn the_manifest_says_what_comes() {
     assert_eq!(get(&server, &data).status, 200);
     refused(&get(&server, &data.replace("7%20or", "8%20or")), 410, "gone");
     // A layout says nothing of the lake.
-    let layout = Request::get("/api/v1/layouts/echolake.json").with("origin", "https://viewer.example").send(&server);
+    let layout =
+        HttpRequest::get("/api/v1/layouts/echolake.json").with("origin", "https://viewer.example").send(&server);
     assert_eq!((layout.status, layout.header("access-control-allow-origin")), (200, Some("*")));
     assert!(json(&layout)["configById"].is_object());
 }
@@ -397,9 +399,9 @@ fn the_lakes_files_are_urls_that_outlive_what_replaces_them() {
     for file in &files {
         let whole = get(&server, &path(file));
         assert_eq!((whole.status, whole.body.len() as u64), (200, file["bytes"].as_u64().expect("bytes")));
-        let end = Request::get(&path(file)).with("range", "bytes=-4").send(&server);
+        let end = HttpRequest::get(&path(file)).with("range", "bytes=-4").send(&server);
         assert_eq!((end.status, &end.body[..]), (206, &b"PAR1"[..]));
-        let headed = Request::head(&path(file)).send(&server);
+        let headed = HttpRequest::head(&path(file)).send(&server);
         assert_eq!(headed.header("content-length"), Some(&*whole.body.len().to_string()));
         assert_eq!(file["superseded_rows"], 0);
         rows += if file["table"] == "measurements" { file["rows"].as_u64().expect("rows") } else { 0 };
@@ -420,7 +422,7 @@ fn the_lakes_files_are_urls_that_outlive_what_replaces_them() {
         refused(&get(&server, &path(file)), 410, "gone");
     }
     refused(&get(&server, "/api/v1/tables/measurements/none.parquet"), 404, "not_found");
-    let foreign = Request::get("/api/v1/files").with("origin", "https://evil.example").send(&server);
+    let foreign = HttpRequest::get("/api/v1/files").with("origin", "https://evil.example").send(&server);
     refused(&foreign, 403, "foreign_origin");
     assert_eq!(running(&server), 0.0);
 }

@@ -5,7 +5,7 @@ use std::net::TcpStream;
 
 use super::query_client::AnswerDigest;
 use super::{QueryClient, QueryOutcome, percent_encoded};
-use crate::serve::http::Request;
+use crate::serve::http::HttpRequest;
 
 /// Bytes of an error that are read.
 const LARGEST_PROBLEM: u64 = 64 << 10;
@@ -21,18 +21,18 @@ struct AnswerHead {
 
 /// Runs a query; the answer is CSV.
 pub(super) fn query(client: &QueryClient, sql: &str) -> QueryOutcome {
-    let request = Request::post("/api/v1/sql?format=csv", sql).with("content-type", "text/plain");
+    let request = HttpRequest::post("/api/v1/sql?format=csv", sql).with("content-type", "text/plain");
     send_request(client, request)
 }
 
 /// Asks for a slice of the client's run.
 pub(super) fn query_slice(client: &QueryClient, filter: &str) -> QueryOutcome {
     let path = format!("/api/v1/slices.mcap?run={}&where={}", client.run, percent_encoded(filter));
-    send_request(client, Request::get(&path))
+    send_request(client, HttpRequest::get(&path))
 }
 
 /// Sends a request with the client's token and reads the answer.
-pub(super) fn send_request(client: &QueryClient, request: Request) -> QueryOutcome {
+pub(super) fn send_request(client: &QueryClient, request: HttpRequest) -> QueryOutcome {
     let address = &client.addresses.http;
     let bytes = request.with("authorization", &format!("Bearer {}", client.token)).bytes(address);
     let Ok(stream) = client.connections.connect(address) else { return QueryOutcome::Disconnected };

@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 
 use super::query_client::AnswerDigest;
 use super::{ObservedServer, QueryClient, QueryOutcome, QueryProtocol, http_query};
-use crate::serve::http::Request;
+use crate::serve::http::HttpRequest;
 
 /// Between the beginnings of two probes.
 const PROBE_EVERY: Duration = Duration::from_millis(200);
@@ -103,7 +103,7 @@ fn send_probe(probe: LightProbe, client: &QueryClient) -> QueryOutcome {
     client.connections.close_after(PROBE_LIMIT, || match probe {
         LightProbe::HttpQuery => client.query(QueryProtocol::Http, LIGHT_QUERY),
         LightProbe::PostgresQuery => client.query(QueryProtocol::PostgresSimple, LIGHT_QUERY),
-        LightProbe::Health => http_query::send_request(&client, Request::get("/health")),
+        LightProbe::Health => http_query::send_request(&client, HttpRequest::get("/health")),
     })
 }
 

@@ -9,7 +9,7 @@ use anyhow::{Context as _, Result, ensure};
 
 use crate::SMALL_RIG;
 use crate::child::run_command;
-use crate::serve::server::Served;
+use crate::serve::server::ServedLake;
 
 mod client_connections;
 mod flight_query;
@@ -67,7 +67,7 @@ pub(crate) struct ObservedServer {
     folder: tempfile::TempDir,
     binary: PathBuf,
     tokens: Vec<ClientToken>,
-    served: Served,
+    served: ServedLake,
     runs: Vec<String>,
     /// Number of restarts.
     pub(crate) restarts: usize,
@@ -94,7 +94,7 @@ impl ObservedServer {
     }
 
     pub(crate) fn addresses(&self) -> ServerAddresses {
-        let Served { http, flight_sql, postgres, .. } = &self.served;
+        let ServedLake { http, flight_sql, postgres, .. } = &self.served;
         ServerAddresses { http: http.clone(), flight_sql: flight_sql.clone(), postgres: postgres.clone() }
     }
 
@@ -177,8 +177,8 @@ impl Drop for ObservedServer {
     }
 }
 
-fn serve(binary: &Path, folder: &Path) -> Served {
-    Served::start(binary, folder, &["--tokens", "tokens.toml", "--memory", QUERY_MEMORY_MIB])
+fn serve(binary: &Path, folder: &Path) -> ServedLake {
+    ServedLake::start(binary, folder, &["--tokens", "tokens.toml", "--memory", QUERY_MEMORY_MIB])
 }
 
 fn run_echolake(binary: &Path, folder: &Path, args: &[&str]) -> Result<Output> {

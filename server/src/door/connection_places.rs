@@ -1,6 +1,5 @@
-//! Places for connections: a listener accepts no more than it has. If all are taken, a new connection takes the place of the
-//! oldest one without a request or a login, of the address that has the most: whoever sends slowly, or opens many, locks
-//! nobody else out.
+//! Places for connections: a listener accepts a limited number. If all are taken, a new connection evicts the oldest one
+//! without a request or a login, of the address that has the most: slow senders and crowds lock out no other client.
 
 use std::cmp::Reverse;
 use std::collections::HashMap;
@@ -17,14 +16,14 @@ use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::Notify;
 use tokio::time::Sleep;
 
-/// How long to wait where the system has no more sockets.
+/// Time to wait if the system has no more sockets.
 const PAUSE: Duration = Duration::from_millis(100);
 /// Bytes that a connection reads before it is the turn of others. A frame of HTTP/2 may have nine and no answer.
 const TURN_BYTES: usize = 16 << 10;
-/// Bytes that a connection may send of what is no request. Each of a flood of frames is little, and costs as much as one
+/// Bytes that a connection may send outside of requests. Each of a flood of frames is small, and costs as much as one
 /// that says something.
 const IDLE_BYTES: usize = 1 << 20;
-/// How long a client may read nothing of an answer.
+/// Time for which a client may read nothing of an answer.
 const STALL: Duration = Duration::from_secs(300);
 
 /// An address, and its places.
@@ -70,7 +69,7 @@ impl ConnectionPlaces {
                         return self.place(stream, peer.ip());
                     }
                 }
-                // Who broke off already is no trouble; that there are no more sockets passes.
+                // A client that hung up already is no problem; a lack of sockets passes.
                 Err(_) => tokio::time::sleep(PAUSE).await,
             }
         }
@@ -83,7 +82,7 @@ impl ConnectionPlaces {
         PlacedStream { stream, state, taken: self.taken.clone(), turn_bytes: 0, idle_bytes: 0, stalled: None }
     }
 
-    // Another machine has half of the places at most; false where all of those work.
+    // Another machine has half of the places at most; false if all of those work.
     async fn make_room(&self, address: IpAddr) -> bool {
         loop {
             let freed = self.taken.freed.notified();
@@ -158,7 +157,7 @@ impl Drop for PlacedStream {
     }
 }
 
-/// Marks a connection that works, which keeps its place. A request works once it is whole and known whose it is.
+/// Marks a connection that works, which keeps its place. A request works once it is whole and authenticated.
 #[derive(Clone)]
 pub(super) struct PlaceWork(Arc<PlaceState>);
 

@@ -15,15 +15,15 @@ use super::engine_process::{EndReason, EngineLease, EngineProcess, EngineStart};
 use super::temp_folder::ServerFolders;
 use crate::Error;
 use crate::client_identity::ClientIdentity;
-use crate::fault::Fault;
-use crate::metrics::Metrics;
+use crate::fault::RequestFault;
+use crate::metrics::ServerMetrics;
 
 /// Time without a request after which an engine ends.
 const IDLE: Duration = Duration::from_secs(300);
 /// Time between two looks at the memory of engines, while one answers and while none does.
 const LOOK: Duration = Duration::from_millis(20);
 const IDLE_LOOK: Duration = Duration::from_millis(250);
-/// How long a client without an engine waits for a place among the engines.
+/// Time for which a client without an engine waits for a place among the engines.
 const PLACE_WAIT: Duration = Duration::from_secs(10);
 /// Memory of an engine that is not of its queries: footers of files, small tables, what the allocator keeps.
 const CACHE_BYTES: usize = 96 << 20;
@@ -35,13 +35,13 @@ const FORGIVEN: Duration = Duration::from_secs(60);
 
 /// The engines.
 #[derive(Clone)]
-pub(super) struct EnginePool(Arc<Inner>);
+pub(super) struct EnginePool(Arc<EnginePoolState>);
 
-struct Inner {
+struct EnginePoolState {
     settings: EngineSettings,
     lake: Lake,
     folders: ServerFolders,
-    metrics: Arc<Metrics>,
+    metrics: Arc<ServerMetrics>,
     clients: Mutex<HashMap<String, Arc<ClientEngine>>>,
     spare: Mutex<Option<Arc<EngineProcess>>>,
     spare_taken: Notify,
@@ -65,9 +65,9 @@ struct ClientState {
 }
 
 impl EnginePool {
-    pub(super) fn new(lake: &Lake, settings: EngineSettings, metrics: Arc<Metrics>) -> Result<Self, Error> {
+    pub(super) fn new(lake: &Lake, settings: EngineSettings, metrics: Arc<ServerMetrics>) -> Result<Self, Error> {
         let folders = ServerFolders::new(lake, settings.temp.as_deref())?;
-        Ok(Self(Arc::new(Inner {
+        Ok(Self(Arc::new(EnginePoolState {
             settings,
             lake: lake.clone(),
             folders,
@@ -81,18 +81,18 @@ impl EnginePool {
         })))
     }
 
-    /// The engine of a client, for one request. It is started if there is none; a client whose engines end again and
-    /// again waits longer each time.
+    /// Leases a client's engine for one request. It is started if there is none; a client whose engines end again and
+    /// again waits longer each time (backoff).
     ///
     /// # Errors
-    /// [`Fault::TooMany`] if other clients' engines are all answering; [`Fault::EngineEnded`].
-    pub(super) async fn lease(&self, client: &ClientIdentity) -> Result<EngineLease, Fault> {
+    /// [`RequestFault::TooMany`] if other clients' engines are all answering; [`RequestFault::EngineEnded`].
+    pub(super) async fn lease(&self, client: &ClientIdentity) -> Result<EngineLease, RequestFault> {
         let own = self.client(&client.name);
         if let Some(lease) = own.lease() {
             return Ok(lease);
         }
         let mut state = own.state.lock().await;
-        // Whoever held the lock has started one.
+        // Another request that held the lock may have started one.
         if let Some(lease) = own.lease() {
             return Ok(lease);
         }
@@ -101,15 +101,16 @@ impl EnginePool {
         self.make_room(&own).await?;
         let engine = self.take_spare().map_err(|failed| {
             eprintln!("no engine can be started: {failed}");
-            Fault::Internal
+            RequestFault::Internal
         })?;
         if let Err(EndReason::Failed(reason)) = engine.assign(client).await {
             state.ends += 1;
             state.last_end = Some(Instant::now());
             eprintln!("an engine did not start: {reason}");
-            return Err(Fault::EngineEnded { reason });
+            return Err(RequestFault::EngineEnded { reason });
         }
-        let lease = engine.lease().ok_or_else(|| Fault::EngineEnded { reason: "it ended at once".to_owned() })?;
+        let lease =
+            engine.lease().ok_or_else(|| RequestFault::EngineEnded { reason: "it ended at once".to_owned() })?;
         *lock(&own.current) = Some(engine);
         Ok(lease)
     }
@@ -133,7 +134,7 @@ impl EnginePool {
     }
 
     // Waits until there is a place among the engines: the one that is idle for longest makes room.
-    async fn make_room(&self, own: &Arc<ClientEngine>) -> Result<(), Fault> {
+    async fn make_room(&self, own: &Arc<ClientEngine>) -> Result<(), RequestFault> {
         let free = async {
             loop {
                 let freed = self.0.freed.notified();
@@ -151,7 +152,7 @@ impl EnginePool {
         };
         debug_assert!(lock(&own.current).is_none());
         let limit = self.0.settings.count;
-        tokio::time::timeout(PLACE_WAIT, free).await.map_err(|_| Fault::TooMany { what: "clients", limit })
+        tokio::time::timeout(PLACE_WAIT, free).await.map_err(|_| RequestFault::TooMany { what: "clients", limit })
     }
 
     // The engines that have a client.

@@ -18,12 +18,12 @@ use super::EngineSettings;
 use crate::client_identity::{ClientIdentity, counted_bytes};
 use crate::engine::EngineSocket;
 use crate::engine::report::EngineReport;
-use crate::metrics::Metrics;
+use crate::metrics::ServerMetrics;
 
-/// How long a request that lost its engine waits to learn why.
+/// Time for which a request that lost its engine waits for the reason.
 const REASON_WAIT: Duration = Duration::from_secs(2);
 
-/// Why an engine ended.
+/// The reason for which an engine ended.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) enum EndReason {
     /// The door needed it no more.
@@ -39,7 +39,7 @@ pub(super) struct EngineProcess {
     stdin: tokio::sync::Mutex<ChildStdin>,
     usage: Mutex<EngineUsage>,
     base_bytes: OnceLock<usize>,
-    /// What its client's queries may occupy.
+    /// Memory limit of its client's queries.
     memory_limit: OnceLock<usize>,
     ready: SetOnce<()>,
     kill: Notify,
@@ -54,11 +54,11 @@ struct EngineUsage {
     is_ending: bool,
 }
 
-/// What an engine is started with.
+/// Parameters with which an engine is started.
 pub(super) struct EngineStart<'a> {
     pub(super) settings: &'a EngineSettings,
     pub(super) lake: &'a str,
-    /// The lake's folder, where it is one.
+    /// The lake's folder, if it is in one.
     pub(super) lake_folder: Option<&'a Path>,
     /// Folders that are the engine's own.
     pub(super) sockets: PathBuf,
@@ -70,7 +70,7 @@ impl EngineProcess {
     ///
     /// # Errors
     /// The system gives no folder or process.
-    pub(super) fn start(start: EngineStart<'_>, metrics: Arc<Metrics>) -> io::Result<Arc<Self>> {
+    pub(super) fn start(start: EngineStart<'_>, metrics: Arc<ServerMetrics>) -> io::Result<Arc<Self>> {
         std::fs::create_dir(&start.sockets)?;
         std::fs::create_dir(&start.spills)?;
         let mut child = Command::new(&start.settings.program)
@@ -108,7 +108,7 @@ impl EngineProcess {
         Ok(engine)
     }
 
-    /// Waits until it is ready, and tells it whose it is.
+    /// Waits until it is ready, and assigns it to a client.
     ///
     /// # Errors
     /// It ended before that.
@@ -164,7 +164,7 @@ impl EngineProcess {
         true
     }
 
-    /// Whether its process is gone.
+    /// Returns whether its process has ended.
     pub(super) fn has_ended(&self) -> bool {
         self.ended.get().is_some()
     }
@@ -173,7 +173,7 @@ impl EngineProcess {
         self.usage.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// How it ended, if it did.
+    /// Returns the reason of its end, if it has ended.
     pub(super) fn end_reason(&self) -> Option<&EndReason> {
         self.ended.get()
     }
@@ -241,7 +241,7 @@ async fn supervise(
     mut child: Child,
     stdout: ChildStdout,
     spills: PathBuf,
-    metrics: Arc<Metrics>,
+    metrics: Arc<ServerMetrics>,
 ) {
     let mut reports = EngineReports { metrics, counters: Vec::new(), why: None };
     let mut lines = BufReader::new(stdout).lines();
@@ -272,7 +272,7 @@ async fn supervise(
 }
 
 struct EngineReports {
-    metrics: Arc<Metrics>,
+    metrics: Arc<ServerMetrics>,
     counters: Vec<u64>,
     why: Option<String>,
 }

@@ -1,4 +1,4 @@
-//! Flight SQL's connections of the door: HTTP/2, whose requests are forwarded to the engine of who asks.
+//! Flight SQL connections of the door: HTTP/2, whose requests are forwarded to the client's engine.
 
 use std::convert::Infallible;
 use std::pin::pin;
@@ -14,11 +14,11 @@ use tokio::net::TcpListener;
 use tokio::sync::watch;
 use tokio::task::JoinSet;
 
-use super::Door;
+use super::ServerDoor;
 use super::connection_places::{ConnectionPlaces, PlaceWork, PlacedStream};
-use super::forward::Wire;
+use super::forward::EngineProtocol;
 use crate::client_identity::ClientIdentity;
-use crate::fault::Fault;
+use crate::fault::RequestFault;
 use crate::flight::{WINDOW_BYTES, status};
 use crate::tokens::of_header;
 
@@ -31,8 +31,8 @@ const STREAMS: u32 = 64;
 /// Methods whose clients may wait for an answer before they end their request.
 const INTERACTIVE: [&str; 3] = ["DoPut", "DoExchange", "Handshake"];
 
-/// Answers connections until `stopping`, then lets those end that are at it.
-pub(super) async fn serve(door: Door, listener: TcpListener, stopping: watch::Receiver<bool>) {
+/// Answers connections until `stopping`, then lets pending requests end.
+pub(super) async fn serve(door: ServerDoor, listener: TcpListener, stopping: watch::Receiver<bool>) {
     let places = ConnectionPlaces::new(listener, MOST);
     let mut stopped = stopping.clone();
     let mut open = JoinSet::new();
@@ -46,7 +46,7 @@ pub(super) async fn serve(door: Door, listener: TcpListener, stopping: watch::Re
     while open.join_next().await.is_some() {}
 }
 
-async fn answer(stream: PlacedStream, door: Door, mut stopping: watch::Receiver<bool>) {
+async fn answer(stream: PlacedStream, door: ServerDoor, mut stopping: watch::Receiver<bool>) {
     let evicted = stream.evicted();
     let work = stream.work();
     let service = service_fn(move |request: Request<Incoming>| {
@@ -75,12 +75,16 @@ async fn answer(stream: PlacedStream, door: Door, mut stopping: watch::Receiver<
     let _ = connection.await;
 }
 
-impl Door {
-    async fn answer_flight(&self, request: Request<Incoming>, work: &PlaceWork) -> Result<Response<Body>, Fault> {
+impl ServerDoor {
+    async fn answer_flight(
+        &self,
+        request: Request<Incoming>,
+        work: &PlaceWork,
+    ) -> Result<Response<Body>, RequestFault> {
         let token = request.headers().get(header::AUTHORIZATION).and_then(|v| v.to_str().ok()).and_then(of_header);
         let client = self.access().client(token.as_deref(), ClientIdentity::programs)?;
         let is_interactive = INTERACTIVE.iter().any(|method| request.uri().path().ends_with(method));
-        let wire = if is_interactive { Wire::InteractiveGrpc } else { Wire::Grpc };
+        let wire = if is_interactive { EngineProtocol::InteractiveGrpc } else { EngineProtocol::Grpc };
         let response = self.engines().forward(&client, request.map(Body::new), wire, work).await?;
         Ok(response.map(Body::new))
     }

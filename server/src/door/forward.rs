@@ -22,7 +22,7 @@ use super::engine_pool::EnginePool;
 use super::engine_process::{EndReason, EngineLease, EngineProcess};
 use crate::client_identity::ClientIdentity;
 use crate::engine::EngineSocket;
-use crate::fault::Fault;
+use crate::fault::RequestFault;
 use crate::flight::WINDOW_BYTES;
 
 /// Bytes of a request up to which it is kept, so that it can be sent again to a new engine.
@@ -34,7 +34,7 @@ const LARGEST_GRPC: usize = (4 << 20) + 5;
 /// Parts of a body beyond which they must have so many bytes on average: each costs as much as one that says something.
 const FREE_PARTS: usize = 4_096;
 const LEAST_PART_BYTES: usize = 16;
-/// How long the body of a request may take.
+/// Time limit for the body of a request.
 const BODY_LIMIT: Duration = Duration::from_secs(30);
 /// Bytes of a frame of HTTP/2 between an engine and the door; the default of 16 KiB costs a wake-up each.
 const FRAME_BYTES: u32 = 256 << 10;
@@ -42,9 +42,9 @@ const FRAME_BYTES: u32 = 256 << 10;
 const OF_CONNECTION: [HeaderName; 4] =
     [header::CONNECTION, header::TRANSFER_ENCODING, header::UPGRADE, HeaderName::from_static("keep-alive")];
 
-/// How an engine is asked.
+/// The protocol to an engine.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Wire {
+pub(super) enum EngineProtocol {
     /// HTTP/1.1, on a connection for each request.
     Http,
     /// HTTP/2, on one connection for all.
@@ -60,29 +60,29 @@ enum RequestBody {
     Streamed(Body, BodyFault),
 }
 
-/// What was wrong with a body that was passed on, once that is known.
-type BodyFault = Arc<Mutex<Option<Fault>>>;
+/// The fault of a streamed body, once it is known.
+type BodyFault = Arc<Mutex<Option<RequestFault>>>;
 
 impl EnginePool {
     /// Answers a request by the engine of `client`. If the engine ends before its answer begins, a new one is asked once.
     ///
     /// # Errors
-    /// [`Fault::EngineEnded`], [`Fault::TooMany`], [`Fault::TooLarge`], [`Fault::Request`].
+    /// [`RequestFault::EngineEnded`], [`RequestFault::TooMany`], [`RequestFault::TooLarge`], [`RequestFault::Request`].
     pub(super) async fn forward(
         &self,
         client: &ClientIdentity,
         request: Request<Body>,
-        wire: Wire,
+        wire: EngineProtocol,
         work: &PlaceWork,
-    ) -> Result<Response<EngineBody>, Fault> {
+    ) -> Result<Response<EngineBody>, RequestFault> {
         let (mut parts, body) = request.into_parts();
         for name in OF_CONNECTION {
             parts.headers.remove(name);
         }
         let mut body = match wire {
-            Wire::InteractiveGrpc => RequestBody::stream(Bytes::new(), BodyReader::new(body, 1), usize::MAX),
-            Wire::Http => read_body(body, &parts.headers, LARGEST_HTTP).await?,
-            Wire::Grpc => read_body(body, &parts.headers, LARGEST_GRPC).await?,
+            EngineProtocol::InteractiveGrpc => RequestBody::stream(Bytes::new(), BodyReader::new(body, 1), usize::MAX),
+            EngineProtocol::Http => read_body(body, &parts.headers, LARGEST_HTTP).await?,
+            EngineProtocol::Grpc => read_body(body, &parts.headers, LARGEST_GRPC).await?,
         };
         let working = work.begin();
         loop {
@@ -108,7 +108,7 @@ impl EnginePool {
 }
 
 impl RequestBody {
-    // The body behind what was read of it, in pieces. It fails where it is too long or takes too long: one that just ended
+    // The rest of a body, after `read`, in pieces. It fails if it is too long or takes too long: one that just ended
     // would look whole.
     fn stream(read: Bytes, rest: BodyReader, most: usize) -> Self {
         let fault = BodyFault::default();
@@ -121,7 +121,7 @@ impl RequestBody {
                     Ok(piece) if piece.is_empty() => return Ok(None),
                     Ok(piece) => match left.checked_sub(piece.len()) {
                         Some(left) => return Ok(Some((piece, (Bytes::new(), rest, left)))),
-                        None => Fault::TooLarge { limit: most },
+                        None => RequestFault::TooLarge { limit: most },
                     },
                     Err(fault) => fault,
                 };
@@ -133,7 +133,7 @@ impl RequestBody {
         Self::Streamed(Body::from_stream(stream), fault)
     }
 
-    // What is sent, and what can be sent once more if that fails.
+    // Returns the body to send, its fault, and a copy for a retry.
     fn send(self) -> (Body, BodyFault, Option<Self>) {
         match self {
             Self::Whole(bytes) => {
@@ -153,22 +153,22 @@ fn request_of(parts: &Parts, body: Body) -> Request<Body> {
     request
 }
 
-async fn why(lease: &EngineLease, failed: &str) -> Fault {
+async fn why(lease: &EngineLease, failed: &str) -> RequestFault {
     match lease.engine().why_ended().await {
-        Some(EndReason::Failed(reason)) => Fault::EngineEnded { reason },
-        Some(EndReason::Retired) => Fault::EngineEnded { reason: "the server needed its place".to_owned() },
+        Some(EndReason::Failed(reason)) => RequestFault::EngineEnded { reason },
+        Some(EndReason::Retired) => RequestFault::EngineEnded { reason: "the server needed its place".to_owned() },
         None => {
             eprintln!("an engine does not answer: {failed}");
-            Fault::Internal
+            RequestFault::Internal
         }
     }
 }
 
 // Reads a short body to its end; of a long one, what is read goes before the rest.
-async fn read_body(body: Body, headers: &HeaderMap, limit: usize) -> Result<RequestBody, Fault> {
+async fn read_body(body: Body, headers: &HeaderMap, limit: usize) -> Result<RequestBody, RequestFault> {
     let declared = headers.get(header::CONTENT_LENGTH).and_then(|v| v.to_str().ok()?.parse::<usize>().ok());
     if declared.is_some_and(|bytes| bytes > limit) {
-        return Err(Fault::TooLarge { limit });
+        return Err(RequestFault::TooLarge { limit });
     }
     let mut rest = BodyReader::new(body, KEPT_BYTES);
     let read = rest.next_piece().await?;
@@ -196,17 +196,17 @@ impl BodyReader {
     }
 
     // Empty at the end.
-    async fn next_piece(&mut self) -> Result<Bytes, Fault> {
+    async fn next_piece(&mut self) -> Result<Bytes, RequestFault> {
         let mut piece = BytesMut::new();
         let filled = tokio::time::timeout_at(self.end, self.fill(&mut piece)).await;
-        filled.map_err(|_| Fault::request(format!("the body took longer than {BODY_LIMIT:?}")))??;
+        filled.map_err(|_| RequestFault::request(format!("the body took longer than {BODY_LIMIT:?}")))??;
         Ok(piece.freeze())
     }
 
-    async fn fill(&mut self, piece: &mut BytesMut) -> Result<(), Fault> {
+    async fn fill(&mut self, piece: &mut BytesMut) -> Result<(), RequestFault> {
         while !self.is_ended && piece.len() < self.piece_bytes {
             let part = self.parts.try_next().await;
-            match part.map_err(|_| Fault::request("the request's body did not come whole"))? {
+            match part.map_err(|_| RequestFault::request("the request's body did not come whole"))? {
                 Some(part) => {
                     self.part_count += 1;
                     self.bytes += part.len();
@@ -215,7 +215,9 @@ impl BodyReader {
                 None => self.is_ended = true,
             }
             if self.part_count > FREE_PARTS && self.bytes < self.part_count * LEAST_PART_BYTES {
-                return Err(Fault::request(format!("the body comes in parts of less than {LEAST_PART_BYTES} bytes")));
+                return Err(RequestFault::request(format!(
+                    "the body comes in parts of less than {LEAST_PART_BYTES} bytes"
+                )));
             }
         }
         Ok(())
@@ -225,20 +227,22 @@ impl BodyReader {
 struct EngineAnswer {
     response: Response<Incoming>,
     connection: JoinSet<()>,
-    wire: Wire,
+    wire: EngineProtocol,
 }
 
 impl EngineAnswer {
-    async fn fetch(engine: &EngineProcess, request: Request<Body>, wire: Wire) -> Result<Self, String> {
+    async fn fetch(engine: &EngineProcess, request: Request<Body>, wire: EngineProtocol) -> Result<Self, String> {
         let mut connection = JoinSet::new();
         let response = match wire {
-            Wire::Http => {
+            EngineProtocol::Http => {
                 let stream = engine.connect(EngineSocket::Http).await.map_err(|e| e.to_string())?;
                 let (mut sender, driver) = http1::handshake(TokioIo::new(stream)).await.map_err(|e| e.to_string())?;
                 connection.spawn(async move { drop(driver.await) });
                 sender.send_request(request).await
             }
-            Wire::Grpc | Wire::InteractiveGrpc => engine.flight_sender().await?.send_request(request).await,
+            EngineProtocol::Grpc | EngineProtocol::InteractiveGrpc => {
+                engine.flight_sender().await?.send_request(request).await
+            }
         };
         let response = response.map_err(|e| e.to_string())?;
         Ok(Self { response, connection, wire })
@@ -280,7 +284,7 @@ impl EngineProcess {
 /// The body of an engine's answer. Dropping it ends the query.
 pub(super) struct EngineBody {
     incoming: Incoming,
-    wire: Wire,
+    wire: EngineProtocol,
     lease: EngineLease,
     _connection: JoinSet<()>,
     _working: WorkingPlace,
@@ -288,9 +292,10 @@ pub(super) struct EngineBody {
 }
 
 impl EngineBody {
-    // gRPC says how an answer ended behind it, so that it can be told; HTTP/1.1 breaks the connection off.
+    // gRPC reports a failure in trailers behind the answer, so that the client sees it; HTTP/1.1 breaks the connection
+    // off.
     fn failure(&self) -> Option<Frame<Bytes>> {
-        if self.wire == Wire::Http {
+        if self.wire == EngineProtocol::Http {
             return None;
         }
         let reason = match self.lease.engine().end_reason() {
@@ -298,7 +303,7 @@ impl EngineBody {
             _ => "it stopped answering".to_owned(),
         };
         let mut trailers = HeaderMap::new();
-        crate::flight::status(&Fault::EngineEnded { reason }).add_header(&mut trailers).ok()?;
+        crate::flight::status(&RequestFault::EngineEnded { reason }).add_header(&mut trailers).ok()?;
         Some(Frame::trailers(trailers))
     }
 }

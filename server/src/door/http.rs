@@ -16,20 +16,20 @@ use tokio::net::TcpListener;
 use tokio::sync::watch;
 use tokio::task::JoinSet;
 
-use super::Door;
+use super::ServerDoor;
 use super::connection_places::{ConnectionPlaces, PlaceWork, PlacedStream};
-use super::forward::Wire;
+use super::forward::EngineProtocol;
 use crate::client_identity::ClientIdentity;
-use crate::fault::Fault;
-use crate::http::{Problem, RequestSite, authenticate, door_router, request_site};
+use crate::fault::RequestFault;
+use crate::http::{ProblemResponse, RequestSite, authenticate, door_router, request_site};
 
 /// Connections at once. Systems often allow a process 1024 open files.
 const MOST: usize = 512;
-/// How long a request's head may take, and how long a connection may stand idle between two.
+/// Time limit for a request's head, and for an idle connection between two requests.
 const HEAD: Duration = Duration::from_secs(30);
 
-/// Answers connections until `stopping`, then lets those end that are at it.
-pub(super) async fn serve(door: Door, listener: TcpListener, stopping: watch::Receiver<bool>) {
+/// Answers connections until `stopping`, then lets pending requests end.
+pub(super) async fn serve(door: ServerDoor, listener: TcpListener, stopping: watch::Receiver<bool>) {
     let router = door_router(&door);
     let places = ConnectionPlaces::new(listener, MOST);
     let mut stopped = stopping.clone();
@@ -66,24 +66,24 @@ async fn answer(stream: PlacedStream, router: Router, mut stopping: watch::Recei
     let _ = connection.await;
 }
 
-impl Door {
-    /// Answers a request by the engine of who asks.
+impl ServerDoor {
+    /// Forwards a request to the client's engine.
     pub(crate) async fn forward_http(State(door): State<Self>, request: Request) -> Response {
         door.answer_http(request).await.unwrap_or_else(|fault| {
             door.metrics().failed(fault.code());
-            Problem(fault).into_response()
+            ProblemResponse(fault).into_response()
         })
     }
 
-    async fn answer_http(&self, request: Request) -> Result<Response, Fault> {
-        let work = request.extensions().get::<PlaceWork>().cloned().ok_or(Fault::Internal)?;
+    async fn answer_http(&self, request: Request) -> Result<Response, RequestFault> {
+        let work = request.extensions().get::<PlaceWork>().cloned().ok_or(RequestFault::Internal)?;
         let local = || match request_site(request.uri(), request.headers()) {
             RequestSite::Foreign => ClientIdentity::foreign(),
             RequestSite::OwnPage => ClientIdentity::pages(),
             RequestSite::Program => ClientIdentity::programs(),
         };
         let client = authenticate(self.access(), request.headers(), local)?;
-        let response = self.engines().forward(&client, request, Wire::Http, &work).await?;
+        let response = self.engines().forward(&client, request, EngineProtocol::Http, &work).await?;
         Ok(response.map(Body::new))
     }
 }

@@ -21,31 +21,31 @@ use tokio::sync::watch;
 use tokio::task::JoinSet;
 
 use crate::Error;
-use crate::metrics::Metrics;
-use crate::tokens::{Access, Tokens};
+use crate::metrics::ServerMetrics;
+use crate::tokens::{TokenAccess, TokenFile};
 use engine_pool::EnginePool;
 
-/// How long answers may go on when the server is told to stop.
+/// Time for which answers may continue after the server was asked to stop.
 const GRACE: Duration = Duration::from_secs(5);
 /// Bytes that the system keeps for a connection until they are read, and connections until they are accepted.
 const RECEIVED_BYTES: u32 = 128 << 10;
 const BACKLOG: u32 = 1024;
 
-/// Where a server listens, whom it lets in, and what it gives them.
-pub struct Settings {
+/// Addresses, access rules and engine limits of a server.
+pub struct ServerSettings {
     /// HTTP; None for none, as below. Port 0 for any that is free.
     pub http: Option<SocketAddr>,
     /// Arrow Flight SQL.
     pub flight_sql: Option<SocketAddr>,
     /// Postgres' protocol.
     pub postgres: Option<SocketAddr>,
-    /// Who is let in; None for everybody, on loopback only.
-    pub tokens: Option<Tokens>,
+    /// The accepted tokens; None for open access, on loopback only.
+    pub tokens: Option<TokenFile>,
     /// The engines.
     pub engines: EngineSettings,
 }
 
-/// What engines are started as, and what they may use.
+/// The engines' program and their limits.
 #[derive(Debug, Clone)]
 pub struct EngineSettings {
     /// The program that has the command `engine`.
@@ -60,19 +60,19 @@ pub struct EngineSettings {
 }
 
 /// A server that listens and does not answer yet.
-pub struct Server {
-    door: Door,
+pub struct LakeServer {
+    door: ServerDoor,
     http: Option<TcpListener>,
     flight_sql: Option<TcpListener>,
     postgres: Option<TcpListener>,
 }
 
-impl Server {
+impl LakeServer {
     /// Listens.
     ///
     /// # Errors
     /// [`Error::Open`], [`Error::Bind`], [`Error::Temp`].
-    pub fn bind(lake: &Lake, settings: Settings) -> Result<Self, Error> {
+    pub fn bind(lake: &Lake, settings: ServerSettings) -> Result<Self, Error> {
         let addresses = [settings.http, settings.flight_sql, settings.postgres];
         if settings.tokens.is_none()
             && let Some(address) = addresses.into_iter().flatten().find(|a| !a.ip().is_loopback())
@@ -80,14 +80,14 @@ impl Server {
             return Err(Error::Open { address });
         }
         Ok(Self {
-            door: Door::new(lake, settings.tokens, settings.engines)?,
+            door: ServerDoor::new(lake, settings.tokens, settings.engines)?,
             http: listen(settings.http)?,
             flight_sql: listen(settings.flight_sql)?,
             postgres: listen(settings.postgres)?,
         })
     }
 
-    /// Where it listens, as URLs.
+    /// Returns the listening addresses, as URLs.
     pub fn addresses(&self) -> Vec<String> {
         let url = |scheme: &str, listener: &Option<TcpListener>, path: &str| {
             let address = listener.as_ref()?.local_addr().ok()?;
@@ -101,7 +101,7 @@ impl Server {
         all.into_iter().flatten().collect()
     }
 
-    /// Answers until `stop`, then lets answers go on for five seconds.
+    /// Answers until `stop`, then lets answers continue for five seconds.
     ///
     /// # Errors
     /// [`Error::System`].
@@ -148,28 +148,28 @@ fn bind(address: SocketAddr) -> std::io::Result<TcpListener> {
     socket.listen(BACKLOG)
 }
 
-/// What all connections share.
+/// State shared by all connections.
 #[derive(Clone)]
-pub(crate) struct Door(Arc<Inner>);
+pub(crate) struct ServerDoor(Arc<DoorState>);
 
-struct Inner {
-    access: Access,
-    metrics: Arc<Metrics>,
+struct DoorState {
+    access: TokenAccess,
+    metrics: Arc<ServerMetrics>,
     engines: EnginePool,
 }
 
-impl Door {
-    fn new(lake: &Lake, tokens: Option<Tokens>, settings: EngineSettings) -> Result<Self, Error> {
-        let metrics = Arc::new(Metrics::default());
+impl ServerDoor {
+    fn new(lake: &Lake, tokens: Option<TokenFile>, settings: EngineSettings) -> Result<Self, Error> {
+        let metrics = Arc::new(ServerMetrics::default());
         let engines = EnginePool::new(lake, settings, metrics.clone())?;
-        Ok(Self(Arc::new(Inner { access: Access::new(tokens), metrics, engines })))
+        Ok(Self(Arc::new(DoorState { access: TokenAccess::new(tokens), metrics, engines })))
     }
 
-    pub(crate) fn access(&self) -> &Access {
+    pub(crate) fn access(&self) -> &TokenAccess {
         &self.0.access
     }
 
-    pub(crate) fn metrics(&self) -> &Metrics {
+    pub(crate) fn metrics(&self) -> &ServerMetrics {
         &self.0.metrics
     }
 

@@ -9,9 +9,9 @@ use tempfile::{Builder, TempDir};
 
 use crate::Error;
 
-/// The folder in the lake that temporary files are in, where nobody names another.
+/// The folder in the lake for temporary files, if no other is given.
 const IN_LAKE: &str = "temp";
-/// What the folder of a server is called, before its process's number.
+/// Prefix of a server's folder, before its process's number.
 const PREFIX: &str = "serve-";
 /// The number that statfs tells of a file system in memory (`TMPFS_MAGIC` in linux/magic.h).
 const TMPFS: u64 = 0x0102_1994;

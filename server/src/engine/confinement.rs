@@ -1,4 +1,5 @@
-//! Limits that the system holds an engine to: files by Landlock, where the kernel has it, and memory by a resource limit.
+//! Limits that the system enforces on an engine: files by Landlock, if the kernel has it, and memory by a resource
+//! limit.
 
 use std::io;
 use std::path::{Path, PathBuf};

@@ -1,5 +1,5 @@
 //! An engine: the queries of one client, in a process of their own. It answers the three protocols on Unix sockets in a
-//! folder that only its user may enter; the door, which started it, is its only peer and has found out who asks.
+//! folder that only its user may enter; the door, which started it, is its only peer and has authenticated the client.
 
 pub mod confinement;
 pub(crate) mod report;
@@ -16,7 +16,7 @@ use tokio::net::UnixListener;
 use tokio::sync::oneshot;
 
 use crate::client_identity::ClientIdentity;
-use crate::service::Service;
+use crate::service::QueryService;
 use crate::{Error, flight, http, postgres};
 use report::EngineReport;
 
@@ -64,7 +64,7 @@ pub async fn run_engine(lake: &Lake, sockets: &Path, memory: Option<usize>) -> R
     // The door went away before it had a use for this engine.
     let Ok(identity) = assigned.await else { return Ok(()) };
     let limit = identity.memory_bytes.into_iter().chain(memory).min();
-    let service = Service::new(lake, engine, identity)?;
+    let service = QueryService::new(lake, engine, identity)?;
     // Behind the start of its threads, whose stacks count.
     limit.map(confinement::limit_memory).transpose().map_err(Error::System)?;
     watchdog::start(&service).map_err(Error::System)?;
@@ -83,7 +83,7 @@ fn read_assignment() -> oneshot::Receiver<ClientIdentity> {
         for line in std::io::stdin().lock().lines().map_while(Result::ok) {
             let identity = serde_json::from_str(&line).ok();
             if let (Some(identity), Some(send)) = (identity, send.take()) {
-                // Nobody receives it where the engine has failed meanwhile.
+                // The receiver is gone if the engine has failed meanwhile.
                 let _ = send.send(identity);
             }
         }
@@ -94,7 +94,7 @@ fn read_assignment() -> oneshot::Receiver<ClientIdentity> {
 
 async fn warm_up(engine: &Engine) -> Result<(), Error> {
     let session = engine.session(&Arc::new(Client::new("warm-up", Quota::default())));
-    // What is wrong with the lake is told to whoever asks it.
+    // A defect of the lake is reported to each client that queries it.
     let answer = async { session.query(WARM_UP).await?.next().await };
     drop(answer.boxed().await);
     Ok(())

@@ -12,7 +12,7 @@ pub(crate) enum EngineReport {
     Ready,
     /// It ends itself, for this reason.
     Ending(String),
-    /// Its counters, as [`crate::metrics::Metrics::counters`] lists them.
+    /// Its counters, as [`crate::metrics::ServerMetrics::counters`] lists them.
     Counters(Vec<u64>),
 }
 
@@ -22,7 +22,7 @@ impl EngineReport {
         let mut line = serde_json::to_vec(self).unwrap_or_default();
         line.push(b'\n');
         let mut stdout = std::io::stdout().lock();
-        // Where the door is gone, standard input ends too, and the engine with it.
+        // If the door is gone, standard input ends too, and the engine with it.
         let _ = stdout.write_all(&line).and_then(|()| stdout.flush());
     }
 }

@@ -1,16 +1,16 @@
-//! Ends its own process where work continues that nobody waits for any more: planning, a call of a function, an operator
-//! that does not return. The library cannot be interrupted there; the process is one client's, and its door starts another.
+//! Ends its own process if work continues after its query has ended: planning, a call of a function, an operator that
+//! does not return. The library cannot be interrupted there; the process is one client's, and its door starts another.
 
 use std::time::{Duration, Instant};
 
 use rustix::time::{ClockId, clock_gettime};
 
 use super::report::EngineReport;
-use crate::service::Service;
+use crate::service::QueryService;
 
 /// Time between two looks; the door's figures are sent as often.
 const INTERVAL: Duration = Duration::from_millis(50);
-/// How long work may continue after its query was cancelled, ran out of time, or lost its client.
+/// Time for which work may continue after its query was cancelled, ran out of time, or lost its client.
 const GRACE: Duration = Duration::from_millis(250);
 /// Part of one processor from which an engine without requests is not idle.
 const BUSY: f64 = 0.5;
@@ -19,13 +19,13 @@ const BUSY: f64 = 0.5;
 ///
 /// # Errors
 /// The system gives no thread.
-pub(super) fn start(service: &Service) -> std::io::Result<()> {
+pub(super) fn start(service: &QueryService) -> std::io::Result<()> {
     let service = service.clone();
     std::thread::Builder::new().name("watchdog".to_owned()).spawn(move || watch(&service))?;
     Ok(())
 }
 
-fn watch(service: &Service) {
+fn watch(service: &QueryService) {
     let mut idle = IdleWork::default();
     let mut sent = Vec::new();
     loop {

@@ -18,22 +18,23 @@ use prost::Message as _;
 use tonic::{Response, Status};
 
 use super::status::status;
-use crate::fault::Fault;
-use crate::running::{Encode, Running};
+use crate::fault::RequestFault;
+use crate::running::{AnswerEncoder, RunningQuery};
 
-/// What DoGet sends.
-pub(super) type Data = Pin<Box<dyn Stream<Item = Result<FlightData, Status>> + Send>>;
+/// The stream that DoGet sends.
+pub(super) type FlightStream = Pin<Box<dyn Stream<Item = Result<FlightData, Status>> + Send>>;
 
-/// Rows in the columns that were told before: the plan's, which may differ from those of its run in what may be null.
-pub(super) struct Told(pub(super) SchemaRef);
+/// Encodes rows with the columns that were announced: the plan's, which may differ from those of its run in
+/// nullability.
+pub(super) struct AnnouncedColumns(pub(super) SchemaRef);
 
-impl Encode for Told {
+impl AnswerEncoder for AnnouncedColumns {
     type Item = RecordBatch;
 
-    fn batch(&mut self, batch: RecordBatch) -> Result<Vec<RecordBatch>, Fault> {
+    fn batch(&mut self, batch: RecordBatch) -> Result<Vec<RecordBatch>, RequestFault> {
         let wrong = |e: ArrowError| {
             eprintln!("an answer does not have the columns that were told: {e}");
-            Fault::Internal
+            RequestFault::Internal
         };
         let columns = batch.columns().iter().zip(self.0.fields()).map(|(column, field)| {
             if column.data_type() == field.data_type() { Ok(column.clone()) } else { cast(column, field.data_type()) }
@@ -42,18 +43,21 @@ impl Encode for Told {
         Ok(vec![RecordBatch::try_new(self.0.clone(), columns).map_err(wrong)?])
     }
 
-    fn end(self) -> Result<Vec<RecordBatch>, Fault> {
+    fn end(self) -> Result<Vec<RecordBatch>, RequestFault> {
         Ok(Vec::new())
     }
 }
 
-/// Whether these columns can be told: a placeholder without a value has no type yet.
+/// Returns whether these columns can be announced: a placeholder without a value has no type yet.
 pub(super) fn is_settled(schema: &Schema) -> bool {
     schema.fields().iter().all(|f| *f.data_type() != DataType::Null)
 }
 
 /// The rows of a run. The answer begins with the first of them: until then, the door may ask another engine.
-pub(super) async fn run(schema: SchemaRef, mut running: Running<RecordBatch>) -> Result<Response<Data>, Fault> {
+pub(super) async fn run(
+    schema: SchemaRef,
+    mut running: RunningQuery<RecordBatch>,
+) -> Result<Response<FlightStream>, RequestFault> {
     let first = running.next().await?;
     let batches = stream::try_unfold((first, running), |(first, mut running)| async move {
         let batch = match first {
@@ -67,7 +71,7 @@ pub(super) async fn run(schema: SchemaRef, mut running: Running<RecordBatch>) ->
 }
 
 /// The rows of a batch.
-pub(super) fn batch(batch: Result<RecordBatch, FlightError>) -> Result<Response<Data>, Status> {
+pub(super) fn batch(batch: Result<RecordBatch, FlightError>) -> Result<Response<FlightStream>, Status> {
     let batch = batch.map_err(|e| Status::internal(e.to_string()))?;
     Ok(send(batch.schema(), stream::iter([Ok(batch)])))
 }
@@ -76,12 +80,12 @@ pub(super) fn batch(batch: Result<RecordBatch, FlightError>) -> Result<Response<
 fn send(
     schema: SchemaRef,
     batches: impl Stream<Item = Result<RecordBatch, FlightError>> + Send + 'static,
-) -> Response<Data> {
+) -> Response<FlightStream> {
     let data = FlightDataEncoderBuilder::new().with_schema(schema).build(batches);
     Response::new(data.map_err(Status::from).boxed())
 }
 
-/// Where an answer is fetched.
+/// The ticket and the columns with which an answer is fetched.
 pub(super) fn info(
     schema: Option<&Schema>,
     ticket: &impl ProstMessageExt,

@@ -1,4 +1,4 @@
-//! What the server says about itself: names, abilities and types, for drivers that ask.
+//! Server metadata for drivers: names, capabilities and types.
 
 use arrow::datatypes::{DataType, Field, Schema};
 use arrow_flight::error::FlightError;

@@ -15,15 +15,15 @@ use tokio::net::{UnixListener, UnixStream};
 use tonic::transport::Server;
 
 use crate::Error;
-use crate::service::Service;
+use crate::service::QueryService;
 pub(crate) use status::status;
 
 /// Bytes of an answer that may be on their way to one request: the door holds them while its client reads slowly.
 pub(crate) const WINDOW_BYTES: u32 = 1 << 20;
 
 /// Answers Flight SQL on an engine's socket.
-pub(crate) async fn serve(service: Service, listener: UnixListener) -> Result<(), Error> {
-    let flight = service::Flight::new(service).map_err(|e| Error::Transport(Box::new(e)))?;
+pub(crate) async fn serve(service: QueryService, listener: UnixListener) -> Result<(), Error> {
+    let flight = service::LakeFlightService::new(service).map_err(|e| Error::Transport(Box::new(e)))?;
     Server::builder()
         .add_service(FlightServiceServer::new(flight))
         .serve_with_incoming(stream::unfold(listener, next))

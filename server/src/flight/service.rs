@@ -29,15 +29,15 @@ use prost::Message as _;
 use tonic::metadata::MetadataValue;
 use tonic::{Request, Response, Status, Streaming};
 
-use super::answer::{self, Data, Told, is_settled};
-use super::statements::{Statement, Statements};
+use super::answer::{self, AnnouncedColumns, FlightStream, is_settled};
+use super::statements::{HeldStatement, HeldStatements};
 use super::status::status;
 use super::{info, values};
-use crate::fault::Fault;
-use crate::metrics::Protocol;
-use crate::running::Stop;
-use crate::service::{CATALOG, FRESH, Job, SCHEMA, Service, Work};
-use crate::tokens::{Scope, of_header};
+use crate::fault::RequestFault;
+use crate::metrics::ServerProtocol;
+use crate::running::StopSignal;
+use crate::service::{CATALOG, FRESH, QueryJob, QueryService, QueryWork, SCHEMA};
+use crate::tokens::{TokenScope, of_header};
 
 /// The action that ends a query by what GetFlightInfo gave.
 const CANCEL_FLIGHT_INFO: &str = "CancelFlightInfo";
@@ -47,28 +47,28 @@ const CANCELLED: i32 = 1;
 const TABLE: &str = "TABLE";
 
 /// Flight SQL on the shared service.
-pub(super) struct Flight {
-    service: Service,
-    statements: Statements,
+pub(super) struct LakeFlightService {
+    service: QueryService,
+    statements: HeldStatements,
     sql_info: SqlInfoData,
     types: XdbcTypeInfoData,
 }
 
-impl Flight {
-    pub(super) fn new(service: Service) -> Result<Self, FlightError> {
-        Ok(Self { service, statements: Statements::default(), sql_info: info::sql_info()?, types: info::types()? })
+impl LakeFlightService {
+    pub(super) fn new(service: QueryService) -> Result<Self, FlightError> {
+        Ok(Self { service, statements: HeldStatements::default(), sql_info: info::sql_info()?, types: info::types()? })
     }
 
     fn client(&self) -> Result<Arc<Client>, Status> {
-        self.service.client(Scope::Sql).map_err(|fault| status(&fault))
+        self.service.client(TokenScope::Sql).map_err(|fault| status(&fault))
     }
 
-    async fn plan(&self, client: &Arc<Client>, sql: String) -> Result<Statement, Status> {
+    async fn plan(&self, client: &Arc<Client>, sql: String) -> Result<HeldStatement, Status> {
         let (session, sql): (_, Arc<str>) = (Arc::new(self.service.session(client)), sql.into());
         let prepared = self.prepare(&session, &sql).await?;
         let values = ParamValues::from(Vec::<ScalarValue>::new());
         let (schema, planned) = (prepared.schema(), Instant::now());
-        Ok(Statement { session, sql, prepared, planned, schema, values, stop: Stop::new() })
+        Ok(HeldStatement { session, sql, prepared, planned, schema, values, stop: StopSignal::new() })
     }
 
     async fn prepare(&self, session: &Arc<Session>, sql: &Arc<str>) -> Result<Arc<Prepared>, Status> {
@@ -77,22 +77,22 @@ impl Flight {
         Ok(Arc::new(planned.map_err(|f| status(&f))?))
     }
 
-    // The statement of a handle. An engine that another one was before plans it anew, without the values that were bound.
-    async fn find(&self, client: &Arc<Client>, handle: &[u8]) -> Result<Statement, Status> {
+    // The statement of a handle. An engine that replaced another one plans it again, without bound values.
+    async fn find(&self, client: &Arc<Client>, handle: &[u8]) -> Result<HeldStatement, Status> {
         let lost = match self.statements.find(client.name(), handle) {
             Ok(found) => return Ok(found),
             Err(fault) => status(&fault),
         };
-        let sql = Statements::text(handle).ok_or(lost)?;
+        let sql = HeldStatements::text(handle).ok_or(lost)?;
         let statement = self.plan(client, sql).await?;
         self.statements.keep_as(handle, statement.clone()).map_err(|f| status(&f))?;
         Ok(statement)
     }
 
     // A statement of a client's handle, for a run of its own on today's lake.
-    async fn prepared(&self, client: &Arc<Client>, handle: &[u8]) -> Result<Statement, Status> {
+    async fn prepared(&self, client: &Arc<Client>, handle: &[u8]) -> Result<HeldStatement, Status> {
         let found = self.find(client, handle).await?;
-        let mut statement = Statement { stop: Stop::new(), ..found };
+        let mut statement = HeldStatement { stop: StopSignal::new(), ..found };
         if statement.planned.elapsed() >= FRESH {
             statement.prepared = self.prepare(&statement.session, &statement.sql).await?;
             statement.planned = Instant::now();
@@ -101,24 +101,25 @@ impl Flight {
     }
 
     // A ticket of its own for each run, so that binding other values meanwhile does not change it.
-    fn ticket(&self, statement: Statement, descriptor: FlightDescriptor) -> Result<Response<FlightInfo>, Status> {
+    fn ticket(&self, statement: HeldStatement, descriptor: FlightDescriptor) -> Result<Response<FlightInfo>, Status> {
         let schema = statement.schema.clone();
         let handle = self.statements.keep(statement).map_err(|f| status(&f))?;
         let ticket = TicketStatementQuery { statement_handle: handle };
         answer::info(is_settled(&schema).then_some(schema.as_ref()), &ticket, descriptor)
     }
 
-    async fn run(&self, statement: Statement) -> Result<Response<Data>, Status> {
+    async fn run(&self, statement: HeldStatement) -> Result<Response<FlightStream>, Status> {
         let told = is_settled(&statement.schema).then(|| statement.schema.clone());
-        let job = Job {
-            protocol: Protocol::FlightSql,
+        let job = QueryJob {
+            protocol: ServerProtocol::FlightSql,
             session: statement.session,
-            work: Work::Prepared(statement.prepared, statement.values),
+            work: QueryWork::Prepared(statement.prepared, statement.values),
             limit: None,
             stop: statement.stop,
         };
         let given = told.clone();
-        let begun = self.service.begin(job, move |schema| Ok(Told(given.unwrap_or_else(|| schema.clone())))).await;
+        let begun =
+            self.service.begin(job, move |schema| Ok(AnnouncedColumns(given.unwrap_or_else(|| schema.clone())))).await;
         let running = begun.map_err(|f| status(&f))?;
         let schema = told.unwrap_or_else(|| running.schema.clone());
         answer::run(schema, running).await.map_err(|f| status(&f))
@@ -137,7 +138,7 @@ impl Flight {
 }
 
 fn read_only() -> Status {
-    status(&Fault::Query(QueryError::NotReading { statement: "an update".to_owned() }))
+    status(&RequestFault::Query(QueryError::NotReading { statement: "an update".to_owned() }))
 }
 
 fn batch_info<T: arrow_flight::sql::ProstMessageExt>(
@@ -149,12 +150,12 @@ fn batch_info<T: arrow_flight::sql::ProstMessageExt>(
 }
 
 // Nothing in a lake is declared a key.
-fn no_keys() -> Result<Response<Data>, Status> {
+fn no_keys() -> Result<Response<FlightStream>, Status> {
     answer::batch(Ok(arrow::array::RecordBatch::new_empty(answer::shared(info::key_schema()))))
 }
 
 #[tonic::async_trait]
-impl FlightSqlService for Flight {
+impl FlightSqlService for LakeFlightService {
     type FlightService = Self;
 
     // What a driver does with a user and password: the password is the token, and becomes the bearer's.
@@ -274,7 +275,7 @@ impl FlightSqlService for Flight {
         let client = self.client()?;
         let action = request.into_inner();
         if action.r#type != CANCEL_FLIGHT_INFO {
-            return Err(status(&Fault::unsupported(format!("the action `{}`", action.r#type))));
+            return Err(status(&RequestFault::unsupported(format!("the action `{}`", action.r#type))));
         }
         let asked =
             CancelFlightInfoRequest::decode(action.body).map_err(|e| Status::invalid_argument(e.to_string()))?;
@@ -509,7 +510,7 @@ impl FlightSqlService for Flight {
         _: Request<Action>,
     ) -> Result<ActionBeginTransactionResult, Status> {
         self.client()?;
-        Err(status(&Fault::unsupported("a transaction (each query sees one frozen view of the lake)")))
+        Err(status(&RequestFault::unsupported("a transaction (each query sees one frozen view of the lake)")))
     }
 
     // What the server is, is not for others to say.

@@ -1,5 +1,6 @@
-//! Statements that clients hold handles of. A handle begins with a random number, under which the statement is kept until
-//! it is not used any more, and goes on with its text, so that another engine of the same client can plan it anew.
+//! Statements that clients hold handles of. A handle begins with a random number, under which the statement is kept
+//! until it is not used any more, and continues with its text, so that another engine of the same client can plan it
+//! again.
 
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -10,51 +11,51 @@ use bytes::Bytes;
 use datafusion::common::ParamValues;
 use echolake_query::{Prepared, Session};
 
-use crate::fault::Fault;
-use crate::running::Stop;
+use crate::fault::RequestFault;
+use crate::running::StopSignal;
 
 /// Bytes of a text up to which handles carry it.
 const CARRIED_BYTES: usize = 32 << 10;
-/// How long an unused handle is good for.
+/// Time after which an unused handle expires.
 const KEPT: Duration = Duration::from_secs(600);
-/// Handles of one client; the one not used for longest makes room.
+/// Handles of one client; the least recently used is evicted.
 const HELD: usize = 256;
 
-type Handle = [u8; 16];
+type StatementHandle = [u8; 16];
 
-/// What a handle stands for.
+/// The statement of a handle.
 #[derive(Clone)]
-pub(super) struct Statement {
+pub(super) struct HeldStatement {
     /// The session it was planned in; its client owns the handle.
     pub(super) session: Arc<Session>,
     pub(super) sql: Arc<str>,
     pub(super) prepared: Arc<Prepared>,
-    /// When: it sees the lake as it was then.
+    /// Time of planning: it sees the lake as of then.
     pub(super) planned: Instant,
-    /// Columns as they were told to the client.
+    /// Columns as they were announced to the client.
     pub(super) schema: SchemaRef,
     /// Values of its placeholders.
     pub(super) values: ParamValues,
     /// Ends its run.
-    pub(super) stop: Stop,
+    pub(super) stop: StopSignal,
 }
 
 /// The statements of all clients.
 #[derive(Default)]
-pub(super) struct Statements(Mutex<HashMap<Handle, Kept>>);
+pub(super) struct HeldStatements(Mutex<HashMap<StatementHandle, StatementEntry>>);
 
-struct Kept {
-    statement: Statement,
+struct StatementEntry {
+    statement: HeldStatement,
     used: Instant,
 }
 
-impl Statements {
+impl HeldStatements {
     /// Keeps a statement.
-    pub(super) fn keep(&self, statement: Statement) -> Result<Bytes, Fault> {
-        let mut handle = Handle::default();
+    pub(super) fn keep(&self, statement: HeldStatement) -> Result<Bytes, RequestFault> {
+        let mut handle = StatementHandle::default();
         getrandom::fill(&mut handle).map_err(|failed| {
             eprintln!("no random bytes: {failed}");
-            Fault::Internal
+            RequestFault::Internal
         })?;
         let sql = Some(statement.sql.clone()).filter(|sql| sql.len() <= CARRIED_BYTES);
         let whole = [&handle, sql.as_deref().unwrap_or_default().as_bytes()].concat();
@@ -63,7 +64,7 @@ impl Statements {
     }
 
     /// Keeps a statement under a handle that another engine made.
-    pub(super) fn keep_as(&self, handle: &[u8], statement: Statement) -> Result<(), Fault> {
+    pub(super) fn keep_as(&self, handle: &[u8], statement: HeldStatement) -> Result<(), RequestFault> {
         let (handle, _) = handle.split_first_chunk().ok_or_else(gone)?;
         self.insert(*handle, statement);
         Ok(())
@@ -71,11 +72,11 @@ impl Statements {
 
     /// The text that a handle carries.
     pub(super) fn text(handle: &[u8]) -> Option<String> {
-        let (_, sql) = handle.split_first_chunk::<{ size_of::<Handle>() }>()?;
+        let (_, sql) = handle.split_first_chunk::<{ size_of::<StatementHandle>() }>()?;
         String::from_utf8(sql.to_vec()).ok().filter(|sql| !sql.is_empty())
     }
 
-    fn insert(&self, handle: Handle, statement: Statement) {
+    fn insert(&self, handle: StatementHandle, statement: HeldStatement) {
         let mut all = self.lock();
         all.retain(|_, kept| kept.used.elapsed() < KEPT);
         let owner = statement.session.client().name();
@@ -88,27 +89,32 @@ impl Statements {
         for (_, oldest) in own.iter().take((own.len() + 1).saturating_sub(HELD)) {
             all.remove(oldest);
         }
-        all.insert(handle, Kept { statement, used: Instant::now() });
+        all.insert(handle, StatementEntry { statement, used: Instant::now() });
     }
 
     /// The statement of a client's handle.
-    pub(super) fn find(&self, client: &str, handle: &[u8]) -> Result<Statement, Fault> {
+    pub(super) fn find(&self, client: &str, handle: &[u8]) -> Result<HeldStatement, RequestFault> {
         self.with(client, handle, |kept| kept.statement.clone())
     }
 
     /// Sets the values of its placeholders.
-    pub(super) fn bind(&self, client: &str, handle: &[u8], values: ParamValues) -> Result<(), Fault> {
+    pub(super) fn bind(&self, client: &str, handle: &[u8], values: ParamValues) -> Result<(), RequestFault> {
         self.with(client, handle, |kept| kept.statement.values = values)
     }
 
-    /// Forgets it; what runs goes on.
+    /// Forgets it; a running query continues.
     pub(super) fn forget(&self, client: &str, handle: &[u8]) {
         if self.find(client, handle).is_ok() {
             self.lock().retain(|known, _| !handle.starts_with(known));
         }
     }
 
-    fn with<T>(&self, client: &str, handle: &[u8], act: impl FnOnce(&mut Kept) -> T) -> Result<T, Fault> {
+    fn with<T>(
+        &self,
+        client: &str,
+        handle: &[u8],
+        act: impl FnOnce(&mut StatementEntry) -> T,
+    ) -> Result<T, RequestFault> {
         let (handle, _) = handle.split_first_chunk().ok_or_else(gone)?;
         let mut all = self.lock();
         let kept = all.get_mut(handle).filter(|kept| kept.statement.session.client().name() == client);
@@ -117,11 +123,11 @@ impl Statements {
         Ok(act(kept))
     }
 
-    fn lock(&self) -> MutexGuard<'_, HashMap<Handle, Kept>> {
+    fn lock(&self) -> MutexGuard<'_, HashMap<StatementHandle, StatementEntry>> {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
-fn gone() -> Fault {
-    Fault::NotFound { what: "this statement".to_owned(), hint: "ask again: it may have expired" }
+fn gone() -> RequestFault {
+    RequestFault::NotFound { what: "this statement".to_owned(), hint: "ask again: it may have expired" }
 }

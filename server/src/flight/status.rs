@@ -3,33 +3,35 @@
 use tonic::metadata::{MetadataMap, MetadataValue};
 use tonic::{Code as Grpc, Status};
 
-use crate::fault::{Code, Fault};
+use crate::fault::{FaultCode, RequestFault};
 
 /// The metadata key of the code that stays the same.
 const CODE: &str = "echolake-code";
 
 /// A failure as a status.
-pub(crate) fn status(fault: &Fault) -> Status {
+pub(crate) fn status(fault: &RequestFault) -> Status {
     let code = fault.code();
     let mut metadata = MetadataMap::new();
     metadata.insert(CODE, MetadataValue::from_static(code.name()));
     Status::with_metadata(grpc(code), fault.to_string(), metadata)
 }
 
-fn grpc(code: Code) -> Grpc {
+fn grpc(code: FaultCode) -> Grpc {
     match code {
-        Code::Query | Code::Request | Code::Format | Code::Method => Grpc::InvalidArgument,
-        Code::ReadOnly | Code::Forbidden | Code::Foreign => Grpc::PermissionDenied,
-        Code::Execution | Code::Changed => Grpc::FailedPrecondition,
-        Code::Lake => Grpc::Unavailable,
-        Code::Unsupported => Grpc::Unimplemented,
-        Code::NotFound | Code::Gone | Code::NoData => Grpc::NotFound,
-        Code::Range => Grpc::OutOfRange,
-        Code::Unauthenticated => Grpc::Unauthenticated,
-        Code::Cancelled => Grpc::Cancelled,
-        Code::TimeLimit => Grpc::DeadlineExceeded,
-        Code::TooLarge | Code::TooMany | Code::MemoryLimit | Code::RowLimit => Grpc::ResourceExhausted,
-        Code::EngineEnded => Grpc::Aborted,
-        Code::Internal => Grpc::Internal,
+        FaultCode::Query | FaultCode::Request | FaultCode::Format | FaultCode::Method => Grpc::InvalidArgument,
+        FaultCode::ReadOnly | FaultCode::Forbidden | FaultCode::Foreign => Grpc::PermissionDenied,
+        FaultCode::Execution | FaultCode::Changed => Grpc::FailedPrecondition,
+        FaultCode::Lake => Grpc::Unavailable,
+        FaultCode::Unsupported => Grpc::Unimplemented,
+        FaultCode::NotFound | FaultCode::Gone | FaultCode::NoData => Grpc::NotFound,
+        FaultCode::Range => Grpc::OutOfRange,
+        FaultCode::Unauthenticated => Grpc::Unauthenticated,
+        FaultCode::Cancelled => Grpc::Cancelled,
+        FaultCode::TimeLimit => Grpc::DeadlineExceeded,
+        FaultCode::TooLarge | FaultCode::TooMany | FaultCode::MemoryLimit | FaultCode::RowLimit => {
+            Grpc::ResourceExhausted
+        }
+        FaultCode::EngineEnded => Grpc::Aborted,
+        FaultCode::Internal => Grpc::Internal,
     }
 }

@@ -11,10 +11,10 @@ use datafusion::common::{ParamValues, ScalarValue};
 use echolake_query::Prepared;
 use futures::TryStreamExt as _;
 
-use crate::fault::Fault;
+use crate::fault::RequestFault;
 
 /// The placeholders as columns.
-pub(super) fn parameter_schema(prepared: &Prepared) -> Result<Schema, Fault> {
+pub(super) fn parameter_schema(prepared: &Prepared) -> Result<Schema, RequestFault> {
     let fields = prepared.parameters()?.into_iter().enumerate().map(|(i, kind)| {
         let kind = kind.unwrap_or(DataType::Null);
         Field::new(format!("${}", i + 1), kind, true)
@@ -36,8 +36,8 @@ fn uncompressed(message: FlightData) -> Result<FlightData, FlightError> {
 }
 
 /// The values that a client puts.
-pub(super) async fn read(stream: PeekableFlightDataStream, prepared: &Prepared) -> Result<ParamValues, Fault> {
-    let wrong = |e: FlightError| Fault::request(format!("the values cannot be read: {e}"));
+pub(super) async fn read(stream: PeekableFlightDataStream, prepared: &Prepared) -> Result<ParamValues, RequestFault> {
+    let wrong = |e: FlightError| RequestFault::request(format!("the values cannot be read: {e}"));
     let data = stream.into_peekable().map_err(|status| FlightError::Tonic(Box::new(status)));
     let data = data.and_then(async |message| uncompressed(message));
     let mut batches = FlightRecordBatchStream::new_from_flight_data(data);
@@ -46,22 +46,22 @@ pub(super) async fn read(stream: PeekableFlightDataStream, prepared: &Prepared) 
         match batch.num_rows() {
             0 => {}
             1 if row.is_none() => row = Some(batch),
-            _ => return Err(Fault::unsupported("more than one row of values; a query takes one")),
+            _ => return Err(RequestFault::unsupported("more than one row of values; a query takes one")),
         }
     }
     let Some(row) = row else { return Ok(ParamValues::from(Vec::<ScalarValue>::new())) };
     let kinds = prepared.parameters()?;
     if row.num_columns() != kinds.len() {
         let (given, wanted) = (row.num_columns(), kinds.len());
-        return Err(Fault::request(format!("{given} values for {wanted} placeholders")));
+        return Err(RequestFault::request(format!("{given} values for {wanted} placeholders")));
     }
     let values = row.columns().iter().zip(kinds).enumerate().map(|(i, (column, kind))| {
-        let wrong = |e| Fault::request(format!("the value of ${}: {e}", i + 1));
+        let wrong = |e| RequestFault::request(format!("the value of ${}: {e}", i + 1));
         let value = ScalarValue::try_from_array(column, 0).map_err(wrong)?;
         match kind {
             Some(kind) if kind != value.data_type() => value.cast_to(&kind).map_err(wrong),
             _ => Ok(value),
         }
     });
-    Ok(ParamValues::from(values.collect::<Result<Vec<_>, Fault>>()?))
+    Ok(ParamValues::from(values.collect::<Result<Vec<_>, RequestFault>>()?))
 }

@@ -1,4 +1,4 @@
-//! Files of the lake, as they are: whole or in ranges, for viewers that read them from elsewhere.
+//! Files of the lake, as they are: whole or in ranges, for viewers on pages of other origins, too.
 //!
 //! Which file it is comes from the snapshot; a request's text is only ever compared with the names in it.
 
@@ -17,103 +17,106 @@ use object_store::path::Path as StorePath;
 use object_store::{GetOptions, GetRange, ObjectStore as _, ObjectStoreExt as _};
 use serde::Deserialize;
 
-use super::catalogue::{self, Asked as Asking, Catalogue, View, text};
-use super::problem::Problem;
-use super::ranges::{Asked, Described};
-use crate::fault::Fault;
-use crate::tokens::Scope;
+use super::catalogue::{self, CatalogueRequest, LakeCatalogue, SnapshotView, text};
+use super::problem::ProblemResponse;
+use super::ranges::{FileDescription, RangeAnswer};
+use crate::fault::RequestFault;
+use crate::tokens::TokenScope;
 
 /// A run's file.
 pub(super) const RUN: &str = "/api/v1/runs/{run_id}/file.mcap";
 /// A table's file.
 pub(super) const TABLE: &str = "/api/v1/tables/{table}/{file}";
 
-/// Viewers on other pages read run files, so whoever may ask for them may do so from anywhere: without credentials, and
-/// told what ranges need. A page of elsewhere finds out no run's name here.
-pub(super) fn for_viewers(catalogue: &Catalogue) -> Router {
+/// Routes that viewers on other pages use: run files may be requested from any origin, without credentials, and with
+/// the headers that ranges need. A page of another origin learns no run's name here.
+pub(super) fn for_viewers(catalogue: &LakeCatalogue) -> Router {
     Router::new().route(RUN, get(run)).with_state(catalogue.clone())
 }
 
 /// The files that only the server's own pages and programs read.
-pub(super) fn for_own(catalogue: &Catalogue) -> Router {
+pub(super) fn for_own(catalogue: &LakeCatalogue) -> Router {
     Router::new().route(TABLE, get(table)).with_state(catalogue.clone())
 }
 
 async fn run(
-    State(catalogue): State<Catalogue>,
+    State(catalogue): State<LakeCatalogue>,
     path: Result<Path<String>, PathRejection>,
     headers: HeaderMap,
-) -> Result<Response, Problem> {
-    catalogue.service().client(Scope::Files)?;
-    let Path(name) = path.map_err(|_| Fault::request("the path is not UTF-8"))?;
+) -> Result<Response, ProblemResponse> {
+    catalogue.service().client(TokenScope::Files)?;
+    let Path(name) = path.map_err(|_| RequestFault::request("the path is not UTF-8"))?;
     let view = catalogue.view().await?;
     let run = catalogue::run(&view, &name)?;
     let etag = digest(&catalogue, &view, run.run.as_str()).await?;
-    let described = Described {
+    let described = FileDescription {
         etag: format!("\"{etag}\""),
         media_type: "application/octet-stream",
         // A page elsewhere may embed what it may read.
         policy: "cross-origin",
     };
-    let stored = Stored { path: Lake::run_path(&run.surface, &run.run), described };
+    let stored = RangedFile { path: Lake::run_path(&run.surface, &run.run), described };
     Ok(stored.answer(catalogue.lake(), &headers).await?)
 }
 
 async fn table(
-    State(catalogue): State<Catalogue>,
+    State(catalogue): State<LakeCatalogue>,
     path: Result<Path<(String, String)>, PathRejection>,
     headers: HeaderMap,
-) -> Result<Response, Problem> {
-    catalogue.service().client(Scope::Files)?;
-    let Path((table, name)) = path.map_err(|_| Fault::request("the path is not UTF-8"))?;
+) -> Result<Response, ProblemResponse> {
+    catalogue.service().client(TokenScope::Files)?;
+    let Path((table, name)) = path.map_err(|_| RequestFault::request("the path is not UTF-8"))?;
     let view = catalogue.view().await?;
     let hint = "GET /api/v1/tables/{table} lists what there is";
     let file = catalogue.shown(&view, catalogue::table(&table)?, &name);
-    let file = file.ok_or(Fault::NotFound { what: format!("file `{name}` of table `{table}`"), hint })?;
-    let described = Described {
+    let file = file.ok_or(RequestFault::NotFound { what: format!("file `{name}` of table `{table}`"), hint })?;
+    let described = FileDescription {
         // Its name is a digest of what it was made of.
         etag: format!("\"{name}-{}\"", file.bytes),
         media_type: "application/vnd.apache.parquet",
         policy: "same-origin",
     };
-    Ok(Stored { path: file.path.clone(), described }.answer(catalogue.lake(), &headers).await?)
+    Ok(RangedFile { path: file.path.clone(), described }.answer(catalogue.lake(), &headers).await?)
 }
 
 #[derive(Deserialize)]
-struct Digest {
+struct FileDigest {
     file_sha256: String,
 }
 
 // The digest that a run's row has of its file.
-async fn digest(catalogue: &Catalogue, view: &Arc<View>, run: &str) -> Result<String, Fault> {
+async fn digest(catalogue: &LakeCatalogue, view: &Arc<SnapshotView>, run: &str) -> Result<String, RequestFault> {
     let sql = "select file_sha256 from runs where run_id = $1";
-    let rows: Vec<Digest> = Asking::of(catalogue, view).rows(sql, vec![text(run)]).await?;
+    let rows: Vec<FileDigest> = CatalogueRequest::of(catalogue, view).rows(sql, vec![text(run)]).await?;
     let hint = "GET /api/v1/runs lists what there is";
-    rows.into_iter().next().map(|row| row.file_sha256).ok_or(Fault::NotFound { what: format!("run `{run}`"), hint })
+    rows.into_iter()
+        .next()
+        .map(|row| row.file_sha256)
+        .ok_or(RequestFault::NotFound { what: format!("run `{run}`"), hint })
 }
 
 /// A file of the lake's store that never changes.
-struct Stored {
+struct RangedFile {
     path: StorePath,
-    described: Described,
+    described: FileDescription,
 }
 
-impl Stored {
-    async fn answer(&self, lake: &Lake, headers: &HeaderMap) -> Result<Response, Fault> {
+impl RangedFile {
+    async fn answer(&self, lake: &Lake, headers: &HeaderMap) -> Result<Response, RequestFault> {
         let store = lake.store();
         let unread = |e: object_store::Error| match e {
             object_store::Error::NotFound { .. } => {
-                Fault::Gone { what: "this file", hint: "ask for the list of files again" }
+                RequestFault::Gone { what: "this file", hint: "ask for the list of files again" }
             }
             other => {
                 eprintln!("a file cannot be read: {other}");
-                Fault::Unreadable
+                RequestFault::Unreadable
             }
         };
         let bytes = store.head(&self.path).await.map_err(unread)?.size;
         let part = match self.described.asked(headers, bytes) {
-            Asked::Answer(answer) => return Ok(answer),
-            Asked::Part(part) => part,
+            RangeAnswer::Answer(answer) => return Ok(answer),
+            RangeAnswer::Part(part) => part,
         };
         let body = match part.range.is_empty() {
             true => Body::empty(),

@@ -1,4 +1,4 @@
-//! Which format an answer has, and its bytes.
+//! Formats of answers: their negotiation and their encoding.
 
 use std::io::{self, Write};
 use std::mem::take;
@@ -10,8 +10,8 @@ use axum::http::{HeaderMap, header};
 use bytes::Bytes;
 use echolake_query::output::{AnswerWriter, Format};
 
-use crate::fault::Fault;
-use crate::running::Encode;
+use crate::fault::RequestFault;
+use crate::running::AnswerEncoder;
 
 /// The formats of answers, each with its media types, the first of them ours.
 const FORMATS: [(Format, &[&str]); 4] = [
@@ -22,16 +22,16 @@ const FORMATS: [(Format, &[&str]); 4] = [
 ];
 
 /// The format of this name.
-pub(super) fn named(name: &str) -> Result<Format, Fault> {
+pub(super) fn named(name: &str) -> Result<Format, RequestFault> {
     let known = FORMATS.iter().map(|(format, _)| *format);
     known.clone().find(|f| f.name() == name).ok_or_else(|| {
         let names: Vec<_> = known.map(Format::name).collect();
-        Fault::request(format!("no format `{name}`; hint: {}", names.join(", ")))
+        RequestFault::request(format!("no format `{name}`; hint: {}", names.join(", ")))
     })
 }
 
 /// The format that an `Accept` header likes best.
-pub(super) fn accepted(accept: &str) -> Result<Format, Fault> {
+pub(super) fn accepted(accept: &str) -> Result<Format, RequestFault> {
     let mut best: Option<(f32, Format)> = None;
     for range in accept.split(',') {
         let mut parts = range.split(';').map(str::trim);
@@ -46,17 +46,17 @@ pub(super) fn accepted(accept: &str) -> Result<Format, Fault> {
     }
     best.map(|(_, format)| format).ok_or_else(|| {
         let types: Vec<_> = FORMATS.iter().map(|(_, types)| types[0]).collect();
-        Fault::request(format!("nothing in `Accept: {accept}` can be had; hint: {}", types.join(", ")))
+        RequestFault::request(format!("nothing in `Accept: {accept}` can be had; hint: {}", types.join(", ")))
     })
 }
 
-/// Whether an Arrow stream is liked better than JSON.
+/// Returns whether an Arrow stream is preferred to JSON.
 pub(super) fn prefers_arrow(headers: &HeaderMap) -> bool {
     let accept = headers.get(header::ACCEPT).and_then(|v| v.to_str().ok()).unwrap_or_default();
     accepted(accept).is_ok_and(|format| format == Format::Arrow)
 }
 
-/// Whether an encoding of HTTP is taken.
+/// Returns whether the client accepts an encoding of HTTP.
 pub(super) fn takes(headers: &HeaderMap, encoding: &str) -> bool {
     let accepted = headers.get(header::ACCEPT_ENCODING).and_then(|v| v.to_str().ok()).unwrap_or_default();
     accepted.split(',').any(|one| {
@@ -71,22 +71,22 @@ pub(super) fn media_type(format: Format) -> &'static str {
 }
 
 /// Writes an answer into bytes that are taken as they come.
-pub(super) struct Written {
-    writer: AnswerWriter<Shared>,
-    written: Shared,
+pub(super) struct FormatEncoder {
+    writer: AnswerWriter<SharedBuffer>,
+    written: SharedBuffer,
 }
 
 #[derive(Clone, Default)]
-struct Shared(Arc<Mutex<Vec<u8>>>);
+struct SharedBuffer(Arc<Mutex<Vec<u8>>>);
 
-impl Shared {
+impl SharedBuffer {
     fn take(&self) -> Vec<Bytes> {
         let bytes = take(&mut *self.0.lock().unwrap_or_else(PoisonError::into_inner));
         if bytes.is_empty() { Vec::new() } else { vec![bytes.into()] }
     }
 }
 
-impl Write for Shared {
+impl Write for SharedBuffer {
     fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
         self.0.lock().unwrap_or_else(PoisonError::into_inner).extend_from_slice(bytes);
         Ok(bytes.len())
@@ -97,23 +97,23 @@ impl Write for Shared {
     }
 }
 
-impl Written {
+impl FormatEncoder {
     /// Begins an answer of this schema.
-    pub(super) fn new(format: Format, schema: &SchemaRef) -> Result<Self, Fault> {
-        let written = Shared::default();
+    pub(super) fn new(format: Format, schema: &SchemaRef) -> Result<Self, RequestFault> {
+        let written = SharedBuffer::default();
         Ok(Self { writer: AnswerWriter::new(format, schema, written.clone())?, written })
     }
 }
 
-impl Encode for Written {
+impl AnswerEncoder for FormatEncoder {
     type Item = Bytes;
 
-    fn batch(&mut self, batch: RecordBatch) -> Result<Vec<Bytes>, Fault> {
+    fn batch(&mut self, batch: RecordBatch) -> Result<Vec<Bytes>, RequestFault> {
         self.writer.write(&batch)?;
         Ok(self.written.take())
     }
 
-    fn end(self) -> Result<Vec<Bytes>, Fault> {
+    fn end(self) -> Result<Vec<Bytes>, RequestFault> {
         self.writer.finish()?;
         Ok(self.written.take())
     }

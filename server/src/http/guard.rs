@@ -1,6 +1,6 @@
-//! Who may speak HTTP to the server: holders of a token, or, where none are set, this machine's own programs and
-//! pages. A browser lets every page of the web send requests to loopback, and a name that its owner points there
-//! (DNS rebinding) lets it read the answers too; so without tokens `Host` and `Origin` must be this machine's.
+//! Access control of HTTP: for holders of a token, or, if none are set, for this machine's own programs and pages. A
+//! browser lets every page of the web send requests to loopback, and a name that its owner points there (DNS rebinding)
+//! lets it read the answers too; so without tokens `Host` and `Origin` must be this machine's.
 
 use std::net::IpAddr;
 use std::sync::Arc;
@@ -13,30 +13,30 @@ use axum::middleware::Next;
 use axum::response::{IntoResponse as _, Response};
 use echolake_query::Client;
 
-use super::problem::Problem;
+use super::problem::ProblemResponse;
 use super::ranges::POLICY;
 use crate::client_identity::ClientIdentity;
-use crate::fault::Fault;
-use crate::service::Service;
-use crate::tokens::{Access, Scope, of_header};
+use crate::fault::RequestFault;
+use crate::service::QueryService;
+use crate::tokens::{TokenAccess, TokenScope, of_header};
 
 const FETCH_SITE: HeaderName = HeaderName::from_static("sec-fetch-site");
 
-/// Whoever may ask in SQL.
+/// A client that is authorised for SQL.
 pub(super) struct MayQuery(pub(super) Arc<Client>);
 
 /// The cookie of a browser's session.
 pub(super) const COOKIE: &str = "echolake";
 
-/// Who asks, by token or by session; `local` makes the client of a server that has no tokens.
+/// Authenticates a client by token or by session; `local` makes the client of a server that has no tokens.
 ///
 /// # Errors
-/// [`Fault::Unauthenticated`], [`Fault::Foreign`].
+/// [`RequestFault::Unauthenticated`], [`RequestFault::Foreign`].
 pub(crate) fn authenticate(
-    access: &Access,
+    access: &TokenAccess,
     headers: &HeaderMap,
     local: impl FnOnce() -> ClientIdentity,
-) -> Result<Arc<ClientIdentity>, Fault> {
+) -> Result<Arc<ClientIdentity>, RequestFault> {
     let token = headers.get(header::AUTHORIZATION).and_then(|v| v.to_str().ok()).and_then(of_header);
     match (token, cookie(headers)) {
         // A browser sends the cookie along whichever page of this machine asks, on whatever port it was served.
@@ -47,10 +47,10 @@ pub(crate) fn authenticate(
     }
 }
 
-/// What stands behind a request, as its headers tell.
+/// The origin of a request, according to its headers.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum RequestSite {
-    /// A page of elsewhere.
+    /// A page of another origin.
     Foreign,
     /// A page of this server.
     OwnPage,
@@ -58,7 +58,7 @@ pub(crate) enum RequestSite {
     Program,
 }
 
-/// Tells what stands behind a request to a server without tokens.
+/// Determines the origin of a request to a server without tokens.
 pub(crate) fn request_site(uri: &Uri, headers: &HeaderMap) -> RequestSite {
     match (is_own(uri, headers), headers.contains_key(FETCH_SITE)) {
         (Err(_), _) => RequestSite::Foreign,
@@ -72,53 +72,55 @@ fn cookie(headers: &HeaderMap) -> Option<&str> {
     all.flat_map(|v| v.split(';')).find_map(|pair| pair.trim().strip_prefix(COOKIE)?.strip_prefix('='))
 }
 
-impl FromRequestParts<Service> for MayQuery {
-    type Rejection = Problem;
+impl FromRequestParts<QueryService> for MayQuery {
+    type Rejection = ProblemResponse;
 
-    async fn from_request_parts(_: &mut Parts, service: &Service) -> Result<Self, Problem> {
-        Ok(Self(service.client(Scope::Sql)?))
+    async fn from_request_parts(_: &mut Parts, service: &QueryService) -> Result<Self, ProblemResponse> {
+        Ok(Self(service.client(TokenScope::Sql)?))
     }
 }
 
-/// Lets no page of elsewhere through, where there are no tokens.
+/// Refuses requests of pages from other origins, if there are no tokens.
 pub(super) async fn own_pages_only(State(is_open): State<bool>, request: Request, next: Next) -> Response {
     // With tokens there is nothing that a page could use without having one.
     match is_own(request.uri(), request.headers()) {
-        Err(fault) if is_open => Problem(fault).into_response(),
+        Err(fault) if is_open => ProblemResponse(fault).into_response(),
         _ => next.run(request).await,
     }
 }
 
-/// Whether a request comes from this machine's own programs and pages.
+/// Checks that a request comes from this machine's own programs and pages.
 ///
 /// # Errors
-/// [`Fault::Foreign`] where it does not.
-pub(super) fn is_own(uri: &Uri, headers: &HeaderMap) -> Result<(), Fault> {
-    // HTTP/1.1 wants one Host; with two, they who check and they who route may look at different ones.
+/// [`RequestFault::Foreign`] if it does not.
+pub(super) fn is_own(uri: &Uri, headers: &HeaderMap) -> Result<(), RequestFault> {
+    // HTTP/1.1 wants one Host; with two, the check and the routing may use different ones.
     let host = match (headers.get_all(header::HOST).iter().count(), text(headers, &header::HOST)) {
         (1, Some(host)) => host,
-        (_, host) => return Err(Fault::Foreign { what: "host", found: host.unwrap_or_default() }),
+        (_, host) => return Err(RequestFault::Foreign { what: "host", found: host.unwrap_or_default() }),
     };
     if !is_local(&host) {
-        return Err(Fault::Foreign { what: "host", found: host });
+        return Err(RequestFault::Foreign { what: "host", found: host });
     }
-    // An address in absolute form goes before Host for whoever routes, so it must be the same.
+    // An address in absolute form takes precedence over Host in routing, so it must be the same.
     if let Some(authority) = uri.authority().filter(|authority| authority.as_str() != host) {
-        return Err(Fault::Foreign { what: "address", found: authority.to_string() });
+        return Err(RequestFault::Foreign { what: "address", found: authority.to_string() });
     }
     is_same_origin(headers, &["http://"])
 }
 
-// That no page of elsewhere stands behind a request, as browsers tell.
-fn is_same_origin(headers: &HeaderMap, schemes: &[&str]) -> Result<(), Fault> {
+// Checks by the headers of browsers that a request is not made by a page of another origin.
+fn is_same_origin(headers: &HeaderMap, schemes: &[&str]) -> Result<(), RequestFault> {
     let host = text(headers, &header::HOST).unwrap_or_default();
     if let Some(origin) = text(headers, &header::ORIGIN)
         && !schemes.iter().any(|scheme| origin.strip_prefix(scheme) == Some(&host))
     {
-        return Err(Fault::Foreign { what: "origin", found: origin });
+        return Err(RequestFault::Foreign { what: "origin", found: origin });
     }
     match text(headers, &FETCH_SITE) {
-        Some(site) if site != "same-origin" && site != "none" => Err(Fault::Foreign { what: "site", found: site }),
+        Some(site) if site != "same-origin" && site != "none" => {
+            Err(RequestFault::Foreign { what: "site", found: site })
+        }
         _ => Ok(()),
     }
 }
@@ -132,7 +134,7 @@ fn is_local(host: &str) -> bool {
     let Ok(authority) = host.parse::<Authority>() else { return false };
     let name = authority.host();
     let behind = host.strip_prefix(name).map(|port| port.strip_prefix(':').unwrap_or(port));
-    // Nothing stands before the name (a user), nor behind it but a port.
+    // There is nothing before the name (a user), nor behind it but a port.
     if behind != Some(authority.port().as_ref().map_or("", |port| port.as_str())) {
         return false;
     }
@@ -140,7 +142,7 @@ fn is_local(host: &str) -> bool {
     name.eq_ignore_ascii_case("localhost") || address.parse::<IpAddr>().is_ok_and(|ip| ip.is_loopback())
 }
 
-/// What every answer says to browsers, unless its route knows better.
+/// Adds the security headers that every answer has, unless its route set its own.
 pub(super) async fn security_headers(mut response: Response) -> Response {
     let headers = response.headers_mut();
     for (name, value) in [

@@ -1,4 +1,4 @@
-//! `GET /health` and `GET /metrics`: for those who look after the server.
+//! `GET /health` and `GET /metrics`, for operators of the server.
 
 use axum::Json;
 use axum::extract::State;
@@ -7,19 +7,22 @@ use axum::response::IntoResponse;
 use serde_json::{Value, json};
 
 use super::guard::authenticate;
-use super::problem::Problem;
+use super::problem::ProblemResponse;
 use crate::client_identity::ClientIdentity;
-use crate::door::Door;
-use crate::tokens::Scope;
+use crate::door::ServerDoor;
+use crate::tokens::TokenScope;
 
-/// That it answers.
+/// Answers that the server is up, with its version.
 pub(super) async fn health() -> Json<Value> {
     Json(json!({ "status": "ok", "version": env!("CARGO_PKG_VERSION") }))
 }
 
 /// The figures, in Prometheus' text format.
-pub(super) async fn metrics(State(door): State<Door>, headers: HeaderMap) -> Result<impl IntoResponse, Problem> {
+pub(super) async fn metrics(
+    State(door): State<ServerDoor>,
+    headers: HeaderMap,
+) -> Result<impl IntoResponse, ProblemResponse> {
     let client = authenticate(door.access(), &headers, ClientIdentity::pages);
-    client.and_then(|client| client.require(Scope::Metrics)).inspect_err(|f| door.metrics().failed(f.code()))?;
+    client.and_then(|client| client.require(TokenScope::Metrics)).inspect_err(|f| door.metrics().failed(f.code()))?;
     Ok(([(header::CONTENT_TYPE, "text/plain; version=0.0.4; charset=utf-8")], door.figures()))
 }

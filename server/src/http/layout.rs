@@ -1,5 +1,5 @@
 //! `GET /api/v1/layouts/echolake.json`: how Foxglove and Lichtblick show a run or a slice. It says nothing of the lake,
-//! so it is given to whoever asks.
+//! so it needs no token.
 
 use axum::Router;
 use axum::http::{HeaderMap, StatusCode, header};
@@ -14,7 +14,8 @@ const LAYOUT: &str = include_str!("layout.json");
 /// Changes with the program.
 const ETAG: &str = concat!("\"layout-", env!("CARGO_PKG_VERSION"), "\"");
 
-/// Where the layout is. Lichtblick names what it takes from a URL by the file's name, in place of its own of that name.
+/// The route of the layout. Lichtblick names a layout from a URL by its file name, and replaces its own layout of that
+/// name.
 pub(super) fn for_viewers() -> Router {
     Router::new()
         .route("/api/v1/layouts/echolake.json", get(layout))

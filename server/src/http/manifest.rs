@@ -10,40 +10,44 @@ use echolake_lake::DataFile;
 use echolake_schema::tables::Table;
 use serde::Serialize;
 
-use super::catalogue::{self, Catalogue, Params, is_known};
-use super::problem::Problem;
-use crate::fault::Fault;
-use crate::tokens::Scope;
+use super::catalogue::{self, LakeCatalogue, RequestParams, is_known};
+use super::problem::ProblemResponse;
+use crate::fault::RequestFault;
+use crate::tokens::TokenScope;
 
 const FORWARDED_PROTO: HeaderName = HeaderName::from_static("x-forwarded-proto");
 
 #[derive(Serialize)]
-struct Manifest<'a> {
+struct FileManifest<'a> {
     /// Of the snapshot; another one, another version.
     version: &'a str,
-    files: Vec<File>,
+    files: Vec<ManifestFile>,
 }
 
 #[derive(Serialize)]
-struct File {
+struct ManifestFile {
     table: &'static str,
     url: String,
     bytes: u64,
     /// Those that the snapshot shows.
     rows: u64,
-    /// Those that stand in the file too, and that newer rows of the same runs have replaced.
+    /// Rows that are in the file, too, but were replaced by newer rows of the same runs.
     superseded_rows: u64,
 }
 
-/// Where the list is.
-pub(super) fn for_own(catalogue: &Catalogue) -> Router {
+/// The route of the list.
+pub(super) fn for_own(catalogue: &LakeCatalogue) -> Router {
     Router::new().route("/api/v1/files", get(files)).with_state(catalogue.clone())
 }
 
-async fn files(State(catalogue): State<Catalogue>, uri: Uri, headers: HeaderMap) -> Result<Response, Problem> {
-    catalogue.service().client(Scope::Files)?;
-    let params = Params::of(&uri)?;
-    let tables = params.all("table").map(catalogue::table).collect::<Result<Vec<_>, Fault>>()?;
+async fn files(
+    State(catalogue): State<LakeCatalogue>,
+    uri: Uri,
+    headers: HeaderMap,
+) -> Result<Response, ProblemResponse> {
+    catalogue.service().client(TokenScope::Files)?;
+    let params = RequestParams::of(&uri)?;
+    let tables = params.all("table").map(catalogue::table).collect::<Result<Vec<_>, RequestFault>>()?;
     let view = catalogue.view().await?;
     let origin = origin(&headers);
     let etag = format!("\"{}\"", view.version);
@@ -58,13 +62,13 @@ async fn files(State(catalogue): State<Catalogue>, uri: Uri, headers: HeaderMap)
     let all = Table::ALL.into_iter().filter(|table| tables.is_empty() || tables.contains(table));
     let files = all.flat_map(|table| {
         let origin = &origin;
-        view.snapshot.files(table).iter().filter_map(move |file| File::of(origin, table, file))
+        view.snapshot.files(table).iter().filter_map(move |file| ManifestFile::of(origin, table, file))
     });
-    let manifest = Manifest { version: &view.version, files: files.collect() };
+    let manifest = FileManifest { version: &view.version, files: files.collect() };
     Ok((validators, axum::Json(manifest)).into_response())
 }
 
-// What a URL of this server begins with, as who asks sees it: behind a proxy with TLS, `https`.
+// The origin of this server's URLs as the client sees it: behind a proxy with TLS, `https`.
 fn origin(headers: &HeaderMap) -> String {
     let text = |name: HeaderName| headers.get(name).and_then(|v| v.to_str().ok());
     let scheme = match text(FORWARDED_PROTO) {
@@ -74,7 +78,7 @@ fn origin(headers: &HeaderMap) -> String {
     format!("{scheme}://{}", text(header::HOST).unwrap_or_default())
 }
 
-impl File {
+impl ManifestFile {
     fn of(origin: &str, table: Table, file: &DataFile) -> Option<Self> {
         let (name, rows) = (file.path.filename()?, file.visible_rows());
         Some(Self {

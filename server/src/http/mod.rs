@@ -27,15 +27,15 @@ use tokio::net::UnixListener;
 use tower_http::catch_panic::CatchPanicLayer;
 
 use crate::Error;
-use crate::door::Door;
-use crate::fault::Fault;
-use crate::service::Service;
-use catalogue::Catalogue;
+use crate::door::ServerDoor;
+use crate::fault::RequestFault;
+use crate::service::QueryService;
+use catalogue::LakeCatalogue;
 pub(crate) use guard::{RequestSite, authenticate, request_site};
-pub(crate) use problem::Problem;
+pub(crate) use problem::ProblemResponse;
 
 /// Answers HTTP on an engine's socket; a connection is one request.
-pub(crate) async fn serve(service: Service, listener: UnixListener) -> Result<(), Error> {
+pub(crate) async fn serve(service: QueryService, listener: UnixListener) -> Result<(), Error> {
     let router = engine_router(&service);
     loop {
         let (stream, _) = listener.accept().await.map_err(Error::System)?;
@@ -49,8 +49,8 @@ pub(crate) async fn serve(service: Service, listener: UnixListener) -> Result<()
     }
 }
 
-fn engine_router(service: &Service) -> Router {
-    let catalogue = Catalogue::new(service.clone());
+fn engine_router(service: &QueryService) -> Router {
+    let catalogue = LakeCatalogue::new(service.clone());
     let own = Router::new()
         .route("/api/v1/sql", post(sql::post))
         .with_state(service.clone())
@@ -62,8 +62,8 @@ fn engine_router(service: &Service) -> Router {
     with_refusals(all)
 }
 
-/// The paths of the server: those of the door, and those that it forwards to the engine of who asks.
-pub(crate) fn door_router(door: &Door) -> Router {
+/// The paths of the server: those of the door, and those that it forwards to the client's engine.
+pub(crate) fn door_router(door: &ServerDoor) -> Router {
     let own = Router::new()
         .route("/api/v1/session", post(session::post))
         .route("/api/v1/openapi.json", get(openapi::get))
@@ -72,8 +72,10 @@ pub(crate) fn door_router(door: &Door) -> Router {
         .layer(from_fn_with_state(door.access().is_open(), guard::own_pages_only));
     let viewers = [files::RUN, slices::SLICE, slices::FOXGLOVE_MANIFEST];
     // Here and not for all routes: a preflight must come to the layer.
-    let viewers = viewers.into_iter().fold(Router::new(), |router, path| router.route(path, any(Door::forward_http)));
-    let forwarded = Router::new().route("/api/{*path}", any(Door::forward_http)).merge(viewers.layer(ranges::cors()));
+    let viewers =
+        viewers.into_iter().fold(Router::new(), |router, path| router.route(path, any(ServerDoor::forward_http)));
+    let forwarded =
+        Router::new().route("/api/{*path}", any(ServerDoor::forward_http)).merge(viewers.layer(ranges::cors()));
     #[cfg(feature = "web")]
     let rest = pages::fallback;
     #[cfg(not(feature = "web"))]
@@ -85,14 +87,17 @@ pub(crate) fn door_router(door: &Door) -> Router {
 fn with_refusals(router: Router) -> Router {
     router
         .method_not_allowed_fallback(wrong_method)
-        .layer(CatchPanicLayer::custom(|_| Problem(Fault::Internal).answer()))
+        .layer(CatchPanicLayer::custom(|_| ProblemResponse(RequestFault::Internal).answer()))
         .layer(map_response(guard::security_headers))
 }
 
-async fn nothing() -> Problem {
-    Problem(Fault::NotFound { what: "this path".to_owned(), hint: "GET /api/v1/openapi.json lists what there is" })
+async fn nothing() -> ProblemResponse {
+    ProblemResponse(RequestFault::NotFound {
+        what: "this path".to_owned(),
+        hint: "GET /api/v1/openapi.json lists what there is",
+    })
 }
 
-async fn wrong_method() -> Problem {
-    Problem(Fault::Method)
+async fn wrong_method() -> ProblemResponse {
+    ProblemResponse(RequestFault::Method)
 }

@@ -1,4 +1,4 @@
-//! The catalogue's pages, which are part of the program. They hold no data, so they are given to whoever asks.
+//! The catalogue's pages, which are part of the program. They hold no data, so they need no token.
 
 use std::sync::LazyLock;
 
@@ -8,20 +8,20 @@ use sha2::{Digest as _, Sha256};
 
 use super::catalogue::is_known;
 use super::format::takes;
-use super::problem::Problem;
-use crate::fault::Fault;
+use super::problem::ProblemResponse;
+use crate::fault::RequestFault;
 
 /// Nothing inline, nothing from elsewhere.
 const POLICY: &str = "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob:; font-src 'self'; \
      media-src 'self' blob:; connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'";
 const INDEX: &str = "/index.html";
-/// What stands there has a digest in its name.
+/// Path of files that have a digest in their name.
 const ASSETS: &str = "/assets/";
 /// Paths that are no page's.
 const OTHERS: [&str; 4] = ["/api", "/assets", "/health", "/metrics"];
 
 /// A file of the pages; `build.rs` lists them.
-struct Page {
+struct PageFile {
     path: &'static str,
     media_type: &'static str,
     bytes: &'static [u8],
@@ -30,10 +30,10 @@ struct Page {
 }
 
 #[cfg(not(pages_not_built))]
-static PAGES: &[Page] = include!(concat!(env!("OUT_DIR"), "/pages.rs"));
+static PAGES: &[PageFile] = include!(concat!(env!("OUT_DIR"), "/pages.rs"));
 /// The only page of a program that was built without Node.
 #[cfg(pages_not_built)]
-static PAGES: &[Page] = &[Page {
+static PAGES: &[PageFile] = &[PageFile {
     path: INDEX,
     media_type: "text/html; charset=utf-8",
     bytes: include_bytes!("pages_not_built.html"),
@@ -42,17 +42,17 @@ static PAGES: &[Page] = &[Page {
 }];
 
 /// A page, each with its digest.
-static TAGGED: LazyLock<Vec<(&Page, String)>> = LazyLock::new(|| {
-    let tag = |page: &Page| format!("\"{}\"", hex::encode(&Sha256::digest(page.bytes)[..8]));
+static TAGGED: LazyLock<Vec<(&PageFile, String)>> = LazyLock::new(|| {
+    let tag = |page: &PageFile| format!("\"{}\"", hex::encode(&Sha256::digest(page.bytes)[..8]));
     PAGES.iter().map(|page| (page, tag(page))).collect()
 });
 
-/// Answers what is no other path. The pages find out themselves what an address shows, so every one of them has the same
+/// Answers all other paths. The pages decide themselves what an address shows, so every one of them has the same
 /// file.
 pub(super) async fn fallback(method: Method, uri: Uri, headers: HeaderMap) -> Response {
     let Some((page, tag)) = page(uri.path()) else { return super::nothing().await.into_response() };
     if method != Method::GET && method != Method::HEAD {
-        let mut response = Problem(Fault::Method).into_response();
+        let mut response = ProblemResponse(RequestFault::Method).into_response();
         response.headers_mut().insert(header::ALLOW, HeaderValue::from_static("GET,HEAD"));
         return response;
     }
@@ -82,7 +82,7 @@ pub(super) async fn fallback(method: Method, uri: Uri, headers: HeaderMap) -> Re
     response
 }
 
-fn page(path: &str) -> Option<&'static (&'static Page, String)> {
+fn page(path: &str) -> Option<&'static (&'static PageFile, String)> {
     let of = |path: &str| TAGGED.iter().find(|(page, _)| page.path == path);
     let is_other =
         OTHERS.iter().any(|other| path.strip_prefix(other).is_some_and(|r| r.is_empty() || r.starts_with('/')));
@@ -91,7 +91,7 @@ fn page(path: &str) -> Option<&'static (&'static Page, String)> {
     of(path).or_else(|| if is_other || is_file { None } else { of(INDEX) })
 }
 
-impl Page {
+impl PageFile {
     fn body(&self, headers: &HeaderMap) -> (&'static [u8], Option<&'static str>) {
         match (self.brotli.filter(|_| takes(headers, "br")), self.gzip.filter(|_| takes(headers, "gzip"))) {
             (Some(packed), _) => (packed, Some("br")),

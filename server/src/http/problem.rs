@@ -4,13 +4,13 @@ use axum::http::{HeaderValue, StatusCode, header};
 use axum::response::{IntoResponse, Response};
 use serde::Serialize;
 
-use crate::fault::{Code, Fault};
+use crate::fault::{FaultCode, RequestFault};
 
 /// A failure, to be answered.
-pub(crate) struct Problem(pub(crate) Fault);
+pub(crate) struct ProblemResponse(pub(crate) RequestFault);
 
 #[derive(Serialize)]
-struct Body<'a> {
+struct ProblemBody<'a> {
     #[serde(rename = "type")]
     kind: String,
     title: &'a str,
@@ -19,18 +19,18 @@ struct Body<'a> {
     detail: String,
 }
 
-impl From<Fault> for Problem {
-    fn from(fault: Fault) -> Self {
+impl From<RequestFault> for ProblemResponse {
+    fn from(fault: RequestFault) -> Self {
         Self(fault)
     }
 }
 
-impl Problem {
-    /// It as a response.
+impl ProblemResponse {
+    /// Returns the failure as a response.
     pub(crate) fn answer(&self) -> Response {
         let code = self.0.code();
         let (status, title) = status(code);
-        let body = Body {
+        let body = ProblemBody {
             kind: format!("urn:echolake:problem:{}", code.name()),
             title,
             status: status.as_u16(),
@@ -47,37 +47,37 @@ impl Problem {
     }
 }
 
-impl IntoResponse for Problem {
+impl IntoResponse for ProblemResponse {
     fn into_response(self) -> Response {
         self.answer()
     }
 }
 
-fn status(code: Code) -> (StatusCode, &'static str) {
+fn status(code: FaultCode) -> (StatusCode, &'static str) {
     match code {
-        Code::Query => (StatusCode::BAD_REQUEST, "The query is not right"),
-        Code::ReadOnly => (StatusCode::FORBIDDEN, "Only reading is allowed"),
-        Code::Execution => (StatusCode::UNPROCESSABLE_ENTITY, "The query failed"),
-        Code::Format => (StatusCode::UNPROCESSABLE_ENTITY, "The answer does not fit its format"),
-        Code::Lake => (StatusCode::SERVICE_UNAVAILABLE, "The lake cannot be read"),
-        Code::Request => (StatusCode::BAD_REQUEST, "The request is not right"),
-        Code::Unsupported => (StatusCode::NOT_IMPLEMENTED, "Not supported"),
-        Code::NotFound => (StatusCode::NOT_FOUND, "Not there"),
-        Code::Gone => (StatusCode::GONE, "No longer there"),
-        Code::Changed => (StatusCode::CONFLICT, "A run's file has changed"),
-        Code::NoData => (StatusCode::NOT_FOUND, "There are no such data"),
-        Code::Method => (StatusCode::METHOD_NOT_ALLOWED, "Not for this method"),
-        Code::Range => (StatusCode::RANGE_NOT_SATISFIABLE, "Not in the file"),
-        Code::TooLarge => (StatusCode::PAYLOAD_TOO_LARGE, "The request is too large"),
-        Code::Unauthenticated => (StatusCode::UNAUTHORIZED, "A token is needed"),
-        Code::Forbidden => (StatusCode::FORBIDDEN, "The token is not for this"),
-        Code::Foreign => (StatusCode::FORBIDDEN, "Not from here"),
-        Code::Cancelled => (StatusCode::CONFLICT, "The query was cancelled"),
-        Code::TimeLimit => (StatusCode::REQUEST_TIMEOUT, "The query took too long"),
-        Code::MemoryLimit => (StatusCode::INSUFFICIENT_STORAGE, "There is not enough memory or disk"),
-        Code::RowLimit => (StatusCode::UNPROCESSABLE_ENTITY, "The answer is too long"),
-        Code::TooMany => (StatusCode::TOO_MANY_REQUESTS, "Too much at once"),
-        Code::EngineEnded => (StatusCode::INTERNAL_SERVER_ERROR, "The query ended its engine"),
-        Code::Internal => (StatusCode::INTERNAL_SERVER_ERROR, "The server failed"),
+        FaultCode::Query => (StatusCode::BAD_REQUEST, "The query is not right"),
+        FaultCode::ReadOnly => (StatusCode::FORBIDDEN, "Only reading is allowed"),
+        FaultCode::Execution => (StatusCode::UNPROCESSABLE_ENTITY, "The query failed"),
+        FaultCode::Format => (StatusCode::UNPROCESSABLE_ENTITY, "The answer does not fit its format"),
+        FaultCode::Lake => (StatusCode::SERVICE_UNAVAILABLE, "The lake cannot be read"),
+        FaultCode::Request => (StatusCode::BAD_REQUEST, "The request is not right"),
+        FaultCode::Unsupported => (StatusCode::NOT_IMPLEMENTED, "Not supported"),
+        FaultCode::NotFound => (StatusCode::NOT_FOUND, "Not there"),
+        FaultCode::Gone => (StatusCode::GONE, "No longer there"),
+        FaultCode::Changed => (StatusCode::CONFLICT, "A run's file has changed"),
+        FaultCode::NoData => (StatusCode::NOT_FOUND, "There are no such data"),
+        FaultCode::Method => (StatusCode::METHOD_NOT_ALLOWED, "Not for this method"),
+        FaultCode::Range => (StatusCode::RANGE_NOT_SATISFIABLE, "Not in the file"),
+        FaultCode::TooLarge => (StatusCode::PAYLOAD_TOO_LARGE, "The request is too large"),
+        FaultCode::Unauthenticated => (StatusCode::UNAUTHORIZED, "A token is needed"),
+        FaultCode::Forbidden => (StatusCode::FORBIDDEN, "The token is not for this"),
+        FaultCode::Foreign => (StatusCode::FORBIDDEN, "Not from here"),
+        FaultCode::Cancelled => (StatusCode::CONFLICT, "The query was cancelled"),
+        FaultCode::TimeLimit => (StatusCode::REQUEST_TIMEOUT, "The query took too long"),
+        FaultCode::MemoryLimit => (StatusCode::INSUFFICIENT_STORAGE, "There is not enough memory or disk"),
+        FaultCode::RowLimit => (StatusCode::UNPROCESSABLE_ENTITY, "The answer is too long"),
+        FaultCode::TooMany => (StatusCode::TOO_MANY_REQUESTS, "Too much at once"),
+        FaultCode::EngineEnded => (StatusCode::INTERNAL_SERVER_ERROR, "The query ended its engine"),
+        FaultCode::Internal => (StatusCode::INTERNAL_SERVER_ERROR, "The server failed"),
     }
 }

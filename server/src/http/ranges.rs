@@ -1,4 +1,4 @@
-//! Files over HTTP: what part of one is asked for, and the headers that viewers of elsewhere need.
+//! Files over HTTP: parsing of ranges, and the headers that viewers of other origins need.
 
 use std::ops::Range;
 
@@ -8,14 +8,14 @@ use axum::response::{IntoResponse as _, Response};
 use tower_http::cors::{Any, CorsLayer};
 
 use super::catalogue::is_known;
-use super::problem::Problem;
-use crate::fault::Fault;
+use super::problem::ProblemResponse;
+use crate::fault::RequestFault;
 
-/// Who may embed an answer.
+/// The header that says which origins may embed an answer.
 pub(super) const POLICY: HeaderName = HeaderName::from_static("cross-origin-resource-policy");
 const FETCH_MODE: HeaderName = HeaderName::from_static("sec-fetch-mode");
 
-/// For what pages of elsewhere may read: from anywhere, without credentials, and told what ranges need.
+/// The CORS headers of routes that other origins may read: from anywhere, without credentials, with what ranges need.
 pub(super) fn cors() -> CorsLayer {
     CorsLayer::new()
         .allow_origin(Any)
@@ -25,56 +25,56 @@ pub(super) fn cors() -> CorsLayer {
         .allow_private_network(true)
 }
 
-/// Whether who asks has to be told a file's length: for a part of it, or as viewers in a browser do before they ask for
-/// parts.
+/// Returns whether the answer must state the file's length: for ranges, or because viewers in a browser read it before
+/// they request ranges.
 pub(super) fn needs_length(method: &Method, headers: &HeaderMap) -> bool {
     let is_script = headers.get(FETCH_MODE).is_some_and(|mode| mode == "cors") || headers.contains_key(header::ORIGIN);
     method == Method::HEAD || headers.contains_key(header::RANGE) || is_script
 }
 
 /// A file that never changes, as its answers describe it.
-pub(super) struct Described {
+pub(super) struct FileDescription {
     pub(super) etag: String,
     pub(super) media_type: &'static str,
-    /// Who may embed it.
+    /// The origins that may embed it, as `Cross-Origin-Resource-Policy` has them.
     pub(super) policy: &'static str,
 }
 
-/// What is to be answered.
-pub(super) enum Asked {
+/// The kind of answer to a request.
+pub(super) enum RangeAnswer {
     /// This, without any of the file's bytes.
     Answer(Response),
     /// These bytes.
-    Part(Part),
+    Part(FilePart),
 }
 
 /// Bytes of a file.
-pub(super) struct Part {
+pub(super) struct FilePart {
     pub(super) range: Range<u64>,
-    /// The file's bytes, where these are not all.
+    /// The file's length, if these are not all of its bytes.
     of: Option<u64>,
 }
 
-impl Described {
-    /// What a request is for, of a file of so many bytes.
-    pub(super) fn asked(&self, headers: &HeaderMap, bytes: u64) -> Asked {
+impl FileDescription {
+    /// Determines the answer to a request, for a file of `bytes` bytes.
+    pub(super) fn asked(&self, headers: &HeaderMap, bytes: u64) -> RangeAnswer {
         if let Some(known) = self.known(headers) {
-            return Asked::Answer(known);
+            return RangeAnswer::Answer(known);
         }
         match self.wanted(headers, bytes) {
-            Wanted::Whole => Asked::Part(Part { range: 0..bytes, of: None }),
-            Wanted::Part(range) => Asked::Part(Part { range, of: Some(bytes) }),
-            Wanted::Nothing => Asked::Answer(self.nothing(bytes)),
+            WantedRange::Whole => RangeAnswer::Part(FilePart { range: 0..bytes, of: None }),
+            WantedRange::Part(range) => RangeAnswer::Part(FilePart { range, of: Some(bytes) }),
+            WantedRange::Nothing => RangeAnswer::Answer(self.nothing(bytes)),
         }
     }
 
-    /// The answer to who has it already.
+    /// Returns the answer to a client that has this version already, which is 304.
     pub(super) fn known(&self, headers: &HeaderMap) -> Option<Response> {
         is_known(headers, &self.etag).then(|| self.with_headers(StatusCode::NOT_MODIFIED.into_response()))
     }
 
     /// Bytes as they were asked for.
-    pub(super) fn part(&self, part: &Part, body: Body) -> Response {
+    pub(super) fn part(&self, part: &FilePart, body: Body) -> Response {
         let status = if part.of.is_some() { StatusCode::PARTIAL_CONTENT } else { StatusCode::OK };
         let mut response = self.with_headers((status, body).into_response());
         let (out, range) = (response.headers_mut(), &part.range);
@@ -91,7 +91,7 @@ impl Described {
     }
 
     fn nothing(&self, bytes: u64) -> Response {
-        let mut response = Problem(Fault::Range { bytes }).into_response();
+        let mut response = ProblemResponse(RequestFault::Range { bytes }).into_response();
         insert(response.headers_mut(), header::CONTENT_RANGE, &format!("bytes */{bytes}"));
         insert(response.headers_mut(), POLICY, self.policy);
         response
@@ -112,13 +112,13 @@ impl Described {
         response
     }
 
-    fn wanted(&self, headers: &HeaderMap, bytes: u64) -> Wanted {
+    fn wanted(&self, headers: &HeaderMap, bytes: u64) -> WantedRange {
         let text = |name: HeaderName| headers.get(name).and_then(|v| v.to_str().ok());
         // A range of what the file no longer is would be none of it.
         if text(header::IF_RANGE).is_some_and(|known| known != self.etag) {
-            return Wanted::Whole;
+            return WantedRange::Whole;
         }
-        text(header::RANGE).map_or(Wanted::Whole, |range| Wanted::of(range, bytes))
+        text(header::RANGE).map_or(WantedRange::Whole, |range| WantedRange::of(range, bytes))
     }
 }
 
@@ -128,16 +128,16 @@ fn insert(headers: &mut HeaderMap, name: HeaderName, value: &str) {
     }
 }
 
-/// What part of a file is wanted.
+/// The requested part of a file.
 #[derive(Debug, PartialEq, Eq)]
-enum Wanted {
+enum WantedRange {
     Whole,
     Part(Range<u64>),
-    /// None that it has.
+    /// A range outside of the file.
     Nothing,
 }
 
-impl Wanted {
+impl WantedRange {
     // RFC 9110, section 14: a header that makes no sense, and several ranges at once, are answered by the whole file.
     fn of(range: &str, bytes: u64) -> Self {
         let Some((first, last)) = range.strip_prefix("bytes=").and_then(|r| r.trim().split_once('-')) else {
@@ -161,23 +161,23 @@ mod tests {
     #[test]
     fn ranges_are_as_the_standard_has_them() {
         for (range, expected) in [
-            ("bytes=0-99", Wanted::Part(0..100)),
-            ("bytes=990-", Wanted::Part(990..1000)),
-            ("bytes=-10", Wanted::Part(990..1000)),
-            ("bytes=-5000", Wanted::Part(0..1000)),
-            ("bytes=500-5000", Wanted::Part(500..1000)),
-            ("bytes=1000-", Wanted::Nothing),
-            ("bytes=-0", Wanted::Nothing),
-            ("bytes=5-4", Wanted::Whole),
-            ("bytes=0-1,5-6", Wanted::Whole),
-            ("bytes=a-b", Wanted::Whole),
-            ("bytes=-", Wanted::Whole),
-            ("bytes=+1-2", Wanted::Whole),
-            ("lines=1-2", Wanted::Whole),
-            ("bytes=0-18446744073709551615", Wanted::Part(0..1000)),
-            ("bytes=99999999999999999999-", Wanted::Whole),
+            ("bytes=0-99", WantedRange::Part(0..100)),
+            ("bytes=990-", WantedRange::Part(990..1000)),
+            ("bytes=-10", WantedRange::Part(990..1000)),
+            ("bytes=-5000", WantedRange::Part(0..1000)),
+            ("bytes=500-5000", WantedRange::Part(500..1000)),
+            ("bytes=1000-", WantedRange::Nothing),
+            ("bytes=-0", WantedRange::Nothing),
+            ("bytes=5-4", WantedRange::Whole),
+            ("bytes=0-1,5-6", WantedRange::Whole),
+            ("bytes=a-b", WantedRange::Whole),
+            ("bytes=-", WantedRange::Whole),
+            ("bytes=+1-2", WantedRange::Whole),
+            ("lines=1-2", WantedRange::Whole),
+            ("bytes=0-18446744073709551615", WantedRange::Part(0..1000)),
+            ("bytes=99999999999999999999-", WantedRange::Whole),
         ] {
-            assert_eq!(Wanted::of(range, 1000), expected, "{range}");
+            assert_eq!(WantedRange::of(range, 1000), expected, "{range}");
         }
     }
 }

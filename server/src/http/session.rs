@@ -8,9 +8,9 @@ use bytes::Bytes;
 use serde::Deserialize;
 
 use super::guard::COOKIE;
-use super::problem::Problem;
-use crate::door::Door;
-use crate::fault::Fault;
+use super::problem::ProblemResponse;
+use crate::door::ServerDoor;
+use crate::fault::RequestFault;
 use crate::sessions::LIFETIME;
 
 /// Bytes of a request: a token is short.
@@ -18,18 +18,18 @@ const LARGEST: usize = 4096;
 
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
-struct Shown {
+struct SessionRequest {
     token: String,
 }
 
 /// Begins a session.
 pub(super) async fn post(
-    State(door): State<Door>,
+    State(door): State<ServerDoor>,
     body: Result<Bytes, BytesRejection>,
-) -> Result<impl IntoResponse, Problem> {
-    let body = body.ok().filter(|b| b.len() <= LARGEST).ok_or(Fault::TooLarge { limit: LARGEST })?;
-    let Shown { token } = serde_json::from_slice(&body)
-        .map_err(|_| Fault::request("the body is not as expected; hint: {\"token\": \"echolake_...\"}"))?;
+) -> Result<impl IntoResponse, ProblemResponse> {
+    let body = body.ok().filter(|b| b.len() <= LARGEST).ok_or(RequestFault::TooLarge { limit: LARGEST })?;
+    let SessionRequest { token } = serde_json::from_slice(&body)
+        .map_err(|_| RequestFault::request("the body is not as expected; hint: {\"token\": \"echolake_...\"}"))?;
     let secret = door.access().begin_session(&token).inspect_err(|f| door.metrics().failed(f.code()))?;
     let cookie = format!("{COOKIE}={secret}; HttpOnly; SameSite=Strict; Path=/; Max-Age={}", LIFETIME.as_secs());
     Ok((StatusCode::NO_CONTENT, [(header::SET_COOKIE, cookie)]))

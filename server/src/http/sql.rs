@@ -12,20 +12,20 @@ use echolake_query::output::Format;
 use futures::stream;
 use serde::Deserialize;
 
-use super::format::{Written, accepted, media_type, named};
+use super::format::{FormatEncoder, accepted, media_type, named};
 use super::guard::MayQuery;
-use super::problem::Problem;
-use crate::fault::Fault;
-use crate::metrics::Protocol;
-use crate::running::{Running, Stop};
-use crate::service::{Job, Service, Work};
+use super::problem::ProblemResponse;
+use crate::fault::RequestFault;
+use crate::metrics::ServerProtocol;
+use crate::running::{RunningQuery, StopSignal};
+use crate::service::{QueryJob, QueryService, QueryWork};
 
 /// Bytes of a request, axum's own limit.
 const LARGEST: usize = 2 << 20;
 
-/// What stands behind the path's `?`.
+/// The parameters after the path's `?`.
 #[derive(Deserialize)]
-pub(super) struct Params {
+pub(super) struct SqlParams {
     format: Option<String>,
 }
 
@@ -38,23 +38,24 @@ struct Asked {
 
 /// Answers a query.
 pub(super) async fn post(
-    State(service): State<Service>,
+    State(service): State<QueryService>,
     MayQuery(client): MayQuery,
-    params: Result<Query<Params>, QueryRejection>,
+    params: Result<Query<SqlParams>, QueryRejection>,
     headers: HeaderMap,
     body: Result<Bytes, BytesRejection>,
-) -> Result<Response, Problem> {
-    let Query(params) = params.map_err(|_| Fault::request("the path's parameters are not right; hint: ?format=csv"))?;
+) -> Result<Response, ProblemResponse> {
+    let Query(params) =
+        params.map_err(|_| RequestFault::request("the path's parameters are not right; hint: ?format=csv"))?;
     let asked = asked(&headers, &whole(body)?)?;
     let format = format(&headers, params.format.or(asked.format))?;
-    let job = Job {
-        protocol: Protocol::Http,
+    let job = QueryJob {
+        protocol: ServerProtocol::Http,
         session: Arc::new(service.session(&client)),
-        work: Work::Sql(asked.query),
+        work: QueryWork::Sql(asked.query),
         limit: None,
-        stop: Stop::new(),
+        stop: StopSignal::new(),
     };
-    let mut running = service.begin(job, move |schema| Written::new(format, schema)).await?;
+    let mut running = service.begin(job, move |schema| FormatEncoder::new(format, schema)).await?;
     // A query that fails at once still has a status to say so with.
     let first = running.next().await?;
     let headers = [(header::CONTENT_TYPE, media_type(format))];
@@ -62,7 +63,10 @@ pub(super) async fn post(
 }
 
 // An error on the way breaks the connection off: a short answer would look like a whole one.
-fn rest(first: Option<Bytes>, running: Running<Bytes>) -> impl stream::Stream<Item = Result<Bytes, Fault>> + Send {
+fn rest(
+    first: Option<Bytes>,
+    running: RunningQuery<Bytes>,
+) -> impl stream::Stream<Item = Result<Bytes, RequestFault>> + Send {
     stream::try_unfold((first, running), |(first, mut running)| async move {
         let part = match first {
             Some(part) => Some(part),
@@ -72,30 +76,30 @@ fn rest(first: Option<Bytes>, running: Running<Bytes>) -> impl stream::Stream<It
     })
 }
 
-fn whole(body: Result<Bytes, BytesRejection>) -> Result<Bytes, Fault> {
+fn whole(body: Result<Bytes, BytesRejection>) -> Result<Bytes, RequestFault> {
     body.map_err(|rejection| match rejection.status() {
-        StatusCode::PAYLOAD_TOO_LARGE => Fault::TooLarge { limit: LARGEST },
-        _ => Fault::request("the request's body did not come whole"),
+        StatusCode::PAYLOAD_TOO_LARGE => RequestFault::TooLarge { limit: LARGEST },
+        _ => RequestFault::request("the request's body did not come whole"),
     })
 }
 
-fn asked(headers: &HeaderMap, body: &[u8]) -> Result<Asked, Fault> {
+fn asked(headers: &HeaderMap, body: &[u8]) -> Result<Asked, RequestFault> {
     let kind = headers.get(header::CONTENT_TYPE).and_then(|v| v.to_str().ok()).unwrap_or_default();
     match kind.split(';').next().unwrap_or_default().trim().to_ascii_lowercase().as_str() {
         "application/json" => serde_json::from_slice(body).map_err(|e| {
-            Fault::request(format!("the body is not as expected: {e}; hint: {{\"query\": \"select 1\"}}"))
+            RequestFault::request(format!("the body is not as expected: {e}; hint: {{\"query\": \"select 1\"}}"))
         }),
         "text/plain" | "application/sql" => match std::str::from_utf8(body) {
             Ok(query) => Ok(Asked { query: query.to_owned(), format: None }),
-            Err(_) => Err(Fault::request("the query is not UTF-8")),
+            Err(_) => Err(RequestFault::request("the query is not UTF-8")),
         },
-        other => Err(Fault::request(format!(
+        other => Err(RequestFault::request(format!(
             "a query does not come as `{other}`; hint: Content-Type application/json, application/sql or text/plain"
         ))),
     }
 }
 
-fn format(headers: &HeaderMap, name: Option<String>) -> Result<Format, Fault> {
+fn format(headers: &HeaderMap, name: Option<String>) -> Result<Format, RequestFault> {
     match (name, headers.get(header::ACCEPT).and_then(|v| v.to_str().ok())) {
         (Some(name), _) => named(&name),
         (None, Some(accept)) => accepted(accept),

@@ -25,9 +25,9 @@ use datafusion_pg_catalog::pg_catalog::{ArrowTable, PgCatalogSchemaProvider, PgC
 use echolake_query::{Extend, Function};
 
 use super::functions;
-use super::information::Information;
+use super::information::InformationSchema;
 use super::rewrite::OWN_TABLES;
-use super::settings::Settings;
+use super::settings::SessionSettings;
 use crate::Error;
 use crate::service::{CATALOG, SCHEMA};
 
@@ -43,7 +43,7 @@ const KEYWORDS: &str = "pg_get_keywords";
 /// The only role; `pg_get_userbyid`, `session_user` and `user` say the same.
 pub(super) const ROLE: &str = "postgres";
 
-/// What every session is extended by.
+/// Tables and functions of `pg_catalog` that extend every session.
 #[derive(Clone)]
 pub(super) struct PgCatalog {
     schema: Arc<dyn SchemaProvider>,
@@ -56,18 +56,19 @@ impl PgCatalog {
     pub(super) fn new(tables: Vec<(&'static str, SchemaRef)>, own: Vec<Function>) -> Result<Self, Error> {
         let fixed = Arc::new(PgCatalogStaticTables::try_new()?);
         let keywords = fixed.pg_get_keywords.clone();
-        let names = Names(Arc::new(tables.into_iter().collect()));
+        let names = TableNames(Arc::new(tables.into_iter().collect()));
         let mut functions = functions::fixed();
         functions.push(functions::to_regtype(type_numbers(&fixed.pg_type)?));
         let of_own = own.iter().zip(OWN_NUMBERS..).map(|(f, n)| (n, f.arguments().to_owned())).collect();
         functions.push(functions::arguments(of_own));
         let own = own_functions(&own)?;
-        let schema = Arc::new(Complete { inner: PgCatalogSchemaProvider::try_new(names, fixed, Roles)?, own });
+        let schema =
+            Arc::new(ExtendedSchema { inner: PgCatalogSchemaProvider::try_new(names, fixed, RoleProvider)?, own });
         Ok(Self { schema, keywords, functions: Arc::new(functions) })
     }
 
     /// For a session of these settings.
-    pub(super) fn extend(&self, settings: &Arc<Settings>) -> Extend {
+    pub(super) fn extend(&self, settings: &Arc<SessionSettings>) -> Extend {
         let (pg, own) = (self.clone(), functions::of_settings(settings));
         Arc::new(move |context| pg.register(context, &own))
     }
@@ -83,10 +84,10 @@ impl PgCatalog {
         context.register_udtf(KEYWORDS, self.keywords.clone());
         // Types such as regclass are known to this planner of types.
         let (state, known) = (context.state_ref(), context.state());
-        lake.register_schema(INFORMATION_SCHEMA, Arc::new(Information::of(&known)))?;
+        lake.register_schema(INFORMATION_SCHEMA, Arc::new(InformationSchema::of(&known)))?;
         let mut extended =
             SessionStateBuilder::new_from_existing(known).with_type_planner(Arc::new(PgOidTypePlanner)).build();
-        // Where this is on, DataFusion's own stands before the one that is registered.
+        // If this is on, DataFusion's own takes precedence over the one that is registered.
         extended.config_mut().options_mut().catalog.information_schema = false;
         *state.write() = extended;
         CoerceIntArgsToBigInt::widen(context);
@@ -110,14 +111,14 @@ fn type_numbers(types: &ArrowTable) -> Result<HashMap<String, i32>, DataFusionEr
 
 // The tables of `datafusion-pg-catalog`, and what clients miss in them.
 #[derive(Debug)]
-struct Complete<S> {
+struct ExtendedSchema<S> {
     inner: S,
     /// Number and name of the field's functions.
     own: Arc<dyn TableProvider>,
 }
 
 #[async_trait]
-impl<S: SchemaProvider> SchemaProvider for Complete<S> {
+impl<S: SchemaProvider> SchemaProvider for ExtendedSchema<S> {
     fn table_names(&self) -> Vec<String> {
         let mut names = self.inner.table_names();
         names.extend(OWN_TABLES.map(str::to_owned));
@@ -233,16 +234,16 @@ pub(super) fn view(
 
 // The lake's tables by name.
 #[derive(Debug, Clone)]
-struct Names(Arc<BTreeMap<&'static str, SchemaRef>>);
+struct TableNames(Arc<BTreeMap<&'static str, SchemaRef>>);
 
-impl Names {
+impl TableNames {
     fn find(&self, catalog: &str, schema: &str, table: &str) -> Option<&SchemaRef> {
         (catalog == CATALOG && schema == SCHEMA).then(|| self.0.get(table)).flatten()
     }
 }
 
 #[async_trait]
-impl CatalogInfo for Names {
+impl CatalogInfo for TableNames {
     async fn catalog_names(&self) -> Result<Vec<String>, DataFusionError> {
         Ok(vec![CATALOG.to_owned()])
     }
@@ -272,10 +273,10 @@ impl CatalogInfo for Names {
 }
 
 #[derive(Debug, Clone)]
-struct Roles;
+struct RoleProvider;
 
 #[async_trait]
-impl PgCatalogContextProvider for Roles {
+impl PgCatalogContextProvider for RoleProvider {
     async fn roles(&self) -> Vec<String> {
         vec![ROLE.to_owned()]
     }

@@ -1,4 +1,4 @@
-//! Doing what a statement asks: the same for both of the protocol's ways to ask.
+//! Execution of statements, for both the simple and the extended query protocol.
 
 use std::fmt::Debug;
 
@@ -14,149 +14,160 @@ use pgwire::messages::PgWireBackendMessage;
 use pgwire::messages::copy::CopyData;
 use pgwire::messages::response::{NoticeResponse, TransactionStatus};
 
-use super::connection::{Connection, Kept, Run};
-use super::copy::{Copied, CopyAs};
-use super::cursor::Cursor;
-use super::rows::{Rows, fields, response, text_fields, texts};
+use super::connection::{CommandRun, NamedObject, PostgresConnection};
+use super::copy::{CopyAs, CopyRowEncoder};
+use super::cursor::QueryCursor;
+use super::rows::{RowEncoder, fields, response, text_fields, texts};
 use super::sqlstate::error;
-use super::statement::Statement;
-use crate::fault::Fault;
-use crate::running::{Batches, Running};
+use super::statement::ClientStatement;
+use crate::fault::RequestFault;
+use crate::running::{BatchEncoder, RunningQuery};
 
 /// Columns of `SHOW ALL`.
 const ALL: [&str; 2] = ["name", "setting"];
 
-/// What is sent for a statement.
-pub(super) enum Reply {
+/// The answer to a statement.
+pub(super) enum StatementReply {
     Rows(QueryResponse),
-    Copy(CopyAs, Running<Vec<CopyData>>),
+    Copy(CopyAs, RunningQuery<Vec<CopyData>>),
     Done(Tag),
 }
 
 /// The columns that a statement gives.
 pub(super) fn columns(
-    connection: &Connection,
-    statement: &Statement,
+    connection: &PostgresConnection,
+    statement: &ClientStatement,
     format: &Format,
-) -> Result<Vec<FieldInfo>, Fault> {
+) -> Result<Vec<FieldInfo>, RequestFault> {
     let fields = match statement {
-        Statement::Query(planned) => fields(&planned.prepared.schema(), format)?,
-        Statement::Fetch { name, .. } => fields(&connection.cursor(name)?.schema, format)?,
-        Statement::Show(Some(name)) => text_fields(&[name]),
-        Statement::Show(None) => text_fields(&ALL),
+        ClientStatement::Query(planned) => fields(&planned.prepared.schema(), format)?,
+        ClientStatement::Fetch { name, .. } => fields(&connection.cursor(name)?.schema, format)?,
+        ClientStatement::Show(Some(name)) => text_fields(&[name]),
+        ClientStatement::Show(None) => text_fields(&ALL),
         _ => return Ok(Vec::new()),
     };
     Ok(fields.to_vec())
 }
 
-/// Does what a statement asks.
+/// Executes a statement.
 pub(super) async fn act<C>(
-    connection: &Connection,
+    connection: &PostgresConnection,
     client: &mut C,
-    run: &Run,
-    statement: &Statement,
+    run: &CommandRun,
+    statement: &ClientStatement,
     values: ParamValues,
     format: &Format,
-) -> PgWireResult<Reply>
+) -> PgWireResult<StatementReply>
 where
     C: ClientInfo + ClientPortalStore + Sink<PgWireBackendMessage> + Unpin + Send + Sync,
     C::PortalStore: PortalStore,
     C::Error: Debug,
     PgWireError: From<<C as Sink<PgWireBackendMessage>>::Error>,
 {
-    let ends = matches!(statement, Statement::Commit | Statement::Rollback | Statement::Savepoint("ROLLBACK"));
+    let ends = matches!(
+        statement,
+        ClientStatement::Commit | ClientStatement::Rollback | ClientStatement::Savepoint("ROLLBACK")
+    );
     if client.transaction_status() == TransactionStatus::Error && !ends {
         return Err(aborted());
     }
     match statement {
-        Statement::Begin | Statement::Commit | Statement::Rollback | Statement::Savepoint(_) => {
-            transaction(connection, client, statement).await
-        }
-        Statement::Discard(DiscardObject::ALL) => {
+        ClientStatement::Begin
+        | ClientStatement::Commit
+        | ClientStatement::Rollback
+        | ClientStatement::Savepoint(_) => transaction(connection, client, statement).await,
+        ClientStatement::Discard(DiscardObject::ALL) => {
             client.portal_store().clear_portals();
             connection.forget_portals();
             settle(connection, statement).map_err(|fault| error(&fault))
         }
-        Statement::Deallocate(name) => {
+        ClientStatement::Deallocate(name) => {
             if let Some(name) = name {
                 client.portal_store().rm_statement(name);
-                connection.forget(Kept::Statement, name);
+                connection.forget(NamedObject::Statement, name);
             }
-            Ok(Reply::Done(Tag::new("DEALLOCATE")))
+            Ok(StatementReply::Done(Tag::new("DEALLOCATE")))
         }
         other => ask(connection, run, other, values, format).await.map_err(|fault| error(&fault)),
     }
 }
 
 async fn ask(
-    connection: &Connection,
-    run: &Run,
-    statement: &Statement,
+    connection: &PostgresConnection,
+    run: &CommandRun,
+    statement: &ClientStatement,
     values: ParamValues,
     format: &Format,
-) -> Result<Reply, Fault> {
+) -> Result<StatementReply, RequestFault> {
     match statement {
-        Statement::Query(planned) => {
+        ClientStatement::Query(planned) => {
             let encode = format.clone();
-            let running = connection.run(run, planned, values, move |schema| Rows::new(schema, &encode)).await?;
-            Ok(Reply::Rows(response(running, format)?))
+            let running = connection.run(run, planned, values, move |schema| RowEncoder::new(schema, &encode)).await?;
+            Ok(StatementReply::Rows(response(running, format)?))
         }
-        Statement::Copy(planned, form) => {
+        ClientStatement::Copy(planned, form) => {
             let encode = form.clone();
-            let running = connection.run(run, planned, values, move |schema| Copied::new(schema, &encode)).await?;
-            Ok(Reply::Copy(form.clone(), running))
+            let running =
+                connection.run(run, planned, values, move |schema| CopyRowEncoder::new(schema, &encode)).await?;
+            Ok(StatementReply::Copy(form.clone(), running))
         }
-        Statement::Declare { name, planned, held } => {
-            let running = connection.run(run, planned, values, |_| Ok(Batches)).await?;
-            connection.declare(name, Cursor::new(running, *held))?;
-            Ok(Reply::Done(Tag::new("DECLARE CURSOR")))
+        ClientStatement::Declare { name, planned, held } => {
+            let running = connection.run(run, planned, values, |_| Ok(BatchEncoder)).await?;
+            connection.declare(name, QueryCursor::new(running, *held))?;
+            Ok(StatementReply::Done(Tag::new("DECLARE CURSOR")))
         }
-        Statement::Fetch { name, rows } => Ok(Reply::Rows(connection.cursor(name)?.fetch(*rows, run, format).await?)),
+        ClientStatement::Fetch { name, rows } => {
+            Ok(StatementReply::Rows(connection.cursor(name)?.fetch(*rows, run, format).await?))
+        }
         other => settle(connection, other),
     }
 }
 
-fn settle(connection: &Connection, statement: &Statement) -> Result<Reply, Fault> {
+fn settle(connection: &PostgresConnection, statement: &ClientStatement) -> Result<StatementReply, RequestFault> {
     let settings = &connection.settings;
     let tag = match statement {
-        Statement::Close(name) => {
+        ClientStatement::Close(name) => {
             connection.close(name.as_deref())?;
             if name.is_some() { "CLOSE CURSOR" } else { "CLOSE CURSOR ALL" }
         }
-        Statement::Set(pairs) => {
+        ClientStatement::Set(pairs) => {
             pairs.iter().try_for_each(|(name, value)| match value.eq_ignore_ascii_case("default") {
                 true => settings.reset(Some(name)),
                 false => settings.set(name, value),
             })?;
             "SET"
         }
-        Statement::Reset(name) => {
+        ClientStatement::Reset(name) => {
             settings.reset(name.as_deref())?;
             "RESET"
         }
-        Statement::Discard(DiscardObject::ALL) => {
+        ClientStatement::Discard(DiscardObject::ALL) => {
             settings.reset(None)?;
             connection.close(None)?;
             "DISCARD ALL"
         }
-        Statement::Discard(_) => "DISCARD",
-        Statement::Show(Some(name)) => {
+        ClientStatement::Discard(_) => "DISCARD",
+        ClientStatement::Show(Some(name)) => {
             let mut rows = texts(&[name], &[vec![settings.get(name)?]])?;
             rows.set_command_tag("SHOW");
-            return Ok(Reply::Rows(rows));
+            return Ok(StatementReply::Rows(rows));
         }
-        Statement::Show(None) => {
+        ClientStatement::Show(None) => {
             let all: Vec<_> = settings.all().into_iter().map(|(name, value)| vec![name.to_owned(), value]).collect();
-            return Ok(Reply::Rows(texts(&ALL, &all)?));
+            return Ok(StatementReply::Rows(texts(&ALL, &all)?));
         }
-        // Those that ask or end a transaction were done before.
-        _ => return Err(Fault::Internal),
+        // Queries and transaction statements were handled before.
+        _ => return Err(RequestFault::Internal),
     };
-    Ok(Reply::Done(Tag::new(tag)))
+    Ok(StatementReply::Done(Tag::new(tag)))
 }
 
 // Transactions are kept as far as clients see them: there is nothing to commit, and nothing to roll back.
-async fn transaction<C>(connection: &Connection, client: &mut C, statement: &Statement) -> PgWireResult<Reply>
+async fn transaction<C>(
+    connection: &PostgresConnection,
+    client: &mut C,
+    statement: &ClientStatement,
+) -> PgWireResult<StatementReply>
 where
     C: ClientInfo + ClientPortalStore + Sink<PgWireBackendMessage> + Unpin + Send + Sync,
     C::PortalStore: PortalStore,
@@ -165,13 +176,13 @@ where
 {
     let before = client.transaction_status();
     let (tag, after) = match statement {
-        Statement::Begin => {
+        ClientStatement::Begin => {
             if before == TransactionStatus::Transaction {
                 warn(client, "25001", "there is already a transaction in progress").await?;
             }
             ("BEGIN", TransactionStatus::Transaction)
         }
-        Statement::Savepoint(tag) => {
+        ClientStatement::Savepoint(tag) => {
             if before == TransactionStatus::Idle {
                 return Err(outside(tag));
             }
@@ -181,7 +192,7 @@ where
             if before == TransactionStatus::Idle {
                 warn(client, "25P01", "there is no transaction in progress").await?;
             }
-            let committed = matches!(ended, Statement::Commit) && before != TransactionStatus::Error;
+            let committed = matches!(ended, ClientStatement::Commit) && before != TransactionStatus::Error;
             connection.end_transaction();
             connection.forget_portals();
             client.portal_store().clear_portals();
@@ -189,7 +200,7 @@ where
         }
     };
     client.set_transaction_status(after);
-    Ok(Reply::Done(Tag::new(tag)))
+    Ok(StatementReply::Done(Tag::new(tag)))
 }
 
 async fn warn<C>(client: &mut C, state: &str, message: &str) -> PgWireResult<()>

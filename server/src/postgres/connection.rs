@@ -15,14 +15,14 @@ use pgwire::messages::startup::SecretKey;
 use tokio::sync::SetOnce;
 
 use super::catalog::PgCatalog;
-use super::cursor::Cursor;
-use super::settings::Settings;
-use super::statement::{self, Planned, Statement};
+use super::cursor::QueryCursor;
+use super::settings::SessionSettings;
+use super::statement::{self, ClientStatement, PlannedQuery};
 use crate::Error;
-use crate::fault::Fault;
-use crate::metrics::Protocol;
-use crate::running::{Encode, Limit, Running, Stop, ended};
-use crate::service::{FRESH, Job, Service, Work};
+use crate::fault::RequestFault;
+use crate::metrics::ServerProtocol;
+use crate::running::{AnswerEncoder, RunningQuery, SessionTimeLimit, StopSignal, ended};
+use crate::service::{FRESH, QueryJob, QueryService, QueryWork};
 
 /// Cursors of a connection at once.
 const CURSORS: usize = 16;
@@ -31,26 +31,26 @@ const LARGEST: usize = 2 << 20;
 /// Prepared statements of a connection at once, and portals.
 const NAMED: usize = 500;
 
-/// What a client cancels by: the process's number and the secret that it was given.
+/// The key by which a client cancels: the process's number and the secret that it was given.
 type BackendKey = (i32, Bytes);
 
-/// What all connections share.
-pub(super) struct Shared {
-    pub(super) service: Service,
+/// State shared by all connections.
+pub(super) struct PostgresState {
+    pub(super) service: QueryService,
     pub(super) parser: PostgresCompatibilityParser,
     pub(super) catalog: PgCatalog,
     next_pid: AtomicI32,
-    running: Mutex<HashMap<BackendKey, Arc<Mutex<Stop>>>>,
+    running: Mutex<HashMap<BackendKey, Arc<Mutex<StopSignal>>>>,
 }
 
-impl Shared {
-    pub(super) fn new(service: Service) -> Result<Self, Error> {
+impl PostgresState {
+    pub(super) fn new(service: QueryService) -> Result<Self, Error> {
         let catalog = PgCatalog::new(service.tables(), service.functions())?;
         let parser = PostgresCompatibilityParser::new();
         Ok(Self { service, parser, catalog, next_pid: AtomicI32::new(1), running: Mutex::default() })
     }
 
-    /// Ends what runs on the connection of this key.
+    /// Cancels the query on the connection of this key.
     pub(super) fn cancel(&self, pid: i32, key: &SecretKey) {
         let found = lock(&self.running).get(&(pid, key.to_bytes())).cloned();
         if let Some(current) = found {
@@ -60,17 +60,17 @@ impl Shared {
 }
 
 /// A connection.
-pub(super) struct Connection {
-    shared: Arc<Shared>,
+pub(super) struct PostgresConnection {
+    shared: Arc<PostgresState>,
     session: SetOnce<Arc<Session>>,
     key: OnceLock<BackendKey>,
-    current: Arc<Mutex<Stop>>,
-    cursors: Mutex<HashMap<String, Arc<Cursor>>>,
-    kept: Mutex<HashSet<(Kept, String)>>,
-    pub(super) settings: Arc<Settings>,
+    current: Arc<Mutex<StopSignal>>,
+    cursors: Mutex<HashMap<String, Arc<QueryCursor>>>,
+    kept: Mutex<HashSet<(NamedObject, String)>>,
+    pub(super) settings: Arc<SessionSettings>,
 }
 
-impl Drop for Connection {
+impl Drop for PostgresConnection {
     fn drop(&mut self) {
         if let Some(key) = self.key.get() {
             lock(&self.shared.running).remove(key);
@@ -78,14 +78,14 @@ impl Drop for Connection {
     }
 }
 
-/// What clients keep by name.
+/// Kinds of named objects that clients keep.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-pub(super) enum Kept {
+pub(super) enum NamedObject {
     Statement,
     Portal,
 }
 
-impl Kept {
+impl NamedObject {
     fn name(self) -> &'static str {
         match self {
             Self::Statement => "prepared statements",
@@ -94,37 +94,37 @@ impl Kept {
     }
 }
 
-/// What a command runs under.
+/// Stop signal and time limit of a command.
 #[derive(Clone)]
-pub(super) struct Run {
-    pub(super) stop: Stop,
-    pub(super) limit: Option<Limit>,
+pub(super) struct CommandRun {
+    pub(super) stop: StopSignal,
+    pub(super) limit: Option<SessionTimeLimit>,
 }
 
-impl Connection {
-    /// A connection that nobody has logged in on.
-    pub(super) fn new(shared: Arc<Shared>) -> Self {
+impl PostgresConnection {
+    /// A connection without a login.
+    pub(super) fn new(shared: Arc<PostgresState>) -> Self {
         Self {
             shared,
             session: SetOnce::new(),
             key: OnceLock::new(),
-            current: Arc::new(Mutex::new(Stop::new())),
+            current: Arc::new(Mutex::new(StopSignal::new())),
             cursors: Mutex::default(),
             kept: Mutex::default(),
             settings: Arc::default(),
         }
     }
 
-    pub(super) fn shared(&self) -> &Shared {
+    pub(super) fn shared(&self) -> &PostgresState {
         &self.shared
     }
 
     /// Logs a client in; returns what a CancelRequest must show. `wide` keys are of protocol 3.2.
-    pub(super) fn log_in(&self, client: &Arc<Client>, wide: bool) -> Result<(i32, SecretKey), Fault> {
+    pub(super) fn log_in(&self, client: &Arc<Client>, wide: bool) -> Result<(i32, SecretKey), RequestFault> {
         let mut secret = [0; 32];
         getrandom::fill(&mut secret).map_err(|failed| {
             eprintln!("no random bytes: {failed}");
-            Fault::Internal
+            RequestFault::Internal
         })?;
         let pid = self.shared.next_pid.fetch_add(1, Ordering::Relaxed);
         let key = match wide {
@@ -134,27 +134,27 @@ impl Connection {
         let session = self.shared.service.session(client).extended(self.shared.catalog.extend(&self.settings));
         let known = (pid, key.to_bytes());
         if self.session.set(Arc::new(session)).is_err() || self.key.set(known.clone()).is_err() {
-            return Err(Fault::request("this connection is logged in already"));
+            return Err(RequestFault::request("this connection is logged in already"));
         }
         lock(&self.shared.running).insert(known, self.current.clone());
         Ok((pid, key))
     }
 
     /// Its session.
-    pub(super) fn session(&self) -> Result<&Arc<Session>, Fault> {
-        self.session.get().ok_or(Fault::Unauthenticated)
+    pub(super) fn session(&self) -> Result<&Arc<Session>, RequestFault> {
+        self.session.get().ok_or(RequestFault::Unauthenticated)
     }
 
-    /// Waits until somebody has logged in.
+    /// Waits for the login.
     pub(super) async fn logged_in(&self) {
         self.session.wait().await;
     }
 
     /// Begins a command: a CancelRequest ends this one from now on.
-    pub(super) fn command(&self) -> Run {
-        let stop = Stop::new();
+    pub(super) fn command(&self) -> CommandRun {
+        let stop = StopSignal::new();
         *lock(&self.current) = stop.clone();
-        Run { stop, limit: self.settings.statement_timeout().map(Limit::of) }
+        CommandRun { stop, limit: self.settings.statement_timeout().map(SessionTimeLimit::of) }
     }
 
     /// Parses and plans. Boxed for the same reason as [`echolake_query::Opaque`].
@@ -162,11 +162,11 @@ impl Connection {
         &'a self,
         sql: &'a str,
         types: &'a [Option<Type>],
-        run: &'a Run,
-    ) -> BoxFuture<'a, Result<Vec<Statement>, Fault>> {
+        run: &'a CommandRun,
+    ) -> BoxFuture<'a, Result<Vec<ClientStatement>, RequestFault>> {
         let statements = async move {
             if sql.len() > LARGEST {
-                return Err(Fault::TooLarge { limit: LARGEST });
+                return Err(RequestFault::TooLarge { limit: LARGEST });
             }
             let (shared, session) = (self.shared.clone(), self.session()?.clone());
             let (sql, types): (Arc<str>, _) = (sql.into(), types.to_vec());
@@ -184,23 +184,23 @@ impl Connection {
 
     async fn planned<T: Send + 'static>(
         &self,
-        run: &Run,
-        work: impl Future<Output = Result<T, Fault>> + Send + 'static,
-    ) -> Result<T, Fault> {
+        run: &CommandRun,
+        work: impl Future<Output = Result<T, RequestFault>> + Send + 'static,
+    ) -> Result<T, RequestFault> {
         tokio::select! {
             fault = ended(&run.stop, run.limit) => Err(fault),
             planned = self.shared.service.plan(self.session()?.client(), work) => planned,
         }
     }
 
-    /// Runs what was planned, anew where the plan is old.
-    pub(super) async fn run<E: Encode>(
+    /// Runs a planned statement; plans it again if the plan is old.
+    pub(super) async fn run<E: AnswerEncoder>(
         &self,
-        run: &Run,
-        planned: &Arc<Planned>,
+        run: &CommandRun,
+        planned: &Arc<PlannedQuery>,
         values: ParamValues,
-        encode: impl FnOnce(&arrow::datatypes::SchemaRef) -> Result<E, Fault> + Send + 'static,
-    ) -> Result<Running<E::Item>, Fault> {
+        encode: impl FnOnce(&arrow::datatypes::SchemaRef) -> Result<E, RequestFault> + Send + 'static,
+    ) -> Result<RunningQuery<E::Item>, RequestFault> {
         let session = self.session()?.clone();
         let prepared = match planned.at.elapsed() < FRESH {
             true => planned.prepared.clone(),
@@ -208,63 +208,63 @@ impl Connection {
                 let (planner, old) = (session.clone(), planned.clone());
                 let new = self.planned(run, async move { Ok(old.again(&planner).await?) }).await?;
                 if new.schema() != planned.prepared.schema() {
-                    return Err(Fault::unsupported("a prepared statement whose columns have changed since"));
+                    return Err(RequestFault::unsupported("a prepared statement whose columns have changed since"));
                 }
                 Arc::new(new)
             }
         };
-        let job = Job {
-            protocol: Protocol::Postgres,
+        let job = QueryJob {
+            protocol: ServerProtocol::Postgres,
             session,
-            work: Work::Prepared(prepared, values),
+            work: QueryWork::Prepared(prepared, values),
             limit: run.limit,
             stop: run.stop.clone(),
         };
         self.shared.service.begin(job, encode).await
     }
 
-    /// Counts what a client keeps by name.
-    pub(super) fn remember(&self, kind: Kept, name: &str) -> Result<(), Fault> {
+    /// Counts an object that a client keeps by name.
+    pub(super) fn remember(&self, kind: NamedObject, name: &str) -> Result<(), RequestFault> {
         let mut all = lock(&self.kept);
         let new = (kind, name.to_owned());
         if !all.contains(&new) && all.iter().filter(|(known, _)| *known == kind).count() >= NAMED {
-            return Err(Fault::TooMany { what: kind.name(), limit: NAMED });
+            return Err(RequestFault::TooMany { what: kind.name(), limit: NAMED });
         }
         all.insert(new);
         Ok(())
     }
 
-    /// Counts it no more.
-    pub(super) fn forget(&self, kind: Kept, name: &str) {
+    /// Stops counting it.
+    pub(super) fn forget(&self, kind: NamedObject, name: &str) {
         lock(&self.kept).remove(&(kind, name.to_owned()));
     }
 
     /// All portals are gone.
     pub(super) fn forget_portals(&self) {
-        lock(&self.kept).retain(|(kind, _)| *kind != Kept::Portal);
+        lock(&self.kept).retain(|(kind, _)| *kind != NamedObject::Portal);
     }
 
     /// Keeps a cursor.
-    pub(super) fn declare(&self, name: &str, cursor: Cursor) -> Result<(), Fault> {
+    pub(super) fn declare(&self, name: &str, cursor: QueryCursor) -> Result<(), RequestFault> {
         let mut cursors = lock(&self.cursors);
         if cursors.contains_key(name) {
-            return Err(Fault::request(format!("cursor \"{name}\" already exists")));
+            return Err(RequestFault::request(format!("cursor \"{name}\" already exists")));
         }
         if cursors.len() >= CURSORS {
-            return Err(Fault::TooMany { what: "cursors", limit: CURSORS });
+            return Err(RequestFault::TooMany { what: "cursors", limit: CURSORS });
         }
         cursors.insert(name.to_owned(), Arc::new(cursor));
         Ok(())
     }
 
     /// A cursor.
-    pub(super) fn cursor(&self, name: &str) -> Result<Arc<Cursor>, Fault> {
-        let missing = || Fault::NotFound { what: format!("cursor \"{name}\""), hint: "DECLARE it first" };
+    pub(super) fn cursor(&self, name: &str) -> Result<Arc<QueryCursor>, RequestFault> {
+        let missing = || RequestFault::NotFound { what: format!("cursor \"{name}\""), hint: "DECLARE it first" };
         lock(&self.cursors).get(name).cloned().ok_or_else(missing)
     }
 
     /// Closes a cursor, or all of them.
-    pub(super) fn close(&self, name: Option<&str>) -> Result<(), Fault> {
+    pub(super) fn close(&self, name: Option<&str>) -> Result<(), RequestFault> {
         match name {
             Some(name) => {
                 self.cursor(name)?;

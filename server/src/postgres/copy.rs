@@ -23,15 +23,15 @@ use pgwire::messages::copy::{CopyData, CopyDone, CopyOutResponse};
 
 use super::rows::{encoding, fields};
 use super::sqlstate::error;
-use crate::fault::Fault;
-use crate::running::{Encode, Running};
+use crate::fault::RequestFault;
+use crate::running::{AnswerEncoder, RunningQuery};
 
-/// What a binary copy begins with: signature, no flags, no extension.
+/// Header of a binary copy: signature, no flags, no extension.
 const BINARY_HEADER: &[u8] = b"PGCOPY\n\xff\r\n\0\0\0\0\0\0\0\0\0";
-/// And ends with.
+/// Trailer of a binary copy.
 const BINARY_END: &[u8] = &[0xff, 0xff];
 
-/// How rows are copied.
+/// The format of a copy.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) enum CopyAs {
     Binary,
@@ -40,7 +40,7 @@ pub(super) enum CopyAs {
 }
 
 #[derive(Default)]
-struct Options {
+struct CopyOptions {
     format: Option<String>,
     delimiter: Option<char>,
     null: Option<String>,
@@ -51,17 +51,17 @@ struct Options {
 /// The query that is copied, and how.
 ///
 /// # Errors
-/// Where it is copied to a file or a program, or in a way that is not known.
+/// It is copied to a file or a program, or in a way that is not known.
 pub(super) fn read(
     source: CopySource,
     target: &CopyTarget,
     options: Vec<CopyOption>,
     legacy: Vec<CopyLegacyOption>,
-) -> Result<(Sql, CopyAs), Fault> {
+) -> Result<(Sql, CopyAs), RequestFault> {
     if *target != CopyTarget::Stdout {
-        return Err(Fault::Query(QueryError::NotReading { statement: format!("COPY TO {target}") }));
+        return Err(RequestFault::Query(QueryError::NotReading { statement: format!("COPY TO {target}") }));
     }
-    let mut read = Options::default();
+    let mut read = CopyOptions::default();
     options.into_iter().try_for_each(|option| read.take(option))?;
     legacy.into_iter().try_for_each(|option| read.take_legacy(option))?;
     let query = match source {
@@ -72,14 +72,14 @@ pub(super) fn read(
             // Both were parsed as names, and print as such.
             let sql = format!("SELECT {columns} FROM {table_name}");
             let parsed = Parser::parse_sql(&PostgreSqlDialect {}, &sql).ok().and_then(|mut all| all.pop());
-            parsed.ok_or_else(|| Fault::request(format!("`{table_name}` cannot be copied")))?
+            parsed.ok_or_else(|| RequestFault::request(format!("`{table_name}` cannot be copied")))?
         }
     };
     Ok((query, read.form()?))
 }
 
-impl Options {
-    fn take(&mut self, option: CopyOption) -> Result<(), Fault> {
+impl CopyOptions {
+    fn take(&mut self, option: CopyOption) -> Result<(), RequestFault> {
         match option {
             CopyOption::Format(format) => self.format = Some(format.value.to_ascii_lowercase()),
             CopyOption::Delimiter(c) => self.delimiter = Some(c),
@@ -87,12 +87,12 @@ impl Options {
             CopyOption::Quote(c) => self.quote = Some(c),
             CopyOption::Header(header) => self.header = header,
             CopyOption::Encoding(name) if ["utf8", "utf-8"].contains(&name.to_ascii_lowercase().as_str()) => {}
-            other => return Err(Fault::unsupported(format!("COPY with {other}"))),
+            other => return Err(RequestFault::unsupported(format!("COPY with {other}"))),
         }
         Ok(())
     }
 
-    fn take_legacy(&mut self, option: CopyLegacyOption) -> Result<(), Fault> {
+    fn take_legacy(&mut self, option: CopyLegacyOption) -> Result<(), RequestFault> {
         match option {
             CopyLegacyOption::Binary => self.format = Some("binary".to_owned()),
             CopyLegacyOption::Delimiter(c) => self.delimiter = Some(c),
@@ -104,19 +104,19 @@ impl Options {
                     match option {
                         CopyLegacyCsvOption::Header => self.header = true,
                         CopyLegacyCsvOption::Quote(c) => self.quote = Some(c),
-                        other => return Err(Fault::unsupported(format!("COPY with {other}"))),
+                        other => return Err(RequestFault::unsupported(format!("COPY with {other}"))),
                     }
                 }
             }
-            other => return Err(Fault::unsupported(format!("COPY with {other}"))),
+            other => return Err(RequestFault::unsupported(format!("COPY with {other}"))),
         }
         Ok(())
     }
 
-    fn form(self) -> Result<CopyAs, Fault> {
+    fn form(self) -> Result<CopyAs, RequestFault> {
         let is_mark = |c: &char| c.is_ascii() && !c.is_ascii_alphanumeric() && !['\n', '\r', '\0', '\\'].contains(c);
         if let Some(wrong) = [self.delimiter, self.quote].iter().flatten().find(|c| !is_mark(c)) {
-            return Err(Fault::request(format!("{wrong:?} cannot separate or quote")));
+            return Err(RequestFault::request(format!("{wrong:?} cannot separate or quote")));
         }
         let mark = |given: Option<char>, usual: char| given.unwrap_or(usual).to_string();
         match self.format.as_deref() {
@@ -132,7 +132,7 @@ impl Options {
                 null: self.null.unwrap_or_else(|| "\\N".to_owned()),
                 header: self.header,
             }),
-            Some(other) => Err(Fault::unsupported(format!("COPY as {other}"))),
+            Some(other) => Err(RequestFault::unsupported(format!("COPY as {other}"))),
         }
     }
 }
@@ -142,7 +142,7 @@ impl CopyAs {
         if *self == Self::Binary { Format::UnifiedBinary } else { Format::UnifiedText }
     }
 
-    // Names of columns, where they are wanted.
+    // Names of columns, if they are wanted.
     fn first_line(&self, fields: &[FieldInfo]) -> Option<Bytes> {
         let names = |delimiter: &str, quoted: &dyn Fn(&str) -> String| {
             let names: Vec<_> = fields.iter().map(|f| quoted(f.name())).collect();
@@ -166,14 +166,14 @@ impl CopyAs {
 }
 
 /// Encodes rows to be copied, a message each, as Postgres sends them.
-pub(super) struct Copied {
+pub(super) struct CopyRowEncoder {
     encoder: CopyEncoder,
     fields: Arc<Vec<FieldInfo>>,
 }
 
-impl Copied {
+impl CopyRowEncoder {
     /// For an answer of these columns.
-    pub(super) fn new(schema: &SchemaRef, form: &CopyAs) -> Result<Self, Fault> {
+    pub(super) fn new(schema: &SchemaRef, form: &CopyAs) -> Result<Self, RequestFault> {
         let fields = fields(schema, &form.format())?;
         let encoder = match form {
             CopyAs::Binary => CopyEncoder::new_binary(fields.clone()),
@@ -196,10 +196,10 @@ impl Copied {
     }
 }
 
-impl Encode for Copied {
+impl AnswerEncoder for CopyRowEncoder {
     type Item = Vec<CopyData>;
 
-    fn batch(&mut self, batch: RecordBatch) -> Result<Vec<Vec<CopyData>>, Fault> {
+    fn batch(&mut self, batch: RecordBatch) -> Result<Vec<Vec<CopyData>>, RequestFault> {
         let schema = batch.schema();
         let mut rows = Vec::with_capacity(batch.num_rows());
         for row in 0..batch.num_rows() {
@@ -212,13 +212,13 @@ impl Encode for Copied {
         Ok(vec![rows])
     }
 
-    fn end(self) -> Result<Vec<Vec<CopyData>>, Fault> {
+    fn end(self) -> Result<Vec<Vec<CopyData>>, RequestFault> {
         Ok(Vec::new())
     }
 }
 
 /// Sends a copy to its end.
-pub(super) async fn send<C>(client: &mut C, form: &CopyAs, mut running: Running<Vec<CopyData>>) -> PgWireResult<()>
+pub(super) async fn send<C>(client: &mut C, form: &CopyAs, mut running: RunningQuery<Vec<CopyData>>) -> PgWireResult<()>
 where
     C: Sink<PgWireBackendMessage> + Unpin,
     C::Error: Debug,

@@ -11,30 +11,30 @@ use pgwire::error::PgWireResult;
 use pgwire::messages::data::DataRow;
 use tokio::sync::Mutex;
 
-use super::connection::Run;
-use super::rows::{Rows, fields, flat};
+use super::connection::CommandRun;
+use super::rows::{RowEncoder, fields, flat};
 use super::sqlstate::error;
-use crate::fault::Fault;
-use crate::running::Running;
+use crate::fault::RequestFault;
+use crate::running::RunningQuery;
 
 /// A cursor.
-pub(super) struct Cursor {
+pub(super) struct QueryCursor {
     /// Its columns.
     pub(super) schema: SchemaRef,
-    /// Whether it outlives its transaction.
+    /// True if it outlives its transaction (WITH HOLD).
     pub(super) held: bool,
-    rows: Arc<Mutex<Left>>,
+    rows: Arc<Mutex<RemainingRows>>,
 }
 
-// What is left of its rows.
-struct Left {
-    running: Running<RecordBatch>,
+// The remaining rows.
+struct RemainingRows {
+    running: RunningQuery<RecordBatch>,
     begun: Option<RecordBatch>,
 }
 
-impl Left {
+impl RemainingRows {
     // The next rows, at most this many.
-    async fn take(&mut self, most: usize) -> Result<Option<RecordBatch>, Fault> {
+    async fn take(&mut self, most: usize) -> Result<Option<RecordBatch>, RequestFault> {
         let batch = match self.begun.take() {
             Some(batch) => batch,
             None => match self.running.next().await? {
@@ -50,14 +50,19 @@ impl Left {
     }
 }
 
-impl Cursor {
-    pub(super) fn new(running: Running<RecordBatch>, held: bool) -> Self {
+impl QueryCursor {
+    pub(super) fn new(running: RunningQuery<RecordBatch>, held: bool) -> Self {
         let schema = running.schema.clone();
-        Self { schema, held, rows: Arc::new(Mutex::new(Left { running, begun: None })) }
+        Self { schema, held, rows: Arc::new(Mutex::new(RemainingRows { running, begun: None })) }
     }
 
     /// The next rows; None for all.
-    pub(super) async fn fetch(&self, count: Option<u64>, run: &Run, format: &Format) -> Result<QueryResponse, Fault> {
+    pub(super) async fn fetch(
+        &self,
+        count: Option<u64>,
+        run: &CommandRun,
+        format: &Format,
+    ) -> Result<QueryResponse, RequestFault> {
         let rows = self.rows.clone();
         {
             // A fetch has a time of its own, and a CancelRequest ends what is fetched.
@@ -65,7 +70,7 @@ impl Cursor {
             left.running.limit = run.limit;
             left.running.stop = run.stop.clone();
         }
-        let encoder = Arc::new(Rows::new(&self.schema, format)?);
+        let encoder = Arc::new(RowEncoder::new(&self.schema, format)?);
         let parts = stream::try_unfold((rows, count), move |(rows, wanted)| {
             let encoder = encoder.clone();
             async move {
@@ -80,10 +85,10 @@ impl Cursor {
 }
 
 async fn next(
-    rows: &Mutex<Left>,
+    rows: &Mutex<RemainingRows>,
     wanted: Option<u64>,
-    encoder: &Rows,
-) -> Result<Option<(Vec<DataRow>, Option<u64>)>, Fault> {
+    encoder: &RowEncoder,
+) -> Result<Option<(Vec<DataRow>, Option<u64>)>, RequestFault> {
     let most = wanted.map_or(usize::MAX, |n| usize::try_from(n).unwrap_or(usize::MAX));
     if most == 0 {
         return Ok(None);

@@ -1,4 +1,4 @@
-//! The extended way to ask: parse, bind, describe, execute, with values and in parts.
+//! The extended query protocol: parse, bind, describe, execute, with values and in parts.
 
 use std::fmt::Debug;
 use std::sync::Arc;
@@ -23,34 +23,34 @@ use pgwire::messages::extendedquery::{
 };
 use pgwire::messages::response::{EmptyQueryResponse, ReadyForQuery, TransactionStatus};
 
-use super::command::{Reply, act, columns};
-use super::connection::{Connection, Kept};
+use super::command::{StatementReply, act, columns};
+use super::connection::{NamedObject, PostgresConnection};
 use super::copy;
 use super::rows::fields;
 use super::sqlstate::error;
-use super::statement::Statement;
-use crate::fault::Fault;
+use super::statement::ClientStatement;
+use crate::fault::RequestFault;
 
 /// Answers extended queries.
-pub(super) struct Extended {
-    connection: Arc<Connection>,
-    parser: Arc<Planner>,
+pub(super) struct ExtendedQueries {
+    connection: Arc<PostgresConnection>,
+    parser: Arc<StatementPlanner>,
 }
 
-impl Extended {
-    pub(super) fn new(connection: Arc<Connection>) -> Self {
-        Self { parser: Arc::new(Planner(connection.clone())), connection }
+impl ExtendedQueries {
+    pub(super) fn new(connection: Arc<PostgresConnection>) -> Self {
+        Self { parser: Arc::new(StatementPlanner(connection.clone())), connection }
     }
 }
 
-/// Plans what is parsed.
-pub(super) struct Planner(Arc<Connection>);
+/// Plans parsed statements.
+pub(super) struct StatementPlanner(Arc<PostgresConnection>);
 
 #[async_trait]
-impl QueryParser for Planner {
-    type Statement = Statement;
+impl QueryParser for StatementPlanner {
+    type Statement = ClientStatement;
 
-    async fn parse_sql<C>(&self, _: &C, sql: &str, types: &[Option<Type>]) -> PgWireResult<Option<Statement>>
+    async fn parse_sql<C>(&self, _: &C, sql: &str, types: &[Option<Type>]) -> PgWireResult<Option<ClientStatement>>
     where
         C: ClientInfo + Unpin + Send + Sync,
     {
@@ -58,44 +58,44 @@ impl QueryParser for Planner {
         let mut statements = self.0.statements(sql, types, &run).await.map_err(|fault| error(&fault))?;
         match statements.len() {
             0 | 1 => Ok(statements.pop()),
-            _ => Err(error(&Fault::request("cannot insert multiple commands into a prepared statement"))),
+            _ => Err(error(&RequestFault::request("cannot insert multiple commands into a prepared statement"))),
         }
     }
 
-    fn get_parameter_types(&self, statement: &Statement) -> PgWireResult<Vec<Type>> {
+    fn get_parameter_types(&self, statement: &ClientStatement) -> PgWireResult<Vec<Type>> {
         let kinds = kinds(statement).map_err(|fault| error(&fault))?;
-        // Where the query does not tell, Postgres takes a text.
+        // If the query does not determine the type, Postgres takes a text.
         let one = |kind: Option<DataType>| kind.map_or(Ok(Type::TEXT), |kind| into_pg_type(&kind));
         kinds.into_iter().map(one).collect()
     }
 
-    fn get_result_schema(&self, statement: &Statement, format: Option<&Format>) -> PgWireResult<Vec<FieldInfo>> {
+    fn get_result_schema(&self, statement: &ClientStatement, format: Option<&Format>) -> PgWireResult<Vec<FieldInfo>> {
         let format = format.unwrap_or(&Format::UnifiedText);
         columns(&self.0, statement, format).map_err(|fault| error(&fault))
     }
 }
 
-fn kinds(statement: &Statement) -> Result<Vec<Option<DataType>>, Fault> {
+fn kinds(statement: &ClientStatement) -> Result<Vec<Option<DataType>>, RequestFault> {
     match statement {
-        Statement::Query(planned) | Statement::Copy(planned, _) | Statement::Declare { planned, .. } => {
-            Ok(planned.prepared.parameters()?)
-        }
+        ClientStatement::Query(planned)
+        | ClientStatement::Copy(planned, _)
+        | ClientStatement::Declare { planned, .. } => Ok(planned.prepared.parameters()?),
         _ => Ok(Vec::new()),
     }
 }
 
-fn values(portal: &Portal<Statement>) -> Result<ParamValues, Fault> {
+fn values(portal: &Portal<ClientStatement>) -> Result<ParamValues, RequestFault> {
     let kinds = kinds(&portal.statement.statement)?;
     let given = portal.parameter_len();
     if given != kinds.len() {
-        return Err(Fault::request(format!("{given} values for {} placeholders", kinds.len())));
+        return Err(RequestFault::request(format!("{given} values for {} placeholders", kinds.len())));
     }
     if let Format::Individual(codes) = &portal.parameter_format
         && codes.len() != given
     {
-        return Err(Fault::request(format!("{} formats for {given} values", codes.len())));
+        return Err(RequestFault::request(format!("{} formats for {given} values", codes.len())));
     }
-    // Where neither side tells the type, it is the text that was advertised.
+    // If neither side gives the type, it is the text that was advertised.
     let told = |i: usize| {
         portal.statement.parameter_types.get(i).is_some_and(|t| t.as_ref().is_some_and(|t| *t != Type::UNKNOWN))
     };
@@ -103,30 +103,30 @@ fn values(portal: &Portal<Statement>) -> Result<ParamValues, Fault> {
     let kinds: Vec<_> = kinds.into_iter().enumerate().map(settled).collect();
     let hints: Vec<_> = kinds.iter().map(Option::as_ref).collect();
     deserialize_parameters(portal, &hints).map_err(|e| match e {
-        PgWireError::UserError(info) => Fault::request(info.message.clone()),
-        other => Fault::request(other.to_string()),
+        PgWireError::UserError(info) => RequestFault::request(info.message.clone()),
+        other => RequestFault::request(other.to_string()),
     })
 }
 
 #[async_trait]
-impl ExtendedQueryHandler for Extended {
-    type Statement = Statement;
-    type QueryParser = Planner;
+impl ExtendedQueryHandler for ExtendedQueries {
+    type Statement = ClientStatement;
+    type QueryParser = StatementPlanner;
 
-    fn query_parser(&self) -> Arc<Planner> {
+    fn query_parser(&self) -> Arc<StatementPlanner> {
         self.parser.clone()
     }
 
     async fn on_parse<C>(&self, client: &mut C, message: Parse) -> PgWireResult<()>
     where
         C: ClientInfo + ClientPortalStore + Sink<PgWireBackendMessage> + Unpin + Send + Sync,
-        C::PortalStore: PortalStore<Statement = Statement>,
+        C::PortalStore: PortalStore<Statement = ClientStatement>,
         C::Error: Debug,
         PgWireError: From<<C as Sink<PgWireBackendMessage>>::Error>,
     {
         let name = message.name.clone().unwrap_or_else(|| DEFAULT_NAME.to_owned());
         let parsed = StoredStatement::parse(client, &message, self.parser.clone()).await?;
-        self.connection.remember(Kept::Statement, &name).map_err(|fault| error(&fault))?;
+        self.connection.remember(NamedObject::Statement, &name).map_err(|fault| error(&fault))?;
         match parsed {
             Some(statement) => client.portal_store().put_statement(Arc::new(statement)),
             None => client.portal_store().put_empty_statement(&name),
@@ -139,13 +139,13 @@ impl ExtendedQueryHandler for Extended {
     async fn on_bind<C>(&self, client: &mut C, message: Bind) -> PgWireResult<()>
     where
         C: ClientInfo + ClientPortalStore + Sink<PgWireBackendMessage> + Unpin + Send + Sync,
-        C::PortalStore: PortalStore<Statement = Statement>,
+        C::PortalStore: PortalStore<Statement = ClientStatement>,
         C::Error: Debug,
         PgWireError: From<<C as Sink<PgWireBackendMessage>>::Error>,
     {
         let statement = message.statement_name.as_deref().unwrap_or(DEFAULT_NAME);
         let portal = message.portal_name.as_deref().unwrap_or(DEFAULT_NAME);
-        self.connection.remember(Kept::Portal, portal).map_err(|fault| error(&fault))?;
+        self.connection.remember(NamedObject::Portal, portal).map_err(|fault| error(&fault))?;
         match client.portal_store().get_statement(statement) {
             Some(Entry::Value(statement)) => {
                 client.portal_store().put_portal(Arc::new(Portal::try_new(&message, statement)?));
@@ -161,7 +161,7 @@ impl ExtendedQueryHandler for Extended {
     async fn on_execute<C>(&self, client: &mut C, message: Execute) -> PgWireResult<()>
     where
         C: ClientInfo + ClientPortalStore + Sink<PgWireBackendMessage> + Unpin + Send + Sync,
-        C::PortalStore: PortalStore<Statement = Statement>,
+        C::PortalStore: PortalStore<Statement = ClientStatement>,
         C::Error: Debug,
         PgWireError: From<<C as Sink<PgWireBackendMessage>>::Error>,
     {
@@ -188,7 +188,7 @@ impl ExtendedQueryHandler for Extended {
     async fn on_describe<C>(&self, client: &mut C, message: Describe) -> PgWireResult<()>
     where
         C: ClientInfo + ClientPortalStore + Sink<PgWireBackendMessage> + Unpin + Send + Sync,
-        C::PortalStore: PortalStore<Statement = Statement>,
+        C::PortalStore: PortalStore<Statement = ClientStatement>,
         C::Error: Debug,
         PgWireError: From<<C as Sink<PgWireBackendMessage>>::Error>,
     {
@@ -206,7 +206,7 @@ impl ExtendedQueryHandler for Extended {
     async fn on_sync<C>(&self, client: &mut C, _: PgSync) -> PgWireResult<()>
     where
         C: ClientInfo + ClientPortalStore + Sink<PgWireBackendMessage> + Unpin + Send + Sync,
-        C::PortalStore: PortalStore<Statement = Statement>,
+        C::PortalStore: PortalStore<Statement = ClientStatement>,
         C::Error: Debug,
         PgWireError: From<<C as Sink<PgWireBackendMessage>>::Error>,
     {
@@ -225,7 +225,7 @@ impl ExtendedQueryHandler for Extended {
     async fn on_close<C>(&self, client: &mut C, message: Close) -> PgWireResult<()>
     where
         C: ClientInfo + ClientPortalStore + Sink<PgWireBackendMessage> + Unpin + Send + Sync,
-        C::PortalStore: PortalStore<Statement = Statement>,
+        C::PortalStore: PortalStore<Statement = ClientStatement>,
         C::Error: Debug,
         PgWireError: From<<C as Sink<PgWireBackendMessage>>::Error>,
     {
@@ -233,21 +233,21 @@ impl ExtendedQueryHandler for Extended {
         match message.target_type {
             TARGET_TYPE_BYTE_STATEMENT => {
                 client.portal_store().rm_statement(name);
-                self.connection.forget(Kept::Statement, name);
+                self.connection.forget(NamedObject::Statement, name);
             }
             _ => {
                 client.portal_store().rm_portal(name);
-                self.connection.forget(Kept::Portal, name);
+                self.connection.forget(NamedObject::Portal, name);
             }
         }
         client.feed(PgWireBackendMessage::CloseComplete(CloseComplete::new())).await?;
         Ok(())
     }
 
-    async fn do_query<C>(&self, _: &mut C, _: &Portal<Statement>, _: usize) -> PgWireResult<Response>
+    async fn do_query<C>(&self, _: &mut C, _: &Portal<ClientStatement>, _: usize) -> PgWireResult<Response>
     where
         C: ClientInfo + ClientPortalStore + Sink<PgWireBackendMessage> + Unpin + Send + Sync,
-        C::PortalStore: PortalStore<Statement = Statement>,
+        C::PortalStore: PortalStore<Statement = ClientStatement>,
         C::Error: Debug,
         PgWireError: From<<C as Sink<PgWireBackendMessage>>::Error>,
     {
@@ -256,11 +256,11 @@ impl ExtendedQueryHandler for Extended {
     }
 }
 
-impl Extended {
-    async fn execute<C>(&self, client: &mut C, portal: &Portal<Statement>, most: usize) -> PgWireResult<()>
+impl ExtendedQueries {
+    async fn execute<C>(&self, client: &mut C, portal: &Portal<ClientStatement>, most: usize) -> PgWireResult<()>
     where
         C: ClientInfo + ClientPortalStore + Sink<PgWireBackendMessage> + Unpin + Send + Sync,
-        C::PortalStore: PortalStore<Statement = Statement>,
+        C::PortalStore: PortalStore<Statement = ClientStatement>,
         C::Error: Debug,
         PgWireError: From<<C as Sink<PgWireBackendMessage>>::Error>,
     {
@@ -271,9 +271,9 @@ impl Extended {
             let run = self.connection.command();
             let statement = &portal.statement.statement;
             match act(&self.connection, client, &run, statement, values, &portal.result_column_format).await? {
-                Reply::Rows(rows) => *state = PortalExecutionState::Suspended(rows),
-                Reply::Copy(form, running) => return copy::send(client, &form, running).await,
-                Reply::Done(tag) => {
+                StatementReply::Rows(rows) => *state = PortalExecutionState::Suspended(rows),
+                StatementReply::Copy(form, running) => return copy::send(client, &form, running).await,
+                StatementReply::Done(tag) => {
                     client.feed(PgWireBackendMessage::CommandComplete(tag.into())).await?;
                     return Ok(());
                 }

@@ -17,7 +17,7 @@ use datafusion::prelude::create_udf;
 use datafusion_pg_catalog::pg_catalog as pg;
 
 use super::catalog::ROLE;
-use super::settings::{Settings, VERSION};
+use super::settings::{SessionSettings, VERSION};
 
 /// Functions that are the same in all sessions.
 pub(super) fn fixed() -> Vec<Arc<ScalarUDF>> {
@@ -70,7 +70,7 @@ pub(super) fn fixed() -> Vec<Arc<ScalarUDF>> {
         ("inet_server_addr", None),
         ("inet_client_addr", None),
     ];
-    all.extend(texts.map(|(name, text)| Answer::udf(name, ScalarValue::Utf8(text))));
+    all.extend(texts.map(|(name, text)| ConstantAnswer::udf(name, ScalarValue::Utf8(text))));
     let visible = [
         "pg_function_is_visible",
         "pg_type_is_visible",
@@ -89,13 +89,13 @@ pub(super) fn fixed() -> Vec<Arc<ScalarUDF>> {
         "has_language_privilege",
         "pg_has_role",
     ];
-    all.extend(visible.map(|name| Answer::udf(name, ScalarValue::Boolean(Some(true)))));
+    all.extend(visible.map(|name| ConstantAnswer::udf(name, ScalarValue::Boolean(Some(true)))));
     let never = ["pg_is_in_recovery", "pg_is_other_temp_schema"];
-    all.extend(never.map(|name| Answer::udf(name, ScalarValue::Boolean(Some(false)))));
+    all.extend(never.map(|name| ConstantAnswer::udf(name, ScalarValue::Boolean(Some(false)))));
     let sizes = ["pg_table_size", "pg_indexes_size", "pg_database_size", "pg_tablespace_size"];
-    all.extend(sizes.map(|name| Answer::udf(name, ScalarValue::Int64(Some(0)))));
-    all.push(Answer::udf("pg_my_temp_schema", ScalarValue::Int32(Some(0))));
-    all.push(Answer::udf("pg_backend_pid", ScalarValue::Int32(Some(0))));
+    all.extend(sizes.map(|name| ConstantAnswer::udf(name, ScalarValue::Int64(Some(0)))));
+    all.push(ConstantAnswer::udf("pg_my_temp_schema", ScalarValue::Int32(Some(0))));
+    all.push(ConstantAnswer::udf("pg_backend_pid", ScalarValue::Int32(Some(0))));
     all.push(ScalarUDF::new_from_impl(JsonObject::new()));
     all.into_iter().map(Arc::new).collect()
 }
@@ -112,7 +112,7 @@ pub(super) fn arguments(of: HashMap<i32, String>) -> Arc<ScalarUDF> {
     Arc::new(create_udf(name, vec![DataType::Int32], DataType::Utf8, Volatility::Stable, Arc::new(find)))
 }
 
-/// `to_regtype(name)`: the number of a type; NULL where there is none.
+/// `to_regtype(name)`: the number of a type; NULL if there is none.
 pub(super) fn to_regtype(types: HashMap<String, i32>) -> Arc<ScalarUDF> {
     let find = move |args: &[ColumnarValue]| {
         let names = ColumnarValue::values_to_arrays(args)?;
@@ -141,27 +141,27 @@ fn standard(name: &str) -> &str {
 }
 
 /// Functions of a session's settings.
-pub(super) fn of_settings(settings: &Arc<Settings>) -> Vec<Arc<ScalarUDF>> {
+pub(super) fn of_settings(settings: &Arc<SessionSettings>) -> Vec<Arc<ScalarUDF>> {
     let udf = |kind| Arc::new(ScalarUDF::new_from_impl(OfSettings::new(kind, settings.clone())));
-    vec![udf(Kind::Get), udf(Kind::Set)]
+    vec![udf(SettingFunction::Get), udf(SettingFunction::Set)]
 }
 
 /// A function with one answer, whatever it is given.
 #[derive(Debug, PartialEq, Eq, Hash)]
-struct Answer {
+struct ConstantAnswer {
     name: &'static str,
     signature: Signature,
     answer: ScalarValue,
 }
 
-impl Answer {
+impl ConstantAnswer {
     fn udf(name: &'static str, answer: ScalarValue) -> ScalarUDF {
         let any = vec![TypeSignature::Nullary, TypeSignature::VariadicAny];
         ScalarUDF::new_from_impl(Self { name, signature: Signature::one_of(any, Volatility::Stable), answer })
     }
 }
 
-impl ScalarUDFImpl for Answer {
+impl ScalarUDFImpl for ConstantAnswer {
     fn name(&self) -> &str {
         self.name
     }
@@ -235,7 +235,7 @@ fn json(value: &ScalarValue) -> serde_json::Value {
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-enum Kind {
+enum SettingFunction {
     Get,
     Set,
 }
@@ -243,9 +243,9 @@ enum Kind {
 /// `current_setting(name [, missing_ok])` and `set_config(name, value, is_local)`, within what SET may.
 #[derive(Debug)]
 struct OfSettings {
-    kind: Kind,
+    kind: SettingFunction,
     signature: Signature,
-    settings: Arc<Settings>,
+    settings: Arc<SessionSettings>,
 }
 
 impl PartialEq for OfSettings {
@@ -263,21 +263,21 @@ impl Hash for OfSettings {
 }
 
 impl OfSettings {
-    fn new(kind: Kind, settings: Arc<Settings>) -> Self {
+    fn new(kind: SettingFunction, settings: Arc<SessionSettings>) -> Self {
         use DataType::{Boolean, Utf8};
         let signature = match kind {
-            Kind::Get => Signature::one_of(
+            SettingFunction::Get => Signature::one_of(
                 vec![TypeSignature::Exact(vec![Utf8]), TypeSignature::Exact(vec![Utf8, Boolean])],
                 Volatility::Stable,
             ),
-            Kind::Set => Signature::exact(vec![Utf8, Utf8, Boolean], Volatility::Volatile),
+            SettingFunction::Set => Signature::exact(vec![Utf8, Utf8, Boolean], Volatility::Volatile),
         };
         Self { kind, signature, settings }
     }
 
     fn one(&self, name: &str, value: Option<&str>, missing_ok: bool) -> Result<Option<String>> {
-        let wrong = |e: crate::fault::Fault| DataFusionError::Execution(e.to_string());
-        if let (Kind::Set, Some(value)) = (self.kind, value) {
+        let wrong = |e: crate::fault::RequestFault| DataFusionError::Execution(e.to_string());
+        if let (SettingFunction::Set, Some(value)) = (self.kind, value) {
             self.settings.set(name, value).map_err(wrong)?;
         }
         match self.settings.get(name) {
@@ -291,8 +291,8 @@ impl OfSettings {
 impl ScalarUDFImpl for OfSettings {
     fn name(&self) -> &str {
         match self.kind {
-            Kind::Get => "current_setting",
-            Kind::Set => "set_config",
+            SettingFunction::Get => "current_setting",
+            SettingFunction::Set => "set_config",
         }
     }
 
@@ -311,11 +311,11 @@ impl ScalarUDFImpl for OfSettings {
         let names = names.as_string::<i32>();
         let second = columns.get(1);
         let values = match (self.kind, second) {
-            (Kind::Set, Some(column)) => Some(texts(column)?),
+            (SettingFunction::Set, Some(column)) => Some(texts(column)?),
             _ => None,
         };
         let missing_ok = match (self.kind, second) {
-            (Kind::Get, Some(column)) => Some(column.as_boolean()),
+            (SettingFunction::Get, Some(column)) => Some(column.as_boolean()),
             _ => None,
         };
         let answers = (0..names.len()).map(|row| {

@@ -24,13 +24,13 @@ const TYPE: &str = "data_type";
 
 /// DataFusion's, of a query's catalogues.
 #[derive(Debug)]
-pub(super) struct Information {
+pub(super) struct InformationSchema {
     /// Of which one holds this.
     catalogs: Weak<dyn CatalogProviderList>,
     functions: HashMap<String, Arc<TableFunction>>,
 }
 
-impl Information {
+impl InformationSchema {
     /// For queries that begin in this state.
     pub(super) fn of(state: &SessionState) -> Self {
         Self { catalogs: Arc::downgrade(state.catalog_list()), functions: state.table_functions().clone() }
@@ -43,7 +43,7 @@ impl Information {
 }
 
 #[async_trait]
-impl SchemaProvider for Information {
+impl SchemaProvider for InformationSchema {
     fn table_names(&self) -> Vec<String> {
         self.inner().map(|inner| inner.table_names()).unwrap_or_default()
     }

@@ -1,4 +1,4 @@
-//! Postgres' wire protocol, for psql, drivers and tools that speak it: reading only, a session a connection.
+//! Postgres' wire protocol, for psql, drivers and tools that speak it: reading only, one session per connection.
 
 mod catalog;
 mod command;
@@ -30,25 +30,25 @@ use tokio::io::Interest;
 use tokio::net::{UnixListener, UnixStream};
 
 use crate::Error;
-use crate::service::Service;
-use connection::Connection;
-use startup::Startup;
+use crate::service::QueryService;
+use connection::PostgresConnection;
+use startup::LoginHandler;
 
 /// Answers Postgres' protocol on an engine's socket.
-pub(crate) async fn serve(service: Service, listener: UnixListener) -> Result<(), Error> {
-    let shared = Arc::new(connection::Shared::new(service)?);
+pub(crate) async fn serve(service: QueryService, listener: UnixListener) -> Result<(), Error> {
+    let shared = Arc::new(connection::PostgresState::new(service)?);
     loop {
         let (socket, _) = listener.accept().await.map_err(Error::System)?;
-        tokio::spawn(attend(socket, Arc::new(Connection::new(shared.clone()))));
+        tokio::spawn(attend(socket, Arc::new(PostgresConnection::new(shared.clone()))));
     }
 }
 
-// What a connection asks ends with it: dropping the handlers drops the answers that they send.
-async fn attend(socket: UnixStream, connection: Arc<Connection>) {
+// A connection's queries end with it: dropping the handlers drops the answers that they send.
+async fn attend(socket: UnixStream, connection: Arc<PostgresConnection>) {
     let Ok((socket, watched)) = twice(socket) else { return };
     tokio::select! {
         // What breaks the protocol is the client's own affair.
-        _ = process_socket_unix(socket, Handlers(connection.clone())) => {}
+        _ = process_socket_unix(socket, ProtocolHandlers(connection.clone())) => {}
         () = gone(&watched, &connection) => {}
     }
 }
@@ -59,9 +59,9 @@ fn twice(socket: UnixStream) -> io::Result<(UnixStream, UnixStream)> {
     Ok((UnixStream::from_std(socket)?, UnixStream::from_std(watched)?))
 }
 
-// While a query runs nobody reads from the connection, so that its end must be watched for. Nothing runs before a
-// login, and who sends a CancelRequest hangs up behind it: it is read all the same.
-async fn gone(socket: &UnixStream, connection: &Connection) {
+// While a query runs, the connection is not read, so that its end must be watched for. Nothing runs before a login, and
+// a client that sends a CancelRequest hangs up behind it: it is read all the same.
+async fn gone(socket: &UnixStream, connection: &PostgresConnection) {
     connection.logged_in().await;
     while let Ok(ready) = socket.ready(Interest::READABLE).await
         && !ready.is_read_closed()
@@ -71,30 +71,30 @@ async fn gone(socket: &UnixStream, connection: &Connection) {
     }
 }
 
-struct Handlers(Arc<Connection>);
+struct ProtocolHandlers(Arc<PostgresConnection>);
 
-impl PgWireServerHandlers for Handlers {
+impl PgWireServerHandlers for ProtocolHandlers {
     fn simple_query_handler(&self) -> Arc<impl SimpleQueryHandler> {
-        Arc::new(simple::Simple(self.0.clone()))
+        Arc::new(simple::SimpleQueries(self.0.clone()))
     }
 
     fn extended_query_handler(&self) -> Arc<impl ExtendedQueryHandler> {
-        Arc::new(extended::Extended::new(self.0.clone()))
+        Arc::new(extended::ExtendedQueries::new(self.0.clone()))
     }
 
     fn startup_handler(&self) -> Arc<impl StartupHandler> {
-        Arc::new(Startup(self.0.clone()))
+        Arc::new(LoginHandler(self.0.clone()))
     }
 
     fn cancel_handler(&self) -> Arc<impl CancelHandler> {
-        Arc::new(Canceller(self.0.clone()))
+        Arc::new(CancelRequestHandler(self.0.clone()))
     }
 }
 
-struct Canceller(Arc<Connection>);
+struct CancelRequestHandler(Arc<PostgresConnection>);
 
 #[async_trait]
-impl CancelHandler for Canceller {
+impl CancelHandler for CancelRequestHandler {
     async fn on_cancel_request(&self, request: CancelRequest) {
         self.0.shared().cancel(request.pid, &request.secret_key);
     }

@@ -1,4 +1,4 @@
-//! What clients' own questions to the catalogue need beyond what `datafusion-pg-catalog` adapts.
+//! Adaptations of clients' catalogue queries beyond those of `datafusion-pg-catalog`.
 
 use std::ops::ControlFlow;
 
@@ -17,7 +17,7 @@ const FUNCTIONS: [&str; 6] = ["typinput", "typoutput", "typreceive", "typsend", 
 const AGGREGATES: [&str; 8] = ["array_agg", "avg", "bool_or", "count", "max", "min", "string_agg", "sum"];
 /// Tables about what no column of the lake has.
 const NOTHING: [&str; 3] = ["pg_attrdef", "pg_collation", "pg_sequence"];
-/// How such a column says that there is none.
+/// The value of such a column that names no function.
 const NONE: &str = "-";
 
 /// Tables of `pg_catalog` that are found without its name, beside those that `datafusion-pg-catalog` knows.
@@ -27,13 +27,13 @@ const PG_CATALOG: &str = "pg_catalog";
 /// Adapts a statement; `types` are those that its client gives its placeholders.
 pub(super) fn rewrite(mut statement: Statement, types: &[Option<Type>]) -> Statement {
     // It never breaks off.
-    let _ = statement.visit(&mut Adapt(types));
+    let _ = statement.visit(&mut StatementAdapter(types));
     statement
 }
 
-struct Adapt<'a>(&'a [Option<Type>]);
+struct StatementAdapter<'a>(&'a [Option<Type>]);
 
-impl Adapt<'_> {
+impl StatementAdapter<'_> {
     // `x = ANY($1)` came here as array_contains($1, x). A client that tells no type sends the array as a text.
     fn any_of_text(&self, expr: &mut Expr) -> Option<()> {
         let Expr::Function(Function { name, args: FunctionArguments::List(args), .. }) = expr else { return None };
@@ -53,7 +53,7 @@ impl Adapt<'_> {
     }
 }
 
-impl VisitorMut for Adapt<'_> {
+impl VisitorMut for StatementAdapter<'_> {
     type Break = ();
 
     fn pre_visit_relation(&mut self, relation: &mut ObjectName) -> ControlFlow<()> {
@@ -91,7 +91,7 @@ impl VisitorMut for Adapt<'_> {
     }
 }
 
-// DuckDB reads a table by ranges of places; where `pg_class` says that it has one page, there is one range, of all rows.
+// DuckDB reads a table by ranges of `ctid`; if `pg_class` reports one page, there is one range, of all rows.
 fn is_whole_table(expr: &Expr) -> bool {
     let is_place = |expr: &Expr, place: &str| {
         matches!(expr, Expr::Cast { expr, data_type, .. }
@@ -160,7 +160,7 @@ fn call(name: &str, argument: Expr, like: &Function) -> Expr {
     Expr::Function(Function { name: ObjectName::from(vec![Ident::new(name)]), args, ..like.clone() })
 }
 
-// What a column's default, sequence or collation is: none has one of its own.
+// Queries for a column's default, sequence or collation: no column has one.
 fn asks_for_nothing(query: &Query) -> bool {
     let SetExpr::Select(select) = query.body.as_ref() else { return false };
     let counts = |item: &SelectItem| {

@@ -15,16 +15,16 @@ use pgwire::error::{PgWireError, PgWireResult};
 use pgwire::messages::data::DataRow;
 
 use super::sqlstate::error;
-use crate::fault::Fault;
-use crate::running::{Encode, Running};
+use crate::fault::RequestFault;
+use crate::running::{AnswerEncoder, RunningQuery};
 
 /// Columns as fields.
-pub(super) fn fields(schema: &Schema, format: &Format) -> Result<Arc<Vec<FieldInfo>>, Fault> {
+pub(super) fn fields(schema: &Schema, format: &Format) -> Result<Arc<Vec<FieldInfo>>, RequestFault> {
     let count = schema.fields().len();
     if let Format::Individual(codes) = format
         && codes.len() != count
     {
-        return Err(Fault::request(format!("{} formats for {count} columns", codes.len())));
+        return Err(RequestFault::request(format!("{} formats for {count} columns", codes.len())));
     }
     let fields = arrow_schema_to_pg_fields(schema, format, None).map_err(|e| encoding(&e))?;
     // A column of nothing but NULL is a text to Postgres' clients.
@@ -35,45 +35,45 @@ pub(super) fn fields(schema: &Schema, format: &Format) -> Result<Arc<Vec<FieldIn
     Ok(Arc::new(fields.into_iter().map(settled).collect()))
 }
 
-/// What cannot be sent to a Postgres client.
-pub(super) fn encoding(error: &PgWireError) -> Fault {
+/// The fault for a value that cannot be sent to a Postgres client.
+pub(super) fn encoding(error: &PgWireError) -> RequestFault {
     let message = match error {
         PgWireError::UserError(info) => info.message.clone(),
         other => other.to_string(),
     };
-    Fault::Query(QueryError::Format { format: "a row of Postgres", message })
+    RequestFault::Query(QueryError::Format { format: "a row of Postgres", message })
 }
 
 /// Encodes rows.
-pub(super) struct Rows(Arc<Vec<FieldInfo>>);
+pub(super) struct RowEncoder(Arc<Vec<FieldInfo>>);
 
-impl Rows {
+impl RowEncoder {
     /// For an answer of these columns.
-    pub(super) fn new(schema: &SchemaRef, format: &Format) -> Result<Self, Fault> {
+    pub(super) fn new(schema: &SchemaRef, format: &Format) -> Result<Self, RequestFault> {
         Ok(Self(fields(schema, format)?))
     }
 
     /// The rows of a batch.
-    pub(super) fn encode(&self, batch: RecordBatch) -> Result<Vec<DataRow>, Fault> {
+    pub(super) fn encode(&self, batch: RecordBatch) -> Result<Vec<DataRow>, RequestFault> {
         let rows: PgWireResult<Vec<_>> = encode_recordbatch(self.0.clone(), batch).collect();
         rows.map_err(|e| encoding(&e))
     }
 }
 
-impl Encode for Rows {
+impl AnswerEncoder for RowEncoder {
     type Item = Vec<DataRow>;
 
-    fn batch(&mut self, batch: RecordBatch) -> Result<Vec<Vec<DataRow>>, Fault> {
+    fn batch(&mut self, batch: RecordBatch) -> Result<Vec<Vec<DataRow>>, RequestFault> {
         Ok(vec![self.encode(batch)?])
     }
 
-    fn end(self) -> Result<Vec<Vec<DataRow>>, Fault> {
+    fn end(self) -> Result<Vec<Vec<DataRow>>, RequestFault> {
         Ok(Vec::new())
     }
 }
 
 /// The rows of a run, as they come.
-pub(super) fn response(running: Running<Vec<DataRow>>, format: &Format) -> Result<QueryResponse, Fault> {
+pub(super) fn response(running: RunningQuery<Vec<DataRow>>, format: &Format) -> Result<QueryResponse, RequestFault> {
     let fields = fields(&running.schema, format)?;
     let parts = stream::try_unfold(running, |mut running| async move {
         let part = running.next().await.map_err(|fault| error(&fault))?;
@@ -96,7 +96,7 @@ pub(super) fn text_fields(names: &[&str]) -> Arc<Vec<FieldInfo>> {
 }
 
 /// Rows of text.
-pub(super) fn texts(names: &[&str], rows: &[Vec<String>]) -> Result<QueryResponse, Fault> {
+pub(super) fn texts(names: &[&str], rows: &[Vec<String>]) -> Result<QueryResponse, RequestFault> {
     let fields = text_fields(names);
     let mut encoder = DataRowEncoder::new(fields.clone());
     let mut encoded = Vec::with_capacity(rows.len());

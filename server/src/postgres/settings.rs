@@ -5,16 +5,16 @@ use std::collections::BTreeMap;
 use std::sync::{Mutex, PoisonError};
 use std::time::Duration;
 
-use crate::fault::Fault;
+use crate::fault::RequestFault;
 
-/// What the server says it is; the first word is what clients compare.
+/// The server's version as shown to clients, which compare the first word.
 pub(super) const VERSION: &str = concat!("16.6 (echolake ", env!("CARGO_PKG_VERSION"), ")");
 /// Characters of a setting.
 const LONGEST: usize = 1000;
 
-/// What may be done with a setting.
+/// The allowed changes of a setting.
 #[derive(Debug, Clone, Copy)]
-enum May {
+enum AllowedChange {
     /// Nothing: it is a fact.
     Read,
     /// Set it to anything: it changes nothing here.
@@ -29,79 +29,79 @@ const ON: &[&str] = &["on", "true", "yes", "1"];
 const ISOLATION: &[&str] = &["serializable", "repeatable read", "read committed", "read uncommitted"];
 
 /// Each setting in lower case, as it is shown, what it is at first, and what may be done.
-const KNOWN: [(&str, &str, May); 37] = [
-    ("application_name", "", May::Set),
-    ("backslash_quote", "safe_encoding", May::Read),
-    ("bytea_output", "hex", May::Keep(&["hex"])),
-    ("check_function_bodies", "on", May::Set),
-    ("client_encoding", "UTF8", May::Keep(&["utf8", "utf-8", "unicode"])),
-    ("client_min_messages", "notice", May::Set),
-    ("datestyle", "ISO, YMD", May::Set),
-    ("default_tablespace", "", May::Set),
-    ("default_transaction_isolation", "repeatable read", May::Keep(ISOLATION)),
-    ("default_transaction_read_only", "on", May::Keep(ON)),
-    ("escape_string_warning", "on", May::Set),
-    ("extra_float_digits", "1", May::Set),
-    ("geqo", "off", May::Set),
-    ("idle_in_transaction_session_timeout", "0", May::Set),
-    ("in_hot_standby", "off", May::Read),
-    ("integer_datetimes", "on", May::Read),
-    ("intervalstyle", "postgres", May::Keep(&["postgres"])),
-    ("is_superuser", "off", May::Read),
-    ("jit", "off", May::Set),
-    ("lc_collate", "C", May::Read),
-    ("lc_ctype", "C", May::Read),
-    ("lock_timeout", "0", May::Set),
-    ("max_identifier_length", "63", May::Read),
-    ("max_index_keys", "32", May::Read),
-    ("row_security", "on", May::Set),
-    ("search_path", "public", May::Set),
-    ("server_encoding", "UTF8", May::Read),
-    ("server_version", VERSION, May::Read),
-    ("server_version_num", "160006", May::Read),
-    ("session_authorization", "", May::Read),
-    ("standard_conforming_strings", "on", May::Keep(ON)),
-    ("statement_timeout", "0", May::Time),
-    ("synchronize_seqscans", "on", May::Set),
-    ("timezone", "UTC", May::Set),
-    ("transaction_isolation", "repeatable read", May::Keep(ISOLATION)),
-    ("transaction_read_only", "on", May::Keep(ON)),
-    ("xmloption", "content", May::Set),
+const KNOWN: [(&str, &str, AllowedChange); 37] = [
+    ("application_name", "", AllowedChange::Set),
+    ("backslash_quote", "safe_encoding", AllowedChange::Read),
+    ("bytea_output", "hex", AllowedChange::Keep(&["hex"])),
+    ("check_function_bodies", "on", AllowedChange::Set),
+    ("client_encoding", "UTF8", AllowedChange::Keep(&["utf8", "utf-8", "unicode"])),
+    ("client_min_messages", "notice", AllowedChange::Set),
+    ("datestyle", "ISO, YMD", AllowedChange::Set),
+    ("default_tablespace", "", AllowedChange::Set),
+    ("default_transaction_isolation", "repeatable read", AllowedChange::Keep(ISOLATION)),
+    ("default_transaction_read_only", "on", AllowedChange::Keep(ON)),
+    ("escape_string_warning", "on", AllowedChange::Set),
+    ("extra_float_digits", "1", AllowedChange::Set),
+    ("geqo", "off", AllowedChange::Set),
+    ("idle_in_transaction_session_timeout", "0", AllowedChange::Set),
+    ("in_hot_standby", "off", AllowedChange::Read),
+    ("integer_datetimes", "on", AllowedChange::Read),
+    ("intervalstyle", "postgres", AllowedChange::Keep(&["postgres"])),
+    ("is_superuser", "off", AllowedChange::Read),
+    ("jit", "off", AllowedChange::Set),
+    ("lc_collate", "C", AllowedChange::Read),
+    ("lc_ctype", "C", AllowedChange::Read),
+    ("lock_timeout", "0", AllowedChange::Set),
+    ("max_identifier_length", "63", AllowedChange::Read),
+    ("max_index_keys", "32", AllowedChange::Read),
+    ("row_security", "on", AllowedChange::Set),
+    ("search_path", "public", AllowedChange::Set),
+    ("server_encoding", "UTF8", AllowedChange::Read),
+    ("server_version", VERSION, AllowedChange::Read),
+    ("server_version_num", "160006", AllowedChange::Read),
+    ("session_authorization", "", AllowedChange::Read),
+    ("standard_conforming_strings", "on", AllowedChange::Keep(ON)),
+    ("statement_timeout", "0", AllowedChange::Time),
+    ("synchronize_seqscans", "on", AllowedChange::Set),
+    ("timezone", "UTC", AllowedChange::Set),
+    ("transaction_isolation", "repeatable read", AllowedChange::Keep(ISOLATION)),
+    ("transaction_read_only", "on", AllowedChange::Keep(ON)),
+    ("xmloption", "content", AllowedChange::Set),
 ];
 
 /// The settings of a session.
 #[derive(Debug, Default)]
-pub(super) struct Settings(Mutex<BTreeMap<&'static str, String>>);
+pub(super) struct SessionSettings(Mutex<BTreeMap<&'static str, String>>);
 
-impl Settings {
+impl SessionSettings {
     /// Sets one.
-    pub(super) fn set(&self, name: &str, value: &str) -> Result<(), Fault> {
+    pub(super) fn set(&self, name: &str, value: &str) -> Result<(), RequestFault> {
         let (name, _, may) = known(name)?;
         let value = value.trim();
         let allowed = match may {
-            May::Read => false,
-            May::Set => value.chars().count() <= LONGEST,
-            May::Keep(values) => values.iter().any(|v| value.eq_ignore_ascii_case(v)),
-            May::Time => time(value).is_some(),
+            AllowedChange::Read => false,
+            AllowedChange::Set => value.chars().count() <= LONGEST,
+            AllowedChange::Keep(values) => values.iter().any(|v| value.eq_ignore_ascii_case(v)),
+            AllowedChange::Time => time(value).is_some(),
         };
         if !allowed {
-            return Err(Fault::request(format!("`{name}` cannot be set to `{value}` here")));
+            return Err(RequestFault::request(format!("`{name}` cannot be set to `{value}` here")));
         }
         // What is kept to stays as it is shown; times and words are shown as they were set.
-        if matches!(may, May::Set | May::Time) {
+        if matches!(may, AllowedChange::Set | AllowedChange::Time) {
             self.0.lock().unwrap_or_else(PoisonError::into_inner).insert(name, value.to_owned());
         }
         Ok(())
     }
 
-    /// Who logged in, by their own word.
+    /// Stores the user name, as the client gave it at login.
     pub(super) fn set_user(&self, user: &str) {
         let user = user.chars().take(LONGEST).collect();
         self.0.lock().unwrap_or_else(PoisonError::into_inner).insert("session_authorization", user);
     }
 
     /// One of them.
-    pub(super) fn get(&self, name: &str) -> Result<String, Fault> {
+    pub(super) fn get(&self, name: &str) -> Result<String, RequestFault> {
         let (name, value, _) = known(name)?;
         let set = self.0.lock().unwrap_or_else(PoisonError::into_inner).get(name).cloned();
         Ok(set.unwrap_or_else(|| value.to_owned()))
@@ -113,7 +113,7 @@ impl Settings {
     }
 
     /// One as it was at first, or all of them.
-    pub(super) fn reset(&self, name: Option<&str>) -> Result<(), Fault> {
+    pub(super) fn reset(&self, name: Option<&str>) -> Result<(), RequestFault> {
         let name = name.map(known).transpose()?.map(|(name, ..)| name);
         let keeps = |known: &&str| *known == "session_authorization" || name.is_some_and(|n| n != *known);
         self.0.lock().unwrap_or_else(PoisonError::into_inner).retain(|known, _| keeps(known));
@@ -126,10 +126,10 @@ impl Settings {
     }
 }
 
-fn known(name: &str) -> Result<(&'static str, &'static str, May), Fault> {
+fn known(name: &str) -> Result<(&'static str, &'static str, AllowedChange), RequestFault> {
     let lower = name.to_ascii_lowercase();
     let found = KNOWN.iter().find(|(known, ..)| *known == lower);
-    found.copied().ok_or_else(|| Fault::NotFound {
+    found.copied().ok_or_else(|| RequestFault::NotFound {
         what: format!("the setting `{}`", name.chars().take(LONGEST).collect::<String>()),
         hint: "SHOW ALL lists them",
     })
@@ -158,7 +158,7 @@ mod tests {
 
     #[test]
     fn what_changes_nothing_may_be_set_and_nothing_else() {
-        let settings = Settings::default();
+        let settings = SessionSettings::default();
         for (name, value) in [
             ("application_name", "psql"),
             ("DateStyle", "ISO"),
@@ -192,7 +192,7 @@ mod tests {
 
     #[test]
     fn times_have_units() {
-        let settings = Settings::default();
+        let settings = SessionSettings::default();
         assert_eq!(settings.statement_timeout(), None);
         for (value, millis) in [("250", 250), ("500ms", 500), ("2s", 2_000), (" 1 min", 60_000)] {
             settings.set("statement_timeout", value).expect(value);

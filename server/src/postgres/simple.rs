@@ -1,4 +1,4 @@
-//! The simple way to ask: a text of one or more statements, done one after the other.
+//! The simple query protocol: a text of one or more statements, executed one after the other.
 
 use std::fmt::Debug;
 use std::sync::Arc;
@@ -16,13 +16,13 @@ use pgwire::messages::PgWireBackendMessage;
 use pgwire::messages::response::EmptyQueryResponse;
 use pgwire::messages::simplequery::Query;
 
-use super::command::{Reply, act};
-use super::connection::Connection;
+use super::command::{StatementReply, act};
+use super::connection::PostgresConnection;
 use super::copy;
 use super::sqlstate::error;
 
 /// Answers simple queries.
-pub(super) struct Simple(pub(super) Arc<Connection>);
+pub(super) struct SimpleQueries(pub(super) Arc<PostgresConnection>);
 
 /// No values.
 pub(super) fn none() -> ParamValues {
@@ -30,7 +30,7 @@ pub(super) fn none() -> ParamValues {
 }
 
 #[async_trait]
-impl SimpleQueryHandler for Simple {
+impl SimpleQueryHandler for SimpleQueries {
     // The library's own plans and begins all statements of a text before the first is answered.
     async fn on_query<C>(&self, client: &mut C, query: Query) -> PgWireResult<()>
     where
@@ -50,9 +50,9 @@ impl SimpleQueryHandler for Simple {
         }
         for statement in &statements {
             match act(&self.0, client, &run, statement, none(), &Format::UnifiedText).await? {
-                Reply::Rows(rows) => send_query_response(client, rows, true).await?,
-                Reply::Copy(form, running) => copy::send(client, &form, running).await?,
-                Reply::Done(tag) => client.feed(PgWireBackendMessage::CommandComplete(tag.into())).await?,
+                StatementReply::Rows(rows) => send_query_response(client, rows, true).await?,
+                StatementReply::Copy(form, running) => copy::send(client, &form, running).await?,
+                StatementReply::Done(tag) => client.feed(PgWireBackendMessage::CommandComplete(tag.into())).await?,
             }
         }
         client.set_state(PgWireConnectionState::ReadyForQuery);

@@ -3,19 +3,19 @@
 use echolake_query::Error as QueryError;
 use pgwire::error::{ErrorInfo, PgWireError};
 
-use crate::fault::{Code, Fault};
+use crate::fault::{FaultCode, RequestFault};
 
-/// A failure after which the connection goes on.
-pub(crate) fn error(fault: &Fault) -> PgWireError {
+/// A failure that leaves the connection open.
+pub(crate) fn error(fault: &RequestFault) -> PgWireError {
     info("ERROR", fault)
 }
 
 /// A failure that ends the connection.
-pub(crate) fn fatal(fault: &Fault) -> PgWireError {
+pub(crate) fn fatal(fault: &RequestFault) -> PgWireError {
     info("FATAL", fault)
 }
 
-fn info(severity: &str, fault: &Fault) -> PgWireError {
+fn info(severity: &str, fault: &RequestFault) -> PgWireError {
     let (message, place, hint) = parts(fault);
     let mut info = ErrorInfo::new(severity.to_owned(), state(fault).to_owned(), message);
     info.detail = place;
@@ -23,8 +23,8 @@ fn info(severity: &str, fault: &Fault) -> PgWireError {
     PgWireError::UserError(Box::new(info))
 }
 
-fn parts(fault: &Fault) -> (String, Option<String>, Option<String>) {
-    if let Fault::Query(QueryError::Query { message, place, hint }) = fault {
+fn parts(fault: &RequestFault) -> (String, Option<String>, Option<String>) {
+    if let RequestFault::Query(QueryError::Query { message, place, hint }) = fault {
         return (message.clone(), place.clone(), hint.clone());
     }
     let text = fault.to_string();
@@ -35,29 +35,29 @@ fn parts(fault: &Fault) -> (String, Option<String>, Option<String>) {
 }
 
 // Appendix A of Postgres' manual.
-fn state(fault: &Fault) -> &'static str {
+fn state(fault: &RequestFault) -> &'static str {
     match fault {
-        Fault::Query(QueryError::Query { message, .. }) if message.starts_with("no table ") => "42P01",
-        Fault::Query(QueryError::Query { message, .. }) if message.starts_with("no column ") => "42703",
-        Fault::TooMany { what: "connections", .. } => "53300",
-        Fault::NotFound { what, .. } if what.starts_with("cursor ") => "34000",
+        RequestFault::Query(QueryError::Query { message, .. }) if message.starts_with("no table ") => "42P01",
+        RequestFault::Query(QueryError::Query { message, .. }) if message.starts_with("no column ") => "42703",
+        RequestFault::TooMany { what: "connections", .. } => "53300",
+        RequestFault::NotFound { what, .. } if what.starts_with("cursor ") => "34000",
         _ => match fault.code() {
-            Code::Query => "42601",
-            Code::ReadOnly => "25006",
-            Code::Execution => "22000",
-            Code::Format => "0A000",
-            Code::Lake | Code::Changed => "58030",
-            Code::Request | Code::Method | Code::Range => "22023",
-            Code::Unsupported => "0A000",
-            Code::NotFound | Code::Gone | Code::NoData => "42704",
-            Code::MemoryLimit => "53200",
-            Code::TooLarge | Code::RowLimit => "54000",
-            Code::TooMany => "53300",
-            Code::Unauthenticated => "28P01",
-            Code::Forbidden | Code::Foreign => "42501",
-            Code::Cancelled | Code::TimeLimit => "57014",
-            Code::EngineEnded => "58000",
-            Code::Internal => "XX000",
+            FaultCode::Query => "42601",
+            FaultCode::ReadOnly => "25006",
+            FaultCode::Execution => "22000",
+            FaultCode::Format => "0A000",
+            FaultCode::Lake | FaultCode::Changed => "58030",
+            FaultCode::Request | FaultCode::Method | FaultCode::Range => "22023",
+            FaultCode::Unsupported => "0A000",
+            FaultCode::NotFound | FaultCode::Gone | FaultCode::NoData => "42704",
+            FaultCode::MemoryLimit => "53200",
+            FaultCode::TooLarge | FaultCode::RowLimit => "54000",
+            FaultCode::TooMany => "53300",
+            FaultCode::Unauthenticated => "28P01",
+            FaultCode::Forbidden | FaultCode::Foreign => "42501",
+            FaultCode::Cancelled | FaultCode::TimeLimit => "57014",
+            FaultCode::EngineEnded => "58000",
+            FaultCode::Internal => "XX000",
         },
     }
 }

@@ -13,17 +13,17 @@ use pgwire::api::{ClientInfo, METADATA_USER, PgWireConnectionState};
 use pgwire::error::{PgWireError, PgWireResult};
 use pgwire::messages::{PgWireBackendMessage, PgWireFrontendMessage, ProtocolVersion};
 
-use super::connection::Connection;
+use super::connection::PostgresConnection;
 use super::settings::VERSION;
 use super::sqlstate::fatal;
-use crate::fault::Fault;
-use crate::tokens::Scope;
+use crate::fault::RequestFault;
+use crate::tokens::TokenScope;
 
 /// Logs in.
-pub(super) struct Startup(pub(super) Arc<Connection>);
+pub(super) struct LoginHandler(pub(super) Arc<PostgresConnection>);
 
 #[async_trait]
-impl StartupHandler for Startup {
+impl StartupHandler for LoginHandler {
     async fn on_startup<C>(&self, client: &mut C, message: PgWireFrontendMessage) -> PgWireResult<()>
     where
         C: ClientInfo + Sink<PgWireBackendMessage> + Unpin + Send + Sync,
@@ -38,12 +38,12 @@ impl StartupHandler for Startup {
                 client.set_state(PgWireConnectionState::AuthenticationInProgress);
                 self.let_in(client).await
             }
-            _ => Err(fatal(&Fault::request("the protocol's startup is expected"))),
+            _ => Err(fatal(&RequestFault::request("the protocol's startup is expected"))),
         }
     }
 }
 
-impl Startup {
+impl LoginHandler {
     async fn let_in<C>(&self, client: &mut C) -> PgWireResult<()>
     where
         C: ClientInfo + Sink<PgWireBackendMessage> + Unpin + Send + Sync,
@@ -51,7 +51,7 @@ impl Startup {
         PgWireError: From<<C as Sink<PgWireBackendMessage>>::Error>,
     {
         let service = &self.0.shared().service;
-        let who = service.client(Scope::Sql).map_err(|fault| fatal(&fault))?;
+        let who = service.client(TokenScope::Sql).map_err(|fault| fatal(&fault))?;
         let wide = client.protocol_version() != ProtocolVersion::PROTOCOL3_0;
         let (pid, key) = self.0.log_in(&who, wide).map_err(|fault| fatal(&fault))?;
         client.set_pid_and_secret_key(pid, key);
@@ -64,15 +64,15 @@ impl Startup {
     }
 
     // `options` may carry settings, as in `-c statement_timeout=5s`.
-    fn begin_with(&self, given: &std::collections::HashMap<String, String>) -> Result<(), Fault> {
+    fn begin_with(&self, given: &std::collections::HashMap<String, String>) -> Result<(), RequestFault> {
         let settings = &self.0.settings;
         if given.get("replication").is_some_and(|v| v != "false" && v != "off" && v != "0") {
-            return Err(Fault::unsupported("replication"));
+            return Err(RequestFault::unsupported("replication"));
         }
         if let Some(user) = given.get(METADATA_USER) {
             settings.set_user(user);
         }
-        // What a driver always sends counts where it is known, and is no reason to turn it away.
+        // A setting that a driver always sends is applied if it is known, and is no reason to refuse the client.
         for (name, value) in given {
             let _ = settings.set(name, value);
         }
@@ -85,7 +85,7 @@ impl Startup {
             };
             let (name, value) = pair
                 .and_then(|p| p.split_once('='))
-                .ok_or_else(|| Fault::request(format!("`{word}` is no option; hint: -c name=value")))?;
+                .ok_or_else(|| RequestFault::request(format!("`{word}` is no option; hint: -c name=value")))?;
             settings.set(name, value)?;
         }
         Ok(())

@@ -16,21 +16,21 @@ use pgwire::api::Type;
 
 use super::copy::{self, CopyAs};
 use super::rewrite;
-use crate::fault::Fault;
+use crate::fault::RequestFault;
 
 /// Statements of one text at most.
 const TOGETHER: usize = 100;
 
 /// A planned query.
-pub(super) struct Planned {
+pub(super) struct PlannedQuery {
     pub(super) prepared: Arc<Prepared>,
     pub(super) at: Instant,
     statement: Opaque<Parsed>,
     sql: Arc<str>,
 }
 
-impl Planned {
-    async fn new(session: &Session, sql: &Arc<str>, statement: Parsed) -> Result<Arc<Self>, Fault> {
+impl PlannedQuery {
+    async fn new(session: &Session, sql: &Arc<str>, statement: Parsed) -> Result<Arc<Self>, RequestFault> {
         let prepared = Arc::new(session.prepare_statement(sql, statement.clone()).await?);
         Ok(Arc::new(Self { prepared, at: Instant::now(), statement: Opaque::new(statement), sql: sql.clone() }))
     }
@@ -41,14 +41,14 @@ impl Planned {
     }
 }
 
-/// What a client may ask.
+/// A statement that a client may run.
 #[derive(Clone)]
-pub(super) enum Statement {
-    Query(Arc<Planned>),
-    Copy(Arc<Planned>, CopyAs),
+pub(super) enum ClientStatement {
+    Query(Arc<PlannedQuery>),
+    Copy(Arc<PlannedQuery>, CopyAs),
     Declare {
         name: String,
-        planned: Arc<Planned>,
+        planned: Arc<PlannedQuery>,
         held: bool,
     },
     /// None for all rows that are left.
@@ -70,22 +70,22 @@ pub(super) enum Statement {
     Deallocate(Option<String>),
 }
 
-/// The statements of a text, whose placeholders have these types where their client tells.
+/// Parses the statements of a text, whose placeholders have these types if the client gives them.
 pub(super) fn parse(
     parser: &PostgresCompatibilityParser,
     session: &Session,
     sql: &str,
     types: &[Option<Type>],
-) -> Result<Vec<Parsed>, Fault> {
+) -> Result<Vec<Parsed>, RequestFault> {
     check_statement_bounds(sql, &PostgreSqlDialect {})?;
     let Ok(adapted) = parser.parse(sql) else {
-        // DataFusion's own parser knows more, such as DESCRIBE, and says where an error is.
+        // DataFusion's own parser knows more, such as DESCRIBE, and gives the position of an error.
         return Ok(vec![session.parse(sql)?]);
     };
     if adapted.len() > TOGETHER {
-        return Err(Fault::TooMany { what: "statements in one text", limit: TOGETHER });
+        return Err(RequestFault::TooMany { what: "statements in one text", limit: TOGETHER });
     }
-    // The adapted ones have lost their places; where nothing but places differs, these keep them.
+    // The adapted ones have lost their positions; if nothing but positions differs, these keep them.
     let placed = Parser::parse_sql(&PostgreSqlDialect {}, sql).unwrap_or_default();
     let placed: Vec<_> = placed.into_iter().map(|s| parser.rewrite(s)).collect();
     let statements = if placed == adapted { placed } else { adapted };
@@ -93,39 +93,39 @@ pub(super) fn parse(
 }
 
 /// Makes of a statement what can be done.
-pub(super) async fn plan(session: &Session, sql: &Arc<str>, parsed: Parsed) -> Result<Statement, Fault> {
-    let query = async |statement: Parsed| Planned::new(session, sql, statement).await;
+pub(super) async fn plan(session: &Session, sql: &Arc<str>, parsed: Parsed) -> Result<ClientStatement, RequestFault> {
+    let query = async |statement: Parsed| PlannedQuery::new(session, sql, statement).await;
     let statement = match parsed {
         Parsed::Statement(statement) => *statement,
-        other => return Ok(Statement::Query(query(other).await?)),
+        other => return Ok(ClientStatement::Query(query(other).await?)),
     };
     Ok(match statement {
-        Sql::StartTransaction { statements, .. } if statements.is_empty() => Statement::Begin,
-        Sql::Commit { .. } => Statement::Commit,
-        Sql::Rollback { savepoint: None, .. } => Statement::Rollback,
-        Sql::Rollback { .. } => Statement::Savepoint("ROLLBACK"),
-        Sql::Savepoint { .. } => Statement::Savepoint("SAVEPOINT"),
-        Sql::ReleaseSavepoint { .. } => Statement::Savepoint("RELEASE"),
-        Sql::Set(set) => Statement::Set(settings(set)?),
-        Sql::Reset(reset) => Statement::Reset(match reset.reset {
+        Sql::StartTransaction { statements, .. } if statements.is_empty() => ClientStatement::Begin,
+        Sql::Commit { .. } => ClientStatement::Commit,
+        Sql::Rollback { savepoint: None, .. } => ClientStatement::Rollback,
+        Sql::Rollback { .. } => ClientStatement::Savepoint("ROLLBACK"),
+        Sql::Savepoint { .. } => ClientStatement::Savepoint("SAVEPOINT"),
+        Sql::ReleaseSavepoint { .. } => ClientStatement::Savepoint("RELEASE"),
+        Sql::Set(set) => ClientStatement::Set(settings(set)?),
+        Sql::Reset(reset) => ClientStatement::Reset(match reset.reset {
             Reset::ALL => None,
             Reset::ConfigurationParameter(name) => Some(name.to_string()),
         }),
-        Sql::ShowVariable { variable } => Statement::Show(shown(&variable)),
-        Sql::Discard { object_type } => Statement::Discard(object_type),
-        Sql::Deallocate { name, .. } => Statement::Deallocate(unless_all(&name)),
+        Sql::ShowVariable { variable } => ClientStatement::Show(shown(&variable)),
+        Sql::Discard { object_type } => ClientStatement::Discard(object_type),
+        Sql::Deallocate { name, .. } => ClientStatement::Deallocate(unless_all(&name)),
         Sql::Declare { stmts } => {
             let (name, held, asked) = declared(stmts)?;
-            Statement::Declare { name, held, planned: query(asked).await? }
+            ClientStatement::Declare { name, held, planned: query(asked).await? }
         }
-        Sql::Fetch { name, direction, .. } => Statement::Fetch { name: name.value, rows: forward(&direction)? },
-        Sql::Close { cursor: CloseCursor::All } => Statement::Close(None),
-        Sql::Close { cursor: CloseCursor::Specific { name } } => Statement::Close(Some(name.value)),
+        Sql::Fetch { name, direction, .. } => ClientStatement::Fetch { name: name.value, rows: forward(&direction)? },
+        Sql::Close { cursor: CloseCursor::All } => ClientStatement::Close(None),
+        Sql::Close { cursor: CloseCursor::Specific { name } } => ClientStatement::Close(Some(name.value)),
         Sql::Copy { source, to: true, target, options, legacy_options, .. } => {
             let (asked, form) = copy::read(source, &target, options, legacy_options)?;
-            Statement::Copy(query(Parsed::Statement(Box::new(asked))).await?, form)
+            ClientStatement::Copy(query(Parsed::Statement(Box::new(asked))).await?, form)
         }
-        other => Statement::Query(query(Parsed::Statement(Box::new(other))).await?),
+        other => ClientStatement::Query(query(Parsed::Statement(Box::new(other))).await?),
     })
 }
 
@@ -146,14 +146,14 @@ fn shown(variable: &[Ident]) -> Option<String> {
     }
 }
 
-fn settings(set: Set) -> Result<Vec<(String, String)>, Fault> {
+fn settings(set: Set) -> Result<Vec<(String, String)>, RequestFault> {
     match set {
         Set::SingleAssignment { variable, values, .. } => Ok(vec![(name(&variable), text(&values)?)]),
         Set::SetTimeZone { value, .. } => Ok(vec![("timezone".to_owned(), text(&[value])?)]),
         Set::SetNames { charset_name, .. } => Ok(vec![("client_encoding".to_owned(), charset_name.value)]),
         // All transactions read, and see what is there when each of their queries begins.
         Set::SetTransaction { .. } => Ok(Vec::new()),
-        other => Err(Fault::unsupported(format!("`{other}`"))),
+        other => Err(RequestFault::unsupported(format!("`{other}`"))),
     }
 }
 
@@ -162,19 +162,19 @@ fn name(name: &ObjectName) -> String {
     parts.collect::<Vec<_>>().join(".")
 }
 
-fn text(values: &[Expr]) -> Result<String, Fault> {
+fn text(values: &[Expr]) -> Result<String, RequestFault> {
     let one = |value: &Expr| match value {
         Expr::Value(ValueWithSpan { value: Value::SingleQuotedString(text), .. }) => Ok(text.clone()),
         Expr::Value(value) => Ok(value.to_string()),
         Expr::Identifier(word) => Ok(word.value.clone()),
         Expr::UnaryOp { .. } | Expr::Interval(_) => Ok(value.to_string()),
-        other => Err(Fault::request(format!("`{other}` is no value of a setting"))),
+        other => Err(RequestFault::request(format!("`{other}` is no value of a setting"))),
     };
     Ok(values.iter().map(one).collect::<Result<Vec<_>, _>>()?.join(", "))
 }
 
-fn declared(mut statements: Vec<Declare>) -> Result<(String, bool, Parsed), Fault> {
-    let refused = || Fault::unsupported("DECLARE of anything but one cursor");
+fn declared(mut statements: Vec<Declare>) -> Result<(String, bool, Parsed), RequestFault> {
+    let refused = || RequestFault::unsupported("DECLARE of anything but one cursor");
     let (Some(declare), true) = (statements.pop(), statements.is_empty()) else { return Err(refused()) };
     let (Some(name), Some(query), Some(DeclareType::Cursor)) =
         (declare.names.first(), declare.for_query, declare.declare_type)
@@ -182,20 +182,23 @@ fn declared(mut statements: Vec<Declare>) -> Result<(String, bool, Parsed), Faul
         return Err(refused());
     };
     if declare.scroll == Some(true) {
-        return Err(Fault::unsupported("a cursor that goes back (SCROLL)"));
+        return Err(RequestFault::unsupported("a cursor that goes back (SCROLL)"));
     }
     let statement = Parsed::Statement(Box::new(Sql::Query(query)));
     Ok((name.value.clone(), declare.hold == Some(true), statement))
 }
 
-fn forward(direction: &FetchDirection) -> Result<Option<u64>, Fault> {
+fn forward(direction: &FetchDirection) -> Result<Option<u64>, RequestFault> {
     let count = |limit: &ValueWithSpan| {
-        limit.to_string().parse().map_err(|_| Fault::request(format!("`{limit}` is no number of rows to go forward")))
+        limit
+            .to_string()
+            .parse()
+            .map_err(|_| RequestFault::request(format!("`{limit}` is no number of rows to go forward")))
     };
     match direction {
         FetchDirection::Next | FetchDirection::Forward { limit: None } => Ok(Some(1)),
         FetchDirection::Count { limit } | FetchDirection::Forward { limit: Some(limit) } => count(limit).map(Some),
         FetchDirection::All | FetchDirection::ForwardAll => Ok(None),
-        other => Err(Fault::unsupported(format!("FETCH {other}"))),
+        other => Err(RequestFault::unsupported(format!("FETCH {other}"))),
     }
 }

@@ -1,4 +1,4 @@
-//! The list of what is safe, for whoever must know: a line an attempt, written when the disk has it.
+//! The list of acknowledged attempts, for other programs: one line per attempt, written once it is synced to disk.
 
 use std::fs::{File, OpenOptions};
 use std::io::{self, Write};
@@ -9,26 +9,28 @@ use echolake_acquisition::controller::Event;
 use echolake_schema::messages::Verdict;
 
 /// An open list.
-pub(super) struct Acknowledgements {
-    out: Out,
+pub(super) struct AcknowledgementWriter {
+    out: AcknowledgementTarget,
 }
 
-enum Out {
+enum AcknowledgementTarget {
     Stdout,
     File(File),
 }
 
-impl Acknowledgements {
+impl AcknowledgementWriter {
     /// Opens the list for more lines; `-` is stdout.
     pub(super) fn open(path: &Path) -> anyhow::Result<Self> {
         if path == Path::new("-") {
-            return Ok(Self { out: Out::Stdout });
+            return Ok(Self { out: AcknowledgementTarget::Stdout });
         }
         let file = OpenOptions::new().create(true).append(true).open(path);
-        Ok(Self { out: Out::File(file.with_context(|| format!("cannot write `{}`", path.display()))?) })
+        Ok(Self {
+            out: AcknowledgementTarget::File(file.with_context(|| format!("cannot write `{}`", path.display()))?),
+        })
     }
 
-    /// Writes what became safe.
+    /// Writes the attempts that are safe on the disk.
     pub(super) fn observe(&mut self, event: &Event<'_>) {
         let Event::Safe { verdicts, .. } = event else { return };
         let mut lines = String::new();
@@ -42,10 +44,10 @@ impl Acknowledgements {
             lines.push_str(&format!("{} {} {verdict} {:.1}\n", m.pair_id, m.attempt, m.snr_db));
         }
         let written = match &mut self.out {
-            Out::Stdout => io::stdout().lock().write_all(lines.as_bytes()),
-            Out::File(file) => file.write_all(lines.as_bytes()),
+            AcknowledgementTarget::Stdout => io::stdout().lock().write_all(lines.as_bytes()),
+            AcknowledgementTarget::File(file) => file.write_all(lines.as_bytes()),
         };
-        // The run is worth more than the list; whoever reads it takes what is missing for not measured.
+        // The run is worth more than the list; its readers take a missing attempt for one that was not measured.
         if let Err(error) = written {
             eprintln!("warning: the list of what is safe cannot be written: {error}");
         }

@@ -1,4 +1,4 @@
-//! What is measured, from the arguments: a generated relief with its parameters, or somebody's mesh.
+//! The specimen from the arguments: a generated relief with its parameters, or a mesh file.
 
 use std::path::Path;
 
@@ -10,11 +10,11 @@ use echolake_schema::SurfaceId;
 
 use crate::cli::AcquireArgs;
 
-/// What the arguments name.
+/// Returns the specimen that the arguments name.
 pub(super) fn of(args: &AcquireArgs) -> anyhow::Result<Specimen> {
     let surface = args.surface.as_ref().context("no surface is named; hint: --surface NAME")?;
     Ok(match (&args.mesh, &args.parameters) {
-        // Absolute, so that a run can be gone on with from another folder.
+        // Absolute, so that a run can be resumed from another folder.
         (Some(mesh), _) => {
             let path = std::path::absolute(mesh).unwrap_or_else(|_| mesh.clone());
             Specimen::Mesh(path, args.side.unwrap_or(Side::Front))

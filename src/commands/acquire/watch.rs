@@ -1,4 +1,4 @@
-//! What whoever runs the rig sees and can do: progress, pause, stop.
+//! Progress and control of a run for its operator: pause, stop.
 
 use std::io::{BufRead as _, IsTerminal as _};
 use std::path::PathBuf;
@@ -15,12 +15,12 @@ use echolake_schema::manifest::RunEnd;
 use echolake_schema::messages::Verdict;
 use tokio::signal::unix::{SignalKind, signal};
 
-use crate::progress::{Progress, Task};
+use crate::progress::{CommandProgress, TaskProgress};
 use crate::signals::StopRequest;
 
 /// The progress of one run.
-pub(super) struct Watcher {
-    task: Task,
+pub(super) struct RunWatcher {
+    task: TaskProgress,
     metrics: RunMetrics,
     folder: PathBuf,
     repeats: u64,
@@ -31,10 +31,10 @@ pub(super) struct Watcher {
     cost: Cost,
 }
 
-impl Watcher {
+impl RunWatcher {
     /// Of a run over `planned` pairs, `accepted` of which are measured already.
     pub(super) fn new(
-        progress: &Progress,
+        progress: &CommandProgress,
         surface: &str,
         planned: u64,
         accepted: u64,
@@ -47,7 +47,7 @@ impl Watcher {
         Self { task, metrics, folder, repeats: 0, given_up: 0, snr_db: f64::NAN, pair: String::new(), begun, cost }
     }
 
-    /// Something happened. Only what is on the disk counts as done.
+    /// Records an event. Only measurements that are safe on the disk count as done.
     pub(super) fn observe(&mut self, event: &Event<'_>) {
         self.metrics.observe(event);
         match event {
@@ -73,7 +73,7 @@ impl Watcher {
         }
     }
 
-    /// The run is over, or broke off.
+    /// Reports the end of the run, or that it broke off.
     pub(super) fn done(self, end: Option<RunEnd>) {
         let (busy, whole) = (self.cost.busy.as_secs_f64(), self.begun.elapsed().as_secs_f64());
         self.task.say(&format!(
@@ -97,7 +97,7 @@ impl Watcher {
 }
 
 /// Lets signals and the terminal control a run from now on: Ctrl-C and SIGTERM stop it after the current pair, a second
-/// one at once; SIGUSR1, or `p` and Enter on a terminal, pauses it and lets it go on.
+/// one at once; SIGUSR1, or `p` and Enter on a terminal, pauses or resumes it.
 ///
 /// # Errors
 /// The system refused a handler.

@@ -15,41 +15,41 @@ use echolake_acquisition::simulate::simulate;
 use echolake_schema::manifest::RunEnd;
 use echolake_schema::{Rig, RunId, Timestamp};
 
-use crate::progress::{Progress, Task};
+use crate::progress::{CommandProgress, TaskProgress};
 
 /// 2026-01-05 08:00 UTC for seed 1, and eleven hours from run to run: a run takes ten.
 const FIRST_START: Timestamp = Timestamp(1_767_600_000_000_000_000);
 const RUN_EVERY_SECS: u32 = 39_600;
-/// With more surfaces than this, progress is told in surfaces.
+/// With more surfaces than this, progress counts surfaces.
 const TOLD_EACH: usize = 20;
 
-/// What is to be measured.
-pub(super) struct Campaign {
+/// A collection of surfaces to measure.
+pub(super) struct DemoCampaign {
     pub(super) rig: Rig,
     /// In the order in which they are measured.
     pub(super) surfaces: Vec<Member>,
     pub(super) keep: Keep,
     pub(super) seed: u64,
-    /// Where the runs go.
+    /// Folder of the recordings.
     pub(super) folder: PathBuf,
     /// Names, without their tags, of the runs that are there already.
     pub(super) known: HashSet<String>,
 }
 
-/// What the threads of a campaign share.
-struct Shared<'a> {
-    campaign: &'a Campaign,
-    progress: &'a Progress,
+/// State shared by the threads of a campaign.
+struct CampaignState<'a> {
+    campaign: &'a DemoCampaign,
+    progress: &'a CommandProgress,
     stop: &'a AtomicBool,
     next: AtomicUsize,
-    /// Of all surfaces, where they are not told one by one.
-    whole: Option<Mutex<(Task, u64)>>,
-    made: Mutex<Made>,
+    /// Progress over all surfaces, if they are not shown one by one.
+    whole: Option<Mutex<(TaskProgress, u64)>>,
+    made: Mutex<CampaignTotals>,
 }
 
-/// What was measured, as opposed to found.
+/// Totals of the new measurements, without those that were there before.
 #[derive(Default)]
-struct Made {
+struct CampaignTotals {
     runs: u64,
     accepted: u64,
     attempts: u64,
@@ -57,23 +57,24 @@ struct Made {
     failure: Option<anyhow::Error>,
 }
 
-impl Campaign {
-    /// Measures what is not measured yet. When `stop` becomes true it ends behind the surfaces that are in hand.
-    pub(super) fn measure(mut self, stop: &AtomicBool, progress: &Progress) -> anyhow::Result<()> {
+impl DemoCampaign {
+    /// Measures the surfaces that are missing. When `stop` becomes true, it ends after those that are being measured.
+    pub(super) fn measure(mut self, stop: &AtomicBool, progress: &CommandProgress) -> anyhow::Result<()> {
         self.look_for_runs()?;
         let campaign = &self;
         let cores = std::thread::available_parallelism().map_or(1, usize::from);
         let begun = Instant::now();
         let count = campaign.surfaces.len();
         let whole = (count > TOLD_EACH).then(|| Mutex::new((progress.task("measure", count as u64, "surfaces"), 0)));
-        let shared = Shared { campaign, progress, stop, next: AtomicUsize::new(0), whole, made: Mutex::default() };
+        let shared =
+            CampaignState { campaign, progress, stop, next: AtomicUsize::new(0), whole, made: Mutex::default() };
         std::thread::scope(|scope| {
             for _ in 0..cores.min(count) {
                 scope.spawn(|| shared.work());
             }
         });
-        let Shared { whole, made, .. } = shared;
-        let Made { runs, accepted, attempts, bytes, failure } =
+        let CampaignState { whole, made, .. } = shared;
+        let CampaignTotals { runs, accepted, attempts, bytes, failure } =
             made.into_inner().unwrap_or_else(PoisonError::into_inner);
         if let Some(failure) = failure {
             return Err(failure);
@@ -122,7 +123,7 @@ impl Campaign {
     }
 }
 
-impl Shared<'_> {
+impl CampaignState<'_> {
     fn work(&self) {
         while !self.stop.load(Ordering::Relaxed) {
             let number = self.next.fetch_add(1, Ordering::Relaxed);
@@ -156,9 +157,9 @@ impl Shared<'_> {
         }
     }
 
-    // How the run ended and its size; nothing where it was measured before.
+    // Returns how the run ended and its size; nothing if it was measured before.
     fn surface(&self, number: usize, member: &Member) -> anyhow::Result<Option<(RunEnd, u64)>> {
-        let Campaign { rig, keep, seed, folder, known, .. } = self.campaign;
+        let DemoCampaign { rig, keep, seed, folder, known, .. } = self.campaign;
         let surface = &member.surface;
         let tag = random_tag();
         if known.contains(self.campaign.run_id(number, tag)?.untagged()) {
@@ -182,7 +183,7 @@ impl Shared<'_> {
         let pairs = rig.grid()?.pairs().len();
         let mut task = self.whole.is_none().then(|| self.progress.task(surface.to_string(), pairs as u64, "pairs"));
         let begun = Instant::now();
-        // A demo's run takes seconds, so it is whole or there is none: only the next one is not begun.
+        // A demo's run takes seconds and is always completed: a stop only keeps the next one from beginning.
         let measured = simulate(&run, &AtomicBool::new(false), &mut |done| {
             if let Some(task) = &mut task {
                 task.at(done as u64);

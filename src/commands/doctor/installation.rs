@@ -1,4 +1,4 @@
-//! `echolake doctor --self`: what this program can do on this machine, without looking into a lake's data.
+//! `echolake doctor --self`: capabilities of this program on this machine; a lake's data are not read.
 
 use std::env;
 use std::env::consts::{ARCH, OS};
@@ -16,8 +16,8 @@ use echolake_lake::{Error as LakeError, LAKE_FORMAT, Lake};
 use echolake_server::CataloguePages;
 use serde::Serialize;
 
-use crate::Done;
-use crate::cli::Cli;
+use crate::CommandOutcome;
+use crate::cli::CliArguments;
 use crate::commands::{print, size};
 
 /// Versions of what reads and writes the lake's files, and of all else that was compiled in.
@@ -25,12 +25,12 @@ const LOCK_FILE: &str = include_str!("../../../Cargo.lock");
 const FORMAT_CRATES: [&str; 4] = ["mcap", "parquet", "arrow", "datafusion"];
 /// The release sets it; a build in a checkout does not know its commit.
 const COMMIT: Option<&str> = option_env!("ECHOLAKE_COMMIT");
-/// What the demo writes.
+/// Disk space that the demo needs.
 const DEMO_BYTES: u64 = 900_000_000;
-/// What `serve` keeps of slices in temporary files, at most.
+/// Disk space that `serve` uses for temporary files of slices, at most.
 const SLICE_BYTES: u64 = 2 << 30;
 
-/// What an installation can do.
+/// The capabilities of an installation.
 #[derive(Debug, Serialize)]
 struct InstallationReport {
     version: &'static str,
@@ -74,7 +74,7 @@ impl InstallationFact {
 }
 
 /// Prints the report; an error if the installation cannot do its job.
-pub(super) async fn run(json: bool, lake_url: &str) -> anyhow::Result<Done> {
+pub(super) async fn run(json: bool, lake_url: &str) -> anyhow::Result<CommandOutcome> {
     let report = examine_installation(lake_url).await;
     match json {
         true => print(&serde_json::to_string_pretty(&report)?)?,
@@ -83,7 +83,7 @@ pub(super) async fn run(json: bool, lake_url: &str) -> anyhow::Result<Done> {
     let failed: Vec<_> =
         report.facts.iter().filter(|f| f.state == FactState::Failed).map(|f| f.name.as_str()).collect();
     anyhow::ensure!(failed.is_empty(), "this installation cannot do its job here: {}", failed.join(", "));
-    Ok(Done::Whole)
+    Ok(CommandOutcome::Whole)
 }
 
 async fn examine_installation(lake_url: &str) -> InstallationReport {
@@ -252,7 +252,7 @@ fn free_space(name: &str, folder: &Path, wanted: u64, hint: &str) -> Installatio
     }
 }
 
-/// Does with small files all that a lake does with its own; the error says what was refused.
+/// Tries all file operations of a lake with small files; the error names the one that was refused.
 fn try_files(folder: &Path) -> Result<(), String> {
     let scratch = folder.join(format!(".echolake-doctor-{}", std::process::id()));
     let refused = |what: &str, error: io::Error| format!("cannot {what} in {}: {error}", folder.display());
@@ -270,7 +270,7 @@ fn try_files_in(scratch: &Path) -> Result<(), (&'static str, io::Error)> {
     file.try_lock().map_err(|e| ("lock a file", e.into()))?;
     fs::rename(&first, &second).map_err(|e| ("rename a file", e))?;
     fs::hard_link(&second, &third).map_err(|e| ("link a file", e))?;
-    // A commit counts on it: who comes second is refused.
+    // Commits rely on this: the second writer of a name is refused.
     if fs::hard_link(&second, &third).is_ok() {
         return Err(("rely on links", io::Error::other("a name was given twice")));
     }
@@ -279,7 +279,7 @@ fn try_files_in(scratch: &Path) -> Result<(), (&'static str, io::Error)> {
 
 /// The ports that `serve` listens on by default.
 fn ports() -> Vec<InstallationFact> {
-    let cli = Cli::command();
+    let cli = CliArguments::command();
     let arguments = cli.find_subcommand("serve").into_iter().flat_map(clap::Command::get_arguments);
     let defaults = arguments.filter_map(|argument| {
         let address: SocketAddr = argument.get_default_values().first()?.to_str()?.parse().ok()?;

@@ -5,13 +5,13 @@ use std::fmt::Write as _;
 use echolake_ingest::doctor::{Finding, Report, Severity, examine};
 use echolake_lake::Lake;
 
-use crate::Done;
+use crate::CommandOutcome;
 use crate::commands::{print, size};
-use crate::progress::Progress;
+use crate::progress::CommandProgress;
 
-pub(super) async fn run(json: bool, lake_url: &str) -> anyhow::Result<Done> {
+pub(super) async fn run(json: bool, lake_url: &str) -> anyhow::Result<CommandOutcome> {
     let lake = Lake::open(lake_url).await?;
-    let progress = Progress::new();
+    let progress = CommandProgress::new();
     let mut task = None;
     let report = examine(&lake, &mut |step| {
         task.get_or_insert_with(|| progress.task("check", step.total as u64, "files")).at(step.done as u64);
@@ -24,7 +24,7 @@ pub(super) async fn run(json: bool, lake_url: &str) -> anyhow::Result<Done> {
         true => print(&serde_json::to_string_pretty(&report)?)?,
         false => print(&text(&lake, &report))?,
     }
-    Ok(if report.is_damaged() { Done::WithLoss } else { Done::Whole })
+    Ok(if report.is_damaged() { CommandOutcome::WithLoss } else { CommandOutcome::Whole })
 }
 
 fn text(lake: &Lake, report: &Report) -> String {

@@ -6,10 +6,10 @@ use anyhow::Context as _;
 use echolake_acquisition::relief::Relief;
 use echolake_acquisition::relief::group::{BandLevel, Ranges};
 
-use crate::Done;
+use crate::CommandOutcome;
 
 /// Writes a JSON file for each surface and `group.csv` with a row for each.
-pub(super) fn make(ranges: &Path, count: usize, folder: &Path) -> anyhow::Result<Done> {
+pub(super) fn make(ranges: &Path, count: usize, folder: &Path) -> anyhow::Result<CommandOutcome> {
     let reliefs = read(ranges)?.draw(count)?;
     std::fs::create_dir_all(folder).with_context(|| format!("cannot make `{}`", folder.display()))?;
     let keys: Vec<_> = reliefs.first().map(Relief::parameters).into_iter().flatten().map(|(key, _)| key).collect();
@@ -23,11 +23,11 @@ pub(super) fn make(ranges: &Path, count: usize, folder: &Path) -> anyhow::Result
     super::write(&folder.join("group.csv"), table.as_bytes())?;
     eprintln!("{}: {count} surfaces", folder.display());
     eprintln!("next: echolake acquire --surface 0001_0 --parameters {}", folder.join("0001_0.json").display());
-    Ok(Done::Whole)
+    Ok(CommandOutcome::Whole)
 }
 
-/// Writes the ranges of the next group, and says why they are what they are.
-pub(super) fn next(ranges: &Path, results: &Path, output: &Path) -> anyhow::Result<Done> {
+/// Writes the ranges of the next group, and prints the reasons for them.
+pub(super) fn next(ranges: &Path, results: &Path, output: &Path) -> anyhow::Result<CommandOutcome> {
     let text = std::fs::read_to_string(results).with_context(|| format!("cannot read `{}`", results.display()))?;
     let rows = csv::Reader::from_reader(text.as_bytes()).deserialize().collect::<Result<Vec<BandLevel>, _>>();
     let rows = rows.with_context(|| {
@@ -37,7 +37,7 @@ pub(super) fn next(ranges: &Path, results: &Path, output: &Path) -> anyhow::Resu
     let reasons: String = step.reasons.iter().map(|reason| format!("# {reason}\n")).collect();
     super::write(output, (reasons + &step.ranges.to_toml()).as_bytes())?;
     super::super::print(&step.reasons.join("\n"))?;
-    Ok(Done::Whole)
+    Ok(CommandOutcome::Whole)
 }
 
 fn read(path: &Path) -> anyhow::Result<Ranges> {

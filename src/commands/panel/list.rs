@@ -1,10 +1,10 @@
-//! `echolake panel --list`: what there is to choose from.
+//! `echolake panel --list`: the reliefs and their parameters.
 
 use echolake_acquisition::relief::{Domain, Parameter, Relief};
 
-use crate::Done;
+use crate::CommandOutcome;
 
-pub(super) fn run(name: Option<&str>, json: bool) -> anyhow::Result<Done> {
+pub(super) fn run(name: Option<&str>, json: bool) -> anyhow::Result<CommandOutcome> {
     let names: Vec<&str> = name.map_or_else(|| Relief::NAMES.to_vec(), |name| vec![name]);
     let reliefs = names.into_iter().map(Relief::by_name).collect::<Result<Vec<_>, _>>()?;
     let text = if json {
@@ -15,7 +15,7 @@ pub(super) fn run(name: Option<&str>, json: bool) -> anyhow::Result<Done> {
         reliefs.iter().map(described).collect::<Vec<_>>().join("\n\n")
     };
     super::super::print(&text)?;
-    Ok(Done::Whole)
+    Ok(CommandOutcome::Whole)
 }
 
 fn described(relief: &Relief) -> String {

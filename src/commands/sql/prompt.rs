@@ -19,24 +19,24 @@ use rustyline::history::DefaultHistory;
 use rustyline::{CompletionType, Editor};
 
 use crate::signals::interrupt_signal;
-use command::{Command, HELP};
-use words::Words;
+use command::{HELP, PromptCommand};
+use words::WordCompleter;
 
 /// Lines of history that are kept.
 const HISTORY: usize = 10_000;
 
-/// How answers are given.
-struct Settings {
+/// The form of answers.
+struct PromptSettings {
     format: Format,
-    /// Where to, instead of the terminal; the next answer alone.
+    /// File for the next answer alone, instead of the terminal.
     output: Option<PathBuf>,
     timing: bool,
     pager: bool,
 }
 
 pub(super) async fn run(session: &Session, lake: &Lake) -> anyhow::Result<()> {
-    let mut editor: Editor<Words, DefaultHistory> = Editor::new()?;
-    editor.set_helper(Some(Words::of(session)));
+    let mut editor: Editor<WordCompleter, DefaultHistory> = Editor::new()?;
+    editor.set_helper(Some(WordCompleter::of(session)));
     editor.set_completion_type(CompletionType::List);
     editor.set_max_history_size(HISTORY)?;
     editor.set_history_ignore_dups(true)?;
@@ -48,7 +48,7 @@ pub(super) async fn run(session: &Session, lake: &Lake) -> anyhow::Result<()> {
     // Held from before the greeting on, so that Ctrl-C never ends the prompt.
     let _interrupts = interrupt_signal()?;
     eprintln!("lake {}; \\? for help", lake.location());
-    let mut settings = Settings { format: Format::Table, output: None, timing: false, pager: true };
+    let mut settings = PromptSettings { format: Format::Table, output: None, timing: false, pager: true };
     let mut begun = String::new();
     loop {
         let line = match editor.readline(if begun.is_empty() { "echolake> " } else { "      ..> " }) {
@@ -65,7 +65,7 @@ pub(super) async fn run(session: &Session, lake: &Lake) -> anyhow::Result<()> {
         {
             editor.add_history_entry(line.trim_end())?;
             match command {
-                Ok(Command::Quit) => break,
+                Ok(PromptCommand::Quit) => break,
                 Ok(command) => obey(command, session, &mut settings)?,
                 Err(message) => eprintln!("error: {message}"),
             }
@@ -89,26 +89,26 @@ pub(super) async fn run(session: &Session, lake: &Lake) -> anyhow::Result<()> {
     Ok(())
 }
 
-fn obey(command: Command, session: &Session, settings: &mut Settings) -> anyhow::Result<()> {
+fn obey(command: PromptCommand, session: &Session, settings: &mut PromptSettings) -> anyhow::Result<()> {
     match command {
-        Command::Quit => {}
-        Command::Help => eprintln!("{HELP}"),
-        Command::Timing => {
+        PromptCommand::Quit => {}
+        PromptCommand::Help => eprintln!("{HELP}"),
+        PromptCommand::Timing => {
             settings.timing = !settings.timing;
             eprintln!("timing is {}", on_or_off(settings.timing));
         }
-        Command::Pager => {
+        PromptCommand::Pager => {
             settings.pager = !settings.pager;
             eprintln!("the pager is {}", on_or_off(settings.pager));
         }
-        Command::Format(format) => {
+        PromptCommand::Format(format) => {
             settings.format = format;
             eprintln!("answers are {}", format.name());
         }
-        Command::Output(path) => settings.output = path,
-        Command::Tables => pager::show(settings.pager, &tables(session))?,
-        Command::Columns(table) => pager::show(settings.pager, &columns(session, &table))?,
-        Command::Functions(part) => pager::show(settings.pager, &functions(session, part.as_deref()))?,
+        PromptCommand::Output(path) => settings.output = path,
+        PromptCommand::Tables => pager::show(settings.pager, &tables(session))?,
+        PromptCommand::Columns(table) => pager::show(settings.pager, &columns(session, &table))?,
+        PromptCommand::Functions(part) => pager::show(settings.pager, &functions(session, part.as_deref()))?,
     }
     Ok(())
 }
@@ -118,7 +118,7 @@ fn on_or_off(is_on: bool) -> &'static str {
 }
 
 // An error or an interrupt ends the query, not the prompt.
-async fn answer(session: &Session, sql: &str, settings: &mut Settings) {
+async fn answer(session: &Session, sql: &str, settings: &mut PromptSettings) {
     let begun = Instant::now();
     let outcome = interrupted_or_given(session, sql, settings).await;
     settings.output = None;
@@ -130,7 +130,7 @@ async fn answer(session: &Session, sql: &str, settings: &mut Settings) {
 }
 
 // A fresh listener hears no interrupt from before the query.
-async fn interrupted_or_given(session: &Session, sql: &str, settings: &Settings) -> anyhow::Result<usize> {
+async fn interrupted_or_given(session: &Session, sql: &str, settings: &PromptSettings) -> anyhow::Result<usize> {
     let mut interrupts = interrupt_signal()?;
     tokio::select! {
         outcome = give(session, sql, settings) => outcome,
@@ -138,7 +138,7 @@ async fn interrupted_or_given(session: &Session, sql: &str, settings: &Settings)
     }
 }
 
-async fn give(session: &Session, sql: &str, settings: &Settings) -> anyhow::Result<usize> {
+async fn give(session: &Session, sql: &str, settings: &PromptSettings) -> anyhow::Result<usize> {
     let answer = session.query(sql).await?;
     if let Some(path) = &settings.output {
         return super::to_file(answer, settings.format, path).await;
@@ -148,7 +148,7 @@ async fn give(session: &Session, sql: &str, settings: &Settings) -> anyhow::Resu
         "{} is not for a terminal; hint: \\o FILE before the query",
         settings.format.name()
     );
-    let mut page = pager::Page::open(settings.pager);
+    let mut page = pager::PageOutput::open(settings.pager);
     let rows = super::write(answer, settings.format, &mut page).await?;
     page.flush().context("cannot write the answer")?;
     Ok(rows)

@@ -1,4 +1,4 @@
-//! Keys that clients cancel by. They are random and the door's own; an engine's are never told to a client.
+//! Keys by which clients cancel. They are random and the door's own; an engine's keys are never sent to a client.
 
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -36,17 +36,17 @@ impl CancelKeys {
         Some(CancelKey { pid: i32::from_be_bytes(*pid) & i32::MAX, secret: secret.get(..bytes.min(32))?.to_vec() })
     }
 
-    /// What runs on this connection can be cancelled there from now on.
+    /// Lets this key cancel queries of the target's connection from now on.
     pub(super) fn set(&self, key: &CancelKey, target: CancelTarget) {
         self.lock().insert((key.pid, key.secret.clone()), target);
     }
 
-    /// It cannot be cancelled any more.
+    /// Removes a key.
     pub(super) fn remove(&self, key: &CancelKey) {
         self.lock().remove(&(key.pid, key.secret.clone()));
     }
 
-    /// Cancels what runs on the connection of a key; false if there is none.
+    /// Cancels the query on the connection of a key; false if there is none.
     pub(super) async fn cancel(&self, pid: i32, secret: &[u8]) -> bool {
         let found = self.lock().get(&(pid, secret.to_vec())).cloned();
         let Some(target) = found else { return false };

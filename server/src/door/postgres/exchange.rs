@@ -1,5 +1,5 @@
-//! What a connection has asked and was answered, as far as it takes to ask again: the messages since the last statement
-//! that was answered, prepared statements, and settings. The door sees only types of messages and tags of commands.
+//! A connection's requests and answers, as far as they are needed to retry: the messages since the last statement that
+//! was answered, prepared statements, and settings. The door sees only types of messages and tags of commands.
 
 use std::collections::{BTreeMap, VecDeque};
 
@@ -17,19 +17,19 @@ const CURSOR: &[u8] = b"DECLARE CURSOR";
 
 /// A connection's exchange with its engine.
 #[derive(Default)]
-pub(super) struct Exchange {
-    /// Messages that are not answered, the bytes of each part that asks for an answer, and those of all such parts.
+pub(super) struct MessageExchange {
+    /// Unanswered messages, the bytes of each part that requests an answer, and those of all such parts.
     asked: BytesMut,
     parts: VecDeque<usize>,
     part_bytes: usize,
-    /// Whether `asked` is all that was asked.
+    /// True if a part of the messages was too long to keep in `asked`.
     is_cut: bool,
     /// Texts to be prepared, until the engine has done so.
     parses: VecDeque<(Vec<u8>, Vec<u8>)>,
     prepared: BTreeMap<Vec<u8>, Vec<u8>>,
     prepared_bytes: usize,
     settings: Vec<Vec<u8>>,
-    /// Whether all that was prepared and set is known.
+    /// True if a prepared statement or setting was too long to keep, so that the session cannot be rebuilt.
     is_forgetful: bool,
     /// Answers to the statement that runs: messages that were passed on, and what was seen in them.
     answered: usize,
@@ -40,8 +40,8 @@ pub(super) struct Exchange {
     pub(super) has_cursor: bool,
 }
 
-impl Exchange {
-    /// Takes note of a client's message, whole or as much as there is of a long one.
+impl MessageExchange {
+    /// Records a client's message, whole or as much as there is of a long one.
     pub(super) fn ask(&mut self, header: FrameHeader, bytes: &[u8]) {
         if bytes.len() < header.bytes || self.asked.len() + bytes.len() > KEPT_BYTES {
             self.is_cut = true;
@@ -61,17 +61,17 @@ impl Exchange {
         }
     }
 
-    /// Whether an answer is awaited.
+    /// Returns whether an answer is pending.
     pub(super) fn is_waiting(&self) -> bool {
         !self.parts.is_empty() || !self.asked.is_empty() || self.is_cut
     }
 
-    /// Whether the client has asked for an answer to the statement that runs, and not only sent its parts.
+    /// Returns whether the client has requested an answer to the running statement, and not only sent its parts.
     pub(super) fn has_end(&self) -> bool {
         !self.parts.is_empty()
     }
 
-    /// Takes note of an engine's message that is passed on.
+    /// Records an engine's message that is passed on.
     pub(super) fn answer(&mut self, kind: u8, body: &[u8]) {
         self.answered += 1;
         match kind {
@@ -135,24 +135,24 @@ impl Exchange {
         (self.answered, self.has_rows, self.sets) = (0, false, None);
     }
 
-    /// Whether the statement that runs can be asked again as if nothing had happened.
+    /// Returns whether the running statement can be retried without the client seeing it.
     pub(super) fn is_repeatable(&self) -> bool {
         !self.is_cut && !self.has_rows && !self.is_repeated && !self.is_forgetful && !self.has_cursor
     }
 
-    /// Whether a new engine can take the connection over.
+    /// Returns whether a new engine can take the connection over.
     pub(super) fn is_transferable(&self) -> bool {
         !self.is_forgetful
     }
 
-    /// Begins to ask again; returns how many messages of the new answer the client knows already.
+    /// Begins a retry; returns the number of messages of the new answer that the client has already.
     pub(super) fn repeat(&mut self) -> usize {
         self.is_repeated = true;
         self.parses.clear();
         std::mem::take(&mut self.answered)
     }
 
-    /// Drops the statement that runs, after its failure was told.
+    /// Drops the running statement, after its failure was sent to the client.
     pub(super) fn fail(&mut self) {
         self.sets = None;
         if self.is_cut {
@@ -170,17 +170,17 @@ impl Exchange {
         self.in_transaction = false;
     }
 
-    /// What was set; each of these has an answer that ends by saying that the next is awaited.
+    /// Returns the messages that set settings; the answer to each ends with ReadyForQuery.
     pub(super) fn settings(&self) -> impl Iterator<Item = &[u8]> {
         self.settings.iter().map(Vec::as_slice)
     }
 
-    /// What was prepared.
+    /// Returns the messages that prepared the named statements.
     pub(super) fn prepared(&self) -> impl Iterator<Item = &[u8]> {
         self.prepared.values().map(Vec::as_slice)
     }
 
-    /// Messages that are not answered.
+    /// Returns the messages that are not answered.
     pub(super) fn unanswered(&self) -> &[u8] {
         &self.asked
     }
@@ -195,7 +195,7 @@ fn name(body: &[u8]) -> &[u8] {
 mod tests {
     use super::*;
 
-    fn ask(exchange: &mut Exchange, kind: u8, body: &[u8]) -> Vec<u8> {
+    fn ask(exchange: &mut MessageExchange, kind: u8, body: &[u8]) -> Vec<u8> {
         let mut message = vec![kind];
         message.extend((body.len() as u32 + 4).to_be_bytes());
         message.extend(body);
@@ -205,7 +205,7 @@ mod tests {
 
     #[test]
     fn what_was_answered_is_not_asked_again() {
-        let mut exchange = Exchange::default();
+        let mut exchange = MessageExchange::default();
         let first = ask(&mut exchange, b'Q', b"select 1\0");
         let second = ask(&mut exchange, b'Q', b"select 2\0");
         assert_eq!(exchange.unanswered(), [first, second.clone()].concat());
@@ -224,7 +224,7 @@ mod tests {
 
     #[test]
     fn settings_and_statements_are_prepared_again() {
-        let mut exchange = Exchange::default();
+        let mut exchange = MessageExchange::default();
         let set = ask(&mut exchange, b'Q', b"set timezone = 'UTC'\0");
         exchange.answer(b'C', b"SET\0");
         exchange.answer(b'Z', b"I");
@@ -245,7 +245,7 @@ mod tests {
 
     #[test]
     fn long_messages_are_not_kept() {
-        let mut exchange = Exchange::default();
+        let mut exchange = MessageExchange::default();
         ask(&mut exchange, b'Q', &vec![b'x'; KEPT_BYTES]);
         assert!(exchange.is_waiting() && !exchange.is_repeatable() && exchange.unanswered().is_empty());
         exchange.answer(b'Z', b"I");

@@ -4,7 +4,7 @@ use bytes::{Buf as _, BufMut as _, BytesMut};
 use pgwire::error::{ErrorInfo, PgWireError};
 use pgwire::messages::PgWireBackendMessage;
 
-use crate::fault::Fault;
+use crate::fault::RequestFault;
 use crate::postgres::sqlstate;
 
 /// Bytes of a message's type and length.
@@ -28,40 +28,40 @@ impl FrameHeader {
     /// Reads it from the beginning of a buffer; None until there is enough.
     ///
     /// # Errors
-    /// [`Fault::Request`] if the length is impossible.
-    pub(super) fn peek(buffer: &[u8]) -> Result<Option<Self>, Fault> {
+    /// [`RequestFault::Request`] if the length is impossible.
+    pub(super) fn peek(buffer: &[u8]) -> Result<Option<Self>, RequestFault> {
         let Some((&[kind, a, b, c, d], _)) = buffer.split_first_chunk() else { return Ok(None) };
         match i32::from_be_bytes([a, b, c, d]) {
             length @ 4.. => Ok(Some(Self { kind, bytes: length.unsigned_abs() as usize + 1 })),
-            length => Err(Fault::request(format!("a message of {length} bytes; a length is 4 at least"))),
+            length => Err(RequestFault::request(format!("a message of {length} bytes; a length is 4 at least"))),
         }
     }
 
     /// Checks a client's message before anything of it is kept.
     ///
     /// # Errors
-    /// [`Fault::TooLarge`], [`Fault::Request`].
-    pub(super) fn check(self) -> Result<(), Fault> {
+    /// [`RequestFault::TooLarge`], [`RequestFault::Request`].
+    pub(super) fn check(self) -> Result<(), RequestFault> {
         let limit = match self.kind {
             b'Q' | b'P' => TEXT,
             b'B' => VALUES,
             b'D' | b'C' | b'E' | b'H' | b'S' | b'X' | b'p' | b'c' | b'f' | b'd' | b'F' => NAMES,
-            other => return Err(Fault::request(format!("a message of the type {other:#04x}, which is none"))),
+            other => return Err(RequestFault::request(format!("a message of the type {other:#04x}, which is none"))),
         };
         match self.bytes <= limit {
             true => Ok(()),
-            false => Err(Fault::TooLarge { limit }),
+            false => Err(RequestFault::TooLarge { limit }),
         }
     }
 }
 
-/// A failure after which the connection goes on.
-pub(super) fn error_message(fault: &Fault) -> BytesMut {
+/// A failure that leaves the connection open.
+pub(super) fn error_message(fault: &RequestFault) -> BytesMut {
     encode_error(sqlstate::error(fault))
 }
 
 /// A failure that ends the connection.
-pub(super) fn fatal_message(fault: &Fault) -> BytesMut {
+pub(super) fn fatal_message(fault: &RequestFault) -> BytesMut {
     encode_error(sqlstate::fatal(fault))
 }
 
@@ -74,12 +74,12 @@ fn encode_error(error: PgWireError) -> BytesMut {
 
 /// Says that the next statement is awaited, outside of a transaction.
 pub(super) const READY: [u8; 6] = [b'Z', 0, 0, 0, 5, b'I'];
-/// Asks for all answers so far.
+/// Requests all answers so far.
 pub(super) const SYNC: [u8; 5] = [b'S', 0, 0, 0, 4];
-/// Asks for a password.
+/// Requests a password.
 pub(super) const PASSWORD_WANTED: [u8; 9] = [b'R', 0, 0, 0, 8, 0, 0, 0, 3];
 
-/// A key that a client may cancel by, as the server tells it.
+/// Encodes a cancel key for the client.
 pub(super) fn key_message(pid: i32, secret: &[u8]) -> BytesMut {
     let mut bytes = BytesMut::new();
     bytes.put_u8(b'K');
@@ -89,7 +89,7 @@ pub(super) fn key_message(pid: i32, secret: &[u8]) -> BytesMut {
     bytes
 }
 
-/// A request to cancel what runs on the connection of this key.
+/// Encodes a request to cancel the query on the connection of this key.
 pub(super) fn cancel_message(pid: i32, secret: &[u8]) -> BytesMut {
     let mut bytes = BytesMut::new();
     bytes.put_i32(12 + i32::try_from(secret.len()).unwrap_or(0));
@@ -99,17 +99,17 @@ pub(super) fn cancel_message(pid: i32, secret: &[u8]) -> BytesMut {
     bytes
 }
 
-/// Codes that stand where a startup packet has its protocol's version.
+/// Request codes in the place of a startup packet's protocol version.
 const CANCEL: i32 = 80_877_102;
 const TLS: i32 = 80_877_103;
 const GSS: i32 = 80_877_104;
 
-/// What a client's first packet says.
+/// The content of a client's first packet.
 #[derive(Debug, PartialEq, Eq)]
 pub(super) enum StartupPacket {
-    /// It would rather speak encrypted.
+    /// It asks for encryption.
     Encryption,
-    /// It cancels what runs on another connection.
+    /// It cancels the query of another connection.
     Cancel { pid: i32, secret: Vec<u8> },
     /// It begins a session, as this user.
     Session { user: String },
@@ -119,9 +119,9 @@ impl StartupPacket {
     /// Reads the packet behind its length.
     ///
     /// # Errors
-    /// [`Fault::Request`].
-    pub(super) fn parse(mut packet: &[u8]) -> Result<Self, Fault> {
-        let wrong = || Fault::request("the protocol's startup is expected");
+    /// [`RequestFault::Request`].
+    pub(super) fn parse(mut packet: &[u8]) -> Result<Self, RequestFault> {
+        let wrong = || RequestFault::request("the protocol's startup is expected");
         match packet.try_get_i32().map_err(|_| wrong())? {
             TLS | GSS => Ok(Self::Encryption),
             CANCEL => {

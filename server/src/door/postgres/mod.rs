@@ -1,5 +1,5 @@
-//! Postgres' connections of the door. It logs clients in, checks the lengths of messages, and passes them on; where an
-//! engine ends, it says so on the connection, which goes on with the next engine.
+//! Postgres connections of the door. It logs clients in, checks the lengths of messages, and passes them on; if an
+//! engine ends, it reports that on the connection, which continues with the next engine.
 
 mod cancel_keys;
 mod exchange;
@@ -15,26 +15,26 @@ use tokio::net::TcpListener;
 use tokio::sync::watch;
 use tokio::task::JoinSet;
 
-use super::Door;
+use super::ServerDoor;
 use super::connection_places::{ConnectionPlaces, PlacedStream};
 use crate::client_identity::ClientIdentity;
-use crate::fault::Fault;
-use crate::tokens::Scope;
+use crate::fault::RequestFault;
+use crate::tokens::TokenScope;
 use cancel_keys::CancelKeys;
 use frames::{FrameHeader, HEADER, PASSWORD_WANTED, StartupPacket, fatal_message};
-use relay::Relay;
+use relay::MessageRelay;
 
 /// Connections at once.
 const MOST: usize = 128;
-/// How long a login may take.
+/// Time limit for a login.
 const LOGIN: Duration = Duration::from_secs(10);
 /// Bytes of a startup packet, as in Postgres, and of a password.
 const STARTUP: usize = 10_000;
-/// How long who shows a wrong key is kept waiting.
+/// Delay of the answer to a wrong cancel key.
 const WRONG_KEY: Duration = Duration::from_secs(1);
 
 /// Answers connections until `stopping`, then until their statements are answered.
-pub(super) async fn serve(door: Door, listener: TcpListener, stopping: watch::Receiver<bool>) {
+pub(super) async fn serve(door: ServerDoor, listener: TcpListener, stopping: watch::Receiver<bool>) {
     let places = ConnectionPlaces::new(listener, MOST);
     let keys = Arc::new(CancelKeys::default());
     let mut stopped = stopping.clone();
@@ -51,7 +51,7 @@ pub(super) async fn serve(door: Door, listener: TcpListener, stopping: watch::Re
     while open.join_next().await.is_some() {}
 }
 
-async fn attend(mut stream: PlacedStream, door: Door, keys: Arc<CancelKeys>, stopping: watch::Receiver<bool>) {
+async fn attend(mut stream: PlacedStream, door: ServerDoor, keys: Arc<CancelKeys>, stopping: watch::Receiver<bool>) {
     let evicted = stream.evicted();
     let login = async {
         tokio::select! {
@@ -61,7 +61,7 @@ async fn attend(mut stream: PlacedStream, door: Door, keys: Arc<CancelKeys>, sto
     };
     let Some(session) = login.await else { return };
     let _working = stream.work().begin();
-    Relay::new(stream, door, keys, session).run(stopping).await;
+    MessageRelay::new(stream, door, keys, session).run(stopping).await;
 }
 
 /// A client that is logged in.
@@ -71,13 +71,13 @@ struct PostgresLogin {
     startup: BytesMut,
 }
 
-// None where the connection has nothing more to say.
-async fn log_in(stream: &mut PlacedStream, door: &Door, keys: &CancelKeys) -> Option<PostgresLogin> {
+// None if the connection has nothing more to say.
+async fn log_in(stream: &mut PlacedStream, door: &ServerDoor, keys: &CancelKeys) -> Option<PostgresLogin> {
     match try_log_in(stream, door, keys).await {
         Ok(login) => login,
         Err(fault) => {
             door.metrics().failed(fault.code());
-            // Who hangs up needs no reason.
+            // A client that hangs up needs no reason.
             let _ = stream.write_all(&fatal_message(&fault)).await;
             let _ = stream.shutdown().await;
             None
@@ -85,7 +85,11 @@ async fn log_in(stream: &mut PlacedStream, door: &Door, keys: &CancelKeys) -> Op
     }
 }
 
-async fn try_log_in(stream: &mut PlacedStream, door: &Door, keys: &CancelKeys) -> Result<Option<PostgresLogin>, Fault> {
+async fn try_log_in(
+    stream: &mut PlacedStream,
+    door: &ServerDoor,
+    keys: &CancelKeys,
+) -> Result<Option<PostgresLogin>, RequestFault> {
     loop {
         let Some(startup) = read_startup(stream).await? else { return Ok(None) };
         match StartupPacket::parse(&startup[4..])? {
@@ -106,26 +110,26 @@ async fn try_log_in(stream: &mut PlacedStream, door: &Door, keys: &CancelKeys) -
                     false => Some(read_password(stream).await?),
                 };
                 let client = door.access().client(token.as_deref(), || ClientIdentity::user(&user))?;
-                client.require(Scope::Sql)?;
+                client.require(TokenScope::Sql)?;
                 return Ok(Some(PostgresLogin { client, startup }));
             }
         }
     }
 }
 
-fn broken() -> Fault {
-    Fault::request("the login did not come whole")
+fn broken() -> RequestFault {
+    RequestFault::request("the login did not come whole")
 }
 
 // None at the end of the connection.
-async fn read_startup(stream: &mut PlacedStream) -> Result<Option<BytesMut>, Fault> {
+async fn read_startup(stream: &mut PlacedStream) -> Result<Option<BytesMut>, RequestFault> {
     let mut length = [0; 4];
     if stream.read_exact(&mut length).await.is_err() {
         return Ok(None);
     }
     let bytes = usize::try_from(i32::from_be_bytes(length)).unwrap_or(0);
     if !(8..=STARTUP).contains(&bytes) {
-        return Err(Fault::request(format!("a startup packet of {bytes} bytes; it has 8 to {STARTUP}")));
+        return Err(RequestFault::request(format!("a startup packet of {bytes} bytes; it has 8 to {STARTUP}")));
     }
     let mut packet = BytesMut::zeroed(bytes);
     packet[..4].copy_from_slice(&length);
@@ -133,18 +137,18 @@ async fn read_startup(stream: &mut PlacedStream) -> Result<Option<BytesMut>, Fau
     Ok(Some(packet))
 }
 
-async fn read_password(stream: &mut PlacedStream) -> Result<String, Fault> {
+async fn read_password(stream: &mut PlacedStream) -> Result<String, RequestFault> {
     stream.write_all(&PASSWORD_WANTED).await.map_err(|_| broken())?;
     let mut header = [0; HEADER];
     stream.read_exact(&mut header).await.map_err(|_| broken())?;
     let Some(header) = FrameHeader::peek(&header)? else { return Err(broken()) };
     if header.kind != b'p' {
-        return Err(Fault::request("a password is expected"));
+        return Err(RequestFault::request("a password is expected"));
     }
     header.check()?;
     let mut password = BytesMut::zeroed(header.bytes - HEADER);
     stream.read_exact(&mut password).await.map_err(|_| broken())?;
     let end = password.iter().position(|byte| *byte == 0).unwrap_or(password.len());
     password.truncate(end);
-    String::from_utf8(password.copy_to_bytes(end).to_vec()).map_err(|_| Fault::Unauthenticated)
+    String::from_utf8(password.copy_to_bytes(end).to_vec()).map_err(|_| RequestFault::Unauthenticated)
 }

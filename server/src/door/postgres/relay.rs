@@ -1,4 +1,4 @@
-//! Passes messages between a client and its engine, and keeps the connection where the engine ends.
+//! Passes messages between a client and its engine, and keeps the connection if the engine ends.
 
 use std::io;
 use std::sync::Arc;
@@ -11,13 +11,13 @@ use tokio::sync::watch;
 
 use super::PostgresLogin;
 use super::cancel_keys::{CancelKey, CancelKeys, CancelTarget};
-use super::exchange::Exchange;
+use super::exchange::MessageExchange;
 use super::frames::{FrameHeader, HEADER, READY, SYNC, error_message, fatal_message, key_message};
-use crate::door::Door;
+use crate::door::ServerDoor;
 use crate::door::connection_places::PlacedStream;
 use crate::door::engine_process::{EndReason, EngineLease, EngineProcess};
 use crate::engine::EngineSocket;
-use crate::fault::Fault;
+use crate::fault::RequestFault;
 
 /// Bytes that are read at once, and of a message from which it is passed on before it is whole.
 const READ_BYTES: usize = 256 << 10;
@@ -25,8 +25,8 @@ const READ_BYTES: usize = 256 << 10;
 const ASK_BYTES: usize = 64 << 10;
 
 /// A connection of a client that is logged in.
-pub(super) struct Relay {
-    door: Door,
+pub(super) struct MessageRelay {
+    door: ServerDoor,
     keys: Arc<CancelKeys>,
     login: PostgresLogin,
     key: Option<CancelKey>,
@@ -37,9 +37,9 @@ pub(super) struct Relay {
     /// Bytes of a long message that are still to come, and whether they are passed on.
     rest: usize,
     is_rest_dropped: bool,
-    /// Whether messages are passed over up to the next Sync, as after any error.
+    /// True if messages are skipped up to the next Sync, as after any error.
     is_skipping: bool,
-    exchange: Exchange,
+    exchange: MessageExchange,
 }
 
 /// A connection to an engine.
@@ -56,14 +56,14 @@ struct EngineLink {
     known: usize,
 }
 
-/// Why passing on ends.
+/// The reason for which passing on ends.
 enum RelayEnd {
     Client,
     Engine,
-    Broken(Fault),
+    Broken(RequestFault),
 }
 
-impl Drop for Relay {
+impl Drop for MessageRelay {
     fn drop(&mut self) {
         if let Some(key) = &self.key {
             self.keys.remove(key);
@@ -71,8 +71,8 @@ impl Drop for Relay {
     }
 }
 
-impl Relay {
-    pub(super) fn new(stream: PlacedStream, door: Door, keys: Arc<CancelKeys>, login: PostgresLogin) -> Self {
+impl MessageRelay {
+    pub(super) fn new(stream: PlacedStream, door: ServerDoor, keys: Arc<CancelKeys>, login: PostgresLogin) -> Self {
         let (read, write) = tokio::io::split(stream);
         Self {
             door,
@@ -86,7 +86,7 @@ impl Relay {
             rest: 0,
             is_rest_dropped: false,
             is_skipping: false,
-            exchange: Exchange::default(),
+            exchange: MessageExchange::default(),
         }
     }
 
@@ -96,13 +96,13 @@ impl Relay {
             self.door.metrics().failed(fault.code());
             self.outgoing.extend_from_slice(&fatal_message(&fault));
         }
-        // Who hangs up needs no last word.
+        // A client that hangs up needs no last message.
         let _ = self.write.write_all_buf(&mut self.outgoing).await;
         let _ = self.write.shutdown().await;
     }
 
-    // The error is what the client is told last; None where it is gone, or was told already.
-    async fn converse(&mut self, mut stopping: watch::Receiver<bool>) -> Result<(), Option<Fault>> {
+    // The error is the last message to the client; None if the client is gone, or has it already.
+    async fn converse(&mut self, mut stopping: watch::Receiver<bool>) -> Result<(), Option<RequestFault>> {
         let mut link = self.connect(true).await?;
         loop {
             match self.pass_on(&mut link, &mut stopping).await {
@@ -221,8 +221,8 @@ impl Relay {
         Ok(())
     }
 
-    // The engine has ended. What it was asked is asked again, or fails; the next engine is there when it is needed.
-    async fn recover(&mut self, old: EngineLink) -> Result<EngineLink, Option<Fault>> {
+    // The engine has ended. The pending request is retried, or fails; the next engine is leased when it is needed.
+    async fn recover(&mut self, old: EngineLink) -> Result<EngineLink, Option<RequestFault>> {
         // A message that is passed on in part can be followed by nothing.
         if old.rest > 0 {
             return Err(None);
@@ -259,7 +259,7 @@ impl Relay {
         }
     }
 
-    fn tell(&mut self, fault: &Fault) {
+    fn tell(&mut self, fault: &RequestFault) {
         self.door.metrics().failed(fault.code());
         self.outgoing.extend_from_slice(&error_message(fault));
         match self.exchange.has_end() {
@@ -269,7 +269,7 @@ impl Relay {
         self.exchange.fail();
     }
 
-    async fn wait_for_client(&mut self) -> Result<(), Option<Fault>> {
+    async fn wait_for_client(&mut self) -> Result<(), Option<RequestFault>> {
         self.write.write_all_buf(&mut self.outgoing).await.map_err(|_| None)?;
         while self.incoming.is_empty() {
             let read = self.read.read_buf(&mut self.incoming).await;
@@ -280,8 +280,8 @@ impl Relay {
         Ok(())
     }
 
-    // Begins a session on the client's engine; one that is not the first is brought to where the last one was.
-    async fn connect(&mut self, is_first: bool) -> Result<EngineLink, Option<Fault>> {
+    // Begins a session on the client's engine; one that is not the first is brought to the state of the last one.
+    async fn connect(&mut self, is_first: bool) -> Result<EngineLink, Option<RequestFault>> {
         let told = self.outgoing.len();
         let mut is_repeated = false;
         loop {
@@ -300,7 +300,7 @@ impl Relay {
         }
     }
 
-    // None where the engine refuses the session, which the client is told in its words.
+    // None if the engine refuses the session; its error message is passed on to the client.
     async fn start_session(&mut self, lease: EngineLease, is_first: bool) -> io::Result<Option<EngineLink>> {
         let stream: UnixStream = lease.engine().connect(EngineSocket::Postgres).await?;
         let (read, write) = stream.into_split();
@@ -374,9 +374,9 @@ impl EngineLink {
     }
 }
 
-async fn engine_fault(engine: &EngineProcess) -> Fault {
+async fn engine_fault(engine: &EngineProcess) -> RequestFault {
     match engine.why_ended().await {
-        Some(EndReason::Failed(reason)) => Fault::EngineEnded { reason },
-        _ => Fault::EngineEnded { reason: "it closed the connection".to_owned() },
+        Some(EndReason::Failed(reason)) => RequestFault::EngineEnded { reason },
+        _ => RequestFault::EngineEnded { reason: "it closed the connection".to_owned() },
     }
 }

@@ -1,4 +1,4 @@
-//! What an endpoint is asked, and how it asks the lake: values are bound or validated, never part of a text.
+//! A request to an endpoint, and its queries of the lake: values are bound or validated, never part of a text.
 
 use std::collections::HashMap;
 use std::sync::Arc;
@@ -10,28 +10,28 @@ use echolake_query::output::Format;
 use echolake_schema::{RunId, SurfaceId};
 use serde::de::DeserializeOwned;
 
-use super::super::format::Written;
-use super::Catalogue;
-use super::map::Places;
-use super::params::Params;
-use super::summary::{Entry, Summary};
-use super::view::View;
-use crate::fault::Fault;
-use crate::metrics::Protocol;
-use crate::running::{Batches, Encode, Running, Stop};
-use crate::service::{Job, Work};
+use super::super::format::FormatEncoder;
+use super::LakeCatalogue;
+use super::map::SurfacePositions;
+use super::params::RequestParams;
+use super::summary::{CatalogueSummary, SurfaceEntry};
+use super::view::SnapshotView;
+use crate::fault::RequestFault;
+use crate::metrics::ServerProtocol;
+use crate::running::{AnswerEncoder, BatchEncoder, RunningQuery, StopSignal};
+use crate::service::{QueryJob, QueryWork};
 
 /// Bytes of one query's rows, as JSON; the largest that endpoints ask for are a run's events or a few responses.
 const MOST_BYTES: usize = 64 << 20;
 
 /// A request to an endpoint.
-pub(in super::super) struct Asked {
-    pub(super) catalogue: Catalogue,
-    pub(super) view: Arc<View>,
+pub(in super::super) struct CatalogueRequest {
+    pub(super) catalogue: LakeCatalogue,
+    pub(super) view: Arc<SnapshotView>,
     /// The path's parts that have a name.
     pub(super) path: HashMap<String, String>,
-    pub(super) params: Params,
-    /// Whether an Arrow stream is liked better than JSON.
+    pub(super) params: RequestParams,
+    /// True if an Arrow stream is preferred to JSON.
     pub(super) as_arrow: bool,
 }
 
@@ -50,11 +50,11 @@ pub(super) fn long(value: i64) -> ScalarValue {
     ScalarValue::Int64(Some(value))
 }
 
-impl Asked {
-    /// Nothing but the lake as a snapshot shows it.
-    pub(in super::super) fn of(catalogue: &Catalogue, view: &Arc<View>) -> Self {
+impl CatalogueRequest {
+    /// A request without path and parameters, for queries of one snapshot.
+    pub(in super::super) fn of(catalogue: &LakeCatalogue, view: &Arc<SnapshotView>) -> Self {
         let (catalogue, view) = (catalogue.clone(), view.clone());
-        Self { catalogue, view, path: HashMap::new(), params: Params::default(), as_arrow: false }
+        Self { catalogue, view, path: HashMap::new(), params: RequestParams::default(), as_arrow: false }
     }
 
     /// A part of the path.
@@ -63,17 +63,17 @@ impl Asked {
     }
 
     /// All surfaces in short.
-    pub(super) async fn summary(&self) -> Result<&Summary, Fault> {
-        self.view.summary.get_or_try_init(|| Summary::read(self)).await
+    pub(super) async fn summary(&self) -> Result<&CatalogueSummary, RequestFault> {
+        self.view.summary.get_or_try_init(|| CatalogueSummary::read(self)).await
     }
 
     /// The surfaces' places on the map.
-    pub(super) async fn places(&self) -> Result<&Places, Fault> {
-        self.view.places.get_or_try_init(|| Places::find(self)).await
+    pub(super) async fn places(&self) -> Result<&SurfacePositions, RequestFault> {
+        self.view.places.get_or_try_init(|| SurfacePositions::find(self)).await
     }
 
     /// The surface that the path names.
-    pub(super) async fn surface(&self) -> Result<&Entry, Fault> {
+    pub(super) async fn surface(&self) -> Result<&SurfaceEntry, RequestFault> {
         let name = self.part("surface_id");
         let known = name.parse::<SurfaceId>().ok();
         let found = match known {
@@ -84,12 +84,12 @@ impl Asked {
     }
 
     /// The run that the path names, as the snapshot shows it.
-    pub(super) fn run(&self) -> Result<&VisibleRun, Fault> {
+    pub(super) fn run(&self) -> Result<&VisibleRun, RequestFault> {
         run(&self.view, self.part("run_id"))
     }
 
-    /// The grid point of a parameter, where it is given.
-    pub(super) fn microphone(&self) -> Result<Option<usize>, Fault> {
+    /// Returns the grid point of the parameter `microphone`, if it is given.
+    pub(super) fn microphone(&self) -> Result<Option<usize>, RequestFault> {
         self.params.whole("microphone", 0..=self.catalogue.lake().grid().points().len().saturating_sub(1))
     }
 
@@ -98,13 +98,13 @@ impl Asked {
         &self,
         sql: &str,
         values: Vec<ScalarValue>,
-    ) -> Result<Vec<T>, Fault> {
-        let mut running = self.begin(sql, values, |schema| Written::new(Format::Json, schema)).await?;
+    ) -> Result<Vec<T>, RequestFault> {
+        let mut running = self.begin(sql, values, |schema| FormatEncoder::new(Format::Json, schema)).await?;
         let mut json = Vec::new();
         while let Some(part) = running.next().await? {
             json.extend_from_slice(&part);
             if json.len() > MOST_BYTES {
-                return Err(Fault::TooLarge { limit: MOST_BYTES });
+                return Err(RequestFault::TooLarge { limit: MOST_BYTES });
             }
         }
         if json.iter().all(u8::is_ascii_whitespace) {
@@ -112,21 +112,25 @@ impl Asked {
         }
         serde_json::from_slice(&json).map_err(|e| {
             eprintln!("the rows of `{sql}` are not as expected: {e}");
-            Fault::Internal
+            RequestFault::Internal
         })
     }
 
     /// The batches of a query, as they come.
-    pub(super) async fn batches(&self, sql: &str, values: Vec<ScalarValue>) -> Result<Running<RecordBatch>, Fault> {
-        self.begin(sql, values, |_| Ok(Batches)).await
-    }
-
-    async fn begin<E: Encode>(
+    pub(super) async fn batches(
         &self,
         sql: &str,
         values: Vec<ScalarValue>,
-        encode: impl FnOnce(&arrow::datatypes::SchemaRef) -> Result<E, Fault> + Send + 'static,
-    ) -> Result<Running<E::Item>, Fault> {
+    ) -> Result<RunningQuery<RecordBatch>, RequestFault> {
+        self.begin(sql, values, |_| Ok(BatchEncoder)).await
+    }
+
+    async fn begin<E: AnswerEncoder>(
+        &self,
+        sql: &str,
+        values: Vec<ScalarValue>,
+        encode: impl FnOnce(&arrow::datatypes::SchemaRef) -> Result<E, RequestFault> + Send + 'static,
+    ) -> Result<RunningQuery<E::Item>, RequestFault> {
         let service = self.catalogue.service();
         let prepared = match self.view.prepared(sql) {
             Some(prepared) => prepared,
@@ -139,24 +143,24 @@ impl Asked {
                 planned
             }
         };
-        let job = Job {
-            protocol: Protocol::Http,
+        let job = QueryJob {
+            protocol: ServerProtocol::Http,
             session: self.view.session.clone(),
-            work: Work::Prepared(prepared, ParamValues::from(values)),
+            work: QueryWork::Prepared(prepared, ParamValues::from(values)),
             limit: None,
-            stop: Stop::new(),
+            stop: StopSignal::new(),
         };
         service.begin(job, encode).await
     }
 }
 
 /// The run of this name.
-pub(in super::super) fn run<'a>(view: &'a View, name: &str) -> Result<&'a VisibleRun, Fault> {
+pub(in super::super) fn run<'a>(view: &'a SnapshotView, name: &str) -> Result<&'a VisibleRun, RequestFault> {
     let found = name.parse::<RunId>().ok().and_then(|id| view.snapshot.run(&id));
     found.ok_or_else(|| missing(format!("run `{name}`"), "GET /api/v1/runs lists what there is"))
 }
 
-/// What is not there.
-pub(super) fn missing(what: String, hint: &'static str) -> Fault {
-    Fault::NotFound { what, hint }
+/// The fault for a missing item.
+pub(super) fn missing(what: String, hint: &'static str) -> RequestFault {
+    RequestFault::NotFound { what, hint }
 }

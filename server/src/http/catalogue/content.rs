@@ -9,7 +9,7 @@ use bytes::Bytes;
 use serde::Serialize;
 
 use super::super::format::takes;
-use crate::fault::Fault;
+use crate::fault::RequestFault;
 
 pub(super) const ARROW: &str = "application/vnd.apache.arrow.stream";
 /// Shorter answers fit a packet or two as they are.
@@ -20,15 +20,15 @@ const LEVEL: u8 = 3;
 const GZIP_HEAD: [u8; 10] = [0x1f, 0x8b, 8, 0, 0, 0, 0, 0, 0, 255];
 
 /// An answer.
-pub(super) struct Content {
+pub(super) struct AnswerContent {
     pub(super) media_type: &'static str,
     pub(super) bytes: Bytes,
-    /// What a browser is to save it as.
+    /// File name under which a browser saves it.
     pub(super) name: Option<String>,
     packed: OnceLock<Bytes>,
 }
 
-impl Content {
+impl AnswerContent {
     /// Bytes of a media type.
     pub(super) fn new(media_type: &'static str, bytes: impl Into<Bytes>) -> Self {
         Self { media_type, bytes: bytes.into(), name: None, packed: OnceLock::new() }
@@ -44,11 +44,11 @@ impl Content {
     /// A value as JSON; what is not finite becomes null.
     ///
     /// # Errors
-    /// [`Fault::Internal`] where it cannot be written, which is a defect.
-    pub(super) fn json(value: &impl Serialize) -> Result<Self, Fault> {
+    /// [`RequestFault::Internal`] if it cannot be written, which is a defect.
+    pub(super) fn json(value: &impl Serialize) -> Result<Self, RequestFault> {
         let bytes = serde_json::to_vec(value).map_err(|e| {
             eprintln!("an answer makes no JSON: {e}");
-            Fault::Internal
+            RequestFault::Internal
         })?;
         Ok(Self::new("application/json", bytes))
     }
@@ -56,8 +56,8 @@ impl Content {
     /// Rows as an Arrow stream.
     ///
     /// # Errors
-    /// As [`Content::json`].
-    pub(super) fn arrow(batch: &RecordBatch) -> Result<Self, Fault> {
+    /// As [`AnswerContent::json`].
+    pub(super) fn arrow(batch: &RecordBatch) -> Result<Self, RequestFault> {
         let written = || {
             let mut writer = StreamWriter::try_new(Vec::new(), &batch.schema())?;
             writer.write(batch)?;
@@ -65,12 +65,12 @@ impl Content {
         };
         let bytes = written().map_err(|e| {
             eprintln!("an answer makes no Arrow stream: {e}");
-            Fault::Internal
+            RequestFault::Internal
         })?;
         Ok(Self::new(ARROW, bytes))
     }
 
-    /// What it weighs in memory.
+    /// Returns its size in memory, in bytes.
     pub(super) fn weight(&self) -> usize {
         self.bytes.len() + self.packed.get().map_or(0, Bytes::len) + self.name.as_ref().map_or(0, String::len)
     }
@@ -101,7 +101,7 @@ mod tests {
 
     #[test]
     fn long_answers_are_packed_for_those_who_take_it() {
-        let content = Content::new("application/json", vec![b'7'; 5000]);
+        let content = AnswerContent::new("application/json", vec![b'7'; 5000]);
         let accepting = |value: &str| {
             let mut headers = HeaderMap::new();
             headers.insert(header::ACCEPT_ENCODING, value.parse().expect("a value"));
@@ -116,6 +116,6 @@ mod tests {
         for other in ["identity", "gzip;q=0", "br"] {
             assert!(!accepting(other).1, "{other}");
         }
-        assert!(!Content::new("image/png", vec![0; 5000]).body(&HeaderMap::new()).1);
+        assert!(!AnswerContent::new("image/png", vec![0; 5000]).body(&HeaderMap::new()).1);
     }
 }

@@ -6,29 +6,29 @@ use echolake_dsp::correlation::pearson;
 use serde::Serialize;
 use serde_json::Value;
 
-use super::asked::Asked;
-use super::content::Content;
-use super::summary::Entry;
-use crate::fault::Fault;
+use super::asked::CatalogueRequest;
+use super::content::AnswerContent;
+use super::summary::SurfaceEntry;
+use crate::fault::RequestFault;
 
-/// Fewer surfaces tell nothing: two are always on a line.
+/// Fewer surfaces have no meaningful correlation: two are always on a line.
 const LEAST: usize = 3;
 /// Parameters that are answered.
 const MOST: usize = 500;
-/// References are no designs.
+/// Typology of references, which are not designs and are left out.
 const REFERENCE: &str = "reference";
-/// A number that says nothing of the relief.
+/// A parameter without meaning for the shape of a relief.
 const SEED: &str = "seed";
 
 #[derive(Serialize)]
-struct Correlations {
+struct CorrelationTable {
     method: &'static str,
-    items: Vec<Correlation>,
+    items: Vec<BandCorrelation>,
     surfaces: usize,
 }
 
 #[derive(Serialize)]
-struct Correlation {
+struct BandCorrelation {
     parameter: String,
     unit: &'static str,
     band: String,
@@ -37,10 +37,10 @@ struct Correlation {
 }
 
 /// Pearson's r of every numeric parameter with every band's level against Flat.
-pub(super) async fn correlations(asked: Asked) -> Result<Content, Fault> {
+pub(super) async fn correlations(asked: CatalogueRequest) -> Result<AnswerContent, RequestFault> {
     let summary = asked.summary().await?;
     let typologies: Vec<_> = asked.params.all("typology").collect();
-    let is_chosen = |entry: &&Entry| {
+    let is_chosen = |entry: &&SurfaceEntry| {
         let typology = entry.surface.typology.as_str();
         typology != REFERENCE && (typologies.is_empty() || typologies.contains(&typology))
     };
@@ -53,14 +53,14 @@ pub(super) async fn correlations(asked: Asked) -> Result<Content, Fault> {
             // They are equally long.
             let r = if x.len() < LEAST { None } else { pearson(&x, &y).unwrap_or(None) };
             let unit = unit(&parameter);
-            items.push(Correlation { parameter: parameter.clone(), unit, band: band.key.clone(), r, n: x.len() });
+            items.push(BandCorrelation { parameter: parameter.clone(), unit, band: band.key.clone(), r, n: x.len() });
         }
     }
-    Content::json(&Correlations { method: "pearson", items, surfaces: chosen.len() })
+    AnswerContent::json(&CorrelationTable { method: "pearson", items, surfaces: chosen.len() })
 }
 
 // Each parameter's values, with the surface that has them.
-fn columns(chosen: &[&Entry]) -> BTreeMap<String, Vec<(usize, f64)>> {
+fn columns(chosen: &[&SurfaceEntry]) -> BTreeMap<String, Vec<(usize, f64)>> {
     let mut columns: BTreeMap<String, Vec<(usize, f64)>> = BTreeMap::new();
     for (i, entry) in chosen.iter().enumerate() {
         let own = [

@@ -8,21 +8,21 @@ use datafusion::common::ScalarValue;
 use echolake_schema::Rig;
 use serde::{Deserialize, Serialize};
 
-use super::asked::{Asked, number, text};
-use super::content::Content;
-use super::summary::Entry;
-use crate::fault::Fault;
+use super::asked::{CatalogueRequest, number, text};
+use super::content::AnswerContent;
+use super::summary::SurfaceEntry;
+use crate::fault::RequestFault;
 
 /// Curves of a surface beside those of its Flat.
 #[derive(Serialize)]
 pub(super) struct CurveSet {
     pub(super) time_ms: Vec<f64>,
-    surface: Curves,
-    flat: Curves,
+    surface: SurfaceCurves,
+    flat: SurfaceCurves,
 }
 
 #[derive(Clone, Serialize)]
-struct Curves {
+struct SurfaceCurves {
     surface_id: String,
     /// Measurements that the mean is over.
     pairs: i64,
@@ -30,20 +30,20 @@ struct Curves {
 }
 
 #[derive(Deserialize)]
-struct Row {
+struct CurveRow {
     surface_id: String,
     pairs: i64,
     bands: Vec<Option<Vec<f64>>>,
 }
 
-/// Which pairs a mean is over.
-pub(super) enum Over {
+/// The pairs of which a mean is taken.
+pub(super) enum PairSelection {
     All,
     Point(usize),
     Pair(usize),
 }
 
-impl Over {
+impl PairSelection {
     fn filter(&self) -> (&'static str, Option<ScalarValue>) {
         match self {
             Self::All => ("", None),
@@ -56,7 +56,12 @@ impl Over {
 impl CurveSet {
     /// # Errors
     /// Those of its query.
-    pub(super) async fn read(asked: &Asked, entry: &Entry, over: Over, points: usize) -> Result<Self, Fault> {
+    pub(super) async fn read(
+        asked: &CatalogueRequest,
+        entry: &SurfaceEntry,
+        over: PairSelection,
+        points: usize,
+    ) -> Result<Self, RequestFault> {
         let rig = asked.catalogue.lake().rig();
         let (filter, value) = over.filter();
         let means: Vec<_> = rig.band_names().iter().map(|band| format!("avg_list(nce_{band})")).collect();
@@ -67,19 +72,19 @@ impl CurveSet {
         );
         let (id, flat) = (&entry.surface.surface_id, &entry.surface.flat_reference);
         let values = [text(id), text(flat)].into_iter().chain(value).collect();
-        let rows: Vec<Row> = asked.rows(&sql, values).await?;
+        let rows: Vec<CurveRow> = asked.rows(&sql, values).await?;
         let kept = indices(rig.impulse_response.length, points);
         let of = |surface: &str| curves(surface, rows.iter().find(|row| row.surface_id == surface), rig, &kept);
         Ok(Self { time_ms: times_ms(rig, &kept), surface: of(id), flat: of(flat) })
     }
 
-    /// Whether the surface itself has curves.
+    /// Returns whether the surface itself has curves.
     pub(super) fn is_there(&self) -> bool {
         self.surface.pairs > 0
     }
 
     // A column of times and one a band of either surface.
-    fn batch(&self, rig: &Rig) -> Result<RecordBatch, Fault> {
+    fn batch(&self, rig: &Rig) -> Result<RecordBatch, RequestFault> {
         let column = |values: &[f64]| -> ArrayRef {
             let padded = (0..self.time_ms.len()).map(|i| values.get(i).copied());
             Arc::new(padded.collect::<Float64Array>())
@@ -93,19 +98,19 @@ impl CurveSet {
         RecordBatch::try_from_iter_with_nullable(columns.into_iter().map(|(name, values)| (name, values, true)))
             .map_err(|e| {
                 eprintln!("curves make no batch: {e}");
-                Fault::Internal
+                RequestFault::Internal
             })
     }
 }
 
-fn curves(surface: &str, row: Option<&Row>, rig: &Rig, kept: &[usize]) -> Curves {
+fn curves(surface: &str, row: Option<&CurveRow>, rig: &Rig, kept: &[usize]) -> SurfaceCurves {
     let thin = |curve: &Option<Vec<f64>>| {
         let curve = curve.as_deref().unwrap_or_default();
         kept.iter().filter_map(|i| curve.get(*i).copied()).collect()
     };
     let bands =
         row.map_or_else(|| vec![Vec::new(); rig.band_names().len()], |row| row.bands.iter().map(thin).collect());
-    Curves { surface_id: surface.to_owned(), pairs: row.map_or(0, |row| row.pairs), bands }
+    SurfaceCurves { surface_id: surface.to_owned(), pairs: row.map_or(0, |row| row.pairs), bands }
 }
 
 // First and last sample are always kept.
@@ -122,14 +127,14 @@ fn times_ms(rig: &Rig, kept: &[usize]) -> Vec<f64> {
 }
 
 /// `GET /api/v1/surfaces/{surface_id}/curves`.
-pub(super) async fn curves_of(asked: Asked) -> Result<Content, Fault> {
+pub(super) async fn curves_of(asked: CatalogueRequest) -> Result<AnswerContent, RequestFault> {
     let entry = asked.surface().await?;
-    let over = asked.microphone()?.map_or(Over::All, Over::Point);
+    let over = asked.microphone()?.map_or(PairSelection::All, PairSelection::Point);
     let points = asked.params.whole("points", 16..=4096)?.unwrap_or(192);
     let set = CurveSet::read(&asked, entry, over, points).await?;
     match asked.as_arrow {
-        true => Content::arrow(&set.batch(asked.catalogue.lake().rig())?),
-        false => Content::json(&set),
+        true => AnswerContent::arrow(&set.batch(asked.catalogue.lake().rig())?),
+        false => AnswerContent::json(&set),
     }
 }
 

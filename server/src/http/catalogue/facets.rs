@@ -7,24 +7,24 @@ use std::ops::RangeInclusive;
 
 use serde::Serialize;
 
-use super::asked::Asked;
-use super::content::Content;
-use super::params::{Params, range};
-use super::summary::{Entry, Summary, Surface};
-use crate::fault::Fault;
+use super::asked::CatalogueRequest;
+use super::content::AnswerContent;
+use super::params::{RequestParams, range};
+use super::summary::{CatalogueSummary, SurfaceEntry, SurfaceSummary};
+use crate::fault::RequestFault;
 
 /// Values of a facet that are answered, the most frequent ones.
 const MOST_VALUES: usize = 200;
 const BINS: usize = 24;
 /// A bin is never narrower, so that one value makes a bin and not a division by nothing.
 const LEAST_WIDTH: f64 = 1e-9;
-/// How what is not known is called as a facet's value.
+/// The facet value of surfaces for which it is not known.
 const UNKNOWN: &str = "\u{2014}";
 
-/// A text that surfaces are told apart by: parameter, title, and where it stands.
-type Facet = (&'static str, &'static str, fn(&Surface) -> Option<&str>);
+/// A text by which surfaces are distinguished: parameter, title, and getter.
+type SurfaceFacet = (&'static str, &'static str, fn(&SurfaceSummary) -> Option<&str>);
 
-const FACETS: [Facet; 6] = [
+const FACETS: [SurfaceFacet; 6] = [
     ("typology", "Typology", |s| Some(&s.typology)),
     ("macrostructure", "Macrostructure", |s| s.macrostructure.as_deref()),
     ("mesostructure", "Mesostructure", |s| s.mesostructure.as_deref()),
@@ -34,12 +34,12 @@ const FACETS: [Facet; 6] = [
 ];
 
 #[derive(Serialize)]
-struct Page<'a> {
+struct SurfacePage<'a> {
     total: usize,
     offset: usize,
-    items: Vec<&'a Surface>,
+    items: Vec<&'a SurfaceSummary>,
     facets: Vec<FacetCounts<'a>>,
-    histograms: Vec<Histogram>,
+    histograms: Vec<SurfaceHistogram>,
     counts: &'static str,
 }
 
@@ -57,31 +57,31 @@ struct FacetValue<'a> {
 }
 
 #[derive(Serialize)]
-struct Histogram {
+struct SurfaceHistogram {
     name: String,
     label: String,
     unit: &'static str,
-    bins: Vec<Bin>,
+    bins: Vec<HistogramBin>,
 }
 
 #[derive(Serialize)]
-struct Bin {
+struct HistogramBin {
     from: f64,
     to: f64,
     count: usize,
 }
 
-/// A number that surfaces are told apart by.
+/// A number by which surfaces are distinguished.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Measure {
+enum SurfaceMeasure {
     /// Against Flat, of the band at this place.
     Level(usize),
     Relief,
     Started,
 }
 
-impl Measure {
-    fn of(self, entry: &Entry) -> Option<f64> {
+impl SurfaceMeasure {
+    fn of(self, entry: &SurfaceEntry) -> Option<f64> {
         let value = match self {
             Self::Level(band) => entry.surface.against_flat_db[band],
             Self::Relief => entry.surface.relief_rms_mm,
@@ -92,14 +92,14 @@ impl Measure {
 }
 
 /// One filter; all must let a surface through.
-enum Filter<'a> {
+enum SurfaceFilter<'a> {
     Words(Vec<String>),
     Facet(usize, Vec<&'a str>),
-    Measure(Measure, Vec<RangeInclusive<f64>>),
+    Measure(SurfaceMeasure, Vec<RangeInclusive<f64>>),
 }
 
-impl Filter<'_> {
-    fn passes(&self, entry: &Entry) -> bool {
+impl SurfaceFilter<'_> {
+    fn passes(&self, entry: &SurfaceEntry) -> bool {
         match self {
             Self::Words(words) => words.iter().all(|word| entry.words.contains(word)),
             Self::Facet(facet, wanted) => wanted.contains(&value(*facet, &entry.surface)),
@@ -113,30 +113,30 @@ impl Filter<'_> {
         matches!(self, Self::Facet(own, _) if *own == facet)
     }
 
-    fn is_of(&self, measure: Measure) -> bool {
+    fn is_of(&self, measure: SurfaceMeasure) -> bool {
         matches!(self, Self::Measure(own, _) if *own == measure)
     }
 }
 
-fn value(facet: usize, surface: &Surface) -> &str {
+fn value(facet: usize, surface: &SurfaceSummary) -> &str {
     (FACETS[facet].2)(surface).unwrap_or(UNKNOWN)
 }
 
-fn filters<'a>(params: &'a Params, summary: &Summary) -> Result<Vec<Filter<'a>>, Fault> {
+fn filters<'a>(params: &'a RequestParams, summary: &CatalogueSummary) -> Result<Vec<SurfaceFilter<'a>>, RequestFault> {
     let mut filters = Vec::new();
     let words: Vec<_> = params.one("q")?.unwrap_or_default().split_whitespace().map(str::to_lowercase).collect();
     if !words.is_empty() {
-        filters.push(Filter::Words(words));
+        filters.push(SurfaceFilter::Words(words));
     }
     for (i, (name, ..)) in FACETS.iter().enumerate() {
         let wanted: Vec<_> = params.all(name).collect();
         if !wanted.is_empty() {
-            filters.push(Filter::Facet(i, wanted));
+            filters.push(SurfaceFilter::Facet(i, wanted));
         }
     }
-    for (name, measure) in [("started", Measure::Started), ("relief", Measure::Relief)] {
+    for (name, measure) in [("started", SurfaceMeasure::Started), ("relief", SurfaceMeasure::Relief)] {
         if let Some(text) = params.one(name)? {
-            filters.push(Filter::Measure(measure, vec![range(name, text)?]));
+            filters.push(SurfaceFilter::Measure(measure, vec![range(name, text)?]));
         }
     }
     let mut levels: BTreeMap<usize, Vec<_>> = BTreeMap::new();
@@ -144,37 +144,38 @@ fn filters<'a>(params: &'a Params, summary: &Summary) -> Result<Vec<Filter<'a>>,
         let (key, span) = text.split_once(':').unwrap_or((text, ""));
         levels.entry(band(summary, "level", key)?).or_default().push(range("level", span)?);
     }
-    filters.extend(levels.into_iter().map(|(band, ranges)| Filter::Measure(Measure::Level(band), ranges)));
+    filters
+        .extend(levels.into_iter().map(|(band, ranges)| SurfaceFilter::Measure(SurfaceMeasure::Level(band), ranges)));
     Ok(filters)
 }
 
-fn band(summary: &Summary, name: &str, key: &str) -> Result<usize, Fault> {
+fn band(summary: &CatalogueSummary, name: &str, key: &str) -> Result<usize, RequestFault> {
     summary.bands.iter().position(|band| band.key == key).ok_or_else(|| {
         let keys: Vec<_> = summary.bands.iter().map(|band| band.key.as_str()).collect();
-        Fault::request(format!("`{name}` names no band of the lake; hint: {}", keys.join(", ")))
+        RequestFault::request(format!("`{name}` names no band of the lake; hint: {}", keys.join(", ")))
     })
 }
 
-/// Which filters keep a surface out.
+/// The filters that keep a surface out: none, exactly one, or more.
 #[derive(Clone, Copy, PartialEq, Eq)]
-enum Standing {
+enum FilterOutcome {
     In,
     /// This one alone.
     But(usize),
     Out,
 }
 
-fn standing(filters: &[Filter<'_>], entry: &Entry) -> Standing {
+fn standing(filters: &[SurfaceFilter<'_>], entry: &SurfaceEntry) -> FilterOutcome {
     let mut against = filters.iter().enumerate().filter(|(_, filter)| !filter.passes(entry));
     match (against.next(), against.next()) {
-        (None, _) => Standing::In,
-        (Some((only, _)), None) => Standing::But(only),
-        _ => Standing::Out,
+        (None, _) => FilterOutcome::In,
+        (Some((only, _)), None) => FilterOutcome::But(only),
+        _ => FilterOutcome::Out,
     }
 }
 
 /// A page of surfaces.
-pub(super) async fn surfaces(asked: Asked) -> Result<Content, Fault> {
+pub(super) async fn surfaces(asked: CatalogueRequest) -> Result<AnswerContent, RequestFault> {
     let (summary, params) = (asked.summary().await?, &asked.params);
     let filters = filters(params, summary)?;
     let order = order(params, summary)?;
@@ -182,9 +183,9 @@ pub(super) async fn surfaces(asked: Asked) -> Result<Content, Fault> {
     let limit = params.whole("limit", 1..=500)?.unwrap_or(60);
     let all: Vec<_> = summary.entries.iter().map(|entry| (entry, standing(&filters, entry))).collect();
     let mut left: Vec<_> =
-        all.iter().filter(|(_, standing)| *standing == Standing::In).map(|(entry, _)| *entry).collect();
+        all.iter().filter(|(_, standing)| *standing == FilterOutcome::In).map(|(entry, _)| *entry).collect();
     left.sort_by(|a, b| order.compare(a, b));
-    Content::json(&Page {
+    AnswerContent::json(&SurfacePage {
         total: left.len(),
         offset,
         items: left.into_iter().skip(offset).take(limit).map(|entry| &entry.surface).collect(),
@@ -194,7 +195,11 @@ pub(super) async fn surfaces(asked: Asked) -> Result<Content, Fault> {
     })
 }
 
-fn counts<'a>(facet: usize, filters: &[Filter<'_>], all: &[(&'a Entry, Standing)]) -> FacetCounts<'a> {
+fn counts<'a>(
+    facet: usize,
+    filters: &[SurfaceFilter<'_>],
+    all: &[(&'a SurfaceEntry, FilterOutcome)],
+) -> FacetCounts<'a> {
     let own = filters.iter().position(|f| f.is_of_facet(facet));
     let mut counts: BTreeMap<&str, usize> = BTreeMap::new();
     for (entry, standing) in all {
@@ -207,32 +212,36 @@ fn counts<'a>(facet: usize, filters: &[Filter<'_>], all: &[(&'a Entry, Standing)
 }
 
 // Whether a surface is let through by all filters but one's own.
-fn counted(standing: Standing, own: Option<usize>) -> bool {
+fn counted(standing: FilterOutcome, own: Option<usize>) -> bool {
     match standing {
-        Standing::In => true,
-        Standing::But(only) => Some(only) == own,
-        Standing::Out => false,
+        FilterOutcome::In => true,
+        FilterOutcome::But(only) => Some(only) == own,
+        FilterOutcome::Out => false,
     }
 }
 
-fn histograms(summary: &Summary, filters: &[Filter<'_>], all: &[(&Entry, Standing)]) -> Vec<Histogram> {
+fn histograms(
+    summary: &CatalogueSummary,
+    filters: &[SurfaceFilter<'_>],
+    all: &[(&SurfaceEntry, FilterOutcome)],
+) -> Vec<SurfaceHistogram> {
     let levels = summary.bands.iter().enumerate().map(|(i, band)| {
-        (Measure::Level(i), format!("level:{}", band.key), format!("{} against Flat", band.label), "dB")
+        (SurfaceMeasure::Level(i), format!("level:{}", band.key), format!("{} against Flat", band.label), "dB")
     });
     let others = [
-        (Measure::Relief, "relief".to_owned(), "Relief, rms".to_owned(), "mm"),
-        (Measure::Started, "started".to_owned(), "Measured".to_owned(), "day"),
+        (SurfaceMeasure::Relief, "relief".to_owned(), "Relief, rms".to_owned(), "mm"),
+        (SurfaceMeasure::Started, "started".to_owned(), "Measured".to_owned(), "day"),
     ];
     let all = levels.chain(others).filter_map(|(measure, name, label, unit)| {
         let own = filters.iter().position(|f| f.is_of(measure));
         let values = all.iter().filter_map(|(entry, standing)| Some((measure.of(entry)?, counted(*standing, own))));
-        Some(Histogram { name, label, unit, bins: bins(&values.collect::<Vec<_>>())? })
+        Some(SurfaceHistogram { name, label, unit, bins: bins(&values.collect::<Vec<_>>())? })
     });
     all.collect()
 }
 
 // Bins over all values, which do not move when something is filtered; counts of those that are left.
-fn bins(values: &[(f64, bool)]) -> Option<Vec<Bin>> {
+fn bins(values: &[(f64, bool)]) -> Option<Vec<HistogramBin>> {
     let low = values.iter().map(|v| v.0).min_by(f64::total_cmp)?;
     let high = values.iter().map(|v| v.0).max_by(f64::total_cmp)?;
     let width = ((high - low) / BINS as f64).max(LEAST_WIDTH);
@@ -241,48 +250,54 @@ fn bins(values: &[(f64, bool)]) -> Option<Vec<Bin>> {
         counts[(((value - low) / width) as usize).min(BINS - 1)] += 1;
     }
     let edge = |i: usize| low + i as f64 * width;
-    Some(counts.into_iter().enumerate().map(|(i, count)| Bin { from: edge(i), to: edge(i + 1), count }).collect())
+    Some(
+        counts
+            .into_iter()
+            .enumerate()
+            .map(|(i, count)| HistogramBin { from: edge(i), to: edge(i + 1), count })
+            .collect(),
+    )
 }
 
 /// In which order surfaces come.
-struct Order {
-    by: Option<By>,
+struct SurfaceOrder {
+    by: Option<SortKey>,
     descends: bool,
 }
 
-/// What surfaces are sorted by, where it is not their name.
-enum By {
-    Measure(Measure),
+/// The sort key of surfaces, if it is not their name.
+enum SortKey {
+    Measure(SurfaceMeasure),
     Spread(usize),
 }
 
-fn order(params: &Params, summary: &Summary) -> Result<Order, Fault> {
+fn order(params: &RequestParams, summary: &CatalogueSummary) -> Result<SurfaceOrder, RequestFault> {
     let band = match params.one("sort_band")? {
         Some(key) => band(summary, "sort_band", key)?,
         None => summary.bands.len() - 1,
     };
     let by = match params.choice("sort", &["surface_id", "started", "relief", "spread", "level"])? {
-        "started" => Some(By::Measure(Measure::Started)),
-        "relief" => Some(By::Measure(Measure::Relief)),
-        "spread" => Some(By::Spread(band)),
-        "level" => Some(By::Measure(Measure::Level(band))),
+        "started" => Some(SortKey::Measure(SurfaceMeasure::Started)),
+        "relief" => Some(SortKey::Measure(SurfaceMeasure::Relief)),
+        "spread" => Some(SortKey::Spread(band)),
+        "level" => Some(SortKey::Measure(SurfaceMeasure::Level(band))),
         _ => None,
     };
-    Ok(Order { by, descends: params.choice("order", &["asc", "desc"])? == "desc" })
+    Ok(SurfaceOrder { by, descends: params.choice("order", &["asc", "desc"])? == "desc" })
 }
 
-impl Order {
-    fn compare(&self, a: &Entry, b: &Entry) -> Ordering {
+impl SurfaceOrder {
+    fn compare(&self, a: &SurfaceEntry, b: &SurfaceEntry) -> Ordering {
         let turned = |ordering: Ordering| if self.descends { ordering.reverse() } else { ordering };
-        let value = |entry: &Entry| match self.by.as_ref()? {
-            By::Measure(measure) => measure.of(entry),
-            By::Spread(band) => entry.surface.spread_db[*band],
+        let value = |entry: &SurfaceEntry| match self.by.as_ref()? {
+            SortKey::Measure(measure) => measure.of(entry),
+            SortKey::Spread(band) => entry.surface.spread_db[*band],
         };
         let names = || natural(&a.surface.surface_id, &b.surface.surface_id);
         match (self.by.is_some(), value(a), value(b)) {
             (false, ..) => turned(names()),
             (true, Some(x), Some(y)) => turned(x.total_cmp(&y)).then_with(names),
-            // What is not known comes last, whichever way.
+            // Unknown values come last, in either direction.
             (true, x, y) => y.is_some().cmp(&x.is_some()).then_with(names),
         }
     }
@@ -343,8 +358,8 @@ mod tests {
 
     #[test]
     fn a_facet_leaves_its_own_filter_out() {
-        assert!(counted(Standing::In, None) && counted(Standing::But(2), Some(2)));
-        assert!(!counted(Standing::But(2), Some(1)) && !counted(Standing::But(0), None));
-        assert!(!counted(Standing::Out, Some(0)));
+        assert!(counted(FilterOutcome::In, None) && counted(FilterOutcome::But(2), Some(2)));
+        assert!(!counted(FilterOutcome::But(2), Some(1)) && !counted(FilterOutcome::But(0), None));
+        assert!(!counted(FilterOutcome::Out, Some(0)));
     }
 }

@@ -1,4 +1,4 @@
-//! Answers that were given: each is computed once, however many ask at the same time, and the oldest go first.
+//! Cache of answers: each is computed once for all concurrent requests, and the oldest are evicted first.
 
 use std::collections::{HashMap, VecDeque};
 use std::future::Future;
@@ -6,8 +6,8 @@ use std::sync::{Arc, Mutex, PoisonError};
 
 use tokio::sync::OnceCell;
 
-use super::content::Content;
-use crate::fault::Fault;
+use super::content::AnswerContent;
+use crate::fault::RequestFault;
 
 /// Bytes of answers that are kept of one snapshot.
 const MOST_BYTES: usize = 96 << 20;
@@ -15,20 +15,20 @@ const MOST_BYTES: usize = 96 << 20;
 const LARGEST: usize = 8 << 20;
 
 /// An address with its parameters, and whether the answer is an Arrow stream.
-pub(super) type Key = (String, bool);
+pub(super) type AnswerKey = (String, bool);
 
-/// Answers that are kept.
+/// Cache of answers of one snapshot.
 #[derive(Default)]
-pub(super) struct Answers(Mutex<Kept>);
+pub(super) struct AnswerCache(Mutex<CachedAnswers>);
 
-/// Somebody who waits for an answer. The last one who leaves without any leaves nothing behind.
-struct Place<'a> {
-    answers: &'a Answers,
-    cell: Arc<OnceCell<Arc<Content>>>,
-    key: Key,
+/// A request that waits for an answer. The last one that is dropped without an answer removes the empty entry.
+struct AnswerWaiter<'a> {
+    answers: &'a AnswerCache,
+    cell: Arc<OnceCell<Arc<AnswerContent>>>,
+    key: AnswerKey,
 }
 
-impl Drop for Place<'_> {
+impl Drop for AnswerWaiter<'_> {
     fn drop(&mut self) {
         let mut kept = self.answers.kept();
         // Two: the map's and this one.
@@ -39,23 +39,24 @@ impl Drop for Place<'_> {
 }
 
 #[derive(Default)]
-struct Kept {
-    answers: HashMap<Key, Arc<OnceCell<Arc<Content>>>>,
-    order: VecDeque<(Key, usize)>,
+struct CachedAnswers {
+    answers: HashMap<AnswerKey, Arc<OnceCell<Arc<AnswerContent>>>>,
+    order: VecDeque<(AnswerKey, usize)>,
     bytes: usize,
 }
 
-impl Answers {
-    /// The answer to a question; `make` is run where nobody has it yet, and nobody else is at it.
+impl AnswerCache {
+    /// Returns the answer for a key; `make` runs if it is neither cached nor being made by another request.
     ///
     /// # Errors
-    /// Those of `make`, which are not kept.
+    /// Errors of `make`, which are not cached.
     pub(super) async fn once(
         &self,
-        key: Key,
-        make: impl Future<Output = Result<Content, Fault>>,
-    ) -> Result<Arc<Content>, Fault> {
-        let place = Place { answers: self, cell: self.kept().answers.entry(key.clone()).or_default().clone(), key };
+        key: AnswerKey,
+        make: impl Future<Output = Result<AnswerContent, RequestFault>>,
+    ) -> Result<Arc<AnswerContent>, RequestFault> {
+        let place =
+            AnswerWaiter { answers: self, cell: self.kept().answers.entry(key.clone()).or_default().clone(), key };
         let mut made = false;
         let answer = place
             .cell
@@ -72,7 +73,7 @@ impl Answers {
         answer
     }
 
-    fn keep(&self, key: Key, content: &Content) {
+    fn keep(&self, key: AnswerKey, content: &AnswerContent) {
         // What it will weigh once it is packed too.
         let weight = content.weight() * 3 / 2 + key.0.len() * 2;
         let mut kept = self.kept();
@@ -90,7 +91,7 @@ impl Answers {
         }
     }
 
-    fn kept(&self) -> std::sync::MutexGuard<'_, Kept> {
+    fn kept(&self) -> std::sync::MutexGuard<'_, CachedAnswers> {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
@@ -101,22 +102,22 @@ mod tests {
 
     use super::*;
 
-    fn key(name: &str) -> Key {
+    fn key(name: &str) -> AnswerKey {
         (name.to_owned(), false)
     }
 
     #[tokio::test]
     async fn an_answer_is_made_once_and_a_failure_again() {
-        let (answers, made) = (Answers::default(), AtomicUsize::new(0));
+        let (answers, made) = (AnswerCache::default(), AtomicUsize::new(0));
         let make = || async {
             made.fetch_add(1, Ordering::Relaxed);
             tokio::task::yield_now().await;
-            Ok(Content::new("text/plain", "x"))
+            Ok(AnswerContent::new("text/plain", "x"))
         };
         let (a, b) = tokio::join!(answers.once(key("a"), make()), answers.once(key("a"), make()));
         assert!(Arc::ptr_eq(&a.expect("made"), &b.expect("the same")));
         assert_eq!(made.load(Ordering::Relaxed), 1);
-        let failed = answers.once(key("b"), async { Err(Fault::Internal) }).await;
+        let failed = answers.once(key("b"), async { Err(RequestFault::Internal) }).await;
         assert!(failed.is_err());
         drop(Box::pin(answers.once(key("c"), make())));
         assert_eq!(answers.kept().answers.len(), 1);
@@ -125,13 +126,13 @@ mod tests {
 
     #[tokio::test]
     async fn what_is_kept_is_bounded() {
-        let answers = Answers::default();
+        let answers = AnswerCache::default();
         for i in 0..60 {
-            let large = async { Ok(Content::new("text/plain", vec![0; LARGEST / 2])) };
+            let large = async { Ok(AnswerContent::new("text/plain", vec![0; LARGEST / 2])) };
             assert!(answers.once(key(&i.to_string()), large).await.is_ok());
             assert!(answers.kept().bytes <= MOST_BYTES);
         }
-        let too_large = async { Ok(Content::new("text/plain", vec![0; LARGEST + 1])) };
+        let too_large = async { Ok(AnswerContent::new("text/plain", vec![0; LARGEST + 1])) };
         assert!(answers.once(key("too large"), too_large).await.is_ok());
         let kept = answers.kept();
         assert_eq!(kept.answers.len(), kept.order.len());

@@ -3,28 +3,28 @@
 use echolake_schema::Rig;
 use serde::{Deserialize, Serialize};
 
-use super::asked::Asked;
-use super::content::Content;
-use crate::fault::Fault;
+use super::asked::CatalogueRequest;
+use super::content::AnswerContent;
+use crate::fault::RequestFault;
 
 /// A band, or the total, which has no centre.
 #[derive(Debug, Serialize)]
-pub(super) struct Band {
-    /// As in column names.
+pub(super) struct BandDescription {
+    /// Name of the band in column names.
     pub(super) key: String,
     centre_hz: Option<f64>,
     pub(super) label: String,
 }
 
-/// Name of what has no band.
+/// Name of the total over all bands.
 pub(super) const TOTAL: &str = "total";
 
 /// The rig's bands, the total last.
-pub(super) fn bands(rig: &Rig) -> Vec<Band> {
+pub(super) fn bands(rig: &Rig) -> Vec<BandDescription> {
     let label = |hz: f64| if hz >= 1000.0 { format!("{} kHz", hz / 1000.0) } else { format!("{hz} Hz") };
     let named = rig.band_names().into_iter().zip(&rig.bands.centres_hz);
-    let bands = named.map(|(key, hz)| Band { key, centre_hz: Some(*hz), label: label(*hz) });
-    bands.chain([Band { key: TOTAL.into(), centre_hz: None, label: "Total".into() }]).collect()
+    let bands = named.map(|(key, hz)| BandDescription { key, centre_hz: Some(*hz), label: label(*hz) });
+    bands.chain([BandDescription { key: TOTAL.into(), centre_hz: None, label: "Total".into() }]).collect()
 }
 
 /// A column for each of the rig's bands and the total, as one list.
@@ -47,11 +47,11 @@ pub(super) fn levels_db(linear: &[Option<f64>]) -> Vec<Option<f64>> {
 }
 
 #[derive(Serialize)]
-struct Lake<'a> {
+struct LakeDescription<'a> {
     name: &'a str,
     version: &'a str,
     software: &'static str,
-    bands: Vec<Band>,
+    bands: Vec<BandDescription>,
     rate_hz: f64,
     low_hz: f64,
     high_hz: f64,
@@ -60,13 +60,13 @@ struct Lake<'a> {
     panel_size_mm: f64,
     panel_depth_mm: f64,
     layers: i32,
-    points: Vec<Point>,
-    counts: Counts,
+    points: Vec<GridPoint>,
+    counts: LakeCounts,
     simulated: bool,
 }
 
 #[derive(Deserialize, Serialize)]
-struct Point {
+struct GridPoint {
     point_id: i32,
     layer: i32,
     gridx: i32,
@@ -77,7 +77,7 @@ struct Point {
 }
 
 #[derive(Serialize)]
-struct Counts {
+struct LakeCounts {
     surfaces: usize,
     runs: i64,
     measurements: i64,
@@ -85,28 +85,28 @@ struct Counts {
 }
 
 #[derive(Deserialize)]
-struct Runs {
+struct RunTotals {
     runs: i64,
     measurements: Option<i64>,
 }
 
-/// What the lake holds.
-pub(super) async fn lake(asked: Asked) -> Result<Content, Fault> {
+/// The contents of the lake.
+pub(super) async fn lake(asked: CatalogueRequest) -> Result<AnswerContent, RequestFault> {
     let lake = asked.catalogue.lake();
     let rig = lake.rig();
-    let points: Vec<Point> = asked
+    let points: Vec<GridPoint> = asked
         .rows("select point_id, layer, gridx, gridy, x_mm, y_mm, z_mm from points order by point_id", Vec::new())
         .await?;
-    let runs: Vec<Runs> =
+    let runs: Vec<RunTotals> =
         asked.rows("select count(*) as runs, sum(measurements) as measurements from runs", Vec::new()).await?;
     let summary = asked.summary().await?;
-    let counts = Counts {
+    let counts = LakeCounts {
         surfaces: summary.entries.len(),
         runs: runs.first().map_or(0, |r| r.runs),
         measurements: runs.first().and_then(|r| r.measurements).unwrap_or(0),
         pairs: lake.grid().pairs().len(),
     };
-    Content::json(&Lake {
+    AnswerContent::json(&LakeDescription {
         name: name(lake.location()),
         version: &asked.view.version,
         software: concat!("echolake ", env!("CARGO_PKG_VERSION")),
@@ -125,7 +125,7 @@ pub(super) async fn lake(asked: Asked) -> Result<Content, Fault> {
     })
 }
 
-// Where it stands on the server's disk is nobody's matter.
+// The lake's path on the server's disk is not disclosed.
 fn name(location: &str) -> &str {
     location.split(['/', '\\']).rfind(|part| !part.is_empty()).unwrap_or("lake")
 }

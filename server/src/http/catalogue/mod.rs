@@ -1,4 +1,4 @@
-//! The catalogue: what the pages show, each a question to the lake, answered once a snapshot and kept.
+//! The catalogue: the data of the pages, each a query of the lake, answered once per snapshot and cached.
 //!
 //! [`ENDPOINTS`] is the table of them; `web/openapi.json` is their contract.
 
@@ -35,35 +35,35 @@ use echolake_lake::Lake;
 use echolake_schema::tables::Table;
 
 use super::format;
-use super::problem::Problem;
-use crate::fault::Fault;
-use crate::service::Service;
-use crate::tokens::Scope;
-pub(super) use asked::{Asked, run, text};
-use content::Content;
-pub(super) use params::Params;
+use super::problem::ProblemResponse;
+use crate::fault::RequestFault;
+use crate::service::QueryService;
+use crate::tokens::TokenScope;
+pub(super) use asked::{CatalogueRequest, run, text};
+use content::AnswerContent;
+pub(super) use params::RequestParams;
 pub(super) use tables::table;
-use view::Views;
-pub(super) use view::{Shown, View};
+use view::SnapshotViews;
+pub(super) use view::{SnapshotView, VisibleFile};
 
-/// What an endpoint does.
-type Answering = Pin<Box<dyn Future<Output = Result<Content, Fault>> + Send>>;
+/// The pending answer of an endpoint.
+type PendingAnswer = Pin<Box<dyn Future<Output = Result<AnswerContent, RequestFault>> + Send>>;
 
 /// An address of the catalogue.
 #[derive(Clone, Copy)]
-struct Endpoint {
+struct CatalogueEndpoint {
     path: &'static str,
-    scope: Scope,
-    answer: fn(Asked) -> Answering,
+    scope: TokenScope,
+    answer: fn(CatalogueRequest) -> PendingAnswer,
 }
 
 macro_rules! endpoint {
     ($path:literal, $scope:ident, $answer:path) => {
-        Endpoint { path: $path, scope: Scope::$scope, answer: |asked| Box::pin($answer(asked)) }
+        CatalogueEndpoint { path: $path, scope: TokenScope::$scope, answer: |asked| Box::pin($answer(asked)) }
     };
 }
 
-const ENDPOINTS: [Endpoint; 17] = [
+const ENDPOINTS: [CatalogueEndpoint; 17] = [
     endpoint!("/api/v1/lake", Sql, lake::lake),
     endpoint!("/api/v1/surfaces", Sql, facets::surfaces),
     endpoint!("/api/v1/surfaces/{surface_id}", Sql, surface::surface),
@@ -83,18 +83,18 @@ const ENDPOINTS: [Endpoint; 17] = [
     endpoint!("/api/v1/tables/{table}", Sql, tables::files),
 ];
 
-/// What the endpoints share.
+/// State shared by the endpoints.
 #[derive(Clone)]
-pub(super) struct Catalogue(Arc<Inner>);
+pub(super) struct LakeCatalogue(Arc<CatalogueState>);
 
-struct Inner {
-    service: Service,
-    views: Views,
+struct CatalogueState {
+    service: QueryService,
+    views: SnapshotViews,
 }
 
-impl Catalogue {
-    pub(super) fn new(service: Service) -> Self {
-        Self(Arc::new(Inner { service, views: Views::default() }))
+impl LakeCatalogue {
+    pub(super) fn new(service: QueryService) -> Self {
+        Self(Arc::new(CatalogueState { service, views: SnapshotViews::default() }))
     }
 
     /// The addresses of the catalogue.
@@ -103,13 +103,13 @@ impl Catalogue {
             let catalogue = self.clone();
             let handler = move |path: Result<RawPathParams, RawPathParamsRejection>, uri: Uri, headers: HeaderMap| {
                 let catalogue = catalogue.clone();
-                async move { catalogue.respond(endpoint, path, &uri, &headers).await.map_err(Problem) }
+                async move { catalogue.respond(endpoint, path, &uri, &headers).await.map_err(ProblemResponse) }
             };
             router.route(endpoint.path, get(handler))
         })
     }
 
-    pub(super) fn service(&self) -> &Service {
+    pub(super) fn service(&self) -> &QueryService {
         &self.0.service
     }
 
@@ -118,34 +118,34 @@ impl Catalogue {
     }
 
     /// The lake as it is now, with what was computed of it already.
-    pub(super) async fn view(&self) -> Result<Arc<View>, Fault> {
+    pub(super) async fn view(&self) -> Result<Arc<SnapshotView>, RequestFault> {
         self.0.views.current(&self.0.service).await
     }
 
     /// A table's file of this name, of the lake as it is or as it was while the server ran.
-    pub(super) fn shown(&self, view: &View, table: Table, name: &str) -> Option<Shown> {
+    pub(super) fn shown(&self, view: &SnapshotView, table: Table, name: &str) -> Option<VisibleFile> {
         self.0.views.shown(view, table, name)
     }
 
     async fn respond(
         &self,
-        endpoint: Endpoint,
+        endpoint: CatalogueEndpoint,
         path: Result<RawPathParams, RawPathParamsRejection>,
         uri: &Uri,
         headers: &HeaderMap,
-    ) -> Result<Response, Fault> {
+    ) -> Result<Response, RequestFault> {
         self.service().client(endpoint.scope)?;
-        let path = path.map_err(|_| Fault::request("the path is not UTF-8"))?;
+        let path = path.map_err(|_| RequestFault::request("the path is not UTF-8"))?;
         let view = self.view().await?;
         let as_arrow = format::prefers_arrow(headers);
         let etag = view.etag(as_arrow);
         if is_known(headers, &etag) {
             return Ok((StatusCode::NOT_MODIFIED, [(header::ETAG, etag)]).into_response());
         }
-        let params = Params::of(uri)?;
+        let params = RequestParams::of(uri)?;
         let key = (uri.path_and_query().map_or_else(String::new, ToString::to_string), as_arrow);
         let path = path.iter().map(|(name, value)| (name.to_owned(), value.to_owned())).collect();
-        let asked = Asked { catalogue: self.clone(), view: view.clone(), path, params, as_arrow };
+        let asked = CatalogueRequest { catalogue: self.clone(), view: view.clone(), path, params, as_arrow };
         let answer = (endpoint.answer)(asked);
         let content =
             view.answers.once(key, answer).await.inspect_err(|f| self.service().metrics().failed(f.code()))?;
@@ -153,18 +153,18 @@ impl Catalogue {
     }
 }
 
-/// Whether who asks has it already.
+/// Returns whether the client has this version already.
 pub(super) fn is_known(headers: &HeaderMap, etag: &str) -> bool {
     let tags = headers.get_all(header::IF_NONE_MATCH).iter().filter_map(|v| v.to_str().ok());
     tags.flat_map(|v| v.split(',')).map(str::trim).any(|tag| tag == "*" || tag.trim_start_matches("W/") == etag)
 }
 
-fn response(content: &Content, headers: &HeaderMap, etag: String) -> Response {
+fn response(content: &AnswerContent, headers: &HeaderMap, etag: String) -> Response {
     let (body, packed) = content.body(headers);
     let mut response =
         ([(header::CONTENT_TYPE, content.media_type), (header::VARY, "Accept, Accept-Encoding")], body).into_response();
     let out = response.headers_mut();
-    // Asked again each time, and answered by 304 for as long as nothing changes; no cache between keeps what a token opened.
+    // Revalidated each time, by 304 for as long as nothing changes; no cache in between keeps what needed a token.
     out.insert(header::CACHE_CONTROL, HeaderValue::from_static("private, no-cache"));
     if packed {
         out.insert(header::CONTENT_ENCODING, HeaderValue::from_static("gzip"));

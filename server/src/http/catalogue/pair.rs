@@ -6,23 +6,23 @@ use arrow::array::{ArrayRef, Float64Array};
 use arrow::record_batch::RecordBatch;
 use serde::{Deserialize, Serialize};
 
-use super::asked::{Asked, long, missing, number, text};
-use super::content::Content;
-use super::curves::{CurveSet, Over};
-use super::environment::{Reading, Series};
+use super::asked::{CatalogueRequest, long, missing, number, text};
+use super::content::AnswerContent;
+use super::curves::{CurveSet, PairSelection};
+use super::environment::{AirReading, AirSeries};
 use super::lake::{TOTAL, band_list, levels_db};
-use super::runs::Event;
-use super::summary::Entry;
-use crate::fault::Fault;
+use super::runs::RunEvent;
+use super::summary::SurfaceEntry;
+use crate::fault::RequestFault;
 
-/// How much of the air's history stands around a measurement, before it and after it.
+/// Length of the air's history that is shown before and after a measurement.
 const AROUND_NS: i64 = 900_000_000_000;
 
 #[derive(Serialize)]
-struct Detail<'a> {
+struct PairDetail<'a> {
     surface_id: &'a str,
-    pair: Pair,
-    measurement: &'a Measurement,
+    pair: PairDescription,
+    measurement: &'a PairMeasurement,
     rate_hz: f64,
     measured: &'a [f64],
     reflected: Option<&'a [f64]>,
@@ -31,27 +31,27 @@ struct Detail<'a> {
     tnce_band_db: Vec<Option<f64>>,
     curves: Option<CurveSet>,
     symmetries: Vec<SymmetricPair>,
-    attempts: Vec<Event>,
-    environment: Series,
+    attempts: Vec<RunEvent>,
+    environment: AirSeries,
 }
 
 #[derive(Serialize)]
-struct Pair {
+struct PairDescription {
     pair_id: usize,
     #[serde(flatten)]
-    geometry: Geometry,
-    fresnel: Vec<Fresnel>,
+    geometry: PairGeometry,
+    fresnel: Vec<FresnelEllipse>,
 }
 
 #[derive(Serialize)]
-struct Fresnel {
+struct FresnelEllipse {
     frequency_hz: f64,
     major_mm: f64,
     minor_mm: f64,
 }
 
 #[derive(Deserialize, Serialize)]
-struct Geometry {
+struct PairGeometry {
     microphone: i32,
     speaker: i32,
     microphone_mm: [f64; 3],
@@ -67,7 +67,7 @@ struct Geometry {
 }
 
 #[derive(Deserialize, Serialize)]
-pub(super) struct Measurement {
+pub(super) struct PairMeasurement {
     #[serde(skip_serializing)]
     pub(super) ir: Vec<f64>,
     #[serde(skip_serializing)]
@@ -91,13 +91,13 @@ pub(super) struct Measurement {
 }
 
 #[derive(Deserialize)]
-pub(super) struct Reflected {
+pub(super) struct ReflectedResponse {
     surface_id: String,
     pub(super) reflected: Option<Vec<f64>>,
 }
 
 #[derive(Deserialize)]
-struct Energies {
+struct PairEnergies {
     total: Vec<Option<f64>>,
     band: Vec<Option<f64>>,
 }
@@ -113,7 +113,7 @@ struct SymmetricPair {
 }
 
 #[derive(Deserialize)]
-struct Moved {
+struct SymmetryRow {
     symmetry: String,
     pair_id: i64,
     microphone: i64,
@@ -139,15 +139,15 @@ const ATTEMPTS: &str = "select log_time, level, name, message from events \
 const AIR: &str = "select log_time_ns as ns, temperature_c, humidity_pct, pressure_hpa, outside_level_db \
     from environment where run_id = $1 and log_time_ns between $2 and $3 order by log_time_ns limit 2000";
 
-impl Asked {
+impl CatalogueRequest {
     /// The pair that the path names.
-    fn pair(&self) -> Result<usize, Fault> {
+    fn pair(&self) -> Result<usize, RequestFault> {
         let (text, pairs) = (self.part("pair_id"), self.catalogue.lake().grid().pairs().len());
         let digits = !text.is_empty() && text.bytes().all(|b| b.is_ascii_digit());
         match (digits, text.parse::<usize>()) {
             (true, Ok(pair)) if pair < pairs => Ok(pair),
             (true, _) => Err(missing(format!("pair `{text}`"), "table `pairs` lists what there is")),
-            _ => Err(Fault::request(format!("the pair is `{text}`; hint: a whole number below {pairs}"))),
+            _ => Err(RequestFault::request(format!("the pair is `{text}`; hint: a whole number below {pairs}"))),
         }
     }
 }
@@ -155,8 +155,11 @@ impl Asked {
 /// The newest measurement of the pair that the path names.
 ///
 /// # Errors
-/// [`Fault::NotFound`] where there is none.
-pub(super) async fn measurement(asked: &Asked, entry: &Entry) -> Result<(usize, Measurement), Fault> {
+/// [`RequestFault::NotFound`] if there is none.
+pub(super) async fn measurement(
+    asked: &CatalogueRequest,
+    entry: &SurfaceEntry,
+) -> Result<(usize, PairMeasurement), RequestFault> {
     let pair = asked.pair()?;
     let id = &entry.surface.surface_id;
     let found = asked.rows(MEASUREMENT, vec![text(id), number(pair)]).await?.into_iter().next();
@@ -164,16 +167,20 @@ pub(super) async fn measurement(asked: &Asked, entry: &Entry) -> Result<(usize, 
     Ok((pair, found.ok_or_else(|| missing(what(), "its run may be partial; another pair may be there"))?))
 }
 
-/// The responses of a surface and of its Flat after Foam's were subtracted, where they are known.
-pub(super) async fn reflected(asked: &Asked, entry: &Entry, pair: usize) -> Result<[Option<Vec<f64>>; 2], Fault> {
+/// The responses of a surface and of its Flat after Foam's were subtracted, if they are known.
+pub(super) async fn reflected(
+    asked: &CatalogueRequest,
+    entry: &SurfaceEntry,
+    pair: usize,
+) -> Result<[Option<Vec<f64>>; 2], RequestFault> {
     let (id, flat) = (&entry.surface.surface_id, &entry.surface.flat_reference);
-    let rows: Vec<Reflected> = asked.rows(REFLECTED, vec![text(id), text(flat), number(pair)]).await?;
+    let rows: Vec<ReflectedResponse> = asked.rows(REFLECTED, vec![text(id), text(flat), number(pair)]).await?;
     let of = |surface: &str| rows.iter().find(|row| row.surface_id == surface).and_then(|row| row.reflected.clone());
     Ok([of(id), of(flat)])
 }
 
 /// Everything about one impulse response; as an Arrow stream its samples.
-pub(super) async fn pair(asked: Asked) -> Result<Content, Fault> {
+pub(super) async fn pair(asked: CatalogueRequest) -> Result<AnswerContent, RequestFault> {
     let entry = asked.surface().await?;
     let pair = asked.pair()?;
     let responses = tokio::try_join!(measurement(&asked, entry), reflected(&asked, entry, pair));
@@ -182,13 +189,13 @@ pub(super) async fn pair(asked: Asked) -> Result<Content, Fault> {
         return samples(&asked, &measurement.ir, own.as_deref(), flat.as_deref());
     }
     let (geometry, energies, moved, curves, attempts, air) = tokio::try_join!(
-        asked.rows::<Geometry>(GEOMETRY, vec![number(pair)]),
+        asked.rows::<PairGeometry>(GEOMETRY, vec![number(pair)]),
         energies(&asked, entry, pair, &measurement.run_id),
         symmetries(&asked, entry, pair, &measurement.run_id),
-        CurveSet::read(&asked, entry, Over::Pair(pair), usize::MAX),
+        CurveSet::read(&asked, entry, PairSelection::Pair(pair), usize::MAX),
         // The controller's messages about a pair begin so.
-        asked.rows::<Event>(ATTEMPTS, vec![text(&measurement.run_id), text(&format!("pair {pair},%"))]),
-        asked.rows::<Reading>(
+        asked.rows::<RunEvent>(ATTEMPTS, vec![text(&measurement.run_id), text(&format!("pair {pair},%"))]),
+        asked.rows::<AirReading>(
             AIR,
             vec![
                 text(&measurement.run_id),
@@ -198,10 +205,10 @@ pub(super) async fn pair(asked: Asked) -> Result<Content, Fault> {
         ),
     )?;
     let geometry = geometry.into_iter().next().ok_or_else(|| missing(format!("pair {pair}"), "ask for another one"))?;
-    Content::json(&Detail {
+    AnswerContent::json(&PairDetail {
         surface_id: &entry.surface.surface_id,
         pair: geometry.pair(pair),
-        environment: Series::new(air, measurement.log_time_ns, &measurement.log_time),
+        environment: AirSeries::new(air, measurement.log_time_ns, &measurement.log_time),
         measured: &measurement.ir,
         measurement: &measurement,
         rate_hz: asked.catalogue.lake().rig().sweep.rate_hz.get(),
@@ -215,17 +222,22 @@ pub(super) async fn pair(asked: Asked) -> Result<Content, Fault> {
     })
 }
 
-impl Geometry {
-    fn pair(self, pair_id: usize) -> Pair {
+impl PairGeometry {
+    fn pair(self, pair_id: usize) -> PairDescription {
         let zone = |frequency_hz: f64, [major, minor]: [Option<f64>; 2]| {
-            Some(Fresnel { frequency_hz, major_mm: major?, minor_mm: minor? })
+            Some(FresnelEllipse { frequency_hz, major_mm: major?, minor_mm: minor? })
         };
         let fresnel = [zone(2000.0, self.low_mm), zone(40_000.0, self.high_mm)].into_iter().flatten().collect();
-        Pair { pair_id, geometry: self, fresnel }
+        PairDescription { pair_id, geometry: self, fresnel }
     }
 }
 
-async fn energies(asked: &Asked, entry: &Entry, pair: usize, run: &str) -> Result<Energies, Fault> {
+async fn energies(
+    asked: &CatalogueRequest,
+    entry: &SurfaceEntry,
+    pair: usize,
+    run: &str,
+) -> Result<PairEnergies, RequestFault> {
     let rig = asked.catalogue.lake().rig();
     let total = band_list(rig, |band| format!("tnce_{band}"));
     let band = band_list(rig, |band| if band == TOTAL { "tnce_total".into() } else { format!("tnce_band_{band}") });
@@ -235,10 +247,15 @@ async fn energies(asked: &Asked, entry: &Entry, pair: usize, run: &str) -> Resul
     let values = vec![text(&entry.surface.surface_id), number(pair), text(run)];
     let nothing = vec![None; rig.band_names().len() + 1];
     let found = asked.rows(&sql, values).await?.into_iter().next();
-    Ok(found.unwrap_or_else(|| Energies { total: nothing.clone(), band: nothing }))
+    Ok(found.unwrap_or_else(|| PairEnergies { total: nothing.clone(), band: nothing }))
 }
 
-async fn symmetries(asked: &Asked, entry: &Entry, pair: usize, run: &str) -> Result<Vec<SymmetricPair>, Fault> {
+async fn symmetries(
+    asked: &CatalogueRequest,
+    entry: &SurfaceEntry,
+    pair: usize,
+    run: &str,
+) -> Result<Vec<SymmetricPair>, RequestFault> {
     let energies = band_list(asked.catalogue.lake().rig(), |band| format!("t.tnce_{band}"));
     let sql = format!(
         "select d.symmetry, d.d4_pair_id as pair_id, d.d4_microphone as microphone, d.d4_speaker as speaker, d.swapped, \
@@ -247,7 +264,7 @@ async fn symmetries(asked: &Asked, entry: &Entry, pair: usize, run: &str) -> Res
          and t.surface_id = $1 and t.run_id = $3 order by d.symmetry"
     );
     let rows = asked.rows(&sql, vec![text(&entry.surface.surface_id), number(pair), text(run)]).await?;
-    let levels = |row: Moved| SymmetricPair {
+    let levels = |row: SymmetryRow| SymmetricPair {
         symmetry: row.symmetry,
         pair_id: row.pair_id,
         microphone: row.microphone,
@@ -258,7 +275,12 @@ async fn symmetries(asked: &Asked, entry: &Entry, pair: usize, run: &str) -> Res
     Ok(rows.into_iter().map(levels).collect())
 }
 
-fn samples(asked: &Asked, measured: &[f64], own: Option<&[f64]>, flat: Option<&[f64]>) -> Result<Content, Fault> {
+fn samples(
+    asked: &CatalogueRequest,
+    measured: &[f64],
+    own: Option<&[f64]>,
+    flat: Option<&[f64]>,
+) -> Result<AnswerContent, RequestFault> {
     let rate_hz = asked.catalogue.lake().rig().sweep.rate_hz.get();
     let times = (0..measured.len()).map(|i| Some(1000.0 * i as f64 / rate_hz));
     let column = |values: Option<&[f64]>| -> ArrayRef {
@@ -272,8 +294,8 @@ fn samples(asked: &Asked, measured: &[f64], own: Option<&[f64]>, flat: Option<&[
         ("flat_reflected", column(flat)),
     ];
     let batch = RecordBatch::try_from_iter_with_nullable(columns.map(|(name, values)| (name, values, true)));
-    Content::arrow(&batch.map_err(|e| {
+    AnswerContent::arrow(&batch.map_err(|e| {
         eprintln!("samples make no batch: {e}");
-        Fault::Internal
+        RequestFault::Internal
     })?)
 }

@@ -1,21 +1,22 @@
-//! A request's parameters: what is not as the contract wants it is refused with what would be right.
+//! A request's parameters: a value that violates the contract is refused with a hint of what is allowed.
 
 use std::ops::RangeInclusive;
 
 use axum::extract::Query;
 use axum::http::Uri;
 
-use crate::fault::Fault;
+use crate::fault::RequestFault;
 
-/// What stands behind a path's `?`.
+/// The query part of a URL, after the `?`.
 #[derive(Default)]
-pub(in super::super) struct Params(Vec<(String, String)>);
+pub(in super::super) struct RequestParams(Vec<(String, String)>);
 
-impl Params {
+impl RequestParams {
     /// # Errors
-    /// [`Fault::Request`] where it is not form-encoded.
-    pub(in super::super) fn of(uri: &Uri) -> Result<Self, Fault> {
-        let Query(pairs) = Query::try_from_uri(uri).map_err(|_| Fault::request("the parameters are not UTF-8"))?;
+    /// [`RequestFault::Request`] if it is not form-encoded.
+    pub(in super::super) fn of(uri: &Uri) -> Result<Self, RequestFault> {
+        let Query(pairs) =
+            Query::try_from_uri(uri).map_err(|_| RequestFault::request("the parameters are not UTF-8"))?;
         Ok(Self(pairs))
     }
 
@@ -30,52 +31,57 @@ impl Params {
     }
 
     /// The value of a name that may be there once.
-    pub(in super::super) fn one(&self, name: &str) -> Result<Option<&str>, Fault> {
+    pub(in super::super) fn one(&self, name: &str) -> Result<Option<&str>, RequestFault> {
         let mut values = self.all(name);
         match (values.next(), values.next()) {
             (value, None) => Ok(value),
-            _ => Err(Fault::request(format!("`{name}` is there twice"))),
+            _ => Err(RequestFault::request(format!("`{name}` is there twice"))),
         }
     }
 
     /// A whole number within bounds.
-    pub(super) fn whole(&self, name: &str, bounds: RangeInclusive<usize>) -> Result<Option<usize>, Fault> {
+    pub(super) fn whole(&self, name: &str, bounds: RangeInclusive<usize>) -> Result<Option<usize>, RequestFault> {
         let Some(text) = self.one(name)? else { return Ok(None) };
         // No sign, no spaces: the same number is one address.
         let digits = text.bytes().all(|b| b.is_ascii_digit());
         let value = text.parse().ok().filter(|n| digits && bounds.contains(n));
         value.map(Some).ok_or_else(|| {
             let (low, high) = (bounds.start(), bounds.end());
-            Fault::request(format!("`{name}` is `{text}`; hint: a whole number from {low} to {high}"))
+            RequestFault::request(format!("`{name}` is `{text}`; hint: a whole number from {low} to {high}"))
         })
     }
 
-    /// One of a few words, the first where none is given.
-    pub(in super::super) fn choice(&self, name: &str, words: &'static [&'static str]) -> Result<&'static str, Fault> {
+    /// Returns one of a few words, the first if none is given.
+    pub(in super::super) fn choice(
+        &self,
+        name: &str,
+        words: &'static [&'static str],
+    ) -> Result<&'static str, RequestFault> {
         let Some(text) = self.one(name)? else { return Ok(words[0]) };
         let known = words.iter().copied().find(|word| *word == text);
-        known.ok_or_else(|| Fault::request(format!("`{name}` is `{text}`; hint: {}", words.join(", "))))
+        known.ok_or_else(|| RequestFault::request(format!("`{name}` is `{text}`; hint: {}", words.join(", "))))
     }
 }
 
 /// Reads `lo..hi`.
 ///
 /// # Errors
-/// [`Fault::Request`] where it is not that.
-pub(super) fn range(name: &str, text: &str) -> Result<RangeInclusive<f64>, Fault> {
+/// [`RequestFault::Request`] if it is not that.
+pub(super) fn range(name: &str, text: &str) -> Result<RangeInclusive<f64>, RequestFault> {
     let number = |text: &str| text.parse::<f64>().ok().filter(|n| n.is_finite());
     let bounds = text.split_once("..").and_then(|(low, high)| Some(number(low)?..=number(high)?));
     let bounds = bounds.filter(|b| b.start() <= b.end());
-    bounds
-        .ok_or_else(|| Fault::request(format!("`{name}` is `{text}`; hint: two numbers, the lower first, as -6..0.5")))
+    bounds.ok_or_else(|| {
+        RequestFault::request(format!("`{name}` is `{text}`; hint: two numbers, the lower first, as -6..0.5"))
+    })
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    fn params(query: &str) -> Params {
-        Params::of(&format!("/x?{query}").parse().expect("a path")).expect("parameters")
+    fn params(query: &str) -> RequestParams {
+        RequestParams::of(&format!("/x?{query}").parse().expect("a path")).expect("parameters")
     }
 
     #[test]
@@ -92,7 +98,7 @@ mod tests {
         }
         assert_eq!(given.choice("order", &["asc", "desc"]).expect("the first"), "asc");
         assert!(params("order=up").choice("order", &["asc", "desc"]).is_err());
-        assert!(Params::of(&"/x?a=%ff".parse().expect("a path")).is_ok_and(|p| p.all("a").count() == 1));
+        assert!(RequestParams::of(&"/x?a=%ff".parse().expect("a path")).is_ok_and(|p| p.all("a").count() == 1));
     }
 
     #[test]

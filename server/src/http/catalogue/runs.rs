@@ -3,15 +3,15 @@
 use datafusion::common::ScalarValue;
 use serde::{Deserialize, Serialize};
 
-use super::asked::{Asked, missing, text};
-use super::content::Content;
-use crate::fault::Fault;
+use super::asked::{CatalogueRequest, missing, text};
+use super::content::AnswerContent;
+use crate::fault::RequestFault;
 
 /// Lines of a run's log that are answered.
 const MOST_EVENTS: usize = 200;
 
 #[derive(Deserialize, Serialize)]
-struct Run {
+struct RunRecord {
     surface_id: String,
     run_id: String,
     state: String,
@@ -39,9 +39,9 @@ struct Run {
     code_version: String,
 }
 
-/// What somebody or something said during a run.
+/// A log message of a run.
 #[derive(Deserialize, Serialize)]
-pub(super) struct Event {
+pub(super) struct RunEvent {
     log_time: String,
     level: String,
     name: String,
@@ -51,24 +51,24 @@ pub(super) struct Event {
 const COLUMNS: &str = "surface_id, run_id, state, missing, origin, rig, started, ended, measurements, rejected, \
     attempts, damaged, temperature_min_c, temperature_max_c, humidity_min_pct, humidity_max_pct, pressure_min_hpa, \
     pressure_max_hpa, file, file_bytes, file_sha256, recorded_by, flat_version, foam_version, code_version";
-/// An empty text stands for what is not asked for.
+/// An empty text switches its condition off.
 const CHOSEN: &str = "($1 = '' or strpos(lower(concat(run_id, ' ', surface_id, ' ', state)), $1) > 0) \
     and ($2 = '' or surface_id = $2) and ($3 = '' or state = $3)";
 
 #[derive(Serialize)]
-struct Page {
+struct RunPage {
     total: i64,
     offset: usize,
-    items: Vec<Run>,
+    items: Vec<RunRecord>,
 }
 
 #[derive(Deserialize)]
-struct Count {
+struct RunCount {
     total: i64,
 }
 
-/// A page of runs, the newest first where nothing else is asked for.
-pub(super) async fn runs(asked: Asked) -> Result<Content, Fault> {
+/// A page of runs, the newest first by default.
+pub(super) async fn runs(asked: CatalogueRequest) -> Result<AnswerContent, RequestFault> {
     let params = &asked.params;
     let column = match params.choice("sort", &["started", "surface_id", "attempts", "file_bytes"])? {
         "started" => "started_ns",
@@ -77,29 +77,30 @@ pub(super) async fn runs(asked: Asked) -> Result<Content, Fault> {
     let order = params.choice("order", &["desc", "asc"])?;
     let offset = params.whole("offset", 0..=usize::MAX)?.unwrap_or(0);
     let limit = params.whole("limit", 1..=500)?.unwrap_or(100);
-    let one = |name| Ok::<_, Fault>(params.one(name)?.unwrap_or_default());
+    let one = |name| Ok::<_, RequestFault>(params.one(name)?.unwrap_or_default());
     let chosen = vec![text(&one("q")?.to_lowercase()), text(one("surface_id")?), text(one("state")?)];
     let page =
         format!("select {COLUMNS} from runs where {CHOSEN} order by {column} {order}, run_id limit $5 offset $4");
     let count = format!("select count(*) as total from runs where {CHOSEN}");
     let whole = |n: usize| ScalarValue::Int64(Some(i64::try_from(n).unwrap_or(i64::MAX)));
     let values = chosen.iter().cloned().chain([whole(offset), whole(limit)]).collect();
-    let (items, total) = tokio::try_join!(asked.rows::<Run>(&page, values), asked.rows::<Count>(&count, chosen))?;
-    Content::json(&Page { total: total.first().map_or(0, |c| c.total), offset, items })
+    let (items, total) =
+        tokio::try_join!(asked.rows::<RunRecord>(&page, values), asked.rows::<RunCount>(&count, chosen))?;
+    AnswerContent::json(&RunPage { total: total.first().map_or(0, |c| c.total), offset, items })
 }
 
 #[derive(Serialize)]
-struct Detail {
-    run: Run,
-    topics: Vec<Topic>,
-    attachments: Vec<Attachment>,
-    quality: Vec<Quality>,
-    repeats: Vec<Repeats>,
-    events: Vec<Event>,
+struct RunDetail {
+    run: RunRecord,
+    topics: Vec<RunTopic>,
+    attachments: Vec<RunAttachment>,
+    quality: Vec<QualityCount>,
+    repeats: Vec<AttemptCount>,
+    events: Vec<RunEvent>,
 }
 
 #[derive(Serialize)]
-struct Topic {
+struct RunTopic {
     topic: String,
     schema: String,
     encoding: String,
@@ -108,27 +109,27 @@ struct Topic {
 }
 
 #[derive(Serialize)]
-struct Attachment {
+struct RunAttachment {
     name: String,
     media_type: String,
     bytes: u64,
 }
 
 #[derive(Serialize)]
-struct Quality {
+struct QualityCount {
     flag: &'static str,
     label: String,
     measurements: i64,
 }
 
 #[derive(Deserialize, Serialize)]
-struct Repeats {
+struct AttemptCount {
     attempt: i64,
     measurements: i64,
 }
 
 #[derive(Deserialize)]
-struct Flags {
+struct QualityFlags {
     clipped: i64,
     snr: i64,
     arrival: i64,
@@ -142,7 +143,7 @@ const FLAGS: &str = "select count(*) filter (where clipped_samples > 0) as clipp
     count(*) filter (where outside_level_db > $4) as outside from measurements where run_id = $1";
 
 /// One run.
-pub(super) async fn run(asked: Asked) -> Result<Content, Fault> {
+pub(super) async fn run(asked: CatalogueRequest) -> Result<AnswerContent, RequestFault> {
     let visible = asked.run()?.clone();
     let id = text(visible.run.as_str());
     let limits = &asked.catalogue.lake().rig().validation;
@@ -156,13 +157,13 @@ pub(super) async fn run(asked: Asked) -> Result<Content, Fault> {
     let (session, service) = (asked.view.session.clone(), asked.catalogue.service());
     let (contents, run, repeats, flags, events) = tokio::try_join!(
         service.plan(asked.view.session.client(), async move { Ok(session.contents(&visible).await?) }),
-        asked.rows::<Run>(&one, vec![id.clone()]),
-        asked.rows::<Repeats>(REPEATS, vec![id.clone()]),
-        asked.rows::<Flags>(FLAGS, flags),
-        asked.rows::<Event>(&log, vec![id.clone()]),
+        asked.rows::<RunRecord>(&one, vec![id.clone()]),
+        asked.rows::<AttemptCount>(REPEATS, vec![id.clone()]),
+        asked.rows::<QualityFlags>(FLAGS, flags),
+        asked.rows::<RunEvent>(&log, vec![id.clone()]),
     )?;
     let run = run.into_iter().next().ok_or_else(|| missing("this run".into(), "ask again"))?;
-    let topic = |t: echolake_query::Topic| Topic {
+    let topic = |t: echolake_query::Topic| RunTopic {
         topic: t.topic,
         schema: t.schema,
         encoding: t.encoding,
@@ -170,8 +171,8 @@ pub(super) async fn run(asked: Asked) -> Result<Content, Fault> {
         bytes: t.bytes,
     };
     let attachment =
-        |a: echolake_query::Attachment| Attachment { name: a.name, media_type: a.media_type, bytes: a.bytes };
-    Content::json(&Detail {
+        |a: echolake_query::Attachment| RunAttachment { name: a.name, media_type: a.media_type, bytes: a.bytes };
+    AnswerContent::json(&RunDetail {
         run,
         topics: contents.topics.into_iter().map(topic).collect(),
         attachments: contents.attachments.into_iter().map(attachment).collect(),
@@ -181,8 +182,8 @@ pub(super) async fn run(asked: Asked) -> Result<Content, Fault> {
     })
 }
 
-fn quality(flags: &Flags, limits: &echolake_schema::rig::Validation) -> Vec<Quality> {
-    let flag = |flag, label, measurements| Quality { flag, label, measurements };
+fn quality(flags: &QualityFlags, limits: &echolake_schema::rig::Validation) -> Vec<QualityCount> {
+    let flag = |flag, label, measurements| QualityCount { flag, label, measurements };
     vec![
         flag("clipped", "clipped samples".to_owned(), flags.clipped),
         flag("snr", format!("signal to noise below {} dB", limits.snr_db), flags.snr),

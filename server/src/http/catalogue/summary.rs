@@ -1,20 +1,20 @@
-//! All surfaces in short, read once a snapshot and held in memory: what facets, map and correlations begin with.
+//! All surfaces in short, read once per snapshot and cached: the input of facets, map and correlations.
 
 use std::collections::HashMap;
 
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 
-use super::asked::Asked;
-use super::lake::{Band, bands};
-use crate::fault::Fault;
+use super::asked::CatalogueRequest;
+use super::lake::{BandDescription, bands};
+use crate::fault::RequestFault;
 
 /// Nanoseconds of a day.
 const DAY_NS: f64 = 86_400e9;
 
 /// A surface as the pages know it.
 #[derive(Debug, Serialize)]
-pub(super) struct Surface {
+pub(super) struct SurfaceSummary {
     pub(super) surface_id: String,
     pub(super) run_id: Option<String>,
     panel: String,
@@ -37,20 +37,20 @@ pub(super) struct Surface {
 }
 
 /// A surface, and what it is found and compared by.
-pub(super) struct Entry {
-    pub(super) surface: Surface,
-    /// Of its relief's generator.
+pub(super) struct SurfaceEntry {
+    pub(super) surface: SurfaceSummary,
+    /// Parameters of its relief's generator.
     pub(super) parameters: Map<String, Value>,
     pub(super) mesh_triangles: Option<i64>,
     pub(super) mesh_watertight: Option<bool>,
     pub(super) reflection_factor: Option<f64>,
     /// Start of its run, days since 1970.
     pub(super) day: Option<f64>,
-    /// What the search looks in, in small letters.
+    /// The searched text, in lower case.
     pub(super) words: String,
 }
 
-impl Entry {
+impl SurfaceEntry {
     /// From the lowest to the highest point.
     pub(super) fn relief_range_mm(&self) -> Option<f64> {
         Some(self.surface.relief_max_mm? - self.surface.relief_min_mm?)
@@ -58,14 +58,14 @@ impl Entry {
 }
 
 /// All surfaces, by name.
-pub(super) struct Summary {
-    pub(super) bands: Vec<Band>,
-    pub(super) entries: Vec<Entry>,
+pub(super) struct CatalogueSummary {
+    pub(super) bands: Vec<BandDescription>,
+    pub(super) entries: Vec<SurfaceEntry>,
     places: HashMap<String, usize>,
 }
 
 #[derive(Deserialize)]
-struct Row {
+struct SurfaceRow {
     surface_id: String,
     run_id: Option<String>,
     panel: String,
@@ -90,7 +90,7 @@ struct Row {
 }
 
 #[derive(Deserialize)]
-struct Stat {
+struct BandStatistic {
     surface_id: String,
     band: String,
     p90_mean_db: Option<f64>,
@@ -98,7 +98,7 @@ struct Stat {
 }
 
 /// Level and spread of a surface by band.
-type Stats = HashMap<String, HashMap<String, (Option<f64>, Option<f64>)>>;
+type SurfaceLevels = HashMap<String, HashMap<String, (Option<f64>, Option<f64>)>>;
 
 const SURFACES: &str = "select s.surface_id, s.run_id, s.panel, s.side, s.typology, s.macrostructure, s.mesostructure, \
     s.microstructure, s.material, s.flat_reference, s.foam_reference, s.parameters, s.mesh_triangles, s.mesh_watertight, \
@@ -106,13 +106,15 @@ const SURFACES: &str = "select s.surface_id, s.run_id, s.panel, s.side, s.typolo
     from surfaces s left join runs r on r.run_id = s.run_id order by s.surface_id, s.run_id";
 const STATS: &str = "select surface_id, band, p90_mean_db, spread_db from surface_stats order by surface_id, run_id";
 
-impl Summary {
+impl CatalogueSummary {
     /// # Errors
     /// Those of its queries.
-    pub(super) async fn read(asked: &Asked) -> Result<Self, Fault> {
-        let (rows, stats) =
-            tokio::try_join!(asked.rows::<Row>(SURFACES, Vec::new()), asked.rows::<Stat>(STATS, Vec::new()))?;
-        let mut levels = Stats::new();
+    pub(super) async fn read(asked: &CatalogueRequest) -> Result<Self, RequestFault> {
+        let (rows, stats) = tokio::try_join!(
+            asked.rows::<SurfaceRow>(SURFACES, Vec::new()),
+            asked.rows::<BandStatistic>(STATS, Vec::new())
+        )?;
+        let mut levels = SurfaceLevels::new();
         for stat in stats {
             levels.entry(stat.surface_id).or_default().insert(stat.band, (stat.p90_mean_db, stat.spread_db));
         }
@@ -126,12 +128,12 @@ impl Summary {
     }
 
     /// The surface of a name.
-    pub(super) fn entry(&self, surface: &str) -> Option<&Entry> {
+    pub(super) fn entry(&self, surface: &str) -> Option<&SurfaceEntry> {
         self.places.get(surface).map(|place| &self.entries[*place])
     }
 }
 
-fn entry(row: Row, levels: &Stats, bands: &[Band]) -> Entry {
+fn entry(row: SurfaceRow, levels: &SurfaceLevels, bands: &[BandDescription]) -> SurfaceEntry {
     let of = |surface: &str| -> Vec<_> {
         let own = levels.get(surface);
         bands.iter().map(|band| own.and_then(|own| own.get(&band.key)).copied().unwrap_or_default()).collect()
@@ -150,14 +152,14 @@ fn entry(row: Row, levels: &Stats, bands: &[Band]) -> Entry {
         &some(&row.material),
         &parameters,
     ];
-    Entry {
+    SurfaceEntry {
         words: words.map(|w| w.to_lowercase()).join(" "),
         parameters: serde_json::from_str(&parameters).unwrap_or_default(),
         mesh_triangles: row.mesh_triangles,
         mesh_watertight: row.mesh_watertight,
         reflection_factor: row.reflection_factor,
         day: row.started_ns.map(|ns| ns / DAY_NS),
-        surface: Surface {
+        surface: SurfaceSummary {
             surface_id: row.surface_id,
             run_id: row.run_id,
             panel: row.panel,

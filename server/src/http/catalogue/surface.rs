@@ -5,27 +5,27 @@ use std::collections::HashMap;
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 
-use super::asked::{Asked, number, text};
-use super::content::Content;
+use super::asked::{CatalogueRequest, number, text};
+use super::content::AnswerContent;
 use super::lake::{band_list, levels_db};
-use super::summary::Surface;
-use crate::fault::Fault;
+use super::summary::SurfaceSummary;
+use crate::fault::RequestFault;
 
 #[derive(Serialize)]
-struct Detail<'a> {
-    surface: &'a Surface,
+struct SurfaceDetail<'a> {
+    surface: &'a SurfaceSummary,
     parameters: &'a Map<String, Value>,
     mesh_triangles: Option<i64>,
     mesh_watertight: Option<bool>,
     reflection_factor: Option<f64>,
     runs: Vec<String>,
-    statistics: Vec<Statistics>,
+    statistics: Vec<BandStatistics>,
     flat_mean: Vec<Option<f64>>,
     mean: Vec<Option<f64>>,
 }
 
 #[derive(Deserialize, Serialize)]
-struct Statistics {
+struct BandStatistics {
     band: String,
     measurements: i64,
     p90_mean_db: Option<f64>,
@@ -38,13 +38,13 @@ struct Statistics {
 }
 
 #[derive(Deserialize)]
-struct Means {
+struct SurfaceMeans {
     surface_id: String,
     means: Vec<Option<f64>>,
 }
 
 #[derive(Deserialize)]
-struct Run {
+struct SurfaceRun {
     run_id: String,
 }
 
@@ -52,16 +52,16 @@ const STATISTICS: &str = "select band, measurements, p90_mean_db, p5_db, p50_db,
     from surface_stats where surface_id = $1 order by run_id desc";
 
 /// One surface with its statistics and means against Flat.
-pub(super) async fn surface(asked: Asked) -> Result<Content, Fault> {
+pub(super) async fn surface(asked: CatalogueRequest) -> Result<AnswerContent, RequestFault> {
     let entry = asked.surface().await?;
     let (id, flat) = (&entry.surface.surface_id, &entry.surface.flat_reference);
     let means = band_list(asked.catalogue.lake().rig(), |band| format!("avg(tnce_{band})"));
     let means =
         format!("select surface_id, {means} as means from tnce where surface_id in ($1, $2) group by surface_id");
     let (found, rows, runs) = tokio::try_join!(
-        asked.rows::<Statistics>(STATISTICS, vec![text(id)]),
-        asked.rows::<Means>(&means, vec![text(id), text(flat)]),
-        asked.rows::<Run>("select run_id from runs where surface_id = $1 order by started_ns", vec![text(id)]),
+        asked.rows::<BandStatistics>(STATISTICS, vec![text(id)]),
+        asked.rows::<SurfaceMeans>(&means, vec![text(id), text(flat)]),
+        asked.rows::<SurfaceRun>("select run_id from runs where surface_id = $1 order by started_ns", vec![text(id)]),
     )?;
     let bands = &asked.summary().await?.bands;
     let mean = |surface: &str| {
@@ -70,7 +70,7 @@ pub(super) async fn surface(asked: Asked) -> Result<Content, Fault> {
     };
     // The newest run's row of each band, in the order of the bands.
     let mut by_band: HashMap<_, _> = found.into_iter().rev().map(|row| (row.band.clone(), row)).collect();
-    Content::json(&Detail {
+    AnswerContent::json(&SurfaceDetail {
         surface: &entry.surface,
         parameters: &entry.parameters,
         mesh_triangles: entry.mesh_triangles,
@@ -84,7 +84,7 @@ pub(super) async fn surface(asked: Asked) -> Result<Content, Fault> {
 }
 
 #[derive(Serialize)]
-struct Grid<'a> {
+struct SurfaceGrid<'a> {
     surface_id: &'a str,
     microphone: usize,
     over: &'static str,
@@ -94,21 +94,21 @@ struct Grid<'a> {
 }
 
 #[derive(Deserialize)]
-struct Cell {
+struct GridCell {
     pair_id: i32,
     microphone: usize,
     speaker: usize,
     energies: Vec<Option<f64>>,
 }
 
-/// What the total is over is Flat's total either way.
+/// The normalisation of the bands. The total is always normalised by Flat's total.
 const OVER: [&str; 2] = ["flat-total", "flat-band"];
 
 /// TNCE over the grid for one microphone point; a pair that was measured the other way round is used by reciprocity.
-pub(super) async fn grid(asked: Asked) -> Result<Content, Fault> {
+pub(super) async fn grid(asked: CatalogueRequest) -> Result<AnswerContent, RequestFault> {
     let entry = asked.surface().await?;
     let microphone =
-        asked.microphone()?.ok_or_else(|| Fault::request("`microphone` is missing; hint: a grid point"))?;
+        asked.microphone()?.ok_or_else(|| RequestFault::request("`microphone` is missing; hint: a grid point"))?;
     let over = asked.params.choice("over", &OVER)?;
     let column = |band: &str| match band == super::lake::TOTAL || over == OVER[0] {
         true => format!("avg(tnce_{band})"),
@@ -119,12 +119,12 @@ pub(super) async fn grid(asked: Asked) -> Result<Content, Fault> {
         "select pair_id, microphone, speaker, {energies} as energies from tnce \
          where surface_id = $1 and (microphone = $2 or speaker = $2) group by pair_id, microphone, speaker"
     );
-    let mut cells: Vec<Cell> = asked.rows(&sql, vec![text(&entry.surface.surface_id), number(microphone)]).await?;
-    // Where both directions were measured, the one that was asked for counts.
+    let mut cells: Vec<GridCell> = asked.rows(&sql, vec![text(&entry.surface.surface_id), number(microphone)]).await?;
+    // If both directions were measured, the requested one counts.
     cells.sort_by_key(|cell| cell.microphone == microphone);
     let points = asked.catalogue.lake().grid().points().len();
     let bands = asked.summary().await?.bands.len();
-    let mut grid = Grid {
+    let mut grid = SurfaceGrid {
         surface_id: &entry.surface.surface_id,
         microphone,
         over,
@@ -144,5 +144,5 @@ pub(super) async fn grid(asked: Asked) -> Result<Content, Fault> {
             band[other] = level;
         }
     }
-    Content::json(&grid)
+    AnswerContent::json(&grid)
 }

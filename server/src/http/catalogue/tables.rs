@@ -1,21 +1,21 @@
 //! Tables: what can be asked, with units, and the Parquet files of their snapshot.
 
 use arrow::datatypes::Field;
-use echolake_schema::tables::{COMMENT, Table as Known, UNIT};
+use echolake_schema::tables::{COMMENT, Table, UNIT};
 use serde::Serialize;
 
-use super::asked::{Asked, missing};
-use super::content::Content;
-use crate::fault::Fault;
+use super::asked::{CatalogueRequest, missing};
+use super::content::AnswerContent;
+use crate::fault::RequestFault;
 
 #[derive(Serialize)]
-struct Table {
+struct TableDescription {
     name: &'static str,
-    columns: Vec<Column>,
+    columns: Vec<ColumnDescription>,
 }
 
 #[derive(Serialize)]
-struct Column {
+struct ColumnDescription {
     name: String,
     #[serde(rename = "type")]
     kind: String,
@@ -24,7 +24,7 @@ struct Column {
     comment: Option<String>,
 }
 
-impl Column {
+impl ColumnDescription {
     fn of(field: &Field) -> Self {
         let metadata = |key: &str| field.metadata().get(key).filter(|text| !text.is_empty()).cloned();
         Self {
@@ -38,34 +38,34 @@ impl Column {
 }
 
 /// The tables and views.
-pub(super) async fn tables(asked: Asked) -> Result<Content, Fault> {
-    let table = |(name, schema): (_, arrow::datatypes::SchemaRef)| Table {
+pub(super) async fn tables(asked: CatalogueRequest) -> Result<AnswerContent, RequestFault> {
+    let table = |(name, schema): (_, arrow::datatypes::SchemaRef)| TableDescription {
         name,
-        columns: schema.fields().iter().map(|f| Column::of(f)).collect(),
+        columns: schema.fields().iter().map(|f| ColumnDescription::of(f)).collect(),
     };
-    Content::json(&asked.catalogue.service().tables().into_iter().map(table).collect::<Vec<_>>())
+    AnswerContent::json(&asked.catalogue.service().tables().into_iter().map(table).collect::<Vec<_>>())
 }
 
 #[derive(Serialize)]
-struct File<'a> {
+struct TableFile<'a> {
     file: &'a str,
     bytes: u64,
     rows: Option<u64>,
 }
 
 /// The Parquet files of a table.
-pub(super) async fn files(asked: Asked) -> Result<Content, Fault> {
+pub(super) async fn files(asked: CatalogueRequest) -> Result<AnswerContent, RequestFault> {
     let files = asked.view.snapshot.files(table(asked.part("table"))?).iter();
     let file = |file: &'_ echolake_lake::DataFile| {
         let rows = Some(file.visible_rows());
         file.path.filename().map(|name| (name.to_owned(), file.bytes, rows))
     };
     let files: Vec<_> = files.filter_map(file).collect();
-    let files = files.iter().map(|(file, bytes, rows)| File { file, bytes: *bytes, rows: *rows });
-    Content::json(&files.collect::<Vec<_>>())
+    let files = files.iter().map(|(file, bytes, rows)| TableFile { file, bytes: *bytes, rows: *rows });
+    AnswerContent::json(&files.collect::<Vec<_>>())
 }
 
 /// The table of a name.
-pub(in super::super) fn table(name: &str) -> Result<Known, Fault> {
-    Known::by_name(name).ok_or_else(|| missing(format!("table `{name}`"), "GET /api/v1/tables lists what there is"))
+pub(in super::super) fn table(name: &str) -> Result<Table, RequestFault> {
+    Table::by_name(name).ok_or_else(|| missing(format!("table `{name}`"), "GET /api/v1/tables lists what there is"))
 }

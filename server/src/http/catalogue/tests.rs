@@ -32,5 +32,5 @@ fn the_contract_knows_every_code() {
     let document: Value = serde_json::from_str(openapi::DOCUMENT).expect("JSON");
     let known = &document["components"]["schemas"]["Problem"]["properties"]["code"]["enum"];
     let known: BTreeSet<_> = known.as_array().expect("codes").iter().filter_map(Value::as_str).collect();
-    assert_eq!(known, crate::fault::Code::ALL.iter().map(|code| code.name()).collect());
+    assert_eq!(known, crate::fault::FaultCode::ALL.iter().map(|code| code.name()).collect());
 }

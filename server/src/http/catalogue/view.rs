@@ -1,4 +1,4 @@
-//! The lake as one snapshot shows it, with what was computed of it: a new snapshot begins anew.
+//! The lake as one snapshot shows it, with cached results: a new snapshot begins with an empty cache.
 
 use std::collections::{HashMap, HashSet, VecDeque};
 use std::sync::{Arc, Mutex, PoisonError};
@@ -11,13 +11,13 @@ use object_store::path::Path as StorePath;
 use sha2::{Digest as _, Sha256};
 use tokio::sync::OnceCell;
 
-use super::kept::Answers;
-use super::map::Places;
-use super::summary::Summary;
-use crate::fault::Fault;
-use crate::service::Service;
+use super::kept::AnswerCache;
+use super::map::SurfacePositions;
+use super::summary::CatalogueSummary;
+use crate::fault::RequestFault;
+use crate::service::QueryService;
 
-/// What the catalogue's own queries may take: they read a surface at most, and all surfaces once a snapshot.
+/// Time limit of the catalogue's own queries: they read a surface at most, and all surfaces once per snapshot.
 const LONGEST: Duration = Duration::from_secs(60);
 /// Files of earlier snapshots that are remembered.
 const EARLIER: usize = 20_000;
@@ -25,25 +25,25 @@ const EARLIER: usize = 20_000;
 const VERSION_BYTES: usize = 8;
 
 /// One snapshot.
-pub(in super::super) struct View {
+pub(in super::super) struct SnapshotView {
     /// Changes with every snapshot, and with the program.
     pub(in super::super) version: String,
     pub(in super::super) snapshot: Arc<Snapshot>,
     pub(super) session: Arc<Session>,
-    pub(super) answers: Answers,
-    pub(super) summary: OnceCell<Summary>,
-    pub(super) places: OnceCell<Places>,
-    /// By their text, of which there are few: values are bound.
+    pub(super) answers: AnswerCache,
+    pub(super) summary: OnceCell<CatalogueSummary>,
+    pub(super) places: OnceCell<SurfacePositions>,
+    /// Prepared queries by their text; there are few texts, because values are bound.
     prepared: Mutex<HashMap<String, Arc<Prepared>>>,
 }
 
-impl View {
+impl SnapshotView {
     fn new(snapshot: Arc<Snapshot>, session: Arc<Session>) -> Self {
         Self {
             version: version(&snapshot),
             snapshot,
             session,
-            answers: Answers::default(),
+            answers: AnswerCache::default(),
             summary: OnceCell::new(),
             places: OnceCell::new(),
             prepared: Mutex::default(),
@@ -64,7 +64,7 @@ impl View {
     }
 }
 
-// What a snapshot shows is named by its files.
+// The version of a snapshot: a digest of its files' names and visible rows.
 fn version(snapshot: &Snapshot) -> String {
     let mut digest = Sha256::new();
     digest.update(env!("CARGO_PKG_VERSION"));
@@ -79,13 +79,13 @@ fn version(snapshot: &Snapshot) -> String {
 
 /// A file of a table.
 #[derive(Debug, Clone)]
-pub(in super::super) struct Shown {
+pub(in super::super) struct VisibleFile {
     table: Table,
     pub(in super::super) path: StorePath,
     pub(in super::super) bytes: u64,
 }
 
-impl Shown {
+impl VisibleFile {
     fn of(table: Table, file: &DataFile) -> Self {
         Self { table, path: file.path.clone(), bytes: file.bytes }
     }
@@ -97,22 +97,22 @@ impl Shown {
 
 /// The newest snapshot that was seen.
 #[derive(Default)]
-pub(super) struct Views(Mutex<Seen>);
+pub(super) struct SnapshotViews(Mutex<ViewHistory>);
 
 #[derive(Default)]
-struct Seen {
-    view: Option<Arc<View>>,
-    /// Files that earlier snapshots showed: they stay until `vacuum` removes them, and who reads by a manifest of then
-    /// goes on.
-    earlier: VecDeque<Shown>,
+struct ViewHistory {
+    view: Option<Arc<SnapshotView>>,
+    /// Files that earlier snapshots showed: they stay until `vacuum` removes them, and clients that read by a manifest
+    /// of that time can continue.
+    earlier: VecDeque<VisibleFile>,
 }
 
-impl Views {
+impl SnapshotViews {
     /// The lake as it is now.
     ///
     /// # Errors
-    /// Where it cannot be read.
-    pub(super) async fn current(&self, service: &Service) -> Result<Arc<View>, Fault> {
+    /// The snapshot cannot be read.
+    pub(super) async fn current(&self, service: &QueryService) -> Result<Arc<SnapshotView>, RequestFault> {
         let known = self.seen().view.clone();
         let session = match &known {
             Some(view) => view.session.clone(),
@@ -124,7 +124,7 @@ impl Views {
         match seen.view.as_ref().filter(|view| Arc::ptr_eq(&view.snapshot, &snapshot)) {
             Some(view) => Ok(view.clone()),
             None => {
-                let view = Arc::new(View::new(snapshot, session));
+                let view = Arc::new(SnapshotView::new(snapshot, session));
                 let before = seen.view.replace(view.clone());
                 let gone = before.map(|before| gone(&before.snapshot, &view.snapshot)).unwrap_or_default();
                 seen.earlier.extend(gone);
@@ -136,30 +136,30 @@ impl Views {
     }
 
     /// A file that a view shows, or that an earlier one did.
-    pub(super) fn shown(&self, view: &View, table: Table, name: &str) -> Option<Shown> {
+    pub(super) fn shown(&self, view: &SnapshotView, table: Table, name: &str) -> Option<VisibleFile> {
         let now = view.snapshot.files(table).iter().find(|file| file.path.filename() == Some(name));
         let earlier = || self.seen().earlier.iter().find(|file| file.is(table, name)).cloned();
-        now.map(|file| Shown::of(table, file)).or_else(earlier)
+        now.map(|file| VisibleFile::of(table, file)).or_else(earlier)
     }
 
-    fn seen(&self) -> std::sync::MutexGuard<'_, Seen> {
+    fn seen(&self) -> std::sync::MutexGuard<'_, ViewHistory> {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
-// What a snapshot shows and the next does not.
-fn gone(before: &Snapshot, after: &Snapshot) -> Vec<Shown> {
+// The files that a snapshot shows and the next does not.
+fn gone(before: &Snapshot, after: &Snapshot) -> Vec<VisibleFile> {
     let mut gone = Vec::new();
     for table in Table::ALL {
         let stay: HashSet<_> = after.files(table).iter().map(|file| &file.path).collect();
         let left = before.files(table).iter().filter(|file| !stay.contains(&file.path));
-        gone.extend(left.map(|file| Shown::of(table, file)));
+        gone.extend(left.map(|file| VisibleFile::of(table, file)));
     }
     gone
 }
 
-// Who may ask was found out before; how much their queries of their own may take is no matter of these.
-fn session(service: &Service) -> Arc<Session> {
+// The client was authorised before; the quota of its own queries does not apply to these.
+fn session(service: &QueryService) -> Arc<Session> {
     let quota = Quota { time: Some(LONGEST), ..Quota::default() };
     Arc::new(service.session(&Arc::new(Client::new("catalogue", quota))))
 }

@@ -1,11 +1,11 @@
-//! `GET /api/v1/surfaces/{surface_id}/pairs/{pair_id}/ir.wav`: a response to listen to, slowed down to full scale.
+//! `GET /api/v1/surfaces/{surface_id}/pairs/{pair_id}/ir.wav`: an audible response, slowed down to full scale.
 
-use super::asked::Asked;
-use super::content::Content;
+use super::asked::CatalogueRequest;
+use super::content::AnswerContent;
 use super::pair::{measurement, reflected};
-use crate::fault::Fault;
+use crate::fault::RequestFault;
 
-/// The panels are a tenth of the walls that they stand for: so are the wavelengths.
+/// The panels are models of walls at a tenth of their size: the wavelengths are a tenth, too.
 const SCALE: usize = 10;
 /// IEEE floats, in WAVE's words.
 const FLOATS: u16 = 3;
@@ -14,7 +14,7 @@ const SAMPLE_BYTES: u16 = 4;
 const HEAD: usize = 58;
 
 /// The response as 32-bit float WAV, whose rate is the rig's over `slowdown`.
-pub(super) async fn wav(asked: Asked) -> Result<Content, Fault> {
+pub(super) async fn wav(asked: CatalogueRequest) -> Result<AnswerContent, RequestFault> {
     let entry = asked.surface().await?;
     let signal = asked.params.choice("signal", &["reflected", "measured"])?;
     let slowdown = asked.params.whole("slowdown", 1..=100)?.unwrap_or(SCALE);
@@ -29,9 +29,10 @@ pub(super) async fn wav(asked: Asked) -> Result<Content, Fault> {
     };
     let hint = "its Foam is missing; ask for signal=measured";
     let what = || format!("pair {pair} of surface `{id}`");
-    let samples = samples.ok_or_else(|| Fault::NoData { what: what(), data: "reflected response", hint })?;
+    let samples = samples.ok_or_else(|| RequestFault::NoData { what: what(), data: "reflected response", hint })?;
     let rate_hz = asked.catalogue.lake().rig().sweep.rate_hz.get() / slowdown as f64;
-    Ok(Content::new("audio/wav", file(&samples, rate_hz.round() as u32)).named(format!("{id}-{pair}-{signal}.wav")))
+    Ok(AnswerContent::new("audio/wav", file(&samples, rate_hz.round() as u32))
+        .named(format!("{id}-{pair}-{signal}.wav")))
 }
 
 fn file(samples: &[f64], rate_hz: u32) -> Vec<u8> {

@@ -10,46 +10,45 @@ use echolake_query::{Client, Error as QueryError};
 use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc};
 use tokio::task::JoinSet;
 
-use crate::fault::Fault;
-use crate::metrics::Protocol;
+use crate::fault::RequestFault;
+use crate::metrics::ServerProtocol;
 use crate::running::{WAITING, finish};
-use crate::service::Service;
+use crate::service::QueryService;
 
-/// How long a slice waits for its reader to take the next piece.
+/// Time for which a slice waits for its reader to take the next piece.
 const PATIENCE: Duration = Duration::from_secs(300);
 
-/// How long a slice waits for a place among what its client runs: work that was broken off gives its own back a moment
-/// later.
+/// Time for which a slice waits for a query permit of its client: cancelled work releases its own a moment later.
 const HANDOVER: Duration = Duration::from_secs(1);
 
 /// A slice that is being cut.
-pub(super) struct Cutting {
+pub(super) struct SliceTask {
     pieces: mpsc::Receiver<Bytes>,
-    task: JoinSet<Result<(), Fault>>,
+    task: JoinSet<Result<(), RequestFault>>,
 }
 
-/// What a slice takes up of the server.
-pub(super) struct Room {
+/// Server resources that a slice occupies.
+pub(super) struct SliceResources {
     pub(super) place: OwnedSemaphorePermit,
-    /// Those who are worked at have one.
+    /// The permits of slices that are being worked on.
     pub(super) turns: Arc<Semaphore>,
 }
 
-impl Cutting {
+impl SliceTask {
     /// Begins, in one of its client's places.
     pub(super) fn begin(
-        service: &Service,
+        service: &QueryService,
         client: &Arc<Client>,
         snapshot: Arc<Snapshot>,
         params: SliceParams,
-        room: Room,
+        room: SliceResources,
     ) -> Self {
         let (to, pieces) = mpsc::channel(WAITING);
         let (of, client) = (service.clone(), client.clone());
-        let Room { place: room, turns } = room;
+        let SliceResources { place: room, turns } = room;
         let task = service.spawn(async move {
             let work = async {
-                let _held = (client.place_within(HANDOVER).await?, room, of.metrics().begin(Protocol::Http));
+                let _held = (client.place_within(HANDOVER).await?, room, of.metrics().begin(ServerProtocol::Http));
                 cut(&of, &snapshot, params, client.quota().time, &turns, to).await
             };
             work.await.inspect_err(|fault| of.metrics().failed(fault.code()))
@@ -61,7 +60,7 @@ impl Cutting {
     ///
     /// # Errors
     /// Why the slice cannot be cut, or not to its end.
-    pub(super) async fn next(&mut self) -> Result<Option<Bytes>, Fault> {
+    pub(super) async fn next(&mut self) -> Result<Option<Bytes>, RequestFault> {
         match self.pieces.recv().await {
             Some(piece) => Ok(Some(piece)),
             None => finish(&mut self.task).await.map(|()| None),
@@ -70,13 +69,13 @@ impl Cutting {
 }
 
 async fn cut(
-    service: &Service,
+    service: &QueryService,
     snapshot: &Snapshot,
     params: SliceParams,
     limit: Option<Duration>,
     turns: &Semaphore,
     to: mpsc::Sender<Bytes>,
-) -> Result<(), Fault> {
+) -> Result<(), RequestFault> {
     let mut begun = Instant::now();
     let mut worked = Duration::ZERO;
     let mut slice = Slice::open(service.lake(), snapshot, params).await?;
@@ -88,10 +87,10 @@ async fn cut(
         if let Some(limit) = limit.filter(|limit| worked > *limit) {
             return Err(QueryError::TimeLimit { limit }.into());
         }
-        // Nobody is there any more where sending fails.
+        // If sending fails, the reader is gone.
         match tokio::time::timeout(PATIENCE, to.send(piece)).await {
             Ok(Ok(())) => {}
-            _ => return Err(Fault::Cancelled),
+            _ => return Err(RequestFault::Cancelled),
         }
         // Never closed; a slice begins without a turn, so that its first bytes are early.
         turn = turns.acquire().await.ok();

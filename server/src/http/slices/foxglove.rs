@@ -1,6 +1,6 @@
-//! Foxglove's remote data loader: what there is to load, as its manifest says it (`manifest_schema.json` of the SDK's
-//! conformance suite). Runs that are named and not narrowed down are static files, read by ranges; all else is a source
-//! that streams a run's slice, ascending in time. Who may read is asked here and again where the data are.
+//! Foxglove's remote data loader: the manifest of what can be loaded (`manifest_schema.json` of the SDK's conformance
+//! suite). Named runs without a narrower selection are static files, read by ranges; all else is a source that streams
+//! a run's slice, ascending in time. Access is checked here and again when the data are requested.
 
 use axum::extract::State;
 use axum::http::{HeaderMap, Uri};
@@ -13,24 +13,24 @@ use echolake_schema::RunId;
 use serde::Serialize;
 
 use super::super::files::RUN;
-use super::super::problem::Problem;
+use super::super::problem::ProblemResponse;
 use super::question::MOST_RUNS;
 use super::selection::digest;
-use super::{Question, Request, SLICE, Slices};
-use crate::fault::Fault;
+use super::{SLICE, SliceQuery, SliceRequest, SliceService};
+use crate::fault::RequestFault;
 
 /// The manifest.
 pub(in crate::http) const MANIFEST: &str = "/api/v1/foxglove/manifest";
 
 #[derive(Serialize)]
-struct Manifest {
+struct FoxgloveManifest {
     name: String,
-    sources: Vec<Source>,
+    sources: Vec<FoxgloveSource>,
 }
 
 #[derive(Serialize)]
 #[serde(untagged, rename_all_fields = "camelCase")]
-enum Source {
+enum FoxgloveSource {
     Static {
         url: String,
         supports_range_requests: bool,
@@ -39,8 +39,8 @@ enum Source {
         url: String,
         /// The key that the loader keeps the data by, for everybody.
         id: String,
-        topics: Vec<Topic>,
-        schemas: Vec<Schema>,
+        topics: Vec<FoxgloveTopic>,
+        schemas: Vec<FoxgloveSchema>,
         start_time: String,
         end_time: String,
     },
@@ -48,7 +48,7 @@ enum Source {
 
 #[derive(Serialize)]
 #[serde(rename_all = "camelCase")]
-struct Topic {
+struct FoxgloveTopic {
     name: String,
     message_encoding: String,
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -56,15 +56,19 @@ struct Topic {
 }
 
 #[derive(Serialize)]
-struct Schema {
+struct FoxgloveSchema {
     id: u16,
     name: String,
     encoding: String,
     data: String,
 }
 
-/// Answers with the manifest of what is asked for.
-pub(super) async fn manifest(State(slices): State<Slices>, uri: Uri, headers: HeaderMap) -> Result<Response, Problem> {
+/// Answers with the manifest of the requested data.
+pub(super) async fn manifest(
+    State(slices): State<SliceService>,
+    uri: Uri,
+    headers: HeaderMap,
+) -> Result<Response, ProblemResponse> {
     let request = slices.request(&uri, &headers).await?;
     let manifest = match request.question.is_of_whole_runs() {
         true => whole_runs(&request.question),
@@ -73,46 +77,53 @@ pub(super) async fn manifest(State(slices): State<Slices>, uri: Uri, headers: He
     Ok(axum::Json(manifest).into_response())
 }
 
-fn whole_runs(question: &Question) -> Manifest {
+fn whole_runs(question: &SliceQuery) -> FoxgloveManifest {
     let url = |run: &RunId| RUN.replace("{run_id}", run.as_str());
-    let source = |run: &RunId| Source::Static { url: url(run), supports_range_requests: true };
+    let source = |run: &RunId| FoxgloveSource::Static { url: url(run), supports_range_requests: true };
     let names: Vec<_> = question.runs.iter().map(RunId::as_str).collect();
-    Manifest { name: names.join(", "), sources: question.runs.iter().map(source).collect() }
+    FoxgloveManifest { name: names.join(", "), sources: question.runs.iter().map(source).collect() }
 }
 
-// A source a run: within a run a topic has one schema, and what is added to the lake leaves the other runs' keys alone.
-async fn streamed(slices: &Slices, mut request: Request) -> Result<Manifest, Fault> {
+// One source per run: within a run a topic has one schema, and adding to the lake does not change other runs' keys.
+async fn streamed(slices: &SliceService, mut request: SliceRequest) -> Result<FoxgloveManifest, RequestFault> {
     // Its data are read as they come, so they have to ascend.
     request.question.layout = Layout::InTime;
     let selection = slices.selection(&request).await?;
     let runs: Vec<_> = selection.taken.chunk_by(|a, b| a.run == b.run).collect();
     if runs.len() > MOST_RUNS {
-        return Err(Fault::request(format!("{} runs are selected, {MOST_RUNS} may be; hint: run=RUN", runs.len())));
+        return Err(RequestFault::request(format!(
+            "{} runs are selected, {MOST_RUNS} may be; hint: run=RUN",
+            runs.len()
+        )));
     }
     let mut sources = Vec::new();
     for taken in &runs {
         sources.push(source(slices, &request, taken).await?);
     }
-    Ok(Manifest { name: format!("{} measurements of {} runs", selection.taken.len(), runs.len()), sources })
+    Ok(FoxgloveManifest { name: format!("{} measurements of {} runs", selection.taken.len(), runs.len()), sources })
 }
 
-async fn source(slices: &Slices, request: &Request, taken: &[Taken]) -> Result<Source, Fault> {
+async fn source(
+    slices: &SliceService,
+    request: &SliceRequest,
+    taken: &[Taken],
+) -> Result<FoxgloveSource, RequestFault> {
     let service = slices.0.catalogue.service();
     let (params, lake, snapshot) =
-        (Slices::params(request, taken.to_vec()), service.lake().clone(), request.view.snapshot.clone());
+        (SliceService::params(request, taken.to_vec()), service.lake().clone(), request.view.snapshot.clone());
     let found = service.plan(&request.client, async move { Ok(outline(&lake, &snapshot, params).await?) }).await?;
     let number = |index: usize| u16::try_from(index + 1).ok();
-    let topic = |topic: OutlineTopic| Topic {
+    let topic = |topic: OutlineTopic| FoxgloveTopic {
         name: topic.name,
         message_encoding: topic.message_encoding,
         schema_id: topic.schema.and_then(number),
     };
     let schema = |(index, schema): (usize, OutlineSchema)| {
         let OutlineSchema { name, encoding, data } = schema;
-        Some(Schema { id: number(index)?, name, encoding, data: BASE64.encode(&data) })
+        Some(FoxgloveSchema { id: number(index)?, name, encoding, data: BASE64.encode(&data) })
     };
     let digest = digest(&request.view, &request.question, taken);
-    Ok(Source::Streamed {
+    Ok(FoxgloveSource::Streamed {
         url: format!("{SLICE}?{}&id={digest}", request.question.query_of(&taken[0].run)),
         id: format!("echolake-{digest}"),
         topics: found.topics.into_iter().map(topic).collect(),

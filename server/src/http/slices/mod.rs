@@ -1,9 +1,8 @@
-//! Slices of run files over HTTP: cut while they are sent, or, for who reads by ranges, cut once and kept for a while.
+//! Slices of run files over HTTP: cut while they are sent, or, for clients that read by ranges, cut once and cached.
 //!
 //! A slice's bytes follow from its measurements, topics and layout alone, so its ETag is a digest of these, and it may
-//! be cut as often as somebody asks: whoever reads it to its end gets it as it is cut, in memory that is bounded.
-//! Ranges, HEAD and a script's plain GET need its length, so for them it is cut to its end first, into a file without a
-//! name.
+//! be cut any number of times: a client that reads it to its end gets it as it is cut, in bounded memory. Ranges, HEAD
+//! and a script's plain GET need its length, so for them it is cut to its end first, into a file without a name.
 
 mod cutting;
 mod foxglove;
@@ -24,16 +23,16 @@ use echolake_query::{Client, PredicateForm};
 use futures::stream;
 use tokio::sync::Semaphore;
 
-use super::catalogue::{Catalogue, View};
+use super::catalogue::{LakeCatalogue, SnapshotView};
 use super::guard;
-use super::problem::Problem;
-use super::ranges::{Asked, Described, needs_length};
-use crate::fault::Fault;
-use crate::tokens::Scope;
-use cutting::{Cutting, Room};
-use question::Question;
-use selection::{Selection, Selections};
-use spool::Spool;
+use super::problem::ProblemResponse;
+use super::ranges::{FileDescription, RangeAnswer, needs_length};
+use crate::fault::RequestFault;
+use crate::tokens::TokenScope;
+use cutting::{SliceResources, SliceTask};
+use question::SliceQuery;
+use selection::{SelectionCache, SliceSelection};
+use spool::SliceSpool;
 
 /// Foxglove's manifest of slices.
 pub(in crate::http) use foxglove::MANIFEST as FOXGLOVE_MANIFEST;
@@ -46,24 +45,24 @@ const MOST: usize = 128;
 /// wait for all that have.
 const TURNS: usize = 4;
 
-/// What slices share.
+/// State shared by slices.
 #[derive(Clone)]
-struct Slices(Arc<Inner>);
+struct SliceService(Arc<SlicesState>);
 
-struct Inner {
-    catalogue: Catalogue,
-    selections: Selections,
-    spool: Spool,
+struct SlicesState {
+    catalogue: LakeCatalogue,
+    selections: SelectionCache,
+    spool: SliceSpool,
     places: Arc<Semaphore>,
     turns: Arc<Semaphore>,
 }
 
-/// Slices, and what viewers need around them; pages of elsewhere may ask for them.
-pub(super) fn for_viewers(catalogue: &Catalogue) -> Router {
-    let slices = Slices(Arc::new(Inner {
+/// Routes of slices and of their manifest; pages of other origins may request them.
+pub(super) fn for_viewers(catalogue: &LakeCatalogue) -> Router {
+    let slices = SliceService(Arc::new(SlicesState {
         catalogue: catalogue.clone(),
-        selections: Selections::default(),
-        spool: Spool::default(),
+        selections: SelectionCache::default(),
+        spool: SliceSpool::default(),
         places: Arc::new(Semaphore::new(MOST)),
         turns: Arc::new(Semaphore::new(TURNS)),
     }));
@@ -74,20 +73,20 @@ pub(super) fn for_viewers(catalogue: &Catalogue) -> Router {
         .with_state(slices)
 }
 
-/// Somebody who may ask for slices, and what they ask.
-struct Request {
+/// An authorised request for a slice.
+struct SliceRequest {
     client: Arc<Client>,
-    view: Arc<View>,
-    question: Question,
+    view: Arc<SnapshotView>,
+    question: SliceQuery,
 }
 
-impl Slices {
+impl SliceService {
     // A slice holds what files do, and is chosen by SQL.
-    async fn request(&self, uri: &Uri, headers: &HeaderMap) -> Result<Request, Fault> {
+    async fn request(&self, uri: &Uri, headers: &HeaderMap) -> Result<SliceRequest, RequestFault> {
         let service = self.0.catalogue.service();
-        service.client(Scope::Files)?;
-        let client = service.client(Scope::Sql)?;
-        let mut question = Question::of(uri)?;
+        service.client(TokenScope::Files)?;
+        let client = service.client(TokenScope::Sql)?;
+        let mut question = SliceQuery::of(uri)?;
         let view = self.0.catalogue.view().await?;
         // Without tokens a page of elsewhere may read the runs whose names it knows, and ask nothing of others, nor
         // anything that costs more than reading them.
@@ -102,14 +101,14 @@ impl Slices {
         for run in &question.runs {
             super::catalogue::run(&view, run.as_str())?;
         }
-        Ok(Request { client, view, question })
+        Ok(SliceRequest { client, view, question })
     }
 
-    async fn selection(&self, request: &Request) -> Result<Arc<Selection>, Fault> {
+    async fn selection(&self, request: &SliceRequest) -> Result<Arc<SliceSelection>, RequestFault> {
         self.0.selections.of(&self.0.catalogue, request).await
     }
 
-    fn params(request: &Request, taken: Vec<Taken>) -> SliceParams {
+    fn params(request: &SliceRequest, taken: Vec<Taken>) -> SliceParams {
         SliceParams {
             taken,
             topics: request.question.topics.clone(),
@@ -119,27 +118,27 @@ impl Slices {
         }
     }
 
-    fn cut(&self, request: &Request, selection: &Selection) -> Result<Cutting, Fault> {
+    fn cut(&self, request: &SliceRequest, selection: &SliceSelection) -> Result<SliceTask, RequestFault> {
         let params = Self::params(request, selection.taken.clone());
         let places = self.0.places.clone();
-        let place = places.try_acquire_owned().map_err(|_| Fault::TooMany { what: "slices", limit: MOST })?;
-        let room = Room { place, turns: self.0.turns.clone() };
-        Ok(Cutting::begin(self.0.catalogue.service(), &request.client, request.view.snapshot.clone(), params, room))
+        let place = places.try_acquire_owned().map_err(|_| RequestFault::TooMany { what: "slices", limit: MOST })?;
+        let room = SliceResources { place, turns: self.0.turns.clone() };
+        Ok(SliceTask::begin(self.0.catalogue.service(), &request.client, request.view.snapshot.clone(), params, room))
     }
 }
 
 async fn slice(
-    State(slices): State<Slices>,
+    State(slices): State<SliceService>,
     method: Method,
     uri: Uri,
     headers: HeaderMap,
-) -> Result<Response, Problem> {
+) -> Result<Response, ProblemResponse> {
     let request = slices.request(&uri, &headers).await?;
     let selection = slices.selection(&request).await?;
     if request.question.id.as_ref().is_some_and(|id| *id != selection.digest) {
-        return Err(Fault::Gone { what: "this slice", hint: "ask for the manifest again" }.into());
+        return Err(RequestFault::Gone { what: "this slice", hint: "ask for the manifest again" }.into());
     }
-    let described = Described {
+    let described = FileDescription {
         etag: format!("\"{}\"", selection.digest),
         media_type: "application/octet-stream",
         policy: "cross-origin",
@@ -156,16 +155,16 @@ async fn slice(
     let cut = || slices.cut(&request, &selection);
     let whole = slices.0.spool.once(&selection.digest, cut).await?;
     Ok(match described.asked(&headers, whole.bytes()) {
-        Asked::Answer(answer) => answer,
-        Asked::Part(part) => described.part(&part, Body::from_stream(whole.read(part.range.clone()))),
+        RangeAnswer::Answer(answer) => answer,
+        RangeAnswer::Part(part) => described.part(&part, Body::from_stream(whole.read(part.range.clone()))),
     })
 }
 
 // A failure on the way breaks the connection off: a short slice would look like a whole one.
 fn rest(
     first: Option<bytes::Bytes>,
-    cutting: Cutting,
-) -> impl stream::Stream<Item = Result<bytes::Bytes, Fault>> + Send {
+    cutting: SliceTask,
+) -> impl stream::Stream<Item = Result<bytes::Bytes, RequestFault>> + Send {
     stream::try_unfold((first, cutting), |(first, mut cutting)| async move {
         let piece = match first {
             Some(piece) => Some(piece),

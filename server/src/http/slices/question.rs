@@ -1,46 +1,49 @@
-//! What a slice is asked for by: a predicate over measurements, and what of them is wanted.
+//! The parameters of a slice request: a predicate over measurements, and the wanted topics and layout.
 
 use axum::http::Uri;
 use echolake_export::{Layout, Taken};
 use echolake_query::PredicateForm;
 use echolake_schema::RunId;
 
-use super::super::catalogue::Params;
-use crate::fault::Fault;
+use super::super::catalogue::RequestParams;
+use crate::fault::RequestFault;
 
 /// Runs that may be named, and sources of a manifest.
 pub(super) const MOST_RUNS: usize = 100;
-/// What may stand behind the path's `?`.
+/// Parameters that are allowed after the path's `?`.
 const NAMES: [&str; 5] = ["where", "run", "topics", "layout", "id"];
 
 /// A question.
-pub(super) struct Question {
-    /// The predicate; None where all measurements of the runs are wanted.
+pub(super) struct SliceQuery {
+    /// The predicate; None if all measurements of the runs are wanted.
     predicate: Option<String>,
     /// None, or the runs that the measurements are of.
     pub(super) runs: Vec<RunId>,
-    /// The topics, sorted; all where there are none.
+    /// The topics, sorted; all if there are none.
     pub(super) topics: Vec<String>,
-    /// In which chunks messages stand.
+    /// The distribution of messages over chunks.
     pub(super) layout: Layout,
     /// The slice that is expected.
     pub(super) id: Option<String>,
-    /// What the predicate may consist of.
+    /// The syntax that is allowed in the predicate.
     pub(super) form: PredicateForm,
 }
 
-impl Question {
+impl SliceQuery {
     /// # Errors
-    /// [`Fault::Request`] where it is not right.
-    pub(super) fn of(uri: &Uri) -> Result<Self, Fault> {
-        let params = Params::of(uri)?;
+    /// [`RequestFault::Request`] if it is not right.
+    pub(super) fn of(uri: &Uri) -> Result<Self, RequestFault> {
+        let params = RequestParams::of(uri)?;
         if let Some(unknown) = params.names().find(|name| !NAMES.contains(name)) {
-            return Err(Fault::request(format!("there is no parameter `{unknown}`; hint: {}", NAMES.join(", "))));
+            return Err(RequestFault::request(format!(
+                "there is no parameter `{unknown}`; hint: {}",
+                NAMES.join(", ")
+            )));
         }
         let mut runs = Vec::new();
         for name in params.all("run") {
             let hint = "GET /api/v1/runs lists what there is";
-            runs.push(name.parse().map_err(|_| Fault::NotFound { what: format!("run `{name}`"), hint })?);
+            runs.push(name.parse().map_err(|_| RequestFault::NotFound { what: format!("run `{name}`"), hint })?);
         }
         let mut topics: Vec<_> = params.all("topics").flat_map(|t| t.split(',')).map(str::to_owned).collect();
         topics.retain(|topic| !topic.is_empty());
@@ -49,11 +52,11 @@ impl Question {
         runs.sort();
         runs.dedup();
         if runs.len() > MOST_RUNS {
-            return Err(Fault::request(format!("{} runs are named, {MOST_RUNS} may be", runs.len())));
+            return Err(RequestFault::request(format!("{} runs are named, {MOST_RUNS} may be", runs.len())));
         }
         let predicate = params.one("where")?.map(str::to_owned);
         if predicate.is_none() && runs.is_empty() {
-            return Err(Fault::request("`where` is missing; hint: where=surface_id='flat' and pair_id<100"));
+            return Err(RequestFault::request("`where` is missing; hint: where=surface_id='flat' and pair_id<100"));
         }
         let layout = match params.choice("layout", &["by-topic", "in-time"])? {
             "in-time" => Layout::InTime,
@@ -63,12 +66,12 @@ impl Question {
         Ok(Self { predicate, runs, topics, layout, id, form: PredicateForm::AnyExpression })
     }
 
-    /// The predicate; a true one where none was given.
+    /// The predicate; a true one if none was given.
     pub(super) fn predicate(&self) -> &str {
         self.predicate.as_deref().unwrap_or("true")
     }
 
-    /// The query's beginning, which the predicate stands behind.
+    /// The beginning of the query, which the predicate completes.
     pub(super) fn select(&self) -> String {
         // Names of runs have letters, digits, `_` and `-` alone.
         let named: Vec<_> = self.runs.iter().map(|run| format!("'{run}'")).collect();
@@ -76,12 +79,12 @@ impl Question {
         format!("select {} from measurements where{runs}", Taken::COLUMNS.join(", "))
     }
 
-    /// Whether it is for all of the runs that it names.
+    /// Returns whether it selects all of the runs that it names.
     pub(super) fn is_of_whole_runs(&self) -> bool {
         self.predicate.is_none() && self.topics.is_empty()
     }
 
-    /// It, of one run, as it stands behind a path's `?`.
+    /// Returns its parameters for one run, as the query part of a URL.
     pub(super) fn query_of(&self, run: &RunId) -> String {
         let mut pairs = vec![("layout", self.layout_name())];
         pairs.extend(self.predicate.as_deref().map(|predicate| ("where", predicate)));
@@ -114,8 +117,8 @@ fn encoded(text: &str) -> String {
 mod tests {
     use super::*;
 
-    fn question(query: &str) -> Result<Question, Fault> {
-        Question::of(&format!("/x?{query}").parse().expect("a path"))
+    fn question(query: &str) -> Result<SliceQuery, RequestFault> {
+        SliceQuery::of(&format!("/x?{query}").parse().expect("a path"))
     }
 
     #[test]

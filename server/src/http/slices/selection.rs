@@ -1,5 +1,4 @@
-//! The measurements of a slice: found by the engine, within the limits of who asks, and kept for the ranges that
-//! follow.
+//! The measurements of a slice: found by the engine, within the client's limits, and cached for the ranges that follow.
 
 use std::collections::VecDeque;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -7,12 +6,12 @@ use std::sync::{Arc, Mutex, PoisonError};
 use echolake_export::Taken;
 use sha2::{Digest as _, Sha256};
 
-use super::super::catalogue::{Catalogue, View};
-use super::{Question, Request};
-use crate::fault::Fault;
-use crate::metrics::Protocol;
-use crate::running::{Batches, Stop};
-use crate::service::{Job, Work};
+use super::super::catalogue::{LakeCatalogue, SnapshotView};
+use super::{SliceQuery, SliceRequest};
+use crate::fault::RequestFault;
+use crate::metrics::ServerProtocol;
+use crate::running::{BatchEncoder, StopSignal};
+use crate::service::{QueryJob, QueryWork};
 
 /// Measurements of a slice, of a hundred runs and more.
 const MOST: usize = 400_000;
@@ -23,28 +22,32 @@ const DIGEST_BYTES: usize = 16;
 /// Changes with what slices of the same measurements are.
 const FORMAT: &str = concat!("slice 1, echolake ", env!("CARGO_PKG_VERSION"));
 
-/// What a slice is cut from.
-pub(super) struct Selection {
+/// The input of a slice.
+pub(super) struct SliceSelection {
     /// By run, time and pair.
     pub(super) taken: Vec<Taken>,
     /// Says which slice it is: the same measurements, topics and layout, the same bytes.
     pub(super) digest: String,
 }
 
-/// Who asks, the lake's version, and the question with all that is in it.
-type Key = (String, String, String);
+/// The client's name, the lake's version, and the question with all that is in it.
+type SelectionKey = (String, String, String);
 
 /// Selections of the last questions.
 #[derive(Default)]
-pub(super) struct Selections(Mutex<VecDeque<(Key, Arc<Selection>)>>);
+pub(super) struct SelectionCache(Mutex<VecDeque<(SelectionKey, Arc<SliceSelection>)>>);
 
-impl Selections {
+impl SelectionCache {
     /// The measurements that a request is for.
     ///
     /// # Errors
-    /// What is wrong with the predicate, or ended its query; [`Fault::NoData`] where it selects nothing.
-    pub(super) async fn of(&self, catalogue: &Catalogue, request: &Request) -> Result<Arc<Selection>, Fault> {
-        let Request { client, view, question } = request;
+    /// A defect of the predicate, or what ended its query; [`RequestFault::NoData`] if it selects nothing.
+    pub(super) async fn of(
+        &self,
+        catalogue: &LakeCatalogue,
+        request: &SliceRequest,
+    ) -> Result<Arc<SliceSelection>, RequestFault> {
+        let SliceRequest { client, view, question } = request;
         let asked = format!("{:?} {} {}", question.form, question.select(), question.predicate());
         let described = format!("{} {} {asked}", question.layout_name(), question.topics.join(","));
         let key = (client.name().to_owned(), view.version.clone(), described);
@@ -54,55 +57,62 @@ impl Selections {
         let mut taken = taken(catalogue, request).await?;
         taken.sort_by(|a, b| (&a.run, a.log_time_ns, a.pair).cmp(&(&b.run, b.log_time_ns, b.pair)));
         let digest = digest(view, question, &taken);
-        let selection = Arc::new(Selection { taken, digest });
+        let selection = Arc::new(SliceSelection { taken, digest });
         self.keep(key, &selection);
         Ok(selection)
     }
 
-    fn known(&self, key: &Key) -> Option<Arc<Selection>> {
+    fn known(&self, key: &SelectionKey) -> Option<Arc<SliceSelection>> {
         let kept = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         kept.iter().find(|(known, _)| known == key).map(|(_, selection)| selection.clone())
     }
 
-    fn keep(&self, key: Key, selection: &Arc<Selection>) {
+    fn keep(&self, key: SelectionKey, selection: &Arc<SliceSelection>) {
         let mut kept = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         kept.push_back((key, selection.clone()));
         // One that is small weighs something too.
-        let weight =
-            |kept: &VecDeque<(Key, Arc<Selection>)>| kept.iter().map(|(_, s)| s.taken.len() + 100).sum::<usize>();
+        let weight = |kept: &VecDeque<(SelectionKey, Arc<SliceSelection>)>| {
+            kept.iter().map(|(_, s)| s.taken.len() + 100).sum::<usize>()
+        };
         while weight(&kept) > KEPT && kept.len() > 1 {
             kept.pop_front();
         }
     }
 }
 
-async fn taken(catalogue: &Catalogue, request: &Request) -> Result<Vec<Taken>, Fault> {
-    let Request { client, question, .. } = request;
+async fn taken(catalogue: &LakeCatalogue, request: &SliceRequest) -> Result<Vec<Taken>, RequestFault> {
+    let SliceRequest { client, question, .. } = request;
     let (service, predicate) = (catalogue.service(), question.predicate().to_owned());
     let session = Arc::new(service.session(client));
     let (asking, select, form) = (session.clone(), question.select(), question.form);
     let sql = service.plan(client, async move { Ok(asking.selecting(&select, &predicate, form)?) }).await?;
-    let job = Job { protocol: Protocol::Http, session, work: Work::Sql(sql), limit: None, stop: Stop::new() };
-    let mut running = service.begin(job, |_| Ok(Batches)).await?;
+    let job = QueryJob {
+        protocol: ServerProtocol::Http,
+        session,
+        work: QueryWork::Sql(sql),
+        limit: None,
+        stop: StopSignal::new(),
+    };
+    let mut running = service.begin(job, |_| Ok(BatchEncoder)).await?;
     let mut taken = Vec::new();
     while let Some(batch) = running.next().await? {
         taken.extend(Taken::of_batch(&batch)?);
         if taken.len() > MOST {
-            return Err(Fault::SliceTooLarge { limit: MOST });
+            return Err(RequestFault::SliceTooLarge { limit: MOST });
         }
     }
     match taken.is_empty() {
         false => Ok(taken),
         true => {
             let hint = "POST /api/v1/sql tries predicates over `measurements`";
-            Err(Fault::NoData { what: "what `where` selects".to_owned(), data: "measurements", hint })
+            Err(RequestFault::NoData { what: "what `where` selects".to_owned(), data: "measurements", hint })
         }
     }
 }
 
 /// Says which slice measurements make: they are sorted by run, time and pair.
 // A run's derivation is a digest of its file, among others.
-pub(super) fn digest(view: &View, question: &Question, taken: &[Taken]) -> String {
+pub(super) fn digest(view: &SnapshotView, question: &SliceQuery, taken: &[Taken]) -> String {
     let mut digest = Sha256::new();
     let mut add = |text: &str| {
         digest.update((text.len() as u64).to_le_bytes());

@@ -1,4 +1,4 @@
-//! Slices that are read by ranges: cut once, kept in files without names, so many bytes of them, the oldest going
+//! Slices that are read by ranges: cut once, cached in files without names up to a number of bytes, the oldest evicted
 //! first. Disks are waited for on threads of their own.
 
 use std::collections::{HashMap, VecDeque};
@@ -12,49 +12,49 @@ use bytes::Bytes;
 use futures::stream::{self, Stream};
 use tokio::sync::OnceCell;
 
-use super::Cutting;
-use crate::fault::Fault;
+use super::SliceTask;
+use crate::fault::RequestFault;
 
 /// Bytes of all slices that are kept, and of one.
 const MOST_BYTES: u64 = 2 << 30;
-/// What is read at a time.
+/// Bytes that are read at a time.
 const BLOCK: u64 = 256 << 10;
 
-/// Slices that are kept, by what they are.
+/// Cache of slices, by their digest.
 #[derive(Clone, Default)]
-pub(super) struct Spool(Arc<Mutex<Kept>>);
+pub(super) struct SliceSpool(Arc<Mutex<SpoolState>>);
 
 #[derive(Default)]
-struct Kept {
-    slices: HashMap<String, Arc<OnceCell<Arc<Spooled>>>>,
-    /// Those that are whole, the one that was asked for last at the end.
+struct SpoolState {
+    slices: HashMap<String, Arc<OnceCell<Arc<SpooledSlice>>>>,
+    /// Keys of complete slices, the most recently used last.
     order: VecDeque<String>,
-    /// Of all files that are open, kept or not.
+    /// Bytes of all open files, cached or not.
     bytes: u64,
 }
 
-/// A slice in a file without a name: it is gone when nobody has it open, however that comes.
-pub(super) struct Spooled {
+/// A slice in a file without a name: the system deletes it when it is closed, even by a crash.
+pub(super) struct SpooledSlice {
     file: File,
     /// Those that are counted in its spool.
     bytes: u64,
-    spool: Spool,
+    spool: SliceSpool,
 }
 
-impl Drop for Spooled {
+impl Drop for SpooledSlice {
     fn drop(&mut self) {
         self.spool.kept().bytes -= self.bytes;
     }
 }
 
-/// Somebody who waits for a slice. The last one who leaves without any leaves nothing behind.
-struct Waiting<'a> {
-    spool: &'a Spool,
-    cell: Arc<OnceCell<Arc<Spooled>>>,
+/// A request that waits for a slice. The last one that is dropped without a slice removes the empty entry.
+struct SliceWaiter<'a> {
+    spool: &'a SliceSpool,
+    cell: Arc<OnceCell<Arc<SpooledSlice>>>,
     key: &'a str,
 }
 
-impl Drop for Waiting<'_> {
+impl Drop for SliceWaiter<'_> {
     fn drop(&mut self) {
         let mut kept = self.spool.kept();
         // Two: the map's and this one.
@@ -64,39 +64,39 @@ impl Drop for Waiting<'_> {
     }
 }
 
-impl Spool {
-    /// The slice of this name; it is cut where nobody has it yet, and nobody else is at it. Who leaves ends the work,
-    /// and another who waits begins it anew.
+impl SliceSpool {
+    /// Returns the slice of this name; it is cut if it is neither cached nor being cut by another request. If that
+    /// request is dropped, the work is cancelled, and another waiting one starts it again.
     ///
     /// # Errors
-    /// Those of cutting, and [`Fault::NoRoom`].
+    /// Those of cutting, and [`RequestFault::NoRoom`].
     pub(super) async fn once(
         &self,
         key: &str,
-        cut: impl FnOnce() -> Result<Cutting, Fault>,
-    ) -> Result<Arc<Spooled>, Fault> {
+        cut: impl FnOnce() -> Result<SliceTask, RequestFault>,
+    ) -> Result<Arc<SpooledSlice>, RequestFault> {
         let cell = self.kept().slices.entry(key.to_owned()).or_default().clone();
-        let waiting = Waiting { spool: self, cell, key };
+        let waiting = SliceWaiter { spool: self, cell, key };
         let spooled = waiting.cell.get_or_try_init(|| async { self.fill(cut()?).await.map(Arc::new) }).await?.clone();
         self.touch(key, &waiting.cell);
         Ok(spooled)
     }
 
-    async fn fill(&self, mut cutting: Cutting) -> Result<Spooled, Fault> {
+    async fn fill(&self, mut cutting: SliceTask) -> Result<SpooledSlice, RequestFault> {
         let file = on_disk(tempfile::tempfile).await.map_err(no_room)?;
-        let mut slice = Spooled { file, bytes: 0, spool: self.clone() };
+        let mut slice = SpooledSlice { file, bytes: 0, spool: self.clone() };
         while let Some(piece) = cutting.next().await? {
             self.make_room(piece.len() as u64)?;
             slice.bytes += piece.len() as u64;
-            // It goes along: whoever leaves meanwhile, it is counted for as long as it is written to.
+            // It moves along: even if the request is dropped meanwhile, its bytes count as long as it is written to.
             let written = on_disk(move || slice.file.write_all(&piece).map(|()| slice)).await;
             slice = written.map_err(no_room)?;
         }
         Ok(slice)
     }
 
-    // Counts bytes that are about to be written, and lets the oldest slices go for them.
-    fn make_room(&self, bytes: u64) -> Result<(), Fault> {
+    // Counts bytes that are about to be written, and evicts the oldest slices for them.
+    fn make_room(&self, bytes: u64) -> Result<(), RequestFault> {
         let mut gone = Vec::new();
         let has_room = loop {
             let mut kept = self.kept();
@@ -107,13 +107,13 @@ impl Spool {
             let Some(oldest) = kept.order.pop_front() else { break false };
             gone.extend(kept.slices.remove(&oldest));
             drop(kept);
-            // Its bytes are free once it is dropped, unless somebody reads it; dropping takes the lock.
+            // Its bytes are free once it is dropped, unless it is being read; dropping takes the lock.
             gone.clear();
         };
-        if has_room { Ok(()) } else { Err(Fault::NoRoom { limit: MOST_BYTES }) }
+        if has_room { Ok(()) } else { Err(RequestFault::NoRoom { limit: MOST_BYTES }) }
     }
 
-    fn touch(&self, key: &str, cell: &Arc<OnceCell<Arc<Spooled>>>) {
+    fn touch(&self, key: &str, cell: &Arc<OnceCell<Arc<SpooledSlice>>>) {
         let mut kept = self.kept();
         // It may have had to go meanwhile.
         if kept.slices.get(key).is_some_and(|known| Arc::ptr_eq(known, cell)) {
@@ -122,7 +122,7 @@ impl Spool {
         }
     }
 
-    fn kept(&self) -> std::sync::MutexGuard<'_, Kept> {
+    fn kept(&self) -> std::sync::MutexGuard<'_, SpoolState> {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
@@ -132,19 +132,22 @@ async fn on_disk<T: Send + 'static>(work: impl FnOnce() -> io::Result<T> + Send 
     tokio::task::spawn_blocking(work).await?
 }
 
-fn no_room(error: io::Error) -> Fault {
+fn no_room(error: io::Error) -> RequestFault {
     eprintln!("a slice cannot be kept in `{}`: {error}", std::env::temp_dir().display());
-    Fault::NoRoom { limit: MOST_BYTES }
+    RequestFault::NoRoom { limit: MOST_BYTES }
 }
 
-impl Spooled {
+impl SpooledSlice {
     /// Its length.
     pub(super) fn bytes(&self) -> u64 {
         self.bytes
     }
 
     /// Bytes of it, a block at a time.
-    pub(super) fn read(self: &Arc<Self>, range: Range<u64>) -> impl Stream<Item = Result<Bytes, Fault>> + Send + use<> {
+    pub(super) fn read(
+        self: &Arc<Self>,
+        range: Range<u64>,
+    ) -> impl Stream<Item = Result<Bytes, RequestFault>> + Send + use<> {
         stream::try_unfold((self.clone(), range), |(slice, range)| async move {
             if range.is_empty() {
                 return Ok(None);
@@ -159,7 +162,7 @@ impl Spooled {
                 Ok(block) => Ok(Some((block, (slice, end..range.end)))),
                 Err(failed) => {
                     eprintln!("a kept slice cannot be read: {failed}");
-                    Err(Fault::Internal)
+                    Err(RequestFault::Internal)
                 }
             }
         })

@@ -1,10 +1,10 @@
-//! What a line of the prompt orders when it is no SQL.
+//! Commands of the prompt: lines that are not SQL.
 
 use std::path::PathBuf;
 
 use echolake_query::output::Format;
 
-/// What `\?` prints.
+/// The text that `\?` prints.
 pub(super) const HELP: &str = "\
 a query ends with ;
 \\d          the tables               \\d TABLE      its columns, with units
@@ -17,7 +17,7 @@ Tab completes; Ctrl-R searches the history; Ctrl-C stops a query or clears the l
 
 /// An order to the prompt.
 #[derive(Debug, PartialEq, Eq)]
-pub(super) enum Command {
+pub(super) enum PromptCommand {
     /// Leave.
     Quit,
     /// Print the help.
@@ -38,24 +38,24 @@ pub(super) enum Command {
     Functions(Option<String>),
 }
 
-/// The order of a line; None where it is SQL.
-pub(super) fn parse(line: &str) -> Option<Result<Command, String>> {
+/// Parses the command of a line; None if it is SQL.
+pub(super) fn parse(line: &str) -> Option<Result<PromptCommand, String>> {
     let line = line.trim();
     let (word, rest) = line.split_once(char::is_whitespace).unwrap_or((line, ""));
     let rest = rest.trim().trim_end_matches(';').trim_end();
     let name = (!rest.is_empty()).then(|| rest.to_owned());
     Some(Ok(match word.trim_end_matches(';') {
-        "\\q" | "exit" | "quit" if name.is_none() => Command::Quit,
-        "\\?" | "\\h" | "help" if name.is_none() => Command::Help,
-        "\\timing" => Command::Timing,
-        "\\pager" | "\\pset" => Command::Pager,
+        "\\q" | "exit" | "quit" if name.is_none() => PromptCommand::Quit,
+        "\\?" | "\\h" | "help" if name.is_none() => PromptCommand::Help,
+        "\\timing" => PromptCommand::Timing,
+        "\\pager" | "\\pset" => PromptCommand::Pager,
         "\\f" | "\\format" => match Format::ALL.into_iter().find(|f| f.name().eq_ignore_ascii_case(rest)) {
-            Some(format) => Command::Format(format),
+            Some(format) => PromptCommand::Format(format),
             None => return Some(Err(format!("no format `{rest}`; hint: table, csv, json, parquet or arrow"))),
         },
-        "\\o" => Command::Output(name.map(PathBuf::from)),
-        "\\d" | "\\dt" | "\\d+" => name.map_or(Command::Tables, Command::Columns),
-        "\\df" => Command::Functions(name),
+        "\\o" => PromptCommand::Output(name.map(PathBuf::from)),
+        "\\d" | "\\dt" | "\\d+" => name.map_or(PromptCommand::Tables, PromptCommand::Columns),
+        "\\df" => PromptCommand::Functions(name),
         other if other.starts_with('\\') => return Some(Err(format!("no command `{other}`; hint: \\? lists them"))),
         _ => return None,
     }))
@@ -67,11 +67,11 @@ mod tests {
 
     #[test]
     fn lines_are_orders_or_sql() {
-        assert_eq!(parse("\\d  runs;"), Some(Ok(Command::Columns("runs".to_owned()))));
-        assert_eq!(parse("\\d"), Some(Ok(Command::Tables)));
-        assert_eq!(parse("  quit "), Some(Ok(Command::Quit)));
-        assert_eq!(parse("\\f CSV"), Some(Ok(Command::Format(Format::Csv))));
-        assert_eq!(parse("\\o a b.csv"), Some(Ok(Command::Output(Some("a b.csv".into())))));
+        assert_eq!(parse("\\d  runs;"), Some(Ok(PromptCommand::Columns("runs".to_owned()))));
+        assert_eq!(parse("\\d"), Some(Ok(PromptCommand::Tables)));
+        assert_eq!(parse("  quit "), Some(Ok(PromptCommand::Quit)));
+        assert_eq!(parse("\\f CSV"), Some(Ok(PromptCommand::Format(Format::Csv))));
+        assert_eq!(parse("\\o a b.csv"), Some(Ok(PromptCommand::Output(Some("a b.csv".into())))));
         assert_eq!(parse("select 1;"), None);
         assert_eq!(parse(""), None);
         assert!(matches!(parse("\\f xls"), Some(Err(m)) if m.contains("xls")));

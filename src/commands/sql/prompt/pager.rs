@@ -3,19 +3,19 @@
 use std::io::{IsTerminal as _, Write};
 use std::process::{Child, Command, Stdio};
 
-/// Leaves at once where all fits on the screen, and what was shown stays there; long lines are not folded.
+/// Exits at once if all fits on the screen, and leaves the text there; long lines are not folded.
 const PAGER: &str = "less -FRSX";
 
-/// Somewhere to write an answer for people.
-pub(super) enum Page {
+/// The output for a formatted answer.
+pub(super) enum PageOutput {
     /// The pager.
     Pager(Child),
     /// The terminal itself.
     Terminal(std::io::Stdout),
 }
 
-impl Page {
-    /// The pager where one is wanted and there, else the terminal.
+impl PageOutput {
+    /// The pager if one is wanted and available, else the terminal.
     pub(super) fn open(is_wanted: bool) -> Self {
         let terminal = std::io::stdout();
         if !is_wanted || !terminal.is_terminal() {
@@ -29,12 +29,12 @@ impl Page {
     }
 }
 
-impl Write for Page {
+impl Write for PageOutput {
     fn write(&mut self, bytes: &[u8]) -> std::io::Result<usize> {
         match self {
             Self::Terminal(terminal) => terminal.write(bytes),
             Self::Pager(child) => match child.stdin.as_mut().map(|pipe| pipe.write(bytes)) {
-                // Whoever leaves the pager early has seen enough.
+                // A user who leaves the pager early wants no more.
                 Some(Err(e)) if e.kind() == std::io::ErrorKind::BrokenPipe => Ok(bytes.len()),
                 Some(written) => written,
                 None => Ok(bytes.len()),
@@ -50,7 +50,7 @@ impl Write for Page {
     }
 }
 
-impl Drop for Page {
+impl Drop for PageOutput {
     // The prompt comes back when the pager has gone.
     fn drop(&mut self) {
         if let Self::Pager(child) = self {
@@ -63,5 +63,5 @@ impl Drop for Page {
 
 /// Shows a text.
 pub(super) fn show(is_paged: bool, text: &str) -> std::io::Result<()> {
-    writeln!(Page::open(is_paged), "{text}")
+    writeln!(PageOutput::open(is_paged), "{text}")
 }

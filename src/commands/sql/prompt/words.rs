@@ -52,14 +52,14 @@ const COMMANDS: [&str; 9] = ["\\?", "\\d", "\\df", "\\f", "\\o", "\\pager", "\\q
 /// Words after which a table is named.
 const BEFORE_TABLE: [&str; 5] = ["from", "join", "describe", "\\d", "\\d+"];
 
-/// What may be meant by a word that is begun.
+/// Completions of a word.
 #[derive(Helper, Highlighter, Hinter, Validator)]
-pub(super) struct Words {
+pub(super) struct WordCompleter {
     tables: BTreeMap<String, Vec<String>>,
     functions: Vec<String>,
 }
 
-impl Words {
+impl WordCompleter {
     /// The names that a session knows.
     pub(super) fn of(session: &Session) -> Self {
         let columns = |schema: &arrow::datatypes::Schema| schema.fields().iter().map(|f| f.name().clone()).collect();
@@ -93,7 +93,7 @@ impl Words {
         found
     }
 
-    // Columns of the tables that the line names; of all, where it names none yet.
+    // Columns of the tables that the line names; of all, if it names none yet.
     fn columns<'a>(&'a self, line: &'a str) -> impl Iterator<Item = &'a String> {
         let words: Vec<_> = line.split(|c: char| !is_part(c)).collect();
         let is_named = |table: &String| words.iter().any(|w| w.eq_ignore_ascii_case(table));
@@ -107,7 +107,7 @@ fn is_part(c: char) -> bool {
     c.is_alphanumeric() || c == '_' || c == '\\' || c == '+' || c == '?'
 }
 
-impl Completer for Words {
+impl Completer for WordCompleter {
     type Candidate = Pair;
 
     fn complete(&self, line: &str, pos: usize, _: &Context<'_>) -> rustyline::Result<(usize, Vec<Pair>)> {
@@ -122,9 +122,9 @@ impl Completer for Words {
 mod tests {
     use super::*;
 
-    fn words() -> Words {
+    fn words() -> WordCompleter {
         let table = |name: &str, columns: &[&str]| (name.to_owned(), columns.iter().map(|c| (*c).to_owned()).collect());
-        Words {
+        WordCompleter {
             tables: [table("runs", &["run_id", "started"]), table("pairs", &["pair_id", "path_mm"])].into(),
             functions: vec!["round".to_owned(), "p90_mean".to_owned()],
         }
