@@ -7,11 +7,37 @@ _list:
 test:
     cargo test --release --workspace --locked
 
-# Format, lints and all tests but the slow ones: what to run between two edits.
+# Rust's format and lints, and all tests but the slow ones: what to run between two edits.
 quick:
     cargo fmt --all --check
     cargo clippy --release --workspace --all-targets --locked -- -D warnings
     cargo test --release --workspace --tests --locked -- --skip slow
+
+# Formats Rust, the pages and the Python package.
+fmt:
+    cargo fmt --all
+    .ci/lint --fix
+
+# Lints of all three, formatting and types of the pages and the Python package.
+lint:
+    cargo clippy --release --workspace --all-targets --locked -- -D warnings
+    .ci/lint
+
+# Writes docs/functions.md from what the functions say of themselves.
+docs:
+    ECHOLAKE_RENEW=1 cargo test --release --workspace --locked manual
+
+# Writes the types of the API for the pages, from web/openapi.json.
+api:
+    npm run --silent --prefix web api
+
+# A long form of what tests try in short: README lists them.
+campaign NAME *OPTIONS:
+    cargo run --release --locked -p echolake-campaigns -- {{ NAME }} {{ OPTIONS }}
+
+# A benchmark, built as packages are; `kernels` are those of cargo bench.
+bench NAME *OPTIONS:
+    {{ if NAME == "kernels" { "cargo bench --profile dist --workspace --bench kernels" } else { "cargo run --profile dist --locked -p echolake-campaigns -- " + NAME } }} {{ OPTIONS }}
 
 # What a change must pass.
 ci:

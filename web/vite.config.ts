@@ -17,7 +17,7 @@ const LICENCES = 'licences.json'
 async function withFontLicences(path: string) {
   const listed: { name: string }[] = JSON.parse(await readFile(path, 'utf8'))
   const { dependencies } = JSON.parse(await readFile('package.json', 'utf8'))
-  for (const name of Object.keys(dependencies).filter(name => !listed.some(entry => entry.name === name))) {
+  for (const name of Object.keys(dependencies).filter((name) => !listed.some((entry) => entry.name === name))) {
     const folder = join('node_modules', name)
     const { version, license: identifier } = JSON.parse(await readFile(join(folder, 'package.json'), 'utf8'))
     const entry = { name, version, identifier, text: await readFile(join(folder, 'LICENSE'), 'utf8') }
@@ -28,7 +28,8 @@ async function withFontLicences(path: string) {
 
 function packed(): Plugin {
   return {
-    name: 'packed', apply: 'build',
+    name: 'packed',
+    apply: 'build',
     async closeBundle() {
       const folder = join(import.meta.dirname, 'dist')
       await withFontLicences(join(folder, LICENCES))
@@ -50,16 +51,21 @@ const SERVER = process.env.ECHOLAKE ?? 'http://127.0.0.1:8080'
 const toServer: ProxyOptions = {
   target: SERVER,
   changeOrigin: true,
-  configure: (proxy) => proxy.on('proxyReq', (passed, request) => {
-    if (request.headers.origin === `http://${request.headers.host}`) passed.setHeader('origin', SERVER)
-  }),
+  configure: (proxy) =>
+    proxy.on('proxyReq', (passed, request) => {
+      if (request.headers.origin === `http://${request.headers.host}`) passed.setHeader('origin', SERVER)
+    }),
 }
 
 export default defineConfig({
   plugins: [svelte(), packed()],
   server: { proxy: { '/api': toServer, '/health': toServer, '/metrics': toServer } },
   build: {
-    target: 'es2022', assetsInlineLimit: 0, modulePreload: { polyfill: false }, reportCompressedSize: true,
-    chunkSizeWarningLimit: 900, license: { fileName: LICENCES },
+    target: 'es2022',
+    assetsInlineLimit: 0,
+    modulePreload: { polyfill: false },
+    reportCompressedSize: true,
+    chunkSizeWarningLimit: 900,
+    license: { fileName: LICENCES },
   },
 })

@@ -71,10 +71,12 @@ def main() -> None:
     }
     loaders = {
         "echolake.torch": partial(loaded, given.path, given.workers),
-        "echolake.torch, turned, heights": partial(loaded, given.path, given.workers, symmetries="random", heights=True),
+        "echolake.torch, turned, heights": partial(
+            loaded, given.path, given.workers, symmetries="random", heights=True
+        ),
     }
     rates: dict[str, list[float]] = {name: [] for name in [*bare, *loaders]}
-    for name, run in bare.items():
+    for run in bare.values():
         rate(run)
     for _ in range(given.rounds):
         for name, run in (bare | loaders).items():

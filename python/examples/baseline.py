@@ -10,8 +10,10 @@ a window there, where torch is. TRAINING_SET is a folder of ``echolake export ml
 from __future__ import annotations
 
 import argparse
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -50,7 +52,7 @@ def read(folder: Path, split: str, bands: list[str], rng: np.random.Generator) -
     table = pq.read_table(heights, filters=[("symmetry", "=", "identity")])
     places = {surface: i for i, surface in enumerate(table.column("surface_id").to_pylist())}
     maps = fixed(table.column("heights_mm"))
-    cells = int(round(maps.shape[1] ** 0.5))
+    cells = round(maps.shape[1] ** 0.5)
     columns = ["surface_id", "typology", "symmetry", "pair_id", "microphone_mm", "speaker_mm", *bands]
     parts: list[list[NDArray[np.generic]]] = []
     for file in sorted((folder / "data").glob(f"{split}-*.parquet")):
@@ -63,14 +65,16 @@ def read(folder: Path, split: str, bands: list[str], rng: np.random.Generator) -
             plain = np.flatnonzero(np.asarray(some.column("symmetry").to_pylist()) == "identity")
             keep = np.sort(rng.permutation(plain)[:PAIRS_A_SURFACE])
             levels = np.stack([10 * np.log10(np.maximum(some.column(b).to_numpy(), 1e-12)) for b in bands], axis=1)
-            parts.append([
-                np.full(len(keep), places[surface]),
-                some.column("pair_id").to_numpy()[keep],
-                fixed(some.column("microphone_mm"))[keep],
-                fixed(some.column("speaker_mm"))[keep],
-                np.maximum(levels[keep], FLOOR_DB).astype(np.float32),
-            ])
-    surface, pair, microphone, speaker, target = (np.concatenate(column) for column in zip(*parts))
+            parts.append(
+                [
+                    np.full(len(keep), places[surface]),
+                    some.column("pair_id").to_numpy()[keep],
+                    fixed(some.column("microphone_mm"))[keep],
+                    fixed(some.column("speaker_mm"))[keep],
+                    np.maximum(levels[keep], FLOOR_DB).astype(np.float32),
+                ]
+            )
+    surface, pair, microphone, speaker, target = (np.concatenate(column) for column in zip(*parts, strict=True))
     size = float(table.column("size_mm")[0].as_py())
     return Rows(surface, pair, microphone, speaker, target, maps.reshape(-1, cells, cells), size)
 
@@ -78,14 +82,16 @@ def read(folder: Path, split: str, bands: list[str], rng: np.random.Generator) -
 def fixed(column) -> Floats:  # type: ignore[no-untyped-def]
     """A column of lists of one length as a matrix."""
     array = column.combine_chunks()
-    return array.flatten().to_numpy().reshape(len(array), -1)
+    matrix: Floats = array.flatten().to_numpy().reshape(len(array), -1)
+    return matrix
 
 
 def specular(rows: Rows) -> Floats:
     """Where the flat panel would reflect, x and y in mm."""
     m, s = rows.microphone, rows.speaker
     share = (m[:, 2] / (m[:, 2] + s[:, 2]))[:, None]
-    return m[:, :2] + share * (s[:, :2] - m[:, :2])
+    point: Floats = m[:, :2] + share * (s[:, :2] - m[:, :2])
+    return point
 
 
 def features(rows: Rows) -> Floats:
@@ -94,7 +100,8 @@ def features(rows: Rows) -> Floats:
     pitch = rows.size_mm / cells
     point = specular(rows)
     centre = np.clip(np.round(point / pitch + (cells - 1) / 2).astype(int), 0, cells - 1)
-    along_y, along_x = np.gradient(rows.maps, pitch, axis=(1, 2))
+    along_y: Floats = np.gradient(rows.maps, pitch, axis=1)
+    along_x: Floats = np.gradient(rows.maps, pitch, axis=2)
     columns = [np.linalg.norm(rows.microphone - rows.speaker, axis=1) / 300, point[:, 0] / 300, point[:, 1] / 300]
     columns += [rows.microphone[:, 2] / 300, rows.speaker[:, 2] / 300, (np.abs(point) / 300).max(axis=1)]
     for radius in RADII_MM:
@@ -119,14 +126,15 @@ def features(rows: Rows) -> Floats:
 
 def ridge(x: Floats, y: Floats, weight: float) -> tuple[Floats, Floats, Floats]:
     """Weights for standardised features, with their means and scales."""
-    mean, scale = x.mean(0), x.std(0) + 1e-6
+    mean: Floats = x.mean(0)
+    scale: Floats = x.std(0) + 1e-6
     mean[0], scale[0] = 0, 1
     z = ((x - mean) / scale).astype(np.float64)
     weights = np.linalg.solve(z.T @ z + weight * len(z) * np.eye(z.shape[1]), z.T @ y)
     return weights.astype(np.float32), mean, scale
 
 
-def report(name: str, bands: list[str], errors: dict[str, Floats]) -> None:
+def report(name: str, bands: list[str], errors: Mapping[str, NDArray[np.floating[Any]]]) -> None:
     """Root mean square errors in dB, a line a split."""
     for split, error in errors.items():
         each = "  ".join(f"{e:6.2f}" for e in np.sqrt((error**2).mean(0)))
@@ -178,7 +186,8 @@ def network(splits: dict[str, Rows], bands: list[str], epochs: int) -> dict[str,
             self.say = nn.Sequential(nn.Linear(32 * (side // 8) ** 2 + 6, 96), nn.ReLU(), nn.Linear(96, len(bands)))
 
         def forward(self, maps: torch.Tensor, geometry: torch.Tensor) -> torch.Tensor:
-            return self.say(torch.cat([self.see(maps), geometry], 1))  # type: ignore[no-any-return]
+            said: torch.Tensor = self.say(torch.cat([self.see(maps), geometry], 1))
+            return said
 
     net, train = Net(), splits["train"]
     mean, scale = train.target.mean(0), train.target.std(0)
@@ -216,7 +225,9 @@ def main() -> None:
     if not first:
         parser.error(f"no data/train-*.parquet in `{arguments.folder}`; is it made by `echolake export ml`?")
     names = pq.read_schema(first[0]).names
-    bands = [name for name in names if name.startswith("tnce_") and name.split("_")[-1].isdigit() and "band" not in name]
+    bands = [
+        name for name in names if name.startswith("tnce_") and name.split("_")[-1].isdigit() and "band" not in name
+    ]
     rng = np.random.default_rng(1)
     found = {split: read(arguments.folder, split, bands, rng) for split in SPLITS}
     splits = {split: rows for split, rows in found.items() if rows is not None}

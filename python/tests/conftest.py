@@ -44,7 +44,18 @@ def lake(echolake: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def addresses(echolake: str, lake: Path) -> Iterator[dict[str, str]]:
     """Where it is served, by scheme."""
     anywhere = "127.0.0.1:0"
-    command = [echolake, "--lake", str(lake), "serve", "--listen", anywhere, "--flight-sql", anywhere, "--postgres", "off"]
+    command = [
+        echolake,
+        "--lake",
+        str(lake),
+        "serve",
+        "--listen",
+        anywhere,
+        "--flight-sql",
+        anywhere,
+        "--postgres",
+        "off",
+    ]
     server = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True)
     # Reading its lines has no limit of its own: a server that says nothing is killed, and they end.
     silence = threading.Timer(LIMIT_SECS, server.kill)

@@ -24,7 +24,8 @@ def get(url: str) -> bytes:
 
 def files(served_http: str, table: str) -> list[dict[str, Any]]:
     found: list[dict[str, Any]] = json.loads(get(f"{served_http}/api/v1/files?table={table}"))["files"]
-    assert found and all(file["table"] == table and file["superseded_rows"] == 0 for file in found)
+    assert found
+    assert all(file["table"] == table and file["superseded_rows"] == 0 for file in found)
     return found
 
 
@@ -107,7 +108,9 @@ def test_the_manifest_is_what_its_data_hold(served_http: str, tmp_path: Path) ->
     manifest = json.loads(get(f"{served_http}/api/v1/foxglove/manifest?where=pair_id%3C3&run={a_run(served_http)}"))
     (source,) = manifest["sources"]
     assert set(source) == {"url", "id", "topics", "schemas", "startTime", "endTime"}
-    assert all(re.fullmatch(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\.\d{9}Z", source[time]) for time in ("startTime", "endTime"))
+    assert all(
+        re.fullmatch(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\.\d{9}Z", source[time]) for time in ("startTime", "endTime")
+    )
     schemas = {schema["id"]: schema for schema in source["schemas"]}
     told = {topic["name"]: (topic["messageEncoding"], schemas[topic["schemaId"]]) for topic in source["topics"]}
     path = tmp_path / "data.mcap"
@@ -119,6 +122,10 @@ def test_the_manifest_is_what_its_data_hold(served_http: str, tmp_path: Path) ->
             assert message.log_time >= last
             last = message.log_time
             encoding, expected = told[channel.topic]
-            assert (channel.message_encoding, schema.name, schema.encoding) == (encoding, expected["name"], expected["encoding"])
+            assert (channel.message_encoding, schema.name, schema.encoding) == (
+                encoding,
+                expected["name"],
+                expected["encoding"],
+            )
             assert base64.b64decode(expected["data"], validate=True) == schema.data
     assert last > 0

@@ -7,7 +7,7 @@ import pytest
 pytest.importorskip("rerun")
 pytest.importorskip("mcap_protobuf")
 
-import echolake.rerun  # noqa: E402
+import echolake.rerun
 
 
 def test_a_slice_becomes_a_recording(a_slice: Path, tmp_path: Path) -> None:

@@ -10,7 +10,8 @@ from echolake.symmetry import MATRICES, NAMES, turn_heights, turn_positions
 
 def test_the_eight_are_a_group() -> None:
     products = {tuple((MATRICES[a] @ MATRICES[b]).ravel()) for a in NAMES for b in NAMES}
-    assert products == {tuple(MATRICES[a].ravel()) for a in NAMES} and len(products) == 8
+    assert products == {tuple(MATRICES[a].ravel()) for a in NAMES}
+    assert len(products) == 8
 
 
 def test_heights_move_with_positions() -> None:
@@ -38,7 +39,7 @@ def test_height_maps_are_those_that_the_lake_has(turned_set: Path) -> None:
 def test_positions_are_those_that_the_lake_has(turned_set: Path) -> None:
     table = pq.read_table(next((turned_set / "data").glob("test-*.parquet")))
     columns = ("symmetry", "pair_id", "swapped", "microphone_mm", "speaker_mm")
-    rows = zip(*(table.column(name).to_pylist() for name in columns))
+    rows = zip(*(table.column(name).to_pylist() for name in columns), strict=True)
     placed = {(symmetry, pair): (swapped, np.array(m), np.array(s)) for symmetry, pair, swapped, m, s in rows}
     for (symmetry, pair), (swapped, microphone, speaker) in placed.items():
         _, m, s = placed["identity", pair]

@@ -2,6 +2,7 @@
 
 import pickle
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ from echolake.torch import Batch, Measurements  # noqa: E402
 def rows(dataset: Measurements, workers: int = 0) -> list[tuple[str, str, int]]:
     found = []
     for batch in DataLoader(dataset, batch_size=None, num_workers=workers):
-        for place, pair in zip(batch["surface"].tolist(), batch["pair_id"].tolist()):
+        for place, pair in zip(batch["surface"].tolist(), batch["pair_id"].tolist(), strict=True):
             found.append((batch["surface_ids"][place], batch["symmetries"][place], pair))
     return found
 
@@ -55,7 +56,7 @@ def test_turns_are_those_of_the_rows_as_measured(training_set: Path) -> None:
             plain[key] = batch["microphone_mm"][row].numpy(), batch["speaker_mm"][row].numpy()
     seen = set()
     for batch in Measurements(training_set, columns=columns, symmetries="all", heights=True, seed=3):
-        for place, (surface, symmetry) in enumerate(zip(batch["surface_ids"], batch["symmetries"])):
+        for place, (surface, symmetry) in enumerate(zip(batch["surface_ids"], batch["symmetries"], strict=True)):
             seen.add(symmetry)
             assert np.array_equal(batch["heights"][place], turn_heights(maps[surface], symmetry))
         for row in range(0, len(batch["surface"]), 97):
@@ -67,11 +68,11 @@ def test_turns_are_those_of_the_rows_as_measured(training_set: Path) -> None:
     assert seen == set(NAMES)
 
 
-def contents(batch: Batch) -> dict[str, object]:
+def contents(batch: Batch) -> dict[str, Any]:
     return {name: value.numpy().copy() if isinstance(value, torch.Tensor) else value for name, value in batch.items()}
 
 
-def same(one: dict[str, object], other: dict[str, object]) -> bool:
+def same(one: dict[str, Any], other: dict[str, Any]) -> bool:
     return list(one) == list(other) and all(np.array_equal(one[name], other[name]) for name in one)
 
 
@@ -81,7 +82,7 @@ def test_a_worker_sends_what_is_read_without_one(training_set: Path) -> None:
     expected = [contents(batch) for batch in dataset]
     kept = list(DataLoader(dataset, batch_size=None, num_workers=1))
     assert len(kept) == len(expected) > 40
-    assert all(same(contents(batch), other) for batch, other in zip(kept, expected))
+    assert all(same(contents(batch), other) for batch, other in zip(kept, expected, strict=True))
     assert kept[0]["ir"].is_contiguous()
 
 

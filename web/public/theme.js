@@ -2,4 +2,6 @@
 try {
   const theme = localStorage.getItem('theme')
   if (theme === 'dark' || theme === 'light') document.documentElement.dataset.theme = theme
-} catch { /* storage is refused; the system's theme holds */ }
+} catch {
+  /* storage is refused; the system's theme holds */
+}

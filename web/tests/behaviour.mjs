@@ -4,15 +4,28 @@ import { contextOf, eventually, launch } from './browser.mjs'
 
 const base = process.argv[2]
 const get = async (path) => (await fetch(base + path)).json()
-const sql = async (query) => (await fetch(base + '/api/v1/sql', { method: 'POST', headers: { accept: 'application/json', 'content-type': 'application/json' }, body: JSON.stringify({ query }) })).json()
+const sql = async (query) =>
+  (
+    await fetch(base + '/api/v1/sql', {
+      method: 'POST',
+      headers: { accept: 'application/json', 'content-type': 'application/json' },
+      body: JSON.stringify({ query }),
+    })
+  ).json()
 const lake = await get('/api/v1/lake')
 const all = await get('/api/v1/surfaces?limit=500')
 const id = all.items.find((s) => s.typology !== 'reference').surface_id
 const browser = await launch()
-const context = await contextOf(browser, { viewport: { width: 1280, height: 900 }, deviceScaleFactor: 1, acceptDownloads: true })
+const context = await contextOf(browser, {
+  viewport: { width: 1280, height: 900 },
+  deviceScaleFactor: 1,
+  acceptDownloads: true,
+})
 const page = await context.newPage()
 const said = []
-page.on('console', (message) => { if (!message.text().includes('GPU stall due to ReadPixels')) said.push(message.text()) })
+page.on('console', (message) => {
+  if (!message.text().includes('GPU stall due to ReadPixels')) said.push(message.text())
+})
 page.on('pageerror', (error) => said.push(error.message))
 const open = (path) => page.goto(base + path, { waitUntil: 'networkidle' })
 const settled = () => page.waitForLoadState('networkidle').then(() => page.waitForTimeout(150))
@@ -34,8 +47,12 @@ await check('the grid plot’s pixels have the colours that SQL says', async () 
   const microphone = 14
   await open(`/surfaces/${id}?microphone=${microphone}`)
   await settled()
-  const columns = lake.bands.map((b) => `10 * log10(${b.key === 'total' ? 'tnce_total' : `tnce_${b.key}`}) as "${b.key}"`).join(', ')
-  const rows = await sql(`select case when microphone = ${microphone} then speaker else microphone end as point, ${columns} from tnce where surface_id = '${id}' and (microphone = ${microphone} or speaker = ${microphone})`)
+  const columns = lake.bands
+    .map((b) => `10 * log10(${b.key === 'total' ? 'tnce_total' : `tnce_${b.key}`}) as "${b.key}"`)
+    .join(', ')
+  const rows = await sql(
+    `select case when microphone = ${microphone} then speaker else microphone end as point, ${columns} from tnce where surface_id = '${id}' and (microphone = ${microphone} or speaker = ${microphone})`,
+  )
   const width = await page.evaluate(() => document.querySelector('.cells canvas').width)
   // Layers across in equal columns, bands down: found from the outside by the plot's size alone.
   const left = 58
@@ -46,15 +63,18 @@ await check('the grid plot’s pixels have the colours that SQL says', async () 
     const size = across === 1 ? Math.floor(side / 3) : Math.floor((side - 2) / across)
     const inset = Math.floor((side - size * across) / 2)
     return lake.bands.map((band, b) => ({
-      x: left + point.layer * (side + 10) + inset + point.gridx * size + 3, y: 22 + b * (side + 10) + inset + (across - 1 - point.gridy) * size + 3,
-      db: row[band.key], what: `point ${row.point}, band ${band.key}`,
+      x: left + point.layer * (side + 10) + inset + point.gridx * size + 3,
+      y: 22 + b * (side + 10) + inset + (across - 1 - point.gridy) * size + 3,
+      db: row[band.key],
+      what: `point ${row.point}, band ${band.key}`,
     }))
   })
-  const drawn = () => page.evaluate((places) => {
-    const canvas = document.querySelector('.cells canvas')
-    const { data } = canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height)
-    return places.map(({ x, y }) => [...data.slice(4 * (y * canvas.width + x), 4 * (y * canvas.width + x) + 3)])
-  }, wanted)
+  const drawn = () =>
+    page.evaluate((places) => {
+      const canvas = document.querySelector('.cells canvas')
+      const { data } = canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height)
+      return places.map(({ x, y }) => [...data.slice(4 * (y * canvas.width + x), 4 * (y * canvas.width + x) + 3)])
+    }, wanted)
   await eventually(async () => {
     const colours = await drawn()
     wanted.forEach((cell, i) => assert.deepEqual(colours[i], expected(cell.db), `${cell.what}, ${cell.db} dB`))
@@ -67,7 +87,10 @@ await check('a facet click changes the address and the counts, and a fresh link 
   await open('/')
   const before = await page.locator('h1').innerText()
   const facet = all.facets.find((f) => f.name === 'typology').values[0]
-  await page.locator('button.value', { hasText: facet.value.replaceAll('_', ' ') }).first().click()
+  await page
+    .locator('button.value', { hasText: facet.value.replaceAll('_', ' ') })
+    .first()
+    .click()
   await page.waitForFunction((text) => document.querySelector('h1').innerText !== text, before)
   await page.waitForURL(new RegExp(`typology=${facet.value}`))
   await settled()
@@ -84,19 +107,23 @@ await check('a facet click changes the address and the counts, and a fresh link 
 })
 
 await check('the relief is not blank, and shows more once a pair is chosen', async () => {
-  const kinds = async () => page.evaluate(() => {
-    const canvas = document.querySelector('.stage canvas')
-    const copy = document.createElement('canvas')
-    copy.width = canvas.width
-    copy.height = canvas.height
-    const context = copy.getContext('2d')
-    context.drawImage(canvas, 0, 0)
-    const { data } = context.getImageData(0, 0, copy.width, copy.height)
-    const colours = new Set()
-    let orange = 0
-    for (let i = 0; i < data.length; i += 4) { colours.add((data[i] << 16) | (data[i + 1] << 8) | data[i + 2]); if (data[i] > data[i + 2] + 60) orange += 1 }
-    return { colours: colours.size, orange }
-  })
+  const kinds = async () =>
+    page.evaluate(() => {
+      const canvas = document.querySelector('.stage canvas')
+      const copy = document.createElement('canvas')
+      copy.width = canvas.width
+      copy.height = canvas.height
+      const context = copy.getContext('2d')
+      context.drawImage(canvas, 0, 0)
+      const { data } = context.getImageData(0, 0, copy.width, copy.height)
+      const colours = new Set()
+      let orange = 0
+      for (let i = 0; i < data.length; i += 4) {
+        colours.add((data[i] << 16) | (data[i + 1] << 8) | data[i + 2])
+        if (data[i] > data[i + 2] + 60) orange += 1
+      }
+      return { colours: colours.size, orange }
+    })
   await open(`/surfaces/${id}?microphone=14`)
   const alone = await eventually(async () => {
     const seen = await kinds()
@@ -155,11 +182,23 @@ await check('the keyboard alone reaches an impulse response from the wall', asyn
 })
 
 await check('a WAV, a picture and numbers can be saved', async () => {
-  const [wav] = await Promise.all([page.waitForEvent('download'), page.getByRole('link', { name: 'WAV, full scale' }).click()])
+  const [wav] = await Promise.all([
+    page.waitForEvent('download'),
+    page.getByRole('link', { name: 'WAV, full scale' }).click(),
+  ])
   assert.match(wav.suggestedFilename(), /\.wav$/)
-  for (const [item, ending] of [['Picture, PNG', 'png'], ['Picture, SVG', 'svg'], ['Numbers, CSV', 'csv'], ['Numbers, Parquet', 'parquet'], ['Numbers, Arrow', 'arrow']]) {
+  for (const [item, ending] of [
+    ['Picture, PNG', 'png'],
+    ['Picture, SVG', 'svg'],
+    ['Numbers, CSV', 'csv'],
+    ['Numbers, Parquet', 'parquet'],
+    ['Numbers, Arrow', 'arrow'],
+  ]) {
     await page.locator('section[aria-label="Spectrum"] summary').click()
-    const [file] = await Promise.all([page.waitForEvent('download'), page.locator('details[open] .menu button', { hasText: item }).click()])
+    const [file] = await Promise.all([
+      page.waitForEvent('download'),
+      page.locator('details[open] .menu button', { hasText: item }).click(),
+    ])
     assert.ok(file.suggestedFilename().endsWith(`.${ending}`), file.suggestedFilename())
     const stream = await file.createReadStream()
     let bytes = 0
@@ -173,12 +212,23 @@ await check('the console shows rows of every table, integers of 64 bits to the l
   assert.ok(tables.length > 10, `${tables.length} tables`)
   for (const { name } of tables) {
     await open(`/sql?q=${encodeURIComponent(`select * from ${name} limit 3`)}`)
-    await page.locator('.rows tbody tr').first().waitFor().catch(() => assert.fail(`no rows of ${name} are shown: ${said.join(' ')}`))
+    await page
+      .locator('.rows tbody tr')
+      .first()
+      .waitFor()
+      .catch(() => assert.fail(`no rows of ${name} are shown: ${said.join(' ')}`))
   }
-  const odd = 'select 1767718800000000001 as ns, arrow_cast(9007199254740993, \'UInt64\') as large, [9007199254740993] as list, to_timestamp_seconds(9000000000000) as late, named_struct(\'n\', -5) as s'
+  const odd =
+    "select 1767718800000000001 as ns, arrow_cast(9007199254740993, 'UInt64') as large, [9007199254740993] as list, to_timestamp_seconds(9000000000000) as late, named_struct('n', -5) as s"
   await open(`/sql?q=${encodeURIComponent(odd)}`)
   await page.locator('.rows tbody td').first().waitFor()
-  assert.deepEqual(await page.locator('.rows tbody td').allInnerTexts(), ['1767718800000000001', '9007199254740993', '9007199254740993', 'out of range', '{"n":-5}'])
+  assert.deepEqual(await page.locator('.rows tbody td').allInnerTexts(), [
+    '1767718800000000001',
+    '9007199254740993',
+    '9007199254740993',
+    'out of range',
+    '{"n":-5}',
+  ])
 })
 
 await check('names from the lake stay text', async () => {
@@ -198,7 +248,9 @@ await check('what the first view costs', async () => {
   const fresh = await contextOf(browser, { viewport: { width: 1280, height: 900 } })
   const first = await fresh.newPage()
   let script = 0
-  first.on('response', async (response) => { if (response.url().endsWith('.js')) script += Number(response.headers()['content-length'] ?? 0) })
+  first.on('response', async (response) => {
+    if (response.url().endsWith('.js')) script += Number(response.headers()['content-length'] ?? 0)
+  })
   const client = await fresh.newCDPSession(first)
   await first.goto(base + '/')
   await first.locator('.sheet li').first().waitFor()
@@ -207,18 +259,28 @@ await check('what the first view costs', async () => {
   const facets = first.locator('button.value')
   for (let i = 0; i < 20; i += 1) {
     // From the click to the frame that shows the answer, in the page's own time.
-    times.push(await facets.nth(i % 4).evaluate((button) => new Promise((resolve) => {
-      const start = performance.now()
-      button.click()
-      const look = () => (document.querySelector('.sheet').ariaBusy === 'false' ? resolve(performance.now() - start) : requestAnimationFrame(look))
-      requestAnimationFrame(() => requestAnimationFrame(look))
-    })))
+    times.push(
+      await facets.nth(i % 4).evaluate(
+        (button) =>
+          new Promise((resolve) => {
+            const start = performance.now()
+            button.click()
+            const look = () =>
+              document.querySelector('.sheet').ariaBusy === 'false'
+                ? resolve(performance.now() - start)
+                : requestAnimationFrame(look)
+            requestAnimationFrame(() => requestAnimationFrame(look))
+          }),
+      ),
+    )
   }
   times.sort((a, b) => a - b)
   await client.send('HeapProfiler.enable')
   await client.send('HeapProfiler.collectGarbage')
   const { usedSize } = await client.send('Runtime.getHeapUsage')
-  process.stdout.write(`  first cards after ${shown.toFixed(0)} ms, facet click p95 ${times[18].toFixed(0)} ms, scripts ${(script / 1000).toFixed(0)} kB as sent, heap ${(usedSize / 1e6).toFixed(1)} MB\n`)
+  process.stdout.write(
+    `  first cards after ${shown.toFixed(0)} ms, facet click p95 ${times[18].toFixed(0)} ms, scripts ${(script / 1000).toFixed(0)} kB as sent, heap ${(usedSize / 1e6).toFixed(1)} MB\n`,
+  )
   assert.ok(script > 0 && script < 120_000, `${script} bytes of script`)
   await fresh.close()
 })

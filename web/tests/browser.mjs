@@ -27,4 +27,5 @@ export async function contextOf(browser, options) {
 }
 
 /** Starts it, with more arguments where a script needs them. */
-export const launch = (...more) => chromium.launch({ executablePath: process.env.CHROMIUM ?? '/usr/bin/chromium', args: [...ARGS, ...more] })
+export const launch = (...more) =>
+  chromium.launch({ executablePath: process.env.CHROMIUM ?? '/usr/bin/chromium', args: [...ARGS, ...more] })

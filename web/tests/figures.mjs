@@ -12,8 +12,16 @@ const { items: runs } = await get('/api/v1/runs?limit=1')
 const measured = items.filter((s) => s.typology !== 'reference')
 const id = measured[0].surface_id
 const VIEWS = {
-  wall: '/', surface: `/surfaces/${id}?microphone=14&point=40`, response: `/surfaces/${id}/pairs/159`,
-  compare: `/compare?s=${items.slice(0, 8).map((s) => s.surface_id).join(',')}`, map: `/map?at=${id}`, runs: '/runs', run: `/runs/${runs[0].run_id}`,
+  wall: '/',
+  surface: `/surfaces/${id}?microphone=14&point=40`,
+  response: `/surfaces/${id}/pairs/159`,
+  compare: `/compare?s=${items
+    .slice(0, 8)
+    .map((s) => s.surface_id)
+    .join(',')}`,
+  map: `/map?at=${id}`,
+  runs: '/runs',
+  run: `/runs/${runs[0].run_id}`,
   sql: `/sql?q=${encodeURIComponent('select surface_id, microphone, speaker, tnce_total from tnce limit 5000')}`,
 }
 
@@ -26,8 +34,20 @@ const ms = (times) => `${sorted(times)[0].toFixed(0)} ms (${times.map((t) => t.t
 /** From the navigation to the frame after `ready` holds, in the page's own time. */
 async function opened(path, ready) {
   const page = await fresh()
-  await page.addInitScript(() => { globalThis.shown = (holds) => { const look = () => (holds() ? requestAnimationFrame(() => { globalThis.shownAt = performance.now() }) : requestAnimationFrame(look)); look() } })
-  await page.addInitScript(`document.addEventListener('readystatechange', () => { if (document.readyState === 'interactive') shown(${ready}) })`)
+  await page.addInitScript(() => {
+    globalThis.shown = (holds) => {
+      const look = () =>
+        holds()
+          ? requestAnimationFrame(() => {
+              globalThis.shownAt = performance.now()
+            })
+          : requestAnimationFrame(look)
+      look()
+    }
+  })
+  await page.addInitScript(
+    `document.addEventListener('readystatechange', () => { if (document.readyState === 'interactive') shown(${ready}) })`,
+  )
   await page.goto(base + path)
   const handle = await page.waitForFunction(() => globalThis.shownAt)
   const time = await handle.jsonValue()
@@ -43,7 +63,9 @@ const SURFACE = `() => { const canvas = document.querySelector('.cells canvas');
 async function firstView() {
   const scripts = new Map()
   const page = await fresh()
-  page.on('response', async (answer) => { if (answer.url().endsWith('.js')) scripts.set(answer.url(), await answer.body()) })
+  page.on('response', async (answer) => {
+    if (answer.url().endsWith('.js')) scripts.set(answer.url(), await answer.body())
+  })
   await page.goto(base + '/', { waitUntil: 'networkidle' })
   const gzipped = [...scripts.values()].reduce((sum, body) => sum + gzipSync(body, { level: 9 }).length, 0)
   await page.context().close()
@@ -57,12 +79,20 @@ async function facetClicks() {
   const count = await facets.count()
   const times = []
   for (let i = 0; i < CLICKS; i += 1) {
-    times.push(await facets.nth((i * 7) % Math.min(count, await facets.count())).evaluate((button) => new Promise((resolve) => {
-      const start = performance.now()
-      button.click()
-      const look = () => (document.querySelector('.sheet')?.ariaBusy !== 'true' ? resolve(performance.now() - start) : requestAnimationFrame(look))
-      requestAnimationFrame(() => requestAnimationFrame(look))
-    })))
+    times.push(
+      await facets.nth((i * 7) % Math.min(count, await facets.count())).evaluate(
+        (button) =>
+          new Promise((resolve) => {
+            const start = performance.now()
+            button.click()
+            const look = () =>
+              document.querySelector('.sheet')?.ariaBusy !== 'true'
+                ? resolve(performance.now() - start)
+                : requestAnimationFrame(look)
+            requestAnimationFrame(() => requestAnimationFrame(look))
+          }),
+      ),
+    )
   }
   await page.context().close()
   return times
@@ -73,10 +103,27 @@ async function weight(path) {
   const page = await fresh()
   const client = await page.context().newCDPSession(page)
   let most = 0
-  const used = async () => { const { usedSize, embedderHeapUsedSize = 0, backingStorageSize = 0 } = await client.send('Runtime.getHeapUsage'); return (usedSize + embedderHeapUsedSize + backingStorageSize) / 1e6 }
-  const watch = setInterval(() => used().then((now) => { most = Math.max(most, now) }, () => {}), 50)
+  const used = async () => {
+    const { usedSize, embedderHeapUsedSize = 0, backingStorageSize = 0 } = await client.send('Runtime.getHeapUsage')
+    return (usedSize + embedderHeapUsedSize + backingStorageSize) / 1e6
+  }
+  const watch = setInterval(
+    () =>
+      used().then(
+        (now) => {
+          most = Math.max(most, now)
+        },
+        () => {},
+      ),
+    50,
+  )
   await page.goto(base + path, { waitUntil: 'networkidle' })
-  await page.evaluate(async () => { for (let y = 0; y < document.body.scrollHeight; y += 600) { scrollTo(0, y); await new Promise((r) => setTimeout(r, 30)) } })
+  await page.evaluate(async () => {
+    for (let y = 0; y < document.body.scrollHeight; y += 600) {
+      scrollTo(0, y)
+      await new Promise((r) => setTimeout(r, 30))
+    }
+  })
   await page.waitForTimeout(1200)
   clearInterval(watch)
   await client.send('HeapProfiler.enable')
@@ -89,7 +136,11 @@ async function weight(path) {
 say(`${base}: ${total ?? items.length} surfaces; ${browser.version()}; load ${loadavg()[0].toFixed(1)}`)
 const { gzipped, count } = await firstView()
 say(`scripts of the first view: ${count} files, ${(gzipped / 1000).toFixed(1)} kB gzipped`)
-const rows = { 'first view, cards': [CARDS, '/'], 'first view, with pictures': [PICTURES, '/'], 'surface page': [SURFACE, `/surfaces/${id}`] }
+const rows = {
+  'first view, cards': [CARDS, '/'],
+  'first view, with pictures': [PICTURES, '/'],
+  'surface page': [SURFACE, `/surfaces/${id}`],
+}
 for (const [name, [ready, path]] of Object.entries(rows)) {
   const times = []
   for (let i = 0; i < Number(rounds); i += 1) {

@@ -11,13 +11,32 @@ const { items } = await get('/api/v1/surfaces?limit=500')
 const { items: runs } = await get('/api/v1/runs?limit=1')
 const measured = items.filter((s) => s.typology !== 'reference')
 const id = measured[0].surface_id
-const query = "select p.incidence_deg, 10 * log10(t.tnce_10000) as level_db from tnce t join pairs p using (pair_id) where t.surface_id = '" + id + "' order by p.incidence_deg limit 400"
+const query =
+  "select p.incidence_deg, 10 * log10(t.tnce_10000) as level_db from tnce t join pairs p using (pair_id) where t.surface_id = '" +
+  id +
+  "' order by p.incidence_deg limit 400"
 
 const PAGES = {
-  wall: '/', filtered: `/?typology=${measured[0].typology}&sort=level&pick=${id}`, empty: '/?q=nothing-like-this',
-  surface: `/surfaces/${id}?microphone=14&point=40&over=flat-band`, missing: '/surfaces/no%3Cb%3Esuch', ir: `/surfaces/${id}/pairs/159`,
-  compare: `/compare?s=${items.slice(0, 4).map((s) => s.surface_id).join(',')}`, difference: `/compare?s=${measured.slice(0, 3).map((s) => s.surface_id).join(',')}&show=difference&band=10000`, nothing: '/compare',
-  map: `/map?at=${id}`, runs: '/runs', run: `/runs/${runs[0].run_id}`, sql: `/sql?q=${encodeURIComponent(query)}`, wrong: '/sql?q=select%20nope',
+  wall: '/',
+  filtered: `/?typology=${measured[0].typology}&sort=level&pick=${id}`,
+  empty: '/?q=nothing-like-this',
+  surface: `/surfaces/${id}?microphone=14&point=40&over=flat-band`,
+  missing: '/surfaces/no%3Cb%3Esuch',
+  ir: `/surfaces/${id}/pairs/159`,
+  compare: `/compare?s=${items
+    .slice(0, 4)
+    .map((s) => s.surface_id)
+    .join(',')}`,
+  difference: `/compare?s=${measured
+    .slice(0, 3)
+    .map((s) => s.surface_id)
+    .join(',')}&show=difference&band=10000`,
+  nothing: '/compare',
+  map: `/map?at=${id}`,
+  runs: '/runs',
+  run: `/runs/${runs[0].run_id}`,
+  sql: `/sql?q=${encodeURIComponent(query)}`,
+  wrong: '/sql?q=select%20nope',
 }
 
 /** Of the screen, while a page comes up; browsers call up to 0.1 good. */
@@ -26,14 +45,25 @@ const MOST_JUMP = 0.1
 await mkdir(folder, { recursive: true })
 const browser = await launch()
 let failures = 0
-const fail = (text) => { failures += 1; process.stdout.write(`FAIL ${text}\n`) }
+const fail = (text) => {
+  failures += 1
+  process.stdout.write(`FAIL ${text}\n`)
+}
 for (const theme of ['light', 'dark']) {
   for (const width of [1280, 390]) {
-    const context = await contextOf(browser, { viewport: { width, height: width === 390 ? 844 : 900 }, colorScheme: theme, hasTouch: width === 390, bypassCSP: false })
+    const context = await contextOf(browser, {
+      viewport: { width, height: width === 390 ? 844 : 900 },
+      colorScheme: theme,
+      hasTouch: width === 390,
+      bypassCSP: false,
+    })
     const page = await context.newPage()
     await page.addInitScript(() => {
       globalThis.jumps = []
-      new PerformanceObserver((list) => { for (const entry of list.getEntries()) if (!entry.hadRecentInput) globalThis.jumps.push([entry.value, entry.sources?.[0]?.node?.className ?? '']) }).observe({ type: 'layout-shift', buffered: true })
+      new PerformanceObserver((list) => {
+        for (const entry of list.getEntries())
+          if (!entry.hadRecentInput) globalThis.jumps.push([entry.value, entry.sources?.[0]?.node?.className ?? ''])
+      }).observe({ type: 'layout-shift', buffered: true })
     })
     for (const [name, path] of Object.entries(PAGES)) {
       if (only && !only.split(',').includes(name)) continue
@@ -42,20 +72,35 @@ for (const theme of ['light', 'dark']) {
       page.removeAllListeners('console')
       page.removeAllListeners('pageerror')
       // Reading back a screenshot stalls the software renderer, which says so.
-      page.on('console', (message) => { if (!message.text().includes('GPU stall due to ReadPixels') && !(expected && message.text().includes(`status of ${expected}`))) said.push(`${message.type()}: ${message.text()}`) })
+      page.on('console', (message) => {
+        if (
+          !message.text().includes('GPU stall due to ReadPixels') &&
+          !(expected && message.text().includes(`status of ${expected}`))
+        )
+          said.push(`${message.type()}: ${message.text()}`)
+      })
       page.on('pageerror', (error) => said.push(`error: ${error.stack.split('\n').slice(0, 3).join(' ')}`))
       const at = `${name}-${theme}-${width}`
       await page.goto(base + path, { waitUntil: 'networkidle' })
       await page.waitForTimeout(['surface', 'sql', 'wrong'].includes(name) ? 900 : 250)
       const jumps = await page.evaluate(() => globalThis.jumps)
       const jumped = jumps.reduce((sum, [value]) => sum + value, 0)
-      if (jumped > MOST_JUMP) fail(`${at}: the layout jumped by ${jumped.toFixed(3)}: ${JSON.stringify(jumps.filter(([value]) => value > 0.01))}`)
+      if (jumped > MOST_JUMP)
+        fail(
+          `${at}: the layout jumped by ${jumped.toFixed(3)}: ${JSON.stringify(jumps.filter(([value]) => value > 0.01))}`,
+        )
       const wide = await page.evaluate(() => document.documentElement.scrollWidth - innerWidth)
       if (wide > 0) fail(`${at}: the page is ${wide} px too wide`)
       await page.screenshot({ path: `${folder}/${at}.png`, fullPage: true })
       await page.evaluate(axe)
       const { violations } = await page.evaluate(() => globalThis.axe.run(document, { resultTypes: ['violations'] }))
-      for (const violation of violations) fail(`${at}: axe ${violation.id}: ${violation.help}\n  ${violation.nodes.slice(0, 3).map((n) => `${n.html.slice(0, 160)} | ${n.failureSummary?.split('\n')[1] ?? ''}`).join('\n  ')}`)
+      for (const violation of violations)
+        fail(
+          `${at}: axe ${violation.id}: ${violation.help}\n  ${violation.nodes
+            .slice(0, 3)
+            .map((n) => `${n.html.slice(0, 160)} | ${n.failureSummary?.split('\n')[1] ?? ''}`)
+            .join('\n  ')}`,
+        )
       for (const line of said) fail(`${at}: console: ${line}`)
     }
     await context.close()

@@ -8,11 +8,17 @@ const MOST_BYTES = 200_000
 const get = async (path) => (await fetch(base + path)).json()
 const { items } = await get('/api/v1/surfaces?limit=500')
 const id = (items.find((s) => s.surface_id === 'brick') ?? items.find((s) => s.typology !== 'reference')).surface_id
-const PICTURES = [['wall', '/'], ['surface', `/surfaces/${id}?microphone=14&point=40&over=flat-band`], ['response', `/surfaces/${id}/pairs/159`]]
+const PICTURES = [
+  ['wall', '/'],
+  ['surface', `/surfaces/${id}?microphone=14&point=40&over=flat-band`],
+  ['response', `/surfaces/${id}/pairs/159`],
+]
 
 await mkdir(folder, { recursive: true })
 const browser = await launch()
-const page = await (await browser.newContext({ viewport: { width: 1200, height: 720 }, colorScheme: 'light' })).newPage()
+const page = await (
+  await browser.newContext({ viewport: { width: 1200, height: 720 }, colorScheme: 'light' })
+).newPage()
 for (const [name, path] of PICTURES) {
   await page.goto(base + path, { waitUntil: 'networkidle' })
   await page.waitForTimeout(1200)

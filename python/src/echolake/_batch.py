@@ -111,7 +111,9 @@ class Memory:
         self._reuses = _parent_can_open()
         self._layouts: dict[Any, tuple[_Layout, int]] = {}
 
-    def batch(self, columns: Mapping[str, NDArray[Any]], chosen: NDArray[np.int64], whole: Mapping[str, NDArray[Any]]) -> Batch:
+    def batch(
+        self, columns: Mapping[str, NDArray[Any]], chosen: NDArray[np.int64], whole: Mapping[str, NDArray[Any]]
+    ) -> Batch:
         """The ``chosen`` rows of columns, and all of what is ``whole``."""
         layout, size = self._layout(columns, len(chosen), whole)
         slab = self._slab(size) if self._reuses else None
@@ -129,7 +131,9 @@ class Memory:
         return batch
 
     # The same for almost all batches of a dataset.
-    def _layout(self, columns: Mapping[str, NDArray[Any]], rows: int, whole: Mapping[str, NDArray[Any]]) -> tuple[_Layout, int]:
+    def _layout(
+        self, columns: Mapping[str, NDArray[Any]], rows: int, whole: Mapping[str, NDArray[Any]]
+    ) -> tuple[_Layout, int]:
         key = rows, *(values.shape for values in whole.values())
         if key not in self._layouts:
             shapes = {name: (rows, *values.shape[1:]) for name, values in columns.items()}

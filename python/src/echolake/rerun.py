@@ -58,9 +58,9 @@ def view(
 ) -> Any:
     """Shows a run or a slice; returns the recording.
 
-    ``source`` is an MCAP file or its URL (``echolake export mcap`` makes small ones), ``pairs`` the pairs to show, all by
-    default. The first ``sounds`` measurements can be listened to. ``save`` writes an ``.rrd`` file; without it a viewer is
-    started, unless ``spawn`` is false.
+    ``source`` is an MCAP file or its URL (``echolake export mcap`` makes small ones), ``pairs`` the pairs to show, all
+    by default. The first ``sounds`` measurements can be listened to. ``save`` writes an ``.rrd`` file; without it a
+    viewer is started, unless ``spawn`` is false.
     """
     recording = rr.RecordingStream("echolake")
     if save is not None:

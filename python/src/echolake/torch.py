@@ -68,15 +68,15 @@ class Measurements(IterableDataset[Batch]):
     keep up with the disk. Each batch has one tensor a column with ``batch_size`` rows, and
 
     - ``surface``: for each row, which of ``surface_ids`` and ``symmetries`` it is of,
-    - ``heights`` (with ``heights=True``): ``[len(surface_ids), cells, cells]`` in mm, so ``batch["heights"][batch["surface"]]``
-      has a map for each row.
+    - ``heights`` (with ``heights=True``): ``[len(surface_ids), cells, cells]`` in mm, so
+      ``batch["heights"][batch["surface"]]`` has a map for each row.
 
-    Files are dealt to ranks and workers; where there are fewer files than workers, surfaces are. ``mix`` surfaces, of as
-    many files, are read at a time and shuffled together, while the next ones are being read.
+    Files are dealt to ranks and workers; where there are fewer files than workers, surfaces are. ``mix`` surfaces, of
+    as many files, are read at a time and shuffled together, while the next ones are being read.
 
-    ``symmetries``: ``"none"``; ``"random"``, each surface under one of the eight, another one every epoch; ``"all"``, each
-    under every one. Positions and height maps turn together; microphone and speaker keep their roles, so that nothing
-    relies on reciprocity.
+    ``symmetries``: ``"none"``; ``"random"``, each surface under one of the eight, another one every epoch; ``"all"``,
+    each under every one. Positions and height maps turn together; microphone and speaker keep their roles, so that
+    nothing relies on reciprocity.
     """
 
     def __init__(
@@ -109,7 +109,9 @@ class Measurements(IterableDataset[Batch]):
         self.with_heights = heights
         distributed = torch.distributed.is_available() and torch.distributed.is_initialized()
         self.rank = rank if rank is not None else (torch.distributed.get_rank() if distributed else 0)
-        self.world_size = world_size if world_size is not None else (torch.distributed.get_world_size() if distributed else 1)
+        self.world_size = (
+            world_size if world_size is not None else (torch.distributed.get_world_size() if distributed else 1)
+        )
         if not 0 <= self.rank < self.world_size:
             raise ValueError(f"rank {self.rank} of {self.world_size}")
         self.epoch = 0
@@ -187,7 +189,7 @@ class Measurements(IterableDataset[Batch]):
         starts = np.cumsum([0, *(item.rows for item in items)])
         columns = self._columns(int(starts[-1]), room)
         parts = []
-        for item, start, stop in zip(items, starts, starts[1:]):
+        for item, start, stop in zip(items, starts[:-1], starts[1:], strict=True):
             part = {name: values[start:stop] for name, values in columns.items()}
             parts.append(readers.submit(self._read, item, part))
         return readers.submit(lambda: _Block(columns, *_numbered([part.result() for part in parts])))
@@ -223,7 +225,7 @@ class Measurements(IterableDataset[Batch]):
         coded = table.column("symmetry").combine_chunks().dictionary_encode()
         names = coded.dictionary.to_pylist()
         if names != ["identity"] and self.symmetries != "none":
-            raise ValueError("the training set has its symmetries already; take symmetries=\"none\"")
+            raise ValueError('the training set has its symmetries already; take symmetries="none"')
         of_row[:] = coded.indices.to_numpy()
         surface_ids = [table.column("surface_id")[0].as_py()] * len(names)
         return _Surfaces(surface_ids, [item.symmetry] if names == ["identity"] else names, of_row)
@@ -239,7 +241,7 @@ class Measurements(IterableDataset[Batch]):
 
     def _maps(self, block: _Block) -> NDArray[np.float32]:
         known = self._known_heights()
-        pairs = zip(block.surface_ids, block.symmetries)
+        pairs = zip(block.surface_ids, block.symmetries, strict=True)
         return np.stack([turn_heights(known[surface], symmetry) for surface, symmetry in pairs])
 
     def _known_heights(self) -> dict[str, NDArray[np.float32]]:
@@ -249,9 +251,9 @@ class Measurements(IterableDataset[Batch]):
                 raise FileNotFoundError(f"`{file}` is not there: the lake has no height maps")
             table = pq.read_table(file, columns=["surface_id", "heights_mm"], filters=[("symmetry", "=", "identity")])
             values = _numpy(table.column("heights_mm"))
-            cells = int(round(values.shape[1] ** 0.5))
+            cells = round(values.shape[1] ** 0.5)
             maps = values.reshape(-1, cells, cells)
-            self._heights = dict(zip(table.column("surface_id").to_pylist(), maps))
+            self._heights = dict(zip(table.column("surface_id").to_pylist(), maps, strict=True))
         return self._heights
 
 

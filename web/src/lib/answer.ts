@@ -2,12 +2,40 @@
 import { tableFromIPC } from '@uwdata/flechette'
 import { ApiError } from './api'
 
-export interface Answer { readonly columns: readonly { readonly name: string; readonly type: string; readonly numeric: boolean; at(i: number): unknown }[]; readonly rows: number; readonly bytes: number }
+export interface Answer {
+  readonly columns: readonly {
+    readonly name: string
+    readonly type: string
+    readonly numeric: boolean
+    at(i: number): unknown
+  }[]
+  readonly rows: number
+  readonly bytes: number
+}
 
 /** What a page takes in before it says that it is too much. */
 const MOST_BYTES = 48_000_000
 const NUMERIC = new Set([2, 3])
-const NAMES: Record<number, string> = { 1: 'null', 2: 'integer', 3: 'number', 4: 'binary', 5: 'text', 6: 'boolean', 7: 'decimal', 8: 'date', 9: 'time', 10: 'time', 11: 'interval', 12: 'list', 13: 'struct', 16: 'list', 17: 'map', 20: 'text', 21: 'list', 24: 'text' }
+const NAMES: Record<number, string> = {
+  1: 'null',
+  2: 'integer',
+  3: 'number',
+  4: 'binary',
+  5: 'text',
+  6: 'boolean',
+  7: 'decimal',
+  8: 'date',
+  9: 'time',
+  10: 'time',
+  11: 'interval',
+  12: 'list',
+  13: 'struct',
+  16: 'list',
+  17: 'map',
+  20: 'text',
+  21: 'list',
+  24: 'text',
+}
 const TIMESTAMP = 10
 
 export async function readAnswer(response: Response, stop: () => void): Promise<Answer> {
@@ -18,21 +46,38 @@ export async function readAnswer(response: Response, stop: () => void): Promise<
     const { done, value } = await reader.read()
     if (done) break
     bytes += value.length
-    if (bytes > MOST_BYTES) { stop(); throw new ApiError(413, 'request_too_large', `the answer is larger than ${MOST_BYTES / 1e6} MB`, 'Add a limit, or export it: an export is not kept in the page.') }
+    if (bytes > MOST_BYTES) {
+      stop()
+      throw new ApiError(
+        413,
+        'request_too_large',
+        `the answer is larger than ${MOST_BYTES / 1e6} MB`,
+        'Add a limit, or export it: an export is not kept in the page.',
+      )
+    }
     parts.push(value)
   }
   const whole = new Uint8Array(bytes)
   let at = 0
-  for (const part of parts) { whole.set(part, at); at += part.length }
+  for (const part of parts) {
+    whole.set(part, at)
+    at += part.length
+  }
   if (bytes === 0) return { columns: [], rows: 0, bytes }
   // Times in ns are larger than a number holds exactly: integers of 64 bits come as BigInt.
   const table = tableFromIPC(whole, { useBigInt: true })
   return {
-    rows: table.numRows, bytes,
+    rows: table.numRows,
+    bytes,
     columns: table.schema.fields.map((field, i) => {
       const column = table.getChildAt(i)
       const typeId = field.type.typeId as number
-      return { name: field.name, type: NAMES[typeId] ?? 'value', numeric: NUMERIC.has(typeId) || typeId === TIMESTAMP, at: (row: number) => (typeId === TIMESTAMP ? when(column.at(row) as number | null) : column.at(row)) }
+      return {
+        name: field.name,
+        type: NAMES[typeId] ?? 'value',
+        numeric: NUMERIC.has(typeId) || typeId === TIMESTAMP,
+        at: (row: number) => (typeId === TIMESTAMP ? when(column.at(row) as number | null) : column.at(row)),
+      }
     }),
   }
 }
@@ -44,13 +89,21 @@ const LONG = 6
 /** A value as a cell shows it. */
 export function cellText(value: unknown): string {
   if (value === null || value === undefined) return ''
-  if (value instanceof Date) return Number.isNaN(value.getTime()) ? 'out of range' : value.toISOString().replace('T', ' ').replace(/\.?0*Z$/, '')
+  if (value instanceof Date)
+    return Number.isNaN(value.getTime())
+      ? 'out of range'
+      : value
+          .toISOString()
+          .replace('T', ' ')
+          .replace(/\.?0*Z$/, '')
   if (typeof value === 'bigint') return String(value).replace('-', '\u2212')
-  if (typeof value === 'number') return (Number.isInteger(value) ? String(value) : String(Number(value.toPrecision(7)))).replace('-', '\u2212')
+  if (typeof value === 'number')
+    return (Number.isInteger(value) ? String(value) : String(Number(value.toPrecision(7)))).replace('-', '\u2212')
   if (ArrayBuffer.isView(value) || Array.isArray(value)) {
     const list = Array.from(value as ArrayLike<unknown>)
     return `${list.slice(0, LONG).map(cellText).join(', ')}${list.length > LONG ? `, … ${list.length} values` : ''}`
   }
-  if (typeof value === 'object') return JSON.stringify(value, (_, inner: unknown) => (typeof inner === 'bigint' ? Number(inner) : inner))
+  if (typeof value === 'object')
+    return JSON.stringify(value, (_, inner: unknown) => (typeof inner === 'bigint' ? Number(inner) : inner))
   return String(value)
 }

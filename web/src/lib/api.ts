@@ -37,7 +37,8 @@ const kept = new Map<string, { readonly since: number; readonly answer: Promise<
 /** Builds an address of the API. */
 export function apiHref(path: string, params: Record<string, string | number | null | undefined> = {}): string {
   const search = new URLSearchParams()
-  for (const [name, value] of Object.entries(params)) if (value !== null && value !== undefined) search.set(name, String(value))
+  for (const [name, value] of Object.entries(params))
+    if (value !== null && value !== undefined) search.set(name, String(value))
   const text = search.toString()
   return `/api/v1${path}${text ? `?${text}` : ''}`
 }
@@ -54,9 +55,16 @@ async function refusal(response: Response): Promise<ApiError> {
 
 async function ask(href: string, init?: RequestInit): Promise<Response> {
   let response: Response
-  try { response = await fetch(href, init) } catch (error) {
+  try {
+    response = await fetch(href, init)
+  } catch (error) {
     if (error instanceof DOMException && error.name === 'AbortError') throw error
-    throw new ApiError(0, 'lake_unreadable', 'the server does not answer', 'See whether echolake serve still runs, then try again.')
+    throw new ApiError(
+      0,
+      'lake_unreadable',
+      'the server does not answer',
+      'See whether echolake serve still runs, then try again.',
+    )
   }
   if (!response.ok) throw await refusal(response)
   return response
@@ -78,13 +86,27 @@ export const get = <T>(href: string): Promise<T> => remember(href, async () => (
 
 /** A surface's heights in mm. */
 export const heightmap = (id: string): Promise<Float32Array> =>
-  remember(`heights ${id}`, async () => new Float32Array(await (await ask(apiHref(`/surfaces/${encodeURIComponent(id)}/heightmap`))).arrayBuffer()))
+  remember(
+    `heights ${id}`,
+    async () =>
+      new Float32Array(await (await ask(apiHref(`/surfaces/${encodeURIComponent(id)}/heightmap`))).arrayBuffer()),
+  )
 
 /** Runs a query; closing by `signal` cancels it. */
 export const sql = (query: string, accept: string, signal?: AbortSignal): Promise<Response> =>
-  ask('/api/v1/sql', { method: 'POST', headers: { 'content-type': 'application/json', accept }, body: JSON.stringify({ query }), ...(signal ? { signal } : {}) })
+  ask('/api/v1/sql', {
+    method: 'POST',
+    headers: { 'content-type': 'application/json', accept },
+    body: JSON.stringify({ query }),
+    ...(signal ? { signal } : {}),
+  })
 
 /** Shows the server a token; it answers with a cookie, which pictures and downloads send too. */
-export const login = (token: string): Promise<Response> => ask('/api/v1/session', { method: 'POST', headers: { 'content-type': 'application/json' }, body: JSON.stringify({ token }) })
+export const login = (token: string): Promise<Response> =>
+  ask('/api/v1/session', {
+    method: 'POST',
+    headers: { 'content-type': 'application/json' },
+    body: JSON.stringify({ token }),
+  })
 
 export const thumbnailHref = (id: string) => apiHref(`/surfaces/${encodeURIComponent(id)}/thumbnail.png`)

@@ -34,13 +34,20 @@ export function differenceColour(value_db: number, reach_db: number): Rgb {
 export const css = ([r, g, b]: Rgb) => `rgb(${r}, ${g}, ${b})`
 
 /** Black or white, whichever is read better on a colour. */
-export const inkOn = ([r, g, b]: Rgb): string => (0.2126 * (r / 255) ** 2.2 + 0.7152 * (g / 255) ** 2.2 + 0.0722 * (b / 255) ** 2.2 > 0.18 ? '#000' : '#fff')
+export const inkOn = ([r, g, b]: Rgb): string =>
+  0.2126 * (r / 255) ** 2.2 + 0.7152 * (g / 255) ** 2.2 + 0.0722 * (b / 255) ** 2.2 > 0.18 ? '#000' : '#fff'
 
 /** The value of a custom property, for canvases. */
 export const token = (name: string) => getComputedStyle(document.documentElement).getPropertyValue(name).trim()
 
 /** Viridis by five stops, for spectrograms: readable without telling red from green, and in grey. */
-const VIRIDIS: readonly Rgb[] = [[68, 1, 84], [59, 82, 139], [33, 145, 140], [94, 201, 98], [253, 231, 37]]
+const VIRIDIS: readonly Rgb[] = [
+  [68, 1, 84],
+  [59, 82, 139],
+  [33, 145, 140],
+  [94, 201, 98],
+  [253, 231, 37],
+]
 
 /** 0..1 to viridis. */
 export function viridis(share: number): Rgb {

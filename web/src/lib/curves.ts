@@ -13,11 +13,21 @@ export function stacked(lake: Lake, set: CurveSet, which: 'surface' | 'flat' = '
     x: { label: 'Time', unit: 'ms', values: set.time_ms },
     y: { label: 'NCE over Flat’s total', unit: 'ratio', low: 0, ...(high === undefined ? {} : { high }) },
     lines: [
-      ...bands.map((band, b) => ({ label: band.label, values: sums[b] ?? [], colour: `--band-${b % 5}`, width: 0.5, fillTo: b === 0 ? ('zero' as const) : b - 1, parts: own.bands[b] ?? [] })),
-      ...(which === 'surface' ? [{ label: 'Flat, total', values: flat, colour: '--ink', width: 1.6, dash: [5, 4] }] : []),
+      ...bands.map((band, b) => ({
+        label: band.label,
+        values: sums[b] ?? [],
+        colour: `--band-${b % 5}`,
+        width: 0.5,
+        fillTo: b === 0 ? ('zero' as const) : b - 1,
+        parts: own.bands[b] ?? [],
+      })),
+      ...(which === 'surface'
+        ? [{ label: 'Flat, total', values: flat, colour: '--ink', width: 1.6, dash: [5, 4] }]
+        : []),
     ],
   }
 }
 
 /** The sum over the bands. */
-export const total = (curves: Schemas['Curves']): number[] => curves.bands[0]?.map((_, i) => curves.bands.reduce((sum, band) => sum + band[i], 0)) ?? []
+export const total = (curves: Schemas['Curves']): number[] =>
+  curves.bands[0]?.map((_, i) => curves.bands.reduce((sum, band) => sum + band[i], 0)) ?? []

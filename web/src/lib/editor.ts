@@ -1,5 +1,12 @@
 //! The SQL editor. It lives in a shadow root, where its styles need no inline style element that the page's policy forbids.
-import { acceptCompletion, autocompletion, closeBrackets, completionKeymap, type Completion, type CompletionContext } from '@codemirror/autocomplete'
+import {
+  acceptCompletion,
+  autocompletion,
+  closeBrackets,
+  completionKeymap,
+  type Completion,
+  type CompletionContext,
+} from '@codemirror/autocomplete'
 import { defaultKeymap, history, historyKeymap } from '@codemirror/commands'
 import { PostgreSQL, sql, type SQLNamespace } from '@codemirror/lang-sql'
 import { bracketMatching, HighlightStyle, syntaxHighlighting } from '@codemirror/language'
@@ -10,7 +17,13 @@ import type { Schemas } from './api'
 
 type Table = Schemas['Table']
 
-export interface Editor { text(): string; set(text: string): void; complete(tables: readonly Table[], functions: readonly string[]): void; focus(): void; destroy(): void }
+export interface Editor {
+  text(): string
+  set(text: string): void
+  complete(tables: readonly Table[], functions: readonly string[]): void
+  focus(): void
+  destroy(): void
+}
 
 const look = EditorView.theme({
   '&': { height: '100%', fontSize: '14px', color: 'var(--ink)', backgroundColor: 'var(--paper)' },
@@ -27,8 +40,10 @@ const look = EditorView.theme({
   '.cm-completionDetail': { color: 'var(--ink-2)', fontStyle: 'normal', marginLeft: '12px' },
 })
 const colours = HighlightStyle.define([
-  { tag: tags.keyword, color: 'var(--accent)' }, { tag: [tags.string, tags.special(tags.string)], color: 'var(--mark)' },
-  { tag: [tags.number, tags.bool, tags.null], color: 'var(--under)' }, { tag: tags.comment, color: 'var(--ink-2)' },
+  { tag: tags.keyword, color: 'var(--accent)' },
+  { tag: [tags.string, tags.special(tags.string)], color: 'var(--mark)' },
+  { tag: [tags.number, tags.bool, tags.null], color: 'var(--under)' },
+  { tag: tags.comment, color: 'var(--ink-2)' },
 ])
 
 /** Functions and every column, also before a table is named. */
@@ -43,15 +58,37 @@ function words(tables: readonly Table[], functions: readonly string[]): Completi
   }
   return [
     ...functions.map((label) => ({ label, type: 'function', apply: `${label}(` })),
-    ...[...columns].map(([label, about]) => ({ label, type: 'property', boost: -1, detail: about.unit, info: `${about.comment}. In ${about.tables.join(', ')}.` })),
+    ...[...columns].map(([label, about]) => ({
+      label,
+      type: 'property',
+      boost: -1,
+      detail: about.unit,
+      info: `${about.comment}. In ${about.tables.join(', ')}.`,
+    })),
   ]
 }
 
 function names(tables: readonly Table[]): SQLNamespace {
-  return Object.fromEntries(tables.map((table) => [table.name, table.columns.map((column) => ({ label: column.name, type: 'property', detail: column.unit ?? '', info: column.comment ?? '' }))]))
+  return Object.fromEntries(
+    tables.map((table) => [
+      table.name,
+      table.columns.map((column) => ({
+        label: column.name,
+        type: 'property',
+        detail: column.unit ?? '',
+        info: column.comment ?? '',
+      })),
+    ]),
+  )
 }
 
-export function editor(host: HTMLElement, text: string, changed: (text: string) => void, run: () => void, stop: () => void): Editor {
+export function editor(
+  host: HTMLElement,
+  text: string,
+  changed: (text: string) => void,
+  run: () => void,
+  stop: () => void,
+): Editor {
   const root = host.shadowRoot ?? host.attachShadow({ mode: 'open' })
   root.replaceChildren()
   const parent = document.createElement('div')
@@ -60,16 +97,50 @@ export function editor(host: HTMLElement, text: string, changed: (text: string) 
   const language = new Compartment()
   const functions = new Compartment()
   const view = new EditorView({
-    root, parent,
+    root,
+    parent,
     state: EditorState.create({
       doc: text,
       extensions: [
-        lineNumbers(), history(), bracketMatching(), closeBrackets(), autocompletion({ icons: false }), highlightActiveLine(), EditorView.lineWrapping, look, syntaxHighlighting(colours),
+        lineNumbers(),
+        history(),
+        bracketMatching(),
+        closeBrackets(),
+        autocompletion({ icons: false }),
+        highlightActiveLine(),
+        EditorView.lineWrapping,
+        look,
+        syntaxHighlighting(colours),
         EditorView.contentAttributes.of({ 'aria-label': 'Query. Ctrl Enter runs it, Escape cancels it.' }),
-        Prec.highest(keymap.of([{ key: 'Mod-Enter', run: () => { run(); return true } }, { key: 'Tab', run: acceptCompletion }])),
-        keymap.of([...completionKeymap, { key: 'Escape', run: () => { stop(); return false } }, ...defaultKeymap, ...historyKeymap]),
-        language.of(sql({ dialect: PostgreSQL })), functions.of([]),
-        EditorView.updateListener.of((update) => { if (update.docChanged) changed(update.state.doc.toString()) }),
+        Prec.highest(
+          keymap.of([
+            {
+              key: 'Mod-Enter',
+              run: () => {
+                run()
+                return true
+              },
+            },
+            { key: 'Tab', run: acceptCompletion },
+          ]),
+        ),
+        keymap.of([
+          ...completionKeymap,
+          {
+            key: 'Escape',
+            run: () => {
+              stop()
+              return false
+            },
+          },
+          ...defaultKeymap,
+          ...historyKeymap,
+        ]),
+        language.of(sql({ dialect: PostgreSQL })),
+        functions.of([]),
+        EditorView.updateListener.of((update) => {
+          if (update.docChanged) changed(update.state.doc.toString())
+        }),
       ],
     }),
   })
@@ -79,9 +150,19 @@ export function editor(host: HTMLElement, text: string, changed: (text: string) 
     complete(tables, called) {
       const support = sql({ dialect: PostgreSQL, schema: names(tables), upperCaseKeywords: false })
       const options = words(tables, called)
-      view.dispatch({ effects: [language.reconfigure(support), functions.reconfigure(PostgreSQL.language.data.of({
-        autocomplete: (context: CompletionContext) => { const word = context.matchBefore(/\w+/); return word ? { from: word.from, options } : null },
-      }))] })
+      view.dispatch({
+        effects: [
+          language.reconfigure(support),
+          functions.reconfigure(
+            PostgreSQL.language.data.of({
+              autocomplete: (context: CompletionContext) => {
+                const word = context.matchBefore(/\w+/)
+                return word ? { from: word.from, options } : null
+              },
+            }),
+          ),
+        ],
+      })
     },
     focus: () => view.focus(),
     destroy: () => view.destroy(),

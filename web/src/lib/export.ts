@@ -15,7 +15,10 @@ const cell = (value: unknown) => {
   return /[",\n\r]/.test(text) ? `"${text.replaceAll('"', '""')}"` : text
 }
 
-export const csvOf = (table: TableData) => new Blob([[table.columns, ...table.rows].map((row) => row.map(cell).join(',')).join('\n') + '\n'], { type: 'text/csv' })
+export const csvOf = (table: TableData) =>
+  new Blob([[table.columns, ...table.rows].map((row) => row.map(cell).join(',')).join('\n') + '\n'], {
+    type: 'text/csv',
+  })
 
 /** An SVG drawn at twice its size. */
 export async function pngOf(svg: string): Promise<Blob> {
@@ -29,12 +32,21 @@ export async function pngOf(svg: string): Promise<Blob> {
     canvas.height = image.naturalHeight * 2
     canvas.getContext('2d')?.drawImage(image, 0, 0, canvas.width, canvas.height)
     return await blobOf(canvas)
-  } finally { URL.revokeObjectURL(url) }
+  } finally {
+    URL.revokeObjectURL(url)
+  }
 }
 
-export const blobOf = (canvas: HTMLCanvasElement) => new Promise<Blob>((resolve, reject) => canvas.toBlob((blob) => (blob ? resolve(blob) : reject(new Error('the picture could not be made'))), 'image/png'))
+export const blobOf = (canvas: HTMLCanvasElement) =>
+  new Promise<Blob>((resolve, reject) =>
+    canvas.toBlob((blob) => (blob ? resolve(blob) : reject(new Error('the picture could not be made'))), 'image/png'),
+  )
 
-export const FORMATS = { csv: 'text/csv', parquet: 'application/vnd.apache.parquet', arrow: 'application/vnd.apache.arrow.stream' } as const
+export const FORMATS = {
+  csv: 'text/csv',
+  parquet: 'application/vnd.apache.parquet',
+  arrow: 'application/vnd.apache.arrow.stream',
+} as const
 
 /** Runs a query and saves its answer. */
 export async function saveQuery(query: string, format: keyof typeof FORMATS, name: string): Promise<void> {

@@ -24,7 +24,10 @@ export function bytes(value: number | null): string {
   if (value === null) return '\u2013'
   const units = ['B', 'kB', 'MB', 'GB', 'TB']
   let power = 0
-  while (value >= 1000 && power < units.length - 1) { value /= 1000; power += 1 }
+  while (value >= 1000 && power < units.length - 1) {
+    value /= 1000
+    power += 1
+  }
   return `${value.toFixed(power === 0 || value >= 100 ? 0 : 1)} ${units[power]}`
 }
 
@@ -41,7 +44,9 @@ export function duration(from: string, to: string): string {
 export function parameter(name: string): { label: string; unit: string } {
   const found = /^(.*)_(mm|deg|c|pct|hpa|hz)$/.exec(name)
   const units: Record<string, string> = { deg: '°', c: '°C', pct: '%', hpa: 'hPa', hz: 'Hz' }
-  return found ? { label: found[1].replaceAll('_', ' '), unit: units[found[2]] ?? found[2] } : { label: name.replaceAll('_', ' '), unit: '' }
+  return found
+    ? { label: found[1].replaceAll('_', ' '), unit: units[found[2]] ?? found[2] }
+    : { label: name.replaceAll('_', ' '), unit: '' }
 }
 
 /** A grid point as the paper names it: layer, then column and row. */

@@ -8,8 +8,8 @@ export function fft(re: Float64Array, im: Float64Array): void {
     for (; j & bit; bit >>= 1) j ^= bit
     j ^= bit
     if (i < j) {
-      [re[i], re[j]] = [re[j], re[i]];
-      [im[i], im[j]] = [im[j], im[i]]
+      ;[re[i], re[j]] = [re[j], re[i]]
+      ;[im[i], im[j]] = [im[j], im[i]]
     }
   }
   for (let size = 2; size <= n; size <<= 1) {
@@ -42,7 +42,13 @@ export function spectrum(samples: readonly number[], rate_hz: number): { frequen
   return { frequency_hz: bins.map((k) => (k * rate_hz) / n), level_db: bins.map((k) => level(re[k], im[k])) }
 }
 
-export interface Spectrogram { readonly times: number; readonly bins: number; readonly step_s: number; readonly bin_hz: number; readonly level_db: Float32Array }
+export interface Spectrogram {
+  readonly times: number
+  readonly bins: number
+  readonly step_s: number
+  readonly bin_hz: number
+  readonly level_db: Float32Array
+}
 
 /** Hann windows of `window` samples, `step` apart, padded to 256; by time, then by frequency. */
 export function spectrogram(samples: readonly number[], rate_hz: number, window = 48, step = 2): Spectrogram {
@@ -55,7 +61,8 @@ export function spectrogram(samples: readonly number[], rate_hz: number, window 
     const im = new Float64Array(n)
     for (let i = 0; i < window; i += 1) {
       const at = t * step + i - window / 2
-      if (at >= 0 && at < samples.length) re[i] = samples[at] * (0.5 - 0.5 * Math.cos((2 * Math.PI * (i + 0.5)) / window))
+      if (at >= 0 && at < samples.length)
+        re[i] = samples[at] * (0.5 - 0.5 * Math.cos((2 * Math.PI * (i + 0.5)) / window))
     }
     fft(re, im)
     for (let k = 0; k < bins; k += 1) level_db[t * bins + k] = level(re[k], im[k])

@@ -9,7 +9,12 @@ export function specular(a: Vec3, b: Vec3): Vec3 {
 }
 
 /** First Fresnel zone on z = 0: points whose way by the plane is at most half a wavelength longer than the image path. */
-export function fresnelZone(a: Vec3, b: Vec3, frequency_hz: number, speed_m_s = 343): { centre: Vec3; along: number; across: number; angle: number } {
+export function fresnelZone(
+  a: Vec3,
+  b: Vec3,
+  frequency_hz: number,
+  speed_m_s = 343,
+): { centre: Vec3; along: number; across: number; angle: number } {
   const [dx, dy] = [b[0] - a[0], b[1] - a[1]]
   const r = Math.hypot(dx, dy)
   const [h1, h2] = [a[2], b[2]]
@@ -21,5 +26,10 @@ export function fresnelZone(a: Vec3, b: Vec3, frequency_hz: number, speed_m_s = 
   const g = (bb * bb) / (4 * aa) - cc
   const x = -bb / (2 * aa)
   const angle = Math.atan2(dy, dx)
-  return { centre: [a[0] + x * Math.cos(angle), a[1] + x * Math.sin(angle), 0], along: Math.sqrt(g / aa), across: Math.sqrt(g) / (2 * length), angle }
+  return {
+    centre: [a[0] + x * Math.cos(angle), a[1] + x * Math.sin(angle), 0],
+    along: Math.sqrt(g / aa),
+    across: Math.sqrt(g) / (2 * length),
+    angle,
+  }
 }

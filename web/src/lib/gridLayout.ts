@@ -1,9 +1,29 @@
 //! Where the cells of a layered grid plot lie: layers across, bands down.
 import type { Lake, Point } from './api'
 
-export interface Cell { readonly point: Point; readonly x: number; readonly y: number; readonly size: number }
-export interface Block { readonly layer: number; readonly x: number; readonly side: number; readonly inset: number; readonly extent: number; readonly cells: readonly Cell[] }
-export interface Layout { readonly blocks: readonly Block[]; readonly rowTops: readonly number[]; readonly width: number; readonly height: number; readonly side: number; readonly left: number; readonly top: number }
+export interface Cell {
+  readonly point: Point
+  readonly x: number
+  readonly y: number
+  readonly size: number
+}
+export interface Block {
+  readonly layer: number
+  readonly x: number
+  readonly side: number
+  readonly inset: number
+  readonly extent: number
+  readonly cells: readonly Cell[]
+}
+export interface Layout {
+  readonly blocks: readonly Block[]
+  readonly rowTops: readonly number[]
+  readonly width: number
+  readonly height: number
+  readonly side: number
+  readonly left: number
+  readonly top: number
+}
 
 const GAP = 10
 const ROW_GAP = 10
@@ -21,7 +41,12 @@ export function layout(lake: Lake, width: number, rows: number): Layout {
     const many = Math.max(xs.length, ys.length)
     const size = many === 1 ? Math.floor(side / 3) : Math.floor((side - 2) / many)
     const inset = Math.floor((side - size * many) / 2)
-    const cells = points.map((point): Cell => ({ point, x: x + inset + xs.indexOf(point.x_mm) * size, y: inset + (ys.length - 1 - ys.indexOf(point.y_mm)) * size, size }))
+    const cells = points.map((point): Cell => ({
+      point,
+      x: x + inset + xs.indexOf(point.x_mm) * size,
+      y: inset + (ys.length - 1 - ys.indexOf(point.y_mm)) * size,
+      size,
+    }))
     return { layer, x, side, inset, extent: size * many, cells }
   })
   const rowTops = Array.from({ length: rows }, (_, row) => top + row * (side + ROW_GAP))

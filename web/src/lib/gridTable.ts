@@ -4,7 +4,29 @@ import type { TableData } from './plot'
 
 export function gridTable(lake: Lake, grid: Grid): TableData {
   return {
-    columns: ['point', 'layer', 'gridx', 'gridy', 'x_mm', 'y_mm', 'z_mm', 'pair', 'measured the other way round', ...lake.bands.map((band) => `tnce ${band.label}, dB`)],
-    rows: lake.points.map((p) => [p.point_id, p.layer, p.gridx, p.gridy, p.x_mm, p.y_mm, p.z_mm, grid.pairs[p.point_id], grid.swapped[p.point_id], ...lake.bands.map((_, b) => grid.bands[b][p.point_id])]),
+    columns: [
+      'point',
+      'layer',
+      'gridx',
+      'gridy',
+      'x_mm',
+      'y_mm',
+      'z_mm',
+      'pair',
+      'measured the other way round',
+      ...lake.bands.map((band) => `tnce ${band.label}, dB`),
+    ],
+    rows: lake.points.map((p) => [
+      p.point_id,
+      p.layer,
+      p.gridx,
+      p.gridy,
+      p.x_mm,
+      p.y_mm,
+      p.z_mm,
+      grid.pairs[p.point_id],
+      grid.swapped[p.point_id],
+      ...lake.bands.map((_, b) => grid.bands[b][p.point_id]),
+    ]),
   }
 }

@@ -1,6 +1,12 @@
 //! What a line plot shows; drawn on screen by Plot.svelte and on paper by plotSvg.ts.
 
-export interface Axis { readonly label: string; readonly unit: string; readonly low?: number; readonly high?: number; readonly log?: boolean }
+export interface Axis {
+  readonly label: string
+  readonly unit: string
+  readonly low?: number
+  readonly high?: number
+  readonly log?: boolean
+}
 export interface Line {
   readonly label: string
   readonly values: readonly (number | null)[]
@@ -15,8 +21,16 @@ export interface Line {
   /** What the legend shows instead of `values`: the parts of a stack. */
   readonly parts?: readonly number[]
 }
-export interface PlotSpec { readonly x: Axis & { readonly values: readonly number[] }; readonly y: Axis; readonly lines: readonly Line[]; readonly mark?: number }
-export interface TableData { readonly columns: readonly string[]; readonly rows: readonly (readonly (string | number | boolean | null)[])[] }
+export interface PlotSpec {
+  readonly x: Axis & { readonly values: readonly number[] }
+  readonly y: Axis
+  readonly lines: readonly Line[]
+  readonly mark?: number
+}
+export interface TableData {
+  readonly columns: readonly string[]
+  readonly rows: readonly (readonly (string | number | boolean | null)[])[]
+}
 
 /** An axis as it is written beside it. */
 export const axisTitle = (axis: Axis) => (axis.unit ? `${axis.label}, ${axis.unit}` : axis.label)

@@ -1,12 +1,38 @@
 //! The panel in three dimensions: relief, microphone, speaker, paths and first Fresnel zones. Loaded when shown.
 import {
-  AmbientLight, BufferAttribute, BufferGeometry, Color, ConeGeometry, DirectionalLight, Line, LineBasicMaterial, LineDashedMaterial, LineLoop, Mesh,
-  MeshLambertMaterial, MeshBasicMaterial, Object3D, PerspectiveCamera, PlaneGeometry, Scene, SphereGeometry, Vector3, WebGLRenderer, Group,
+  AmbientLight,
+  BufferAttribute,
+  BufferGeometry,
+  Color,
+  ConeGeometry,
+  DirectionalLight,
+  Line,
+  LineBasicMaterial,
+  LineDashedMaterial,
+  LineLoop,
+  Mesh,
+  MeshLambertMaterial,
+  MeshBasicMaterial,
+  Object3D,
+  PerspectiveCamera,
+  PlaneGeometry,
+  Scene,
+  SphereGeometry,
+  Vector3,
+  WebGLRenderer,
+  Group,
 } from 'three'
 import { OrbitControls } from 'three/examples/jsm/controls/OrbitControls.js'
 import { fresnelZone, specular, type Vec3 } from './geometry'
 
-export interface ReliefColours { paper: string; relief: string; microphone: string; speaker: string; ink: string; zone: string }
+export interface ReliefColours {
+  paper: string
+  relief: string
+  microphone: string
+  speaker: string
+  ink: string
+  zone: string
+}
 export interface Relief {
   setPair(microphone: Vec3 | null, speaker: Vec3 | null): void
   setColours(colours: ReliefColours): void
@@ -22,7 +48,12 @@ const v = (p: Vec3) => new Vector3(p[0], p[1], p[2])
 const ZONE_LIFT_MM = 1.5
 
 /** A scene on a canvas; it draws only when something changed. */
-export function relief(canvas: HTMLCanvasElement, colours: ReliefColours, grid: readonly Vec3[], reduced: boolean): Relief {
+export function relief(
+  canvas: HTMLCanvasElement,
+  colours: ReliefColours,
+  grid: readonly Vec3[],
+  reduced: boolean,
+): Relief {
   const renderer = new WebGLRenderer({ canvas, antialias: true, preserveDrawingBuffer: true })
   renderer.setPixelRatio(Math.min(2, devicePixelRatio || 1))
   const scene = new Scene()
@@ -36,7 +67,9 @@ export function relief(canvas: HTMLCanvasElement, colours: ReliefColours, grid: 
   controls.maxDistance = 4000
   controls.zoomSpeed = reduced ? 0.5 : 1
   controls.enableZoom = false
-  canvas.addEventListener('dblclick', () => { controls.enableZoom = !controls.enableZoom })
+  canvas.addEventListener('dblclick', () => {
+    controls.enableZoom = !controls.enableZoom
+  })
   scene.add(new AmbientLight(0xffffff, 1.1))
   const sun = new DirectionalLight(0xffffff, 2.6)
   sun.position.set(-500, 500, 560)
@@ -50,12 +83,20 @@ export function relief(canvas: HTMLCanvasElement, colours: ReliefColours, grid: 
   scene.add(points)
   let shown: [Vec3 | null, Vec3 | null] = [null, null]
   let frame = 0
-  const draw = () => { frame = 0; renderer.render(scene, camera) }
-  const later = () => { if (!frame) frame = requestAnimationFrame(draw) }
+  const draw = () => {
+    frame = 0
+    renderer.render(scene, camera)
+  }
+  const later = () => {
+    if (!frame) frame = requestAnimationFrame(draw)
+  }
   controls.addEventListener('change', later)
 
   function clear(group: Group) {
-    for (const child of [...group.children]) { group.remove(child); free(child) }
+    for (const child of [...group.children]) {
+      group.remove(child)
+      free(child)
+    }
   }
   function free(object: Object3D) {
     const mesh = object as Mesh
@@ -63,7 +104,12 @@ export function relief(canvas: HTMLCanvasElement, colours: ReliefColours, grid: 
     if (mesh.material && !Array.isArray(mesh.material)) mesh.material.dispose()
   }
   function path(corners: readonly Vec3[], colour: string, dashed: boolean) {
-    const line = new Line(new BufferGeometry().setFromPoints(corners.map(v)), dashed ? new LineDashedMaterial({ color: colour, dashSize: 14, gapSize: 10 }) : new LineBasicMaterial({ color: colour }))
+    const line = new Line(
+      new BufferGeometry().setFromPoints(corners.map(v)),
+      dashed
+        ? new LineDashedMaterial({ color: colour, dashSize: 14, gapSize: 10 })
+        : new LineBasicMaterial({ color: colour }),
+    )
     line.computeLineDistances()
     pair.add(line)
   }
@@ -72,7 +118,11 @@ export function relief(canvas: HTMLCanvasElement, colours: ReliefColours, grid: 
     const ring = Array.from({ length: 96 }, (_, i) => {
       const t = (2 * Math.PI * i) / 96
       const [x, y] = [z.along * Math.cos(t), z.across * Math.sin(t)]
-      return new Vector3(z.centre[0] + x * Math.cos(z.angle) - y * Math.sin(z.angle), z.centre[1] + x * Math.sin(z.angle) + y * Math.cos(z.angle), top + ZONE_LIFT_MM)
+      return new Vector3(
+        z.centre[0] + x * Math.cos(z.angle) - y * Math.sin(z.angle),
+        z.centre[1] + x * Math.sin(z.angle) + y * Math.cos(z.angle),
+        top + ZONE_LIFT_MM,
+      )
     })
     pair.add(new LineLoop(new BufferGeometry().setFromPoints(ring), new LineBasicMaterial({ color: colours.zone })))
   }
@@ -106,11 +156,14 @@ export function relief(canvas: HTMLCanvasElement, colours: ReliefColours, grid: 
   }
 
   return {
-    setPair(microphone, speaker) { shown = [microphone, speaker]; rebuild() },
+    setPair(microphone, speaker) {
+      shown = [microphone, speaker]
+      rebuild()
+    },
     setColours(next) {
       colours = next
-      scene.background = new Color(next.paper);
-      (panel.material as MeshLambertMaterial).color.set(next.relief)
+      scene.background = new Color(next.paper)
+      ;(panel.material as MeshLambertMaterial).color.set(next.relief)
       rebuild()
     },
     setHeights(heights, size_mm) {
@@ -154,7 +207,10 @@ export function relief(canvas: HTMLCanvasElement, colours: ReliefColours, grid: 
       camera.updateProjectionMatrix()
       later()
     },
-    picture() { draw(); return canvas },
+    picture() {
+      draw()
+      return canvas
+    },
     dispose() {
       if (frame) cancelAnimationFrame(frame)
       clear(pair)

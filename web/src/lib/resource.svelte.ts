@@ -17,19 +17,45 @@ export function resource<T>(href: () => string | null, asks: (href: string) => P
   $effect(() => {
     const wanted = href()
     void turn
-    if (wanted === null) { data = undefined; error = undefined; loading = false; return }
+    if (wanted === null) {
+      data = undefined
+      error = undefined
+      loading = false
+      return
+    }
     let current = true
     loading = true
     asks(wanted).then(
-      (answer) => { if (current) { data = answer; error = undefined; loading = false } },
-      (reason: unknown) => { if (current) { error = reason instanceof ApiError ? reason : new ApiError(0, 'internal', String(reason), ''); loading = false } },
+      (answer) => {
+        if (current) {
+          data = answer
+          error = undefined
+          loading = false
+        }
+      },
+      (reason: unknown) => {
+        if (current) {
+          error = reason instanceof ApiError ? reason : new ApiError(0, 'internal', String(reason), '')
+          loading = false
+        }
+      },
     )
-    return () => { current = false }
+    return () => {
+      current = false
+    }
   })
   return {
-    get data() { return data },
-    get error() { return error },
-    get loading() { return loading },
-    retry: () => { turn += 1 },
+    get data() {
+      return data
+    },
+    get error() {
+      return error
+    },
+    get loading() {
+      return loading
+    },
+    retry: () => {
+      turn += 1
+    },
   }
 }

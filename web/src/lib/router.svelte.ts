@@ -1,4 +1,5 @@
 //! Where the reader is. All of a view's state is in the address, so that every view is a link.
+import { changeSearch, parseSearch, type SearchChanges } from './search'
 
 const read = () => ({ path: decodeURI(location.pathname), search: location.search })
 
@@ -6,9 +7,15 @@ let here = $state(read())
 
 /** The current address, reactive. */
 export const place = {
-  get path(): string { return here.path },
-  get search(): string { return here.search },
-  get params(): URLSearchParams { return new URLSearchParams(here.search) },
+  get path(): string {
+    return here.path
+  },
+  get search(): string {
+    return here.search
+  },
+  get params(): URLSearchParams {
+    return parseSearch(here.search)
+  },
 }
 
 /** Goes to an address of this site. */
@@ -20,19 +27,12 @@ export function go(href: string, replace = false): void {
 }
 
 /** The address with some parameters changed; null or '' removes one, a list repeats it. */
-export function withParams(changes: Record<string, string | number | null | readonly string[]>, path = location.pathname): string {
-  const params = new URLSearchParams(path === location.pathname ? here.search : '')
-  for (const [name, value] of Object.entries(changes)) {
-    params.delete(name)
-    if (Array.isArray(value)) for (const one of value) params.append(name, one)
-    else if (value !== null && value !== '') params.set(name, String(value))
-  }
-  const text = params.toString().replaceAll('%2C', ',').replaceAll('%3A', ':').replaceAll('%2F', '/')
-  return text ? `${path}?${text}` : path
+export function withParams(changes: SearchChanges, path = location.pathname): string {
+  return changeSearch(path, path === location.pathname ? here.search : '', changes)
 }
 
 /** Changes parameters in place; `push` makes it a step that Back undoes. */
-export function setParams(changes: Record<string, string | number | null | readonly string[]>, push = false): void {
+export function setParams(changes: SearchChanges, push = false): void {
   go(withParams(changes), !push)
 }
 
@@ -43,9 +43,19 @@ export const runHref = (id: string) => `/runs/${encodeURIComponent(id)}`
 
 /** Plain clicks on this site's links stay in the page. */
 export function follow(): void {
-  addEventListener('popstate', () => { here = read() })
+  addEventListener('popstate', () => {
+    here = read()
+  })
   addEventListener('click', (event) => {
-    if (event.defaultPrevented || event.button !== 0 || event.metaKey || event.ctrlKey || event.shiftKey || event.altKey) return
+    if (
+      event.defaultPrevented ||
+      event.button !== 0 ||
+      event.metaKey ||
+      event.ctrlKey ||
+      event.shiftKey ||
+      event.altKey
+    )
+      return
     const link = (event.target as Element | null)?.closest?.('a')
     if (!link || link.target || link.hasAttribute('download') || link.origin !== location.origin) return
     if (/^\/(api|health|metrics)/.test(link.pathname)) return

@@ -7,22 +7,32 @@ function stored<T extends string>(name: string, allowed: readonly T[], fallback:
   try {
     const value = localStorage.getItem(name) as T | null
     return value && allowed.includes(value) ? value : fallback
-  } catch { return fallback }
+  } catch {
+    return fallback
+  }
 }
 
 function store(name: string, value: string): void {
-  try { localStorage.setItem(name, value) } catch { /* storage is refused; the choice lasts for this page */ }
+  try {
+    localStorage.setItem(name, value)
+  } catch {
+    /* storage is refused; the choice lasts for this page */
+  }
 }
 
 const dark = matchMedia('(prefers-color-scheme: dark)')
 let theme = $state<Theme>(stored('theme', ['system', 'light', 'dark'], 'system'))
 let palette = $state<Palette>(stored('palette', ['paper', 'safe'], 'paper'))
 let systemDark = $state(dark.matches)
-dark.addEventListener('change', () => { systemDark = dark.matches })
+dark.addEventListener('change', () => {
+  systemDark = dark.matches
+})
 document.documentElement.dataset.palette = stored('palette', ['paper', 'safe'], 'paper')
 
 export const settings = {
-  get theme() { return theme },
+  get theme() {
+    return theme
+  },
   set theme(value: Theme) {
     theme = value
     store('theme', value)
@@ -30,11 +40,15 @@ export const settings = {
     else document.documentElement.dataset.theme = value
   },
   /** Red and green as in the paper, or colours that a colour-blind reader tells apart. */
-  get palette() { return palette },
+  get palette() {
+    return palette
+  },
   set palette(value: Palette) {
     palette = value
     store('palette', value)
     document.documentElement.dataset.palette = value
   },
-  get isDark() { return theme === 'dark' || (theme === 'system' && systemDark) },
+  get isDark() {
+    return theme === 'dark' || (theme === 'system' && systemDark)
+  },
 }

@@ -2,14 +2,45 @@
 import type { Lake } from './api'
 
 export const EXAMPLES: readonly { title: string; query: (lake: Lake) => string }[] = [
-  { title: 'Quietest surfaces', query: () => "select surface_id, p90_mean_db, spread_db\nfrom surface_stats\nwhere band = 'total'\norder by p90_mean_db\nlimit 20" },
-  { title: 'Band levels side by side', query: (lake) => `select surface_id,\n${lake.bands.map((b) => `  max(p90_mean_db) filter (where band = '${b.key}') as "${b.label}"`).join(',\n')}\nfrom surface_stats\ngroup by surface_id\norder by surface_id` },
-  { title: 'Incidence and level of one surface', query: (lake) => `select p.incidence_deg, 10 * log10(t.tnce_${lake.bands[Math.min(2, lake.bands.length - 1)].key}) as level_db\nfrom tnce t join pairs p using (pair_id)\nwhere t.surface_id = (select min(surface_id) from surfaces where typology <> 'reference')\norder by p.incidence_deg` },
-  { title: 'One impulse response', query: () => "select surface_id, pair_id, temperature_c, snr_db, ir\nfrom measurements\nwhere surface_id = 'flat' and pair_id = 0" },
-  { title: 'Signal to noise by attempt', query: () => 'select attempt, count(*) as measurements, avg(snr_db) as snr_db, min(snr_db) as lowest_db\nfrom measurements\ngroup by attempt\norder by attempt' },
-  { title: 'Temperature by hour', query: () => "select date_trunc('hour', log_time) as hour, avg(temperature_c) as temperature_c, max(outside_level_db) as outside_db\nfrom environment\ngroup by 1\norder by 1" },
-  { title: 'Why measurements were repeated', query: () => "select run_id, log_time, message\nfrom events\nwhere level = 'warning'\norder by log_time\nlimit 100" },
-  { title: 'Flat and Foam of every surface', query: () => 'select flat_reference, foam_reference, count(*) as surfaces\nfrom surfaces\ngroup by 1, 2\norder by 3 desc' },
+  {
+    title: 'Quietest surfaces',
+    query: () =>
+      "select surface_id, p90_mean_db, spread_db\nfrom surface_stats\nwhere band = 'total'\norder by p90_mean_db\nlimit 20",
+  },
+  {
+    title: 'Band levels side by side',
+    query: (lake) =>
+      `select surface_id,\n${lake.bands.map((b) => `  max(p90_mean_db) filter (where band = '${b.key}') as "${b.label}"`).join(',\n')}\nfrom surface_stats\ngroup by surface_id\norder by surface_id`,
+  },
+  {
+    title: 'Incidence and level of one surface',
+    query: (lake) =>
+      `select p.incidence_deg, 10 * log10(t.tnce_${lake.bands[Math.min(2, lake.bands.length - 1)].key}) as level_db\nfrom tnce t join pairs p using (pair_id)\nwhere t.surface_id = (select min(surface_id) from surfaces where typology <> 'reference')\norder by p.incidence_deg`,
+  },
+  {
+    title: 'One impulse response',
+    query: () =>
+      "select surface_id, pair_id, temperature_c, snr_db, ir\nfrom measurements\nwhere surface_id = 'flat' and pair_id = 0",
+  },
+  {
+    title: 'Signal to noise by attempt',
+    query: () =>
+      'select attempt, count(*) as measurements, avg(snr_db) as snr_db, min(snr_db) as lowest_db\nfrom measurements\ngroup by attempt\norder by attempt',
+  },
+  {
+    title: 'Temperature by hour',
+    query: () =>
+      "select date_trunc('hour', log_time) as hour, avg(temperature_c) as temperature_c, max(outside_level_db) as outside_db\nfrom environment\ngroup by 1\norder by 1",
+  },
+  {
+    title: 'Why measurements were repeated',
+    query: () => "select run_id, log_time, message\nfrom events\nwhere level = 'warning'\norder by log_time\nlimit 100",
+  },
+  {
+    title: 'Flat and Foam of every surface',
+    query: () =>
+      'select flat_reference, foam_reference, count(*) as surfaces\nfrom surfaces\ngroup by 1, 2\norder by 3 desc',
+  },
 ]
 
 const pythonText = (query: string) => `"""${query.replaceAll('\\', '\\\\').replaceAll('"""', '\\"\\"\\"')}"""`

@@ -4,7 +4,7 @@ import { axisTitle, ticks, yRange, type PlotSpec } from './plot'
 
 export const escape = (text: string) => text.replace(/[&<>"']/g, (c) => `&#${c.charCodeAt(0)};`)
 
-const FONT = "font-family=\"'IBM Plex Sans','Helvetica Neue',Arial,sans-serif\" font-size=\"12\""
+const FONT = 'font-family="\'IBM Plex Sans\',\'Helvetica Neue\',Arial,sans-serif" font-size="12"'
 
 /** A whole picture on the page's paper. */
 export const picture = (width: number, height: number, body: string) =>
@@ -25,12 +25,20 @@ export function plotSvg(spec: PlotSpec, title: string, width = 720, height = 400
   const px = (v: number) => left + across(v) * (width - left - right)
   const py = (v: number) => height - bottom - ((v - y0) / (y1 - y0)) * (height - top - bottom)
   const within = xs.map((x) => x >= x0 && x <= x1)
-  const points = (values: readonly (number | null)[]) => values.flatMap((v, i) => (v === null || !within[i] ? [] : [`${px(xs[i]).toFixed(2)},${py(Math.max(y0, Math.min(y1, v))).toFixed(2)}`]))
+  const points = (values: readonly (number | null)[]) =>
+    values.flatMap((v, i) =>
+      v === null || !within[i] ? [] : [`${px(xs[i]).toFixed(2)},${py(Math.max(y0, Math.min(y1, v))).toFixed(2)}`],
+    )
   const grid = token('--rule')
   let body = label(left, 20, title, 'start', 'font-weight="600"')
-  for (const t of ticks(y0, y1, 6)) body += `<path d="M${left} ${py(t)}H${width - right}" stroke="${grid}"/>` + label(left - 6, py(t) + 4, minus(t), 'end')
+  for (const t of ticks(y0, y1, 6))
+    body +=
+      `<path d="M${left} ${py(t)}H${width - right}" stroke="${grid}"/>` + label(left - 6, py(t) + 4, minus(t), 'end')
   const xTicks = spec.x.log ? [1, 2, 5, 10, 20, 50, 100].filter((t) => t >= x0 && t <= x1) : ticks(x0, x1, 8)
-  for (const t of xTicks) body += `<path d="M${px(t)} ${top}V${height - bottom}" stroke="${grid}"/>` + label(px(t), height - bottom + 16, minus(t), 'middle')
+  for (const t of xTicks)
+    body +=
+      `<path d="M${px(t)} ${top}V${height - bottom}" stroke="${grid}"/>` +
+      label(px(t), height - bottom + 16, minus(t), 'middle')
   spec.lines.forEach((line) => {
     const colour = token(line.colour)
     if (line.fillTo !== undefined) {
@@ -39,11 +47,17 @@ export function plotSvg(spec: PlotSpec, title: string, width = 720, height = 400
     }
   })
   spec.lines.forEach((line) => {
-    if (line.dots) body += points(line.values).map((p) => `<circle cx="${p.split(',')[0]}" cy="${p.split(',')[1]}" r="2" fill="${token(line.colour)}"/>`).join('')
-    else if (line.fillTo === undefined) body += `<path d="M${points(line.values).join('L')}" fill="none" stroke="${token(line.colour)}" stroke-width="${line.width ?? 1.5}"${line.dash ? ` stroke-dasharray="${line.dash.join(' ')}"` : ''}/>`
+    if (line.dots)
+      body += points(line.values)
+        .map((p) => `<circle cx="${p.split(',')[0]}" cy="${p.split(',')[1]}" r="2" fill="${token(line.colour)}"/>`)
+        .join('')
+    else if (line.fillTo === undefined)
+      body += `<path d="M${points(line.values).join('L')}" fill="none" stroke="${token(line.colour)}" stroke-width="${line.width ?? 1.5}"${line.dash ? ` stroke-dasharray="${line.dash.join(' ')}"` : ''}/>`
   })
   body += `<path d="M${left} ${top}V${height - bottom}H${width - right}" fill="none" stroke="${token('--ink')}"/>`
-  body += label((left + width - right) / 2, height - 8, axisTitle(spec.x), 'middle') + label(0, 0, axisTitle(spec.y), 'middle', `transform="translate(14 ${(top + height - bottom) / 2}) rotate(-90)"`)
+  body +=
+    label((left + width - right) / 2, height - 8, axisTitle(spec.x), 'middle') +
+    label(0, 0, axisTitle(spec.y), 'middle', `transform="translate(14 ${(top + height - bottom) / 2}) rotate(-90)"`)
   let at = left
   for (const line of spec.lines) {
     body += `<path d="M${at} 38h16" stroke="${token(line.colour)}" stroke-width="3"/>` + label(at + 21, 42, line.label)
