@@ -7,7 +7,7 @@ use std::path::PathBuf;
 
 use clap::{Args, Parser, Subcommand};
 use echolake_acquisition::ViewerAccess;
-use echolake_acquisition::mesh::Side;
+use echolake_acquisition::mesh::PanelSide;
 use echolake_acquisition::replay::SPEEDS;
 use echolake_schema::SurfaceId;
 
@@ -77,7 +77,7 @@ pub(crate) struct AcquireArgs {
     pub(crate) mesh: Option<PathBuf>,
     /// The side of the mesh that is measured: the back is seen when the panel is turned over about its y axis.
     #[arg(long, value_name = "front|back", value_parser = side, requires = "mesh")]
-    pub(crate) side: Option<Side>,
+    pub(crate) side: Option<PanelSide>,
     /// The rig; by default the lake's, or that of the paper for a new lake.
     #[arg(long)]
     pub(crate) rig: Option<PathBuf>,
@@ -176,8 +176,8 @@ fn origin(text: &str) -> Result<String, String> {
     if is_origin { Ok(origin) } else { Err("expected scheme and host, as https://viewer.example:8080".to_owned()) }
 }
 
-fn side(text: &str) -> Result<Side, String> {
-    Side::parse(text).ok_or_else(|| "expected front or back".to_owned())
+fn side(text: &str) -> Result<PanelSide, String> {
+    PanelSide::parse(text).ok_or_else(|| "expected front or back".to_owned())
 }
 
 fn speed(text: &str) -> Result<f32, String> {

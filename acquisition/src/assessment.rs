@@ -6,7 +6,7 @@ use echolake_dsp::{Error, chain};
 use echolake_schema::Rig;
 use echolake_schema::rig::Validation;
 
-use crate::objection::Objection;
+use crate::objection::TakeObjection;
 
 /// Attenuation of the assessed response outside of the sweep's range, dB: only the range counts.
 const OUT_OF_RANGE_DB: f64 = 60.0;
@@ -20,7 +20,7 @@ const ARRIVAL_SHARE: f32 = 0.3;
 
 /// Assessment of one recording.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Assessment {
+pub struct TakeAssessment {
     /// Mean power of the response's first part over that of its noise, in the sweep's range, dB; NaN if the recording
     /// is too short to tell.
     pub snr_db: f64,
@@ -34,7 +34,7 @@ pub struct Assessment {
 }
 
 /// Assesses recordings of one length.
-pub struct Assessor {
+pub struct TakeAssessor {
     plan: DeconvolutionPlan<f32>,
     scratch: DeconvolutionScratch<f32>,
     response: Vec<f32>,
@@ -42,7 +42,7 @@ pub struct Assessor {
     rate_hz: f64,
 }
 
-impl Assessor {
+impl TakeAssessor {
     /// Plans for recordings of `recording_len` samples of this rig.
     ///
     /// # Errors
@@ -78,9 +78,9 @@ impl Assessor {
         loopback: &[f32],
         expected_arrival_secs: f64,
         clipped_samples: u32,
-    ) -> Result<Assessment, Error> {
+    ) -> Result<TakeAssessment, Error> {
         self.plan.run(microphone, loopback, &mut self.response, &mut self.scratch)?;
-        Ok(Assessment {
+        Ok(TakeAssessment {
             snr_db: self.snr_db(),
             clipped_samples,
             loopback_dbfs: power_to_db(mean_power(loopback)),
@@ -125,24 +125,24 @@ impl Assessor {
     }
 }
 
-impl Assessment {
+impl TakeAssessment {
     /// Returns the rig's reasons against the recording; empty if it would accept it.
-    pub fn objections(&self, limits: &Validation, outside_level_db: f64) -> Vec<Objection> {
+    pub fn objections(&self, limits: &Validation, outside_level_db: f64) -> Vec<TakeObjection> {
         let mut reasons = Vec::new();
         if self.clipped_samples > 0 {
-            reasons.push(Objection::Clipped { samples: self.clipped_samples });
+            reasons.push(TakeObjection::Clipped { samples: self.clipped_samples });
         }
         if !(self.loopback_dbfs >= limits.loopback_dbfs) {
-            reasons.push(Objection::Loopback { dbfs: self.loopback_dbfs, least_dbfs: limits.loopback_dbfs });
+            reasons.push(TakeObjection::Loopback { dbfs: self.loopback_dbfs, least_dbfs: limits.loopback_dbfs });
         }
         if self.snr_db < limits.snr_db {
-            reasons.push(Objection::Noise { snr_db: self.snr_db, least_db: limits.snr_db });
+            reasons.push(TakeObjection::Noise { snr_db: self.snr_db, least_db: limits.snr_db });
         }
         if self.arrival_error_us.abs() > limits.arrival_us {
-            reasons.push(Objection::Arrival { off_us: self.arrival_error_us, most_us: limits.arrival_us });
+            reasons.push(TakeObjection::Arrival { off_us: self.arrival_error_us, most_us: limits.arrival_us });
         }
         if outside_level_db > limits.outside_level_db {
-            reasons.push(Objection::Outside { level_db: outside_level_db, most_db: limits.outside_level_db });
+            reasons.push(TakeObjection::Outside { level_db: outside_level_db, most_db: limits.outside_level_db });
         }
         reasons
     }
@@ -158,7 +158,7 @@ mod tests {
     use echolake_dsp::sweep::LinearSweep;
 
     // A sweep and its echo-free recording, `delay` samples late, in a little noise.
-    fn assessed(delay: usize, expected: f64) -> Assessment {
+    fn assessed(delay: usize, expected: f64) -> TakeAssessment {
         let rig = Rig::from_toml("sweep.duration_secs = 0.03").expect("a rig");
         let sweep = LinearSweep { rate_hz: 96e3, duration_secs: 0.03, low_hz: 2e3, high_hz: 40e3, fade_secs: 1e-3 };
         let mut loopback: Vec<f32> = sweep.samples().iter().map(|x| 0.5 * *x as f32).collect();
@@ -171,7 +171,7 @@ mod tests {
             })
             .collect();
         microphone[delay..].iter_mut().zip(&loopback).for_each(|(m, l)| *m += 0.3 * l);
-        let mut assessor = Assessor::new(&rig, loopback.len()).expect("a plan");
+        let mut assessor = TakeAssessor::new(&rig, loopback.len()).expect("a plan");
         assessor.assess(&microphone, &loopback, expected / 96e3, 0).expect("assessed")
     }
 

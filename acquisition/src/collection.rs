@@ -2,35 +2,36 @@
 
 use echolake_schema::{Error, SurfaceId};
 
-use crate::relief::Relief;
+use crate::relief::PanelRelief;
 
 /// The references, which are measured first.
-const REFERENCES: [(&str, Relief); 3] = [("flat", Relief::Flat), ("foam", Relief::Foam), ("wood", Relief::Wood)];
+const REFERENCES: [(&str, PanelRelief); 3] =
+    [("flat", PanelRelief::Flat), ("foam", PanelRelief::Foam), ("wood", PanelRelief::Wood)];
 /// Number of surfaces of the largest collection: four digits number its panels.
 pub const LARGEST: usize = REFERENCES.len() + 2 * 9_999;
 
 /// One surface of a collection.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Member {
+pub struct CollectionSurface {
     /// Its name: `flat`, `foam`, `wood`, then `0001_0`, `0001_1`, `0002_0`, ...
     pub surface: SurfaceId,
     /// Its geometry and material.
-    pub relief: Relief,
+    pub relief: PanelRelief,
 }
 
 /// Returns the first `count` surfaces of the collection that `seed` names; a larger one begins with the smaller one.
 ///
 /// # Errors
 /// [`Error::Quantity`] if there are more than [`LARGEST`].
-pub fn collection(seed: u64, count: usize) -> Result<Vec<Member>, Error> {
+pub fn collection(seed: u64, count: usize) -> Result<Vec<CollectionSurface>, Error> {
     if count > LARGEST {
         let (quantity, expected) = ("number of surfaces", "20001 at most, as panels have four digits");
         return Err(Error::Quantity { quantity, actual: count.to_string(), expected });
     }
     let references = REFERENCES.map(|(name, relief)| (name.to_owned(), relief));
-    let sides = (0u64..).map(|n| (format!("{:04}_{}", n / 2 + 1, n % 2), Relief::drawn(seed, n)));
+    let sides = (0u64..).map(|n| (format!("{:04}_{}", n / 2 + 1, n % 2), PanelRelief::drawn(seed, n)));
     let surfaces = references.into_iter().chain(sides).take(count);
-    surfaces.map(|(name, relief)| Ok(Member { surface: name.parse()?, relief })).collect()
+    surfaces.map(|(name, relief)| Ok(CollectionSurface { surface: name.parse()?, relief })).collect()
 }
 
 #[cfg(test)]

@@ -2,15 +2,15 @@
 
 use echolake_schema::Timestamp;
 
-use crate::rig::{AmbientSensor, AudioInterface, Power, Robots, Take};
+use crate::rig::{AmbientSensor, AudioInterface, AudioTake, DrivePower, RobotArms};
 
 /// Checks that the arms reach their targets and refuse positions out of reach.
 ///
 /// # Panics
 /// If they do not.
-pub fn robots(robots: &mut dyn Robots, reachable: [[f64; 3]; 2], unreachable: [[f64; 3]; 2]) {
+pub fn robots(robots: &mut dyn RobotArms, reachable: [[f64; 3]; 2], unreachable: [[f64; 3]; 2]) {
     let [microphone, speaker] = reachable;
-    assert!(robots.power(Power::On).is_ok(), "the drives switch on");
+    assert!(robots.power(DrivePower::On).is_ok(), "the drives switch on");
     let stand = robots.move_to(microphone, speaker).unwrap_or_else(|e| panic!("{e}"));
     for (wanted, reached) in [(microphone, stand.microphone_mm), (speaker, stand.speaker_mm)] {
         let off = wanted.iter().zip(reached).map(|(a, b)| (a - b).powi(2)).sum::<f64>().sqrt();
@@ -20,9 +20,9 @@ pub fn robots(robots: &mut dyn Robots, reachable: [[f64; 3]; 2], unreachable: [[
     for bad in [f64::NAN, f64::INFINITY] {
         assert!(robots.move_to([bad, microphone[1], microphone[2]], speaker).is_err(), "{bad} is no position");
     }
-    assert!(robots.power(Power::Off).is_ok(), "the drives switch off");
+    assert!(robots.power(DrivePower::Off).is_ok(), "the drives switch off");
     assert!(robots.move_to(speaker, microphone).is_err(), "nothing moves without power");
-    assert!(robots.power(Power::On).is_ok(), "the drives switch on again");
+    assert!(robots.power(DrivePower::On).is_ok(), "the drives switch on again");
 }
 
 /// Checks that takes are as long as the output, that the loopback carries the output, and that time advances.
@@ -33,7 +33,7 @@ pub fn audio(audio: &mut dyn AudioInterface) {
     assert!(audio.rate_hz() > 0.0);
     // Its frequency rises, so that it resembles itself at one delay only.
     let tone: Vec<f32> = (0..4_800).map(|n| n as f32).map(|n| 0.25 * (n * (0.2 + n * 1e-4)).sin()).collect();
-    let (mut take, mut last) = (Take::default(), Timestamp(i64::MIN));
+    let (mut take, mut last) = (AudioTake::default(), Timestamp(i64::MIN));
     for output in [&tone[..], &tone[..1_000], &[0.0; 2_000]] {
         audio.play_and_record(output, &mut take).unwrap_or_else(|e| panic!("{e}"));
         assert_eq!([take.microphone.len(), take.loopback.len()], [output.len(); 2]);

@@ -19,12 +19,12 @@ use echolake_schema::manifest::{Origin, RunEnd};
 use echolake_schema::messages::{Measurement, Verdict};
 use echolake_schema::{Grid, Pair, Rig, Timestamp};
 
-use crate::assessment::Assessor;
+use crate::assessment::TakeAssessor;
 use crate::recorder::{LogLevel, Recorder, Tried};
-use crate::rig::{Devices, Power, Take};
+use crate::rig::{AudioTake, DrivePower, RigDevices};
 pub(crate) use attempt::implausible;
 pub use error::Error;
-use watch::Watch;
+use watch::RunMonitor;
 
 /// Source name of the controller's log entries.
 const NAME: &str = "controller";
@@ -33,7 +33,7 @@ const PAUSE_LOOKS: Duration = Duration::from_millis(50);
 
 /// Choice of the messages that a run records.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Keep {
+pub enum RecordingMode {
     /// Sweeps and impulse responses.
     Sweeps,
     /// Impulse responses alone.
@@ -44,14 +44,14 @@ pub enum Keep {
 #[derive(Debug, Clone, Copy)]
 pub struct RunOptions {
     /// Recorded messages.
-    pub keep: Keep,
+    pub keep: RecordingMode,
     /// Pairs between two checkpoints: a power cut may cost these. A real rig takes 1, 12 s each.
     pub checkpoint_every: usize,
 }
 
 /// Pairs and settings of a run.
 #[derive(Debug, Clone, Copy)]
-pub struct Work<'a> {
+pub struct RunWorkload<'a> {
     /// The pairs, in their order.
     pub pairs: &'a [Pair],
     /// Earlier attempts by pair id, if the run is resumed: accepted pairs are skipped.
@@ -62,7 +62,7 @@ pub struct Work<'a> {
 
 /// Flags with which any thread can stop or pause a run.
 #[derive(Debug, Default)]
-pub struct Control {
+pub struct RunControl {
     /// The run ends after the current pair.
     pub stop: AtomicBool,
     /// The run waits after the current pair, for as long as this is true.
@@ -71,7 +71,7 @@ pub struct Control {
 
 /// An event in a run, as the observer gets it.
 #[derive(Debug, Clone, Copy)]
-pub enum Event<'a> {
+pub enum RunEvent<'a> {
     /// The arms go to a pair.
     Pair(Pair),
     /// An attempt was made; it is not on the disk yet.
@@ -94,7 +94,7 @@ pub enum Event<'a> {
 
 /// Result of a run.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Outcome {
+pub struct RunOutcome {
     /// Counts and end time, as written to its file.
     pub end: RunEnd,
     /// Pairs that were not tried, because it was stopped.
@@ -105,25 +105,25 @@ pub struct Outcome {
 pub struct RunController<'a> {
     rig: &'a Rig,
     grid: Grid,
-    devices: Devices,
+    devices: RigDevices,
     output: Vec<f32>,
     deconvolution: DeconvolutionPlan<f32>,
     scratch: DeconvolutionScratch<f32>,
-    assessor: Assessor,
-    take: Take,
+    assessor: TakeAssessor,
+    take: AudioTake,
     microphone: Vec<f32>,
     loopback: Vec<f32>,
     ir: Vec<f32>,
 }
 
 /// State of a run in progress.
-struct Running<'r> {
+struct RunProgress<'r> {
     recorder: &'r mut Recorder,
     options: RunOptions,
     tried: BTreeMap<u32, Tried>,
     attempts: u64,
     ended: Timestamp,
-    watch: Watch,
+    watch: RunMonitor,
     /// Verdicts since the last checkpoint.
     unsafe_verdicts: Vec<Measurement>,
     /// Pairs since the last checkpoint.
@@ -135,7 +135,7 @@ impl<'a> RunController<'a> {
     ///
     /// # Errors
     /// [`Error::Plan`] if its settings contradict each other, [`Error::Rate`] if the interface's rate is not the rig's.
-    pub fn new(rig: &'a Rig, devices: Devices) -> Result<Self, Error> {
+    pub fn new(rig: &'a Rig, devices: RigDevices) -> Result<Self, Error> {
         let failed = |cause| Error::Plan { rig: rig.name.clone(), cause };
         let (sweep, recording_len) = (&rig.sweep, rig.recording_len());
         let (expected_hz, actual_hz) = (sweep.rate_hz.get(), devices.audio.rate_hz());
@@ -171,8 +171,8 @@ impl<'a> RunController<'a> {
             scratch: deconvolution.scratch(),
             ir: vec![0.0; deconvolution.output_len()],
             deconvolution,
-            assessor: Assessor::new(rig, recording_len).map_err(failed)?,
-            take: Take::default(),
+            assessor: TakeAssessor::new(rig, recording_len).map_err(failed)?,
+            take: AudioTake::default(),
             microphone: Vec::new(),
             loopback: Vec::new(),
         })
@@ -198,17 +198,17 @@ impl<'a> RunController<'a> {
     pub fn run(
         &mut self,
         recorder: &mut Recorder,
-        work: &Work<'_>,
-        control: &Control,
-        observe: &mut dyn FnMut(Event<'_>),
-    ) -> Result<Outcome, Error> {
+        work: &RunWorkload<'_>,
+        control: &RunControl,
+        observe: &mut dyn FnMut(RunEvent<'_>),
+    ) -> Result<RunOutcome, Error> {
         let begun = self.air()?;
-        let watch = Watch::new(recorder.partial(), begun.at);
+        let watch = RunMonitor::new(recorder.partial(), begun.at);
         let (tried, options) = (work.before.clone(), work.options);
         let attempts = tried.values().map(|t| u64::from(t.attempts)).sum();
         let (unsafe_verdicts, unsafe_pairs) = (Vec::new(), 0);
         let mut run =
-            Running { recorder, options, tried, attempts, ended: begun.at, watch, unsafe_verdicts, unsafe_pairs };
+            RunProgress { recorder, options, tried, attempts, ended: begun.at, watch, unsafe_verdicts, unsafe_pairs };
         let todo: Vec<Pair> = work.pairs.iter().filter(|p| !run.is_accepted(p.id.0)).copied().collect();
         let (left_out, of) = (work.pairs.len() - todo.len(), work.pairs.len());
         let what = match work.before.is_empty() {
@@ -221,9 +221,9 @@ impl<'a> RunController<'a> {
                 let left = todo.len() - done;
                 run.say(LogLevel::Warning, &format!("stopped by hand with {left} of {of} pairs left"))?;
                 run.checkpoint(observe)?;
-                return Ok(Outcome { end: run.end(), left });
+                return Ok(RunOutcome { end: run.end(), left });
             }
-            observe(Event::Pair(*pair));
+            observe(RunEvent::Pair(*pair));
             let measured = self.measure(&mut run, *pair, observe);
             if let Err(error) = measured.and_then(|()| run.pair_done(observe)) {
                 return Err(self.broken_off(&mut run, *pair, error, observe));
@@ -233,25 +233,25 @@ impl<'a> RunController<'a> {
         let RunEnd { accepted, rejected, attempts, .. } = end;
         run.say(LogLevel::Info, &format!("{accepted} pairs accepted, {rejected} given up, {attempts} attempts"))?;
         run.checkpoint(observe)?;
-        Ok(Outcome { end, left: 0 })
+        Ok(RunOutcome { end, left: 0 })
     }
 
     // Waits while the run is paused.
     fn is_to_stop(
         &mut self,
-        run: &mut Running<'_>,
-        control: &Control,
-        observe: &mut dyn FnMut(Event<'_>),
+        run: &mut RunProgress<'_>,
+        control: &RunControl,
+        observe: &mut dyn FnMut(RunEvent<'_>),
     ) -> Result<bool, Error> {
         let is_set = |flag: &AtomicBool| flag.load(Ordering::Relaxed);
         if is_set(&control.pause) && !is_set(&control.stop) {
             run.say(LogLevel::Info, "paused by hand")?;
             run.checkpoint(observe)?;
-            observe(Event::Paused);
+            observe(RunEvent::Paused);
             while is_set(&control.pause) && !is_set(&control.stop) {
                 std::thread::sleep(PAUSE_LOOKS);
             }
-            observe(Event::Continued);
+            observe(RunEvent::Continued);
             run.ended = run.ended.max(self.air()?.at);
             run.say(LogLevel::Info, "gone on with by hand")?;
         }
@@ -260,19 +260,24 @@ impl<'a> RunController<'a> {
 
     fn broken_off(
         &mut self,
-        run: &mut Running<'_>,
+        run: &mut RunProgress<'_>,
         pair: Pair,
         error: Error,
-        observe: &mut dyn FnMut(Event<'_>),
+        observe: &mut dyn FnMut(RunEvent<'_>),
     ) -> Error {
         // The caller must get the first failure; that these fail after it too would only hide it.
-        let _ = self.devices.robots.power(Power::Off);
+        let _ = self.devices.robots.power(DrivePower::Off);
         let told = run.say(LogLevel::Error, &format!("broken off at pair {}: {error}", pair.id.0));
         let _ = told.and_then(|()| run.checkpoint(observe));
         error
     }
 
-    fn measure(&mut self, run: &mut Running<'_>, pair: Pair, observe: &mut dyn FnMut(Event<'_>)) -> Result<(), Error> {
+    fn measure(
+        &mut self,
+        run: &mut RunProgress<'_>,
+        pair: Pair,
+        observe: &mut dyn FnMut(RunEvent<'_>),
+    ) -> Result<(), Error> {
         let before = run.tried.get(&pair.id.0).map_or(0, |t| t.attempts);
         let mut objections = Vec::new();
         for attempt in 1..=self.rig.validation.attempts {
@@ -282,7 +287,7 @@ impl<'a> RunController<'a> {
             self.record(run, &made)?;
             run.attempts += 1;
             run.ended = made.at.plus_secs(self.output.len() as f64 / self.rig.sweep.rate_hz.get());
-            observe(Event::Attempt(&made.measurement));
+            observe(RunEvent::Attempt(&made.measurement));
             let verdict = made.measurement.verdict();
             objections = std::mem::take(&mut made.objections);
             let accepted = verdict == Verdict::Accepted;
@@ -300,7 +305,7 @@ impl<'a> RunController<'a> {
     }
 }
 
-impl Running<'_> {
+impl RunProgress<'_> {
     fn is_accepted(&self, pair: u32) -> bool {
         self.tried.get(&pair).is_some_and(|t| t.accepted)
     }
@@ -315,7 +320,7 @@ impl Running<'_> {
         Ok(self.recorder.log(self.ended, level, NAME, what)?)
     }
 
-    fn pair_done(&mut self, observe: &mut dyn FnMut(Event<'_>)) -> Result<(), Error> {
+    fn pair_done(&mut self, observe: &mut dyn FnMut(RunEvent<'_>)) -> Result<(), Error> {
         self.unsafe_pairs += 1;
         if self.unsafe_pairs < self.options.checkpoint_every {
             return Ok(());
@@ -325,12 +330,12 @@ impl Running<'_> {
     }
 
     // A verdict is reported only after the disk has it.
-    fn checkpoint(&mut self, observe: &mut dyn FnMut(Event<'_>)) -> Result<(), Error> {
+    fn checkpoint(&mut self, observe: &mut dyn FnMut(RunEvent<'_>)) -> Result<(), Error> {
         self.recorder.checkpoint()?;
         self.unsafe_pairs = 0;
         let verdicts = std::mem::take(&mut self.unsafe_verdicts);
         let accepted = self.tried.values().filter(|t| t.accepted).count() as u64;
-        observe(Event::Safe { verdicts: &verdicts, accepted, cost: self.recorder.cost() });
+        observe(RunEvent::Safe { verdicts: &verdicts, accepted, cost: self.recorder.cost() });
         Ok(())
     }
 }

@@ -1,9 +1,9 @@
 //! Acquisition: from a rig, or from files of another origin, to a run's MCAP file.
 //!
 //! ```
-//! use echolake_acquisition::relief::Relief;
+//! use echolake_acquisition::relief::PanelRelief;
 //!
-//! let wall = Relief::by_name("brick")?;
+//! let wall = PanelRelief::by_name("brick")?;
 //! assert_eq!(wall.material().reflection_factor, 0.83);
 //! # Ok::<(), echolake_acquisition::relief::Error>(())
 //! ```

@@ -2,7 +2,7 @@
 
 /// A reason to reject a take. Its text is recorded in the verdict.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
-pub enum Objection {
+pub enum TakeObjection {
     /// Samples at full scale.
     #[error("{samples} samples clipped")]
     Clipped {
@@ -75,7 +75,7 @@ pub enum Objection {
     },
 }
 
-impl Objection {
+impl TakeObjection {
     /// Returns advice for an objection that persists.
     pub fn hint(&self) -> &'static str {
         match self {

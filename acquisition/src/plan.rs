@@ -3,9 +3,9 @@
 use std::collections::BTreeMap;
 use std::path::PathBuf;
 
-use crate::controller::Keep;
-use crate::mesh::Side;
-use crate::relief::Relief;
+use crate::controller::RecordingMode;
+use crate::mesh::PanelSide;
+use crate::relief::PanelRelief;
 
 const KEEP: &str = "keep";
 const SEED: &str = "seed";
@@ -19,30 +19,30 @@ const RESPONSES: &str = "responses";
 #[derive(Debug, Clone, PartialEq)]
 pub struct RunPlan {
     /// Recorded messages.
-    pub keep: Keep,
+    pub keep: RecordingMode,
     /// Seed of the simulation.
     pub seed: u64,
     /// The measured panel.
-    pub specimen: Specimen,
+    pub specimen: PanelSpecimen,
 }
 
 /// A panel to be measured.
 #[derive(Debug, Clone, PartialEq)]
-pub enum Specimen {
+pub enum PanelSpecimen {
     /// A generated relief.
-    Relief(Relief),
+    Relief(PanelRelief),
     /// A side of the mesh in a file, as a coated print.
-    Mesh(PathBuf, Side),
+    Mesh(PathBuf, PanelSide),
 }
 
 impl RunPlan {
     /// Returns the metadata record's key and value pairs.
     pub fn to_metadata(&self) -> BTreeMap<String, String> {
-        let keep = if self.keep == Keep::Sweeps { SWEEPS } else { RESPONSES };
+        let keep = if self.keep == RecordingMode::Sweeps { SWEEPS } else { RESPONSES };
         let mut record = vec![(KEEP, keep.to_owned()), (SEED, self.seed.to_string())];
         match &self.specimen {
-            Specimen::Relief(relief) => record.push((RELIEF, relief.to_json().to_string())),
-            Specimen::Mesh(path, side) => {
+            PanelSpecimen::Relief(relief) => record.push((RELIEF, relief.to_json().to_string())),
+            PanelSpecimen::Mesh(path, side) => {
                 record.extend([(MESH, path.to_string_lossy().into_owned()), (SIDE, side.name().to_owned())]);
             }
         }
@@ -56,20 +56,20 @@ impl RunPlan {
     pub fn from_metadata(record: &BTreeMap<String, String>) -> Result<Self, String> {
         let text = |key: &str| record.get(key).map(String::as_str).ok_or_else(|| format!("its plan has no `{key}`"));
         let keep = match text(KEEP)? {
-            SWEEPS => Keep::Sweeps,
-            RESPONSES => Keep::ResponsesOnly,
+            SWEEPS => RecordingMode::Sweeps,
+            RESPONSES => RecordingMode::ResponsesOnly,
             other => return Err(format!("its plan keeps `{other}`, expected `{SWEEPS}` or `{RESPONSES}`")),
         };
         let seed = text(SEED)?;
         let seed = seed.parse().map_err(|_| format!("its plan has the seed `{seed}`, expected a whole number"))?;
         let specimen = match text(RELIEF) {
-            Ok(json) => Specimen::Relief(Relief::from_json(json).map_err(|e| e.to_string())?),
+            Ok(json) => PanelSpecimen::Relief(PanelRelief::from_json(json).map_err(|e| e.to_string())?),
             Err(_) => {
                 // Earlier plans have no side: there was only the front.
-                let side = record.get(SIDE).map_or(Side::Front.name(), String::as_str);
-                let side = Side::parse(side)
+                let side = record.get(SIDE).map_or(PanelSide::Front.name(), String::as_str);
+                let side = PanelSide::parse(side)
                     .ok_or_else(|| format!("its plan has the side `{side}`, expected front or back"))?;
-                Specimen::Mesh(text(MESH)?.into(), side)
+                PanelSpecimen::Mesh(text(MESH)?.into(), side)
             }
         };
         Ok(Self { keep, seed, specimen })
@@ -82,10 +82,10 @@ mod tests {
 
     #[test]
     fn a_plan_comes_back_as_it_was() {
-        let relief = Relief::by_name("brick").expect("a relief");
+        let relief = PanelRelief::by_name("brick").expect("a relief");
         for (keep, specimen) in [
-            (Keep::Sweeps, Specimen::Relief(relief)),
-            (Keep::ResponsesOnly, Specimen::Mesh("panels/0015.glb".into(), Side::Back)),
+            (RecordingMode::Sweeps, PanelSpecimen::Relief(relief)),
+            (RecordingMode::ResponsesOnly, PanelSpecimen::Mesh("panels/0015.glb".into(), PanelSide::Back)),
         ] {
             let plan = RunPlan { keep, seed: u64::MAX, specimen };
             assert_eq!(RunPlan::from_metadata(&plan.to_metadata()), Ok(plan));

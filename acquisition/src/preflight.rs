@@ -6,7 +6,7 @@ use echolake_dsp::chain::raw_len;
 use echolake_schema::{Pair, Rig};
 
 use crate::controller::watch::KEPT_FREE;
-use crate::controller::{Keep, RunController, implausible};
+use crate::controller::{RecordingMode, RunController, implausible};
 use crate::disk::free_bytes;
 
 /// Bytes per recorded sample of both channels and audio, compressed: 4.92 in a simulated run with sweeps of 0.5 s.
@@ -22,45 +22,45 @@ const REPEATS: f64 = 1.1;
 
 /// A preflight check that failed.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Finding {
+pub struct PreflightFinding {
     /// The problem.
     pub what: String,
     /// Advice.
     pub hint: String,
 }
 
-impl Finding {
+impl PreflightFinding {
     /// Makes a finding of a problem and advice.
     pub fn new(what: impl Into<String>, hint: impl Into<String>) -> Self {
         Self { what: what.into(), hint: hint.into() }
     }
 }
 
-impl std::fmt::Display for Finding {
+impl std::fmt::Display for PreflightFinding {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         write!(f, "{}; hint: {}", self.what, self.hint)
     }
 }
 
 /// Estimates the file size of a run of so many pairs, bytes.
-pub fn expected_bytes(rig: &Rig, keep: Keep, pairs: usize) -> u64 {
+pub fn expected_bytes(rig: &Rig, keep: RecordingMode, pairs: usize) -> u64 {
     let reference = rig.impulse_response.reference_temperature_c.get();
     let response = raw_len(rig.impulse_response.length, reference) as f64 * RESPONSE_BYTES_A_SAMPLE;
     let sweep = match keep {
-        Keep::Sweeps => rig.recording_len() as f64 * SWEEP_BYTES_A_SAMPLE,
-        Keep::ResponsesOnly => 0.0,
+        RecordingMode::Sweeps => rig.recording_len() as f64 * SWEEP_BYTES_A_SAMPLE,
+        RecordingMode::ResponsesOnly => 0.0,
     };
     (RUN_BYTES + (sweep + response + PAIR_BYTES) * REPEATS * pairs as f64) as u64
 }
 
 /// Checks that the disk has room for a run of so many pairs.
-pub fn disk(folder: &Path, rig: &Rig, keep: Keep, pairs: usize) -> Option<Finding> {
+pub fn disk(folder: &Path, rig: &Rig, keep: RecordingMode, pairs: usize) -> Option<PreflightFinding> {
     // A file system that does not report its free space is no reason to refuse.
     let free = free_bytes(folder).ok()?;
     room(folder, free, expected_bytes(rig, keep, pairs) + KEPT_FREE)
 }
 
-fn room(folder: &Path, free: u64, needed: u64) -> Option<Finding> {
+fn room(folder: &Path, free: u64, needed: u64) -> Option<PreflightFinding> {
     let megabytes = |bytes: u64| bytes as f64 / 1e6;
     (free < needed).then(|| {
         let what = format!(
@@ -69,15 +69,18 @@ fn room(folder: &Path, free: u64, needed: u64) -> Option<Finding> {
             megabytes(free),
             megabytes(needed)
         );
-        Finding::new(what, "make room, or record impulse responses alone (--ir-only)")
+        PreflightFinding::new(what, "make room, or record impulse responses alone (--ir-only)")
     })
 }
 
 /// Checks sensor, loopback, level and room: a reading, and a take at a pair that is not recorded. A single take may be
 /// spoiled, so it is repeated as often as the rig allows.
-pub fn devices(controller: &mut RunController<'_>, pair: Pair) -> Vec<Finding> {
+pub fn devices(controller: &mut RunController<'_>, pair: Pair) -> Vec<PreflightFinding> {
     let failed = |error: crate::rig::Error| {
-        vec![Finding::new(error.to_string(), "is it plugged in, switched on, and named rightly in the rig file?")]
+        vec![PreflightFinding::new(
+            error.to_string(),
+            "is it plugged in, switched on, and named rightly in the rig file?",
+        )]
     };
     let reading = match controller.air() {
         Ok(reading) => reading,
@@ -85,7 +88,10 @@ pub fn devices(controller: &mut RunController<'_>, pair: Pair) -> Vec<Finding> {
     };
     let nonsense = implausible(&reading);
     if !nonsense.is_empty() {
-        return nonsense.iter().map(|o| Finding::new(format!("the ambient sensor says {o}"), o.hint())).collect();
+        return nonsense
+            .iter()
+            .map(|o| PreflightFinding::new(format!("the ambient sensor says {o}"), o.hint()))
+            .collect();
     }
     let mut objections = Vec::new();
     for _ in 0..controller.rig().validation.attempts {
@@ -95,7 +101,7 @@ pub fn devices(controller: &mut RunController<'_>, pair: Pair) -> Vec<Finding> {
             Err(error) => return failed(error),
         }
     }
-    objections.iter().map(|o| Finding::new(format!("a take at pair {}: {o}", pair.id.0), o.hint())).collect()
+    objections.iter().map(|o| PreflightFinding::new(format!("a take at pair {}: {o}", pair.id.0), o.hint())).collect()
 }
 
 #[cfg(test)]
@@ -107,8 +113,12 @@ mod tests {
         let rig = Rig::paper();
         let megabytes = |keep| expected_bytes(&rig, keep, 2951) as f64 / 1e6;
         // A simulated run with the paper's rig has 723 MB with sweeps, 8.7 without.
-        assert!((650.0..1_000.0).contains(&megabytes(Keep::Sweeps)), "{}", megabytes(Keep::Sweeps));
-        assert!((8.0..16.0).contains(&megabytes(Keep::ResponsesOnly)), "{}", megabytes(Keep::ResponsesOnly));
+        assert!((650.0..1_000.0).contains(&megabytes(RecordingMode::Sweeps)), "{}", megabytes(RecordingMode::Sweeps));
+        assert!(
+            (8.0..16.0).contains(&megabytes(RecordingMode::ResponsesOnly)),
+            "{}",
+            megabytes(RecordingMode::ResponsesOnly)
+        );
     }
 
     #[test]

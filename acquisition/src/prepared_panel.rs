@@ -5,10 +5,10 @@ use std::path::Path;
 use echolake_schema::manifest::MeshFacts;
 use echolake_schema::{Rig, SurfaceRecord};
 
-use crate::mesh::{self, BACK_MM, Format, MESH_CELLS, Mesh, Side};
-use crate::plan::Specimen;
+use crate::mesh::{self, BACK_MM, Format, MESH_CELLS, Mesh, PanelSide};
+use crate::plan::PanelSpecimen;
 use crate::recorder::OriginalFile;
-use crate::relief::{HeightField, Relief};
+use crate::relief::{HeightField, PanelRelief};
 use crate::rigs::simulated::FACETS;
 
 /// A specimen, ready to be measured and recorded.
@@ -25,10 +25,10 @@ impl PreparedPanel {
     ///
     /// # Errors
     /// The mesh cannot be used.
-    pub(crate) fn new(specimen: &Specimen, rig: &Rig) -> Result<Self, mesh::Error> {
+    pub(crate) fn new(specimen: &PanelSpecimen, rig: &Rig) -> Result<Self, mesh::Error> {
         match specimen {
-            Specimen::Relief(relief) => Ok(generated(relief)),
-            Specimen::Mesh(path, side) => from_file(path, *side, rig),
+            PanelSpecimen::Relief(relief) => Ok(generated(relief)),
+            PanelSpecimen::Mesh(path, side) => from_file(path, *side, rig),
         }
     }
 
@@ -39,7 +39,7 @@ impl PreparedPanel {
     }
 }
 
-fn generated(relief: &Relief) -> PreparedPanel {
+fn generated(relief: &PanelRelief) -> PreparedPanel {
     let material = relief.material();
     let mesh = Mesh::from_height_field(&relief.height_field(MESH_CELLS), BACK_MM);
     let heights = relief.height_field(FACETS);
@@ -50,7 +50,7 @@ fn generated(relief: &Relief) -> PreparedPanel {
         relief_mm: heights.extent_mm().map(f64::from),
     };
     let (macrostructure, microstructure) = match relief {
-        Relief::Layered(wall) => (Some(wall.macrostructure().to_owned()), Some(wall.microstructure())),
+        PanelRelief::Layered(wall) => (Some(wall.macrostructure().to_owned()), Some(wall.microstructure())),
         _ => (None, None),
     };
     PreparedPanel {
@@ -72,14 +72,14 @@ fn generated(relief: &Relief) -> PreparedPanel {
     }
 }
 
-fn from_file(path: &Path, side: Side, rig: &Rig) -> Result<PreparedPanel, mesh::Error> {
+fn from_file(path: &Path, side: PanelSide, rig: &Rig) -> Result<PreparedPanel, mesh::Error> {
     let format = Format::of(path)?;
     let mesh = Mesh::read(path)?.seen_from(side).check(rig.panel.size_mm, rig.panel.depth_mm, path)?;
     let heights = mesh.to_height_field(FACETS, rig.panel.size_mm, rig.panel.depth_mm, path)?;
     let bytes = std::fs::read(path).map_err(|source| mesh::Error::Read { path: path.to_owned(), source })?;
     let name = path.file_name().map_or_else(|| "panel".to_owned(), |n| n.to_string_lossy().into_owned());
     // A coated print, as the paper's panels are.
-    let material = Relief::Flat.material();
+    let material = PanelRelief::Flat.material();
     let facts = MeshFacts {
         file: name.clone(),
         triangles: mesh.triangles.len() as u64,

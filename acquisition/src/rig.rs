@@ -10,21 +10,21 @@ use echolake_schema::manifest::Origin;
 use crate::robots::Joints;
 
 /// Two arms: one carries the microphone, one the speaker. Positions in mm over the panel.
-pub trait Robots: Send {
+pub trait RobotArms: Send {
     /// Moves both and waits until they stand still; returns their positions. A position that cannot be reached or is
     /// not finite, two positions too near each other, and any move without power are refused, and then nothing has
     /// moved.
     ///
     /// # Errors
     /// [`Error::Unreachable`] or [`Error::Device`].
-    fn move_to(&mut self, microphone_mm: [f64; 3], speaker_mm: [f64; 3]) -> Result<Positions, Error>;
+    fn move_to(&mut self, microphone_mm: [f64; 3], speaker_mm: [f64; 3]) -> Result<ArmPositions, Error>;
 
     /// Switches the drives; with them off the arms are silent and hold by their brakes. What is recorded with them
     /// on is a take all the same, with their noise in it.
     ///
     /// # Errors
     /// [`Error::Device`].
-    fn power(&mut self, power: Power) -> Result<(), Error>;
+    fn power(&mut self, power: DrivePower) -> Result<(), Error>;
 
     /// Returns the problems that were handled since the last call, for the run's log.
     fn notices(&mut self) -> Vec<String> {
@@ -34,7 +34,7 @@ pub trait Robots: Send {
 
 /// Positions of the arms, mm.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Positions {
+pub struct ArmPositions {
     /// The microphone.
     pub microphone_mm: [f64; 3],
     /// The speaker.
@@ -45,7 +45,7 @@ pub struct Positions {
 
 /// The drives' power.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Power {
+pub enum DrivePower {
     /// The arms can move.
     On,
     /// The arms are silent.
@@ -63,7 +63,7 @@ pub trait AudioInterface: Send {
     ///
     /// # Errors
     /// [`Error::Device`].
-    fn play_and_record(&mut self, output: &[f32], take: &mut Take) -> Result<(), Error>;
+    fn play_and_record(&mut self, output: &[f32], take: &mut AudioTake) -> Result<(), Error>;
 
     /// Returns the problems that were handled since the last call, for the run's log.
     fn notices(&mut self) -> Vec<String> {
@@ -73,7 +73,7 @@ pub trait AudioInterface: Send {
 
 /// One recording: signed 24-bit samples, full scale 2^23.
 #[derive(Debug, Clone, Default)]
-pub struct Take {
+pub struct AudioTake {
     /// Time of its first sample.
     pub started: Option<Timestamp>,
     /// The measurement microphone.
@@ -88,7 +88,7 @@ pub trait AmbientSensor: Send {
     ///
     /// # Errors
     /// [`Error::Device`].
-    fn read(&mut self) -> Result<Reading, Error>;
+    fn read(&mut self) -> Result<AmbientReading, Error>;
 
     /// Returns the problems that were handled since the last call, for the run's log.
     fn notices(&mut self) -> Vec<String> {
@@ -98,7 +98,7 @@ pub trait AmbientSensor: Send {
 
 /// One reading of the ambient sensor.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Reading {
+pub struct AmbientReading {
     /// Time of the reading.
     pub at: Timestamp,
     /// Temperature, C.
@@ -112,9 +112,9 @@ pub struct Reading {
 }
 
 /// A rig's devices.
-pub struct Devices {
+pub struct RigDevices {
     /// The arms.
-    pub robots: Box<dyn Robots>,
+    pub robots: Box<dyn RobotArms>,
     /// The audio interface.
     pub audio: Box<dyn AudioInterface>,
     /// The ambient sensor.
@@ -123,7 +123,7 @@ pub struct Devices {
     pub origin: Origin,
 }
 
-impl Devices {
+impl RigDevices {
     /// Returns the problems that were handled since the last call, each with its device.
     pub fn notices(&mut self) -> Vec<(&'static str, String)> {
         let of = |device, notices: Vec<String>| notices.into_iter().map(move |notice| (device, notice));

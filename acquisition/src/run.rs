@@ -7,18 +7,18 @@ use std::sync::Arc;
 use echolake_schema::manifest::{Origin, RunManifest};
 use echolake_schema::{Rig, RunId, SurfaceId, Timestamp};
 
-use crate::controller::{self, Keep, RunController};
+use crate::controller::{self, RecordingMode, RunController};
 use crate::disk::folder_of;
+pub use crate::plan::PanelSpecimen;
 use crate::plan::RunPlan;
-pub use crate::plan::Specimen;
-use crate::preflight::Finding;
+use crate::preflight::PreflightFinding;
 use crate::prepared_panel::PreparedPanel;
 use crate::recorder::{Held, Recorder, Relief as RecordedRelief, RunStart, Shape, Tried};
-use crate::rig::Devices;
+use crate::rig::RigDevices;
 use crate::rigs::simulated::TAKE_SECS;
 use crate::rigs::{DeviceRequest, open_devices};
 use crate::robots::Choreography;
-use crate::session::{Job, Measured, Preflight, Session, WhenStopped};
+use crate::session::{MeasuredRun, PreflightMode, RunJob, RunSession, WhenStopped};
 use crate::{mesh, recovery};
 
 /// A run that is to be measured.
@@ -29,7 +29,7 @@ pub struct RunRequest<'a> {
     /// Name of the surface.
     pub surface: SurfaceId,
     /// The panel to measure.
-    pub specimen: &'a Specimen,
+    pub specimen: &'a PanelSpecimen,
     /// The surface that normalises it, if it is not the lake's.
     pub flat: Option<SurfaceId>,
     /// The surface whose direct sound is subtracted from it, if it is not the lake's.
@@ -41,7 +41,7 @@ pub struct RunRequest<'a> {
     /// Tag of the run's name.
     pub tag: u64,
     /// Messages to record.
-    pub keep: Keep,
+    pub keep: RecordingMode,
     /// Folder of the run's file, which has the run's name.
     pub folder: &'a Path,
 }
@@ -65,7 +65,7 @@ pub enum Error {
     #[error("not fit to measure: {}", findings.iter().map(ToString::to_string).collect::<Vec<_>>().join("\n  and: "))]
     Unfit {
         /// The failed checks.
-        findings: Vec<Finding>,
+        findings: Vec<PreflightFinding>,
     },
 }
 
@@ -74,7 +74,7 @@ impl RunRequest<'_> {
     ///
     /// # Errors
     /// [`Error`]; a run that was begun leaves its `.partial` file.
-    pub fn measure(&self, session: Session<'_>) -> Result<Measured, Error> {
+    pub fn measure(&self, session: RunSession<'_>) -> Result<MeasuredRun, Error> {
         let panel = PreparedPanel::new(self.specimen, self.rig)?;
         let arms = Choreography::of(self.rig)?;
         let request =
@@ -88,12 +88,12 @@ impl RunRequest<'_> {
     /// is stopped.
     pub(crate) fn measure_with(
         &self,
-        devices: Devices,
+        devices: RigDevices,
         panel: &PreparedPanel,
         arms: Option<Arc<Choreography>>,
-        session: Session<'_>,
+        session: RunSession<'_>,
         plan: Option<BTreeMap<String, String>>,
-    ) -> Result<Measured, Error> {
+    ) -> Result<MeasuredRun, Error> {
         let manifest = RunManifest {
             run_id: self.run_id()?,
             surface_id: self.surface.clone(),
@@ -136,7 +136,7 @@ impl RunRequest<'_> {
 ///
 /// # Errors
 /// [`Error::Resume`] if it cannot be resumed; the file is as it was.
-pub fn resume(partial: &Path, session: Session<'_>) -> Result<Measured, Error> {
+pub fn resume(partial: &Path, session: RunSession<'_>) -> Result<MeasuredRun, Error> {
     let held = Held::read(partial)?;
     let reason = |reason: String| recovery::Error::NoPlan { path: partial.to_owned(), reason };
     let plan = RunPlan::from_metadata(&held.plan).map_err(reason)?;
@@ -163,8 +163,8 @@ pub fn resume(partial: &Path, session: Session<'_>) -> Result<Measured, Error> {
     Ok(job.measure(&mut controller, recorder, session)?)
 }
 
-fn check_fitness(job: &Job<'_>, controller: &mut RunController<'_>, preflight: Preflight) -> Result<(), Error> {
-    if preflight == Preflight::Skip {
+fn check_fitness(job: &RunJob<'_>, controller: &mut RunController<'_>, preflight: PreflightMode) -> Result<(), Error> {
+    if preflight == PreflightMode::Skip {
         return Ok(());
     }
     let findings = job.look_over(controller, job.rig.grid()?.pairs());
@@ -175,11 +175,11 @@ fn job<'a>(
     panel: &'a PreparedPanel,
     rig: &'a Rig,
     folder: &'a Path,
-    keep: Keep,
+    keep: RecordingMode,
     before: &'a BTreeMap<u32, Tried>,
     started: Timestamp,
     arms: Option<Arc<Choreography>>,
-) -> Job<'a> {
+) -> RunJob<'a> {
     let shape = Some(Shape { heights: &panel.heights, mesh: &panel.mesh });
-    Job { rig, folder, shape, keep, before, started, arms, when_stopped: WhenStopped::Open }
+    RunJob { rig, folder, shape, keep, before, started, arms, when_stopped: WhenStopped::Open }
 }

@@ -10,8 +10,10 @@ use std::sync::Arc;
 use echolake_schema::manifest::Origin;
 use echolake_schema::{Pair, Rig, Timestamp};
 
-use crate::controller::{self, Control, Event, Keep, Outcome, RunController, RunOptions, Work};
-use crate::preflight::{self, Finding};
+use crate::controller::{
+    self, RecordingMode, RunControl, RunController, RunEvent, RunOptions, RunOutcome, RunWorkload,
+};
+use crate::preflight::{self, PreflightFinding};
 use crate::recorder::{Recorder, Shape, Tap, Tried};
 use crate::robots::Choreography;
 
@@ -19,25 +21,25 @@ use crate::robots::Choreography;
 const SIMULATED_CHECKPOINT_EVERY: usize = 200;
 
 /// Supervision of a run: its control, its observers and its settings.
-pub struct Session<'a> {
+pub struct RunSession<'a> {
     /// Stops or pauses it.
-    pub control: &'a Control,
+    pub control: &'a RunControl,
     /// Gets its events.
-    pub observe: &'a mut dyn FnMut(Event<'_>),
+    pub observe: &'a mut dyn FnMut(RunEvent<'_>),
     /// Gets every message.
     pub tap: Option<Box<dyn Tap>>,
     /// Choice to run the preflight checks first.
-    pub preflight: Preflight,
+    pub preflight: PreflightMode,
     /// Pairs between two checkpoints; by default 1 on a real rig, whose pairs take 12 s each, and 200 on the simulated
     /// one.
     pub checkpoint_every: Option<usize>,
     /// Duration of a simulated take.
-    pub pace: Pace,
+    pub pace: TakePace,
 }
 
 /// Choice to run preflight checks before a run begins.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Preflight {
+pub enum PreflightMode {
     /// They are run, and the run is refused if one fails.
     Check,
     /// They are skipped.
@@ -46,7 +48,7 @@ pub enum Preflight {
 
 /// Duration of a simulated take.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub enum Pace {
+pub enum TakePace {
     /// Time of its computation, without a wait.
     Fast,
     /// At least this many seconds.
@@ -55,19 +57,19 @@ pub enum Pace {
 
 /// Result of a session.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Measured {
+pub struct MeasuredRun {
     /// The run's file; its `.partial` if it was stopped.
     pub path: PathBuf,
     /// Counts, and the pairs that are left.
-    pub outcome: Outcome,
+    pub outcome: RunOutcome,
 }
 
 /// A run to measure, apart from its recorder.
-pub(crate) struct Job<'a> {
+pub(crate) struct RunJob<'a> {
     pub(crate) rig: &'a Rig,
     pub(crate) folder: &'a Path,
     pub(crate) shape: Option<Shape<'a>>,
-    pub(crate) keep: Keep,
+    pub(crate) keep: RecordingMode,
     pub(crate) before: &'a BTreeMap<u32, Tried>,
     pub(crate) started: Timestamp,
     /// Joints of the arms at each pair, if the arms are known.
@@ -84,9 +86,9 @@ pub(crate) enum WhenStopped {
     Open,
 }
 
-impl Job<'_> {
+impl RunJob<'_> {
     /// Runs the preflight checks; returns those that failed.
-    pub(crate) fn look_over(&self, controller: &mut RunController<'_>, pairs: &[Pair]) -> Vec<Finding> {
+    pub(crate) fn look_over(&self, controller: &mut RunController<'_>, pairs: &[Pair]) -> Vec<PreflightFinding> {
         let todo: Vec<_> = pairs.iter().filter(|p| !self.before.get(&p.id.0).is_some_and(|t| t.accepted)).collect();
         let mut findings: Vec<_> = preflight::disk(self.folder, self.rig, self.keep, todo.len()).into_iter().collect();
         if let Some(first) = todo.first() {
@@ -100,8 +102,8 @@ impl Job<'_> {
         &self,
         controller: &mut RunController<'_>,
         mut recorder: Recorder,
-        session: Session<'_>,
-    ) -> Result<Measured, controller::Error> {
+        session: RunSession<'_>,
+    ) -> Result<MeasuredRun, controller::Error> {
         let origin = controller.origin();
         let mut pairs = self.rig.grid()?.pairs().to_vec();
         if let Some(arms) = &self.arms {
@@ -118,13 +120,13 @@ impl Job<'_> {
         }
         let checkpoint_every = session.checkpoint_every.unwrap_or_else(|| checkpoint_every(origin));
         let options = RunOptions { keep: self.keep, checkpoint_every };
-        let work = Work { pairs: &pairs, before: self.before, options };
+        let work = RunWorkload { pairs: &pairs, before: self.before, options };
         let outcome = controller.run(&mut recorder, &work, session.control, session.observe)?;
         let path = match (outcome.left, self.when_stopped) {
             (0, _) | (_, WhenStopped::Ended) => recorder.finish(&outcome.end)?,
             (_, WhenStopped::Open) => recorder.partial().to_owned(),
         };
-        Ok(Measured { path, outcome })
+        Ok(MeasuredRun { path, outcome })
     }
 }
 

@@ -6,12 +6,12 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use echolake_schema::manifest::RunEnd;
 use echolake_schema::messages::Verdict;
 
-use crate::controller::{self, Control, Event};
+use crate::controller::{self, RunControl, RunEvent};
 use crate::prepared_panel::PreparedPanel;
 use crate::rigs::{DeviceRequest, simulated_devices};
 use crate::robots::Choreography;
 use crate::run::{Error, RunRequest};
-use crate::session::{Pace, Preflight, Session};
+use crate::session::{PreflightMode, RunSession, TakePace};
 
 /// Simulates all pairs, without a preflight check; returns the run's file and how it ended. Once `stop` is true it ends
 /// with the pairs that it has.
@@ -23,22 +23,22 @@ pub fn simulate(
     stop: &AtomicBool,
     progress: &mut dyn FnMut(usize),
 ) -> Result<(PathBuf, RunEnd), Error> {
-    let (control, mut done) = (Control::default(), 0);
-    let mut observe = |event: Event<'_>| match event {
-        Event::Pair(_) => control.stop.store(stop.load(Ordering::Relaxed), Ordering::Relaxed),
-        Event::Attempt(m) if m.verdict() != Verdict::Repeated => {
+    let (control, mut done) = (RunControl::default(), 0);
+    let mut observe = |event: RunEvent<'_>| match event {
+        RunEvent::Pair(_) => control.stop.store(stop.load(Ordering::Relaxed), Ordering::Relaxed),
+        RunEvent::Attempt(m) if m.verdict() != Verdict::Repeated => {
             done += 1;
             progress(done);
         }
         _ => {}
     };
-    let session = Session {
+    let session = RunSession {
         control: &control,
         observe: &mut observe,
         tap: None,
-        preflight: Preflight::Skip,
+        preflight: PreflightMode::Skip,
         checkpoint_every: None,
-        pace: Pace::Fast,
+        pace: TakePace::Fast,
     };
     let RunRequest { rig, start, seed, .. } = *request;
     let panel = PreparedPanel::new(request.specimen, rig)?;

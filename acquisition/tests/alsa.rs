@@ -12,7 +12,7 @@ use std::process::Command;
 
 use echolake_acquisition::conformance;
 use echolake_acquisition::drivers::audio_interface;
-use echolake_acquisition::rig::{AudioInterface, Error, Take};
+use echolake_acquisition::rig::{AudioInterface, AudioTake, Error};
 use echolake_schema::Timestamp;
 use echolake_schema::devices::{AlsaParams, AudioFormat};
 
@@ -51,11 +51,11 @@ struct Rewired {
     inner: Box<dyn AudioInterface>,
     folder: PathBuf,
     format: AudioFormat,
-    cable: Cable,
+    cable: CableState,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Cable {
+enum CableState {
     Plugged,
     Missing,
     /// A sample is lost in the middle.
@@ -63,7 +63,7 @@ enum Cable {
 }
 
 impl Rewired {
-    fn new(folder: &Path, format: AudioFormat, cable: Cable) -> Self {
+    fn new(folder: &Path, format: AudioFormat, cable: CableState) -> Self {
         let params = params(format);
         // The file has to be there when the device is opened.
         std::fs::write(folder.join("in.raw"), vec![0; 1 << 16]).expect("written");
@@ -75,8 +75,8 @@ impl Rewired {
         let total = output.len() + 40_000;
         let played = |n: usize| n.checked_sub(DELAY).and_then(|n| output.get(n)).copied().unwrap_or(0.0);
         let frames = (0..total).flat_map(|n| {
-            let lost = usize::from(self.cable == Cable::Leaking && n > DELAY + output.len() / 2);
-            let loopback = if self.cable == Cable::Missing { 0.0 } else { 0.5 * played(n + lost) };
+            let lost = usize::from(self.cable == CableState::Leaking && n > DELAY + output.len() / 2);
+            let loopback = if self.cable == CableState::Missing { 0.0 } else { 0.5 * played(n + lost) };
             [0.125 * played(n), loopback]
         });
         frames.flat_map(|x| sample(x, self.format)).collect()
@@ -88,7 +88,7 @@ impl AudioInterface for Rewired {
         self.inner.rate_hz()
     }
 
-    fn play_and_record(&mut self, output: &[f32], take: &mut Take) -> Result<(), Error> {
+    fn play_and_record(&mut self, output: &[f32], take: &mut AudioTake) -> Result<(), Error> {
         std::fs::write(self.folder.join("in.raw"), self.file(output)).expect("written");
         self.inner.play_and_record(output, take)
     }
@@ -120,7 +120,7 @@ fn sweep() -> Vec<f32> {
 
 fn checks(folder: &Path) {
     for format in [AudioFormat::S32, AudioFormat::S24, AudioFormat::S24Packed] {
-        conformance::audio(&mut Rewired::new(folder, format, Cable::Plugged));
+        conformance::audio(&mut Rewired::new(folder, format, CableState::Plugged));
         takes_are_exact_to_the_sample(folder, format);
     }
     faults_are_named(folder);
@@ -128,7 +128,8 @@ fn checks(folder: &Path) {
 }
 
 fn takes_are_exact_to_the_sample(folder: &Path, format: AudioFormat) {
-    let (mut audio, mut take, output) = (Rewired::new(folder, format, Cable::Plugged), Take::default(), sweep());
+    let (mut audio, mut take, output) =
+        (Rewired::new(folder, format, CableState::Plugged), AudioTake::default(), sweep());
     let before = Timestamp::now();
     audio.play_and_record(&output, &mut take).unwrap_or_else(|e| panic!("{e}"));
     let gained = |gain: f32| output.iter().map(|x| value(gain * x)).collect::<Vec<_>>();
@@ -145,11 +146,11 @@ fn takes_are_exact_to_the_sample(folder: &Path, format: AudioFormat) {
 
 fn faults_are_named(folder: &Path) {
     let check = |audio: &mut Rewired, expected: &str| {
-        let error = audio.play_and_record(&sweep(), &mut Take::default()).expect_err(expected).to_string();
+        let error = audio.play_and_record(&sweep(), &mut AudioTake::default()).expect_err(expected).to_string();
         assert!(error.contains(expected), "{error}");
     };
-    check(&mut Rewired::new(folder, AudioFormat::S32, Cable::Missing), "is its cable plugged in");
-    let mut leaking = Rewired::new(folder, AudioFormat::S32, Cable::Leaking);
+    check(&mut Rewired::new(folder, AudioFormat::S32, CableState::Missing), "is its cable plugged in");
+    let mut leaking = Rewired::new(folder, AudioFormat::S32, CableState::Leaking);
     check(&mut leaking, "2 takes in a row have gaps, the last: 1 samples went missing or came twice");
     assert_eq!(leaking.notices().len(), 1);
 

@@ -13,7 +13,7 @@
 use std::io::Write as _;
 
 use anyhow::Result;
-use echolake_acquisition::relief::{HeightField, PANEL_SIZE_MM, Relief};
+use echolake_acquisition::relief::{HeightField, PANEL_SIZE_MM, PanelRelief};
 use echolake_dsp::filter_bank::gain;
 use echolake_dsp::kirchhoff::KirchhoffPlan;
 use echolake_dsp::level::{p90_mean, power_to_db};
@@ -116,7 +116,7 @@ pub(crate) fn run(args: &ExperimentsArgs) -> Result<()> {
         writeln!(out, "{:<20}   2.5k     5k    10k    20k    40k  total | against the first", "")?;
         let mut first = None;
         for (label, name, settings) in experiment.panels {
-            let mut relief = Relief::by_name(name)?;
+            let mut relief = PanelRelief::by_name(name)?;
             settings.iter().try_for_each(|(key, value)| relief.set(key, value))?;
             let levels = levels_db(&lab.energies(&relief.height_field(cells))?, &flat);
             let against = *first.get_or_insert(levels);

@@ -7,7 +7,9 @@ use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 use anyhow::Result;
-use echolake_acquisition::robots::{Cell, Course, PlanParams, Standing, Unreachable, course, length_secs, plan};
+use echolake_acquisition::robots::{
+    ArmPose, Cell, MotionCourse, PlanParams, UnreachableReason, course, length_secs, plan,
+};
 use echolake_schema::robots::{RobotCell, Rod};
 use echolake_schema::{Grid, Rig};
 
@@ -87,11 +89,11 @@ fn off_axis_mm(microphone: [f64; 3], speaker: [f64; 3]) -> f64 {
     (dot(to, to) - dot(to, axis).powi(2) / dot(axis, axis)).max(0.0).sqrt()
 }
 
-fn named(why: Unreachable) -> String {
+fn named(why: UnreachableReason) -> String {
     format!("NOT reached: {why}")
 }
 
-fn standings(grid: &Grid, cell: &Cell) -> Result<Vec<Standing>, Unreachable> {
+fn standings(grid: &Grid, cell: &Cell) -> Result<Vec<ArmPose>, UnreachableReason> {
     let at = |id: echolake_schema::PointId| grid.points()[id.index()].position_mm;
     grid.pairs().iter().map(|p| cell.reach(at(p.microphone), at(p.speaker))).collect()
 }
@@ -107,9 +109,9 @@ fn published(grid: &Grid, path: &Path) -> Result<Vec<usize>> {
     Ok(order)
 }
 
-fn report(out: &mut dyn Write, name: &str, cell: &Cell, standings: &[Standing], order: &[usize]) -> io::Result<()> {
+fn report(out: &mut dyn Write, name: &str, cell: &Cell, standings: &[ArmPose], order: &[usize]) -> io::Result<()> {
     let mut courses: BTreeMap<String, usize> = BTreeMap::new();
-    let (mut secs, mut turned, mut last) = (0.0, 0.0, Standing::home());
+    let (mut secs, mut turned, mut last) = (0.0, 0.0, ArmPose::home());
     for next in order.iter().map(|i| standings[*i]) {
         match course(cell, &last, &next) {
             Some(motion) => {
@@ -132,6 +134,6 @@ fn report(out: &mut dyn Write, name: &str, cell: &Cell, standings: &[Standing], 
         length_secs(standings, order),
         turned / std::f64::consts::TAU
     )?;
-    let together = courses.remove(&format!("{:?}", Course::Together)).unwrap_or(0);
+    let together = courses.remove(&format!("{:?}", MotionCourse::Together)).unwrap_or(0);
     writeln!(out, "  moves: {together} both arms at once; else {courses:?}")
 }

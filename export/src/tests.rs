@@ -8,10 +8,10 @@ use std::sync::atomic::AtomicBool;
 use arrow::array::AsArray as _;
 use arrow::datatypes::{Int32Type, Int64Type};
 use arrow::record_batch::RecordBatch;
-use echolake_acquisition::controller::Keep;
+use echolake_acquisition::controller::RecordingMode;
 use echolake_acquisition::import::{ImportOptions, import_gir, import_wav};
-use echolake_acquisition::relief::Relief;
-use echolake_acquisition::run::{RunRequest, Specimen};
+use echolake_acquisition::relief::PanelRelief;
+use echolake_acquisition::run::{PanelSpecimen, RunRequest};
 use echolake_acquisition::simulate::simulate;
 use echolake_ingest::{Ingest, complete, pending};
 use echolake_lake::{Lake, References};
@@ -26,7 +26,7 @@ use crate::*;
 const SMALL_RIG: &str = include_str!("../../tests/fixtures/small_rig.toml");
 const SURFACES: [&str; 6] = ["flat", "foam", "0001_0", "0001_1", "0002_0", "0003_0"];
 
-async fn lake(home: &TempDir, keep: Keep) -> Lake {
+async fn lake(home: &TempDir, keep: RecordingMode) -> Lake {
     let rig = Rig::from_toml(SMALL_RIG).expect("a rig");
     let url = home.path().join("lake").display().to_string();
     let lake = Lake::open_or_create(&url, &rig, &References::default()).await.expect("a lake");
@@ -34,7 +34,7 @@ async fn lake(home: &TempDir, keep: Keep) -> Lake {
     std::fs::create_dir_all(&inbox).expect("a folder");
     for (number, surface) in SURFACES.into_iter().enumerate() {
         let name = if number < 2 { surface } else { "wavy" };
-        let specimen = Specimen::Relief(Relief::by_name(name).expect("a relief"));
+        let specimen = PanelSpecimen::Relief(PanelRelief::by_name(name).expect("a relief"));
         let run = RunRequest {
             rig: &rig,
             surface: surface.parse().expect("an id"),
@@ -98,7 +98,7 @@ fn messages(file: &[u8]) -> Vec<(String, u64, Vec<u8>)> {
 #[tokio::test(flavor = "multi_thread")]
 async fn a_slice_has_the_messages_of_its_measurements_and_no_others() {
     let home = tempfile::tempdir().expect("a folder");
-    let lake = lake(&home, Keep::Sweeps).await;
+    let lake = lake(&home, RecordingMode::Sweeps).await;
     let all = measurements(&lake, &["0001_0", "0002_0"]).await;
     let some: Vec<_> = all.iter().filter(|t| t.pair % 5 == 2).cloned().collect();
     let times: HashSet<u64> = some.iter().map(|t| t.log_time_ns as u64).collect();
@@ -159,7 +159,7 @@ async fn a_slice_has_the_messages_of_its_measurements_and_no_others() {
 #[tokio::test(flavor = "multi_thread")]
 async fn a_slice_of_few_topics_has_only_these() {
     let home = tempfile::tempdir().expect("a folder");
-    let lake = lake(&home, Keep::Sweeps).await;
+    let lake = lake(&home, RecordingMode::Sweeps).await;
     let taken = measurements(&lake, &["0001_0"]).await;
     let params =
         |topic: &str| SliceParams { taken: taken.clone(), topics: vec![topic.into()], ..SliceParams::default() };
@@ -176,7 +176,7 @@ async fn a_slice_of_few_topics_has_only_these() {
 #[tokio::test(flavor = "multi_thread")]
 async fn a_run_file_that_is_not_the_ingested_one_is_refused() {
     let home = tempfile::tempdir().expect("a folder");
-    let lake = lake(&home, Keep::ResponsesOnly).await;
+    let lake = lake(&home, RecordingMode::ResponsesOnly).await;
     let taken = measurements(&lake, &["0003_0"]).await;
     let path = run_file(&lake, &taken[0].run);
     let original = std::fs::read(&path).expect("the run");
@@ -227,7 +227,7 @@ fn content(folder: &Path) -> BTreeMap<String, Vec<u8>> {
 #[tokio::test(flavor = "multi_thread")]
 async fn a_training_set_is_repeatable_and_leaks_nothing() {
     let home = tempfile::tempdir().expect("a folder");
-    let lake = lake(&home, Keep::ResponsesOnly).await;
+    let lake = lake(&home, RecordingMode::ResponsesOnly).await;
     let folders = [home.path().join("a"), home.path().join("b")];
     let mut exported = Vec::new();
     for folder in &folders {
@@ -274,7 +274,7 @@ async fn a_training_set_is_repeatable_and_leaks_nothing() {
 #[tokio::test(flavor = "multi_thread")]
 async fn a_training_set_that_fails_leaves_nothing() {
     let home = tempfile::tempdir().expect("a folder");
-    let lake = lake(&home, Keep::ResponsesOnly).await;
+    let lake = lake(&home, RecordingMode::ResponsesOnly).await;
     let folder = home.path().join("set");
     let failed = async |set: &TrainingSet| {
         write_training_set(&lake, &folder, set, &mut |_, _| {}).await.expect_err("fails").to_string()
@@ -301,7 +301,7 @@ async fn a_training_set_that_fails_leaves_nothing() {
 #[tokio::test(flavor = "multi_thread")]
 async fn recordings_and_responses_come_back() {
     let home = tempfile::tempdir().expect("a folder");
-    let lake = lake(&home, Keep::Sweeps).await;
+    let lake = lake(&home, RecordingMode::Sweeps).await;
     let taken = measurements(&lake, &["0001_0"]).await;
     let wav = home.path().join("wav");
     let count = write_wav(&lake, &wav, &taken, Check::Whole, &mut |_, _| {}).await.expect("written");

@@ -7,9 +7,9 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use arrow::row::{RowConverter, SortField};
 use bytes::Bytes;
 use chrono::TimeDelta;
-use echolake_acquisition::controller::Keep;
-use echolake_acquisition::relief::Relief;
-use echolake_acquisition::run::{RunRequest, Specimen};
+use echolake_acquisition::controller::RecordingMode;
+use echolake_acquisition::relief::PanelRelief;
+use echolake_acquisition::run::{PanelSpecimen, RunRequest};
 use echolake_acquisition::simulate::simulate;
 use echolake_lake::{Deletion, Lake, References};
 use echolake_schema::tables::Table;
@@ -35,7 +35,7 @@ fn runs(surfaces: &[&str]) -> Vec<(String, Bytes)> {
     let (folder, rig) = (tempfile::tempdir().expect("a folder"), rig());
     let one = |(number, surface): (usize, &&str)| {
         let relief = surface.split('_').next().expect("a name");
-        let specimen = Specimen::Relief(Relief::by_name(relief).expect("a relief"));
+        let specimen = PanelSpecimen::Relief(PanelRelief::by_name(relief).expect("a relief"));
         let run = RunRequest {
             rig: &rig,
             surface: surface.parse().expect("an id"),
@@ -45,7 +45,7 @@ fn runs(surfaces: &[&str]) -> Vec<(String, Bytes)> {
             start: Timestamp(1_767_600_000_000_000_000).plus_secs(number as f64 * 3_600.0),
             seed: number as u64 + 1,
             tag: number as u64 + 1,
-            keep: Keep::ResponsesOnly,
+            keep: RecordingMode::ResponsesOnly,
             folder: folder.path(),
         };
         let (path, _) = simulate(&run, &AtomicBool::new(false), &mut |_| {}).expect("a run");

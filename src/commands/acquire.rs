@@ -9,13 +9,13 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use anyhow::Context as _;
-use echolake_acquisition::controller::{Control, Event, Keep};
+use echolake_acquisition::controller::{RecordingMode, RunControl, RunEvent};
 use echolake_acquisition::live::LiveServer;
 use echolake_acquisition::mesh::Mesh;
-use echolake_acquisition::metrics::{InfluxPush, MetricsServer, RunMetrics, Target};
+use echolake_acquisition::metrics::{InfluxPush, MetricsServer, PushTarget, RunMetrics};
 use echolake_acquisition::recorder::{Held, partial_of, random_tag};
-use echolake_acquisition::run::{self, RunRequest, Specimen};
-use echolake_acquisition::session::{Measured, Pace, Preflight, Session};
+use echolake_acquisition::run::{self, PanelSpecimen, RunRequest};
+use echolake_acquisition::session::{MeasuredRun, PreflightMode, RunSession, TakePace};
 use echolake_lake::{Lake, References};
 use echolake_schema::{Rig, SurfaceId, Timestamp};
 
@@ -39,21 +39,21 @@ enum AcquireJob {
 struct NewRun {
     rig: Rig,
     surface: SurfaceId,
-    specimen: Specimen,
+    specimen: PanelSpecimen,
     folder: PathBuf,
     flat: Option<SurfaceId>,
     foam: Option<SurfaceId>,
     start: Timestamp,
     seed: u64,
     tag: u64,
-    keep: Keep,
+    keep: RecordingMode,
 }
 
 pub(crate) async fn run(args: &AcquireArgs, lake_url: &str) -> anyhow::Result<CommandOutcome> {
     // Wrong arguments are refused before anything is created.
-    let influx = args.influx.as_deref().map(str::parse::<Target>).transpose()?;
-    let pace = if args.pace > 0.0 { Pace::Secs(args.pace) } else { Pace::Fast };
-    let control = Arc::new(Control::default());
+    let influx = args.influx.as_deref().map(str::parse::<PushTarget>).transpose()?;
+    let pace = if args.pace > 0.0 { TakePace::Secs(args.pace) } else { TakePace::Fast };
+    let control = Arc::new(RunControl::default());
     watch::obey(&control)?;
     let progress = CommandProgress::new();
     let job = match &args.resume {
@@ -80,17 +80,17 @@ pub(crate) async fn run(args: &AcquireArgs, lake_url: &str) -> anyhow::Result<Co
         InfluxPush::start(target, metrics.clone(), TOLD_EVERY, |e| eprintln!("warning: metrics were not taken: {e}"))
     });
     let mut watcher = RunWatcher::new(&progress, &surface, planned, accepted, metrics.clone(), job.folder());
-    let preflight = if args.skip_checks { Preflight::Skip } else { Preflight::Check };
+    let preflight = if args.skip_checks { PreflightMode::Skip } else { PreflightMode::Check };
     let (checkpoint_every, tap) = (args.checkpoint_every.map(|n| n as usize), live.as_ref().map(LiveServer::tap));
     let partial = job.partial()?;
     let measured = tokio::task::spawn_blocking(move || {
-        let mut observe = |event: Event<'_>| {
+        let mut observe = |event: RunEvent<'_>| {
             if let Some(acknowledgements) = &mut acknowledgements {
                 acknowledgements.observe(&event);
             }
             watcher.observe(&event);
         };
-        let session = Session { control: &control, observe: &mut observe, tap, preflight, checkpoint_every, pace };
+        let session = RunSession { control: &control, observe: &mut observe, tap, preflight, checkpoint_every, pace };
         let measured = job.measure(session);
         if measured.is_err() {
             metrics.broke_off();
@@ -113,8 +113,8 @@ pub(crate) async fn run(args: &AcquireArgs, lake_url: &str) -> anyhow::Result<Co
 }
 
 // Reports the path of the run's file, and the next step.
-fn tell(measured: &Measured, lake_url: &str) -> anyhow::Result<CommandOutcome> {
-    let Measured { path, outcome } = measured;
+fn tell(measured: &MeasuredRun, lake_url: &str) -> anyhow::Result<CommandOutcome> {
+    let MeasuredRun { path, outcome } = measured;
     if outcome.left > 0 {
         eprintln!("stopped with {} pairs left; nothing that was measured is lost", outcome.left);
         go_on(path, lake_url);
@@ -132,7 +132,7 @@ fn go_on(partial: &Path, lake_url: &str) {
 async fn fresh(args: &AcquireArgs, lake_url: &str, progress: &CommandProgress) -> anyhow::Result<AcquireJob> {
     let specimen = specimen::of(args)?;
     let rig = super::rig_or(args.rig.as_deref(), lake_url, Rig::paper).await?;
-    if let Specimen::Mesh(path, side) = &specimen {
+    if let PanelSpecimen::Mesh(path, side) = &specimen {
         Mesh::read(path)?.seen_from(*side).check(rig.panel.size_mm, rig.panel.depth_mm, path)?;
     }
     let lake = Lake::open_or_create(lake_url, &rig, &References::default()).await?;
@@ -156,7 +156,7 @@ async fn fresh(args: &AcquireArgs, lake_url: &str, progress: &CommandProgress) -
         start: Timestamp::now(),
         seed: args.seed,
         tag: random_tag(),
-        keep: if args.ir_only { Keep::ResponsesOnly } else { Keep::Sweeps },
+        keep: if args.ir_only { RecordingMode::ResponsesOnly } else { RecordingMode::Sweeps },
     })))
 }
 
@@ -222,7 +222,7 @@ impl AcquireJob {
         }
     }
 
-    fn measure(&self, session: Session<'_>) -> Result<Measured, run::Error> {
+    fn measure(&self, session: RunSession<'_>) -> Result<MeasuredRun, run::Error> {
         match self {
             Self::Fresh(fresh) => fresh.request().measure(session),
             Self::Resumed { partial, .. } => run::resume(partial, session),

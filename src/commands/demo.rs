@@ -5,9 +5,9 @@ mod measure;
 use std::path::Path;
 use std::time::Instant;
 
-use echolake_acquisition::collection::{Member, collection};
-use echolake_acquisition::controller::Keep;
-use echolake_acquisition::relief::Relief;
+use echolake_acquisition::collection::{CollectionSurface, collection};
+use echolake_acquisition::controller::RecordingMode;
+use echolake_acquisition::relief::PanelRelief;
 use echolake_ingest::pending;
 use echolake_lake::{Lake, References};
 use echolake_query::Session;
@@ -40,7 +40,7 @@ pub(crate) async fn run(args: &DemoArgs, lake_url: &str) -> anyhow::Result<Comma
     let campaign = DemoCampaign {
         rig,
         surfaces,
-        keep: if args.ir_only { Keep::ResponsesOnly } else { Keep::Sweeps },
+        keep: if args.ir_only { RecordingMode::ResponsesOnly } else { RecordingMode::Sweeps },
         seed: args.seed,
         folder: super::inbox(&lake)?,
         known: lake.snapshot().await?.runs().map(|r| r.run.untagged().to_owned()).collect(),
@@ -73,8 +73,8 @@ fn ensure_wanted(stop: &StopRequest) -> anyhow::Result<()> {
     Ok(())
 }
 
-fn few_surfaces() -> anyhow::Result<Vec<Member>> {
-    let member = |name: &&str| Ok(Member { surface: name.parse()?, relief: Relief::by_name(name)? });
+fn few_surfaces() -> anyhow::Result<Vec<CollectionSurface>> {
+    let member = |name: &&str| Ok(CollectionSurface { surface: name.parse()?, relief: PanelRelief::by_name(name)? });
     SURFACES.iter().map(member).collect()
 }
 

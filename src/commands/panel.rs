@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context as _, bail};
 use clap::Args;
 use echolake_acquisition::mesh::{BACK_MM, Format, Mesh};
-use echolake_acquisition::relief::{HeightField, Relief};
+use echolake_acquisition::relief::{HeightField, PanelRelief};
 
 use crate::CommandOutcome;
 
@@ -80,10 +80,10 @@ pub(crate) fn run(args: &PanelArgs) -> anyhow::Result<CommandOutcome> {
     }
     let mut front = match &args.parameters {
         Some(path) => super::acquire::relief_of_file(path)?,
-        None => Relief::by_name(args.name.as_deref().unwrap_or_default())?,
+        None => PanelRelief::by_name(args.name.as_deref().unwrap_or_default())?,
     };
     super::acquire::set_all(&mut front, &args.set)?;
-    let mut back = args.back.as_deref().map(Relief::by_name).transpose()?;
+    let mut back = args.back.as_deref().map(PanelRelief::by_name).transpose()?;
     if let Some(back) = &mut back {
         super::acquire::set_all(back, &args.back_set)?;
     }
@@ -119,7 +119,7 @@ impl OutputKind {
         })
     }
 
-    fn bytes(self, relief: &Relief) -> anyhow::Result<Vec<u8>> {
+    fn bytes(self, relief: &PanelRelief) -> anyhow::Result<Vec<u8>> {
         Ok(match self {
             Self::Picture => relief.height_field(PICTURE_CELLS).to_png(),
             Self::Heights => relief.height_field(FIELD_CELLS).to_npy(),
@@ -132,13 +132,14 @@ impl OutputKind {
 fn write_one(
     path: &Path,
     kind: OutputKind,
-    front: &Relief,
-    back: Option<&Relief>,
+    front: &PanelRelief,
+    back: Option<&PanelRelief>,
     cells: Option<usize>,
 ) -> anyhow::Result<()> {
     match (kind, back) {
         (OutputKind::Mesh(format), _) => {
-            let field = |relief: &Relief| -> HeightField { relief.height_field(cells.unwrap_or(mesh_cells(relief))) };
+            let field =
+                |relief: &PanelRelief| -> HeightField { relief.height_field(cells.unwrap_or(mesh_cells(relief))) };
             let mesh = match back {
                 Some(back) => Mesh::double_sided(&field(front), &field(back)),
                 None => Mesh::from_height_field(&field(front), BACK_MM),
@@ -156,8 +157,8 @@ fn write_one(
     Ok(())
 }
 
-fn mesh_cells(relief: &Relief) -> usize {
-    if matches!(relief, Relief::Layered(_)) { FINE_CELLS } else { CELLS }
+fn mesh_cells(relief: &PanelRelief) -> usize {
+    if matches!(relief, PanelRelief::Layered(_)) { FINE_CELLS } else { CELLS }
 }
 
 /// `0015.png` is `0015_0.png` for side 0.

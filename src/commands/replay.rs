@@ -5,7 +5,7 @@ use std::time::Duration;
 
 #[cfg(feature = "lake")]
 use anyhow::Context as _;
-use echolake_acquisition::replay::{Recording, ReplayOptions, ReplayServer, Standing};
+use echolake_acquisition::replay::{Recording, ReplayOptions, ReplayServer, ReplayState};
 use echolake_lake::Lake;
 #[cfg(feature = "lake")]
 use echolake_schema::{RunId, SurfaceId};
@@ -73,7 +73,7 @@ fn open(paths: &[PathBuf], progress: &CommandProgress) -> (Vec<Recording>, bool)
     (recordings, lost)
 }
 
-fn show(task: &mut TaskProgress, standing: &Standing, said: &mut usize) {
+fn show(task: &mut TaskProgress, standing: &ReplayState, said: &mut usize) {
     for damage in &standing.damages[*said..] {
         task.say(&format!("warning: {damage}"));
     }

@@ -6,11 +6,11 @@ use echolake_schema::messages::{AmbientSample, ImpulseResponse, Measurement, Sam
 use echolake_schema::samples::split_24;
 use echolake_schema::{Celsius, Pair, Timestamp};
 
-use super::{Error, Keep, NAME, RunController, Running};
-use crate::assessment::Assessment;
-use crate::objection::Objection;
+use super::{Error, NAME, RecordingMode, RunController, RunProgress};
+use crate::assessment::TakeAssessment;
+use crate::objection::TakeObjection;
 use crate::recorder::LogLevel;
-use crate::rig::{Error as RigError, Positions, Power, Reading};
+use crate::rig::{AmbientReading, ArmPositions, DrivePower, Error as RigError};
 
 /// Full scale of a take's samples.
 const FULL_SCALE: f32 = 8_388_608.0;
@@ -24,19 +24,19 @@ const PRESSURE_HPA: [f64; 2] = [300.0, 1_100.0];
 const LEVEL_DB: [f64; 2] = [0.0, 150.0];
 
 /// One attempt with its measurement.
-pub(super) struct Attempt {
+pub(super) struct AttemptResult {
     pub(super) at: Timestamp,
     pub(super) measurement: Measurement,
-    pub(super) objections: Vec<Objection>,
-    reading: Reading,
+    pub(super) objections: Vec<TakeObjection>,
+    reading: AmbientReading,
     /// Positions of the arms; None if they refused.
-    reached: Option<Positions>,
-    response: Response,
+    reached: Option<ArmPositions>,
+    response: ResponseState,
 }
 
 /// State of the response buffer after an attempt.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Response {
+enum ResponseState {
     /// It is in the controller's buffer.
     Deconvolved,
     /// The recording cannot be deconvolved, and the buffer still has the response of an attempt before.
@@ -45,32 +45,32 @@ enum Response {
 
 /// Assessment of a take, with the objections to it.
 struct Judged {
-    assessment: Assessment,
-    response: Response,
-    objections: Vec<Objection>,
+    assessment: TakeAssessment,
+    response: ResponseState,
+    objections: Vec<TakeObjection>,
 }
 
 impl RunController<'_> {
     pub(super) fn attempt(
         &mut self,
-        run: &mut Running<'_>,
+        run: &mut RunProgress<'_>,
         pair: Pair,
         number: u32,
         is_last: bool,
-    ) -> Result<Attempt, Error> {
+    ) -> Result<AttemptResult, Error> {
         let [microphone, speaker] = self.positions(pair);
-        self.devices.robots.power(Power::On)?;
+        self.devices.robots.power(DrivePower::On)?;
         let reached = match self.devices.robots.move_to(microphone, speaker) {
             Ok(reached) => reached,
             // A retry would not change it; the other pairs may be reached.
             Err(refusal @ RigError::Unreachable { .. }) => {
-                self.devices.robots.power(Power::Off)?;
+                self.devices.robots.power(DrivePower::Off)?;
                 return self.refused(pair, number, refusal);
             }
             Err(error) => return Err(error.into()),
         };
         // The drives hum; the arms hold by their brakes while the sweep is recorded.
-        self.devices.robots.power(Power::Off)?;
+        self.devices.robots.power(DrivePower::Off)?;
         self.take(run)?;
         let reading = self.air()?;
         let Judged { assessment, response, objections } = self.judge(microphone, speaker, &reading);
@@ -89,15 +89,15 @@ impl RunController<'_> {
             ..verdict_on(pair, number, verdict, &objections, &reading)
         };
         let at = self.take.started.unwrap_or(reading.at);
-        Ok(Attempt { at, measurement, objections, reading, reached: Some(reached), response })
+        Ok(AttemptResult { at, measurement, objections, reading, reached: Some(reached), response })
     }
 
     /// Makes a take at a pair and judges it without recording it: a check of the rig before a run.
-    pub(crate) fn trial(&mut self, pair: Pair) -> Result<(Assessment, Vec<Objection>), RigError> {
+    pub(crate) fn trial(&mut self, pair: Pair) -> Result<(TakeAssessment, Vec<TakeObjection>), RigError> {
         let [microphone, speaker] = self.positions(pair);
-        self.devices.robots.power(Power::On)?;
+        self.devices.robots.power(DrivePower::On)?;
         self.devices.robots.move_to(microphone, speaker)?;
-        self.devices.robots.power(Power::Off)?;
+        self.devices.robots.power(DrivePower::Off)?;
         self.devices.audio.play_and_record(&self.output, &mut self.take)?;
         let reading = self.air()?;
         let judged = self.judge(microphone, speaker, &reading);
@@ -105,12 +105,12 @@ impl RunController<'_> {
     }
 
     /// Reads the air, with retries if the sensor fails.
-    pub(crate) fn air(&mut self) -> Result<Reading, RigError> {
+    pub(crate) fn air(&mut self) -> Result<AmbientReading, RigError> {
         persistently(|| self.devices.sensor.read())
     }
 
     // An interface that lost samples is retried: nothing of that take is kept.
-    fn take(&mut self, run: &mut Running<'_>) -> Result<(), Error> {
+    fn take(&mut self, run: &mut RunProgress<'_>) -> Result<(), Error> {
         let mut lost = Vec::new();
         let taken = persistently(|| {
             let taken = self.devices.audio.play_and_record(&self.output, &mut self.take);
@@ -127,9 +127,9 @@ impl RunController<'_> {
         [pair.microphone, pair.speaker].map(|id| self.grid.points()[id.index()].position_mm)
     }
 
-    fn refused(&mut self, pair: Pair, number: u32, refusal: RigError) -> Result<Attempt, Error> {
+    fn refused(&mut self, pair: Pair, number: u32, refusal: RigError) -> Result<AttemptResult, Error> {
         let reading = self.air()?;
-        let objections = vec![Objection::Refused { refusal }];
+        let objections = vec![TakeObjection::Refused { refusal }];
         let unknown = f64::NAN;
         let measurement = Measurement {
             snr_db: unknown,
@@ -139,10 +139,17 @@ impl RunController<'_> {
             speaker_residual_mm: unknown,
             ..verdict_on(pair, number, Verdict::Rejected, &objections, &reading)
         };
-        Ok(Attempt { at: reading.at, measurement, objections, reading, reached: None, response: Response::Missing })
+        Ok(AttemptResult {
+            at: reading.at,
+            measurement,
+            objections,
+            reading,
+            reached: None,
+            response: ResponseState::Missing,
+        })
     }
 
-    fn judge(&mut self, microphone: [f64; 3], speaker: [f64; 3], reading: &Reading) -> Judged {
+    fn judge(&mut self, microphone: [f64; 3], speaker: [f64; 3], reading: &AmbientReading) -> Judged {
         let mut clipped = to_fractions(&self.take.microphone, &mut self.microphone);
         clipped += to_fractions(&self.take.loopback, &mut self.loopback);
         let arrival = direct_mm(microphone, speaker) / 1e3 / speed_of_sound(reading.temperature_c);
@@ -151,23 +158,23 @@ impl RunController<'_> {
                 let mut objections = assessment.objections(&self.rig.validation, reading.outside_level_db);
                 objections.extend(unknowns(&assessment, reading));
                 objections.extend(implausible(reading));
-                Judged { assessment, response: Response::Deconvolved, objections }
+                Judged { assessment, response: ResponseState::Deconvolved, objections }
             }
             Err(cause) => {
-                let objections = vec![Objection::Broken { reason: cause.to_string() }];
-                Judged { assessment: nothing(clipped), response: Response::Missing, objections }
+                let objections = vec![TakeObjection::Broken { reason: cause.to_string() }];
+                Judged { assessment: nothing(clipped), response: ResponseState::Missing, objections }
             }
         }
     }
 
-    fn assess(&mut self, arrival_secs: f64, clipped: u32) -> Result<Assessment, echolake_dsp::Error> {
+    fn assess(&mut self, arrival_secs: f64, clipped: u32) -> Result<TakeAssessment, echolake_dsp::Error> {
         self.deconvolution.run(&self.microphone, &self.loopback, &mut self.ir, &mut self.scratch)?;
         self.assessor.assess(&self.microphone, &self.loopback, arrival_secs, clipped)
     }
 
     // The order within an attempt is kept for live views. In the file a verdict follows its messages because
     // the recorder writes its chunk last.
-    pub(super) fn record(&mut self, run: &mut Running<'_>, made: &Attempt) -> Result<(), Error> {
+    pub(super) fn record(&mut self, run: &mut RunProgress<'_>, made: &AttemptResult) -> Result<(), Error> {
         let (at, m, reading) = (made.at, &made.measurement, &made.reading);
         let sample_rate_hz = self.rig.sweep.rate_hz.get();
         if let Some(reached) = made.reached {
@@ -188,7 +195,7 @@ impl RunController<'_> {
         }
         // Without a temperature they are useless; the verdict has the sensor's values.
         let is_usable = made.reached.is_some() && Celsius::new(reading.temperature_c).is_ok();
-        if run.options.keep == Keep::Sweeps && is_usable {
+        if run.options.keep == RecordingMode::Sweeps && is_usable {
             let recording = SweepRecording {
                 pair_id: m.pair_id,
                 attempt: m.attempt,
@@ -201,7 +208,7 @@ impl RunController<'_> {
             };
             run.recorder.sweep(at, &recording)?;
         }
-        if made.response == Response::Deconvolved && is_usable {
+        if made.response == ResponseState::Deconvolved && is_usable {
             let ir = ImpulseResponse {
                 pair_id: m.pair_id,
                 attempt: m.attempt,
@@ -232,7 +239,13 @@ fn persistently<T>(mut ask: impl FnMut() -> Result<T, RigError>) -> Result<T, Ri
     ask()
 }
 
-fn verdict_on(pair: Pair, attempt: u32, verdict: Verdict, objections: &[Objection], reading: &Reading) -> Measurement {
+fn verdict_on(
+    pair: Pair,
+    attempt: u32,
+    verdict: Verdict,
+    objections: &[TakeObjection],
+    reading: &AmbientReading,
+) -> Measurement {
     Measurement {
         pair_id: pair.id.0,
         attempt,
@@ -249,7 +262,7 @@ fn verdict_on(pair: Pair, attempt: u32, verdict: Verdict, objections: &[Objectio
 }
 
 // A comparison with NaN raises no objection, and a take with unknown values is no good one.
-fn unknowns(found: &Assessment, reading: &Reading) -> Vec<Objection> {
+fn unknowns(found: &TakeAssessment, reading: &AmbientReading) -> Vec<TakeObjection> {
     let values = [
         ("signal-to-noise ratio", found.snr_db),
         ("arrival of the direct sound", found.arrival_error_us),
@@ -257,11 +270,11 @@ fn unknowns(found: &Assessment, reading: &Reading) -> Vec<Objection> {
         ("temperature", if reading.temperature_c.is_finite() { reading.temperature_c } else { f64::NAN }),
         ("level outside", reading.outside_level_db),
     ];
-    values.into_iter().filter(|(_, x)| x.is_nan()).map(|(what, _)| Objection::Unknown { what }).collect()
+    values.into_iter().filter(|(_, x)| x.is_nan()).map(|(what, _)| TakeObjection::Unknown { what }).collect()
 }
 
 /// Returns objections to values that no room has; values that the reading leaves unknown are not among them.
-pub(crate) fn implausible(reading: &Reading) -> Vec<Objection> {
+pub(crate) fn implausible(reading: &AmbientReading) -> Vec<TakeObjection> {
     let values = [
         ("a temperature", reading.temperature_c, "C", TEMPERATURE_C),
         ("a humidity", reading.humidity_pct, "%", HUMIDITY_PCT),
@@ -272,7 +285,7 @@ pub(crate) fn implausible(reading: &Reading) -> Vec<Objection> {
     values
         .into_iter()
         .filter(wrong)
-        .map(|(what, value, unit, [least, most])| Objection::Implausible { what, value, unit, least, most })
+        .map(|(what, value, unit, [least, most])| TakeObjection::Implausible { what, value, unit, least, most })
         .collect()
 }
 
@@ -283,7 +296,7 @@ fn to_fractions(samples: &[i32], out: &mut Vec<f32>) -> u32 {
     samples.iter().filter(|x| **x <= -(1 << 23) || **x >= (1 << 23) - 1).count() as u32
 }
 
-fn nothing(clipped_samples: u32) -> Assessment {
+fn nothing(clipped_samples: u32) -> TakeAssessment {
     let unknown = f64::NAN;
-    Assessment { snr_db: unknown, clipped_samples, loopback_dbfs: unknown, arrival_error_us: unknown }
+    TakeAssessment { snr_db: unknown, clipped_samples, loopback_dbfs: unknown, arrival_error_us: unknown }
 }

@@ -13,9 +13,11 @@ use prost::Message as _;
 use super::*;
 use crate::preflight;
 use crate::recorder::{Held, Recorder, RunStart};
-use crate::relief::Relief;
-use crate::rig::{AmbientSensor, AudioInterface, Devices, Error as RigError, Positions, Reading, Robots, Take};
-use crate::rigs::simulated::{Simulation, devices};
+use crate::relief::PanelRelief;
+use crate::rig::{
+    AmbientReading, AmbientSensor, ArmPositions, AudioInterface, AudioTake, Error as RigError, RigDevices, RobotArms,
+};
+use crate::rigs::simulated::{RigSimulation, devices};
 
 /// Pairs of a run, and the one at which its fault begins.
 const PAIRS: usize = 12;
@@ -23,54 +25,54 @@ const AT: u32 = 6;
 
 /// A fault, as changes to the devices' answers.
 #[derive(Clone, Copy)]
-struct Fault {
-    reading: fn(Result<Reading, RigError>) -> Result<Reading, RigError>,
-    take: fn(&mut Take) -> Result<(), RigError>,
+struct DeviceFault {
+    reading: fn(Result<AmbientReading, RigError>) -> Result<AmbientReading, RigError>,
+    take: fn(&mut AudioTake) -> Result<(), RigError>,
     refuse: bool,
 }
 
-const NONE: Fault = Fault { reading: |r| r, take: |_| Ok(()), refuse: false };
+const NONE: DeviceFault = DeviceFault { reading: |r| r, take: |_| Ok(()), refuse: false };
 
 /// Devices that share the count of takes, and whether the fault is still there.
 #[derive(Clone)]
-struct Shared {
-    fault: Fault,
+struct SharedFault {
+    fault: DeviceFault,
     takes: Arc<AtomicU32>,
     moves: Arc<AtomicU32>,
     mended: Arc<AtomicBool>,
 }
 
-impl Shared {
+impl SharedFault {
     fn is_on(&self, count: &AtomicU32) -> bool {
         count.load(Ordering::Relaxed) >= AT && !self.mended.load(Ordering::Relaxed)
     }
 }
 
-struct Sensor(Box<dyn AmbientSensor>, Shared);
-struct Audio(Box<dyn AudioInterface>, Shared);
-struct Arms(Box<dyn Robots>, Shared);
+struct FaultySensor(Box<dyn AmbientSensor>, SharedFault);
+struct FaultyAudio(Box<dyn AudioInterface>, SharedFault);
+struct FaultyArms(Box<dyn RobotArms>, SharedFault);
 
-impl AmbientSensor for Sensor {
-    fn read(&mut self) -> Result<Reading, RigError> {
+impl AmbientSensor for FaultySensor {
+    fn read(&mut self) -> Result<AmbientReading, RigError> {
         let reading = self.0.read();
         if self.1.is_on(&self.1.takes) { (self.1.fault.reading)(reading) } else { reading }
     }
 }
 
-impl AudioInterface for Audio {
+impl AudioInterface for FaultyAudio {
     fn rate_hz(&self) -> f64 {
         self.0.rate_hz()
     }
 
-    fn play_and_record(&mut self, output: &[f32], take: &mut Take) -> Result<(), RigError> {
+    fn play_and_record(&mut self, output: &[f32], take: &mut AudioTake) -> Result<(), RigError> {
         self.0.play_and_record(output, take)?;
         self.1.takes.fetch_add(1, Ordering::Relaxed);
         if self.1.is_on(&self.1.takes) { (self.1.fault.take)(take) } else { Ok(()) }
     }
 }
 
-impl Robots for Arms {
-    fn move_to(&mut self, microphone_mm: [f64; 3], speaker_mm: [f64; 3]) -> Result<Positions, RigError> {
+impl RobotArms for FaultyArms {
+    fn move_to(&mut self, microphone_mm: [f64; 3], speaker_mm: [f64; 3]) -> Result<ArmPositions, RigError> {
         self.1.moves.fetch_add(1, Ordering::Relaxed);
         if self.1.fault.refuse && self.1.is_on(&self.1.moves) {
             return Err(RigError::Unreachable { microphone_mm, speaker_mm, reason: "joint 4 at its limit" });
@@ -78,7 +80,7 @@ impl Robots for Arms {
         self.0.move_to(microphone_mm, speaker_mm)
     }
 
-    fn power(&mut self, power: Power) -> Result<(), RigError> {
+    fn power(&mut self, power: DrivePower) -> Result<(), RigError> {
         self.0.power(power)
     }
 }
@@ -87,15 +89,15 @@ fn rig() -> Rig {
     Rig::from_toml("sweep.duration_secs = 0.03").expect("a rig")
 }
 
-fn simulated(rig: &Rig, fault: Fault, start: Timestamp, seed: u64) -> (Devices, Shared) {
-    let relief = Relief::Flat.height_field(60);
-    let inner = devices(&Simulation { rig, relief: &relief, reflection_factor: 0.83, start, seed, arms: None })
+fn simulated(rig: &Rig, fault: DeviceFault, start: Timestamp, seed: u64) -> (RigDevices, SharedFault) {
+    let relief = PanelRelief::Flat.height_field(60);
+    let inner = devices(&RigSimulation { rig, relief: &relief, reflection_factor: 0.83, start, seed, arms: None })
         .expect("devices");
-    let shared = Shared { fault, takes: Arc::default(), moves: Arc::default(), mended: Arc::default() };
-    let faulty = Devices {
-        robots: Box::new(Arms(inner.robots, shared.clone())),
-        audio: Box::new(Audio(inner.audio, shared.clone())),
-        sensor: Box::new(Sensor(inner.sensor, shared.clone())),
+    let shared = SharedFault { fault, takes: Arc::default(), moves: Arc::default(), mended: Arc::default() };
+    let faulty = RigDevices {
+        robots: Box::new(FaultyArms(inner.robots, shared.clone())),
+        audio: Box::new(FaultyAudio(inner.audio, shared.clone())),
+        sensor: Box::new(FaultySensor(inner.sensor, shared.clone())),
         origin: Origin::Simulated,
     };
     (faulty, shared)
@@ -123,7 +125,7 @@ fn begun(path: &std::path::Path, rig: &Rig) -> Recorder {
 
 /// Runs into a fault, checks what is said of it, mends it, goes on, and checks the whole file. Returns its verdicts and
 /// the lines of its log.
-fn check(fault: Fault, expected: &str) -> (Vec<Measurement>, Vec<String>) {
+fn check(fault: DeviceFault, expected: &str) -> (Vec<Measurement>, Vec<String>) {
     let rig = rig();
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("run.mcap");
@@ -131,16 +133,17 @@ fn check(fault: Fault, expected: &str) -> (Vec<Measurement>, Vec<String>) {
     let (faulty, _) = simulated(&rig, fault, start(), 3);
     let mut controller = RunController::new(&rig, faulty).expect("a controller");
     let pairs = controller.grid.pairs()[..PAIRS].to_vec();
-    let options = RunOptions { keep: Keep::Sweeps, checkpoint_every: 1 };
-    let control = Control::default();
-    let mut note = |event: Event<'_>| {
-        if let Event::Safe { verdicts, .. } = event {
+    let options = RunOptions { keep: RecordingMode::Sweeps, checkpoint_every: 1 };
+    let control = RunControl::default();
+    let mut note = |event: RunEvent<'_>| {
+        if let RunEvent::Safe { verdicts, .. } = event {
             acknowledged.extend_from_slice(verdicts);
         }
     };
     let nothing = BTreeMap::new();
     let mut recorder = begun(&path, &rig);
-    let broken = controller.run(&mut recorder, &Work { pairs: &pairs, before: &nothing, options }, &control, &mut note);
+    let broken =
+        controller.run(&mut recorder, &RunWorkload { pairs: &pairs, before: &nothing, options }, &control, &mut note);
     let error = broken.expect_err(expected).to_string();
     assert!(error.contains(expected), "{error}");
     drop(recorder);
@@ -152,7 +155,7 @@ fn check(fault: Fault, expected: &str) -> (Vec<Measurement>, Vec<String>) {
     shared.mended.store(true, Ordering::Relaxed);
     let mut controller = RunController::new(&rig, mended).expect("a controller");
     let (mut recorder, held) = Recorder::resume(&partial).expect("gone on with");
-    let work = Work { pairs: &pairs, before: &held.pairs, options };
+    let work = RunWorkload { pairs: &pairs, before: &held.pairs, options };
     let outcome = controller.run(&mut recorder, &work, &control, &mut note).expect("a whole run");
     assert_eq!((outcome.left, outcome.end.accepted, outcome.end.rejected), (0, PAIRS as u64, 0));
     let path = recorder.finish(&outcome.end).expect("finished");
@@ -182,62 +185,62 @@ fn check(fault: Fault, expected: &str) -> (Vec<Measurement>, Vec<String>) {
 #[test]
 fn a_sensor_that_is_unplugged_is_named() {
     let gone = |_| Err(RigError::Device { device: "ambient sensor", reason: "the line is gone".into() });
-    let (verdicts, _) = check(Fault { reading: gone, ..NONE }, "ambient sensor: the line is gone");
+    let (verdicts, _) = check(DeviceFault { reading: gone, ..NONE }, "ambient sensor: the line is gone");
     assert_eq!(verdicts.len(), PAIRS, "the take without a reading was not kept");
 }
 
 #[test]
 fn a_sensor_that_talks_nonsense_is_named() {
-    let nonsense = |r: Result<Reading, RigError>| r.map(|r| Reading { temperature_c: -999.0, ..r });
-    let (verdicts, _) = check(Fault { reading: nonsense, ..NONE }, "a temperature of -999 C is not plausible");
+    let nonsense = |r: Result<AmbientReading, RigError>| r.map(|r| AmbientReading { temperature_c: -999.0, ..r });
+    let (verdicts, _) = check(DeviceFault { reading: nonsense, ..NONE }, "a temperature of -999 C is not plausible");
     assert!(verdicts.iter().any(|m| m.verdict() == Verdict::Rejected));
-    let high = |r: Result<Reading, RigError>| r.map(|r| Reading { pressure_hpa: 1e9, ..r });
-    check(Fault { reading: high, ..NONE }, "a pressure of 1000000000 hPa is not plausible");
+    let high = |r: Result<AmbientReading, RigError>| r.map(|r| AmbientReading { pressure_hpa: 1e9, ..r });
+    check(DeviceFault { reading: high, ..NONE }, "a pressure of 1000000000 hPa is not plausible");
 }
 
 #[test]
 fn a_loopback_that_is_missing_is_named() {
-    let silent: fn(&mut Take) -> Result<(), RigError> = |take| {
+    let silent: fn(&mut AudioTake) -> Result<(), RigError> = |take| {
         take.loopback.fill(0);
         Ok(())
     };
-    check(Fault { take: silent, ..NONE }, "is the loopback cable in");
-    let hum: fn(&mut Take) -> Result<(), RigError> = |take| {
+    check(DeviceFault { take: silent, ..NONE }, "is the loopback cable in");
+    let hum: fn(&mut AudioTake) -> Result<(), RigError> = |take| {
         take.loopback.iter_mut().enumerate().for_each(|(i, x)| *x = (i % 7) as i32 - 3);
         Ok(())
     };
-    check(Fault { take: hum, ..NONE }, "loopback at -");
+    check(DeviceFault { take: hum, ..NONE }, "loopback at -");
 }
 
 #[test]
 fn lasting_clipping_is_named() {
-    let clipped: fn(&mut Take) -> Result<(), RigError> = |take| {
+    let clipped: fn(&mut AudioTake) -> Result<(), RigError> = |take| {
         take.microphone[100..130].fill((1 << 23) - 1);
         Ok(())
     };
-    check(Fault { take: clipped, ..NONE }, "30 samples clipped");
+    check(DeviceFault { take: clipped, ..NONE }, "30 samples clipped");
 }
 
 #[test]
 fn lasting_noise_outside_is_named() {
-    let loud = |r: Result<Reading, RigError>| r.map(|r| Reading { outside_level_db: 81.0, ..r });
-    check(Fault { reading: loud, ..NONE }, "81.0 dB outside, most 65.0; hint: wait until it is quiet");
+    let loud = |r: Result<AmbientReading, RigError>| r.map(|r| AmbientReading { outside_level_db: 81.0, ..r });
+    check(DeviceFault { reading: loud, ..NONE }, "81.0 dB outside, most 65.0; hint: wait until it is quiet");
 }
 
 #[test]
 fn a_robot_that_refuses_is_named() {
-    let (verdicts, _) = check(Fault { refuse: true, ..NONE }, "joint 4 at its limit");
+    let (verdicts, _) = check(DeviceFault { refuse: true, ..NONE }, "joint 4 at its limit");
     // Of what was refused there is a verdict, and no second attempt in the same session.
     assert_eq!(verdicts.iter().filter(|m| m.verdict() == Verdict::Rejected).count(), 3);
 }
 
 #[test]
 fn a_clock_that_goes_back_is_named() {
-    let back: fn(&mut Take) -> Result<(), RigError> = |take| {
+    let back: fn(&mut AudioTake) -> Result<(), RigError> = |take| {
         take.started = take.started.map(|at| at.plus_secs(-3_600.0));
         Ok(())
     };
-    let (verdicts, _) = check(Fault { take: back, ..NONE }, "the clock went back by 3587.");
+    let (verdicts, _) = check(DeviceFault { take: back, ..NONE }, "the clock went back by 3587.");
     assert_eq!(verdicts.len(), PAIRS, "the take of the wrong time was not kept");
 }
 
@@ -252,7 +255,7 @@ fn an_overrun_is_taken_again() {
             self.0.rate_hz()
         }
 
-        fn play_and_record(&mut self, output: &[f32], take: &mut Take) -> Result<(), RigError> {
+        fn play_and_record(&mut self, output: &[f32], take: &mut AudioTake) -> Result<(), RigError> {
             self.0.play_and_record(output, take)?;
             self.1 += 1;
             match self.1.is_multiple_of(4) {
@@ -266,9 +269,9 @@ fn an_overrun_is_taken_again() {
     let mut controller = RunController::new(&rig, devices).expect("a controller");
     let pairs = controller.grid.pairs()[..PAIRS].to_vec();
     let mut recorder = begun(&folder.path().join("run.mcap"), &rig);
-    let options = RunOptions { keep: Keep::Sweeps, checkpoint_every: 5 };
-    let work = Work { pairs: &pairs, before: &BTreeMap::new(), options };
-    let outcome = controller.run(&mut recorder, &work, &Control::default(), &mut |_| {}).expect("a run");
+    let options = RunOptions { keep: RecordingMode::Sweeps, checkpoint_every: 5 };
+    let work = RunWorkload { pairs: &pairs, before: &BTreeMap::new(), options };
+    let outcome = controller.run(&mut recorder, &work, &RunControl::default(), &mut |_| {}).expect("a run");
     assert_eq!(outcome.end.accepted, PAIRS as u64);
     let file = std::fs::read(recorder.finish(&outcome.end).expect("finished")).expect("the file");
     let lost = mcap::MessageStream::new(&file).expect("an MCAP file").map(|m| m.expect("whole")).filter(|m| {
@@ -280,7 +283,7 @@ fn an_overrun_is_taken_again() {
 #[test]
 fn what_is_not_fit_is_told_before_the_run() {
     let rig = rig();
-    let told = |fault: Fault| {
+    let told = |fault: DeviceFault| {
         let (devices, shared) = simulated(&rig, fault, start(), 3);
         shared.takes.store(AT, Ordering::Relaxed);
         let mut controller = RunController::new(&rig, devices).expect("a controller");
@@ -289,19 +292,19 @@ fn what_is_not_fit_is_told_before_the_run() {
     };
     assert_eq!(told(NONE), "");
     let gone = |_| Err(RigError::Device { device: "ambient sensor", reason: "no such port".into() });
-    assert!(told(Fault { reading: gone, ..NONE }).contains("no such port; hint: is it plugged in"));
-    let nonsense = |r: Result<Reading, RigError>| r.map(|r| Reading { temperature_c: 4_000.0, ..r });
-    assert!(told(Fault { reading: nonsense, ..NONE }).contains("a temperature of 4000 C"));
-    let clipped: fn(&mut Take) -> Result<(), RigError> = |take| {
+    assert!(told(DeviceFault { reading: gone, ..NONE }).contains("no such port; hint: is it plugged in"));
+    let nonsense = |r: Result<AmbientReading, RigError>| r.map(|r| AmbientReading { temperature_c: 4_000.0, ..r });
+    assert!(told(DeviceFault { reading: nonsense, ..NONE }).contains("a temperature of 4000 C"));
+    let clipped: fn(&mut AudioTake) -> Result<(), RigError> = |take| {
         take.microphone[100] = (1 << 23) - 1;
         Ok(())
     };
-    assert!(told(Fault { take: clipped, ..NONE }).contains("1 samples clipped; hint: lower the gain"));
-    let silent: fn(&mut Take) -> Result<(), RigError> = |take| {
+    assert!(told(DeviceFault { take: clipped, ..NONE }).contains("1 samples clipped; hint: lower the gain"));
+    let silent: fn(&mut AudioTake) -> Result<(), RigError> = |take| {
         take.loopback.fill(0);
         Ok(())
     };
-    assert!(told(Fault { take: silent, ..NONE }).contains("loopback cable"));
+    assert!(told(DeviceFault { take: silent, ..NONE }).contains("loopback cable"));
 }
 
 #[test]
@@ -313,25 +316,25 @@ fn a_run_is_paused_and_continued_and_stopped() {
     let mut controller = RunController::new(&rig, devices).expect("a controller");
     let pairs = controller.grid.pairs()[..PAIRS].to_vec();
     let mut recorder = begun(&path, &rig);
-    let options = RunOptions { keep: Keep::ResponsesOnly, checkpoint_every: 100 };
-    let control = Arc::new(Control::default());
+    let options = RunOptions { keep: RecordingMode::ResponsesOnly, checkpoint_every: 100 };
+    let control = Arc::new(RunControl::default());
     let (mut tried, mut heard) = (0, Vec::new());
-    let mut observe = |event: Event<'_>| match event {
-        Event::Attempt(_) => {
+    let mut observe = |event: RunEvent<'_>| match event {
+        RunEvent::Attempt(_) => {
             tried += 1;
             control.pause.store(tried == 3, Ordering::Relaxed);
             control.stop.store(tried == 7, Ordering::Relaxed);
         }
-        Event::Paused => {
+        RunEvent::Paused => {
             heard.push("paused".to_owned());
             let control = control.clone();
             std::thread::spawn(move || control.pause.store(false, Ordering::Relaxed));
         }
-        Event::Continued => heard.push("continued".to_owned()),
-        Event::Safe { verdicts, .. } => heard.push(format!("{} safe", verdicts.len())),
-        Event::Pair(_) => {}
+        RunEvent::Continued => heard.push("continued".to_owned()),
+        RunEvent::Safe { verdicts, .. } => heard.push(format!("{} safe", verdicts.len())),
+        RunEvent::Pair(_) => {}
     };
-    let work = Work { pairs: &pairs, before: &BTreeMap::new(), options };
+    let work = RunWorkload { pairs: &pairs, before: &BTreeMap::new(), options };
     let outcome = controller.run(&mut recorder, &work, &control, &mut observe).expect("stopped");
     assert_eq!((outcome.left, outcome.end.accepted), (PAIRS - 7, 7));
     assert_eq!(heard, ["3 safe", "paused", "continued", "4 safe"]);

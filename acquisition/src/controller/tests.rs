@@ -9,14 +9,14 @@ use echolake_schema::{RunId, topics};
 
 use super::*;
 use crate::recorder::RunStart;
-use crate::relief::Relief;
-use crate::rig::{AmbientSensor, AudioInterface, Error as RigError, Positions, Reading, Robots};
-use crate::rigs::simulated::{Simulation, devices};
+use crate::relief::PanelRelief;
+use crate::rig::{AmbientReading, AmbientSensor, ArmPositions, AudioInterface, Error as RigError, RobotArms};
+use crate::rigs::simulated::{RigSimulation, devices};
 
 /// An interface with something wrong on its first takes.
 struct Faulty {
     inner: Box<dyn AudioInterface>,
-    fault: fn(&mut Take),
+    fault: fn(&mut AudioTake),
     takes: u32,
 }
 
@@ -25,7 +25,7 @@ impl AudioInterface for Faulty {
         self.inner.rate_hz()
     }
 
-    fn play_and_record(&mut self, output: &[f32], take: &mut Take) -> Result<(), RigError> {
+    fn play_and_record(&mut self, output: &[f32], take: &mut AudioTake) -> Result<(), RigError> {
         self.inner.play_and_record(output, take)?;
         if self.takes > 0 {
             self.takes -= 1;
@@ -43,7 +43,7 @@ impl AudioInterface for Slower {
         self.0.rate_hz() / 2.0
     }
 
-    fn play_and_record(&mut self, output: &[f32], take: &mut Take) -> Result<(), RigError> {
+    fn play_and_record(&mut self, output: &[f32], take: &mut AudioTake) -> Result<(), RigError> {
         self.0.play_and_record(output, take)
     }
 }
@@ -52,20 +52,20 @@ impl AudioInterface for Slower {
 struct Deaf(Box<dyn AmbientSensor>);
 
 impl AmbientSensor for Deaf {
-    fn read(&mut self) -> Result<Reading, RigError> {
-        Ok(Reading { outside_level_db: f64::NAN, ..self.0.read()? })
+    fn read(&mut self) -> Result<AmbientReading, RigError> {
+        Ok(AmbientReading { outside_level_db: f64::NAN, ..self.0.read()? })
     }
 }
 
 /// Arms that fail at their third move, and count how often they were switched off.
 struct Failing {
-    inner: Box<dyn Robots>,
+    inner: Box<dyn RobotArms>,
     moves: u32,
     switched_off: Arc<AtomicU32>,
 }
 
-impl Robots for Failing {
-    fn move_to(&mut self, microphone_mm: [f64; 3], speaker_mm: [f64; 3]) -> Result<Positions, RigError> {
+impl RobotArms for Failing {
+    fn move_to(&mut self, microphone_mm: [f64; 3], speaker_mm: [f64; 3]) -> Result<ArmPositions, RigError> {
         self.moves += 1;
         match self.moves {
             3 => Err(RigError::Device { device: "left arm", reason: "protective stop".into() }),
@@ -73,8 +73,8 @@ impl Robots for Failing {
         }
     }
 
-    fn power(&mut self, power: Power) -> Result<(), RigError> {
-        if power == Power::Off {
+    fn power(&mut self, power: DrivePower) -> Result<(), RigError> {
+        if power == DrivePower::Off {
             self.switched_off.fetch_add(1, Ordering::Relaxed);
         }
         self.inner.power(power)
@@ -89,24 +89,25 @@ fn start() -> Timestamp {
     Timestamp(1_767_600_000_000_000_000)
 }
 
-fn simulated(rig: &Rig, reflection_factor: f64, seed: u64) -> Devices {
-    let relief = Relief::Flat.height_field(60);
-    devices(&Simulation { rig, relief: &relief, reflection_factor, start: start(), seed, arms: None }).expect("devices")
+fn simulated(rig: &Rig, reflection_factor: f64, seed: u64) -> RigDevices {
+    let relief = PanelRelief::Flat.height_field(60);
+    devices(&RigSimulation { rig, relief: &relief, reflection_factor, start: start(), seed, arms: None })
+        .expect("devices")
 }
 
-fn faulty(rig: &Rig, fault: fn(&mut Take), takes: u32) -> Devices {
+fn faulty(rig: &Rig, fault: fn(&mut AudioTake), takes: u32) -> RigDevices {
     let mut devices = simulated(rig, 0.83, 3);
     devices.audio = Box::new(Faulty { inner: devices.audio, fault, takes });
     devices
 }
 
 /// A run's file, and how the run ended.
-struct Recorded {
+struct RecordedRun {
     end: Result<RunEnd, Error>,
     file: Vec<u8>,
 }
 
-impl Recorded {
+impl RecordedRun {
     fn topics(&self) -> Vec<String> {
         self.raw().map(|m| m.channel.topic.clone()).collect()
     }
@@ -133,7 +134,7 @@ impl Recorded {
     }
 }
 
-fn record(rig: &Rig, devices: Devices, pairs: usize, keep: Keep, stop_after: usize) -> Recorded {
+fn record(rig: &Rig, devices: RigDevices, pairs: usize, keep: RecordingMode, stop_after: usize) -> RecordedRun {
     let folder = tempfile::tempdir().expect("a folder");
     let surface = "flat".parse().expect("an id");
     let manifest = RunManifest {
@@ -150,12 +151,12 @@ fn record(rig: &Rig, devices: Devices, pairs: usize, keep: Keep, stop_after: usi
     let mut recorder = Recorder::create(&path, &run).expect("a recorder");
     let mut controller = RunController::new(rig, devices).expect("a controller");
     let pairs: Vec<_> = controller.grid.pairs().iter().step_by(2951 / pairs).copied().take(pairs).collect();
-    let (control, nothing) = (Control::default(), BTreeMap::new());
+    let (control, nothing) = (RunControl::default(), BTreeMap::new());
     let options = RunOptions { keep, checkpoint_every: 50 };
-    let work = Work { pairs: &pairs, before: &nothing, options };
+    let work = RunWorkload { pairs: &pairs, before: &nothing, options };
     let mut tried = 0;
-    let mut observe = |event: Event<'_>| {
-        if matches!(event, Event::Attempt(m) if m.verdict() != Verdict::Repeated) {
+    let mut observe = |event: RunEvent<'_>| {
+        if matches!(event, RunEvent::Attempt(m) if m.verdict() != Verdict::Repeated) {
             tried += 1;
             control.stop.store(tried >= stop_after, Ordering::Relaxed);
         }
@@ -168,11 +169,11 @@ fn record(rig: &Rig, devices: Devices, pairs: usize, keep: Keep, stop_after: usi
             path.with_extension("mcap.partial")
         }
     };
-    Recorded { end: outcome.map(|o| o.end), file: std::fs::read(path).expect("the file") }
+    RecordedRun { end: outcome.map(|o| o.end), file: std::fs::read(path).expect("the file") }
 }
 
-fn run_of(rig: &Rig, devices: Devices, pairs: usize) -> Recorded {
-    record(rig, devices, pairs, Keep::ResponsesOnly, usize::MAX)
+fn run_of(rig: &Rig, devices: RigDevices, pairs: usize) -> RecordedRun {
+    record(rig, devices, pairs, RecordingMode::ResponsesOnly, usize::MAX)
 }
 
 // Flat and Foam: the direct sound is there even where the surface swallows the rest.
@@ -189,7 +190,7 @@ fn good_takes_are_accepted_at_once() {
     }
 }
 
-fn check(fault: fn(&mut Take), takes: u32, expected: &str) {
+fn check(fault: fn(&mut AudioTake), takes: u32, expected: &str) {
     let rig = quick();
     let run = run_of(&rig, faulty(&rig, fault, takes), 1);
     let (verdicts, counts) = (run.verdicts(), run.counts());
@@ -216,7 +217,7 @@ fn clipping_is_repeated() {
 
 #[test]
 fn noise_is_repeated() {
-    let noisy: fn(&mut Take) = |take| {
+    let noisy: fn(&mut AudioTake) = |take| {
         let mut state = 1u32;
         for x in &mut take.microphone {
             state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
@@ -247,7 +248,7 @@ fn a_take_of_the_wrong_length_is_given_up() {
 fn what_cannot_be_deconvolved_has_no_response() {
     let rig = quick();
     // The first pair is good, so that its response is at hand when the second pair's loopback is silent.
-    let silent_later: fn(&mut Take) = |take| {
+    let silent_later: fn(&mut AudioTake) = |take| {
         if take.started.is_some_and(|at| at > start().plus_secs(20.0)) {
             take.loopback.fill(0);
         }
@@ -297,7 +298,7 @@ fn an_interface_at_another_rate_is_refused() {
 #[test]
 fn an_attempt_is_recorded_before_its_verdict() {
     let rig = quick();
-    let run = record(&rig, simulated(&rig, 0.83, 3), 2, Keep::Sweeps, usize::MAX);
+    let run = record(&rig, simulated(&rig, 0.83, 3), 2, RecordingMode::Sweeps, usize::MAX);
     let recorded = run.topics();
     let places =
         |topic: &str| recorded.iter().enumerate().filter(|(_, t)| *t == topic).map(|(i, _)| i).collect::<Vec<_>>();
@@ -321,11 +322,11 @@ fn pattern(index: usize) -> i32 {
 #[test]
 fn samples_are_recorded_bit_by_bit() {
     let rig = quick();
-    let fault = |take: &mut Take| {
+    let fault = |take: &mut AudioTake| {
         take.microphone.iter_mut().enumerate().for_each(|(i, x)| *x = pattern(i));
         take.loopback.iter_mut().enumerate().for_each(|(i, x)| *x = pattern(i + 1));
     };
-    let run = record(&rig, faulty(&rig, fault, 1), 1, Keep::Sweeps, usize::MAX);
+    let run = record(&rig, faulty(&rig, fault, 1), 1, RecordingMode::Sweeps, usize::MAX);
     let sweep = run.all::<SweepRecording>(topics::SWEEP).swap_remove(0);
     let expected: Vec<i32> = (0..=rig.recording_len()).map(pattern).collect();
     for (bytes, expected) in [(&sweep.microphone, &expected[..]), (&sweep.loopback, &expected[1..])] {
@@ -338,7 +339,7 @@ fn samples_are_recorded_bit_by_bit() {
 #[test]
 fn a_stop_waits_for_its_pair() {
     let rig = quick();
-    let run = record(&rig, simulated(&rig, 0.83, 3), 9, Keep::ResponsesOnly, 4);
+    let run = record(&rig, simulated(&rig, 0.83, 3), 9, RecordingMode::ResponsesOnly, 4);
     assert_eq!(run.counts(), (4, 0, 4));
     assert_eq!(run.verdicts().len(), 4);
 }
@@ -359,7 +360,7 @@ fn a_failing_device_ends_the_run_and_leaves_what_was_recorded() {
 #[test]
 fn the_same_seed_gives_the_same_file() {
     let rig = quick();
-    let file = |seed| record(&rig, simulated(&rig, 0.83, seed), 5, Keep::Sweeps, usize::MAX).file;
+    let file = |seed| record(&rig, simulated(&rig, 0.83, seed), 5, RecordingMode::Sweeps, usize::MAX).file;
     assert!(file(1) == file(1));
     assert!(file(1) != file(2));
 }

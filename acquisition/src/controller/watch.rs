@@ -6,7 +6,7 @@ use echolake_schema::Timestamp;
 
 use super::Error;
 use crate::disk::{folder_of, free_bytes};
-use crate::objection::Objection;
+use crate::objection::TakeObjection;
 
 /// Pairs given up in a row before the run is: one may be bad luck, three with all their attempts are not.
 const LASTING: usize = 3;
@@ -14,14 +14,14 @@ const LASTING: usize = 3;
 pub(crate) const KEPT_FREE: u64 = 1 << 20;
 
 /// Monitoring state of a run.
-pub(super) struct Watch {
+pub(super) struct RunMonitor {
     folder: PathBuf,
     given_up: usize,
     last: Timestamp,
     free: fn(&Path) -> std::io::Result<u64>,
 }
 
-impl Watch {
+impl RunMonitor {
     /// Starts at a time, for a recording at `path`.
     pub(super) fn new(path: &Path, last: Timestamp) -> Self {
         Self { folder: folder_of(path).to_owned(), given_up: 0, last, free: free_bytes }
@@ -36,13 +36,13 @@ impl Watch {
     ///
     /// # Errors
     /// [`Error::Lasting`] if too many were in a row.
-    pub(super) fn given_up(&mut self, reasons: &[Objection]) -> Result<(), Error> {
+    pub(super) fn given_up(&mut self, reasons: &[TakeObjection]) -> Result<(), Error> {
         self.given_up += 1;
         if self.given_up < LASTING {
             return Ok(());
         }
         let text: Vec<_> = reasons.iter().map(ToString::to_string).collect();
-        let hint = reasons.first().map_or("look at the log", Objection::hint);
+        let hint = reasons.first().map_or("look at the log", TakeObjection::hint);
         Err(Error::Lasting { pairs: self.given_up, reasons: text.join("; "), hint })
     }
 
@@ -81,8 +81,8 @@ mod tests {
 
     #[test]
     fn one_bad_pair_is_luck_and_three_are_a_fault() {
-        let mut watch = Watch::new(Path::new("run.mcap"), Timestamp(0));
-        let loud = [Objection::Outside { level_db: 80.0, most_db: 65.0 }];
+        let mut watch = RunMonitor::new(Path::new("run.mcap"), Timestamp(0));
+        let loud = [TakeObjection::Outside { level_db: 80.0, most_db: 65.0 }];
         assert!(watch.given_up(&loud).is_ok() && watch.given_up(&loud).is_ok());
         watch.accepted();
         assert!(watch.given_up(&loud).is_ok() && watch.given_up(&loud).is_ok());
@@ -92,7 +92,7 @@ mod tests {
 
     #[test]
     fn a_disk_that_fills_up_is_noticed_before_it_is_full() {
-        let mut watch = Watch::new(Path::new("run.mcap"), Timestamp(0));
+        let mut watch = RunMonitor::new(Path::new("run.mcap"), Timestamp(0));
         watch.free = |_| Ok(KEPT_FREE);
         assert!(watch.disk().is_ok());
         watch.free = |_| Ok(KEPT_FREE - 1);

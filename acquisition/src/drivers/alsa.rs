@@ -8,7 +8,7 @@ use alsa::{Direction, ValueOr};
 use echolake_schema::Timestamp;
 use echolake_schema::devices::{AlsaParams, AudioFormat};
 
-use super::audio::{DEVICE, Duplex, Recorded, Trouble};
+use super::audio::{AudioDuplex, DEVICE, DuplexRecording, TransferError};
 use crate::rig::Error;
 
 /// Periods per buffer of the device; one is filled or emptied while the others pass.
@@ -73,9 +73,9 @@ impl AlsaDuplex {
         pcm.sw_params(&software)
     }
 
-    fn run(&self, played: &[u8], captured: &mut [u8]) -> Result<Timestamp, Trouble> {
+    fn run(&self, played: &[u8], captured: &mut [u8]) -> Result<Timestamp, TransferError> {
         let [player, recorder] = [self.pcm(Direction::Playback), self.pcm(Direction::Capture)];
-        let (player, recorder) = (player.map_err(Trouble::Gone)?, recorder.map_err(Trouble::Gone)?);
+        let (player, recorder) = (player.map_err(TransferError::Gone)?, recorder.map_err(TransferError::Gone)?);
         // PCMs that cannot be linked are started one after the other; the loopback shows the difference.
         let linked = recorder.link(&player).is_ok();
         let [out_frame, in_frame] = [self.params.outputs, self.params.inputs].map(|n| n as usize * self.sample_bytes());
@@ -121,12 +121,17 @@ impl AlsaDuplex {
     }
 }
 
-impl Duplex for AlsaDuplex {
+impl AudioDuplex for AlsaDuplex {
     fn rate_hz(&self) -> f64 {
         self.rate_hz.into()
     }
 
-    fn transfer(&mut self, output: &[f32], frames: usize, recorded: &mut Recorded) -> Result<Timestamp, Trouble> {
+    fn transfer(
+        &mut self,
+        output: &[f32],
+        frames: usize,
+        recorded: &mut DuplexRecording,
+    ) -> Result<Timestamp, TransferError> {
         let mut played = Vec::with_capacity(frames * self.params.outputs as usize * self.sample_bytes());
         for n in 0..frames {
             let sample = encoded(output.get(n).copied().unwrap_or(0.0), self.params.format);
@@ -140,14 +145,14 @@ impl Duplex for AlsaDuplex {
     }
 }
 
-fn write(player: &PCM, bytes: &[u8], most: usize) -> Result<usize, Trouble> {
+fn write(player: &PCM, bytes: &[u8], most: usize) -> Result<usize, TransferError> {
     player.io_bytes().writei(&bytes[..bytes.len().min(most)]).map_err(trouble)
 }
 
-fn trouble(e: alsa::Error) -> Trouble {
+fn trouble(e: alsa::Error) -> TransferError {
     match LATE.contains(&e.errno().abs()) {
-        true => Trouble::Late(format!("overrun or underrun ({e})")),
-        false => Trouble::Gone(format!("{e}; hint: is the interface still plugged in?")),
+        true => TransferError::Late(format!("overrun or underrun ({e})")),
+        false => TransferError::Gone(format!("{e}; hint: is the interface still plugged in?")),
     }
 }
 

@@ -13,14 +13,14 @@ use echolake_schema::Rig;
 use echolake_schema::devices::{AlsaParams, AudioParams, DeviceParams, RobotsParams, SensorParams};
 use echolake_schema::manifest::Origin;
 
-use crate::rig::{AudioInterface, Devices, Error};
+use crate::rig::{AudioInterface, Error, RigDevices};
 use crate::robots::Cell;
 
 /// Opens a rig's devices; None if all of them are simulated.
 ///
 /// # Errors
 /// [`Error::Device`] if one does not answer, is not built in, or is simulated beside real ones.
-pub fn open(rig: &Rig) -> Result<Option<Devices>, Error> {
+pub fn open(rig: &Rig) -> Result<Option<RigDevices>, Error> {
     let DeviceParams { audio, sensor, robots } = &rig.devices;
     // Every kind is named, so that a new one cannot become a simulation.
     let audio = match audio {
@@ -43,7 +43,7 @@ pub fn open(rig: &Rig) -> Result<Option<Devices>, Error> {
             return Err(Error::Device { device: "rig", reason: reason.to_owned() });
         }
     };
-    Ok(Some(Devices {
+    Ok(Some(RigDevices {
         audio: audio_interface(audio, rig.sweep.rate_hz.get())?,
         sensor: Box::new(serial::SerialSensor::open(sensor)?),
         robots: Box::new(rosbridge::RosbridgeRobots::connect(robots, Cell::of(rig))?),
@@ -58,7 +58,7 @@ pub fn open(rig: &Rig) -> Result<Option<Devices>, Error> {
 #[cfg(feature = "alsa")]
 pub fn audio_interface(params: &AlsaParams, rate_hz: f64) -> Result<Box<dyn AudioInterface>, Error> {
     let pcm = alsa::AlsaDuplex::open(params, rate_hz)?;
-    Ok(Box::new(audio::Aligned::new(pcm, params.latency_secs, params.repeats)))
+    Ok(Box::new(audio::AlignedAudio::new(pcm, params.latency_secs, params.repeats)))
 }
 
 /// An interface through ALSA, which this build does not have.

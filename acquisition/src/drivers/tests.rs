@@ -10,14 +10,16 @@ use echolake_schema::messages::Measurement;
 use echolake_schema::{Rig, RunId, SurfaceRecord, Timestamp, topics};
 use prost::Message as _;
 
-use super::audio::Aligned;
-use super::audio::tests::{Cable, Fault as AudioFault, since};
+use super::audio::AlignedAudio;
+use super::audio::tests::{CableFault, LoopbackCable, since};
 use super::rosbridge::RosbridgeRobots;
-use super::rosbridge::fake::{FakeBridge, Fault};
+use super::rosbridge::fake::{BridgeFault, FakeBridge};
 use super::serial::SerialSensor;
 use super::serial::tests::{FakeSensor, GOOD, IMPATIENT_SECS, PATIENT_SECS};
 use super::*;
-use crate::controller::{Control, Error as RunError, Event, Keep, RunController, RunOptions, Work};
+use crate::controller::{
+    Error as RunError, RecordingMode, RunControl, RunController, RunEvent, RunOptions, RunWorkload,
+};
 use crate::recorder::{Recorder, RunStart, Tried};
 
 // A cable is no air: its sound comes at the wrong time for any distance.
@@ -25,13 +27,13 @@ const RIG: &str = "sweep.duration_secs = 0.1\nvalidation.attempts = 1\nvalidatio
     [[-62.5, 62.5, 124.0], [62.5, -62.5, 214.0], [0.0, 0.0, 304.0]]";
 
 /// The far ends of the three devices.
-struct Room {
+struct FakeDevices {
     rig: Rig,
     bridge: FakeBridge,
     sensor: FakeSensor,
 }
 
-impl Room {
+impl FakeDevices {
     fn new() -> Self {
         Self::of(RIG)
     }
@@ -44,15 +46,15 @@ impl Room {
         }
     }
 
-    fn devices(&self, audio: Aligned<Cable>) -> Devices {
+    fn devices(&self, audio: AlignedAudio<LoopbackCable>) -> RigDevices {
         self.devices_with_sensor_timeout(audio, PATIENT_SECS)
     }
 
-    fn devices_with_sensor_timeout(&self, audio: Aligned<Cable>, sensor_secs: f64) -> Devices {
+    fn devices_with_sensor_timeout(&self, audio: AlignedAudio<LoopbackCable>, sensor_secs: f64) -> RigDevices {
         let params =
             RosbridgeParams { url: self.bridge.url(), speed: 1.0, timeout_secs: PATIENT_SECS, ..Default::default() };
         let robots = RosbridgeRobots::connect(&params, Cell::of(&self.rig)).expect("connected");
-        Devices {
+        RigDevices {
             robots: Box::new(robots),
             audio: Box::new(audio),
             sensor: Box::new(SerialSensor::open(&self.sensor.params(sensor_secs)).expect("open")),
@@ -62,12 +64,12 @@ impl Room {
 }
 
 /// Result of a run, and the topics and contents of its file.
-struct Ended {
+struct FinishedRun {
     outcome: Result<u64, RunError>,
     messages: Vec<(String, Vec<u8>)>,
 }
 
-impl Ended {
+impl FinishedRun {
     fn count(&self, topic: &str) -> usize {
         self.messages.iter().filter(|(of, _)| of == topic).count()
     }
@@ -84,7 +86,7 @@ impl Ended {
     }
 }
 
-fn begun(room: &Room, folder: &Path) -> Recorder {
+fn begun(room: &FakeDevices, folder: &Path) -> Recorder {
     let (rig, start) = (&room.rig, Timestamp::now());
     let surface = "flat".parse().expect("an id");
     let manifest = RunManifest {
@@ -104,25 +106,25 @@ fn begun(room: &Room, folder: &Path) -> Recorder {
 
 // `progress` is called before each pair, and may pull plugs.
 fn measure(
-    room: &mut Room,
-    devices: Devices,
+    room: &mut FakeDevices,
+    devices: RigDevices,
     recorder: &mut Recorder,
     before: &BTreeMap<u32, Tried>,
-    progress: &mut dyn FnMut(&mut Room, usize),
+    progress: &mut dyn FnMut(&mut FakeDevices, usize),
 ) -> Result<RunEnd, RunError> {
     let rig = room.rig.clone();
     let grid = rig.grid().expect("a grid");
     let mut controller = RunController::new(&rig, devices).expect("a plan");
-    let options = RunOptions { keep: Keep::Sweeps, checkpoint_every: 1 };
+    let options = RunOptions { keep: RecordingMode::Sweeps, checkpoint_every: 1 };
     let mut begun = 0;
-    let mut observe = |event: Event<'_>| {
-        if let Event::Pair(_) = event {
+    let mut observe = |event: RunEvent<'_>| {
+        if let RunEvent::Pair(_) = event {
             begun += 1;
             progress(room, begun);
         }
     };
-    let work = Work { pairs: grid.pairs(), before, options };
-    let outcome = controller.run(recorder, &work, &Control::default(), &mut observe);
+    let work = RunWorkload { pairs: grid.pairs(), before, options };
+    let outcome = controller.run(recorder, &work, &RunControl::default(), &mut observe);
     let _ = recorder.checkpoint();
     outcome.map(|outcome| outcome.end)
 }
@@ -134,17 +136,17 @@ fn messages(path: &Path) -> Vec<(String, Vec<u8>)> {
     messages.map(|m| (m.channel.topic.clone(), m.data.to_vec())).collect()
 }
 
-fn run(room: &mut Room, devices: Devices, progress: &mut dyn FnMut(&mut Room, usize)) -> Ended {
+fn run(room: &mut FakeDevices, devices: RigDevices, progress: &mut dyn FnMut(&mut FakeDevices, usize)) -> FinishedRun {
     let folder = tempfile::tempdir().expect("a folder");
     let mut recorder = begun(room, folder.path());
     let outcome = measure(room, devices, &mut recorder, &BTreeMap::new(), progress);
-    Ended { outcome: outcome.map(|end| end.attempts), messages: messages(recorder.partial()) }
+    FinishedRun { outcome: outcome.map(|end| end.attempts), messages: messages(recorder.partial()) }
 }
 
 #[test]
 fn a_run_over_all_drivers_holds_what_they_told() {
-    let mut room = Room::new();
-    let devices = room.devices(since(Timestamp::now(), &[AudioFault::Overrun]));
+    let mut room = FakeDevices::new();
+    let devices = room.devices(since(Timestamp::now(), &[CableFault::Overrun]));
     let ended = run(&mut room, devices, &mut |_, _| ());
     assert_eq!(ended.outcome.as_ref().ok(), Some(&3), "{:?}", ended.outcome);
     for topic in [topics::TF, topics::MICROPHONE_JOINTS, topics::SPEAKER_JOINTS, topics::SWEEP, topics::MEASUREMENT] {
@@ -155,20 +157,20 @@ fn a_run_over_all_drivers_holds_what_they_told() {
 
 #[test]
 fn a_run_that_lost_a_driver_is_gone_on_with() {
-    let mut room = Room::new();
+    let mut room = FakeDevices::new();
     let folder = tempfile::tempdir().expect("a folder");
     let mut recorder = begun(&room, folder.path());
     let devices = room.devices(since(Timestamp::now(), &[]));
     let broken = measure(&mut room, devices, &mut recorder, &BTreeMap::new(), &mut |room, done| {
         if done == 2 {
-            room.bridge.set_fault(Fault::HangsUp);
+            room.bridge.set_fault(BridgeFault::HangsUp);
         }
     });
     assert!(broken.is_err_and(|e| e.to_string().contains("robots: lost `ws://")));
     let partial = recorder.partial().to_owned();
     drop(recorder);
 
-    let mut room = Room::new();
+    let mut room = FakeDevices::new();
     let (mut recorder, held) = Recorder::resume(&partial).expect("gone on with");
     assert!((1..3).contains(&held.pairs.len()), "{:?}", held.pairs);
     let devices = room.devices(since(Timestamp::now(), &[]));
@@ -188,9 +190,10 @@ mod slow {
 
     #[test]
     fn faults_in_mid_run_are_named_and_nothing_is_lost() {
-        type Pull = fn(&mut Room);
+        type Pull = fn(&mut FakeDevices);
         let check = |pull: Pull, expected: &str| {
-            let mut room = Room::of(&RIG.replace("[0.0, 0.0, 304.0]", "[0.0, 0.0, 304.0], [-62.5, -62.5, 214.0]"));
+            let mut room =
+                FakeDevices::of(&RIG.replace("[0.0, 0.0, 304.0]", "[0.0, 0.0, 304.0], [-62.5, -62.5, 214.0]"));
             let devices = room.devices_with_sensor_timeout(since(Timestamp::now(), &[]), IMPATIENT_SECS);
             let ended = run(&mut room, devices, &mut |room, done| {
                 // Good lines may be waiting yet: only the pair after this one is measured without any.
@@ -201,9 +204,9 @@ mod slow {
             assert!(ended.said().contains(expected), "{expected}: {}", ended.said());
             assert!(ended.count(topics::MEASUREMENT) >= 2, "{expected}: what was measured before is kept");
         };
-        check(|room| room.bridge.set_fault(Fault::Refuses), "refuses the target");
-        check(|room| room.bridge.set_fault(Fault::NoPower), "the safety chain is open");
-        check(|room| room.bridge.set_fault(Fault::HangsUp), "robots: lost `ws://");
+        check(|room| room.bridge.set_fault(BridgeFault::Refuses), "refuses the target");
+        check(|room| room.bridge.set_fault(BridgeFault::NoPower), "the safety chain is open");
+        check(|room| room.bridge.set_fault(BridgeFault::HangsUp), "robots: lost `ws://");
         check(|room| room.sensor.unplug(), "ambient sensor: lost `/dev/pts/");
         check(|room| room.sensor.send("~~~\n"), "ambient sensor: nothing but nonsense");
     }

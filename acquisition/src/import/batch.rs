@@ -6,15 +6,15 @@ use echolake_schema::manifest::RunEnd;
 
 use crate::recorder::{Error, Recorder, RunStart, Sealed};
 
-/// Runs that are written and not yet named. Dropped before [`Batch::publish`] has named all, it removes its files,
-/// and only its own.
+/// Runs that are written and not yet named. Dropped before [`ImportBatch::publish`] has named all, it removes its
+/// files, and only its own.
 #[derive(Default)]
-pub(super) struct Batch {
+pub(super) struct ImportBatch {
     sealed: Vec<Sealed>,
     ours: Vec<PathBuf>,
 }
 
-impl Batch {
+impl ImportBatch {
     /// Begins one of the runs.
     pub(super) fn create(&mut self, path: &Path, start: &RunStart<'_>) -> Result<Recorder, Error> {
         let recorder = Recorder::create(path, start)?;
@@ -48,7 +48,7 @@ impl Batch {
     }
 }
 
-impl Drop for Batch {
+impl Drop for ImportBatch {
     fn drop(&mut self) {
         for path in &self.ours {
             // Most partial files have been renamed; if one cannot be removed, the import's own error explains it.

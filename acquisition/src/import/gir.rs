@@ -14,8 +14,8 @@ use echolake_schema::{Celsius, Grid, Pair, PairId, Rig, SurfaceId, SurfaceRecord
 use ndarray::{Array1, Array2, Ix1, Ix2};
 use ndarray_npy::{NpzReader, ReadableElement};
 
-use super::batch::Batch;
-use super::response::Response;
+use super::batch::ImportBatch;
+use super::response::ImportedResponse;
 use super::{Error, ImportOptions, ImportedRun, RUN_SECS, wrong};
 use crate::mesh::{BACK_MM, MESH_CELLS, Mesh};
 use crate::recorder::{LogLevel, Relief, RunStart};
@@ -41,10 +41,10 @@ pub fn import_gir(
     let order = visiting_order(&folder.join("combinations.csv"), &grid)?;
     let info = panel_info(&folder.join("panel_info.csv"))?;
     let files = surfaces(folder)?;
-    let (mut runs, mut batch) = (Vec::new(), Batch::default());
+    let (mut runs, mut batch) = (Vec::new(), ImportBatch::default());
     for (number, file) in (0u16..).zip(&files) {
         let surface: SurfaceId = file.file_stem().unwrap_or_default().to_string_lossy().parse()?;
-        let import = Import { rig, order: order.as_ref(), grid: &grid, options, number };
+        let import = GirImport { rig, order: order.as_ref(), grid: &grid, options, number };
         runs.push(import.surface(file, surface.clone(), info.get(&surface), &mut batch)?);
         progress(runs.len(), files.len());
     }
@@ -52,7 +52,7 @@ pub fn import_gir(
     Ok(runs)
 }
 
-struct Import<'a> {
+struct GirImport<'a> {
     rig: &'a Rig,
     order: Option<&'a Vec<Pair>>,
     grid: &'a Grid,
@@ -60,13 +60,13 @@ struct Import<'a> {
     number: u16,
 }
 
-impl Import<'_> {
+impl GirImport<'_> {
     fn surface(
         &self,
         file: &Path,
         surface: SurfaceId,
         info: Option<&SurfaceRecord>,
-        batch: &mut Batch,
+        batch: &mut ImportBatch,
     ) -> Result<ImportedRun, Error> {
         let pairs = self.order.map_or(self.grid.pairs(), Vec::as_slice);
         let matrix = self.matrix(file, pairs.len())?;
@@ -98,7 +98,7 @@ impl Import<'_> {
         for ((row, pair), celsius) in pairs.iter().enumerate().zip(&temperatures) {
             at = at.plus_secs(TAKE_SECS);
             let samples = matrix.row(row).iter().map(|x| *x as f32).collect();
-            let response = Response { pair: *pair, at, celsius: *celsius, samples, is_corrected: true };
+            let response = ImportedResponse { pair: *pair, at, celsius: *celsius, samples, is_corrected: true };
             response.record(&mut recorder, self.rig, self.grid)?;
         }
         let count = pairs.len() as u64;

@@ -6,7 +6,7 @@ use echolake_schema::{Celsius, Grid, Pair, Rig, Timestamp};
 use crate::recorder::{Error, Recorder};
 
 /// A response, recorded as the file has it.
-pub(super) struct Response {
+pub(super) struct ImportedResponse {
     pub(super) pair: Pair,
     pub(super) at: Timestamp,
     pub(super) celsius: Celsius,
@@ -15,7 +15,7 @@ pub(super) struct Response {
     pub(super) is_corrected: bool,
 }
 
-impl Response {
+impl ImportedResponse {
     /// Records it as the pair's first attempt, accepted.
     pub(super) fn record(self, recorder: &mut Recorder, rig: &Rig, grid: &Grid) -> Result<(), Error> {
         let Self { pair, at, celsius, samples, is_corrected } = self;

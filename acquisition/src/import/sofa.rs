@@ -13,9 +13,9 @@ use echolake_dsp::temperature::{TemperatureCorrection, resampling_ratio};
 use echolake_schema::manifest::{Origin, RunEnd};
 use echolake_schema::{Celsius, Grid, Pair, PairId, Rig, SurfaceId, SurfaceRecord, Timestamp};
 
-use super::batch::Batch;
-use super::response::Response;
-use super::sofa_file::{SofaFile, Variable};
+use super::batch::ImportBatch;
+use super::response::ImportedResponse;
+use super::sofa_file::{SofaFile, SofaVariable};
 use super::{Error, ImportOptions, ImportedRun, RUN_SECS, wrong};
 use crate::recorder::{LogLevel, RunStart};
 use crate::rigs::simulated::TAKE_SECS;
@@ -43,9 +43,9 @@ pub fn import_sofa(
     progress: &mut dyn FnMut(usize, usize),
 ) -> Result<Vec<ImportedRun>, Error> {
     let grid = rig.grid()?;
-    let (mut runs, mut batch) = (Vec::new(), Batch::default());
+    let (mut runs, mut batch) = (Vec::new(), ImportBatch::default());
     each(files, rig, &grid, celsius, |sofa, number| {
-        runs.push(sofa.record(&Import { rig, grid: &grid, options, number }, &mut batch)?);
+        runs.push(sofa.record(&SofaImport { rig, grid: &grid, options, number }, &mut batch)?);
         progress(runs.len(), files.len());
         Ok(())
     })?;
@@ -81,7 +81,7 @@ fn each(
     Ok(())
 }
 
-struct Import<'a> {
+struct SofaImport<'a> {
     rig: &'a Rig,
     grid: &'a Grid,
     options: ImportOptions<'a>,
@@ -92,13 +92,13 @@ struct Import<'a> {
 struct Sofa {
     surface: SurfaceId,
     /// In the order of their times.
-    measurements: Vec<Measured>,
+    measurements: Vec<SofaMeasurement>,
     length: usize,
     samples: Vec<f32>,
     is_corrected: bool,
 }
 
-struct Measured {
+struct SofaMeasurement {
     /// Row of its response.
     row: usize,
     pair: Pair,
@@ -112,7 +112,7 @@ impl Sofa {
         let unread = |reason| Error::Read { path: path.to_owned(), reason };
         std::fs::File::open(path).map_err(|e| unread(e.to_string()))?;
         let file = SofaFile::open(path).map_err(|reason| unread(format!("it is no HDF5 file: {reason}")))?;
-        let reader = Reader { path, file };
+        let reader = SofaReader { path, file };
         let is_ours = reader.file.text("APIName") == OURS;
         reader.expect_text("SOFAConventions", "SingleRoomSRIR")?;
         reader.expect_text("DataType", "FIR")?;
@@ -147,7 +147,7 @@ impl Sofa {
         }
         let pairs = reader.pairs(count, grid)?;
         let times = reader.times(count)?;
-        let row = |row: usize| Measured {
+        let row = |row: usize| SofaMeasurement {
             row,
             pair: pairs[row],
             celsius: celsius[row],
@@ -165,7 +165,7 @@ impl Sofa {
         })
     }
 
-    fn record(&self, import: &Import<'_>, batch: &mut Batch) -> Result<ImportedRun, Error> {
+    fn record(&self, import: &SofaImport<'_>, batch: &mut ImportBatch) -> Result<ImportedRun, Error> {
         let times = self.times(import.options.started.plus_secs(f64::from(import.number) * RUN_SECS));
         let (started, ended) = (times[0], times[times.len() - 1]);
         let manifest = super::manifest(Origin::ImportedSofa, &self.surface, import.rig, started)?;
@@ -178,8 +178,8 @@ impl Sofa {
         }
         for (measured, at) in self.measurements.iter().zip(times) {
             let samples = self.samples[measured.row * self.length..][..self.length].to_vec();
-            let Measured { pair, celsius, .. } = *measured;
-            let response = Response { pair, at, celsius, samples, is_corrected: self.is_corrected };
+            let SofaMeasurement { pair, celsius, .. } = *measured;
+            let response = ImportedResponse { pair, at, celsius, samples, is_corrected: self.is_corrected };
             response.record(&mut recorder, import.rig, import.grid)?;
         }
         let count = self.measurements.len();
@@ -192,7 +192,7 @@ impl Sofa {
     // Returns the file's times, each later than the one before.
     fn times(&self, fallback: Timestamp) -> Vec<Timestamp> {
         let mut last = i64::MIN;
-        let at = |(i, measured): (u32, &Measured)| {
+        let at = |(i, measured): (u32, &SofaMeasurement)| {
             let told = measured.time.map(Timestamp).unwrap_or_else(|| fallback.plus_secs(f64::from(i) * TAKE_SECS));
             last = told.0.max(last.saturating_add(STEP_NANOS));
             Timestamp(last)
@@ -202,17 +202,17 @@ impl Sofa {
 }
 
 /// A reader that checks a file into a [`Sofa`].
-struct Reader<'a> {
+struct SofaReader<'a> {
     path: &'a Path,
     file: SofaFile,
 }
 
-impl Reader<'_> {
-    fn variable(&self, name: &str) -> Result<Option<Variable>, Error> {
+impl SofaReader<'_> {
+    fn variable(&self, name: &str) -> Result<Option<SofaVariable>, Error> {
         self.file.variable(name).map_err(|actual| wrong(self.path, name, actual, "numbers"))
     }
 
-    fn needed(&self, name: &str) -> Result<Variable, Error> {
+    fn needed(&self, name: &str) -> Result<SofaVariable, Error> {
         let found = self.variable(name)?;
         found.ok_or_else(|| wrong(self.path, name, "it is missing", "what SingleRoomSRIR asks for"))
     }
@@ -322,7 +322,7 @@ impl Reader<'_> {
     }
 
     // One row a measurement, or the same for all.
-    fn rows<'v>(&self, name: &str, v: &'v Variable, count: usize, width: usize) -> Result<Vec<&'v [f64]>, Error> {
+    fn rows<'v>(&self, name: &str, v: &'v SofaVariable, count: usize, width: usize) -> Result<Vec<&'v [f64]>, Error> {
         let rows: Vec<_> = v.values.chunks_exact(width).collect();
         match rows.len() {
             n if n == count && v.values.len() == count * width => Ok(rows),

@@ -16,7 +16,7 @@ pub(super) struct SofaFile(H5File);
 
 /// A variable.
 #[derive(Debug, Clone, PartialEq)]
-pub(super) struct Variable {
+pub(super) struct SofaVariable {
     pub(super) shape: Vec<usize>,
     pub(super) values: Vec<f64>,
 }
@@ -39,7 +39,7 @@ impl SofaFile {
     }
 
     /// Reads a variable; None if it is missing.
-    pub(super) fn variable(&self, name: &str) -> Result<Option<Variable>, String> {
+    pub(super) fn variable(&self, name: &str) -> Result<Option<SofaVariable>, String> {
         if !self.0.dataset_names().iter().any(|known| known == name) {
             return Ok(None);
         }
@@ -54,7 +54,7 @@ impl SofaFile {
             false => packed(&dataset, &filters, &shape)?,
         };
         match values.len() == count {
-            true => Ok(Some(Variable { shape, values })),
+            true => Ok(Some(SofaVariable { shape, values })),
             false => Err(format!("{} numbers, expected {count}", values.len())),
         }
     }

@@ -13,10 +13,10 @@ use echolake_schema::manifest::{Origin, RunEnd};
 use echolake_schema::messages::{AmbientSample, ImpulseResponse, Measurement, SweepRecording, Verdict};
 use echolake_schema::{Grid, Rig, SampleRate, SurfaceId, SurfaceRecord, Timestamp};
 
-use super::batch::Batch;
-use super::wav_manifest::{self, Row};
+use super::batch::ImportBatch;
+use super::wav_manifest::{self, ManifestRow};
 use super::{Error, ImportOptions, ImportedRun};
-use crate::assessment::Assessor;
+use crate::assessment::TakeAssessor;
 use crate::recorder::{LogLevel, Recorder, RunStart};
 
 /// Source name of the import's log entries.
@@ -44,9 +44,9 @@ pub fn import_wav(
     let grid = rig.grid()?;
     let surfaces = wav_manifest::read(manifest, rig, &grid)?;
     let total = surfaces.values().map(Vec::len).sum();
-    let (mut runs, mut batch, mut done) = (Vec::new(), Batch::default(), 0);
+    let (mut runs, mut batch, mut done) = (Vec::new(), ImportBatch::default(), 0);
     for (surface, rows) in surfaces {
-        let import = Import { manifest, rig, grid: &grid, options };
+        let import = WavImport { manifest, rig, grid: &grid, options };
         let run = import.surface(surface, &rows, &mut batch, &mut || {
             done += 1;
             progress(done, total);
@@ -57,19 +57,19 @@ pub fn import_wav(
     Ok(runs)
 }
 
-struct Import<'a> {
+struct WavImport<'a> {
     manifest: &'a Path,
     rig: &'a Rig,
     grid: &'a Grid,
     options: ImportOptions<'a>,
 }
 
-impl Import<'_> {
+impl WavImport<'_> {
     fn surface(
         &self,
         surface: SurfaceId,
-        rows: &[Row],
-        batch: &mut Batch,
+        rows: &[ManifestRow],
+        batch: &mut ImportBatch,
         done: &mut dyn FnMut(),
     ) -> Result<ImportedRun, Error> {
         // A run's file is in the order of time, however the manifest's rows are.
@@ -93,12 +93,12 @@ impl Import<'_> {
         Ok(ImportedRun { path, run_id: manifest.run_id, surface, measurements: rows.len(), warnings })
     }
 
-    fn time(&self, row: &Row, index: u32) -> Timestamp {
+    fn time(&self, row: &ManifestRow, index: u32) -> Timestamp {
         row.recorded_at.unwrap_or_else(|| self.options.started.plus_secs(f64::from(index)))
     }
 
     // Import keeps all it is given: objections of the rig become warnings, not refusals.
-    fn row(&self, recorder: &mut Recorder, row: &Row, at: Timestamp) -> Result<Option<String>, Error> {
+    fn row(&self, recorder: &mut Recorder, row: &ManifestRow, at: Timestamp) -> Result<Option<String>, Error> {
         let unread = |column, what| Error::Row { path: self.manifest.to_owned(), line: row.line, column, what };
         let microphone = row.recording.read(row.format).map_err(|e| unread("recording", e))?;
         let loopback = row.loopback.read(row.format).map_err(|e| unread("loopback", e))?;
@@ -122,7 +122,7 @@ impl Import<'_> {
         let [m, s] = [row.pair.microphone, row.pair.speaker].map(|id| self.grid.points()[id.index()].position_mm);
         let arrival = direct_mm(m, s) / 1e3 / speed_of_sound(celsius);
         let clipped = microphone.clipped + loopback.clipped;
-        let assessment = Assessor::new(rig, len)
+        let assessment = TakeAssessor::new(rig, len)
             .and_then(|mut a| a.assess(&microphone.fractions, &loopback.fractions, arrival, clipped))
             .map_err(planned)?;
         // The geometry of a foreign rig is known less well than its files say, and the level outside was not recorded:

@@ -18,7 +18,7 @@ pub(super) struct WavChannel {
 }
 
 /// The samples of a channel.
-pub(super) struct Samples {
+pub(super) struct ChannelSamples {
     pub(super) bytes: Vec<u8>,
     pub(super) fractions: Vec<f32>,
     pub(super) clipped: u32,
@@ -80,11 +80,11 @@ impl WavChannel {
     }
 
     /// Reads its samples, as bytes of `format`, which is its own or a wider one.
-    pub(super) fn read(&self, format: SampleFormat) -> Result<Samples, String> {
+    pub(super) fn read(&self, format: SampleFormat) -> Result<ChannelSamples, String> {
         let failed = |e: hound::Error| format!("cannot read `{}`: {e}", self.path.display());
         let mut reader = WavReader::open(&self.path).map_err(failed)?;
         let (skip, step) = (usize::from(self.channel), usize::from(self.spec.channels));
-        let mut out = Samples { bytes: Vec::new(), fractions: Vec::new(), clipped: 0 };
+        let mut out = ChannelSamples { bytes: Vec::new(), fractions: Vec::new(), clipped: 0 };
         if self.spec.sample_format == WavFormat::Float {
             for sample in reader.samples::<f32>().skip(skip).step_by(step) {
                 let x = sample.map_err(failed)?;

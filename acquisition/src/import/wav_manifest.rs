@@ -16,7 +16,7 @@ const NEEDED: usize = 6;
 
 /// A row of the manifest, checked.
 #[derive(Debug, Clone)]
-pub(super) struct Row {
+pub(super) struct ManifestRow {
     pub(super) line: u64,
     pub(super) recording: WavChannel,
     pub(super) loopback: WavChannel,
@@ -30,7 +30,7 @@ pub(super) struct Row {
 }
 
 /// A manifest's rows by surface.
-pub(super) type Manifest = BTreeMap<SurfaceId, Vec<Row>>;
+pub(super) type WavManifest = BTreeMap<SurfaceId, Vec<ManifestRow>>;
 
 /// Opens a manifest and checks its header; returns the place of each column.
 fn open(path: &Path) -> Result<(csv::Reader<std::fs::File>, Vec<Option<usize>>), Error> {
@@ -55,16 +55,16 @@ fn open(path: &Path) -> Result<(csv::Reader<std::fs::File>, Vec<Option<usize>>),
 pub(super) fn first_recording(path: &Path) -> Result<WavChannel, Error> {
     let (mut reader, places) = open(path)?;
     let record = next(path, &mut reader)?.ok_or_else(|| no_rows(path))?;
-    let cells = Cells { path, places: &places, record: &record };
+    let cells = ManifestCells { path, places: &places, record: &record };
     cells.wav("recording")
 }
 
 /// Reads and checks all rows.
-pub(super) fn read(path: &Path, rig: &Rig, grid: &Grid) -> Result<Manifest, Error> {
+pub(super) fn read(path: &Path, rig: &Rig, grid: &Grid) -> Result<WavManifest, Error> {
     let (mut reader, places) = open(path)?;
-    let mut manifest = Manifest::new();
+    let mut manifest = WavManifest::new();
     while let Some(record) = next(path, &mut reader)? {
-        let cells = Cells { path, places: &places, record: &record };
+        let cells = ManifestCells { path, places: &places, record: &record };
         let surface: SurfaceId = cells.parse("surface")?;
         let row = cells.row(rig, grid)?;
         let rows = manifest.entry(surface).or_default();
@@ -93,13 +93,13 @@ fn no_rows(path: &Path) -> Error {
     Error::Header { path: path.to_owned(), what: "it has no rows".into() }
 }
 
-struct Cells<'a> {
+struct ManifestCells<'a> {
     path: &'a Path,
     places: &'a [Option<usize>],
     record: &'a StringRecord,
 }
 
-impl Cells<'_> {
+impl ManifestCells<'_> {
     fn get(&self, column: &'static str) -> Option<&str> {
         let index = WAV_MANIFEST.iter().position(|c| *c == column)?;
         self.record.get(self.places[index]?).filter(|text| !text.is_empty())
@@ -129,7 +129,7 @@ impl Cells<'_> {
         WavChannel::open(folder, self.needed(column)?).map_err(|what| self.wrong(column, what))
     }
 
-    fn row(&self, rig: &Rig, grid: &Grid) -> Result<Row, Error> {
+    fn row(&self, rig: &Rig, grid: &Grid) -> Result<ManifestRow, Error> {
         let (recording, loopback) = (self.wav("recording")?, self.wav("loopback")?);
         let expected = rig.sweep.rate_hz.get();
         for (column, wav) in [("recording", &recording), ("loopback", &loopback)] {
@@ -151,7 +151,7 @@ impl Cells<'_> {
         })?;
         let celsius = self.number("temperature_c")?.ok_or_else(|| self.wrong("temperature_c", "it is empty"))?;
         let attempt = self.get("attempt").map_or(Ok(1), str::parse).ok().filter(|a| (1..=1000).contains(a));
-        Ok(Row {
+        Ok(ManifestRow {
             line: self.record.position().map_or(0, csv::Position::line),
             format,
             pair: self.pair(grid)?,

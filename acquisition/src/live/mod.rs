@@ -12,7 +12,7 @@ use std::sync::Arc;
 use echolake_schema::topics;
 
 use crate::recorder::{Tap, Topic};
-use crate::viewer::{Server, Shared, ViewerAccess};
+use crate::viewer::{ViewerAccess, ViewerServer, ViewerState};
 
 /// An error that prevents the live view.
 #[derive(Debug, thiserror::Error)]
@@ -28,7 +28,7 @@ pub enum Error {
 }
 
 /// A server that shows one run. Dropped, it disconnects its clients.
-pub struct LiveServer(Server);
+pub struct LiveServer(ViewerServer);
 
 impl LiveServer {
     /// Listens; port 0 takes a free one.
@@ -36,7 +36,9 @@ impl LiveServer {
     /// # Errors
     /// [`Error::Listen`].
     pub fn start(address: SocketAddr, access: ViewerAccess) -> Result<Self, Error> {
-        Server::start(address, access, Vec::new(), None).map(Self).map_err(|source| Error::Listen { address, source })
+        ViewerServer::start(address, access, Vec::new(), None)
+            .map(Self)
+            .map_err(|source| Error::Listen { address, source })
     }
 
     /// Returns the address of its listener.
@@ -61,7 +63,7 @@ impl LiveServer {
 }
 
 struct LiveTap {
-    shared: Arc<Shared>,
+    shared: Arc<ViewerState>,
     /// Channels whose last message is sent to new clients.
     light: Vec<u16>,
 }

@@ -27,9 +27,9 @@ fn topic(channel: u16, name: &str) -> Topic {
     }
 }
 
-type Socket = tungstenite::WebSocket<tungstenite::stream::MaybeTlsStream<TcpStream>>;
+type ViewerSocket = tungstenite::WebSocket<tungstenite::stream::MaybeTlsStream<TcpStream>>;
 
-fn connect(server: &LiveServer) -> Socket {
+fn connect(server: &LiveServer) -> ViewerSocket {
     let mut request = format!("ws://{}", server.address()).into_client_request().expect("a request");
     let offered = "foxglove.sdk.v1".parse().expect("a header");
     request.headers_mut().insert("Sec-WebSocket-Protocol", offered);
@@ -41,14 +41,14 @@ fn connect(server: &LiveServer) -> Socket {
     socket
 }
 
-fn json(socket: &mut Socket) -> serde_json::Value {
+fn json(socket: &mut ViewerSocket) -> serde_json::Value {
     match socket.read().expect("a message") {
         Message::Text(text) => serde_json::from_str(&text).expect("JSON"),
         other => panic!("{other:?}"),
     }
 }
 
-fn data(socket: &mut Socket) -> (u32, u64, Vec<u8>) {
+fn data(socket: &mut ViewerSocket) -> (u32, u64, Vec<u8>) {
     match socket.read().expect("a message") {
         Message::Binary(bytes) => {
             assert_eq!(bytes[0], 1);

@@ -30,14 +30,14 @@ pub struct Mesh {
 
 /// A side of a panel, which is turned over about its y axis to see its back.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Side {
+pub enum PanelSide {
     /// The upper one in its mesh.
     Front,
     /// The lower one.
     Back,
 }
 
-impl Side {
+impl PanelSide {
     /// Its name in arguments and files.
     pub fn name(self) -> &'static str {
         match self {
@@ -145,12 +145,12 @@ impl Mesh {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::relief::Relief;
+    use crate::relief::PanelRelief;
 
     const ALL: [Format; 4] = [Format::Glb, Format::Stl, Format::Obj, Format::Ply];
 
     fn small() -> Mesh {
-        Mesh::from_height_field(&Relief::by_name("wavy").expect("a relief").height_field(4), -20.0)
+        Mesh::from_height_field(&PanelRelief::by_name("wavy").expect("a relief").height_field(4), -20.0)
     }
 
     fn parse(format: Format, bytes: &[u8]) -> Result<Mesh, Error> {

@@ -22,28 +22,28 @@ pub(super) fn write(mesh: &Mesh) -> Vec<u8> {
     file
 }
 
-struct Element {
+struct PlyElement {
     name: String,
     count: usize,
-    properties: Vec<Property>,
+    properties: Vec<PlyProperty>,
 }
 
-struct Property {
+struct PlyProperty {
     name: String,
-    kind: Kind,
+    kind: PlyType,
     /// Of a list: the kind of its length.
-    length: Option<Kind>,
+    length: Option<PlyType>,
 }
 
 #[derive(Debug, Clone, Copy)]
-enum Kind {
+enum PlyType {
     Signed(usize),
     Unsigned(usize),
     Float,
     Double,
 }
 
-impl Kind {
+impl PlyType {
     fn parse(name: &str) -> Option<Self> {
         Some(match name {
             "char" | "int8" => Self::Signed(1),
@@ -60,13 +60,13 @@ impl Kind {
 }
 
 /// The numbers of the body, one after the other.
-enum Body<'a> {
+enum PlyBody<'a> {
     Text(Vec<&'a str>, usize),
     Binary(&'a [u8], usize),
 }
 
-impl Body<'_> {
-    fn next(&mut self, kind: Kind) -> Option<f64> {
+impl PlyBody<'_> {
+    fn next(&mut self, kind: PlyType) -> Option<f64> {
         match self {
             Self::Text(words, at) => {
                 *at += 1;
@@ -74,18 +74,18 @@ impl Body<'_> {
             }
             Self::Binary(bytes, at) => {
                 let size = match kind {
-                    Kind::Signed(n) | Kind::Unsigned(n) => n,
-                    Kind::Float => 4,
-                    Kind::Double => 8,
+                    PlyType::Signed(n) | PlyType::Unsigned(n) => n,
+                    PlyType::Float => 4,
+                    PlyType::Double => 8,
                 };
                 let raw = bytes.get(*at..*at + size)?;
                 *at += size;
                 let bits = raw.iter().rev().fold(0u64, |n, b| n << 8 | u64::from(*b));
                 Some(match kind {
-                    Kind::Signed(n) => ((bits << (64 - 8 * n)) as i64 >> (64 - 8 * n)) as f64,
-                    Kind::Unsigned(_) => bits as f64,
-                    Kind::Float => f64::from(f32::from_bits(bits as u32)),
-                    Kind::Double => f64::from_bits(bits),
+                    PlyType::Signed(n) => ((bits << (64 - 8 * n)) as i64 >> (64 - 8 * n)) as f64,
+                    PlyType::Unsigned(_) => bits as f64,
+                    PlyType::Float => f64::from(f32::from_bits(bits as u32)),
+                    PlyType::Double => f64::from_bits(bits),
                 })
             }
         }
@@ -105,7 +105,7 @@ pub(super) fn parse(bytes: &[u8], path: &Path) -> Result<Mesh, Error> {
     if lines.next() != Some("ply") {
         return Err(wrong("line 1", "something else".into(), "`ply`"));
     }
-    let (mut elements, mut format) = (Vec::<Element>::new(), "");
+    let (mut elements, mut format) = (Vec::<PlyElement>::new(), "");
     for line in lines {
         let words: Vec<_> = line.split_whitespace().collect();
         match words[..] {
@@ -120,7 +120,7 @@ pub(super) fn parse(bytes: &[u8], path: &Path) -> Result<Mesh, Error> {
             }
             ["element", name, count] => {
                 let count = count.parse().map_err(|_| wrong("the header", format!("`{line}`"), "a count"))?;
-                elements.push(Element { name: name.into(), count, properties: Vec::new() });
+                elements.push(PlyElement { name: name.into(), count, properties: Vec::new() });
             }
             ["property", "list", length, kind, name] => add(&mut elements, name, kind, Some(length))
                 .ok_or_else(|| wrong("the header", format!("`{line}`"), "a property of an element"))?,
@@ -130,8 +130,8 @@ pub(super) fn parse(bytes: &[u8], path: &Path) -> Result<Mesh, Error> {
         }
     }
     let mut body = match format {
-        "ascii" => Body::Text(std::str::from_utf8(body).unwrap_or_default().split_whitespace().collect(), 0),
-        "binary" => Body::Binary(body, 0),
+        "ascii" => PlyBody::Text(std::str::from_utf8(body).unwrap_or_default().split_whitespace().collect(), 0),
+        "binary" => PlyBody::Binary(body, 0),
         _ => return Err(wrong("the header", "another format".into(), "ascii or binary_little_endian")),
     };
     let mut mesh = Mesh::default();
@@ -144,12 +144,12 @@ pub(super) fn parse(bytes: &[u8], path: &Path) -> Result<Mesh, Error> {
     Ok(mesh)
 }
 
-fn add(elements: &mut [Element], name: &str, kind: &str, length: Option<&str>) -> Option<()> {
+fn add(elements: &mut [PlyElement], name: &str, kind: &str, length: Option<&str>) -> Option<()> {
     let length = match length {
-        Some(length) => Some(Kind::parse(length)?),
+        Some(length) => Some(PlyType::parse(length)?),
         None => None,
     };
-    elements.last_mut()?.properties.push(Property { name: name.into(), kind: Kind::parse(kind)?, length });
+    elements.last_mut()?.properties.push(PlyProperty { name: name.into(), kind: PlyType::parse(kind)?, length });
     Some(())
 }
 
@@ -166,7 +166,7 @@ fn split(bytes: &[u8]) -> Option<(&[u8], &[u8])> {
 }
 
 // An error has the actual and the expected content.
-fn read_row(element: &Element, body: &mut Body<'_>, mesh: &mut Mesh) -> Result<(), (String, &'static str)> {
+fn read_row(element: &PlyElement, body: &mut PlyBody<'_>, mesh: &mut Mesh) -> Result<(), (String, &'static str)> {
     let no_number = || ("no number".to_owned(), "as many as the header counts");
     let mut position = [f32::NAN; 3];
     // An element without properties would be read without end.

@@ -3,7 +3,7 @@
 use std::collections::HashMap;
 use std::path::Path;
 
-use super::{Error, Mesh, Side};
+use super::{Error, Mesh, PanelSide};
 use crate::relief::{HeightField, RELIEF_MM};
 use crate::rigs::simulated::FACETS;
 
@@ -24,8 +24,8 @@ impl Mesh {
 
     /// Returns the mesh with a side above: the back is turned over, to the height of the front of our panels.
     #[must_use]
-    pub fn seen_from(mut self, side: Side) -> Self {
-        if side == Side::Back {
+    pub fn seen_from(mut self, side: PanelSide) -> Self {
+        if side == PanelSide::Back {
             for [x, _, z] in &mut self.vertices_mm {
                 (*x, *z) = (-*x, -*z - CORE_MM as f32);
             }
@@ -246,7 +246,7 @@ fn rasterise(corners: [[f64; 3]; 3], cells: usize, tops: &mut [f32]) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::relief::{PANEL_SIZE_MM, Relief};
+    use crate::relief::{PANEL_SIZE_MM, PanelRelief};
 
     #[test]
     fn a_box_has_its_volume_and_is_closed() {
@@ -275,10 +275,10 @@ mod tests {
 
     #[test]
     fn a_panel_that_is_turned_over_shows_its_back() {
-        let of = |name: &str| Relief::by_name(name).expect("a relief").height_field(100);
+        let of = |name: &str| PanelRelief::by_name(name).expect("a relief").height_field(100);
         let (front, back) = (of("brick"), of("wavy"));
         let path = Path::new("panel");
-        let panel = Mesh::double_sided(&front, &back).seen_from(Side::Back);
+        let panel = Mesh::double_sided(&front, &back).seen_from(PanelSide::Back);
         assert_eq!(panel.check(PANEL_SIZE_MM, 40.0, path).map(drop), Ok(()), "it is closed, its outside outside");
         assert!(panel.volume_mm3() > 0.0);
         let seen = panel.to_height_field(100, PANEL_SIZE_MM, 40.0, path).expect("heights");
@@ -287,13 +287,13 @@ mod tests {
         };
         assert!(off(&back) < 0.25, "{} mm", off(&back));
         assert!(off(&front) > 1.0);
-        let front_again = Mesh::double_sided(&front, &back).seen_from(Side::Front);
+        let front_again = Mesh::double_sided(&front, &back).seen_from(PanelSide::Front);
         assert_eq!(front_again, Mesh::double_sided(&front, &back));
     }
 
     #[test]
     fn heights_survive_the_way_through_a_mesh() {
-        let field = Relief::by_name("wavy").expect("a relief").height_field(100);
+        let field = PanelRelief::by_name("wavy").expect("a relief").height_field(100);
         let mesh = Mesh::from_height_field(&field, -20.0);
         let again = mesh.to_height_field(100, PANEL_SIZE_MM, 40.0, Path::new("wavy")).expect("heights");
         let off = field.heights_mm().iter().zip(again.heights_mm()).fold(0.0f32, |m, (a, b)| m.max((a - b).abs()));

@@ -10,20 +10,20 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use echolake_schema::messages::{Measurement, Verdict};
 
-use crate::controller::Event;
+use crate::controller::RunEvent;
 use crate::recorder::Cost;
-pub use push::{InfluxPush, Target, TargetError};
+pub use push::{InfluxPush, PushTarget, TargetError};
 pub use serve::MetricsServer;
 
 /// A run's numbers; clones share them.
 #[derive(Clone)]
 pub struct RunMetrics {
     surface: String,
-    inner: Arc<Mutex<Numbers>>,
+    inner: Arc<Mutex<MetricValues>>,
 }
 
 #[derive(Default)]
-struct Numbers {
+struct MetricValues {
     planned: u64,
     accepted: u64,
     attempts: u64,
@@ -39,12 +39,12 @@ struct Numbers {
 
 /// Kind of a metric: a counter only grows.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Kind {
+enum MetricKind {
     Counter,
     Gauge,
 }
 
-impl Kind {
+impl MetricKind {
     fn name(self) -> &'static str {
         match self {
             Self::Counter => "counter",
@@ -54,21 +54,21 @@ impl Kind {
 }
 
 /// A metric: its name without `echolake_`, its kind, its help text, its value.
-type Metric = (&'static str, Kind, &'static str, f64);
+type Metric = (&'static str, MetricKind, &'static str, f64);
 
 impl RunMetrics {
     /// Metrics of a run over `planned` pairs, `accepted` of which are measured already.
     pub fn new(surface: &str, planned: u64, accepted: u64) -> Self {
-        let numbers = Numbers { planned, accepted, ..Numbers::default() };
+        let numbers = MetricValues { planned, accepted, ..MetricValues::default() };
         Self { surface: surface.to_owned(), inner: Arc::new(Mutex::new(numbers)) }
     }
 
     /// Counts an event of the run.
-    pub fn observe(&self, event: &Event<'_>) {
+    pub fn observe(&self, event: &RunEvent<'_>) {
         let mut numbers = self.numbers();
         match event {
-            Event::Pair(pair) => numbers.pair = pair.id.0,
-            Event::Attempt(m) => {
+            RunEvent::Pair(pair) => numbers.pair = pair.id.0,
+            RunEvent::Attempt(m) => {
                 numbers.attempts += 1;
                 match m.verdict() {
                     Verdict::Repeated => numbers.repeated += 1,
@@ -78,9 +78,9 @@ impl RunMetrics {
                 numbers.last = Some((*m).clone());
             }
             // These pairs are on the disk.
-            Event::Safe { accepted, cost, .. } => (numbers.accepted, numbers.cost) = (*accepted, *cost),
-            Event::Paused => numbers.paused = true,
-            Event::Continued => numbers.paused = false,
+            RunEvent::Safe { accepted, cost, .. } => (numbers.accepted, numbers.cost) = (*accepted, *cost),
+            RunEvent::Paused => numbers.paused = true,
+            RunEvent::Continued => numbers.paused = false,
         }
     }
 
@@ -115,14 +115,14 @@ impl RunMetrics {
         format!("echolake_run,surface={} {} {at_nanos}\n", self.surface, fields.join(","))
     }
 
-    fn numbers(&self) -> MutexGuard<'_, Numbers> {
+    fn numbers(&self) -> MutexGuard<'_, MetricValues> {
         self.inner.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
-impl Numbers {
+impl MetricValues {
     fn metrics(&self) -> Vec<Metric> {
-        use Kind::{Counter, Gauge};
+        use MetricKind::{Counter, Gauge};
         let flag = |on: bool| f64::from(u8::from(on));
         let mut metrics: Vec<Metric> = vec![
             ("pairs_planned", Gauge, "Pairs of the run.", self.planned as f64),

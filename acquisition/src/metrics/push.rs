@@ -15,7 +15,7 @@ const PATIENCE: Duration = Duration::from_secs(5);
 
 /// Destination of metrics.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub enum Target {
+pub enum PushTarget {
     /// One datagram per line.
     Udp {
         /// `host:port`.
@@ -38,7 +38,7 @@ pub struct TargetError {
     pub given: String,
 }
 
-impl std::str::FromStr for Target {
+impl std::str::FromStr for PushTarget {
     type Err = TargetError;
 
     fn from_str(given: &str) -> Result<Self, TargetError> {
@@ -64,7 +64,7 @@ fn has_port(host: &str) -> bool {
     host.rsplit_once(':').is_some_and(|(name, port)| !name.is_empty() && port.parse::<u16>().is_ok())
 }
 
-impl Target {
+impl PushTarget {
     /// Sends one line.
     ///
     /// # Errors
@@ -111,7 +111,7 @@ pub struct InfluxPush {
 impl InfluxPush {
     /// Starts the thread; `failed` gets the first failure, and the first after each success.
     pub fn start(
-        target: Target,
+        target: PushTarget,
         metrics: RunMetrics,
         every: Duration,
         failed: impl Fn(&io::Error) + Send + 'static,

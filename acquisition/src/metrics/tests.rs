@@ -14,8 +14,8 @@ const ANSWER_LIMIT: Duration = Duration::from_secs(60);
 fn told() -> RunMetrics {
     let metrics = RunMetrics::new("0015_0", 2951, 100);
     let attempt = |verdict: Verdict, snr_db| Measurement { verdict: verdict.into(), snr_db, ..Measurement::default() };
-    metrics.observe(&Event::Attempt(&attempt(Verdict::Repeated, 12.0)));
-    metrics.observe(&Event::Attempt(&attempt(Verdict::Accepted, 61.5)));
+    metrics.observe(&RunEvent::Attempt(&attempt(Verdict::Repeated, 12.0)));
+    metrics.observe(&RunEvent::Attempt(&attempt(Verdict::Accepted, 61.5)));
     metrics
 }
 
@@ -29,8 +29,8 @@ fn a_pair_counts_when_it_is_safe() {
     };
     assert_eq!((value("attempts_total"), value("repeats_total")), (Some(2.0), Some(1.0)));
     assert_eq!((value("pairs_accepted"), value("snr_db")), (Some(100.0), Some(61.5)));
-    metrics.observe(&Event::Safe { verdicts: &[], accepted: 101, cost: Cost { checkpoints: 1, ..Cost::default() } });
-    metrics.observe(&Event::Paused);
+    metrics.observe(&RunEvent::Safe { verdicts: &[], accepted: 101, cost: Cost { checkpoints: 1, ..Cost::default() } });
+    metrics.observe(&RunEvent::Paused);
     assert_eq!(
         (value("pairs_accepted"), value("checkpoints_total"), value("paused")),
         (Some(101.0), Some(1.0), Some(1.0))
@@ -65,7 +65,7 @@ fn prometheus_asks_and_gets_an_answer() {
 fn lines_have_no_unknown_numbers() {
     let metrics = told();
     let unknown = Measurement { snr_db: f64::NAN, temperature_c: 21.5, ..Measurement::default() };
-    metrics.observe(&Event::Attempt(&unknown));
+    metrics.observe(&RunEvent::Attempt(&unknown));
     let line = metrics.influx(1_767_600_000_123_456_789);
     assert!(line.starts_with("echolake_run,surface=0015_0 pairs_planned=2951,pairs_accepted=100,"), "{line}");
     assert!(line.ends_with(" 1767600000123456789\n") && line.contains(",temperature_c=21.5,"), "{line}");
@@ -74,13 +74,13 @@ fn lines_have_no_unknown_numbers() {
 
 #[test]
 fn targets_are_read_or_named() {
-    let udp = Target::Udp { host: "lab:8089".into() };
+    let udp = PushTarget::Udp { host: "lab:8089".into() };
     assert_eq!("udp://lab:8089".parse(), Ok(udp));
-    let http = Target::Http { host: "lab:8428".into(), path: "/write?db=lab".into() };
+    let http = PushTarget::Http { host: "lab:8428".into(), path: "/write?db=lab".into() };
     assert_eq!("http://lab:8428/write?db=lab".parse(), Ok(http));
     for wrong in ["lab:8089", "udp://lab", "http://lab:8428", "https://lab:1/write", "http://lab:1/a b", "http://:1/a"]
     {
-        let error = wrong.parse::<Target>().expect_err(wrong).to_string();
+        let error = wrong.parse::<PushTarget>().expect_err(wrong).to_string();
         assert!(error.contains(wrong) && error.contains("hint"), "{error}");
     }
 }
@@ -91,7 +91,7 @@ fn a_store_is_told_a_last_time_at_the_end() {
     socket.set_read_timeout(Some(ANSWER_LIMIT)).expect("set");
     let host = socket.local_addr().expect("an address").to_string();
     let (metrics, hour) = (told(), Duration::from_secs(3_600));
-    drop(InfluxPush::start(Target::Udp { host }, metrics, hour, |e| panic!("{e}")));
+    drop(InfluxPush::start(PushTarget::Udp { host }, metrics, hour, |e| panic!("{e}")));
     let mut buffer = [0; 4096];
     let length = socket.recv(&mut buffer).expect("a datagram");
     assert!(String::from_utf8_lossy(&buffer[..length]).starts_with("echolake_run,surface=0015_0 "));
@@ -116,7 +116,7 @@ fn a_store_that_refuses_is_told_of() {
             String::from_utf8(request).expect("text")
         })
     });
-    let target: Target = format!("http://{host}/write?db=lab").parse().expect("a target");
+    let target: PushTarget = format!("http://{host}/write?db=lab").parse().expect("a target");
     target.send("a b=1 2\n").expect("taken");
     let refused = target.send("a b=1 2\n").expect_err("refused").to_string();
     assert!(refused.contains("400 Bad Request"), "{refused}");

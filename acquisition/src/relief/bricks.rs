@@ -7,9 +7,9 @@ use serde::{Deserialize, Serialize};
 /// A brick wall at 1:10.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
-pub struct Bricks {
+pub struct BrickWall {
     /// Bond of the wall.
-    pub bond: Bond,
+    pub bond: BrickBond,
     /// Length of a stretcher, mm; a header is half as long, less half a joint.
     pub length_mm: f64,
     /// Height of a course without its joint, mm.
@@ -29,7 +29,7 @@ pub struct Bricks {
 /// Bond of a brick wall: the order of its bricks.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
-pub enum Bond {
+pub enum BrickBond {
     /// Stretchers, each course shifted by half a brick.
     Stretcher,
     /// Stretchers and headers in turn.
@@ -46,10 +46,10 @@ struct Brick {
     size: [f64; 2],
 }
 
-impl Default for Bricks {
+impl Default for BrickWall {
     fn default() -> Self {
         Self {
-            bond: Bond::Stretcher,
+            bond: BrickBond::Stretcher,
             length_mm: 80.0,
             height_mm: 30.0,
             joint_width_mm: 4.0,
@@ -61,7 +61,7 @@ impl Default for Bricks {
     }
 }
 
-impl Bricks {
+impl BrickWall {
     pub(super) fn check(&self) -> Result<(), &'static str> {
         let within = |x: f64, low: f64, high: f64| (low..=high).contains(&x);
         if !within(self.length_mm, 5.0, 585.0) || !within(self.height_mm, 2.0, 585.0) {
@@ -96,12 +96,12 @@ impl Bricks {
         let stretcher = self.length_mm + self.joint_width_mm;
         let odd = course.rem_euclid(2) == 1;
         let (column, dx, width) = match self.bond {
-            Bond::Stretcher => {
+            BrickBond::Stretcher => {
                 let x = if odd { x + stretcher / 2.0 } else { x };
                 let column = (x / stretcher).floor();
                 (column as i64, x - (column + 0.5) * stretcher, self.length_mm)
             }
-            Bond::Flemish => {
+            BrickBond::Flemish => {
                 let header = stretcher / 2.0;
                 let period = stretcher + header;
                 // A header stands over the middle of a stretcher.
@@ -132,7 +132,7 @@ mod tests {
 
     #[test]
     fn joints_lie_between_the_bricks() {
-        let wall = Bricks { jitter_mm: 0.0, tilt_deg: 0.0, ..Bricks::default() };
+        let wall = BrickWall { jitter_mm: 0.0, tilt_deg: 0.0, ..BrickWall::default() };
         // The first course spans y = 0 to 34, its first brick x = 0 to 84, joints around it.
         assert_eq!(wall.height(42.0, 17.0), 0.0);
         assert_eq!(wall.height(0.5, 17.0), -8.0);
@@ -142,7 +142,7 @@ mod tests {
 
     #[test]
     fn seeds_tell_walls_apart() {
-        let height = |seed| Bricks { seed, ..Bricks::default() }.height(42.0, 17.0);
+        let height = |seed| BrickWall { seed, ..BrickWall::default() }.height(42.0, 17.0);
         assert_eq!(height(1), height(1));
         assert_ne!(height(1), height(2));
     }

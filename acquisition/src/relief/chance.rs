@@ -3,7 +3,7 @@
 
 /// Numbers that belong to a seed and a purpose.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Chance(u64);
+pub(super) struct SeededRandom(u64);
 
 /// The finaliser of SplitMix64 (Steele, Lea, Flood 2014, "Fast splittable pseudorandom number generators").
 const fn mix(mut x: u64) -> u64 {
@@ -15,7 +15,7 @@ const fn mix(mut x: u64) -> u64 {
 /// SplitMix64's increment: the golden ratio in 64 bits.
 const STEP: u64 = 0x9E37_79B9_7F4A_7C15;
 
-impl Chance {
+impl SeededRandom {
     pub(super) fn new(seed: u64, purpose: u64) -> Self {
         Self(mix(seed.wrapping_mul(STEP).wrapping_add(mix(purpose.wrapping_add(STEP)))))
     }
@@ -82,7 +82,7 @@ mod tests {
 
     #[test]
     fn numbers_are_spread_evenly_and_tell_places_apart() {
-        let chance = Chance::new(1, 2);
+        let chance = SeededRandom::new(1, 2);
         let mut tenths = [0; 10];
         for x in -50..50 {
             for y in -50..50 {
@@ -92,12 +92,12 @@ mod tests {
         // 10,000 draws: a tenth holds 1000 with a standard deviation of 30.
         assert!(tenths.iter().all(|n| (880..1120).contains(n)), "{tenths:?}");
         assert_ne!(chance.at(0, 1).whole(0), chance.at(1, 0).whole(0));
-        assert_ne!(Chance::new(1, 2).whole(0), Chance::new(2, 1).whole(0));
+        assert_ne!(SeededRandom::new(1, 2).whole(0), SeededRandom::new(2, 1).whole(0));
     }
 
     #[test]
     fn noise_is_smooth_and_bounded() {
-        let chance = Chance::new(7, 0);
+        let chance = SeededRandom::new(7, 0);
         let mut last = chance.noise(-3.0, 0.4);
         for step in 1..6000 {
             let now = chance.noise(-3.0 + f64::from(step) * 1e-3, 0.4);

@@ -1,31 +1,31 @@
 //! Squared stones in courses of different heights: coursed ashlar, and slate, whose courses are thin.
 
 use super::PANEL_SIZE_MM;
-use super::chance::Chance;
+use super::chance::SeededRandom;
 use super::microstructure::{JOINT_SHAPE, joint_depth, joint_width};
-use super::parameter::{Layer, Parameter};
-use super::settings::Settings;
-use super::stone::{Faces, bulge, lean, pillow, projection};
-use super::stones::{SEED, Spot, Stones};
+use super::parameter::{ParameterLayer, ReliefParameter};
+use super::settings::WallSettings;
+use super::stone::{StoneFaces, bulge, lean, pillow, projection};
+use super::stones::{SEED, StoneLayout, StoneSpot};
 
-const MESO: Layer = Layer::Mesostructure;
+const MESO: ParameterLayer = ParameterLayer::Mesostructure;
 /// Bulging stones are level from this distance to their edges on, as a share of their smaller side.
 const PILLOW: f64 = 0.35;
 
-const fn course_height([low, high, default]: [f64; 3]) -> Parameter {
-    Parameter::mm("course_height_mm", MESO, [low, high, default], "mean height of a course")
+const fn course_height([low, high, default]: [f64; 3]) -> ReliefParameter {
+    ReliefParameter::mm("course_height_mm", MESO, [low, high, default], "mean height of a course")
 }
 
-const fn stone_length(default: f64) -> Parameter {
-    Parameter::mm("stone_length_mm", MESO, [150.0, 1500.0, default], "mean length of a stone")
+const fn stone_length(default: f64) -> ReliefParameter {
+    ReliefParameter::mm("stone_length_mm", MESO, [150.0, 1500.0, default], "mean length of a stone")
 }
 
-const fn variation(default: f64) -> Parameter {
+const fn variation(default: f64) -> ReliefParameter {
     let about = "courses and stones differ from their mean by up to this share of it";
-    Parameter::number("variation", MESO, "share", [0.0, 0.7, default], about)
+    ReliefParameter::number("variation", MESO, "share", [0.0, 0.7, default], about)
 }
 
-pub(super) const ASHLAR: [Parameter; 10] = [
+pub(super) const ASHLAR: [ReliefParameter; 10] = [
     course_height([80.0, 600.0, 250.0]),
     stone_length(500.0),
     variation(0.4),
@@ -39,7 +39,7 @@ pub(super) const ASHLAR: [Parameter; 10] = [
 ];
 
 /// Slate is laid nearly dry.
-pub(super) const SLATE: [Parameter; 10] = [
+pub(super) const SLATE: [ReliefParameter; 10] = [
     course_height([20.0, 150.0, 50.0]),
     stone_length(600.0),
     variation(0.6),
@@ -53,41 +53,41 @@ pub(super) const SLATE: [Parameter; 10] = [
 ];
 
 /// A wall in courses, model mm.
-pub(super) struct Courses {
-    courses: Vec<Course>,
-    faces: Faces,
-    chance: Chance,
+pub(super) struct CoursedStones {
+    courses: Vec<StoneCourse>,
+    faces: StoneFaces,
+    chance: SeededRandom,
 }
 
-struct Course {
+struct StoneCourse {
     top: f64,
     height: f64,
     /// Right ends of its stones, ascending.
     ends: Vec<f64>,
 }
 
-impl Courses {
-    pub(super) fn of(settings: &Settings, seed: u64) -> Self {
+impl CoursedStones {
+    pub(super) fn of(settings: &WallSettings, seed: u64) -> Self {
         let height = settings.model_mm(&ASHLAR[0]);
         let length = settings.model_mm(&ASHLAR[1]);
         let variation = settings.number(&ASHLAR[2]);
-        let chance = Chance::new(seed, 0xA541);
+        let chance = SeededRandom::new(seed, 0xA541);
         let half = PANEL_SIZE_MM / 2.0;
-        let (mut courses, mut top) = (Vec::<Course>::new(), -half - height * chance.unit(0));
+        let (mut courses, mut top) = (Vec::<StoneCourse>::new(), -half - height * chance.unit(0));
         while top < half {
             let row = chance.at(-1, courses.len() as i64);
             let height = height * (1.0 + variation * row.signed(0));
             top += height;
-            let below = courses.last().map_or(&[][..], |c: &Course| &c.ends);
-            courses.push(Course { top, height, ends: ends(row, length, variation, below) });
+            let below = courses.last().map_or(&[][..], |c: &StoneCourse| &c.ends);
+            courses.push(StoneCourse { top, height, ends: ends(row, length, variation, below) });
         }
-        Self { courses, faces: Faces::of(settings), chance }
+        Self { courses, faces: StoneFaces::of(settings), chance }
     }
 }
 
 // Ends of a course's stones from beyond the left to beyond the right of the panel. Joints do not run on from one
 // course into the next: an end that falls next to one below is moved off it.
-fn ends(row: Chance, length: f64, variation: f64, below: &[f64]) -> Vec<f64> {
+fn ends(row: SeededRandom, length: f64, variation: f64, below: &[f64]) -> Vec<f64> {
     let clear = 0.15 * length * (1.0 - variation);
     let mut at = -PANEL_SIZE_MM / 2.0 - 2.0 * length * row.unit(1);
     let mut ends = Vec::new();
@@ -104,8 +104,8 @@ fn ends(row: Chance, length: f64, variation: f64, below: &[f64]) -> Vec<f64> {
     ends
 }
 
-impl Stones for Courses {
-    fn spot(&self, x: f64, y: f64, half_joint: f64) -> Spot {
+impl StoneLayout for CoursedStones {
+    fn spot(&self, x: f64, y: f64, half_joint: f64) -> StoneSpot {
         let row = self.courses.partition_point(|c| c.top <= y).min(self.courses.len() - 1);
         let course = &self.courses[row];
         let column = course.ends.partition_point(|end| *end <= x).min(course.ends.len() - 1);
@@ -117,6 +117,6 @@ impl Stones for Courses {
         let to_joint = (half_length - dx.abs()).min(half_height - dy.abs()).max(0.0);
         let stone = self.chance.at(column as i64, row as i64);
         let rise = pillow(to_joint - half_joint, PILLOW * 2.0 * half_height.min(half_length));
-        Spot { to_joint, face: self.faces.height(stone, [dx / half_length, dy / half_height], rise) }
+        StoneSpot { to_joint, face: self.faces.height(stone, [dx / half_length, dy / half_height], rise) }
     }
 }

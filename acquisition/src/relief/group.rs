@@ -9,13 +9,13 @@ use std::collections::BTreeMap;
 
 use serde::{Deserialize, Serialize};
 
-use super::chance::Chance;
-use super::{Domain, Error as ReliefError, Parameter, Relief};
+use super::chance::SeededRandom;
+use super::{Error as ReliefError, PanelRelief, ParameterDomain, ReliefParameter};
 
 /// Ranges that a group is drawn from; `ranges.toml`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct Ranges {
+pub struct GroupRanges {
     /// The relief.
     pub relief: String,
     /// Seed of the draw.
@@ -28,13 +28,13 @@ pub struct Ranges {
     #[serde(default)]
     pub fixed: BTreeMap<String, toml::Value>,
     /// Parameters that vary: `[low, high]`, or words, which are taken in turn.
-    pub ranges: BTreeMap<String, Range>,
+    pub ranges: BTreeMap<String, ParameterRange>,
 }
 
 /// Range of one parameter.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(untagged)]
-pub enum Range {
+#[serde(untagged, expecting = "data did not match any variant of untagged enum Range")]
+pub enum ParameterRange {
     /// From, to.
     Numbers([f64; 2]),
     /// One of these.
@@ -55,9 +55,9 @@ pub struct BandLevel {
 
 /// Ranges of the next group, with the reasons.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Step {
+pub struct GroupStep {
     /// The next group's.
-    pub ranges: Ranges,
+    pub ranges: GroupRanges,
     /// Spread of the results, dB.
     pub spread_db: f64,
     /// Factor by which the ranges became wider; below 1 narrower.
@@ -110,7 +110,7 @@ fn default_target() -> f64 {
     1.5
 }
 
-impl Ranges {
+impl GroupRanges {
     /// Parses ranges from TOML and checks them.
     ///
     /// # Errors
@@ -128,7 +128,7 @@ impl Ranges {
     fn check(&self) -> Result<(), Error> {
         let mut relief = self.draw(1)?.swap_remove(0);
         for (key, range) in &self.ranges {
-            if let Range::Words(words) = range {
+            if let ParameterRange::Words(words) = range {
                 words.iter().try_for_each(|word| relief.set(key, word))?;
             }
         }
@@ -146,22 +146,22 @@ impl Ranges {
     ///
     /// # Errors
     /// [`Error`], if a parameter is none of the relief's, or is refused.
-    pub fn draw(&self, count: usize) -> Result<Vec<Relief>, Error> {
-        let mut shared = Relief::by_name(&self.relief)?;
+    pub fn draw(&self, count: usize) -> Result<Vec<PanelRelief>, Error> {
+        let mut shared = PanelRelief::by_name(&self.relief)?;
         for (key, value) in &self.fixed {
             shared.set(key, value.as_str().unwrap_or(&value.to_string()))?;
         }
         let known = shared.describe();
         let mut drawn = vec![shared; count];
-        let own_seed = |p: &&Parameter| p.key == "seed" && !self.fixed.contains_key("seed");
+        let own_seed = |p: &&ReliefParameter| p.key == "seed" && !self.fixed.contains_key("seed");
         if let Some(seed) = known.iter().find(own_seed) {
-            let chance = Chance::new(self.seed, 0x5EED);
+            let chance = SeededRandom::new(self.seed, 0x5EED);
             for (n, relief) in drawn.iter_mut().enumerate() {
                 relief.set(seed.key, &(chance.whole(n as u64) % 1_000_000).to_string())?;
             }
         }
         for (number, (key, range)) in self.ranges.iter().enumerate() {
-            let chance = Chance::new(self.seed, number as u64);
+            let chance = SeededRandom::new(self.seed, number as u64);
             let place = shuffled(chance, count);
             for (n, relief) in drawn.iter_mut().enumerate() {
                 let part = (place[n] as f64 + chance.at(n as i64, 0).unit(0)) / count as f64;
@@ -175,10 +175,10 @@ impl Ranges {
     ///
     /// # Errors
     /// [`Error::Results`] for fewer than two surfaces or levels that are no numbers, else as [`Self::draw`].
-    pub fn next(&self, results: &[BandLevel]) -> Result<Step, Error> {
+    pub fn next(&self, results: &[BandLevel]) -> Result<GroupStep, Error> {
         let spread_db = spread(results)?;
         let factor = (self.target_spread_db / spread_db.max(1e-9)).clamp(1.0 / LARGEST_STEP, LARGEST_STEP);
-        let known = Relief::by_name(&self.relief)?.describe();
+        let known = PanelRelief::by_name(&self.relief)?.describe();
         let (judgement, change) = if factor > 1.0 { ("too alike", "wider") } else { ("far apart", "narrower") };
         let mut reasons = vec![format!(
             "The last group's results lie {spread_db:.2} dB apart, {:.2} dB are wanted: {judgement}, so ranges become {factor:.2} times as wide ({change}).",
@@ -187,27 +187,27 @@ impl Ranges {
         let mut next = Self { seed: self.seed.wrapping_add(1), ..self.clone() };
         for (key, range) in &mut next.ranges {
             let before = range.clone();
-            if let (Range::Numbers(range), Some([low, high])) = (&mut *range, limits(key, &known)) {
+            if let (ParameterRange::Numbers(range), Some([low, high])) = (&mut *range, limits(key, &known)) {
                 *range = stretched(*range, factor, [low, high]);
             }
             reasons.push(match (&before, &*range) {
-                (Range::Numbers(a), Range::Numbers(b)) if a == b => {
+                (ParameterRange::Numbers(a), ParameterRange::Numbers(b)) if a == b => {
                     format!("{key}: stays {} to {}, its limits.", a[0], a[1])
                 }
-                (Range::Numbers(a), Range::Numbers(b)) => {
+                (ParameterRange::Numbers(a), ParameterRange::Numbers(b)) => {
                     format!("{key}: {} to {} becomes {} to {}.", a[0], a[1], b[0], b[1])
                 }
                 _ => format!("{key}: words stay as they are."),
             });
         }
         next.check()?;
-        Ok(Step { ranges: next, spread_db, factor, reasons })
+        Ok(GroupStep { ranges: next, spread_db, factor, reasons })
     }
 }
 
-impl Range {
+impl ParameterRange {
     /// Returns the value at a share of the range, or the `place`-th word.
-    fn value(&self, key: &str, known: &[Parameter], share: f64, place: usize) -> Result<String, Error> {
+    fn value(&self, key: &str, known: &[ReliefParameter], share: f64, place: usize) -> Result<String, Error> {
         match self {
             Self::Words(words) if !words.is_empty() => Ok(words[place % words.len()].clone()),
             Self::Words(_) => Err(self.refused(key, known)),
@@ -218,7 +218,7 @@ impl Range {
                     return Err(self.refused(key, known));
                 }
                 let value = from + (to - from) * share;
-                let whole = known.iter().any(|p| p.key == key && matches!(p.domain, Domain::Whole { .. }));
+                let whole = known.iter().any(|p| p.key == key && matches!(p.domain, ParameterDomain::Whole { .. }));
                 let rounding = if whole {
                     1.0
                 } else if to - from < 10.0 {
@@ -231,7 +231,7 @@ impl Range {
         }
     }
 
-    fn refused(&self, key: &str, known: &[Parameter]) -> Error {
+    fn refused(&self, key: &str, known: &[ReliefParameter]) -> Error {
         let given = match self {
             Self::Numbers([from, to]) => format!("{from} to {to}"),
             Self::Words(words) => format!("{words:?}"),
@@ -241,11 +241,11 @@ impl Range {
     }
 }
 
-fn limits(key: &str, known: &[Parameter]) -> Option<[f64; 2]> {
+fn limits(key: &str, known: &[ReliefParameter]) -> Option<[f64; 2]> {
     known.iter().find(|p| p.key == key).and_then(|p| match p.domain {
-        Domain::Number { low, high, .. } => Some([low, high]),
-        Domain::Whole { low, high, .. } => Some([low as f64, high as f64]),
-        Domain::Choice { .. } => None,
+        ParameterDomain::Number { low, high, .. } => Some([low, high]),
+        ParameterDomain::Whole { low, high, .. } => Some([low as f64, high as f64]),
+        ParameterDomain::Choice { .. } => None,
     })
 }
 
@@ -280,7 +280,7 @@ fn spread(results: &[BandLevel]) -> Result<f64, Error> {
 }
 
 /// 0 to `count - 1` in an order of chance.
-fn shuffled(chance: Chance, count: usize) -> Vec<usize> {
+fn shuffled(chance: SeededRandom, count: usize) -> Vec<usize> {
     let mut order: Vec<usize> = (0..count).collect();
     order.sort_by_key(|n| chance.at(*n as i64, 1).whole(0));
     order
@@ -294,7 +294,7 @@ mod tests {
         [fixed]\nmacrostructure = \"wavy_x\"\n\
         [ranges]\njoint_depth_mm = [10.0, 20.0]\njoint_shape = [\"recessed\", \"v\"]\nstone_length_mm = [400, 800]\n";
 
-    fn number(relief: &Relief, key: &str) -> f64 {
+    fn number(relief: &PanelRelief, key: &str) -> f64 {
         relief.parameters()[key].as_f64().expect("a number")
     }
 
@@ -309,7 +309,7 @@ mod tests {
 
     #[test]
     fn a_group_fills_its_ranges_evenly() {
-        let ranges = Ranges::from_toml(TEXT).expect("ranges");
+        let ranges = GroupRanges::from_toml(TEXT).expect("ranges");
         let group = ranges.draw(8).expect("a group");
         assert_eq!(group, ranges.draw(8).expect("a group"));
         for (key, low, width) in [("joint_depth_mm", 10.0, 10.0), ("stone_length_mm", 400.0, 400.0)] {
@@ -323,34 +323,34 @@ mod tests {
         assert_eq!(pointed, 4);
         let seeds: std::collections::BTreeSet<_> = group.iter().map(|r| r.parameters()["seed"].to_string()).collect();
         assert_eq!(seeds.len(), 8);
-        let other = Ranges { seed: 4, ..ranges };
+        let other = GroupRanges { seed: 4, ..ranges };
         assert_ne!(other.draw(8).expect("a group"), group);
     }
 
     #[test]
     fn alike_results_widen_and_different_ones_narrow() {
-        let ranges = Ranges::from_toml(TEXT).expect("ranges");
+        let ranges = GroupRanges::from_toml(TEXT).expect("ranges");
         // Standard deviation 0.5 dB, 1 is wanted: twice as wide.
         let wider = ranges.next(&results([0.0, 0.5, 1.0])).expect("a step");
         assert_eq!((wider.spread_db, wider.factor), (0.5, 2.0));
-        assert_eq!(wider.ranges.ranges["joint_depth_mm"], Range::Numbers([5.0, 25.0]));
+        assert_eq!(wider.ranges.ranges["joint_depth_mm"], ParameterRange::Numbers([5.0, 25.0]));
         assert_eq!(wider.ranges.seed, 4);
         let narrower = ranges.next(&results([-1.25, 0.0, 1.25])).expect("a step");
-        assert_eq!(narrower.ranges.ranges["stone_length_mm"], Range::Numbers([440.0, 760.0]));
+        assert_eq!(narrower.ranges.ranges["stone_length_mm"], ParameterRange::Numbers([440.0, 760.0]));
         assert!(narrower.reasons[0].contains("far apart") && narrower.reasons.len() == 4, "{:?}", narrower.reasons);
         // Three steps meet the parameter's limits; results that are the same are no division by zero.
         let mut last = ranges;
         for _ in 0..3 {
             last = last.next(&results([1.0, 1.0, 1.0])).expect("a step").ranges;
         }
-        assert_eq!(last.ranges["joint_depth_mm"], Range::Numbers([0.0, 40.0]));
-        assert_eq!(Ranges::from_toml(&last.to_toml()), Ok(last));
+        assert_eq!(last.ranges["joint_depth_mm"], ParameterRange::Numbers([0.0, 40.0]));
+        assert_eq!(GroupRanges::from_toml(&last.to_toml()), Ok(last));
     }
 
     #[test]
     fn what_is_no_group_is_refused() {
         let check = |from: &str, to: &str, expected: &str| {
-            let error = Ranges::from_toml(&TEXT.replace(from, to)).expect_err(to).to_string();
+            let error = GroupRanges::from_toml(&TEXT.replace(from, to)).expect_err(to).to_string();
             assert!(error.contains(expected), "{error}");
         };
         check("[10.0, 20.0]", "[10.0, 50.0]", "range of `joint_depth_mm` is 10 to 50, expected 0 to 40");
@@ -360,7 +360,7 @@ mod tests {
         check("\"v\"", "\"u\"", "`u`, expected recessed");
         check("coursed_ashlar", "marble", "no relief");
         check("= 1.0", "= 0.0", "target_spread_db");
-        let ranges = Ranges::from_toml(TEXT).expect("ranges");
+        let ranges = GroupRanges::from_toml(TEXT).expect("ranges");
         assert!(matches!(ranges.next(&results([0.0; 3])[..1]), Err(Error::Results { .. })));
         assert!(matches!(ranges.next(&results([0.0, f64::NAN, 1.0])), Err(Error::Results { .. })));
     }

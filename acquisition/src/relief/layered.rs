@@ -5,11 +5,11 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::macrostructure::{self, Macrostructure};
-use super::mesostructure::Mesostructure;
-use super::microstructure::{GRAIN, JOINT_DEPTH, JOINT_SHAPE, JOINT_WIDTH, Microstructure, ROUGHNESS};
-use super::parameter::{Domain, Parameter, Setting};
-use super::settings::Settings;
+use super::macrostructure::{self, MacrostructureModel};
+use super::mesostructure::StoneArrangement;
+use super::microstructure::{GRAIN, JOINT_DEPTH, JOINT_SHAPE, JOINT_WIDTH, MicrostructureModel, ROUGHNESS};
+use super::parameter::{ParameterDomain, ParameterValue, ReliefParameter};
+use super::settings::WallSettings;
 use super::stones::SEED;
 use super::{Error, HeightField, PANEL_SIZE_MM, RELIEF_MM};
 
@@ -18,26 +18,26 @@ const DETAIL_MM: f64 = 0.4;
 
 /// A wall in layers.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct Layered {
-    mesostructure: Mesostructure,
+pub struct LayeredWall {
+    mesostructure: StoneArrangement,
     #[serde(flatten)]
-    settings: Settings,
+    settings: WallSettings,
 }
 
-impl Layered {
+impl LayeredWall {
     /// A wall with its default parameters.
-    pub fn new(mesostructure: Mesostructure) -> Self {
-        let default = |p: Parameter| (p.key.to_owned(), p.default_setting());
-        let mut settings = Settings(parameters(mesostructure).into_iter().map(default).collect());
-        if mesostructure == Mesostructure::Macrostructure {
+    pub fn new(mesostructure: StoneArrangement) -> Self {
+        let default = |p: ReliefParameter| (p.key.to_owned(), p.default_setting());
+        let mut settings = WallSettings(parameters(mesostructure).into_iter().map(default).collect());
+        if mesostructure == StoneArrangement::Macrostructure {
             // Without stones and flat it would be Flat.
-            settings.0.insert(macrostructure::SHAPE.key.to_owned(), Setting::Word("wavy_xy".to_owned()));
+            settings.0.insert(macrostructure::SHAPE.key.to_owned(), ParameterValue::Word("wavy_xy".to_owned()));
         }
         Self { mesostructure, settings }
     }
 
     /// Returns the arrangement of its stones.
-    pub fn mesostructure(&self) -> Mesostructure {
+    pub fn mesostructure(&self) -> StoneArrangement {
         self.mesostructure
     }
 
@@ -54,21 +54,21 @@ impl Layered {
         };
         let [width, depth] = [&JOINT_WIDTH, &JOINT_DEPTH].map(|p| self.settings.number(p));
         match self.settings.word(&JOINT_SHAPE) {
-            _ if width == 0.0 || self.mesostructure == Mesostructure::Macrostructure => skin,
+            _ if width == 0.0 || self.mesostructure == StoneArrangement::Macrostructure => skin,
             "flush" => format!("flush joints {width} mm wide, {skin}"),
             shape => format!("{shape} joints {width} mm wide and {depth} mm deep, {skin}"),
         }
     }
 
     /// Returns its parameters with their values.
-    pub fn settings(&self) -> impl Iterator<Item = (&str, &Setting)> {
+    pub fn settings(&self) -> impl Iterator<Item = (&str, &ParameterValue)> {
         self.settings.0.iter().map(|(key, setting)| (key.as_str(), setting))
     }
 
     /// Makes the parameter's value here its default.
-    pub(super) fn name_default(&self, parameter: &mut Parameter) {
-        if let Domain::Choice { options, default } = &mut parameter.domain {
-            let set = self.settings.word(&Parameter::choice(parameter.key, parameter.layer, options, ""));
+    pub(super) fn name_default(&self, parameter: &mut ReliefParameter) {
+        if let ParameterDomain::Choice { options, default } = &mut parameter.domain {
+            let set = self.settings.word(&ReliefParameter::choice(parameter.key, parameter.layer, options, ""));
             *default = options.iter().find(|o| **o == set).unwrap_or(default);
         }
     }
@@ -89,11 +89,11 @@ impl Layered {
     pub(super) fn height_field(&self, cells: usize) -> HeightField {
         let settings = &self.settings;
         let seed = match settings.0.get(SEED.key) {
-            Some(Setting::Whole(seed)) => *seed,
+            Some(ParameterValue::Whole(seed)) => *seed,
             _ => 1,
         };
-        let shape = Macrostructure::of(settings);
-        let skin = Microstructure::of(settings, seed);
+        let shape = MacrostructureModel::of(settings);
+        let skin = MicrostructureModel::of(settings, seed);
         let stones = self.mesostructure.stones(settings, seed);
         let half_joint = settings.model_mm(&JOINT_WIDTH) / 2.0;
         let height = |x: f64, y: f64| {
@@ -116,7 +116,7 @@ impl Layered {
 }
 
 /// Parameters of all layers of a wall.
-pub(super) fn parameters(mesostructure: Mesostructure) -> Vec<Parameter> {
+pub(super) fn parameters(mesostructure: StoneArrangement) -> Vec<ReliefParameter> {
     use macrostructure::{DEPTH, PHASE, SHAPE, WAVELENGTH};
     let large = [SHAPE, DEPTH, WAVELENGTH, PHASE];
     let seed = (mesostructure.parameters().iter().all(|p| p.key != SEED.key)).then_some(SEED);
@@ -133,16 +133,16 @@ fn centred(heights: HeightField) -> HeightField {
 
 #[cfg(test)]
 mod tests {
-    use super::super::{Domain, Relief};
+    use super::super::{PanelRelief, ParameterDomain};
     use super::*;
 
-    fn wall(name: &str, settings: &[(&str, &str)]) -> Relief {
-        let mut relief = Relief::by_name(name).expect(name);
+    fn wall(name: &str, settings: &[(&str, &str)]) -> PanelRelief {
+        let mut relief = PanelRelief::by_name(name).expect(name);
         settings.iter().for_each(|(key, value)| relief.set(key, value).expect(key));
         relief
     }
 
-    fn depth(relief: &Relief) -> f32 {
+    fn depth(relief: &PanelRelief) -> f32 {
         let [low, high] = relief.height_field(128).extent_mm();
         high - low
     }
@@ -168,7 +168,7 @@ mod tests {
             let bytes: Vec<u8> = heights.heights_mm().iter().flat_map(|h| h.to_le_bytes()).collect();
             crc32fast::hash(&bytes)
         };
-        let digests = Mesostructure::ALL.map(|m| digest(m.name()));
+        let digests = StoneArrangement::ALL.map(|m| digest(m.name()));
         assert_eq!(digests, DIGESTS);
     }
 
@@ -186,7 +186,7 @@ mod tests {
 
     #[test]
     fn seeds_and_walls_are_told_apart() {
-        for mesostructure in Mesostructure::ALL {
+        for mesostructure in StoneArrangement::ALL {
             let of = |seed| wall(mesostructure.name(), &[("roughness_mm", "3"), ("seed", seed)]).height_field(32);
             assert_eq!(of("5"), of("5"));
             assert_ne!(of("5"), of("6"), "{mesostructure:?}");
@@ -213,17 +213,17 @@ mod tests {
 
     #[test]
     fn parameters_go_through_json() {
-        for name in Relief::NAMES {
-            let mut relief = Relief::by_name(name).expect(name);
+        for name in PanelRelief::NAMES {
+            let mut relief = PanelRelief::by_name(name).expect(name);
             if relief.describe().iter().any(|p| p.key == "seed") {
                 relief.set("seed", "9").expect("a seed");
             }
-            assert_eq!(Relief::from_json(&relief.to_json().to_string()), Ok(relief));
+            assert_eq!(PanelRelief::from_json(&relief.to_json().to_string()), Ok(relief));
         }
         let deep = r#"{"relief": "stretcher_bond", "parameters": {"joint_depth_mm": 400}}"#;
-        assert!(matches!(Relief::from_json(deep), Err(Error::Value { .. })));
+        assert!(matches!(PanelRelief::from_json(deep), Err(Error::Value { .. })));
         for text in ["", "[]", "{}", r#"{"relief": "flat"}"#] {
-            assert!(matches!(Relief::from_json(text), Err(Error::Text { .. })), "{text}");
+            assert!(matches!(PanelRelief::from_json(text), Err(Error::Text { .. })), "{text}");
         }
     }
 
@@ -248,7 +248,7 @@ mod tests {
                 deep("30")
             );
             assert_eq!(depth(&bricks(&[("joint_shape", "flush")])), 0.0);
-            let mean_square = |relief: &Relief| {
+            let mean_square = |relief: &PanelRelief| {
                 let heights = relief.height_field(512);
                 heights.heights_mm().iter().map(|h| f64::from(h * h)).sum::<f64>()
             };
@@ -281,20 +281,20 @@ mod tests {
         // every joint and every solid.
         #[test]
         fn every_combination_fits_the_relief() {
-            for mesostructure in Mesostructure::ALL {
-                let mut greatest = Relief::Layered(Layered::new(mesostructure));
+            for mesostructure in StoneArrangement::ALL {
+                let mut greatest = PanelRelief::Layered(LayeredWall::new(mesostructure));
                 let parameters = greatest.describe();
                 for parameter in &parameters {
                     match parameter.domain {
-                        Domain::Number { high, .. } => {
+                        ParameterDomain::Number { high, .. } => {
                             greatest.set(parameter.key, &high.to_string()).expect("in range")
                         }
-                        Domain::Whole { .. } => greatest.set(parameter.key, "7").expect("in range"),
-                        Domain::Choice { .. } => {}
+                        ParameterDomain::Whole { .. } => greatest.set(parameter.key, "7").expect("in range"),
+                        ParameterDomain::Choice { .. } => {}
                     }
                 }
                 for parameter in &parameters {
-                    let Domain::Choice { options, .. } = parameter.domain else { continue };
+                    let ParameterDomain::Choice { options, .. } = parameter.domain else { continue };
                     for option in options {
                         let mut relief = greatest.clone();
                         relief.set("macrostructure", "convex").expect("a shape");

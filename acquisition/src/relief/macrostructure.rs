@@ -2,26 +2,30 @@
 
 use super::PANEL_SIZE_MM;
 use super::chance::cosine_of_turns;
-use super::parameter::{Layer, Parameter};
-use super::settings::Settings;
+use super::parameter::{ParameterLayer, ReliefParameter};
+use super::settings::WallSettings;
 
-pub(super) const SHAPE: Parameter = Parameter::choice(
+pub(super) const SHAPE: ReliefParameter = ReliefParameter::choice(
     "macrostructure",
-    Layer::Macrostructure,
+    ParameterLayer::Macrostructure,
     &["flat", "wavy_x", "wavy_y", "wavy_xy", "convex", "concave"],
     "the wall's large shape: waves along x, along y or both, a dome or a bowl",
 );
-pub(super) const DEPTH: Parameter = Parameter::mm(
+pub(super) const DEPTH: ReliefParameter = ReliefParameter::mm(
     "macro_depth_mm",
-    Layer::Macrostructure,
+    ParameterLayer::Macrostructure,
     [0.0, 200.0, 120.0],
     "height of the large shape from its lowest to its highest point; nothing where it is flat",
 );
-pub(super) const WAVELENGTH: Parameter =
-    Parameter::mm("macro_wavelength_mm", Layer::Macrostructure, [600.0, 6000.0, 2500.0], "from crest to crest");
-pub(super) const PHASE: Parameter = Parameter::number(
+pub(super) const WAVELENGTH: ReliefParameter = ReliefParameter::mm(
+    "macro_wavelength_mm",
+    ParameterLayer::Macrostructure,
+    [600.0, 6000.0, 2500.0],
+    "from crest to crest",
+);
+pub(super) const PHASE: ReliefParameter = ReliefParameter::number(
     "macro_phase",
-    Layer::Macrostructure,
+    ParameterLayer::Macrostructure,
     "turns",
     [0.0, 1.0, 0.0],
     "where in a wave the wall's middle is: 0 on a crest, 0.5 in a trough",
@@ -29,8 +33,8 @@ pub(super) const PHASE: Parameter = Parameter::number(
 
 /// The large shape.
 #[derive(Debug, Clone, PartialEq)]
-pub(super) struct Macrostructure {
-    shape: Shape,
+pub(super) struct MacrostructureModel {
+    shape: MacrostructureShape,
     /// Model mm.
     depth: f64,
     wavelength: f64,
@@ -38,22 +42,22 @@ pub(super) struct Macrostructure {
 }
 
 #[derive(Debug, Clone, Copy, PartialEq)]
-enum Shape {
+enum MacrostructureShape {
     Flat,
     Wavy { x: bool, y: bool },
     Convex,
     Concave,
 }
 
-impl Macrostructure {
-    pub(super) fn of(settings: &Settings) -> Self {
+impl MacrostructureModel {
+    pub(super) fn of(settings: &WallSettings) -> Self {
         let shape = match settings.word(&SHAPE) {
-            "wavy_x" => Shape::Wavy { x: true, y: false },
-            "wavy_y" => Shape::Wavy { x: false, y: true },
-            "wavy_xy" => Shape::Wavy { x: true, y: true },
-            "convex" => Shape::Convex,
-            "concave" => Shape::Concave,
-            _ => Shape::Flat,
+            "wavy_x" => MacrostructureShape::Wavy { x: true, y: false },
+            "wavy_y" => MacrostructureShape::Wavy { x: false, y: true },
+            "wavy_xy" => MacrostructureShape::Wavy { x: true, y: true },
+            "convex" => MacrostructureShape::Convex,
+            "concave" => MacrostructureShape::Concave,
+            _ => MacrostructureShape::Flat,
         };
         Self {
             shape,
@@ -71,12 +75,12 @@ impl Macrostructure {
         let wave = |v: f64| 0.5 + 0.5 * cosine_of_turns(v / self.wavelength + self.phase);
         self.depth
             * match self.shape {
-                Shape::Flat => 0.0,
-                Shape::Wavy { x: true, y: false } => wave(x),
-                Shape::Wavy { x: false, .. } => wave(y),
-                Shape::Wavy { x: true, y: true } => (wave(x) + wave(y)) / 2.0,
-                Shape::Convex => dome(),
-                Shape::Concave => 1.0 - dome(),
+                MacrostructureShape::Flat => 0.0,
+                MacrostructureShape::Wavy { x: true, y: false } => wave(x),
+                MacrostructureShape::Wavy { x: false, .. } => wave(y),
+                MacrostructureShape::Wavy { x: true, y: true } => (wave(x) + wave(y)) / 2.0,
+                MacrostructureShape::Convex => dome(),
+                MacrostructureShape::Concave => 1.0 - dome(),
             }
     }
 }

@@ -1,44 +1,44 @@
 //! Bricks in stretcher and in Flemish bond, in full-scale sizes.
 
-use super::Bond;
-use super::chance::Chance;
+use super::BrickBond;
+use super::chance::SeededRandom;
 use super::microstructure::{JOINT_DEPTH, JOINT_SHAPE, JOINT_WIDTH};
-use super::parameter::{Layer, Parameter};
-use super::settings::Settings;
-use super::stone::{Faces, lean, projection};
-use super::stones::{SEED, Spot, Stones};
+use super::parameter::{ParameterLayer, ReliefParameter};
+use super::settings::WallSettings;
+use super::stone::{StoneFaces, lean, projection};
+use super::stones::{SEED, StoneLayout, StoneSpot};
 
-const LENGTH: Parameter = Parameter::mm(
+const LENGTH: ReliefParameter = ReliefParameter::mm(
     "brick_length_mm",
-    Layer::Mesostructure,
+    ParameterLayer::Mesostructure,
     [150.0, 600.0, 250.0],
     "length of a brick; in Flemish bond a header shows half of it, less half a joint",
 );
-const HEIGHT: Parameter =
-    Parameter::mm("brick_height_mm", Layer::Mesostructure, [40.0, 250.0, 65.0], "height of a brick");
+const HEIGHT: ReliefParameter =
+    ReliefParameter::mm("brick_height_mm", ParameterLayer::Mesostructure, [40.0, 250.0, 65.0], "height of a brick");
 
-pub(super) const PARAMETERS: [Parameter; 8] =
+pub(super) const PARAMETERS: [ReliefParameter; 8] =
     [LENGTH, HEIGHT, projection(80.0, 4.0), lean(3.0), SEED, JOINT_SHAPE, JOINT_WIDTH, JOINT_DEPTH];
 
 /// A wall of bricks, model mm.
-pub(super) struct Masonry {
-    bond: Bond,
+pub(super) struct MasonryStones {
+    bond: BrickBond,
     length: f64,
     height: f64,
     joint: f64,
-    faces: Faces,
-    chance: Chance,
+    faces: StoneFaces,
+    chance: SeededRandom,
 }
 
-impl Masonry {
-    pub(super) fn of(settings: &Settings, seed: u64, bond: Bond) -> Self {
+impl MasonryStones {
+    pub(super) fn of(settings: &WallSettings, seed: u64, bond: BrickBond) -> Self {
         Self {
             bond,
             length: settings.model_mm(&LENGTH),
             height: settings.model_mm(&HEIGHT),
             joint: settings.model_mm(&JOINT_WIDTH),
-            faces: Faces::of(settings),
-            chance: Chance::new(seed, 0xB41C),
+            faces: StoneFaces::of(settings),
+            chance: SeededRandom::new(seed, 0xB41C),
         }
     }
 
@@ -48,12 +48,12 @@ impl Masonry {
         let header = stretcher / 2.0;
         let odd = course.rem_euclid(2) as f64;
         match self.bond {
-            Bond::Stretcher => {
+            BrickBond::Stretcher => {
                 let x = x + odd * stretcher / 2.0;
                 let column = (x / stretcher).floor();
                 (column as i64, x - (column + 0.5) * stretcher, stretcher / 2.0)
             }
-            Bond::Flemish => {
+            BrickBond::Flemish => {
                 let period = stretcher + header;
                 // A header stands over the middle of a stretcher.
                 let x = x + odd * period / 2.0;
@@ -70,13 +70,13 @@ impl Masonry {
     }
 }
 
-impl Stones for Masonry {
-    fn spot(&self, x: f64, y: f64, _half_joint: f64) -> Spot {
+impl StoneLayout for MasonryStones {
+    fn spot(&self, x: f64, y: f64, _half_joint: f64) -> StoneSpot {
         let half_height = (self.height + self.joint) / 2.0;
         let course = (y / (2.0 * half_height)).floor();
         let dy = y - (2.0 * course + 1.0) * half_height;
         let (column, dx, half_length) = self.along(x, course as i64);
         let face = self.faces.height(self.chance.at(column, course as i64), [dx / half_length, dy / half_height], 0.0);
-        Spot { to_joint: (half_length - dx.abs()).min(half_height - dy.abs()), face }
+        StoneSpot { to_joint: (half_length - dx.abs()).min(half_height - dy.abs()), face }
     }
 }

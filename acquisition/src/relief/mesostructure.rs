@@ -1,14 +1,14 @@
 //! Mesostructures of walls: the list of all arrangements of stones.
 
-use super::parameter::Parameter;
-use super::settings::Settings;
-use super::stones::Stones;
+use super::parameter::ReliefParameter;
+use super::settings::WallSettings;
+use super::stones::StoneLayout;
 use super::{courses, masonry, primitives, voronoi, wells};
 
 /// Mesostructure of a wall: the arrangement of its stones.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
 #[serde(rename_all = "snake_case")]
-pub enum Mesostructure {
+pub enum StoneArrangement {
     /// No stones: the large shape alone.
     Macrostructure,
     /// Bricks, each course shifted by half a brick.
@@ -29,7 +29,7 @@ pub enum Mesostructure {
     PrimitiveRoot,
 }
 
-impl Mesostructure {
+impl StoneArrangement {
     /// All of them.
     pub const ALL: [Self; 9] = [
         Self::Macrostructure,
@@ -74,7 +74,7 @@ impl Mesostructure {
     }
 
     /// Parameters of the stones and their joints.
-    pub(super) fn parameters(self) -> &'static [Parameter] {
+    pub(super) fn parameters(self) -> &'static [ReliefParameter] {
         match self {
             Self::Macrostructure => &[],
             Self::StretcherBond | Self::FlemishBond => &masonry::PARAMETERS,
@@ -88,16 +88,16 @@ impl Mesostructure {
     }
 
     /// Returns its stones; None if it has none.
-    pub(super) fn stones(self, settings: &Settings, seed: u64) -> Option<Box<dyn Stones>> {
+    pub(super) fn stones(self, settings: &WallSettings, seed: u64) -> Option<Box<dyn StoneLayout>> {
         Some(match self {
             Self::Macrostructure => return None,
-            Self::StretcherBond => Box::new(masonry::Masonry::of(settings, seed, super::Bond::Stretcher)),
-            Self::FlemishBond => Box::new(masonry::Masonry::of(settings, seed, super::Bond::Flemish)),
-            Self::CoursedAshlar | Self::SlatedStone => Box::new(courses::Courses::of(settings, seed)),
-            Self::PolygonalRubble => Box::new(voronoi::Cells::of(settings, seed, voronoi::Outline::Polygons)),
-            Self::RiverRock => Box::new(voronoi::Cells::of(settings, seed, voronoi::Outline::Round)),
-            Self::Primitives => Box::new(primitives::Primitives::of(settings, seed)),
-            Self::PrimitiveRoot => Box::new(wells::Wells::of(settings)),
+            Self::StretcherBond => Box::new(masonry::MasonryStones::of(settings, seed, super::BrickBond::Stretcher)),
+            Self::FlemishBond => Box::new(masonry::MasonryStones::of(settings, seed, super::BrickBond::Flemish)),
+            Self::CoursedAshlar | Self::SlatedStone => Box::new(courses::CoursedStones::of(settings, seed)),
+            Self::PolygonalRubble => Box::new(voronoi::StoneCells::of(settings, seed, voronoi::StoneOutline::Polygons)),
+            Self::RiverRock => Box::new(voronoi::StoneCells::of(settings, seed, voronoi::StoneOutline::Round)),
+            Self::Primitives => Box::new(primitives::PrimitiveStones::of(settings, seed)),
+            Self::PrimitiveRoot => Box::new(wells::DiffuserWells::of(settings)),
         })
     }
 }

@@ -1,53 +1,58 @@
 //! The skin of a wall: its joints' profile, and how rough it is.
 
-use super::chance::Chance;
-use super::parameter::{Layer, Parameter};
-use super::settings::Settings;
+use super::chance::SeededRandom;
+use super::parameter::{ParameterLayer, ReliefParameter};
+use super::settings::WallSettings;
 
-const LAYER: Layer = Layer::Microstructure;
+const LAYER: ParameterLayer = ParameterLayer::Microstructure;
 
-pub(super) const JOINT_SHAPE: Parameter = Parameter::choice(
+pub(super) const JOINT_SHAPE: ReliefParameter = ReliefParameter::choice(
     "joint_shape",
     LAYER,
     &["recessed", "flush", "raked", "concave", "v"],
     "profile of the joints: recessed has a level floor, flush is filled up to the stones, raked has an uneven floor, \
      concave is a bucket handle's arc, v has two slopes",
 );
-pub(super) const JOINT_WIDTH: Parameter = joint_width(10.0);
-pub(super) const JOINT_DEPTH: Parameter = joint_depth(10.0);
-pub(super) const ROUGHNESS: Parameter = Parameter::mm(
+pub(super) const JOINT_WIDTH: ReliefParameter = joint_width(10.0);
+pub(super) const JOINT_DEPTH: ReliefParameter = joint_depth(10.0);
+pub(super) const ROUGHNESS: ReliefParameter = ReliefParameter::mm(
     "roughness_mm",
     LAYER,
     [0.0, 10.0, 0.0],
     "height of the surface's unevenness from its lowest to its highest point at most",
 );
-pub(super) const GRAIN: Parameter =
-    Parameter::mm("roughness_grain_mm", LAYER, [20.0, 400.0, 60.0], "size of the unevenness along the wall");
+pub(super) const GRAIN: ReliefParameter =
+    ReliefParameter::mm("roughness_grain_mm", LAYER, [20.0, 400.0, 60.0], "size of the unevenness along the wall");
 
 /// [`JOINT_WIDTH`] with another default.
-pub(super) const fn joint_width(default: f64) -> Parameter {
-    Parameter::mm("joint_width_mm", LAYER, [0.0, 40.0, default], "width of the joints between stones")
+pub(super) const fn joint_width(default: f64) -> ReliefParameter {
+    ReliefParameter::mm("joint_width_mm", LAYER, [0.0, 40.0, default], "width of the joints between stones")
 }
 
 /// [`JOINT_DEPTH`] with another default.
-pub(super) const fn joint_depth(default: f64) -> Parameter {
-    Parameter::mm("joint_depth_mm", LAYER, [0.0, 40.0, default], "how far the joints lie behind the stones' faces")
+pub(super) const fn joint_depth(default: f64) -> ReliefParameter {
+    ReliefParameter::mm(
+        "joint_depth_mm",
+        LAYER,
+        [0.0, 40.0, default],
+        "how far the joints lie behind the stones' faces",
+    )
 }
 
 /// Joints and skin.
 #[derive(Debug, Clone)]
-pub(super) struct Microstructure {
-    shape: Shape,
+pub(super) struct MicrostructureModel {
+    shape: JointShape,
     /// Model mm.
     half_width: f64,
     depth: f64,
     roughness: f64,
     grain: f64,
-    chance: Chance,
+    chance: SeededRandom,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq)]
-enum Shape {
+enum JointShape {
     Flush,
     Recessed,
     Raked,
@@ -55,14 +60,14 @@ enum Shape {
     V,
 }
 
-impl Microstructure {
-    pub(super) fn of(settings: &Settings, seed: u64) -> Self {
+impl MicrostructureModel {
+    pub(super) fn of(settings: &WallSettings, seed: u64) -> Self {
         let shape = match settings.word(&JOINT_SHAPE) {
-            "flush" => Shape::Flush,
-            "raked" => Shape::Raked,
-            "concave" => Shape::Concave,
-            "v" => Shape::V,
-            _ => Shape::Recessed,
+            "flush" => JointShape::Flush,
+            "raked" => JointShape::Raked,
+            "concave" => JointShape::Concave,
+            "v" => JointShape::V,
+            _ => JointShape::Recessed,
         };
         Self {
             shape,
@@ -70,7 +75,7 @@ impl Microstructure {
             depth: settings.model_mm(&JOINT_DEPTH),
             roughness: settings.model_mm(&ROUGHNESS),
             grain: settings.model_mm(&GRAIN),
-            chance: Chance::new(seed, 0x4A01),
+            chance: SeededRandom::new(seed, 0x4A01),
         }
     }
 
@@ -84,12 +89,14 @@ impl Microstructure {
         // 0 at the joint's edges, 1 in its middle.
         let in_joint = (-inside / self.half_width).clamp(0.0, 1.0);
         let share = match self.shape {
-            Shape::Flush => 0.0,
-            Shape::Recessed => 1.0,
+            JointShape::Flush => 0.0,
+            JointShape::Recessed => 1.0,
             // Mortar that was scratched out is uneven along the joint, by about its width.
-            Shape::Raked => 0.75 + 0.25 * self.chance.noise(x / (2.0 * self.half_width), y / (2.0 * self.half_width)),
-            Shape::Concave => (in_joint * (2.0 - in_joint)).sqrt(),
-            Shape::V => in_joint,
+            JointShape::Raked => {
+                0.75 + 0.25 * self.chance.noise(x / (2.0 * self.half_width), y / (2.0 * self.half_width))
+            }
+            JointShape::Concave => (in_joint * (2.0 - in_joint)).sqrt(),
+            JointShape::V => in_joint,
         };
         -self.depth * share
     }

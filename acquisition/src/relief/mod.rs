@@ -21,13 +21,13 @@ mod voronoi;
 mod wavy;
 mod wells;
 
-pub use bricks::{Bond, Bricks};
-pub use layered::Layered;
-pub use mesostructure::Mesostructure;
-pub use parameter::{Domain, Layer, Parameter, Setting};
+pub use bricks::{BrickBond, BrickWall};
+pub use layered::LayeredWall;
+pub use mesostructure::StoneArrangement;
+pub use parameter::{ParameterDomain, ParameterLayer, ParameterValue, ReliefParameter};
 pub use primitive_root::PrimitiveRootDiffuser;
 pub use settings::FULL_SCALE;
-pub use wavy::Wavy;
+pub use wavy::WavyWall;
 
 pub use echolake_dsp::height_field::HeightField;
 use serde::{Deserialize, Serialize};
@@ -41,7 +41,7 @@ pub const RELIEF_MM: [f64; 2] = [-11.0, 29.0];
 /// A relief and its material.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "relief", rename_all = "snake_case")]
-pub enum Relief {
+pub enum PanelRelief {
     /// A plane print.
     Flat,
     /// A plane absorber: only the direct sound remains.
@@ -51,18 +51,18 @@ pub enum Relief {
     /// A 2D primitive-root diffuser.
     Prd(PrimitiveRootDiffuser),
     /// Bricks in stretcher bond.
-    Brick(Bricks),
+    Brick(BrickWall),
     /// Bricks in Flemish bond.
-    Flemish(Bricks),
+    Flemish(BrickWall),
     /// A smooth macrostructure.
-    Wavy(Wavy),
+    Wavy(WavyWall),
     /// A wall in layers, with full-scale parameters.
-    Layered(Layered),
+    Layered(LayeredWall),
 }
 
 /// Material of a surface.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Material {
+pub struct SurfaceMaterial {
     /// Its name.
     pub name: &'static str,
     /// Pressure reflection factor.
@@ -73,7 +73,7 @@ pub struct Material {
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum Error {
     /// No such relief.
-    #[error("`{given}` is no relief; hint: {}", Relief::NAMES.join(", "))]
+    #[error("`{given}` is no relief; hint: {}", PanelRelief::NAMES.join(", "))]
     Name {
         /// The given name.
         given: String,
@@ -110,8 +110,8 @@ pub enum Error {
     },
 }
 
-impl Relief {
-    /// The names that [`Relief::by_name`] knows.
+impl PanelRelief {
+    /// The names that [`PanelRelief::by_name`] knows.
     pub const NAMES: [&'static str; 16] = [
         "flat",
         "foam",
@@ -141,11 +141,11 @@ impl Relief {
             "foam" => Self::Foam,
             "wood" => Self::Wood,
             "prd" => Self::Prd(PrimitiveRootDiffuser::default()),
-            "brick" => Self::Brick(Bricks { bond: Bond::Stretcher, ..Bricks::default() }),
-            "flemish" => Self::Flemish(Bricks { bond: Bond::Flemish, ..Bricks::default() }),
-            "wavy" => Self::Wavy(Wavy::default()),
-            _ => match Mesostructure::ALL.into_iter().find(|m| m.name() == name) {
-                Some(mesostructure) => Self::Layered(Layered::new(mesostructure)),
+            "brick" => Self::Brick(BrickWall { bond: BrickBond::Stretcher, ..BrickWall::default() }),
+            "flemish" => Self::Flemish(BrickWall { bond: BrickBond::Flemish, ..BrickWall::default() }),
+            "wavy" => Self::Wavy(WavyWall::default()),
+            _ => match StoneArrangement::ALL.into_iter().find(|m| m.name() == name) {
+                Some(mesostructure) => Self::Layered(LayeredWall::new(mesostructure)),
                 None => return Err(Error::Name { given: name.to_owned() }),
             },
         })
@@ -156,7 +156,7 @@ impl Relief {
         Self::NAMES.into_iter().filter(|name| surface.starts_with(name)).max_by_key(|name| name.len())
     }
 
-    /// Parses the text of [`Relief::to_json`]; every parameter is checked, those that are missing have their defaults.
+    /// Parses the text of [`PanelRelief::to_json`]; every parameter is checked, missing ones have their defaults.
     ///
     /// # Errors
     /// [`Error`], as for the names and values themselves.
@@ -186,11 +186,11 @@ impl Relief {
     }
 
     /// Returns the parameters, with ranges and defaults.
-    pub fn describe(&self) -> Vec<Parameter> {
+    pub fn describe(&self) -> Vec<ReliefParameter> {
         match self {
             Self::Layered(wall) => {
                 let mut all = layered::parameters(wall.mesostructure());
-                let fresh = Layered::new(wall.mesostructure());
+                let fresh = LayeredWall::new(wall.mesostructure());
                 all.iter_mut().for_each(|p| fresh.name_default(p));
                 all
             }
@@ -261,15 +261,15 @@ impl Relief {
     }
 
     /// Returns its material. Flat reflects 29.3 % less energy than Wood (Rust et al. 2021), hence 0.83.
-    pub fn material(&self) -> Material {
+    pub fn material(&self) -> SurfaceMaterial {
         match self {
-            Self::Foam => Material { name: "melamine foam", reflection_factor: 0.05 },
-            Self::Wood => Material { name: "MDF", reflection_factor: 0.99 },
-            _ => Material { name: "coated print", reflection_factor: 0.83 },
+            Self::Foam => SurfaceMaterial { name: "melamine foam", reflection_factor: 0.05 },
+            Self::Wood => SurfaceMaterial { name: "MDF", reflection_factor: 0.99 },
+            _ => SurfaceMaterial { name: "coated print", reflection_factor: 0.83 },
         }
     }
 
-    /// Its parameters by name, all that [`Bricks`] and the like have.
+    /// Its parameters by name, all that [`BrickWall`] and the like have.
     pub fn parameters(&self) -> serde_json::Map<String, serde_json::Value> {
         if let Self::Layered(wall) = self {
             let value = |setting| serde_json::to_value(setting).unwrap_or_default();
@@ -319,19 +319,19 @@ mod tests {
 
     #[test]
     fn a_flemish_wall_stays_one_whatever_is_set() {
-        let mut wall = Relief::by_name("flemish").expect("a relief");
+        let mut wall = PanelRelief::by_name("flemish").expect("a relief");
         wall.set("seed", "7").expect("a parameter");
-        assert_eq!(wall, Relief::Flemish(Bricks { bond: Bond::Flemish, seed: 7, ..Bricks::default() }));
+        assert_eq!(wall, PanelRelief::Flemish(BrickWall { bond: BrickBond::Flemish, seed: 7, ..BrickWall::default() }));
         // Parameters alone say what the wall is: the table `surfaces` keeps them.
-        let again: Bricks = serde_json::from_value(wall.parameters().into()).expect("bricks");
-        assert_eq!(Relief::Flemish(again), wall);
+        let again: BrickWall = serde_json::from_value(wall.parameters().into()).expect("bricks");
+        assert_eq!(PanelRelief::Flemish(again), wall);
         let refused = wall.set("bond", "stretcher").expect_err("another relief").to_string();
         assert!(refused.contains("has no parameter `bond`") && !refused.contains("bond,"), "{refused}");
     }
 
     #[test]
     fn parameters_are_set_by_name() {
-        let mut brick = Relief::by_name("brick").expect("a relief");
+        let mut brick = PanelRelief::by_name("brick").expect("a relief");
         brick.set("joint_depth_mm", "6").expect("a parameter");
         brick.set("seed", "7").expect("a parameter");
         assert_eq!(brick.parameters()["joint_depth_mm"], 6.0);
@@ -340,8 +340,8 @@ mod tests {
         for (key, value) in [("joint_depth_mm", "NaN"), ("joint_depth_mm", "-1"), ("length_mm", "0"), ("seed", "1.5")] {
             assert!(brick.set(key, value).is_err(), "{key}={value}");
         }
-        assert!(Relief::Flat.set("depth", "1").expect_err("none").to_string().contains("it has none"));
-        assert!(Relief::by_name("marble").expect_err("unknown").to_string().contains("wavy"));
+        assert!(PanelRelief::Flat.set("depth", "1").expect_err("none").to_string().contains("it has none"));
+        assert!(PanelRelief::by_name("marble").expect_err("unknown").to_string().contains("wavy"));
     }
 
     mod slow {
@@ -349,12 +349,12 @@ mod tests {
 
         #[test]
         fn every_relief_stays_within_its_depth() {
-            for name in Relief::NAMES {
-                let relief = Relief::by_name(name).expect(name);
+            for name in PanelRelief::NAMES {
+                let relief = PanelRelief::by_name(name).expect(name);
                 assert_eq!(relief.name(), name);
                 let [low, high] = relief.height_field(274).extent_mm();
                 assert!(low >= -11.0 && high <= 29.0, "{name}: {low} {high}");
-                let is_plane = matches!(relief, Relief::Flat | Relief::Foam | Relief::Wood);
+                let is_plane = matches!(relief, PanelRelief::Flat | PanelRelief::Foam | PanelRelief::Wood);
                 assert_eq!(high - low < 1.0, is_plane, "{name}: {low} {high}");
                 assert_eq!(relief.height_field(64), relief.height_field(64), "{name}");
             }

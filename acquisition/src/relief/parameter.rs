@@ -7,7 +7,7 @@ use super::Error;
 /// Layer of the wall that a parameter shapes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
-pub enum Layer {
+pub enum ParameterLayer {
     /// The large shape of the wall.
     Macrostructure,
     /// Its stones.
@@ -21,7 +21,7 @@ pub enum Layer {
 /// Domain and default of a parameter.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 #[serde(rename_all = "snake_case")]
-pub enum Domain {
+pub enum ParameterDomain {
     /// A number.
     Number {
         /// Least.
@@ -51,15 +51,15 @@ pub enum Domain {
 
 /// A named parameter.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
-pub struct Parameter {
+pub struct ReliefParameter {
     /// Its name, as in `--set`.
     pub key: &'static str,
     /// The layer that it shapes.
-    pub layer: Layer,
+    pub layer: ParameterLayer,
     /// Its unit; empty for words and counts.
     pub unit: &'static str,
     /// Its domain.
-    pub domain: Domain,
+    pub domain: ParameterDomain,
     /// Its meaning.
     pub about: &'static str,
 }
@@ -67,7 +67,7 @@ pub struct Parameter {
 /// Value of a parameter.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(untagged)]
-pub enum Setting {
+pub enum ParameterValue {
     /// A whole number.
     Whole(u64),
     /// A number.
@@ -76,54 +76,54 @@ pub enum Setting {
     Word(String),
 }
 
-impl Parameter {
+impl ReliefParameter {
     /// A number in millimetres of the full-scale wall.
     pub(super) const fn mm(
         key: &'static str,
-        layer: Layer,
+        layer: ParameterLayer,
         [low, high, default]: [f64; 3],
         about: &'static str,
     ) -> Self {
-        Self { key, layer, unit: "mm full scale", domain: Domain::Number { low, high, default }, about }
+        Self { key, layer, unit: "mm full scale", domain: ParameterDomain::Number { low, high, default }, about }
     }
 
     /// A number of another unit.
     pub(super) const fn number(
         key: &'static str,
-        layer: Layer,
+        layer: ParameterLayer,
         unit: &'static str,
         [low, high, default]: [f64; 3],
         about: &'static str,
     ) -> Self {
-        Self { key, layer, unit, domain: Domain::Number { low, high, default }, about }
+        Self { key, layer, unit, domain: ParameterDomain::Number { low, high, default }, about }
     }
 
     /// A word; the first is the default.
     pub(super) const fn choice(
         key: &'static str,
-        layer: Layer,
+        layer: ParameterLayer,
         options: &'static [&'static str],
         about: &'static str,
     ) -> Self {
-        Self { key, layer, unit: "", domain: Domain::Choice { options, default: options[0] }, about }
+        Self { key, layer, unit: "", domain: ParameterDomain::Choice { options, default: options[0] }, about }
     }
 
     /// A whole number.
     pub(super) const fn whole(
         key: &'static str,
-        layer: Layer,
+        layer: ParameterLayer,
         [low, high, default]: [u64; 3],
         about: &'static str,
     ) -> Self {
-        Self { key, layer, unit: "", domain: Domain::Whole { low, high, default }, about }
+        Self { key, layer, unit: "", domain: ParameterDomain::Whole { low, high, default }, about }
     }
 
     /// Returns its default.
-    pub fn default_setting(&self) -> Setting {
+    pub fn default_setting(&self) -> ParameterValue {
         match self.domain {
-            Domain::Number { default, .. } => Setting::Number(default),
-            Domain::Whole { default, .. } => Setting::Whole(default),
-            Domain::Choice { default, .. } => Setting::Word(default.to_owned()),
+            ParameterDomain::Number { default, .. } => ParameterValue::Number(default),
+            ParameterDomain::Whole { default, .. } => ParameterValue::Whole(default),
+            ParameterDomain::Choice { default, .. } => ParameterValue::Word(default.to_owned()),
         }
     }
 
@@ -131,15 +131,17 @@ impl Parameter {
     ///
     /// # Errors
     /// [`Error::Value`], which names the domain.
-    pub fn parse(&self, relief: &'static str, text: &str) -> Result<Setting, Error> {
+    pub fn parse(&self, relief: &'static str, text: &str) -> Result<ParameterValue, Error> {
         let setting = match self.domain {
-            Domain::Number { low, high, .. } => {
-                text.parse().ok().filter(|x: &f64| (low..=high).contains(x)).map(Setting::Number)
+            ParameterDomain::Number { low, high, .. } => {
+                text.parse().ok().filter(|x: &f64| (low..=high).contains(x)).map(ParameterValue::Number)
             }
-            Domain::Whole { low, high, .. } => {
-                text.parse().ok().filter(|x: &u64| (low..=high).contains(x)).map(Setting::Whole)
+            ParameterDomain::Whole { low, high, .. } => {
+                text.parse().ok().filter(|x: &u64| (low..=high).contains(x)).map(ParameterValue::Whole)
             }
-            Domain::Choice { options, .. } => options.contains(&text).then(|| Setting::Word(text.to_owned())),
+            ParameterDomain::Choice { options, .. } => {
+                options.contains(&text).then(|| ParameterValue::Word(text.to_owned()))
+            }
         };
         setting.ok_or_else(|| Error::Value {
             relief,
@@ -151,7 +153,7 @@ impl Parameter {
     }
 }
 
-impl std::fmt::Display for Domain {
+impl std::fmt::Display for ParameterDomain {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         match self {
             Self::Number { low, high, .. } => write!(f, "{low} to {high}"),
@@ -161,7 +163,7 @@ impl std::fmt::Display for Domain {
     }
 }
 
-impl std::fmt::Display for Setting {
+impl std::fmt::Display for ParameterValue {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         match self {
             Self::Whole(x) => write!(f, "{x}"),

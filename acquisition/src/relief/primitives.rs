@@ -1,32 +1,34 @@
 //! Solids of geometry on a square lattice.
 
-use super::chance::Chance;
+use super::chance::SeededRandom;
 use super::microstructure::{JOINT_SHAPE, joint_depth, joint_width};
-use super::parameter::{Layer, Parameter};
-use super::settings::Settings;
-use super::stones::{SEED, Spot, Stones};
+use super::parameter::{ParameterLayer, ReliefParameter};
+use super::settings::WallSettings;
+use super::stones::{SEED, StoneLayout, StoneSpot};
 
-const MESO: Layer = Layer::Mesostructure;
+const MESO: ParameterLayer = ParameterLayer::Mesostructure;
 
-const SOLID: Parameter = Parameter::choice(
+const SOLID: ReliefParameter = ReliefParameter::choice(
     "primitive",
     MESO,
     &["pyramid", "hemisphere", "box", "wedge", "ridge", "cone", "cylinder"],
     "the solid that is repeated; a wedge rises to one side, a ridge to its middle line",
 );
-const SIZE: Parameter = Parameter::mm("primitive_size_mm", MESO, [100.0, 2000.0, 450.0], "edge of a solid's base");
-const HEIGHT: Parameter = Parameter::mm("primitive_height_mm", MESO, [0.0, 150.0, 150.0], "height of a solid");
-const GAP: Parameter = Parameter::mm("gap_mm", MESO, [0.0, 500.0, 30.0], "between the bases of two solids");
-const VARIATION: Parameter =
-    Parameter::number("variation", MESO, "share", [0.0, 1.0, 0.0], "solids are lower by up to this share");
-const TURN: Parameter = Parameter::choice(
+const SIZE: ReliefParameter =
+    ReliefParameter::mm("primitive_size_mm", MESO, [100.0, 2000.0, 450.0], "edge of a solid's base");
+const HEIGHT: ReliefParameter =
+    ReliefParameter::mm("primitive_height_mm", MESO, [0.0, 150.0, 150.0], "height of a solid");
+const GAP: ReliefParameter = ReliefParameter::mm("gap_mm", MESO, [0.0, 500.0, 30.0], "between the bases of two solids");
+const VARIATION: ReliefParameter =
+    ReliefParameter::number("variation", MESO, "share", [0.0, 1.0, 0.0], "solids are lower by up to this share");
+const TURN: ReliefParameter = ReliefParameter::choice(
     "turn",
     MESO,
     &["alike", "alternating", "random"],
     "how wedges and ridges are turned, in quarter turns",
 );
 
-pub(super) const PARAMETERS: [Parameter; 10] =
+pub(super) const PARAMETERS: [ReliefParameter; 10] =
     [SOLID, SIZE, HEIGHT, GAP, VARIATION, TURN, SEED, JOINT_SHAPE, joint_width(0.0), joint_depth(0.0)];
 
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -48,18 +50,18 @@ enum Turn {
 }
 
 /// A lattice of solids, model mm.
-pub(super) struct Primitives {
+pub(super) struct PrimitiveStones {
     solid: Solid,
     half_size: f64,
     height: f64,
     half_pitch: f64,
     variation: f64,
     turn: Turn,
-    chance: Chance,
+    chance: SeededRandom,
 }
 
-impl Primitives {
-    pub(super) fn of(settings: &Settings, seed: u64) -> Self {
+impl PrimitiveStones {
+    pub(super) fn of(settings: &WallSettings, seed: u64) -> Self {
         let solid = match settings.word(&SOLID) {
             "hemisphere" => Solid::Hemisphere,
             "box" => Solid::Box,
@@ -82,11 +84,11 @@ impl Primitives {
             half_pitch: half_size + settings.model_mm(&GAP) / 2.0,
             variation: settings.number(&VARIATION),
             turn,
-            chance: Chance::new(seed, 0x9813),
+            chance: SeededRandom::new(seed, 0x9813),
         }
     }
 
-    fn turned(&self, place: [f64; 2], cell: [i64; 2], stone: Chance) -> [f64; 2] {
+    fn turned(&self, place: [f64; 2], cell: [i64; 2], stone: SeededRandom) -> [f64; 2] {
         let quarters = match self.turn {
             Turn::Alike => 0,
             Turn::Alternating => (cell[0] + cell[1]).rem_euclid(2) as u64,
@@ -115,8 +117,8 @@ impl Solid {
     }
 }
 
-impl Stones for Primitives {
-    fn spot(&self, x: f64, y: f64, _half_joint: f64) -> Spot {
+impl StoneLayout for PrimitiveStones {
+    fn spot(&self, x: f64, y: f64, _half_joint: f64) -> StoneSpot {
         let pitch = 2.0 * self.half_pitch;
         // A solid stands in the panel's middle.
         let cell = [x, y].map(|v| (v / pitch + 0.5).floor());
@@ -126,6 +128,6 @@ impl Stones for Primitives {
         let place = self.turned([dx / self.half_size, dy / self.half_size], cell, stone);
         let height = self.height * (1.0 - self.variation * stone.unit(0));
         let to_joint = (self.half_pitch - dx.abs()).min(self.half_pitch - dy.abs()).max(0.0);
-        Spot { to_joint, face: height * self.solid.share(place) }
+        StoneSpot { to_joint, face: height * self.solid.share(place) }
     }
 }

@@ -4,7 +4,7 @@ use rand::seq::SliceRandom as _;
 use rand::{Rng as _, SeedableRng as _};
 use rand_chacha::ChaCha8Rng;
 
-use super::{Bond, Bricks, PrimitiveRootDiffuser, Relief, Wavy};
+use super::{BrickBond, BrickWall, PanelRelief, PrimitiveRootDiffuser, WavyWall};
 
 /// Primes p with p - 1 = n (n + 1), n = 5 to 27: nearly square wells, from 117 mm down to 21 mm wide.
 const PRIMES: [u64; 11] = [31, 43, 73, 157, 211, 241, 307, 421, 463, 601, 757];
@@ -20,7 +20,7 @@ enum Typology {
     Wavy,
 }
 
-impl Relief {
+impl PanelRelief {
     /// Relief `number` of the collection that `seed` names; it does not depend on how many there are. Every four from
     /// a multiple of four are one each of bricks in stretcher and in Flemish bond, diffusers and waves, in any order.
     /// Planes are not among them.
@@ -31,8 +31,8 @@ impl Relief {
         deck.shuffle(&mut generator(seed, DECKS | (number / cards)));
         let mut rng = generator(seed, number);
         match deck[(number % cards) as usize] {
-            Stretcher => Self::Brick(bricks(&mut rng, Bond::Stretcher)),
-            Flemish => Self::Flemish(bricks(&mut rng, Bond::Flemish)),
+            Stretcher => Self::Brick(bricks(&mut rng, BrickBond::Stretcher)),
+            Flemish => Self::Flemish(bricks(&mut rng, BrickBond::Flemish)),
             Prd => Self::Prd(diffuser(&mut rng)),
             Wavy => Self::Wavy(waves(&mut rng)),
         }
@@ -45,8 +45,8 @@ fn generator(seed: u64, stream: u64) -> ChaCha8Rng {
     rng
 }
 
-fn bricks(rng: &mut ChaCha8Rng, bond: Bond) -> Bricks {
-    Bricks {
+fn bricks(rng: &mut ChaCha8Rng, bond: BrickBond) -> BrickWall {
+    BrickWall {
         bond,
         length_mm: tenths(rng, 40.0, 120.0),
         height_mm: tenths(rng, 15.0, 45.0),
@@ -62,8 +62,8 @@ fn diffuser(rng: &mut ChaCha8Rng) -> PrimitiveRootDiffuser {
     PrimitiveRootDiffuser { prime: PRIMES[rng.random_range(0..PRIMES.len())], depth_mm: tenths(rng, 8.0, 38.0) }
 }
 
-fn waves(rng: &mut ChaCha8Rng) -> Wavy {
-    Wavy {
+fn waves(rng: &mut ChaCha8Rng) -> WavyWall {
+    WavyWall {
         waves: rng.random_range(1..=8),
         wavelength_mm: tenths(rng, 60.0, 500.0),
         depth_mm: tenths(rng, 6.0, 22.0),
@@ -89,7 +89,7 @@ mod tests {
 
     #[test]
     fn the_same_seed_draws_the_same_reliefs() {
-        let drawn = |seed| (0..100).map(|n| Relief::drawn(seed, n)).collect::<Vec<_>>();
+        let drawn = |seed| (0..100).map(|n| PanelRelief::drawn(seed, n)).collect::<Vec<_>>();
         assert_eq!(drawn(1), drawn(1));
         let (one, two) = (drawn(1), drawn(2));
         // Of two drawn diffusers one pair in thousands is the same by chance.
@@ -102,17 +102,17 @@ mod tests {
     #[test]
     fn every_typology_occurs_in_every_four() {
         for block in 0..50u64 {
-            let names: BTreeSet<_> = (0..4).map(|n| Relief::drawn(7, 4 * block + n).name()).collect();
+            let names: BTreeSet<_> = (0..4).map(|n| PanelRelief::drawn(7, 4 * block + n).name()).collect();
             assert_eq!(names, BTreeSet::from(["brick", "flemish", "prd", "wavy"]), "block {block}");
         }
-        let first: BTreeSet<_> = (0..50).map(|block| Relief::drawn(7, 4 * block).name()).collect();
+        let first: BTreeSet<_> = (0..50).map(|block| PanelRelief::drawn(7, 4 * block).name()).collect();
         assert_eq!(first.len(), 4, "the order changes");
     }
 
     #[test]
     fn every_drawn_relief_can_be_made() {
         for (seed, number) in [1u64, 2, 3].into_iter().flat_map(|seed| (0..200u64).map(move |n| (seed, n))) {
-            let relief = Relief::drawn(seed, number);
+            let relief = PanelRelief::drawn(seed, number);
             assert_eq!(relief.check(), Ok(()), "{relief:?}");
             let [low, high] = relief.height_field(100).extent_mm().map(f64::from);
             assert!(low >= RELIEF_MM[0] && high <= RELIEF_MM[1] && high - low > 1.0, "{low} to {high}: {relief:?}");

@@ -1,37 +1,37 @@
 //! Shape shared by stones of every kind: they stand out, lean and bulge.
 
-use super::chance::Chance;
-use super::parameter::{Layer, Parameter};
-use super::settings::Settings;
+use super::chance::SeededRandom;
+use super::parameter::{ParameterLayer, ReliefParameter};
+use super::settings::WallSettings;
 
 /// Makes the parameter for the stones' height over the wall.
-pub(super) const fn projection(high: f64, default: f64) -> Parameter {
+pub(super) const fn projection(high: f64, default: f64) -> ReliefParameter {
     let about = "stones stand out of the wall by up to this";
-    Parameter::mm("projection_mm", Layer::Mesostructure, [0.0, high, default], about)
+    ReliefParameter::mm("projection_mm", ParameterLayer::Mesostructure, [0.0, high, default], about)
 }
 
 /// Makes the parameter for the stones' lean.
-pub(super) const fn lean(default: f64) -> Parameter {
+pub(super) const fn lean(default: f64) -> ReliefParameter {
     let about = "one edge or corner of a stone stands out over its opposite by up to this";
-    Parameter::mm("lean_mm", Layer::Mesostructure, [0.0, 30.0, default], about)
+    ReliefParameter::mm("lean_mm", ParameterLayer::Mesostructure, [0.0, 30.0, default], about)
 }
 
 /// Makes the parameter for the bulge of the stones' faces.
-pub(super) const fn bulge(high: f64, default: f64) -> Parameter {
+pub(super) const fn bulge(high: f64, default: f64) -> ReliefParameter {
     let about = "the middle of a stone's face stands out over its edges by this";
-    Parameter::mm("bulge_mm", Layer::Mesostructure, [0.0, high, default], about)
+    ReliefParameter::mm("bulge_mm", ParameterLayer::Mesostructure, [0.0, high, default], about)
 }
 
 /// Face of each stone of a wall, model mm.
 #[derive(Debug, Clone)]
-pub(super) struct Faces {
+pub(super) struct StoneFaces {
     projection: f64,
     lean: f64,
     bulge: f64,
 }
 
-impl Faces {
-    pub(super) fn of(settings: &Settings) -> Self {
+impl StoneFaces {
+    pub(super) fn of(settings: &WallSettings) -> Self {
         Self {
             projection: settings.model_mm(&projection(0.0, 0.0)),
             lean: settings.model_mm(&lean(0.0)),
@@ -41,7 +41,7 @@ impl Faces {
 
     /// Height of a stone's face. `place` runs from -1 to 1 over the stone, `rise` from 0 at its edge to 1 where it
     /// bulges most.
-    pub(super) fn height(&self, stone: Chance, place: [f64; 2], rise: f64) -> f64 {
+    pub(super) fn height(&self, stone: SeededRandom, place: [f64; 2], rise: f64) -> f64 {
         let slope = [stone.signed(1), stone.signed(2)];
         // Leaning stones turn out of the wall, never into it.
         let lean: f64 = (0..2).map(|i| slope[i] * place[i].clamp(-1.0, 1.0) + slope[i].abs()).sum();

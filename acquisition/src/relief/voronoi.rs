@@ -1,14 +1,14 @@
 //! Stones around scattered points, each of the places nearest to its own: polygonal rubble and river rock.
 
 use super::PANEL_SIZE_MM;
-use super::chance::Chance;
+use super::chance::SeededRandom;
 use super::microstructure::{JOINT_SHAPE, joint_depth, joint_width};
-use super::parameter::{Layer, Parameter};
-use super::settings::Settings;
-use super::stone::{Faces, bulge, lean, pillow, projection};
-use super::stones::{SEED, Spot, Stones};
+use super::parameter::{ParameterLayer, ReliefParameter};
+use super::settings::WallSettings;
+use super::stone::{StoneFaces, bulge, lean, pillow, projection};
+use super::stones::{SEED, StoneLayout, StoneSpot};
 
-const MESO: Layer = Layer::Mesostructure;
+const MESO: ParameterLayer = ParameterLayer::Mesostructure;
 /// Round stones leave this share of the way to their middle to the joint: it widens in the corners.
 const CORNERS: f64 = 0.2;
 /// Stones further away than this many lengths of the lattice border on no other.
@@ -16,21 +16,21 @@ const REACH: i64 = 2;
 /// Bulging rubble is level from this distance to its edges on, as a share of the way to its middle.
 const PILLOW: f64 = 0.5;
 
-const fn size([low, high, default]: [f64; 3]) -> Parameter {
-    Parameter::mm("stone_size_mm", MESO, [low, high, default], "mean distance between the middles of stones")
+const fn size([low, high, default]: [f64; 3]) -> ReliefParameter {
+    ReliefParameter::mm("stone_size_mm", MESO, [low, high, default], "mean distance between the middles of stones")
 }
 
-const IRREGULARITY: Parameter = Parameter::number(
+const IRREGULARITY: ReliefParameter = ReliefParameter::number(
     "irregularity",
     MESO,
     "share",
     [0.0, 1.0, 0.65],
     "how far the stones' middles leave their lattice: 0 makes all stones alike",
 );
-const ELONGATION: Parameter =
-    Parameter::number("elongation", MESO, "ratio", [1.0, 3.0, 1.3], "stones are longer than high by this");
+const ELONGATION: ReliefParameter =
+    ReliefParameter::number("elongation", MESO, "ratio", [1.0, 3.0, 1.3], "stones are longer than high by this");
 
-pub(super) const RUBBLE: [Parameter; 10] = [
+pub(super) const RUBBLE: [ReliefParameter; 10] = [
     size([100.0, 1200.0, 400.0]),
     IRREGULARITY,
     ELONGATION,
@@ -43,7 +43,7 @@ pub(super) const RUBBLE: [Parameter; 10] = [
     joint_depth(15.0),
 ];
 
-pub(super) const RIVER_ROCK: [Parameter; 9] = [
+pub(super) const RIVER_ROCK: [ReliefParameter; 9] = [
     size([80.0, 800.0, 280.0]),
     IRREGULARITY,
     ELONGATION,
@@ -57,7 +57,7 @@ pub(super) const RIVER_ROCK: [Parameter; 9] = [
 
 /// Outline of stones.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Outline {
+pub(super) enum StoneOutline {
     /// Halfway to the next.
     Polygons,
     /// The same with its corners rounded, under an elliptic dome.
@@ -65,16 +65,16 @@ pub(super) enum Outline {
 }
 
 /// A wall of cells, model mm.
-pub(super) struct Cells {
+pub(super) struct StoneCells {
     /// Length of the lattice along x and y.
     scale: [f64; 2],
     /// The lattice's first stone, and stones in a row.
     first: [i64; 2],
     row: usize,
     stones: Vec<Stone>,
-    outline: Outline,
-    faces: Faces,
-    chance: Chance,
+    outline: StoneOutline,
+    faces: StoneFaces,
+    chance: SeededRandom,
 }
 
 struct Stone {
@@ -84,12 +84,12 @@ struct Stone {
     radius: f64,
 }
 
-impl Cells {
-    pub(super) fn of(settings: &Settings, seed: u64, outline: Outline) -> Self {
+impl StoneCells {
+    pub(super) fn of(settings: &WallSettings, seed: u64, outline: StoneOutline) -> Self {
         let size = settings.model_mm(&RUBBLE[0]);
         let scale = [size * settings.number(&ELONGATION), size];
         let irregularity = settings.number(&IRREGULARITY);
-        let chance = Chance::new(seed, 0x5701);
+        let chance = SeededRandom::new(seed, 0x5701);
         // As many stones as places of the panel look at, and those that these look at.
         let first = scale.map(|s| (-PANEL_SIZE_MM / 2.0 / s).floor() as i64 - 2 * REACH);
         let counts = first.map(|first| (-2 * first + 1) as usize);
@@ -101,7 +101,7 @@ impl Cells {
             Stone { middle: [ix as f64 + shift + off(8), iy as f64 + off(9)], radius: 0.0 }
         };
         let stones = (0..counts[0] * counts[1]).map(stone).collect();
-        let mut cells = Self { scale, first, row: counts[0], stones, outline, faces: Faces::of(settings), chance };
+        let mut cells = Self { scale, first, row: counts[0], stones, outline, faces: StoneFaces::of(settings), chance };
         let radius = |n: usize| cells.to_border(cells.stones[n].middle, n);
         let radii: Vec<f64> = (0..cells.stones.len()).map(radius).collect();
         cells.stones.iter_mut().zip(radii).for_each(|(stone, radius)| stone.radius = radius);
@@ -130,9 +130,9 @@ impl Cells {
         };
         let distances = self.around(place).filter(|n| *n != own).map(distance);
         match self.outline {
-            Outline::Polygons => distances.fold(f64::INFINITY, f64::min),
+            StoneOutline::Polygons => distances.fold(f64::INFINITY, f64::min),
             // Like the least of them, but smooth if two are alike.
-            Outline::Round => 1.0 / distances.map(|d| 1.0 / (d * d)).sum::<f64>().sqrt(),
+            StoneOutline::Round => 1.0 / distances.map(|d| 1.0 / (d * d)).sum::<f64>().sqrt(),
         }
     }
 }
@@ -142,8 +142,8 @@ fn squared(a: [f64; 2], b: [f64; 2]) -> f64 {
     d[0] * d[0] + d[1] * d[1]
 }
 
-impl Stones for Cells {
-    fn spot(&self, x: f64, y: f64, half_joint: f64) -> Spot {
+impl StoneLayout for StoneCells {
+    fn spot(&self, x: f64, y: f64, half_joint: f64) -> StoneSpot {
         let place = [x / self.scale[0], y / self.scale[1]];
         let nearest = |(best, least): (usize, f64), n: usize| {
             let distance = squared(place, self.stones[n].middle);
@@ -153,11 +153,11 @@ impl Stones for Cells {
         let Stone { middle, radius } = &self.stones[own];
         let to_border = self.to_border(place, own);
         let (to_joint, rise) = match self.outline {
-            Outline::Polygons => {
+            StoneOutline::Polygons => {
                 let level = PILLOW * (radius - half_joint).max(0.1 * radius);
                 (to_border, pillow(to_border - half_joint, level))
             }
-            Outline::Round => {
+            StoneOutline::Round => {
                 let to_joint = (to_border - CORNERS * radius).max(0.0);
                 let dome = ((1.0 - CORNERS) * radius - half_joint).max(0.1 * radius);
                 let t = ((to_joint - half_joint) / dome).clamp(0.0, 1.0);
@@ -166,6 +166,6 @@ impl Stones for Cells {
         };
         let stone = self.chance.at(self.first[0] + (own % self.row) as i64, self.first[1] + (own / self.row) as i64);
         let from_middle = [0, 1].map(|i| 2.0 * (place[i] - middle[i]));
-        Spot { to_joint, face: self.faces.height(stone, from_middle, rise) }
+        StoneSpot { to_joint, face: self.faces.height(stone, from_middle, rise) }
     }
 }

@@ -9,7 +9,7 @@ use serde::{Deserialize, Serialize};
 /// A smooth wall at 1:10.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
-pub struct Wavy {
+pub struct WavyWall {
     /// Number of waves.
     pub waves: u64,
     /// Shortest wavelength, mm.
@@ -20,14 +20,14 @@ pub struct Wavy {
     pub seed: u64,
 }
 
-impl Default for Wavy {
+impl Default for WavyWall {
     fn default() -> Self {
         Self { waves: 3, wavelength_mm: 250.0, depth_mm: 20.0, seed: 1 }
     }
 }
 
 /// The waves of one wall.
-pub(super) struct Waves(Vec<Wave>);
+pub(super) struct WaveSum(Vec<Wave>);
 
 struct Wave {
     amplitude: f64,
@@ -36,7 +36,7 @@ struct Wave {
     phase: f64,
 }
 
-impl Wavy {
+impl WavyWall {
     pub(super) fn check(&self) -> Result<(), &'static str> {
         if !(1..=32).contains(&self.waves) {
             return Err("1 to 32 waves");
@@ -47,7 +47,7 @@ impl Wavy {
         Ok(())
     }
 
-    pub(super) fn waves(&self) -> Waves {
+    pub(super) fn waves(&self) -> WaveSum {
         let mut rng = ChaCha8Rng::seed_from_u64(self.seed);
         let amplitude = self.depth_mm / 2.0 / self.waves as f64;
         let wave = |_| {
@@ -55,11 +55,11 @@ impl Wavy {
             let k = TAU / (self.wavelength_mm * rng.random_range(1.0..2.0));
             Wave { amplitude, kx: k * direction.cos(), ky: k * direction.sin(), phase: rng.random_range(0.0..TAU) }
         };
-        Waves((0..self.waves).map(wave).collect())
+        WaveSum((0..self.waves).map(wave).collect())
     }
 }
 
-impl Waves {
+impl WaveSum {
     pub(super) fn height(&self, x: f64, y: f64) -> f64 {
         self.0.iter().map(|w| w.amplitude * (w.kx * x + w.ky * y + w.phase).cos()).sum()
     }

@@ -1,35 +1,35 @@
 //! The wells of a 2D primitive-root diffuser as a wall's stones.
 
 use super::microstructure::{JOINT_SHAPE, joint_depth, joint_width};
-use super::parameter::{Layer, Parameter};
-use super::settings::Settings;
-use super::stones::{Spot, Stones};
+use super::parameter::{ParameterLayer, ReliefParameter};
+use super::settings::WallSettings;
+use super::stones::{StoneLayout, StoneSpot};
 use super::{PANEL_SIZE_MM, PrimitiveRootDiffuser};
 
-const PRIME: Parameter = Parameter::choice(
+const PRIME: ReliefParameter = ReliefParameter::choice(
     "prime",
-    Layer::Mesostructure,
+    ParameterLayer::Mesostructure,
     &["157", "31", "43", "73", "211", "241", "307", "421", "463", "601", "757"],
     "p of the sequence g^k mod p; p - 1 wells, nearly square for these",
 );
-const DEPTH: Parameter = Parameter::mm(
+const DEPTH: ReliefParameter = ReliefParameter::mm(
     "well_depth_mm",
-    Layer::Mesostructure,
+    ParameterLayer::Mesostructure,
     [10.0, 150.0, 150.0],
     "depth of the deepest well; `prd` makes deeper ones",
 );
 
-pub(super) const PARAMETERS: [Parameter; 5] = [PRIME, DEPTH, JOINT_SHAPE, joint_width(0.0), joint_depth(0.0)];
+pub(super) const PARAMETERS: [ReliefParameter; 5] = [PRIME, DEPTH, JOINT_SHAPE, joint_width(0.0), joint_depth(0.0)];
 
 /// Wells over the panel, model mm.
-pub(super) struct Wells {
+pub(super) struct DiffuserWells {
     depths: Vec<f64>,
     sides: [f64; 2],
     deepest: f64,
 }
 
-impl Wells {
-    pub(super) fn of(settings: &Settings) -> Self {
+impl DiffuserWells {
+    pub(super) fn of(settings: &WallSettings) -> Self {
         let deepest = settings.model_mm(&DEPTH);
         // The options are primes, and the smallest is 31.
         let prime = settings.word(&PRIME).parse().unwrap_or(31);
@@ -39,8 +39,8 @@ impl Wells {
     }
 }
 
-impl Stones for Wells {
-    fn spot(&self, x: f64, y: f64, _half_joint: f64) -> Spot {
+impl StoneLayout for DiffuserWells {
+    fn spot(&self, x: f64, y: f64, _half_joint: f64) -> StoneSpot {
         let mut to_joint = f64::INFINITY;
         let mut well = [0, 0];
         for (i, v) in [x, y].into_iter().enumerate() {
@@ -50,6 +50,6 @@ impl Stones for Wells {
             to_joint = to_joint.min((width / 2.0 - (v - middle).abs()).max(0.0));
             well[i] = index as usize;
         }
-        Spot { to_joint, face: self.deepest - self.depths[well[1] * self.sides[0] as usize + well[0]] }
+        StoneSpot { to_joint, face: self.deepest - self.depths[well[1] * self.sides[0] as usize + well[0]] }
     }
 }

@@ -8,7 +8,7 @@ pub const SPEEDS: RangeInclusive<f32> = 0.01..=1e6;
 
 /// A clock that shows the time of the played messages, ns since 1970.
 #[derive(Debug)]
-pub(super) struct Clock {
+pub(super) struct ReplayClock {
     /// Its time when it was last set, stopped or started.
     shown: u64,
     /// Start of the current run; None while it is stopped.
@@ -16,7 +16,7 @@ pub(super) struct Clock {
     speed: f32,
 }
 
-impl Clock {
+impl ReplayClock {
     /// Makes a clock that is stopped at a time.
     pub(super) fn new(at: u64, speed: f32) -> Self {
         Self { shown: at, since: None, speed: speed.clamp(*SPEEDS.start(), *SPEEDS.end()) }
@@ -65,7 +65,7 @@ mod tests {
 
     #[test]
     fn it_stands_goes_and_is_put_elsewhere() {
-        let mut clock = Clock::new(1_000, 1e9);
+        let mut clock = ReplayClock::new(1_000, 1e9);
         assert_eq!(clock.speed(), *SPEEDS.end());
         assert_eq!(clock.now(), 1_000);
         clock.go(true);

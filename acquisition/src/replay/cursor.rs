@@ -9,11 +9,11 @@ use super::recording::{Key, Message, Recording};
 const OVERLAP: usize = 512 << 20;
 
 /// Damage in the file: its offset, and a text.
-pub(super) type Damage = (u64, String);
+pub(super) type ChunkDamage = (u64, String);
 
 /// A place in a recording.
 #[derive(Debug, Default)]
-pub(super) struct Cursor {
+pub(super) struct MessageCursor {
     wanted: BTreeSet<u16>,
     /// Key of the last message that was given out or skipped.
     passed: Key,
@@ -22,7 +22,7 @@ pub(super) struct Cursor {
     bytes: usize,
 }
 
-impl Cursor {
+impl MessageCursor {
     /// Starts right behind `passed`, with these of the file's channels.
     pub(super) fn behind(passed: Key, wanted: BTreeSet<u16>) -> Self {
         Self { wanted, passed, ..Self::default() }
@@ -39,7 +39,7 @@ impl Cursor {
     }
 
     /// Returns the time of the next message; None behind the last.
-    pub(super) fn peek(&mut self, recording: &Recording, damages: &mut Vec<Damage>) -> Option<u64> {
+    pub(super) fn peek(&mut self, recording: &Recording, damages: &mut Vec<ChunkDamage>) -> Option<u64> {
         self.fill(recording, damages);
         self.first().map(|(_, key)| key.0)
     }
@@ -62,7 +62,7 @@ impl Cursor {
     }
 
     // Opens chunks until none that is closed can have an earlier message than the next.
-    fn fill(&mut self, recording: &Recording, damages: &mut Vec<Damage>) {
+    fn fill(&mut self, recording: &Recording, damages: &mut Vec<ChunkDamage>) {
         while let Some(chunk) = recording.chunks.get(self.next_chunk) {
             if self.first().is_some_and(|(_, key)| key.0 < chunk.start) {
                 return;
@@ -94,7 +94,7 @@ pub(super) fn standing(
     recording: &Recording,
     upto: Key,
     channels: &BTreeSet<u16>,
-    damages: &mut Vec<Damage>,
+    damages: &mut Vec<ChunkDamage>,
 ) -> Vec<Message> {
     let mut found: BTreeMap<u16, Vec<Message>> = BTreeMap::new();
     let mut chunks: Vec<_> = recording.chunks.iter().filter(|c| c.start <= upto.0).collect();

@@ -19,10 +19,10 @@ use std::sync::mpsc;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::JoinHandle;
 
-use crate::viewer::{Playback, Server, ViewerAccess};
+use crate::viewer::{PlaybackControl, ViewerAccess, ViewerServer};
 pub use clock::SPEEDS;
 pub use error::Error;
-use player::Player;
+use player::ReplayPlayer;
 pub use recording::Recording;
 
 /// Limit of pending commands for the player; clients with more wait.
@@ -39,7 +39,7 @@ pub struct ReplayOptions {
 
 /// State of a replay.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Standing {
+pub struct ReplayState {
     /// The recording that is shown.
     pub recording: PathBuf,
     /// Played time since the begin of the first recording, without the gaps between recordings, s.
@@ -59,9 +59,9 @@ pub struct Standing {
 /// A server that replays recordings. Dropped, it disconnects its clients.
 pub struct ReplayServer {
     // Dropped before the thread is waited for, because the server's end is the player's.
-    server: Server,
+    server: ViewerServer,
     _thread: PlayerThread,
-    standing: Arc<Mutex<Standing>>,
+    standing: Arc<Mutex<ReplayState>>,
     length_secs: f64,
     range: (u64, u64),
 }
@@ -82,12 +82,13 @@ impl ReplayServer {
         let nothing = |reason| Error::Nothing { reason };
         let first = recordings.first().ok_or_else(|| nothing("there is no recording"))?;
         let range = recordings.iter().fold(first.range(), |all, r| (all.0, all.1.max(r.range().1)));
-        let playback = Playback { range, commands };
+        let playback = PlaybackControl { range, commands };
         let length_secs = recordings.iter().map(player::secs).sum();
-        let topics = player::Topics::of(&recordings).ok_or_else(|| nothing("there are more topics than channels"))?;
-        let server = Server::start(address, access, topics.all.clone(), Some(playback))
+        let topics =
+            player::ReplayTopics::of(&recordings).ok_or_else(|| nothing("there are more topics than channels"))?;
+        let server = ViewerServer::start(address, access, topics.all.clone(), Some(playback))
             .map_err(|source| Error::Listen { address, source })?;
-        let standing = Arc::new(Mutex::new(Standing {
+        let standing = Arc::new(Mutex::new(ReplayState {
             recording: first.path().to_owned(),
             shown_secs: 0.0,
             is_playing: false,
@@ -96,7 +97,7 @@ impl ReplayServer {
             lost: 0,
             damages: Vec::new(),
         }));
-        let player = Player::new(recordings, topics, options, server.shared().clone(), standing.clone());
+        let player = ReplayPlayer::new(recordings, topics, options, server.shared().clone(), standing.clone());
         let thread = PlayerThread(Some(std::thread::spawn(move || player.run(&obeyed))));
         Ok(Self { server, _thread: thread, standing, length_secs, range })
     }
@@ -122,7 +123,7 @@ impl ReplayServer {
     }
 
     /// Returns its current state.
-    pub fn standing(&self) -> Standing {
+    pub fn standing(&self) -> ReplayState {
         self.standing.lock().unwrap_or_else(PoisonError::into_inner).clone()
     }
 }

@@ -5,12 +5,14 @@ use std::sync::mpsc::{Receiver, RecvTimeoutError};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
-use super::clock::Clock;
-use super::cursor::{Cursor, Damage, standing};
+use super::clock::ReplayClock;
+use super::cursor::{ChunkDamage, MessageCursor, standing};
 use super::recording::{Key, Recording};
-use super::{ReplayOptions, Standing};
+use super::{ReplayOptions, ReplayState};
 use crate::recorder::Topic;
-use crate::viewer::{Command, PlaybackRequest, PlaybackState, PlaybackStatus, Queue, Shared, Waiting};
+use crate::viewer::{
+    ClientQueue, PendingMessage, PlaybackRequest, PlaybackState, PlaybackStatus, PlayerCommand, ViewerState,
+};
 
 /// Interval at which clients get the time.
 const TICK: Duration = Duration::from_millis(33);
@@ -25,14 +27,14 @@ pub(super) fn secs(recording: &Recording) -> f64 {
 }
 
 /// The topics of all recordings, each once.
-pub(super) struct Topics {
+pub(super) struct ReplayTopics {
     /// With the channels that clients know.
     pub(super) all: Vec<Topic>,
     /// Of each recording: the clients' channel by the file's.
     of: Vec<BTreeMap<u16, u16>>,
 }
 
-impl Topics {
+impl ReplayTopics {
     /// None if there are more topics than channels.
     pub(super) fn of(recordings: &[Recording]) -> Option<Self> {
         let (mut all, mut of) = (Vec::<Topic>::new(), Vec::new());
@@ -57,29 +59,29 @@ impl Topics {
 }
 
 /// The player of a replay: its recordings, its clock and its place in them.
-pub(super) struct Player {
+pub(super) struct ReplayPlayer {
     recordings: Vec<Recording>,
-    topics: Topics,
-    shared: Arc<Shared>,
-    told: Arc<Mutex<Standing>>,
-    clock: Clock,
+    topics: ReplayTopics,
+    shared: Arc<ViewerState>,
+    told: Arc<Mutex<ReplayState>>,
+    clock: ReplayClock,
     status: PlaybackStatus,
     /// The recording that is played.
     number: usize,
-    cursor: Cursor,
+    cursor: MessageCursor,
     /// Counter of subscription changes when the cursor was made.
     wishes: u64,
     /// Damage that was reported already.
     damaged: BTreeSet<(usize, u64)>,
 }
 
-impl Player {
+impl ReplayPlayer {
     pub(super) fn new(
         recordings: Vec<Recording>,
-        topics: Topics,
+        topics: ReplayTopics,
         options: ReplayOptions,
-        shared: Arc<Shared>,
-        told: Arc<Mutex<Standing>>,
+        shared: Arc<ViewerState>,
+        told: Arc<Mutex<ReplayState>>,
     ) -> Self {
         let start = recordings.first().map_or(0, |r| r.range().0);
         let status = if options.paused { PlaybackStatus::Paused } else { PlaybackStatus::Playing };
@@ -88,17 +90,17 @@ impl Player {
             topics,
             shared,
             told,
-            clock: Clock::new(start, options.speed),
+            clock: ReplayClock::new(start, options.speed),
             status,
             number: 0,
-            cursor: Cursor::behind(at_all_of(start), BTreeSet::new()),
+            cursor: MessageCursor::behind(at_all_of(start), BTreeSet::new()),
             wishes: 0,
             damaged: BTreeSet::new(),
         }
     }
 
     /// Plays until the server has ended.
-    pub(super) fn run(mut self, commands: &Receiver<Command>) {
+    pub(super) fn run(mut self, commands: &Receiver<PlayerCommand>) {
         while !self.shared.has_ended() {
             let wait = self.step();
             self.tell();
@@ -178,7 +180,7 @@ impl Player {
     fn put(&mut self, time: u64) {
         self.clock.set(time);
         self.wishes = self.shared.wishes();
-        self.cursor = Cursor::behind(at_all_of(time), self.wanted());
+        self.cursor = MessageCursor::behind(at_all_of(time), self.wanted());
     }
 
     // Channels of the file with a subscription.
@@ -191,23 +193,25 @@ impl Player {
         let wishes = self.shared.wishes();
         if wishes != self.wishes {
             self.wishes = wishes;
-            self.cursor = Cursor::behind(self.cursor.passed(), self.wanted());
+            self.cursor = MessageCursor::behind(self.cursor.passed(), self.wanted());
         }
     }
 
-    fn obey(&mut self, commands: Vec<Command>) {
-        let mut new: Vec<(Arc<Queue>, BTreeSet<u16>)> = Vec::new();
-        let seeks = |c: &Command| matches!(c, Command::Playback(request) if request.seek.is_some());
+    fn obey(&mut self, commands: Vec<PlayerCommand>) {
+        let mut new: Vec<(Arc<ClientQueue>, BTreeSet<u16>)> = Vec::new();
+        let seeks = |c: &PlayerCommand| matches!(c, PlayerCommand::Playback(request) if request.seek.is_some());
         // Who drags a slider seeks faster than anything can be shown.
         let mut seeks_left = commands.iter().filter(|c| seeks(c)).count();
         for command in commands {
             seeks_left -= usize::from(seeks(&command));
             match command {
-                Command::Subscribed(queue, wanted) => match new.iter_mut().find(|(q, _)| Arc::ptr_eq(q, &queue)) {
-                    Some((_, channels)) => channels.extend(wanted),
-                    None => new.push((queue, wanted)),
-                },
-                Command::Playback(request) => self.control(request, seeks_left == 0),
+                PlayerCommand::Subscribed(queue, wanted) => {
+                    match new.iter_mut().find(|(q, _)| Arc::ptr_eq(q, &queue)) {
+                        Some((_, channels)) => channels.extend(wanted),
+                        None => new.push((queue, wanted)),
+                    }
+                }
+                PlayerCommand::Playback(request) => self.control(request, seeks_left == 0),
             }
         }
         for (queue, mut channels) in new {
@@ -254,22 +258,22 @@ impl Player {
     }
 
     // Sends clients the current state of their channels.
-    fn show_to(&mut self, clients: &[Arc<Queue>]) {
+    fn show_to(&mut self, clients: &[Arc<ClientQueue>]) {
         let all: Vec<_> = clients.iter().map(|c| (c.clone(), c.wanted().into_iter().collect())).collect();
         self.show(&all);
     }
 
-    fn show(&mut self, to: &[(Arc<Queue>, BTreeSet<u16>)]) {
+    fn show(&mut self, to: &[(Arc<ClientQueue>, BTreeSet<u16>)]) {
         let channels = &self.topics.of[self.number];
         let asked = |to_channel: &u16| to.iter().any(|(_, wanted)| wanted.contains(to_channel));
         let of_file = channels.iter().filter(|(_, to)| asked(to)).map(|(from, _)| *from).collect();
         let mut damages = Vec::new();
         let messages = standing(&self.recordings[self.number], self.cursor.passed(), &of_file, &mut damages);
-        let known: Vec<Waiting> = messages
+        let known: Vec<PendingMessage> = messages
             .into_iter()
             .filter_map(|m| {
                 let channel = *channels.get(&m.channel)?;
-                Some(Waiting { channel, log_time_nanos: m.key.0, data: m.data.into() })
+                Some(PendingMessage { channel, log_time_nanos: m.key.0, data: m.data.into() })
             })
             .collect();
         for (queue, wanted) in to {
@@ -315,7 +319,7 @@ impl Player {
         (told.viewers, told.lost) = (viewers, lost);
     }
 
-    fn note(&mut self, damages: Vec<Damage>) {
+    fn note(&mut self, damages: Vec<ChunkDamage>) {
         for (offset, what) in damages {
             if self.damaged.insert((self.number, offset)) {
                 let path = self.recordings[self.number].path().display();

@@ -11,9 +11,9 @@ use tungstenite::Message;
 use tungstenite::client::IntoClientRequest as _;
 
 use super::*;
-use crate::controller::Keep;
-use crate::relief::Relief;
-use crate::run::{RunRequest, Specimen};
+use crate::controller::RecordingMode;
+use crate::relief::PanelRelief;
+use crate::run::{PanelSpecimen, RunRequest};
 use crate::simulate::simulate;
 
 const SMALL_RIG: &str = include_str!("../../../tests/fixtures/small_rig.toml");
@@ -27,7 +27,7 @@ const ONCE: [&str; 3] = [topics::PANEL_SCENE, topics::PANEL_POINTS, topics::ROBO
 /// Measures a surface, `hours` after the first.
 fn run(folder: &Path, surface: &str, hours: f64) -> PathBuf {
     let rig = Rig::from_toml(SMALL_RIG).expect("a rig");
-    let specimen = Specimen::Relief(Relief::by_name("flat").expect("a relief"));
+    let specimen = PanelSpecimen::Relief(PanelRelief::by_name("flat").expect("a relief"));
     let run = RunRequest {
         rig: &rig,
         surface: surface.parse().expect("an id"),
@@ -37,20 +37,20 @@ fn run(folder: &Path, surface: &str, hours: f64) -> PathBuf {
         start: Timestamp(START).plus_secs(hours * 3_600.0),
         seed: 1,
         tag: 1,
-        keep: Keep::Sweeps,
+        keep: RecordingMode::Sweeps,
         folder,
     };
     simulate(&run, &AtomicBool::new(false), &mut |_| {}).expect("a run").0
 }
 
 /// Topic, time and content.
-type Seen = (String, u64, Vec<u8>);
+type SeenMessage = (String, u64, Vec<u8>);
 
 /// All messages of a file by time.
-fn messages(path: &Path) -> Vec<Seen> {
+fn messages(path: &Path) -> Vec<SeenMessage> {
     let file = std::fs::read(path).expect("the run");
     let stream = mcap::MessageStream::new(&file).expect("an MCAP file").map(|m| m.expect("whole"));
-    let mut all: Vec<Seen> = stream.map(|m| (m.channel.topic.clone(), m.log_time, m.data.to_vec())).collect();
+    let mut all: Vec<SeenMessage> = stream.map(|m| (m.channel.topic.clone(), m.log_time, m.data.to_vec())).collect();
     all.sort_by_key(|(_, time, _)| *time);
     all
 }
@@ -63,19 +63,19 @@ fn replay(paths: &[&Path], options: ReplayOptions) -> ReplayServer {
 /// A message or event at a client.
 #[derive(Debug, PartialEq)]
 enum Heard {
-    Message(Seen),
+    Message(SeenMessage),
     Time(u64),
     /// Status, time, whether it was set, the request.
     State(u8, u64, bool, String),
 }
 
-struct Client {
+struct ReplayClient {
     socket: tungstenite::WebSocket<tungstenite::stream::MaybeTlsStream<TcpStream>>,
     info: Value,
     channels: Vec<(u64, String)>,
 }
 
-impl Client {
+impl ReplayClient {
     fn connect(server: &ReplayServer) -> Self {
         let address = server.address();
         let mut request = format!("ws://{address}").into_client_request().expect("a request");
@@ -128,7 +128,7 @@ impl Client {
         }
     }
 
-    fn seen(&self, bytes: &[u8]) -> Seen {
+    fn seen(&self, bytes: &[u8]) -> SeenMessage {
         let subscription = u32::from_le_bytes(bytes[1..5].try_into().expect("four"));
         let is_its = |(id, _): &&(u64, String)| id + 1_000 == u64::from(subscription);
         let (_, topic) = self.channels.iter().find(is_its).expect("a subscription");
@@ -137,7 +137,7 @@ impl Client {
     }
 
     /// Messages until as many are there.
-    fn collect(&mut self, count: usize) -> Vec<Seen> {
+    fn collect(&mut self, count: usize) -> Vec<SeenMessage> {
         let mut all = Vec::new();
         while all.len() < count {
             match self.socket.read() {
@@ -157,7 +157,7 @@ impl Client {
     }
 
     /// Waits for the answer to a request; returns it, and the messages before it.
-    fn answer(&mut self, id: &str) -> (Heard, Vec<Seen>) {
+    fn answer(&mut self, id: &str) -> (Heard, Vec<SeenMessage>) {
         let mut before = Vec::new();
         loop {
             match self.hear() {
@@ -171,7 +171,7 @@ impl Client {
     }
 }
 
-fn by_content(mut all: Vec<Seen>) -> Vec<Seen> {
+fn by_content(mut all: Vec<SeenMessage>) -> Vec<SeenMessage> {
     all.sort_by(|a, b| (a.1, &a.0, &a.2).cmp(&(b.1, &b.0, &b.2)));
     all
 }
@@ -183,7 +183,7 @@ fn every_message_of_several_runs_comes_once_and_in_order() {
     let expected = [messages(&first), messages(&second)].concat();
     // They are named in the other order.
     let server = replay(&[&second, &first], FAST);
-    let mut client = Client::connect(&server);
+    let mut client = ReplayClient::connect(&server);
     assert_eq!(client.info["capabilities"], json!(["playbackControl", "time"]));
     let time = |t: u64| json!({"sec": t / 1_000_000_000, "nsec": t % 1_000_000_000});
     assert_eq!(client.info["dataStartTime"], time(expected[0].1));
@@ -204,7 +204,7 @@ fn playback_is_paused_put_elsewhere_and_ended() {
     let expected = messages(&path);
     let (start, end) = (expected[0].1, expected[expected.len() - 1].1);
     let server = replay(&[&path], ReplayOptions { speed: 1.0, paused: true });
-    let mut client = Client::connect(&server);
+    let mut client = ReplayClient::connect(&server);
     client.subscribe(&[]);
     // Messages that are in the file once are sent before anything plays.
     let at_start: Vec<_> = expected.iter().filter(|(_, time, _)| *time == start).cloned().collect();
@@ -249,8 +249,8 @@ fn who_sleeps_stops_nobody_and_loses_no_order() {
     let paths: Vec<&Path> = paths.iter().map(PathBuf::as_path).collect();
     let expected: usize = paths.iter().map(|path| messages(path).len()).sum();
     let server = replay(&paths, FAST);
-    let mut sleeper = Client::connect(&server);
-    let mut awake = Client::connect(&server);
+    let mut sleeper = ReplayClient::connect(&server);
+    let mut awake = ReplayClient::connect(&server);
     // The sleeper waits for its first message, so that it is known to be served.
     sleeper.subscribe(&[]);
     sleeper.collect(1);
@@ -300,7 +300,7 @@ fn damage_is_named_and_left_out() {
         .filter(|m| (hit.message_start_time..=hit.message_end_time).contains(&m.1))
         .count();
     let server = replay(&[&path], FAST);
-    let mut client = Client::connect(&server);
+    let mut client = ReplayClient::connect(&server);
     client.subscribe(&[]);
     client.collect(expected.len() - lost);
     let damages = server.standing().damages;
@@ -316,7 +316,7 @@ fn damage_is_named_and_left_out() {
     assert!(cut.defect().is_some_and(|d| d.contains("ends within")), "{:?}", cut.defect());
     let server =
         ReplayServer::start(([127, 0, 0, 1], 0).into(), ViewerAccess::default(), vec![cut], FAST).expect("a server");
-    let mut client = Client::connect(&server);
+    let mut client = ReplayClient::connect(&server);
     client.subscribe(&[topics::PANEL_POINTS]);
     assert_eq!(client.collect(1)[0].0, topics::PANEL_POINTS);
     for (content, expected) in [(&b"no MCAP at all"[..], "it is no MCAP file"), (&whole[..40], "ends within")] {
@@ -332,7 +332,7 @@ fn recordings_of_the_same_time_are_shown_one_after_the_other() {
     let path = run(home.path(), "a", 0.0);
     let expected = messages(&path);
     let server = replay(&[&path, &path], FAST);
-    let mut client = Client::connect(&server);
+    let mut client = ReplayClient::connect(&server);
     client.subscribe(&[]);
     let mut seen = client.collect(2 * expected.len());
     let second = seen.split_off(expected.len());

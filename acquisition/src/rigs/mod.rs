@@ -9,11 +9,11 @@ use echolake_schema::{Rig, Timestamp};
 
 use crate::drivers;
 use crate::prepared_panel::PreparedPanel;
-use crate::rig::{Devices, Error};
+use crate::rig::{Error, RigDevices};
 use crate::robots::Choreography;
-use crate::session::Pace;
+use crate::session::TakePace;
 use paced::paced;
-use simulated::{Simulation, devices};
+use simulated::{RigSimulation, devices};
 
 /// Inputs for opening a rig's devices.
 pub(crate) struct DeviceRequest<'a> {
@@ -30,7 +30,7 @@ pub(crate) struct DeviceRequest<'a> {
 ///
 /// # Errors
 /// [`Error::Device`] if one does not answer, or is not built in.
-pub(crate) fn open_devices(request: &DeviceRequest<'_>, pace: Pace) -> Result<Devices, Error> {
+pub(crate) fn open_devices(request: &DeviceRequest<'_>, pace: TakePace) -> Result<RigDevices, Error> {
     match drivers::open(request.rig)? {
         Some(real) => Ok(real),
         None => simulated_devices(request, pace),
@@ -41,8 +41,8 @@ pub(crate) fn open_devices(request: &DeviceRequest<'_>, pace: Pace) -> Result<De
 ///
 /// # Errors
 /// [`Error::Device`] if the rig's grid has no points.
-pub(crate) fn simulated_devices(request: &DeviceRequest<'_>, pace: Pace) -> Result<Devices, Error> {
-    let devices = devices(&Simulation {
+pub(crate) fn simulated_devices(request: &DeviceRequest<'_>, pace: TakePace) -> Result<RigDevices, Error> {
+    let devices = devices(&RigSimulation {
         rig: request.rig,
         relief: &request.panel.heights,
         reflection_factor: request.panel.reflection_factor,
@@ -51,7 +51,7 @@ pub(crate) fn simulated_devices(request: &DeviceRequest<'_>, pace: Pace) -> Resu
         arms: request.arms.clone(),
     })?;
     Ok(match pace {
-        Pace::Fast => devices,
-        Pace::Secs(secs) => paced(devices, secs),
+        TakePace::Fast => devices,
+        TakePace::Secs(secs) => paced(devices, secs),
     })
 }

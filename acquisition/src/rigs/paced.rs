@@ -3,10 +3,10 @@
 
 use std::time::{Duration, Instant};
 
-use crate::rig::{AudioInterface, Devices, Error, Take};
+use crate::rig::{AudioInterface, AudioTake, Error, RigDevices};
 
 /// Wraps devices so that takes last at least `secs`.
-pub(crate) fn paced(mut devices: Devices, secs: f64) -> Devices {
+pub(crate) fn paced(mut devices: RigDevices, secs: f64) -> RigDevices {
     let pace = Duration::try_from_secs_f64(secs).unwrap_or_default();
     devices.audio = Box::new(Paced { inner: devices.audio, pace });
     devices
@@ -22,7 +22,7 @@ impl AudioInterface for Paced {
         self.inner.rate_hz()
     }
 
-    fn play_and_record(&mut self, output: &[f32], take: &mut Take) -> Result<(), Error> {
+    fn play_and_record(&mut self, output: &[f32], take: &mut AudioTake) -> Result<(), Error> {
         let begun = Instant::now();
         self.inner.play_and_record(output, take)?;
         std::thread::sleep(self.pace.saturating_sub(begun.elapsed()));

@@ -20,7 +20,9 @@ use realfft::num_complex::Complex;
 use realfft::{ComplexToReal, RealToComplex};
 
 use crate::relief::HeightField;
-use crate::rig::{AmbientSensor, AudioInterface, Devices, Error, Positions, Power, Reading, Robots, Take};
+use crate::rig::{
+    AmbientReading, AmbientSensor, ArmPositions, AudioInterface, AudioTake, DrivePower, Error, RigDevices, RobotArms,
+};
 use crate::robots::Choreography;
 
 /// Facets along each side: 2.14 mm, a quarter of the wavelength at 40 kHz.
@@ -47,7 +49,7 @@ const FULL_SCALE: f64 = 8_388_608.0;
 
 /// Settings of a simulation.
 #[derive(Debug, Clone)]
-pub struct Simulation<'a> {
+pub struct RigSimulation<'a> {
     /// The rig.
     pub rig: &'a Rig,
     /// The panel.
@@ -63,11 +65,11 @@ pub struct Simulation<'a> {
 }
 
 /// State that the devices share.
-struct World {
+struct SimulatedWorld {
     grid: Grid,
     now: Timestamp,
     start: Timestamp,
-    power: Power,
+    power: DrivePower,
     /// Microphone's and speaker's position, as indices of the grid's points.
     stand: [usize; 2],
     air: Air,
@@ -82,13 +84,13 @@ struct Air {
     walk: f64,
 }
 
-type Shared = Arc<Mutex<World>>;
+type SharedWorld = Arc<Mutex<SimulatedWorld>>;
 
 /// The devices of a simulated rig.
 ///
 /// # Errors
 /// [`Error::Device`] if the rig's grid has no points.
-pub fn devices(simulation: &Simulation<'_>) -> Result<Devices, Error> {
+pub fn devices(simulation: &RigSimulation<'_>) -> Result<RigDevices, Error> {
     let failed = |e: echolake_schema::Error| Error::Device { device: "simulated rig", reason: e.to_string() };
     let grid = simulation.rig.grid().map_err(failed)?;
     let mut rng = ChaCha8Rng::seed_from_u64(simulation.seed);
@@ -96,17 +98,17 @@ pub fn devices(simulation: &Simulation<'_>) -> Result<Devices, Error> {
     let rate_hz = simulation.rig.sweep.rate_hz.get();
     let plan =
         KirchhoffPlan::new(simulation.relief, &points, rate_hz, response_len(simulation.relief, &points, rate_hz));
-    let world = Arc::new(Mutex::new(World {
+    let world = Arc::new(Mutex::new(SimulatedWorld {
         grid,
         now: simulation.start,
         start: simulation.start,
-        power: Power::Off,
+        power: DrivePower::Off,
         stand: [0, 1],
         air: Air { phase: rng.random_range(0.0..TAU), walk: 0.0 },
         rng,
         outside_level_db: 42.0,
     }));
-    Ok(Devices {
+    Ok(RigDevices {
         robots: Box::new(SimulatedRobots { world: world.clone(), arms: simulation.arms.clone() }),
         audio: Box::new(SimulatedAudio {
             world: world.clone(),
@@ -132,11 +134,11 @@ fn response_len(relief: &HeightField, points: &[[f64; 3]], rate_hz: f64) -> usiz
     (samples as usize).next_power_of_two()
 }
 
-fn lock(world: &Shared) -> MutexGuard<'_, World> {
+fn lock(world: &SharedWorld) -> MutexGuard<'_, SimulatedWorld> {
     world.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-impl World {
+impl SimulatedWorld {
     fn temperature_c(&self) -> f64 {
         let hours = (self.now.0 - self.start.0) as f64 / 3.6e12;
         21.5 + 0.8 * (TAU * hours / 7.0 + self.air.phase).sin() + self.air.walk
@@ -148,15 +150,15 @@ impl World {
 }
 
 struct SimulatedRobots {
-    world: Shared,
+    world: SharedWorld,
     arms: Option<Arc<Choreography>>,
 }
 
-impl Robots for SimulatedRobots {
-    fn move_to(&mut self, microphone_mm: [f64; 3], speaker_mm: [f64; 3]) -> Result<Positions, Error> {
+impl RobotArms for SimulatedRobots {
+    fn move_to(&mut self, microphone_mm: [f64; 3], speaker_mm: [f64; 3]) -> Result<ArmPositions, Error> {
         let mut world = lock(&self.world);
         let refuse = |reason| Error::Unreachable { microphone_mm, speaker_mm, reason };
-        if world.power == Power::Off {
+        if world.power == DrivePower::Off {
             return Err(refuse("the drives are off"));
         }
         let index = |mm| world.grid.point_at(mm).map(|p| p.id.index());
@@ -174,24 +176,24 @@ impl Robots for SimulatedRobots {
         world.stand = [microphone, speaker];
         // The arms repeat to 0.02 mm. The residual is returned; the simulated sound does not depend on it.
         let mut off = |mm: [f64; 3]| mm.map(|x| x + 0.01 * world.normal().clamp(-2.0, 2.0));
-        Ok(Positions { microphone_mm: off(microphone_mm), speaker_mm: off(speaker_mm), joints })
+        Ok(ArmPositions { microphone_mm: off(microphone_mm), speaker_mm: off(speaker_mm), joints })
     }
 
-    fn power(&mut self, power: Power) -> Result<(), Error> {
+    fn power(&mut self, power: DrivePower) -> Result<(), Error> {
         lock(&self.world).power = power;
         Ok(())
     }
 }
 
-struct SimulatedSensor(Shared);
+struct SimulatedSensor(SharedWorld);
 
 impl AmbientSensor for SimulatedSensor {
-    fn read(&mut self) -> Result<Reading, Error> {
+    fn read(&mut self) -> Result<AmbientReading, Error> {
         let mut world = lock(&self.0);
         let hours = (world.now.0 - world.start.0) as f64 / 3.6e12;
         // A resolution of 0.01 C, and as much noise.
         let temperature_c = ((world.temperature_c() + 0.005 * world.normal()) * 100.0).round() / 100.0;
-        Ok(Reading {
+        Ok(AmbientReading {
             at: world.now,
             temperature_c,
             humidity_pct: 45.0 + 4.0 * (TAU * hours / 9.0).sin() + 0.1 * world.normal(),
@@ -202,7 +204,7 @@ impl AmbientSensor for SimulatedSensor {
 }
 
 struct SimulatedAudio {
-    world: Shared,
+    world: SharedWorld,
     rate_hz: f64,
     reflection_factor: f64,
     plan: KirchhoffPlan,
@@ -229,7 +231,7 @@ impl AudioInterface for SimulatedAudio {
         self.rate_hz
     }
 
-    fn play_and_record(&mut self, output: &[f32], take: &mut Take) -> Result<(), Error> {
+    fn play_and_record(&mut self, output: &[f32], take: &mut AudioTake) -> Result<(), Error> {
         let mut world = lock(&self.world);
         world.now = world.now.plus_secs(TAKE_SECS);
         world.air.walk += 0.002 * world.normal();
@@ -247,7 +249,7 @@ impl AudioInterface for SimulatedAudio {
         };
         played.through(&self.response);
         let room = if spoiled { SPOILED_NOISE } else { NOISE[0] };
-        let noise = if world.power == Power::On { room.hypot(DRIVES) } else { room };
+        let noise = if world.power == DrivePower::On { room.hypot(DRIVES) } else { room };
         take.started = Some(world.now);
         quantise(&played.signal[..output.len()], MICROPHONE_GAIN, noise, &mut world, &mut take.microphone);
         quantise(&played.loopback, 1.0, NOISE[1], &mut world, &mut take.loopback);
@@ -302,7 +304,7 @@ impl Played {
 }
 
 // 24 bits with noise; samples over full scale are clipped.
-fn quantise(signal: &[f32], gain: f64, noise: f64, world: &mut World, out: &mut Vec<i32>) {
+fn quantise(signal: &[f32], gain: f64, noise: f64, world: &mut SimulatedWorld, out: &mut Vec<i32>) {
     out.clear();
     out.extend(signal.iter().map(|x| {
         let value = f64::from(*x) * gain + noise * world.normal();
@@ -314,12 +316,12 @@ fn quantise(signal: &[f32], gain: f64, noise: f64, world: &mut World, out: &mut 
 mod tests {
     use super::*;
     use crate::conformance;
-    use crate::relief::Relief;
+    use crate::relief::PanelRelief;
 
-    fn simulated(seed: u64) -> Devices {
-        let (rig, relief) = (Rig::paper(), Relief::Flat.height_field(40));
+    fn simulated(seed: u64) -> RigDevices {
+        let (rig, relief) = (Rig::paper(), PanelRelief::Flat.height_field(40));
         let start = Timestamp(1_767_600_000_000_000_000);
-        devices(&Simulation { rig: &rig, relief: &relief, reflection_factor: 0.83, start, seed, arms: None })
+        devices(&RigSimulation { rig: &rig, relief: &relief, reflection_factor: 0.83, start, seed, arms: None })
             .expect("devices")
     }
 
@@ -338,7 +340,7 @@ mod tests {
 
     #[test]
     fn drives_are_heard_until_they_are_off() {
-        let (mut devices, mut take) = (simulated(1), Take::default());
+        let (mut devices, mut take) = (simulated(1), AudioTake::default());
         let mut noise = |power| {
             devices.robots.power(power).expect("a switch");
             devices.audio.play_and_record(&[0.0; 4_000], &mut take).expect("a take");
@@ -346,14 +348,14 @@ mod tests {
             (sum / 4_000.0).sqrt()
         };
         // 4,000 samples of white noise tell its rms to about 1 %.
-        let (off, on) = (noise(Power::Off), noise(Power::On));
+        let (off, on) = (noise(DrivePower::Off), noise(DrivePower::On));
         assert!((off / NOISE[0] - 1.0).abs() < 0.1, "{off}");
         assert!((on / DRIVES - 1.0).abs() < 0.1, "{on}");
     }
 
     #[test]
     fn responses_hold_the_farthest_echo_at_any_rate() {
-        let relief = Relief::Flat.height_field(40);
+        let relief = PanelRelief::Flat.height_field(40);
         let points: Vec<_> = Rig::paper().grid().expect("a grid").points().iter().map(|p| p.position_mm).collect();
         // From over one corner to the far corner and back, 743.8 mm each way: the third layer's outermost point.
         for rate_hz in [48e3, 96e3, 192e3] {
@@ -366,7 +368,7 @@ mod tests {
     #[test]
     fn seeds_tell_runs_apart_and_repeat_them() {
         let take = |seed| {
-            let (mut devices, mut take) = (simulated(seed), Take::default());
+            let (mut devices, mut take) = (simulated(seed), AudioTake::default());
             devices.audio.play_and_record(&[0.5; 500], &mut take).expect("a take");
             take.microphone
         };

@@ -97,7 +97,7 @@ impl Tool {
 
 /// Part of an arm, as collisions name it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-pub enum Part {
+pub enum ArmPart {
     /// From the foot to the shoulder.
     Column,
     /// From the shoulder to the elbow.
@@ -114,9 +114,9 @@ pub enum Part {
 
 /// All points nearer to a segment than a radius, m.
 #[derive(Debug, Clone, Copy)]
-pub struct Capsule {
+pub struct LinkCapsule {
     /// The part that it encloses.
-    pub part: Part,
+    pub part: ArmPart,
     /// One end.
     pub from: DVec3,
     /// The other.
@@ -126,13 +126,13 @@ pub struct Capsule {
 }
 
 /// An arm on its foot.
-pub struct Arm {
+pub struct RobotArm {
     kinematics: OPWKinematics,
     foot: Pose,
     tool: Tool,
 }
 
-impl Arm {
+impl RobotArm {
     /// Makes an arm with its foot at `foot_m` over the panel, turned by `heading` about the vertical.
     pub fn new(tool: Tool, foot_m: [f64; 3], heading: f64) -> Self {
         let parameters = Parameters {
@@ -185,19 +185,19 @@ impl Arm {
     }
 
     /// The arm as capsules.
-    pub fn capsules(&self, joints: &Joints) -> [Capsule; 6] {
+    pub fn capsules(&self, joints: &Joints) -> [LinkCapsule; 6] {
         let frames = self.frames(joints);
         let at = |i: usize| frames[i].translation;
         let bend = frames[6].transform_point(DVec3::new(0.0, 0.0, self.tool.length_m() * self.straight()));
         let [holder, transducer] = self.tool.radii_m();
-        let capsule = |part, from, to, radius| Capsule { part, from, to, radius };
+        let capsule = |part, from, to, radius| LinkCapsule { part, from, to, radius };
         [
-            capsule(Part::Column, at(0), at(1), RADII_M[0]),
-            capsule(Part::UpperArm, at(2), at(3), RADII_M[1]),
-            capsule(Part::Forearm, at(3), at(5), RADII_M[2]),
-            capsule(Part::Wrist, at(5), at(6), RADII_M[3]),
-            capsule(Part::Holder, at(6), bend, holder),
-            capsule(Part::Transducer, bend, at(7), transducer),
+            capsule(ArmPart::Column, at(0), at(1), RADII_M[0]),
+            capsule(ArmPart::UpperArm, at(2), at(3), RADII_M[1]),
+            capsule(ArmPart::Forearm, at(3), at(5), RADII_M[2]),
+            capsule(ArmPart::Wrist, at(5), at(6), RADII_M[3]),
+            capsule(ArmPart::Holder, at(6), bend, holder),
+            capsule(ArmPart::Transducer, bend, at(7), transducer),
         ]
     }
 
@@ -254,8 +254,8 @@ fn wrapped(angle: f64) -> f64 {
 mod tests {
     use super::*;
 
-    fn arm(tool: Tool) -> Arm {
-        Arm::new(tool, [-0.6, 0.1, -0.2], 0.3)
+    fn arm(tool: Tool) -> RobotArm {
+        RobotArm::new(tool, [-0.6, 0.1, -0.2], 0.3)
     }
 
     #[test]

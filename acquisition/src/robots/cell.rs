@@ -7,8 +7,8 @@ use echolake_schema::robots::{RobotCell, Rod};
 use rs_opw_kinematics::glam::{DQuat, DVec3};
 use rs_opw_kinematics::kinematic_traits::Pose;
 
-use super::arm::{Arm, Capsule, Joints, Part, Tool, from_home, home, in_range};
-use super::clearance::{Surroundings, touches_itself, touching};
+use super::arm::{ArmPart, Joints, LinkCapsule, RobotArm, Tool, from_home, home, in_range};
+use super::clearance::{ArmSurroundings, touches_itself, touching};
 
 /// Inclinations of the microphone's rod that are tried, degrees from the vertical: its wrist then stays on its own
 /// side, and the speaker has room above the microphone.
@@ -23,7 +23,7 @@ const TRIED: [usize; 2] = [6, usize::MAX];
 
 /// Direction of the speaker's axis.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-pub enum Aim {
+pub enum SpeakerAim {
     /// At the point of the panel where a mirror would reflect to the microphone.
     Specular,
     /// Half-way between that point and the one straight below.
@@ -32,7 +32,7 @@ pub enum Aim {
     Down,
 }
 
-impl Aim {
+impl SpeakerAim {
     const ALL: [Self; 3] = [Self::Specular, Self::Steeper, Self::Down];
 
     // The axis from `speaker` for a microphone at `microphone`, both in m over the mirror plane z = 0.
@@ -55,25 +55,25 @@ impl Aim {
 
 /// Joints of both arms at a pair.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Standing {
+pub struct ArmPose {
     /// Joints of the microphone's arm.
     pub microphone: Joints,
     /// Joints of the speaker's arm.
     pub speaker: Joints,
     /// Direction of the speaker's axis.
-    pub aim: Aim,
+    pub aim: SpeakerAim,
 }
 
-impl Standing {
+impl ArmPose {
     /// Both arms at home.
     pub fn home() -> Self {
-        Self { microphone: home(), speaker: home(), aim: Aim::Down }
+        Self { microphone: home(), speaker: home(), aim: SpeakerAim::Down }
     }
 }
 
 /// The reason why a pair cannot be reached.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, thiserror::Error)]
-pub enum Unreachable {
+pub enum UnreachableReason {
     /// A position is not finite.
     #[error("a position is not a number")]
     NoPosition,
@@ -88,10 +88,10 @@ pub enum Unreachable {
     Touches(Tool),
     /// Both arms get there, but not at the same time.
     #[error("the arms would touch: {0:?} of the microphone's and {1:?} of the speaker's")]
-    ArmsTouch(Part, Part),
+    ArmsTouch(ArmPart, ArmPart),
 }
 
-impl Unreachable {
+impl UnreachableReason {
     /// Returns the reason as a static text, for [`crate::rig::Error::Unreachable`].
     pub fn reason(&self) -> &'static str {
         match self {
@@ -109,23 +109,23 @@ impl Unreachable {
 
 /// Both arms and their surroundings.
 pub struct Cell {
-    microphone: Arm,
-    speaker: Arm,
+    microphone: RobotArm,
+    speaker: RobotArm,
     rod: Rod,
-    around: Surroundings,
+    around: ArmSurroundings,
 }
 
 /// One solution for an arm, with the space that it occupies.
 #[derive(Clone)]
-struct Way {
+struct ArmSolution {
     joints: Joints,
-    capsules: [Capsule; 6],
+    capsules: [LinkCapsule; 6],
     cost: f64,
 }
 
 /// Solutions for an arm at a position, or the reason why there are none.
 #[derive(Clone)]
-pub struct Ways(Result<Vec<Way>, Unreachable>);
+pub struct ArmSolutions(Result<Vec<ArmSolution>, UnreachableReason>);
 
 impl Cell {
     /// The arms over a panel with sides of `panel_mm`.
@@ -133,12 +133,12 @@ impl Cell {
         let metres = |mm: [f64; 3]| mm.map(|x| x / 1e3);
         // Each faces the panel.
         let heading = |foot: [f64; 3]| (-foot[1]).atan2(-foot[0]);
-        let arm = |tool, foot| Arm::new(tool, metres(foot), heading(foot));
+        let arm = |tool, foot| RobotArm::new(tool, metres(foot), heading(foot));
         Self {
             microphone: arm(Tool::Microphone, place.microphone_foot_mm),
             speaker: arm(Tool::Speaker, place.speaker_foot_mm),
             rod: place.rod,
-            around: Surroundings {
+            around: ArmSurroundings {
                 half_m: panel_mm / 2e3,
                 relief_m: place.relief_mm / 1e3,
                 table_m: place.table_mm / 1e3,
@@ -153,12 +153,12 @@ impl Cell {
     }
 
     /// Returns the arms' surroundings.
-    pub fn around(&self) -> &Surroundings {
+    pub fn around(&self) -> &ArmSurroundings {
         &self.around
     }
 
     /// The arm that carries a tool.
-    pub fn arm(&self, tool: Tool) -> &Arm {
+    pub fn arm(&self, tool: Tool) -> &RobotArm {
         match tool {
             Tool::Microphone => &self.microphone,
             Tool::Speaker => &self.speaker,
@@ -174,43 +174,43 @@ impl Cell {
     /// Returns joints of both arms that bring the tools to these positions.
     ///
     /// # Errors
-    /// [`Unreachable`], with the obstacle.
-    pub fn reach(&self, microphone_mm: [f64; 3], speaker_mm: [f64; 3]) -> Result<Standing, Unreachable> {
+    /// [`UnreachableReason`], with the obstacle.
+    pub fn reach(&self, microphone_mm: [f64; 3], speaker_mm: [f64; 3]) -> Result<ArmPose, UnreachableReason> {
         self.reach_with(&self.microphone_ways(microphone_mm), microphone_mm, speaker_mm)
     }
 
     /// As [`Self::reach`], with the microphone's ways found before: they do not depend on the speaker.
     ///
     /// # Errors
-    /// [`Unreachable`].
+    /// [`UnreachableReason`].
     pub fn reach_with(
         &self,
-        ways: &Ways,
+        ways: &ArmSolutions,
         microphone_mm: [f64; 3],
         speaker_mm: [f64; 3],
-    ) -> Result<Standing, Unreachable> {
+    ) -> Result<ArmPose, UnreachableReason> {
         if !microphone_mm.iter().chain(&speaker_mm).all(|x| x.is_finite()) {
-            return Err(Unreachable::NoPosition);
+            return Err(UnreachableReason::NoPosition);
         }
         let microphones = ways.0.as_ref().map_err(|e| *e)?;
         let mut failure = None;
-        for aim in Aim::ALL {
+        for aim in SpeakerAim::ALL {
             let solved = self.speaker_solutions(microphone_mm, speaker_mm, aim);
             for most in TRIED {
                 let ways = self.clear_ways(&self.speaker, &solved, most).0;
                 match ways.and_then(|speakers| self.together(microphones, &speakers)) {
-                    Ok([microphone, speaker]) => return Ok(Standing { microphone, speaker, aim }),
+                    Ok([microphone, speaker]) => return Ok(ArmPose { microphone, speaker, aim }),
                     Err(e) => failure = failure.max(Some(e)),
                 }
             }
         }
-        Err(failure.unwrap_or(Unreachable::NoPosition))
+        Err(failure.unwrap_or(UnreachableReason::NoPosition))
     }
 
     /// Returns the solutions of the microphone's arm for a position.
-    pub fn microphone_ways(&self, position_mm: [f64; 3]) -> Ways {
+    pub fn microphone_ways(&self, position_mm: [f64; 3]) -> ArmSolutions {
         if !position_mm.iter().all(|x| x.is_finite()) {
-            return Ways(Err(Unreachable::NoPosition));
+            return ArmSolutions(Err(UnreachableReason::NoPosition));
         }
         let position = DVec3::from_array(position_mm) / 1e3;
         let away = self.microphone.foot().transform_vector(DVec3::X);
@@ -227,7 +227,7 @@ impl Cell {
         self.clear_ways(&self.microphone, &solutions(&self.microphone, poses.map(pose)), usize::MAX)
     }
 
-    fn speaker_solutions(&self, microphone_mm: [f64; 3], speaker_mm: [f64; 3], aim: Aim) -> Vec<Joints> {
+    fn speaker_solutions(&self, microphone_mm: [f64; 3], speaker_mm: [f64; 3], aim: SpeakerAim) -> Vec<Joints> {
         let [microphone, speaker] = [microphone_mm, speaker_mm].map(|mm| DVec3::from_array(mm) / 1e3);
         // From below the panel's plane no mirror is seen; straight down will do, and is refused as what it is.
         let axis = match speaker.z > 0.0 && microphone.z > 0.0 {
@@ -240,28 +240,32 @@ impl Cell {
     }
 
     // The first ways, nearest to home, in which an arm touches neither itself nor its surroundings.
-    fn clear_ways(&self, arm: &Arm, solved: &[Joints], most: usize) -> Ways {
+    fn clear_ways(&self, arm: &RobotArm, solved: &[Joints], most: usize) -> ArmSolutions {
         let mut failure = match solved.is_empty() {
-            true => Unreachable::OutOfReach(arm.tool()),
-            false => Unreachable::Joints(arm.tool()),
+            true => UnreachableReason::OutOfReach(arm.tool()),
+            false => UnreachableReason::Joints(arm.tool()),
         };
         let mut ways = Vec::new();
         for joints in solved.iter().filter(|joints| in_range(joints)) {
             let capsules = arm.capsules(joints);
             if !self.around.is_clear(&capsules) || touches_itself(&capsules, self.around.margin_m) {
-                failure = Unreachable::Touches(arm.tool());
+                failure = UnreachableReason::Touches(arm.tool());
                 continue;
             }
-            ways.push(Way { joints: *joints, capsules, cost: from_home(joints) });
+            ways.push(ArmSolution { joints: *joints, capsules, cost: from_home(joints) });
             if ways.len() == most {
                 break;
             }
         }
-        Ways(if ways.is_empty() { Err(failure) } else { Ok(ways) })
+        ArmSolutions(if ways.is_empty() { Err(failure) } else { Ok(ways) })
     }
 
     // The ways that are nearest to home together, of those in which the arms keep clear of each other.
-    fn together(&self, microphones: &[Way], speakers: &[Way]) -> Result<[Joints; 2], Unreachable> {
+    fn together(
+        &self,
+        microphones: &[ArmSolution],
+        speakers: &[ArmSolution],
+    ) -> Result<[Joints; 2], UnreachableReason> {
         let mut best: Option<(f64, [Joints; 2])> = None;
         let mut touch = None;
         for a in microphones {
@@ -272,11 +276,11 @@ impl Cell {
                 }
                 match touching(&a.capsules, &b.capsules, self.around.margin_m) {
                     None => best = Some((cost, [a.joints, b.joints])),
-                    Some((a, b)) => touch = touch.or(Some(Unreachable::ArmsTouch(a, b))),
+                    Some((a, b)) => touch = touch.or(Some(UnreachableReason::ArmsTouch(a, b))),
                 }
             }
         }
-        best.map(|(_, joints)| joints).ok_or(touch.unwrap_or(Unreachable::NoPosition))
+        best.map(|(_, joints)| joints).ok_or(touch.unwrap_or(UnreachableReason::NoPosition))
     }
 
     /// Returns whether both arms keep clear of each other and of their surroundings.
@@ -288,7 +292,7 @@ impl Cell {
 }
 
 // All joints that bring an arm's tool to one of these poses, nearest to home first.
-fn solutions(arm: &Arm, poses: impl Iterator<Item = Pose>) -> Vec<Joints> {
+fn solutions(arm: &RobotArm, poses: impl Iterator<Item = Pose>) -> Vec<Joints> {
     let mut found: Vec<(f64, Joints)> = poses.flat_map(|pose| arm.solve(pose)).map(|q| (from_home(&q), q)).collect();
     found.sort_by(|a, b| a.0.total_cmp(&b.0));
     found.into_iter().map(|(_, joints)| joints).collect()
@@ -310,7 +314,7 @@ mod tests {
         {
             assert!(wanted.iter().zip(reached).all(|(a, b)| (a - b).abs() < 1e-6), "{reached:?}");
         }
-        assert_eq!(stand.aim, Aim::Specular);
+        assert_eq!(stand.aim, SpeakerAim::Specular);
         // A ray along the axis, mirrored by the plane z = 0, meets the microphone.
         let frame = cell.arm(Tool::Speaker).frames(&stand.speaker)[7];
         let axis = frame.transform_vector(DVec3::Z);
@@ -324,10 +328,10 @@ mod tests {
         let cell = cell();
         let near = [-187.5, -187.5, 124.0];
         let reason = |microphone, speaker| cell.reach(microphone, speaker).expect_err("out of reach");
-        assert_eq!(reason(near, [0.0, 0.0, 5_000.0]), Unreachable::OutOfReach(Tool::Speaker));
-        assert_eq!(reason([0.0, 2_000.0, 124.0], near), Unreachable::OutOfReach(Tool::Microphone));
-        assert_eq!(reason([f64::NAN, 0.0, 124.0], near), Unreachable::NoPosition);
-        assert_eq!(reason([0.0, 0.0, 10.0], near), Unreachable::Touches(Tool::Microphone));
-        assert!(matches!(reason(near, near), Unreachable::ArmsTouch(Part::Transducer, Part::Transducer)));
+        assert_eq!(reason(near, [0.0, 0.0, 5_000.0]), UnreachableReason::OutOfReach(Tool::Speaker));
+        assert_eq!(reason([0.0, 2_000.0, 124.0], near), UnreachableReason::OutOfReach(Tool::Microphone));
+        assert_eq!(reason([f64::NAN, 0.0, 124.0], near), UnreachableReason::NoPosition);
+        assert_eq!(reason([0.0, 0.0, 10.0], near), UnreachableReason::Touches(Tool::Microphone));
+        assert!(matches!(reason(near, near), UnreachableReason::ArmsTouch(ArmPart::Transducer, ArmPart::Transducer)));
     }
 }

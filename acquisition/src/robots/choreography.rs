@@ -6,35 +6,35 @@ use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 use echolake_schema::robots::VisitOrder;
 use echolake_schema::{Error, Grid, Pair, PairId, Rig};
 
-use super::cell::{Cell, Standing, Unreachable, Ways};
+use super::cell::{ArmPose, ArmSolutions, Cell, UnreachableReason};
 use super::plan::{PlanParams, plan};
 
 /// The last one that was computed: a lake's runs have one rig, and computing it takes a second.
-static LAST: Mutex<Option<(Key, Option<Arc<Choreography>>)>> = Mutex::new(None);
+static LAST: Mutex<Option<(RigKey, Option<Arc<Choreography>>)>> = Mutex::new(None);
 
 /// All settings that a choreography depends on, as text.
-type Key = String;
+type RigKey = String;
 
 /// Joints of both arms at all pairs of a grid, each solved when it is first needed.
 pub struct Choreography {
     cell: Arc<Cell>,
     grid: Grid,
-    ways: Vec<OnceLock<Ways>>,
-    standings: Vec<OnceLock<Result<Standing, Unreachable>>>,
+    ways: Vec<OnceLock<ArmSolutions>>,
+    standings: Vec<OnceLock<Result<ArmPose, UnreachableReason>>>,
     /// Each pair's turn, if the rig visits its pairs in a planned order.
     turns: Option<HashMap<PairId, usize>>,
 }
 
 /// A pair that the arms cannot reach.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Missing {
+pub struct MissingPair {
     /// The pair.
     pub pair: Pair,
     /// The reason.
-    pub why: Unreachable,
+    pub why: UnreachableReason,
 }
 
-fn key(rig: &Rig) -> Key {
+fn key(rig: &Rig) -> RigKey {
     format!("{:?} {:?} {}", rig.robots, rig.grid, rig.panel.size_mm)
 }
 
@@ -84,8 +84,8 @@ impl Choreography {
     }
 
     /// Returns the pairs that the arms cannot reach, with the reasons.
-    pub fn missing(&self) -> Vec<Missing> {
-        let missing = |pair: &Pair| self.standing(pair.id).err().map(|why| Missing { pair: *pair, why });
+    pub fn missing(&self) -> Vec<MissingPair> {
+        let missing = |pair: &Pair| self.standing(pair.id).err().map(|why| MissingPair { pair: *pair, why });
         self.grid.pairs().iter().filter_map(missing).collect()
     }
 
@@ -103,10 +103,10 @@ impl Choreography {
     /// Returns the joints of both arms at a pair of the grid.
     ///
     /// # Errors
-    /// [`Unreachable`].
-    pub fn standing(&self, pair: PairId) -> Result<Standing, Unreachable> {
+    /// [`UnreachableReason`].
+    pub fn standing(&self, pair: PairId) -> Result<ArmPose, UnreachableReason> {
         let (Some(lock), Some(pair)) = (self.standings.get(pair.index()), self.grid.pair(pair)) else {
-            return Err(Unreachable::NoPosition);
+            return Err(UnreachableReason::NoPosition);
         };
         *lock.get_or_init(|| {
             let [microphone, speaker] =
@@ -127,7 +127,7 @@ impl Choreography {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::robots::Aim;
+    use crate::robots::SpeakerAim;
 
     #[test]
     fn the_whole_grid_of_the_paper_is_within_reach() {
@@ -135,8 +135,8 @@ mod tests {
         let arms = Choreography::of(&rig).expect("a grid").expect("within reach");
         let grid = rig.grid().expect("a grid");
         for pair in grid.pairs() {
-            let Standing { microphone, speaker, aim } = arms.standing(pair.id).expect("within reach");
-            assert_eq!(aim, Aim::Specular);
+            let ArmPose { microphone, speaker, aim } = arms.standing(pair.id).expect("within reach");
+            assert_eq!(aim, SpeakerAim::Specular);
             assert!(arms.cell.is_clear(&microphone, &speaker), "{pair:?}");
             let wanted = [pair.microphone, pair.speaker].map(|id| grid.points()[id.index()].position_mm);
             for (wanted, reached) in wanted.iter().zip(arms.cell.positions_mm(&microphone, &speaker)) {

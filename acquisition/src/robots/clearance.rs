@@ -2,11 +2,11 @@
 
 use rs_opw_kinematics::glam::DVec3;
 
-use super::arm::{Capsule, Part};
+use super::arm::{ArmPart, LinkCapsule};
 
 /// Obstacles around the arms, beside each other.
 #[derive(Debug, Clone, Copy)]
-pub struct Surroundings {
+pub struct ArmSurroundings {
     /// Half the panel's side, m.
     pub half_m: f64,
     /// The relief's highest point, m over the panel's mean plane.
@@ -18,33 +18,33 @@ pub struct Surroundings {
 }
 
 /// Distance of two capsules' surfaces, m; negative if they overlap.
-pub fn distance(a: &Capsule, b: &Capsule) -> f64 {
+pub fn distance(a: &LinkCapsule, b: &LinkCapsule) -> f64 {
     between(a.from, a.to, b.from, b.to) - a.radius - b.radius
 }
 
 /// The first parts of two arms that are nearer to each other than `margin_m`.
-pub fn touching(a: &[Capsule; 6], b: &[Capsule; 6], margin_m: f64) -> Option<(Part, Part)> {
-    let near = |a: &&Capsule, b: &Capsule| distance(a, b) < margin_m;
+pub fn touching(a: &[LinkCapsule; 6], b: &[LinkCapsule; 6], margin_m: f64) -> Option<(ArmPart, ArmPart)> {
+    let near = |a: &&LinkCapsule, b: &LinkCapsule| distance(a, b) < margin_m;
     a.iter().rev().find_map(|a| b.iter().rev().find(|b| near(&a, b)).map(|b| (a.part, b.part)))
 }
 
 /// Returns whether an arm touches itself: wrist and tool with column and upper arm. Neighbours touch always.
-pub fn touches_itself(arm: &[Capsule; 6], margin_m: f64) -> bool {
+pub fn touches_itself(arm: &[LinkCapsule; 6], margin_m: f64) -> bool {
     arm[3..].iter().any(|outer| arm[..2].iter().any(|inner| distance(outer, inner) < margin_m))
 }
 
-impl Surroundings {
+impl ArmSurroundings {
     /// Returns whether an arm that stands on the table keeps away from the table and the panel.
-    pub fn is_clear(&self, arm: &[Capsule; 6]) -> bool {
+    pub fn is_clear(&self, arm: &[LinkCapsule; 6]) -> bool {
         arm[1..].iter().all(|c| self.over_table(c) && self.over_panel(c))
     }
 
-    fn over_table(&self, c: &Capsule) -> bool {
+    fn over_table(&self, c: &LinkCapsule) -> bool {
         c.from.z.min(c.to.z) - c.radius >= self.table_m + self.margin_m
     }
 
     // The part of the segment that is over the panel, widened by radius and margin, has to be high enough.
-    fn over_panel(&self, c: &Capsule) -> bool {
+    fn over_panel(&self, c: &LinkCapsule) -> bool {
         let (reach, along) = (self.half_m + c.radius + self.margin_m, c.to - c.from);
         let mut range = [0.0f64, 1.0];
         for (from, along) in [(c.from.x, along.x), (c.from.y, along.y)] {
@@ -82,8 +82,8 @@ fn between(p1: DVec3, q1: DVec3, p2: DVec3, q2: DVec3) -> f64 {
 mod tests {
     use super::*;
 
-    fn capsule(from: [f64; 3], to: [f64; 3], radius: f64) -> Capsule {
-        Capsule { part: Part::Forearm, from: from.into(), to: to.into(), radius }
+    fn capsule(from: [f64; 3], to: [f64; 3], radius: f64) -> LinkCapsule {
+        LinkCapsule { part: ArmPart::Forearm, from: from.into(), to: to.into(), radius }
     }
 
     #[test]
@@ -120,7 +120,7 @@ mod tests {
 
     #[test]
     fn what_dips_into_the_panel_is_not_clear() {
-        let around = Surroundings { half_m: 0.3, relief_m: 0.03, table_m: -0.1, margin_m: 0.01 };
+        let around = ArmSurroundings { half_m: 0.3, relief_m: 0.03, table_m: -0.1, margin_m: 0.01 };
         let over = |from, to| around.over_panel(&capsule(from, to, 0.02));
         assert!(over([-0.6, 0.0, 0.0], [-0.35, 0.0, 0.0]), "beside the panel");
         assert!(!over([-0.6, 0.0, 0.2], [0.0, 0.0, 0.05]), "into it");

@@ -6,7 +6,7 @@ use rs_opw_kinematics::glam::DVec3;
 use rs_opw_kinematics::kinematic_traits::Pose;
 
 use super::arm::{
-    Arm, ELBOW_ASIDE_M, FLANGE_M, FOREARM_M, RADII_M, RANGES_DEG, SHOULDER_M, SPEEDS_DEG, Tool, UPPER_ARM_M,
+    ELBOW_ASIDE_M, FLANGE_M, FOREARM_M, RADII_M, RANGES_DEG, RobotArm, SHOULDER_M, SPEEDS_DEG, Tool, UPPER_ARM_M,
 };
 use super::cell::Cell;
 
@@ -53,7 +53,7 @@ impl Cell {
     }
 }
 
-fn arm(out: &mut String, arm: &Arm) {
+fn arm(out: &mut String, arm: &RobotArm) {
     let (tool, frames) = (arm.tool(), frame_names(arm.tool()));
     let cylinder = |radius: f64, length: f64| format!("<cylinder radius=\"{radius}\" length=\"{length}\"/>");
     let sphere = |radius: f64| format!("<sphere radius=\"{radius}\"/>");

@@ -6,7 +6,7 @@
 //! let cell = Cell::of(&echolake_schema::Rig::paper());
 //! let standing = cell.reach([-37.5, 37.5, 124.0], [62.5, -62.5, 304.0])?;
 //! assert!(cell.is_clear(&standing.microphone, &standing.speaker));
-//! # Ok::<(), echolake_acquisition::robots::Unreachable>(())
+//! # Ok::<(), echolake_acquisition::robots::UnreachableReason>(())
 //! ```
 
 pub mod arm;
@@ -17,9 +17,9 @@ mod description;
 mod motion;
 mod plan;
 
-pub use arm::{Arm, Joints, Part, Tool};
-pub use cell::{Aim, Cell, Standing, Unreachable, Ways};
-pub use choreography::{Choreography, Missing};
+pub use arm::{ArmPart, Joints, RobotArm, Tool};
+pub use cell::{ArmPose, ArmSolutions, Cell, SpeakerAim, UnreachableReason};
+pub use choreography::{Choreography, MissingPair};
 pub use description::{PANEL_M, frame_names, joint_names};
-pub use motion::{Course, Motion, course};
+pub use motion::{ArmMotion, MotionCourse, course};
 pub use plan::{PlanParams, length_secs, plan};

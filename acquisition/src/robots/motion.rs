@@ -2,7 +2,7 @@
 //! arms drawn back meanwhile.
 
 use super::arm::{Joints, SPEEDS_DEG, travel_secs};
-use super::cell::{Cell, Standing};
+use super::cell::{ArmPose, Cell};
 
 /// Largest turn of a joint between two collision checks, degrees: 850 mm of arm move 15 mm.
 const STEP_DEG: f64 = 1.0;
@@ -12,7 +12,7 @@ const BACKS_DEG: [[f64; 2]; 3] = [[-70.0, 130.0], [-30.0, 70.0], [-30.0, 115.0]]
 
 /// Order in which both arms get from one pose to another.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Course {
+pub enum MotionCourse {
     /// Both at once.
     Together,
     /// The microphone's arm, then the speaker's.
@@ -29,7 +29,7 @@ pub enum Course {
     MicrophoneLast,
 }
 
-impl Course {
+impl MotionCourse {
     /// All of them.
     pub const ALL: [Self; 7] = [
         Self::Together,
@@ -67,24 +67,24 @@ type Pose = [Joints; 2];
 
 /// A motion from one pose of both arms to another.
 #[derive(Debug, Clone)]
-pub struct Motion {
+pub struct ArmMotion {
     /// Order of its moves.
-    pub course: Course,
+    pub course: MotionCourse,
     /// Joints of microphone's and speaker's arm at each stop, the last included.
     pub stops: Vec<[Joints; 2]>,
     /// Time that it takes at least, s: the data sheet's speeds, acceleration left out.
     pub secs: f64,
 }
 
-/// Returns the quickest course on which nothing touches; None if there is none among [`Course::ALL`].
-pub fn course(cell: &Cell, from: &Standing, to: &Standing) -> Option<Motion> {
+/// Returns the quickest course on which nothing touches; None if there is none among [`MotionCourse::ALL`].
+pub fn course(cell: &Cell, from: &ArmPose, to: &ArmPose) -> Option<ArmMotion> {
     let [from, to] = [from, to].map(|s| [s.microphone, s.speaker]);
-    let motion = |(course, back_deg): (Course, [f64; 2])| {
+    let motion = |(course, back_deg): (MotionCourse, [f64; 2])| {
         let stops = course.by(back_deg, &from, &to);
         let secs = legs(&from, &stops).map(|(a, b)| leg_secs(a, b)).sum();
-        Motion { course, stops, secs }
+        ArmMotion { course, stops, secs }
     };
-    let ways = BACKS_DEG.iter().flat_map(|back_deg| Course::ALL.map(|course| (course, *back_deg)));
+    let ways = BACKS_DEG.iter().flat_map(|back_deg| MotionCourse::ALL.map(|course| (course, *back_deg)));
     let mut motions: Vec<_> = ways.map(motion).collect();
     motions.sort_by(|a, b| a.secs.total_cmp(&b.secs));
     motions.into_iter().find(|motion| legs(&from, &motion.stops).all(|(a, b)| is_clear(cell, a, b)))
@@ -110,7 +110,7 @@ fn is_clear(cell: &Cell, from: &Pose, to: &Pose) -> bool {
 }
 
 /// Returns a pose as twelve times, s: the greatest difference of two is the time between them.
-pub(super) fn as_secs(standing: &Standing) -> [f32; 12] {
+pub(super) fn as_secs(standing: &ArmPose) -> [f32; 12] {
     std::array::from_fn(|i| {
         let joints = if i < 6 { &standing.microphone } else { &standing.speaker };
         (joints[i % 6].to_degrees() / SPEEDS_DEG[i % 6]) as f32

@@ -4,7 +4,7 @@
 use rand::{Rng as _, SeedableRng as _};
 use rand_chacha::ChaCha8Rng;
 
-use super::cell::Standing;
+use super::cell::ArmPose;
 use super::motion::as_secs;
 
 /// Nearest poses that 2-opt tries for each one.
@@ -28,7 +28,7 @@ impl Default for PlanParams {
 }
 
 /// Returns indices of `standings`, in the order in which they are best visited, beginning at home.
-pub fn plan(standings: &[Standing], params: PlanParams) -> Vec<usize> {
+pub fn plan(standings: &[ArmPose], params: PlanParams) -> Vec<usize> {
     let mut tour = Tour::nearest(standings);
     tour.settle((0..tour.places.len()).collect());
     let mut rng = ChaCha8Rng::seed_from_u64(params.seed);
@@ -39,8 +39,8 @@ pub fn plan(standings: &[Standing], params: PlanParams) -> Vec<usize> {
 }
 
 /// Time of travel in an order, from home, s: the data sheet's speeds, straight from each to the next.
-pub fn length_secs(standings: &[Standing], order: &[usize]) -> f64 {
-    let home = as_secs(&Standing::home());
+pub fn length_secs(standings: &[ArmPose], order: &[usize]) -> f64 {
+    let home = as_secs(&ArmPose::home());
     let stops: Vec<_> = std::iter::once(home).chain(order.iter().map(|i| as_secs(&standings[*i]))).collect();
     stops.windows(2).map(|w| f64::from(between(&w[0], &w[1]))).sum()
 }
@@ -60,8 +60,8 @@ struct Tour {
 }
 
 impl Tour {
-    fn nearest(standings: &[Standing]) -> Self {
-        let places: Vec<_> = std::iter::once(&Standing::home()).chain(standings).map(as_secs).collect();
+    fn nearest(standings: &[ArmPose]) -> Self {
+        let places: Vec<_> = std::iter::once(&ArmPose::home()).chain(standings).map(as_secs).collect();
         let mut left: Vec<usize> = (1..places.len()).collect();
         let mut order = vec![0];
         while let Some((k, _)) = left
@@ -176,12 +176,12 @@ fn neighbours(places: &[[f32; 12]], of: usize) -> Vec<usize> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::robots::Aim;
+    use crate::robots::SpeakerAim;
 
     // Standings along a line, in a shuffled order: the best path is known.
-    fn line(count: usize) -> Vec<Standing> {
+    fn line(count: usize) -> Vec<ArmPose> {
         let at = |i: usize| {
-            let mut standing = Standing { aim: Aim::Down, ..Standing::home() };
+            let mut standing = ArmPose { aim: SpeakerAim::Down, ..ArmPose::home() };
             standing.speaker[0] += 0.01 * ((i * 7) % count + 1) as f64;
             standing
         };
@@ -200,7 +200,7 @@ mod tests {
     fn every_place_is_visited_once_and_seeds_repeat() {
         let mut rng = ChaCha8Rng::seed_from_u64(5);
         let mut standing = || {
-            let mut standing = Standing::home();
+            let mut standing = ArmPose::home();
             standing.microphone.iter_mut().chain(&mut standing.speaker).for_each(|q| *q += rng.random_range(-1.0..1.0));
             standing
         };

@@ -4,7 +4,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use super::*;
 use crate::recorder::Held;
-use crate::relief::Relief;
+use crate::relief::PanelRelief;
 use crate::run::{RunRequest, Specimen, resume};
 use crate::simulate::simulate;
 use echolake_recording::prove_file;
@@ -12,7 +12,7 @@ use echolake_recording::prove_file;
 const SMALL_RIG: &str = include_str!("../../../tests/fixtures/small_rig.toml");
 const PAIRS: u64 = 45;
 
-fn run<'a>(rig: &'a Rig, specimen: &'a Specimen, folder: &'a Path) -> RunRequest<'a> {
+fn run<'a>(rig: &'a Rig, specimen: &'a PanelSpecimen, folder: &'a Path) -> RunRequest<'a> {
     RunRequest {
         rig,
         surface: "flat".parse().expect("an id"),
@@ -22,13 +22,13 @@ fn run<'a>(rig: &'a Rig, specimen: &'a Specimen, folder: &'a Path) -> RunRequest
         start: Timestamp(1_767_600_000_000_000_000),
         seed: 1,
         tag: 1,
-        keep: Keep::Sweeps,
+        keep: RecordingMode::Sweeps,
         folder,
     }
 }
 
-fn flat() -> Specimen {
-    Specimen::Relief(Relief::by_name("flat").expect("a relief"))
+fn flat() -> PanelSpecimen {
+    PanelSpecimen::Relief(PanelRelief::by_name("flat").expect("a relief"))
 }
 
 #[test]
@@ -38,18 +38,18 @@ fn a_run_that_is_stopped_is_gone_on_with() {
     let mut left = Vec::new();
     let mut partial: Option<PathBuf> = None;
     loop {
-        let (control, mut tried) = (Control::default(), 0);
-        let mut observe = |event: Event<'_>| {
-            tried += usize::from(matches!(event, Event::Pair(_)));
+        let (control, mut tried) = (RunControl::default(), 0);
+        let mut observe = |event: RunEvent<'_>| {
+            tried += usize::from(matches!(event, RunEvent::Pair(_)));
             control.stop.store(tried >= 20, Ordering::Relaxed);
         };
-        let session = Session {
+        let session = RunSession {
             control: &control,
             observe: &mut observe,
             tap: None,
-            preflight: Preflight::Check,
+            preflight: PreflightMode::Check,
             checkpoint_every: Some(7),
-            pace: Pace::Fast,
+            pace: TakePace::Fast,
         };
         let measured = match &partial {
             None => run(&rig, &specimen, folder.path()).measure(session),

@@ -12,9 +12,9 @@ use tungstenite::{Message, WebSocket};
 
 use super::access::{AccessCheck, refusal};
 use super::handshakes::{LONGEST_HANDSHAKE, TimedStream};
-use super::protocol::{self, Wish};
-use super::queue::Outgoing;
-use super::{Queue, Shared};
+use super::protocol::{self, ClientRequest};
+use super::queue::OutgoingItem;
+use super::{ClientQueue, ViewerState};
 
 /// Timeout of one wait for the client's messages.
 const LOOKS: Duration = Duration::from_millis(10);
@@ -24,7 +24,7 @@ const PATIENCE: Duration = Duration::from_secs(10);
 const LARGEST_WISH: usize = 1 << 20;
 
 /// Serves a client until it or the server is gone.
-pub(super) fn serve(stream: TcpStream, shared: &Shared) {
+pub(super) fn serve(stream: TcpStream, shared: &ViewerState) {
     // After any error here the client is disconnected, and may connect again.
     let Ok(shaken) = shake_hands(stream, shared) else { return };
     let Some(queue) = shared.join() else { return };
@@ -44,7 +44,7 @@ fn choose(access: &AccessCheck, request: &Request, mut response: Response) -> Re
     }
 }
 
-fn shake_hands(stream: TcpStream, shared: &Shared) -> Result<WebSocket<TimedStream>, Box<dyn std::error::Error>> {
+fn shake_hands(stream: TcpStream, shared: &ViewerState) -> Result<WebSocket<TimedStream>, Box<dyn std::error::Error>> {
     stream.set_nodelay(true)?;
     stream.set_write_timeout(Some(PATIENCE))?;
     let stream = Arc::new(stream);
@@ -62,8 +62,8 @@ fn shake_hands(stream: TcpStream, shared: &Shared) -> Result<WebSocket<TimedStre
 
 fn talk(
     mut socket: WebSocket<TimedStream>,
-    shared: &Shared,
-    queue: &Arc<Queue>,
+    shared: &ViewerState,
+    queue: &Arc<ClientQueue>,
 ) -> Result<(), Box<dyn std::error::Error>> {
     socket.send(Message::text(protocol::server_info(shared.playback.as_ref().map(|p| p.range))))?;
     socket.send(Message::text(protocol::advertise(&shared.topics())))?;
@@ -71,11 +71,11 @@ fn talk(
         listen(&mut socket, shared, queue)?;
         while let Some(outgoing) = queue.pop() {
             socket.write(Message::binary(match outgoing {
-                Outgoing::Message(subscription, message) => {
+                OutgoingItem::Message(subscription, message) => {
                     protocol::message_data(subscription, message.log_time_nanos, &message.data)
                 }
-                Outgoing::Time(nanos) => protocol::time(nanos),
-                Outgoing::State(encoded) => encoded,
+                OutgoingItem::Time(nanos) => protocol::time(nanos),
+                OutgoingItem::State(encoded) => encoded,
             }))?;
         }
         socket.flush()?;
@@ -85,10 +85,14 @@ fn talk(
     Ok(socket.flush()?)
 }
 
-fn listen(socket: &mut WebSocket<TimedStream>, shared: &Shared, queue: &Arc<Queue>) -> Result<(), tungstenite::Error> {
+fn listen(
+    socket: &mut WebSocket<TimedStream>,
+    shared: &ViewerState,
+    queue: &Arc<ClientQueue>,
+) -> Result<(), tungstenite::Error> {
     let wish = match socket.read() {
         Ok(Message::Text(text)) => protocol::wish(&text),
-        Ok(Message::Binary(bytes)) => protocol::playback_request(&bytes).map(Wish::Playback),
+        Ok(Message::Binary(bytes)) => protocol::playback_request(&bytes).map(ClientRequest::Playback),
         Ok(_) => None,
         Err(tungstenite::Error::Io(e))
             if matches!(e.kind(), std::io::ErrorKind::WouldBlock | std::io::ErrorKind::TimedOut) =>
@@ -98,9 +102,9 @@ fn listen(socket: &mut WebSocket<TimedStream>, shared: &Shared, queue: &Arc<Queu
         Err(error) => return Err(error),
     };
     match wish {
-        Some(Wish::Subscribe(wishes)) => shared.subscribe(queue, &wishes),
-        Some(Wish::Unsubscribe(ids)) => shared.unsubscribe(queue, &ids),
-        Some(Wish::Playback(request)) => shared.control(queue, request),
+        Some(ClientRequest::Subscribe(wishes)) => shared.subscribe(queue, &wishes),
+        Some(ClientRequest::Unsubscribe(ids)) => shared.unsubscribe(queue, &ids),
+        Some(ClientRequest::Playback(request)) => shared.control(queue, request),
         None => {}
     }
     Ok(())

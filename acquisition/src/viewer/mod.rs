@@ -21,38 +21,38 @@ use access::AccessCheck;
 pub use access::ViewerAccess;
 use handshakes::PendingHandshakes;
 pub(crate) use protocol::{PlaybackRequest, PlaybackState, PlaybackStatus};
-pub(crate) use queue::{Queue, Waiting};
+pub(crate) use queue::{ClientQueue, PendingMessage};
 
 /// Limit of connected clients.
 const CLIENTS: usize = 16;
 
 /// A server. Dropped, it disconnects its clients.
-pub(crate) struct Server {
+pub(crate) struct ViewerServer {
     address: SocketAddr,
-    shared: Arc<Shared>,
+    shared: Arc<ViewerState>,
     thread: Option<JoinHandle<()>>,
 }
 
 /// Playback that clients may control.
-pub(crate) struct Playback {
+pub(crate) struct PlaybackControl {
     /// First and last time of the data, ns since 1970.
     pub(crate) range: (u64, u64),
     /// Queue of the player's commands.
-    pub(crate) commands: SyncSender<Command>,
+    pub(crate) commands: SyncSender<PlayerCommand>,
 }
 
 /// Requests of clients to a player.
-pub(crate) enum Command {
+pub(crate) enum PlayerCommand {
     /// A client subscribed to channels, and first needs their current state.
-    Subscribed(Arc<Queue>, BTreeSet<u16>),
+    Subscribed(Arc<ClientQueue>, BTreeSet<u16>),
     /// Play, pause, seek.
     Playback(PlaybackRequest),
 }
 
 /// State that the server's threads share.
-pub(crate) struct Shared {
+pub(crate) struct ViewerState {
     state: Mutex<State>,
-    playback: Option<Playback>,
+    playback: Option<PlaybackControl>,
     access: AccessCheck,
     handshakes: PendingHandshakes,
     ended: AtomicBool,
@@ -66,21 +66,21 @@ pub(crate) struct Shared {
 struct State {
     topics: Vec<Topic>,
     /// The last message of each retained channel: new clients get it.
-    last: BTreeMap<u16, Waiting>,
-    clients: Vec<Arc<Queue>>,
+    last: BTreeMap<u16, PendingMessage>,
+    clients: Vec<Arc<ClientQueue>>,
 }
 
-impl Server {
+impl ViewerServer {
     /// Listens; port 0 takes a free one.
     pub(crate) fn start(
         address: SocketAddr,
         access: ViewerAccess,
         topics: Vec<Topic>,
-        playback: Option<Playback>,
+        playback: Option<PlaybackControl>,
     ) -> Result<Self, std::io::Error> {
         let listener = TcpListener::bind(address)?;
         let address = listener.local_addr()?;
-        let shared = Arc::new(Shared {
+        let shared = Arc::new(ViewerState {
             state: Mutex::new(State { topics, ..State::default() }),
             playback,
             access: AccessCheck::new(access, address),
@@ -104,12 +104,12 @@ impl Server {
         self.shared.access.url(self.address)
     }
 
-    pub(crate) fn shared(&self) -> &Arc<Shared> {
+    pub(crate) fn shared(&self) -> &Arc<ViewerState> {
         &self.shared
     }
 }
 
-impl Drop for Server {
+impl Drop for ViewerServer {
     fn drop(&mut self) {
         self.shared.ended.store(true, Ordering::Relaxed);
         // Its accept waits for a connection.
@@ -120,7 +120,7 @@ impl Drop for Server {
     }
 }
 
-impl Shared {
+impl ViewerState {
     fn state(&self) -> MutexGuard<'_, State> {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
@@ -138,7 +138,7 @@ impl Shared {
     }
 
     /// Returns the connected clients.
-    pub(crate) fn clients(&self) -> Vec<Arc<Queue>> {
+    pub(crate) fn clients(&self) -> Vec<Arc<ClientQueue>> {
         self.state().clients.clone()
     }
 
@@ -158,7 +158,7 @@ impl Shared {
     }
 
     /// Sends a client the current state of channels; new messages follow from here on.
-    pub(crate) fn prime(&self, queue: &Queue, channels: &BTreeSet<u16>, known: &[Waiting]) {
+    pub(crate) fn prime(&self, queue: &ClientQueue, channels: &BTreeSet<u16>, known: &[PendingMessage]) {
         queue.prime(channels, known);
         self.wishes.fetch_add(1, Ordering::Release);
     }
@@ -178,7 +178,7 @@ impl Shared {
         if wanted.is_empty() && !is_kept {
             return;
         }
-        let waiting = Waiting { channel, log_time_nanos, data: data.into() };
+        let waiting = PendingMessage { channel, log_time_nanos, data: data.into() };
         let lost: u64 = wanted.iter().map(|client| client.push(waiting.clone())).sum();
         self.lost.fetch_add(lost, Ordering::Relaxed);
         if is_kept {
@@ -187,7 +187,7 @@ impl Shared {
     }
 
     /// Subscribes a client to channels; it first gets their current state.
-    fn subscribe(&self, queue: &Arc<Queue>, wishes: &[(u32, u16)]) {
+    fn subscribe(&self, queue: &Arc<ClientQueue>, wishes: &[(u32, u16)]) {
         let channels: BTreeSet<u16> = wishes.iter().map(|(_, channel)| *channel).collect();
         // No new message comes between the current state and those that follow.
         let state = self.state();
@@ -196,7 +196,7 @@ impl Shared {
             Some(playback) => {
                 drop(state);
                 // A player that is gone has no use for it.
-                let _ = playback.commands.send(Command::Subscribed(queue.clone(), channels));
+                let _ = playback.commands.send(PlayerCommand::Subscribed(queue.clone(), channels));
             }
             None => {
                 let known: Vec<_> = channels.iter().filter_map(|channel| state.last.get(channel)).cloned().collect();
@@ -205,34 +205,34 @@ impl Shared {
         }
     }
 
-    fn unsubscribe(&self, queue: &Queue, subscriptions: &[u32]) {
+    fn unsubscribe(&self, queue: &ClientQueue, subscriptions: &[u32]) {
         queue.unsubscribe(subscriptions);
         self.wishes.fetch_add(1, Ordering::Release);
     }
 
-    fn control(&self, queue: &Queue, request: PlaybackRequest) {
+    fn control(&self, queue: &ClientQueue, request: PlaybackRequest) {
         if let Some(playback) = &self.playback {
             queue.hear_of_playback();
-            let _ = playback.commands.send(Command::Playback(request));
+            let _ = playback.commands.send(PlayerCommand::Playback(request));
         }
     }
 
-    fn join(&self) -> Option<Arc<Queue>> {
+    fn join(&self) -> Option<Arc<ClientQueue>> {
         let mut state = self.state();
         (state.clients.len() < CLIENTS).then(|| {
-            let queue = Arc::new(Queue::default());
+            let queue = Arc::new(ClientQueue::default());
             state.clients.push(queue.clone());
             queue
         })
     }
 
-    fn leave(&self, queue: &Arc<Queue>) {
+    fn leave(&self, queue: &Arc<ClientQueue>) {
         self.state().clients.retain(|client| !Arc::ptr_eq(client, queue));
         self.wishes.fetch_add(1, Ordering::Release);
     }
 }
 
-fn accept(listener: &TcpListener, shared: &Arc<Shared>) {
+fn accept(listener: &TcpListener, shared: &Arc<ViewerState>) {
     let mut threads: Vec<JoinHandle<()>> = Vec::new();
     for stream in listener.incoming() {
         if shared.has_ended() {

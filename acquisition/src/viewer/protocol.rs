@@ -23,7 +23,7 @@ const NANOS: u64 = 1_000_000_000;
 
 /// A client's request.
 #[derive(Debug, PartialEq)]
-pub(super) enum Wish {
+pub(super) enum ClientRequest {
     /// Subscriptions and their channels.
     Subscribe(Vec<(u32, u16)>),
     /// Subscriptions.
@@ -184,12 +184,12 @@ pub(super) fn playback_request(bytes: &[u8]) -> Option<PlaybackRequest> {
 }
 
 /// Parses a client's request; None if it does not concern a server that only shows data.
-pub(super) fn wish(text: &str) -> Option<Wish> {
+pub(super) fn wish(text: &str) -> Option<ClientRequest> {
     Some(match serde_json::from_str(text).ok()? {
         FromClient::Subscribe { subscriptions } => {
-            Wish::Subscribe(subscriptions.into_iter().map(|s| (s.id, s.channel_id)).collect())
+            ClientRequest::Subscribe(subscriptions.into_iter().map(|s| (s.id, s.channel_id)).collect())
         }
-        FromClient::Unsubscribe { subscription_ids } => Wish::Unsubscribe(subscription_ids),
+        FromClient::Unsubscribe { subscription_ids } => ClientRequest::Unsubscribe(subscription_ids),
     })
 }
 
@@ -254,8 +254,8 @@ mod tests {
     #[test]
     fn clients_are_understood_or_ignored() {
         let subscribe = r#"{"op":"subscribe","subscriptions":[{"id":7,"channelId":3}]}"#;
-        assert_eq!(wish(subscribe), Some(Wish::Subscribe(vec![(7, 3)])));
-        assert_eq!(wish(r#"{"op":"unsubscribe","subscriptionIds":[7]}"#), Some(Wish::Unsubscribe(vec![7])));
+        assert_eq!(wish(subscribe), Some(ClientRequest::Subscribe(vec![(7, 3)])));
+        assert_eq!(wish(r#"{"op":"unsubscribe","subscriptionIds":[7]}"#), Some(ClientRequest::Unsubscribe(vec![7])));
         for other in ["", "{}", r#"{"op":"getParameters"}"#, r#"{"op":"subscribe","subscriptions":[{"id":-1}]}"#] {
             assert_eq!(wish(other), None, "{other}");
         }

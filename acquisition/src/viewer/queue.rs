@@ -8,7 +8,7 @@ pub(super) const WAITING_BYTES: usize = 16 << 20;
 
 /// A pending message.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(crate) struct Waiting {
+pub(crate) struct PendingMessage {
     pub(crate) channel: u16,
     pub(crate) log_time_nanos: u64,
     pub(crate) data: Arc<[u8]>,
@@ -16,9 +16,9 @@ pub(crate) struct Waiting {
 
 /// The next item to send to a client.
 #[derive(Debug, PartialEq, Eq)]
-pub(crate) enum Outgoing {
+pub(crate) enum OutgoingItem {
     /// A message and its subscription.
-    Message(u32, Waiting),
+    Message(u32, PendingMessage),
     /// The time of playback, ns since 1970.
     Time(u64),
     /// An encoded state of playback.
@@ -27,39 +27,39 @@ pub(crate) enum Outgoing {
 
 /// Pending messages of one client.
 #[derive(Default)]
-pub(crate) struct Queue {
-    inner: Mutex<Inner>,
+pub(crate) struct ClientQueue {
+    inner: Mutex<QueueState>,
 }
 
 #[derive(Default)]
-struct Inner {
-    entries: VecDeque<Entry>,
+struct QueueState {
+    entries: VecDeque<QueueEntry>,
     /// Bytes of messages that may be dropped.
     bytes: usize,
     /// Bytes of messages that may not.
     kept: usize,
-    wanted: BTreeMap<u16, Wanted>,
+    wanted: BTreeMap<u16, ChannelSubscription>,
     /// The client controls playback, so it understands states.
     controls: bool,
 }
 
 /// A subscription.
-struct Wanted {
+struct ChannelSubscription {
     subscription: u32,
     /// True after it got the current state, so that new messages may follow.
     primed: bool,
 }
 
-enum Entry {
+enum QueueEntry {
     /// May be dropped.
-    Message(Waiting),
+    Message(PendingMessage),
     /// Current state of its channel, which is not dropped.
-    Kept(Waiting),
+    Kept(PendingMessage),
     Time(u64),
     State(Vec<u8>),
 }
 
-impl Entry {
+impl QueueEntry {
     fn bytes(&self) -> usize {
         match self {
             Self::Message(waiting) => waiting.data.len(),
@@ -75,8 +75,8 @@ impl Entry {
     }
 }
 
-impl Queue {
-    fn inner(&self) -> MutexGuard<'_, Inner> {
+impl ClientQueue {
+    fn inner(&self) -> MutexGuard<'_, QueueState> {
         self.inner.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
@@ -112,7 +112,7 @@ impl Queue {
     }
 
     pub(super) fn subscribe(&self, channel: u16, subscription: u32) {
-        self.inner().wanted.insert(channel, Wanted { subscription, primed: false });
+        self.inner().wanted.insert(channel, ChannelSubscription { subscription, primed: false });
     }
 
     pub(super) fn unsubscribe(&self, subscriptions: &[u32]) {
@@ -124,28 +124,28 @@ impl Queue {
     }
 
     /// Queues the current state of channels, by time; new messages follow from here on.
-    pub(crate) fn prime(&self, channels: &BTreeSet<u16>, known: &[Waiting]) {
+    pub(crate) fn prime(&self, channels: &BTreeSet<u16>, known: &[PendingMessage]) {
         let mut inner = self.inner();
         inner.wanted.iter_mut().filter(|(id, _)| channels.contains(id)).for_each(|(_, wanted)| wanted.primed = true);
         let known: Vec<_> = known.iter().filter(|waiting| channels.contains(&waiting.channel)).cloned().collect();
         let new: usize = known.iter().map(|waiting| waiting.data.len()).sum();
         if inner.kept + new > WAITING_BYTES {
             // A client that has not read the older state for so long does not need it any more.
-            inner.entries.retain(|e| !matches!(e, Entry::Kept(waiting) if channels.contains(&waiting.channel)));
-            inner.kept = inner.entries.iter().map(Entry::kept).sum();
+            inner.entries.retain(|e| !matches!(e, QueueEntry::Kept(waiting) if channels.contains(&waiting.channel)));
+            inner.kept = inner.entries.iter().map(QueueEntry::kept).sum();
         }
         inner.kept += new;
-        inner.entries.extend(known.into_iter().map(Entry::Kept));
+        inner.entries.extend(known.into_iter().map(QueueEntry::Kept));
     }
 
     /// Queues a new message; returns how many old ones are dropped for it.
-    pub(super) fn push(&self, message: Waiting) -> u64 {
+    pub(super) fn push(&self, message: PendingMessage) -> u64 {
         let mut inner = self.inner();
         inner.bytes += message.data.len();
-        inner.entries.push_back(Entry::Message(message));
+        inner.entries.push_back(QueueEntry::Message(message));
         let mut lost = 0;
         while inner.bytes > WAITING_BYTES {
-            let oldest = inner.entries.iter().position(|entry| matches!(entry, Entry::Message(_)));
+            let oldest = inner.entries.iter().position(|entry| matches!(entry, QueueEntry::Message(_)));
             // The newest is sent, whatever its size.
             let Some(oldest) = oldest.filter(|at| at + 1 < inner.entries.len()) else { break };
             inner.bytes -= inner.entries.remove(oldest).map_or(0, |entry| entry.bytes());
@@ -157,17 +157,17 @@ impl Queue {
     /// Queues the time; of several pending times only the latest matters.
     pub(crate) fn tell_time(&self, nanos: u64) {
         let mut inner = self.inner();
-        if let Some(Entry::Time(_)) = inner.entries.back() {
+        if let Some(QueueEntry::Time(_)) = inner.entries.back() {
             inner.entries.pop_back();
         }
-        inner.entries.push_back(Entry::Time(nanos));
+        inner.entries.push_back(QueueEntry::Time(nanos));
     }
 
     /// Queues the state of playback, if the client controls it.
     pub(crate) fn tell_state(&self, encoded: Vec<u8>) {
         let mut inner = self.inner();
         if inner.controls {
-            inner.entries.push_back(Entry::State(encoded));
+            inner.entries.push_back(QueueEntry::State(encoded));
         }
     }
 
@@ -175,24 +175,24 @@ impl Queue {
     /// current state anew.
     pub(crate) fn forget(&self) {
         let mut inner = self.inner();
-        inner.entries.retain(|entry| matches!(entry, Entry::State(_)));
+        inner.entries.retain(|entry| matches!(entry, QueueEntry::State(_)));
         (inner.bytes, inner.kept) = (0, 0);
         inner.wanted.values_mut().for_each(|wanted| wanted.primed = false);
     }
 
     /// Returns the next item to send.
-    pub(crate) fn pop(&self) -> Option<Outgoing> {
+    pub(crate) fn pop(&self) -> Option<OutgoingItem> {
         let mut inner = self.inner();
         loop {
             let entry = inner.entries.pop_front()?;
             inner.bytes -= entry.bytes();
             inner.kept -= entry.kept();
             match entry {
-                Entry::Time(nanos) => return Some(Outgoing::Time(nanos)),
-                Entry::State(encoded) => return Some(Outgoing::State(encoded)),
-                Entry::Message(waiting) | Entry::Kept(waiting) => {
+                QueueEntry::Time(nanos) => return Some(OutgoingItem::Time(nanos)),
+                QueueEntry::State(encoded) => return Some(OutgoingItem::State(encoded)),
+                QueueEntry::Message(waiting) | QueueEntry::Kept(waiting) => {
                     if let Some(wanted) = inner.wanted.get(&waiting.channel) {
-                        return Some(Outgoing::Message(wanted.subscription, waiting));
+                        return Some(OutgoingItem::Message(wanted.subscription, waiting));
                     }
                 }
             }
@@ -204,17 +204,17 @@ impl Queue {
 mod tests {
     use super::*;
 
-    fn waiting(channel: u16, log_time_nanos: u64, bytes: usize) -> Waiting {
-        Waiting { channel, log_time_nanos, data: vec![0; bytes].into() }
+    fn waiting(channel: u16, log_time_nanos: u64, bytes: usize) -> PendingMessage {
+        PendingMessage { channel, log_time_nanos, data: vec![0; bytes].into() }
     }
 
-    fn drained(queue: &Queue) -> Vec<(u16, u64)> {
+    fn drained(queue: &ClientQueue) -> Vec<(u16, u64)> {
         let mut all = Vec::new();
         while let Some(outgoing) = queue.pop() {
             match outgoing {
-                Outgoing::Message(_, w) => all.push((w.channel, w.log_time_nanos)),
-                Outgoing::Time(nanos) => all.push((0, nanos)),
-                Outgoing::State(_) => all.push((0, 0)),
+                OutgoingItem::Message(_, w) => all.push((w.channel, w.log_time_nanos)),
+                OutgoingItem::Time(nanos) => all.push((0, nanos)),
+                OutgoingItem::State(_) => all.push((0, 0)),
             }
         }
         all
@@ -222,7 +222,7 @@ mod tests {
 
     #[test]
     fn the_oldest_are_lost_and_never_what_tells_where_things_stand() {
-        let queue = Queue::default();
+        let queue = ClientQueue::default();
         queue.subscribe(1, 10);
         queue.subscribe(2, 20);
         queue.prime(&[1, 2].into(), &[waiting(1, 5, WAITING_BYTES)]);
@@ -236,7 +236,7 @@ mod tests {
 
     #[test]
     fn what_is_of_another_time_is_forgotten() {
-        let queue = Queue::default();
+        let queue = ClientQueue::default();
         queue.subscribe(1, 10);
         queue.tell_state(vec![1]);
         assert_eq!(drained(&queue), [], "states are for those who control");

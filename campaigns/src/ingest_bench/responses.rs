@@ -6,7 +6,7 @@ use std::path::Path;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
 use anyhow::{Context as _, Result};
-use echolake_acquisition::controller::Keep;
+use echolake_acquisition::controller::RecordingMode;
 
 use super::IngestBenchArgs;
 use super::meter::{Cost, Meter};
@@ -17,8 +17,13 @@ use super::{lake_size, layout};
 
 pub(crate) async fn measure(args: &IngestBenchArgs, folder: &Path, report: &mut Report) -> Result<()> {
     let runs = folder.join("responses");
-    let order =
-        Order { count: args.runs(), keep: Keep::ResponsesOnly, pairs: usize::MAX, seed: args.seed, folder: &runs };
+    let order = Order {
+        count: args.runs(),
+        keep: RecordingMode::ResponsesOnly,
+        pairs: usize::MAX,
+        seed: args.seed,
+        folder: &runs,
+    };
     let runs = order.make()?;
     let (mut whole, mut panels, mut alone) = (Cost::NONE, Cost::NONE, Cost::NONE);
     let (mut peak, mut last): (f64, Option<Ingested>) = (0.0, None);

@@ -5,9 +5,9 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 
 use anyhow::{Context as _, Result, ensure};
-use echolake_acquisition::collection::{Member, collection};
-use echolake_acquisition::controller::Keep;
-use echolake_acquisition::run::{RunRequest, Specimen};
+use echolake_acquisition::collection::{CollectionSurface, collection};
+use echolake_acquisition::controller::RecordingMode;
+use echolake_acquisition::run::{PanelSpecimen, RunRequest};
 use echolake_acquisition::simulate::simulate;
 use echolake_ingest::{Ingest, Report as Told, complete, pending};
 use echolake_lake::{Lake, References};
@@ -45,7 +45,7 @@ pub(crate) struct Counts {
 /// Runs to be made.
 pub(crate) struct Order<'a> {
     pub(crate) count: usize,
-    pub(crate) keep: Keep,
+    pub(crate) keep: RecordingMode,
     /// Pairs after which each run is stopped.
     pub(crate) pairs: usize,
     pub(crate) seed: u64,
@@ -97,11 +97,11 @@ impl Order<'_> {
         Ok(runs)
     }
 
-    fn run(&self, number: usize, member: &Member) -> Result<(PathBuf, RunEnd)> {
+    fn run(&self, number: usize, member: &CollectionSurface) -> Result<(PathBuf, RunEnd)> {
         let run = RunRequest {
             rig: &Rig::paper(),
             surface: member.surface.clone(),
-            specimen: &Specimen::Relief(member.relief.clone()),
+            specimen: &PanelSpecimen::Relief(member.relief.clone()),
             flat: None,
             foam: None,
             start: FIRST_START.plus_secs(number as f64 * RUN_EVERY_SECS),

@@ -6,7 +6,7 @@ use std::path::Path;
 use std::process::Command;
 
 use anyhow::{Context as _, Result, ensure};
-use echolake_acquisition::controller::Keep;
+use echolake_acquisition::controller::RecordingMode;
 use echolake_dsp::deconvolution::fast_length;
 use echolake_schema::messages::SweepRecording;
 use echolake_schema::{samples, topics};
@@ -37,7 +37,7 @@ struct Recording {
 
 pub(crate) async fn measure(args: &IngestBenchArgs, folder: &Path, report: &mut Report) -> Result<()> {
     let runs = folder.join("sweeps");
-    let order = Order { count: RUNS, keep: Keep::Sweeps, pairs: args.pairs(), seed: args.seed, folder: &runs };
+    let order = Order { count: RUNS, keep: RecordingMode::Sweeps, pairs: args.pairs(), seed: args.seed, folder: &runs };
     let runs = order.make()?;
     let recordings = sampled(&runs)?;
     let length = recordings.first().context("no recordings")?.microphone.len();

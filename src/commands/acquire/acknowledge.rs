@@ -5,7 +5,7 @@ use std::io::{self, Write};
 use std::path::Path;
 
 use anyhow::Context as _;
-use echolake_acquisition::controller::Event;
+use echolake_acquisition::controller::RunEvent;
 use echolake_schema::messages::Verdict;
 
 /// An open list.
@@ -31,8 +31,8 @@ impl AcknowledgementWriter {
     }
 
     /// Writes the attempts that are safe on the disk.
-    pub(super) fn observe(&mut self, event: &Event<'_>) {
-        let Event::Safe { verdicts, .. } = event else { return };
+    pub(super) fn observe(&mut self, event: &RunEvent<'_>) {
+        let RunEvent::Safe { verdicts, .. } = event else { return };
         let mut lines = String::new();
         for m in *verdicts {
             let verdict = match m.verdict() {

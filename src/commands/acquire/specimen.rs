@@ -3,52 +3,52 @@
 use std::path::Path;
 
 use anyhow::Context as _;
-use echolake_acquisition::mesh::Side;
-use echolake_acquisition::relief::Relief;
-use echolake_acquisition::run::Specimen;
+use echolake_acquisition::mesh::PanelSide;
+use echolake_acquisition::relief::PanelRelief;
+use echolake_acquisition::run::PanelSpecimen;
 use echolake_schema::SurfaceId;
 
 use crate::cli::AcquireArgs;
 
 /// Returns the specimen that the arguments name.
-pub(super) fn of(args: &AcquireArgs) -> anyhow::Result<Specimen> {
+pub(super) fn of(args: &AcquireArgs) -> anyhow::Result<PanelSpecimen> {
     let surface = args.surface.as_ref().context("no surface is named; hint: --surface NAME")?;
     Ok(match (&args.mesh, &args.parameters) {
         // Absolute, so that a run can be resumed from another folder.
         (Some(mesh), _) => {
             let path = std::path::absolute(mesh).unwrap_or_else(|_| mesh.clone());
-            Specimen::Mesh(path, args.side.unwrap_or(Side::Front))
+            PanelSpecimen::Mesh(path, args.side.unwrap_or(PanelSide::Front))
         }
         (None, Some(file)) => {
             let mut relief = relief_of_file(file)?;
             set_all(&mut relief, &args.set)?;
-            Specimen::Relief(relief)
+            PanelSpecimen::Relief(relief)
         }
-        (None, None) => Specimen::Relief(relief(args.panel.as_deref(), surface, &args.set)?),
+        (None, None) => PanelSpecimen::Relief(relief(args.panel.as_deref(), surface, &args.set)?),
     })
 }
 
 /// The named relief, or the one that the surface's name begins with, with its parameters set.
-fn relief(name: Option<&str>, surface: &SurfaceId, set: &[String]) -> anyhow::Result<Relief> {
-    let guessed = || Relief::guess(surface.as_str());
+fn relief(name: Option<&str>, surface: &SurfaceId, set: &[String]) -> anyhow::Result<PanelRelief> {
+    let guessed = || PanelRelief::guess(surface.as_str());
     let name = name.or_else(guessed).with_context(|| {
         format!(
             "unknown surface `{surface}`: it says nothing of its relief; hint: --panel {} or --mesh FILE",
-            Relief::NAMES.join("|")
+            PanelRelief::NAMES.join("|")
         )
     })?;
     with_parameters(name, set)
 }
 
 /// A relief with its parameters set from `key=value`.
-fn with_parameters(name: &str, set: &[String]) -> anyhow::Result<Relief> {
-    let mut relief = Relief::by_name(name)?;
+fn with_parameters(name: &str, set: &[String]) -> anyhow::Result<PanelRelief> {
+    let mut relief = PanelRelief::by_name(name)?;
     set_all(&mut relief, set)?;
     Ok(relief)
 }
 
 /// Sets parameters from `key=value`.
-pub(in crate::commands) fn set_all(relief: &mut Relief, set: &[String]) -> anyhow::Result<()> {
+pub(in crate::commands) fn set_all(relief: &mut PanelRelief, set: &[String]) -> anyhow::Result<()> {
     for setting in set {
         let (key, value) =
             setting.split_once('=').with_context(|| format!("`--set {setting}` has no `=`; hint: --set key=value"))?;
@@ -58,7 +58,7 @@ pub(in crate::commands) fn set_all(relief: &mut Relief, set: &[String]) -> anyho
 }
 
 /// The relief of a file of parameters.
-pub(in crate::commands) fn relief_of_file(path: &Path) -> anyhow::Result<Relief> {
+pub(in crate::commands) fn relief_of_file(path: &Path) -> anyhow::Result<PanelRelief> {
     let text = std::fs::read_to_string(path).with_context(|| format!("cannot read parameters `{}`", path.display()))?;
-    Relief::from_json(&text).with_context(|| format!("parameters `{}`", path.display()))
+    PanelRelief::from_json(&text).with_context(|| format!("parameters `{}`", path.display()))
 }

@@ -7,7 +7,7 @@ use std::sync::atomic::Ordering;
 use std::time::Instant;
 
 use anyhow::Context as _;
-use echolake_acquisition::controller::{Control, Event};
+use echolake_acquisition::controller::{RunControl, RunEvent};
 use echolake_acquisition::disk::free_bytes;
 use echolake_acquisition::metrics::RunMetrics;
 use echolake_acquisition::recorder::Cost;
@@ -48,28 +48,28 @@ impl RunWatcher {
     }
 
     /// Records an event. Only measurements that are safe on the disk count as done.
-    pub(super) fn observe(&mut self, event: &Event<'_>) {
+    pub(super) fn observe(&mut self, event: &RunEvent<'_>) {
         self.metrics.observe(event);
         match event {
-            Event::Pair(pair) => {
+            RunEvent::Pair(pair) => {
                 self.pair =
                     format!("pair {} (microphone {}, speaker {})", pair.id.0, pair.microphone.0, pair.speaker.0);
             }
-            Event::Attempt(m) => {
+            RunEvent::Attempt(m) => {
                 self.snr_db = m.snr_db;
                 self.repeats += u64::from(m.verdict() == Verdict::Repeated);
                 self.given_up += u64::from(m.verdict() == Verdict::Rejected);
                 self.task.note(self.line());
             }
-            Event::Safe { accepted, cost, .. } => {
+            RunEvent::Safe { accepted, cost, .. } => {
                 self.cost = *cost;
                 if let Ok(bytes) = free_bytes(&self.folder) {
                     self.metrics.disk_free(bytes);
                 }
                 self.task.at(*accepted);
             }
-            Event::Paused => self.task.say("paused: everything is safe; `p` and Enter, or SIGUSR1, goes on"),
-            Event::Continued => self.task.say("going on"),
+            RunEvent::Paused => self.task.say("paused: everything is safe; `p` and Enter, or SIGUSR1, goes on"),
+            RunEvent::Continued => self.task.say("going on"),
         }
     }
 
@@ -101,7 +101,7 @@ impl RunWatcher {
 ///
 /// # Errors
 /// The system refused a handler.
-pub(super) fn obey(control: &Arc<Control>) -> anyhow::Result<()> {
+pub(super) fn obey(control: &Arc<RunControl>) -> anyhow::Result<()> {
     let stop = StopRequest::listen("stopping after the current pair; Ctrl-C again stops at once")?;
     let mut pauses = signal(SignalKind::user_defined1()).context("cannot listen to SIGUSR1")?;
     let stopped = control.clone();
@@ -128,6 +128,6 @@ pub(super) fn obey(control: &Arc<Control>) -> anyhow::Result<()> {
     Ok(())
 }
 
-fn toggle(control: &Control) {
+fn toggle(control: &RunControl) {
     control.pause.fetch_xor(true, Ordering::Relaxed);
 }

@@ -7,10 +7,10 @@ use std::sync::{Mutex, PoisonError};
 use std::time::Instant;
 
 use anyhow::Context as _;
-use echolake_acquisition::collection::Member;
-use echolake_acquisition::controller::Keep;
+use echolake_acquisition::collection::CollectionSurface;
+use echolake_acquisition::controller::RecordingMode;
 use echolake_acquisition::recorder::random_tag;
-use echolake_acquisition::run::{RunRequest, Specimen};
+use echolake_acquisition::run::{PanelSpecimen, RunRequest};
 use echolake_acquisition::simulate::simulate;
 use echolake_schema::manifest::RunEnd;
 use echolake_schema::{Rig, RunId, Timestamp};
@@ -27,8 +27,8 @@ const TOLD_EACH: usize = 20;
 pub(super) struct DemoCampaign {
     pub(super) rig: Rig,
     /// In the order in which they are measured.
-    pub(super) surfaces: Vec<Member>,
-    pub(super) keep: Keep,
+    pub(super) surfaces: Vec<CollectionSurface>,
+    pub(super) keep: RecordingMode,
     pub(super) seed: u64,
     /// Folder of the recordings.
     pub(super) folder: PathBuf,
@@ -158,7 +158,7 @@ impl CampaignState<'_> {
     }
 
     // Returns how the run ended and its size; nothing if it was measured before.
-    fn surface(&self, number: usize, member: &Member) -> anyhow::Result<Option<(RunEnd, u64)>> {
+    fn surface(&self, number: usize, member: &CollectionSurface) -> anyhow::Result<Option<(RunEnd, u64)>> {
         let DemoCampaign { rig, keep, seed, folder, known, .. } = self.campaign;
         let surface = &member.surface;
         let tag = random_tag();
@@ -171,7 +171,7 @@ impl CampaignState<'_> {
         let run = RunRequest {
             rig,
             surface: surface.clone(),
-            specimen: &Specimen::Relief(member.relief.clone()),
+            specimen: &PanelSpecimen::Relief(member.relief.clone()),
             flat: None,
             foam: None,
             start: self.campaign.start(number),

@@ -3,8 +3,8 @@
 use std::path::Path;
 
 use anyhow::Context as _;
-use echolake_acquisition::relief::Relief;
-use echolake_acquisition::relief::group::{BandLevel, Ranges};
+use echolake_acquisition::relief::PanelRelief;
+use echolake_acquisition::relief::group::{BandLevel, GroupRanges};
 
 use crate::CommandOutcome;
 
@@ -12,7 +12,7 @@ use crate::CommandOutcome;
 pub(super) fn make(ranges: &Path, count: usize, folder: &Path) -> anyhow::Result<CommandOutcome> {
     let reliefs = read(ranges)?.draw(count)?;
     std::fs::create_dir_all(folder).with_context(|| format!("cannot make `{}`", folder.display()))?;
-    let keys: Vec<_> = reliefs.first().map(Relief::parameters).into_iter().flatten().map(|(key, _)| key).collect();
+    let keys: Vec<_> = reliefs.first().map(PanelRelief::parameters).into_iter().flatten().map(|(key, _)| key).collect();
     let mut table = format!("surface_id,relief,{}\n", keys.join(","));
     for (n, relief) in reliefs.iter().enumerate() {
         let surface = format!("{:04}_{}", n / 2 + 1, n % 2);
@@ -40,7 +40,7 @@ pub(super) fn next(ranges: &Path, results: &Path, output: &Path) -> anyhow::Resu
     Ok(CommandOutcome::Whole)
 }
 
-fn read(path: &Path) -> anyhow::Result<Ranges> {
+fn read(path: &Path) -> anyhow::Result<GroupRanges> {
     let text = std::fs::read_to_string(path).with_context(|| format!("cannot read ranges `{}`", path.display()))?;
-    Ranges::from_toml(&text).with_context(|| format!("ranges `{}`", path.display()))
+    GroupRanges::from_toml(&text).with_context(|| format!("ranges `{}`", path.display()))
 }

@@ -5,7 +5,7 @@ use realfft::num_complex::Complex;
 
 /// Position of an output in a recording.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) struct Delay {
+pub(super) struct LoopbackDelay {
     /// First sample of the output.
     pub(super) at: usize,
     /// Correlation there, -1 to 1.
@@ -16,9 +16,9 @@ pub(super) struct Delay {
 ///
 /// output     `[n]`      full scale 1.0
 /// recording  `[n + m]`  any scale; delays 0 to m are tried
-pub(super) fn locate(output: &[f32], recording: &[i32]) -> Delay {
+pub(super) fn locate(output: &[f32], recording: &[i32]) -> LoopbackDelay {
     let (Some(most), false) = (recording.len().checked_sub(output.len()), output.is_empty()) else {
-        return Delay { at: 0, likeness: 0.0 };
+        return LoopbackDelay { at: 0, likeness: 0.0 };
     };
     let len = (recording.len() + output.len()).next_power_of_two();
     let (forward, inverse) = (f64::plan_real_forward(len), f64::plan_real_inverse(len));
@@ -39,12 +39,12 @@ pub(super) fn locate(output: &[f32], recording: &[i32]) -> Delay {
     let energy_sent: f64 = output.iter().map(|x| f64::from(*x).powi(2)).sum();
     let square = |n: usize| f64::from(recording[n]).powi(2);
     let mut energy: f64 = (0..output.len()).map(square).sum();
-    let mut best = Delay { at: 0, likeness: 0.0 };
+    let mut best = LoopbackDelay { at: 0, likeness: 0.0 };
     for (at, alike) in correlation.iter().enumerate().take(most + 1) {
         let norm = (energy * energy_sent).sqrt();
         let likeness = if norm > 0.0 { alike / len as f64 / norm } else { 0.0 };
         if likeness > best.likeness {
-            best = Delay { at, likeness };
+            best = LoopbackDelay { at, likeness };
         }
         if at < most {
             energy += square(at + output.len()) - square(at);
@@ -76,7 +76,7 @@ mod tests {
     #[test]
     fn nothing_is_like_silence() {
         for (output, recording) in [(vec![1.0; 10], vec![0; 20]), (vec![], vec![1; 5]), (vec![1.0; 10], vec![1; 5])] {
-            assert_eq!(locate(&output, &recording), Delay { at: 0, likeness: 0.0 });
+            assert_eq!(locate(&output, &recording), LoopbackDelay { at: 0, likeness: 0.0 });
         }
     }
 }

@@ -1,5 +1,5 @@
 //! Alignment common to all audio interfaces, above the system's calls: takes that begin with the output to the sample,
-//! detection of gaps, retries. [`Duplex`] is the part of a system.
+//! detection of gaps, retries. [`AudioDuplex`] is the part of a system.
 
 mod delay;
 #[cfg(test)]
@@ -7,8 +7,8 @@ pub(super) mod tests;
 
 use echolake_schema::Timestamp;
 
-use crate::rig::{AudioInterface, Error, Take};
-use delay::{Delay, locate};
+use crate::rig::{AudioInterface, AudioTake, Error};
+use delay::{LoopbackDelay, locate};
 
 pub(crate) const DEVICE: &str = "audio interface";
 /// Least correlation of loopback and output, -1 to 1: below it the loopback carries something else.
@@ -19,7 +19,7 @@ const SILENCE: f64 = 1e-5;
 const SHORTEST_PART: usize = 512;
 
 /// Plays and records at the same time; the start of one against the other is not known.
-pub trait Duplex: Send {
+pub trait AudioDuplex: Send {
     /// Sampling rate, Hz.
     fn rate_hz(&self) -> f64;
 
@@ -27,13 +27,18 @@ pub trait Duplex: Send {
     /// output. Returns when the first frame was taken.
     ///
     /// # Errors
-    /// [`Trouble`].
-    fn transfer(&mut self, output: &[f32], frames: usize, recorded: &mut Recorded) -> Result<Timestamp, Trouble>;
+    /// [`TransferError`].
+    fn transfer(
+        &mut self,
+        output: &[f32],
+        frames: usize,
+        recorded: &mut DuplexRecording,
+    ) -> Result<Timestamp, TransferError>;
 }
 
 /// Two channels, signed 24 bits.
 #[derive(Debug, Clone, Default)]
-pub struct Recorded {
+pub struct DuplexRecording {
     /// The microphone.
     pub microphone: Vec<i32>,
     /// The output, looped back.
@@ -42,7 +47,7 @@ pub struct Recorded {
 
 /// A transfer that gave no complete recording.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub enum Trouble {
+pub enum TransferError {
     /// The computer was too late to fetch or to bring samples; a retry may succeed.
     Late(String),
     /// The device is gone or refuses.
@@ -50,21 +55,21 @@ pub enum Trouble {
 }
 
 /// An audio interface whose takes begin with the output.
-pub struct Aligned<D> {
+pub struct AlignedAudio<D> {
     duplex: D,
     latency_secs: f64,
     repeats: u32,
-    recorded: Recorded,
+    recorded: DuplexRecording,
     /// The last delay that was found, for outputs that are silent.
     delay: usize,
     last: Timestamp,
     notices: Vec<String>,
 }
 
-impl<D: Duplex> Aligned<D> {
+impl<D: AudioDuplex> AlignedAudio<D> {
     /// Over a duplex that records at most `latency_secs` late; takes with a gap are repeated `repeats` times.
     pub fn new(duplex: D, latency_secs: f64, repeats: u32) -> Self {
-        let (recorded, last) = (Recorded::default(), Timestamp(i64::MIN));
+        let (recorded, last) = (DuplexRecording::default(), Timestamp(i64::MIN));
         Self { duplex, latency_secs, repeats, recorded, delay: 0, last, notices: Vec::new() }
     }
 
@@ -74,8 +79,8 @@ impl<D: Duplex> Aligned<D> {
         let latency = (self.latency_secs * rate_hz).ceil() as usize;
         let frames = output.len() + latency;
         let began = self.duplex.transfer(output, frames, &mut self.recorded).map_err(|trouble| match trouble {
-            Trouble::Late(why) => Failure::Again(why),
-            Trouble::Gone(why) => Failure::Final(why),
+            TransferError::Late(why) => Failure::Again(why),
+            TransferError::Gone(why) => Failure::Final(why),
         })?;
         let counts = [self.recorded.microphone.len(), self.recorded.loopback.len()];
         if counts != [frames; 2] {
@@ -108,7 +113,7 @@ impl<D: Duplex> Aligned<D> {
         Ok(found.at)
     }
 
-    fn no_loopback(&self, found: &Delay) -> String {
+    fn no_loopback(&self, found: &LoopbackDelay) -> String {
         let level = 20.0 * rms_24(&self.recorded.loopback).max(1e-9).log10();
         let likeness = found.likeness;
         format!(
@@ -124,12 +129,12 @@ enum Failure {
     Final(String),
 }
 
-impl<D: Duplex> AudioInterface for Aligned<D> {
+impl<D: AudioDuplex> AudioInterface for AlignedAudio<D> {
     fn rate_hz(&self) -> f64 {
         self.duplex.rate_hz()
     }
 
-    fn play_and_record(&mut self, output: &[f32], take: &mut Take) -> Result<(), Error> {
+    fn play_and_record(&mut self, output: &[f32], take: &mut AudioTake) -> Result<(), Error> {
         let failed = |reason| Err(Error::Device { device: DEVICE, reason });
         for attempt in 0..=self.repeats {
             match self.attempt(output) {

@@ -11,7 +11,7 @@ use std::time::{Duration, Instant};
 use serde_json::{Value, json};
 use tungstenite::{Message, WebSocket};
 
-use crate::robots::{Joints, Standing};
+use crate::robots::{ArmPose, Joints};
 
 /// Interval between two joint states.
 const TICK: Duration = Duration::from_millis(20);
@@ -24,7 +24,7 @@ const NAMES: [&str; 2] = ["/microphone", "/speaker"];
 
 /// A fault of the fake arms or their bridge.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Fault {
+pub enum BridgeFault {
     /// Nothing.
     None,
     /// The bridge answers trajectories with an error.
@@ -46,18 +46,18 @@ pub enum Fault {
 /// A fake rosbridge; it ends when it is dropped.
 pub struct FakeBridge {
     address: SocketAddr,
-    world: Arc<Mutex<World>>,
+    world: Arc<Mutex<FakeWorld>>,
     stop: Arc<AtomicBool>,
     thread: Option<JoinHandle<()>>,
 }
 
-struct World {
-    arms: [Arm; 2],
-    fault: Fault,
+struct FakeWorld {
+    arms: [FakeArm; 2],
+    fault: BridgeFault,
 }
 
 /// An arm on its way from one pose to another.
-struct Arm {
+struct FakeArm {
     from: Joints,
     to: Joints,
     began: Instant,
@@ -65,10 +65,10 @@ struct Arm {
     power: bool,
 }
 
-impl Arm {
-    fn joints(&self, fault: Fault) -> Joints {
+impl FakeArm {
+    fn joints(&self, fault: BridgeFault) -> Joints {
         let share = if self.secs > 0.0 { (self.began.elapsed().as_secs_f64() / self.secs).min(1.0) } else { 1.0 };
-        let share = if fault == Fault::StopsHalfWay { share.min(0.5) } else { share };
+        let share = if fault == BridgeFault::StopsHalfWay { share.min(0.5) } else { share };
         std::array::from_fn(|i| self.from[i] + share * (self.to[i] - self.from[i]))
     }
 }
@@ -82,9 +82,12 @@ impl FakeBridge {
         let listener = TcpListener::bind(address)?;
         listener.set_nonblocking(true)?;
         let address = listener.local_addr()?;
-        let home = Standing::home();
-        let arm = |at| Arm { from: at, to: at, began: Instant::now(), secs: 0.0, power: false };
-        let world = Arc::new(Mutex::new(World { arms: [arm(home.microphone), arm(home.speaker)], fault: Fault::None }));
+        let home = ArmPose::home();
+        let arm = |at| FakeArm { from: at, to: at, began: Instant::now(), secs: 0.0, power: false };
+        let world = Arc::new(Mutex::new(FakeWorld {
+            arms: [arm(home.microphone), arm(home.speaker)],
+            fault: BridgeFault::None,
+        }));
         let stop = Arc::new(AtomicBool::new(false));
         let (theirs, stopped) = (world.clone(), stop.clone());
         let thread = std::thread::spawn(move || accept(&listener, &theirs, &stopped));
@@ -97,7 +100,7 @@ impl FakeBridge {
     }
 
     /// Sets the fault from now on.
-    pub fn set_fault(&self, fault: Fault) {
+    pub fn set_fault(&self, fault: BridgeFault) {
         lock(&self.world).fault = fault;
     }
 
@@ -114,17 +117,17 @@ impl Drop for FakeBridge {
     }
 }
 
-fn lock(world: &Mutex<World>) -> MutexGuard<'_, World> {
+fn lock(world: &Mutex<FakeWorld>) -> MutexGuard<'_, FakeWorld> {
     world.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-fn accept(listener: &TcpListener, world: &Arc<Mutex<World>>, stop: &Arc<AtomicBool>) {
+fn accept(listener: &TcpListener, world: &Arc<Mutex<FakeWorld>>, stop: &Arc<AtomicBool>) {
     let mut clients = Vec::new();
     while !stop.load(Ordering::Relaxed) {
         match listener.accept() {
             Ok((stream, _)) => {
                 let (world, stop) = (world.clone(), stop.clone());
-                clients.push(std::thread::spawn(move || Client::serve(stream, &world, &stop)));
+                clients.push(std::thread::spawn(move || BridgeClient::serve(stream, &world, &stop)));
             }
             Err(_) => std::thread::sleep(PAUSE),
         }
@@ -132,13 +135,13 @@ fn accept(listener: &TcpListener, world: &Arc<Mutex<World>>, stop: &Arc<AtomicBo
     clients.into_iter().for_each(|client| drop(client.join()));
 }
 
-struct Client {
+struct BridgeClient {
     socket: WebSocket<TcpStream>,
     topics: Vec<String>,
 }
 
-impl Client {
-    fn serve(stream: TcpStream, world: &Mutex<World>, stop: &AtomicBool) {
+impl BridgeClient {
+    fn serve(stream: TcpStream, world: &Mutex<FakeWorld>, stop: &AtomicBool) {
         let set = stream
             .set_nonblocking(false)
             .and_then(|()| stream.set_nodelay(true))
@@ -153,7 +156,7 @@ impl Client {
         while !stop.load(Ordering::Relaxed) {
             match client.socket.read() {
                 Ok(Message::Text(text)) => {
-                    if lock(world).fault == Fault::HangsUp {
+                    if lock(world).fault == BridgeFault::HangsUp {
                         return;
                     }
                     let answer = client.answer(text.as_str(), world);
@@ -178,7 +181,7 @@ impl Client {
         self.socket.send(Message::text(text))
     }
 
-    fn publish(&mut self, world: &Mutex<World>) -> Result<(), tungstenite::Error> {
+    fn publish(&mut self, world: &Mutex<FakeWorld>) -> Result<(), tungstenite::Error> {
         let (fault, joints) = {
             let world = lock(world);
             (world.fault, [0, 1].map(|i| world.arms[i].joints(world.fault)))
@@ -187,16 +190,16 @@ impl Client {
         for (name, joints) in NAMES.iter().zip(joints) {
             let header = json!({"seq": 0, "stamp": {"secs": 0, "nsecs": 0}, "frame_id": ""});
             let states = json!({"header": header, "name": names, "position": joints, "velocity": [], "effort": []});
-            let stopped = i32::from(fault == Fault::EmergencyStop);
+            let stopped = i32::from(fault == BridgeFault::EmergencyStop);
             let status =
                 json!({"header": header, "e_stopped": {"val": stopped}, "in_error": {"val": 0}, "error_code": 0});
             for (topic, message) in [("joint_states", states), ("robot_status", status)] {
                 let topic = format!("{name}/{topic}");
-                if !self.topics.contains(&topic) || (fault == Fault::Silent && topic.ends_with("joint_states")) {
+                if !self.topics.contains(&topic) || (fault == BridgeFault::Silent && topic.ends_with("joint_states")) {
                     continue;
                 }
                 match fault {
-                    Fault::Nonsense => self.say("\u{fffd}{\"op\":")?,
+                    BridgeFault::Nonsense => self.say("\u{fffd}{\"op\":")?,
                     _ => self.say(&json!({"op": "publish", "topic": topic, "msg": message}).to_string())?,
                 }
             }
@@ -204,7 +207,7 @@ impl Client {
         Ok(())
     }
 
-    fn answer(&mut self, text: &str, world: &Mutex<World>) -> Option<Value> {
+    fn answer(&mut self, text: &str, world: &Mutex<FakeWorld>) -> Option<Value> {
         let complaint = |words: &str| Some(json!({"op": "status", "level": "error", "msg": words}));
         let Ok(message) = serde_json::from_str::<Value>(text) else { return complaint("no JSON") };
         let topic = || message["topic"].as_str().unwrap_or_default().to_owned();
@@ -230,13 +233,13 @@ impl Client {
 }
 
 // Starts an arm's move; returns a complaint if it is refused.
-fn follow(topic: &str, message: &Value, world: &mut World) -> Option<&'static str> {
+fn follow(topic: &str, message: &Value, world: &mut FakeWorld) -> Option<&'static str> {
     let Some(i) = NAMES.iter().position(|n| topic.strip_prefix(n) == Some("/joint_path_command")) else {
         return Some("nobody listens to this topic");
     };
     let fault = world.fault;
     let arm = &mut world.arms[i];
-    if fault == Fault::Refuses {
+    if fault == BridgeFault::Refuses {
         return Some("the target is outside of the joints' ranges");
     }
     if !arm.power {
@@ -252,12 +255,12 @@ fn follow(topic: &str, message: &Value, world: &mut World) -> Option<&'static st
     None
 }
 
-fn switch(service: &str, world: &mut World) -> (bool, &'static str) {
+fn switch(service: &str, world: &mut FakeWorld) -> (bool, &'static str) {
     let Some((i, verb)) = NAMES.iter().enumerate().find_map(|(i, n)| Some((i, service.strip_prefix(n)?))) else {
         return (false, "no such service");
     };
     match verb {
-        "/robot_enable" if world.fault == Fault::NoPower => (false, "the safety chain is open"),
+        "/robot_enable" if world.fault == BridgeFault::NoPower => (false, "the safety chain is open"),
         "/robot_enable" | "/robot_disable" => {
             world.arms[i].power = verb == "/robot_enable";
             (true, "")

@@ -13,9 +13,9 @@ use echolake_schema::devices::RosbridgeParams;
 use tungstenite::stream::MaybeTlsStream;
 use tungstenite::{Message, WebSocket};
 
-use crate::rig::{Error, Positions, Power, Robots};
-use crate::robots::{Aim, Cell, Joints, Standing, course};
-use wire::{Incoming, Side};
+use crate::rig::{ArmPositions, DrivePower, Error, RobotArms};
+use crate::robots::{ArmPose, Cell, Joints, SpeakerAim, course};
+use wire::{ArmRole, BridgeMessage};
 
 const DEVICE: &str = "robots";
 /// Timeout of one wait for a message.
@@ -27,14 +27,14 @@ const LEAST_SECS: f64 = 0.05;
 /// Joint states in a row that have to be near the target before it counts as reached.
 const STANDS: usize = 3;
 
-type Socket = WebSocket<MaybeTlsStream<TcpStream>>;
+type BridgeSocket = WebSocket<MaybeTlsStream<TcpStream>>;
 
 /// Two arms behind a rosbridge.
 pub struct RosbridgeRobots {
     params: RosbridgeParams,
     cell: Cell,
-    socket: Option<Socket>,
-    power: Power,
+    socket: Option<BridgeSocket>,
+    power: DrivePower,
     calls: u32,
     joints: [Option<Joints>; 2],
     faults: [Option<String>; 2],
@@ -51,7 +51,7 @@ impl RosbridgeRobots {
             params: params.clone(),
             cell,
             socket: None,
-            power: Power::Off,
+            power: DrivePower::Off,
             calls: 0,
             joints: [None; 2],
             faults: [None, None],
@@ -61,7 +61,7 @@ impl RosbridgeRobots {
         Ok(robots)
     }
 
-    fn connected(&mut self) -> Result<&mut Socket, Error> {
+    fn connected(&mut self) -> Result<&mut BridgeSocket, Error> {
         if self.socket.is_none() {
             let url = &self.params.url;
             let failed =
@@ -88,21 +88,21 @@ impl RosbridgeRobots {
     }
 
     // The next message, or nothing within a pause.
-    fn receive(&mut self) -> Result<Option<Incoming>, Error> {
+    fn receive(&mut self) -> Result<Option<BridgeMessage>, Error> {
         match self.connected()?.read() {
             Ok(Message::Text(text)) => match wire::read(text.as_str(), &self.params) {
                 Ok(incoming) => {
                     match &incoming {
-                        Incoming::Joints(side, joints) => self.joints[*side as usize] = Some(*joints),
-                        Incoming::Fault(side, why) => self.faults[*side as usize] = Some(why.clone()),
-                        Incoming::Well(side) => self.faults[*side as usize] = None,
+                        BridgeMessage::Joints(side, joints) => self.joints[*side as usize] = Some(*joints),
+                        BridgeMessage::Fault(side, why) => self.faults[*side as usize] = Some(why.clone()),
+                        BridgeMessage::Well(side) => self.faults[*side as usize] = None,
                         _ => {}
                     }
                     Ok(Some(incoming))
                 }
                 Err(nonsense) => {
                     self.notices.push(format!("nonsense from `{}`: {nonsense}", self.params.url));
-                    Ok(Some(Incoming::Other))
+                    Ok(Some(BridgeMessage::Other))
                 }
             },
             Ok(_) => Ok(None),
@@ -118,7 +118,7 @@ impl RosbridgeRobots {
     // The next call connects anew; until then the state of the motors is unknown.
     fn lost(&mut self, why: &str) -> Error {
         self.socket = None;
-        self.power = Power::Off;
+        self.power = DrivePower::Off;
         failure(format!("lost `{}`: {why}; hint: is the controller still on, the cable plugged in?", self.params.url))
     }
 
@@ -133,7 +133,7 @@ impl RosbridgeRobots {
                 return Ok([microphone, speaker]);
             }
             if Instant::now() >= end {
-                let silent = Side::BOTH.into_iter().find(|side| self.joints[*side as usize].is_none());
+                let silent = ArmRole::BOTH.into_iter().find(|side| self.joints[*side as usize].is_none());
                 let name = silent.map_or("", |side| side.namespace(&self.params));
                 let secs = self.params.timeout_secs;
                 return Err(failure(format!(
@@ -153,7 +153,7 @@ impl RosbridgeRobots {
         let from = self.current()?;
         let way = |i: usize| crate::robots::arm::travel_secs(&from[i], &target[i]);
         let secs = (way(0).max(way(1)) / self.params.speed).max(LEAST_SECS);
-        for side in Side::BOTH {
+        for side in ArmRole::BOTH {
             if way(side as usize) > 0.0 {
                 self.send(&wire::trajectory(&self.params, side, &target[side as usize], secs))?;
             }
@@ -161,11 +161,14 @@ impl RosbridgeRobots {
         let (end, mut stands) = (self.deadline(secs), 0);
         while stands < STANDS {
             match self.receive()? {
-                Some(Incoming::Complaint(why)) => return Err(failure(format!("the bridge refuses the target: {why}"))),
-                Some(Incoming::Joints(..)) => stands = if self.farthest(target).1 { stands + 1 } else { 0 },
+                Some(BridgeMessage::Complaint(why)) => {
+                    return Err(failure(format!("the bridge refuses the target: {why}")));
+                }
+                Some(BridgeMessage::Joints(..)) => stands = if self.farthest(target).1 { stands + 1 } else { 0 },
                 _ => {}
             }
-            if let Some((side, why)) = Side::BOTH.into_iter().find_map(|s| Some((s, self.faults[s as usize].clone()?)))
+            if let Some((side, why)) =
+                ArmRole::BOTH.into_iter().find_map(|s| Some((s, self.faults[s as usize].clone()?)))
             {
                 return Err(failure(format!("`{}` refuses to move: {why}", side.namespace(&self.params))));
             }
@@ -182,7 +185,7 @@ impl RosbridgeRobots {
     // The joint that is farthest from its target, in words, and whether all are near enough.
     fn farthest(&self, target: &[Joints; 2]) -> (String, bool) {
         let mut worst = (0.0, String::new());
-        for side in Side::BOTH {
+        for side in ArmRole::BOTH {
             let Some(joints) = self.joints[side as usize] else { continue };
             for (i, (is, wanted)) in joints.iter().zip(target[side as usize]).enumerate() {
                 let off = (is - wanted).abs().to_degrees();
@@ -195,7 +198,7 @@ impl RosbridgeRobots {
         (worst.1, worst.0 <= self.params.tolerance_deg)
     }
 
-    fn call(&mut self, side: Side, service: &str) -> Result<(), Error> {
+    fn call(&mut self, side: ArmRole, service: &str) -> Result<(), Error> {
         self.calls += 1;
         let id = format!("echolake-{}", self.calls);
         self.send(&wire::trigger(&self.params, side, service, &id))?;
@@ -203,8 +206,8 @@ impl RosbridgeRobots {
         let end = self.deadline(0.0);
         while Instant::now() < end {
             match self.receive()? {
-                Some(Incoming::Answer(of, true, _)) if of == id => return Ok(()),
-                Some(Incoming::Answer(of, false, why)) if of == id => {
+                Some(BridgeMessage::Answer(of, true, _)) if of == id => return Ok(()),
+                Some(BridgeMessage::Answer(of, false, why)) if of == id => {
                     return Err(failure(format!("`{name}` refuses: {why}")));
                 }
                 _ => {}
@@ -214,15 +217,15 @@ impl RosbridgeRobots {
     }
 }
 
-impl Robots for RosbridgeRobots {
-    fn move_to(&mut self, microphone_mm: [f64; 3], speaker_mm: [f64; 3]) -> Result<Positions, Error> {
+impl RobotArms for RosbridgeRobots {
+    fn move_to(&mut self, microphone_mm: [f64; 3], speaker_mm: [f64; 3]) -> Result<ArmPositions, Error> {
         let refuse = |reason| Error::Unreachable { microphone_mm, speaker_mm, reason };
-        if self.power == Power::Off {
+        if self.power == DrivePower::Off {
             return Err(refuse("the drives are off"));
         }
         let target = self.cell.reach(microphone_mm, speaker_mm).map_err(|why| refuse(why.reason()))?;
         let [microphone, speaker] = self.current()?;
-        let from = Standing { microphone, speaker, aim: Aim::Down };
+        let from = ArmPose { microphone, speaker, aim: SpeakerAim::Down };
         let motion =
             course(&self.cell, &from, &target).ok_or_else(|| refuse("no way there without touching is known"))?;
         let mut joints = [microphone, speaker];
@@ -230,15 +233,15 @@ impl Robots for RosbridgeRobots {
             joints = self.drive(stop)?;
         }
         let [microphone_mm, speaker_mm] = self.cell.positions_mm(&joints[0], &joints[1]);
-        Ok(Positions { microphone_mm, speaker_mm, joints: Some(joints) })
+        Ok(ArmPositions { microphone_mm, speaker_mm, joints: Some(joints) })
     }
 
-    fn power(&mut self, power: Power) -> Result<(), Error> {
+    fn power(&mut self, power: DrivePower) -> Result<(), Error> {
         let service = match power {
-            Power::On => "robot_enable",
-            Power::Off => "robot_disable",
+            DrivePower::On => "robot_enable",
+            DrivePower::Off => "robot_disable",
         };
-        for side in Side::BOTH {
+        for side in ArmRole::BOTH {
             self.call(side, service)?;
         }
         self.power = power;

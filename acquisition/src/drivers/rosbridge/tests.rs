@@ -2,7 +2,7 @@
 
 use echolake_schema::Rig;
 
-use super::fake::{FakeBridge, Fault};
+use super::fake::{BridgeFault, FakeBridge};
 use super::*;
 use crate::conformance;
 
@@ -29,7 +29,7 @@ fn it_conforms() {
     conformance::robots(&mut robots, NEAR, [NEAR[0], [0.0, 0.0, 5_000.0]]);
     conformance::robots(&mut robots, NEAR, [NEAR[0], NEAR[0]]);
     assert!(bridge.has_power());
-    robots.power(Power::Off).expect("a switch");
+    robots.power(DrivePower::Off).expect("a switch");
     assert!(!bridge.has_power());
 }
 
@@ -37,7 +37,7 @@ fn it_conforms() {
 fn joints_are_those_that_the_arms_told() {
     let bridge = bridge();
     let mut robots = connected(&bridge);
-    robots.power(Power::On).expect("a switch");
+    robots.power(DrivePower::On).expect("a switch");
     let reached = robots.move_to(NEAR[0], NEAR[1]).expect("reached");
     let joints = reached.joints.expect("joints");
     let wanted = Cell::of(&Rig::paper()).reach(NEAR[0], NEAR[1]).expect("within reach");
@@ -50,8 +50,8 @@ fn joints_are_those_that_the_arms_told() {
 fn motors_that_stay_off_are_named() {
     let bridge = bridge();
     let mut robots = connected(&bridge);
-    bridge.set_fault(Fault::NoPower);
-    let error = robots.power(Power::On).expect_err("refused").to_string();
+    bridge.set_fault(BridgeFault::NoPower);
+    let error = robots.power(DrivePower::On).expect_err("refused").to_string();
     assert!(error.contains("`/microphone/robot_enable` refuses: the safety chain is open"), "{error}");
     let error = robots.move_to(NEAR[0], NEAR[1]).expect_err("no power").to_string();
     assert!(error.contains("the drives are off"), "{error}");
@@ -61,7 +61,7 @@ fn motors_that_stay_off_are_named() {
 fn nonsense_is_told_of() {
     let bridge = bridge();
     let mut robots = connected(&bridge);
-    bridge.set_fault(Fault::Nonsense);
+    bridge.set_fault(BridgeFault::Nonsense);
     robots.params.timeout_secs = IMPATIENT_SECS;
     let _ = robots.current();
     assert!(robots.notices().iter().any(|n| n.contains("no JSON")));
@@ -82,22 +82,22 @@ mod slow {
         let check = |fault, expected: &str| {
             let bridge = bridge();
             let mut robots = connected(&bridge);
-            robots.power(Power::On).expect("a switch");
+            robots.power(DrivePower::On).expect("a switch");
             bridge.set_fault(fault);
             robots.params.timeout_secs = IMPATIENT_SECS;
             let error = robots.move_to(NEAR[0], NEAR[1]).expect_err(expected).to_string();
             robots.params.timeout_secs = PATIENT_SECS;
             assert!(error.starts_with("robots: ") && error.contains(expected), "{fault:?}: {error}");
             // Back to normal, the next try does; after a lost connection the motors have to be switched on again.
-            bridge.set_fault(Fault::None);
-            robots.power(Power::On).expect("a switch");
+            bridge.set_fault(BridgeFault::None);
+            robots.power(DrivePower::On).expect("a switch");
             robots.move_to(NEAR[0], NEAR[1]).unwrap_or_else(|e| panic!("{fault:?}: {e}"));
         };
-        check(Fault::Refuses, "the bridge refuses the target: the target is outside of the joints' ranges");
-        check(Fault::StopsHalfWay, "degrees off; hint: are the motors on");
-        check(Fault::EmergencyStop, "refuses to move: emergency stop");
-        check(Fault::Silent, "no joint states on `/microphone/joint_states`");
-        check(Fault::HangsUp, "is the controller still on");
-        check(Fault::Nonsense, "no joint states on");
+        check(BridgeFault::Refuses, "the bridge refuses the target: the target is outside of the joints' ranges");
+        check(BridgeFault::StopsHalfWay, "degrees off; hint: are the motors on");
+        check(BridgeFault::EmergencyStop, "refuses to move: emergency stop");
+        check(BridgeFault::Silent, "no joint states on `/microphone/joint_states`");
+        check(BridgeFault::HangsUp, "is the controller still on");
+        check(BridgeFault::Nonsense, "no joint states on");
     }
 }

@@ -3,7 +3,7 @@
 
 /// Values of one line.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Line {
+pub struct SensorLine {
     /// Temperature, C.
     pub temperature_c: f64,
     /// Relative humidity, %.
@@ -18,7 +18,7 @@ pub struct Line {
 const VALUES: [(&str, f64, f64); 4] =
     [("T", -40.0, 85.0), ("RH", 0.0, 100.0), ("P", 300.0, 1_100.0), ("L", 0.0, 150.0)];
 
-impl Line {
+impl SensorLine {
     /// Reads a line without its end. None if it is empty or a comment, which begins with `#`.
     ///
     /// # Errors
@@ -69,7 +69,7 @@ mod tests {
 
     #[test]
     fn lines_are_read() {
-        let line = Line { temperature_c: 21.53, humidity_pct: 45.2, pressure_hpa: 965.1, level_db: 42.0 };
+        let line = SensorLine { temperature_c: 21.53, humidity_pct: 45.2, pressure_hpa: 965.1, level_db: 42.0 };
         for text in [
             "T=21.53 RH=45.2 P=965.1 L=42.0",
             "L=42,RH=45.2,P=965.1,T=21.53,CO2=412\r",
@@ -78,17 +78,17 @@ mod tests {
             let sum = text.split('*').next().unwrap_or_default().bytes().fold(0, |sum, byte| sum ^ byte);
             let text =
                 if text.contains('*') { format!("T=21.53 RH=45.2 P=965.1 L=42.0*{sum:02x}") } else { text.into() };
-            assert_eq!(Line::parse(&text), Ok(Some(line)), "{text}");
+            assert_eq!(SensorLine::parse(&text), Ok(Some(line)), "{text}");
         }
         for text in ["", "  \r", "# booting, firmware 1.2"] {
-            assert_eq!(Line::parse(text), Ok(None), "{text:?}");
+            assert_eq!(SensorLine::parse(text), Ok(None), "{text:?}");
         }
     }
 
     #[test]
     fn nonsense_is_named() {
         let check = |text: &str, expected: &str| {
-            let error = Line::parse(text).expect_err(text);
+            let error = SensorLine::parse(text).expect_err(text);
             assert!(error.contains(expected), "{text}: {error}");
         };
         check("hello", "no `name=value`");
@@ -110,7 +110,7 @@ mod tests {
                     (x >> 56) as u8
                 })
                 .collect();
-            assert!(!matches!(Line::parse(&String::from_utf8_lossy(&bytes)), Ok(Some(_))));
+            assert!(!matches!(SensorLine::parse(&String::from_utf8_lossy(&bytes)), Ok(Some(_))));
         }
     }
 }

@@ -10,8 +10,8 @@ use echolake_schema::Timestamp;
 use echolake_schema::devices::SerialParams;
 use serial2::SerialPort;
 
-use crate::rig::{AmbientSensor, Error, Reading};
-use line::Line;
+use crate::rig::{AmbientReading, AmbientSensor, Error};
+use line::SensorLine;
 
 const DEVICE: &str = "ambient sensor";
 /// Timeout of one wait for bytes; bytes without a pause of this length are taken together.
@@ -35,8 +35,8 @@ pub struct SerialSensor {
 
 /// Lines received while waiting for one reading.
 #[derive(Default)]
-struct Taken {
-    line: Option<Line>,
+struct ReceivedLines {
+    line: Option<SensorLine>,
     loudest_db: f64,
     nonsense: usize,
     last_nonsense: String,
@@ -74,7 +74,7 @@ impl SerialSensor {
     }
 
     // Reads the bytes that are there already, or come until a pause. An error means that the line is gone.
-    fn take(&mut self, taken: &mut Taken) -> std::io::Result<()> {
+    fn take(&mut self, taken: &mut ReceivedLines) -> std::io::Result<()> {
         let mut buffer = [0; 512];
         loop {
             let Some(port) = &self.port else { return Ok(()) };
@@ -88,7 +88,7 @@ impl SerialSensor {
         }
     }
 
-    fn split(&mut self, bytes: &[u8], taken: &mut Taken) {
+    fn split(&mut self, bytes: &[u8], taken: &mut ReceivedLines) {
         for byte in bytes {
             match byte {
                 b'\n' => {
@@ -108,7 +108,7 @@ impl SerialSensor {
         }
     }
 
-    fn silent(&self, taken: &Taken, lost: Option<String>) -> Error {
+    fn silent(&self, taken: &ReceivedLines, lost: Option<String>) -> Error {
         let secs = self.params.timeout_secs;
         let path = &self.params.path;
         let reason = match (lost, taken.nonsense) {
@@ -123,9 +123,9 @@ impl SerialSensor {
     }
 }
 
-impl Taken {
+impl ReceivedLines {
     fn line(&mut self, text: &str) {
-        match Line::parse(text) {
+        match SensorLine::parse(text) {
             Ok(Some(line)) => {
                 self.loudest_db = self.loudest_db.max(line.level_db);
                 self.line = Some(line);
@@ -143,9 +143,9 @@ impl Taken {
 }
 
 impl AmbientSensor for SerialSensor {
-    fn read(&mut self) -> Result<Reading, Error> {
+    fn read(&mut self) -> Result<AmbientReading, Error> {
         let end = Instant::now() + Duration::from_secs_f64(self.params.timeout_secs);
-        let (mut taken, mut lost) = (Taken::default(), None);
+        let (mut taken, mut lost) = (ReceivedLines::default(), None);
         loop {
             if self.port.is_none() {
                 match self.connect() {
@@ -164,7 +164,7 @@ impl AmbientSensor for SerialSensor {
                     self.notices.push(format!("{count} lines of nonsense, the last {last}"));
                 }
                 self.last = Timestamp(Timestamp::now().0.max(self.last.0));
-                return Ok(Reading {
+                return Ok(AmbientReading {
                     at: self.last,
                     temperature_c: line.temperature_c,
                     humidity_pct: line.humidity_pct,

@@ -17,13 +17,13 @@ fn rig() -> Rig {
     Rig::from_toml(&format!("impulse_response.length = {SAMPLES}\n{points}")).expect("a rig")
 }
 
-struct Place {
+struct GirFolders {
     _root: tempfile::TempDir,
     gir: PathBuf,
     inbox: PathBuf,
 }
 
-impl Place {
+impl GirFolders {
     fn new() -> Self {
         let root = tempfile::tempdir().expect("a folder");
         let [gir, inbox] = ["gir", "inbox"].map(|name| root.path().join(name));
@@ -59,7 +59,7 @@ fn matrix() -> Array2<f32> {
 
 #[test]
 fn responses_come_back_as_they_were() {
-    let place = Place::new();
+    let place = GirFolders::new();
     place.surface("a.npz", &matrix(), &CELSIUS);
     let runs = place.import(&mut |_, _| {}).expect("imported");
     assert_eq!((runs.len(), runs[0].measurements, runs[0].surface.as_str()), (1, 3, "a"));
@@ -77,7 +77,7 @@ fn responses_come_back_as_they_were() {
 
 #[test]
 fn rows_are_in_the_order_of_the_visits() {
-    let place = Place::new();
+    let place = GirFolders::new();
     place.surface("a.npz", &matrix(), &CELSIUS);
     // The first row is the pair of points 1 and 2, which the grid counts last.
     let order = "combination,mic_layer,mic_x,mic_y,speaker_layer,speaker_x,speaker_y\n\
@@ -96,8 +96,8 @@ fn rows_are_in_the_order_of_the_visits() {
 
 #[test]
 fn what_is_wrong_is_named_and_nothing_is_left() {
-    let refused = |name: &str, damage: &dyn Fn(&Place), expected: &str| {
-        let place = Place::new();
+    let refused = |name: &str, damage: &dyn Fn(&GirFolders), expected: &str| {
+        let place = GirFolders::new();
         // The first surface is good: it must not be left behind alone.
         place.surface("a.npz", &matrix(), &CELSIUS);
         damage(&place);
@@ -118,13 +118,13 @@ fn what_is_wrong_is_named_and_nothing_is_left() {
     refused("b.npz", &|p| p.surface("b.npz", &matrix(), &[20.0, 20.0, f64::NAN]), "temperatures[2]");
     refused("b.npz", &|p| p.surface("b.npz", &matrix(), &CELSIUS[..2]), "2 values, expected 3");
     refused("b.npz", &|p| std::fs::write(p.gir.join("b.npz"), "PK, but not really").expect("written"), "matrix");
-    let heights = |p: &Place| {
+    let heights = |p: &GirFolders| {
         let mut npz = NpzWriter::new(File::create(p.gir.join("a_mat.npz")).expect("a file"));
         npz.add_array("surface", &Array2::<f64>::zeros((5, 4))).expect("written");
         npz.finish().expect("closed");
     };
     refused("a_mat.npz", &heights, "5 x 4");
-    let far = |p: &Place| {
+    let far = |p: &GirFolders| {
         let order = "combination,mic_layer,mic_x,mic_y,speaker_layer,speaker_x,speaker_y\n1,0,0,0,0,9,0\n";
         std::fs::write(p.gir.join("combinations.csv"), order).expect("written");
     };
@@ -135,7 +135,7 @@ fn what_is_wrong_is_named_and_nothing_is_left() {
 
 #[test]
 fn no_run_has_its_name_before_all_are_whole() {
-    let place = Place::new();
+    let place = GirFolders::new();
     place.surface("a.npz", &matrix(), &CELSIUS);
     place.surface("b.npz", &matrix(), &CELSIUS);
     let mut seen = Vec::new();

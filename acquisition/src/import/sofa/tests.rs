@@ -16,15 +16,15 @@ fn rig() -> Rig {
 }
 
 /// Name, shape, numbers and attributes of a variable.
-type Written = (&'static str, Vec<usize>, Vec<f64>, Vec<(&'static str, &'static str)>);
+type WrittenVariable = (&'static str, Vec<usize>, Vec<f64>, Vec<(&'static str, &'static str)>);
 
 /// A file's content, to be changed before it is written.
-struct Made {
+struct SofaContent {
     texts: Vec<(&'static str, String)>,
-    variables: Vec<Written>,
+    variables: Vec<WrittenVariable>,
 }
 
-impl Made {
+impl SofaContent {
     /// Two pairs of the rig, positions of the speaker spherical, times the other way round.
     fn new() -> Self {
         let text = |name, value: &str| (name, value.to_owned());
@@ -90,9 +90,9 @@ impl Made {
     }
 }
 
-struct Place(tempfile::TempDir);
+struct SofaFolder(tempfile::TempDir);
 
-impl Place {
+impl SofaFolder {
     fn new() -> Self {
         let place = Self(tempfile::tempdir().expect("a folder"));
         std::fs::create_dir(place.inbox()).expect("a folder");
@@ -103,7 +103,7 @@ impl Place {
         self.0.path().join("inbox")
     }
 
-    fn import(&self, made: &[(&str, Made)], celsius: Option<f64>) -> Result<Vec<ImportedRun>, Error> {
+    fn import(&self, made: &[(&str, SofaContent)], celsius: Option<f64>) -> Result<Vec<ImportedRun>, Error> {
         let files: Vec<_> = made
             .iter()
             .map(|(name, made)| {
@@ -128,8 +128,8 @@ fn irs(run: &ImportedRun) -> Vec<(u64, ImpulseResponse)> {
 
 #[test]
 fn responses_of_others_come_at_their_own_temperature_and_in_the_order_of_time() {
-    let place = Place::new();
-    let runs = place.import(&[("0007_1.sofa", Made::new())], None).expect("imported");
+    let place = SofaFolder::new();
+    let runs = place.import(&[("0007_1.sofa", SofaContent::new())], None).expect("imported");
     assert_eq!((runs.len(), runs[0].measurements, runs[0].surface.as_str()), (1, 2, "0007_1"));
     let irs = irs(&runs[0]);
     assert_eq!(irs.iter().map(|(time, _)| *time / 1_000_000_000).collect::<Vec<_>>(), [1_767_600_000, 1_767_600_012]);
@@ -147,8 +147,8 @@ fn responses_of_others_come_at_their_own_temperature_and_in_the_order_of_time() 
 
 #[test]
 fn what_a_file_does_not_tell_is_made_up_or_asked_for() {
-    let place = Place::new();
-    let silent = || Made::new().without("MeasurementDate").without("RoomTemperature").without("Data.Delay");
+    let place = SofaFolder::new();
+    let silent = || SofaContent::new().without("MeasurementDate").without("RoomTemperature").without("Data.Delay");
     let error = place.import(&[("a.sofa", silent())], None).expect_err("no temperature").to_string();
     assert!(error.contains("RoomTemperature") && error.contains("--temperature-c"), "{error}");
     let runs = place.import(&[("b.sofa", silent())], Some(18.0)).expect("imported");
@@ -159,35 +159,35 @@ fn what_a_file_does_not_tell_is_made_up_or_asked_for() {
 
 #[test]
 fn what_is_wrong_is_named_and_nothing_is_left() {
-    let refused = |made: Made, expected: &str| {
-        let place = Place::new();
+    let refused = |made: SofaContent, expected: &str| {
+        let place = SofaFolder::new();
         // The first file is good: it must not be left behind alone.
-        let error = place.import(&[("good.sofa", Made::new()), ("b.sofa", made)], None).expect_err(expected);
+        let error = place.import(&[("good.sofa", SofaContent::new()), ("b.sofa", made)], None).expect_err(expected);
         let error = error.to_string();
         assert!(error.contains(expected) && error.contains("b.sofa"), "{error}");
         assert_eq!(std::fs::read_dir(place.inbox()).expect("a folder").count(), 0, "{expected}");
     };
     refused(
-        Made::new().text("SOFAConventions", "SimpleFreeFieldHRIR"),
+        SofaContent::new().text("SOFAConventions", "SimpleFreeFieldHRIR"),
         "`SimpleFreeFieldHRIR`, expected `SingleRoomSRIR`",
     );
-    refused(Made::new().text("DataType", "TF"), "expected `FIR`");
-    refused(Made::new().without("Data.IR"), "Data.IR: it is missing");
-    refused(Made::new().with("Data.IR", &[2, 2, LENGTH], &vec![0.0; 4 * LENGTH]), "1 receiver");
-    refused(Made::new().with("Data.IR", &[2, 1, 100], &[0.0; 200]), "100 samples");
+    refused(SofaContent::new().text("DataType", "TF"), "expected `FIR`");
+    refused(SofaContent::new().without("Data.IR"), "Data.IR: it is missing");
+    refused(SofaContent::new().with("Data.IR", &[2, 2, LENGTH], &vec![0.0; 4 * LENGTH]), "1 receiver");
+    refused(SofaContent::new().with("Data.IR", &[2, 1, 100], &[0.0; 200]), "100 samples");
     let mut broken = vec![0.0; 2 * LENGTH];
     broken[LENGTH + 7] = f64::NAN;
-    refused(Made::new().with("Data.IR", &[2, 1, LENGTH], &broken), "Data.IR[1, 0, 7]");
-    refused(Made::new().with("Data.SamplingRate", &[1], &[48_000.0]), "48000 Hz, expected the rig's 96000 Hz");
-    refused(Made::new().with("Data.Delay", &[1, 1], &[12.0]), "Data.Delay: 12");
-    refused(Made::new().with("ReceiverPosition", &[1, 3, 1], &[0.0, 0.09, 0.0]), "ReceiverPosition: 0.09");
-    refused(Made::new().with("ListenerPosition", &[1, 3], &[0.0, 0.0, 0.2]), "the nearest is");
-    refused(Made::new().with("ListenerPosition", &[5, 3], &[0.0; 15]), "[5, 3], expected [2, 3] or [1, 3]");
+    refused(SofaContent::new().with("Data.IR", &[2, 1, LENGTH], &broken), "Data.IR[1, 0, 7]");
+    refused(SofaContent::new().with("Data.SamplingRate", &[1], &[48_000.0]), "48000 Hz, expected the rig's 96000 Hz");
+    refused(SofaContent::new().with("Data.Delay", &[1, 1], &[12.0]), "Data.Delay: 12");
+    refused(SofaContent::new().with("ReceiverPosition", &[1, 3, 1], &[0.0, 0.09, 0.0]), "ReceiverPosition: 0.09");
+    refused(SofaContent::new().with("ListenerPosition", &[1, 3], &[0.0, 0.0, 0.2]), "the nearest is");
+    refused(SofaContent::new().with("ListenerPosition", &[5, 3], &[0.0; 15]), "[5, 3], expected [2, 3] or [1, 3]");
     let same = [0.0, 124f64.atan2(150.0).to_degrees(), 150f64.hypot(124.0) / 1e3];
-    refused(Made::new().with("SourcePosition", &[1, 3], &same), "a second response of its pair");
-    refused(Made::new().with("RoomTemperature", &[1], &[20.0]), "RoomTemperature");
-    refused(Made::new().with("MeasurementDate", &[2], &[-1.0, 1.0]), "seconds since 1970");
-    let place = Place::new();
+    refused(SofaContent::new().with("SourcePosition", &[1, 3], &same), "a second response of its pair");
+    refused(SofaContent::new().with("RoomTemperature", &[1], &[20.0]), "RoomTemperature");
+    refused(SofaContent::new().with("MeasurementDate", &[2], &[-1.0, 1.0]), "seconds since 1970");
+    let place = SofaFolder::new();
     let path = place.0.path().join("text.sofa");
     std::fs::write(&path, "no HDF5 at all").expect("written");
     let error = check_sofa(&[path], &rig(), None).expect_err("text").to_string();

@@ -8,9 +8,9 @@ use super::*;
 
 const SAMPLES: u32 = 4_000;
 
-struct Place(tempfile::TempDir);
+struct WavFolder(tempfile::TempDir);
 
-impl Place {
+impl WavFolder {
     /// Two surfaces; the second one's recording has the sample `last` at its end.
     fn new(last: f32) -> Self {
         let place = Self(tempfile::tempdir().expect("a folder"));
@@ -59,7 +59,7 @@ impl Place {
 
 #[test]
 fn runs_get_their_names_together() {
-    let place = Place::new(0.5);
+    let place = WavFolder::new(0.5);
     let mut named = 0;
     let runs = place
         .import(&mut |_, _| named += place.left().iter().filter(|n| n.ends_with(".mcap")).count())
@@ -71,7 +71,7 @@ fn runs_get_their_names_together() {
 
 #[test]
 fn a_sample_that_is_no_number_leaves_nothing() {
-    let place = Place::new(f32::NAN);
+    let place = WavFolder::new(f32::NAN);
     let mut done = 0;
     let error = place.import(&mut |d, _| done = d).expect_err("NaN").to_string();
     assert!(error.contains("line 3") && error.contains("last.wav"), "{error}");
@@ -80,7 +80,7 @@ fn a_sample_that_is_no_number_leaves_nothing() {
 
 #[test]
 fn somebody_elses_file_under_a_runs_name_is_left_alone() {
-    let place = Place::new(0.5);
+    let place = WavFolder::new(0.5);
     let taken = |done: usize| {
         // The second run's name is known from its partial file.
         let last = place.left().pop().filter(|_| done == 2)?;
@@ -98,7 +98,7 @@ fn somebody_elses_file_under_a_runs_name_is_left_alone() {
 
 #[test]
 fn messages_are_in_the_order_of_time_however_the_rows_are() {
-    let place = Place::new(0.5);
+    let place = WavFolder::new(0.5);
     let rows = "surface,recording,loopback,microphone,speaker,temperature_c,recorded_at\n\
                 a,good.wav,good.wav,0/0/0,0/0/1,20,2026-01-05T08:00:30Z\n\
                 a,last.wav,good.wav,0/0/0,0/0/2,20,2026-01-05T08:00:10Z\n\

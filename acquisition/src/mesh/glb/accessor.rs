@@ -5,7 +5,7 @@ use serde_json::Value;
 use super::{FLOAT, UNSIGNED_BYTE, UNSIGNED_INT, UNSIGNED_SHORT};
 
 /// A file's JSON and its binary chunk.
-pub(super) struct File<'a> {
+pub(super) struct GlbFile<'a> {
     pub(super) document: Value,
     pub(super) bin: &'a [u8],
 }
@@ -41,7 +41,7 @@ fn number_or(value: &Value, default: usize) -> Option<usize> {
     if value.is_null() { Some(default) } else { number(value) }
 }
 
-impl<'a> File<'a> {
+impl<'a> GlbFile<'a> {
     /// Returns the number of elements that an accessor declares.
     pub(super) fn count(&self, accessor: &Value) -> Option<usize> {
         number(&self.accessor(accessor)?["count"])

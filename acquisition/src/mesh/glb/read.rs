@@ -7,8 +7,8 @@ use std::path::Path;
 
 use serde_json::Value;
 
-use super::accessor::{File, list};
-use super::scene::{Instance, Wrong, instances};
+use super::accessor::{GlbFile, list};
+use super::scene::{MeshInstance, SceneFault, instances};
 use super::{BIN_CHUNK, JSON_CHUNK, MAGIC, from_gltf};
 use crate::mesh::{Error, Mesh};
 
@@ -21,7 +21,7 @@ const AT_MOST: &str = "up to 6 million vertices and as many triangles in all ins
 
 /// Reads positions and triangles of every mesh in the file's scene, each transformed by its nodes.
 pub(crate) fn parse(bytes: &[u8], path: &Path) -> Result<Mesh, Error> {
-    read(bytes).map_err(|Wrong { place, actual, expected }| Error::Syntax {
+    read(bytes).map_err(|SceneFault { place, actual, expected }| Error::Syntax {
         path: path.to_owned(),
         place,
         actual,
@@ -29,11 +29,11 @@ pub(crate) fn parse(bytes: &[u8], path: &Path) -> Result<Mesh, Error> {
     })
 }
 
-fn wrong(place: impl Into<String>, actual: impl Into<String>, expected: &'static str) -> Wrong {
-    Wrong { place: place.into(), actual: actual.into(), expected }
+fn wrong(place: impl Into<String>, actual: impl Into<String>, expected: &'static str) -> SceneFault {
+    SceneFault { place: place.into(), actual: actual.into(), expected }
 }
 
-fn read(bytes: &[u8]) -> Result<Mesh, Wrong> {
+fn read(bytes: &[u8]) -> Result<Mesh, SceneFault> {
     let file = open(bytes)?;
     let mut mesh = Mesh::default();
     for instance in instances(&file.document)? {
@@ -48,7 +48,7 @@ fn read(bytes: &[u8]) -> Result<Mesh, Wrong> {
 }
 
 // The chunks of the file: its JSON, and its numbers, if any.
-fn open(bytes: &[u8]) -> Result<File<'_>, Wrong> {
+fn open(bytes: &[u8]) -> Result<GlbFile<'_>, SceneFault> {
     let word = |at: usize| Some(u32::from_le_bytes(bytes.get(at..at + 4)?.try_into().ok()?) as usize);
     if bytes.get(..4) != Some(MAGIC) || word(4) != Some(2) {
         return Err(wrong("byte 0", "no glTF 2.0 header", "`glTF` and version 2"));
@@ -63,14 +63,14 @@ fn open(bytes: &[u8]) -> Result<File<'_>, Wrong> {
     let text = chunk(12, JSON_CHUNK).ok_or_else(|| wrong("byte 12", "no JSON chunk", "a JSON chunk"))?;
     let bin = chunk(20 + text.len(), BIN_CHUNK).unwrap_or(&[]);
     let document = serde_json::from_slice(text).map_err(|e| wrong("its JSON", e.to_string(), "valid JSON"))?;
-    Ok(File { document, bin })
+    Ok(GlbFile { document, bin })
 }
 
 // Adds a primitive with its node's transform; an error has the actual and the expected content.
 fn append(
     mesh: &mut Mesh,
-    file: &File<'_>,
-    instance: &Instance,
+    file: &GlbFile<'_>,
+    instance: &MeshInstance,
     primitive: &Value,
 ) -> Result<(), (String, &'static str)> {
     const PLAIN: &str = "plain f32 positions and whole-numbered triangle indices";

@@ -6,25 +6,25 @@ use super::accessor::{list, number};
 
 /// An affine map: three rows of a 3 x 3 matrix and a translation.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) struct Transform([[f64; 4]; 3]);
+pub(super) struct NodeTransform([[f64; 4]; 3]);
 
 /// A mesh and its transform.
 #[derive(Debug, PartialEq)]
-pub(super) struct Instance {
+pub(super) struct MeshInstance {
     /// Its index in `meshes`.
     pub(super) mesh: usize,
-    pub(super) transform: Transform,
+    pub(super) transform: NodeTransform,
 }
 
 /// A fault of a scene.
 #[derive(Debug, PartialEq)]
-pub(super) struct Wrong {
+pub(super) struct SceneFault {
     pub(super) place: String,
     pub(super) actual: String,
     pub(super) expected: &'static str,
 }
 
-impl Transform {
+impl NodeTransform {
     const IDENTITY: Self = Self([[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]]);
 
     pub(super) fn apply(&self, p: [f32; 3]) -> [f32; 3] {
@@ -73,27 +73,27 @@ fn numbers<const N: usize>(value: &Value, default: [f64; N]) -> Option<[f64; N]>
 
 /// The meshes of the file's scene, in the order of its tree. A file without nodes is a library of meshes: each
 /// keeps its place.
-pub(super) fn instances(document: &Value) -> Result<Vec<Instance>, Wrong> {
+pub(super) fn instances(document: &Value) -> Result<Vec<MeshInstance>, SceneFault> {
     let (nodes, meshes) = (list(&document["nodes"]), list(&document["meshes"]).len());
     if nodes.is_empty() {
-        return Ok((0..meshes).map(|mesh| Instance { mesh, transform: Transform::IDENTITY }).collect());
+        return Ok((0..meshes).map(|mesh| MeshInstance { mesh, transform: NodeTransform::IDENTITY }).collect());
     }
     let mut found = Vec::new();
     let mut seen = vec![false; nodes.len()];
-    let mut waiting: Vec<_> = roots(document, nodes)?.into_iter().rev().map(|n| (n, Transform::IDENTITY)).collect();
+    let mut waiting: Vec<_> = roots(document, nodes)?.into_iter().rev().map(|n| (n, NodeTransform::IDENTITY)).collect();
     // A tree has each node once, which ends this whatever the file says, at any depth.
     while let Some((at, parent)) = waiting.pop() {
-        let wrong = |actual: String, expected| Wrong { place: format!("node {at}"), actual, expected };
+        let wrong = |actual: String, expected| SceneFault { place: format!("node {at}"), actual, expected };
         if std::mem::replace(&mut seen[at], true) {
             return Err(wrong("a second parent, or itself above it".into(), "a tree of nodes"));
         }
         let node = &nodes[at];
-        let own = Transform::of(node).ok_or_else(|| wrong("a transform that is none".into(), "finite numbers"))?;
+        let own = NodeTransform::of(node).ok_or_else(|| wrong("a transform that is none".into(), "finite numbers"))?;
         let transform = parent.after(&own);
         if !node["mesh"].is_null() {
             let mesh = number(&node["mesh"]).filter(|m| *m < meshes);
             let mesh = mesh.ok_or_else(|| wrong(format!("mesh {}", node["mesh"]), "one of the file's meshes"))?;
-            found.push(Instance { mesh, transform });
+            found.push(MeshInstance { mesh, transform });
         }
         let children = indices(&node["children"], nodes.len(), || format!("node {at}"))?;
         waiting.extend(children.into_iter().rev().map(|child| (child, transform)));
@@ -102,11 +102,11 @@ pub(super) fn instances(document: &Value) -> Result<Vec<Instance>, Wrong> {
 }
 
 // The nodes of the default scene; without scenes, all that have no parent.
-fn roots(document: &Value, nodes: &[Value]) -> Result<Vec<usize>, Wrong> {
+fn roots(document: &Value, nodes: &[Value]) -> Result<Vec<usize>, SceneFault> {
     let scenes = list(&document["scenes"]);
     if !scenes.is_empty() {
         let shown = if document["scene"].is_null() { Some(0) } else { number(&document["scene"]) };
-        let scene = shown.and_then(|s| scenes.get(s)).ok_or_else(|| Wrong {
+        let scene = shown.and_then(|s| scenes.get(s)).ok_or_else(|| SceneFault {
             place: "its JSON".into(),
             actual: format!("scene {}", document["scene"]),
             expected: "one of the file's scenes",
@@ -122,10 +122,14 @@ fn roots(document: &Value, nodes: &[Value]) -> Result<Vec<usize>, Wrong> {
     Ok((0..nodes.len()).filter(|n| !is_child[*n]).collect())
 }
 
-fn indices(value: &Value, nodes: usize, place: impl Fn() -> String) -> Result<Vec<usize>, Wrong> {
+fn indices(value: &Value, nodes: usize, place: impl Fn() -> String) -> Result<Vec<usize>, SceneFault> {
     let index = |v: &Value| {
         let found = number(v).filter(|n| *n < nodes);
-        found.ok_or_else(|| Wrong { place: place(), actual: format!("node {v}"), expected: "one of the file's nodes" })
+        found.ok_or_else(|| SceneFault {
+            place: place(),
+            actual: format!("node {v}"),
+            expected: "one of the file's nodes",
+        })
     };
     list(value).iter().map(index).collect()
 }

@@ -9,7 +9,7 @@ use std::sync::{Arc, Once};
 use std::time::{Duration, Instant};
 
 use anyhow::{Context as _, Result, ensure};
-use echolake_acquisition::controller::Keep;
+use echolake_acquisition::controller::RecordingMode;
 use echolake_ingest::{Inspected, Inspection, inspect};
 use echolake_lake::{Lake, References};
 use object_store::memory::InMemory;
@@ -89,7 +89,7 @@ pub(crate) async fn run(settings: Settings, progress: &mut dyn FnMut(u64)) -> Re
     let rig = specimen::rig();
     let lake = Lake::open_or_create("memory://", &rig, &References::default()).await?;
     let mut subjects = Vec::new();
-    for (name, keep) in [("sweeps", Keep::Sweeps), ("responses", Keep::ResponsesOnly)] {
+    for (name, keep) in [("sweeps", RecordingMode::Sweeps), ("responses", RecordingMode::ResponsesOnly)] {
         let specimen = Specimen::simulate(name, &rig, keep)?;
         let whole = read(&lake, specimen.bytes.clone()).await?.context("an undamaged file is refused")?;
         ensure!(NAME == format!("runs/{}/{}.mcap", whole.surface, whole.run), "it is run {}", whole.run);

@@ -6,11 +6,11 @@ use std::path::Path;
 
 use anyhow::{Context as _, Result, ensure};
 use bytes::Bytes;
-use echolake_acquisition::controller::{Control, Keep, RunController, RunOptions, Work};
+use echolake_acquisition::controller::{RecordingMode, RunControl, RunController, RunOptions, RunWorkload};
 use echolake_acquisition::mesh::Mesh;
 use echolake_acquisition::recorder::{Recorder, Relief, RunStart};
 use echolake_acquisition::relief::HeightField;
-use echolake_acquisition::rigs::simulated::{Simulation, devices};
+use echolake_acquisition::rigs::simulated::{RigSimulation, devices};
 use echolake_schema::grid::Layer;
 use echolake_schema::manifest::RunManifest;
 use echolake_schema::messages::{ImpulseResponse, Measurement, SweepRecording};
@@ -63,13 +63,13 @@ pub(crate) fn rig() -> Rig {
 
 impl Specimen {
     /// Measures a run with the simulated rig.
-    pub(crate) fn simulate(name: &'static str, rig: &Rig, keep: Keep) -> Result<Self> {
+    pub(crate) fn simulate(name: &'static str, rig: &Rig, keep: RecordingMode) -> Result<Self> {
         let folder = tempfile::tempdir()?;
         let relief = HeightField::from_fn(rig.panel.size_mm, 40, |x, y| 10.0 * (x / 50.0).sin() + y / 100.0);
         let mesh = Mesh::from_height_field(&HeightField::from_fn(rig.panel.size_mm, 9, |x, _| x / 50.0), -30.0);
         let surface = "0015_0".parse()?;
         let simulation =
-            Simulation { rig, relief: &relief, reflection_factor: 0.83, start: START, seed: 1, arms: None };
+            RigSimulation { rig, relief: &relief, reflection_factor: 0.83, start: START, seed: 1, arms: None };
         let devices = devices(&simulation)?;
         let manifest = RunManifest {
             run_id: RunId::compose(START, &surface, 0x7c1e)?,
@@ -87,8 +87,9 @@ impl Specimen {
         let options = RunOptions { keep, checkpoint_every: PAIRS_A_CHUNK };
         let grid = rig.grid()?;
         let nothing = BTreeMap::new();
-        let work = Work { pairs: grid.pairs(), before: &nothing, options };
-        let outcome = RunController::new(rig, devices)?.run(&mut recorder, &work, &Control::default(), &mut |_| {})?;
+        let work = RunWorkload { pairs: grid.pairs(), before: &nothing, options };
+        let outcome =
+            RunController::new(rig, devices)?.run(&mut recorder, &work, &RunControl::default(), &mut |_| {})?;
         Self::map(name, &recorder.finish(&outcome.end)?)
     }
 
