@@ -16,7 +16,7 @@ use datafusion::error::DataFusionError;
 use datafusion::optimizer::OptimizerRule;
 use datafusion::prelude::SessionContext;
 use datafusion::sql::parser::Statement;
-use echolake_lake::{DataFile, Lake, Moment, Snapshot, VisibleRun};
+use echolake_lake::{DataFile, Lake, LakeMoment, LakeSnapshot, VisibleRun};
 use echolake_schema::tables::Table;
 
 use crate::as_of::{self, Past};
@@ -45,11 +45,11 @@ pub(crate) struct Catalog {
 }
 
 /// A table as it was at a moment.
-type PastTable = ((Moment, Table), Arc<LakeTable>);
+type PastTable = ((LakeMoment, Table), Arc<LakeTable>);
 
 /// One view of the lake.
 struct Current {
-    snapshot: Arc<Snapshot>,
+    snapshot: Arc<LakeSnapshot>,
     tables: HashMap<Table, Arc<LakeTable>>,
     providers: Vec<(&'static str, Arc<dyn TableProvider>)>,
     looked: Mutex<Instant>,
@@ -104,7 +104,7 @@ impl Catalog {
     ///
     /// # Errors
     /// [`Error::Lake`] where the lake cannot be read.
-    pub(crate) async fn snapshot(&self) -> Result<Arc<Snapshot>, Error> {
+    pub(crate) async fn snapshot(&self) -> Result<Arc<LakeSnapshot>, Error> {
         Ok(self.current().await?.snapshot.clone())
     }
 
@@ -218,7 +218,7 @@ impl Catalog {
         Ok(Arc::new(view.over(&self.lake, &self.lookups, &beneath).map_err(failed)?))
     }
 
-    async fn table_at(&self, moment: Moment, table: Table) -> Result<Arc<LakeTable>, Error> {
+    async fn table_at(&self, moment: LakeMoment, table: Table) -> Result<Arc<LakeTable>, Error> {
         let kept = |past: &[PastTable]| {
             past.iter().find(|(key, _)| *key == (moment, table)).map(|(_, provider)| provider.clone())
         };
@@ -228,7 +228,7 @@ impl Catalog {
         let snapshot = self.lake.snapshot_at(moment, table).await?;
         let provider = self.table(table, snapshot.files(table))?;
         // What a later time shows is not settled yet.
-        if matches!(moment, Moment::Version(_)) {
+        if matches!(moment, LakeMoment::Version(_)) {
             let mut past = self.past.lock().unwrap_or_else(PoisonError::into_inner);
             if past.len() >= PAST_KEPT {
                 past.remove(0);

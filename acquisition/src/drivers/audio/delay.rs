@@ -1,6 +1,6 @@
 //! Where in a recording an output begins: the delay at which both are most alike.
 
-use echolake_dsp::Real as _;
+use echolake_dsp::RealSample as _;
 use realfft::num_complex::Complex;
 
 /// Where an output begins in a recording.

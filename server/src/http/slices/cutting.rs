@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 
 use bytes::Bytes;
 use echolake_export::{Slice, SliceParams};
-use echolake_lake::Snapshot;
+use echolake_lake::LakeSnapshot;
 use echolake_query::{Client, Error as QueryError};
 use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc};
 use tokio::task::JoinSet;
@@ -40,7 +40,7 @@ impl Cutting {
     pub(super) fn begin(
         service: &Service,
         client: &Arc<Client>,
-        snapshot: Arc<Snapshot>,
+        snapshot: Arc<LakeSnapshot>,
         params: SliceParams,
         room: Room,
     ) -> Self {
@@ -71,7 +71,7 @@ impl Cutting {
 
 async fn cut(
     service: &Service,
-    snapshot: &Snapshot,
+    snapshot: &LakeSnapshot,
     params: SliceParams,
     limit: Option<Duration>,
     turns: &Semaphore,
