@@ -37,19 +37,19 @@ const PAPER: &str = "The paper's tables give totals of -0.4, -2.3 and +1.6 dB ov
     and 0005_1.\nTheir parameters are not known here: what can be compared is which bands change, not by how much.";
 
 /// Panels that are compared with the first of them.
-struct Experiment {
+struct ReliefExperiment {
     title: &'static str,
     claim: &'static str,
-    panels: &'static [Panel],
+    panels: &'static [ExperimentPanel],
 }
 
 /// A name, a relief, and what is set of it.
-type Panel = (&'static str, &'static str, &'static [(&'static str, &'static str)]);
+type ExperimentPanel = (&'static str, &'static str, &'static [(&'static str, &'static str)]);
 
 const BARE: [(&str, &str); 2] = [("projection_mm", "0"), ("lean_mm", "0")];
 
-const EXPERIMENTS: [Experiment; 3] = [
-    Experiment {
+const EXPERIMENTS: [ReliefExperiment; 3] = [
+    ReliefExperiment {
         title: "mortar joints of bricks in stretcher bond, 10 mm wide (full scale)",
         claim: "the paper: joints change only the two upper bands",
         panels: &[
@@ -59,7 +59,7 @@ const EXPERIMENTS: [Experiment; 3] = [
             ("joints 20 mm deep", "stretcher_bond", &[BARE[0], BARE[1], ("joint_depth_mm", "20")]),
         ],
     },
-    Experiment {
+    ReliefExperiment {
         title: "the same bricks, joints 10 mm deep, on large shapes 150 mm deep",
         claim: "the paper: the large shape shows in all bands",
         panels: &[
@@ -82,7 +82,7 @@ const EXPERIMENTS: [Experiment; 3] = [
             ),
         ],
     },
-    Experiment {
+    ReliefExperiment {
         title: "stone in place of brick, on a flat wall",
         claim: "the paper compares stones with bricks too; its values by band are not known here",
         panels: &[
@@ -107,7 +107,7 @@ pub(crate) struct ExperimentsArgs {
 
 pub(crate) fn run(args: &ExperimentsArgs) -> Result<()> {
     let (cells, every) = (args.cells, args.every.max(1));
-    let lab = Lab::new(Rig::paper().grid()?, every);
+    let lab = ExperimentGrid::new(Rig::paper().grid()?, every);
     let flat = lab.energies(&HeightField::from_fn(PANEL_SIZE_MM, cells, |_, _| 0.0))?;
     let mut out = std::io::stdout().lock();
     writeln!(out, "{} pairs, {cells} x {cells} facets; dB over Flat's same band", lab.pairs.len())?;
@@ -133,7 +133,7 @@ pub(crate) fn run(args: &ExperimentsArgs) -> Result<()> {
 }
 
 /// The grid, and the direct sound of its pairs.
-struct Lab {
+struct ExperimentGrid {
     points_mm: Vec<[f64; 3]>,
     pairs: Vec<[usize; 2]>,
     direct: KirchhoffPlan,
@@ -141,7 +141,7 @@ struct Lab {
     weights: Vec<[f64; COLUMNS]>,
 }
 
-impl Lab {
+impl ExperimentGrid {
     fn new(grid: Grid, every: usize) -> Self {
         let points_mm: Vec<_> = grid.points().iter().map(|p| p.position_mm).collect();
         let pairs = grid.pairs().iter().step_by(every).map(|p| [p.microphone.index(), p.speaker.index()]).collect();

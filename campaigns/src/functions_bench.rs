@@ -32,7 +32,7 @@ const CENTRES_HZ: [f64; 5] = [2_500.0, 5_000.0, 10_000.0, 20_000.0, 40_000.0];
 const ROUNDS: usize = 15;
 
 /// The functions, and their input.
-struct Bench {
+struct FunctionsBench {
     functions: Functions,
     samples: Vec<f32>,
     lists: ArrayRef,
@@ -50,7 +50,7 @@ pub(crate) fn run() -> Result<()> {
         .collect();
     let lists = lists(&samples, LEN)?;
     let functions = Functions::all(&Rig::paper())?;
-    let mut bench = Bench { functions, samples, lists, out: std::io::stdout().lock() };
+    let mut bench = FunctionsBench { functions, samples, lists, out: std::io::stdout().lock() };
     writeln!(bench.out, "{ROWS} lists of {LEN} f32, one core; best of {ROUNDS} rounds")?;
     writeln!(bench.out, "{:<24} {:>12} {:>12} {:>7}", "function", "rows/s", "loop rows/s", "ratio")?;
     bench.arithmetic()?;
@@ -79,7 +79,7 @@ fn invoke(function: &ScalarUDF, args: &[ColumnarValue], number_rows: usize) -> R
     Ok(function.invoke_with_args(args)?)
 }
 
-impl Bench {
+impl FunctionsBench {
     fn arithmetic(&mut self) -> Result<()> {
         let samples = std::mem::take(&mut self.samples);
         let both = [self.column(), self.column()];

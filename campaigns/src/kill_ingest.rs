@@ -18,12 +18,12 @@ pub(crate) struct KillIngestArgs {
     #[arg(default_value_t = 1)]
     seed: u64,
     /// Kind of disturbance of ingest.
-    #[arg(value_enum, default_value_t = Disturbance::Kills)]
-    disturbance: Disturbance,
+    #[arg(value_enum, default_value_t = IngestDisturbance::Kills)]
+    disturbance: IngestDisturbance,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
-enum Disturbance {
+enum IngestDisturbance {
     /// It is killed.
     Kills,
     /// Two processes ingest half of 40 runs each; one of them is killed in every second round.
@@ -40,8 +40,8 @@ pub(crate) fn run(args: &KillIngestArgs) -> Result<()> {
         }
     };
     let outcome = match disturbance {
-        Disturbance::Kills => KillCampaign::new(&binary, seed).rounds(rounds, &mut tell),
-        Disturbance::Halves => KillCampaign::of(&binary, seed, SHARED_RUNS).halves(rounds, &mut tell),
+        IngestDisturbance::Kills => KillCampaign::new(&binary, seed).rounds(rounds, &mut tell),
+        IngestDisturbance::Halves => KillCampaign::of(&binary, seed, SHARED_RUNS).halves(rounds, &mut tell),
     };
     writeln!(
         std::io::stdout(),

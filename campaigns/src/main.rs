@@ -56,13 +56,13 @@ const SMALL_RIG: &str = include_str!("../../tests/fixtures/small_rig.toml");
 /// Campaigns and benchmarks of echolake.
 #[derive(Debug, clap::Parser)]
 #[command(name = "campaign", max_term_width = 100)]
-struct Cli {
+struct CampaignCli {
     #[command(subcommand)]
-    campaign: Campaign,
+    campaign: CampaignCommand,
 }
 
 #[derive(Debug, clap::Subcommand)]
-enum Campaign {
+enum CampaignCommand {
     /// Damage run files; ingest must keep what is whole and report the rest.
     Flips(flips::FlipsArgs),
     /// Kill ingests, or let two processes ingest at once; the tables must be those of an undisturbed ingest.
@@ -100,24 +100,24 @@ enum Campaign {
 }
 
 fn main() -> Result<()> {
-    match Cli::parse().campaign {
-        Campaign::Flips(args) => block_on(flips::run(&args)),
-        Campaign::Kills(args) => kill_ingest::run(&args),
-        Campaign::HostileFiles(args) => hostile_ingest::run(&args),
-        Campaign::AcquireKills(args) => kill_acquire::run(&args),
-        Campaign::Fuzz(args) => fuzz_server::run(&args),
-        Campaign::Attacks(args) => attacks::run(&args),
-        Campaign::HostileClients(args) => hostile_clients::run(&args),
-        Campaign::EngineKills(args) => engine_kills::run(&args),
-        Campaign::Cancels(args) => cancels::run(&args),
-        Campaign::IngestBench(args) => ingest_bench::run(&args),
-        Campaign::QueryBench(args) => block_on(query_bench::run(&args)),
-        Campaign::McapBench(args) => block_on(mcap_bench::run(&args)),
-        Campaign::Readers(args) => readers::run(&args),
-        Campaign::Slices(args) => slices::run(&args),
-        Campaign::FunctionsBench => functions_bench::run(),
-        Campaign::Experiments(args) => experiments::run(&args),
-        Campaign::Motion(args) => motion::run(&args),
+    match CampaignCli::parse().campaign {
+        CampaignCommand::Flips(args) => block_on(flips::run(&args)),
+        CampaignCommand::Kills(args) => kill_ingest::run(&args),
+        CampaignCommand::HostileFiles(args) => hostile_ingest::run(&args),
+        CampaignCommand::AcquireKills(args) => kill_acquire::run(&args),
+        CampaignCommand::Fuzz(args) => fuzz_server::run(&args),
+        CampaignCommand::Attacks(args) => attacks::run(&args),
+        CampaignCommand::HostileClients(args) => hostile_clients::run(&args),
+        CampaignCommand::EngineKills(args) => engine_kills::run(&args),
+        CampaignCommand::Cancels(args) => cancels::run(&args),
+        CampaignCommand::IngestBench(args) => ingest_bench::run(&args),
+        CampaignCommand::QueryBench(args) => block_on(query_bench::run(&args)),
+        CampaignCommand::McapBench(args) => block_on(mcap_bench::run(&args)),
+        CampaignCommand::Readers(args) => readers::run(&args),
+        CampaignCommand::Slices(args) => slices::run(&args),
+        CampaignCommand::FunctionsBench => functions_bench::run(),
+        CampaignCommand::Experiments(args) => experiments::run(&args),
+        CampaignCommand::Motion(args) => motion::run(&args),
     }
 }
 

@@ -44,12 +44,12 @@ pub(crate) struct ReadersArgs {
 }
 
 /// A connection that is kept open.
-struct Connection {
+struct CatalogueConnection {
     address: String,
     stream: BufReader<TcpStream>,
 }
 
-impl Connection {
+impl CatalogueConnection {
     fn open(address: &str) -> Result<Self> {
         let stream = TcpStream::connect(address)?;
         stream.set_nodelay(true)?;
@@ -83,16 +83,16 @@ impl Connection {
 }
 
 /// Surfaces, facets, runs and pairs that requests name.
-struct Lake {
+struct CatalogueContents {
     surfaces: Vec<String>,
     facets: Vec<(String, String)>,
     runs: Vec<String>,
     pairs: u64,
 }
 
-impl Lake {
+impl CatalogueContents {
     fn read(address: &str) -> Result<Self> {
-        let mut connection = Connection::open(address)?;
+        let mut connection = CatalogueConnection::open(address)?;
         let mut json = |path: &str| -> Result<Value> { Ok(serde_json::from_slice(&connection.get(path)?.1)?) };
         let text = |value: &Value| value.as_str().unwrap_or_default().to_owned();
         let page = json("/api/v1/surfaces?limit=500")?;
@@ -118,7 +118,7 @@ impl Lake {
         })
     }
 
-    fn path(&self, kind: QuestionKind, chance: &mut Chance) -> String {
+    fn path(&self, kind: QuestionKind, chance: &mut RequestRandom) -> String {
         let surface = &self.surfaces[chance.below(self.surfaces.len() as u64) as usize];
         let pair = chance.below(self.pairs);
         match (kind, chance.below(10)) {
@@ -150,9 +150,9 @@ fn encoded(text: &str) -> String {
 }
 
 /// Numbers that are the same each time (Marsaglia 2003, xorshift).
-struct Chance(u64);
+struct RequestRandom(u64);
 
-impl Chance {
+impl RequestRandom {
     fn below(&mut self, bound: u64) -> u64 {
         self.0 ^= self.0 << 13;
         self.0 ^= self.0 >> 7;
@@ -163,13 +163,13 @@ impl Chance {
 
 pub(crate) fn run(args: &ReadersArgs) -> Result<()> {
     let args = Arc::new(args.clone());
-    let lake = Arc::new(Lake::read(&args.address)?);
+    let lake = Arc::new(CatalogueContents::read(&args.address)?);
     let (times, errors) = (Arc::new(Mutex::new(Vec::new())), Arc::new(AtomicU64::new(0)));
     let end = Instant::now() + Duration::from_secs(args.seconds);
     let reader = |number: u64| {
         let (args, lake, times, errors) = (args.clone(), lake.clone(), times.clone(), errors.clone());
         std::thread::spawn(move || {
-            let mut chance = Chance(number.wrapping_mul(0x9e37_79b9_7f4a_7c15) | 1);
+            let mut chance = RequestRandom(number.wrapping_mul(0x9e37_79b9_7f4a_7c15) | 1);
             (0..10).for_each(|_| {
                 let _ = chance.below(1);
             });
@@ -180,7 +180,7 @@ pub(crate) fn run(args: &ReadersArgs) -> Result<()> {
                 let begun = Instant::now();
                 let asked = match connection.take() {
                     Some(open) => Ok(open),
-                    None => Connection::open(&args.address),
+                    None => CatalogueConnection::open(&args.address),
                 };
                 match asked.and_then(|mut open| open.get(&path).map(|answer| (open, answer))) {
                     // Not every surface has every pair.

@@ -34,14 +34,14 @@ pub(crate) struct SlicesArgs {
 }
 
 /// Bytes and times of reading a slice.
-struct Took {
+struct SliceTimes {
     bytes: u64,
     first: Duration,
     all: Duration,
 }
 
 /// Reads a slice to its end; it is an error if the end does not come.
-fn read(address: &str, path: &str) -> Result<Took> {
+fn read(address: &str, path: &str) -> Result<SliceTimes> {
     let begun = Instant::now();
     let mut stream = TcpStream::connect(address)?;
     stream.write_all(format!("GET {path} HTTP/1.1\r\nhost: {address}\r\nconnection: close\r\n\r\n").as_bytes())?;
@@ -69,7 +69,7 @@ fn read(address: &str, path: &str) -> Result<Took> {
     if !end.ends_with(b"\r\n0\r\n\r\n") {
         bail!("{path} broke off after {bytes} bytes");
     }
-    Ok(Took { bytes, first: first.unwrap_or_default(), all: begun.elapsed() })
+    Ok(SliceTimes { bytes, first: first.unwrap_or_default(), all: begun.elapsed() })
 }
 
 fn path(run: &str, pairs: std::ops::Range<u64>, more: &str) -> String {

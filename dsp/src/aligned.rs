@@ -4,14 +4,14 @@
 const LINE: usize = 64;
 
 /// A fixed number of values, the first of them at the start of a line.
-pub(crate) struct Aligned<T> {
+pub(crate) struct AlignedBuffer<T> {
     /// With room for a line before the values.
     room: Vec<T>,
     start: usize,
     len: usize,
 }
 
-impl<T: Clone + Default> Aligned<T> {
+impl<T: Clone + Default> AlignedBuffer<T> {
     pub(crate) fn new(len: usize) -> Self {
         let slack = LINE / size_of::<T>().max(1);
         let room = vec![T::default(); len + slack];
@@ -32,7 +32,7 @@ mod tests {
     #[test]
     fn values_start_on_a_line() {
         for len in [0, 1, 7, 48_001] {
-            let (mut f32s, mut f64s) = (Aligned::<[f32; 2]>::new(len), Aligned::<[f64; 2]>::new(len));
+            let (mut f32s, mut f64s) = (AlignedBuffer::<[f32; 2]>::new(len), AlignedBuffer::<[f64; 2]>::new(len));
             assert_eq!((f32s.values().len(), f64s.values().len()), (len, len));
             assert_eq!(f32s.values().as_ptr().align_offset(LINE), 0);
             assert_eq!(f64s.values().as_ptr().align_offset(LINE), 0);

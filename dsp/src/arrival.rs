@@ -1,13 +1,13 @@
 //! Time of a response's first arrival.
 
-use crate::Real;
+use crate::RealSample;
 
 /// Time of the first arrival in samples from the first, fractions included: the point at which the magnitude first
 /// reaches `threshold_db` (below 0) relative to its greatest, linearly interpolated from the sample before. None if
 /// there is no sound, or a sample that is not finite.
 ///
 /// ISO 3382-1:2009 looks for the start of a response at least 20 dB below its greatest.
-pub fn first_arrival<T: Real>(ir: &[T], threshold_db: f64) -> Option<f64> {
+pub fn first_arrival<T: RealSample>(ir: &[T], threshold_db: f64) -> Option<f64> {
     let magnitude = |x: &T| x.f64().abs();
     let mut greatest = 0.0f64;
     for x in ir {

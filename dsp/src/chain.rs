@@ -6,7 +6,7 @@ use crate::error::check_len;
 use crate::filter_bank::{FilterBankPlan, FilterBankScratch};
 use crate::foam::subtract;
 use crate::temperature::{TemperatureCorrection, resampling_ratio};
-use crate::{Error, Real};
+use crate::{Error, RealSample};
 
 /// Coldest and warmest air that a plan is made for, C: the range of all temperatures that are accepted.
 const TEMPERATURES: [f64; 2] = [-60.0, 80.0];
@@ -31,7 +31,7 @@ pub struct MeasurementParams {
 }
 
 /// Recording to response: deconvolve, correct the temperature, crop.
-pub struct MeasurementPlan<T: Real> {
+pub struct MeasurementPlan<T: RealSample> {
     deconvolution: DeconvolutionPlan<T>,
     correction: TemperatureCorrection<T>,
     ir_len: usize,
@@ -44,7 +44,7 @@ pub struct MeasurementScratch<T> {
     raw: Vec<T>,
 }
 
-impl<T: Real> MeasurementPlan<T> {
+impl<T: RealSample> MeasurementPlan<T> {
     /// Plans for recordings of one length.
     ///
     /// # Errors
@@ -113,7 +113,7 @@ fn check_celsius(what: &'static str, celsius: f64) -> Result<(), Error> {
 
 /// Results that are derived from one response.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Derived<T> {
+pub struct DerivedResponse<T> {
     /// `[len]`: the response without the direct sound.
     pub reflected: Vec<T>,
     /// `[bands x len]`: NCE, over Flat's total energy.
@@ -138,7 +138,7 @@ pub struct FlatEnergies {
 }
 
 /// Response to reflected response, curves and energies.
-pub struct DerivationPlan<T: Real> {
+pub struct DerivationPlan<T: RealSample> {
     bank: FilterBankPlan<T>,
 }
 
@@ -149,7 +149,7 @@ pub struct DerivationScratch<T> {
     flat: FlatEnergies,
 }
 
-impl<T: Real> DerivationPlan<T> {
+impl<T: RealSample> DerivationPlan<T> {
     /// Plans for responses of `len` samples.
     ///
     /// # Errors
@@ -169,9 +169,9 @@ impl<T: Real> DerivationPlan<T> {
     }
 
     /// A place for results, which runs fill again and again.
-    pub fn derived(&self) -> Derived<T> {
+    pub fn derived(&self) -> DerivedResponse<T> {
         let (bands, len) = (self.bank.bands(), self.bank.len());
-        Derived {
+        DerivedResponse {
             reflected: vec![T::default(); len],
             curves: vec![T::default(); bands * len],
             energies: vec![0.0; bands],
@@ -200,7 +200,7 @@ impl<T: Real> DerivationPlan<T> {
         ir: &[T],
         foam: &[T],
         flat: &[T],
-        derived: &mut Derived<T>,
+        derived: &mut DerivedResponse<T>,
         scratch: &mut DerivationScratch<T>,
     ) -> Result<(), Error> {
         self.measure_flat(flat, scratch)?;
@@ -218,7 +218,7 @@ impl<T: Real> DerivationPlan<T> {
         ir: &[T],
         foam: &[T],
         flat: &FlatEnergies,
-        derived: &mut Derived<T>,
+        derived: &mut DerivedResponse<T>,
         scratch: &mut DerivationScratch<T>,
     ) -> Result<(), Error> {
         check_len("Flat's energies", flat.bands.len(), self.bank.bands())?;
@@ -237,7 +237,7 @@ impl<T: Real> DerivationPlan<T> {
         &self,
         ir: &[T],
         foam: &[T],
-        derived: &mut Derived<T>,
+        derived: &mut DerivedResponse<T>,
         scratch: &mut DerivationScratch<T>,
     ) -> Result<(), Error> {
         check_len("the response", ir.len(), self.bank.len())?;
@@ -247,7 +247,7 @@ impl<T: Real> DerivationPlan<T> {
     }
 }
 
-fn put_over<T: Real>(flat: &FlatEnergies, bands: &[T], derived: &mut Derived<T>) {
+fn put_over<T: RealSample>(flat: &FlatEnergies, bands: &[T], derived: &mut DerivedResponse<T>) {
     let (len, factor) = (derived.reflected.len(), flat.total.recip());
     let curves = bands.chunks_exact(len).zip(derived.curves.chunks_exact_mut(len));
     for ((band, curve), energy) in curves.zip(&mut derived.energies) {

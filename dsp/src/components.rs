@@ -16,7 +16,7 @@ const SETTLED: f64 = 1e-10;
 ///
 /// Distances are root mean squares over the features, so that they have the features' unit.
 #[derive(Debug, Clone)]
-pub struct Components {
+pub struct PrincipalComponents {
     features: usize,
     rows: usize,
     /// Inner products of the centred rows, `[rows x rows]`.
@@ -25,7 +25,7 @@ pub struct Components {
     values: Vec<f64>,
 }
 
-impl Components {
+impl PrincipalComponents {
     /// Finds the leading `count` components. A feature that is not finite in one of the rows is left out; the rows are
     /// centred in place.
     ///
@@ -161,7 +161,7 @@ mod tests {
         let (long, short) = ([3.0, -1.0, -2.0, 0.0], [0.1, 0.1, -0.1, -0.1]);
         let mut rows: Vec<Vec<f32>> =
             (0..4).map(|i| vec![5.0 + 3.0 * long[i] - 4.0 * short[i], 4.0 * long[i] + 3.0 * short[i]]).collect();
-        let found = Components::of(&mut rows, 3).expect("equally long");
+        let found = PrincipalComponents::of(&mut rows, 3).expect("equally long");
         assert_eq!(found.features(), 2);
         // Both directions have a length of five.
         for (i, along) in long.iter().enumerate() {
@@ -177,13 +177,13 @@ mod tests {
     #[test]
     fn what_is_not_a_number_is_left_out() {
         let mut rows = vec![vec![1.0, f32::NAN, 2.0], vec![3.0, 1.0, 2.0], vec![5.0, 1.0, 2.0]];
-        let found = Components::of(&mut rows, 2).expect("equally long");
+        let found = PrincipalComponents::of(&mut rows, 2).expect("equally long");
         assert_eq!(found.features(), 2);
         assert!((found.distance(0, 2) - 4.0 / 2f64.sqrt()).abs() < 1e-6);
-        assert!(Components::of(&mut [vec![1.0], vec![]], 1).is_err());
-        let nothing = Components::of(&mut [], 3).expect("nothing");
+        assert!(PrincipalComponents::of(&mut [vec![1.0], vec![]], 1).is_err());
+        let nothing = PrincipalComponents::of(&mut [], 3).expect("nothing");
         assert!(nothing.explained().is_empty());
-        let alike = Components::of(&mut [vec![1.0; 9], vec![1.0; 9]], 1).expect("equally long");
+        let alike = PrincipalComponents::of(&mut [vec![1.0; 9], vec![1.0; 9]], 1).expect("equally long");
         assert_eq!((alike.explained(), alike.position(0)), (vec![0.0], vec![0.0]));
     }
 

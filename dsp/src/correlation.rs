@@ -7,7 +7,7 @@ use realfft::{ComplexToReal, RealToComplex};
 
 use crate::energy::energy;
 use crate::error::check_len;
-use crate::{Error, Real};
+use crate::{Error, RealSample};
 
 /// Pearson's coefficient of correlation, -1 to 1. None if one does not vary, if there are fewer than two values, or if
 /// one is not finite.
@@ -16,7 +16,7 @@ use crate::{Error, Real};
 ///
 /// # Errors
 /// [`Error::Length`] if they are not equally long.
-pub fn pearson<T: Real>(x: &[T], y: &[T]) -> Result<Option<f64>, Error> {
+pub fn pearson<T: RealSample>(x: &[T], y: &[T]) -> Result<Option<f64>, Error> {
     check_len("the second signal", y.len(), x.len())?;
     let count = x.len() as f64;
     let mean = |x: &[T]| x.iter().map(|x| x.f64()).sum::<f64>() / count;
@@ -39,7 +39,7 @@ pub fn pearson<T: Real>(x: &[T], y: &[T]) -> Result<Option<f64>, Error> {
 /// Greatest cross-correlation of signals of one length over all shifts.
 ///
 /// Signals are padded so that nothing wraps around.
-pub struct CorrelationPlan<T: Real> {
+pub struct CorrelationPlan<T: RealSample> {
     len: usize,
     forward: Arc<dyn RealToComplex<T>>,
     inverse: Arc<dyn ComplexToReal<T>>,
@@ -52,7 +52,7 @@ pub struct CorrelationScratch<T> {
     work: Vec<Complex<T>>,
 }
 
-impl<T: Real> CorrelationPlan<T> {
+impl<T: RealSample> CorrelationPlan<T> {
     /// Plans for signals of `len` samples.
     ///
     /// # Errors

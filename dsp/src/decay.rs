@@ -1,6 +1,6 @@
 //! Decay of a response's energy.
 
-use crate::Real;
+use crate::RealSample;
 
 /// Schroeder's backward integration: the energy from each sample to the end over all of it, dB. The first is 0 dB;
 /// once nothing is left, minus infinity. If the response has no finite energy, returns false and all of `curve` is
@@ -9,7 +9,7 @@ use crate::Real;
 /// ir, curve  `[n]`, summed up in f64
 ///
 /// Source: Schroeder 1965, J. Acoust. Soc. Am. 37(3):409-412.
-pub fn energy_decay_db<T: Real>(ir: &[T], curve: &mut [T]) -> bool {
+pub fn energy_decay_db<T: RealSample>(ir: &[T], curve: &mut [T]) -> bool {
     let total = crate::energy::energy(ir);
     if !(total > 0.0 && total.is_finite()) {
         curve.fill(T::of(f64::NEG_INFINITY));

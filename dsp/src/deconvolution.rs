@@ -6,11 +6,11 @@ use std::sync::Arc;
 use realfft::num_complex::Complex;
 use rustfft::{Fft, FftDirection};
 
-use crate::aligned::Aligned;
+use crate::aligned::AlignedBuffer;
 use crate::error::check_len;
-use crate::joint::{Levels, Power};
+use crate::joint::{BinPower, SignalLevels};
 use crate::pruned::PrunedInverse;
-use crate::{Error, Real};
+use crate::{Error, RealSample};
 
 /// Settings of a deconvolution.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -54,7 +54,7 @@ const PIECE: usize = 64;
 /// Both signals are real, so one complex transform of z = x + i s does for both: with the mirror image
 /// b\[k\] = conj Z\[n - k\], X = (Z + b) / 2 and S = (Z - b) / 2i, and their quotient needs neither of them. It goes
 /// straight to where the inverse transform, of the wanted samples only, reads it.
-pub struct DeconvolutionPlan<T: Real> {
+pub struct DeconvolutionPlan<T: RealSample> {
     recording_len: usize,
     output_len: usize,
     len: usize,
@@ -67,13 +67,13 @@ pub struct DeconvolutionPlan<T: Real> {
 /// Buffers of a [`DeconvolutionPlan`].
 pub struct DeconvolutionScratch<T> {
     /// `[len + 1]`: the transform of both signals, and its first bin again as the mirror image of itself.
-    joint: Aligned<Complex<T>>,
+    joint: AlignedBuffer<Complex<T>>,
     /// Scratch of the transforms; between them, the quotient. One buffer, as the cache has no room for two.
-    work: Aligned<Complex<T>>,
+    work: AlignedBuffer<Complex<T>>,
     sums: Vec<Complex<T>>,
 }
 
-impl<T: Real> DeconvolutionPlan<T> {
+impl<T: RealSample> DeconvolutionPlan<T> {
     /// Plans the transforms.
     ///
     /// # Errors
@@ -112,7 +112,11 @@ impl<T: Real> DeconvolutionPlan<T> {
     pub fn scratch(&self) -> DeconvolutionScratch<T> {
         let work = self.forward.get_inplace_scratch_len();
         let work = work.max(self.inverse.spectrum_len() + self.inverse.scratch_len());
-        DeconvolutionScratch { joint: Aligned::new(self.len + 1), work: Aligned::new(work), sums: self.inverse.sums() }
+        DeconvolutionScratch {
+            joint: AlignedBuffer::new(self.len + 1),
+            work: AlignedBuffer::new(work),
+            sums: self.inverse.sums(),
+        }
     }
 
     /// Samples of the response that a run gives.
@@ -136,7 +140,7 @@ impl<T: Real> DeconvolutionPlan<T> {
         check_len("the response", ir.len(), self.output_len)?;
         let DeconvolutionScratch { joint, work, sums } = scratch;
         let (joint, work) = (joint.values(), work.values());
-        let levels = Levels::of(recording, loopback)?;
+        let levels = SignalLevels::of(recording, loopback)?;
         self.transform(recording, loopback, T::of(levels.gain), joint, work);
         let (quotient, work) = work.split_at_mut(self.inverse.spectrum_len());
         self.divide(joint, levels.rounding, quotient)?;
@@ -177,9 +181,15 @@ impl<T: Real> DeconvolutionPlan<T> {
     }
 
     // Divides with the divisor's power raised to `floor`; returns the power before it is raised, times 4.
-    fn divide_bins(&self, bins: Range<usize>, floor: T, joint: &[Complex<T>], quotient: &mut [Complex<T>]) -> Power<T> {
+    fn divide_bins(
+        &self,
+        bins: Range<usize>,
+        floor: T,
+        joint: &[Complex<T>],
+        quotient: &mut [Complex<T>],
+    ) -> BinPower<T> {
         let (mut piece, mut powers) = ([Complex::default(); PIECE], [T::default(); PIECE]);
-        let mut total = Power::none();
+        let mut total = BinPower::none();
         for first in bins.clone().step_by(PIECE) {
             let count = PIECE.min(bins.end - first);
             let mirrored = &joint[self.len + 1 - first - count..=self.len - first];

@@ -7,7 +7,7 @@
 /// standard asks for receivers in the far field; on the grid of a rig they are in the near field, and the number
 /// compares surfaces measured alike, no more.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Diffusion {
+pub struct DiffusionSums {
     receivers: u64,
     loudest_db: f64,
     /// Sum of the energies over that of the loudest.
@@ -16,13 +16,13 @@ pub struct Diffusion {
     square: f64,
 }
 
-impl Default for Diffusion {
+impl Default for DiffusionSums {
     fn default() -> Self {
         Self { receivers: 0, loudest_db: f64::NEG_INFINITY, energy: 0.0, square: 0.0 }
     }
 }
 
-impl Diffusion {
+impl DiffusionSums {
     /// Adds a receiver by its level, dB. Minus infinity is a receiver without sound; NaN makes the coefficient NaN.
     pub fn add(&mut self, level_db: f64) {
         let (energy, square) = if level_db == f64::NEG_INFINITY { (0.0, 0.0) } else { (1.0, 1.0) };
@@ -72,8 +72,8 @@ fn ratio(level_db: f64, loudest_db: f64) -> f64 {
 }
 
 /// The coefficient of one list of levels, dB; None of fewer than two, or of no sound.
-pub fn diffusion<T: crate::Real>(levels_db: &[T]) -> Option<f64> {
-    let mut sums = Diffusion::default();
+pub fn diffusion<T: crate::RealSample>(levels_db: &[T]) -> Option<f64> {
+    let mut sums = DiffusionSums::default();
     levels_db.iter().for_each(|level| sums.add(level.f64()));
     sums.coefficient()
 }
@@ -105,11 +105,11 @@ mod tests {
         let (sum, square) = (e.iter().sum::<f64>(), e.iter().map(|e| e * e).sum::<f64>());
         let expected = (sum * sum - square) / (4.0 * square);
         assert!((diffusion(&levels).expect("one") - expected).abs() < 1e-12);
-        let (mut first, mut second) = (Diffusion::default(), Diffusion::default());
+        let (mut first, mut second) = (DiffusionSums::default(), DiffusionSums::default());
         levels[..2].iter().for_each(|l| first.add(*l));
         levels[2..].iter().for_each(|l| second.add(*l));
-        first.merge(&Diffusion::from_parts(second.parts()));
-        first.merge(&Diffusion::default());
+        first.merge(&DiffusionSums::from_parts(second.parts()));
+        first.merge(&DiffusionSums::default());
         assert!((first.coefficient().expect("one") - expected).abs() < 1e-12);
     }
 

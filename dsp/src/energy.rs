@@ -1,22 +1,22 @@
 //! Energy, its running sum along time, and both over Flat's.
 
-use crate::Real;
+use crate::RealSample;
 pub use crate::foam::subtract;
 
 /// Sum of squares.
-pub fn energy<T: Real>(x: &[T]) -> f64 {
+pub fn energy<T: RealSample>(x: &[T]) -> f64 {
     x.iter().map(|x| x.f64() * x.f64()).sum()
 }
 
 /// Root of the mean square; 0 of no samples.
-pub fn rms<T: Real>(x: &[T]) -> f64 {
+pub fn rms<T: RealSample>(x: &[T]) -> f64 {
     (energy(x) / x.len().max(1) as f64).sqrt()
 }
 
 /// Running sum of squares of one signal over `scale`: its NCE over Flat's total energy.
 ///
 /// ir, curve  `[n]`
-pub fn cumulate_whole<T: Real>(ir: &[T], scale: f64, curve: &mut [T]) {
+pub fn cumulate_whole<T: RealSample>(ir: &[T], scale: f64, curve: &mut [T]) {
     accumulate(ir, scale.recip(), curve);
 }
 
@@ -25,7 +25,7 @@ pub fn cumulate_whole<T: Real>(ir: &[T], scale: f64, curve: &mut [T]) {
 /// bands  `[bands x len]`
 /// curves `[bands x len]`  cumulative energy (scale 1), or NCE (scale: Flat's total energy)
 /// last   `[bands]`        each curve's last value, in f64
-pub fn cumulate<T: Real>(bands: &[T], len: usize, scale: f64, curves: &mut [T], last: &mut [f64]) {
+pub fn cumulate<T: RealSample>(bands: &[T], len: usize, scale: f64, curves: &mut [T], last: &mut [f64]) {
     let len = len.max(1);
     for ((band, curve), last) in bands.chunks_exact(len).zip(curves.chunks_exact_mut(len)).zip(last) {
         *last = accumulate(band, scale.recip(), curve) * scale.recip();
@@ -35,7 +35,7 @@ pub fn cumulate<T: Real>(bands: &[T], len: usize, scale: f64, curves: &mut [T], 
 /// Running sum of squares of each band, summed up in f64.
 ///
 /// bands, curves  `[bands x len]`
-pub fn cumulative_energy<T: Real>(bands: &[T], curves: &mut [T], len: usize) {
+pub fn cumulative_energy<T: RealSample>(bands: &[T], curves: &mut [T], len: usize) {
     let len = len.max(1);
     for (band, curve) in bands.chunks_exact(len).zip(curves.chunks_exact_mut(len)) {
         accumulate(band, 1.0, curve);
@@ -44,7 +44,7 @@ pub fn cumulative_energy<T: Real>(bands: &[T], curves: &mut [T], len: usize) {
 
 /// Cumulative energy becomes NCE, in place: over Flat's total energy for the same pair. A Flat without energy
 /// leaves values that are not finite.
-pub fn nce<T: Real>(curves: &mut [T], flat_energy: f64) {
+pub fn nce<T: RealSample>(curves: &mut [T], flat_energy: f64) {
     curves.iter_mut().for_each(|x| *x = T::of(x.f64() / flat_energy));
 }
 
@@ -52,7 +52,7 @@ pub fn nce<T: Real>(curves: &mut [T], flat_energy: f64) {
 ///
 /// curves `[bands x len]`
 /// out    `[bands]`
-pub fn tnce<T: Real>(curves: &[T], len: usize, out: &mut [f64]) -> f64 {
+pub fn tnce<T: RealSample>(curves: &[T], len: usize, out: &mut [f64]) -> f64 {
     let last = curves.chunks_exact(len.max(1)).filter_map(<[T]>::last);
     let mut total = 0.0;
     for (out, last) in out.iter_mut().zip(last) {
@@ -76,7 +76,7 @@ const BLOCK: usize = 8;
 ///
 /// Within a block the sums come from doubling (to each, the one 1, 2 and 4 before it), which leaves one dependent
 /// addition a block instead of one a sample.
-pub(crate) fn accumulate<T: Real>(band: &[T], factor: f64, curve: &mut [T]) -> f64 {
+pub(crate) fn accumulate<T: RealSample>(band: &[T], factor: f64, curve: &mut [T]) -> f64 {
     let (mut sum, (blocks, rest)) = (0.0, band.as_chunks::<BLOCK>());
     let (curve_blocks, curve_rest) = curve.as_chunks_mut::<BLOCK>();
     for (block, out) in blocks.iter().zip(curve_blocks) {

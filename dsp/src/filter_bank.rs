@@ -9,7 +9,7 @@ use realfft::num_complex::Complex;
 use rustfft::{Fft, FftDirection};
 
 use crate::error::check_len;
-use crate::{Error, Real};
+use crate::{Error, RealSample};
 
 /// The itersine window on |x| <= 1/2: sin(pi/2 cos^2(pi x)), 0 elsewhere.
 ///
@@ -36,18 +36,18 @@ pub fn gain(centres_hz: &[f64], band: usize, frequency_hz: f64) -> f64 {
 /// Band signals are real, so one complex inverse transform does for two, a + i b, with gains a + i b for its bins.
 ///
 /// Source: Rust et al. 2021; Wesfreid and Wickerhauser 1993 for the window.
-pub struct FilterBankPlan<T: Real> {
+pub struct FilterBankPlan<T: RealSample> {
     len: usize,
     bands: usize,
     /// `[bands x (len/2 + 1)]`.
     gains: Vec<T>,
-    couples: Vec<Couple<T>>,
+    couples: Vec<BandCouple<T>>,
     forward: Arc<dyn RealToComplex<T>>,
     inverse: Arc<dyn Fft<T>>,
 }
 
 /// Two bands that are transformed as one; the second is empty if the number of bands is odd.
-struct Couple<T> {
+struct BandCouple<T> {
     /// Bins in which at least one of them has a gain, up to half of the rate.
     bins: Range<usize>,
     /// `[bins]`: first + i second, over the number of samples.
@@ -63,7 +63,7 @@ pub struct FilterBankScratch<T> {
     work: Vec<Complex<T>>,
 }
 
-impl<T: Real> FilterBankPlan<T> {
+impl<T: RealSample> FilterBankPlan<T> {
     /// Plans for signals of `len` samples; the centres are an octave apart, ascending.
     ///
     /// # Errors
@@ -89,7 +89,7 @@ impl<T: Real> FilterBankPlan<T> {
                 T::of(band.map_or(0.0, |band| gain(centres_hz, *band, frequency(k)) / len as f64))
             };
             let at = |k: usize| Complex::new(scaled(bands.first(), k), scaled(bands.get(1), k));
-            Couple::new((0..len / 2 + 1).map(at).collect())
+            BandCouple::new((0..len / 2 + 1).map(at).collect())
         };
         Ok(Self {
             len,
@@ -175,7 +175,7 @@ impl<T: Real> FilterBankPlan<T> {
     }
 }
 
-impl<T: Real> Couple<T> {
+impl<T: RealSample> BandCouple<T> {
     fn new(mut gains: Vec<Complex<T>>) -> Self {
         let used = |c: &Complex<T>| c.re != T::default() || c.im != T::default();
         let first = gains.iter().position(used).unwrap_or(0);

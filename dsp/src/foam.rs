@@ -1,11 +1,11 @@
 //! Removal of the direct sound, which is what a surface that absorbs everything leaves over.
 
-use crate::Real;
+use crate::RealSample;
 
 /// A response minus Foam's of the same pair (Rust et al. 2021, appendix, step 3): what the surface reflected.
 ///
 /// ir, foam, out  `[n]`, all at the reference temperature; past the shortest, `out` stays as it was
-pub fn subtract<T: Real>(ir: &[T], foam: &[T], out: &mut [T]) {
+pub fn subtract<T: RealSample>(ir: &[T], foam: &[T], out: &mut [T]) {
     out.iter_mut().zip(ir.iter().zip(foam)).for_each(|(out, (ir, foam))| *out = *ir - *foam);
 }
 

@@ -9,7 +9,7 @@ use echolake_schema::{Rig, Symmetry};
 use parquet::arrow::arrow_reader::ParquetRecordBatchReaderBuilder;
 use serde_json::Value;
 
-use crate::Real;
+use crate::RealSample;
 use crate::chain::{DerivationPlan, MeasurementParams, MeasurementPlan};
 use crate::deconvolution::{DeconvolutionParams, DeconvolutionPlan, TransformLength};
 use crate::energy::{cumulative_energy, energy, nce, tnce};
@@ -23,14 +23,14 @@ const CENTRES: [f64; 5] = [2_500.0, 5_000.0, 10_000.0, 20_000.0, 40_000.0];
 const LEN: usize = 384;
 
 /// A case: signals by column name; scalars are signals of one sample.
-type Case = HashMap<String, Vec<f64>>;
+type GoldenCase = HashMap<String, Vec<f64>>;
 
-struct Golden {
-    cases: Vec<Case>,
+struct GoldenCases {
+    cases: Vec<GoldenCase>,
     metadata: HashMap<String, Value>,
 }
 
-fn golden() -> Golden {
+fn golden() -> GoldenCases {
     // Tests run in their package's folder. A path fixed at compile time would be that of another checkout if both
     // share a target folder.
     let path = "../tests/fixtures/golden.parquet";
@@ -55,15 +55,15 @@ fn golden() -> Golden {
         }
     }
     assert_eq!(cases.len(), 8, "all cases are read");
-    Golden { cases, metadata }
+    GoldenCases { cases, metadata }
 }
 
-fn of<T: Real>(x: &[f64]) -> Vec<T> {
+fn of<T: RealSample>(x: &[f64]) -> Vec<T> {
     x.iter().map(|x| T::of(*x)).collect()
 }
 
 /// Relative L2 error.
-fn error<T: Real>(actual: &[T], expected: &[f64]) -> f64 {
+fn error<T: RealSample>(actual: &[T], expected: &[f64]) -> f64 {
     assert_eq!(actual.len(), expected.len());
     let off: f64 = actual.iter().zip(expected).map(|(a, e)| (a.f64() - e).powi(2)).sum();
     (off / energy(expected)).sqrt()
@@ -81,7 +81,7 @@ fn params(recording_len: usize) -> MeasurementParams {
     }
 }
 
-fn check_deconvolution<T: Real>(length: TransformLength, output_len: impl Fn(usize) -> usize, tolerance: f64) {
+fn check_deconvolution<T: RealSample>(length: TransformLength, output_len: impl Fn(usize) -> usize, tolerance: f64) {
     for case in golden().cases {
         for kind in ["foam", "flat", "panel"] {
             let (x, s) = (&case[&format!("{kind}_recording")], &case[&format!("{kind}_loopback")]);
@@ -109,7 +109,7 @@ fn deconvolution() {
 }
 
 // Both are padded to a fast length, which is what keeps f64 from coming closer; see `responses_in_f64_without_padding`.
-fn check_responses<T: Real>(tolerance: f64) {
+fn check_responses<T: RealSample>(tolerance: f64) {
     for case in golden().cases {
         let plan = MeasurementPlan::<T>::new(&params(case["foam_recording"].len())).expect("a plan");
         let mut scratch = plan.scratch();
@@ -172,7 +172,7 @@ fn nearest_fraction(x: f64, largest: u64) -> (u64, u64) {
     }
 }
 
-fn check_derivation<T: Real>(tolerance: f64) {
+fn check_derivation<T: RealSample>(tolerance: f64) {
     let plan = DerivationPlan::<T>::new(LEN, 96e3, &CENTRES).expect("a plan");
     let (mut derived, mut scratch) = (plan.derived(), plan.scratch());
     for case in golden().cases {
@@ -205,7 +205,7 @@ fn derivation() {
 fn dirty_scratch_changes_nothing() {
     let cases = golden().cases;
     let plan = MeasurementPlan::<f32>::new(&params(cases[0]["panel_recording"].len())).expect("a plan");
-    let run = |case: &Case, scratch: &mut _| {
+    let run = |case: &GoldenCase, scratch: &mut _| {
         let mut ir = vec![f32::NAN; LEN];
         let (x, s) = (of(&case["panel_recording"]), of(&case["panel_loopback"]));
         plan.ir(&x, &s, case["panel_celsius"][0], &mut ir, scratch).expect("a response");
@@ -221,7 +221,7 @@ fn dirty_scratch_changes_nothing() {
 fn dirty_derivation_scratch_changes_nothing() {
     let cases = golden().cases;
     let plan = DerivationPlan::<f32>::new(LEN, 96e3, &CENTRES).expect("a plan");
-    let run = |case: &Case, (derived, scratch): &mut (_, _)| {
+    let run = |case: &GoldenCase, (derived, scratch): &mut (_, _)| {
         let [ir, foam, flat] = ["panel_ir", "foam_ir", "flat_reflected_ir"].map(|name| of(&case[name]));
         plan.run(&ir, &foam, &flat, derived, scratch).expect("derived");
         derived.clone()

@@ -1,6 +1,6 @@
 //! Levels of two signals that share a transform, and the power of one of them over its bins.
 
-use crate::{Error, Real};
+use crate::{Error, RealSample};
 
 /// Sums and minima that are kept side by side, as the compiler makes vectors of them.
 const LANES: usize = 8;
@@ -8,7 +8,7 @@ const LANES: usize = 8;
 const BLOCK: usize = 64;
 
 /// Levels of the two signals, from an eighth of their samples.
-pub(crate) struct Levels {
+pub(crate) struct SignalLevels {
     /// Power of two that brings the loopback to the recording's level: in one transform, the rounding of the louder
     /// signal is noise in the other.
     pub(crate) gain: f64,
@@ -16,8 +16,8 @@ pub(crate) struct Levels {
     pub(crate) rounding: f64,
 }
 
-impl Levels {
-    pub(crate) fn of<T: Real>(recording: &[T], loopback: &[T]) -> Result<Self, Error> {
+impl SignalLevels {
+    pub(crate) fn of<T: RealSample>(recording: &[T], loopback: &[T]) -> Result<Self, Error> {
         let (x, s) = (sampled_energy(recording), sampled_energy(loopback));
         for (what, energy) in [("the recording", x), ("the loopback", s)] {
             if !energy.is_finite() {
@@ -34,7 +34,7 @@ impl Levels {
 }
 
 // Blocks that are long enough to be read at full speed, close enough to each other to miss no sweep.
-fn sampled_energy<T: Real>(signal: &[T]) -> f64 {
+fn sampled_energy<T: RealSample>(signal: &[T]) -> f64 {
     let mut sums = [T::default(); LANES];
     for block in signal.chunks(8 * BLOCK) {
         for lanes in block[..block.len().min(BLOCK)].chunks_exact(LANES) {
@@ -45,12 +45,12 @@ fn sampled_energy<T: Real>(signal: &[T]) -> f64 {
 }
 
 /// Power of the divisor over some bins, in lanes that the compiler makes vectors of.
-pub(crate) struct Power<T> {
+pub(crate) struct BinPower<T> {
     sums: [T; LANES],
     least: [T; LANES],
 }
 
-impl<T: Real> Power<T> {
+impl<T: RealSample> BinPower<T> {
     pub(crate) fn none() -> Self {
         Self { sums: [T::default(); LANES], least: [T::max_value(); LANES] }
     }

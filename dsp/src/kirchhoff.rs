@@ -14,7 +14,7 @@ use realfft::{ComplexToReal, RealToComplex};
 
 use crate::error::check_len;
 use crate::height_field::HeightField;
-use crate::{Error, Real as _};
+use crate::{Error, RealSample as _};
 
 /// Arrivals are gathered at this multiple of the sampling rate.
 const OVERSAMPLING: usize = 8;
@@ -25,7 +25,7 @@ const PASS: f64 = 41.0 / 96.0;
 pub struct KirchhoffPlan {
     rate_hz: f64,
     /// Distances and cosines of each facet as seen from each point.
-    points: Vec<Seen>,
+    points: Vec<FacetGeometry>,
     /// Area of each facet along its normal, m^2.
     area: f32,
     len: usize,
@@ -36,7 +36,7 @@ pub struct KirchhoffPlan {
 }
 
 /// Every facet as seen from one point.
-struct Seen {
+struct FacetGeometry {
     position_m: [f64; 3],
     /// Distance, m.
     distance: Vec<f32>,
@@ -62,7 +62,7 @@ impl KirchhoffPlan {
         let pitch = relief.pitch_mm() / 1e3;
         Self {
             rate_hz,
-            points: points_mm.iter().map(|p| Seen::from(*p, relief)).collect(),
+            points: points_mm.iter().map(|p| FacetGeometry::from(*p, relief)).collect(),
             area: (pitch * pitch) as f32,
             len,
             forward: f32::plan_real_forward(wide),
@@ -123,12 +123,12 @@ impl KirchhoffPlan {
         Ok(())
     }
 
-    fn point(&self, what: &'static str, index: usize) -> Result<&Seen, Error> {
+    fn point(&self, what: &'static str, index: usize) -> Result<&FacetGeometry, Error> {
         let expected = "one of the plan's points";
         self.points.get(index).ok_or_else(|| Error::Setting { what, actual: format!("point {index}"), expected })
     }
 
-    fn gather(&self, a: &Seen, b: &Seen, per_metre: f32, scratch: &mut KirchhoffScratch) {
+    fn gather(&self, a: &FacetGeometry, b: &FacetGeometry, per_metre: f32, scratch: &mut KirchhoffScratch) {
         let last = scratch.plain.len() - 2;
         let facets = a.distance.iter().zip(&a.cosine_over_distance).zip(b.distance.iter().zip(&b.cosine_over_distance));
         for ((r1, q1), (r2, q2)) in facets {
@@ -176,7 +176,7 @@ impl KirchhoffPlan {
     }
 }
 
-impl Seen {
+impl FacetGeometry {
     fn from(position_mm: [f64; 3], relief: &HeightField) -> Self {
         let cells = relief.cells();
         let [px, py, pz] = position_mm;

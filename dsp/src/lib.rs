@@ -1,6 +1,6 @@
 //! The signal-processing kernels of echolake: plan once, run many, nothing allocated in `run`. No I/O.
 //!
-//! Signals are slices of `f32` (the product) or `f64` (its oracle); see [`Real`]. The order of work is
+//! Signals are slices of `f32` (the product) or `f64` (its oracle); see [`RealSample`]. The order of work is
 //! deconvolve, temperature-correct, crop, subtract Foam, filter, cumulate, normalise by Flat.
 //!
 //! ```
@@ -56,4 +56,4 @@ pub mod sweep;
 pub mod temperature;
 
 pub use error::Error;
-pub use real::Real;
+pub use real::RealSample;

@@ -1,21 +1,21 @@
 //! Signals multiplied and averaged, sample by sample.
 
 use crate::error::check_len;
-use crate::{Error, Real};
+use crate::{Error, RealSample};
 
 /// Sum of equally long signals, in f64, for their mean.
 #[derive(Debug, Clone, Default, PartialEq)]
-pub struct Mean {
+pub struct SignalMean {
     sums: Vec<f64>,
     count: u64,
 }
 
-impl Mean {
+impl SignalMean {
     /// Adds a signal; the first decides the length.
     ///
     /// # Errors
     /// [`Error::Length`] if it is not as long as those before.
-    pub fn add<T: Real>(&mut self, signal: &[T]) -> Result<(), Error> {
+    pub fn add<T: RealSample>(&mut self, signal: &[T]) -> Result<(), Error> {
         self.fit(signal.len())?;
         self.sums.iter_mut().zip(signal).for_each(|(sum, x)| *sum += x.f64());
         self.count += 1;
@@ -65,7 +65,7 @@ impl Mean {
 ///
 /// # Errors
 /// [`Error::Length`] if they are not equally long.
-pub fn multiply<T: Real>(x: &[T], y: &[T], out: &mut [T]) -> Result<(), Error> {
+pub fn multiply<T: RealSample>(x: &[T], y: &[T], out: &mut [T]) -> Result<(), Error> {
     check_len("the second list", y.len(), x.len())?;
     check_len("the product", out.len(), x.len())?;
     out.iter_mut().zip(x.iter().zip(y)).for_each(|(out, (x, y))| *out = *x * *y);
@@ -78,7 +78,7 @@ mod tests {
 
     #[test]
     fn means_are_of_each_sample() {
-        let (mut first, mut second) = (Mean::default(), Mean::default());
+        let (mut first, mut second) = (SignalMean::default(), SignalMean::default());
         first.add(&[1.0f32, 2.0]).expect("equally long");
         second.add(&[3.0, 6.0]).expect("equally long");
         second.add(&[5.0, 1.0]).expect("equally long");
@@ -87,7 +87,7 @@ mod tests {
         assert_eq!((first.values().collect::<Vec<_>>(), first.count()), (vec![3.0, 3.0], 3));
         assert!(matches!(first.add(&[1.0]), Err(Error::Length { actual: 1, expected: 2, .. })));
         assert!(matches!(first.merge(&[1.0], 1), Err(Error::Length { .. })));
-        assert_eq!(Mean::default().values().count(), 0);
+        assert_eq!(SignalMean::default().values().count(), 0);
     }
 
     #[test]

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use realfft::num_complex::Complex;
 use rustfft::{Fft, FftDirection};
 
-use crate::Real;
+use crate::RealSample;
 
 /// Room behind each strand: rows of whole KiB would all fall into the same few lines of the cache.
 const GAP: usize = 8;
@@ -16,7 +16,7 @@ const GAP: usize = 8;
 /// x\[m\] = sum_r w^r (strand r)\[m\], w = e^(2 pi i m / n). The signal is real, so strand p - r is the conjugate
 /// of strand r, and half of them are enough. Their sum is a polynomial in w, for which Horner's rule needs no
 /// more twiddles than there are samples wanted.
-pub(crate) struct PrunedInverse<T: Real> {
+pub(crate) struct PrunedInverse<T: RealSample> {
     strands: usize,
     strand_len: usize,
     inverse: Arc<dyn Fft<T>>,
@@ -24,7 +24,7 @@ pub(crate) struct PrunedInverse<T: Real> {
     turns: Vec<Complex<T>>,
 }
 
-impl<T: Real> PrunedInverse<T> {
+impl<T: RealSample> PrunedInverse<T> {
     pub(crate) fn new(n: usize, output_len: usize) -> Self {
         let strand_len = strand_len(n, output_len);
         let turn = |m: usize| {

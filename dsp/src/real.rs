@@ -9,7 +9,7 @@ use rustfft::{Fft, FftDirection, FftPlanner};
 ///
 /// Transforms are planned here and nowhere else: rustfft's planner is generic, and each crate that calls it compiles all
 /// of rustfft's kernels once more (20 s of a first build).
-pub trait Real: FftNum + PartialOrd + Default {
+pub trait RealSample: FftNum + PartialOrd + Default {
     /// Nearest to an f64.
     fn of(value: f64) -> Self;
     /// As f64, exactly.
@@ -26,7 +26,7 @@ pub trait Real: FftNum + PartialOrd + Default {
     fn plan_real_inverse(len: usize) -> Arc<dyn ComplexToReal<Self>>;
 }
 
-impl Real for f32 {
+impl RealSample for f32 {
     fn of(value: f64) -> Self {
         value as Self
     }
@@ -56,7 +56,7 @@ impl Real for f32 {
     }
 }
 
-impl Real for f64 {
+impl RealSample for f64 {
     fn of(value: f64) -> Self {
         value
     }

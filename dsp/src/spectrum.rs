@@ -6,14 +6,14 @@ use realfft::RealToComplex;
 use realfft::num_complex::Complex;
 
 use crate::error::check_len;
-use crate::{Error, Real};
+use crate::{Error, RealSample};
 
 /// Levels of the bins of responses of one length.
 ///
 /// ir      `[len]`
 /// levels  `[len/2 + 1]`, 20 log10 |X_k|, X_k = sum_n x_n e^(-2 pi i k n / len), not scaled: of a response, that is
 ///         its gain, and a single sample of 1 is 0 dB throughout. Bin k is at k rate / len; nothing is minus infinity.
-pub struct SpectrumPlan<T: Real> {
+pub struct SpectrumPlan<T: RealSample> {
     len: usize,
     forward: Arc<dyn RealToComplex<T>>,
 }
@@ -35,7 +35,7 @@ pub fn bin_hz(bin: usize, len: usize, rate_hz: f64) -> f64 {
     bin as f64 * rate_hz / len as f64
 }
 
-impl<T: Real> SpectrumPlan<T> {
+impl<T: RealSample> SpectrumPlan<T> {
     /// Plans for signals of `len` samples.
     ///
     /// # Errors

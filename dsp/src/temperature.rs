@@ -3,7 +3,7 @@
 use std::f64::consts::PI;
 use std::sync::{Arc, LazyLock};
 
-use crate::Real;
+use crate::RealSample;
 
 /// Speed of sound at 0 C, m/s (Rust et al. 2021, appendix, step 2).
 const C0: f64 = 331.3;
@@ -42,14 +42,14 @@ pub fn resampling_ratio(celsius: f64, reference_celsius: f64) -> f64 {
 /// from a fraction serves every ratio: outputs gather where they grow scarcer, inputs scatter where they do.
 #[derive(Debug, Clone)]
 pub struct TemperatureCorrection<T> {
-    table: Arc<[Piece<T>]>,
+    table: Arc<[KernelPiece<T>]>,
 }
 
 /// Coefficients of 1, t, t^2 and t^3 of each tap, t from 0 to 1 along a piece.
-type Piece<T> = [[T; TAPS]; 4];
+type KernelPiece<T> = [[T; TAPS]; 4];
 
 // Tap j is k(fraction + CENTRE - j), piece i for fractions from i / PIECES to (i + 1) / PIECES.
-static TABLE: LazyLock<Vec<Piece<f64>>> = LazyLock::new(|| {
+static TABLE: LazyLock<Vec<KernelPiece<f64>>> = LazyLock::new(|| {
     let cubic = |i: usize, j: usize| {
         let at = |t: f64| kernel((i as f64 + t) / PIECES as f64 + CENTRE as f64 - j as f64);
         let [a, b, c, d] = [-1.0, 0.0, 1.0, 2.0].map(at);
@@ -62,13 +62,13 @@ static TABLE: LazyLock<Vec<Piece<f64>>> = LazyLock::new(|| {
     (0..PIECES).map(piece).collect()
 });
 
-impl<T: Real> Default for TemperatureCorrection<T> {
+impl<T: RealSample> Default for TemperatureCorrection<T> {
     fn default() -> Self {
         Self::new()
     }
 }
 
-impl<T: Real> TemperatureCorrection<T> {
+impl<T: RealSample> TemperatureCorrection<T> {
     /// The plan; it serves every ratio.
     pub fn new() -> Self {
         Self { table: TABLE.iter().map(|piece| piece.map(|taps| taps.map(T::of))).collect() }
@@ -141,7 +141,7 @@ impl<T: Real> TemperatureCorrection<T> {
 }
 
 // Four sums side by side, which the compiler makes a vector of.
-fn dot<T: Real>(x: &[T; TAPS], taps: &[T; TAPS]) -> T {
+fn dot<T: RealSample>(x: &[T; TAPS], taps: &[T; TAPS]) -> T {
     let mut sums = [T::default(); 4];
     for (x, taps) in x.as_chunks::<4>().0.iter().zip(taps.as_chunks::<4>().0) {
         sums.iter_mut().zip(x.iter().zip(taps)).for_each(|(sum, (x, tap))| *sum = *sum + *x * *tap);
@@ -150,7 +150,7 @@ fn dot<T: Real>(x: &[T; TAPS], taps: &[T; TAPS]) -> T {
 }
 
 /// The first samples, with zeros if there are fewer.
-pub fn crop<T: Real>(from: &[T], to: &mut [T]) {
+pub fn crop<T: RealSample>(from: &[T], to: &mut [T]) {
     let kept = from.len().min(to.len());
     to[..kept].copy_from_slice(&from[..kept]);
     to[kept..].fill(T::default());

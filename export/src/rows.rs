@@ -4,7 +4,7 @@ use arrow::array::{Array as _, AsArray as _};
 use arrow::compute::concat_batches;
 use arrow::datatypes::{ArrowPrimitiveType, Schema};
 use arrow::record_batch::RecordBatch;
-use echolake_lake::{DataFile, Lake, Snapshot};
+use echolake_lake::{DataFile, Lake, LakeSnapshot};
 use echolake_schema::RunId;
 use echolake_schema::tables::Table;
 use futures::TryStreamExt as _;
@@ -15,7 +15,7 @@ use crate::error::{Error, Result};
 /// Reads the named columns of a run's rows in a table, in the table's order of columns.
 pub(crate) async fn of_run(
     lake: &Lake,
-    snapshot: &Snapshot,
+    snapshot: &LakeSnapshot,
     table: Table,
     run: &RunId,
     columns: &[&str],

@@ -14,7 +14,7 @@ use echolake_acquisition::relief::PanelRelief;
 use echolake_acquisition::run::{PanelSpecimen, RunRequest};
 use echolake_acquisition::simulate::simulate;
 use echolake_ingest::{Ingest, complete, pending};
-use echolake_lake::{Lake, References};
+use echolake_lake::{Lake, ReferenceSurfaces};
 use echolake_schema::{Rig, RunId, Table, Timestamp, topics};
 use futures::TryStreamExt as _;
 use parquet::arrow::arrow_reader::ParquetRecordBatchReaderBuilder;
@@ -29,7 +29,7 @@ const SURFACES: [&str; 6] = ["flat", "foam", "0001_0", "0001_1", "0002_0", "0003
 async fn lake(home: &TempDir, keep: RecordingMode) -> Lake {
     let rig = Rig::from_toml(SMALL_RIG).expect("a rig");
     let url = home.path().join("lake").display().to_string();
-    let lake = Lake::open_or_create(&url, &rig, &References::default()).await.expect("a lake");
+    let lake = Lake::open_or_create(&url, &rig, &ReferenceSurfaces::default()).await.expect("a lake");
     let inbox = home.path().join("lake/inbox");
     std::fs::create_dir_all(&inbox).expect("a folder");
     for (number, surface) in SURFACES.into_iter().enumerate() {

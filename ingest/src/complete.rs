@@ -3,7 +3,7 @@
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
-use echolake_lake::{Committed, Lake, VisibleRun};
+use echolake_lake::{CommitOutcome, Lake, VisibleRun};
 use echolake_schema::tables::Table;
 use echolake_schema::{RunId, SurfaceId};
 
@@ -80,11 +80,11 @@ async fn round(
     };
     let ended = &mut |(_, result): pipeline::Ended<_, Completed>| {
         let (completed, outcome) = result?;
-        if outcome == Some(Committed::Now) {
+        if outcome == Some(CommitOutcome::Now) {
             count += 1;
             done(&completed);
         }
-        overtaken |= outcome == Some(Committed::Outdated);
+        overtaken |= outcome == Some(CommitOutcome::Outdated);
         Ok(())
     };
     pipeline::run(lake, cores, jobs, stop, do_one, ended).await?;

@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use arrow::record_batch::RecordBatch;
-use echolake_lake::{EncodedFile, FileName, Lake, Snapshot, Staged, VisibleRun, encode};
+use echolake_lake::{EncodedFile, FileName, Lake, LakeSnapshot, StagedFile, VisibleRun, encode};
 use echolake_schema::tables::Table;
 use futures::future::join_all;
 
@@ -17,7 +17,7 @@ use crate::rows::Keys;
 pub(crate) struct Context {
     pub(crate) lake: Lake,
     pub(crate) cores: Cores,
-    pub(crate) snapshot: Arc<Snapshot>,
+    pub(crate) snapshot: Arc<LakeSnapshot>,
     pub(crate) finder: SharedFinder,
 }
 
@@ -35,7 +35,7 @@ impl Context {
         keys: &Keys,
         derivation: &str,
         files: Vec<(Table, EncodedFile)>,
-    ) -> Result<Vec<Staged>> {
+    ) -> Result<Vec<StagedFile>> {
         let Keys { surface, run } = keys.clone();
         let name = FileName::Rows { surface, run, derivation: derivation.to_owned() };
         // In parallel, because each file waits for the disk by itself.
@@ -45,7 +45,7 @@ impl Context {
 
     /// Stages a run's row of `runs`, which replaces the rows in the snapshot. After its commit readers see the files
     /// that the row names, and nothing else of the run.
-    pub(crate) async fn stage_pointer(&self, run: VisibleRun, row: &[RecordBatch]) -> Result<Staged> {
+    pub(crate) async fn stage_pointer(&self, run: VisibleRun, row: &[RecordBatch]) -> Result<StagedFile> {
         let file = encode(Table::Runs, &Table::Runs.schema(self.lake.rig()), row)?;
         let staged = self.lake.stage(Table::Runs, &FileName::Pointer(run.clone()), file).await?;
         Ok(staged.replacing(&run, self.snapshot.files_of(Table::Runs, &run.run)))

@@ -11,7 +11,7 @@ use echolake_acquisition::controller::RecordingMode;
 use echolake_acquisition::relief::PanelRelief;
 use echolake_acquisition::run::{PanelSpecimen, RunRequest};
 use echolake_acquisition::simulate::simulate;
-use echolake_lake::{Deletion, Lake, References};
+use echolake_lake::{DeletionMode, Lake, ReferenceSurfaces};
 use echolake_schema::tables::Table;
 use echolake_schema::{Rig, Timestamp};
 use futures::TryStreamExt as _;
@@ -56,7 +56,7 @@ fn runs(surfaces: &[&str]) -> Vec<(String, Bytes)> {
 }
 
 async fn lake(store: Arc<dyn ObjectStore>) -> echolake_lake::Result<Lake> {
-    Lake::open_or_create_in(store, "a lake under test", &rig(), &References::default()).await
+    Lake::open_or_create_in(store, "a lake under test", &rig(), &ReferenceSurfaces::default()).await
 }
 
 /// A lake with these runs in its inbox.
@@ -99,7 +99,7 @@ async fn tables(store: Arc<InMemory>) -> (BTreeMap<String, Bytes>, Vec<String>) 
 async fn tidy(store: Arc<dyn ObjectStore>) -> echolake_lake::Result<()> {
     let (lake, stop) = (lake(store).await?, AtomicBool::new(false));
     lake.optimize(1 << 30, &stop, &mut |_| {}).await?;
-    lake.vacuum(TimeDelta::zero(), Deletion::Real, &mut |_, _| {}).await?;
+    lake.vacuum(TimeDelta::zero(), DeletionMode::Real, &mut |_, _| {}).await?;
     Ok(())
 }
 

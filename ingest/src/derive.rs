@@ -3,7 +3,7 @@
 
 use std::sync::Arc;
 
-use echolake_lake::{EncodedFile, FileEncoder, Lake, Staged, encode};
+use echolake_lake::{EncodedFile, FileEncoder, Lake, StagedFile, encode};
 use echolake_schema::Rig;
 use echolake_schema::tables::Table;
 
@@ -44,7 +44,7 @@ impl Derivation {
         context: &Context,
         keys: &Keys,
         responses: Responses,
-    ) -> Result<(Vec<Staged>, References)> {
+    ) -> Result<(Vec<StagedFile>, References)> {
         let (this, for_rows, lake) = (Arc::new(self), keys.clone(), context.lake.clone());
         let derivation = this.clone();
         let (files, unpaired) = context.cores.compute(move || derivation.encode(&lake, &for_rows, &responses)).await?;

@@ -2,7 +2,7 @@
 
 use std::collections::HashMap;
 
-use echolake_dsp::chain::{DerivationPlan, Derived, FlatEnergies};
+use echolake_dsp::chain::{DerivationPlan, DerivedResponse, FlatEnergies};
 use echolake_schema::Rig;
 
 /// Mean impulse response of each pair of a reference.
@@ -56,7 +56,7 @@ impl DerivedRows {
     }
 
     /// Appends the values of one measurement.
-    pub(crate) fn push(&mut self, pair: u32, derived: &Derived<f32>) {
+    pub(crate) fn push(&mut self, pair: u32, derived: &DerivedResponse<f32>) {
         self.pairs.push(pair);
         self.reflected.extend_from_slice(&derived.reflected);
         let length = derived.reflected.len();

@@ -4,7 +4,7 @@ use std::collections::BTreeSet;
 use std::sync::Arc;
 
 use arrow::record_batch::RecordBatch;
-use echolake_lake::{DataFile, FileName, Lake, Snapshot};
+use echolake_lake::{DataFile, FileName, Lake, LakeSnapshot};
 use echolake_recording::{DecodedChunk, ResyncItem, ResyncReader};
 use echolake_schema::tables::Table;
 use futures::TryStreamExt as _;
@@ -138,7 +138,7 @@ async fn check_table_file(lake: &Lake, table: Table, file: &DataFile) -> Result<
     Err(Error::DataFile { file: file.path.to_string(), reason })
 }
 
-async fn check_run(lake: &Lake, snapshot: &Arc<Snapshot>, row: &RecordBatch, report: &mut Report) -> Result<()> {
+async fn check_run(lake: &Lake, snapshot: &Arc<LakeSnapshot>, row: &RecordBatch, report: &mut Report) -> Result<()> {
     let text = |column| text_of(row, column).unwrap_or_default();
     let (run, path, state) = (text("run_id"), text("file"), text("state"));
     for finding in check_run_file(lake, &Path::from(path.as_str()), &text("file_sha256"), report).await? {
@@ -194,7 +194,7 @@ async fn check_run_file(lake: &Lake, path: &Path, sha256: &str, report: &mut Rep
 }
 
 // Files that no row names: not yet ingested, refused, or left behind by a crash.
-async fn find_strays(lake: &Lake, snapshot: &Snapshot, report: &mut Report) -> Result<()> {
+async fn find_strays(lake: &Lake, snapshot: &LakeSnapshot, report: &mut Report) -> Result<()> {
     let named: BTreeSet<Path> = Table::ALL
         .iter()
         .flat_map(|t| snapshot.files(*t).iter().chain(snapshot.superseded(*t)))

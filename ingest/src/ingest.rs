@@ -4,7 +4,7 @@ use std::collections::BTreeSet;
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
-use echolake_lake::{Committed, EncodedFile, Lake, VisibleRun, encode};
+use echolake_lake::{CommitOutcome, EncodedFile, Lake, VisibleRun, encode};
 use echolake_schema::tables::Table;
 use echolake_schema::{RunId, SurfaceId};
 use object_store::path::Path;
@@ -134,7 +134,7 @@ impl<'a> Ingest<'a> {
         let mut refused = Vec::new();
         let ended = &mut |(source, done): pipeline::Ended<Source, Taken>| match done {
             Ok((taken, outcome)) => {
-                let outcome = Outcome::from(outcome == Some(Committed::Now));
+                let outcome = Outcome::from(outcome == Some(CommitOutcome::Now));
                 report(Report::Taken(Taken { outcome, ..taken }));
                 Ok(())
             }

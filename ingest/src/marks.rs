@@ -121,7 +121,7 @@ fn mark_path(lake: &Lake, source: &Source) -> Option<PathBuf> {
 
 #[cfg(test)]
 mod tests {
-    use echolake_lake::References;
+    use echolake_lake::ReferenceSurfaces;
     use echolake_schema::Rig;
     use object_store::ObjectStoreExt as _;
     use object_store::path::Path as ObjectPath;
@@ -132,7 +132,7 @@ mod tests {
     async fn only_a_file_by_which_two_processes_ended_is_refused() {
         let folder = tempfile::tempdir().expect("a folder");
         let url = folder.path().join("lake").display().to_string();
-        let lake = Lake::open_or_create(&url, &Rig::paper(), &References::default()).await.expect("a lake");
+        let lake = Lake::open_or_create(&url, &Rig::paper(), &ReferenceSurfaces::default()).await.expect("a lake");
         // Too long for the name of the reason's file.
         let name = format!("{}.mcap", "a".repeat(240));
         let source = Source::Lake(ObjectPath::from(format!("inbox/{name}")));

@@ -10,7 +10,7 @@ use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
-use echolake_lake::{Committed, Lake, Staged};
+use echolake_lake::{CommitOutcome, Lake, StagedFile};
 use rayon::{ThreadPool, ThreadPoolBuilder};
 use tokio::sync::{mpsc, oneshot};
 use tokio::task::JoinSet;
@@ -49,12 +49,12 @@ impl Drop for Busy {
 /// A finished job, ready for the commit.
 pub(crate) struct Ready<R> {
     /// Files in the store; the last one decides the job's outcome.
-    pub(crate) staged: Vec<Staged>,
+    pub(crate) staged: Vec<StagedFile>,
     pub(crate) report: R,
 }
 
 /// A job with its result: its report, and the outcome of its last file (None if it had no files).
-pub(crate) type Ended<J, R> = (J, Result<(R, Option<Committed>)>);
+pub(crate) type Ended<J, R> = (J, Result<(R, Option<CommitOutcome>)>);
 
 impl Cores {
     pub(crate) fn all() -> Result<Self> {

@@ -4,7 +4,7 @@ use arrow::array::{Array as _, AsArray as _};
 use arrow::compute::concat_batches;
 use arrow::datatypes::{Float32Type, Int32Type};
 use arrow::record_batch::RecordBatch;
-use echolake_lake::{DataFile, Lake, Snapshot};
+use echolake_lake::{DataFile, Lake, LakeSnapshot};
 use echolake_schema::RunId;
 use echolake_schema::tables::Table;
 use futures::TryStreamExt as _;
@@ -16,7 +16,7 @@ use crate::derived_values::Responses;
 use crate::error::{Error, Result};
 
 /// Reads a run's impulse responses from `measurements`.
-pub(crate) async fn responses(lake: &Lake, snapshot: &Snapshot, run: &RunId) -> Result<Responses> {
+pub(crate) async fn responses(lake: &Lake, snapshot: &LakeSnapshot, run: &RunId) -> Result<Responses> {
     let mut out = Responses::default();
     let files: Vec<_> = snapshot.files_of(Table::Measurements, run).cloned().collect();
     for file in files {

@@ -3,7 +3,7 @@
 use std::collections::{BTreeSet, HashMap};
 use std::sync::Arc;
 
-use echolake_lake::{DataFile, FileName, Lake, References, Snapshot};
+use echolake_lake::{DataFile, FileName, Lake, LakeSnapshot, ReferenceSurfaces};
 use echolake_schema::tables::Table;
 use echolake_schema::{Rig, SurfaceId, SurfaceRecord};
 use sha2::{Digest as _, Sha256};
@@ -20,7 +20,7 @@ const VERSION_DIGITS: usize = 12;
 /// Finds references in one snapshot, and caches their responses.
 pub(crate) struct Finder {
     lake: Lake,
-    snapshot: Arc<Snapshot>,
+    snapshot: Arc<LakeSnapshot>,
     /// The references that each surface's row names.
     names: HashMap<SurfaceId, Names>,
     versions: HashMap<SurfaceId, String>,
@@ -41,7 +41,7 @@ pub(crate) struct Names {
 
 impl Names {
     /// Returns the names that a run's surface gives, else the lake's.
-    pub(crate) fn of(surface: &SurfaceRecord, references: &References) -> Self {
+    pub(crate) fn of(surface: &SurfaceRecord, references: &ReferenceSurfaces) -> Self {
         Self {
             flat: surface.flat_reference.clone().unwrap_or_else(|| references.flat.clone()),
             foam: surface.foam_reference.clone().unwrap_or_else(|| references.foam.clone()),
@@ -67,7 +67,7 @@ pub(crate) struct Found {
 }
 
 impl Finder {
-    pub(crate) fn new(lake: &Lake, snapshot: Arc<Snapshot>) -> Self {
+    pub(crate) fn new(lake: &Lake, snapshot: Arc<LakeSnapshot>) -> Self {
         let mut runs: HashMap<_, Vec<_>> = HashMap::new();
         for run in snapshot.runs() {
             runs.entry(run.surface.clone()).or_default().push(format!("{}.{}", run.run, run.run_derivation));
@@ -83,7 +83,7 @@ impl Finder {
         Self { lake: lake.clone(), snapshot, names, versions, means: HashMap::new(), flats: HashMap::new() }
     }
 
-    pub(crate) fn shared(lake: &Lake, snapshot: Arc<Snapshot>) -> SharedFinder {
+    pub(crate) fn shared(lake: &Lake, snapshot: Arc<LakeSnapshot>) -> SharedFinder {
         Arc::new(Mutex::new(Self::new(lake, snapshot)))
     }
 
@@ -148,7 +148,7 @@ impl Finder {
 }
 
 // The names in a surface's row, taken from its file's statistics.
-fn names(file: &DataFile, references: &References) -> Option<(SurfaceId, Names)> {
+fn names(file: &DataFile, references: &ReferenceSurfaces) -> Option<(SurfaceId, Names)> {
     let Some(FileName::Rows { surface, .. }) = FileName::parse(&file.path) else { return None };
     let text = |column: &str| file.stats.as_ref()?.min.get(column)?.as_str()?.parse().ok();
     let names = Names {

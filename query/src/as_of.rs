@@ -16,7 +16,7 @@ use datafusion::sql::sqlparser::ast::{
 };
 use datafusion::sql::sqlparser::dialect::GenericDialect;
 use datafusion::sql::sqlparser::tokenizer::{Location, Token, TokenWithSpan, Tokenizer};
-use echolake_lake::Moment;
+use echolake_lake::LakeMoment;
 
 use crate::Error;
 
@@ -43,7 +43,7 @@ impl Past {
     ///
     /// # Errors
     /// [`Error::Query`] if it is neither a version nor a time.
-    pub(crate) fn moment(&self) -> Result<Moment, Error> {
+    pub(crate) fn moment(&self) -> Result<LakeMoment, Error> {
         self.at.parse().map_err(|_| Error::Query {
             message: format!("`{}` is neither a version nor a time", self.at),
             place: None,

@@ -17,7 +17,7 @@ use datafusion::error::DataFusionError;
 use datafusion::optimizer::OptimizerRule;
 use datafusion::prelude::SessionContext;
 use datafusion::sql::parser::Statement;
-use echolake_lake::{DataFile, Lake, Moment, Snapshot, VisibleRun};
+use echolake_lake::{DataFile, Lake, LakeMoment, LakeSnapshot, VisibleRun};
 use echolake_schema::tables::Table;
 
 use crate::as_of::{self, Past};
@@ -46,11 +46,11 @@ pub(crate) struct Catalog {
 }
 
 /// A table as it was at a moment.
-type PastTable = ((Moment, Table), Arc<LakeTable>);
+type PastTable = ((LakeMoment, Table), Arc<LakeTable>);
 
 /// One snapshot of the lake with its tables and views.
 struct Current {
-    snapshot: Arc<Snapshot>,
+    snapshot: Arc<LakeSnapshot>,
     tables: HashMap<Table, Arc<LakeTable>>,
     providers: Vec<(&'static str, Arc<dyn TableProvider>)>,
     looked: Mutex<Instant>,
@@ -105,7 +105,7 @@ impl Catalog {
     ///
     /// # Errors
     /// [`Error::Lake`] if the lake cannot be read.
-    pub(crate) async fn snapshot(&self) -> Result<Arc<Snapshot>, Error> {
+    pub(crate) async fn snapshot(&self) -> Result<Arc<LakeSnapshot>, Error> {
         Ok(self.current().await?.snapshot.clone())
     }
 
@@ -219,7 +219,7 @@ impl Catalog {
         Ok(Arc::new(view.over(&self.lake, &self.lookups, &beneath).map_err(failed)?))
     }
 
-    async fn table_at(&self, moment: Moment, table: Table) -> Result<Arc<LakeTable>, Error> {
+    async fn table_at(&self, moment: LakeMoment, table: Table) -> Result<Arc<LakeTable>, Error> {
         let kept = |past: &[PastTable]| {
             past.iter().find(|(key, _)| *key == (moment, table)).map(|(_, provider)| provider.clone())
         };
@@ -229,7 +229,7 @@ impl Catalog {
         let snapshot = self.lake.snapshot_at(moment, table).await?;
         let provider = self.table(table, snapshot.files(table))?;
         // Only versions are cached: the result for a time may still change.
-        if matches!(moment, Moment::Version(_)) {
+        if matches!(moment, LakeMoment::Version(_)) {
             let mut past = self.past.lock().unwrap_or_else(PoisonError::into_inner);
             if past.len() >= PAST_KEPT {
                 past.remove(0);

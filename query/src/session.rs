@@ -15,7 +15,7 @@ use datafusion::physical_plan::{ExecutionPlan, execute_stream};
 use datafusion::prelude::SessionContext;
 use datafusion::sql::parser::Statement;
 use datafusion::sql::sqlparser::dialect::GenericDialect;
-use echolake_lake::{Lake, Snapshot, VisibleRun};
+use echolake_lake::{Lake, LakeSnapshot, VisibleRun};
 use futures::StreamExt as _;
 use tokio::sync::mpsc;
 use tokio::task::JoinHandle;
@@ -280,7 +280,7 @@ impl Session {
     ///
     /// # Errors
     /// [`Error::Lake`] if the lake cannot be read.
-    pub async fn snapshot(&self) -> Result<Arc<Snapshot>, Error> {
+    pub async fn snapshot(&self) -> Result<Arc<LakeSnapshot>, Error> {
         self.engine.catalog().snapshot().await
     }
 

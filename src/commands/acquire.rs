@@ -16,7 +16,7 @@ use echolake_acquisition::metrics::{InfluxPush, MetricsServer, PushTarget, RunMe
 use echolake_acquisition::recorder::{Held, partial_of, random_tag};
 use echolake_acquisition::run::{self, PanelSpecimen, RunRequest};
 use echolake_acquisition::session::{MeasuredRun, PreflightMode, RunSession, TakePace};
-use echolake_lake::{Lake, References};
+use echolake_lake::{Lake, ReferenceSurfaces};
 use echolake_schema::{Rig, SurfaceId, Timestamp};
 
 use crate::CommandOutcome;
@@ -135,7 +135,7 @@ async fn fresh(args: &AcquireArgs, lake_url: &str, progress: &CommandProgress) -
     if let PanelSpecimen::Mesh(path, side) = &specimen {
         Mesh::read(path)?.seen_from(*side).check(rig.panel.size_mm, rig.panel.depth_mm, path)?;
     }
-    let lake = Lake::open_or_create(lake_url, &rig, &References::default()).await?;
+    let lake = Lake::open_or_create(lake_url, &rig, &ReferenceSurfaces::default()).await?;
     let folder = super::inbox(&lake)?;
     let surface = args.surface.clone().context("no surface is named; hint: --surface NAME")?;
     #[cfg(feature = "lake")]

@@ -9,7 +9,7 @@ use echolake_acquisition::collection::{CollectionSurface, collection};
 use echolake_acquisition::controller::RecordingMode;
 use echolake_acquisition::relief::PanelRelief;
 use echolake_ingest::pending;
-use echolake_lake::{Lake, References};
+use echolake_lake::{Lake, ReferenceSurfaces};
 use echolake_query::Session;
 use echolake_schema::Rig;
 
@@ -34,7 +34,7 @@ pub(crate) async fn run(args: &DemoArgs, lake_url: &str) -> anyhow::Result<Comma
         None => few_surfaces()?,
     };
     let rig = rig(args.rig.as_deref(), lake_url).await?;
-    let lake = Lake::open_or_create(lake_url, &rig, &References::default()).await?;
+    let lake = Lake::open_or_create(lake_url, &rig, &ReferenceSurfaces::default()).await?;
     let progress = CommandProgress::new();
     progress.say("simulated rig: nothing here is measured");
     let campaign = DemoCampaign {

@@ -4,7 +4,7 @@ use echolake_acquisition::import::{
     Error, GIR_IR_LEN, ImportOptions, ImportedRun, check_sofa, check_wav, import_gir, import_sofa, import_wav,
     sampling_rate_of,
 };
-use echolake_lake::{Lake, References};
+use echolake_lake::{Lake, ReferenceSurfaces};
 use echolake_schema::{Celsius, Rig, Timestamp};
 
 use crate::CommandOutcome;
@@ -48,7 +48,7 @@ pub(crate) async fn run(args: &ImportCommand, lake_url: &str) -> anyhow::Result<
             ImportCommand::Gir { .. } => {}
         }
     }
-    let lake = Lake::open_or_create(lake_url, &rig, &References::default()).await?;
+    let lake = Lake::open_or_create(lake_url, &rig, &ReferenceSurfaces::default()).await?;
     let folder = super::inbox(&lake)?;
     let progress = CommandProgress::new();
     let mut task = None;

@@ -1,6 +1,6 @@
 //! `echolake optimize`: small files of a table become large ones.
 
-use echolake_lake::{Lake, TableOptimized};
+use echolake_lake::{Lake, TableOptimizeReport};
 
 use crate::CommandOutcome;
 use crate::cli::OptimizeArgs;
@@ -33,9 +33,9 @@ pub(crate) async fn run(args: &OptimizeArgs, lake_url: &str) -> anyhow::Result<C
     Ok(CommandOutcome::Whole)
 }
 
-fn text(tables: &[TableOptimized]) -> String {
+fn text(tables: &[TableOptimizeReport]) -> String {
     let head = format!("{:<14} {:>7} {:>10} {:>7} {:>10}", "table", "merged", "size", "into", "size");
-    let line = |t: &TableOptimized| {
+    let line = |t: &TableOptimizeReport| {
         let (before, after) = (super::size(t.bytes_before), super::size(t.bytes_after));
         let outdated = match t.outdated {
             0 => String::new(),

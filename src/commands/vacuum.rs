@@ -1,7 +1,7 @@
 //! `echolake vacuum`: files that are in no table any more are deleted.
 
 use chrono::TimeDelta;
-use echolake_lake::{Deletion, Lake};
+use echolake_lake::{DeletionMode, Lake};
 
 use crate::CommandOutcome;
 use crate::cli::VacuumArgs;
@@ -9,7 +9,7 @@ use crate::progress::CommandProgress;
 
 pub(crate) async fn run(args: &VacuumArgs, lake_url: &str) -> anyhow::Result<CommandOutcome> {
     let lake = Lake::open(lake_url).await?;
-    let deletion = if args.dry_run { Deletion::Pretended } else { Deletion::Real };
+    let deletion = if args.dry_run { DeletionMode::Pretended } else { DeletionMode::Real };
     let progress = CommandProgress::new();
     let mut task = None;
     let report = lake

@@ -15,22 +15,22 @@ pub struct LakeConfig {
     /// The lake's format.
     pub format: u32,
     /// References of surfaces that name none of their own.
-    pub references: References,
+    pub references: ReferenceSurfaces,
     /// The rig that all of its runs share.
     pub rig: Rig,
 }
 
 /// The surfaces that normalise, and whose direct sound is subtracted.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct References {
+#[serde(deny_unknown_fields, rename = "References")]
+pub struct ReferenceSurfaces {
     /// The surface that normalises.
     pub flat: SurfaceId,
     /// The surface whose response is the direct sound.
     pub foam: SurfaceId,
 }
 
-impl Default for References {
+impl Default for ReferenceSurfaces {
     #[allow(clippy::expect_used, reason = "two constants, checked by the test below")]
     fn default() -> Self {
         Self { flat: "flat".parse().expect("a valid id"), foam: "foam".parse().expect("a valid id") }
@@ -69,7 +69,7 @@ mod tests {
 
     #[test]
     fn config_round_trips() {
-        let config = LakeConfig { format: LAKE_FORMAT, references: References::default(), rig: Rig::paper() };
+        let config = LakeConfig { format: LAKE_FORMAT, references: ReferenceSurfaces::default(), rig: Rig::paper() };
         let text = config.to_toml().expect("text");
         assert_eq!(LakeConfig::from_toml(&text, "x").expect("the same"), config);
     }

@@ -7,10 +7,10 @@ use echolake_schema::{Grid, Rig, RunId, SurfaceId};
 use object_store::path::Path;
 use object_store::{ObjectStore, ObjectStoreExt as _, PutMode};
 
-use crate::location::Location;
+use crate::location::LakeLocation;
 #[cfg(feature = "tables")]
 use crate::tables::delta::DeltaLog;
-use crate::{Error, LAKE_FORMAT, LakeConfig, References, Result};
+use crate::{Error, LAKE_FORMAT, LakeConfig, ReferenceSurfaces, Result};
 
 /// A lake. Cheap to clone.
 #[derive(Debug, Clone)]
@@ -18,7 +18,7 @@ pub struct Lake(Arc<OpenLake>);
 
 #[derive(Debug)]
 struct OpenLake {
-    location: Location,
+    location: LakeLocation,
     config: LakeConfig,
     grid: Grid,
     #[cfg(feature = "tables")]
@@ -33,7 +33,7 @@ impl Lake {
     /// # Errors
     /// [`Error::NoLake`], [`Error::Newer`], [`Error::Config`], or what the store says.
     pub async fn open(url: &str) -> Result<Self> {
-        let location = Location::parse(url)?;
+        let location = LakeLocation::parse(url)?;
         match read_config(&location).await? {
             Some(config) => Self::assemble(location, config),
             None => Err(Error::NoLake { location: location.text }),
@@ -46,8 +46,8 @@ impl Lake {
     /// # Errors
     /// As [`Lake::open`]; [`Error::OtherRig`] if the lake exists and was made for another rig, and
     /// [`Error::Occupied`] if other files do.
-    pub async fn open_or_create(url: &str, rig: &Rig, references: &References) -> Result<Self> {
-        Self::open_or_create_at(Location::parse(url)?, rig, references).await
+    pub async fn open_or_create(url: &str, rig: &Rig, references: &ReferenceSurfaces) -> Result<Self> {
+        Self::open_or_create_at(LakeLocation::parse(url)?, rig, references).await
     }
 
     /// The same in a store that holds nothing but the lake; `name` is what messages call it.
@@ -58,12 +58,12 @@ impl Lake {
         store: Arc<dyn ObjectStore>,
         name: &str,
         rig: &Rig,
-        references: &References,
+        references: &ReferenceSurfaces,
     ) -> Result<Self> {
-        Self::open_or_create_at(Location::store(name, store), rig, references).await
+        Self::open_or_create_at(LakeLocation::store(name, store), rig, references).await
     }
 
-    async fn open_or_create_at(location: Location, rig: &Rig, references: &References) -> Result<Self> {
+    async fn open_or_create_at(location: LakeLocation, rig: &Rig, references: &ReferenceSurfaces) -> Result<Self> {
         rig.check()?;
         let config = match read_config(&location).await? {
             Some(config) => config,
@@ -77,7 +77,7 @@ impl Lake {
         Ok(lake)
     }
 
-    fn assemble(location: Location, config: LakeConfig) -> Result<Self> {
+    fn assemble(location: LakeLocation, config: LakeConfig) -> Result<Self> {
         let grid = config.rig.grid()?;
         #[cfg(feature = "tables")]
         let log = DeltaLog::new(location.store.clone(), config.rig.clone());
@@ -150,7 +150,7 @@ impl Lake {
     }
 }
 
-async fn read_config(location: &Location) -> Result<Option<LakeConfig>> {
+async fn read_config(location: &LakeLocation) -> Result<Option<LakeConfig>> {
     let path = Path::from(CONFIG);
     let failed = |e| Error::store("read", format!("{}/{CONFIG}", location.text), e);
     let bytes = match location.store.get(&path).await {
@@ -163,7 +163,7 @@ async fn read_config(location: &Location) -> Result<Option<LakeConfig>> {
     LakeConfig::from_toml(text, &location.text).map(Some)
 }
 
-async fn create_config(location: &Location, rig: &Rig, references: &References) -> Result<LakeConfig> {
+async fn create_config(location: &LakeLocation, rig: &Rig, references: &ReferenceSurfaces) -> Result<LakeConfig> {
     let failed = |e| Error::store("write", format!("{}/{CONFIG}", location.text), e);
     let there = location.store.list_with_delimiter(None).await.map_err(failed)?;
     let ours = |p: &Path| p.filename().is_some_and(|n| matches!(n, "runs" | "inbox" | "quarantine" | "tables"));
@@ -189,7 +189,7 @@ mod tests {
     use super::*;
 
     async fn paper(url: &str) -> Result<Lake> {
-        Lake::open_or_create(url, &Rig::paper(), &References::default()).await
+        Lake::open_or_create(url, &Rig::paper(), &ReferenceSurfaces::default()).await
     }
 
     fn url(folder: &tempfile::TempDir) -> String {
@@ -216,7 +216,8 @@ mod tests {
         paper(&url(&folder)).await.expect("made");
         let mut other = Rig::paper();
         other.impulse_response.length = 400;
-        let error = Lake::open_or_create(&url(&folder), &other, &References::default()).await.expect_err("differs");
+        let error =
+            Lake::open_or_create(&url(&folder), &other, &ReferenceSurfaces::default()).await.expect_err("differs");
         assert!(error.to_string().contains("`impulse_response.length` is 400, the lake's is 384"), "{error}");
     }
 

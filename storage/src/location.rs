@@ -14,7 +14,7 @@ use crate::{Error, Result};
 
 /// A lake's location, opened.
 #[derive(Debug)]
-pub(crate) struct Location {
+pub(crate) struct LakeLocation {
     /// As the user wrote it.
     pub(crate) text: String,
     /// The folder, if it is one.
@@ -23,7 +23,7 @@ pub(crate) struct Location {
     pub(crate) store: Arc<dyn ObjectStore>,
 }
 
-impl Location {
+impl LakeLocation {
     pub(crate) fn parse(text: &str) -> Result<Self> {
         let wrong = |reason: &str| Error::Location { location: text.to_owned(), reason: reason.to_owned() };
         if text.trim().is_empty() {
@@ -64,7 +64,7 @@ mod tests {
     #[test]
     fn nonsense_is_refused_with_a_hint() {
         for bad in ["", "s3://bucket/lake", "http://host/lake", "://", "/dev/null"] {
-            let error = Location::parse(bad).expect_err(bad).to_string();
+            let error = LakeLocation::parse(bad).expect_err(bad).to_string();
             assert!(error.contains("hint"), "{error}");
         }
     }
@@ -72,9 +72,9 @@ mod tests {
     #[test]
     fn folders_and_file_urls_are_the_same() {
         let folder = tempfile::tempdir().expect("a folder");
-        let plain = Location::parse(&folder.path().display().to_string()).expect("a folder");
+        let plain = LakeLocation::parse(&folder.path().display().to_string()).expect("a folder");
         let url = Url::from_directory_path(folder.path()).expect("its URL");
-        let url = Location::parse(url.as_str()).expect("a folder");
+        let url = LakeLocation::parse(url.as_str()).expect("a folder");
         assert_eq!(plain.folder, url.folder);
     }
 }

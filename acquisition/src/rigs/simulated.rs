@@ -7,7 +7,7 @@
 use std::f64::consts::{PI, TAU};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
-use echolake_dsp::Real as _;
+use echolake_dsp::RealSample as _;
 use echolake_dsp::deconvolution::fast_length;
 use echolake_dsp::kirchhoff::{KirchhoffPlan, KirchhoffScratch};
 use echolake_dsp::temperature::speed_of_sound;

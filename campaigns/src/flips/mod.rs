@@ -9,7 +9,7 @@ use std::io::Write as _;
 use std::time::Instant;
 
 use anyhow::{Result, ensure};
-use campaign::{Settings, Summary, Tally};
+use campaign::{FlipSettings, FlipSummary, OutcomeTally};
 
 #[derive(Debug, clap::Args)]
 pub(crate) struct FlipsArgs {
@@ -28,7 +28,7 @@ pub(crate) async fn run(args: &FlipsArgs) -> Result<()> {
     let FlipsArgs { count, seed, first } = *args;
     let begun = Instant::now();
     let mut before = None;
-    let summary = campaign::run(Settings { count, seed, first }, &mut |_| {
+    let summary = campaign::run(FlipSettings { count, seed, first }, &mut |_| {
         before.get_or_insert_with(memory);
     })
     .await?;
@@ -43,7 +43,7 @@ pub(crate) async fn run(args: &FlipsArgs) -> Result<()> {
     Ok(())
 }
 
-fn print(summary: &Summary, out: &mut impl std::io::Write) -> Result<()> {
+fn print(summary: &FlipSummary, out: &mut impl std::io::Write) -> Result<()> {
     for (name, bytes, chunks, measurements) in &summary.specimens {
         writeln!(out, "specimen `{name}`: {bytes} bytes, {chunks} chunks, {measurements} measurements")?;
     }
@@ -52,7 +52,7 @@ fn print(summary: &Summary, out: &mut impl std::io::Write) -> Result<()> {
         "{:<20} {:>7} {:>9} {:>9} {:>8} {:>9} {:>9} {:>10} {:>8} {:>9}",
         "kind", "rounds", "complete", "partial", "refused", "kept", "reported", "undefined", "unnamed", "unnoticed"
     )?;
-    let mut all = Tally::default();
+    let mut all = OutcomeTally::default();
     for (kind, tally) in &summary.by_kind {
         row(kind, tally, out)?;
         all = sum(all, *tally);
@@ -64,7 +64,7 @@ fn print(summary: &Summary, out: &mut impl std::io::Write) -> Result<()> {
     Ok(())
 }
 
-fn row(kind: &str, t: &Tally, out: &mut impl std::io::Write) -> Result<()> {
+fn row(kind: &str, t: &OutcomeTally, out: &mut impl std::io::Write) -> Result<()> {
     writeln!(
         out,
         "{kind:<20} {:>7} {:>9} {:>9} {:>8} {:>9} {:>9} {:>10} {:>8} {:>9}",
@@ -73,8 +73,8 @@ fn row(kind: &str, t: &Tally, out: &mut impl std::io::Write) -> Result<()> {
     Ok(())
 }
 
-fn sum(a: Tally, b: Tally) -> Tally {
-    Tally {
+fn sum(a: OutcomeTally, b: OutcomeTally) -> OutcomeTally {
+    OutcomeTally {
         rounds: a.rounds + b.rounds,
         complete: a.complete + b.complete,
         partial: a.partial + b.partial,

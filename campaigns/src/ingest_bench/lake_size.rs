@@ -7,11 +7,11 @@ use echolake_schema::tables::Table;
 use parquet::basic::Type;
 use parquet::file::metadata::{ParquetMetaData, ParquetMetaDataReader};
 
-use super::parquet_files::{Stored, raw_bytes};
-use super::report::{Goal, Report};
-use super::simulated::Ingested;
+use super::parquet_files::{StoredTableFile, raw_bytes};
+use super::report::{FigureGoal, FigureReport};
+use super::simulated::IngestedLake;
 
-pub(crate) fn measure(ingested: &Ingested, files: &[Stored], report: &mut Report) -> Result<()> {
+pub(crate) fn measure(ingested: &IngestedLake, files: &[StoredTableFile], report: &mut FigureReport) -> Result<()> {
     report.title("Size of tables/, logs included, against the same numbers as raw f32 and f64")?;
     report.line(&format!("{:<14} {:>9} {:>12} {:>12} {:>8}", "table", "rows", "bytes a row", "raw a row", "ratio"))?;
     let (mut all_raw, mut all_arrays) = (0, 0);
@@ -45,10 +45,10 @@ pub(crate) fn measure(ingested: &Ingested, files: &[Stored], report: &mut Report
         "tables/ / its arrays and other numbers, raw",
         100.0 * tables / all_raw as f64,
         "%",
-        Goal::AtMost(80.0),
+        FigureGoal::AtMost(80.0),
     )?;
     let panels = 100.0 * panels_bytes as f64 / panels_raw as f64;
-    report.goal("the same of the runs that are no references", panels, "%", Goal::AtMost(80.0))?;
+    report.goal("the same of the runs that are no references", panels, "%", FigureGoal::AtMost(80.0))?;
     report.figure("tables/ / its f32 arrays alone, raw", 100.0 * tables / all_arrays as f64, "%")
 }
 

@@ -10,20 +10,25 @@ use parquet::file::metadata::{PageIndexPolicy, ParquetMetaDataReader};
 use parquet::file::properties::WriterPropertiesBuilder;
 
 use super::IngestBenchArgs;
-use super::parquet_files::{LEVEL, Numbers, PAGE_BYTES, Rows, Stored, builder_as, read_all, zstd};
-use super::report::Report;
+use super::parquet_files::{FileRows, LEVEL, NumberEncoding, PAGE_BYTES, StoredTableFile, builder_as, read_all, zstd};
+use super::report::FigureReport;
 
 /// Page sizes that are compared.
 const PAGES: [usize; 4] = [64 << 10, 128 << 10, 256 << 10, 1 << 20];
 
 /// One way to write a file.
-struct Layout {
+struct FileLayout {
     name: &'static str,
-    numbers: Numbers,
+    numbers: NumberEncoding,
     compression: Compression,
 }
 
-pub(crate) fn measure(args: &IngestBenchArgs, files: &[Stored], rows: &[Rows], report: &mut Report) -> Result<()> {
+pub(crate) fn measure(
+    args: &IngestBenchArgs,
+    files: &[StoredTableFile],
+    rows: &[FileRows],
+    report: &mut FigureReport,
+) -> Result<()> {
     for table in [Table::Measurements, Table::Nce] {
         // Much of what is derived of the references is zero.
         let file = files.iter().rfind(|f| f.table == table && !f.of_reference).context("no file of a table")?;
@@ -40,19 +45,19 @@ pub(crate) fn measure(args: &IngestBenchArgs, files: &[Stored], rows: &[Rows], r
     Ok(())
 }
 
-fn layouts(args: &IngestBenchArgs, file: &Bytes, rows: &Rows, report: &mut Report) -> Result<()> {
-    let layout = |name, numbers, compression| Layout { name, numbers, compression };
+fn layouts(args: &IngestBenchArgs, file: &Bytes, rows: &FileRows, report: &mut FigureReport) -> Result<()> {
+    let layout = |name, numbers, compression| FileLayout { name, numbers, compression };
     let metadata = ParquetMetaDataReader::new().parse_and_finish(file)?;
     let candidates = [
-        layout("as stored: byte stream split, zstd 1", Numbers::AsStored, zstd(LEVEL)),
-        layout("byte stream split, zstd 3", Numbers::AsStored, zstd(3)),
-        layout("byte stream split, snappy", Numbers::AsStored, Compression::SNAPPY),
-        layout("byte stream split, uncompressed", Numbers::AsStored, Compression::UNCOMPRESSED),
-        layout("plain, zstd 1", Numbers::Plain, zstd(LEVEL)),
-        layout("dictionary, zstd 1", Numbers::Dictionary, zstd(LEVEL)),
+        layout("as stored: byte stream split, zstd 1", NumberEncoding::AsStored, zstd(LEVEL)),
+        layout("byte stream split, zstd 3", NumberEncoding::AsStored, zstd(3)),
+        layout("byte stream split, snappy", NumberEncoding::AsStored, Compression::SNAPPY),
+        layout("byte stream split, uncompressed", NumberEncoding::AsStored, Compression::UNCOMPRESSED),
+        layout("plain, zstd 1", NumberEncoding::Plain, zstd(LEVEL)),
+        layout("dictionary, zstd 1", NumberEncoding::Dictionary, zstd(LEVEL)),
     ];
     report.line(&format!("{:<40} {:>10} {:>12} {:>12}", "layout", "of raw", "write MB/s", "read MB/s"))?;
-    for Layout { name, numbers, compression } in candidates {
+    for FileLayout { name, numbers, compression } in candidates {
         let properties = builder_as(&metadata, numbers).set_data_page_size_limit(PAGE_BYTES);
         let properties = properties.set_compression(compression).build();
         let (mut size, mut write, mut read) = (0, f64::INFINITY, f64::INFINITY);
@@ -75,12 +80,12 @@ fn layouts(args: &IngestBenchArgs, file: &Bytes, rows: &Rows, report: &mut Repor
 }
 
 // What a reader that knows the file's indices fetches for one row of its first list column.
-fn pages(file: &Bytes, rows: &Rows, report: &mut Report) -> Result<()> {
+fn pages(file: &Bytes, rows: &FileRows, report: &mut FigureReport) -> Result<()> {
     let metadata = ParquetMetaDataReader::new().parse_and_finish(file)?;
     report.line(&format!("{:<40} {:>10} {:>12} {:>12}", "page size", "of raw", "row fetched", "page index"))?;
     for bytes in PAGES {
         let limit = |builder: WriterPropertiesBuilder| builder.set_data_page_size_limit(bytes).build();
-        let written = Bytes::from(rows.write(&limit(builder_as(&metadata, Numbers::AsStored)))?);
+        let written = Bytes::from(rows.write(&limit(builder_as(&metadata, NumberEncoding::AsStored)))?);
         let (page, index) = point_lookup(&written)?;
         let ratio = 100.0 * written.len() as f64 / rows.raw as f64;
         let name = format!("{} KiB", bytes >> 10);

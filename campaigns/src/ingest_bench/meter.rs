@@ -9,19 +9,19 @@ const TICKS: f64 = 100.0;
 
 /// Seconds that something took.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(crate) struct Cost {
+pub(crate) struct MeasuredCost {
     /// CPU time of all threads, user and system.
     pub(crate) cpu: f64,
     pub(crate) wall: f64,
 }
 
 /// A clock that runs.
-pub(crate) struct Meter {
+pub(crate) struct CostMeter {
     cpu: f64,
     wall: Instant,
 }
 
-impl Cost {
+impl MeasuredCost {
     pub(crate) const NONE: Self = Self { cpu: f64::INFINITY, wall: f64::INFINITY };
 
     pub(crate) fn plus(self, other: Self) -> Self {
@@ -34,13 +34,13 @@ impl Cost {
     }
 }
 
-impl Meter {
+impl CostMeter {
     pub(crate) fn start() -> Result<Self> {
         Ok(Self { cpu: process_cpu()?, wall: Instant::now() })
     }
 
-    pub(crate) fn stop(self) -> Result<Cost> {
-        Ok(Cost { cpu: process_cpu()? - self.cpu, wall: self.wall.elapsed().as_secs_f64() })
+    pub(crate) fn stop(self) -> Result<MeasuredCost> {
+        Ok(MeasuredCost { cpu: process_cpu()? - self.cpu, wall: self.wall.elapsed().as_secs_f64() })
     }
 }
 

@@ -16,7 +16,7 @@ mod sweeps;
 use std::path::PathBuf;
 
 use anyhow::Result;
-use report::Report;
+use report::FigureReport;
 use simulated::REFERENCES;
 
 #[derive(Debug, clap::Args)]
@@ -66,7 +66,7 @@ pub(crate) fn run(args: &IngestBenchArgs) -> Result<()> {
         Some(parent) => tempfile::tempdir_in(parent)?,
         None => tempfile::tempdir()?,
     };
-    let mut report = Report::new();
+    let mut report = FigureReport::new();
     super::block_on(async {
         sweeps::measure(args, folder.path(), &mut report).await?;
         responses::measure(args, folder.path(), &mut report).await

@@ -22,7 +22,7 @@ pub(crate) const PAGE_BYTES: usize = 128 * 1024;
 const BATCH_ROWS: usize = 512;
 
 /// A file that ingest wrote.
-pub(crate) struct Stored {
+pub(crate) struct StoredTableFile {
     pub(crate) table: Table,
     /// It is of a reference's run.
     pub(crate) of_reference: bool,
@@ -30,7 +30,7 @@ pub(crate) struct Stored {
 }
 
 /// A file's rows, and how they were written.
-pub(crate) struct Rows {
+pub(crate) struct FileRows {
     pub(crate) table: Table,
     pub(crate) of_reference: bool,
     pub(crate) schema: SchemaRef,
@@ -44,7 +44,7 @@ pub(crate) struct Rows {
 
 /// Encoding of columns of numbers.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Numbers {
+pub(crate) enum NumberEncoding {
     /// As in the file.
     AsStored,
     Plain,
@@ -56,7 +56,7 @@ pub(crate) fn zstd(level: i32) -> Compression {
 }
 
 /// All files that ingest wrote.
-pub(crate) async fn files(lake: &Lake) -> anyhow::Result<Vec<Stored>> {
+pub(crate) async fn files(lake: &Lake) -> anyhow::Result<Vec<StoredTableFile>> {
     let snapshot = lake.snapshot().await?;
     let mut found = Vec::new();
     for table in Table::ALL.into_iter().filter(|t| t.source() != Source::Rig) {
@@ -69,16 +69,19 @@ pub(crate) async fn files(lake: &Lake) -> anyhow::Result<Vec<Stored>> {
                 _ => false,
             };
             let bytes = lake.store().get(&file.path).await?.bytes().await?;
-            found.push(Stored { table, of_reference, bytes });
+            found.push(StoredTableFile { table, of_reference, bytes });
         }
     }
     Ok(found)
 }
 
-impl Rows {
-    pub(crate) fn read(&Stored { table, of_reference, bytes: ref file }: &Stored) -> anyhow::Result<Self> {
+impl FileRows {
+    pub(crate) fn read(
+        &StoredTableFile { table, of_reference, bytes: ref file }: &StoredTableFile,
+    ) -> anyhow::Result<Self> {
         let builder = ParquetRecordBatchReaderBuilder::try_new(file.clone())?.with_batch_size(BATCH_ROWS);
-        let properties = builder_as(builder.metadata(), Numbers::AsStored).set_data_page_size_limit(PAGE_BYTES).build();
+        let properties =
+            builder_as(builder.metadata(), NumberEncoding::AsStored).set_data_page_size_limit(PAGE_BYTES).build();
         let raw = raw_bytes(builder.metadata());
         let reader = builder.build()?;
         let schema = reader.schema();
@@ -113,7 +116,7 @@ pub(crate) fn raw_bytes(metadata: &ParquetMetaData) -> u64 {
 }
 
 /// Writer properties as a file records them, its numbers' encoding apart; compressed as the lake's files are.
-pub(crate) fn builder_as(metadata: &ParquetMetaData, numbers: Numbers) -> WriterPropertiesBuilder {
+pub(crate) fn builder_as(metadata: &ParquetMetaData, numbers: NumberEncoding) -> WriterPropertiesBuilder {
     let mut builder =
         WriterProperties::builder().set_compression(zstd(LEVEL)).set_statistics_enabled(EnabledStatistics::Page);
     let Some(group) = metadata.row_groups().first() else { return builder };
@@ -121,8 +124,8 @@ pub(crate) fn builder_as(metadata: &ParquetMetaData, numbers: Numbers) -> Writer
     for column in group.columns() {
         let path = column.column_path().clone();
         let split = column.encodings().any(|e| e == Encoding::BYTE_STREAM_SPLIT);
-        if split && numbers != Numbers::Dictionary {
-            let encoding = if numbers == Numbers::Plain { Encoding::PLAIN } else { Encoding::BYTE_STREAM_SPLIT };
+        if split && numbers != NumberEncoding::Dictionary {
+            let encoding = if numbers == NumberEncoding::Plain { Encoding::PLAIN } else { Encoding::BYTE_STREAM_SPLIT };
             builder =
                 builder.set_column_encoding(path.clone(), encoding).set_column_dictionary_enabled(path.clone(), false);
         }

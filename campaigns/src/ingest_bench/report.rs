@@ -6,18 +6,18 @@ use anyhow::Result;
 
 /// Limit that a figure should meet.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(crate) enum Goal {
+pub(crate) enum FigureGoal {
     AtLeast(f64),
     AtMost(f64),
 }
 
 /// Prints as it goes, because the whole takes minutes.
-pub(crate) struct Report {
+pub(crate) struct FigureReport {
     missed: Vec<String>,
     goals: usize,
 }
 
-impl Goal {
+impl FigureGoal {
     fn is_met(self, figure: f64) -> bool {
         match self {
             Self::AtLeast(least) => figure >= least,
@@ -33,7 +33,7 @@ impl Goal {
     }
 }
 
-impl Report {
+impl FigureReport {
     pub(crate) fn new() -> Self {
         Self { missed: Vec::new(), goals: 0 }
     }
@@ -50,7 +50,7 @@ impl Report {
         self.line(&format!("{name:<66} {figure:>10.3} {unit}"))
     }
 
-    pub(crate) fn goal(&mut self, name: &str, figure: f64, unit: &str, goal: Goal) -> Result<()> {
+    pub(crate) fn goal(&mut self, name: &str, figure: f64, unit: &str, goal: FigureGoal) -> Result<()> {
         self.goals += 1;
         let outcome = match goal.is_met(figure) {
             true => "met",

@@ -9,15 +9,15 @@ use anyhow::{Context as _, Result};
 use echolake_acquisition::controller::RecordingMode;
 
 use super::IngestBenchArgs;
-use super::meter::{Cost, Meter};
-use super::parquet_files::{Rows, files};
-use super::report::{Goal, Report};
-use super::simulated::{Ingested, Order};
+use super::meter::{CostMeter, MeasuredCost};
+use super::parquet_files::{FileRows, files};
+use super::report::{FigureGoal, FigureReport};
+use super::simulated::{IngestedLake, SimulationOrder};
 use super::{lake_size, layout};
 
-pub(crate) async fn measure(args: &IngestBenchArgs, folder: &Path, report: &mut Report) -> Result<()> {
+pub(crate) async fn measure(args: &IngestBenchArgs, folder: &Path, report: &mut FigureReport) -> Result<()> {
     let runs = folder.join("responses");
-    let order = Order {
+    let order = SimulationOrder {
         count: args.runs(),
         keep: RecordingMode::ResponsesOnly,
         pairs: usize::MAX,
@@ -25,8 +25,8 @@ pub(crate) async fn measure(args: &IngestBenchArgs, folder: &Path, report: &mut 
         folder: &runs,
     };
     let runs = order.make()?;
-    let (mut whole, mut panels, mut alone) = (Cost::NONE, Cost::NONE, Cost::NONE);
-    let (mut peak, mut last): (f64, Option<Ingested>) = (0.0, None);
+    let (mut whole, mut panels, mut alone) = (MeasuredCost::NONE, MeasuredCost::NONE, MeasuredCost::NONE);
+    let (mut peak, mut last): (f64, Option<IngestedLake>) = (0.0, None);
     for _ in 0..args.repeats() {
         let ingested = runs.ingest(&folder.join("lake")).await?;
         whole = whole.least(ingested.whole);
@@ -36,13 +36,13 @@ pub(crate) async fn measure(args: &IngestBenchArgs, folder: &Path, report: &mut 
     }
     let last = last.context("no repeats")?;
     let found = files(&last.lake).await?;
-    let rows = found.iter().map(Rows::read).collect::<Result<Vec<_>>>()?;
+    let rows = found.iter().map(FileRows::read).collect::<Result<Vec<_>>>()?;
     let of_panels: Vec<_> = rows.iter().filter(|r| !r.of_reference).collect();
     let mut written = 0;
     for _ in 0..args.repeats() {
         let target = folder.join("written");
         fs::create_dir_all(&target)?;
-        let meter = Meter::start()?;
+        let meter = CostMeter::start()?;
         written = write_all(&of_panels, &target)?;
         alone = alone.least(meter.stop()?);
         fs::remove_dir_all(&target)?;
@@ -69,16 +69,16 @@ pub(crate) async fn measure(args: &IngestBenchArgs, folder: &Path, report: &mut 
     report.figure("size of what it wrote / of the lake's files", written as f64 / stored as f64, "x")?;
     report.goal("speed of ingest / of the parquet crate, by CPU time", 100.0 * alone.cpu / panels.cpu, "%", HALF)?;
     report.figure("the same by wall time", 100.0 * alone.wall / panels.wall, "%")?;
-    report.goal("peak memory of the ingest", peak, "MiB", Goal::AtMost(600.0))?;
+    report.goal("peak memory of the ingest", peak, "MiB", FigureGoal::AtMost(600.0))?;
     lake_size::measure(&last, &found, report)?;
     layout::measure(args, &found, &rows, report)
 }
 
-const HALF: Goal = Goal::AtLeast(50.0);
+const HALF: FigureGoal = FigureGoal::AtLeast(50.0);
 
 // Each file is encoded in memory, written, synced and renamed, and its folder synced, as the lake does it. Returns how
 // many bytes they are.
-fn write_all(rows: &[&Rows], folder: &Path) -> Result<usize> {
+fn write_all(rows: &[&FileRows], folder: &Path) -> Result<usize> {
     let next = AtomicUsize::new(0);
     let work = || -> Result<usize> {
         let mut bytes = 0;

@@ -10,11 +10,11 @@ use echolake_acquisition::controller::RecordingMode;
 use echolake_acquisition::run::{PanelSpecimen, RunRequest};
 use echolake_acquisition::simulate::simulate;
 use echolake_ingest::{Ingest, Report as Told, complete, pending};
-use echolake_lake::{Lake, References};
+use echolake_lake::{Lake, ReferenceSurfaces};
 use echolake_schema::manifest::RunEnd;
 use echolake_schema::{Rig, Timestamp};
 
-use super::meter::{Cost, Meter, forget_peak, peak_mib};
+use super::meter::{CostMeter, MeasuredCost, forget_peak, peak_mib};
 
 /// 2026-01-05 08:00 UTC, and a run every eleven hours.
 const FIRST_START: Timestamp = Timestamp(1_767_600_000_000_000_000);
@@ -25,25 +25,25 @@ const RUN_EVERY_SECS: f64 = 39_600.0;
 pub(crate) const REFERENCES: usize = 2;
 
 /// Runs' files.
-pub(crate) struct Runs {
+pub(crate) struct SimulatedRuns {
     /// In the collection's order.
     pub(crate) files: Vec<PathBuf>,
     /// All of them.
-    pub(crate) all: Counts,
+    pub(crate) all: RunCounts,
     /// Those that are no references.
-    pub(crate) panels: Counts,
+    pub(crate) panels: RunCounts,
 }
 
 /// Attempts, accepted measurements and bytes of some runs.
 #[derive(Debug, Clone, Copy, Default)]
-pub(crate) struct Counts {
+pub(crate) struct RunCounts {
     pub(crate) attempts: u64,
     pub(crate) accepted: u64,
     pub(crate) bytes: u64,
 }
 
 /// Runs to be made.
-pub(crate) struct Order<'a> {
+pub(crate) struct SimulationOrder<'a> {
     pub(crate) count: usize,
     pub(crate) keep: RecordingMode,
     /// Pairs after which each run is stopped.
@@ -53,19 +53,19 @@ pub(crate) struct Order<'a> {
 }
 
 /// A lake that has just taken in runs.
-pub(crate) struct Ingested {
+pub(crate) struct IngestedLake {
     pub(crate) lake: Lake,
     pub(crate) folder: PathBuf,
     /// Of all runs.
-    pub(crate) whole: Cost,
+    pub(crate) whole: MeasuredCost,
     /// Of those that are no references, with the references there.
-    pub(crate) panels: Cost,
+    pub(crate) panels: MeasuredCost,
     pub(crate) peak_mib: f64,
 }
 
-impl Order<'_> {
+impl SimulationOrder<'_> {
     /// Makes them, on all cores.
-    pub(crate) fn make(&self) -> Result<Runs> {
+    pub(crate) fn make(&self) -> Result<SimulatedRuns> {
         std::fs::create_dir_all(self.folder)?;
         let members = collection(self.seed, self.count)?;
         let cores = std::thread::available_parallelism().map_or(1, usize::from);
@@ -85,7 +85,7 @@ impl Order<'_> {
         let mut done: Vec<_> = done.into_iter().flatten().collect();
         // Their names begin with the time of their start.
         done.sort_by(|a, b| a.0.cmp(&b.0));
-        let mut runs = Runs { files: Vec::new(), all: Counts::default(), panels: Counts::default() };
+        let mut runs = SimulatedRuns { files: Vec::new(), all: RunCounts::default(), panels: RunCounts::default() };
         for (number, (file, end)) in done.into_iter().enumerate() {
             let bytes = file.metadata()?.len();
             runs.all.add(&end, bytes);
@@ -116,13 +116,14 @@ impl Order<'_> {
     }
 }
 
-impl Runs {
+impl SimulatedRuns {
     /// Ingests them into a lake of its own, which replaces the one before.
-    pub(crate) async fn ingest(&self, folder: &Path) -> Result<Ingested> {
+    pub(crate) async fn ingest(&self, folder: &Path) -> Result<IngestedLake> {
         if folder.exists() {
             std::fs::remove_dir_all(folder)?;
         }
-        let lake = Lake::open_or_create(&folder.display().to_string(), &Rig::paper(), &References::default()).await?;
+        let lake =
+            Lake::open_or_create(&folder.display().to_string(), &Rig::paper(), &ReferenceSurfaces::default()).await?;
         let stop = Arc::new(AtomicBool::new(false));
         let (mut accepted, mut refused) = (0, Vec::new());
         let mut report = |told| match told {
@@ -130,11 +131,11 @@ impl Runs {
             other => refused.push(format!("{other:?}")),
         };
         forget_peak();
-        let mut costs = [Cost::NONE; 2];
+        let mut costs = [MeasuredCost::NONE; 2];
         let (references, panels) = self.files.split_at(REFERENCES);
         for (files, cost) in [references, panels].into_iter().zip(&mut costs) {
             put_into_inbox(files, folder)?;
-            let meter = Meter::start()?;
+            let meter = CostMeter::start()?;
             Ingest::new(&lake, stop.clone()).take_in(pending(&lake).await?, &mut report).await?;
             complete(&lake, &stop, &mut |_| {}).await?;
             *cost = meter.stop()?;
@@ -143,11 +144,11 @@ impl Runs {
         ensure!(accepted == self.all.accepted, "{accepted} measurements ingested of {}", self.all.accepted);
         let [references, panels] = costs;
         let whole = references.plus(panels);
-        Ok(Ingested { lake, folder: folder.to_owned(), whole, panels, peak_mib: peak_mib()? })
+        Ok(IngestedLake { lake, folder: folder.to_owned(), whole, panels, peak_mib: peak_mib()? })
     }
 }
 
-impl Counts {
+impl RunCounts {
     fn add(&mut self, end: &RunEnd, bytes: u64) {
         self.attempts += end.attempts;
         self.accepted += end.accepted;

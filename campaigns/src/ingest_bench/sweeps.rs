@@ -15,9 +15,9 @@ use prost::Message as _;
 use realfft::RealFftPlanner;
 
 use super::IngestBenchArgs;
-use super::meter::{Cost, Meter};
-use super::report::{Goal, Report};
-use super::simulated::{Order, Runs};
+use super::meter::{CostMeter, MeasuredCost};
+use super::report::{FigureGoal, FigureReport};
+use super::simulated::{SimulatedRuns, SimulationOrder};
 
 /// Runs: Flat, Foam and two others.
 const RUNS: usize = 4;
@@ -29,20 +29,26 @@ const SWEEP_LEN: usize = 48_000;
 const BARE_SECS: f64 = 1.0;
 const PROCESS: &str = include_str!("process.py");
 
-struct Recording {
+struct SampledRecording {
     celsius: f64,
     microphone: Vec<f32>,
     loopback: Vec<f32>,
 }
 
-pub(crate) async fn measure(args: &IngestBenchArgs, folder: &Path, report: &mut Report) -> Result<()> {
+pub(crate) async fn measure(args: &IngestBenchArgs, folder: &Path, report: &mut FigureReport) -> Result<()> {
     let runs = folder.join("sweeps");
-    let order = Order { count: RUNS, keep: RecordingMode::Sweeps, pairs: args.pairs(), seed: args.seed, folder: &runs };
+    let order = SimulationOrder {
+        count: RUNS,
+        keep: RecordingMode::Sweeps,
+        pairs: args.pairs(),
+        seed: args.seed,
+        folder: &runs,
+    };
     let runs = order.make()?;
     let recordings = sampled(&runs)?;
     let length = recordings.first().context("no recordings")?.microphone.len();
     let padded = fast_length(length);
-    let (mut whole, mut panels) = (Cost::NONE, Cost::NONE);
+    let (mut whole, mut panels) = (MeasuredCost::NONE, MeasuredCost::NONE);
     let (mut bare, mut unpadded) = (f64::INFINITY, f64::INFINITY);
     let mut peak: f64 = 0.0;
     for _ in 0..args.repeats() {
@@ -64,21 +70,21 @@ pub(crate) async fn measure(args: &IngestBenchArgs, folder: &Path, report: &mut 
     report.figure("ingest with the references', CPU a recording", whole.cpu / all * 1e6, "us")?;
     report.figure(&format!("two bare transforms of {padded} samples (padded as ingest does)"), bare * 1e6, "us")?;
     report.figure(&format!("two bare transforms of {SWEEP_LEN} samples (the sweep alone)"), unpadded * 1e6, "us")?;
-    report.goal("ingest / bare transforms", each / bare, "x", Goal::AtMost(3.0))?;
+    report.goal("ingest / bare transforms", each / bare, "x", FigureGoal::AtMost(3.0))?;
     report.figure("the same with the references'", whole.cpu / all / bare, "x")?;
     report.figure(&format!("ingest / bare transforms of {SWEEP_LEN}"), each / unpadded, "x")?;
     match reference(args, folder, &recordings) {
         Ok(process) => {
             report.figure("pipeline.py's process, CPU a recording, one core", process * 1e6, "us")?;
-            report.goal("pipeline.py's process / ingest", process / each, "x", Goal::AtLeast(20.0))?;
+            report.goal("pipeline.py's process / ingest", process / each, "x", FigureGoal::AtLeast(20.0))?;
         }
         Err(why) => report.line(&format!("pipeline.py skipped: {why:#}"))?,
     }
-    report.goal("peak memory of the ingest", peak, "MiB", Goal::AtMost(600.0))
+    report.goal("peak memory of the ingest", peak, "MiB", FigureGoal::AtMost(600.0))
 }
 
 // Recordings spread over the last run, because the reference pipeline's cost depends on the temperature.
-fn sampled(runs: &Runs) -> Result<Vec<Recording>> {
+fn sampled(runs: &SimulatedRuns) -> Result<Vec<SampledRecording>> {
     let bytes = std::fs::read(runs.files.last().context("no runs")?)?;
     let mut found = Vec::new();
     let every = (runs.all.attempts as usize / RUNS / SAMPLED).max(1);
@@ -89,14 +95,14 @@ fn sampled(runs: &Runs) -> Result<Vec<Recording>> {
             continue;
         }
         if number % every == 0 && found.len() < SAMPLED {
-            found.push(Recording::read(&message.data)?);
+            found.push(SampledRecording::read(&message.data)?);
         }
         number += 1;
     }
     Ok(found)
 }
 
-impl Recording {
+impl SampledRecording {
     fn read(data: &[u8]) -> Result<Self> {
         let sweep = SweepRecording::decode(data)?;
         let (mut microphone, mut loopback) =
@@ -108,15 +114,15 @@ impl Recording {
 }
 
 // CPU seconds that the two transforms of a recording take, of `length` samples each.
-fn transforms(recordings: &[Recording], length: usize) -> Result<f64> {
+fn transforms(recordings: &[SampledRecording], length: usize) -> Result<f64> {
     let forward = RealFftPlanner::<f32>::new().plan_fft_forward(length);
     let (mut input, mut spectrum) = (forward.make_input_vec(), forward.make_output_vec());
     let mut work = forward.make_scratch_vec();
-    let meter = Meter::start()?;
+    let meter = CostMeter::start()?;
     let begun = std::time::Instant::now();
     let mut done = 0;
     while begun.elapsed().as_secs_f64() < BARE_SECS {
-        for Recording { microphone, loopback, .. } in recordings {
+        for SampledRecording { microphone, loopback, .. } in recordings {
             for signal in [microphone, loopback] {
                 let count = signal.len().min(length);
                 input[..count].copy_from_slice(&signal[..count]);
@@ -131,12 +137,12 @@ fn transforms(recordings: &[Recording], length: usize) -> Result<f64> {
 }
 
 // CPU seconds that the reference pipeline takes per recording, on one core.
-fn reference(args: &IngestBenchArgs, folder: &Path, recordings: &[Recording]) -> Result<f64> {
+fn reference(args: &IngestBenchArgs, folder: &Path, recordings: &[SampledRecording]) -> Result<f64> {
     let pipeline = args.reference.join("pipeline.py");
     ensure!(pipeline.is_file(), "no `{}`; hint: --reference DIR", pipeline.display());
     let file = folder.join("recordings.f32");
     let mut out = std::io::BufWriter::new(std::fs::File::create(&file)?);
-    for Recording { celsius, microphone, loopback } in recordings {
+    for SampledRecording { celsius, microphone, loopback } in recordings {
         out.write_all(&(*celsius as f32).to_le_bytes())?;
         for x in microphone.iter().chain(loopback) {
             out.write_all(&x.to_le_bytes())?;

@@ -11,12 +11,12 @@ const TOLERANCE: f64 = 1e-9;
 
 /// Rows, and of each column the sum of its numbers or of its texts' lengths.
 #[derive(Debug, Clone, PartialEq)]
-pub(crate) struct Digest {
+pub(crate) struct RowsDigest {
     pub(crate) rows: u64,
     pub(crate) sums: Vec<f64>,
 }
 
-impl Digest {
+impl RowsDigest {
     pub(crate) fn of(batches: &[RecordBatch]) -> Result<Self> {
         let rows = batches.iter().map(|b| b.num_rows() as u64).sum();
         let columns = batches.first().map_or(0, RecordBatch::num_columns);

@@ -13,12 +13,12 @@ use std::time::Instant;
 
 use anyhow::{Context as _, Result};
 use arrow::record_batch::RecordBatch;
-use digest::Digest;
+use digest::RowsDigest;
 use echolake_lake::Lake;
 use echolake_query::Session;
 use echolake_schema::tables::Table;
-use peer::Peer;
-use queries::Query;
+use peer::DuckdbPeer;
+use queries::BenchQuery;
 
 #[derive(Debug, clap::Args)]
 pub(crate) struct QueryBenchArgs {
@@ -43,7 +43,7 @@ pub(crate) struct QueryBenchArgs {
 }
 
 /// A query's times, s.
-struct Row {
+struct QueryTimes {
     name: &'static str,
     own: f64,
     peer: Option<f64>,
@@ -54,7 +54,7 @@ pub(crate) async fn run(args: &QueryBenchArgs) -> Result<()> {
     let lake = Lake::open(&args.lake).await?;
     let session = Session::new(&lake)?;
     let mut peer = match &args.python {
-        Some(python) => Some(Peer::start(python, &files(&lake).await?, args.threads)?),
+        Some(python) => Some(DuckdbPeer::start(python, &files(&lake).await?, args.threads)?),
         None => None,
     };
     let surface = middle_surface(&lake).await?;
@@ -73,7 +73,12 @@ pub(crate) async fn run(args: &QueryBenchArgs) -> Result<()> {
 }
 
 // One untimed run of each, then in turns.
-async fn compare(session: &Session, mut peer: Option<&mut Peer>, query: &Query, runs: usize) -> Result<Row> {
+async fn compare(
+    session: &Session,
+    mut peer: Option<&mut DuckdbPeer>,
+    query: &BenchQuery,
+    runs: usize,
+) -> Result<QueryTimes> {
     let (mut own, mut other) = (Vec::new(), Vec::new());
     let mut rows = 0;
     for run in 0..=runs {
@@ -86,14 +91,14 @@ async fn compare(session: &Session, mut peer: Option<&mut Peer>, query: &Query, 
             anyhow::ensure!(digest.agrees(&theirs), "{}: answers differ, {digest:?} and {theirs:?}", query.name);
         }
     }
-    Ok(Row { name: query.name, own: median(own), peer: (!other.is_empty()).then(|| median(other)), rows })
+    Ok(QueryTimes { name: query.name, own: median(own), peer: (!other.is_empty()).then(|| median(other)), rows })
 }
 
-async fn ask(session: &Session, query: &Query) -> Result<(f64, Digest)> {
+async fn ask(session: &Session, query: &BenchQuery) -> Result<(f64, RowsDigest)> {
     let start = Instant::now();
     let batches = collect(session, &query.sql).await.with_context(|| query.name)?;
     let seconds = start.elapsed().as_secs_f64();
-    Ok((seconds, Digest::of(&batches)?))
+    Ok((seconds, RowsDigest::of(&batches)?))
 }
 
 async fn collect(session: &Session, sql: &str) -> Result<Vec<RecordBatch>> {
@@ -105,7 +110,7 @@ async fn collect(session: &Session, sql: &str) -> Result<Vec<RecordBatch>> {
     Ok(batches)
 }
 
-async fn explain(session: &Session, query: &Query) -> Result<()> {
+async fn explain(session: &Session, query: &BenchQuery) -> Result<()> {
     collect(session, &query.sql).await?;
     let batches = collect(session, &format!("EXPLAIN ANALYZE {}", query.sql)).await?;
     let text = arrow::util::pretty::pretty_format_batches(&batches)?;
@@ -138,7 +143,7 @@ async fn middle_surface(lake: &Lake) -> Result<String> {
     Ok(runs.get(runs.len() / 2).context("the lake has no runs")?.surface.to_string())
 }
 
-fn report(rows: &[Row], version: Option<&str>) -> Result<()> {
+fn report(rows: &[QueryTimes], version: Option<&str>) -> Result<()> {
     let mut out = std::io::stdout().lock();
     writeln!(out, "{:<20} {:>9} {:>12} {:>12} {:>7}", "query", "rows", "echolake ms", "duckdb ms", "ratio")?;
     let mut logs = Vec::new();

@@ -7,13 +7,13 @@ use std::process::{Child, ChildStdin, ChildStdout, Command, Stdio};
 use anyhow::{Context as _, Result};
 use serde_json::{Value, json};
 
-use super::digest::Digest;
+use super::digest::RowsDigest;
 
 /// Path of the script.
 const SCRIPT: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../tests/clients/duckdb_peer.py");
 
 /// A running DuckDB.
-pub(crate) struct Peer {
+pub(crate) struct DuckdbPeer {
     child: Child,
     ask: ChildStdin,
     answers: BufReader<ChildStdout>,
@@ -21,7 +21,7 @@ pub(crate) struct Peer {
     pub(crate) version: String,
 }
 
-impl Peer {
+impl DuckdbPeer {
     /// Starts it, with a view a table over just these files.
     pub(crate) fn start(python: &Path, tables: &[(String, Vec<String>)], threads: usize) -> Result<Self> {
         let mut child = Command::new(python)
@@ -41,12 +41,12 @@ impl Peer {
     }
 
     /// Answers a query; seconds, and what came.
-    pub(crate) fn query(&mut self, sql: &str) -> Result<(f64, Digest)> {
+    pub(crate) fn query(&mut self, sql: &str) -> Result<(f64, RowsDigest)> {
         let answer = self.exchange(&json!({ "sql": sql }))?;
         let seconds = answer["seconds"].as_f64().context("the peer gave no time")?;
         let sums = answer["sums"].as_array().context("the peer gave no sums")?;
         let rows = answer["rows"].as_u64().context("the peer gave no rows")?;
-        Ok((seconds, Digest { rows, sums: sums.iter().filter_map(Value::as_f64).collect() }))
+        Ok((seconds, RowsDigest { rows, sums: sums.iter().filter_map(Value::as_f64).collect() }))
     }
 
     fn exchange(&mut self, question: &Value) -> Result<Value> {
@@ -62,7 +62,7 @@ impl Peer {
     }
 }
 
-impl Drop for Peer {
+impl Drop for DuckdbPeer {
     fn drop(&mut self) {
         // It ends with its input; a peer that hangs is not waited for.
         let _ = self.child.kill();

@@ -1,7 +1,7 @@
 //! The twelve queries, written down once. Both engines get the same text, but for views that only echolake has.
 
 /// One query of the benchmark.
-pub(crate) struct Query {
+pub(crate) struct BenchQuery {
     /// Short name.
     pub(crate) name: &'static str,
     /// Query for echolake.
@@ -11,10 +11,10 @@ pub(crate) struct Query {
 }
 
 /// The queries about a surface and a pair of the lake.
-pub(crate) fn all(surface: &str, pair: i64) -> Vec<Query> {
+pub(crate) fn all(surface: &str, pair: i64) -> Vec<BenchQuery> {
     let query = |name, sql: &str| {
         let sql = sql.replace("$SURFACE", surface).replace("$PAIR", &pair.to_string());
-        Query { name, sql, peer: None }
+        BenchQuery { name, sql, peer: None }
     };
     let mut augmented = query("augmented_surface", AUGMENTED);
     augmented.peer = Some(AUGMENTED_PEER.replace("$SURFACE", surface));

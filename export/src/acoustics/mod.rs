@@ -8,7 +8,7 @@ use std::path::Path;
 
 use arrow::array::AsArray as _;
 use arrow::datatypes::{Float32Type, Float64Type, Int32Type, Int64Type};
-use echolake_lake::{Lake, Snapshot, VisibleRun};
+use echolake_lake::{Lake, LakeSnapshot, VisibleRun};
 use echolake_schema::SurfaceId;
 use echolake_schema::tables::Table;
 
@@ -69,7 +69,7 @@ pub async fn write_responses(
 }
 
 // The newest run of each surface, sorted by surface id.
-fn newest_runs(snapshot: &Snapshot, surfaces: &[SurfaceId]) -> Result<Vec<VisibleRun>> {
+fn newest_runs(snapshot: &LakeSnapshot, surfaces: &[SurfaceId]) -> Result<Vec<VisibleRun>> {
     let mut newest: std::collections::BTreeMap<&SurfaceId, &VisibleRun> = std::collections::BTreeMap::new();
     newest.extend(snapshot.runs().map(|run| (&run.surface, run)));
     if let Some(unknown) = surfaces.iter().find(|s| !newest.contains_key(s)) {
@@ -84,7 +84,7 @@ fn newest_runs(snapshot: &Snapshot, surfaces: &[SurfaceId]) -> Result<Vec<Visibl
 }
 
 impl Responses {
-    async fn read(lake: &Lake, snapshot: &Snapshot, run: &VisibleRun) -> Result<Self> {
+    async fn read(lake: &Lake, snapshot: &LakeSnapshot, run: &VisibleRun) -> Result<Self> {
         let columns = ["pair_id", "log_time_ns", "temperature_c", "ir"];
         let batch = rows::of_run(lake, snapshot, Table::Measurements, &run.run, &columns).await?;
         let damaged = |reason: String| Error::damaged(format!("measurements, run {}", run.run), reason);

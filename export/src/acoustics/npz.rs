@@ -5,7 +5,7 @@ use std::io::Cursor;
 
 use arrow::array::AsArray as _;
 use arrow::datatypes::Float32Type;
-use echolake_lake::{Lake, Snapshot, VisibleRun};
+use echolake_lake::{Lake, LakeSnapshot, VisibleRun};
 use echolake_schema::interchange::{GIR_COMBINATIONS, GIR_PANEL_INFO};
 use echolake_schema::tables::Table;
 use ndarray::{Array1, Array2};
@@ -19,7 +19,7 @@ use crate::rows;
 /// Writes a surface's files.
 pub(super) async fn write(
     lake: &Lake,
-    snapshot: &Snapshot,
+    snapshot: &LakeSnapshot,
     responses: &Responses,
     folder: &PendingFolder,
 ) -> Result<Vec<WrittenFile>> {
@@ -67,7 +67,7 @@ fn archive(
     Ok(npz.finish()?.into_inner())
 }
 
-async fn heights(lake: &Lake, snapshot: &Snapshot, responses: &Responses) -> Result<Option<Array2<f64>>> {
+async fn heights(lake: &Lake, snapshot: &LakeSnapshot, responses: &Responses) -> Result<Option<Array2<f64>>> {
     let run = &responses.run.run;
     let batch = rows::of_run(lake, snapshot, Table::Heightmaps, run, &["symmetry", "heights_mm"]).await?;
     let Some(row) = rows::texts(&batch, "symmetry").iter().position(|s| *s == "identity") else { return Ok(None) };
@@ -80,7 +80,7 @@ async fn heights(lake: &Lake, snapshot: &Snapshot, responses: &Responses) -> Res
 /// Writes `combinations.csv` (the pair of each matrix row) and `panel_info.csv` (one row per surface).
 pub(super) async fn describe(
     lake: &Lake,
-    snapshot: &Snapshot,
+    snapshot: &LakeSnapshot,
     runs: &[VisibleRun],
     folder: &PendingFolder,
 ) -> Result<Vec<WrittenFile>> {

@@ -6,7 +6,7 @@ use arrow::array::{Array as _, ArrayRef, AsArray as _, StringArray};
 use arrow::compute::filter_record_batch;
 use arrow::datatypes::{DataType, Schema, SchemaRef};
 use arrow::record_batch::RecordBatch;
-use echolake_lake::{Lake, Snapshot};
+use echolake_lake::{Lake, LakeSnapshot};
 use echolake_schema::tables::Table;
 
 use super::columns::{field, list};
@@ -36,7 +36,7 @@ pub(super) fn schema() -> Result<SchemaRef> {
 /// Reads a surface's height maps under these symmetries; None if it has none.
 pub(super) async fn read(
     lake: &Lake,
-    snapshot: &Snapshot,
+    snapshot: &LakeSnapshot,
     surface: &Surface,
     part: Part,
     symmetries: &[&str],

@@ -10,7 +10,7 @@ use arrow::array::{
 use arrow::compute::{cast, take};
 use arrow::datatypes::{DataType, FieldRef, Int32Type};
 use arrow::record_batch::RecordBatch;
-use echolake_lake::{Lake, Snapshot};
+use echolake_lake::{Lake, LakeSnapshot};
 use echolake_schema::symmetry::MovedPair;
 use echolake_schema::tables::Table;
 use echolake_schema::{Grid, PointId, Symmetry};
@@ -43,7 +43,7 @@ impl Moves {
 /// Builds the rows of runs from a snapshot of the lake.
 pub(super) struct Maker<'a> {
     pub(super) lake: &'a Lake,
-    pub(super) snapshot: &'a Snapshot,
+    pub(super) snapshot: &'a LakeSnapshot,
     pub(super) columns: &'a Columns,
     pub(super) moves: &'a Moves,
 }

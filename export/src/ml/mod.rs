@@ -14,7 +14,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use arrow::datatypes::SchemaRef;
-use echolake_lake::{Lake, Snapshot};
+use echolake_lake::{Lake, LakeSnapshot};
 use echolake_schema::SurfaceId;
 use futures::StreamExt as _;
 
@@ -105,7 +105,7 @@ struct Shard {
 }
 
 impl Plan {
-    async fn new(lake: &Lake, snapshot: &Snapshot, set: &TrainingSet) -> Result<Self> {
+    async fn new(lake: &Lake, snapshot: &LakeSnapshot, set: &TrainingSet) -> Result<Self> {
         let columns = Columns::choose(lake.rig(), &set.columns)?;
         let (surfaces, waiting) = surfaces::read(lake, snapshot).await?;
         let parts = split::assign(&surfaces, set.split)?;
@@ -197,7 +197,7 @@ pub async fn write_training_set(
 /// State shared by the tasks that write files.
 struct Job {
     lake: Lake,
-    snapshot: Snapshot,
+    snapshot: LakeSnapshot,
     plan: Plan,
     folder: PendingFolder,
 }

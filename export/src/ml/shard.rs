@@ -2,7 +2,7 @@
 
 use arrow::datatypes::{DataType, SchemaRef};
 use arrow::record_batch::RecordBatch;
-use echolake_lake::{Lake, Snapshot};
+use echolake_lake::{Lake, LakeSnapshot};
 use echolake_schema::tables::LIST_CHILD;
 use parquet::arrow::ArrowWriter;
 use parquet::basic::{Compression, Encoding, ZstdLevel};
@@ -72,7 +72,7 @@ pub(super) async fn write(job: &Job, shard: &Shard) -> Result<(WrittenFile, Vec<
 /// Writes the height maps of a part; returns the file, if there are any, and the number of surfaces that have them.
 pub(super) async fn heights(
     lake: &Lake,
-    snapshot: &Snapshot,
+    snapshot: &LakeSnapshot,
     plan: &Plan,
     part: Part,
     folder: &PendingFolder,

@@ -2,7 +2,7 @@
 
 use std::collections::{BTreeMap, HashSet};
 
-use echolake_lake::{Lake, Snapshot, VisibleRun};
+use echolake_lake::{Lake, LakeSnapshot, VisibleRun};
 use echolake_schema::SurfaceId;
 use echolake_schema::tables::Table;
 
@@ -29,7 +29,7 @@ pub(super) struct Run {
 }
 
 /// Reads all surfaces that have a derived run, sorted by name, and the number of runs that wait for references.
-pub(super) async fn read(lake: &Lake, snapshot: &Snapshot) -> Result<(Vec<Surface>, usize)> {
+pub(super) async fn read(lake: &Lake, snapshot: &LakeSnapshot) -> Result<(Vec<Surface>, usize)> {
     let mut surfaces = BTreeMap::new();
     let mut references = HashSet::new();
     let columns = ["surface_id", "typology", "macrostructure", "origin", "flat_reference", "foam_reference"];

@@ -13,7 +13,7 @@ use arrow::compute::cast;
 use arrow::datatypes::{DataType, Int32Type, Int64Type};
 use arrow::record_batch::RecordBatch;
 use bytes::Bytes;
-use echolake_lake::{Lake, Snapshot};
+use echolake_lake::{Lake, LakeSnapshot};
 use echolake_recording::Metadata;
 use echolake_schema::{RunId, SurfaceId, topics};
 use futures::stream::{self, BoxStream, StreamExt as _};
@@ -164,7 +164,7 @@ pub(crate) async fn open_runs(lake: &Lake, taken: &[Taken], check: Check) -> Res
 }
 
 // The runs of measurements with their files, by their start; at least one.
-async fn files(lake: &Lake, snapshot: &Snapshot, taken: Vec<Taken>) -> Result<Vec<(RunFile, Vec<Taken>)>> {
+async fn files(lake: &Lake, snapshot: &LakeSnapshot, taken: Vec<Taken>) -> Result<Vec<(RunFile, Vec<Taken>)>> {
     if taken.is_empty() {
         return Err(Error::Nothing { reason: "no measurement is selected".into() });
     }
@@ -241,7 +241,7 @@ impl Slice {
     /// # Errors
     /// [`Error::Nothing`] without measurements, [`Error::Unknown`] for a topic that none of the runs has,
     /// [`Error::Changed`] for a file that is not the ingested one.
-    pub async fn open(lake: &Lake, snapshot: &Snapshot, params: SliceParams) -> Result<Self> {
+    pub async fn open(lake: &Lake, snapshot: &LakeSnapshot, params: SliceParams) -> Result<Self> {
         let SliceParams { taken, topics, layout, check } = params;
         let (runs, mut known) = (files(lake, snapshot, taken).await?, BTreeSet::new());
         let (mut first, lead) = (None, runs[0].0.run.clone());

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeSet;
 
-use echolake_lake::{Lake, Snapshot};
+use echolake_lake::{Lake, LakeSnapshot};
 use echolake_recording::ChunkIndex;
 
 use super::groups::is_once;
@@ -49,7 +49,7 @@ pub struct OutlineSchema {
 ///
 /// # Errors
 /// As [`super::Slice::open`].
-pub async fn outline(lake: &Lake, snapshot: &Snapshot, params: SliceParams) -> Result<Outline> {
+pub async fn outline(lake: &Lake, snapshot: &LakeSnapshot, params: SliceParams) -> Result<Outline> {
     let SliceParams { taken, topics, check, .. } = params;
     let (mut outline, mut known) =
         (Outline { start_ns: i64::MAX, end_ns: i64::MIN, ..Outline::default() }, BTreeSet::new());

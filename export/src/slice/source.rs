@@ -6,7 +6,7 @@ use std::sync::Arc;
 
 use arrow::datatypes::Int64Type;
 use bytes::Bytes;
-use echolake_lake::{Lake, Snapshot};
+use echolake_lake::{Lake, LakeSnapshot};
 use echolake_recording::{
     Attachment, Channel, ChunkIndex, DecodedChunk, McapError, Record, RecordCursor, RecordError, RunSummary,
     chunk_body, describe, summary_range, tail_range,
@@ -57,7 +57,7 @@ pub(super) struct Message {
 
 impl RunFile {
     /// Looks a run up.
-    pub(super) async fn find(lake: &Lake, snapshot: &Snapshot, run: &RunId) -> Result<Self> {
+    pub(super) async fn find(lake: &Lake, snapshot: &LakeSnapshot, run: &RunId) -> Result<Self> {
         let columns = ["surface_id", "run_id", "started_ns", "file", "file_bytes", "file_sha256"];
         let row = rows::of_run(lake, snapshot, Table::Runs, run, &columns).await?;
         let text = |column| rows::texts(&row, column).first().map(|text| (*text).to_owned());

@@ -1,7 +1,7 @@
 //! The row of table `surfaces`.
 
 use arrow::record_batch::RecordBatch;
-use echolake_lake::References;
+use echolake_lake::ReferenceSurfaces;
 use echolake_schema::tables::Table;
 use echolake_schema::{Rig, SurfaceRecord};
 
@@ -14,7 +14,7 @@ pub(crate) fn row(
     rig: &Rig,
     keys: &Keys,
     surface: &SurfaceRecord,
-    references: &References,
+    references: &ReferenceSurfaces,
     origin: &str,
     heights_mm: &[f32],
 ) -> Result<RecordBatch> {

@@ -8,12 +8,12 @@ use arrow::buffer::NullBuffer;
 use arrow::datatypes::{ArrowNativeType, DataType, Field, Float32Type, Float64Type, Int64Type};
 use datafusion::error::{DataFusionError, Result};
 use datafusion::logical_expr::ColumnarValue;
-use echolake_dsp::Real;
+use echolake_dsp::RealSample;
 
 use super::description::{Description, Kind, Parameter};
 
 /// A sample type with an Arrow type.
-pub(super) trait Element: Real + ArrowNativeType {
+pub(super) trait Element: RealSample + ArrowNativeType {
     type Arrow: ArrowPrimitiveType<Native = Self>;
 }
 

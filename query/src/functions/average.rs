@@ -6,7 +6,7 @@ use arrow::array::{ArrayRef, AsArray as _, UInt64Array};
 use arrow::buffer::NullBuffer;
 use arrow::datatypes::{DataType, Float64Type, UInt64Type};
 use datafusion::error::{DataFusionError, Result};
-use echolake_dsp::mean::Mean;
+use echolake_dsp::mean::SignalMean;
 
 use super::aggregate::{Aggregate, Groups};
 use super::answers::list_array;
@@ -44,7 +44,7 @@ impl AvgList {
         Ok(())
     }
 
-    fn lists<T: Element>(groups: &[Mean]) -> Result<ArrayRef> {
+    fn lists<T: Element>(groups: &[SignalMean]) -> Result<ArrayRef> {
         let mut values = Vec::new();
         groups.iter().for_each(|group| values.extend(group.values().map(T::of)));
         let nulls = NullBuffer::from_iter(groups.iter().map(|group| group.count() > 0));
@@ -53,7 +53,7 @@ impl AvgList {
 }
 
 impl Aggregate for AvgList {
-    type Group = Mean;
+    type Group = SignalMean;
 
     fn description(&self) -> &'static Description {
         &DESCRIPTION
@@ -89,25 +89,25 @@ impl Aggregate for AvgList {
         Ok(())
     }
 
-    fn keep(&self, groups: &[Mean]) -> Result<Vec<ArrayRef>> {
+    fn keep(&self, groups: &[SignalMean]) -> Result<Vec<ArrayRef>> {
         let sums: Vec<f64> = groups.iter().flat_map(|group| group.sums().iter().copied()).collect();
         let counts: UInt64Array = groups.iter().map(|group| Some(group.count())).collect();
         Ok(vec![Arc::new(list_array::<f64>(sums, offsets(groups)?, None)?), Arc::new(counts)])
     }
 
-    fn answer(&self, groups: &[Mean], returns: &DataType) -> Result<ArrayRef> {
+    fn answer(&self, groups: &[SignalMean], returns: &DataType) -> Result<ArrayRef> {
         match element(returns) {
             Some(DataType::Float32) => Self::lists::<f32>(groups),
             _ => Self::lists::<f64>(groups),
         }
     }
 
-    fn heap(group: &Mean) -> usize {
+    fn heap(group: &SignalMean) -> usize {
         size_of_val(group.sums())
     }
 }
 
-fn offsets(groups: &[Mean]) -> Result<Vec<i32>> {
+fn offsets(groups: &[SignalMean]) -> Result<Vec<i32>> {
     let ends = groups.iter().scan(0usize, |end, group| {
         *end += group.sums().len();
         Some(i32::try_from(*end))

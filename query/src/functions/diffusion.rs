@@ -5,7 +5,7 @@ use std::sync::Arc;
 use arrow::array::{ArrayRef, AsArray as _, Float64Array, UInt64Array};
 use arrow::datatypes::{DataType, Float64Type, UInt64Type};
 use datafusion::error::Result;
-use echolake_dsp::diffusion::{Diffusion, diffusion};
+use echolake_dsp::diffusion::{DiffusionSums, diffusion};
 
 use super::aggregate::{Aggregate, Groups};
 use super::answers::numbers;
@@ -78,7 +78,7 @@ impl Scalar for DiffusionOf {
 }
 
 impl Aggregate for DiffusionCoefficient {
-    type Group = Diffusion;
+    type Group = DiffusionSums;
 
     fn description(&self) -> &'static Description {
         &ROWS
@@ -110,15 +110,15 @@ impl Aggregate for DiffusionCoefficient {
         let parts = receivers.iter().zip(loudest).zip(energy.iter().zip(square));
         for (row, ((receivers, loudest), (energy, square))) in parts.enumerate() {
             groups.at(row, |group| {
-                group.merge(&Diffusion::from_parts((*receivers, *loudest, *energy, *square)));
+                group.merge(&DiffusionSums::from_parts((*receivers, *loudest, *energy, *square)));
                 Ok(())
             })?;
         }
         Ok(())
     }
 
-    fn keep(&self, groups: &[Diffusion]) -> Result<Vec<ArrayRef>> {
-        let parts = || groups.iter().map(Diffusion::parts);
+    fn keep(&self, groups: &[DiffusionSums]) -> Result<Vec<ArrayRef>> {
+        let parts = || groups.iter().map(DiffusionSums::parts);
         let number = |values: Vec<f64>| -> ArrayRef { Arc::new(Float64Array::from(values)) };
         Ok(vec![
             Arc::new(parts().map(|p| Some(p.0)).collect::<UInt64Array>()),
@@ -128,7 +128,7 @@ impl Aggregate for DiffusionCoefficient {
         ])
     }
 
-    fn answer(&self, groups: &[Diffusion], _: &DataType) -> Result<ArrayRef> {
-        Ok(Arc::new(groups.iter().map(Diffusion::coefficient).collect::<Float64Array>()))
+    fn answer(&self, groups: &[DiffusionSums], _: &DataType) -> Result<ArrayRef> {
+        Ok(Arc::new(groups.iter().map(DiffusionSums::coefficient).collect::<Float64Array>()))
     }
 }

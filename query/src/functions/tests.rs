@@ -8,7 +8,7 @@ use arrow::datatypes::{DataType, Field, Float32Type, Float64Type, Int64Type};
 use arrow::record_batch::RecordBatch;
 use arrow::util::pretty::pretty_format_batches;
 use bytes::Bytes;
-use echolake_lake::{FileName, Lake, References, VisibleRun, encode};
+use echolake_lake::{FileName, Lake, ReferenceSurfaces, VisibleRun, encode};
 use echolake_schema::tables::Table;
 use echolake_schema::{Rig, Symmetry};
 use parquet::arrow::arrow_reader::ParquetRecordBatchReaderBuilder;
@@ -30,7 +30,7 @@ impl Small {
     async fn new() -> Self {
         let folder = tempfile::tempdir().expect("a folder");
         let url = folder.path().join("lake").display().to_string();
-        let lake = Lake::open_or_create(&url, &Rig::paper(), &References::default()).await.expect("a lake");
+        let lake = Lake::open_or_create(&url, &Rig::paper(), &ReferenceSurfaces::default()).await.expect("a lake");
         let golden = golden();
         put(&lake, "0015_0", &golden, "panel_ir", "reflected_ir").await;
         put(&lake, "flat", &golden, "flat_ir", "flat_reflected_ir").await;

@@ -34,7 +34,7 @@ use datafusion::sql::parser::Statement;
 use datafusion::sql::sqlparser::ast::{
     Expr as SqlExpr, FunctionArg, FunctionArgExpr, ObjectNamePart, TableFactor, VisitMut as _, VisitorMut,
 };
-use echolake_lake::Snapshot;
+use echolake_lake::LakeSnapshot;
 
 use crate::Error;
 pub use contents::{Contents, Topic};
@@ -78,7 +78,7 @@ type Call = (Function, Vec<String>);
 /// [`Error::Query`] for a call that is not right, [`Error::Execution`] where a file cannot be read.
 pub(crate) async fn register(
     context: &SessionContext,
-    snapshot: &Snapshot,
+    snapshot: &LakeSnapshot,
     files: &Arc<Files>,
     statement: &mut Statement,
 ) -> Result<(), Error> {
@@ -100,7 +100,7 @@ pub(crate) async fn register(
 async fn table(
     function: Function,
     arguments: &[String],
-    snapshot: &Snapshot,
+    snapshot: &LakeSnapshot,
     files: &Arc<Files>,
 ) -> Result<Arc<dyn TableProvider>, Fault> {
     let usage = || Fault::call(format!("{} is called with {} texts", function.name(), arguments.len()), USAGE);

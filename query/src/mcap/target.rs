@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-use echolake_lake::{Lake, Snapshot, VisibleRun};
+use echolake_lake::{Lake, LakeSnapshot, VisibleRun};
 use futures::{StreamExt as _, TryStreamExt as _};
 use object_store::path::Path;
 
@@ -26,7 +26,7 @@ pub(super) struct Target {
 
 impl Target {
     /// Opens the files that `pattern` means, each once.
-    pub(super) async fn open(pattern: &str, snapshot: &Snapshot, files: &Files) -> Result<Vec<Self>, Fault> {
+    pub(super) async fn open(pattern: &str, snapshot: &LakeSnapshot, files: &Files) -> Result<Vec<Self>, Fault> {
         let mut meant = BTreeMap::new();
         for part in pattern.split(',').map(str::trim) {
             if part.contains('/') || part.ends_with(EXTENSION) {
@@ -49,7 +49,7 @@ fn names(run: &VisibleRun) -> (String, String) {
     (run.surface.to_string(), run.run.to_string())
 }
 
-fn runs(pattern: &str, snapshot: &Snapshot) -> Result<Vec<Meant>, Fault> {
+fn runs(pattern: &str, snapshot: &LakeSnapshot) -> Result<Vec<Meant>, Fault> {
     let meant = |r: &&VisibleRun| matches(pattern, r.surface.as_str()) || matches(pattern, r.run.as_str());
     let found = snapshot.runs().filter(meant).map(|r| (Lake::run_path(&r.surface, &r.run), Some(names(r))));
     let found: Vec<_> = found.collect();

@@ -5,7 +5,7 @@ use std::io::Cursor;
 use arrow::array::{AsArray as _, RecordBatch};
 use arrow::datatypes::Int64Type;
 use arrow::util::pretty::pretty_format_batches;
-use echolake_lake::{FileName, Lake, References, VisibleRun, encode};
+use echolake_lake::{FileName, Lake, ReferenceSurfaces, VisibleRun, encode};
 use echolake_schema::Rig;
 use echolake_schema::tables::Table;
 use mcap::records::MessageHeader;
@@ -26,7 +26,7 @@ struct TestLake {
 }
 
 async fn lake() -> TestLake {
-    let lake = Lake::open_or_create("memory://", &Rig::paper(), &References::default()).await.expect("a lake");
+    let lake = Lake::open_or_create("memory://", &Rig::paper(), &ReferenceSurfaces::default()).await.expect("a lake");
     let session = Session::new(&lake).expect("a session");
     TestLake { lake, session }
 }

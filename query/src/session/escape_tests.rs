@@ -1,6 +1,6 @@
 //! Three hundred attempts to bypass the gate: none reads, writes or changes anything.
 
-use echolake_lake::{Lake, References};
+use echolake_lake::{Lake, ReferenceSurfaces};
 use echolake_schema::Rig;
 
 use super::attempts::{SECRET, attempts, files};
@@ -22,7 +22,7 @@ async fn no_attempt_has_an_effect() {
     std::fs::write(&secret, format!("a,b\n{SECRET},1\n")).expect("written");
     std::fs::create_dir(&outside).expect("made");
     let url = folder.path().join("lake").display().to_string();
-    let lake = Lake::open_or_create(&url, &Rig::paper(), &References::default()).await.expect("a lake");
+    let lake = Lake::open_or_create(&url, &Rig::paper(), &ReferenceSurfaces::default()).await.expect("a lake");
     let before = files(folder.path());
     let session = Session::new(&lake).expect("a session");
     let all = attempts(&secret, &outside);

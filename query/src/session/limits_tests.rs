@@ -3,7 +3,7 @@
 use std::time::{Duration, Instant};
 
 use datafusion::sql::sqlparser::dialect::GenericDialect;
-use echolake_lake::{Lake, References};
+use echolake_lake::{Lake, ReferenceSurfaces};
 use echolake_schema::Rig;
 
 use super::*;
@@ -20,7 +20,7 @@ const BARREN: &str = "select count(*) from generate_series(1, 1000000) a(x) join
 async fn engine(limits: Limits) -> (tempfile::TempDir, Engine) {
     let folder = tempfile::tempdir().expect("a folder");
     let url = folder.path().join("lake").display().to_string();
-    let lake = Lake::open_or_create(&url, &Rig::paper(), &References::default()).await.expect("a lake");
+    let lake = Lake::open_or_create(&url, &Rig::paper(), &ReferenceSurfaces::default()).await.expect("a lake");
     (folder, Engine::new(&lake, limits).expect("an engine"))
 }
 

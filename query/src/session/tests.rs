@@ -6,7 +6,7 @@ use arrow::array::{ArrayRef, AsArray as _, Int64Array, StringArray};
 use arrow::compute::cast;
 use arrow::datatypes::{DataType, Field, Float64Type, Int64Type};
 use datafusion::execution::object_store::ObjectStoreUrl;
-use echolake_lake::{FileName, References, VisibleRun, encode};
+use echolake_lake::{FileName, ReferenceSurfaces, VisibleRun, encode};
 use echolake_schema::Rig;
 use echolake_schema::tables::Table;
 
@@ -16,7 +16,7 @@ use crate::PredicateForm;
 async fn lake() -> (tempfile::TempDir, Lake) {
     let folder = tempfile::tempdir().expect("a folder");
     let url = folder.path().join("lake").display().to_string();
-    let lake = Lake::open_or_create(&url, &Rig::paper(), &References::default()).await.expect("a lake");
+    let lake = Lake::open_or_create(&url, &Rig::paper(), &ReferenceSurfaces::default()).await.expect("a lake");
     (folder, lake)
 }
 

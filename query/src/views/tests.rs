@@ -7,7 +7,7 @@ use arrow::buffer::OffsetBuffer;
 use arrow::compute::{cast, concat_batches};
 use arrow::datatypes::{DataType, Field, Float32Type, Float64Type, Int32Type, Int64Type};
 use arrow::record_batch::RecordBatch;
-use echolake_lake::{FileName, Lake, References, VisibleRun, encode};
+use echolake_lake::{FileName, Lake, ReferenceSurfaces, VisibleRun, encode};
 use echolake_schema::tables::{COMMENT, Table, UNIT};
 use echolake_schema::{Rig, Symmetry};
 
@@ -23,7 +23,7 @@ const TABLES: [Table; 6] =
 async fn lake() -> (tempfile::TempDir, Lake) {
     let folder = tempfile::tempdir().expect("a folder");
     let url = folder.path().join("lake").display().to_string();
-    let lake = Lake::open_or_create(&url, &Rig::paper(), &References::default()).await.expect("a lake");
+    let lake = Lake::open_or_create(&url, &Rig::paper(), &ReferenceSurfaces::default()).await.expect("a lake");
     (folder, lake)
 }
 

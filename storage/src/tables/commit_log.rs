@@ -26,14 +26,14 @@ pub struct DataFile {
     /// Least and greatest values, if the log has them.
     pub stats: Option<FileStats>,
     /// If it was merged from files of several runs: their parts, in the order of their rows, which are contiguous.
-    pub parts: Vec<Part>,
+    pub parts: Vec<RunPart>,
     /// The runs of parts that a snapshot does not show; empty as the log gives it.
     pub hidden: Vec<RunId>,
 }
 
 /// The rows of one run in a file that was merged from several.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Part {
+pub struct RunPart {
     /// The run's surface.
     pub surface: SurfaceId,
     /// The run.
@@ -52,7 +52,7 @@ impl DataFile {
     }
 
     /// The parts that readers see, each with the range of its rows in the file.
-    pub fn visible_parts(&self) -> impl Iterator<Item = (&Part, Range<u64>)> {
+    pub fn visible_parts(&self) -> impl Iterator<Item = (&RunPart, Range<u64>)> {
         let mut end = 0;
         let placed = self.parts.iter().map(move |part| {
             let start = end;
@@ -82,14 +82,14 @@ pub struct NewFile {
     /// Delta's statistics, JSON.
     pub stats: String,
     /// The files that it replaces, if it replaces any.
-    pub replaces: Option<Replaces>,
+    pub replaces: Option<ReplacedFiles>,
     /// The parts that it was merged from, if it was merged.
-    pub parts: Vec<Part>,
+    pub parts: Vec<RunPart>,
 }
 
 /// The files that a new one replaces. If other files have taken their place, the new one is not added.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Replaces {
+pub struct ReplacedFiles {
     /// Beginning of the names of all files in that place; None if the names alone are the place.
     pub prefix: Option<String>,
     /// The names that are expected there; they go with the same commit.
@@ -98,7 +98,7 @@ pub struct Replaces {
 
 /// Effect of a commit on a reader that follows a table.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub enum Effect {
+pub enum CommitEffect {
     /// Rows come or go.
     #[default]
     Rows,
@@ -108,18 +108,18 @@ pub enum Effect {
 
 /// One change of one table: all of it or nothing.
 #[derive(Debug, Clone, Default)]
-pub struct Commit {
+pub struct TableCommit {
     /// Files that come.
     pub add: Vec<NewFile>,
     /// Files that go; one that is already gone is passed over.
     pub remove: Vec<Path>,
     /// Its effect on readers.
-    pub effect: Effect,
+    pub effect: CommitEffect,
 }
 
 /// The names of a table's files, as the log knows them.
 #[derive(Debug, Clone, Default)]
-pub struct History {
+pub struct FileHistory {
     /// Those that are in the table.
     pub current: HashSet<String>,
     /// Those that were, and when they went. The log forgets them after a week.
@@ -128,7 +128,7 @@ pub struct History {
 
 /// Outcome of adding a new file.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Committed {
+pub enum CommitOutcome {
     /// It is in the log now.
     Now,
     /// It was there before.
@@ -156,7 +156,7 @@ pub trait CommitLog: Send + Sync + std::fmt::Debug {
     /// Returns whether a file of this name is in the log.
     async fn has(&self, table: Table, name: &str) -> Result<bool>;
     /// Names of the current and the removed files; None if there is no log.
-    async fn history(&self, table: Table) -> Result<Option<History>>;
+    async fn history(&self, table: Table) -> Result<Option<FileHistory>>;
     /// Makes a change; returns the outcome of each new file, in order. Repeating the same change adds nothing.
-    async fn commit(&self, table: Table, commit: &Commit) -> Result<Vec<Committed>>;
+    async fn commit(&self, table: Table, commit: &TableCommit) -> Result<Vec<CommitOutcome>>;
 }

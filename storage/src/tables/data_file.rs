@@ -37,7 +37,7 @@ pub struct FileEncoder {
     schema: SchemaRef,
     /// Made with the first batch, from whose rows the size of row groups follows.
     writer: Option<ArrowWriter<Vec<u8>>>,
-    stats: Stats,
+    stats: StatsCollector,
 }
 
 /// A file's bytes, and Delta's statistics of it as JSON.
@@ -50,7 +50,7 @@ pub struct EncodedFile {
 impl FileEncoder {
     /// A file of a table, whose schema is given because it depends on the lake's rig.
     pub fn new(table: Table, schema: SchemaRef) -> Self {
-        let stats = Stats::new(&schema);
+        let stats = StatsCollector::new(&schema);
         Self { table, schema, writer: None, stats }
     }
 
@@ -152,7 +152,7 @@ fn properties(table: Table, schema: &SchemaRef, first: &RecordBatch) -> WriterPr
 }
 
 /// Delta's statistics of a file, gathered batch by batch.
-struct Stats {
+struct StatsCollector {
     rows: usize,
     columns: Vec<ColumnStats>,
 }
@@ -167,7 +167,7 @@ struct ColumnStats {
     unknown: bool,
 }
 
-impl Stats {
+impl StatsCollector {
     fn new(schema: &SchemaRef) -> Self {
         let told = |kind: &DataType| !matches!(kind, DataType::List(_) | DataType::Boolean | DataType::Timestamp(..));
         let columns = schema.fields().iter().enumerate().take(STATS_COLUMNS).filter(|(_, f)| told(f.data_type()));
@@ -287,7 +287,7 @@ mod tests {
             "maxValues": { "id": 7, "name": "b" },
             "nullCount": { "id": 0, "name": 1, "x": 0 },
         });
-        let mut stats = Stats::new(&schema);
+        let mut stats = StatsCollector::new(&schema);
         batches.iter().for_each(|b| stats.add(b));
         assert_eq!(stats.json(), expected);
     }

@@ -27,7 +27,8 @@ use self::table_state::TableState;
 use crate::tables::snapshot::{decode_parts, encode_parts, is_merged};
 use crate::tables::versions;
 use crate::{
-    Commit, CommitLog, Committed, DataFile, Effect, Error, FileStats, History, NewFile, Part, Result, TableVersion,
+    CommitEffect, CommitLog, CommitOutcome, DataFile, Error, FileHistory, FileStats, NewFile, Result, RunPart,
+    TableCommit, TableVersion,
 };
 
 /// Tries of one commit against other writers; each loses to a commit that went through.
@@ -81,7 +82,12 @@ impl DeltaLog {
     }
 
     // Written against one version, so that it takes effect only if that is still the newest.
-    async fn try_commit(&self, table: Table, state: &Arc<TableState>, change: &Change<'_>) -> Result<CommitAttempt> {
+    async fn try_commit(
+        &self,
+        table: Table,
+        state: &Arc<TableState>,
+        change: &PendingChange<'_>,
+    ) -> Result<CommitAttempt> {
         let log = self.log_folder(table);
         log.check_writable(state)?;
         let now = Utc::now();
@@ -99,21 +105,21 @@ impl DeltaLog {
 }
 
 /// The rest of a commit that one version of a table still lacks.
-struct Change<'a> {
-    outcomes: Vec<Committed>,
+struct PendingChange<'a> {
+    outcomes: Vec<CommitOutcome>,
     add: Vec<&'a NewFile>,
     remove: BTreeSet<String>,
-    effect: Effect,
+    effect: CommitEffect,
 }
 
-impl<'a> Change<'a> {
-    fn of(commit: &'a Commit, mut names: HashSet<String>) -> Self {
+impl<'a> PendingChange<'a> {
+    fn of(commit: &'a TableCommit, mut names: HashSet<String>) -> Self {
         let gone = commit.remove.iter().filter_map(Path::filename).filter(|n| names.contains(*n));
         let remove = gone.map(str::to_owned).collect();
         let mut change = Self { outcomes: Vec::new(), add: Vec::new(), remove, effect: commit.effect };
         for file in &commit.add {
             let outcome = change.outcome(file, &names);
-            if outcome == Committed::Now {
+            if outcome == CommitOutcome::Now {
                 if let Some(replaces) = &file.replaces {
                     names.retain(|name| !replaces.names.contains(name));
                     change.remove.extend(replaces.names.iter().cloned());
@@ -129,12 +135,12 @@ impl<'a> Change<'a> {
 
     /// The commit's lines, against the version whose state is given.
     fn log_lines(&self, state: &TableState, now_millis: i64) -> Vec<LogLine> {
-        let data_change = self.effect == Effect::Rows;
+        let data_change = self.effect == CommitEffect::Rows;
         let largest = self.add.iter().map(|f| f.bytes).max().unwrap_or(0);
         let (operation, parameters) = match self.effect {
-            Effect::Rows if self.remove.is_empty() => ("WRITE", json!({ "mode": "Append" })),
-            Effect::Rows => ("WRITE", json!({ "mode": "Overwrite" })),
-            Effect::Layout => ("OPTIMIZE", json!({ "targetSize": largest.to_string() })),
+            CommitEffect::Rows if self.remove.is_empty() => ("WRITE", json!({ "mode": "Append" })),
+            CommitEffect::Rows => ("WRITE", json!({ "mode": "Overwrite" })),
+            CommitEffect::Layout => ("OPTIMIZE", json!({ "targetSize": largest.to_string() })),
         };
         let removed = state.files.values().filter(|f| self.remove.contains(&file_name(&f.path)));
         let removed =
@@ -144,17 +150,17 @@ impl<'a> Change<'a> {
         std::iter::once(commit_info(operation, parameters, now_millis)).chain(added).chain(removed).collect()
     }
 
-    fn outcome(&self, file: &NewFile, names: &HashSet<String>) -> Committed {
+    fn outcome(&self, file: &NewFile, names: &HashSet<String>) -> CommitOutcome {
         if names.contains(&file.name) {
-            return Committed::Before;
+            return CommitOutcome::Before;
         }
-        let Some(replaces) = &file.replaces else { return Committed::Now };
+        let Some(replaces) = &file.replaces else { return CommitOutcome::Now };
         let expected = replaces.names.iter().all(|n| names.contains(n));
         let alone = replaces
             .prefix
             .as_ref()
             .is_none_or(|prefix| names.iter().filter(|n| n.starts_with(prefix)).count() == replaces.names.len());
-        if expected && alone { Committed::Now } else { Committed::Outdated }
+        if expected && alone { CommitOutcome::Now } else { CommitOutcome::Outdated }
     }
 }
 
@@ -219,19 +225,19 @@ impl CommitLog for DeltaLog {
         Ok(self.load(table).await?.is_some_and(|state| state.files.keys().any(|path| decoded_name(path) == name)))
     }
 
-    async fn history(&self, table: Table) -> Result<Option<History>> {
+    async fn history(&self, table: Table) -> Result<Option<FileHistory>> {
         let Some(state) = self.load(table).await? else { return Ok(None) };
         let removed = state.removed.values().map(|remove| {
             let at = remove.deletion_timestamp.and_then(DateTime::from_timestamp_millis);
             (file_name(&remove.path), at.unwrap_or_default())
         });
-        Ok(Some(History { current: file_names(&state), removed: removed.collect() }))
+        Ok(Some(FileHistory { current: file_names(&state), removed: removed.collect() }))
     }
 
-    async fn commit(&self, table: Table, commit: &Commit) -> Result<Vec<Committed>> {
+    async fn commit(&self, table: Table, commit: &TableCommit) -> Result<Vec<CommitOutcome>> {
         for _ in 0..COMMIT_TRIES {
             let state = self.require(table).await?;
-            let change = Change::of(commit, file_names(&state));
+            let change = PendingChange::of(commit, file_names(&state));
             if change.add.is_empty() && change.remove.is_empty() {
                 return Ok(change.outcomes);
             }
@@ -278,7 +284,7 @@ fn decoded_name(path: &str) -> Cow<'_, str> {
     percent_decode_str(path).decode_utf8_lossy()
 }
 
-fn parts(table: Table, add: &AddFile) -> Result<Vec<Part>> {
+fn parts(table: Table, add: &AddFile) -> Result<Vec<RunPart>> {
     let text = add.tags.as_ref().and_then(|tags| tags.get(PARTS).cloned().flatten());
     text.and_then(|text| decode_parts(&text)).ok_or_else(|| {
         let reason = format!("`{}` has lost the list of its parts; {REBUILD_HINT}", add.path);
@@ -354,10 +360,10 @@ fn delta_type(data_type: &ArrowType) -> Value {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::Replaces;
+    use crate::ReplacedFiles;
 
     fn file(name: &str, replaces: Option<(&str, &[&str])>) -> NewFile {
-        let replaces = replaces.map(|(prefix, names)| Replaces {
+        let replaces = replaces.map(|(prefix, names)| ReplacedFiles {
             prefix: Some(prefix.to_owned()).filter(|p| !p.is_empty()),
             names: names.iter().map(|n| (*n).to_owned()).collect(),
         });
@@ -370,13 +376,13 @@ mod tests {
 
     #[test]
     fn what_is_there_is_not_added_again_and_what_is_gone_not_removed() {
-        let commit = Commit {
+        let commit = TableCommit {
             add: vec![file("a", None), file("b", None), file("b", None)],
             remove: vec![Path::from("tables/runs/c"), Path::from("tables/runs/d")],
-            effect: Effect::Rows,
+            effect: CommitEffect::Rows,
         };
-        let change = Change::of(&commit, names(&["a", "c"]));
-        assert_eq!(change.outcomes, [Committed::Before, Committed::Now, Committed::Before]);
+        let change = PendingChange::of(&commit, names(&["a", "c"]));
+        assert_eq!(change.outcomes, [CommitOutcome::Before, CommitOutcome::Now, CommitOutcome::Before]);
         assert_eq!(change.add.iter().map(|f| f.name.as_str()).collect::<Vec<_>>(), ["b"]);
         assert_eq!(change.remove.iter().collect::<Vec<_>>(), ["c"]);
     }
@@ -384,23 +390,23 @@ mod tests {
     #[test]
     fn a_file_takes_the_place_of_what_it_expects_there_and_of_nothing_else() {
         let outcomes = |add: Vec<NewFile>, there: &[&str]| {
-            let commit = Commit { add, ..Commit::default() };
-            let change = Change::of(&commit, names(there));
+            let commit = TableCommit { add, ..TableCommit::default() };
+            let change = PendingChange::of(&commit, names(there));
             (change.outcomes.clone(), change.remove.into_iter().collect::<Vec<_>>())
         };
         let new = || file("x.2", Some(("x.", &["x.1"])));
-        assert_eq!(outcomes(vec![new()], &["x.1", "y.1"]), (vec![Committed::Now], vec!["x.1".to_owned()]));
-        assert_eq!(outcomes(vec![new()], &["x.3"]), (vec![Committed::Outdated], vec![]));
-        assert_eq!(outcomes(vec![new()], &["x.1", "x.3"]), (vec![Committed::Outdated], vec![]));
-        assert_eq!(outcomes(vec![new()], &["x.2"]), (vec![Committed::Before], vec![]));
+        assert_eq!(outcomes(vec![new()], &["x.1", "y.1"]), (vec![CommitOutcome::Now], vec!["x.1".to_owned()]));
+        assert_eq!(outcomes(vec![new()], &["x.3"]), (vec![CommitOutcome::Outdated], vec![]));
+        assert_eq!(outcomes(vec![new()], &["x.1", "x.3"]), (vec![CommitOutcome::Outdated], vec![]));
+        assert_eq!(outcomes(vec![new()], &["x.2"]), (vec![CommitOutcome::Before], vec![]));
         let merged = || file("m", Some(("", &["x.1", "y.1"])));
         let gone = vec!["x.1".to_owned(), "y.1".to_owned()];
-        assert_eq!(outcomes(vec![merged()], &["x.1", "y.1", "x.2"]), (vec![Committed::Now], gone));
-        assert_eq!(outcomes(vec![merged()], &["x.1", "y.2"]), (vec![Committed::Outdated], vec![]));
+        assert_eq!(outcomes(vec![merged()], &["x.1", "y.1", "x.2"]), (vec![CommitOutcome::Now], gone));
+        assert_eq!(outcomes(vec![merged()], &["x.1", "y.2"]), (vec![CommitOutcome::Outdated], vec![]));
         let first = |name| file(name, Some(("x.", &[])));
         assert_eq!(
             outcomes(vec![first("x.1"), first("x.2")], &[]),
-            (vec![Committed::Now, Committed::Outdated], vec![])
+            (vec![CommitOutcome::Now, CommitOutcome::Outdated], vec![])
         );
     }
 }

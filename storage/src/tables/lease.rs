@@ -22,16 +22,16 @@ const RENEW_EVERY: Duration = Duration::from_secs(60);
 
 /// The lease, held.
 #[derive(Debug)]
-pub(crate) struct Lease {
+pub(crate) struct MaintenanceLease {
     store: Arc<dyn ObjectStore>,
     location: String,
-    record: Record,
+    record: LeaseRecord,
     renewed: Instant,
 }
 
 /// Contents of the object.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-struct Record {
+struct LeaseRecord {
     /// Distinguishes all that ever held it.
     holder: String,
     host: String,
@@ -39,7 +39,7 @@ struct Record {
     expires: DateTime<Utc>,
 }
 
-impl Record {
+impl LeaseRecord {
     fn new() -> Self {
         let (host, pid, now) = (host(), std::process::id(), Utc::now());
         let holder = format!("{host}.{pid}.{}", now.timestamp_nanos_opt().unwrap_or_default());
@@ -52,13 +52,13 @@ impl Record {
     }
 }
 
-impl Lease {
+impl MaintenanceLease {
     /// Acquires the lease; an expired one is taken over.
     ///
     /// # Errors
     /// [`Error::Maintained`] if another process holds it, or what the store says.
     pub(crate) async fn take(lake: &Lake) -> Result<Self> {
-        let (store, location, record) = (lake.store(), lake.location().to_owned(), Record::new());
+        let (store, location, record) = (lake.store(), lake.location().to_owned(), LeaseRecord::new());
         let path = Path::from(PATH);
         let failed = |e| Error::store("write", PATH, e);
         if let Some(held) = read(store.as_ref()).await? {
@@ -117,7 +117,7 @@ impl Lease {
 }
 
 // One that cannot be read holds from its making on, as any other.
-async fn read(store: &dyn ObjectStore) -> Result<Option<Record>> {
+async fn read(store: &dyn ObjectStore) -> Result<Option<LeaseRecord>> {
     let failed = |e| Error::store("read", PATH, e);
     let found = match store.get(&Path::from(PATH)).await {
         Ok(found) => found,
@@ -130,7 +130,7 @@ async fn read(store: &dyn ObjectStore) -> Result<Option<Record>> {
         Err(object_store::Error::NotFound { .. }) => return Ok(None),
         Err(e) => return Err(failed(e)),
     };
-    let unreadable = || Record { holder: String::new(), host: "?".into(), pid: 0, expires: made + HOLDS };
+    let unreadable = || LeaseRecord { holder: String::new(), host: "?".into(), pid: 0, expires: made + HOLDS };
     Ok(Some(serde_json::from_slice(&bytes).unwrap_or_else(|_| unreadable())))
 }
 
@@ -144,30 +144,30 @@ mod tests {
     use echolake_schema::Rig;
 
     use super::*;
-    use crate::References;
+    use crate::ReferenceSurfaces;
 
     async fn lake() -> Lake {
-        Lake::open_or_create("memory://", &Rig::paper(), &References::default()).await.expect("a lake")
+        Lake::open_or_create("memory://", &Rig::paper(), &ReferenceSurfaces::default()).await.expect("a lake")
     }
 
     #[tokio::test]
     async fn one_holds_it_and_the_second_is_told_who() {
         let lake = lake().await;
-        let mut first = Lease::take(&lake).await.expect("free");
+        let mut first = MaintenanceLease::take(&lake).await.expect("free");
         first.keep().await.expect("held");
-        let error = Lease::take(&lake).await.expect_err("held").to_string();
+        let error = MaintenanceLease::take(&lake).await.expect_err("held").to_string();
         assert!(error.contains(&format!("process {}", std::process::id())) && error.contains(&host()), "{error}");
         first.release().await.expect("given back");
-        Lease::take(&lake).await.expect("free again");
+        MaintenanceLease::take(&lake).await.expect("free again");
     }
 
     #[tokio::test]
     async fn a_dead_holder_is_followed_and_notices_where_it_was_not_dead() {
         let lake = lake().await;
-        let mut first = Lease::take(&lake).await.expect("free");
+        let mut first = MaintenanceLease::take(&lake).await.expect("free");
         first.record.expires = Utc::now() - TimeDelta::seconds(1);
         lake.store().put(&Path::from(PATH), first.record.bytes().into()).await.expect("written");
-        let mut second = Lease::take(&lake).await.expect("run out");
+        let mut second = MaintenanceLease::take(&lake).await.expect("run out");
         assert!(matches!(first.keep().await, Err(Error::LeaseLost { .. })));
         first.release().await.expect("not ours, left alone");
         second.keep().await.expect("held");

@@ -11,12 +11,15 @@ mod snapshot;
 mod vacuum;
 mod versions;
 
-pub use commit_log::{Commit, CommitLog, Committed, DataFile, Effect, FileStats, History, NewFile, Part, Replaces};
+pub use commit_log::{
+    CommitEffect, CommitLog, CommitOutcome, DataFile, FileHistory, FileStats, NewFile, ReplacedFiles, RunPart,
+    TableCommit,
+};
 pub use data_file::{EncodedFile, FileEncoder, encode};
-pub use optimize::{Merging, Optimized, TARGET_BYTES, TableOptimized};
-pub use snapshot::{FileName, Snapshot, VisibleRun};
-pub use vacuum::{Deletion, Freed, KEEP_HOURS, Vacuumed};
-pub use versions::{Moment, NoMoment, TableVersion};
+pub use optimize::{MergeProgress, OptimizeReport, TARGET_BYTES, TableOptimizeReport};
+pub use snapshot::{FileName, LakeSnapshot, VisibleRun};
+pub use vacuum::{DeletedFile, DeletionMode, KEEP_HOURS, VacuumReport};
+pub use versions::{LakeMoment, NoMoment, TableVersion};
 
 use arrow::record_batch::RecordBatch;
 use echolake_schema::tables::{Source, Table};
@@ -28,18 +31,18 @@ use crate::{Error, LAKE_FORMAT, Lake, Result};
 
 /// A file in the store that no commit names yet.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Staged {
+pub struct StagedFile {
     pub(crate) table: Table,
     pub(crate) file: NewFile,
 }
 
-impl Staged {
+impl StagedFile {
     /// Makes a run's row replace its present rows, which are these files or none. If there are others by the time of
-    /// the commit, the outcome is [`Committed::Outdated`].
+    /// the commit, the outcome is [`CommitOutcome::Outdated`].
     #[must_use]
     pub fn replacing<'a>(mut self, run: &VisibleRun, old: impl IntoIterator<Item = &'a DataFile>) -> Self {
         let names = old.into_iter().filter_map(|f| f.path.filename()).map(str::to_owned).collect();
-        self.file.replaces = Some(Replaces { prefix: Some(run.prefix()), names });
+        self.file.replaces = Some(ReplacedFiles { prefix: Some(run.prefix()), names });
         self
     }
 }
@@ -77,20 +80,20 @@ impl Lake {
     ///
     /// # Errors
     /// [`Error::Log`] if a table's log is damaged.
-    pub async fn snapshot(&self) -> Result<Snapshot> {
-        Snapshot::take(self.log()).await
+    pub async fn snapshot(&self) -> Result<LakeSnapshot> {
+        LakeSnapshot::take(self.log()).await
     }
 
     /// Puts a file's bytes into the store, for a commit to name. No reader sees them before that.
     ///
     /// # Errors
     /// What the store says.
-    pub async fn stage(&self, table: Table, name: &FileName, file: EncodedFile) -> Result<Staged> {
+    pub async fn stage(&self, table: Table, name: &FileName, file: EncodedFile) -> Result<StagedFile> {
         let name = name.compose();
         let path = folder(table).join(name.as_str());
         let (bytes, stats) = (file.bytes.len() as u64, file.stats);
         self.store().put(&path, file.bytes.into()).await.map_err(|e| Error::store("write", &path, e))?;
-        Ok(Staged { table, file: NewFile { name, bytes, stats, replaces: None, parts: Vec::new() } })
+        Ok(StagedFile { table, file: NewFile { name, bytes, stats, replaces: None, parts: Vec::new() } })
     }
 
     /// Returns whether a file of this name is in the table.
@@ -107,8 +110,8 @@ impl Lake {
     ///
     /// # Errors
     /// What the store says. Tables that were committed before stay so, unseen by readers; repeating the call resumes.
-    pub async fn commit(&self, staged: &[Staged]) -> Result<Vec<Committed>> {
-        let mut outcomes = vec![Committed::Before; staged.len()];
+    pub async fn commit(&self, staged: &[StagedFile]) -> Result<Vec<CommitOutcome>> {
+        let mut outcomes = vec![CommitOutcome::Before; staged.len()];
         let (pointers, others): (Vec<_>, Vec<_>) = Table::ALL.into_iter().partition(|table| *table == Table::Runs);
         for tables in [others, pointers] {
             // Each runs to its end, even if another fails.
@@ -120,13 +123,13 @@ impl Lake {
     }
 
     // Returns the outcome of each file of one table, with its index among all.
-    async fn commit_table(&self, table: Table, staged: &[Staged]) -> Result<Vec<(usize, Committed)>> {
+    async fn commit_table(&self, table: Table, staged: &[StagedFile]) -> Result<Vec<(usize, CommitOutcome)>> {
         let of: Vec<_> = (0..staged.len()).filter(|i| staged[*i].table == table).collect();
         if of.is_empty() {
             return Ok(Vec::new());
         }
         let add = of.iter().map(|i| staged[*i].file.clone()).collect();
-        let done = self.log().commit(table, &Commit { add, ..Commit::default() }).await?;
+        let done = self.log().commit(table, &TableCommit { add, ..TableCommit::default() }).await?;
         Ok(of.into_iter().zip(done).collect())
     }
 
@@ -134,9 +137,9 @@ impl Lake {
     ///
     /// # Errors
     /// [`Error::Encode`] if the rows do not fit the table, or what the store says.
-    pub async fn append_rows(&self, table: Table, name: &FileName, batches: &[RecordBatch]) -> Result<Committed> {
+    pub async fn append_rows(&self, table: Table, name: &FileName, batches: &[RecordBatch]) -> Result<CommitOutcome> {
         if self.has(table, name).await? {
-            return Ok(Committed::Before);
+            return Ok(CommitOutcome::Before);
         }
         let staged = self.stage(table, name, encode(table, &table.schema(self.rig()), batches)?).await?;
         Ok(self.commit(&[staged]).await?[0])
@@ -154,7 +157,7 @@ impl Lake {
             let remove: Vec<_> = snapshot.superseded(table).iter().map(|f| f.path.clone()).collect();
             if !remove.is_empty() {
                 count += remove.len();
-                self.log().commit(table, &Commit { remove, ..Commit::default() }).await?;
+                self.log().commit(table, &TableCommit { remove, ..TableCommit::default() }).await?;
             }
             for file in snapshot.outgrown(table) {
                 self.rewrite(table, file).await?;
@@ -170,10 +173,10 @@ mod tests {
     use echolake_schema::Rig;
 
     use super::*;
-    use crate::References;
+    use crate::ReferenceSurfaces;
 
     async fn paper(url: &str) -> Result<Lake> {
-        Lake::open_or_create(url, &Rig::paper(), &References::default()).await
+        Lake::open_or_create(url, &Rig::paper(), &ReferenceSurfaces::default()).await
     }
 
     #[tokio::test]
@@ -182,8 +185,8 @@ mod tests {
         let grid = lake.rig().grid().expect("a grid");
         let rows = || vec![rig_tables::points(lake.rig(), &grid).expect("rows")];
         let name = || FileName::Rig { derivation: "test".into() };
-        assert_eq!(lake.append_rows(Table::Points, &name(), &rows()).await.expect("added"), Committed::Now);
-        assert_eq!(lake.append_rows(Table::Points, &name(), &rows()).await.expect("known"), Committed::Before);
+        assert_eq!(lake.append_rows(Table::Points, &name(), &rows()).await.expect("added"), CommitOutcome::Now);
+        assert_eq!(lake.append_rows(Table::Points, &name(), &rows()).await.expect("known"), CommitOutcome::Before);
         assert_eq!(lake.log().files(Table::Points).await.expect("files").len(), 2);
     }
 

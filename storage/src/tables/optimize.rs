@@ -11,9 +11,10 @@ use futures::TryStreamExt as _;
 use serde::Serialize;
 use sha2::{Digest as _, Sha256};
 
-use crate::tables::lease::Lease;
+use crate::tables::lease::MaintenanceLease;
 use crate::{
-    Commit, Committed, DataFile, Effect, Error, FileEncoder, FileName, Lake, Part, Replaces, Result, Snapshot,
+    CommitEffect, CommitOutcome, DataFile, Error, FileEncoder, FileName, Lake, LakeSnapshot, ReplacedFiles, Result,
+    RunPart, TableCommit,
 };
 
 /// Default size that files are merged to: few enough for a million responses, small enough to be held in memory.
@@ -23,7 +24,7 @@ const DIGEST_DIGITS: usize = 16;
 
 /// Progress of a merge.
 #[derive(Debug, Clone, Copy)]
-pub struct Merging {
+pub struct MergeProgress {
     /// The table at work.
     pub table: Table,
     /// Files merged, of all tables.
@@ -34,16 +35,16 @@ pub struct Merging {
 
 /// Report of merging a lake's files.
 #[derive(Debug, Clone, Default, Serialize)]
-pub struct Optimized {
+pub struct OptimizeReport {
     /// The tables that were changed.
-    pub tables: Vec<TableOptimized>,
+    pub tables: Vec<TableOptimizeReport>,
     /// It was stopped before its end.
     pub stopped: bool,
 }
 
 /// Report of merging a table's files.
 #[derive(Debug, Clone, Serialize)]
-pub struct TableOptimized {
+pub struct TableOptimizeReport {
     /// Its name.
     pub table: &'static str,
     /// Files that were merged.
@@ -68,9 +69,9 @@ impl Lake {
         &self,
         target_bytes: u64,
         stop: &AtomicBool,
-        progress: &mut (dyn FnMut(Merging) + Send),
-    ) -> Result<Optimized> {
-        let mut lease = Lease::take(self).await?;
+        progress: &mut (dyn FnMut(MergeProgress) + Send),
+    ) -> Result<OptimizeReport> {
+        let mut lease = MaintenanceLease::take(self).await?;
         let done = self.merge_all(target_bytes, stop, progress, &mut lease).await;
         let released = lease.release().await;
         done.and_then(|report| released.map(|()| report))
@@ -80,26 +81,26 @@ impl Lake {
         &self,
         target_bytes: u64,
         stop: &AtomicBool,
-        progress: &mut (dyn FnMut(Merging) + Send),
-        lease: &mut Lease,
-    ) -> Result<Optimized> {
+        progress: &mut (dyn FnMut(MergeProgress) + Send),
+        lease: &mut MaintenanceLease,
+    ) -> Result<OptimizeReport> {
         self.remove_superseded().await?;
         let snapshot = self.snapshot().await?;
         let plans: Vec<_> = Table::ALL.into_iter().map(|table| (table, plan(&snapshot, table, target_bytes))).collect();
         let total = plans.iter().flat_map(|(_, groups)| groups).map(Vec::len).sum();
-        let (mut report, mut done) = (Optimized::default(), 0);
+        let (mut report, mut done) = (OptimizeReport::default(), 0);
         for (table, groups) in plans.into_iter().filter(|(_, groups)| !groups.is_empty()) {
             let name = table.name();
             let mut of =
-                TableOptimized { table: name, merged: 0, bytes_before: 0, files: 0, bytes_after: 0, outdated: 0 };
+                TableOptimizeReport { table: name, merged: 0, bytes_before: 0, files: 0, bytes_after: 0, outdated: 0 };
             for group in &groups {
-                progress(Merging { table, done, total });
+                progress(MergeProgress { table, done, total });
                 if stop.load(Ordering::Relaxed) {
                     report.stopped = true;
                     break;
                 }
-                match self.merge(table, group, Effect::Layout, Some(&mut *lease)).await? {
-                    (Committed::Outdated, _) => of.outdated += 1,
+                match self.merge(table, group, CommitEffect::Layout, Some(&mut *lease)).await? {
+                    (CommitOutcome::Outdated, _) => of.outdated += 1,
                     (_, bytes) => {
                         of.merged += group.len();
                         of.bytes_before += group.iter().map(|f| f.bytes).sum::<u64>();
@@ -115,8 +116,8 @@ impl Lake {
     }
 
     /// Rewrites a merged file without its superseded rows. If another writer did so meanwhile, nothing changes.
-    pub(crate) async fn rewrite(&self, table: Table, file: &DataFile) -> Result<Committed> {
-        let (outcome, _) = self.merge(table, std::slice::from_ref(file), Effect::Rows, None).await?;
+    pub(crate) async fn rewrite(&self, table: Table, file: &DataFile) -> Result<CommitOutcome> {
+        let (outcome, _) = self.merge(table, std::slice::from_ref(file), CommitEffect::Rows, None).await?;
         Ok(outcome)
     }
 
@@ -125,9 +126,9 @@ impl Lake {
         &self,
         table: Table,
         files: &[DataFile],
-        effect: Effect,
-        mut lease: Option<&mut Lease>,
-    ) -> Result<(Committed, u64)> {
+        effect: CommitEffect,
+        mut lease: Option<&mut MaintenanceLease>,
+    ) -> Result<(CommitOutcome, u64)> {
         let mut slices: Vec<_> = files.iter().flat_map(slices).collect();
         slices.sort_by(|a, b| key(&a.part).cmp(&key(&b.part)));
         let mut encoder = FileEncoder::new(table, table.schema(self.rig()));
@@ -149,38 +150,38 @@ impl Lake {
         let parts: Vec<_> = slices.into_iter().map(|s| s.part).collect();
         let mut staged = self.stage(table, &name(&parts), encoder.finish()?).await?;
         let names = files.iter().filter_map(|f| f.path.filename()).map(str::to_owned).collect();
-        staged.file.replaces = Some(Replaces { prefix: None, names });
+        staged.file.replaces = Some(ReplacedFiles { prefix: None, names });
         staged.file.parts = parts;
         if let Some(lease) = lease {
             lease.keep().await?;
         }
         let bytes = staged.file.bytes;
-        let commit = Commit { add: vec![staged.file], effect, ..Commit::default() };
+        let commit = TableCommit { add: vec![staged.file], effect, ..TableCommit::default() };
         let outcome = self.log().commit(table, &commit).await?;
         Ok((outcome[0], bytes))
     }
 }
 
 /// A run's rows, and their range in a file.
-struct Slice<'a> {
+struct RunSlice<'a> {
     file: &'a DataFile,
-    part: Part,
+    part: RunPart,
     rows: std::ops::Range<u64>,
 }
 
-fn slices(file: &DataFile) -> Vec<Slice<'_>> {
+fn slices(file: &DataFile) -> Vec<RunSlice<'_>> {
     if let Some(FileName::Rows { surface, run, derivation }) = FileName::parse(&file.path) {
-        let part = Part { surface, run, derivation, rows: file.rows };
-        return vec![Slice { file, rows: 0..file.rows, part }];
+        let part = RunPart { surface, run, derivation, rows: file.rows };
+        return vec![RunSlice { file, rows: 0..file.rows, part }];
     }
-    file.visible_parts().map(|(part, rows)| Slice { file, part: part.clone(), rows }).collect()
+    file.visible_parts().map(|(part, rows)| RunSlice { file, part: part.clone(), rows }).collect()
 }
 
-fn key(part: &Part) -> (&str, &str) {
+fn key(part: &RunPart) -> (&str, &str) {
     (part.surface.as_str(), part.run.as_str())
 }
 
-fn name(parts: &[Part]) -> FileName {
+fn name(parts: &[RunPart]) -> FileName {
     let mut sha = Sha256::new();
     for part in parts {
         sha.update(part.file_name().compose());
@@ -190,7 +191,7 @@ fn name(parts: &[Part]) -> FileName {
 }
 
 // Neighbours by surface and run in groups of about the wanted size, so that a query for a surface opens few files.
-fn plan(snapshot: &Snapshot, table: Table, target_bytes: u64) -> Vec<Vec<DataFile>> {
+fn plan(snapshot: &LakeSnapshot, table: Table, target_bytes: u64) -> Vec<Vec<DataFile>> {
     let merges = matches!(table.source(), Source::Run | Source::References) && table != Table::Surfaces;
     if !merges {
         return Vec::new();

@@ -31,19 +31,22 @@ struct StoredFile {
     bytes: u64,
 }
 
-type Read<'a, T> = BoxFuture<'a, std::result::Result<T, ParquetError>>;
+type ParquetRead<'a, T> = BoxFuture<'a, std::result::Result<T, ParquetError>>;
 
 impl AsyncFileReader for StoredFile {
-    fn get_bytes(&mut self, range: Range<u64>) -> Read<'_, Bytes> {
+    fn get_bytes(&mut self, range: Range<u64>) -> ParquetRead<'_, Bytes> {
         self.store.get_range(&self.path, range).map_err(|e| ParquetError::External(e.into())).boxed()
     }
 
-    fn get_byte_ranges(&mut self, ranges: Vec<Range<u64>>) -> Read<'_, Vec<Bytes>> {
+    fn get_byte_ranges(&mut self, ranges: Vec<Range<u64>>) -> ParquetRead<'_, Vec<Bytes>> {
         let read = async move { self.store.get_ranges(&self.path, &ranges).await };
         read.map_err(|e| ParquetError::External(e.into())).boxed()
     }
 
-    fn get_metadata<'a>(&'a mut self, options: Option<&'a ArrowReaderOptions>) -> Read<'a, Arc<ParquetMetaData>> {
+    fn get_metadata<'a>(
+        &'a mut self,
+        options: Option<&'a ArrowReaderOptions>,
+    ) -> ParquetRead<'a, Arc<ParquetMetaData>> {
         let bytes = self.bytes;
         let reader =
             ParquetMetaDataReader::new().with_arrow_reader_options(options).with_prefetch_hint(Some(FOOTER_BYTES));

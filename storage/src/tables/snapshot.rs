@@ -11,7 +11,7 @@ use echolake_schema::{RunId, SurfaceId};
 use object_store::path::Path;
 use serde_json::{Value, json};
 
-use crate::{CommitLog, DataFile, Part, Result};
+use crate::{CommitLog, DataFile, Result, RunPart};
 
 /// Parsed name of a file in `tables/`.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -61,9 +61,9 @@ impl VisibleRun {
 
 /// A frozen view of all tables.
 #[derive(Debug, Clone, Default)]
-pub struct Snapshot {
+pub struct LakeSnapshot {
     files: HashMap<Table, Vec<DataFile>>,
-    runs: BTreeMap<RunId, Current>,
+    runs: BTreeMap<RunId, CurrentRun>,
     hidden: HashMap<Table, Vec<DataFile>>,
     outgrown: HashMap<Table, Vec<DataFile>>,
     versions: HashMap<Table, u64>,
@@ -71,7 +71,7 @@ pub struct Snapshot {
 
 /// A run's row in `runs`, and when it was committed.
 #[derive(Debug, Clone)]
-struct Current {
+struct CurrentRun {
     run: VisibleRun,
     since: DateTime<Utc>,
 }
@@ -116,7 +116,7 @@ impl FileName {
     }
 }
 
-impl Snapshot {
+impl LakeSnapshot {
     /// Takes a view. `runs` is read first, so that whatever it names was committed before.
     pub(crate) async fn take(log: &dyn CommitLog) -> Result<Self> {
         // Versions are read before files, so that a commit between the two is taken for one that is yet to be seen.
@@ -183,7 +183,7 @@ impl Snapshot {
 
     fn sort_in(&mut self, table: Table, files: Vec<DataFile>) {
         let (merged, single): (Vec<_>, Vec<_>) = files.into_iter().partition(|f| !f.parts.is_empty());
-        let mut sorted = Sorted::default();
+        let mut sorted = SortedFiles::default();
         merged.into_iter().for_each(|file| self.sort_merged(table, file, &mut sorted));
         for file in single {
             match self.sees(table, &file) {
@@ -201,7 +201,7 @@ impl Snapshot {
     }
 
     // What is merged was seen before; what is no longer seen of it is superseded, whatever its age.
-    fn sort_merged(&self, table: Table, mut file: DataFile, sorted: &mut Sorted) {
+    fn sort_merged(&self, table: Table, mut file: DataFile, sorted: &mut SortedFiles) {
         let mut superseded = 0;
         for part in &file.parts {
             match self.sees_rows(table, &part.surface, &part.run, &part.derivation) {
@@ -250,7 +250,7 @@ impl Snapshot {
 
 /// A table's files on their way into a snapshot.
 #[derive(Default)]
-struct Sorted {
+struct SortedFiles {
     seen: Vec<DataFile>,
     hidden: Vec<DataFile>,
     outgrown: Vec<DataFile>,
@@ -272,22 +272,22 @@ pub(crate) fn is_merged(name: &str) -> bool {
 }
 
 /// Parts as text: the name that each had as a file of its own, and its rows.
-pub(crate) fn encode_parts(parts: &[Part]) -> String {
-    let one = |part: &Part| json!([part.file_name().compose(), part.rows]);
+pub(crate) fn encode_parts(parts: &[RunPart]) -> String {
+    let one = |part: &RunPart| json!([part.file_name().compose(), part.rows]);
     Value::Array(parts.iter().map(one).collect()).to_string()
 }
 
 /// Decodes the parts from such a text; None if it is none.
-pub(crate) fn decode_parts(text: &str) -> Option<Vec<Part>> {
+pub(crate) fn decode_parts(text: &str) -> Option<Vec<RunPart>> {
     let parts: Vec<(String, u64)> = serde_json::from_str(text).ok()?;
     let one = |(name, rows): (String, u64)| match FileName::parse(&Path::from(name))? {
-        FileName::Rows { surface, run, derivation } => Some(Part { surface, run, derivation, rows }),
+        FileName::Rows { surface, run, derivation } => Some(RunPart { surface, run, derivation, rows }),
         _ => None,
     };
     parts.into_iter().map(one).collect::<Option<Vec<_>>>().filter(|parts| !parts.is_empty())
 }
 
-impl Part {
+impl RunPart {
     /// The name of a file with these rows alone.
     pub fn file_name(&self) -> FileName {
         let Self { surface, run, derivation, .. } = self.clone();
@@ -301,11 +301,11 @@ fn one_a_surface(table: Table) -> bool {
 }
 
 // A crash between a run's new row and the removal of its old one leaves two; the newer one counts.
-fn current_runs(pointers: &[DataFile]) -> BTreeMap<RunId, Current> {
+fn current_runs(pointers: &[DataFile]) -> BTreeMap<RunId, CurrentRun> {
     let mut by_age: Vec<_> = pointers.iter().collect();
     by_age.sort_by_key(|f| (f.modified, f.path.clone()));
     let parsed = by_age.into_iter().filter_map(|f| match FileName::parse(&f.path) {
-        Some(FileName::Pointer(run)) => Some((run.run.clone(), Current { run, since: f.modified })),
+        Some(FileName::Pointer(run)) => Some((run.run.clone(), CurrentRun { run, since: f.modified })),
         _ => None,
     });
     parsed.collect()
@@ -323,9 +323,9 @@ mod tests {
         DataFile { path, bytes: 1, rows: 1, modified, stats: None, parts: Vec::new(), hidden: Vec::new() }
     }
 
-    fn view(files: &[(Table, &str, i64)]) -> Snapshot {
+    fn view(files: &[(Table, &str, i64)]) -> LakeSnapshot {
         let of = |table| files.iter().filter(|f| f.0 == table).map(|f| file(f.0, f.1, f.2)).collect::<Vec<_>>();
-        let mut snapshot = Snapshot { runs: current_runs(&of(Table::Runs)), ..Snapshot::default() };
+        let mut snapshot = LakeSnapshot { runs: current_runs(&of(Table::Runs)), ..LakeSnapshot::default() };
         Table::ALL.into_iter().for_each(|table| snapshot.sort_in(table, of(table)));
         snapshot
     }
@@ -405,9 +405,9 @@ mod tests {
     fn parts_are_seen_and_superseded_as_files_were() {
         let runs = |wood: &str| {
             let pointers = ["flat.r1.ab.cd.parquet".to_owned(), format!("wood.r2.ab.{wood}.parquet")];
-            let mut snapshot = Snapshot {
+            let mut snapshot = LakeSnapshot {
                 runs: current_runs(&pointers.map(|name| file(Table::Runs, &name, 5))),
-                ..Snapshot::default()
+                ..LakeSnapshot::default()
             };
             let files = vec![
                 file(Table::Nce, "flat.r1.cd.parquet", 9),

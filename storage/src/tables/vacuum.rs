@@ -11,8 +11,8 @@ use object_store::{ObjectStore as _, ObjectStoreExt as _};
 use serde::Serialize;
 
 use crate::tables::delta::folder;
-use crate::tables::lease::Lease;
-use crate::{Error, History, Lake, Result};
+use crate::tables::lease::MaintenanceLease;
+use crate::{Error, FileHistory, Lake, Result};
 
 /// Hours for which a file is kept after it left its table, by default and at most: Delta's log forgets the time of
 /// removal after a week.
@@ -24,7 +24,7 @@ const INBOX: &str = "inbox";
 
 /// Choice between deleting files and listing them.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Deletion {
+pub enum DeletionMode {
     /// Files are deleted.
     Real,
     /// Files are only reported.
@@ -33,27 +33,27 @@ pub enum Deletion {
 
 /// The files that were deleted, or would be.
 #[derive(Debug, Clone, Default, Serialize)]
-pub struct Vacuumed {
+pub struct VacuumReport {
     /// The files.
-    pub files: Vec<Freed>,
+    pub files: Vec<DeletedFile>,
     /// Their bytes.
     pub bytes: u64,
 }
 
 /// One file that was deleted.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Serialize)]
-pub struct Freed {
+pub struct DeletedFile {
     /// Path in the lake.
     pub path: String,
     /// Size.
     pub bytes: u64,
     #[serde(skip)]
-    place: Place,
+    place: FileAccess,
 }
 
 /// Access to a file: by the store or by the local file system.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
-enum Place {
+enum FileAccess {
     Store(Path),
     /// The store does not list a local write's temporary file.
     Local(PathBuf),
@@ -69,13 +69,13 @@ impl Lake {
     pub async fn vacuum(
         &self,
         keep: TimeDelta,
-        deletion: Deletion,
+        deletion: DeletionMode,
         deleted: &mut (dyn FnMut(usize, usize) + Send),
-    ) -> Result<Vacuumed> {
-        if deletion == Deletion::Pretended {
+    ) -> Result<VacuumReport> {
+        if deletion == DeletionMode::Pretended {
             return self.left_over(keep).await;
         }
-        let mut lease = Lease::take(self).await?;
+        let mut lease = MaintenanceLease::take(self).await?;
         let done = self.delete_left_over(keep, deleted, &mut lease).await;
         let released = lease.release().await;
         done.and_then(|report| released.map(|()| report))
@@ -85,20 +85,20 @@ impl Lake {
         &self,
         keep: TimeDelta,
         deleted: &mut (dyn FnMut(usize, usize) + Send),
-        lease: &mut Lease,
-    ) -> Result<Vacuumed> {
+        lease: &mut MaintenanceLease,
+    ) -> Result<VacuumReport> {
         let report = self.left_over(keep).await?;
         for (done, file) in report.files.iter().enumerate() {
             lease.keep().await?;
             match &file.place {
-                Place::Store(path) => match self.store().delete(path).await {
+                FileAccess::Store(path) => match self.store().delete(path).await {
                     Err(e) if !matches!(e, object_store::Error::NotFound { .. }) => {
                         return Err(Error::store("delete", path, e));
                     }
                     _ => {}
                 },
                 // Its writer may have taken it away.
-                Place::Local(path) => drop(std::fs::remove_file(path)),
+                FileAccess::Local(path) => drop(std::fs::remove_file(path)),
             }
             deleted(done + 1, report.files.len());
         }
@@ -106,7 +106,7 @@ impl Lake {
     }
 
     // The store is listed before the logs are read, so that whatever is committed meanwhile is named.
-    async fn left_over(&self, keep: TimeDelta) -> Result<Vacuumed> {
+    async fn left_over(&self, keep: TimeDelta) -> Result<VacuumReport> {
         let (now, mut files) = (Utc::now(), Vec::new());
         let old = |modified| is_over(modified, None, now, keep);
         for table in Table::ALL {
@@ -116,7 +116,7 @@ impl Lake {
             let Some(history) = self.log().history(table).await? else { continue };
             for meta in there.objects {
                 if is_left_over(&history, &meta.location, |gone| is_over(meta.last_modified, gone, now, keep)) {
-                    files.push(Freed::stored(meta.location, meta.size));
+                    files.push(DeletedFile::stored(meta.location, meta.size));
                 }
             }
         }
@@ -127,28 +127,28 @@ impl Lake {
             .await
             .map_err(|e| Error::store("list", INBOX, e))?;
         let copying = inbox.into_iter().filter(|m| m.location.extension() == Some("copying") && old(m.last_modified));
-        files.extend(copying.map(|meta| Freed::stored(meta.location, meta.size)));
+        files.extend(copying.map(|meta| DeletedFile::stored(meta.location, meta.size)));
         if let Some(lake) = self.folder() {
             let mut temporaries = Vec::new();
             ["tables", INBOX].iter().for_each(|name| find_temporaries(&lake.join(name), &mut temporaries));
             let old = temporaries.into_iter().filter(|(_, modified, _)| old(DateTime::<Utc>::from(*modified)));
             files.extend(old.map(|(path, _, bytes)| {
                 let within = path.strip_prefix(lake).unwrap_or(&path).display().to_string();
-                Freed { path: within, bytes, place: Place::Local(path) }
+                DeletedFile { path: within, bytes, place: FileAccess::Local(path) }
             }));
         }
         files.sort();
-        Ok(Vacuumed { bytes: files.iter().map(|f| f.bytes).sum(), files })
+        Ok(VacuumReport { bytes: files.iter().map(|f| f.bytes).sum(), files })
     }
 }
 
-impl Freed {
+impl DeletedFile {
     fn stored(path: Path, bytes: u64) -> Self {
-        Self { path: path.to_string(), bytes, place: Place::Store(path) }
+        Self { path: path.to_string(), bytes, place: FileAccess::Store(path) }
     }
 }
 
-fn is_left_over(history: &History, path: &Path, is_over: impl Fn(Option<DateTime<Utc>>) -> bool) -> bool {
+fn is_left_over(history: &FileHistory, path: &Path, is_over: impl Fn(Option<DateTime<Utc>>) -> bool) -> bool {
     let Some(name) = path.filename() else { return false };
     path.extension() == Some("parquet")
         && !history.current.contains(name)

@@ -13,7 +13,7 @@ use object_store::{GetOptions, GetRange, ObjectStore};
 use serde_json::Value;
 
 use crate::tables::delta::folder;
-use crate::{Error, Lake, Result, Snapshot};
+use crate::{Error, Lake, LakeSnapshot, Result};
 
 /// Bytes of a commit that are read for its time, which writers put first.
 const COMMIT_HEAD: u64 = 4096;
@@ -33,14 +33,14 @@ pub struct TableVersion {
 
 /// A moment of a lake.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-pub enum Moment {
+pub enum LakeMoment {
     /// A version of the lake, that of its table `runs`.
     Version(u64),
     /// The newest version at a time.
     Time(DateTime<Utc>),
 }
 
-impl std::fmt::Display for Moment {
+impl std::fmt::Display for LakeMoment {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         match self {
             Self::Version(version) => write!(f, "version {version}"),
@@ -57,7 +57,7 @@ pub struct NoMoment {
     pub text: String,
 }
 
-impl FromStr for Moment {
+impl FromStr for LakeMoment {
     type Err = NoMoment;
 
     /// Reads a version, or a time as in RFC 3339; without a zone it is UTC, without a time of day midnight.
@@ -87,11 +87,11 @@ impl Lake {
     ///
     /// # Errors
     /// [`Error::NoMoment`] if the log does not hold it, [`Error::Vacuumed`] if files of it are deleted.
-    pub async fn snapshot_at(&self, moment: Moment, table: Table) -> Result<Snapshot> {
+    pub async fn snapshot_at(&self, moment: LakeMoment, table: Table) -> Result<LakeSnapshot> {
         let versions = self.versions().await?;
         let found = match moment {
-            Moment::Version(number) => versions.iter().find(|v| v.version == number),
-            Moment::Time(time) => versions.iter().rfind(|v| v.committed <= time),
+            LakeMoment::Version(number) => versions.iter().find(|v| v.version == number),
+            LakeMoment::Time(time) => versions.iter().rfind(|v| v.committed <= time),
         };
         let found = found.ok_or_else(|| no_moment(moment, &versions))?;
         let pointers = self.log().files_at(Table::Runs, found.version).await?;
@@ -105,12 +105,12 @@ impl Lake {
                 }
             }
         };
-        let snapshot = Snapshot::of(&pointers, table, files);
+        let snapshot = LakeSnapshot::of(&pointers, table, files);
         self.are_there(moment, table, &snapshot).await?;
         Ok(snapshot)
     }
 
-    async fn are_there(&self, moment: Moment, table: Table, snapshot: &Snapshot) -> Result<()> {
+    async fn are_there(&self, moment: LakeMoment, table: Table, snapshot: &LakeSnapshot) -> Result<()> {
         let folder = folder(table);
         let there = self.store().list_with_delimiter(Some(&folder)).await;
         let there = there.map_err(|e| Error::store("list", &folder, e))?;
@@ -124,7 +124,7 @@ impl Lake {
     }
 }
 
-fn no_moment(moment: Moment, versions: &[TableVersion]) -> Error {
+fn no_moment(moment: LakeMoment, versions: &[TableVersion]) -> Error {
     let text = |v: &TableVersion| {
         format!("version {} of {}", v.version, v.committed.to_rfc3339_opts(SecondsFormat::AutoSi, true))
     };
@@ -208,11 +208,11 @@ mod tests {
     fn times_without_a_zone_are_utc() {
         let ten = "2026-11-21T10:00:00Z".parse().expect("a time");
         for text in ["2026-11-21T10:00:00Z", "2026-11-21 10:00:00", "2026-11-21 10:00", "2026-11-21T11:00:00+01:00"] {
-            assert_eq!(text.parse(), Ok(Moment::Time(ten)), "{text}");
+            assert_eq!(text.parse(), Ok(LakeMoment::Time(ten)), "{text}");
         }
-        assert_eq!("12".parse(), Ok(Moment::Version(12)));
+        assert_eq!("12".parse(), Ok(LakeMoment::Version(12)));
         for text in ["yesterday", "-1", "", "2026-13-01"] {
-            assert!(text.parse::<Moment>().is_err(), "{text}");
+            assert!(text.parse::<LakeMoment>().is_err(), "{text}");
         }
     }
 

@@ -1,6 +1,6 @@
 //! Delay of an output in a recording: the one of highest correlation.
 
-use echolake_dsp::Real as _;
+use echolake_dsp::RealSample as _;
 use realfft::num_complex::Complex;
 
 /// Position of an output in a recording.

@@ -8,7 +8,7 @@ use mcap::records::Record;
 use rand::Rng;
 use rand::seq::IndexedRandom as _;
 
-use super::specimen::{FRAME, Specimen};
+use super::specimen::{FRAME, FlipSpecimen};
 
 /// Largest block that is zeroed, doubled or taken out.
 const LARGEST_BLOCK: f64 = 65_536.0;
@@ -19,7 +19,7 @@ const MESSAGE_HEAD: usize = 22;
 
 /// Kind of damage to a file.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Kind {
+pub(crate) enum DamageKind {
     /// 1 to 8 bytes anywhere.
     Flips,
     /// 1 to 8 bytes in the first ones of records.
@@ -42,7 +42,7 @@ pub(crate) enum Kind {
 
 /// A part of a damaged file.
 #[derive(Debug, Clone)]
-enum Piece {
+enum FilePiece {
     /// Bytes of the undamaged file.
     Intact(Range<usize>),
     /// Others.
@@ -51,11 +51,11 @@ enum Piece {
 
 /// A damaged file.
 #[derive(Debug)]
-pub(crate) struct Damaged {
-    pieces: Vec<Piece>,
+pub(crate) struct DamagedFile {
+    pieces: Vec<FilePiece>,
 }
 
-impl Kind {
+impl DamageKind {
     pub(crate) const ALL: [Self; 9] = [
         Self::Flips,
         Self::FrameFlips,
@@ -85,33 +85,33 @@ impl Kind {
     }
 }
 
-impl Damaged {
+impl DamagedFile {
     /// Damages a specimen.
     ///
     /// # Errors
     /// If the specimen itself is not as expected.
-    pub(crate) fn new(specimen: &Specimen, kind: Kind, rng: &mut impl Rng) -> Result<Self> {
-        let mut damaged = Self { pieces: vec![Piece::Intact(0..specimen.bytes.len())] };
+    pub(crate) fn new(specimen: &FlipSpecimen, kind: DamageKind, rng: &mut impl Rng) -> Result<Self> {
+        let mut damaged = Self { pieces: vec![FilePiece::Intact(0..specimen.bytes.len())] };
         match kind {
-            Kind::Several => {
+            DamageKind::Several => {
                 for _ in 0..rng.random_range(2..=4) {
-                    let kind = *Kind::SINGLE.choose(rng).context("there are kinds")?;
+                    let kind = *DamageKind::SINGLE.choose(rng).context("there are kinds")?;
                     damaged.apply(specimen, kind, rng);
                 }
             }
-            Kind::Sealed => damaged.seal(specimen, rng)?,
+            DamageKind::Sealed => damaged.seal(specimen, rng)?,
             kind => damaged.apply(specimen, kind, rng),
         }
         Ok(damaged)
     }
 
     /// The damaged file's bytes.
-    pub(crate) fn bytes(&self, specimen: &Specimen) -> Bytes {
+    pub(crate) fn bytes(&self, specimen: &FlipSpecimen) -> Bytes {
         let mut bytes = Vec::with_capacity(self.len());
         for piece in &self.pieces {
             match piece {
-                Piece::Intact(range) => bytes.extend_from_slice(&specimen.bytes[range.clone()]),
-                Piece::Altered(altered) => bytes.extend_from_slice(altered),
+                FilePiece::Intact(range) => bytes.extend_from_slice(&specimen.bytes[range.clone()]),
+                FilePiece::Altered(altered) => bytes.extend_from_slice(altered),
             }
         }
         bytes.into()
@@ -119,14 +119,14 @@ impl Damaged {
 
     /// Returns whether these bytes of the undamaged file are still somewhere in one piece.
     pub(crate) fn keeps(&self, part: &Range<usize>) -> bool {
-        self.pieces.iter().any(|p| matches!(p, Piece::Intact(r) if r.start <= part.start && part.end <= r.end))
+        self.pieces.iter().any(|p| matches!(p, FilePiece::Intact(r) if r.start <= part.start && part.end <= r.end))
     }
 
     fn len(&self) -> usize {
-        self.pieces.iter().map(Piece::len).sum()
+        self.pieces.iter().map(FilePiece::len).sum()
     }
 
-    fn apply(&mut self, specimen: &Specimen, kind: Kind, rng: &mut impl Rng) {
+    fn apply(&mut self, specimen: &FlipSpecimen, kind: DamageKind, rng: &mut impl Rng) {
         let size = self.len();
         if size == 0 {
             return;
@@ -134,28 +134,28 @@ impl Damaged {
         let length = (LARGEST_BLOCK.powf(rng.random_range(0.0..1.0)) as usize).min(size);
         let start = rng.random_range(0..=size - length);
         match kind {
-            Kind::FrameFlips => {
+            DamageKind::FrameFlips => {
                 for _ in 0..rng.random_range(1..=8) {
                     let record = specimen.records.choose(rng).map_or(0, |r| r.start);
                     self.flip((record + rng.random_range(0..NEAR)).min(size - 1), specimen, rng);
                 }
             }
-            Kind::Truncated => {
+            DamageKind::Truncated => {
                 let kept = self.split(rng.random_range(0..size));
                 self.pieces.truncate(kept);
             }
-            Kind::Zeroed => self.replace(start, length, vec![Piece::Altered(vec![0; length])]),
-            Kind::Doubled => {
+            DamageKind::Zeroed => self.replace(start, length, vec![FilePiece::Altered(vec![0; length])]),
+            DamageKind::Doubled => {
                 let (from, to) = (self.split(start), self.split(start + length));
                 let copy = self.pieces[from..to].to_vec();
                 self.pieces.splice(to..to, copy);
             }
-            Kind::Removed => self.replace(start, length, Vec::new()),
-            Kind::Cut => {
+            DamageKind::Removed => self.replace(start, length, Vec::new()),
+            DamageKind::Cut => {
                 let (a, b) = (rng.random_range(0..size), rng.random_range(0..size));
                 self.replace(a.min(b), a.abs_diff(b), Vec::new());
             }
-            Kind::Flips | Kind::Several | Kind::Sealed => {
+            DamageKind::Flips | DamageKind::Several | DamageKind::Sealed => {
                 for _ in 0..rng.random_range(1..=8) {
                     self.flip(rng.random_range(0..size), specimen, rng);
                 }
@@ -163,19 +163,19 @@ impl Damaged {
         }
     }
 
-    fn flip(&mut self, at: usize, specimen: &Specimen, rng: &mut impl Rng) {
+    fn flip(&mut self, at: usize, specimen: &FlipSpecimen, rng: &mut impl Rng) {
         // Half of them a single bit, as memory and wires do.
         let mask = if rng.random() { 1 << rng.random_range(0..8) } else { rng.random_range(1..=255) };
         let index = self.split(at);
         self.split(at + 1);
         let byte = match &self.pieces[index] {
-            Piece::Intact(range) => specimen.bytes[range.start],
-            Piece::Altered(bytes) => bytes[0],
+            FilePiece::Intact(range) => specimen.bytes[range.start],
+            FilePiece::Altered(bytes) => bytes[0],
         };
-        self.pieces[index] = Piece::Altered(vec![byte ^ mask]);
+        self.pieces[index] = FilePiece::Altered(vec![byte ^ mask]);
     }
 
-    fn replace(&mut self, start: usize, length: usize, by: Vec<Piece>) {
+    fn replace(&mut self, start: usize, length: usize, by: Vec<FilePiece>) {
         let (from, to) = (self.split(start), self.split(start + length));
         self.pieces.splice(from..to, by);
     }
@@ -199,7 +199,7 @@ impl Damaged {
     }
 
     // Flips bytes of messages in one chunk, and rebuilds its record.
-    fn seal(&mut self, specimen: &Specimen, rng: &mut impl Rng) -> Result<()> {
+    fn seal(&mut self, specimen: &FlipSpecimen, rng: &mut impl Rng) -> Result<()> {
         let range = specimen.chunks.choose(rng).context("there are chunks")?.range.clone();
         let body = &specimen.bytes[range.start + FRAME..range.end];
         let Record::Chunk { mut header, data } = mcap::parse_record(0x06, body)? else {
@@ -230,12 +230,12 @@ impl Damaged {
         record.extend(header.compression.bytes());
         record.extend((data.len() as u64).to_le_bytes());
         record.extend(data);
-        self.replace(range.start, range.len(), vec![Piece::Altered(record)]);
+        self.replace(range.start, range.len(), vec![FilePiece::Altered(record)]);
         Ok(())
     }
 }
 
-impl Piece {
+impl FilePiece {
     fn len(&self) -> usize {
         match self {
             Self::Intact(range) => range.len(),

@@ -11,15 +11,15 @@ use std::time::{Duration, Instant};
 use anyhow::{Context as _, Result, ensure};
 use echolake_acquisition::controller::RecordingMode;
 use echolake_ingest::{Inspected, Inspection, inspect};
-use echolake_lake::{Lake, References};
+use echolake_lake::{Lake, ReferenceSurfaces};
 use object_store::memory::InMemory;
 use object_store::path::Path;
 use object_store::{ObjectStore, ObjectStoreExt as _};
 use rand::{Rng as _, SeedableRng as _};
 use rand_chacha::ChaCha8Rng;
 
-use damage::{Damaged, Kind};
-use specimen::Specimen;
+use damage::{DamageKind, DamagedFile};
+use specimen::FlipSpecimen;
 
 /// A round that takes longer hangs: they take milliseconds, and more on a busy machine.
 const HANGS: Duration = Duration::from_secs(120);
@@ -30,7 +30,7 @@ static PANICS: AtomicUsize = AtomicUsize::new(0);
 
 /// Rounds and seed of a campaign.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct Settings {
+pub(crate) struct FlipSettings {
     /// Rounds.
     pub(crate) count: u64,
     /// Seed of all rounds.
@@ -41,7 +41,7 @@ pub(crate) struct Settings {
 
 /// Outcomes of the rounds of one kind.
 #[derive(Debug, Clone, Copy, Default)]
-pub(crate) struct Tally {
+pub(crate) struct OutcomeTally {
     pub(crate) rounds: u64,
     /// Files of which every measurement was kept.
     pub(crate) complete: u64,
@@ -63,8 +63,8 @@ pub(crate) struct Tally {
 
 /// Outcomes of all rounds.
 #[derive(Debug)]
-pub(crate) struct Summary {
-    pub(crate) by_kind: Vec<(&'static str, Tally)>,
+pub(crate) struct FlipSummary {
+    pub(crate) by_kind: Vec<(&'static str, OutcomeTally)>,
     /// Descriptions of the violations, with the round.
     pub(crate) failures: Vec<String>,
     pub(crate) slowest: Duration,
@@ -73,8 +73,8 @@ pub(crate) struct Summary {
 }
 
 /// A specimen and what ingest makes of it undamaged.
-struct Subject {
-    specimen: Specimen,
+struct TestSubject {
+    specimen: FlipSpecimen,
     whole: Inspection,
     /// Results of ingest from the recorded responses: they are taken if their sweeps cannot be read.
     from_responses: Vec<Inspected>,
@@ -84,40 +84,40 @@ struct Subject {
 ///
 /// # Errors
 /// If the specimens cannot be made; what the rounds find is in the summary.
-pub(crate) async fn run(settings: Settings, progress: &mut dyn FnMut(u64)) -> Result<Summary> {
+pub(crate) async fn run(settings: FlipSettings, progress: &mut dyn FnMut(u64)) -> Result<FlipSummary> {
     count_panics();
     let rig = specimen::rig();
-    let lake = Lake::open_or_create("memory://", &rig, &References::default()).await?;
+    let lake = Lake::open_or_create("memory://", &rig, &ReferenceSurfaces::default()).await?;
     let mut subjects = Vec::new();
     for (name, keep) in [("sweeps", RecordingMode::Sweeps), ("responses", RecordingMode::ResponsesOnly)] {
-        let specimen = Specimen::simulate(name, &rig, keep)?;
+        let specimen = FlipSpecimen::simulate(name, &rig, keep)?;
         let whole = read(&lake, specimen.bytes.clone()).await?.context("an undamaged file is refused")?;
         ensure!(NAME == format!("runs/{}/{}.mcap", whole.surface, whole.run), "it is run {}", whole.run);
         ensure!(whole.whole && whole.damaged.is_empty(), "undamaged, but {:?}", whole.damaged);
         ensure!(whole.measurements.len() > specimen.chunks.len(), "too few measurements: {}", whole.measurements.len());
-        subjects.push(Subject { specimen, whole, from_responses: Vec::new() });
+        subjects.push(TestSubject { specimen, whole, from_responses: Vec::new() });
     }
     // The same seed: the second specimen is the first one without its sweeps.
     if let [sweeps, responses] = &mut subjects[..] {
         sweeps.from_responses.clone_from(&responses.whole.measurements);
     }
-    let mut summary = Summary {
-        by_kind: Kind::ALL.map(|k| (k.label(), Tally::default())).to_vec(),
+    let mut summary = FlipSummary {
+        by_kind: DamageKind::ALL.map(|k| (k.label(), OutcomeTally::default())).to_vec(),
         failures: Vec::new(),
         slowest: Duration::ZERO,
-        specimens: subjects.iter().map(Subject::facts).collect(),
+        specimens: subjects.iter().map(TestSubject::facts).collect(),
     };
     for round in settings.first..settings.first + settings.count {
         let mut rng = ChaCha8Rng::seed_from_u64(settings.seed);
         rng.set_stream(round);
-        let number = rng.random_range(0..Kind::ALL.len());
+        let number = rng.random_range(0..DamageKind::ALL.len());
         let subject = &subjects[rng.random_range(0..subjects.len())];
-        let damaged = Damaged::new(&subject.specimen, Kind::ALL[number], &mut rng)?;
+        let damaged = DamagedFile::new(&subject.specimen, DamageKind::ALL[number], &mut rng)?;
         let begun = Instant::now();
-        let outcome = subject.round(&lake, Kind::ALL[number], &damaged, &mut summary.by_kind[number].1).await;
+        let outcome = subject.round(&lake, DamageKind::ALL[number], &damaged, &mut summary.by_kind[number].1).await;
         summary.slowest = summary.slowest.max(begun.elapsed());
         if let Err(reason) = outcome {
-            let (kind, name) = (Kind::ALL[number].label(), subject.specimen.name);
+            let (kind, name) = (DamageKind::ALL[number].label(), subject.specimen.name);
             summary.failures.push(format!("--seed {} --first {round} ({kind}, {name}): {reason:#}", settings.seed));
         }
         progress(round);
@@ -150,13 +150,19 @@ fn count_panics() {
     });
 }
 
-impl Subject {
+impl TestSubject {
     fn facts(&self) -> (&'static str, usize, usize, usize) {
         let Self { specimen, whole, .. } = self;
         (specimen.name, specimen.bytes.len(), specimen.chunks.len(), whole.measurements.len())
     }
 
-    async fn round(&self, lake: &Lake, kind: Kind, damaged: &Damaged, tally: &mut Tally) -> Result<()> {
+    async fn round(
+        &self,
+        lake: &Lake,
+        kind: DamageKind,
+        damaged: &DamagedFile,
+        tally: &mut OutcomeTally,
+    ) -> Result<()> {
         tally.rounds += 1;
         let bytes = damaged.bytes(&self.specimen);
         let differs = bytes != self.specimen.bytes;
@@ -181,7 +187,7 @@ impl Subject {
             tally.unnoticed += 1;
         }
         ensure!(lost == 0 || !inspection.damaged.is_empty(), "{lost} measurements are lost and nothing says so");
-        if kind == Kind::Sealed {
+        if kind == DamageKind::Sealed {
             return plausible(&inspection);
         }
         let (run, surface) = (&inspection.run, &inspection.surface);
@@ -210,7 +216,7 @@ impl Subject {
     }
 
     /// Checks that measurements in chunks without damage, verdict and sweep or response, are returned.
-    fn untouched(&self, damaged: &Damaged, inspection: &Inspection, tally: &mut Tally) -> Result<()> {
+    fn untouched(&self, damaged: &DamagedFile, inspection: &Inspection, tally: &mut OutcomeTally) -> Result<()> {
         let whole = || self.specimen.chunks.iter().filter(|c| damaged.keeps(&c.range));
         let returned: BTreeSet<_> = inspection.measurements.iter().map(|m| (m.pair, m.attempt)).collect();
         let expected = |m: &&Inspected| {

@@ -27,7 +27,7 @@ const START: Timestamp = Timestamp(1_767_600_000_000_000_000);
 const PAIRS_A_CHUNK: usize = 5;
 
 /// A run's file and its parts.
-pub(crate) struct Specimen {
+pub(crate) struct FlipSpecimen {
     pub(crate) name: &'static str,
     pub(crate) bytes: Bytes,
     /// All records, frames included.
@@ -61,7 +61,7 @@ pub(crate) fn rig() -> Rig {
     rig
 }
 
-impl Specimen {
+impl FlipSpecimen {
     /// Measures a run with the simulated rig.
     pub(crate) fn simulate(name: &'static str, rig: &Rig, keep: RecordingMode) -> Result<Self> {
         let folder = tempfile::tempdir()?;

@@ -4,7 +4,7 @@ use arrow::array::AsArray as _;
 use arrow::datatypes::{Float32Type, Int32Type};
 use arrow::record_batch::RecordBatch;
 use datafusion::common::ScalarValue;
-use echolake_dsp::components::Components;
+use echolake_dsp::components::PrincipalComponents;
 use serde::Serialize;
 
 use std::collections::HashMap;
@@ -24,7 +24,7 @@ const MOST_PRODUCTS: usize = 4_000_000_000;
 /// Surfaces on the map.
 pub(super) struct SurfacePositions {
     names: Vec<String>,
-    components: Components,
+    components: PrincipalComponents,
 }
 
 #[derive(Serialize)]
@@ -90,7 +90,8 @@ impl SurfacePositions {
         while let Some(batch) = rows.next().await? {
             vectors.add(&batch)?;
         }
-        let found = asked.catalogue.service().crunch(move || Components::of(&mut vectors.rows, COMPONENTS)).await?;
+        let found =
+            asked.catalogue.service().crunch(move || PrincipalComponents::of(&mut vectors.rows, COMPONENTS)).await?;
         let components = found.map_err(|e| {
             eprintln!("surfaces have no places: {e}");
             RequestFault::Internal

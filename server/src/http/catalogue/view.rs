@@ -4,7 +4,7 @@ use std::collections::{HashMap, HashSet, VecDeque};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
-use echolake_lake::{DataFile, Snapshot};
+use echolake_lake::{DataFile, LakeSnapshot};
 use echolake_query::{Client, Prepared, Quota, Session};
 use echolake_schema::tables::Table;
 use object_store::path::Path as StorePath;
@@ -28,7 +28,7 @@ const VERSION_BYTES: usize = 8;
 pub(in super::super) struct SnapshotView {
     /// Changes with every snapshot, and with the program.
     pub(in super::super) version: String,
-    pub(in super::super) snapshot: Arc<Snapshot>,
+    pub(in super::super) snapshot: Arc<LakeSnapshot>,
     pub(super) session: Arc<Session>,
     pub(super) answers: AnswerCache,
     pub(super) summary: OnceCell<CatalogueSummary>,
@@ -38,7 +38,7 @@ pub(in super::super) struct SnapshotView {
 }
 
 impl SnapshotView {
-    fn new(snapshot: Arc<Snapshot>, session: Arc<Session>) -> Self {
+    fn new(snapshot: Arc<LakeSnapshot>, session: Arc<Session>) -> Self {
         Self {
             version: version(&snapshot),
             snapshot,
@@ -65,7 +65,7 @@ impl SnapshotView {
 }
 
 // The version of a snapshot: a digest of its files' names and visible rows.
-fn version(snapshot: &Snapshot) -> String {
+fn version(snapshot: &LakeSnapshot) -> String {
     let mut digest = Sha256::new();
     digest.update(env!("CARGO_PKG_VERSION"));
     for table in Table::ALL {
@@ -148,7 +148,7 @@ impl SnapshotViews {
 }
 
 // The files that a snapshot shows and the next does not.
-fn gone(before: &Snapshot, after: &Snapshot) -> Vec<VisibleFile> {
+fn gone(before: &LakeSnapshot, after: &LakeSnapshot) -> Vec<VisibleFile> {
     let mut gone = Vec::new();
     for table in Table::ALL {
         let stay: HashSet<_> = after.files(table).iter().map(|file| &file.path).collect();

@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 
 use bytes::Bytes;
 use echolake_export::{Slice, SliceParams};
-use echolake_lake::Snapshot;
+use echolake_lake::LakeSnapshot;
 use echolake_query::{Client, Error as QueryError};
 use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc};
 use tokio::task::JoinSet;
@@ -39,7 +39,7 @@ impl SliceTask {
     pub(super) fn begin(
         service: &QueryService,
         client: &Arc<Client>,
-        snapshot: Arc<Snapshot>,
+        snapshot: Arc<LakeSnapshot>,
         params: SliceParams,
         room: SliceResources,
     ) -> Self {
@@ -70,7 +70,7 @@ impl SliceTask {
 
 async fn cut(
     service: &QueryService,
-    snapshot: &Snapshot,
+    snapshot: &LakeSnapshot,
     params: SliceParams,
     limit: Option<Duration>,
     turns: &Semaphore,

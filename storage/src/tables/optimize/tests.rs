@@ -17,14 +17,16 @@ use parquet::basic::Encoding;
 use parquet::file::metadata::{PageIndexPolicy, ParquetMetaDataReader};
 
 use super::*;
-use crate::{References, VisibleRun, encode};
+use crate::{ReferenceSurfaces, VisibleRun, encode};
 
 const TABLE: Table = Table::Nce;
 const ROWS: usize = 20;
 
 async fn lake(store: &Arc<InMemory>) -> Lake {
     let store: Arc<dyn ObjectStore> = store.clone();
-    Lake::open_or_create_in(store, "a lake under test", &Rig::paper(), &References::default()).await.expect("a lake")
+    Lake::open_or_create_in(store, "a lake under test", &Rig::paper(), &ReferenceSurfaces::default())
+        .await
+        .expect("a lake")
 }
 
 fn column(field: &Field, surface: &str, run: &str, value: usize) -> ArrayRef {
@@ -96,7 +98,7 @@ async fn files(lake: &Lake) -> Vec<DataFile> {
     lake.log().files(TABLE).await.expect("a log")
 }
 
-async fn optimize(lake: &Lake) -> Optimized {
+async fn optimize(lake: &Lake) -> OptimizeReport {
     lake.optimize(TARGET_BYTES, &AtomicBool::new(false), &mut |_| {}).await.expect("merged")
 }
 
@@ -186,8 +188,8 @@ async fn a_merge_of_what_is_replaced_meanwhile_changes_nothing() {
     put(&lake, "flat", "r1", "d2", 77).await;
     lake.remove_superseded().await.expect("cleaned up");
     let (before, named) = (seen(&lake).await, files(&lake).await);
-    let (outcome, _) = lake.merge(TABLE, &planned, Effect::Layout, None).await.expect("no error");
-    assert_eq!(outcome, Committed::Outdated);
+    let (outcome, _) = lake.merge(TABLE, &planned, CommitEffect::Layout, None).await.expect("no error");
+    assert_eq!(outcome, CommitOutcome::Outdated);
     assert_eq!(files(&lake).await, named);
     assert!(seen(&lake).await == before, "other rows");
 }
@@ -203,11 +205,11 @@ async fn of_two_merges_at_once_one_is_made() {
             let (store, planned) = (store.clone(), planned.clone());
             tokio::spawn(async move {
                 let lake = lake(&store).await;
-                lake.merge(TABLE, &planned[range], Effect::Layout, None).await.expect("no error").0
+                lake.merge(TABLE, &planned[range], CommitEffect::Layout, None).await.expect("no error").0
             })
         };
         let (a, b) = tokio::join!(merge(0..4), merge(1..5));
-        let mut outcomes = [a.expect("done"), b.expect("done")].map(|o| o == Committed::Now);
+        let mut outcomes = [a.expect("done"), b.expect("done")].map(|o| o == CommitOutcome::Now);
         outcomes.sort();
         assert_eq!(outcomes, [false, true]);
         assert_eq!(files(&lakes).await.iter().map(|f| f.rows).sum::<u64>() as usize, 5 * ROWS);
@@ -242,14 +244,14 @@ async fn vacuum_deletes_what_is_merged_and_nothing_that_is_named() {
         let lake = lake.clone();
         async move { lake.vacuum(chrono::TimeDelta::hours(hours), deletion, &mut |_, _| {}).await.expect("no error") }
     };
-    assert!(vacuum(1, crate::Deletion::Real).await.files.is_empty(), "readers may hold them");
-    let told = vacuum(0, crate::Deletion::Pretended).await;
+    assert!(vacuum(1, crate::DeletionMode::Real).await.files.is_empty(), "readers may hold them");
+    let told = vacuum(0, crate::DeletionMode::Pretended).await;
     let names: Vec<_> = told.files.iter().map(|f| f.path.clone()).collect();
     assert_eq!(names, singles.iter().map(|f| f.path.to_string()).collect::<Vec<_>>());
     assert_eq!(told.bytes, singles.iter().map(|f| f.bytes).sum::<u64>());
     object_store::ObjectStoreExt::head(store.as_ref(), &singles[0].path).await.expect("only told");
-    assert_eq!(vacuum(0, crate::Deletion::Real).await.files, told.files);
+    assert_eq!(vacuum(0, crate::DeletionMode::Real).await.files, told.files);
     object_store::ObjectStoreExt::head(store.as_ref(), &singles[0].path).await.expect_err("deleted");
     assert!(seen(&lake).await == before, "other rows");
-    assert!(vacuum(0, crate::Deletion::Real).await.files.is_empty());
+    assert!(vacuum(0, crate::DeletionMode::Real).await.files.is_empty());
 }
