@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use echolake_query::Quota;
+use echolake_query::QueryQuota;
 use serde::{Deserialize, Serialize};
 
 use crate::fault::Fault;
@@ -30,7 +30,7 @@ pub(crate) struct ClientIdentity {
     /// Whether the server has no tokens, so that requests of foreign pages must be told from others.
     pub(crate) is_open: bool,
     pub(crate) scopes: Vec<Scope>,
-    /// Limits, as [`Quota`] has them.
+    /// Limits, as [`QueryQuota`] has them.
     pub(crate) seconds: Option<u64>,
     pub(crate) memory_bytes: Option<usize>,
     pub(crate) rows: Option<u64>,
@@ -66,8 +66,8 @@ impl ClientIdentity {
     }
 
     /// Limits of its queries.
-    pub(crate) fn quota(&self) -> Quota {
-        Quota {
+    pub(crate) fn quota(&self) -> QueryQuota {
+        QueryQuota {
             time: self.seconds.map(Duration::from_secs),
             memory: self.memory_bytes.map(counted_bytes),
             rows: self.rows,

@@ -9,7 +9,7 @@ use echolake_acquisition::collection::{Member, collection};
 use echolake_acquisition::controller::Keep;
 use echolake_acquisition::run::{RunRequest, Specimen};
 use echolake_acquisition::simulate::simulate;
-use echolake_ingest::{Ingest, Report as Told, complete, pending};
+use echolake_ingest::{FileReport as Told, LakeIngest, complete, pending};
 use echolake_lake::{Lake, References};
 use echolake_schema::manifest::RunEnd;
 use echolake_schema::{Rig, Timestamp};
@@ -135,7 +135,7 @@ impl Runs {
         for (files, cost) in [references, panels].into_iter().zip(&mut costs) {
             put_into_inbox(files, folder)?;
             let meter = Meter::start()?;
-            Ingest::new(&lake, stop.clone()).take_in(pending(&lake).await?, &mut report).await?;
+            LakeIngest::new(&lake, stop.clone()).take_in(pending(&lake).await?, &mut report).await?;
             complete(&lake, &stop, &mut |_| {}).await?;
             *cost = meter.stop()?;
         }

@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 use arrow::datatypes::SchemaRef;
 use bytes::Bytes;
 use datafusion::common::ParamValues;
-use echolake_query::{Prepared, Session};
+use echolake_query::{PreparedQuery, Session};
 
 use crate::fault::Fault;
 use crate::running::Stop;
@@ -28,7 +28,7 @@ pub(super) struct Statement {
     /// The session it was planned in; its client owns the handle.
     pub(super) session: Arc<Session>,
     pub(super) sql: Arc<str>,
-    pub(super) prepared: Arc<Prepared>,
+    pub(super) prepared: Arc<PreparedQuery>,
     /// When: it sees the lake as it was then.
     pub(super) planned: Instant,
     /// Columns as they were told to the client.

@@ -11,7 +11,7 @@ use axum::http::uri::Authority;
 use axum::http::{HeaderMap, HeaderName, HeaderValue, Uri, header};
 use axum::middleware::Next;
 use axum::response::{IntoResponse as _, Response};
-use echolake_query::Client;
+use echolake_query::EngineClient;
 
 use super::problem::Problem;
 use super::ranges::POLICY;
@@ -23,7 +23,7 @@ use crate::tokens::{Access, Scope, of_header};
 const FETCH_SITE: HeaderName = HeaderName::from_static("sec-fetch-site");
 
 /// Whoever may ask in SQL.
-pub(super) struct MayQuery(pub(super) Arc<Client>);
+pub(super) struct MayQuery(pub(super) Arc<EngineClient>);
 
 /// The cookie of a browser's session.
 pub(super) const COOKIE: &str = "echolake";

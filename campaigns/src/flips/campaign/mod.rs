@@ -10,7 +10,7 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Context as _, Result, ensure};
 use echolake_acquisition::controller::Keep;
-use echolake_ingest::{Inspected, Inspection, inspect};
+use echolake_ingest::{InspectedMeasurement, RunInspection, inspect};
 use echolake_lake::{Lake, References};
 use object_store::memory::InMemory;
 use object_store::path::Path;
@@ -75,9 +75,9 @@ pub(crate) struct Summary {
 /// A specimen and what ingest makes of it undamaged.
 struct Subject {
     specimen: Specimen,
-    whole: Inspection,
+    whole: RunInspection,
     /// What it makes of the recorded responses: they are taken where their sweeps cannot be read.
-    from_responses: Vec<Inspected>,
+    from_responses: Vec<InspectedMeasurement>,
 }
 
 /// Runs the campaign; `progress` hears of each round.
@@ -126,7 +126,7 @@ pub(crate) async fn run(settings: Settings, progress: &mut dyn FnMut(u64)) -> Re
 }
 
 /// Reads a file as ingest does. The outer error is a hang or a panic, the inner one a refusal.
-async fn read(lake: &Lake, bytes: bytes::Bytes) -> Result<echolake_ingest::Result<Inspection>> {
+async fn read(lake: &Lake, bytes: bytes::Bytes) -> Result<echolake_ingest::Result<RunInspection>> {
     let panics = PANICS.load(Ordering::Relaxed);
     let lake = lake.clone();
     let task = tokio::spawn(async move {
@@ -191,12 +191,12 @@ impl Subject {
     }
 
     /// What is returned must be what was measured, bit for bit and once.
-    fn unaltered(&self, inspection: &Inspection) -> Result<()> {
+    fn unaltered(&self, inspection: &RunInspection) -> Result<()> {
         let mut pairs = BTreeSet::new();
         for measured in &inspection.measurements {
-            let same = |m: &&Inspected| m.pair == measured.pair && m.attempt == measured.attempt;
+            let same = |m: &&InspectedMeasurement| m.pair == measured.pair && m.attempt == measured.attempt;
             ensure!(self.whole.measurements.iter().any(|m| same(&m)), "pair {} is new", measured.pair);
-            let bits = |m: &Inspected| m.ir.iter().map(|x| x.to_bits()).collect::<Vec<_>>();
+            let bits = |m: &InspectedMeasurement| m.ir.iter().map(|x| x.to_bits()).collect::<Vec<_>>();
             let mut made = self.whole.measurements.iter().chain(&self.from_responses).filter(same);
             ensure!(made.any(|m| bits(m) == bits(measured)), "pair {} is another than was measured", measured.pair);
             ensure!(pairs.insert(measured.pair), "pair {} is there twice", measured.pair);
@@ -210,10 +210,10 @@ impl Subject {
     }
 
     /// What stands in chunks that the damage does not touch, verdict and sweep or response, must be returned.
-    fn untouched(&self, damaged: &Damaged, inspection: &Inspection, tally: &mut Tally) -> Result<()> {
+    fn untouched(&self, damaged: &Damaged, inspection: &RunInspection, tally: &mut Tally) -> Result<()> {
         let whole = || self.specimen.chunks.iter().filter(|c| damaged.keeps(&c.range));
         let returned: BTreeSet<_> = inspection.measurements.iter().map(|m| (m.pair, m.attempt)).collect();
-        let expected = |m: &&Inspected| {
+        let expected = |m: &&InspectedMeasurement| {
             let key = (m.pair, m.attempt);
             whole().any(|c| c.verdicts.contains(&key)) && whole().any(|c| c.responses.contains(&key))
         };
@@ -235,7 +235,7 @@ impl Subject {
 }
 
 /// All that can be asked where the CRC vouches for damaged bytes.
-fn plausible(inspection: &Inspection) -> Result<()> {
+fn plausible(inspection: &RunInspection) -> Result<()> {
     let length = specimen::rig().impulse_response.length;
     for m in &inspection.measurements {
         ensure!(m.ir.len() == length, "pair {} has {} samples", m.pair, m.ir.len());

@@ -5,7 +5,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
 use echolake_lake::{DataFile, Snapshot};
-use echolake_query::{Client, Prepared, Quota, Session};
+use echolake_query::{EngineClient, PreparedQuery, QueryQuota, Session};
 use echolake_schema::tables::Table;
 use object_store::path::Path as StorePath;
 use sha2::{Digest as _, Sha256};
@@ -34,7 +34,7 @@ pub(in super::super) struct View {
     pub(super) summary: OnceCell<Summary>,
     pub(super) places: OnceCell<Places>,
     /// By their text, of which there are few: values are bound.
-    prepared: Mutex<HashMap<String, Arc<Prepared>>>,
+    prepared: Mutex<HashMap<String, Arc<PreparedQuery>>>,
 }
 
 impl View {
@@ -55,11 +55,11 @@ impl View {
         format!("\"{}{}\"", self.version, if as_arrow { "-arrow" } else { "" })
     }
 
-    pub(super) fn prepared(&self, sql: &str) -> Option<Arc<Prepared>> {
+    pub(super) fn prepared(&self, sql: &str) -> Option<Arc<PreparedQuery>> {
         self.prepared.lock().unwrap_or_else(PoisonError::into_inner).get(sql).cloned()
     }
 
-    pub(super) fn keep_prepared(&self, sql: &str, prepared: Arc<Prepared>) {
+    pub(super) fn keep_prepared(&self, sql: &str, prepared: Arc<PreparedQuery>) {
         self.prepared.lock().unwrap_or_else(PoisonError::into_inner).insert(sql.to_owned(), prepared);
     }
 }
@@ -160,6 +160,6 @@ fn gone(before: &Snapshot, after: &Snapshot) -> Vec<Shown> {
 
 // Who may ask was found out before; how much their queries of their own may take is no matter of these.
 fn session(service: &Service) -> Arc<Session> {
-    let quota = Quota { time: Some(LONGEST), ..Quota::default() };
-    Arc::new(service.session(&Arc::new(Client::new("catalogue", quota))))
+    let quota = QueryQuota { time: Some(LONGEST), ..QueryQuota::default() };
+    Arc::new(service.session(&Arc::new(EngineClient::new("catalogue", quota))))
 }

@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 use bytes::Bytes;
 use echolake_export::{Slice, SliceParams};
 use echolake_lake::Snapshot;
-use echolake_query::{Client, Error as QueryError};
+use echolake_query::{EngineClient, Error as QueryError};
 use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc};
 use tokio::task::JoinSet;
 
@@ -39,7 +39,7 @@ impl Cutting {
     /// Begins, in one of its client's places.
     pub(super) fn begin(
         service: &Service,
-        client: &Arc<Client>,
+        client: &Arc<EngineClient>,
         snapshot: Arc<Snapshot>,
         params: SliceParams,
         room: Room,

@@ -20,7 +20,7 @@ use axum::http::{HeaderMap, Method, Uri};
 use axum::response::Response;
 use axum::routing::get;
 use echolake_export::{Check, SliceParams, Taken};
-use echolake_query::{Client, PredicateForm};
+use echolake_query::{EngineClient, PredicateForm};
 use futures::stream;
 use tokio::sync::Semaphore;
 
@@ -76,7 +76,7 @@ pub(super) fn for_viewers(catalogue: &Catalogue) -> Router {
 
 /// Somebody who may ask for slices, and what they ask.
 struct Request {
-    client: Arc<Client>,
+    client: Arc<EngineClient>,
     view: Arc<View>,
     question: Question,
 }

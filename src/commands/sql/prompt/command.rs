@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use echolake_query::output::Format;
+use echolake_query::output::AnswerFormat;
 
 /// What `\?` prints.
 pub(super) const HELP: &str = "\
@@ -27,7 +27,7 @@ pub(super) enum Command {
     /// Page, or do not.
     Pager,
     /// The format of answers.
-    Format(Format),
+    Format(AnswerFormat),
     /// The file for the next answer.
     Output(Option<PathBuf>),
     /// List the tables.
@@ -49,7 +49,7 @@ pub(super) fn parse(line: &str) -> Option<Result<Command, String>> {
         "\\?" | "\\h" | "help" if name.is_none() => Command::Help,
         "\\timing" => Command::Timing,
         "\\pager" | "\\pset" => Command::Pager,
-        "\\f" | "\\format" => match Format::ALL.into_iter().find(|f| f.name().eq_ignore_ascii_case(rest)) {
+        "\\f" | "\\format" => match AnswerFormat::ALL.into_iter().find(|f| f.name().eq_ignore_ascii_case(rest)) {
             Some(format) => Command::Format(format),
             None => return Some(Err(format!("no format `{rest}`; hint: table, csv, json, parquet or arrow"))),
         },
@@ -70,7 +70,7 @@ mod tests {
         assert_eq!(parse("\\d  runs;"), Some(Ok(Command::Columns("runs".to_owned()))));
         assert_eq!(parse("\\d"), Some(Ok(Command::Tables)));
         assert_eq!(parse("  quit "), Some(Ok(Command::Quit)));
-        assert_eq!(parse("\\f CSV"), Some(Ok(Command::Format(Format::Csv))));
+        assert_eq!(parse("\\f CSV"), Some(Ok(Command::Format(AnswerFormat::Csv))));
         assert_eq!(parse("\\o a b.csv"), Some(Ok(Command::Output(Some("a b.csv".into())))));
         assert_eq!(parse("select 1;"), None);
         assert_eq!(parse(""), None);
