@@ -20,7 +20,7 @@ use echolake_dsp::diffusion::diffusion;
 use echolake_dsp::filter_bank::FilterBankPlan;
 use echolake_dsp::heights::moved;
 use echolake_dsp::spectrum::SpectrumPlan;
-use echolake_query::Functions;
+use echolake_query::FunctionSet;
 use echolake_schema::{Rig, Symmetry};
 
 /// Responses, as many as a surface has.
@@ -33,7 +33,7 @@ const ROUNDS: usize = 15;
 
 /// The functions, and their input.
 struct FunctionsBench {
-    functions: Functions,
+    functions: FunctionSet,
     samples: Vec<f32>,
     lists: ArrayRef,
     out: std::io::StdoutLock<'static>,
@@ -49,7 +49,7 @@ pub(crate) fn run() -> Result<()> {
         })
         .collect();
     let lists = lists(&samples, LEN)?;
-    let functions = Functions::all(&Rig::paper())?;
+    let functions = FunctionSet::all(&Rig::paper())?;
     let mut bench = FunctionsBench { functions, samples, lists, out: std::io::stdout().lock() };
     writeln!(bench.out, "{ROWS} lists of {LEN} f32, one core; best of {ROUNDS} rounds")?;
     writeln!(bench.out, "{:<24} {:>12} {:>12} {:>7}", "function", "rows/s", "loop rows/s", "ratio")?;

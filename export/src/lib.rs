@@ -22,6 +22,8 @@ mod tests;
 
 pub use acoustics::{ResponseFormat, write_responses, write_wav};
 pub use error::{Error, Result};
-pub use ml::{Exported, Part, PartCounts, SHARDS, Split, SplitBy, Symmetries, TrainingSet, write_training_set};
+pub use ml::{
+    ExportSummary, PartCounts, RowSymmetries, SHARDS, SplitBy, SplitParams, SplitPart, TrainingSet, write_training_set,
+};
 pub use output::{PendingFile, WrittenFile};
 pub use slice::{Check, Layout, Outline, OutlineSchema, OutlineTopic, Slice, SliceParams, Taken, outline};

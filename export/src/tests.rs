@@ -13,7 +13,7 @@ use echolake_acquisition::import::{ImportOptions, import_gir, import_wav};
 use echolake_acquisition::relief::PanelRelief;
 use echolake_acquisition::run::{PanelSpecimen, RunRequest};
 use echolake_acquisition::simulate::simulate;
-use echolake_ingest::{Ingest, complete, pending};
+use echolake_ingest::{LakeIngest, complete, pending};
 use echolake_lake::{Lake, ReferenceSurfaces};
 use echolake_schema::{Rig, RunId, Table, Timestamp, topics};
 use futures::TryStreamExt as _;
@@ -51,7 +51,7 @@ async fn lake(home: &TempDir, keep: RecordingMode) -> Lake {
     }
     let stop = Arc::new(AtomicBool::new(false));
     let sources = pending(&lake).await.expect("runs");
-    Ingest::new(&lake, stop.clone()).take_in(sources, &mut |_| {}).await.expect("ingested");
+    LakeIngest::new(&lake, stop.clone()).take_in(sources, &mut |_| {}).await.expect("ingested");
     complete(&lake, &stop, &mut |_| {}).await.expect("derived");
     lake
 }
@@ -200,7 +200,7 @@ async fn a_run_file_that_is_not_the_ingested_one_is_refused() {
     assert!(cut(&lake, SliceParams { taken, ..SliceParams::default() }).await.is_ok());
 }
 
-fn set(symmetries: Symmetries) -> TrainingSet {
+fn set(symmetries: RowSymmetries) -> TrainingSet {
     TrainingSet { symmetries, ..TrainingSet::default() }
 }
 
@@ -231,7 +231,8 @@ async fn a_training_set_is_repeatable_and_leaks_nothing() {
     let folders = [home.path().join("a"), home.path().join("b")];
     let mut exported = Vec::new();
     for folder in &folders {
-        exported.push(write_training_set(&lake, folder, &set(Symmetries::All), &mut |_, _| {}).await.expect("written"));
+        exported
+            .push(write_training_set(&lake, folder, &set(RowSymmetries::All), &mut |_, _| {}).await.expect("written"));
     }
     let (files, again) = (content(&folders[0]), content(&folders[1]));
     assert!(files == again, "the same lake gives the same bytes");
@@ -281,7 +282,10 @@ async fn a_training_set_that_fails_leaves_nothing() {
     };
     let columns = TrainingSet { columns: vec!["nope".into()], ..TrainingSet::default() };
     assert!(failed(&columns).await.contains("no column `nope`"));
-    let by = TrainingSet { split: Split { by: SplitBy::Macrostructure, ..Split::default() }, ..TrainingSet::default() };
+    let by = TrainingSet {
+        split: SplitParams { by: SplitBy::Macrostructure, ..SplitParams::default() },
+        ..TrainingSet::default()
+    };
     assert!(failed(&by).await.contains("by-macrostructure"));
     // One file of the lake is damaged: the export breaks off half-way.
     let measurements = home.path().join("lake/tables/tnce");

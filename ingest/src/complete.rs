@@ -7,20 +7,20 @@ use echolake_lake::{CommitOutcome, Lake, VisibleRun};
 use echolake_schema::tables::Table;
 use echolake_schema::{RunId, SurfaceId};
 
-use crate::context::Context;
-use crate::derive::Derivation;
+use crate::context::IngestContext;
+use crate::derive::ReferenceDerivation;
 use crate::error::Result;
-use crate::pipeline::{self, Cores, Ready};
+use crate::pipeline::{self, Cores, ReadyJob};
 use crate::read_back;
-use crate::references::{Finder, Wanted};
-use crate::rows::{self, Keys};
+use crate::references::{ReferenceFinder, WantedReferences};
+use crate::rows::{self, RunKeys};
 
 /// Maximum number of retries with a new snapshot after another ingest committed first.
 const ROUNDS: usize = 20;
 
 /// A run with new derived rows.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Completed {
+pub struct CompletedRun {
     /// The run.
     pub run: RunId,
     /// Its surface.
@@ -34,7 +34,7 @@ pub struct Completed {
 ///
 /// # Errors
 /// [`crate::Error`]; runs completed before stay so, and the same call resumes with the rest.
-pub async fn complete(lake: &Lake, stop: &AtomicBool, done: &mut (dyn FnMut(&Completed) + Send)) -> Result<usize> {
+pub async fn complete(lake: &Lake, stop: &AtomicBool, done: &mut (dyn FnMut(&CompletedRun) + Send)) -> Result<usize> {
     let (cores, mut count) = (Cores::all()?, 0);
     for _ in 0..ROUNDS {
         let (changed, overtaken) = round(lake, &cores, stop, done).await?;
@@ -53,7 +53,7 @@ pub async fn complete(lake: &Lake, stop: &AtomicBool, done: &mut (dyn FnMut(&Com
 /// [`crate::Error::Lake`] if the lake cannot be read.
 pub async fn waiting(lake: &Lake) -> Result<Vec<(RunId, String)>> {
     let snapshot = Arc::new(lake.snapshot().await?);
-    let finder = Finder::new(lake, snapshot.clone());
+    let finder = ReferenceFinder::new(lake, snapshot.clone());
     let missing = |run: &VisibleRun| (run.run.clone(), finder.wanted(&run.surface).missing());
     Ok(snapshot.runs().map(missing).filter(|(_, missing)| !missing.is_empty()).collect())
 }
@@ -63,9 +63,9 @@ async fn round(
     lake: &Lake,
     cores: &Cores,
     stop: &AtomicBool,
-    done: &mut (dyn FnMut(&Completed) + Send),
+    done: &mut (dyn FnMut(&CompletedRun) + Send),
 ) -> Result<(usize, bool)> {
-    let context = Context::now(lake, cores).await?;
+    let context = IngestContext::now(lake, cores).await?;
     let mut jobs = Vec::new();
     for run in context.snapshot.runs() {
         let wanted = context.finder.lock().await.wanted(&run.surface);
@@ -74,11 +74,11 @@ async fn round(
         }
     }
     let (mut count, mut overtaken) = (0, false);
-    let do_one = move |(run, wanted): (VisibleRun, Wanted)| {
+    let do_one = move |(run, wanted): (VisibleRun, WantedReferences)| {
         let context = context.clone();
         async move { complete_run(&context, &run, &wanted).await }
     };
-    let ended = &mut |(_, result): pipeline::Ended<_, Completed>| {
+    let ended = &mut |(_, result): pipeline::JobOutcome<_, CompletedRun>| {
         let (completed, outcome) = result?;
         if outcome == Some(CommitOutcome::Now) {
             count += 1;
@@ -91,12 +91,17 @@ async fn round(
     Ok((count, overtaken))
 }
 
-async fn complete_run(context: &Context, run: &VisibleRun, wanted: &Wanted) -> Result<Ready<Completed>> {
-    let (lake, keys) = (&context.lake, Keys { surface: run.surface.clone(), run: run.run.clone() });
+async fn complete_run(
+    context: &IngestContext,
+    run: &VisibleRun,
+    wanted: &WantedReferences,
+) -> Result<ReadyJob<CompletedRun>> {
+    let (lake, keys) = (&context.lake, RunKeys { surface: run.surface.clone(), run: run.run.clone() });
     let responses = read_back::responses(lake, &context.snapshot, &run.run).await?;
-    let report = Completed { run: run.run.clone(), surface: run.surface.clone(), measurements: responses.pairs.len() };
-    let Some(derivation) = Derivation::new(&run.run_derivation, wanted, &context.finder).await? else {
-        return Ok(Ready { staged: Vec::new(), report });
+    let report =
+        CompletedRun { run: run.run.clone(), surface: run.surface.clone(), measurements: responses.pairs.len() };
+    let Some(derivation) = ReferenceDerivation::new(&run.run_derivation, wanted, &context.finder).await? else {
+        return Ok(ReadyJob { staged: Vec::new(), report });
     };
     let (mut staged, references) = derivation.stage(context, &keys, responses).await?;
     let mut row = Vec::new();
@@ -105,5 +110,5 @@ async fn complete_run(context: &Context, run: &VisibleRun, wanted: &Wanted) -> R
     }
     let pointer = VisibleRun { reference_derivation: references.derivation.clone(), ..run.clone() };
     staged.push(context.stage_pointer(pointer, &row).await?);
-    Ok(Ready { staged, report })
+    Ok(ReadyJob { staged, report })
 }

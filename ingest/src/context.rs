@@ -9,34 +9,34 @@ use futures::future::join_all;
 
 use crate::error::Result;
 use crate::pipeline::Cores;
-use crate::references::{Finder, SharedFinder};
-use crate::rows::Keys;
+use crate::references::{ReferenceFinder, SharedFinder};
+use crate::rows::RunKeys;
 
 /// The lake with one snapshot of it. Cheap to clone.
 #[derive(Clone)]
-pub(crate) struct Context {
+pub(crate) struct IngestContext {
     pub(crate) lake: Lake,
     pub(crate) cores: Cores,
     pub(crate) snapshot: Arc<LakeSnapshot>,
     pub(crate) finder: SharedFinder,
 }
 
-impl Context {
+impl IngestContext {
     /// Returns a context with the current snapshot of the lake.
     pub(crate) async fn now(lake: &Lake, cores: &Cores) -> Result<Self> {
         let snapshot = Arc::new(lake.snapshot().await?);
-        let finder = Finder::shared(lake, snapshot.clone());
+        let finder = ReferenceFinder::shared(lake, snapshot.clone());
         Ok(Self { lake: lake.clone(), cores: cores.clone(), snapshot, finder })
     }
 
     /// Stages a run's files of one derivation.
     pub(crate) async fn stage_rows(
         &self,
-        keys: &Keys,
+        keys: &RunKeys,
         derivation: &str,
         files: Vec<(Table, EncodedFile)>,
     ) -> Result<Vec<StagedFile>> {
-        let Keys { surface, run } = keys.clone();
+        let RunKeys { surface, run } = keys.clone();
         let name = FileName::Rows { surface, run, derivation: derivation.to_owned() };
         // In parallel, because each file waits for the disk by itself.
         let staged = join_all(files.into_iter().map(|(table, file)| self.lake.stage(table, &name, file))).await;

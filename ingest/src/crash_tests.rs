@@ -20,8 +20,8 @@ use object_store::path::Path;
 use object_store::{ObjectStore, ObjectStoreExt as _};
 use parquet::arrow::arrow_reader::ParquetRecordBatchReaderBuilder;
 
-use crate::mortal::{Death, Mortal};
-use crate::{Ingest, Report, complete, pending};
+use crate::mortal::{DeathMoment, MortalStore};
+use crate::{FileReport, LakeIngest, complete, pending};
 
 /// Ten points, so that a run takes milliseconds.
 const SMALL_RIG: &str = include_str!("../../tests/fixtures/small_rig.toml");
@@ -69,11 +69,11 @@ async fn with_inbox(runs: &[(String, Bytes)]) -> Arc<InMemory> {
     store
 }
 
-async fn ingest(store: Arc<dyn ObjectStore>) -> crate::Result<Vec<Report>> {
+async fn ingest(store: Arc<dyn ObjectStore>) -> crate::Result<Vec<FileReport>> {
     let (lake, stop) = (lake(store).await?, Arc::new(AtomicBool::new(false)));
     let mut reports = Vec::new();
     let sources = pending(&lake).await?;
-    Ingest::new(&lake, stop.clone()).take_in(sources, &mut |report| reports.push(report)).await?;
+    LakeIngest::new(&lake, stop.clone()).take_in(sources, &mut |report| reports.push(report)).await?;
     complete(&lake, &stop, &mut |_| {}).await?;
     Ok(reports)
 }
@@ -119,17 +119,18 @@ async fn rows(store: Arc<InMemory>) -> BTreeMap<&'static str, Vec<Vec<u8>>> {
     all
 }
 
-/// Dies at each write of `work`, made or not, and hands over what is left each time; returns how many deaths there were.
+/// Dies at each write of `work`, made or not, and hands over what is left each time; returns how many deaths there
+/// were.
 async fn each_death<T, E: std::fmt::Debug>(
     start: &InMemory,
     work: impl AsyncFn(Arc<dyn ObjectStore>) -> Result<T, E>,
     check: impl AsyncFn(Arc<InMemory>, String),
 ) -> usize {
     let mut deaths = 0;
-    for death in [Death::Before, Death::After] {
+    for death in [DeathMoment::Before, DeathMoment::After] {
         for last in 0.. {
             let inner = Arc::new(start.fork());
-            let mortal = Mortal::new(inner.clone(), last, death);
+            let mortal = MortalStore::new(inner.clone(), last, death);
             let first = work(mortal.clone()).await;
             if !mortal.died() {
                 first.expect("it lived");
@@ -165,7 +166,8 @@ async fn upkeep_beside_ingest_loses_nothing_and_doubles_nothing() {
     });
     for (name, bytes) in &runs[2..] {
         store.put(&Path::from(format!("inbox/{name}")), bytes.clone().into()).await.expect("written");
-        // Nothing is kept for readers here, so that ingest may find a file gone that was merged meanwhile: it is run again.
+        // Nothing is kept for readers here, so that ingest may find a file gone that was merged meanwhile: it is run
+        // again.
         let mut tries = 0;
         while let Err(e) = ingest(store.clone()).await {
             tries += 1;
@@ -217,7 +219,7 @@ async fn refused_files_go_to_quarantine_with_the_reason_and_the_rest_goes_on() {
     runs.push(("text.mcap".into(), Bytes::from_static(b"no MCAP at all")));
     let store = with_inbox(&runs).await;
     let reports = ingest(store.clone()).await.expect("ingested");
-    let refused: Vec<_> = reports.iter().filter(|r| matches!(r, Report::Refused { .. })).collect();
+    let refused: Vec<_> = reports.iter().filter(|r| matches!(r, FileReport::Refused { .. })).collect();
     assert_eq!(refused.len(), 1, "{refused:?}");
     let reason = store.get(&Path::from("quarantine/text.mcap.reason.txt")).await.expect("a reason");
     let reason = String::from_utf8(reason.bytes().await.expect("bytes").to_vec()).expect("text");
@@ -227,7 +229,7 @@ async fn refused_files_go_to_quarantine_with_the_reason_and_the_rest_goes_on() {
     let taken: Vec<_> = reports
         .iter()
         .filter_map(|r| match r {
-            Report::Taken(taken) => Some((taken.surface.as_str(), taken.whole, taken.measurements)),
+            FileReport::Taken(taken) => Some((taken.surface.as_str(), taken.whole, taken.measurements)),
             _ => None,
         })
         .collect();
@@ -254,7 +256,7 @@ async fn a_record_that_is_too_large_is_passed_over_and_told() {
     file.extend(&whole[header..]);
     runs[0].1 = file.into();
     let reports = ingest(with_inbox(&runs).await).await.expect("ingested");
-    let [Report::Taken(taken)] = reports.as_slice() else { panic!("{reports:?}") };
+    let [FileReport::Taken(taken)] = reports.as_slice() else { panic!("{reports:?}") };
     assert_eq!(taken.measurements, 45);
     let place = format!("record of kind 0x09 at byte {header} has ");
     assert!(taken.damaged.iter().any(|d| d.starts_with(&place) && d.contains("more than")), "{:?}", taken.damaged);
@@ -263,8 +265,8 @@ async fn a_record_that_is_too_large_is_passed_over_and_told() {
 mod slow {
     use super::*;
 
-    // A death at each write, made or not: afterwards ingest is run once more, and the tables are those of an ingest that
-    // nothing disturbed, byte for byte.
+    // A death at each write, made or not: afterwards ingest is run once more, and the tables are those of an ingest
+    // that nothing disturbed, byte for byte.
     #[tokio::test(flavor = "multi_thread")]
     async fn a_death_at_any_write_is_repaired_by_running_again() {
         let runs = runs(&["flat", "foam", "wood"]);
@@ -288,8 +290,8 @@ mod slow {
         assert!(deaths > 2 * 35, "{deaths} deaths");
     }
 
-    // A death at each write of a merge and of the clean-up behind it: readers see the same rows at once, and once it is run
-    // again the files are those of one that nothing disturbed.
+    // A death at each write of a merge and of the clean-up behind it: readers see the same rows at once, and once it is
+    // run again the files are those of one that nothing disturbed.
     #[tokio::test(flavor = "multi_thread")]
     async fn a_death_at_any_write_of_the_upkeep_changes_no_row() {
         let start = with_inbox(&runs(&["flat", "foam", "wood"])).await;
@@ -314,7 +316,8 @@ mod slow {
             assert!(files(inner).await <= kept + 1, "{death}: files are left over");
         })
         .await;
-        // A merge of each of eight tables is a file and a commit; 24 files are deleted; two leases are taken and given back.
+        // A merge of each of eight tables is a file and a commit; 24 files are deleted; two leases are taken and given
+        // back.
         assert!(deaths > 2 * 40, "{deaths} deaths");
     }
 

@@ -7,29 +7,33 @@ use echolake_lake::{EncodedFile, FileEncoder, Lake, StagedFile, encode};
 use echolake_schema::Rig;
 use echolake_schema::tables::Table;
 
-use crate::context::Context;
-use crate::derived_values::{DerivedRows, Flats, Means, Responses, derivation_plan};
+use crate::context::IngestContext;
+use crate::derived_values::{DerivedRows, FlatEnergyMap, MeanResponses, RunResponses, derivation_plan};
 use crate::error::{Error, Result};
-use crate::references::{SharedFinder, Wanted};
-use crate::rows::derived::Versions;
-use crate::rows::runs::References;
-use crate::rows::{self, Keys};
+use crate::references::{SharedFinder, WantedReferences};
+use crate::rows::derived::ReferenceVersions;
+use crate::rows::runs::RunReferences;
+use crate::rows::{self, RunKeys};
 
 /// Number of measurements derived and encoded at a time: it bounds memory independently of the run's length.
 const SLICE: usize = 256;
 
 /// Loaded references, and the name of the derivation with them.
-pub(crate) struct Derivation {
+pub(crate) struct ReferenceDerivation {
     pub(crate) name: String,
     flat_version: String,
     foam_version: String,
-    flat: Arc<Flats>,
-    foam: Arc<Means>,
+    flat: Arc<FlatEnergyMap>,
+    foam: Arc<MeanResponses>,
 }
 
-impl Derivation {
+impl ReferenceDerivation {
     /// Loads the wanted references; None if one is missing.
-    pub(crate) async fn new(run_derivation: &str, wanted: &Wanted, finder: &SharedFinder) -> Result<Option<Self>> {
+    pub(crate) async fn new(
+        run_derivation: &str,
+        wanted: &WantedReferences,
+        finder: &SharedFinder,
+    ) -> Result<Option<Self>> {
         let (Some((flat_version, foam_version)), Some(name)) = (wanted.versions(), wanted.derivation(run_derivation))
         else {
             return Ok(None);
@@ -41,15 +45,15 @@ impl Derivation {
     /// Derives every pair that both references have, and stages the files. Returns them and the run row's references.
     pub(crate) async fn stage(
         self,
-        context: &Context,
-        keys: &Keys,
-        responses: Responses,
-    ) -> Result<(Vec<StagedFile>, References)> {
+        context: &IngestContext,
+        keys: &RunKeys,
+        responses: RunResponses,
+    ) -> Result<(Vec<StagedFile>, RunReferences)> {
         let (this, for_rows, lake) = (Arc::new(self), keys.clone(), context.lake.clone());
         let derivation = this.clone();
         let (files, unpaired) = context.cores.compute(move || derivation.encode(&lake, &for_rows, &responses)).await?;
         let staged = context.stage_rows(keys, &this.name, files).await?;
-        let references = References {
+        let references = RunReferences {
             missing: if unpaired == 0 { String::new() } else { format!("references of {unpaired} pairs") },
             derivation: Some(this.name.clone()),
             flat_version: Some(this.flat_version.clone()),
@@ -59,10 +63,15 @@ impl Derivation {
     }
 
     // Returns the files, and the number of pairs that a reference lacks.
-    fn encode(&self, lake: &Lake, keys: &Keys, responses: &Responses) -> Result<(Vec<(Table, EncodedFile)>, usize)> {
+    fn encode(
+        &self,
+        lake: &Lake,
+        keys: &RunKeys,
+        responses: &RunResponses,
+    ) -> Result<(Vec<(Table, EncodedFile)>, usize)> {
         let (rig, grid) = (lake.rig(), lake.grid());
-        let moved = rows::derived::Moved::of(grid);
-        let of = Versions { flat: &self.flat_version, foam: &self.foam_version };
+        let moved = rows::derived::SymmetryPairs::of(grid);
+        let of = ReferenceVersions { flat: &self.flat_version, foam: &self.foam_version };
         let mut encoders =
             [Table::Nce, Table::Tnce, Table::TnceD4].map(|table| (table, FileEncoder::new(table, table.schema(rig))));
         let mut totals: Vec<Vec<f64>> = vec![Vec::new(); rig.bands.centres_hz.len() + 1];
@@ -94,8 +103,8 @@ impl Derivation {
     fn slices(
         &self,
         rig: &Rig,
-        keys: &Keys,
-        responses: &Responses,
+        keys: &RunKeys,
+        responses: &RunResponses,
         take: &mut dyn FnMut(&mut DerivedRows) -> Result<()>,
     ) -> Result<()> {
         let (bands, length) = (rig.bands.centres_hz.len(), rig.impulse_response.length);

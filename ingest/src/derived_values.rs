@@ -6,10 +6,10 @@ use echolake_dsp::chain::{DerivationPlan, DerivedResponse, FlatEnergies};
 use echolake_schema::Rig;
 
 /// Mean impulse response of each pair of a reference.
-pub(crate) type Means = HashMap<u32, Vec<f32>>;
+pub(crate) type MeanResponses = HashMap<u32, Vec<f32>>;
 
 /// Energies of each pair of Flat, with its Foam subtracted.
-pub(crate) type Flats = HashMap<u32, FlatEnergies>;
+pub(crate) type FlatEnergyMap = HashMap<u32, FlatEnergies>;
 
 /// Returns the derivation plan for a rig's responses.
 pub(crate) fn derivation_plan(rig: &Rig) -> std::result::Result<DerivationPlan<f32>, echolake_dsp::Error> {
@@ -18,7 +18,7 @@ pub(crate) fn derivation_plan(rig: &Rig) -> std::result::Result<DerivationPlan<f
 
 /// A run's impulse responses.
 #[derive(Debug, Clone, Default)]
-pub(crate) struct Responses {
+pub(crate) struct RunResponses {
     pub(crate) pairs: Vec<u32>,
     /// `[pairs x length]`.
     pub(crate) irs: Vec<f32>,

@@ -14,12 +14,12 @@ use serde::Serialize;
 
 use crate::error::{Error, Result};
 use crate::read_back;
-use crate::references::Finder;
+use crate::references::ReferenceFinder;
 use crate::rows::runs::text_of;
 
 /// Result of a check of a lake.
 #[derive(Debug, Clone, Default, Serialize)]
-pub struct Report {
+pub struct LakeReport {
     /// The tables, in order.
     pub tables: Vec<TableReport>,
     /// Runs that readers see.
@@ -27,7 +27,7 @@ pub struct Report {
     /// Bytes of run files.
     pub run_bytes: u64,
     /// Problems and notes, worst first.
-    pub findings: Vec<Finding>,
+    pub findings: Vec<LakeFinding>,
 }
 
 /// Counts of one table.
@@ -45,9 +45,9 @@ pub struct TableReport {
 
 /// A problem or note.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Serialize)]
-pub struct Finding {
+pub struct LakeFinding {
     /// Its severity.
-    pub severity: Severity,
+    pub severity: FindingSeverity,
     /// The file or run.
     pub subject: String,
     /// Description with a hint.
@@ -57,7 +57,7 @@ pub struct Finding {
 /// Severity of a finding, worst first.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
 #[serde(rename_all = "snake_case")]
-pub enum Severity {
+pub enum FindingSeverity {
     /// Data are damaged or lost.
     Damaged,
     /// Something is missing so far.
@@ -68,7 +68,7 @@ pub enum Severity {
 
 /// Progress of the check.
 #[derive(Debug, Clone, Copy)]
-pub struct Step<'a> {
+pub struct CheckStep<'a> {
     /// The file that is being checked.
     pub subject: &'a str,
     /// Files done.
@@ -77,14 +77,14 @@ pub struct Step<'a> {
     pub total: usize,
 }
 
-impl Report {
+impl LakeReport {
     /// Returns whether data are damaged or lost.
     pub fn is_damaged(&self) -> bool {
-        self.findings.iter().any(|f| f.severity == Severity::Damaged)
+        self.findings.iter().any(|f| f.severity == FindingSeverity::Damaged)
     }
 
-    fn find(&mut self, severity: Severity, subject: impl ToString, what: impl Into<String>) {
-        self.findings.push(Finding { severity, subject: subject.to_string(), what: what.into() });
+    fn find(&mut self, severity: FindingSeverity, subject: impl ToString, what: impl Into<String>) {
+        self.findings.push(LakeFinding { severity, subject: subject.to_string(), what: what.into() });
     }
 }
 
@@ -92,18 +92,18 @@ impl Report {
 ///
 /// # Errors
 /// [`Error`] if the lake itself cannot be read; damage in it is a finding.
-pub async fn examine(lake: &Lake, progress: &mut dyn FnMut(Step<'_>)) -> Result<Report> {
+pub async fn examine(lake: &Lake, progress: &mut dyn FnMut(CheckStep<'_>)) -> Result<LakeReport> {
     let snapshot = Arc::new(lake.snapshot().await?);
-    let mut report = Report { runs: snapshot.runs().count(), ..Report::default() };
+    let mut report = LakeReport { runs: snapshot.runs().count(), ..LakeReport::default() };
     let total = Table::ALL.iter().map(|t| snapshot.files(*t).len()).sum::<usize>() + report.runs;
     let mut done = 0;
     for table in Table::ALL {
         let files = snapshot.files(table);
         for file in files {
-            progress(Step { subject: file.path.as_ref(), done, total });
+            progress(CheckStep { subject: file.path.as_ref(), done, total });
             done += 1;
             if let Err(error) = check_table_file(lake, table, file).await {
-                report.find(Severity::Damaged, &file.path, error.to_string());
+                report.find(FindingSeverity::Damaged, &file.path, error.to_string());
             }
         }
         report.tables.push(TableReport {
@@ -115,7 +115,7 @@ pub async fn examine(lake: &Lake, progress: &mut dyn FnMut(Step<'_>)) -> Result<
     }
     let pointers: Vec<_> = snapshot.files(Table::Runs).to_vec();
     for file in pointers {
-        progress(Step { subject: file.path.as_ref(), done, total });
+        progress(CheckStep { subject: file.path.as_ref(), done, total });
         done += 1;
         match read_back::run_row(lake, &file).await {
             Ok(row) => check_run(lake, &snapshot, &row, &mut report).await?,
@@ -138,28 +138,33 @@ async fn check_table_file(lake: &Lake, table: Table, file: &DataFile) -> Result<
     Err(Error::DataFile { file: file.path.to_string(), reason })
 }
 
-async fn check_run(lake: &Lake, snapshot: &Arc<LakeSnapshot>, row: &RecordBatch, report: &mut Report) -> Result<()> {
+async fn check_run(
+    lake: &Lake,
+    snapshot: &Arc<LakeSnapshot>,
+    row: &RecordBatch,
+    report: &mut LakeReport,
+) -> Result<()> {
     let text = |column| text_of(row, column).unwrap_or_default();
     let (run, path, state) = (text("run_id"), text("file"), text("state"));
     for finding in check_run_file(lake, &Path::from(path.as_str()), &text("file_sha256"), report).await? {
-        report.find(Severity::Damaged, &path, finding);
+        report.find(FindingSeverity::Damaged, &path, finding);
     }
     if state == "partial" {
         report.find(
-            Severity::Note,
+            FindingSeverity::Note,
             &run,
             "the run was cut off or damaged when it was taken in; what was whole is in the tables",
         );
     }
     if let Ok(surface) = text("surface_id").parse() {
-        let missing = Finder::new(lake, snapshot.clone()).wanted(&surface).missing();
+        let missing = ReferenceFinder::new(lake, snapshot.clone()).wanted(&surface).missing();
         if !missing.is_empty() {
             let what =
                 format!("waits for reference {missing}; hint: ingest a run of that surface, and it is completed");
-            report.find(Severity::Missing, &run, what);
+            report.find(FindingSeverity::Missing, &run, what);
         } else if text("reference_derivation").is_empty() {
             report.find(
-                Severity::Missing,
+                FindingSeverity::Missing,
                 &run,
                 "its references are there, its derived rows are not; hint: `echolake ingest`",
             );
@@ -169,7 +174,7 @@ async fn check_run(lake: &Lake, snapshot: &Arc<LakeSnapshot>, row: &RecordBatch,
 }
 
 /// Returns descriptions of the damage in a run's file.
-async fn check_run_file(lake: &Lake, path: &Path, sha256: &str, report: &mut Report) -> Result<Vec<String>> {
+async fn check_run_file(lake: &Lake, path: &Path, sha256: &str, report: &mut LakeReport) -> Result<Vec<String>> {
     let mut reader = match ResyncReader::open(lake.store(), path.clone(), path.to_string()).await {
         Ok(reader) => reader,
         Err(e) => return Ok(vec![e.to_string()]),
@@ -194,7 +199,7 @@ async fn check_run_file(lake: &Lake, path: &Path, sha256: &str, report: &mut Rep
 }
 
 // Files that no row names: not yet ingested, refused, or left behind by a crash.
-async fn find_strays(lake: &Lake, snapshot: &LakeSnapshot, report: &mut Report) -> Result<()> {
+async fn find_strays(lake: &Lake, snapshot: &LakeSnapshot, report: &mut LakeReport) -> Result<()> {
     let named: BTreeSet<Path> = Table::ALL
         .iter()
         .flat_map(|t| snapshot.files(*t).iter().chain(snapshot.superseded(*t)))
@@ -208,16 +213,16 @@ async fn find_strays(lake: &Lake, snapshot: &LakeSnapshot, report: &mut Report) 
         let parts: Vec<_> = path.parts().map(|p| p.as_ref().to_owned()).collect();
         match parts.first().map(String::as_str) {
             Some("inbox") if path.extension() == Some("mcap") => {
-                report.find(Severity::Missing, &path, "not yet taken in; hint: `echolake ingest`");
+                report.find(FindingSeverity::Missing, &path, "not yet taken in; hint: `echolake ingest`");
             }
             Some("inbox") => report.find(
-                Severity::Note,
+                FindingSeverity::Note,
                 &path,
                 "a recording that goes on, or was stopped or cut off; hint: `echolake acquire --resume` goes on with it, \
                  `echolake recover` makes a run of what it holds",
             ),
-            Some("runs") => report.find(Severity::Missing, &path, "in no table; hint: `echolake ingest`"),
-            Some("quarantine") => report.find(Severity::Note, &path, "was refused; the reason stands beside it"),
+            Some("runs") => report.find(FindingSeverity::Missing, &path, "in no table; hint: `echolake ingest`"),
+            Some("quarantine") => report.find(FindingSeverity::Note, &path, "was refused; the reason stands beside it"),
             Some("tables") if FileName::parse(&path).is_some() => {
                 left_behind = (left_behind.0 + 1, left_behind.1 + meta.size);
             }
@@ -229,7 +234,7 @@ async fn find_strays(lake: &Lake, snapshot: &LakeSnapshot, report: &mut Report) 
             "{} files ({} bytes) of older derivations or of an ingest that was cut off; hint: `echolake vacuum`",
             left_behind.0, left_behind.1
         );
-        report.find(Severity::Note, "tables", what);
+        report.find(FindingSeverity::Note, "tables", what);
     }
     Ok(())
 }

@@ -28,14 +28,14 @@ const PART: u64 = 8 << 20;
 
 /// Location of a run's file.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub enum Source {
+pub enum RunSource {
     /// In the lake: under `inbox/` or `runs/`.
     Lake(Path),
     /// Anywhere else on this machine.
     File(PathBuf),
 }
 
-impl std::fmt::Display for Source {
+impl std::fmt::Display for RunSource {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         match self {
             Self::Lake(path) => path.fmt(f),
@@ -52,7 +52,7 @@ pub(crate) struct Opened {
     pub(crate) name: String,
 }
 
-impl Source {
+impl RunSource {
     pub(crate) fn open(&self, lake: &Lake) -> Result<Opened> {
         let name = self.to_string();
         match self {
@@ -74,7 +74,7 @@ impl Source {
 ///
 /// # Errors
 /// [`Error::Lake`] if the snapshot cannot be read, [`Error::Read`] if a folder cannot be listed.
-pub async fn pending(lake: &Lake) -> Result<Vec<Source>> {
+pub async fn pending(lake: &Lake) -> Result<Vec<RunSource>> {
     let snapshot = lake.snapshot().await?;
     let mut found = Vec::new();
     for folder in [INBOX, RUNS] {
@@ -88,7 +88,7 @@ pub async fn pending(lake: &Lake) -> Result<Vec<Source>> {
         run.and_then(|r| snapshot.run(&r)).is_some_and(|r| Lake::run_path(&r.surface, &r.run) == *path)
     };
     found.retain(|p| p.extension() == Some("mcap") && !known(p));
-    Ok(found.into_iter().map(Source::Lake).collect())
+    Ok(found.into_iter().map(RunSource::Lake).collect())
 }
 
 /// Renames the recordings in the inbox whose recorder died, so that ingest accepts their complete part; returns them.
@@ -140,7 +140,7 @@ async fn is_made_whole_otherwise(partial: &FsPath) -> bool {
 }
 
 /// Moves or copies a run's file to its place, before any row names it.
-pub(crate) async fn keep(lake: &Lake, source: &Source, to: &Path, bytes: u64) -> Result<()> {
+pub(crate) async fn keep(lake: &Lake, source: &RunSource, to: &Path, bytes: u64) -> Result<()> {
     let store = lake.store();
     let failed = |e: object_store::Error| written(to, e);
     let there = match store.head(to).await {
@@ -149,25 +149,25 @@ pub(crate) async fn keep(lake: &Lake, source: &Source, to: &Path, bytes: u64) ->
         Err(e) => return Err(failed(e)),
     };
     match source {
-        Source::Lake(from) if from == to => Ok(()),
+        RunSource::Lake(from) if from == to => Ok(()),
         // If it has disappeared, another ingest has moved it there.
-        Source::Lake(from) if there => match store.delete(from).await {
+        RunSource::Lake(from) if there => match store.delete(from).await {
             Err(e) if !matches!(e, object_store::Error::NotFound { .. }) => Err(failed(e)),
             _ => Ok(()),
         },
-        Source::Lake(from) => match store.rename(from, to).await {
+        RunSource::Lake(from) => match store.rename(from, to).await {
             Err(object_store::Error::NotFound { .. }) if store.head(to).await.is_ok() => Ok(()),
             renamed => renamed.map_err(failed),
         },
-        Source::File(_) if there => Ok(()),
-        Source::File(from) => copy_in(lake, from, to).await,
+        RunSource::File(_) if there => Ok(()),
+        RunSource::File(from) => copy_in(lake, from, to).await,
     }
 }
 
 /// Moves a refused file of the inbox to `quarantine/`, the reason first; returns its path. Files outside the inbox
 /// stay.
-pub(crate) async fn quarantine(lake: &Lake, source: &Source, why: &Error) -> Result<Option<Path>> {
-    let Source::Lake(from) = source else { return Ok(None) };
+pub(crate) async fn quarantine(lake: &Lake, source: &RunSource, why: &Error) -> Result<Option<Path>> {
+    let RunSource::Lake(from) = source else { return Ok(None) };
     // A file that cannot be read now may be readable later.
     if !source.is_in_inbox() || matches!(why, Error::Read { .. }) {
         return Ok(None);

@@ -11,22 +11,22 @@ use object_store::path::Path;
 use serde::{Deserialize, Serialize};
 
 use crate::CODE_VERSION;
-use crate::context::Context;
-use crate::derive::Derivation;
-use crate::derived_values::Responses;
+use crate::context::IngestContext;
+use crate::derive::ReferenceDerivation;
+use crate::derived_values::RunResponses;
 use crate::error::{Error, Result};
-use crate::files::{self, Source};
+use crate::files::{self, RunSource};
 use crate::marks::ReadingMark;
 use crate::measure::Measurer;
-use crate::pipeline::{self, Cores, Ready};
+use crate::pipeline::{self, Cores, ReadyJob};
 use crate::read_back;
-use crate::references::{Names, digest};
-use crate::rows::{self, Keys};
+use crate::references::{ReferenceNames, digest};
+use crate::rows::{self, RunKeys};
 use crate::run_content::{Head, RunContent};
 
 /// Result of the ingest of one run.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct Taken {
+pub struct IngestedRun {
     /// The run.
     #[serde(rename = "run_id")]
     pub run: RunId,
@@ -41,7 +41,7 @@ pub struct Taken {
     pub missing: String,
     /// Its outcome; in JSON the boolean `added`.
     #[serde(rename = "added")]
-    pub outcome: Outcome,
+    pub outcome: IngestOutcome,
     /// Descriptions of what could not be read.
     pub damaged: Vec<String>,
     /// True if the file was closed and records how the run ended.
@@ -51,58 +51,58 @@ pub struct Taken {
 /// Outcome of an ingest: the run is new, or was in the lake before.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(from = "bool", into = "bool")]
-pub enum Outcome {
+pub enum IngestOutcome {
     /// It is in the lake now.
     Added,
     /// It was in the lake before; nothing was added.
     Known,
 }
 
-impl From<bool> for Outcome {
+impl From<bool> for IngestOutcome {
     fn from(is_added: bool) -> Self {
         if is_added { Self::Added } else { Self::Known }
     }
 }
 
-impl From<Outcome> for bool {
-    fn from(outcome: Outcome) -> Self {
-        outcome == Outcome::Added
+impl From<IngestOutcome> for bool {
+    fn from(outcome: IngestOutcome) -> Self {
+        outcome == IngestOutcome::Added
     }
 }
 
 /// Report on one file.
 #[derive(Debug)]
-pub enum Report {
+pub enum FileReport {
     /// It is in the tables.
-    Taken(Taken),
+    Taken(IngestedRun),
     /// It cannot be ingested, now or later.
     Refused {
         /// The file.
-        source: Source,
+        source: RunSource,
         /// The cause.
         why: Error,
         /// Its new path, if it was moved.
         moved: Option<Path>,
     },
     /// Another ingest has moved it meanwhile.
-    Gone(Source),
+    Gone(RunSource),
 }
 
 /// Ingests runs into a lake.
 #[derive(Debug, Clone)]
-pub struct Ingest<'a> {
+pub struct LakeIngest<'a> {
     lake: &'a Lake,
     stop: Arc<AtomicBool>,
 }
 
 /// State shared by the workers.
 #[derive(Clone)]
-struct Work {
-    context: Context,
+struct IngestWork {
+    context: IngestContext,
     measurer: Arc<Measurer>,
 }
 
-impl<'a> Ingest<'a> {
+impl<'a> LakeIngest<'a> {
     /// Creates an ingest into this lake. Once `stop` is set, no run is started; runs in progress are completed.
     pub fn new(lake: &'a Lake, stop: Arc<AtomicBool>) -> Self {
         Self { lake, stop }
@@ -114,28 +114,28 @@ impl<'a> Ingest<'a> {
     /// # Errors
     /// [`Error::Stopped`], or an error of the lake. Readers do not see files that are not reported yet; the same call
     /// resumes with them.
-    pub async fn take_in(&self, sources: Vec<Source>, report: &mut (dyn FnMut(Report) + Send)) -> Result<()> {
+    pub async fn take_in(&self, sources: Vec<RunSource>, report: &mut (dyn FnMut(FileReport) + Send)) -> Result<()> {
         let (references, others) = self.in_order(sources).await?;
         let (cores, measurer) = (Cores::all()?, Arc::new(Measurer::new(self.lake)));
         for sources in [references, others].into_iter().filter(|s| !s.is_empty()) {
-            let context = Context::now(self.lake, &cores).await?;
-            self.take_in_group(Work { context, measurer: measurer.clone() }, sources, report).await?;
+            let context = IngestContext::now(self.lake, &cores).await?;
+            self.take_in_group(IngestWork { context, measurer: measurer.clone() }, sources, report).await?;
         }
         Ok(())
     }
 
     async fn take_in_group(
         &self,
-        work: Work,
-        sources: Vec<Source>,
-        report: &mut (dyn FnMut(Report) + Send),
+        work: IngestWork,
+        sources: Vec<RunSource>,
+        report: &mut (dyn FnMut(FileReport) + Send),
     ) -> Result<()> {
         let cores = work.context.cores.clone();
         let mut refused = Vec::new();
-        let ended = &mut |(source, done): pipeline::Ended<Source, Taken>| match done {
+        let ended = &mut |(source, done): pipeline::JobOutcome<RunSource, IngestedRun>| match done {
             Ok((taken, outcome)) => {
-                let outcome = Outcome::from(outcome == Some(CommitOutcome::Now));
-                report(Report::Taken(Taken { outcome, ..taken }));
+                let outcome = IngestOutcome::from(outcome == Some(CommitOutcome::Now));
+                report(FileReport::IngestedRun(IngestedRun { outcome, ..taken }));
                 Ok(())
             }
             Err(why) if why.is_refusal() => {
@@ -151,8 +151,8 @@ impl<'a> Ingest<'a> {
         let done = pipeline::run(self.lake, &cores, sources, &self.stop, do_one, ended).await;
         for (source, why) in refused {
             report(match why {
-                Error::Gone { .. } => Report::Gone(source),
-                why => Report::Refused { moved: files::quarantine(self.lake, &source, &why).await?, source, why },
+                Error::Gone { .. } => FileReport::Gone(source),
+                why => FileReport::Refused { moved: files::quarantine(self.lake, &source, &why).await?, source, why },
             });
         }
         done
@@ -160,7 +160,7 @@ impl<'a> Ingest<'a> {
 
     // Runs of surfaces that others name as references, and the rest. The order only saves time: rows are derived again
     // if their references change.
-    async fn in_order(&self, sources: Vec<Source>) -> Result<(Vec<Source>, Vec<Source>)> {
+    async fn in_order(&self, sources: Vec<RunSource>) -> Result<(Vec<RunSource>, Vec<RunSource>)> {
         let defaults = &self.lake.config().references;
         let mut names = BTreeSet::from([defaults.flat.clone(), defaults.foam.clone()]);
         let mut heads = Vec::with_capacity(sources.len());
@@ -175,18 +175,18 @@ impl<'a> Ingest<'a> {
         }
         let is_reference = |head: &Option<Head>| head.as_ref().is_some_and(|h| names.contains(&h.surface));
         let (references, others): (Vec<_>, Vec<_>) = heads.into_iter().partition(|(_, head)| is_reference(head));
-        let sources = |of: Vec<(Source, _)>| of.into_iter().map(|(source, _)| source).collect();
+        let sources = |of: Vec<(RunSource, _)>| of.into_iter().map(|(source, _)| source).collect();
         Ok((sources(references), sources(others)))
     }
 }
 
-impl Work {
-    async fn take_in(&self, source: &Source) -> Result<Ready<Taken>> {
-        let Context { lake, cores, snapshot, finder } = &self.context;
+impl IngestWork {
+    async fn take_in(&self, source: &RunSource) -> Result<ReadyJob<IngestedRun>> {
+        let IngestContext { lake, cores, snapshot, finder } = &self.context;
         let mut mark = ReadingMark::new(lake, source);
         let opened = source.open(lake)?;
         let content = Arc::new(RunContent::read(lake, &self.measurer, cores, &opened).await?);
-        let keys = Keys { surface: content.manifest.surface_id.clone(), run: content.manifest.run_id.clone() };
+        let keys = RunKeys { surface: content.manifest.surface_id.clone(), run: content.manifest.run_id.clone() };
         let derivation = digest(&[content.integrity.sha256.as_str(), CODE_VERSION]);
         let known = snapshot.run(&keys.run);
         if let Some(known) = known {
@@ -194,21 +194,21 @@ impl Work {
         }
         let place = Lake::run_path(&keys.surface, &keys.run);
         files::keep(lake, source, &place, content.integrity.bytes).await?;
-        mark = mark.and_then(|mark| mark.follow(lake, &Source::Lake(place)));
-        let names = Names::of(&content.surface, &lake.config().references);
+        mark = mark.and_then(|mark| mark.follow(lake, &RunSource::Lake(place)));
+        let names = ReferenceNames::of(&content.surface, &lake.config().references);
         let wanted = finder.lock().await.wanted_by(names);
-        let mut taken = Taken {
+        let mut taken = IngestedRun {
             run: keys.run.clone(),
             surface: keys.surface.clone(),
             measurements: content.accepted.len(),
             derived: false,
             missing: wanted.missing(),
-            outcome: Outcome::Added,
+            outcome: IngestOutcome::Added,
             damaged: content.damaged.clone(),
             whole: content.is_whole(),
         };
         if known.is_some_and(|k| k.run_derivation == derivation) {
-            return Ok(Ready { staged: Vec::new(), report: taken });
+            return Ok(ReadyJob { staged: Vec::new(), report: taken });
         }
         let (its_lake, for_rows, its_content) = (lake.clone(), keys.clone(), content.clone());
         let of_the_run = async {
@@ -216,14 +216,14 @@ impl Work {
             self.context.stage_rows(&keys, &derivation, files).await
         };
         let of_references = async {
-            match Derivation::new(&derivation, &wanted, finder).await? {
+            match ReferenceDerivation::new(&derivation, &wanted, finder).await? {
                 Some(derived) => derived.stage(&self.context, &keys, content.responses()).await.map(Some),
                 None => Ok(None),
             }
         };
         let (mut staged, derived) = tokio::try_join!(of_the_run, of_references)?;
         let mut references =
-            rows::runs::References { missing: taken.missing.clone(), ..rows::runs::References::default() };
+            rows::runs::RunReferences { missing: taken.missing.clone(), ..rows::runs::RunReferences::default() };
         if let Some((files, used)) = derived {
             staged.extend(files);
             taken.derived = true;
@@ -239,7 +239,7 @@ impl Work {
         let row = rows::runs::row(lake, &keys, &content, &derivation, &references)?;
         staged.push(self.context.stage_pointer(run, &[row]).await?);
         drop(mark);
-        Ok(Ready { staged, report: taken })
+        Ok(ReadyJob { staged, report: taken })
     }
 
     async fn check_same(&self, known: &VisibleRun, content: &RunContent, file: &str) -> Result<()> {
@@ -255,7 +255,7 @@ impl Work {
 }
 
 // The rows that do not depend on references.
-fn encode_run(lake: &Lake, keys: &Keys, content: &RunContent) -> Result<Vec<(Table, EncodedFile)>> {
+fn encode_run(lake: &Lake, keys: &RunKeys, content: &RunContent) -> Result<Vec<(Table, EncodedFile)>> {
     let rig = lake.rig();
     let origin = content.manifest.origin.label();
     let references = &lake.config().references;
@@ -277,8 +277,8 @@ fn encode_run(lake: &Lake, keys: &Keys, content: &RunContent) -> Result<Vec<(Tab
 
 impl RunContent {
     /// Returns the responses alone, sorted by pair.
-    fn responses(&self) -> Responses {
-        Responses {
+    fn responses(&self) -> RunResponses {
+        RunResponses {
             pairs: self.accepted.iter().map(|(m, _)| m.pair_id).collect(),
             irs: self.accepted.iter().flat_map(|(_, r)| r.ir.iter().copied()).collect(),
         }

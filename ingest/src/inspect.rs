@@ -15,13 +15,13 @@ use crate::run_content::RunContent;
 
 /// The contents of a run's file.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Inspection {
+pub struct RunInspection {
     /// The run's id in the file.
     pub run: RunId,
     /// The surface's id in the file.
     pub surface: SurfaceId,
     /// Accepted measurements by pair.
-    pub measurements: Vec<Inspected>,
+    pub measurements: Vec<InspectedMeasurement>,
     /// Times of the ambient sensor's readings, ns since 1970, in file order.
     pub readings_ns: Vec<i64>,
     /// True if the file was closed and records how the run ended.
@@ -32,7 +32,7 @@ pub struct Inspection {
 
 /// An accepted measurement.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Inspected {
+pub struct InspectedMeasurement {
     /// Pair.
     pub pair: u32,
     /// Attempt.
@@ -45,13 +45,16 @@ pub struct Inspected {
 ///
 /// # Errors
 /// [`Error`](crate::Error) if ingest would refuse the whole file; the message names it.
-pub async fn inspect(lake: &Lake, store: Arc<dyn ObjectStore>, path: &Path, name: &str) -> Result<Inspection> {
+pub async fn inspect(lake: &Lake, store: Arc<dyn ObjectStore>, path: &Path, name: &str) -> Result<RunInspection> {
     let opened = Opened { store, path: path.clone(), name: name.to_owned() };
     let content = RunContent::read(lake, &Arc::new(Measurer::new(lake)), &Cores::all()?, &opened).await?;
     let whole = content.is_whole();
-    let inspected =
-        content.accepted.into_iter().map(|(m, r)| Inspected { pair: m.pair_id, attempt: m.attempt, ir: r.ir });
-    Ok(Inspection {
+    let inspected = content.accepted.into_iter().map(|(m, r)| InspectedMeasurement {
+        pair: m.pair_id,
+        attempt: m.attempt,
+        ir: r.ir,
+    });
+    Ok(RunInspection {
         run: content.manifest.run_id,
         surface: content.manifest.surface_id,
         measurements: inspected.collect(),

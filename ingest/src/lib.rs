@@ -4,14 +4,14 @@
 //! [`complete()`] derives again the rows that used outdated references, and nothing else.
 //!
 //! ```no_run,standalone_crate
-//! use echolake_ingest::{Ingest, Report, complete, pending};
+//! use echolake_ingest::{FileReport, LakeIngest, complete, pending};
 //! # async fn example() -> Result<(), Box<dyn std::error::Error>> {
 //! let lake = echolake_lake::Lake::open("lake").await?;
 //! let stop = std::sync::Arc::default();
-//! let ingest = Ingest::new(&lake, std::sync::Arc::clone(&stop));
+//! let ingest = LakeIngest::new(&lake, std::sync::Arc::clone(&stop));
 //! ingest
 //!     .take_in(pending(&lake).await?, &mut |report| {
-//!         if let Report::Taken(taken) = report {
+//!         if let FileReport::Taken(taken) = report {
 //!             println!("{} measurements of {}", taken.measurements, taken.surface);
 //!         }
 //!     })
@@ -49,13 +49,13 @@ mod rows;
 mod run_channels;
 mod run_content;
 
-pub use complete::{Completed, complete, waiting};
+pub use complete::{CompletedRun, complete, waiting};
 pub use echolake_recording::FileIntegrity;
 pub use error::{Error, Result};
-pub use files::{Source, adopt_cut_off, pending};
-pub use ingest::{Ingest, Outcome, Report, Taken};
+pub use files::{RunSource, adopt_cut_off, pending};
+pub use ingest::{FileReport, IngestOutcome, IngestedRun, LakeIngest};
 #[doc(hidden)]
-pub use inspect::{Inspected, Inspection, inspect};
+pub use inspect::{InspectedMeasurement, RunInspection, inspect};
 pub use marks::SuspectFile;
 
 /// Version of the code that derives rows; every row has it.

@@ -12,8 +12,8 @@ use std::path::{Path, PathBuf};
 use echolake_lake::Lake;
 
 use crate::error::{Error, Result};
-use crate::files::{self, Source};
-use crate::ingest::Report;
+use crate::files::{self, RunSource};
+use crate::ingest::FileReport;
 use crate::references::digest;
 
 /// Folder of the marks. Deleting `tables/` deletes them, too.
@@ -30,7 +30,7 @@ pub(crate) struct ReadingMark {
 impl ReadingMark {
     /// Marks a file. None if it is not in the lake, if another ingest reads it, or if the disk is full: a missing mark
     /// must not fail the ingest.
-    pub(crate) fn new(lake: &Lake, source: &Source) -> Option<Self> {
+    pub(crate) fn new(lake: &Lake, source: &RunSource) -> Option<Self> {
         let path = mark_path(lake, source)?;
         fs::create_dir_all(path.parent()?).ok()?;
         let lock = OpenOptions::new().append(true).create(true).open(&path).ok()?;
@@ -39,7 +39,7 @@ impl ReadingMark {
     }
 
     /// Marks the file under its new name.
-    pub(crate) fn follow(mut self, lake: &Lake, source: &Source) -> Option<Self> {
+    pub(crate) fn follow(mut self, lake: &Lake, source: &RunSource) -> Option<Self> {
         let path = mark_path(lake, source)?;
         fs::rename(&self.path, &path).ok()?;
         self.path = path;
@@ -59,7 +59,7 @@ impl Drop for ReadingMark {
 /// A file that an ingest was reading when it died.
 #[derive(Debug)]
 pub struct SuspectFile {
-    source: Source,
+    source: RunSource,
     mark: PathBuf,
     /// Endings of the processes that ingested this file alone.
     endings: Vec<String>,
@@ -67,7 +67,7 @@ pub struct SuspectFile {
 
 impl SuspectFile {
     /// Returns the suspect if the file has an unlocked mark; None for a file that is being read now.
-    pub fn from_source(lake: &Lake, source: &Source) -> Option<Self> {
+    pub fn from_source(lake: &Lake, source: &RunSource) -> Option<Self> {
         let mark = mark_path(lake, source)?;
         let is_read = File::open(&mark).ok()?.try_lock_shared().is_err();
         let endings = fs::read_to_string(&mark).unwrap_or_default().lines().map(str::to_owned).collect();
@@ -75,7 +75,7 @@ impl SuspectFile {
     }
 
     /// The file.
-    pub fn source(&self) -> &Source {
+    pub fn source(&self) -> &RunSource {
         &self.source
     }
 
@@ -98,7 +98,7 @@ impl SuspectFile {
     ///
     /// # Errors
     /// Errors of the lake.
-    pub async fn refuse(&self, lake: &Lake) -> Result<Option<Report>> {
+    pub async fn refuse(&self, lake: &Lake) -> Result<Option<FileReport>> {
         if self.endings.len() < MOST_DEATHS {
             return Ok(None);
         }
@@ -109,13 +109,13 @@ impl SuspectFile {
         if moved.is_some() {
             let _ = fs::remove_file(&self.mark);
         }
-        Ok(Some(Report::Refused { source: self.source.clone(), why, moved }))
+        Ok(Some(FileReport::Refused { source: self.source.clone(), why, moved }))
     }
 }
 
 // Named by a digest, because a path may be longer than a file name.
-fn mark_path(lake: &Lake, source: &Source) -> Option<PathBuf> {
-    let Source::Lake(path) = source else { return None };
+fn mark_path(lake: &Lake, source: &RunSource) -> Option<PathBuf> {
+    let RunSource::Lake(path) = source else { return None };
     Some(lake.folder()?.join(Path::new(FOLDER)).join(digest(&[path.as_ref()])))
 }
 
@@ -135,7 +135,7 @@ mod tests {
         let lake = Lake::open_or_create(&url, &Rig::paper(), &ReferenceSurfaces::default()).await.expect("a lake");
         // Too long for the name of the reason's file.
         let name = format!("{}.mcap", "a".repeat(240));
-        let source = Source::Lake(ObjectPath::from(format!("inbox/{name}")));
+        let source = RunSource::Lake(ObjectPath::from(format!("inbox/{name}")));
         let inbox = folder.path().join("lake/inbox");
         fs::create_dir_all(&inbox).and_then(|()| fs::write(inbox.join(name), "x")).expect("written");
         let is_suspect = || SuspectFile::from_source(&lake, &source).is_some();
@@ -157,7 +157,7 @@ mod tests {
         die();
         suspect.add_death("signal: 9 (SIGKILL)").expect("written");
         let report = suspect.refuse(&lake).await.expect("asked").expect("refused");
-        let Report::Refused { moved: Some(moved), why, .. } = report else { panic!("{report:?}") };
+        let FileReport::Refused { moved: Some(moved), why, .. } = report else { panic!("{report:?}") };
         assert!(why.to_string().contains("signal: 6 (SIGABRT), signal: 9 (SIGKILL)"), "{why}");
         let reason = ObjectPath::from(format!("{moved}.reason.txt"));
         assert!(lake.store().head(&moved).await.is_ok() && lake.store().head(&reason).await.is_ok(), "{moved}");

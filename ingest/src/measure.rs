@@ -38,7 +38,7 @@ pub(crate) struct Measurer {
     rig: Rig,
     pairs: u32,
     /// Cache of plans by recording length: a run has one length, an import may have several.
-    plans: Mutex<HashMap<usize, Arc<Planned>>>,
+    plans: Mutex<HashMap<usize, Arc<RecordingPlan>>>,
     correction: TemperatureCorrection<f32>,
 }
 
@@ -60,22 +60,22 @@ impl RunBudget {
 }
 
 /// The plan of one recording length, and a pool of idle buffers.
-struct Planned {
+struct RecordingPlan {
     plan: MeasurementPlan<f32>,
-    idle: Mutex<Vec<Buffers>>,
+    idle: Mutex<Vec<MeasurementBuffers>>,
 }
 
-struct Buffers {
+struct MeasurementBuffers {
     microphone: Vec<f32>,
     loopback: Vec<f32>,
     scratch: MeasurementScratch<f32>,
 }
 
-impl Planned {
-    fn with_buffers<T>(&self, len: usize, work: impl FnOnce(&mut Buffers) -> T) -> T {
+impl RecordingPlan {
+    fn with_buffers<T>(&self, len: usize, work: impl FnOnce(&mut MeasurementBuffers) -> T) -> T {
         let idle = || self.idle.lock().unwrap_or_else(PoisonError::into_inner);
         let found = idle().pop();
-        let mut buffers = found.unwrap_or_else(|| Buffers {
+        let mut buffers = found.unwrap_or_else(|| MeasurementBuffers {
             microphone: vec![0.0; len],
             loopback: vec![0.0; len],
             scratch: self.plan.scratch(),
@@ -106,19 +106,19 @@ pub(crate) struct Response {
     pub(crate) log_time_ns: i64,
     pub(crate) chunk_offset: u64,
     pub(crate) temperature_c: f64,
-    pub(crate) source: Source,
+    pub(crate) source: ResponseSource,
     pub(crate) ir: Vec<f32>,
 }
 
 /// Origin of a response; the greater is preferred.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-pub(crate) enum Source {
+pub(crate) enum ResponseSource {
     Corrected,
     Ir,
     Sweep,
 }
 
-impl Source {
+impl ResponseSource {
     pub(crate) fn label(self) -> &'static str {
         match self {
             Self::Corrected => "corrected",
@@ -246,7 +246,7 @@ impl Measurer {
         let planned = self.plan(count)?;
         let mut ir = vec![0.0; self.rig.impulse_response.length];
         let measured = planned.with_buffers(count, |buffers| {
-            let Buffers { microphone, loopback, scratch } = buffers;
+            let MeasurementBuffers { microphone, loopback, scratch } = buffers;
             samples::decode(format, &sweep.microphone, microphone).map_err(|e| e.to_string())?;
             samples::decode(format, &sweep.loopback, loopback).map_err(|e| e.to_string())?;
             match planned.plan.ir(microphone, loopback, celsius.get(), &mut ir, scratch) {
@@ -264,7 +264,7 @@ impl Measurer {
             log_time_ns: message.log_time_ns,
             chunk_offset,
             temperature_c: celsius.get(),
-            source: Source::Sweep,
+            source: ResponseSource::Sweep,
             ir,
         }))
     }
@@ -291,13 +291,13 @@ impl Measurer {
                 .get(..length)
                 .ok_or_else(|| format!("it has {} samples, the lake's responses have {length}", given.samples.len()))?;
             ir.copy_from_slice(kept);
-            Source::Corrected
+            ResponseSource::Corrected
         } else if swept.contains(&(given.pair_id, given.attempt)) {
             return Ok(None);
         } else {
             let reference = self.rig.impulse_response.reference_temperature_c.get();
             self.correction.run(&given.samples, resampling_ratio(celsius.get(), reference), &mut ir);
-            Source::Ir
+            ResponseSource::Ir
         };
         Ok(Some(Response {
             pair: given.pair_id,
@@ -310,7 +310,7 @@ impl Measurer {
         }))
     }
 
-    fn plan(&self, recording_len: usize) -> Result<Arc<Planned>, String> {
+    fn plan(&self, recording_len: usize) -> Result<Arc<RecordingPlan>, String> {
         let longest = LONGEST_RECORDING.max(4 * self.rig.recording_len());
         if recording_len > longest {
             return Err(format!("it has {recording_len} samples, more than {longest}"));
@@ -331,7 +331,7 @@ impl Measurer {
             floor_db: self.rig.impulse_response.floor_db,
             reference_celsius: self.rig.impulse_response.reference_temperature_c.get(),
         });
-        let plan = Arc::new(Planned { plan: plan.map_err(|e| e.to_string())?, idle: Mutex::default() });
+        let plan = Arc::new(RecordingPlan { plan: plan.map_err(|e| e.to_string())?, idle: Mutex::default() });
         plans.insert(recording_len, plan.clone());
         Ok(plan)
     }

@@ -15,7 +15,7 @@ use object_store::{
 
 /// The moment of a store's death.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Death {
+pub(crate) enum DeathMoment {
     /// The write is not made.
     Before,
     /// The write is made, and its author gets an error.
@@ -24,15 +24,15 @@ pub(crate) enum Death {
 
 /// A store that dies at its nth write; all later writes fail.
 #[derive(Debug)]
-pub(crate) struct Mortal {
+pub(crate) struct MortalStore {
     inner: Arc<InMemory>,
     writes: AtomicUsize,
     last: usize,
-    death: Death,
+    death: DeathMoment,
 }
 
-impl Mortal {
-    pub(crate) fn new(inner: Arc<InMemory>, last: usize, death: Death) -> Arc<Self> {
+impl MortalStore {
+    pub(crate) fn new(inner: Arc<InMemory>, last: usize, death: DeathMoment) -> Arc<Self> {
         Arc::new(Self { inner, writes: AtomicUsize::new(0), last, death })
     }
 
@@ -44,7 +44,7 @@ impl Mortal {
     // Returns (made, acknowledged): whether the write is made, and whether its author gets its result.
     fn write(&self) -> (bool, bool) {
         let number = self.writes.fetch_add(1, Ordering::SeqCst);
-        (number < self.last || (number == self.last && self.death == Death::After), number < self.last)
+        (number < self.last || (number == self.last && self.death == DeathMoment::After), number < self.last)
     }
 
     async fn mutate<T>(&self, work: impl Future<Output = StoreResult<T>>) -> StoreResult<T> {
@@ -58,14 +58,14 @@ fn dead() -> StoreError {
     StoreError::Generic { store: "Mortal", source: "the power is gone".into() }
 }
 
-impl fmt::Display for Mortal {
+impl fmt::Display for MortalStore {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str("Mortal")
     }
 }
 
 #[async_trait]
-impl ObjectStore for Mortal {
+impl ObjectStore for MortalStore {
     async fn put_opts(&self, location: &Path, payload: PutPayload, opts: PutOptions) -> StoreResult<PutResult> {
         self.mutate(self.inner.put_opts(location, payload, opts)).await
     }

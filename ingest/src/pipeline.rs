@@ -35,26 +35,26 @@ pub(crate) struct Cores {
 }
 
 /// A guard that counts a core as busy until it is dropped.
-pub(crate) struct Busy(Arc<AtomicUsize>);
+pub(crate) struct BusyCore(Arc<AtomicUsize>);
 
 /// Handle of a computation on a core.
 pub(crate) struct Begun<T>(oneshot::Receiver<std::thread::Result<T>>);
 
-impl Drop for Busy {
+impl Drop for BusyCore {
     fn drop(&mut self) {
         self.0.fetch_sub(1, Ordering::Relaxed);
     }
 }
 
 /// A finished job, ready for the commit.
-pub(crate) struct Ready<R> {
+pub(crate) struct ReadyJob<R> {
     /// Files in the store; the last one decides the job's outcome.
     pub(crate) staged: Vec<StagedFile>,
     pub(crate) report: R,
 }
 
 /// A job with its result: its report, and the outcome of its last file (None if it had no files).
-pub(crate) type Ended<J, R> = (J, Result<(R, Option<CommitOutcome>)>);
+pub(crate) type JobOutcome<J, R> = (J, Result<(R, Option<CommitOutcome>)>);
 
 impl Cores {
     pub(crate) fn all() -> Result<Self> {
@@ -68,9 +68,9 @@ impl Cores {
     }
 
     /// Counts the caller as a busy core.
-    pub(crate) fn busy(&self) -> Busy {
+    pub(crate) fn busy(&self) -> BusyCore {
         self.busy.fetch_add(1, Ordering::Relaxed);
-        Busy(self.busy.clone())
+        BusyCore(self.busy.clone())
     }
 
     /// Returns whether a core is idle.
@@ -121,13 +121,13 @@ pub(crate) async fn run<J, R, W, F>(
     jobs: Vec<J>,
     stop: &AtomicBool,
     work: W,
-    ended: &mut (dyn FnMut(Ended<J, R>) -> Result<()> + Send),
+    ended: &mut (dyn FnMut(JobOutcome<J, R>) -> Result<()> + Send),
 ) -> Result<()>
 where
     J: Send + Clone + 'static,
     R: Send + 'static,
     W: Fn(J) -> F + Clone + Send + 'static,
-    F: Future<Output = Result<Ready<R>>> + Send,
+    F: Future<Output = Result<ReadyJob<R>>> + Send,
 {
     let queue = Arc::new(Mutex::new(VecDeque::from(jobs)));
     let next = |queue: &Mutex<VecDeque<J>>| queue.lock().unwrap_or_else(PoisonError::into_inner).pop_front();
@@ -177,8 +177,8 @@ async fn gather<T>(ready: &mut mpsc::Receiver<T>) -> Option<Vec<T>> {
 
 async fn commit<J, R>(
     lake: &Lake,
-    group: Vec<(J, Result<Ready<R>>)>,
-    ended: &mut (dyn FnMut(Ended<J, R>) -> Result<()> + Send),
+    group: Vec<(J, Result<ReadyJob<R>>)>,
+    ended: &mut (dyn FnMut(JobOutcome<J, R>) -> Result<()> + Send),
 ) -> Result<()> {
     let staged: Vec<_> =
         group.iter().flat_map(|(_, done)| done.iter().flat_map(|r| r.staged.iter().cloned())).collect();

@@ -12,12 +12,12 @@ use object_store::ObjectStoreExt as _;
 use parquet::arrow::ProjectionMask;
 use parquet::arrow::arrow_reader::{ArrowReaderOptions, ParquetRecordBatchReaderBuilder};
 
-use crate::derived_values::Responses;
+use crate::derived_values::RunResponses;
 use crate::error::{Error, Result};
 
 /// Reads a run's impulse responses from `measurements`.
-pub(crate) async fn responses(lake: &Lake, snapshot: &LakeSnapshot, run: &RunId) -> Result<Responses> {
-    let mut out = Responses::default();
+pub(crate) async fn responses(lake: &Lake, snapshot: &LakeSnapshot, run: &RunId) -> Result<RunResponses> {
+    let mut out = RunResponses::default();
     let files: Vec<_> = snapshot.files_of(Table::Measurements, run).cloned().collect();
     for file in files {
         for batch in responses_in(lake, &file, run).await? {

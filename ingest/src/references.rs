@@ -10,7 +10,7 @@ use sha2::{Digest as _, Sha256};
 use tokio::sync::Mutex;
 
 use crate::CODE_VERSION;
-use crate::derived_values::{Flats, Means, derivation_plan};
+use crate::derived_values::{FlatEnergyMap, MeanResponses, derivation_plan};
 use crate::error::{Error, Result};
 use crate::read_back;
 
@@ -18,28 +18,28 @@ use crate::read_back;
 const VERSION_DIGITS: usize = 12;
 
 /// Finds references in one snapshot, and caches their responses.
-pub(crate) struct Finder {
+pub(crate) struct ReferenceFinder {
     lake: Lake,
     snapshot: Arc<LakeSnapshot>,
     /// The references that each surface's row names.
-    names: HashMap<SurfaceId, Names>,
+    names: HashMap<SurfaceId, ReferenceNames>,
     versions: HashMap<SurfaceId, String>,
     /// Keyed by version: the means change with the runs, and so does the version.
-    means: HashMap<String, Arc<Means>>,
-    flats: HashMap<String, Arc<Flats>>,
+    means: HashMap<String, Arc<MeanResponses>>,
+    flats: HashMap<String, Arc<FlatEnergyMap>>,
 }
 
 /// One finder for all workers: they share its cache.
-pub(crate) type SharedFinder = Arc<Mutex<Finder>>;
+pub(crate) type SharedFinder = Arc<Mutex<ReferenceFinder>>;
 
 /// The surfaces that a surface names as its references.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(crate) struct Names {
+pub(crate) struct ReferenceNames {
     pub(crate) flat: SurfaceId,
     pub(crate) foam: SurfaceId,
 }
 
-impl Names {
+impl ReferenceNames {
     /// Returns the names that a run's surface gives, else the lake's.
     pub(crate) fn of(surface: &SurfaceRecord, references: &ReferenceSurfaces) -> Self {
         Self {
@@ -51,22 +51,22 @@ impl Names {
 
 /// The references of a surface, as far as the lake has them.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(crate) struct Wanted {
-    pub(crate) flat: Found,
-    pub(crate) foam: Found,
+pub(crate) struct WantedReferences {
+    pub(crate) flat: ReferenceVersion,
+    pub(crate) foam: ReferenceVersion,
     /// Flat's own Foam.
-    flat_foam: Found,
+    flat_foam: ReferenceVersion,
 }
 
 /// One reference.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(crate) struct Found {
+pub(crate) struct ReferenceVersion {
     pub(crate) surface: SurfaceId,
     /// None if the lake has no run of the surface.
     pub(crate) version: Option<String>,
 }
 
-impl Finder {
+impl ReferenceFinder {
     pub(crate) fn new(lake: &Lake, snapshot: Arc<LakeSnapshot>) -> Self {
         let mut runs: HashMap<_, Vec<_>> = HashMap::new();
         for run in snapshot.runs() {
@@ -88,18 +88,21 @@ impl Finder {
     }
 
     /// Returns the references with which the surface's rows must be derived.
-    pub(crate) fn wanted(&self, surface: &SurfaceId) -> Wanted {
+    pub(crate) fn wanted(&self, surface: &SurfaceId) -> WantedReferences {
         self.wanted_by(self.names(surface))
     }
 
     /// The same for a surface with these names.
-    pub(crate) fn wanted_by(&self, Names { flat, foam }: Names) -> Wanted {
+    pub(crate) fn wanted_by(&self, ReferenceNames { flat, foam }: ReferenceNames) -> WantedReferences {
         let flat_foam = self.names(&flat).foam;
-        Wanted { flat: self.found(flat), foam: self.found(foam), flat_foam: self.found(flat_foam) }
+        WantedReferences { flat: self.found(flat), foam: self.found(foam), flat_foam: self.found(flat_foam) }
     }
 
     /// Loads the mean responses of Foam and the energies of Flat with its Foam subtracted; None if one is missing.
-    pub(crate) async fn load(&mut self, wanted: &Wanted) -> Result<Option<(Arc<Means>, Arc<Flats>)>> {
+    pub(crate) async fn load(
+        &mut self,
+        wanted: &WantedReferences,
+    ) -> Result<Option<(Arc<MeanResponses>, Arc<FlatEnergyMap>)>> {
         let Some((version, _)) = wanted.versions() else { return Ok(None) };
         let foam = self.mean(&wanted.foam).await?;
         if let Some(known) = self.flats.get(&version) {
@@ -112,7 +115,7 @@ impl Finder {
         Ok(Some((foam, flats)))
     }
 
-    async fn mean(&mut self, of: &Found) -> Result<Arc<Means>> {
+    async fn mean(&mut self, of: &ReferenceVersion) -> Result<Arc<MeanResponses>> {
         let key = of.version.clone().unwrap_or_default();
         if let Some(known) = self.means.get(&key) {
             return Ok(known.clone());
@@ -130,39 +133,39 @@ impl Finder {
         let mean = |(pair, (count, sum)): (u32, (u32, Vec<f64>))| {
             (pair, sum.into_iter().map(|s| (s / f64::from(count)) as f32).collect())
         };
-        let means: Arc<Means> = Arc::new(sums.into_iter().map(mean).collect());
+        let means: Arc<MeanResponses> = Arc::new(sums.into_iter().map(mean).collect());
         self.means.insert(key, means.clone());
         Ok(means)
     }
 
-    fn found(&self, surface: SurfaceId) -> Found {
-        Found { version: self.versions.get(&surface).cloned(), surface }
+    fn found(&self, surface: SurfaceId) -> ReferenceVersion {
+        ReferenceVersion { version: self.versions.get(&surface).cloned(), surface }
     }
 
     // The lake's defaults for an unknown surface.
-    fn names(&self, surface: &SurfaceId) -> Names {
+    fn names(&self, surface: &SurfaceId) -> ReferenceNames {
         let references = &self.lake.config().references;
-        let defaults = || Names { flat: references.flat.clone(), foam: references.foam.clone() };
+        let defaults = || ReferenceNames { flat: references.flat.clone(), foam: references.foam.clone() };
         self.names.get(surface).cloned().unwrap_or_else(defaults)
     }
 }
 
 // The names in a surface's row, taken from its file's statistics.
-fn names(file: &DataFile, references: &ReferenceSurfaces) -> Option<(SurfaceId, Names)> {
+fn names(file: &DataFile, references: &ReferenceSurfaces) -> Option<(SurfaceId, ReferenceNames)> {
     let Some(FileName::Rows { surface, .. }) = FileName::parse(&file.path) else { return None };
     let text = |column: &str| file.stats.as_ref()?.min.get(column)?.as_str()?.parse().ok();
-    let names = Names {
+    let names = ReferenceNames {
         flat: text("flat_reference").unwrap_or_else(|| references.flat.clone()),
         foam: text("foam_reference").unwrap_or_else(|| references.foam.clone()),
     };
     Some((surface, names))
 }
 
-fn flats(rig: &Rig, flat: &Means, foam: &Means) -> Result<Flats> {
+fn flats(rig: &Rig, flat: &MeanResponses, foam: &MeanResponses) -> Result<FlatEnergyMap> {
     let failed = |cause| Error::Kernel { file: "the reference".to_owned(), cause };
     let plan = derivation_plan(rig).map_err(failed)?;
     let mut scratch = plan.scratch();
-    let mut flats = Flats::with_capacity(flat.len());
+    let mut flats = FlatEnergyMap::with_capacity(flat.len());
     for (pair, ir) in flat {
         let Some(foam) = foam.get(pair) else { continue };
         let subtracted: Vec<f32> = ir.iter().zip(foam).map(|(a, b)| a - b).collect();
@@ -171,7 +174,7 @@ fn flats(rig: &Rig, flat: &Means, foam: &Means) -> Result<Flats> {
     Ok(flats)
 }
 
-impl Wanted {
+impl WantedReferences {
     /// Returns Flat's version and Foam's; None if one is missing. Flat's version includes that of its own Foam.
     pub(crate) fn versions(&self) -> Option<(String, String)> {
         let (flat, flat_foam) = (self.flat.version.as_ref()?, self.flat_foam.version.as_ref()?);

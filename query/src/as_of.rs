@@ -24,7 +24,7 @@ use crate::Error;
 const MARK: char = '@';
 /// A table or view at a moment.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
-pub(crate) struct Past {
+pub(crate) struct PastTableName {
     /// Its name as the query has it, `nce@12`.
     pub(crate) name: String,
     /// The name of the table.
@@ -33,7 +33,7 @@ pub(crate) struct Past {
     pub(crate) at: String,
 }
 
-impl Past {
+impl PastTableName {
     fn of(name: &str) -> Option<Self> {
         let (table, at) = name.split_once(MARK)?;
         Some(Self { name: name.to_owned(), table: table.to_owned(), at: at.to_owned() })
@@ -68,7 +68,7 @@ pub(crate) fn respelled(sql: &str) -> Cow<'_, str> {
     }
     let mut out = String::with_capacity(sql.len() + 2);
     let (mut offsets, mut done) = (ByteOffsets::of(sql), 0);
-    for Clause { start, end, name } in found {
+    for AsOfClause { start, end, name } in found {
         let (from, to) = (offsets.advance(start), offsets.advance(end));
         let Some(between) = sql.get(done..from) else { continue };
         let Some(replaced) = sql.get(from..to) else { continue };
@@ -81,13 +81,13 @@ pub(crate) fn respelled(sql: &str) -> Cow<'_, str> {
 }
 
 /// A clause `nce VERSION AS OF 12` and its replacement.
-struct Clause {
+struct AsOfClause {
     start: Location,
     end: Location,
     name: String,
 }
 
-fn clause(tokens: &[TokenWithSpan], at: usize) -> Option<Clause> {
+fn clause(tokens: &[TokenWithSpan], at: usize) -> Option<AsOfClause> {
     let Token::Word(table) = &tokens[at].token else { return None };
     // `FOR VERSION AS OF 3` belongs to the name before it.
     if is_word(&tokens[at], "for") {
@@ -108,7 +108,7 @@ fn clause(tokens: &[TokenWithSpan], at: usize) -> Option<Clause> {
     };
     let written = if table.quote_style.is_some() { table.value.clone() } else { table.value.to_lowercase() };
     let name = format!("\"{}{MARK}{}\"", written.replace('"', "\"\""), moment.replace('"', "\"\""));
-    as_of.then(|| Clause { start: tokens[at].span.start, end: last.span.end, name })
+    as_of.then(|| AsOfClause { start: tokens[at].span.start, end: last.span.end, name })
 }
 
 fn is_word(token: &TokenWithSpan, word: &str) -> bool {
@@ -153,7 +153,7 @@ impl<'a> ByteOffsets<'a> {
 
 /// Returns the past tables that a statement names. Each one without an alias gets its plain name as alias, so that
 /// `nce.pair_id` refers to it.
-pub(crate) fn named(statement: &mut Statement) -> BTreeSet<Past> {
+pub(crate) fn named(statement: &mut Statement) -> BTreeSet<PastTableName> {
     match statement {
         Statement::Statement(sql) => named_in(sql),
         Statement::Explain(explain) => named(&mut explain.statement),
@@ -161,16 +161,16 @@ pub(crate) fn named(statement: &mut Statement) -> BTreeSet<Past> {
     }
 }
 
-fn named_in(sql: &mut Sql) -> BTreeSet<Past> {
-    let mut found = Found::default();
+fn named_in(sql: &mut Sql) -> BTreeSet<PastTableName> {
+    let mut found = PastTableVisitor::default();
     let ControlFlow::<()>::Continue(()) = sql.visit(&mut found) else { return BTreeSet::new() };
     found.0
 }
 
 #[derive(Default)]
-struct Found(BTreeSet<Past>);
+struct PastTableVisitor(BTreeSet<PastTableName>);
 
-impl VisitorMut for Found {
+impl VisitorMut for PastTableVisitor {
     type Break = ();
 
     fn pre_visit_relation(&mut self, relation: &mut ObjectName) -> ControlFlow<()> {
@@ -189,9 +189,9 @@ impl VisitorMut for Found {
     }
 }
 
-fn past(name: &ObjectName) -> Option<Past> {
+fn past(name: &ObjectName) -> Option<PastTableName> {
     match name.0.last()? {
-        ObjectNamePart::Identifier(ident) => Past::of(&ident.value),
+        ObjectNamePart::Identifier(ident) => PastTableName::of(&ident.value),
         ObjectNamePart::Function(_) => None,
     }
 }

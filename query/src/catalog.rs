@@ -20,10 +20,10 @@ use datafusion::sql::parser::Statement;
 use echolake_lake::{DataFile, Lake, LakeMoment, LakeSnapshot, VisibleRun};
 use echolake_schema::tables::Table;
 
-use crate::as_of::{self, Past};
+use crate::as_of::{self, PastTableName};
 use crate::mcap::{self, Contents};
-use crate::table::{LakeTable, Source};
-use crate::views::{Lookups, PairJoin, SortedNulls, UnusedJoin, View};
+use crate::table::{FileReaders, LakeTable};
+use crate::views::{LakeView, LookupFunctions, PairJoin, SortedNulls, UnusedJoin};
 use crate::{Error, error};
 
 /// Time for which a new layout of the same rows may go undetected; vacuum keeps replaced files for an hour at least.
@@ -32,12 +32,12 @@ const LAYOUT_SEEN: Duration = Duration::from_secs(30);
 const PAST_KEPT: usize = 32;
 
 /// Registers the tables of a lake in a query's context.
-pub(crate) struct Catalog {
+pub(crate) struct LakeCatalog {
     lake: Lake,
-    source: Source,
-    lookups: Lookups,
+    source: FileReaders,
+    lookups: LookupFunctions,
     names: Vec<(&'static str, SchemaRef)>,
-    current: Mutex<Option<Arc<Current>>>,
+    current: Mutex<Option<Arc<CatalogSnapshot>>>,
     /// Held while one query takes a new snapshot; the others wait for it.
     taking: tokio::sync::Mutex<()>,
     /// Cache of past tables, which do not change. The oldest is evicted first.
@@ -49,20 +49,20 @@ pub(crate) struct Catalog {
 type PastTable = ((LakeMoment, Table), Arc<LakeTable>);
 
 /// One snapshot of the lake with its tables and views.
-struct Current {
+struct CatalogSnapshot {
     snapshot: Arc<LakeSnapshot>,
     tables: HashMap<Table, Arc<LakeTable>>,
     providers: Vec<(&'static str, Arc<dyn TableProvider>)>,
     looked: Mutex<Instant>,
 }
 
-impl Catalog {
+impl LakeCatalog {
     /// # Errors
     /// [`Error::Lake`] if the rig cannot be laid out, [`Error::Execution`] if a view does not fit its tables.
-    pub(crate) fn new(lake: &Lake, source: Source) -> Result<Self, Error> {
-        let lookups = Lookups::of(lake)?;
+    pub(crate) fn new(lake: &Lake, source: FileReaders) -> Result<Self, Error> {
+        let lookups = LookupFunctions::of(lake)?;
         let mut names: Vec<_> = Table::ALL.into_iter().map(|t| (t.name(), t.schema(lake.rig()))).collect();
-        for view in View::ALL {
+        for view in LakeView::ALL {
             names.push((view.name(), view.schema(lake, &lookups).map_err(failed)?));
         }
         Ok(Self {
@@ -120,7 +120,7 @@ impl Catalog {
     /// Returns the bytes of the first attachment of a run's file whose name has this ending; None if there is none.
     ///
     /// # Errors
-    /// As [`Catalog::contents`].
+    /// As [`LakeCatalog::contents`].
     pub(crate) async fn attachment(&self, run: &VisibleRun, ending: &str) -> Result<Option<Bytes>, Error> {
         mcap::attachment(run, ending, &self.runs).await
     }
@@ -130,7 +130,7 @@ impl Catalog {
         self.names.iter().cloned()
     }
 
-    async fn current(&self) -> Result<Arc<Current>, Error> {
+    async fn current(&self) -> Result<Arc<CatalogSnapshot>, Error> {
         let known = self.known();
         if let Some(current) = &known
             && self.is_fresh(current).await?
@@ -151,11 +151,11 @@ impl Catalog {
         Ok(taken)
     }
 
-    fn known(&self) -> Option<Arc<Current>> {
+    fn known(&self) -> Option<Arc<CatalogSnapshot>> {
         self.current.lock().unwrap_or_else(PoisonError::into_inner).clone()
     }
 
-    async fn is_fresh(&self, current: &Current) -> Result<bool, Error> {
+    async fn is_fresh(&self, current: &CatalogSnapshot) -> Result<bool, Error> {
         let log = self.lake.log();
         let Some(version) = current.snapshot.version(Table::Runs) else { return Ok(false) };
         if log.has_after(Table::Runs, version).await? {
@@ -179,7 +179,7 @@ impl Catalog {
         Ok(true)
     }
 
-    async fn take(&self, before: Option<&Current>) -> Result<Current, Error> {
+    async fn take(&self, before: Option<&CatalogSnapshot>) -> Result<CatalogSnapshot, Error> {
         let snapshot = Arc::new(self.lake.snapshot().await?);
         let mut tables = HashMap::new();
         for table in Table::ALL {
@@ -193,12 +193,12 @@ impl Catalog {
         }
         let mut providers: Vec<(&'static str, Arc<dyn TableProvider>)> =
             tables.iter().map(|(table, provider)| (table.name(), provider.clone() as _)).collect();
-        for view in View::ALL {
+        for view in LakeView::ALL {
             let of = |table: &Table| Some((*table, tables.get(table)?.clone() as Arc<dyn TableProvider>));
             let beneath = view.tables().iter().filter_map(of).collect();
             providers.push((view.name(), Arc::new(view.over(&self.lake, &self.lookups, &beneath).map_err(failed)?)));
         }
-        Ok(Current { snapshot, tables, providers, looked: Mutex::new(Instant::now()) })
+        Ok(CatalogSnapshot { snapshot, tables, providers, looked: Mutex::new(Instant::now()) })
     }
 
     fn table(&self, table: Table, files: &[DataFile]) -> Result<Arc<LakeTable>, Error> {
@@ -206,12 +206,12 @@ impl Catalog {
         Ok(Arc::new(LakeTable::new(table, schema, files.to_vec(), self.source.clone()).map_err(failed)?))
     }
 
-    async fn at(&self, past: &Past) -> Result<Arc<dyn TableProvider>, Error> {
+    async fn at(&self, past: &PastTableName) -> Result<Arc<dyn TableProvider>, Error> {
         let moment = past.moment()?;
         if let Some(table) = Table::by_name(&past.table) {
             return Ok(self.table_at(moment, table).await?);
         }
-        let Some(view) = View::by_name(&past.table) else { return Err(error::missing(&past.table)) };
+        let Some(view) = LakeView::by_name(&past.table) else { return Err(error::missing(&past.table)) };
         let mut beneath = HashMap::new();
         for table in view.tables() {
             beneath.insert(*table, self.table_at(moment, *table).await? as Arc<dyn TableProvider>);

@@ -22,13 +22,13 @@ use echolake_lake::Lake;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 use tokio::task::JoinHandle;
 
-use crate::catalog::Catalog;
+use crate::catalog::LakeCatalog;
 use crate::control::pool::PartialPool;
-use crate::control::threads::Threads;
-use crate::control::{RunningQueries, Stop, Ticket};
+use crate::control::threads::QueryThreads;
+use crate::control::{QueryTicket, RunningQueries, StopReason};
 use crate::small::SmallTables;
-use crate::table::Source;
-use crate::{Error, Functions, Opaque, Session};
+use crate::table::FileReaders;
+use crate::{Error, FunctionSet, OpaqueValue, Session};
 
 /// URL of the lake's store. No other store is registered, so no query can reach a file outside of the lake.
 const STORE: &str = "echolake://lake/";
@@ -45,30 +45,30 @@ const SPILL_BYTES: u64 = 16 << 30;
 
 /// Answers the queries of many sessions on one lake.
 #[derive(Clone)]
-pub struct Engine(Opaque<Inner>);
+pub struct QueryEngine(OpaqueValue<EngineState>);
 
-struct Inner {
+struct EngineState {
     template: SessionState,
-    catalog: Catalog,
-    threads: Threads,
+    catalog: LakeCatalog,
+    threads: QueryThreads,
     running: RunningQueries,
-    limits: Limits,
+    limits: EngineLimits,
     /// Names of echolake's own functions.
     own: BTreeSet<String>,
     // A thread for timeouts, which busy query threads cannot delay.
-    watch: Threads,
+    watch: QueryThreads,
 }
 
 /// Limits on all queries of a process together.
 #[derive(Debug, Clone, Copy, Default)]
-pub struct Limits {
+pub struct EngineLimits {
     /// Bytes that queries may hold; None for no limit.
     pub memory: Option<usize>,
 }
 
 /// A function that queries may call.
 #[derive(Debug, Clone)]
-pub struct Function {
+pub struct SqlFunction {
     /// Its name.
     pub name: String,
     /// Its call syntax.
@@ -79,7 +79,7 @@ pub struct Function {
     pub is_own: bool,
 }
 
-impl Function {
+impl SqlFunction {
     /// Returns the arguments in the call syntax, without the parentheses.
     pub fn arguments(&self) -> &str {
         let inner = self.syntax.split_once('(').map_or("", |(_, rest)| rest);
@@ -89,17 +89,17 @@ impl Function {
 
 /// A client with its quota. All sessions of a token share one.
 #[derive(Debug)]
-pub struct Client {
+pub struct EngineClient {
     name: String,
-    quota: Quota,
+    quota: QueryQuota,
     places: Option<Arc<Semaphore>>,
     /// Bytes that operators of its queries have reserved.
     held: Arc<AtomicUsize>,
 }
 
-impl Client {
+impl EngineClient {
     /// Creates a client.
-    pub fn new(name: impl Into<String>, quota: Quota) -> Self {
+    pub fn new(name: impl Into<String>, quota: QueryQuota) -> Self {
         let places = quota.concurrent.map(|places| Arc::new(Semaphore::new(places)));
         Self { name: name.into(), quota, places, held: Arc::default() }
     }
@@ -110,7 +110,7 @@ impl Client {
     }
 
     /// Returns the limits on the client's queries.
-    pub fn quota(&self) -> &Quota {
+    pub fn quota(&self) -> &QueryQuota {
         &self.quota
     }
 
@@ -126,20 +126,21 @@ impl Client {
     ///
     /// # Errors
     /// [`Error::Busy`] if all are taken.
-    pub fn place(&self) -> Result<Place, Error> {
-        let Some(places) = &self.places else { return Ok(Place(None)) };
+    pub fn place(&self) -> Result<QueryPermit, Error> {
+        let Some(places) = &self.places else { return Ok(QueryPermit(None)) };
         let place = places.clone().try_acquire_owned().map_err(|_| self.busy())?;
-        Ok(Place(Some(place)))
+        Ok(QueryPermit(Some(place)))
     }
 
-    /// Acquires a permit like [`Client::place`], but waits up to `wait` if all are taken; first come, first served.
+    /// Acquires a permit like [`EngineClient::place`], but waits up to `wait` if all are taken; first come, first
+    /// served.
     ///
     /// # Errors
     /// [`Error::Busy`] if none becomes free within `wait`.
-    pub async fn place_within(&self, wait: Duration) -> Result<Place, Error> {
-        let Some(places) = &self.places else { return Ok(Place(None)) };
+    pub async fn place_within(&self, wait: Duration) -> Result<QueryPermit, Error> {
+        let Some(places) = &self.places else { return Ok(QueryPermit(None)) };
         match tokio::time::timeout(wait, places.clone().acquire_owned()).await {
-            Ok(Ok(place)) => Ok(Place(Some(place))),
+            Ok(Ok(place)) => Ok(QueryPermit(Some(place))),
             // The semaphore is never closed, so this is the timeout.
             _ => Err(self.busy()),
         }
@@ -152,11 +153,11 @@ impl Client {
 
 /// A permit for one of the queries that a client may run at once; released on drop.
 #[derive(Debug)]
-pub struct Place(#[expect(dead_code, reason = "it is held")] Option<OwnedSemaphorePermit>);
+pub struct QueryPermit(#[expect(dead_code, reason = "it is held")] Option<OwnedSemaphorePermit>);
 
 /// Limits on the queries of one client; None means no limit.
 #[derive(Debug, Clone, Default)]
-pub struct Quota {
+pub struct QueryQuota {
     /// Maximum time from a query's start to its last row.
     pub time: Option<Duration>,
     /// Maximum memory of all its queries, bytes.
@@ -167,34 +168,34 @@ pub struct Quota {
     pub concurrent: Option<usize>,
 }
 
-impl Engine {
+impl QueryEngine {
     /// Creates an engine on a lake.
     ///
     /// # Errors
     /// [`Error::Execution`] if DataFusion cannot be set up.
-    pub fn new(lake: &Lake, limits: Limits) -> Result<Self, Error> {
+    pub fn new(lake: &Lake, limits: EngineLimits) -> Result<Self, Error> {
         let failed = |e: DataFusionError| Error::execution(&e);
         let url = ObjectStoreUrl::parse(STORE).map_err(failed)?;
         let runtime = runtime(lake, &url, limits).map_err(failed)?;
         let metadata = runtime.cache_manager.get_file_metadata_cache();
         let reader = Arc::new(CachedParquetFileReaderFactory::new(lake.store(), metadata));
-        let functions = Functions::all(lake.rig()).map_err(|e| Error::Execution { message: e.to_string() })?;
+        let functions = FunctionSet::all(lake.rig()).map_err(|e| Error::Execution { message: e.to_string() })?;
         let threads = |e: std::io::Error| Error::Execution { message: format!("no threads for queries: {e}") };
-        let catalog = Catalog::new(lake, Source { url, reader, small: Arc::new(SmallTables::new(lake)) })?;
-        let inner = Inner {
+        let catalog = LakeCatalog::new(lake, FileReaders { url, reader, small: Arc::new(SmallTables::new(lake)) })?;
+        let inner = EngineState {
             template: template(runtime, &functions, catalog.rules()),
             catalog,
-            threads: Threads::per_core("query").map_err(threads)?,
+            threads: QueryThreads::per_core("query").map_err(threads)?,
             running: RunningQueries::default(),
             limits,
             own: functions.names().map(str::to_owned).collect(),
-            watch: Threads::new("query-watch", 1).map_err(threads)?,
+            watch: QueryThreads::new("query-watch", 1).map_err(threads)?,
         };
-        Ok(Self(Opaque::new(inner)))
+        Ok(Self(OpaqueValue::new(inner)))
     }
 
     /// Creates a session of a client, one per connection.
-    pub fn session(&self, client: &Arc<Client>) -> Session {
+    pub fn session(&self, client: &Arc<EngineClient>) -> Session {
         Session::of(self.clone(), client.clone())
     }
 
@@ -209,7 +210,7 @@ impl Engine {
     }
 
     /// Returns the functions, sorted by name.
-    pub(crate) fn functions(&self) -> Vec<Function> {
+    pub(crate) fn functions(&self) -> Vec<SqlFunction> {
         let state = &self.0.template;
         let scalar = state.scalar_functions().iter().map(|(name, f)| (name, f.documentation()));
         let aggregate = state.aggregate_functions().iter().map(|(name, f)| (name, f.documentation()));
@@ -221,8 +222,8 @@ impl Engine {
         functions
     }
 
-    fn function(&self, name: &str, doc: Option<&Documentation>) -> Function {
-        Function {
+    fn function(&self, name: &str, doc: Option<&Documentation>) -> SqlFunction {
+        SqlFunction {
             name: name.to_owned(),
             syntax: doc.map_or_else(|| format!("{name}(...)"), |d| d.syntax_example.clone()),
             description: doc.map_or_else(String::new, |d| d.description.clone()),
@@ -231,7 +232,7 @@ impl Engine {
     }
 
     /// Runs other work of a client's request, such as parsing, in the same way as queries: on the same threads and with
-    /// a timeout of `time`. If the caller drops it, the work is ended or reported by [`Engine::overdue`].
+    /// a timeout of `time`. If the caller drops it, the work is ended or reported by [`QueryEngine::overdue`].
     ///
     /// # Errors
     /// Those of `work`; [`Error::TimeLimit`].
@@ -244,15 +245,15 @@ impl Engine {
     }
 
     /// Creates a ticket with a timeout of `time`.
-    pub(crate) fn ticket(&self, time: Option<Duration>) -> Arc<Ticket> {
-        let ticket = Arc::new(Ticket::new());
+    pub(crate) fn ticket(&self, time: Option<Duration>) -> Arc<QueryTicket> {
+        let ticket = Arc::new(QueryTicket::new());
         self.0.running.add(&ticket);
         if let (Some(time), Some(threads)) = (time, self.0.watch.handle()) {
             let watched = Arc::downgrade(&ticket);
             threads.spawn(async move {
                 tokio::time::sleep(time).await;
                 if let Some(ticket) = watched.upgrade() {
-                    ticket.stop(Stop::Time(time));
+                    ticket.stop(StopReason::Time(time));
                 }
             });
         }
@@ -262,7 +263,7 @@ impl Engine {
     // Constants are computed while a query is planned, so planning must not block the caller's threads.
     pub(crate) async fn on_threads<T: Send + 'static, E: From<Error> + Send + 'static>(
         &self,
-        ticket: &Arc<Ticket>,
+        ticket: &Arc<QueryTicket>,
         work: impl Future<Output = Result<T, E>> + Send + 'static,
     ) -> Result<T, E> {
         let Some(threads) = self.0.threads.handle() else { return Err(ended().into()) };
@@ -279,17 +280,17 @@ impl Engine {
     }
 
     /// Returns the catalogue of tables and views.
-    pub(crate) fn catalog(&self) -> &Catalog {
+    pub(crate) fn catalog(&self) -> &LakeCatalog {
         &self.0.catalog
     }
 
     /// Returns the threads that plan and run queries.
-    pub(crate) fn threads(&self) -> &Threads {
+    pub(crate) fn threads(&self) -> &QueryThreads {
         &self.0.threads
     }
 
     /// Returns the memory limit of one query, bytes; `usize::MAX` if there is none.
-    pub(crate) fn memory(&self, quota: &Quota) -> usize {
+    pub(crate) fn memory(&self, quota: &QueryQuota) -> usize {
         self.0.limits.memory.into_iter().chain(quota.memory).min().unwrap_or(usize::MAX)
     }
 
@@ -316,7 +317,7 @@ impl Engine {
 
 fn template(
     runtime: Arc<RuntimeEnv>,
-    functions: &Functions,
+    functions: &FunctionSet,
     rules: impl IntoIterator<Item = Arc<dyn OptimizerRule + Send + Sync>>,
 ) -> SessionState {
     let builder = SessionStateBuilder::new().with_config(config()).with_runtime_env(runtime).with_default_features();
@@ -341,7 +342,7 @@ fn config() -> SessionConfig {
     config
 }
 
-fn runtime(lake: &Lake, url: &ObjectStoreUrl, limits: Limits) -> Result<Arc<RuntimeEnv>, DataFusionError> {
+fn runtime(lake: &Lake, url: &ObjectStoreUrl, limits: EngineLimits) -> Result<Arc<RuntimeEnv>, DataFusionError> {
     let stores = DefaultObjectStoreRegistry::new();
     stores.deregister_store(ObjectStoreUrl::parse(MACHINE)?.as_ref())?;
     stores.register_store(url.as_ref(), lake.store());
@@ -359,13 +360,13 @@ fn runtime(lake: &Lake, url: &ObjectStoreUrl, limits: Limits) -> Result<Arc<Runt
 /// Cancels the query and aborts its planning when the waiting caller is dropped; the task ends at its next await.
 struct StopOnDrop<T> {
     work: JoinHandle<T>,
-    ticket: Arc<Ticket>,
+    ticket: Arc<QueryTicket>,
 }
 
 impl<T> Drop for StopOnDrop<T> {
     fn drop(&mut self) {
         if !self.work.is_finished() {
-            self.ticket.stop(Stop::Cancelled);
+            self.ticket.stop(StopReason::Cancelled);
             self.work.abort();
         }
     }

@@ -11,7 +11,7 @@ use datafusion::error::DataFusionError;
 use datafusion::sql::sqlparser::parser::ParserError;
 use echolake_schema::tables::Table;
 
-use crate::control::Stop;
+use crate::control::StopReason;
 
 /// Minimum similarity of a suggested name: half of the letters, as in DataFusion's own suggestions.
 const ALIKE: f64 = 0.5;
@@ -117,10 +117,10 @@ impl Error {
     }
 
     /// Returns the error for a query that was stopped.
-    pub(crate) fn stopped(why: &Stop) -> Self {
+    pub(crate) fn stopped(why: &StopReason) -> Self {
         match why {
-            Stop::Cancelled => Self::Cancelled,
-            Stop::Time(limit) => Self::TimeLimit { limit: *limit },
+            StopReason::Cancelled => Self::Cancelled,
+            StopReason::Time(limit) => Self::TimeLimit { limit: *limit },
         }
     }
 }

@@ -30,12 +30,12 @@ mod statement_bounds;
 mod table;
 mod views;
 
-pub use control::threads::Threads;
-pub use engine::{Client, Engine, Function, Limits, Place, Quota};
+pub use control::threads::QueryThreads;
+pub use engine::{EngineClient, EngineLimits, QueryEngine, QueryPermit, QueryQuota, SqlFunction};
 pub use error::Error;
-pub use functions::Functions;
+pub use functions::FunctionSet;
 pub use mcap::{Attachment, Contents, Topic};
-pub use opaque::Opaque;
+pub use opaque::OpaqueValue;
 pub use predicate::PredicateForm;
-pub use session::{Answer, CancelHandle, Extend, Prepared, Session};
+pub use session::{CancelHandle, ContextExtension, PreparedQuery, QueryAnswer, Session};
 pub use statement_bounds::check_statement_bounds;

@@ -8,22 +8,22 @@ use std::sync::Arc;
 /// DataFusion's plans and sqlparser's statements are recursive types of hundreds of parts. Every method of an
 /// `async_trait` proves again that all types it reaches are `Send`. For each of thirty methods of the server that
 /// reached one of those types, this took three seconds of compilation.
-pub struct Opaque<T: ?Sized>(Arc<dyn Deref<Target = T> + Send + Sync>);
+pub struct OpaqueValue<T: ?Sized>(Arc<dyn Deref<Target = T> + Send + Sync>);
 
-impl<T: Send + Sync + 'static> Opaque<T> {
+impl<T: Send + Sync + 'static> OpaqueValue<T> {
     /// Shares a value.
     pub fn new(value: T) -> Self {
         Self(Arc::new(Box::new(value)))
     }
 }
 
-impl<T: ?Sized> Clone for Opaque<T> {
+impl<T: ?Sized> Clone for OpaqueValue<T> {
     fn clone(&self) -> Self {
         Self(self.0.clone())
     }
 }
 
-impl<T: ?Sized> Deref for Opaque<T> {
+impl<T: ?Sized> Deref for OpaqueValue<T> {
     type Target = T;
 
     fn deref(&self) -> &T {

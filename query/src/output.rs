@@ -27,7 +27,7 @@ const ROW_GROUP_BYTES: usize = 16 << 20;
 
 /// A format of answers.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Format {
+pub enum AnswerFormat {
     /// Text for people: lists are shortened, and rows after [`TABLE_ROWS`] are only counted.
     Table,
     /// Comma-separated, lists as JSON.
@@ -40,7 +40,7 @@ pub enum Format {
     Arrow,
 }
 
-impl Format {
+impl AnswerFormat {
     /// All formats.
     pub const ALL: [Self; 5] = [Self::Table, Self::Csv, Self::Json, Self::Parquet, Self::Arrow];
 
@@ -63,13 +63,13 @@ impl Format {
 
 /// Writes the batches of one answer.
 pub struct AnswerWriter<W: Write + Send> {
-    format: Format,
+    format: AnswerFormat,
     schema: SchemaRef,
     rows: usize,
-    inner: Inner<W>,
+    inner: FormatWriter<W>,
 }
 
-enum Inner<W: Write + Send> {
+enum FormatWriter<W: Write + Send> {
     Table(W, Vec<RecordBatch>),
     Csv(W, Vec<u8>),
     Json(arrow::json::ArrayWriter<W>),
@@ -82,31 +82,33 @@ impl<W: Write + Send> AnswerWriter<W> {
     ///
     /// # Errors
     /// [`Error::Format`] or [`Error::Write`].
-    pub fn new(format: Format, schema: &SchemaRef, to: W) -> Result<Self, Error> {
-        if matches!(format, Format::Json | Format::Parquet) {
+    pub fn new(format: AnswerFormat, schema: &SchemaRef, to: W) -> Result<Self, Error> {
+        if matches!(format, AnswerFormat::Json | AnswerFormat::Parquet) {
             one_name_each(format, schema)?;
         }
         let inner = match format {
-            Format::Table => Inner::Table(to, Vec::new()),
-            Format::Csv => {
+            AnswerFormat::Table => FormatWriter::Table(to, Vec::new()),
+            AnswerFormat::Csv => {
                 let (mut to, mut text) = (to, Vec::new());
                 // A header even if there are no rows.
                 write_csv(&mut to, &mut text, &RecordBatch::new_empty(flat_schema(schema)), true)?;
-                Inner::Csv(to, text)
+                FormatWriter::Csv(to, text)
             }
-            Format::Json => Inner::Json(arrow::json::WriterBuilder::new().with_explicit_nulls(true).build(to)),
-            Format::Parquet => {
+            AnswerFormat::Json => {
+                FormatWriter::Json(arrow::json::WriterBuilder::new().with_explicit_nulls(true).build(to))
+            }
+            AnswerFormat::Parquet => {
                 let zstd = Compression::ZSTD(ZstdLevel::try_new(3).unwrap_or_default());
                 let properties = WriterProperties::builder()
                     .set_compression(zstd)
                     .set_max_row_group_bytes(Some(ROW_GROUP_BYTES))
                     .build();
                 let writer = ArrowWriter::try_new(to, schema.clone(), Some(properties));
-                Inner::Parquet(Box::new(writer.map_err(parquet_error)?))
+                FormatWriter::Parquet(Box::new(writer.map_err(parquet_error)?))
             }
-            Format::Arrow => {
+            AnswerFormat::Arrow => {
                 let writer = arrow::ipc::writer::StreamWriter::try_new(to, schema);
-                Inner::Arrow(writer.map_err(|e| arrow_error(format, e))?)
+                FormatWriter::Arrow(writer.map_err(|e| arrow_error(format, e))?)
             }
         };
         Ok(Self { format, schema: schema.clone(), rows: 0, inner })
@@ -121,14 +123,14 @@ impl<W: Write + Send> AnswerWriter<W> {
         self.rows += batch.num_rows();
         let failed = |e| arrow_error(self.format, e);
         match &mut self.inner {
-            Inner::Table(_, batches) if room > 0 => {
+            FormatWriter::Table(_, batches) if room > 0 => {
                 batches.push(flat(&batch.slice(0, room), short_list).map_err(failed)?);
             }
-            Inner::Table(..) => {}
-            Inner::Csv(to, text) => write_csv(to, text, &flat(batch, json_list).map_err(failed)?, false)?,
-            Inner::Json(writer) => writer.write(batch).map_err(failed)?,
-            Inner::Parquet(writer) => writer.write(batch).map_err(parquet_error)?,
-            Inner::Arrow(writer) => writer.write(batch).map_err(failed)?,
+            FormatWriter::Table(..) => {}
+            FormatWriter::Csv(to, text) => write_csv(to, text, &flat(batch, json_list).map_err(failed)?, false)?,
+            FormatWriter::Json(writer) => writer.write(batch).map_err(failed)?,
+            FormatWriter::Parquet(writer) => writer.write(batch).map_err(parquet_error)?,
+            FormatWriter::Arrow(writer) => writer.write(batch).map_err(failed)?,
         }
         Ok(())
     }
@@ -140,22 +142,22 @@ impl<W: Write + Send> AnswerWriter<W> {
     pub fn finish(self) -> Result<usize, Error> {
         let failed = |e| arrow_error(self.format, e);
         match self.inner {
-            Inner::Table(mut to, batches) => {
+            FormatWriter::Table(mut to, batches) => {
                 let batches =
                     if batches.is_empty() { vec![RecordBatch::new_empty(flat_schema(&self.schema))] } else { batches };
                 writeln!(to, "{}", pretty_format_batches(&batches).map_err(failed)?)?;
                 to.flush()?;
             }
-            Inner::Csv(mut to, _) => to.flush()?,
-            Inner::Json(mut writer) => {
+            FormatWriter::Csv(mut to, _) => to.flush()?,
+            FormatWriter::Json(mut writer) => {
                 writer.finish().map_err(failed)?;
                 let mut to = writer.into_inner();
                 writeln!(to)?;
                 to.flush()?;
             }
             // `finish` flushes, and unlike `into_inner` it keeps the system's error.
-            Inner::Parquet(mut writer) => writer.finish().map(drop).map_err(parquet_error)?,
-            Inner::Arrow(writer) => writer.into_inner().map_err(failed)?.flush()?,
+            FormatWriter::Parquet(mut writer) => writer.finish().map(drop).map_err(parquet_error)?,
+            FormatWriter::Arrow(writer) => writer.into_inner().map_err(failed)?.flush()?,
         }
         Ok(self.rows)
     }
@@ -168,12 +170,12 @@ fn write_csv(to: &mut impl Write, text: &mut Vec<u8>, batch: &RecordBatch, heade
         .with_header(header)
         .build(&mut *text)
         .write(batch)
-        .map_err(|e| arrow_error(Format::Csv, e))?;
+        .map_err(|e| arrow_error(AnswerFormat::Csv, e))?;
     Ok(to.write_all(text)?)
 }
 
 // Readers of JSON objects and of Parquet find columns by name.
-fn one_name_each(format: Format, schema: &SchemaRef) -> Result<(), Error> {
+fn one_name_each(format: AnswerFormat, schema: &SchemaRef) -> Result<(), Error> {
     let mut seen = HashSet::new();
     match schema.fields().iter().find(|field| !seen.insert(field.name())) {
         None => Ok(()),
@@ -185,7 +187,7 @@ fn one_name_each(format: Format, schema: &SchemaRef) -> Result<(), Error> {
 }
 
 // Keeps the system's own error, so that a closed pipe can be recognised.
-fn arrow_error(format: Format, error: ArrowError) -> Error {
+fn arrow_error(format: AnswerFormat, error: ArrowError) -> Error {
     match error {
         ArrowError::IoError(_, source) => Error::Write(source),
         other => Error::Format { format: format.name(), message: other.to_string() },
@@ -290,7 +292,7 @@ mod tests {
         RecordBatch::try_new(Arc::new(schema), columns).expect("a batch")
     }
 
-    fn written(format: Format) -> Vec<u8> {
+    fn written(format: AnswerFormat) -> Vec<u8> {
         let (batch, mut out) = (batch(), Vec::new());
         let mut writer = AnswerWriter::new(format, &batch.schema(), &mut out).expect("begun");
         writer.write(&batch).expect("written");
@@ -298,30 +300,34 @@ mod tests {
         out
     }
 
-    fn text(format: Format) -> String {
+    fn text(format: AnswerFormat) -> String {
         String::from_utf8(written(format)).expect("text")
     }
 
     #[test]
     fn text_formats() {
-        assert!(text(Format::Table).contains("| [0.5,-1.0,2.0, ... 4 values] |"), "{}", text(Format::Table));
+        assert!(
+            text(AnswerFormat::Table).contains("| [0.5,-1.0,2.0, ... 4 values] |"),
+            "{}",
+            text(AnswerFormat::Table)
+        );
         assert_eq!(
-            text(Format::Csv),
+            text(AnswerFormat::Csv),
             "id,name,ir,at\n1,\"a,\"\"b\"\"\",\"[0.5,-1.0,2.0,3.0]\",2026-01-05T08:00:00Z\n,,[1e-9],\n"
         );
         assert_eq!(
-            text(Format::Json).trim(),
+            text(AnswerFormat::Json).trim(),
             r#"[{"id":1,"name":"a,\"b\"","ir":[0.5,-1.0,2.0,3.0],"at":"2026-01-05T08:00:00Z"},{"id":null,"name":null,"ir":[1.0e-9],"at":null}]"#
         );
     }
 
     #[test]
     fn binary_formats_read_back() {
-        let parquet = bytes::Bytes::from(written(Format::Parquet));
+        let parquet = bytes::Bytes::from(written(AnswerFormat::Parquet));
         let reader = parquet::arrow::arrow_reader::ParquetRecordBatchReaderBuilder::try_new(parquet).expect("Parquet");
         let back: Vec<_> = reader.build().expect("a reader").map(|b| b.expect("a batch")).collect();
         assert_eq!(back, [batch()]);
-        let arrow = written(Format::Arrow);
+        let arrow = written(AnswerFormat::Arrow);
         let reader = arrow::ipc::reader::StreamReader::try_new(&arrow[..], None).expect("Arrow");
         assert_eq!(reader.map(|b| b.expect("a batch")).collect::<Vec<_>>(), [batch()]);
     }
@@ -333,7 +339,7 @@ mod tests {
             |from: u32| Arc::new(arrow::array::Float64Array::from_iter_values((from..from + 100_000).map(chance)));
         let batch = |from| RecordBatch::try_from_iter([("x", numbers(from) as ArrayRef)]).expect("a batch");
         let mut out = Vec::new();
-        let mut writer = AnswerWriter::new(Format::Parquet, &batch(0).schema(), &mut out).expect("begun");
+        let mut writer = AnswerWriter::new(AnswerFormat::Parquet, &batch(0).schema(), &mut out).expect("begun");
         (0..30).for_each(|n| writer.write(&batch(n * 100_000)).expect("written"));
         writer.finish().expect("finished");
         let reader = parquet::arrow::arrow_reader::ParquetRecordBatchReaderBuilder::try_new(bytes::Bytes::from(out));
@@ -346,7 +352,7 @@ mod tests {
         let column: ArrayRef = Arc::new(Int64Array::from_iter_values(0..6_000));
         let batch = RecordBatch::try_new(schema.clone(), vec![column]).expect("a batch");
         let mut out = Vec::new();
-        let mut writer = AnswerWriter::new(Format::Table, &schema, &mut out).expect("begun");
+        let mut writer = AnswerWriter::new(AnswerFormat::Table, &schema, &mut out).expect("begun");
         (0..3).for_each(|_| writer.write(&batch).expect("written"));
         assert_eq!(writer.finish().expect("finished"), 18_000);
         let lines = String::from_utf8(out).expect("text").lines().count();
@@ -357,9 +363,9 @@ mod tests {
     fn a_name_twice_is_refused_where_columns_go_by_name() {
         let field = || Field::new("run_id", DataType::Int64, false);
         let schema = Arc::new(Schema::new(vec![field(), field()]));
-        for format in Format::ALL {
+        for format in AnswerFormat::ALL {
             let begun = AnswerWriter::new(format, &schema, Vec::new());
-            let by_name = matches!(format, Format::Json | Format::Parquet);
+            let by_name = matches!(format, AnswerFormat::Json | AnswerFormat::Parquet);
             assert_eq!(begun.is_err(), by_name, "{}", format.name());
         }
     }
@@ -375,7 +381,7 @@ mod tests {
                 Ok(())
             }
         }
-        for format in Format::ALL {
+        for format in AnswerFormat::ALL {
             let batch = batch();
             let failed = AnswerWriter::new(format, &batch.schema(), Closed)
                 .and_then(|mut writer| writer.write(&batch).and_then(|()| writer.finish()))
@@ -397,7 +403,7 @@ mod tests {
 
     #[test]
     fn an_answer_without_rows_still_has_its_columns() {
-        for (format, expected) in [(Format::Csv, "id,name,ir,at\n"), (Format::Json, "[]\n")] {
+        for (format, expected) in [(AnswerFormat::Csv, "id,name,ir,at\n"), (AnswerFormat::Json, "[]\n")] {
             let mut out = Vec::new();
             AnswerWriter::new(format, &batch().schema(), &mut out).expect("begun").finish().expect("finished");
             assert_eq!(String::from_utf8(out).expect("text"), expected);

@@ -21,11 +21,11 @@ use tokio::sync::mpsc;
 use tokio::task::JoinHandle;
 
 use crate::control::pool::PartialPool;
-use crate::control::{Stop, Ticket, WorkGuard};
-use crate::engine::{self, Client, Engine, Function, Limits, Place, Quota};
+use crate::control::{QueryTicket, StopReason, WorkGuard};
+use crate::engine::{self, EngineClient, EngineLimits, QueryEngine, QueryPermit, QueryQuota, SqlFunction};
 use crate::mcap::Contents;
 use crate::statement_bounds::check_statement_bounds;
-use crate::{Error, Opaque, as_of, gate};
+use crate::{Error, OpaqueValue, as_of, gate};
 
 /// Capacity of the queue of batches to a slow reader.
 const AHEAD: usize = 2;
@@ -33,23 +33,23 @@ const AHEAD: usize = 2;
 /// Runs SQL queries on a lake, one session per connection. Clones are the same session.
 #[derive(Clone)]
 pub struct Session {
-    engine: Engine,
-    client: Arc<Client>,
-    extend: Option<Extend>,
+    engine: QueryEngine,
+    client: Arc<EngineClient>,
+    extend: Option<ContextExtension>,
 }
 
 /// Adds a protocol's own tables and functions to the context of every query.
-pub type Extend = Arc<dyn Fn(&SessionContext) -> Result<(), DataFusionError> + Send + Sync>;
+pub type ContextExtension = Arc<dyn Fn(&SessionContext) -> Result<(), DataFusionError> + Send + Sync>;
 
 /// A planned query that can be run repeatedly with other values. It keeps the snapshot of the lake on which it was
 /// planned.
-pub struct Prepared {
-    state: Opaque<SessionState>,
-    plan: Opaque<LogicalPlan>,
+pub struct PreparedQuery {
+    state: OpaqueValue<SessionState>,
+    plan: OpaqueValue<LogicalPlan>,
     sql: String,
 }
 
-impl Prepared {
+impl PreparedQuery {
     /// Returns the schema of its answers.
     pub fn schema(&self) -> SchemaRef {
         Arc::new(self.plan.schema().as_arrow().clone())
@@ -78,30 +78,30 @@ impl Prepared {
 }
 
 /// A stream of answer batches. Dropping it cancels the query.
-pub struct Answer {
+pub struct QueryAnswer {
     /// Its columns.
     pub schema: SchemaRef,
     batches: mpsc::Receiver<Result<RecordBatch, DataFusionError>>,
     query: Option<JoinHandle<()>>,
-    ticket: Arc<Ticket>,
+    ticket: Arc<QueryTicket>,
     rows: u64,
     limit: Option<u64>,
     // Keeps the query's threads alive while the answer is read, even if the session is dropped.
-    _engine: Engine,
+    _engine: QueryEngine,
 }
 
 /// Cancels a query from another task.
 #[derive(Clone)]
-pub struct CancelHandle(Arc<Ticket>);
+pub struct CancelHandle(Arc<QueryTicket>);
 
 impl CancelHandle {
     /// Cancels the query; its answer fails with [`Error::Cancelled`]. Has no effect on a finished query.
     pub fn cancel(&self) {
-        self.0.stop(Stop::Cancelled);
+        self.0.stop(StopReason::Cancelled);
     }
 }
 
-impl Answer {
+impl QueryAnswer {
     /// Returns the next rows; None after the last.
     ///
     /// # Errors
@@ -117,7 +117,7 @@ impl Answer {
         let batch = batch.map_err(|e| Error::execution(&e))?;
         self.rows += batch.num_rows() as u64;
         if let Some(limit) = self.limit.filter(|limit| self.rows > *limit) {
-            self.ticket.stop(Stop::Cancelled);
+            self.ticket.stop(StopReason::Cancelled);
             return Err(Error::RowLimit { limit });
         }
         Ok(Some(batch))
@@ -138,9 +138,9 @@ impl Answer {
     }
 }
 
-impl Drop for Answer {
+impl Drop for QueryAnswer {
     fn drop(&mut self) {
-        self.ticket.stop(Stop::Cancelled);
+        self.ticket.stop(StopReason::Cancelled);
     }
 }
 
@@ -150,23 +150,23 @@ impl Session {
     /// # Errors
     /// [`Error::Execution`] if DataFusion cannot be set up.
     pub fn new(lake: &Lake) -> Result<Self, Error> {
-        let client = Client::new("local", Quota::default());
-        Ok(Engine::new(lake, Limits::default())?.session(&Arc::new(client)))
+        let client = EngineClient::new("local", QueryQuota::default());
+        Ok(QueryEngine::new(lake, EngineLimits::default())?.session(&Arc::new(client)))
     }
 
-    pub(crate) fn of(engine: Engine, client: Arc<Client>) -> Self {
+    pub(crate) fn of(engine: QueryEngine, client: Arc<EngineClient>) -> Self {
         Self { engine, client, extend: None }
     }
 
     /// Adds a protocol's own tables and functions to the session.
     #[must_use]
-    pub fn extended(mut self, extend: Extend) -> Self {
+    pub fn extended(mut self, extend: ContextExtension) -> Self {
         self.extend = Some(extend);
         self
     }
 
     /// Returns the client.
-    pub fn client(&self) -> &Arc<Client> {
+    pub fn client(&self) -> &Arc<EngineClient> {
         &self.client
     }
 
@@ -174,8 +174,8 @@ impl Session {
     ///
     /// # Errors
     /// [`Error::Query`] if it is invalid, [`Error::NotReading`] if it would change something, [`Error::Lake`] if the
-    /// lake cannot be read, [`Error::Busy`] if the client has no permit left, and those of [`Answer::next`].
-    pub async fn query(&self, sql: &str) -> Result<Answer, Error> {
+    /// lake cannot be read, [`Error::Busy`] if the client has no permit left, and those of [`QueryAnswer::next`].
+    pub async fn query(&self, sql: &str) -> Result<QueryAnswer, Error> {
         let started = self.start()?;
         let prepared = self.plan(sql, self.parse(sql)?, &started.ticket).await?;
         self.run(&prepared, LogicalPlan::clone(&prepared.plan), started).await
@@ -185,7 +185,7 @@ impl Session {
     ///
     /// # Errors
     /// As [`Session::query`].
-    pub async fn prepare(&self, sql: &str) -> Result<Prepared, Error> {
+    pub async fn prepare(&self, sql: &str) -> Result<PreparedQuery, Error> {
         self.prepare_statement(sql, self.parse(sql)?).await
     }
 
@@ -193,7 +193,7 @@ impl Session {
     ///
     /// # Errors
     /// As [`Session::query`].
-    pub async fn prepare_statement(&self, sql: &str, statement: Statement) -> Result<Prepared, Error> {
+    pub async fn prepare_statement(&self, sql: &str, statement: Statement) -> Result<PreparedQuery, Error> {
         let started = self.start()?;
         self.plan(sql, statement, &started.ticket).await
     }
@@ -202,7 +202,7 @@ impl Session {
     ///
     /// # Errors
     /// [`Error::Query`] if values are missing or of the wrong type; else as [`Session::query`].
-    pub async fn execute(&self, prepared: &Prepared, values: ParamValues) -> Result<Answer, Error> {
+    pub async fn execute(&self, prepared: &PreparedQuery, values: ParamValues) -> Result<QueryAnswer, Error> {
         let plan =
             LogicalPlan::clone(&prepared.plan).with_param_values(values).map_err(|e| Error::plan(&prepared.sql, &e))?;
         self.run(prepared, plan, self.start()?).await
@@ -226,7 +226,12 @@ impl Session {
         Ok(Started { ticket: self.engine.ticket(self.client.quota().time), place })
     }
 
-    async fn plan(&self, sql: &str, mut statement: Statement, ticket: &Arc<Ticket>) -> Result<Prepared, Error> {
+    async fn plan(
+        &self,
+        sql: &str,
+        mut statement: Statement,
+        ticket: &Arc<QueryTicket>,
+    ) -> Result<PreparedQuery, Error> {
         gate::check(&statement)?;
         let (session, text) = (self.clone(), sql.to_owned());
         let plan = async move {
@@ -241,12 +246,12 @@ impl Session {
             // `SELECT INTO` reads by its first word and makes a table by its plan.
             let reading = SQLOptions::new().with_allow_ddl(false).with_allow_dml(false).with_allow_statements(false);
             reading.verify_plan(&plan).map_err(|_| Error::NotReading { statement: plan.display().to_string() })?;
-            Ok(Prepared { state: Opaque::new(context.state()), plan: Opaque::new(plan), sql })
+            Ok(PreparedQuery { state: OpaqueValue::new(context.state()), plan: OpaqueValue::new(plan), sql })
         };
         self.engine.on_threads(ticket, plan).await
     }
 
-    async fn run(&self, prepared: &Prepared, plan: LogicalPlan, started: Started) -> Result<Answer, Error> {
+    async fn run(&self, prepared: &PreparedQuery, plan: LogicalPlan, started: Started) -> Result<QueryAnswer, Error> {
         let Started { ticket, place } = started;
         let (state, sql) = (prepared.state.clone(), prepared.sql.clone());
         let physical = async move { state.create_physical_plan(&plan).await.map_err(|e| Error::plan(&sql, &e)) };
@@ -256,7 +261,7 @@ impl Session {
         let schema = plan.schema();
         let context = self.task_context(&prepared.state, &ticket);
         let query = threads.spawn(drive(plan, context, send, ticket.begin_work(), place));
-        Ok(Answer {
+        Ok(QueryAnswer {
             schema,
             batches,
             query: Some(query),
@@ -268,7 +273,7 @@ impl Session {
     }
 
     // As DataFusion builds it, except for the memory pool.
-    fn task_context(&self, state: &SessionState, ticket: &Arc<Ticket>) -> Arc<TaskContext> {
+    fn task_context(&self, state: &SessionState, ticket: &Arc<QueryTicket>) -> Arc<TaskContext> {
         let mut runtime = state.runtime_env().as_ref().clone();
         let limit = self.engine.memory(self.client.quota());
         let pool = self.client.memory_pool(runtime.memory_pool);
@@ -301,7 +306,7 @@ impl Session {
     }
 
     /// Returns the functions, sorted by name.
-    pub fn functions(&self) -> Vec<Function> {
+    pub fn functions(&self) -> Vec<SqlFunction> {
         self.engine.functions()
     }
 
@@ -313,8 +318,8 @@ impl Session {
 
 /// A started query with its permit, before it is planned.
 struct Started {
-    ticket: Arc<Ticket>,
-    place: Place,
+    ticket: Arc<QueryTicket>,
+    place: QueryPermit,
 }
 
 // Runs a query. It holds its permit until its operators are dropped, even if the reader is gone.
@@ -323,7 +328,7 @@ async fn drive(
     context: Arc<TaskContext>,
     send: mpsc::Sender<Result<RecordBatch, DataFusionError>>,
     work: WorkGuard,
-    _place: Place,
+    _place: QueryPermit,
 ) {
     let mut batches = match execute_stream(plan, context) {
         Ok(batches) => batches,

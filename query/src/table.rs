@@ -52,7 +52,7 @@ pub(crate) struct LakeTable {
     columns: DFSchema,
     files: Vec<ScanFile>,
     all: Statistics,
-    source: Source,
+    source: FileReaders,
     /// All rows, if the table is small and was queried.
     rows: OnceCell<RecordBatch>,
 }
@@ -67,7 +67,7 @@ struct ScanFile {
 
 /// Readers of data files, shared by all tables.
 #[derive(Debug, Clone)]
-pub(crate) struct Source {
+pub(crate) struct FileReaders {
     /// URL of the lake's store.
     pub(crate) url: ObjectStoreUrl,
     /// Caches footers for all sessions.
@@ -79,7 +79,7 @@ pub(crate) struct Source {
 impl LakeTable {
     /// # Errors
     /// If the schema names a column twice.
-    pub(crate) fn new(table: Table, schema: SchemaRef, files: Vec<DataFile>, source: Source) -> Result<Self> {
+    pub(crate) fn new(table: Table, schema: SchemaRef, files: Vec<DataFile>, source: FileReaders) -> Result<Self> {
         let columns = DFSchema::try_from(schema.clone())?;
         let files: Vec<_> = files.into_iter().map(|file| ScanFile::new(file, &schema)).collect();
         let all = Statistics::try_merge_iter(files.iter().map(|f| f.known.as_ref()), &schema)?;

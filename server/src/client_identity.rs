@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use echolake_query::Quota;
+use echolake_query::QueryQuota;
 use serde::{Deserialize, Serialize};
 
 use crate::fault::RequestFault;
@@ -66,8 +66,8 @@ impl ClientIdentity {
     }
 
     /// Limits of its queries.
-    pub(crate) fn quota(&self) -> Quota {
-        Quota {
+    pub(crate) fn quota(&self) -> QueryQuota {
+        QueryQuota {
             time: self.seconds.map(Duration::from_secs),
             memory: self.memory_bytes.map(counted_bytes),
             rows: self.rows,

@@ -7,7 +7,7 @@ use std::time::Duration;
 use arrow::datatypes::SchemaRef;
 use datafusion::common::ParamValues;
 use echolake_lake::Lake;
-use echolake_query::{Client, Engine, Function, Prepared, Quota, Session, Threads};
+use echolake_query::{EngineClient, PreparedQuery, QueryEngine, QueryQuota, QueryThreads, Session, SqlFunction};
 use tokio::sync::{mpsc, oneshot};
 use tokio::task::JoinSet;
 
@@ -30,13 +30,13 @@ pub(crate) struct QueryService(Arc<ServiceState>);
 
 struct ServiceState {
     lake: Lake,
-    engine: Engine,
+    engine: QueryEngine,
     identity: ClientIdentity,
-    client: Arc<Client>,
+    client: Arc<EngineClient>,
     activity: ActivityCounter,
     metrics: ServerMetrics,
     // Answers are encoded on threads of their own: connections are answered, and queries cancelled, while all are busy.
-    encoders: Threads,
+    encoders: QueryThreads,
 }
 
 /// The query text or plan to run.
@@ -44,7 +44,7 @@ pub(crate) enum QueryWork {
     /// A text.
     Sql(String),
     /// A prepared plan, with values for its placeholders.
-    Prepared(Arc<Prepared>, ParamValues),
+    PreparedQuery(Arc<PreparedQuery>, ParamValues),
 }
 
 /// A query to run.
@@ -83,15 +83,15 @@ impl ActivityCounter {
 }
 
 impl QueryService {
-    pub(crate) fn new(lake: &Lake, engine: Engine, identity: ClientIdentity) -> Result<Self, Error> {
+    pub(crate) fn new(lake: &Lake, engine: QueryEngine, identity: ClientIdentity) -> Result<Self, Error> {
         Ok(Self(Arc::new(ServiceState {
             lake: lake.clone(),
             engine,
-            client: Arc::new(Client::new(identity.name.clone(), identity.quota())),
+            client: Arc::new(EngineClient::new(identity.name.clone(), identity.quota())),
             identity,
             activity: ActivityCounter::default(),
             metrics: ServerMetrics::default(),
-            encoders: Threads::per_core("encode").map_err(Error::System)?,
+            encoders: QueryThreads::per_core("encode").map_err(Error::System)?,
         })))
     }
 
@@ -99,7 +99,7 @@ impl QueryService {
         &self.0.lake
     }
 
-    pub(crate) fn engine(&self) -> &Engine {
+    pub(crate) fn engine(&self) -> &QueryEngine {
         &self.0.engine
     }
 
@@ -112,7 +112,7 @@ impl QueryService {
     ///
     /// # Errors
     /// [`RequestFault::Forbidden`].
-    pub(crate) fn client(&self, scope: TokenScope) -> Result<Arc<Client>, RequestFault> {
+    pub(crate) fn client(&self, scope: TokenScope) -> Result<Arc<EngineClient>, RequestFault> {
         self.0.identity.require(scope).inspect_err(|fault| self.0.metrics.failed(fault.code()))?;
         Ok(self.0.client.clone())
     }
@@ -127,19 +127,19 @@ impl QueryService {
     }
 
     /// Begins a session: one per connection, or one per request if the protocol has no connections.
-    pub(crate) fn session(&self, client: &Arc<Client>) -> Session {
+    pub(crate) fn session(&self, client: &Arc<EngineClient>) -> Session {
         self.0.engine.session(client)
     }
 
     /// The tables and their schemas.
     pub(crate) fn tables(&self) -> Vec<(&'static str, SchemaRef)> {
-        let nobody = Arc::new(Client::new("tables", Quota::default()));
+        let nobody = Arc::new(EngineClient::new("tables", QueryQuota::default()));
         self.session(&nobody).tables().collect()
     }
 
     /// The field's functions.
-    pub(crate) fn functions(&self) -> Vec<Function> {
-        let nobody = Arc::new(Client::new("functions", Quota::default()));
+    pub(crate) fn functions(&self) -> Vec<SqlFunction> {
+        let nobody = Arc::new(EngineClient::new("functions", QueryQuota::default()));
         self.session(&nobody).functions().into_iter().filter(|f| f.is_own).collect()
     }
 
@@ -160,7 +160,7 @@ impl QueryService {
     /// Parses and plans for a client, away from the threads that answer connections.
     pub(crate) async fn plan<T: Send + 'static>(
         &self,
-        client: &Client,
+        client: &EngineClient,
         work: impl Future<Output = Result<T, RequestFault>> + Send + 'static,
     ) -> Result<T, RequestFault> {
         let guard = self.0.activity.enter();

@@ -5,8 +5,8 @@ use std::path::PathBuf;
 use anyhow::Context as _;
 use clap::{Args, Subcommand, ValueEnum};
 use echolake_export::{
-    Check, Exported, Layout, PendingFile, ResponseFormat, Slice, SliceParams, Split, SplitBy, Symmetries, Taken,
-    TrainingSet, WrittenFile, write_responses, write_training_set, write_wav,
+    Check, ExportSummary, Layout, PendingFile, ResponseFormat, RowSymmetries, Slice, SliceParams, SplitBy, SplitParams,
+    Taken, TrainingSet, WrittenFile, write_responses, write_training_set, write_wav,
 };
 use echolake_lake::Lake;
 use echolake_query::{PredicateForm, Session};
@@ -161,10 +161,10 @@ async fn ml(lake: &Lake, args: &MlArgs) -> anyhow::Result<()> {
         SplitArg::None => SplitBy::Nothing,
     };
     let symmetries = match args.symmetries {
-        SymmetriesArg::None => Symmetries::None,
-        SymmetriesArg::All => Symmetries::All,
+        SymmetriesArg::None => RowSymmetries::None,
+        SymmetriesArg::All => RowSymmetries::All,
     };
-    let split = Split { by, test: args.test, validation: args.validation, seed: args.seed };
+    let split = SplitParams { by, test: args.test, validation: args.validation, seed: args.seed };
     let set = TrainingSet { symmetries, split, columns: args.columns.clone() };
     let (progress, mut task) = (CommandProgress::new(), None);
     let exported = write_training_set(lake, &args.output, &set, &mut |done, total| {
@@ -177,7 +177,7 @@ async fn ml(lake: &Lake, args: &MlArgs) -> anyhow::Result<()> {
     Ok(())
 }
 
-fn in_words(exported: &Exported) -> String {
+fn in_words(exported: &ExportSummary) -> String {
     let mut lines = vec![format!("{:<12} {:>6} {:>7} {:>9} {:>10}", "split", "files", "panels", "surfaces", "rows")];
     lines.extend(
         exported
@@ -195,7 +195,7 @@ fn in_words(exported: &Exported) -> String {
     lines.join("\n")
 }
 
-fn in_json(exported: &Exported) -> serde_json::Result<String> {
+fn in_json(exported: &ExportSummary) -> serde_json::Result<String> {
     let parts: Vec<_> = exported
         .parts
         .iter()

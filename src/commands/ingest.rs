@@ -9,7 +9,10 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use anyhow::Context as _;
-use echolake_ingest::{Ingest, Outcome, Report, Source, SuspectFile, Taken, adopt_cut_off, complete, pending, waiting};
+use echolake_ingest::{
+    FileReport, IngestOutcome, IngestedRun, LakeIngest, RunSource, SuspectFile, adopt_cut_off, complete, pending,
+    waiting,
+};
 use echolake_lake::Lake;
 use futures::TryStreamExt as _;
 use object_store::ObjectStoreExt as _;
@@ -32,7 +35,7 @@ const PANICKED: i32 = 101;
 /// The results of all files.
 #[derive(Default, Serialize, Deserialize)]
 pub(crate) struct IngestSummary {
-    pub(crate) taken: Vec<Taken>,
+    pub(crate) taken: Vec<IngestedRun>,
     refused: Vec<RefusedFile>,
 }
 
@@ -50,19 +53,19 @@ impl IngestSummary {
         !self.refused.is_empty() || self.taken.iter().any(|t| !t.whole || !t.damaged.is_empty())
     }
 
-    fn add(&mut self, report: Report, progress: &CommandProgress) {
+    fn add(&mut self, report: FileReport, progress: &CommandProgress) {
         match report {
-            Report::Taken(taken) => {
+            FileReport::Taken(taken) => {
                 say(progress, &taken);
                 self.taken.push(taken);
             }
-            Report::Refused { source, why, moved } => {
+            FileReport::Refused { source, why, moved } => {
                 let whereto = moved.as_ref().map(|m| format!(" (now at `{m}`)")).unwrap_or_default();
                 progress.say(format!("error: {why}{whereto}"));
                 let (file, reason, moved_to) = (source.to_string(), why.to_string(), moved.map(|m| m.to_string()));
                 self.refused.push(RefusedFile { file, reason, moved_to });
             }
-            Report::Gone(source) => progress.say(format!("{source}: another ingest has taken it")),
+            FileReport::Gone(source) => progress.say(format!("{source}: another ingest has taken it")),
         }
     }
 }
@@ -98,7 +101,7 @@ pub(crate) async fn run(args: &IngestArgs, lake_url: &str) -> anyhow::Result<Com
 }
 
 // All pending files, with the recordings that a crashed recorder left.
-async fn all_pending(lake: &Lake) -> anyhow::Result<Vec<Source>> {
+async fn all_pending(lake: &Lake) -> anyhow::Result<Vec<RunSource>> {
     for path in adopt_cut_off(lake).await? {
         eprintln!("`{path}` was cut off; what was complete is taken in");
     }
@@ -108,7 +111,7 @@ async fn all_pending(lake: &Lake) -> anyhow::Result<Vec<Source>> {
 /// Ingests runs, then completes rows that waited for references.
 pub(crate) async fn take_in(
     lake: &Lake,
-    sources: Vec<Source>,
+    sources: Vec<RunSource>,
     stop: &Arc<AtomicBool>,
     progress: &CommandProgress,
 ) -> anyhow::Result<IngestSummary> {
@@ -117,19 +120,20 @@ pub(crate) async fn take_in(
     let mut ended = 0;
     let (suspects, sources): (Vec<_>, Vec<_>) =
         sources.into_iter().partition(|source| SuspectFile::from_source(lake, source).is_some());
-    let mut report = |report: Report| {
+    let mut report = |report: FileReport| {
         ended += 1;
         summary.add(report, progress);
         task.at(ended);
     };
-    let mut outcome = Ingest::new(lake, stop.clone()).take_in(sources, &mut report).await.map_err(anyhow::Error::from);
+    let mut outcome =
+        LakeIngest::new(lake, stop.clone()).take_in(sources, &mut report).await.map_err(anyhow::Error::from);
     // All others first: these may end the process of which this one is a part.
     for mut suspect in suspects.iter().filter_map(|source| SuspectFile::from_source(lake, source)) {
         if outcome.is_ok() {
             outcome = watch_suspect(lake, &mut suspect, stop, &mut summary, progress).await;
         }
     }
-    let added = || summary.taken.iter().filter(|t| t.outcome == Outcome::Added);
+    let added = || summary.taken.iter().filter(|t| t.outcome == IngestOutcome::Added);
     let measurements: usize = added().map(|t| t.measurements).sum();
     let derived: usize = added().filter(|t| t.derived).map(|t| t.measurements).sum();
     task.done(format!("{} runs, {measurements} new measurements, {derived} of them derived", summary.taken.len()));
@@ -161,7 +165,7 @@ async fn watch_suspect(
     progress: &CommandProgress,
 ) -> anyhow::Result<()> {
     let file = suspect.source().clone();
-    let Source::Lake(path) = &file else { return Ok(()) };
+    let RunSource::Lake(path) = &file else { return Ok(()) };
     loop {
         if let Some(report) = suspect.refuse(lake).await? {
             summary.add(report, progress);
@@ -208,8 +212,8 @@ async fn take_in_suspect(
         std::process::exit(1);
     });
     let mut summary = IngestSummary::default();
-    let source = Source::Lake(ObjectPath::parse(path)?);
-    Ingest::new(lake, stop.clone()).take_in(vec![source], &mut |report| summary.add(report, progress)).await?;
+    let source = RunSource::Lake(ObjectPath::parse(path)?);
+    LakeIngest::new(lake, stop.clone()).take_in(vec![source], &mut |report| summary.add(report, progress)).await?;
     super::print(&serde_json::to_string(&summary)?)?;
     Ok(CommandOutcome::Whole)
 }
@@ -227,7 +231,7 @@ async fn watch(lake: &Lake, stop: &StopRequest, progress: &CommandProgress) -> a
         let mut now = HashMap::new();
         let mut states = HashMap::new();
         for source in all_pending(lake).await? {
-            let Source::Lake(path) = &source else { continue };
+            let RunSource::Lake(path) = &source else { continue };
             // It may be gone again.
             let Ok(meta) = lake.store().head(path).await else { continue };
             let state = (meta.size, meta.last_modified);
@@ -268,11 +272,11 @@ async fn pause(time: Duration, stop: &StopRequest) {
     let _ = tokio::time::timeout(time, stop.wait()).await;
 }
 
-fn say(progress: &CommandProgress, taken: &Taken) {
-    let Taken { run, measurements, .. } = taken;
+fn say(progress: &CommandProgress, taken: &IngestedRun) {
+    let IngestedRun { run, measurements, .. } = taken;
     match taken.outcome {
-        Outcome::Known => progress.say(format!("{run}: is in the lake already, nothing added")),
-        Outcome::Added => progress.say(format!("{run}: {measurements} measurements")),
+        IngestOutcome::Known => progress.say(format!("{run}: is in the lake already, nothing added")),
+        IngestOutcome::Added => progress.say(format!("{run}: {measurements} measurements")),
     }
     if !taken.whole {
         progress.say(format!("{run}: warning: the file was cut off; what was complete is in the tables"));
@@ -283,11 +287,11 @@ fn say(progress: &CommandProgress, taken: &Taken) {
 }
 
 // A name of an existing file is that file; any other is looked up in the lake.
-async fn sources_of(lake: &Lake, names: &[String]) -> anyhow::Result<Vec<Source>> {
+async fn sources_of(lake: &Lake, names: &[String]) -> anyhow::Result<Vec<RunSource>> {
     let mut sources = Vec::new();
     for name in names {
         if Path::new(name).is_file() {
-            sources.push(in_lake(lake, Path::new(name)).unwrap_or_else(|| Source::File(name.into())));
+            sources.push(in_lake(lake, Path::new(name)).unwrap_or_else(|| RunSource::File(name.into())));
             continue;
         }
         let file = if name.ends_with(".mcap") { name.clone() } else { format!("{name}.mcap") };
@@ -296,16 +300,16 @@ async fn sources_of(lake: &Lake, names: &[String]) -> anyhow::Result<Vec<Source>
             let folder = p.parts().next().is_some_and(|f| matches!(f.as_ref(), "inbox" | "runs"));
             folder && (p.filename() == Some(file.as_str()) || p.as_ref() == file)
         });
-        sources.push(Source::Lake(found.ok_or(echolake_ingest::Error::NoRun { given: name.clone() })?));
+        sources.push(RunSource::Lake(found.ok_or(echolake_ingest::Error::NoRun { given: name.clone() })?));
     }
     Ok(sources)
 }
 
 // A file under the lake's own inbox/ or runs/ is not copied.
-fn in_lake(lake: &Lake, file: &Path) -> Option<Source> {
+fn in_lake(lake: &Lake, file: &Path) -> Option<RunSource> {
     let folder = lake.folder()?.canonicalize().ok()?;
     let inside = file.canonicalize().ok()?.strip_prefix(folder).ok()?.to_owned();
     let path = ObjectPath::parse(inside.to_str()?).ok()?;
     let first = path.parts().next()?;
-    matches!(first.as_ref(), "inbox" | "runs").then_some(Source::Lake(path))
+    matches!(first.as_ref(), "inbox" | "runs").then_some(RunSource::Lake(path))
 }

@@ -9,8 +9,8 @@ use std::path::{Path, PathBuf};
 use anyhow::Context as _;
 use clap::ValueEnum;
 use echolake_lake::Lake;
-use echolake_query::output::{AnswerWriter, Format, TABLE_ROWS};
-use echolake_query::{Answer, Session};
+use echolake_query::output::{AnswerFormat, AnswerWriter, TABLE_ROWS};
+use echolake_query::{QueryAnswer, Session};
 
 #[derive(Debug, clap::Args)]
 pub(crate) struct SqlArgs {
@@ -36,7 +36,7 @@ enum FormatArg {
     Arrow,
 }
 
-impl From<FormatArg> for Format {
+impl From<FormatArg> for AnswerFormat {
     fn from(arg: FormatArg) -> Self {
         match arg {
             FormatArg::Table => Self::Table,
@@ -57,7 +57,7 @@ pub(crate) async fn run(args: &SqlArgs, lake_url: &str) -> anyhow::Result<()> {
         None if std::io::stdin().is_terminal() => return prompt::run(&session, &lake).await,
         None => from_stdin()?,
     };
-    let format = if args.json { Format::Json } else { args.format.into() };
+    let format = if args.json { AnswerFormat::Json } else { args.format.into() };
     let answer = session.query(&query).await?;
     match &args.output {
         Some(path) => to_file(answer, format, path).await.map(drop),
@@ -80,23 +80,23 @@ fn from_stdin() -> anyhow::Result<String> {
 
 /// Prints an answer for people.
 pub(super) async fn print_table(session: &Session, sql: &str) -> anyhow::Result<()> {
-    write(session.query(sql).await?, Format::Table, std::io::stdout()).await.map(drop)
+    write(session.query(sql).await?, AnswerFormat::Table, std::io::stdout()).await.map(drop)
 }
 
-async fn write(mut answer: Answer, format: Format, to: impl Write + Send) -> anyhow::Result<usize> {
+async fn write(mut answer: QueryAnswer, format: AnswerFormat, to: impl Write + Send) -> anyhow::Result<usize> {
     let mut writer = AnswerWriter::new(format, &answer.schema, to)?;
     while let Some(batch) = answer.next().await? {
         writer.write(&batch)?;
     }
     let rows = writer.finish()?;
-    if format == Format::Table && rows > TABLE_ROWS {
+    if format == AnswerFormat::Table && rows > TABLE_ROWS {
         eprintln!("the first {TABLE_ROWS} of {rows} rows; hint: --format csv prints all");
     }
     Ok(rows)
 }
 
 // Written beside its path first, so that a file is whole or not there. A device or a pipe is written directly.
-async fn to_file(answer: Answer, format: Format, path: &Path) -> anyhow::Result<usize> {
+async fn to_file(answer: QueryAnswer, format: AnswerFormat, path: &Path) -> anyhow::Result<usize> {
     let failed = || format!("cannot write `{}`", path.display());
     if path.metadata().is_ok_and(|m| !m.is_file()) {
         let special = OpenOptions::new().write(true).open(path).with_context(failed)?;

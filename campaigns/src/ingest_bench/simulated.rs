@@ -136,7 +136,7 @@ impl SimulatedRuns {
         for (files, cost) in [references, panels].into_iter().zip(&mut costs) {
             put_into_inbox(files, folder)?;
             let meter = CostMeter::start()?;
-            Ingest::new(&lake, stop.clone()).take_in(pending(&lake).await?, &mut report).await?;
+            LakeIngest::new(&lake, stop.clone()).take_in(pending(&lake).await?, &mut report).await?;
             complete(&lake, &stop, &mut |_| {}).await?;
             *cost = meter.stop()?;
         }

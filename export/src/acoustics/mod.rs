@@ -18,7 +18,7 @@ use crate::rows;
 pub use wav::write_wav;
 
 /// The responses of one run, in the order of their pairs.
-struct Responses {
+struct SurfaceResponses {
     run: VisibleRun,
     pairs: Vec<u32>,
     log_time_ns: Vec<i64>,
@@ -54,7 +54,7 @@ pub async fn write_responses(
     let pending = PendingFolder::create(folder)?;
     let mut files = Vec::new();
     for (done, run) in runs.iter().enumerate() {
-        let responses = Responses::read(lake, &snapshot, run).await?;
+        let responses = SurfaceResponses::read(lake, &snapshot, run).await?;
         match format {
             ResponseFormat::Sofa => files.push(sofa::write(lake, &responses, &pending)?),
             ResponseFormat::Npz => files.extend(npz::write(lake, &snapshot, &responses, &pending).await?),
@@ -83,7 +83,7 @@ fn newest_runs(snapshot: &LakeSnapshot, surfaces: &[SurfaceId]) -> Result<Vec<Vi
     Ok(newest.into_values().cloned().collect())
 }
 
-impl Responses {
+impl SurfaceResponses {
     async fn read(lake: &Lake, snapshot: &LakeSnapshot, run: &VisibleRun) -> Result<Self> {
         let columns = ["pair_id", "log_time_ns", "temperature_c", "ir"];
         let batch = rows::of_run(lake, snapshot, Table::Measurements, &run.run, &columns).await?;

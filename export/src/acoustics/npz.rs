@@ -11,7 +11,7 @@ use echolake_schema::tables::Table;
 use ndarray::{Array1, Array2};
 use ndarray_npy::NpzWriter;
 
-use super::Responses;
+use super::SurfaceResponses;
 use crate::error::{Error, Result};
 use crate::output::{PendingFolder, WrittenFile};
 use crate::rows;
@@ -20,7 +20,7 @@ use crate::rows;
 pub(super) async fn write(
     lake: &Lake,
     snapshot: &LakeSnapshot,
-    responses: &Responses,
+    responses: &SurfaceResponses,
     folder: &PendingFolder,
 ) -> Result<Vec<WrittenFile>> {
     let (surface, all) = (&responses.run.surface, lake.grid().pairs().len());
@@ -67,7 +67,7 @@ fn archive(
     Ok(npz.finish()?.into_inner())
 }
 
-async fn heights(lake: &Lake, snapshot: &LakeSnapshot, responses: &Responses) -> Result<Option<Array2<f64>>> {
+async fn heights(lake: &Lake, snapshot: &LakeSnapshot, responses: &SurfaceResponses) -> Result<Option<Array2<f64>>> {
     let run = &responses.run.run;
     let batch = rows::of_run(lake, snapshot, Table::Heightmaps, run, &["symmetry", "heights_mm"]).await?;
     let Some(row) = rows::texts(&batch, "symmetry").iter().position(|s| *s == "identity") else { return Ok(None) };

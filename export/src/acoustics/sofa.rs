@@ -6,7 +6,7 @@ use echolake_schema::{Point, Timestamp};
 use rust_hdf5::{H5Dataset, H5File, Hdf5Error};
 use sha2::{Digest as _, Sha256};
 
-use super::Responses;
+use super::SurfaceResponses;
 use crate::error::{Error, Result};
 use crate::output::{PendingFolder, WrittenFile};
 
@@ -18,7 +18,7 @@ const KELVIN: f64 = 273.15;
 struct Dimensions(Vec<(char, usize, H5Dataset)>);
 
 /// Writes `<surface>.sofa`.
-pub(super) fn write(lake: &Lake, responses: &Responses, folder: &PendingFolder) -> Result<WrittenFile> {
+pub(super) fn write(lake: &Lake, responses: &SurfaceResponses, folder: &PendingFolder) -> Result<WrittenFile> {
     let name = format!("{}.sofa", responses.run.surface);
     let path = folder.meanwhile(&name);
     let failed = |e: Hdf5Error| Error::write(&folder.named(&name), e);
@@ -29,7 +29,7 @@ pub(super) fn write(lake: &Lake, responses: &Responses, folder: &PendingFolder) 
     Ok(WrittenFile { name, bytes: bytes.len() as u64, sha256: hex::encode(Sha256::digest(&bytes)) })
 }
 
-fn fill(file: &H5File, lake: &Lake, responses: &Responses) -> std::result::Result<(), Hdf5Error> {
+fn fill(file: &H5File, lake: &Lake, responses: &SurfaceResponses) -> std::result::Result<(), Hdf5Error> {
     let rig = lake.rig();
     let reference = rig.impulse_response.reference_temperature_c.get();
     let first = Timestamp(responses.log_time_ns.iter().copied().min().unwrap_or(0)).to_string();

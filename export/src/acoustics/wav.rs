@@ -35,7 +35,7 @@ pub async fn write_wav(
     let mut done = 0;
     for run in &mut runs {
         while let Some(measured) = run.next().await? {
-            let recording = Recording::of(&measured)?;
+            let recording = WavRecording::of(&measured)?;
             let name = format!(
                 "{}/{}-p{:04}-a{}.wav",
                 run.surface(),
@@ -62,13 +62,13 @@ pub async fn write_wav(
 }
 
 /// One measurement's sweep recording and verdict, decoded.
-struct Recording {
+struct WavRecording {
     sweep: SweepRecording,
     verdict: Measurement,
     time_ns: i64,
 }
 
-impl Recording {
+impl WavRecording {
     fn of(measured: &Measured) -> Result<Self> {
         let damaged = |e: prost::DecodeError| Error::damaged(&measured.file, e);
         let Some((time_ns, sweep)) = measured.message(topics::SWEEP) else {
@@ -175,7 +175,7 @@ mod tests {
                 loopback: bytes.into(),
                 ..SweepRecording::default()
             };
-            let recording = Recording { sweep, verdict: Measurement::default(), time_ns: 0 };
+            let recording = WavRecording { sweep, verdict: Measurement::default(), time_ns: 0 };
             let wav = recording.wav().expect("a file");
             let mut reader = hound::WavReader::new(Cursor::new(wav)).expect("a WAV file");
             assert_eq!((reader.spec().bits_per_sample, reader.spec().sample_rate), (24, 96_000));
@@ -192,7 +192,7 @@ mod tests {
             microphone: vec![0; 6].into(),
             ..SweepRecording::default()
         };
-        let recording = Recording { sweep, verdict: Measurement::default(), time_ns: 0 };
+        let recording = WavRecording { sweep, verdict: Measurement::default(), time_ns: 0 };
         assert!(recording.wav().is_err_and(|e| e.contains("6 bytes for 9")));
     }
 }

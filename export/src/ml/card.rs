@@ -6,8 +6,8 @@ use arrow::datatypes::{DataType, Field};
 use echolake_lake::Lake;
 use echolake_schema::tables::{COMMENT, UNIT};
 
-use super::split::{Part, SplitBy};
-use super::{Exported, Plan, Shard, Symmetries, heights};
+use super::split::{SplitBy, SplitPart};
+use super::{ExportSummary, Plan, RowSymmetries, Shard, heights};
 use crate::error::{Error, Result};
 
 /// The paper that the rig, the bands and TNCE are of.
@@ -15,13 +15,13 @@ pub(super) const PAPER: &str = "Rust, R. et al. (2021). A data acquisition setup
 Building Acoustics 28(4), 345-360. https://doi.org/10.1177/1351010X20986901";
 
 /// Contents of a card: the lake, the plan, and the export's counts.
-pub(super) struct About<'a> {
+pub(super) struct CardContents<'a> {
     pub(super) lake: &'a Lake,
     pub(super) plan: &'a Plan,
-    pub(super) exported: &'a Exported,
+    pub(super) exported: &'a ExportSummary,
 }
 
-impl About<'_> {
+impl CardContents<'_> {
     /// Returns a summary of one sentence.
     pub(super) fn summary(&self) -> String {
         let rows: u64 = self.exported.parts.iter().map(|p| p.rows).sum();
@@ -35,7 +35,7 @@ impl About<'_> {
     /// Returns the origins of the surfaces: measured, simulated, imported.
     pub(super) fn origins(&self) -> Vec<String> {
         let mut origins: Vec<_> =
-            Part::ALL.iter().flat_map(|p| self.plan.of_part(*p)).map(|s| s.origin.clone()).collect();
+            SplitPart::ALL.iter().flat_map(|p| self.plan.of_part(*p)).map(|s| s.origin.clone()).collect();
         origins.sort();
         origins.dedup();
         origins
@@ -52,7 +52,7 @@ impl About<'_> {
 }
 
 /// Returns the text of the card.
-pub(super) fn write(about: &About<'_>) -> String {
+pub(super) fn write(about: &CardContents<'_>) -> String {
     let mut text = front_matter(about);
     let split = about.plan.set.split;
     let _ = write!(text, "# Reflections of relief surfaces\n\n{}\n\n", about.summary());
@@ -104,14 +104,17 @@ pub(super) fn write(about: &About<'_>) -> String {
     text
 }
 
-fn front_matter(about: &About<'_>) -> String {
+fn front_matter(about: &CardContents<'_>) -> String {
     let mut text = String::from(
         "---\npretty_name: Reflections of relief surfaces\ntags:\n- acoustics\n- impulse-response\nconfigs:\n",
     );
-    let mut config = |name: &str, default: bool, path: &dyn Fn(Part) -> String, has: &dyn Fn(Part) -> bool| {
+    let mut config = |name: &str,
+                      default: bool,
+                      path: &dyn Fn(SplitPart) -> String,
+                      has: &dyn Fn(SplitPart) -> bool| {
         let _ =
             write!(text, "- config_name: {name}\n{}  data_files:\n", if default { "  default: true\n" } else { "" });
-        for part in Part::ALL.into_iter().filter(|p| has(*p)) {
+        for part in SplitPart::ALL.into_iter().filter(|p| has(*p)) {
             let _ = writeln!(text, "  - split: {}\n    path: {}", part.name(), path(part));
         }
     };
@@ -126,13 +129,13 @@ fn front_matter(about: &About<'_>) -> String {
     text
 }
 
-fn files(text: &mut String, about: &About<'_>) {
+fn files(text: &mut String, about: &CardContents<'_>) {
     text.push_str(
         "\n## Files\n\n- `data/<split>-*.parquet`: measurements. Whole surfaces in a file, one row group a surface, in a drawn order.\n- `heightmaps/<split>.parquet`: the surfaces' heights, joined by `surface_id` and `symmetry`.\n- `surfaces.csv`: every surface and run, its file, rows, and the digests of what its rows were derived from.\n- `croissant.json`: the same as Croissant metadata. `SHA256SUMS`: `sha256sum -c SHA256SUMS` checks all files.\n\n",
     );
     text.push_str(match about.plan.set.symmetries {
-        Symmetries::None => "Rows are as they were measured. The grid and the panel have the eight symmetries of a square; `echolake.torch.Measurements(symmetries=\"all\")` turns positions and height maps together while it loads.\n",
-        Symmetries::All => "Every measurement stands there under each of the square's eight symmetries: its positions are turned, its numbers are the same, and the height map of the same `symmetry` is turned with it. Where `swapped` is true, microphone and speaker changed places as well, which relies on reciprocity; leave these rows out where that is not wanted.\n",
+        RowSymmetries::None => "Rows are as they were measured. The grid and the panel have the eight symmetries of a square; `echolake.torch.Measurements(symmetries=\"all\")` turns positions and height maps together while it loads.\n",
+        RowSymmetries::All => "Every measurement stands there under each of the square's eight symmetries: its positions are turned, its numbers are the same, and the height map of the same `symmetry` is turned with it. Where `swapped` is true, microphone and speaker changed places as well, which relies on reciprocity; leave these rows out where that is not wanted.\n",
     });
     let _ = writeln!(
         text,

@@ -27,7 +27,7 @@ const NOT_CHOSEN: [&str; 10] = [
 
 /// The chosen columns, by the table that they come from.
 #[derive(Debug, Clone)]
-pub(super) struct Columns {
+pub(super) struct TrainingColumns {
     /// In the order of the training set.
     chosen: Vec<(Table, FieldRef)>,
     schema: SchemaRef,
@@ -41,7 +41,7 @@ fn defaults(rig: &Rig) -> Vec<String> {
     names
 }
 
-impl Columns {
+impl TrainingColumns {
     /// Chooses the columns of these names; the defaults if there are no names.
     pub(super) fn choose(rig: &Rig, names: &[String]) -> Result<Self> {
         let tables: Vec<_> = TABLES.into_iter().map(|table| (table, table.schema(rig))).collect();
@@ -149,14 +149,15 @@ mod tests {
     #[test]
     fn columns_are_chosen_by_name_and_unknown_ones_are_named() {
         let rig = Rig::paper();
-        let usual = Columns::choose(&rig, &[]).expect("the usual");
+        let usual = TrainingColumns::choose(&rig, &[]).expect("the usual");
         assert_eq!(usual.of(Table::Tnce).len(), 6);
         let length = |name: &str| usual.schema().field_with_name(name).map(|f| f.data_type().clone()).expect(name);
         assert_eq!(length("ir"), list(384).expect("a list"));
-        let some = Columns::choose(&rig, &["nce_2500".into(), "tnce_total".into(), "nce_2500".into()]).expect("some");
+        let some =
+            TrainingColumns::choose(&rig, &["nce_2500".into(), "tnce_total".into(), "nce_2500".into()]).expect("some");
         assert_eq!(some.chosen().len(), 2);
         for bad in ["nope", "code_version", "surface_id"] {
-            let error = Columns::choose(&rig, &[bad.to_owned()]).expect_err(bad).to_string();
+            let error = TrainingColumns::choose(&rig, &[bad.to_owned()]).expect_err(bad).to_string();
             assert!(error.contains("reflected_ir, nce_2500"), "{error}");
         }
     }

@@ -4,15 +4,15 @@ use arrow::datatypes::{DataType, Field};
 use echolake_schema::tables::{COMMENT, UNIT};
 use serde_json::{Value, json};
 
-use super::card::{About, PAPER};
+use super::card::{CardContents, PAPER};
 use super::heights;
-use super::split::Part;
+use super::split::SplitPart;
 use crate::error::{Error, Result};
 
 const PARQUET: &str = "application/x-parquet";
 
 /// The metadata as JSON-LD.
-pub(super) fn write(about: &About<'_>) -> Result<String> {
+pub(super) fn write(about: &CardContents<'_>) -> Result<String> {
     let exported = about.exported;
     let mut distribution: Vec<Value> = Vec::new();
     let mut record_sets = vec![splits()];
@@ -76,13 +76,13 @@ fn file_set(id: &str, includes: &str, description: &str) -> Value {
 
 // The names of the splits, to which the field `split` of every row refers.
 fn splits() -> Value {
-    let data: Vec<_> = Part::ALL
+    let data: Vec<_> = SplitPart::ALL
         .iter()
         .map(|part| {
             let role = match part {
-                Part::Train => "cr:TrainingSplit",
-                Part::Validation => "cr:ValidationSplit",
-                Part::Test => "cr:TestSplit",
+                SplitPart::Train => "cr:TrainingSplit",
+                SplitPart::Validation => "cr:ValidationSplit",
+                SplitPart::Test => "cr:TestSplit",
             };
             json!({ "splits/name": part.name(), "splits/url": role })
         })

@@ -11,8 +11,8 @@ use echolake_schema::tables::Table;
 
 use super::columns::{field, list};
 use super::measurements::fixed;
-use super::split::Part;
-use super::surfaces::Surface;
+use super::split::SplitPart;
+use super::surfaces::TrainingSurface;
 use crate::error::{Error, Result};
 use crate::rows;
 
@@ -37,8 +37,8 @@ pub(super) fn schema() -> Result<SchemaRef> {
 pub(super) async fn read(
     lake: &Lake,
     snapshot: &LakeSnapshot,
-    surface: &Surface,
-    part: Part,
+    surface: &TrainingSurface,
+    part: SplitPart,
     symmetries: &[&str],
 ) -> Result<Option<RecordBatch>> {
     let columns = ["symmetry", "size_mm", "heights_mm"];
@@ -55,8 +55,8 @@ pub(super) async fn read(
 }
 
 fn arranged(
-    surface: &Surface,
-    part: Part,
+    surface: &TrainingSurface,
+    part: SplitPart,
     batch: &RecordBatch,
 ) -> std::result::Result<RecordBatch, arrow::error::ArrowError> {
     let schema = schema().map_err(|e| arrow::error::ArrowError::SchemaError(e.to_string()))?;

@@ -15,21 +15,21 @@ use echolake_schema::symmetry::MovedPair;
 use echolake_schema::tables::Table;
 use echolake_schema::{Grid, PointId, Symmetry};
 
-use super::columns::Columns;
-use super::split::Part;
-use super::surfaces::{Run, Surface};
+use super::columns::TrainingColumns;
+use super::split::SplitPart;
+use super::surfaces::{TrainingRun, TrainingSurface};
 use crate::error::{Error, Result};
 use crate::rows;
 
 /// The symmetries of a training set, and the image of each of the rig's pairs under them.
-pub(super) struct Moves(Vec<(Symmetry, Vec<MovedPair>)>);
+pub(super) struct SymmetryMoves(Vec<(Symmetry, Vec<MovedPair>)>);
 
-impl Moves {
+impl SymmetryMoves {
     /// Returns all symmetries of the grid, or the identity alone.
-    pub(super) fn of(grid: &Grid, symmetries: super::Symmetries) -> Self {
+    pub(super) fn of(grid: &Grid, symmetries: super::RowSymmetries) -> Self {
         let wanted: &[Symmetry] = match symmetries {
-            super::Symmetries::None => &[Symmetry::Identity],
-            super::Symmetries::All => &Symmetry::ALL,
+            super::RowSymmetries::None => &[Symmetry::Identity],
+            super::RowSymmetries::All => &Symmetry::ALL,
         };
         Self(wanted.iter().filter_map(|s| grid.moved_pairs(*s).map(|pairs| (*s, pairs))).collect())
     }
@@ -41,11 +41,11 @@ impl Moves {
 }
 
 /// Builds the rows of runs from a snapshot of the lake.
-pub(super) struct Maker<'a> {
+pub(super) struct RowBuilder<'a> {
     pub(super) lake: &'a Lake,
     pub(super) snapshot: &'a LakeSnapshot,
-    pub(super) columns: &'a Columns,
-    pub(super) moves: &'a Moves,
+    pub(super) columns: &'a TrainingColumns,
+    pub(super) moves: &'a SymmetryMoves,
 }
 
 /// Rows of a run before any symmetry, in the order of their pairs.
@@ -54,9 +54,9 @@ pub(super) struct RunRows {
     values: Vec<ArrayRef>,
 }
 
-impl Maker<'_> {
+impl RowBuilder<'_> {
     /// Reads the chosen columns of the pairs that the run has in all of the chosen tables.
-    pub(super) async fn read(&self, run: &Run) -> Result<RunRows> {
+    pub(super) async fn read(&self, run: &TrainingRun) -> Result<RunRows> {
         let mut tables = HashMap::new();
         let mut pairs: Option<Vec<u32>> = None;
         for table in [Table::Measurements, Table::Nce, Table::Tnce] {
@@ -90,15 +90,21 @@ impl Maker<'_> {
     }
 
     /// Returns the rows under each symmetry, one batch per symmetry.
-    pub(super) fn batches(&self, surface: &Surface, run: &Run, part: Part, rows: &RunRows) -> Result<Vec<RecordBatch>> {
+    pub(super) fn batches(
+        &self,
+        surface: &TrainingSurface,
+        run: &TrainingRun,
+        part: SplitPart,
+        rows: &RunRows,
+    ) -> Result<Vec<RecordBatch>> {
         self.moves.0.iter().map(|(symmetry, moved)| self.batch(surface, run, part, rows, (*symmetry, moved))).collect()
     }
 
     fn batch(
         &self,
-        surface: &Surface,
-        run: &Run,
-        part: Part,
+        surface: &TrainingSurface,
+        run: &TrainingRun,
+        part: SplitPart,
         rows: &RunRows,
         (symmetry, moved): (Symmetry, &[MovedPair]),
     ) -> Result<RecordBatch> {

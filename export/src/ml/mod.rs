@@ -20,10 +20,10 @@ use futures::StreamExt as _;
 
 use crate::error::{Error, Result};
 use crate::output::{PendingFolder, WrittenFile};
-use columns::Columns;
-use measurements::Moves;
-pub use split::{Part, Split, SplitBy};
-use surfaces::Surface;
+use columns::TrainingColumns;
+use measurements::SymmetryMoves;
+pub use split::{SplitBy, SplitParams, SplitPart};
+use surfaces::TrainingSurface;
 
 /// Minimum number of files per split, if it has that many surfaces: loaders give whole files to their workers.
 pub const SHARDS: usize = 32;
@@ -32,7 +32,7 @@ const SURFACES_A_SHARD: usize = 64;
 
 /// The D4 symmetries by which rows are repeated.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Symmetries {
+pub enum RowSymmetries {
     /// Rows as they were measured; `echolake.torch` turns them while it loads.
     None,
     /// Every row eight times, as far as the grid has the symmetry.
@@ -43,22 +43,22 @@ pub enum Symmetries {
 #[derive(Debug, Clone, PartialEq)]
 pub struct TrainingSet {
     /// Its symmetries.
-    pub symmetries: Symmetries,
+    pub symmetries: RowSymmetries,
     /// Its split into parts.
-    pub split: Split,
+    pub split: SplitParams,
     /// Columns of `measurements`, `nce` and `tnce`; the default columns if empty.
     pub columns: Vec<String>,
 }
 
 impl Default for TrainingSet {
     fn default() -> Self {
-        Self { symmetries: Symmetries::None, split: Split::default(), columns: Vec::new() }
+        Self { symmetries: RowSymmetries::None, split: SplitParams::default(), columns: Vec::new() }
     }
 }
 
 /// Result of an export of a training set.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Exported {
+pub struct ExportSummary {
     /// The parts, training first.
     pub parts: Vec<PartCounts>,
     /// Surfaces that are left out because another side of their panel is held out.
@@ -73,7 +73,7 @@ pub struct Exported {
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct PartCounts {
     /// The part.
-    pub part: Part,
+    pub part: SplitPart,
     /// Files of measurements.
     pub files: usize,
     /// Physical panels.
@@ -89,8 +89,8 @@ pub struct PartCounts {
 /// The plan of an export, complete before the first row is read.
 struct Plan {
     set: TrainingSet,
-    columns: Columns,
-    moves: Moves,
+    columns: TrainingColumns,
+    moves: SymmetryMoves,
     shards: Vec<Shard>,
     left_out: Vec<SurfaceId>,
     waiting: usize,
@@ -99,31 +99,31 @@ struct Plan {
 /// A file of measurements.
 #[derive(Debug, Clone)]
 struct Shard {
-    part: Part,
+    part: SplitPart,
     name: String,
-    surfaces: Vec<Surface>,
+    surfaces: Vec<TrainingSurface>,
 }
 
 impl Plan {
     async fn new(lake: &Lake, snapshot: &LakeSnapshot, set: &TrainingSet) -> Result<Self> {
-        let columns = Columns::choose(lake.rig(), &set.columns)?;
+        let columns = TrainingColumns::choose(lake.rig(), &set.columns)?;
         let (surfaces, waiting) = surfaces::read(lake, snapshot).await?;
         let parts = split::assign(&surfaces, set.split)?;
         let mut left_out = Vec::new();
-        let mut of_part: [Vec<Surface>; 3] = Default::default();
+        let mut of_part: [Vec<TrainingSurface>; 3] = Default::default();
         for (surface, part) in surfaces.into_iter().zip(parts) {
-            match part.and_then(|part| Part::ALL.iter().position(|p| *p == part)) {
+            match part.and_then(|part| SplitPart::ALL.iter().position(|p| *p == part)) {
                 Some(at) => of_part[at].push(surface),
                 None => left_out.push(surface.id),
             }
         }
         let shards =
-            Part::ALL.into_iter().zip(of_part).flat_map(|(part, of)| shards(part, of, set.split.seed)).collect();
-        let moves = Moves::of(lake.grid(), set.symmetries);
+            SplitPart::ALL.into_iter().zip(of_part).flat_map(|(part, of)| shards(part, of, set.split.seed)).collect();
+        let moves = SymmetryMoves::of(lake.grid(), set.symmetries);
         Ok(Self { set: set.clone(), columns, moves, shards, left_out, waiting })
     }
 
-    fn of_part(&self, part: Part) -> impl Iterator<Item = &Surface> {
+    fn of_part(&self, part: SplitPart) -> impl Iterator<Item = &TrainingSurface> {
         self.shards.iter().filter(move |s| s.part == part).flat_map(|s| &s.surfaces)
     }
 
@@ -133,7 +133,7 @@ impl Plan {
 }
 
 // Dealt like cards in a drawn order, so that every file has surfaces of every kind.
-fn shards(part: Part, mut surfaces: Vec<Surface>, seed: u64) -> Vec<Shard> {
+fn shards(part: SplitPart, mut surfaces: Vec<TrainingSurface>, seed: u64) -> Vec<Shard> {
     surfaces.sort_by_cached_key(|s| split::digest(seed, s.id.as_str()));
     let count = SHARDS.max(surfaces.len().div_ceil(SURFACES_A_SHARD)).min(surfaces.len());
     let mut shards: Vec<_> = (0..count)
@@ -157,21 +157,21 @@ pub async fn write_training_set(
     folder: &Path,
     set: &TrainingSet,
     progress: &mut dyn FnMut(usize, usize),
-) -> Result<Exported> {
+) -> Result<ExportSummary> {
     let snapshot = lake.snapshot().await?;
     let plan = Plan::new(lake, &snapshot, set).await?;
     let pending = PendingFolder::create(folder)?;
     let (mut parts, mut files) = (Vec::new(), Vec::new());
-    for part in Part::ALL {
+    for part in SplitPart::ALL {
         if plan.of_part(part).next().is_some() {
             let (written, height_maps) = shard::heights(lake, &snapshot, &plan, part, &pending).await?;
             files.extend(written);
             parts.push(counts(&plan, part, height_maps));
         }
     }
-    let job = Arc::new(Job { lake: lake.clone(), snapshot, plan, folder: pending });
+    let job = Arc::new(ExportJob { lake: lake.clone(), snapshot, plan, folder: pending });
     let written = shards_of(&job, progress).await?;
-    let Job { plan, folder: pending, .. } = &*job;
+    let ExportJob { plan, folder: pending, .. } = &*job;
     let mut sources = Vec::new();
     for (one, (file, rows)) in plan.shards.iter().zip(written) {
         if let Some(counts) = parts.iter_mut().find(|p| p.part == one.part) {
@@ -181,8 +181,8 @@ pub async fn write_training_set(
         files.push(file);
     }
     files.push(pending.write("surfaces.csv", card::sources(&sources)?.as_bytes())?);
-    let mut exported = Exported { parts, left_out: plan.left_out.clone(), waiting: plan.waiting, files };
-    let about = card::About { lake, plan, exported: &exported };
+    let mut exported = ExportSummary { parts, left_out: plan.left_out.clone(), waiting: plan.waiting, files };
+    let about = card::CardContents { lake, plan, exported: &exported };
     let (croissant, readme) = (croissant::write(&about)?, card::write(&about));
     exported.files.push(pending.write("croissant.json", croissant.as_bytes())?);
     exported.files.push(pending.write("README.md", readme.as_bytes())?);
@@ -195,7 +195,7 @@ pub async fn write_training_set(
 }
 
 /// State shared by the tasks that write files.
-struct Job {
+struct ExportJob {
     lake: Lake,
     snapshot: LakeSnapshot,
     plan: Plan,
@@ -203,7 +203,10 @@ struct Job {
 }
 
 // One file per core at a time; returns each written file with the rows of each of its surfaces.
-async fn shards_of(job: &Arc<Job>, progress: &mut dyn FnMut(usize, usize)) -> Result<Vec<(WrittenFile, Vec<u64>)>> {
+async fn shards_of(
+    job: &Arc<ExportJob>,
+    progress: &mut dyn FnMut(usize, usize),
+) -> Result<Vec<(WrittenFile, Vec<u64>)>> {
     let surfaces = |of: &Shard| of.surfaces.len();
     let (mut done, total) = (0, job.plan.shards.iter().map(surfaces).sum());
     let cores = std::thread::available_parallelism().map_or(1, usize::from);
@@ -233,7 +236,7 @@ async fn shards_of(job: &Arc<Job>, progress: &mut dyn FnMut(usize, usize)) -> Re
     failed.map_or(Ok(written), Err)
 }
 
-fn counts(plan: &Plan, part: Part, height_maps: usize) -> PartCounts {
+fn counts(plan: &Plan, part: SplitPart, height_maps: usize) -> PartCounts {
     let panels: std::collections::HashSet<_> = plan.of_part(part).map(|s| s.id.panel().to_owned()).collect();
     let files = plan.shards.iter().filter(|s| s.part == part).count();
     PartCounts { part, files, panels: panels.len(), surfaces: plan.of_part(part).count(), rows: 0, height_maps }

@@ -9,9 +9,9 @@ use parquet::basic::{Compression, Encoding, ZstdLevel};
 use parquet::file::properties::{EnabledStatistics, WriterProperties};
 use parquet::schema::types::ColumnPath;
 
-use super::measurements::Maker;
-use super::split::Part;
-use super::{Job, Plan, Shard, heights};
+use super::measurements::RowBuilder;
+use super::split::SplitPart;
+use super::{ExportJob, Plan, Shard, heights};
 use crate::error::{Error, Result};
 use crate::output::{HashedFile, PendingFolder, WrittenFile};
 
@@ -49,10 +49,10 @@ impl<'a> ShardWriter<'a> {
 }
 
 /// Writes a file of measurements; returns it, and the rows of each surface.
-pub(super) async fn write(job: &Job, shard: &Shard) -> Result<(WrittenFile, Vec<u64>)> {
-    let Job { lake, snapshot, plan, folder } = job;
+pub(super) async fn write(job: &ExportJob, shard: &Shard) -> Result<(WrittenFile, Vec<u64>)> {
+    let ExportJob { lake, snapshot, plan, folder } = job;
     let mut writer = ShardWriter::create(folder, &shard.name, plan.schema())?;
-    let maker = Maker { lake, snapshot, columns: &plan.columns, moves: &plan.moves };
+    let maker = RowBuilder { lake, snapshot, columns: &plan.columns, moves: &plan.moves };
     let mut counts = Vec::with_capacity(shard.surfaces.len());
     for surface in &shard.surfaces {
         let mut rows = 0;
@@ -74,7 +74,7 @@ pub(super) async fn heights(
     lake: &Lake,
     snapshot: &LakeSnapshot,
     plan: &Plan,
-    part: Part,
+    part: SplitPart,
     folder: &PendingFolder,
 ) -> Result<(Option<WrittenFile>, usize)> {
     let name = format!("heightmaps/{}.parquet", part.name());

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use sha2::{Digest as _, Sha256};
 
-use super::surfaces::Surface;
+use super::surfaces::TrainingSurface;
 use crate::error::{Error, Result};
 
 /// The kind of group that is held out of training.
@@ -34,7 +34,7 @@ impl SplitBy {
 
 /// Parameters of the split.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Split {
+pub struct SplitParams {
     /// The kind of group that is held out.
     pub by: SplitBy,
     /// Minimum share of the surfaces in the test set, 0 to 1.
@@ -45,7 +45,7 @@ pub struct Split {
     pub seed: u64,
 }
 
-impl Default for Split {
+impl Default for SplitParams {
     fn default() -> Self {
         Self { by: SplitBy::Panel, test: 0.1, validation: 0.1, seed: 1 }
     }
@@ -53,7 +53,7 @@ impl Default for Split {
 
 /// A part of a training set, the rarest first.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
-pub enum Part {
+pub enum SplitPart {
     /// For the last measurement of an error.
     Test,
     /// For choosing among models.
@@ -62,7 +62,7 @@ pub enum Part {
     Train,
 }
 
-impl Part {
+impl SplitPart {
     /// All parts, as cards list them.
     pub const ALL: [Self; 3] = [Self::Train, Self::Validation, Self::Test];
 
@@ -78,14 +78,14 @@ impl Part {
 
 /// Returns the part of each surface, in the given order; None for a surface that is left out because another side of
 /// its panel is in a rarer part.
-pub(super) fn assign(surfaces: &[Surface], split: Split) -> Result<Vec<Option<Part>>> {
+pub(super) fn assign(surfaces: &[TrainingSurface], split: SplitParams) -> Result<Vec<Option<SplitPart>>> {
     let drawn = draw(surfaces, split)?;
-    let own = |surface: &Surface| match (surface.reference, drawn.get(&category(surface, split.by))) {
+    let own = |surface: &TrainingSurface| match (surface.reference, drawn.get(&category(surface, split.by))) {
         (false, Some(part)) => *part,
         // References are in the numbers of every other surface already.
-        _ => Part::Train,
+        _ => SplitPart::Train,
     };
-    let mut rarest: BTreeMap<&str, Part> = BTreeMap::new();
+    let mut rarest: BTreeMap<&str, SplitPart> = BTreeMap::new();
     let mut fixed: BTreeMap<&str, ()> = BTreeMap::new();
     for surface in surfaces {
         let part = own(surface);
@@ -95,9 +95,9 @@ pub(super) fn assign(surfaces: &[Surface], split: Split) -> Result<Vec<Option<Pa
             fixed.insert(surface.id.panel(), ());
         }
     }
-    let part = |surface: &Surface| {
+    let part = |surface: &TrainingSurface| {
         let of_panel = match fixed.contains_key(surface.id.panel()) {
-            true => Part::Train,
+            true => SplitPart::Train,
             false => *rarest.get(surface.id.panel())?,
         };
         (own(surface) == of_panel || fixed.contains_key(surface.id.panel())).then_some(of_panel)
@@ -106,11 +106,11 @@ pub(super) fn assign(surfaces: &[Surface], split: Split) -> Result<Vec<Option<Pa
 }
 
 // Draws a part for each category: sorted by digest, the first fill the test set, the next the validation set.
-fn draw(surfaces: &[Surface], split: Split) -> Result<BTreeMap<String, Part>> {
+fn draw(surfaces: &[TrainingSurface], split: SplitParams) -> Result<BTreeMap<String, SplitPart>> {
     let mut counts: BTreeMap<String, usize> = BTreeMap::new();
     surfaces.iter().filter(|s| !s.reference).for_each(|s| *counts.entry(category(s, split.by)).or_default() += 1);
     if split.by == SplitBy::Nothing {
-        return Ok(counts.into_keys().map(|c| (c, Part::Train)).collect());
+        return Ok(counts.into_keys().map(|c| (c, SplitPart::Train)).collect());
     }
     let share = |x: f64| (0.0..1.0).contains(&x);
     if !share(split.test) || !share(split.validation) || !share(split.test + split.validation) {
@@ -118,7 +118,7 @@ fn draw(surfaces: &[Surface], split: Split) -> Result<BTreeMap<String, Part>> {
         return Err(Error::Split { by: split.by.name(), reason });
     }
     let (total, categories) = (counts.values().sum::<usize>(), counts.len());
-    let wanted = [(Part::Test, split.test), (Part::Validation, split.validation)];
+    let wanted = [(SplitPart::Test, split.test), (SplitPart::Validation, split.validation)];
     let needed = 1 + wanted.iter().filter(|(_, share)| *share > 0.0).count();
     if categories < needed {
         let reason =
@@ -141,11 +141,11 @@ fn draw(surfaces: &[Surface], split: Split) -> Result<BTreeMap<String, Part>> {
             drawn.insert(category, part);
         }
     }
-    drawn.extend(order.map(|(category, _)| (category, Part::Train)));
+    drawn.extend(order.map(|(category, _)| (category, SplitPart::Train)));
     Ok(drawn)
 }
 
-fn category(surface: &Surface, by: SplitBy) -> String {
+fn category(surface: &TrainingSurface, by: SplitBy) -> String {
     match by {
         SplitBy::Panel | SplitBy::Nothing => surface.id.panel().to_owned(),
         SplitBy::Typology => surface.typology.clone(),
@@ -167,8 +167,8 @@ mod tests {
 
     use super::*;
 
-    fn surface(id: &str, typology: &str) -> Surface {
-        Surface {
+    fn surface(id: &str, typology: &str) -> TrainingSurface {
+        TrainingSurface {
             id: id.parse().expect("valid"),
             typology: typology.into(),
             macrostructure: None,
@@ -178,7 +178,7 @@ mod tests {
         }
     }
 
-    fn lake() -> Vec<Surface> {
+    fn lake() -> Vec<TrainingSurface> {
         let typologies = ["brick", "wavy", "rubble", "ashlar"];
         let side = |i: usize| surface(&format!("{:04}_{}", i / 2, i % 2), typologies[(i * 7 + i / 5) % 4]);
         let mut all: Vec<_> = (0..200).map(side).collect();
@@ -192,15 +192,15 @@ mod tests {
         for by in [SplitBy::Panel, SplitBy::Typology, SplitBy::Nothing] {
             for seed in 0..50 {
                 let surfaces = lake();
-                let parts = assign(&surfaces, Split { by, seed, ..Split::default() }).expect("split");
-                let mut of_panel: HashMap<&str, HashSet<Part>> = HashMap::new();
+                let parts = assign(&surfaces, SplitParams { by, seed, ..SplitParams::default() }).expect("split");
+                let mut of_panel: HashMap<&str, HashSet<SplitPart>> = HashMap::new();
                 for (surface, part) in surfaces.iter().zip(&parts) {
                     of_panel.entry(surface.id.panel()).or_default().extend(*part);
                 }
                 assert!(of_panel.values().all(|parts| parts.len() == 1), "{by:?} {seed} {of_panel:?}");
                 let has = |part| parts.contains(&Some(part));
-                assert_eq!(has(Part::Test) && has(Part::Validation), by != SplitBy::Nothing, "{by:?} {seed}");
-                assert!(has(Part::Train));
+                assert_eq!(has(SplitPart::Test) && has(SplitPart::Validation), by != SplitBy::Nothing, "{by:?} {seed}");
+                assert!(has(SplitPart::Train));
             }
         }
     }
@@ -208,13 +208,13 @@ mod tests {
     #[test]
     fn a_typology_that_is_held_out_is_never_trained_on() {
         let surfaces = lake();
-        let parts = assign(&surfaces, Split { by: SplitBy::Typology, ..Split::default() }).expect("split");
+        let parts = assign(&surfaces, SplitParams { by: SplitBy::Typology, ..SplitParams::default() }).expect("split");
         let of = |part| -> HashSet<&str> {
             let of_part = surfaces.iter().zip(&parts).filter(|(_, p)| **p == Some(part));
             of_part.map(|(s, _)| s.typology.as_str()).collect()
         };
-        assert!(of(Part::Test).is_disjoint(&of(Part::Train)));
-        assert!(of(Part::Validation).is_disjoint(&of(Part::Train)));
+        assert!(of(SplitPart::Test).is_disjoint(&of(SplitPart::Train)));
+        assert!(of(SplitPart::Validation).is_disjoint(&of(SplitPart::Train)));
         assert!(parts.iter().any(Option::is_none), "other sides of held-out panels are left out");
     }
 
@@ -223,10 +223,10 @@ mod tests {
         let mut surfaces = lake();
         surfaces[30].reference = true;
         for seed in 0..20 {
-            let parts = assign(&surfaces, Split { seed, ..Split::default() }).expect("split");
+            let parts = assign(&surfaces, SplitParams { seed, ..SplitParams::default() }).expect("split");
             for (surface, part) in surfaces.iter().zip(parts) {
                 if surface.reference || surface.id.panel() == surfaces[30].id.panel() {
-                    assert_eq!(part, Some(Part::Train), "{}", surface.id);
+                    assert_eq!(part, Some(SplitPart::Train), "{}", surface.id);
                 }
             }
         }
@@ -235,9 +235,10 @@ mod tests {
     #[test]
     fn what_cannot_be_split_says_so() {
         let few: Vec<_> = lake().into_iter().take(4).collect();
-        let error = assign(&few, Split::default()).expect_err("two panels").to_string();
+        let error = assign(&few, SplitParams::default()).expect_err("two panels").to_string();
         assert!(error.contains("has 2 of them, expected 3"), "{error}");
-        let error = assign(&lake(), Split { test: 0.6, validation: 0.5, ..Split::default() }).expect_err("too much");
+        let error = assign(&lake(), SplitParams { test: 0.6, validation: 0.5, ..SplitParams::default() })
+            .expect_err("too much");
         assert!(error.to_string().contains("0.6 and 0.5"), "{error}");
     }
 }

@@ -11,25 +11,25 @@ use crate::rows;
 
 /// A surface, and its runs that are derived.
 #[derive(Debug, Clone)]
-pub(super) struct Surface {
+pub(super) struct TrainingSurface {
     pub(super) id: SurfaceId,
     pub(super) typology: String,
     pub(super) macrostructure: Option<String>,
     pub(super) origin: String,
     /// True if other surfaces name it as their Flat or Foam.
     pub(super) reference: bool,
-    pub(super) runs: Vec<Run>,
+    pub(super) runs: Vec<TrainingRun>,
 }
 
 /// A run and the digest of its file.
 #[derive(Debug, Clone)]
-pub(super) struct Run {
+pub(super) struct TrainingRun {
     pub(super) visible: VisibleRun,
     pub(super) file_sha256: String,
 }
 
 /// Reads all surfaces that have a derived run, sorted by name, and the number of runs that wait for references.
-pub(super) async fn read(lake: &Lake, snapshot: &LakeSnapshot) -> Result<(Vec<Surface>, usize)> {
+pub(super) async fn read(lake: &Lake, snapshot: &LakeSnapshot) -> Result<(Vec<TrainingSurface>, usize)> {
     let mut surfaces = BTreeMap::new();
     let mut references = HashSet::new();
     let columns = ["surface_id", "typology", "macrostructure", "origin", "flat_reference", "foam_reference"];
@@ -41,7 +41,7 @@ pub(super) async fn read(lake: &Lake, snapshot: &LakeSnapshot) -> Result<(Vec<Su
         let (typologies, origins) = (rows::texts(&batch, "typology"), rows::texts(&batch, "origin"));
         let macrostructures = rows::optional_texts(&batch, "macrostructure");
         for (row, id) in rows::texts(&batch, "surface_id").into_iter().enumerate() {
-            let surface = Surface {
+            let surface = TrainingSurface {
                 id: id.parse()?,
                 typology: typologies[row].to_owned(),
                 macrostructure: macrostructures[row].map(str::to_owned),
@@ -61,7 +61,7 @@ pub(super) async fn read(lake: &Lake, snapshot: &LakeSnapshot) -> Result<(Vec<Su
         }
         let row = rows::of_run(lake, snapshot, Table::Runs, &visible.run, &["file_sha256"]).await?;
         let file_sha256 = rows::texts(&row, "file_sha256").first().copied().unwrap_or_default().to_owned();
-        surface.runs.push(Run { visible: visible.clone(), file_sha256 });
+        surface.runs.push(TrainingRun { visible: visible.clone(), file_sha256 });
     }
     let mut surfaces: Vec<_> = surfaces.into_values().filter(|s| !s.runs.is_empty()).collect();
     surfaces.iter_mut().for_each(|s| s.reference = references.contains(s.id.as_str()));

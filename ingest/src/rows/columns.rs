@@ -17,25 +17,25 @@ use crate::error::Result;
 
 /// Key columns of every row of a run.
 #[derive(Debug, Clone)]
-pub(crate) struct Keys {
+pub(crate) struct RunKeys {
     pub(crate) surface: SurfaceId,
     pub(crate) run: RunId,
 }
 
 /// The columns of one batch.
-pub(crate) struct Columns {
+pub(crate) struct RowColumns {
     table: Table,
     rows: usize,
     arrays: Vec<ArrayRef>,
 }
 
-impl Columns {
+impl RowColumns {
     pub(crate) fn new(table: Table, rows: usize) -> Self {
         Self { table, rows, arrays: Vec::new() }
     }
 
     /// Returns columns that begin with the run's keys.
-    pub(crate) fn of_run(table: Table, rows: usize, keys: &Keys) -> Self {
+    pub(crate) fn of_run(table: Table, rows: usize, keys: &RunKeys) -> Self {
         let mut columns = Self::new(table, rows);
         columns.same(keys.surface.as_str()).same(keys.run.as_str());
         columns

@@ -5,22 +5,22 @@ use echolake_schema::symmetry::MovedPair;
 use echolake_schema::tables::Table;
 use echolake_schema::{Grid, PairId, Rig, Symmetry};
 
-use super::{Columns, Keys};
+use super::{RowColumns, RunKeys};
 use crate::CODE_VERSION;
 use crate::derived_values::{DerivedLists, DerivedRows};
 use crate::error::Result;
 
 /// Versions of the references that the rows used.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct Versions<'a> {
+pub(crate) struct ReferenceVersions<'a> {
     pub(crate) flat: &'a str,
     pub(crate) foam: &'a str,
 }
 
 /// The image of each pair under each symmetry that the grid has.
-pub(crate) struct Moved(Vec<(Symmetry, Vec<MovedPair>)>);
+pub(crate) struct SymmetryPairs(Vec<(Symmetry, Vec<MovedPair>)>);
 
-impl Moved {
+impl SymmetryPairs {
     pub(crate) fn of(grid: &Grid) -> Self {
         let moved = |symmetry| grid.moved_pairs(symmetry).map(|pairs| (symmetry, pairs));
         Self(Symmetry::ALL.into_iter().filter_map(moved).collect())
@@ -28,8 +28,14 @@ impl Moved {
 }
 
 /// Builds rows of `nce`.
-pub(crate) fn nce(rig: &Rig, grid: &Grid, keys: &Keys, derived: DerivedLists, of: Versions<'_>) -> Result<RecordBatch> {
-    let mut columns = Columns::of_run(Table::Nce, derived.pairs.len(), keys);
+pub(crate) fn nce(
+    rig: &Rig,
+    grid: &Grid,
+    keys: &RunKeys,
+    derived: DerivedLists,
+    of: ReferenceVersions<'_>,
+) -> Result<RecordBatch> {
+    let mut columns = RowColumns::of_run(Table::Nce, derived.pairs.len(), keys);
     pair_columns(&mut columns, grid, &derived.pairs);
     columns.lists(derived.reflected);
     for curves in derived.curves {
@@ -43,11 +49,11 @@ pub(crate) fn nce(rig: &Rig, grid: &Grid, keys: &Keys, derived: DerivedLists, of
 pub(crate) fn tnce(
     rig: &Rig,
     grid: &Grid,
-    keys: &Keys,
+    keys: &RunKeys,
     derived: &DerivedRows,
-    of: Versions<'_>,
+    of: ReferenceVersions<'_>,
 ) -> Result<RecordBatch> {
-    let mut columns = Columns::of_run(Table::Tnce, derived.pairs.len(), keys);
+    let mut columns = RowColumns::of_run(Table::Tnce, derived.pairs.len(), keys);
     pair_columns(&mut columns, grid, &derived.pairs);
     energy_columns(&mut columns, derived, 1);
     columns.same(of.flat).same(of.foam).same(CODE_VERSION);
@@ -58,10 +64,10 @@ pub(crate) fn tnce(
 pub(crate) fn tnce_d4(
     rig: &Rig,
     grid: &Grid,
-    Moved(moved): &Moved,
-    keys: &Keys,
+    SymmetryPairs(moved): &SymmetryPairs,
+    keys: &RunKeys,
     derived: &DerivedRows,
-    of: Versions<'_>,
+    of: ReferenceVersions<'_>,
 ) -> Result<RecordBatch> {
     let each = moved.len();
     let rows: Vec<_> = derived
@@ -70,7 +76,7 @@ pub(crate) fn tnce_d4(
         .flat_map(|pair| moved.iter().map(move |(symmetry, pairs)| (*symmetry, pairs[*pair as usize])))
         .collect();
     let pairs: Vec<u32> = derived.pairs.iter().flat_map(|p| std::iter::repeat_n(*p, each)).collect();
-    let mut columns = Columns::of_run(Table::TnceD4, rows.len(), keys);
+    let mut columns = RowColumns::of_run(Table::TnceD4, rows.len(), keys);
     pair_columns(&mut columns, grid, &pairs);
     columns
         .texts(rows.iter().map(|(s, _)| Some(s.name())))
@@ -89,7 +95,7 @@ pub(crate) fn tnce_d4(
     columns.finish(rig)
 }
 
-fn pair_columns(columns: &mut Columns, grid: &Grid, pairs: &[u32]) {
+fn pair_columns(columns: &mut RowColumns, grid: &Grid, pairs: &[u32]) {
     let pair = |id: &u32| grid.pair(PairId(*id));
     columns
         .ints(pairs.iter().map(|p| Some(*p as i32)))
@@ -98,7 +104,7 @@ fn pair_columns(columns: &mut Columns, grid: &Grid, pairs: &[u32]) {
 }
 
 // Repeats each measurement's numbers in `each` rows.
-fn energy_columns(columns: &mut Columns, derived: &DerivedRows, each: usize) {
+fn energy_columns(columns: &mut RowColumns, derived: &DerivedRows, each: usize) {
     for values in derived.energy_columns() {
         columns.doubles(values.into_iter().flat_map(|x| std::iter::repeat_n(Some(x), each)));
     }

@@ -5,14 +5,14 @@ use echolake_dsp::heights::moved;
 use echolake_schema::tables::Table;
 use echolake_schema::{Rig, Symmetry};
 
-use super::{Columns, Keys};
+use super::{RowColumns, RunKeys};
 use crate::CODE_VERSION;
 use crate::error::{Error, Result};
 
 const CELLS: usize = Table::HEIGHTMAP_CELLS;
 
 /// Builds one row per symmetry; None if the heights are not a square.
-pub(crate) fn rows(rig: &Rig, keys: &Keys, heights_mm: &[f32]) -> Result<Option<RecordBatch>> {
+pub(crate) fn rows(rig: &Rig, keys: &RunKeys, heights_mm: &[f32]) -> Result<Option<RecordBatch>> {
     let side = heights_mm.len().isqrt();
     if side == 0 || side * side != heights_mm.len() {
         return Ok(None);
@@ -23,7 +23,7 @@ pub(crate) fn rows(rig: &Rig, keys: &Keys, heights_mm: &[f32]) -> Result<Option<
     for (symmetry, out) in Symmetry::ALL.into_iter().zip(all.chunks_exact_mut(small.len())) {
         moved(&small, symmetry, out).map_err(|cause| Error::Kernel { file: keys.run.to_string(), cause })?;
     }
-    let mut columns = Columns::of_run(Table::Heightmaps, rows, keys);
+    let mut columns = RowColumns::of_run(Table::Heightmaps, rows, keys);
     columns
         .texts(Symmetry::ALL.map(|s| Some(s.name())))
         .ints(std::iter::repeat_n(Some(CELLS as i32), rows))

@@ -5,14 +5,14 @@ use echolake_schema::Rig;
 use echolake_schema::messages::AmbientSample;
 use echolake_schema::tables::Table;
 
-use super::{Columns, Keys};
+use super::{RowColumns, RunKeys};
 use crate::CODE_VERSION;
 use crate::error::Result;
 use crate::measure::Event;
 
 /// Builds one row per reading.
-pub(crate) fn environment(rig: &Rig, keys: &Keys, readings: &[(i64, AmbientSample)]) -> Result<RecordBatch> {
-    let mut columns = Columns::of_run(Table::Environment, readings.len(), keys);
+pub(crate) fn environment(rig: &Rig, keys: &RunKeys, readings: &[(i64, AmbientSample)]) -> Result<RecordBatch> {
+    let mut columns = RowColumns::of_run(Table::Environment, readings.len(), keys);
     columns
         .times(readings.iter().map(|r| r.0))
         .doubles(readings.iter().map(|r| Some(r.1.temperature_c)))
@@ -24,8 +24,8 @@ pub(crate) fn environment(rig: &Rig, keys: &Keys, readings: &[(i64, AmbientSampl
 }
 
 /// Builds one row per log line.
-pub(crate) fn events(rig: &Rig, keys: &Keys, events: &[(i64, Event)]) -> Result<RecordBatch> {
-    let mut columns = Columns::of_run(Table::Events, events.len(), keys);
+pub(crate) fn events(rig: &Rig, keys: &RunKeys, events: &[(i64, Event)]) -> Result<RecordBatch> {
+    let mut columns = RowColumns::of_run(Table::Events, events.len(), keys);
     columns
         .times(events.iter().map(|e| e.0))
         .texts(events.iter().map(|e| Some(e.1.level_name())))

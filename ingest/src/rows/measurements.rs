@@ -6,7 +6,7 @@ use echolake_schema::messages::Measurement;
 use echolake_schema::tables::Table;
 use echolake_schema::{Grid, PairId, Rig};
 
-use super::{Columns, Keys};
+use super::{RowColumns, RunKeys};
 use crate::CODE_VERSION;
 use crate::error::Result;
 use crate::measure::Response;
@@ -15,7 +15,12 @@ use crate::measure::Response;
 const LIST_VALUES: usize = 1 << 18;
 
 /// Encodes one row per measurement, in the given order, which is by pair.
-pub(crate) fn encode(rig: &Rig, grid: &Grid, keys: &Keys, accepted: &[(Measurement, Response)]) -> Result<EncodedFile> {
+pub(crate) fn encode(
+    rig: &Rig,
+    grid: &Grid,
+    keys: &RunKeys,
+    accepted: &[(Measurement, Response)],
+) -> Result<EncodedFile> {
     let rows_a_batch = (LIST_VALUES / rig.impulse_response.length).max(1);
     let mut encoder = FileEncoder::new(Table::Measurements, Table::Measurements.schema(rig));
     for part in accepted.chunks(rows_a_batch) {
@@ -24,10 +29,10 @@ pub(crate) fn encode(rig: &Rig, grid: &Grid, keys: &Keys, accepted: &[(Measureme
     Ok(encoder.finish()?)
 }
 
-fn batch(rig: &Rig, grid: &Grid, keys: &Keys, rows: &[(Measurement, Response)]) -> Result<RecordBatch> {
+fn batch(rig: &Rig, grid: &Grid, keys: &RunKeys, rows: &[(Measurement, Response)]) -> Result<RecordBatch> {
     let pair = |m: &Measurement| grid.pair(PairId(m.pair_id));
     let known = |value: f64| super::columns::finite(value);
-    let mut columns = Columns::of_run(Table::Measurements, rows.len(), keys);
+    let mut columns = RowColumns::of_run(Table::Measurements, rows.len(), keys);
     columns
         .ints(rows.iter().map(|(m, _)| Some(m.pair_id as i32)))
         .ints(rows.iter().map(|(m, _)| pair(m).map(|p| p.microphone.0 as i32)))

@@ -9,4 +9,4 @@ pub(crate) mod runs;
 pub(crate) mod stats;
 pub(crate) mod surfaces;
 
-pub(crate) use columns::{Columns, Keys};
+pub(crate) use columns::{RowColumns, RunKeys};

@@ -7,14 +7,14 @@ use arrow::record_batch::RecordBatch;
 use echolake_lake::Lake;
 use echolake_schema::tables::Table;
 
-use super::{Columns, Keys};
+use super::{RowColumns, RunKeys};
 use crate::CODE_VERSION;
 use crate::error::{Error, Result};
 use crate::run_content::RunContent;
 
 /// The columns of a run's row about its references.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
-pub(crate) struct References {
+pub(crate) struct RunReferences {
     /// Description of missing references; empty if none is missing.
     pub(crate) missing: String,
     pub(crate) derivation: Option<String>,
@@ -32,15 +32,15 @@ const PARTIAL: &str = "partial";
 /// Builds the row of a newly ingested run.
 pub(crate) fn row(
     lake: &Lake,
-    keys: &Keys,
+    keys: &RunKeys,
     content: &RunContent,
     run_derivation: &str,
-    references: &References,
+    references: &RunReferences,
 ) -> Result<RecordBatch> {
     let ended = content.end.map_or(content.last_time_ns.max(content.manifest.started.0), |e| e.ended.0);
     let partial = !content.is_whole() || !content.damaged.is_empty();
     let state = if partial { PARTIAL } else { state(references) };
-    let mut columns = Columns::of_run(Table::Runs, 1, keys);
+    let mut columns = RowColumns::of_run(Table::Runs, 1, keys);
     columns
         .text(Some(state))
         .text(Some(&references.missing))
@@ -75,7 +75,7 @@ pub(crate) fn row(
 }
 
 /// Returns a run's row with other references.
-pub(crate) fn with_references(row: &RecordBatch, references: &References) -> Result<RecordBatch> {
+pub(crate) fn with_references(row: &RecordBatch, references: &RunReferences) -> Result<RecordBatch> {
     let was_partial = text_of(row, "state").as_deref() == Some(PARTIAL);
     let mut columns = row.columns().to_vec();
     for (name, value) in [
@@ -100,7 +100,7 @@ pub(crate) fn text_of(row: &RecordBatch, column: &str) -> Option<String> {
     (array.len() == 1 && array.is_valid(0)).then(|| array.value(0).to_owned())
 }
 
-fn state(references: &References) -> &'static str {
+fn state(references: &RunReferences) -> &'static str {
     if references.missing.is_empty() { COMPLETE } else { WAITING }
 }
 

@@ -6,14 +6,14 @@ use echolake_schema::Rig;
 use echolake_schema::tables::Table;
 
 use super::columns::finite;
-use super::derived::Versions;
-use super::{Columns, Keys};
+use super::derived::ReferenceVersions;
+use super::{RowColumns, RunKeys};
 use crate::CODE_VERSION;
 use crate::error::Result;
 
 /// Statistics of one band's TNCE values over the pairs.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
-struct Stats {
+struct BandStats {
     p90_mean_db: Option<f64>,
     p5_db: Option<f64>,
     p50_db: Option<f64>,
@@ -24,11 +24,11 @@ struct Stats {
 }
 
 /// Builds one row per band and one for the total, from the TNCE values of each over all pairs.
-pub(crate) fn rows(rig: &Rig, keys: &Keys, tnce: &[Vec<f64>], of: Versions<'_>) -> Result<RecordBatch> {
+pub(crate) fn rows(rig: &Rig, keys: &RunKeys, tnce: &[Vec<f64>], of: ReferenceVersions<'_>) -> Result<RecordBatch> {
     let names = rig.band_names();
     let pairs = tnce.first().map_or(0, Vec::len);
     let stats: Vec<_> = tnce.iter().map(|values| stats_of(values)).collect();
-    let mut columns = Columns::of_run(Table::SurfaceStats, stats.len(), keys);
+    let mut columns = RowColumns::of_run(Table::SurfaceStats, stats.len(), keys);
     columns
         .texts(names.iter().map(|n| Some(n.as_str())).chain([Some("total")]))
         .doubles(rig.bands.centres_hz.iter().map(|hz| Some(*hz)).chain([None]))
@@ -47,15 +47,15 @@ pub(crate) fn rows(rig: &Rig, keys: &Keys, tnce: &[Vec<f64>], of: Versions<'_>) 
 }
 
 // Means are of power, as in the paper's tables; no energy at all has no level.
-fn stats_of(values: &[f64]) -> Stats {
+fn stats_of(values: &[f64]) -> BandStats {
     let mut sorted: Vec<f64> = values.iter().copied().filter(|x| x.is_finite()).collect();
     if sorted.is_empty() {
-        return Stats::default();
+        return BandStats::default();
     }
     sorted.sort_by(f64::total_cmp);
     let db = |power: f64| finite(power_to_db(power));
     let levels: Vec<f64> = sorted.iter().filter_map(|x| db(*x)).collect();
-    Stats {
+    BandStats {
         p90_mean_db: p90_mean(&sorted, &mut Vec::new()).and_then(db),
         p5_db: db(percentile(&sorted, 5.0)),
         p50_db: db(percentile(&sorted, 50.0)),
@@ -87,7 +87,7 @@ mod tests {
 
     #[test]
     fn no_energy_has_no_level() {
-        assert_eq!(stats_of(&[]), Stats::default());
+        assert_eq!(stats_of(&[]), BandStats::default());
         let silent = stats_of(&[0.0, 0.0]);
         assert_eq!((silent.p50_db, silent.spread_db), (None, None));
     }

@@ -5,14 +5,14 @@ use echolake_lake::ReferenceSurfaces;
 use echolake_schema::tables::Table;
 use echolake_schema::{Rig, SurfaceRecord};
 
-use super::{Columns, Keys};
+use super::{RowColumns, RunKeys};
 use crate::CODE_VERSION;
 use crate::error::Result;
 
 /// Builds the row of a run's surface; references that it does not name default to the lake's.
 pub(crate) fn row(
     rig: &Rig,
-    keys: &Keys,
+    keys: &RunKeys,
     surface: &SurfaceRecord,
     references: &ReferenceSurfaces,
     origin: &str,
@@ -23,7 +23,7 @@ pub(crate) fn row(
     let known = |i: usize| relief.map(|r| r[i]).filter(|x| x.is_finite());
     let flat = surface.flat_reference.as_ref().unwrap_or(&references.flat);
     let foam = surface.foam_reference.as_ref().unwrap_or(&references.foam);
-    let mut columns = Columns::of_run(Table::Surfaces, 1, keys);
+    let mut columns = RowColumns::of_run(Table::Surfaces, 1, keys);
     columns
         .text(Some(keys.surface.panel()))
         .ints([keys.surface.side().map(i32::from)])

@@ -1,4 +1,5 @@
-//! Limits of queries: a [`Ticket`] signals whether a query may continue, [`pool`] counts the memory of its operators.
+//! Limits of queries: a [`QueryTicket`] signals whether a query may continue, [`pool`] counts the memory of its
+//! operators.
 //!
 //! DataFusion ends a query only at an await, and allocates between two checks of its pool. [`RunningQueries::overdue`]
 //! finds work that does not end soon after its ticket was stopped; a server then ends the whole process, which serves
@@ -16,7 +17,7 @@ use tokio::sync::Notify;
 
 /// Reason for which a query was stopped.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(crate) enum Stop {
+pub(crate) enum StopReason {
     /// The client cancelled it.
     Cancelled,
     /// It took too long.
@@ -24,8 +25,8 @@ pub(crate) enum Stop {
 }
 
 /// Cancellation state and accounting of one query.
-pub(crate) struct Ticket {
-    stop: OnceLock<(Stop, Instant)>,
+pub(crate) struct QueryTicket {
+    stop: OnceLock<(StopReason, Instant)>,
     stopped: Notify,
     /// Bytes that its operators have reserved.
     held: Arc<AtomicUsize>,
@@ -34,10 +35,10 @@ pub(crate) struct Ticket {
 }
 
 /// A guard for work on a query, dropped on the thread that does the work.
-pub(crate) struct WorkGuard(Arc<Ticket>);
+pub(crate) struct WorkGuard(Arc<QueryTicket>);
 
 impl WorkGuard {
-    pub(crate) fn ticket(&self) -> &Ticket {
+    pub(crate) fn ticket(&self) -> &QueryTicket {
         &self.0
     }
 }
@@ -48,24 +49,24 @@ impl Drop for WorkGuard {
     }
 }
 
-impl Ticket {
+impl QueryTicket {
     pub(crate) fn new() -> Self {
         Self { stop: OnceLock::new(), stopped: Notify::new(), held: Arc::default(), working: AtomicUsize::new(0) }
     }
 
     /// Stops the query; the first reason counts.
-    pub(crate) fn stop(&self, why: Stop) {
+    pub(crate) fn stop(&self, why: StopReason) {
         let _ = self.stop.set((why, Instant::now()));
         self.stopped.notify_waiters();
     }
 
     /// Returns the reason for which the query was stopped, if it was.
-    pub(crate) fn why(&self) -> Option<&Stop> {
+    pub(crate) fn why(&self) -> Option<&StopReason> {
         self.stop.get().map(|(why, _)| why)
     }
 
     /// Waits until the query must end.
-    pub(crate) async fn stopped(&self) -> Stop {
+    pub(crate) async fn stopped(&self) -> StopReason {
         loop {
             // Subscribes before the check, or a stop between them would be missed.
             let stopped = self.stopped.notified();
@@ -94,18 +95,18 @@ impl Ticket {
     }
 }
 
-impl fmt::Debug for Ticket {
+impl fmt::Debug for QueryTicket {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.debug_struct("Ticket").field("stop", &self.why()).field("held", &self.held).finish_non_exhaustive()
+        f.debug_struct("QueryTicket").field("stop", &self.why()).field("held", &self.held).finish_non_exhaustive()
     }
 }
 
 /// The queries of an engine.
 #[derive(Debug, Default)]
-pub(crate) struct RunningQueries(Mutex<Vec<Weak<Ticket>>>);
+pub(crate) struct RunningQueries(Mutex<Vec<Weak<QueryTicket>>>);
 
 impl RunningQueries {
-    pub(crate) fn add(&self, ticket: &Arc<Ticket>) {
+    pub(crate) fn add(&self, ticket: &Arc<QueryTicket>) {
         let mut tickets = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         tickets.retain(|t| t.strong_count() > 0);
         tickets.push(Arc::downgrade(ticket));
@@ -121,7 +122,7 @@ impl RunningQueries {
         self.live().iter().filter_map(|t| t.overdue()).max()
     }
 
-    fn live(&self) -> Vec<Arc<Ticket>> {
+    fn live(&self) -> Vec<Arc<QueryTicket>> {
         let tickets = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         tickets.iter().filter_map(Weak::upgrade).collect()
     }

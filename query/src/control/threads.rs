@@ -8,9 +8,9 @@ use tokio::runtime::{Builder, Handle, Runtime};
 const STACK_BYTES: usize = 16 << 20;
 
 /// A Tokio runtime that may be dropped anywhere, even in asynchronous code.
-pub struct Threads(Option<Runtime>);
+pub struct QueryThreads(Option<Runtime>);
 
-impl Threads {
+impl QueryThreads {
     /// Starts `count` threads with this name.
     ///
     /// # Errors
@@ -30,7 +30,7 @@ impl Threads {
     /// Starts one thread per core.
     ///
     /// # Errors
-    /// As [`Threads::new`].
+    /// As [`QueryThreads::new`].
     pub fn per_core(name: &str) -> std::io::Result<Self> {
         Self::new(name, std::thread::available_parallelism().map_or(1, usize::from))
     }
@@ -41,7 +41,7 @@ impl Threads {
     }
 }
 
-impl Drop for Threads {
+impl Drop for QueryThreads {
     // A runtime's own drop waits for its threads, which asynchronous code must not.
     fn drop(&mut self) {
         if let Some(runtime) = self.0.take() {

@@ -13,16 +13,16 @@ use datafusion::logical_expr::{
     Accumulator, AggregateUDF, AggregateUDFImpl, Documentation, EmitTo, GroupsAccumulator, Signature, Volatility,
 };
 
-use super::arguments::{Arguments, check, coerced};
-use super::description::Description;
+use super::arguments::{CallArguments, check, coerced};
+use super::description::FunctionDescription;
 
 /// A function of the values of many rows. Null rows do not count.
-pub(super) trait Aggregate: Send + Sync + Clone + 'static {
+pub(super) trait AggregateKernel: Send + Sync + Clone + 'static {
     /// State of one group.
     type Group: Default + Debug + Send + Sync;
 
     /// Returns the function's description.
-    fn description(&self) -> &'static Description;
+    fn description(&self) -> &'static FunctionDescription;
 
     /// Returns the type of its answer; the arguments' types are already checked.
     fn returns(&self, arguments: &[DataType]) -> DataType;
@@ -34,13 +34,13 @@ pub(super) trait Aggregate: Send + Sync + Clone + 'static {
     ///
     /// # Errors
     /// If a value is invalid; the error names its row.
-    fn update(&self, arguments: &Arguments<'_>, groups: &mut Groups<'_, Self>) -> Result<()>;
+    fn update(&self, arguments: &CallArguments<'_>, groups: &mut GroupStates<'_, Self>) -> Result<()>;
 
     /// Merges states of other partial aggregations into the groups.
     ///
     /// # Errors
     /// If a state does not fit the one here.
-    fn merge(&self, states: &[ArrayRef], groups: &mut Groups<'_, Self>) -> Result<()>;
+    fn merge(&self, states: &[ArrayRef], groups: &mut GroupStates<'_, Self>) -> Result<()>;
 
     /// Returns the states, one row per group.
     ///
@@ -61,7 +61,7 @@ pub(super) trait Aggregate: Send + Sync + Clone + 'static {
 }
 
 /// The groups that a batch's rows belong to.
-pub(super) struct Groups<'a, A: Aggregate> {
+pub(super) struct GroupStates<'a, A: AggregateKernel> {
     all: &'a mut [A::Group],
     heap: &'a mut usize,
     /// Index of each row's group; None if all rows belong to the first.
@@ -69,7 +69,7 @@ pub(super) struct Groups<'a, A: Aggregate> {
     filter: Option<&'a BooleanArray>,
 }
 
-impl<A: Aggregate> Groups<'_, A> {
+impl<A: AggregateKernel> GroupStates<'_, A> {
     /// Updates the group of a row, unless the filter excludes the row.
     pub(super) fn at(&mut self, row: usize, change: impl FnOnce(&mut A::Group) -> Result<()>) -> Result<()> {
         if self.filter.is_some_and(|filter| !filter.value(row) || arrow::array::Array::is_null(filter, row)) {
@@ -83,15 +83,15 @@ impl<A: Aggregate> Groups<'_, A> {
     }
 }
 
-/// Adapts an [`Aggregate`] to DataFusion's trait.
-struct Adapter<A> {
+/// Adapts an [`AggregateKernel`] to DataFusion's trait.
+struct AggregateAdapter<A> {
     function: A,
     signature: Signature,
     documentation: Documentation,
 }
 
 /// Accumulator of groups; a single group if there is no GROUP BY.
-struct Accumulated<A: Aggregate> {
+struct Accumulated<A: AggregateKernel> {
     function: A,
     returns: DataType,
     groups: Vec<A::Group>,
@@ -99,16 +99,16 @@ struct Accumulated<A: Aggregate> {
 }
 
 /// Wraps the function for DataFusion.
-pub(super) fn udaf(function: impl Aggregate) -> AggregateUDF {
+pub(super) fn udaf(function: impl AggregateKernel) -> AggregateUDF {
     let documentation = function.description().documentation();
-    AggregateUDF::new_from_impl(Adapter {
+    AggregateUDF::new_from_impl(AggregateAdapter {
         function,
         signature: Signature::user_defined(Volatility::Immutable),
         documentation,
     })
 }
 
-impl<A: Aggregate> Adapter<A> {
+impl<A: AggregateKernel> AggregateAdapter<A> {
     fn accumulated(&self, args: &AccumulatorArgs<'_>) -> Result<Accumulated<A>> {
         if args.is_distinct {
             let name = self.function.description().name;
@@ -120,7 +120,7 @@ impl<A: Aggregate> Adapter<A> {
     }
 }
 
-impl<A: Aggregate> AggregateUDFImpl for Adapter<A> {
+impl<A: AggregateKernel> AggregateUDFImpl for AggregateAdapter<A> {
     fn name(&self) -> &str {
         self.function.description().name
     }
@@ -162,16 +162,16 @@ impl<A: Aggregate> AggregateUDFImpl for Adapter<A> {
     }
 }
 
-impl<A: Aggregate> Accumulated<A> {
+impl<A: AggregateKernel> Accumulated<A> {
     fn update(&mut self, values: &[ArrayRef], of: Option<&[usize]>, filter: Option<&BooleanArray>) -> Result<()> {
         let Self { function, groups, heap, .. } = self;
-        let arguments = Arguments::columns(function.description(), values);
-        function.update(&arguments, &mut Groups { all: groups, heap, of, filter })
+        let arguments = CallArguments::columns(function.description(), values);
+        function.update(&arguments, &mut GroupStates { all: groups, heap, of, filter })
     }
 
     fn merge(&mut self, states: &[ArrayRef], of: Option<&[usize]>) -> Result<()> {
         let Self { function, groups, heap, .. } = self;
-        function.merge(states, &mut Groups { all: groups, heap, of, filter: None })
+        function.merge(states, &mut GroupStates { all: groups, heap, of, filter: None })
     }
 
     fn take(&mut self, emit: EmitTo) -> Vec<A::Group> {
@@ -185,7 +185,7 @@ impl<A: Aggregate> Accumulated<A> {
     }
 }
 
-impl<A: Aggregate> Accumulator for Accumulated<A> {
+impl<A: AggregateKernel> Accumulator for Accumulated<A> {
     fn update_batch(&mut self, values: &[ArrayRef]) -> Result<()> {
         self.update(values, None, None)
     }
@@ -208,7 +208,7 @@ impl<A: Aggregate> Accumulator for Accumulated<A> {
     }
 }
 
-impl<A: Aggregate> GroupsAccumulator for Accumulated<A> {
+impl<A: AggregateKernel> GroupsAccumulator for Accumulated<A> {
     fn update_batch(
         &mut self,
         values: &[ArrayRef],
@@ -236,11 +236,11 @@ impl<A: Aggregate> GroupsAccumulator for Accumulated<A> {
     }
 
     fn convert_to_state(&self, values: &[ArrayRef], filter: Option<&BooleanArray>) -> Result<Vec<ArrayRef>> {
-        let arguments = Arguments::columns(self.function.description(), values);
+        let arguments = CallArguments::columns(self.function.description(), values);
         let of: Vec<usize> = (0..arguments.rows()).collect();
         let mut groups = Vec::new();
         groups.resize_with(of.len(), A::Group::default);
-        let rows = &mut Groups { all: &mut groups, heap: &mut 0, of: Some(&of), filter };
+        let rows = &mut GroupStates { all: &mut groups, heap: &mut 0, of: Some(&of), filter };
         self.function.update(&arguments, rows)?;
         self.function.keep(&groups)
     }
@@ -250,28 +250,28 @@ impl<A: Aggregate> GroupsAccumulator for Accumulated<A> {
     }
 }
 
-impl<A: Aggregate> Debug for Accumulated<A> {
+impl<A: AggregateKernel> Debug for Accumulated<A> {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(f, "{} of {} groups", self.function.description().name, self.groups.len())
     }
 }
 
-impl<A: Aggregate> Debug for Adapter<A> {
+impl<A: AggregateKernel> Debug for AggregateAdapter<A> {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(self.name())
     }
 }
 
 // Compared by name, like scalar functions.
-impl<A: Aggregate> PartialEq for Adapter<A> {
+impl<A: AggregateKernel> PartialEq for AggregateAdapter<A> {
     fn eq(&self, other: &Self) -> bool {
         self.name() == other.name()
     }
 }
 
-impl<A: Aggregate> Eq for Adapter<A> {}
+impl<A: AggregateKernel> Eq for AggregateAdapter<A> {}
 
-impl<A: Aggregate> Hash for Adapter<A> {
+impl<A: AggregateKernel> Hash for AggregateAdapter<A> {
     fn hash<H: Hasher>(&self, state: &mut H) {
         self.name().hash(state);
     }

@@ -7,25 +7,25 @@ use echolake_dsp::Error;
 use echolake_dsp::correlation::{CorrelationPlan, pearson};
 
 use super::answers::numbers;
-use super::arguments::{Arguments, Element};
-use super::description::{Description, Family, Kind, Parameter};
+use super::arguments::{CallArguments, SampleElement};
+use super::description::{ArgumentKind, FunctionDescription, FunctionFamily, FunctionParameter};
 use super::per_length::PerLength;
-use super::scalar::Scalar;
+use super::scalar::ScalarKernel;
 
 /// `pearson`.
-pub(super) struct Pearson;
+pub(super) struct PearsonFunction;
 
 /// `similarity`.
-pub(super) struct Similarity;
+pub(super) struct SimilarityFunction;
 
-static PEARSON: Description = Description {
+static PEARSON: FunctionDescription = FunctionDescription {
     name: "pearson",
-    family: Family::Comparison,
+    family: FunctionFamily::Comparison,
     about: "Pearson's coefficient of correlation of two equally long lists, -1 to 1, without unit. Null where one of them \
             does not vary, is shorter than two, or is not finite. Of two columns, corr() is the aggregate.",
     parameters: &[
-        Parameter { name: "x", kind: Kind::Samples, about: "the first list" },
-        Parameter { name: "y", kind: Kind::Samples, about: "the second list, as long as the first" },
+        FunctionParameter { name: "x", kind: ArgumentKind::Samples, about: "the first list" },
+        FunctionParameter { name: "y", kind: ArgumentKind::Samples, about: "the second list, as long as the first" },
     ],
     optional: 0,
     example: "select round(pearson([1, 2, 3], [5, 7, 9]), 6) as alike, pearson([1, 2, 3], [4, 4, 4]) as \
@@ -39,15 +39,19 @@ static PEARSON: Description = Description {
     related: &["similarity"],
 };
 
-static SIMILARITY: Description = Description {
+static SIMILARITY: FunctionDescription = FunctionDescription {
     name: "similarity",
-    family: Family::Comparison,
+    family: FunctionFamily::Comparison,
     about: "Greatest normalised cross-correlation of two equally long responses over all shifts, up to 1, without unit: 1 \
             where one is the other, later or louder, whatever its level; an inverted one is not alike. Null where one has \
             no energy.",
     parameters: &[
-        Parameter { name: "ir", kind: Kind::Samples, about: "the first response" },
-        Parameter { name: "other", kind: Kind::Samples, about: "the second response, as long as the first" },
+        FunctionParameter { name: "ir", kind: ArgumentKind::Samples, about: "the first response" },
+        FunctionParameter {
+            name: "other",
+            kind: ArgumentKind::Samples,
+            about: "the second response, as long as the first",
+        },
     ],
     optional: 0,
     example: "select round(similarity([1, -2, 0, 0], [0, 0, 3, -6]), 6) as alike",
@@ -60,8 +64,8 @@ static SIMILARITY: Description = Description {
     related: &["pearson", "arrival"],
 };
 
-impl Scalar for Pearson {
-    fn description(&self) -> &'static Description {
+impl ScalarKernel for PearsonFunction {
+    fn description(&self) -> &'static FunctionDescription {
         &PEARSON
     }
 
@@ -69,14 +73,14 @@ impl Scalar for Pearson {
         DataType::Float64
     }
 
-    fn call<T: Element>(&self, arguments: &Arguments<'_>) -> Result<ArrayRef> {
+    fn call<T: SampleElement>(&self, arguments: &CallArguments<'_>) -> Result<ArrayRef> {
         let (x, y) = (arguments.samples::<T>(0)?, arguments.samples::<T>(1)?);
         numbers(arguments, |row| pearson(x.at(row)?, y.at(row)?).map_err(|e| arguments.refused(row, &e)))
     }
 }
 
-impl Scalar for Similarity {
-    fn description(&self) -> &'static Description {
+impl ScalarKernel for SimilarityFunction {
+    fn description(&self) -> &'static FunctionDescription {
         &SIMILARITY
     }
 
@@ -84,7 +88,7 @@ impl Scalar for Similarity {
         DataType::Float64
     }
 
-    fn call<T: Element>(&self, arguments: &Arguments<'_>) -> Result<ArrayRef> {
+    fn call<T: SampleElement>(&self, arguments: &CallArguments<'_>) -> Result<ArrayRef> {
         let (x, y) = (arguments.samples::<T>(0)?, arguments.samples::<T>(1)?);
         let mut plans = PerLength::new(SIMILARITY.name);
         numbers(arguments, |row| {

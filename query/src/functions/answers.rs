@@ -8,11 +8,11 @@ use arrow::buffer::{NullBuffer, OffsetBuffer, ScalarBuffer};
 use arrow::datatypes::{DataType, Field, Fields};
 use datafusion::error::{DataFusionError, Result};
 
-use super::arguments::{Arguments, Element};
+use super::arguments::{CallArguments, SampleElement};
 
 /// Builds one number per row; None is null.
 pub(super) fn numbers(
-    arguments: &Arguments<'_>,
+    arguments: &CallArguments<'_>,
     mut number: impl FnMut(usize) -> Result<Option<f64>>,
 ) -> Result<ArrayRef> {
     let mut values = Vec::with_capacity(arguments.rows());
@@ -27,8 +27,8 @@ pub(super) fn numbers(
 
 /// Builds one list per row, with a capacity of `room` values in all. `list` appends a row's values; if it returns
 /// false, the row is null.
-pub(super) fn lists<T: Element>(
-    arguments: &Arguments<'_>,
+pub(super) fn lists<T: SampleElement>(
+    arguments: &CallArguments<'_>,
     room: usize,
     mut list: impl FnMut(usize, &mut Vec<T>) -> Result<bool>,
 ) -> Result<ArrayRef> {
@@ -49,7 +49,7 @@ pub(super) fn lists<T: Element>(
 }
 
 /// Builds lists of the type that [`super::arguments::list_of`] returns.
-pub(super) fn list_array<T: Element>(
+pub(super) fn list_array<T: SampleElement>(
     values: Vec<T>,
     offsets: Vec<i32>,
     nulls: Option<NullBuffer>,
@@ -62,7 +62,7 @@ pub(super) fn list_array<T: Element>(
 
 /// Builds one struct of numbers per row. `numbers` fills them; if it returns false, the row is null.
 pub(super) fn structs(
-    arguments: &Arguments<'_>,
+    arguments: &CallArguments<'_>,
     fields: &Fields,
     mut numbers: impl FnMut(usize, &mut [f64]) -> Result<bool>,
 ) -> Result<ArrayRef> {
@@ -89,7 +89,7 @@ pub(super) fn number_fields<'a>(names: impl IntoIterator<Item = &'a str>) -> Fie
 }
 
 /// Appends `by` default values and returns them.
-pub(super) fn grow<T: Element>(values: &mut Vec<T>, by: usize) -> &mut [T] {
+pub(super) fn grow<T: SampleElement>(values: &mut Vec<T>, by: usize) -> &mut [T] {
     let start = values.len();
     values.resize(start + by, T::default());
     &mut values[start..]

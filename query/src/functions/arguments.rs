@@ -10,37 +10,37 @@ use datafusion::error::{DataFusionError, Result};
 use datafusion::logical_expr::ColumnarValue;
 use echolake_dsp::RealSample;
 
-use super::description::{Description, Kind, Parameter};
+use super::description::{ArgumentKind, FunctionDescription, FunctionParameter};
 
 /// A sample type with an Arrow type.
-pub(super) trait Element: RealSample + ArrowNativeType {
+pub(super) trait SampleElement: RealSample + ArrowNativeType {
     type Arrow: ArrowPrimitiveType<Native = Self>;
 }
 
-impl Element for f32 {
+impl SampleElement for f32 {
     type Arrow = Float32Type;
 }
 
-impl Element for f64 {
+impl SampleElement for f64 {
     type Arrow = Float64Type;
 }
 
 /// The arguments of one call: arrays with one value per row, or with a single value for all rows.
-pub(super) struct Arguments<'a> {
-    description: &'a Description,
-    columns: Vec<Column>,
+pub(super) struct CallArguments<'a> {
+    description: &'a FunctionDescription,
+    columns: Vec<ArgumentColumn>,
     rows: usize,
     /// Rows in which an argument is null.
     nulls: Option<NullBuffer>,
 }
 
-struct Column {
+struct ArgumentColumn {
     array: ArrayRef,
     constant: bool,
 }
 
 /// Lists of samples.
-pub(super) struct Samples<'a, T> {
+pub(super) struct SampleLists<'a, T> {
     list: &'a ListArray,
     values: &'a [T],
     nulls: Option<&'a NullBuffer>,
@@ -50,41 +50,41 @@ pub(super) struct Samples<'a, T> {
 }
 
 /// Numbers, or whole numbers.
-pub(super) struct Numbers<'a, N> {
+pub(super) struct NumberValues<'a, N> {
     values: &'a [N],
     constant: bool,
 }
 
 /// Returns an argument as texts.
-pub(super) struct Texts<'a> {
+pub(super) struct TextValues<'a> {
     values: &'a StringArray,
     constant: bool,
 }
 
 /// Returns the types to which a call's arguments are cast. Unsuitable types are kept: [`check`] refuses them.
-pub(super) fn coerced(description: &Description, types: &[DataType]) -> Vec<DataType> {
+pub(super) fn coerced(description: &FunctionDescription, types: &[DataType]) -> Vec<DataType> {
     let kind = |i: usize| description.parameters.get(i).map(|p| p.kind);
-    let samples = types.iter().enumerate().filter(|(i, _)| kind(*i) == Some(Kind::Samples));
+    let samples = types.iter().enumerate().filter(|(i, _)| kind(*i) == Some(ArgumentKind::Samples));
     let narrow = samples.clone().any(|(_, t)| element(t) == Some(&DataType::Float32))
         && samples
             .into_iter()
             .all(|(_, t)| matches!(element(t), Some(DataType::Float32 | DataType::Null)) || t.is_null());
     let wanted = if narrow { DataType::Float32 } else { DataType::Float64 };
     let coerce = |(i, given): (usize, &DataType)| match kind(i) {
-        Some(Kind::Samples) if given.is_null() || element(given).is_some_and(is_number) => match given {
+        Some(ArgumentKind::Samples) if given.is_null() || element(given).is_some_and(is_number) => match given {
             DataType::List(child) if *child.data_type() == wanted => given.clone(),
             _ => list_of(wanted.clone()),
         },
-        Some(Kind::Number) if is_number(given) => DataType::Float64,
-        Some(Kind::Integer) if given.is_integer() || given.is_null() => DataType::Int64,
-        Some(Kind::Text) if is_text(given) => DataType::Utf8,
+        Some(ArgumentKind::Number) if is_number(given) => DataType::Float64,
+        Some(ArgumentKind::Integer) if given.is_integer() || given.is_null() => DataType::Int64,
+        Some(ArgumentKind::Text) if is_text(given) => DataType::Utf8,
         _ => given.clone(),
     };
     types.iter().enumerate().map(coerce).collect()
 }
 
 /// Checks the number of arguments and their types, after [`coerced`].
-pub(super) fn check(description: &Description, types: &[DataType]) -> Result<()> {
+pub(super) fn check(description: &FunctionDescription, types: &[DataType]) -> Result<()> {
     let (most, name) = (description.parameters.len(), description.name);
     if !(most - description.optional..=most).contains(&types.len()) {
         let given = match types.len() {
@@ -93,13 +93,14 @@ pub(super) fn check(description: &Description, types: &[DataType]) -> Result<()>
         };
         return Err(DataFusionError::Plan(format!("`{name}`: {given} given; hint: {}", description.syntax())));
     }
-    for (i, (given, Parameter { name: parameter, kind, about })) in types.iter().zip(description.parameters).enumerate()
+    for (i, (given, FunctionParameter { name: parameter, kind, about })) in
+        types.iter().zip(description.parameters).enumerate()
     {
         let fits = match kind {
-            Kind::Samples => matches!(element(given), Some(DataType::Float32 | DataType::Float64)),
-            Kind::Number => *given == DataType::Float64,
-            Kind::Integer => *given == DataType::Int64,
-            Kind::Text => *given == DataType::Utf8,
+            ArgumentKind::Samples => matches!(element(given), Some(DataType::Float32 | DataType::Float64)),
+            ArgumentKind::Number => *given == DataType::Float64,
+            ArgumentKind::Integer => *given == DataType::Int64,
+            ArgumentKind::Text => *given == DataType::Utf8,
         };
         if !fits {
             let (i, words) = (i + 1, kind.words());
@@ -139,24 +140,24 @@ fn is_text(kind: &DataType) -> bool {
     }
 }
 
-impl<'a> Arguments<'a> {
+impl<'a> CallArguments<'a> {
     /// Arguments of a call of a scalar function; constants are kept as one value.
-    pub(super) fn new(description: &'a Description, values: &[ColumnarValue], rows: usize) -> Result<Self> {
+    pub(super) fn new(description: &'a FunctionDescription, values: &[ColumnarValue], rows: usize) -> Result<Self> {
         let column = |value: &ColumnarValue| match value {
-            ColumnarValue::Array(array) => Ok(Column { array: array.clone(), constant: false }),
-            ColumnarValue::Scalar(value) => Ok(Column { array: value.to_array_of_size(1)?, constant: true }),
+            ColumnarValue::Array(array) => Ok(ArgumentColumn { array: array.clone(), constant: false }),
+            ColumnarValue::Scalar(value) => Ok(ArgumentColumn { array: value.to_array_of_size(1)?, constant: true }),
         };
         Ok(Self::of(description, values.iter().map(column).collect::<Result<_>>()?, rows))
     }
 
     /// Arguments from a batch of an aggregate's input.
-    pub(super) fn columns(description: &'a Description, arrays: &[ArrayRef]) -> Self {
+    pub(super) fn columns(description: &'a FunctionDescription, arrays: &[ArrayRef]) -> Self {
         let rows = arrays.first().map_or(0, |a| a.len());
-        let column = |array: &ArrayRef| Column { array: array.clone(), constant: false };
+        let column = |array: &ArrayRef| ArgumentColumn { array: array.clone(), constant: false };
         Self::of(description, arrays.iter().map(column).collect(), rows)
     }
 
-    fn of(description: &'a Description, columns: Vec<Column>, rows: usize) -> Self {
+    fn of(description: &'a FunctionDescription, columns: Vec<ArgumentColumn>, rows: usize) -> Self {
         let nulls = columns.iter().fold(None, |nulls: Option<NullBuffer>, column| match column.constant {
             true if column.array.is_null(0) => Some(NullBuffer::new_null(rows)),
             true => nulls,
@@ -181,11 +182,11 @@ impl<'a> Arguments<'a> {
     }
 
     /// Returns an argument as lists of `T`.
-    pub(super) fn samples<T: Element>(&self, argument: usize) -> Result<Samples<'_, T>> {
-        let Column { array, constant } = &self.columns[argument];
+    pub(super) fn samples<T: SampleElement>(&self, argument: usize) -> Result<SampleLists<'_, T>> {
+        let ArgumentColumn { array, constant } = &self.columns[argument];
         let list = array.as_list_opt::<i32>().ok_or_else(|| self.other_type(argument))?;
         let values = list.values().as_primitive_opt::<T::Arrow>().ok_or_else(|| self.other_type(argument))?;
-        Ok(Samples {
+        Ok(SampleLists {
             list,
             values: values.values(),
             nulls: values.nulls().filter(|nulls| nulls.null_count() > 0),
@@ -196,24 +197,24 @@ impl<'a> Arguments<'a> {
     }
 
     /// Returns an argument as numbers.
-    pub(super) fn numbers(&self, argument: usize) -> Result<Numbers<'_, f64>> {
-        let Column { array, constant } = &self.columns[argument];
+    pub(super) fn numbers(&self, argument: usize) -> Result<NumberValues<'_, f64>> {
+        let ArgumentColumn { array, constant } = &self.columns[argument];
         let values = array.as_primitive_opt::<Float64Type>().ok_or_else(|| self.other_type(argument))?;
-        Ok(Numbers { values: values.values(), constant: *constant })
+        Ok(NumberValues { values: values.values(), constant: *constant })
     }
 
     /// Returns an argument as whole numbers.
-    pub(super) fn integers(&self, argument: usize) -> Result<Numbers<'_, i64>> {
-        let Column { array, constant } = &self.columns[argument];
+    pub(super) fn integers(&self, argument: usize) -> Result<NumberValues<'_, i64>> {
+        let ArgumentColumn { array, constant } = &self.columns[argument];
         let values = array.as_primitive_opt::<Int64Type>().ok_or_else(|| self.other_type(argument))?;
-        Ok(Numbers { values: values.values(), constant: *constant })
+        Ok(NumberValues { values: values.values(), constant: *constant })
     }
 
     /// Returns an argument as texts.
-    pub(super) fn texts(&self, argument: usize) -> Result<Texts<'_>> {
-        let Column { array, constant } = &self.columns[argument];
+    pub(super) fn texts(&self, argument: usize) -> Result<TextValues<'_>> {
+        let ArgumentColumn { array, constant } = &self.columns[argument];
         let values = array.as_string_opt::<i32>().ok_or_else(|| self.other_type(argument))?;
-        Ok(Texts { values, constant: *constant })
+        Ok(TextValues { values, constant: *constant })
     }
 
     /// Returns the error for an invalid argument of a row, with a hint.
@@ -247,7 +248,7 @@ impl<'a> Arguments<'a> {
     }
 }
 
-impl<'a, T> Samples<'a, T> {
+impl<'a, T> SampleLists<'a, T> {
     /// Returns the samples of a row that is not null.
     pub(super) fn at(&self, row: usize) -> Result<&'a [T]> {
         let row = if self.constant { 0 } else { row };
@@ -276,14 +277,14 @@ impl<'a, T> Samples<'a, T> {
     }
 }
 
-impl<N: Copy> Numbers<'_, N> {
+impl<N: Copy> NumberValues<'_, N> {
     /// Returns the number of a row that is not null.
     pub(super) fn at(&self, row: usize) -> N {
         self.values[if self.constant { 0 } else { row }]
     }
 }
 
-impl Texts<'_> {
+impl TextValues<'_> {
     /// Returns the text of a row that is not null.
     pub(super) fn at(&self, row: usize) -> &str {
         self.values.value(if self.constant { 0 } else { row })

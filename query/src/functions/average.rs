@@ -8,21 +8,21 @@ use arrow::datatypes::{DataType, Float64Type, UInt64Type};
 use datafusion::error::{DataFusionError, Result};
 use echolake_dsp::mean::SignalMean;
 
-use super::aggregate::{Aggregate, Groups};
+use super::aggregate::{AggregateKernel, GroupStates};
 use super::answers::list_array;
-use super::arguments::{Arguments, Element, element, list_of};
-use super::description::{Description, Family, Kind, Parameter};
+use super::arguments::{CallArguments, SampleElement, element, list_of};
+use super::description::{ArgumentKind, FunctionDescription, FunctionFamily, FunctionParameter};
 
 /// `avg_list`.
 #[derive(Clone)]
-pub(super) struct AvgList;
+pub(super) struct AvgListFunction;
 
-static DESCRIPTION: Description = Description {
+static DESCRIPTION: FunctionDescription = FunctionDescription {
     name: "avg_list",
-    family: Family::Aggregates,
+    family: FunctionFamily::Aggregates,
     about: "Mean of equally long lists, element by element, in their unit: of the responses of repeated runs, what a \
             reference is. Summed up in f64. Null lists do not count; null of none.",
-    parameters: &[Parameter { name: "list", kind: Kind::Samples, about: "the lists, as ir" }],
+    parameters: &[FunctionParameter { name: "list", kind: ArgumentKind::Samples, about: "the lists, as ir" }],
     optional: 0,
     example: "select avg_list(x) as mean from (values ([1, 2]), ([3, 6])) as t(x)",
     answer: "\
@@ -34,8 +34,8 @@ static DESCRIPTION: Description = Description {
     related: &["list_energy", "pearson"],
 };
 
-impl AvgList {
-    fn add<T: Element>(arguments: &Arguments<'_>, groups: &mut Groups<'_, Self>) -> Result<()> {
+impl AvgListFunction {
+    fn add<T: SampleElement>(arguments: &CallArguments<'_>, groups: &mut GroupStates<'_, Self>) -> Result<()> {
         let lists = arguments.samples::<T>(0)?;
         for row in (0..arguments.rows()).filter(|row| !arguments.is_null(*row)) {
             let list = lists.at(row)?;
@@ -44,7 +44,7 @@ impl AvgList {
         Ok(())
     }
 
-    fn lists<T: Element>(groups: &[SignalMean]) -> Result<ArrayRef> {
+    fn lists<T: SampleElement>(groups: &[SignalMean]) -> Result<ArrayRef> {
         let mut values = Vec::new();
         groups.iter().for_each(|group| values.extend(group.values().map(T::of)));
         let nulls = NullBuffer::from_iter(groups.iter().map(|group| group.count() > 0));
@@ -52,10 +52,10 @@ impl AvgList {
     }
 }
 
-impl Aggregate for AvgList {
+impl AggregateKernel for AvgListFunction {
     type Group = SignalMean;
 
-    fn description(&self) -> &'static Description {
+    fn description(&self) -> &'static FunctionDescription {
         &DESCRIPTION
     }
 
@@ -67,14 +67,14 @@ impl Aggregate for AvgList {
         vec![("sums", list_of(DataType::Float64)), ("count", DataType::UInt64)]
     }
 
-    fn update(&self, arguments: &Arguments<'_>, groups: &mut Groups<'_, Self>) -> Result<()> {
+    fn update(&self, arguments: &CallArguments<'_>, groups: &mut GroupStates<'_, Self>) -> Result<()> {
         match arguments.samples::<f32>(0) {
             Ok(_) => Self::add::<f32>(arguments, groups),
             Err(_) => Self::add::<f64>(arguments, groups),
         }
     }
 
-    fn merge(&self, states: &[ArrayRef], groups: &mut Groups<'_, Self>) -> Result<()> {
+    fn merge(&self, states: &[ArrayRef], groups: &mut GroupStates<'_, Self>) -> Result<()> {
         let (lists, counts) = (states[0].as_list::<i32>(), states[1].as_primitive::<UInt64Type>().values());
         let sums = lists.values().as_primitive::<Float64Type>().values();
         for (row, ends) in lists.value_offsets().windows(2).enumerate() {

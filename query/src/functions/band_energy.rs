@@ -8,31 +8,31 @@ use datafusion::error::Result;
 use echolake_dsp::filter_bank::FilterBankPlan;
 
 use super::answers::{number_fields, numbers, structs};
-use super::arguments::{Arguments, Element, Samples};
-use super::description::{Description, Family, Kind, Parameter};
+use super::arguments::{CallArguments, SampleElement, SampleLists};
+use super::description::{ArgumentKind, FunctionDescription, FunctionFamily, FunctionParameter};
 use super::per_length::PerLength;
-use super::rig::Facts;
-use super::scalar::Scalar;
+use super::rig::RigFacts;
+use super::scalar::ScalarKernel;
 
 /// `band_energy`.
-pub(super) struct BandEnergy {
-    facts: Arc<Facts>,
+pub(super) struct BandEnergyFunction {
+    facts: Arc<RigFacts>,
     fields: Fields,
 }
 
-static DESCRIPTION: Description = Description {
+static DESCRIPTION: FunctionDescription = FunctionDescription {
     name: "band_energy",
-    family: Family::Responses,
+    family: FunctionFamily::Responses,
     about: "Energy of a response, sum of squares, in each band of the lake's itersine filter bank: a struct with a field \
             a band, `energy_2500` and so on as in table tnce, and `energy_total`, their sum; of one band where its centre \
             is given. Null for a list without samples.",
     parameters: &[
-        Parameter {
+        FunctionParameter {
             name: "ir",
-            kind: Kind::Samples,
+            kind: ArgumentKind::Samples,
             about: "the response at the lake's sampling rate, as reflected_ir",
         },
-        Parameter { name: "centre_hz", kind: Kind::Number, about: "centre of one band, Hz" },
+        FunctionParameter { name: "centre_hz", kind: ArgumentKind::Number, about: "centre of one band, Hz" },
     ],
     optional: 1,
     example: "select band_energy([1, 0])['energy_total'] as total, round(band_energy(reflected_ir, 2500) / \
@@ -47,20 +47,20 @@ static DESCRIPTION: Description = Description {
     related: &["nce", "list_energy", "spectrum"],
 };
 
-impl BandEnergy {
-    pub(super) fn new(facts: &Arc<Facts>) -> Self {
+impl BandEnergyFunction {
+    pub(super) fn new(facts: &Arc<RigFacts>) -> Self {
         let mut names: Vec<_> = facts.band_names.iter().map(|name| format!("energy_{name}")).collect();
         names.push("energy_total".into());
         Self { facts: facts.clone(), fields: number_fields(names.iter().map(String::as_str)) }
     }
 
     /// Returns a function that writes a row's energies into a slice; it returns false if the row has no samples.
-    fn energies<'a, T: Element>(
+    fn energies<'a, T: SampleElement>(
         &'a self,
-        arguments: &'a Arguments<'_>,
-        ir: &'a Samples<'a, T>,
+        arguments: &'a CallArguments<'_>,
+        ir: &'a SampleLists<'a, T>,
     ) -> impl FnMut(usize, &mut [f64]) -> Result<bool> + 'a {
-        let Facts { rate_hz, centres_hz, .. } = &*self.facts;
+        let RigFacts { rate_hz, centres_hz, .. } = &*self.facts;
         let mut plans = PerLength::new(DESCRIPTION.name);
         move |row, energies| {
             let ir = ir.at(row)?;
@@ -78,8 +78,8 @@ impl BandEnergy {
     }
 }
 
-impl Scalar for BandEnergy {
-    fn description(&self) -> &'static Description {
+impl ScalarKernel for BandEnergyFunction {
+    fn description(&self) -> &'static FunctionDescription {
         &DESCRIPTION
     }
 
@@ -87,7 +87,7 @@ impl Scalar for BandEnergy {
         if arguments.len() > 1 { DataType::Float64 } else { DataType::Struct(self.fields.clone()) }
     }
 
-    fn call<T: Element>(&self, arguments: &Arguments<'_>) -> Result<ArrayRef> {
+    fn call<T: SampleElement>(&self, arguments: &CallArguments<'_>) -> Result<ArrayRef> {
         let (ir, bands) = (arguments.samples::<T>(0)?, self.facts.centres_hz.len());
         let mut energies = self.energies(arguments, &ir);
         if arguments.given() == 1 {

@@ -9,26 +9,26 @@ use echolake_dsp::arrival::first_arrival;
 use echolake_dsp::decay::energy_decay_db;
 
 use super::answers::{grow, lists, numbers};
-use super::arguments::{Arguments, Element};
-use super::description::{Description, Family, Kind, Parameter};
-use super::rig::Facts;
-use super::scalar::Scalar;
+use super::arguments::{CallArguments, SampleElement};
+use super::description::{ArgumentKind, FunctionDescription, FunctionFamily, FunctionParameter};
+use super::rig::RigFacts;
+use super::scalar::ScalarKernel;
 
 /// Default level of the arrival, dB re the greatest sample; see [`first_arrival`].
 const ARRIVAL_DB: f64 = -20.0;
 
 /// `edc`.
-pub(super) struct Edc;
+pub(super) struct EdcFunction;
 
 /// `arrival`.
-pub(super) struct Arrival(pub(super) Arc<Facts>);
+pub(super) struct ArrivalFunction(pub(super) Arc<RigFacts>);
 
-static EDC: Description = Description {
+static EDC: FunctionDescription = FunctionDescription {
     name: "edc",
-    family: Family::Responses,
+    family: FunctionFamily::Responses,
     about: "Energy decay curve by Schroeder's backward integration: the energy from each sample to the end over all of it, \
             in dB. It starts at 0 dB; where nothing is left it is minus infinity. Null for a response without energy.",
-    parameters: &[Parameter { name: "ir", kind: Kind::Samples, about: "the response" }],
+    parameters: &[FunctionParameter { name: "ir", kind: ArgumentKind::Samples, about: "the response" }],
     optional: 0,
     example: "select edc([3, 0, 1, 0]) as levels",
     answer: "\
@@ -40,15 +40,19 @@ static EDC: Description = Description {
     related: &["nce", "arrival"],
 };
 
-static ARRIVAL: Description = Description {
+static ARRIVAL: FunctionDescription = FunctionDescription {
     name: "arrival",
-    family: Family::Responses,
+    family: FunctionFamily::Responses,
     about: "Time of the first arrival after the first sample, in ms at the lake's sampling rate: where the magnitude first \
             reaches a level relative to its greatest, -20 dB if none is given, linearly interpolated between samples. Null \
             for a response without sound.",
     parameters: &[
-        Parameter { name: "ir", kind: Kind::Samples, about: "the response, its direct sound still in it, as ir" },
-        Parameter { name: "threshold_db", kind: Kind::Number, about: "the level, dB, 0 or less" },
+        FunctionParameter {
+            name: "ir",
+            kind: ArgumentKind::Samples,
+            about: "the response, its direct sound still in it, as ir",
+        },
+        FunctionParameter { name: "threshold_db", kind: ArgumentKind::Number, about: "the level, dB, 0 or less" },
     ],
     optional: 1,
     example: "select arrival([0, 0, 0, 1, 0.5], 0) as ms",
@@ -61,8 +65,8 @@ static ARRIVAL: Description = Description {
     related: &["edc", "speed_of_sound"],
 };
 
-impl Scalar for Edc {
-    fn description(&self) -> &'static Description {
+impl ScalarKernel for EdcFunction {
+    fn description(&self) -> &'static FunctionDescription {
         &EDC
     }
 
@@ -70,7 +74,7 @@ impl Scalar for Edc {
         super::lists::like(&arguments[0])
     }
 
-    fn call<T: Element>(&self, arguments: &Arguments<'_>) -> Result<ArrayRef> {
+    fn call<T: SampleElement>(&self, arguments: &CallArguments<'_>) -> Result<ArrayRef> {
         let ir = arguments.samples::<T>(0)?;
         lists::<T>(arguments, ir.room(arguments.rows()), |row, out| {
             let ir = ir.at(row)?;
@@ -80,8 +84,8 @@ impl Scalar for Edc {
     }
 }
 
-impl Scalar for Arrival {
-    fn description(&self) -> &'static Description {
+impl ScalarKernel for ArrivalFunction {
+    fn description(&self) -> &'static FunctionDescription {
         &ARRIVAL
     }
 
@@ -89,7 +93,7 @@ impl Scalar for Arrival {
         DataType::Float64
     }
 
-    fn call<T: Element>(&self, arguments: &Arguments<'_>) -> Result<ArrayRef> {
+    fn call<T: SampleElement>(&self, arguments: &CallArguments<'_>) -> Result<ArrayRef> {
         let ir = arguments.samples::<T>(0)?;
         let threshold = if arguments.given() > 1 { Some(arguments.numbers(1)?) } else { None };
         numbers(arguments, |row| {
@@ -106,7 +110,7 @@ impl Scalar for Arrival {
 }
 
 // A silent response has no answer; one with NaN would have a wrong answer, and is an error.
-fn require_finite<T: Element>(arguments: &Arguments<'_>, row: usize, ir: &[T]) -> Result<()> {
+fn require_finite<T: SampleElement>(arguments: &CallArguments<'_>, row: usize, ir: &[T]) -> Result<()> {
     if ir.iter().all(|x| x.f64().is_finite()) {
         return Ok(());
     }

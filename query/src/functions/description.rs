@@ -4,12 +4,12 @@ use datafusion::logical_expr::{DocSection, Documentation};
 
 /// A function's name, arguments and meaning.
 #[derive(Debug)]
-pub(super) struct Description {
+pub(super) struct FunctionDescription {
     pub(super) name: &'static str,
-    pub(super) family: Family,
+    pub(super) family: FunctionFamily,
     /// Its result, with the unit.
     pub(super) about: &'static str,
-    pub(super) parameters: &'static [Parameter],
+    pub(super) parameters: &'static [FunctionParameter],
     /// Number of trailing arguments that are optional.
     pub(super) optional: usize,
     /// A query on a small lake.
@@ -21,7 +21,7 @@ pub(super) struct Description {
 
 /// A chapter of the manual.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Family {
+pub(super) enum FunctionFamily {
     Levels,
     Responses,
     Comparison,
@@ -32,16 +32,16 @@ pub(super) enum Family {
 
 /// One argument.
 #[derive(Debug)]
-pub(super) struct Parameter {
+pub(super) struct FunctionParameter {
     pub(super) name: &'static str,
-    pub(super) kind: Kind,
+    pub(super) kind: ArgumentKind,
     /// Its meaning, with the unit.
     pub(super) about: &'static str,
 }
 
 /// Kinds of arguments.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Kind {
+pub(super) enum ArgumentKind {
     /// A list of numbers, f32 or f64 in the kernel.
     Samples,
     /// A number, f64 in the kernel.
@@ -52,7 +52,7 @@ pub(super) enum Kind {
     Text,
 }
 
-impl Family {
+impl FunctionFamily {
     #[cfg(test)]
     pub(super) const ALL: [Self; 6] =
         [Self::Levels, Self::Responses, Self::Comparison, Self::Geometry, Self::Lists, Self::Aggregates];
@@ -70,7 +70,7 @@ impl Family {
     }
 }
 
-impl Kind {
+impl ArgumentKind {
     /// Returns a description for errors and the manual.
     pub(super) fn words(self) -> &'static str {
         match self {
@@ -82,7 +82,7 @@ impl Kind {
     }
 }
 
-impl Description {
+impl FunctionDescription {
     /// Returns the call syntax, `nce(ir, flat_energy[, centre_hz])`.
     pub(super) fn syntax(&self) -> String {
         let required = self.parameters.len() - self.optional;

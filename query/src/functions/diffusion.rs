@@ -7,29 +7,29 @@ use arrow::datatypes::{DataType, Float64Type, UInt64Type};
 use datafusion::error::Result;
 use echolake_dsp::diffusion::{DiffusionSums, diffusion};
 
-use super::aggregate::{Aggregate, Groups};
+use super::aggregate::{AggregateKernel, GroupStates};
 use super::answers::numbers;
-use super::arguments::{Arguments, Element};
-use super::description::{Description, Family, Kind, Parameter};
-use super::scalar::Scalar;
+use super::arguments::{CallArguments, SampleElement};
+use super::description::{ArgumentKind, FunctionDescription, FunctionFamily, FunctionParameter};
+use super::scalar::ScalarKernel;
 
 /// `diffusion`.
-pub(super) struct DiffusionOf;
+pub(super) struct DiffusionFunction;
 
 /// `diffusion_coefficient`.
 #[derive(Clone)]
-pub(super) struct DiffusionCoefficient;
+pub(super) struct DiffusionCoefficientFunction;
 
-static LIST: Description = Description {
+static LIST: FunctionDescription = FunctionDescription {
     name: "diffusion",
-    family: Family::Comparison,
+    family: FunctionFamily::Comparison,
     about: "Directional diffusion coefficient of a list of levels at receivers around a surface, without unit: ((sum e)^2 - \
             sum e^2) / ((n - 1) sum e^2), e = 10^(L/10), 1 where all are equal, 0 where all energy is at one. It has the \
             form of ISO 17497-2, with equal weights; but that asks for receivers in the far field, and the grid of a rig is \
             in the near field, so compare it with surfaces measured alike only. Null for fewer than two levels or no sound.",
-    parameters: &[Parameter {
+    parameters: &[FunctionParameter {
         name: "levels_db",
-        kind: Kind::Samples,
+        kind: ArgumentKind::Samples,
         about: "levels, dB; minus infinity is no sound",
     }],
     optional: 0,
@@ -43,13 +43,17 @@ static LIST: Description = Description {
     related: &["diffusion_coefficient"],
 };
 
-static ROWS: Description = Description {
+static ROWS: FunctionDescription = FunctionDescription {
     name: "diffusion_coefficient",
-    family: Family::Aggregates,
+    family: FunctionFamily::Aggregates,
     about: "Directional diffusion coefficient over rows, one a receiver; see diffusion(), whose reservation about the near \
             field holds here too. Take the rows of one speaker position. Null levels do not count; a receiver without sound \
             is minus infinity.",
-    parameters: &[Parameter { name: "level_db", kind: Kind::Number, about: "level at one receiver, dB" }],
+    parameters: &[FunctionParameter {
+        name: "level_db",
+        kind: ArgumentKind::Number,
+        about: "level at one receiver, dB",
+    }],
     optional: 0,
     example: "select round(diffusion_coefficient(level), 4) as d from (values (60), (57), (63)) as \
               receivers(level)",
@@ -62,8 +66,8 @@ static ROWS: Description = Description {
     related: &["diffusion", "p90_mean"],
 };
 
-impl Scalar for DiffusionOf {
-    fn description(&self) -> &'static Description {
+impl ScalarKernel for DiffusionFunction {
+    fn description(&self) -> &'static FunctionDescription {
         &LIST
     }
 
@@ -71,16 +75,16 @@ impl Scalar for DiffusionOf {
         DataType::Float64
     }
 
-    fn call<T: Element>(&self, arguments: &Arguments<'_>) -> Result<ArrayRef> {
+    fn call<T: SampleElement>(&self, arguments: &CallArguments<'_>) -> Result<ArrayRef> {
         let levels = arguments.samples::<T>(0)?;
         numbers(arguments, |row| Ok(diffusion(levels.at(row)?)))
     }
 }
 
-impl Aggregate for DiffusionCoefficient {
+impl AggregateKernel for DiffusionCoefficientFunction {
     type Group = DiffusionSums;
 
-    fn description(&self) -> &'static Description {
+    fn description(&self) -> &'static FunctionDescription {
         &ROWS
     }
 
@@ -93,7 +97,7 @@ impl Aggregate for DiffusionCoefficient {
         vec![("receivers", DataType::UInt64), number("loudest_db"), number("energy"), number("square")]
     }
 
-    fn update(&self, arguments: &Arguments<'_>, groups: &mut Groups<'_, Self>) -> Result<()> {
+    fn update(&self, arguments: &CallArguments<'_>, groups: &mut GroupStates<'_, Self>) -> Result<()> {
         let levels = arguments.numbers(0)?;
         for row in (0..arguments.rows()).filter(|row| !arguments.is_null(*row)) {
             groups.at(row, |group| {
@@ -104,7 +108,7 @@ impl Aggregate for DiffusionCoefficient {
         Ok(())
     }
 
-    fn merge(&self, states: &[ArrayRef], groups: &mut Groups<'_, Self>) -> Result<()> {
+    fn merge(&self, states: &[ArrayRef], groups: &mut GroupStates<'_, Self>) -> Result<()> {
         let receivers = states[0].as_primitive::<UInt64Type>().values();
         let [loudest, energy, square] = [1, 2, 3].map(|i| states[i].as_primitive::<Float64Type>().values());
         let parts = receivers.iter().zip(loudest).zip(energy.iter().zip(square));

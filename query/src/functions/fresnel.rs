@@ -8,26 +8,26 @@ use datafusion::error::Result;
 use echolake_dsp::fresnel::first_fresnel_zone;
 
 use super::answers::{number_fields, structs};
-use super::arguments::{Arguments, Element};
-use super::description::{Description, Family, Kind, Parameter};
-use super::scalar::Scalar;
+use super::arguments::{CallArguments, SampleElement};
+use super::description::{ArgumentKind, FunctionDescription, FunctionFamily, FunctionParameter};
+use super::scalar::ScalarKernel;
 
 /// Default speed of sound, m/s: that of table `pairs`.
 const SPEED_OF_SOUND: f64 = 343.0;
 
 /// `fresnel`.
-pub(super) struct Fresnel;
+pub(super) struct FresnelFunction;
 
 static FIELDS: LazyLock<Fields> =
     LazyLock::new(|| number_fields(["centre_x_mm", "centre_y_mm", "major_mm", "minor_mm"]));
 
-const fn mm(name: &'static str, about: &'static str) -> Parameter {
-    Parameter { name, kind: Kind::Number, about }
+const fn mm(name: &'static str, about: &'static str) -> FunctionParameter {
+    FunctionParameter { name, kind: ArgumentKind::Number, about }
 }
 
-static DESCRIPTION: Description = Description {
+static DESCRIPTION: FunctionDescription = FunctionDescription {
     name: "fresnel",
-    family: Family::Geometry,
+    family: FunctionFamily::Geometry,
     about: "First Fresnel zone of the reflection in the panel's reference plane, z = 0: the ellipse within which a path is at \
             most half a wavelength longer. A struct of its centre, `centre_x_mm` and `centre_y_mm`, and its diameters in the \
             plane of incidence, `major_mm`, and across it, `minor_mm`, in mm.",
@@ -53,8 +53,8 @@ static DESCRIPTION: Description = Description {
     related: &["speed_of_sound"],
 };
 
-impl Scalar for Fresnel {
-    fn description(&self) -> &'static Description {
+impl ScalarKernel for FresnelFunction {
+    fn description(&self) -> &'static FunctionDescription {
         &DESCRIPTION
     }
 
@@ -62,7 +62,7 @@ impl Scalar for Fresnel {
         DataType::Struct(FIELDS.clone())
     }
 
-    fn call<T: Element>(&self, arguments: &Arguments<'_>) -> Result<ArrayRef> {
+    fn call<T: SampleElement>(&self, arguments: &CallArguments<'_>) -> Result<ArrayRef> {
         let given = (0..arguments.given()).map(|i| arguments.numbers(i)).collect::<Result<Vec<_>>>()?;
         structs(arguments, &FIELDS, |row, out| {
             let mut values = [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, SPEED_OF_SOUND];

@@ -6,28 +6,32 @@ use datafusion::error::Result;
 use echolake_dsp::level::{amplitude_to_db, power_to_db, sound_pressure_level_db};
 
 use super::answers::{grow, lists, numbers};
-use super::arguments::{Arguments, Element};
-use super::description::{Description, Family, Kind, Parameter};
-use super::scalar::Scalar;
+use super::arguments::{CallArguments, SampleElement};
+use super::description::{ArgumentKind, FunctionDescription, FunctionFamily, FunctionParameter};
+use super::scalar::ScalarKernel;
 
 /// `db`: the level of an energy ratio.
-pub(super) struct Db;
+pub(super) struct DbFunction;
 
 /// `db_amplitude`: the level of an amplitude ratio.
-pub(super) struct DbAmplitude;
+pub(super) struct DbAmplitudeFunction;
 
 /// `spl`: sound pressure level.
-pub(super) struct Spl;
+pub(super) struct SplFunction;
 
 /// `list_db`: the levels of a list of energy ratios.
-pub(super) struct ListDb;
+pub(super) struct ListDbFunction;
 
-static DB: Description = Description {
+static DB: FunctionDescription = FunctionDescription {
     name: "db",
-    family: Family::Levels,
+    family: FunctionFamily::Levels,
     about: "Level of a ratio of energies or powers, 10 log10(x), in dB. What has no energy has no level: null for 0 and \
             less, so that averages and files meet no infinity.",
-    parameters: &[Parameter { name: "x", kind: Kind::Number, about: "ratio of energies, as tnce_total" }],
+    parameters: &[FunctionParameter {
+        name: "x",
+        kind: ArgumentKind::Number,
+        about: "ratio of energies, as tnce_total",
+    }],
     optional: 0,
     example: "select round(db(0.5), 2) as half, db(0) as none",
     answer: "\
@@ -39,11 +43,15 @@ static DB: Description = Description {
     related: &["db_amplitude", "list_db", "p90_mean"],
 };
 
-static DB_AMPLITUDE: Description = Description {
+static DB_AMPLITUDE: FunctionDescription = FunctionDescription {
     name: "db_amplitude",
-    family: Family::Levels,
+    family: FunctionFamily::Levels,
     about: "Level of a ratio of amplitudes, 20 log10 |x|, in dB; null for 0.",
-    parameters: &[Parameter { name: "x", kind: Kind::Number, about: "ratio of amplitudes, of either sign" }],
+    parameters: &[FunctionParameter {
+        name: "x",
+        kind: ArgumentKind::Number,
+        about: "ratio of amplitudes, of either sign",
+    }],
     optional: 0,
     example: "select round(db_amplitude(-0.5), 2) as half",
     answer: "\
@@ -55,13 +63,13 @@ static DB_AMPLITUDE: Description = Description {
     related: &["db", "spl"],
 };
 
-static SPL: Description = Description {
+static SPL: FunctionDescription = FunctionDescription {
     name: "spl",
-    family: Family::Levels,
+    family: FunctionFamily::Levels,
     about: "Sound pressure level, 20 log10(p / 20 uPa), in dB; null for 0 and less.",
-    parameters: &[Parameter {
+    parameters: &[FunctionParameter {
         name: "rms_pa",
-        kind: Kind::Number,
+        kind: ArgumentKind::Number,
         about: "root mean square of the sound pressure, Pa",
     }],
     optional: 0,
@@ -75,11 +83,15 @@ static SPL: Description = Description {
     related: &["db_amplitude", "list_rms"],
 };
 
-static LIST_DB: Description = Description {
+static LIST_DB: FunctionDescription = FunctionDescription {
     name: "list_db",
-    family: Family::Levels,
+    family: FunctionFamily::Levels,
     about: "Level of each element, 10 log10(x), in dB. Inside of a list, no energy is minus infinity.",
-    parameters: &[Parameter { name: "list", kind: Kind::Samples, about: "ratios of energies, as an NCE curve" }],
+    parameters: &[FunctionParameter {
+        name: "list",
+        kind: ArgumentKind::Samples,
+        about: "ratios of energies, as an NCE curve",
+    }],
     optional: 0,
     example: "select list_db([1, 0.1, 0]) as levels",
     answer: "\
@@ -91,13 +103,13 @@ static LIST_DB: Description = Description {
     related: &["db", "nce"],
 };
 
-fn level(arguments: &Arguments<'_>, level: impl Fn(f64) -> f64, there: impl Fn(f64) -> bool) -> Result<ArrayRef> {
+fn level(arguments: &CallArguments<'_>, level: impl Fn(f64) -> f64, there: impl Fn(f64) -> bool) -> Result<ArrayRef> {
     let x = arguments.numbers(0)?;
     numbers(arguments, |row| Ok(Some(x.at(row)).filter(|x| there(*x) || x.is_nan()).map(&level)))
 }
 
-impl Scalar for Db {
-    fn description(&self) -> &'static Description {
+impl ScalarKernel for DbFunction {
+    fn description(&self) -> &'static FunctionDescription {
         &DB
     }
 
@@ -105,13 +117,13 @@ impl Scalar for Db {
         DataType::Float64
     }
 
-    fn call<T: Element>(&self, arguments: &Arguments<'_>) -> Result<ArrayRef> {
+    fn call<T: SampleElement>(&self, arguments: &CallArguments<'_>) -> Result<ArrayRef> {
         level(arguments, power_to_db, |x| x > 0.0)
     }
 }
 
-impl Scalar for DbAmplitude {
-    fn description(&self) -> &'static Description {
+impl ScalarKernel for DbAmplitudeFunction {
+    fn description(&self) -> &'static FunctionDescription {
         &DB_AMPLITUDE
     }
 
@@ -119,13 +131,13 @@ impl Scalar for DbAmplitude {
         DataType::Float64
     }
 
-    fn call<T: Element>(&self, arguments: &Arguments<'_>) -> Result<ArrayRef> {
+    fn call<T: SampleElement>(&self, arguments: &CallArguments<'_>) -> Result<ArrayRef> {
         level(arguments, amplitude_to_db, |x| x != 0.0)
     }
 }
 
-impl Scalar for Spl {
-    fn description(&self) -> &'static Description {
+impl ScalarKernel for SplFunction {
+    fn description(&self) -> &'static FunctionDescription {
         &SPL
     }
 
@@ -133,13 +145,13 @@ impl Scalar for Spl {
         DataType::Float64
     }
 
-    fn call<T: Element>(&self, arguments: &Arguments<'_>) -> Result<ArrayRef> {
+    fn call<T: SampleElement>(&self, arguments: &CallArguments<'_>) -> Result<ArrayRef> {
         level(arguments, sound_pressure_level_db, |x| x > 0.0)
     }
 }
 
-impl Scalar for ListDb {
-    fn description(&self) -> &'static Description {
+impl ScalarKernel for ListDbFunction {
+    fn description(&self) -> &'static FunctionDescription {
         &LIST_DB
     }
 
@@ -147,7 +159,7 @@ impl Scalar for ListDb {
         super::lists::like(&arguments[0])
     }
 
-    fn call<T: Element>(&self, arguments: &Arguments<'_>) -> Result<ArrayRef> {
+    fn call<T: SampleElement>(&self, arguments: &CallArguments<'_>) -> Result<ArrayRef> {
         let list = arguments.samples::<T>(0)?;
         lists::<T>(arguments, list.room(arguments.rows()), |row, out| {
             let list = list.at(row)?;

@@ -7,26 +7,26 @@ use echolake_dsp::energy::{energy, rms};
 use echolake_dsp::mean::multiply;
 
 use super::answers::{grow, lists, numbers};
-use super::arguments::{Arguments, Element, element, list_of};
-use super::description::{Description, Family, Kind, Parameter};
-use super::scalar::Scalar;
+use super::arguments::{CallArguments, SampleElement, element, list_of};
+use super::description::{ArgumentKind, FunctionDescription, FunctionFamily, FunctionParameter};
+use super::scalar::ScalarKernel;
 
 /// `list_multiply`.
-pub(super) struct Multiply;
+pub(super) struct ListMultiplyFunction;
 
 /// `list_energy`.
-pub(super) struct Energy;
+pub(super) struct ListEnergyFunction;
 
 /// `list_rms`.
-pub(super) struct Rms;
+pub(super) struct ListRmsFunction;
 
-static MULTIPLY: Description = Description {
+static MULTIPLY: FunctionDescription = FunctionDescription {
     name: "list_multiply",
-    family: Family::Lists,
+    family: FunctionFamily::Lists,
     about: "Product of two equally long lists, element by element: a window on a response.",
     parameters: &[
-        Parameter { name: "x", kind: Kind::Samples, about: "the first list" },
-        Parameter { name: "y", kind: Kind::Samples, about: "the second list, as long as the first" },
+        FunctionParameter { name: "x", kind: ArgumentKind::Samples, about: "the first list" },
+        FunctionParameter { name: "y", kind: ArgumentKind::Samples, about: "the second list, as long as the first" },
     ],
     optional: 0,
     example: "select list_multiply([1, 2, 3], [2, 0, -1]) as product",
@@ -39,11 +39,11 @@ static MULTIPLY: Description = Description {
     related: &["list_energy", "avg_list"],
 };
 
-static ENERGY: Description = Description {
+static ENERGY: FunctionDescription = FunctionDescription {
     name: "list_energy",
-    family: Family::Lists,
+    family: FunctionFamily::Lists,
     about: "Sum of the squares of a list, in f64: the energy of a response. 0 for a list without elements.",
-    parameters: &[Parameter { name: "list", kind: Kind::Samples, about: "the list, as reflected_ir" }],
+    parameters: &[FunctionParameter { name: "list", kind: ArgumentKind::Samples, about: "the list, as reflected_ir" }],
     optional: 0,
     example: "select list_energy([3, -4]) as energy",
     answer: "\
@@ -55,11 +55,11 @@ static ENERGY: Description = Description {
     related: &["list_rms", "band_energy"],
 };
 
-static RMS: Description = Description {
+static RMS: FunctionDescription = FunctionDescription {
     name: "list_rms",
-    family: Family::Lists,
+    family: FunctionFamily::Lists,
     about: "Root of the mean square of a list, in its unit. 0 for a list without elements.",
-    parameters: &[Parameter { name: "list", kind: Kind::Samples, about: "the list" }],
+    parameters: &[FunctionParameter { name: "list", kind: ArgumentKind::Samples, about: "the list" }],
     optional: 0,
     example: "select round(list_rms([3, -4]), 4) as rms",
     answer: "\
@@ -76,8 +76,8 @@ pub(super) fn like(list: &DataType) -> DataType {
     list_of(element(list).cloned().unwrap_or(DataType::Float64))
 }
 
-impl Scalar for Multiply {
-    fn description(&self) -> &'static Description {
+impl ScalarKernel for ListMultiplyFunction {
+    fn description(&self) -> &'static FunctionDescription {
         &MULTIPLY
     }
 
@@ -85,7 +85,7 @@ impl Scalar for Multiply {
         like(&arguments[0])
     }
 
-    fn call<T: Element>(&self, arguments: &Arguments<'_>) -> Result<ArrayRef> {
+    fn call<T: SampleElement>(&self, arguments: &CallArguments<'_>) -> Result<ArrayRef> {
         let (x, y) = (arguments.samples::<T>(0)?, arguments.samples::<T>(1)?);
         lists::<T>(arguments, x.room(arguments.rows()), |row, out| {
             let (x, y) = (x.at(row)?, y.at(row)?);
@@ -95,8 +95,8 @@ impl Scalar for Multiply {
     }
 }
 
-impl Scalar for Energy {
-    fn description(&self) -> &'static Description {
+impl ScalarKernel for ListEnergyFunction {
+    fn description(&self) -> &'static FunctionDescription {
         &ENERGY
     }
 
@@ -104,14 +104,14 @@ impl Scalar for Energy {
         DataType::Float64
     }
 
-    fn call<T: Element>(&self, arguments: &Arguments<'_>) -> Result<ArrayRef> {
+    fn call<T: SampleElement>(&self, arguments: &CallArguments<'_>) -> Result<ArrayRef> {
         let list = arguments.samples::<T>(0)?;
         numbers(arguments, |row| Ok(Some(energy(list.at(row)?))))
     }
 }
 
-impl Scalar for Rms {
-    fn description(&self) -> &'static Description {
+impl ScalarKernel for ListRmsFunction {
+    fn description(&self) -> &'static FunctionDescription {
         &RMS
     }
 
@@ -119,7 +119,7 @@ impl Scalar for Rms {
         DataType::Float64
     }
 
-    fn call<T: Element>(&self, arguments: &Arguments<'_>) -> Result<ArrayRef> {
+    fn call<T: SampleElement>(&self, arguments: &CallArguments<'_>) -> Result<ArrayRef> {
         let list = arguments.samples::<T>(0)?;
         numbers(arguments, |row| Ok(Some(rms(list.at(row)?))))
     }

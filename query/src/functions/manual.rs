@@ -5,8 +5,8 @@ use std::fmt::Write as _;
 use datafusion::logical_expr::Documentation;
 use echolake_schema::Rig;
 
-use super::Functions;
-use super::description::Family;
+use super::FunctionSet;
+use super::description::FunctionFamily;
 
 /// Path of the page; tests run in their package's folder.
 const PAGE: &str = "../docs/functions.md";
@@ -27,12 +27,12 @@ This page is generated; `ECHOLAKE_RENEW=1 cargo test --release --workspace manua
 ";
 
 fn page() -> String {
-    let functions = Functions::all(&Rig::paper()).expect("the built-in rig is valid");
+    let functions = FunctionSet::all(&Rig::paper()).expect("the built-in rig is valid");
     let scalar = functions.scalar().iter().filter_map(|f| Some((f.name(), f.documentation()?)));
     let aggregate = functions.aggregate().iter().filter_map(|f| Some((f.name(), f.documentation()?)));
     let all: Vec<_> = scalar.chain(aggregate).collect();
     let mut page = HEAD.to_owned();
-    for family in Family::ALL {
+    for family in FunctionFamily::ALL {
         let _ = write!(page, "\n## {}\n", family.title());
         for (name, documentation) in all.iter().filter(|(_, d)| d.doc_section.label == family.title()) {
             page += &entry(name, documentation);
@@ -68,7 +68,7 @@ fn manual_is_fresh() {
 
 #[test]
 fn related_functions_exist() {
-    let functions = Functions::all(&Rig::paper()).expect("the built-in rig is valid");
+    let functions = FunctionSet::all(&Rig::paper()).expect("the built-in rig is valid");
     let scalar = functions.scalar().iter().map(|f| (f.name(), f.documentation()));
     let all: Vec<_> = scalar.chain(functions.aggregate().iter().map(|f| (f.name(), f.documentation()))).collect();
     for (name, documentation) in &all {

@@ -31,47 +31,51 @@ use datafusion::logical_expr::{AggregateUDF, ScalarUDF};
 use echolake_schema::Rig;
 
 use aggregate::udaf;
-use rig::Facts;
+use rig::RigFacts;
 use scalar::udf;
 
 /// All functions of a lake, made once for all its sessions.
-pub struct Functions {
+pub struct FunctionSet {
     scalar: Vec<Arc<ScalarUDF>>,
     aggregate: Vec<Arc<AggregateUDF>>,
 }
 
-impl Functions {
+impl FunctionSet {
     /// Creates the functions for a lake of this rig, from its sampling rate, bands and grid.
     ///
     /// # Errors
     /// [`echolake_schema::Error`] if the rig has no grid.
     pub fn all(rig: &Rig) -> Result<Self, echolake_schema::Error> {
-        let facts = Arc::new(Facts::of(rig)?);
+        let facts = Arc::new(RigFacts::of(rig)?);
         let scalar = vec![
-            udf(levels::Db),
-            udf(levels::DbAmplitude),
-            udf(levels::Spl),
-            udf(levels::ListDb),
-            udf(band_energy::BandEnergy::new(&facts)),
-            udf(nce::Nce(facts.clone())),
-            udf(spectrum::Spectrum),
-            udf(spectrum::Frequencies(facts.clone())),
-            udf(decay::Edc),
-            udf(decay::Arrival(facts.clone())),
-            udf(alike::Pearson),
-            udf(alike::Similarity),
-            udf(diffusion::DiffusionOf),
-            udf(fresnel::Fresnel),
-            udf(sound::SpeedOfSound),
-            udf(symmetry::D4),
-            udf(symmetry::D4Point(facts.clone())),
-            udf(symmetry::D4Pair(facts)),
-            udf(symmetry::D4Heightmap),
-            udf(lists::Multiply),
-            udf(lists::Energy),
-            udf(lists::Rms),
+            udf(levels::DbFunction),
+            udf(levels::DbAmplitudeFunction),
+            udf(levels::SplFunction),
+            udf(levels::ListDbFunction),
+            udf(band_energy::BandEnergyFunction::new(&facts)),
+            udf(nce::NceFunction(facts.clone())),
+            udf(spectrum::SpectrumFunction),
+            udf(spectrum::SpectrumFrequenciesFunction(facts.clone())),
+            udf(decay::EdcFunction),
+            udf(decay::ArrivalFunction(facts.clone())),
+            udf(alike::PearsonFunction),
+            udf(alike::SimilarityFunction),
+            udf(diffusion::DiffusionFunction),
+            udf(fresnel::FresnelFunction),
+            udf(sound::SpeedOfSoundFunction),
+            udf(symmetry::D4PositionFunction),
+            udf(symmetry::D4PointFunction(facts.clone())),
+            udf(symmetry::D4PairFunction(facts)),
+            udf(symmetry::D4HeightmapFunction),
+            udf(lists::ListMultiplyFunction),
+            udf(lists::ListEnergyFunction),
+            udf(lists::ListRmsFunction),
         ];
-        let aggregate = vec![udaf(p90_mean::P90Mean), udaf(diffusion::DiffusionCoefficient), udaf(average::AvgList)];
+        let aggregate = vec![
+            udaf(p90_mean::P90MeanFunction),
+            udaf(diffusion::DiffusionCoefficientFunction),
+            udaf(average::AvgListFunction),
+        ];
         Ok(Self {
             scalar: scalar.into_iter().map(Arc::new).collect(),
             aggregate: aggregate.into_iter().map(Arc::new).collect(),

@@ -9,29 +9,33 @@ use echolake_dsp::energy::cumulate_whole;
 use echolake_dsp::filter_bank::FilterBankPlan;
 
 use super::answers::{grow, lists};
-use super::arguments::{Arguments, Element};
-use super::description::{Description, Family, Kind, Parameter};
+use super::arguments::{CallArguments, SampleElement};
+use super::description::{ArgumentKind, FunctionDescription, FunctionFamily, FunctionParameter};
 use super::per_length::PerLength;
-use super::rig::Facts;
-use super::scalar::Scalar;
+use super::rig::RigFacts;
+use super::scalar::ScalarKernel;
 
 /// `nce`.
-pub(super) struct Nce(pub(super) Arc<Facts>);
+pub(super) struct NceFunction(pub(super) Arc<RigFacts>);
 
-static DESCRIPTION: Description = Description {
+static DESCRIPTION: FunctionDescription = FunctionDescription {
     name: "nce",
-    family: Family::Responses,
+    family: FunctionFamily::Responses,
     about: "Normalised cumulative energy (NCE): the energy of a response up to each of its samples over Flat's total \
             energy for the same pair; the last value is TNCE. Of the whole response, or of one band where its centre is \
             given, as the columns `nce_2500` and so on of table nce. Null where Flat has no energy.",
     parameters: &[
-        Parameter { name: "ir", kind: Kind::Samples, about: "the response with Foam's subtracted, as reflected_ir" },
-        Parameter {
+        FunctionParameter {
+            name: "ir",
+            kind: ArgumentKind::Samples,
+            about: "the response with Foam's subtracted, as reflected_ir",
+        },
+        FunctionParameter {
             name: "flat_energy",
-            kind: Kind::Number,
+            kind: ArgumentKind::Number,
             about: "Flat's energy of the pair, sum of squares, all bands",
         },
-        Parameter { name: "centre_hz", kind: Kind::Number, about: "centre of one band, Hz" },
+        FunctionParameter { name: "centre_hz", kind: ArgumentKind::Number, about: "centre of one band, Hz" },
     ],
     optional: 1,
     example: "select nce([1, 2, 0, 1], 8) as curve",
@@ -44,8 +48,8 @@ static DESCRIPTION: Description = Description {
     related: &["band_energy", "list_db", "edc"],
 };
 
-impl Scalar for Nce {
-    fn description(&self) -> &'static Description {
+impl ScalarKernel for NceFunction {
+    fn description(&self) -> &'static FunctionDescription {
         &DESCRIPTION
     }
 
@@ -53,7 +57,7 @@ impl Scalar for Nce {
         super::lists::like(&arguments[0])
     }
 
-    fn call<T: Element>(&self, arguments: &Arguments<'_>) -> Result<ArrayRef> {
+    fn call<T: SampleElement>(&self, arguments: &CallArguments<'_>) -> Result<ArrayRef> {
         let (ir, flat) = (arguments.samples::<T>(0)?, arguments.numbers(1)?);
         let room = ir.room(arguments.rows());
         if arguments.given() == 2 {

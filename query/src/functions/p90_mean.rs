@@ -7,22 +7,26 @@ use arrow::datatypes::{DataType, Float64Type};
 use datafusion::error::{DataFusionError, Result};
 use echolake_dsp::level::p90_mean;
 
-use super::aggregate::{Aggregate, Groups};
+use super::aggregate::{AggregateKernel, GroupStates};
 use super::answers::list_array;
-use super::arguments::{Arguments, list_of};
-use super::description::{Description, Family, Kind, Parameter};
+use super::arguments::{CallArguments, list_of};
+use super::description::{ArgumentKind, FunctionDescription, FunctionFamily, FunctionParameter};
 
 /// `p90_mean`.
 #[derive(Clone)]
-pub(super) struct P90Mean;
+pub(super) struct P90MeanFunction;
 
-static DESCRIPTION: Description = Description {
+static DESCRIPTION: FunctionDescription = FunctionDescription {
     name: "p90_mean",
-    family: Family::Aggregates,
+    family: FunctionFamily::Aggregates,
     about: "Mean of the values up to their 90th percentile, which a few focusing pairs do not carry away, in the unit of x. \
             Of TNCE, which is linear, `db(p90_mean(tnce_total))` is what the paper's tables and surface_stats.p90_mean_db \
             say. Null values and those that are not finite do not count; null of none.",
-    parameters: &[Parameter { name: "x", kind: Kind::Number, about: "the values, as tnce_total (linear, not dB)" }],
+    parameters: &[FunctionParameter {
+        name: "x",
+        kind: ArgumentKind::Number,
+        about: "the values, as tnce_total (linear, not dB)",
+    }],
     optional: 0,
     example: "select p90_mean(x) as mean from (values (1), (2), (3), (4), (1000)) as t(x)",
     answer: "\
@@ -34,10 +38,10 @@ static DESCRIPTION: Description = Description {
     related: &["db", "diffusion_coefficient"],
 };
 
-impl Aggregate for P90Mean {
+impl AggregateKernel for P90MeanFunction {
     type Group = Vec<f64>;
 
-    fn description(&self) -> &'static Description {
+    fn description(&self) -> &'static FunctionDescription {
         &DESCRIPTION
     }
 
@@ -49,7 +53,7 @@ impl Aggregate for P90Mean {
         vec![("values", list_of(DataType::Float64))]
     }
 
-    fn update(&self, arguments: &Arguments<'_>, groups: &mut Groups<'_, Self>) -> Result<()> {
+    fn update(&self, arguments: &CallArguments<'_>, groups: &mut GroupStates<'_, Self>) -> Result<()> {
         let values = arguments.numbers(0)?;
         for row in (0..arguments.rows()).filter(|row| !arguments.is_null(*row) && values.at(*row).is_finite()) {
             groups.at(row, |group| {
@@ -60,7 +64,7 @@ impl Aggregate for P90Mean {
         Ok(())
     }
 
-    fn merge(&self, states: &[ArrayRef], groups: &mut Groups<'_, Self>) -> Result<()> {
+    fn merge(&self, states: &[ArrayRef], groups: &mut GroupStates<'_, Self>) -> Result<()> {
         let lists = states[0].as_list::<i32>();
         let values = lists.values().as_primitive::<Float64Type>().values();
         for (row, ends) in lists.value_offsets().windows(2).enumerate() {

@@ -4,7 +4,7 @@ use echolake_schema::symmetry::MovedPair;
 use echolake_schema::{Error, Grid, PointId, Rig, Symmetry};
 
 /// Rate, bands and grid of a rig, with the images of points and pairs under the symmetries.
-pub(super) struct Facts {
+pub(super) struct RigFacts {
     pub(super) rate_hz: f64,
     pub(super) centres_hz: Vec<f64>,
     pub(super) band_names: Vec<String>,
@@ -13,7 +13,7 @@ pub(super) struct Facts {
     pairs: Vec<Option<Vec<MovedPair>>>,
 }
 
-impl Facts {
+impl RigFacts {
     pub(super) fn of(rig: &Rig) -> Result<Self, Error> {
         let grid: Grid = rig.grid()?;
         Ok(Self {

@@ -11,13 +11,13 @@ use datafusion::logical_expr::{
     ColumnarValue, Documentation, ScalarFunctionArgs, ScalarUDF, ScalarUDFImpl, Signature, Volatility,
 };
 
-use super::arguments::{Arguments, Element, check, coerced, element};
-use super::description::Description;
+use super::arguments::{CallArguments, SampleElement, check, coerced, element};
+use super::description::FunctionDescription;
 
 /// A function of the values of one row. A null argument makes the answer null.
-pub(super) trait Scalar: Send + Sync + 'static {
+pub(super) trait ScalarKernel: Send + Sync + 'static {
     /// Returns the function's description.
-    fn description(&self) -> &'static Description;
+    fn description(&self) -> &'static FunctionDescription;
 
     /// Returns the type of its answer; the arguments' types are already checked.
     fn returns(&self, arguments: &[DataType]) -> DataType;
@@ -26,27 +26,27 @@ pub(super) trait Scalar: Send + Sync + 'static {
     ///
     /// # Errors
     /// If a value is invalid; the error names its row.
-    fn call<T: Element>(&self, arguments: &Arguments<'_>) -> Result<ArrayRef>;
+    fn call<T: SampleElement>(&self, arguments: &CallArguments<'_>) -> Result<ArrayRef>;
 }
 
-/// Adapts a [`Scalar`] to DataFusion's trait.
-struct Adapter<F> {
+/// Adapts a [`ScalarKernel`] to DataFusion's trait.
+struct ScalarAdapter<F> {
     function: F,
     signature: Signature,
     documentation: Documentation,
 }
 
 /// Wraps the function for DataFusion.
-pub(super) fn udf(function: impl Scalar) -> ScalarUDF {
+pub(super) fn udf(function: impl ScalarKernel) -> ScalarUDF {
     let documentation = function.description().documentation();
-    ScalarUDF::new_from_impl(Adapter {
+    ScalarUDF::new_from_impl(ScalarAdapter {
         function,
         signature: Signature::user_defined(Volatility::Immutable),
         documentation,
     })
 }
 
-impl<F: Scalar> ScalarUDFImpl for Adapter<F> {
+impl<F: ScalarKernel> ScalarUDFImpl for ScalarAdapter<F> {
     fn name(&self) -> &str {
         self.function.description().name
     }
@@ -71,7 +71,7 @@ impl<F: Scalar> ScalarUDFImpl for Adapter<F> {
     fn invoke_with_args(&self, args: ScalarFunctionArgs) -> Result<ColumnarValue> {
         let constant = args.args.iter().all(|value| matches!(value, ColumnarValue::Scalar(_)));
         let rows = if constant { 1 } else { args.number_rows };
-        let arguments = Arguments::new(self.function.description(), &args.args, rows)?;
+        let arguments = CallArguments::new(self.function.description(), &args.args, rows)?;
         let narrow = args.args.iter().find_map(|value| element(&value.data_type()).cloned()) == Some(DataType::Float32);
         let answer =
             if narrow { self.function.call::<f32>(&arguments)? } else { self.function.call::<f64>(&arguments)? };
@@ -87,22 +87,22 @@ impl<F: Scalar> ScalarUDFImpl for Adapter<F> {
     }
 }
 
-impl<F: Scalar> Debug for Adapter<F> {
+impl<F: ScalarKernel> Debug for ScalarAdapter<F> {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(self.name())
     }
 }
 
 // Compared by name: names are unique in an engine, and its plans never contain functions of another engine.
-impl<F: Scalar> PartialEq for Adapter<F> {
+impl<F: ScalarKernel> PartialEq for ScalarAdapter<F> {
     fn eq(&self, other: &Self) -> bool {
         self.name() == other.name()
     }
 }
 
-impl<F: Scalar> Eq for Adapter<F> {}
+impl<F: ScalarKernel> Eq for ScalarAdapter<F> {}
 
-impl<F: Scalar> Hash for Adapter<F> {
+impl<F: ScalarKernel> Hash for ScalarAdapter<F> {
     fn hash<H: Hasher>(&self, state: &mut H) {
         self.name().hash(state);
     }

@@ -6,21 +6,25 @@ use datafusion::error::Result;
 use echolake_dsp::temperature::speed_of_sound;
 
 use super::answers::numbers;
-use super::arguments::{Arguments, Element};
-use super::description::{Description, Family, Kind, Parameter};
-use super::scalar::Scalar;
+use super::arguments::{CallArguments, SampleElement};
+use super::description::{ArgumentKind, FunctionDescription, FunctionFamily, FunctionParameter};
+use super::scalar::ScalarKernel;
 
 /// 0 K, C.
 const ABSOLUTE_ZERO: f64 = -273.15;
 
 /// `speed_of_sound`.
-pub(super) struct SpeedOfSound;
+pub(super) struct SpeedOfSoundFunction;
 
-static DESCRIPTION: Description = Description {
+static DESCRIPTION: FunctionDescription = FunctionDescription {
     name: "speed_of_sound",
-    family: Family::Geometry,
+    family: FunctionFamily::Geometry,
     about: "Speed of sound in dry air, 331.3 sqrt(1 + T / 273.15), in m/s: what the responses of the lake are corrected by.",
-    parameters: &[Parameter { name: "temperature_c", kind: Kind::Number, about: "temperature, C, -273.15 or more" }],
+    parameters: &[FunctionParameter {
+        name: "temperature_c",
+        kind: ArgumentKind::Number,
+        about: "temperature, C, -273.15 or more",
+    }],
     optional: 0,
     example: "select round(speed_of_sound(20), 2) as m_s",
     answer: "\
@@ -32,8 +36,8 @@ static DESCRIPTION: Description = Description {
     related: &["fresnel", "arrival"],
 };
 
-impl Scalar for SpeedOfSound {
-    fn description(&self) -> &'static Description {
+impl ScalarKernel for SpeedOfSoundFunction {
+    fn description(&self) -> &'static FunctionDescription {
         &DESCRIPTION
     }
 
@@ -41,7 +45,7 @@ impl Scalar for SpeedOfSound {
         DataType::Float64
     }
 
-    fn call<T: Element>(&self, arguments: &Arguments<'_>) -> Result<ArrayRef> {
+    fn call<T: SampleElement>(&self, arguments: &CallArguments<'_>) -> Result<ArrayRef> {
         let celsius = arguments.numbers(0)?;
         numbers(arguments, |row| match celsius.at(row) {
             celsius if celsius < ABSOLUTE_ZERO => {

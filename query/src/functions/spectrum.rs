@@ -8,28 +8,28 @@ use datafusion::error::Result;
 use echolake_dsp::spectrum::{SpectrumPlan, bin_hz, bins};
 
 use super::answers::{grow, lists};
-use super::arguments::{Arguments, Element, list_of};
-use super::description::{Description, Family, Kind, Parameter};
+use super::arguments::{CallArguments, SampleElement, list_of};
+use super::description::{ArgumentKind, FunctionDescription, FunctionFamily, FunctionParameter};
 use super::per_length::PerLength;
-use super::rig::Facts;
-use super::scalar::Scalar;
+use super::rig::RigFacts;
+use super::scalar::ScalarKernel;
 
 /// Maximum number of samples for `spectrum_frequencies`, more than `spectrum` accepts.
 const MOST: i64 = 1 << 20;
 
 /// `spectrum`.
-pub(super) struct Spectrum;
+pub(super) struct SpectrumFunction;
 
 /// `spectrum_frequencies`.
-pub(super) struct Frequencies(pub(super) Arc<Facts>);
+pub(super) struct SpectrumFrequenciesFunction(pub(super) Arc<RigFacts>);
 
-static SPECTRUM: Description = Description {
+static SPECTRUM: FunctionDescription = FunctionDescription {
     name: "spectrum",
-    family: Family::Responses,
+    family: FunctionFamily::Responses,
     about: "Levels of a response over frequency, 20 log10 of the magnitude of its discrete Fourier transform, in dB: n/2 + 1 \
             values for n samples, at the frequencies that spectrum_frequencies(n) lists. Not scaled: a response is a gain, \
             and a single sample of 1 is 0 dB throughout. Nothing is minus infinity.",
-    parameters: &[Parameter { name: "ir", kind: Kind::Samples, about: "the response" }],
+    parameters: &[FunctionParameter { name: "ir", kind: ArgumentKind::Samples, about: "the response" }],
     optional: 0,
     example: "select spectrum([0, 10, 0, 0]) as levels",
     answer: "\
@@ -41,11 +41,15 @@ static SPECTRUM: Description = Description {
     related: &["spectrum_frequencies", "band_energy"],
 };
 
-static FREQUENCIES: Description = Description {
+static FREQUENCIES: FunctionDescription = FunctionDescription {
     name: "spectrum_frequencies",
-    family: Family::Responses,
+    family: FunctionFamily::Responses,
     about: "Frequencies of the values of spectrum() for n samples at the lake's sampling rate, in Hz.",
-    parameters: &[Parameter { name: "n", kind: Kind::Integer, about: "samples of the response, 0 to 1048576" }],
+    parameters: &[FunctionParameter {
+        name: "n",
+        kind: ArgumentKind::Integer,
+        about: "samples of the response, 0 to 1048576",
+    }],
     optional: 0,
     example: "select spectrum_frequencies(4) as hz",
     answer: "\
@@ -57,8 +61,8 @@ static FREQUENCIES: Description = Description {
     related: &["spectrum"],
 };
 
-impl Scalar for Spectrum {
-    fn description(&self) -> &'static Description {
+impl ScalarKernel for SpectrumFunction {
+    fn description(&self) -> &'static FunctionDescription {
         &SPECTRUM
     }
 
@@ -66,7 +70,7 @@ impl Scalar for Spectrum {
         super::lists::like(&arguments[0])
     }
 
-    fn call<T: Element>(&self, arguments: &Arguments<'_>) -> Result<ArrayRef> {
+    fn call<T: SampleElement>(&self, arguments: &CallArguments<'_>) -> Result<ArrayRef> {
         let ir = arguments.samples::<T>(0)?;
         let mut plans = PerLength::new(SPECTRUM.name);
         let room = bins(ir.room(arguments.rows())) + arguments.rows();
@@ -87,8 +91,8 @@ impl Scalar for Spectrum {
     }
 }
 
-impl Scalar for Frequencies {
-    fn description(&self) -> &'static Description {
+impl ScalarKernel for SpectrumFrequenciesFunction {
+    fn description(&self) -> &'static FunctionDescription {
         &FREQUENCIES
     }
 
@@ -96,7 +100,7 @@ impl Scalar for Frequencies {
         list_of(DataType::Float64)
     }
 
-    fn call<T: Element>(&self, arguments: &Arguments<'_>) -> Result<ArrayRef> {
+    fn call<T: SampleElement>(&self, arguments: &CallArguments<'_>) -> Result<ArrayRef> {
         let lengths = arguments.integers(0)?;
         lists::<f64>(arguments, 0, |row, out| {
             let given = lengths.at(row);

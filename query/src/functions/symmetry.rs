@@ -10,26 +10,26 @@ use echolake_dsp::heights::moved;
 use echolake_schema::Symmetry;
 
 use super::answers::{grow, lists, number_fields, structs};
-use super::arguments::{Arguments, Element, Texts};
-use super::description::{Description, Family, Kind, Parameter};
-use super::rig::Facts;
-use super::scalar::Scalar;
+use super::arguments::{CallArguments, SampleElement, TextValues};
+use super::description::{ArgumentKind, FunctionDescription, FunctionFamily, FunctionParameter};
+use super::rig::RigFacts;
+use super::scalar::ScalarKernel;
 
 /// `d4`: a position.
-pub(super) struct D4;
+pub(super) struct D4PositionFunction;
 
 /// `d4_point`: a point of the grid.
-pub(super) struct D4Point(pub(super) Arc<Facts>);
+pub(super) struct D4PointFunction(pub(super) Arc<RigFacts>);
 
 /// `d4_pair`: a pair.
-pub(super) struct D4Pair(pub(super) Arc<Facts>);
+pub(super) struct D4PairFunction(pub(super) Arc<RigFacts>);
 
 /// `d4_heightmap`: a height map.
-pub(super) struct D4Heightmap;
+pub(super) struct D4HeightmapFunction;
 
-const SYMMETRY: Parameter = Parameter {
+const SYMMETRY: FunctionParameter = FunctionParameter {
     name: "symmetry",
-    kind: Kind::Text,
+    kind: ArgumentKind::Text,
     about: "one of identity, rot90, rot180, rot270, mirror_x, mirror_y, mirror_diag, mirror_anti",
 };
 
@@ -39,15 +39,15 @@ static PAIR_FIELDS: LazyLock<Fields> = LazyLock::new(|| {
     Fields::from(vec![Field::new("pair_id", DataType::Int32, true), Field::new("swapped", DataType::Boolean, true)])
 });
 
-static D4_POSITION: Description = Description {
+static D4_POSITION: FunctionDescription = FunctionDescription {
     name: "d4",
-    family: Family::Geometry,
+    family: FunctionFamily::Geometry,
     about: "A position under one of the eight symmetries of the square (D4) about the panel's centre: a struct of `x` and `y` \
             in the unit of the arguments. rot90 turns counter-clockwise seen from above, mirror_x changes the sign of x, \
             mirror_diag exchanges x and y.",
     parameters: &[
-        Parameter { name: "x", kind: Kind::Number, about: "x from the panel's centre, mm" },
-        Parameter { name: "y", kind: Kind::Number, about: "y from the panel's centre, mm" },
+        FunctionParameter { name: "x", kind: ArgumentKind::Number, about: "x from the panel's centre, mm" },
+        FunctionParameter { name: "y", kind: ArgumentKind::Number, about: "y from the panel's centre, mm" },
         SYMMETRY,
     ],
     optional: 0,
@@ -61,11 +61,14 @@ static D4_POSITION: Description = Description {
     related: &["d4_point", "d4_pair", "d4_heightmap"],
 };
 
-static D4_POINT: Description = Description {
+static D4_POINT: FunctionDescription = FunctionDescription {
     name: "d4_point",
-    family: Family::Geometry,
+    family: FunctionFamily::Geometry,
     about: "The point of the lake's grid that a point becomes under a symmetry.",
-    parameters: &[Parameter { name: "point_id", kind: Kind::Integer, about: "a point of table points" }, SYMMETRY],
+    parameters: &[
+        FunctionParameter { name: "point_id", kind: ArgumentKind::Integer, about: "a point of table points" },
+        SYMMETRY,
+    ],
     optional: 0,
     example: "select d4_point(0, 'rot180') as point",
     answer: "\
@@ -77,12 +80,15 @@ static D4_POINT: Description = Description {
     related: &["d4", "d4_pair"],
 };
 
-static D4_PAIR: Description = Description {
+static D4_PAIR: FunctionDescription = FunctionDescription {
     name: "d4_pair",
-    family: Family::Geometry,
+    family: FunctionFamily::Geometry,
     about: "The pair that a pair becomes under a symmetry: a struct of `pair_id` and `swapped`, which tells that microphone and \
             speaker change places, so that the measurement stands for the other by reciprocity.",
-    parameters: &[Parameter { name: "pair_id", kind: Kind::Integer, about: "a pair of table pairs" }, SYMMETRY],
+    parameters: &[
+        FunctionParameter { name: "pair_id", kind: ArgumentKind::Integer, about: "a pair of table pairs" },
+        SYMMETRY,
+    ],
     optional: 0,
     example: "select d4_pair(0, 'rot180') as moved",
     answer: "\
@@ -94,14 +100,14 @@ static D4_PAIR: Description = Description {
     related: &["d4", "d4_point"],
 };
 
-static D4_HEIGHTMAP: Description = Description {
+static D4_HEIGHTMAP: FunctionDescription = FunctionDescription {
     name: "d4_heightmap",
-    family: Family::Geometry,
+    family: FunctionFamily::Geometry,
     about: "A square map under a symmetry about its centre, in the unit of its values: what stood at p stands where p goes.",
     parameters: &[
-        Parameter {
+        FunctionParameter {
             name: "list",
-            kind: Kind::Samples,
+            kind: ArgumentKind::Samples,
             about: "n x n values, row by row along x, y ascending, as heights_mm",
         },
         SYMMETRY,
@@ -118,14 +124,14 @@ static D4_HEIGHTMAP: Description = Description {
 };
 
 /// Returns the symmetry of a row.
-fn symmetry(arguments: &Arguments<'_>, texts: &Texts<'_>, argument: usize, row: usize) -> Result<Symmetry> {
+fn symmetry(arguments: &CallArguments<'_>, texts: &TextValues<'_>, argument: usize, row: usize) -> Result<Symmetry> {
     let name = texts.at(row);
     let found = Symmetry::ALL.into_iter().find(|s| s.name() == name);
     found.ok_or_else(|| arguments.wrong(argument, row, name, SYMMETRY.about))
 }
 
 /// Returns the image of a row's point or pair, out of the images of all.
-fn of_all<'a, M>(arguments: &Arguments<'_>, row: usize, id: i64, all: Option<&'a [M]>) -> Result<&'a M> {
+fn of_all<'a, M>(arguments: &CallArguments<'_>, row: usize, id: i64, all: Option<&'a [M]>) -> Result<&'a M> {
     let Some(all) = all else {
         return Err(arguments.wrong(1, row, "no symmetry of the lake's grid", "table points lists the grid"));
     };
@@ -133,8 +139,8 @@ fn of_all<'a, M>(arguments: &Arguments<'_>, row: usize, id: i64, all: Option<&'a
     found.ok_or_else(|| arguments.wrong(0, row, id, &format!("the lake has 0 to {}", all.len().saturating_sub(1))))
 }
 
-impl Scalar for D4 {
-    fn description(&self) -> &'static Description {
+impl ScalarKernel for D4PositionFunction {
+    fn description(&self) -> &'static FunctionDescription {
         &D4_POSITION
     }
 
@@ -142,7 +148,7 @@ impl Scalar for D4 {
         DataType::Struct(POSITION_FIELDS.clone())
     }
 
-    fn call<T: Element>(&self, arguments: &Arguments<'_>) -> Result<ArrayRef> {
+    fn call<T: SampleElement>(&self, arguments: &CallArguments<'_>) -> Result<ArrayRef> {
         let (x, y, names) = (arguments.numbers(0)?, arguments.numbers(1)?, arguments.texts(2)?);
         structs(arguments, &POSITION_FIELDS, |row, out| {
             let [x, y, _] = symmetry(arguments, &names, 2, row)?.apply([x.at(row), y.at(row), 0.0]);
@@ -153,8 +159,8 @@ impl Scalar for D4 {
     }
 }
 
-impl Scalar for D4Point {
-    fn description(&self) -> &'static Description {
+impl ScalarKernel for D4PointFunction {
+    fn description(&self) -> &'static FunctionDescription {
         &D4_POINT
     }
 
@@ -162,7 +168,7 @@ impl Scalar for D4Point {
         DataType::Int32
     }
 
-    fn call<T: Element>(&self, arguments: &Arguments<'_>) -> Result<ArrayRef> {
+    fn call<T: SampleElement>(&self, arguments: &CallArguments<'_>) -> Result<ArrayRef> {
         let (ids, names) = (arguments.integers(0)?, arguments.texts(1)?);
         let point = |row| {
             if arguments.is_null(row) {
@@ -175,8 +181,8 @@ impl Scalar for D4Point {
     }
 }
 
-impl Scalar for D4Pair {
-    fn description(&self) -> &'static Description {
+impl ScalarKernel for D4PairFunction {
+    fn description(&self) -> &'static FunctionDescription {
         &D4_PAIR
     }
 
@@ -184,7 +190,7 @@ impl Scalar for D4Pair {
         DataType::Struct(PAIR_FIELDS.clone())
     }
 
-    fn call<T: Element>(&self, arguments: &Arguments<'_>) -> Result<ArrayRef> {
+    fn call<T: SampleElement>(&self, arguments: &CallArguments<'_>) -> Result<ArrayRef> {
         let (ids, names) = (arguments.integers(0)?, arguments.texts(1)?);
         let pair = |row| {
             if arguments.is_null(row) {
@@ -202,8 +208,8 @@ impl Scalar for D4Pair {
     }
 }
 
-impl Scalar for D4Heightmap {
-    fn description(&self) -> &'static Description {
+impl ScalarKernel for D4HeightmapFunction {
+    fn description(&self) -> &'static FunctionDescription {
         &D4_HEIGHTMAP
     }
 
@@ -211,7 +217,7 @@ impl Scalar for D4Heightmap {
         super::lists::like(&arguments[0])
     }
 
-    fn call<T: Element>(&self, arguments: &Arguments<'_>) -> Result<ArrayRef> {
+    fn call<T: SampleElement>(&self, arguments: &CallArguments<'_>) -> Result<ArrayRef> {
         let (maps, names) = (arguments.samples::<T>(0)?, arguments.texts(1)?);
         lists::<T>(arguments, maps.room(arguments.rows()), |row, out| {
             let (map, symmetry) = (maps.at(row)?, symmetry(arguments, &names, 1, row)?);

@@ -13,7 +13,7 @@ use echolake_schema::tables::Table;
 use echolake_schema::{Rig, Symmetry};
 use parquet::arrow::arrow_reader::ParquetRecordBatchReaderBuilder;
 
-use super::Functions;
+use super::FunctionSet;
 use crate::{Error, Session};
 
 const LEN: usize = 384;
@@ -173,7 +173,7 @@ fn example(documentation: &datafusion::logical_expr::Documentation) -> (String, 
 #[tokio::test]
 async fn examples_answer_what_they_say() {
     let small = Small::new().await;
-    let functions = Functions::all(&Rig::paper()).expect("the built-in rig is valid");
+    let functions = FunctionSet::all(&Rig::paper()).expect("the built-in rig is valid");
     let scalar = functions.scalar().iter().map(|f| (f.name(), f.documentation()));
     let all: Vec<_> = scalar.chain(functions.aggregate().iter().map(|f| (f.name(), f.documentation()))).collect();
     let mut wrong = String::new();
@@ -496,14 +496,14 @@ async fn hostile_arguments_are_refused_in_words_or_null() {
 fn slices_of_arrays_are_read_where_they_begin() {
     use datafusion::logical_expr::ColumnarValue;
 
-    use super::arguments::Arguments;
-    use super::description::{Description, Family, Kind, Parameter};
+    use super::arguments::CallArguments;
+    use super::description::{ArgumentKind, FunctionDescription, FunctionFamily, FunctionParameter};
 
-    static DESCRIPTION: Description = Description {
+    static DESCRIPTION: FunctionDescription = FunctionDescription {
         name: "f",
-        family: Family::Lists,
+        family: FunctionFamily::Lists,
         about: "",
-        parameters: &[Parameter { name: "x", kind: Kind::Samples, about: "" }],
+        parameters: &[FunctionParameter { name: "x", kind: ArgumentKind::Samples, about: "" }],
         optional: 0,
         example: "",
         answer: "",
@@ -513,7 +513,7 @@ fn slices_of_arrays_are_read_where_they_begin() {
     let lists = super::answers::list_array::<f32>(vec![1.0; 5], vec![0, 2, 3, 5], None).expect("lists");
     let (field, offsets, ..) = lists.into_parts();
     let lists = arrow::array::ListArray::new(field, offsets, Arc::new(values), None).slice(1, 2);
-    let arguments = Arguments::new(&DESCRIPTION, &[ColumnarValue::Array(Arc::new(lists))], 2).expect("arguments");
+    let arguments = CallArguments::new(&DESCRIPTION, &[ColumnarValue::Array(Arc::new(lists))], 2).expect("arguments");
     let samples = arguments.samples::<f32>(0).expect("f32");
     assert_eq!((samples.at(0).expect("whole"), samples.at(1).expect("whole")), (&[3.0][..], &[4.0, 5.0][..]));
     assert_eq!(samples.room(2), 3);

@@ -17,15 +17,15 @@ const ENDLESS: &str = "with recursive r as (select 1 n union all select n + 1 fr
 const BARREN: &str = "select count(*) from generate_series(1, 1000000) a(x) join generate_series(1, 1000000) b(y) \
                       on a.x > b.y + 2000000";
 
-async fn engine(limits: Limits) -> (tempfile::TempDir, Engine) {
+async fn engine(limits: EngineLimits) -> (tempfile::TempDir, QueryEngine) {
     let folder = tempfile::tempdir().expect("a folder");
     let url = folder.path().join("lake").display().to_string();
     let lake = Lake::open_or_create(&url, &Rig::paper(), &ReferenceSurfaces::default()).await.expect("a lake");
-    (folder, Engine::new(&lake, limits).expect("an engine"))
+    (folder, QueryEngine::new(&lake, limits).expect("an engine"))
 }
 
-fn session(engine: &Engine, quota: Quota) -> Session {
-    engine.session(&Arc::new(Client::new("somebody", quota)))
+fn session(engine: &QueryEngine, quota: QueryQuota) -> Session {
+    engine.session(&Arc::new(EngineClient::new("somebody", quota)))
 }
 
 async fn outcome(session: &Session, sql: &str) -> Result<u64, Error> {
@@ -42,9 +42,9 @@ async fn outcome(session: &Session, sql: &str) -> Result<u64, Error> {
 
 #[tokio::test]
 async fn a_query_ends_when_it_is_cancelled() {
-    let (_folder, engine) = engine(Limits::default()).await;
+    let (_folder, engine) = engine(EngineLimits::default()).await;
     for sql in [ENDLESS, BARREN] {
-        let mut answer = session(&engine, Quota::default()).query(sql).await.expect("it begins");
+        let mut answer = session(&engine, QueryQuota::default()).query(sql).await.expect("it begins");
         let handle = answer.cancel_handle();
         let reading = tokio::spawn(async move { answer.next().await.map(|_| ()) });
         tokio::time::sleep(Duration::from_millis(50)).await;
@@ -57,13 +57,13 @@ async fn a_query_ends_when_it_is_cancelled() {
 
 #[tokio::test]
 async fn time_rows_and_places_are_limited() {
-    let (_folder, engine) = engine(Limits::default()).await;
-    let brief = session(&engine, Quota { time: Some(Duration::from_millis(100)), ..Quota::default() });
+    let (_folder, engine) = engine(EngineLimits::default()).await;
+    let brief = session(&engine, QueryQuota { time: Some(Duration::from_millis(100)), ..QueryQuota::default() });
     assert!(matches!(outcome(&brief, ENDLESS).await, Err(Error::TimeLimit { .. })));
-    let few = session(&engine, Quota { rows: Some(10), ..Quota::default() });
+    let few = session(&engine, QueryQuota { rows: Some(10), ..QueryQuota::default() });
     assert!(matches!(outcome(&few, "select * from pairs").await, Err(Error::RowLimit { limit: 10 })));
     assert_eq!(outcome(&few, "select * from pairs limit 10").await.expect("ten rows"), 10);
-    let alone = session(&engine, Quota { concurrent: Some(1), ..Quota::default() });
+    let alone = session(&engine, QueryQuota { concurrent: Some(1), ..QueryQuota::default() });
     let first = alone.query(BARREN).await.expect("it begins");
     assert!(matches!(alone.query("select 1").await, Err(Error::Busy { limit: 1, .. })));
     drop(first);
@@ -76,8 +76,8 @@ async fn time_rows_and_places_are_limited() {
 
 #[tokio::test]
 async fn memory_is_limited() {
-    let (_folder, engine) = engine(Limits { memory: Some(32 << 20) }).await;
-    let session = session(&engine, Quota::default());
+    let (_folder, engine) = engine(EngineLimits { memory: Some(32 << 20) }).await;
+    let session = session(&engine, QueryQuota::default());
     // One list of all values, which cannot be spilled to disk.
     let sql = "select array_agg(x || 'abcdefghijklmnopqrstuvwxyz') from generate_series(1, 10000000) t(x)";
     let ended = outcome(&session, sql).await;
@@ -86,8 +86,8 @@ async fn memory_is_limited() {
 
 #[tokio::test]
 async fn what_does_not_end_is_found() {
-    let (_folder, engine) = engine(Limits::default()).await;
-    let session = session(&engine, Quota { time: Some(Duration::from_millis(50)), ..Quota::default() });
+    let (_folder, engine) = engine(EngineLimits::default()).await;
+    let session = session(&engine, QueryQuota { time: Some(Duration::from_millis(50)), ..QueryQuota::default() });
     assert_eq!(engine.overdue(), None);
     // One call of a function, computed while the query is planned.
     let sql = "select levenshtein(repeat('a', 60000), repeat('b', 60000))";
@@ -102,8 +102,8 @@ async fn what_does_not_end_is_found() {
 
 #[tokio::test]
 async fn an_answer_outlives_its_session() {
-    let (_folder, engine) = engine(Limits::default()).await;
-    let mut answer = session(&engine, Quota::default()).query("select * from pairs").await.expect("it begins");
+    let (_folder, engine) = engine(EngineLimits::default()).await;
+    let mut answer = session(&engine, QueryQuota::default()).query("select * from pairs").await.expect("it begins");
     drop(engine);
     let mut rows = 0;
     while let Some(batch) = answer.next().await.expect("rows") {
@@ -118,8 +118,8 @@ mod slow {
     // A stack that is too small ends the whole process, and this test with it.
     #[tokio::test]
     async fn the_longest_chains_that_pass_fit_the_stacks() {
-        let (_folder, engine) = engine(Limits::default()).await;
-        let session = session(&engine, Quota::default());
+        let (_folder, engine) = engine(EngineLimits::default()).await;
+        let session = session(&engine, QueryQuota::default());
         for (again, end) in [
             ("1 + ", "1"),
             ("x + ", "1"),

@@ -16,14 +16,14 @@ use echolake_schema::{Grid, Symmetry};
 
 /// The lookup functions of a lake.
 #[derive(Debug, Clone)]
-pub(crate) struct Lookups(Vec<Arc<ScalarUDF>>);
+pub(crate) struct LookupFunctions(Vec<Arc<ScalarUDF>>);
 
 /// Prefix of the lookup functions for columns of `pairs`.
 const OF_PAIR: &str = "pair_";
 
 /// Values of all pairs, or of all pairs under each symmetry of D4, one symmetry after the other.
 #[derive(Debug)]
-struct Lookup {
+struct LookupFunction {
     name: String,
     /// `[pairs]`, or `[symmetries * pairs]`.
     values: ArrayRef,
@@ -31,7 +31,7 @@ struct Lookup {
     signature: Signature,
 }
 
-impl Lookups {
+impl LookupFunctions {
     /// Creates the functions.
     ///
     /// # Errors
@@ -41,7 +41,7 @@ impl Lookups {
         let columns = pairs.schema();
         let own = columns.fields().iter().zip(pairs.columns()).skip(1);
         let mut all: Vec<_> = own
-            .map(|(field, values)| Lookup::new(OF_PAIR, field.name(), values.clone(), pairs.num_rows(), 1))
+            .map(|(field, values)| LookupFunction::new(OF_PAIR, field.name(), values.clone(), pairs.num_rows(), 1))
             .collect();
         all.extend(moved(lake.grid()));
         Ok(Self(all.into_iter().map(|lookup| Arc::new(ScalarUDF::from(lookup))).collect()))
@@ -59,7 +59,7 @@ impl Lookups {
     }
 }
 
-fn moved(grid: &Grid) -> Vec<Lookup> {
+fn moved(grid: &Grid) -> Vec<LookupFunction> {
     // A symmetry that the grid lacks is in no view; nulls fill its place, so that the ids stay the same.
     let moved: Vec<Option<MovedPair>> = Symmetry::ALL
         .into_iter()
@@ -86,10 +86,10 @@ fn moved(grid: &Grid) -> Vec<Lookup> {
         let speaker = axis(|g, m| g.point(m.pair.speaker).map(|p| p.position_mm), i);
         columns.extend([(format!("microphone_{name}"), microphone), (format!("speaker_{name}"), speaker)]);
     }
-    columns.into_iter().map(|(name, values)| Lookup::new("d4_", &name, values, grid.pairs().len(), 2)).collect()
+    columns.into_iter().map(|(name, values)| LookupFunction::new("d4_", &name, values, grid.pairs().len(), 2)).collect()
 }
 
-impl Lookup {
+impl LookupFunction {
     fn new(prefix: &str, name: &str, values: ArrayRef, pairs: usize, arguments: usize) -> Self {
         let signature = Signature::exact(vec![DataType::Int32; arguments], Volatility::Immutable);
         Self { name: format!("{prefix}{name}"), values, pairs, signature }
@@ -103,21 +103,21 @@ impl Lookup {
 }
 
 // The same name with other values belongs to another lake.
-impl PartialEq for Lookup {
+impl PartialEq for LookupFunction {
     fn eq(&self, other: &Self) -> bool {
         self.name == other.name && Arc::ptr_eq(&self.values, &other.values)
     }
 }
 
-impl Eq for Lookup {}
+impl Eq for LookupFunction {}
 
-impl Hash for Lookup {
+impl Hash for LookupFunction {
     fn hash<H: Hasher>(&self, state: &mut H) {
         self.name.hash(state);
     }
 }
 
-impl ScalarUDFImpl for Lookup {
+impl ScalarUDFImpl for LookupFunction {
     fn name(&self) -> &str {
         &self.name
     }

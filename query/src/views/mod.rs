@@ -25,14 +25,14 @@ use echolake_lake::Lake;
 use echolake_schema::tables::{COMMENT, Table, UNIT};
 use futures::FutureExt as _;
 
-pub(crate) use lookup::Lookups;
+pub(crate) use lookup::LookupFunctions;
 pub(crate) use pair_join::PairJoin;
 pub(crate) use sorted_nulls::SortedNulls;
 pub(crate) use unused_join::UnusedJoin;
 
 /// A view.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum View {
+pub(crate) enum LakeView {
     /// One row per measurement: geometry and samples.
     Ir,
     /// One row per measurement: TNCE in dB, with geometry.
@@ -44,9 +44,9 @@ pub(crate) enum View {
 }
 
 /// Metadata of columns by name: unit and meaning.
-type Notes = HashMap<String, HashMap<String, String>>;
+type ColumnNotes = HashMap<String, HashMap<String, String>>;
 
-impl View {
+impl LakeView {
     /// All views.
     pub(crate) const ALL: [Self; 4] = [Self::Ir, Self::TnceDb, Self::Augmented, Self::Catalogue];
 
@@ -85,7 +85,7 @@ impl View {
     }
 
     // Columns taken from the tables keep their own metadata; these are the others.
-    fn notes(self, lake: &Lake) -> Notes {
+    fn notes(self, lake: &Lake) -> ColumnNotes {
         match self {
             Self::Ir => notes_of(Table::Pairs, lake),
             Self::TnceDb => notes_of(Table::Pairs, lake).into_iter().chain(tnce_db::notes(lake.rig())).collect(),
@@ -94,14 +94,14 @@ impl View {
         }
     }
 
-    /// Plans the view over tables, which are those of [`View::tables`].
+    /// Plans the view over tables, which are those of [`LakeView::tables`].
     ///
     /// # Errors
     /// If the view does not fit the tables, which is a bug in this crate.
     pub(crate) fn over(
         self,
         lake: &Lake,
-        lookups: &Lookups,
+        lookups: &LookupFunctions,
         tables: &HashMap<Table, Arc<dyn TableProvider>>,
     ) -> Result<ViewTable> {
         let context = SessionContext::new();
@@ -120,8 +120,8 @@ impl View {
     /// Returns its schema.
     ///
     /// # Errors
-    /// As [`View::over`].
-    pub(crate) fn schema(self, lake: &Lake, lookups: &Lookups) -> Result<SchemaRef> {
+    /// As [`LakeView::over`].
+    pub(crate) fn schema(self, lake: &Lake, lookups: &LookupFunctions) -> Result<SchemaRef> {
         let empty = |table: Table| -> Result<(Table, Arc<dyn TableProvider>)> {
             let schema = table.schema(lake.rig());
             Ok((table, Arc::new(datafusion::datasource::empty::EmptyTable::new(schema))))
@@ -131,7 +131,7 @@ impl View {
     }
 }
 
-fn annotated(plan: LogicalPlan, notes: &Notes) -> Result<LogicalPlan> {
+fn annotated(plan: LogicalPlan, notes: &ColumnNotes) -> Result<LogicalPlan> {
     let column = |field: &Arc<Field>| match notes.get(field.name()) {
         Some(note) => ident(field.name()).alias_with_metadata(field.name(), Some(FieldMetadata::from(note))),
         None => ident(field.name()),
@@ -145,7 +145,7 @@ fn note(column: impl Into<String>, unit: &str, comment: impl Into<String>) -> (S
     (column.into(), HashMap::from(metadata))
 }
 
-fn notes_of(table: Table, lake: &Lake) -> Notes {
+fn notes_of(table: Table, lake: &Lake) -> ColumnNotes {
     table.schema(lake.rig()).fields().iter().map(|f| (f.name().clone(), f.metadata().clone())).collect()
 }
 

@@ -13,18 +13,18 @@ use datafusion::optimizer::optimizer::ApplyOrder;
 use datafusion::optimizer::{OptimizerConfig, OptimizerRule};
 use echolake_schema::tables::Table;
 
-use super::Lookups;
+use super::LookupFunctions;
 use crate::table::LakeTable;
 
 const KEY: &str = "pair_id";
 
 /// The rule.
 #[derive(Debug)]
-pub(crate) struct PairJoin(Lookups);
+pub(crate) struct PairJoin(LookupFunctions);
 
 impl PairJoin {
     /// Creates the rule with a lake's lookups.
-    pub(crate) fn new(lookups: &Lookups) -> Self {
+    pub(crate) fn new(lookups: &LookupFunctions) -> Self {
         Self(lookups.clone())
     }
 

@@ -11,7 +11,7 @@ use echolake_lake::{FileName, Lake, ReferenceSurfaces, VisibleRun, encode};
 use echolake_schema::tables::{COMMENT, Table, UNIT};
 use echolake_schema::{Rig, Symmetry};
 
-use super::View;
+use super::LakeView;
 use crate::{Error, Session};
 
 /// Pairs that each run of the lake measures.
@@ -99,7 +99,7 @@ async fn views_are_listed_and_every_column_says_what_it_means() {
     let (_folder, lake) = lake().await;
     let session = Session::new(&lake).expect("a session");
     let listed = "select count(*) from information_schema.tables where table_type = 'VIEW' and table_schema = 'public'";
-    assert_eq!(number(&session, listed).await, View::ALL.len() as i64);
+    assert_eq!(number(&session, listed).await, LakeView::ALL.len() as i64);
     for (name, schema) in session.tables() {
         for field in schema.fields() {
             let metadata = field.metadata();
@@ -107,7 +107,7 @@ async fn views_are_listed_and_every_column_says_what_it_means() {
             assert!(metadata.contains_key(UNIT), "{name}.{}", field.name());
         }
     }
-    for view in View::ALL {
+    for view in LakeView::ALL {
         let answer = rows(&session, &format!("select * from {}", view.name())).await;
         assert_eq!(answer.num_rows(), 0);
     }

@@ -10,7 +10,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use echolake_lake::Lake;
-use echolake_query::{Client, Engine, Limits, Quota};
+use echolake_query::{EngineClient, EngineLimits, QueryEngine, QueryQuota};
 use futures::FutureExt as _;
 use tokio::net::UnixListener;
 use tokio::sync::oneshot;
@@ -58,7 +58,7 @@ pub async fn run_engine(lake: &Lake, sockets: &Path, memory: Option<usize>) -> R
     let http = EngineSocket::Http.listen(sockets)?;
     let flight_sql = EngineSocket::FlightSql.listen(sockets)?;
     let postgres = EngineSocket::Postgres.listen(sockets)?;
-    let engine = Engine::new(lake, Limits { memory })?;
+    let engine = QueryEngine::new(lake, EngineLimits { memory })?;
     warm_up(&engine).await?;
     EngineReport::Ready.send();
     // The door went away before it had a use for this engine.
@@ -92,8 +92,8 @@ fn read_assignment() -> oneshot::Receiver<ClientIdentity> {
     receive
 }
 
-async fn warm_up(engine: &Engine) -> Result<(), Error> {
-    let session = engine.session(&Arc::new(Client::new("warm-up", Quota::default())));
+async fn warm_up(engine: &QueryEngine) -> Result<(), Error> {
+    let session = engine.session(&Arc::new(EngineClient::new("warm-up", QueryQuota::default())));
     // A defect of the lake is reported to each client that queries it.
     let answer = async { session.query(WARM_UP).await?.next().await };
     drop(answer.boxed().await);

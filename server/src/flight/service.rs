@@ -23,7 +23,7 @@ use arrow_flight::{
 };
 use bytes::Bytes;
 use datafusion::common::{ParamValues, ScalarValue};
-use echolake_query::{Client, Error as QueryError, Prepared, Session};
+use echolake_query::{EngineClient, Error as QueryError, PreparedQuery, Session};
 use futures::{Stream, StreamExt as _, stream};
 use prost::Message as _;
 use tonic::metadata::MetadataValue;
@@ -59,11 +59,11 @@ impl LakeFlightService {
         Ok(Self { service, statements: HeldStatements::default(), sql_info: info::sql_info()?, types: info::types()? })
     }
 
-    fn client(&self) -> Result<Arc<Client>, Status> {
+    fn client(&self) -> Result<Arc<EngineClient>, Status> {
         self.service.client(TokenScope::Sql).map_err(|fault| status(&fault))
     }
 
-    async fn plan(&self, client: &Arc<Client>, sql: String) -> Result<HeldStatement, Status> {
+    async fn plan(&self, client: &Arc<EngineClient>, sql: String) -> Result<HeldStatement, Status> {
         let (session, sql): (_, Arc<str>) = (Arc::new(self.service.session(client)), sql.into());
         let prepared = self.prepare(&session, &sql).await?;
         let values = ParamValues::from(Vec::<ScalarValue>::new());
@@ -71,14 +71,14 @@ impl LakeFlightService {
         Ok(HeldStatement { session, sql, prepared, planned, schema, values, stop: StopSignal::new() })
     }
 
-    async fn prepare(&self, session: &Arc<Session>, sql: &Arc<str>) -> Result<Arc<Prepared>, Status> {
+    async fn prepare(&self, session: &Arc<Session>, sql: &Arc<str>) -> Result<Arc<PreparedQuery>, Status> {
         let (planner, sql) = (session.clone(), sql.clone());
         let planned = self.service.plan(session.client(), async move { Ok(planner.prepare(&sql).await?) }).await;
         Ok(Arc::new(planned.map_err(|f| status(&f))?))
     }
 
     // The statement of a handle. An engine that replaced another one plans it again, without bound values.
-    async fn find(&self, client: &Arc<Client>, handle: &[u8]) -> Result<HeldStatement, Status> {
+    async fn find(&self, client: &Arc<EngineClient>, handle: &[u8]) -> Result<HeldStatement, Status> {
         let lost = match self.statements.find(client.name(), handle) {
             Ok(found) => return Ok(found),
             Err(fault) => status(&fault),
@@ -90,7 +90,7 @@ impl LakeFlightService {
     }
 
     // A statement of a client's handle, for a run of its own on today's lake.
-    async fn prepared(&self, client: &Arc<Client>, handle: &[u8]) -> Result<HeldStatement, Status> {
+    async fn prepared(&self, client: &Arc<EngineClient>, handle: &[u8]) -> Result<HeldStatement, Status> {
         let found = self.find(client, handle).await?;
         let mut statement = HeldStatement { stop: StopSignal::new(), ..found };
         if statement.planned.elapsed() >= FRESH {
@@ -125,7 +125,7 @@ impl LakeFlightService {
         answer::run(schema, running).await.map_err(|f| status(&f))
     }
 
-    fn cancel(&self, client: &Client, info: &FlightInfo) -> Result<(), Status> {
+    fn cancel(&self, client: &EngineClient, info: &FlightInfo) -> Result<(), Status> {
         for endpoint in &info.endpoint {
             let ticket = endpoint.ticket.as_ref().map(|t| t.ticket.clone()).unwrap_or_default();
             let handle = Any::decode(ticket).ok().and_then(|any| any.unpack::<TicketStatementQuery>().ok().flatten());

@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 use arrow::datatypes::SchemaRef;
 use bytes::Bytes;
 use datafusion::common::ParamValues;
-use echolake_query::{Prepared, Session};
+use echolake_query::{PreparedQuery, Session};
 
 use crate::fault::RequestFault;
 use crate::running::StopSignal;
@@ -29,7 +29,7 @@ pub(super) struct HeldStatement {
     /// The session it was planned in; its client owns the handle.
     pub(super) session: Arc<Session>,
     pub(super) sql: Arc<str>,
-    pub(super) prepared: Arc<Prepared>,
+    pub(super) prepared: Arc<PreparedQuery>,
     /// Time of planning: it sees the lake as of then.
     pub(super) planned: Instant,
     /// Columns as they were announced to the client.

@@ -8,13 +8,13 @@ use arrow_flight::decode::FlightRecordBatchStream;
 use arrow_flight::error::FlightError;
 use arrow_flight::sql::server::PeekableFlightDataStream;
 use datafusion::common::{ParamValues, ScalarValue};
-use echolake_query::Prepared;
+use echolake_query::PreparedQuery;
 use futures::TryStreamExt as _;
 
 use crate::fault::RequestFault;
 
 /// The placeholders as columns.
-pub(super) fn parameter_schema(prepared: &Prepared) -> Result<Schema, RequestFault> {
+pub(super) fn parameter_schema(prepared: &PreparedQuery) -> Result<Schema, RequestFault> {
     let fields = prepared.parameters()?.into_iter().enumerate().map(|(i, kind)| {
         let kind = kind.unwrap_or(DataType::Null);
         Field::new(format!("${}", i + 1), kind, true)
@@ -36,7 +36,10 @@ fn uncompressed(message: FlightData) -> Result<FlightData, FlightError> {
 }
 
 /// The values that a client puts.
-pub(super) async fn read(stream: PeekableFlightDataStream, prepared: &Prepared) -> Result<ParamValues, RequestFault> {
+pub(super) async fn read(
+    stream: PeekableFlightDataStream,
+    prepared: &PreparedQuery,
+) -> Result<ParamValues, RequestFault> {
     let wrong = |e: FlightError| RequestFault::request(format!("the values cannot be read: {e}"));
     let data = stream.into_peekable().map_err(|status| FlightError::Tonic(Box::new(status)));
     let data = data.and_then(async |message| uncompressed(message));

@@ -8,31 +8,31 @@ use arrow::datatypes::SchemaRef;
 use arrow::record_batch::RecordBatch;
 use axum::http::{HeaderMap, header};
 use bytes::Bytes;
-use echolake_query::output::{AnswerWriter, Format};
+use echolake_query::output::{AnswerFormat, AnswerWriter};
 
 use crate::fault::RequestFault;
 use crate::running::AnswerEncoder;
 
 /// The formats of answers, each with its media types, the first of them ours.
-const FORMATS: [(Format, &[&str]); 4] = [
-    (Format::Json, &["application/json", "application/*", "*/*"]),
-    (Format::Arrow, &["application/vnd.apache.arrow.stream"]),
-    (Format::Csv, &["text/csv", "text/*"]),
-    (Format::Parquet, &["application/vnd.apache.parquet", "application/x-parquet"]),
+const FORMATS: [(AnswerFormat, &[&str]); 4] = [
+    (AnswerFormat::Json, &["application/json", "application/*", "*/*"]),
+    (AnswerFormat::Arrow, &["application/vnd.apache.arrow.stream"]),
+    (AnswerFormat::Csv, &["text/csv", "text/*"]),
+    (AnswerFormat::Parquet, &["application/vnd.apache.parquet", "application/x-parquet"]),
 ];
 
 /// The format of this name.
-pub(super) fn named(name: &str) -> Result<Format, RequestFault> {
+pub(super) fn named(name: &str) -> Result<AnswerFormat, RequestFault> {
     let known = FORMATS.iter().map(|(format, _)| *format);
     known.clone().find(|f| f.name() == name).ok_or_else(|| {
-        let names: Vec<_> = known.map(Format::name).collect();
+        let names: Vec<_> = known.map(AnswerFormat::name).collect();
         RequestFault::request(format!("no format `{name}`; hint: {}", names.join(", ")))
     })
 }
 
 /// The format that an `Accept` header likes best.
-pub(super) fn accepted(accept: &str) -> Result<Format, RequestFault> {
-    let mut best: Option<(f32, Format)> = None;
+pub(super) fn accepted(accept: &str) -> Result<AnswerFormat, RequestFault> {
+    let mut best: Option<(f32, AnswerFormat)> = None;
     for range in accept.split(',') {
         let mut parts = range.split(';').map(str::trim);
         let kind = parts.next().unwrap_or_default().to_ascii_lowercase();
@@ -53,7 +53,7 @@ pub(super) fn accepted(accept: &str) -> Result<Format, RequestFault> {
 /// Returns whether an Arrow stream is preferred to JSON.
 pub(super) fn prefers_arrow(headers: &HeaderMap) -> bool {
     let accept = headers.get(header::ACCEPT).and_then(|v| v.to_str().ok()).unwrap_or_default();
-    accepted(accept).is_ok_and(|format| format == Format::Arrow)
+    accepted(accept).is_ok_and(|format| format == AnswerFormat::Arrow)
 }
 
 /// Returns whether the client accepts an encoding of HTTP.
@@ -66,7 +66,7 @@ pub(super) fn takes(headers: &HeaderMap, encoding: &str) -> bool {
 }
 
 /// The media type of a format.
-pub(super) fn media_type(format: Format) -> &'static str {
+pub(super) fn media_type(format: AnswerFormat) -> &'static str {
     FORMATS.iter().find(|(known, _)| *known == format).map_or("application/octet-stream", |(_, types)| types[0])
 }
 
@@ -99,7 +99,7 @@ impl Write for SharedBuffer {
 
 impl FormatEncoder {
     /// Begins an answer of this schema.
-    pub(super) fn new(format: Format, schema: &SchemaRef) -> Result<Self, RequestFault> {
+    pub(super) fn new(format: AnswerFormat, schema: &SchemaRef) -> Result<Self, RequestFault> {
         let written = SharedBuffer::default();
         Ok(Self { writer: AnswerWriter::new(format, schema, written.clone())?, written })
     }
@@ -126,12 +126,12 @@ mod tests {
     #[test]
     fn the_best_liked_format_is_chosen() {
         for (accept, expected) in [
-            ("*/*", Some(Format::Json)),
-            ("text/csv", Some(Format::Csv)),
-            ("text/html,application/xhtml+xml,*/*;q=0.8", Some(Format::Json)),
-            ("application/json;q=0.1, application/vnd.apache.arrow.stream", Some(Format::Arrow)),
-            ("text/csv;q=0.5, application/vnd.apache.parquet;q=0.9", Some(Format::Parquet)),
-            ("TEXT/CSV; charset=utf-8", Some(Format::Csv)),
+            ("*/*", Some(AnswerFormat::Json)),
+            ("text/csv", Some(AnswerFormat::Csv)),
+            ("text/html,application/xhtml+xml,*/*;q=0.8", Some(AnswerFormat::Json)),
+            ("application/json;q=0.1, application/vnd.apache.arrow.stream", Some(AnswerFormat::Arrow)),
+            ("text/csv;q=0.5, application/vnd.apache.parquet;q=0.9", Some(AnswerFormat::Parquet)),
+            ("TEXT/CSV; charset=utf-8", Some(AnswerFormat::Csv)),
             ("text/html", None),
             ("application/json;q=0", None),
             ("", None),

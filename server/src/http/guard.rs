@@ -11,7 +11,7 @@ use axum::http::uri::Authority;
 use axum::http::{HeaderMap, HeaderName, HeaderValue, Uri, header};
 use axum::middleware::Next;
 use axum::response::{IntoResponse as _, Response};
-use echolake_query::Client;
+use echolake_query::EngineClient;
 
 use super::problem::ProblemResponse;
 use super::ranges::POLICY;
@@ -23,7 +23,7 @@ use crate::tokens::{TokenAccess, TokenScope, of_header};
 const FETCH_SITE: HeaderName = HeaderName::from_static("sec-fetch-site");
 
 /// A client that is authorised for SQL.
-pub(super) struct MayQuery(pub(super) Arc<Client>);
+pub(super) struct MayQuery(pub(super) Arc<EngineClient>);
 
 /// The cookie of a browser's session.
 pub(super) const COOKIE: &str = "echolake";

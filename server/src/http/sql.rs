@@ -8,7 +8,7 @@ use axum::extract::{Query, State};
 use axum::http::{HeaderMap, StatusCode, header};
 use axum::response::{IntoResponse as _, Response};
 use bytes::Bytes;
-use echolake_query::output::Format;
+use echolake_query::output::AnswerFormat;
 use futures::stream;
 use serde::Deserialize;
 
@@ -99,10 +99,10 @@ fn asked(headers: &HeaderMap, body: &[u8]) -> Result<Asked, RequestFault> {
     }
 }
 
-fn format(headers: &HeaderMap, name: Option<String>) -> Result<Format, RequestFault> {
+fn format(headers: &HeaderMap, name: Option<String>) -> Result<AnswerFormat, RequestFault> {
     match (name, headers.get(header::ACCEPT).and_then(|v| v.to_str().ok())) {
         (Some(name), _) => named(&name),
         (None, Some(accept)) => accepted(accept),
-        (None, None) => Ok(Format::Json),
+        (None, None) => Ok(AnswerFormat::Json),
     }
 }

@@ -22,7 +22,7 @@ use datafusion_pg_catalog::pg_catalog::context::{PgCatalogContextProvider, Role}
 use datafusion_pg_catalog::pg_catalog::generate_series_arg_coercion::CoerceIntArgsToBigInt;
 use datafusion_pg_catalog::pg_catalog::oid_type_planner::PgOidTypePlanner;
 use datafusion_pg_catalog::pg_catalog::{ArrowTable, PgCatalogSchemaProvider, PgCatalogStaticTables};
-use echolake_query::{Extend, Function};
+use echolake_query::{ContextExtension, SqlFunction};
 
 use super::functions;
 use super::information::InformationSchema;
@@ -53,7 +53,7 @@ pub(super) struct PgCatalog {
 
 impl PgCatalog {
     /// For a lake of these tables, and the field's functions.
-    pub(super) fn new(tables: Vec<(&'static str, SchemaRef)>, own: Vec<Function>) -> Result<Self, Error> {
+    pub(super) fn new(tables: Vec<(&'static str, SchemaRef)>, own: Vec<SqlFunction>) -> Result<Self, Error> {
         let fixed = Arc::new(PgCatalogStaticTables::try_new()?);
         let keywords = fixed.pg_get_keywords.clone();
         let names = TableNames(Arc::new(tables.into_iter().collect()));
@@ -68,7 +68,7 @@ impl PgCatalog {
     }
 
     /// For a session of these settings.
-    pub(super) fn extend(&self, settings: &Arc<SessionSettings>) -> Extend {
+    pub(super) fn extend(&self, settings: &Arc<SessionSettings>) -> ContextExtension {
         let (pg, own) = (self.clone(), functions::of_settings(settings));
         Arc::new(move |context| pg.register(context, &own))
     }
@@ -160,7 +160,7 @@ fn only_utc() -> Result<Arc<dyn TableProvider>, DataFusionError> {
     Ok(Arc::new(ViewTable::new(plan, None)))
 }
 
-fn own_functions(functions: &[Function]) -> Result<Arc<dyn TableProvider>, DataFusionError> {
+fn own_functions(functions: &[SqlFunction]) -> Result<Arc<dyn TableProvider>, DataFusionError> {
     let numbers: ArrayRef = Arc::new(Int32Array::from_iter_values(OWN_NUMBERS..OWN_NUMBERS + functions.len() as i32));
     let names: ArrayRef = Arc::new(StringArray::from_iter_values(functions.iter().map(|f| &f.name)));
     let rows = RecordBatch::try_from_iter([(OWN_NUMBER, numbers), (OWN_NAME, names)])?;

@@ -7,7 +7,7 @@ use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
 use bytes::Bytes;
 use datafusion::common::ParamValues;
 use datafusion_pg_catalog::sql::PostgresCompatibilityParser;
-use echolake_query::{Client, Session};
+use echolake_query::{EngineClient, Session};
 use futures::FutureExt as _;
 use futures::future::BoxFuture;
 use pgwire::api::Type;
@@ -120,7 +120,7 @@ impl PostgresConnection {
     }
 
     /// Logs a client in; returns what a CancelRequest must show. `wide` keys are of protocol 3.2.
-    pub(super) fn log_in(&self, client: &Arc<Client>, wide: bool) -> Result<(i32, SecretKey), RequestFault> {
+    pub(super) fn log_in(&self, client: &Arc<EngineClient>, wide: bool) -> Result<(i32, SecretKey), RequestFault> {
         let mut secret = [0; 32];
         getrandom::fill(&mut secret).map_err(|failed| {
             eprintln!("no random bytes: {failed}");

@@ -11,7 +11,7 @@ use datafusion::sql::sqlparser::ast::{
 use datafusion::sql::sqlparser::dialect::PostgreSqlDialect;
 use datafusion::sql::sqlparser::parser::Parser;
 use datafusion_pg_catalog::sql::PostgresCompatibilityParser;
-use echolake_query::{Error as QueryError, Opaque, Prepared, Session, check_statement_bounds};
+use echolake_query::{Error as QueryError, OpaqueValue, PreparedQuery, Session, check_statement_bounds};
 use pgwire::api::Type;
 
 use super::copy::{self, CopyAs};
@@ -23,20 +23,20 @@ const TOGETHER: usize = 100;
 
 /// A planned query.
 pub(super) struct PlannedQuery {
-    pub(super) prepared: Arc<Prepared>,
+    pub(super) prepared: Arc<PreparedQuery>,
     pub(super) at: Instant,
-    statement: Opaque<Parsed>,
+    statement: OpaqueValue<Parsed>,
     sql: Arc<str>,
 }
 
 impl PlannedQuery {
     async fn new(session: &Session, sql: &Arc<str>, statement: Parsed) -> Result<Arc<Self>, RequestFault> {
         let prepared = Arc::new(session.prepare_statement(sql, statement.clone()).await?);
-        Ok(Arc::new(Self { prepared, at: Instant::now(), statement: Opaque::new(statement), sql: sql.clone() }))
+        Ok(Arc::new(Self { prepared, at: Instant::now(), statement: OpaqueValue::new(statement), sql: sql.clone() }))
     }
 
     /// The same on today's lake.
-    pub(super) async fn again(&self, session: &Session) -> Result<Prepared, QueryError> {
+    pub(super) async fn again(&self, session: &Session) -> Result<PreparedQuery, QueryError> {
         session.prepare_statement(&self.sql, Parsed::clone(&self.statement)).await
     }
 }

@@ -2,7 +2,7 @@
 
 use std::fmt::Write as _;
 
-use echolake_ingest::doctor::{Finding, Report, Severity, examine};
+use echolake_ingest::doctor::{FindingSeverity, LakeFinding, LakeReport, examine};
 use echolake_lake::Lake;
 
 use crate::CommandOutcome;
@@ -27,18 +27,18 @@ pub(super) async fn run(json: bool, lake_url: &str) -> anyhow::Result<CommandOut
     Ok(if report.is_damaged() { CommandOutcome::WithLoss } else { CommandOutcome::Whole })
 }
 
-fn text(lake: &Lake, report: &Report) -> String {
+fn text(lake: &Lake, report: &LakeReport) -> String {
     let mut out = format!("lake {}, rig {}\n", lake.location(), lake.rig().name);
     let _ = writeln!(out, "{} runs, {} in run files\n", report.runs, size(report.run_bytes));
     let _ = writeln!(out, "{:<14} {:>6} {:>10} {:>10}", "table", "files", "rows", "size");
     for t in &report.tables {
         let _ = writeln!(out, "{:<14} {:>6} {:>10} {:>10}", t.table, t.files, t.rows, size(t.bytes));
     }
-    for Finding { severity, subject, what } in &report.findings {
+    for LakeFinding { severity, subject, what } in &report.findings {
         let word = match severity {
-            Severity::Damaged => "damaged",
-            Severity::Missing => "missing",
-            Severity::Note => "note",
+            FindingSeverity::Damaged => "damaged",
+            FindingSeverity::Missing => "missing",
+            FindingSeverity::Note => "note",
         };
         let _ = write!(out, "\n{word}: {subject}: {what}");
     }

@@ -11,7 +11,7 @@ use std::time::Instant;
 use anyhow::Context as _;
 use echolake_lake::Lake;
 use echolake_query::Session;
-use echolake_query::output::Format;
+use echolake_query::output::AnswerFormat;
 use echolake_schema::tables::{COMMENT, UNIT};
 use rustyline::config::Configurer as _;
 use rustyline::error::ReadlineError;
@@ -27,7 +27,7 @@ const HISTORY: usize = 10_000;
 
 /// The form of answers.
 struct PromptSettings {
-    format: Format,
+    format: AnswerFormat,
     /// File for the next answer alone, instead of the terminal.
     output: Option<PathBuf>,
     timing: bool,
@@ -48,7 +48,7 @@ pub(super) async fn run(session: &Session, lake: &Lake) -> anyhow::Result<()> {
     // Held from before the greeting on, so that Ctrl-C never ends the prompt.
     let _interrupts = interrupt_signal()?;
     eprintln!("lake {}; \\? for help", lake.location());
-    let mut settings = PromptSettings { format: Format::Table, output: None, timing: false, pager: true };
+    let mut settings = PromptSettings { format: AnswerFormat::Table, output: None, timing: false, pager: true };
     let mut begun = String::new();
     loop {
         let line = match editor.readline(if begun.is_empty() { "echolake> " } else { "      ..> " }) {

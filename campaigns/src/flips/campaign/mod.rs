@@ -10,7 +10,7 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Context as _, Result, ensure};
 use echolake_acquisition::controller::RecordingMode;
-use echolake_ingest::{Inspected, Inspection, inspect};
+use echolake_ingest::{InspectedMeasurement, RunInspection, inspect};
 use echolake_lake::{Lake, ReferenceSurfaces};
 use object_store::memory::InMemory;
 use object_store::path::Path;
@@ -75,9 +75,9 @@ pub(crate) struct FlipSummary {
 /// A specimen and what ingest makes of it undamaged.
 struct TestSubject {
     specimen: FlipSpecimen,
-    whole: Inspection,
+    whole: RunInspection,
     /// Results of ingest from the recorded responses: they are taken if their sweeps cannot be read.
-    from_responses: Vec<Inspected>,
+    from_responses: Vec<InspectedMeasurement>,
 }
 
 /// Runs the campaign; `progress` is called after each round.
@@ -126,7 +126,7 @@ pub(crate) async fn run(settings: FlipSettings, progress: &mut dyn FnMut(u64)) -
 }
 
 /// Reads a file as ingest does. The outer error is a hang or a panic, the inner one a refusal.
-async fn read(lake: &Lake, bytes: bytes::Bytes) -> Result<echolake_ingest::Result<Inspection>> {
+async fn read(lake: &Lake, bytes: bytes::Bytes) -> Result<echolake_ingest::Result<RunInspection>> {
     let panics = PANICS.load(Ordering::Relaxed);
     let lake = lake.clone();
     let task = tokio::spawn(async move {
@@ -197,12 +197,12 @@ impl TestSubject {
     }
 
     /// Checks that all returned measurements and readings are the measured ones, bit for bit and once.
-    fn unaltered(&self, inspection: &Inspection) -> Result<()> {
+    fn unaltered(&self, inspection: &RunInspection) -> Result<()> {
         let mut pairs = BTreeSet::new();
         for measured in &inspection.measurements {
-            let same = |m: &&Inspected| m.pair == measured.pair && m.attempt == measured.attempt;
+            let same = |m: &&InspectedMeasurement| m.pair == measured.pair && m.attempt == measured.attempt;
             ensure!(self.whole.measurements.iter().any(|m| same(&m)), "pair {} is new", measured.pair);
-            let bits = |m: &Inspected| m.ir.iter().map(|x| x.to_bits()).collect::<Vec<_>>();
+            let bits = |m: &InspectedMeasurement| m.ir.iter().map(|x| x.to_bits()).collect::<Vec<_>>();
             let mut made = self.whole.measurements.iter().chain(&self.from_responses).filter(same);
             ensure!(made.any(|m| bits(m) == bits(measured)), "pair {} is another than was measured", measured.pair);
             ensure!(pairs.insert(measured.pair), "pair {} is there twice", measured.pair);
@@ -216,10 +216,10 @@ impl TestSubject {
     }
 
     /// Checks that measurements in chunks without damage, verdict and sweep or response, are returned.
-    fn untouched(&self, damaged: &DamagedFile, inspection: &Inspection, tally: &mut OutcomeTally) -> Result<()> {
+    fn untouched(&self, damaged: &DamagedFile, inspection: &RunInspection, tally: &mut OutcomeTally) -> Result<()> {
         let whole = || self.specimen.chunks.iter().filter(|c| damaged.keeps(&c.range));
         let returned: BTreeSet<_> = inspection.measurements.iter().map(|m| (m.pair, m.attempt)).collect();
-        let expected = |m: &&Inspected| {
+        let expected = |m: &&InspectedMeasurement| {
             let key = (m.pair, m.attempt);
             whole().any(|c| c.verdicts.contains(&key)) && whole().any(|c| c.responses.contains(&key))
         };
@@ -241,7 +241,7 @@ impl TestSubject {
 }
 
 /// Makes the checks that are left if the CRC vouches for damaged bytes.
-fn plausible(inspection: &Inspection) -> Result<()> {
+fn plausible(inspection: &RunInspection) -> Result<()> {
     let length = specimen::rig().impulse_response.length;
     for m in &inspection.measurements {
         ensure!(m.ir.len() == length, "pair {} has {} samples", m.pair, m.ir.len());

@@ -6,7 +6,7 @@ use std::sync::Arc;
 use arrow::record_batch::RecordBatch;
 use datafusion::common::{ParamValues, ScalarValue};
 use echolake_lake::VisibleRun;
-use echolake_query::output::Format;
+use echolake_query::output::AnswerFormat;
 use echolake_schema::{RunId, SurfaceId};
 use serde::de::DeserializeOwned;
 
@@ -99,7 +99,7 @@ impl CatalogueRequest {
         sql: &str,
         values: Vec<ScalarValue>,
     ) -> Result<Vec<T>, RequestFault> {
-        let mut running = self.begin(sql, values, |schema| FormatEncoder::new(Format::Json, schema)).await?;
+        let mut running = self.begin(sql, values, |schema| FormatEncoder::new(AnswerFormat::Json, schema)).await?;
         let mut json = Vec::new();
         while let Some(part) = running.next().await? {
             json.extend_from_slice(&part);

@@ -5,7 +5,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
 use echolake_lake::{DataFile, LakeSnapshot};
-use echolake_query::{Client, Prepared, Quota, Session};
+use echolake_query::{EngineClient, PreparedQuery, QueryQuota, Session};
 use echolake_schema::tables::Table;
 use object_store::path::Path as StorePath;
 use sha2::{Digest as _, Sha256};
@@ -33,8 +33,8 @@ pub(in super::super) struct SnapshotView {
     pub(super) answers: AnswerCache,
     pub(super) summary: OnceCell<CatalogueSummary>,
     pub(super) places: OnceCell<SurfacePositions>,
-    /// Prepared queries by their text; there are few texts, because values are bound.
-    prepared: Mutex<HashMap<String, Arc<Prepared>>>,
+    /// PreparedQuery queries by their text; there are few texts, because values are bound.
+    prepared: Mutex<HashMap<String, Arc<PreparedQuery>>>,
 }
 
 impl SnapshotView {
@@ -55,11 +55,11 @@ impl SnapshotView {
         format!("\"{}{}\"", self.version, if as_arrow { "-arrow" } else { "" })
     }
 
-    pub(super) fn prepared(&self, sql: &str) -> Option<Arc<Prepared>> {
+    pub(super) fn prepared(&self, sql: &str) -> Option<Arc<PreparedQuery>> {
         self.prepared.lock().unwrap_or_else(PoisonError::into_inner).get(sql).cloned()
     }
 
-    pub(super) fn keep_prepared(&self, sql: &str, prepared: Arc<Prepared>) {
+    pub(super) fn keep_prepared(&self, sql: &str, prepared: Arc<PreparedQuery>) {
         self.prepared.lock().unwrap_or_else(PoisonError::into_inner).insert(sql.to_owned(), prepared);
     }
 }
@@ -160,6 +160,6 @@ fn gone(before: &LakeSnapshot, after: &LakeSnapshot) -> Vec<VisibleFile> {
 
 // The client was authorised before; the quota of its own queries does not apply to these.
 fn session(service: &QueryService) -> Arc<Session> {
-    let quota = Quota { time: Some(LONGEST), ..Quota::default() };
-    Arc::new(service.session(&Arc::new(Client::new("catalogue", quota))))
+    let quota = QueryQuota { time: Some(LONGEST), ..QueryQuota::default() };
+    Arc::new(service.session(&Arc::new(EngineClient::new("catalogue", quota))))
 }

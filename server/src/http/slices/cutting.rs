@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 use bytes::Bytes;
 use echolake_export::{Slice, SliceParams};
 use echolake_lake::LakeSnapshot;
-use echolake_query::{Client, Error as QueryError};
+use echolake_query::{EngineClient, Error as QueryError};
 use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc};
 use tokio::task::JoinSet;
 
@@ -38,7 +38,7 @@ impl SliceTask {
     /// Begins, in one of its client's places.
     pub(super) fn begin(
         service: &QueryService,
-        client: &Arc<Client>,
+        client: &Arc<EngineClient>,
         snapshot: Arc<LakeSnapshot>,
         params: SliceParams,
         room: SliceResources,

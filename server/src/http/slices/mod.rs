@@ -19,7 +19,7 @@ use axum::http::{HeaderMap, Method, Uri};
 use axum::response::Response;
 use axum::routing::get;
 use echolake_export::{Check, SliceParams, Taken};
-use echolake_query::{Client, PredicateForm};
+use echolake_query::{EngineClient, PredicateForm};
 use futures::stream;
 use tokio::sync::Semaphore;
 
@@ -75,7 +75,7 @@ pub(super) fn for_viewers(catalogue: &LakeCatalogue) -> Router {
 
 /// An authorised request for a slice.
 struct SliceRequest {
-    client: Arc<Client>,
+    client: Arc<EngineClient>,
     view: Arc<SnapshotView>,
     question: SliceQuery,
 }

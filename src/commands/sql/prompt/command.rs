@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use echolake_query::output::Format;
+use echolake_query::output::AnswerFormat;
 
 /// The text that `\?` prints.
 pub(super) const HELP: &str = "\
@@ -27,7 +27,7 @@ pub(super) enum PromptCommand {
     /// Page, or do not.
     Pager,
     /// The format of answers.
-    Format(Format),
+    Format(AnswerFormat),
     /// The file for the next answer.
     Output(Option<PathBuf>),
     /// List the tables.
@@ -49,8 +49,8 @@ pub(super) fn parse(line: &str) -> Option<Result<PromptCommand, String>> {
         "\\?" | "\\h" | "help" if name.is_none() => PromptCommand::Help,
         "\\timing" => PromptCommand::Timing,
         "\\pager" | "\\pset" => PromptCommand::Pager,
-        "\\f" | "\\format" => match Format::ALL.into_iter().find(|f| f.name().eq_ignore_ascii_case(rest)) {
-            Some(format) => PromptCommand::Format(format),
+        "\\f" | "\\format" => match AnswerFormat::ALL.into_iter().find(|f| f.name().eq_ignore_ascii_case(rest)) {
+            Some(format) => PromptCommand::AnswerFormat(format),
             None => return Some(Err(format!("no format `{rest}`; hint: table, csv, json, parquet or arrow"))),
         },
         "\\o" => PromptCommand::Output(name.map(PathBuf::from)),
@@ -70,7 +70,7 @@ mod tests {
         assert_eq!(parse("\\d  runs;"), Some(Ok(PromptCommand::Columns("runs".to_owned()))));
         assert_eq!(parse("\\d"), Some(Ok(PromptCommand::Tables)));
         assert_eq!(parse("  quit "), Some(Ok(PromptCommand::Quit)));
-        assert_eq!(parse("\\f CSV"), Some(Ok(PromptCommand::Format(Format::Csv))));
+        assert_eq!(parse("\\f CSV"), Some(Ok(PromptCommand::AnswerFormat(AnswerFormat::Csv))));
         assert_eq!(parse("\\o a b.csv"), Some(Ok(PromptCommand::Output(Some("a b.csv".into())))));
         assert_eq!(parse("select 1;"), None);
         assert_eq!(parse(""), None);
