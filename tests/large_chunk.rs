@@ -1,6 +1,6 @@
 //! A run file with a chunk that is larger than any that is read: whoever reads it says so in the same words.
 
-use super::{Place, stderr};
+use super::{TestFolder, stderr};
 
 /// Bytes of the chunk before compression.
 const CHUNK_BYTES: u64 = 300 << 20;
@@ -53,7 +53,10 @@ fn with_large_chunk(file: &[u8]) -> Vec<u8> {
     }
     let place = [(data.len() as u64).to_le_bytes(), (chunk.len() as u64).to_le_bytes()].concat();
     let sizes = [compressed.to_le_bytes(), CHUNK_BYTES.to_le_bytes()].concat();
-    index.extend(record(0x08, &[&times[..], &place, &[0; 4], &[0; 8], &text("zstd"), &sizes].concat()));
+    // It has messages of every topic, as the index tells it.
+    let channels: Vec<_> = summary.channels.keys().flat_map(|id| [&id.to_le_bytes()[..], &[0; 8]].concat()).collect();
+    let channels = [&(channels.len() as u32).to_le_bytes()[..], &channels].concat();
+    index.extend(record(0x08, &[&times[..], &place, &channels, &[0; 8], &text("zstd"), &sizes].concat()));
     data.extend(chunk);
     data.extend(record(0x0F, &[0; 4]));
     let summary_start = (data.len() as u64).to_le_bytes();
@@ -63,7 +66,7 @@ fn with_large_chunk(file: &[u8]) -> Vec<u8> {
 
 #[test]
 fn all_readers_refuse_a_chunk_of_300_mib_in_the_same_words() {
-    let place = Place::new();
+    let place = TestFolder::new();
     let path = place.acquire("flat", &["--seed", "1"]);
     let file = std::fs::read(&path).expect("the run");
     std::fs::write(&path, with_large_chunk(&file)).expect("written");

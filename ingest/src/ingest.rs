@@ -135,7 +135,7 @@ impl<'a> LakeIngest<'a> {
         let ended = &mut |(source, done): pipeline::JobOutcome<RunSource, IngestedRun>| match done {
             Ok((taken, outcome)) => {
                 let outcome = IngestOutcome::from(outcome == Some(CommitOutcome::Now));
-                report(FileReport::IngestedRun(IngestedRun { outcome, ..taken }));
+                report(FileReport::Taken(IngestedRun { outcome, ..taken }));
                 Ok(())
             }
             Err(why) if why.is_refusal() => {

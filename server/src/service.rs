@@ -44,7 +44,7 @@ pub(crate) enum QueryWork {
     /// A text.
     Sql(String),
     /// A prepared plan, with values for its placeholders.
-    PreparedQuery(Arc<PreparedQuery>, ParamValues),
+    Prepared(Arc<PreparedQuery>, ParamValues),
 }
 
 /// A query to run.

@@ -5,7 +5,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use super::*;
 use crate::recorder::Held;
 use crate::relief::PanelRelief;
-use crate::run::{RunRequest, Specimen, resume};
+use crate::run::{PanelSpecimen, RunRequest, resume};
 use crate::simulate::simulate;
 use echolake_recording::prove_file;
 

@@ -9,7 +9,7 @@ use echolake_acquisition::collection::{CollectionSurface, collection};
 use echolake_acquisition::controller::RecordingMode;
 use echolake_acquisition::run::{PanelSpecimen, RunRequest};
 use echolake_acquisition::simulate::simulate;
-use echolake_ingest::{Ingest, Report as Told, complete, pending};
+use echolake_ingest::{FileReport as Told, LakeIngest, complete, pending};
 use echolake_lake::{Lake, ReferenceSurfaces};
 use echolake_schema::manifest::RunEnd;
 use echolake_schema::{Rig, Timestamp};

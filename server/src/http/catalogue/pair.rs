@@ -11,7 +11,7 @@ use super::content::AnswerContent;
 use super::curves::{CurveSet, PairSelection};
 use super::environment::{AirReading, AirSeries};
 use super::lake::{TOTAL, band_list, levels_db};
-use super::runs::RunEvent;
+use super::runs::RunLogEntry;
 use super::summary::SurfaceEntry;
 use crate::fault::RequestFault;
 
@@ -31,7 +31,7 @@ struct PairDetail<'a> {
     tnce_band_db: Vec<Option<f64>>,
     curves: Option<CurveSet>,
     symmetries: Vec<SymmetricPair>,
-    attempts: Vec<RunEvent>,
+    attempts: Vec<RunLogEntry>,
     environment: AirSeries,
 }
 
@@ -194,7 +194,7 @@ pub(super) async fn pair(asked: CatalogueRequest) -> Result<AnswerContent, Reque
         symmetries(&asked, entry, pair, &measurement.run_id),
         CurveSet::read(&asked, entry, PairSelection::Pair(pair), usize::MAX),
         // The controller's messages about a pair begin so.
-        asked.rows::<RunEvent>(ATTEMPTS, vec![text(&measurement.run_id), text(&format!("pair {pair},%"))]),
+        asked.rows::<RunLogEntry>(ATTEMPTS, vec![text(&measurement.run_id), text(&format!("pair {pair},%"))]),
         asked.rows::<AirReading>(
             AIR,
             vec![

@@ -41,7 +41,7 @@ struct RunRecord {
 
 /// A log message of a run.
 #[derive(Deserialize, Serialize)]
-pub(super) struct RunEvent {
+pub(super) struct RunLogEntry {
     log_time: String,
     level: String,
     name: String,
@@ -96,7 +96,7 @@ struct RunDetail {
     attachments: Vec<RunAttachment>,
     quality: Vec<QualityCount>,
     repeats: Vec<AttemptCount>,
-    events: Vec<RunEvent>,
+    events: Vec<RunLogEntry>,
 }
 
 #[derive(Serialize)]
@@ -160,7 +160,7 @@ pub(super) async fn run(asked: CatalogueRequest) -> Result<AnswerContent, Reques
         asked.rows::<RunRecord>(&one, vec![id.clone()]),
         asked.rows::<AttemptCount>(REPEATS, vec![id.clone()]),
         asked.rows::<QualityFlags>(FLAGS, flags),
-        asked.rows::<RunEvent>(&log, vec![id.clone()]),
+        asked.rows::<RunLogEntry>(&log, vec![id.clone()]),
     )?;
     let run = run.into_iter().next().ok_or_else(|| missing("this run".into(), "ask again"))?;
     let topic = |t: echolake_query::Topic| RunTopic {

@@ -50,7 +50,7 @@ pub(super) fn parse(line: &str) -> Option<Result<PromptCommand, String>> {
         "\\timing" => PromptCommand::Timing,
         "\\pager" | "\\pset" => PromptCommand::Pager,
         "\\f" | "\\format" => match AnswerFormat::ALL.into_iter().find(|f| f.name().eq_ignore_ascii_case(rest)) {
-            Some(format) => PromptCommand::AnswerFormat(format),
+            Some(format) => PromptCommand::Format(format),
             None => return Some(Err(format!("no format `{rest}`; hint: table, csv, json, parquet or arrow"))),
         },
         "\\o" => PromptCommand::Output(name.map(PathBuf::from)),
@@ -70,7 +70,7 @@ mod tests {
         assert_eq!(parse("\\d  runs;"), Some(Ok(PromptCommand::Columns("runs".to_owned()))));
         assert_eq!(parse("\\d"), Some(Ok(PromptCommand::Tables)));
         assert_eq!(parse("  quit "), Some(Ok(PromptCommand::Quit)));
-        assert_eq!(parse("\\f CSV"), Some(Ok(PromptCommand::AnswerFormat(AnswerFormat::Csv))));
+        assert_eq!(parse("\\f CSV"), Some(Ok(PromptCommand::Format(AnswerFormat::Csv))));
         assert_eq!(parse("\\o a b.csv"), Some(Ok(PromptCommand::Output(Some("a b.csv".into())))));
         assert_eq!(parse("select 1;"), None);
         assert_eq!(parse(""), None);
