@@ -28,6 +28,8 @@ mod file_proof;
 pub mod limits;
 mod prefix_reader;
 mod record_frame;
+#[cfg(feature = "store")]
+mod record_shape;
 mod record_splitter;
 #[cfg(feature = "store")]
 mod resync_reader;

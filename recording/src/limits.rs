@@ -3,9 +3,9 @@
 /// Bytes of the largest chunk that is read: as it is stored and decompressed, together.
 pub const LARGEST_CHUNK: u64 = 256 << 20;
 /// Bytes of the largest attachment that is ingested.
-pub(crate) const LARGEST_ATTACHMENT: u64 = LARGEST_CHUNK;
+pub const LARGEST_ATTACHMENT: u64 = LARGEST_CHUNK;
 /// Bytes of the largest schema, channel or metadata record that is ingested.
-pub(crate) const LARGEST_DEFINITION: u64 = 4 << 20;
+pub const LARGEST_DEFINITION: u64 = 4 << 20;
 /// Bytes of the largest record that is recovered. The recorder's chunks have a few MiB; a panel's mesh is one attachment.
 pub const LARGEST_RECORD: u64 = 1 << 30;
 /// Bytes of the largest summary that is read.

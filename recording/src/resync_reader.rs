@@ -18,7 +18,8 @@ use sha2::{Digest as _, Sha256};
 use tokio::sync::{Semaphore, SemaphorePermit};
 
 use crate::block_reader::BlockReader;
-use crate::record_frame::{FRAME_BYTES, PREFIX_BYTES, RecordFrame, RecordShape, largest_record};
+use crate::record_frame::{FRAME_BYTES, RecordFrame};
+use crate::record_shape::{PREFIX_BYTES, RecordShape, largest_record};
 
 const FRAME: u64 = FRAME_BYTES as u64;
 /// Most that is passed over at a time, and what a search fetches at a time.
