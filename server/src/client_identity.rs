@@ -30,7 +30,7 @@ pub(crate) struct ClientIdentity {
     /// True if the server has no tokens, so that requests of foreign pages must be distinguished from others.
     pub(crate) is_open: bool,
     pub(crate) scopes: Vec<TokenScope>,
-    /// Limits, as [`Quota`] has them.
+    /// Limits, as [`QueryQuota`] has them.
     pub(crate) seconds: Option<u64>,
     pub(crate) memory_bytes: Option<usize>,
     pub(crate) rows: Option<u64>,

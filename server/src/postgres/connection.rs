@@ -157,7 +157,7 @@ impl PostgresConnection {
         CommandRun { stop, limit: self.settings.statement_timeout().map(SessionTimeLimit::of) }
     }
 
-    /// Parses and plans. Boxed for the same reason as [`echolake_query::Opaque`].
+    /// Parses and plans. Boxed for the same reason as [`echolake_query::OpaqueValue`].
     pub(super) fn statements<'a>(
         &'a self,
         sql: &'a str,
