@@ -204,6 +204,26 @@ pub fn chunk_body(record: &Bytes) -> Result<Bytes, String> {
     }
 }
 
+/// Parses a record.
+///
+/// # Errors
+/// The library's. It panics at an attachment that ends within its first fields, which is an error here.
+pub fn parse_record(code: u8, body: &[u8]) -> Result<Record<'_>, McapError> {
+    match code == op::ATTACHMENT && !has_attachment_head(body) {
+        true => Err(McapError::UnexpectedEof),
+        false => mcap::parse_record(code, body),
+    }
+}
+
+// Two times, name, media type, the data's length, and a CRC behind the data.
+fn has_attachment_head(body: &[u8]) -> bool {
+    let text_end = |begin: usize| {
+        let length = body.get(begin..begin.checked_add(4)?)?.first_chunk().map(|bytes| u32::from_le_bytes(*bytes))?;
+        begin.checked_add(4)?.checked_add(length as usize)
+    };
+    text_end(16).and_then(text_end).and_then(|end| end.checked_add(8 + 4)).is_some_and(|end| end <= body.len())
+}
+
 /// Returns an error of the MCAP library with its cause.
 pub fn describe(error: &McapError) -> String {
     match std::error::Error::source(error) {
@@ -213,7 +233,7 @@ pub fn describe(error: &McapError) -> String {
 }
 
 fn chunk_parts(body: &[u8]) -> Result<(ChunkHeader, &[u8]), ChunkError> {
-    let Ok(Record::Chunk { header, data: Cow::Borrowed(data) }) = mcap::parse_record(op::CHUNK, body) else {
+    let Ok(Record::Chunk { header, data: Cow::Borrowed(data) }) = parse_record(op::CHUNK, body) else {
         return Err(ChunkError::Header);
     };
     let stored = if header.compression.is_empty() { 0 } else { data.len() as u64 };
@@ -242,7 +262,7 @@ fn parse_fast(code: u8, body: &[u8]) -> Result<Record<'_>, McapError> {
             },
             data: Cow::Borrowed(data),
         }),
-        _ => mcap::parse_record(code, body),
+        _ => parse_record(code, body),
     }
 }
 

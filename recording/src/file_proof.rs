@@ -35,7 +35,7 @@ pub fn prove_file(path: &Path) -> Result<(), String> {
             }
             LinearReadEvent::Record { data, opcode } => {
                 // Attachments' sums are compared where they are parsed.
-                let record = mcap::parse_record(opcode, data).map_err(|e| e.to_string())?;
+                let record = crate::chunk::parse_record(opcode, data).map_err(|e| e.to_string())?;
                 has_summary |= matches!(record, Record::Statistics(_));
             }
         }

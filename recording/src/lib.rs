@@ -41,7 +41,7 @@ pub use chunk::{
 pub use chunk_writer::{ChunkLane, ChunkWriter, StreamWriter, stream_writer};
 pub use file_proof::prove_file;
 pub use mcap::records::{ChunkIndex, MessageHeader, Metadata, Record, op as opcode};
-pub use mcap::{Attachment, Channel, MAGIC, McapError, McapResult, Writer, parse_record};
+pub use mcap::{Attachment, Channel, MAGIC, McapError, McapResult, Writer};
 pub use prefix_reader::{PrefixError, PrefixItem, PrefixReader};
 pub use record_frame::FRAME_BYTES;
 pub use record_splitter::{RecordSplitter, SplitRecord};

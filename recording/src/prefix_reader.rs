@@ -7,9 +7,9 @@ use std::path::{Path, PathBuf};
 
 use bytes::Bytes;
 use mcap::records::{Metadata, Record};
-use mcap::{Attachment, MAGIC, parse_record};
+use mcap::{Attachment, MAGIC};
 
-use crate::chunk::{DecodedChunk, describe};
+use crate::chunk::{DecodedChunk, describe, parse_record};
 use crate::limits::LARGEST_RECORD;
 use crate::record_frame::{FRAME_BYTES, RecordFrame};
 

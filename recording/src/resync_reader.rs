@@ -386,7 +386,7 @@ impl ResyncReader {
     }
 
     fn item(&mut self, code: u8, offset: u64, body: &Bytes) -> Option<ResyncItem> {
-        match mcap::parse_record(code, body) {
+        match crate::chunk::parse_record(code, body) {
             Ok(Record::Attachment { header, data, crc }) => {
                 // Its CRC was checked, but 0 stands for none: it may be what now stands at its end.
                 self.doubtful = (crc == 0).then_some(offset);

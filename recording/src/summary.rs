@@ -47,7 +47,9 @@ pub fn summary_range(tail: &[u8], file_bytes: u64) -> Option<Range<u64>> {
     if footer[0] != op::FOOTER {
         return None;
     }
-    let Ok(Record::Footer(footer)) = mcap::parse_record(op::FOOTER, &footer[FRAME_BYTES..]) else { return None };
+    let Ok(Record::Footer(footer)) = crate::chunk::parse_record(op::FOOTER, &footer[FRAME_BYTES..]) else {
+        return None;
+    };
     let inside = MAGIC.len() as u64..file_bytes - (FOOTER_BYTES + MAGIC.len()) as u64;
     let start = footer.summary_start;
     (inside.contains(&start) && file_bytes - start <= LARGEST_SUMMARY).then_some(start..file_bytes)
@@ -79,7 +81,7 @@ impl RunSummary {
                     reader.notify_read(next.len());
                     next = &[];
                 }
-                LinearReadEvent::Record { opcode, data } => match mcap::parse_record(opcode, data)? {
+                LinearReadEvent::Record { opcode, data } => match crate::chunk::parse_record(opcode, data)? {
                     Record::Statistics(statistics) => found.statistics = Some(statistics),
                     Record::ChunkIndex(index) => found.chunk_indexes.push(index),
                     Record::AttachmentIndex(index) => found.attachment_indexes.push(index),
