@@ -43,6 +43,8 @@ struct TakenPlaces {
 struct PlaceState {
     address: IpAddr,
     working: AtomicUsize,
+    /// Bytes since the last request.
+    idle_bytes: AtomicUsize,
     evicted: Notify,
 }
 
@@ -76,10 +78,15 @@ impl ConnectionPlaces {
     }
 
     fn place(&self, stream: TcpStream, address: IpAddr) -> PlacedStream {
-        let state = PlaceState { address, working: AtomicUsize::new(0), evicted: Notify::new() };
+        let state = PlaceState {
+            address,
+            working: AtomicUsize::new(0),
+            idle_bytes: AtomicUsize::new(0),
+            evicted: Notify::new(),
+        };
         let state = Arc::new(state);
         self.taken.lock().push(state.clone());
-        PlacedStream { stream, state, taken: self.taken.clone(), turn_bytes: 0, idle_bytes: 0, stalled: None }
+        PlacedStream { stream, state, taken: self.taken.clone(), turn_bytes: 0, stalled: None }
     }
 
     // Another machine has half of the places at most; false if all of those work.
@@ -124,7 +131,6 @@ pub(super) struct PlacedStream {
     state: Arc<PlaceState>,
     taken: Arc<TakenPlaces>,
     turn_bytes: usize,
-    idle_bytes: usize,
     stalled: Option<Pin<Box<Sleep>>>,
 }
 
@@ -162,6 +168,11 @@ impl Drop for PlacedStream {
 pub(super) struct PlaceWork(Arc<PlaceState>);
 
 impl PlaceWork {
+    /// Takes note of a request: what was sent up to here was one.
+    pub(super) fn hear_request(&self) {
+        self.0.idle_bytes.store(0, Ordering::Relaxed);
+    }
+
     pub(super) fn begin(&self) -> WorkingPlace {
         self.0.working.fetch_add(1, Ordering::Relaxed);
         WorkingPlace(self.0.clone())
@@ -192,8 +203,7 @@ impl AsyncRead for PlacedStream {
         let read = Pin::new(&mut self.stream).poll_read(context, buffer);
         let bytes = buffer.filled().len() - before;
         self.turn_bytes = if read.is_ready() { self.turn_bytes + bytes } else { 0 };
-        self.idle_bytes = if self.state.is_idle() { self.idle_bytes + bytes } else { 0 };
-        if self.idle_bytes > IDLE_BYTES {
+        if self.state.is_idle() && self.state.idle_bytes.fetch_add(bytes, Ordering::Relaxed) + bytes > IDLE_BYTES {
             return Poll::Ready(Err(io::Error::other("too much was sent without a request")));
         }
         read
@@ -230,6 +240,7 @@ impl AsyncWrite for PlacedStream {
 
 #[cfg(test)]
 mod tests {
+    use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
     use tokio::net::TcpSocket;
 
     use super::*;
@@ -273,5 +284,29 @@ mod tests {
         tokio::time::timeout(Duration::from_secs(60), taken[1].evicted()).await.expect("it must leave its place");
         let stays = tokio::time::timeout(Duration::from_millis(50), taken[0].evicted()).await;
         assert!(stays.is_err(), "the only one of its address stays, though it is the oldest");
+    }
+    #[tokio::test]
+    async fn what_is_no_request_is_limited_and_requests_are_not() {
+        let listener = TcpListener::bind("127.0.0.1:0").await.expect("a free port");
+        let address = listener.local_addr().expect("its address");
+        let places = ConnectionPlaces::new(listener, 1);
+        let mut client = TcpStream::connect(address).await.expect("connected");
+        let mut place = places.next().await;
+        tokio::spawn(async move { while client.write_all(&[0; 1024]).await.is_ok() {} });
+        let work = place.work();
+        let mut buffer = vec![0; IDLE_BYTES / 4];
+        for _ in 0..12 {
+            place.read_exact(&mut buffer).await.expect("a request");
+            work.hear_request();
+        }
+        let mut read = 0;
+        let failed = loop {
+            match place.read(&mut buffer).await {
+                Ok(bytes) => read += bytes,
+                Err(failed) => break failed,
+            }
+        };
+        assert_eq!(failed.to_string(), "too much was sent without a request");
+        assert!(read <= IDLE_BYTES, "{read}");
     }
 }

@@ -50,6 +50,7 @@ async fn answer(stream: PlacedStream, door: ServerDoor, mut stopping: watch::Rec
     let evicted = stream.evicted();
     let work = stream.work();
     let service = service_fn(move |request: Request<Incoming>| {
+        work.hear_request();
         let (door, work) = (door.clone(), work.clone());
         async move {
             let response = door.answer_flight(request, &work).await.unwrap_or_else(|fault| {

@@ -49,6 +49,7 @@ async fn answer(stream: PlacedStream, router: Router, mut stopping: watch::Recei
     let work = stream.work();
     let answers = TowerToHyperService::new(router);
     let service = service_fn(move |mut request: hyper::Request<Incoming>| {
+        work.hear_request();
         request.extensions_mut().insert(work.clone());
         answers.call(request)
     });
