@@ -23,10 +23,13 @@ const PATIENCE: Duration = Duration::from_secs(10);
 /// Limit of a client's message, bytes: requests are short.
 const LARGEST_WISH: usize = 1 << 20;
 
-/// Serves a client until it or the server is gone.
-pub(super) fn serve(stream: TcpStream, shared: &ViewerState) {
+/// Serves a client, whose handshake is pending, until it or the server is gone.
+pub(super) fn serve(stream: Arc<TcpStream>, shared: &ViewerState) {
     // After any error here the client is disconnected, and may connect again.
-    let Ok(shaken) = shake_hands(stream, shared) else { return };
+    let shaken = shake_hands(stream.clone(), shared);
+    shared.handshakes.remove(&stream);
+    drop(stream);
+    let Ok(shaken) = shaken else { return };
     let Some(queue) = shared.join() else { return };
     let _ = talk(shaken, shared, &queue);
     shared.leave(&queue);
@@ -44,17 +47,16 @@ fn choose(access: &AccessCheck, request: &Request, mut response: Response) -> Re
     }
 }
 
-fn shake_hands(stream: TcpStream, shared: &ViewerState) -> Result<WebSocket<TimedStream>, Box<dyn std::error::Error>> {
+fn shake_hands(
+    stream: Arc<TcpStream>,
+    shared: &ViewerState,
+) -> Result<WebSocket<TimedStream>, Box<dyn std::error::Error>> {
     stream.set_nodelay(true)?;
     stream.set_write_timeout(Some(PATIENCE))?;
-    let stream = Arc::new(stream);
-    shared.handshakes.add(&stream)?;
     let config = WebSocketConfig::default().max_message_size(Some(LARGEST_WISH)).max_frame_size(Some(LARGEST_WISH));
     let choose = |request: &Request, response: Response| choose(&shared.access, request, response);
-    let shaken =
-        tungstenite::accept_hdr_with_config(TimedStream::new(stream.clone(), LONGEST_HANDSHAKE), choose, Some(config));
-    shared.handshakes.remove(&stream);
-    let mut socket = shaken.map_err(|e| e.to_string())?;
+    let stream = TimedStream::new(stream, LONGEST_HANDSHAKE);
+    let mut socket = tungstenite::accept_hdr_with_config(stream, choose, Some(config)).map_err(|e| e.to_string())?;
     socket.get_mut().lift_deadline();
     socket.get_ref().stream.set_read_timeout(Some(LOOKS))?;
     Ok(socket)

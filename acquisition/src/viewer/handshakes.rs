@@ -18,7 +18,7 @@ const MOST_OF_ALL: usize = 64;
 pub(super) struct PendingHandshakes(Mutex<Vec<(IpAddr, Arc<TcpStream>)>>);
 
 impl PendingHandshakes {
-    /// Adds a client's; ends the oldest one if there are too many.
+    /// Adds a client's, in the order of connecting; ends the oldest one if there are too many.
     pub(super) fn add(&self, stream: &Arc<TcpStream>) -> io::Result<()> {
         let address = stream.peer_addr()?.ip();
         let mut pending = self.0.lock().unwrap_or_else(PoisonError::into_inner);

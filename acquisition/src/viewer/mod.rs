@@ -239,7 +239,11 @@ fn accept(listener: &TcpListener, shared: &Arc<ViewerState>) {
             break;
         }
         threads.retain(|thread| !thread.is_finished());
-        let Ok(stream) = stream else { continue };
+        let Ok(stream) = stream.map(Arc::new) else { continue };
+        // Here and not on the client's thread: threads start in any order, and the oldest client is the first to go.
+        if shared.handshakes.add(&stream).is_err() {
+            continue;
+        }
         let shared = shared.clone();
         threads.push(std::thread::spawn(move || client::serve(stream, &shared)));
     }
