@@ -96,7 +96,7 @@ impl ConnectionPlaces {
             let is_crowd = |place: &&Arc<PlaceState>| place.address == address && !address.is_loopback();
             {
                 let mut all = self.taken.lock();
-                if all.iter().filter(is_crowd).count() >= self.most / 2 {
+                if all.iter().filter(is_crowd).count() >= (self.most / 2).max(1) {
                     return evict(&mut all, |place| is_crowd(&place));
                 }
                 if all.len() < self.most || evict(&mut all, |_| true) {
@@ -285,13 +285,15 @@ mod tests {
         let stays = tokio::time::timeout(Duration::from_millis(50), taken[0].evicted()).await;
         assert!(stays.is_err(), "the only one of its address stays, though it is the oldest");
     }
+
     #[tokio::test]
     async fn what_is_no_request_is_limited_and_requests_are_not() {
         let listener = TcpListener::bind("127.0.0.1:0").await.expect("a free port");
         let address = listener.local_addr().expect("its address");
         let places = ConnectionPlaces::new(listener, 1);
         let mut client = TcpStream::connect(address).await.expect("connected");
-        let mut place = places.next().await;
+        let next = tokio::time::timeout(Duration::from_secs(60), places.next());
+        let mut place = next.await.expect("the only place");
         tokio::spawn(async move { while client.write_all(&[0; 1024]).await.is_ok() {} });
         let work = place.work();
         let mut buffer = vec![0; IDLE_BYTES / 4];
