@@ -262,6 +262,25 @@ async fn a_record_that_is_too_large_is_passed_over_and_told() {
     assert!(taken.damaged.iter().any(|d| d.starts_with(&place) && d.contains("more than")), "{:?}", taken.damaged);
 }
 
+// A chunk without a CRC, as other writers may make it, that ends within a message.
+#[tokio::test(flavor = "multi_thread")]
+async fn a_chunk_whose_records_end_early_is_told() {
+    let mut runs = runs(&["flat"]);
+    let whole = runs[0].1.clone();
+    let header = 17 + u64::from_le_bytes(whole[9..17].try_into().expect("a length")) as usize;
+    let records = [&[0x05][..], &100_u64.to_le_bytes(), &[7; 50]].concat();
+    let length = (records.len() as u64).to_le_bytes();
+    // Times, uncompressed size, no CRC, no compression, records.
+    let body = [&[0; 16][..], &length, &[0; 8], &length, &records].concat();
+    let chunk = [&[0x06][..], &(body.len() as u64).to_le_bytes(), &body].concat();
+    runs[0].1 = [&whole[..header], &chunk, &whole[header..]].concat().into();
+    let reports = ingest(with_inbox(&runs).await).await.expect("ingested");
+    let [FileReport::Taken(taken)] = reports.as_slice() else { panic!("{reports:?}") };
+    assert_eq!(taken.measurements, 45);
+    let place = format!("the chunk at byte {header}: a record ends early");
+    assert!(taken.damaged.iter().any(|d| d.starts_with(&place)), "{:?}", taken.damaged);
+}
+
 mod slow {
     use super::*;
 

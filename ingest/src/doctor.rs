@@ -183,9 +183,13 @@ async fn check_run_file(lake: &Lake, path: &Path, sha256: &str, report: &mut Lak
     while let Some(item) = reader.next_item().await? {
         if let ResyncItem::Chunk(raw) = item {
             let offset = raw.offset;
-            if let Err(reason) = DecodedChunk::decode(&raw.body) {
-                wrong.push(format!("the chunk at byte {offset}: {reason}"));
-                reader.look_into(offset).await?;
+            match DecodedChunk::decode(&raw.body) {
+                Ok(chunk) => wrong
+                    .extend(chunk.check_records().err().map(|reason| format!("the chunk at byte {offset}: {reason}"))),
+                Err(reason) => {
+                    wrong.push(format!("the chunk at byte {offset}: {reason}"));
+                    reader.look_into(offset).await?;
+                }
             }
         }
     }

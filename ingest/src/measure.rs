@@ -178,6 +178,9 @@ impl Measurer {
         budget: &RunBudget,
     ) -> Yield {
         let mut out = Yield { last_time_ns: i64::MIN, ..Yield::default() };
+        if let Err(reason) = chunk.check_records() {
+            out.damaged.push(format!("the chunk at byte {offset}: {reason}; what is before it is read"));
+        }
         let mut swept = HashSet::new();
         for message in chunk.messages() {
             out.last_time_ns = out.last_time_ns.max(message.log_time_ns);

@@ -115,7 +115,22 @@ impl DecodedChunk {
         (self.crc, self.records.len(), first.and_then(|(_, body)| body[..14].try_into().ok()))
     }
 
-    /// Returns its records as (opcode, body). Ends early if a frame makes no sense, which a right CRC excludes.
+    /// Checks that it is made of whole records and messages. A right CRC does not say so: its writer may have erred,
+    /// and a chunk without a CRC may be damaged.
+    ///
+    /// # Errors
+    /// [`RecordError::Early`].
+    pub fn check_records(&self) -> Result<(), RecordError> {
+        let is_whole = |(code, body): (u8, &[u8])| code != op::MESSAGE || body.len() >= MESSAGE_HEADER_BYTES;
+        let mut whole_bytes = 0;
+        for record in self.records() {
+            whole_bytes += FRAME_BYTES + record.1.len();
+            is_whole(record).then_some(()).ok_or(RecordError::Early)?;
+        }
+        (whole_bytes == self.records.len()).then_some(()).ok_or(RecordError::Early)
+    }
+
+    /// Returns its records as (opcode, body). Ends at one that is not whole: see [`Self::check_records`].
     pub fn records(&self) -> impl Iterator<Item = (u8, &[u8])> {
         let mut rest = &self.records[..];
         std::iter::from_fn(move || {
@@ -125,7 +140,7 @@ impl DecodedChunk {
         })
     }
 
-    /// Returns its messages.
+    /// Returns its messages that are whole.
     pub fn messages(&self) -> impl Iterator<Item = ChunkMessage<'_>> {
         let messages = self.records().filter(|(code, body)| *code == op::MESSAGE && body.len() >= MESSAGE_HEADER_BYTES);
         messages.map(|(_, body)| ChunkMessage {
@@ -366,9 +381,13 @@ mod tests {
 
     #[test]
     fn a_cursor_fails_where_a_record_ends_early() {
-        let whole = DecodedChunk::decode(&chunk(None)).expect("sound").records;
+        let whole = DecodedChunk::decode(&chunk(None)).expect("sound");
+        whole.check_records().expect("whole records");
+        let whole = whole.records;
         for cut in [1, FRAME_BYTES, whole.len() - 1] {
-            let mut cursor = RecordCursor::new(whole.slice(..cut));
+            let part = DecodedChunk { records: whole.slice(..cut), crc: 0 };
+            assert!(part.check_records().is_err(), "{cut}");
+            let mut cursor = part.into_cursor();
             let failed =
                 std::iter::from_fn(|| cursor.next_record().map(|r| r.map(drop)).transpose()).find_map(Result::err);
             assert!(matches!(failed, Some(RecordError::Early)), "{cut}: {failed:?}");
