@@ -115,9 +115,6 @@ pub(crate) struct AcquireArgs {
     /// Serve metrics for Prometheus under http://ADDR/metrics.
     #[arg(long, value_name = "ADDR")]
     pub(crate) metrics: Option<std::net::SocketAddr>,
-    /// Send metrics every ten seconds as InfluxDB lines: udp://HOST:PORT, or an http:// address of a write endpoint.
-    #[arg(long, value_name = "URL")]
-    pub(crate) influx: Option<String>,
 }
 
 #[derive(Debug, Args)]

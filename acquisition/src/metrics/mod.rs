@@ -1,6 +1,5 @@
-//! Metrics of a run in progress: Prometheus scrapes them, InfluxDB gets them pushed.
+//! Metrics of a run in progress, for Prometheus to scrape.
 
-mod push;
 mod serve;
 #[cfg(test)]
 mod tests;
@@ -12,7 +11,6 @@ use echolake_schema::messages::{Measurement, Verdict};
 
 use crate::controller::RunEvent;
 use crate::recorder::Cost;
-pub use push::{InfluxPush, PushTarget, TargetError};
 pub use serve::MetricsServer;
 
 /// A run's numbers; clones share them.
@@ -104,15 +102,6 @@ impl RunMetrics {
             let _ = writeln!(out, "echolake_{name}{label} {value}");
         }
         out
-    }
-
-    /// Returns the metrics as one line of InfluxDB's line protocol, at this time in ns since 1970. Unknown numbers are
-    /// left out: it has no NaN.
-    pub fn influx(&self, at_nanos: i64) -> String {
-        let metrics = self.numbers().metrics();
-        let fields: Vec<_> =
-            metrics.iter().filter(|m| m.3.is_finite()).map(|(name, .., value)| format!("{name}={value}")).collect();
-        format!("echolake_run,surface={} {} {at_nanos}\n", self.surface, fields.join(","))
     }
 
     fn numbers(&self) -> MutexGuard<'_, MetricValues> {
