@@ -378,10 +378,10 @@ mod slow {
         place.fails(1, &["acquire", "--surface", "mystery", "--rig", "rig.toml"], "unknown surface `mystery`");
         place.fails(2, &["acquire", "--surface", "../x", "--rig", "rig.toml"], "not a valid surface id");
         place.fails(1, &["acquire", "--surface", "brick", "--set", "colour=red"], "no parameter `colour`");
-        place.ok(&["panel", "wavy", "-o", "wavy.stl"]);
+        place.ok(&["panel", "macrostructure", "--cells", "128", "-o", "wavy.stl"]);
         place.acquire("from_file", &["--mesh", "wavy.stl"]);
         place.fails(2, &["acquire", "--surface", "x", "--rig", "rig.toml", "--side", "back"], "--mesh");
-        place.ok(&["panel", "flat", "--back", "wavy", "--cells", "64", "-o", "two.stl"]);
+        place.ok(&["panel", "flat", "--back", "macrostructure", "--cells", "64", "-o", "two.stl"]);
         place.acquire("two_0", &["--mesh", "two.stl"]);
         place.acquire("two_1", &["--mesh", "two.stl", "--side", "back"]);
         place.ok(&["ingest"]);

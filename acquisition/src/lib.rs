@@ -3,7 +3,7 @@
 //! ```
 //! use echolake_acquisition::relief::PanelRelief;
 //!
-//! let wall = PanelRelief::by_name("brick")?;
+//! let wall = PanelRelief::by_name("stretcher_bond")?;
 //! assert_eq!(wall.material().reflection_factor, 0.83);
 //! # Ok::<(), echolake_acquisition::relief::Error>(())
 //! ```

@@ -82,7 +82,7 @@ mod tests {
 
     #[test]
     fn a_plan_comes_back_as_it_was() {
-        let relief = PanelRelief::by_name("brick").expect("a relief");
+        let relief = PanelRelief::by_name("stretcher_bond").expect("a relief");
         for (keep, specimen) in [
             (RecordingMode::Sweeps, PanelSpecimen::Relief(relief)),
             (RecordingMode::ResponsesOnly, PanelSpecimen::Mesh("panels/0015.glb".into(), PanelSide::Back)),

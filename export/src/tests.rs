@@ -33,7 +33,7 @@ async fn lake(home: &TempDir, keep: RecordingMode) -> Lake {
     let inbox = home.path().join("lake/inbox");
     std::fs::create_dir_all(&inbox).expect("a folder");
     for (number, surface) in SURFACES.into_iter().enumerate() {
-        let name = if number < 2 { surface } else { "wavy" };
+        let name = if number < 2 { surface } else { "macrostructure" };
         let specimen = PanelSpecimen::Relief(PanelRelief::by_name(name).expect("a relief"));
         let run = RunRequest {
             rig: &rig,

@@ -34,7 +34,7 @@ fn rig() -> Rig {
 fn runs(surfaces: &[&str]) -> Vec<(String, Bytes)> {
     let (folder, rig) = (tempfile::tempdir().expect("a folder"), rig());
     let one = |(number, surface): (usize, &&str)| {
-        let relief = surface.split('_').next().expect("a name");
+        let relief = PanelRelief::guess(surface).expect("a name");
         let specimen = PanelSpecimen::Relief(PanelRelief::by_name(relief).expect("a relief"));
         let run = RunRequest {
             rig: &rig,

@@ -150,7 +150,7 @@ mod tests {
     const ALL: [Format; 4] = [Format::Glb, Format::Stl, Format::Obj, Format::Ply];
 
     fn small() -> Mesh {
-        Mesh::from_height_field(&PanelRelief::by_name("wavy").expect("a relief").height_field(4), -20.0)
+        Mesh::from_height_field(&PanelRelief::by_name("macrostructure").expect("a relief").height_field(4), -20.0)
     }
 
     fn parse(format: Format, bytes: &[u8]) -> Result<Mesh, Error> {

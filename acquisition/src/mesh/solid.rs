@@ -276,7 +276,7 @@ mod tests {
     #[test]
     fn a_panel_that_is_turned_over_shows_its_back() {
         let of = |name: &str| PanelRelief::by_name(name).expect("a relief").height_field(100);
-        let (front, back) = (of("brick"), of("wavy"));
+        let (front, back) = (of("river_rock"), of("macrostructure"));
         let path = Path::new("panel");
         let panel = Mesh::double_sided(&front, &back).seen_from(PanelSide::Back);
         assert_eq!(panel.check(PANEL_SIZE_MM, 40.0, path).map(drop), Ok(()), "it is closed, its outside outside");
@@ -293,7 +293,7 @@ mod tests {
 
     #[test]
     fn heights_survive_the_way_through_a_mesh() {
-        let field = PanelRelief::by_name("wavy").expect("a relief").height_field(100);
+        let field = PanelRelief::by_name("macrostructure").expect("a relief").height_field(100);
         let mesh = Mesh::from_height_field(&field, -20.0);
         let again = mesh.to_height_field(100, PANEL_SIZE_MM, 40.0, Path::new("wavy")).expect("heights");
         let off = field.heights_mm().iter().zip(again.heights_mm()).fold(0.0f32, |m, (a, b)| m.max((a - b).abs()));

@@ -41,6 +41,13 @@ impl SeededRandom {
         mix(self.0.wrapping_add((n + 1).wrapping_mul(STEP)))
     }
 
+    /// Returns 0 to `count - 1` in an order of chance.
+    pub(super) fn shuffled(self, count: usize) -> Vec<usize> {
+        let mut order: Vec<usize> = (0..count).collect();
+        order.sort_by_key(|n| self.at(*n as i64, 1).whole(0));
+        order
+    }
+
     /// Smooth noise over the plane, -1 to 1, with features of about the length 1.
     pub(super) fn noise(self, x: f64, y: f64) -> f64 {
         let (ix, iy) = (x.floor(), y.floor());

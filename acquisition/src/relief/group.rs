@@ -10,6 +10,7 @@ use std::collections::BTreeMap;
 use serde::{Deserialize, Serialize};
 
 use super::chance::SeededRandom;
+use super::parameter::rounded;
 use super::{Error as ReliefError, PanelRelief, ParameterDomain, ReliefParameter};
 
 /// Ranges that a group is drawn from; `ranges.toml`.
@@ -103,8 +104,6 @@ const RESULTS_HINT: &str =
     "echolake sql --format csv \"select surface_id, band, p90_mean_db from surface_stats where surface_id like '...'\"";
 /// Largest factor of a step; its inverse is the smallest.
 const LARGEST_STEP: f64 = 2.0;
-/// Parameters are rounded to the inverse of this, so that they are easy to read.
-const ROUNDING: f64 = 10.0;
 
 fn default_target() -> f64 {
     1.5
@@ -162,7 +161,7 @@ impl GroupRanges {
         }
         for (number, (key, range)) in self.ranges.iter().enumerate() {
             let chance = SeededRandom::new(self.seed, number as u64);
-            let place = shuffled(chance, count);
+            let place = chance.shuffled(count);
             for (n, relief) in drawn.iter_mut().enumerate() {
                 let part = (place[n] as f64 + chance.at(n as i64, 0).unit(0)) / count as f64;
                 relief.set(key, &range.value(key, &known, part, place[n])?)?;
@@ -219,14 +218,8 @@ impl ParameterRange {
                 }
                 let value = from + (to - from) * share;
                 let whole = known.iter().any(|p| p.key == key && matches!(p.domain, ParameterDomain::Whole { .. }));
-                let rounding = if whole {
-                    1.0
-                } else if to - from < 10.0 {
-                    100.0 * ROUNDING
-                } else {
-                    ROUNDING
-                };
-                Ok(((value * rounding).round() / rounding).clamp(*from, *to).to_string())
+                let value = if whole { value.round() } else { rounded(value, to - from) };
+                Ok(value.clamp(*from, *to).to_string())
             }
         }
     }
@@ -252,8 +245,7 @@ fn limits(key: &str, known: &[ReliefParameter]) -> Option<[f64; 2]> {
 // Widens about the middle, within the limits; a part that is cut off on one side is not added on the other.
 fn stretched([from, to]: [f64; 2], factor: f64, [low, high]: [f64; 2]) -> [f64; 2] {
     let (middle, half) = ((from + to) / 2.0, (to - from) / 2.0 * factor);
-    let rounding = if to - from < 10.0 { 100.0 * ROUNDING } else { ROUNDING };
-    [(middle - half).max(low), (middle + half).min(high)].map(|x| (x * rounding).round() / rounding)
+    [(middle - half).max(low), (middle + half).min(high)].map(|x| rounded(x, to - from))
 }
 
 /// Standard deviation of the surfaces' levels in each band, mean over the bands, dB.
@@ -277,13 +269,6 @@ fn spread(results: &[BandLevel]) -> Result<f64, Error> {
         (levels.iter().map(|x| (x - mean) * (x - mean)).sum::<f64>() / (n - 1.0)).sqrt()
     };
     Ok(bands.values().map(deviation).sum::<f64>() / bands.len() as f64)
-}
-
-/// 0 to `count - 1` in an order of chance.
-fn shuffled(chance: SeededRandom, count: usize) -> Vec<usize> {
-    let mut order: Vec<usize> = (0..count).collect();
-    order.sort_by_key(|n| chance.at(*n as i64, 1).whole(0));
-    order
 }
 
 #[cfg(test)]

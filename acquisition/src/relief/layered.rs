@@ -3,24 +3,22 @@
 //! Parameters are full-scale: the panel is a tenth of the wall. Every parameter's range is such that all of them at
 //! their greatest still fit the relief's 40 mm, so that each combination can be made.
 
-use serde::{Deserialize, Serialize};
-
+use super::chance::SeededRandom;
 use super::macrostructure::{self, MacrostructureModel};
 use super::mesostructure::StoneArrangement;
 use super::microstructure::{GRAIN, JOINT_DEPTH, JOINT_SHAPE, JOINT_WIDTH, MicrostructureModel, ROUGHNESS};
 use super::parameter::{ParameterDomain, ParameterValue, ReliefParameter};
 use super::settings::WallSettings;
 use super::stones::SEED;
-use super::{Error, HeightField, PANEL_SIZE_MM, RELIEF_MM};
+use super::{HeightField, PANEL_SIZE_MM, RELIEF_MM};
 
 /// Heights of a cell are the mean of those this far apart or less, mm: a joint is 1 mm wide.
 const DETAIL_MM: f64 = 0.4;
 
 /// A wall in layers.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct LayeredWall {
     mesostructure: StoneArrangement,
-    #[serde(flatten)]
     settings: WallSettings,
 }
 
@@ -34,6 +32,19 @@ impl LayeredWall {
             settings.0.insert(macrostructure::SHAPE.key.to_owned(), ParameterValue::Word("wavy_xy".to_owned()));
         }
         Self { mesostructure, settings }
+    }
+
+    /// A wall with every parameter drawn from its range.
+    pub(super) fn drawn(mesostructure: StoneArrangement, chance: SeededRandom) -> Self {
+        let mut wall = Self::new(mesostructure);
+        for (n, parameter) in (0..).zip(parameters(mesostructure)) {
+            let value = parameter.domain.value(chance.unit(n));
+            // Without stones and flat it would be Flat.
+            if mesostructure != StoneArrangement::Macrostructure || value != ParameterValue::Word("flat".to_owned()) {
+                wall.set(parameter.key, value);
+            }
+        }
+        wall
     }
 
     /// Returns the arrangement of its stones.
@@ -73,16 +84,9 @@ impl LayeredWall {
         }
     }
 
-    pub(super) fn set(&mut self, key: &str, text: &str) -> Result<(), Error> {
-        let relief = self.mesostructure.name();
-        let known = parameters(self.mesostructure);
-        let parameter = known.iter().find(|p| p.key == key).ok_or_else(|| Error::Parameter {
-            relief,
-            given: key.to_owned(),
-            valid: known.iter().map(|p| p.key).collect::<Vec<_>>().join(", "),
-        })?;
-        self.settings.0.insert(key.to_owned(), parameter.parse(relief, text)?);
-        Ok(())
+    /// Sets a parameter to a value of its domain.
+    pub(super) fn set(&mut self, key: &str, value: ParameterValue) {
+        self.settings.0.insert(key.to_owned(), value);
     }
 
     /// Its heights, each the mean over its cell. Their mean is 0 if that keeps them within the relief.
@@ -133,7 +137,7 @@ fn centred(heights: HeightField) -> HeightField {
 
 #[cfg(test)]
 mod tests {
-    use super::super::{PanelRelief, ParameterDomain};
+    use super::super::{Error, PanelRelief, ParameterDomain};
     use super::*;
 
     fn wall(name: &str, settings: &[(&str, &str)]) -> PanelRelief {

@@ -1,6 +1,5 @@
 //! Bricks in stretcher and in Flemish bond, in full-scale sizes.
 
-use super::BrickBond;
 use super::chance::SeededRandom;
 use super::microstructure::{JOINT_DEPTH, JOINT_SHAPE, JOINT_WIDTH};
 use super::parameter::{ParameterLayer, ReliefParameter};
@@ -19,6 +18,15 @@ const HEIGHT: ReliefParameter =
 
 pub(super) const PARAMETERS: [ReliefParameter; 8] =
     [LENGTH, HEIGHT, projection(80.0, 4.0), lean(3.0), SEED, JOINT_SHAPE, JOINT_WIDTH, JOINT_DEPTH];
+
+/// Bond of a brick wall: the order of its bricks.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum BrickBond {
+    /// Stretchers, each course shifted by half a brick.
+    Stretcher,
+    /// Stretchers and headers in turn.
+    Flemish,
+}
 
 /// A wall of bricks, model mm.
 pub(super) struct MasonryStones {

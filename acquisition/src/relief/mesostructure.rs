@@ -6,8 +6,7 @@ use super::stones::StoneLayout;
 use super::{courses, masonry, primitives, voronoi, wells};
 
 /// Mesostructure of a wall: the arrangement of its stones.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
-#[serde(rename_all = "snake_case")]
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum StoneArrangement {
     /// No stones: the large shape alone.
     Macrostructure,
@@ -91,8 +90,8 @@ impl StoneArrangement {
     pub(super) fn stones(self, settings: &WallSettings, seed: u64) -> Option<Box<dyn StoneLayout>> {
         Some(match self {
             Self::Macrostructure => return None,
-            Self::StretcherBond => Box::new(masonry::MasonryStones::of(settings, seed, super::BrickBond::Stretcher)),
-            Self::FlemishBond => Box::new(masonry::MasonryStones::of(settings, seed, super::BrickBond::Flemish)),
+            Self::StretcherBond => Box::new(masonry::MasonryStones::of(settings, seed, masonry::BrickBond::Stretcher)),
+            Self::FlemishBond => Box::new(masonry::MasonryStones::of(settings, seed, masonry::BrickBond::Flemish)),
             Self::CoursedAshlar | Self::SlatedStone => Box::new(courses::CoursedStones::of(settings, seed)),
             Self::PolygonalRubble => Box::new(voronoi::StoneCells::of(settings, seed, voronoi::StoneOutline::Polygons)),
             Self::RiverRock => Box::new(voronoi::StoneCells::of(settings, seed, voronoi::StoneOutline::Round)),

@@ -1,6 +1,5 @@
 //! Reliefs: surfaces as height fields, and the generators that make them.
 
-mod bricks;
 mod chance;
 mod courses;
 pub mod group;
@@ -9,28 +8,24 @@ mod macrostructure;
 mod masonry;
 mod mesostructure;
 mod microstructure;
-mod model;
 mod parameter;
 mod primitive_root;
 mod primitives;
-mod random;
 mod settings;
 mod stone;
 mod stones;
 mod voronoi;
-mod wavy;
 mod wells;
 
-pub use bricks::{BrickBond, BrickWall};
 pub use layered::LayeredWall;
 pub use mesostructure::StoneArrangement;
 pub use parameter::{ParameterDomain, ParameterLayer, ParameterValue, ReliefParameter};
 pub use primitive_root::PrimitiveRootDiffuser;
 pub use settings::FULL_SCALE;
-pub use wavy::WavyWall;
 
 pub use echolake_dsp::height_field::HeightField;
-use serde::{Deserialize, Serialize};
+
+use chance::SeededRandom;
 
 /// Edge of a panel, mm (Rust et al. 2021).
 pub const PANEL_SIZE_MM: f64 = 585.0;
@@ -39,8 +34,7 @@ pub const PANEL_SIZE_MM: f64 = 585.0;
 pub const RELIEF_MM: [f64; 2] = [-11.0, 29.0];
 
 /// A relief and its material.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(tag = "relief", rename_all = "snake_case")]
+#[derive(Debug, Clone, PartialEq)]
 pub enum PanelRelief {
     /// A plane print.
     Flat,
@@ -50,12 +44,6 @@ pub enum PanelRelief {
     Wood,
     /// A 2D primitive-root diffuser.
     Prd(PrimitiveRootDiffuser),
-    /// Bricks in stretcher bond.
-    Brick(BrickWall),
-    /// Bricks in Flemish bond.
-    Flemish(BrickWall),
-    /// A smooth macrostructure.
-    Wavy(WavyWall),
     /// A wall in layers, with full-scale parameters.
     Layered(LayeredWall),
 }
@@ -77,6 +65,17 @@ pub enum Error {
     Name {
         /// The given name.
         given: String,
+    },
+    /// A relief of before, which a wall in layers replaces.
+    #[error(
+        "relief `{given}` is gone: `{name}` makes such walls, with full-scale lengths, ten times the panel's; hint: \
+         `echolake panel {name} --list`"
+    )]
+    Renamed {
+        /// The given name.
+        given: String,
+        /// The name of its successor.
+        name: &'static str,
     },
     /// No such parameter.
     #[error("relief `{relief}` has no parameter `{given}`; hint: {valid}")]
@@ -110,16 +109,17 @@ pub enum Error {
     },
 }
 
+/// Reliefs of before, and what replaces them. Surfaces may still be named after them.
+const RENAMED: [(&str, &str); 3] =
+    [("brick", "stretcher_bond"), ("flemish", "flemish_bond"), ("wavy", "macrostructure")];
+
 impl PanelRelief {
     /// The names that [`PanelRelief::by_name`] knows.
-    pub const NAMES: [&'static str; 16] = [
+    pub const NAMES: [&'static str; 13] = [
         "flat",
         "foam",
         "wood",
         "prd",
-        "brick",
-        "flemish",
-        "wavy",
         "macrostructure",
         "stretcher_bond",
         "flemish_bond",
@@ -134,26 +134,41 @@ impl PanelRelief {
     /// A relief with its default parameters.
     ///
     /// # Errors
-    /// [`Error::Name`], which lists the names.
+    /// [`Error::Name`], which lists the names, or [`Error::Renamed`].
     pub fn by_name(name: &str) -> Result<Self, Error> {
         Ok(match name {
             "flat" => Self::Flat,
             "foam" => Self::Foam,
             "wood" => Self::Wood,
             "prd" => Self::Prd(PrimitiveRootDiffuser::default()),
-            "brick" => Self::Brick(BrickWall { bond: BrickBond::Stretcher, ..BrickWall::default() }),
-            "flemish" => Self::Flemish(BrickWall { bond: BrickBond::Flemish, ..BrickWall::default() }),
-            "wavy" => Self::Wavy(WavyWall::default()),
             _ => match StoneArrangement::ALL.into_iter().find(|m| m.name() == name) {
                 Some(mesostructure) => Self::Layered(LayeredWall::new(mesostructure)),
-                None => return Err(Error::Name { given: name.to_owned() }),
+                None => {
+                    let given = name.to_owned();
+                    return Err(match RENAMED.iter().find(|(old, _)| *old == name) {
+                        Some((_, name)) => Error::Renamed { given, name },
+                        None => Error::Name { given },
+                    });
+                }
             },
         })
     }
 
     /// Returns the relief that a surface's name begins with: the longest name that matches.
     pub fn guess(surface: &str) -> Option<&'static str> {
-        Self::NAMES.into_iter().filter(|name| surface.starts_with(name)).max_by_key(|name| name.len())
+        let names = Self::NAMES.into_iter().map(|name| (name, name)).chain(RENAMED);
+        let matching = names.filter(|(start, _)| surface.starts_with(start));
+        matching.max_by_key(|(start, _)| start.len()).map(|(_, name)| name)
+    }
+
+    /// Relief `number` of the collection that `seed` names; it does not depend on how many there are. Every nine from
+    /// a multiple of nine are one each of the walls in layers, in any order, with parameters from all of their ranges.
+    pub fn drawn(seed: u64, number: u64) -> Self {
+        let chance = SeededRandom::new(seed, 0xDECC);
+        let count = StoneArrangement::ALL.len() as u64;
+        let deck = chance.at((number / count) as i64, 1).shuffled(count as usize);
+        let mesostructure = StoneArrangement::ALL[deck[(number % count) as usize]];
+        Self::Layered(LayeredWall::drawn(mesostructure, chance.at(number as i64, 0)))
     }
 
     /// Parses the text of [`PanelRelief::to_json`]; every parameter is checked, missing ones have their defaults.
@@ -167,10 +182,7 @@ impl PanelRelief {
         let mut relief = Self::by_name(name.ok_or_else(|| wrong("they do not name a `relief`".to_owned()))?)?;
         let parameters = fields.get("parameters").and_then(|p| p.as_object());
         for (key, value) in parameters.ok_or_else(|| wrong("they have no `parameters`".to_owned()))? {
-            // The bond of the older walls is their name's.
-            if key != "bond" {
-                relief.set(key, value.as_str().unwrap_or(&value.to_string()))?;
-            }
+            relief.set(key, value.as_str().unwrap_or(&value.to_string()))?;
         }
         Ok(relief)
     }
@@ -194,7 +206,8 @@ impl PanelRelief {
                 all.iter_mut().for_each(|p| fresh.name_default(p));
                 all
             }
-            older => model::parameters(older.name()).to_vec(),
+            Self::Prd(_) => primitive_root::PARAMETERS.to_vec(),
+            Self::Flat | Self::Foam | Self::Wood => Vec::new(),
         }
     }
 
@@ -203,11 +216,8 @@ impl PanelRelief {
     /// # Errors
     /// [`Error::Parameter`] or [`Error::Value`], which name the valid ones.
     pub fn set(&mut self, key: &str, value: &str) -> Result<(), Error> {
-        if let Self::Layered(wall) = self {
-            return wall.set(key, value);
-        }
         let relief = self.name();
-        let known = model::parameters(relief);
+        let known = self.describe();
         let parameter = known.iter().find(|p| p.key == key).ok_or_else(|| Error::Parameter {
             relief,
             given: key.to_owned(),
@@ -217,20 +227,17 @@ impl PanelRelief {
             },
         })?;
         let setting = parameter.parse(relief, value)?;
-        let wrong = |expected: &str| Error::Value {
-            relief,
-            key: key.to_owned(),
-            given: value.to_owned(),
-            expected: expected.to_owned(),
-            hint: parameter.about,
-        };
-        let mut fields = self.parameters();
-        fields.insert(key.to_owned(), serde_json::to_value(setting).unwrap_or_default());
-        fields.insert("relief".to_owned(), relief.into());
-        let changed: Self = serde_json::from_value(fields.into()).map_err(|_| wrong("another kind of value"))?;
-        // What depends on other parameters too.
-        changed.check().map_err(wrong)?;
-        *self = changed;
+        match self {
+            Self::Layered(wall) => wall.set(key, setting),
+            Self::Prd(prd) => prd.set(&setting).map_err(|expected| Error::Value {
+                relief,
+                key: key.to_owned(),
+                given: value.to_owned(),
+                expected: expected.to_owned(),
+                hint: parameter.about,
+            })?,
+            Self::Flat | Self::Foam | Self::Wood => {}
+        }
         Ok(())
     }
 
@@ -241,9 +248,6 @@ impl PanelRelief {
             Self::Foam => "foam",
             Self::Wood => "wood",
             Self::Prd(_) => "prd",
-            Self::Brick(_) => "brick",
-            Self::Flemish(_) => "flemish",
-            Self::Wavy(_) => "wavy",
             Self::Layered(wall) => wall.mesostructure().name(),
         }
     }
@@ -253,9 +257,6 @@ impl PanelRelief {
         match self {
             Self::Flat | Self::Foam | Self::Wood => "reference",
             Self::Prd(_) => "primitive_root_diffuser",
-            Self::Brick(_) => "stretcher_bond_bricks",
-            Self::Flemish(_) => "flemish_bond_bricks",
-            Self::Wavy(_) => "macrostructure",
             Self::Layered(wall) => wall.mesostructure().typology(),
         }
     }
@@ -269,18 +270,18 @@ impl PanelRelief {
         }
     }
 
-    /// Its parameters by name, all that [`BrickWall`] and the like have.
+    /// Its parameters by name.
     pub fn parameters(&self) -> serde_json::Map<String, serde_json::Value> {
-        if let Self::Layered(wall) = self {
-            let value = |setting| serde_json::to_value(setting).unwrap_or_default();
-            return wall.settings().map(|(key, setting)| (key.to_owned(), value(setting))).collect();
-        }
-        match serde_json::to_value(self) {
-            Ok(serde_json::Value::Object(mut fields)) => {
-                fields.remove("relief");
-                fields
+        match self {
+            Self::Flat | Self::Foam | Self::Wood => serde_json::Map::new(),
+            Self::Prd(prd) => [("prime", prd.prime.into()), ("depth_mm", prd.depth_mm.into())]
+                .map(|(key, value): (&str, serde_json::Value)| (key.to_owned(), value))
+                .into_iter()
+                .collect(),
+            Self::Layered(wall) => {
+                let value = |setting| serde_json::to_value(setting).unwrap_or_default();
+                wall.settings().map(|(key, setting)| (key.to_owned(), value(setting))).collect()
             }
-            _ => serde_json::Map::new(),
         }
     }
 
@@ -292,56 +293,60 @@ impl PanelRelief {
                 let depths = prd.depths_mm();
                 HeightField::from_fn(PANEL_SIZE_MM, cells, |x, y| prd.height(&depths, x, y))
             }
-            Self::Brick(bricks) | Self::Flemish(bricks) => {
-                HeightField::from_fn(PANEL_SIZE_MM, cells, |x, y| bricks.height(x, y))
-            }
-            Self::Wavy(wavy) => {
-                let waves = wavy.waves();
-                HeightField::from_fn(PANEL_SIZE_MM, cells, |x, y| waves.height(x, y))
-            }
             Self::Layered(wall) => wall.height_field(cells),
-        }
-    }
-
-    fn check(&self) -> Result<(), &'static str> {
-        match self {
-            Self::Prd(prd) => prd.check(),
-            Self::Brick(bricks) | Self::Flemish(bricks) => bricks.check(),
-            Self::Wavy(wavy) => wavy.check(),
-            _ => Ok(()),
         }
     }
 }
 
 #[cfg(test)]
 mod tests {
+    use std::collections::BTreeSet;
+
     use super::*;
 
     #[test]
-    fn a_flemish_wall_stays_one_whatever_is_set() {
-        let mut wall = PanelRelief::by_name("flemish").expect("a relief");
-        wall.set("seed", "7").expect("a parameter");
-        assert_eq!(wall, PanelRelief::Flemish(BrickWall { bond: BrickBond::Flemish, seed: 7, ..BrickWall::default() }));
-        // Parameters alone say what the wall is: the table `surfaces` keeps them.
-        let again: BrickWall = serde_json::from_value(wall.parameters().into()).expect("bricks");
-        assert_eq!(PanelRelief::Flemish(again), wall);
-        let refused = wall.set("bond", "stretcher").expect_err("another relief").to_string();
-        assert!(refused.contains("has no parameter `bond`") && !refused.contains("bond,"), "{refused}");
+    fn parameters_are_set_by_name() {
+        let mut prd = PanelRelief::by_name("prd").expect("a relief");
+        prd.set("depth_mm", "6").expect("a parameter");
+        prd.set("prime", "31").expect("a parameter");
+        assert_eq!((&prd.parameters()["depth_mm"], &prd.parameters()["prime"]), (&6.0.into(), &31.into()));
+        let unknown = prd.set("colour", "red").expect_err("unknown").to_string();
+        assert!(unknown.contains("has no parameter `colour`; hint: prime, depth_mm"), "{unknown}");
+        for (key, value) in [("depth_mm", "NaN"), ("depth_mm", "-1"), ("depth_mm", "39"), ("prime", "32"), ("prime", "1.5")]
+        {
+            assert!(prd.set(key, value).is_err(), "{key}={value}");
+        }
+        assert!(PanelRelief::Flat.set("depth", "1").expect_err("none").to_string().contains("it has none"));
+        assert!(PanelRelief::by_name("marble").expect_err("unknown").to_string().contains("river_rock"));
     }
 
     #[test]
-    fn parameters_are_set_by_name() {
-        let mut brick = PanelRelief::by_name("brick").expect("a relief");
-        brick.set("joint_depth_mm", "6").expect("a parameter");
-        brick.set("seed", "7").expect("a parameter");
-        assert_eq!(brick.parameters()["joint_depth_mm"], 6.0);
-        let unknown = brick.set("colour", "red").expect_err("unknown").to_string();
-        assert!(unknown.contains("joint_depth_mm"), "{unknown}");
-        for (key, value) in [("joint_depth_mm", "NaN"), ("joint_depth_mm", "-1"), ("length_mm", "0"), ("seed", "1.5")] {
-            assert!(brick.set(key, value).is_err(), "{key}={value}");
+    fn reliefs_of_before_name_their_successor() {
+        for (old, new) in RENAMED {
+            let refused = PanelRelief::by_name(old).expect_err("gone").to_string();
+            assert!(refused.contains(&format!("`{old}` is gone")) && refused.contains(&format!("panel {new} --list")));
+            assert_eq!(PanelRelief::guess(&format!("{old}_2")), Some(new));
         }
-        assert!(PanelRelief::Flat.set("depth", "1").expect_err("none").to_string().contains("it has none"));
-        assert!(PanelRelief::by_name("marble").expect_err("unknown").to_string().contains("wavy"));
+        assert_eq!(PanelRelief::guess("flemish_bond_2"), Some("flemish_bond"));
+        assert_eq!(PanelRelief::guess("0001_0"), None);
+    }
+
+    #[test]
+    fn collections_are_their_seeds() {
+        let drawn = |seed| (0..90).map(|n| PanelRelief::drawn(seed, n)).collect::<Vec<_>>();
+        assert_eq!(drawn(1), drawn(1));
+        let (one, two) = (drawn(1), drawn(2));
+        assert!(one.iter().zip(&two).all(|(a, b)| a != b));
+        for block in one.chunks(9) {
+            let names: BTreeSet<_> = block.iter().map(PanelRelief::name).collect();
+            assert_eq!(names.len(), 9, "{names:?}");
+        }
+        let first: BTreeSet<_> = one.iter().step_by(9).map(PanelRelief::name).collect();
+        assert!(first.len() > 3, "the order changes");
+        // What is drawn can be set, so it is within the ranges.
+        for relief in one {
+            assert_eq!(PanelRelief::from_json(&relief.to_json().to_string()), Ok(relief));
+        }
     }
 
     mod slow {

@@ -153,6 +153,29 @@ impl ReliefParameter {
     }
 }
 
+impl ParameterDomain {
+    /// Returns the value at a share of the domain, from 0 to below 1. Seeds stay below a million.
+    pub(super) fn value(&self, share: f64) -> ParameterValue {
+        match *self {
+            Self::Number { low, high, .. } => {
+                ParameterValue::Number(rounded(low + (high - low) * share, high - low).clamp(low, high))
+            }
+            Self::Whole { low, high, .. } => {
+                ParameterValue::Whole(low + ((high.min(999_999) - low) as f64 * share) as u64)
+            }
+            Self::Choice { options, .. } => {
+                ParameterValue::Word(options[(options.len() as f64 * share) as usize].to_owned())
+            }
+        }
+    }
+}
+
+/// Rounds a value of a range, so that it is easy to read.
+pub(super) fn rounded(value: f64, width: f64) -> f64 {
+    let steps = if width < 10.0 { 1_000.0 } else { 10.0 };
+    (value * steps).round() / steps
+}
+
 impl std::fmt::Display for ParameterDomain {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         match self {

@@ -1,16 +1,26 @@
 //! The 2D primitive-root diffuser: wells whose depths follow the powers of a primitive root modulo a prime.
 
-use serde::{Deserialize, Serialize};
-
 use super::PANEL_SIZE_MM;
+use super::parameter::{ParameterLayer, ParameterValue, ReliefParameter};
+
+/// Parameters of relief `prd`; its lengths are the panel's own.
+pub(super) const PARAMETERS: [ReliefParameter; 2] = [
+    ReliefParameter::whole("prime", ParameterLayer::Whole, [5, LARGEST_PRIME, 157], "the prime p; p - 1 wells"),
+    ReliefParameter::number(
+        "depth_mm",
+        ParameterLayer::Whole,
+        "mm on the panel",
+        [0.1, 38.0, 38.0],
+        "depth of the deepest well under the highest",
+    ),
+];
 
 /// A 2D primitive-root diffuser of p - 1 wells in a rectangle.
 ///
 /// Well k is g^k mod p deep, in units of the greatest depth over p; the sequence goes along the rectangle's
 /// diagonal, which by the Chinese remainder theorem meets every well once if the sides have no common factor.
 /// Source: Cox and D'Antonio, Acoustic Absorbers and Diffusers, chapter on Schroeder diffusers.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct PrimitiveRootDiffuser {
     /// The prime. 157 makes 12 x 13 wells of 49 x 45 mm.
     pub prime: u64,
@@ -28,12 +38,17 @@ impl Default for PrimitiveRootDiffuser {
 const LARGEST_PRIME: u64 = 10_007;
 
 impl PrimitiveRootDiffuser {
-    pub(super) fn check(&self) -> Result<(), &'static str> {
-        if !is_prime(self.prime) || !(5..=LARGEST_PRIME).contains(&self.prime) || self.sides().is_none() {
-            return Err("a prime from 5 to 10007 with p - 1 = n m, n and m without a common factor");
-        }
-        if !(self.depth_mm > 0.0 && self.depth_mm <= 38.0) {
-            return Err("a depth above 0, up to 38 mm");
+    /// Sets the prime to a whole number, or the depth to a number, of their [`PARAMETERS`].
+    ///
+    /// # Errors
+    /// Returns the expected value.
+    pub(super) fn set(&mut self, value: &ParameterValue) -> Result<(), &'static str> {
+        match *value {
+            ParameterValue::Whole(prime) if is_prime(prime) && (Self { prime, ..*self }).sides().is_some() => {
+                self.prime = prime;
+            }
+            ParameterValue::Number(depth_mm) => self.depth_mm = depth_mm,
+            _ => return Err("a prime from 5 to 10007 with p - 1 = n m, n and m without a common factor"),
         }
         Ok(())
     }
@@ -158,10 +173,11 @@ mod tests {
 
     #[test]
     fn what_is_no_diffuser_is_refused() {
-        for prime in [0, 4, 5, 9, 17, 15, 10_009] {
-            let result = PrimitiveRootDiffuser { prime, ..PrimitiveRootDiffuser::default() }.check();
-            assert!(result.is_err(), "{prime}");
+        let mut prd = PrimitiveRootDiffuser::default();
+        for prime in [0, 4, 5, 9, 17, 15, 10_008] {
+            assert!(prd.set(&ParameterValue::Whole(prime)).is_err(), "{prime}");
         }
-        assert_eq!(PrimitiveRootDiffuser { prime: 31, depth_mm: 20.0 }.check(), Ok(()));
+        assert_eq!(prd.set(&ParameterValue::Whole(31)), Ok(()));
+        assert_eq!(prd.sides(), Some((5, 6)));
     }
 }

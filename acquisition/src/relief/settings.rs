@@ -2,15 +2,12 @@
 
 use std::collections::BTreeMap;
 
-use serde::{Deserialize, Serialize};
-
 use super::parameter::{ParameterDomain, ParameterValue, ReliefParameter};
 
 /// The wall is this many times as large as the panel (Rust et al. 2021).
 pub const FULL_SCALE: f64 = 10.0;
 /// Values by parameter name; parameters without one have their defaults.
-#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
-#[serde(transparent)]
+#[derive(Debug, Clone, PartialEq)]
 pub(super) struct WallSettings(pub(super) BTreeMap<String, ParameterValue>);
 
 impl WallSettings {
