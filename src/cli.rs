@@ -72,7 +72,7 @@ pub(crate) struct AcquireArgs {
     /// A parameter of it.
     #[arg(long, value_name = "KEY=VALUE")]
     pub(crate) set: Vec<String>,
-    /// A mesh to measure instead: GLB, STL, OBJ or PLY.
+    /// A mesh to measure instead: GLB or STL.
     #[arg(long)]
     pub(crate) mesh: Option<PathBuf>,
     /// The side of the mesh that is measured: the back is seen when the panel is turned over about its y axis.

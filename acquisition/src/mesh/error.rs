@@ -20,6 +20,16 @@ pub enum Error {
         /// The file.
         path: PathBuf,
     },
+    /// The format is written and not read.
+    #[error(
+        "mesh `{}` is of a format that is only written; hint: meshes are read from .glb and .stl, which Blender, MeshLab \
+         and trimesh export",
+        path.display()
+    )]
+    WrittenOnly {
+        /// The file.
+        path: PathBuf,
+    },
     /// The file is damaged, or of a kind that is not read.
     #[error("mesh `{}`: {place} has {actual}, expected {expected}", path.display())]
     Syntax {

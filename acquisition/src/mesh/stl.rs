@@ -2,7 +2,6 @@
 
 use std::path::Path;
 
-use super::obj::numbers;
 use super::{Error, Mesh};
 
 const HEADER: usize = 80;
@@ -67,6 +66,22 @@ fn text(bytes: &[u8], path: &Path) -> Result<Mesh, Error> {
         actual: "no end".to_owned(),
         expected: "three vertices a facet and `endsolid`",
     })
+}
+
+/// The first numbers of a line.
+fn numbers<const N: usize>(text: &str, path: &Path, line: usize) -> Result<[f32; N], Error> {
+    let mut words = text.split_whitespace();
+    let mut out = [0.0; N];
+    for slot in &mut out {
+        let word = words.next().unwrap_or("nothing");
+        *slot = word.parse().map_err(|_| Error::Syntax {
+            path: path.to_owned(),
+            place: format!("line {}", line + 1),
+            actual: format!("`{}`", word.chars().take(60).collect::<String>()),
+            expected: "a number",
+        })?;
+    }
+    Ok(out)
 }
 
 fn soup(vertices_mm: Vec<[f32; 3]>) -> Mesh {

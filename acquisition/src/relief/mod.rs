@@ -312,7 +312,8 @@ mod tests {
         assert_eq!((&prd.parameters()["depth_mm"], &prd.parameters()["prime"]), (&6.0.into(), &31.into()));
         let unknown = prd.set("colour", "red").expect_err("unknown").to_string();
         assert!(unknown.contains("has no parameter `colour`; hint: prime, depth_mm"), "{unknown}");
-        for (key, value) in [("depth_mm", "NaN"), ("depth_mm", "-1"), ("depth_mm", "39"), ("prime", "32"), ("prime", "1.5")]
+        for (key, value) in
+            [("depth_mm", "NaN"), ("depth_mm", "-1"), ("depth_mm", "39"), ("prime", "32"), ("prime", "1.5")]
         {
             assert!(prd.set(key, value).is_err(), "{key}={value}");
         }
