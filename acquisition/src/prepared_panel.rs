@@ -50,7 +50,7 @@ fn generated(relief: &PanelRelief) -> PreparedPanel {
         relief_mm: heights.extent_mm().map(f64::from),
     };
     let (macrostructure, microstructure) = match relief {
-        PanelRelief::Layered(wall) => (Some(wall.macrostructure().to_owned()), Some(wall.microstructure())),
+        PanelRelief::Layered(wall) => (Some(wall.macrostructure()), Some(wall.microstructure())),
         _ => (None, None),
     };
     PreparedPanel {

@@ -4,7 +4,7 @@ use super::PANEL_SIZE_MM;
 use super::chance::SeededRandom;
 use super::microstructure::{JOINT_SHAPE, joint_depth, joint_width};
 use super::parameter::{ParameterLayer, ReliefParameter};
-use super::settings::WallSettings;
+use super::settings::{FULL_SCALE, WallSettings};
 use super::stone::{StoneFaces, bulge, lean, pillow, projection};
 use super::stones::{SEED, StoneLayout, StoneSpot};
 
@@ -67,11 +67,11 @@ struct StoneCourse {
 }
 
 impl CoursedStones {
-    pub(super) fn of(settings: &WallSettings, seed: u64) -> Self {
-        let height = settings.model_mm(&ASHLAR[0]);
-        let length = settings.model_mm(&ASHLAR[1]);
-        let variation = settings.number(&ASHLAR[2]);
-        let chance = SeededRandom::new(seed, 0xA541);
+    pub(super) fn of(settings: &WallSettings) -> Self {
+        let height = settings.course_height_mm / FULL_SCALE;
+        let length = settings.stone_length_mm / FULL_SCALE;
+        let variation = settings.variation;
+        let chance = SeededRandom::new(settings.seed, 0xA541);
         let half = PANEL_SIZE_MM / 2.0;
         let (mut courses, mut top) = (Vec::<StoneCourse>::new(), -half - height * chance.unit(0));
         while top < half {

@@ -4,11 +4,11 @@
 //! their greatest still fit the relief's 40 mm, so that each combination can be made.
 
 use super::chance::SeededRandom;
-use super::macrostructure::{self, MacrostructureModel};
+use super::macrostructure::{self, MacrostructureModel, MacrostructureShape};
 use super::mesostructure::StoneArrangement;
-use super::microstructure::{GRAIN, JOINT_DEPTH, JOINT_SHAPE, JOINT_WIDTH, MicrostructureModel, ROUGHNESS};
+use super::microstructure::{JointShape, MicrostructureModel, SKIN};
 use super::parameter::{ParameterDomain, ParameterValue, ReliefParameter};
-use super::settings::WallSettings;
+use super::settings::{FULL_SCALE, WallSettings};
 use super::stones::SEED;
 use super::{HeightField, PANEL_SIZE_MM, RELIEF_MM};
 
@@ -19,30 +19,27 @@ const DETAIL_MM: f64 = 0.4;
 #[derive(Debug, Clone, PartialEq)]
 pub struct LayeredWall {
     mesostructure: StoneArrangement,
-    settings: WallSettings,
+    settings: Box<WallSettings>,
 }
 
 impl LayeredWall {
     /// A wall with its default parameters.
     pub fn new(mesostructure: StoneArrangement) -> Self {
-        let default = |p: ReliefParameter| (p.key.to_owned(), p.default_setting());
-        let mut settings = WallSettings(parameters(mesostructure).into_iter().map(default).collect());
-        if mesostructure == StoneArrangement::Macrostructure {
-            // Without stones and flat it would be Flat.
-            settings.0.insert(macrostructure::SHAPE.key.to_owned(), ParameterValue::Word("wavy_xy".to_owned()));
-        }
-        Self { mesostructure, settings }
+        Self::with(mesostructure, |_, parameter| parameter.default_setting())
     }
 
     /// A wall with every parameter drawn from its range.
     pub(super) fn drawn(mesostructure: StoneArrangement, chance: SeededRandom) -> Self {
-        let mut wall = Self::new(mesostructure);
-        for (n, parameter) in (0..).zip(parameters(mesostructure)) {
-            let value = parameter.domain.value(chance.unit(n));
+        Self::with(mesostructure, |n, parameter| parameter.domain.value(chance.unit(n)))
+    }
+
+    fn with(mesostructure: StoneArrangement, value: impl Fn(u64, &ReliefParameter) -> ParameterValue) -> Self {
+        let mut wall = Self { mesostructure, settings: Box::default() };
+        wall.set((0..).zip(parameters(mesostructure)).map(|(n, parameter)| (parameter.key, value(n, &parameter))));
+        let shape = &mut wall.settings.macrostructure;
+        if mesostructure == StoneArrangement::Macrostructure && *shape == MacrostructureShape::Flat {
             // Without stones and flat it would be Flat.
-            if mesostructure != StoneArrangement::Macrostructure || value != ParameterValue::Word("flat".to_owned()) {
-                wall.set(parameter.key, value);
-            }
+            *shape = MacrostructureShape::WavyXy;
         }
         wall
     }
@@ -52,54 +49,63 @@ impl LayeredWall {
         self.mesostructure
     }
 
-    /// Its large shape.
-    pub fn macrostructure(&self) -> &str {
-        self.settings.word(&macrostructure::SHAPE)
-    }
-
     /// Its joints and skin, in words.
     pub fn microstructure(&self) -> String {
-        let skin = match self.settings.number(&ROUGHNESS) {
-            0.0 => "smooth".to_owned(),
-            roughness => format!("rough by {roughness} mm"),
-        };
-        let [width, depth] = [&JOINT_WIDTH, &JOINT_DEPTH].map(|p| self.settings.number(p));
-        match self.settings.word(&JOINT_SHAPE) {
+        let WallSettings { roughness_mm, joint_width_mm: width, joint_depth_mm: depth, joint_shape, .. } =
+            *self.settings;
+        let skin = if roughness_mm == 0.0 { "smooth".to_owned() } else { format!("rough by {roughness_mm} mm") };
+        match joint_shape {
             _ if width == 0.0 || self.mesostructure == StoneArrangement::Macrostructure => skin,
-            "flush" => format!("flush joints {width} mm wide, {skin}"),
-            shape => format!("{shape} joints {width} mm wide and {depth} mm deep, {skin}"),
+            JointShape::Flush => format!("flush joints {width} mm wide, {skin}"),
+            _ => {
+                let shape = self.word("joint_shape");
+                format!("{shape} joints {width} mm wide and {depth} mm deep, {skin}")
+            }
         }
     }
 
+    /// Its large shape.
+    pub fn macrostructure(&self) -> String {
+        self.word("macrostructure")
+    }
+
+    fn word(&self, key: &str) -> String {
+        self.parameters().remove(key).and_then(|v| v.as_str().map(str::to_owned)).unwrap_or_default()
+    }
+
     /// Returns its parameters with their values.
-    pub fn settings(&self) -> impl Iterator<Item = (&str, &ParameterValue)> {
-        self.settings.0.iter().map(|(key, setting)| (key.as_str(), setting))
+    pub fn parameters(&self) -> serde_json::Map<String, serde_json::Value> {
+        let Ok(serde_json::Value::Object(mut all)) = serde_json::to_value(&self.settings) else {
+            return serde_json::Map::new();
+        };
+        let own = parameters(self.mesostructure);
+        all.retain(|key, _| own.iter().any(|p| p.key == key));
+        all
     }
 
     /// Makes the parameter's value here its default.
     pub(super) fn name_default(&self, parameter: &mut ReliefParameter) {
         if let ParameterDomain::Choice { options, default } = &mut parameter.domain {
-            let set = self.settings.word(&ReliefParameter::choice(parameter.key, parameter.layer, options, ""));
+            let set = self.word(parameter.key);
             *default = options.iter().find(|o| **o == set).unwrap_or(default);
         }
     }
 
-    /// Sets a parameter to a value of its domain.
-    pub(super) fn set(&mut self, key: &str, value: ParameterValue) {
-        self.settings.0.insert(key.to_owned(), value);
+    /// Sets parameters to values of their domains.
+    pub(super) fn set(&mut self, values: impl IntoIterator<Item = (&'static str, ParameterValue)>) {
+        let mut all = self.parameters();
+        all.extend(values.into_iter().map(|(key, value)| (key.to_owned(), value.into())));
+        // Values of a parameter's domain fit its field; a test tries them.
+        self.settings = serde_json::from_value(all.into()).unwrap_or_default();
     }
 
     /// Its heights, each the mean over its cell. Their mean is 0 if that keeps them within the relief.
     pub(super) fn height_field(&self, cells: usize) -> HeightField {
         let settings = &self.settings;
-        let seed = match settings.0.get(SEED.key) {
-            Some(ParameterValue::Whole(seed)) => *seed,
-            _ => 1,
-        };
         let shape = MacrostructureModel::of(settings);
-        let skin = MicrostructureModel::of(settings, seed);
-        let stones = self.mesostructure.stones(settings, seed);
-        let half_joint = settings.model_mm(&JOINT_WIDTH) / 2.0;
+        let skin = MicrostructureModel::of(settings);
+        let stones = self.mesostructure.stones(settings);
+        let half_joint = settings.joint_width_mm / FULL_SCALE / 2.0;
         let height = |x: f64, y: f64| {
             let relief = stones.as_ref().map_or(0.0, |stones| {
                 let spot = stones.spot(x, y, half_joint);
@@ -121,10 +127,9 @@ impl LayeredWall {
 
 /// Parameters of all layers of a wall.
 pub(super) fn parameters(mesostructure: StoneArrangement) -> Vec<ReliefParameter> {
-    use macrostructure::{DEPTH, PHASE, SHAPE, WAVELENGTH};
-    let large = [SHAPE, DEPTH, WAVELENGTH, PHASE];
-    let seed = (mesostructure.parameters().iter().all(|p| p.key != SEED.key)).then_some(SEED);
-    large.into_iter().chain(mesostructure.parameters().iter().copied()).chain([ROUGHNESS, GRAIN]).chain(seed).collect()
+    let own = mesostructure.parameters().iter().copied();
+    let seed = own.clone().all(|p| p.key != SEED.key).then_some(SEED);
+    macrostructure::PARAMETERS.into_iter().chain(own).chain(SKIN).chain(seed).collect()
 }
 
 fn centred(heights: HeightField) -> HeightField {
@@ -291,7 +296,8 @@ mod tests {
                 for parameter in &parameters {
                     match parameter.domain {
                         ParameterDomain::Number { high, .. } => {
-                            greatest.set(parameter.key, &high.to_string()).expect("in range")
+                            greatest.set(parameter.key, &high.to_string()).expect("in range");
+                            assert_eq!(greatest.parameters()[parameter.key], high);
                         }
                         ParameterDomain::Whole { .. } => greatest.set(parameter.key, "7").expect("in range"),
                         ParameterDomain::Choice { .. } => {}
@@ -303,6 +309,7 @@ mod tests {
                         let mut relief = greatest.clone();
                         relief.set("macrostructure", "convex").expect("a shape");
                         relief.set(parameter.key, option).expect("an option");
+                        assert_eq!(relief.parameters()[parameter.key], *option);
                         let [low, high] = relief.height_field(40).extent_mm().map(f64::from);
                         let fits = low >= RELIEF_MM[0] - 1e-4 && high <= RELIEF_MM[1] + 1e-4;
                         assert!(fits, "{} {}={option}: {low} to {high}", relief.name(), parameter.key);

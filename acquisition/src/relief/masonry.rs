@@ -1,23 +1,29 @@
 //! Bricks in stretcher and in Flemish bond, in full-scale sizes.
 
 use super::chance::SeededRandom;
-use super::microstructure::{JOINT_DEPTH, JOINT_SHAPE, JOINT_WIDTH};
+use super::microstructure::{JOINT_SHAPE, joint_depth, joint_width};
 use super::parameter::{ParameterLayer, ReliefParameter};
-use super::settings::WallSettings;
+use super::settings::{FULL_SCALE, WallSettings};
 use super::stone::{StoneFaces, lean, projection};
 use super::stones::{SEED, StoneLayout, StoneSpot};
 
-const LENGTH: ReliefParameter = ReliefParameter::mm(
-    "brick_length_mm",
-    ParameterLayer::Mesostructure,
-    [150.0, 600.0, 250.0],
-    "length of a brick; in Flemish bond a header shows half of it, less half a joint",
-);
-const HEIGHT: ReliefParameter =
-    ReliefParameter::mm("brick_height_mm", ParameterLayer::Mesostructure, [40.0, 250.0, 65.0], "height of a brick");
+const MESO: ParameterLayer = ParameterLayer::Mesostructure;
 
-pub(super) const PARAMETERS: [ReliefParameter; 8] =
-    [LENGTH, HEIGHT, projection(80.0, 4.0), lean(3.0), SEED, JOINT_SHAPE, JOINT_WIDTH, JOINT_DEPTH];
+pub(super) const PARAMETERS: [ReliefParameter; 8] = [
+    ReliefParameter::mm(
+        "brick_length_mm",
+        MESO,
+        [150.0, 600.0, 250.0],
+        "length of a brick; in Flemish bond a header shows half of it, less half a joint",
+    ),
+    ReliefParameter::mm("brick_height_mm", MESO, [40.0, 250.0, 65.0], "height of a brick"),
+    projection(80.0, 4.0),
+    lean(3.0),
+    SEED,
+    JOINT_SHAPE,
+    joint_width(10.0),
+    joint_depth(10.0),
+];
 
 /// Bond of a brick wall: the order of its bricks.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -39,14 +45,14 @@ pub(super) struct MasonryStones {
 }
 
 impl MasonryStones {
-    pub(super) fn of(settings: &WallSettings, seed: u64, bond: BrickBond) -> Self {
+    pub(super) fn of(settings: &WallSettings, bond: BrickBond) -> Self {
         Self {
             bond,
-            length: settings.model_mm(&LENGTH),
-            height: settings.model_mm(&HEIGHT),
-            joint: settings.model_mm(&JOINT_WIDTH),
+            length: settings.brick_length_mm / FULL_SCALE,
+            height: settings.brick_height_mm / FULL_SCALE,
+            joint: settings.joint_width_mm / FULL_SCALE,
             faces: StoneFaces::of(settings),
-            chance: SeededRandom::new(seed, 0xB41C),
+            chance: SeededRandom::new(settings.seed, 0xB41C),
         }
     }
 

@@ -87,15 +87,15 @@ impl StoneArrangement {
     }
 
     /// Returns its stones; None if it has none.
-    pub(super) fn stones(self, settings: &WallSettings, seed: u64) -> Option<Box<dyn StoneLayout>> {
+    pub(super) fn stones(self, settings: &WallSettings) -> Option<Box<dyn StoneLayout>> {
         Some(match self {
             Self::Macrostructure => return None,
-            Self::StretcherBond => Box::new(masonry::MasonryStones::of(settings, seed, masonry::BrickBond::Stretcher)),
-            Self::FlemishBond => Box::new(masonry::MasonryStones::of(settings, seed, masonry::BrickBond::Flemish)),
-            Self::CoursedAshlar | Self::SlatedStone => Box::new(courses::CoursedStones::of(settings, seed)),
-            Self::PolygonalRubble => Box::new(voronoi::StoneCells::of(settings, seed, voronoi::StoneOutline::Polygons)),
-            Self::RiverRock => Box::new(voronoi::StoneCells::of(settings, seed, voronoi::StoneOutline::Round)),
-            Self::Primitives => Box::new(primitives::PrimitiveStones::of(settings, seed)),
+            Self::StretcherBond => Box::new(masonry::MasonryStones::of(settings, masonry::BrickBond::Stretcher)),
+            Self::FlemishBond => Box::new(masonry::MasonryStones::of(settings, masonry::BrickBond::Flemish)),
+            Self::CoursedAshlar | Self::SlatedStone => Box::new(courses::CoursedStones::of(settings)),
+            Self::PolygonalRubble => Box::new(voronoi::StoneCells::of(settings, voronoi::StoneOutline::Polygons)),
+            Self::RiverRock => Box::new(voronoi::StoneCells::of(settings, voronoi::StoneOutline::Round)),
+            Self::Primitives => Box::new(primitives::PrimitiveStones::of(settings)),
             Self::PrimitiveRoot => Box::new(wells::DiffuserWells::of(settings)),
         })
     }

@@ -1,8 +1,10 @@
 //! The skin of a wall: its joints' profile, and how rough it is.
 
+use serde::{Deserialize, Serialize};
+
 use super::chance::SeededRandom;
 use super::parameter::{ParameterLayer, ReliefParameter};
-use super::settings::WallSettings;
+use super::settings::{FULL_SCALE, WallSettings};
 
 const LAYER: ParameterLayer = ParameterLayer::Microstructure;
 
@@ -13,23 +15,23 @@ pub(super) const JOINT_SHAPE: ReliefParameter = ReliefParameter::choice(
     "profile of the joints: recessed has a level floor, flush is filled up to the stones, raked has an uneven floor, \
      concave is a bucket handle's arc, v has two slopes",
 );
-pub(super) const JOINT_WIDTH: ReliefParameter = joint_width(10.0);
-pub(super) const JOINT_DEPTH: ReliefParameter = joint_depth(10.0);
-pub(super) const ROUGHNESS: ReliefParameter = ReliefParameter::mm(
-    "roughness_mm",
-    LAYER,
-    [0.0, 10.0, 0.0],
-    "height of the surface's unevenness from its lowest to its highest point at most",
-);
-pub(super) const GRAIN: ReliefParameter =
-    ReliefParameter::mm("roughness_grain_mm", LAYER, [20.0, 400.0, 60.0], "size of the unevenness along the wall");
+/// Parameters of the skin.
+pub(super) const SKIN: [ReliefParameter; 2] = [
+    ReliefParameter::mm(
+        "roughness_mm",
+        LAYER,
+        [0.0, 10.0, 0.0],
+        "height of the surface's unevenness from its lowest to its highest point at most",
+    ),
+    ReliefParameter::mm("roughness_grain_mm", LAYER, [20.0, 400.0, 60.0], "size of the unevenness along the wall"),
+];
 
-/// [`JOINT_WIDTH`] with another default.
+/// Makes the parameter for the joints' width.
 pub(super) const fn joint_width(default: f64) -> ReliefParameter {
     ReliefParameter::mm("joint_width_mm", LAYER, [0.0, 40.0, default], "width of the joints between stones")
 }
 
-/// [`JOINT_DEPTH`] with another default.
+/// Makes the parameter for the joints' depth.
 pub(super) const fn joint_depth(default: f64) -> ReliefParameter {
     ReliefParameter::mm(
         "joint_depth_mm",
@@ -51,31 +53,26 @@ pub(super) struct MicrostructureModel {
     chance: SeededRandom,
 }
 
-#[derive(Debug, Clone, Copy, PartialEq)]
-enum JointShape {
-    Flush,
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub(super) enum JointShape {
+    #[default]
     Recessed,
+    Flush,
     Raked,
     Concave,
     V,
 }
 
 impl MicrostructureModel {
-    pub(super) fn of(settings: &WallSettings, seed: u64) -> Self {
-        let shape = match settings.word(&JOINT_SHAPE) {
-            "flush" => JointShape::Flush,
-            "raked" => JointShape::Raked,
-            "concave" => JointShape::Concave,
-            "v" => JointShape::V,
-            _ => JointShape::Recessed,
-        };
+    pub(super) fn of(settings: &WallSettings) -> Self {
         Self {
-            shape,
-            half_width: settings.model_mm(&JOINT_WIDTH) / 2.0,
-            depth: settings.model_mm(&JOINT_DEPTH),
-            roughness: settings.model_mm(&ROUGHNESS),
-            grain: settings.model_mm(&GRAIN),
-            chance: SeededRandom::new(seed, 0x4A01),
+            shape: settings.joint_shape,
+            half_width: settings.joint_width_mm / FULL_SCALE / 2.0,
+            depth: settings.joint_depth_mm / FULL_SCALE,
+            roughness: settings.roughness_mm / FULL_SCALE,
+            grain: settings.roughness_grain_mm / FULL_SCALE,
+            chance: SeededRandom::new(settings.seed, 0x4A01),
         }
     }
 

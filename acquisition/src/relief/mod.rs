@@ -228,7 +228,7 @@ impl PanelRelief {
         })?;
         let setting = parameter.parse(relief, value)?;
         match self {
-            Self::Layered(wall) => wall.set(key, setting),
+            Self::Layered(wall) => wall.set([(parameter.key, setting)]),
             Self::Prd(prd) => prd.set(&setting).map_err(|expected| Error::Value {
                 relief,
                 key: key.to_owned(),
@@ -278,10 +278,7 @@ impl PanelRelief {
                 .map(|(key, value): (&str, serde_json::Value)| (key.to_owned(), value))
                 .into_iter()
                 .collect(),
-            Self::Layered(wall) => {
-                let value = |setting| serde_json::to_value(setting).unwrap_or_default();
-                wall.settings().map(|(key, setting)| (key.to_owned(), value(setting))).collect()
-            }
+            Self::Layered(wall) => wall.parameters(),
         }
     }
 

@@ -1,6 +1,6 @@
 //! Parameters of reliefs: their names, meanings and domains.
 
-use serde::{Deserialize, Serialize};
+use serde::Serialize;
 
 use super::Error;
 
@@ -65,8 +65,7 @@ pub struct ReliefParameter {
 }
 
 /// Value of a parameter.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(untagged)]
+#[derive(Debug, Clone, PartialEq)]
 pub enum ParameterValue {
     /// A whole number.
     Whole(u64),
@@ -186,12 +185,12 @@ impl std::fmt::Display for ParameterDomain {
     }
 }
 
-impl std::fmt::Display for ParameterValue {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        match self {
-            Self::Whole(x) => write!(f, "{x}"),
-            Self::Number(x) => write!(f, "{x}"),
-            Self::Word(x) => f.write_str(x),
+impl From<ParameterValue> for serde_json::Value {
+    fn from(value: ParameterValue) -> Self {
+        match value {
+            ParameterValue::Whole(x) => x.into(),
+            ParameterValue::Number(x) => x.into(),
+            ParameterValue::Word(x) => x.into(),
         }
     }
 }

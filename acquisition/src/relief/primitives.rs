@@ -1,38 +1,42 @@
 //! Solids of geometry on a square lattice.
 
+use serde::{Deserialize, Serialize};
+
 use super::chance::SeededRandom;
 use super::microstructure::{JOINT_SHAPE, joint_depth, joint_width};
 use super::parameter::{ParameterLayer, ReliefParameter};
-use super::settings::WallSettings;
+use super::settings::{FULL_SCALE, WallSettings};
 use super::stones::{SEED, StoneLayout, StoneSpot};
 
 const MESO: ParameterLayer = ParameterLayer::Mesostructure;
 
-const SOLID: ReliefParameter = ReliefParameter::choice(
-    "primitive",
-    MESO,
-    &["pyramid", "hemisphere", "box", "wedge", "ridge", "cone", "cylinder"],
-    "the solid that is repeated; a wedge rises to one side, a ridge to its middle line",
-);
-const SIZE: ReliefParameter =
-    ReliefParameter::mm("primitive_size_mm", MESO, [100.0, 2000.0, 450.0], "edge of a solid's base");
-const HEIGHT: ReliefParameter =
-    ReliefParameter::mm("primitive_height_mm", MESO, [0.0, 150.0, 150.0], "height of a solid");
-const GAP: ReliefParameter = ReliefParameter::mm("gap_mm", MESO, [0.0, 500.0, 30.0], "between the bases of two solids");
-const VARIATION: ReliefParameter =
-    ReliefParameter::number("variation", MESO, "share", [0.0, 1.0, 0.0], "solids are lower by up to this share");
-const TURN: ReliefParameter = ReliefParameter::choice(
-    "turn",
-    MESO,
-    &["alike", "alternating", "random"],
-    "how wedges and ridges are turned, in quarter turns",
-);
+pub(super) const PARAMETERS: [ReliefParameter; 10] = [
+    ReliefParameter::choice(
+        "primitive",
+        MESO,
+        &["pyramid", "hemisphere", "box", "wedge", "ridge", "cone", "cylinder"],
+        "the solid that is repeated; a wedge rises to one side, a ridge to its middle line",
+    ),
+    ReliefParameter::mm("primitive_size_mm", MESO, [100.0, 2000.0, 450.0], "edge of a solid's base"),
+    ReliefParameter::mm("primitive_height_mm", MESO, [0.0, 150.0, 150.0], "height of a solid"),
+    ReliefParameter::mm("gap_mm", MESO, [0.0, 500.0, 30.0], "between the bases of two solids"),
+    ReliefParameter::number("variation", MESO, "share", [0.0, 1.0, 0.0], "solids are lower by up to this share"),
+    ReliefParameter::choice(
+        "turn",
+        MESO,
+        &["alike", "alternating", "random"],
+        "how wedges and ridges are turned, in quarter turns",
+    ),
+    SEED,
+    JOINT_SHAPE,
+    joint_width(0.0),
+    joint_depth(0.0),
+];
 
-pub(super) const PARAMETERS: [ReliefParameter; 10] =
-    [SOLID, SIZE, HEIGHT, GAP, VARIATION, TURN, SEED, JOINT_SHAPE, joint_width(0.0), joint_depth(0.0)];
-
-#[derive(Debug, Clone, Copy, PartialEq)]
-enum Solid {
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub(super) enum SolidShape {
+    #[default]
     Pyramid,
     Hemisphere,
     Box,
@@ -42,8 +46,10 @@ enum Solid {
     Cylinder,
 }
 
-#[derive(Debug, Clone, Copy, PartialEq)]
-enum Turn {
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub(super) enum SolidTurn {
+    #[default]
     Alike,
     Alternating,
     Random,
@@ -51,54 +57,40 @@ enum Turn {
 
 /// A lattice of solids, model mm.
 pub(super) struct PrimitiveStones {
-    solid: Solid,
+    solid: SolidShape,
     half_size: f64,
     height: f64,
     half_pitch: f64,
     variation: f64,
-    turn: Turn,
+    turn: SolidTurn,
     chance: SeededRandom,
 }
 
 impl PrimitiveStones {
-    pub(super) fn of(settings: &WallSettings, seed: u64) -> Self {
-        let solid = match settings.word(&SOLID) {
-            "hemisphere" => Solid::Hemisphere,
-            "box" => Solid::Box,
-            "wedge" => Solid::Wedge,
-            "ridge" => Solid::Ridge,
-            "cone" => Solid::Cone,
-            "cylinder" => Solid::Cylinder,
-            _ => Solid::Pyramid,
-        };
-        let turn = match settings.word(&TURN) {
-            "alternating" => Turn::Alternating,
-            "random" => Turn::Random,
-            _ => Turn::Alike,
-        };
-        let half_size = settings.model_mm(&SIZE) / 2.0;
+    pub(super) fn of(settings: &WallSettings) -> Self {
+        let half_size = settings.primitive_size_mm / FULL_SCALE / 2.0;
         Self {
-            solid,
+            solid: settings.primitive,
             half_size,
-            height: settings.model_mm(&HEIGHT),
-            half_pitch: half_size + settings.model_mm(&GAP) / 2.0,
-            variation: settings.number(&VARIATION),
-            turn,
-            chance: SeededRandom::new(seed, 0x9813),
+            height: settings.primitive_height_mm / FULL_SCALE,
+            half_pitch: half_size + settings.gap_mm / FULL_SCALE / 2.0,
+            variation: settings.variation,
+            turn: settings.turn,
+            chance: SeededRandom::new(settings.seed, 0x9813),
         }
     }
 
     fn turned(&self, place: [f64; 2], cell: [i64; 2], stone: SeededRandom) -> [f64; 2] {
         let quarters = match self.turn {
-            Turn::Alike => 0,
-            Turn::Alternating => (cell[0] + cell[1]).rem_euclid(2) as u64,
-            Turn::Random => stone.whole(3) % 4,
+            SolidTurn::Alike => 0,
+            SolidTurn::Alternating => (cell[0] + cell[1]).rem_euclid(2) as u64,
+            SolidTurn::Random => stone.whole(3) % 4,
         };
         (0..quarters).fold(place, |[u, v], _| [v, -u])
     }
 }
 
-impl Solid {
+impl SolidShape {
     /// Height as a share of the greatest, at a place from -1 to 1 in both directions.
     fn share(self, [u, v]: [f64; 2]) -> f64 {
         if u.abs() > 1.0 || v.abs() > 1.0 {

@@ -2,7 +2,7 @@
 
 use super::chance::SeededRandom;
 use super::parameter::{ParameterLayer, ReliefParameter};
-use super::settings::WallSettings;
+use super::settings::{FULL_SCALE, WallSettings};
 
 /// Makes the parameter for the stones' height over the wall.
 pub(super) const fn projection(high: f64, default: f64) -> ReliefParameter {
@@ -33,9 +33,9 @@ pub(super) struct StoneFaces {
 impl StoneFaces {
     pub(super) fn of(settings: &WallSettings) -> Self {
         Self {
-            projection: settings.model_mm(&projection(0.0, 0.0)),
-            lean: settings.model_mm(&lean(0.0)),
-            bulge: settings.model_mm(&bulge(0.0, 0.0)),
+            projection: settings.projection_mm / FULL_SCALE,
+            lean: settings.lean_mm / FULL_SCALE,
+            bulge: settings.bulge_mm / FULL_SCALE,
         }
     }
 

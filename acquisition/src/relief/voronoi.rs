@@ -4,7 +4,7 @@ use super::PANEL_SIZE_MM;
 use super::chance::SeededRandom;
 use super::microstructure::{JOINT_SHAPE, joint_depth, joint_width};
 use super::parameter::{ParameterLayer, ReliefParameter};
-use super::settings::WallSettings;
+use super::settings::{FULL_SCALE, WallSettings};
 use super::stone::{StoneFaces, bulge, lean, pillow, projection};
 use super::stones::{SEED, StoneLayout, StoneSpot};
 
@@ -85,11 +85,10 @@ struct Stone {
 }
 
 impl StoneCells {
-    pub(super) fn of(settings: &WallSettings, seed: u64, outline: StoneOutline) -> Self {
-        let size = settings.model_mm(&RUBBLE[0]);
-        let scale = [size * settings.number(&ELONGATION), size];
-        let irregularity = settings.number(&IRREGULARITY);
-        let chance = SeededRandom::new(seed, 0x5701);
+    pub(super) fn of(settings: &WallSettings, outline: StoneOutline) -> Self {
+        let size = settings.stone_size_mm / FULL_SCALE;
+        let scale = [size * settings.elongation, size];
+        let chance = SeededRandom::new(settings.seed, 0x5701);
         // As many stones as places of the panel look at, and those that these look at.
         let first = scale.map(|s| (-PANEL_SIZE_MM / 2.0 / s).floor() as i64 - 2 * REACH);
         let counts = first.map(|first| (-2 * first + 1) as usize);
@@ -97,7 +96,7 @@ impl StoneCells {
             let (ix, iy) = (first[0] + (n % counts[0]) as i64, first[1] + (n / counts[0]) as i64);
             // Odd rows are shifted by half a stone, so that stones without irregularity are hexagons.
             let shift = 0.5 * iy.rem_euclid(2) as f64;
-            let off = |n| 0.45 * irregularity * chance.at(ix, iy).signed(n);
+            let off = |n| 0.45 * settings.irregularity * chance.at(ix, iy).signed(n);
             Stone { middle: [ix as f64 + shift + off(8), iy as f64 + off(9)], radius: 0.0 }
         };
         let stones = (0..counts[0] * counts[1]).map(stone).collect();

@@ -2,24 +2,29 @@
 
 use super::microstructure::{JOINT_SHAPE, joint_depth, joint_width};
 use super::parameter::{ParameterLayer, ReliefParameter};
-use super::settings::WallSettings;
+use super::settings::{FULL_SCALE, WallSettings};
 use super::stones::{StoneLayout, StoneSpot};
 use super::{PANEL_SIZE_MM, PrimitiveRootDiffuser};
 
-const PRIME: ReliefParameter = ReliefParameter::choice(
-    "prime",
-    ParameterLayer::Mesostructure,
-    &["157", "31", "43", "73", "211", "241", "307", "421", "463", "601", "757"],
-    "p of the sequence g^k mod p; p - 1 wells, nearly square for these",
-);
-const DEPTH: ReliefParameter = ReliefParameter::mm(
-    "well_depth_mm",
-    ParameterLayer::Mesostructure,
-    [10.0, 150.0, 150.0],
-    "depth of the deepest well; `prd` makes deeper ones",
-);
+const MESO: ParameterLayer = ParameterLayer::Mesostructure;
 
-pub(super) const PARAMETERS: [ReliefParameter; 5] = [PRIME, DEPTH, JOINT_SHAPE, joint_width(0.0), joint_depth(0.0)];
+pub(super) const PARAMETERS: [ReliefParameter; 5] = [
+    ReliefParameter::choice(
+        "prime",
+        MESO,
+        &["157", "31", "43", "73", "211", "241", "307", "421", "463", "601", "757"],
+        "p of the sequence g^k mod p; p - 1 wells, nearly square for these",
+    ),
+    ReliefParameter::mm(
+        "well_depth_mm",
+        MESO,
+        [10.0, 150.0, 150.0],
+        "depth of the deepest well; `prd` makes deeper ones",
+    ),
+    JOINT_SHAPE,
+    joint_width(0.0),
+    joint_depth(0.0),
+];
 
 /// Wells over the panel, model mm.
 pub(super) struct DiffuserWells {
@@ -30,9 +35,9 @@ pub(super) struct DiffuserWells {
 
 impl DiffuserWells {
     pub(super) fn of(settings: &WallSettings) -> Self {
-        let deepest = settings.model_mm(&DEPTH);
+        let deepest = settings.well_depth_mm / FULL_SCALE;
         // The options are primes, and the smallest is 31.
-        let prime = settings.word(&PRIME).parse().unwrap_or(31);
+        let prime = settings.prime.parse().unwrap_or(31);
         let diffuser = PrimitiveRootDiffuser { prime, depth_mm: deepest };
         let (n, m) = diffuser.sides().unwrap_or((1, 1));
         Self { depths: diffuser.depths_mm(), sides: [n as f64, m as f64], deepest }
