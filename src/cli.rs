@@ -7,7 +7,7 @@ use std::path::PathBuf;
 
 use clap::{Args, Parser, Subcommand};
 use echolake_acquisition::ViewerAccess;
-use echolake_acquisition::mesh::PanelSide;
+use echolake_acquisition::panel::mesh::PanelSide;
 use echolake_acquisition::replay::SPEEDS;
 use echolake_schema::SurfaceId;
 

@@ -8,13 +8,13 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use anyhow::Context as _;
-use echolake_acquisition::controller::{RecordingMode, RunControl, RunEvent};
-use echolake_acquisition::live::LiveServer;
-use echolake_acquisition::mesh::Mesh;
-use echolake_acquisition::metrics::{MetricsServer, RunMetrics};
-use echolake_acquisition::recorder::{Held, partial_of, random_tag};
+use echolake_acquisition::panel::mesh::Mesh;
+use echolake_acquisition::run::controller::{RecordingMode, RunControl, RunEvent};
+use echolake_acquisition::run::live::LiveServer;
+use echolake_acquisition::run::metrics::{MetricsServer, RunMetrics};
+use echolake_acquisition::run::recorder::{Held, partial_of, random_tag};
+use echolake_acquisition::run::session::{MeasuredRun, PreflightMode, RunSession, TakePace};
 use echolake_acquisition::run::{self, PanelSpecimen, RunRequest};
-use echolake_acquisition::session::{MeasuredRun, PreflightMode, RunSession, TakePace};
 use echolake_lake::{Lake, ReferenceSurfaces};
 use echolake_schema::{Rig, SurfaceId, Timestamp};
 

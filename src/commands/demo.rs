@@ -5,9 +5,9 @@ mod measure;
 use std::path::Path;
 use std::time::Instant;
 
-use echolake_acquisition::collection::{CollectionSurface, collection};
-use echolake_acquisition::controller::RecordingMode;
-use echolake_acquisition::relief::PanelRelief;
+use echolake_acquisition::panel::collection::{CollectionSurface, collection};
+use echolake_acquisition::panel::relief::PanelRelief;
+use echolake_acquisition::run::controller::RecordingMode;
 use echolake_ingest::pending;
 use echolake_lake::{Lake, ReferenceSurfaces};
 use echolake_query::Session;

@@ -7,8 +7,8 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context as _, bail};
 use clap::Args;
-use echolake_acquisition::mesh::{BACK_MM, Format, Mesh};
-use echolake_acquisition::relief::{HeightField, PanelRelief};
+use echolake_acquisition::panel::mesh::{BACK_MM, Format, Mesh};
+use echolake_acquisition::panel::relief::{HeightField, PanelRelief};
 
 use crate::CommandOutcome;
 
