@@ -7,7 +7,7 @@ use std::path::PathBuf;
 
 use clap::{Args, Parser, Subcommand};
 use echolake_acquisition::ViewerAccess;
-use echolake_acquisition::mesh::PanelSide;
+use echolake_acquisition::panel::mesh::PanelSide;
 use echolake_acquisition::replay::SPEEDS;
 use echolake_schema::SurfaceId;
 
@@ -72,7 +72,7 @@ pub(crate) struct AcquireArgs {
     /// A parameter of it.
     #[arg(long, value_name = "KEY=VALUE")]
     pub(crate) set: Vec<String>,
-    /// A mesh to measure instead: GLB, STL, OBJ or PLY.
+    /// A mesh to measure instead: GLB or STL.
     #[arg(long)]
     pub(crate) mesh: Option<PathBuf>,
     /// The side of the mesh that is measured: the back is seen when the panel is turned over about its y axis.
@@ -115,9 +115,6 @@ pub(crate) struct AcquireArgs {
     /// Serve metrics for Prometheus under http://ADDR/metrics.
     #[arg(long, value_name = "ADDR")]
     pub(crate) metrics: Option<std::net::SocketAddr>,
-    /// Send metrics every ten seconds as InfluxDB lines: udp://HOST:PORT, or an http:// address of a write endpoint.
-    #[arg(long, value_name = "URL")]
-    pub(crate) influx: Option<String>,
 }
 
 #[derive(Debug, Args)]

@@ -363,25 +363,29 @@ mod slow {
             place.fails(1, &args.iter().map(String::as_str).collect::<Vec<_>>(), expected);
             assert!(!place.path("lake").exists(), "no lake is made for it: {mesh}");
         };
-        std::fs::write(place.path("empty.obj"), "v 0 0 0\n").expect("written");
-        std::fs::write(place.path("open.obj"), "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n").expect("written");
-        std::fs::write(
-            place.path("large.obj"),
-            "v 0 0 0\nv 1000 0 0\nv 0 1000 0\nv 0 0 1\nf 1 2 3\nf 1 2 4\nf 2 3 4\nf 1 3 4\n",
-        )
-        .expect("written");
-        check("empty.obj", "is empty");
-        check("open.obj", "is open: 3 edges");
-        check("large.obj", "larger than the panel");
+        let stl = |file: &str, triangles: &[[[u32; 3]; 3]]| {
+            let vertex = |[x, y, z]: &[u32; 3]| format!("vertex {x} {y} {z}\n");
+            let text: String = triangles.iter().flatten().map(vertex).collect();
+            std::fs::write(place.path(file), format!("solid x\n{text}endsolid x\n")).expect("written");
+        };
+        stl("empty.stl", &[]);
+        stl("open.stl", &[[[0, 0, 0], [1, 0, 0], [0, 1, 0]]]);
+        let [a, b, c, d] = [[0, 0, 0], [1000, 0, 0], [0, 1000, 0], [0, 0, 1]];
+        stl("large.stl", &[[a, b, c], [a, b, d], [b, c, d], [a, c, d]]);
+        std::fs::write(place.path("panel.ply"), "ply\n").expect("written");
+        check("empty.stl", "is empty");
+        check("open.stl", "is open: 3 edges");
+        check("large.stl", "larger than the panel");
+        check("panel.ply", "read from .glb and .stl");
         check("missing.stl", "cannot read mesh");
         check("panel.step", "no mesh file that is known");
         place.fails(1, &["acquire", "--surface", "mystery", "--rig", "rig.toml"], "unknown surface `mystery`");
         place.fails(2, &["acquire", "--surface", "../x", "--rig", "rig.toml"], "not a valid surface id");
         place.fails(1, &["acquire", "--surface", "brick", "--set", "colour=red"], "no parameter `colour`");
-        place.ok(&["panel", "wavy", "-o", "wavy.stl"]);
+        place.ok(&["panel", "macrostructure", "--cells", "128", "-o", "wavy.stl"]);
         place.acquire("from_file", &["--mesh", "wavy.stl"]);
         place.fails(2, &["acquire", "--surface", "x", "--rig", "rig.toml", "--side", "back"], "--mesh");
-        place.ok(&["panel", "flat", "--back", "wavy", "--cells", "64", "-o", "two.stl"]);
+        place.ok(&["panel", "flat", "--back", "macrostructure", "--cells", "64", "-o", "two.stl"]);
         place.acquire("two_0", &["--mesh", "two.stl"]);
         place.acquire("two_1", &["--mesh", "two.stl", "--side", "back"]);
         place.ok(&["ingest"]);

@@ -59,14 +59,13 @@ fn a_collection_is_measured_once_and_ingested() {
 
     // A larger collection begins with the smaller one.
     let printed = place.ok(&demo("7", &[]));
-    assert!(["flat", "foam", "wood", "macrostructure"].iter().all(|name| printed.contains(name)), "{printed}");
     assert_eq!(place.number("select count(*) from measurements"), 7.0 * PAIRS);
     assert_eq!(place.number("select count(*) from tnce"), 7.0 * PAIRS);
     let rows = place.sql("select surface_id, typology, panel, side from surfaces where origin = 'simulated'");
     let typologies: BTreeSet<_> = rows.iter().map(|r| r["typology"].as_str().expect("text")).collect();
-    let expected =
-        ["flemish_bond_bricks", "macrostructure", "primitive_root_diffuser", "reference", "stretcher_bond_bricks"];
-    assert_eq!(typologies, BTreeSet::from(expected));
+    assert_eq!(typologies.len(), 5, "those of four walls, and the references': {typologies:?}");
+    let kinds = typologies.iter().filter(|kind| **kind != "reference").chain(&["flat", "foam", "wood"]);
+    kinds.for_each(|kind| assert!(printed.contains(kind), "{kind}: {printed}"));
     let side = rows.iter().find(|r| r["surface_id"] == "0002_1").expect("the second panel's other side");
     assert_eq!((&side["panel"], &side["side"]), (&"0002".into(), &1.into()));
 

@@ -5,7 +5,7 @@ use super::TestFolder;
 #[test]
 fn sofa_out_and_in_again() {
     let (place, other) = (TestFolder::new(), TestFolder::new());
-    for (surface, panel, seed) in [("flat", "flat", "1"), ("foam", "foam", "2"), ("0015_0", "wavy", "3")] {
+    for (surface, panel, seed) in [("flat", "flat", "1"), ("foam", "foam", "2"), ("0015_0", "macrostructure", "3")] {
         place.acquire(surface, &["--seed", seed, "--panel", panel, "--ir-only"]);
     }
     place.ok(&["ingest"]);

@@ -7,7 +7,7 @@
 
 use std::io::{Read as _, Write as _};
 
-use echolake_acquisition::drivers::rosbridge::fake::FakeBridge;
+use echolake_acquisition::rig::drivers::rosbridge::fake::FakeBridge;
 
 fn main() -> std::io::Result<()> {
     let address = std::env::args().nth(1).unwrap_or_else(|| "127.0.0.1:9090".into());

@@ -10,8 +10,8 @@ mod child;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-use echolake_acquisition::conformance;
-use echolake_acquisition::drivers::audio_interface;
+use echolake_acquisition::rig::conformance;
+use echolake_acquisition::rig::drivers::audio_interface;
 use echolake_acquisition::rig::{AudioInterface, AudioTake, Error};
 use echolake_schema::Timestamp;
 use echolake_schema::devices::{AlsaParams, AudioFormat};

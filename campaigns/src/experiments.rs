@@ -13,7 +13,7 @@
 use std::io::Write as _;
 
 use anyhow::Result;
-use echolake_acquisition::relief::{HeightField, PANEL_SIZE_MM, PanelRelief};
+use echolake_acquisition::panel::relief::{HeightField, PANEL_SIZE_MM, PanelRelief};
 use echolake_dsp::filter_bank::gain;
 use echolake_dsp::kirchhoff::KirchhoffPlan;
 use echolake_dsp::level::{p90_mean, power_to_db};

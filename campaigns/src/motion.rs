@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 use anyhow::Result;
-use echolake_acquisition::robots::{
+use echolake_acquisition::rig::robots::{
     ArmPose, Cell, MotionCourse, PlanParams, UnreachableReason, course, length_secs, plan,
 };
 use echolake_schema::robots::{RobotCell, Rod};

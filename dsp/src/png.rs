@@ -1,4 +1,5 @@
-//! PNG files of one grey channel (W3C Portable Network Graphics, third edition).
+//! PNG files of one grey channel (W3C Portable Network Graphics, third edition). The crate `png` would add itself,
+//! fdeflate and a second miniz_oxide to the lock for the forty lines here.
 
 const SIGNATURE: [u8; 8] = [0x89, b'P', b'N', b'G', b'\r', b'\n', 0x1A, b'\n'];
 /// 8 bits, grey, deflate, adaptive filters, not interlaced.

@@ -8,11 +8,11 @@ use std::sync::atomic::AtomicBool;
 use arrow::array::AsArray as _;
 use arrow::datatypes::{Int32Type, Int64Type};
 use arrow::record_batch::RecordBatch;
-use echolake_acquisition::controller::RecordingMode;
 use echolake_acquisition::import::{ImportOptions, import_gir, import_wav};
-use echolake_acquisition::relief::PanelRelief;
+use echolake_acquisition::panel::relief::PanelRelief;
+use echolake_acquisition::run::controller::RecordingMode;
+use echolake_acquisition::run::simulate::simulate;
 use echolake_acquisition::run::{PanelSpecimen, RunRequest};
-use echolake_acquisition::simulate::simulate;
 use echolake_ingest::{LakeIngest, complete, pending};
 use echolake_lake::{Lake, ReferenceSurfaces};
 use echolake_schema::{Rig, RunId, Table, Timestamp, topics};
@@ -33,7 +33,7 @@ async fn lake(home: &TempDir, keep: RecordingMode) -> Lake {
     let inbox = home.path().join("lake/inbox");
     std::fs::create_dir_all(&inbox).expect("a folder");
     for (number, surface) in SURFACES.into_iter().enumerate() {
-        let name = if number < 2 { surface } else { "wavy" };
+        let name = if number < 2 { surface } else { "macrostructure" };
         let specimen = PanelSpecimen::Relief(PanelRelief::by_name(name).expect("a relief"));
         let run = RunRequest {
             rig: &rig,

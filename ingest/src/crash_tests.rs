@@ -7,10 +7,10 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use arrow::row::{RowConverter, SortField};
 use bytes::Bytes;
 use chrono::TimeDelta;
-use echolake_acquisition::controller::RecordingMode;
-use echolake_acquisition::relief::PanelRelief;
+use echolake_acquisition::panel::relief::PanelRelief;
+use echolake_acquisition::run::controller::RecordingMode;
+use echolake_acquisition::run::simulate::simulate;
 use echolake_acquisition::run::{PanelSpecimen, RunRequest};
-use echolake_acquisition::simulate::simulate;
 use echolake_lake::{DeletionMode, Lake, ReferenceSurfaces};
 use echolake_schema::tables::Table;
 use echolake_schema::{Rig, Timestamp};
@@ -34,7 +34,7 @@ fn rig() -> Rig {
 fn runs(surfaces: &[&str]) -> Vec<(String, Bytes)> {
     let (folder, rig) = (tempfile::tempdir().expect("a folder"), rig());
     let one = |(number, surface): (usize, &&str)| {
-        let relief = surface.split('_').next().expect("a name");
+        let relief = PanelRelief::guess(surface).expect("a name");
         let specimen = PanelSpecimen::Relief(PanelRelief::by_name(relief).expect("a relief"));
         let run = RunRequest {
             rig: &rig,

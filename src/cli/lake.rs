@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use clap::{Args, Subcommand};
-use echolake_acquisition::collection::LARGEST;
+use echolake_acquisition::panel::collection::LARGEST;
 use echolake_lake::{KEEP_HOURS, TARGET_BYTES};
 
 use crate::commands::export::ExportCommand;

@@ -6,16 +6,15 @@ mod watch;
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use std::time::Duration;
 
 use anyhow::Context as _;
-use echolake_acquisition::controller::{RecordingMode, RunControl, RunEvent};
-use echolake_acquisition::live::LiveServer;
-use echolake_acquisition::mesh::Mesh;
-use echolake_acquisition::metrics::{InfluxPush, MetricsServer, PushTarget, RunMetrics};
-use echolake_acquisition::recorder::{Held, partial_of, random_tag};
+use echolake_acquisition::panel::mesh::Mesh;
+use echolake_acquisition::run::controller::{RecordingMode, RunControl, RunEvent};
+use echolake_acquisition::run::live::LiveServer;
+use echolake_acquisition::run::metrics::{MetricsServer, RunMetrics};
+use echolake_acquisition::run::recorder::{Held, partial_of, random_tag};
+use echolake_acquisition::run::session::{MeasuredRun, PreflightMode, RunSession, TakePace};
 use echolake_acquisition::run::{self, PanelSpecimen, RunRequest};
-use echolake_acquisition::session::{MeasuredRun, PreflightMode, RunSession, TakePace};
 use echolake_lake::{Lake, ReferenceSurfaces};
 use echolake_schema::{Rig, SurfaceId, Timestamp};
 
@@ -25,9 +24,6 @@ use crate::progress::CommandProgress;
 use acknowledge::AcknowledgementWriter;
 pub(super) use specimen::{relief_of_file, set_all};
 use watch::RunWatcher;
-
-/// Time between two pushes of metrics to a time-series store.
-const TOLD_EVERY: Duration = Duration::from_secs(10);
 
 /// A run to begin or to resume.
 enum AcquireJob {
@@ -50,8 +46,6 @@ struct NewRun {
 }
 
 pub(crate) async fn run(args: &AcquireArgs, lake_url: &str) -> anyhow::Result<CommandOutcome> {
-    // Wrong arguments are refused before anything is created.
-    let influx = args.influx.as_deref().map(str::parse::<PushTarget>).transpose()?;
     let pace = if args.pace > 0.0 { TakePace::Secs(args.pace) } else { TakePace::Fast };
     let control = Arc::new(RunControl::default());
     watch::obey(&control)?;
@@ -76,9 +70,6 @@ pub(crate) async fn run(args: &AcquireArgs, lake_url: &str) -> anyhow::Result<Co
     if let Some(served) = &served {
         progress.say(format!("metrics: http://{}/metrics", served.address()));
     }
-    let pushed = influx.map(|target| {
-        InfluxPush::start(target, metrics.clone(), TOLD_EVERY, |e| eprintln!("warning: metrics were not taken: {e}"))
-    });
     let mut watcher = RunWatcher::new(&progress, &surface, planned, accepted, metrics.clone(), job.folder());
     let preflight = if args.skip_checks { PreflightMode::Skip } else { PreflightMode::Check };
     let (checkpoint_every, tap) = (args.checkpoint_every.map(|n| n as usize), live.as_ref().map(LiveServer::tap));
@@ -99,8 +90,8 @@ pub(crate) async fn run(args: &AcquireArgs, lake_url: &str) -> anyhow::Result<Co
         measured
     });
     let measured = measured.await?;
-    // The last metrics are sent, and viewers are disconnected, before the command ends.
-    drop((pushed, served, live));
+    // Viewers are disconnected before the command ends.
+    drop((served, live));
     match measured {
         Ok(measured) => tell(&measured, lake_url),
         Err(error) => {

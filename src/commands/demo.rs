@@ -5,9 +5,9 @@ mod measure;
 use std::path::Path;
 use std::time::Instant;
 
-use echolake_acquisition::collection::{CollectionSurface, collection};
-use echolake_acquisition::controller::RecordingMode;
-use echolake_acquisition::relief::PanelRelief;
+use echolake_acquisition::panel::collection::{CollectionSurface, collection};
+use echolake_acquisition::panel::relief::PanelRelief;
+use echolake_acquisition::run::controller::RecordingMode;
 use echolake_ingest::pending;
 use echolake_lake::{Lake, ReferenceSurfaces};
 use echolake_query::Session;
@@ -20,9 +20,9 @@ use crate::signals::StopRequest;
 use measure::DemoCampaign;
 
 /// The surfaces, in the order in which they are measured: name and relief are the same.
-const SURFACES: [&str; 6] = ["flat", "foam", "wood", "prd", "brick", "wavy"];
+const SURFACES: [&str; 6] = ["flat", "foam", "wood", "prd", "river_rock", "macrostructure"];
 /// The surface that the second table compares with Flat.
-const COMPARED: &str = "brick";
+const COMPARED: &str = "river_rock";
 /// Sweeps of 0.05 s instead of the paper's rig's 0.5 s: they fit a laptop's disk.
 const SWEEP_SECS: f64 = 0.05;
 

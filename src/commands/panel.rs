@@ -7,12 +7,12 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context as _, bail};
 use clap::Args;
-use echolake_acquisition::mesh::{BACK_MM, Format, Mesh};
-use echolake_acquisition::relief::{HeightField, PanelRelief};
+use echolake_acquisition::panel::mesh::{BACK_MM, Format, Mesh};
+use echolake_acquisition::panel::relief::{HeightField, PanelRelief};
 
 use crate::CommandOutcome;
 
-/// Cells along each side of a mesh of the older reliefs, and of those whose joints are 1 mm wide.
+/// Cells along each side of a mesh without joints, and of those whose joints are 1 mm wide.
 const CELLS: usize = 274;
 const FINE_CELLS: usize = 585;
 /// Cells along each side of a height field, as in the published data.
@@ -44,7 +44,7 @@ pub(crate) struct PanelArgs {
     #[arg(short, long, required_unless_present = "list", value_name = "FILE")]
     output: Vec<PathBuf>,
     /// Cells along each side of the mesh; by default 585, which are 1 mm, for walls with joints, and 274 for flat, foam,
-    /// wood, prd, brick, flemish and wavy.
+    /// wood and prd.
     #[arg(long, value_parser = clap::value_parser!(u32).range(16..=2340))]
     cells: Option<u32>,
     /// Print all reliefs and parameters with ranges, defaults and units; of one relief where it is named.

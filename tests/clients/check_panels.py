@@ -59,7 +59,7 @@ def main(command, folder):
         check_sides(mesh, folder, name)
         assert json.loads((folder / f"{name}_1.json").read_text())["relief"] == other
         print(f"{name} / {other}: {facts}")
-        if name in ("brick", "river_rock"):
+        if name in ("stretcher_bond", "river_rock"):
             for extension in (".glb", ".obj", ".ply"):
                 path = folder / f"{name}{extension}"
                 panel(command, name, "--back", other, "-o", str(path))

@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use echolake_schema::manifest::RunEnd;
 
-use crate::recorder::{Error, Recorder, RunStart, Sealed};
+use crate::run::recorder::{Error, Recorder, RunStart, Sealed};
 
 /// Runs that are written and not yet named. Dropped before [`ImportBatch::publish`] has named all, it removes its
 /// files, and only its own.

@@ -17,10 +17,10 @@ use ndarray_npy::{NpzReader, ReadableElement};
 use super::batch::ImportBatch;
 use super::response::ImportedResponse;
 use super::{Error, ImportOptions, ImportedRun, RUN_SECS, wrong};
-use crate::mesh::{BACK_MM, MESH_CELLS, Mesh};
-use crate::recorder::{LogLevel, Relief, RunStart};
-use crate::relief::HeightField;
-use crate::rigs::simulated::TAKE_SECS;
+use crate::panel::mesh::{BACK_MM, MESH_CELLS, Mesh};
+use crate::panel::relief::HeightField;
+use crate::rig::devices::simulated::TAKE_SECS;
+use crate::run::recorder::{LogLevel, Relief, RunStart};
 
 /// Samples of the published responses.
 pub const GIR_IR_LEN: usize = 400;

@@ -14,7 +14,7 @@ use std::path::{Path, PathBuf};
 use echolake_schema::manifest::{Origin, RunManifest};
 use echolake_schema::{Rig, RunId, SurfaceId, Timestamp};
 
-use crate::recorder::random_tag;
+use crate::run::recorder::random_tag;
 
 pub use gir::{GIR_IR_LEN, import_gir};
 pub use sofa::{check_sofa, import_sofa};
@@ -92,7 +92,7 @@ pub enum Error {
     },
     /// The run cannot be recorded.
     #[error(transparent)]
-    Record(#[from] crate::recorder::Error),
+    Record(#[from] crate::run::recorder::Error),
     /// The rig's settings make no plan.
     #[error("rig `{rig}` does not fit: {cause}")]
     Plan {

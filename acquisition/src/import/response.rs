@@ -3,7 +3,7 @@
 use echolake_schema::messages::{AmbientSample, ImpulseResponse, Measurement, Verdict};
 use echolake_schema::{Celsius, Grid, Pair, Rig, Timestamp};
 
-use crate::recorder::{Error, Recorder};
+use crate::run::recorder::{Error, Recorder};
 
 /// A response, recorded as the file has it.
 pub(super) struct ImportedResponse {

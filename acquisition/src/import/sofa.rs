@@ -17,8 +17,8 @@ use super::batch::ImportBatch;
 use super::response::ImportedResponse;
 use super::sofa_file::{SofaFile, SofaVariable};
 use super::{Error, ImportOptions, ImportedRun, RUN_SECS, wrong};
-use crate::recorder::{LogLevel, RunStart};
-use crate::rigs::simulated::TAKE_SECS;
+use crate::rig::devices::simulated::TAKE_SECS;
+use crate::run::recorder::{LogLevel, RunStart};
 
 /// Source name of the import's log entries.
 const NAME: &str = "import sofa";

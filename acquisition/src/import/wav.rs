@@ -16,8 +16,8 @@ use echolake_schema::{Grid, Rig, SampleRate, SurfaceId, SurfaceRecord, Timestamp
 use super::batch::ImportBatch;
 use super::wav_manifest::{self, ManifestRow};
 use super::{Error, ImportOptions, ImportedRun};
-use crate::assessment::TakeAssessor;
-use crate::recorder::{LogLevel, Recorder, RunStart};
+use crate::run::assessment::TakeAssessor;
+use crate::run::recorder::{LogLevel, Recorder, RunStart};
 
 /// Source name of the import's log entries.
 const NAME: &str = "import wav";

@@ -9,7 +9,7 @@ use mcap::read::Options;
 use prost::Message as _;
 
 use super::*;
-use crate::recorder::{Held, Recorder, RunStart};
+use crate::run::recorder::{Held, Recorder, RunStart};
 
 /// Pairs of the run, one a checkpoint.
 const PAIRS: u32 = 20;

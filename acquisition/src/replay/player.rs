@@ -9,7 +9,7 @@ use super::clock::ReplayClock;
 use super::cursor::{ChunkDamage, MessageCursor, standing};
 use super::recording::{Key, Recording};
 use super::{ReplayOptions, ReplayState};
-use crate::recorder::Topic;
+use crate::run::recorder::Topic;
 use crate::viewer::{
     ClientQueue, PendingMessage, PlaybackRequest, PlaybackState, PlaybackStatus, PlayerCommand, ViewerState,
 };

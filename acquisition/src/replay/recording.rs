@@ -14,7 +14,7 @@ use echolake_recording::{
 };
 
 use super::error::Error;
-use crate::recorder::Topic;
+use crate::run::recorder::Topic;
 
 const FRAME: u64 = FRAME_BYTES as u64;
 

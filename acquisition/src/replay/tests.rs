@@ -11,10 +11,10 @@ use tungstenite::Message;
 use tungstenite::client::IntoClientRequest as _;
 
 use super::*;
-use crate::controller::RecordingMode;
-use crate::relief::PanelRelief;
+use crate::panel::relief::PanelRelief;
+use crate::run::controller::RecordingMode;
+use crate::run::simulate::simulate;
 use crate::run::{PanelSpecimen, RunRequest};
-use crate::simulate::simulate;
 
 const SMALL_RIG: &str = include_str!("../../../tests/fixtures/small_rig.toml");
 const START: i64 = 1_767_600_000_000_000_000;

@@ -16,7 +16,7 @@ use std::sync::mpsc::SyncSender;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::thread::JoinHandle;
 
-use crate::recorder::Topic;
+use crate::run::recorder::Topic;
 use access::AccessCheck;
 pub use access::ViewerAccess;
 use handshakes::PendingHandshakes;

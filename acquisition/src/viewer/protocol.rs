@@ -6,7 +6,7 @@ use base64::Engine as _;
 use base64::prelude::BASE64_STANDARD as BASE64;
 use serde::{Deserialize, Serialize};
 
-use crate::recorder::Topic;
+use crate::run::recorder::Topic;
 
 /// The supported subprotocols; for the messages used here they are the same. The first that a client offers, too, is
 /// chosen.

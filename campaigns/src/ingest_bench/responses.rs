@@ -6,7 +6,7 @@ use std::path::Path;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
 use anyhow::{Context as _, Result};
-use echolake_acquisition::controller::RecordingMode;
+use echolake_acquisition::run::controller::RecordingMode;
 
 use super::IngestBenchArgs;
 use super::meter::{CostMeter, MeasuredCost};

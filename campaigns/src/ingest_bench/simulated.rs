@@ -5,10 +5,10 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 
 use anyhow::{Context as _, Result, ensure};
-use echolake_acquisition::collection::{CollectionSurface, collection};
-use echolake_acquisition::controller::RecordingMode;
+use echolake_acquisition::panel::collection::{CollectionSurface, collection};
+use echolake_acquisition::run::controller::RecordingMode;
+use echolake_acquisition::run::simulate::simulate;
 use echolake_acquisition::run::{PanelSpecimen, RunRequest};
-use echolake_acquisition::simulate::simulate;
 use echolake_ingest::{FileReport as Told, LakeIngest, complete, pending};
 use echolake_lake::{Lake, ReferenceSurfaces};
 use echolake_schema::manifest::RunEnd;

@@ -6,7 +6,7 @@ use std::path::Path;
 use std::process::Command;
 
 use anyhow::{Context as _, Result, ensure};
-use echolake_acquisition::controller::RecordingMode;
+use echolake_acquisition::run::controller::RecordingMode;
 use echolake_dsp::deconvolution::fast_length;
 use echolake_schema::messages::SweepRecording;
 use echolake_schema::{samples, topics};

@@ -5,7 +5,7 @@ use std::io::{self, Write};
 use std::path::Path;
 
 use anyhow::Context as _;
-use echolake_acquisition::controller::RunEvent;
+use echolake_acquisition::run::controller::RunEvent;
 use echolake_schema::messages::Verdict;
 
 /// An open list.

@@ -3,8 +3,8 @@
 use std::path::Path;
 
 use anyhow::Context as _;
-use echolake_acquisition::mesh::PanelSide;
-use echolake_acquisition::relief::PanelRelief;
+use echolake_acquisition::panel::mesh::PanelSide;
+use echolake_acquisition::panel::relief::PanelRelief;
 use echolake_acquisition::run::PanelSpecimen;
 use echolake_schema::SurfaceId;
 

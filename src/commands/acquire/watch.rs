@@ -7,10 +7,10 @@ use std::sync::atomic::Ordering;
 use std::time::Instant;
 
 use anyhow::Context as _;
-use echolake_acquisition::controller::{RunControl, RunEvent};
 use echolake_acquisition::disk::free_bytes;
-use echolake_acquisition::metrics::RunMetrics;
-use echolake_acquisition::recorder::Cost;
+use echolake_acquisition::run::controller::{RunControl, RunEvent};
+use echolake_acquisition::run::metrics::RunMetrics;
+use echolake_acquisition::run::recorder::Cost;
 use echolake_schema::manifest::RunEnd;
 use echolake_schema::messages::Verdict;
 use tokio::signal::unix::{SignalKind, signal};

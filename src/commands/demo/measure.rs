@@ -7,11 +7,11 @@ use std::sync::{Mutex, PoisonError};
 use std::time::Instant;
 
 use anyhow::Context as _;
-use echolake_acquisition::collection::CollectionSurface;
-use echolake_acquisition::controller::RecordingMode;
-use echolake_acquisition::recorder::random_tag;
+use echolake_acquisition::panel::collection::CollectionSurface;
+use echolake_acquisition::run::controller::RecordingMode;
+use echolake_acquisition::run::recorder::random_tag;
+use echolake_acquisition::run::simulate::simulate;
 use echolake_acquisition::run::{PanelSpecimen, RunRequest};
-use echolake_acquisition::simulate::simulate;
 use echolake_schema::manifest::RunEnd;
 use echolake_schema::{Rig, RunId, Timestamp};
 

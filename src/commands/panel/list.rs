@@ -1,6 +1,6 @@
 //! `echolake panel --list`: the reliefs and their parameters.
 
-use echolake_acquisition::relief::{PanelRelief, ParameterDomain, ReliefParameter};
+use echolake_acquisition::panel::relief::{PanelRelief, ParameterDomain, ReliefParameter};
 
 use crate::CommandOutcome;
 

@@ -9,7 +9,7 @@ use std::sync::{Arc, Once};
 use std::time::{Duration, Instant};
 
 use anyhow::{Context as _, Result, ensure};
-use echolake_acquisition::controller::RecordingMode;
+use echolake_acquisition::run::controller::RecordingMode;
 use echolake_ingest::{InspectedMeasurement, RunInspection, inspect};
 use echolake_lake::{Lake, ReferenceSurfaces};
 use object_store::memory::InMemory;

@@ -6,11 +6,11 @@ use std::path::Path;
 
 use anyhow::{Context as _, Result, ensure};
 use bytes::Bytes;
-use echolake_acquisition::controller::{RecordingMode, RunControl, RunController, RunOptions, RunWorkload};
-use echolake_acquisition::mesh::Mesh;
-use echolake_acquisition::recorder::{Recorder, Relief, RunStart};
-use echolake_acquisition::relief::HeightField;
-use echolake_acquisition::rigs::simulated::{RigSimulation, devices};
+use echolake_acquisition::panel::mesh::Mesh;
+use echolake_acquisition::panel::relief::HeightField;
+use echolake_acquisition::rig::devices::simulated::{RigSimulation, devices};
+use echolake_acquisition::run::controller::{RecordingMode, RunControl, RunController, RunOptions, RunWorkload};
+use echolake_acquisition::run::recorder::{Recorder, Relief, RunStart};
 use echolake_schema::grid::Layer;
 use echolake_schema::manifest::RunManifest;
 use echolake_schema::messages::{ImpulseResponse, Measurement, SweepRecording};

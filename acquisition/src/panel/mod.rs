@@ -1,0 +1,6 @@
+//! Panels: reliefs and their meshes, collections of them, and a panel as a run needs it.
+
+pub mod collection;
+pub mod mesh;
+pub(crate) mod prepared_panel;
+pub mod relief;

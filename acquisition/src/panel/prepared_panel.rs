@@ -1,0 +1,104 @@
+//! A specimen as a run needs it: heights for its devices, a mesh and facts for its file.
+
+use std::path::Path;
+
+use echolake_schema::manifest::MeshFacts;
+use echolake_schema::{Rig, SurfaceRecord};
+
+use crate::panel::mesh::{self, BACK_MM, Format, MESH_CELLS, Mesh, PanelSide};
+use crate::panel::relief::{HeightField, PanelRelief};
+use crate::rig::devices::simulated::FACETS;
+use crate::run::plan::PanelSpecimen;
+use crate::run::recorder::OriginalFile;
+
+/// A specimen, ready to be measured and recorded.
+pub(crate) struct PreparedPanel {
+    pub(crate) heights: HeightField,
+    pub(crate) mesh: Mesh,
+    pub(crate) record: SurfaceRecord,
+    pub(crate) reflection_factor: f64,
+    original: Option<(String, Format, Vec<u8>)>,
+}
+
+impl PreparedPanel {
+    /// Generates the relief, or reads the mesh.
+    ///
+    /// # Errors
+    /// The mesh cannot be used.
+    pub(crate) fn new(specimen: &PanelSpecimen, rig: &Rig) -> Result<Self, mesh::Error> {
+        match specimen {
+            PanelSpecimen::Relief(relief) => Ok(generated(relief)),
+            PanelSpecimen::Mesh(path, side) => from_file(path, *side, rig),
+        }
+    }
+
+    /// The file that the mesh was read from.
+    pub(crate) fn original(&self) -> Option<OriginalFile<'_>> {
+        let (name, format, bytes) = self.original.as_ref()?;
+        Some(OriginalFile { name, media_type: format.media_type(), bytes })
+    }
+}
+
+fn generated(relief: &PanelRelief) -> PreparedPanel {
+    let material = relief.material();
+    let mesh = Mesh::from_height_field(&relief.height_field(MESH_CELLS), BACK_MM);
+    let heights = relief.height_field(FACETS);
+    let facts = MeshFacts {
+        file: echolake_schema::topics::MESH_ATTACHMENT.to_owned(),
+        triangles: mesh.triangles.len() as u64,
+        watertight: true,
+        relief_mm: heights.extent_mm().map(f64::from),
+    };
+    let (macrostructure, microstructure) = match relief {
+        PanelRelief::Layered(wall) => (Some(wall.macrostructure()), Some(wall.microstructure())),
+        _ => (None, None),
+    };
+    PreparedPanel {
+        record: SurfaceRecord {
+            typology: relief.typology().to_owned(),
+            macrostructure,
+            mesostructure: Some(relief.name().to_owned()),
+            microstructure,
+            material: Some(material.name.to_owned()),
+            reflection_factor: Some(material.reflection_factor),
+            parameters: relief.parameters().into(),
+            mesh: Some(facts),
+            ..SurfaceRecord::default()
+        },
+        heights,
+        mesh,
+        reflection_factor: material.reflection_factor,
+        original: None,
+    }
+}
+
+fn from_file(path: &Path, side: PanelSide, rig: &Rig) -> Result<PreparedPanel, mesh::Error> {
+    let format = Format::of(path)?;
+    let mesh = Mesh::read(path)?.seen_from(side).check(rig.panel.size_mm, rig.panel.depth_mm, path)?;
+    let heights = mesh.to_height_field(FACETS, rig.panel.size_mm, rig.panel.depth_mm, path)?;
+    let bytes = std::fs::read(path).map_err(|source| mesh::Error::Read { path: path.to_owned(), source })?;
+    let name = path.file_name().map_or_else(|| "panel".to_owned(), |n| n.to_string_lossy().into_owned());
+    // A coated print, as the paper's panels are.
+    let material = PanelRelief::Flat.material();
+    let facts = MeshFacts {
+        file: name.clone(),
+        triangles: mesh.triangles.len() as u64,
+        watertight: true,
+        relief_mm: heights.extent_mm().map(f64::from),
+    };
+    Ok(PreparedPanel {
+        record: SurfaceRecord {
+            typology: "mesh".to_owned(),
+            material: Some(material.name.to_owned()),
+            reflection_factor: Some(material.reflection_factor),
+            // The attached file is the producer's, which shows its front.
+            parameters: serde_json::json!({ "side": side.name() }),
+            mesh: Some(facts),
+            ..SurfaceRecord::default()
+        },
+        heights,
+        mesh,
+        reflection_factor: material.reflection_factor,
+        original: Some((name, format, bytes)),
+    })
+}

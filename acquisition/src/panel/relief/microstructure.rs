@@ -1,0 +1,112 @@
+//! The skin of a wall: its joints' profile, and how rough it is.
+
+use serde::{Deserialize, Serialize};
+
+use super::chance::SeededRandom;
+use super::parameter::{ParameterLayer, ReliefParameter};
+use super::settings::{FULL_SCALE, WallSettings};
+
+const LAYER: ParameterLayer = ParameterLayer::Microstructure;
+
+pub(super) const JOINT_SHAPE: ReliefParameter = ReliefParameter::choice(
+    "joint_shape",
+    LAYER,
+    &["recessed", "flush", "raked", "concave", "v"],
+    "profile of the joints: recessed has a level floor, flush is filled up to the stones, raked has an uneven floor, \
+     concave is a bucket handle's arc, v has two slopes",
+);
+/// Parameters of the skin.
+pub(super) const SKIN: [ReliefParameter; 2] = [
+    ReliefParameter::mm(
+        "roughness_mm",
+        LAYER,
+        [0.0, 10.0, 0.0],
+        "height of the surface's unevenness from its lowest to its highest point at most",
+    ),
+    ReliefParameter::mm("roughness_grain_mm", LAYER, [20.0, 400.0, 60.0], "size of the unevenness along the wall"),
+];
+
+/// Makes the parameter for the joints' width.
+pub(super) const fn joint_width(default: f64) -> ReliefParameter {
+    ReliefParameter::mm("joint_width_mm", LAYER, [0.0, 40.0, default], "width of the joints between stones")
+}
+
+/// Makes the parameter for the joints' depth.
+pub(super) const fn joint_depth(default: f64) -> ReliefParameter {
+    ReliefParameter::mm(
+        "joint_depth_mm",
+        LAYER,
+        [0.0, 40.0, default],
+        "how far the joints lie behind the stones' faces",
+    )
+}
+
+/// Joints and skin.
+#[derive(Debug, Clone)]
+pub(super) struct MicrostructureModel {
+    shape: JointShape,
+    /// Model mm.
+    half_width: f64,
+    depth: f64,
+    roughness: f64,
+    grain: f64,
+    chance: SeededRandom,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub(super) enum JointShape {
+    #[default]
+    Recessed,
+    Flush,
+    Raked,
+    Concave,
+    V,
+}
+
+impl MicrostructureModel {
+    pub(super) fn of(settings: &WallSettings) -> Self {
+        Self {
+            shape: settings.joint_shape,
+            half_width: settings.joint_width_mm / FULL_SCALE / 2.0,
+            depth: settings.joint_depth_mm / FULL_SCALE,
+            roughness: settings.roughness_mm / FULL_SCALE,
+            grain: settings.roughness_grain_mm / FULL_SCALE,
+            chance: SeededRandom::new(settings.seed, 0x4A01),
+        }
+    }
+
+    /// Distance of a point from its stone's edge, model mm: below 0 in the joint.
+    pub(super) fn inside(&self, to_middle_of_joint: f64) -> f64 {
+        to_middle_of_joint - self.half_width
+    }
+
+    /// Returns the height of the joint under the wall's plane, if `inside` is below 0.
+    pub(super) fn joint(&self, inside: f64, x: f64, y: f64) -> f64 {
+        // 0 at the joint's edges, 1 in its middle.
+        let in_joint = (-inside / self.half_width).clamp(0.0, 1.0);
+        let share = match self.shape {
+            JointShape::Flush => 0.0,
+            JointShape::Recessed => 1.0,
+            // Mortar that was scratched out is uneven along the joint, by about its width.
+            JointShape::Raked => {
+                0.75 + 0.25 * self.chance.noise(x / (2.0 * self.half_width), y / (2.0 * self.half_width))
+            }
+            JointShape::Concave => (in_joint * (2.0 - in_joint)).sqrt(),
+            JointShape::V => in_joint,
+        };
+        -self.depth * share
+    }
+
+    /// Unevenness of the skin: three octaves of noise, each half as high as the one before.
+    pub(super) fn roughness(&self, x: f64, y: f64) -> f64 {
+        if self.roughness == 0.0 {
+            return 0.0;
+        }
+        let octave = |n: u32| {
+            let scale = f64::from(1 << n);
+            self.chance.at(1, i64::from(n)).noise(x * scale / self.grain, y * scale / self.grain) / scale
+        };
+        (octave(0) + octave(1) + octave(2)) / 1.75 * self.roughness / 2.0
+    }
+}

@@ -1,0 +1,44 @@
+//! Values of a wall's parameters.
+
+use serde::{Deserialize, Serialize};
+
+use super::macrostructure::MacrostructureShape;
+use super::microstructure::JointShape;
+use super::primitives::{SolidShape, SolidTurn};
+
+/// The wall is this many times as large as the panel (Rust et al. 2021).
+pub const FULL_SCALE: f64 = 10.0;
+
+/// Parameters of a wall by their keys, lengths in full-scale mm. Those that its relief does not have are 0.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[serde(default)]
+pub(super) struct WallSettings {
+    pub(super) seed: u64,
+    pub(super) macrostructure: MacrostructureShape,
+    pub(super) macro_depth_mm: f64,
+    pub(super) macro_wavelength_mm: f64,
+    pub(super) macro_phase: f64,
+    pub(super) projection_mm: f64,
+    pub(super) lean_mm: f64,
+    pub(super) bulge_mm: f64,
+    pub(super) brick_length_mm: f64,
+    pub(super) brick_height_mm: f64,
+    pub(super) course_height_mm: f64,
+    pub(super) stone_length_mm: f64,
+    pub(super) variation: f64,
+    pub(super) stone_size_mm: f64,
+    pub(super) irregularity: f64,
+    pub(super) elongation: f64,
+    pub(super) primitive: SolidShape,
+    pub(super) primitive_size_mm: f64,
+    pub(super) primitive_height_mm: f64,
+    pub(super) gap_mm: f64,
+    pub(super) turn: SolidTurn,
+    pub(super) prime: String,
+    pub(super) well_depth_mm: f64,
+    pub(super) joint_shape: JointShape,
+    pub(super) joint_width_mm: f64,
+    pub(super) joint_depth_mm: f64,
+    pub(super) roughness_mm: f64,
+    pub(super) roughness_grain_mm: f64,
+}

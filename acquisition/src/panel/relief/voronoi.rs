@@ -1,0 +1,170 @@
+//! Stones around scattered points, each of the places nearest to its own: polygonal rubble and river rock.
+
+use super::PANEL_SIZE_MM;
+use super::chance::SeededRandom;
+use super::microstructure::{JOINT_SHAPE, joint_depth, joint_width};
+use super::parameter::{ParameterLayer, ReliefParameter};
+use super::settings::{FULL_SCALE, WallSettings};
+use super::stone::{StoneFaces, bulge, lean, pillow, projection};
+use super::stones::{SEED, StoneLayout, StoneSpot};
+
+const MESO: ParameterLayer = ParameterLayer::Mesostructure;
+/// Round stones leave this share of the way to their middle to the joint: it widens in the corners.
+const CORNERS: f64 = 0.2;
+/// Stones further away than this many lengths of the lattice border on no other.
+const REACH: i64 = 2;
+/// Bulging rubble is level from this distance to its edges on, as a share of the way to its middle.
+const PILLOW: f64 = 0.5;
+
+const fn size([low, high, default]: [f64; 3]) -> ReliefParameter {
+    ReliefParameter::mm("stone_size_mm", MESO, [low, high, default], "mean distance between the middles of stones")
+}
+
+const IRREGULARITY: ReliefParameter = ReliefParameter::number(
+    "irregularity",
+    MESO,
+    "share",
+    [0.0, 1.0, 0.65],
+    "how far the stones' middles leave their lattice: 0 makes all stones alike",
+);
+const ELONGATION: ReliefParameter =
+    ReliefParameter::number("elongation", MESO, "ratio", [1.0, 3.0, 1.3], "stones are longer than high by this");
+
+pub(super) const RUBBLE: [ReliefParameter; 10] = [
+    size([100.0, 1200.0, 400.0]),
+    IRREGULARITY,
+    ELONGATION,
+    projection(80.0, 20.0),
+    lean(10.0),
+    bulge(40.0, 15.0),
+    SEED,
+    JOINT_SHAPE,
+    joint_width(20.0),
+    joint_depth(15.0),
+];
+
+pub(super) const RIVER_ROCK: [ReliefParameter; 9] = [
+    size([80.0, 800.0, 280.0]),
+    IRREGULARITY,
+    ELONGATION,
+    projection(30.0, 20.0),
+    bulge(120.0, 70.0),
+    SEED,
+    JOINT_SHAPE,
+    joint_width(15.0),
+    joint_depth(20.0),
+];
+
+/// Outline of stones.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum StoneOutline {
+    /// Halfway to the next.
+    Polygons,
+    /// The same with its corners rounded, under an elliptic dome.
+    Round,
+}
+
+/// A wall of cells, model mm.
+pub(super) struct StoneCells {
+    /// Length of the lattice along x and y.
+    scale: [f64; 2],
+    /// The lattice's first stone, and stones in a row.
+    first: [i64; 2],
+    row: usize,
+    stones: Vec<Stone>,
+    outline: StoneOutline,
+    faces: StoneFaces,
+    chance: SeededRandom,
+}
+
+struct Stone {
+    /// Its middle, in lengths of the lattice.
+    middle: [f64; 2],
+    /// From its middle to its border, mm, as its outline measures it.
+    radius: f64,
+}
+
+impl StoneCells {
+    pub(super) fn of(settings: &WallSettings, outline: StoneOutline) -> Self {
+        let size = settings.stone_size_mm / FULL_SCALE;
+        let scale = [size * settings.elongation, size];
+        let chance = SeededRandom::new(settings.seed, 0x5701);
+        // As many stones as places of the panel look at, and those that these look at.
+        let first = scale.map(|s| (-PANEL_SIZE_MM / 2.0 / s).floor() as i64 - 2 * REACH);
+        let counts = first.map(|first| (-2 * first + 1) as usize);
+        let stone = |n: usize| {
+            let (ix, iy) = (first[0] + (n % counts[0]) as i64, first[1] + (n / counts[0]) as i64);
+            // Odd rows are shifted by half a stone, so that stones without irregularity are hexagons.
+            let shift = 0.5 * iy.rem_euclid(2) as f64;
+            let off = |n| 0.45 * settings.irregularity * chance.at(ix, iy).signed(n);
+            Stone { middle: [ix as f64 + shift + off(8), iy as f64 + off(9)], radius: 0.0 }
+        };
+        let stones = (0..counts[0] * counts[1]).map(stone).collect();
+        let mut cells = Self { scale, first, row: counts[0], stones, outline, faces: StoneFaces::of(settings), chance };
+        let radius = |n: usize| cells.to_border(cells.stones[n].middle, n);
+        let radii: Vec<f64> = (0..cells.stones.len()).map(radius).collect();
+        cells.stones.iter_mut().zip(radii).for_each(|(stone, radius)| stone.radius = radius);
+        cells
+    }
+
+    /// Numbers of the stones around a place.
+    fn around(&self, place: [f64; 2]) -> impl Iterator<Item = usize> + '_ {
+        let rows = self.stones.len() / self.row;
+        let range = move |i: usize, count: usize| {
+            let at = place[i].round() as i64 - self.first[i];
+            (at - REACH).clamp(0, count as i64) as usize..(at + REACH + 1).clamp(0, count as i64) as usize
+        };
+        range(1, rows).flat_map(move |y| range(0, self.row).map(move |x| y * self.row + x))
+    }
+
+    /// From a place within a stone to the stone's border, mm.
+    fn to_border(&self, place: [f64; 2], own: usize) -> f64 {
+        let middle = self.stones[own].middle;
+        let distance = |other: usize| {
+            let other = self.stones[other].middle;
+            // The border between two is straight in the stretched lattice too.
+            let gap = squared(place, other) - squared(place, middle);
+            let slope = [0, 1].map(|i| 2.0 * (other[i] - middle[i]) / self.scale[i]);
+            (gap / (slope[0] * slope[0] + slope[1] * slope[1]).sqrt()).max(1e-6)
+        };
+        let distances = self.around(place).filter(|n| *n != own).map(distance);
+        match self.outline {
+            StoneOutline::Polygons => distances.fold(f64::INFINITY, f64::min),
+            // Like the least of them, but smooth if two are alike.
+            StoneOutline::Round => 1.0 / distances.map(|d| 1.0 / (d * d)).sum::<f64>().sqrt(),
+        }
+    }
+}
+
+fn squared(a: [f64; 2], b: [f64; 2]) -> f64 {
+    let d = [a[0] - b[0], a[1] - b[1]];
+    d[0] * d[0] + d[1] * d[1]
+}
+
+impl StoneLayout for StoneCells {
+    fn spot(&self, x: f64, y: f64, half_joint: f64) -> StoneSpot {
+        let place = [x / self.scale[0], y / self.scale[1]];
+        let nearest = |(best, least): (usize, f64), n: usize| {
+            let distance = squared(place, self.stones[n].middle);
+            if distance < least { (n, distance) } else { (best, least) }
+        };
+        let (own, _) = self.around(place).fold((0, f64::INFINITY), nearest);
+        let Stone { middle, radius } = &self.stones[own];
+        let to_border = self.to_border(place, own);
+        let (to_joint, rise) = match self.outline {
+            StoneOutline::Polygons => {
+                let level = PILLOW * (radius - half_joint).max(0.1 * radius);
+                (to_border, pillow(to_border - half_joint, level))
+            }
+            StoneOutline::Round => {
+                let to_joint = (to_border - CORNERS * radius).max(0.0);
+                let dome = ((1.0 - CORNERS) * radius - half_joint).max(0.1 * radius);
+                let t = ((to_joint - half_joint) / dome).clamp(0.0, 1.0);
+                (to_joint, t * (2.0 - t))
+            }
+        };
+        let stone = self.chance.at(self.first[0] + (own % self.row) as i64, self.first[1] + (own / self.row) as i64);
+        let from_middle = [0, 1].map(|i| 2.0 * (place[i] - middle[i]));
+        StoneSpot { to_joint, face: self.faces.height(stone, from_middle, rise) }
+    }
+}

@@ -1,0 +1,57 @@
+//! A rig's devices: those that its file names, or simulated ones.
+
+pub(crate) mod paced;
+pub mod simulated;
+
+use std::sync::Arc;
+
+use echolake_schema::{Rig, Timestamp};
+
+use crate::panel::prepared_panel::PreparedPanel;
+use crate::rig::drivers;
+use crate::rig::robots::Choreography;
+use crate::rig::{Error, RigDevices};
+use crate::run::session::TakePace;
+use paced::paced;
+use simulated::{RigSimulation, devices};
+
+/// Inputs for opening a rig's devices.
+pub(crate) struct DeviceRequest<'a> {
+    pub(crate) rig: &'a Rig,
+    /// Panel that simulated devices measure; `start` and `seed` are of their clock and noise.
+    pub(crate) panel: &'a PreparedPanel,
+    pub(crate) start: Timestamp,
+    pub(crate) seed: u64,
+    /// Joints of the arms at each pair, if a model of them is known.
+    pub(crate) arms: Option<Arc<Choreography>>,
+}
+
+/// Opens the devices that the rig file names; simulated ones only if it says so for all of them.
+///
+/// # Errors
+/// [`Error::Device`] if one does not answer, or is not built in.
+pub(crate) fn open_devices(request: &DeviceRequest<'_>, pace: TakePace) -> Result<RigDevices, Error> {
+    match drivers::open(request.rig)? {
+        Some(real) => Ok(real),
+        None => simulated_devices(request, pace),
+    }
+}
+
+/// Makes simulated devices.
+///
+/// # Errors
+/// [`Error::Device`] if the rig's grid has no points.
+pub(crate) fn simulated_devices(request: &DeviceRequest<'_>, pace: TakePace) -> Result<RigDevices, Error> {
+    let devices = devices(&RigSimulation {
+        rig: request.rig,
+        relief: &request.panel.heights,
+        reflection_factor: request.panel.reflection_factor,
+        start: request.start,
+        seed: request.seed,
+        arms: request.arms.clone(),
+    })?;
+    Ok(match pace {
+        TakePace::Fast => devices,
+        TakePace::Secs(secs) => paced(devices, secs),
+    })
+}

@@ -1,0 +1,378 @@
+//! The simulated rig: computed, never measured, and marked as such in every run it makes ([`Origin::Simulated`]).
+//!
+//! The room's air drifts over the simulated hours; the panel reflects as [`KirchhoffPlan`] says, times its
+//! material's factor; the direct sound goes as 1/d; both channels pass the converter; noise is added, and now and
+//! then something outside spoils a take. The same seed gives the same bits.
+
+use std::f64::consts::{PI, TAU};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+
+use echolake_dsp::RealSample as _;
+use echolake_dsp::deconvolution::fast_length;
+use echolake_dsp::kirchhoff::{KirchhoffPlan, KirchhoffScratch};
+use echolake_dsp::temperature::speed_of_sound;
+use echolake_schema::manifest::Origin;
+use echolake_schema::{Grid, Rig, Timestamp};
+use rand::{Rng as _, SeedableRng as _};
+use rand_chacha::ChaCha8Rng;
+use rand_distr::{Distribution as _, StandardNormal};
+use realfft::num_complex::Complex;
+use realfft::{ComplexToReal, RealToComplex};
+
+use crate::panel::relief::HeightField;
+use crate::rig::robots::Choreography;
+use crate::rig::{
+    AmbientReading, AmbientSensor, ArmPositions, AudioInterface, AudioTake, DrivePower, Error, RigDevices, RobotArms,
+};
+
+/// Facets along each side: 2.14 mm, a quarter of the wavelength at 40 kHz.
+pub const FACETS: usize = 274;
+/// Samples of a response beyond its farthest echo: the band limit rings.
+const RINGING: f64 = 32.0;
+/// Time of one measurement (Rust et al. 2021): moving, settling, sweep.
+pub(crate) const TAKE_SECS: f64 = 12.3;
+/// Gain from pressure at 1 m to full scale: the direct sound at 75 mm stays 9 dB under it.
+const MICROPHONE_GAIN: f64 = 0.037;
+/// Noise of the channels, rms re full scale: -102 and -108 dB.
+const NOISE: [f64; 2] = [8e-6, 4e-6];
+/// The drives' noise in the microphone, rms re full scale: 36 dB over its own.
+const DRIVES: f64 = 5e-4;
+/// The converter: a pole above the audio range, and a delay that both channels share.
+const CONVERTER_POLE_HZ: f64 = 60_000.0;
+const CONVERTER_DELAY: f64 = 37.0;
+/// Share of takes that something outside spoils, and how loud it is: dB re 20 uPa outside, rms re full scale inside.
+const SPOILED: f64 = 0.004;
+const SPOILED_LEVEL_DB: f64 = 78.0;
+const SPOILED_NOISE: f64 = 3e-3;
+/// Full scale of 24 bits.
+const FULL_SCALE: f64 = 8_388_608.0;
+
+/// Settings of a simulation.
+#[derive(Debug, Clone)]
+pub struct RigSimulation<'a> {
+    /// The rig.
+    pub rig: &'a Rig,
+    /// The panel.
+    pub relief: &'a HeightField,
+    /// Its pressure reflection factor.
+    pub reflection_factor: f64,
+    /// Time at which its clock begins.
+    pub start: Timestamp,
+    /// Seed of drift and noise.
+    pub seed: u64,
+    /// Joints of the arms at each pair, if a model of them is known.
+    pub arms: Option<Arc<Choreography>>,
+}
+
+/// State that the devices share.
+struct SimulatedWorld {
+    grid: Grid,
+    now: Timestamp,
+    start: Timestamp,
+    power: DrivePower,
+    /// Microphone's and speaker's position, as indices of the grid's points.
+    stand: [usize; 2],
+    air: Air,
+    rng: ChaCha8Rng,
+    /// Level outside during the last take.
+    outside_level_db: f64,
+}
+
+/// The air's slow drift.
+struct Air {
+    phase: f64,
+    walk: f64,
+}
+
+type SharedWorld = Arc<Mutex<SimulatedWorld>>;
+
+/// The devices of a simulated rig.
+///
+/// # Errors
+/// [`Error::Device`] if the rig's grid has no points.
+pub fn devices(simulation: &RigSimulation<'_>) -> Result<RigDevices, Error> {
+    let failed = |e: echolake_schema::Error| Error::Device { device: "simulated rig", reason: e.to_string() };
+    let grid = simulation.rig.grid().map_err(failed)?;
+    let mut rng = ChaCha8Rng::seed_from_u64(simulation.seed);
+    let points: Vec<_> = grid.points().iter().map(|p| p.position_mm).collect();
+    let rate_hz = simulation.rig.sweep.rate_hz.get();
+    let plan =
+        KirchhoffPlan::new(simulation.relief, &points, rate_hz, response_len(simulation.relief, &points, rate_hz));
+    let world = Arc::new(Mutex::new(SimulatedWorld {
+        grid,
+        now: simulation.start,
+        start: simulation.start,
+        power: DrivePower::Off,
+        stand: [0, 1],
+        air: Air { phase: rng.random_range(0.0..TAU), walk: 0.0 },
+        rng,
+        outside_level_db: 42.0,
+    }));
+    Ok(RigDevices {
+        robots: Box::new(SimulatedRobots { world: world.clone(), arms: simulation.arms.clone() }),
+        audio: Box::new(SimulatedAudio {
+            world: world.clone(),
+            rate_hz,
+            reflection_factor: simulation.reflection_factor,
+            scratch: plan.scratch(),
+            response: vec![0.0; plan.len()],
+            plan,
+            output: None,
+        }),
+        sensor: Box::new(SimulatedSensor(world)),
+        origin: Origin::Simulated,
+    })
+}
+
+// The farthest echo comes by a corner of the panel, between the two points that are farthest from theirs, in air of
+// 0 C at the coldest.
+fn response_len(relief: &HeightField, points: &[[f64; 3]], rate_hz: f64) -> usize {
+    let (half, lowest) = (relief.size_mm() / 2.0, f64::from(relief.extent_mm()[0]));
+    let to_corner = |[x, y, z]: [f64; 3]| (x.abs() + half).hypot(y.abs() + half).hypot(z - lowest);
+    let farthest = points.iter().map(|p| to_corner(*p)).fold(0.0, f64::max);
+    let samples = 2.0 * farthest / 1e3 / speed_of_sound(0.0) * rate_hz + RINGING;
+    (samples as usize).next_power_of_two()
+}
+
+fn lock(world: &SharedWorld) -> MutexGuard<'_, SimulatedWorld> {
+    world.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+impl SimulatedWorld {
+    fn temperature_c(&self) -> f64 {
+        let hours = (self.now.0 - self.start.0) as f64 / 3.6e12;
+        21.5 + 0.8 * (TAU * hours / 7.0 + self.air.phase).sin() + self.air.walk
+    }
+
+    fn normal(&mut self) -> f64 {
+        StandardNormal.sample(&mut self.rng)
+    }
+}
+
+struct SimulatedRobots {
+    world: SharedWorld,
+    arms: Option<Arc<Choreography>>,
+}
+
+impl RobotArms for SimulatedRobots {
+    fn move_to(&mut self, microphone_mm: [f64; 3], speaker_mm: [f64; 3]) -> Result<ArmPositions, Error> {
+        let mut world = lock(&self.world);
+        let refuse = |reason| Error::Unreachable { microphone_mm, speaker_mm, reason };
+        if world.power == DrivePower::Off {
+            return Err(refuse("the drives are off"));
+        }
+        let index = |mm| world.grid.point_at(mm).map(|p| p.id.index());
+        let stand = [index(microphone_mm), index(speaker_mm)];
+        let [Some(microphone), Some(speaker)] = stand else {
+            return Err(refuse("the simulated arms know the grid's points only"));
+        };
+        let [a, b] = [microphone, speaker].map(|index| world.grid.points()[index].id);
+        let Some(pair) = world.grid.pair_id(a, b).or_else(|| world.grid.pair_id(b, a)) else {
+            return Err(refuse("the arms would touch"));
+        };
+        // The model knows the roles that the grid gives.
+        let known = self.arms.as_ref().filter(|_| world.grid.pair_id(a, b).is_some());
+        let joints = known.and_then(|arms| arms.standing(pair).ok()).map(|stand| [stand.microphone, stand.speaker]);
+        world.stand = [microphone, speaker];
+        // The arms repeat to 0.02 mm. The residual is returned; the simulated sound does not depend on it.
+        let mut off = |mm: [f64; 3]| mm.map(|x| x + 0.01 * world.normal().clamp(-2.0, 2.0));
+        Ok(ArmPositions { microphone_mm: off(microphone_mm), speaker_mm: off(speaker_mm), joints })
+    }
+
+    fn power(&mut self, power: DrivePower) -> Result<(), Error> {
+        lock(&self.world).power = power;
+        Ok(())
+    }
+}
+
+struct SimulatedSensor(SharedWorld);
+
+impl AmbientSensor for SimulatedSensor {
+    fn read(&mut self) -> Result<AmbientReading, Error> {
+        let mut world = lock(&self.0);
+        let hours = (world.now.0 - world.start.0) as f64 / 3.6e12;
+        // A resolution of 0.01 C, and as much noise.
+        let temperature_c = ((world.temperature_c() + 0.005 * world.normal()) * 100.0).round() / 100.0;
+        Ok(AmbientReading {
+            at: world.now,
+            temperature_c,
+            humidity_pct: 45.0 + 4.0 * (TAU * hours / 9.0).sin() + 0.1 * world.normal(),
+            pressure_hpa: 965.0 + 1.5 * (TAU * hours / 20.0).cos() + 0.02 * world.normal(),
+            outside_level_db: world.outside_level_db,
+        })
+    }
+}
+
+struct SimulatedAudio {
+    world: SharedWorld,
+    rate_hz: f64,
+    reflection_factor: f64,
+    plan: KirchhoffPlan,
+    scratch: KirchhoffScratch,
+    response: Vec<f32>,
+    /// Cache for the last output: a run plays one sweep.
+    output: Option<Played>,
+}
+
+/// An output, its loopback without noise, and the transforms that take it through the room.
+struct Played {
+    output: Vec<f32>,
+    loopback: Vec<f32>,
+    spectrum: Vec<Complex<f32>>,
+    forward: Arc<dyn RealToComplex<f32>>,
+    inverse: Arc<dyn ComplexToReal<f32>>,
+    signal: Vec<f32>,
+    product: Vec<Complex<f32>>,
+    work: Vec<Complex<f32>>,
+}
+
+impl AudioInterface for SimulatedAudio {
+    fn rate_hz(&self) -> f64 {
+        self.rate_hz
+    }
+
+    fn play_and_record(&mut self, output: &[f32], take: &mut AudioTake) -> Result<(), Error> {
+        let mut world = lock(&self.world);
+        world.now = world.now.plus_secs(TAKE_SECS);
+        world.air.walk += 0.002 * world.normal();
+        let spoiled = world.rng.random_bool(SPOILED);
+        let level = if spoiled { SPOILED_LEVEL_DB } else { 42.0 };
+        world.outside_level_db = level + 1.5 * world.normal();
+        let c = speed_of_sound(world.temperature_c());
+        let failed = |e: echolake_dsp::Error| Error::Device { device: "simulated room", reason: e.to_string() };
+        self.plan
+            .response(world.stand, c, self.reflection_factor, &mut self.scratch, &mut self.response)
+            .map_err(failed)?;
+        let played = match &mut self.output {
+            Some(played) if played.output == output => played,
+            other => other.insert(Played::new(output, self.rate_hz, self.response.len())),
+        };
+        played.through(&self.response);
+        let room = if spoiled { SPOILED_NOISE } else { NOISE[0] };
+        let noise = if world.power == DrivePower::On { room.hypot(DRIVES) } else { room };
+        take.started = Some(world.now);
+        quantise(&played.signal[..output.len()], MICROPHONE_GAIN, noise, &mut world, &mut take.microphone);
+        quantise(&played.loopback, 1.0, NOISE[1], &mut world, &mut take.loopback);
+        Ok(())
+    }
+}
+
+impl Played {
+    fn new(output: &[f32], rate_hz: f64, response_len: usize) -> Self {
+        // Room for the response and the converter's delay behind the output, so that nothing wraps around.
+        let len = fast_length(output.len() + response_len + 2 * CONVERTER_DELAY as usize);
+        let (forward, inverse) = (f32::plan_real_forward(len), f32::plan_real_inverse(len));
+        let mut played = Self {
+            output: output.to_vec(),
+            loopback: Vec::new(),
+            spectrum: forward.make_output_vec(),
+            signal: vec![0.0; len],
+            product: forward.make_output_vec(),
+            work: vec![Complex::default(); forward.get_scratch_len().max(inverse.get_scratch_len())],
+            forward,
+            inverse,
+        };
+        played.signal[..output.len()].copy_from_slice(output);
+        let _ = played.forward.process_with_scratch(&mut played.signal, &mut played.spectrum, &mut played.work);
+        for (k, x) in played.spectrum.iter_mut().enumerate() {
+            let hz = k as f64 * rate_hz / len as f64;
+            let pole = Complex::new(1.0, hz / CONVERTER_POLE_HZ).inv();
+            let delay = Complex::from_polar(1.0, -2.0 * PI * k as f64 * CONVERTER_DELAY / len as f64);
+            let response = pole * delay;
+            *x *= Complex::new(response.re as f32, response.im as f32);
+        }
+        played.through(&[1.0]);
+        played.loopback = played.signal[..output.len()].to_vec();
+        played
+    }
+
+    // `signal` becomes the output through the converter and this response.
+    fn through(&mut self, response: &[f32]) {
+        let len = self.signal.len();
+        self.signal.fill(0.0);
+        self.signal[..response.len()].copy_from_slice(response);
+        // Lengths are the plan's own, so the transforms cannot refuse; they ask for real ends only.
+        let _ = self.forward.process_with_scratch(&mut self.signal, &mut self.product, &mut self.work);
+        let scale = 1.0 / len as f32;
+        self.product.iter_mut().zip(&self.spectrum).for_each(|(p, s)| *p = *p * *s * scale);
+        self.product[0].im = 0.0;
+        if let Some(last) = self.product.last_mut() {
+            last.im = 0.0;
+        }
+        let _ = self.inverse.process_with_scratch(&mut self.product, &mut self.signal, &mut self.work);
+    }
+}
+
+// 24 bits with noise; samples over full scale are clipped.
+fn quantise(signal: &[f32], gain: f64, noise: f64, world: &mut SimulatedWorld, out: &mut Vec<i32>) {
+    out.clear();
+    out.extend(signal.iter().map(|x| {
+        let value = f64::from(*x) * gain + noise * world.normal();
+        (value * FULL_SCALE).round().clamp(-FULL_SCALE, FULL_SCALE - 1.0) as i32
+    }));
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::panel::relief::PanelRelief;
+    use crate::rig::conformance;
+
+    fn simulated(seed: u64) -> RigDevices {
+        let (rig, relief) = (Rig::paper(), PanelRelief::Flat.height_field(40));
+        let start = Timestamp(1_767_600_000_000_000_000);
+        devices(&RigSimulation { rig: &rig, relief: &relief, reflection_factor: 0.83, start, seed, arms: None })
+            .expect("devices")
+    }
+
+    #[test]
+    fn it_conforms() {
+        let mut devices = simulated(1);
+        let (near, far) = ([-187.5, -187.5, 124.0], [-187.5, -112.5, 124.0]);
+        conformance::robots(devices.robots.as_mut(), [near, far], [near, near]);
+        conformance::robots(devices.robots.as_mut(), [near, far], [near, [0.0, 0.0, 5_000.0]]);
+        // One straight over the other: the grid leaves that pair out.
+        conformance::robots(devices.robots.as_mut(), [near, far], [near, [-187.5, -187.5, 214.0]]);
+        conformance::audio(devices.audio.as_mut());
+        conformance::sensor(devices.sensor.as_mut());
+        assert_eq!(devices.origin, Origin::Simulated);
+    }
+
+    #[test]
+    fn drives_are_heard_until_they_are_off() {
+        let (mut devices, mut take) = (simulated(1), AudioTake::default());
+        let mut noise = |power| {
+            devices.robots.power(power).expect("a switch");
+            devices.audio.play_and_record(&[0.0; 4_000], &mut take).expect("a take");
+            let sum: f64 = take.microphone.iter().map(|x| (f64::from(*x) / FULL_SCALE).powi(2)).sum();
+            (sum / 4_000.0).sqrt()
+        };
+        // 4,000 samples of white noise tell its rms to about 1 %.
+        let (off, on) = (noise(DrivePower::Off), noise(DrivePower::On));
+        assert!((off / NOISE[0] - 1.0).abs() < 0.1, "{off}");
+        assert!((on / DRIVES - 1.0).abs() < 0.1, "{on}");
+    }
+
+    #[test]
+    fn responses_hold_the_farthest_echo_at_any_rate() {
+        let relief = PanelRelief::Flat.height_field(40);
+        let points: Vec<_> = Rig::paper().grid().expect("a grid").points().iter().map(|p| p.position_mm).collect();
+        // From over one corner to the far corner and back, 743.8 mm each way: the third layer's outermost point.
+        for rate_hz in [48e3, 96e3, 192e3] {
+            let echo = 2.0 * 0.7438 / 331.3 * rate_hz;
+            let len = response_len(&relief, &points, rate_hz) as f64;
+            assert!(len > echo + 30.0 && len < 2.5 * echo, "{rate_hz}: {len}, {echo}");
+        }
+    }
+
+    #[test]
+    fn seeds_tell_runs_apart_and_repeat_them() {
+        let take = |seed| {
+            let (mut devices, mut take) = (simulated(seed), AudioTake::default());
+            devices.audio.play_and_record(&[0.5; 500], &mut take).expect("a take");
+            take.microphone
+        };
+        assert_eq!(take(1), take(1));
+        assert_ne!(take(1), take(2));
+    }
+}

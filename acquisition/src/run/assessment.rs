@@ -1,0 +1,195 @@
+//! Quality of a recording: signal-to-noise ratio, clipping, loopback level, and arrival of the direct sound.
+
+use echolake_dsp::deconvolution::{DeconvolutionParams, DeconvolutionPlan, DeconvolutionScratch, TransformLength};
+use echolake_dsp::level::power_to_db;
+use echolake_dsp::{Error, chain};
+use echolake_schema::Rig;
+use echolake_schema::rig::Validation;
+
+use crate::run::objection::TakeObjection;
+
+/// Attenuation of the assessed response outside of the sweep's range, dB: only the range counts.
+const OUT_OF_RANGE_DB: f64 = 60.0;
+/// Half width of the search window around the direct sound's expected time, samples: the first echo follows it by nine
+/// samples at least.
+const ARRIVAL_WINDOW: f64 = 5.0;
+/// Least share of the strongest sample at which an arrival counts: a peak at the expected time is the direct sound only
+/// if it reaches this share itself and nothing before it does. The ringing of a band-limited arrival stays under 0.22,
+/// a reflection under the direct sound or, focused, not far over it.
+const ARRIVAL_SHARE: f32 = 0.3;
+
+/// Assessment of one recording.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct TakeAssessment {
+    /// Mean power of the response's first part over that of its noise, in the sweep's range, dB; NaN if the recording
+    /// is too short to tell.
+    pub snr_db: f64,
+    /// Samples at full scale, both channels.
+    pub clipped_samples: u32,
+    /// Level of the loopback, dB re full scale.
+    pub loopback_dbfs: f64,
+    /// Direct sound's arrival minus the expected one, us; NaN if the expected one is outside of the response. If there
+    /// is no direct sound at the expected time, the arrival is the first strong one, at any time.
+    pub arrival_error_us: f64,
+}
+
+/// Assesses recordings of one length.
+pub struct TakeAssessor {
+    plan: DeconvolutionPlan<f32>,
+    scratch: DeconvolutionScratch<f32>,
+    response: Vec<f32>,
+    signal_len: usize,
+    rate_hz: f64,
+}
+
+impl TakeAssessor {
+    /// Plans for recordings of `recording_len` samples of this rig.
+    ///
+    /// # Errors
+    /// As [`DeconvolutionPlan::new`].
+    pub fn new(rig: &Rig, recording_len: usize) -> Result<Self, Error> {
+        let rate_hz = rig.sweep.rate_hz.get();
+        let plan = DeconvolutionPlan::new(DeconvolutionParams {
+            recording_len,
+            output_len: recording_len,
+            rate_hz,
+            low_hz: rig.sweep.low_hz,
+            high_hz: rig.sweep.high_hz,
+            floor_db: OUT_OF_RANGE_DB,
+            length: TransformLength::Fast,
+        })?;
+        let reference = rig.impulse_response.reference_temperature_c.get();
+        Ok(Self {
+            scratch: plan.scratch(),
+            plan,
+            response: vec![0.0; recording_len],
+            signal_len: chain::raw_len(rig.impulse_response.length, reference).min(recording_len),
+            rate_hz,
+        })
+    }
+
+    /// Assesses one recording; samples are fractions of full scale.
+    ///
+    /// # Errors
+    /// As [`DeconvolutionPlan::run`]: a silent loopback leaves nothing to assess.
+    pub fn assess(
+        &mut self,
+        microphone: &[f32],
+        loopback: &[f32],
+        expected_arrival_secs: f64,
+        clipped_samples: u32,
+    ) -> Result<TakeAssessment, Error> {
+        self.plan.run(microphone, loopback, &mut self.response, &mut self.scratch)?;
+        Ok(TakeAssessment {
+            snr_db: self.snr_db(),
+            clipped_samples,
+            loopback_dbfs: power_to_db(mean_power(loopback)),
+            arrival_error_us: self.arrival_error_us(expected_arrival_secs),
+        })
+    }
+
+    // The deconvolution spreads noise over the whole length; far behind the response there is nothing else.
+    fn snr_db(&self) -> f64 {
+        let len = self.response.len();
+        let quiet = (len / 2).max(self.signal_len)..len / 4 * 3;
+        let (Some(noise), signal) = (self.response.get(quiet), &self.response[..self.signal_len]) else {
+            return f64::NAN;
+        };
+        let noise = mean_power(noise);
+        power_to_db((mean_power(signal) - noise).max(0.0) / noise)
+    }
+
+    fn arrival_error_us(&self, expected_secs: f64) -> f64 {
+        let expected = expected_secs * self.rate_hz;
+        let from = (expected - ARRIVAL_WINDOW).ceil().max(1.0) as usize;
+        let to = ((expected + ARRIVAL_WINDOW).floor().max(0.0) as usize).min(self.response.len().saturating_sub(2));
+        let magnitude = |n: usize| f64::from(self.response[n].abs());
+        let Some(near) = (from..=to).max_by(|a, b| magnitude(*a).total_cmp(&magnitude(*b))) else { return f64::NAN };
+        let first = self.first_arrival(to);
+        let peak = if (from..=to).contains(&first) { near } else { first };
+        // A parabola through the peak and its neighbours.
+        let [before, at, after] = [peak - 1, peak, peak + 1].map(magnitude);
+        let bend = before - 2.0 * at + after;
+        let shift = if bend < 0.0 { (0.5 * (before - after) / bend).clamp(-1.0, 1.0) } else { 0.0 };
+        (peak as f64 + shift - expected) / self.rate_hz * 1e6
+    }
+
+    // The local maximum that follows the first sample of a strong arrival, up to the response's end or `to`.
+    fn first_arrival(&self, to: usize) -> usize {
+        let end = self.signal_len.max(to + 1).min(self.response.len() - 1);
+        let searched = &self.response[..end];
+        let strongest = searched.iter().fold(0.0f32, |most, x| most.max(x.abs()));
+        let strong = searched.iter().position(|x| x.abs() >= ARRIVAL_SHARE * strongest).unwrap_or(0);
+        let rises = |n: &usize| self.response[n + 1].abs() > self.response[*n].abs();
+        (strong.max(1)..end - 1).find(|n| !rises(n)).unwrap_or(end - 1).max(1)
+    }
+}
+
+impl TakeAssessment {
+    /// Returns the rig's reasons against the recording; empty if it would accept it.
+    pub fn objections(&self, limits: &Validation, outside_level_db: f64) -> Vec<TakeObjection> {
+        let mut reasons = Vec::new();
+        if self.clipped_samples > 0 {
+            reasons.push(TakeObjection::Clipped { samples: self.clipped_samples });
+        }
+        if !(self.loopback_dbfs >= limits.loopback_dbfs) {
+            reasons.push(TakeObjection::Loopback { dbfs: self.loopback_dbfs, least_dbfs: limits.loopback_dbfs });
+        }
+        if self.snr_db < limits.snr_db {
+            reasons.push(TakeObjection::Noise { snr_db: self.snr_db, least_db: limits.snr_db });
+        }
+        if self.arrival_error_us.abs() > limits.arrival_us {
+            reasons.push(TakeObjection::Arrival { off_us: self.arrival_error_us, most_us: limits.arrival_us });
+        }
+        if outside_level_db > limits.outside_level_db {
+            reasons.push(TakeObjection::Outside { level_db: outside_level_db, most_db: limits.outside_level_db });
+        }
+        reasons
+    }
+}
+
+fn mean_power(x: &[f32]) -> f64 {
+    echolake_dsp::energy::energy(x) / x.len().max(1) as f64
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use echolake_dsp::sweep::LinearSweep;
+
+    // A sweep and its echo-free recording, `delay` samples late, in a little noise.
+    fn assessed(delay: usize, expected: f64) -> TakeAssessment {
+        let rig = Rig::from_toml("sweep.duration_secs = 0.03").expect("a rig");
+        let sweep = LinearSweep { rate_hz: 96e3, duration_secs: 0.03, low_hz: 2e3, high_hz: 40e3, fade_secs: 1e-3 };
+        let mut loopback: Vec<f32> = sweep.samples().iter().map(|x| 0.5 * *x as f32).collect();
+        loopback.resize(rig.recording_len(), 0.0);
+        let mut state = 1u32;
+        let mut microphone: Vec<f32> = (0..loopback.len())
+            .map(|_| {
+                state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+                (state >> 8) as f32 / 16_777_216.0 * 1e-5
+            })
+            .collect();
+        microphone[delay..].iter_mut().zip(&loopback).for_each(|(m, l)| *m += 0.3 * l);
+        let mut assessor = TakeAssessor::new(&rig, loopback.len()).expect("a plan");
+        assessor.assess(&microphone, &loopback, expected / 96e3, 0).expect("assessed")
+    }
+
+    #[test]
+    fn an_arrival_is_told_however_far_off_it_is() {
+        // One sample is 10.4 us. Half a sample off, the parabola is right to a tenth of one.
+        for off in [-80i32, -37, -12, -7, -3, -1, 0, 1, 3, 7, 12, 37, 80, 200] {
+            for fraction in [0.0, 0.4] {
+                let expected = f64::from(100 - off) + fraction;
+                let told = assessed(100, expected.max(2.0)).arrival_error_us;
+                let wanted = (100.0 - expected.max(2.0)) / 96e3 * 1e6;
+                assert!((told - wanted).abs() < 2.0, "{off}, {fraction}: {told} us, {wanted} us");
+            }
+        }
+    }
+
+    #[test]
+    fn an_arrival_outside_of_the_response_is_unknown() {
+        assert!(assessed(100, 1e6).arrival_error_us.is_nan());
+    }
+}

@@ -1,0 +1,302 @@
+//! One attempt at one pair: made, judged, and recorded.
+
+use echolake_dsp::geometry::direct_mm;
+use echolake_dsp::temperature::speed_of_sound;
+use echolake_schema::messages::{AmbientSample, ImpulseResponse, Measurement, SampleFormat, SweepRecording, Verdict};
+use echolake_schema::samples::split_24;
+use echolake_schema::{Celsius, Pair, Timestamp};
+
+use super::{Error, NAME, RecordingMode, RunController, RunProgress};
+use crate::rig::{AmbientReading, ArmPositions, DrivePower, Error as RigError};
+use crate::run::assessment::TakeAssessment;
+use crate::run::objection::TakeObjection;
+use crate::run::recorder::LogLevel;
+
+/// Full scale of a take's samples.
+const FULL_SCALE: f32 = 8_388_608.0;
+/// Number of tries of a device that fails before the run ends: an overrun, or a line of a sensor that was cut short, is
+/// over at once.
+const TRIES: usize = 3;
+/// Plausible range of readings in rooms; a value outside is the fault of the sensor or its line.
+const TEMPERATURE_C: [f64; 2] = [-20.0, 60.0];
+const HUMIDITY_PCT: [f64; 2] = [0.0, 100.0];
+const PRESSURE_HPA: [f64; 2] = [300.0, 1_100.0];
+const LEVEL_DB: [f64; 2] = [0.0, 150.0];
+
+/// One attempt with its measurement.
+pub(super) struct AttemptResult {
+    pub(super) at: Timestamp,
+    pub(super) measurement: Measurement,
+    pub(super) objections: Vec<TakeObjection>,
+    reading: AmbientReading,
+    /// Positions of the arms; None if they refused.
+    reached: Option<ArmPositions>,
+    response: ResponseState,
+}
+
+/// State of the response buffer after an attempt.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum ResponseState {
+    /// It is in the controller's buffer.
+    Deconvolved,
+    /// The recording cannot be deconvolved, and the buffer still has the response of an attempt before.
+    Missing,
+}
+
+/// Assessment of a take, with the objections to it.
+struct Judged {
+    assessment: TakeAssessment,
+    response: ResponseState,
+    objections: Vec<TakeObjection>,
+}
+
+impl RunController<'_> {
+    pub(super) fn attempt(
+        &mut self,
+        run: &mut RunProgress<'_>,
+        pair: Pair,
+        number: u32,
+        is_last: bool,
+    ) -> Result<AttemptResult, Error> {
+        let [microphone, speaker] = self.positions(pair);
+        self.devices.robots.power(DrivePower::On)?;
+        let reached = match self.devices.robots.move_to(microphone, speaker) {
+            Ok(reached) => reached,
+            // A retry would not change it; the other pairs may be reached.
+            Err(refusal @ RigError::Unreachable { .. }) => {
+                self.devices.robots.power(DrivePower::Off)?;
+                return self.refused(pair, number, refusal);
+            }
+            Err(error) => return Err(error.into()),
+        };
+        // The drives hum; the arms hold by their brakes while the sweep is recorded.
+        self.devices.robots.power(DrivePower::Off)?;
+        self.take(run)?;
+        let reading = self.air()?;
+        let Judged { assessment, response, objections } = self.judge(microphone, speaker, &reading);
+        let verdict = match (objections.is_empty(), is_last) {
+            (true, _) => Verdict::Accepted,
+            (false, false) => Verdict::Repeated,
+            (false, true) => Verdict::Rejected,
+        };
+        let measurement = Measurement {
+            snr_db: assessment.snr_db,
+            clipped_samples: assessment.clipped_samples,
+            loopback_level_dbfs: assessment.loopback_dbfs,
+            arrival_error_us: assessment.arrival_error_us,
+            microphone_residual_mm: direct_mm(microphone, reached.microphone_mm),
+            speaker_residual_mm: direct_mm(speaker, reached.speaker_mm),
+            ..verdict_on(pair, number, verdict, &objections, &reading)
+        };
+        let at = self.take.started.unwrap_or(reading.at);
+        Ok(AttemptResult { at, measurement, objections, reading, reached: Some(reached), response })
+    }
+
+    /// Makes a take at a pair and judges it without recording it: a check of the rig before a run.
+    pub(crate) fn trial(&mut self, pair: Pair) -> Result<(TakeAssessment, Vec<TakeObjection>), RigError> {
+        let [microphone, speaker] = self.positions(pair);
+        self.devices.robots.power(DrivePower::On)?;
+        self.devices.robots.move_to(microphone, speaker)?;
+        self.devices.robots.power(DrivePower::Off)?;
+        self.devices.audio.play_and_record(&self.output, &mut self.take)?;
+        let reading = self.air()?;
+        let judged = self.judge(microphone, speaker, &reading);
+        Ok((judged.assessment, judged.objections))
+    }
+
+    /// Reads the air, with retries if the sensor fails.
+    pub(crate) fn air(&mut self) -> Result<AmbientReading, RigError> {
+        persistently(|| self.devices.sensor.read())
+    }
+
+    // An interface that lost samples is retried: nothing of that take is kept.
+    fn take(&mut self, run: &mut RunProgress<'_>) -> Result<(), Error> {
+        let mut lost = Vec::new();
+        let taken = persistently(|| {
+            let taken = self.devices.audio.play_and_record(&self.output, &mut self.take);
+            lost.extend(taken.as_ref().err().map(ToString::to_string));
+            taken
+        });
+        for what in lost {
+            run.say(LogLevel::Warning, &format!("a take was lost, and made again: {what}"))?;
+        }
+        Ok(taken?)
+    }
+
+    fn positions(&self, pair: Pair) -> [[f64; 3]; 2] {
+        [pair.microphone, pair.speaker].map(|id| self.grid.points()[id.index()].position_mm)
+    }
+
+    fn refused(&mut self, pair: Pair, number: u32, refusal: RigError) -> Result<AttemptResult, Error> {
+        let reading = self.air()?;
+        let objections = vec![TakeObjection::Refused { refusal }];
+        let unknown = f64::NAN;
+        let measurement = Measurement {
+            snr_db: unknown,
+            loopback_level_dbfs: unknown,
+            arrival_error_us: unknown,
+            microphone_residual_mm: unknown,
+            speaker_residual_mm: unknown,
+            ..verdict_on(pair, number, Verdict::Rejected, &objections, &reading)
+        };
+        Ok(AttemptResult {
+            at: reading.at,
+            measurement,
+            objections,
+            reading,
+            reached: None,
+            response: ResponseState::Missing,
+        })
+    }
+
+    fn judge(&mut self, microphone: [f64; 3], speaker: [f64; 3], reading: &AmbientReading) -> Judged {
+        let mut clipped = to_fractions(&self.take.microphone, &mut self.microphone);
+        clipped += to_fractions(&self.take.loopback, &mut self.loopback);
+        let arrival = direct_mm(microphone, speaker) / 1e3 / speed_of_sound(reading.temperature_c);
+        match self.assess(arrival, clipped) {
+            Ok(assessment) => {
+                let mut objections = assessment.objections(&self.rig.validation, reading.outside_level_db);
+                objections.extend(unknowns(&assessment, reading));
+                objections.extend(implausible(reading));
+                Judged { assessment, response: ResponseState::Deconvolved, objections }
+            }
+            Err(cause) => {
+                let objections = vec![TakeObjection::Broken { reason: cause.to_string() }];
+                Judged { assessment: nothing(clipped), response: ResponseState::Missing, objections }
+            }
+        }
+    }
+
+    fn assess(&mut self, arrival_secs: f64, clipped: u32) -> Result<TakeAssessment, echolake_dsp::Error> {
+        self.deconvolution.run(&self.microphone, &self.loopback, &mut self.ir, &mut self.scratch)?;
+        self.assessor.assess(&self.microphone, &self.loopback, arrival_secs, clipped)
+    }
+
+    // The order within an attempt is kept for live views. In the file a verdict follows its messages because
+    // the recorder writes its chunk last.
+    pub(super) fn record(&mut self, run: &mut RunProgress<'_>, made: &AttemptResult) -> Result<(), Error> {
+        let (at, m, reading) = (made.at, &made.measurement, &made.reading);
+        let sample_rate_hz = self.rig.sweep.rate_hz.get();
+        if let Some(reached) = made.reached {
+            run.recorder.poses(at, reached.microphone_mm, reached.speaker_mm)?;
+            if let Some(joints) = &reached.joints {
+                run.recorder.joints(at, joints)?;
+            }
+        }
+        let sample = AmbientSample {
+            temperature_c: reading.temperature_c,
+            humidity_pct: reading.humidity_pct,
+            pressure_hpa: reading.pressure_hpa,
+            outside_level_db: reading.outside_level_db,
+        };
+        run.recorder.environment(reading.at, &sample)?;
+        for (device, notice) in self.devices.notices() {
+            run.recorder.log(at, LogLevel::Warning, device, &notice)?;
+        }
+        // Without a temperature they are useless; the verdict has the sensor's values.
+        let is_usable = made.reached.is_some() && Celsius::new(reading.temperature_c).is_ok();
+        if run.options.keep == RecordingMode::Sweeps && is_usable {
+            let recording = SweepRecording {
+                pair_id: m.pair_id,
+                attempt: m.attempt,
+                sample_rate_hz,
+                sample_count: self.take.microphone.len() as u32,
+                format: SampleFormat::S24Split.into(),
+                microphone: split_24(&self.take.microphone).into(),
+                loopback: split_24(&self.take.loopback).into(),
+                temperature_c: reading.temperature_c,
+            };
+            run.recorder.sweep(at, &recording)?;
+        }
+        if made.response == ResponseState::Deconvolved && is_usable {
+            let ir = ImpulseResponse {
+                pair_id: m.pair_id,
+                attempt: m.attempt,
+                sample_rate_hz,
+                samples: self.ir.clone(),
+                temperature_c: reading.temperature_c,
+                temperature_corrected: false,
+            };
+            run.recorder.ir(at, &ir)?;
+        }
+        run.recorder.measurement(at, m)?;
+        if m.verdict() != Verdict::Accepted {
+            let next = if m.verdict() == Verdict::Repeated { "tried again" } else { "given up" };
+            let what = format!("pair {}, attempt {}: {}; {next}", m.pair_id, m.attempt, m.reasons.join("; "));
+            run.recorder.log(at, LogLevel::Warning, NAME, &what)?;
+        }
+        Ok(())
+    }
+}
+
+// Retries a device that fails, a few times.
+fn persistently<T>(mut ask: impl FnMut() -> Result<T, RigError>) -> Result<T, RigError> {
+    for _ in 1..TRIES {
+        if let Ok(answer) = ask() {
+            return Ok(answer);
+        }
+    }
+    ask()
+}
+
+fn verdict_on(
+    pair: Pair,
+    attempt: u32,
+    verdict: Verdict,
+    objections: &[TakeObjection],
+    reading: &AmbientReading,
+) -> Measurement {
+    Measurement {
+        pair_id: pair.id.0,
+        attempt,
+        microphone: pair.microphone.0,
+        speaker: pair.speaker.0,
+        verdict: verdict.into(),
+        outside_level_db: reading.outside_level_db,
+        temperature_c: reading.temperature_c,
+        humidity_pct: reading.humidity_pct,
+        pressure_hpa: reading.pressure_hpa,
+        reasons: objections.iter().map(ToString::to_string).collect(),
+        ..Measurement::default()
+    }
+}
+
+// A comparison with NaN raises no objection, and a take with unknown values is no good one.
+fn unknowns(found: &TakeAssessment, reading: &AmbientReading) -> Vec<TakeObjection> {
+    let values = [
+        ("signal-to-noise ratio", found.snr_db),
+        ("arrival of the direct sound", found.arrival_error_us),
+        // Infinite is as bad as unknown here, while a take without any noise has an infinite ratio.
+        ("temperature", if reading.temperature_c.is_finite() { reading.temperature_c } else { f64::NAN }),
+        ("level outside", reading.outside_level_db),
+    ];
+    values.into_iter().filter(|(_, x)| x.is_nan()).map(|(what, _)| TakeObjection::Unknown { what }).collect()
+}
+
+/// Returns objections to values that no room has; values that the reading leaves unknown are not among them.
+pub(crate) fn implausible(reading: &AmbientReading) -> Vec<TakeObjection> {
+    let values = [
+        ("a temperature", reading.temperature_c, "C", TEMPERATURE_C),
+        ("a humidity", reading.humidity_pct, "%", HUMIDITY_PCT),
+        ("a pressure", reading.pressure_hpa, "hPa", PRESSURE_HPA),
+        ("a level outside", reading.outside_level_db, "dB", LEVEL_DB),
+    ];
+    let wrong = |(_, value, _, [least, most]): &(_, f64, _, [f64; 2])| value < least || value > most;
+    values
+        .into_iter()
+        .filter(wrong)
+        .map(|(what, value, unit, [least, most])| TakeObjection::Implausible { what, value, unit, least, most })
+        .collect()
+}
+
+// Samples as fractions of full scale; returns how many are at it.
+fn to_fractions(samples: &[i32], out: &mut Vec<f32>) -> u32 {
+    out.clear();
+    out.extend(samples.iter().map(|x| *x as f32 / FULL_SCALE));
+    samples.iter().filter(|x| **x <= -(1 << 23) || **x >= (1 << 23) - 1).count() as u32
+}
+
+fn nothing(clipped_samples: u32) -> TakeAssessment {
+    let unknown = f64::NAN;
+    TakeAssessment { snr_db: unknown, clipped_samples, loopback_dbfs: unknown, arrival_error_us: unknown }
+}

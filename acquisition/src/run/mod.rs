@@ -1,0 +1,197 @@
+//! A run, from a specimen and a rig's devices to a closed MCAP file.
+
+pub mod assessment;
+pub mod controller;
+pub mod live;
+pub mod metrics;
+pub mod objection;
+pub mod plan;
+pub mod preflight;
+pub mod recorder;
+pub mod session;
+pub mod simulate;
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use echolake_schema::manifest::{Origin, RunManifest};
+use echolake_schema::{Rig, RunId, SurfaceId, Timestamp};
+
+use crate::disk::folder_of;
+use crate::panel::mesh;
+use crate::panel::prepared_panel::PreparedPanel;
+use crate::recovery;
+use crate::rig::RigDevices;
+use crate::rig::devices::simulated::TAKE_SECS;
+use crate::rig::devices::{DeviceRequest, open_devices};
+use crate::rig::robots::Choreography;
+use crate::run::controller::{RecordingMode, RunController};
+pub use crate::run::plan::PanelSpecimen;
+use crate::run::plan::RunPlan;
+use crate::run::preflight::PreflightFinding;
+use crate::run::recorder::{Held, Recorder, Relief as RecordedRelief, RunStart, Shape, Tried};
+use crate::run::session::{MeasuredRun, PreflightMode, RunJob, RunSession, WhenStopped};
+
+/// A run that is to be measured.
+#[derive(Debug, Clone)]
+pub struct RunRequest<'a> {
+    /// The rig.
+    pub rig: &'a Rig,
+    /// Name of the surface.
+    pub surface: SurfaceId,
+    /// The panel to measure.
+    pub specimen: &'a PanelSpecimen,
+    /// The surface that normalises it, if it is not the lake's.
+    pub flat: Option<SurfaceId>,
+    /// The surface whose direct sound is subtracted from it, if it is not the lake's.
+    pub foam: Option<SurfaceId>,
+    /// Time of its begin.
+    pub start: Timestamp,
+    /// Seed of room and noise of simulated devices.
+    pub seed: u64,
+    /// Tag of the run's name.
+    pub tag: u64,
+    /// Messages to record.
+    pub keep: RecordingMode,
+    /// Folder of the run's file, which has the run's name.
+    pub folder: &'a Path,
+}
+
+/// An error of measuring or resuming a run.
+#[derive(Debug, thiserror::Error)]
+pub enum Error {
+    /// The mesh cannot be used.
+    #[error(transparent)]
+    Mesh(#[from] mesh::Error),
+    /// A device cannot be used, or measuring failed.
+    #[error(transparent)]
+    Run(#[from] controller::Error),
+    /// A name is not valid.
+    #[error(transparent)]
+    Schema(#[from] echolake_schema::Error),
+    /// The run cannot be resumed.
+    #[error(transparent)]
+    Resume(#[from] recovery::Error),
+    /// The preflight check found something, and nothing was begun.
+    #[error("not fit to measure: {}", findings.iter().map(ToString::to_string).collect::<Vec<_>>().join("\n  and: "))]
+    Unfit {
+        /// The failed checks.
+        findings: Vec<PreflightFinding>,
+    },
+}
+
+impl RunRequest<'_> {
+    /// Measures all pairs with the devices that the rig file names. A run that is stopped or interrupted can be resumed.
+    ///
+    /// # Errors
+    /// [`Error`]; a run that was begun leaves its `.partial` file.
+    pub fn measure(&self, session: RunSession<'_>) -> Result<MeasuredRun, Error> {
+        let panel = PreparedPanel::new(self.specimen, self.rig)?;
+        let arms = Choreography::of(self.rig)?;
+        let request =
+            DeviceRequest { rig: self.rig, panel: &panel, start: self.start, seed: self.seed, arms: arms.clone() };
+        let devices = open_devices(&request, session.pace).map_err(controller::Error::from)?;
+        let plan = RunPlan { keep: self.keep, seed: self.seed, specimen: self.specimen.clone() };
+        self.measure_with(devices, &panel, arms, session, Some(plan.to_metadata()))
+    }
+
+    /// Measures all pairs with these devices. Only a run with a plan can be resumed; without one it is closed when it
+    /// is stopped.
+    pub(crate) fn measure_with(
+        &self,
+        devices: RigDevices,
+        panel: &PreparedPanel,
+        arms: Option<Arc<Choreography>>,
+        session: RunSession<'_>,
+        plan: Option<BTreeMap<String, String>>,
+    ) -> Result<MeasuredRun, Error> {
+        let manifest = RunManifest {
+            run_id: self.run_id()?,
+            surface_id: self.surface.clone(),
+            started: self.start,
+            software: concat!("echolake ", env!("CARGO_PKG_VERSION")).to_owned(),
+            rig: self.rig.name.clone(),
+            origin: devices.origin,
+        };
+        let mut surface = panel.record.clone();
+        surface.flat_reference = self.flat.clone();
+        surface.foam_reference = self.foam.clone();
+        let relief = RecordedRelief { heights: &panel.heights, mesh: &panel.mesh, original: panel.original() };
+        let start = RunStart { manifest: &manifest, rig: self.rig, surface: &surface, relief: Some(relief), plan };
+        let none = BTreeMap::new();
+        let mut job = job(panel, self.rig, self.folder, self.keep, &none, self.start, arms);
+        if start.plan.is_none() {
+            job.when_stopped = WhenStopped::Ended;
+        }
+        // Requests that can be refused are refused before there is a file.
+        let mut controller = RunController::new(self.rig, devices)?;
+        check_fitness(&job, &mut controller, session.preflight)?;
+        let recorder = Recorder::create(&self.path()?, &start).map_err(controller::Error::from)?;
+        Ok(job.measure(&mut controller, recorder, session)?)
+    }
+
+    /// The run's file.
+    ///
+    /// # Errors
+    /// [`Error::Schema`] if the surface's name is too long for a run's.
+    pub fn path(&self) -> Result<PathBuf, Error> {
+        Ok(self.folder.join(format!("{}.mcap", self.run_id()?)))
+    }
+
+    fn run_id(&self) -> Result<RunId, Error> {
+        Ok(RunId::compose(self.start, &self.surface, self.tag)?)
+    }
+}
+
+/// Resumes a run that was stopped or interrupted: measurements that are safe in its file are not repeated.
+///
+/// # Errors
+/// [`Error::Resume`] if it cannot be resumed; the file is as it was.
+pub fn resume(partial: &Path, session: RunSession<'_>) -> Result<MeasuredRun, Error> {
+    let held = Held::read(partial)?;
+    let reason = |reason: String| recovery::Error::NoPlan { path: partial.to_owned(), reason };
+    let plan = RunPlan::from_metadata(&held.plan).map_err(reason)?;
+    let panel = PreparedPanel::new(&plan.specimen, &held.rig)?;
+    let now = Timestamp::now();
+    let start = match held.manifest.origin {
+        // After everything recorded: the simulated clock runs ahead of ours.
+        Origin::Simulated => now.max(held.last.plus_secs(TAKE_SECS)),
+        _ if now < held.last => {
+            let back_secs = (held.last.0 - now.0) as f64 / 1e9;
+            return Err(controller::Error::Clock { before: held.last, now, back_secs }.into());
+        }
+        _ => now,
+    };
+    // A repeated seed would give the same noise again.
+    let seed = plan.seed.wrapping_add(held.attempts.wrapping_add(1).wrapping_mul(0x9E37_79B9));
+    let arms = Choreography::of(&held.rig)?;
+    let request = DeviceRequest { rig: &held.rig, panel: &panel, start, seed, arms: arms.clone() };
+    let devices = open_devices(&request, session.pace).map_err(controller::Error::from)?;
+    let job = job(&panel, &held.rig, folder_of(partial), plan.keep, &held.pairs, start, arms);
+    let mut controller = RunController::new(&held.rig, devices)?;
+    check_fitness(&job, &mut controller, session.preflight)?;
+    let (recorder, _) = Recorder::resume(partial)?;
+    Ok(job.measure(&mut controller, recorder, session)?)
+}
+
+fn check_fitness(job: &RunJob<'_>, controller: &mut RunController<'_>, preflight: PreflightMode) -> Result<(), Error> {
+    if preflight == PreflightMode::Skip {
+        return Ok(());
+    }
+    let findings = job.look_over(controller, job.rig.grid()?.pairs());
+    if findings.is_empty() { Ok(()) } else { Err(Error::Unfit { findings }) }
+}
+
+fn job<'a>(
+    panel: &'a PreparedPanel,
+    rig: &'a Rig,
+    folder: &'a Path,
+    keep: RecordingMode,
+    before: &'a BTreeMap<u32, Tried>,
+    started: Timestamp,
+    arms: Option<Arc<Choreography>>,
+) -> RunJob<'a> {
+    let shape = Some(Shape { heights: &panel.heights, mesh: &panel.mesh });
+    RunJob { rig, folder, shape, keep, before, started, arms, when_stopped: WhenStopped::Open }
+}

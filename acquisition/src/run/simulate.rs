@@ -1,0 +1,50 @@
+//! Whole runs of the simulated rig, whatever devices a rig file names: for demos, benchmarks and tests.
+
+use std::path::PathBuf;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+use echolake_schema::manifest::RunEnd;
+use echolake_schema::messages::Verdict;
+
+use crate::panel::prepared_panel::PreparedPanel;
+use crate::rig::devices::{DeviceRequest, simulated_devices};
+use crate::rig::robots::Choreography;
+use crate::run::controller::{self, RunControl, RunEvent};
+use crate::run::session::{PreflightMode, RunSession, TakePace};
+use crate::run::{Error, RunRequest};
+
+/// Simulates all pairs, without a preflight check; returns the run's file and how it ended. Once `stop` is true it ends
+/// with the pairs that it has.
+///
+/// # Errors
+/// [`Error`]; a run that was begun leaves its `.partial` file.
+pub fn simulate(
+    request: &RunRequest<'_>,
+    stop: &AtomicBool,
+    progress: &mut dyn FnMut(usize),
+) -> Result<(PathBuf, RunEnd), Error> {
+    let (control, mut done) = (RunControl::default(), 0);
+    let mut observe = |event: RunEvent<'_>| match event {
+        RunEvent::Pair(_) => control.stop.store(stop.load(Ordering::Relaxed), Ordering::Relaxed),
+        RunEvent::Attempt(m) if m.verdict() != Verdict::Repeated => {
+            done += 1;
+            progress(done);
+        }
+        _ => {}
+    };
+    let session = RunSession {
+        control: &control,
+        observe: &mut observe,
+        tap: None,
+        preflight: PreflightMode::Skip,
+        checkpoint_every: None,
+        pace: TakePace::Fast,
+    };
+    let RunRequest { rig, start, seed, .. } = *request;
+    let panel = PreparedPanel::new(request.specimen, rig)?;
+    let arms = Choreography::of(rig)?;
+    let devices = DeviceRequest { rig, panel: &panel, start, seed, arms: arms.clone() };
+    let devices = simulated_devices(&devices, session.pace).map_err(controller::Error::from)?;
+    let measured = request.measure_with(devices, &panel, arms, session, None)?;
+    Ok((measured.path, measured.outcome.end))
+}
