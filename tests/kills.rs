@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::time::{Duration, Instant};
 
+use echolake_schema::{Rig, Table};
 use rand::seq::SliceRandom as _;
 use rand::{Rng as _, SeedableRng as _};
 use rand_chacha::ChaCha8Rng;
@@ -14,21 +15,15 @@ use super::child::{ChildProcess, run_command};
 
 /// Surfaces of the lake: references and what waits for them, in an order that a run must not depend on.
 const SURFACES: [&str; 6] = ["wood", "flat", "prd", "foam", "brick", "wavy"];
-/// Every table, with the order that makes its rows comparable.
-pub(crate) const TABLES: [(&str, &str); 12] = [
-    ("surfaces", "surface_id"),
-    ("runs", "run_id"),
-    ("points", "point_id"),
-    ("pairs", "pair_id"),
-    ("measurements", "run_id, pair_id"),
-    ("nce", "run_id, pair_id"),
-    ("tnce", "run_id, pair_id"),
-    ("tnce_d4", "run_id, pair_id, symmetry"),
-    ("heightmaps", "surface_id, symmetry"),
-    ("environment", "run_id, log_time_ns"),
-    ("events", "run_id, log_time_ns, message"),
-    ("surface_stats", "surface_id, band, run_id"),
-];
+/// Returns a query for each table, whose rows are in a comparable order: by key, or by all columns if they may repeat.
+pub(crate) fn table_queries() -> impl Iterator<Item = (&'static str, String)> {
+    Table::ALL.into_iter().map(|table| {
+        let schema = table.schema(&Rig::paper());
+        let all = schema.fields().iter().map(|field| field.name().as_str());
+        let order = if table.key().is_empty() { all.collect() } else { table.key().to_vec() };
+        (table.name(), format!("select * from {} order by {}", table.name(), order.join(", ")))
+    })
+}
 
 /// Counts of a campaign.
 #[derive(Debug, Default)]
@@ -179,11 +174,7 @@ impl KillCampaign {
     }
 
     fn tables(&self, lake: &str) -> BTreeMap<&'static str, Vec<u8>> {
-        let rows = |(table, order): &(&'static str, &str)| {
-            let query = format!("select * from {table} order by {order}");
-            (*table, self.run(lake, &["sql", "--format", "csv", &query]))
-        };
-        TABLES.iter().map(rows).collect()
+        table_queries().map(|(table, query)| (table, self.run(lake, &["sql", "--format", "csv", &query]))).collect()
     }
 
     fn copy(&self, lake: &str) {

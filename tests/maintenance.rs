@@ -5,13 +5,10 @@ use std::path::{Path, PathBuf};
 use std::time::{Duration, SystemTime};
 
 use super::TestFolder;
-use super::kills::TABLES;
+use super::kills::table_queries;
 
 fn tables(place: &TestFolder) -> BTreeMap<&'static str, String> {
-    let rows = |(table, order): &(&'static str, &str)| {
-        (*table, place.ok(&["sql", "--format", "csv", &format!("select * from {table} order by {order}")]))
-    };
-    TABLES.iter().map(rows).collect()
+    table_queries().map(|(table, query)| (table, place.ok(&["sql", "--format", "csv", &query]))).collect()
 }
 
 fn same(actual: &BTreeMap<&'static str, String>, expected: &BTreeMap<&'static str, String>, when: &str) {

@@ -106,7 +106,8 @@ async fn complete_run(
     let (mut staged, references) = derivation.stage(context, &keys, responses).await?;
     let mut row = Vec::new();
     for file in context.snapshot.files_of(Table::Runs, &run.run) {
-        row.push(rows::runs::with_references(&read_back::run_row(lake, file).await?, &references)?);
+        let before = read_back::run_row(lake, file).await?;
+        row.push(rows::runs::with_references(lake.rig(), &keys, &before, &references)?);
     }
     let pointer = VisibleRun { reference_derivation: references.derivation.clone(), ..run.clone() };
     staged.push(context.stage_pointer(pointer, &row).await?);

@@ -77,12 +77,15 @@ impl DerivedRows {
         }
     }
 
-    /// Returns the values of every column from `tnce_*` to `energy_total`, in the tables' order.
-    pub(crate) fn energy_columns(&self) -> Vec<Vec<f64>> {
-        let mut columns = self.tnce_columns();
-        columns.extend((0..self.bands).map(|b| self.column(&self.tnce_over_band, b)));
-        columns.extend((0..self.bands).map(|b| self.column(&self.energies, b)));
-        columns.push(self.totals(&self.energies));
+    /// Returns the values of every column from `tnce_*` to `energy_total`, by its name.
+    pub(crate) fn energy_columns(&self, bands: &[String]) -> Vec<(String, Vec<f64>)> {
+        let mut columns =
+            vec![("tnce_total".into(), self.totals(&self.tnce)), ("energy_total".into(), self.totals(&self.energies))];
+        for (b, band) in bands.iter().enumerate() {
+            columns.push((format!("tnce_{band}"), self.column(&self.tnce, b)));
+            columns.push((format!("tnce_band_{band}"), self.column(&self.tnce_over_band, b)));
+            columns.push((format!("energy_{band}"), self.column(&self.energies, b)));
+        }
         columns
     }
 

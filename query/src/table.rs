@@ -96,19 +96,6 @@ impl LakeTable {
         self.table
     }
 
-    /// Returns a table's unique key, if views join by it.
-    pub(crate) fn key(table: Table) -> Option<&'static [&'static str]> {
-        match table {
-            Table::Nce | Table::Tnce | Table::Measurements => Some(&["run_id", "pair_id"]),
-            Table::Heightmaps => Some(&["surface_id", "symmetry"]),
-            Table::Surfaces => Some(&["surface_id"]),
-            Table::Runs => Some(&["run_id"]),
-            Table::Pairs => Some(&["pair_id"]),
-            Table::Points => Some(&["point_id"]),
-            _ => None,
-        }
-    }
-
     // Prunes files by their statistics in the log. DataFusion would prune them, too, but only after opening each; a
     // query for one surface should not open the files of others.
     fn kept(&self, state: &dyn Session, filters: &[Expr]) -> Result<Vec<&ScanFile>> {

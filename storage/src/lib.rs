@@ -29,10 +29,10 @@ pub use error::{Error, StoreError};
 pub use lake::Lake;
 #[cfg(feature = "tables")]
 pub use tables::{
-    CommitEffect, CommitLog, CommitOutcome, DataFile, DeletedFile, DeletionMode, EncodedFile, FileEncoder, FileHistory,
-    FileName, FileStats, KEEP_HOURS, LakeMoment, LakeSnapshot, MergeProgress, NewFile, NoMoment, OptimizeReport,
-    ReplacedFiles, RunPart, StagedFile, TARGET_BYTES, TableCommit, TableOptimizeReport, TableVersion, VacuumReport,
-    VisibleRun, encode,
+    BatchBuilder, CommitEffect, CommitLog, CommitOutcome, DataFile, DeletedFile, DeletionMode, EncodedFile,
+    FileEncoder, FileHistory, FileName, FileStats, KEEP_HOURS, LakeMoment, LakeSnapshot, MergeProgress, NewFile,
+    NoMoment, OptimizeReport, ReplacedFiles, RunPart, StagedFile, TARGET_BYTES, TableCommit, TableOptimizeReport,
+    TableVersion, VacuumReport, VisibleRun, encode,
 };
 
 /// The result of what a lake does.

@@ -1,12 +1,12 @@
 //! Rows of tables `nce`, `tnce` and `tnce_d4`.
 
 use arrow::record_batch::RecordBatch;
+use echolake_lake::BatchBuilder;
 use echolake_schema::symmetry::MovedPair;
 use echolake_schema::tables::Table;
-use echolake_schema::{Grid, PairId, Rig, Symmetry};
+use echolake_schema::{Grid, Pair, PairId, Rig, Symmetry};
 
-use super::{RowColumns, RunKeys};
-use crate::CODE_VERSION;
+use super::RunKeys;
 use crate::derived_values::{DerivedLists, DerivedRows};
 use crate::error::Result;
 
@@ -35,14 +35,12 @@ pub(crate) fn nce(
     derived: DerivedLists,
     of: ReferenceVersions<'_>,
 ) -> Result<RecordBatch> {
-    let mut columns = RowColumns::of_run(Table::Nce, derived.pairs.len(), keys);
-    pair_columns(&mut columns, grid, &derived.pairs);
-    columns.lists(derived.reflected);
-    for curves in derived.curves {
-        columns.lists(curves);
+    let mut columns = keys.begin_rows(Table::Nce, rig, derived.pairs.len());
+    columns.pairs("", grid_pairs(grid, derived.pairs.iter())).lists("reflected_ir", derived.reflected);
+    for (band, curves) in rig.band_names().iter().zip(derived.curves) {
+        columns.lists(&format!("nce_{band}"), curves);
     }
-    columns.same(of.flat).same(of.foam).same(CODE_VERSION);
-    columns.finish(rig)
+    Ok(columns.text("flat_version", of.flat).text("foam_version", of.foam).finish()?)
 }
 
 /// Builds rows of `tnce`.
@@ -53,11 +51,10 @@ pub(crate) fn tnce(
     derived: &DerivedRows,
     of: ReferenceVersions<'_>,
 ) -> Result<RecordBatch> {
-    let mut columns = RowColumns::of_run(Table::Tnce, derived.pairs.len(), keys);
-    pair_columns(&mut columns, grid, &derived.pairs);
-    energy_columns(&mut columns, derived, 1);
-    columns.same(of.flat).same(of.foam).same(CODE_VERSION);
-    columns.finish(rig)
+    let mut columns = keys.begin_rows(Table::Tnce, rig, derived.pairs.len());
+    columns.pairs("", grid_pairs(grid, derived.pairs.iter()));
+    energy_columns(&mut columns, rig, derived, 1);
+    Ok(columns.text("flat_version", of.flat).text("foam_version", of.foam).finish()?)
 }
 
 /// Builds rows of `tnce_d4`, grouped by pair, one per symmetry. Symmetries that the grid lacks are left out.
@@ -75,37 +72,29 @@ pub(crate) fn tnce_d4(
         .iter()
         .flat_map(|pair| moved.iter().map(move |(symmetry, pairs)| (*symmetry, pairs[*pair as usize])))
         .collect();
-    let pairs: Vec<u32> = derived.pairs.iter().flat_map(|p| std::iter::repeat_n(*p, each)).collect();
-    let mut columns = RowColumns::of_run(Table::TnceD4, rows.len(), keys);
-    pair_columns(&mut columns, grid, &pairs);
+    let measured = derived.pairs.iter().flat_map(|pair| std::iter::repeat_n(pair, each));
+    let moved = rows.iter().map(|(_, moved)| Some(&moved.pair));
+    let mut columns = keys.begin_rows(Table::TnceD4, rig, rows.len());
     columns
-        .texts(rows.iter().map(|(s, _)| Some(s.name())))
-        .flags(rows.iter().map(|(_, m)| Some(m.swapped)))
-        .ints(rows.iter().map(|(_, m)| Some(m.pair.id.0 as i32)))
-        .ints(rows.iter().map(|(_, m)| Some(m.pair.microphone.0 as i32)))
-        .ints(rows.iter().map(|(_, m)| Some(m.pair.speaker.0 as i32)));
-    for axis in 0..3 {
-        columns.doubles(rows.iter().map(|(_, m)| grid.point(m.pair.microphone).map(|p| p.position_mm[axis])));
-    }
-    for axis in 0..3 {
-        columns.doubles(rows.iter().map(|(_, m)| grid.point(m.pair.speaker).map(|p| p.position_mm[axis])));
-    }
-    energy_columns(&mut columns, derived, each);
-    columns.same(of.flat).same(of.foam).same(CODE_VERSION);
-    columns.finish(rig)
+        .pairs("", grid_pairs(grid, measured))
+        .texts("symmetry", rows.iter().map(|(symmetry, _)| symmetry.name()))
+        .flags("swapped", rows.iter().map(|(_, moved)| moved.swapped))
+        .pairs("d4_", moved.clone())
+        .positions(grid, moved);
+    energy_columns(&mut columns, rig, derived, each);
+    Ok(columns.text("flat_version", of.flat).text("foam_version", of.foam).finish()?)
 }
 
-fn pair_columns(columns: &mut RowColumns, grid: &Grid, pairs: &[u32]) {
-    let pair = |id: &u32| grid.pair(PairId(*id));
-    columns
-        .ints(pairs.iter().map(|p| Some(*p as i32)))
-        .ints(pairs.iter().map(|p| pair(p).map(|p| p.microphone.0 as i32)))
-        .ints(pairs.iter().map(|p| pair(p).map(|p| p.speaker.0 as i32)));
+fn grid_pairs<'a>(
+    grid: &'a Grid,
+    ids: impl Iterator<Item = &'a u32> + Clone,
+) -> impl Iterator<Item = Option<&'a Pair>> + Clone {
+    ids.map(|id| grid.pair(PairId(*id)))
 }
 
 // Repeats each measurement's numbers in `each` rows.
-fn energy_columns(columns: &mut RowColumns, derived: &DerivedRows, each: usize) {
-    for values in derived.energy_columns() {
-        columns.doubles(values.into_iter().flat_map(|x| std::iter::repeat_n(Some(x), each)));
+fn energy_columns(columns: &mut BatchBuilder, rig: &Rig, derived: &DerivedRows, each: usize) {
+    for (name, values) in derived.energy_columns(&rig.band_names()) {
+        columns.doubles(&name, values.into_iter().flat_map(|x| std::iter::repeat_n(x, each)));
     }
 }

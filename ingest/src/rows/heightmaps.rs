@@ -5,8 +5,7 @@ use echolake_dsp::heights::moved;
 use echolake_schema::tables::Table;
 use echolake_schema::{Rig, Symmetry};
 
-use super::{RowColumns, RunKeys};
-use crate::CODE_VERSION;
+use super::RunKeys;
 use crate::error::{Error, Result};
 
 const CELLS: usize = Table::HEIGHTMAP_CELLS;
@@ -23,14 +22,14 @@ pub(crate) fn rows(rig: &Rig, keys: &RunKeys, heights_mm: &[f32]) -> Result<Opti
     for (symmetry, out) in Symmetry::ALL.into_iter().zip(all.chunks_exact_mut(small.len())) {
         moved(&small, symmetry, out).map_err(|cause| Error::Kernel { file: keys.run.to_string(), cause })?;
     }
-    let mut columns = RowColumns::of_run(Table::Heightmaps, rows, keys);
-    columns
-        .texts(Symmetry::ALL.map(|s| Some(s.name())))
-        .ints(std::iter::repeat_n(Some(CELLS as i32), rows))
-        .floats(std::iter::repeat_n(Some(rig.panel.size_mm as f32), rows))
-        .lists(all)
-        .same(CODE_VERSION);
-    columns.finish(rig).map(Some)
+    let batch = keys
+        .begin_rows(Table::Heightmaps, rig, rows)
+        .texts("symmetry", Symmetry::ALL.map(Symmetry::name))
+        .ints("cells", std::iter::repeat_n(CELLS as i32, rows))
+        .floats("size_mm", std::iter::repeat_n(rig.panel.size_mm as f32, rows))
+        .lists("heights_mm", all)
+        .finish()?;
+    Ok(Some(batch))
 }
 
 // Each small cell is the mean of the area it covers, first along x, then along y.

@@ -6,8 +6,7 @@ use echolake_schema::messages::Measurement;
 use echolake_schema::tables::Table;
 use echolake_schema::{Grid, PairId, Rig};
 
-use super::{RowColumns, RunKeys};
-use crate::CODE_VERSION;
+use super::{RunKeys, finite};
 use crate::error::Result;
 use crate::measure::Response;
 
@@ -30,29 +29,26 @@ pub(crate) fn encode(
 }
 
 fn batch(rig: &Rig, grid: &Grid, keys: &RunKeys, rows: &[(Measurement, Response)]) -> Result<RecordBatch> {
-    let pair = |m: &Measurement| grid.pair(PairId(m.pair_id));
-    let known = |value: f64| super::columns::finite(value);
-    let mut columns = RowColumns::of_run(Table::Measurements, rows.len(), keys);
-    columns
-        .ints(rows.iter().map(|(m, _)| Some(m.pair_id as i32)))
-        .ints(rows.iter().map(|(m, _)| pair(m).map(|p| p.microphone.0 as i32)))
-        .ints(rows.iter().map(|(m, _)| pair(m).map(|p| p.speaker.0 as i32)))
-        .times(rows.iter().map(|(_, r)| r.log_time_ns))
-        .ints(rows.iter().map(|(m, _)| Some(m.attempt as i32)))
-        .texts(rows.iter().map(|(m, _)| Some(m.verdict().label())))
-        .texts(rows.iter().map(|(m, _)| Some(m.reasons.join("; "))))
-        .doubles(rows.iter().map(|(_, r)| Some(r.temperature_c)))
-        .doubles(rows.iter().map(|(m, _)| known(m.humidity_pct)))
-        .doubles(rows.iter().map(|(m, _)| known(m.pressure_hpa)))
-        .floats(rows.iter().map(|(m, _)| known(m.outside_level_db).map(|x| x as f32)))
-        .floats(rows.iter().map(|(m, _)| known(m.snr_db).map(|x| x as f32)))
-        .ints(rows.iter().map(|(m, _)| Some(m.clipped_samples as i32)))
-        .floats(rows.iter().map(|(m, _)| known(m.arrival_error_us).map(|x| x as f32)))
-        .floats(rows.iter().map(|(m, _)| known(m.microphone_residual_mm).map(|x| x as f32)))
-        .floats(rows.iter().map(|(m, _)| known(m.speaker_residual_mm).map(|x| x as f32)))
-        .texts(rows.iter().map(|(_, r)| Some(r.source.label())))
-        .longs(rows.iter().map(|(_, r)| Some(r.chunk_offset as i64)))
-        .lists(rows.iter().flat_map(|(_, r)| r.ir.iter().copied()).collect())
-        .same(CODE_VERSION);
-    columns.finish(rig)
+    let known = |value: f64| finite(value).map(|x| x as f32);
+    let batch = keys
+        .begin_rows(Table::Measurements, rig, rows.len())
+        .pairs("", rows.iter().map(|(m, _)| grid.pair(PairId(m.pair_id))))
+        .times("log_time", rows.iter().map(|(_, r)| r.log_time_ns))
+        .ints("attempt", rows.iter().map(|(m, _)| m.attempt as i32))
+        .texts("verdict", rows.iter().map(|(m, _)| m.verdict().label()))
+        .texts("reasons", rows.iter().map(|(m, _)| m.reasons.join("; ")))
+        .doubles("temperature_c", rows.iter().map(|(_, r)| r.temperature_c))
+        .doubles("humidity_pct", rows.iter().map(|(m, _)| finite(m.humidity_pct)))
+        .doubles("pressure_hpa", rows.iter().map(|(m, _)| finite(m.pressure_hpa)))
+        .floats("outside_level_db", rows.iter().map(|(m, _)| known(m.outside_level_db)))
+        .floats("snr_db", rows.iter().map(|(m, _)| known(m.snr_db)))
+        .ints("clipped_samples", rows.iter().map(|(m, _)| m.clipped_samples as i32))
+        .floats("arrival_error_us", rows.iter().map(|(m, _)| known(m.arrival_error_us)))
+        .floats("microphone_residual_mm", rows.iter().map(|(m, _)| known(m.microphone_residual_mm)))
+        .floats("speaker_residual_mm", rows.iter().map(|(m, _)| known(m.speaker_residual_mm)))
+        .texts("source", rows.iter().map(|(_, r)| r.source.label()))
+        .longs("chunk_offset", rows.iter().map(|(_, r)| r.chunk_offset as i64))
+        .lists("ir", rows.iter().flat_map(|(_, r)| r.ir.iter().copied()).collect())
+        .finish()?;
+    Ok(batch)
 }

@@ -1,12 +1,17 @@
-//! Rows of every table, as Arrow batches in the order of the table's columns.
+//! Rows of every table of a run, as Arrow batches.
 
-mod columns;
 pub(crate) mod derived;
 pub(crate) mod heightmaps;
+mod keys;
 pub(crate) mod logs;
 pub(crate) mod measurements;
 pub(crate) mod runs;
 pub(crate) mod stats;
 pub(crate) mod surfaces;
 
-pub(crate) use columns::{RowColumns, RunKeys};
+pub(crate) use keys::RunKeys;
+
+/// Returns None for NaN and infinities.
+fn finite(value: f64) -> Option<f64> {
+    value.is_finite().then_some(value)
+}

@@ -1,15 +1,13 @@
 //! The row of table `runs`, and its update when references arrive.
 
-use std::sync::Arc;
-
-use arrow::array::{ArrayRef, StringArray};
 use arrow::record_batch::RecordBatch;
-use echolake_lake::Lake;
+use echolake_lake::{BatchBuilder, Lake};
+use echolake_schema::Rig;
+use echolake_schema::messages::Measurement;
 use echolake_schema::tables::Table;
 
-use super::{RowColumns, RunKeys};
-use crate::CODE_VERSION;
-use crate::error::{Error, Result};
+use super::RunKeys;
+use crate::error::Result;
 use crate::run_content::RunContent;
 
 /// The columns of a run's row about its references.
@@ -39,58 +37,61 @@ pub(crate) fn row(
 ) -> Result<RecordBatch> {
     let ended = content.end.map_or(content.last_time_ns.max(content.manifest.started.0), |e| e.ended.0);
     let partial = !content.is_whole() || !content.damaged.is_empty();
-    let state = if partial { PARTIAL } else { state(references) };
-    let mut columns = RowColumns::of_run(Table::Runs, 1, keys);
-    columns
-        .text(Some(state))
-        .text(Some(&references.missing))
-        .text(Some(content.manifest.origin.label()))
-        .text(Some(&content.manifest.rig))
-        .times([content.manifest.started.0])
-        .times([ended])
-        .longs([Some(content.accepted.len() as i64)])
-        .longs([Some(content.rejected as i64)])
-        .longs([Some(content.attempts as i64)])
-        .longs([Some(content.damaged.len() as i64)]);
-    for of in [
-        |(m, _): &(echolake_schema::messages::Measurement, _)| m.temperature_c,
-        |(m, _): &(echolake_schema::messages::Measurement, _)| m.humidity_pct,
-        |(m, _): &(echolake_schema::messages::Measurement, _)| m.pressure_hpa,
+    let mut columns = keys.begin_rows(Table::Runs, lake.rig(), 1);
+    for (lowest, highest, of) in [
+        ("temperature_min_c", "temperature_max_c", (|m| m.temperature_c) as fn(&Measurement) -> f64),
+        ("humidity_min_pct", "humidity_max_pct", |m| m.humidity_pct),
+        ("pressure_min_hpa", "pressure_max_hpa", |m| m.pressure_hpa),
     ] {
-        let values = || content.accepted.iter().map(of).filter(|x: &f64| x.is_finite());
-        columns.floats([values().reduce(f64::min).map(|x| x as f32)]);
-        columns.floats([values().reduce(f64::max).map(|x| x as f32)]);
+        let values = || content.accepted.iter().map(|(m, _)| of(m)).filter(|x| x.is_finite());
+        columns.floats(lowest, [values().reduce(f64::min).map(|x| x as f32)]);
+        columns.floats(highest, [values().reduce(f64::max).map(|x| x as f32)]);
     }
     columns
-        .text(Some(Lake::run_path(&keys.surface, &keys.run).as_ref()))
-        .longs([Some(content.integrity.bytes as i64)])
-        .text(Some(&content.integrity.sha256))
-        .text(Some(&content.manifest.software))
-        .text(Some(run_derivation))
-        .text(references.derivation.as_deref())
-        .text(references.flat_version.as_deref())
-        .text(references.foam_version.as_deref())
-        .text(Some(CODE_VERSION));
-    columns.finish(lake.rig())
+        .text("origin", content.manifest.origin.label())
+        .text("rig", content.manifest.rig.as_str())
+        .times("started", [content.manifest.started.0])
+        .times("ended", [ended])
+        .longs("measurements", [content.accepted.len() as i64])
+        .longs("rejected", [content.rejected as i64])
+        .longs("attempts", [content.attempts as i64])
+        .longs("damaged", [content.damaged.len() as i64])
+        .texts("file", [Lake::run_path(&keys.surface, &keys.run)])
+        .longs("file_bytes", [content.integrity.bytes as i64])
+        .text("file_sha256", content.integrity.sha256.as_str())
+        .text("recorded_by", content.manifest.software.as_str())
+        .text("run_derivation", run_derivation);
+    Ok(push_references(&mut columns, partial, references).finish()?)
 }
 
 /// Returns a run's row with other references.
-pub(crate) fn with_references(row: &RecordBatch, references: &RunReferences) -> Result<RecordBatch> {
-    let was_partial = text_of(row, "state").as_deref() == Some(PARTIAL);
-    let mut columns = row.columns().to_vec();
-    for (name, value) in [
-        ("state", Some(if was_partial { PARTIAL } else { state(references) })),
-        ("missing", Some(references.missing.as_str())),
-        ("reference_derivation", references.derivation.as_deref()),
-        ("flat_version", references.flat_version.as_deref()),
-        ("foam_version", references.foam_version.as_deref()),
-        ("code_version", Some(CODE_VERSION)),
-    ] {
-        let index = row.schema().index_of(name).map_err(damaged)?;
-        let array: ArrayRef = Arc::new(StringArray::from(vec![value]));
-        columns[index] = array;
-    }
-    RecordBatch::try_new(row.schema(), columns).map_err(damaged)
+pub(crate) fn with_references(
+    rig: &Rig,
+    keys: &RunKeys,
+    row: &RecordBatch,
+    references: &RunReferences,
+) -> Result<RecordBatch> {
+    let partial = text_of(row, "state").as_deref() == Some(PARTIAL);
+    let mut columns = keys.begin_rows(Table::Runs, rig, 1);
+    Ok(push_references(&mut columns, partial, references).take_rest(row).finish()?)
+}
+
+fn push_references<'a>(
+    columns: &'a mut BatchBuilder,
+    partial: bool,
+    references: &RunReferences,
+) -> &'a mut BatchBuilder {
+    let state = match partial {
+        true => PARTIAL,
+        false if references.missing.is_empty() => COMPLETE,
+        false => WAITING,
+    };
+    columns
+        .text("state", state)
+        .text("missing", references.missing.as_str())
+        .text("reference_derivation", references.derivation.as_deref())
+        .text("flat_version", references.flat_version.as_deref())
+        .text("foam_version", references.foam_version.as_deref())
 }
 
 /// Returns a text of the row.
@@ -98,12 +99,4 @@ pub(crate) fn text_of(row: &RecordBatch, column: &str) -> Option<String> {
     use arrow::array::{Array as _, AsArray as _};
     let array = row.column_by_name(column)?.as_string_opt::<i32>()?;
     (array.len() == 1 && array.is_valid(0)).then(|| array.value(0).to_owned())
-}
-
-fn state(references: &RunReferences) -> &'static str {
-    if references.missing.is_empty() { COMPLETE } else { WAITING }
-}
-
-fn damaged(error: arrow::error::ArrowError) -> Error {
-    Error::DataFile { file: "tables/runs".into(), reason: error.to_string() }
 }

@@ -3,59 +3,47 @@
 use arrow::record_batch::RecordBatch;
 use echolake_dsp::level::{p90_mean, percentile, power_to_db};
 use echolake_schema::Rig;
-use echolake_schema::tables::Table;
+use echolake_schema::tables::{BandStatistics, Table};
 
-use super::columns::finite;
 use super::derived::ReferenceVersions;
-use super::{RowColumns, RunKeys};
-use crate::CODE_VERSION;
+use super::{RunKeys, finite};
 use crate::error::Result;
-
-/// Statistics of one band's TNCE values over the pairs.
-#[derive(Debug, Clone, Copy, PartialEq, Default)]
-struct BandStats {
-    p90_mean_db: Option<f64>,
-    p5_db: Option<f64>,
-    p50_db: Option<f64>,
-    p95_db: Option<f64>,
-    min_db: Option<f64>,
-    max_db: Option<f64>,
-    spread_db: Option<f64>,
-}
 
 /// Builds one row per band and one for the total, from the TNCE values of each over all pairs.
 pub(crate) fn rows(rig: &Rig, keys: &RunKeys, tnce: &[Vec<f64>], of: ReferenceVersions<'_>) -> Result<RecordBatch> {
-    let names = rig.band_names();
-    let pairs = tnce.first().map_or(0, Vec::len);
-    let stats: Vec<_> = tnce.iter().map(|values| stats_of(values)).collect();
-    let mut columns = RowColumns::of_run(Table::SurfaceStats, stats.len(), keys);
-    columns
-        .texts(names.iter().map(|n| Some(n.as_str())).chain([Some("total")]))
-        .doubles(rig.bands.centres_hz.iter().map(|hz| Some(*hz)).chain([None]))
-        .ints(std::iter::repeat_n(Some(pairs as i32), stats.len()))
-        .doubles(stats.iter().map(|s| s.p90_mean_db))
-        .doubles(stats.iter().map(|s| s.p5_db))
-        .doubles(stats.iter().map(|s| s.p50_db))
-        .doubles(stats.iter().map(|s| s.p95_db))
-        .doubles(stats.iter().map(|s| s.min_db))
-        .doubles(stats.iter().map(|s| s.max_db))
-        .doubles(stats.iter().map(|s| s.spread_db))
-        .same(of.flat)
-        .same(of.foam)
-        .same(CODE_VERSION);
-    columns.finish(rig)
+    let names = rig.band_names().into_iter().chain(["total".to_owned()]);
+    let stats: Vec<_> = names.zip(tnce).map(|(band, values)| stats_of(band, values)).collect();
+    let batch = keys
+        .begin_rows(Table::SurfaceStats, rig, stats.len())
+        .texts("band", stats.iter().map(|s| &s.band))
+        .doubles("band_hz", rig.bands.centres_hz.iter().map(|hz| Some(*hz)).chain([None]))
+        .ints("measurements", stats.iter().map(|s| s.measurements))
+        .doubles("p90_mean_db", stats.iter().map(|s| s.p90_mean_db))
+        .doubles("p5_db", stats.iter().map(|s| s.p5_db))
+        .doubles("p50_db", stats.iter().map(|s| s.p50_db))
+        .doubles("p95_db", stats.iter().map(|s| s.p95_db))
+        .doubles("min_db", stats.iter().map(|s| s.min_db))
+        .doubles("max_db", stats.iter().map(|s| s.max_db))
+        .doubles("spread_db", stats.iter().map(|s| s.spread_db))
+        .text("flat_version", of.flat)
+        .text("foam_version", of.foam)
+        .finish()?;
+    Ok(batch)
 }
 
 // Means are of power, as in the paper's tables; no energy at all has no level.
-fn stats_of(values: &[f64]) -> BandStats {
+fn stats_of(band: String, values: &[f64]) -> BandStatistics {
+    let measurements = values.len() as i32;
     let mut sorted: Vec<f64> = values.iter().copied().filter(|x| x.is_finite()).collect();
     if sorted.is_empty() {
-        return BandStats::default();
+        return BandStatistics { band, measurements, ..BandStatistics::default() };
     }
     sorted.sort_by(f64::total_cmp);
     let db = |power: f64| finite(power_to_db(power));
     let levels: Vec<f64> = sorted.iter().filter_map(|x| db(*x)).collect();
-    BandStats {
+    BandStatistics {
+        band,
+        measurements,
         p90_mean_db: p90_mean(&sorted, &mut Vec::new()).and_then(db),
         p5_db: db(percentile(&sorted, 5.0)),
         p50_db: db(percentile(&sorted, 50.0)),
@@ -78,7 +66,7 @@ mod tests {
 
     #[test]
     fn levels_of_known_values() {
-        let stats = stats_of(&[10.0, 1.0, 0.1]);
+        let stats = stats_of("2500".into(), &[10.0, 1.0, 0.1]);
         assert_eq!(stats.p50_db, Some(0.0));
         assert!((stats.min_db.expect("there") + 10.0).abs() < 1e-12);
         assert!((stats.max_db.expect("there") - 10.0).abs() < 1e-12);
@@ -87,8 +75,8 @@ mod tests {
 
     #[test]
     fn no_energy_has_no_level() {
-        assert_eq!(stats_of(&[]), BandStats::default());
-        let silent = stats_of(&[0.0, 0.0]);
+        assert_eq!(stats_of(String::new(), &[]), BandStatistics::default());
+        let silent = stats_of(String::new(), &[0.0, 0.0]);
         assert_eq!((silent.p50_db, silent.spread_db), (None, None));
     }
 }

@@ -5,8 +5,7 @@ use echolake_lake::ReferenceSurfaces;
 use echolake_schema::tables::Table;
 use echolake_schema::{Rig, SurfaceRecord};
 
-use super::{RowColumns, RunKeys};
-use crate::CODE_VERSION;
+use super::RunKeys;
 use crate::error::Result;
 
 /// Builds the row of a run's surface; references that it does not name default to the lake's.
@@ -20,31 +19,31 @@ pub(crate) fn row(
 ) -> Result<RecordBatch> {
     let mesh = surface.mesh.as_ref();
     let relief = relief(heights_mm).or(mesh.map(|m| [m.relief_mm[0] as f32, m.relief_mm[1] as f32, f32::NAN]));
-    let known = |i: usize| relief.map(|r| r[i]).filter(|x| x.is_finite());
+    let known = |i: usize| [relief.map(|r| r[i]).filter(|x| x.is_finite())];
     let flat = surface.flat_reference.as_ref().unwrap_or(&references.flat);
     let foam = surface.foam_reference.as_ref().unwrap_or(&references.foam);
-    let mut columns = RowColumns::of_run(Table::Surfaces, 1, keys);
-    columns
-        .text(Some(keys.surface.panel()))
-        .ints([keys.surface.side().map(i32::from)])
-        .text(Some(&surface.typology))
-        .text(surface.macrostructure.as_deref())
-        .text(surface.mesostructure.as_deref())
-        .text(surface.microstructure.as_deref())
-        .text(surface.material.as_deref())
-        .doubles([surface.reflection_factor])
-        .text(Some(flat.as_str()))
-        .text(Some(foam.as_str()))
-        .text(Some(&surface.parameters.to_string()))
-        .text(mesh.map(|m| m.file.as_str()))
-        .longs([mesh.map(|m| m.triangles as i64)])
-        .flags([mesh.map(|m| m.watertight)])
-        .floats([known(0)])
-        .floats([known(1)])
-        .floats([known(2)])
-        .text(Some(origin))
-        .text(Some(CODE_VERSION));
-    columns.finish(rig)
+    let row = keys
+        .begin_rows(Table::Surfaces, rig, 1)
+        .text("panel", keys.surface.panel())
+        .ints("side", [keys.surface.side().map(i32::from)])
+        .text("typology", surface.typology.as_str())
+        .text("macrostructure", surface.macrostructure.as_deref())
+        .text("mesostructure", surface.mesostructure.as_deref())
+        .text("microstructure", surface.microstructure.as_deref())
+        .text("material", surface.material.as_deref())
+        .doubles("reflection_factor", [surface.reflection_factor])
+        .text("flat_reference", flat.as_str())
+        .text("foam_reference", foam.as_str())
+        .texts("parameters", [surface.parameters.to_string()])
+        .text("mesh_file", mesh.map(|m| m.file.as_str()))
+        .longs("mesh_triangles", [mesh.map(|m| m.triangles as i64)])
+        .flags("mesh_watertight", [mesh.map(|m| m.watertight)])
+        .floats("relief_min_mm", known(0))
+        .floats("relief_max_mm", known(1))
+        .floats("relief_rms_mm", known(2))
+        .text("origin", origin)
+        .finish()?;
+    Ok(row)
 }
 
 // Minimum, maximum and root mean square height about the mean.

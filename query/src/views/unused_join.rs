@@ -11,9 +11,9 @@ use datafusion::logical_expr::logical_plan::{Aggregate, Join, Projection};
 use datafusion::logical_expr::{Expr, LogicalPlan};
 use datafusion::optimizer::optimizer::ApplyOrder;
 use datafusion::optimizer::{OptimizerConfig, OptimizerRule};
+use echolake_schema::Table;
 
 use super::pair_join::scanned;
-use crate::table::LakeTable;
 
 /// The rule.
 #[derive(Debug)]
@@ -83,6 +83,6 @@ fn changes_nothing(join: &Join, used: &HashSet<Column>) -> bool {
 
 fn finds_one(right: &LogicalPlan, on: &[(Expr, Expr)]) -> bool {
     let keys: HashSet<_> = on.iter().filter_map(|(_, key)| key.try_as_col()).map(|key| key.name.as_str()).collect();
-    let key = scanned(right, false).and_then(LakeTable::key);
-    key.is_some_and(|key| key.iter().all(|column| keys.contains(column)))
+    let key = scanned(right, false).map_or(&[] as &[_], Table::key);
+    !key.is_empty() && key.iter().all(|column| keys.contains(column))
 }

@@ -1,26 +1,49 @@
-//! The columns of every table, in order.
+//! The definition of every table: its name, source, key and columns, in order.
 
-use super::Table;
 use super::column::Column;
+use super::{Source, Table};
 use crate::manifest::ORIGINS;
 
-/// The columns of a table in a lake whose bands have these names.
-pub(super) fn columns(table: Table, bands: &[String]) -> Vec<Column> {
-    match table {
-        Table::Surfaces => surfaces(),
-        Table::Runs => runs(),
-        Table::Points => points(),
-        Table::Pairs => pairs(),
-        Table::Measurements => measurements(),
-        Table::Nce => nce(bands),
-        Table::Tnce => tnce(bands),
-        Table::TnceD4 => tnce_d4(bands),
-        Table::Heightmaps => heightmaps(),
-        Table::Environment => environment(),
-        Table::Events => events(),
-        Table::SurfaceStats => surface_stats(),
+/// A table's definition. [`Table`] describes each part.
+pub(super) struct TableDefinition {
+    pub(super) name: &'static str,
+    pub(super) source: Source,
+    pub(super) key: &'static [&'static str],
+    /// Its columns in a lake whose bands have these names.
+    pub(super) columns: fn(&[String]) -> Vec<Column>,
+}
+
+impl TableDefinition {
+    pub(super) fn of(table: Table) -> Self {
+        match table {
+            Table::Surfaces => Self::new("surfaces", Source::Run, &["surface_id"], |_| surfaces()),
+            Table::Runs => Self::new("runs", Source::Pointer, &["run_id"], |_| runs()),
+            Table::Points => Self::new("points", Source::Rig, &["point_id"], |_| points()),
+            Table::Pairs => Self::new("pairs", Source::Rig, &["pair_id"], |_| pairs()),
+            Table::Measurements => Self::new("measurements", Source::Run, &PAIR_KEY, |_| measurements()),
+            Table::Nce => Self::new("nce", Source::References, &PAIR_KEY, nce),
+            Table::Tnce => Self::new("tnce", Source::References, &PAIR_KEY, tnce),
+            Table::TnceD4 => Self::new("tnce_d4", Source::References, &["run_id", "pair_id", "symmetry"], tnce_d4),
+            Table::Heightmaps => Self::new("heightmaps", Source::Run, &["surface_id", "symmetry"], |_| heightmaps()),
+            Table::Environment => Self::new("environment", Source::Run, &[], |_| environment()),
+            Table::Events => Self::new("events", Source::Run, &[], |_| events()),
+            Table::SurfaceStats => {
+                Self::new("surface_stats", Source::References, &["run_id", "band"], |_| surface_stats())
+            }
+        }
+    }
+
+    fn new(
+        name: &'static str,
+        source: Source,
+        key: &'static [&'static str],
+        columns: fn(&[String]) -> Vec<Column>,
+    ) -> Self {
+        Self { name, source, key, columns }
     }
 }
+
+const PAIR_KEY: [&str; 2] = ["run_id", "pair_id"];
 
 fn run_keys() -> Vec<Column> {
     vec![

@@ -5,13 +5,17 @@
 
 mod column;
 mod definitions;
+mod rows;
 
 use std::sync::Arc;
 
 use arrow_schema::{Schema, SchemaRef};
 
 pub use column::{COMMENT, LIST_CHILD, UNIT};
+pub use rows::BandStatistics;
 
+use self::column::Column;
+use self::definitions::TableDefinition;
 use crate::Rig;
 
 /// A table of the lake.
@@ -62,20 +66,7 @@ impl Table {
 
     /// Its name in SQL and its folder.
     pub fn name(self) -> &'static str {
-        match self {
-            Self::Surfaces => "surfaces",
-            Self::Runs => "runs",
-            Self::Points => "points",
-            Self::Pairs => "pairs",
-            Self::Measurements => "measurements",
-            Self::Nce => "nce",
-            Self::Tnce => "tnce",
-            Self::TnceD4 => "tnce_d4",
-            Self::Heightmaps => "heightmaps",
-            Self::Environment => "environment",
-            Self::Events => "events",
-            Self::SurfaceStats => "surface_stats",
-        }
+        TableDefinition::of(self).name
     }
 
     /// The table of a name.
@@ -85,18 +76,19 @@ impl Table {
 
     /// Source of its rows.
     pub fn source(self) -> Source {
-        match self {
-            Self::Points | Self::Pairs => Source::Rig,
-            Self::Runs => Source::Pointer,
-            Self::Nce | Self::Tnce | Self::TnceD4 | Self::SurfaceStats => Source::References,
-            _ => Source::Run,
-        }
+        TableDefinition::of(self).source
+    }
+
+    /// Columns of which no two visible rows have the same values; none if rows may repeat. If `surface_id` is one of
+    /// them, only the newest run of a surface has visible rows.
+    pub fn key(self) -> &'static [&'static str] {
+        TableDefinition::of(self).key
     }
 
     /// Its schema in a lake of this rig.
     pub fn schema(self, rig: &Rig) -> SchemaRef {
-        let fields: Vec<_> = definitions::columns(self, &rig.band_names()).into_iter().map(|c| c.field()).collect();
-        Arc::new(Schema::new(fields))
+        let columns = (TableDefinition::of(self).columns)(&rig.band_names());
+        Arc::new(Schema::new(columns.into_iter().map(Column::field).collect::<Vec<_>>()))
     }
 
     /// Cells along each side of a stored height map.
@@ -156,10 +148,38 @@ mod tests {
             if matches!(table.source(), Source::Run | Source::References | Source::Pointer) {
                 assert_eq!(names[..2], ["surface_id", "run_id"], "{}", table.name());
             }
+            assert!(table.key().iter().all(|key| names.iter().any(|name| name == key)), "{}", table.name());
             let count = names.len();
             names.sort();
             names.dedup();
             assert_eq!(names.len(), count, "{}", table.name());
+        }
+    }
+
+    #[test]
+    fn names_end_in_their_units() {
+        let suffixes = [
+            ("_mm", "mm"),
+            ("_db", "dB"),
+            ("_ns", "ns"),
+            ("_us", "us"),
+            ("_c", "C"),
+            ("_pct", "%"),
+            ("_hpa", "hPa"),
+            ("_hz", "Hz"),
+            ("_deg", "deg"),
+            ("_bytes", "B"),
+            ("chunk_offset", "B"),
+        ];
+        for table in Table::ALL {
+            for field in table.schema(&Rig::paper()).fields() {
+                // After the unit comes the reference of a level.
+                let unit = field.metadata()[UNIT].split(' ').next().unwrap_or_default();
+                let expected =
+                    suffixes.iter().find(|(suffix, _)| field.name().ends_with(suffix)).map(|(_, unit)| *unit);
+                let agrees = expected.map_or(matches!(unit, "" | "1"), |expected| unit == expected);
+                assert!(agrees, "{}.{} has the unit `{unit}`", table.name(), field.name());
+            }
         }
     }
 }

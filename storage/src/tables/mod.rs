@@ -1,5 +1,6 @@
 //! A lake's tables: rows in, and a view of them.
 
+mod batch_builder;
 mod commit_log;
 mod data_file;
 pub(crate) mod delta;
@@ -11,6 +12,7 @@ mod snapshot;
 mod vacuum;
 mod versions;
 
+pub use batch_builder::BatchBuilder;
 pub use commit_log::{
     CommitEffect, CommitLog, CommitOutcome, DataFile, FileHistory, FileStats, NewFile, ReplacedFiles, RunPart,
     TableCommit,

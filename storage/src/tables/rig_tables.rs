@@ -1,30 +1,30 @@
 //! The two tables that come from the rig alone: points and pairs.
 
-use std::sync::Arc;
-
-use arrow::array::{ArrayRef, Float64Array, Int32Array};
 use arrow::record_batch::RecordBatch;
 use echolake_dsp::fresnel::first_fresnel_zone;
 use echolake_dsp::geometry::{direct_mm, image_mm, incidence_deg, specular_point};
 use echolake_schema::tables::Table;
 use echolake_schema::{Grid, Rig};
 
-use crate::{Error, Result};
+use super::BatchBuilder;
+use crate::Result;
 
 /// Speed of sound that geometry alone is stated at, m/s: that of the published GIR combinations.
 const GEOMETRY_SPEED_OF_SOUND: f64 = 343.0;
 
 /// The rows of table `points`.
 pub(crate) fn points(rig: &Rig, grid: &Grid) -> Result<RecordBatch> {
-    let int = |f: fn(&echolake_schema::Point) -> u32| -> ArrayRef {
-        Arc::new(grid.points().iter().map(|p| Some(f(p) as i32)).collect::<Int32Array>())
-    };
-    let axis = |i: usize| -> ArrayRef {
-        Arc::new(grid.points().iter().map(|p| Some(p.position_mm[i])).collect::<Float64Array>())
-    };
-    let columns =
-        vec![int(|p| p.id.0), int(|p| p.layer), int(|p| p.gridx), int(|p| p.gridy), axis(0), axis(1), axis(2)];
-    batch(Table::Points, rig, columns)
+    let points = grid.points();
+    let axis = |i: usize| points.iter().map(move |p| p.position_mm[i]);
+    BatchBuilder::new(Table::Points, rig, points.len())
+        .ints("point_id", points.iter().map(|p| p.id.0 as i32))
+        .ints("layer", points.iter().map(|p| p.layer as i32))
+        .ints("gridx", points.iter().map(|p| p.gridx as i32))
+        .ints("gridy", points.iter().map(|p| p.gridy as i32))
+        .doubles("x_mm", axis(0))
+        .doubles("y_mm", axis(1))
+        .doubles("z_mm", axis(2))
+        .finish()
 }
 
 /// The rows of table `pairs`.
@@ -34,36 +34,24 @@ pub(crate) fn pairs(rig: &Rig, grid: &Grid) -> Result<RecordBatch> {
         .iter()
         .map(|p| [p.microphone, p.speaker].map(|id| grid.points()[id.index()].position_mm).into())
         .collect();
-    let int = |f: fn(&echolake_schema::Pair) -> u32| -> ArrayRef {
-        Arc::new(grid.pairs().iter().map(|p| Some(f(p) as i32)).collect::<Int32Array>())
-    };
-    let double = |f: &dyn Fn([f64; 3], [f64; 3]) -> f64| -> ArrayRef {
-        Arc::new(ends.iter().map(|(m, s)| Some(f(*m, *s))).collect::<Float64Array>())
-    };
+    let each = |f: &dyn Fn([f64; 3], [f64; 3]) -> f64| -> Vec<f64> { ends.iter().map(|(m, s)| f(*m, *s)).collect() };
     let zone = |hz: f64, major: bool| {
-        double(&move |m, s| {
+        each(&move |m, s| {
             let zone = first_fresnel_zone(m, s, hz, GEOMETRY_SPEED_OF_SOUND);
             2.0 * if major { zone.semi_major_mm } else { zone.semi_minor_mm }
         })
     };
-    let mut columns = vec![int(|p| p.id.0), int(|p| p.microphone.0), int(|p| p.speaker.0)];
-    columns.extend((0..3).map(|i| double(&move |m, _| m[i])));
-    columns.extend((0..3).map(|i| double(&move |_, s| s[i])));
-    columns.extend([
-        double(&direct_mm),
-        double(&image_mm),
-        double(&incidence_deg),
-        double(&|m, s| specular_point(m, s)[0]),
-        double(&|m, s| specular_point(m, s)[1]),
-        zone(2_000.0, true),
-        zone(2_000.0, false),
-        zone(40_000.0, true),
-        zone(40_000.0, false),
-    ]);
-    batch(Table::Pairs, rig, columns)
-}
-
-fn batch(table: Table, rig: &Rig, columns: Vec<ArrayRef>) -> Result<RecordBatch> {
-    RecordBatch::try_new(table.schema(rig), columns)
-        .map_err(|e| Error::Encode { table: table.name(), reason: e.to_string() })
+    BatchBuilder::new(Table::Pairs, rig, ends.len())
+        .pairs("", grid.pairs().iter().map(Some))
+        .positions(grid, grid.pairs().iter().map(Some))
+        .doubles("direct_mm", each(&direct_mm))
+        .doubles("image_mm", each(&image_mm))
+        .doubles("incidence_deg", each(&incidence_deg))
+        .doubles("specular_x_mm", each(&|m, s| specular_point(m, s)[0]))
+        .doubles("specular_y_mm", each(&|m, s| specular_point(m, s)[1]))
+        .doubles("fresnel_major_2000_mm", zone(2_000.0, true))
+        .doubles("fresnel_minor_2000_mm", zone(2_000.0, false))
+        .doubles("fresnel_major_40000_mm", zone(40_000.0, true))
+        .doubles("fresnel_minor_40000_mm", zone(40_000.0, false))
+        .finish()
 }

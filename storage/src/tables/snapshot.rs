@@ -235,7 +235,8 @@ impl LakeSnapshot {
             Source::References => current.reference_derivation.as_deref() == Some(derivation),
             _ => current.run_derivation == derivation,
         };
-        Some(names && (!one_a_surface(table) || self.latest(surface) == Some(run)))
+        // A surface that was measured twice is still one surface: its newest run describes it.
+        Some(names && (!table.key().contains(&"surface_id") || self.latest(surface) == Some(run)))
     }
 
     fn is_older_than_its_run(&self, file: &DataFile) -> bool {
@@ -293,11 +294,6 @@ impl RunPart {
         let Self { surface, run, derivation, .. } = self.clone();
         FileName::Rows { surface, run, derivation }
     }
-}
-
-// A surface that was measured twice is still one surface: its newest run describes it.
-fn one_a_surface(table: Table) -> bool {
-    matches!(table, Table::Surfaces | Table::Heightmaps)
 }
 
 // A crash between a run's new row and the removal of its old one leaves two; the newer one counts.

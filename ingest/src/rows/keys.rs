@@ -1,0 +1,26 @@
+//! The columns that all rows of a run have.
+
+use echolake_lake::BatchBuilder;
+use echolake_schema::tables::Table;
+use echolake_schema::{Rig, RunId, SurfaceId};
+
+use crate::CODE_VERSION;
+
+/// Key columns of every row of a run.
+#[derive(Debug, Clone)]
+pub(crate) struct RunKeys {
+    pub(crate) surface: SurfaceId,
+    pub(crate) run: RunId,
+}
+
+impl RunKeys {
+    /// Returns a builder that has the run's keys and the code version.
+    pub(super) fn begin_rows(&self, table: Table, rig: &Rig, rows: usize) -> BatchBuilder {
+        let mut columns = BatchBuilder::new(table, rig, rows);
+        columns
+            .text("surface_id", self.surface.as_str())
+            .text("run_id", self.run.as_str())
+            .text("code_version", CODE_VERSION);
+        columns
+    }
+}
