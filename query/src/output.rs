@@ -62,6 +62,20 @@ impl AnswerFormat {
 }
 
 /// Writes the batches of one answer.
+///
+/// ```
+/// use arrow::array::{ArrayRef, Int32Array, RecordBatch};
+/// use echolake_query::output::{AnswerFormat, AnswerWriter};
+///
+/// let pairs: ArrayRef = std::sync::Arc::new(Int32Array::from(vec![7, 8]));
+/// let batch = RecordBatch::try_from_iter([("pair_id", pairs)])?;
+/// let mut text = Vec::new();
+/// let mut writer = AnswerWriter::new(AnswerFormat::Json, &batch.schema(), &mut text)?;
+/// writer.write(&batch)?;
+/// assert_eq!(writer.finish()?, 2);
+/// assert_eq!(text, b"[{\"pair_id\":7},{\"pair_id\":8}]\n");
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 pub struct AnswerWriter<W: Write + Send> {
     format: AnswerFormat,
     schema: SchemaRef,
@@ -269,6 +283,7 @@ mod tests {
     use arrow::array::{Float32Array, Int64Array, ListArray, TimestampMicrosecondArray};
     use arrow::buffer::OffsetBuffer;
     use arrow::datatypes::TimeUnit;
+    use expect_test::expect;
 
     use super::*;
 
@@ -306,19 +321,24 @@ mod tests {
 
     #[test]
     fn text_formats() {
-        assert!(
-            text(AnswerFormat::Table).contains("| [0.5,-1.0,2.0, ... 4 values] |"),
-            "{}",
-            text(AnswerFormat::Table)
-        );
-        assert_eq!(
-            text(AnswerFormat::Csv),
-            "id,name,ir,at\n1,\"a,\"\"b\"\"\",\"[0.5,-1.0,2.0,3.0]\",2026-01-05T08:00:00Z\n,,[1e-9],\n"
-        );
-        assert_eq!(
-            text(AnswerFormat::Json).trim(),
-            r#"[{"id":1,"name":"a,\"b\"","ir":[0.5,-1.0,2.0,3.0],"at":"2026-01-05T08:00:00Z"},{"id":null,"name":null,"ir":[1.0e-9],"at":null}]"#
-        );
+        expect![[r#"
+            +----+-------+------------------------------+----------------------+
+            | id | name  | ir                           | at                   |
+            +----+-------+------------------------------+----------------------+
+            | 1  | a,"b" | [0.5,-1.0,2.0, ... 4 values] | 2026-01-05T08:00:00Z |
+            |    |       | [1e-9]                       |                      |
+            +----+-------+------------------------------+----------------------+
+        "#]]
+        .assert_eq(&text(AnswerFormat::Table));
+        expect![[r#"
+            id,name,ir,at
+            1,"a,""b""","[0.5,-1.0,2.0,3.0]",2026-01-05T08:00:00Z
+            ,,[1e-9],
+        "#]]
+        .assert_eq(&text(AnswerFormat::Csv));
+        expect![[r#"
+            [{"id":1,"name":"a,\"b\"","ir":[0.5,-1.0,2.0,3.0],"at":"2026-01-05T08:00:00Z"},{"id":null,"name":null,"ir":[1.0e-9],"at":null}]
+        "#]].assert_eq(&text(AnswerFormat::Json));
     }
 
     #[test]

@@ -9,6 +9,16 @@ use crate::{Celsius, Error, SampleRate};
 
 /// A rig, as its TOML describes it. Settings that the TOML omits are those of Rust et al. 2021
 /// ("A data acquisition setup for data driven acoustic design", Building Acoustics 28(4)).
+///
+/// ```
+/// use echolake_schema::Rig;
+///
+/// let rig = Rig::from_toml("name = \"hall\"\n[sweep]\nduration_secs = 1.0")?;
+/// assert_eq!((rig.recording_len(), rig.band_names().len()), (96_960, 5));
+/// assert!(Rig::paper().differences(&rig).is_empty(), "the tables' numbers mean the same");
+/// assert!(Rig::from_toml("[sweep]\nlow_hz = 50e3").is_err());
+/// # Ok::<(), echolake_schema::Error>(())
+/// ```
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Rig {
@@ -318,6 +328,8 @@ impl Celsius {
 
 #[cfg(test)]
 mod tests {
+    use expect_test::expect;
+
     use super::*;
 
     #[test]
@@ -343,27 +355,102 @@ mod tests {
 
     #[test]
     fn contradictions_name_the_field() {
-        let check = |toml: &str, expected: &str| {
-            let error = Rig::from_toml(toml).expect_err(toml).to_string();
-            assert!(error.contains(expected), "{toml}: {error}");
-        };
-        check("sweep.rate_hz = 48000", "sweep.high_hz");
-        check("sweep.rate_hz = -1", "sampling rate");
-        check("sweep.low_hz = 50000", "sweep.low_hz");
-        check("bands.centres_hz = [1000, 3000]", "bands.centres_hz");
-        check("bands.centres_hz = []", "bands.centres_hz");
-        check("impulse_response.length = 0", "impulse_response.length");
-        check("impulse_response.reference_temperature_c = 400", "temperature");
-        check("sweeep.rate_hz = 1", "unknown field");
-        check("[grid]\nlayers = []\npoints_mm = []", "number of grid points");
-        check("name = [", "line 1");
-        check("robots.table_mm = 50", "robots");
-        check("devices.sensor.kind = \"serial\"", "simulated devices beside real ones");
-        check("devices.sensor.kind = \"parallel\"", "unknown variant");
-        check("devices.sensor = { kind = \"serial\", bauds = 3 }", "unknown field");
-        check(&format!("{REAL}audio.loopback = 3"), "devices");
-        check(&format!("{REAL}robots.speed = 2.0"), "speed");
-        check("robots.order = \"random\"", "unknown variant");
+        let mut said = String::new();
+        for toml in [
+            "sweep.rate_hz = 48000",
+            "sweep.rate_hz = -1",
+            "sweep.low_hz = 50000",
+            "bands.centres_hz = [1000, 3000]",
+            "bands.centres_hz = []",
+            "impulse_response.length = 0",
+            "impulse_response.reference_temperature_c = 400",
+            "sweeep.rate_hz = 1",
+            "[grid]\nlayers = []\npoints_mm = []",
+            "name = [",
+            "robots.table_mm = 50",
+            "devices.sensor.kind = \"serial\"",
+            "devices.sensor.kind = \"parallel\"",
+            "devices.sensor = { kind = \"serial\", bauds = 3 }",
+            &format!("{REAL}audio.loopback = 3"),
+            &format!("{REAL}robots.speed = 2.0"),
+            "robots.order = \"random\"",
+        ] {
+            let error = Rig::from_toml(toml).expect_err(toml);
+            said += &format!("{}\n    {error}\n", toml.strip_prefix(REAL).unwrap_or(toml));
+        }
+        expect![[r#"
+            sweep.rate_hz = 48000
+                rig `paper`: `sweep.high_hz` is 40000, above half the sampling rate, 24000 Hz
+            sweep.rate_hz = -1
+                not a rig description: TOML parse error at line 1, column 17
+              |
+            1 | sweep.rate_hz = -1
+              |                 ^^
+            sampling rate (Hz) is -1, expected 1 to 10 000 000
+
+            sweep.low_hz = 50000
+                rig `paper`: `sweep.low_hz` is 50000, expected above 0 and below sweep.high_hz = 40000
+            bands.centres_hz = [1000, 3000]
+                rig `paper`: `bands.centres_hz` is [1000.0, 3000.0], expected 1 to 12 whole numbers of Hz, each twice the one before
+            bands.centres_hz = []
+                rig `paper`: `bands.centres_hz` is [], expected 1 to 12 whole numbers of Hz, each twice the one before
+            impulse_response.length = 0
+                rig `paper`: `impulse_response.length` is 0, expected 1 to 16777216
+            impulse_response.reference_temperature_c = 400
+                not a rig description: TOML parse error at line 1, column 44
+              |
+            1 | impulse_response.reference_temperature_c = 400
+              |                                            ^^^
+            temperature (C) is 400, expected -60 to 80
+
+            sweeep.rate_hz = 1
+                not a rig description: TOML parse error at line 1, column 1
+              |
+            1 | sweeep.rate_hz = 1
+              | ^^^^^^
+            unknown field `sweeep`, expected one of `name`, `sweep`, `impulse_response`, `bands`, `panel`, `validation`, `grid`, `robots`, `devices`
+
+            [grid]
+            layers = []
+            points_mm = []
+                number of grid points is 0, expected 2 to 2000
+            name = [
+                not a rig description: TOML parse error at line 1, column 9
+              |
+            1 | name = [
+              |         ^
+            unclosed array, expected `]`
+
+            robots.table_mm = 50
+                rig `paper`: `robots` table_mm = 50 is not below relief_mm = 29
+            devices.sensor.kind = "serial"
+                rig `paper`: `devices` has simulated devices beside real ones; hint: audio, sensor and robots all need a `kind`
+            devices.sensor.kind = "parallel"
+                not a rig description: TOML parse error at line 1, column 23
+              |
+            1 | devices.sensor.kind = "parallel"
+              |                       ^^^^^^^^^^
+            unknown variant `parallel`, expected `simulated` or `serial`
+
+            devices.sensor = { kind = "serial", bauds = 3 }
+                not a rig description: TOML parse error at line 1, column 18
+              |
+            1 | devices.sensor = { kind = "serial", bauds = 3 }
+              |                  ^^^^^^^^^^^^^^^^^^^^^^^^^^^^^^
+            unknown field `bauds`, expected one of `path`, `baud`, `timeout_secs`
+
+            audio.loopback = 3
+                rig `paper`: `devices` audio: a channel is 0 or beyond `outputs` or `inputs`, or microphone and loopback are one
+            robots.speed = 2.0
+                rig `paper`: `devices` robots: expected 0 < speed <= 1, 0 < tolerance_deg <= 5, timeout_secs above 0
+            robots.order = "random"
+                not a rig description: TOML parse error at line 1, column 16
+              |
+            1 | robots.order = "random"
+              |                ^^^^^^^^
+            unknown variant `random`, expected `numbered` or `planned`
+
+        "#]].assert_eq(&said);
     }
 
     #[test]

@@ -18,6 +18,7 @@ mod light_load;
 mod memory_watch;
 mod postgres_query;
 mod process_tree;
+mod protocol_query;
 mod query_client;
 mod right_answers;
 

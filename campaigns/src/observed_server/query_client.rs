@@ -1,11 +1,11 @@
-//! A client that queries in SQL over any of the protocols, and distinguishes a whole answer, an error, and neither.
+//! A client that queries in SQL, and the outcomes of its queries: a whole answer, an error, or neither.
 
 use std::fmt::{self, Write as _};
 use std::io;
 use std::net::Ipv4Addr;
 use std::sync::Arc;
 
-use super::{ClientConnections, ServerAddresses, flight_query, http_query, postgres_query};
+use super::{ClientConnections, ServerAddresses};
 
 /// A protocol for queries in SQL.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, clap::ValueEnum)]
@@ -110,24 +110,6 @@ impl QueryClient {
         self.connections = Arc::new(ClientConnections::new(source));
         self
     }
-
-    /// Runs a query and reads its answer to the end.
-    pub(crate) fn query(&self, protocol: QueryProtocol, sql: &str) -> QueryOutcome {
-        let outcome = match protocol {
-            QueryProtocol::Http => http_query::query(self, sql),
-            QueryProtocol::SliceFilter => http_query::query_slice(self, &slice_filter(sql)),
-            QueryProtocol::PostgresSimple => postgres_query::query_simple(self, sql),
-            QueryProtocol::PostgresExtended => postgres_query::query_extended(self, sql),
-            QueryProtocol::FlightSql => flight_query::query(self, sql),
-        };
-        let is_lost = matches!(outcome, QueryOutcome::Truncated | QueryOutcome::Disconnected);
-        if is_lost && self.connections.is_closed() { QueryOutcome::Abandoned } else { outcome }
-    }
-}
-
-// A predicate that needs the query's rows.
-fn slice_filter(sql: &str) -> String {
-    format!("exists ({sql})")
 }
 
 /// Encodes all that RFC 3986 reserves.

@@ -9,6 +9,7 @@ use datafusion::execution::object_store::ObjectStoreUrl;
 use echolake_lake::{FileName, ReferenceSurfaces, VisibleRun, encode};
 use echolake_schema::Rig;
 use echolake_schema::tables::Table;
+use expect_test::{Expect, expect};
 
 use super::*;
 use crate::PredicateForm;
@@ -192,22 +193,55 @@ async fn nothing_but_reading_is_allowed() {
 async fn errors_point_at_the_place() {
     let (_folder, lake) = lake().await;
     let session = Session::new(&lake).expect("a session");
-    let check = async |sql: &str, expected: &[&str]| {
-        let error = session.query(sql).await.map(drop).expect_err(sql).to_string();
-        for text in expected {
-            assert!(error.contains(text), "{sql}: {error}");
-        }
+    let check = async |sql: &str, expected: Expect| {
+        expected.assert_eq(&session.query(sql).await.map(drop).expect_err(sql).to_string());
     };
+    check("select nonsense from runs", expect![[r#"
+        no column `nonsense`
+          select nonsense from runs
+                 ^
+        hint: the columns are surface_id, run_id, state, missing, origin, rig, started_ns, started, ended_ns, ended, measurements, rejected, ...; DESCRIBE lists all of a table"#]]).await;
     check(
-        "select nonsense from runs",
-        &["no column `nonsense`", "\n  select nonsense from runs\n         ^", "hint: "],
+        "select pair_idd from pairs",
+        expect![[r#"
+        no column `pair_idd`
+          select pair_idd from pairs
+                 ^
+        hint: did you mean `pair_id`?"#]],
     )
     .await;
-    check("select pair_idd from pairs", &["did you mean `pair_id`"]).await;
-    check("selec 1", &["selec", "^"]).await;
-    check("select * from rums", &["no table `rums`", "did you mean `runs`"]).await;
-    check("select 1; select 2", &["one statement at a time"]).await;
-    check("select 1 +", &["the end of the query", "\n  select 1 +\n            ^"]).await;
+    check(
+        "selec 1",
+        expect![[r#"
+        Expected: an SQL statement, found: selec
+          selec 1
+          ^"#]],
+    )
+    .await;
+    check(
+        "select * from rums",
+        expect![[r#"
+        no table `rums`
+          select * from rums
+                        ^
+        hint: did you mean `runs`?"#]],
+    )
+    .await;
+    check(
+        "select 1; select 2",
+        expect![[r#"
+        one statement at a time
+        hint: the prompt takes several, each ended by ;"#]],
+    )
+    .await;
+    check(
+        "select 1 +",
+        expect![[r#"
+        Expected: an expression, found the end of the query
+          select 1 +
+                    ^"#]],
+    )
+    .await;
 }
 
 /// Adds a run's log lines, or others in their place, as ingest does.

@@ -10,7 +10,7 @@ use echolake_schema::{RunId, SurfaceId};
 use object_store::path::Path;
 use serde_json::{Map, Value};
 
-use crate::{Result, TableVersion};
+use crate::Result;
 
 /// A Parquet file of a table.
 #[derive(Debug, Clone, PartialEq)]
@@ -124,6 +124,15 @@ pub struct FileHistory {
     pub current: HashSet<String>,
     /// Those that were, and when they went. The log forgets them after a week.
     pub removed: HashMap<String, DateTime<Utc>>,
+}
+
+/// One version of a table, and when it was committed.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct TableVersion {
+    /// Its number.
+    pub version: u64,
+    /// Time of its commit, or of an earlier version's if that writer's clock was ahead.
+    pub committed: DateTime<Utc>,
 }
 
 /// Outcome of adding a new file.

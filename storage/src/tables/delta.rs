@@ -2,6 +2,7 @@
 
 mod actions;
 mod checkpoint;
+mod commit_files;
 mod log_folder;
 mod table_state;
 
@@ -25,7 +26,6 @@ use self::actions::{AddFile, FileFormat, LogLine, TableMetadata};
 use self::log_folder::{CommitAttempt, LogFolder, REBUILD_HINT, own_protocol};
 use self::table_state::TableState;
 use crate::tables::snapshot::{decode_parts, encode_parts, is_merged};
-use crate::tables::versions;
 use crate::{
     CommitEffect, CommitLog, CommitOutcome, DataFile, Error, FileHistory, FileStats, NewFile, Result, RunPart,
     TableCommit, TableVersion,
@@ -211,7 +211,7 @@ impl CommitLog for DeltaLog {
     }
 
     async fn versions(&self, table: Table) -> Result<Vec<TableVersion>> {
-        versions::listed(self.store.as_ref(), table).await
+        self.log_folder(table).list_versions().await
     }
 
     async fn files_at(&self, table: Table, version: u64) -> Result<Vec<DataFile>> {

@@ -15,13 +15,13 @@ mod versions;
 pub use batch_builder::BatchBuilder;
 pub use commit_log::{
     CommitEffect, CommitLog, CommitOutcome, DataFile, FileHistory, FileStats, NewFile, ReplacedFiles, RunPart,
-    TableCommit,
+    TableCommit, TableVersion,
 };
 pub use data_file::{EncodedFile, FileEncoder, encode};
 pub use optimize::{MergeProgress, OptimizeReport, TARGET_BYTES, TableOptimizeReport};
 pub use snapshot::{FileName, LakeSnapshot, VisibleRun};
 pub use vacuum::{DeletedFile, DeletionMode, KEEP_HOURS, VacuumReport};
-pub use versions::{LakeMoment, NoMoment, TableVersion};
+pub use versions::{LakeMoment, NoMoment};
 
 use arrow::record_batch::RecordBatch;
 use echolake_schema::tables::{Source, Table};
@@ -80,6 +80,19 @@ impl Lake {
 
     /// A frozen view of what readers may see.
     ///
+    /// ```
+    /// use echolake_lake::{Lake, ReferenceSurfaces};
+    /// use echolake_schema::{Rig, tables::Table};
+    ///
+    /// # tokio::runtime::Runtime::new()?.block_on(async {
+    /// let lake = Lake::open_or_create("memory://", &Rig::paper(), &ReferenceSurfaces::default()).await?;
+    /// let snapshot = lake.snapshot().await?;
+    /// assert_eq!((snapshot.runs().count(), snapshot.files(Table::Points)[0].visible_rows()), (0, 78));
+    /// # Ok::<(), echolake_lake::Error>(())
+    /// # })?;
+    /// # Ok::<(), Box<dyn std::error::Error>>(())
+    /// ```
+    ///
     /// # Errors
     /// [`Error::Log`] if a table's log is damaged.
     pub async fn snapshot(&self) -> Result<LakeSnapshot> {
@@ -109,6 +122,22 @@ impl Lake {
     /// Commits staged files, once per table. All tables commit concurrently except `runs`, which is last: from that
     /// commit on readers see the files. Returns the outcome of each file, in the given order. Repeating the call adds
     /// nothing.
+    ///
+    /// ```
+    /// use echolake_lake::{CommitOutcome, FileName, Lake, ReferenceSurfaces, encode};
+    /// use echolake_schema::{Rig, tables::Table};
+    ///
+    /// # tokio::runtime::Runtime::new()?.block_on(async {
+    /// let lake = Lake::open_or_create("memory://", &Rig::paper(), &ReferenceSurfaces::default()).await?;
+    /// let file = encode(Table::Pairs, &Table::Pairs.schema(lake.rig()), &[lake.pairs()?])?;
+    /// let name = FileName::Rig { derivation: "example".into() };
+    /// let staged = [lake.stage(Table::Pairs, &name, file).await?];
+    /// assert_eq!(lake.commit(&staged).await?, [CommitOutcome::Now]);
+    /// assert_eq!(lake.commit(&staged).await?, [CommitOutcome::Before]);
+    /// # Ok::<(), echolake_lake::Error>(())
+    /// # })?;
+    /// # Ok::<(), Box<dyn std::error::Error>>(())
+    /// ```
     ///
     /// # Errors
     /// What the store says. Tables that were committed before stay so, unseen by readers; repeating the call resumes.

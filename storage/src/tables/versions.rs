@@ -7,31 +7,23 @@ use std::str::FromStr;
 
 use chrono::{DateTime, NaiveDate, NaiveDateTime, SecondsFormat, Utc};
 use echolake_schema::tables::Table;
-use futures::{StreamExt as _, TryStreamExt as _};
-use object_store::path::Path;
-use object_store::{GetOptions, GetRange, ObjectStore};
-use serde_json::Value;
 
 use crate::tables::delta::folder;
-use crate::{Error, Lake, LakeSnapshot, Result};
+use crate::{Error, Lake, LakeSnapshot, Result, TableVersion};
 
-/// Bytes of a commit that are read for its time, which writers put first.
-const COMMIT_HEAD: u64 = 4096;
 /// Formats of times beside RFC 3339.
 const TIMES: [&str; 4] = ["%Y-%m-%dT%H:%M:%S%.f", "%Y-%m-%d %H:%M:%S%.f", "%Y-%m-%dT%H:%M", "%Y-%m-%d %H:%M"];
-/// Commits that are read concurrently.
-const TOGETHER: usize = 16;
-
-/// One version of a table, and when it was committed.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct TableVersion {
-    /// Its number.
-    pub version: u64,
-    /// Time of its commit, or of an earlier version's if that writer's clock was ahead.
-    pub committed: DateTime<Utc>,
-}
 
 /// A moment of a lake.
+///
+/// ```
+/// use echolake_lake::LakeMoment;
+///
+/// assert_eq!("12".parse(), Ok(LakeMoment::Version(12)));
+/// assert_eq!("2026-01-05 08:00".parse::<LakeMoment>()?.to_string(), "2026-01-05T08:00:00Z");
+/// assert!("yesterday".parse::<LakeMoment>().is_err());
+/// # Ok::<(), echolake_lake::NoMoment>(())
+/// ```
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum LakeMoment {
     /// A version of the lake, that of its table `runs`.
@@ -135,74 +127,9 @@ fn no_moment(moment: LakeMoment, versions: &[TableVersion]) -> Error {
     Error::NoMoment { moment: moment.to_string(), held }
 }
 
-/// The versions whose commits are in a table's log folder, oldest first.
-pub(crate) async fn listed(store: &dyn ObjectStore, table: Table) -> Result<Vec<TableVersion>> {
-    let folder = folder(table).join("_delta_log");
-    let there = store.list_with_delimiter(Some(&folder)).await.map_err(|e| Error::store("list", &folder, e))?;
-    let mut commits: Vec<_> = there
-        .objects
-        .into_iter()
-        .filter_map(|o| Some((commit_number(&o.location)?, o.location, o.last_modified)))
-        .collect();
-    commits.sort_by_key(|c| c.0);
-    let times = futures::stream::iter(commits).map(|(version, path, modified)| async move {
-        Ok::<_, Error>((version, commit_time(store, &path).await?.unwrap_or(modified)))
-    });
-    let times: Vec<_> = times.buffered(TOGETHER).try_collect().await?;
-    let mut latest = DateTime::<Utc>::MIN_UTC;
-    let monotonic = times.into_iter().map(|(version, time)| {
-        latest = latest.max(time);
-        TableVersion { version, committed: latest }
-    });
-    Ok(monotonic.collect())
-}
-
-/// Name of a version's commit in the log folder.
-pub(crate) fn commit_name(version: u64) -> String {
-    format!("{version:020}.json")
-}
-
-/// The version of a commit's file; None if it is none.
-pub(crate) fn commit_number(path: &Path) -> Option<u64> {
-    let digits = path.filename()?.strip_suffix(".json")?;
-    (digits.len() == 20).then(|| digits.parse().ok()).flatten()
-}
-
-// The first line of a commit; one that is longer than what is read is searched as text.
-async fn commit_time(store: &dyn ObjectStore, path: &Path) -> Result<Option<DateTime<Utc>>> {
-    let range = Some(GetRange::Bounded(0..COMMIT_HEAD));
-    let head = store.get_opts(path, GetOptions { range, ..GetOptions::default() }).await;
-    let head = head.map_err(|e| Error::store("read", path, e))?;
-    let bytes = head.bytes().await.map_err(|e| Error::store("read", path, e))?;
-    let text = String::from_utf8_lossy(&bytes);
-    let millis = text.lines().find_map(millis_of);
-    Ok(millis.and_then(DateTime::from_timestamp_millis))
-}
-
-fn millis_of(line: &str) -> Option<i64> {
-    let after = line.strip_prefix("{\"commitInfo\":")?;
-    if let Some(whole) = after.strip_suffix('}')
-        && let Ok(Value::Object(whole)) = serde_json::from_str::<Value>(whole)
-    {
-        return whole.get("timestamp")?.as_i64();
-    }
-    let (_, from) = after.split_once("\"timestamp\":")?;
-    let digits: String = from.trim_start().chars().take_while(char::is_ascii_digit).collect();
-    digits.parse().ok()
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn times_of_commits_are_found_in_whole_and_cut_lines() {
-        let check = |line: &str, expected: Option<i64>| assert_eq!(millis_of(line), expected, "{line}");
-        check(r#"{"commitInfo":{"timestamp":1795256318599,"operation":"WRITE"}}"#, Some(1_795_256_318_599));
-        check(r#"{"commitInfo":{"operation":"x","timestamp":5}}"#, Some(5));
-        check(r#"{"commitInfo":{"timestamp":17,"operation":"CREATE TABLE","operationPar"#, Some(17));
-        check(r#"{"add":{"path":"x"}}"#, None);
-    }
 
     #[test]
     fn times_without_a_zone_are_utc() {
@@ -214,14 +141,5 @@ mod tests {
         for text in ["yesterday", "-1", "", "2026-13-01"] {
             assert!(text.parse::<LakeMoment>().is_err(), "{text}");
         }
-    }
-
-    #[test]
-    fn commits_are_told_from_checkpoints() {
-        let check = |name: &str, expected| assert_eq!(commit_number(&Path::from(name)), expected, "{name}");
-        check("tables/runs/_delta_log/00000000000000000012.json", Some(12));
-        check("tables/runs/_delta_log/00000000000000000010.checkpoint.parquet", None);
-        check("tables/runs/_delta_log/_commits/x.json", None);
-        assert_eq!(commit_number(&Path::from(commit_name(7))), Some(7));
     }
 }

@@ -1,6 +1,6 @@
 //! Calls and casts that make much of little: one call allocates all of it between two looks at the memory.
 
-use super::{SqlAttack, attack, numbered, steps};
+use super::sql_attack::{SqlAttack, attack, numbered, steps};
 
 pub(super) const ATTACKS: &[SqlAttack] = &[
     attack("array_repeat of a range in a list", || {

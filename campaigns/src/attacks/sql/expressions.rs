@@ -1,6 +1,6 @@
 //! Deep and long expressions: what parses, plans, prints or drops them recurses along them or tries them again.
 
-use super::{SqlAttack, attack, nested, numbered};
+use super::sql_attack::{SqlAttack, attack, nested, numbered};
 
 pub(super) const ATTACKS: &[SqlAttack] = &[
     attack("chain of plus", || format!("select {}", numbered("1", "+", 8000))),

@@ -1,6 +1,6 @@
 //! Single calls that take long: they do not check for cancellation while they run.
 
-use super::{SqlAttack, attack, numbered};
+use super::sql_attack::{SqlAttack, attack, numbered};
 
 pub(super) const ATTACKS: &[SqlAttack] = &[
     attack("levenshtein of long texts", || {

@@ -1,6 +1,6 @@
 //! Joins, recursion and series that never come to an end, and sorts and groups of all that they make.
 
-use super::{SqlAttack, attack, numbered};
+use super::sql_attack::{SqlAttack, attack, numbered};
 
 pub(super) const ATTACKS: &[SqlAttack] = &[
     attack("endless recursion", || {

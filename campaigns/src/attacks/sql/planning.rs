@@ -1,6 +1,6 @@
 //! Small statements whose plans are large, or are computed while they are planned: nothing runs yet that could be ended.
 
-use super::{SqlAttack, attack, numbered, steps};
+use super::sql_attack::{SqlAttack, attack, numbered, steps};
 
 pub(super) const ATTACKS: &[SqlAttack] = &[
     attack("folded levenshtein", || {

@@ -1,6 +1,6 @@
 //! The lake's own tables, catalogues and run files, read many times in one statement.
 
-use super::{SqlAttack, attack, numbered};
+use super::sql_attack::{SqlAttack, attack, numbered};
 
 pub(super) const ATTACKS: &[SqlAttack] = &[
     attack("mcap in unions", || numbered("select count(*) from mcap('flat', '/sweep')", " union all ", 300)),

@@ -1,6 +1,6 @@
 //! Windows whose frames hold or compute again more than their rows.
 
-use super::{SqlAttack, attack};
+use super::sql_attack::{SqlAttack, attack};
 
 pub(super) const ATTACKS: &[SqlAttack] = &[
     attack("array_agg of what follows", || {

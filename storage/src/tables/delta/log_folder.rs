@@ -12,10 +12,10 @@ use serde_json::json;
 
 use super::actions::LogLine;
 use super::checkpoint::{decode_checkpoint, encode_checkpoint};
+use super::commit_files::{commit_name, commit_number, list_versions};
 use super::folder;
 use super::table_state::TableState;
-use crate::tables::versions::{commit_name, commit_number};
-use crate::{Error, Result};
+use crate::{Error, Result, TableVersion};
 
 /// The newest version of the protocol that this reads.
 const READER_VERSION: i32 = 1;
@@ -107,6 +107,11 @@ impl<'a> LogFolder<'a> {
         }
         self.check_readable(&state)?;
         Ok(Some(state))
+    }
+
+    /// Lists its versions, oldest first.
+    pub(super) async fn list_versions(&self) -> Result<Vec<TableVersion>> {
+        list_versions(self.store, &self.path).await
     }
 
     pub(super) async fn has_version(&self, version: u64) -> Result<bool> {
