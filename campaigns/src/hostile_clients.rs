@@ -16,7 +16,8 @@ use rand_chacha::ChaCha8Rng;
 
 use super::attacks::{AttackCase, all_cases};
 use super::observed_server::{
-    ClientGroup, MemoryWatch, ObservedServer, QueryClient, QueryOutcome, RightAnswers, take_right_answers,
+    ClientGroup, MemoryWatch, ObservedServer, QueryClient, QueryOutcome, QueryProtocol, RightAnswers,
+    take_right_answers,
 };
 use super::percentile::{millis, percentile};
 
@@ -68,7 +69,7 @@ pub(crate) struct WorkerReport {
     /// Times of right answers.
     pub(crate) times: Vec<Duration>,
     pub(crate) wrong_answers: usize,
-    /// Number of each kind of error that came in place of an answer.
+    /// Number of errors that came in place of an answer, by protocol and kind.
     pub(crate) errors: BTreeMap<String, usize>,
 }
 
@@ -203,17 +204,17 @@ impl ClientPhase<'_> {
             let one = client.clone().with_source(client.connections.source());
             let begun = Instant::now();
             let answer = one.connections.close_after(QUERY_LIMIT, || one.query(*protocol, sql));
-            self.count_answer(answer, expected, begun.elapsed());
+            self.count_answer(*protocol, answer, expected, begun.elapsed());
             std::thread::sleep(LONGEST_PAUSE.mul_f64(random.random()));
         }
     }
 
-    fn count_answer(&self, answer: QueryOutcome, expected: &QueryOutcome, took: Duration) {
+    fn count_answer(&self, protocol: QueryProtocol, answer: QueryOutcome, expected: &QueryOutcome, took: Duration) {
         let mut report = self.report.lock().unwrap_or_else(PoisonError::into_inner);
         match answer {
             right if right == *expected => report.times.push(took),
             QueryOutcome::Answer(_) => report.wrong_answers += 1,
-            other => *report.errors.entry(other.to_string()).or_default() += 1,
+            other => *report.errors.entry(format!("{}: {other}", protocol.name())).or_default() += 1,
         }
     }
 

@@ -1,5 +1,6 @@
 //! Places for connections: a listener accepts a limited number. If all are taken, a new connection evicts the oldest one
-//! without a request or a login, of the address that has the most: slow senders and crowds lock out no other client.
+//! without a request or a login, of the address that has the most, and never one of an address that has fewer than its
+//! own: slow senders and crowds lock out no other client.
 
 use std::cmp::Reverse;
 use std::collections::HashMap;
@@ -89,18 +90,26 @@ impl ConnectionPlaces {
         PlacedStream { stream, state, taken: self.taken.clone(), turn_bytes: 0, stalled: None }
     }
 
-    // Another machine has half of the places at most; false if all of those work.
+    // Another machine has half of the places at most. False if the newcomer's address has had its share.
     async fn make_room(&self, address: IpAddr) -> bool {
         loop {
             let freed = self.taken.freed.notified();
-            let is_crowd = |place: &&Arc<PlaceState>| place.address == address && !address.is_loopback();
             {
                 let mut all = self.taken.lock();
-                if all.iter().filter(is_crowd).count() >= (self.most / 2).max(1) {
-                    return evict(&mut all, |place| is_crowd(&place));
-                }
-                if all.len() < self.most || evict(&mut all, |_| true) {
+                let own = all.iter().filter(|place| place.address == address).count();
+                let is_crowd = !address.is_loopback() && own >= (self.most / 2).max(1);
+                if !is_crowd && all.len() < self.most {
                     return true;
+                }
+                match oldest_idle(&all, |place| !is_crowd || place.address == address) {
+                    // A crowd pushes out its own, and not one that has just come.
+                    Some((_, places)) if places < own => return false,
+                    Some((oldest, _)) => {
+                        all.remove(oldest).evicted.notify_one();
+                        return true;
+                    }
+                    None if is_crowd => return false,
+                    None => {}
                 }
             }
             freed.await;
@@ -108,15 +117,13 @@ impl ConnectionPlaces {
     }
 }
 
-// Evicts the oldest idle connection of the address that has the most: a crowd pushes out its own.
-fn evict(all: &mut Vec<Arc<PlaceState>>, may: impl Fn(&Arc<PlaceState>) -> bool) -> bool {
+// The oldest idle connection of the address that has the most places, and how many these are.
+fn oldest_idle(all: &[Arc<PlaceState>], may: impl Fn(&PlaceState) -> bool) -> Option<(usize, usize)> {
     let mut counts = HashMap::new();
     all.iter().for_each(|place| *counts.entry(place.address).or_insert(0_usize) += 1);
     let idle = all.iter().enumerate().filter(|(_, place)| place.is_idle() && may(place));
-    let oldest = idle.max_by_key(|(index, place)| (counts.get(&place.address), Reverse(*index)));
-    let Some((oldest, _)) = oldest else { return false };
-    all.remove(oldest).evicted.notify_one();
-    true
+    let counted = idle.map(|(index, place)| (index, counts.get(&place.address).copied().unwrap_or(0)));
+    counted.max_by_key(|(index, places)| (*places, Reverse(*index)))
 }
 
 impl TakenPlaces {
@@ -284,6 +291,12 @@ mod tests {
         tokio::time::timeout(Duration::from_secs(60), taken[1].evicted()).await.expect("it must leave its place");
         let stays = tokio::time::timeout(Duration::from_millis(50), taken[0].evicted()).await;
         assert!(stays.is_err(), "the only one of its address stays, though it is the oldest");
+        let _works: Vec<_> = taken[2..].iter().map(|place| place.work().begin()).collect();
+        let socket = TcpSocket::new_v4().expect("a socket");
+        socket.bind("127.0.0.3:0".parse().expect("an address")).expect("bound");
+        let mut refused = socket.connect(address).await.expect("connected");
+        assert!(tokio::time::timeout(Duration::from_millis(50), places.next()).await.is_err());
+        assert_eq!(refused.read(&mut [0]).await.expect("closed"), 0, "a crowd that works takes no other's place");
     }
 
     #[tokio::test]
