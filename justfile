@@ -13,6 +13,14 @@ quick:
     cargo clippy --release --workspace --all-targets --locked -- -D warnings
     cargo test --release --workspace --tests --locked -- --skip slow
 
+# Tests of one member's library, as `just member query views`: nothing but the member is compiled.
+member MEMBER *NAMES:
+    cargo test --release -p echolake -p echolake-{{ MEMBER }} --lib --locked -- {{ NAMES }}
+
+# How long that takes after a change of one line, for all members.
+inner-loop *FOLDERS:
+    tests/inner_loop.sh {{ FOLDERS }}
+
 # Formats Rust, the pages and the Python package.
 fmt:
     cargo fmt --all
@@ -35,9 +43,9 @@ api:
 campaign NAME *OPTIONS:
     cargo run --release --locked -p echolake-campaigns -- {{ NAME }} {{ OPTIONS }}
 
-# A benchmark, built as packages are; `kernels` are those of cargo bench.
+# A benchmark, built as packages are; `kernels` are criterion's.
 bench NAME *OPTIONS:
-    {{ if NAME == "kernels" { "cargo bench --profile dist --workspace --bench kernels" } else { "cargo run --profile dist --locked -p echolake-campaigns -- " + NAME } }} {{ OPTIONS }}
+    {{ if NAME == "kernels" { "cargo bench --manifest-path campaigns/kernels/Cargo.toml --locked --" } else { "cargo run --profile dist --locked -p echolake-campaigns -- " + NAME } }} {{ OPTIONS }}
 
 # What a change must pass.
 ci:

@@ -7,6 +7,11 @@ use crate::RealSample;
 /// there is no sound, or a sample that is not finite.
 ///
 /// ISO 3382-1:2009 looks for the start of a response at least 20 dB below its greatest.
+///
+/// ```
+/// let arrival = echolake_dsp::arrival::first_arrival(&[0.0, 0.0, 1.0, 0.5], -20.0);
+/// assert!(arrival.is_some_and(|samples| (samples - 1.1).abs() < 1e-9));
+/// ```
 pub fn first_arrival<T: RealSample>(ir: &[T], threshold_db: f64) -> Option<f64> {
     let magnitude = |x: &T| x.f64().abs();
     let mut greatest = 0.0f64;

@@ -138,6 +138,17 @@ pub struct FlatEnergies {
 }
 
 /// Response to reflected response, curves and energies.
+///
+/// ```
+/// let plan = echolake_dsp::chain::DerivationPlan::new(384, 96e3, &[2_500.0, 5_000.0, 10_000.0, 20_000.0, 40_000.0])?;
+/// let mut flat = vec![0.0; 384];
+/// flat[100] = 1.0;
+/// let (foam, ir) = (vec![0.0; 384], flat.iter().map(|x| 0.5 * x).collect::<Vec<f64>>());
+/// let mut derived = plan.derived();
+/// plan.run(&ir, &foam, &flat, &mut derived, &mut plan.scratch())?;
+/// assert!((derived.total - 0.25).abs() < 1e-9);
+/// # Ok::<(), echolake_dsp::Error>(())
+/// ```
 pub struct DerivationPlan<T: RealSample> {
     bank: FilterBankPlan<T>,
 }

@@ -15,6 +15,14 @@ const SETTLED: f64 = 1e-10;
 /// Rows as points: their distances, and their places along the components of greatest variance.
 ///
 /// Distances are root mean squares over the features, so that they have the features' unit.
+///
+/// ```
+/// let mut rows = [vec![0.0, 7.0], vec![2.0, 7.0], vec![4.0, 7.0]];
+/// let found = echolake_dsp::components::PrincipalComponents::of(&mut rows, 1)?;
+/// assert!((found.explained()[0] - 1.0).abs() < 1e-9);
+/// assert!((found.distance(0, 2) - 8f64.sqrt()).abs() < 1e-9);
+/// # Ok::<(), echolake_dsp::Error>(())
+/// ```
 #[derive(Debug, Clone)]
 pub struct PrincipalComponents {
     features: usize,

@@ -14,6 +14,12 @@ use crate::{Error, RealSample};
 ///
 /// x, y  `[n]`
 ///
+/// ```
+/// let r = echolake_dsp::correlation::pearson(&[1.0, 2.0, 4.0], &[-1.0, -3.0, -7.0])?;
+/// assert!(r.is_some_and(|r| (r + 1.0).abs() < 1e-12));
+/// # Ok::<(), echolake_dsp::Error>(())
+/// ```
+///
 /// # Errors
 /// [`Error::Length`] if they are not equally long.
 pub fn pearson<T: RealSample>(x: &[T], y: &[T]) -> Result<Option<f64>, Error> {
@@ -39,6 +45,13 @@ pub fn pearson<T: RealSample>(x: &[T], y: &[T]) -> Result<Option<f64>, Error> {
 /// Greatest cross-correlation of signals of one length over all shifts.
 ///
 /// Signals are padded so that nothing wraps around.
+///
+/// ```
+/// let plan = echolake_dsp::correlation::CorrelationPlan::new(4)?;
+/// let later_and_louder = plan.similarity(&[1.0, 2.0, 0.0, 0.0], &[0.0, 0.0, 3.0, 6.0], &mut plan.scratch())?;
+/// assert!(later_and_louder.is_some_and(|x| (x - 1.0).abs() < 1e-9));
+/// # Ok::<(), echolake_dsp::Error>(())
+/// ```
 pub struct CorrelationPlan<T: RealSample> {
     len: usize,
     forward: Arc<dyn RealToComplex<T>>,

@@ -9,6 +9,12 @@ use crate::RealSample;
 /// ir, curve  `[n]`, summed up in f64
 ///
 /// Source: Schroeder 1965, J. Acoust. Soc. Am. 37(3):409-412.
+///
+/// ```
+/// let mut curve = [0.0; 2];
+/// assert!(echolake_dsp::decay::energy_decay_db(&[3.0, 1.0], &mut curve));
+/// assert_eq!(curve, [0.0, -10.0]);
+/// ```
 pub fn energy_decay_db<T: RealSample>(ir: &[T], curve: &mut [T]) -> bool {
     let total = crate::energy::energy(ir);
     if !(total > 0.0 && total.is_finite()) {

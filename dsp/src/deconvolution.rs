@@ -54,6 +54,28 @@ const PIECE: usize = 64;
 /// Both signals are real, so one complex transform of z = x + i s does for both: with the mirror image
 /// b\[k\] = conj Z\[n - k\], X = (Z + b) / 2 and S = (Z - b) / 2i, and their quotient needs neither of them. It goes
 /// straight to where the inverse transform, of the wanted samples only, reads it.
+///
+/// ```
+/// use echolake_dsp::deconvolution::{DeconvolutionParams, DeconvolutionPlan, TransformLength};
+/// use echolake_dsp::sweep::LinearSweep;
+///
+/// let sweep = LinearSweep { rate_hz: 8e3, duration_secs: 0.064, low_hz: 100.0, high_hz: 3_900.0, fade_secs: 0.001 };
+/// let loopback = sweep.samples();
+/// let recording: Vec<f64> = (0..512).map(|n| if n < 3 { 0.0 } else { 0.5 * loopback[n - 3] }).collect();
+/// let plan = DeconvolutionPlan::new(DeconvolutionParams {
+///     recording_len: 512,
+///     output_len: 8,
+///     rate_hz: 8e3,
+///     low_hz: 100.0,
+///     high_hz: 3_900.0,
+///     floor_db: -60.0,
+///     length: TransformLength::Fast,
+/// })?;
+/// let mut ir = [0.0; 8];
+/// plan.run(&recording, &loopback, &mut ir, &mut plan.scratch())?;
+/// assert!((ir[3] - 0.5).abs() < 0.05, "{ir:?}");
+/// # Ok::<(), echolake_dsp::Error>(())
+/// ```
 pub struct DeconvolutionPlan<T: RealSample> {
     recording_len: usize,
     output_len: usize,

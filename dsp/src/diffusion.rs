@@ -72,6 +72,13 @@ fn ratio(level_db: f64, loudest_db: f64) -> f64 {
 }
 
 /// The coefficient of one list of levels, dB; None of fewer than two, or of no sound.
+///
+/// ```
+/// use echolake_dsp::diffusion::diffusion;
+///
+/// assert_eq!(diffusion(&[60.0, 60.0, 60.0]), Some(1.0));
+/// assert_eq!(diffusion(&[60.0, f64::NEG_INFINITY, f64::NEG_INFINITY]), Some(0.0));
+/// ```
 pub fn diffusion<T: crate::RealSample>(levels_db: &[T]) -> Option<f64> {
     let mut sums = DiffusionSums::default();
     levels_db.iter().for_each(|level| sums.add(level.f64()));

@@ -52,6 +52,17 @@ pub fn nce<T: RealSample>(curves: &mut [T], flat_energy: f64) {
 ///
 /// curves `[bands x len]`
 /// out    `[bands]`
+///
+/// ```
+/// use echolake_dsp::energy::{cumulative_energy, nce, tnce};
+///
+/// let mut curves = [0.0; 4];
+/// cumulative_energy(&[1.0, 1.0, 2.0, 0.0], &mut curves, 2);
+/// nce(&mut curves, 8.0);
+/// assert_eq!(curves, [0.125, 0.25, 0.5, 0.5]);
+/// let mut per_band = [0.0; 2];
+/// assert_eq!((tnce(&curves, 2, &mut per_band), per_band), (0.75, [0.25, 0.5]));
+/// ```
 pub fn tnce<T: RealSample>(curves: &[T], len: usize, out: &mut [f64]) -> f64 {
     let last = curves.chunks_exact(len.max(1)).filter_map(<[T]>::last);
     let mut total = 0.0;

@@ -36,6 +36,17 @@ pub fn gain(centres_hz: &[f64], band: usize, frequency_hz: f64) -> f64 {
 /// Band signals are real, so one complex inverse transform does for two, a + i b, with gains a + i b for its bins.
 ///
 /// Source: Rust et al. 2021; Wesfreid and Wickerhauser 1993 for the window.
+///
+/// ```
+/// let plan = echolake_dsp::filter_bank::FilterBankPlan::new(384, 96e3, &[5_000.0, 10_000.0, 20_000.0])?;
+/// let mut ir = vec![0.0; 384];
+/// ir[7] = 2.0;
+/// let mut bands = vec![0.0; plan.bands() * plan.len()];
+/// plan.run(&ir, &mut bands, &mut plan.scratch())?;
+/// let energy: f64 = bands.iter().map(|x| x * x).sum();
+/// assert!((energy - 4.0).abs() < 1e-9);
+/// # Ok::<(), echolake_dsp::Error>(())
+/// ```
 pub struct FilterBankPlan<T: RealSample> {
     len: usize,
     bands: usize,

@@ -18,6 +18,12 @@ pub struct FresnelZone {
 ///
 /// The paper's own four diameters fit no definition exactly; this one gives 227.6 to 535.5 mm at 2 kHz and
 /// 47.3 to 162.3 mm at 40 kHz over the measured pairs.
+///
+/// ```
+/// let above = [0.0, 0.0, 100.0];
+/// let zone = echolake_dsp::fresnel::first_fresnel_zone(above, above, 3_430.0, 343.0);
+/// assert!((zone.semi_major_mm - 75.0).abs() < 1e-9 && (zone.semi_minor_mm - 75.0).abs() < 1e-9);
+/// ```
 pub fn first_fresnel_zone(
     microphone: [f64; 3],
     speaker: [f64; 3],

@@ -6,6 +6,14 @@ pub fn direct_mm(microphone: [f64; 3], speaker: [f64; 3]) -> f64 {
 }
 
 /// Length of the path by the speaker's mirror image, mm.
+///
+/// ```
+/// use echolake_dsp::geometry::{direct_mm, image_mm, specular_point};
+///
+/// let (microphone, speaker) = ([0.0, 0.0, 20.0], [30.0, 0.0, 20.0]);
+/// assert_eq!((direct_mm(microphone, speaker), image_mm(microphone, speaker)), (30.0, 50.0));
+/// assert_eq!(specular_point(microphone, speaker), [15.0, 0.0]);
+/// ```
 pub fn image_mm(microphone: [f64; 3], speaker: [f64; 3]) -> f64 {
     direct_mm(microphone, mirrored(speaker))
 }

@@ -3,6 +3,12 @@
 mod picture;
 
 /// Heights in mm over a square, at the centres of its cells; origin at the square's centre.
+///
+/// ```
+/// let field = echolake_dsp::height_field::HeightField::from_fn(100.0, 4, |x, _| x / 10.0);
+/// assert_eq!((field.pitch_mm(), field.extent_mm()), (25.0, [-3.75, 3.75]));
+/// assert!((field.height_at(20.0, 0.0) - 2.0).abs() < 1e-9);
+/// ```
 #[derive(Debug, Clone, PartialEq)]
 pub struct HeightField {
     size_mm: f64,

@@ -8,6 +8,13 @@ use crate::Error;
 ///
 /// heights, out  `[side x side]`, row by row along x, y ascending
 ///
+/// ```
+/// let mut turned = [0; 4];
+/// echolake_dsp::heights::moved(&[1, 2, 3, 4], echolake_schema::Symmetry::Rot90, &mut turned)?;
+/// assert_eq!(turned, [3, 1, 4, 2]);
+/// # Ok::<(), echolake_dsp::Error>(())
+/// ```
+///
 /// # Errors
 /// [`Error::Setting`] if they are no square, [`Error::Length`] if `out` is not as long.
 pub fn moved<T: Copy>(heights: &[T], symmetry: Symmetry, out: &mut [T]) -> Result<(), Error> {

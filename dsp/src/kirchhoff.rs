@@ -22,6 +22,19 @@ const OVERSAMPLING: usize = 8;
 const PASS: f64 = 41.0 / 96.0;
 
 /// A relief and the points over it, ready to give the response of every pair of them.
+///
+/// ```
+/// use echolake_dsp::height_field::HeightField;
+/// use echolake_dsp::kirchhoff::KirchhoffPlan;
+///
+/// let flat = HeightField::from_fn(585.0, 32, |_, _| 0.0);
+/// let plan = KirchhoffPlan::new(&flat, &[[-100.0, 0.0, 200.0], [100.0, 0.0, 200.0]], 96e3, 384);
+/// let mut ir = [0.0; 384];
+/// plan.response([0, 1], 343.0, 0.0, &mut plan.scratch(), &mut ir)?;
+/// // Without a reflection, the direct sound alone: 0.2 m at 343 m/s are 56 samples.
+/// assert_eq!((0..384).max_by(|a, b| ir[*a].total_cmp(&ir[*b])), Some(56));
+/// # Ok::<(), echolake_dsp::Error>(())
+/// ```
 pub struct KirchhoffPlan {
     rate_hz: f64,
     /// Distances and cosines of each facet as seen from each point.

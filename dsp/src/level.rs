@@ -33,6 +33,11 @@ pub fn percentile(sorted: &[f64], percent: f64) -> f64 {
 }
 
 /// Mean of the values up to their 90th percentile, as in the paper's tables; None of none, NaN if one is.
+///
+/// ```
+/// let mean = echolake_dsp::level::p90_mean(&[1.0, 2.0, 3.0, 100.0], &mut Vec::new());
+/// assert_eq!(mean, Some(2.0));
+/// ```
 pub fn p90_mean(values: &[f64], scratch: &mut Vec<f64>) -> Option<f64> {
     scratch.clear();
     scratch.extend_from_slice(values);

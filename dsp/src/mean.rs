@@ -4,6 +4,14 @@ use crate::error::check_len;
 use crate::{Error, RealSample};
 
 /// Sum of equally long signals, in f64, for their mean.
+///
+/// ```
+/// let mut mean = echolake_dsp::mean::SignalMean::default();
+/// mean.add(&[1.0, 3.0])?;
+/// mean.add(&[3.0, 5.0])?;
+/// assert_eq!(mean.values().collect::<Vec<_>>(), [2.0, 4.0]);
+/// # Ok::<(), echolake_dsp::Error>(())
+/// ```
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct SignalMean {
     sums: Vec<f64>,

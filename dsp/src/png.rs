@@ -12,6 +12,11 @@ const COMPRESSION: u8 = 6;
 ///
 /// pixels  `[height x width]`, rows from the top, 0 black
 ///
+/// ```
+/// let file = echolake_dsp::png::grey(&[0, 255, 255, 0], 2);
+/// assert!(file.starts_with(b"\x89PNG"));
+/// ```
+///
 /// # Panics
 /// If `width` is 0.
 pub fn grey(pixels: &[u8], width: usize) -> Vec<u8> {

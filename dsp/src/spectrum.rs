@@ -13,6 +13,14 @@ use crate::{Error, RealSample};
 /// ir      `[len]`
 /// levels  `[len/2 + 1]`, 20 log10 |X_k|, X_k = sum_n x_n e^(-2 pi i k n / len), not scaled: of a response, that is
 ///         its gain, and a single sample of 1 is 0 dB throughout. Bin k is at k rate / len; nothing is minus infinity.
+///
+/// ```
+/// let plan = echolake_dsp::spectrum::SpectrumPlan::new(4)?;
+/// let mut levels = [f64::NAN; 3];
+/// plan.levels_db(&[0.0, 10.0, 0.0, 0.0], &mut levels, &mut plan.scratch())?;
+/// assert_eq!(levels, [20.0; 3]);
+/// # Ok::<(), echolake_dsp::Error>(())
+/// ```
 pub struct SpectrumPlan<T: RealSample> {
     len: usize,
     forward: Arc<dyn RealToComplex<T>>,

@@ -3,6 +3,19 @@
 use std::f64::consts::PI;
 
 /// A linear sine sweep.
+///
+/// ```
+/// let sweep = echolake_dsp::sweep::LinearSweep {
+///     rate_hz: 96e3,
+///     duration_secs: 0.5,
+///     low_hz: 2e3,
+///     high_hz: 40e3,
+///     fade_secs: 0.001,
+/// };
+/// let samples = sweep.samples();
+/// assert_eq!(samples.len(), 48_000);
+/// assert!(samples.iter().all(|x| x.abs() <= 1.0));
+/// ```
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct LinearSweep {
     /// Sampling rate, Hz.

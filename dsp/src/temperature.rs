@@ -40,6 +40,18 @@ pub fn resampling_ratio(celsius: f64, reference_celsius: f64) -> f64 {
 /// For rho >= 1 the kernel is read at m/rho - n, and all taps of one output have the same fraction of a sample.
 /// For rho < 1 it is read at m - rho n, and all taps of one *input* have. So one table of the kernel at whole steps
 /// from a fraction serves every ratio: outputs gather where they grow scarcer, inputs scatter where they do.
+///
+/// ```
+/// use echolake_dsp::temperature::{TemperatureCorrection, resampling_ratio, speed_of_sound};
+///
+/// let rho = resampling_ratio(30.0, 20.0);
+/// assert!((speed_of_sound(30.0) / speed_of_sound(20.0) - rho).abs() < 1e-12);
+/// let (mut warm, mut corrected) = ([0.0; 120], [0.0; 120]);
+/// warm[100] = 1.0;
+/// TemperatureCorrection::<f64>::new().run(&warm, rho, &mut corrected);
+/// // In air of 20 C, what arrived after 100 samples arrives after 101.7.
+/// assert_eq!((0..120).max_by(|a, b| corrected[*a].total_cmp(&corrected[*b])), Some(102));
+/// ```
 #[derive(Debug, Clone)]
 pub struct TemperatureCorrection<T> {
     table: Arc<[KernelPiece<T>]>,

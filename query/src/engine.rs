@@ -44,6 +44,24 @@ const METADATA_BYTES: usize = 256 << 20;
 const SPILL_BYTES: u64 = 16 << 30;
 
 /// Answers the queries of many sessions on one lake.
+///
+/// ```
+/// use std::sync::Arc;
+///
+/// use echolake_lake::{Lake, ReferenceSurfaces};
+/// use echolake_query::{EngineClient, EngineLimits, Error, QueryEngine, QueryQuota};
+/// use echolake_schema::Rig;
+///
+/// # tokio::runtime::Runtime::new()?.block_on(async {
+/// let lake = Lake::open_or_create("memory://", &Rig::paper(), &ReferenceSurfaces::default()).await?;
+/// let engine = QueryEngine::new(&lake, EngineLimits::default())?;
+/// let client = EngineClient::new("guest", QueryQuota { rows: Some(1), ..QueryQuota::default() });
+/// let mut answer = engine.session(&Arc::new(client)).query("select * from points").await?;
+/// assert!(matches!(answer.next().await, Err(Error::RowLimit { limit: 1 })));
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// # })?;
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 #[derive(Clone)]
 pub struct QueryEngine(OpaqueValue<EngineState>);
 
@@ -88,6 +106,17 @@ impl SqlFunction {
 }
 
 /// A client with its quota. All sessions of a token share one.
+///
+/// ```
+/// use echolake_query::{EngineClient, QueryQuota};
+///
+/// let client = EngineClient::new("guest", QueryQuota { concurrent: Some(1), ..QueryQuota::default() });
+/// let permit = client.place()?;
+/// assert!(client.place().is_err());
+/// drop(permit);
+/// assert!(client.place().is_ok());
+/// # Ok::<(), echolake_query::Error>(())
+/// ```
 #[derive(Debug)]
 pub struct EngineClient {
     name: String,

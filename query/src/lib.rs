@@ -1,16 +1,25 @@
 //! SQL over the lake's tables: read-only, one snapshot of the lake per query.
 //!
-//! ```no_run,standalone_crate
-//! # async fn example() -> Result<(), Box<dyn std::error::Error>> {
-//! let lake = echolake_lake::Lake::open("lake").await?;
-//! let session = echolake_query::Session::new(&lake)?;
-//! let mut answer = session.query("select surface_id, state from runs").await?;
-//! println!("{} columns", answer.schema.fields().len());
+//! ```
+//! use echolake_lake::{Lake, ReferenceSurfaces};
+//! use echolake_query::Session;
+//! use echolake_query::output::{AnswerFormat, AnswerWriter};
+//! use echolake_schema::Rig;
+//!
+//! # tokio::runtime::Runtime::new()?.block_on(async {
+//! let lake = Lake::open_or_create("memory://", &Rig::paper(), &ReferenceSurfaces::default()).await?;
+//! let session = Session::new(&lake)?;
+//! let mut answer = session.query("select pair_id, direct_mm from pairs order by pair_id limit 2").await?;
+//! let mut csv = Vec::new();
+//! let mut writer = AnswerWriter::new(AnswerFormat::Csv, &answer.schema, &mut csv)?;
 //! while let Some(batch) = answer.next().await? {
-//!     println!("{} rows more", batch.num_rows());
+//!     writer.write(&batch)?;
 //! }
-//! # Ok(())
-//! # }
+//! assert_eq!(writer.finish()?, 2);
+//! assert_eq!(csv, b"pair_id,direct_mm\n0,75.0\n1,150.0\n");
+//! # Ok::<(), Box<dyn std::error::Error>>(())
+//! # })?;
+//! # Ok::<(), Box<dyn std::error::Error>>(())
 //! ```
 
 mod as_of;

@@ -21,6 +21,22 @@ impl Session {
     /// Returns the query `select` with a predicate appended: `select` ends in `where`, or in `and` after it. The query
     /// is not run, and its permissions are left to the gate; this only checks that `predicate` is one expression.
     ///
+    /// ```
+    /// use echolake_lake::{Lake, ReferenceSurfaces};
+    /// use echolake_query::{PredicateForm, Session};
+    /// use echolake_schema::Rig;
+    ///
+    /// # tokio::runtime::Runtime::new()?.block_on(async {
+    /// let lake = Lake::open_or_create("memory://", &Rig::paper(), &ReferenceSurfaces::default()).await?;
+    /// let session = Session::new(&lake)?;
+    /// let selecting = |predicate| session.selecting("select 1 from pairs where", predicate, PredicateForm::Comparisons);
+    /// assert_eq!(selecting("pair_id < 9")?, "select 1 from pairs where (\npair_id < 9\n)");
+    /// assert!(selecting("true) or (true").is_err());
+    /// # Ok::<(), Box<dyn std::error::Error>>(())
+    /// # })?;
+    /// # Ok::<(), Box<dyn std::error::Error>>(())
+    /// ```
+    ///
     /// # Errors
     /// [`Error::Query`] if the predicate is none, or is not of the form.
     pub fn selecting(&self, select: &str, predicate: &str, form: PredicateForm) -> Result<String, Error> {

@@ -172,6 +172,22 @@ impl Session {
 
     /// Plans and runs a query.
     ///
+    /// ```
+    /// use echolake_lake::{Lake, ReferenceSurfaces};
+    /// use echolake_query::{Error, Session};
+    /// use echolake_schema::Rig;
+    ///
+    /// # tokio::runtime::Runtime::new()?.block_on(async {
+    /// let lake = Lake::open_or_create("memory://", &Rig::paper(), &ReferenceSurfaces::default()).await?;
+    /// let session = Session::new(&lake)?;
+    /// let mut answer = session.query("select point_id from points where z_mm = 474").await?;
+    /// assert_eq!(answer.next().await?.map(|batch| batch.num_rows()), Some(1));
+    /// assert!(matches!(session.query("drop table runs").await, Err(Error::NotReading { .. })));
+    /// # Ok::<(), Box<dyn std::error::Error>>(())
+    /// # })?;
+    /// # Ok::<(), Box<dyn std::error::Error>>(())
+    /// ```
+    ///
     /// # Errors
     /// [`Error::Query`] if it is invalid, [`Error::NotReading`] if it would change something, [`Error::Lake`] if the
     /// lake cannot be read, [`Error::Busy`] if the client has no permit left, and those of [`QueryAnswer::next`].
@@ -182,6 +198,21 @@ impl Session {
     }
 
     /// Plans a query.
+    ///
+    /// ```
+    /// use echolake_lake::{Lake, ReferenceSurfaces};
+    /// use echolake_schema::Rig;
+    ///
+    /// # tokio::runtime::Runtime::new()?.block_on(async {
+    /// let lake = Lake::open_or_create("memory://", &Rig::paper(), &ReferenceSurfaces::default()).await?;
+    /// let session = echolake_query::Session::new(&lake)?;
+    /// let prepared = session.prepare("select pair_id from pairs where direct_mm > $1").await?;
+    /// assert_eq!(prepared.parameters()?, [Some(arrow::datatypes::DataType::Float64)]);
+    /// assert_eq!(prepared.schema().field(0).name(), "pair_id");
+    /// # Ok::<(), Box<dyn std::error::Error>>(())
+    /// # })?;
+    /// # Ok::<(), Box<dyn std::error::Error>>(())
+    /// ```
     ///
     /// # Errors
     /// As [`Session::query`].

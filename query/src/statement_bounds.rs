@@ -66,6 +66,14 @@ struct OpenBracket {
 
 /// Accepts statements whose shape is cheap to parse and plan.
 ///
+/// ```
+/// use datafusion::sql::sqlparser::dialect::GenericDialect;
+/// use echolake_query::check_statement_bounds;
+///
+/// assert!(check_statement_bounds("select 1 + 1", &GenericDialect {}).is_ok());
+/// assert!(check_statement_bounds(&format!("select 1{}", " + 1".repeat(2000)), &GenericDialect {}).is_err());
+/// ```
+///
 /// # Errors
 /// [`Error::Query`] with the exceeded limit for all others.
 pub fn check_statement_bounds(sql: &str, dialect: &dyn Dialect) -> Result<(), Error> {

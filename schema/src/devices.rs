@@ -3,6 +3,15 @@
 use serde::{Deserialize, Serialize};
 
 /// A rig's devices: all of them simulated, or none, because simulated devices have a clock of their own.
+///
+/// ```
+/// use echolake_schema::{Rig, devices::SensorParams};
+///
+/// let rig = Rig::from_toml("[devices.sensor]\nkind = \"simulated\"")?;
+/// assert_eq!(rig.devices.sensor, SensorParams::Simulated);
+/// assert!(rig.devices.are_simulated());
+/// # Ok::<(), echolake_schema::Error>(())
+/// ```
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct DeviceParams {

@@ -36,6 +36,15 @@ pub struct Pair {
 }
 
 /// Description of a rig's grid: square layers, or single points.
+///
+/// ```
+/// use echolake_schema::grid::{GridParams, Layer, PairRule};
+///
+/// let layers = vec![Layer { points_per_side: 2, pitch_mm: 75.0, height_mm: 124.0 }];
+/// let params = GridParams { pairs: PairRule::Ordered, clearance_mm: 40.0, layers, points_mm: Vec::new() };
+/// assert_eq!(params.build()?.pairs().len(), 4 * 3);
+/// # Ok::<(), echolake_schema::Error>(())
+/// ```
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(from = "GridText")]
 pub struct GridParams {
@@ -98,6 +107,18 @@ pub enum PairRule {
 }
 
 /// The points and pairs of a rig.
+///
+/// ```
+/// use echolake_schema::Rig;
+///
+/// let grid = Rig::paper().grid()?;
+/// let microphone = grid.parse_point("0/0/0")?;
+/// let speaker = grid.parse_point("0 0 474")?;
+/// let pair = grid.parse_pair(microphone, speaker)?;
+/// assert_eq!(grid.pair(pair).map(|pair| pair.speaker), Some(speaker.id));
+/// assert_eq!(microphone.position_mm, [-187.5, -187.5, 124.0]);
+/// # Ok::<(), echolake_schema::Error>(())
+/// ```
 #[derive(Debug, Clone)]
 pub struct Grid {
     points: Vec<Point>,

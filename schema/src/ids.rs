@@ -13,6 +13,15 @@ const RUN_MAX: usize = 128;
 /// Name of one side of a panel (`0015_0`), of a reference (`flat`) or of anything else measured.
 ///
 /// One to 64 of `A-Z a-z 0-9 _ -`, beginning with a letter or a digit: it names folders and files.
+///
+/// ```
+/// use echolake_schema::SurfaceId;
+///
+/// let id: SurfaceId = "0015_1".parse()?;
+/// assert_eq!((id.panel(), id.side()), ("0015", Some(1)));
+/// assert!("../etc".parse::<SurfaceId>().is_err());
+/// # Ok::<(), echolake_schema::Error>(())
+/// ```
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[serde(try_from = "String", into = "String")]
 pub struct SurfaceId(String);
@@ -20,6 +29,15 @@ pub struct SurfaceId(String);
 /// Name of one run: `<start, UTC>-<surface>-<tag>`, so that names sort by time.
 ///
 /// One to 128 of `A-Z a-z 0-9 _ -`, beginning with a letter or a digit.
+///
+/// ```
+/// use echolake_schema::{RunId, Timestamp};
+///
+/// let run = RunId::compose(Timestamp::parse("2026-01-05T08:00:00Z")?, &"flat".parse()?, 0x7c1e)?;
+/// assert_eq!(run.as_str(), "20260105T080000Z-flat-0000000000007c1e");
+/// assert_eq!(run.untagged(), "20260105T080000Z-flat");
+/// # Ok::<(), echolake_schema::Error>(())
+/// ```
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[serde(try_from = "String", into = "String")]
 pub struct RunId(String);

@@ -10,6 +10,22 @@ use crate::{Error, RunId, SurfaceId, Timestamp};
 pub const RUN_FORMAT: u32 = 1;
 
 /// Metadata `echolake.run`: name, surface, start, software, rig and origin of a run.
+///
+/// ```
+/// use echolake_schema::manifest::{Origin, RunManifest};
+/// use echolake_schema::{RunId, Timestamp};
+///
+/// let manifest = RunManifest {
+///     run_id: "20260105T080000Z-flat-7c1e".parse()?,
+///     surface_id: "flat".parse()?,
+///     started: Timestamp::parse("2026-01-05T08:00:00Z")?,
+///     software: "echolake 0.1.0".into(),
+///     rig: "paper".into(),
+///     origin: Origin::Simulated,
+/// };
+/// assert_eq!(RunManifest::from_metadata(&manifest.to_metadata()), Ok(manifest));
+/// # Ok::<(), echolake_schema::Error>(())
+/// ```
 #[derive(Debug, Clone, PartialEq)]
 pub struct RunManifest {
     /// The run's name.
@@ -59,6 +75,14 @@ pub struct RunEnd {
 }
 
 /// Attachment `surface.json`: description of a surface.
+///
+/// ```
+/// use echolake_schema::SurfaceRecord;
+///
+/// let record: SurfaceRecord = serde_json::from_str(r#"{"typology": "brick", "flat_reference": "flat"}"#)?;
+/// assert_eq!((record.typology.as_str(), record.foam_reference), ("brick", None));
+/// # Ok::<(), serde_json::Error>(())
+/// ```
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, Default)]
 #[serde(default)]
 pub struct SurfaceRecord {

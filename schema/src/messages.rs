@@ -8,6 +8,15 @@ include!("messages/echolake.v1.rs");
 pub const FILE_DESCRIPTOR_SET: &[u8] = include_bytes!("messages/echolake.v1.fds");
 
 /// A message that a run's file can hold.
+///
+/// ```
+/// use echolake_schema::messages::{Measurement, Message, Verdict};
+/// use prost::Message as _;
+///
+/// assert_eq!(Measurement::FULL_NAME, "echolake.v1.Measurement");
+/// let message = Measurement { pair_id: 7, verdict: Verdict::Accepted.into(), ..Measurement::default() };
+/// assert_eq!(Measurement::decode(&*message.encode_to_vec()), Ok(message));
+/// ```
 pub trait Message: prost::Message + Default {
     /// Its full name, the name of its MCAP schema.
     const FULL_NAME: &'static str;

@@ -8,16 +8,41 @@ use serde::{Deserialize, Serialize};
 use crate::Error;
 
 /// Temperature of air in degrees Celsius, -60 to 80: the range of a sensor in a room or a cold store.
+///
+/// ```
+/// use echolake_schema::Celsius;
+///
+/// assert_eq!(Celsius::new(21.5)?.get(), 21.5);
+/// assert!(Celsius::new(294.65).is_err(), "kelvin are refused");
+/// # Ok::<(), echolake_schema::Error>(())
+/// ```
 #[derive(Debug, Clone, Copy, PartialEq, PartialOrd, Serialize, Deserialize)]
 #[serde(try_from = "f64", into = "f64")]
 pub struct Celsius(f64);
 
 /// Samples per second, 1 Hz to 10 MHz.
+///
+/// ```
+/// use echolake_schema::SampleRate;
+///
+/// assert_eq!(SampleRate::new(96e3)?.get(), 96_000.0);
+/// assert!(SampleRate::new(0.0).is_err());
+/// # Ok::<(), echolake_schema::Error>(())
+/// ```
 #[derive(Debug, Clone, Copy, PartialEq, PartialOrd, Serialize, Deserialize)]
 #[serde(try_from = "f64", into = "f64")]
 pub struct SampleRate(f64);
 
 /// Nanoseconds since 1970-01-01 UTC.
+///
+/// ```
+/// use echolake_schema::Timestamp;
+///
+/// let start = Timestamp::parse("2026-01-05T09:00:00+01:00")?;
+/// assert_eq!((start.compact().as_str(), start.micros()), ("20260105T080000Z", 1_767_600_000_000_000));
+/// assert_eq!(start.plus_secs(0.5).to_string(), "2026-01-05T08:00:00.500Z");
+/// # Ok::<(), echolake_schema::Error>(())
+/// ```
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 pub struct Timestamp(pub i64);
 

@@ -6,6 +6,15 @@ use crate::grid::{Grid, Pair};
 use crate::{PairId, PointId};
 
 /// One of D4's eight; acts on (x, y).
+///
+/// ```
+/// use echolake_schema::{Rig, Symmetry};
+///
+/// assert_eq!(Symmetry::Rot90.apply([1.0, 2.0, 3.0]), [-2.0, 1.0, 3.0]);
+/// let moved = Rig::paper().grid()?.moved_pairs(Symmetry::Rot180);
+/// assert_eq!(moved.map(|pairs| pairs.len()), Some(2951));
+/// # Ok::<(), echolake_schema::Error>(())
+/// ```
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Symmetry {

@@ -30,6 +30,15 @@ const CONFIG: &str = "lake.toml";
 impl Lake {
     /// Opens an existing lake.
     ///
+    /// ```
+    /// use echolake_lake::{Error, Lake};
+    ///
+    /// # tokio::runtime::Runtime::new()?.block_on(async {
+    /// assert!(matches!(Lake::open("memory://").await, Err(Error::NoLake { .. })));
+    /// # });
+    /// # Ok::<(), std::io::Error>(())
+    /// ```
+    ///
     /// # Errors
     /// [`Error::NoLake`], [`Error::Newer`], [`Error::Config`], or what the store says.
     pub async fn open(url: &str) -> Result<Self> {
@@ -42,6 +51,20 @@ impl Lake {
 
     /// Opens a lake, or makes one for this rig if the location is empty; then makes the tables that are missing, in a
     /// build that has tables.
+    ///
+    /// ```
+    /// use echolake_lake::{Error, Lake, ReferenceSurfaces};
+    /// use echolake_schema::Rig;
+    ///
+    /// # tokio::runtime::Runtime::new()?.block_on(async {
+    /// let lake = Lake::open_or_create("memory://", &Rig::paper(), &ReferenceSurfaces::default()).await?;
+    /// assert_eq!((lake.rig().name.as_str(), lake.grid().pairs().len()), ("paper", 2951));
+    /// let other = Rig::from_toml("[impulse_response]\nlength = 400")?;
+    /// assert!(matches!(lake.fits(&other), Err(Error::OtherRig { .. })));
+    /// # Ok::<(), Box<dyn std::error::Error>>(())
+    /// # })?;
+    /// # Ok::<(), Box<dyn std::error::Error>>(())
+    /// ```
     ///
     /// # Errors
     /// As [`Lake::open`]; [`Error::OtherRig`] if the lake exists and was made for another rig, and
@@ -145,6 +168,12 @@ impl Lake {
     }
 
     /// Path of a run's file.
+    ///
+    /// ```
+    /// let path = echolake_lake::Lake::run_path(&"flat".parse()?, &"20260105T080000Z-flat-7c1e".parse()?);
+    /// assert_eq!(path.as_ref(), "runs/flat/20260105T080000Z-flat-7c1e.mcap");
+    /// # Ok::<(), echolake_schema::Error>(())
+    /// ```
     pub fn run_path(surface: &SurfaceId, run: &RunId) -> Path {
         Path::from(format!("runs/{surface}/{run}.mcap"))
     }

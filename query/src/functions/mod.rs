@@ -35,6 +35,12 @@ use rig::RigFacts;
 use scalar::udf;
 
 /// All functions of a lake, made once for all its sessions.
+///
+/// ```
+/// let functions = echolake_query::FunctionSet::all(&echolake_schema::Rig::paper())?;
+/// assert!(functions.names().any(|name| name == "band_energy"));
+/// # Ok::<(), echolake_schema::Error>(())
+/// ```
 pub struct FunctionSet {
     scalar: Vec<Arc<ScalarUDF>>,
     aggregate: Vec<Arc<AggregateUDF>>,

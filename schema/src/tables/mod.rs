@@ -19,6 +19,16 @@ use self::definitions::TableDefinition;
 use crate::Rig;
 
 /// A table of the lake.
+///
+/// ```
+/// use echolake_schema::Rig;
+/// use echolake_schema::tables::{Table, UNIT};
+///
+/// let schema = Table::Pairs.schema(&Rig::paper());
+/// assert_eq!(schema.field(0).name(), "pair_id");
+/// assert_eq!(schema.field_with_name("direct_mm").map(|field| field.metadata()[UNIT].as_str()).ok(), Some("mm"));
+/// assert_eq!(Table::by_name("tnce_d4"), Some(Table::TnceD4));
+/// ```
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum Table {
     /// One row per run, with its record of the surface.

@@ -32,6 +32,15 @@ const STATS_COLUMNS: usize = 32;
 const STATS_TEXT: usize = 64;
 
 /// Rows on their way into a file, a batch at a time.
+///
+/// ```
+/// use echolake_lake::FileEncoder;
+/// use echolake_schema::{Rig, tables::Table};
+///
+/// let empty = FileEncoder::new(Table::Runs, Table::Runs.schema(&Rig::paper())).finish()?;
+/// assert_eq!(empty, echolake_lake::encode(Table::Runs, &Table::Runs.schema(&Rig::paper()), &[])?);
+/// # Ok::<(), echolake_lake::Error>(())
+/// ```
 pub struct FileEncoder {
     table: Table,
     schema: SchemaRef,

@@ -57,6 +57,22 @@ impl AsyncFileReader for StoredFile {
 impl Lake {
     /// Rows of a file, by their places in it, with the named columns or all. Pages of other rows are not fetched.
     ///
+    /// ```
+    /// use echolake_lake::{Lake, ReferenceSurfaces};
+    /// use echolake_schema::{Rig, tables::Table};
+    /// use futures::TryStreamExt as _;
+    ///
+    /// # tokio::runtime::Runtime::new()?.block_on(async {
+    /// let lake = Lake::open_or_create("memory://", &Rig::paper(), &ReferenceSurfaces::default()).await?;
+    /// let snapshot = lake.snapshot().await?;
+    /// let rows = lake.rows(Table::Pairs, &snapshot.files(Table::Pairs)[0], &["pair_id", "direct_mm"], 10..13).await?;
+    /// let batches: Vec<_> = rows.try_collect().await?;
+    /// assert_eq!((batches[0].num_rows(), batches[0].num_columns()), (3, 2));
+    /// # Ok::<(), echolake_lake::Error>(())
+    /// # })?;
+    /// # Ok::<(), Box<dyn std::error::Error>>(())
+    /// ```
+    ///
     /// # Errors
     /// [`Error::DataFile`] if the file is not what its log says, also in the stream.
     pub async fn rows(

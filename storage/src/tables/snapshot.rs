@@ -14,6 +14,15 @@ use serde_json::{Value, json};
 use crate::{CommitLog, DataFile, Result, RunPart};
 
 /// Parsed name of a file in `tables/`.
+///
+/// ```
+/// use echolake_lake::FileName;
+///
+/// let name = FileName::Rows { surface: "flat".parse()?, run: "r1".parse()?, derivation: "ab".into() };
+/// assert_eq!(name.compose(), "flat.r1.ab.parquet");
+/// assert_eq!(FileName::parse(&"tables/nce/flat.r1.ab.parquet".into()), Some(name));
+/// # Ok::<(), echolake_schema::Error>(())
+/// ```
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum FileName {
     /// Rows that come from the rig alone.

@@ -1,0 +1,178 @@
+//! Cost of each kernel, and of the transforms it cannot do without: `just bench kernels`, or `just bench kernels NCE`
+//! for those whose name contains it.
+
+use std::hint::black_box;
+
+use criterion::{BenchmarkId, Criterion, Throughput, criterion_group, criterion_main};
+use echolake_dsp::Error;
+use echolake_dsp::chain::{DerivationPlan, MeasurementParams, MeasurementPlan, raw_len};
+use echolake_dsp::deconvolution::{DeconvolutionParams, DeconvolutionPlan, TransformLength};
+use echolake_dsp::energy::{cumulative_energy, nce, tnce};
+use echolake_dsp::filter_bank::FilterBankPlan;
+use echolake_dsp::sweep::LinearSweep;
+use echolake_dsp::temperature::{TemperatureCorrection, resampling_ratio};
+use realfft::RealFftPlanner;
+use realfft::num_complex::Complex;
+use rustfft::FftPlanner;
+
+const RATE_HZ: f64 = 96e3;
+const LOW_HZ: f64 = 2e3;
+const HIGH_HZ: f64 = 40e3;
+const FLOOR_DB: f64 = -60.0;
+const REFERENCE_CELSIUS: f64 = 20.0;
+const IR_LEN: usize = 384;
+const CENTRES_HZ: [f64; 5] = [2_500.0, 5_000.0, 10_000.0, 20_000.0, 40_000.0];
+
+criterion_group!(kernels, transforms, deconvolution, temperature, measurement, filter_bank, energy, derivation);
+criterion_main!(kernels);
+
+/// The sweep, and what a microphone hears of it 90 samples later.
+fn recordings() -> [Vec<f32>; 2] {
+    let sweep =
+        LinearSweep { rate_hz: RATE_HZ, duration_secs: 0.5, low_hz: LOW_HZ, high_hz: HIGH_HZ, fade_secs: 0.001 };
+    let loopback: Vec<f32> = sweep.samples().into_iter().map(|x| x as f32).collect();
+    let recording = (0..loopback.len()).map(|n| if n < 90 { 0.0 } else { 0.3 * loopback[n - 90] }).collect();
+    [recording, loopback]
+}
+
+/// A response as long as the paper's.
+fn response() -> Vec<f32> {
+    let [_, loopback] = recordings();
+    loopback[..IR_LEN].to_vec()
+}
+
+/// What the chain has to be compared with: transforms of recording and loopback, one by one and as one.
+fn transforms(criterion: &mut Criterion) {
+    let [recording, loopback] = recordings();
+    let n = recording.len();
+    let mut group = criterion.benchmark_group("transform");
+    group.throughput(Throughput::Elements(n as u64));
+    let forward = RealFftPlanner::<f32>::new().plan_fft_forward(n);
+    let (mut input, mut spectrum) = (forward.make_input_vec(), forward.make_output_vec());
+    let mut work = forward.make_scratch_vec();
+    group.bench_function(BenchmarkId::new("two_real", n), |bencher| {
+        bencher.iter(|| {
+            for signal in [&recording, &loopback] {
+                input.copy_from_slice(signal);
+                forward.process_with_scratch(&mut input, &mut spectrum, &mut work).expect("lengths are the plan's");
+                black_box(&spectrum);
+            }
+        });
+    });
+    let joint = FftPlanner::<f32>::new().plan_fft_forward(n);
+    let mut signals = vec![Complex::default(); n];
+    let mut work = vec![Complex::default(); joint.get_inplace_scratch_len()];
+    group.bench_function(BenchmarkId::new("one_complex", n), |bencher| {
+        bencher.iter(|| {
+            for (z, (x, s)) in signals.iter_mut().zip(recording.iter().zip(&loopback)) {
+                *z = Complex::new(*x, *s);
+            }
+            joint.process_with_scratch(&mut signals, &mut work);
+            black_box(&signals);
+        });
+    });
+}
+
+fn deconvolution(criterion: &mut Criterion) {
+    let [recording, loopback] = recordings();
+    let n = recording.len();
+    let params = |length| DeconvolutionParams {
+        recording_len: n,
+        output_len: raw_len(IR_LEN, REFERENCE_CELSIUS),
+        rate_hz: RATE_HZ,
+        low_hz: LOW_HZ,
+        high_hz: HIGH_HZ,
+        floor_db: FLOOR_DB,
+        length,
+    };
+    let mut group = criterion.benchmark_group("deconvolution");
+    group.throughput(Throughput::Elements(n as u64));
+    for (name, length) in [("fast", TransformLength::Fast), ("exact", TransformLength::Exact)] {
+        let plan = DeconvolutionPlan::<f32>::new(params(length)).expect("settings of the paper");
+        let (mut scratch, mut ir) = (plan.scratch(), vec![0.0; plan.output_len()]);
+        group.bench_function(BenchmarkId::new(name, n), |bencher| {
+            bencher.iter(|| plan.run(black_box(&recording), &loopback, &mut ir, &mut scratch));
+        });
+    }
+}
+
+fn temperature(criterion: &mut Criterion) {
+    let [_, loopback] = recordings();
+    let correction = TemperatureCorrection::<f32>::new();
+    let mut corrected = vec![0.0; IR_LEN];
+    let mut group = criterion.benchmark_group("temperature");
+    group.throughput(Throughput::Elements(IR_LEN as u64));
+    // Warmer than the reference, outputs gather inputs; colder, inputs scatter.
+    for (name, celsius) in [("gather", 23.7), ("scatter", 15.0)] {
+        let rho = resampling_ratio(celsius, REFERENCE_CELSIUS);
+        let raw = &loopback[..raw_len(IR_LEN, REFERENCE_CELSIUS)];
+        group.bench_function(BenchmarkId::new(name, IR_LEN), |bencher| {
+            bencher.iter(|| correction.run(black_box(raw), rho, &mut corrected));
+        });
+    }
+}
+
+fn measurement(criterion: &mut Criterion) {
+    let [recording, loopback] = recordings();
+    let n = recording.len();
+    let plan = MeasurementPlan::<f32>::new(&MeasurementParams {
+        recording_len: n,
+        ir_len: IR_LEN,
+        rate_hz: RATE_HZ,
+        low_hz: LOW_HZ,
+        high_hz: HIGH_HZ,
+        floor_db: FLOOR_DB,
+        reference_celsius: REFERENCE_CELSIUS,
+    })
+    .expect("settings of the paper");
+    let (mut scratch, mut ir) = (plan.scratch(), vec![0.0; IR_LEN]);
+    let mut group = criterion.benchmark_group("measurement");
+    group.throughput(Throughput::Elements(n as u64));
+    group.bench_function(BenchmarkId::new("recording_to_response", n), |bencher| {
+        bencher.iter(|| plan.ir(black_box(&recording), &loopback, 23.7, &mut ir, &mut scratch));
+    });
+}
+
+fn filter_bank(criterion: &mut Criterion) {
+    let ir = response();
+    let plan = FilterBankPlan::<f32>::new(IR_LEN, RATE_HZ, &CENTRES_HZ).expect("bands of the paper");
+    let (mut scratch, mut bands) = (plan.scratch(), vec![0.0; plan.bands() * IR_LEN]);
+    let mut energies = vec![0.0; plan.bands()];
+    let mut group = criterion.benchmark_group("filter_bank");
+    group.throughput(Throughput::Elements(IR_LEN as u64));
+    group.bench_function(BenchmarkId::new("bands", IR_LEN), |bencher| {
+        bencher.iter(|| plan.run(black_box(&ir), &mut bands, &mut scratch));
+    });
+    group.bench_function(BenchmarkId::new("energies", IR_LEN), |bencher| {
+        bencher.iter(|| plan.energies(black_box(&ir), &mut energies, &mut scratch));
+    });
+}
+
+fn energy(criterion: &mut Criterion) {
+    let bands = response().repeat(CENTRES_HZ.len());
+    let (mut curves, mut per_band) = (vec![0.0; bands.len()], [0.0; CENTRES_HZ.len()]);
+    let mut group = criterion.benchmark_group("energy");
+    group.throughput(Throughput::Elements(bands.len() as u64));
+    group.bench_function(BenchmarkId::new("nce", IR_LEN), |bencher| {
+        bencher.iter(|| {
+            cumulative_energy(black_box(&bands), &mut curves, IR_LEN);
+            nce(&mut curves, 3.0);
+            tnce(&curves, IR_LEN, &mut per_band)
+        });
+    });
+}
+
+fn derivation(criterion: &mut Criterion) {
+    let (ir, foam) = (response(), vec![0.0; IR_LEN]);
+    let plan = DerivationPlan::<f32>::new(IR_LEN, RATE_HZ, &CENTRES_HZ).expect("bands of the paper");
+    let (mut scratch, mut derived) = (plan.scratch(), plan.derived());
+    let energies = plan.flat_energies(&ir, &mut scratch).expect("a response");
+    let mut group = criterion.benchmark_group("derivation");
+    group.throughput(Throughput::Elements(IR_LEN as u64));
+    group.bench_function(BenchmarkId::new("response_to_curves", IR_LEN), |bencher| {
+        bencher.iter(|| -> Result<(), Error> { plan.run(black_box(&ir), &foam, &ir, &mut derived, &mut scratch) });
+    });
+    group.bench_function(BenchmarkId::new("with_known_flat", IR_LEN), |bencher| {
+        bencher.iter(|| plan.run_over(black_box(&ir), &foam, &energies, &mut derived, &mut scratch));
+    });
+}
