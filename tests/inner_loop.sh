@@ -16,6 +16,8 @@ restore() {
 }
 trap restore EXIT
 TIMEFORMAT=%R
+# For what goes wrong, because stderr is timed.
+exec 3>&2
 
 # Beside the command, a member has the features of the whole workspace, and nothing else is compiled for it.
 tests() {
@@ -23,7 +25,7 @@ tests() {
     package=$(sed -n 's/^name = "\(.*\)"/\1/p' "$1/Cargo.toml" | head -n 1)
     shift
     cargo test --release -p echolake -p "$package" --lib --locked "$@" >"$logs/cargo.log" 2>&1 ||
-        { cat "$logs/cargo.log" >&2 && false; }
+        { cat "$logs/cargo.log" >&3 && false; }
 }
 
 echo "| a line more in | compiles for, s | tests run for, s |"
