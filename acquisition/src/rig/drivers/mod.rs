@@ -22,33 +22,31 @@ use crate::rig::{AudioInterface, Error, RigDevices};
 /// [`Error::Device`] if one does not answer, is not built in, or is simulated beside real ones.
 pub fn open(rig: &Rig) -> Result<Option<RigDevices>, Error> {
     let DeviceParams { audio, sensor, robots } = &rig.devices;
+    if rig.devices.are_simulated() {
+        return Ok(None);
+    }
     // Every kind is named, so that a new one cannot become a simulation.
-    let audio = match audio {
-        AudioParams::Simulated => None,
-        AudioParams::Alsa(params) => Some(params),
-    };
-    let sensor = match sensor {
-        SensorParams::Simulated => None,
-        SensorParams::Serial(params) => Some(params),
-    };
-    let robots = match robots {
-        RobotsParams::Simulated => None,
-        RobotsParams::Rosbridge(params) => Some(params),
-    };
-    let (audio, sensor, robots) = match (audio, sensor, robots) {
-        (None, None, None) => return Ok(None),
-        (Some(audio), Some(sensor), Some(robots)) => (audio, sensor, robots),
-        _ => {
-            let reason = "has simulated devices beside real ones; hint: audio, sensor and robots all need a `kind`";
-            return Err(Error::Device { device: "rig", reason: reason.to_owned() });
-        }
-    };
     Ok(Some(RigDevices {
-        audio: audio_interface(audio, rig.sweep.rate_hz.get())?,
-        sensor: Box::new(serial::SerialSensor::open(sensor)?),
-        robots: Box::new(rosbridge::RosbridgeRobots::connect(robots, Cell::of(rig))?),
+        audio: match audio {
+            AudioParams::Simulated => return Err(simulated_beside_real()),
+            AudioParams::Alsa(params) => audio_interface(params, rig.sweep.rate_hz.get())?,
+        },
+        sensor: match sensor {
+            SensorParams::Simulated => return Err(simulated_beside_real()),
+            SensorParams::Serial(params) => Box::new(serial::SerialSensor::open(params)?),
+        },
+        robots: match robots {
+            RobotsParams::Simulated => return Err(simulated_beside_real()),
+            RobotsParams::Rosbridge(params) => Box::new(rosbridge::RosbridgeRobots::connect(params, Cell::of(rig))?),
+        },
         origin: Origin::Measured,
     }))
+}
+
+// A rig file that mixes them is refused when it is read.
+fn simulated_beside_real() -> Error {
+    let reason = "has simulated devices beside real ones; hint: audio, sensor and robots all need a `kind`";
+    Error::Device { device: "rig", reason: reason.to_owned() }
 }
 
 /// An interface through ALSA.
