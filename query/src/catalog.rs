@@ -19,6 +19,7 @@ use datafusion::prelude::SessionContext;
 use datafusion::sql::parser::Statement;
 use echolake_lake::{DataFile, Lake, LakeMoment, LakeSnapshot, VisibleRun};
 use echolake_schema::tables::Table;
+use quick_cache::sync::Cache;
 
 use crate::as_of::{self, PastTableName};
 use crate::mcap::{self, Contents};
@@ -29,7 +30,7 @@ use crate::{Error, error};
 /// Time for which a new layout of the same rows may go undetected; vacuum keeps replaced files for an hour at least.
 const LAYOUT_SEEN: Duration = Duration::from_secs(30);
 /// Maximum number of cached past tables.
-const PAST_KEPT: usize = 32;
+const PAST_TABLES: usize = 32;
 
 /// Registers the tables of a lake in a query's context.
 pub(crate) struct LakeCatalog {
@@ -40,13 +41,10 @@ pub(crate) struct LakeCatalog {
     current: Mutex<Option<Arc<CatalogSnapshot>>>,
     /// Held while one query takes a new snapshot; the others wait for it.
     taking: tokio::sync::Mutex<()>,
-    /// Cache of past tables, which do not change. The oldest is evicted first.
-    past: Mutex<Vec<PastTable>>,
+    /// Cache of tables as of versions of the lake, which do not change.
+    past: Cache<(u64, Table), Arc<LakeTable>>,
     runs: Arc<mcap::Files>,
 }
-
-/// A table as it was at a moment.
-type PastTable = ((LakeMoment, Table), Arc<LakeTable>);
 
 /// One snapshot of the lake with its tables and views.
 struct CatalogSnapshot {
@@ -72,7 +70,7 @@ impl LakeCatalog {
             names,
             current: Mutex::default(),
             taking: tokio::sync::Mutex::default(),
-            past: Mutex::default(),
+            past: Cache::new(PAST_TABLES),
             runs: Arc::new(mcap::Files::new(lake.store())),
         })
     }
@@ -220,23 +218,15 @@ impl LakeCatalog {
     }
 
     async fn table_at(&self, moment: LakeMoment, table: Table) -> Result<Arc<LakeTable>, Error> {
-        let kept = |past: &[PastTable]| {
-            past.iter().find(|(key, _)| *key == (moment, table)).map(|(_, provider)| provider.clone())
+        let read = async {
+            let snapshot = self.lake.snapshot_at(moment, table).await?;
+            self.table(table, snapshot.files(table))
         };
-        if let Some(kept) = kept(&self.past.lock().unwrap_or_else(PoisonError::into_inner)) {
-            return Ok(kept);
+        match moment {
+            LakeMoment::Version(version) => self.past.get_or_insert_async(&(version, table), read).await,
+            // The table as of a time may still change.
+            LakeMoment::Time(_) => read.await,
         }
-        let snapshot = self.lake.snapshot_at(moment, table).await?;
-        let provider = self.table(table, snapshot.files(table))?;
-        // Only versions are cached: the result for a time may still change.
-        if matches!(moment, LakeMoment::Version(_)) {
-            let mut past = self.past.lock().unwrap_or_else(PoisonError::into_inner);
-            if past.len() >= PAST_KEPT {
-                past.remove(0);
-            }
-            past.push(((moment, table), provider.clone()));
-        }
-        Ok(provider)
     }
 }
 

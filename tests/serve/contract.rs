@@ -44,7 +44,7 @@ impl ApiContract {
 
     fn check(&self, schema: &Value, value: &Value, at: &str, found: &mut Vec<String>) {
         let schema = self.resolved(schema);
-        if let Some(any) = schema["anyOf"].as_array() {
+        if let Some(any) = schema["anyOf"].as_array().or(schema["oneOf"].as_array()) {
             let fits = any.iter().any(|one| {
                 let mut wrong = Vec::new();
                 self.check(one, value, at, &mut wrong);

@@ -3,9 +3,9 @@
 //! Both come from its summary, which is read by ranges from its end. A file without one, because it was cut off or its
 //! writer makes none, or with one that is damaged, is walked from its first byte, one record in memory at a time.
 
-use std::collections::{BTreeMap, BTreeSet, HashMap};
+use std::collections::{BTreeMap, BTreeSet};
 use std::ops::Range;
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::Arc;
 
 use bytes::Bytes;
 use echolake_recording::{
@@ -13,7 +13,9 @@ use echolake_recording::{
     parse_record, summary_range, tail_range,
 };
 use object_store::path::Path;
-use object_store::{ObjectMeta, ObjectStore, ObjectStoreExt as _};
+use object_store::{ObjectStore, ObjectStoreExt as _};
+use quick_cache::Weighter;
+use quick_cache::sync::Cache;
 
 use super::chunk::{PieceKind, PieceRecords, ReadStep, ReadStop};
 use super::error::Fault;
@@ -23,8 +25,9 @@ use super::schema::RawSchema;
 const BLOCK: u64 = 4 << 20;
 /// Messages that stand in no chunk are read in pieces of this size.
 const PIECE: u64 = 1 << 20;
-/// Summaries that are kept for the next query, in bytes.
-const KEPT: usize = 64 << 20;
+/// Maximum size of the cached summaries, bytes.
+const CACHED_BYTES: u64 = 64 << 20;
+
 /// What is known of a file before any message is read.
 #[derive(Debug)]
 pub(super) struct McapFile {
@@ -84,43 +87,38 @@ impl Piece {
     }
 }
 
-/// Opens files; the summaries of the last ones are kept, which is good for as long as size and time stay.
+/// Opens files, and caches their summaries.
 #[derive(Debug)]
 pub(crate) struct Files {
     pub(super) store: Arc<dyn ObjectStore>,
-    kept: Mutex<Kept>,
+    cache: Cache<FileVersion, Arc<McapFile>, SummaryWeighter>,
 }
 
-#[derive(Debug, Default)]
-struct Kept {
-    files: HashMap<Path, (ObjectMeta, Arc<McapFile>)>,
-    bytes: usize,
+/// A file with its size in bytes and its time in microseconds: it has another summary once they change.
+type FileVersion = (Path, u64, i64);
+
+/// Weighs summaries by their memory in bytes.
+#[derive(Debug, Clone)]
+struct SummaryWeighter;
+
+impl Weighter<FileVersion, Arc<McapFile>> for SummaryWeighter {
+    fn weight(&self, _: &FileVersion, file: &Arc<McapFile>) -> u64 {
+        file.memory() as u64
+    }
 }
 
 impl Files {
     pub(crate) fn new(store: Arc<dyn ObjectStore>) -> Self {
-        Self { store, kept: Mutex::default() }
+        // So few items are one shard, in which a summary may take all the room.
+        Self { store, cache: Cache::with_weighter(32, CACHED_BYTES, SummaryWeighter) }
     }
 
     /// Opens a file of the lake's store.
     pub(super) async fn open(&self, path: &Path) -> Result<Arc<McapFile>, Fault> {
         let meta = self.store.head(path).await.map_err(|source| Fault::Read { file: path.to_string(), source })?;
-        let known = self.kept().files.get(path).filter(|(known, _)| *known == meta).map(|(_, file)| file.clone());
-        if let Some(file) = known {
-            return Ok(file);
-        }
-        let file = Arc::new(Opening { store: self.store.as_ref(), path, bytes: meta.size }.file().await?);
-        let mut kept = self.kept();
-        if kept.bytes > KEPT {
-            *kept = Kept::default();
-        }
-        kept.bytes += file.memory();
-        kept.files.insert(path.clone(), (meta, file.clone()));
-        Ok(file)
-    }
-
-    fn kept(&self) -> std::sync::MutexGuard<'_, Kept> {
-        self.kept.lock().unwrap_or_else(PoisonError::into_inner)
+        let opening = Opening { store: self.store.as_ref(), path, bytes: meta.size };
+        let version = (path.clone(), meta.size, meta.last_modified.timestamp_micros());
+        self.cache.get_or_insert_async(&version, async { opening.file().await.map(Arc::new) }).await
     }
 }
 

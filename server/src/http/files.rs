@@ -4,20 +4,21 @@
 
 use std::sync::Arc;
 
-use axum::Router;
 use axum::body::Body;
-use axum::extract::rejection::PathRejection;
-use axum::extract::{Path, State};
+use axum::extract::State;
 use axum::http::HeaderMap;
 use axum::response::Response;
-use axum::routing::get;
 use echolake_lake::Lake;
 use futures::TryStreamExt as _;
 use object_store::path::Path as StorePath;
 use object_store::{GetOptions, GetRange, ObjectStore as _, ObjectStoreExt as _};
 use serde::Deserialize;
+use utoipa::IntoParams;
+use utoipa_axum::router::OpenApiRouter;
+use utoipa_axum::routes;
 
-use super::catalogue::{self, CatalogueRequest, LakeCatalogue, SnapshotView, text};
+use super::catalogue::{self, CatalogueRequest, LakeCatalogue, RunPath, SnapshotView, text};
+use super::extract::{BinaryContent, PathParams};
 use super::problem::ProblemResponse;
 use super::ranges::{FileDescription, RangeAnswer};
 use crate::fault::RequestFault;
@@ -25,29 +26,49 @@ use crate::tokens::TokenScope;
 
 /// A run's file.
 pub(super) const RUN: &str = "/api/v1/runs/{run_id}/file.mcap";
-/// A table's file.
-pub(super) const TABLE: &str = "/api/v1/tables/{table}/{file}";
+
+/// The path of a table's file.
+#[derive(Deserialize, IntoParams)]
+#[into_params(parameter_in = Path)]
+pub(super) struct TableFilePath {
+    table: String,
+    file: String,
+}
 
 /// Routes that viewers on other pages use: run files may be requested from any origin, without credentials, and with
 /// the headers that ranges need. A page of another origin learns no run's name here.
-pub(super) fn for_viewers(catalogue: &LakeCatalogue) -> Router {
-    Router::new().route(RUN, get(run)).with_state(catalogue.clone())
+pub(super) fn viewer_routes() -> OpenApiRouter<LakeCatalogue> {
+    OpenApiRouter::new().routes(routes!(run_file))
 }
 
 /// The files that only the server's own pages and programs read.
-pub(super) fn for_own(catalogue: &LakeCatalogue) -> Router {
-    Router::new().route(TABLE, get(table)).with_state(catalogue.clone())
+pub(super) fn own_routes() -> OpenApiRouter<LakeCatalogue> {
+    OpenApiRouter::new().routes(routes!(table_file))
 }
 
-async fn run(
+/// The MCAP file of a run.
+///
+/// Range, If-Range, HEAD; CORS with Accept-Ranges, Content-Length, Content-Range and ETag exposed; ETag is its SHA-256.
+#[utoipa::path(
+    get,
+    path = RUN,
+    tag = "runs",
+    params(RunPath, ("Range" = Option<String>, Header, nullable = false)),
+    responses(
+        (status = 200, description = "OK", body = inline(BinaryContent), content_type = "application/octet-stream"),
+        (status = 206, description = "The range", body = inline(BinaryContent),
+            content_type = "application/octet-stream")
+    ),
+    extensions(("x-sql" = json!(["select file, file_bytes, file_sha256 from runs where run_id = $1"])))
+)]
+async fn run_file(
     State(catalogue): State<LakeCatalogue>,
-    path: Result<Path<String>, PathRejection>,
+    PathParams(path): PathParams<RunPath>,
     headers: HeaderMap,
 ) -> Result<Response, ProblemResponse> {
     catalogue.service().client(TokenScope::Files)?;
-    let Path(name) = path.map_err(|_| RequestFault::request("the path is not UTF-8"))?;
     let view = catalogue.view().await?;
-    let run = catalogue::run(&view, &name)?;
+    let run = catalogue::run(&view, &path.run_id)?;
     let etag = digest(&catalogue, &view, run.run.as_str()).await?;
     let described = FileDescription {
         etag: format!("\"{etag}\""),
@@ -59,13 +80,26 @@ async fn run(
     Ok(stored.answer(catalogue.lake(), &headers).await?)
 }
 
-async fn table(
+/// One Parquet file; Range.
+#[utoipa::path(
+    get,
+    path = "/api/v1/tables/{table}/{file}",
+    tag = "files",
+    params(TableFilePath, ("Range" = Option<String>, Header, nullable = false)),
+    responses(
+        (status = 200, description = "OK", body = inline(BinaryContent),
+            content_type = "application/vnd.apache.parquet"),
+        (status = 206, description = "The range", body = inline(BinaryContent),
+            content_type = "application/vnd.apache.parquet")
+    )
+)]
+async fn table_file(
     State(catalogue): State<LakeCatalogue>,
-    path: Result<Path<(String, String)>, PathRejection>,
+    PathParams(path): PathParams<TableFilePath>,
     headers: HeaderMap,
 ) -> Result<Response, ProblemResponse> {
     catalogue.service().client(TokenScope::Files)?;
-    let Path((table, name)) = path.map_err(|_| RequestFault::request("the path is not UTF-8"))?;
+    let TableFilePath { table, file: name } = path;
     let view = catalogue.view().await?;
     let hint = "GET /api/v1/tables/{table} lists what there is";
     let file = catalogue.shown(&view, catalogue::table(&table)?, &name);
@@ -87,7 +121,7 @@ struct FileDigest {
 // The digest that a run's row has of its file.
 async fn digest(catalogue: &LakeCatalogue, view: &Arc<SnapshotView>, run: &str) -> Result<String, RequestFault> {
     let sql = "select file_sha256 from runs where run_id = $1";
-    let rows: Vec<FileDigest> = CatalogueRequest::of(catalogue, view).rows(sql, vec![text(run)]).await?;
+    let rows: Vec<FileDigest> = CatalogueRequest::new(catalogue, view, false).rows(sql, vec![text(run)]).await?;
     let hint = "GET /api/v1/runs lists what there is";
     rows.into_iter()
         .next()

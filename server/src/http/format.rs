@@ -23,11 +23,13 @@ const FORMATS: [(AnswerFormat, &[&str]); 4] = [
 
 /// The format of this name.
 pub(super) fn named(name: &str) -> Result<AnswerFormat, RequestFault> {
-    let known = FORMATS.iter().map(|(format, _)| *format);
-    known.clone().find(|f| f.name() == name).ok_or_else(|| {
-        let names: Vec<_> = known.map(AnswerFormat::name).collect();
-        RequestFault::request(format!("no format `{name}`; hint: {}", names.join(", ")))
-    })
+    let known = FORMATS.iter().map(|(format, _)| *format).find(|f| f.name() == name);
+    known.ok_or_else(|| RequestFault::request(format!("no format `{name}`; hint: {}", format_names().join(", "))))
+}
+
+/// The names of all formats.
+pub(super) fn format_names() -> [&'static str; 4] {
+    FORMATS.map(|(format, _)| format.name())
 }
 
 /// The format that an `Accept` header likes best.

@@ -4,7 +4,8 @@ use axum::Json;
 use axum::extract::State;
 use axum::http::{HeaderMap, header};
 use axum::response::IntoResponse;
-use serde_json::{Value, json};
+use serde::Serialize;
+use utoipa::ToSchema;
 
 use super::guard::authenticate;
 use super::problem::ProblemResponse;
@@ -12,12 +13,31 @@ use crate::client_identity::ClientIdentity;
 use crate::door::ServerDoor;
 use crate::tokens::TokenScope;
 
+/// The state of the server.
+#[derive(Serialize, ToSchema)]
+pub(super) struct ServerHealth {
+    status: &'static str,
+    version: &'static str,
+}
+
 /// Answers that the server is up, with its version.
-pub(super) async fn health() -> Json<Value> {
-    Json(json!({ "status": "ok", "version": env!("CARGO_PKG_VERSION") }))
+#[utoipa::path(
+    get,
+    path = "/health",
+    tag = "operation",
+    responses((status = 200, description = "It is up", body = ServerHealth))
+)]
+pub(super) async fn health() -> Json<ServerHealth> {
+    Json(ServerHealth { status: "ok", version: env!("CARGO_PKG_VERSION") })
 }
 
 /// The figures, in Prometheus' text format.
+#[utoipa::path(
+    get,
+    path = "/metrics",
+    tag = "operation",
+    responses((status = 200, description = "OK", body = String, content_type = "text/plain"))
+)]
 pub(super) async fn metrics(
     State(door): State<ServerDoor>,
     headers: HeaderMap,

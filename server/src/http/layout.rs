@@ -4,7 +4,8 @@
 use axum::Router;
 use axum::http::{HeaderMap, StatusCode, header};
 use axum::response::{IntoResponse as _, Response};
-use axum::routing::get;
+use utoipa_axum::router::OpenApiRouter;
+use utoipa_axum::routes;
 
 use super::catalogue::is_known;
 use super::ranges::{POLICY, cors};
@@ -16,13 +17,22 @@ const ETAG: &str = concat!("\"layout-", env!("CARGO_PKG_VERSION"), "\"");
 
 /// The route of the layout. Lichtblick names a layout from a URL by its file name, and replaces its own layout of that
 /// name.
-pub(super) fn for_viewers() -> Router {
-    Router::new()
-        .route("/api/v1/layouts/echolake.json", get(layout))
-        .method_not_allowed_fallback(super::wrong_method)
-        .layer(cors())
+pub(super) fn routes() -> OpenApiRouter {
+    OpenApiRouter::new().routes(routes!(layout))
 }
 
+/// The layout for viewers on pages of any origin.
+pub(super) fn for_viewers() -> Router {
+    Router::from(routes()).method_not_allowed_fallback(super::wrong_method).layer(cors())
+}
+
+/// A layout for Foxglove and Lichtblick: panel and arms, response, air, measurement, log.
+#[utoipa::path(
+    get,
+    path = "/api/v1/layouts/echolake.json",
+    tag = "runs",
+    responses((status = 200, description = "OK", body = HashMap<String, Value>))
+)]
 async fn layout(headers: HeaderMap) -> Response {
     let common = [
         (header::CONTENT_TYPE, "application/json"),
@@ -40,10 +50,10 @@ async fn layout(headers: HeaderMap) -> Response {
 mod tests {
     use std::collections::BTreeSet;
 
-    use echolake_schema::topics;
     use serde_json::Value;
 
     use super::*;
+    use echolake_schema::topics;
 
     // What a mosaic's leaves name.
     fn panels(tree: &Value, found: &mut BTreeSet<String>) {

@@ -1,53 +1,79 @@
 //! `GET /api/v1/files`: the Parquet files of the lake's snapshot as URLs, so that loaders of training sets take a list
 //! and read by ranges, without a copy.
 
-use axum::Router;
 use axum::extract::State;
-use axum::http::{HeaderMap, HeaderName, StatusCode, Uri, header};
+use axum::http::{HeaderMap, HeaderName, StatusCode, header};
 use axum::response::{IntoResponse as _, Response};
-use axum::routing::get;
 use echolake_lake::DataFile;
 use echolake_schema::tables::Table;
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
+use utoipa::{IntoParams, ToSchema};
+use utoipa_axum::router::OpenApiRouter;
+use utoipa_axum::routes;
 
-use super::catalogue::{self, LakeCatalogue, RequestParams, is_known};
+use super::catalogue::{self, LakeCatalogue, is_known};
+use super::extract::QueryParams;
 use super::problem::ProblemResponse;
 use crate::fault::RequestFault;
 use crate::tokens::TokenScope;
 
 const FORWARDED_PROTO: HeaderName = HeaderName::from_static("x-forwarded-proto");
 
-#[derive(Serialize)]
+/// The tables that files are listed of.
+#[derive(Default, Deserialize, IntoParams)]
+#[serde(default)]
+#[into_params(parameter_in = Query)]
+pub(super) struct FilesQuery {
+    /// Only of these tables.
+    #[param(style = Form, explode)]
+    table: Vec<String>,
+}
+
+/// The Parquet files of a snapshot.
+#[derive(Serialize, ToSchema)]
 struct FileManifest<'a> {
     /// Of the snapshot; another one, another version.
     version: &'a str,
     files: Vec<ManifestFile>,
 }
 
-#[derive(Serialize)]
+/// A Parquet file with its address.
+#[derive(Serialize, ToSchema)]
 struct ManifestFile {
     table: &'static str,
+    #[schema(format = "uri")]
     url: String,
     bytes: u64,
-    /// Those that the snapshot shows.
+    /// Rows that the snapshot shows.
     rows: u64,
     /// Rows that are in the file, too, but were replaced by newer rows of the same runs.
     superseded_rows: u64,
 }
 
 /// The route of the list.
-pub(super) fn for_own(catalogue: &LakeCatalogue) -> Router {
-    Router::new().route("/api/v1/files", get(files)).with_state(catalogue.clone())
+pub(super) fn routes() -> OpenApiRouter<LakeCatalogue> {
+    OpenApiRouter::new().routes(routes!(files))
 }
 
+/// The Parquet files of the lake's snapshot as URLs, for loaders that take a list of them.
+///
+/// Needs the scope files.
+#[utoipa::path(
+    get,
+    path = "/api/v1/files",
+    tag = "files",
+    params(FilesQuery),
+    responses((status = 200, description = "OK", body = FileManifest)),
+    extensions(("x-sql" = json!(["the commit log"])))
+)]
 async fn files(
     State(catalogue): State<LakeCatalogue>,
-    uri: Uri,
+    QueryParams(query): QueryParams<FilesQuery>,
     headers: HeaderMap,
 ) -> Result<Response, ProblemResponse> {
     catalogue.service().client(TokenScope::Files)?;
-    let params = RequestParams::of(&uri)?;
-    let tables = params.all("table").map(catalogue::table).collect::<Result<Vec<_>, RequestFault>>()?;
+    let tables = query.table.iter().map(|name| catalogue::table(name));
+    let tables = tables.collect::<Result<Vec<_>, RequestFault>>()?;
     let view = catalogue.view().await?;
     let origin = origin(&headers);
     let etag = format!("\"{}\"", view.version);

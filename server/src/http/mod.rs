@@ -2,6 +2,7 @@
 //! rest ([`door_router`]): pages, sessions, health and figures.
 
 mod catalogue;
+mod extract;
 mod files;
 mod format;
 mod guard;
@@ -19,12 +20,15 @@ mod sql;
 
 use axum::Router;
 use axum::middleware::{from_fn_with_state, map_response};
-use axum::routing::{any, get, post};
+use axum::routing::any;
 use hyper::server::conn::http1;
 use hyper_util::rt::TokioIo;
 use hyper_util::service::TowerToHyperService;
 use tokio::net::UnixListener;
 use tower_http::catch_panic::CatchPanicLayer;
+use utoipa::openapi::OpenApi;
+use utoipa_axum::router::OpenApiRouter;
+use utoipa_axum::routes;
 
 use crate::Error;
 use crate::door::ServerDoor;
@@ -51,25 +55,19 @@ pub(crate) async fn serve(service: QueryService, listener: UnixListener) -> Resu
 
 fn engine_router(service: &QueryService) -> Router {
     let catalogue = LakeCatalogue::new(service.clone());
-    let own = Router::new()
-        .route("/api/v1/sql", post(sql::post))
+    let files = files::own_routes().merge(manifest::routes());
+    let own = Router::from(sql::routes())
         .with_state(service.clone())
         .merge(catalogue.router())
-        .merge(files::for_own(&catalogue))
-        .merge(manifest::for_own(&catalogue))
+        .merge(Router::from(files).with_state(catalogue.clone()))
         .layer(from_fn_with_state(service.is_open(), guard::own_pages_only));
-    let all = own.merge(files::for_viewers(&catalogue)).merge(slices::for_viewers(&catalogue)).fallback(nothing);
-    with_refusals(all)
+    let viewers = Router::from(files::viewer_routes()).with_state(catalogue.clone());
+    with_refusals(own.merge(viewers).merge(slices::for_viewers(&catalogue)).fallback(nothing))
 }
 
 /// The paths of the server: those of the door, and those that it forwards to the client's engine.
 pub(crate) fn door_router(door: &ServerDoor) -> Router {
-    let own = Router::new()
-        .route("/api/v1/session", post(session::post))
-        .route("/api/v1/openapi.json", get(openapi::get))
-        .route("/metrics", get(health::metrics))
-        .route("/health", get(health::health))
-        .layer(from_fn_with_state(door.access().is_open(), guard::own_pages_only));
+    let own = Router::from(door_routes()).layer(from_fn_with_state(door.access().is_open(), guard::own_pages_only));
     let viewers = [files::RUN, slices::SLICE, slices::FOXGLOVE_MANIFEST];
     // Here and not for all routes: a preflight must come to the layer.
     let viewers =
@@ -82,6 +80,27 @@ pub(crate) fn door_router(door: &ServerDoor) -> Router {
     let rest = nothing;
     let all = own.merge(forwarded).with_state(door.clone()).merge(layout::for_viewers()).fallback(rest);
     with_refusals(all)
+}
+
+// What the door answers itself, but for pages and the layout.
+fn door_routes() -> OpenApiRouter<ServerDoor> {
+    OpenApiRouter::new()
+        .routes(routes!(session::post))
+        .routes(routes!(openapi::get))
+        .routes(routes!(health::metrics))
+        .routes(routes!(health::health))
+}
+
+// The contract of all routes: of those whose answers to GET have an ETag, and of the others.
+fn contract_parts() -> [OpenApi; 2] {
+    let files = files::viewer_routes().merge(files::own_routes()).merge(manifest::routes());
+    let mut validated =
+        catalogue::table_routes().merge(catalogue::file_routes()).merge(layout::routes()).into_openapi();
+    validated.merge(files.into_openapi());
+    let mut others = sql::routes().into_openapi();
+    others.merge(slices::routes().into_openapi());
+    others.merge(door_routes().into_openapi());
+    [validated, others]
 }
 
 fn with_refusals(router: Router) -> Router {

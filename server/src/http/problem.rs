@@ -3,20 +3,32 @@
 use axum::http::{HeaderValue, StatusCode, header};
 use axum::response::{IntoResponse, Response};
 use serde::Serialize;
+use utoipa::ToSchema;
+use utoipa::openapi::{ObjectBuilder, RefOr, Schema, Type};
 
 use crate::fault::{FaultCode, RequestFault};
 
 /// A failure, to be answered.
 pub(crate) struct ProblemResponse(pub(crate) RequestFault);
 
-#[derive(Serialize)]
-struct ProblemBody<'a> {
+/// RFC 9457; `code` is stable and made for programs.
+#[derive(Serialize, ToSchema)]
+#[schema(as = Problem)]
+pub(super) struct ProblemBody<'a> {
     #[serde(rename = "type")]
     kind: String,
     title: &'a str,
     status: u16,
+    #[schema(schema_with = code_schema)]
     code: &'a str,
+    /// What is wrong; what to do follows after `; hint: `.
+    #[schema(required = false)]
     detail: String,
+}
+
+fn code_schema() -> RefOr<Schema> {
+    let codes = FaultCode::ALL.iter().map(|code| code.name());
+    ObjectBuilder::new().schema_type(Type::String).enum_values(Some(codes)).into()
 }
 
 impl From<RequestFault> for ProblemResponse {
@@ -38,6 +50,7 @@ impl ProblemResponse {
             detail: self.0.to_string(),
         };
         let mut response = (status, axum::Json(body)).into_response();
+        response.extensions_mut().insert(code);
         let headers = response.headers_mut();
         headers.insert(header::CONTENT_TYPE, HeaderValue::from_static("application/problem+json"));
         if status == StatusCode::UNAUTHORIZED {

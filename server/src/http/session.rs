@@ -6,6 +6,7 @@ use axum::http::{StatusCode, header};
 use axum::response::IntoResponse;
 use bytes::Bytes;
 use serde::Deserialize;
+use utoipa::ToSchema;
 
 use super::guard::COOKIE;
 use super::problem::ProblemResponse;
@@ -16,13 +17,25 @@ use crate::sessions::LIFETIME;
 /// Bytes of a request: a token is short.
 const LARGEST: usize = 4096;
 
-#[derive(Deserialize)]
+/// A token.
+#[derive(Deserialize, ToSchema)]
 #[serde(deny_unknown_fields)]
+#[schema(as = Session)]
 struct SessionRequest {
     token: String,
 }
 
-/// Begins a session.
+/// Takes a token and answers with a cookie (HttpOnly, SameSite=Strict) that stands for it.
+///
+/// Pictures and downloads of a page can send no Authorization header. Only if the server has tokens.
+#[utoipa::path(
+    post,
+    path = "/api/v1/session",
+    operation_id = "session",
+    tag = "operation",
+    request_body = SessionRequest,
+    responses((status = 204, description = "The cookie is set"))
+)]
 pub(super) async fn post(
     State(door): State<ServerDoor>,
     body: Result<Bytes, BytesRejection>,

@@ -11,8 +11,13 @@ use bytes::Bytes;
 use echolake_query::output::AnswerFormat;
 use futures::stream;
 use serde::Deserialize;
+use utoipa::openapi::{ObjectBuilder, RefOr, Schema, Type};
+use utoipa::{IntoParams, ToSchema};
+use utoipa_axum::router::OpenApiRouter;
+use utoipa_axum::routes;
 
-use super::format::{FormatEncoder, accepted, media_type, named};
+use super::extract::BinaryContent;
+use super::format::{FormatEncoder, accepted, format_names, media_type, named};
 use super::guard::MayQuery;
 use super::problem::ProblemResponse;
 use crate::fault::RequestFault;
@@ -24,20 +29,53 @@ use crate::service::{QueryJob, QueryService, QueryWork};
 const LARGEST: usize = 2 << 20;
 
 /// The parameters after the path's `?`.
-#[derive(Deserialize)]
+#[derive(Deserialize, IntoParams)]
+#[into_params(parameter_in = Query)]
 pub(super) struct SqlParams {
+    #[param(schema_with = format_schema)]
     format: Option<String>,
 }
 
-#[derive(Deserialize)]
+/// A query.
+#[derive(Deserialize, ToSchema)]
 #[serde(deny_unknown_fields)]
-struct Asked {
+#[schema(as = Query)]
+struct SqlRequest {
     query: String,
+    #[schema(schema_with = format_schema, required = false)]
     format: Option<String>,
 }
 
-/// Answers a query.
-pub(super) async fn post(
+fn format_schema() -> RefOr<Schema> {
+    let names = ObjectBuilder::new().schema_type(Type::String).enum_values(Some(format_names()));
+    names.description(Some("Instead of the Accept header.")).into()
+}
+
+/// The route of queries.
+pub(super) fn routes() -> OpenApiRouter<QueryService> {
+    OpenApiRouter::new().routes(routes!(post))
+}
+
+/// Answers one read-only query.
+///
+/// The Accept header chooses the form, JSON if there is none. Closing the connection cancels it.
+#[utoipa::path(
+    post,
+    path = "/api/v1/sql",
+    operation_id = "sql",
+    tag = "sql",
+    params(SqlParams),
+    request_body(content(
+        (SqlRequest = "application/json"), (String = "application/sql"), (String = "text/plain")
+    )),
+    responses((status = 200, description = "The rows", content(
+        (inline(BinaryContent) = "application/vnd.apache.arrow.stream"),
+        (inline(BinaryContent) = "application/vnd.apache.parquet"),
+        (String = "text/csv"),
+        (Vec<HashMap<String, Value>> = "application/json")
+    )))
+)]
+async fn post(
     State(service): State<QueryService>,
     MayQuery(client): MayQuery,
     params: Result<Query<SqlParams>, QueryRejection>,
@@ -46,12 +84,12 @@ pub(super) async fn post(
 ) -> Result<Response, ProblemResponse> {
     let Query(params) =
         params.map_err(|_| RequestFault::request("the path's parameters are not right; hint: ?format=csv"))?;
-    let asked = asked(&headers, &whole(body)?)?;
-    let format = format(&headers, params.format.or(asked.format))?;
+    let request = parse_body(&headers, &whole(body)?)?;
+    let format = format(&headers, params.format.or(request.format))?;
     let job = QueryJob {
         protocol: ServerProtocol::Http,
         session: Arc::new(service.session(&client)),
-        work: QueryWork::Sql(asked.query),
+        work: QueryWork::Sql(request.query),
         limit: None,
         stop: StopSignal::new(),
     };
@@ -83,14 +121,14 @@ fn whole(body: Result<Bytes, BytesRejection>) -> Result<Bytes, RequestFault> {
     })
 }
 
-fn asked(headers: &HeaderMap, body: &[u8]) -> Result<Asked, RequestFault> {
+fn parse_body(headers: &HeaderMap, body: &[u8]) -> Result<SqlRequest, RequestFault> {
     let kind = headers.get(header::CONTENT_TYPE).and_then(|v| v.to_str().ok()).unwrap_or_default();
     match kind.split(';').next().unwrap_or_default().trim().to_ascii_lowercase().as_str() {
         "application/json" => serde_json::from_slice(body).map_err(|e| {
             RequestFault::request(format!("the body is not as expected: {e}; hint: {{\"query\": \"select 1\"}}"))
         }),
         "text/plain" | "application/sql" => match std::str::from_utf8(body) {
-            Ok(query) => Ok(Asked { query: query.to_owned(), format: None }),
+            Ok(query) => Ok(SqlRequest { query: query.to_owned(), format: None }),
             Err(_) => Err(RequestFault::request("the query is not UTF-8")),
         },
         other => Err(RequestFault::request(format!(

@@ -4,6 +4,63 @@
  */
 
 export interface paths {
+    readonly "/api/v1/correlations": {
+        readonly parameters: {
+            readonly query?: never;
+            readonly header?: never;
+            readonly path?: never;
+            readonly cookie?: never;
+        };
+        /** Pearson's r of every numeric geometric parameter with every band's level against Flat. */
+        readonly get: operations["correlations"];
+        readonly put?: never;
+        readonly post?: never;
+        readonly delete?: never;
+        readonly options?: never;
+        readonly head?: never;
+        readonly patch?: never;
+        readonly trace?: never;
+    };
+    readonly "/api/v1/files": {
+        readonly parameters: {
+            readonly query?: never;
+            readonly header?: never;
+            readonly path?: never;
+            readonly cookie?: never;
+        };
+        /**
+         * The Parquet files of the lake's snapshot as URLs, for loaders that take a list of them.
+         * @description Needs the scope files.
+         */
+        readonly get: operations["files"];
+        readonly put?: never;
+        readonly post?: never;
+        readonly delete?: never;
+        readonly options?: never;
+        readonly head?: never;
+        readonly patch?: never;
+        readonly trace?: never;
+    };
+    readonly "/api/v1/foxglove/manifest": {
+        readonly parameters: {
+            readonly query?: never;
+            readonly header?: never;
+            readonly path?: never;
+            readonly cookie?: never;
+        };
+        /**
+         * The manifest of Foxglove's remote data loader.
+         * @description Runs without where and topics are static files; all else is a streamed source per run, ascending in time.
+         */
+        readonly get: operations["foxglove_manifest"];
+        readonly put?: never;
+        readonly post?: never;
+        readonly delete?: never;
+        readonly options?: never;
+        readonly head?: never;
+        readonly patch?: never;
+        readonly trace?: never;
+    };
     readonly "/api/v1/lake": {
         readonly parameters: {
             readonly query?: never;
@@ -11,7 +68,7 @@ export interface paths {
             readonly path?: never;
             readonly cookie?: never;
         };
-        /** What the lake holds, its rig, bands and grid */
+        /** The contents of the lake, its rig, bands and grid. */
         readonly get: operations["lake"];
         readonly put?: never;
         readonly post?: never;
@@ -21,151 +78,15 @@ export interface paths {
         readonly patch?: never;
         readonly trace?: never;
     };
-    readonly "/api/v1/surfaces": {
+    readonly "/api/v1/layouts/echolake.json": {
         readonly parameters: {
             readonly query?: never;
             readonly header?: never;
             readonly path?: never;
             readonly cookie?: never;
         };
-        /** A page of surfaces with facets. Filters of different names are all required, values of one name are alternatives; a facet's counts leave its own filter out. Computed from one summary a snapshot, held in memory */
-        readonly get: operations["surfaces"];
-        readonly put?: never;
-        readonly post?: never;
-        readonly delete?: never;
-        readonly options?: never;
-        readonly head?: never;
-        readonly patch?: never;
-        readonly trace?: never;
-    };
-    readonly "/api/v1/surfaces/{surface_id}": {
-        readonly parameters: {
-            readonly query?: never;
-            readonly header?: never;
-            readonly path?: never;
-            readonly cookie?: never;
-        };
-        /** One surface with its statistics and means against Flat */
-        readonly get: operations["surface"];
-        readonly put?: never;
-        readonly post?: never;
-        readonly delete?: never;
-        readonly options?: never;
-        readonly head?: never;
-        readonly patch?: never;
-        readonly trace?: never;
-    };
-    readonly "/api/v1/surfaces/{surface_id}/grid": {
-        readonly parameters: {
-            readonly query?: never;
-            readonly header?: never;
-            readonly path?: never;
-            readonly cookie?: never;
-        };
-        /** TNCE over the grid for one microphone point; pairs measured the other way round are used by reciprocity and marked */
-        readonly get: operations["grid"];
-        readonly put?: never;
-        readonly post?: never;
-        readonly delete?: never;
-        readonly options?: never;
-        readonly head?: never;
-        readonly patch?: never;
-        readonly trace?: never;
-    };
-    readonly "/api/v1/surfaces/{surface_id}/curves": {
-        readonly parameters: {
-            readonly query?: never;
-            readonly header?: never;
-            readonly path?: never;
-            readonly cookie?: never;
-        };
-        /** NCE by band, mean over all pairs or over those of one microphone point, and the same of the surface's Flat, decimated to `points`. As an Arrow stream: `time_ms`, `nce_2500`, ..., `flat_nce_2500`, ... */
-        readonly get: operations["curves"];
-        readonly put?: never;
-        readonly post?: never;
-        readonly delete?: never;
-        readonly options?: never;
-        readonly head?: never;
-        readonly patch?: never;
-        readonly trace?: never;
-    };
-    readonly "/api/v1/surfaces/{surface_id}/heightmap": {
-        readonly parameters: {
-            readonly query?: never;
-            readonly header?: never;
-            readonly path?: never;
-            readonly cookie?: never;
-        };
-        /** Heights in mm as little-endian f32, row by row; as many cells a side as the square root of their number */
-        readonly get: operations["heightmap"];
-        readonly put?: never;
-        readonly post?: never;
-        readonly delete?: never;
-        readonly options?: never;
-        readonly head?: never;
-        readonly patch?: never;
-        readonly trace?: never;
-    };
-    readonly "/api/v1/surfaces/{surface_id}/thumbnail.png": {
-        readonly parameters: {
-            readonly query?: never;
-            readonly header?: never;
-            readonly path?: never;
-            readonly cookie?: never;
-        };
-        /** The relief in oblique light, grey, 128 x 128; to scale in depth: one light for all surfaces */
-        readonly get: operations["thumbnail"];
-        readonly put?: never;
-        readonly post?: never;
-        readonly delete?: never;
-        readonly options?: never;
-        readonly head?: never;
-        readonly patch?: never;
-        readonly trace?: never;
-    };
-    readonly "/api/v1/surfaces/{surface_id}/mesh.glb": {
-        readonly parameters: {
-            readonly query?: never;
-            readonly header?: never;
-            readonly path?: never;
-            readonly cookie?: never;
-        };
-        /** The panel's mesh as the run file holds it */
-        readonly get: operations["mesh"];
-        readonly put?: never;
-        readonly post?: never;
-        readonly delete?: never;
-        readonly options?: never;
-        readonly head?: never;
-        readonly patch?: never;
-        readonly trace?: never;
-    };
-    readonly "/api/v1/surfaces/{surface_id}/pairs/{pair_id}": {
-        readonly parameters: {
-            readonly query?: never;
-            readonly header?: never;
-            readonly path?: never;
-            readonly cookie?: never;
-        };
-        /** Everything about one impulse response. As an Arrow stream its samples: `time_ms`, `measured`, `reflected`, `flat_reflected` */
-        readonly get: operations["pair"];
-        readonly put?: never;
-        readonly post?: never;
-        readonly delete?: never;
-        readonly options?: never;
-        readonly head?: never;
-        readonly patch?: never;
-        readonly trace?: never;
-    };
-    readonly "/api/v1/surfaces/{surface_id}/pairs/{pair_id}/ir.wav": {
-        readonly parameters: {
-            readonly query?: never;
-            readonly header?: never;
-            readonly path?: never;
-            readonly cookie?: never;
-        };
-        /** The response as 32-bit float WAV. The rate in its header is the rig's divided by `slowdown`: 10 gives full scale */
-        readonly get: operations["wav"];
+        /** A layout for Foxglove and Lichtblick: panel and arms, response, air, measurement, log. */
+        readonly get: operations["layout"];
         readonly put?: never;
         readonly post?: never;
         readonly delete?: never;
@@ -181,7 +102,11 @@ export interface paths {
             readonly path?: never;
             readonly cookie?: never;
         };
-        /** Principal components of the surfaces' TNCE vectors (all pairs and bands, dB over Flat's same band) and nearest neighbours; once a snapshot */
+        /**
+         * Surfaces as points, close together if they reflect alike, and their nearest neighbours.
+         * @description Principal components of the surfaces' TNCE vectors (all pairs and bands, dB over Flat's same band); once per
+         *     snapshot.
+         */
         readonly get: operations["map"];
         readonly put?: never;
         readonly post?: never;
@@ -191,15 +116,15 @@ export interface paths {
         readonly patch?: never;
         readonly trace?: never;
     };
-    readonly "/api/v1/correlations": {
+    readonly "/api/v1/openapi.json": {
         readonly parameters: {
             readonly query?: never;
             readonly header?: never;
             readonly path?: never;
             readonly cookie?: never;
         };
-        /** Pearson's r of every numeric geometric parameter with every band's level against Flat */
-        readonly get: operations["correlations"];
+        /** This document. */
+        readonly get: operations["openapi"];
         readonly put?: never;
         readonly post?: never;
         readonly delete?: never;
@@ -215,7 +140,7 @@ export interface paths {
             readonly path?: never;
             readonly cookie?: never;
         };
-        /** Runs, newest first */
+        /** A page of runs, the newest first. */
         readonly get: operations["runs"];
         readonly put?: never;
         readonly post?: never;
@@ -232,7 +157,7 @@ export interface paths {
             readonly path?: never;
             readonly cookie?: never;
         };
-        /** One run: topics and sizes from the file's summary, quality flags, repeats, log */
+        /** One run: topics and sizes from the file's summary, quality flags, repeats, log. */
         readonly get: operations["run"];
         readonly put?: never;
         readonly post?: never;
@@ -249,7 +174,7 @@ export interface paths {
             readonly path?: never;
             readonly cookie?: never;
         };
-        /** The air over a run, decimated to `points` means (the outside level: maxima) */
+        /** The air over a run, decimated to `points` means; of the outside level, maxima. */
         readonly get: operations["environment"];
         readonly put?: never;
         readonly post?: never;
@@ -266,93 +191,11 @@ export interface paths {
             readonly path?: never;
             readonly cookie?: never;
         };
-        /** The MCAP file. Range, If-Range, HEAD; CORS with Accept-Ranges, Content-Length, Content-Range and ETag exposed; ETag is its SHA-256 */
+        /**
+         * The MCAP file of a run.
+         * @description Range, If-Range, HEAD; CORS with Accept-Ranges, Content-Length, Content-Range and ETag exposed; ETag is its SHA-256.
+         */
         readonly get: operations["run_file"];
-        readonly put?: never;
-        readonly post?: never;
-        readonly delete?: never;
-        readonly options?: never;
-        readonly head?: never;
-        readonly patch?: never;
-        readonly trace?: never;
-    };
-    readonly "/api/v1/slices.mcap": {
-        readonly parameters: {
-            readonly query?: never;
-            readonly header?: never;
-            readonly path?: never;
-            readonly cookie?: never;
-        };
-        /** The messages of some measurements as an MCAP file. Streamed as it is cut; who sends Range, HEAD or Origin is told its length, and it is cut to its end first. CORS as for run files. The same measurements, topics and layout are the same bytes and the same ETag. Needs the scopes sql and files */
-        readonly get: operations["slice"];
-        readonly put?: never;
-        readonly post?: never;
-        readonly delete?: never;
-        readonly options?: never;
-        readonly head?: never;
-        readonly patch?: never;
-        readonly trace?: never;
-    };
-    readonly "/api/v1/foxglove/manifest": {
-        readonly parameters: {
-            readonly query?: never;
-            readonly header?: never;
-            readonly path?: never;
-            readonly cookie?: never;
-        };
-        /** The manifest of Foxglove's remote data loader. Runs without where and topics are static files; all else is a streamed source a run, ascending in time */
-        readonly get: operations["foxglove_manifest"];
-        readonly put?: never;
-        readonly post?: never;
-        readonly delete?: never;
-        readonly options?: never;
-        readonly head?: never;
-        readonly patch?: never;
-        readonly trace?: never;
-    };
-    readonly "/api/v1/layouts/echolake.json": {
-        readonly parameters: {
-            readonly query?: never;
-            readonly header?: never;
-            readonly path?: never;
-            readonly cookie?: never;
-        };
-        /** A layout for Foxglove and Lichtblick: panel and arms, response, air, measurement, log */
-        readonly get: operations["layout"];
-        readonly put?: never;
-        readonly post?: never;
-        readonly delete?: never;
-        readonly options?: never;
-        readonly head?: never;
-        readonly patch?: never;
-        readonly trace?: never;
-    };
-    readonly "/api/v1/tables": {
-        readonly parameters: {
-            readonly query?: never;
-            readonly header?: never;
-            readonly path?: never;
-            readonly cookie?: never;
-        };
-        /** Tables, columns, units, meanings; for completion. Functions: select distinct routine_name from information_schema.routines */
-        readonly get: operations["tables"];
-        readonly put?: never;
-        readonly post?: never;
-        readonly delete?: never;
-        readonly options?: never;
-        readonly head?: never;
-        readonly patch?: never;
-        readonly trace?: never;
-    };
-    readonly "/api/v1/files": {
-        readonly parameters: {
-            readonly query?: never;
-            readonly header?: never;
-            readonly path?: never;
-            readonly cookie?: never;
-        };
-        /** The Parquet files of the lake's snapshot as URLs, for loaders that take a list of them. Needs the scope files */
-        readonly get: operations["files"];
         readonly put?: never;
         readonly post?: never;
         readonly delete?: never;
@@ -370,8 +213,33 @@ export interface paths {
         };
         readonly get?: never;
         readonly put?: never;
-        /** Takes a token and answers with a cookie (HttpOnly, SameSite=Strict) that stands for it, because pictures and downloads of a page can send no Authorization header. Only where the server has tokens */
+        /**
+         * Takes a token and answers with a cookie (HttpOnly, SameSite=Strict) that stands for it.
+         * @description Pictures and downloads of a page can send no Authorization header. Only if the server has tokens.
+         */
         readonly post: operations["session"];
+        readonly delete?: never;
+        readonly options?: never;
+        readonly head?: never;
+        readonly patch?: never;
+        readonly trace?: never;
+    };
+    readonly "/api/v1/slices.mcap": {
+        readonly parameters: {
+            readonly query?: never;
+            readonly header?: never;
+            readonly path?: never;
+            readonly cookie?: never;
+        };
+        /**
+         * The messages of some measurements as an MCAP file.
+         * @description Streamed as it is cut; who sends Range, HEAD or Origin is told its length, and it is cut to its end first. CORS as for
+         *     run files. The same measurements, topics and layout are the same bytes and the same ETag. Needs the scopes sql and
+         *     files.
+         */
+        readonly get: operations["slice"];
+        readonly put?: never;
+        readonly post?: never;
         readonly delete?: never;
         readonly options?: never;
         readonly head?: never;
@@ -387,8 +255,207 @@ export interface paths {
         };
         readonly get?: never;
         readonly put?: never;
-        /** One read-only query. The Accept header chooses the form, JSON where there is none. Closing the connection cancels it */
+        /**
+         * Answers one read-only query.
+         * @description The Accept header chooses the form, JSON if there is none. Closing the connection cancels it.
+         */
         readonly post: operations["sql"];
+        readonly delete?: never;
+        readonly options?: never;
+        readonly head?: never;
+        readonly patch?: never;
+        readonly trace?: never;
+    };
+    readonly "/api/v1/surfaces": {
+        readonly parameters: {
+            readonly query?: never;
+            readonly header?: never;
+            readonly path?: never;
+            readonly cookie?: never;
+        };
+        /**
+         * A page of surfaces with facets.
+         * @description Filters of different names are all required, values of one name are alternatives; a facet's counts leave its own
+         *     filter out. Computed from one summary per snapshot, held in memory.
+         */
+        readonly get: operations["surfaces"];
+        readonly put?: never;
+        readonly post?: never;
+        readonly delete?: never;
+        readonly options?: never;
+        readonly head?: never;
+        readonly patch?: never;
+        readonly trace?: never;
+    };
+    readonly "/api/v1/surfaces/{surface_id}": {
+        readonly parameters: {
+            readonly query?: never;
+            readonly header?: never;
+            readonly path?: never;
+            readonly cookie?: never;
+        };
+        /** One surface with its statistics and means against Flat. */
+        readonly get: operations["surface"];
+        readonly put?: never;
+        readonly post?: never;
+        readonly delete?: never;
+        readonly options?: never;
+        readonly head?: never;
+        readonly patch?: never;
+        readonly trace?: never;
+    };
+    readonly "/api/v1/surfaces/{surface_id}/curves": {
+        readonly parameters: {
+            readonly query?: never;
+            readonly header?: never;
+            readonly path?: never;
+            readonly cookie?: never;
+        };
+        /**
+         * NCE by band, a mean over pairs, of a surface and of its Flat, decimated to `points`.
+         * @description The pairs are all, or those of one microphone point. As an Arrow stream: `time_ms`, `nce_2500`, ...,
+         *     `flat_nce_2500`, ...
+         */
+        readonly get: operations["curves"];
+        readonly put?: never;
+        readonly post?: never;
+        readonly delete?: never;
+        readonly options?: never;
+        readonly head?: never;
+        readonly patch?: never;
+        readonly trace?: never;
+    };
+    readonly "/api/v1/surfaces/{surface_id}/grid": {
+        readonly parameters: {
+            readonly query?: never;
+            readonly header?: never;
+            readonly path?: never;
+            readonly cookie?: never;
+        };
+        /**
+         * TNCE over the grid for one microphone point.
+         * @description Pairs that were measured the other way round are used by reciprocity and marked.
+         */
+        readonly get: operations["grid"];
+        readonly put?: never;
+        readonly post?: never;
+        readonly delete?: never;
+        readonly options?: never;
+        readonly head?: never;
+        readonly patch?: never;
+        readonly trace?: never;
+    };
+    readonly "/api/v1/surfaces/{surface_id}/heightmap": {
+        readonly parameters: {
+            readonly query?: never;
+            readonly header?: never;
+            readonly path?: never;
+            readonly cookie?: never;
+        };
+        /**
+         * Heights in mm as little-endian f32, row by row.
+         * @description A side has as many cells as the square root of their number. y ascends.
+         */
+        readonly get: operations["heightmap"];
+        readonly put?: never;
+        readonly post?: never;
+        readonly delete?: never;
+        readonly options?: never;
+        readonly head?: never;
+        readonly patch?: never;
+        readonly trace?: never;
+    };
+    readonly "/api/v1/surfaces/{surface_id}/mesh.glb": {
+        readonly parameters: {
+            readonly query?: never;
+            readonly header?: never;
+            readonly path?: never;
+            readonly cookie?: never;
+        };
+        /** The panel's mesh as the run file holds it. */
+        readonly get: operations["mesh"];
+        readonly put?: never;
+        readonly post?: never;
+        readonly delete?: never;
+        readonly options?: never;
+        readonly head?: never;
+        readonly patch?: never;
+        readonly trace?: never;
+    };
+    readonly "/api/v1/surfaces/{surface_id}/pairs/{pair_id}": {
+        readonly parameters: {
+            readonly query?: never;
+            readonly header?: never;
+            readonly path?: never;
+            readonly cookie?: never;
+        };
+        /**
+         * Everything about one impulse response.
+         * @description As an Arrow stream its samples: `time_ms`, `measured`, `reflected`, `flat_reflected`.
+         */
+        readonly get: operations["pair"];
+        readonly put?: never;
+        readonly post?: never;
+        readonly delete?: never;
+        readonly options?: never;
+        readonly head?: never;
+        readonly patch?: never;
+        readonly trace?: never;
+    };
+    readonly "/api/v1/surfaces/{surface_id}/pairs/{pair_id}/ir.wav": {
+        readonly parameters: {
+            readonly query?: never;
+            readonly header?: never;
+            readonly path?: never;
+            readonly cookie?: never;
+        };
+        /**
+         * The response as 32-bit float WAV.
+         * @description The rate in its header is the rig's divided by `slowdown`: 10 gives full scale.
+         */
+        readonly get: operations["wav"];
+        readonly put?: never;
+        readonly post?: never;
+        readonly delete?: never;
+        readonly options?: never;
+        readonly head?: never;
+        readonly patch?: never;
+        readonly trace?: never;
+    };
+    readonly "/api/v1/surfaces/{surface_id}/thumbnail.png": {
+        readonly parameters: {
+            readonly query?: never;
+            readonly header?: never;
+            readonly path?: never;
+            readonly cookie?: never;
+        };
+        /**
+         * The relief in oblique light, grey, 128 x 128.
+         * @description To scale in depth: one light for all surfaces.
+         */
+        readonly get: operations["thumbnail"];
+        readonly put?: never;
+        readonly post?: never;
+        readonly delete?: never;
+        readonly options?: never;
+        readonly head?: never;
+        readonly patch?: never;
+        readonly trace?: never;
+    };
+    readonly "/api/v1/tables": {
+        readonly parameters: {
+            readonly query?: never;
+            readonly header?: never;
+            readonly path?: never;
+            readonly cookie?: never;
+        };
+        /**
+         * Tables, columns, units, meanings; for completion.
+         * @description Functions: select distinct routine_name from information_schema.routines
+         */
+        readonly get: operations["tables"];
+        readonly put?: never;
+        readonly post?: never;
         readonly delete?: never;
         readonly options?: never;
         readonly head?: never;
@@ -402,7 +469,7 @@ export interface paths {
             readonly path?: never;
             readonly cookie?: never;
         };
-        /** The Parquet files of a table's snapshot */
+        /** The Parquet files of a table's snapshot. */
         readonly get: operations["table_files"];
         readonly put?: never;
         readonly post?: never;
@@ -419,7 +486,7 @@ export interface paths {
             readonly path?: never;
             readonly cookie?: never;
         };
-        /** One Parquet file; Range */
+        /** One Parquet file; Range. */
         readonly get: operations["table_file"];
         readonly put?: never;
         readonly post?: never;
@@ -436,7 +503,7 @@ export interface paths {
             readonly path?: never;
             readonly cookie?: never;
         };
-        /** Whether the lake answers */
+        /** Answers that the server is up, with its version. */
         readonly get: operations["health"];
         readonly put?: never;
         readonly post?: never;
@@ -453,25 +520,8 @@ export interface paths {
             readonly path?: never;
             readonly cookie?: never;
         };
-        /** Prometheus text */
+        /** The figures, in Prometheus' text format. */
         readonly get: operations["metrics"];
-        readonly put?: never;
-        readonly post?: never;
-        readonly delete?: never;
-        readonly options?: never;
-        readonly head?: never;
-        readonly patch?: never;
-        readonly trace?: never;
-    };
-    readonly "/api/v1/openapi.json": {
-        readonly parameters: {
-            readonly query?: never;
-            readonly header?: never;
-            readonly path?: never;
-            readonly cookie?: never;
-        };
-        /** This document */
-        readonly get: operations["openapi"];
         readonly put?: never;
         readonly post?: never;
         readonly delete?: never;
@@ -484,369 +534,474 @@ export interface paths {
 export type webhooks = Record<string, never>;
 export interface components {
     schemas: {
-        /** @description RFC 9457; `code` is stable and made for programs */
-        readonly Problem: {
-            readonly type: string;
-            readonly title: string;
-            readonly status: number;
-            /** @enum {string} */
-            readonly code: "query_invalid" | "read_only" | "query_failed" | "format_impossible" | "lake_unreadable" | "request_invalid" | "unsupported" | "not_found" | "gone" | "file_changed" | "no_data" | "method_not_allowed" | "range_not_satisfiable" | "request_too_large" | "unauthenticated" | "forbidden" | "foreign_origin" | "cancelled" | "time_limit" | "memory_limit" | "row_limit" | "too_many" | "query_ended_engine" | "internal";
-            /** @description What is wrong; what to do follows after `; hint: ` */
-            readonly detail?: string;
-            readonly instance?: string;
+        /** @description Measurements that took this attempt. */
+        readonly AttemptCount: {
+            readonly attempt: number;
+            readonly measurements: number;
         };
+        /** @description A band, or the total, which has no centre. */
         readonly Band: {
-            /** @description As in column names: `2500`, ..., `total` */
-            readonly key: string;
             readonly centre_hz: number | null;
-            /** @description As in pictures: `2.5 kHz` */
+            /** @description As in column names: `2500`, ..., `total`. */
+            readonly key: string;
+            /** @description As in pictures: `2.5 kHz`. */
             readonly label: string;
         };
+        /** @description Statistics of a band. */
+        readonly BandStatistics: {
+            readonly band: string;
+            readonly max_db: number | null;
+            readonly measurements: number;
+            readonly min_db: number | null;
+            readonly p50_db: number | null;
+            readonly p5_db: number | null;
+            readonly p90_mean_db: number | null;
+            readonly p95_db: number | null;
+            readonly spread_db: number | null;
+        };
+        /** @description Surfaces with values from one number to another. */
+        readonly Bin: {
+            readonly count: number;
+            readonly from: number;
+            readonly to: number;
+        };
+        /** @description A column. */
+        readonly Column: {
+            readonly comment: string | null;
+            readonly name: string;
+            readonly nullable: boolean;
+            /** @description As Arrow writes it. */
+            readonly type: string;
+            readonly unit: string | null;
+        };
+        /** @description The correlation of a parameter with the level of a band. */
+        readonly Correlation: {
+            readonly band: string;
+            readonly n: number;
+            readonly parameter: string;
+            readonly r: number | null;
+            readonly unit: string;
+        };
+        /** @description Correlations of parameters and levels. */
+        readonly Correlations: {
+            readonly items: readonly components["schemas"]["Correlation"][];
+            readonly method: string;
+            readonly surfaces: number;
+        };
+        /** @description Curves of a surface beside those of its Flat. */
+        readonly CurveSet: {
+            readonly flat: components["schemas"]["Curves"];
+            readonly surface: components["schemas"]["Curves"];
+            readonly time_ms: readonly number[];
+        };
+        /** @description Curves of a surface. */
+        readonly Curves: {
+            /** @description By band (no total), then by time: NCE over Flat's total, linear. */
+            readonly bands: readonly (readonly number[])[];
+            /** @description Measurements that the mean is over. */
+            readonly pairs: number;
+            readonly surface_id: string;
+        };
+        /** @description Readings over the time since `start`. */
+        readonly EnvironmentSeries: {
+            readonly humidity_pct: readonly (number | null)[];
+            /** @description The loudest of each interval. */
+            readonly outside_level_db: readonly (number | null)[];
+            readonly pressure_hpa: readonly (number | null)[];
+            /** Format: date-time */
+            readonly start: string;
+            readonly temperature_c: readonly (number | null)[];
+            /** @description Since `start`. */
+            readonly time_s: readonly number[];
+        };
+        /** @description A log message of a run. */
+        readonly Event: {
+            readonly level: string;
+            /** Format: date-time */
+            readonly log_time: string;
+            readonly message: string;
+            readonly name: string;
+        };
+        /** @description Surfaces by the values of a text. */
+        readonly Facet: {
+            readonly label: string;
+            /** @description The query parameter that filters by it. */
+            readonly name: string;
+            readonly values: readonly components["schemas"]["FacetValue"][];
+        };
+        /** @description A value, and the surfaces that have it. */
+        readonly FacetValue: {
+            readonly count: number;
+            readonly value: string;
+        };
+        /** @description The Parquet files of a snapshot. */
+        readonly FileManifest: {
+            readonly files: readonly components["schemas"]["ManifestFile"][];
+            /** @description Of the snapshot; another one, another version. */
+            readonly version: string;
+        };
+        /** @description A manifest. */
+        readonly FoxgloveManifest: {
+            readonly name: string;
+            readonly sources: readonly components["schemas"]["FoxgloveSource"][];
+        };
+        /** @description A schema of a source's messages. */
+        readonly FoxgloveSchema: {
+            readonly data: string;
+            readonly encoding: string;
+            readonly id: number;
+            readonly name: string;
+        };
+        /** @description A source of data. */
+        readonly FoxgloveSource: {
+            readonly supportsRangeRequests: boolean;
+            readonly url: string;
+        } | {
+            /** Format: date-time */
+            readonly endTime: string;
+            /** @description The key that the loader keeps the data by, for everybody. */
+            readonly id: string;
+            readonly schemas: readonly components["schemas"]["FoxgloveSchema"][];
+            /** Format: date-time */
+            readonly startTime: string;
+            readonly topics: readonly components["schemas"]["FoxgloveTopic"][];
+            readonly url: string;
+        };
+        /** @description A topic of a source. */
+        readonly FoxgloveTopic: {
+            readonly messageEncoding: string;
+            readonly name: string;
+            readonly schemaId?: number;
+        };
+        /** @description A first Fresnel zone, by its full diameters. */
+        readonly FresnelEllipse: {
+            readonly frequency_hz: number;
+            readonly major_mm: number;
+            readonly minor_mm: number;
+        };
+        /** @description TNCE over the grid for one microphone point. */
+        readonly Grid: {
+            /** @description By band, then by point: TNCE in dB. */
+            readonly bands: readonly (readonly (number | null)[])[];
+            readonly microphone: number;
+            /**
+             * @description The normalisation of the bands. The total is always normalised by Flat's total.
+             * @default flat-total
+             * @enum {string}
+             */
+            readonly over: "flat-total" | "flat-band";
+            /** @description Pair with the microphone by point; null if the pair was not measured or is the microphone itself. */
+            readonly pairs: readonly (number | null)[];
+            readonly surface_id: string;
+            /** @description The pair was measured with microphone and speaker exchanged. */
+            readonly swapped: readonly boolean[];
+        };
+        /** @description Surfaces by the values of a number. */
+        readonly Histogram: {
+            readonly bins: readonly components["schemas"]["Bin"][];
+            readonly label: string;
+            /** @description The query parameter that filters by it, as `lo..hi`. */
+            readonly name: string;
+            readonly unit: string;
+        };
+        /** @description The lake. */
+        readonly Lake: {
+            readonly bands: readonly components["schemas"]["Band"][];
+            readonly counts: components["schemas"]["LakeCounts"];
+            readonly high_hz: number;
+            readonly ir_length: number;
+            readonly layers: number;
+            readonly low_hz: number;
+            readonly name: string;
+            readonly panel_depth_mm: number;
+            readonly panel_size_mm: number;
+            readonly points: readonly components["schemas"]["Point"][];
+            readonly rate_hz: number;
+            readonly reference_temperature_c: number;
+            /** @description Every surface comes from the simulated rig. */
+            readonly simulated: boolean;
+            readonly software: string;
+            /** @description Changes with every snapshot; also the ETag of what is computed from it. */
+            readonly version: string;
+        };
+        /** @description Numbers of what the lake holds. */
+        readonly LakeCounts: {
+            readonly measurements: number;
+            readonly pairs: number;
+            readonly runs: number;
+            readonly surfaces: number;
+        };
+        /** @description A Parquet file with its address. */
+        readonly ManifestFile: {
+            readonly bytes: number;
+            /** @description Rows that the snapshot shows. */
+            readonly rows: number;
+            /** @description Rows that are in the file, too, but were replaced by newer rows of the same runs. */
+            readonly superseded_rows: number;
+            readonly table: string;
+            /** Format: uri */
+            readonly url: string;
+        };
+        /** @description A surface on the map. */
+        readonly MapPoint: {
+            readonly neighbours: readonly components["schemas"]["SurfaceNeighbour"][];
+            /** @description Coordinates along the components, dB. */
+            readonly position: readonly number[];
+            readonly surface_id: string;
+            readonly typology: string;
+        };
+        /** @description A measurement of a pair. */
+        readonly Measurement: {
+            readonly arrival_error_us: number | null;
+            readonly attempt: number;
+            readonly chunk_offset: number;
+            readonly clipped_samples: number | null;
+            readonly humidity_pct: number | null;
+            /** Format: date-time */
+            readonly log_time: string;
+            readonly microphone_residual_mm: number | null;
+            readonly outside_level_db: number | null;
+            readonly pressure_hpa: number | null;
+            readonly reasons: string;
+            readonly run_id: string;
+            readonly snr_db: number | null;
+            readonly source: string;
+            readonly speaker_residual_mm: number | null;
+            readonly temperature_c: number | null;
+            readonly verdict: string;
+        };
+        /** @description The geometry of a pair. */
+        readonly Pair: {
+            readonly direct_mm: number;
+            /** @description Those at 2 and 40 kHz. They are no column of the table. */
+            readonly fresnel: readonly components["schemas"]["FresnelEllipse"][];
+            readonly image_mm: number;
+            readonly incidence_deg: number;
+            readonly microphone: number;
+            readonly microphone_mm: readonly number[];
+            readonly pair_id: number;
+            readonly speaker: number;
+            readonly speaker_mm: readonly number[];
+            /** @description x, y in the panel's plane. */
+            readonly specular_mm: readonly number[];
+        };
+        /** @description Everything about one impulse response. */
+        readonly PairDetail: {
+            /** @description What the controller logged about this pair. */
+            readonly attempts: readonly components["schemas"]["Event"][];
+            readonly curves: components["schemas"]["CurveSet"] | null;
+            readonly environment: components["schemas"]["EnvironmentSeries"];
+            readonly flat_reflected: readonly number[] | null;
+            /** @description Temperature-corrected, cropped, direct sound still in it; Pa per unit of the sweep's amplitude. */
+            readonly measured: readonly number[];
+            readonly measurement: components["schemas"]["Measurement"];
+            readonly pair: components["schemas"]["Pair"];
+            readonly rate_hz: number;
+            /** @description After Foam's response was subtracted; null if Foam is missing. */
+            readonly reflected: readonly number[] | null;
+            readonly surface_id: string;
+            readonly symmetries: readonly components["schemas"]["SymmetricPair"][];
+            /** @description Over Flat's same band, by band as `tnce_db`. */
+            readonly tnce_band_db: readonly (number | null)[];
+            /** @description Over Flat's total. One value per band in the order of `lake.bands`, the total last; null if there is no value. */
+            readonly tnce_db: readonly (number | null)[];
+        };
+        /** @description A point of the grid. */
         readonly Point: {
-            readonly point_id: number;
-            readonly layer: number;
             readonly gridx: number;
             readonly gridy: number;
+            readonly layer: number;
+            readonly point_id: number;
             readonly x_mm: number;
             readonly y_mm: number;
             readonly z_mm: number;
         };
-        readonly Lake: {
-            readonly name: string;
-            /** @description Changes with every snapshot; also the ETag of what is computed from it */
-            readonly version: string;
-            readonly software: string;
-            readonly bands: readonly components["schemas"]["Band"][];
-            readonly rate_hz: number;
-            readonly low_hz: number;
-            readonly high_hz: number;
-            readonly ir_length: number;
-            readonly reference_temperature_c: number;
-            readonly panel_size_mm: number;
-            readonly panel_depth_mm: number;
-            readonly layers: number;
-            readonly points: readonly components["schemas"]["Point"][];
-            readonly counts: {
-                readonly surfaces: number;
-                readonly runs: number;
-                readonly measurements: number;
-                readonly pairs: number;
-            };
-            /** @description Every surface comes from the simulated rig */
-            readonly simulated: boolean;
-        };
-        readonly Surface: {
-            readonly surface_id: string;
-            readonly run_id: string | null;
-            readonly panel: string;
-            readonly side: number | null;
-            readonly typology: string;
-            readonly macrostructure: string | null;
-            readonly mesostructure: string | null;
-            readonly microstructure: string | null;
-            readonly material: string;
-            readonly flat_reference: string;
-            readonly foam_reference: string;
-            readonly origin: string;
-            /** Format: date-time */
-            readonly started: string | null;
-            readonly relief_min_mm: number | null;
-            readonly relief_max_mm: number | null;
-            readonly relief_rms_mm: number | null;
-            /** @description Mean TNCE of the values up to the 90th percentile, dB over Flat's total. One value a band in the order of `lake.bands`, the total last; null where there is no value */
-            readonly level_db: readonly (number | null)[];
-            /** @description `level_db` less that of the surface's Flat. One value a band in the order of `lake.bands`, the total last; null where there is no value */
-            readonly against_flat_db: readonly (number | null)[];
-            /** @description Standard deviation of the pairs' TNCE in dB. One value a band in the order of `lake.bands`, the total last; null where there is no value */
-            readonly spread_db: readonly (number | null)[];
-        };
-        readonly FacetValue: {
-            readonly value: string;
-            readonly count: number;
-        };
-        readonly Facet: {
-            /** @description The query parameter that filters by it */
-            readonly name: string;
-            readonly label: string;
-            readonly values: readonly components["schemas"]["FacetValue"][];
-        };
-        readonly Bin: {
-            readonly from: number;
-            readonly to: number;
-            readonly count: number;
-        };
-        readonly Histogram: {
-            /** @description The query parameter that filters by it, as `lo..hi` */
-            readonly name: string;
-            readonly label: string;
-            readonly unit: string;
-            readonly bins: readonly components["schemas"]["Bin"][];
-        };
-        readonly SurfacePage: {
-            readonly total: number;
-            readonly offset: number;
-            readonly items: readonly components["schemas"]["Surface"][];
-            readonly facets: readonly components["schemas"]["Facet"][];
-            readonly histograms: readonly components["schemas"]["Histogram"][];
-            /**
-             * @description What the counts are; the page says so where they are not exact
-             * @enum {string}
-             */
-            readonly counts: "exact" | "approximate" | "timed_out";
-        };
-        readonly BandStatistics: {
-            readonly band: string;
-            readonly measurements: number;
-            readonly p90_mean_db: number | null;
-            readonly p5_db: number | null;
-            readonly p50_db: number | null;
-            readonly p95_db: number | null;
-            readonly min_db: number | null;
-            readonly max_db: number | null;
-            readonly spread_db: number | null;
-        };
-        readonly SurfaceDetail: {
-            readonly surface: components["schemas"]["Surface"];
-            readonly parameters: {
-                readonly [key: string]: unknown;
-            };
-            readonly mesh_triangles: number | null;
-            readonly mesh_watertight: boolean | null;
-            readonly reflection_factor: number | null;
-            readonly runs: readonly string[];
-            readonly statistics: readonly components["schemas"]["BandStatistics"][];
-            /** @description Mean over the pairs of Flat's TNCE, linear, over Flat's total. One value a band in the order of `lake.bands`, the total last; null where there is no value */
-            readonly flat_mean: readonly (number | null)[];
-            /** @description The same of this surface. One value a band in the order of `lake.bands`, the total last; null where there is no value */
-            readonly mean: readonly (number | null)[];
-        };
-        readonly Grid: {
-            readonly surface_id: string;
-            readonly microphone: number;
+        /** @description RFC 9457; `code` is stable and made for programs. */
+        readonly Problem: {
             /** @enum {string} */
-            readonly over: "flat-total" | "flat-band";
-            /** @description Pair with the microphone by point, null where the pair was not measured or is the microphone itself */
-            readonly pairs: readonly (number | null)[];
-            /** @description The pair was measured with microphone and speaker exchanged */
-            readonly swapped: readonly boolean[];
-            /** @description By band, then by point: TNCE in dB */
-            readonly bands: readonly (readonly (number | null)[])[];
+            readonly code: "query_invalid" | "read_only" | "query_failed" | "format_impossible" | "lake_unreadable" | "request_invalid" | "unsupported" | "not_found" | "gone" | "file_changed" | "no_data" | "method_not_allowed" | "range_not_satisfiable" | "request_too_large" | "unauthenticated" | "forbidden" | "foreign_origin" | "cancelled" | "time_limit" | "memory_limit" | "row_limit" | "too_many" | "query_ended_engine" | "internal";
+            /** @description What is wrong; what to do follows after `; hint: `. */
+            readonly detail?: string;
+            readonly status: number;
+            readonly title: string;
+            readonly type: string;
         };
-        readonly Curves: {
-            readonly surface_id: string;
-            /** @description How many pairs the mean is over */
-            readonly pairs: number;
-            /** @description By band (no total), then by time: NCE over Flat's total, linear */
-            readonly bands: readonly (readonly number[])[];
-        };
-        readonly CurveSet: {
-            readonly time_ms: readonly number[];
-            readonly surface: components["schemas"]["Curves"];
-            readonly flat: components["schemas"]["Curves"];
-        };
-        readonly Pair: {
-            readonly pair_id: number;
-            readonly microphone: number;
-            readonly speaker: number;
-            readonly microphone_mm: readonly number[];
-            readonly speaker_mm: readonly number[];
-            readonly direct_mm: number;
-            readonly image_mm: number;
-            readonly incidence_deg: number;
-            /** @description x, y in the panel's plane */
-            readonly specular_mm: readonly number[];
-            /** @description Full diameters of the first zone */
-            readonly fresnel: readonly {
-                readonly frequency_hz: number;
-                readonly major_mm: number;
-                readonly minor_mm: number;
-            }[];
-        };
-        readonly Measurement: {
-            readonly run_id: string;
-            /** Format: date-time */
-            readonly log_time: string;
-            readonly attempt: number;
-            readonly verdict: string;
-            readonly reasons: string;
-            readonly temperature_c: number | null;
-            readonly humidity_pct: number | null;
-            readonly pressure_hpa: number | null;
-            readonly outside_level_db: number | null;
-            readonly snr_db: number | null;
-            readonly clipped_samples: number | null;
-            readonly arrival_error_us: number | null;
-            readonly microphone_residual_mm: number | null;
-            readonly speaker_residual_mm: number | null;
-            readonly source: string;
-            readonly chunk_offset: number;
-        };
-        readonly SymmetricPair: {
-            readonly symmetry: string;
-            readonly pair_id: number;
-            readonly microphone: number;
-            readonly speaker: number;
-            /** @description Relies on reciprocity */
-            readonly swapped: boolean;
-            /** @description Of that pair on the same surface, over Flat's total. One value a band in the order of `lake.bands`, the total last; null where there is no value */
-            readonly tnce_db: readonly (number | null)[];
-        };
-        readonly EnvironmentSeries: {
-            /** @description Since `start` */
-            readonly time_s: readonly number[];
-            /** Format: date-time */
-            readonly start: string;
-            readonly temperature_c: readonly (number | null)[];
-            readonly humidity_pct: readonly (number | null)[];
-            readonly pressure_hpa: readonly (number | null)[];
-            /** @description The loudest of each interval */
-            readonly outside_level_db: readonly (number | null)[];
-        };
-        readonly Event: {
-            /** Format: date-time */
-            readonly log_time: string;
-            readonly level: string;
-            readonly name: string;
-            readonly message: string;
-        };
-        readonly PairDetail: {
-            readonly surface_id: string;
-            readonly pair: components["schemas"]["Pair"];
-            readonly measurement: components["schemas"]["Measurement"];
-            readonly rate_hz: number;
-            /** @description Temperature-corrected, cropped, direct sound still in it; Pa per unit of the sweep's amplitude */
-            readonly measured: readonly number[];
-            /** @description After Foam's response was subtracted; null where Foam is missing */
-            readonly reflected: readonly number[] | null;
-            readonly flat_reflected: readonly number[] | null;
-            /** @description Over Flat's total. One value a band in the order of `lake.bands`, the total last; null where there is no value */
-            readonly tnce_db: readonly (number | null)[];
-            /** @description Over Flat's same band. One value a band in the order of `lake.bands`, the total last; null where there is no value */
-            readonly tnce_band_db: readonly (number | null)[];
-            readonly curves: components["schemas"]["CurveSet"] | null;
-            readonly symmetries: readonly components["schemas"]["SymmetricPair"][];
-            /** @description What the controller logged about this pair */
-            readonly attempts: readonly components["schemas"]["Event"][];
-            readonly environment: components["schemas"]["EnvironmentSeries"];
-        };
-        readonly MapPoint: {
-            readonly surface_id: string;
-            readonly typology: string;
-            /** @description Coordinates along the components, dB */
-            readonly position: readonly number[];
-            readonly neighbours: readonly {
-                readonly surface_id: string;
-                /** @description Root mean square over the features */
-                readonly distance_db: number;
-            }[];
-        };
-        readonly SurfaceMap: {
-            /** @description Pairs times bands that all surfaces have */
-            readonly features: number;
-            /** @description Share of the variance by component */
-            readonly explained: readonly number[];
-            readonly points: readonly components["schemas"]["MapPoint"][];
-            /** @description Surfaces without TNCE, and those beyond the first 2000 */
-            readonly left_out: readonly string[];
-        };
-        readonly Correlation: {
-            readonly parameter: string;
-            readonly unit: string;
-            readonly band: string;
-            readonly r: number | null;
-            readonly n: number;
-        };
-        readonly Correlations: {
-            /** @enum {string} */
-            readonly method: "pearson";
-            readonly items: readonly components["schemas"]["Correlation"][];
-            readonly surfaces: number;
-        };
-        readonly Run: {
-            readonly surface_id: string;
-            readonly run_id: string;
-            readonly state: string;
-            readonly missing: string;
-            readonly origin: string;
-            readonly rig: string;
-            /** Format: date-time */
-            readonly started: string;
-            /** Format: date-time */
-            readonly ended: string;
-            readonly measurements: number;
-            readonly rejected: number;
-            readonly attempts: number;
-            readonly damaged: number;
-            readonly temperature_min_c: number | null;
-            readonly temperature_max_c: number | null;
-            readonly humidity_min_pct: number | null;
-            readonly humidity_max_pct: number | null;
-            readonly pressure_min_hpa: number | null;
-            readonly pressure_max_hpa: number | null;
-            readonly file: string;
-            readonly file_bytes: number;
-            readonly file_sha256: string;
-            readonly recorded_by: string;
-            readonly flat_version: string | null;
-            readonly foam_version: string | null;
-            readonly code_version: string;
-        };
-        readonly RunPage: {
-            readonly total: number;
-            readonly offset: number;
-            readonly items: readonly components["schemas"]["Run"][];
-        };
-        readonly Topic: {
-            readonly topic: string;
-            readonly schema: string;
-            readonly encoding: string;
-            readonly messages: number;
-            /** @description Of the messages before compression, from the message index */
-            readonly bytes: number | null;
-        };
+        /** @description Measurements with a flag. */
         readonly Quality: {
             readonly flag: string;
             readonly label: string;
             readonly measurements: number;
         };
+        /** @description A query. */
+        readonly Query: {
+            readonly format?: ("json" | "arrow" | "csv" | "parquet") & Record<string, never>;
+            readonly query: string;
+        };
+        /** @description A run. */
+        readonly Run: {
+            readonly attempts: number;
+            readonly code_version: string;
+            readonly damaged: number;
+            /** Format: date-time */
+            readonly ended: string;
+            readonly file: string;
+            readonly file_bytes: number;
+            readonly file_sha256: string;
+            readonly flat_version: string | null;
+            readonly foam_version: string | null;
+            readonly humidity_max_pct: number | null;
+            readonly humidity_min_pct: number | null;
+            readonly measurements: number;
+            readonly missing: string;
+            readonly origin: string;
+            readonly pressure_max_hpa: number | null;
+            readonly pressure_min_hpa: number | null;
+            readonly recorded_by: string;
+            readonly rejected: number;
+            readonly rig: string;
+            readonly run_id: string;
+            /** Format: date-time */
+            readonly started: string;
+            readonly state: string;
+            readonly surface_id: string;
+            readonly temperature_max_c: number | null;
+            readonly temperature_min_c: number | null;
+        };
+        /** @description A file within a run's file. */
+        readonly RunAttachment: {
+            readonly bytes: number;
+            readonly media_type: string;
+            readonly name: string;
+        };
+        /** @description One run. */
         readonly RunDetail: {
+            readonly attachments: readonly components["schemas"]["RunAttachment"][];
+            /** @description Warnings and errors first, at most 200. */
+            readonly events: readonly components["schemas"]["Event"][];
+            readonly quality: readonly components["schemas"]["Quality"][];
+            readonly repeats: readonly components["schemas"]["AttemptCount"][];
             readonly run: components["schemas"]["Run"];
             readonly topics: readonly components["schemas"]["Topic"][];
-            readonly attachments: readonly {
-                readonly name: string;
-                readonly media_type: string;
-                readonly bytes: number;
-            }[];
-            readonly quality: readonly components["schemas"]["Quality"][];
-            readonly repeats: readonly {
-                readonly attempt: number;
-                readonly measurements: number;
-            }[];
-            /** @description Warnings and errors first, at most 200 */
-            readonly events: readonly components["schemas"]["Event"][];
         };
-        readonly Column: {
-            readonly name: string;
-            /** @description As Arrow writes it */
-            readonly type: string;
-            readonly nullable: boolean;
-            readonly unit: string | null;
-            readonly comment: string | null;
+        /** @description A page of runs. */
+        readonly RunPage: {
+            readonly items: readonly components["schemas"]["Run"][];
+            readonly offset: number;
+            readonly total: number;
         };
-        readonly Table: {
-            readonly name: string;
-            readonly columns: readonly components["schemas"]["Column"][];
+        /** @description The state of the server. */
+        readonly ServerHealth: {
+            readonly status: string;
+            readonly version: string;
         };
+        /** @description A token. */
         readonly Session: {
             readonly token: string;
         };
-        readonly Query: {
-            readonly query: string;
+        /** @description A surface as the pages know it. */
+        readonly Surface: {
+            /** @description `level_db` less that of the surface's Flat. */
+            readonly against_flat_db: readonly (number | null)[];
+            readonly flat_reference: string;
+            readonly foam_reference: string;
             /**
-             * @description Instead of the Accept header
-             * @enum {string}
+             * @description Mean TNCE of the values up to the 90th percentile, dB over Flat's total. One value per band in the order of
+             *     `lake.bands`, the total last; null if there is no value.
              */
-            readonly format?: "json" | "arrow" | "csv" | "parquet";
+            readonly level_db: readonly (number | null)[];
+            readonly macrostructure: string | null;
+            readonly material: string;
+            readonly mesostructure: string | null;
+            readonly microstructure: string | null;
+            readonly origin: string;
+            readonly panel: string;
+            readonly relief_max_mm: number | null;
+            readonly relief_min_mm: number | null;
+            readonly relief_rms_mm: number | null;
+            readonly run_id: string | null;
+            readonly side: number | null;
+            /** @description Standard deviation of the pairs' TNCE in dB, by band as `level_db`. */
+            readonly spread_db: readonly (number | null)[];
+            /** Format: date-time */
+            readonly started: string | null;
+            readonly surface_id: string;
+            readonly typology: string;
+        };
+        /** @description One surface. */
+        readonly SurfaceDetail: {
+            /**
+             * @description Mean over the pairs of Flat's TNCE, linear, over Flat's total. One value per band in the order of `lake.bands`, the
+             *     total last; null if there is no value.
+             */
+            readonly flat_mean: readonly (number | null)[];
+            /** @description The same of this surface. */
+            readonly mean: readonly (number | null)[];
+            readonly mesh_triangles: number | null;
+            readonly mesh_watertight: boolean | null;
+            readonly parameters: {
+                readonly [key: string]: unknown;
+            };
+            readonly reflection_factor: number | null;
+            readonly runs: readonly string[];
+            readonly statistics: readonly components["schemas"]["BandStatistics"][];
+            readonly surface: components["schemas"]["Surface"];
+        };
+        /** @description Surfaces on the map. */
+        readonly SurfaceMap: {
+            /** @description Share of the variance by component. */
+            readonly explained: readonly number[];
+            /** @description Pairs times bands that all surfaces have. */
+            readonly features: number;
+            /** @description Surfaces without TNCE, and those beyond the first 2000. */
+            readonly left_out: readonly string[];
+            readonly points: readonly components["schemas"]["MapPoint"][];
+        };
+        /** @description A surface that is near another one. */
+        readonly SurfaceNeighbour: {
+            /** @description Root mean square over the features. */
+            readonly distance_db: number;
+            readonly surface_id: string;
+        };
+        /** @description A page of surfaces. */
+        readonly SurfacePage: {
+            /** @description What the counts are: exact. */
+            readonly counts: string;
+            readonly facets: readonly components["schemas"]["Facet"][];
+            readonly histograms: readonly components["schemas"]["Histogram"][];
+            readonly items: readonly components["schemas"]["Surface"][];
+            readonly offset: number;
+            readonly total: number;
+        };
+        /** @description A pair that a symmetry of the grid makes of another. */
+        readonly SymmetricPair: {
+            readonly microphone: number;
+            readonly pair_id: number;
+            readonly speaker: number;
+            /** @description Relies on reciprocity. */
+            readonly swapped: boolean;
+            readonly symmetry: string;
+            /** @description Of that pair on the same surface, over Flat's total, by band as in `PairDetail`. */
+            readonly tnce_db: readonly (number | null)[];
+        };
+        /** @description A table or view. */
+        readonly Table: {
+            readonly columns: readonly components["schemas"]["Column"][];
+            readonly name: string;
+        };
+        /** @description A Parquet file. */
+        readonly TableFile: {
+            readonly bytes: number;
+            readonly file: string;
+            readonly rows: number | null;
+        };
+        /** @description A topic of a run. */
+        readonly Topic: {
+            /** @description Of the messages before compression, from the message index. */
+            readonly bytes: number | null;
+            readonly encoding: string;
+            readonly messages: number;
+            readonly schema: string;
+            readonly topic: string;
         };
     };
     responses: {
@@ -867,6 +1022,104 @@ export interface components {
 }
 export type $defs = Record<string, never>;
 export interface operations {
+    readonly correlations: {
+        readonly parameters: {
+            readonly query?: {
+                readonly typology?: readonly string[];
+            };
+            readonly header?: never;
+            readonly path?: never;
+            readonly cookie?: never;
+        };
+        readonly requestBody?: never;
+        readonly responses: {
+            /** @description OK */
+            readonly 200: {
+                headers: {
+                    readonly ETag?: string;
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "application/json": components["schemas"]["Correlations"];
+                };
+            };
+            /** @description Not changed since the ETag of If-None-Match */
+            readonly 304: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content?: never;
+            };
+            readonly default: components["responses"]["Problem"];
+        };
+    };
+    readonly files: {
+        readonly parameters: {
+            readonly query?: {
+                /** @description Only of these tables. */
+                readonly table?: readonly string[];
+            };
+            readonly header?: never;
+            readonly path?: never;
+            readonly cookie?: never;
+        };
+        readonly requestBody?: never;
+        readonly responses: {
+            /** @description OK */
+            readonly 200: {
+                headers: {
+                    readonly ETag?: string;
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "application/json": components["schemas"]["FileManifest"];
+                };
+            };
+            /** @description Not changed since the ETag of If-None-Match */
+            readonly 304: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content?: never;
+            };
+            readonly default: components["responses"]["Problem"];
+        };
+    };
+    readonly foxglove_manifest: {
+        readonly parameters: {
+            readonly query?: {
+                /**
+                 * @description An SQL predicate over the columns of table measurements; all measurements of the runs if there is none.
+                 * @example pair_id < 5
+                 */
+                readonly where?: string;
+                /** @description The runs that the measurements are of; a page of elsewhere has to name them. */
+                readonly run?: readonly string[];
+                /** @description Topics, separated by commas; all, and the attachments, if there are none. */
+                readonly topics?: string;
+                /** @description Heavy topics in chunks of their own, or all messages in the order of time. */
+                readonly layout?: "by-topic" | "in-time";
+                /** @description The slice's ETag without quotes; if it is another by now, 410. */
+                readonly id?: string;
+            };
+            readonly header?: never;
+            readonly path?: never;
+            readonly cookie?: never;
+        };
+        readonly requestBody?: never;
+        readonly responses: {
+            /** @description OK */
+            readonly 200: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "application/json": components["schemas"]["FoxgloveManifest"];
+                };
+            };
+            readonly default: components["responses"]["Problem"];
+        };
+    };
     readonly lake: {
         readonly parameters: {
             readonly query?: never;
@@ -896,30 +1149,9 @@ export interface operations {
             readonly default: components["responses"]["Problem"];
         };
     };
-    readonly surfaces: {
+    readonly layout: {
         readonly parameters: {
-            readonly query?: {
-                /** @description Text in id, typology, structures, material, parameters */
-                readonly q?: string;
-                readonly typology?: readonly string[];
-                readonly macrostructure?: readonly string[];
-                readonly mesostructure?: readonly string[];
-                readonly material?: readonly string[];
-                readonly flat_reference?: readonly string[];
-                readonly origin?: readonly string[];
-                /** @description `lo..hi` in days since 1970, as the histogram's bins */
-                readonly started?: string;
-                /** @description `lo..hi` mm, root mean square */
-                readonly relief?: string;
-                /** @description `band:lo..hi`, dB against Flat */
-                readonly level?: readonly string[];
-                readonly sort?: "surface_id" | "started" | "relief" | "spread" | "level";
-                /** @description A band's key, as in `lake.bands` */
-                readonly sort_band?: string;
-                readonly order?: "asc" | "desc";
-                readonly offset?: number;
-                readonly limit?: number;
-            };
+            readonly query?: never;
             readonly header?: never;
             readonly path?: never;
             readonly cookie?: never;
@@ -933,269 +1165,9 @@ export interface operations {
                     readonly [name: string]: unknown;
                 };
                 content: {
-                    readonly "application/json": components["schemas"]["SurfacePage"];
-                };
-            };
-            /** @description Not changed since the ETag of If-None-Match */
-            readonly 304: {
-                headers: {
-                    readonly [name: string]: unknown;
-                };
-                content?: never;
-            };
-            readonly default: components["responses"]["Problem"];
-        };
-    };
-    readonly surface: {
-        readonly parameters: {
-            readonly query?: never;
-            readonly header?: never;
-            readonly path: {
-                readonly surface_id: string;
-            };
-            readonly cookie?: never;
-        };
-        readonly requestBody?: never;
-        readonly responses: {
-            /** @description OK */
-            readonly 200: {
-                headers: {
-                    readonly ETag?: string;
-                    readonly [name: string]: unknown;
-                };
-                content: {
-                    readonly "application/json": components["schemas"]["SurfaceDetail"];
-                };
-            };
-            /** @description Not changed since the ETag of If-None-Match */
-            readonly 304: {
-                headers: {
-                    readonly [name: string]: unknown;
-                };
-                content?: never;
-            };
-            readonly default: components["responses"]["Problem"];
-        };
-    };
-    readonly grid: {
-        readonly parameters: {
-            readonly query: {
-                readonly microphone: number;
-                /** @description flat-total: as in the paper's tables. flat-band: as in its grid plots; the total is then over Flat's total */
-                readonly over?: "flat-total" | "flat-band";
-            };
-            readonly header?: never;
-            readonly path: {
-                readonly surface_id: string;
-            };
-            readonly cookie?: never;
-        };
-        readonly requestBody?: never;
-        readonly responses: {
-            /** @description OK */
-            readonly 200: {
-                headers: {
-                    readonly ETag?: string;
-                    readonly [name: string]: unknown;
-                };
-                content: {
-                    readonly "application/json": components["schemas"]["Grid"];
-                };
-            };
-            /** @description Not changed since the ETag of If-None-Match */
-            readonly 304: {
-                headers: {
-                    readonly [name: string]: unknown;
-                };
-                content?: never;
-            };
-            readonly default: components["responses"]["Problem"];
-        };
-    };
-    readonly curves: {
-        readonly parameters: {
-            readonly query?: {
-                readonly microphone?: number;
-                readonly points?: number;
-            };
-            readonly header?: never;
-            readonly path: {
-                readonly surface_id: string;
-            };
-            readonly cookie?: never;
-        };
-        readonly requestBody?: never;
-        readonly responses: {
-            /** @description OK */
-            readonly 200: {
-                headers: {
-                    readonly ETag?: string;
-                    readonly [name: string]: unknown;
-                };
-                content: {
-                    readonly "application/json": components["schemas"]["CurveSet"];
-                    readonly "application/vnd.apache.arrow.stream": string;
-                };
-            };
-            /** @description Not changed since the ETag of If-None-Match */
-            readonly 304: {
-                headers: {
-                    readonly [name: string]: unknown;
-                };
-                content?: never;
-            };
-            readonly default: components["responses"]["Problem"];
-        };
-    };
-    readonly heightmap: {
-        readonly parameters: {
-            readonly query?: never;
-            readonly header?: never;
-            readonly path: {
-                readonly surface_id: string;
-            };
-            readonly cookie?: never;
-        };
-        readonly requestBody?: never;
-        readonly responses: {
-            /** @description OK */
-            readonly 200: {
-                headers: {
-                    readonly ETag?: string;
-                    readonly [name: string]: unknown;
-                };
-                content: {
-                    readonly "application/octet-stream": string;
-                };
-            };
-            /** @description Not changed since the ETag of If-None-Match */
-            readonly 304: {
-                headers: {
-                    readonly [name: string]: unknown;
-                };
-                content?: never;
-            };
-            readonly default: components["responses"]["Problem"];
-        };
-    };
-    readonly thumbnail: {
-        readonly parameters: {
-            readonly query?: never;
-            readonly header?: never;
-            readonly path: {
-                readonly surface_id: string;
-            };
-            readonly cookie?: never;
-        };
-        readonly requestBody?: never;
-        readonly responses: {
-            /** @description OK */
-            readonly 200: {
-                headers: {
-                    readonly ETag?: string;
-                    readonly [name: string]: unknown;
-                };
-                content: {
-                    readonly "image/png": string;
-                };
-            };
-            /** @description Not changed since the ETag of If-None-Match */
-            readonly 304: {
-                headers: {
-                    readonly [name: string]: unknown;
-                };
-                content?: never;
-            };
-            readonly default: components["responses"]["Problem"];
-        };
-    };
-    readonly mesh: {
-        readonly parameters: {
-            readonly query?: never;
-            readonly header?: never;
-            readonly path: {
-                readonly surface_id: string;
-            };
-            readonly cookie?: never;
-        };
-        readonly requestBody?: never;
-        readonly responses: {
-            /** @description OK */
-            readonly 200: {
-                headers: {
-                    readonly ETag?: string;
-                    readonly [name: string]: unknown;
-                };
-                content: {
-                    readonly "model/gltf-binary": string;
-                };
-            };
-            /** @description Not changed since the ETag of If-None-Match */
-            readonly 304: {
-                headers: {
-                    readonly [name: string]: unknown;
-                };
-                content?: never;
-            };
-            readonly default: components["responses"]["Problem"];
-        };
-    };
-    readonly pair: {
-        readonly parameters: {
-            readonly query?: never;
-            readonly header?: never;
-            readonly path: {
-                readonly surface_id: string;
-                readonly pair_id: number;
-            };
-            readonly cookie?: never;
-        };
-        readonly requestBody?: never;
-        readonly responses: {
-            /** @description OK */
-            readonly 200: {
-                headers: {
-                    readonly ETag?: string;
-                    readonly [name: string]: unknown;
-                };
-                content: {
-                    readonly "application/json": components["schemas"]["PairDetail"];
-                    readonly "application/vnd.apache.arrow.stream": string;
-                };
-            };
-            /** @description Not changed since the ETag of If-None-Match */
-            readonly 304: {
-                headers: {
-                    readonly [name: string]: unknown;
-                };
-                content?: never;
-            };
-            readonly default: components["responses"]["Problem"];
-        };
-    };
-    readonly wav: {
-        readonly parameters: {
-            readonly query?: {
-                readonly signal?: "measured" | "reflected";
-                readonly slowdown?: number;
-            };
-            readonly header?: never;
-            readonly path: {
-                readonly surface_id: string;
-                readonly pair_id: number;
-            };
-            readonly cookie?: never;
-        };
-        readonly requestBody?: never;
-        readonly responses: {
-            /** @description OK */
-            readonly 200: {
-                headers: {
-                    readonly ETag?: string;
-                    readonly [name: string]: unknown;
-                };
-                content: {
-                    readonly "audio/wav": string;
+                    readonly "application/json": {
+                        readonly [key: string]: unknown;
+                    };
                 };
             };
             /** @description Not changed since the ETag of If-None-Match */
@@ -1239,11 +1211,9 @@ export interface operations {
             readonly default: components["responses"]["Problem"];
         };
     };
-    readonly correlations: {
+    readonly openapi: {
         readonly parameters: {
-            readonly query?: {
-                readonly typology?: readonly string[];
-            };
+            readonly query?: never;
             readonly header?: never;
             readonly path?: never;
             readonly cookie?: never;
@@ -1253,19 +1223,13 @@ export interface operations {
             /** @description OK */
             readonly 200: {
                 headers: {
-                    readonly ETag?: string;
                     readonly [name: string]: unknown;
                 };
                 content: {
-                    readonly "application/json": components["schemas"]["Correlations"];
+                    readonly "application/json": {
+                        readonly [key: string]: unknown;
+                    };
                 };
-            };
-            /** @description Not changed since the ETag of If-None-Match */
-            readonly 304: {
-                headers: {
-                    readonly [name: string]: unknown;
-                };
-                content?: never;
             };
             readonly default: components["responses"]["Problem"];
         };
@@ -1273,11 +1237,12 @@ export interface operations {
     readonly runs: {
         readonly parameters: {
             readonly query?: {
+                /** @description Text in id, surface and state. */
                 readonly q?: string;
                 readonly surface_id?: string;
                 readonly state?: string;
                 readonly sort?: "started" | "surface_id" | "attempts" | "file_bytes";
-                readonly order?: "asc" | "desc";
+                readonly order?: "desc" | "asc";
                 readonly offset?: number;
                 readonly limit?: number;
             };
@@ -1375,7 +1340,7 @@ export interface operations {
         readonly parameters: {
             readonly query?: never;
             readonly header?: {
-                readonly Range?: string;
+                readonly Range?: string | null;
             };
             readonly path: {
                 readonly run_id: string;
@@ -1414,25 +1379,48 @@ export interface operations {
             readonly default: components["responses"]["Problem"];
         };
     };
+    readonly session: {
+        readonly parameters: {
+            readonly query?: never;
+            readonly header?: never;
+            readonly path?: never;
+            readonly cookie?: never;
+        };
+        readonly requestBody: {
+            readonly content: {
+                readonly "application/json": components["schemas"]["Session"];
+            };
+        };
+        readonly responses: {
+            /** @description The cookie is set */
+            readonly 204: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content?: never;
+            };
+            readonly default: components["responses"]["Problem"];
+        };
+    };
     readonly slice: {
         readonly parameters: {
-            readonly query: {
+            readonly query?: {
                 /**
-                 * @description An SQL predicate over the columns of table measurements
+                 * @description An SQL predicate over the columns of table measurements; all measurements of the runs if there is none.
                  * @example pair_id < 5
                  */
-                readonly where: string;
-                /** @description The runs that the measurements are of; a page of elsewhere has to name them */
+                readonly where?: string;
+                /** @description The runs that the measurements are of; a page of elsewhere has to name them. */
                 readonly run?: readonly string[];
-                /** @description Topics, separated by commas; all, and the attachments, where there are none */
+                /** @description Topics, separated by commas; all, and the attachments, if there are none. */
                 readonly topics?: string;
-                /** @description Heavy topics in chunks of their own, or all messages in the order of time */
+                /** @description Heavy topics in chunks of their own, or all messages in the order of time. */
                 readonly layout?: "by-topic" | "in-time";
-                /** @description The slice's ETag without quotes; where it is another by now, 410 */
+                /** @description The slice's ETag without quotes; if it is another by now, 410. */
                 readonly id?: string;
             };
             readonly header?: {
-                readonly Range?: string;
+                readonly Range?: string | null;
             };
             readonly path?: never;
             readonly cookie?: never;
@@ -1442,7 +1430,6 @@ export interface operations {
             /** @description The slice */
             readonly 200: {
                 headers: {
-                    readonly ETag?: string;
                     readonly [name: string]: unknown;
                 };
                 content: {
@@ -1469,65 +1456,65 @@ export interface operations {
             readonly default: components["responses"]["Problem"];
         };
     };
-    readonly foxglove_manifest: {
+    readonly sql: {
         readonly parameters: {
             readonly query?: {
-                /**
-                 * @description An SQL predicate over the columns of table measurements
-                 * @example pair_id < 5
-                 */
-                readonly where?: string;
-                /** @description The runs that the measurements are of; a page of elsewhere has to name them */
-                readonly run?: readonly string[];
-                /** @description Topics, separated by commas; all, and the attachments, where there are none */
-                readonly topics?: string;
+                /** @description Instead of the Accept header. */
+                readonly format?: "json" | "arrow" | "csv" | "parquet";
             };
             readonly header?: never;
             readonly path?: never;
             readonly cookie?: never;
         };
-        readonly requestBody?: never;
+        readonly requestBody: {
+            readonly content: {
+                readonly "application/json": components["schemas"]["Query"];
+                readonly "application/sql": string;
+                readonly "text/plain": string;
+            };
+        };
         readonly responses: {
-            /** @description OK */
+            /** @description The rows */
             readonly 200: {
                 headers: {
                     readonly [name: string]: unknown;
                 };
                 content: {
-                    readonly "application/json": {
-                        readonly name: string;
-                        readonly sources: readonly ({
-                            readonly url: string;
-                            /** @enum {boolean} */
-                            readonly supportsRangeRequests: true;
-                        } | {
-                            readonly url: string;
-                            readonly id: string;
-                            readonly topics: readonly {
-                                readonly name: string;
-                                readonly messageEncoding: string;
-                                readonly schemaId?: number;
-                            }[];
-                            readonly schemas: readonly {
-                                readonly id: number;
-                                readonly name: string;
-                                readonly encoding: string;
-                                readonly data: string;
-                            }[];
-                            /** Format: date-time */
-                            readonly startTime: string;
-                            /** Format: date-time */
-                            readonly endTime: string;
-                        })[];
-                    };
+                    readonly "application/json": readonly {
+                        readonly [key: string]: unknown;
+                    }[];
+                    readonly "application/vnd.apache.arrow.stream": string;
+                    readonly "application/vnd.apache.parquet": string;
+                    readonly "text/csv": string;
                 };
             };
             readonly default: components["responses"]["Problem"];
         };
     };
-    readonly layout: {
+    readonly surfaces: {
         readonly parameters: {
-            readonly query?: never;
+            readonly query?: {
+                /** @description Text in id, typology, structures, material, parameters. */
+                readonly q?: string;
+                readonly typology?: readonly string[];
+                readonly macrostructure?: readonly string[];
+                readonly mesostructure?: readonly string[];
+                readonly material?: readonly string[];
+                readonly flat_reference?: readonly string[];
+                readonly origin?: readonly string[];
+                /** @description `lo..hi` in days since 1970, as the histogram's bins. */
+                readonly started?: string;
+                /** @description `lo..hi` mm, root mean square. */
+                readonly relief?: string;
+                /** @description `band:lo..hi`, dB against Flat. */
+                readonly level?: readonly string[];
+                readonly sort?: "surface_id" | "started" | "relief" | "spread" | "level";
+                /** @description A band's key, as in `lake.bands`. */
+                readonly sort_band?: string;
+                readonly order?: "asc" | "desc";
+                readonly offset?: number;
+                readonly limit?: number;
+            };
             readonly header?: never;
             readonly path?: never;
             readonly cookie?: never;
@@ -1541,10 +1528,271 @@ export interface operations {
                     readonly [name: string]: unknown;
                 };
                 content: {
-                    readonly "application/json": {
-                        readonly configById: Record<string, never>;
-                        readonly layout: Record<string, never>;
-                    };
+                    readonly "application/json": components["schemas"]["SurfacePage"];
+                };
+            };
+            /** @description Not changed since the ETag of If-None-Match */
+            readonly 304: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content?: never;
+            };
+            readonly default: components["responses"]["Problem"];
+        };
+    };
+    readonly surface: {
+        readonly parameters: {
+            readonly query?: never;
+            readonly header?: never;
+            readonly path: {
+                readonly surface_id: string;
+            };
+            readonly cookie?: never;
+        };
+        readonly requestBody?: never;
+        readonly responses: {
+            /** @description OK */
+            readonly 200: {
+                headers: {
+                    readonly ETag?: string;
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "application/json": components["schemas"]["SurfaceDetail"];
+                };
+            };
+            /** @description Not changed since the ETag of If-None-Match */
+            readonly 304: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content?: never;
+            };
+            readonly default: components["responses"]["Problem"];
+        };
+    };
+    readonly curves: {
+        readonly parameters: {
+            readonly query?: {
+                /** @description A grid point. */
+                readonly microphone?: number;
+                readonly points?: number;
+            };
+            readonly header?: never;
+            readonly path: {
+                readonly surface_id: string;
+            };
+            readonly cookie?: never;
+        };
+        readonly requestBody?: never;
+        readonly responses: {
+            /** @description OK */
+            readonly 200: {
+                headers: {
+                    readonly ETag?: string;
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "application/json": components["schemas"]["CurveSet"];
+                    readonly "application/vnd.apache.arrow.stream": string;
+                };
+            };
+            /** @description Not changed since the ETag of If-None-Match */
+            readonly 304: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content?: never;
+            };
+            readonly default: components["responses"]["Problem"];
+        };
+    };
+    readonly grid: {
+        readonly parameters: {
+            readonly query: {
+                /** @description A grid point. */
+                readonly microphone: number;
+                /** @description flat-total: as in the paper's tables. flat-band: as in its grid plots; the total is then over Flat's total. */
+                readonly over?: "flat-total" | "flat-band";
+            };
+            readonly header?: never;
+            readonly path: {
+                readonly surface_id: string;
+            };
+            readonly cookie?: never;
+        };
+        readonly requestBody?: never;
+        readonly responses: {
+            /** @description OK */
+            readonly 200: {
+                headers: {
+                    readonly ETag?: string;
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "application/json": components["schemas"]["Grid"];
+                };
+            };
+            /** @description Not changed since the ETag of If-None-Match */
+            readonly 304: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content?: never;
+            };
+            readonly default: components["responses"]["Problem"];
+        };
+    };
+    readonly heightmap: {
+        readonly parameters: {
+            readonly query?: never;
+            readonly header?: never;
+            readonly path: {
+                readonly surface_id: string;
+            };
+            readonly cookie?: never;
+        };
+        readonly requestBody?: never;
+        readonly responses: {
+            /** @description OK */
+            readonly 200: {
+                headers: {
+                    readonly ETag?: string;
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "application/octet-stream": string;
+                };
+            };
+            /** @description Not changed since the ETag of If-None-Match */
+            readonly 304: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content?: never;
+            };
+            readonly default: components["responses"]["Problem"];
+        };
+    };
+    readonly mesh: {
+        readonly parameters: {
+            readonly query?: never;
+            readonly header?: never;
+            readonly path: {
+                readonly surface_id: string;
+            };
+            readonly cookie?: never;
+        };
+        readonly requestBody?: never;
+        readonly responses: {
+            /** @description OK */
+            readonly 200: {
+                headers: {
+                    readonly ETag?: string;
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "model/gltf-binary": string;
+                };
+            };
+            /** @description Not changed since the ETag of If-None-Match */
+            readonly 304: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content?: never;
+            };
+            readonly default: components["responses"]["Problem"];
+        };
+    };
+    readonly pair: {
+        readonly parameters: {
+            readonly query?: never;
+            readonly header?: never;
+            readonly path: {
+                readonly surface_id: string;
+                readonly pair_id: number;
+            };
+            readonly cookie?: never;
+        };
+        readonly requestBody?: never;
+        readonly responses: {
+            /** @description OK */
+            readonly 200: {
+                headers: {
+                    readonly ETag?: string;
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "application/json": components["schemas"]["PairDetail"];
+                    readonly "application/vnd.apache.arrow.stream": string;
+                };
+            };
+            /** @description Not changed since the ETag of If-None-Match */
+            readonly 304: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content?: never;
+            };
+            readonly default: components["responses"]["Problem"];
+        };
+    };
+    readonly wav: {
+        readonly parameters: {
+            readonly query?: {
+                readonly signal?: "reflected" | "measured";
+                readonly slowdown?: number;
+            };
+            readonly header?: never;
+            readonly path: {
+                readonly surface_id: string;
+                readonly pair_id: number;
+            };
+            readonly cookie?: never;
+        };
+        readonly requestBody?: never;
+        readonly responses: {
+            /** @description OK */
+            readonly 200: {
+                headers: {
+                    readonly ETag?: string;
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "audio/wav": string;
+                };
+            };
+            /** @description Not changed since the ETag of If-None-Match */
+            readonly 304: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content?: never;
+            };
+            readonly default: components["responses"]["Problem"];
+        };
+    };
+    readonly thumbnail: {
+        readonly parameters: {
+            readonly query?: never;
+            readonly header?: never;
+            readonly path: {
+                readonly surface_id: string;
+            };
+            readonly cookie?: never;
+        };
+        readonly requestBody?: never;
+        readonly responses: {
+            /** @description OK */
+            readonly 200: {
+                headers: {
+                    readonly ETag?: string;
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "image/png": string;
                 };
             };
             /** @description Not changed since the ETag of If-None-Match */
@@ -1586,109 +1834,6 @@ export interface operations {
             readonly default: components["responses"]["Problem"];
         };
     };
-    readonly files: {
-        readonly parameters: {
-            readonly query?: {
-                /** @description Only of these tables */
-                readonly table?: readonly string[];
-            };
-            readonly header?: never;
-            readonly path?: never;
-            readonly cookie?: never;
-        };
-        readonly requestBody?: never;
-        readonly responses: {
-            /** @description OK */
-            readonly 200: {
-                headers: {
-                    readonly ETag?: string;
-                    readonly [name: string]: unknown;
-                };
-                content: {
-                    readonly "application/json": {
-                        /** @description Of the snapshot */
-                        readonly version: string;
-                        readonly files: readonly {
-                            readonly table: string;
-                            /** Format: uri */
-                            readonly url: string;
-                            readonly bytes: number;
-                            /** @description Rows that the snapshot shows */
-                            readonly rows: number;
-                            /** @description Rows that stand in the file too and are replaced by newer ones of their runs; the next ingest writes it anew */
-                            readonly superseded_rows: number;
-                        }[];
-                    };
-                };
-            };
-            /** @description Not changed since the ETag of If-None-Match */
-            readonly 304: {
-                headers: {
-                    readonly [name: string]: unknown;
-                };
-                content?: never;
-            };
-            readonly default: components["responses"]["Problem"];
-        };
-    };
-    readonly session: {
-        readonly parameters: {
-            readonly query?: never;
-            readonly header?: never;
-            readonly path?: never;
-            readonly cookie?: never;
-        };
-        readonly requestBody: {
-            readonly content: {
-                readonly "application/json": components["schemas"]["Session"];
-            };
-        };
-        readonly responses: {
-            /** @description The cookie is set */
-            readonly 204: {
-                headers: {
-                    readonly [name: string]: unknown;
-                };
-                content?: never;
-            };
-            readonly default: components["responses"]["Problem"];
-        };
-    };
-    readonly sql: {
-        readonly parameters: {
-            readonly query?: {
-                /** @description Instead of the Accept header */
-                readonly format?: "json" | "arrow" | "csv" | "parquet";
-            };
-            readonly header?: never;
-            readonly path?: never;
-            readonly cookie?: never;
-        };
-        readonly requestBody: {
-            readonly content: {
-                readonly "application/json": components["schemas"]["Query"];
-                readonly "application/sql": string;
-                readonly "text/plain": string;
-            };
-        };
-        readonly responses: {
-            /** @description The rows */
-            readonly 200: {
-                headers: {
-                    readonly [name: string]: unknown;
-                };
-                content: {
-                    readonly "application/vnd.apache.arrow.stream": string;
-                    readonly "application/vnd.apache.parquet": string;
-                    readonly "text/csv": string;
-                    readonly "application/json": readonly {
-                        readonly [key: string]: unknown;
-                    }[];
-                };
-            };
-            readonly default: components["responses"]["Problem"];
-        };
-    };
     readonly table_files: {
         readonly parameters: {
             readonly query?: never;
@@ -1707,11 +1852,7 @@ export interface operations {
                     readonly [name: string]: unknown;
                 };
                 content: {
-                    readonly "application/json": readonly {
-                        readonly file: string;
-                        readonly bytes: number;
-                        readonly rows: number | null;
-                    }[];
+                    readonly "application/json": readonly components["schemas"]["TableFile"][];
                 };
             };
             /** @description Not changed since the ETag of If-None-Match */
@@ -1728,7 +1869,7 @@ export interface operations {
         readonly parameters: {
             readonly query?: never;
             readonly header?: {
-                readonly Range?: string;
+                readonly Range?: string | null;
             };
             readonly path: {
                 readonly table: string;
@@ -1777,16 +1918,13 @@ export interface operations {
         };
         readonly requestBody?: never;
         readonly responses: {
-            /** @description It does */
+            /** @description It is up */
             readonly 200: {
                 headers: {
                     readonly [name: string]: unknown;
                 };
                 content: {
-                    readonly "application/json": {
-                        readonly status: string;
-                        readonly version: string;
-                    };
+                    readonly "application/json": components["schemas"]["ServerHealth"];
                 };
             };
             readonly default: components["responses"]["Problem"];
@@ -1808,29 +1946,6 @@ export interface operations {
                 };
                 content: {
                     readonly "text/plain": string;
-                };
-            };
-            readonly default: components["responses"]["Problem"];
-        };
-    };
-    readonly openapi: {
-        readonly parameters: {
-            readonly query?: never;
-            readonly header?: never;
-            readonly path?: never;
-            readonly cookie?: never;
-        };
-        readonly requestBody?: never;
-        readonly responses: {
-            /** @description OK */
-            readonly 200: {
-                headers: {
-                    readonly [name: string]: unknown;
-                };
-                content: {
-                    readonly "application/json": {
-                        readonly [key: string]: unknown;
-                    };
                 };
             };
             readonly default: components["responses"]["Problem"];

@@ -2,14 +2,16 @@
 
 use std::collections::BTreeMap;
 
+use axum::Extension;
 use echolake_dsp::correlation::pearson;
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 use serde_json::Value;
+use utoipa::{IntoParams, ToSchema};
 
-use super::asked::CatalogueRequest;
-use super::content::AnswerContent;
+use super::super::extract::QueryParams;
+use super::content::{AnswerContent, EndpointAnswer};
+use super::request::CatalogueRequest;
 use super::summary::SurfaceEntry;
-use crate::fault::RequestFault;
 
 /// Fewer surfaces have no meaningful correlation: two are always on a line.
 const LEAST: usize = 3;
@@ -20,14 +22,18 @@ const REFERENCE: &str = "reference";
 /// A parameter without meaning for the shape of a relief.
 const SEED: &str = "seed";
 
-#[derive(Serialize)]
+/// Correlations of parameters and levels.
+#[derive(Serialize, ToSchema)]
+#[schema(as = Correlations)]
 struct CorrelationTable {
     method: &'static str,
     items: Vec<BandCorrelation>,
     surfaces: usize,
 }
 
-#[derive(Serialize)]
+/// The correlation of a parameter with the level of a band.
+#[derive(Serialize, ToSchema)]
+#[schema(as = Correlation)]
 struct BandCorrelation {
     parameter: String,
     unit: &'static str,
@@ -36,13 +42,34 @@ struct BandCorrelation {
     n: usize,
 }
 
-/// Pearson's r of every numeric parameter with every band's level against Flat.
-pub(super) async fn correlations(asked: CatalogueRequest) -> Result<AnswerContent, RequestFault> {
-    let summary = asked.summary().await?;
-    let typologies: Vec<_> = asked.params.all("typology").collect();
+/// The surfaces that correlations are of.
+#[derive(Default, Deserialize, IntoParams)]
+#[serde(default)]
+#[into_params(parameter_in = Query)]
+pub(super) struct CorrelationsQuery {
+    typology: Vec<String>,
+}
+
+/// Pearson's r of every numeric geometric parameter with every band's level against Flat.
+#[utoipa::path(
+    get,
+    path = "/api/v1/correlations",
+    tag = "catalogue",
+    params(CorrelationsQuery),
+    responses((status = 200, description = "OK", body = CorrelationTable)),
+    extensions(("x-sql" = json!([
+        "select surface_id, parameters, relief_rms_mm, relief_max_mm - relief_min_mm, reflection_factor from \
+         surfaces where typology <> 'reference', joined with the summary of /surfaces",
+    ])))
+)]
+pub(super) async fn correlations(
+    Extension(request): Extension<CatalogueRequest>,
+    QueryParams(query): QueryParams<CorrelationsQuery>,
+) -> EndpointAnswer {
+    let summary = request.summary().await?;
     let is_chosen = |entry: &&SurfaceEntry| {
         let typology = entry.surface.typology.as_str();
-        typology != REFERENCE && (typologies.is_empty() || typologies.contains(&typology))
+        typology != REFERENCE && (query.typology.is_empty() || query.typology.iter().any(|chosen| chosen == typology))
     };
     let chosen: Vec<_> = summary.entries.iter().filter(is_chosen).collect();
     let mut items = Vec::new();
@@ -56,7 +83,7 @@ pub(super) async fn correlations(asked: CatalogueRequest) -> Result<AnswerConten
             items.push(BandCorrelation { parameter: parameter.clone(), unit, band: band.key.clone(), r, n: x.len() });
         }
     }
-    AnswerContent::json(&CorrelationTable { method: "pearson", items, surfaces: chosen.len() })
+    Ok(AnswerContent::json(&CorrelationTable { method: "pearson", items, surfaces: chosen.len() })?)
 }
 
 // Each parameter's values, with the surface that has them.

@@ -4,36 +4,42 @@ use std::sync::Arc;
 
 use arrow::array::{ArrayRef, Float64Array};
 use arrow::record_batch::RecordBatch;
+use axum::Extension;
 use datafusion::common::ScalarValue;
 use echolake_schema::Rig;
 use serde::{Deserialize, Serialize};
+use utoipa::{IntoParams, ToSchema};
 
-use super::asked::{CatalogueRequest, number, text};
-use super::content::AnswerContent;
+use super::super::extract::{BinaryContent, PathParams, QueryParams, WholeNumber};
+use super::content::{AnswerContent, EndpointAnswer};
+use super::request::{CatalogueRequest, SurfacePath, number, text};
 use super::summary::SurfaceEntry;
 use crate::fault::RequestFault;
 
 /// Curves of a surface beside those of its Flat.
-#[derive(Serialize)]
+#[derive(Serialize, ToSchema)]
 pub(super) struct CurveSet {
     pub(super) time_ms: Vec<f64>,
     surface: SurfaceCurves,
     flat: SurfaceCurves,
 }
 
-#[derive(Clone, Serialize)]
+/// Curves of a surface.
+#[derive(Clone, Serialize, ToSchema)]
+#[schema(as = Curves)]
 struct SurfaceCurves {
     surface_id: String,
     /// Measurements that the mean is over.
     pairs: i64,
-    bands: Vec<Vec<f64>>,
+    /// By band (no total), then by time: NCE over Flat's total, linear.
+    bands: Vec<Vec<f32>>,
 }
 
 #[derive(Deserialize)]
 struct CurveRow {
     surface_id: String,
     pairs: i64,
-    bands: Vec<Option<Vec<f64>>>,
+    bands: Vec<Option<Vec<f32>>>,
 }
 
 /// The pairs of which a mean is taken.
@@ -57,12 +63,12 @@ impl CurveSet {
     /// # Errors
     /// Those of its query.
     pub(super) async fn read(
-        asked: &CatalogueRequest,
+        request: &CatalogueRequest,
         entry: &SurfaceEntry,
         over: PairSelection,
         points: usize,
     ) -> Result<Self, RequestFault> {
-        let rig = asked.catalogue.lake().rig();
+        let rig = request.catalogue.lake().rig();
         let (filter, value) = over.filter();
         let means: Vec<_> = rig.band_names().iter().map(|band| format!("avg_list(nce_{band})")).collect();
         let sql = format!(
@@ -72,9 +78,9 @@ impl CurveSet {
         );
         let (id, flat) = (&entry.surface.surface_id, &entry.surface.flat_reference);
         let values = [text(id), text(flat)].into_iter().chain(value).collect();
-        let rows: Vec<CurveRow> = asked.rows(&sql, values).await?;
+        let rows: Vec<CurveRow> = request.rows(&sql, values).await?;
         let kept = indices(rig.impulse_response.length, points);
-        let of = |surface: &str| curves(surface, rows.iter().find(|row| row.surface_id == surface), rig, &kept);
+        let of = |surface: &str| thinned_curves(surface, rows.iter().find(|row| row.surface_id == surface), rig, &kept);
         Ok(Self { time_ms: times_ms(rig, &kept), surface: of(id), flat: of(flat) })
     }
 
@@ -85,11 +91,12 @@ impl CurveSet {
 
     // A column of times and one a band of either surface.
     fn batch(&self, rig: &Rig) -> Result<RecordBatch, RequestFault> {
-        let column = |values: &[f64]| -> ArrayRef {
-            let padded = (0..self.time_ms.len()).map(|i| values.get(i).copied());
+        let column = |values: &[f32]| -> ArrayRef {
+            let padded = (0..self.time_ms.len()).map(|i| values.get(i).copied().map(f64::from));
             Arc::new(padded.collect::<Float64Array>())
         };
-        let mut columns = vec![("time_ms".to_owned(), column(&self.time_ms))];
+        let times: ArrayRef = Arc::new(Float64Array::from(self.time_ms.clone()));
+        let mut columns = vec![("time_ms".to_owned(), times)];
         for (name, curves) in [("nce", &self.surface), ("flat_nce", &self.flat)] {
             for (band, values) in rig.band_names().iter().zip(&curves.bands) {
                 columns.push((format!("{name}_{band}"), column(values)));
@@ -103,8 +110,8 @@ impl CurveSet {
     }
 }
 
-fn curves(surface: &str, row: Option<&CurveRow>, rig: &Rig, kept: &[usize]) -> SurfaceCurves {
-    let thin = |curve: &Option<Vec<f64>>| {
+fn thinned_curves(surface: &str, row: Option<&CurveRow>, rig: &Rig, kept: &[usize]) -> SurfaceCurves {
+    let thin = |curve: &Option<Vec<f32>>| {
         let curve = curve.as_deref().unwrap_or_default();
         kept.iter().filter_map(|i| curve.get(*i).copied()).collect()
     };
@@ -126,16 +133,51 @@ fn times_ms(rig: &Rig, kept: &[usize]) -> Vec<f64> {
     kept.iter().map(|i| 1000.0 * *i as f64 / rig.sweep.rate_hz.get()).collect()
 }
 
-/// `GET /api/v1/surfaces/{surface_id}/curves`.
-pub(super) async fn curves_of(asked: CatalogueRequest) -> Result<AnswerContent, RequestFault> {
-    let entry = asked.surface().await?;
-    let over = asked.microphone()?.map_or(PairSelection::All, PairSelection::Point);
-    let points = asked.params.whole("points", 16..=4096)?.unwrap_or(192);
-    let set = CurveSet::read(&asked, entry, over, points).await?;
-    match asked.as_arrow {
-        true => AnswerContent::arrow(&set.batch(asked.catalogue.lake().rig())?),
-        false => AnswerContent::json(&set),
-    }
+/// The pairs and the points of curves.
+#[derive(Default, Deserialize, IntoParams)]
+#[serde(default)]
+#[into_params(parameter_in = Query)]
+pub(super) struct CurvesQuery {
+    /// A grid point.
+    #[param(value_type = usize, required = false)]
+    microphone: Option<String>,
+    #[param(inline)]
+    points: WholeNumber<16, 4096, 192>,
+}
+
+/// NCE by band, a mean over pairs, of a surface and of its Flat, decimated to `points`.
+///
+/// The pairs are all, or those of one microphone point. As an Arrow stream: `time_ms`, `nce_2500`, ...,
+/// `flat_nce_2500`, ...
+#[utoipa::path(
+    get,
+    path = "/api/v1/surfaces/{surface_id}/curves",
+    tag = "catalogue",
+    params(SurfacePath, CurvesQuery),
+    responses((status = 200, description = "OK", content(
+        (CurveSet = "application/json"),
+        (inline(BinaryContent) = "application/vnd.apache.arrow.stream")
+    ))),
+    extensions(("x-sql" = json!([
+        "select nce_2500, ..., nce_40000 from nce where surface_id in ($1, $flat) [and (microphone = $2 or speaker = \
+         $2)]; averaged sample by sample",
+    ])))
+)]
+pub(super) async fn curves(
+    Extension(request): Extension<CatalogueRequest>,
+    PathParams(path): PathParams<SurfacePath>,
+    QueryParams(query): QueryParams<CurvesQuery>,
+) -> EndpointAnswer {
+    let entry = request.surface(&path.surface_id).await?;
+    let over = match &query.microphone {
+        Some(point) => PairSelection::Point(request.microphone(point)?),
+        None => PairSelection::All,
+    };
+    let set = CurveSet::read(&request, entry, over, query.points.get()).await?;
+    Ok(match request.as_arrow {
+        true => AnswerContent::arrow(&set.batch(request.catalogue.lake().rig())?)?,
+        false => AnswerContent::json(&set)?,
+    })
 }
 
 #[cfg(test)]

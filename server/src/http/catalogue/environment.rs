@@ -1,9 +1,12 @@
 //! The air: over a run, decimated to means, and as a series that answers share.
 
+use axum::Extension;
 use serde::{Deserialize, Serialize};
+use utoipa::{IntoParams, ToSchema};
 
-use super::asked::{CatalogueRequest, long, text};
-use super::content::AnswerContent;
+use super::super::extract::{PathParams, QueryParams, WholeNumber};
+use super::content::{AnswerContent, EndpointAnswer};
+use super::request::{CatalogueRequest, RunPath, long, text};
 use crate::fault::RequestFault;
 
 /// A reading, or the mean of some.
@@ -13,18 +16,22 @@ pub(super) struct AirReading {
     temperature_c: Option<f64>,
     humidity_pct: Option<f64>,
     pressure_hpa: Option<f64>,
-    outside_level_db: Option<f64>,
+    outside_level_db: Option<f32>,
 }
 
 /// Readings over the time since `start`.
-#[derive(Serialize)]
+#[derive(Serialize, ToSchema)]
+#[schema(as = EnvironmentSeries)]
 pub(super) struct AirSeries {
+    /// Since `start`.
     time_s: Vec<f64>,
+    #[schema(format = DateTime)]
     start: String,
     temperature_c: Vec<Option<f64>>,
     humidity_pct: Vec<Option<f64>>,
     pressure_hpa: Vec<Option<f64>>,
-    outside_level_db: Vec<Option<f64>>,
+    /// The loudest of each interval.
+    outside_level_db: Vec<Option<f32>>,
 }
 
 impl AirSeries {
@@ -37,7 +44,7 @@ impl AirSeries {
             temperature_c: of(|r| r.temperature_c),
             humidity_pct: of(|r| r.humidity_pct),
             pressure_hpa: of(|r| r.pressure_hpa),
-            outside_level_db: of(|r| r.outside_level_db),
+            outside_level_db: rows.iter().map(|r| r.outside_level_db).collect(),
         }
     }
 }
@@ -55,21 +62,44 @@ const MEANS: &str = "select min(log_time_ns) as ns, avg(temperature_c) as temper
     avg(humidity_pct) as humidity_pct, avg(pressure_hpa) as pressure_hpa, max(outside_level_db) as outside_level_db \
     from environment where run_id = $1 group by (log_time_ns - $2) / $3 order by 1";
 
-/// `GET /api/v1/runs/{run_id}/environment`: means of up to `points` intervals, of the outside level the maxima.
-pub(super) async fn environment(asked: CatalogueRequest) -> Result<AnswerContent, RequestFault> {
-    let run = asked.run()?.run.to_string();
-    let points = asked.params.whole("points", 10..=2000)?.unwrap_or(300);
-    let span: Vec<TimeSpan> = asked.rows(SPAN, vec![text(&run)]).await?;
+/// The number of means.
+#[derive(Default, Deserialize, IntoParams)]
+#[serde(default)]
+#[into_params(parameter_in = Query)]
+pub(super) struct EnvironmentQuery {
+    #[param(inline)]
+    points: WholeNumber<10, 2000, 300>,
+}
+
+/// The air over a run, decimated to `points` means; of the outside level, maxima.
+#[utoipa::path(
+    get,
+    path = "/api/v1/runs/{run_id}/environment",
+    tag = "runs",
+    params(RunPath, EnvironmentQuery),
+    responses((status = 200, description = "OK", body = AirSeries)),
+    extensions(("x-sql" = json!([
+        "select (log_time_ns - $start) / $width as bucket, avg(temperature_c), avg(humidity_pct), avg(pressure_hpa), \
+         max(outside_level_db) from environment where run_id = $1 group by 1 order by 1",
+    ])))
+)]
+pub(super) async fn environment(
+    Extension(request): Extension<CatalogueRequest>,
+    PathParams(path): PathParams<RunPath>,
+    QueryParams(query): QueryParams<EnvironmentQuery>,
+) -> EndpointAnswer {
+    let run = request.run(&path.run_id)?.run.to_string();
+    let span: Vec<TimeSpan> = request.rows(SPAN, vec![text(&run)]).await?;
     let none = || RequestFault::NoData {
         what: format!("run `{run}`"),
         data: "readings of the air",
         hint: "imports may have none",
     };
     let Some(TimeSpan { first: Some(first), last: Some(last), start: Some(start) }) = span.into_iter().next() else {
-        return Err(none());
+        return Err(none().into());
     };
     // One more than the last falls into the last interval too.
-    let width = (last.saturating_sub(first) / points as i64).saturating_add(1);
-    let rows = asked.rows(MEANS, vec![text(&run), long(first), long(width)]).await?;
-    AnswerContent::json(&AirSeries::new(rows, first, &start))
+    let width = (last.saturating_sub(first) / query.points.get() as i64).saturating_add(1);
+    let rows = request.rows(MEANS, vec![text(&run), long(first), long(width)]).await?;
+    Ok(AnswerContent::json(&AirSeries::new(rows, first, &start))?)
 }

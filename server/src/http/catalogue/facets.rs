@@ -5,11 +5,15 @@ use std::cmp::Ordering;
 use std::collections::BTreeMap;
 use std::ops::RangeInclusive;
 
-use serde::Serialize;
+use axum::Extension;
+use serde::de::Error as _;
+use serde::{Deserialize, Deserializer, Serialize};
+use utoipa::openapi::{ObjectBuilder, RefOr, Schema, Type};
+use utoipa::{IntoParams, PartialSchema, ToSchema};
 
-use super::asked::CatalogueRequest;
-use super::content::AnswerContent;
-use super::params::{RequestParams, range};
+use super::super::extract::{NumberRange, QueryParams, RANGE_PATTERN, WholeNumber};
+use super::content::{AnswerContent, EndpointAnswer};
+use super::request::CatalogueRequest;
 use super::summary::{CatalogueSummary, SurfaceEntry, SurfaceSummary};
 use crate::fault::RequestFault;
 
@@ -21,50 +25,160 @@ const LEAST_WIDTH: f64 = 1e-9;
 /// The facet value of surfaces for which it is not known.
 const UNKNOWN: &str = "\u{2014}";
 
-/// A text by which surfaces are distinguished: parameter, title, and getter.
-type SurfaceFacet = (&'static str, &'static str, fn(&SurfaceSummary) -> Option<&str>);
+/// A text by which surfaces are distinguished: parameter, title, the surface's value, and the wanted ones.
+struct SurfaceFacet {
+    name: &'static str,
+    label: &'static str,
+    value: fn(&SurfaceSummary) -> Option<&str>,
+    wanted: fn(&SurfacesQuery) -> &[String],
+}
 
 const FACETS: [SurfaceFacet; 6] = [
-    ("typology", "Typology", |s| Some(&s.typology)),
-    ("macrostructure", "Macrostructure", |s| s.macrostructure.as_deref()),
-    ("mesostructure", "Mesostructure", |s| s.mesostructure.as_deref()),
-    ("material", "Material", |s| Some(&s.material)),
-    ("flat_reference", "Flat reference", |s| Some(&s.flat_reference)),
-    ("origin", "Origin", |s| Some(&s.origin)),
+    SurfaceFacet { name: "typology", label: "Typology", value: |s| Some(&s.typology), wanted: |q| &q.typology },
+    SurfaceFacet {
+        name: "macrostructure",
+        label: "Macrostructure",
+        value: |s| s.macrostructure.as_deref(),
+        wanted: |q| &q.macrostructure,
+    },
+    SurfaceFacet {
+        name: "mesostructure",
+        label: "Mesostructure",
+        value: |s| s.mesostructure.as_deref(),
+        wanted: |q| &q.mesostructure,
+    },
+    SurfaceFacet { name: "material", label: "Material", value: |s| Some(&s.material), wanted: |q| &q.material },
+    SurfaceFacet {
+        name: "flat_reference",
+        label: "Flat reference",
+        value: |s| Some(&s.flat_reference),
+        wanted: |q| &q.flat_reference,
+    },
+    SurfaceFacet { name: "origin", label: "Origin", value: |s| Some(&s.origin), wanted: |q| &q.origin },
 ];
 
-#[derive(Serialize)]
+/// Filters, order and part of a page of surfaces.
+#[derive(Default, Deserialize, IntoParams)]
+#[serde(default)]
+#[into_params(parameter_in = Query)]
+pub(super) struct SurfacesQuery {
+    /// Text in id, typology, structures, material, parameters.
+    q: Option<String>,
+    typology: Vec<String>,
+    macrostructure: Vec<String>,
+    mesostructure: Vec<String>,
+    material: Vec<String>,
+    flat_reference: Vec<String>,
+    origin: Vec<String>,
+    /// `lo..hi` in days since 1970, as the histogram's bins.
+    #[param(inline)]
+    started: Option<NumberRange>,
+    /// `lo..hi` mm, root mean square.
+    #[param(inline)]
+    relief: Option<NumberRange>,
+    /// `band:lo..hi`, dB against Flat.
+    #[param(inline)]
+    level: Vec<LevelRange>,
+    #[param(inline)]
+    sort: SurfaceSort,
+    /// A band's key, as in `lake.bands`.
+    #[param(default = "total")]
+    sort_band: Option<String>,
+    #[param(inline)]
+    order: SurfaceDirection,
+    #[param(inline)]
+    offset: WholeNumber<0, { usize::MAX }, 0>,
+    #[param(inline)]
+    limit: WholeNumber<1, 500, 60>,
+}
+
+#[derive(Clone, Copy, Default, Deserialize, ToSchema)]
+#[serde(rename_all = "snake_case")]
+#[schema(default = "surface_id")]
+enum SurfaceSort {
+    #[default]
+    SurfaceId,
+    Started,
+    Relief,
+    Spread,
+    Level,
+}
+
+#[derive(Clone, Copy, Default, PartialEq, Eq, Deserialize, ToSchema)]
+#[serde(rename_all = "lowercase")]
+#[schema(default = "asc")]
+enum SurfaceDirection {
+    #[default]
+    Asc,
+    Desc,
+}
+
+/// Levels of a band, written `band:lo..hi`.
+struct LevelRange {
+    band: String,
+    range: NumberRange,
+}
+
+impl<'de> Deserialize<'de> for LevelRange {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        let text = String::deserialize(deserializer)?;
+        let (band, range) = text.split_once(':').unwrap_or((text.as_str(), ""));
+        Ok(Self { band: band.to_owned(), range: NumberRange::parse(range).map_err(D::Error::custom)? })
+    }
+}
+
+impl PartialSchema for LevelRange {
+    fn schema() -> RefOr<Schema> {
+        let pattern = format!("^[a-z0-9]+:{RANGE_PATTERN}$");
+        ObjectBuilder::new().schema_type(Type::String).pattern(Some(pattern)).into()
+    }
+}
+
+impl ToSchema for LevelRange {}
+
+/// A page of surfaces.
+#[derive(Serialize, ToSchema)]
 struct SurfacePage<'a> {
     total: usize,
     offset: usize,
     items: Vec<&'a SurfaceSummary>,
     facets: Vec<FacetCounts<'a>>,
     histograms: Vec<SurfaceHistogram>,
+    /// What the counts are: exact.
     counts: &'static str,
 }
 
-#[derive(Serialize)]
+/// Surfaces by the values of a text.
+#[derive(Serialize, ToSchema)]
+#[schema(as = Facet)]
 struct FacetCounts<'a> {
+    /// The query parameter that filters by it.
     name: &'static str,
     label: &'static str,
     values: Vec<FacetValue<'a>>,
 }
 
-#[derive(Serialize)]
+/// A value, and the surfaces that have it.
+#[derive(Serialize, ToSchema)]
 struct FacetValue<'a> {
     value: &'a str,
     count: usize,
 }
 
-#[derive(Serialize)]
+/// Surfaces by the values of a number.
+#[derive(Serialize, ToSchema)]
+#[schema(as = Histogram)]
 struct SurfaceHistogram {
+    /// The query parameter that filters by it, as `lo..hi`.
     name: String,
     label: String,
     unit: &'static str,
     bins: Vec<HistogramBin>,
 }
 
-#[derive(Serialize)]
+/// Surfaces with values from one number to another.
+#[derive(Serialize, ToSchema)]
+#[schema(as = Bin)]
 struct HistogramBin {
     from: f64,
     to: f64,
@@ -119,30 +233,29 @@ impl SurfaceFilter<'_> {
 }
 
 fn value(facet: usize, surface: &SurfaceSummary) -> &str {
-    (FACETS[facet].2)(surface).unwrap_or(UNKNOWN)
+    (FACETS[facet].value)(surface).unwrap_or(UNKNOWN)
 }
 
-fn filters<'a>(params: &'a RequestParams, summary: &CatalogueSummary) -> Result<Vec<SurfaceFilter<'a>>, RequestFault> {
+fn filters<'a>(query: &'a SurfacesQuery, summary: &CatalogueSummary) -> Result<Vec<SurfaceFilter<'a>>, RequestFault> {
     let mut filters = Vec::new();
-    let words: Vec<_> = params.one("q")?.unwrap_or_default().split_whitespace().map(str::to_lowercase).collect();
+    let words: Vec<_> = query.q.iter().flat_map(|q| q.split_whitespace()).map(str::to_lowercase).collect();
     if !words.is_empty() {
         filters.push(SurfaceFilter::Words(words));
     }
-    for (i, (name, ..)) in FACETS.iter().enumerate() {
-        let wanted: Vec<_> = params.all(name).collect();
+    for (i, facet) in FACETS.iter().enumerate() {
+        let wanted: Vec<_> = (facet.wanted)(query).iter().map(String::as_str).collect();
         if !wanted.is_empty() {
             filters.push(SurfaceFilter::Facet(i, wanted));
         }
     }
-    for (name, measure) in [("started", SurfaceMeasure::Started), ("relief", SurfaceMeasure::Relief)] {
-        if let Some(text) = params.one(name)? {
-            filters.push(SurfaceFilter::Measure(measure, vec![range(name, text)?]));
+    for (range, measure) in [(&query.started, SurfaceMeasure::Started), (&query.relief, SurfaceMeasure::Relief)] {
+        if let Some(NumberRange(range)) = range {
+            filters.push(SurfaceFilter::Measure(measure, vec![range.clone()]));
         }
     }
     let mut levels: BTreeMap<usize, Vec<_>> = BTreeMap::new();
-    for text in params.all("level") {
-        let (key, span) = text.split_once(':').unwrap_or((text, ""));
-        levels.entry(band(summary, "level", key)?).or_default().push(range("level", span)?);
+    for level in &query.level {
+        levels.entry(band(summary, "level", &level.band)?).or_default().push(level.range.0.clone());
     }
     filters
         .extend(levels.into_iter().map(|(band, ranges)| SurfaceFilter::Measure(SurfaceMeasure::Level(band), ranges)));
@@ -174,25 +287,40 @@ fn standing(filters: &[SurfaceFilter<'_>], entry: &SurfaceEntry) -> FilterOutcom
     }
 }
 
-/// A page of surfaces.
-pub(super) async fn surfaces(asked: CatalogueRequest) -> Result<AnswerContent, RequestFault> {
-    let (summary, params) = (asked.summary().await?, &asked.params);
-    let filters = filters(params, summary)?;
-    let order = order(params, summary)?;
-    let offset = params.whole("offset", 0..=usize::MAX)?.unwrap_or(0);
-    let limit = params.whole("limit", 1..=500)?.unwrap_or(60);
+/// A page of surfaces with facets.
+///
+/// Filters of different names are all required, values of one name are alternatives; a facet's counts leave its own
+/// filter out. Computed from one summary per snapshot, held in memory.
+#[utoipa::path(
+    get,
+    path = "/api/v1/surfaces",
+    tag = "catalogue",
+    params(SurfacesQuery),
+    responses((status = 200, description = "OK", body = SurfacePage)),
+    extensions(("x-sql" = json!([
+        "select s.*, r.started from surfaces s left join runs r using (run_id)",
+        "select surface_id, band, p90_mean_db, spread_db from surface_stats",
+    ])))
+)]
+pub(super) async fn surfaces(
+    Extension(request): Extension<CatalogueRequest>,
+    QueryParams(query): QueryParams<SurfacesQuery>,
+) -> EndpointAnswer {
+    let summary = request.summary().await?;
+    let filters = filters(&query, summary)?;
+    let order = order(&query, summary)?;
     let all: Vec<_> = summary.entries.iter().map(|entry| (entry, standing(&filters, entry))).collect();
     let mut left: Vec<_> =
         all.iter().filter(|(_, standing)| *standing == FilterOutcome::In).map(|(entry, _)| *entry).collect();
     left.sort_by(|a, b| order.compare(a, b));
-    AnswerContent::json(&SurfacePage {
+    Ok(AnswerContent::json(&SurfacePage {
         total: left.len(),
-        offset,
-        items: left.into_iter().skip(offset).take(limit).map(|entry| &entry.surface).collect(),
+        offset: query.offset.get(),
+        items: left.into_iter().skip(query.offset.get()).take(query.limit.get()).map(|entry| &entry.surface).collect(),
         facets: (0..FACETS.len()).map(|facet| counts(facet, &filters, &all)).collect(),
         histograms: histograms(summary, &filters, &all),
         counts: "exact",
-    })
+    })?)
 }
 
 fn counts<'a>(
@@ -208,7 +336,7 @@ fn counts<'a>(
     let mut values: Vec<_> = counts.into_iter().map(|(value, count)| FacetValue { value, count }).collect();
     values.sort_by(|a, b| b.count.cmp(&a.count).then_with(|| a.value.cmp(b.value)));
     values.truncate(MOST_VALUES);
-    FacetCounts { name: FACETS[facet].0, label: FACETS[facet].1, values }
+    FacetCounts { name: FACETS[facet].name, label: FACETS[facet].label, values }
 }
 
 // Whether a surface is let through by all filters but one's own.
@@ -271,19 +399,19 @@ enum SortKey {
     Spread(usize),
 }
 
-fn order(params: &RequestParams, summary: &CatalogueSummary) -> Result<SurfaceOrder, RequestFault> {
-    let band = match params.one("sort_band")? {
+fn order(query: &SurfacesQuery, summary: &CatalogueSummary) -> Result<SurfaceOrder, RequestFault> {
+    let band = match &query.sort_band {
         Some(key) => band(summary, "sort_band", key)?,
         None => summary.bands.len() - 1,
     };
-    let by = match params.choice("sort", &["surface_id", "started", "relief", "spread", "level"])? {
-        "started" => Some(SortKey::Measure(SurfaceMeasure::Started)),
-        "relief" => Some(SortKey::Measure(SurfaceMeasure::Relief)),
-        "spread" => Some(SortKey::Spread(band)),
-        "level" => Some(SortKey::Measure(SurfaceMeasure::Level(band))),
-        _ => None,
+    let by = match query.sort {
+        SurfaceSort::SurfaceId => None,
+        SurfaceSort::Started => Some(SortKey::Measure(SurfaceMeasure::Started)),
+        SurfaceSort::Relief => Some(SortKey::Measure(SurfaceMeasure::Relief)),
+        SurfaceSort::Spread => Some(SortKey::Spread(band)),
+        SurfaceSort::Level => Some(SortKey::Measure(SurfaceMeasure::Level(band))),
     };
-    Ok(SurfaceOrder { by, descends: params.choice("order", &["asc", "desc"])? == "desc" })
+    Ok(SurfaceOrder { by, descends: query.order == SurfaceDirection::Desc })
 }
 
 impl SurfaceOrder {

@@ -1,18 +1,21 @@
 //! `GET /api/v1/lake`: what the lake holds, its rig, bands and grid.
 
+use axum::Extension;
 use echolake_schema::Rig;
 use serde::{Deserialize, Serialize};
+use utoipa::ToSchema;
 
-use super::asked::CatalogueRequest;
-use super::content::AnswerContent;
-use crate::fault::RequestFault;
+use super::content::{AnswerContent, EndpointAnswer};
+use super::request::CatalogueRequest;
 
 /// A band, or the total, which has no centre.
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, ToSchema)]
+#[schema(as = Band)]
 pub(super) struct BandDescription {
-    /// Name of the band in column names.
+    /// As in column names: `2500`, ..., `total`.
     pub(super) key: String,
     centre_hz: Option<f64>,
+    /// As in pictures: `2.5 kHz`.
     pub(super) label: String,
 }
 
@@ -46,9 +49,12 @@ pub(super) fn levels_db(linear: &[Option<f64>]) -> Vec<Option<f64>> {
     linear.iter().map(|x| x.filter(|x| *x > 0.0).map(|x| 10.0 * x.log10())).collect()
 }
 
-#[derive(Serialize)]
+/// The lake.
+#[derive(Serialize, ToSchema)]
+#[schema(as = Lake)]
 struct LakeDescription<'a> {
     name: &'a str,
+    /// Changes with every snapshot; also the ETag of what is computed from it.
     version: &'a str,
     software: &'static str,
     bands: Vec<BandDescription>,
@@ -62,10 +68,13 @@ struct LakeDescription<'a> {
     layers: i32,
     points: Vec<GridPoint>,
     counts: LakeCounts,
+    /// Every surface comes from the simulated rig.
     simulated: bool,
 }
 
-#[derive(Deserialize, Serialize)]
+/// A point of the grid.
+#[derive(Deserialize, Serialize, ToSchema)]
+#[schema(as = Point)]
 struct GridPoint {
     point_id: i32,
     layer: i32,
@@ -76,7 +85,8 @@ struct GridPoint {
     z_mm: f64,
 }
 
-#[derive(Serialize)]
+/// Numbers of what the lake holds.
+#[derive(Serialize, ToSchema)]
 struct LakeCounts {
     surfaces: usize,
     runs: i64,
@@ -90,25 +100,37 @@ struct RunTotals {
     measurements: Option<i64>,
 }
 
-/// The contents of the lake.
-pub(super) async fn lake(asked: CatalogueRequest) -> Result<AnswerContent, RequestFault> {
-    let lake = asked.catalogue.lake();
+/// The contents of the lake, its rig, bands and grid.
+#[utoipa::path(
+    get,
+    path = "/api/v1/lake",
+    tag = "catalogue",
+    responses((status = 200, description = "OK", body = LakeDescription)),
+    extensions(("x-sql" = json!([
+        "select * from points order by point_id",
+        "select count(*) from surfaces",
+        "select count(*), sum(measurements) from runs",
+        "lake.toml for the rig",
+    ])))
+)]
+pub(super) async fn lake(Extension(request): Extension<CatalogueRequest>) -> EndpointAnswer {
+    let lake = request.catalogue.lake();
     let rig = lake.rig();
-    let points: Vec<GridPoint> = asked
+    let points: Vec<GridPoint> = request
         .rows("select point_id, layer, gridx, gridy, x_mm, y_mm, z_mm from points order by point_id", Vec::new())
         .await?;
     let runs: Vec<RunTotals> =
-        asked.rows("select count(*) as runs, sum(measurements) as measurements from runs", Vec::new()).await?;
-    let summary = asked.summary().await?;
+        request.rows("select count(*) as runs, sum(measurements) as measurements from runs", Vec::new()).await?;
+    let summary = request.summary().await?;
     let counts = LakeCounts {
         surfaces: summary.entries.len(),
         runs: runs.first().map_or(0, |r| r.runs),
         measurements: runs.first().and_then(|r| r.measurements).unwrap_or(0),
         pairs: lake.grid().pairs().len(),
     };
-    AnswerContent::json(&LakeDescription {
+    Ok(AnswerContent::json(&LakeDescription {
         name: name(lake.location()),
-        version: &asked.view.version,
+        version: &request.view.version,
         software: concat!("echolake ", env!("CARGO_PKG_VERSION")),
         bands: bands(rig),
         rate_hz: rig.sweep.rate_hz.get(),
@@ -122,7 +144,7 @@ pub(super) async fn lake(asked: CatalogueRequest) -> Result<AnswerContent, Reque
         points,
         counts,
         simulated: !summary.entries.is_empty() && summary.entries.iter().all(|e| e.surface.origin == "simulated"),
-    })
+    })?)
 }
 
 // The lake's path on the server's disk is not disclosed.

@@ -3,14 +3,17 @@
 use arrow::array::AsArray as _;
 use arrow::datatypes::{Float32Type, Int32Type};
 use arrow::record_batch::RecordBatch;
+use axum::Extension;
 use datafusion::common::ScalarValue;
 use echolake_dsp::components::PrincipalComponents;
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
+use utoipa::{IntoParams, ToSchema};
 
 use std::collections::HashMap;
 
-use super::asked::CatalogueRequest;
-use super::content::AnswerContent;
+use super::super::extract::{QueryParams, WholeNumber};
+use super::content::{AnswerContent, EndpointAnswer};
+use super::request::CatalogueRequest;
 use crate::fault::RequestFault;
 
 /// Components that are answered.
@@ -27,71 +30,103 @@ pub(super) struct SurfacePositions {
     components: PrincipalComponents,
 }
 
-#[derive(Serialize)]
+/// Surfaces on the map.
+#[derive(Serialize, ToSchema)]
 struct SurfaceMap<'a> {
+    /// Pairs times bands that all surfaces have.
     features: usize,
+    /// Share of the variance by component.
     explained: Vec<f64>,
     points: Vec<MapPoint<'a>>,
+    /// Surfaces without TNCE, and those beyond the first 2000.
     left_out: Vec<&'a str>,
 }
 
-#[derive(Serialize)]
+/// A surface on the map.
+#[derive(Serialize, ToSchema)]
 struct MapPoint<'a> {
     surface_id: &'a str,
     typology: &'a str,
+    /// Coordinates along the components, dB.
     position: Vec<f64>,
     neighbours: Vec<SurfaceNeighbour<'a>>,
 }
 
-#[derive(Serialize)]
+/// A surface that is near another one.
+#[derive(Serialize, ToSchema)]
 struct SurfaceNeighbour<'a> {
     surface_id: &'a str,
+    /// Root mean square over the features.
     distance_db: f64,
 }
 
-/// The surfaces' places and nearest neighbours.
-pub(super) async fn map(asked: CatalogueRequest) -> Result<AnswerContent, RequestFault> {
-    let count = asked.params.whole("neighbours", 1..=20)?.unwrap_or(6);
-    let (summary, places) = (asked.summary().await?, asked.places().await?);
+/// The number of neighbours.
+#[derive(Default, Deserialize, IntoParams)]
+#[serde(default)]
+#[into_params(parameter_in = Query)]
+pub(super) struct MapQuery {
+    #[param(inline)]
+    neighbours: WholeNumber<1, 20, 6>,
+}
+
+/// Surfaces as points, close together if they reflect alike, and their nearest neighbours.
+///
+/// Principal components of the surfaces' TNCE vectors (all pairs and bands, dB over Flat's same band); once per
+/// snapshot.
+#[utoipa::path(
+    get,
+    path = "/api/v1/map",
+    tag = "catalogue",
+    params(MapQuery),
+    responses((status = 200, description = "OK", body = SurfaceMap)),
+    extensions(("x-sql" = json!([
+        "select surface_id, pair_id, tnce_band_2500, ..., tnce_band_40000 from tnce; Gram matrix, leading eigenvectors",
+    ])))
+)]
+pub(super) async fn map(
+    Extension(request): Extension<CatalogueRequest>,
+    QueryParams(query): QueryParams<MapQuery>,
+) -> EndpointAnswer {
+    let (summary, places) = (request.summary().await?, request.places().await?);
     let typology = |name: &str| summary.entry(name).map_or("", |entry| entry.surface.typology.as_str());
     let point = |(i, name)| MapPoint {
         surface_id: name,
         typology: typology(name),
         position: places.components.position(i),
-        neighbours: places.neighbours(i, count),
+        neighbours: places.neighbours(i, query.neighbours.get()),
     };
     let names: std::collections::HashSet<_> = places.names.iter().map(String::as_str).collect();
     let all = summary.entries.iter().map(|entry| entry.surface.surface_id.as_str());
-    AnswerContent::json(&SurfaceMap {
+    Ok(AnswerContent::json(&SurfaceMap {
         features: places.components.features(),
         explained: places.components.explained(),
         points: places.names.iter().map(String::as_str).enumerate().map(point).collect(),
         left_out: all.filter(|name| !names.contains(name)).collect(),
-    })
+    })?)
 }
 
 impl SurfacePositions {
     /// # Errors
     /// Those of its query.
-    pub(super) async fn find(asked: &CatalogueRequest) -> Result<Self, RequestFault> {
-        let summary = asked.summary().await?;
-        let rig = asked.catalogue.lake().rig();
+    pub(super) async fn find(request: &CatalogueRequest) -> Result<Self, RequestFault> {
+        let summary = request.summary().await?;
+        let rig = request.catalogue.lake().rig();
         let known = summary.entries.iter().filter(|e| e.surface.against_flat_db.iter().any(Option::is_some));
         let names: Vec<_> = known.map(|e| e.surface.surface_id.clone()).take(MOST_SURFACES).collect();
         let bands = rig.band_names();
-        let pairs = asked.catalogue.lake().grid().pairs().len();
+        let pairs = request.catalogue.lake().grid().pairs().len();
         let products = names.len() * names.len() / 2 * pairs * bands.len();
         let step = products.div_ceil(MOST_PRODUCTS).max(1);
         let mut vectors = LevelVectors::new(&names, pairs.div_ceil(step), bands.len(), step);
         let columns: Vec<_> = bands.iter().map(|b| format!("cast(10 * log10(tnce_band_{b}) as float)")).collect();
         let sql =
             format!("select surface_id, pair_id, {} from tnce where pair_id % $1 = 0", numbered(&columns).join(", "));
-        let mut rows = asked.batches(&sql, vec![ScalarValue::Int32(i32::try_from(step).ok())]).await?;
+        let mut rows = request.batches(&sql, vec![ScalarValue::Int32(i32::try_from(step).ok())]).await?;
         while let Some(batch) = rows.next().await? {
             vectors.add(&batch)?;
         }
         let found =
-            asked.catalogue.service().crunch(move || PrincipalComponents::of(&mut vectors.rows, COMPONENTS)).await?;
+            request.catalogue.service().crunch(move || PrincipalComponents::of(&mut vectors.rows, COMPONENTS)).await?;
         let components = found.map_err(|e| {
             eprintln!("surfaces have no places: {e}");
             RequestFault::Internal

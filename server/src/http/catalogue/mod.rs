@@ -1,19 +1,20 @@
 //! The catalogue: the data of the pages, each a query of the lake, answered once per snapshot and cached.
 //!
-//! [`ENDPOINTS`] is the table of them; `web/openapi.json` is their contract.
+//! [`table_routes`] and [`file_routes`] list the endpoints. [`respond`] stands before all of them: whether the client may
+//! ask, whether it has the answer already, and whether the cache does.
 
-mod asked;
+mod answer_cache;
 mod content;
 mod correlations;
 mod curves;
 mod environment;
 mod facets;
-mod kept;
 mod lake;
 mod map;
 mod pair;
-mod params;
 mod relief;
+mod request;
+mod rows;
 mod runs;
 mod summary;
 mod surface;
@@ -21,67 +22,53 @@ mod tables;
 mod view;
 mod wav;
 
-use std::future::Future;
-use std::pin::Pin;
 use std::sync::Arc;
 
 use axum::Router;
-use axum::extract::RawPathParams;
-use axum::extract::rejection::RawPathParamsRejection;
-use axum::http::{HeaderMap, HeaderValue, StatusCode, Uri, header};
+use axum::extract::{Request, State};
+use axum::http::{HeaderMap, HeaderValue, Method, StatusCode, header};
+use axum::middleware::{Next, from_fn_with_state};
 use axum::response::{IntoResponse as _, Response};
-use axum::routing::get;
 use echolake_lake::Lake;
 use echolake_schema::tables::Table;
+use utoipa_axum::router::OpenApiRouter;
+use utoipa_axum::routes;
 
 use super::format;
 use super::problem::ProblemResponse;
-use crate::fault::RequestFault;
+use crate::fault::{FaultCode, RequestFault};
 use crate::service::QueryService;
 use crate::tokens::TokenScope;
-pub(super) use asked::{CatalogueRequest, run, text};
-use content::AnswerContent;
-pub(super) use params::RequestParams;
+pub(super) use request::{CatalogueRequest, RunPath, run, text};
 pub(super) use tables::table;
 use view::SnapshotViews;
 pub(super) use view::{SnapshotView, VisibleFile};
 
-/// The pending answer of an endpoint.
-type PendingAnswer = Pin<Box<dyn Future<Output = Result<AnswerContent, RequestFault>> + Send>>;
-
-/// An address of the catalogue.
-#[derive(Clone, Copy)]
-struct CatalogueEndpoint {
-    path: &'static str,
-    scope: TokenScope,
-    answer: fn(CatalogueRequest) -> PendingAnswer,
+/// The endpoints that are answered from tables.
+pub(super) fn table_routes() -> OpenApiRouter {
+    OpenApiRouter::new()
+        .routes(routes!(lake::lake))
+        .routes(routes!(facets::surfaces))
+        .routes(routes!(surface::surface))
+        .routes(routes!(surface::grid))
+        .routes(routes!(curves::curves))
+        .routes(routes!(relief::heightmap))
+        .routes(routes!(relief::thumbnail))
+        .routes(routes!(pair::pair))
+        .routes(routes!(wav::wav))
+        .routes(routes!(map::map))
+        .routes(routes!(correlations::correlations))
+        .routes(routes!(runs::runs))
+        .routes(routes!(runs::run))
+        .routes(routes!(environment::environment))
+        .routes(routes!(tables::tables))
+        .routes(routes!(tables::table_files))
 }
 
-macro_rules! endpoint {
-    ($path:literal, $scope:ident, $answer:path) => {
-        CatalogueEndpoint { path: $path, scope: TokenScope::$scope, answer: |asked| Box::pin($answer(asked)) }
-    };
+/// The endpoints that are answered from run files.
+pub(super) fn file_routes() -> OpenApiRouter {
+    OpenApiRouter::new().routes(routes!(relief::mesh))
 }
-
-const ENDPOINTS: [CatalogueEndpoint; 17] = [
-    endpoint!("/api/v1/lake", Sql, lake::lake),
-    endpoint!("/api/v1/surfaces", Sql, facets::surfaces),
-    endpoint!("/api/v1/surfaces/{surface_id}", Sql, surface::surface),
-    endpoint!("/api/v1/surfaces/{surface_id}/grid", Sql, surface::grid),
-    endpoint!("/api/v1/surfaces/{surface_id}/curves", Sql, curves::curves_of),
-    endpoint!("/api/v1/surfaces/{surface_id}/heightmap", Sql, relief::heightmap),
-    endpoint!("/api/v1/surfaces/{surface_id}/thumbnail.png", Sql, relief::thumbnail),
-    endpoint!("/api/v1/surfaces/{surface_id}/mesh.glb", Files, relief::mesh),
-    endpoint!("/api/v1/surfaces/{surface_id}/pairs/{pair_id}", Sql, pair::pair),
-    endpoint!("/api/v1/surfaces/{surface_id}/pairs/{pair_id}/ir.wav", Sql, wav::wav),
-    endpoint!("/api/v1/map", Sql, map::map),
-    endpoint!("/api/v1/correlations", Sql, correlations::correlations),
-    endpoint!("/api/v1/runs", Sql, runs::runs),
-    endpoint!("/api/v1/runs/{run_id}", Sql, runs::run),
-    endpoint!("/api/v1/runs/{run_id}/environment", Sql, environment::environment),
-    endpoint!("/api/v1/tables", Sql, tables::tables),
-    endpoint!("/api/v1/tables/{table}", Sql, tables::files),
-];
 
 /// State shared by the endpoints.
 #[derive(Clone)]
@@ -97,16 +84,12 @@ impl LakeCatalogue {
         Self(Arc::new(CatalogueState { service, views: SnapshotViews::default() }))
     }
 
-    /// The addresses of the catalogue.
-    pub(super) fn router<S: Clone + Send + Sync + 'static>(&self) -> Router<S> {
-        ENDPOINTS.into_iter().fold(Router::new(), |router, endpoint| {
-            let catalogue = self.clone();
-            let handler = move |path: Result<RawPathParams, RawPathParamsRejection>, uri: Uri, headers: HeaderMap| {
-                let catalogue = catalogue.clone();
-                async move { catalogue.respond(endpoint, path, &uri, &headers).await.map_err(ProblemResponse) }
-            };
-            router.route(endpoint.path, get(handler))
-        })
+    /// Routes of the endpoints.
+    pub(super) fn router(&self) -> Router {
+        let cached = |routes: OpenApiRouter, scope| {
+            Router::from(routes).route_layer(from_fn_with_state((self.clone(), scope), respond))
+        };
+        cached(table_routes(), TokenScope::Sql).merge(cached(file_routes(), TokenScope::Files))
     }
 
     pub(super) fn service(&self) -> &QueryService {
@@ -126,31 +109,48 @@ impl LakeCatalogue {
     pub(super) fn shown(&self, view: &SnapshotView, table: Table, name: &str) -> Option<VisibleFile> {
         self.0.views.shown(view, table, name)
     }
+}
 
-    async fn respond(
-        &self,
-        endpoint: CatalogueEndpoint,
-        path: Result<RawPathParams, RawPathParamsRejection>,
-        uri: &Uri,
-        headers: &HeaderMap,
-    ) -> Result<Response, RequestFault> {
-        self.service().client(endpoint.scope)?;
-        let path = path.map_err(|_| RequestFault::request("the path is not UTF-8"))?;
-        let view = self.view().await?;
-        let as_arrow = format::prefers_arrow(headers);
-        let etag = view.etag(as_arrow);
-        if is_known(headers, &etag) {
-            return Ok((StatusCode::NOT_MODIFIED, [(header::ETAG, etag)]).into_response());
-        }
-        let params = RequestParams::of(uri)?;
-        let key = (uri.path_and_query().map_or_else(String::new, ToString::to_string), as_arrow);
-        let path = path.iter().map(|(name, value)| (name.to_owned(), value.to_owned())).collect();
-        let asked = CatalogueRequest { catalogue: self.clone(), view: view.clone(), path, params, as_arrow };
-        let answer = (endpoint.answer)(asked);
-        let content =
-            view.answers.once(key, answer).await.inspect_err(|f| self.service().metrics().failed(f.code()))?;
-        Ok(response(&content, headers, etag))
+/// Answers a request from the cache, or by its endpoint.
+async fn respond(
+    State((catalogue, scope)): State<(LakeCatalogue, TokenScope)>,
+    mut request: Request,
+    next: Next,
+) -> Result<Response, ProblemResponse> {
+    if !matches!(*request.method(), Method::GET | Method::HEAD) {
+        return Ok(next.run(request).await);
     }
+    catalogue.service().client(scope)?;
+    let view = catalogue.view().await?;
+    let headers = request.headers().clone();
+    let as_arrow = format::prefers_arrow(&headers);
+    let etag = view.etag(as_arrow);
+    if is_known(&headers, &etag) {
+        return Ok((StatusCode::NOT_MODIFIED, [(header::ETAG, etag)]).into_response());
+    }
+    let key = (request.uri().path_and_query().map_or_else(String::new, ToString::to_string), as_arrow);
+    // One answer is for both methods: HEAD's body is left out behind this.
+    *request.method_mut() = Method::GET;
+    request.extensions_mut().insert(CatalogueRequest::new(&catalogue, &view, as_arrow));
+    match view.answers.get_or_make(&key, next.run(request)).await {
+        Ok(answer) => Ok(with_validators(answer.respond(&headers), &etag)),
+        Err(failed) => {
+            let code = failed.extensions().get::<FaultCode>().copied();
+            catalogue.service().metrics().failed(code.unwrap_or(FaultCode::Internal));
+            Ok(failed)
+        }
+    }
+}
+
+fn with_validators(mut response: Response, etag: &str) -> Response {
+    let out = response.headers_mut();
+    out.insert(header::VARY, HeaderValue::from_static("Accept, Accept-Encoding"));
+    // Revalidated each time, by 304 for as long as nothing changes; no cache in between keeps what needed a token.
+    out.insert(header::CACHE_CONTROL, HeaderValue::from_static("private, no-cache"));
+    if let Ok(etag) = HeaderValue::from_str(etag) {
+        out.insert(header::ETAG, etag);
+    }
+    response
 }
 
 /// Returns whether the client has this version already.
@@ -158,26 +158,3 @@ pub(super) fn is_known(headers: &HeaderMap, etag: &str) -> bool {
     let tags = headers.get_all(header::IF_NONE_MATCH).iter().filter_map(|v| v.to_str().ok());
     tags.flat_map(|v| v.split(',')).map(str::trim).any(|tag| tag == "*" || tag.trim_start_matches("W/") == etag)
 }
-
-fn response(content: &AnswerContent, headers: &HeaderMap, etag: String) -> Response {
-    let (body, packed) = content.body(headers);
-    let mut response =
-        ([(header::CONTENT_TYPE, content.media_type), (header::VARY, "Accept, Accept-Encoding")], body).into_response();
-    let out = response.headers_mut();
-    // Revalidated each time, by 304 for as long as nothing changes; no cache in between keeps what needed a token.
-    out.insert(header::CACHE_CONTROL, HeaderValue::from_static("private, no-cache"));
-    if packed {
-        out.insert(header::CONTENT_ENCODING, HeaderValue::from_static("gzip"));
-    }
-    if let Ok(etag) = HeaderValue::from_str(&etag) {
-        out.insert(header::ETAG, etag);
-    }
-    let name = content.name.as_ref().map(|name| format!("attachment; filename=\"{name}\""));
-    if let Some(Ok(name)) = name.map(|name| HeaderValue::from_str(&name)) {
-        out.insert(header::CONTENT_DISPOSITION, name);
-    }
-    response
-}
-
-#[cfg(test)]
-mod tests;

@@ -4,13 +4,16 @@ use std::sync::Arc;
 
 use arrow::array::{ArrayRef, Float64Array};
 use arrow::record_batch::RecordBatch;
+use axum::Extension;
 use serde::{Deserialize, Serialize};
+use utoipa::{IntoParams, ToSchema};
 
-use super::asked::{CatalogueRequest, long, missing, number, text};
-use super::content::AnswerContent;
+use super::super::extract::{BinaryContent, PathParams};
+use super::content::{AnswerContent, EndpointAnswer};
 use super::curves::{CurveSet, PairSelection};
 use super::environment::{AirReading, AirSeries};
 use super::lake::{TOTAL, band_list, levels_db};
+use super::request::{CatalogueRequest, long, missing, number, text};
 use super::runs::RunLogEntry;
 use super::summary::SurfaceEntry;
 use crate::fault::RequestFault;
@@ -18,40 +21,51 @@ use crate::fault::RequestFault;
 /// Length of the air's history that is shown before and after a measurement.
 const AROUND_NS: i64 = 900_000_000_000;
 
-#[derive(Serialize)]
+/// The path of a pair of a surface.
+#[derive(Deserialize, IntoParams)]
+#[into_params(parameter_in = Path)]
+pub(super) struct PairPath {
+    pub(super) surface_id: String,
+    #[param(value_type = usize)]
+    pub(super) pair_id: String,
+}
+
+/// Everything about one impulse response.
+#[derive(Serialize, ToSchema)]
 struct PairDetail<'a> {
     surface_id: &'a str,
-    pair: PairDescription,
+    pair: PairGeometry,
     measurement: &'a PairMeasurement,
     rate_hz: f64,
-    measured: &'a [f64],
-    reflected: Option<&'a [f64]>,
-    flat_reflected: Option<&'a [f64]>,
+    /// Temperature-corrected, cropped, direct sound still in it; Pa per unit of the sweep's amplitude.
+    measured: &'a [f32],
+    /// After Foam's response was subtracted; null if Foam is missing.
+    reflected: Option<&'a [f32]>,
+    flat_reflected: Option<&'a [f32]>,
+    /// Over Flat's total. One value per band in the order of `lake.bands`, the total last; null if there is no value.
     tnce_db: Vec<Option<f64>>,
+    /// Over Flat's same band, by band as `tnce_db`.
     tnce_band_db: Vec<Option<f64>>,
     curves: Option<CurveSet>,
     symmetries: Vec<SymmetricPair>,
+    /// What the controller logged about this pair.
     attempts: Vec<RunLogEntry>,
     environment: AirSeries,
 }
 
-#[derive(Serialize)]
-struct PairDescription {
-    pair_id: usize,
-    #[serde(flatten)]
-    geometry: PairGeometry,
-    fresnel: Vec<FresnelEllipse>,
-}
-
-#[derive(Serialize)]
+/// A first Fresnel zone, by its full diameters.
+#[derive(Deserialize, Serialize, ToSchema)]
 struct FresnelEllipse {
     frequency_hz: f64,
     major_mm: f64,
     minor_mm: f64,
 }
 
-#[derive(Deserialize, Serialize)]
+/// The geometry of a pair.
+#[derive(Deserialize, Serialize, ToSchema)]
+#[schema(as = Pair)]
 struct PairGeometry {
+    pair_id: i32,
     microphone: i32,
     speaker: i32,
     microphone_mm: [f64; 3],
@@ -59,20 +73,32 @@ struct PairGeometry {
     direct_mm: f64,
     image_mm: f64,
     incidence_deg: f64,
+    /// x, y in the panel's plane.
     specular_mm: [f64; 2],
+    /// Those at 2 and 40 kHz. They are no column of the table.
+    #[serde(default)]
+    #[schema(required = true)]
+    fresnel: Vec<FresnelEllipse>,
     #[serde(skip_serializing)]
+    #[schema(ignore)]
     low_mm: [Option<f64>; 2],
     #[serde(skip_serializing)]
+    #[schema(ignore)]
     high_mm: [Option<f64>; 2],
 }
 
-#[derive(Deserialize, Serialize)]
+/// A measurement of a pair.
+#[derive(Deserialize, Serialize, ToSchema)]
+#[schema(as = Measurement)]
 pub(super) struct PairMeasurement {
     #[serde(skip_serializing)]
-    pub(super) ir: Vec<f64>,
+    #[schema(ignore)]
+    pub(super) ir: Vec<f32>,
     #[serde(skip_serializing)]
+    #[schema(ignore)]
     log_time_ns: i64,
     run_id: String,
+    #[schema(format = DateTime)]
     log_time: String,
     attempt: i64,
     verdict: String,
@@ -80,12 +106,12 @@ pub(super) struct PairMeasurement {
     temperature_c: Option<f64>,
     humidity_pct: Option<f64>,
     pressure_hpa: Option<f64>,
-    outside_level_db: Option<f64>,
-    snr_db: Option<f64>,
+    outside_level_db: Option<f32>,
+    snr_db: Option<f32>,
     clipped_samples: Option<i64>,
-    arrival_error_us: Option<f64>,
-    microphone_residual_mm: Option<f64>,
-    speaker_residual_mm: Option<f64>,
+    arrival_error_us: Option<f32>,
+    microphone_residual_mm: Option<f32>,
+    speaker_residual_mm: Option<f32>,
     source: String,
     chunk_offset: i64,
 }
@@ -93,7 +119,7 @@ pub(super) struct PairMeasurement {
 #[derive(Deserialize)]
 pub(super) struct ReflectedResponse {
     surface_id: String,
-    pub(super) reflected: Option<Vec<f64>>,
+    pub(super) reflected: Option<Vec<f32>>,
 }
 
 #[derive(Deserialize)]
@@ -102,13 +128,16 @@ struct PairEnergies {
     band: Vec<Option<f64>>,
 }
 
-#[derive(Serialize)]
+/// A pair that a symmetry of the grid makes of another.
+#[derive(Serialize, ToSchema)]
 struct SymmetricPair {
     symmetry: String,
     pair_id: i64,
     microphone: i64,
     speaker: i64,
+    /// Relies on reciprocity.
     swapped: bool,
+    /// Of that pair on the same surface, over Flat's total, by band as in `PairDetail`.
     tnce_db: Vec<Option<f64>>,
 }
 
@@ -126,7 +155,7 @@ const MEASUREMENT: &str = "select ir, log_time_ns, run_id, log_time, attempt, ve
     humidity_pct, pressure_hpa, outside_level_db, snr_db, clipped_samples, arrival_error_us, microphone_residual_mm, \
     speaker_residual_mm, source, chunk_offset from measurements \
     where surface_id = $1 and pair_id = $2 order by run_id desc limit 1";
-const GEOMETRY: &str = "select microphone, speaker, \
+const GEOMETRY: &str = "select pair_id, microphone, speaker, \
     make_array(microphone_x_mm, microphone_y_mm, microphone_z_mm) as microphone_mm, \
     make_array(speaker_x_mm, speaker_y_mm, speaker_z_mm) as speaker_mm, direct_mm, image_mm, incidence_deg, \
     make_array(specular_x_mm, specular_y_mm) as specular_mm, \
@@ -140,9 +169,9 @@ const AIR: &str = "select log_time_ns as ns, temperature_c, humidity_pct, pressu
     from environment where run_id = $1 and log_time_ns between $2 and $3 order by log_time_ns limit 2000";
 
 impl CatalogueRequest {
-    /// The pair that the path names.
-    fn pair(&self) -> Result<usize, RequestFault> {
-        let (text, pairs) = (self.part("pair_id"), self.catalogue.lake().grid().pairs().len());
+    /// The pair of this number.
+    pub(super) fn pair(&self, text: &str) -> Result<usize, RequestFault> {
+        let pairs = self.catalogue.lake().grid().pairs().len();
         let digits = !text.is_empty() && text.bytes().all(|b| b.is_ascii_digit());
         match (digits, text.parse::<usize>()) {
             (true, Ok(pair)) if pair < pairs => Ok(pair),
@@ -152,50 +181,75 @@ impl CatalogueRequest {
     }
 }
 
-/// The newest measurement of the pair that the path names.
+/// The newest measurement of a pair.
 ///
 /// # Errors
 /// [`RequestFault::NotFound`] if there is none.
 pub(super) async fn measurement(
-    asked: &CatalogueRequest,
+    request: &CatalogueRequest,
     entry: &SurfaceEntry,
-) -> Result<(usize, PairMeasurement), RequestFault> {
-    let pair = asked.pair()?;
+    pair: usize,
+) -> Result<PairMeasurement, RequestFault> {
     let id = &entry.surface.surface_id;
-    let found = asked.rows(MEASUREMENT, vec![text(id), number(pair)]).await?.into_iter().next();
+    let found = request.rows(MEASUREMENT, vec![text(id), number(pair)]).await?.into_iter().next();
     let what = || format!("a measurement of pair {pair} on surface `{id}`");
-    Ok((pair, found.ok_or_else(|| missing(what(), "its run may be partial; another pair may be there"))?))
+    found.ok_or_else(|| missing(what(), "its run may be partial; another pair may be there"))
 }
 
 /// The responses of a surface and of its Flat after Foam's were subtracted, if they are known.
 pub(super) async fn reflected(
-    asked: &CatalogueRequest,
+    request: &CatalogueRequest,
     entry: &SurfaceEntry,
     pair: usize,
-) -> Result<[Option<Vec<f64>>; 2], RequestFault> {
+) -> Result<[Option<Vec<f32>>; 2], RequestFault> {
     let (id, flat) = (&entry.surface.surface_id, &entry.surface.flat_reference);
-    let rows: Vec<ReflectedResponse> = asked.rows(REFLECTED, vec![text(id), text(flat), number(pair)]).await?;
+    let rows: Vec<ReflectedResponse> = request.rows(REFLECTED, vec![text(id), text(flat), number(pair)]).await?;
     let of = |surface: &str| rows.iter().find(|row| row.surface_id == surface).and_then(|row| row.reflected.clone());
     Ok([of(id), of(flat)])
 }
 
-/// Everything about one impulse response; as an Arrow stream its samples.
-pub(super) async fn pair(asked: CatalogueRequest) -> Result<AnswerContent, RequestFault> {
-    let entry = asked.surface().await?;
-    let pair = asked.pair()?;
-    let responses = tokio::try_join!(measurement(&asked, entry), reflected(&asked, entry, pair));
-    let ((_, measurement), [own, flat]) = responses?;
-    if asked.as_arrow {
-        return samples(&asked, &measurement.ir, own.as_deref(), flat.as_deref());
+/// Everything about one impulse response.
+///
+/// As an Arrow stream its samples: `time_ms`, `measured`, `reflected`, `flat_reflected`.
+#[utoipa::path(
+    get,
+    path = "/api/v1/surfaces/{surface_id}/pairs/{pair_id}",
+    tag = "catalogue",
+    params(PairPath),
+    responses((status = 200, description = "OK", content(
+        (PairDetail = "application/json"),
+        (inline(BinaryContent) = "application/vnd.apache.arrow.stream")
+    ))),
+    extensions(("x-sql" = json!([
+        "select * from measurements where surface_id = $1 and pair_id = $2",
+        "select reflected_ir, nce_* from nce where surface_id in ($1, $flat) and pair_id = $2",
+        "select * from tnce where surface_id = $1 and pair_id = $2",
+        "select * from pairs where pair_id = $2",
+        "select d.symmetry, d.d4_pair_id, d.d4_microphone, d.d4_speaker, d.swapped, t.* from tnce_d4 d join tnce t \
+         on t.surface_id = d.surface_id and t.pair_id = d.d4_pair_id where d.surface_id = $1 and d.pair_id = $2",
+        "select * from events where run_id = $run and message like 'pair ' || $2 || ',%'",
+        "select * from environment where run_id = $run and log_time_ns between $t - 900e9 and $t + 900e9",
+    ])))
+)]
+pub(super) async fn pair(
+    Extension(request): Extension<CatalogueRequest>,
+    PathParams(path): PathParams<PairPath>,
+) -> EndpointAnswer {
+    let entry = request.surface(&path.surface_id).await?;
+    let pair = request.pair(&path.pair_id)?;
+    let responses = tokio::try_join!(measurement(&request, entry, pair), reflected(&request, entry, pair));
+    let (measurement, [own, flat]) = responses?;
+    if request.as_arrow {
+        return Ok(samples(&request, &measurement.ir, own.as_deref(), flat.as_deref())?);
     }
     let (geometry, energies, moved, curves, attempts, air) = tokio::try_join!(
-        asked.rows::<PairGeometry>(GEOMETRY, vec![number(pair)]),
-        energies(&asked, entry, pair, &measurement.run_id),
-        symmetries(&asked, entry, pair, &measurement.run_id),
-        CurveSet::read(&asked, entry, PairSelection::Pair(pair), usize::MAX),
+        request.rows::<PairGeometry>(GEOMETRY, vec![number(pair)]),
+        energies(&request, entry, pair, &measurement.run_id),
+        symmetries(&request, entry, pair, &measurement.run_id),
+        CurveSet::read(&request, entry, PairSelection::Pair(pair), usize::MAX),
         // The controller's messages about a pair begin so.
-        asked.rows::<RunLogEntry>(ATTEMPTS, vec![text(&measurement.run_id), text(&format!("pair {pair},%"))]),
-        asked.rows::<AirReading>(
+        request.rows::<RunLogEntry>(ATTEMPTS, vec![text(&measurement.run_id), text(&format!("pair {pair},%"))]),
+        request.rows::<AirReading>(
             AIR,
             vec![
                 text(&measurement.run_id),
@@ -205,13 +259,13 @@ pub(super) async fn pair(asked: CatalogueRequest) -> Result<AnswerContent, Reque
         ),
     )?;
     let geometry = geometry.into_iter().next().ok_or_else(|| missing(format!("pair {pair}"), "ask for another one"))?;
-    AnswerContent::json(&PairDetail {
+    Ok(AnswerContent::json(&PairDetail {
         surface_id: &entry.surface.surface_id,
-        pair: geometry.pair(pair),
+        pair: geometry.with_fresnel(),
         environment: AirSeries::new(air, measurement.log_time_ns, &measurement.log_time),
         measured: &measurement.ir,
         measurement: &measurement,
-        rate_hz: asked.catalogue.lake().rig().sweep.rate_hz.get(),
+        rate_hz: request.catalogue.lake().rig().sweep.rate_hz.get(),
         reflected: own.as_deref(),
         flat_reflected: flat.as_deref(),
         tnce_db: levels_db(&energies.total),
@@ -219,26 +273,26 @@ pub(super) async fn pair(asked: CatalogueRequest) -> Result<AnswerContent, Reque
         curves: Some(curves).filter(CurveSet::is_there),
         symmetries: moved,
         attempts,
-    })
+    })?)
 }
 
 impl PairGeometry {
-    fn pair(self, pair_id: usize) -> PairDescription {
+    fn with_fresnel(mut self) -> Self {
         let zone = |frequency_hz: f64, [major, minor]: [Option<f64>; 2]| {
             Some(FresnelEllipse { frequency_hz, major_mm: major?, minor_mm: minor? })
         };
-        let fresnel = [zone(2000.0, self.low_mm), zone(40_000.0, self.high_mm)].into_iter().flatten().collect();
-        PairDescription { pair_id, geometry: self, fresnel }
+        self.fresnel = [zone(2000.0, self.low_mm), zone(40_000.0, self.high_mm)].into_iter().flatten().collect();
+        self
     }
 }
 
 async fn energies(
-    asked: &CatalogueRequest,
+    request: &CatalogueRequest,
     entry: &SurfaceEntry,
     pair: usize,
     run: &str,
 ) -> Result<PairEnergies, RequestFault> {
-    let rig = asked.catalogue.lake().rig();
+    let rig = request.catalogue.lake().rig();
     let total = band_list(rig, |band| format!("tnce_{band}"));
     let band = band_list(rig, |band| if band == TOTAL { "tnce_total".into() } else { format!("tnce_band_{band}") });
     let sql = format!(
@@ -246,24 +300,24 @@ async fn energies(
     );
     let values = vec![text(&entry.surface.surface_id), number(pair), text(run)];
     let nothing = vec![None; rig.band_names().len() + 1];
-    let found = asked.rows(&sql, values).await?.into_iter().next();
+    let found = request.rows(&sql, values).await?.into_iter().next();
     Ok(found.unwrap_or_else(|| PairEnergies { total: nothing.clone(), band: nothing }))
 }
 
 async fn symmetries(
-    asked: &CatalogueRequest,
+    request: &CatalogueRequest,
     entry: &SurfaceEntry,
     pair: usize,
     run: &str,
 ) -> Result<Vec<SymmetricPair>, RequestFault> {
-    let energies = band_list(asked.catalogue.lake().rig(), |band| format!("t.tnce_{band}"));
+    let energies = band_list(request.catalogue.lake().rig(), |band| format!("t.tnce_{band}"));
     let sql = format!(
         "select d.symmetry, d.d4_pair_id as pair_id, d.d4_microphone as microphone, d.d4_speaker as speaker, d.swapped, \
          {energies} as energies from tnce_d4 d join tnce t on t.surface_id = d.surface_id and t.run_id = d.run_id \
          and t.pair_id = d.d4_pair_id where d.surface_id = $1 and d.pair_id = $2 and d.run_id = $3 \
          and t.surface_id = $1 and t.run_id = $3 order by d.symmetry"
     );
-    let rows = asked.rows(&sql, vec![text(&entry.surface.surface_id), number(pair), text(run)]).await?;
+    let rows = request.rows(&sql, vec![text(&entry.surface.surface_id), number(pair), text(run)]).await?;
     let levels = |row: SymmetryRow| SymmetricPair {
         symmetry: row.symmetry,
         pair_id: row.pair_id,
@@ -276,16 +330,16 @@ async fn symmetries(
 }
 
 fn samples(
-    asked: &CatalogueRequest,
-    measured: &[f64],
-    own: Option<&[f64]>,
-    flat: Option<&[f64]>,
+    request: &CatalogueRequest,
+    measured: &[f32],
+    own: Option<&[f32]>,
+    flat: Option<&[f32]>,
 ) -> Result<AnswerContent, RequestFault> {
-    let rate_hz = asked.catalogue.lake().rig().sweep.rate_hz.get();
+    let rate_hz = request.catalogue.lake().rig().sweep.rate_hz.get();
     let times = (0..measured.len()).map(|i| Some(1000.0 * i as f64 / rate_hz));
-    let column = |values: Option<&[f64]>| -> ArrayRef {
+    let column = |values: Option<&[f32]>| -> ArrayRef {
         let values = values.unwrap_or_default();
-        Arc::new((0..measured.len()).map(|i| values.get(i).copied()).collect::<Float64Array>())
+        Arc::new((0..measured.len()).map(|i| values.get(i).copied().map(f64::from)).collect::<Float64Array>())
     };
     let columns: [(&str, ArrayRef); 4] = [
         ("time_ms", Arc::new(times.collect::<Float64Array>())),

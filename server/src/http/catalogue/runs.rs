@@ -1,16 +1,20 @@
 //! Runs: a page of them, and one with topics and sizes, quality, repeats and log.
 
+use axum::Extension;
 use datafusion::common::ScalarValue;
 use serde::{Deserialize, Serialize};
+use utoipa::{IntoParams, ToSchema};
 
-use super::asked::{CatalogueRequest, missing, text};
-use super::content::AnswerContent;
-use crate::fault::RequestFault;
+use super::super::extract::{PathParams, QueryParams, WholeNumber};
+use super::content::{AnswerContent, EndpointAnswer};
+use super::request::{CatalogueRequest, RunPath, missing, text};
 
 /// Lines of a run's log that are answered.
 const MOST_EVENTS: usize = 200;
 
-#[derive(Deserialize, Serialize)]
+/// A run.
+#[derive(Deserialize, Serialize, ToSchema)]
+#[schema(as = Run)]
 struct RunRecord {
     surface_id: String,
     run_id: String,
@@ -18,18 +22,20 @@ struct RunRecord {
     missing: String,
     origin: String,
     rig: String,
+    #[schema(format = DateTime)]
     started: String,
+    #[schema(format = DateTime)]
     ended: String,
     measurements: i64,
     rejected: i64,
     attempts: i64,
     damaged: i64,
-    temperature_min_c: Option<f64>,
-    temperature_max_c: Option<f64>,
-    humidity_min_pct: Option<f64>,
-    humidity_max_pct: Option<f64>,
-    pressure_min_hpa: Option<f64>,
-    pressure_max_hpa: Option<f64>,
+    temperature_min_c: Option<f32>,
+    temperature_max_c: Option<f32>,
+    humidity_min_pct: Option<f32>,
+    humidity_max_pct: Option<f32>,
+    pressure_min_hpa: Option<f32>,
+    pressure_max_hpa: Option<f32>,
     file: String,
     file_bytes: i64,
     file_sha256: String,
@@ -40,8 +46,10 @@ struct RunRecord {
 }
 
 /// A log message of a run.
-#[derive(Deserialize, Serialize)]
+#[derive(Deserialize, Serialize, ToSchema)]
+#[schema(as = Event)]
 pub(super) struct RunLogEntry {
+    #[schema(format = DateTime)]
     log_time: String,
     level: String,
     name: String,
@@ -55,7 +63,47 @@ const COLUMNS: &str = "surface_id, run_id, state, missing, origin, rig, started,
 const CHOSEN: &str = "($1 = '' or strpos(lower(concat(run_id, ' ', surface_id, ' ', state)), $1) > 0) \
     and ($2 = '' or surface_id = $2) and ($3 = '' or state = $3)";
 
-#[derive(Serialize)]
+/// Filters, order and part of a page of runs.
+#[derive(Default, Deserialize, IntoParams)]
+#[serde(default)]
+#[into_params(parameter_in = Query)]
+pub(super) struct RunsQuery {
+    /// Text in id, surface and state.
+    q: String,
+    surface_id: String,
+    state: String,
+    #[param(inline)]
+    sort: RunSort,
+    #[param(inline)]
+    order: RunDirection,
+    #[param(inline)]
+    offset: WholeNumber<0, { usize::MAX }, 0>,
+    #[param(inline)]
+    limit: WholeNumber<1, 500, 100>,
+}
+
+#[derive(Clone, Copy, Default, Deserialize, ToSchema)]
+#[serde(rename_all = "snake_case")]
+#[schema(default = "started")]
+enum RunSort {
+    #[default]
+    Started,
+    SurfaceId,
+    Attempts,
+    FileBytes,
+}
+
+#[derive(Clone, Copy, Default, Deserialize, ToSchema)]
+#[serde(rename_all = "lowercase")]
+#[schema(default = "desc")]
+enum RunDirection {
+    #[default]
+    Desc,
+    Asc,
+}
+
+/// A page of runs.
+#[derive(Serialize, ToSchema)]
 struct RunPage {
     total: i64,
     offset: usize,
@@ -67,62 +115,85 @@ struct RunCount {
     total: i64,
 }
 
-/// A page of runs, the newest first by default.
-pub(super) async fn runs(asked: CatalogueRequest) -> Result<AnswerContent, RequestFault> {
-    let params = &asked.params;
-    let column = match params.choice("sort", &["started", "surface_id", "attempts", "file_bytes"])? {
-        "started" => "started_ns",
-        other => other,
+/// A page of runs, the newest first.
+#[utoipa::path(
+    get,
+    path = "/api/v1/runs",
+    tag = "runs",
+    params(RunsQuery),
+    responses((status = 200, description = "OK", body = RunPage)),
+    extensions(("x-sql" = json!(["select * from runs order by started_ns desc"])))
+)]
+pub(super) async fn runs(
+    Extension(request): Extension<CatalogueRequest>,
+    QueryParams(query): QueryParams<RunsQuery>,
+) -> EndpointAnswer {
+    let column = match query.sort {
+        RunSort::Started => "started_ns",
+        RunSort::SurfaceId => "surface_id",
+        RunSort::Attempts => "attempts",
+        RunSort::FileBytes => "file_bytes",
     };
-    let order = params.choice("order", &["desc", "asc"])?;
-    let offset = params.whole("offset", 0..=usize::MAX)?.unwrap_or(0);
-    let limit = params.whole("limit", 1..=500)?.unwrap_or(100);
-    let one = |name| Ok::<_, RequestFault>(params.one(name)?.unwrap_or_default());
-    let chosen = vec![text(&one("q")?.to_lowercase()), text(one("surface_id")?), text(one("state")?)];
+    let order = match query.order {
+        RunDirection::Desc => "desc",
+        RunDirection::Asc => "asc",
+    };
+    let chosen = vec![text(&query.q.to_lowercase()), text(&query.surface_id), text(&query.state)];
     let page =
         format!("select {COLUMNS} from runs where {CHOSEN} order by {column} {order}, run_id limit $5 offset $4");
     let count = format!("select count(*) as total from runs where {CHOSEN}");
     let whole = |n: usize| ScalarValue::Int64(Some(i64::try_from(n).unwrap_or(i64::MAX)));
-    let values = chosen.iter().cloned().chain([whole(offset), whole(limit)]).collect();
+    let part = [whole(query.offset.get()), whole(query.limit.get())];
+    let values = chosen.iter().cloned().chain(part).collect();
     let (items, total) =
-        tokio::try_join!(asked.rows::<RunRecord>(&page, values), asked.rows::<RunCount>(&count, chosen))?;
-    AnswerContent::json(&RunPage { total: total.first().map_or(0, |c| c.total), offset, items })
+        tokio::try_join!(request.rows::<RunRecord>(&page, values), request.rows::<RunCount>(&count, chosen))?;
+    let total = total.first().map_or(0, |c| c.total);
+    Ok(AnswerContent::json(&RunPage { total, offset: query.offset.get(), items })?)
 }
 
-#[derive(Serialize)]
+/// One run.
+#[derive(Serialize, ToSchema)]
 struct RunDetail {
     run: RunRecord,
     topics: Vec<RunTopic>,
     attachments: Vec<RunAttachment>,
     quality: Vec<QualityCount>,
     repeats: Vec<AttemptCount>,
+    /// Warnings and errors first, at most 200.
     events: Vec<RunLogEntry>,
 }
 
-#[derive(Serialize)]
+/// A topic of a run.
+#[derive(Serialize, ToSchema)]
+#[schema(as = Topic)]
 struct RunTopic {
     topic: String,
     schema: String,
     encoding: String,
     messages: u64,
+    /// Of the messages before compression, from the message index.
     bytes: Option<u64>,
 }
 
-#[derive(Serialize)]
+/// A file within a run's file.
+#[derive(Serialize, ToSchema)]
 struct RunAttachment {
     name: String,
     media_type: String,
     bytes: u64,
 }
 
-#[derive(Serialize)]
+/// Measurements with a flag.
+#[derive(Serialize, ToSchema)]
+#[schema(as = Quality)]
 struct QualityCount {
     flag: &'static str,
     label: String,
     measurements: i64,
 }
 
-#[derive(Deserialize, Serialize)]
+/// Measurements that took this attempt.
+#[derive(Deserialize, Serialize, ToSchema)]
 struct AttemptCount {
     attempt: i64,
     measurements: i64,
@@ -142,11 +213,29 @@ const FLAGS: &str = "select count(*) filter (where clipped_samples > 0) as clipp
     count(*) filter (where snr_db < $2) as snr, count(*) filter (where abs(arrival_error_us) > $3) as arrival, \
     count(*) filter (where outside_level_db > $4) as outside from measurements where run_id = $1";
 
-/// One run.
-pub(super) async fn run(asked: CatalogueRequest) -> Result<AnswerContent, RequestFault> {
-    let visible = asked.run()?.clone();
+/// One run: topics and sizes from the file's summary, quality flags, repeats, log.
+#[utoipa::path(
+    get,
+    path = "/api/v1/runs/{run_id}",
+    tag = "runs",
+    params(RunPath),
+    responses((status = 200, description = "OK", body = RunDetail)),
+    extensions(("x-sql" = json!([
+        "select * from runs where run_id = $1",
+        "select attempt, count(*) from measurements where run_id = $1 group by attempt",
+        "select count(*) filter (where clipped_samples > 0), count(*) filter (where snr_db < 30), count(*) filter \
+         (where abs(arrival_error_us) > 20), count(*) filter (where outside_level_db > 65) from measurements where \
+         run_id = $1 (limits: [rig.validation])",
+        "select * from events where run_id = $1 order by level = 'info', log_time_ns limit 200",
+    ])))
+)]
+pub(super) async fn run(
+    Extension(request): Extension<CatalogueRequest>,
+    PathParams(path): PathParams<RunPath>,
+) -> EndpointAnswer {
+    let visible = request.run(&path.run_id)?.clone();
     let id = text(visible.run.as_str());
-    let limits = &asked.catalogue.lake().rig().validation;
+    let limits = &request.catalogue.lake().rig().validation;
     let real = |value: f64| ScalarValue::Float64(Some(value));
     let flags = vec![id.clone(), real(limits.snr_db), real(limits.arrival_us), real(limits.outside_level_db)];
     let one = format!("select {COLUMNS} from runs where run_id = $1");
@@ -154,13 +243,13 @@ pub(super) async fn run(asked: CatalogueRequest) -> Result<AnswerContent, Reques
         "select log_time, level, name, message from events where run_id = $1 \
          order by level in ('debug', 'info', 'unknown'), log_time_ns limit {MOST_EVENTS}"
     );
-    let (session, service) = (asked.view.session.clone(), asked.catalogue.service());
+    let (session, service) = (request.view.session.clone(), request.catalogue.service());
     let (contents, run, repeats, flags, events) = tokio::try_join!(
-        service.plan(asked.view.session.client(), async move { Ok(session.contents(&visible).await?) }),
-        asked.rows::<RunRecord>(&one, vec![id.clone()]),
-        asked.rows::<AttemptCount>(REPEATS, vec![id.clone()]),
-        asked.rows::<QualityFlags>(FLAGS, flags),
-        asked.rows::<RunLogEntry>(&log, vec![id.clone()]),
+        service.plan(request.view.session.client(), async move { Ok(session.contents(&visible).await?) }),
+        request.rows::<RunRecord>(&one, vec![id.clone()]),
+        request.rows::<AttemptCount>(REPEATS, vec![id.clone()]),
+        request.rows::<QualityFlags>(FLAGS, flags),
+        request.rows::<RunLogEntry>(&log, vec![id.clone()]),
     )?;
     let run = run.into_iter().next().ok_or_else(|| missing("this run".into(), "ask again"))?;
     let topic = |t: echolake_query::Topic| RunTopic {
@@ -172,14 +261,14 @@ pub(super) async fn run(asked: CatalogueRequest) -> Result<AnswerContent, Reques
     };
     let attachment =
         |a: echolake_query::Attachment| RunAttachment { name: a.name, media_type: a.media_type, bytes: a.bytes };
-    AnswerContent::json(&RunDetail {
+    Ok(AnswerContent::json(&RunDetail {
         run,
         topics: contents.topics.into_iter().map(topic).collect(),
         attachments: contents.attachments.into_iter().map(attachment).collect(),
         quality: flags.first().map_or_else(Vec::new, |flags| quality(flags, limits)),
         repeats,
         events,
-    })
+    })?)
 }
 
 fn quality(flags: &QualityFlags, limits: &echolake_schema::rig::Validation) -> Vec<QualityCount> {

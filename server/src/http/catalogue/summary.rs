@@ -2,18 +2,20 @@
 
 use std::collections::HashMap;
 
-use serde::{Deserialize, Serialize};
+use serde::{Deserialize, Deserializer, Serialize};
 use serde_json::{Map, Value};
+use utoipa::ToSchema;
 
-use super::asked::CatalogueRequest;
 use super::lake::{BandDescription, bands};
+use super::request::CatalogueRequest;
 use crate::fault::RequestFault;
 
 /// Nanoseconds of a day.
 const DAY_NS: f64 = 86_400e9;
 
 /// A surface as the pages know it.
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, ToSchema)]
+#[schema(as = Surface)]
 pub(super) struct SurfaceSummary {
     pub(super) surface_id: String,
     pub(super) run_id: Option<String>,
@@ -27,12 +29,17 @@ pub(super) struct SurfaceSummary {
     pub(super) flat_reference: String,
     foam_reference: String,
     pub(super) origin: String,
+    #[schema(format = DateTime)]
     started: Option<String>,
     relief_min_mm: Option<f64>,
     relief_max_mm: Option<f64>,
     pub(super) relief_rms_mm: Option<f64>,
+    /// Mean TNCE of the values up to the 90th percentile, dB over Flat's total. One value per band in the order of
+    /// `lake.bands`, the total last; null if there is no value.
     level_db: Vec<Option<f64>>,
+    /// `level_db` less that of the surface's Flat.
     pub(super) against_flat_db: Vec<Option<f64>>,
+    /// Standard deviation of the pairs' TNCE in dB, by band as `level_db`.
     pub(super) spread_db: Vec<Option<f64>>,
 }
 
@@ -81,12 +88,21 @@ struct SurfaceRow {
     mesh_triangles: Option<i64>,
     mesh_watertight: Option<bool>,
     reflection_factor: Option<f64>,
+    #[serde(deserialize_with = "decimal")]
     relief_min_mm: Option<f64>,
+    #[serde(deserialize_with = "decimal")]
     relief_max_mm: Option<f64>,
+    #[serde(deserialize_with = "decimal")]
     relief_rms_mm: Option<f64>,
     origin: String,
     started: Option<String>,
-    started_ns: Option<f64>,
+    started_ns: Option<i64>,
+}
+
+// A number of single precision as tables show it, so that a filter by 0.1 finds 0.1: not 0.10000000149.
+fn decimal<'de, D: Deserializer<'de>>(column: D) -> Result<Option<f64>, D::Error> {
+    let number = Option::<f32>::deserialize(column)?;
+    Ok(number.map(|x| x.to_string().parse().unwrap_or(f64::from(x))))
 }
 
 #[derive(Deserialize)]
@@ -109,16 +125,16 @@ const STATS: &str = "select surface_id, band, p90_mean_db, spread_db from surfac
 impl CatalogueSummary {
     /// # Errors
     /// Those of its queries.
-    pub(super) async fn read(asked: &CatalogueRequest) -> Result<Self, RequestFault> {
+    pub(super) async fn read(request: &CatalogueRequest) -> Result<Self, RequestFault> {
         let (rows, stats) = tokio::try_join!(
-            asked.rows::<SurfaceRow>(SURFACES, Vec::new()),
-            asked.rows::<BandStatistic>(STATS, Vec::new())
+            request.rows::<SurfaceRow>(SURFACES, Vec::new()),
+            request.rows::<BandStatistic>(STATS, Vec::new())
         )?;
         let mut levels = SurfaceLevels::new();
         for stat in stats {
             levels.entry(stat.surface_id).or_default().insert(stat.band, (stat.p90_mean_db, stat.spread_db));
         }
-        let bands = bands(asked.catalogue.lake().rig());
+        let bands = bands(request.catalogue.lake().rig());
         // The newest of several rows counts, as run names sort by time.
         let newest: HashMap<_, _> = rows.into_iter().map(|row| (row.surface_id.clone(), row)).collect();
         let mut entries: Vec<_> = newest.into_values().map(|row| entry(row, &levels, &bands)).collect();
@@ -158,7 +174,7 @@ fn entry(row: SurfaceRow, levels: &SurfaceLevels, bands: &[BandDescription]) -> 
         mesh_triangles: row.mesh_triangles,
         mesh_watertight: row.mesh_watertight,
         reflection_factor: row.reflection_factor,
-        day: row.started_ns.map(|ns| ns / DAY_NS),
+        day: row.started_ns.map(|ns| ns as f64 / DAY_NS),
         surface: SurfaceSummary {
             surface_id: row.surface_id,
             run_id: row.run_id,

@@ -2,29 +2,38 @@
 
 use std::collections::HashMap;
 
+use axum::Extension;
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
+use utoipa::{IntoParams, ToSchema};
 
-use super::asked::{CatalogueRequest, number, text};
-use super::content::AnswerContent;
+use super::super::extract::{PathParams, QueryParams};
+use super::content::{AnswerContent, EndpointAnswer};
 use super::lake::{band_list, levels_db};
+use super::request::{CatalogueRequest, SurfacePath, number, text};
 use super::summary::SurfaceSummary;
 use crate::fault::RequestFault;
 
-#[derive(Serialize)]
+/// One surface.
+#[derive(Serialize, ToSchema)]
 struct SurfaceDetail<'a> {
     surface: &'a SurfaceSummary,
+    #[schema(value_type = HashMap<String, Value>)]
     parameters: &'a Map<String, Value>,
     mesh_triangles: Option<i64>,
     mesh_watertight: Option<bool>,
     reflection_factor: Option<f64>,
     runs: Vec<String>,
     statistics: Vec<BandStatistics>,
+    /// Mean over the pairs of Flat's TNCE, linear, over Flat's total. One value per band in the order of `lake.bands`, the
+    /// total last; null if there is no value.
     flat_mean: Vec<Option<f64>>,
+    /// The same of this surface.
     mean: Vec<Option<f64>>,
 }
 
-#[derive(Deserialize, Serialize)]
+/// Statistics of a band.
+#[derive(Deserialize, Serialize, ToSchema)]
 struct BandStatistics {
     band: String,
     measurements: i64,
@@ -52,25 +61,41 @@ const STATISTICS: &str = "select band, measurements, p90_mean_db, p5_db, p50_db,
     from surface_stats where surface_id = $1 order by run_id desc";
 
 /// One surface with its statistics and means against Flat.
-pub(super) async fn surface(asked: CatalogueRequest) -> Result<AnswerContent, RequestFault> {
-    let entry = asked.surface().await?;
+#[utoipa::path(
+    get,
+    path = "/api/v1/surfaces/{surface_id}",
+    tag = "catalogue",
+    params(SurfacePath),
+    responses((status = 200, description = "OK", body = SurfaceDetail)),
+    extensions(("x-sql" = json!([
+        "the summary of /surfaces",
+        "select * from surface_stats where surface_id = $1",
+        "select surface_id, avg(tnce_2500), ..., avg(tnce_total) from tnce where surface_id in ($1, $flat) group by \
+         surface_id",
+    ])))
+)]
+pub(super) async fn surface(
+    Extension(request): Extension<CatalogueRequest>,
+    PathParams(path): PathParams<SurfacePath>,
+) -> EndpointAnswer {
+    let entry = request.surface(&path.surface_id).await?;
     let (id, flat) = (&entry.surface.surface_id, &entry.surface.flat_reference);
-    let means = band_list(asked.catalogue.lake().rig(), |band| format!("avg(tnce_{band})"));
+    let means = band_list(request.catalogue.lake().rig(), |band| format!("avg(tnce_{band})"));
     let means =
         format!("select surface_id, {means} as means from tnce where surface_id in ($1, $2) group by surface_id");
     let (found, rows, runs) = tokio::try_join!(
-        asked.rows::<BandStatistics>(STATISTICS, vec![text(id)]),
-        asked.rows::<SurfaceMeans>(&means, vec![text(id), text(flat)]),
-        asked.rows::<SurfaceRun>("select run_id from runs where surface_id = $1 order by started_ns", vec![text(id)]),
+        request.rows::<BandStatistics>(STATISTICS, vec![text(id)]),
+        request.rows::<SurfaceMeans>(&means, vec![text(id), text(flat)]),
+        request.rows::<SurfaceRun>("select run_id from runs where surface_id = $1 order by started_ns", vec![text(id)]),
     )?;
-    let bands = &asked.summary().await?.bands;
+    let bands = &request.summary().await?.bands;
     let mean = |surface: &str| {
         let own = rows.iter().find(|row| row.surface_id == surface);
         own.map_or_else(|| vec![None; bands.len()], |row| row.means.clone())
     };
     // The newest run's row of each band, in the order of the bands.
     let mut by_band: HashMap<_, _> = found.into_iter().rev().map(|row| (row.band.clone(), row)).collect();
-    AnswerContent::json(&SurfaceDetail {
+    Ok(AnswerContent::json(&SurfaceDetail {
         surface: &entry.surface,
         parameters: &entry.parameters,
         mesh_triangles: entry.mesh_triangles,
@@ -80,16 +105,22 @@ pub(super) async fn surface(asked: CatalogueRequest) -> Result<AnswerContent, Re
         statistics: bands.iter().filter_map(|band| by_band.remove(&band.key)).collect(),
         flat_mean: mean(flat),
         mean: mean(id),
-    })
+    })?)
 }
 
-#[derive(Serialize)]
+/// TNCE over the grid for one microphone point.
+#[derive(Serialize, ToSchema)]
+#[schema(as = Grid)]
 struct SurfaceGrid<'a> {
     surface_id: &'a str,
     microphone: usize,
-    over: &'static str,
+    #[schema(inline)]
+    over: GridNormalisation,
+    /// Pair with the microphone by point; null if the pair was not measured or is the microphone itself.
     pairs: Vec<Option<i32>>,
+    /// The pair was measured with microphone and speaker exchanged.
     swapped: Vec<bool>,
+    /// By band, then by point: TNCE in dB.
     bands: Vec<Vec<Option<f64>>>,
 }
 
@@ -101,33 +132,71 @@ struct GridCell {
     energies: Vec<Option<f64>>,
 }
 
-/// The normalisation of the bands. The total is always normalised by Flat's total.
-const OVER: [&str; 2] = ["flat-total", "flat-band"];
+/// The point and the levels of a grid.
+#[derive(Deserialize, IntoParams)]
+#[into_params(parameter_in = Query)]
+pub(super) struct GridQuery {
+    /// A grid point.
+    #[param(value_type = usize, required = true)]
+    microphone: Option<String>,
+    /// flat-total: as in the paper's tables. flat-band: as in its grid plots; the total is then over Flat's total.
+    #[serde(default)]
+    #[param(inline)]
+    over: GridNormalisation,
+}
 
-/// TNCE over the grid for one microphone point; a pair that was measured the other way round is used by reciprocity.
-pub(super) async fn grid(asked: CatalogueRequest) -> Result<AnswerContent, RequestFault> {
-    let entry = asked.surface().await?;
+/// The normalisation of the bands. The total is always normalised by Flat's total.
+#[derive(Clone, Copy, Default, PartialEq, Eq, Deserialize, Serialize, ToSchema)]
+#[serde(rename_all = "kebab-case")]
+#[schema(default = "flat-total")]
+enum GridNormalisation {
+    #[default]
+    FlatTotal,
+    FlatBand,
+}
+
+/// TNCE over the grid for one microphone point.
+///
+/// Pairs that were measured the other way round are used by reciprocity and marked.
+#[utoipa::path(
+    get,
+    path = "/api/v1/surfaces/{surface_id}/grid",
+    tag = "catalogue",
+    params(SurfacePath, GridQuery),
+    responses((status = 200, description = "OK", body = SurfaceGrid)),
+    extensions(("x-sql" = json!([
+        "select t.pair_id, t.microphone, t.speaker, <10 log10 of tnce_* or tnce_band_*> from tnce t where \
+         t.surface_id = $1 and (t.microphone = $2 or t.speaker = $2)",
+    ])))
+)]
+pub(super) async fn grid(
+    Extension(request): Extension<CatalogueRequest>,
+    PathParams(path): PathParams<SurfacePath>,
+    QueryParams(query): QueryParams<GridQuery>,
+) -> EndpointAnswer {
+    let entry = request.surface(&path.surface_id).await?;
     let microphone =
-        asked.microphone()?.ok_or_else(|| RequestFault::request("`microphone` is missing; hint: a grid point"))?;
-    let over = asked.params.choice("over", &OVER)?;
-    let column = |band: &str| match band == super::lake::TOTAL || over == OVER[0] {
+        query.microphone.ok_or_else(|| RequestFault::request("`microphone` is missing; hint: a grid point"))?;
+    let microphone = request.microphone(&microphone)?;
+    let column = |band: &str| match band == super::lake::TOTAL || query.over == GridNormalisation::FlatTotal {
         true => format!("avg(tnce_{band})"),
         false => format!("avg(tnce_band_{band})"),
     };
-    let energies = band_list(asked.catalogue.lake().rig(), column);
+    let energies = band_list(request.catalogue.lake().rig(), column);
     let sql = format!(
         "select pair_id, microphone, speaker, {energies} as energies from tnce \
          where surface_id = $1 and (microphone = $2 or speaker = $2) group by pair_id, microphone, speaker"
     );
-    let mut cells: Vec<GridCell> = asked.rows(&sql, vec![text(&entry.surface.surface_id), number(microphone)]).await?;
+    let mut cells: Vec<GridCell> =
+        request.rows(&sql, vec![text(&entry.surface.surface_id), number(microphone)]).await?;
     // If both directions were measured, the requested one counts.
     cells.sort_by_key(|cell| cell.microphone == microphone);
-    let points = asked.catalogue.lake().grid().points().len();
-    let bands = asked.summary().await?.bands.len();
+    let points = request.catalogue.lake().grid().points().len();
+    let bands = request.summary().await?.bands.len();
     let mut grid = SurfaceGrid {
         surface_id: &entry.surface.surface_id,
         microphone,
-        over,
+        over: query.over,
         pairs: vec![None; points],
         swapped: vec![false; points],
         bands: vec![vec![None; points]; bands],
@@ -144,5 +213,5 @@ pub(super) async fn grid(asked: CatalogueRequest) -> Result<AnswerContent, Reque
             band[other] = level;
         }
     }
-    AnswerContent::json(&grid)
+    Ok(AnswerContent::json(&grid)?)
 }

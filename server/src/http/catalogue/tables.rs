@@ -1,22 +1,30 @@
 //! Tables: what can be asked, with units, and the Parquet files of their snapshot.
 
 use arrow::datatypes::Field;
+use axum::Extension;
 use echolake_schema::tables::{COMMENT, Table, UNIT};
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
+use utoipa::{IntoParams, ToSchema};
 
-use super::asked::{CatalogueRequest, missing};
-use super::content::AnswerContent;
+use super::super::extract::PathParams;
+use super::content::{AnswerContent, EndpointAnswer};
+use super::request::{CatalogueRequest, missing};
 use crate::fault::RequestFault;
 
-#[derive(Serialize)]
+/// A table or view.
+#[derive(Serialize, ToSchema)]
+#[schema(as = Table)]
 struct TableDescription {
     name: &'static str,
     columns: Vec<ColumnDescription>,
 }
 
-#[derive(Serialize)]
+/// A column.
+#[derive(Serialize, ToSchema)]
+#[schema(as = Column)]
 struct ColumnDescription {
     name: String,
+    /// As Arrow writes it.
     #[serde(rename = "type")]
     kind: String,
     nullable: bool,
@@ -37,32 +45,60 @@ impl ColumnDescription {
     }
 }
 
-/// The tables and views.
-pub(super) async fn tables(asked: CatalogueRequest) -> Result<AnswerContent, RequestFault> {
+/// Tables, columns, units, meanings; for completion.
+///
+/// Functions: select distinct routine_name from information_schema.routines
+#[utoipa::path(
+    get,
+    path = "/api/v1/tables",
+    tag = "sql",
+    responses((status = 200, description = "OK", body = Vec<TableDescription>)),
+    extensions(("x-sql" = json!(["the tables' own schemas"])))
+)]
+pub(super) async fn tables(Extension(request): Extension<CatalogueRequest>) -> EndpointAnswer {
     let table = |(name, schema): (_, arrow::datatypes::SchemaRef)| TableDescription {
         name,
         columns: schema.fields().iter().map(|f| ColumnDescription::of(f)).collect(),
     };
-    AnswerContent::json(&asked.catalogue.service().tables().into_iter().map(table).collect::<Vec<_>>())
+    Ok(AnswerContent::json(&request.catalogue.service().tables().into_iter().map(table).collect::<Vec<_>>())?)
 }
 
-#[derive(Serialize)]
+/// The path of a table.
+#[derive(Deserialize, IntoParams)]
+#[into_params(parameter_in = Path)]
+pub(super) struct TablePath {
+    table: String,
+}
+
+/// A Parquet file.
+#[derive(Serialize, ToSchema)]
 struct TableFile<'a> {
     file: &'a str,
     bytes: u64,
     rows: Option<u64>,
 }
 
-/// The Parquet files of a table.
-pub(super) async fn files(asked: CatalogueRequest) -> Result<AnswerContent, RequestFault> {
-    let files = asked.view.snapshot.files(table(asked.part("table"))?).iter();
+/// The Parquet files of a table's snapshot.
+#[utoipa::path(
+    get,
+    path = "/api/v1/tables/{table}",
+    tag = "files",
+    params(TablePath),
+    responses((status = 200, description = "OK", body = Vec<TableFile>)),
+    extensions(("x-sql" = json!(["the commit log"])))
+)]
+pub(super) async fn table_files(
+    Extension(request): Extension<CatalogueRequest>,
+    PathParams(path): PathParams<TablePath>,
+) -> EndpointAnswer {
+    let files = request.view.snapshot.files(table(&path.table)?).iter();
     let file = |file: &'_ echolake_lake::DataFile| {
         let rows = Some(file.visible_rows());
         file.path.filename().map(|name| (name.to_owned(), file.bytes, rows))
     };
     let files: Vec<_> = files.filter_map(file).collect();
     let files = files.iter().map(|(file, bytes, rows)| TableFile { file, bytes: *bytes, rows: *rows });
-    AnswerContent::json(&files.collect::<Vec<_>>())
+    Ok(AnswerContent::json(&files.collect::<Vec<_>>())?)
 }
 
 /// The table of a name.

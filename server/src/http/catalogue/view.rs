@@ -11,7 +11,7 @@ use object_store::path::Path as StorePath;
 use sha2::{Digest as _, Sha256};
 use tokio::sync::OnceCell;
 
-use super::kept::AnswerCache;
+use super::answer_cache::AnswerCache;
 use super::map::SurfacePositions;
 use super::summary::CatalogueSummary;
 use crate::fault::RequestFault;
@@ -33,7 +33,7 @@ pub(in super::super) struct SnapshotView {
     pub(super) answers: AnswerCache,
     pub(super) summary: OnceCell<CatalogueSummary>,
     pub(super) places: OnceCell<SurfacePositions>,
-    /// PreparedQuery queries by their text; there are few texts, because values are bound.
+    /// Prepared queries by their text; there are few texts, because values are bound.
     prepared: Mutex<HashMap<String, Arc<PreparedQuery>>>,
 }
 

@@ -11,10 +11,12 @@ use chrono::{DateTime, SecondsFormat};
 use echolake_export::{Layout, OutlineSchema, OutlineTopic, Taken, outline};
 use echolake_schema::RunId;
 use serde::Serialize;
+use utoipa::ToSchema;
 
+use super::super::extract::QueryParams;
 use super::super::files::RUN;
 use super::super::problem::ProblemResponse;
-use super::question::MOST_RUNS;
+use super::query::{MOST_RUNS, SliceParameters};
 use super::selection::digest;
 use super::{SLICE, SliceQuery, SliceRequest, SliceService};
 use crate::fault::RequestFault;
@@ -22,54 +24,74 @@ use crate::fault::RequestFault;
 /// The manifest.
 pub(in crate::http) const MANIFEST: &str = "/api/v1/foxglove/manifest";
 
-#[derive(Serialize)]
+/// A manifest.
+#[derive(Serialize, ToSchema)]
 struct FoxgloveManifest {
     name: String,
     sources: Vec<FoxgloveSource>,
 }
 
-#[derive(Serialize)]
-#[serde(untagged, rename_all_fields = "camelCase")]
+/// A source of data.
+#[derive(Serialize, ToSchema)]
+#[serde(untagged)]
 enum FoxgloveSource {
-    Static {
-        url: String,
-        supports_range_requests: bool,
-    },
+    #[serde(rename_all = "camelCase")]
+    Static { url: String, supports_range_requests: bool },
+    #[serde(rename_all = "camelCase")]
     Streamed {
         url: String,
         /// The key that the loader keeps the data by, for everybody.
         id: String,
         topics: Vec<FoxgloveTopic>,
         schemas: Vec<FoxgloveSchema>,
+        #[schema(format = DateTime)]
         start_time: String,
+        #[schema(format = DateTime)]
         end_time: String,
     },
 }
 
-#[derive(Serialize)]
+/// A topic of a source.
+#[derive(Serialize, ToSchema)]
 #[serde(rename_all = "camelCase")]
 struct FoxgloveTopic {
     name: String,
     message_encoding: String,
     #[serde(skip_serializing_if = "Option::is_none")]
+    #[schema(nullable = false, minimum = 1)]
     schema_id: Option<u16>,
 }
 
-#[derive(Serialize)]
+/// A schema of a source's messages.
+#[derive(Serialize, ToSchema)]
 struct FoxgloveSchema {
+    #[schema(minimum = 1)]
     id: u16,
     name: String,
     encoding: String,
+    #[schema(content_encoding = "base64")]
     data: String,
 }
 
-/// Answers with the manifest of the requested data.
+/// The manifest of Foxglove's remote data loader.
+///
+/// Runs without where and topics are static files; all else is a streamed source per run, ascending in time.
+#[utoipa::path(
+    get,
+    path = MANIFEST,
+    operation_id = "foxglove_manifest",
+    tag = "runs",
+    params(SliceParameters),
+    responses((status = 200, description = "OK", body = FoxgloveManifest)),
+    extensions(("x-sql" = json!(["select run_id, pair_id, attempt, log_time_ns from measurements where (...)"])))
+)]
 pub(super) async fn manifest(
     State(slices): State<SliceService>,
+    QueryParams(params): QueryParams<SliceParameters>,
     uri: Uri,
     headers: HeaderMap,
 ) -> Result<Response, ProblemResponse> {
-    let request = slices.request(&uri, &headers).await?;
+    let request = slices.request(params, &uri, &headers).await?;
     let manifest = match request.question.is_of_whole_runs() {
         true => whole_runs(&request.question),
         false => streamed(&slices, request).await?,

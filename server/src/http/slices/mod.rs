@@ -6,7 +6,7 @@
 
 mod cutting;
 mod foxglove;
-mod question;
+mod query;
 mod selection;
 mod spool;
 
@@ -17,20 +17,22 @@ use axum::body::Body;
 use axum::extract::State;
 use axum::http::{HeaderMap, Method, Uri};
 use axum::response::Response;
-use axum::routing::get;
 use echolake_export::{Check, SliceParams, Taken};
 use echolake_query::{EngineClient, PredicateForm};
 use futures::stream;
 use tokio::sync::Semaphore;
+use utoipa_axum::router::OpenApiRouter;
+use utoipa_axum::routes;
 
 use super::catalogue::{LakeCatalogue, SnapshotView};
+use super::extract::{BinaryContent, QueryParams};
 use super::guard;
 use super::problem::ProblemResponse;
 use super::ranges::{FileDescription, RangeAnswer, needs_length};
 use crate::fault::RequestFault;
 use crate::tokens::TokenScope;
 use cutting::{SliceResources, SliceTask};
-use question::SliceQuery;
+use query::{SliceParameters, SliceQuery};
 use selection::{SelectionCache, SliceSelection};
 use spool::SliceSpool;
 
@@ -47,7 +49,7 @@ const TURNS: usize = 4;
 
 /// State shared by slices.
 #[derive(Clone)]
-struct SliceService(Arc<SlicesState>);
+pub(super) struct SliceService(Arc<SlicesState>);
 
 struct SlicesState {
     catalogue: LakeCatalogue,
@@ -57,7 +59,12 @@ struct SlicesState {
     turns: Arc<Semaphore>,
 }
 
-/// Routes of slices and of their manifest; pages of other origins may request them.
+/// Routes of slices and of their manifest.
+pub(super) fn routes() -> OpenApiRouter<SliceService> {
+    OpenApiRouter::new().routes(routes!(slice)).routes(routes!(foxglove::manifest))
+}
+
+/// Slices and their manifest for viewers on pages of any origin.
 pub(super) fn for_viewers(catalogue: &LakeCatalogue) -> Router {
     let slices = SliceService(Arc::new(SlicesState {
         catalogue: catalogue.clone(),
@@ -66,11 +73,7 @@ pub(super) fn for_viewers(catalogue: &LakeCatalogue) -> Router {
         places: Arc::new(Semaphore::new(MOST)),
         turns: Arc::new(Semaphore::new(TURNS)),
     }));
-    Router::new()
-        .route(SLICE, get(slice))
-        .route(foxglove::MANIFEST, get(foxglove::manifest))
-        .method_not_allowed_fallback(super::wrong_method)
-        .with_state(slices)
+    Router::from(routes()).method_not_allowed_fallback(super::wrong_method).with_state(slices)
 }
 
 /// An authorised request for a slice.
@@ -82,11 +85,16 @@ struct SliceRequest {
 
 impl SliceService {
     // A slice holds what files do, and is chosen by SQL.
-    async fn request(&self, uri: &Uri, headers: &HeaderMap) -> Result<SliceRequest, RequestFault> {
+    async fn request(
+        &self,
+        params: SliceParameters,
+        uri: &Uri,
+        headers: &HeaderMap,
+    ) -> Result<SliceRequest, RequestFault> {
         let service = self.0.catalogue.service();
         service.client(TokenScope::Files)?;
         let client = service.client(TokenScope::Sql)?;
-        let mut question = SliceQuery::of(uri)?;
+        let mut question = SliceQuery::new(params)?;
         let view = self.0.catalogue.view().await?;
         // Without tokens a page of elsewhere may read the runs whose names it knows, and ask nothing of others, nor
         // anything that costs more than reading them.
@@ -127,13 +135,33 @@ impl SliceService {
     }
 }
 
+/// The messages of some measurements as an MCAP file.
+///
+/// Streamed as it is cut; who sends Range, HEAD or Origin is told its length, and it is cut to its end first. CORS as for
+/// run files. The same measurements, topics and layout are the same bytes and the same ETag. Needs the scopes sql and
+/// files.
+#[utoipa::path(
+    get,
+    path = SLICE,
+    tag = "runs",
+    params(SliceParameters, ("Range" = Option<String>, Header, nullable = false)),
+    responses(
+        (status = 200, description = "The slice", body = inline(BinaryContent),
+            content_type = "application/octet-stream", headers(("ETag" = String))),
+        (status = 206, description = "The range", body = inline(BinaryContent),
+            content_type = "application/octet-stream"),
+        (status = 304, description = "Not changed since the ETag of If-None-Match")
+    ),
+    extensions(("x-sql" = json!(["select run_id, pair_id, attempt, log_time_ns from measurements where (...)"])))
+)]
 async fn slice(
     State(slices): State<SliceService>,
+    QueryParams(params): QueryParams<SliceParameters>,
     method: Method,
     uri: Uri,
     headers: HeaderMap,
 ) -> Result<Response, ProblemResponse> {
-    let request = slices.request(&uri, &headers).await?;
+    let request = slices.request(params, &uri, &headers).await?;
     let selection = slices.selection(&request).await?;
     if request.question.id.as_ref().is_some_and(|id| *id != selection.digest) {
         return Err(RequestFault::Gone { what: "this slice", hint: "ask for the manifest again" }.into());

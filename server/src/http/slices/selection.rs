@@ -1,9 +1,10 @@
 //! The measurements of a slice: found by the engine, within the client's limits, and cached for the ranges that follow.
 
-use std::collections::VecDeque;
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::Arc;
 
 use echolake_export::Taken;
+use quick_cache::Weighter;
+use quick_cache::sync::Cache;
 use sha2::{Digest as _, Sha256};
 
 use super::super::catalogue::{LakeCatalogue, SnapshotView};
@@ -15,8 +16,8 @@ use crate::service::{QueryJob, QueryWork};
 
 /// Measurements of a slice, of a hundred runs and more.
 const MOST: usize = 400_000;
-/// Measurements that are kept: some 80 bytes each.
-const KEPT: usize = 800_000;
+/// Maximum number of cached measurements: some 80 bytes each.
+const CACHED: u64 = 800_000;
 /// Bytes of a digest that tell it from all others.
 const DIGEST_BYTES: usize = 16;
 /// Changes with what slices of the same measurements are.
@@ -33,9 +34,25 @@ pub(super) struct SliceSelection {
 /// The client's name, the lake's version, and the question with all that is in it.
 type SelectionKey = (String, String, String);
 
-/// Selections of the last questions.
-#[derive(Default)]
-pub(super) struct SelectionCache(Mutex<VecDeque<(SelectionKey, Arc<SliceSelection>)>>);
+/// Cache of selections.
+pub(super) struct SelectionCache(Cache<SelectionKey, Arc<SliceSelection>, SelectionWeighter>);
+
+/// Weighs selections by their measurements; an empty one has a weight, too.
+#[derive(Clone)]
+struct SelectionWeighter;
+
+impl Weighter<SelectionKey, Arc<SliceSelection>> for SelectionWeighter {
+    fn weight(&self, _: &SelectionKey, selection: &Arc<SliceSelection>) -> u64 {
+        selection.taken.len() as u64 + 100
+    }
+}
+
+impl Default for SelectionCache {
+    fn default() -> Self {
+        // So few items are one shard, in which a selection may take all the room.
+        Self(Cache::with_weighter(32, CACHED, SelectionWeighter))
+    }
+}
 
 impl SelectionCache {
     /// The measurements that a request is for.
@@ -51,32 +68,13 @@ impl SelectionCache {
         let asked = format!("{:?} {} {}", question.form, question.select(), question.predicate());
         let described = format!("{} {} {asked}", question.layout_name(), question.topics.join(","));
         let key = (client.name().to_owned(), view.version.clone(), described);
-        if let Some(known) = self.known(&key) {
-            return Ok(known);
-        }
-        let mut taken = taken(catalogue, request).await?;
-        taken.sort_by(|a, b| (&a.run, a.log_time_ns, a.pair).cmp(&(&b.run, b.log_time_ns, b.pair)));
-        let digest = digest(view, question, &taken);
-        let selection = Arc::new(SliceSelection { taken, digest });
-        self.keep(key, &selection);
-        Ok(selection)
-    }
-
-    fn known(&self, key: &SelectionKey) -> Option<Arc<SliceSelection>> {
-        let kept = self.0.lock().unwrap_or_else(PoisonError::into_inner);
-        kept.iter().find(|(known, _)| known == key).map(|(_, selection)| selection.clone())
-    }
-
-    fn keep(&self, key: SelectionKey, selection: &Arc<SliceSelection>) {
-        let mut kept = self.0.lock().unwrap_or_else(PoisonError::into_inner);
-        kept.push_back((key, selection.clone()));
-        // One that is small weighs something too.
-        let weight = |kept: &VecDeque<(SelectionKey, Arc<SliceSelection>)>| {
-            kept.iter().map(|(_, s)| s.taken.len() + 100).sum::<usize>()
+        let select = async {
+            let mut taken = taken(catalogue, request).await?;
+            taken.sort_by(|a, b| (&a.run, a.log_time_ns, a.pair).cmp(&(&b.run, b.log_time_ns, b.pair)));
+            let digest = digest(view, question, &taken);
+            Ok(Arc::new(SliceSelection { taken, digest }))
         };
-        while weight(&kept) > KEPT && kept.len() > 1 {
-            kept.pop_front();
-        }
+        self.0.get_or_insert_async(&key, select).await
     }
 }
 

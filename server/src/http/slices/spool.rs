@@ -1,5 +1,8 @@
 //! Slices that are read by ranges: cut once, cached in files without names up to a number of bytes, the oldest evicted
 //! first. Disks are waited for on threads of their own.
+//!
+//! It is none of the caches by `quick_cache`, which count an item once it is complete and until it is evicted: here bytes
+//! count from when they are written until the last reader closes the file.
 
 use std::collections::{HashMap, VecDeque};
 use std::fs::File;

@@ -1,19 +1,48 @@
 //! The parameters of a slice request: a predicate over measurements, and the wanted topics and layout.
 
-use axum::http::Uri;
 use echolake_export::{Layout, Taken};
 use echolake_query::PredicateForm;
 use echolake_schema::RunId;
+use serde::Deserialize;
+use utoipa::{IntoParams, ToSchema};
 
-use super::super::catalogue::RequestParams;
 use crate::fault::RequestFault;
 
 /// Runs that may be named, and sources of a manifest.
 pub(super) const MOST_RUNS: usize = 100;
-/// Parameters that are allowed after the path's `?`.
-const NAMES: [&str; 5] = ["where", "run", "topics", "layout", "id"];
 
-/// A question.
+/// The parameters after the path's `?`.
+#[derive(Default, Deserialize, IntoParams)]
+#[serde(default, deny_unknown_fields)]
+#[into_params(parameter_in = Query)]
+pub(super) struct SliceParameters {
+    /// An SQL predicate over the columns of table measurements; all measurements of the runs if there is none.
+    #[serde(rename = "where")]
+    #[param(example = "pair_id < 5")]
+    predicate: Option<String>,
+    /// The runs that the measurements are of; a page of elsewhere has to name them.
+    #[param(style = Form, explode)]
+    run: Vec<String>,
+    /// Topics, separated by commas; all, and the attachments, if there are none.
+    #[param(value_type = String, required = false)]
+    topics: Vec<String>,
+    /// Heavy topics in chunks of their own, or all messages in the order of time.
+    #[param(inline)]
+    layout: SliceLayout,
+    /// The slice's ETag without quotes; if it is another by now, 410.
+    id: Option<String>,
+}
+
+#[derive(Clone, Copy, Default, Deserialize, ToSchema)]
+#[serde(rename_all = "kebab-case")]
+#[schema(default = "by-topic")]
+enum SliceLayout {
+    #[default]
+    ByTopic,
+    InTime,
+}
+
+/// The slice that is requested.
 pub(super) struct SliceQuery {
     /// The predicate; None if all measurements of the runs are wanted.
     predicate: Option<String>,
@@ -32,20 +61,13 @@ pub(super) struct SliceQuery {
 impl SliceQuery {
     /// # Errors
     /// [`RequestFault::Request`] if it is not right.
-    pub(super) fn of(uri: &Uri) -> Result<Self, RequestFault> {
-        let params = RequestParams::of(uri)?;
-        if let Some(unknown) = params.names().find(|name| !NAMES.contains(name)) {
-            return Err(RequestFault::request(format!(
-                "there is no parameter `{unknown}`; hint: {}",
-                NAMES.join(", ")
-            )));
-        }
+    pub(super) fn new(params: SliceParameters) -> Result<Self, RequestFault> {
         let mut runs = Vec::new();
-        for name in params.all("run") {
+        for name in &params.run {
             let hint = "GET /api/v1/runs lists what there is";
             runs.push(name.parse().map_err(|_| RequestFault::NotFound { what: format!("run `{name}`"), hint })?);
         }
-        let mut topics: Vec<_> = params.all("topics").flat_map(|t| t.split(',')).map(str::to_owned).collect();
+        let mut topics: Vec<_> = params.topics.iter().flat_map(|t| t.split(',')).map(str::to_owned).collect();
         topics.retain(|topic| !topic.is_empty());
         topics.sort();
         topics.dedup();
@@ -54,16 +76,15 @@ impl SliceQuery {
         if runs.len() > MOST_RUNS {
             return Err(RequestFault::request(format!("{} runs are named, {MOST_RUNS} may be", runs.len())));
         }
-        let predicate = params.one("where")?.map(str::to_owned);
+        let predicate = params.predicate;
         if predicate.is_none() && runs.is_empty() {
             return Err(RequestFault::request("`where` is missing; hint: where=surface_id='flat' and pair_id<100"));
         }
-        let layout = match params.choice("layout", &["by-topic", "in-time"])? {
-            "in-time" => Layout::InTime,
-            _ => Layout::ByTopic,
+        let layout = match params.layout {
+            SliceLayout::ByTopic => Layout::ByTopic,
+            SliceLayout::InTime => Layout::InTime,
         };
-        let id = params.one("id")?.map(str::to_owned);
-        Ok(Self { predicate, runs, topics, layout, id, form: PredicateForm::AnyExpression })
+        Ok(Self { predicate, runs, topics, layout, id: params.id, form: PredicateForm::AnyExpression })
     }
 
     /// The predicate; a true one if none was given.
@@ -115,10 +136,11 @@ fn encoded(text: &str) -> String {
 
 #[cfg(test)]
 mod tests {
+    use super::super::super::extract::parse_query;
     use super::*;
 
     fn question(query: &str) -> Result<SliceQuery, RequestFault> {
-        SliceQuery::of(&format!("/x?{query}").parse().expect("a path"))
+        SliceQuery::new(parse_query(&format!("/x?{query}").parse().expect("a path"))?)
     }
 
     #[test]
@@ -143,6 +165,8 @@ mod tests {
         {
             assert!(question(wrong).is_err(), "{wrong}");
         }
+        let unknown = question("topic=/tf&where=a").err().expect("a fault").to_string();
+        assert_eq!(unknown, "there is no parameter `topic`; hint: where, run, topics, layout, id");
         let many: String = (0..=MOST_RUNS).map(|i| format!("&run=r{i}")).collect();
         assert!(question(&many).is_err());
     }

@@ -1,19 +1,19 @@
 //! A request to an endpoint, and its queries of the lake: values are bound or validated, never part of a text.
 
-use std::collections::HashMap;
 use std::sync::Arc;
 
 use arrow::record_batch::RecordBatch;
 use datafusion::common::{ParamValues, ScalarValue};
 use echolake_lake::VisibleRun;
-use echolake_query::output::AnswerFormat;
 use echolake_schema::{RunId, SurfaceId};
+use serde::Deserialize;
 use serde::de::DeserializeOwned;
+use utoipa::IntoParams;
 
-use super::super::format::FormatEncoder;
+use super::super::extract::parse_whole;
 use super::LakeCatalogue;
 use super::map::SurfacePositions;
-use super::params::RequestParams;
+use super::rows::RowDecoder;
 use super::summary::{CatalogueSummary, SurfaceEntry};
 use super::view::SnapshotView;
 use crate::fault::RequestFault;
@@ -21,18 +21,27 @@ use crate::metrics::ServerProtocol;
 use crate::running::{AnswerEncoder, BatchEncoder, RunningQuery, StopSignal};
 use crate::service::{QueryJob, QueryWork};
 
-/// Bytes of one query's rows, as JSON; the largest that endpoints ask for are a run's events or a few responses.
-const MOST_BYTES: usize = 64 << 20;
-
 /// A request to an endpoint.
+#[derive(Clone)]
 pub(in super::super) struct CatalogueRequest {
     pub(super) catalogue: LakeCatalogue,
     pub(super) view: Arc<SnapshotView>,
-    /// The path's parts that have a name.
-    pub(super) path: HashMap<String, String>,
-    pub(super) params: RequestParams,
     /// True if an Arrow stream is preferred to JSON.
     pub(super) as_arrow: bool,
+}
+
+/// The path of a surface.
+#[derive(Deserialize, IntoParams)]
+#[into_params(parameter_in = Path)]
+pub(super) struct SurfacePath {
+    pub(super) surface_id: String,
+}
+
+/// The path of a run.
+#[derive(Deserialize, IntoParams)]
+#[into_params(parameter_in = Path)]
+pub(in super::super) struct RunPath {
+    pub(in super::super) run_id: String,
 }
 
 /// A text, to be bound.
@@ -51,15 +60,9 @@ pub(super) fn long(value: i64) -> ScalarValue {
 }
 
 impl CatalogueRequest {
-    /// A request without path and parameters, for queries of one snapshot.
-    pub(in super::super) fn of(catalogue: &LakeCatalogue, view: &Arc<SnapshotView>) -> Self {
-        let (catalogue, view) = (catalogue.clone(), view.clone());
-        Self { catalogue, view, path: HashMap::new(), params: RequestParams::default(), as_arrow: false }
-    }
-
-    /// A part of the path.
-    pub(super) fn part(&self, name: &str) -> &str {
-        self.path.get(name).map_or("", String::as_str)
+    /// A request for what a snapshot shows.
+    pub(in super::super) fn new(catalogue: &LakeCatalogue, view: &Arc<SnapshotView>, as_arrow: bool) -> Self {
+        Self { catalogue: catalogue.clone(), view: view.clone(), as_arrow }
     }
 
     /// All surfaces in short.
@@ -72,9 +75,8 @@ impl CatalogueRequest {
         self.view.places.get_or_try_init(|| SurfacePositions::find(self)).await
     }
 
-    /// The surface that the path names.
-    pub(super) async fn surface(&self) -> Result<&SurfaceEntry, RequestFault> {
-        let name = self.part("surface_id");
+    /// The surface of this name.
+    pub(super) async fn surface(&self, name: &str) -> Result<&SurfaceEntry, RequestFault> {
         let known = name.parse::<SurfaceId>().ok();
         let found = match known {
             Some(id) => self.summary().await?.entry(id.as_str()),
@@ -83,37 +85,30 @@ impl CatalogueRequest {
         found.ok_or_else(|| missing(format!("surface `{name}`"), "GET /api/v1/surfaces lists what there is"))
     }
 
-    /// The run that the path names, as the snapshot shows it.
-    pub(super) fn run(&self) -> Result<&VisibleRun, RequestFault> {
-        run(&self.view, self.part("run_id"))
+    /// The run of this name, as the snapshot shows it.
+    pub(super) fn run(&self, name: &str) -> Result<&VisibleRun, RequestFault> {
+        run(&self.view, name)
     }
 
-    /// Returns the grid point of the parameter `microphone`, if it is given.
-    pub(super) fn microphone(&self) -> Result<Option<usize>, RequestFault> {
-        self.params.whole("microphone", 0..=self.catalogue.lake().grid().points().len().saturating_sub(1))
+    /// Reads the parameter `microphone`, a grid point of the lake.
+    pub(super) fn microphone(&self, text: &str) -> Result<usize, RequestFault> {
+        let last = self.catalogue.lake().grid().points().len().saturating_sub(1);
+        parse_whole(text, 0..=last).map_err(|e| RequestFault::request(format!("`microphone` {e}")))
     }
 
     /// The rows of a query. `sql` is a text of the program's own; what came with the request is among `values`.
-    pub(in super::super) async fn rows<T: DeserializeOwned>(
+    pub(in super::super) async fn rows<T: DeserializeOwned + Send + 'static>(
         &self,
         sql: &str,
         values: Vec<ScalarValue>,
     ) -> Result<Vec<T>, RequestFault> {
-        let mut running = self.begin(sql, values, |schema| FormatEncoder::new(AnswerFormat::Json, schema)).await?;
-        let mut json = Vec::new();
+        let decoder = RowDecoder::new(sql.to_owned());
+        let mut running = self.begin(sql, values, |_| Ok(decoder)).await?;
+        let mut rows = Vec::new();
         while let Some(part) = running.next().await? {
-            json.extend_from_slice(&part);
-            if json.len() > MOST_BYTES {
-                return Err(RequestFault::TooLarge { limit: MOST_BYTES });
-            }
+            rows.extend(part);
         }
-        if json.iter().all(u8::is_ascii_whitespace) {
-            return Ok(Vec::new());
-        }
-        serde_json::from_slice(&json).map_err(|e| {
-            eprintln!("the rows of `{sql}` are not as expected: {e}");
-            RequestFault::Internal
-        })
+        Ok(rows)
     }
 
     /// The batches of a query, as they come.
