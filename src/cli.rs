@@ -12,6 +12,7 @@ use echolake_acquisition::replay::SPEEDS;
 use echolake_schema::SurfaceId;
 
 use crate::commands::panel::PanelArgs;
+use crate::logging::{FORMAT_VARIABLE, LogFormat};
 #[cfg(feature = "lake")]
 pub(crate) use lake::{DemoArgs, ImportCommand, IngestArgs, LakeCommand, OptimizeArgs, VacuumArgs};
 
@@ -22,6 +23,9 @@ pub(crate) struct CliArguments {
     /// The lake: a folder or a file:// URL.
     #[arg(long, global = true, env = "ECHOLAKE_LAKE", default_value = "lake", value_name = "URL")]
     pub(crate) lake: String,
+    /// Format of the log on stderr; RUST_LOG sets its levels.
+    #[arg(long, global = true, env = FORMAT_VARIABLE, default_value = "text", value_name = "FORMAT")]
+    pub(crate) log_format: LogFormat,
     #[command(subcommand)]
     pub(crate) command: CliCommand,
 }

@@ -2,12 +2,16 @@
 
 mod cli;
 mod commands;
+mod error_text;
+mod logging;
 mod progress;
 mod signals;
 
 use std::process::ExitCode;
 
 use clap::Parser as _;
+
+use error_text::describe_error;
 
 // glibc keeps what each of many threads freed: a third more memory at the peak of an ingest.
 #[global_allocator]
@@ -32,6 +36,7 @@ const DONE_WITH_LOSS: u8 = 3;
 fn main() -> ExitCode {
     // clap itself ends with 2 on wrong usage.
     let cli = cli::CliArguments::parse();
+    logging::start_log(cli.log_format);
     let runtime = || {
         tokio::runtime::Builder::new_multi_thread()
             .enable_all()
@@ -48,7 +53,7 @@ fn main() -> ExitCode {
         Ok(CommandOutcome::WithLoss) => ExitCode::from(DONE_WITH_LOSS),
         Err(error) if is_broken_pipe(&error) => ExitCode::SUCCESS,
         Err(error) => {
-            eprintln!("error: {error:#}");
+            eprintln!("error: {}", describe_error(&error));
             ExitCode::from(FAILED)
         }
     }

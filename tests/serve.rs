@@ -5,6 +5,7 @@ pub(crate) mod catalogue;
 mod contract;
 mod escapes;
 pub(crate) mod http;
+mod log;
 pub(crate) mod postgres;
 pub(crate) mod server;
 mod slices;

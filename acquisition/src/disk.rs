@@ -14,8 +14,8 @@ pub fn free_bytes(path: &Path) -> io::Result<u64> {
 }
 
 /// Waits until a file's content, or a folder's entries, are on the disk.
-pub(crate) fn sync(path: &Path) -> Result<(), String> {
-    File::open(path).and_then(|f| f.sync_all()).map_err(|e| e.to_string())
+pub(crate) fn sync(path: &Path) -> io::Result<()> {
+    File::open(path)?.sync_all()
 }
 
 /// Returns a file's folder. A bare name's parent is the empty path, which cannot be opened.

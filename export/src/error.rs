@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
-use echolake_schema::RunId;
+use echolake_schema::{ErrorCause, RunId};
 
 /// An error of an export. No partial output is left under its final name.
 #[derive(Debug, thiserror::Error)]
@@ -16,12 +16,12 @@ pub enum Error {
         hint: &'static str,
     },
     /// The system refused to write.
-    #[error("cannot write `{}`: {reason}; hint: is its folder there and writable, and its disk not full?", path.display())]
+    #[error("cannot write `{}`: {source}; hint: is its folder there and writable, and its disk not full?", path.display())]
     Write {
         /// The file or folder.
         path: PathBuf,
-        /// The system's error text.
-        reason: String,
+        /// The error of the system, or of what encodes.
+        source: ErrorCause,
     },
     /// There is nothing to export.
     #[error("nothing to export: {reason}")]
@@ -48,24 +48,24 @@ pub enum Error {
         reason: String,
     },
     /// A file of the lake does not agree with its commit log.
-    #[error("`{file}` is damaged: {reason}; hint: `echolake doctor` says what is")]
+    #[error("`{file}` is damaged: {source}; hint: `echolake doctor` says what is")]
     Damaged {
         /// The file.
         file: String,
-        /// Description of the damage.
-        reason: String,
+        /// The damage.
+        source: ErrorCause,
     },
     /// A run's file is not the one that was ingested.
     #[error(
-        "`{file}` is not the file that run {run} was ingested from: {reason}; hint: bring the original back, `echolake doctor` lists all"
+        "`{file}` is not the file that run {run} was ingested from: {source}; hint: bring the original back, `echolake doctor` lists all"
     )]
     Changed {
         /// The run.
         run: RunId,
         /// Its file.
         file: String,
-        /// The difference: expected and actual.
-        reason: String,
+        /// The difference, expected and actual; or the error of the store.
+        source: ErrorCause,
     },
     /// A run's file cannot be sliced.
     #[error("run {run} cannot be cut: {reason}")]
@@ -87,11 +87,11 @@ pub enum Error {
 pub type Result<T> = std::result::Result<T, Error>;
 
 impl Error {
-    pub(crate) fn write(path: &Path, reason: impl ToString) -> Self {
-        Self::Write { path: path.to_owned(), reason: reason.to_string() }
+    pub(crate) fn write(path: &Path, source: impl Into<ErrorCause>) -> Self {
+        Self::Write { path: path.to_owned(), source: source.into() }
     }
 
-    pub(crate) fn damaged(file: impl ToString, reason: impl ToString) -> Self {
-        Self::Damaged { file: file.to_string(), reason: reason.to_string() }
+    pub(crate) fn damaged(file: impl ToString, source: impl Into<ErrorCause>) -> Self {
+        Self::Damaged { file: file.to_string(), source: source.into() }
     }
 }

@@ -6,6 +6,7 @@ use std::sync::atomic::AtomicBool;
 use echolake_lake::{CommitOutcome, Lake, VisibleRun};
 use echolake_schema::tables::Table;
 use echolake_schema::{RunId, SurfaceId};
+use tracing::Instrument as _;
 
 use crate::context::IngestContext;
 use crate::derive::ReferenceDerivation;
@@ -76,7 +77,8 @@ async fn round(
     let (mut count, mut overtaken) = (0, false);
     let do_one = move |(run, wanted): (VisibleRun, WantedReferences)| {
         let context = context.clone();
-        async move { complete_run(&context, &run, &wanted).await }
+        let span = tracing::error_span!("complete", run = %run.run, surface = %run.surface);
+        async move { complete_run(&context, &run, &wanted).await }.instrument(span)
     };
     let ended = &mut |(_, result): pipeline::JobOutcome<_, CompletedRun>| {
         let (completed, outcome) = result?;

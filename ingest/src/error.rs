@@ -1,18 +1,19 @@
 //! Errors between a run's file and the tables.
 
 use echolake_recording::ResyncError;
+use echolake_schema::ErrorCause;
 use echolake_schema::manifest::ManifestError;
 
 /// An error of an ingest.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
     /// The file cannot be read.
-    #[error("cannot read `{file}`: {reason}")]
+    #[error("cannot read `{file}`: {source}")]
     Read {
         /// The file.
         file: String,
         /// The cause.
-        reason: String,
+        source: ErrorCause,
     },
     /// The file is no MCAP file at all.
     #[error(
@@ -38,6 +39,7 @@ pub enum Error {
         /// The file.
         file: String,
         /// The cause.
+        #[source]
         cause: ManifestError,
     },
     /// Its metadata may be damaged.
@@ -49,14 +51,14 @@ pub enum Error {
         reason: String,
     },
     /// An attachment that must be there is missing or damaged.
-    #[error("`{file}`: attachment `{attachment}` {reason}")]
+    #[error("`{file}`: attachment `{attachment}` {source}")]
     Attachment {
         /// The file.
         file: String,
         /// The attachment.
         attachment: &'static str,
-        /// Description of the damage.
-        reason: String,
+        /// The damage.
+        source: ErrorCause,
     },
     /// Another run of this name is in the lake.
     #[error(
@@ -102,6 +104,7 @@ pub enum Error {
         /// The file.
         file: String,
         /// The kernel's error.
+        #[source]
         cause: echolake_dsp::Error,
     },
     /// A data file of the lake cannot be read.
@@ -115,10 +118,10 @@ pub enum Error {
         reason: String,
     },
     /// The machine gives no more threads.
-    #[error("cannot start the threads that compute: {reason}; hint: is a limit of processes reached?")]
+    #[error("cannot start the threads that compute: {source}; hint: is a limit of processes reached?")]
     Threads {
         /// The cause.
-        reason: String,
+        source: rayon::ThreadPoolBuildError,
     },
     /// The ingest was stopped.
     #[error("stopped; hint: the same command goes on where this one ended")]
@@ -131,7 +134,7 @@ pub enum Error {
 impl From<ResyncError> for Error {
     fn from(error: ResyncError) -> Self {
         match error {
-            ResyncError::Read { file, reason } => Self::Read { file, reason },
+            ResyncError::Read { file, source } => Self::Read { file, source },
             ResyncError::Gone { file } => Self::Gone { file },
             ResyncError::NotMcap { file, actual } => Self::NotMcap { file, actual },
         }
@@ -155,7 +158,7 @@ impl Error {
         }
     }
 
-    pub(crate) fn read(file: impl ToString, reason: impl std::fmt::Display) -> Self {
-        Self::Read { file: file.to_string(), reason: reason.to_string() }
+    pub(crate) fn read(file: impl ToString, source: impl Into<ErrorCause>) -> Self {
+        Self::Read { file: file.to_string(), source: source.into() }
     }
 }

@@ -224,11 +224,11 @@ async fn copy_in(lake: &Lake, from: &FsPath, to: &Path) -> Result<()> {
 
 // The lake itself cannot be written: an error of the lake, not of the run.
 fn written(path: &Path, cause: object_store::Error) -> Error {
-    let cause = StoreError(cause);
-    Error::Lake(echolake_lake::Error::Store { action: "write", path: path.to_string(), cause })
+    let source = StoreError(cause);
+    Error::Lake(echolake_lake::Error::Store { action: "write", path: path.to_string(), source })
 }
 
 fn absolute(file: &FsPath) -> Result<Path> {
-    let failed = |e: &dyn std::fmt::Display| Error::read(file.display(), e);
-    Path::from_absolute_path(std::path::absolute(file).map_err(|e| failed(&e))?).map_err(|e| failed(&e))
+    let absolute = std::path::absolute(file).map_err(|e| Error::read(file.display(), e))?;
+    Path::from_absolute_path(absolute).map_err(|e| Error::read(file.display(), e))
 }

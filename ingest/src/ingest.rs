@@ -9,6 +9,7 @@ use echolake_schema::tables::Table;
 use echolake_schema::{RunId, SurfaceId};
 use object_store::path::Path;
 use serde::{Deserialize, Serialize};
+use tracing::{Instrument as _, Span, field};
 
 use crate::CODE_VERSION;
 use crate::context::IngestContext;
@@ -146,7 +147,8 @@ impl<'a> LakeIngest<'a> {
         };
         let do_one = move |source| {
             let work = work.clone();
-            async move { work.take_in(&source).await }
+            let span = tracing::error_span!("ingest", file = %source, run = field::Empty, surface = field::Empty);
+            async move { work.take_in(&source).await }.instrument(span)
         };
         let done = pipeline::run(self.lake, &cores, sources, &self.stop, do_one, ended).await;
         for (source, why) in refused {
@@ -187,6 +189,9 @@ impl IngestWork {
         let opened = source.open(lake)?;
         let content = Arc::new(RunContent::read(lake, &self.measurer, cores, &opened).await?);
         let keys = RunKeys { surface: content.manifest.surface_id.clone(), run: content.manifest.run_id.clone() };
+        let span = Span::current();
+        span.record("run", field::display(&keys.run)).record("surface", field::display(&keys.surface));
+        tracing::debug!(measurements = content.accepted.len(), damages = content.damaged.len(), "the file is read");
         let derivation = digest(&[content.integrity.sha256.as_str(), CODE_VERSION]);
         let known = snapshot.run(&keys.run);
         if let Some(known) = known {
@@ -239,6 +244,7 @@ impl IngestWork {
         let row = rows::runs::row(lake, &keys, &content, &derivation, &references)?;
         staged.push(self.context.stage_pointer(run, &[row]).await?);
         drop(mark);
+        tracing::debug!(files = staged.len(), missing = taken.missing, "the rows are written and not committed yet");
         Ok(ReadyJob { staged, report: taken })
     }
 

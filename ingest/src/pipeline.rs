@@ -15,6 +15,7 @@ use rayon::{ThreadPool, ThreadPoolBuilder};
 use tokio::sync::{mpsc, oneshot};
 use tokio::task::JoinSet;
 use tokio::time::{Instant, timeout_at};
+use tracing::Span;
 
 use crate::error::{Error, Result};
 
@@ -59,7 +60,7 @@ pub(crate) type JobOutcome<J, R> = (J, Result<(R, Option<CommitOutcome>)>);
 impl Cores {
     pub(crate) fn all() -> Result<Self> {
         let pool = ThreadPoolBuilder::new().thread_name(|i| format!("compute-{i}")).build();
-        let pool = pool.map_err(|e| Error::Threads { reason: e.to_string() })?;
+        let pool = pool.map_err(|source| Error::Threads { source })?;
         Ok(Self { pool: Arc::new(pool), busy: Arc::default() })
     }
 
@@ -81,9 +82,9 @@ impl Cores {
     /// Starts a computation on a core of its own once one is free, in the order of the calls.
     pub(crate) fn begin<T: Send + 'static>(&self, work: impl FnOnce() -> T + Send + 'static) -> Begun<T> {
         let (sender, done) = oneshot::channel();
-        let busy = self.busy();
+        let (busy, span) = (self.busy(), Span::current());
         self.pool.spawn_fifo(move || {
-            let done = catch_unwind(AssertUnwindSafe(work));
+            let done = catch_unwind(AssertUnwindSafe(|| span.in_scope(work)));
             drop(busy);
             // The receiver is gone if the whole ingest was cancelled.
             let _ = sender.send(done);

@@ -8,7 +8,7 @@ use echolake_lake::Lake;
 use echolake_recording::{DecodedChunk, FileIntegrity, Metadata, RawChunk, ResyncItem, ResyncReader, list_damage};
 use echolake_schema::manifest::{Origin, RunEnd, RunManifest};
 use echolake_schema::messages::{AmbientSample, Measurement, Verdict};
-use echolake_schema::{Rig, SurfaceId, SurfaceRecord, topics};
+use echolake_schema::{ErrorCause, Rig, SurfaceId, SurfaceRecord, topics};
 
 use crate::error::{Error, Result};
 use crate::files::Opened;
@@ -242,17 +242,24 @@ impl Envelope {
     }
 
     fn rig(&self, name: &str) -> Result<Rig> {
-        let wrong = |reason| Error::Attachment { file: name.to_owned(), attachment: topics::RIG_ATTACHMENT, reason };
-        let bytes = self.attachments.get(topics::RIG_ATTACHMENT).ok_or_else(|| wrong("is missing".to_owned()))?;
-        let text = std::str::from_utf8(bytes).map_err(|e| wrong(format!("is no text: {e}")))?;
-        Rig::from_toml(text).map_err(|e| wrong(e.to_string()))
+        let wrong = |source: ErrorCause| Error::Attachment {
+            file: name.to_owned(),
+            attachment: topics::RIG_ATTACHMENT,
+            source,
+        };
+        let bytes = self.attachments.get(topics::RIG_ATTACHMENT).ok_or_else(|| wrong("is missing".into()))?;
+        let text = std::str::from_utf8(bytes).map_err(|e| wrong(format!("is no text: {e}").into()))?;
+        Rig::from_toml(text).map_err(|e| wrong(e.into()))
     }
 
     fn surface(&self, name: &str) -> Result<SurfaceRecord> {
-        let wrong =
-            |reason| Error::Attachment { file: name.to_owned(), attachment: topics::SURFACE_ATTACHMENT, reason };
-        let bytes = self.attachments.get(topics::SURFACE_ATTACHMENT).ok_or_else(|| wrong("is missing".to_owned()))?;
-        serde_json::from_slice(bytes).map_err(|e| wrong(e.to_string()))
+        let wrong = |source: ErrorCause| Error::Attachment {
+            file: name.to_owned(),
+            attachment: topics::SURFACE_ATTACHMENT,
+            source,
+        };
+        let bytes = self.attachments.get(topics::SURFACE_ATTACHMENT).ok_or_else(|| wrong("is missing".into()))?;
+        serde_json::from_slice(bytes).map_err(|e| wrong(e.into()))
     }
 
     fn heights(&self) -> Vec<f32> {

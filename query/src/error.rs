@@ -9,6 +9,7 @@ use datafusion::common::utils::datafusion_strsim::normalized_levenshtein;
 use datafusion::common::{Column, SchemaError};
 use datafusion::error::DataFusionError;
 use datafusion::sql::sqlparser::parser::ParserError;
+use echolake_schema::ErrorCause;
 use echolake_schema::tables::Table;
 
 use crate::control::StopReason;
@@ -75,12 +76,12 @@ pub enum Error {
         limit: usize,
     },
     /// The answer cannot be written.
-    #[error("the answer cannot be written as {format}: {message}")]
+    #[error("the answer cannot be written as {format}: {source}")]
     Format {
         /// The format.
         format: &'static str,
-        /// The cause.
-        message: String,
+        /// The encoder's error.
+        source: ErrorCause,
     },
     /// The answer's destination refused.
     #[error("cannot write the answer")]

@@ -194,8 +194,8 @@ fn one_name_each(format: AnswerFormat, schema: &SchemaRef) -> Result<(), Error> 
     match schema.fields().iter().find(|field| !seen.insert(field.name())) {
         None => Ok(()),
         Some(field) => {
-            let message = format!("two columns are called `{}`; hint: name one with AS", field.name());
-            Err(Error::Format { format: format.name(), message })
+            let source = format!("two columns are called `{}`; hint: name one with AS", field.name()).into();
+            Err(Error::Format { format: format.name(), source })
         }
     }
 }
@@ -204,7 +204,7 @@ fn one_name_each(format: AnswerFormat, schema: &SchemaRef) -> Result<(), Error> 
 fn arrow_error(format: AnswerFormat, error: ArrowError) -> Error {
     match error {
         ArrowError::IoError(_, source) => Error::Write(source),
-        other => Error::Format { format: format.name(), message: other.to_string() },
+        other => Error::Format { format: format.name(), source: other.into() },
     }
 }
 
@@ -212,9 +212,9 @@ fn parquet_error(error: ParquetError) -> Error {
     match error {
         ParquetError::External(source) => match source.downcast::<std::io::Error>() {
             Ok(source) => Error::Write(*source),
-            Err(other) => Error::Format { format: "parquet", message: other.to_string() },
+            Err(other) => Error::Format { format: "parquet", source: other },
         },
-        other => Error::Format { format: "parquet", message: other.to_string() },
+        other => Error::Format { format: "parquet", source: other.into() },
     }
 }
 

@@ -5,6 +5,7 @@ use std::cell::RefCell;
 use std::io::{self, Read as _};
 
 use bytes::Bytes;
+use echolake_schema::ErrorCause;
 use mcap::McapError;
 use mcap::records::{ChunkHeader, MessageHeader, Record, op};
 use zstd::bulk::Decompressor;
@@ -237,6 +238,14 @@ fn has_attachment_head(body: &[u8]) -> bool {
         begin.checked_add(4)?.checked_add(length as usize)
     };
     text_end(16).and_then(text_end).and_then(|end| end.checked_add(8 + 4)).is_some_and(|end| end <= body.len())
+}
+
+/// Returns the cause of an error of the MCAP library: the system's own error, which the library's text does not name.
+pub fn system_cause(error: McapError) -> ErrorCause {
+    match error {
+        McapError::Io(system) => system.into(),
+        other => other.into(),
+    }
 }
 
 /// Returns an error of the MCAP library with its cause.

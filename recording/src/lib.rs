@@ -37,7 +37,7 @@ mod summary;
 
 pub use chunk::{
     ChunkError, ChunkIdentity, ChunkMessage, DecodedChunk, RecordCursor, RecordError, chunk_body, describe,
-    parse_record,
+    parse_record, system_cause,
 };
 pub use chunk_writer::{ChunkLane, ChunkWriter, StreamWriter, stream_writer};
 pub use file_proof::prove_file;

@@ -10,6 +10,7 @@ use std::sync::Arc;
 
 use bytes::Bytes;
 use crc32fast::Hasher as Crc32;
+use echolake_schema::ErrorCause;
 use mcap::MAGIC;
 use mcap::records::{Metadata, Record, op};
 use object_store::path::Path;
@@ -42,12 +43,12 @@ const FOOTER: u64 = FRAME + 20 + MAGIC.len() as u64;
 #[derive(Debug, thiserror::Error)]
 pub enum ResyncError {
     /// The store does not give it.
-    #[error("cannot read `{file}`: {reason}")]
+    #[error("cannot read `{file}`: {source}")]
     Read {
         /// The file.
         file: String,
-        /// The store's reason.
-        reason: String,
+        /// The store's error.
+        source: ErrorCause,
     },
     /// No file of this name.
     #[error("`{file}` is gone")]
@@ -66,8 +67,8 @@ pub enum ResyncError {
 }
 
 impl ResyncError {
-    fn read(file: &str, reason: impl ToString) -> Self {
-        Self::Read { file: file.to_owned(), reason: reason.to_string() }
+    fn read(file: &str, source: impl Into<ErrorCause>) -> Self {
+        Self::Read { file: file.to_owned(), source: source.into() }
     }
 }
 

@@ -1,5 +1,8 @@
 //! Errors for values from outside: names, numbers, rig descriptions, points, pairs and samples.
 
+/// The cause of another member's error: an error of a library or the system, or a text.
+pub type ErrorCause = Box<dyn std::error::Error + Send + Sync>;
+
 /// A value that is not what its type promises.
 #[derive(Debug, thiserror::Error, Clone, PartialEq)]
 pub enum Error {

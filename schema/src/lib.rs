@@ -26,7 +26,7 @@ pub mod symmetry;
 pub mod tables;
 pub mod topics;
 
-pub use error::Error;
+pub use error::{Error, ErrorCause};
 pub use grid::{Grid, Pair, Point};
 pub use ids::{PairId, PointId, RunId, SurfaceId};
 pub use manifest::{RunManifest, SurfaceRecord};

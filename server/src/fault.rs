@@ -235,6 +235,18 @@ impl RequestFault {
         Self::Unsupported { what: what.into() }
     }
 
+    /// Writes it to the log: as a warning if the client is not to blame for it, else for debugging, because its text may
+    /// quote a statement.
+    pub(crate) fn log(&self) {
+        let (code, text) = (self.code(), self.to_string());
+        match code {
+            FaultCode::Internal | FaultCode::Lake | FaultCode::Changed | FaultCode::EngineEnded => {
+                tracing::warn!(code = code.name(), text, "a request failed");
+            }
+            _ => tracing::debug!(code = code.name(), text, "a request failed"),
+        }
+    }
+
     /// Its code.
     pub(crate) fn code(&self) -> FaultCode {
         match self {

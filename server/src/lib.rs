@@ -23,6 +23,7 @@ mod flight;
 mod http;
 mod metrics;
 mod postgres;
+mod request_span;
 mod running;
 mod service;
 mod sessions;

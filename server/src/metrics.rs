@@ -4,7 +4,7 @@ use std::fmt::Write as _;
 use std::sync::atomic::{AtomicI64, AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
-use crate::fault::FaultCode;
+use crate::fault::{FaultCode, RequestFault};
 
 /// The protocol of a query.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -17,7 +17,8 @@ pub(crate) enum ServerProtocol {
 impl ServerProtocol {
     const ALL: [Self; 3] = [Self::Http, Self::FlightSql, Self::Postgres];
 
-    fn name(self) -> &'static str {
+    /// As metrics and the log have it.
+    pub(crate) fn name(self) -> &'static str {
         match self {
             Self::Http => "http",
             Self::FlightSql => "flight_sql",
@@ -70,6 +71,12 @@ impl ServerMetrics {
     /// Counts a failed request.
     pub(crate) fn failed(&self, code: FaultCode) {
         self.failures[code as usize].fetch_add(1, Ordering::Relaxed);
+    }
+
+    /// Counts a failed request and writes it to the log.
+    pub(crate) fn record_failure(&self, fault: &RequestFault) {
+        self.failed(fault.code());
+        fault.log();
     }
 
     fn took(&self, time: Duration) {

@@ -8,6 +8,7 @@ use arrow::record_batch::RecordBatch;
 use tokio::sync::{mpsc, watch};
 use tokio::task::JoinSet;
 use tokio::time::Instant;
+use tracing::Span;
 
 use crate::fault::RequestFault;
 use crate::service::QueryService;
@@ -74,6 +75,7 @@ pub(crate) struct RunningQuery<T> {
     pub(crate) stop: StopSignal,
     pub(crate) limit: Option<SessionTimeLimit>,
     pub(crate) service: QueryService,
+    pub(crate) span: Span,
 }
 
 /// A session's own limit of time.
@@ -101,7 +103,7 @@ impl<T: Send + 'static> RunningQuery<T> {
             biased;
             fault = ended(&self.stop, limit) => {
                 self.task.abort_all();
-                self.service.metrics().failed(fault.code());
+                self.span.in_scope(|| self.service.metrics().record_failure(&fault));
                 return Err(fault);
             }
             item = self.items.recv() => if let Some(item) = item {
@@ -132,7 +134,7 @@ pub(crate) async fn finish(task: &mut JoinSet<Result<(), RequestFault>>) -> Resu
         None => Ok(()),
         Some(Ok(done)) => done,
         Some(Err(failed)) => {
-            eprintln!("a query ended its task: {failed}");
+            tracing::error!(error = &failed as &dyn std::error::Error, "a query ended its task");
             Err(RequestFault::Internal)
         }
     }

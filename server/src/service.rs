@@ -10,6 +10,7 @@ use echolake_lake::Lake;
 use echolake_query::{EngineClient, PreparedQuery, QueryEngine, QueryQuota, QueryThreads, Session, SqlFunction};
 use tokio::sync::{mpsc, oneshot};
 use tokio::task::JoinSet;
+use tracing::Instrument as _;
 
 use crate::Error;
 use crate::client_identity::ClientIdentity;
@@ -113,7 +114,7 @@ impl QueryService {
     /// # Errors
     /// [`RequestFault::Forbidden`].
     pub(crate) fn client(&self, scope: TokenScope) -> Result<Arc<EngineClient>, RequestFault> {
-        self.0.identity.require(scope).inspect_err(|fault| self.0.metrics.failed(fault.code()))?;
+        self.0.identity.require(scope).inspect_err(|fault| self.0.metrics.record_failure(fault))?;
         Ok(self.0.client.clone())
     }
 
@@ -168,8 +169,8 @@ impl QueryService {
             let _guard = guard;
             work.await
         };
-        let planned = self.0.engine.supervise(client.quota().time, work).await;
-        planned.inspect_err(|fault| self.0.metrics.failed(fault.code()))
+        let planned = self.0.engine.supervise(client.quota().time, work.in_current_span()).await;
+        planned.inspect_err(|fault| self.0.metrics.record_failure(fault))
     }
 
     /// Computes something long, which waits for nothing.
@@ -185,7 +186,7 @@ impl QueryService {
         let handle = self.0.encoders.handle().map(|threads| threads.spawn_blocking(work));
         let Some(handle) = handle else { return Err(RequestFault::Internal) };
         handle.await.map_err(|failed| {
-            eprintln!("computing ended its task: {failed}");
+            tracing::error!(error = &failed as &dyn std::error::Error, "computing ended its task");
             RequestFault::Internal
         })
     }
@@ -203,19 +204,21 @@ impl QueryService {
         let (to, items) = mpsc::channel(WAITING);
         let (stop, limit) = (job.stop.clone(), job.limit);
         let inner = self.0.clone();
-        let mut task = self.spawn(async move {
+        let span = tracing::error_span!("query", protocol = job.protocol.name(), client = self.0.identity.name);
+        let work = async move {
             let _timed = inner.metrics.begin(job.protocol);
             let done = run(&inner.metrics, job, encode, columns, to).await;
-            done.inspect_err(|fault| inner.metrics.failed(fault.code()))
-        });
+            done.inspect_err(|fault| inner.metrics.record_failure(fault))
+        };
+        let mut task = self.spawn(work.instrument(span.clone()));
         tokio::select! {
             biased;
             fault = ended(&stop, limit) => {
-                self.0.metrics.failed(fault.code());
+                span.in_scope(|| self.0.metrics.record_failure(&fault));
                 Err(fault)
             }
             schema = known => match schema {
-                Ok(schema) => Ok(RunningQuery { schema, items, task, stop, limit, service: self.clone() }),
+                Ok(schema) => Ok(RunningQuery { schema, items, task, stop, limit, service: self.clone(), span }),
                 // It ended without having any: it says why.
                 Err(_) => finish(&mut task).await.and(Err(RequestFault::Internal)),
             }

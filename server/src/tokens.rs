@@ -219,7 +219,7 @@ impl TokenAccess {
             return Err(RequestFault::NotFound { what: "a session".to_owned(), hint });
         };
         sessions.begin(tokens.find(token).ok_or(RequestFault::Unauthenticated)?).map_err(|failed| {
-            eprintln!("no session can begin: {failed}");
+            tracing::error!(error = &failed as &dyn std::error::Error, "no session can begin");
             RequestFault::Internal
         })
     }

@@ -21,6 +21,8 @@ use serde::{Deserialize, Serialize};
 
 use crate::CommandOutcome;
 use crate::cli::IngestArgs;
+use crate::error_text::describe_error;
+use crate::logging::child_variable;
 use crate::progress::CommandProgress;
 use crate::signals::StopRequest;
 
@@ -177,6 +179,8 @@ async fn watch_suspect(
         progress.say(format!("{file}: an ingest died while it read this; a process of its own takes it in"));
         let mut command = Command::new(std::env::current_exe().context("this program has no path")?);
         command.args(["--lake", lake.location(), "ingest", "--suspect", path.as_ref()]);
+        let (name, value) = child_variable();
+        command.env(name, value);
         command.stdin(Stdio::piped()).stdout(Stdio::piped());
         let run = move || {
             let mut child = command.spawn()?;
@@ -259,7 +263,7 @@ async fn watch(lake: &Lake, stop: &StopRequest, progress: &CommandProgress) -> a
             Err(e) if stop.is_made() => drop(e),
             // A full disk or an absent store passes; the files are still there.
             Err(e) => {
-                eprintln!("error: {e:#}; trying again in {} s", RETRY_AFTER.as_secs());
+                eprintln!("error: {}; trying again in {} s", describe_error(&e), RETRY_AFTER.as_secs());
                 pause(RETRY_AFTER, stop).await;
             }
         }

@@ -11,6 +11,7 @@ use echolake_server::tokens::{self, TokenFile};
 use echolake_server::{CataloguePages, EngineSettings, Error, LakeServer, ServerSettings};
 
 use crate::CommandOutcome;
+use crate::logging::child_variable;
 use crate::signals::StopRequest;
 
 /// Memory for queries, and engines at once, by default.
@@ -141,7 +142,14 @@ pub(crate) async fn catalogue(lake: &Lake, stop: &StopRequest) -> anyhow::Result
 
 fn engines(memory_mib: u32, count: u32, temp: Option<PathBuf>) -> anyhow::Result<EngineSettings> {
     let program = std::env::current_exe().context("this program does not know its own path")?;
-    Ok(EngineSettings { program, memory: (memory_mib as usize) << 20, count: count as usize, temp })
+    let (name, value) = child_variable();
+    Ok(EngineSettings {
+        program,
+        environment: vec![(name.to_owned(), value.to_owned())],
+        memory: (memory_mib as usize) << 20,
+        count: count as usize,
+        temp,
+    })
 }
 
 async fn answer(server: LakeServer, stop: &StopRequest) -> anyhow::Result<CommandOutcome> {

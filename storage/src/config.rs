@@ -1,6 +1,6 @@
 //! `lake.toml`: the lake's format, its rig and its references.
 
-use echolake_schema::{Rig, SurfaceId};
+use echolake_schema::{ErrorCause, Rig, SurfaceId};
 use serde::{Deserialize, Serialize};
 
 use crate::{Error, Result};
@@ -45,20 +45,19 @@ struct FormatOnly {
 
 impl LakeConfig {
     pub(crate) fn to_toml(&self) -> Result<String> {
-        let body =
-            toml::to_string(self).map_err(|e| Error::Config { location: String::new(), reason: e.to_string() })?;
+        let body = toml::to_string(self).map_err(|e| Error::Config { location: String::new(), source: e.into() })?;
         Ok(format!("# What this lake holds; written once, when it was made.\n{body}"))
     }
 
     pub(crate) fn from_toml(text: &str, location: &str) -> Result<Self> {
-        let damaged = |reason: String| Error::Config { location: location.to_owned(), reason };
+        let damaged = |source: ErrorCause| Error::Config { location: location.to_owned(), source };
         // A newer format may have any other fields, so its number is read first.
-        let FormatOnly { format } = toml::from_str(text).map_err(|e| damaged(e.to_string()))?;
+        let FormatOnly { format } = toml::from_str(text).map_err(|e| damaged(e.into()))?;
         if format > LAKE_FORMAT {
             return Err(Error::Newer { location: location.to_owned(), actual: format, newest: LAKE_FORMAT });
         }
-        let config: Self = toml::from_str(text).map_err(|e| damaged(e.to_string()))?;
-        config.rig.check().map_err(|e| damaged(e.to_string()))?;
+        let config: Self = toml::from_str(text).map_err(|e| damaged(e.into()))?;
+        config.rig.check().map_err(|e| damaged(e.into()))?;
         Ok(config)
     }
 }

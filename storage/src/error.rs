@@ -1,5 +1,7 @@
 //! Errors of a lake.
 
+use echolake_schema::ErrorCause;
+
 /// The commands of this build that make a missing lake, as words of a hint.
 #[cfg(feature = "tables")]
 const LAKE_MAKERS: &str = "`echolake demo`, `echolake acquire` and `echolake import` make one";
@@ -11,13 +13,13 @@ const LAKE_MAKERS: &str = "`echolake acquire` makes one";
 pub enum Error {
     /// The location is no path and no URL that this build reaches.
     #[error(
-        "`{location}` is not a lake's location: {reason}; hint: give a folder, or file:///... (object stores are not in this build)"
+        "`{location}` is not a lake's location: {source}; hint: give a folder, or file:///... (object stores are not in this build)"
     )]
     Location {
         /// The given location.
         location: String,
-        /// Description of the fault.
-        reason: String,
+        /// The fault.
+        source: ErrorCause,
     },
     /// There is no lake there.
     #[error("no lake at `{location}`: it has no lake.toml; hint: {LAKE_MAKERS}")]
@@ -32,12 +34,12 @@ pub enum Error {
         location: String,
     },
     /// `lake.toml` cannot be read.
-    #[error("`{location}/lake.toml` is damaged: {reason}")]
+    #[error("`{location}/lake.toml` is damaged: {source}")]
     Config {
         /// The lake's location.
         location: String,
-        /// Description of the damage.
-        reason: String,
+        /// The damage.
+        source: ErrorCause,
     },
     /// A later version wrote the lake.
     #[error(
@@ -66,24 +68,24 @@ pub enum Error {
         differences: String,
     },
     /// The store refused.
-    #[error("cannot {action} `{path}`: {}{}", reason(cause), hint(cause))]
+    #[error("cannot {action} `{path}`: {source}{}", source.hint())]
     Store {
         /// The attempted operation.
         action: &'static str,
         /// Path of the object.
         path: String,
-        /// The store's error; no `source`, because the text above already prints it.
-        cause: StoreError,
+        /// The store's error.
+        source: StoreError,
     },
     /// The commit log of a table is damaged or unreadable.
-    #[error("the log of table `{table}` cannot be {action}: {reason}")]
+    #[error("the log of table `{table}` cannot be {action}: {source}")]
     Log {
         /// The table.
         table: &'static str,
         /// The attempted operation.
         action: &'static str,
-        /// Description of the fault.
-        reason: String,
+        /// The fault.
+        source: ErrorCause,
     },
     /// Rows could not be encoded.
     #[error("rows of table `{table}` cannot be encoded: {reason}")]
@@ -94,12 +96,12 @@ pub enum Error {
         reason: String,
     },
     /// A file of a table cannot be read.
-    #[error("`{file}` is damaged: {reason}; hint: delete the table's folder, `echolake ingest` makes it anew")]
+    #[error("`{file}` is damaged: {source}; hint: delete the table's folder, `echolake ingest` makes it anew")]
     DataFile {
         /// The file.
         file: String,
-        /// Description of the damage.
-        reason: String,
+        /// The damage.
+        source: ErrorCause,
     },
     /// Another process holds the maintenance lease.
     #[error(
@@ -148,40 +150,43 @@ pub enum Error {
     Schema(#[from] echolake_schema::Error),
 }
 
-/// An object store's error, kept apart so that its text is printed once.
-#[derive(Debug)]
-pub struct StoreError(pub object_store::Error);
+/// An object store's error. Its text is that of the innermost cause, which is what a user can act on: object_store wraps
+/// the system's error several times.
+#[derive(Debug, thiserror::Error)]
+#[error("{}", root_cause(.0))]
+pub struct StoreError(#[source] pub object_store::Error);
 
 impl Error {
     pub(crate) fn store(action: &'static str, path: impl ToString, source: object_store::Error) -> Self {
-        Self::Store { action, path: path.to_string(), cause: StoreError(source) }
+        Self::Store { action, path: path.to_string(), source: StoreError(source) }
     }
 }
 
-// object_store wraps the system's error several times; the innermost one is what a user can act on.
-fn reason(error: &StoreError) -> String {
-    let mut source: &dyn std::error::Error = &error.0;
-    while let Some(inner) = source.source() {
-        source = inner;
-    }
-    source.to_string()
-}
-
-fn hint(error: &StoreError) -> &'static str {
-    let mut source: Option<&dyn std::error::Error> = Some(&error.0);
-    while let Some(error) = source {
-        if let Some(io) = error.downcast_ref::<std::io::Error>() {
-            return match io.kind() {
-                std::io::ErrorKind::StorageFull | std::io::ErrorKind::QuotaExceeded => {
-                    "; hint: the disk is full; make space and run the command again, nothing is half-written"
-                }
-                std::io::ErrorKind::PermissionDenied | std::io::ErrorKind::ReadOnlyFilesystem => {
-                    "; hint: the lake must be writable for this command"
-                }
-                _ => "",
-            };
+impl StoreError {
+    fn hint(&self) -> &'static str {
+        let mut source: Option<&dyn std::error::Error> = Some(&self.0);
+        while let Some(error) = source {
+            if let Some(io) = error.downcast_ref::<std::io::Error>() {
+                return match io.kind() {
+                    std::io::ErrorKind::StorageFull | std::io::ErrorKind::QuotaExceeded => {
+                        "; hint: the disk is full; make space and run the command again, nothing is half-written"
+                    }
+                    std::io::ErrorKind::PermissionDenied | std::io::ErrorKind::ReadOnlyFilesystem => {
+                        "; hint: the lake must be writable for this command"
+                    }
+                    _ => "",
+                };
+            }
+            source = error.source();
         }
-        source = error.source();
+        ""
     }
-    ""
+}
+
+fn root_cause(error: &object_store::Error) -> &dyn std::error::Error {
+    let mut cause: &dyn std::error::Error = error;
+    while let Some(inner) = cause.source() {
+        cause = inner;
+    }
+    cause
 }

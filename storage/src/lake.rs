@@ -187,8 +187,8 @@ async fn read_config(location: &LakeLocation) -> Result<Option<LakeConfig>> {
         Err(object_store::Error::NotFound { .. }) => return Ok(None),
         Err(e) => return Err(failed(e)),
     };
-    let text = std::str::from_utf8(&bytes)
-        .map_err(|e| Error::Config { location: location.text.clone(), reason: e.to_string() })?;
+    let text =
+        std::str::from_utf8(&bytes).map_err(|e| Error::Config { location: location.text.clone(), source: e.into() })?;
     LakeConfig::from_toml(text, &location.text).map(Some)
 }
 

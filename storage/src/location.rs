@@ -3,6 +3,7 @@
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
+use echolake_schema::ErrorCause;
 use object_store::ObjectStore;
 use object_store::memory::InMemory;
 use object_store::path::Path as ObjectPath;
@@ -25,18 +26,18 @@ pub(crate) struct LakeLocation {
 
 impl LakeLocation {
     pub(crate) fn parse(text: &str) -> Result<Self> {
-        let wrong = |reason: &str| Error::Location { location: text.to_owned(), reason: reason.to_owned() };
+        let wrong = |source: ErrorCause| Error::Location { location: text.to_owned(), source };
         if text.trim().is_empty() {
-            return Err(wrong("it is empty"));
+            return Err(wrong("it is empty".into()));
         }
         if !text.contains("://") {
             return Self::folder(text, Path::new(text));
         }
-        let url = Url::parse(text).map_err(|e| wrong(&e.to_string()))?;
+        let url = Url::parse(text).map_err(|e| wrong(e.into()))?;
         match url.scheme() {
-            "file" => Self::folder(text, &url.to_file_path().map_err(|()| wrong("it names no local folder"))?),
+            "file" => Self::folder(text, &url.to_file_path().map_err(|()| wrong("it names no local folder".into()))?),
             "memory" => Ok(Self::store(text, Arc::new(InMemory::new()))),
-            scheme => Err(wrong(&format!("this build does not reach `{scheme}://`"))),
+            scheme => Err(wrong(format!("this build does not reach `{scheme}://`").into())),
         }
     }
 
@@ -46,12 +47,12 @@ impl LakeLocation {
     }
 
     fn folder(text: &str, path: &Path) -> Result<Self> {
-        let wrong = |reason: String| Error::Location { location: text.to_owned(), reason };
-        let absolute = std::path::absolute(path).map_err(|e| wrong(e.to_string()))?;
+        let wrong = |source: ErrorCause| Error::Location { location: text.to_owned(), source };
+        let absolute = std::path::absolute(path).map_err(|e| wrong(e.into()))?;
         if absolute.exists() && !absolute.is_dir() {
-            return Err(wrong("it is a file".to_owned()));
+            return Err(wrong("it is a file".into()));
         }
-        let prefix = ObjectPath::from_absolute_path(&absolute).map_err(|e| wrong(e.to_string()))?;
+        let prefix = ObjectPath::from_absolute_path(&absolute).map_err(|e| wrong(e.into()))?;
         let store = Arc::new(PrefixStore::new(DurableFileSystem::new(), prefix));
         Ok(Self { text: text.to_owned(), folder: Some(absolute), store })
     }

@@ -159,7 +159,7 @@ fn temperatures(file: &Path, rows: usize) -> Result<Vec<Celsius>, Error> {
 
 // Every .npz that is no height map.
 fn surfaces(folder: &Path) -> Result<Vec<PathBuf>, Error> {
-    let unreadable = |e: std::io::Error| Error::Read { path: folder.to_owned(), reason: e.to_string() };
+    let unreadable = |e: std::io::Error| Error::Read { path: folder.to_owned(), source: e.into() };
     let mut files = Vec::new();
     for entry in std::fs::read_dir(folder).map_err(unreadable)? {
         let path = entry.map_err(unreadable)?.path();
@@ -241,7 +241,7 @@ fn panel_info(path: &Path) -> Result<HashMap<SurfaceId, SurfaceRecord>, Error> {
 
 // The named columns of a CSV file, with the number of each line.
 fn table(path: &Path, names: &[&str]) -> Result<Vec<(u64, Vec<String>)>, Error> {
-    let unreadable = |e: csv::Error| Error::Read { path: path.to_owned(), reason: e.to_string() };
+    let unreadable = |e: csv::Error| Error::Read { path: path.to_owned(), source: e.into() };
     let mut reader = csv::Reader::from_path(path).map_err(unreadable)?;
     let header = reader.headers().map_err(unreadable)?.clone();
     let place = |name: &&str| {

@@ -12,7 +12,7 @@ mod wav_manifest;
 use std::path::{Path, PathBuf};
 
 use echolake_schema::manifest::{Origin, RunManifest};
-use echolake_schema::{Rig, RunId, SurfaceId, Timestamp};
+use echolake_schema::{ErrorCause, Rig, RunId, SurfaceId, Timestamp};
 
 use crate::run::recorder::random_tag;
 
@@ -51,12 +51,12 @@ pub struct ImportOptions<'a> {
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
     /// The system refused.
-    #[error("cannot read `{}`: {reason}", path.display())]
+    #[error("cannot read `{}`: {source}", path.display())]
     Read {
         /// The file.
         path: PathBuf,
         /// The reason.
-        reason: String,
+        source: ErrorCause,
     },
     /// The manifest has a wrong header.
     #[error("manifest `{}`: {what}; hint: the columns are {}", path.display(), echolake_schema::interchange::WAV_MANIFEST.join(", "))]
@@ -99,6 +99,7 @@ pub enum Error {
         /// The rig.
         rig: String,
         /// The cause.
+        #[source]
         cause: echolake_dsp::Error,
     },
     /// A name or rig is not valid.

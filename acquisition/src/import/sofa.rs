@@ -11,7 +11,7 @@ use std::path::{Path, PathBuf};
 
 use echolake_dsp::temperature::{TemperatureCorrection, resampling_ratio};
 use echolake_schema::manifest::{Origin, RunEnd};
-use echolake_schema::{Celsius, Grid, Pair, PairId, Rig, SurfaceId, SurfaceRecord, Timestamp};
+use echolake_schema::{Celsius, ErrorCause, Grid, Pair, PairId, Rig, SurfaceId, SurfaceRecord, Timestamp};
 
 use super::batch::ImportBatch;
 use super::response::ImportedResponse;
@@ -109,9 +109,9 @@ struct SofaMeasurement {
 
 impl Sofa {
     fn read(path: &Path, rig: &Rig, grid: &Grid, celsius: Option<Celsius>) -> Result<Self, Error> {
-        let unread = |reason| Error::Read { path: path.to_owned(), reason };
-        std::fs::File::open(path).map_err(|e| unread(e.to_string()))?;
-        let file = SofaFile::open(path).map_err(|reason| unread(format!("it is no HDF5 file: {reason}")))?;
+        let unread = |source: ErrorCause| Error::Read { path: path.to_owned(), source };
+        std::fs::File::open(path).map_err(|e| unread(e.into()))?;
+        let file = SofaFile::open(path).map_err(|reason| unread(format!("it is no HDF5 file: {reason}").into()))?;
         let reader = SofaReader { path, file };
         let is_ours = reader.file.text("APIName") == OURS;
         reader.expect_text("SOFAConventions", "SingleRoomSRIR")?;

@@ -34,7 +34,7 @@ pub(super) type WavManifest = BTreeMap<SurfaceId, Vec<ManifestRow>>;
 
 /// Opens a manifest and checks its header; returns the place of each column.
 fn open(path: &Path) -> Result<(csv::Reader<std::fs::File>, Vec<Option<usize>>), Error> {
-    let unreadable = |e: csv::Error| Error::Read { path: path.to_owned(), reason: e.to_string() };
+    let unreadable = |e: csv::Error| Error::Read { path: path.to_owned(), source: e.into() };
     let mut reader = csv::ReaderBuilder::new().trim(csv::Trim::All).from_path(path).map_err(unreadable)?;
     let header = reader.headers().map_err(unreadable)?.clone();
     let wrong = |what| Error::Header { path: path.to_owned(), what };
@@ -85,7 +85,7 @@ fn next(path: &Path, reader: &mut csv::Reader<std::fs::File>) -> Result<Option<S
     match reader.read_record(&mut record) {
         Ok(true) => Ok(Some(record)),
         Ok(false) => Ok(None),
-        Err(e) => Err(Error::Read { path: path.to_owned(), reason: e.to_string() }),
+        Err(e) => Err(Error::Read { path: path.to_owned(), source: e.into() }),
     }
 }
 

@@ -4,6 +4,7 @@ use std::io;
 use std::path::PathBuf;
 
 use echolake_recording::PrefixError;
+use echolake_schema::ErrorCause;
 
 /// Why a recording cannot be recovered or gone on with. The recording itself is as it was.
 #[derive(Debug, thiserror::Error)]
@@ -23,20 +24,20 @@ pub enum Error {
         path: PathBuf,
     },
     /// It holds nothing that could be kept.
-    #[error("`{}` holds no run: {reason}; hint: nothing was measured into it, measure anew", path.display())]
+    #[error("`{}` holds no run: {source}; hint: nothing was measured into it, measure anew", path.display())]
     Headless {
         /// The file.
         path: PathBuf,
-        /// What is missing, or where it is damaged.
-        reason: String,
+        /// What is missing, or the damage.
+        source: ErrorCause,
     },
     /// It does not say how to go on.
-    #[error("`{}` cannot be gone on with: {reason}; hint: `echolake recover` makes a run of what it holds", path.display())]
+    #[error("`{}` cannot be gone on with: {source}; hint: `echolake recover` makes a run of what it holds", path.display())]
     NoPlan {
         /// The file.
         path: PathBuf,
-        /// Why.
-        reason: String,
+        /// The missing or damaged plan.
+        source: ErrorCause,
     },
     /// The name is taken.
     #[error("`{}` is there already; hint: give another with -o", path.display())]
@@ -45,20 +46,20 @@ pub enum Error {
         path: PathBuf,
     },
     /// The system refused to write.
-    #[error("cannot write `{}`: {reason}; hint: is the disk full or read-only?", path.display())]
+    #[error("cannot write `{}`: {source}; hint: is the disk full or read-only?", path.display())]
     Write {
         /// The file.
         path: PathBuf,
-        /// The system's or the writer's words.
-        reason: String,
+        /// The system's or the writer's error.
+        source: ErrorCause,
     },
     /// What was written is not what was read; it was removed again.
-    #[error("what was written to `{}` is not what was read: {reason}; hint: is the disk sound?", path.display())]
+    #[error("what was written to `{}` is not what was read: {source}; hint: is the disk sound?", path.display())]
     Unproven {
         /// The file that was removed.
         path: PathBuf,
-        /// What differs.
-        reason: String,
+        /// The difference.
+        source: ErrorCause,
     },
 }
 
@@ -67,7 +68,7 @@ impl From<PrefixError> for Error {
         match error {
             PrefixError::Read { path, source } => Self::Read { path, source },
             PrefixError::Headless { path, bytes } => {
-                Self::Headless { path, reason: format!("it is no MCAP file, or only {bytes} bytes of one") }
+                Self::Headless { path, source: format!("it is no MCAP file, or only {bytes} bytes of one").into() }
             }
         }
     }

@@ -9,7 +9,9 @@ use std::collections::BTreeMap;
 use std::fs::{File, OpenOptions, TryLockError};
 use std::path::{Path, PathBuf};
 
-use echolake_recording::{ChunkWriter, McapError, Metadata, PrefixItem, PrefixReader, Record, prove_file};
+use echolake_recording::{
+    ChunkWriter, McapError, Metadata, PrefixItem, PrefixReader, Record, prove_file, system_cause,
+};
 use echolake_schema::topics;
 use serde::Serialize;
 
@@ -108,8 +110,8 @@ fn survey(from: &Path) -> Result<Report, Error> {
     // The first chunk has the topics, behind all that a run is described by.
     if !has_manifest || topics_by_id.is_empty() {
         let found = walk.defect.clone().unwrap_or_else(|| "it ends".to_owned());
-        let reason = format!("{found}, before its first chunk is whole");
-        return Err(Error::Headless { path: from.to_owned(), reason });
+        let source = format!("{found}, before its first chunk is whole").into();
+        return Err(Error::Headless { path: from.to_owned(), source });
     }
     // What follows the data can be made anew from them.
     let verified_bytes = if walk.ended { walk.size } else { walk.verified };
@@ -123,7 +125,7 @@ pub(crate) fn messages(path: &Path) -> Result<Counts, Error> {
 }
 
 fn rebuild(from: &Path, to: &Path, report: &Report) -> Result<(), Error> {
-    let failed = |e: McapError| Error::Write { path: to.to_owned(), reason: e.to_string() };
+    let failed = |e: McapError| Error::Write { path: to.to_owned(), source: system_cause(e) };
     let file = OpenOptions::new().write(true).create(true).truncate(true).open(to);
     let file = file.map_err(|e| failed(e.into()))?;
     let mut writer = ChunkWriter::new(file).map_err(failed)?;
@@ -149,7 +151,7 @@ fn rebuild(from: &Path, to: &Path, report: &Report) -> Result<(), Error> {
 // What was written is read back from its first byte: by another reader for every CRC and the summary, and by ours for
 // what it holds.
 fn compare(written: &Path, expected: &Report) -> Result<(), Error> {
-    let unproven = |reason: String| Error::Unproven { path: written.to_owned(), reason };
+    let unproven = |text: String| Error::Unproven { path: written.to_owned(), source: text.into() };
     prove_file(written).map_err(unproven)?;
     let found = survey(written)?;
     if found.messages != expected.messages || found.has_end != expected.has_end {
@@ -159,11 +161,11 @@ fn compare(written: &Path, expected: &Report) -> Result<(), Error> {
 }
 
 fn publish(staged: &Path, to: &Path) -> Result<(), Error> {
-    let failed = |reason: String| Error::Write { path: to.to_owned(), reason };
+    let failed = |e: std::io::Error| Error::Write { path: to.to_owned(), source: e.into() };
     if to.exists() {
         return Err(Error::Exists { path: to.to_owned() });
     }
-    std::fs::rename(staged, to).map_err(|e| failed(e.to_string()))?;
+    std::fs::rename(staged, to).map_err(failed)?;
     sync(folder_of(to)).map_err(failed)
 }
 

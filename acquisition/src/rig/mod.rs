@@ -9,8 +9,10 @@ pub mod devices;
 pub mod drivers;
 pub mod robots;
 
-use echolake_schema::Timestamp;
+use std::sync::Arc;
+
 use echolake_schema::manifest::Origin;
+use echolake_schema::{ErrorCause, Timestamp};
 
 use crate::rig::robots::Joints;
 
@@ -137,6 +139,50 @@ impl RigDevices {
     }
 }
 
+/// A fault of a device in words, and the error behind it if there is one. Two faults are equal if their words are.
+#[derive(Debug, Clone)]
+pub struct DeviceFault {
+    text: String,
+    cause: Option<Arc<dyn std::error::Error + Send + Sync>>,
+}
+
+impl DeviceFault {
+    /// Creates a fault whose words name its cause.
+    pub fn with_cause(text: String, cause: impl Into<ErrorCause>) -> Self {
+        Self { text, cause: Some(Arc::from(cause.into())) }
+    }
+}
+
+impl From<String> for DeviceFault {
+    fn from(text: String) -> Self {
+        Self { text, cause: None }
+    }
+}
+
+impl From<&str> for DeviceFault {
+    fn from(text: &str) -> Self {
+        Self::from(text.to_owned())
+    }
+}
+
+impl PartialEq for DeviceFault {
+    fn eq(&self, other: &Self) -> bool {
+        self.text == other.text
+    }
+}
+
+impl std::fmt::Display for DeviceFault {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str(&self.text)
+    }
+}
+
+impl std::error::Error for DeviceFault {
+    fn source(&self) -> Option<&(dyn std::error::Error + 'static)> {
+        self.cause.as_deref().map(|cause| cause as _)
+    }
+}
+
 /// A failure of a device.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum Error {
@@ -156,6 +202,7 @@ pub enum Error {
         /// Name of the device.
         device: &'static str,
         /// The device's error.
-        reason: String,
+        #[source]
+        reason: DeviceFault,
     },
 }

@@ -17,6 +17,7 @@ use std::sync::Arc;
 
 use echolake_schema::manifest::{Origin, RunManifest};
 use echolake_schema::{Rig, RunId, SurfaceId, Timestamp};
+use tracing::Span;
 
 use crate::disk::folder_of;
 use crate::panel::mesh;
@@ -114,6 +115,7 @@ impl RunRequest<'_> {
             rig: self.rig.name.clone(),
             origin: devices.origin,
         };
+        let _span = run_span(&manifest).entered();
         let mut surface = panel.record.clone();
         surface.flat_reference = self.flat.clone();
         surface.foam_reference = self.foam.clone();
@@ -150,8 +152,9 @@ impl RunRequest<'_> {
 /// [`Error::Resume`] if it cannot be resumed; the file is as it was.
 pub fn resume(partial: &Path, session: RunSession<'_>) -> Result<MeasuredRun, Error> {
     let held = Held::read(partial)?;
-    let reason = |reason: String| recovery::Error::NoPlan { path: partial.to_owned(), reason };
-    let plan = RunPlan::from_metadata(&held.plan).map_err(reason)?;
+    let _span = run_span(&held.manifest).entered();
+    let no_plan = |text: String| recovery::Error::NoPlan { path: partial.to_owned(), source: text.into() };
+    let plan = RunPlan::from_metadata(&held.plan).map_err(no_plan)?;
     let panel = PreparedPanel::new(&plan.specimen, &held.rig)?;
     let now = Timestamp::now();
     let start = match held.manifest.origin {
@@ -173,6 +176,11 @@ pub fn resume(partial: &Path, session: RunSession<'_>) -> Result<MeasuredRun, Er
     check_fitness(&job, &mut controller, session.preflight)?;
     let (recorder, _) = Recorder::resume(partial)?;
     Ok(job.measure(&mut controller, recorder, session)?)
+}
+
+// All that is logged of a run, at the level of errors: no filter that lets a line through takes its span away.
+fn run_span(manifest: &RunManifest) -> Span {
+    tracing::error_span!("run", run = %manifest.run_id, surface = %manifest.surface_id)
 }
 
 fn check_fitness(job: &RunJob<'_>, controller: &mut RunController<'_>, preflight: PreflightMode) -> Result<(), Error> {

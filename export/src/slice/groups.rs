@@ -114,9 +114,10 @@ impl Groups {
         if missing == 0 {
             return Ok(());
         }
-        let reason = format!("{missing} of {} measurements are not where the tables say", self.wanted.keys.len());
+        let source =
+            format!("{missing} of {} measurements are not where the tables say", self.wanted.keys.len()).into();
         let file = self.source.file.path.to_string();
-        Err(Error::Changed { run: self.source.file.run.clone(), file, reason })
+        Err(Error::Changed { run: self.source.file.run.clone(), file, source })
     }
 }
 

@@ -12,7 +12,7 @@ use echolake_recording::{
     chunk_body, describe, summary_range, tail_range,
 };
 use echolake_schema::tables::Table;
-use echolake_schema::{RunId, SurfaceId, topics};
+use echolake_schema::{ErrorCause, RunId, SurfaceId, topics};
 use object_store::path::Path;
 use object_store::{ObjectStore, ObjectStoreExt as _};
 use sha2::{Digest as _, Sha256};
@@ -70,8 +70,8 @@ impl RunFile {
         Ok(Self { run: run.clone(), surface, path: Path::from(path), bytes, sha256, started_ns })
     }
 
-    fn changed(&self, reason: impl ToString) -> Error {
-        Error::Changed { run: self.run.clone(), file: self.path.to_string(), reason: reason.to_string() }
+    fn changed(&self, source: impl Into<ErrorCause>) -> Error {
+        Error::Changed { run: self.run.clone(), file: self.path.to_string(), source: source.into() }
     }
 }
 
@@ -151,7 +151,7 @@ impl Source {
         Error::damaged(&self.file.path, describe(error))
     }
 
-    fn damaged_record(&self, error: &RecordError) -> Error {
+    fn damaged_record(&self, error: RecordError) -> Error {
         Error::damaged(&self.file.path, error)
     }
 
@@ -160,7 +160,7 @@ impl Source {
         let Some(range) = self.attachments.get(number) else { return Ok(None) };
         let record = self.read(range.clone()).await?;
         let mut record = RecordCursor::new(record);
-        match record.next_record().map_err(|e| self.damaged_record(&e))? {
+        match record.next_record().map_err(|e| self.damaged_record(e))? {
             Some(Record::Attachment { header, data, .. }) => Ok(Some(Attachment {
                 log_time: header.log_time,
                 create_time: header.create_time,
@@ -181,7 +181,7 @@ impl Source {
         let decoded = DecodedChunk::decode(&body).map_err(|e| chunk_damaged(format!("a chunk is damaged: {e}")))?;
         let mut records = decoded.into_cursor();
         let mut messages = Vec::new();
-        while let Some(record) = records.next_record().map_err(|e| self.damaged_record(&e))? {
+        while let Some(record) = records.next_record().map_err(|e| self.damaged_record(e))? {
             let Record::Message { header, data } = record else { continue };
             let channel = self.channels.get(&header.channel_id).cloned();
             let channel =

@@ -71,7 +71,7 @@ impl Default for Lane {
 impl SliceWriter {
     pub(super) fn new(layout: Layout) -> Result<Self> {
         let out = Shared::default();
-        let writer = stream_writer(out.clone()).map_err(|e| failed(&e))?;
+        let writer = stream_writer(out.clone()).map_err(failed)?;
         let lanes = vec![Lane::default()];
         Ok(Self { writer, out, layout, lanes, lane_of: HashMap::new(), sequence: 0, messages: 0, has_more: false })
     }
@@ -83,26 +83,24 @@ impl SliceWriter {
 
     pub(super) fn metadata(&mut self, metadata: Metadata) -> Result<()> {
         self.flush_all()?;
-        self.writer.write_metadata(&metadata).map_err(|e| failed(&e))
+        self.writer.write_metadata(&metadata).map_err(failed)
     }
 
     pub(super) fn attach(&mut self, attachment: &Attachment<'_>) -> Result<()> {
         self.flush_all()?;
         self.has_more = true;
-        self.writer.attach(attachment).map_err(|e| failed(&e))
+        self.writer.attach(attachment).map_err(failed)
     }
 
     /// Writes a message; they come by time.
     pub(super) fn write(&mut self, message: Message) -> Result<()> {
         let channel = &message.channel;
         let schema = match &channel.schema {
-            Some(schema) => {
-                self.writer.add_schema(&schema.name, &schema.encoding, &schema.data).map_err(|e| failed(&e))?
-            }
+            Some(schema) => self.writer.add_schema(&schema.name, &schema.encoding, &schema.data).map_err(failed)?,
             None => 0,
         };
         let added = self.writer.add_channel(schema, &channel.topic, &channel.message_encoding, &channel.metadata);
-        let channel_id = added.map_err(|e| failed(&e))?;
+        let channel_id = added.map_err(failed)?;
         self.sequence = self.sequence.wrapping_add(1);
         self.messages += 1;
         let lane = self.lane(&message);
@@ -145,9 +143,9 @@ impl SliceWriter {
         of.enough = (of.enough * 2).min(CHUNK_BYTES);
         self.has_more = true;
         for (header, data) in of.messages.drain(..) {
-            self.writer.write_to_known_channel(&header, &data).map_err(|e| failed(&e))?;
+            self.writer.write_to_known_channel(&header, &data).map_err(failed)?;
         }
-        self.writer.flush().map_err(|e| failed(&e))
+        self.writer.flush().map_err(failed)
     }
 
     fn flush_all(&mut self) -> Result<()> {
@@ -160,12 +158,12 @@ impl SliceWriter {
     /// Ends the file; returns the rest of it.
     pub(super) fn finish(mut self) -> Result<Bytes> {
         self.flush_all()?;
-        self.writer.finish().map_err(|e| failed(&e))?;
+        self.writer.finish().map_err(failed)?;
         Ok(std::mem::take(&mut *self.out.lock()).into())
     }
 }
 
 // It writes to memory, so what fails is what it is given.
-fn failed(error: &McapError) -> Error {
+fn failed(error: McapError) -> Error {
     Error::damaged("the slice", error)
 }

@@ -100,13 +100,13 @@ impl EnginePool {
         tokio::time::sleep(state.backoff()).await;
         self.make_room(&own).await?;
         let engine = self.take_spare().map_err(|failed| {
-            eprintln!("no engine can be started: {failed}");
+            tracing::error!(error = &failed as &dyn std::error::Error, "no engine can be started");
             RequestFault::Internal
         })?;
         if let Err(EndReason::Failed(reason)) = engine.assign(client).await {
             state.ends += 1;
             state.last_end = Some(Instant::now());
-            eprintln!("an engine did not start: {reason}");
+            tracing::error!(reason, "an engine did not start");
             return Err(RequestFault::EngineEnded { reason });
         }
         let lease =
@@ -123,7 +123,7 @@ impl EnginePool {
         let ended = lock(&own.current).take();
         let Some(ended) = ended else { return };
         if let Some(EndReason::Failed(reason)) = ended.why_ended().await {
-            eprintln!("an engine ended: {reason}");
+            tracing::warn!(reason, "an engine ended");
             self.0.failed.fetch_add(1, Ordering::Relaxed);
             if state.last_end.is_some_and(|at| at.elapsed() > FORGIVEN) {
                 state.ends = 0;
@@ -192,7 +192,7 @@ impl EnginePool {
                 match self.start() {
                     Ok(engine) => *lock(&self.0.spare) = Some(engine),
                     Err(failed) => {
-                        eprintln!("no spare engine can be started: {failed}");
+                        tracing::error!(error = &failed as &dyn std::error::Error, "no spare engine can be started");
                         tokio::time::sleep(LONGEST_BACKOFF).await;
                     }
                 }

@@ -79,6 +79,7 @@ impl EngineProcess {
             .args(start.lake_folder.iter().flat_map(|folder| [OsStr::new("--confine-to"), folder.as_os_str()]))
             .arg("--memory-bytes")
             .arg(counted_bytes(start.settings.memory).to_string())
+            .envs(start.settings.environment.iter().map(|(name, value)| (name, value)))
             .env("TMPDIR", &start.spills)
             // Memory that is reserved and not used would count against the limit.
             .env("MIMALLOC_ARENA_EAGER_COMMIT", "0")
@@ -286,7 +287,7 @@ impl EngineReports {
                 self.metrics.add(&self.counters, &counters);
                 self.counters = counters;
             }
-            Err(_) => eprintln!("an engine wrote `{line}`"),
+            Err(_) => tracing::warn!(line, "an engine wrote what is no report"),
         }
     }
 

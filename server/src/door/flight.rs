@@ -13,6 +13,7 @@ use hyper_util::rt::{TokioExecutor, TokioIo, TokioTimer};
 use tokio::net::TcpListener;
 use tokio::sync::watch;
 use tokio::task::JoinSet;
+use tracing::Instrument as _;
 
 use super::ServerDoor;
 use super::connection_places::{ConnectionPlaces, PlaceWork, PlacedStream};
@@ -20,6 +21,8 @@ use super::forward::EngineProtocol;
 use crate::client_identity::ClientIdentity;
 use crate::fault::RequestFault;
 use crate::flight::{WINDOW_BYTES, status};
+use crate::metrics::ServerProtocol;
+use crate::request_span::begin_request;
 use crate::tokens::of_header;
 
 /// Connections at once. With those of the other protocols they are within the 1024 files that systems often allow.
@@ -49,16 +52,18 @@ pub(super) async fn serve(door: ServerDoor, listener: TcpListener, stopping: wat
 async fn answer(stream: PlacedStream, door: ServerDoor, mut stopping: watch::Receiver<bool>) {
     let evicted = stream.evicted();
     let work = stream.work();
-    let service = service_fn(move |request: Request<Incoming>| {
+    let service = service_fn(move |mut request: Request<Incoming>| {
         work.hear_request();
         let (door, work) = (door.clone(), work.clone());
-        async move {
+        let span = begin_request(request.headers_mut(), ServerProtocol::FlightSql);
+        let answer = async move {
             let response = door.answer_flight(request, &work).await.unwrap_or_else(|fault| {
-                door.metrics().failed(fault.code());
+                door.metrics().record_failure(&fault);
                 status(&fault).into_http()
             });
             Ok::<_, Infallible>(response)
-        }
+        };
+        answer.instrument(span)
     });
     let connection = http2::Builder::new(TokioExecutor::new())
         .timer(TokioTimer::new())

@@ -16,6 +16,7 @@ use hyper::client::conn::{http1, http2};
 use hyper_util::rt::{TokioExecutor, TokioIo};
 use tokio::task::JoinSet;
 use tokio::time::Instant;
+use tracing::Span;
 
 use super::connection_places::{PlaceWork, WorkingPlace};
 use super::engine_pool::EnginePool;
@@ -75,6 +76,7 @@ impl EnginePool {
         wire: EngineProtocol,
         work: &PlaceWork,
     ) -> Result<Response<EngineBody>, RequestFault> {
+        Span::current().record("client", &client.name);
         let (mut parts, body) = request.into_parts();
         for name in OF_CONNECTION {
             parts.headers.remove(name);
@@ -158,7 +160,7 @@ async fn why(lease: &EngineLease, failed: &str) -> RequestFault {
         Some(EndReason::Failed(reason)) => RequestFault::EngineEnded { reason },
         Some(EndReason::Retired) => RequestFault::EngineEnded { reason: "the server needed its place".to_owned() },
         None => {
-            eprintln!("an engine does not answer: {failed}");
+            tracing::error!(error = failed, "an engine does not answer");
             RequestFault::Internal
         }
     }
@@ -252,7 +254,15 @@ impl EngineAnswer {
         let Self { response, connection, wire } = self;
         response.map(|incoming| {
             let is_ended = false;
-            EngineBody { incoming, wire, lease, _connection: connection, _working: working, is_ended }
+            EngineBody {
+                incoming,
+                wire,
+                lease,
+                _connection: connection,
+                _working: working,
+                span: Span::current(),
+                is_ended,
+            }
         })
     }
 }
@@ -274,7 +284,7 @@ impl EngineProcess {
         let (sender, driver) = handshake.await.map_err(|e| e.to_string())?;
         tokio::spawn(async move {
             if let Err(failed) = driver.await {
-                eprintln!("a connection to an engine ended: {failed:?}");
+                tracing::warn!(error = ?failed, "a connection to an engine ended");
             }
         });
         Ok(shared.insert(sender).clone())
@@ -288,6 +298,7 @@ pub(super) struct EngineBody {
     lease: EngineLease,
     _connection: JoinSet<()>,
     _working: WorkingPlace,
+    span: Span,
     is_ended: bool,
 }
 
@@ -295,13 +306,14 @@ impl EngineBody {
     // gRPC reports a failure in trailers behind the answer, so that the client sees it; HTTP/1.1 breaks the connection
     // off.
     fn failure(&self) -> Option<Frame<Bytes>> {
-        if self.wire == EngineProtocol::Http {
-            return None;
-        }
         let reason = match self.lease.engine().end_reason() {
             Some(EndReason::Failed(reason)) => reason.clone(),
             _ => "it stopped answering".to_owned(),
         };
+        self.span.in_scope(|| tracing::info!(reason, "an answer broke off"));
+        if self.wire == EngineProtocol::Http {
+            return None;
+        }
         let mut trailers = HeaderMap::new();
         crate::flight::status(&RequestFault::EngineEnded { reason }).add_header(&mut trailers).ok()?;
         Some(Frame::trailers(trailers))

@@ -15,6 +15,7 @@ use hyper_util::service::TowerToHyperService;
 use tokio::net::TcpListener;
 use tokio::sync::watch;
 use tokio::task::JoinSet;
+use tracing::Instrument as _;
 
 use super::ServerDoor;
 use super::connection_places::{ConnectionPlaces, PlaceWork, PlacedStream};
@@ -22,6 +23,8 @@ use super::forward::EngineProtocol;
 use crate::client_identity::ClientIdentity;
 use crate::fault::RequestFault;
 use crate::http::{ProblemResponse, RequestSite, authenticate, door_router, request_site};
+use crate::metrics::ServerProtocol;
+use crate::request_span::begin_request;
 
 /// Connections at once. Systems often allow a process 1024 open files.
 const MOST: usize = 512;
@@ -69,11 +72,15 @@ async fn answer(stream: PlacedStream, router: Router, mut stopping: watch::Recei
 
 impl ServerDoor {
     /// Forwards a request to the client's engine.
-    pub(crate) async fn forward_http(State(door): State<Self>, request: Request) -> Response {
-        door.answer_http(request).await.unwrap_or_else(|fault| {
-            door.metrics().failed(fault.code());
-            ProblemResponse(fault).into_response()
-        })
+    pub(crate) async fn forward_http(State(door): State<Self>, mut request: Request) -> Response {
+        let span = begin_request(request.headers_mut(), ServerProtocol::Http);
+        let answer = async {
+            door.answer_http(request).await.unwrap_or_else(|fault| {
+                door.metrics().record_failure(&fault);
+                ProblemResponse(fault).into_response()
+            })
+        };
+        answer.instrument(span).await
     }
 
     async fn answer_http(&self, request: Request) -> Result<Response, RequestFault> {

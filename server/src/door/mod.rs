@@ -55,6 +55,8 @@ pub struct EngineSettings {
     pub memory: usize,
     /// Engines at once, which is clients at once.
     pub count: usize,
+    /// Variables of their environment beside the server's own.
+    pub environment: Vec<(String, String)>,
     /// The folder for temporary files; None for one in the lake.
     pub temp: Option<PathBuf>,
 }

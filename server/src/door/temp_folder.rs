@@ -40,14 +40,18 @@ impl ServerFolders {
             (None, Some(lake)) => match spill_folder(&lake.join(IN_LAKE)) {
                 Ok(folder) => folder,
                 Err(refused) => {
-                    eprintln!("note: temporary files are in `{}`: the lake's folder: {refused}", system.display());
+                    tracing::warn!(
+                        error = &refused as &dyn std::error::Error,
+                        "temporary files are in `{}`, because the lake's folder takes none",
+                        system.display()
+                    );
                     spill_folder(&system).map_err(failed(&system))?
                 }
             },
             (None, None) => spill_folder(&system).map_err(failed(&system))?,
         };
         if statfs(spills.path()).is_ok_and(|system| u64::try_from(system.f_type) == Ok(TMPFS)) {
-            eprintln!("note: temporary files in `{}` are in memory; hint: --temp DIR", spills.path().display());
+            tracing::warn!("temporary files in `{}` are in memory; hint: --temp DIR", spills.path().display());
         }
         Ok(Self { sockets, spills })
     }

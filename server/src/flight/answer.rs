@@ -33,7 +33,7 @@ impl AnswerEncoder for AnnouncedColumns {
 
     fn batch(&mut self, batch: RecordBatch) -> Result<Vec<RecordBatch>, RequestFault> {
         let wrong = |e: ArrowError| {
-            eprintln!("an answer does not have the columns that were told: {e}");
+            tracing::error!(error = &e as &dyn std::error::Error, "an answer does not have the announced columns");
             RequestFault::Internal
         };
         let columns = batch.columns().iter().zip(self.0.fields()).map(|(column, field)| {

@@ -15,6 +15,7 @@ use tokio::net::{UnixListener, UnixStream};
 use tonic::transport::Server;
 
 use crate::Error;
+use crate::request_span::continue_request;
 use crate::service::QueryService;
 pub(crate) use status::status;
 
@@ -25,6 +26,7 @@ pub(crate) const WINDOW_BYTES: u32 = 1 << 20;
 pub(crate) async fn serve(service: QueryService, listener: UnixListener) -> Result<(), Error> {
     let flight = service::LakeFlightService::new(service).map_err(|e| Error::Transport(Box::new(e)))?;
     Server::builder()
+        .trace_fn(|request| continue_request(request.headers()))
         .add_service(FlightServiceServer::new(flight))
         .serve_with_incoming(stream::unfold(listener, next))
         .await

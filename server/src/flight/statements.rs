@@ -54,7 +54,7 @@ impl HeldStatements {
     pub(super) fn keep(&self, statement: HeldStatement) -> Result<Bytes, RequestFault> {
         let mut handle = StatementHandle::default();
         getrandom::fill(&mut handle).map_err(|failed| {
-            eprintln!("no random bytes: {failed}");
+            tracing::error!(error = &failed as &dyn std::error::Error, "no random bytes");
             RequestFault::Internal
         })?;
         let sql = Some(statement.sql.clone()).filter(|sql| sql.len() <= CARRIED_BYTES);

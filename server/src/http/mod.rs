@@ -19,7 +19,7 @@ mod slices;
 mod sql;
 
 use axum::Router;
-use axum::middleware::{from_fn_with_state, map_response};
+use axum::middleware::{from_fn, from_fn_with_state, map_response};
 use axum::routing::any;
 use hyper::server::conn::http1;
 use hyper_util::rt::TokioIo;
@@ -33,6 +33,7 @@ use utoipa_axum::routes;
 use crate::Error;
 use crate::door::ServerDoor;
 use crate::fault::RequestFault;
+use crate::request_span::trace_request;
 use crate::service::QueryService;
 use catalogue::LakeCatalogue;
 pub(crate) use guard::{RequestSite, authenticate, request_site};
@@ -62,7 +63,8 @@ fn engine_router(service: &QueryService) -> Router {
         .merge(Router::from(files).with_state(catalogue.clone()))
         .layer(from_fn_with_state(service.is_open(), guard::own_pages_only));
     let viewers = Router::from(files::viewer_routes()).with_state(catalogue.clone());
-    with_refusals(own.merge(viewers).merge(slices::for_viewers(&catalogue)).fallback(nothing))
+    let all = own.merge(viewers).merge(slices::for_viewers(&catalogue)).fallback(nothing);
+    with_refusals(all).layer(from_fn(trace_request))
 }
 
 /// The paths of the server: those of the door, and those that it forwards to the client's engine.

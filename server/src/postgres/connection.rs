@@ -123,7 +123,7 @@ impl PostgresConnection {
     pub(super) fn log_in(&self, client: &Arc<EngineClient>, wide: bool) -> Result<(i32, SecretKey), RequestFault> {
         let mut secret = [0; 32];
         getrandom::fill(&mut secret).map_err(|failed| {
-            eprintln!("no random bytes: {failed}");
+            tracing::error!(error = &failed as &dyn std::error::Error, "no random bytes");
             RequestFault::Internal
         })?;
         let pid = self.shared.next_pid.fetch_add(1, Ordering::Relaxed);

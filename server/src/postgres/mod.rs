@@ -28,8 +28,10 @@ use pgwire::messages::cancel::CancelRequest;
 use pgwire::tokio::process_socket_unix;
 use tokio::io::Interest;
 use tokio::net::{UnixListener, UnixStream};
+use tracing::Instrument as _;
 
 use crate::Error;
+use crate::request_span::continue_connection;
 use crate::service::QueryService;
 use connection::PostgresConnection;
 use startup::LoginHandler;
@@ -39,7 +41,8 @@ pub(crate) async fn serve(service: QueryService, listener: UnixListener) -> Resu
     let shared = Arc::new(connection::PostgresState::new(service)?);
     loop {
         let (socket, _) = listener.accept().await.map_err(Error::System)?;
-        tokio::spawn(attend(socket, Arc::new(PostgresConnection::new(shared.clone()))));
+        let connection = Arc::new(PostgresConnection::new(shared.clone()));
+        tokio::spawn(attend(socket, connection).instrument(continue_connection()));
     }
 }
 

@@ -41,7 +41,7 @@ pub(super) fn encoding(error: &PgWireError) -> RequestFault {
         PgWireError::UserError(info) => info.message.clone(),
         other => other.to_string(),
     };
-    RequestFault::Query(QueryError::Format { format: "a row of Postgres", message })
+    RequestFault::Query(QueryError::Format { format: "a row of Postgres", source: message.into() })
 }
 
 /// Encodes rows.

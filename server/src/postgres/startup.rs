@@ -17,6 +17,7 @@ use super::connection::PostgresConnection;
 use super::settings::VERSION;
 use super::sqlstate::fatal;
 use crate::fault::RequestFault;
+use crate::request_span;
 use crate::tokens::TokenScope;
 
 /// Logs in.
@@ -66,6 +67,9 @@ impl LoginHandler {
     // `options` may carry settings, as in `-c statement_timeout=5s`.
     fn begin_with(&self, given: &std::collections::HashMap<String, String>) -> Result<(), RequestFault> {
         let settings = &self.0.settings;
+        if let Some(number) = given.get(request_span::PARAMETER) {
+            request_span::record_connection(number);
+        }
         if given.get("replication").is_some_and(|v| v != "false" && v != "off" && v != "0") {
             return Err(RequestFault::unsupported("replication"));
         }

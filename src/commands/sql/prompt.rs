@@ -18,6 +18,7 @@ use rustyline::error::ReadlineError;
 use rustyline::history::DefaultHistory;
 use rustyline::{CompletionType, Editor};
 
+use crate::error_text::describe_error;
 use crate::signals::interrupt_signal;
 use command::{HELP, PromptCommand};
 use words::WordCompleter;
@@ -125,7 +126,7 @@ async fn answer(session: &Session, sql: &str, settings: &mut PromptSettings) {
     match outcome {
         Ok(rows) if settings.timing => eprintln!("{rows} rows, {:.3} s", begun.elapsed().as_secs_f64()),
         Ok(rows) => eprintln!("{rows} rows"),
-        Err(e) => eprintln!("error: {e:#}"),
+        Err(e) => eprintln!("error: {}", describe_error(&e)),
     }
 }
 

@@ -77,7 +77,7 @@ impl DeltaLog {
         self.load(table).await?.ok_or_else(|| Error::Log {
             table: table.name(),
             action: "read",
-            reason: "it has no log; hint: `echolake ingest` makes it anew from the runs".into(),
+            source: "it has no log; hint: `echolake ingest` makes it anew from the runs".into(),
         })
     }
 
@@ -245,8 +245,8 @@ impl CommitLog for DeltaLog {
                 return Ok(change.outcomes);
             }
         }
-        let reason = format!("{COMMIT_TRIES} tries lost to other writers; hint: run the command again");
-        Err(Error::Log { table: table.name(), action: "written", reason })
+        let source = format!("{COMMIT_TRIES} tries lost to other writers; hint: run the command again").into();
+        Err(Error::Log { table: table.name(), action: "written", source })
     }
 }
 
@@ -287,8 +287,8 @@ fn decoded_name(path: &str) -> Cow<'_, str> {
 fn parts(table: Table, add: &AddFile) -> Result<Vec<RunPart>> {
     let text = add.tags.as_ref().and_then(|tags| tags.get(PARTS).cloned().flatten());
     text.and_then(|text| decode_parts(&text)).ok_or_else(|| {
-        let reason = format!("`{}` has lost the list of its parts; {REBUILD_HINT}", add.path);
-        Error::Log { table: table.name(), action: "read", reason }
+        let source = format!("`{}` has lost the list of its parts; {REBUILD_HINT}", add.path).into();
+        Error::Log { table: table.name(), action: "read", source }
     })
 }
 

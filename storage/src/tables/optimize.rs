@@ -143,8 +143,8 @@ impl Lake {
                 encoder.write(&batch)?;
             }
             if rows != slice.part.rows {
-                let reason = format!("{rows} rows were read of {} of run {}", slice.part.rows, slice.part.run);
-                return Err(Error::DataFile { file: slice.file.path.to_string(), reason });
+                let source = format!("{rows} rows were read of {} of run {}", slice.part.rows, slice.part.run).into();
+                return Err(Error::DataFile { file: slice.file.path.to_string(), source });
             }
         }
         let parts: Vec<_> = slices.into_iter().map(|s| s.part).collect();

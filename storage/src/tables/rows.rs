@@ -83,7 +83,7 @@ impl Lake {
         rows: Range<u64>,
     ) -> Result<BoxStream<'static, Result<RecordBatch>>> {
         let name = file.path.to_string();
-        let damaged = move |e: ParquetError| Error::DataFile { file: name.clone(), reason: e.to_string() };
+        let damaged = move |e: ParquetError| Error::DataFile { file: name.clone(), source: e.into() };
         let reader = StoredFile { store: self.store(), path: file.path.clone(), bytes: file.bytes };
         let options = ArrowReaderOptions::new()
             .with_schema(table.schema(self.rig()))
@@ -92,8 +92,8 @@ impl Lake {
             ParquetRecordBatchStreamBuilder::new_with_options(reader, options).await.map_err(damaged.clone())?;
         let there = u64::try_from(builder.metadata().file_metadata().num_rows()).unwrap_or(0);
         if there != file.rows {
-            let reason = format!("it has {there} rows, its log says {}", file.rows);
-            return Err(Error::DataFile { file: file.path.to_string(), reason });
+            let source = format!("it has {there} rows, its log says {}", file.rows).into();
+            return Err(Error::DataFile { file: file.path.to_string(), source });
         }
         if !columns.is_empty() {
             let mask = ProjectionMask::columns(builder.parquet_schema(), columns.iter().copied());

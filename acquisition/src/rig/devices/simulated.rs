@@ -22,7 +22,8 @@ use realfft::{ComplexToReal, RealToComplex};
 use crate::panel::relief::HeightField;
 use crate::rig::robots::Choreography;
 use crate::rig::{
-    AmbientReading, AmbientSensor, ArmPositions, AudioInterface, AudioTake, DrivePower, Error, RigDevices, RobotArms,
+    AmbientReading, AmbientSensor, ArmPositions, AudioInterface, AudioTake, DeviceFault, DrivePower, Error, RigDevices,
+    RobotArms,
 };
 
 /// Facets along each side: 2.14 mm, a quarter of the wavelength at 40 kHz.
@@ -91,7 +92,10 @@ type SharedWorld = Arc<Mutex<SimulatedWorld>>;
 /// # Errors
 /// [`Error::Device`] if the rig's grid has no points.
 pub fn devices(simulation: &RigSimulation<'_>) -> Result<RigDevices, Error> {
-    let failed = |e: echolake_schema::Error| Error::Device { device: "simulated rig", reason: e.to_string() };
+    let failed = |e: echolake_schema::Error| Error::Device {
+        device: "simulated rig",
+        reason: DeviceFault::with_cause(e.to_string(), e),
+    };
     let grid = simulation.rig.grid().map_err(failed)?;
     let mut rng = ChaCha8Rng::seed_from_u64(simulation.seed);
     let points: Vec<_> = grid.points().iter().map(|p| p.position_mm).collect();
@@ -239,7 +243,10 @@ impl AudioInterface for SimulatedAudio {
         let level = if spoiled { SPOILED_LEVEL_DB } else { 42.0 };
         world.outside_level_db = level + 1.5 * world.normal();
         let c = speed_of_sound(world.temperature_c());
-        let failed = |e: echolake_dsp::Error| Error::Device { device: "simulated room", reason: e.to_string() };
+        let failed = |e: echolake_dsp::Error| Error::Device {
+            device: "simulated room",
+            reason: DeviceFault::with_cause(e.to_string(), e),
+        };
         self.plan
             .response(world.stand, c, self.reflection_factor, &mut self.scratch, &mut self.response)
             .map_err(failed)?;

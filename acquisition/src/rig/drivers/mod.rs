@@ -46,7 +46,7 @@ pub fn open(rig: &Rig) -> Result<Option<RigDevices>, Error> {
 // A rig file that mixes them is refused when it is read.
 fn simulated_beside_real() -> Error {
     let reason = "has simulated devices beside real ones; hint: audio, sensor and robots all need a `kind`";
-    Error::Device { device: "rig", reason: reason.to_owned() }
+    Error::Device { device: "rig", reason: reason.into() }
 }
 
 /// An interface through ALSA.
@@ -65,10 +65,10 @@ pub fn audio_interface(params: &AlsaParams, rate_hz: f64) -> Result<Box<dyn Audi
 /// [`Error::Device`], always: it says what the build needs.
 #[cfg(not(feature = "alsa"))]
 pub fn audio_interface(params: &AlsaParams, _rate_hz: f64) -> Result<Box<dyn AudioInterface>, Error> {
-    let reason = format!(
+    let text = format!(
         "cannot open `{}`: this build has no ALSA; hint: install libasound2-dev and pkg-config, then build with \
          `--features alsa`",
         params.capture
     );
-    Err(Error::Device { device: audio::DEVICE, reason })
+    Err(Error::Device { device: audio::DEVICE, reason: text.into() })
 }

@@ -15,6 +15,7 @@ pub enum Error {
         /// The rig.
         rig: String,
         /// The cause.
+        #[source]
         cause: echolake_dsp::Error,
     },
     /// The rig's grid is not valid.

@@ -3,6 +3,7 @@
 
 use std::sync::Arc;
 
+use echolake_recording::system_cause;
 use echolake_schema::{Timestamp, topics};
 use foxglove::messages as fg;
 
@@ -62,7 +63,7 @@ impl Recorder {
             let mut joints = |topic| foxglove_channel::<fg::JointStates>(&mut self.writer.mcap, topic);
             Ok((description, [joints(topics::MICROPHONE_JOINTS)?, joints(topics::SPEAKER_JOINTS)?]))
         });
-        let (description, joints) = channels.map_err(|e| self.failed(e.to_string()))?;
+        let (description, joints) = channels.map_err(|e| self.failed(system_cause(e)))?;
         let message = cdr_string(&cell.urdf(name));
         // A run that is gone on with has it already.
         if !self.is_resumed {

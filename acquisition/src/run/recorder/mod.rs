@@ -16,12 +16,12 @@ use std::fs::{File, OpenOptions};
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
-use echolake_recording::{Attachment, ChunkLane, ChunkWriter, MessageHeader, Metadata};
+use echolake_recording::{Attachment, ChunkLane, ChunkWriter, MessageHeader, Metadata, system_cause};
 use echolake_schema::manifest::{RunEnd, RunManifest};
 use echolake_schema::messages::{
     AmbientSample, ImpulseResponse, Measurement, Message as RunMessage, SampleFormat, SweepRecording,
 };
-use echolake_schema::{Rig, SurfaceRecord, Timestamp, samples, topics};
+use echolake_schema::{ErrorCause, Rig, SurfaceRecord, Timestamp, samples, topics};
 use foxglove::Encode;
 
 use crate::disk::{folder_of, sync};
@@ -176,10 +176,10 @@ impl Recorder {
         if path.exists() {
             return Err(Error::Exists { path: path.to_owned() });
         }
-        let failed = |reason: String| Error::Create { path: path.to_owned(), reason };
+        let failed = |source: ErrorCause| Error::Create { path: path.to_owned(), source };
         let file = OpenOptions::new().write(true).create_new(true).open(&partial).map_err(|e| match e.kind() {
             std::io::ErrorKind::AlreadyExists => Error::Exists { path: partial.clone() },
-            _ => failed(e.to_string()),
+            _ => failed(e.into()),
         })?;
         // Held until the file is closed: whoever finds it unlocked knows that its recorder is dead. Where the file
         // system has no locks, it is never found so.
@@ -189,7 +189,7 @@ impl Recorder {
             // What cannot be removed either has a cause that the error tells already.
             let _ = std::fs::remove_file(&partial);
             match e {
-                Error::Write { reason, .. } => failed(reason),
+                Error::Write { source, .. } => failed(source),
                 other => other,
             }
         })
@@ -199,7 +199,7 @@ impl Recorder {
         let (path, partial) = (path.to_owned(), partial.to_owned());
         match ChunkWriter::new(file) {
             Ok(writer) => Ok(Self::with(writer, path, partial, Channels::default(), 0)),
-            Err(e) => Err(Error::Create { path, reason: e.to_string() }),
+            Err(e) => Err(Error::Create { path, source: system_cause(e) }),
         }
     }
 
@@ -216,7 +216,7 @@ impl Recorder {
         if let Some(plan) = &start.plan {
             self.metadata(topics::RUN_PLAN_METADATA, plan.clone())?;
         }
-        let surface = serde_json::to_vec_pretty(start.surface).map_err(|e| Error::Surface { reason: e.to_string() })?;
+        let surface = serde_json::to_vec_pretty(start.surface).map_err(|source| Error::Surface { source })?;
         self.attach(at, topics::RIG_ATTACHMENT, "application/toml", start.rig.to_toml().as_bytes())?;
         self.attach(at, topics::SURFACE_ATTACHMENT, "application/json", &surface)?;
         let glb = start.relief.as_ref().map(|r| r.mesh.to_bytes(crate::panel::mesh::Format::Glb));
@@ -228,14 +228,14 @@ impl Recorder {
                 self.attach(at, &own_name(file.name), file.media_type, file.bytes)?;
             }
         }
-        self.channels = Channels::register(&mut self.writer.mcap).map_err(|e| self.failed(e.to_string()))?;
+        self.channels = Channels::register(&mut self.writer.mcap).map_err(|e| self.failed(system_cause(e)))?;
         if let (Some(relief), Some(glb)) = (&start.relief, glb) {
             self.foxglove(self.channels.scene, at, &scene::panel(at, glb))?;
             self.foxglove(self.channels.points, at, &scene::points(at, relief.heights))?;
         }
         self.checkpoint()?;
         // The file's name, too, survives a power cut from here on.
-        sync(folder_of(&self.partial)).map_err(|reason| self.failed(reason))
+        sync(folder_of(&self.partial)).map_err(|e| self.failed(e.into()))
     }
 
     /// Lets `tap` hear every message from now on, and shows it the panel, which is in the file since its head.
@@ -300,8 +300,9 @@ impl Recorder {
         self.end_large(ChunkLane::Light)
     }
 
-    /// Records a line of the log.
+    /// Records a line of the run's log. The process's own log has it for debugging alone: commands tell their user.
     pub fn log(&mut self, at: Timestamp, level: LogLevel, name: &str, message: &str) -> Result<(), Error> {
+        tracing::debug!(source = name, run_level = ?level, "{message}");
         self.foxglove(self.channels.log, at, &scene::log(at, level, name, message))
     }
 
@@ -312,9 +313,9 @@ impl Recorder {
     /// [`Error::Write`]: nothing that was recorded since the checkpoint before may be acknowledged.
     pub fn checkpoint(&mut self) -> Result<(), Error> {
         let begun = Instant::now();
-        self.writer.end_all().map_err(|e| self.failed(e.to_string()))?;
+        self.writer.end_all().map_err(|e| self.failed(system_cause(e)))?;
         let written = Instant::now();
-        self.writer.sync().map_err(|e| self.failed(e.to_string()))?;
+        self.writer.sync().map_err(|e| self.failed(system_cause(e)))?;
         self.cost.checkpoints += 1;
         self.cost.waited += written.elapsed();
         self.cost.busy += begun.elapsed();
@@ -337,7 +338,7 @@ impl Recorder {
     pub fn seal(mut self, end: &RunEnd) -> Result<Sealed, Error> {
         self.metadata(topics::RUN_END_METADATA, end.to_metadata())?;
         // The writer's own drop would swallow what goes wrong here.
-        self.writer.finish().map_err(|e| self.failed(e.to_string()))?;
+        self.writer.finish().map_err(|e| self.failed(system_cause(e)))?;
         if self.cost.checkpoints >= MANY_CHECKPOINTS {
             // What is on the disk is whole: where there is no room to make it better it stays as it is.
             let _ = tidy::with_larger_chunks(&self.partial, &self.path);
@@ -386,7 +387,7 @@ impl Recorder {
 
     fn end_large(&mut self, part: ChunkLane) -> Result<(), Error> {
         let begun = Instant::now();
-        let ended = self.writer.end_large(part).map_err(|e| self.failed(e.to_string()));
+        let ended = self.writer.end_large(part).map_err(|e| self.failed(system_cause(e)));
         self.cost.busy += begun.elapsed();
         ended
     }
@@ -400,18 +401,18 @@ impl Recorder {
             media_type: media_type.to_owned(),
             data: data.into(),
         };
-        self.writer.mcap.attach(&attachment).map_err(|e| self.failed(e.to_string()))
+        self.writer.mcap.attach(&attachment).map_err(|e| self.failed(system_cause(e)))
     }
 
     fn metadata(&mut self, name: &str, metadata: BTreeMap<String, String>) -> Result<(), Error> {
         let record = Metadata { name: name.to_owned(), metadata };
         // Behind all that came before it: a run's end is the last of it.
         let written = self.writer.end_all().and_then(|()| self.writer.mcap.write_metadata(&record));
-        written.map_err(|e| self.failed(e.to_string()))
+        written.map_err(|e| self.failed(system_cause(e)))
     }
 
-    fn failed(&self, reason: String) -> Error {
-        Error::Write { path: self.path.clone(), partial: self.partial.clone(), reason }
+    fn failed(&self, source: ErrorCause) -> Error {
+        Error::Write { path: self.path.clone(), partial: self.partial.clone(), source }
     }
 }
 

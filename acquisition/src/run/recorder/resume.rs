@@ -4,10 +4,10 @@ use std::collections::{BTreeMap, HashSet};
 use std::fs::OpenOptions;
 use std::path::{Path, PathBuf};
 
-use echolake_recording::{ChunkLane, ChunkWriter, MessageHeader, PrefixItem, PrefixReader, Record};
+use echolake_recording::{ChunkLane, ChunkWriter, MessageHeader, PrefixItem, PrefixReader, Record, system_cause};
 use echolake_schema::manifest::RunManifest;
 use echolake_schema::messages::{Measurement, Verdict};
-use echolake_schema::{Rig, Timestamp, topics};
+use echolake_schema::{ErrorCause, Rig, Timestamp, topics};
 use prost::Message as _;
 
 use super::Recorder;
@@ -65,16 +65,16 @@ impl Held {
                 PrefixItem::Attachment(_) => {}
             }
         }
-        let headless = |reason: String| Error::Headless { path: partial.to_owned(), reason };
-        let begins = |what: &str| headless(format!("it has no {what}"));
+        let headless = |source: ErrorCause| Error::Headless { path: partial.to_owned(), source };
+        let begins = |what: &str| headless(format!("it has no {what}").into());
         let record = seen.metadata.get(topics::RUN_METADATA).ok_or_else(|| begins("manifest"))?;
-        let manifest = RunManifest::from_metadata(record).map_err(|e| headless(e.to_string()))?;
+        let manifest = RunManifest::from_metadata(record).map_err(|e| headless(e.into()))?;
         let rig = seen.rig.and_then(|bytes| String::from_utf8(bytes).ok()).ok_or_else(|| begins("rig"))?;
-        let rig = Rig::from_toml(&rig).map_err(|e| headless(e.to_string()))?;
+        let rig = Rig::from_toml(&rig).map_err(|e| headless(e.into()))?;
         if !seen.channels.values().any(|topic| topic == topics::MEASUREMENT) {
             return Err(begins("chunk that is whole"));
         }
-        let no_plan = || Error::NoPlan { path: partial.to_owned(), reason: "it does not say what was planned".into() };
+        let no_plan = || Error::NoPlan { path: partial.to_owned(), source: "it does not say what was planned".into() };
         Ok(Self {
             plan: seen.metadata.remove(topics::RUN_PLAN_METADATA).ok_or_else(no_plan)?,
             last: Timestamp(seen.last.max(manifest.started.0)),
@@ -137,8 +137,8 @@ impl Recorder {
     pub fn resume(partial: &Path) -> Result<(Self, Held), Error> {
         let path = partial.with_extension("");
         if partial.extension().is_none_or(|e| e != PARTIAL) {
-            let reason = "its name does not end in `.partial`: it is whole, or somebody else's".to_owned();
-            return Err(Error::NoPlan { path: partial.to_owned(), reason });
+            let source = "its name does not end in `.partial`: it is whole, or somebody else's".into();
+            return Err(Error::NoPlan { path: partial.to_owned(), source });
         }
         if path.exists() {
             return Err(Error::Exists { path });
@@ -158,26 +158,26 @@ impl Recorder {
     }
 
     fn behind(held: &Held, partial: &Path, path: &Path, copy: &Path) -> Result<Self, Error> {
-        let failed = |reason: String| Error::Write { path: copy.to_owned(), reason };
+        let failed = |source: ErrorCause| Error::Write { path: copy.to_owned(), source };
         let file = OpenOptions::new().write(true).create(true).truncate(true).open(copy);
-        let file = file.map_err(|e| failed(e.to_string()))?;
+        let file = file.map_err(|e| failed(e.into()))?;
         // As in Recorder::create.
         let _ = file.try_lock();
-        let mut writer = ChunkWriter::new(file).map_err(|e| failed(e.to_string()))?;
+        let mut writer = ChunkWriter::new(file).map_err(|e| failed(system_cause(e)))?;
         let mut walk = PrefixReader::open(partial)?;
         let mut taken = Copy::new(&mut writer);
         let acknowledged =
             |part: ChunkLane, header: &MessageHeader| part == ChunkLane::Light || held.times.contains(&header.log_time);
         while let Some(item) = walk.next_item()? {
             if !is_end(&item) {
-                taken.take(item, &acknowledged).map_err(|e| failed(e.to_string()))?;
+                taken.take(item, &acknowledged).map_err(|e| failed(system_cause(e)))?;
             }
         }
         let sequence = taken.sequence;
-        let channels = Channels::register(&mut writer.mcap).map_err(|e| failed(e.to_string()))?;
-        writer.sync().map_err(|e| failed(e.to_string()))?;
-        std::fs::rename(copy, partial).map_err(|e| failed(e.to_string()))?;
-        sync(folder_of(partial)).map_err(failed)?;
+        let channels = Channels::register(&mut writer.mcap).map_err(|e| failed(system_cause(e)))?;
+        writer.sync().map_err(|e| failed(system_cause(e)))?;
+        std::fs::rename(copy, partial).map_err(|e| failed(e.into()))?;
+        sync(folder_of(partial)).map_err(|e| failed(e.into()))?;
         Ok(Self::with(writer, path.to_owned(), PathBuf::from(partial), channels, sequence))
     }
 }

@@ -30,10 +30,10 @@ impl Sealed {
         if self.path.exists() {
             return Err(Error::Exists { path: self.path });
         }
-        let renamed = std::fs::rename(&self.partial, &self.path).map_err(|e| e.to_string());
+        let renamed = std::fs::rename(&self.partial, &self.path);
         match renamed.and_then(|()| sync(folder_of(&self.path))) {
             Ok(()) => Ok(self.path),
-            Err(reason) => Err(Error::Write { path: self.path, partial: self.partial, reason }),
+            Err(e) => Err(Error::Write { path: self.path, partial: self.partial, source: e.into() }),
         }
     }
 }

@@ -14,11 +14,13 @@ use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
 use tokio::net::TcpListener;
 use tokio::sync::watch;
 use tokio::task::JoinSet;
+use tracing::Instrument as _;
 
 use super::ServerDoor;
 use super::connection_places::{ConnectionPlaces, PlacedStream};
 use crate::client_identity::ClientIdentity;
 use crate::fault::RequestFault;
+use crate::request_span::begin_connection;
 use crate::tokens::TokenScope;
 use cancel_keys::CancelKeys;
 use frames::{FrameHeader, HEADER, PASSWORD_WANTED, StartupPacket, fatal_message};
@@ -59,9 +61,10 @@ async fn attend(mut stream: PlacedStream, door: ServerDoor, keys: Arc<CancelKeys
             () = evicted => None,
         }
     };
-    let Some(session) = login.await else { return };
+    let Some(mut session) = login.await else { return };
     let _working = stream.work().begin();
-    MessageRelay::new(stream, door, keys, session).run(stopping).await;
+    let span = begin_connection(&mut session.startup, &session.client.name, STARTUP);
+    MessageRelay::new(stream, door, keys, session).run(stopping).instrument(span).await;
 }
 
 /// A client that is logged in.
@@ -76,7 +79,7 @@ async fn log_in(stream: &mut PlacedStream, door: &ServerDoor, keys: &CancelKeys)
     match try_log_in(stream, door, keys).await {
         Ok(login) => login,
         Err(fault) => {
-            door.metrics().failed(fault.code());
+            door.metrics().record_failure(&fault);
             // A client that hangs up needs no reason.
             let _ = stream.write_all(&fatal_message(&fault)).await;
             let _ = stream.shutdown().await;

@@ -93,7 +93,7 @@ impl MessageRelay {
     /// Answers the client until it goes, or until `stopping` and nothing is asked.
     pub(super) async fn run(mut self, stopping: watch::Receiver<bool>) {
         if let Err(Some(fault)) = self.converse(stopping).await {
-            self.door.metrics().failed(fault.code());
+            self.door.metrics().record_failure(&fault);
             self.outgoing.extend_from_slice(&fatal_message(&fault));
         }
         // A client that hangs up needs no last message.
@@ -260,7 +260,7 @@ impl MessageRelay {
     }
 
     fn tell(&mut self, fault: &RequestFault) {
-        self.door.metrics().failed(fault.code());
+        self.door.metrics().record_failure(fault);
         self.outgoing.extend_from_slice(&error_message(fault));
         match self.exchange.has_end() {
             true => self.outgoing.extend_from_slice(&READY),

@@ -4,6 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
 use chrono::{DateTime, TimeDelta, Utc};
+use echolake_schema::ErrorCause;
 use echolake_schema::tables::Table;
 use futures::{StreamExt as _, TryStreamExt as _};
 use object_store::path::Path;
@@ -127,7 +128,7 @@ impl<'a> LogFolder<'a> {
     pub(super) async fn write_commit(&self, version: u64, lines: &[LogLine]) -> Result<CommitAttempt> {
         let mut text = Vec::new();
         for line in lines {
-            serde_json::to_writer(&mut text, line).map_err(|e| self.failed("written", e.to_string()))?;
+            serde_json::to_writer(&mut text, line).map_err(|e| self.failed("written", e))?;
             text.push(b'\n');
         }
         let path = self.path.clone().join(commit_name(version));
@@ -149,7 +150,7 @@ impl<'a> LogFolder<'a> {
 
     async fn write_checkpoint(&self, state: &TableState, now: DateTime<Utc>) -> Result<()> {
         let lines = state.checkpoint_lines(now.timestamp_millis());
-        let file = encode_checkpoint(&lines).map_err(|e| self.failed("written", e.to_string()))?;
+        let file = encode_checkpoint(&lines).map_err(|e| self.failed("written", e))?;
         let hint = json!({ "version": state.version, "size": lines.len(), "sizeInBytes": file.len(),
             "numOfAddFiles": state.files.len() });
         let path = self.path.clone().join(checkpoint_name(state.version));
@@ -254,8 +255,8 @@ impl<'a> LogFolder<'a> {
         self.failed("read", format!("{what}; {REBUILD_HINT}"))
     }
 
-    fn failed(&self, action: &'static str, reason: String) -> Error {
-        Error::Log { table: self.table.name(), action, reason }
+    fn failed(&self, action: &'static str, source: impl Into<ErrorCause>) -> Error {
+        Error::Log { table: self.table.name(), action, source: source.into() }
     }
 }
 

@@ -135,7 +135,7 @@ impl<D: AudioDuplex> AudioInterface for AlignedAudio<D> {
     }
 
     fn play_and_record(&mut self, output: &[f32], take: &mut AudioTake) -> Result<(), Error> {
-        let failed = |reason| Err(Error::Device { device: DEVICE, reason });
+        let failed = |text: String| Err(Error::Device { device: DEVICE, reason: text.into() });
         for attempt in 0..=self.repeats {
             match self.attempt(output) {
                 Ok((delay, began)) => {

@@ -9,12 +9,13 @@ pub mod wire;
 use std::net::TcpStream;
 use std::time::{Duration, Instant};
 
+use echolake_schema::ErrorCause;
 use echolake_schema::devices::RosbridgeParams;
 use tungstenite::stream::MaybeTlsStream;
 use tungstenite::{Message, WebSocket};
 
 use crate::rig::robots::{ArmPose, Cell, Joints, SpeakerAim, course};
-use crate::rig::{ArmPositions, DrivePower, Error, RobotArms};
+use crate::rig::{ArmPositions, DeviceFault, DrivePower, Error, RobotArms};
 use wire::{ArmRole, BridgeMessage};
 
 const DEVICE: &str = "robots";
@@ -64,13 +65,13 @@ impl RosbridgeRobots {
     fn connected(&mut self) -> Result<&mut BridgeSocket, Error> {
         if self.socket.is_none() {
             let url = &self.params.url;
-            let failed =
-                |reason: String| failure(format!("cannot reach `{url}`: {reason}; hint: is rosbridge running?"));
-            let (socket, _) = tungstenite::connect(url).map_err(|e| failed(e.to_string()))?;
+            let failed = |cause: ErrorCause| {
+                let text = format!("cannot reach `{url}`: {cause}; hint: is rosbridge running?");
+                failure(DeviceFault::with_cause(text, cause))
+            };
+            let (socket, _) = tungstenite::connect(url).map_err(|e| failed(e.into()))?;
             match socket.get_ref() {
-                MaybeTlsStream::Plain(stream) => {
-                    stream.set_read_timeout(Some(PAUSE)).map_err(|e| failed(e.to_string()))?
-                }
+                MaybeTlsStream::Plain(stream) => stream.set_read_timeout(Some(PAUSE)).map_err(|e| failed(e.into()))?,
                 _ => return Err(failed("only plain ws:// is spoken".into())),
             }
             self.socket = Some(socket);
@@ -78,13 +79,13 @@ impl RosbridgeRobots {
                 self.send(&message)?;
             }
         }
-        self.socket.as_mut().ok_or_else(|| failure("no connection".into()))
+        self.socket.as_mut().ok_or_else(|| failure("no connection"))
     }
 
     fn send(&mut self, message: &serde_json::Value) -> Result<(), Error> {
         let text = message.to_string();
         let sent = self.connected()?.send(Message::text(text));
-        sent.map_err(|e| self.lost(&e.to_string()))
+        sent.map_err(|e| self.lost(e))
     }
 
     // The next message, or nothing within a pause.
@@ -111,15 +112,17 @@ impl RosbridgeRobots {
             {
                 Ok(None)
             }
-            Err(e) => Err(self.lost(&e.to_string())),
+            Err(e) => Err(self.lost(e)),
         }
     }
 
     // The next call connects anew; until then the state of the motors is unknown.
-    fn lost(&mut self, why: &str) -> Error {
+    fn lost(&mut self, cause: tungstenite::Error) -> Error {
         self.socket = None;
         self.power = DrivePower::Off;
-        failure(format!("lost `{}`: {why}; hint: is the controller still on, the cable plugged in?", self.params.url))
+        let url = &self.params.url;
+        let text = format!("lost `{url}`: {cause}; hint: is the controller still on, the cable plugged in?");
+        failure(DeviceFault::with_cause(text, cause))
     }
 
     // Pending messages are old; each arm's next joint states are waited for.
@@ -253,6 +256,6 @@ impl RobotArms for RosbridgeRobots {
     }
 }
 
-fn failure(reason: String) -> Error {
-    Error::Device { device: DEVICE, reason }
+fn failure(reason: impl Into<DeviceFault>) -> Error {
+    Error::Device { device: DEVICE, reason: reason.into() }
 }

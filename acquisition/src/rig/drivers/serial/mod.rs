@@ -6,11 +6,11 @@ pub(super) mod tests;
 
 use std::time::{Duration, Instant};
 
-use echolake_schema::Timestamp;
 use echolake_schema::devices::SerialParams;
+use echolake_schema::{ErrorCause, Timestamp};
 use serial2::SerialPort;
 
-use crate::rig::{AmbientReading, AmbientSensor, Error};
+use crate::rig::{AmbientReading, AmbientSensor, DeviceFault, Error};
 use line::SensorLine;
 
 const DEVICE: &str = "ambient sensor";
@@ -60,14 +60,16 @@ impl SerialSensor {
         Ok(sensor)
     }
 
-    fn connect(&mut self) -> Result<(), String> {
+    fn connect(&mut self) -> Result<(), DeviceFault> {
         let path = &self.params.path;
         let opened = SerialPort::open(path, self.params.baud).and_then(|mut port| {
             port.set_read_timeout(PAUSE)?;
             Ok(port)
         });
-        let hint = "is the sensor plugged in, and may this user open it?";
-        self.port = Some(opened.map_err(|e| format!("cannot open `{path}`: {e}; hint: {hint}"))?);
+        self.port = Some(opened.map_err(|e| {
+            let hint = "is the sensor plugged in, and may this user open it?";
+            DeviceFault::with_cause(format!("cannot open `{path}`: {e}; hint: {hint}"), e)
+        })?);
         self.bytes.clear();
         self.in_step = false;
         Ok(())
@@ -108,16 +110,20 @@ impl SerialSensor {
         }
     }
 
-    fn silent(&self, taken: &ReceivedLines, lost: Option<String>) -> Error {
+    fn silent(&self, taken: &ReceivedLines, lost: Option<ErrorCause>) -> Error {
         let secs = self.params.timeout_secs;
         let path = &self.params.path;
         let reason = match (lost, taken.nonsense) {
-            (Some(lost), _) => format!("lost `{path}`: {lost}; hint: is the sensor still plugged in?"),
-            (None, 0) => format!("no line on `{path}` for {secs} s; hint: is the sensor powered?"),
+            (Some(lost), _) => {
+                let text = format!("lost `{path}`: {lost}; hint: is the sensor still plugged in?");
+                DeviceFault::with_cause(text, lost)
+            }
+            (None, 0) => format!("no line on `{path}` for {secs} s; hint: is the sensor powered?").into(),
             (None, count) => format!(
                 "nothing but nonsense on `{path}` for {secs} s, {count} lines, the last {}; hint: is {} baud right?",
                 taken.last_nonsense, self.params.baud
-            ),
+            )
+            .into(),
         };
         Error::Device { device: DEVICE, reason }
     }
@@ -145,17 +151,17 @@ impl ReceivedLines {
 impl AmbientSensor for SerialSensor {
     fn read(&mut self) -> Result<AmbientReading, Error> {
         let end = Instant::now() + Duration::from_secs_f64(self.params.timeout_secs);
-        let (mut taken, mut lost) = (ReceivedLines::default(), None);
+        let (mut taken, mut lost) = (ReceivedLines::default(), None::<ErrorCause>);
         loop {
             if self.port.is_none() {
                 match self.connect() {
                     Ok(()) => self.notices.push(format!("`{}` is open again", self.params.path)),
-                    Err(why) => lost = Some(why),
+                    Err(fault) => lost = Some(fault.into()),
                 }
             }
             if let Err(e) = self.take(&mut taken) {
                 self.notices.push(format!("lost `{}`: {e}", self.params.path));
-                lost = Some(e.to_string());
+                lost = Some(e.into());
                 self.port = None;
             }
             if let Some(line) = taken.line {
