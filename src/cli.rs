@@ -1,20 +1,33 @@
-//! The arguments, and nothing else.
-
-#[cfg(feature = "lake")]
-mod lake;
+//! The commands as they are typed: their tree, and which function runs each.
 
 use std::path::PathBuf;
 
-use clap::{Args, Parser, Subcommand};
-use echolake_acquisition::ViewerAccess;
-use echolake_acquisition::panel::mesh::PanelSide;
-use echolake_acquisition::replay::SPEEDS;
-use echolake_schema::SurfaceId;
+use anyhow::Context as _;
+use clap::{CommandFactory as _, Parser, Subcommand};
 
-use crate::commands::panel::PanelArgs;
-use crate::logging::{FORMAT_VARIABLE, LogFormat};
+use crate::CommandOutcome;
+use crate::commands::acquire::{self, AcquireArgs};
 #[cfg(feature = "lake")]
-pub(crate) use lake::{DemoArgs, ImportCommand, IngestArgs, LakeCommand, OptimizeArgs, VacuumArgs};
+use crate::commands::demo::{self, DemoArgs};
+use crate::commands::doctor::{self, DoctorArgs};
+#[cfg(feature = "lake")]
+use crate::commands::export::{self, ExportCommand};
+#[cfg(feature = "lake")]
+use crate::commands::import::{self, ImportCommand};
+#[cfg(feature = "lake")]
+use crate::commands::ingest::{self, IngestArgs};
+#[cfg(feature = "lake")]
+use crate::commands::optimize::{self, OptimizeArgs};
+use crate::commands::panel::{self, PanelArgs};
+use crate::commands::recover::{self, RecoverArgs};
+use crate::commands::replay::{self, ReplayArgs};
+#[cfg(feature = "lake")]
+use crate::commands::serve::{self, EngineArgs, ServeArgs};
+#[cfg(feature = "lake")]
+use crate::commands::sql::{self, SqlArgs};
+#[cfg(feature = "lake")]
+use crate::commands::vacuum::{self, VacuumArgs};
+use crate::logging::{FORMAT_VARIABLE, LogFormat};
 
 /// A data lake and catalogue for sweep measurements.
 #[derive(Debug, Parser)]
@@ -58,140 +71,87 @@ pub(crate) enum CliCommand {
     },
 }
 
-#[derive(Debug, Args)]
-pub(crate) struct AcquireArgs {
-    /// Name of the measured surface, as 0015_0.
-    #[arg(long, required_unless_present = "resume")]
-    pub(crate) surface: Option<SurfaceId>,
-    /// Go on with a run that was stopped or cut off: its `.mcap.partial`. What is safe in it is not measured again.
-    #[arg(long, value_name = "FILE", conflicts_with_all = ["surface", "panel", "parameters", "set", "mesh", "side", "rig", "flat", "foam", "seed", "ir_only"])]
-    pub(crate) resume: Option<PathBuf>,
-    /// Relief for the simulated rig, by a name of `echolake panel --list`; by default the one that the surface's name
-    /// begins with.
-    #[arg(long, value_name = "NAME", conflicts_with = "mesh")]
-    pub(crate) panel: Option<String>,
-    /// A JSON file of parameters, as `echolake panel` writes them, in place of a name.
-    #[arg(long, value_name = "FILE", conflicts_with_all = ["mesh", "panel"])]
-    pub(crate) parameters: Option<PathBuf>,
-    /// A parameter of it.
-    #[arg(long, value_name = "KEY=VALUE")]
-    pub(crate) set: Vec<String>,
-    /// A mesh to measure instead: GLB or STL.
-    #[arg(long)]
-    pub(crate) mesh: Option<PathBuf>,
-    /// The side of the mesh that is measured: the back is seen when the panel is turned over about its y axis.
-    #[arg(long, value_name = "front|back", value_parser = side, requires = "mesh")]
-    pub(crate) side: Option<PanelSide>,
-    /// The rig; by default the lake's, or that of the paper for a new lake.
-    #[arg(long)]
-    pub(crate) rig: Option<PathBuf>,
-    /// Surface that normalises this one, where it is not the lake's.
-    #[arg(long)]
-    pub(crate) flat: Option<SurfaceId>,
-    /// Surface whose direct sound is subtracted from this one, where it is not the lake's.
-    #[arg(long)]
-    pub(crate) foam: Option<SurfaceId>,
-    /// Seed of the simulation.
-    #[arg(long, default_value_t = 1)]
-    pub(crate) seed: u64,
-    /// Record no sweeps, only impulse responses.
-    #[arg(long)]
-    pub(crate) ir_only: bool,
-    /// Pairs between two checkpoints: what a power cut costs at most, and how late a pair is told to be safe. By default 1
-    /// on a real rig, 200 on the simulated one.
-    #[arg(long, value_name = "PAIRS", value_parser = clap::value_parser!(u32).range(1..))]
-    pub(crate) checkpoint_every: Option<u32>,
-    /// Seconds that a simulated take lasts at least; a real rig's are 12.3.
-    #[arg(long, value_name = "SECS", default_value_t = 0.0)]
-    pub(crate) pace: f64,
-    /// Begin even where disk, sensor, level or loopback are not fit.
-    #[arg(long)]
-    pub(crate) skip_checks: bool,
-    /// Append a line to this file for every attempt once it is safe on the disk: pair, attempt, verdict, SNR in dB.
-    /// `-` is stdout.
-    #[arg(long, value_name = "FILE")]
-    pub(crate) acknowledge: Option<PathBuf>,
-    /// Show the run as it happens to Foxglove and Lichtblick, which open ws://ADDR.
-    #[arg(long, value_name = "ADDR")]
-    pub(crate) live: Option<std::net::SocketAddr>,
-    #[command(flatten)]
-    pub(crate) viewers: ViewerArgs,
-    /// Serve metrics for Prometheus under http://ADDR/metrics.
-    #[arg(long, value_name = "ADDR")]
-    pub(crate) metrics: Option<std::net::SocketAddr>,
+/// The commands that need the lake's tables.
+#[cfg(feature = "lake")]
+#[derive(Debug, Subcommand)]
+pub(crate) enum LakeCommand {
+    /// Measure a few surfaces with the simulated rig, ingest them, print the paper's tables and serve the catalogue.
+    Demo(DemoArgs),
+    /// Turn existing measurements into runs.
+    #[command(subcommand)]
+    Import(ImportCommand),
+    /// Turn runs into rows.
+    Ingest(IngestArgs),
+    /// Ask the lake in SQL; a prompt where no query is given.
+    Sql(SqlArgs),
+    /// Data out: training sets, slices of runs, SOFA, WAV, npz.
+    #[command(subcommand)]
+    Export(ExportCommand),
+    /// Serve the catalogue, and the lake over HTTP, Arrow Flight SQL and Postgres' protocol, for reading.
+    Serve(ServeArgs),
+    /// Answer one client's queries, as a child of `serve`.
+    #[command(hide = true)]
+    Engine(EngineArgs),
+    /// Make a token for `serve --tokens`.
+    Token {
+        /// Name of its holder.
+        name: String,
+    },
+    /// Merge the tables' small files into large ones; ingest and queries may go on.
+    Optimize(OptimizeArgs),
+    /// Delete files that are in no table any more, and what crashes left behind.
+    Vacuum(VacuumArgs),
 }
 
-#[derive(Debug, Args)]
-pub(crate) struct RecoverArgs {
-    /// The recording that was cut off or damaged; it is only read.
-    pub(crate) file: PathBuf,
-    /// Path of the rebuilt file; by default beside it, without `.partial`.
-    #[arg(short, long, value_name = "FILE")]
-    pub(crate) output: Option<PathBuf>,
-    /// Print what was done as JSON.
-    #[arg(long)]
-    pub(crate) json: bool,
-}
+impl CliArguments {
+    /// Gives up what the command does not need. To be called before there are threads.
+    pub(crate) fn confine(&self) -> anyhow::Result<()> {
+        match &self.command {
+            #[cfg(feature = "lake")]
+            CliCommand::Lake(LakeCommand::Engine(args)) => args.confine(),
+            _ => Ok(()),
+        }
+    }
 
-#[derive(Debug, Args)]
-pub(crate) struct ReplayArgs {
-    /// Names of runs, surfaces (of each its newest run), or .mcap files; they are shown one after the other.
-    #[arg(required = true, value_name = "RUN")]
-    pub(crate) runs: Vec<String>,
-    /// Address to listen on.
-    #[arg(long, value_name = "ADDR", default_value = "127.0.0.1:8765")]
-    pub(crate) listen: std::net::SocketAddr,
-    #[command(flatten)]
-    pub(crate) viewers: ViewerArgs,
-    /// Speed at first, as a factor of real time.
-    #[arg(long, value_name = "X", default_value_t = 1.0, value_parser = speed)]
-    pub(crate) speed: f32,
-    /// Wait for a viewer's play button; without it playback begins with the first viewer.
-    #[arg(long)]
-    pub(crate) paused: bool,
-}
-
-/// Access of viewers.
-#[derive(Debug, Args)]
-pub(crate) struct ViewerArgs {
-    /// Let a viewer that is a web page look on, beside pages of this machine, as `https://app.foxglove.dev`; repeatable.
-    #[arg(long = "allow-origin", value_name = "URL", value_parser = origin)]
-    pub(crate) allowed_origins: Vec<String>,
-    /// Let other machines look on without the token that is part of the printed address.
-    #[arg(long)]
-    pub(crate) open: bool,
-}
-
-impl ViewerArgs {
-    pub(crate) fn access(&self) -> ViewerAccess {
-        ViewerAccess { allowed_origins: self.allowed_origins.clone(), is_open: self.open }
+    /// Runs the command.
+    pub(crate) async fn run(self) -> anyhow::Result<CommandOutcome> {
+        let lake = &self.lake;
+        match &self.command {
+            #[cfg(feature = "lake")]
+            CliCommand::Lake(command) => command.run(lake).await,
+            CliCommand::Acquire(args) => acquire::run(args, lake).await,
+            CliCommand::Panel(args) => panel::run(args),
+            CliCommand::Replay(args) => replay::run(args, lake).await,
+            CliCommand::Recover(args) => recover::run(args),
+            CliCommand::Doctor(args) => doctor::run(args, lake).await,
+            CliCommand::Completions { shell } => {
+                clap_complete::generate(*shell, &mut Self::command(), "echolake", &mut std::io::stdout());
+                Ok(CommandOutcome::Whole)
+            }
+            CliCommand::Man { folder } => {
+                let written =
+                    std::fs::create_dir_all(folder).and_then(|()| clap_mangen::generate_to(Self::command(), folder));
+                written.with_context(|| format!("cannot write man pages to `{}`", folder.display()))?;
+                Ok(CommandOutcome::Whole)
+            }
+        }
     }
 }
 
-// As browsers spell it.
-fn origin(text: &str) -> Result<String, String> {
-    let origin = text.trim_end_matches('/').to_ascii_lowercase();
-    let is_origin = origin.split_once("://").is_some_and(|(scheme, host)| {
-        !scheme.is_empty() && !host.is_empty() && !host.contains(['/', '?', '#', '@', ' '])
-    });
-    if is_origin { Ok(origin) } else { Err("expected scheme and host, as https://viewer.example:8080".to_owned()) }
-}
-
-fn side(text: &str) -> Result<PanelSide, String> {
-    PanelSide::parse(text).ok_or_else(|| "expected front or back".to_owned())
-}
-
-fn speed(text: &str) -> Result<f32, String> {
-    let speed = text.parse().ok().filter(|x| SPEEDS.contains(x));
-    speed.ok_or_else(|| format!("expected a number from {} to {}", SPEEDS.start(), SPEEDS.end()))
-}
-
-#[derive(Debug, Args)]
-pub(crate) struct DoctorArgs {
-    /// Report what this installation can do instead: pages, audio, formats, disk, ports. The lake's data are not read.
-    #[arg(long = "self")]
-    pub(crate) installation: bool,
-    /// Print the report as JSON.
-    #[arg(long)]
-    pub(crate) json: bool,
+#[cfg(feature = "lake")]
+impl LakeCommand {
+    async fn run(&self, lake: &str) -> anyhow::Result<CommandOutcome> {
+        match self {
+            Self::Demo(args) => demo::run(args, lake).await,
+            Self::Import(args) => import::run(args, lake).await,
+            Self::Ingest(args) => ingest::run(args, lake).await,
+            Self::Sql(args) => sql::run(args, lake).await.map(|()| CommandOutcome::Whole),
+            Self::Export(args) => export::run(args, lake).await,
+            Self::Serve(args) => serve::run(args, lake).await,
+            Self::Engine(args) => serve::engine(args, lake).await,
+            Self::Token { name } => serve::token(name),
+            Self::Optimize(args) => optimize::run(args, lake).await,
+            Self::Vacuum(args) => vacuum::run(args, lake).await,
+        }
+    }
 }

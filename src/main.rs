@@ -1,4 +1,5 @@
 //! The `echolake` command: reads its arguments, runs one verb, and decides the exit code.
+#![allow(clippy::print_stderr, reason = "this is the program that talks to people")]
 
 mod cli;
 mod commands;
@@ -46,8 +47,7 @@ fn main() -> ExitCode {
             .max_blocking_threads(BLOCKING_THREADS)
             .build()
     };
-    let outcome =
-        commands::confine(&cli).and_then(|()| Ok(runtime()?)).and_then(|runtime| runtime.block_on(commands::run(cli)));
+    let outcome = cli.confine().and_then(|()| Ok(runtime()?)).and_then(|runtime| runtime.block_on(cli.run()));
     match outcome {
         Ok(CommandOutcome::Whole) => ExitCode::SUCCESS,
         Ok(CommandOutcome::WithLoss) => ExitCode::from(DONE_WITH_LOSS),

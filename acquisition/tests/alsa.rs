@@ -2,6 +2,7 @@
 //! played ends in a file, what is recorded comes from another; the test is the cable between them.
 //!
 //! libasound finds its configuration by the environment, so the program starts itself once more with that set.
+#![allow(clippy::print_stderr, reason = "it has no harness that would say what was tried")]
 
 #[allow(dead_code, unused_imports, reason = "the tests' helper, of which this wants a part")]
 #[path = "../../tests/child.rs"]

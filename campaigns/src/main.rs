@@ -1,5 +1,6 @@
 //! Long forms of what the tests try in short, and benchmarks: a subcommand each of one program. The test command does
 //! not build it, because no test needs it.
+#![allow(clippy::print_stderr, reason = "a campaign tells how it goes")]
 
 #[path = "../../tests/acquire_kills.rs"]
 mod acquire_kills;

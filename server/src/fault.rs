@@ -235,6 +235,14 @@ impl RequestFault {
         Self::Unsupported { what: what.into() }
     }
 
+    /// Turns the cause of a defect into [`RequestFault::Internal`], and writes it to the log: `what` failed.
+    pub(crate) fn defect<E: std::error::Error + 'static>(what: &'static str) -> impl Fn(E) -> Self + Copy {
+        move |cause| {
+            tracing::error!(error = &cause as &dyn std::error::Error, "{what}");
+            Self::Internal
+        }
+    }
+
     /// Writes it to the log: as a warning if the client is not to blame for it, else for debugging, because its text may
     /// quote a statement.
     pub(crate) fn log(&self) {

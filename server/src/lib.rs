@@ -17,6 +17,7 @@ mod catalogue_pages;
 mod client_identity;
 mod door;
 pub mod engine;
+mod engine_socket;
 mod error;
 mod fault;
 mod flight;

@@ -133,10 +133,7 @@ pub(crate) async fn finish(task: &mut JoinSet<Result<(), RequestFault>>) -> Resu
     match task.join_next().await {
         None => Ok(()),
         Some(Ok(done)) => done,
-        Some(Err(failed)) => {
-            tracing::error!(error = &failed as &dyn std::error::Error, "a query ended its task");
-            Err(RequestFault::Internal)
-        }
+        Some(Err(failed)) => Err(RequestFault::defect("a query ended its task")(failed)),
     }
 }
 

@@ -185,10 +185,7 @@ impl QueryService {
         };
         let handle = self.0.encoders.handle().map(|threads| threads.spawn_blocking(work));
         let Some(handle) = handle else { return Err(RequestFault::Internal) };
-        handle.await.map_err(|failed| {
-            tracing::error!(error = &failed as &dyn std::error::Error, "computing ended its task");
-            RequestFault::Internal
-        })
+        handle.await.map_err(RequestFault::defect("computing ended its task"))
     }
 
     /// Begins a query; its columns are known when this returns.

@@ -218,10 +218,9 @@ impl TokenAccess {
             let hint = "this server has no tokens, ask right away";
             return Err(RequestFault::NotFound { what: "a session".to_owned(), hint });
         };
-        sessions.begin(tokens.find(token).ok_or(RequestFault::Unauthenticated)?).map_err(|failed| {
-            tracing::error!(error = &failed as &dyn std::error::Error, "no session can begin");
-            RequestFault::Internal
-        })
+        sessions
+            .begin(tokens.find(token).ok_or(RequestFault::Unauthenticated)?)
+            .map_err(RequestFault::defect("no session can begin"))
     }
 
     /// Returns the client of the session with this secret; as [`TokenAccess::client`].

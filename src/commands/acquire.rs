@@ -19,11 +19,80 @@ use echolake_lake::{Lake, ReferenceSurfaces};
 use echolake_schema::{Rig, SurfaceId, Timestamp};
 
 use crate::CommandOutcome;
-use crate::cli::AcquireArgs;
+use crate::commands::replay::ViewerArgs;
 use crate::progress::CommandProgress;
 use acknowledge::AcknowledgementWriter;
+use clap::Args;
+use echolake_acquisition::panel::mesh::PanelSide;
 pub(super) use specimen::{relief_of_file, set_all};
 use watch::RunWatcher;
+
+#[derive(Debug, Args)]
+pub(crate) struct AcquireArgs {
+    /// Name of the measured surface, as 0015_0.
+    #[arg(long, required_unless_present = "resume")]
+    pub(crate) surface: Option<SurfaceId>,
+    /// Go on with a run that was stopped or cut off: its `.mcap.partial`. What is safe in it is not measured again.
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["surface", "panel", "parameters", "set", "mesh", "side", "rig", "flat", "foam", "seed", "ir_only"])]
+    pub(crate) resume: Option<PathBuf>,
+    /// Relief for the simulated rig, by a name of `echolake panel --list`; by default the one that the surface's name
+    /// begins with.
+    #[arg(long, value_name = "NAME", conflicts_with = "mesh")]
+    pub(crate) panel: Option<String>,
+    /// A JSON file of parameters, as `echolake panel` writes them, in place of a name.
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["mesh", "panel"])]
+    pub(crate) parameters: Option<PathBuf>,
+    /// A parameter of it.
+    #[arg(long, value_name = "KEY=VALUE")]
+    pub(crate) set: Vec<String>,
+    /// A mesh to measure instead: GLB or STL.
+    #[arg(long)]
+    pub(crate) mesh: Option<PathBuf>,
+    /// The side of the mesh that is measured: the back is seen when the panel is turned over about its y axis.
+    #[arg(long, value_name = "front|back", value_parser = side, requires = "mesh")]
+    pub(crate) side: Option<PanelSide>,
+    /// The rig; by default the lake's, or that of the paper for a new lake.
+    #[arg(long)]
+    pub(crate) rig: Option<PathBuf>,
+    /// Surface that normalises this one, where it is not the lake's.
+    #[arg(long)]
+    pub(crate) flat: Option<SurfaceId>,
+    /// Surface whose direct sound is subtracted from this one, where it is not the lake's.
+    #[arg(long)]
+    pub(crate) foam: Option<SurfaceId>,
+    /// Seed of the simulation.
+    #[arg(long, default_value_t = 1)]
+    pub(crate) seed: u64,
+    /// Record no sweeps, only impulse responses.
+    #[arg(long)]
+    pub(crate) ir_only: bool,
+    /// Pairs between two checkpoints: what a power cut costs at most, and how late a pair is told to be safe. By default 1
+    /// on a real rig, 200 on the simulated one.
+    #[arg(long, value_name = "PAIRS", value_parser = clap::value_parser!(u32).range(1..))]
+    pub(crate) checkpoint_every: Option<u32>,
+    /// Seconds that a simulated take lasts at least; a real rig's are 12.3.
+    #[arg(long, value_name = "SECS", default_value_t = 0.0)]
+    pub(crate) pace: f64,
+    /// Begin even where disk, sensor, level or loopback are not fit.
+    #[arg(long)]
+    pub(crate) skip_checks: bool,
+    /// Append a line to this file for every attempt once it is safe on the disk: pair, attempt, verdict, SNR in dB.
+    /// `-` is stdout.
+    #[arg(long, value_name = "FILE")]
+    pub(crate) acknowledge: Option<PathBuf>,
+    /// Show the run as it happens to Foxglove and Lichtblick, which open ws://ADDR.
+    #[arg(long, value_name = "ADDR")]
+    pub(crate) live: Option<std::net::SocketAddr>,
+    #[command(flatten)]
+    pub(crate) viewers: ViewerArgs,
+    /// Serve metrics for Prometheus under http://ADDR/metrics.
+    #[arg(long, value_name = "ADDR")]
+    pub(crate) metrics: Option<std::net::SocketAddr>,
+}
+
+fn side(text: &str) -> Result<PanelSide, String> {
+    PanelSide::parse(text).ok_or_else(|| "expected front or back".to_owned())
+}
 
 /// A run to begin or to resume.
 enum AcquireJob {

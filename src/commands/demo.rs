@@ -14,10 +14,35 @@ use echolake_query::Session;
 use echolake_schema::Rig;
 
 use crate::CommandOutcome;
-use crate::cli::DemoArgs;
 use crate::progress::CommandProgress;
 use crate::signals::StopRequest;
+use clap::Args;
+use echolake_acquisition::panel::collection::LARGEST;
 use measure::DemoCampaign;
+use std::path::PathBuf;
+
+#[derive(Debug, Args)]
+pub(crate) struct DemoArgs {
+    /// Measure this many surfaces instead: the references, then panels of every typology with random parameters.
+    /// Those that are measured already are not measured again.
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=LARGEST as i64))]
+    pub(crate) surfaces: Option<u32>,
+    /// Record no sweeps, only impulse responses: a tenth of the space.
+    #[arg(long)]
+    pub(crate) ir_only: bool,
+    /// Do not serve the catalogue afterwards.
+    #[arg(long)]
+    pub(crate) no_serve: bool,
+    /// Leave the runs in the lake's inbox/.
+    #[arg(long, hide = true)]
+    pub(crate) no_ingest: bool,
+    /// The rig; by default that of the paper with sweeps of 0.05 s.
+    #[arg(long)]
+    pub(crate) rig: Option<PathBuf>,
+    /// Seed of the simulation: the same seed gives the same data.
+    #[arg(long, default_value_t = 1)]
+    pub(crate) seed: u64,
+}
 
 /// The surfaces, in the order in which they are measured: name and relief are the same.
 const SURFACES: [&str; 6] = ["flat", "foam", "wood", "prd", "river_rock", "macrostructure"];

@@ -5,7 +5,17 @@ mod installation;
 mod lake;
 
 use crate::CommandOutcome;
-use crate::cli::DoctorArgs;
+use clap::Args;
+
+#[derive(Debug, Args)]
+pub(crate) struct DoctorArgs {
+    /// Report what this installation can do instead: pages, audio, formats, disk, ports. The lake's data are not read.
+    #[arg(long = "self")]
+    pub(crate) installation: bool,
+    /// Print the report as JSON.
+    #[arg(long)]
+    pub(crate) json: bool,
+}
 
 pub(crate) async fn run(args: &DoctorArgs, lake_url: &str) -> anyhow::Result<CommandOutcome> {
     if args.installation {

@@ -8,8 +8,41 @@ use echolake_lake::{Lake, ReferenceSurfaces};
 use echolake_schema::{Celsius, Rig, Timestamp};
 
 use crate::CommandOutcome;
-use crate::cli::ImportCommand;
 use crate::progress::{CommandProgress, TaskProgress};
+use clap::Subcommand;
+use std::path::PathBuf;
+
+#[derive(Debug, Subcommand)]
+pub(crate) enum ImportCommand {
+    /// Recordings and loopbacks as WAV files, listed in a CSV manifest.
+    Wav {
+        /// The manifest.
+        manifest: PathBuf,
+        /// The rig that made them: sweep range, response length, bands, grid.
+        #[arg(long)]
+        rig: Option<PathBuf>,
+    },
+    /// A folder of the published GIR data set.
+    Gir {
+        /// The folder.
+        folder: PathBuf,
+        /// The rig; by default the lake's, or the paper's with responses of 400 samples for a new lake.
+        #[arg(long)]
+        rig: Option<PathBuf>,
+    },
+    /// Responses as SOFA files (SingleRoomSRIR), one a surface.
+    Sofa {
+        /// The files.
+        #[arg(required = true, value_name = "FILE")]
+        files: Vec<PathBuf>,
+        /// The rig; by default the lake's, or the paper's for a new lake.
+        #[arg(long)]
+        rig: Option<PathBuf>,
+        /// Temperature of files that do not tell it.
+        #[arg(long, value_name = "C", allow_negative_numbers = true)]
+        temperature_c: Option<f64>,
+    },
+}
 
 pub(crate) async fn run(args: &ImportCommand, lake_url: &str) -> anyhow::Result<CommandOutcome> {
     let rig = match args {

@@ -20,11 +20,26 @@ use object_store::path::Path as ObjectPath;
 use serde::{Deserialize, Serialize};
 
 use crate::CommandOutcome;
-use crate::cli::IngestArgs;
 use crate::error_text::describe_error;
 use crate::logging::child_variable;
 use crate::progress::CommandProgress;
 use crate::signals::StopRequest;
+use clap::Args;
+
+#[derive(Debug, Args)]
+pub(crate) struct IngestArgs {
+    /// Run files, or names of runs in the lake; by default all that are not in the tables yet.
+    pub(crate) runs: Vec<String>,
+    /// Go on: take in what comes into the lake's inbox, until Ctrl-C.
+    #[arg(long, conflicts_with_all = ["runs", "json"])]
+    pub(crate) watch: bool,
+    /// Print what was done as JSON.
+    #[arg(long)]
+    pub(crate) json: bool,
+    /// Take in this file of the lake alone, for the ingest that started this one.
+    #[arg(long, hide = true, value_name = "PATH", conflicts_with_all = ["runs", "watch", "json"])]
+    pub(crate) suspect: Option<String>,
+}
 
 /// Time between two looks at the inbox.
 const LOOK_EVERY: Duration = Duration::from_secs(2);

@@ -1,91 +1,37 @@
-//! The verbs, one file each.
+//! The commands, one file each: their arguments, and what they do.
 
-mod acquire;
+pub(crate) mod acquire;
 #[cfg(feature = "lake")]
-mod demo;
-mod doctor;
+pub(crate) mod demo;
+pub(crate) mod doctor;
 #[cfg(feature = "lake")]
 pub(crate) mod export;
 #[cfg(feature = "lake")]
-mod import;
+pub(crate) mod import;
 #[cfg(feature = "lake")]
-mod ingest;
+pub(crate) mod ingest;
 #[cfg(feature = "lake")]
-mod optimize;
+pub(crate) mod optimize;
 pub(crate) mod panel;
-mod recover;
-mod replay;
+pub(crate) mod recover;
+pub(crate) mod replay;
 #[cfg(feature = "lake")]
 pub(crate) mod serve;
 #[cfg(feature = "lake")]
 pub(crate) mod sql;
 #[cfg(feature = "lake")]
-mod vacuum;
+pub(crate) mod vacuum;
 
 use std::net::SocketAddr;
 use std::path::Path;
 
 use anyhow::Context as _;
-use clap::CommandFactory as _;
 use echolake_lake::{Error as LakeError, Lake};
 use echolake_schema::Rig;
 
-use crate::CommandOutcome;
-#[cfg(feature = "lake")]
-use crate::cli::LakeCommand;
-use crate::cli::{CliArguments, CliCommand, ViewerArgs};
 use crate::progress::CommandProgress;
 use crate::signals::StopRequest;
-
-/// Gives up what the command's verb does not need. To be called before there are threads.
-pub(crate) fn confine(cli: &CliArguments) -> anyhow::Result<()> {
-    match &cli.command {
-        #[cfg(feature = "lake")]
-        CliCommand::Lake(LakeCommand::Engine(args)) => args.confine(),
-        _ => Ok(()),
-    }
-}
-
-/// Runs the command's verb.
-pub(crate) async fn run(cli: CliArguments) -> anyhow::Result<CommandOutcome> {
-    let lake = &cli.lake;
-    match &cli.command {
-        #[cfg(feature = "lake")]
-        CliCommand::Lake(command) => run_lake(command, lake).await,
-        CliCommand::Acquire(args) => acquire::run(args, lake).await,
-        CliCommand::Panel(args) => panel::run(args),
-        CliCommand::Replay(args) => replay::run(args, lake).await,
-        CliCommand::Recover(args) => recover::run(args),
-        CliCommand::Doctor(args) => doctor::run(args, lake).await,
-        CliCommand::Completions { shell } => {
-            clap_complete::generate(*shell, &mut CliArguments::command(), "echolake", &mut std::io::stdout());
-            Ok(CommandOutcome::Whole)
-        }
-        CliCommand::Man { folder } => {
-            let written = std::fs::create_dir_all(folder)
-                .and_then(|()| clap_mangen::generate_to(CliArguments::command(), folder));
-            written.with_context(|| format!("cannot write man pages to `{}`", folder.display()))?;
-            Ok(CommandOutcome::Whole)
-        }
-    }
-}
-
-/// Runs a verb that needs the lake's tables.
-#[cfg(feature = "lake")]
-async fn run_lake(command: &LakeCommand, lake: &str) -> anyhow::Result<CommandOutcome> {
-    match command {
-        LakeCommand::Demo(args) => demo::run(args, lake).await,
-        LakeCommand::Import(args) => import::run(args, lake).await,
-        LakeCommand::Ingest(args) => ingest::run(args, lake).await,
-        LakeCommand::Sql(args) => sql::run(args, lake).await.map(|()| CommandOutcome::Whole),
-        LakeCommand::Export(args) => export::run(args, lake).await,
-        LakeCommand::Serve(args) => serve::run(args, lake).await,
-        LakeCommand::Engine(args) => serve::engine(args, lake).await,
-        LakeCommand::Token { name } => serve::token(name),
-        LakeCommand::Optimize(args) => optimize::run(args, lake).await,
-        LakeCommand::Vacuum(args) => vacuum::run(args, lake).await,
-    }
-}
+use replay::ViewerArgs;
 
 /// Writes text and a line break to stdout; a closed pipe is an error that `main` takes for success.
 fn print(text: &str) -> std::io::Result<()> {

@@ -6,7 +6,20 @@ use anyhow::ensure;
 use echolake_acquisition::recovery::{Report, beside, recover};
 
 use crate::CommandOutcome;
-use crate::cli::RecoverArgs;
+use clap::Args;
+use std::path::PathBuf;
+
+#[derive(Debug, Args)]
+pub(crate) struct RecoverArgs {
+    /// The recording that was cut off or damaged; it is only read.
+    pub(crate) file: PathBuf,
+    /// Path of the rebuilt file; by default beside it, without `.partial`.
+    #[arg(short, long, value_name = "FILE")]
+    pub(crate) output: Option<PathBuf>,
+    /// Print what was done as JSON.
+    #[arg(long)]
+    pub(crate) json: bool,
+}
 
 pub(crate) fn run(args: &RecoverArgs) -> anyhow::Result<CommandOutcome> {
     let to = args.output.clone().unwrap_or_else(|| beside(&args.file));

@@ -11,8 +11,59 @@ use echolake_lake::Lake;
 use echolake_schema::{RunId, SurfaceId};
 
 use crate::CommandOutcome;
-use crate::cli::ReplayArgs;
 use crate::progress::{CommandProgress, TaskProgress};
+use clap::Args;
+use echolake_acquisition::ViewerAccess;
+use echolake_acquisition::replay::SPEEDS;
+
+#[derive(Debug, Args)]
+pub(crate) struct ReplayArgs {
+    /// Names of runs, surfaces (of each its newest run), or .mcap files; they are shown one after the other.
+    #[arg(required = true, value_name = "RUN")]
+    pub(crate) runs: Vec<String>,
+    /// Address to listen on.
+    #[arg(long, value_name = "ADDR", default_value = "127.0.0.1:8765")]
+    pub(crate) listen: std::net::SocketAddr,
+    #[command(flatten)]
+    pub(crate) viewers: ViewerArgs,
+    /// Speed at first, as a factor of real time.
+    #[arg(long, value_name = "X", default_value_t = 1.0, value_parser = speed)]
+    pub(crate) speed: f32,
+    /// Wait for a viewer's play button; without it playback begins with the first viewer.
+    #[arg(long)]
+    pub(crate) paused: bool,
+}
+
+/// Access of viewers.
+#[derive(Debug, Args)]
+pub(crate) struct ViewerArgs {
+    /// Let a viewer that is a web page look on, beside pages of this machine, as `https://app.foxglove.dev`; repeatable.
+    #[arg(long = "allow-origin", value_name = "URL", value_parser = origin)]
+    pub(crate) allowed_origins: Vec<String>,
+    /// Let other machines look on without the token that is part of the printed address.
+    #[arg(long)]
+    pub(crate) open: bool,
+}
+
+impl ViewerArgs {
+    pub(crate) fn access(&self) -> ViewerAccess {
+        ViewerAccess { allowed_origins: self.allowed_origins.clone(), is_open: self.open }
+    }
+}
+
+// As browsers spell it.
+fn origin(text: &str) -> Result<String, String> {
+    let origin = text.trim_end_matches('/').to_ascii_lowercase();
+    let is_origin = origin.split_once("://").is_some_and(|(scheme, host)| {
+        !scheme.is_empty() && !host.is_empty() && !host.contains(['/', '?', '#', '@', ' '])
+    });
+    if is_origin { Ok(origin) } else { Err("expected scheme and host, as https://viewer.example:8080".to_owned()) }
+}
+
+fn speed(text: &str) -> Result<f32, String> {
+    let speed = text.parse().ok().filter(|x| SPEEDS.contains(x));
+    speed.ok_or_else(|| format!("expected a number from {} to {}", SPEEDS.start(), SPEEDS.end()))
+}
 
 /// Time between two looks at the state of the replay.
 const LOOK_EVERY: Duration = Duration::from_millis(200);

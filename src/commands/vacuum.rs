@@ -4,8 +4,23 @@ use chrono::TimeDelta;
 use echolake_lake::{DeletionMode, Lake};
 
 use crate::CommandOutcome;
-use crate::cli::VacuumArgs;
 use crate::progress::CommandProgress;
+use clap::Args;
+use echolake_lake::KEEP_HOURS;
+
+#[derive(Debug, Args)]
+pub(crate) struct VacuumArgs {
+    /// Keep files that went out of their table less than this long ago: longer than any query runs. 168 at most,
+    /// because a table's log forgets after a week when that was.
+    #[arg(long, value_name = "HOURS", default_value_t = KEEP_HOURS, value_parser = clap::value_parser!(u32).range(0..=KEEP_HOURS as i64))]
+    pub(crate) keep_hours: u32,
+    /// Only say what would be deleted.
+    #[arg(long)]
+    pub(crate) dry_run: bool,
+    /// Print what was done as JSON.
+    #[arg(long)]
+    pub(crate) json: bool,
+}
 
 pub(crate) async fn run(args: &VacuumArgs, lake_url: &str) -> anyhow::Result<CommandOutcome> {
     let lake = Lake::open(lake_url).await?;

@@ -10,8 +10,7 @@ use std::time::{Duration, Instant};
 use echolake_lake::Lake;
 use tokio::sync::Notify;
 
-use super::EngineSettings;
-use super::engine_process::{EndReason, EngineLease, EngineProcess, EngineStart};
+use super::engine_process::{EndReason, EngineLease, EngineProcess, EngineSettings, EngineStart};
 use super::temp_folder::ServerFolders;
 use crate::Error;
 use crate::client_identity::ClientIdentity;
@@ -99,10 +98,7 @@ impl EnginePool {
         self.count_end(&own, &mut state).await;
         tokio::time::sleep(state.backoff()).await;
         self.make_room(&own).await?;
-        let engine = self.take_spare().map_err(|failed| {
-            tracing::error!(error = &failed as &dyn std::error::Error, "no engine can be started");
-            RequestFault::Internal
-        })?;
+        let engine = self.take_spare().map_err(RequestFault::defect("no engine can be started"))?;
         if let Err(EndReason::Failed(reason)) = engine.assign(client).await {
             state.ends += 1;
             state.last_end = Some(Instant::now());

@@ -14,14 +14,29 @@ use tokio::net::UnixStream;
 use tokio::process::{Child, ChildStdin, ChildStdout, Command};
 use tokio::sync::{Notify, SetOnce};
 
-use super::EngineSettings;
 use crate::client_identity::{ClientIdentity, counted_bytes};
-use crate::engine::EngineSocket;
 use crate::engine::report::EngineReport;
+use crate::engine_socket::EngineSocket;
 use crate::metrics::ServerMetrics;
 
 /// Time for which a request that lost its engine waits for the reason.
 const REASON_WAIT: Duration = Duration::from_secs(2);
+
+/// The engines' program and their limits.
+#[derive(Debug, Clone)]
+pub struct EngineSettings {
+    /// The program that has the command `engine`.
+    pub program: PathBuf,
+    /// Bytes of memory that queries may hold, those of one client as those of all together; if they hold more, the
+    /// largest engine ends.
+    pub memory: usize,
+    /// Engines at once, which is clients at once.
+    pub count: usize,
+    /// Variables of their environment beside the server's own.
+    pub environment: Vec<(String, String)>,
+    /// The folder for temporary files; None for one in the lake.
+    pub temp: Option<PathBuf>,
+}
 
 /// The reason for which an engine ended.
 #[derive(Debug, Clone, PartialEq, Eq)]

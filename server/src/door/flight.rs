@@ -15,10 +15,10 @@ use tokio::sync::watch;
 use tokio::task::JoinSet;
 use tracing::Instrument as _;
 
-use super::ServerDoor;
 use super::connection_places::{ConnectionPlaces, PlaceWork, PlacedStream};
 use super::forward::EngineProtocol;
 use crate::client_identity::ClientIdentity;
+use crate::door::server_door::ServerDoor;
 use crate::fault::RequestFault;
 use crate::flight::{WINDOW_BYTES, status};
 use crate::metrics::ServerProtocol;

@@ -22,7 +22,7 @@ use super::connection_places::{PlaceWork, WorkingPlace};
 use super::engine_pool::EnginePool;
 use super::engine_process::{EndReason, EngineLease, EngineProcess};
 use crate::client_identity::ClientIdentity;
-use crate::engine::EngineSocket;
+use crate::engine_socket::EngineSocket;
 use crate::fault::RequestFault;
 use crate::flight::WINDOW_BYTES;
 

@@ -17,10 +17,10 @@ use tokio::sync::watch;
 use tokio::task::JoinSet;
 use tracing::Instrument as _;
 
-use super::ServerDoor;
 use super::connection_places::{ConnectionPlaces, PlaceWork, PlacedStream};
 use super::forward::EngineProtocol;
 use crate::client_identity::ClientIdentity;
+use crate::door::server_door::ServerDoor;
 use crate::fault::RequestFault;
 use crate::http::{ProblemResponse, RequestSite, authenticate, door_router, request_site};
 use crate::metrics::ServerProtocol;

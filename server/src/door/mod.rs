@@ -8,11 +8,10 @@ mod flight;
 mod forward;
 mod http;
 mod postgres;
+pub(crate) mod server_door;
 mod temp_folder;
 
 use std::net::SocketAddr;
-use std::path::PathBuf;
-use std::sync::Arc;
 use std::time::Duration;
 
 use echolake_lake::Lake;
@@ -21,9 +20,9 @@ use tokio::sync::watch;
 use tokio::task::JoinSet;
 
 use crate::Error;
-use crate::metrics::ServerMetrics;
-use crate::tokens::{TokenAccess, TokenFile};
-use engine_pool::EnginePool;
+use crate::tokens::TokenFile;
+pub use engine_process::EngineSettings;
+use server_door::ServerDoor;
 
 /// Time for which answers may continue after the server was asked to stop.
 const GRACE: Duration = Duration::from_secs(5);
@@ -43,22 +42,6 @@ pub struct ServerSettings {
     pub tokens: Option<TokenFile>,
     /// The engines.
     pub engines: EngineSettings,
-}
-
-/// The engines' program and their limits.
-#[derive(Debug, Clone)]
-pub struct EngineSettings {
-    /// The program that has the command `engine`.
-    pub program: PathBuf,
-    /// Bytes of memory that queries may hold, those of one client as those of all together; if they hold more, the
-    /// largest engine ends.
-    pub memory: usize,
-    /// Engines at once, which is clients at once.
-    pub count: usize,
-    /// Variables of their environment beside the server's own.
-    pub environment: Vec<(String, String)>,
-    /// The folder for temporary files; None for one in the lake.
-    pub temp: Option<PathBuf>,
 }
 
 /// A server that listens and does not answer yet.
@@ -111,7 +94,7 @@ impl LakeServer {
         let stopping = watch::Sender::new(false);
         let mut tasks = JoinSet::new();
         let mut upkeep = JoinSet::new();
-        upkeep.spawn(self.door.0.engines.clone().keep_up());
+        upkeep.spawn(self.door.engines().clone().keep_up());
         if let Some(listener) = self.http {
             tasks.spawn(http::serve(self.door.clone(), listener, stopping.subscribe()));
         }
@@ -129,7 +112,7 @@ impl LakeServer {
         let rest = async { while tasks.join_next().await.is_some() {} };
         // What is not done by then ends with the process.
         let _ = tokio::time::timeout(GRACE, rest).await;
-        self.door.0.engines.end_all().await;
+        self.door.engines().end_all().await;
         Ok(())
     }
 }
@@ -148,39 +131,4 @@ fn bind(address: SocketAddr) -> std::io::Result<TcpListener> {
     socket.set_recv_buffer_size(RECEIVED_BYTES)?;
     socket.bind(address)?;
     socket.listen(BACKLOG)
-}
-
-/// State shared by all connections.
-#[derive(Clone)]
-pub(crate) struct ServerDoor(Arc<DoorState>);
-
-struct DoorState {
-    access: TokenAccess,
-    metrics: Arc<ServerMetrics>,
-    engines: EnginePool,
-}
-
-impl ServerDoor {
-    fn new(lake: &Lake, tokens: Option<TokenFile>, settings: EngineSettings) -> Result<Self, Error> {
-        let metrics = Arc::new(ServerMetrics::default());
-        let engines = EnginePool::new(lake, settings, metrics.clone())?;
-        Ok(Self(Arc::new(DoorState { access: TokenAccess::new(tokens), metrics, engines })))
-    }
-
-    pub(crate) fn access(&self) -> &TokenAccess {
-        &self.0.access
-    }
-
-    pub(crate) fn metrics(&self) -> &ServerMetrics {
-        &self.0.metrics
-    }
-
-    /// The figures of the door and of all engines, in Prometheus' text format.
-    pub(crate) fn figures(&self) -> String {
-        self.0.metrics.text() + &self.0.engines.figures()
-    }
-
-    fn engines(&self) -> &EnginePool {
-        &self.0.engines
-    }
 }

@@ -6,45 +6,22 @@ pub(crate) mod report;
 mod watchdog;
 
 use std::io::BufRead as _;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::sync::Arc;
 
 use echolake_lake::Lake;
 use echolake_query::{EngineClient, EngineLimits, QueryEngine, QueryQuota};
 use futures::FutureExt as _;
-use tokio::net::UnixListener;
 use tokio::sync::oneshot;
 
 use crate::client_identity::ClientIdentity;
+use crate::engine_socket::EngineSocket;
 use crate::service::QueryService;
 use crate::{Error, flight, http, postgres};
 use report::EngineReport;
 
 /// A query that has a new engine read what every query reads.
 const WARM_UP: &str = "select count(*) from runs";
-
-/// A protocol, as an engine's sockets are named.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum EngineSocket {
-    Http,
-    FlightSql,
-    Postgres,
-}
-
-impl EngineSocket {
-    /// The path of this socket in an engine's folder.
-    pub(crate) fn path(self, folder: &Path) -> PathBuf {
-        folder.join(match self {
-            Self::Http => "http",
-            Self::FlightSql => "flight",
-            Self::Postgres => "postgres",
-        })
-    }
-
-    fn listen(self, folder: &Path) -> Result<UnixListener, Error> {
-        UnixListener::bind(self.path(folder)).map_err(Error::System)
-    }
-}
 
 /// Answers one client's requests until standard input ends, which the door holds.
 ///

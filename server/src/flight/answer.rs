@@ -32,10 +32,7 @@ impl AnswerEncoder for AnnouncedColumns {
     type Item = RecordBatch;
 
     fn batch(&mut self, batch: RecordBatch) -> Result<Vec<RecordBatch>, RequestFault> {
-        let wrong = |e: ArrowError| {
-            tracing::error!(error = &e as &dyn std::error::Error, "an answer does not have the announced columns");
-            RequestFault::Internal
-        };
+        let wrong = RequestFault::defect::<ArrowError>("an answer does not have the announced columns");
         let columns = batch.columns().iter().zip(self.0.fields()).map(|(column, field)| {
             if column.data_type() == field.data_type() { Ok(column.clone()) } else { cast(column, field.data_type()) }
         });

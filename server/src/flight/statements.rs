@@ -53,10 +53,7 @@ impl HeldStatements {
     /// Keeps a statement.
     pub(super) fn keep(&self, statement: HeldStatement) -> Result<Bytes, RequestFault> {
         let mut handle = StatementHandle::default();
-        getrandom::fill(&mut handle).map_err(|failed| {
-            tracing::error!(error = &failed as &dyn std::error::Error, "no random bytes");
-            RequestFault::Internal
-        })?;
+        getrandom::fill(&mut handle).map_err(RequestFault::defect("no random bytes"))?;
         let sql = Some(statement.sql.clone()).filter(|sql| sql.len() <= CARRIED_BYTES);
         let whole = [&handle, sql.as_deref().unwrap_or_default().as_bytes()].concat();
         self.insert(handle, statement);

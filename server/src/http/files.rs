@@ -143,7 +143,7 @@ impl RangedFile {
                 RequestFault::Gone { what: "this file", hint: "ask for the list of files again" }
             }
             other => {
-                eprintln!("a file cannot be read: {other}");
+                tracing::warn!(error = &other as &dyn std::error::Error, "a file cannot be read");
                 RequestFault::Unreadable
             }
         };
@@ -158,7 +158,9 @@ impl RangedFile {
                 let range = Some(GetRange::Bounded(part.range.clone()));
                 let found = store.get_opts(&self.path, GetOptions { range, ..GetOptions::default() }).await;
                 let stream = found.map_err(unread)?.into_stream();
-                Body::from_stream(stream.inspect_err(|e| eprintln!("a file broke off: {e}")))
+                Body::from_stream(stream.inspect_err(|e| {
+                    tracing::warn!(error = e as &dyn std::error::Error, "a file broke off");
+                }))
             }
         };
         Ok(self.described.part(&part, body))

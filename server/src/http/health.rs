@@ -10,7 +10,7 @@ use utoipa::ToSchema;
 use super::guard::authenticate;
 use super::problem::ProblemResponse;
 use crate::client_identity::ClientIdentity;
-use crate::door::ServerDoor;
+use crate::door::server_door::ServerDoor;
 use crate::tokens::TokenScope;
 
 /// The state of the server.

@@ -31,7 +31,7 @@ use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
 use crate::Error;
-use crate::door::ServerDoor;
+use crate::door::server_door::ServerDoor;
 use crate::fault::RequestFault;
 use crate::request_span::trace_request;
 use crate::service::QueryService;

@@ -10,7 +10,7 @@ use utoipa::ToSchema;
 
 use super::guard::COOKIE;
 use super::problem::ProblemResponse;
-use crate::door::ServerDoor;
+use crate::door::server_door::ServerDoor;
 use crate::fault::RequestFault;
 use crate::sessions::LIFETIME;
 

@@ -122,10 +122,7 @@ impl PostgresConnection {
     /// Logs a client in; returns what a CancelRequest must show. `wide` keys are of protocol 3.2.
     pub(super) fn log_in(&self, client: &Arc<EngineClient>, wide: bool) -> Result<(i32, SecretKey), RequestFault> {
         let mut secret = [0; 32];
-        getrandom::fill(&mut secret).map_err(|failed| {
-            tracing::error!(error = &failed as &dyn std::error::Error, "no random bytes");
-            RequestFault::Internal
-        })?;
+        getrandom::fill(&mut secret).map_err(RequestFault::defect("no random bytes"))?;
         let pid = self.shared.next_pid.fetch_add(1, Ordering::Relaxed);
         let key = match wide {
             true => SecretKey::Bytes(Bytes::copy_from_slice(&secret)),

@@ -8,7 +8,7 @@ use echolake_acquisition::panel::relief::PanelRelief;
 use echolake_acquisition::run::PanelSpecimen;
 use echolake_schema::SurfaceId;
 
-use crate::cli::AcquireArgs;
+use super::AcquireArgs;
 
 /// Returns the specimen that the arguments name.
 pub(super) fn of(args: &AcquireArgs) -> anyhow::Result<PanelSpecimen> {

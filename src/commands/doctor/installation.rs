@@ -5,11 +5,13 @@ use std::env::consts::{ARCH, OS};
 use std::fmt::Write as _;
 use std::fs::{self, File};
 use std::io;
+#[cfg(feature = "lake")]
 use std::net::{SocketAddr, TcpListener};
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-use clap::CommandFactory as _;
+#[cfg(feature = "lake")]
+use clap::Args as _;
 use echolake_acquisition::disk::free_bytes;
 use echolake_lake::{Error as LakeError, LAKE_FORMAT, Lake};
 #[cfg(feature = "lake")]
@@ -17,7 +19,8 @@ use echolake_server::CataloguePages;
 use serde::Serialize;
 
 use crate::CommandOutcome;
-use crate::cli::CliArguments;
+#[cfg(feature = "lake")]
+use crate::commands::serve::ServeArgs;
 use crate::commands::{print, size};
 
 /// Versions of what reads and writes the lake's files, and of all else that was compiled in.
@@ -90,6 +93,7 @@ async fn examine_installation(lake_url: &str) -> InstallationReport {
     let mut facts = vec![pages(), audio(), formats(), system(), processor(), memory()];
     facts.extend(lake(lake_url).await);
     facts.push(temporary_files(&env::temp_dir()));
+    #[cfg(feature = "lake")]
     facts.extend(ports());
     InstallationReport {
         version: env!("CARGO_PKG_VERSION"),
@@ -278,16 +282,17 @@ fn try_files_in(scratch: &Path) -> Result<(), (&'static str, io::Error)> {
 }
 
 /// The ports that `serve` listens on by default.
+#[cfg(feature = "lake")]
 fn ports() -> Vec<InstallationFact> {
-    let cli = CliArguments::command();
-    let arguments = cli.find_subcommand("serve").into_iter().flat_map(clap::Command::get_arguments);
-    let defaults = arguments.filter_map(|argument| {
+    let serve = ServeArgs::augment_args(clap::Command::new("serve"));
+    let defaults = serve.get_arguments().filter_map(|argument| {
         let address: SocketAddr = argument.get_default_values().first()?.to_str()?.parse().ok()?;
         Some((argument.get_long()?.to_owned(), address))
     });
     defaults.map(|(option, address)| port(&option, address)).collect()
 }
 
+#[cfg(feature = "lake")]
 fn port(option: &str, address: SocketAddr) -> InstallationFact {
     let name = format!("port {}", address.port());
     match TcpListener::bind(address) {

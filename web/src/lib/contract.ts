@@ -834,7 +834,11 @@ export interface components {
         };
         /** @description A query. */
         readonly Query: {
-            readonly format?: ("json" | "arrow" | "csv" | "parquet") & Record<string, never>;
+            /**
+             * @description Instead of the Accept header.
+             * @enum {string}
+             */
+            readonly format?: "json" | "arrow" | "csv" | "parquet";
             readonly query: string;
         };
         /** @description A run. */
@@ -1340,7 +1344,7 @@ export interface operations {
         readonly parameters: {
             readonly query?: never;
             readonly header?: {
-                readonly Range?: string | null;
+                readonly Range?: string;
             };
             readonly path: {
                 readonly run_id: string;
@@ -1420,7 +1424,7 @@ export interface operations {
                 readonly id?: string;
             };
             readonly header?: {
-                readonly Range?: string | null;
+                readonly Range?: string;
             };
             readonly path?: never;
             readonly cookie?: never;
@@ -1430,6 +1434,7 @@ export interface operations {
             /** @description The slice */
             readonly 200: {
                 headers: {
+                    readonly ETag?: string;
                     readonly [name: string]: unknown;
                 };
                 content: {
@@ -1459,7 +1464,6 @@ export interface operations {
     readonly sql: {
         readonly parameters: {
             readonly query?: {
-                /** @description Instead of the Accept header. */
                 readonly format?: "json" | "arrow" | "csv" | "parquet";
             };
             readonly header?: never;
@@ -1869,7 +1873,7 @@ export interface operations {
         readonly parameters: {
             readonly query?: never;
             readonly header?: {
-                readonly Range?: string | null;
+                readonly Range?: string;
             };
             readonly path: {
                 readonly table: string;

@@ -4,11 +4,11 @@
 //! their greatest still fit the relief's 40 mm, so that each combination can be made.
 
 use super::chance::SeededRandom;
-use super::macrostructure::{self, MacrostructureModel, MacrostructureShape};
+use super::macrostructure::{self, MacrostructureModel};
 use super::mesostructure::StoneArrangement;
-use super::microstructure::{JointShape, MicrostructureModel, SKIN};
+use super::microstructure::{MicrostructureModel, SKIN};
 use super::parameter::{ParameterDomain, ParameterValue, ReliefParameter};
-use super::settings::{FULL_SCALE, WallSettings};
+use super::settings::{FULL_SCALE, JointShape, MacrostructureShape, WallSettings};
 use super::stones::SEED;
 use super::{HeightField, PANEL_SIZE_MM, RELIEF_MM};
 

@@ -1,11 +1,9 @@
 //! The large shape of a wall: flat, waves in one or two directions, a dome, a bowl.
 
-use serde::{Deserialize, Serialize};
-
 use super::PANEL_SIZE_MM;
 use super::chance::cosine_of_turns;
 use super::parameter::{ParameterLayer, ReliefParameter};
-use super::settings::{FULL_SCALE, WallSettings};
+use super::settings::{FULL_SCALE, MacrostructureShape, WallSettings};
 
 const LAYER: ParameterLayer = ParameterLayer::Macrostructure;
 
@@ -40,18 +38,6 @@ pub(super) struct MacrostructureModel {
     depth: f64,
     wavelength: f64,
     phase: f64,
-}
-
-#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub(super) enum MacrostructureShape {
-    #[default]
-    Flat,
-    WavyX,
-    WavyY,
-    WavyXy,
-    Convex,
-    Concave,
 }
 
 impl MacrostructureModel {

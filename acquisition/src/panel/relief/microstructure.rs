@@ -1,10 +1,8 @@
 //! The skin of a wall: its joints' profile, and how rough it is.
 
-use serde::{Deserialize, Serialize};
-
 use super::chance::SeededRandom;
 use super::parameter::{ParameterLayer, ReliefParameter};
-use super::settings::{FULL_SCALE, WallSettings};
+use super::settings::{FULL_SCALE, JointShape, WallSettings};
 
 const LAYER: ParameterLayer = ParameterLayer::Microstructure;
 
@@ -51,17 +49,6 @@ pub(super) struct MicrostructureModel {
     roughness: f64,
     grain: f64,
     chance: SeededRandom,
-}
-
-#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub(super) enum JointShape {
-    #[default]
-    Recessed,
-    Flush,
-    Raked,
-    Concave,
-    V,
 }
 
 impl MicrostructureModel {

@@ -1,11 +1,9 @@
 //! Solids of geometry on a square lattice.
 
-use serde::{Deserialize, Serialize};
-
 use super::chance::SeededRandom;
 use super::microstructure::{JOINT_SHAPE, joint_depth, joint_width};
 use super::parameter::{ParameterLayer, ReliefParameter};
-use super::settings::{FULL_SCALE, WallSettings};
+use super::settings::{FULL_SCALE, SolidShape, SolidTurn, WallSettings};
 use super::stones::{SEED, StoneLayout, StoneSpot};
 
 const MESO: ParameterLayer = ParameterLayer::Mesostructure;
@@ -32,28 +30,6 @@ pub(super) const PARAMETERS: [ReliefParameter; 10] = [
     joint_width(0.0),
     joint_depth(0.0),
 ];
-
-#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub(super) enum SolidShape {
-    #[default]
-    Pyramid,
-    Hemisphere,
-    Box,
-    Wedge,
-    Ridge,
-    Cone,
-    Cylinder,
-}
-
-#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub(super) enum SolidTurn {
-    #[default]
-    Alike,
-    Alternating,
-    Random,
-}
 
 /// A lattice of solids, model mm.
 pub(super) struct PrimitiveStones {

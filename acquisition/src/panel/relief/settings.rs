@@ -2,10 +2,6 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::macrostructure::MacrostructureShape;
-use super::microstructure::JointShape;
-use super::primitives::{SolidShape, SolidTurn};
-
 /// The wall is this many times as large as the panel (Rust et al. 2021).
 pub const FULL_SCALE: f64 = 10.0;
 
@@ -41,4 +37,53 @@ pub(super) struct WallSettings {
     pub(super) joint_depth_mm: f64,
     pub(super) roughness_mm: f64,
     pub(super) roughness_grain_mm: f64,
+}
+
+/// Form of the panel under its stones.
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub(super) enum MacrostructureShape {
+    #[default]
+    Flat,
+    WavyX,
+    WavyY,
+    WavyXy,
+    Convex,
+    Concave,
+}
+
+/// Form of the joints.
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub(super) enum JointShape {
+    #[default]
+    Recessed,
+    Flush,
+    Raked,
+    Concave,
+    V,
+}
+
+/// Solid of a lattice of primitives.
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub(super) enum SolidShape {
+    #[default]
+    Pyramid,
+    Hemisphere,
+    Box,
+    Wedge,
+    Ridge,
+    Cone,
+    Cylinder,
+}
+
+/// Rotation of a lattice's solids.
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub(super) enum SolidTurn {
+    #[default]
+    Alike,
+    Alternating,
+    Random,
 }

@@ -7,7 +7,7 @@ use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
 
 use super::frames::cancel_message;
 use crate::door::engine_process::EngineProcess;
-use crate::engine::EngineSocket;
+use crate::engine_socket::EngineSocket;
 
 /// The engine that a connection uses now, and the key of its connection there.
 #[derive(Clone)]

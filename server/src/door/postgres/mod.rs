@@ -16,9 +16,9 @@ use tokio::sync::watch;
 use tokio::task::JoinSet;
 use tracing::Instrument as _;
 
-use super::ServerDoor;
 use super::connection_places::{ConnectionPlaces, PlacedStream};
 use crate::client_identity::ClientIdentity;
+use crate::door::server_door::ServerDoor;
 use crate::fault::RequestFault;
 use crate::request_span::begin_connection;
 use crate::tokens::TokenScope;

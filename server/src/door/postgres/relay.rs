@@ -13,10 +13,10 @@ use super::PostgresLogin;
 use super::cancel_keys::{CancelKey, CancelKeys, CancelTarget};
 use super::exchange::MessageExchange;
 use super::frames::{FrameHeader, HEADER, READY, SYNC, error_message, fatal_message, key_message};
-use crate::door::ServerDoor;
 use crate::door::connection_places::PlacedStream;
 use crate::door::engine_process::{EndReason, EngineLease, EngineProcess};
-use crate::engine::EngineSocket;
+use crate::door::server_door::ServerDoor;
+use crate::engine_socket::EngineSocket;
 use crate::fault::RequestFault;
 
 /// Bytes that are read at once, and of a message from which it is passed on before it is whole.

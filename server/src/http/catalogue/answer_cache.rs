@@ -78,10 +78,7 @@ impl CachedAnswer {
         parts.headers.remove(header::CONTENT_LENGTH);
         match to_bytes(body, usize::MAX).await {
             Ok(bytes) => Ok(Self { headers: parts.headers, bytes, packed: OnceLock::new() }),
-            Err(e) => {
-                eprintln!("an answer broke off: {e}");
-                Err(ProblemResponse(RequestFault::Internal).into_response())
-            }
+            Err(e) => Err(ProblemResponse(RequestFault::defect("an answer broke off")(e)).into_response()),
         }
     }
 
@@ -165,7 +162,7 @@ mod tests {
         assert!(answers.0.len() > 10);
         let too_large = key("too large");
         let too_large = answers.get_or_make(&too_large, async { answer(vec![0; CACHED_BYTES as usize]) });
-        assert_eq!(too_large.await.ok().expect("an answer").bytes.len(), CACHED_BYTES as usize);
+        assert_eq!(too_large.await.expect("an answer").bytes.len(), CACHED_BYTES as usize);
         assert!(answers.0.weight() <= CACHED_BYTES);
     }
 
@@ -173,7 +170,7 @@ mod tests {
     async fn long_answers_are_packed_for_those_who_take_it() {
         let accepting =
             |value: &str| HeaderMap::from_iter([(header::ACCEPT_ENCODING, value.parse().expect("a value"))]);
-        let cached = CachedAnswer::from_response(answer(vec![b'7'; 5000])).await.ok().expect("an answer");
+        let cached = CachedAnswer::from_response(answer(vec![b'7'; 5000])).await.expect("an answer");
         let packed = cached.respond(&accepting("br, gzip;q=0.9"));
         assert_eq!(packed.headers()[header::CONTENT_ENCODING], "gzip");
         let packed = to_bytes(packed.into_body(), usize::MAX).await.expect("bytes");
@@ -186,7 +183,7 @@ mod tests {
             assert!(!cached.respond(&accepting(other)).headers().contains_key(header::CONTENT_ENCODING), "{other}");
         }
         let picture = AnswerContent::new("image/png", vec![0; 5000]).into_response();
-        let picture = CachedAnswer::from_response(picture).await.ok().expect("an answer");
+        let picture = CachedAnswer::from_response(picture).await.expect("an answer");
         assert!(!picture.respond(&accepting("gzip")).headers().contains_key(header::CONTENT_ENCODING));
     }
 }

@@ -38,10 +38,7 @@ impl AnswerContent {
     /// # Errors
     /// [`RequestFault::Internal`] if it cannot be written, which is a defect.
     pub(super) fn json(value: &impl Serialize) -> Result<Self, RequestFault> {
-        let bytes = serde_json::to_vec(value).map_err(|e| {
-            eprintln!("an answer makes no JSON: {e}");
-            RequestFault::Internal
-        })?;
+        let bytes = serde_json::to_vec(value).map_err(RequestFault::defect("an answer makes no JSON"))?;
         Ok(Self::new("application/json", bytes))
     }
 
@@ -55,10 +52,7 @@ impl AnswerContent {
             writer.write(batch)?;
             writer.into_inner()
         };
-        let bytes = written().map_err(|e| {
-            eprintln!("an answer makes no Arrow stream: {e}");
-            RequestFault::Internal
-        })?;
+        let bytes = written().map_err(RequestFault::defect("an answer makes no Arrow stream"))?;
         Ok(Self::new(ARROW, bytes))
     }
 }

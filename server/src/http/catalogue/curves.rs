@@ -103,10 +103,7 @@ impl CurveSet {
             }
         }
         RecordBatch::try_from_iter_with_nullable(columns.into_iter().map(|(name, values)| (name, values, true)))
-            .map_err(|e| {
-                eprintln!("curves make no batch: {e}");
-                RequestFault::Internal
-            })
+            .map_err(RequestFault::defect("curves make no batch"))
     }
 }
 

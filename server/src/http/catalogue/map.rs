@@ -1,18 +1,14 @@
 //! `GET /api/v1/map`: surfaces as points, close together if they reflect alike. Computed once per snapshot.
 
-use arrow::array::AsArray as _;
-use arrow::datatypes::{Float32Type, Int32Type};
-use arrow::record_batch::RecordBatch;
 use axum::Extension;
 use datafusion::common::ScalarValue;
 use echolake_dsp::components::PrincipalComponents;
 use serde::{Deserialize, Serialize};
 use utoipa::{IntoParams, ToSchema};
 
-use std::collections::HashMap;
-
 use super::super::extract::{QueryParams, WholeNumber};
 use super::content::{AnswerContent, EndpointAnswer};
+use super::positions::{LevelVectors, SurfaceNeighbour, SurfacePositions};
 use super::request::CatalogueRequest;
 use crate::fault::RequestFault;
 
@@ -23,12 +19,6 @@ const MOST_SURFACES: usize = 2000;
 /// Products of features that the distances may take: beyond, pairs are left out evenly. One core does about a billion
 /// a second.
 const MOST_PRODUCTS: usize = 4_000_000_000;
-
-/// Surfaces on the map.
-pub(super) struct SurfacePositions {
-    names: Vec<String>,
-    components: PrincipalComponents,
-}
 
 /// Surfaces on the map.
 #[derive(Serialize, ToSchema)]
@@ -50,14 +40,6 @@ struct MapPoint<'a> {
     /// Coordinates along the components, dB.
     position: Vec<f64>,
     neighbours: Vec<SurfaceNeighbour<'a>>,
-}
-
-/// A surface that is near another one.
-#[derive(Serialize, ToSchema)]
-struct SurfaceNeighbour<'a> {
-    surface_id: &'a str,
-    /// Root mean square over the features.
-    distance_db: f64,
 }
 
 /// The number of neighbours.
@@ -87,7 +69,8 @@ pub(super) async fn map(
     Extension(request): Extension<CatalogueRequest>,
     QueryParams(query): QueryParams<MapQuery>,
 ) -> EndpointAnswer {
-    let (summary, places) = (request.summary().await?, request.places().await?);
+    let summary = request.summary().await?;
+    let places = request.view.places.get_or_try_init(|| find_positions(&request)).await?;
     let typology = |name: &str| summary.entry(name).map_or("", |entry| entry.surface.typology.as_str());
     let point = |(i, name)| MapPoint {
         surface_id: name,
@@ -105,83 +88,32 @@ pub(super) async fn map(
     })?)
 }
 
-impl SurfacePositions {
-    /// # Errors
-    /// Those of its query.
-    pub(super) async fn find(request: &CatalogueRequest) -> Result<Self, RequestFault> {
-        let summary = request.summary().await?;
-        let rig = request.catalogue.lake().rig();
-        let known = summary.entries.iter().filter(|e| e.surface.against_flat_db.iter().any(Option::is_some));
-        let names: Vec<_> = known.map(|e| e.surface.surface_id.clone()).take(MOST_SURFACES).collect();
-        let bands = rig.band_names();
-        let pairs = request.catalogue.lake().grid().pairs().len();
-        let products = names.len() * names.len() / 2 * pairs * bands.len();
-        let step = products.div_ceil(MOST_PRODUCTS).max(1);
-        let mut vectors = LevelVectors::new(&names, pairs.div_ceil(step), bands.len(), step);
-        let columns: Vec<_> = bands.iter().map(|b| format!("cast(10 * log10(tnce_band_{b}) as float)")).collect();
-        let sql =
-            format!("select surface_id, pair_id, {} from tnce where pair_id % $1 = 0", numbered(&columns).join(", "));
-        let mut rows = request.batches(&sql, vec![ScalarValue::Int32(i32::try_from(step).ok())]).await?;
-        while let Some(batch) = rows.next().await? {
-            vectors.add(&batch)?;
-        }
-        let found =
-            request.catalogue.service().crunch(move || PrincipalComponents::of(&mut vectors.rows, COMPONENTS)).await?;
-        let components = found.map_err(|e| {
-            eprintln!("surfaces have no places: {e}");
-            RequestFault::Internal
-        })?;
-        Ok(Self { names, components })
+/// Finds the surfaces' positions by their TNCE.
+///
+/// # Errors
+/// Those of its query.
+async fn find_positions(request: &CatalogueRequest) -> Result<SurfacePositions, RequestFault> {
+    let summary = request.summary().await?;
+    let rig = request.catalogue.lake().rig();
+    let known = summary.entries.iter().filter(|e| e.surface.against_flat_db.iter().any(Option::is_some));
+    let names: Vec<_> = known.map(|e| e.surface.surface_id.clone()).take(MOST_SURFACES).collect();
+    let bands = rig.band_names();
+    let pairs = request.catalogue.lake().grid().pairs().len();
+    let products = names.len() * names.len() / 2 * pairs * bands.len();
+    let step = products.div_ceil(MOST_PRODUCTS).max(1);
+    let mut vectors = LevelVectors::new(&names, pairs.div_ceil(step), bands.len(), step);
+    let columns: Vec<_> = bands.iter().map(|b| format!("cast(10 * log10(tnce_band_{b}) as float)")).collect();
+    let sql = format!("select surface_id, pair_id, {} from tnce where pair_id % $1 = 0", numbered(&columns).join(", "));
+    let mut rows = request.batches(&sql, vec![ScalarValue::Int32(i32::try_from(step).ok())]).await?;
+    while let Some(batch) = rows.next().await? {
+        vectors.add(&batch)?;
     }
-
-    fn neighbours(&self, of: usize, count: usize) -> Vec<SurfaceNeighbour<'_>> {
-        let others = self.names.iter().enumerate().filter(|(i, _)| *i != of);
-        let mut near: Vec<_> = others.map(|(i, name)| (self.components.distance(of, i), name)).collect();
-        near.sort_by(|a, b| a.0.total_cmp(&b.0));
-        near.into_iter()
-            .take(count)
-            .map(|(distance_db, surface_id)| SurfaceNeighbour { surface_id, distance_db })
-            .collect()
-    }
+    let found =
+        request.catalogue.service().crunch(move || PrincipalComponents::of(&mut vectors.rows, COMPONENTS)).await?;
+    let components = found.map_err(RequestFault::defect("surfaces have no places"))?;
+    Ok(SurfacePositions { names, components })
 }
 
 fn numbered(columns: &[String]) -> Vec<String> {
     columns.iter().enumerate().map(|(i, column)| format!("{column} as band_{i}")).collect()
-}
-
-/// A surface's levels, pair by pair and band by band; NaN if there is none.
-struct LevelVectors {
-    places: HashMap<String, usize>,
-    rows: Vec<Vec<f32>>,
-    bands: usize,
-    step: usize,
-}
-
-impl LevelVectors {
-    fn new(names: &[String], pairs: usize, bands: usize, step: usize) -> Self {
-        let places = names.iter().enumerate().map(|(i, name)| (name.clone(), i)).collect();
-        Self { places, rows: vec![vec![f32::NAN; pairs * bands]; names.len()], bands, step }
-    }
-
-    fn add(&mut self, batch: &RecordBatch) -> Result<(), RequestFault> {
-        let columns = batch.columns();
-        let (Some(names), Some(pairs)) =
-            (columns[0].as_string_opt::<i32>(), columns[1].as_primitive_opt::<Int32Type>())
-        else {
-            eprintln!("the map's columns are not as expected: {}", batch.schema());
-            return Err(RequestFault::Internal);
-        };
-        for (band, column) in columns[2..].iter().enumerate() {
-            let Some(levels) = column.as_primitive_opt::<Float32Type>() else { return Err(RequestFault::Internal) };
-            for (i, level) in levels.iter().enumerate() {
-                let place = self.places.get(names.value(i)).map(|place| &mut self.rows[*place]);
-                let at = usize::try_from(pairs.value(i)).unwrap_or(0) / self.step * self.bands + band;
-                // Of several runs of a surface, the last one that comes counts: they are of the same surface.
-                if let (Some(cell), Some(level)) = (place.and_then(|row| row.get_mut(at)), level) {
-                    *cell = level;
-                }
-            }
-        }
-        Ok(())
-    }
 }

@@ -4,6 +4,7 @@
 //! ask, whether it has the answer already, and whether the cache does.
 
 mod answer_cache;
+mod bands;
 mod content;
 mod correlations;
 mod curves;
@@ -12,6 +13,7 @@ mod facets;
 mod lake;
 mod map;
 mod pair;
+mod positions;
 mod relief;
 mod request;
 mod rows;

@@ -9,10 +9,10 @@ use serde::{Deserialize, Serialize};
 use utoipa::{IntoParams, ToSchema};
 
 use super::super::extract::{BinaryContent, PathParams};
+use super::bands::{TOTAL, band_list, levels_db};
 use super::content::{AnswerContent, EndpointAnswer};
 use super::curves::{CurveSet, PairSelection};
 use super::environment::{AirReading, AirSeries};
-use super::lake::{TOTAL, band_list, levels_db};
 use super::request::{CatalogueRequest, long, missing, number, text};
 use super::runs::RunLogEntry;
 use super::summary::SurfaceEntry;
@@ -348,8 +348,5 @@ fn samples(
         ("flat_reflected", column(flat)),
     ];
     let batch = RecordBatch::try_from_iter_with_nullable(columns.map(|(name, values)| (name, values, true)));
-    AnswerContent::arrow(&batch.map_err(|e| {
-        eprintln!("samples make no batch: {e}");
-        RequestFault::Internal
-    })?)
+    AnswerContent::arrow(&batch.map_err(RequestFault::defect("samples make no batch"))?)
 }

@@ -65,10 +65,8 @@ pub(super) async fn thumbnail(
     PathParams(path): PathParams<SurfacePath>,
 ) -> EndpointAnswer {
     let row = read(&request, &path).await?;
-    let pixels = heights::shaded(&row.heights_mm, row.size_mm / row.cells as f32).map_err(|e| {
-        eprintln!("a height map makes no picture: {e}");
-        RequestFault::Internal
-    })?;
+    let pixels = heights::shaded(&row.heights_mm, row.size_mm / row.cells as f32)
+        .map_err(RequestFault::defect("a height map makes no picture"))?;
     Ok(AnswerContent::new("image/png", png::grey(&pixels, row.cells)))
 }
 

@@ -12,9 +12,9 @@ use utoipa::IntoParams;
 
 use super::super::extract::parse_whole;
 use super::LakeCatalogue;
-use super::map::SurfacePositions;
+use super::bands::bands;
 use super::rows::RowDecoder;
-use super::summary::{CatalogueSummary, SurfaceEntry};
+use super::summary::{BAND_STATISTICS, CatalogueSummary, SURFACES, SurfaceEntry};
 use super::view::SnapshotView;
 use crate::fault::RequestFault;
 use crate::metrics::ServerProtocol;
@@ -67,12 +67,12 @@ impl CatalogueRequest {
 
     /// All surfaces in short.
     pub(super) async fn summary(&self) -> Result<&CatalogueSummary, RequestFault> {
-        self.view.summary.get_or_try_init(|| CatalogueSummary::read(self)).await
-    }
-
-    /// The surfaces' places on the map.
-    pub(super) async fn places(&self) -> Result<&SurfacePositions, RequestFault> {
-        self.view.places.get_or_try_init(|| SurfacePositions::find(self)).await
+        let read = || async {
+            let (surfaces, statistics) =
+                tokio::try_join!(self.rows(SURFACES, Vec::new()), self.rows(BAND_STATISTICS, Vec::new()))?;
+            Ok(CatalogueSummary::new(surfaces, statistics, bands(self.catalogue.lake().rig())))
+        };
+        self.view.summary.get_or_try_init(read).await
     }
 
     /// The surface of this name.

@@ -42,7 +42,7 @@ impl<T: DeserializeOwned + Send + 'static> AnswerEncoder for RowDecoder<T> {
         match rows {
             Ok(rows) => Ok(vec![rows]),
             Err(e) => {
-                eprintln!("the rows of `{}` are not as expected: {e}", self.sql);
+                tracing::error!(sql = self.sql, error = e, "the rows of a query are not as expected");
                 Err(RequestFault::Internal)
             }
         }

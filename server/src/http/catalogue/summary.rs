@@ -6,9 +6,7 @@ use serde::{Deserialize, Deserializer, Serialize};
 use serde_json::{Map, Value};
 use utoipa::ToSchema;
 
-use super::lake::{BandDescription, bands};
-use super::request::CatalogueRequest;
-use crate::fault::RequestFault;
+use super::bands::BandDescription;
 
 /// Nanoseconds of a day.
 const DAY_NS: f64 = 86_400e9;
@@ -71,8 +69,9 @@ pub(super) struct CatalogueSummary {
     places: HashMap<String, usize>,
 }
 
+/// A surface and the start of its run.
 #[derive(Deserialize)]
-struct SurfaceRow {
+pub(super) struct SurfaceRow {
     surface_id: String,
     run_id: Option<String>,
     panel: String,
@@ -105,8 +104,9 @@ fn decimal<'de, D: Deserializer<'de>>(column: D) -> Result<Option<f64>, D::Error
     Ok(number.map(|x| x.to_string().parse().unwrap_or(f64::from(x))))
 }
 
+/// Level and spread of a surface in a band.
 #[derive(Deserialize)]
-struct BandStatistic {
+pub(super) struct BandStatistic {
     surface_id: String,
     band: String,
     p90_mean_db: Option<f64>,
@@ -116,31 +116,28 @@ struct BandStatistic {
 /// Level and spread of a surface by band.
 type SurfaceLevels = HashMap<String, HashMap<String, (Option<f64>, Option<f64>)>>;
 
-const SURFACES: &str = "select s.surface_id, s.run_id, s.panel, s.side, s.typology, s.macrostructure, s.mesostructure, \
+/// The query of [`SurfaceRow`].
+pub(super) const SURFACES: &str = "select s.surface_id, s.run_id, s.panel, s.side, s.typology, s.macrostructure, s.mesostructure, \
     s.microstructure, s.material, s.flat_reference, s.foam_reference, s.parameters, s.mesh_triangles, s.mesh_watertight, \
     s.reflection_factor, s.relief_min_mm, s.relief_max_mm, s.relief_rms_mm, s.origin, r.started, r.started_ns \
     from surfaces s left join runs r on r.run_id = s.run_id order by s.surface_id, s.run_id";
-const STATS: &str = "select surface_id, band, p90_mean_db, spread_db from surface_stats order by surface_id, run_id";
+/// The query of [`BandStatistic`].
+pub(super) const BAND_STATISTICS: &str =
+    "select surface_id, band, p90_mean_db, spread_db from surface_stats order by surface_id, run_id";
 
 impl CatalogueSummary {
-    /// # Errors
-    /// Those of its queries.
-    pub(super) async fn read(request: &CatalogueRequest) -> Result<Self, RequestFault> {
-        let (rows, stats) = tokio::try_join!(
-            request.rows::<SurfaceRow>(SURFACES, Vec::new()),
-            request.rows::<BandStatistic>(STATS, Vec::new())
-        )?;
+    /// The surfaces of the rows of [`SURFACES`] with the statistics of [`BAND_STATISTICS`].
+    pub(super) fn new(rows: Vec<SurfaceRow>, statistics: Vec<BandStatistic>, bands: Vec<BandDescription>) -> Self {
         let mut levels = SurfaceLevels::new();
-        for stat in stats {
+        for stat in statistics {
             levels.entry(stat.surface_id).or_default().insert(stat.band, (stat.p90_mean_db, stat.spread_db));
         }
-        let bands = bands(request.catalogue.lake().rig());
         // The newest of several rows counts, as run names sort by time.
         let newest: HashMap<_, _> = rows.into_iter().map(|row| (row.surface_id.clone(), row)).collect();
         let mut entries: Vec<_> = newest.into_values().map(|row| entry(row, &levels, &bands)).collect();
         entries.sort_by(|a, b| a.surface.surface_id.cmp(&b.surface.surface_id));
         let places = entries.iter().enumerate().map(|(i, e)| (e.surface.surface_id.clone(), i)).collect();
-        Ok(Self { bands, entries, places })
+        Self { bands, entries, places }
     }
 
     /// The surface of a name.

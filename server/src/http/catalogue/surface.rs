@@ -8,8 +8,8 @@ use serde_json::{Map, Value};
 use utoipa::{IntoParams, ToSchema};
 
 use super::super::extract::{PathParams, QueryParams};
+use super::bands::{band_list, levels_db};
 use super::content::{AnswerContent, EndpointAnswer};
-use super::lake::{band_list, levels_db};
 use super::request::{CatalogueRequest, SurfacePath, number, text};
 use super::summary::SurfaceSummary;
 use crate::fault::RequestFault;
@@ -178,7 +178,7 @@ pub(super) async fn grid(
     let microphone =
         query.microphone.ok_or_else(|| RequestFault::request("`microphone` is missing; hint: a grid point"))?;
     let microphone = request.microphone(&microphone)?;
-    let column = |band: &str| match band == super::lake::TOTAL || query.over == GridNormalisation::FlatTotal {
+    let column = |band: &str| match band == super::bands::TOTAL || query.over == GridNormalisation::FlatTotal {
         true => format!("avg(tnce_{band})"),
         false => format!("avg(tnce_band_{band})"),
     };

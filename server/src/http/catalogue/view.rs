@@ -12,7 +12,7 @@ use sha2::{Digest as _, Sha256};
 use tokio::sync::OnceCell;
 
 use super::answer_cache::AnswerCache;
-use super::map::SurfacePositions;
+use super::positions::SurfacePositions;
 use super::summary::CatalogueSummary;
 use crate::fault::RequestFault;
 use crate::service::QueryService;

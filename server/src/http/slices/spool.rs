@@ -136,7 +136,7 @@ async fn on_disk<T: Send + 'static>(work: impl FnOnce() -> io::Result<T> + Send 
 }
 
 fn no_room(error: io::Error) -> RequestFault {
-    eprintln!("a slice cannot be kept in `{}`: {error}", std::env::temp_dir().display());
+    tracing::warn!(error = &error as &dyn std::error::Error, folder = %std::env::temp_dir().display(), "a slice cannot be kept");
     RequestFault::NoRoom { limit: MOST_BYTES }
 }
 
@@ -163,10 +163,7 @@ impl SpooledSlice {
             });
             match read.await {
                 Ok(block) => Ok(Some((block, (slice, end..range.end)))),
-                Err(failed) => {
-                    eprintln!("a kept slice cannot be read: {failed}");
-                    Err(RequestFault::Internal)
-                }
+                Err(failed) => Err(RequestFault::defect("a kept slice cannot be read")(failed)),
             }
         })
     }
