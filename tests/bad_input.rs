@@ -75,6 +75,26 @@ fn a_clipped_recording_is_kept_and_said() {
     place.fails(0, &["import", "wav", "manifest.csv", "--rig", "rig.toml"], "1 samples clipped");
     place.ok(&["ingest"]);
     assert_eq!(place.number("select clipped_samples from measurements"), 1.0);
+    // Of both channels of one file the loopback is the second: it is named, and the recording is not.
+    let spec = hound::WavSpec {
+        channels: 2,
+        sample_rate: 96_000,
+        bits_per_sample: 16,
+        sample_format: hound::SampleFormat::Int,
+    };
+    let mut writer = hound::WavWriter::create(place.path("both.wav"), spec).expect("a file");
+    noise(4_000).iter().zip(&clipped).for_each(|(recording, loopback)| {
+        writer.write_sample(*recording).and_then(|()| writer.write_sample(*loopback)).expect("written");
+    });
+    writer.finalize().expect("closed");
+    std::fs::write(place.path("manifest.csv"), format!("{HEADER}b,both.wav,both.wav#2,0/0/0,0/0/1,20\n"))
+        .expect("written");
+    let expected = "line 2: 1 samples clipped in the loopback, `both.wav`, channel 2";
+    place.fails(0, &["import", "wav", "manifest.csv", "--rig", "rig.toml"], expected);
+    place.ok(&["ingest"]);
+    let reasons = place.sql("select reasons from measurements where surface_id = 'b'");
+    let reasons = reasons[0]["reasons"].to_string();
+    assert!(reasons.contains("in the loopback, ") && !reasons.contains("in the recording"), "{reasons}");
 }
 
 #[test]

@@ -35,3 +35,32 @@ fn sofa_out_and_in_again() {
     third.fails(1, &["import", "sofa", "--rig", "rig.toml", "a.sofa", "b.sofa"], "a second file of surface flat");
     assert!(!third.path("lake").exists());
 }
+
+// A SOFA file of one pair is a set in HDF5, too.
+#[test]
+fn a_mapped_set_is_what_its_file_has() {
+    let (place, other) = (TestFolder::new(), TestFolder::new());
+    let rig = std::fs::read_to_string(place.path("rig.toml")).expect("read");
+    let (head, _) = rig.split_once("[[grid.layers]]").expect("a grid");
+    let rig = format!("{head}[grid]\npoints_mm = [[0.0, 0.0, 124.0], [150.0, 0.0, 304.0]]\n");
+    for folder in [&place, &other] {
+        std::fs::write(folder.path("rig.toml"), &rig).expect("written");
+    }
+    place.acquire("flat", &["--ir-only"]);
+    place.ok(&["ingest"]);
+    place.ok(&["export", "sofa", "-o", &other.path("out").to_string_lossy()]);
+    let mapping = "file = \"out/flat.sofa\"\nsurfaces = [\"flat\"]\nsampling_rate = { dataset = \"Data.SamplingRate\" }\n\
+                   [responses]\ndataset = \"Data.IR\"\ndimensions = [\"speaker\", \"microphone\", \"sample\"]\n\
+                   [microphones]\ndataset = \"ListenerPosition\"\n[speakers]\ndataset = \"SourcePosition\"\n\
+                   [temperature]\ndataset = \"RoomTemperature\"\nunits = \"kelvin\"\n";
+    std::fs::write(other.path("set.toml"), mapping.replace("Data.IR", "Data.None")).expect("written");
+    other.fails(1, &["import", "hdf5", "set.toml", "--rig", "rig.toml"], "Data.None: it is missing, expected one of ");
+    assert!(!other.path("lake").exists());
+    std::fs::write(other.path("set.toml"), mapping).expect("written");
+    other.ok(&["import", "hdf5", "set.toml", "--rig", "rig.toml"]);
+    other.ok(&["ingest"]);
+    let responses = "select surface_id, pair_id, ir from measurements";
+    assert_eq!(place.sql(responses).len(), 1);
+    assert!(place.sql(responses) == other.sql(responses), "the response is the same");
+    assert_eq!(other.sql("select origin from runs")[0]["origin"], "imported_hdf5");
+}

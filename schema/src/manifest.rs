@@ -43,7 +43,7 @@ pub struct RunManifest {
 }
 
 /// The labels of [`Origin`], for people.
-pub(crate) const ORIGINS: &str = "measured, simulated, imported_wav, imported_gir or imported_sofa";
+pub(crate) const ORIGINS: &str = "measured, simulated, imported_wav, imported_gir, imported_sofa or imported_hdf5";
 
 /// Origin of a run's signals.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
@@ -59,6 +59,8 @@ pub enum Origin {
     ImportedGir,
     /// Made of a SOFA file.
     ImportedSofa,
+    /// Made of an HDF5 file, by a mapping.
+    ImportedHdf5,
 }
 
 /// Metadata `echolake.run.end`: time and counts at the end of a run.
@@ -130,19 +132,21 @@ impl Origin {
             Self::ImportedWav => "imported_wav",
             Self::ImportedGir => "imported_gir",
             Self::ImportedSofa => "imported_sofa",
+            Self::ImportedHdf5 => "imported_hdf5",
         }
     }
 
     /// Returns whether the run was made of data of other software, whose times and rigs may differ from ours.
     pub fn is_imported(self) -> bool {
         match self {
-            Self::ImportedWav | Self::ImportedGir | Self::ImportedSofa => true,
+            Self::ImportedWav | Self::ImportedGir | Self::ImportedSofa | Self::ImportedHdf5 => true,
             Self::Measured | Self::Simulated => false,
         }
     }
 
     fn parse(text: &str) -> Option<Self> {
-        let all = [Self::Measured, Self::Simulated, Self::ImportedWav, Self::ImportedGir, Self::ImportedSofa];
+        let imported = [Self::ImportedWav, Self::ImportedGir, Self::ImportedSofa, Self::ImportedHdf5];
+        let all = [Self::Measured, Self::Simulated].into_iter().chain(imported);
         all.into_iter().find(|o| o.label() == text)
     }
 }

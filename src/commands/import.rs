@@ -1,8 +1,8 @@
 //! `echolake import`: existing measurements become runs.
 
 use echolake_acquisition::import::{
-    Error, GIR_IR_LEN, ImportOptions, ImportedRun, check_sofa, check_wav, import_gir, import_sofa, import_wav,
-    sampling_rate_of,
+    Error, GIR_IR_LEN, ImportOptions, ImportedRun, check_hdf5, check_sofa, check_wav, import_gir, import_hdf5,
+    import_sofa, import_wav, sampling_rate_of,
 };
 use echolake_lake::{Lake, ReferenceSurfaces};
 use echolake_schema::{Celsius, Rig, Timestamp};
@@ -30,7 +30,8 @@ pub(crate) enum ImportCommand {
         #[arg(long)]
         rig: Option<PathBuf>,
     },
-    /// Responses as SOFA files (SingleRoomSRIR), one a surface.
+    /// Responses as SOFA files (SingleRoomSRIR, SingleRoomMIMOSRIR, GeneralFIR, SimpleFreeFieldHRIR,
+    /// FreeFieldDirectivityTF), one a surface.
     Sofa {
         /// The files.
         #[arg(required = true, value_name = "FILE")]
@@ -38,7 +39,18 @@ pub(crate) enum ImportCommand {
         /// The rig; by default the lake's, or the paper's for a new lake.
         #[arg(long)]
         rig: Option<PathBuf>,
-        /// Temperature of files that do not tell it.
+        /// Temperature of the air, whatever files of others say of it.
+        #[arg(long, value_name = "C", allow_negative_numbers = true)]
+        temperature_c: Option<f64>,
+    },
+    /// Responses of an HDF5 file, whose datasets a mapping describes; see docs/export.md.
+    Hdf5 {
+        /// The mapping.
+        mapping: PathBuf,
+        /// The rig; by default the lake's, or the paper's for a new lake.
+        #[arg(long)]
+        rig: Option<PathBuf>,
+        /// Temperature of the air, whatever the mapping says of it.
         #[arg(long, value_name = "C", allow_negative_numbers = true)]
         temperature_c: Option<f64>,
     },
@@ -59,7 +71,9 @@ pub(crate) async fn run(args: &ImportCommand, lake_url: &str) -> anyhow::Result<
             given
         }
         ImportCommand::Gir { rig, .. } => super::rig_or(rig.as_deref(), lake_url, gir_rig).await?,
-        ImportCommand::Sofa { rig, .. } => super::rig_or(rig.as_deref(), lake_url, Rig::paper).await?,
+        ImportCommand::Sofa { rig, .. } | ImportCommand::Hdf5 { rig, .. } => {
+            super::rig_or(rig.as_deref(), lake_url, Rig::paper).await?
+        }
     };
     // All is checked and written beside the lake's tables before a lake is made for it.
     let existing = match Lake::open(lake_url).await {
@@ -71,13 +85,16 @@ pub(crate) async fn run(args: &ImportCommand, lake_url: &str) -> anyhow::Result<
         Err(e) => return Err(e.into()),
     };
     let celsius = match args {
-        ImportCommand::Sofa { temperature_c, .. } => temperature_c.map(Celsius::new).transpose()?,
+        ImportCommand::Sofa { temperature_c, .. } | ImportCommand::Hdf5 { temperature_c, .. } => {
+            temperature_c.map(Celsius::new).transpose()?
+        }
         _ => None,
     };
     if existing.is_none() {
         match args {
             ImportCommand::Wav { manifest, .. } => check_wav(manifest, &rig)?,
             ImportCommand::Sofa { files, .. } => check_sofa(files, &rig, celsius)?,
+            ImportCommand::Hdf5 { mapping, .. } => check_hdf5(mapping, &rig, celsius)?,
             ImportCommand::Gir { .. } => {}
         }
     }
@@ -96,6 +113,9 @@ pub(crate) async fn run(args: &ImportCommand, lake_url: &str) -> anyhow::Result<
         ImportCommand::Gir { folder, .. } => import_gir(folder, &rig, options, &mut |d, t| step("surfaces", d, t)),
         ImportCommand::Sofa { files, .. } => {
             import_sofa(files, &rig, celsius, options, &mut |d, t| step("surfaces", d, t))
+        }
+        ImportCommand::Hdf5 { mapping, .. } => {
+            import_hdf5(mapping, &rig, celsius, options, &mut |d, t| step("responses", d, t))
         }
     });
     let runs = runs?;

@@ -1,10 +1,14 @@
-//! Import of existing measurements as runs: WAV files listed in a manifest, the published GIR data set, SOFA files.
+//! Import of existing measurements as runs: WAV files listed in a manifest, the published GIR data set, SOFA files, and
+//! HDF5 files by a mapping.
 
 mod batch;
 mod gir;
+mod hdf5;
+mod hdf5_file;
+mod hdf5_mapping;
+mod positions;
 mod response;
 mod sofa;
-mod sofa_file;
 mod wav;
 mod wav_file;
 mod wav_manifest;
@@ -17,6 +21,7 @@ use echolake_schema::{ErrorCause, Rig, RunId, SurfaceId, Timestamp};
 use crate::run::recorder::random_tag;
 
 pub use gir::{GIR_IR_LEN, import_gir};
+pub use hdf5::{check_hdf5, import_hdf5};
 pub use sofa::{check_sofa, import_sofa};
 pub use wav::{check_wav, import_wav, sampling_rate_of};
 

@@ -1,5 +1,6 @@
 //! One imported response as a run records it: its pair, time and temperature; everything else is unknown.
 
+use echolake_dsp::temperature::{TemperatureCorrection, resampling_ratio};
 use echolake_schema::messages::{AmbientSample, ImpulseResponse, Measurement, Verdict};
 use echolake_schema::{Celsius, Grid, Pair, Rig, Timestamp};
 
@@ -62,5 +63,14 @@ impl ImportedResponse {
                 ..Measurement::default()
             },
         )
+    }
+}
+
+/// Returns the samples that it takes to bring a response to the reference temperature.
+pub(super) fn least_length(rig: &Rig, celsius: Celsius, is_corrected: bool) -> usize {
+    let ratio = resampling_ratio(celsius.get(), rig.impulse_response.reference_temperature_c.get());
+    match rig.impulse_response.length {
+        length if is_corrected || ratio == 1.0 => length,
+        length => TemperatureCorrection::<f64>::input_len_for(length, ratio),
     }
 }

@@ -17,6 +17,7 @@ use super::batch::ImportBatch;
 use super::wav_manifest::{self, ManifestRow};
 use super::{Error, ImportOptions, ImportedRun};
 use crate::run::assessment::TakeAssessor;
+use crate::run::objection::TakeObjection;
 use crate::run::recorder::{LogLevel, Recorder, RunStart};
 
 /// Source name of the import's log entries.
@@ -133,8 +134,23 @@ impl WavImport<'_> {
         if judged.snr_db.is_nan() {
             judged.snr_db = f64::INFINITY;
         }
-        let reasons: Vec<_> =
-            judged.objections(&rig.validation, f64::NEG_INFINITY).iter().map(ToString::to_string).collect();
+        let mut reasons = Vec::new();
+        for objection in judged.objections(&rig.validation, f64::NEG_INFINITY) {
+            match objection {
+                // Where to lower the gain depends on which of both it is.
+                TakeObjection::Clipped { .. } => {
+                    let of = [
+                        ("recording", &row.recording, microphone.clipped),
+                        ("loopback", &row.loopback, loopback.clipped),
+                    ];
+                    let clipped = of.iter().filter(|(.., samples)| *samples > 0);
+                    reasons.extend(clipped.map(|(column, wav, samples)| {
+                        format!("{samples} samples clipped in the {column}, {}", wav.label())
+                    }));
+                }
+                other => reasons.push(other.to_string()),
+            }
+        }
         let sample_rate_hz = rig.sweep.rate_hz.get();
         recorder.poses(at, m, s)?;
         recorder.environment(

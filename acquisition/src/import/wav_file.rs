@@ -68,6 +68,11 @@ impl WavChannel {
         }
     }
 
+    /// Returns its file and channel, for messages.
+    pub(super) fn label(&self) -> String {
+        format!("`{}`, channel {}", self.path.display(), self.channel + 1)
+    }
+
     /// Returns the format that stores its samples without loss.
     pub(super) fn format(&self) -> Option<SampleFormat> {
         match (self.spec.sample_format, self.spec.bits_per_sample) {

@@ -63,6 +63,13 @@ impl SofaContent {
         self
     }
 
+    /// Adds a variable, or replaces it, with its attributes.
+    fn put(mut self, variable: WrittenVariable) -> Self {
+        self.variables.retain(|v| v.0 != variable.0);
+        self.variables.push(variable);
+        self
+    }
+
     fn without(mut self, name: &str) -> Self {
         self.variables.retain(|v| v.0 != name);
         self
@@ -158,6 +165,102 @@ fn what_a_file_does_not_tell_is_made_up_or_asked_for() {
 }
 
 #[test]
+fn a_given_temperature_overrides_the_files() {
+    let place = SofaFolder::new();
+    let zero = SofaContent::new().with("RoomTemperature", &[1], &[0.0]);
+    let foreign = ("RoomTemperature", vec![1], vec![70.0], vec![("Units", "fahrenheit")]);
+    let made = [("a.sofa", zero), ("b.sofa", SofaContent::new().put(foreign)), ("c.sofa", SofaContent::new())];
+    let runs = place.import(&made, Some(18.0)).expect("imported");
+    assert!(runs.iter().all(|run| irs(run).iter().all(|(_, ir)| ir.temperature_c == 18.0)));
+    // Only what somebody may have measured is worth a word.
+    let said = |run: &ImportedRun| run.warnings.iter().any(|w| w.contains("RoomTemperature is 21.5 C; taken as 18 C"));
+    assert_eq!(runs.iter().map(said).collect::<Vec<_>>(), [false, false, true]);
+}
+
+#[test]
+fn units_of_positions_are_honoured() {
+    let place = SofaFolder::new();
+    let cartesian = |units| vec![("Type", "Cartesian"), ("Units", units)];
+    let metres =
+        SofaContent::new().put(("ListenerPosition", vec![1, 3], vec![0.0, 0.0, 0.124], cartesian("meter"))).put((
+            "SourcePosition",
+            vec![2, 3],
+            vec![0.15, 0.0, 0.124, 0.0, 0.15, 0.304],
+            cartesian("metre, metre, metre"),
+        ));
+    let millimetres = SofaContent::new()
+        .put(("ListenerPosition", vec![1, 3], vec![0.0, 0.0, 124.0], cartesian("millimetre")))
+        .put(("SourcePosition", vec![2, 3], vec![15.0, 0.0, 124.0, 0.0, 15.0, 304.0], cartesian("cm, cm, mm")));
+    let runs = place.import(&[("a.sofa", metres), ("b.sofa", millimetres)], None).expect("imported");
+    let pairs = |run| irs(run).iter().map(|(_, ir)| ir.pair_id).collect::<Vec<_>>();
+    assert_eq!(pairs(&runs[0]), pairs(&runs[1]));
+    assert!(runs.iter().all(|run| run.warnings.is_empty()));
+    // Without units they are metres, and that is said.
+    let runs = place.import(&[("c.sofa", SofaContent::new())], None).expect("imported");
+    assert!(runs[0].warnings.iter().any(|w| w.contains("ListenerPosition has no attribute Units")), "{:?}", runs[0]);
+}
+
+// Receivers and emitters turn with their listener and source, and come in the file's order.
+#[test]
+fn responses_of_several_receivers_and_emitters() {
+    let place = SofaFolder::new();
+    let metres = || vec![("Type", "cartesian"), ("Units", "metre")];
+    // In the file, samples lie between receivers and emitters.
+    let value = |receiver: usize, emitter: usize, sample: usize| (receiver * 2 + emitter) as f64 + sample as f64 / 1e3;
+    let of_receiver = |r: usize| (0..LENGTH).flat_map(move |n| (0..2).map(move |e| value(r, e, n)));
+    let mimo = SofaContent::new()
+        .text("SOFAConventions", "SingleRoomMIMOSRIR")
+        .text("DataType", "FIR-E")
+        .put(("Data.IR", vec![1, 1, LENGTH, 2], of_receiver(0).collect(), vec![]))
+        .put(("Data.Delay", vec![1, 1, 1], vec![0.0], vec![]))
+        .put(("SourcePosition", vec![1, 3], vec![0.0, 0.0, 0.124], metres()))
+        // To the left and up of a source that looks along y: its left is -x.
+        .put(("SourceView", vec![1, 3], vec![0.0, 2.0, 0.0], metres()))
+        .put(("SourceUp", vec![1, 3], vec![0.0, 0.5, 3.0], vec![]))
+        .put(("EmitterPosition", vec![2, 3, 1], vec![0.15, 0.0, 0.18, 0.0, -0.15, 0.0], metres()))
+        .without("MeasurementDate");
+    let runs = place.import(&[("a.sofa", mimo)], None).expect("imported");
+    let found = irs(&runs[0]);
+    let grid = rig().grid().expect("a grid");
+    let pair = |speaker: usize| grid.parse_pair(&grid.points()[0], &grid.points()[speaker]).expect("a pair").0;
+    assert_eq!(found.iter().map(|(_, ir)| ir.pair_id).collect::<Vec<_>>(), [pair(2), pair(1)]);
+    for (emitter, (_, ir)) in found.iter().enumerate() {
+        assert!(ir.samples.iter().enumerate().all(|(n, x)| *x == value(0, emitter, n) as f32), "{emitter}");
+    }
+}
+
+#[test]
+fn spectra_become_responses() {
+    let place = SofaFolder::new();
+    let bins = LENGTH / 2 + 1;
+    // An impulse at sample 3, as its spectrum.
+    let phase = |k: usize| -std::f64::consts::TAU * (3 * k) as f64 / LENGTH as f64;
+    let spectrum = |part: fn(f64) -> f64| (0..bins).map(|k| part(phase(k))).collect::<Vec<_>>();
+    let frequencies = |highest: f64| (0..bins).map(|k| highest * k as f64 / (bins - 1) as f64).collect::<Vec<_>>();
+    let made = |highest: f64| {
+        SofaContent::new()
+            .text("SOFAConventions", "FreeFieldDirectivityTF")
+            .text("DataType", "TF")
+            .without("Data.IR")
+            .without("Data.SamplingRate")
+            .without("Data.Delay")
+            .without("MeasurementDate")
+            .put(("Data.Real", vec![1, 1, bins], spectrum(f64::cos), vec![]))
+            .put(("Data.Imag", vec![1, 1, bins], spectrum(f64::sin), vec![]))
+            .put(("N", vec![bins], frequencies(highest), vec![("Units", "hertz")]))
+            .put(("SourcePosition", vec![1, 3], vec![0.0, 0.15, 0.304], vec![]))
+    };
+    let runs = place.import(&[("a.sofa", made(48e3))], None).expect("imported");
+    let samples = &irs(&runs[0])[0].1.samples;
+    assert!(samples.iter().enumerate().all(|(n, x)| (x - if n == 3 { 1.0 } else { 0.0 }).abs() < 1e-6));
+    let error = place.import(&[("b.sofa", made(24e3))], None).expect_err("another rate").to_string();
+    assert!(error.contains("b.sofa") && error.contains("N: frequencies up to 24000 Hz"), "{error}");
+    let imaginary = made(48e3).put(("Data.Imag", vec![1, 1, bins], vec![0.5; bins], vec![]));
+    let error = place.import(&[("c.sofa", imaginary)], None).expect_err("no response").to_string();
+    assert!(error.contains("Data.Imag[0, 0, 0]: 5e-1, expected 0"), "{error}");
+}
+
+#[test]
 fn what_is_wrong_is_named_and_nothing_is_left() {
     let refused = |made: SofaContent, expected: &str| {
         let place = SofaFolder::new();
@@ -168,24 +271,37 @@ fn what_is_wrong_is_named_and_nothing_is_left() {
         assert_eq!(std::fs::read_dir(place.inbox()).expect("a folder").count(), 0, "{expected}");
     };
     refused(
-        SofaContent::new().text("SOFAConventions", "SimpleFreeFieldHRIR"),
-        "`SimpleFreeFieldHRIR`, expected `SingleRoomSRIR`",
+        SofaContent::new().text("SOFAConventions", "SimpleHeadphoneIR"),
+        "`SimpleHeadphoneIR`, expected one of SingleRoomSRIR, SingleRoomMIMOSRIR",
     );
     refused(SofaContent::new().text("DataType", "TF"), "expected `FIR`");
     refused(SofaContent::new().without("Data.IR"), "Data.IR: it is missing");
-    refused(SofaContent::new().with("Data.IR", &[2, 2, LENGTH], &vec![0.0; 4 * LENGTH]), "1 receiver");
+    refused(
+        SofaContent::new().with("Data.IR", &[2, 2, LENGTH], &vec![0.0; 4 * LENGTH]),
+        "receiver 1: a second response",
+    );
+    refused(SofaContent::new().with("Data.IR", &[2, LENGTH], &vec![0.0; 2 * LENGTH]), "measurements x receivers");
     refused(SofaContent::new().with("Data.IR", &[2, 1, 100], &[0.0; 200]), "100 samples");
     let mut broken = vec![0.0; 2 * LENGTH];
     broken[LENGTH + 7] = f64::NAN;
     refused(SofaContent::new().with("Data.IR", &[2, 1, LENGTH], &broken), "Data.IR[1, 0, 7]");
     refused(SofaContent::new().with("Data.SamplingRate", &[1], &[48_000.0]), "48000 Hz, expected the rig's 96000 Hz");
     refused(SofaContent::new().with("Data.Delay", &[1, 1], &[12.0]), "Data.Delay: 12");
-    refused(SofaContent::new().with("ReceiverPosition", &[1, 3, 1], &[0.0, 0.09, 0.0]), "ReceiverPosition: 0.09");
+    refused(SofaContent::new().with("ReceiverPosition", &[1, 3, 1], &[0.0, 0.09, 0.0]), "ReceiverPosition[0]");
+    let foreign = |units| ("ListenerPosition", vec![1, 3], vec![0.0; 3], vec![("Units", units)]);
+    refused(SofaContent::new().put(foreign("foot")), "ListenerPosition, its attributes: units `foot`, expected metre");
+    refused(SofaContent::new().put(foreign("metre, metre")), "units `metre, metre`");
+    let spherical = ("ReceiverPosition", vec![1, 3, 1], vec![1.0; 3], vec![("Type", "spherical harmonics")]);
+    refused(SofaContent::new().put(spherical), "type `spherical harmonics`, expected cartesian or spherical");
+    let rate = ("Data.SamplingRate", vec![1], vec![96.0], vec![("Units", "furlong")]);
+    refused(SofaContent::new().put(rate), "units `furlong`, expected hertz");
     refused(SofaContent::new().with("ListenerPosition", &[1, 3], &[0.0, 0.0, 0.2]), "the nearest is");
     refused(SofaContent::new().with("ListenerPosition", &[5, 3], &[0.0; 15]), "[5, 3], expected [2, 3] or [1, 3]");
     let same = [0.0, 124f64.atan2(150.0).to_degrees(), 150f64.hypot(124.0) / 1e3];
     refused(SofaContent::new().with("SourcePosition", &[1, 3], &same), "a second response of its pair");
     refused(SofaContent::new().with("RoomTemperature", &[1], &[20.0]), "RoomTemperature");
+    refused(SofaContent::new().with("RoomTemperature", &[1], &[0.0]), "0 kelvin, with which tools");
+    refused(SofaContent::new().with("RoomTemperature", &[1], &[0.0]), "--temperature-c says");
     refused(SofaContent::new().with("MeasurementDate", &[2], &[-1.0, 1.0]), "seconds since 1970");
     let place = SofaFolder::new();
     let path = place.0.path().join("text.sofa");
