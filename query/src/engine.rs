@@ -26,6 +26,7 @@ use crate::catalog::LakeCatalog;
 use crate::control::pool::PartialPool;
 use crate::control::threads::QueryThreads;
 use crate::control::{QueryTicket, RunningQueries, StopReason};
+use crate::functions::octet_length_of_bytes;
 use crate::small::SmallTables;
 use crate::table::FileReaders;
 use crate::{Error, FunctionSet, OpaqueValue, Session};
@@ -351,6 +352,7 @@ fn template(
 ) -> SessionState {
     let builder = SessionStateBuilder::new().with_config(config()).with_runtime_env(runtime).with_default_features();
     let mut state = rules.into_iter().fold(builder, SessionStateBuilder::with_optimizer_rule).build();
+    let _ = state.register_udf(Arc::new(octet_length_of_bytes()));
     // They replace functions with the same names and aliases; only a closed registry would refuse.
     for function in functions.scalar() {
         let _ = state.register_udf(function.clone());

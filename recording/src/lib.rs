@@ -44,7 +44,7 @@ pub use file_proof::prove_file;
 pub use mcap::records::{ChunkIndex, MessageHeader, Metadata, Record, op as opcode};
 pub use mcap::{Attachment, Channel, MAGIC, McapError, McapResult, Writer};
 pub use prefix_reader::{PrefixError, PrefixItem, PrefixReader};
-pub use record_frame::FRAME_BYTES;
+pub use record_frame::{FRAME_BYTES, RecordFrame};
 pub use record_splitter::{RecordSplitter, SplitRecord};
 #[cfg(feature = "store")]
 pub use resync_reader::{

@@ -16,6 +16,12 @@ use crate::record_frame::FRAME_BYTES;
 const TAIL_BYTES: u64 = 64 << 10;
 /// The footer: its frame, two offsets and a CRC; magic bytes follow.
 const FOOTER_BYTES: usize = FRAME_BYTES + 20;
+/// A message record without data: its frame, channel, sequence and two times.
+const SMALLEST_MESSAGE: u64 = FRAME_BYTES as u64 + 22;
+/// A message index without entries: its frame, channel and the size of its entries.
+const INDEX_FRAME: u64 = FRAME_BYTES as u64 + 6;
+/// An entry of a message index: a time and an offset.
+const INDEX_ENTRY: u64 = 16;
 /// A record that ends the data section and has no CRC: behind it the library checks that of the summary.
 const DATA_END: [u8; FRAME_BYTES + 4] = [op::DATA_END, 4, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0];
 
@@ -26,6 +32,10 @@ pub struct RunSummary {
     pub statistics: Option<Statistics>,
     /// Channels with their schemas, by id. The first definition of an id counts.
     pub channels: BTreeMap<u16, Arc<Channel<'static>>>,
+    /// Number of schemas that it describes.
+    pub schema_count: usize,
+    /// A channel whose schema it does not describe.
+    pub channel_without_schema: Option<u16>,
     /// Chunks, in the order of the summary.
     pub chunk_indexes: Vec<ChunkIndex>,
     /// Attachments.
@@ -90,9 +100,87 @@ impl RunSummary {
                 },
             }
         }
+        found.schema_count = definitions.schemas.len();
+        found.channel_without_schema = definitions.channel_without_schema();
         found.channels = definitions.into_channels();
         Ok(found)
     }
+
+    /// Returns what of the file it does not account for, in words that follow "its summary"; None if it describes and
+    /// lists all that its statistics count. Writers may leave out any part of a summary, and a reader that takes the
+    /// rest for the whole loses messages without a word.
+    pub fn unaccounted(&self) -> Option<String> {
+        let Some(statistics) = &self.statistics else { return Some("has no statistics".to_owned()) };
+        let parts = [
+            ("describes", "schemas", self.schema_count, usize::from(statistics.schema_count)),
+            ("describes", "channels", self.channels.len(), statistics.channel_count as usize),
+            ("lists", "chunks", self.chunk_indexes.len(), statistics.chunk_count as usize),
+            ("lists", "attachments", self.attachment_indexes.len(), statistics.attachment_count as usize),
+        ];
+        if let Some((does, parts, has, all)) = parts.into_iter().find(|(_, _, has, all)| has != all) {
+            return Some(format!("{does} {has} of {all} {parts}"));
+        }
+        if let Some(channel) = self.channel_without_schema {
+            return Some(format!("does not describe the schema of channel {channel}"));
+        }
+        let counted = statistics.channel_message_counts.keys();
+        let indexed = self.chunk_indexes.iter().flat_map(|chunk| chunk.message_index_offsets.keys());
+        if let Some(channel) = counted.chain(indexed).find(|channel| !self.channels.contains_key(channel)) {
+            return Some(format!("does not describe channel {channel}"));
+        }
+        self.unaccounted_messages(statistics)
+    }
+
+    fn unaccounted_messages(&self, statistics: &Statistics) -> Option<String> {
+        let all = statistics.message_count;
+        if self.chunk_indexes.is_empty() && all > 0 {
+            return Some(format!("lists no chunks for {all} messages"));
+        }
+        let of_channels =
+            statistics.channel_message_counts.values().fold(0u64, |sum, count| sum.saturating_add(*count));
+        if of_channels != all {
+            return Some(format!("counts {of_channels} messages by channel, {all} in all"));
+        }
+        let (with_index, without): (Vec<_>, Vec<_>) =
+            self.chunk_indexes.iter().partition(|chunk| !chunk.message_index_offsets.is_empty());
+        let indexed = with_index.iter().try_fold(0u64, |sum, chunk| sum.checked_add(indexed_messages(chunk)?));
+        if indexed.is_none_or(|indexed| indexed > all || (without.is_empty() && indexed < all)) {
+            return Some(format!("has message indexes whose sizes are not those of {all} messages"));
+        }
+        let first = self.chunk_indexes.iter().map(|chunk| chunk.message_start_time).min()?;
+        let last = self.chunk_indexes.iter().map(|chunk| chunk.message_end_time).max()?;
+        let covered = all == 0 || (first <= statistics.message_start_time && statistics.message_end_time <= last);
+        (!covered).then(|| "lists chunks that do not cover the time of all messages".to_owned())
+    }
+
+    /// Returns the ranges in front of the summary, which begins at `summary_start`, that it does not account for and in
+    /// which there is room for a message; None if what it lists overlaps or stands elsewhere.
+    pub fn unlisted_ranges(&self, summary_start: u64) -> Option<Vec<Range<u64>>> {
+        let chunks = self
+            .chunk_indexes
+            .iter()
+            .map(|chunk| (chunk.chunk_start_offset, chunk.chunk_length.checked_add(chunk.message_index_length)));
+        let attachments = self.attachment_indexes.iter().map(|index| (index.offset, Some(index.length)));
+        let metadata = self.metadata_indexes.iter().map(|index| (index.offset, Some(index.length)));
+        let mut listed: Vec<_> = chunks.chain(attachments).chain(metadata).collect();
+        listed.sort_unstable();
+        let mut unlisted = Vec::new();
+        let mut end = MAGIC.len() as u64;
+        for (start, bytes) in listed.into_iter().chain([(summary_start, Some(0))]) {
+            if start.checked_sub(end)? >= SMALLEST_MESSAGE {
+                unlisted.push(end..start);
+            }
+            end = start.checked_add(bytes?)?;
+        }
+        Some(unlisted)
+    }
+}
+
+// Messages that the message indexes behind a chunk list, by their size; None if they have another one.
+fn indexed_messages(chunk: &ChunkIndex) -> Option<u64> {
+    let frames = INDEX_FRAME.checked_mul(chunk.message_index_offsets.len() as u64)?;
+    let entries = chunk.message_index_length.checked_sub(frames)?;
+    entries.is_multiple_of(INDEX_ENTRY).then_some(entries / INDEX_ENTRY)
 }
 
 /// Schemas and channels in the order in which they come.
@@ -121,6 +209,14 @@ impl ChannelDefinitions {
             }
             _ => {}
         }
+    }
+
+    /// Returns a channel whose schema did not come.
+    pub fn channel_without_schema(&self) -> Option<u16> {
+        let lacks = |channel: &&mcap::records::Channel| {
+            channel.schema_id != 0 && !self.schemas.contains_key(&channel.schema_id)
+        };
+        self.channels.values().find(lacks).map(|channel| channel.id)
     }
 
     /// Returns all channels with their schemas. A channel whose schema is missing has none.
@@ -167,6 +263,65 @@ mod tests {
         assert_eq!((channel.topic.as_str(), channel.schema.as_ref().map(|s| s.name.as_str())), ("/a", Some("a.B")));
         file[range.start as usize + FRAME_BYTES + 3] ^= 1;
         assert!(RunSummary::parse(&file[range.start as usize..]).is_err());
+    }
+
+    #[test]
+    fn a_summary_says_what_it_does_not_account_for() {
+        let file = file();
+        let bytes = file.len() as u64;
+        let range = summary_range(&file[tail_range(bytes).start as usize..], bytes).expect("a summary");
+        let parse = || RunSummary::parse(&file[range.start as usize..]).expect("sound");
+        assert_eq!(parse().unaccounted(), None);
+        type Change = fn(&mut RunSummary, &mut Statistics);
+        let changes: [(&str, Change); 10] = [
+            ("describes 0 of 1 schemas", |summary, _| summary.schema_count = 0),
+            ("describes 0 of 1 channels", |summary, _| summary.channels.clear()),
+            ("lists 0 of 1 chunks", |summary, _| summary.chunk_indexes.clear()),
+            ("lists 0 of 2 attachments", |_, statistics| statistics.attachment_count = 2),
+            ("does not describe the schema of channel 5", |summary, _| summary.channel_without_schema = Some(5)),
+            ("does not describe channel 9", |summary, _| {
+                summary.chunk_indexes[0].message_index_offsets.insert(9, 0);
+            }),
+            ("counts 1 messages by channel, 2 in all", |_, statistics| statistics.message_count = 2),
+            ("has message indexes whose sizes are not those of 1 messages", |summary, _| {
+                summary.chunk_indexes[0].message_index_length -= INDEX_ENTRY;
+            }),
+            ("lists chunks that do not cover the time of all messages", |_, statistics| {
+                statistics.message_end_time = 3;
+            }),
+            ("lists no chunks for 1 messages", |summary, statistics| {
+                summary.chunk_indexes.clear();
+                statistics.chunk_count = 0;
+            }),
+        ];
+        for (expected, change) in changes {
+            let mut summary = parse();
+            let mut statistics = summary.statistics.take().expect("statistics");
+            change(&mut summary, &mut statistics);
+            summary.statistics = Some(statistics);
+            assert_eq!(summary.unaccounted().as_deref(), Some(expected));
+        }
+        let mut summary = parse();
+        summary.statistics = None;
+        assert_eq!(summary.unaccounted().as_deref(), Some("has no statistics"));
+    }
+
+    #[test]
+    fn what_a_summary_does_not_list_is_found() {
+        let file = file();
+        let bytes = file.len() as u64;
+        let range = summary_range(&file[tail_range(bytes).start as usize..], bytes).expect("a summary");
+        let mut summary = RunSummary::parse(&file[range.start as usize..]).expect("sound");
+        let chunk = summary.chunk_indexes[0].clone();
+        let header = MAGIC.len() as u64..chunk.chunk_start_offset;
+        let expected = if header.end - header.start >= SMALLEST_MESSAGE { vec![header] } else { Vec::new() };
+        assert_eq!(summary.unlisted_ranges(range.start), Some(expected));
+        summary.chunk_indexes[0].chunk_length = u64::MAX;
+        assert_eq!(summary.unlisted_ranges(range.start), None);
+        summary.chunk_indexes.clear();
+        assert_eq!(summary.unlisted_ranges(range.start), Some(vec![MAGIC.len() as u64..range.start]));
+        summary.chunk_indexes = vec![chunk.clone(), chunk];
+        assert_eq!(summary.unlisted_ranges(range.start), None);
     }
 
     #[test]

@@ -63,7 +63,8 @@ impl Recording {
         let unread = |source| Error::Read { path: path.to_owned(), source };
         let mut file = File::open(path).map_err(unread)?;
         let summary = match summary(&mut file) {
-            Ok(found) => found.filter(|s| !s.chunk_indexes.is_empty()),
+            // One that leaves out a part of what the file holds is as good as none.
+            Ok(found) => found.filter(|s| !s.chunk_indexes.is_empty() && s.unaccounted().is_none()),
             Err(Unread::System(source)) => return Err(unread(source)),
             // The walk says what is wrong.
             Err(Unread::Damaged) => None,

@@ -15,6 +15,7 @@ mod lists;
 #[cfg(test)]
 mod manual;
 mod nce;
+mod octet_length;
 mod p90_mean;
 mod per_length;
 mod rig;
@@ -31,6 +32,7 @@ use datafusion::logical_expr::{AggregateUDF, ScalarUDF};
 use echolake_schema::Rig;
 
 use aggregate::udaf;
+pub(crate) use octet_length::octet_length_of_bytes;
 use rig::RigFacts;
 use scalar::udf;
 

@@ -9,8 +9,8 @@ use arrow::array::{
 };
 use arrow::buffer::{NullBuffer, OffsetBuffer, ScalarBuffer};
 use arrow::datatypes::{
-    DataType, DurationNanosecondType, FieldRef, Fields, Float32Type, Float64Type, Int8Type, Int16Type, Int32Type,
-    Int64Type, TimeUnit, TimestampNanosecondType, UInt8Type, UInt16Type, UInt32Type, UInt64Type,
+    DataType, Decimal128Type, DurationNanosecondType, FieldRef, Fields, Float32Type, Float64Type, Int8Type, Int16Type,
+    Int32Type, Int64Type, TimeUnit, TimestampNanosecondType, UInt8Type, UInt16Type, UInt32Type, UInt64Type,
 };
 use arrow::error::ArrowError;
 
@@ -18,6 +18,9 @@ use arrow::error::ArrowError;
 pub(super) const MOST_LEAVES: usize = 4096;
 /// How deep messages are taken apart.
 pub(super) const DEEPEST: usize = 16;
+
+/// Digits of 2^64 - 1.
+const INTEGER_DIGITS: u8 = 20;
 
 /// Times are UTC.
 pub(super) const UTC: &str = "UTC";
@@ -30,6 +33,11 @@ pub(super) fn time_type() -> DataType {
 /// The type of durations.
 pub(super) fn duration_type() -> DataType {
     DataType::Duration(TimeUnit::Nanosecond)
+}
+
+/// The type of integers of 64 bits, with a sign or without.
+pub(super) fn integer_type() -> DataType {
+    DataType::Decimal128(INTEGER_DIGITS, 0)
 }
 
 /// A column, of one of the types that messages have.
@@ -45,6 +53,8 @@ pub(super) enum Column {
     U64(Numbers<UInt64Type>),
     F32(Numbers<Float32Type>),
     F64(Numbers<Float64Type>),
+    /// Integers of [`integer_type`].
+    Decimal(Numbers<Decimal128Type>),
     Time(Numbers<TimestampNanosecondType>),
     Duration(Numbers<DurationNanosecondType>),
     Text(Strings),
@@ -121,6 +131,14 @@ impl<T: ArrowPrimitiveType> Numbers<T> {
     pub(super) fn extend(&mut self, values: impl ExactSizeIterator<Item = T::Native>) {
         self.nulls.append_n_non_nulls(values.len());
         self.values.extend(values);
+    }
+
+    /// A value, or a missing one.
+    pub(super) fn push_option(&mut self, value: Option<T::Native>) {
+        match value {
+            Some(value) => self.push(value),
+            None => self.push_null(),
+        }
     }
 
     pub(super) fn push_null(&mut self) {
@@ -216,6 +234,7 @@ impl Column {
             DataType::UInt64 => Self::U64(Numbers::new()),
             DataType::Float32 => Self::F32(Numbers::new()),
             DataType::Float64 => Self::F64(Numbers::new()),
+            DataType::Decimal128(_, _) => Self::Decimal(Numbers::new()),
             DataType::Timestamp(_, _) => Self::Time(Numbers::new()),
             DataType::Duration(_) => Self::Duration(Numbers::new()),
             DataType::Utf8 => Self::Text(Strings::new()),
@@ -241,6 +260,7 @@ impl Column {
             Self::U64(c) => c.values.len(),
             Self::F32(c) => c.values.len(),
             Self::F64(c) => c.values.len(),
+            Self::Decimal(c) => c.values.len(),
             Self::Time(c) => c.values.len(),
             Self::Duration(c) => c.values.len(),
             Self::Text(c) | Self::Binary(c) => c.offsets.len() - 1,
@@ -264,6 +284,7 @@ impl Column {
             Self::U64(c) => c.push_null(),
             Self::F32(c) => c.push_null(),
             Self::F64(c) => c.push_null(),
+            Self::Decimal(c) => c.push_null(),
             Self::Time(c) => c.push_null(),
             Self::Duration(c) => c.push_null(),
             Self::Text(c) | Self::Binary(c) => c.push_null(),
@@ -287,6 +308,7 @@ impl Column {
             Self::U64(c) => Arc::new(c.finish()),
             Self::F32(c) => Arc::new(c.finish()),
             Self::F64(c) => Arc::new(c.finish()),
+            Self::Decimal(c) => Arc::new(c.finish().with_precision_and_scale(INTEGER_DIGITS, 0)?),
             Self::Time(c) => Arc::new(c.finish().with_timezone(UTC)),
             Self::Duration(c) => Arc::new(c.finish()),
             Self::Text(c) => {

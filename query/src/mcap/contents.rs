@@ -80,7 +80,7 @@ pub(crate) async fn attachment(run: &VisibleRun, ending: &str, files: &Arc<Files
 
 // Bytes by channel; None where the file does not tell.
 async fn sizes(file: &McapFile, files: &Files) -> Result<Option<HashMap<u16, u64>>, Fault> {
-    let told = file.indexed && file.pieces.iter().all(|p| p.index > 0);
+    let told = file.walked.is_none() && file.pieces.iter().all(|p| p.index > 0);
     if !told || file.pieces.iter().map(|p| p.index).sum::<u64>() > MOST_INDEXES {
         return Ok(None);
     }

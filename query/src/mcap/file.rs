@@ -1,7 +1,8 @@
 //! An MCAP file in the lake's store: its channels, and where its messages are.
 //!
 //! Both come from its summary, which is read by ranges from its end. A file without one, because it was cut off or its
-//! writer makes none, or with one that is damaged, is walked from its first byte, one record in memory at a time.
+//! writer makes none, or with one that is damaged or does not account for all that the file holds, is walked from its
+//! first byte, one record in memory at a time.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::ops::Range;
@@ -9,8 +10,8 @@ use std::sync::Arc;
 
 use bytes::Bytes;
 use echolake_recording::{
-    ChannelDefinitions, FRAME_BYTES, MAGIC, Record, RecordSplitter, RunSummary, SplitRecord, describe, opcode,
-    parse_record, summary_range, tail_range,
+    ChannelDefinitions, FRAME_BYTES, MAGIC, Record, RecordFrame, RecordSplitter, RunSummary, SplitRecord, describe,
+    opcode, parse_record, summary_range, tail_range,
 };
 use object_store::path::Path;
 use object_store::{ObjectStore, ObjectStoreExt as _};
@@ -25,6 +26,8 @@ use super::schema::RawSchema;
 const BLOCK: u64 = 4 << 20;
 /// Messages that stand in no chunk are read in pieces of this size.
 const PIECE: u64 = 1 << 20;
+/// What is read at a time of ranges that a summary does not list.
+const UNLISTED_BLOCK: u64 = 64 << 10;
 /// Maximum size of the cached summaries, bytes.
 const CACHED_BYTES: u64 = 64 << 20;
 
@@ -33,8 +36,8 @@ const CACHED_BYTES: u64 = 64 << 20;
 pub(super) struct McapFile {
     pub(super) path: Path,
     pub(super) bytes: u64,
-    /// Whether its summary told where what is.
-    pub(super) indexed: bool,
+    /// The reason why it was walked; None if its summary told where what is.
+    pub(super) walked: Option<String>,
     pub(super) channels: BTreeMap<u16, Channel>,
     /// In the file's order, without overlaps.
     pub(super) pieces: Vec<Piece>,
@@ -139,21 +142,66 @@ struct Opening<'a> {
 
 impl Opening<'_> {
     async fn file(&self) -> Result<McapFile, Fault> {
+        match self.summary_file().await? {
+            Ok(file) => Ok(file),
+            Err(reason) => self.walk(reason).await,
+        }
+    }
+
+    // The text is the reason why the summary does not do.
+    async fn summary_file(&self) -> Result<Result<McapFile, String>, Fault> {
         let tail = self.read(tail_range(self.bytes)).await?;
-        if let Some(range) = summary_range(&tail, self.bytes) {
-            let start = range.start;
-            let from_end = self.bytes - start;
-            let summary = match tail.len() as u64 >= from_end {
-                true => tail.slice(tail.len() - from_end as usize..),
-                false => self.read(range).await?,
-            };
-            // One that makes no sense is none.
-            if let Some(found) = RunSummary::parse(&summary).ok().and_then(|summary| self.indexed_file(summary, start))
-            {
-                return Ok(found);
+        let Some(range) = summary_range(&tail, self.bytes) else { return Ok(Err("it has no summary".to_owned())) };
+        let start = range.start;
+        let from_end = self.bytes - start;
+        let summary = match tail.len() as u64 >= from_end {
+            true => tail.slice(tail.len() - from_end as usize..),
+            false => self.read(range).await?,
+        };
+        let summary = match RunSummary::parse(&summary) {
+            Ok(summary) => summary,
+            Err(e) => return Ok(Err(format!("its summary is damaged: {}", describe(&e)))),
+        };
+        if let Some(what) = summary.unaccounted() {
+            return Ok(Err(format!("its summary {what}")));
+        }
+        let Some(unlisted) = summary.unlisted_ranges(start) else {
+            return Ok(Err("its summary lists parts that overlap".to_owned()));
+        };
+        for range in unlisted {
+            if self.has_messages(range).await? {
+                return Ok(Err("its summary lists chunks, but there are messages elsewhere".to_owned()));
             }
         }
-        self.walk().await
+        let file = self.indexed_file(summary, start);
+        Ok(file.ok_or_else(|| "its summary lists chunks where there can be none".to_owned()))
+    }
+
+    // Whether there are messages, or chunks of them, in a range of records; so it may be if they are damaged.
+    async fn has_messages(&self, mut range: Range<u64>) -> Result<bool, Fault> {
+        let mut block = Bytes::new();
+        while !range.is_empty() {
+            if block.len() < FRAME_BYTES {
+                block = self.read(range.start..range.end.min(range.start + UNLISTED_BLOCK)).await?;
+            }
+            if block.len() < FRAME_BYTES {
+                return Ok(true);
+            }
+            let RecordFrame { code, length } = RecordFrame::read(&block);
+            let bytes = length.saturating_add(FRAME_BYTES as u64);
+            if matches!(code, opcode::MESSAGE | opcode::CHUNK) || bytes > range.end - range.start {
+                return Ok(true);
+            }
+            range.start += bytes;
+            block = block.slice(block.len().min(bytes as usize)..);
+        }
+        Ok(false)
+    }
+
+    // Whether it ends as a file does that was not cut off.
+    async fn is_closed(&self) -> Result<bool, Fault> {
+        let end = self.read(self.bytes.saturating_sub(MAGIC.len() as u64)..self.bytes).await?;
+        Ok(end[..] == *MAGIC && self.bytes > MAGIC.len() as u64)
     }
 
     async fn read(&self, range: Range<u64>) -> Result<Bytes, Fault> {
@@ -164,13 +212,9 @@ impl Opening<'_> {
         read.map_err(|source| Fault::Read { file: self.path.to_string(), source })
     }
 
-    // None if the summary does not tell where all messages are.
+    // The summary accounts for all messages; None if it has them where they cannot be.
     fn indexed_file(&self, summary: RunSummary, start: u64) -> Option<McapFile> {
-        let indexes = summary.chunk_indexes;
-        let statistics = summary.statistics.filter(|s| s.chunk_count as usize == indexes.len())?;
-        if indexes.is_empty() && statistics.message_count > 0 {
-            return None;
-        }
+        let (indexes, statistics) = (summary.chunk_indexes, summary.statistics?);
         let pieces = indexes.into_iter().map(|index| {
             let end = index.chunk_start_offset.checked_add(index.chunk_length).filter(|end| *end <= start)?;
             let channels = index.message_index_offsets.keys().copied().collect::<Box<[_]>>();
@@ -186,11 +230,9 @@ impl Opening<'_> {
         });
         let mut pieces = pieces.collect::<Option<Vec<_>>>()?;
         pieces.sort_by_key(|p| p.range.start);
-        let overlap = pieces.windows(2).any(|two| two[0].range.end > two[1].range.start);
         let short = pieces.iter().any(|p| p.range.end - p.range.start < FRAME_BYTES as u64);
-        let all: BTreeSet<u16> = pieces.iter().flat_map(|p| p.channels.iter().flatten().copied()).collect();
         let mut channels = with_raw_schemas(&summary.channels);
-        if overlap || short || !all.iter().all(|id| channels.contains_key(id)) {
+        if short {
             return None;
         }
         for (id, channel) in &mut channels {
@@ -202,7 +244,7 @@ impl Opening<'_> {
             Some(Attachment { name: index.name, media_type: index.media_type, bytes: index.data_size, range })
         });
         let attachments = attachments.collect();
-        Some(McapFile { path: self.path.clone(), bytes: self.bytes, indexed: true, channels, pieces, attachments })
+        Some(McapFile { path: self.path.clone(), bytes: self.bytes, walked: None, channels, pieces, attachments })
     }
 
     fn damaged(&self, offset: u64, what: impl Into<String>) -> Fault {
@@ -210,7 +252,7 @@ impl Opening<'_> {
     }
 
     // Goes through all records up to the end of the data or of what there is of them.
-    async fn walk(&self) -> Result<McapFile, Fault> {
+    async fn walk(&self, mut reason: String) -> Result<McapFile, Fault> {
         let start = self.read(0..(MAGIC.len() as u64).min(self.bytes)).await?;
         if start[..] != *MAGIC {
             return Err(self.damaged(0, "it does not begin as an MCAP file does"));
@@ -223,8 +265,14 @@ impl Opening<'_> {
             match splitter.next_record().map_err(|what| self.damaged(offset, what))? {
                 Ok(SplitRecord { code: opcode::DATA_END | opcode::FOOTER, .. }) => break,
                 Ok(record) => walk.record(&record).map_err(|what| self.damaged(offset, what))?,
+                Err(_) if read == self.bytes && self.is_closed().await? => {
+                    return Err(self.damaged(offset, "a record claims more bytes than there are"));
+                }
                 // A record that was cut off is none.
-                Err(_) if read == self.bytes => break,
+                Err(_) if read == self.bytes => {
+                    reason = "it is cut off".to_owned();
+                    break;
+                }
                 Err(missing) => {
                     let block = self.read(read..(read + BLOCK.max(missing)).min(self.bytes)).await?;
                     read += block.len() as u64;
@@ -234,8 +282,9 @@ impl Opening<'_> {
             }
         }
         let attachments = std::mem::take(&mut walk.attachments);
-        let (channels, pieces) = walk.finish();
-        Ok(McapFile { path: self.path.clone(), bytes: self.bytes, indexed: false, channels, pieces, attachments })
+        let (channels, pieces) = walk.finish().map_err(|(offset, what)| self.damaged(offset, what))?;
+        let walked = Some(reason);
+        Ok(McapFile { path: self.path.clone(), bytes: self.bytes, walked, channels, pieces, attachments })
     }
 }
 
@@ -252,6 +301,11 @@ fn with_raw_schemas(channels: &BTreeMap<u16, Arc<echolake_recording::Channel<'st
         Channel { topic: channel.topic.clone(), schema, messages: None, times: None }
     };
     channels.iter().map(|(id, channel)| (*id, raw(channel))).collect()
+}
+
+/// The damage of a message whose channel nothing describes.
+pub(super) fn undescribed(channel: u16) -> String {
+    format!("it has a message of channel {channel}, which no record describes")
 }
 
 /// What a walk has come by.
@@ -341,14 +395,19 @@ impl Walk {
         }
     }
 
-    fn finish(self) -> (BTreeMap<u16, Channel>, Vec<Piece>) {
+    // An error has the place of a message whose channel nothing describes: nobody knows its topic.
+    fn finish(self) -> Result<(BTreeMap<u16, Channel>, Vec<Piece>), (u64, String)> {
         let mut channels = with_raw_schemas(&self.definitions.into_channels());
+        if let Some(unknown) = self.seen.keys().find(|id| !channels.contains_key(id)) {
+            let piece = self.pieces.iter().find(|piece| piece.has(*unknown));
+            return Err((piece.map_or(0, |piece| piece.range.start), undescribed(*unknown)));
+        }
         for (id, channel) in &mut channels {
             let seen = self.seen.get(id);
             channel.messages = Some(seen.map_or(0, |(count, _)| *count));
             channel.times = seen.map(|(_, times)| *times);
         }
-        (channels, self.pieces)
+        Ok((channels, self.pieces))
     }
 }
 

@@ -1,18 +1,29 @@
-//! JSON messages into columns: by their schema's properties, else as one column `json` with the text.
+//! JSON messages into columns: by their schema's properties, else as one column `json` with the text. CBOR is the same
+//! in binary.
 //!
-//! A value that does not fit its column's type is null: nothing in a JSON channel binds its writer to the schema.
+//! A value that does not fit its column's type is null and counted: nothing in a JSON channel binds its writer to the
+//! schema.
 
+use std::borrow::Cow;
 use std::sync::Arc;
 
 use arrow::datatypes::{DataType, Field, Fields};
 use echolake_schema::tables::LIST_CHILD;
-use serde_json::{Map, Value};
+use serde_json::{Map, Number, Value};
 
-use super::column::{Column, DEEPEST, MOST_LEAVES, Record, width};
+use super::cbor;
+use super::column::{Column, DEEPEST, MOST_LEAVES, Record, integer_type, width};
 use super::error::{Malformed, Spent};
+use super::schema::BYTE_ORDER_MARK;
 
 /// A parsed value takes about this many bytes for each byte of its text, at worst.
 const PARSED: usize = 16;
+/// The same of CBOR, in which a value may have one byte.
+const PARSED_CBOR: usize = 96;
+/// Integers are below this, 2^64.
+const MOST_INTEGER: f64 = 18_446_744_073_709_551_616.0;
+/// Numbers that JSON's grammar lacks and that many writers write all the same.
+const NO_NUMBERS: [&str; 3] = ["-Infinity", "Infinity", "NaN"];
 
 /// Where the columns come from.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -21,6 +32,13 @@ pub(super) enum Shape {
     Properties,
     /// There is one, the text.
     Text,
+}
+
+/// The encoding of messages.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum JsonEncoding {
+    Text,
+    Cbor,
 }
 
 /// The columns that a JSON schema describes.
@@ -63,7 +81,7 @@ fn kind(schema: &Value, depth: usize, leaves: &mut usize) -> Result<DataType, St
     };
     Ok(match name {
         Some("number") => DataType::Float64,
-        Some("integer") => DataType::Int64,
+        Some("integer") => integer(schema),
         Some("boolean") => DataType::Boolean,
         Some("array") if depth < DEEPEST => match schema.get("items") {
             Some(items) => {
@@ -80,44 +98,78 @@ fn kind(schema: &Value, depth: usize, leaves: &mut usize) -> Result<DataType, St
     })
 }
 
+// 64 bits with a sign if the schema bounds it so. Of others nobody knows the sign, and JSON's numbers are commonly those
+// of 64 bits with a sign or without.
+fn integer(schema: &Value) -> DataType {
+    let bounded = |name| schema.get(name).is_some_and(Value::is_i64);
+    let format = schema.get("format").and_then(Value::as_str);
+    let is_named = format.is_some_and(|name| matches!(name, "int8" | "int16" | "int32" | "int64"));
+    match is_named || (bounded("minimum") && bounded("maximum")) {
+        true => DataType::Int64,
+        false => integer_type(),
+    }
+}
+
 /// Decodes messages.
 pub(super) struct Decoder {
     shape: Shape,
+    encoding: JsonEncoding,
     fields: Fields,
     record: Record,
     width: usize,
     pub(super) spent: Spent,
+    /// Values that are null because they are not of their column's type, or no numbers.
+    pub(super) unfit: usize,
 }
 
 impl Decoder {
-    pub(super) fn new(shape: Shape, all: &Fields, wanted: &[usize]) -> Self {
+    pub(super) fn new(shape: Shape, encoding: JsonEncoding, all: &Fields, wanted: &[usize]) -> Self {
         let fields: Fields = wanted.iter().map(|i| all[*i].clone()).collect();
         let width = fields.iter().map(|f| width(f.data_type())).sum();
-        Self { shape, record: Record::new(&fields), fields, width, spent: Spent::default() }
+        Self { shape, encoding, record: Record::new(&fields), fields, width, spent: Spent::default(), unfit: 0 }
     }
 
     pub(super) fn push(&mut self, data: &[u8]) -> Result<(), Malformed> {
         self.spent.add(self.width)?;
-        if self.shape == Shape::Text {
-            self.spent.add(data.len())?;
-            for column in &mut self.record.columns {
-                if let Column::Text(c) = column {
-                    c.push_text(data);
-                }
-            }
-            return Ok(());
-        }
         // Nothing is asked of the message: it is not parsed.
         if self.record.columns.is_empty() {
             return Ok(());
         }
-        Spent::default().add(data.len().saturating_mul(PARSED))?;
-        let message: Value = serde_json::from_slice(data).map_err(|_| Malformed::Json)?;
+        if self.shape == Shape::Text {
+            let text = match self.encoding {
+                JsonEncoding::Text => Cow::Borrowed(data),
+                JsonEncoding::Cbor => Cow::Owned(self.parse(data)?.to_string().into_bytes()),
+            };
+            self.spent.add(text.len())?;
+            for column in &mut self.record.columns {
+                if let Column::Text(c) = column {
+                    c.push_text(&text);
+                }
+            }
+            return Ok(());
+        }
+        let message = self.parse(data)?;
         let message = message.as_object().ok_or(Malformed::Json)?;
         for (field, column) in self.fields.iter().zip(&mut self.record.columns) {
-            push(column, field.data_type(), message.get(field.name()), &mut self.spent)?;
+            push(column, field.data_type(), message.get(field.name()), &mut self.spent, &mut self.unfit)?;
         }
         Ok(())
+    }
+
+    fn parse(&mut self, data: &[u8]) -> Result<Value, Malformed> {
+        let factor = if self.encoding == JsonEncoding::Cbor { PARSED_CBOR } else { PARSED };
+        Spent::default().add(data.len().saturating_mul(factor))?;
+        if self.encoding == JsonEncoding::Cbor {
+            return cbor::parse(data);
+        }
+        let data = data.strip_prefix(BYTE_ORDER_MARK).unwrap_or(data);
+        if let Ok(message) = serde_json::from_slice(data) {
+            return Ok(message);
+        }
+        let (text, replaced) = without_no_numbers(data);
+        let message = serde_json::from_slice(&text).map_err(|_| Malformed::Json)?;
+        self.unfit += replaced;
+        Ok(message)
     }
 
     pub(super) fn columns(&mut self) -> &mut [Column] {
@@ -126,14 +178,55 @@ impl Decoder {
     }
 }
 
-fn push(column: &mut Column, kind: &DataType, value: Option<&Value>, spent: &mut Spent) -> Result<(), Malformed> {
+// The text with null in the place of NaN and infinities, and how many there were.
+fn without_no_numbers(data: &[u8]) -> (Vec<u8>, usize) {
+    let mut text = Vec::with_capacity(data.len());
+    let (mut replaced, mut at, mut in_string) = (0, 0, false);
+    while at < data.len() {
+        let rest = &data[at..];
+        let found = NO_NUMBERS.iter().find(|name| !in_string && rest.starts_with(name.as_bytes()));
+        let taken = match found {
+            Some(name) => {
+                text.extend_from_slice(b"null");
+                replaced += 1;
+                name.len()
+            }
+            None => {
+                // What an escape is of does not end a string.
+                let taken = if in_string && rest[0] == b'\\' { rest.len().min(2) } else { 1 };
+                in_string ^= rest[0] == b'"';
+                text.extend_from_slice(&rest[..taken]);
+                taken
+            }
+        };
+        at += taken;
+    }
+    (text, replaced)
+}
+
+fn push(
+    column: &mut Column,
+    kind: &DataType,
+    value: Option<&Value>,
+    spent: &mut Spent,
+    unfit: &mut usize,
+) -> Result<(), Malformed> {
     let Some(value) = value.filter(|v| !v.is_null()) else {
         column.push_null();
         return Ok(());
     };
     match (column, kind, value) {
         (Column::F64(c), _, Value::Number(n)) if n.as_f64().is_some() => c.push(n.as_f64().unwrap_or(f64::NAN)),
-        (Column::I64(c), _, Value::Number(n)) if n.as_i64().is_some() => c.push(n.as_i64().unwrap_or(0)),
+        (Column::I64(c), _, Value::Number(n)) => {
+            let value = integer_of(n).and_then(|value| i64::try_from(value).ok());
+            *unfit += usize::from(value.is_none());
+            c.push_option(value);
+        }
+        (Column::Decimal(c), _, Value::Number(n)) => {
+            let value = integer_of(n);
+            *unfit += usize::from(value.is_none());
+            c.push_option(value);
+        }
         (Column::Bool(c), _, Value::Bool(b)) => c.push(*b),
         (Column::Text(c), _, Value::String(text)) => {
             spent.add(text.len())?;
@@ -148,17 +241,29 @@ fn push(column: &mut Column, kind: &DataType, value: Option<&Value>, spent: &mut
             let each = width(child.data_type());
             for value in values {
                 spent.add(each)?;
-                push(&mut list.values, child.data_type(), Some(value), spent)?;
+                push(&mut list.values, child.data_type(), Some(value), spent, unfit)?;
             }
             list.end_row();
         }
         (Column::Struct(record), DataType::Struct(fields), Value::Object(members)) => {
             for (field, column) in fields.iter().zip(&mut record.columns) {
-                push(column, field.data_type(), members.get(field.name()), spent)?;
+                push(column, field.data_type(), members.get(field.name()), spent, unfit)?;
             }
             record.end_row();
         }
-        (other, _, _) => other.push_null(),
+        (other, _, _) => {
+            *unfit += 1;
+            other.push_null();
+        }
     }
     Ok(())
+}
+
+// A number without a fraction, however it is written: `1.0` and `1e3` are integers in JSON Schema.
+fn integer_of(number: &Number) -> Option<i128> {
+    let exact = number.as_i64().map(i128::from).or_else(|| number.as_u64().map(i128::from));
+    exact.or_else(|| {
+        let value = number.as_f64()?;
+        (value.fract() == 0.0 && value.abs() < MOST_INTEGER).then_some(value as i128)
+    })
 }

@@ -3,6 +3,7 @@
 //! Planning cannot wait for a store, so what a statement asks for is looked up before it is planned; the functions that
 //! the planner then calls only hand it over.
 
+mod cbor;
 mod chunk;
 mod column;
 mod contents;
@@ -10,7 +11,7 @@ mod error;
 mod file;
 mod json;
 mod protobuf;
-mod ros2;
+mod ros;
 mod rows;
 mod scan;
 mod schema;

@@ -7,10 +7,14 @@ use std::sync::Arc;
 
 use arrow::datatypes::{DataType, Field, Fields};
 use echolake_schema::tables::LIST_CHILD;
+use prost_reflect::prost::Message as _;
+use prost_reflect::prost_types::{FileDescriptorProto, FileDescriptorSet};
 use prost_reflect::{DescriptorPool, FieldDescriptor, Kind as ProtoKind, MessageDescriptor};
 
 use super::column::{Column, DEEPEST, List, MOST_LEAVES, Record, duration_type, time_type, width};
 use super::error::{Malformed, Spent};
+
+mod edition;
 
 const NANOS: i64 = 1_000_000_000;
 /// Field numbers up to here are looked up in a table, others in a map.
@@ -18,7 +22,14 @@ const SMALL_NUMBERS: u32 = 1024;
 
 /// The message type that a channel's schema describes: `data` is a FileDescriptorSet.
 pub(super) fn message_type(name: &str, data: &[u8]) -> Result<MessageDescriptor, String> {
-    let pool = DescriptorPool::decode(data).map_err(|e| format!("its schema is no set of file descriptors: {e}"))?;
+    let files =
+        FileDescriptorSet::decode(data).map_err(|e| format!("its schema is no set of file descriptors: {e}"))?;
+    let is_plain = |file: &FileDescriptorProto| matches!(file.syntax.as_deref(), None | Some("proto2" | "proto3"));
+    let pool = match files.file.iter().all(is_plain) {
+        true => DescriptorPool::decode(data),
+        false => DescriptorPool::from_file_descriptor_set(edition::without_editions(files, data)?),
+    };
+    let pool = pool.map_err(|e| format!("its schema is no set of file descriptors: {e}"))?;
     pool.get_message_by_name(name).ok_or_else(|| format!("its schema does not describe `{name}`"))
 }
 
@@ -395,8 +406,8 @@ impl Kind {
             }
             ProtoKind::Enum(names) => {
                 let mut by_number = HashMap::new();
-                // Of several names of one number the first is the one to show.
-                for value in names.values() {
+                // Of several names of one number the first in the file is the one to show.
+                for value in &names.enum_descriptor_proto().value {
                     by_number.entry(value.number()).or_insert_with(|| value.name().to_owned());
                 }
                 Self::Enum(by_number)

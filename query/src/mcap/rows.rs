@@ -52,9 +52,9 @@ impl Head {
             Self::Surface => Field::new("surface_id", DataType::Utf8, true),
             Self::Run => Field::new("run_id", DataType::Utf8, true),
             Self::Topic => Field::new("topic", DataType::Utf8, false),
-            Self::Time => Field::new("log_time", time_type(), false),
-            Self::TimeNanos => Field::new("log_time_ns", DataType::Int64, false),
-            Self::Published => Field::new("publish_time", time_type(), false),
+            Self::Time => Field::new("log_time", time_type(), true),
+            Self::TimeNanos => Field::new("log_time_ns", DataType::Int64, true),
+            Self::Published => Field::new("publish_time", time_type(), true),
             Self::Sequence => Field::new("sequence", DataType::Int64, false),
             Self::Size => Field::new("size", DataType::Int64, false),
             Self::Data => Field::new("data", DataType::Binary, false),
@@ -89,6 +89,8 @@ pub(super) struct Rows {
     count: usize,
     bytes: usize,
     most: usize,
+    /// Values that are null because they are not of their column's type.
+    unfit: usize,
     ready: VecDeque<RecordBatch>,
 }
 
@@ -119,7 +121,17 @@ impl Rows {
                 None => output.push(Output::Own(place - heads.len())),
             }
         }
-        Self { schema, output, heads: wanted, current: None, count: 0, bytes: 0, most, ready: VecDeque::new() }
+        Self {
+            schema,
+            output,
+            heads: wanted,
+            current: None,
+            count: 0,
+            bytes: 0,
+            most,
+            unfit: 0,
+            ready: VecDeque::new(),
+        }
     }
 
     /// Adds a message; true once a batch is ready.
@@ -140,6 +152,7 @@ impl Rows {
                 return Ok(Err(e));
             }
             bytes = current.decoder.bytes();
+            self.unfit += current.decoder.take_unfit();
         }
         for (head, column) in &mut self.heads {
             self.bytes += head.push(message, column);
@@ -149,6 +162,11 @@ impl Rows {
             self.finish()?;
         }
         Ok(Ok(!self.ready.is_empty()))
+    }
+
+    /// Takes the number of values since the last call that are null because they are not of their column's type.
+    pub(super) fn take_unfit(&mut self) -> usize {
+        std::mem::take(&mut self.unfit)
     }
 
     /// A batch that is ready.
@@ -178,11 +196,12 @@ impl Rows {
 impl Head {
     // The bytes that the value takes.
     fn push(self, message: &Message<'_>, column: &mut Column) -> usize {
-        let nanos = |time: u64| i64::try_from(time).unwrap_or(i64::MAX);
+        // A time that 64 bits with a sign do not hold, from the year 2262 on, is null.
+        let nanos = |time: u64| i64::try_from(time).ok();
         match (self, column) {
-            (Self::Time, Column::Time(c)) => c.push(nanos(message.header.log_time)),
-            (Self::TimeNanos, Column::I64(c)) => c.push(nanos(message.header.log_time)),
-            (Self::Published, Column::Time(c)) => c.push(nanos(message.header.publish_time)),
+            (Self::Time, Column::Time(c)) => c.push_option(nanos(message.header.log_time)),
+            (Self::TimeNanos, Column::I64(c)) => c.push_option(nanos(message.header.log_time)),
+            (Self::Published, Column::Time(c)) => c.push_option(nanos(message.header.publish_time)),
             (Self::Sequence, Column::I64(c)) => c.push(i64::from(message.header.sequence)),
             (Self::Size, Column::I64(c)) => c.push(message.data.len() as i64),
             (Self::Data, Column::Binary(c)) => {

@@ -27,7 +27,7 @@ use object_store::ObjectStoreExt as _;
 
 use super::chunk::{PieceRecords, ReadProgress, ReadStep, ReadStop};
 use super::error::Fault;
-use super::file::Piece;
+use super::file::{Piece, undescribed};
 use super::rows::{Message, Rows};
 use super::table::Parts;
 
@@ -46,8 +46,8 @@ pub(super) struct Scan {
     pub(super) projection: Vec<usize>,
     /// The same as fields.
     pub(super) schema: SchemaRef,
-    /// Times of messages, ns.
-    pub(super) times: RangeInclusive<i64>,
+    /// Times of messages, ns; None if all are asked for, also those that have no such time.
+    pub(super) times: Option<RangeInclusive<i64>>,
     pub(super) limit: Option<usize>,
 }
 
@@ -181,6 +181,7 @@ impl ExecutionPlan for McapExec {
             left: scan.limit.unwrap_or(usize::MAX),
             memory: MemoryConsumer::new("McapExec").register(context.memory_pool()),
             chunks: count("chunks_read"),
+            unfit: count("values_unfit"),
             baseline: BaselineMetrics::new(&self.metrics, partition),
         };
         let batches = stream::try_unfold(scanner, |mut scanner| async move {
@@ -220,6 +221,8 @@ struct Scanner {
     left: usize,
     memory: MemoryReservation,
     chunks: Count,
+    /// Values that are null because they are not of their column's type.
+    unfit: Count,
     baseline: BaselineMetrics,
 }
 
@@ -297,8 +300,16 @@ impl Scanner {
         let offset = current.offset;
         let mut sink = |record: Record<'_>| {
             let Record::Message { header, data } = &record else { return Ok(ReadStep::Continue) };
-            let Some((topic, mapping)) = source.channels.get(&header.channel_id) else { return Ok(ReadStep::Continue) };
-            if !times.contains(&i64::try_from(header.log_time).unwrap_or(i64::MAX)) {
+            let Some((topic, mapping)) = source.channels.get(&header.channel_id) else {
+                if source.file.channels.contains_key(&header.channel_id) {
+                    return Ok(ReadStep::Continue);
+                }
+                let (file, what) = (source.file.path.to_string(), undescribed(header.channel_id));
+                return Err(Fault::Damaged { file, offset, what }.into());
+            };
+            let within =
+                |times: &RangeInclusive<i64>| i64::try_from(header.log_time).is_ok_and(|nanos| times.contains(&nanos));
+            if !times.as_ref().is_none_or(within) {
                 return Ok(ReadStep::Continue);
             }
             let message = Message { run: source.run.as_ref(), topic, header, data };
@@ -313,7 +324,9 @@ impl Scanner {
             *left -= 1;
             Ok::<_, DataFusionError>(if ready || *left == 0 { ReadStep::Pause } else { ReadStep::Continue })
         };
-        match current.records.read(&mut sink) {
+        let progress = current.records.read(&mut sink);
+        self.unfit.add(self.rows.take_unfit());
+        match progress {
             Ok(ReadProgress::Paused) => Ok(()),
             Ok(ReadProgress::Done) => {
                 self.current = None;

@@ -6,7 +6,9 @@ use arrow::error::ArrowError;
 use prost_reflect::MessageDescriptor;
 
 use super::error::Malformed;
-use super::{json, protobuf, ros2};
+use super::json::JsonEncoding;
+use super::ros::RosVersion;
+use super::{json, protobuf, ros};
 
 /// A channel's schema as it stands in the file.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, Default)]
@@ -32,31 +34,40 @@ pub(super) struct Layout {
 enum Kind {
     Protobuf(MessageDescriptor),
     /// By its properties, or one column with the text.
-    Json(json::Shape),
-    Ros2(ros2::Definition),
+    Json(json::Shape, JsonEncoding),
+    Ros(ros::Definition),
+    /// Messages of an encoding that is not known, which have no columns.
+    Unknown,
 }
+
+/// The start of some texts in UTF-8, which is no part of them.
+pub(super) const BYTE_ORDER_MARK: &[u8] = b"\xef\xbb\xbf";
+
+/// The encodings that have columns, in words.
+const KNOWN: &str = "protobuf, json and cbor with jsonschema or none, cdr with ros2msg, and ros1 with ros1msg";
 
 impl Layout {
     /// Understands a schema; the text of an error says what is wrong with it.
     pub(super) fn new(schema: &RawSchema) -> Result<Self, String> {
-        let (fields, kind) = match (schema.messages.as_str(), schema.encoding.as_str()) {
-            ("protobuf", "protobuf") => {
+        let text = schema.data.strip_prefix(BYTE_ORDER_MARK).unwrap_or(&schema.data);
+        let (fields, kind) = match Encoding::of(schema) {
+            Some(Encoding::Protobuf) => {
                 let message = protobuf::message_type(&schema.name, &schema.data)?;
                 (protobuf::fields(&message)?, Kind::Protobuf(message))
             }
-            ("json", "jsonschema" | "") => {
-                let (fields, shape) = json::columns(&schema.data)?;
-                (fields, Kind::Json(shape))
+            Some(Encoding::Json(encoding)) => {
+                let (fields, shape) = json::columns(text)?;
+                (fields, Kind::Json(shape, encoding))
             }
-            ("cdr", "ros2msg") => {
-                let text = std::str::from_utf8(&schema.data).map_err(|e| format!("its schema is no text: {e}"))?;
-                let definition = ros2::Definition::parse(&schema.name, text)?;
-                (definition.fields()?, Kind::Ros2(definition))
+            Some(Encoding::Ros(version)) => {
+                let text = std::str::from_utf8(text).map_err(|e| format!("its schema is no text: {e}"))?;
+                let definition = ros::Definition::parse(&schema.name, text, version)?;
+                (definition.fields()?, Kind::Ros(definition))
             }
-            (messages, encoding) => {
-                let known = "protobuf, json with jsonschema, and cdr with ros2msg";
+            None => {
+                let (messages, encoding) = (&schema.messages, &schema.encoding);
                 return Err(format!(
-                    "messages in `{messages}` with a schema in `{encoding}` are not known, but {known}"
+                    "messages in `{messages}` with a schema in `{encoding}` are not known, but {KNOWN}"
                 ));
             }
         };
@@ -65,13 +76,45 @@ impl Layout {
         Ok(Self { fields, kind })
     }
 
+    /// The layout of messages that are not decoded: they have rows, and no columns of their own.
+    pub(super) fn without_columns() -> Self {
+        Self { fields: Fields::empty(), kind: Kind::Unknown }
+    }
+
+    /// Returns true if messages with such a schema can be decoded, unless it is damaged.
+    pub(super) fn is_known(schema: &RawSchema) -> bool {
+        Encoding::of(schema).is_some()
+    }
+
     /// A decoder of some of the columns, by their place in `fields`.
     pub(super) fn decoder(&self, wanted: &[usize]) -> Decoder {
         match &self.kind {
             Kind::Protobuf(message) => Decoder::Protobuf(protobuf::Decoder::new(message, &self.fields, wanted)),
-            Kind::Json(shape) => Decoder::Json(json::Decoder::new(*shape, &self.fields, wanted)),
-            Kind::Ros2(definition) => Decoder::Ros2(ros2::Decoder::new(definition, &self.fields, wanted)),
+            Kind::Json(shape, encoding) => Decoder::Json(json::Decoder::new(*shape, *encoding, &self.fields, wanted)),
+            Kind::Ros(definition) => Decoder::Ros(ros::Decoder::new(definition, &self.fields, wanted)),
+            Kind::Unknown => Decoder::None,
         }
+    }
+}
+
+/// An encoding of messages, together with that of their schema.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Encoding {
+    Protobuf,
+    Json(JsonEncoding),
+    Ros(RosVersion),
+}
+
+impl Encoding {
+    fn of(schema: &RawSchema) -> Option<Self> {
+        Some(match (schema.messages.as_str(), schema.encoding.as_str()) {
+            ("protobuf", "protobuf") => Self::Protobuf,
+            ("json", "jsonschema" | "") => Self::Json(JsonEncoding::Text),
+            ("cbor", "jsonschema" | "") => Self::Json(JsonEncoding::Cbor),
+            ("cdr", "ros2msg") => Self::Ros(RosVersion::Two),
+            ("ros1", "ros1msg") => Self::Ros(RosVersion::One),
+            _ => return None,
+        })
     }
 }
 
@@ -79,7 +122,9 @@ impl Layout {
 pub(super) enum Decoder {
     Protobuf(protobuf::Decoder),
     Json(json::Decoder),
-    Ros2(ros2::Decoder),
+    Ros(ros::Decoder),
+    /// Passes messages over.
+    None,
 }
 
 impl Decoder {
@@ -88,7 +133,8 @@ impl Decoder {
         match self {
             Self::Protobuf(decoder) => decoder.push(data),
             Self::Json(decoder) => decoder.push(data),
-            Self::Ros2(decoder) => decoder.push(data),
+            Self::Ros(decoder) => decoder.push(data),
+            Self::None => Ok(()),
         }
     }
 
@@ -97,7 +143,16 @@ impl Decoder {
         match self {
             Self::Protobuf(decoder) => decoder.spent.bytes(),
             Self::Json(decoder) => decoder.spent.bytes(),
-            Self::Ros2(decoder) => decoder.spent.bytes(),
+            Self::Ros(decoder) => decoder.spent.bytes(),
+            Self::None => 0,
+        }
+    }
+
+    /// Takes the number of values since the last call that are null because they are not of their column's type.
+    pub(super) fn take_unfit(&mut self) -> usize {
+        match self {
+            Self::Json(decoder) => std::mem::take(&mut decoder.unfit),
+            Self::Protobuf(_) | Self::Ros(_) | Self::None => 0,
         }
     }
 
@@ -106,7 +161,8 @@ impl Decoder {
         let columns = match self {
             Self::Protobuf(decoder) => decoder.columns(),
             Self::Json(decoder) => decoder.columns(),
-            Self::Ros2(decoder) => decoder.columns(),
+            Self::Ros(decoder) => decoder.columns(),
+            Self::None => &mut [],
         };
         columns.iter_mut().map(super::column::Column::finish).collect()
     }

@@ -16,7 +16,7 @@ use datafusion::logical_expr::{BinaryExpr, Expr, Operator, TableProviderFilterPu
 use datafusion::physical_plan::ExecutionPlan;
 
 use super::error::Fault;
-use super::file::{Files, McapFile, Piece};
+use super::file::{Channel, Files, McapFile, Piece};
 use super::rows::{Head, Mapping};
 use super::scan::{McapExec, Scan};
 use super::schema::{Layout, RawSchema};
@@ -59,18 +59,21 @@ pub(super) struct Source {
 
 /// The table of a topic's messages, a column a field.
 pub(super) fn columns(targets: Vec<Target>, topic: &str, files: &Arc<Files>) -> Result<McapTable, Fault> {
-    let mut layouts = Layouts::default();
-    let mut sources = Vec::new();
-    for target in &targets {
-        let mut channels = BTreeMap::new();
-        for (id, channel) in target.file.channels.iter().filter(|(_, c)| c.topic == topic) {
-            channels.insert(*id, (topic.to_owned(), layouts.of(&target.file, topic, &channel.schema)?));
-        }
-        sources.push(Source { run: target.run.clone(), file: target.file.clone(), channels });
-    }
+    let channels_of = |target: &Target| -> Vec<(u16, Channel)> {
+        let meant = target.file.channels.iter().filter(|(_, channel)| channel.topic == topic);
+        meant.map(|(id, channel)| (*id, channel.clone())).collect()
+    };
+    let layouts = Layouts::of_channels(&targets, topic, channels_of)?;
     if layouts.all.is_empty() {
         return Err(no_topic(&targets, topic));
     }
+    let source = |target: &Target| {
+        let mapped =
+            |(id, channel): (u16, Channel)| Some((id, (topic.to_owned(), *layouts.known.get(&channel.schema)?)));
+        let channels = channels_of(target).into_iter().filter_map(mapped).collect();
+        Source { run: target.run.clone(), file: target.file.clone(), channels }
+    };
+    let sources = targets.iter().map(source).collect();
     let heads = Head::OF_COLUMNS.to_vec();
     let (schema, mappings) = layouts.table(&heads, topic)?;
     let name = format!("topic={topic}");
@@ -117,30 +120,78 @@ struct Layouts {
 }
 
 impl Layouts {
-    fn of(&mut self, file: &McapFile, topic: &str, schema: &Arc<RawSchema>) -> Result<usize, Fault> {
-        if let Some(known) = self.known.get(schema) {
-            return Ok(*known);
+    // A channel without messages adds its columns if they are known and fit those of the others. One with messages in
+    // an encoding that is not known has rows, if another channel of the topic has columns.
+    fn of_channels(
+        targets: &[Target],
+        topic: &str,
+        channels_of: impl Fn(&Target) -> Vec<(u16, Channel)>,
+    ) -> Result<Self, Fault> {
+        let mut layouts = Self::default();
+        let mut refusals = Vec::new();
+        let mut empty = Vec::new();
+        for target in targets {
+            for (_, channel) in channels_of(target) {
+                if channel.messages == Some(0) {
+                    empty.push((target, channel.schema));
+                } else if !layouts.known.contains_key(&channel.schema) {
+                    match layout_of(&target.file, topic, &channel.schema) {
+                        Ok(layout) => layouts.add(&target.file, &channel.schema, layout),
+                        Err(refusal) => refusals.push((target, channel.schema, refusal)),
+                    }
+                }
+            }
         }
-        let layout = match schema.data.len() {
-            ..=LARGEST_SCHEMA => Layout::new(schema),
-            bytes => Err(format!("its schema has {bytes} bytes, more than {LARGEST_SCHEMA}")),
+        let mut refusal_of_empty = None;
+        for (target, schema) in empty {
+            if layouts.known.contains_key(&schema) {
+                continue;
+            }
+            match layout_of(&target.file, topic, &schema) {
+                Ok(layout) if layouts.fits(&layout) => layouts.add(&target.file, &schema, layout),
+                Ok(_) => {}
+                Err(refusal) => refusal_of_empty = refusal_of_empty.or(Some(refusal)),
+            }
+        }
+        for (target, schema, refusal) in refusals {
+            if layouts.all.is_empty() || Layout::is_known(&schema) {
+                return Err(refusal);
+            }
+            layouts.add(&target.file, &schema, Layout::without_columns());
+        }
+        match refusal_of_empty {
+            Some(refusal) if layouts.all.is_empty() => Err(refusal),
+            _ => Ok(layouts),
+        }
+    }
+
+    fn add(&mut self, file: &McapFile, schema: &Arc<RawSchema>, layout: Layout) {
+        self.known.insert(schema.clone(), self.all.len());
+        self.all.push((file.path.to_string(), Arc::new(layout)));
+    }
+
+    // Whether no column has another type than one of its name in the others.
+    fn fits(&self, layout: &Layout) -> bool {
+        let clashes = |field: &Arc<Field>| {
+            let mut others = self.all.iter().filter_map(|(_, other)| other.fields.find(field.name()));
+            others.any(|(_, other)| other != field)
         };
-        let wrong = |what| Fault::Schema { file: file.path.to_string(), topic: topic.to_owned(), what };
-        self.all.push((file.path.to_string(), Arc::new(layout.map_err(wrong)?)));
-        self.known.insert(schema.clone(), self.all.len() - 1);
-        Ok(self.all.len() - 1)
+        !layout.fields.iter().any(clashes)
     }
 
     // The columns of all schemas: those of one name are one column, which a schema may lack.
     fn table(self, heads: &[Head], topic: &str) -> Result<(SchemaRef, Vec<Mapping>), Fault> {
         let mut fields: Vec<Field> = heads.iter().map(|h| h.field()).collect();
         let taken: BTreeSet<String> = fields.iter().map(|f| f.name().clone()).collect();
+        let own_names: BTreeSet<String> =
+            self.all.iter().flat_map(|(_, layout)| layout.fields.iter().map(|f| f.name().clone())).collect();
         let mut places: Vec<HashMap<usize, usize>> = Vec::new();
         for (file, layout) in &self.all {
             let mut of = HashMap::new();
             for (i, field) in layout.fields.iter().enumerate() {
                 let mut name = field.name().clone();
-                while taken.contains(&name) {
+                // Neither a column of every message nor another field of the messages.
+                while taken.contains(&name) || (name != *field.name() && own_names.contains(&name)) {
                     name = format!("{PREFIX}{name}");
                 }
                 let field = field.as_ref().clone().with_name(name);
@@ -173,11 +224,21 @@ impl Layouts {
     }
 }
 
+fn layout_of(file: &McapFile, topic: &str, schema: &RawSchema) -> Result<Layout, Fault> {
+    let layout = match schema.data.len() {
+        ..=LARGEST_SCHEMA => Layout::new(schema),
+        bytes => Err(format!("its schema has {bytes} bytes, more than {LARGEST_SCHEMA}")),
+    };
+    layout.map_err(|what| Fault::Schema { file: file.path.to_string(), topic: topic.to_owned(), what })
+}
+
 impl Source {
     // The pieces that may have messages of the channels in the time.
-    fn pieces<'a>(&'a self, times: &'a RangeInclusive<i64>) -> impl Iterator<Item = &'a Piece> {
+    fn pieces<'a>(&'a self, times: Option<&'a RangeInclusive<i64>>) -> impl Iterator<Item = &'a Piece> {
         let nanos = |time: u64| i64::try_from(time).unwrap_or(i64::MAX);
-        let within = move |p: &&Piece| nanos(p.times.1) >= *times.start() && nanos(p.times.0) <= *times.end();
+        let within = move |p: &&Piece| {
+            times.is_none_or(|times| nanos(p.times.1) >= *times.start() && nanos(p.times.0) <= *times.end())
+        };
         let meant = |p: &&Piece| self.channels.keys().any(|channel| p.has(*channel));
         self.file.pieces.iter().filter(within).filter(meant)
     }
@@ -208,16 +269,13 @@ impl TableProvider for McapTable {
         filters: &[Expr],
         limit: Option<usize>,
     ) -> Result<Arc<dyn ExecutionPlan>> {
-        let mut times = i64::MIN..=i64::MAX;
-        for bound in filters.iter().filter_map(times_of) {
-            times = *times.start().max(bound.start())..=*times.end().min(bound.end());
-        }
+        let times = filters.iter().filter_map(times_of).reduce(both);
         let shown = self.runs(filters.iter().filter(|f| is_of_runs(f)), state)?;
         let sources = &self.parts.sources;
         let all = sources.iter().map(|s| s.file.pieces.len()).sum();
         let pieces = sources.iter().enumerate().filter(|(i, _)| shown[*i]);
         let pieces =
-            pieces.flat_map(|(i, source)| source.pieces(&times).map(move |piece| (i, piece.clone()))).collect();
+            pieces.flat_map(|(i, source)| source.pieces(times.as_ref()).map(move |piece| (i, piece.clone()))).collect();
         let projection = projection.cloned().unwrap_or_else(|| (0..self.schema.fields().len()).collect());
         let schema = Arc::new(self.schema.project(&projection)?);
         let scan = Scan { parts: self.parts.clone(), schema, projection, times, limit };
@@ -269,8 +327,7 @@ fn is_of_runs(filter: &Expr) -> bool {
 fn times_of(filter: &Expr) -> Option<RangeInclusive<i64>> {
     match filter {
         Expr::BinaryExpr(BinaryExpr { left, op: Operator::And, right }) => {
-            let (left, right) = (times_of(left)?, times_of(right)?);
-            Some(*left.start().max(right.start())..=*left.end().min(right.end()))
+            Some(both(times_of(left)?, times_of(right)?))
         }
         Expr::BinaryExpr(BinaryExpr { left, op, right }) if is_time(left) => compared(*op, nanos_of(right)?),
         Expr::BinaryExpr(BinaryExpr { left, op, right }) if is_time(right) => compared(op.swap()?, nanos_of(left)?),
@@ -279,6 +336,11 @@ fn times_of(filter: &Expr) -> Option<RangeInclusive<i64>> {
         }
         _ => None,
     }
+}
+
+// The times that are in both ranges.
+fn both(one: RangeInclusive<i64>, other: RangeInclusive<i64>) -> RangeInclusive<i64> {
+    *one.start().max(other.start())..=*one.end().min(other.end())
 }
 
 fn compared(op: Operator, nanos: i64) -> Option<RangeInclusive<i64>> {

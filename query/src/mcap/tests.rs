@@ -377,6 +377,8 @@ async fn messages_that_do_not_fit_their_schema_are_named() {
     refused(&lake, "select * from mcap('inbox/r.mcap', '/state')", &["ends within a value"]).await;
 }
 
+mod foreign;
+
 mod slow {
     use super::*;
 

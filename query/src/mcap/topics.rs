@@ -1,6 +1,8 @@
 //! The topics of files as a table: what there is, before anything is scanned.
 
 use std::collections::HashMap;
+use std::convert::Infallible;
+use std::ops::Range;
 use std::sync::Arc;
 
 use arrow::array::{ArrayRef, BooleanArray, Int64Array, StringArray, TimestampNanosecondArray};
@@ -13,6 +15,7 @@ use echolake_recording::{Record, RecordCursor};
 use futures::{StreamExt as _, TryStreamExt as _};
 use object_store::ObjectStoreExt as _;
 
+use super::chunk::{PieceKind, PieceRecords, ReadStep, ReadStop};
 use super::column::{UTC, time_type};
 use super::error::Fault;
 use super::file::{Files, McapFile, Piece};
@@ -21,7 +24,7 @@ use super::target::Target;
 
 /// Files that are asked for their first and last times at once.
 const AT_ONCE: usize = 16;
-/// Message indexes larger than this are not read for two times.
+/// Message indexes larger than this are not read for two times, but the chunk is.
 const LARGEST_INDEX: u64 = 16 << 20;
 
 type Times = Option<(u64, u64)>;
@@ -80,8 +83,14 @@ fn batch(rows: &[Row<'_>]) -> Result<RecordBatch, arrow::error::ArrowError> {
         named("chunk_bytes", DataType::Int64, true),
         named("file_bytes", DataType::Int64, true),
         named("indexed", DataType::Boolean, false),
+        named("read_by", DataType::Utf8, false),
     ]);
-    let indexed: Vec<bool> = rows.iter().map(|r| r.target.file.indexed).collect();
+    let indexed: Vec<bool> = rows.iter().map(|r| r.target.file.walked.is_none()).collect();
+    let read_by = |r: &Row<'_>| match &r.target.file.walked {
+        Some(reason) => format!("walk: {reason}"),
+        None => "summary".to_owned(),
+    };
+    let read_by: Vec<String> = rows.iter().map(read_by).collect();
     let columns: Vec<ArrayRef> = vec![
         text(rows, |r| r.target.run.as_ref().map(|(surface, _)| surface.as_str())),
         text(rows, |r| r.target.run.as_ref().map(|(_, run)| run.as_str())),
@@ -96,12 +105,13 @@ fn batch(rows: &[Row<'_>]) -> Result<RecordBatch, arrow::error::ArrowError> {
         long(rows, |r| Some(r.chunk_bytes)),
         long(rows, |r| Some(r.target.file.bytes)),
         Arc::new(BooleanArray::from(indexed)),
+        Arc::new(StringArray::from(read_by)),
     ];
     RecordBatch::try_new(Arc::new(schema), columns)
 }
 
 // Times of each channel's first and last message: from the message indexes behind the first and the last chunks that
-// have it, and behind others only where their times overlap.
+// have it, and behind others only where their times overlap. Chunks without message indexes are read themselves.
 async fn times(file: &McapFile, files: &Files) -> Result<HashMap<u16, (u64, u64)>, Fault> {
     let mut found = HashMap::new();
     let mut indexes = Indexes { file, files, read: HashMap::new() };
@@ -120,7 +130,7 @@ async fn times(file: &McapFile, files: &Files) -> Result<HashMap<u16, (u64, u64)
 struct Indexes<'a> {
     file: &'a McapFile,
     files: &'a Files,
-    /// First and last time of each channel, by the place of the piece.
+    /// First and last time of each channel, by the piece's offset.
     read: HashMap<u64, HashMap<u16, (u64, u64)>>,
 }
 
@@ -133,7 +143,7 @@ impl Indexes<'_> {
             if best.is_some_and(|best| piece.times.0 >= best) {
                 break;
             }
-            let Some((first, _)) = self.of(piece, channel).await? else { return Ok(None) };
+            let Some((first, _)) = self.of(piece, channel).await? else { continue };
             best = Some(best.map_or(first, |best| best.min(first)));
         }
         Ok(best)
@@ -147,26 +157,49 @@ impl Indexes<'_> {
             if best.is_some_and(|best| piece.times.1 <= best) {
                 break;
             }
-            let Some((_, last)) = self.of(piece, channel).await? else { return Ok(None) };
+            let Some((_, last)) = self.of(piece, channel).await? else { continue };
             best = Some(best.map_or(last, |best| best.max(last)));
         }
         Ok(best)
     }
 
-    // None where no index says it.
+    // None if the channel has no messages in the piece.
     async fn of(&mut self, piece: &Piece, channel: u16) -> Result<Times, Fault> {
-        let at = piece.range.end;
-        if !self.read.contains_key(&at) {
-            let times = if piece.index == 0 || piece.index > LARGEST_INDEX {
-                HashMap::new()
-            } else {
-                let path = &self.file.path;
-                let bytes = self.files.store.get_range(path, at..at + piece.index).await;
-                index_times(bytes.map_err(|source| Fault::Read { file: path.to_string(), source })?)
+        let place = piece.range.start;
+        if !self.read.contains_key(&place) {
+            let times = match (1..=LARGEST_INDEX).contains(&piece.index) {
+                true => index_times(self.bytes(piece.range.end..piece.range.end + piece.index).await?),
+                false => {
+                    let damaged = |what| Fault::Damaged { file: self.file.path.to_string(), offset: place, what };
+                    chunk_times(self.bytes(piece.range.clone()).await?).map_err(damaged)?
+                }
             };
-            self.read.insert(at, times);
+            self.read.insert(place, times);
         }
-        Ok(self.read.get(&at).and_then(|times| times.get(&channel).copied()))
+        Ok(self.read.get(&place).and_then(|times| times.get(&channel).copied()))
+    }
+
+    async fn bytes(&self, range: Range<u64>) -> Result<Bytes, Fault> {
+        let path = &self.file.path;
+        let bytes = self.files.store.get_range(path, range).await;
+        bytes.map_err(|source| Fault::Read { file: path.to_string(), source })
+    }
+}
+
+fn chunk_times(chunk: Bytes) -> Result<HashMap<u16, (u64, u64)>, String> {
+    let mut times = HashMap::new();
+    let mut sink = |record: Record<'_>| {
+        if let Record::Message { header, .. } = record {
+            let time = header.log_time;
+            let widen = |(first, last): &mut (u64, u64)| (*first, *last) = (time.min(*first), time.max(*last));
+            times.entry(header.channel_id).and_modify(widen).or_insert((time, time));
+        }
+        Ok::<_, Infallible>(ReadStep::Continue)
+    };
+    match PieceRecords::new(chunk, PieceKind::Chunk)?.read(&mut sink) {
+        Ok(_) => Ok(times),
+        Err(ReadStop::Damage(what)) => Err(what),
+        Err(ReadStop::Sink(never)) => match never {},
     }
 }
 

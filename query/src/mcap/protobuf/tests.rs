@@ -8,7 +8,7 @@ use arrow::datatypes::{
 use prost_reflect::prost::Message as _;
 use prost_reflect::prost_types::field_descriptor_proto::{Label as ProtoLabel, Type};
 use prost_reflect::prost_types::{
-    DescriptorProto, EnumDescriptorProto, EnumValueDescriptorProto, FieldDescriptorProto, FieldOptions,
+    DescriptorProto, EnumDescriptorProto, EnumOptions, EnumValueDescriptorProto, FieldDescriptorProto, FieldOptions,
     FileDescriptorProto, FileDescriptorSet, MessageOptions, OneofDescriptorProto,
 };
 use prost_reflect::{DynamicMessage, MapKey, ReflectMessage as _, Value};
@@ -369,6 +369,120 @@ fn a_message_within_itself_is_its_bytes() {
     assert_eq!(kind("s_again"), Some(DataType::Binary));
     let Some(DataType::Struct(inner)) = kind("s_m") else { panic!("no struct") };
     assert_eq!(inner.find("again").map(|(_, f)| f.data_type()), Some(&DataType::Binary));
+}
+
+// A file descriptor of message `M` with an int32 `a`, a message `m` and an enum `e`, in any syntax; then raw bytes that the
+// library's types lack.
+fn set_of(syntax: &str, field_features: &[u8], file_features: &[u8], names: &[(&str, i32)]) -> Vec<u8> {
+    fn delimited(tag: u8, bytes: &[u8]) -> Vec<u8> {
+        let mut field = vec![tag << 3 | 2];
+        prost::encoding::encode_varint(bytes.len() as u64, &mut field);
+        field.extend_from_slice(bytes);
+        field
+    }
+    let mut message = DescriptorProto { name: Some("M".into()), ..Default::default() };
+    field(&mut message, "m", Type::Message, ProtoLabel::Optional).type_name = Some(".M".into());
+    field(&mut message, "e", Type::Enum, ProtoLabel::Optional).type_name = Some(".E".into());
+    let mut other = DescriptorProto::default();
+    field(&mut other, "a", Type::Int32, ProtoLabel::Optional).number = Some(7);
+    let a = [other.field[0].encode_to_vec().as_slice(), field_features].concat();
+    let message = [message.encode_to_vec(), delimited(2, &a)].concat();
+    let value = |(name, number): &(&str, i32)| EnumValueDescriptorProto {
+        name: Some((*name).into()),
+        number: Some(*number),
+        ..Default::default()
+    };
+    let names = EnumDescriptorProto {
+        name: Some("E".into()),
+        value: names.iter().map(value).collect(),
+        options: Some(EnumOptions { allow_alias: Some(true), ..Default::default() }),
+        ..Default::default()
+    };
+    let file = FileDescriptorProto {
+        name: Some("m.proto".into()),
+        syntax: Some(syntax.into()),
+        enum_type: vec![names],
+        ..Default::default()
+    };
+    let file = [file.encode_to_vec().as_slice(), &delimited(4, &message), file_features].concat();
+    delimited(1, &file)
+}
+
+/// `edition = "2023"`.
+const EDITION_2023: [u8; 3] = [14 << 3, 0xE8, 0x07];
+/// Options of a file and of a field with `features.field_presence = IMPLICIT`.
+const IMPLICIT_FILE: [u8; 6] = [8 << 3 | 2, 5, 0x92, 0x03, 2, 1 << 3];
+const NAMES: [(&str, i32); 4] = [("UP", 1), ("NONE", 0), ("ALSO_UP", 1), ("NOTHING", 0)];
+
+#[test]
+fn an_edition_is_read_by_its_presence() {
+    let implicit_field = [8 << 3 | 2, 5, 0xAA, 0x01, 2, 1 << 3, 2];
+    let implicit_file = [&EDITION_2023[..], &IMPLICIT_FILE, &[2]].concat();
+    let explicit_field = [8 << 3 | 2, 5, 0xAA, 0x01, 2, 1 << 3, 1];
+    for (field_features, file_features, expected) in [
+        (&[][..], &EDITION_2023[..], None),
+        (&implicit_field, &EDITION_2023, Some(0)),
+        (&[], &implicit_file, Some(0)),
+        (&explicit_field, &implicit_file, None),
+    ] {
+        let set = set_of("editions", field_features, file_features, &NAMES);
+        let message = message_type("M", &set).expect("a message type");
+        let names: Vec<_> = fields(&message).expect("columns").iter().map(|f| f.name().clone()).collect();
+        assert_eq!(names, ["m", "e", "a"]);
+        let mut decoder = decoder(&message);
+        // An empty one, then a = 5 and e = 1.
+        decoder.push(&[]).expect("decoded");
+        decoder.push(&[7 << 3, 5, 2 << 3, 1]).expect("decoded");
+        let columns = finish(&mut decoder);
+        let numbers = columns[2].as_primitive::<Int32Type>();
+        assert_eq!((numbers.iter().next().flatten(), numbers.value(1)), (expected, 5), "{field_features:?}");
+        assert_eq!(columns[1].as_string::<i32>().value(1), "UP");
+    }
+}
+
+#[test]
+fn a_syntax_that_is_not_known_is_refused() {
+    for (syntax, features, expected) in [
+        ("proto4", &[][..], "is in `proto4`"),
+        ("editions", &[], "is of edition 0"),
+        ("editions", &[14 << 3, 0xEF, 0x07], "is of edition 1007"),
+    ] {
+        let error = message_type("M", &set_of(syntax, &[], features, &NAMES)).map(drop).expect_err(syntax);
+        assert!(error.contains(expected), "{error}");
+    }
+    // As some writers say proto2.
+    message_type("M", &set_of("", &[], &[], &NAMES)).expect("a message type");
+}
+
+#[test]
+fn of_several_names_the_first_is_shown() {
+    for (syntax, names) in [("proto2", NAMES), ("proto3", [NAMES[1], NAMES[0], NAMES[3], NAMES[2]])] {
+        let message = message_type("M", &set_of(syntax, &[], &[], &names)).expect("a message type");
+        let mut decoder = decoder(&message);
+        decoder.push(&[2 << 3, 1]).expect("decoded");
+        decoder.push(&[2 << 3, 0]).expect("decoded");
+        let columns = finish(&mut decoder);
+        let shown: Vec<_> = columns[1].as_string::<i32>().iter().flatten().collect();
+        assert_eq!(shown, ["UP", "NONE"], "{syntax}");
+    }
+}
+
+#[test]
+fn damaged_descriptors_are_refused_or_read() {
+    let mut random = Random(5);
+    let (mut refused, mut read) = (0, 0);
+    for set in [set_of("proto3", &[], &[], &NAMES[1..]), set_of("editions", &[], &EDITION_2023, &NAMES)] {
+        for _ in 0..2000 {
+            let mut set = set.clone();
+            let at = random.below(set.len() as u64) as usize;
+            set[at] ^= 1 << random.below(8);
+            match message_type("M", &set) {
+                Ok(message) => read += usize::from(fields(&message).is_ok()),
+                Err(_) => refused += 1,
+            }
+        }
+    }
+    assert!(refused > 100 && read > 100, "{refused} refused, {read} read");
 }
 
 // Thirty messages that each have the next one twice would be a thousand million columns.

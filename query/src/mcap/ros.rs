@@ -1,4 +1,5 @@
-//! ROS 2 messages into columns: definitions as text (`ros2msg`), values in CDR, read in order with every length checked.
+//! ROS messages into columns: definitions as text (`ros1msg`, `ros2msg`), values in order, with every length checked. ROS 2
+//! writes them in CDR, ROS 1 one behind the other without a header and without alignment.
 
 use std::collections::HashMap;
 use std::sync::Arc;
@@ -10,12 +11,28 @@ use super::column::{Column, DEEPEST, MOST_LEAVES, Record, duration_type, time_ty
 use super::error::{Malformed, Spent};
 
 const NANOS: i64 = 1_000_000_000;
+/// The line between request and response in a service's definition.
+const SERVICE_LINE: &str = "---";
+/// The ends of the names of a service's message types.
+const REQUEST: &str = "_Request";
+const RESPONSE: &str = "_Response";
+const EVENT: &str = "_Event";
+/// Bytes of the id of a service's client in `service_msgs/ServiceEventInfo`.
+const CLIENT_BYTES: usize = 16;
 /// Longest array of fixed length: it stands in no message, so nothing else bounds it.
 const LONGEST: usize = 1 << 20;
+
+/// A version of ROS: the types that its definitions know, and how values are written.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum RosVersion {
+    One,
+    Two,
+}
 
 /// A message type: its members in their order.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct Definition {
+    version: RosVersion,
     members: Vec<Member>,
 }
 
@@ -57,20 +74,24 @@ enum Kind {
 impl Definition {
     /// Reads a definition and those it names, which follow it behind lines of `=`. The text of an error says what is
     /// wrong.
-    pub(super) fn parse(name: &str, text: &str) -> Result<Self, String> {
+    pub(super) fn parse(name: &str, text: &str, version: RosVersion) -> Result<Self, String> {
         let mut parts = HashMap::new();
         let (mut title, mut lines) = (name.to_owned(), Vec::new());
-        for line in text.lines() {
+        for line in text.lines().map(str::trim) {
             if line.len() >= 3 && line.bytes().all(|b| b == b'=') {
-                parts.entry(short(&title)).or_insert(std::mem::take(&mut lines));
-            } else if let Some(next) = line.strip_prefix("MSG:") {
+                add_part(&mut parts, &title, std::mem::take(&mut lines));
+            } else if let Some(next) = line.strip_prefix("MSG:").or_else(|| line.strip_prefix("SRV:")) {
                 title = next.trim().to_owned();
             } else if !line.split('#').next().unwrap_or("").trim().is_empty() {
                 lines.push(line);
             }
         }
-        parts.entry(short(&title)).or_insert(lines);
-        Parser { parts, leaves: 0 }.definition(&short(name), 1)
+        add_part(&mut parts, &title, lines);
+        let mut parser = Parser { parts, version, leaves: 0 };
+        match parser.service_of(name) {
+            Some(service) => parser.service_event(&service),
+            None => parser.definition(&short(name), 1),
+        }
     }
 
     /// The columns.
@@ -84,12 +105,54 @@ fn short(name: &str) -> String {
     name.replace("/msg/", "/")
 }
 
+// A service's definition is that of its request, a line `---`, and that of its response.
+fn add_part<'a>(parts: &mut HashMap<String, Vec<&'a str>>, title: &str, lines: Vec<&'a str>) {
+    match lines.iter().position(|line| *line == SERVICE_LINE) {
+        Some(at) => {
+            parts.entry(format!("{title}{REQUEST}")).or_insert_with(|| lines[..at].to_vec());
+            parts.entry(format!("{title}{RESPONSE}")).or_insert_with(|| lines[at + 1..].to_vec());
+        }
+        // There may be an empty one in front of the first line of `=`.
+        None if lines.is_empty() && parts.is_empty() && title.ends_with(EVENT) => {}
+        None => drop(parts.entry(short(title)).or_insert(lines)),
+    }
+}
+
 struct Parser<'a> {
     parts: HashMap<String, Vec<&'a str>>,
+    version: RosVersion,
     leaves: usize,
 }
 
 impl Parser<'_> {
+    // The service whose events a message type is of, if its schema describes the service and not the events: recorders
+    // of ROS 2 store them so.
+    fn service_of(&self, name: &str) -> Option<String> {
+        let service = name.strip_suffix(EVENT).filter(|service| service.contains("/srv/"))?;
+        let is_raw = !self.parts.contains_key(name) && self.parts.contains_key(&format!("{service}{REQUEST}"));
+        is_raw.then(|| service.to_owned())
+    }
+
+    // Every event has the same first member, and up to one request and one response.
+    fn service_event(&mut self, service: &str) -> Result<Definition, String> {
+        let member = |name: &str, kind, count| Member { name: name.to_owned(), kind, count };
+        let info = vec![
+            member("event_type", Kind::U8, Count::One),
+            member("stamp", Kind::Time, Count::One),
+            member("client_gid", Kind::U8, Count::Fixed(CLIENT_BYTES)),
+            member("sequence_number", Kind::I64, Count::One),
+        ];
+        let info = Definition { version: self.version, members: info };
+        let request = self.definition(&format!("{service}{REQUEST}"), 2)?;
+        let response = self.definition(&format!("{service}{RESPONSE}"), 2)?;
+        let members = vec![
+            member("info", Kind::Message(info), Count::One),
+            member("request", Kind::Message(request), Count::Sequence),
+            member("response", Kind::Message(response), Count::Sequence),
+        ];
+        Ok(Definition { version: self.version, members })
+    }
+
     fn definition(&mut self, name: &str, depth: usize) -> Result<Definition, String> {
         if depth > DEEPEST {
             return Err(format!("`{name}` stands more than {DEEPEST} messages deep, or within itself"));
@@ -98,11 +161,15 @@ impl Parser<'_> {
             return Err(format!("its schema does not describe `{name}`"));
         };
         let package = name.split_once('/').map_or("", |(package, _)| package).to_owned();
-        let mut members = Vec::new();
+        let mut members: Vec<Member> = Vec::new();
         for line in lines {
-            members.extend(self.member(line, &package, depth)?);
+            let Some(member) = self.member(line, &package, depth)? else { continue };
+            if members.iter().any(|other| other.name == member.name) {
+                return Err(format!("`{name}` has two members `{}`", member.name));
+            }
+            members.push(member);
         }
-        Ok(Definition { members })
+        Ok(Definition { version: self.version, members })
     }
 
     // None for constants.
@@ -129,6 +196,12 @@ impl Parser<'_> {
     fn kind(&mut self, name: &str, package: &str, depth: usize) -> Result<Kind, String> {
         let bare = name.split("<=").next().unwrap_or(name);
         Ok(match bare {
+            "byte" if self.version == RosVersion::One => Kind::I8,
+            "time" if self.version == RosVersion::One => Kind::Time,
+            "duration" if self.version == RosVersion::One => Kind::Duration,
+            "Header" if self.version == RosVersion::One => {
+                Kind::Message(self.definition("std_msgs/Header", depth + 1)?)
+            }
             "bool" => Kind::Bool,
             "int8" => Kind::I8,
             "uint8" | "byte" | "char" => Kind::U8,
@@ -141,7 +214,7 @@ impl Parser<'_> {
             "float32" => Kind::F32,
             "float64" => Kind::F64,
             "string" => Kind::Text,
-            "wstring" => return Err("how a wstring is encoded depends on who wrote it".to_owned()),
+            "wstring" => return Err("how a `wstring` is encoded depends on who wrote it".to_owned()),
             _ => match short(bare).as_str() {
                 "builtin_interfaces/Time" => Kind::Time,
                 "builtin_interfaces/Duration" => Kind::Duration,
@@ -209,6 +282,7 @@ impl Kind {
 
 /// Decodes messages.
 pub(super) struct Decoder {
+    version: RosVersion,
     members: Vec<(Member, Option<usize>)>,
     record: Record,
     width: usize,
@@ -223,12 +297,12 @@ impl Decoder {
         let last = wanted.iter().copied().max().map_or(0, |last| last + 1);
         let members = definition.members.iter().take(last).enumerate().map(|(i, m)| (m.clone(), place(i))).collect();
         let width = some.iter().map(|f| width(f.data_type())).sum();
-        Self { members, record: Record::new(&some), width, spent: Spent::default() }
+        Self { version: definition.version, members, record: Record::new(&some), width, spent: Spent::default() }
     }
 
     pub(super) fn push(&mut self, data: &[u8]) -> Result<(), Malformed> {
         self.spent.add(self.width)?;
-        let mut cdr = Cdr::new(data)?;
+        let mut cdr = Cdr::new(data, self.version)?;
         for (member, place) in &self.members {
             let column = place.map(|i| &mut self.record.columns[i]);
             member.read(&mut cdr, column, &mut self.spent)?;
@@ -359,8 +433,12 @@ impl Kind {
                 }
             }
             Self::Time | Self::Duration => {
-                let (seconds, nanos) = (cdr.u32()? as i32, cdr.u32()?);
-                let nanos = i64::from(seconds) * NANOS + i64::from(nanos);
+                let (seconds, nanos) = (cdr.u32()?, cdr.u32()?);
+                let nanos = match (cdr.version, self) {
+                    (RosVersion::One, Self::Time) => i64::from(seconds) * NANOS + i64::from(nanos),
+                    (RosVersion::One, _) => i64::from(seconds as i32) * NANOS + i64::from(nanos as i32),
+                    (RosVersion::Two, _) => i64::from(seconds as i32) * NANOS + i64::from(nanos),
+                };
                 match column {
                     Some(Column::Time(c)) => c.push(nanos),
                     Some(Column::Duration(c)) => c.push(nanos),
@@ -395,9 +473,11 @@ impl Kind {
 impl Definition {
     fn read(&self, cdr: &mut Cdr<'_>, column: Option<&mut Column>, spent: &mut Spent) -> Result<(), Malformed> {
         match column {
-            // A message without members has a byte all the same.
+            // A message without members has a byte all the same, in ROS 2.
             _ if self.members.is_empty() => {
-                cdr.array::<1>()?;
+                if self.version == RosVersion::Two {
+                    cdr.array::<1>()?;
+                }
                 if let Some(Column::Bool(c)) = column {
                     c.push(true);
                 }
@@ -424,17 +504,21 @@ enum Order {
     Big,
 }
 
-/// Reads one message's values; each is aligned to its size, counted from behind the header.
+/// Reads one message's values; each is aligned to its size, counted from behind the header, in ROS 2.
 struct Cdr<'a> {
+    version: RosVersion,
     data: &'a [u8],
     at: usize,
     order: Order,
-    /// The largest alignment: 8 in the first version of CDR, 4 in the second.
+    /// The largest alignment: 8 in the first version of CDR, 4 in the second, none (1) in ROS 1.
     align: usize,
 }
 
 impl<'a> Cdr<'a> {
-    fn new(data: &'a [u8]) -> Result<Self, Malformed> {
+    fn new(data: &'a [u8], version: RosVersion) -> Result<Self, Malformed> {
+        if version == RosVersion::One {
+            return Ok(Self { version, data, at: 0, order: Order::Little, align: 1 });
+        }
         let (header, data) = data.split_at_checked(4).ok_or(Malformed::Ends)?;
         let (order, align) = match (header[0], header[1]) {
             (0, 0) => (Order::Big, 8),
@@ -443,7 +527,7 @@ impl<'a> Cdr<'a> {
             (0, 7) => (Order::Little, 4),
             _ => return Err(Malformed::Encapsulation),
         };
-        Ok(Self { data, at: 0, order, align })
+        Ok(Self { version, data, at: 0, order, align })
     }
 
     fn rest(&self) -> usize {
@@ -485,10 +569,13 @@ impl<'a> Cdr<'a> {
         Ok(if self.order == Order::Little { u64::from_le_bytes(bytes) } else { u64::from_be_bytes(bytes) })
     }
 
-    // Its length counts a zero at its end, which an empty text may lack.
+    // In ROS 2 its length counts a zero at its end, which an empty text may lack.
     fn text(&mut self) -> Result<&'a [u8], Malformed> {
         let length = self.u32()? as usize;
         let bytes = self.take(length)?;
-        Ok(bytes.strip_suffix(&[0]).unwrap_or(bytes))
+        Ok(match self.version {
+            RosVersion::One => bytes,
+            RosVersion::Two => bytes.strip_suffix(&[0]).unwrap_or(bytes),
+        })
     }
 }

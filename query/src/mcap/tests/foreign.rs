@@ -1,0 +1,360 @@
+//! Files of other writers: summaries that leave parts out, messages in odd places, and schemas that are not ours.
+
+use std::collections::BTreeMap;
+
+use echolake_recording::opcode;
+use mcap::MAGIC;
+
+use super::*;
+
+/// Bits of [`file_without`].
+const PARTS: [&str; 6] = ["channels", "schemas", "statistics", "message indexes", "chunk indexes", "summary offsets"];
+
+/// A file whose summary leaves out the parts whose bits are set.
+fn file_without(parts: usize, chunks: bool) -> Vec<u8> {
+    let has = |part: &str| PARTS.iter().position(|p| *p == part).is_none_or(|bit| parts & (1 << bit) == 0);
+    let options = options(None)
+        .use_chunks(chunks)
+        .repeat_channels(has("channels"))
+        .repeat_schemas(has("schemas"))
+        .emit_statistics(has("statistics"))
+        .emit_message_indexes(has("message indexes"))
+        .emit_chunk_indexes(has("chunk indexes"))
+        .emit_summary_offsets(has("summary offsets"));
+    json_file(options, 3)
+}
+
+#[tokio::test]
+async fn a_summary_that_leaves_parts_out_hides_nothing() {
+    let lake = lake().await;
+    for (parts, chunks) in (0..1 << PARTS.len()).flat_map(|parts| [(parts, true), (parts, false)]) {
+        let path = format!("inbox/{parts}_{chunks}.mcap");
+        put(&lake, &path, file_without(parts, chunks)).await;
+        check(&lake, &format!("select count(*), sum(x) from mcap('{path}', '/point')"), &["30 | 108.75"]).await;
+        assert_eq!(number(&lake, &format!("select count(*) from mcap_messages('{path}')")).await, 33);
+        check(
+            &lake,
+            &format!(
+                "select topic, schema_name, messages, first_time, last_time from mcap_topics('{path}') order by 1"
+            ),
+            &[
+                "/note |  | 3 | 2026-01-06T00:00:00Z | 2026-01-06T00:00:02Z",
+                "/point | Point | 30 | 2026-01-06T00:00:00Z | 2026-01-06T00:00:02.900Z",
+            ],
+        )
+        .await;
+    }
+}
+
+#[tokio::test]
+async fn topics_say_how_their_file_was_read() {
+    let lake = lake().await;
+    for (part, expected) in [
+        ("nothing", "summary"),
+        ("summary offsets", "summary"),
+        ("message indexes", "summary"),
+        ("channels", "walk: its summary describes 0 of 2 channels"),
+        ("schemas", "walk: its summary describes 0 of 1 schemas"),
+        ("statistics", "walk: its summary has no statistics"),
+        ("chunk indexes", "walk: its summary lists 0 of 4 chunks"),
+    ] {
+        let parts = PARTS.iter().position(|p| *p == part).map_or(0, |bit| 1 << bit);
+        put(&lake, "inbox/p.mcap", file_without(parts, true)).await;
+        check(&lake, "select distinct read_by from mcap_topics('inbox/p.mcap')", &[expected]).await;
+    }
+    let whole = file_without(0, true);
+    put(&lake, "inbox/p.mcap", whole[..whole.len() - 20].to_vec()).await;
+    check(&lake, "select distinct read_by from mcap_topics('inbox/p.mcap')", &["walk: it is cut off"]).await;
+}
+
+fn record(code: u8, body: &[u8]) -> Vec<u8> {
+    [&[code], (body.len() as u64).to_le_bytes().as_slice(), body].concat()
+}
+
+fn message_record(channel: u16, log_time: u64, data: &[u8]) -> Vec<u8> {
+    let times = [log_time.to_le_bytes(), 0u64.to_le_bytes()].concat();
+    record(opcode::MESSAGE, &[&channel.to_le_bytes(), 9u32.to_le_bytes().as_slice(), &times, data].concat())
+}
+
+// A message behind the chunks, in front of the end of the data, that the summary knows nothing of.
+#[tokio::test]
+async fn messages_outside_of_the_chunks_are_found() {
+    let mut file = json_file(options(None), 3);
+    let footer = file.len() - MAGIC.len() - 20;
+    let summary = u64::from_le_bytes(file[footer..footer + 8].try_into().expect("eight bytes"));
+    let loose = message_record(1, START, br#"{"x":1000}"#);
+    let bytes = loose.len() as u64;
+    file[footer..footer + 8].copy_from_slice(&(summary + bytes).to_le_bytes());
+    // No place of summary offsets and no CRC.
+    file[footer + 8..footer + 20].fill(0);
+    let data_end = summary as usize - 13;
+    file.splice(data_end..data_end, loose);
+    let lake = lake().await;
+    put(&lake, "inbox/l.mcap", file).await;
+    check(&lake, "select count(*), sum(x) from mcap('inbox/l.mcap', '/point')", &["31 | 1108.75"]).await;
+    let expected = ["walk: its summary lists chunks, but there are messages elsewhere"];
+    check(&lake, "select distinct read_by from mcap_topics('inbox/l.mcap')", &expected).await;
+}
+
+#[tokio::test]
+async fn a_message_of_a_channel_that_nothing_describes_is_damage() {
+    let header = record(opcode::HEADER, &[0; 8]);
+    let end = record(opcode::DATA_END, &[0; 4]);
+    let file = [MAGIC, &header, &message_record(7, START, b"{}"), &end].concat();
+    let lake = lake().await;
+    put(&lake, "inbox/u.mcap", file).await;
+    for function in ["mcap_topics('inbox/u.mcap')", "mcap_messages('inbox/u.mcap')"] {
+        let sql = format!("select * from {function}");
+        refused(&lake, &sql, &["channel 7, which no record describes", "at byte 25"]).await;
+    }
+}
+
+/// A channel of a file: its topic, encoding and schema, and its messages.
+struct TestChannel<'a> {
+    topic: &'a str,
+    encoding: &'a str,
+    /// Name, encoding and data.
+    schema: (&'a str, &'a str, &'a [u8]),
+    messages: &'a [&'a [u8]],
+}
+
+fn file_of(channels: &[TestChannel<'_>]) -> Vec<u8> {
+    let mut file = Cursor::new(Vec::new());
+    let mut writer = options(None).create(&mut file).expect("a writer");
+    for channel in channels {
+        let (name, encoding, data) = channel.schema;
+        let schema = if name.is_empty() { 0 } else { writer.add_schema(name, encoding, data).expect("added") };
+        let id = writer.add_channel(schema, channel.topic, channel.encoding, &BTreeMap::new()).expect("added");
+        for (i, data) in channel.messages.iter().enumerate() {
+            let header = MessageHeader { channel_id: id, sequence: i as u32, log_time: START, publish_time: START };
+            writer.write_to_known_channel(&header, data).expect("written");
+        }
+    }
+    writer.finish().expect("finished");
+    drop(writer);
+    file.into_inner()
+}
+
+fn json_channel<'a>(schema: &'a str, messages: &'a [&'a [u8]]) -> TestChannel<'a> {
+    TestChannel { topic: "/t", encoding: "json", schema: ("T", "jsonschema", schema.as_bytes()), messages }
+}
+
+const NUMBERS: &str = r#"{"properties":{"x":{"type":"number"},"n":{"type":"integer"},
+    "small":{"type":"integer","minimum":0,"maximum":9}}}"#;
+
+#[tokio::test]
+async fn a_channel_of_an_unknown_encoding_leaves_the_others_their_columns() {
+    let lake = lake().await;
+    let known = || json_channel(NUMBERS, &[br#"{"x":1.5}"#]);
+    let unknown = |messages| TestChannel { topic: "/t", encoding: "smoke", schema: ("S", "signals", b"?"), messages };
+    put(&lake, "inbox/none.mcap", file_of(&[known(), unknown(&[])])).await;
+    check(&lake, "select x from mcap('inbox/none.mcap', '/t')", &["1.5"]).await;
+    put(&lake, "inbox/some.mcap", file_of(&[unknown(&[b"puff"]), known()])).await;
+    check(&lake, "select x from mcap('inbox/some.mcap', '/t') order by x", &["1.5", ""]).await;
+    put(&lake, "inbox/alone.mcap", file_of(&[unknown(&[])])).await;
+    let texts = ["`smoke`", "`signals`", "mcap_messages"];
+    refused(&lake, "select * from mcap('inbox/alone.mcap', '/t')", &texts).await;
+    // One without messages whose column has another type does not stand in the way.
+    let other = json_channel(r#"{"properties":{"x":{"type":"string"}}}"#, &[]);
+    put(&lake, "inbox/other.mcap", file_of(&[other, known()])).await;
+    check(&lake, "select x from mcap('inbox/other.mcap', '/t')", &["1.5"]).await;
+}
+
+#[tokio::test]
+async fn fields_keep_apart_whatever_their_names() {
+    let schema = r#"{"properties":{"message_sequence":{"type":"string"},"sequence":{"type":"string"},
+        "message_message_sequence":{"type":"string"},"log_time":{"type":"string"}}}"#;
+    let message = br#"{"sequence":"a","message_sequence":"b","message_message_sequence":"c","log_time":"d"}"#;
+    let lake = lake().await;
+    put(&lake, "inbox/n.mcap", file_of(&[json_channel(schema, &[message])])).await;
+    check(
+        &lake,
+        "select sequence, message_sequence, message_message_sequence, message_message_message_sequence, \
+         message_log_time from mcap('inbox/n.mcap', '/t')",
+        &["0 | b | c | a | d"],
+    )
+    .await;
+}
+
+#[tokio::test]
+async fn numbers_that_json_lacks_are_null_and_counted() {
+    let lake = lake().await;
+    let messages: [&[u8]; 4] = [
+        br#"{"x":NaN,"n":1,"small":-Infinity}"#,
+        br#"{"x":2.5,"n":Infinity,"small":3}"#,
+        b"\xef\xbb\xbf{\"x\":\"\\\"NaN\\\\\",\"n\":NaN,\"small\":10}",
+        br#"{"x":4,"n":"5","small":1.5}"#,
+    ];
+    let schema = format!("\u{feff}{NUMBERS}");
+    put(&lake, "inbox/n.mcap", file_of(&[json_channel(&schema, &messages)])).await;
+    let sql = "select x, n, small from mcap('inbox/n.mcap', '/t') order by sequence";
+    check(&lake, sql, &[" | 1 | ", "2.5 |  | 3", " |  | 10", "4.0 |  | "]).await;
+    // Two of the first message, one of the second, two of the third, two of the fourth.
+    assert_eq!(metric(&lake, sql, "values_unfit").await, 7);
+    put(&lake, "inbox/n.mcap", file_of(&[json_channel(NUMBERS, &[br#"{"x":Nan}"#])])).await;
+    refused(&lake, "select x from mcap('inbox/n.mcap', '/t')", &["it is no JSON object"]).await;
+}
+
+#[tokio::test]
+async fn integers_of_json_are_values_however_they_are_written() {
+    let lake = lake().await;
+    let numbers = ["7", "-7", "1.0", "1e3", "9223372036854775808", "18446744073709551615", "-9223372036854775808"];
+    let messages: Vec<String> = numbers.iter().map(|n| format!(r#"{{"n":{n}}}"#)).collect();
+    let messages: Vec<&[u8]> = messages.iter().map(String::as_bytes).collect();
+    put(&lake, "inbox/i.mcap", file_of(&[json_channel(NUMBERS, &messages)])).await;
+    let sql = "select n from mcap('inbox/i.mcap', '/t') order by sequence";
+    let expected = ["7", "-7", "1", "1000", "9223372036854775808", "18446744073709551615", "-9223372036854775808"];
+    check(&lake, sql, &expected).await;
+    assert_eq!(metric(&lake, sql, "values_unfit").await, 0);
+    let beyond: [&[u8]; 2] = [br#"{"n":18446744073709551616}"#, br#"{"n":1.5}"#];
+    put(&lake, "inbox/b.mcap", file_of(&[json_channel(NUMBERS, &beyond)])).await;
+    let sql = "select count(n), count(*) from mcap('inbox/b.mcap', '/t')";
+    check(&lake, sql, &["0 | 2"]).await;
+    check(
+        &lake,
+        "select arrow_typeof(small), arrow_typeof(n) from mcap('inbox/i.mcap', '/t') limit 1",
+        &["Int64 | Decimal128(20, 0)"],
+    )
+    .await;
+}
+
+#[tokio::test]
+async fn times_that_64_bits_do_not_hold_are_null() {
+    let mut file = Cursor::new(Vec::new());
+    let mut writer = options(None).create(&mut file).expect("a writer");
+    let channel = writer.add_channel(0, "/t", "json", &BTreeMap::new()).expect("added");
+    for (log_time, publish_time) in [(5, u64::MAX), (1 << 63, 5), (u64::MAX, u64::MAX), ((1 << 63) - 1, 5)] {
+        let header = MessageHeader { channel_id: channel, sequence: 0, log_time, publish_time };
+        writer.write_to_known_channel(&header, b"{}").expect("written");
+    }
+    writer.finish().expect("finished");
+    drop(writer);
+    let lake = lake().await;
+    put(&lake, "inbox/t.mcap", file.into_inner()).await;
+    check(
+        &lake,
+        "select log_time_ns, cast(publish_time as bigint) from mcap_messages('inbox/t.mcap') order by 1, 2",
+        &["5 | ", "9223372036854775807 | 5", " | 5", " | "],
+    )
+    .await;
+    let count = |filter: &str| format!("select count(*) from mcap('inbox/t.mcap', '/t') where {filter}");
+    for (filter, expected) in [
+        ("true", 4),
+        ("log_time_ns >= 0", 2),
+        ("log_time_ns <= 9223372036854775807", 2),
+        ("log_time_ns is null", 2),
+        ("log_time > '2026-01-01T00:00:00Z'", 1),
+    ] {
+        assert_eq!(number(&lake, &count(filter)).await, expected, "{filter}");
+    }
+}
+
+#[tokio::test]
+async fn bytes_have_a_length() {
+    let lake = lake().await;
+    put(&lake, "inbox/j.mcap", json_file(options(None), 1)).await;
+    let sql = "select octet_length(data), octet_length('Å'), octet_length(x'010203'), octet_length(null) \
+               from mcap_messages('inbox/j.mcap', '/note')";
+    check(&lake, sql, &["15 | 2 | 3 | "]).await;
+}
+
+// The definition of a service is what recorders store for its events.
+#[tokio::test]
+async fn service_events_are_columns() {
+    let raw = "================================================================================\n\
+               SRV: example_interfaces/srv/AddTwoInts\nint64 a\nint64 b\n---\nint64 sum\n";
+    let event = |kind: u8, has_request: bool| {
+        let cdr = Cdr::default().put([kind]).put(1u32.to_le_bytes()).put(2u32.to_le_bytes());
+        let cdr = (0..16).fold(cdr, |cdr, i| cdr.put([i]));
+        let cdr = cdr.put(3i64.to_le_bytes()).put(u32::from(has_request).to_le_bytes());
+        let cdr = if has_request { cdr.put(4i64.to_le_bytes()).put(5i64.to_le_bytes()) } else { cdr };
+        let cdr = cdr.put(u32::from(!has_request).to_le_bytes());
+        (if has_request { cdr } else { cdr.put(9i64.to_le_bytes()) }).message()
+    };
+    let (request, response) = (event(0, true), event(3, false));
+    let lake = lake().await;
+    let schema = ("example_interfaces/srv/AddTwoInts_Event", "ros2msg", raw.as_bytes());
+    let messages: [&[u8]; 2] = [&request, &response];
+    let channel = TestChannel { topic: "/add/_service_event", encoding: "cdr", schema, messages: &messages };
+    put(&lake, "inbox/s.mcap", file_of(&[channel])).await;
+    check(
+        &lake,
+        "select info['event_type'], info['stamp'], info['sequence_number'], request, response \
+         from mcap('inbox/s.mcap', '/add/_service_event') order by sequence",
+        &[
+            "0 | 1970-01-01T00:00:01.000000002Z | 3 | [{a: 4, b: 5}] | []",
+            "3 | 1970-01-01T00:00:01.000000002Z | 3 | [] | [{sum: 9}]",
+        ],
+    )
+    .await;
+}
+
+#[tokio::test]
+async fn ros_1_messages_are_columns() {
+    let definition = "# Nothing is aligned.\nbyte KIND=3\nHeader header\nfloat64[] position\nuint8[] image\nPoint[2] corners\n\
+        bool ok\nduration age\nbyte level\nstd_msgs/Empty nothing\nstring name\n\
+        ================================================================================\n\
+        MSG: std_msgs/Header\nuint32 seq\ntime stamp\nstring frame_id\n\
+        ================================================================================\n\
+        MSG: test_msgs/Point\nfloat32 x\nint16 y\n\
+        ================================================================================\n\
+        MSG: std_msgs/Empty\n";
+    let mut message = Vec::new();
+    let text = |message: &mut Vec<u8>, text: &str| {
+        message.extend((text.len() as u32).to_le_bytes());
+        message.extend(text.as_bytes());
+    };
+    message.extend([7u32, 3_000_000_000, 5].map(u32::to_le_bytes).concat());
+    text(&mut message, "map\0");
+    message.extend(1u32.to_le_bytes());
+    message.extend(2.5f64.to_le_bytes());
+    message.extend([&2u32.to_le_bytes()[..], &[8, 9]].concat());
+    for (x, y) in [(1.5f32, -1i16), (2.5, -2)] {
+        message.extend(x.to_le_bytes());
+        message.extend(y.to_le_bytes());
+    }
+    message.push(1);
+    message.extend([-1i32, 250_000_000].map(i32::to_le_bytes).concat());
+    message.push(0xFE);
+    text(&mut message, "panel");
+    let lake = lake().await;
+    let file = |message: &[u8]| {
+        let schema = ("test_msgs/State", "ros1msg", definition.as_bytes());
+        file_of(&[TestChannel { topic: "/s", encoding: "ros1", schema, messages: &[message] }])
+    };
+    put(&lake, "inbox/r.mcap", file(&message)).await;
+    check(
+        &lake,
+        "select header['seq'], header['stamp'], octet_length(header['frame_id']), position, encode(image, 'hex'), \
+         corners, ok, cast(age as bigint), level, nothing, name from mcap('inbox/r.mcap', '/s')",
+        &["7 | 2065-01-24T05:20:00.000000005Z | 4 | [2.5] | 0809 | [{x: 1.5, y: -1}, {x: 2.5, y: -2}] | true | \
+           -750000000 | -2 | true | panel"],
+    )
+    .await;
+    for length in 0..message.len() {
+        put(&lake, "inbox/r.mcap", file(&message[..length])).await;
+        refused(&lake, "select * from mcap('inbox/r.mcap', '/s')", &["ends within a value"]).await;
+    }
+}
+
+#[tokio::test]
+async fn cbor_messages_are_columns_or_text() {
+    // {"x": 1.5 in 16 bits, "n": 2^64-1, "small": -1, "z": h'0102', 3: [undefined, 1(0)]}
+    let message = b"\xa5\x61x\xf9\x3e\x00\x61n\x1b\xff\xff\xff\xff\xff\xff\xff\xff\x65small\x20\x61z\x42\x01\x02\
+                    \x03\x82\xf7\xc1\x00";
+    let lake = lake().await;
+    let file = |schema, message: &[u8]| {
+        file_of(&[TestChannel { topic: "/t", encoding: "cbor", schema, messages: &[message] }])
+    };
+    let schema = ("T", "jsonschema", NUMBERS.as_bytes());
+    put(&lake, "inbox/c.mcap", file(schema, message)).await;
+    check(&lake, "select x, n, small from mcap('inbox/c.mcap', '/t')", &["1.5 | 18446744073709551615 | -1"]).await;
+    put(&lake, "inbox/c.mcap", file(("", "", b"".as_slice()), message)).await;
+    let expected = [r#"{"3":[null,0],"n":18446744073709551615,"small":-1,"x":1.5,"z":"0102"}"#];
+    check(&lake, "select json from mcap('inbox/c.mcap', '/t')", &expected).await;
+    for damaged in [&message[..message.len() - 1], &[message.as_slice(), b"\x00"].concat(), b"\x9b\xff\xff\xff\xff\xff"]
+    {
+        put(&lake, "inbox/c.mcap", file(schema, damaged)).await;
+        refused(&lake, "select x from mcap('inbox/c.mcap', '/t')", &["it is no CBOR map"]).await;
+    }
+}
