@@ -6,7 +6,7 @@ use std::hint::black_box;
 use criterion::{BenchmarkId, Criterion, Throughput, criterion_group, criterion_main};
 use echolake_dsp::Error;
 use echolake_dsp::chain::{DerivationPlan, MeasurementParams, MeasurementPlan, raw_len};
-use echolake_dsp::deconvolution::{DeconvolutionParams, DeconvolutionPlan, TransformLength};
+use echolake_dsp::deconvolution::{DeconvolutionParams, DeconvolutionPlan, SpectralDivision, TransformLength};
 use echolake_dsp::energy::{cumulative_energy, nce, tnce};
 use echolake_dsp::filter_bank::FilterBankPlan;
 use echolake_dsp::sweep::LinearSweep;
@@ -18,7 +18,6 @@ use rustfft::FftPlanner;
 const RATE_HZ: f64 = 96e3;
 const LOW_HZ: f64 = 2e3;
 const HIGH_HZ: f64 = 40e3;
-const FLOOR_DB: f64 = -60.0;
 const REFERENCE_CELSIUS: f64 = 20.0;
 const IR_LEN: usize = 384;
 const CENTRES_HZ: [f64; 5] = [2_500.0, 5_000.0, 10_000.0, 20_000.0, 40_000.0];
@@ -76,19 +75,25 @@ fn transforms(criterion: &mut Criterion) {
 fn deconvolution(criterion: &mut Criterion) {
     let [recording, loopback] = recordings();
     let n = recording.len();
-    let params = |length| DeconvolutionParams {
+    let params = |length, division| DeconvolutionParams {
         recording_len: n,
         output_len: raw_len(IR_LEN, REFERENCE_CELSIUS),
         rate_hz: RATE_HZ,
         low_hz: LOW_HZ,
         high_hz: HIGH_HZ,
-        floor_db: FLOOR_DB,
+        division,
+        taper_hz: RATE_HZ / IR_LEN as f64,
         length,
     };
     let mut group = criterion.benchmark_group("deconvolution");
     group.throughput(Throughput::Elements(n as u64));
-    for (name, length) in [("fast", TransformLength::Fast), ("exact", TransformLength::Exact)] {
-        let plan = DeconvolutionPlan::<f32>::new(params(length)).expect("settings of the paper");
+    let floored = SpectralDivision::Floored { floor_db: SpectralDivision::FLOOR_DB };
+    for (name, length, division) in [
+        ("fast", TransformLength::Fast, SpectralDivision::Tapered),
+        ("fast, floored", TransformLength::Fast, floored),
+        ("exact", TransformLength::Exact, SpectralDivision::Tapered),
+    ] {
+        let plan = DeconvolutionPlan::<f32>::new(params(length, division)).expect("settings of the paper");
         let (mut scratch, mut ir) = (plan.scratch(), vec![0.0; plan.output_len()]);
         group.bench_function(BenchmarkId::new(name, n), |bencher| {
             bencher.iter(|| plan.run(black_box(&recording), &loopback, &mut ir, &mut scratch));
@@ -121,7 +126,7 @@ fn measurement(criterion: &mut Criterion) {
         rate_hz: RATE_HZ,
         low_hz: LOW_HZ,
         high_hz: HIGH_HZ,
-        floor_db: FLOOR_DB,
+        division: SpectralDivision::Tapered,
         reference_celsius: REFERENCE_CELSIUS,
     })
     .expect("settings of the paper");

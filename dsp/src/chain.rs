@@ -1,5 +1,7 @@
 //! The kernels in their order, planned once: recording to response, and response to curves and energies.
 
+use echolake_schema::SpectralDivision;
+
 use crate::deconvolution::{DeconvolutionParams, DeconvolutionPlan, DeconvolutionScratch, TransformLength};
 use crate::energy::{accumulate, energy, tnce_over_band};
 use crate::error::check_len;
@@ -24,8 +26,8 @@ pub struct MeasurementParams {
     pub low_hz: f64,
     /// Highest frequency of the sweep, Hz.
     pub high_hz: f64,
-    /// See [`DeconvolutionParams::floor_db`].
-    pub floor_db: f64,
+    /// Treatment of frequencies at the limits of that range and beyond them; a taper is as wide as the response resolves.
+    pub division: SpectralDivision,
     /// Temperature that responses are corrected to, C.
     pub reference_celsius: f64,
 }
@@ -58,7 +60,8 @@ impl<T: RealSample> MeasurementPlan<T> {
             rate_hz: params.rate_hz,
             low_hz: params.low_hz,
             high_hz: params.high_hz,
-            floor_db: params.floor_db,
+            division: params.division,
+            taper_hz: params.rate_hz / params.ir_len as f64,
             length: TransformLength::Fast,
         })?;
         Ok(Self {
@@ -272,6 +275,7 @@ fn put_over<T: RealSample>(flat: &FlatEnergies, bands: &[T], derived: &mut Deriv
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::sweep::LinearSweep;
 
     fn params() -> MeasurementParams {
         MeasurementParams {
@@ -280,7 +284,7 @@ mod tests {
             rate_hz: 96e3,
             low_hz: 2e3,
             high_hz: 40e3,
-            floor_db: -60.0,
+            division: SpectralDivision::Floored { floor_db: -60.0 },
             reference_celsius: 20.0,
         }
     }
@@ -302,6 +306,48 @@ mod tests {
             plan.ir(&noise(), &noise(), good, &mut ir, &mut scratch).expect("a response");
             assert!(ir.iter().all(|x| x.is_finite()), "{good}");
         }
+    }
+
+    // What stands in the tables of a lake whose runs have sweeps of any length, dB: a reflection at 90 samples over
+    // Flat's, each band over Flat's total.
+    fn levels(division: SpectralDivision, duration_secs: f64) -> Vec<f64> {
+        let sweep = LinearSweep { rate_hz: 96e3, duration_secs, low_hz: 2e3, high_hz: 40e3, fade_secs: 0.001 };
+        let mut loopback = sweep.samples();
+        loopback.resize(loopback.len() + 960, 0.0);
+        let n = loopback.len();
+        let heard = |reflections: &[(usize, f64)]| -> Vec<f64> {
+            let part = |i: usize, (delay, r): &(usize, f64)| if i < *delay { 0.0 } else { r * loopback[i - delay] };
+            (0..n).map(|i| reflections.iter().map(|reflection| part(i, reflection)).sum()).collect()
+        };
+        let params = MeasurementParams { recording_len: n, division, ..params() };
+        let (plan, bands) = (MeasurementPlan::<f64>::new(&params).expect("a plan"), [2_500.0, 5e3, 10e3, 20e3, 40e3]);
+        let response = |reflections: &[(usize, f64)]| {
+            let mut ir = vec![0.0; 384];
+            plan.ir(&heard(reflections), &loopback, 21.3, &mut ir, &mut plan.scratch()).expect("a response");
+            ir
+        };
+        let (flat, relief) = (response(&[(90, 1.0)]), response(&[(84, 0.4), (93, -0.3), (101, 0.5), (160, 0.1)]));
+        let plan = DerivationPlan::new(384, 96e3, &bands).expect("a plan");
+        let mut derived = plan.derived();
+        plan.run(&relief, &[0.0; 384], &flat, &mut derived, &mut plan.scratch()).expect("derived");
+        derived.tnce.iter().chain([&derived.total]).map(|tnce| 10.0 * tnce.log10()).collect()
+    }
+
+    #[test]
+    fn levels_do_not_depend_on_the_sweep_s_length() {
+        let apart = |division| {
+            let longest = levels(division, 2.0);
+            let differences = [0.05, 0.5].map(|secs| {
+                let differences = levels(division, secs).into_iter().zip(&longest).map(|(a, b)| (a - b).abs());
+                differences.fold(0.0, f64::max)
+            });
+            differences[0].max(differences[1])
+        };
+        let tapered = apart(SpectralDivision::Tapered);
+        assert!(tapered < 0.001, "{tapered} dB");
+        // Why there is a taper.
+        let floored = apart(SpectralDivision::Floored { floor_db: SpectralDivision::FLOOR_DB });
+        assert!(floored > 0.1, "{floored} dB");
     }
 
     // A surface that is Flat itself: bands that sum to 1 in all, and 1 in each band.

@@ -1,8 +1,10 @@
-//! Division of the recording by the loopback in the Fourier domain, with a floor outside of the sweep's range.
+//! Division of the recording by the loopback in the Fourier domain, within the sweep's range.
 
+use std::f64::consts::FRAC_PI_2;
 use std::ops::{Range, RangeInclusive};
 use std::sync::Arc;
 
+pub use echolake_schema::SpectralDivision;
 use realfft::num_complex::Complex;
 use rustfft::{Fft, FftDirection};
 
@@ -25,8 +27,10 @@ pub struct DeconvolutionParams {
     pub low_hz: f64,
     /// Highest frequency of the sweep, Hz.
     pub high_hz: f64,
-    /// Outside of the sweep's range the divisor's power stays above this, dB re its mean in the range.
-    pub floor_db: f64,
+    /// Treatment of frequencies at the limits of that range and beyond them.
+    pub division: SpectralDivision,
+    /// Width over which [`SpectralDivision::Tapered`] rises and falls, Hz.
+    pub taper_hz: f64,
     /// Length of the transforms.
     pub length: TransformLength,
 }
@@ -49,7 +53,7 @@ const PIECE: usize = 64;
 /// ir        `[output_len]`                                 their ratio; sample 0 is the instant of emission
 ///
 /// Inside of the sweep's range the division is exact. Outside, the sweep has next to no energy and plain
-/// division would fill the lowest and the highest band with noise, so the divisor has a floor.
+/// division would fill the lowest and the highest band with noise; [`SpectralDivision`] says what is done about it.
 ///
 /// Both signals are real, so one complex transform of z = x + i s does for both: with the mirror image
 /// b\[k\] = conj Z\[n - k\], X = (Z + b) / 2 and S = (Z - b) / 2i, and their quotient needs neither of them. It goes
@@ -58,6 +62,7 @@ const PIECE: usize = 64;
 /// ```
 /// use echolake_dsp::deconvolution::{DeconvolutionParams, DeconvolutionPlan, TransformLength};
 /// use echolake_dsp::sweep::LinearSweep;
+/// use echolake_schema::SpectralDivision;
 ///
 /// let sweep = LinearSweep { rate_hz: 8e3, duration_secs: 0.064, low_hz: 100.0, high_hz: 3_900.0, fade_secs: 0.001 };
 /// let loopback = sweep.samples();
@@ -68,7 +73,8 @@ const PIECE: usize = 64;
 ///     rate_hz: 8e3,
 ///     low_hz: 100.0,
 ///     high_hz: 3_900.0,
-///     floor_db: -60.0,
+///     division: SpectralDivision::Floored { floor_db: -60.0 },
+///     taper_hz: 0.0,
 ///     length: TransformLength::Fast,
 /// })?;
 /// let mut ir = [0.0; 8];
@@ -83,7 +89,9 @@ pub struct DeconvolutionPlan<T: RealSample> {
     forward: Arc<dyn Fft<T>>,
     inverse: PrunedInverse<T>,
     in_range: RangeInclusive<usize>,
-    floor: f64,
+    division: SpectralDivision,
+    /// Gains of the first bins in range, and of the last ones from the last on.
+    tapers: [Vec<T>; 2],
 }
 
 /// Buffers of a [`DeconvolutionPlan`].
@@ -105,8 +113,13 @@ impl<T: RealSample> DeconvolutionPlan<T> {
         if params.recording_len < 2 {
             return setting("the recording's length", params.recording_len.to_string(), "2 samples or more");
         }
-        if !params.floor_db.is_finite() {
-            return setting("the divisor's floor (dB)", params.floor_db.to_string(), "a finite level");
+        if let SpectralDivision::Floored { floor_db } = params.division
+            && !floor_db.is_finite()
+        {
+            return setting("the divisor's floor (dB)", floor_db.to_string(), "a finite level");
+        }
+        if !(params.taper_hz >= 0.0 && params.taper_hz.is_finite()) {
+            return setting("the taper's width (Hz)", params.taper_hz.to_string(), "finite, 0 or more");
         }
         let n = match params.length {
             TransformLength::Exact => params.recording_len,
@@ -126,7 +139,11 @@ impl<T: RealSample> DeconvolutionPlan<T> {
             forward: T::plan_fft(n, FftDirection::Forward),
             inverse: PrunedInverse::new(n, params.output_len),
             in_range: first..=last,
-            floor: 10f64.powf(params.floor_db / 10.0),
+            division: params.division,
+            tapers: match params.division {
+                SpectralDivision::Tapered => tapers(&params, step, first..=last),
+                SpectralDivision::Floored { .. } | SpectralDivision::Literal => Default::default(),
+            },
         })
     }
 
@@ -184,29 +201,53 @@ impl<T: RealSample> DeconvolutionPlan<T> {
         joint[self.len] = joint[0];
     }
 
-    // Lays X / S for the inverse transform: first the bins without a floor, because the floor follows from them.
+    // Lays X / S for the inverse transform: first the bins in range, because a floor follows from them.
     fn divide(&self, joint: &[Complex<T>], rounding: f64, quotient: &mut [Complex<T>]) -> Result<(), Error> {
         let (first, end) = (*self.in_range.start(), *self.in_range.end() + 1);
-        let power = self.divide_bins(first..end, T::default(), joint, quotient);
+        let power = self.divide_bins(first..end, T::default(), |_| T::of(1.0), joint, quotient);
         let mean = power.sum() / (end - first) as f64;
         // One sample that is not finite spoils all bins.
         if !mean.is_finite() {
             return Err(Error::NotFinite { what: "the recording or the loopback" });
         }
-        let floor = T::of(mean * self.floor);
-        if !(mean > rounding && power.least() > 0.0 && floor > T::default()) {
+        if !(mean > rounding && power.least() > 0.0) {
             return Err(Error::NoLoopback);
         }
-        self.divide_bins(0..first, floor, joint, quotient);
-        self.divide_bins(end..self.len / 2 + 1, floor, joint, quotient);
+        let beyond = [0..first, end..self.len / 2 + 1];
+        let floor = match self.division {
+            SpectralDivision::Tapered => {
+                let [low, high] = &self.tapers;
+                self.divide_bins(first..first + low.len(), T::default(), |bin| low[bin - first], joint, quotient);
+                self.divide_bins(end - high.len()..end, T::default(), |bin| high[end - 1 - bin], joint, quotient);
+                beyond.into_iter().for_each(|bins| self.silence(bins, quotient));
+                return Ok(());
+            }
+            SpectralDivision::Floored { floor_db } => T::of(mean * 10f64.powf(floor_db / 10.0)),
+            // A bin without any power, as the first one may be, counts as rounding.
+            SpectralDivision::Literal => T::of(rounding),
+        };
+        if floor <= T::default() {
+            return Err(Error::NoLoopback);
+        }
+        for bins in beyond {
+            self.divide_bins(bins, floor, |_| T::of(1.0), joint, quotient);
+        }
         Ok(())
     }
 
-    // Divides with the divisor's power raised to `floor`; returns the power before it is raised, times 4.
+    fn silence(&self, bins: Range<usize>, quotient: &mut [Complex<T>]) {
+        for first in bins.clone().step_by(PIECE) {
+            self.inverse.lay(first, &[Complex::default(); PIECE][..PIECE.min(bins.end - first)], quotient);
+        }
+    }
+
+    // Divides with the divisor's power raised to `floor`, times `gain` of the bin; returns the power before it is raised,
+    // times 4.
     fn divide_bins(
         &self,
         bins: Range<usize>,
         floor: T,
+        gain: impl Fn(usize) -> T,
         joint: &[Complex<T>],
         quotient: &mut [Complex<T>],
     ) -> BinPower<T> {
@@ -216,11 +257,11 @@ impl<T: RealSample> DeconvolutionPlan<T> {
             let count = PIECE.min(bins.end - first);
             let mirrored = &joint[self.len + 1 - first - count..=self.len - first];
             let pairs = joint[first..first + count].iter().zip(mirrored.iter().rev());
-            for (((z, m), to), power) in pairs.zip(&mut piece).zip(&mut powers) {
+            for (bin, (((z, m), to), power)) in (first..).zip(pairs.zip(&mut piece).zip(&mut powers)) {
                 // With d = Z - b = 2i S and u = Z + b = 2 X, X / S = i u conj(d) / |d|^2.
                 let (u, d) = (Complex::new(z.re + m.re, z.im - m.im), Complex::new(z.re - m.re, z.im + m.im));
                 *power = d.re * d.re + d.im * d.im;
-                let raised = T::of(1.0) / if *power > floor { *power } else { floor };
+                let raised = gain(bin) / if *power > floor { *power } else { floor };
                 *to = Complex::new((u.re * d.im - u.im * d.re) * raised, (u.re * d.re + u.im * d.im) * raised);
             }
             self.inverse.lay(first, &piece[..count], quotient);
@@ -228,6 +269,19 @@ impl<T: RealSample> DeconvolutionPlan<T> {
         }
         total
     }
+}
+
+// Gains at both ends of the range: a half cosine from the limit on, over half of the range at most.
+fn tapers<T: RealSample>(params: &DeconvolutionParams, step: f64, bins: RangeInclusive<usize>) -> [Vec<T>; 2] {
+    let width = params.taper_hz.min((params.high_hz - params.low_hz) / 2.0);
+    let gain = |offset: f64| T::of((FRAC_PI_2 * offset / width).sin().powi(2));
+    let offsets = |bin: usize| [bin as f64 * step - params.low_hz, params.high_hz - bin as f64 * step];
+    let low = bins.clone().map(|bin| offsets(bin)[0]);
+    let high = bins.rev().map(|bin| offsets(bin)[1]);
+    [
+        low.take_while(|offset| *offset < width).map(gain).collect(),
+        high.take_while(|offset| *offset < width).map(gain).collect(),
+    ]
 }
 
 /// The least even length without prime factors above 5 that holds `len` samples.
@@ -262,7 +316,8 @@ mod tests {
             rate_hz: 96e3,
             low_hz: 2e3,
             high_hz: 40e3,
-            floor_db: -60.0,
+            division: SpectralDivision::Floored { floor_db: -60.0 },
+            taper_hz: 0.0,
             length: TransformLength::Fast,
         })
         .expect("a plan");
@@ -291,7 +346,8 @@ mod tests {
             rate_hz: 96e3,
             low_hz: 2e3,
             high_hz: 40e3,
-            floor_db: -60.0,
+            division: SpectralDivision::Floored { floor_db: -60.0 },
+            taper_hz: 0.0,
             length: TransformLength::Exact,
         };
         assert!(DeconvolutionPlan::<f32>::new(good).is_ok());
@@ -303,10 +359,61 @@ mod tests {
             DeconvolutionParams { low_hz: f64::NAN, ..good },
             DeconvolutionParams { low_hz: 41e3, ..good },
             DeconvolutionParams { high_hz: f64::NAN, ..good },
-            DeconvolutionParams { floor_db: f64::NAN, ..good },
-            DeconvolutionParams { floor_db: f64::NEG_INFINITY, ..good },
+            DeconvolutionParams { division: SpectralDivision::Floored { floor_db: f64::NAN }, ..good },
+            DeconvolutionParams { division: SpectralDivision::Floored { floor_db: f64::NEG_INFINITY }, ..good },
+            DeconvolutionParams { taper_hz: f64::NAN, ..good },
+            DeconvolutionParams { taper_hz: -1.0, ..good },
         ] {
             assert!(matches!(DeconvolutionPlan::<f32>::new(bad), Err(Error::Setting { .. })), "{bad:?}");
+        }
+    }
+
+    // In range the tapered quotient is the floored one times the taper, beyond it there is nothing.
+    #[test]
+    fn a_tapered_quotient_is_the_floored_one_times_the_taper() {
+        let (len, rate_hz, low_hz, high_hz, taper_hz) = (1_000, 96e3, 2_000.0, 40_000.0, 500.0);
+        let loopback: Vec<f64> = (0..len).map(|i| f64::from((i as u32 * 7919) % 1013) - 506.0).collect();
+        let recording: Vec<f64> = (0..len).map(|i| f64::from((i as u32 * 104_729) % 997) - 498.0).collect();
+        let spectrum = |division| {
+            let length = TransformLength::Exact;
+            let (recording_len, output_len) = (len, len);
+            let plan = DeconvolutionPlan::<f64>::new(DeconvolutionParams {
+                recording_len,
+                output_len,
+                rate_hz,
+                low_hz,
+                high_hz,
+                division,
+                taper_hz,
+                length,
+            })
+            .expect("a plan");
+            let mut ir = vec![0.0; len];
+            plan.run(&recording, &loopback, &mut ir, &mut plan.scratch()).expect("a response");
+            let forward = f64::plan_real_forward(len);
+            let mut bins = forward.make_output_vec();
+            forward.process(&mut ir, &mut bins).expect("a spectrum");
+            bins
+        };
+        let floored = spectrum(SpectralDivision::Floored { floor_db: SpectralDivision::FLOOR_DB });
+        let literal = spectrum(SpectralDivision::Literal);
+        let largest = floored.iter().map(|c| c.norm()).fold(0.0, f64::max);
+        for (k, tapered) in spectrum(SpectralDivision::Tapered).iter().enumerate() {
+            let hz = k as f64 * rate_hz / len as f64;
+            let inside = ((hz - low_hz).min(high_hz - hz) / taper_hz).clamp(0.0, 1.0);
+            let gain = (1.0 - (std::f64::consts::PI * inside).cos()) / 2.0;
+            assert!((tapered - floored[k] * gain).norm() < 1e-9 * largest, "{hz} Hz: {tapered} {}", floored[k]);
+            if (low_hz..=high_hz).contains(&hz) {
+                assert!((literal[k] - floored[k]).norm() < 1e-9 * largest, "{hz} Hz: {}", literal[k]);
+            }
+        }
+        let quotient = |k: usize| {
+            let turn = |n: usize| Complex::from_polar(1.0, -std::f64::consts::TAU * (k * n % len) as f64 / len as f64);
+            let sum = |x: &[f64]| x.iter().enumerate().map(|(n, x)| turn(n) * x).sum::<Complex<f64>>();
+            sum(&recording) / sum(&loopback)
+        };
+        for k in [1, 7, 430, 499] {
+            assert!((literal[k] / quotient(k) - 1.0).norm() < 1e-6, "bin {k}: {} {}", literal[k], quotient(k));
         }
     }
 
@@ -320,7 +427,8 @@ mod tests {
                 rate_hz: 96e3,
                 low_hz: 0.0,
                 high_hz: 48e3,
-                floor_db: -60.0,
+                division: SpectralDivision::Floored { floor_db: -60.0 },
+                taper_hz: 0.0,
                 length: TransformLength::Exact,
             })
             .expect("a plan");
@@ -345,7 +453,8 @@ mod tests {
             rate_hz: 96e3,
             low_hz: 2e3,
             high_hz: 40e3,
-            floor_db: -60.0,
+            division: SpectralDivision::Floored { floor_db: -60.0 },
+            taper_hz: 0.0,
             length: TransformLength::Fast,
         })
         .expect("a plan");
@@ -372,7 +481,8 @@ mod tests {
             rate_hz: 96e3,
             low_hz: 2e3,
             high_hz: 40e3,
-            floor_db: -60.0,
+            division: SpectralDivision::Floored { floor_db: -60.0 },
+            taper_hz: 0.0,
             length: TransformLength::Exact,
         })
         .expect("a plan");

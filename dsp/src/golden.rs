@@ -5,7 +5,7 @@ use std::collections::HashMap;
 use arrow::array::AsArray as _;
 use arrow::datatypes::Float64Type;
 use bytes::Bytes;
-use echolake_schema::{Rig, Symmetry};
+use echolake_schema::{Rig, SpectralDivision, Symmetry};
 use parquet::arrow::arrow_reader::ParquetRecordBatchReaderBuilder;
 use serde_json::Value;
 
@@ -76,7 +76,7 @@ fn params(recording_len: usize) -> MeasurementParams {
         rate_hz: 96e3,
         low_hz: 2e3,
         high_hz: 40e3,
-        floor_db: -60.0,
+        division: SpectralDivision::Floored { floor_db: -60.0 },
         reference_celsius: 20.0,
     }
 }
@@ -87,9 +87,18 @@ fn check_deconvolution<T: RealSample>(length: TransformLength, output_len: impl 
             let (x, s) = (&case[&format!("{kind}_recording")], &case[&format!("{kind}_loopback")]);
             let output_len = output_len(x.len());
             let wanted = &case[&format!("{kind}_deconvolved")][..output_len];
-            let MeasurementParams { rate_hz, low_hz, high_hz, floor_db, .. } = params(x.len());
-            let settings =
-                DeconvolutionParams { recording_len: x.len(), output_len, rate_hz, low_hz, high_hz, floor_db, length };
+            let MeasurementParams { rate_hz, low_hz, high_hz, division, .. } = params(x.len());
+            let recording_len = x.len();
+            let settings = DeconvolutionParams {
+                recording_len,
+                output_len,
+                rate_hz,
+                low_hz,
+                high_hz,
+                division,
+                taper_hz: 0.0,
+                length,
+            };
             let plan = DeconvolutionPlan::<T>::new(settings).expect("a plan");
             let mut ir = vec![T::default(); output_len];
             plan.run(&of(x), &of(s), &mut ir, &mut plan.scratch()).expect("a response");

@@ -6,6 +6,7 @@
 //! ```
 //! use echolake_dsp::chain::{MeasurementParams, MeasurementPlan};
 //! use echolake_dsp::sweep::LinearSweep;
+//! use echolake_schema::SpectralDivision;
 //!
 //! let sweep = LinearSweep { rate_hz: 96e3, duration_secs: 0.03, low_hz: 2e3, high_hz: 40e3, fade_secs: 0.001 };
 //! let loopback = sweep.samples();
@@ -16,7 +17,7 @@
 //!     rate_hz: 96e3,
 //!     low_hz: 2e3,
 //!     high_hz: 40e3,
-//!     floor_db: -60.0,
+//!     division: SpectralDivision::Tapered,
 //!     reference_celsius: 20.0,
 //! })?;
 //! let mut ir = vec![0.0; 384];

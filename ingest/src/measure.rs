@@ -331,7 +331,7 @@ impl Measurer {
             rate_hz: self.rig.sweep.rate_hz.get(),
             low_hz: self.rig.sweep.low_hz,
             high_hz: self.rig.sweep.high_hz,
-            floor_db: self.rig.impulse_response.floor_db,
+            division: self.rig.impulse_response.division,
             reference_celsius: self.rig.impulse_response.reference_temperature_c.get(),
         });
         let plan = Arc::new(RecordingPlan { plan: plan.map_err(|e| e.to_string())?, idle: Mutex::default() });

@@ -31,6 +31,6 @@ pub use grid::{Grid, Pair, Point};
 pub use ids::{PairId, PointId, RunId, SurfaceId};
 pub use manifest::{RunManifest, SurfaceRecord};
 pub use quantities::{Celsius, SampleRate, Timestamp};
-pub use rig::Rig;
+pub use rig::{Rig, SpectralDivision};
 pub use symmetry::Symmetry;
 pub use tables::Table;

@@ -66,14 +66,100 @@ pub struct Sweep {
 
 /// Length and corrections of each impulse response.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
+#[serde(try_from = "ImpulseResponseFields", into = "ImpulseResponseFields")]
 pub struct ImpulseResponse {
     /// Samples.
     pub length: usize,
     /// Temperature that responses are corrected to, C.
     pub reference_temperature_c: Celsius,
-    /// Outside of the sweep's range the divisor's power stays above this, dB re its mean in the range.
-    pub floor_db: f64,
+    /// Treatment of frequencies at the limits of the sweep's range and beyond them.
+    pub division: SpectralDivision,
+}
+
+/// Division of the recording's spectrum by the loopback's at the limits of the sweep's range and beyond them; in between
+/// it is exact.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum SpectralDivision {
+    /// Nothing is left beyond the limits, and the quotient rises from there over a half cosine as wide as the response
+    /// resolves (the sampling rate over its length), so that numbers do not depend on the sweep's length.
+    Tapered,
+    /// Beyond the limits the divisor's power is raised.
+    Floored {
+        /// The least power of the divisor, dB re its mean in the range.
+        floor_db: f64,
+    },
+    /// Plain division everywhere, as the paper prints it: noise beyond the limits.
+    Literal,
+}
+
+impl SpectralDivision {
+    /// Floor of the reference pipeline, dB.
+    pub const FLOOR_DB: f64 = -60.0;
+
+    /// Its name, as rig files spell it.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Tapered => "tapered",
+            Self::Floored { .. } => "floored",
+            Self::Literal => "literal",
+        }
+    }
+}
+
+/// An [`ImpulseResponse`] as rig files spell it. One that has a floor and names no division is from a version that knew
+/// no other.
+#[derive(Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+struct ImpulseResponseFields {
+    length: usize,
+    reference_temperature_c: Celsius,
+    division: Option<DivisionName>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    floor_db: Option<f64>,
+}
+
+#[derive(Clone, Copy, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+enum DivisionName {
+    Tapered,
+    Floored,
+    Literal,
+}
+
+impl Default for ImpulseResponseFields {
+    fn default() -> Self {
+        let ImpulseResponse { length, reference_temperature_c, .. } = ImpulseResponse::default();
+        Self { length, reference_temperature_c, division: None, floor_db: None }
+    }
+}
+
+impl TryFrom<ImpulseResponseFields> for ImpulseResponse {
+    type Error = &'static str;
+
+    fn try_from(fields: ImpulseResponseFields) -> Result<Self, Self::Error> {
+        let ImpulseResponseFields { length, reference_temperature_c, division, floor_db } = fields;
+        let division = match (division, floor_db) {
+            (None | Some(DivisionName::Tapered), None) => SpectralDivision::Tapered,
+            (Some(DivisionName::Literal), None) => SpectralDivision::Literal,
+            (None | Some(DivisionName::Floored), floor) => {
+                SpectralDivision::Floored { floor_db: floor.unwrap_or(SpectralDivision::FLOOR_DB) }
+            }
+            (Some(_), Some(_)) => return Err("`floor_db` goes with `division = \"floored\"` only"),
+        };
+        Ok(Self { length, reference_temperature_c, division })
+    }
+}
+
+impl From<ImpulseResponse> for ImpulseResponseFields {
+    fn from(response: ImpulseResponse) -> Self {
+        let ImpulseResponse { length, reference_temperature_c, division } = response;
+        let (name, floor_db) = match division {
+            SpectralDivision::Tapered => (DivisionName::Tapered, None),
+            SpectralDivision::Floored { floor_db } => (DivisionName::Floored, Some(floor_db)),
+            SpectralDivision::Literal => (DivisionName::Literal, None),
+        };
+        Self { length, reference_temperature_c, division: Some(name), floor_db }
+    }
 }
 
 /// The octave-spaced itersine filter bank.
@@ -142,7 +228,7 @@ impl Default for Sweep {
 
 impl Default for ImpulseResponse {
     fn default() -> Self {
-        Self { length: 384, reference_temperature_c: Celsius::PAPER, floor_db: -60.0 }
+        Self { length: 384, reference_temperature_c: Celsius::PAPER, division: SpectralDivision::Tapered }
     }
 }
 
@@ -204,6 +290,11 @@ impl Rig {
         self.bands.centres_hz.iter().map(|hz| format!("{hz:.0}")).collect()
     }
 
+    /// Width of the taper at the limits of the sweep's range, Hz: what a response of this length resolves.
+    pub fn taper_hz(&self) -> f64 {
+        self.sweep.rate_hz.get() / self.impulse_response.length as f64
+    }
+
     /// The settings that decide what the tables' numbers mean and that differ from `other`'s, as
     /// (field, here, there). A lake holds only runs for which there are none.
     pub fn differences(&self, other: &Self) -> Vec<(&'static str, String, String)> {
@@ -216,13 +307,18 @@ impl Rig {
         }
         let rates = (self.sweep.rate_hz.get(), other.sweep.rate_hz.get());
         let references = [self, other].map(|r| r.impulse_response.reference_temperature_c.get());
+        let divisions = [self, other].map(|r| r.impulse_response.division);
+        let durations =
+            (divisions[0] != SpectralDivision::Tapered).then(|| [self, other].map(|r| r.sweep.duration_secs));
         [
             entry("sweep.rate_hz", &rates.0, &rates.1),
             entry("sweep.low_hz", &self.sweep.low_hz, &other.sweep.low_hz),
             entry("sweep.high_hz", &self.sweep.high_hz, &other.sweep.high_hz),
             entry("impulse_response.length", &self.impulse_response.length, &other.impulse_response.length),
             entry("impulse_response.reference_temperature_c", &references[0], &references[1]),
-            entry("impulse_response.floor_db", &self.impulse_response.floor_db, &other.impulse_response.floor_db),
+            entry("impulse_response.division", &divisions[0], &divisions[1]),
+            // Without a taper the numbers depend on the sweep's length.
+            durations.and_then(|[here, there]| entry("sweep.duration_secs", &here, &there)),
             entry("bands.centres_hz", &self.bands.centres_hz, &other.bands.centres_hz),
             entry("panel", &self.panel, &other.panel),
             entry("grid", &self.grid, &other.grid),
@@ -277,9 +373,9 @@ impl Rig {
                 format!("is {}, expected 1 to 16777216", self.impulse_response.length),
             ),
             (
-                (-200.0..=0.0).contains(&self.impulse_response.floor_db),
+                !matches!(self.impulse_response.division, SpectralDivision::Floored { floor_db } if !(-200.0..=0.0).contains(&floor_db)),
                 "impulse_response.floor_db",
-                format!("is {}, expected -200 to 0", self.impulse_response.floor_db),
+                format!("is {:?}, expected -200 to 0", self.impulse_response.division),
             ),
             (
                 octaves(&self.bands.centres_hz),
@@ -340,6 +436,30 @@ mod tests {
         assert_eq!(Rig::from_toml(""), Ok(rig.clone()));
         assert_eq!(rig.band_names(), ["2500", "5000", "10000", "20000", "40000"]);
         assert_eq!(rig.recording_len(), 48_960);
+    }
+
+    #[test]
+    fn lakes_and_runs_without_a_division_have_the_floor_that_they_were_made_with() {
+        let division = |toml: &str| Rig::from_toml(toml).map(|rig| rig.impulse_response.division);
+        let floored = SpectralDivision::Floored { floor_db: -60.0 };
+        assert_eq!(division("[impulse_response]\nlength = 384\nfloor_db = -60"), Ok(floored));
+        assert_eq!(division("impulse_response.division = \"floored\""), Ok(floored));
+        assert_eq!(division("impulse_response.length = 400"), Ok(SpectralDivision::Tapered));
+        assert!(division("impulse_response = { division = \"literal\", floor_db = -60 }").is_err());
+        assert!(division("impulse_response.floor_db = 3").is_err());
+        for toml in ["impulse_response.division = \"literal\"", "impulse_response.floor_db = -40"] {
+            let rig = Rig::from_toml(toml).expect("a rig");
+            assert_eq!(Rig::from_toml(&rig.to_toml()), Ok(rig.clone()));
+            let fields: Vec<_> = rig.differences(&Rig::paper()).into_iter().map(|(field, ..)| field).collect();
+            assert_eq!(fields, ["impulse_response.division"]);
+            // The sweep's length matters where there is no taper.
+            let mut longer = rig.clone();
+            longer.sweep.duration_secs *= 2.0;
+            assert_eq!(rig.differences(&longer).len(), 1);
+        }
+        let mut longer = Rig::paper();
+        longer.sweep.duration_secs *= 2.0;
+        assert_eq!(Rig::paper().differences(&longer), []);
     }
 
     const REAL: &str = "[devices]\naudio.kind = \"alsa\"\nsensor.kind = \"serial\"\nrobots.kind = \"rosbridge\"\n";

@@ -5,7 +5,7 @@ use echolake_acquisition::import::{
     import_sofa, import_wav, sampling_rate_of,
 };
 use echolake_lake::{Lake, ReferenceSurfaces};
-use echolake_schema::{Celsius, Rig, Timestamp};
+use echolake_schema::{Celsius, Rig, SpectralDivision, Timestamp};
 
 use crate::CommandOutcome;
 use crate::progress::{CommandProgress, TaskProgress};
@@ -141,5 +141,7 @@ fn gir_rig() -> Rig {
     let mut rig = Rig::paper();
     rig.name = "gir".into();
     rig.impulse_response.length = GIR_IR_LEN;
+    // As the data set's responses were made.
+    rig.impulse_response.division = SpectralDivision::Literal;
     rig
 }

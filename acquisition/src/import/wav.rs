@@ -113,7 +113,8 @@ impl WavImport<'_> {
             rate_hz: rig.sweep.rate_hz.get(),
             low_hz: rig.sweep.low_hz,
             high_hz: rig.sweep.high_hz,
-            floor_db: rig.impulse_response.floor_db,
+            division: rig.impulse_response.division,
+            taper_hz: rig.taper_hz(),
             length: TransformLength::Fast,
         })
         .map_err(planned)?;

@@ -3,8 +3,8 @@
 use echolake_dsp::deconvolution::{DeconvolutionParams, DeconvolutionPlan, DeconvolutionScratch, TransformLength};
 use echolake_dsp::level::power_to_db;
 use echolake_dsp::{Error, chain};
-use echolake_schema::Rig;
 use echolake_schema::rig::Validation;
+use echolake_schema::{Rig, SpectralDivision};
 
 use crate::run::objection::TakeObjection;
 
@@ -55,7 +55,8 @@ impl TakeAssessor {
             rate_hz,
             low_hz: rig.sweep.low_hz,
             high_hz: rig.sweep.high_hz,
-            floor_db: OUT_OF_RANGE_DB,
+            division: SpectralDivision::Floored { floor_db: OUT_OF_RANGE_DB },
+            taper_hz: 0.0,
             length: TransformLength::Fast,
         })?;
         let reference = rig.impulse_response.reference_temperature_c.get();

@@ -149,7 +149,8 @@ impl<'a> RunController<'a> {
             rate_hz: sweep.rate_hz.get(),
             low_hz: sweep.low_hz,
             high_hz: sweep.high_hz,
-            floor_db: rig.impulse_response.floor_db,
+            division: rig.impulse_response.division,
+            taper_hz: rig.taper_hz(),
             length: TransformLength::Fast,
         })
         .map_err(failed)?;

@@ -708,6 +708,8 @@ export interface components {
         readonly Lake: {
             readonly bands: readonly components["schemas"]["Band"][];
             readonly counts: components["schemas"]["LakeCounts"];
+            /** @description Division of the spectra at the limits of `low_hz` and `high_hz`: `tapered`, `floored` or `literal`. */
+            readonly division: string;
             readonly high_hz: number;
             readonly ir_length: number;
             readonly layers: number;

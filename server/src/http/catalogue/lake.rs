@@ -22,6 +22,8 @@ struct LakeDescription<'a> {
     high_hz: f64,
     ir_length: usize,
     reference_temperature_c: f64,
+    /// Division of the spectra at the limits of `low_hz` and `high_hz`: `tapered`, `floored` or `literal`.
+    division: &'static str,
     panel_size_mm: f64,
     panel_depth_mm: f64,
     layers: i32,
@@ -97,6 +99,7 @@ pub(super) async fn lake(Extension(request): Extension<CatalogueRequest>) -> End
         high_hz: rig.sweep.high_hz,
         ir_length: rig.impulse_response.length,
         reference_temperature_c: rig.impulse_response.reference_temperature_c.get(),
+        division: rig.impulse_response.division.name(),
         panel_size_mm: rig.panel.size_mm,
         panel_depth_mm: rig.panel.depth_mm,
         layers: points.iter().map(|p| p.layer + 1).max().unwrap_or(0),
