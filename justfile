@@ -43,6 +43,10 @@ api:
 campaign NAME *OPTIONS:
     cargo run --release --locked -p echolake-campaigns -- {{ NAME }} {{ OPTIONS }}
 
+# Fuzzes a reader of foreign files with coverage, as `just fuzz sofa 3600`; targets are in fuzz/targets/.
+fuzz TARGET *OPTIONS:
+    fuzz/run {{ TARGET }} {{ OPTIONS }}
+
 # A benchmark, built as packages are; `kernels` are criterion's.
 bench NAME *OPTIONS:
     {{ if NAME == "kernels" { "cargo bench --manifest-path campaigns/kernels/Cargo.toml --locked --" } else { "cargo run --profile dist --locked -p echolake-campaigns -- " + NAME } }} {{ OPTIONS }}

@@ -1,0 +1,163 @@
+//! The files that fuzzing begins with, by the project's own writers.
+
+use std::io::Cursor;
+use std::path::{Path, PathBuf};
+
+use echolake_acquisition::import::import_wav;
+use echolake_acquisition::panel::mesh::{Format, Mesh};
+use echolake_acquisition::panel::relief::HeightField;
+use hound::{SampleFormat, WavSpec, WavWriter};
+use ndarray::Array2;
+use ndarray_npy::NpzWriter;
+use rust_hdf5::{H5File, VarLenUnicode};
+
+use crate::{ImportFolder, LENGTH, POINTS_MM, WAV_MANIFEST, gir_surface, three_points};
+
+/// Frames of recordings; a run of theirs is a few kilobytes.
+const FRAMES: usize = 1000;
+
+/// Fills the folder that `ECHOLAKE_SEEDS` names with a folder of files per target, and ends the process; without that
+/// variable it does nothing. Every target can do it, so that nothing is built twice, with coverage and without.
+///
+/// # Panics
+/// A file cannot be written.
+pub fn write_seeds_on_request() {
+    if let Some(folder) = std::env::var_os("ECHOLAKE_SEEDS") {
+        write_seeds(PathBuf::from(folder));
+        std::process::exit(0);
+    }
+}
+
+fn write_seeds(folder: PathBuf) {
+    let put = |target: &str, name: &str, bytes: &[u8]| {
+        let folder = folder.join(target);
+        std::fs::create_dir_all(&folder).expect("a folder");
+        std::fs::write(folder.join(name), bytes).expect("written");
+    };
+    for (name, bits, format) in
+        [("16", 16, SampleFormat::Int), ("24", 24, SampleFormat::Int), ("f", 32, SampleFormat::Float)]
+    {
+        let bytes = wav(bits, format);
+        put("wav", name, &bytes);
+        put("mcap", name, &run(&bytes));
+    }
+    let heights = HeightField::from_fn(585.0, 3, |x, y| (x + y) / 100.0);
+    let mesh = Mesh::from_height_field(&heights, -20.0);
+    put("stl", "binary", &mesh.to_bytes(Format::Stl));
+    put("stl", "text", TEXT_STL.as_bytes());
+    put("glb", "panel", &mesh.to_bytes(Format::Glb));
+    let first = |which: u8, bytes: &[u8]| [&[which], bytes].concat();
+    put("gir", "surface", &first(0, &gir_surface()));
+    put("gir", "heights", &first(1, &gir_heights()));
+    put("gir", "combinations", &first(2, COMBINATIONS.as_bytes()));
+    put("gir", "panel_info", &first(3, PANEL_INFO.as_bytes()));
+    let scratch = ImportFolder::new();
+    for (convention, data_type) in
+        [("SingleRoomSRIR", "FIR"), ("SingleRoomMIMOSRIR", "FIR-E"), ("FreeFieldDirectivityTF", "TF")]
+    {
+        let path = scratch.path().join(convention);
+        write_sofa(&path, convention, data_type);
+        put("sofa", convention, &std::fs::read(&path).expect("read"));
+    }
+    let path = scratch.path().join("input.h5");
+    write_set(&path);
+    put("hdf5", "set", &std::fs::read(&path).expect("read"));
+}
+
+const TEXT_STL: &str = "solid a\nfacet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\nendloop\n\
+                        endfacet\nendsolid a\n";
+const COMBINATIONS: &str = "combination,mic_layer,mic_x,mic_y,speaker_layer,speaker_x,speaker_y\n\
+                            1,0,0,0,0,1,0\n2,0,0,0,0,2,0\n3,0,1,0,0,2,0\n";
+const PANEL_INFO: &str = "panel id,flat reference,foam reference,macrostructure reference,mesostructure reference,sand type,\
+                          binder type\na,b,c,flat,river_rock,sand,\n";
+
+// Noise, whose loopback is itself.
+fn wav(bits_per_sample: u16, sample_format: SampleFormat) -> Vec<u8> {
+    let spec = WavSpec { channels: 2, sample_rate: 96_000, bits_per_sample, sample_format };
+    let mut bytes = Cursor::new(Vec::new());
+    let mut writer = WavWriter::new(&mut bytes, spec).expect("a header");
+    for i in 0..FRAMES {
+        let sample = ((i * 7_919) % 20_011) as i32 - 10_005;
+        for _ in 0..2 {
+            match sample_format {
+                SampleFormat::Int => writer.write_sample(sample),
+                SampleFormat::Float => writer.write_sample(sample as f32 / 40_022.0),
+            }
+            .expect("written");
+        }
+    }
+    writer.finalize().expect("a length");
+    bytes.into_inner()
+}
+
+// The run of an import.
+fn run(wav: &[u8]) -> Vec<u8> {
+    let folder = ImportFolder::new();
+    folder.write("input.wav", wav);
+    let manifest = folder.write("manifest.csv", WAV_MANIFEST.as_bytes());
+    let runs = import_wav(&manifest, &three_points(), folder.options(), &mut |_, _| {}).expect("imported");
+    std::fs::read(&runs[0].path).expect("read")
+}
+
+fn gir_heights() -> Vec<u8> {
+    let mut bytes = Cursor::new(Vec::new());
+    let mut npz = NpzWriter::new(&mut bytes);
+    npz.add_array("surface", &Array2::from_shape_fn((4, 4), |(x, y)| (x * y) as f64)).expect("written");
+    npz.finish().expect("written");
+    bytes.into_inner()
+}
+
+fn write_variable(file: &H5File, name: &str, shape: &[usize], value: &[f64], attributes: &[(&str, &str)]) {
+    let dataset = file.new_dataset::<f64>().shape(shape).create(name).expect("a variable");
+    dataset.write_raw(value).expect("written");
+    for (key, value) in attributes {
+        let attribute = dataset.new_attr::<VarLenUnicode>().shape(()).create(key).expect("an attribute");
+        attribute.write_string(value).expect("written");
+    }
+}
+
+fn write_sofa(path: &Path, convention: &str, data_type: &str) {
+    let file = H5File::create(path).expect("a file");
+    let texts =
+        [("Conventions", "SOFA"), ("SOFAConventions", convention), ("DataType", data_type), ("APIName", "seeds")];
+    for (name, value) in texts {
+        file.set_attr_string(name, value).expect("written");
+    }
+    let put = |name: &str, shape: &[usize], attributes: &[(&str, &str)], value: &dyn Fn(usize) -> f64| {
+        let values: Vec<f64> = (0..shape.iter().product()).map(value).collect();
+        write_variable(&file, name, shape, &values, attributes);
+    };
+    let metres: &[(&str, &str)] = &[("Type", "cartesian"), ("Units", "metre")];
+    match data_type {
+        "TF" => {
+            put("N", &[LENGTH / 2 + 1], &[("Units", "hertz")], &|k| 96e3 * k as f64 / LENGTH as f64);
+            put("Data.Real", &[1, 1, LENGTH / 2 + 1], &[], &|_| 1.0);
+            put("Data.Imag", &[1, 1, LENGTH / 2 + 1], &[], &|_| 0.0);
+        }
+        "FIR-E" => put("Data.IR", &[1, 1, LENGTH, 1], &[], &|n| n as f64 / 1e3),
+        _ => put("Data.IR", &[1, 1, LENGTH], &[], &|n| n as f64 / 1e3),
+    }
+    put("Data.SamplingRate", &[1], &[("Units", "hertz")], &|_| 96e3);
+    put("Data.Delay", &[1, 1], &[], &|_| 0.0);
+    put("ListenerPosition", &[1, 3], metres, &|i| POINTS_MM[0][i] / 1e3);
+    put("ListenerView", &[1, 3], metres, &|i| [1.0, 0.0, 0.0][i]);
+    put("ListenerUp", &[1, 3], &[], &|i| [0.0, 0.0, 1.0][i]);
+    put("ReceiverPosition", &[1, 3, 1], metres, &|i| [0.15, 0.0, 0.0][i]);
+    put("SourcePosition", &[1, 3], &[("Type", "Cartesian"), ("Units", "mm")], &|i| POINTS_MM[2][i]);
+    put("EmitterPosition", &[1, 3, 1], &[("Type", "spherical"), ("Units", "degree, degree, metre")], &|_| 0.0);
+    put("RoomTemperature", &[1], &[("Units", "kelvin")], &|_| 293.15);
+    put("MeasurementDate", &[1], &[], &|_| 1.7e9);
+    file.close().expect("closed");
+}
+
+fn write_set(path: &Path) {
+    let file = H5File::create(path).expect("a file");
+    let responses =
+        file.new_dataset::<f32>().shape([1, 2, LENGTH]).chunk(&[1, 1, 100]).create("ir").expect("a dataset");
+    responses.write_slice(&[0, 0, 0], &[1, 2, LENGTH], &vec![0.25f32; 2 * LENGTH]).expect("written");
+    responses.new_attr::<f64>().shape(()).create("fs").expect("an attribute").write_numeric(&96e3f64).expect("written");
+    let metres: Vec<f64> = POINTS_MM[..2].concat().iter().map(|mm| mm / 1e3).collect();
+    write_variable(&file, "microphones", &[2, 3], &metres, &[]);
+    write_variable(&file, "speakers", &[3, 1], &POINTS_MM[2], &[]);
+    file.close().expect("closed");
+}
