@@ -117,8 +117,10 @@ fn no_reader_gives_what_was_not_written() {
         }
         let size = bytes.len() as u64;
         let tail = &bytes[tail_range(size).start as usize..];
-        if let Some(range) = summary_range(tail, size) {
-            let _ = RunSummary::parse(&bytes[range.start as usize..]);
+        if let Some(range) = summary_range(tail, size)
+            && let Ok(summary) = RunSummary::parse(&bytes[range.start as usize..])
+        {
+            let _ = (summary.unaccounted(), summary.unlisted_ranges(range.start));
         }
         let cut = random.random_range(0..=bytes.len());
         let _ = DecodedChunk::decode(&Bytes::copy_from_slice(&bytes[cut..]));

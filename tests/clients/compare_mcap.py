@@ -63,7 +63,8 @@ class PythonReading:
     """What Python's mcap makes of a file, up to the first error."""
 
     def __init__(self, path):
-        self.schemas, self.channels, self.messages, self.error = {0: Schema(b"", "", 0, "")}, {}, [], None
+        self.schemas = {0: Schema(id=0, name="", encoding="", data=b"")}
+        self.channels, self.messages, self.error = {}, [], None
         try:
             with open(path, "rb") as stream:
                 for record in StreamReader(stream).records:

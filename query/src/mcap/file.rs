@@ -303,6 +303,9 @@ fn with_raw_schemas(channels: &BTreeMap<u16, Arc<echolake_recording::Channel<'st
     channels.iter().map(|(id, channel)| (*id, raw(channel))).collect()
 }
 
+/// Channels and pieces of a file that was walked.
+type WalkedParts = (BTreeMap<u16, Channel>, Vec<Piece>);
+
 /// The damage of a message whose channel nothing describes.
 pub(super) fn undescribed(channel: u16) -> String {
     format!("it has a message of channel {channel}, which no record describes")
@@ -396,7 +399,7 @@ impl Walk {
     }
 
     // An error has the place of a message whose channel nothing describes: nobody knows its topic.
-    fn finish(self) -> Result<(BTreeMap<u16, Channel>, Vec<Piece>), (u64, String)> {
+    fn finish(self) -> Result<WalkedParts, (u64, String)> {
         let mut channels = with_raw_schemas(&self.definitions.into_channels());
         if let Some(unknown) = self.seen.keys().find(|id| !channels.contains_key(id)) {
             let piece = self.pieces.iter().find(|piece| piece.has(*unknown));
