@@ -32,6 +32,7 @@ mod gate;
 mod mcap;
 mod opaque;
 pub mod output;
+mod placeholders;
 mod predicate;
 mod session;
 mod small;

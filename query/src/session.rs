@@ -25,7 +25,7 @@ use crate::control::{QueryTicket, StopReason, WorkGuard};
 use crate::engine::{self, EngineClient, EngineLimits, QueryEngine, QueryPermit, QueryQuota, SqlFunction};
 use crate::mcap::Contents;
 use crate::statement_bounds::check_statement_bounds;
-use crate::{Error, OpaqueValue, as_of, gate};
+use crate::{Error, OpaqueValue, as_of, gate, placeholders};
 
 /// Capacity of the queue of batches to a slow reader.
 const AHEAD: usize = 2;
@@ -273,7 +273,12 @@ impl Session {
             if let Some(extend) = &session.extend {
                 extend(&context).map_err(|e| Error::execution(&e))?;
             }
-            let plan = context.state().statement_to_plan(statement).await.map_err(wrong)?;
+            let plan = context
+                .state()
+                .statement_to_plan(statement)
+                .await
+                .and_then(placeholders::infer_types)
+                .map_err(wrong)?;
             // `SELECT INTO` reads by its first word and makes a table by its plan.
             let reading = SQLOptions::new().with_allow_ddl(false).with_allow_dml(false).with_allow_statements(false);
             reading.verify_plan(&plan).map_err(|_| Error::NotReading { statement: plan.display().to_string() })?;

@@ -121,3 +121,62 @@ fn state(body: &[u8]) -> String {
     let field = body.split(|b| *b == 0).find(|f| f.first() == Some(&b'C')).expect("a state");
     String::from_utf8_lossy(&field[1..]).into_owned()
 }
+
+#[test]
+fn the_catalogue_is_as_in_postgres() {
+    let place = super::lake();
+    let server = super::served(&place, &[]);
+    let mut client = WireClient::connect(&server, None);
+    for (sql, expected) in [
+        ("select 1, 1", "1,1"),
+        ("select pg_typeof(1.5::real), pg_typeof(array[1.5::real])", "real,real[]"),
+        ("select pg_size_pretty(20480::bigint)", "20 kB"),
+        ("select format('%s-%I', 'a', 'b c')", "a-\"b c\""),
+        ("select pg_backend_pid() > 0", "t"),
+        (
+            "select nspname from pg_namespace where nspname not like 'pg/_%' escape '/' order by 1 limit 1",
+            "information_schema",
+        ),
+        ("select relkind from pg_class where relname in ('pairs', 'tnce_db') order by relname", "r;v"),
+        (
+            "select table_type from information_schema.tables where table_name in ('pairs', 'ir') order by table_name",
+            "VIEW;BASE TABLE",
+        ),
+        (
+            "select udt_schema, udt_name, is_identity from information_schema.columns where column_name = 'ir' and table_name = 'measurements'",
+            "pg_catalog,_float4,NO",
+        ),
+        (
+            "select format_type(atttypid, atttypmod) from pg_attribute where attrelid = 'measurements'::regclass and attname = 'ir'",
+            "real[]",
+        ),
+        (
+            "select count(*) > 10 from pg_description d where d.objoid = 'pairs'::regclass and classoid = 'pg_class'::regclass",
+            "t",
+        ),
+        (
+            "select col_description('pairs'::regclass, 1) is not null, obj_description('pairs'::regclass)",
+            "t,One row per pair",
+        ),
+        ("select has_table_privilege('pairs', 'SELECT'), has_table_privilege('pairs', 'INSERT')", "t,f"),
+        ("select count(*) from information_schema.table_constraints", "0"),
+        ("select p.proname from pg_type t join pg_proc p on p.oid = t.typinput where t.typname = 'bool'", "boolin"),
+        ("select pg_get_function_result(oid) from pg_proc where proname = 'boolin'", "boolean"),
+        (
+            "select c.relname, exists(select 1 from pg_constraint k where k.conrelid = c.oid) from pg_class c where relname = 'runs'",
+            "runs,f",
+        ),
+        ("select pg_advisory_unlock_all()", ""),
+        ("select 'integer'::regtype::int", "23"),
+        ("select typinput, typinput::text from pg_type where typname = 'bool'", "boolin,boolin"),
+        ("select pg_table_is_visible('information_schema.tables'::regclass)", "f"),
+    ] {
+        let rows = client.query(sql).unwrap_or_else(|state| panic!("{sql}: {state}"));
+        let text = |row: &Vec<Option<String>>| {
+            row.iter().map(|value| value.as_deref().unwrap_or("NULL")).collect::<Vec<_>>().join(",")
+        };
+        assert_eq!(rows.iter().map(text).collect::<Vec<_>>().join(";"), expected, "{sql}");
+    }
+    assert_eq!(client.query("unlisten *"), Ok(Vec::new()));
+    assert_eq!(client.query("listen news"), Err("0A000".to_owned()));
+}

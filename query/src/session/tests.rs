@@ -31,6 +31,26 @@ async fn rows(session: &Session, sql: &str) -> Vec<arrow::record_batch::RecordBa
 }
 
 #[tokio::test]
+async fn placeholders_have_the_types_that_the_query_determines() {
+    let (_folder, lake) = lake().await;
+    let session = Session::new(&lake).expect("a session");
+    let int_list = || DataType::new_list(DataType::Int32, true);
+    for (sql, expected) in [
+        ("select $1::int", vec![Some(DataType::Int32)]),
+        ("select $1::bigint + 1", vec![Some(DataType::Int64)]),
+        ("select pair_id from pairs limit $1 offset $2", vec![Some(DataType::Int64); 2]),
+        ("select (select max(pair_id) from pairs where direct_mm < $1::double)", vec![Some(DataType::Float64)]),
+        ("select 1 from pairs where array_has($1, pair_id)", vec![Some(int_list())]),
+        ("select 1 from pairs where array_has($1::int[], pair_id)", vec![Some(int_list())]),
+        ("select 1 from pairs where pair_id = $1", vec![Some(DataType::Int32)]),
+        ("select $1", vec![None]),
+    ] {
+        let prepared = session.prepare(sql).await.unwrap_or_else(|e| panic!("{sql}: {e}"));
+        assert_eq!(prepared.parameters().expect(sql), expected, "{sql}");
+    }
+}
+
+#[tokio::test]
 async fn tables_are_asked_and_joined() {
     let (_folder, lake) = lake().await;
     let session = Session::new(&lake).expect("a session");

@@ -147,6 +147,7 @@ fn settle(connection: &PostgresConnection, statement: &ClientStatement) -> Resul
             "DISCARD ALL"
         }
         ClientStatement::Discard(_) => "DISCARD",
+        ClientStatement::Unlisten => "UNLISTEN",
         ClientStatement::Show(Some(name)) => {
             let mut rows = texts(&[name], &[vec![settings.get(name)?]])?;
             rows.set_command_tag("SHOW");

@@ -128,7 +128,7 @@ impl PostgresConnection {
             true => SecretKey::Bytes(Bytes::copy_from_slice(&secret)),
             false => SecretKey::I32(i32::from_be_bytes([secret[0], secret[1], secret[2], secret[3]])),
         };
-        let session = self.shared.service.session(client).extended(self.shared.catalog.extend(&self.settings));
+        let session = self.shared.service.session(client).extended(self.shared.catalog.extend(pid, &self.settings));
         let known = (pid, key.to_bytes());
         if self.session.set(Arc::new(session)).is_err() || self.key.set(known.clone()).is_err() {
             return Err(RequestFault::request("this connection is logged in already"));

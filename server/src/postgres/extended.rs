@@ -23,6 +23,7 @@ use pgwire::messages::extendedquery::{
 };
 use pgwire::messages::response::{EmptyQueryResponse, ReadyForQuery, TransactionStatus};
 
+use super::catalog::OID;
 use super::command::{StatementReply, act, columns};
 use super::connection::{NamedObject, PostgresConnection};
 use super::copy;
@@ -65,7 +66,10 @@ impl QueryParser for StatementPlanner {
     fn get_parameter_types(&self, statement: &ClientStatement) -> PgWireResult<Vec<Type>> {
         let kinds = kinds(statement).map_err(|fault| error(&fault))?;
         // If the query does not determine the type, Postgres takes a text.
-        let one = |kind: Option<DataType>| kind.map_or(Ok(Type::TEXT), |kind| into_pg_type(&kind));
+        let one = |kind: Option<DataType>| match kind {
+            Some(DataType::List(element)) if element.name() == OID => Ok(Type::OID_ARRAY),
+            kind => kind.map_or(Ok(Type::TEXT), |kind| into_pg_type(&kind)),
+        };
         kinds.into_iter().map(one).collect()
     }
 

@@ -1,11 +1,11 @@
 //! Functions that Postgres' clients call to learn about the server. Most have one answer here, since there are no
-//! indexes, triggers or comments to speak of.
+//! indexes and triggers to speak of.
 
 use std::collections::HashMap;
 use std::hash::{Hash, Hasher};
 use std::sync::Arc;
 
-use arrow::array::{Array as _, ArrayRef, AsArray as _, Int32Array, StringArray};
+use arrow::array::{Array as _, ArrayRef, AsArray as _, BooleanArray, Int32Array, StringArray};
 use arrow::compute::cast;
 use arrow::datatypes::{DataType, Int32Type};
 use datafusion::common::ScalarValue;
@@ -17,21 +17,18 @@ use datafusion::prelude::create_udf;
 use datafusion_pg_catalog::pg_catalog as pg;
 
 use super::catalog::ROLE;
+use super::fixed_tables::function_name;
+use super::relations;
 use super::settings::{SessionSettings, VERSION};
+use super::text_functions;
 
 /// Functions that are the same in all sessions.
 pub(super) fn fixed() -> Vec<Arc<ScalarUDF>> {
-    let has = pg::has_privilege_udf::create_has_privilege_udf;
     let mut all = vec![
         pg::create_current_database_udf(crate::service::CATALOG),
         pg::create_current_schema_udf(),
         pg::create_current_schemas_udf(),
         pg::create_pg_get_userbyid_udf(),
-        has("has_table_privilege"),
-        has("has_schema_privilege"),
-        has("has_database_privilege"),
-        has("has_any_column_privilege"),
-        pg::create_pg_table_is_visible(),
         pg::format_type::create_format_type_udf(),
         pg::create_session_user_udf(),
         pg::pg_get_expr_udf::create_pg_get_expr_udf(),
@@ -53,8 +50,10 @@ pub(super) fn fixed() -> Vec<Arc<ScalarUDF>> {
         ("user", Some(ROLE.to_owned())),
         ("version", Some(format!("PostgreSQL {VERSION}"))),
         ("pg_client_encoding", Some("UTF8".to_owned())),
-        ("pg_get_function_result", Some(String::new())),
-        ("pg_get_function_identity_arguments", Some(String::new())),
+        ("getdatabaseencoding", Some("UTF8".to_owned())),
+        ("pg_advisory_unlock_all", Some(String::new())),
+        ("pg_describe_object", None),
+        ("pg_get_function_sqlbody", None),
         ("pg_get_functiondef", None),
         ("pg_get_indexdef", None),
         ("pg_get_viewdef", None),
@@ -62,8 +61,6 @@ pub(super) fn fixed() -> Vec<Arc<ScalarUDF>> {
         ("pg_get_ruledef", None),
         ("pg_get_serial_sequence", None),
         ("pg_get_partition_constraintdef", None),
-        ("obj_description", None),
-        ("col_description", None),
         ("shobj_description", None),
         ("pg_tablespace_location", Some(String::new())),
         ("pg_relation_filepath", None),
@@ -82,11 +79,8 @@ pub(super) fn fixed() -> Vec<Arc<ScalarUDF>> {
         "pg_statistics_obj_is_visible",
         "pg_ts_config_is_visible",
         "pg_ts_dict_is_visible",
-        "has_column_privilege",
-        "has_function_privilege",
-        "has_sequence_privilege",
-        "has_type_privilege",
-        "has_language_privilege",
+        "pg_ts_parser_is_visible",
+        "pg_ts_template_is_visible",
         "pg_has_role",
     ];
     all.extend(visible.map(|name| ConstantAnswer::udf(name, ScalarValue::Boolean(Some(true)))));
@@ -95,32 +89,84 @@ pub(super) fn fixed() -> Vec<Arc<ScalarUDF>> {
     let sizes = ["pg_table_size", "pg_indexes_size", "pg_database_size", "pg_tablespace_size"];
     all.extend(sizes.map(|name| ConstantAnswer::udf(name, ScalarValue::Int64(Some(0)))));
     all.push(ConstantAnswer::udf("pg_my_temp_schema", ScalarValue::Int32(Some(0))));
-    all.push(ConstantAnswer::udf("pg_backend_pid", ScalarValue::Int32(Some(0))));
+    all.push(ConstantAnswer::udf("pg_index_column_has_property", ScalarValue::Boolean(None)));
+    // UTF8.
+    all.push(ConstantAnswer::udf("pg_char_to_encoding", ScalarValue::Int32(Some(6))));
     all.push(ScalarUDF::new_from_impl(JsonObject::new()));
+    all.extend(text_functions::all());
     all.into_iter().map(Arc::new).collect()
 }
 
-/// `pg_get_function_arguments(oid)`: what the field's functions take, by their numbers; empty for all others.
-pub(super) fn arguments(of: HashMap<i32, String>) -> Arc<ScalarUDF> {
-    let find = move |args: &[ColumnarValue]| {
-        let numbers = cast(&ColumnarValue::values_to_arrays(args)?[0], &DataType::Int32)?;
-        let numbers = numbers.as_primitive::<Int32Type>().iter();
-        let texts: StringArray = numbers.map(|n| n.map(|n| of.get(&n).map_or("", String::as_str))).collect();
-        Ok(ColumnarValue::Array(Arc::new(texts)))
-    };
-    let name = "pg_get_function_arguments";
-    Arc::new(create_udf(name, vec![DataType::Int32], DataType::Utf8, Volatility::Stable, Arc::new(find)))
+/// What the catalogue's numbers stand for.
+pub(super) struct CatalogNumbers {
+    pub(super) types: HashMap<String, i32>,
+    pub(super) procedures: HashMap<String, i32>,
+    pub(super) relations: HashMap<String, i32>,
+    pub(super) schemas: HashMap<String, i32>,
+    /// Arguments and results of functions.
+    pub(super) signatures: HashMap<i32, (String, String)>,
+    /// Comments by table and column; those of tables by column 0.
+    pub(super) comments: HashMap<(i32, i32), String>,
 }
 
-/// `to_regtype(name)`: the number of a type; NULL if there is none.
-pub(super) fn to_regtype(types: HashMap<String, i32>) -> Arc<ScalarUDF> {
+/// Functions that look something up in the catalogue: NULL if it is not there.
+pub(super) fn lookups(numbers: CatalogNumbers) -> Vec<Arc<ScalarUDF>> {
+    let CatalogNumbers { types, procedures, relations, schemas, signatures, comments } = numbers;
+    let (signatures, comments) = (Arc::new(signatures), Arc::new(comments));
+    let arguments = |name| {
+        let signatures = signatures.clone();
+        text_of_number(name, move |number| Some(signatures.get(&number).map_or("", |(args, _)| args).to_owned()))
+    };
+    let results = signatures.clone();
+    let tables = comments.clone();
+    vec![
+        text_of_number("function_name", |number| function_name(number).map(str::to_owned)),
+        number_of_name("to_regtype", move |name| types.get(standard(name)).copied()),
+        number_of_name("to_regproc", move |name| procedures.get(name.split('(').next().unwrap_or(name)).copied()),
+        number_of_name("to_regclass", move |name| relations.get(name).copied()),
+        number_of_name("to_regnamespace", move |name| schemas.get(name).copied()),
+        arguments("pg_get_function_arguments"),
+        arguments("pg_get_function_identity_arguments"),
+        text_of_number("pg_get_function_result", move |number| {
+            Some(results.get(&number).map_or("", |(_, result)| result).to_owned())
+        }),
+        Arc::new(create_udf(
+            "pg_table_is_visible",
+            vec![DataType::Int32],
+            DataType::Boolean,
+            Volatility::Stable,
+            Arc::new(|args: &[ColumnarValue]| {
+                let numbers = cast(&ColumnarValue::values_to_arrays(args)?[0], &DataType::Int32)?;
+                let visible = numbers.as_primitive::<Int32Type>().iter().map(|n| n.map(relations::is_searched));
+                Ok(ColumnarValue::Array(Arc::new(visible.collect::<BooleanArray>())))
+            }),
+        )),
+        Arc::new(text_functions::comment_of_table("obj_description", tables)),
+        Arc::new(text_functions::comment_of_column("col_description", comments)),
+    ]
+}
+
+// A name as clients write it, with or without quotes and the schema that Postgres always searches.
+fn number_of_name(name: &'static str, find: impl Fn(&str) -> Option<i32> + Send + Sync + 'static) -> Arc<ScalarUDF> {
     let find = move |args: &[ColumnarValue]| {
-        let names = ColumnarValue::values_to_arrays(args)?;
-        let number = |name: Option<&str>| name.and_then(|n| types.get(standard(n.trim())).copied());
-        let numbers: Int32Array = names[0].as_string::<i32>().iter().map(number).collect();
+        let names = cast(&ColumnarValue::values_to_arrays(args)?[0], &DataType::Utf8)?;
+        let number = |name: Option<&str>| {
+            let name = name?.trim().replace('"', "");
+            name.parse().ok().or_else(|| find(name.strip_prefix("pg_catalog.").unwrap_or(&name)))
+        };
+        let numbers: Int32Array = names.as_string::<i32>().iter().map(number).collect();
         Ok(ColumnarValue::Array(Arc::new(numbers)))
     };
-    Arc::new(create_udf("to_regtype", vec![DataType::Utf8], DataType::Int32, Volatility::Stable, Arc::new(find)))
+    Arc::new(create_udf(name, vec![DataType::Utf8], DataType::Int32, Volatility::Stable, Arc::new(find)))
+}
+
+fn text_of_number(name: &'static str, find: impl Fn(i32) -> Option<String> + Send + Sync + 'static) -> Arc<ScalarUDF> {
+    let find = move |args: &[ColumnarValue]| {
+        let numbers = cast(&ColumnarValue::values_to_arrays(args)?[0], &DataType::Int32)?;
+        let texts: StringArray = numbers.as_primitive::<Int32Type>().iter().map(|n| n.and_then(&find)).collect();
+        Ok(ColumnarValue::Array(Arc::new(texts)))
+    };
+    Arc::new(create_udf(name, vec![DataType::Int32], DataType::Utf8, Volatility::Stable, Arc::new(find)))
 }
 
 // `pg_type` has the short names.
@@ -140,10 +186,11 @@ fn standard(name: &str) -> &str {
     }
 }
 
-/// Functions of a session's settings.
-pub(super) fn of_settings(settings: &Arc<SessionSettings>) -> Vec<Arc<ScalarUDF>> {
+/// Functions of the session of this number and these settings.
+pub(super) fn of_session(pid: i32, settings: &Arc<SessionSettings>) -> Vec<Arc<ScalarUDF>> {
     let udf = |kind| Arc::new(ScalarUDF::new_from_impl(OfSettings::new(kind, settings.clone())));
-    vec![udf(SettingFunction::Get), udf(SettingFunction::Set)]
+    let number = ConstantAnswer::udf("pg_backend_pid", ScalarValue::Int32(Some(pid)));
+    vec![udf(SettingFunction::Get), udf(SettingFunction::Set), Arc::new(number)]
 }
 
 /// A function with one answer, whatever it is given.

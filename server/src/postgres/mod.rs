@@ -6,8 +6,10 @@ mod connection;
 mod copy;
 mod cursor;
 mod extended;
+mod fixed_tables;
 mod functions;
 mod information;
+mod relations;
 mod rewrite;
 mod rows;
 mod settings;
@@ -15,6 +17,7 @@ mod simple;
 pub(crate) mod sqlstate;
 mod startup;
 mod statement;
+mod text_functions;
 
 use std::io;
 use std::sync::Arc;

@@ -3,38 +3,101 @@
 use std::ops::ControlFlow;
 
 use datafusion::sql::sqlparser::ast::{
-    BinaryOperator, Expr, Function, FunctionArg, FunctionArgExpr, FunctionArgumentList, FunctionArguments, GroupByExpr,
-    Ident, ObjectName, ObjectNamePart, Query, SelectItem, SetExpr, Statement, TableFactor, Value, ValueWithSpan,
-    VisitMut as _, VisitorMut,
+    AccessExpr, BinaryOperator, Expr, Function, FunctionArg, FunctionArgExpr, FunctionArgumentList, FunctionArguments,
+    GroupByExpr, Ident, ObjectName, ObjectNamePart, Query, Select, SelectItem, SetExpr, Statement, TableFactor, Value,
+    ValueWithSpan, VisitMut, VisitorMut,
 };
 use datafusion::sql::sqlparser::dialect::PostgreSqlDialect;
 use datafusion::sql::sqlparser::parser::Parser;
 use pgwire::api::Type;
 
-/// Columns of `pg_type` that name a function, as texts; Postgres has their numbers there, and 0 for none.
+/// Columns of `pg_type` that name a function by its number.
 const FUNCTIONS: [&str; 6] = ["typinput", "typoutput", "typreceive", "typsend", "typmodin", "typmodout"];
 /// Aggregates that a subquery may have already.
 const AGGREGATES: [&str; 8] = ["array_agg", "avg", "bool_or", "count", "max", "min", "string_agg", "sum"];
 /// Tables about what no column of the lake has.
 const NOTHING: [&str; 3] = ["pg_attrdef", "pg_collation", "pg_sequence"];
-/// The value of such a column that names no function.
-const NONE: &str = "-";
+/// What `datafusion-pg-catalog` makes of a name that is cast to a number, before and after the name, and the function
+/// that does the same without a subquery, and for more names.
+const CASTS: [(&str, &str, &str); 4] = [
+    (
+        "SELECT c.oid FROM pg_catalog.pg_class c JOIN pg_catalog.pg_namespace n ON c.relnamespace = n.oid CROSS JOIN \
+         (SELECT parse_ident(",
+        "::TEXT) AS parts)",
+        "to_regclass",
+    ),
+    ("SELECT oid FROM pg_catalog.pg_namespace WHERE nspname = ", "", "to_regnamespace"),
+    ("SELECT oid FROM pg_catalog.pg_type WHERE typname = ", "", "to_regtype"),
+    ("SELECT oid FROM pg_catalog.pg_proc WHERE proname = ", "", "to_regproc"),
+];
+/// Begins what tells columns of one name apart; clients do not see it.
+pub(super) const REPEATED: char = '\u{1}';
 
 /// Tables of `pg_catalog` that are found without its name, beside those that `datafusion-pg-catalog` knows.
-pub(super) const OWN_TABLES: [&str; 2] = ["pg_indexes", "pg_timezone_names"];
+const OWN_TABLES: [&str; 13] = [
+    "pg_group",
+    "pg_indexes",
+    "pg_locks",
+    "pg_policies",
+    "pg_sequences",
+    "pg_shadow",
+    "pg_stat_activity",
+    "pg_stat_ssl",
+    "pg_timezone_names",
+    "pg_ts_config_map",
+    "pg_user",
+    "pg_user_mappings",
+    "pg_views",
+];
 const PG_CATALOG: &str = "pg_catalog";
+
+/// The name by which asyncpg's query for types is known, and a query with the same answer for types that are no domains,
+/// ranges or rows: DataFusion does not end its recursion.
+const TYPE_TREE: &str = "typeinfo_tree";
+const TYPES: &str = "SELECT t.oid, n.nspname AS ns, t.typname AS name, t.typtype AS kind, CAST(NULL AS oid) AS basetype, \
+     t.typelem AS elemtype, e.typdelim AS elemdelim, CAST(NULL AS oid) AS range_subtype, \
+     CAST(NULL AS TEXT) AS attrtypoids, CAST(NULL AS TEXT) AS attrnames, \
+     CASE WHEN array_contains($1::oid[], t.oid) THEN 0 ELSE 1 END AS depth, CAST(NULL AS TEXT) AS basetype_name, \
+     e.typname AS elemtype_name, CAST(NULL AS TEXT) AS range_subtype_name \
+     FROM pg_catalog.pg_type t JOIN pg_catalog.pg_namespace n ON n.oid = t.typnamespace \
+     LEFT JOIN pg_catalog.pg_type e ON e.oid = t.typelem WHERE array_contains($1::oid[], t.oid) \
+     OR t.oid IN (SELECT o.typelem FROM pg_catalog.pg_type o WHERE array_contains($1::oid[], o.oid)) ORDER BY depth DESC";
 
 /// Adapts a statement; `types` are those that its client gives its placeholders.
 pub(super) fn rewrite(mut statement: Statement, types: &[Option<Type>]) -> Statement {
+    if let Statement::Query(query) = &statement
+        && let Some(with) = &query.with
+        && with.cte_tables.first().is_some_and(|table| table.alias.name.value == TYPE_TREE)
+        && let Some(known) = Parser::parse_sql(&PostgreSqlDialect {}, TYPES).ok().and_then(|mut all| all.pop())
+    {
+        return known;
+    }
     // It never breaks off.
     let _ = statement.visit(&mut StatementAdapter(types));
+    type_integers(&mut statement);
     statement
+}
+
+// An integer alone is of 32 bits in Postgres.
+fn type_integers(statement: &mut Statement) {
+    let Statement::Query(query) = statement else { return };
+    let (None, SetExpr::Select(select)) = (&query.with, query.body.as_mut()) else { return };
+    for item in &mut select.projection {
+        let (SelectItem::UnnamedExpr(expr) | SelectItem::ExprWithAlias { expr, .. }) = item else { continue };
+        if let Expr::Value(ValueWithSpan { value: Value::Number(number, _), .. }) = expr
+            && number.parse::<i32>().is_ok()
+            && let Some(typed) = parsed(&format!("CAST({number} AS INT)"))
+        {
+            *expr = typed;
+        }
+    }
 }
 
 struct StatementAdapter<'a>(&'a [Option<Type>]);
 
 impl StatementAdapter<'_> {
-    // `x = ANY($1)` came here as array_contains($1, x). A client that tells no type sends the array as a text.
+    // `x = ANY($1)` came here as array_contains($1, x). If a client tells that it is a text, it sends
+    // the array as one.
     fn any_of_text(&self, expr: &mut Expr) -> Option<()> {
         let Expr::Function(Function { name, args: FunctionArguments::List(args), .. }) = expr else { return None };
         if name.to_string() != "array_contains" {
@@ -44,7 +107,7 @@ impl StatementAdapter<'_> {
         let Expr::Value(ValueWithSpan { value: Value::Placeholder(placeholder), .. }) = array else { return None };
         let number: usize = placeholder.strip_prefix('$')?.parse().ok()?;
         let told = self.0.get(number.checked_sub(1)?).and_then(Option::as_ref);
-        if told.is_none_or(|told| matches!(*told, Type::UNKNOWN | Type::TEXT | Type::VARCHAR)) {
+        if told.is_some_and(|told| matches!(*told, Type::TEXT | Type::VARCHAR)) {
             let unquoted = format!("replace(replace(btrim({placeholder}, '{{}}'), '\"', ''), ', ', ',')");
             let sql = format!("string_to_array({unquoted}, ',')");
             *array = parsed(&sql)?;
@@ -69,7 +132,17 @@ impl VisitorMut for StatementAdapter<'_> {
         if is_whole_table(expr) {
             *expr = Expr::value(Value::Boolean(true));
         }
-        if let Some(better) = array_of_query(expr).or_else(|| subscripts(expr)) {
+        if let Some(better) = array_of_query(expr)
+            .or_else(|| subscripts(expr))
+            .or_else(|| expanded(expr))
+            .or_else(|| number_of_name(expr))
+            .or_else(|| case_of_truth(expr))
+            .or_else(|| time_of_text(expr))
+            .or_else(|| name_of_function(expr))
+            .or_else(|| number_of_text(expr))
+            .or_else(|| field_of_row(expr))
+            .or_else(|| compared_with_text(expr))
+        {
             *expr = better;
         }
         if let Expr::Subquery(query) = expr
@@ -81,14 +154,264 @@ impl VisitorMut for StatementAdapter<'_> {
             one_row(query);
         }
         self.any_of_text(expr);
-        if let Expr::BinaryOp { left, op: BinaryOperator::Eq | BinaryOperator::NotEq, right } = expr
-            && is_function_column(left)
-            && matches!(right.as_ref(), Expr::Value(ValueWithSpan { value: Value::Number(n, _), .. }) if n == "0")
-        {
-            **right = Expr::value(Value::SingleQuotedString(NONE.to_owned()));
+        escape_by_backslash(expr);
+        ControlFlow::Continue(())
+    }
+
+    fn pre_visit_select(&mut self, select: &mut Select) -> ControlFlow<()> {
+        for item in &mut select.projection {
+            if let SelectItem::UnnamedExpr(expr) | SelectItem::ExprWithAlias { expr, .. } = item {
+                // It never breaks off.
+                let _ = VisitMut::visit(expr, &mut ExistsAdapter { depth: 0 });
+            }
         }
         ControlFlow::Continue(())
     }
+
+    // What was adapted may have become equal.
+    fn post_visit_select(&mut self, select: &mut Select) -> ControlFlow<()> {
+        name_apart(&mut select.projection);
+        ControlFlow::Continue(())
+    }
+}
+
+// DataFusion cannot compute EXISTS outside of WHERE, but can count.
+struct ExistsAdapter {
+    /// Queries around what is visited, whose own WHERE may have it.
+    depth: usize,
+}
+
+impl VisitorMut for ExistsAdapter {
+    type Break = ();
+
+    fn pre_visit_query(&mut self, _: &mut Query) -> ControlFlow<()> {
+        self.depth += 1;
+        ControlFlow::Continue(())
+    }
+
+    fn post_visit_query(&mut self, _: &mut Query) -> ControlFlow<()> {
+        self.depth -= 1;
+        ControlFlow::Continue(())
+    }
+
+    fn pre_visit_expr(&mut self, expr: &mut Expr) -> ControlFlow<()> {
+        if self.depth == 0
+            && let Expr::Exists { subquery, negated } = expr
+            && let SetExpr::Select(select) = subquery.body.as_mut()
+            && matches!(&select.group_by, GroupByExpr::Expressions(by, _) if by.is_empty())
+            && select.having.is_none()
+        {
+            let compared = if *negated { "=" } else { ">" };
+            if let Some(count) = parsed("count(*)") {
+                select.projection = vec![SelectItem::UnnamedExpr(count)];
+                (select.distinct, subquery.order_by, subquery.limit_clause) = (None, None, None);
+                if let Some(counted) = parsed(&format!("({subquery}) {compared} 0")) {
+                    *expr = counted;
+                }
+            }
+        }
+        ControlFlow::Continue(())
+    }
+}
+
+// Postgres allows columns of one name.
+fn name_apart(items: &mut [SelectItem]) {
+    let mut seen: Vec<String> = Vec::new();
+    let names: Vec<_> = items.iter().map(item_name).collect();
+    for (at, (item, (key, name))) in items.iter_mut().zip(&names).enumerate() {
+        let Some(key) = key else { continue };
+        let repeated = seen.contains(key);
+        let repeats = repeated || names.iter().skip(at + 1).any(|(other, _)| other.as_ref() == Some(key));
+        if repeats {
+            let alias = match repeated {
+                true => format!("{name}{REPEATED}{at}"),
+                false => name.clone(),
+            };
+            let alias = Ident::with_quote('"', alias);
+            match item {
+                SelectItem::UnnamedExpr(expr) => *item = SelectItem::ExprWithAlias { expr: expr.clone(), alias },
+                SelectItem::ExprWithAlias { alias: own, .. } => *own = alias,
+                _ => {}
+            }
+        }
+        seen.push(key.clone());
+    }
+}
+
+// What DataFusion tells a column by, and its name in Postgres.
+fn item_name(item: &SelectItem) -> (Option<String>, String) {
+    match item {
+        SelectItem::ExprWithAlias { alias, .. } => {
+            let name = match alias.quote_style {
+                Some(_) => alias.value.clone(),
+                None => alias.value.to_lowercase(),
+            };
+            (Some(name.clone()), name)
+        }
+        SelectItem::UnnamedExpr(expr) => (Some(expr.to_string().to_lowercase()), column_name(expr)),
+        _ => (None, String::new()),
+    }
+}
+
+fn column_name(expr: &Expr) -> String {
+    match expr {
+        Expr::Identifier(name) => name.value.clone(),
+        Expr::CompoundIdentifier(parts) => parts.last().map(|name| name.value.clone()).unwrap_or_default(),
+        Expr::Function(function) => {
+            function.name.0.last().and_then(|n| n.as_ident()).map(|n| n.value.to_lowercase()).unwrap_or_default()
+        }
+        Expr::Cast { expr, .. } | Expr::Nested(expr) => column_name(expr),
+        _ => "?column?".to_owned(),
+    }
+}
+
+// LIKE with an escape character of its own.
+fn escape_by_backslash(expr: &mut Expr) {
+    let (Expr::Like { pattern, escape_char, .. } | Expr::ILike { pattern, escape_char, .. }) = expr else { return };
+    let Some(ValueWithSpan { value: Value::SingleQuotedString(escape), .. }) = escape_char else { return };
+    if escape == "\\" {
+        return;
+    }
+    if let Some(escaped) = parsed(&format!("like_escape({pattern}, '{}')", escape.replace('\'', "''"))) {
+        (**pattern, *escape_char) = (escaped, None);
+    }
+}
+
+// _pg_expandarray(list) gives a row for each element of a list.
+fn expanded(expr: &Expr) -> Option<Expr> {
+    let Expr::Function(function @ Function { name, .. }) = expr else { return None };
+    let asked = name.0.last()?.as_ident()?.value == "_pg_expandarray";
+    // The function within is in capitals, so that it is not adapted again.
+    asked.then(|| {
+        call(
+            "unnest",
+            Expr::Function(Function {
+                name: ObjectName::from(vec![Ident::new("_PG_EXPANDARRAY")]),
+                ..function.clone()
+            }),
+            function,
+        )
+    })
+}
+
+// 'name'::regclass and its like.
+fn number_of_name(expr: &Expr) -> Option<Expr> {
+    let Expr::Subquery(query) = expr else { return None };
+    let text = query.to_string();
+    let text = text.strip_suffix(" LIMIT 1").unwrap_or(&text);
+    CASTS.iter().find_map(|(before, after, function)| {
+        let rest = text.strip_prefix(before)?;
+        let name = match after.is_empty() {
+            true => rest,
+            false => rest.split_once(after)?.0,
+        };
+        let is_value = name.starts_with(['\'', '$']);
+        is_value.then(|| parsed(&format!("{function}({name})"))).flatten()
+    })
+}
+
+// A text that is computed, or the name of a function with its arguments, as the number of what it names.
+fn number_of_text(expr: &Expr) -> Option<Expr> {
+    let Expr::Cast { expr: inner, data_type, .. } = expr else { return None };
+    let kind = data_type.to_string().to_lowercase();
+    let is_literal = matches!(inner.as_ref(), Expr::Value(ValueWithSpan { value: Value::SingleQuotedString(_), .. }));
+    let function = match kind.strip_prefix("pg_catalog.").unwrap_or(&kind) {
+        "regprocedure" if is_literal => "to_regproc",
+        "regclass" if is_text(inner) => "to_regclass",
+        _ => return None,
+    };
+    parsed(&format!("{function}({inner})"))
+}
+
+fn is_text(expr: &Expr) -> bool {
+    match expr {
+        Expr::Function(function) => {
+            ["format", "quote_ident", "concat"].contains(&function.name.to_string().to_lowercase().as_str())
+        }
+        Expr::BinaryOp { op: BinaryOperator::StringConcat, .. } => true,
+        Expr::Nested(inner) => is_text(inner),
+        _ => false,
+    }
+}
+
+// (row).field
+fn field_of_row(expr: &Expr) -> Option<Expr> {
+    let Expr::CompoundFieldAccess { root, access_chain } = expr else { return None };
+    let [AccessExpr::Dot(Expr::Identifier(field))] = &access_chain[..] else { return None };
+    parsed(&format!("get_field({root}, '{}')", field.value.replace('\'', "''")))
+}
+
+// Truths and lists of the catalogue that are compared with texts.
+fn compared_with_text(expr: &Expr) -> Option<Expr> {
+    let Expr::BinaryOp { left, op: op @ (BinaryOperator::Eq | BinaryOperator::NotEq), right } = expr else {
+        return None;
+    };
+    let Expr::Value(ValueWithSpan { value: Value::SingleQuotedString(text), .. }) = right.as_ref() else { return None };
+    let name = match left.as_ref() {
+        Expr::Identifier(name) => name,
+        Expr::CompoundIdentifier(parts) => parts.last()?,
+        _ => return None,
+    };
+    match (name.value.as_str(), text.as_str()) {
+        ("polroles", list) => parsed(&format!("array_to_string({left}, ',') {op} '{}'", list.trim_matches(['{', '}']))),
+        (truth, "t" | "f") if truth.starts_with("indis") => parsed(&format!("{left} {op} {}", text == "t")),
+        _ => None,
+    }
+}
+
+// A function's number as a text is its name.
+fn name_of_function(expr: &Expr) -> Option<Expr> {
+    let Expr::Cast { expr: inner, data_type, .. } = expr else { return None };
+    let name = match inner.as_ref() {
+        Expr::Identifier(name) => name,
+        Expr::CompoundIdentifier(parts) => parts.last()?,
+        _ => return None,
+    };
+    let kind = data_type.to_string().to_lowercase();
+    let is_text = kind.ends_with("text") || kind.ends_with("varchar");
+    let names_function = FUNCTIONS.iter().any(|column| name.value.eq_ignore_ascii_case(column));
+    (is_text && names_function).then(|| parsed(&format!("function_name({inner})"))).flatten()
+}
+
+// to_timestamp(text, 'YYYY-MM-DD'), whose letters are others in DataFusion.
+fn time_of_text(expr: &Expr) -> Option<Expr> {
+    let Expr::Function(Function { name, args: FunctionArguments::List(args), .. }) = expr else { return None };
+    let [text, FunctionArg::Unnamed(FunctionArgExpr::Expr(Expr::Value(format)))] = &args.args[..] else { return None };
+    let Value::SingleQuotedString(format) = &format.value else { return None };
+    if !name.to_string().eq_ignore_ascii_case("to_timestamp") || format.contains('%') {
+        return None;
+    }
+    let letters = [
+        (".US", "%.f"),
+        (".MS", "%.f"),
+        ("YYYY", "%Y"),
+        ("MM", "%m"),
+        ("DD", "%d"),
+        ("HH24", "%H"),
+        ("MI", "%M"),
+        ("SS", "%S"),
+    ];
+    let format = letters.iter().fold(format.clone(), |format, (from, to)| format.replace(from, to));
+    parsed(&format!("to_timestamp({text}, '{}')", format.replace('\'', "''")))
+}
+
+// CASE of a truth, WHEN 't'.
+fn case_of_truth(expr: &Expr) -> Option<Expr> {
+    let Expr::Case { operand: Some(operand), conditions, .. } = expr else { return None };
+    let is_letter = |expr: &Expr| {
+        matches!(expr, Expr::Value(ValueWithSpan { value: Value::SingleQuotedString(text), .. })
+            if text == "t" || text == "f")
+    };
+    let is_column = matches!(operand.as_ref(), Expr::Identifier(_) | Expr::CompoundIdentifier(_));
+    if !is_column || !conditions.iter().all(|when| is_letter(&when.condition)) {
+        return None;
+    }
+    let letter = parsed(&format!("replace(replace(CAST({operand} AS TEXT), 'true', 't'), 'false', 'f')"))?;
+    let mut adapted = expr.clone();
+    if let Expr::Case { operand, .. } = &mut adapted {
+        *operand = Some(Box::new(letter));
+    }
+    Some(adapted)
 }
 
 // DuckDB reads a table by ranges of `ctid`; if `pg_class` reports one page, there is one range, of all rows.
@@ -99,18 +422,6 @@ fn is_whole_table(expr: &Expr) -> bool {
     };
     matches!(expr, Expr::Between { expr, negated: false, low, high }
         if expr.to_string() == "ctid" && is_place(low, "'(0,0)'") && is_place(high, "'(4294967295,0)'"))
-}
-
-fn is_function_column(expr: &Expr) -> bool {
-    let name = match expr {
-        Expr::Identifier(name) => name,
-        Expr::CompoundIdentifier(parts) => match parts.last() {
-            Some(name) => name,
-            None => return false,
-        },
-        _ => return false,
-    };
-    FUNCTIONS.iter().any(|f| name.value.eq_ignore_ascii_case(f))
 }
 
 // ARRAY(SELECT x ...) is (SELECT array_agg(x) ...), but for the order.
@@ -132,7 +443,7 @@ fn array_of_query(expr: &Expr) -> Option<Expr> {
         _ => false,
     };
     if select.from.iter().any(|from| unnests(&from.relation)) {
-        return Some(Expr::value(Value::Null));
+        return parsed("CAST(NULL AS TEXT[])");
     }
     let mut select = select.clone();
     select.projection = vec![SelectItem::UnnamedExpr(call("array_agg", item.clone(), function))];
@@ -219,7 +530,8 @@ mod tests {
 
     fn check(sql: &str, expected: &str) {
         let mut statements = Parser::parse_sql(&PostgreSqlDialect {}, sql).expect(sql);
-        let adapted = rewrite(statements.pop().expect("a statement"), &[None, Some(Type::TEXT_ARRAY)]).to_string();
+        let adapted =
+            rewrite(statements.pop().expect("a statement"), &[Some(Type::TEXT), Some(Type::TEXT_ARRAY)]).to_string();
         assert_eq!(adapted, expected);
     }
 
@@ -229,8 +541,31 @@ mod tests {
             "SELECT ARRAY(SELECT b.n FROM m b WHERE b.i = r.i ORDER BY 1) FROM r",
             "SELECT (SELECT array_agg(b.n) FROM m b WHERE b.i = r.i) FROM r",
         );
-        check("SELECT 1 FROM t WHERE typreceive != 0", "SELECT 1 FROM t WHERE typreceive <> '-'");
-        check("SELECT 1 FROM t WHERE t.typsend = 0", "SELECT 1 FROM t WHERE t.typsend = '-'");
+        check(
+            "SELECT x FROM t WHERE x LIKE 'pg/_%' ESCAPE '/'",
+            "SELECT x FROM t WHERE x LIKE like_escape('pg/_%', '/')",
+        );
+        check("SELECT x FROM t WHERE x LIKE $1 ESCAPE '\\'", "SELECT x FROM t WHERE x LIKE $1 ESCAPE '\\'");
+        check("SELECT 1, 1", "SELECT CAST(1 AS INT) AS \"?column?\", CAST(1 AS INT) AS \"?column?\u{1}1\"");
+        check("SELECT a.x, b.x, y FROM a, b", "SELECT a.x, b.x, y FROM a, b");
+        check(
+            "SELECT EXISTS(SELECT 1 FROM k WHERE k.i = t.i LIMIT 1) AS e FROM t",
+            "SELECT (SELECT count(*) FROM k WHERE k.i = t.i) > 0 AS e FROM t",
+        );
+        check("SELECT x FROM t WHERE EXISTS (SELECT 1 FROM k)", "SELECT x FROM t WHERE EXISTS (SELECT 1 FROM k)");
+        check(
+            "SELECT (SELECT oid FROM pg_catalog.pg_type WHERE typname = 'integer' LIMIT 1)",
+            "SELECT to_regtype('integer')",
+        );
+        check("SELECT to_timestamp(x, 'YYYY-MM-DD HH24:MI:SS.US')", "SELECT to_timestamp(x, '%Y-%m-%d %H:%M:%S%.f')");
+        check("WITH RECURSIVE typeinfo_tree(oid) AS (SELECT 1) SELECT * FROM typeinfo_tree", &{
+            let known = Parser::parse_sql(&PostgreSqlDialect {}, TYPES).expect("SQL");
+            known[0].to_string()
+        });
+        check(
+            "SELECT CASE x WHEN 't' THEN 1 ELSE 0 END",
+            "SELECT CASE replace(replace(CAST(x AS TEXT), 'true', 't'), 'false', 'f') WHEN 't' THEN 1 ELSE 0 END",
+        );
         check("SELECT (SELECT d.x FROM pg_catalog.pg_attrdef d WHERE d.i = a.i LIMIT 1) FROM a", "SELECT NULL FROM a");
         check(
             "SELECT (SELECT count(*) FROM pg_catalog.pg_attrdef) FROM a",
@@ -242,20 +577,26 @@ mod tests {
         );
         check("SELECT (SELECT d.x FROM d) FROM a", "SELECT (SELECT d.x FROM d) FROM a");
         check("SELECT (SELECT count(*) FROM pg_class) FROM a", "SELECT (SELECT count(*) FROM pg_class) FROM a");
-        check("SELECT 1 FROM pg_indexes", "SELECT 1 FROM pg_catalog.pg_indexes");
+        check("SELECT x FROM pg_indexes", "SELECT x FROM pg_catalog.pg_indexes");
         check(
-            "SELECT array_contains($1, x), array_contains($2, x) FROM t",
-            "SELECT array_contains(string_to_array(replace(replace(btrim($1, '{}'), '\"', ''), ', ', ','), ','), x), array_contains($2, x) FROM t",
+            "SELECT array_contains($1, x), array_contains($2, x), array_contains($3, x) FROM t",
+            "SELECT array_contains(string_to_array(replace(replace(btrim($1, '{}'), '\"', ''), ', ', ','), ','), x), array_contains($2, x), array_contains($3, x) FROM t",
         );
         check(
-            "SELECT 1 FROM t WHERE ctid BETWEEN '(0,0)'::tid AND '(4294967295,0)'::tid AND n < 1",
-            "SELECT 1 FROM t WHERE true AND n < 1",
+            "SELECT x FROM t WHERE ctid BETWEEN '(0,0)'::tid AND '(4294967295,0)'::tid AND n < 1",
+            "SELECT x FROM t WHERE true AND n < 1",
         );
         check(
-            "SELECT 1 FROM t WHERE ctid BETWEEN '(1,0)'::tid AND '(4294967295,0)'::tid",
-            "SELECT 1 FROM t WHERE ctid BETWEEN '(1,0)'::tid AND '(4294967295,0)'::tid",
+            "SELECT x FROM t WHERE ctid BETWEEN '(1,0)'::tid AND '(4294967295,0)'::tid",
+            "SELECT x FROM t WHERE ctid BETWEEN '(1,0)'::tid AND '(4294967295,0)'::tid",
         );
-        check("SELECT array(SELECT 'a' || x FROM unnest(t.o) x) FROM t", "SELECT NULL FROM t");
+        check("SELECT array(SELECT 'a' || x FROM unnest(t.o) x) FROM t", "SELECT CAST(NULL AS TEXT[]) FROM t");
+        check("SELECT (keys).n FROM t", "SELECT get_field((keys), 'n') FROM t");
+        check(
+            "SELECT x FROM t WHERE i.indisprimary = 't' AND x = 't'",
+            "SELECT x FROM t WHERE i.indisprimary = true AND x = 't'",
+        );
+        check("SELECT CAST(format('%I', x) AS REGCLASS) FROM t", "SELECT to_regclass(format('%I', x)) FROM t");
         check(
             "SELECT unnest(i.k), generate_subscripts(i.k, $1::INT) AS n FROM i",
             "SELECT unnest(i.k), unnest(generate_series(1, array_length(i.k, $1::INT))) AS n FROM i",

@@ -2,9 +2,11 @@
 
 use std::sync::Arc;
 
-use arrow::datatypes::{Schema, SchemaRef};
+use arrow::array::{Array as _, ArrayRef, AsArray as _, StringArray};
+use arrow::compute::cast;
+use arrow::datatypes::{DataType, Field, FieldRef, Int32Type, Schema, SchemaRef};
 use arrow::record_batch::RecordBatch;
-use arrow_pg::datatypes::arrow_schema_to_pg_fields;
+use arrow_pg::datatypes::{PG_OID_ALIAS_KEY, arrow_schema_to_pg_fields};
 use arrow_pg::encode_recordbatch;
 use echolake_query::Error as QueryError;
 use futures::{Stream, TryStreamExt as _, stream};
@@ -14,6 +16,8 @@ use pgwire::api::results::{DataRowEncoder, FieldFormat, FieldInfo, QueryResponse
 use pgwire::error::{PgWireError, PgWireResult};
 use pgwire::messages::data::DataRow;
 
+use super::fixed_tables::{VECTOR_KEY, function_name};
+use super::rewrite::REPEATED;
 use super::sqlstate::error;
 use crate::fault::RequestFault;
 use crate::running::{AnswerEncoder, RunningQuery};
@@ -26,13 +30,36 @@ pub(super) fn fields(schema: &Schema, format: &Format) -> Result<Arc<Vec<FieldIn
     {
         return Err(RequestFault::request(format!("{} formats for {count} columns", codes.len())));
     }
-    let fields = arrow_schema_to_pg_fields(schema, format, None).map_err(|e| encoding(&e))?;
-    // A column of nothing but NULL is a text to Postgres' clients.
-    let settled = |field: FieldInfo| match *field.datatype() {
-        Type::UNKNOWN => FieldInfo::new(field.name().to_owned(), None, None, Type::TEXT, field.format()),
-        _ => field,
+    // A cast keeps the metadata of what it casts: numbers alone are those of the catalogue.
+    let own = |field: &FieldRef| match field.data_type() {
+        DataType::List(_) if field.metadata().contains_key(VECTOR_KEY) => field.clone(),
+        DataType::Int32 | DataType::Utf8 if !is_cast_number(field) => field.clone(),
+        kind => Arc::new(Field::new(field.name(), kind.clone(), field.is_nullable())),
     };
-    Ok(Arc::new(fields.into_iter().map(settled).collect()))
+    let schema = Schema::new(schema.fields().iter().map(own).collect::<Vec<_>>());
+    let fields = arrow_schema_to_pg_fields(&schema, format, None).map_err(|e| encoding(&e))?;
+    let settled = |(field, own): (FieldInfo, &FieldRef)| {
+        // A column of nothing but NULL is a text to Postgres' clients.
+        let kind = match *field.datatype() {
+            Type::UNKNOWN => Type::TEXT,
+            _ if own.metadata().contains_key(VECTOR_KEY) && field.format() == FieldFormat::Text => Type::TEXT,
+            ref kind => kind.clone(),
+        };
+        let name = field.name().split(REPEATED).next().unwrap_or_default();
+        FieldInfo::new(name.to_owned(), None, None, kind, field.format())
+    };
+    Ok(Arc::new(fields.into_iter().zip(schema.fields()).map(settled).collect()))
+}
+
+// The numbers of a list, with spaces between them.
+fn spaced(list: ArrayRef) -> Option<String> {
+    let numbers = cast(&list, &DataType::Utf8).ok()?;
+    let numbers: Vec<_> = numbers.as_string::<i32>().iter().flatten().collect();
+    Some(numbers.join(" "))
+}
+
+fn is_cast_number(field: &FieldRef) -> bool {
+    *field.data_type() == DataType::Utf8 && field.metadata().contains_key(PG_OID_ALIAS_KEY)
 }
 
 /// The fault for a value that cannot be sent to a Postgres client.
@@ -55,8 +82,43 @@ impl RowEncoder {
 
     /// The rows of a batch.
     pub(super) fn encode(&self, batch: RecordBatch) -> Result<Vec<DataRow>, RequestFault> {
+        let batch = self.write_texts(batch);
         let rows: PgWireResult<Vec<_>> = encode_recordbatch(self.0.clone(), batch).collect();
         rows.map_err(|e| encoding(&e))
+    }
+}
+
+impl RowEncoder {
+    // In texts a function's number is its name, and some lists have no brackets.
+    fn write_texts(&self, batch: RecordBatch) -> RecordBatch {
+        let is_written = |(field, column): (&FieldInfo, &ArrayRef)| {
+            let is_list = matches!(column.data_type(), DataType::List(_)) && *field.datatype() == Type::TEXT;
+            field.format() == FieldFormat::Text && (is_list || *field.datatype() == Type::REGPROC)
+        };
+        if !self.0.iter().zip(batch.columns()).any(is_written) {
+            return batch;
+        }
+        let column = |(field, column): (&FieldInfo, &ArrayRef)| -> ArrayRef {
+            if !is_written((field, column)) {
+                return column.clone();
+            }
+            match (column.as_primitive_opt::<Int32Type>(), column.as_list_opt::<i32>()) {
+                (Some(numbers), _) => {
+                    let names = numbers.iter().map(|number| function_name(number?));
+                    Arc::new(names.collect::<StringArray>())
+                }
+                (None, Some(lists)) => {
+                    Arc::new(lists.iter().map(|list| list.and_then(spaced)).collect::<StringArray>())
+                }
+                (None, None) => column.clone(),
+            }
+        };
+        let columns: Vec<_> = self.0.iter().zip(batch.columns()).map(column).collect();
+        let own = batch.schema();
+        let typed = own.fields().iter().zip(&columns);
+        let fields = typed.map(|(field, column)| Field::new(field.name(), column.data_type().clone(), true));
+        let schema = Arc::new(Schema::new(fields.collect::<Vec<_>>()));
+        RecordBatch::try_new(schema, columns).unwrap_or(batch)
     }
 }
 

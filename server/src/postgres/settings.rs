@@ -29,7 +29,7 @@ const ON: &[&str] = &["on", "true", "yes", "1"];
 const ISOLATION: &[&str] = &["serializable", "repeatable read", "read committed", "read uncommitted"];
 
 /// Each setting in lower case, as it is shown, what it is at first, and what may be done.
-const KNOWN: [(&str, &str, AllowedChange); 37] = [
+const KNOWN: [(&str, &str, AllowedChange); 38] = [
     ("application_name", "", AllowedChange::Set),
     ("backslash_quote", "safe_encoding", AllowedChange::Read),
     ("bytea_output", "hex", AllowedChange::Keep(&["hex"])),
@@ -37,6 +37,7 @@ const KNOWN: [(&str, &str, AllowedChange); 37] = [
     ("client_encoding", "UTF8", AllowedChange::Keep(&["utf8", "utf-8", "unicode"])),
     ("client_min_messages", "notice", AllowedChange::Set),
     ("datestyle", "ISO, YMD", AllowedChange::Set),
+    ("default_table_access_method", "heap", AllowedChange::Read),
     ("default_tablespace", "", AllowedChange::Set),
     ("default_transaction_isolation", "repeatable read", AllowedChange::Keep(ISOLATION)),
     ("default_transaction_read_only", "on", AllowedChange::Keep(ON)),

@@ -68,6 +68,8 @@ pub(super) enum ClientStatement {
     Show(Option<String>),
     Discard(DiscardObject),
     Deallocate(Option<String>),
+    /// Nobody can LISTEN.
+    Unlisten,
 }
 
 /// Parses the statements of a text, whose placeholders have these types if the client gives them.
@@ -113,6 +115,7 @@ pub(super) async fn plan(session: &Session, sql: &Arc<str>, parsed: Parsed) -> R
         }),
         Sql::ShowVariable { variable } => ClientStatement::Show(shown(&variable)),
         Sql::Discard { object_type } => ClientStatement::Discard(object_type),
+        Sql::UNLISTEN { .. } => ClientStatement::Unlisten,
         Sql::Deallocate { name, .. } => ClientStatement::Deallocate(unless_all(&name)),
         Sql::Declare { stmts } => {
             let (name, held, asked) = declared(stmts)?;
