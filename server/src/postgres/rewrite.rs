@@ -84,12 +84,25 @@ fn type_integers(statement: &mut Statement) {
     let (None, SetExpr::Select(select)) = (&query.with, query.body.as_mut()) else { return };
     for item in &mut select.projection {
         let (SelectItem::UnnamedExpr(expr) | SelectItem::ExprWithAlias { expr, .. }) = item else { continue };
-        if let Expr::Value(ValueWithSpan { value: Value::Number(number, _), .. }) = expr
-            && number.parse::<i32>().is_ok()
-            && let Some(typed) = parsed(&format!("CAST({number} AS INT)"))
-        {
-            *expr = typed;
-        }
+        type_integer(expr);
+    }
+}
+
+fn type_integer(expr: &mut Expr) {
+    if let Expr::Value(ValueWithSpan { value: Value::Number(number, _), .. }) = expr
+        && number.parse::<i32>().is_ok()
+        && let Some(typed) = parsed(&format!("CAST({number} AS INT)"))
+    {
+        *expr = typed;
+    }
+}
+
+fn type_of_integer(expr: &mut Expr) {
+    if let Expr::Function(Function { name, args: FunctionArguments::List(args), .. }) = expr
+        && name.to_string().eq_ignore_ascii_case("pg_typeof")
+        && let [FunctionArg::Unnamed(FunctionArgExpr::Expr(arg))] = &mut args.args[..]
+    {
+        type_integer(arg);
     }
 }
 
@@ -155,6 +168,7 @@ impl VisitorMut for StatementAdapter<'_> {
         }
         self.any_of_text(expr);
         escape_by_backslash(expr);
+        type_of_integer(expr);
         ControlFlow::Continue(())
     }
 
