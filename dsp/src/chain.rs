@@ -7,6 +7,7 @@ use crate::energy::{accumulate, energy, tnce_over_band};
 use crate::error::check_len;
 use crate::filter_bank::{FilterBankPlan, FilterBankScratch};
 use crate::foam::subtract;
+use crate::rise::{CurveShape, curve_shape};
 use crate::temperature::{TemperatureCorrection, resampling_ratio};
 use crate::{Error, RealSample};
 
@@ -129,6 +130,8 @@ pub struct DerivedResponse<T> {
     pub total: f64,
     /// `[bands]`: energy over Flat's of the same band.
     pub tnce_over_band: Vec<f64>,
+    /// `[bands]`: shape of each curve; None without energy.
+    pub shapes: Vec<Option<CurveShape>>,
 }
 
 /// Energies of Flat's response of a pair, which normalise all responses of that pair.
@@ -192,6 +195,7 @@ impl<T: RealSample> DerivationPlan<T> {
             tnce: vec![0.0; bands],
             total: 0.0,
             tnce_over_band: vec![0.0; bands],
+            shapes: vec![None; bands],
         }
     }
 
@@ -241,6 +245,24 @@ impl<T: RealSample> DerivationPlan<T> {
         Ok(())
     }
 
+    /// Computes only the energies of what a surface reflected: `energies[band]`.
+    ///
+    /// # Errors
+    /// [`Error::Length`] or [`Error::NotFinite`].
+    pub fn reflected_energies(
+        &self,
+        ir: &[T],
+        direct: &[T],
+        energies: &mut [f64],
+        scratch: &mut DerivationScratch<T>,
+    ) -> Result<(), Error> {
+        check_len("the response", ir.len(), self.bank.len())?;
+        check_len("the direct sound", direct.len(), self.bank.len())?;
+        let reflected = &mut scratch.bands[..ir.len()];
+        subtract(ir, direct, reflected);
+        self.bank.energies(reflected, energies, &mut scratch.bank)
+    }
+
     fn measure_flat(&self, flat: &[T], scratch: &mut DerivationScratch<T>) -> Result<(), Error> {
         check_len("Flat's response", flat.len(), self.bank.len())?;
         scratch.flat.total = energy(flat);
@@ -270,6 +292,11 @@ fn put_over<T: RealSample>(flat: &FlatEnergies, bands: &[T], derived: &mut Deriv
     derived.tnce.iter_mut().zip(&derived.energies).for_each(|(tnce, energy)| *tnce = energy * factor);
     derived.total = derived.tnce.iter().sum();
     tnce_over_band(&derived.energies, &flat.bands, &mut derived.tnce_over_band);
+    derived
+        .shapes
+        .iter_mut()
+        .zip(derived.curves.chunks_exact(len))
+        .for_each(|(shape, curve)| *shape = curve_shape(curve));
 }
 
 #[cfg(test)]
@@ -375,6 +402,11 @@ mod tests {
             plan.run(ir, foam, flat, &mut once, &mut plan.scratch()).expect("derived");
             plan.run_over(ir, foam, &energies, &mut again, &mut scratch).expect("derived");
             assert_eq!(once, again);
+            let mut energies = [f64::NAN; 5];
+            plan.reflected_energies(ir, foam, &mut energies, &mut scratch).expect("energies");
+            // The sum over bins and the sum over samples, in single precision.
+            let alike = |(a, b): (&f64, &f64)| (a / b - 1.0).abs() < 1e-5;
+            assert!(energies.iter().zip(&once.energies).all(alike), "{energies:?} {:?}", once.energies);
         }
         let short = FlatEnergies { bands: vec![1.0; 4], ..energies };
         let result = plan.run_over(flat, foam, &short, &mut plan.derived(), &mut scratch);

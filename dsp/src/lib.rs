@@ -39,6 +39,7 @@ pub mod energy;
 mod error;
 pub mod filter_bank;
 pub mod foam;
+pub mod foam_reflection;
 pub mod fresnel;
 pub mod geometry;
 #[cfg(test)]
@@ -52,6 +53,7 @@ pub mod mean;
 pub mod png;
 mod pruned;
 mod real;
+pub mod rise;
 pub mod spectrum;
 pub mod sweep;
 pub mod temperature;

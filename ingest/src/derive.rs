@@ -8,9 +8,9 @@ use echolake_schema::Rig;
 use echolake_schema::tables::Table;
 
 use crate::context::IngestContext;
-use crate::derived_values::{DerivedRows, FlatEnergyMap, MeanResponses, RunResponses, derivation_plan};
+use crate::derived_values::{DerivedRows, RunResponses, derivation_plan};
 use crate::error::{Error, Result};
-use crate::references::{SharedFinder, WantedReferences};
+use crate::references::{LoadedReferences, SharedFinder, WantedReferences};
 use crate::rows::derived::ReferenceVersions;
 use crate::rows::runs::RunReferences;
 use crate::rows::{self, RunKeys};
@@ -23,8 +23,7 @@ pub(crate) struct ReferenceDerivation {
     pub(crate) name: String,
     flat_version: String,
     foam_version: String,
-    flat: Arc<FlatEnergyMap>,
-    foam: Arc<MeanResponses>,
+    references: LoadedReferences,
 }
 
 impl ReferenceDerivation {
@@ -38,8 +37,8 @@ impl ReferenceDerivation {
         else {
             return Ok(None);
         };
-        let Some((foam, flat)) = finder.lock().await.load(wanted).await? else { return Ok(None) };
-        Ok(Some(Self { name, flat_version, foam_version, flat, foam }))
+        let Some(references) = finder.lock().await.load(wanted).await? else { return Ok(None) };
+        Ok(Some(Self { name, flat_version, foam_version, references }))
     }
 
     /// Derives every pair that both references have, and stages the files. Returns them and the run row's references.
@@ -75,10 +74,12 @@ impl ReferenceDerivation {
         let mut encoders =
             [Table::Nce, Table::Tnce, Table::TnceD4].map(|table| (table, FileEncoder::new(table, table.schema(rig))));
         let mut totals: Vec<Vec<f64>> = vec![Vec::new(); rig.bands.centres_hz.len() + 1];
+        let mut unbiased = totals.clone();
         let mut paired = 0;
         self.slices(rig, keys, responses, &mut |slice| {
             paired += slice.pairs.len();
             totals.iter_mut().zip(slice.tnce_columns()).for_each(|(all, some)| all.extend(some));
+            unbiased.iter_mut().zip(slice.unbiased_columns()).for_each(|(all, some)| all.extend(some));
             let [nce, tnce, tnce_d4] = &mut encoders;
             let lists = slice.take_lists();
             // Lists take most of the time; an idle core can encode the rest meanwhile.
@@ -95,7 +96,7 @@ impl ReferenceDerivation {
         for (table, encoder) in encoders {
             files.push((table, encoder.finish()?));
         }
-        let stats = rows::stats::rows(rig, keys, &totals, of)?;
+        let stats = rows::stats::rows(rig, keys, &totals, &unbiased, of)?;
         files.push((Table::SurfaceStats, encode(Table::SurfaceStats, &Table::SurfaceStats.schema(rig), &[stats])?));
         Ok((files, responses.pairs.len() - paired))
     }
@@ -110,14 +111,17 @@ impl ReferenceDerivation {
         let (bands, length) = (rig.bands.centres_hz.len(), rig.impulse_response.length);
         let failed = |cause| Error::Kernel { file: keys.run.to_string(), cause };
         let plan = derivation_plan(rig).map_err(failed)?;
-        let (mut scratch, mut derived) = (plan.scratch(), plan.derived());
+        let (mut scratch, mut derived, mut energies) = (plan.scratch(), plan.derived(), vec![0.0; bands]);
         let irs = responses.pairs.chunks(SLICE).zip(responses.irs.chunks(SLICE * length));
         for (pairs, irs) in irs {
             let mut slice = DerivedRows::new(bands);
             for (pair, ir) in pairs.iter().zip(irs.chunks_exact(length)) {
-                if let (Some(foam), Some(flat)) = (self.foam.get(pair), self.flat.get(pair)) {
-                    plan.run_over(ir, foam, flat, &mut derived, &mut scratch).map_err(failed)?;
-                    slice.push(*pair, &derived);
+                let Some((direct, flat)) = self.references.chosen.of_pair(*pair) else { continue };
+                plan.run_over(ir, direct, flat, &mut derived, &mut scratch).map_err(failed)?;
+                slice.push(*pair, &derived);
+                if let Some((direct, flat)) = self.references.estimated.as_ref().and_then(|e| e.of_pair(*pair)) {
+                    plan.reflected_energies(ir, direct, &mut energies, &mut scratch).map_err(failed)?;
+                    slice.push_unbiased(&energies, flat);
                 }
             }
             take(&mut slice)?;

@@ -3,6 +3,7 @@
 use std::collections::HashMap;
 
 use echolake_dsp::chain::{DerivationPlan, DerivedResponse, FlatEnergies};
+use echolake_dsp::rise::CurveShape;
 use echolake_schema::Rig;
 
 /// Mean impulse response of each pair of a reference.
@@ -37,6 +38,10 @@ pub(crate) struct DerivedRows {
     energies: Vec<f64>,
     tnce: Vec<f64>,
     tnce_over_band: Vec<f64>,
+    /// `[pairs x bands]`: shapes of the curves.
+    shapes: Vec<Option<CurveShape>>,
+    /// `[pairs x bands]`: TNCE without Foam's reflection; empty if that is not known.
+    unbiased: Vec<f64>,
 }
 
 /// Responses and curves of [`DerivedRows`].
@@ -66,6 +71,12 @@ impl DerivedRows {
         self.energies.extend_from_slice(&derived.energies);
         self.tnce.extend_from_slice(&derived.tnce);
         self.tnce_over_band.extend_from_slice(&derived.tnce_over_band);
+        self.shapes.extend_from_slice(&derived.shapes);
+    }
+
+    /// Appends the TNCE of one measurement without Foam's reflection.
+    pub(crate) fn push_unbiased(&mut self, energies: &[f64], flat: &FlatEnergies) {
+        self.unbiased.extend(energies.iter().map(|energy| energy / flat.total));
     }
 
     /// Moves out the responses and curves, which are empty afterwards.
@@ -89,11 +100,36 @@ impl DerivedRows {
         columns
     }
 
+    /// Returns the values of `rise_ms_*`, `centre_ms_*` and `slope_per_ms_*`, by their names; null without energy.
+    pub(crate) fn shape_columns(&self, bands: &[String], rate_hz: f64) -> Vec<(String, Vec<Option<f32>>)> {
+        let per_ms = rate_hz / 1e3;
+        let quantities: [(&str, fn(&CurveShape, f64) -> f64); 3] = [
+            ("rise_ms", |shape, per_ms| shape.rise / per_ms),
+            ("centre_ms", |shape, per_ms| shape.centre / per_ms),
+            ("slope_per_ms", |shape, per_ms| shape.slope * per_ms),
+        ];
+        let column = |band: usize, value: fn(&CurveShape, f64) -> f64| {
+            let shapes = self.shapes.iter().skip(band).step_by(self.bands);
+            shapes.map(|shape| shape.as_ref().map(|shape| value(shape, per_ms) as f32)).collect()
+        };
+        let named =
+            |(b, band): (usize, &String)| quantities.map(|(name, value)| (format!("{name}_{band}"), column(b, value)));
+        bands.iter().enumerate().flat_map(named).collect()
+    }
+
     /// Returns the values of `tnce_*` and `tnce_total`.
     pub(crate) fn tnce_columns(&self) -> Vec<Vec<f64>> {
-        let mut columns: Vec<_> = (0..self.bands).map(|b| self.column(&self.tnce, b)).collect();
-        columns.push(self.totals(&self.tnce));
-        columns
+        self.band_columns(&self.tnce)
+    }
+
+    /// Returns the same without Foam's reflection; without values if that is not known.
+    pub(crate) fn unbiased_columns(&self) -> Vec<Vec<f64>> {
+        self.band_columns(&self.unbiased)
+    }
+
+    fn band_columns(&self, values: &[f64]) -> Vec<Vec<f64>> {
+        let bands = (0..self.bands).map(|band| self.column(values, band));
+        bands.chain([self.totals(values)]).collect()
     }
 
     fn column(&self, values: &[f64], band: usize) -> Vec<f64> {

@@ -1,5 +1,6 @@
 //! Errors between a run's file and the tables.
 
+use echolake_dsp::foam_reflection::LEAST_PAIRS;
 use echolake_recording::ResyncError;
 use echolake_schema::ErrorCause;
 use echolake_schema::manifest::ManifestError;
@@ -107,6 +108,19 @@ pub enum Error {
         #[source]
         cause: echolake_dsp::Error,
     },
+    /// The direct sound without Foam's reflection is wanted and cannot be estimated.
+    #[error(
+        "Foam's reflection cannot be estimated from `{foam}` and `{flat}`, which `direct_sound = \"estimated\"` of \
+         lake.toml needs: expected {} pairs whose direct and reflected sound are well apart, and a Flat that reflects \
+         more than Foam; hint: set it to \"foam\"",
+        LEAST_PAIRS
+    )]
+    FoamReflection {
+        /// The surface that is Foam.
+        foam: String,
+        /// The surface that is Flat.
+        flat: String,
+    },
     /// A data file of the lake cannot be read.
     #[error(
         "`{file}` in the lake is damaged: {reason}; hint: delete the folder `tables` and run `echolake ingest`, which makes it anew from the runs"
@@ -154,7 +168,11 @@ impl Error {
             | Self::Doubtful { .. }
             | Self::Kernel { .. }
             | Self::Lake(echolake_lake::Error::OtherRig { .. }) => true,
-            Self::DataFile { .. } | Self::Threads { .. } | Self::Stopped | Self::Lake(_) => false,
+            Self::FoamReflection { .. }
+            | Self::DataFile { .. }
+            | Self::Threads { .. }
+            | Self::Stopped
+            | Self::Lake(_) => false,
         }
     }
 

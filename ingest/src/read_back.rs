@@ -4,13 +4,13 @@ use arrow::array::{Array as _, AsArray as _};
 use arrow::compute::concat_batches;
 use arrow::datatypes::{Float32Type, Int32Type};
 use arrow::record_batch::RecordBatch;
-use echolake_lake::{DataFile, Lake, LakeSnapshot};
+use echolake_lake::{DataFile, Lake, LakeSnapshot, add_missing_columns, reader_metadata, wanted_schema};
 use echolake_schema::RunId;
 use echolake_schema::tables::Table;
 use futures::TryStreamExt as _;
 use object_store::ObjectStoreExt as _;
 use parquet::arrow::ProjectionMask;
-use parquet::arrow::arrow_reader::{ArrowReaderOptions, ParquetRecordBatchReaderBuilder};
+use parquet::arrow::arrow_reader::{ArrowReaderMetadata, ArrowReaderOptions, ParquetRecordBatchReaderBuilder};
 
 use crate::derived_values::RunResponses;
 use crate::error::{Error, Result};
@@ -61,13 +61,17 @@ pub(crate) async fn batches(lake: &Lake, table: Table, file: &DataFile, columns:
     if bytes.len() as u64 != file.bytes {
         return Err(damaged(format!("it has {} bytes, its log says {}", bytes.len(), file.bytes)));
     }
-    let options = ArrowReaderOptions::new().with_schema(table.schema(lake.rig()));
-    let builder =
-        ParquetRecordBatchReaderBuilder::try_new_with_options(bytes, options).map_err(|e| damaged(e.to_string()))?;
+    let schema = table.schema(lake.rig());
+    let metadata = ArrowReaderMetadata::load(&bytes, ArrowReaderOptions::new())
+        .and_then(|metadata| reader_metadata(metadata.metadata().clone(), &schema))
+        .map_err(|e| damaged(e.to_string()))?;
+    let builder = ParquetRecordBatchReaderBuilder::new_with_metadata(bytes, metadata);
     let mask = match columns {
         [] => ProjectionMask::all(),
         some => ProjectionMask::columns(builder.parquet_schema(), some.iter().copied()),
     };
     let reader = builder.with_projection(mask).build().map_err(|e| damaged(e.to_string()))?;
-    reader.collect::<std::result::Result<_, _>>().map_err(|e| damaged(e.to_string()))
+    let wanted = wanted_schema(&schema, columns);
+    let complete = |batch: std::result::Result<RecordBatch, _>| batch.and_then(|b| add_missing_columns(&b, &wanted));
+    reader.map(complete).collect::<std::result::Result<_, _>>().map_err(|e| damaged(e.to_string()))
 }

@@ -3,9 +3,13 @@
 use std::collections::{BTreeSet, HashMap};
 use std::sync::Arc;
 
-use echolake_lake::{DataFile, FileName, Lake, LakeSnapshot, ReferenceSurfaces};
+use echolake_dsp::chain::FlatEnergies;
+use echolake_dsp::foam_reflection::FoamReflectionFit;
+use echolake_dsp::geometry::{direct_mm, image_mm};
+use echolake_dsp::temperature::speed_of_sound;
+use echolake_lake::{DataFile, DirectSound, FileName, Lake, LakeSnapshot, ReferenceSurfaces};
 use echolake_schema::tables::Table;
-use echolake_schema::{Rig, SurfaceId, SurfaceRecord};
+use echolake_schema::{PairId, Rig, SurfaceId, SurfaceRecord};
 use sha2::{Digest as _, Sha256};
 use tokio::sync::Mutex;
 
@@ -14,6 +18,8 @@ use crate::derived_values::{FlatEnergyMap, MeanResponses, derivation_plan};
 use crate::error::{Error, Result};
 use crate::read_back;
 
+/// Revision of the rows that follow from references: those of another one are derived anew.
+const ROWS_REVISION: &str = "2";
 /// Number of hex digits of a digest in a version.
 const VERSION_DIGITS: usize = 12;
 
@@ -26,7 +32,23 @@ pub(crate) struct ReferenceFinder {
     versions: HashMap<SurfaceId, String>,
     /// Keyed by version: the means change with the runs, and so does the version.
     means: HashMap<String, Arc<MeanResponses>>,
-    flats: HashMap<String, Arc<FlatEnergyMap>>,
+    /// Keyed by Flat's version and Foam's.
+    loaded: HashMap<(String, String), LoadedReferences>,
+}
+
+/// The direct sound of each pair of a surface, and the energies that normalise it.
+#[derive(Debug, Clone)]
+pub(crate) struct ReferenceResponses {
+    direct: Arc<MeanResponses>,
+    flat: Arc<FlatEnergyMap>,
+}
+
+/// References as the lake subtracts them, and those without Foam's reflection.
+#[derive(Debug, Clone)]
+pub(crate) struct LoadedReferences {
+    pub(crate) chosen: ReferenceResponses,
+    /// None if Foam's reflection cannot be estimated: few pairs, or arrivals that are not apart.
+    pub(crate) estimated: Option<ReferenceResponses>,
 }
 
 /// One finder for all workers: they share its cache.
@@ -56,6 +78,7 @@ pub(crate) struct WantedReferences {
     pub(crate) foam: ReferenceVersion,
     /// Flat's own Foam.
     flat_foam: ReferenceVersion,
+    direct_sound: DirectSound,
 }
 
 /// One reference.
@@ -80,7 +103,7 @@ impl ReferenceFinder {
         let versions = runs.into_iter().map(version).collect();
         let names =
             snapshot.files(Table::Surfaces).iter().filter_map(|f| names(f, &lake.config().references)).collect();
-        Self { lake: lake.clone(), snapshot, names, versions, means: HashMap::new(), flats: HashMap::new() }
+        Self { lake: lake.clone(), snapshot, names, versions, means: HashMap::new(), loaded: HashMap::new() }
     }
 
     pub(crate) fn shared(lake: &Lake, snapshot: Arc<LakeSnapshot>) -> SharedFinder {
@@ -95,24 +118,40 @@ impl ReferenceFinder {
     /// The same for a surface with these names.
     pub(crate) fn wanted_by(&self, ReferenceNames { flat, foam }: ReferenceNames) -> WantedReferences {
         let flat_foam = self.names(&flat).foam;
-        WantedReferences { flat: self.found(flat), foam: self.found(foam), flat_foam: self.found(flat_foam) }
+        WantedReferences {
+            flat: self.found(flat),
+            foam: self.found(foam),
+            flat_foam: self.found(flat_foam),
+            direct_sound: self.lake.config().references.direct_sound,
+        }
     }
 
-    /// Loads the mean responses of Foam and the energies of Flat with its Foam subtracted; None if one is missing.
-    pub(crate) async fn load(
-        &mut self,
-        wanted: &WantedReferences,
-    ) -> Result<Option<(Arc<MeanResponses>, Arc<FlatEnergyMap>)>> {
-        let Some((version, _)) = wanted.versions() else { return Ok(None) };
-        let foam = self.mean(&wanted.foam).await?;
-        if let Some(known) = self.flats.get(&version) {
-            return Ok(Some((foam, known.clone())));
+    /// Loads the direct sound and the energies of Flat without it; None if a reference is missing.
+    ///
+    /// # Errors
+    /// [`Error::FoamReflection`] if the lake wants it estimated and it cannot be.
+    pub(crate) async fn load(&mut self, wanted: &WantedReferences) -> Result<Option<LoadedReferences>> {
+        let Some(versions) = wanted.versions() else { return Ok(None) };
+        if let Some(known) = self.loaded.get(&versions) {
+            return Ok(Some(known.clone()));
         }
+        let foam = self.mean(&wanted.foam).await?;
         let flat_foam = self.mean(&wanted.flat_foam).await?;
         let flat = self.mean(&wanted.flat).await?;
-        let flats = Arc::new(flats(self.lake.rig(), &flat, &flat_foam)?);
-        self.flats.insert(version, flats.clone());
-        Ok(Some((foam, flats)))
+        let estimated = estimated(&self.lake, &flat, &flat_foam, &foam)?;
+        let chosen = match wanted.direct_sound {
+            DirectSound::Foam => {
+                let flat = Arc::new(flat_energies(self.lake.rig(), &flat, &flat_foam)?);
+                ReferenceResponses { direct: foam, flat }
+            }
+            DirectSound::Estimated => estimated.clone().ok_or_else(|| Error::FoamReflection {
+                foam: wanted.foam.surface.to_string(),
+                flat: wanted.flat.surface.to_string(),
+            })?,
+        };
+        let loaded = LoadedReferences { chosen, estimated };
+        self.loaded.insert(versions, loaded.clone());
+        Ok(Some(loaded))
     }
 
     async fn mean(&mut self, of: &ReferenceVersion) -> Result<Arc<MeanResponses>> {
@@ -161,8 +200,56 @@ fn names(file: &DataFile, references: &ReferenceSurfaces) -> Option<(SurfaceId, 
     Some((surface, names))
 }
 
-fn flats(rig: &Rig, flat: &MeanResponses, foam: &MeanResponses) -> Result<FlatEnergyMap> {
-    let failed = |cause| Error::Kernel { file: "the reference".to_owned(), cause };
+impl ReferenceResponses {
+    /// Returns the direct sound of a pair and its energies of Flat, if the references have the pair.
+    pub(crate) fn of_pair(&self, pair: u32) -> Option<(&[f32], &FlatEnergies)> {
+        Some((self.direct.get(&pair)?.as_slice(), self.flat.get(&pair)?))
+    }
+}
+
+fn failed(cause: echolake_dsp::Error) -> Error {
+    Error::Kernel { file: "the reference".to_owned(), cause }
+}
+
+// References without Foam's reflection. Flat's Foam may be another one than the surface's: both are of the same material.
+fn estimated(
+    lake: &Lake,
+    flat: &MeanResponses,
+    flat_foam: &MeanResponses,
+    foam: &MeanResponses,
+) -> Result<Option<ReferenceResponses>> {
+    let (rig, grid) = (lake.rig(), lake.grid());
+    let reference_c = rig.impulse_response.reference_temperature_c.get();
+    let secs = |mm: f64| mm / 1e3 / speed_of_sound(reference_c);
+    let mut fit = FoamReflectionFit::new(rig.impulse_response.length, rig.sweep.rate_hz.get()).map_err(failed)?;
+    let mut pairs: Vec<_> = flat.iter().collect();
+    // In one order, so that sums are the same in every process.
+    pairs.sort_unstable_by_key(|(pair, _)| **pair);
+    for (pair, flat) in pairs {
+        let (Some(foam), Some(points)) = (flat_foam.get(pair), grid.pair(PairId(*pair))) else { continue };
+        let [Some(microphone), Some(speaker)] = [points.microphone, points.speaker].map(|p| grid.point(p)) else {
+            continue;
+        };
+        let (microphone, speaker) = (microphone.position_mm, speaker.position_mm);
+        let arrivals = [direct_mm(microphone, speaker), image_mm(microphone, speaker)].map(secs);
+        fit.add(foam, flat, arrivals[0], arrivals[1]).map_err(failed)?;
+    }
+    let Some(reflection) = fit.finish() else { return Ok(None) };
+    let direct_sound = |foam: &MeanResponses| -> Result<MeanResponses> {
+        let mut direct = MeanResponses::with_capacity(foam.len());
+        for (pair, foam) in foam {
+            let Some(flat) = flat.get(pair) else { continue };
+            let mut without = vec![0.0; foam.len()];
+            reflection.direct_sound(foam, flat, &mut without).map_err(failed)?;
+            direct.insert(*pair, without);
+        }
+        Ok(direct)
+    };
+    let flat = Arc::new(flat_energies(rig, flat, &direct_sound(flat_foam)?)?);
+    Ok(Some(ReferenceResponses { direct: Arc::new(direct_sound(foam)?), flat }))
+}
+
+fn flat_energies(rig: &Rig, flat: &MeanResponses, foam: &MeanResponses) -> Result<FlatEnergyMap> {
     let plan = derivation_plan(rig).map_err(failed)?;
     let mut scratch = plan.scratch();
     let mut flats = FlatEnergyMap::with_capacity(flat.len());
@@ -184,7 +271,7 @@ impl WantedReferences {
     /// Returns the derivation's name for a run with these references.
     pub(crate) fn derivation(&self, run_derivation: &str) -> Option<String> {
         let (flat, foam) = self.versions()?;
-        Some(digest(&[run_derivation, &flat, &foam, CODE_VERSION]))
+        Some(digest(&[run_derivation, &flat, &foam, CODE_VERSION, ROWS_REVISION, self.direct_sound.name()]))
     }
 
     /// Returns the names of the missing references, for messages.

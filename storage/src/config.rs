@@ -20,7 +20,7 @@ pub struct LakeConfig {
     pub rig: Rig,
 }
 
-/// The surfaces that normalise, and whose direct sound is subtracted.
+/// The surfaces that normalise, and the direct sound that is subtracted.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, rename = "References")]
 pub struct ReferenceSurfaces {
@@ -28,12 +28,41 @@ pub struct ReferenceSurfaces {
     pub flat: SurfaceId,
     /// The surface whose response is the direct sound.
     pub foam: SurfaceId,
+    /// The direct sound that is subtracted.
+    #[serde(default, skip_serializing_if = "DirectSound::is_default")]
+    pub direct_sound: DirectSound,
+}
+
+/// The direct sound that is subtracted from all responses of a lake.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum DirectSound {
+    /// Foam's response, with the little that Foam reflects (Rust et al. 2021).
+    #[default]
+    Foam,
+    /// Foam's response without Foam's reflection, which is estimated from Foam and Flat.
+    Estimated,
+}
+
+impl DirectSound {
+    /// Its name, as `lake.toml` spells it.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Foam => "foam",
+            Self::Estimated => "estimated",
+        }
+    }
+
+    fn is_default(&self) -> bool {
+        *self == Self::default()
+    }
 }
 
 impl Default for ReferenceSurfaces {
     #[allow(clippy::expect_used, reason = "two constants, checked by the test below")]
     fn default() -> Self {
-        Self { flat: "flat".parse().expect("a valid id"), foam: "foam".parse().expect("a valid id") }
+        let [flat, foam] = ["flat", "foam"].map(|name| name.parse().expect("a valid id"));
+        Self { flat, foam, direct_sound: DirectSound::default() }
     }
 }
 
@@ -71,6 +100,10 @@ mod tests {
         let config = LakeConfig { format: LAKE_FORMAT, references: ReferenceSurfaces::default(), rig: Rig::paper() };
         let text = config.to_toml().expect("text");
         assert_eq!(LakeConfig::from_toml(&text, "x").expect("the same"), config);
+        let estimated = text.replace("foam = \"foam\"\n", "foam = \"foam\"\ndirect_sound = \"estimated\"\n");
+        let config = LakeConfig::from_toml(&estimated, "x").expect("a choice");
+        assert_eq!(config.references.direct_sound, DirectSound::Estimated);
+        assert_eq!(LakeConfig::from_toml(&config.to_toml().expect("text"), "x").expect("the same"), config);
     }
 
     #[test]

@@ -24,7 +24,7 @@ mod location;
 #[cfg(feature = "tables")]
 mod tables;
 
-pub use config::{LAKE_FORMAT, LakeConfig, ReferenceSurfaces};
+pub use config::{DirectSound, LAKE_FORMAT, LakeConfig, ReferenceSurfaces};
 pub use error::{Error, StoreError};
 pub use lake::Lake;
 #[cfg(feature = "tables")]
@@ -32,7 +32,7 @@ pub use tables::{
     BatchBuilder, CommitEffect, CommitLog, CommitOutcome, DataFile, DeletedFile, DeletionMode, EncodedFile,
     FileEncoder, FileHistory, FileName, FileStats, KEEP_HOURS, LakeMoment, LakeSnapshot, MergeProgress, NewFile,
     NoMoment, OptimizeReport, ReplacedFiles, RunPart, StagedFile, TARGET_BYTES, TableCommit, TableOptimizeReport,
-    TableVersion, VacuumReport, VisibleRun, encode,
+    TableVersion, VacuumReport, VisibleRun, add_missing_columns, encode, reader_metadata, wanted_schema,
 };
 
 /// The result of what a lake does.

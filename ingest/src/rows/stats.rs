@@ -9,10 +9,20 @@ use super::derived::ReferenceVersions;
 use super::{RunKeys, finite};
 use crate::error::Result;
 
-/// Builds one row per band and one for the total, from the TNCE values of each over all pairs.
-pub(crate) fn rows(rig: &Rig, keys: &RunKeys, tnce: &[Vec<f64>], of: ReferenceVersions<'_>) -> Result<RecordBatch> {
+/// Builds one row per band and one for the total, from the TNCE values of each over all pairs; `unbiased` are those
+/// without Foam's reflection, none if it is not known.
+pub(crate) fn rows(
+    rig: &Rig,
+    keys: &RunKeys,
+    tnce: &[Vec<f64>],
+    unbiased: &[Vec<f64>],
+    of: ReferenceVersions<'_>,
+) -> Result<RecordBatch> {
     let names = rig.band_names().into_iter().chain(["total".to_owned()]);
-    let stats: Vec<_> = names.zip(tnce).map(|(band, values)| stats_of(band, values)).collect();
+    let mut stats: Vec<_> = names.zip(tnce).map(|(band, values)| stats_of(band, values)).collect();
+    for (stats, values) in stats.iter_mut().zip(unbiased) {
+        stats.unbiased_p90_mean_db = stats_of(String::new(), values).p90_mean_db;
+    }
     let batch = keys
         .begin_rows(Table::SurfaceStats, rig, stats.len())
         .texts("band", stats.iter().map(|s| &s.band))
@@ -25,6 +35,7 @@ pub(crate) fn rows(rig: &Rig, keys: &RunKeys, tnce: &[Vec<f64>], of: ReferenceVe
         .doubles("min_db", stats.iter().map(|s| s.min_db))
         .doubles("max_db", stats.iter().map(|s| s.max_db))
         .doubles("spread_db", stats.iter().map(|s| s.spread_db))
+        .doubles("unbiased_p90_mean_db", stats.iter().map(|s| s.unbiased_p90_mean_db))
         .text("flat_version", of.flat)
         .text("foam_version", of.foam)
         .finish()?;
@@ -51,6 +62,7 @@ fn stats_of(band: String, values: &[f64]) -> BandStatistics {
         min_db: db(sorted[0]),
         max_db: db(sorted[sorted.len() - 1]),
         spread_db: spread(&levels),
+        unbiased_p90_mean_db: None,
     }
 }
 

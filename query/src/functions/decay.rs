@@ -110,7 +110,7 @@ impl ScalarKernel for ArrivalFunction {
 }
 
 // A silent response has no answer; one with NaN would have a wrong answer, and is an error.
-fn require_finite<T: SampleElement>(arguments: &CallArguments<'_>, row: usize, ir: &[T]) -> Result<()> {
+pub(super) fn require_finite<T: SampleElement>(arguments: &CallArguments<'_>, row: usize, ir: &[T]) -> Result<()> {
     if ir.iter().all(|x| x.f64().is_finite()) {
         return Ok(());
     }

@@ -19,6 +19,7 @@ mod octet_length;
 mod p90_mean;
 mod per_length;
 mod rig;
+mod rise;
 mod scalar;
 mod sound;
 mod spectrum;
@@ -55,7 +56,7 @@ impl FunctionSet {
     /// [`echolake_schema::Error`] if the rig has no grid.
     pub fn all(rig: &Rig) -> Result<Self, echolake_schema::Error> {
         let facts = Arc::new(RigFacts::of(rig)?);
-        let scalar = vec![
+        let mut scalar = vec![
             udf(levels::DbFunction),
             udf(levels::DbAmplitudeFunction),
             udf(levels::SplFunction),
@@ -73,12 +74,13 @@ impl FunctionSet {
             udf(sound::SpeedOfSoundFunction),
             udf(symmetry::D4PositionFunction),
             udf(symmetry::D4PointFunction(facts.clone())),
-            udf(symmetry::D4PairFunction(facts)),
+            udf(symmetry::D4PairFunction(facts.clone())),
             udf(symmetry::D4HeightmapFunction),
             udf(lists::ListMultiplyFunction),
             udf(lists::ListEnergyFunction),
             udf(lists::ListRmsFunction),
         ];
+        scalar.extend(rise::CurveShapeFunction::all(&facts).map(udf));
         let aggregate = vec![
             udaf(p90_mean::P90MeanFunction),
             udaf(diffusion::DiffusionCoefficientFunction),

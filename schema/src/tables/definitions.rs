@@ -249,9 +249,23 @@ fn energies(bands: &[String]) -> Vec<Column> {
 fn tnce(bands: &[String]) -> Vec<Column> {
     let mut columns = pair_keys();
     columns.extend(energies(bands));
+    columns.extend(curve_shapes(bands));
     columns.extend(references());
     columns.push(code_version());
     columns
+}
+
+fn curve_shapes(bands: &[String]) -> Vec<Column> {
+    let quantities = [
+        ("rise_ms", "ms", "Time in which NCE rises from 10 % to 90 % of TNCE"),
+        ("centre_ms", "ms", "Centre of gravity of the reflected energy, from the response's first sample"),
+        ("slope_per_ms", "1/ms", "Mean slope of NCE between 10 % and 90 % of TNCE"),
+    ];
+    let column = |band: &str, (name, unit, comment): (&str, &'static str, &str)| {
+        Column::float(format!("{name}_{band}"), unit, format!("{comment}, band at {band} Hz; null without energy"))
+            .or_null()
+    };
+    bands.iter().flat_map(|band| quantities.map(|quantity| column(band, quantity))).collect()
 }
 
 fn tnce_d4(bands: &[String]) -> Vec<Column> {
@@ -320,6 +334,12 @@ fn surface_stats() -> Vec<Column> {
         Column::double("min_db", "dB re Flat", "Least TNCE").or_null(),
         Column::double("max_db", "dB re Flat", "Greatest TNCE").or_null(),
         Column::double("spread_db", "dB", "Standard deviation of TNCE in dB over the pairs").or_null(),
+        Column::double(
+            "unbiased_p90_mean_db",
+            "dB re Flat",
+            "p90_mean_db without Foam's own reflection, which is estimated from Foam and Flat; null if it cannot be",
+        )
+        .or_null(),
     ]);
     columns.extend(references());
     columns.push(code_version());

@@ -15,4 +15,6 @@ pub struct BandStatistics {
     pub min_db: Option<f64>,
     pub max_db: Option<f64>,
     pub spread_db: Option<f64>,
+    #[serde(default)]
+    pub unbiased_p90_mean_db: Option<f64>,
 }

@@ -29,7 +29,8 @@ pub(super) async fn run(json: bool, lake_url: &str) -> anyhow::Result<CommandOut
 
 fn text(lake: &Lake, report: &LakeReport) -> String {
     let (rig, division) = (lake.rig(), lake.rig().impulse_response.division.name());
-    let mut out = format!("lake {}, rig {}, {division} division\n", lake.location(), rig.name);
+    let direct = lake.config().references.direct_sound.name();
+    let mut out = format!("lake {}, rig {}, {division} division, direct sound: {direct}\n", lake.location(), rig.name);
     let _ = writeln!(out, "{} runs, {} in run files\n", report.runs, size(report.run_bytes));
     let _ = writeln!(out, "{:<14} {:>6} {:>10} {:>10}", "table", "files", "rows", "size");
     for t in &report.tables {

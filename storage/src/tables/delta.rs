@@ -81,6 +81,25 @@ impl DeltaLog {
         })
     }
 
+    /// Adds the columns that a table of an earlier version of the program lacks; its files have nulls there.
+    async fn add_columns(&self, table: Table, mut state: Arc<TableState>) -> Result<()> {
+        for _ in 0..COMMIT_TRIES {
+            let Some((metadata, added)) = grown_metadata(table, &state, &table.schema(&self.rig))? else {
+                return Ok(());
+            };
+            let log = self.log_folder(table);
+            log.check_writable(&state)?;
+            let info = commit_info("ADD COLUMNS", json!({ "columns": added }), Utc::now().timestamp_millis());
+            let lines = [info, LogLine { meta_data: Some(metadata), ..LogLine::default() }];
+            let attempt = log.write_commit(state.version + 1, &lines).await?;
+            state = self.require(table).await?;
+            if attempt == CommitAttempt::Written {
+                return Ok(());
+            }
+        }
+        Err(lost_to_others(table))
+    }
+
     // Written against one version, so that it takes effect only if that is still the newest.
     async fn try_commit(
         &self,
@@ -172,8 +191,8 @@ pub(crate) fn folder(table: Table) -> Path {
 #[async_trait]
 impl CommitLog for DeltaLog {
     async fn ensure(&self, table: Table) -> Result<()> {
-        if self.load(table).await?.is_some() {
-            return Ok(());
+        if let Some(state) = self.load(table).await? {
+            return self.add_columns(table, state).await;
         }
         let now_millis = Utc::now().timestamp_millis();
         let metadata = TableMetadata {
@@ -245,9 +264,33 @@ impl CommitLog for DeltaLog {
                 return Ok(change.outcomes);
             }
         }
-        let source = format!("{COMMIT_TRIES} tries lost to other writers; hint: run the command again").into();
-        Err(Error::Log { table: table.name(), action: "written", source })
+        Err(lost_to_others(table))
     }
+}
+
+fn lost_to_others(table: Table) -> Error {
+    let source = format!("{COMMIT_TRIES} tries lost to other writers; hint: run the command again").into();
+    Error::Log { table: table.name(), action: "written", source }
+}
+
+// The table's metadata with the columns that it lacks behind its own, and these as JSON; None if it lacks none.
+fn grown_metadata(table: Table, state: &TableState, schema: &SchemaRef) -> Result<Option<(TableMetadata, String)>> {
+    let damaged = |source: String| Error::Log { table: table.name(), action: "read", source: source.into() };
+    let mut metadata = state.metadata.clone().ok_or_else(|| damaged(format!("it has no metadata; {REBUILD_HINT}")))?;
+    let mut known: Value = serde_json::from_str(&metadata.schema_string)
+        .map_err(|e| damaged(format!("its schema is no JSON: {e}; {REBUILD_HINT}")))?;
+    let Some(fields) = known.get_mut("fields").and_then(Value::as_array_mut) else {
+        return Err(damaged(format!("its schema has no fields; {REBUILD_HINT}")));
+    };
+    let has = |field: &&Arc<Field>| fields.iter().any(|column| column["name"].as_str() == Some(field.name().as_str()));
+    let lacking: Vec<_> = schema.fields().iter().filter(|field| !has(field)).map(|f| delta_column(f)).collect();
+    if lacking.is_empty() {
+        return Ok(None);
+    }
+    let added = Value::from(lacking.clone()).to_string();
+    fields.extend(lacking);
+    metadata.schema_string = known.to_string();
+    Ok(Some((metadata, added)))
 }
 
 fn data_files(table: Table, state: &TableState) -> Result<Vec<DataFile>> {

@@ -19,6 +19,7 @@ pub use commit_log::{
 };
 pub use data_file::{EncodedFile, FileEncoder, encode};
 pub use optimize::{MergeProgress, OptimizeReport, TARGET_BYTES, TableOptimizeReport};
+pub use rows::{add_missing_columns, reader_metadata, wanted_schema};
 pub use snapshot::{FileName, LakeSnapshot, VisibleRun};
 pub use vacuum::{DeletedFile, DeletionMode, KEEP_HOURS, VacuumReport};
 pub use versions::{LakeMoment, NoMoment};
@@ -201,7 +202,12 @@ impl Lake {
 
 #[cfg(test)]
 mod tests {
+    use std::sync::Arc;
+
+    use arrow::array::{Array as _, ArrayRef, AsArray as _, Int32Array, StringArray, new_null_array};
+    use arrow::datatypes::{DataType, Field, Int32Type, Schema};
     use echolake_schema::Rig;
+    use futures::TryStreamExt as _;
 
     use super::*;
     use crate::ReferenceSurfaces;
@@ -219,6 +225,55 @@ mod tests {
         assert_eq!(lake.append_rows(Table::Points, &name(), &rows()).await.expect("added"), CommitOutcome::Now);
         assert_eq!(lake.append_rows(Table::Points, &name(), &rows()).await.expect("known"), CommitOutcome::Before);
         assert_eq!(lake.log().files(Table::Points).await.expect("files").len(), 2);
+    }
+
+    // A lake of a version whose surface_stats had one column less.
+    #[tokio::test]
+    async fn a_column_that_a_table_lacks_is_added_and_null_in_older_files() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let url = folder.path().join("lake").display().to_string();
+        let made = paper(&url).await.expect("made");
+        let (table, added) = (Table::SurfaceStats, "unbiased_p90_mean_db");
+        let log = folder.path().join("lake/tables/surface_stats/_delta_log");
+        let first = log.join("00000000000000000000.json");
+        let text = std::fs::read_to_string(&first).expect("a commit");
+        let next = r#",{\"metadata\""#;
+        let named = text.find(&format!(r#"\"{added}\""#)).expect("the column");
+        let begin = text[..named].rfind(next).expect("its begin");
+        let end = named + text[named..].find(next).expect("the one behind it");
+        std::fs::write(&first, [&text[..begin], &text[end..]].concat()).expect("written");
+        let schema = table.schema(made.rig());
+        let older: Vec<_> = schema.fields().iter().filter(|f| f.name() != added).cloned().collect();
+        let older = Arc::new(Schema::new(older));
+        let column = |field: &Arc<Field>| -> ArrayRef {
+            match field.data_type() {
+                DataType::Utf8 => Arc::new(StringArray::from(vec!["x"])),
+                DataType::Int32 => Arc::new(Int32Array::from(vec![7])),
+                kind => new_null_array(kind, 1),
+            }
+        };
+        let batch = RecordBatch::try_new(older.clone(), older.fields().iter().map(column).collect()).expect("a row");
+        let name = FileName::Rig { derivation: "older".into() };
+        let lake = Lake::open(&url).await.expect("opened");
+        let file = encode(table, &older, std::slice::from_ref(&batch)).expect("encoded");
+        lake.commit(&[lake.stage(table, &name, file).await.expect("staged")]).await.expect("committed");
+
+        lake.ensure_tables().await.expect("added");
+        lake.ensure_tables().await.expect("there already");
+        assert_eq!(lake.log().version(table).await.expect("a log"), Some(2));
+        let commit = std::fs::read_to_string(log.join("00000000000000000002.json")).expect("a commit");
+        assert!(commit.contains("ADD COLUMNS") && commit.contains("spread_db") && commit.contains(added), "{commit}");
+        let files = lake.log().files(table).await.expect("files");
+        for columns in [&[] as &[&str], &["measurements", added]] {
+            let rows = lake.rows(table, &files[0], columns, 0..1).await.expect("rows");
+            let rows: Vec<_> = rows.try_collect().await.expect("a batch");
+            assert_eq!(rows[0].schema(), wanted_schema(&schema, columns));
+            let value = rows[0].column_by_name("measurements").expect("there").as_primitive::<Int32Type>().value(0);
+            assert_eq!((value, rows[0].column_by_name(added).expect("there").null_count()), (7, 1));
+        }
+        // A column that may not be null does not come from nowhere.
+        let lost = add_missing_columns(&batch.project(&[0]).expect("one column"), &schema).expect_err("refused");
+        assert!(lost.to_string().contains("run_id"), "{lost}");
     }
 
     #[tokio::test]

@@ -3,7 +3,10 @@
 use std::ops::Range;
 use std::sync::Arc;
 
-use arrow::record_batch::RecordBatch;
+use arrow::array::new_null_array;
+use arrow::datatypes::{FieldRef, Fields, Schema, SchemaRef};
+use arrow::error::ArrowError;
+use arrow::record_batch::{RecordBatch, RecordBatchOptions};
 use bytes::Bytes;
 use echolake_schema::tables::Table;
 use futures::future::BoxFuture;
@@ -11,7 +14,7 @@ use futures::stream::BoxStream;
 use futures::{FutureExt as _, StreamExt as _, TryFutureExt as _, TryStreamExt as _};
 use object_store::path::Path;
 use object_store::{ObjectStore, ObjectStoreExt as _};
-use parquet::arrow::arrow_reader::{ArrowReaderOptions, RowSelection, RowSelector};
+use parquet::arrow::arrow_reader::{ArrowReaderMetadata, ArrowReaderOptions, RowSelection, RowSelector};
 use parquet::arrow::async_reader::AsyncFileReader;
 use parquet::arrow::{ParquetRecordBatchStreamBuilder, ProjectionMask};
 use parquet::errors::ParquetError;
@@ -84,12 +87,12 @@ impl Lake {
     ) -> Result<BoxStream<'static, Result<RecordBatch>>> {
         let name = file.path.to_string();
         let damaged = move |e: ParquetError| Error::DataFile { file: name.clone(), source: e.into() };
-        let reader = StoredFile { store: self.store(), path: file.path.clone(), bytes: file.bytes };
-        let options = ArrowReaderOptions::new()
-            .with_schema(table.schema(self.rig()))
-            .with_page_index_policy(PageIndexPolicy::Optional);
-        let mut builder =
-            ParquetRecordBatchStreamBuilder::new_with_options(reader, options).await.map_err(damaged.clone())?;
+        let mut reader = StoredFile { store: self.store(), path: file.path.clone(), bytes: file.bytes };
+        let options = ArrowReaderOptions::new().with_page_index_policy(PageIndexPolicy::Optional);
+        let metadata = reader.get_metadata(Some(&options)).await.map_err(damaged.clone())?;
+        let schema = table.schema(self.rig());
+        let metadata = reader_metadata(metadata, &schema).map_err(damaged.clone())?;
+        let mut builder = ParquetRecordBatchStreamBuilder::new_with_metadata(reader, metadata);
         let there = u64::try_from(builder.metadata().file_metadata().num_rows()).unwrap_or(0);
         if there != file.rows {
             let source = format!("it has {there} rows, its log says {}", file.rows).into();
@@ -105,6 +108,46 @@ impl Lake {
             builder = builder.with_row_selection(selection);
         }
         let stream = builder.with_batch_size(BATCH_ROWS).build().map_err(damaged.clone())?;
-        Ok(stream.map_err(damaged).boxed())
+        let wanted = wanted_schema(&schema, columns);
+        let complete = move |batch: RecordBatch| add_missing_columns(&batch, &wanted).map_err(ParquetError::from);
+        Ok(stream.map(move |batch| batch.and_then(&complete)).map_err(damaged).boxed())
     }
+}
+
+/// Prepares to read a file with its table's types. Columns that came to the table after the file was written are absent:
+/// [`add_missing_columns`] adds them.
+///
+/// # Errors
+/// Columns of other types.
+pub fn reader_metadata(
+    metadata: Arc<ParquetMetaData>,
+    schema: &Schema,
+) -> std::result::Result<ArrowReaderMetadata, ParquetError> {
+    let in_file = metadata.file_metadata().schema_descr().root_schema().get_fields();
+    let there = |field: &&FieldRef| in_file.iter().any(|column| column.name() == field.name());
+    let fields: Fields = schema.fields().iter().filter(there).cloned().collect();
+    ArrowReaderMetadata::try_new(metadata, ArrowReaderOptions::new().with_schema(Arc::new(Schema::new(fields))))
+}
+
+/// Returns the fields of the named columns, in the table's order; all if none is named.
+pub fn wanted_schema(schema: &SchemaRef, columns: &[&str]) -> SchemaRef {
+    if columns.is_empty() {
+        return schema.clone();
+    }
+    let wanted: Fields = schema.fields().iter().filter(|f| columns.contains(&f.name().as_str())).cloned().collect();
+    Arc::new(Schema::new(wanted))
+}
+
+/// Adds the columns of the schema that a batch lacks: nulls.
+///
+/// # Errors
+/// A column that may not be null, or of another type.
+pub fn add_missing_columns(batch: &RecordBatch, schema: &SchemaRef) -> std::result::Result<RecordBatch, ArrowError> {
+    let column = |field: &FieldRef| match batch.column_by_name(field.name()) {
+        Some(column) => column.clone(),
+        None => new_null_array(field.data_type(), batch.num_rows()),
+    };
+    let columns = schema.fields().iter().map(column).collect();
+    let rows = RecordBatchOptions::new().with_row_count(Some(batch.num_rows()));
+    RecordBatch::try_new_with_options(schema.clone(), columns, &rows)
 }

@@ -24,6 +24,8 @@ struct LakeDescription<'a> {
     reference_temperature_c: f64,
     /// Division of the spectra at the limits of `low_hz` and `high_hz`: `tapered`, `floored` or `literal`.
     division: &'static str,
+    /// Direct sound that is subtracted: `foam`, or `estimated` without Foam's own reflection.
+    direct_sound: &'static str,
     panel_size_mm: f64,
     panel_depth_mm: f64,
     layers: i32,
@@ -100,6 +102,7 @@ pub(super) async fn lake(Extension(request): Extension<CatalogueRequest>) -> End
         ir_length: rig.impulse_response.length,
         reference_temperature_c: rig.impulse_response.reference_temperature_c.get(),
         division: rig.impulse_response.division.name(),
+        direct_sound: lake.config().references.direct_sound.name(),
         panel_size_mm: rig.panel.size_mm,
         panel_depth_mm: rig.panel.depth_mm,
         layers: points.iter().map(|p| p.layer + 1).max().unwrap_or(0),

@@ -1,0 +1,115 @@
+//! `rise_time`, `centre_time` and `nce_slope`: the shape of a cumulative energy curve.
+
+use std::sync::Arc;
+
+use arrow::array::ArrayRef;
+use arrow::datatypes::DataType;
+use datafusion::error::Result;
+use echolake_dsp::rise::{CurveShape, curve_shape};
+
+use super::answers::numbers;
+use super::arguments::{CallArguments, SampleElement};
+use super::decay::require_finite;
+use super::description::{ArgumentKind, FunctionDescription, FunctionFamily, FunctionParameter};
+use super::rig::RigFacts;
+use super::scalar::ScalarKernel;
+
+/// One number of a curve's shape.
+pub(super) struct CurveShapeFunction {
+    facts: Arc<RigFacts>,
+    description: &'static FunctionDescription,
+    /// The number, from the shape and the samples per millisecond.
+    value: fn(&CurveShape, f64) -> f64,
+}
+
+impl CurveShapeFunction {
+    /// All functions of this file.
+    pub(super) fn all(facts: &Arc<RigFacts>) -> [Self; 3] {
+        let values: [(_, fn(&CurveShape, f64) -> f64); 3] = [
+            (&RISE, |shape, per_ms| shape.rise / per_ms),
+            (&CENTRE, |shape, per_ms| shape.centre / per_ms),
+            (&SLOPE, |shape, per_ms| shape.slope * per_ms),
+        ];
+        values.map(|(description, value)| Self { facts: facts.clone(), description, value })
+    }
+}
+
+const CURVE: &[FunctionParameter] = &[FunctionParameter {
+    name: "curve",
+    kind: ArgumentKind::Samples,
+    about: "a cumulative energy curve, as nce_10000",
+}];
+
+static RISE: FunctionDescription = FunctionDescription {
+    name: "rise_time",
+    family: FunctionFamily::Responses,
+    about: "Time in which a cumulative energy curve rises from 10 % to 90 % of its last value, in ms, interpolated \
+            linearly; null without energy. A surface that spreads a reflection in time has a longer one. Columns \
+            rise_ms_* of table tnce hold it for each band.",
+    parameters: CURVE,
+    optional: 0,
+    example: "select round(rise_time([0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0]), 4) as ms",
+    answer: "\
++--------+
+| ms     |
++--------+
+| 0.0833 |
++--------+",
+    related: &["centre_time", "nce_slope", "nce"],
+};
+
+static CENTRE: FunctionDescription = FunctionDescription {
+    name: "centre_time",
+    family: FunctionFamily::Responses,
+    about: "Centre of gravity of the energy of a cumulative curve, in ms from its first sample; null without energy. \
+            Columns centre_ms_* of table tnce hold it for each band.",
+    parameters: CURVE,
+    optional: 0,
+    example: "select centre_time([0.0, 1.0, 1.0, 1.0, 2.0]) * 96 as samples",
+    answer: "\
++---------+
+| samples |
++---------+
+| 2.5     |
++---------+",
+    related: &["rise_time", "arrival"],
+};
+
+static SLOPE: FunctionDescription = FunctionDescription {
+    name: "nce_slope",
+    family: FunctionFamily::Responses,
+    about: "Mean slope of a cumulative energy curve between 10 % and 90 % of its last value, per ms: 0.8 of that value \
+            over rise_time; null without energy. Rust et al. 2021 read how diffuse a reflection is from this slope. \
+            Columns slope_per_ms_* of table tnce hold it for each band.",
+    parameters: CURVE,
+    optional: 0,
+    example: "select round(nce_slope([0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0]), 4) as per_ms",
+    answer: "\
++--------+
+| per_ms |
++--------+
+| 9.6    |
++--------+",
+    related: &["rise_time", "nce"],
+};
+
+impl ScalarKernel for CurveShapeFunction {
+    fn description(&self) -> &'static FunctionDescription {
+        self.description
+    }
+
+    fn returns(&self, _: &[DataType]) -> DataType {
+        DataType::Float64
+    }
+
+    fn call<T: SampleElement>(&self, arguments: &CallArguments<'_>) -> Result<ArrayRef> {
+        let (curves, per_ms) = (arguments.samples::<T>(0)?, self.facts.rate_hz / 1e3);
+        numbers(arguments, |row| {
+            let curve = curves.at(row)?;
+            match curve_shape(curve) {
+                Some(shape) => Ok(Some((self.value)(&shape, per_ms))),
+                None => require_finite(arguments, row, curve).map(|()| None),
+            }
+        })
+    }
+}
