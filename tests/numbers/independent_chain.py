@@ -1,0 +1,575 @@
+"""Compares the tables of a lake with an independent chain: `independent_chain.py --program ECHOLAKE`.
+
+The chain was written from the paper (Rust et al. 2021) and from the definitions in ARCHITECTURE.md and
+schema/src/rig.rs; it shares no code with the program. It reads the raw sweeps and loopbacks of run files with Python's
+mcap, computes responses, curves and levels in double precision, and compares them with the tables as deltalake reads
+them, in each variant of `impulse_response.division`. The program makes the lakes: the demo's six surfaces, simulated
+with one seed, on a small grid and on the paper's.
+
+    --folder FOLDER     keeps the lakes there, and uses those that are there already
+    --limit DB          the greatest difference that passes, 0.001 by default
+    --grids GRID...     compares only these: small, small-half-second, paper; `none` for no comparison
+    --reference FOLDER  compares with the pipeline.py in FOLDER, too
+    --variants          prints how far tapered and floored levels are from literal ones
+    --lengths           compares tapered levels of three sweep lengths
+
+Needs Python 3.11 and the PyPI packages deltalake, mcap, mcap-protobuf-support, numpy, pyarrow and scipy. Exits with 1
+if a difference is over its limit.
+"""
+
+import argparse
+import dataclasses
+import fractions
+import importlib.util
+import pathlib
+import subprocess
+import sys
+import tempfile
+import tomllib
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any
+
+import deltalake
+import numpy as np
+import numpy.typing as npt
+from mcap.reader import make_reader
+from mcap_protobuf.decoder import DecoderFactory
+from scipy.signal import resample_poly
+
+Signal = npt.NDArray[np.float64]
+
+VARIANTS = ("tapered", "floored", "literal")
+SMALL_GRID = """
+[[grid.layers]]
+points_per_side = 3
+pitch_mm = 120.0
+height_mm = 124.0
+[[grid.layers]]
+points_per_side = 1
+pitch_mm = 0.0
+height_mm = 304.0
+"""
+# Name of the grid: its text in a rig file, and the sweep's duration in seconds.
+GRIDS = {"small": (SMALL_GRID, 0.03), "small-half-second": (SMALL_GRID, 0.5), "paper": ("", 0.05)}
+# Pairs of each surface that are compared.
+PAIR_COUNT = 45
+LENGTH_SECS = (0.05, 0.5, 2.0)
+LENGTH_PANEL = "river_rock"
+LENGTH_LIMIT_DB = 0.01
+# Seeds of Flat, Foam and the panel. One seed for all gives them the same air and noise, which Foam then takes away.
+LENGTH_SEEDS = ((1, 1, 1), (1, 2, 3), (4, 5, 6))
+# The five bands and the total.
+LEVEL_COLUMNS = 6
+# Beginning of the columns: what they are over.
+OVER = {"tnce": "over Flat's total", "tnce_band": "over Flat's same band"}
+# SampleFormat of sweep_recording.proto: low bytes of all samples, then the upper two of each.
+S24_SPLIT = 5
+ACCEPTED = 1
+KELVIN = 273.15
+
+
+@dataclasses.dataclass(frozen=True)
+class RigSettings:
+    """The settings of a lake's rig that decide its numbers."""
+
+    rate_hz: float
+    low_hz: float
+    high_hz: float
+    length: int
+    reference_celsius: float
+    division: str
+    floor_db: float
+    centres_hz: tuple[float, ...]
+
+    @classmethod
+    def from_lake(cls, folder: pathlib.Path) -> "RigSettings":
+        rig = tomllib.loads((folder / "lake.toml").read_text())["rig"]
+        sweep, response = rig["sweep"], rig["impulse_response"]
+        return cls(
+            rate_hz=sweep["rate_hz"],
+            low_hz=sweep["low_hz"],
+            high_hz=sweep["high_hz"],
+            length=response["length"],
+            reference_celsius=response["reference_temperature_c"],
+            division=response["division"],
+            floor_db=response.get("floor_db", -60.0),
+            centres_hz=tuple(rig["bands"]["centres_hz"]),
+        )
+
+    def band_names(self) -> list[str]:
+        return [f"{centre:.0f}" for centre in self.centres_hz]
+
+
+@dataclasses.dataclass(frozen=True)
+class Sweep:
+    """One accepted recording, in fractions of full scale."""
+
+    recording: Signal
+    loopback: Signal
+    celsius: float
+
+
+@dataclasses.dataclass(frozen=True)
+class Derived:
+    """What a response becomes beside Foam's and Flat's of the same pair."""
+
+    curves: Signal
+    over_total: Signal
+    over_band: Signal
+    total: float
+
+
+class IndependentChain:
+    """The paper's chain: from a recording to its response, and from there to bands."""
+
+    def __init__(self, settings: RigSettings):
+        self.settings = settings
+        self.gains = self.band_gains(np.fft.rfftfreq(settings.length, 1 / settings.rate_hz).astype(np.float64))
+
+    def divide(self, recording: Signal, loopback: Signal) -> Signal:
+        """The appendix's step 1: the recording's spectrum over the loopback's."""
+        rig, count = self.settings, len(recording)
+        numerator, divisor = np.fft.rfft(recording), np.fft.rfft(loopback)
+        hz = np.fft.rfftfreq(count, 1 / rig.rate_hz)
+        inside = (hz >= rig.low_hz) & (hz <= rig.high_hz)
+        if rig.division == "literal":
+            return np.fft.irfft(numerator / divisor, count)
+        if rig.division == "floored":
+            power = np.abs(divisor) ** 2
+            least = power[inside].mean() * 10 ** (rig.floor_db / 10)
+            power = np.where(inside, power, np.maximum(power, least))
+            return np.fft.irfft(numerator * divisor.conj() / power, count)
+        # A response of this many samples resolves this width.
+        width_hz = rig.rate_hz / rig.length
+        rise = np.clip(np.minimum(hz - rig.low_hz, rig.high_hz - hz) / width_hz, 0, 1)
+        quotient = np.zeros_like(numerator)
+        np.divide(numerator, divisor, out=quotient, where=inside)
+        return np.fft.irfft(quotient * (1 - np.cos(np.pi * rise)) / 2, count)
+
+    def correct(self, response: Signal, celsius: float) -> Signal:
+        """Step 2: the time axis of the reference temperature, by SciPy's polyphase filter; then 4 ms of it."""
+        ratio = np.sqrt((KELVIN + celsius) / (KELVIN + self.settings.reference_celsius))
+        # So fine a fraction is off by a hundredth of a sample at sample 384 at most.
+        step = fractions.Fraction(float(ratio)).limit_denominator(20_000)
+        corrected: Signal = resample_poly(response, step.numerator, step.denominator)[: self.settings.length]
+        return np.pad(corrected, (0, self.settings.length - len(corrected)))
+
+    def response(self, sweep: Sweep) -> Signal:
+        return self.correct(self.divide(sweep.recording, sweep.loopback), sweep.celsius)
+
+    def band_gains(self, hz: Signal) -> Signal:
+        """Itersine windows an octave wide at -3 dB, with the cosine squared, which the paper omits in print; lowest and
+        highest band hold what remains."""
+        octaves = np.log2(np.maximum(hz, 1e-3) / self.settings.centres_hz[0])
+        gains = []
+        for band in range(len(self.settings.centres_hz)):
+            distance = octaves - band
+            if band == 0:
+                distance = np.maximum(distance, 0)
+            if band == len(self.settings.centres_hz) - 1:
+                distance = np.minimum(distance, 0)
+            window = np.sin(np.pi / 2 * np.cos(np.pi / 2 * distance) ** 2)
+            gains.append(np.where(np.abs(distance) < 1, window, 0))
+        return np.array(gains)
+
+    def bands(self, response: Signal) -> Signal:
+        return np.fft.irfft(self.gains * np.fft.rfft(response), len(response))
+
+    def derive(self, response: Signal, foam: Signal, flat: Signal) -> Derived:
+        """Step 3, Foam's subtraction, and energies over Flat's."""
+        energies = np.cumsum(self.bands(response - foam) ** 2, axis=1)
+        flat_energies = np.sum(self.bands(flat - foam) ** 2, axis=1)
+        curves = energies / flat_energies.sum()
+        last = energies[:, -1]
+        return Derived(curves, curves[:, -1], last / flat_energies, float(curves[:, -1].sum()))
+
+
+class ReferenceChain(IndependentChain):
+    """The steps of a pipeline.py. It knows the floored division alone; the other two are the chain's."""
+
+    def __init__(self, settings: RigSettings, pipeline: Any):
+        super().__init__(settings)
+        self.pipeline = pipeline
+
+    def divide(self, recording: Signal, loopback: Signal) -> Signal:
+        if self.settings.division == "floored":
+            quotient: Signal = self.pipeline.deconvolve(recording, loopback, floor_db=self.settings.floor_db)
+            return quotient
+        return super().divide(recording, loopback)
+
+    def correct(self, response: Signal, celsius: float) -> Signal:
+        cropped: Signal = self.pipeline.crop(self.pipeline.temperature_correct(response, celsius))
+        return cropped
+
+    def bands(self, response: Signal) -> Signal:
+        filtered: Signal = self.pipeline.band_filter(response)
+        return filtered
+
+    def derive(self, response: Signal, foam: Signal, flat: Signal) -> Derived:
+        subtract, bands = self.pipeline.subtract_direct, self.pipeline.band_filter
+        reflected, flat_reflected = subtract(response, foam), subtract(flat, foam)
+        curves = self.pipeline.nce(bands(reflected), flat_reflected)
+        over_total, total = self.pipeline.tnce(curves)
+        energies = [np.sum(bands(signal) ** 2, axis=1) for signal in (reflected, flat_reflected)]
+        return Derived(curves, over_total, energies[0] / energies[1], float(total))
+
+
+class MeasuredLake:
+    """A lake of simulated runs, one of each surface."""
+
+    def __init__(self, folder: pathlib.Path):
+        self.folder = folder
+        self.settings = RigSettings.from_lake(folder)
+
+    @classmethod
+    def make(cls, program: str, folder: pathlib.Path, rig: str, commands: Sequence[Sequence[str]]) -> "MeasuredLake":
+        """Runs the commands, which make the lake, unless it is there."""
+        if not (folder / "lake.toml").exists():
+            folder.parent.mkdir(parents=True, exist_ok=True)
+            rig_file = folder.with_suffix(".toml")
+            rig_file.write_text(rig)
+            partial = folder.with_suffix(".partial")
+            for command in commands:
+                arguments = [str(rig_file) if argument == "RIG" else argument for argument in command]
+                run = [program, "--lake", str(partial), *arguments]
+                done = subprocess.run(run, capture_output=True, text=True, check=False)
+                if done.returncode:
+                    raise RuntimeError(f"{' '.join(run)}\n{done.stderr}")
+            partial.rename(folder)
+        return cls(folder)
+
+    def surfaces(self) -> list[str]:
+        return sorted(path.name for path in (self.folder / "runs").iterdir())
+
+    def pairs(self) -> list[int]:
+        """Some pairs of all layers, the first and the last among them."""
+        every = sorted(self.rows("tnce", self.surfaces()[0], ["pair_id"]))
+        chosen = np.linspace(0, len(every) - 1, min(PAIR_COUNT, len(every))).round().astype(int)
+        return [every[index] for index in chosen]
+
+    def rows(self, table: str, surface: str, columns: Sequence[str]) -> dict[int, dict[str, Any]]:
+        """The rows of a surface by their pairs."""
+        read = deltalake.DeltaTable(str(self.folder / "tables" / table))
+        filters = [("surface_id", "=", surface)]
+        rows = read.to_pyarrow_table(filters=filters, columns=list({"pair_id", *columns})).to_pylist()
+        return {row["pair_id"]: row for row in rows}
+
+    def levels(self) -> dict[str, dict[str, float]]:
+        """The paper's table: a level for each surface and band."""
+        read = deltalake.DeltaTable(str(self.folder / "tables" / "surface_stats"))
+        levels: dict[str, dict[str, float]] = {}
+        for row in read.to_pyarrow_table(columns=["surface_id", "band", "p90_mean_db"]).to_pylist():
+            if row["p90_mean_db"] is not None:
+                levels.setdefault(row["surface_id"], {})[row["band"]] = row["p90_mean_db"]
+        return levels
+
+    def sweeps(self, surface: str, pairs: Iterable[int]) -> dict[int, Sweep]:
+        """The accepted recordings of some pairs."""
+        files = list((self.folder / "runs" / surface).glob("*.mcap"))
+        if len(files) != 1:
+            raise RuntimeError(f"{self.folder}: {surface} has {len(files)} runs, expected one")
+        wanted, accepted, sweeps = set(pairs), {}, {}
+        with open(files[0], "rb") as stream:
+            reader = make_reader(stream, decoder_factories=[DecoderFactory()])
+            for _, channel, _, message in reader.iter_decoded_messages(topics=["/sweep", "/measurement"]):
+                if message.pair_id not in wanted:
+                    continue
+                if channel.topic == "/measurement" and message.verdict == ACCEPTED:
+                    accepted[message.pair_id] = message.attempt
+                elif channel.topic == "/sweep":
+                    recording, loopback = (
+                        fractions_of(message, part) for part in (message.microphone, message.loopback)
+                    )
+                    sweeps[message.pair_id, message.attempt] = Sweep(recording, loopback, message.temperature_c)
+        return {pair: sweeps[pair, attempt] for pair, attempt in accepted.items()}
+
+
+def fractions_of(message: Any, data: bytes) -> Signal:
+    """Samples as fractions of full scale."""
+    if message.format != S24_SPLIT or len(data) != 3 * message.sample_count:
+        raise RuntimeError(f"format {message.format}, {len(data)} bytes of {message.sample_count} samples")
+    low = np.frombuffer(data, np.uint8, message.sample_count)
+    upper = np.frombuffer(data, "<i2", offset=message.sample_count)
+    return (upper.astype(float) * 256 + low) / 2**23
+
+
+@dataclasses.dataclass
+class Differences:
+    """The greatest differences of measurements, and how many are over a limit."""
+
+    limit_db: float
+    compared: int = 0
+    over_limit: int = 0
+    response: float = 0.0
+    levels_db: Signal = dataclasses.field(default_factory=lambda: np.zeros(4))
+
+    def add(self, here: Derived, there: Derived, responses: tuple[Signal, Signal]) -> None:
+        off_db = np.array(
+            [
+                level_difference(here.over_total, there.over_total),
+                level_difference(here.over_band, there.over_band),
+                level_difference(here.total, there.total),
+                curve_difference(here.curves, there.curves),
+            ]
+        )
+        off = np.linalg.norm(responses[0] - responses[1]) / np.linalg.norm(responses[1])
+        self.compared += 1
+        self.over_limit += bool(off_db.max() > self.limit_db)
+        self.response = max(self.response, float(off))
+        self.levels_db = np.maximum(self.levels_db, off_db)
+
+    def cells(self) -> list[str]:
+        response_db = 20 * np.log10(max(self.response, 1e-17))
+        levels = [f"{level:.6f}" if level < 0.1 else f"{level:.2f}" for level in self.levels_db]
+        return [str(self.compared), str(self.over_limit), f"{response_db:.0f}", *levels]
+
+
+DIFFERENCE_COLUMNS = [
+    "responses",
+    "bands over Flat's total",
+    "bands over Flat's same band",
+    "totals",
+    "curves",
+]
+
+
+def curve_difference(here: Signal, there: Signal) -> float:
+    """The greatest distance of two curves over the last value of theirs, as a level."""
+    last = there[:, -1]
+    return float(10 * np.log10(1 + (np.abs(here - there).max(axis=1) / last).max())) if last.all() else 0.0
+
+
+def level_difference(here: npt.ArrayLike, there: npt.ArrayLike) -> float:
+    """The greatest difference of energies, dB. Foam's are zero, and must be on both sides."""
+    a, b = np.atleast_1d(here).astype(float), np.atleast_1d(there).astype(float)
+    if ((a == 0) != (b == 0)).any():
+        return float("inf")
+    return max((abs(10 * np.log10(x / y)) for x, y in zip(a, b, strict=True) if y), default=0.0)
+
+
+def print_table(title: str, header: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
+    print(f"\n{title}\n")
+    for line in (header, ["---"] * len(header), *rows):
+        print(f"| {' | '.join(line)} |", flush=True)
+
+
+def table_values(lake: MeasuredLake, surface: str) -> dict[int, tuple[Derived, Signal]]:
+    """What the tables hold of a surface, by pair."""
+    names = lake.settings.band_names()
+    over_total, over_band = [f"tnce_{name}" for name in names], [f"tnce_band_{name}" for name in names]
+    levels = lake.rows("tnce", surface, [*over_total, *over_band, "tnce_total"])
+    curves = lake.rows("nce", surface, [f"nce_{name}" for name in names])
+    responses = lake.rows("measurements", surface, ["ir"])
+    values = {}
+    for pair, row in levels.items():
+        derived = Derived(
+            curves=np.array([curves[pair][f"nce_{name}"] for name in names], float),
+            over_total=np.array([row[name] for name in over_total]),
+            over_band=np.array([row[name] for name in over_band]),
+            total=row["tnce_total"],
+        )
+        values[pair] = (derived, np.array(responses[pair]["ir"], float))
+    return values
+
+
+# Levels and response of each surface and pair.
+MeasuredValues = dict[tuple[str, int], tuple[Derived, Signal]]
+Chains = dict[str, Callable[[RigSettings], IndependentChain]]
+
+
+def compare_lake(lake: MeasuredLake, chains: Chains, limit_db: float) -> dict[str, Differences]:
+    """The tables beside the chain, and beside the reference, and these two beside each other."""
+    pairs = lake.pairs()
+    sweeps = {surface: lake.sweeps(surface, pairs) for surface in lake.surfaces()}
+    derived: dict[str, MeasuredValues] = {"tables": {}}
+    for surface in sweeps:
+        values = table_values(lake, surface)
+        derived["tables"] |= {(surface, pair): values[pair] for pair in pairs if pair in values}
+    for name, make in chains.items():
+        chain = make(lake.settings)
+        responses = {s: {pair: chain.response(sweep) for pair, sweep in taken.items()} for s, taken in sweeps.items()}
+        foam, flat = responses["foam"], responses["flat"]
+        derived[name] = {
+            (surface, pair): (chain.derive(response, foam[pair], flat[pair]), response)
+            for surface, of_surface in responses.items()
+            for pair, response in of_surface.items()
+            if pair in foam and pair in flat
+        }
+    names = list(derived)
+    couples = [(a, b) for index, b in enumerate(names) for a in names[:index]]
+    return {f"{a} beside {b}": differences(derived[a], derived[b], limit_db) for a, b in couples}
+
+
+def differences(here: MeasuredValues, there: MeasuredValues, limit_db: float) -> Differences:
+    if here.keys() != there.keys():
+        raise RuntimeError(f"measurements of one side alone: {sorted(here.keys() ^ there.keys())}")
+    found = Differences(limit_db)
+    for key, (derived, response) in here.items():
+        found.add(derived, there[key][0], (response, there[key][1]))
+    return found
+
+
+def demo_lake(program: str, folder: pathlib.Path, grid: str, division: str) -> MeasuredLake:
+    text, secs = GRIDS[grid]
+    demo = ["demo", "--no-serve", "--rig", "RIG"]
+    return MeasuredLake.make(program, folder / f"{grid}-{division}", rig_text(text, secs, division), [demo])
+
+
+def rig_text(grid: str, secs: float, division: str) -> str:
+    return f'name = "numbers"\n[sweep]\nduration_secs = {secs}\n[impulse_response]\ndivision = "{division}"\n{grid}'
+
+
+def panel_lake(program: str, folder: pathlib.Path, secs: float, seeds: Sequence[int]) -> MeasuredLake:
+    """One panel and its references with sweeps of a length."""
+    surfaces = ("flat", "foam", LENGTH_PANEL)
+    acquire = [
+        ["acquire", "--rig", "RIG", "--seed", str(seed), "--surface", surface]
+        for seed, surface in zip(seeds, surfaces, strict=True)
+    ]
+    name = f"length-{secs}-seeds-{'-'.join(map(str, seeds))}"
+    return MeasuredLake.make(program, folder / name, rig_text(SMALL_GRID, secs, "tapered"), [*acquire, ["ingest"]])
+
+
+def check_agreement(program: str, folder: pathlib.Path, grids: Sequence[str], chains: Chains, limit_db: float) -> bool:
+    rows, right = [], True
+    for grid in grids:
+        for variant in VARIANTS:
+            lake = demo_lake(program, folder, grid, variant)
+            for sides, found in compare_lake(lake, chains, limit_db).items():
+                rows.append([grid, variant, sides, *found.cells()])
+                right &= found.over_limit == 0
+                print(f"{grid}, {variant}, {sides}: {found.over_limit} over the limit", file=sys.stderr, flush=True)
+    header = ["grid", "division", "compared", "measurements", f"over {limit_db} dB", *DIFFERENCE_COLUMNS]
+    if rows:
+        print_table("Greatest differences, dB", header, rows)
+    return right
+
+
+def band_levels(lake: MeasuredLake, surface: str, prefix: str) -> dict[int, Signal]:
+    """Levels of a surface by pair, dB: the bands, and the total with the prefix `tnce`."""
+    columns = [f"{prefix}_{name}" for name in lake.settings.band_names()]
+    columns += ["tnce_total"] if prefix == "tnce" else []
+    rows = lake.rows("tnce", surface, columns)
+    with np.errstate(divide="ignore"):
+        return {pair: 10 * np.log10([row[column] for column in columns]) for pair, row in rows.items()}
+
+
+def print_variants(program: str, folder: pathlib.Path, grid: str) -> None:
+    """Prints how far tapered and floored levels are from literal ones, from the tables alone."""
+    lakes = {variant: demo_lake(program, folder, grid, variant) for variant in VARIANTS}
+    literal = lakes["literal"]
+    rows = []
+    for variant in ("tapered", "floored"):
+        for prefix, over in OVER.items():
+            off = surface_changes(lakes[variant], literal, prefix)
+            figures = {
+                "mean": off.mean(axis=0),
+                "standard deviation": off.std(axis=0),
+                "greatest": greatest(off),
+            }
+            rows += [[variant, over, of, *signed(values)] for of, values in figures.items()]
+        changes = greatest(table_changes(lakes[variant], literal))
+        rows.append([variant, "over Flat's total", "greatest, mean up to P90 of a surface", *signed(changes)])
+    print_table(f"Levels less those of literal division, {grid} grid, dB", level_header(literal, "division"), rows)
+
+
+def surface_changes(lake: MeasuredLake, other: MeasuredLake, prefix: str) -> Signal:
+    """Changes of all measurements but those of the references that are constant."""
+    constant = {"foam"} if prefix == "tnce" else {"foam", "flat"}
+    surfaces = [surface for surface in lake.surfaces() if surface not in constant]
+    return np.concatenate([level_changes(lake, other, surface, prefix) for surface in surfaces])
+
+
+def level_changes(lake: MeasuredLake, other: MeasuredLake, surface: str, prefix: str) -> Signal:
+    here, there = band_levels(lake, surface, prefix), band_levels(other, surface, prefix)
+    return np.array([here[pair] - there[pair] for pair in sorted(here.keys() & there.keys())])
+
+
+def table_changes(lake: MeasuredLake, other: MeasuredLake) -> Signal:
+    """Changes of the paper's table, a row for each surface."""
+    here, there = lake.levels(), other.levels()
+    bands = [*lake.settings.band_names(), "total"]
+    return np.array([[here[surface][band] - there[surface][band] for band in bands] for surface in sorted(here)])
+
+
+def check_lengths(program: str, folder: pathlib.Path) -> bool:
+    """Compares lakes of one panel that differ in the sweep's length, and those that differ in the seeds alone."""
+    lakes = {(secs, seeds): panel_lake(program, folder, secs, seeds) for seeds in LENGTH_SEEDS for secs in LENGTH_SECS}
+    first_secs, shared_seeds, own_seeds, other_seeds = LENGTH_SECS[0], *LENGTH_SEEDS
+    lengths = [((secs, seeds), (first_secs, seeds)) for seeds in LENGTH_SEEDS for secs in LENGTH_SECS[1:]]
+    repeats = [((secs, other_seeds), (secs, own_seeds)) for secs in LENGTH_SECS]
+    rows, right = [], True
+    for kind, couples in (("length", lengths), ("seeds", repeats)):
+        for here, there in couples:
+            named = [f"{secs} s, {seeds}" for secs, seeds in (here, there)]
+            changes = {
+                "mean up to P90 of a surface": table_changes(lakes[here], lakes[there]),
+                **{
+                    over: level_changes(lakes[here], lakes[there], LENGTH_PANEL, prefix)
+                    for prefix, over in OVER.items()
+                },
+            }
+            # The tables must be equal; single measurements have noise, unless Foam takes it away.
+            checked = list(changes.values())[: 3 if here[1] == shared_seeds else 1]
+            right &= kind == "seeds" or all(np.abs(off).max() <= LENGTH_LIMIT_DB for off in checked)
+            rows += [[kind, *named, of, *signed(greatest(off), 4)] for of, off in changes.items()]
+    header = level_header(lakes[first_secs, shared_seeds], "what differs")
+    print_table("Greatest changes of tapered levels, dB", [header[0], "here", "there", *header[2:]], rows)
+    return right
+
+
+def level_header(lake: MeasuredLake, first: str) -> list[str]:
+    return [first, "levels", "of", *(f"{name} Hz" for name in lake.settings.band_names()), "total"]
+
+
+def greatest(changes: Signal) -> Signal:
+    """The change of each column that is farthest from zero."""
+    return np.array(changes[np.abs(changes).argmax(axis=0), range(changes.shape[1])])
+
+
+def signed(values: Iterable[float], digits: int = 2) -> list[str]:
+    """Cells of a row; there is no total over Flat's same band."""
+    cells = [f"{value:+.{digits}f}" for value in values]
+    return cells + [""] * (LEVEL_COLUMNS - len(cells))
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--program", required=True, type=lambda path: str(pathlib.Path(path).absolute()))
+    parser.add_argument("--folder", type=pathlib.Path)
+    parser.add_argument("--limit", type=float, default=0.001)
+    parser.add_argument("--grids", nargs="+", choices=[*GRIDS, "none"], default=list(GRIDS))
+    parser.add_argument("--reference", type=pathlib.Path)
+    parser.add_argument("--variants", action="store_true")
+    parser.add_argument("--lengths", action="store_true")
+    options = parser.parse_args()
+    with tempfile.TemporaryDirectory() as place:
+        return run_checks(options, options.folder or pathlib.Path(place))
+
+
+def run_checks(options: argparse.Namespace, folder: pathlib.Path) -> int:
+    chains: Chains = {"chain": IndependentChain}
+    if options.reference:
+        pipeline = load_pipeline(options.reference)
+        chains["reference"] = lambda settings: ReferenceChain(settings, pipeline)
+    grids = [grid for grid in options.grids if grid != "none"]
+    right = check_agreement(options.program, folder, grids, chains, options.limit)
+    if options.variants:
+        for grid in ("paper", "small-half-second"):
+            print_variants(options.program, folder, grid)
+    if options.lengths:
+        right &= check_lengths(options.program, folder)
+    return 0 if right else 1
+
+
+def load_pipeline(folder: pathlib.Path) -> Any:
+    spec = importlib.util.spec_from_file_location("pipeline", folder / "pipeline.py")
+    if spec is None or spec.loader is None:
+        raise RuntimeError(f"{folder} has no pipeline.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+if __name__ == "__main__":
+    sys.exit(main())
