@@ -2,11 +2,12 @@
 
 use echolake_schema::SpectralDivision;
 
-use crate::deconvolution::{DeconvolutionParams, DeconvolutionPlan, DeconvolutionScratch, TransformLength};
+use crate::deconvolution::{DeconvolutionParams, TransformLength};
 use crate::energy::{accumulate, energy, tnce_over_band};
 use crate::error::check_len;
 use crate::filter_bank::{FilterBankPlan, FilterBankScratch};
 use crate::foam::subtract;
+use crate::response_deconvolution::{ResponseDeconvolution, ResponseScratch};
 use crate::rise::{CurveShape, curve_shape};
 use crate::temperature::{TemperatureCorrection, resampling_ratio};
 use crate::{Error, RealSample};
@@ -35,7 +36,7 @@ pub struct MeasurementParams {
 
 /// Recording to response: deconvolve, correct the temperature, crop.
 pub struct MeasurementPlan<T: RealSample> {
-    deconvolution: DeconvolutionPlan<T>,
+    deconvolution: ResponseDeconvolution<T>,
     correction: TemperatureCorrection<T>,
     ir_len: usize,
     reference_celsius: f64,
@@ -43,7 +44,7 @@ pub struct MeasurementPlan<T: RealSample> {
 
 /// Buffers of a [`MeasurementPlan`].
 pub struct MeasurementScratch<T> {
-    deconvolution: DeconvolutionScratch<T>,
+    deconvolution: ResponseScratch<T>,
     raw: Vec<T>,
 }
 
@@ -51,11 +52,11 @@ impl<T: RealSample> MeasurementPlan<T> {
     /// Plans for recordings of one length.
     ///
     /// # Errors
-    /// As [`DeconvolutionPlan::new`], and [`Error::Setting`] for a reference outside of -60 to 80 C.
+    /// As [`ResponseDeconvolution::new`], and [`Error::Setting`] for a reference outside of -60 to 80 C.
     pub fn new(params: &MeasurementParams) -> Result<Self, Error> {
         check_celsius("the reference temperature (C)", params.reference_celsius)?;
         let raw_len = raw_len(params.ir_len, params.reference_celsius).min(params.recording_len);
-        let deconvolution = DeconvolutionPlan::new(DeconvolutionParams {
+        let deconvolution = ResponseDeconvolution::new(DeconvolutionParams {
             recording_len: params.recording_len,
             output_len: raw_len,
             rate_hz: params.rate_hz,
@@ -82,7 +83,7 @@ impl<T: RealSample> MeasurementPlan<T> {
     /// The response of one measurement at the reference temperature.
     ///
     /// # Errors
-    /// As [`DeconvolutionPlan::run`], and [`Error::Setting`] for a temperature outside of -60 to 80 C: the plan
+    /// As [`ResponseDeconvolution::run`], and [`Error::Setting`] for a temperature outside of -60 to 80 C: the plan
     /// has deconvolved too little for it.
     pub fn ir(
         &self,

@@ -53,6 +53,7 @@ pub mod mean;
 pub mod png;
 mod pruned;
 mod real;
+pub mod response_deconvolution;
 pub mod rise;
 pub mod spectrum;
 pub mod sweep;

@@ -6,8 +6,9 @@ mod tests;
 use std::path::Path;
 
 use echolake_dsp::chain::raw_len;
-use echolake_dsp::deconvolution::{DeconvolutionParams, DeconvolutionPlan, TransformLength};
+use echolake_dsp::deconvolution::{DeconvolutionParams, TransformLength};
 use echolake_dsp::geometry::direct_mm;
+use echolake_dsp::response_deconvolution::ResponseDeconvolution;
 use echolake_dsp::temperature::speed_of_sound;
 use echolake_schema::manifest::{Origin, RunEnd};
 use echolake_schema::messages::{AmbientSample, ImpulseResponse, Measurement, SweepRecording, Verdict};
@@ -106,7 +107,7 @@ impl WavImport<'_> {
         let (rig, celsius) = (self.rig, row.celsius.get());
         let planned = |cause| Error::Plan { rig: rig.name.clone(), cause };
         let len = microphone.fractions.len();
-        let plan = DeconvolutionPlan::<f32>::new(DeconvolutionParams {
+        let plan = ResponseDeconvolution::<f32>::new(DeconvolutionParams {
             recording_len: len,
             output_len: raw_len(rig.impulse_response.length, rig.impulse_response.reference_temperature_c.get())
                 .min(len),

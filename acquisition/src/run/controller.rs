@@ -13,7 +13,8 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use echolake_dsp::chain::raw_len;
-use echolake_dsp::deconvolution::{DeconvolutionParams, DeconvolutionPlan, DeconvolutionScratch, TransformLength};
+use echolake_dsp::deconvolution::{DeconvolutionParams, TransformLength};
+use echolake_dsp::response_deconvolution::{ResponseDeconvolution, ResponseScratch};
 use echolake_dsp::sweep::LinearSweep;
 use echolake_schema::manifest::{Origin, RunEnd};
 use echolake_schema::messages::{Measurement, Verdict};
@@ -107,8 +108,8 @@ pub struct RunController<'a> {
     grid: Grid,
     devices: RigDevices,
     output: Vec<f32>,
-    deconvolution: DeconvolutionPlan<f32>,
-    scratch: DeconvolutionScratch<f32>,
+    deconvolution: ResponseDeconvolution<f32>,
+    scratch: ResponseScratch<f32>,
     assessor: TakeAssessor,
     take: AudioTake,
     microphone: Vec<f32>,
@@ -143,7 +144,7 @@ impl<'a> RunController<'a> {
             return Err(Error::Rate { rig: rig.name.clone(), expected_hz, actual_hz });
         }
         let reference = rig.impulse_response.reference_temperature_c.get();
-        let deconvolution = DeconvolutionPlan::new(DeconvolutionParams {
+        let deconvolution = ResponseDeconvolution::new(DeconvolutionParams {
             recording_len,
             output_len: raw_len(rig.impulse_response.length, reference).min(recording_len),
             rate_hz: sweep.rate_hz.get(),
