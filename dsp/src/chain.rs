@@ -10,6 +10,7 @@ use crate::foam::subtract;
 use crate::response_deconvolution::{ResponseDeconvolution, ResponseScratch};
 use crate::rise::{CurveShape, curve_shape};
 use crate::temperature::{TemperatureCorrection, resampling_ratio};
+use crate::uncertainty::EnergySensitivity;
 use crate::{Error, RealSample};
 
 /// Coldest and warmest air that a plan is made for, C: the range of all temperatures that are accepted.
@@ -262,6 +263,20 @@ impl<T: RealSample> DerivationPlan<T> {
         let reflected = &mut scratch.bands[..ir.len()];
         subtract(ir, direct, reflected);
         self.bank.energies(reflected, energies, &mut scratch.bank)
+    }
+
+    /// Computes what errors of the direct sound do to the energies of a reflected response: `sensitivities[band]`.
+    ///
+    /// # Errors
+    /// [`Error::Length`] or [`Error::NotFinite`].
+    pub fn sensitivities(
+        &self,
+        reflected: &[T],
+        direct: &[T],
+        sensitivities: &mut [EnergySensitivity],
+        scratch: &mut DerivationScratch<T>,
+    ) -> Result<(), Error> {
+        self.bank.sensitivities(reflected, direct, sensitivities, &mut scratch.bank)
     }
 
     fn measure_flat(&self, flat: &[T], scratch: &mut DerivationScratch<T>) -> Result<(), Error> {

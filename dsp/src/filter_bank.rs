@@ -9,6 +9,7 @@ use realfft::num_complex::Complex;
 use rustfft::{Fft, FftDirection};
 
 use crate::error::check_len;
+use crate::uncertainty::{EnergySensitivity, angle};
 use crate::{Error, RealSample};
 
 /// The itersine window on |x| <= 1/2: sin(pi/2 cos^2(pi x)), 0 elsewhere.
@@ -164,6 +165,38 @@ impl<T: RealSample> FilterBankPlan<T> {
         for (gains, energy) in self.gains.chunks_exact(scratch.spectrum.len()).zip(energies) {
             let power = |(k, (c, g)): (usize, (&Complex<T>, &T))| self.weight(k) * (*g * *g * c.norm_sqr()).f64();
             *energy = scratch.spectrum.iter().zip(gains).enumerate().map(power).sum::<f64>() / self.len as f64;
+        }
+        Ok(())
+    }
+
+    /// Energy of a reflected response in each band, and what errors of the direct sound beneath it do to that energy.
+    ///
+    /// # Errors
+    /// [`Error::Length`] or [`Error::NotFinite`].
+    pub fn sensitivities(
+        &self,
+        reflected: &[T],
+        direct: &[T],
+        sensitivities: &mut [EnergySensitivity],
+        scratch: &mut FilterBankScratch<T>,
+    ) -> Result<(), Error> {
+        check_len("the sensitivities", sensitivities.len(), self.bands)?;
+        self.spectrum(direct, scratch)?;
+        let direct = scratch.spectrum.clone();
+        self.spectrum(reflected, scratch)?;
+        for (gains, sensitivity) in self.gains.chunks_exact(direct.len()).zip(sensitivities) {
+            let mut sum = EnergySensitivity::default();
+            for (bin, ((x, d), gain)) in scratch.spectrum.iter().zip(&direct).zip(gains).enumerate() {
+                let (weight, angle) = (self.weight(bin) * gain.f64().powi(2) / self.len as f64, angle(bin, self.len));
+                let (product, power) = ((x.conj() * d), d.norm_sqr().f64());
+                sum.energy += weight * x.norm_sqr().f64();
+                sum.gain += 2.0 * weight * product.re.f64();
+                sum.gain_square += weight * power;
+                // A delay adds minus the first derivative, and half of its square times the second.
+                sum.delay += 2.0 * weight * angle * product.im.f64();
+                sum.delay_square += weight * angle * angle * (power - product.re.f64());
+            }
+            *sensitivity = sum;
         }
         Ok(())
     }

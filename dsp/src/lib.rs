@@ -58,6 +58,7 @@ pub mod rise;
 pub mod spectrum;
 pub mod sweep;
 pub mod temperature;
+pub mod uncertainty;
 
 pub use error::Error;
 pub use real::RealSample;

@@ -3,16 +3,17 @@
 
 use std::sync::Arc;
 
+use echolake_dsp::uncertainty::{EnergySensitivity, LevelUncertainty};
 use echolake_lake::{EncodedFile, FileEncoder, Lake, StagedFile, encode};
-use echolake_schema::Rig;
 use echolake_schema::tables::Table;
 
 use crate::context::IngestContext;
-use crate::derived_values::{DerivedRows, RunResponses, derivation_plan};
+use crate::derived_values::{DerivedRows, RunResponses, derivation_plan, residual_fit};
 use crate::error::{Error, Result};
-use crate::references::{LoadedReferences, SharedFinder, WantedReferences};
+use crate::references::{LoadedReferences, SharedFinder, WantedReferences, arrivals};
 use crate::rows::derived::ReferenceVersions;
 use crate::rows::runs::RunReferences;
+use crate::rows::stats::SurfaceLevels;
 use crate::rows::{self, RunKeys};
 
 /// Number of measurements derived and encoded at a time: it bounds memory independently of the run's length.
@@ -75,11 +76,13 @@ impl ReferenceDerivation {
             [Table::Nce, Table::Tnce, Table::TnceD4].map(|table| (table, FileEncoder::new(table, table.schema(rig))));
         let mut totals: Vec<Vec<f64>> = vec![Vec::new(); rig.bands.centres_hz.len() + 1];
         let mut unbiased = totals.clone();
+        let mut errors = vec![Vec::new(); totals.len()];
         let mut paired = 0;
-        self.slices(rig, keys, responses, &mut |slice| {
+        self.slices(lake, keys, responses, &mut |slice| {
             paired += slice.pairs.len();
             totals.iter_mut().zip(slice.tnce_columns()).for_each(|(all, some)| all.extend(some));
             unbiased.iter_mut().zip(slice.unbiased_columns()).for_each(|(all, some)| all.extend(some));
+            errors.iter_mut().zip(slice.error_columns()).for_each(|(all, some)| all.extend(some));
             let [nce, tnce, tnce_d4] = &mut encoders;
             let lists = slice.take_lists();
             // Lists take most of the time; an idle core can encode the rest meanwhile.
@@ -96,36 +99,66 @@ impl ReferenceDerivation {
         for (table, encoder) in encoders {
             files.push((table, encoder.finish()?));
         }
-        let stats = rows::stats::rows(rig, keys, &totals, &unbiased, of)?;
+        let stats = rows::stats::rows(rig, keys, &SurfaceLevels { tnce: totals, unbiased, errors }, of)?;
         files.push((Table::SurfaceStats, encode(Table::SurfaceStats, &Table::SurfaceStats.schema(rig), &[stats])?));
         Ok((files, responses.pairs.len() - paired))
     }
 
     fn slices(
         &self,
-        rig: &Rig,
+        lake: &Lake,
         keys: &RunKeys,
         responses: &RunResponses,
         take: &mut dyn FnMut(&mut DerivedRows) -> Result<()>,
     ) -> Result<()> {
+        let rig = lake.rig();
         let (bands, length) = (rig.bands.centres_hz.len(), rig.impulse_response.length);
         let failed = |cause| Error::Kernel { file: keys.run.to_string(), cause };
         let plan = derivation_plan(rig).map_err(failed)?;
+        let levels = self.level_uncertainty(lake, keys, responses)?;
         let (mut scratch, mut derived, mut energies) = (plan.scratch(), plan.derived(), vec![0.0; bands]);
+        let mut sensitivities = vec![EnergySensitivity::default(); bands];
         let irs = responses.pairs.chunks(SLICE).zip(responses.irs.chunks(SLICE * length));
         for (pairs, irs) in irs {
             let mut slice = DerivedRows::new(bands);
             for (pair, ir) in pairs.iter().zip(irs.chunks_exact(length)) {
                 let Some((direct, flat)) = self.references.chosen.of_pair(*pair) else { continue };
-                plan.run_over(ir, direct, flat, &mut derived, &mut scratch).map_err(failed)?;
+                plan.run_over(ir, direct, &flat.energies, &mut derived, &mut scratch).map_err(failed)?;
                 slice.push(*pair, &derived);
+                if let Some(levels) = &levels {
+                    plan.sensitivities(&derived.reflected, direct, &mut sensitivities, &mut scratch).map_err(failed)?;
+                    slice.push_errors(levels, &sensitivities, flat);
+                }
                 if let Some((direct, flat)) = self.references.estimated.as_ref().and_then(|e| e.of_pair(*pair)) {
                     plan.reflected_energies(ir, direct, &mut energies, &mut scratch).map_err(failed)?;
-                    slice.push_unbiased(&energies, flat);
+                    slice.push_unbiased(&energies, &flat.energies);
                 }
             }
             take(&mut slice)?;
         }
         Ok(())
+    }
+
+    // None if what the direct sound's subtraction leaves cannot be measured.
+    fn level_uncertainty(
+        &self,
+        lake: &Lake,
+        keys: &RunKeys,
+        responses: &RunResponses,
+    ) -> Result<Option<LevelUncertainty>> {
+        let failed = |cause| Error::Kernel { file: keys.run.to_string(), cause };
+        let Some(flat) = self.references.chosen.flat_residual else { return Ok(None) };
+        let length = lake.rig().impulse_response.length;
+        let mut fit = residual_fit(lake.rig()).map_err(failed)?;
+        for (pair, ir) in responses.pairs.iter().zip(responses.irs.chunks_exact(length)) {
+            let (Some((direct, _)), Some(arrivals)) = (self.references.chosen.of_pair(*pair), arrivals(lake, *pair))
+            else {
+                continue;
+            };
+            let reflected: Vec<f32> = ir.iter().zip(direct).map(|(ir, direct)| ir - direct).collect();
+            fit.add(&reflected, direct, arrivals[0], arrivals[1]).map_err(failed)?;
+        }
+        let is_flat = self.references.only_flat.as_ref() == Some(&keys.surface);
+        Ok(fit.finish().map(|run| LevelUncertainty { run, flat, is_flat }))
     }
 }

@@ -4,17 +4,32 @@ use std::collections::HashMap;
 
 use echolake_dsp::chain::{DerivationPlan, DerivedResponse, FlatEnergies};
 use echolake_dsp::rise::CurveShape;
+use echolake_dsp::uncertainty::{EnergySensitivity, ErrorMoments, LevelUncertainty, ResidualFit};
 use echolake_schema::Rig;
 
 /// Mean impulse response of each pair of a reference.
 pub(crate) type MeanResponses = HashMap<u32, Vec<f32>>;
 
-/// Energies of each pair of Flat, with its Foam subtracted.
-pub(crate) type FlatEnergyMap = HashMap<u32, FlatEnergies>;
+/// Values of each pair of Flat.
+pub(crate) type FlatPairs = HashMap<u32, FlatPair>;
+
+/// Values of a pair of Flat without the direct sound.
+#[derive(Debug, Clone)]
+pub(crate) struct FlatPair {
+    pub(crate) energies: FlatEnergies,
+    /// `[bands]`.
+    pub(crate) sensitivities: Vec<EnergySensitivity>,
+}
 
 /// Returns the derivation plan for a rig's responses.
 pub(crate) fn derivation_plan(rig: &Rig) -> std::result::Result<DerivationPlan<f32>, echolake_dsp::Error> {
     DerivationPlan::new(rig.impulse_response.length, rig.sweep.rate_hz.get(), &rig.bands.centres_hz)
+}
+
+/// Returns a fit of what the direct sound's subtraction leaves of a rig's responses.
+pub(crate) fn residual_fit(rig: &Rig) -> std::result::Result<ResidualFit<f32>, echolake_dsp::Error> {
+    let range_hz = [rig.sweep.low_hz, rig.sweep.high_hz];
+    ResidualFit::new(rig.impulse_response.length, rig.sweep.rate_hz.get(), range_hz)
 }
 
 /// A run's impulse responses.
@@ -42,6 +57,11 @@ pub(crate) struct DerivedRows {
     shapes: Vec<Option<CurveShape>>,
     /// `[pairs x bands]`: TNCE without Foam's reflection; empty if that is not known.
     unbiased: Vec<f64>,
+    /// `[pairs x (bands + 1)]`: relative errors of TNCE, the total's last; empty if they are not known.
+    errors: Vec<ErrorMoments>,
+    /// `[pairs x (2 bands + 1)]`: standard uncertainties of levels over Flat's total, of the total, and of levels over Flat's
+    /// same band; null without energy; empty if they are not known.
+    uncertainties: Vec<Option<f64>>,
 }
 
 /// Responses and curves of [`DerivedRows`].
@@ -79,6 +99,15 @@ impl DerivedRows {
         self.unbiased.extend(energies.iter().map(|energy| energy / flat.total));
     }
 
+    /// Appends the errors of one measurement from its sensitivities and Flat's.
+    pub(crate) fn push_errors(&mut self, levels: &LevelUncertainty, of: &[EnergySensitivity], flat: &FlatPair) {
+        let (total, flat_total) = (EnergySensitivity::total(of), EnergySensitivity::total(&flat.sensitivities));
+        let over_total = || of.iter().chain([&total]);
+        self.errors.extend(over_total().map(|of| levels.relative_error(of, &flat_total)));
+        self.uncertainties.extend(over_total().map(|of| levels.level_db(of, &flat_total)));
+        self.uncertainties.extend(of.iter().zip(&flat.sensitivities).map(|(of, flat)| levels.level_db(of, flat)));
+    }
+
     /// Moves out the responses and curves, which are empty afterwards.
     pub(crate) fn take_lists(&mut self) -> DerivedLists {
         DerivedLists {
@@ -100,21 +129,39 @@ impl DerivedRows {
         columns
     }
 
-    /// Returns the values of `rise_ms_*`, `centre_ms_*` and `slope_per_ms_*`, by their names; null without energy.
+    /// Returns the values of `rise_*_ms`, `centre_*_ms` and `slope_*_per_ms`, by their names; null without energy.
     pub(crate) fn shape_columns(&self, bands: &[String], rate_hz: f64) -> Vec<(String, Vec<Option<f32>>)> {
         let per_ms = rate_hz / 1e3;
-        let quantities: [(&str, fn(&CurveShape, f64) -> f64); 3] = [
-            ("rise_ms", |shape, per_ms| shape.rise / per_ms),
-            ("centre_ms", |shape, per_ms| shape.centre / per_ms),
-            ("slope_per_ms", |shape, per_ms| shape.slope * per_ms),
-        ];
-        let column = |band: usize, value: fn(&CurveShape, f64) -> f64| {
+        let column = |band: usize, value: &dyn Fn(&CurveShape) -> f64| {
             let shapes = self.shapes.iter().skip(band).step_by(self.bands);
-            shapes.map(|shape| shape.as_ref().map(|shape| value(shape, per_ms) as f32)).collect()
+            shapes.map(|shape| shape.as_ref().map(|shape| value(shape) as f32)).collect()
         };
-        let named =
-            |(b, band): (usize, &String)| quantities.map(|(name, value)| (format!("{name}_{band}"), column(b, value)));
+        let named = |(b, band): (usize, &String)| {
+            [
+                (format!("rise_{band}_ms"), column(b, &|shape| shape.rise / per_ms)),
+                (format!("centre_{band}_ms"), column(b, &|shape| shape.centre / per_ms)),
+                (format!("slope_{band}_per_ms"), column(b, &|shape| shape.slope * per_ms)),
+            ]
+        };
         bands.iter().enumerate().flat_map(named).collect()
+    }
+
+    /// Returns the values of every column `*_u_db`, by its name; null if they are not known.
+    pub(crate) fn uncertainty_columns(&self, bands: &[String]) -> Vec<(String, Vec<Option<f32>>)> {
+        let over_total = bands.iter().map(|band| format!("tnce_{band}_u_db")).chain(["tnce_total_u_db".to_owned()]);
+        let names: Vec<_> = over_total.chain(bands.iter().map(|band| format!("tnce_band_{band}_u_db"))).collect();
+        let each = names.len();
+        let column = |at: usize| match self.uncertainties.len() {
+            0 => vec![None; self.pairs.len()],
+            _ => self.uncertainties.iter().skip(at).step_by(each).map(|u| u.map(|u| u as f32)).collect(),
+        };
+        names.into_iter().enumerate().map(|(at, name)| (name, column(at))).collect()
+    }
+
+    /// Returns the relative errors of `tnce_*` and `tnce_total`; without values if they are not known.
+    pub(crate) fn error_columns(&self) -> Vec<Vec<ErrorMoments>> {
+        let each = self.bands + 1;
+        (0..each).map(|at| self.errors.iter().skip(at).step_by(each).copied().collect()).collect()
     }
 
     /// Returns the values of `tnce_*` and `tnce_total`.

@@ -3,23 +3,23 @@
 use std::collections::{BTreeSet, HashMap};
 use std::sync::Arc;
 
-use echolake_dsp::chain::FlatEnergies;
 use echolake_dsp::foam_reflection::FoamReflectionFit;
 use echolake_dsp::geometry::{direct_mm, image_mm};
 use echolake_dsp::temperature::speed_of_sound;
+use echolake_dsp::uncertainty::{DirectSoundResidual, EnergySensitivity};
 use echolake_lake::{DataFile, DirectSound, FileName, Lake, LakeSnapshot, ReferenceSurfaces};
 use echolake_schema::tables::Table;
-use echolake_schema::{PairId, Rig, SurfaceId, SurfaceRecord};
+use echolake_schema::{PairId, SurfaceId, SurfaceRecord};
 use sha2::{Digest as _, Sha256};
 use tokio::sync::Mutex;
 
 use crate::CODE_VERSION;
-use crate::derived_values::{FlatEnergyMap, MeanResponses, derivation_plan};
+use crate::derived_values::{FlatPair, FlatPairs, MeanResponses, derivation_plan, residual_fit};
 use crate::error::{Error, Result};
 use crate::read_back;
 
 /// Revision of the rows that follow from references: those of another one are derived anew.
-const ROWS_REVISION: &str = "2";
+const ROWS_REVISION: &str = "3";
 /// Number of hex digits of a digest in a version.
 const VERSION_DIGITS: usize = 12;
 
@@ -36,11 +36,13 @@ pub(crate) struct ReferenceFinder {
     loaded: HashMap<(String, String), LoadedReferences>,
 }
 
-/// The direct sound of each pair of a surface, and the energies that normalise it.
+/// The direct sound of each pair of a surface, and Flat's values without it.
 #[derive(Debug, Clone)]
 pub(crate) struct ReferenceResponses {
     direct: Arc<MeanResponses>,
-    flat: Arc<FlatEnergyMap>,
+    flat: Arc<FlatPairs>,
+    /// Residual of Flat; None if it cannot be measured.
+    pub(crate) flat_residual: Option<DirectSoundResidual>,
 }
 
 /// References as the lake subtracts them, and those without Foam's reflection.
@@ -49,6 +51,8 @@ pub(crate) struct LoadedReferences {
     pub(crate) chosen: ReferenceResponses,
     /// None if Foam's reflection cannot be estimated: few pairs, or arrivals that are not apart.
     pub(crate) estimated: Option<ReferenceResponses>,
+    /// The surface whose only run Flat's energies are from.
+    pub(crate) only_flat: Option<SurfaceId>,
 }
 
 /// One finder for all workers: they share its cache.
@@ -140,16 +144,15 @@ impl ReferenceFinder {
         let flat = self.mean(&wanted.flat).await?;
         let estimated = estimated(&self.lake, &flat, &flat_foam, &foam)?;
         let chosen = match wanted.direct_sound {
-            DirectSound::Foam => {
-                let flat = Arc::new(flat_energies(self.lake.rig(), &flat, &flat_foam)?);
-                ReferenceResponses { direct: foam, flat }
-            }
+            DirectSound::Foam => ReferenceResponses::new(&self.lake, foam, &flat, &flat_foam)?,
             DirectSound::Estimated => estimated.clone().ok_or_else(|| Error::FoamReflection {
                 foam: wanted.foam.surface.to_string(),
                 flat: wanted.flat.surface.to_string(),
             })?,
         };
-        let loaded = LoadedReferences { chosen, estimated };
+        let flat_runs = self.snapshot.runs().filter(|run| run.surface == wanted.flat.surface).count();
+        let only_flat = (flat_runs == 1).then(|| wanted.flat.surface.clone());
+        let loaded = LoadedReferences { chosen, estimated, only_flat };
         self.loaded.insert(versions, loaded.clone());
         Ok(Some(loaded))
     }
@@ -201,10 +204,49 @@ fn names(file: &DataFile, references: &ReferenceSurfaces) -> Option<(SurfaceId, 
 }
 
 impl ReferenceResponses {
-    /// Returns the direct sound of a pair and its energies of Flat, if the references have the pair.
-    pub(crate) fn of_pair(&self, pair: u32) -> Option<(&[f32], &FlatEnergies)> {
+    // `direct` is subtracted from a surface's responses, `flat_direct` from Flat's.
+    fn new(lake: &Lake, direct: Arc<MeanResponses>, flat: &MeanResponses, flat_direct: &MeanResponses) -> Result<Self> {
+        let plan = derivation_plan(lake.rig()).map_err(failed)?;
+        let mut scratch = plan.scratch();
+        let mut residual = residual_fit(lake.rig()).map_err(failed)?;
+        let mut pairs = FlatPairs::with_capacity(flat.len());
+        for (pair, ir) in sorted(flat) {
+            let Some(direct) = flat_direct.get(&pair) else { continue };
+            let reflected: Vec<f32> = ir.iter().zip(direct).map(|(a, b)| a - b).collect();
+            let energies = plan.flat_energies(&reflected, &mut scratch).map_err(failed)?;
+            let mut sensitivities = vec![EnergySensitivity::default(); energies.bands.len()];
+            plan.sensitivities(&reflected, direct, &mut sensitivities, &mut scratch).map_err(failed)?;
+            if let Some([direct_secs, reflected_secs]) = arrivals(lake, pair) {
+                residual.add(&reflected, direct, direct_secs, reflected_secs).map_err(failed)?;
+            }
+            pairs.insert(pair, FlatPair { energies, sensitivities });
+        }
+        Ok(Self { direct, flat: Arc::new(pairs), flat_residual: residual.finish() })
+    }
+
+    /// Returns the direct sound of a pair and its values of Flat, if the references have the pair.
+    pub(crate) fn of_pair(&self, pair: u32) -> Option<(&[f32], &FlatPair)> {
         Some((self.direct.get(&pair)?.as_slice(), self.flat.get(&pair)?))
     }
+}
+
+/// Returns the arrivals of a pair's direct sound and of its reflection in the panel's plane, s.
+pub(crate) fn arrivals(lake: &Lake, pair: u32) -> Option<[f64; 2]> {
+    let points = lake.grid().pair(PairId(pair))?;
+    let position = |point| lake.grid().point(point).map(|point| point.position_mm);
+    let (microphone, speaker) = (position(points.microphone)?, position(points.speaker)?);
+    let reference_c = lake.rig().impulse_response.reference_temperature_c.get();
+    Some(
+        [direct_mm(microphone, speaker), image_mm(microphone, speaker)]
+            .map(|mm| mm / 1e3 / speed_of_sound(reference_c)),
+    )
+}
+
+// In one order, so that sums are the same in every process.
+fn sorted(means: &MeanResponses) -> Vec<(u32, &Vec<f32>)> {
+    let mut pairs: Vec<_> = means.iter().map(|(pair, ir)| (*pair, ir)).collect();
+    pairs.sort_unstable_by_key(|(pair, _)| *pair);
+    pairs
 }
 
 fn failed(cause: echolake_dsp::Error) -> Error {
@@ -218,21 +260,13 @@ fn estimated(
     flat_foam: &MeanResponses,
     foam: &MeanResponses,
 ) -> Result<Option<ReferenceResponses>> {
-    let (rig, grid) = (lake.rig(), lake.grid());
-    let reference_c = rig.impulse_response.reference_temperature_c.get();
-    let secs = |mm: f64| mm / 1e3 / speed_of_sound(reference_c);
+    let rig = lake.rig();
     let mut fit = FoamReflectionFit::new(rig.impulse_response.length, rig.sweep.rate_hz.get()).map_err(failed)?;
-    let mut pairs: Vec<_> = flat.iter().collect();
-    // In one order, so that sums are the same in every process.
-    pairs.sort_unstable_by_key(|(pair, _)| **pair);
-    for (pair, flat) in pairs {
-        let (Some(foam), Some(points)) = (flat_foam.get(pair), grid.pair(PairId(*pair))) else { continue };
-        let [Some(microphone), Some(speaker)] = [points.microphone, points.speaker].map(|p| grid.point(p)) else {
+    for (pair, flat) in sorted(flat) {
+        let (Some(foam), Some([direct_secs, reflected_secs])) = (flat_foam.get(&pair), arrivals(lake, pair)) else {
             continue;
         };
-        let (microphone, speaker) = (microphone.position_mm, speaker.position_mm);
-        let arrivals = [direct_mm(microphone, speaker), image_mm(microphone, speaker)].map(secs);
-        fit.add(foam, flat, arrivals[0], arrivals[1]).map_err(failed)?;
+        fit.add(foam, flat, direct_secs, reflected_secs).map_err(failed)?;
     }
     let Some(reflection) = fit.finish() else { return Ok(None) };
     let direct_sound = |foam: &MeanResponses| -> Result<MeanResponses> {
@@ -245,20 +279,7 @@ fn estimated(
         }
         Ok(direct)
     };
-    let flat = Arc::new(flat_energies(rig, flat, &direct_sound(flat_foam)?)?);
-    Ok(Some(ReferenceResponses { direct: Arc::new(direct_sound(foam)?), flat }))
-}
-
-fn flat_energies(rig: &Rig, flat: &MeanResponses, foam: &MeanResponses) -> Result<FlatEnergyMap> {
-    let plan = derivation_plan(rig).map_err(failed)?;
-    let mut scratch = plan.scratch();
-    let mut flats = FlatEnergyMap::with_capacity(flat.len());
-    for (pair, ir) in flat {
-        let Some(foam) = foam.get(pair) else { continue };
-        let subtracted: Vec<f32> = ir.iter().zip(foam).map(|(a, b)| a - b).collect();
-        flats.insert(*pair, plan.flat_energies(&subtracted, &mut scratch).map_err(failed)?);
-    }
-    Ok(flats)
+    ReferenceResponses::new(lake, Arc::new(direct_sound(foam)?), flat, &direct_sound(flat_foam)?).map(Some)
 }
 
 impl WantedReferences {

@@ -256,12 +256,19 @@ class MeasuredLake:
 
     def levels(self) -> dict[str, dict[str, float]]:
         """The paper's table: a level for each surface and band."""
+        surfaces = {surface: self.surface_rows(surface, ["p90_mean_db"]) for surface in self.surfaces()}
+        levels = {
+            surface: {band: row["p90_mean_db"] for band, row in rows.items() if row["p90_mean_db"] is not None}
+            for surface, rows in surfaces.items()
+        }
+        return {surface: bands for surface, bands in levels.items() if bands}
+
+    def surface_rows(self, surface: str, columns: Sequence[str]) -> dict[str, dict[str, Any]]:
+        """The rows of `surface_stats` of a surface, by band."""
         read = deltalake.DeltaTable(str(self.folder / "tables" / "surface_stats"))
-        levels: dict[str, dict[str, float]] = {}
-        for row in read.to_pyarrow_table(columns=["surface_id", "band", "p90_mean_db"]).to_pylist():
-            if row["p90_mean_db"] is not None:
-                levels.setdefault(row["surface_id"], {})[row["band"]] = row["p90_mean_db"]
-        return levels
+        filters = [("surface_id", "=", surface)]
+        rows = read.to_pyarrow_table(filters=filters, columns=["band", *columns]).to_pylist()
+        return {row["band"]: row for row in rows}
 
     def sweeps(self, surface: str, pairs: Iterable[int]) -> dict[int, Sweep]:
         """The accepted recordings of some pairs."""

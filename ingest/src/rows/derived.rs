@@ -54,7 +54,8 @@ pub(crate) fn tnce(
     let mut columns = keys.begin_rows(Table::Tnce, rig, derived.pairs.len());
     columns.pairs("", grid_pairs(grid, derived.pairs.iter()));
     energy_columns(&mut columns, rig, derived, 1);
-    for (name, values) in derived.shape_columns(&rig.band_names(), rig.sweep.rate_hz.get()) {
+    let shapes = derived.shape_columns(&rig.band_names(), rig.sweep.rate_hz.get());
+    for (name, values) in shapes.into_iter().chain(derived.uncertainty_columns(&rig.band_names())) {
         columns.floats(&name, values);
     }
     Ok(columns.text("flat_version", of.flat).text("foam_version", of.foam).finish()?)

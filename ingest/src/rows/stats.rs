@@ -1,7 +1,10 @@
 //! Rows of table `surface_stats`.
 
+use std::f64::consts::LN_10;
+
 use arrow::record_batch::RecordBatch;
 use echolake_dsp::level::{p90_mean, percentile, power_to_db};
+use echolake_dsp::uncertainty::ErrorMoments;
 use echolake_schema::Rig;
 use echolake_schema::tables::{BandStatistics, Table};
 
@@ -9,19 +12,30 @@ use super::derived::ReferenceVersions;
 use super::{RunKeys, finite};
 use crate::error::Result;
 
-/// Builds one row per band and one for the total, from the TNCE values of each over all pairs; `unbiased` are those
-/// without Foam's reflection, none if it is not known.
+/// Values of a surface's pairs, in each band and of the total.
+pub(crate) struct SurfaceLevels {
+    /// TNCE.
+    pub(crate) tnce: Vec<Vec<f64>>,
+    /// The same without Foam's reflection; none if it is not known.
+    pub(crate) unbiased: Vec<Vec<f64>>,
+    /// Relative errors of TNCE; none if they are not known.
+    pub(crate) errors: Vec<Vec<ErrorMoments>>,
+}
+
+/// Builds one row per band and one for the total.
 pub(crate) fn rows(
     rig: &Rig,
     keys: &RunKeys,
-    tnce: &[Vec<f64>],
-    unbiased: &[Vec<f64>],
+    levels: &SurfaceLevels,
     of: ReferenceVersions<'_>,
 ) -> Result<RecordBatch> {
     let names = rig.band_names().into_iter().chain(["total".to_owned()]);
-    let mut stats: Vec<_> = names.zip(tnce).map(|(band, values)| stats_of(band, values)).collect();
-    for (stats, values) in stats.iter_mut().zip(unbiased) {
+    let mut stats: Vec<_> = names.zip(&levels.tnce).map(|(band, values)| stats_of(band, values)).collect();
+    for (stats, values) in stats.iter_mut().zip(&levels.unbiased) {
         stats.unbiased_p90_mean_db = stats_of(String::new(), values).p90_mean_db;
+    }
+    for ((stats, values), errors) in stats.iter_mut().zip(&levels.tnce).zip(&levels.errors) {
+        stats.p90_mean_u_db = p90_mean_uncertainty(values, errors);
     }
     let batch = keys
         .begin_rows(Table::SurfaceStats, rig, stats.len())
@@ -35,6 +49,7 @@ pub(crate) fn rows(
         .doubles("min_db", stats.iter().map(|s| s.min_db))
         .doubles("max_db", stats.iter().map(|s| s.max_db))
         .doubles("spread_db", stats.iter().map(|s| s.spread_db))
+        .doubles("p90_mean_u_db", stats.iter().map(|s| s.p90_mean_u_db))
         .doubles("unbiased_p90_mean_db", stats.iter().map(|s| s.unbiased_p90_mean_db))
         .text("flat_version", of.flat)
         .text("foam_version", of.foam)
@@ -62,8 +77,23 @@ fn stats_of(band: String, values: &[f64]) -> BandStatistics {
         min_db: db(sorted[0]),
         max_db: db(sorted[sorted.len() - 1]),
         spread_db: spread(&levels),
+        p90_mean_u_db: None,
         unbiased_p90_mean_db: None,
     }
+}
+
+// Errors that the pairs have in common add up, the others average out.
+fn p90_mean_uncertainty(values: &[f64], errors: &[ErrorMoments]) -> Option<f64> {
+    let mut sorted: Vec<f64> = values.iter().copied().filter(|x| x.is_finite()).collect();
+    sorted.sort_by(f64::total_cmp);
+    let limit = percentile(&sorted, 90.0);
+    let (mut sum, mut common, mut variance) = (0.0, 0.0, 0.0);
+    for (value, error) in values.iter().zip(errors).filter(|(value, _)| **value > 0.0 && **value <= limit) {
+        sum += value;
+        common += value * error.mean;
+        variance += value * value * error.variance;
+    }
+    finite(10.0 / LN_10 * (common * common + variance).sqrt() / sum)
 }
 
 fn spread(levels: &[f64]) -> Option<f64> {
@@ -83,6 +113,15 @@ mod tests {
         assert!((stats.min_db.expect("there") + 10.0).abs() < 1e-12);
         assert!((stats.max_db.expect("there") - 10.0).abs() < 1e-12);
         assert!((stats.spread_db.expect("there") - (200.0f64 / 3.0).sqrt()).abs() < 1e-12);
+    }
+
+    #[test]
+    fn common_errors_stay_in_the_mean_and_others_average_out() {
+        let error = |mean, variance| vec![ErrorMoments { mean, variance }; 100];
+        let u = |errors: &[ErrorMoments]| p90_mean_uncertainty(&[0.5; 100], errors).expect("an uncertainty");
+        assert!((u(&error(0.01, 0.0)) - 0.0434).abs() < 1e-4);
+        assert!((u(&error(0.0, 1e-4)) - 0.00434).abs() < 1e-5);
+        assert_eq!(p90_mean_uncertainty(&[0.5; 100], &[]), None);
     }
 
     #[test]

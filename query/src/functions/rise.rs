@@ -45,7 +45,7 @@ static RISE: FunctionDescription = FunctionDescription {
     family: FunctionFamily::Responses,
     about: "Time in which a cumulative energy curve rises from 10 % to 90 % of its last value, in ms, interpolated \
             linearly; null without energy. A surface that spreads a reflection in time has a longer one. Columns \
-            rise_ms_* of table tnce hold it for each band.",
+            rise_*_ms of table tnce hold it for each band.",
     parameters: CURVE,
     optional: 0,
     example: "select round(rise_time([0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0]), 4) as ms",
@@ -62,7 +62,7 @@ static CENTRE: FunctionDescription = FunctionDescription {
     name: "centre_time",
     family: FunctionFamily::Responses,
     about: "Centre of gravity of the energy of a cumulative curve, in ms from its first sample; null without energy. \
-            Columns centre_ms_* of table tnce hold it for each band.",
+            Columns centre_*_ms of table tnce hold it for each band.",
     parameters: CURVE,
     optional: 0,
     example: "select centre_time([0.0, 1.0, 1.0, 1.0, 2.0]) * 96 as samples",
@@ -80,7 +80,7 @@ static SLOPE: FunctionDescription = FunctionDescription {
     family: FunctionFamily::Responses,
     about: "Mean slope of a cumulative energy curve between 10 % and 90 % of its last value, per ms: 0.8 of that value \
             over rise_time; null without energy. Rust et al. 2021 read how diffuse a reflection is from this slope. \
-            Columns slope_per_ms_* of table tnce hold it for each band.",
+            Columns slope_*_per_ms of table tnce hold it for each band.",
     parameters: CURVE,
     optional: 0,
     example: "select round(nce_slope([0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0]), 4) as per_ms",

@@ -250,6 +250,7 @@ fn tnce(bands: &[String]) -> Vec<Column> {
     let mut columns = pair_keys();
     columns.extend(energies(bands));
     columns.extend(curve_shapes(bands));
+    columns.extend(level_uncertainties(bands));
     columns.extend(references());
     columns.push(code_version());
     columns
@@ -257,15 +258,27 @@ fn tnce(bands: &[String]) -> Vec<Column> {
 
 fn curve_shapes(bands: &[String]) -> Vec<Column> {
     let quantities = [
-        ("rise_ms", "ms", "Time in which NCE rises from 10 % to 90 % of TNCE"),
-        ("centre_ms", "ms", "Centre of gravity of the reflected energy, from the response's first sample"),
-        ("slope_per_ms", "1/ms", "Mean slope of NCE between 10 % and 90 % of TNCE"),
+        ("rise", "ms", "Time in which NCE rises from 10 % to 90 % of TNCE"),
+        ("centre", "ms", "Centre of gravity of the reflected energy, from the response's first sample"),
+        ("slope", "1/ms", "Mean slope of NCE between 10 % and 90 % of TNCE"),
     ];
     let column = |band: &str, (name, unit, comment): (&str, &'static str, &str)| {
-        Column::float(format!("{name}_{band}"), unit, format!("{comment}, band at {band} Hz; null without energy"))
-            .or_null()
+        let suffix = unit.replace("1/", "per_");
+        let comment = format!("{comment}, band at {band} Hz; null without energy");
+        Column::float(format!("{name}_{band}_{suffix}"), unit, comment).or_null()
     };
     bands.iter().flat_map(|band| quantities.map(|quantity| column(band, quantity))).collect()
+}
+
+fn level_uncertainties(bands: &[String]) -> Vec<Column> {
+    const COMMENT: &str =
+        "from gain, delay and noise that the direct sound's subtraction leaves; null if it is not known";
+    let column = |name: String| {
+        let comment = format!("Standard uncertainty of the level of {name}, {COMMENT}");
+        Column::float(format!("{name}_u_db"), "dB", comment).or_null()
+    };
+    let over_total = bands.iter().map(|band| format!("tnce_{band}")).chain(["tnce_total".to_owned()]);
+    over_total.chain(bands.iter().map(|band| format!("tnce_band_{band}"))).map(column).collect()
 }
 
 fn tnce_d4(bands: &[String]) -> Vec<Column> {
@@ -334,6 +347,12 @@ fn surface_stats() -> Vec<Column> {
         Column::double("min_db", "dB re Flat", "Least TNCE").or_null(),
         Column::double("max_db", "dB re Flat", "Greatest TNCE").or_null(),
         Column::double("spread_db", "dB", "Standard deviation of TNCE in dB over the pairs").or_null(),
+        Column::double(
+            "p90_mean_u_db",
+            "dB",
+            "Standard uncertainty of p90_mean_db, from that of each measurement; null if it is not known",
+        )
+        .or_null(),
         Column::double(
             "unbiased_p90_mean_db",
             "dB re Flat",

@@ -171,6 +171,8 @@ mod tests {
         let suffixes = [
             ("_mm", "mm"),
             ("_db", "dB"),
+            ("_per_ms", "1/ms"),
+            ("_ms", "ms"),
             ("_ns", "ns"),
             ("_us", "us"),
             ("_c", "C"),

@@ -16,5 +16,7 @@ pub struct BandStatistics {
     pub max_db: Option<f64>,
     pub spread_db: Option<f64>,
     #[serde(default)]
+    pub p90_mean_u_db: Option<f64>,
+    #[serde(default)]
     pub unbiased_p90_mean_db: Option<f64>,
 }

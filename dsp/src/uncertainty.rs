@@ -1,0 +1,398 @@
+//! Standard uncertainty of levels, from what the subtraction of the direct sound leaves.
+//!
+//! Speaker and microphone are never at the same place twice, the air is never the same, and the direct sound of two runs
+//! differs by a delay and a gain. Their size is measured in each run, before the reflection arrives. What they do to a
+//! level is linear in them for most measurements; squares are kept for those whose reflection is weak.
+
+use std::f64::consts::LN_10;
+use std::sync::Arc;
+
+use realfft::num_complex::Complex;
+use realfft::{ComplexToReal, RealToComplex};
+
+use crate::error::check_len;
+use crate::{Error, RealSample};
+
+/// Least time between both arrivals of a pair that residuals are measured in, s.
+const LEAST_SEPARATION_SECS: f64 = 0.6e-3;
+/// Times before the reflection's arrival between which the measured part falls to nothing, s: the first parts of a relief
+/// reflect before the plane does.
+const GATE_SECS: [f64; 2] = [0.5e-3, 0.3e-3];
+/// Time before the direct sound's arrival up to which there is noise alone, s.
+const NOISE_SECS: f64 = 0.4e-3;
+/// Least number of pairs for an estimate.
+pub const LEAST_PAIRS: usize = 24;
+
+/// One kind of error over a run's pairs: the part that all have in common, and the variance about it.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub struct ErrorMoments {
+    /// Mean over the pairs.
+    pub mean: f64,
+    /// Variance about the mean.
+    pub variance: f64,
+}
+
+/// Difference between a run's direct sound and the one that is subtracted, and the noise.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub struct DirectSoundResidual {
+    /// Relative gain.
+    pub gain: ErrorMoments,
+    /// Delay, samples.
+    pub delay: ErrorMoments,
+    /// Power density of the noise within the sweep's range: the mean square of a sample, were it the same everywhere.
+    pub noise: f64,
+}
+
+/// Measures a run's [`DirectSoundResidual`].
+///
+/// ```
+/// use echolake_dsp::uncertainty::ResidualFit;
+///
+/// let mut fit = ResidualFit::<f64>::new(384, 96e3, [2e3, 40e3])?;
+/// let direct: Vec<f64> = (0..384).map(|n| (-(f64::from(n) - 80.0).powi(2) / 8.0).exp()).collect();
+/// let reflected: Vec<f64> = direct.iter().map(|x| 0.01 * x).collect();
+/// for _ in 0..24 {
+///     assert!(fit.add(&reflected, &direct, 80.0 / 96e3, 200.0 / 96e3)?);
+/// }
+/// let residual = fit.finish().ok_or("24 pairs are enough")?;
+/// assert!((residual.gain.mean - 0.01).abs() < 1e-9 && residual.delay.mean.abs() < 1e-9);
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
+pub struct ResidualFit<T: RealSample> {
+    rate_hz: f64,
+    len: usize,
+    forward: Arc<dyn RealToComplex<T>>,
+    inverse: Arc<dyn ComplexToReal<T>>,
+    /// Gain of each bin, over the number of samples: falls smoothly to nothing at the limits of the sweep's range, so that
+    /// nothing rings from one arrival to the other.
+    bin_gains: Vec<f64>,
+    /// Power of what is left of noise, over its density.
+    noise_share: f64,
+    gains: ErrorSums,
+    delays: ErrorSums,
+    noise: (usize, f64),
+}
+
+#[derive(Debug, Clone, Copy, Default)]
+struct ErrorSums {
+    count: usize,
+    sum: f64,
+    squares: f64,
+}
+
+/// Energy of a reflected response, and what gain and delay of the direct sound beneath it do to that energy.
+///
+/// The energy changes by `gain` times a gain, `gain_square` times its square, and the same of a delay in samples.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub struct EnergySensitivity {
+    /// Energy.
+    pub energy: f64,
+    /// Change of the energy per relative gain.
+    pub gain: f64,
+    /// Change of the energy per square of a relative gain: the direct sound's energy.
+    pub gain_square: f64,
+    /// Change of the energy per sample of delay.
+    pub delay: f64,
+    /// Change of the energy per square of a delay.
+    pub delay_square: f64,
+}
+
+/// The residuals of a run and of Flat's, whose energies are divided by one another.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct LevelUncertainty {
+    /// Residual of the run.
+    pub run: DirectSoundResidual,
+    /// Residual of Flat.
+    pub flat: DirectSoundResidual,
+    /// The run is the one that Flat's energies are from: errors of both are the same.
+    pub is_flat: bool,
+}
+
+impl<T: RealSample> ResidualFit<T> {
+    /// Begins with responses of `len` samples to sweeps of this range, Hz.
+    ///
+    /// # Errors
+    /// [`Error::Setting`] for no samples, a rate that is not finite and above 0, or a range that is not below half of it.
+    pub fn new(len: usize, rate_hz: f64, range_hz: [f64; 2]) -> Result<Self, Error> {
+        if len == 0 || !(rate_hz.is_finite() && rate_hz > 0.0) {
+            let actual = format!("{len} samples at {rate_hz} Hz");
+            return Err(Error::Setting { what: "the response", actual, expected: "samples at some kHz" });
+        }
+        let [low, high] = range_hz;
+        if !(0.0 <= low && low < high && 2.0 * high <= rate_hz) {
+            let actual = format!("{low} to {high} Hz");
+            return Err(Error::Setting { what: "the sweep's range", actual, expected: "up to half of the rate" });
+        }
+        let gain = |bin: usize| {
+            let share = (bin as f64 * rate_hz / len as f64 - low) / (high - low);
+            if (0.0..=1.0).contains(&share) { (std::f64::consts::PI * share).sin().powi(2) } else { 0.0 }
+        };
+        let smooth: Vec<f64> = (0..len / 2 + 1).map(gain).collect();
+        Ok(Self {
+            rate_hz,
+            len,
+            forward: T::plan_real_forward(len),
+            inverse: T::plan_real_inverse(len),
+            noise_share: 2.0 * smooth.iter().map(|gain| gain * gain).sum::<f64>() / len as f64,
+            bin_gains: smooth.iter().map(|gain| gain / len as f64).collect(),
+            gains: ErrorSums::default(),
+            delays: ErrorSums::default(),
+            noise: (0, 0.0),
+        })
+    }
+
+    /// Adds a pair: its response without the direct sound, the direct sound, and the arrivals of both in the panel's
+    /// plane, s. Returns false, and measures only the noise, if they arrive too soon after one another.
+    ///
+    /// # Errors
+    /// [`Error::Length`] or [`Error::NotFinite`].
+    pub fn add(&mut self, reflected: &[T], direct: &[T], direct_secs: f64, reflected_secs: f64) -> Result<bool, Error> {
+        check_len("the response", reflected.len(), self.len)?;
+        check_len("the direct sound", direct.len(), self.len)?;
+        let quiet = ((direct_secs - NOISE_SECS) * self.rate_hz).clamp(0.0, self.len as f64) as usize;
+        let spectrum = self.spectrum(reflected)?;
+        let reflected = self.signal(&spectrum, |_| Complex::new(1.0, 0.0))?;
+        self.noise.0 += quiet;
+        self.noise.1 += reflected[..quiet].iter().map(|x| x.f64().powi(2)).sum::<f64>();
+        if reflected_secs - direct_secs < LEAST_SEPARATION_SECS || !(direct_secs + reflected_secs).is_finite() {
+            return Ok(false);
+        }
+        let spectrum = self.spectrum(direct)?;
+        let direct = self.signal(&spectrum, |_| Complex::new(1.0, 0.0))?;
+        let derivative = self.signal(&spectrum, |bin| Complex::new(0.0, angle(bin, self.len)))?;
+        let gate = |n: usize| {
+            let secs = n as f64 / self.rate_hz - (reflected_secs - GATE_SECS[0]);
+            let fall = (secs / (GATE_SECS[0] - GATE_SECS[1])).clamp(0.0, 1.0);
+            0.5 + 0.5 * (std::f64::consts::PI * fall).cos()
+        };
+        // Least squares of gain x direct - delay x derivative.
+        let [mut dd, mut ds, mut ss, mut xd, mut xs] = [0.0; 5];
+        for (n, ((x, d), s)) in reflected.iter().zip(&direct).zip(&derivative).enumerate() {
+            let (weight, x, d, s) = (gate(n), x.f64(), d.f64(), -s.f64());
+            (dd, ds, ss) = (dd + weight * d * d, ds + weight * d * s, ss + weight * s * s);
+            (xd, xs) = (xd + weight * x * d, xs + weight * x * s);
+        }
+        let determinant = dd * ss - ds * ds;
+        // Arrivals at one another's side are not told apart.
+        if !(determinant > 1e-6 * dd * ss) {
+            return Ok(false);
+        }
+        self.gains.add((xd * ss - xs * ds) / determinant);
+        self.delays.add((xs * dd - xd * ds) / determinant);
+        Ok(true)
+    }
+
+    /// Computes the moments; None of fewer than [`LEAST_PAIRS`].
+    pub fn finish(self) -> Option<DirectSoundResidual> {
+        let (samples, squares) = self.noise;
+        (self.gains.count >= LEAST_PAIRS).then(|| DirectSoundResidual {
+            gain: self.gains.moments(),
+            delay: self.delays.moments(),
+            noise: if samples == 0 { 0.0 } else { squares / samples as f64 / self.noise_share },
+        })
+    }
+
+    fn spectrum(&self, signal: &[T]) -> Result<Vec<Complex<T>>, Error> {
+        let (mut signal, mut spectrum) = (signal.to_vec(), self.forward.make_output_vec());
+        let done = self.forward.process(&mut signal, &mut spectrum);
+        let finite = done.is_ok() && spectrum.first().is_some_and(|dc| dc.re.f64().is_finite());
+        finite.then_some(spectrum).ok_or(Error::NotFinite { what: "the response" })
+    }
+
+    // Within the sweep's range, times a factor of each bin.
+    fn signal(&self, spectrum: &[Complex<T>], factor: impl Fn(usize) -> Complex<f64>) -> Result<Vec<T>, Error> {
+        let bins = spectrum.iter().zip(&self.bin_gains).enumerate();
+        let mut filtered: Vec<_> = bins
+            .map(|(bin, (x, gain))| {
+                let value = Complex::new(x.re.f64(), x.im.f64()) * factor(bin) * gain;
+                Complex::new(T::of(value.re), T::of(value.im))
+            })
+            .collect();
+        // The ends of a real signal's spectrum are real.
+        filtered[0].im = T::default();
+        if self.len.is_multiple_of(2) {
+            filtered[self.len / 2].im = T::default();
+        }
+        let mut signal = self.inverse.make_output_vec();
+        let done = self.inverse.process(&mut filtered, &mut signal);
+        done.map(|()| signal).map_err(|_| Error::NotFinite { what: "the response" })
+    }
+}
+
+/// Returns a bin's angle per sample, by which a derivative multiplies it; half of the rate has none.
+pub(crate) fn angle(bin: usize, len: usize) -> f64 {
+    if 2 * bin == len { 0.0 } else { std::f64::consts::TAU * bin as f64 / len as f64 }
+}
+
+impl ErrorSums {
+    fn add(&mut self, value: f64) {
+        self.count += 1;
+        self.sum += value;
+        self.squares += value * value;
+    }
+
+    fn moments(&self) -> ErrorMoments {
+        let mean = self.sum / self.count as f64;
+        ErrorMoments { mean, variance: (self.squares / self.count as f64 - mean * mean).max(0.0) }
+    }
+}
+
+impl EnergySensitivity {
+    /// Sums the sensitivities of bands to that of their sum.
+    pub fn total(bands: &[Self]) -> Self {
+        bands.iter().fold(Self::default(), |a, b| Self {
+            energy: a.energy + b.energy,
+            gain: a.gain + b.gain,
+            gain_square: a.gain_square + b.gain_square,
+            delay: a.delay + b.delay,
+            delay_square: a.delay_square + b.delay_square,
+        })
+    }
+}
+
+impl LevelUncertainty {
+    /// Computes the relative error that a run's measurements have in common, and the variance of the rest, of the energy
+    /// of a measurement over Flat's.
+    pub fn relative_error(&self, of: &EnergySensitivity, flat: &EnergySensitivity) -> ErrorMoments {
+        let per = |s: &EnergySensitivity, change: f64| change / s.energy;
+        let kinds = [
+            (self.run.gain, self.flat.gain, [per(of, of.gain), per(flat, flat.gain)], per(of, of.gain_square)),
+            (self.run.delay, self.flat.delay, [per(of, of.delay), per(flat, flat.delay)], per(of, of.delay_square)),
+        ];
+        let mut error = ErrorMoments::default();
+        for (run, of_flat, [s, s_flat], square) in kinds {
+            if self.is_flat {
+                error.mean += run.mean * (s - s_flat);
+                error.variance += run.variance * (s - s_flat).powi(2);
+                continue;
+            }
+            error.mean += run.mean * s - of_flat.mean * s_flat;
+            // Both have Foam's error in them: half of the smaller variance.
+            let shared = run.variance.min(of_flat.variance);
+            error.variance += run.variance * s * s + of_flat.variance * s_flat * s_flat - shared * s * s_flat;
+            error.variance += 2.0 * (run.variance * square).powi(2);
+        }
+        if !self.is_flat {
+            error.variance += 4.0 * (self.run.noise / of.energy + self.flat.noise / flat.energy);
+        }
+        error
+    }
+
+    /// Computes the standard uncertainty of a level, dB; None without energy.
+    pub fn level_db(&self, of: &EnergySensitivity, flat: &EnergySensitivity) -> Option<f64> {
+        let error = self.relative_error(of, flat);
+        let db = 10.0 / LN_10 * (error.mean.powi(2) + error.variance).sqrt();
+        (of.energy > 0.0 && flat.energy > 0.0 && db.is_finite()).then_some(db)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::chain::DerivationPlan;
+
+    const LEN: usize = 384;
+    const RATE_HZ: f64 = 96e3;
+    const RANGE_HZ: [f64; 2] = [2e3, 40e3];
+
+    // Sound of 2 to 40 kHz about a fraction of a sample.
+    fn pulse(at: f64) -> Vec<f64> {
+        let sample = |n: usize| {
+            let x = n as f64 - at;
+            let sinc = |edge_hz: f64| {
+                let turns = 2.0 * edge_hz / RATE_HZ;
+                if x.abs() < 1e-9 {
+                    turns
+                } else {
+                    (std::f64::consts::PI * turns * x).sin() / (std::f64::consts::PI * x)
+                }
+            };
+            (sinc(40e3) - sinc(2e3)) * (-(x / 60.0).powi(2)).exp()
+        };
+        (0..LEN).map(sample).collect()
+    }
+
+    fn sum(a: &[f64], factor: f64, b: &[f64]) -> Vec<f64> {
+        a.iter().zip(b).map(|(a, b)| a + factor * b).collect()
+    }
+
+    #[test]
+    fn energies_change_as_told_by_gain_and_delay() {
+        let plan = DerivationPlan::new(LEN, RATE_HZ, &[2.5e3, 5e3, 10e3, 20e3, 40e3]).expect("a plan");
+        let (direct, reflected) = (pulse(80.0), sum(&pulse(84.3), 0.2, &pulse(120.0)));
+        let mut scratch = plan.scratch();
+        let mut sensitivities = |signal: &[f64]| {
+            let mut found = [EnergySensitivity::default(); 5];
+            plan.sensitivities(signal, &direct, &mut found, &mut scratch).expect("sensitivities");
+            found
+        };
+        let before = sensitivities(&reflected);
+        for (gain, delay) in [(0.02, 0.0), (0.0, 0.03)] {
+            // The direct sound of the run, later and louder than what is subtracted.
+            let left = sum(&sum(&pulse(80.0 + delay), gain, &direct), -1.0, &direct);
+            let after = sensitivities(&sum(&reflected, 1.0, &left));
+            for (before, after) in before.iter().zip(&after) {
+                let linear = before.gain * gain + before.delay * delay;
+                let square = before.gain_square * gain * gain + before.delay_square * delay * delay;
+                let (told, found) = (linear + square, after.energy - before.energy);
+                assert!((told - found).abs() < 1e-3 * before.energy, "{gain} {delay}: {told} {found}");
+            }
+        }
+    }
+
+    #[test]
+    fn delays_and_gains_are_found_before_the_reflection_and_noise_before_all() {
+        let mut fit = ResidualFit::<f64>::new(LEN, RATE_HZ, RANGE_HZ).expect("a fit");
+        let noise = |n: usize, pair: usize| {
+            let mixed = ((n + LEN * pair) as u32 ^ 0x5bd1_e995).wrapping_mul(0x9e37_79b1);
+            let mixed = (mixed ^ (mixed >> 15)).wrapping_mul(0x85eb_ca6b);
+            (f64::from(mixed ^ (mixed >> 13)) / f64::from(u32::MAX) * 2.0 - 1.0) * 1e-4
+        };
+        for pair in 0..40 {
+            let (direct, at) = (pulse(80.0), 165.0 + pair as f64);
+            let delay = if pair % 2 == 0 { 0.03 } else { 0.01 };
+            let left = sum(&sum(&pulse(80.0 + delay), 0.005, &direct), -1.0, &direct);
+            let mut reflected = sum(&left, 0.7, &pulse(at));
+            reflected.iter_mut().enumerate().for_each(|(n, x)| *x += noise(n, pair));
+            assert_eq!(fit.add(&reflected, &direct, 80.0 / RATE_HZ, at / RATE_HZ), Ok(true));
+        }
+        let found = fit.finish().expect("40 pairs");
+        assert!((found.delay.mean - 0.02).abs() < 0.001, "{found:?}");
+        assert!((found.delay.variance.sqrt() - 0.01).abs() < 0.001, "{found:?}");
+        assert!((found.gain.mean - 0.005).abs() < 0.001, "{found:?}");
+        assert!((found.noise.sqrt() / 1e-4 - 0.577).abs() < 0.06, "{found:?}");
+    }
+
+    #[test]
+    fn few_pairs_and_overlapping_arrivals_give_nothing() {
+        let mut fit = ResidualFit::<f64>::new(LEN, RATE_HZ, RANGE_HZ).expect("a fit");
+        let direct = pulse(80.0);
+        for _ in 1..LEAST_PAIRS {
+            assert_eq!(fit.add(&direct, &direct, 80.0 / RATE_HZ, 160.0 / RATE_HZ), Ok(true));
+        }
+        assert_eq!(fit.add(&direct, &direct, 80.0 / RATE_HZ, 120.0 / RATE_HZ), Ok(false));
+        assert_eq!(fit.add(&[0.0; LEN], &[0.0; LEN], 80.0 / RATE_HZ, 160.0 / RATE_HZ), Ok(false));
+        assert!(matches!(fit.add(&direct[1..], &direct, 0.0, 0.001), Err(Error::Length { .. })));
+        assert!(fit.finish().is_none());
+        for (len, rate_hz, range_hz) in [(0, RATE_HZ, RANGE_HZ), (9, f64::NAN, RANGE_HZ), (9, RATE_HZ, [2e3, 50e3])] {
+            assert!(ResidualFit::<f32>::new(len, rate_hz, range_hz).is_err());
+        }
+    }
+
+    #[test]
+    fn flat_over_itself_has_no_uncertainty_and_nothing_over_flat_has_none_to_tell() {
+        let residual = DirectSoundResidual {
+            gain: ErrorMoments { mean: 0.01, variance: 1e-4 },
+            delay: ErrorMoments { mean: 0.01, variance: 1e-4 },
+            noise: 1e-8,
+        };
+        let flat = EnergySensitivity { energy: 0.5, gain: 0.1, gain_square: 1.0, delay: 0.2, delay_square: 1.0 };
+        let mut levels = LevelUncertainty { run: residual, flat: residual, is_flat: true };
+        assert_eq!(levels.level_db(&flat, &flat), Some(0.0));
+        levels.is_flat = false;
+        // The common parts cancel, as both have them; the others do not.
+        let db = levels.level_db(&flat, &flat).expect("a level");
+        assert!((0.01..0.1).contains(&db), "{db}");
+        assert_eq!(levels.level_db(&EnergySensitivity::default(), &flat), None);
+    }
+}
