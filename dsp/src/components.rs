@@ -71,6 +71,19 @@ impl PrincipalComponents {
         self.features
     }
 
+    /// Rows.
+    pub fn rows(&self) -> usize {
+        self.rows
+    }
+
+    /// Inner products of a row with all rows, centred.
+    ///
+    /// # Panics
+    /// If there is no such row.
+    pub fn products(&self, row: usize) -> &[f64] {
+        &self.gram[row * self.rows..][..self.rows]
+    }
+
     /// Share of the variance by component; 0 if nothing varies.
     pub fn explained(&self) -> Vec<f64> {
         let all: f64 = (0..self.rows).map(|i| self.gram[i * self.rows + i]).sum();

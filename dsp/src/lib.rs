@@ -55,6 +55,7 @@ mod pruned;
 mod real;
 pub mod response_deconvolution;
 pub mod rise;
+pub mod self_organising_map;
 pub mod spectrum;
 pub mod sweep;
 pub mod temperature;

@@ -67,7 +67,7 @@ def main() -> int:
     parser.add_argument("--program", required=True, type=lambda path: str(pathlib.Path(path).absolute()))
     parser.add_argument("--folder", type=pathlib.Path)
     parser.add_argument("--runs", type=int, default=20)
-    parser.add_argument("--surfaces", nargs="+", default=["river_rock", "brick", "dome"])
+    parser.add_argument("--surfaces", nargs="+", default=["river_rock", "stretcher_bond", "macrostructure"])
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as place:
         return count_held(options, options.folder or pathlib.Path(place))
