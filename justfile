@@ -39,6 +39,10 @@ docs:
 api:
     npm run --silent --prefix web api
 
+# Measures the paper's panels on the simulated rig and writes the figures and tables of docs/paper.md.
+paper *LAKE:
+    docs/paper/make.sh {{ LAKE }}
+
 # A long form of what tests try in short: README lists them.
 campaign NAME *OPTIONS:
     cargo run --release --locked -p echolake-campaigns -- {{ NAME }} {{ OPTIONS }}

@@ -44,7 +44,8 @@ def main() -> None:
 
 def write_licences(source: Path, targets: list[str]) -> None:
     pages = page_components(source)
-    components = sorted(crate_components(source, targets) + pages + toolchain_components(targets))
+    own = [*toolchain_components(targets), figure_font(source)]
+    components = sorted(crate_components(source, targets) + pages + own)
     python = source / "python"
     (python / "THIRD-PARTY-LICENCES.txt").write_text(licence_text(components), encoding="utf-8")
     (python / "pages.cdx.json").write_text(json.dumps(page_inventory(pages), indent=1) + "\n", encoding="utf-8")
@@ -129,6 +130,12 @@ def toolchain_components(targets: list[str]) -> list[Component]:
     copyrights = [Path(folder) / "ziglang/lib/libc/musl/COPYRIGHT" for folder in sys.path]
     texts = [path.read_text(encoding="utf-8").strip() for path in copyrights if path.is_file()][:1]
     return [std, Component("musl", "1.2 (programs for musl only)", "MIT", "https://musl.libc.org", texts)]
+
+
+def figure_font(source: Path) -> Component:
+    """The font inside figures: a Latin part of IBM Plex Sans under another name."""
+    text = (source / "figures/src/font/OFL.txt").read_text(encoding="utf-8").strip()
+    return Component("IBM Plex Sans, Latin, without hints", "3.201", "OFL-1.1", "https://github.com/IBM/plex", [text])
 
 
 def licence_text(components: list[Component]) -> str:

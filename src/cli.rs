@@ -13,6 +13,8 @@ use crate::commands::doctor::{self, DoctorArgs};
 #[cfg(feature = "lake")]
 use crate::commands::export::{self, ExportCommand};
 #[cfg(feature = "lake")]
+use crate::commands::figure::{self, FigureCommand};
+#[cfg(feature = "lake")]
 use crate::commands::import::{self, ImportCommand};
 #[cfg(feature = "lake")]
 use crate::commands::ingest::{self, IngestArgs};
@@ -87,6 +89,9 @@ pub(crate) enum LakeCommand {
     /// Data out: training sets, slices of runs, SOFA, WAV, npz.
     #[command(subcommand)]
     Export(ExportCommand),
+    /// The paper's pictures and tables of surfaces, as SVG, PDF, PNG, LaTeX, CSV or Markdown.
+    #[command(subcommand)]
+    Figure(FigureCommand),
     /// Serve the catalogue, and the lake over HTTP, Arrow Flight SQL and Postgres' protocol, for reading.
     Serve(ServeArgs),
     /// Answer one client's queries, as a child of `serve`.
@@ -147,6 +152,7 @@ impl LakeCommand {
             Self::Ingest(args) => ingest::run(args, lake).await,
             Self::Sql(args) => sql::run(args, lake).await.map(|()| CommandOutcome::Whole),
             Self::Export(args) => export::run(args, lake).await,
+            Self::Figure(args) => figure::run(args, lake).await,
             Self::Serve(args) => serve::run(args, lake).await,
             Self::Engine(args) => serve::engine(args, lake).await,
             Self::Token { name } => serve::token(name),

@@ -5,6 +5,7 @@ mod acquire_kills;
 mod bad_input;
 mod child;
 mod end_to_end;
+mod figure;
 mod forgetful;
 mod fuzz;
 mod hostile_files;

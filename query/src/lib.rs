@@ -27,6 +27,7 @@ mod catalog;
 mod control;
 mod engine;
 mod error;
+pub mod figure_rows;
 mod functions;
 mod gate;
 mod mcap;

@@ -7,6 +7,8 @@ pub(crate) mod doctor;
 #[cfg(feature = "lake")]
 pub(crate) mod export;
 #[cfg(feature = "lake")]
+pub(crate) mod figure;
+#[cfg(feature = "lake")]
 pub(crate) mod import;
 #[cfg(feature = "lake")]
 pub(crate) mod ingest;

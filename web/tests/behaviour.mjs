@@ -43,44 +43,50 @@ function expected(db) {
   return Array(3).fill(Math.round((255 * Math.min(20, -db)) / 20))
 }
 
-await check('the grid plot’s pixels have the colours that SQL says', async () => {
+await check('the grid plot’s cells have the colours that SQL says', async () => {
   const microphone = 14
   await open(`/surfaces/${id}?microphone=${microphone}`)
   await settled()
   const columns = lake.bands
-    .map((b) => `10 * log10(${b.key === 'total' ? 'tnce_total' : `tnce_${b.key}`}) as "${b.key}"`)
+    .map((b) => `10 * log10(${b.key === 'total' ? 'tnce_total' : `tnce_band_${b.key}`}) as "${b.key}"`)
     .join(', ')
   const rows = await sql(
     `select case when microphone = ${microphone} then speaker else microphone end as point, ${columns} from tnce where surface_id = '${id}' and (microphone = ${microphone} or speaker = ${microphone})`,
   )
-  const width = await page.evaluate(() => document.querySelector('.cells canvas').width)
-  // Layers across in equal columns, bands down: found from the outside by the plot's size alone.
-  const left = 58
-  const side = Math.floor((width - left - 10 * (lake.layers - 1)) / lake.layers)
-  const wanted = rows.flatMap((row) => {
-    const point = lake.points[row.point]
-    const across = new Set(lake.points.filter((p) => p.layer === point.layer).map((p) => p.gridx)).size
-    const size = across === 1 ? Math.floor(side / 3) : Math.floor((side - 2) / across)
-    const inset = Math.floor((side - size * across) / 2)
-    return lake.bands.map((band, b) => ({
-      x: left + point.layer * (side + 10) + inset + point.gridx * size + 3,
-      y: 22 + b * (side + 10) + inset + (across - 1 - point.gridy) * size + 3,
-      db: row[band.key],
-      what: `point ${row.point}, band ${band.key}`,
-    }))
-  })
   const drawn = () =>
-    page.evaluate((places) => {
-      const canvas = document.querySelector('.cells canvas')
-      const { data } = canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height)
-      return places.map(({ x, y }) => [...data.slice(4 * (y * canvas.width + x), 4 * (y * canvas.width + x) + 3)])
-    }, wanted)
+    page.evaluate(() =>
+      Object.fromEntries(
+        [...document.querySelectorAll('.cells [data-point]')].map((cell) => [
+          `${cell.dataset.row}/${cell.dataset.point}`,
+          getComputedStyle(cell).fill.match(/\d+/g).map(Number),
+        ]),
+      ),
+    )
   await eventually(async () => {
     const colours = await drawn()
-    wanted.forEach((cell, i) => assert.deepEqual(colours[i], expected(cell.db), `${cell.what}, ${cell.db} dB`))
+    for (const row of rows)
+      lake.bands.forEach((band, b) => {
+        const what = `point ${row.point}, band ${band.key}, ${row[band.key]} dB`
+        assert.deepEqual(colours[`${b}/${row.point}`], expected(row[band.key]), what)
+      })
+    assert.ok(Object.keys(colours).length > 300, `${Object.keys(colours).length} cells`)
   })
-  const seen = wanted.length
-  assert.ok(seen > 300, `${seen} cells`)
+})
+
+await check('grid plots of Flat are black, and Compare shows the same as Surface', async () => {
+  const flat = all.items.find((s) => s.surface_id === id).flat_reference
+  const fills = () =>
+    page.evaluate(() => [...document.querySelectorAll('.cells [data-point]')].map((c) => getComputedStyle(c).fill))
+  await open(`/surfaces/${flat}`)
+  await eventually(async () => {
+    const black = (await fills()).filter((fill) => /^rgb\([0-2], [0-2], [0-2]\)$/.test(fill)).length
+    assert.ok(black > 300, `${black} black cells`)
+  })
+  await open(`/compare?s=${id}`)
+  await eventually(async () => assert.ok((await fills()).length > 50))
+  const compared = await fills()
+  await open(`/surfaces/${id}`)
+  await eventually(async () => assert.deepEqual((await fills()).slice(-compared.length), compared))
 })
 
 await check('a facet click changes the address and the counts, and a fresh link shows the same', async () => {

@@ -56,9 +56,8 @@ async function opened(path, ready) {
 
 const CARDS = `() => document.querySelectorAll('.sheet li').length > 0`
 const PICTURES = `() => { const seen = [...document.querySelectorAll('.sheet li img')].filter((i) => i.getBoundingClientRect().top < innerHeight); return seen.length > 0 && seen.every((i) => i.complete && i.naturalWidth > 0) }`
-// A cell of the grid plot has its colour, and the curves are drawn.
-const SURFACE = `() => { const canvas = document.querySelector('.cells canvas'); return canvas?.width > 10 && document.querySelector('.uplot canvas')?.width > 10
-  && [...canvas.getContext('2d').getImageData(58, 22, 120, 120).data].some((v, i) => i % 4 === 0 && v > 0) }`
+// The cells of the grid plot and the curves are drawn.
+const SURFACE = `() => document.querySelectorAll('.cells [data-point]').length > 100 && document.querySelector('.uplot canvas')?.width > 10`
 
 async function firstView() {
   const scripts = new Map()

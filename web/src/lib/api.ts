@@ -34,11 +34,14 @@ const KEPT = 120
 const FRESH_MS = 30_000
 const kept = new Map<string, { readonly since: number; readonly answer: Promise<unknown> }>()
 
-/** Builds an address of the API. */
-export function apiHref(path: string, params: Record<string, string | number | null | undefined> = {}): string {
+type Param = string | number | null | undefined
+
+/** Builds an address of the API. A list is a parameter several times. */
+export function apiHref(path: string, params: Record<string, Param | readonly string[]> = {}): string {
   const search = new URLSearchParams()
   for (const [name, value] of Object.entries(params))
-    if (value !== null && value !== undefined) search.set(name, String(value))
+    for (const one of Array.isArray(value) ? (value as readonly string[]) : [value as Param])
+      if (one !== null && one !== undefined) search.append(name, String(one))
   const text = search.toString()
   return `/api/v1${path}${text ? `?${text}` : ''}`
 }
@@ -83,6 +86,9 @@ function remember<T>(href: string, make: () => Promise<T>): Promise<T> {
 
 /** A JSON answer. */
 export const get = <T>(href: string): Promise<T> => remember(href, async () => (await ask(href)).json() as Promise<T>)
+
+/** A figure that the server draws, as SVG. */
+export const figure = (href: string): Promise<string> => remember(href, async () => (await ask(href)).text())
 
 /** A surface's heights in mm. */
 export const heightmap = (id: string): Promise<Float32Array> =>

@@ -325,6 +325,23 @@ export interface paths {
         readonly patch?: never;
         readonly trace?: never;
     };
+    readonly "/api/v1/surfaces/{surface_id}/curves.svg": {
+        readonly parameters: {
+            readonly query?: never;
+            readonly header?: never;
+            readonly path?: never;
+            readonly cookie?: never;
+        };
+        /** NCE by band, a mean over pairs, stacked, beside Flat's total; drawn. */
+        readonly get: operations["curves_figure"];
+        readonly put?: never;
+        readonly post?: never;
+        readonly delete?: never;
+        readonly options?: never;
+        readonly head?: never;
+        readonly patch?: never;
+        readonly trace?: never;
+    };
     readonly "/api/v1/surfaces/{surface_id}/grid": {
         readonly parameters: {
             readonly query?: never;
@@ -337,6 +354,26 @@ export interface paths {
          * @description Pairs that were measured the other way round are used by reciprocity and marked.
          */
         readonly get: operations["grid"];
+        readonly put?: never;
+        readonly post?: never;
+        readonly delete?: never;
+        readonly options?: never;
+        readonly head?: never;
+        readonly patch?: never;
+        readonly trace?: never;
+    };
+    readonly "/api/v1/surfaces/{surface_id}/grid.svg": {
+        readonly parameters: {
+            readonly query?: never;
+            readonly header?: never;
+            readonly path?: never;
+            readonly cookie?: never;
+        };
+        /**
+         * TNCE over the grid for one microphone point, drawn.
+         * @description White is -20 dB, black 0 dB, red 6 dB. Cells have `data-row` (band) and `data-point`.
+         */
+        readonly get: operations["grid_figure"];
         readonly put?: never;
         readonly post?: never;
         readonly delete?: never;
@@ -1614,6 +1651,46 @@ export interface operations {
             readonly default: components["responses"]["Problem"];
         };
     };
+    readonly curves_figure: {
+        readonly parameters: {
+            readonly query?: {
+                /** @description A grid point. */
+                readonly microphone?: number;
+                readonly points?: number;
+                /** @description Surfaces beside this one. */
+                readonly beside?: readonly string[];
+                readonly frame?: "caption" | "bare";
+                /** @description Width of a surface's plot, px. */
+                readonly width?: number;
+            };
+            readonly header?: never;
+            readonly path: {
+                readonly surface_id: string;
+            };
+            readonly cookie?: never;
+        };
+        readonly requestBody?: never;
+        readonly responses: {
+            /** @description OK */
+            readonly 200: {
+                headers: {
+                    readonly ETag?: string;
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "image/svg+xml": string;
+                };
+            };
+            /** @description Not changed since the ETag of If-None-Match */
+            readonly 304: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content?: never;
+            };
+            readonly default: components["responses"]["Problem"];
+        };
+    };
     readonly grid: {
         readonly parameters: {
             readonly query: {
@@ -1638,6 +1715,52 @@ export interface operations {
                 };
                 content: {
                     readonly "application/json": components["schemas"]["Grid"];
+                };
+            };
+            /** @description Not changed since the ETag of If-None-Match */
+            readonly 304: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content?: never;
+            };
+            readonly default: components["responses"]["Problem"];
+        };
+    };
+    readonly grid_figure: {
+        readonly parameters: {
+            readonly query: {
+                /** @description A grid point. */
+                readonly microphone: number;
+                /** @description As of grid; here the paper's is the default. */
+                readonly over?: ("flat-total" | "flat-band") & Record<string, never>;
+                /** @description Surfaces beside this one. */
+                readonly beside?: readonly string[];
+                /** @description A surface whose levels are subtracted from those of the others. */
+                readonly less?: string;
+                /** @description Key of the only band, as in `lake.bands`; all if there is none. */
+                readonly band?: string;
+                readonly palette?: "paper" | "safe";
+                readonly frame?: "caption" | "bare";
+                /** @description Width of a surface's plot, px. */
+                readonly width?: number;
+            };
+            readonly header?: never;
+            readonly path: {
+                readonly surface_id: string;
+            };
+            readonly cookie?: never;
+        };
+        readonly requestBody?: never;
+        readonly responses: {
+            /** @description OK */
+            readonly 200: {
+                headers: {
+                    readonly ETag?: string;
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "image/svg+xml": string;
                 };
             };
             /** @description Not changed since the ETag of If-None-Match */

@@ -6,6 +6,7 @@ use arrow::array::{ArrayRef, Float64Array};
 use arrow::record_batch::RecordBatch;
 use axum::Extension;
 use datafusion::common::ScalarValue;
+use echolake_query::figure_rows::{CurveRow, curves_query, thinned_samples};
 use echolake_schema::Rig;
 use serde::{Deserialize, Serialize};
 use utoipa::{IntoParams, ToSchema};
@@ -20,26 +21,19 @@ use crate::fault::RequestFault;
 #[derive(Serialize, ToSchema)]
 pub(super) struct CurveSet {
     pub(super) time_ms: Vec<f64>,
-    surface: SurfaceCurves,
-    flat: SurfaceCurves,
+    pub(super) surface: SurfaceCurves,
+    pub(super) flat: SurfaceCurves,
 }
 
 /// Curves of a surface.
 #[derive(Clone, Serialize, ToSchema)]
 #[schema(as = Curves)]
-struct SurfaceCurves {
+pub(super) struct SurfaceCurves {
     surface_id: String,
     /// Measurements that the mean is over.
     pairs: i64,
     /// By band (no total), then by time: NCE over Flat's total, linear.
-    bands: Vec<Vec<f32>>,
-}
-
-#[derive(Deserialize)]
-struct CurveRow {
-    surface_id: String,
-    pairs: i64,
-    bands: Vec<Option<Vec<f32>>>,
+    pub(super) bands: Vec<Vec<f32>>,
 }
 
 /// The pairs of which a mean is taken.
@@ -70,16 +64,11 @@ impl CurveSet {
     ) -> Result<Self, RequestFault> {
         let rig = request.catalogue.lake().rig();
         let (filter, value) = over.filter();
-        let means: Vec<_> = rig.band_names().iter().map(|band| format!("avg_list(nce_{band})")).collect();
-        let sql = format!(
-            "select surface_id, count(*) as pairs, make_array({}) as bands from nce \
-             where surface_id in ($1, $2){filter} group by surface_id",
-            means.join(", ")
-        );
+        let sql = curves_query(rig, "$1, $2", filter);
         let (id, flat) = (&entry.surface.surface_id, &entry.surface.flat_reference);
         let values = [text(id), text(flat)].into_iter().chain(value).collect();
         let rows: Vec<CurveRow> = request.rows(&sql, values).await?;
-        let kept = indices(rig.impulse_response.length, points);
+        let kept = thinned_samples(rig.impulse_response.length, points);
         let of = |surface: &str| thinned_curves(surface, rows.iter().find(|row| row.surface_id == surface), rig, &kept);
         Ok(Self { time_ms: times_ms(rig, &kept), surface: of(id), flat: of(flat) })
     }
@@ -107,23 +96,17 @@ impl CurveSet {
     }
 }
 
-fn thinned_curves(surface: &str, row: Option<&CurveRow>, rig: &Rig, kept: &[usize]) -> SurfaceCurves {
-    let thin = |curve: &Option<Vec<f32>>| {
-        let curve = curve.as_deref().unwrap_or_default();
-        kept.iter().filter_map(|i| curve.get(*i).copied()).collect()
-    };
-    let bands =
-        row.map_or_else(|| vec![Vec::new(); rig.band_names().len()], |row| row.bands.iter().map(thin).collect());
-    SurfaceCurves { surface_id: surface.to_owned(), pairs: row.map_or(0, |row| row.pairs), bands }
+impl SurfaceCurves {
+    /// Returns the sum over the bands.
+    pub(super) fn total(&self) -> Vec<f32> {
+        let length = self.bands.first().map_or(0, Vec::len);
+        (0..length).map(|i| self.bands.iter().filter_map(|band| band.get(i)).sum()).collect()
+    }
 }
 
-// First and last sample are always kept.
-fn indices(length: usize, points: usize) -> Vec<usize> {
-    if length <= points {
-        return (0..length).collect();
-    }
-    let step = (length - 1) as f64 / (points - 1) as f64;
-    (0..points).map(|i| (i as f64 * step).round() as usize).collect()
+fn thinned_curves(surface: &str, row: Option<&CurveRow>, rig: &Rig, kept: &[usize]) -> SurfaceCurves {
+    let bands = row.map_or_else(|| vec![Vec::new(); rig.band_names().len()], |row| row.thinned(kept));
+    SurfaceCurves { surface_id: surface.to_owned(), pairs: row.map_or(0, |row| row.pairs), bands }
 }
 
 fn times_ms(rig: &Rig, kept: &[usize]) -> Vec<f64> {
@@ -175,17 +158,4 @@ pub(super) async fn curves(
         true => AnswerContent::arrow(&set.batch(request.catalogue.lake().rig())?)?,
         false => AnswerContent::json(&set)?,
     })
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn decimation_keeps_both_ends() {
-        assert_eq!(indices(4, 16), [0, 1, 2, 3]);
-        let kept = indices(384, 192);
-        assert_eq!((kept.len(), kept[0], kept[191]), (192, 0, 383));
-        assert!(kept.windows(2).all(|two| two[0] < two[1]));
-    }
 }

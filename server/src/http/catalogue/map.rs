@@ -3,12 +3,13 @@
 use axum::Extension;
 use datafusion::common::ScalarValue;
 use echolake_dsp::components::PrincipalComponents;
+use echolake_query::figure_rows::{LevelVectors, level_vectors_query};
 use serde::{Deserialize, Serialize};
 use utoipa::{IntoParams, ToSchema};
 
 use super::super::extract::{QueryParams, WholeNumber};
 use super::content::{AnswerContent, EndpointAnswer};
-use super::positions::{LevelVectors, SurfaceNeighbour, SurfacePositions};
+use super::positions::{SurfaceNeighbour, SurfacePositions};
 use super::request::CatalogueRequest;
 use crate::fault::RequestFault;
 
@@ -101,19 +102,14 @@ async fn find_positions(request: &CatalogueRequest) -> Result<SurfacePositions, 
     let pairs = request.catalogue.lake().grid().pairs().len();
     let products = names.len() * names.len() / 2 * pairs * bands.len();
     let step = products.div_ceil(MOST_PRODUCTS).max(1);
-    let mut vectors = LevelVectors::new(&names, pairs.div_ceil(step), bands.len(), step);
-    let columns: Vec<_> = bands.iter().map(|b| format!("cast(10 * log10(tnce_band_{b}) as float)")).collect();
-    let sql = format!("select surface_id, pair_id, {} from tnce where pair_id % $1 = 0", numbered(&columns).join(", "));
+    let mut vectors = LevelVectors::new(&names, pairs, bands.len(), step);
+    let sql = level_vectors_query(rig, "$1");
     let mut rows = request.batches(&sql, vec![ScalarValue::Int32(i32::try_from(step).ok())]).await?;
     while let Some(batch) = rows.next().await? {
-        vectors.add(&batch)?;
+        vectors.add(&batch).map_err(RequestFault::defect("the map's columns are not as expected"))?;
     }
     let found =
         request.catalogue.service().crunch(move || PrincipalComponents::of(&mut vectors.rows, COMPONENTS)).await?;
     let components = found.map_err(RequestFault::defect("surfaces have no places"))?;
     Ok(SurfacePositions { names, components })
-}
-
-fn numbered(columns: &[String]) -> Vec<String> {
-    columns.iter().enumerate().map(|(i, column)| format!("{column} as band_{i}")).collect()
 }

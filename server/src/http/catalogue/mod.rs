@@ -10,6 +10,7 @@ mod correlations;
 mod curves;
 mod environment;
 mod facets;
+mod figures;
 mod lake;
 mod map;
 mod pair;
@@ -54,6 +55,8 @@ pub(super) fn table_routes() -> OpenApiRouter {
         .routes(routes!(surface::surface))
         .routes(routes!(surface::grid))
         .routes(routes!(curves::curves))
+        .routes(routes!(figures::grid_figure))
+        .routes(routes!(figures::curves_figure))
         .routes(routes!(relief::heightmap))
         .routes(routes!(relief::thumbnail))
         .routes(routes!(pair::pair))

@@ -5,11 +5,11 @@ use std::sync::Arc;
 use arrow::array::{ArrayRef, Float64Array};
 use arrow::record_batch::RecordBatch;
 use axum::Extension;
+use echolake_query::figure_rows::{TOTAL_BAND, band_list, levels_db};
 use serde::{Deserialize, Serialize};
 use utoipa::{IntoParams, ToSchema};
 
 use super::super::extract::{BinaryContent, PathParams};
-use super::bands::{TOTAL, band_list, levels_db};
 use super::content::{AnswerContent, EndpointAnswer};
 use super::curves::{CurveSet, PairSelection};
 use super::environment::{AirReading, AirSeries};
@@ -294,7 +294,8 @@ async fn energies(
 ) -> Result<PairEnergies, RequestFault> {
     let rig = request.catalogue.lake().rig();
     let total = band_list(rig, |band| format!("tnce_{band}"));
-    let band = band_list(rig, |band| if band == TOTAL { "tnce_total".into() } else { format!("tnce_band_{band}") });
+    let band =
+        band_list(rig, |band| if band == TOTAL_BAND { "tnce_total".into() } else { format!("tnce_band_{band}") });
     let sql = format!(
         "select {total} as total, {band} as band from tnce where surface_id = $1 and pair_id = $2 and run_id = $3"
     );

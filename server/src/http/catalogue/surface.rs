@@ -3,15 +3,15 @@
 use std::collections::HashMap;
 
 use axum::Extension;
+use echolake_query::figure_rows::{GridCell, GridLevels, LevelReference, band_list, grid_query};
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 use utoipa::{IntoParams, ToSchema};
 
 use super::super::extract::{PathParams, QueryParams};
-use super::bands::{band_list, levels_db};
 use super::content::{AnswerContent, EndpointAnswer};
 use super::request::{CatalogueRequest, SurfacePath, number, text};
-use super::summary::SurfaceSummary;
+use super::summary::{SurfaceEntry, SurfaceSummary};
 use crate::fault::RequestFault;
 
 /// One surface.
@@ -124,14 +124,6 @@ struct SurfaceGrid<'a> {
     bands: Vec<Vec<Option<f64>>>,
 }
 
-#[derive(Deserialize)]
-struct GridCell {
-    pair_id: i32,
-    microphone: usize,
-    speaker: usize,
-    energies: Vec<Option<f64>>,
-}
-
 /// The point and the levels of a grid.
 #[derive(Deserialize, IntoParams)]
 #[into_params(parameter_in = Query)]
@@ -149,7 +141,7 @@ pub(super) struct GridQuery {
 #[derive(Clone, Copy, Default, PartialEq, Eq, Deserialize, Serialize, ToSchema)]
 #[serde(rename_all = "kebab-case")]
 #[schema(default = "flat-total")]
-enum GridNormalisation {
+pub(super) enum GridNormalisation {
     #[default]
     FlatTotal,
     FlatBand,
@@ -175,43 +167,47 @@ pub(super) async fn grid(
     QueryParams(query): QueryParams<GridQuery>,
 ) -> EndpointAnswer {
     let entry = request.surface(&path.surface_id).await?;
-    let microphone =
-        query.microphone.ok_or_else(|| RequestFault::request("`microphone` is missing; hint: a grid point"))?;
-    let microphone = request.microphone(&microphone)?;
-    let column = |band: &str| match band == super::bands::TOTAL || query.over == GridNormalisation::FlatTotal {
-        true => format!("avg(tnce_{band})"),
-        false => format!("avg(tnce_band_{band})"),
-    };
-    let energies = band_list(request.catalogue.lake().rig(), column);
-    let sql = format!(
-        "select pair_id, microphone, speaker, {energies} as energies from tnce \
-         where surface_id = $1 and (microphone = $2 or speaker = $2) group by pair_id, microphone, speaker"
-    );
-    let mut cells: Vec<GridCell> =
-        request.rows(&sql, vec![text(&entry.surface.surface_id), number(microphone)]).await?;
-    // If both directions were measured, the requested one counts.
-    cells.sort_by_key(|cell| cell.microphone == microphone);
-    let points = request.catalogue.lake().grid().points().len();
-    let bands = request.summary().await?.bands.len();
-    let mut grid = SurfaceGrid {
+    let microphone = required_microphone(&request, query.microphone.as_deref())?;
+    let levels = read_grid(&request, entry, microphone, query.over).await?;
+    Ok(AnswerContent::json(&SurfaceGrid {
         surface_id: &entry.surface.surface_id,
         microphone,
         over: query.over,
-        pairs: vec![None; points],
-        swapped: vec![false; points],
-        bands: vec![vec![None; points]; bands],
-    };
-    for cell in cells {
-        let swapped = cell.microphone != microphone;
-        let other = if swapped { cell.microphone } else { cell.speaker };
-        if other >= points {
-            continue;
-        }
-        grid.pairs[other] = Some(cell.pair_id);
-        grid.swapped[other] = swapped;
-        for (band, level) in grid.bands.iter_mut().zip(levels_db(&cell.energies)) {
-            band[other] = level;
+        pairs: levels.pairs,
+        swapped: levels.swapped,
+        bands: levels.bands,
+    })?)
+}
+
+impl From<GridNormalisation> for LevelReference {
+    fn from(over: GridNormalisation) -> Self {
+        match over {
+            GridNormalisation::FlatTotal => Self::FlatTotal,
+            GridNormalisation::FlatBand => Self::FlatBand,
         }
     }
-    Ok(AnswerContent::json(&grid)?)
+}
+
+/// The microphone's point of a request that must name one.
+///
+/// # Errors
+/// [`RequestFault::Request`] if it names none.
+pub(super) fn required_microphone(request: &CatalogueRequest, named: Option<&str>) -> Result<usize, RequestFault> {
+    request.microphone(named.ok_or_else(|| RequestFault::request("`microphone` is missing; hint: a grid point"))?)
+}
+
+/// Reads the levels of a surface over the grid.
+///
+/// # Errors
+/// Those of its query.
+pub(super) async fn read_grid(
+    request: &CatalogueRequest,
+    entry: &SurfaceEntry,
+    microphone: usize,
+    over: GridNormalisation,
+) -> Result<GridLevels, RequestFault> {
+    let sql = grid_query(request.catalogue.lake().rig(), over.into(), "$1", "$2");
+    let cells: Vec<GridCell> = request.rows(&sql, vec![text(&entry.surface.surface_id), number(microphone)]).await?;
+    let points = request.catalogue.lake().grid().points().len();
+    Ok(GridLevels::from_cells(cells, microphone, points, request.summary().await?.bands.len()))
 }

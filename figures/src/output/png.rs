@@ -1,0 +1,222 @@
+//! A drawing as PNG, at twice its size.
+
+use echolake_dsp::png;
+use ttf_parser::OutlineBuilder;
+use zeno::{Cap, Command, Join, Mask, Stroke, Style, Transform, Vector};
+
+use super::{ellipse_curves, text_offset};
+use crate::drawing::{DrawnShape, FigureColour, FigureDrawing, ShapeGeometry, StrokeStyle};
+use crate::font::{advance, face, glyphs, outline, text_width};
+
+/// Pixels per px of a drawing: 192 dots per inch.
+const SCALE: f32 = 2.0;
+/// Pixels that are drawn at a time: their memory does not depend on the drawing's size.
+const STRIP_PIXELS: usize = 4 << 20;
+/// More than half the widest line.
+const MOST_STROKE_PX: f32 = 4.0;
+
+impl FigureDrawing {
+    /// Returns the drawing as a PNG file; its notes are texts of the file.
+    pub fn to_png(&self) -> Vec<u8> {
+        let [width, height] = [self.width_px, self.height_px].map(|length| (length * SCALE).ceil().max(1.0) as usize);
+        let extents: Vec<_> = self.shapes.iter().map(|shape| vertical_extent(&shape.geometry)).collect();
+        let strip_rows = (STRIP_PIXELS / width).clamp(1, height);
+        let strips = (0..height).step_by(strip_rows).map(|top| {
+            let rows = strip_rows.min(height - top);
+            let pixels = FigureColour::Paper.rgb().map(f32::from).repeat(width * rows);
+            let mut canvas = PixelStrip { pixels, width, top, rows };
+            let [first, last] = [top, top + rows].map(|row| row as f32 / SCALE);
+            let shown = self.shapes.iter().zip(&extents).filter(|(_, [from, to])| *to >= first && *from <= last);
+            shown.for_each(|(shape, _)| canvas.draw(shape));
+            canvas.pixels.iter().map(|part| part.round() as u8).collect::<Vec<u8>>()
+        });
+        png::coloured(strips, [width, height], &self.notes.named())
+    }
+}
+
+/// Returns the rows, px, that a shape touches at most.
+fn vertical_extent(geometry: &ShapeGeometry) -> [f32; 2] {
+    let [from, to] = match geometry {
+        ShapeGeometry::Rect { y, height, .. } => [*y, y + height],
+        ShapeGeometry::Picture { y, side, .. } => [*y, y + side],
+        ShapeGeometry::Path { points, .. } => {
+            points.iter().fold([f32::MAX, f32::MIN], |[from, to], [_, y]| [from.min(*y), to.max(*y)])
+        }
+        ShapeGeometry::Ellipse { centre, radii, .. } => {
+            let reach = radii[0].max(radii[1]);
+            [centre[1] - reach, centre[1] + reach]
+        }
+        ShapeGeometry::Text { at, text, size_px, upwards, .. } => {
+            let reach = if *upwards { text_width(text, *size_px) } else { *size_px };
+            [at[1] - reach, at[1] + reach]
+        }
+    };
+    [from - MOST_STROKE_PX, to + MOST_STROKE_PX]
+}
+
+/// Some rows of opaque pixels, red, green and blue from 0 to 255; fractions count where many faint shapes overlap.
+struct PixelStrip {
+    pixels: Vec<f32>,
+    width: usize,
+    /// The picture's row that is its first.
+    top: usize,
+    rows: usize,
+}
+
+impl PixelStrip {
+    fn draw(&mut self, shape: &DrawnShape) {
+        match (&shape.geometry, shape.fill) {
+            (ShapeGeometry::Picture { x, y, side, pixels, columns }, _) => {
+                return self.draw_picture([*x, *y], *side, pixels, *columns);
+            }
+            // Cells that touch must not show the page between them: no part of a pixel is covered.
+            (ShapeGeometry::Rect { x, y, width, height }, Some(fill)) => {
+                self.fill_rect([*x, *y], [*width, *height], fill.rgb());
+            }
+            (geometry, Some(fill)) => {
+                let (path, placed) = path_of(geometry);
+                self.cover(&path, placed, Style::default(), fill.rgb(), shape.opacity);
+            }
+            (_, None) => {}
+        }
+        if let Some(StrokeStyle { colour, width_px, dash_px }) = shape.stroke {
+            let (path, placed) = path_of(&shape.geometry);
+            let dashes = [dash_px, dash_px];
+            let mut stroke = Stroke::new(width_px);
+            stroke.cap(Cap::Butt).join(Join::Round);
+            if dash_px > 0.0 {
+                stroke.dash(&dashes, 0.0);
+            }
+            self.cover(&path, placed, stroke.into(), colour.rgb(), 1.0);
+        }
+    }
+
+    fn cover(&mut self, path: &[Command], placed: Transform, style: Style<'_>, rgb: [u8; 3], opacity: f32) {
+        let transform = placed.then_scale(SCALE, SCALE).then_translate(0.0, -(self.top as f32));
+        let (coverage, place) = Mask::new(path).style(style).transform(Some(transform)).render();
+        let columns = place.width as usize;
+        for (row, line) in coverage.chunks_exact(columns.max(1)).enumerate() {
+            let Ok(y) = usize::try_from(place.top + row as i32) else { continue };
+            for (column, share) in line.iter().enumerate().filter(|(_, share)| **share > 0) {
+                if let Ok(x) = usize::try_from(place.left + column as i32) {
+                    self.blend(x, y, rgb, opacity * f32::from(*share) / 255.0);
+                }
+            }
+        }
+    }
+
+    fn blend(&mut self, x: usize, y: usize, rgb: [u8; 3], share: f32) {
+        if x >= self.width || y >= self.rows {
+            return;
+        }
+        let at = 3 * (y * self.width + x);
+        for (below, above) in self.pixels[at..at + 3].iter_mut().zip(rgb) {
+            *below += (f32::from(above) - *below) * share;
+        }
+    }
+
+    fn fill_rect(&mut self, [x, y]: [f32; 2], [width, height]: [f32; 2], rgb: [u8; 3]) {
+        let edge =
+            |at: f32, from: usize, count: usize| ((at * SCALE).round() - from as f32).clamp(0.0, count as f32) as usize;
+        let [left, right] = [x, x + width].map(|at| edge(at, 0, self.width));
+        let [first, end] = [y, y + height].map(|at| edge(at, self.top, self.rows));
+        for row in first..end {
+            for pixel in self.pixels[3 * (row * self.width + left)..3 * (row * self.width + right)].chunks_exact_mut(3)
+            {
+                pixel.copy_from_slice(&rgb.map(f32::from));
+            }
+        }
+    }
+
+    // The nearest cell's brightness.
+    fn draw_picture(&mut self, [x, y]: [f32; 2], side: f32, pixels: &[u8], columns: usize) {
+        let count = (side * SCALE).round() as usize;
+        let [left, top] = [x, y].map(|at| (at * SCALE).round() as usize);
+        for (row, column) in (0..count).flat_map(|row| (0..count).map(move |column| (row, column))) {
+            let cell = (row * columns / count) * columns + column * columns / count;
+            if let (Some(grey), Some(y)) = (pixels.get(cell), (top + row).checked_sub(self.top)) {
+                self.blend(left + column, y, [*grey; 3], 1.0);
+            }
+        }
+    }
+}
+
+fn path_of(geometry: &ShapeGeometry) -> (Vec<Command>, Transform) {
+    let mut path = Vec::new();
+    let mut placed = Transform::IDENTITY;
+    match geometry {
+        ShapeGeometry::Rect { x, y, width, height } => {
+            let corners = [[*x, *y], [x + width, *y], [x + width, y + height], [*x, y + height]];
+            push_lines(&mut path, &corners, true);
+        }
+        ShapeGeometry::Path { points, closed } => push_lines(&mut path, points, *closed),
+        ShapeGeometry::Ellipse { centre, radii, angle_deg } => {
+            let (start, curves) = ellipse_curves(*radii);
+            path.push(Command::MoveTo(start.into()));
+            path.extend(curves.map(|[a, b, to]| Command::CurveTo(a.into(), b.into(), to.into())));
+            path.push(Command::Close);
+            let (sin, cos) = angle_deg.to_radians().sin_cos();
+            placed = Transform::new(cos, sin, -sin, cos, centre[0], centre[1]);
+        }
+        ShapeGeometry::Text { at, text, size_px, anchor, upwards } => {
+            let em = face().map_or(0.0, |face| size_px / f32::from(face.units_per_em()));
+            let mut pen = GlyphPen { path, x: text_offset(text, *size_px, *anchor), em };
+            for glyph in glyphs(text) {
+                outline(glyph, &mut pen);
+                pen.x += advance(glyph) * size_px;
+            }
+            path = pen.path;
+            placed = match upwards {
+                true => Transform::new(0.0, -1.0, 1.0, 0.0, at[0], at[1]),
+                false => Transform::translation(at[0], at[1]),
+            };
+        }
+        ShapeGeometry::Picture { .. } => {}
+    }
+    (path, placed)
+}
+
+fn push_lines(path: &mut Vec<Command>, points: &[[f32; 2]], closed: bool) {
+    for (i, point) in points.iter().enumerate() {
+        let point = Vector::from(*point);
+        path.push(if i == 0 { Command::MoveTo(point) } else { Command::LineTo(point) });
+    }
+    if closed {
+        path.push(Command::Close);
+    }
+}
+
+/// Adds glyphs to a path, from units of the font, whose y is upwards.
+struct GlyphPen {
+    path: Vec<Command>,
+    x: f32,
+    em: f32,
+}
+
+impl GlyphPen {
+    fn at(&self, x: f32, y: f32) -> Vector {
+        Vector::new(self.x + x * self.em, -y * self.em)
+    }
+}
+
+impl OutlineBuilder for GlyphPen {
+    fn move_to(&mut self, x: f32, y: f32) {
+        self.path.push(Command::MoveTo(self.at(x, y)));
+    }
+
+    fn line_to(&mut self, x: f32, y: f32) {
+        self.path.push(Command::LineTo(self.at(x, y)));
+    }
+
+    fn quad_to(&mut self, x1: f32, y1: f32, x: f32, y: f32) {
+        self.path.push(Command::QuadTo(self.at(x1, y1), self.at(x, y)));
+    }
+
+    fn curve_to(&mut self, x1: f32, y1: f32, x2: f32, y2: f32, x: f32, y: f32) {
+        self.path.push(Command::CurveTo(self.at(x1, y1), self.at(x2, y2), self.at(x, y)));
+    }
+
+    fn close(&mut self) {
+        self.path.push(Command::Close);
+    }
+}

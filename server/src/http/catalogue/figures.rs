@@ -1,0 +1,247 @@
+//! Figures of surfaces as SVG: what `echolake figure` writes, for the pages, which show them.
+
+use axum::Extension;
+use echolake_figures::{FigureNotes, GridFigure, GridLayer, GridPanel, LevelPalette, NceFigure, NcePanel};
+use echolake_query::figure_rows::{LevelReference, band_labels, curves_query, grid_query, lake_version, quoted};
+use serde::Deserialize;
+use utoipa::{IntoParams, ToSchema};
+
+use super::super::extract::{BinaryContent, PathParams, QueryParams, WholeNumber};
+use super::content::{AnswerContent, EndpointAnswer};
+use super::curves::{CurveSet, PairSelection};
+use super::request::{CatalogueRequest, SurfacePath};
+use super::summary::SurfaceEntry;
+use super::surface::{GridNormalisation, read_grid, required_microphone};
+use crate::fault::RequestFault;
+
+const SVG: &str = "image/svg+xml";
+/// Surfaces of one figure.
+const MOST_SURFACES: usize = 8;
+/// Surfaces in a row.
+const COLUMNS: usize = 4;
+
+/// The surroundings of a figure.
+#[derive(Clone, Copy, Default, PartialEq, Eq, Deserialize, ToSchema)]
+#[serde(rename_all = "lowercase")]
+#[schema(default = "caption")]
+enum FigureFrame {
+    /// Titles, scale and origin, for a file.
+    #[default]
+    Caption,
+    /// None of them, for a page that has them.
+    Bare,
+}
+
+/// The colour of levels over 0 dB.
+#[derive(Clone, Copy, Default, Deserialize, ToSchema)]
+#[serde(rename_all = "lowercase")]
+#[schema(default = "paper")]
+enum FigurePalette {
+    #[default]
+    Paper,
+    Safe,
+}
+
+/// The contents of a grid plot.
+#[derive(Deserialize, IntoParams)]
+#[into_params(parameter_in = Query)]
+pub(super) struct GridFigureQuery {
+    /// A grid point.
+    #[param(value_type = usize, required = true)]
+    microphone: Option<String>,
+    /// As of grid; here the paper's is the default.
+    #[serde(default = "flat_band")]
+    #[param(inline, default = "flat-band")]
+    over: GridNormalisation,
+    /// Surfaces beside this one.
+    #[serde(default)]
+    beside: Vec<String>,
+    /// A surface whose levels are subtracted from those of the others.
+    less: Option<String>,
+    /// Key of the only band, as in `lake.bands`; all if there is none.
+    band: Option<String>,
+    #[serde(default)]
+    #[param(inline)]
+    palette: FigurePalette,
+    #[serde(default)]
+    #[param(inline)]
+    frame: FigureFrame,
+    /// Width of a surface's plot, px.
+    #[serde(default)]
+    #[param(inline)]
+    width: WholeNumber<160, 1200, 560>,
+}
+
+fn flat_band() -> GridNormalisation {
+    GridNormalisation::FlatBand
+}
+
+/// TNCE over the grid for one microphone point, drawn.
+///
+/// White is -20 dB, black 0 dB, red 6 dB. Cells have `data-row` (band) and `data-point`.
+#[utoipa::path(
+    get,
+    path = "/api/v1/surfaces/{surface_id}/grid.svg",
+    tag = "catalogue",
+    params(SurfacePath, GridFigureQuery),
+    responses((status = 200, description = "OK", body = inline(BinaryContent), content_type = "image/svg+xml")),
+    extensions(("x-sql" = json!(["as of grid"])))
+)]
+pub(super) async fn grid_figure(
+    Extension(request): Extension<CatalogueRequest>,
+    PathParams(path): PathParams<SurfacePath>,
+    QueryParams(query): QueryParams<GridFigureQuery>,
+) -> EndpointAnswer {
+    let entries = surfaces(&request, &path.surface_id, &query.beside).await?;
+    let microphone = required_microphone(&request, query.microphone.as_deref())?;
+    let lake = request.catalogue.lake();
+    let keys = &request.summary().await?.bands;
+    let shown: Vec<usize> = match &query.band {
+        None => (0..keys.len()).collect(),
+        Some(key) => vec![keys.iter().position(|band| band.key == *key).ok_or_else(|| {
+            RequestFault::request(format!("`band` is `{key}`; hint: a key of `bands` of GET /api/v1/lake"))
+        })?],
+    };
+    let base = match &query.less {
+        Some(name) => {
+            let entry = request.surface(name).await?;
+            Some((entry, read_grid(&request, entry, microphone, query.over).await?))
+        }
+        None => None,
+    };
+    let mut panels = Vec::new();
+    for entry in &entries {
+        let id = &entry.surface.surface_id;
+        let levels = read_grid(&request, entry, microphone, query.over).await?;
+        let base = base.as_ref().map(|(entry, base)| (entry.surface.surface_id.as_str(), &base.bands[..]));
+        panels.push(GridPanel::new(id, &levels.bands, &shown, base));
+    }
+    let labels = band_labels(lake.rig());
+    let over = LevelReference::from(query.over);
+    let point = lake.grid().points().get(microphone).map(|point| point.label()).unwrap_or_default();
+    let figure = GridFigure {
+        bands: shown.iter().map(|band| labels[*band].clone()).collect(),
+        layers: GridLayer::from_grid(lake.grid()),
+        microphone,
+        panels,
+        palette: match query.palette {
+            FigurePalette::Paper => LevelPalette::Paper,
+            FigurePalette::Safe => LevelPalette::Safe,
+        },
+        panel_px: query.width.get() as f32,
+        columns: COLUMNS,
+        with_caption: query.frame == FigureFrame::Caption,
+    };
+    let mut options = vec![format!("--microphone {microphone}")];
+    options.extend((over == LevelReference::FlatTotal).then(|| "--over total".to_owned()));
+    options.extend(query.band.iter().map(|band| format!("--band {band}")));
+    options.extend(base.iter().map(|(base, _)| format!("--less {}", base.surface.surface_id)));
+    options.extend((figure.palette == LevelPalette::Safe).then(|| "--safe-colours".to_owned()));
+    let used: Vec<_> = entries.iter().copied().chain(base.iter().map(|(base, _)| *base)).collect();
+    let notes = FigureNotes {
+        title: GridFigure::default_title(&point, over.name()),
+        command: command("grid", &entries, &options),
+        query: grid_query(lake.rig(), over, &quoted(&path.surface_id), &microphone.to_string()),
+        ..notes(&request, &used)
+    };
+    Ok(AnswerContent::new(SVG, figure.draw(&notes).to_svg()))
+}
+
+/// The contents of a plot of NCE curves.
+#[derive(Default, Deserialize, IntoParams)]
+#[serde(default)]
+#[into_params(parameter_in = Query)]
+pub(super) struct CurvesFigureQuery {
+    /// A grid point.
+    #[param(value_type = usize, required = false)]
+    microphone: Option<String>,
+    #[param(inline)]
+    points: WholeNumber<16, 4096, 192>,
+    /// Surfaces beside this one.
+    beside: Vec<String>,
+    #[param(inline)]
+    frame: FigureFrame,
+    /// Width of a surface's plot, px.
+    #[param(inline)]
+    width: WholeNumber<160, 1200, 560>,
+}
+
+/// NCE by band, a mean over pairs, stacked, beside Flat's total; drawn.
+#[utoipa::path(
+    get,
+    path = "/api/v1/surfaces/{surface_id}/curves.svg",
+    tag = "catalogue",
+    params(SurfacePath, CurvesFigureQuery),
+    responses((status = 200, description = "OK", body = inline(BinaryContent), content_type = "image/svg+xml")),
+    extensions(("x-sql" = json!(["as of curves"])))
+)]
+pub(super) async fn curves_figure(
+    Extension(request): Extension<CatalogueRequest>,
+    PathParams(path): PathParams<SurfacePath>,
+    QueryParams(query): QueryParams<CurvesFigureQuery>,
+) -> EndpointAnswer {
+    let entries = surfaces(&request, &path.surface_id, &query.beside).await?;
+    let microphone = query.microphone.as_deref().map(|point| request.microphone(point)).transpose()?;
+    let rig = request.catalogue.lake().rig();
+    let mut time_ms = Vec::new();
+    let mut panels = Vec::new();
+    for entry in &entries {
+        let over = microphone.map_or(PairSelection::All, PairSelection::Point);
+        let set = CurveSet::read(&request, entry, over, query.points.get()).await?;
+        let flat_total = set.flat.total();
+        panels.push(NcePanel { title: entry.surface.surface_id.clone(), bands: set.surface.bands, flat_total });
+        time_ms = set.time_ms;
+    }
+    let mut bands = band_labels(rig);
+    bands.pop();
+    let with_caption = query.frame == FigureFrame::Caption;
+    let panel_px = query.width.get() as f32;
+    let figure = NceFigure { bands, time_ms, panels, panel_px, columns: COLUMNS, with_caption };
+    let point = microphone.and_then(|point| request.catalogue.lake().grid().points().get(point));
+    let filter =
+        microphone.map_or_else(String::new, |point| format!(" and (microphone = {point} or speaker = {point})"));
+    let options: Vec<_> = microphone.iter().map(|point| format!("--microphone {point}")).collect();
+    let notes = FigureNotes {
+        title: NceFigure::default_title(point.map(|point| point.label()).as_deref()),
+        command: command("nce", &entries, &options),
+        query: curves_query(rig, &quoted(&path.surface_id), &filter),
+        ..notes(&request, &entries)
+    };
+    Ok(AnswerContent::new(SVG, figure.draw(&notes).to_svg()))
+}
+
+async fn surfaces<'a>(
+    request: &'a CatalogueRequest,
+    first: &str,
+    beside: &[String],
+) -> Result<Vec<&'a SurfaceEntry>, RequestFault> {
+    if beside.len() >= MOST_SURFACES {
+        let text = format!("`beside` is there {} times; hint: {} at most", beside.len(), MOST_SURFACES - 1);
+        return Err(RequestFault::request(text));
+    }
+    let mut entries = vec![request.surface(first).await?];
+    for name in beside {
+        entries.push(request.surface(name).await?);
+    }
+    Ok(entries)
+}
+
+/// Returns the command that writes the same figure to a file.
+fn command(kind: &str, entries: &[&SurfaceEntry], options: &[String]) -> String {
+    let names = entries.iter().map(|entry| entry.surface.surface_id.as_str());
+    let words: Vec<_> =
+        ["echolake figure", kind].into_iter().chain(names).chain(options.iter().map(String::as_str)).collect();
+    words.join(" ")
+}
+
+fn notes(request: &CatalogueRequest, entries: &[&SurfaceEntry]) -> FigureNotes {
+    let mut origins: Vec<_> = entries.iter().map(|entry| entry.surface.origin.clone()).collect();
+    origins.sort();
+    origins.dedup();
+    FigureNotes {
+        lake: lake_version(&request.view.snapshot),
+        program: concat!("echolake ", env!("CARGO_PKG_VERSION")).into(),
+        origins,
+        ..FigureNotes::default()
+    }
+}

@@ -1,0 +1,195 @@
+//! `echolake figure`: the paper's pictures and tables as files.
+
+mod calculated;
+mod output;
+mod source;
+mod surfaces;
+mod tables;
+
+use clap::{Args, Subcommand, ValueEnum};
+use echolake_lake::Lake;
+use echolake_query::figure_rows::LevelReference;
+use echolake_schema::SurfaceId;
+
+use crate::CommandOutcome;
+use output::OutputArgs;
+use source::FigureSource;
+
+#[derive(Debug, Subcommand)]
+pub(crate) enum FigureCommand {
+    /// TNCE of each point's pair with one microphone point, layers across, bands down.
+    Grid(GridArgs),
+    /// NCE curves stacked by band, beside Flat's total.
+    Nce(NceArgs),
+    /// A table of surfaces by band.
+    Table(TableArgs),
+    /// The filter bank.
+    Filters(FiltersArgs),
+    /// First Fresnel zones of a layer's pairs on the panel.
+    Coverage(CoverageArgs),
+    /// A response in three rows: measured, corrected, direct sound removed.
+    Steps(StepsArgs),
+    /// Surfaces as points, close together if they reflect alike.
+    Map(MapArgs),
+    /// Reliefs in oblique light.
+    Relief(ReliefArgs),
+}
+
+/// The surfaces of a figure, in this order.
+#[derive(Debug, Args)]
+pub(super) struct SelectionArgs {
+    /// Names of surfaces.
+    #[arg(value_name = "SURFACE", required_unless_present = "predicate")]
+    surfaces: Vec<SurfaceId>,
+    /// More surfaces: an SQL predicate over the columns of table surfaces.
+    #[arg(long = "where", value_name = "PREDICATE")]
+    predicate: Option<String>,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct GridArgs {
+    #[command(flatten)]
+    selection: SelectionArgs,
+    #[command(flatten)]
+    output: OutputArgs,
+    /// Grid point of the microphone: a number, layer/x/y, or x y z in mm. By default that in the middle of layer 0.
+    #[arg(long, value_name = "POINT")]
+    microphone: Option<String>,
+    /// Normalisation of the bands: Flat's same band, as in the paper's grid plots, or its total, as in its tables.
+    #[arg(long, value_enum, default_value_t = OverArg::Band)]
+    over: OverArg,
+    /// Only this band: its centre in Hz, or total.
+    #[arg(long)]
+    band: Option<String>,
+    /// Subtract the levels of this surface from those of the others.
+    #[arg(long, value_name = "SURFACE")]
+    less: Option<SurfaceId>,
+    /// Amber in place of red, and a square in each cell over 0 dB.
+    #[arg(long)]
+    safe_colours: bool,
+    /// Surfaces in a row.
+    #[arg(long, default_value_t = 3, value_parser = clap::value_parser!(u32).range(1..=20))]
+    columns: u32,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+enum OverArg {
+    Band,
+    Total,
+}
+
+impl From<OverArg> for LevelReference {
+    fn from(over: OverArg) -> Self {
+        match over {
+            OverArg::Band => Self::FlatBand,
+            OverArg::Total => Self::FlatTotal,
+        }
+    }
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct NceArgs {
+    #[command(flatten)]
+    selection: SelectionArgs,
+    #[command(flatten)]
+    output: OutputArgs,
+    /// Grid point whose pairs the mean is over; by default it is over all pairs.
+    #[arg(long, value_name = "POINT")]
+    microphone: Option<String>,
+    /// Surfaces in a row.
+    #[arg(long, default_value_t = 3, value_parser = clap::value_parser!(u32).range(1..=20))]
+    columns: u32,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct TableArgs {
+    #[command(flatten)]
+    selection: SelectionArgs,
+    #[command(flatten)]
+    output: OutputArgs,
+    /// Values of the table.
+    #[arg(long, value_enum, default_value_t = ValuesArg::Levels)]
+    values: ValuesArg,
+    /// Subtract the levels of this surface from those of the others.
+    #[arg(long, value_name = "SURFACE")]
+    less: Option<SurfaceId>,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+enum ValuesArg {
+    /// Mean of the TNCE values up to their 90th percentile, dB over Flat's total.
+    Levels,
+    /// The same without Foam's own reflection, which is estimated.
+    UnbiasedLevels,
+    /// Mean TNCE over the pairs, linear, beside Flat's, with the difference in per cent.
+    Energies,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct FiltersArgs {
+    #[command(flatten)]
+    output: OutputArgs,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct CoverageArgs {
+    #[command(flatten)]
+    output: OutputArgs,
+    /// Layer of both points, 0 the lowest.
+    #[arg(long, default_value_t = 0)]
+    layer: u32,
+    /// Frequencies in Hz; by default the sweep's limits, the upper one first.
+    #[arg(long, value_delimiter = ',', value_name = "HZ")]
+    frequencies: Vec<f64>,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct StepsArgs {
+    /// Name of the surface.
+    #[arg(value_name = "SURFACE")]
+    surface: SurfaceId,
+    #[command(flatten)]
+    output: OutputArgs,
+    /// The pair.
+    #[arg(long, default_value_t = 0)]
+    pair: u32,
+    /// Temperatures that the second row corrects, as if it had been measured at them; by default the measured one. The
+    /// paper shows 30 and 15.
+    #[arg(long, value_delimiter = ',', value_name = "C", allow_negative_numbers = true)]
+    celsius: Vec<f64>,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct MapArgs {
+    #[command(flatten)]
+    output: OutputArgs,
+    /// Which surfaces: an SQL predicate over the columns of table surfaces; by default all but Foam.
+    #[arg(long = "where", value_name = "PREDICATE")]
+    predicate: Option<String>,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct ReliefArgs {
+    #[command(flatten)]
+    selection: SelectionArgs,
+    #[command(flatten)]
+    output: OutputArgs,
+    /// Surfaces in a row.
+    #[arg(long, default_value_t = 4, value_parser = clap::value_parser!(u32).range(1..=20))]
+    columns: u32,
+}
+
+pub(crate) async fn run(command: &FigureCommand, lake_url: &str) -> anyhow::Result<CommandOutcome> {
+    let source = FigureSource::open(Lake::open(lake_url).await?).await?;
+    match command {
+        FigureCommand::Grid(args) => surfaces::write_grid(&source, args).await?,
+        FigureCommand::Nce(args) => surfaces::write_nce(&source, args).await?,
+        FigureCommand::Table(args) => tables::write_table(&source, args).await?,
+        FigureCommand::Filters(args) => calculated::write_filters(&source, args)?,
+        FigureCommand::Coverage(args) => calculated::write_coverage(&source, args)?,
+        FigureCommand::Steps(args) => surfaces::write_steps(&source, args).await?,
+        FigureCommand::Map(args) => surfaces::write_map(&source, args).await?,
+        FigureCommand::Relief(args) => surfaces::write_relief(&source, args).await?,
+    }
+    Ok(CommandOutcome::Whole)
+}

@@ -1,0 +1,130 @@
+//! The files that figures go to: their names, their formats by extension, and what they say of themselves.
+
+use std::io::Write as _;
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context as _, bail};
+use clap::Args;
+use echolake_figures::{FigureDrawing, FigureNotes, FigureTable};
+
+use super::source::SelectedSurface;
+
+/// The part of a file's name that stands for a surface.
+const PLACEHOLDER: &str = "{surface}";
+/// Options whose values are of the machine, and not of the figure.
+const LOCAL_OPTIONS: [&str; 4] = ["--lake", "-o", "--output", "--log-format"];
+
+#[derive(Debug, Args)]
+pub(crate) struct OutputArgs {
+    /// A file to write, as often as wanted: svg, pdf or png; tex, csv or md of a table. With {surface} in its name, one
+    /// file for each surface. Without it SVG, or Markdown of a table, goes to stdout.
+    #[arg(short, long, value_name = "FILE")]
+    output: Vec<PathBuf>,
+    /// Title of the figure.
+    #[arg(long)]
+    title: Option<String>,
+}
+
+impl OutputArgs {
+    /// Returns the surfaces of each figure: each alone if files are named by them, else all together.
+    ///
+    /// # Errors
+    /// If only some of the files are named by surfaces.
+    pub(super) fn groups<'a>(&self, surfaces: &'a [SelectedSurface]) -> anyhow::Result<Vec<&'a [SelectedSurface]>> {
+        let named = self.output.iter().filter(|path| path.to_string_lossy().contains(PLACEHOLDER)).count();
+        match named {
+            0 => Ok(vec![surfaces]),
+            _ if named == self.output.len() => Ok(surfaces.chunks(1).collect()),
+            _ => bail!("some of the files have {PLACEHOLDER} in their names, some have not; hint: run it twice"),
+        }
+    }
+
+    /// Returns the title: the one that was asked for, or this.
+    pub(super) fn title(&self, otherwise: impl FnOnce() -> String) -> String {
+        self.title.clone().unwrap_or_else(otherwise)
+    }
+
+    /// Writes a drawing to its files.
+    pub(super) fn write_drawing(&self, drawing: &FigureDrawing, surfaces: &[SelectedSurface]) -> anyhow::Result<()> {
+        if self.output.is_empty() {
+            return Ok(std::io::stdout().write_all(drawing.to_svg().as_bytes())?);
+        }
+        for path in self.paths(surfaces) {
+            match extension(&path) {
+                "svg" => write_file(&path, drawing.to_svg().as_bytes())?,
+                "pdf" => write_file(&path, &drawing.to_pdf())?,
+                "png" => write_file(&path, &drawing.to_png())?,
+                _ => bail!("`{}` has another extension; hint: svg, pdf or png", path.display()),
+            }
+        }
+        Ok(())
+    }
+
+    /// Writes a table to its files.
+    pub(super) fn write_table(
+        &self,
+        table: &FigureTable,
+        notes: &FigureNotes,
+        surfaces: &[SelectedSurface],
+    ) -> anyhow::Result<()> {
+        if self.output.is_empty() {
+            return Ok(super::super::print(table.to_markdown(&FigureNotes::default()).trim_end())?);
+        }
+        for path in self.paths(surfaces) {
+            let text = match extension(&path) {
+                "tex" => table.to_latex(notes),
+                "csv" => table.to_csv(notes),
+                "md" => table.to_markdown(notes),
+                _ => bail!("`{}` has another extension; hint: tex, csv or md", path.display()),
+            };
+            write_file(&path, text.as_bytes())?;
+        }
+        Ok(())
+    }
+
+    fn paths(&self, surfaces: &[SelectedSurface]) -> impl Iterator<Item = PathBuf> {
+        let surface = surfaces.first().map_or("", |surface| &surface.surface_id);
+        self.output.iter().map(move |path| match path.to_str() {
+            Some(text) => PathBuf::from(text.replace(PLACEHOLDER, surface)),
+            None => path.clone(),
+        })
+    }
+}
+
+fn extension(path: &Path) -> &str {
+    path.extension().and_then(|extension| extension.to_str()).unwrap_or("")
+}
+
+// Written beside its path first, so that a file is whole or not there.
+fn write_file(path: &Path, bytes: &[u8]) -> anyhow::Result<()> {
+    let failed = || format!("cannot write `{}`", path.display());
+    if let Some(folder) = path.parent() {
+        std::fs::create_dir_all(folder).with_context(failed)?;
+    }
+    let mut partial = path.as_os_str().to_owned();
+    partial.push(".partial");
+    std::fs::write(&partial, bytes).with_context(failed)?;
+    std::fs::rename(&partial, path).with_context(failed)?;
+    eprintln!("{}: {}", path.display(), super::super::size(bytes.len() as u64));
+    Ok(())
+}
+
+/// Returns the command as it was typed, without the lake and the files.
+pub(super) fn typed_command() -> String {
+    let typed: Vec<String> = std::env::args_os().skip(1).map(|word| word.to_string_lossy().into_owned()).collect();
+    plain_command(&typed)
+}
+
+fn plain_command(typed: &[String]) -> String {
+    let mut words = vec!["echolake".to_owned()];
+    let mut typed = typed.iter();
+    while let Some(word) = typed.next() {
+        if LOCAL_OPTIONS.contains(&word.as_str()) {
+            typed.next();
+        } else if !LOCAL_OPTIONS.iter().any(|o| word.starts_with(&format!("{o}="))) && !word.starts_with("-o") {
+            let is_plain = word.chars().all(|c| c.is_ascii_alphanumeric() || "-_./,=".contains(c));
+            words.push(if is_plain { word.clone() } else { format!("'{}'", word.replace('\'', "'\\''")) });
+        }
+    }
+    words.join(" ")
+}

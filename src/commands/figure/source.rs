@@ -1,0 +1,147 @@
+//! The lake that figures are made from: its rows, and what files say of it.
+
+use anyhow::Context as _;
+use echolake_figures::FigureNotes;
+use echolake_lake::Lake;
+use echolake_query::figure_rows::{lake_version, quoted};
+use echolake_query::{PredicateForm, Session};
+use echolake_schema::{Point, SurfaceId};
+use serde::Deserialize;
+use serde::de::DeserializeOwned;
+
+use super::SelectionArgs;
+use super::output::typed_command;
+
+/// A surface of a figure.
+#[derive(Debug, Clone, Deserialize)]
+pub(super) struct SelectedSurface {
+    pub(super) surface_id: String,
+    pub(super) run_id: Option<String>,
+    pub(super) typology: String,
+    pub(super) flat_reference: String,
+    pub(super) foam_reference: String,
+    pub(super) origin: String,
+}
+
+const SURFACES: &str = "select surface_id, run_id, typology, flat_reference, foam_reference, origin from surfaces";
+
+/// The lake, and one session of queries.
+pub(super) struct FigureSource {
+    pub(super) lake: Lake,
+    session: Session,
+    version: String,
+}
+
+impl FigureSource {
+    pub(super) async fn open(lake: Lake) -> anyhow::Result<Self> {
+        let session = Session::new(&lake)?;
+        let version = lake_version(session.snapshot().await?.as_ref());
+        Ok(Self { lake, session, version })
+    }
+
+    /// Returns the rows of a query.
+    pub(super) async fn rows<T: DeserializeOwned>(&self, sql: &str) -> anyhow::Result<Vec<T>> {
+        let mut answer = self.session.query(sql).await?;
+        let mut rows = Vec::new();
+        while let Some(batch) = answer.next().await? {
+            let part: Vec<T> = serde_arrow::from_record_batch(&batch).context("rows are not as expected")?;
+            rows.extend(part);
+        }
+        Ok(rows)
+    }
+
+    /// Returns the session.
+    pub(super) fn session(&self) -> &Session {
+        &self.session
+    }
+
+    /// Returns the surfaces that are selected, the named ones first.
+    ///
+    /// # Errors
+    /// If one is not in the lake, or none is selected.
+    pub(super) async fn surfaces(&self, selection: &SelectionArgs) -> anyhow::Result<Vec<SelectedSurface>> {
+        let names: Vec<_> = selection.surfaces.iter().map(|surface| surface.as_str()).collect();
+        let mut selected = self.named(&names).await?;
+        if let Some(predicate) = &selection.predicate {
+            let more = self.selected(predicate).await?;
+            selected.extend(more.into_iter().filter(|surface| !names.contains(&surface.surface_id.as_str())));
+        }
+        Ok(selected)
+    }
+
+    /// Returns the surfaces of these names, in their order.
+    pub(super) async fn named(&self, names: &[&str]) -> anyhow::Result<Vec<SelectedSurface>> {
+        if names.is_empty() {
+            return Ok(Vec::new());
+        }
+        let list: Vec<_> = names.iter().map(|name| quoted(name)).collect();
+        let sql = format!("{SURFACES} where surface_id in ({}) order by run_id desc", list.join(", "));
+        let found: Vec<SelectedSurface> = self.rows(&sql).await?;
+        let surface = |name: &&str| {
+            let surface = found.iter().find(|surface| surface.surface_id == *name).cloned();
+            surface.with_context(|| {
+                format!("surface `{name}` is not in the lake; hint: echolake sql \"select surface_id from surfaces\"")
+            })
+        };
+        names.iter().map(surface).collect()
+    }
+
+    /// Returns the surface whose levels are subtracted from those of the others.
+    ///
+    /// # Errors
+    /// If it is not in the lake.
+    pub(super) async fn base(&self, surface: Option<&SurfaceId>) -> anyhow::Result<Option<SelectedSurface>> {
+        let names: Vec<_> = surface.map(|surface| surface.as_str()).into_iter().collect();
+        Ok(self.named(&names).await?.pop())
+    }
+
+    /// Returns the surfaces that a predicate selects, by name.
+    pub(super) async fn selected(&self, predicate: &str) -> anyhow::Result<Vec<SelectedSurface>> {
+        let select = format!("{SURFACES} where");
+        let sql = self.session.selecting(&select, predicate, PredicateForm::AnyExpression).context("--where")?;
+        let mut found: Vec<SelectedSurface> = self.rows(&sql).await.context("--where")?;
+        anyhow::ensure!(!found.is_empty(), "`{predicate}` selects no surface; hint: `echolake sql` tries predicates");
+        found.sort_by(|a, b| (&a.surface_id, &b.run_id).cmp(&(&b.surface_id, &a.run_id)));
+        found.dedup_by(|a, b| a.surface_id == b.surface_id);
+        Ok(found)
+    }
+
+    /// Returns the grid point that is named, or the one of the lowest layer that is nearest to the middle.
+    pub(super) fn microphone(&self, named: Option<&str>) -> anyhow::Result<&Point> {
+        let grid = self.lake.grid();
+        if let Some(text) = named {
+            let by_number = text.parse::<usize>().ok();
+            return match by_number {
+                Some(number) => grid.points().get(number).with_context(|| {
+                    format!("`--microphone` is {number}; the grid has the points 0 to {}", grid.points().len() - 1)
+                }),
+                None => Ok(grid.parse_point(text)?),
+            };
+        }
+        let lowest = grid.points().iter().filter(|point| point.layer == 0);
+        let distance = |point: &Point| point.position_mm[0].hypot(point.position_mm[1]);
+        // The first of those that are equally near, as on the pages.
+        let nearest = lowest.reduce(|best, point| if distance(point) < distance(best) - 1e-6 { point } else { best });
+        nearest.context("the grid has no points")
+    }
+
+    /// Returns what a figure of these surfaces says of itself.
+    pub(super) fn notes<'a>(
+        &self,
+        title: String,
+        query: String,
+        surfaces: impl IntoIterator<Item = &'a SelectedSurface>,
+    ) -> FigureNotes {
+        let mut origins: Vec<_> = surfaces.into_iter().map(|surface| surface.origin.clone()).collect();
+        origins.sort();
+        origins.dedup();
+        FigureNotes {
+            title,
+            command: typed_command(),
+            query,
+            lake: self.version.clone(),
+            program: concat!("echolake ", env!("CARGO_PKG_VERSION")).into(),
+            origins,
+        }
+    }
+}

@@ -1,0 +1,144 @@
+//! The paper's tables.
+
+use std::collections::HashMap;
+
+use anyhow::Context as _;
+use echolake_figures::{FigureTable, TableRow};
+use echolake_query::figure_rows::{TOTAL_BAND, band_labels, band_list, quoted};
+use serde::Deserialize;
+
+use super::source::{FigureSource, SelectedSurface};
+use super::{TableArgs, ValuesArg};
+
+#[derive(Deserialize)]
+struct BandLevel {
+    surface_id: String,
+    band: String,
+    level_db: Option<f64>,
+}
+
+#[derive(Deserialize)]
+struct SurfaceMeans {
+    surface_id: String,
+    means: Vec<Option<f64>>,
+}
+
+/// A table and the query of its numbers.
+type QueriedTable = (FigureTable, String);
+
+pub(super) async fn write_table(source: &FigureSource, args: &TableArgs) -> anyhow::Result<()> {
+    let surfaces = source.surfaces(&args.selection).await?;
+    let base = source.base(args.less.as_ref()).await?;
+    for group in args.output.groups(&surfaces)? {
+        let (table, query) = match args.values {
+            ValuesArg::Levels => level_table(source, group, base.as_ref(), "p90_mean_db").await?,
+            ValuesArg::UnbiasedLevels => level_table(source, group, base.as_ref(), "unbiased_p90_mean_db").await?,
+            ValuesArg::Energies => energy_table(source, group).await?,
+        };
+        let title = args.output.title(|| default_title(args.values).into());
+        let notes = source.notes(title, query, group.iter().chain(&base));
+        args.output.write_table(&table, &notes, group)?;
+    }
+    Ok(())
+}
+
+fn default_title(values: ValuesArg) -> &'static str {
+    match values {
+        ValuesArg::Levels => "Mean TNCE of the values up to the 90th percentile, dB over Flat\u{2019}s total",
+        ValuesArg::UnbiasedLevels => {
+            "Mean TNCE of the values up to the 90th percentile, dB over Flat\u{2019}s total, without Foam\u{2019}s reflection"
+        }
+        ValuesArg::Energies => "Mean TNCE over the pairs, over Flat\u{2019}s total",
+    }
+}
+
+fn surface_list(surfaces: &[&str]) -> String {
+    surfaces.iter().map(|name| quoted(name)).collect::<Vec<_>>().join(", ")
+}
+
+async fn level_table(
+    source: &FigureSource,
+    surfaces: &[SelectedSurface],
+    base: Option<&SelectedSurface>,
+    column: &str,
+) -> anyhow::Result<QueriedTable> {
+    let names: Vec<_> = surfaces.iter().map(|surface| surface.surface_id.as_str()).collect();
+    let base = base.map(|surface| surface.surface_id.as_str());
+    let all: Vec<_> = names.iter().copied().chain(base).collect();
+    let query = format!(
+        "select surface_id, band, {column} as level_db from surface_stats where surface_id in ({}) order by run_id",
+        surface_list(&all)
+    );
+    let rows: Vec<BandLevel> = source.rows(&query).await?;
+    // Of several runs of a surface, the newest counts.
+    let levels: HashMap<_, _> =
+        rows.iter().map(|row| ((row.surface_id.as_str(), row.band.as_str()), row.level_db)).collect();
+    let keys = source.lake.rig().band_names();
+    let keys: Vec<_> = keys.iter().map(String::as_str).chain([TOTAL_BAND]).collect();
+    let level = |surface: &str, band: &str| levels.get(&(surface, band)).copied().flatten();
+    let value = |surface: &str, band: &str| match base {
+        Some(base) if base != surface => Some(level(surface, band)? - level(base, band)?),
+        _ => level(surface, band),
+    };
+    let row = |name: &&str| TableRow {
+        name: match base {
+            Some(base) if base != *name => format!("{name} less {base}"),
+            _ => (*name).to_owned(),
+        },
+        values: keys.iter().map(|band| value(name, band)).collect(),
+        decimals: 2,
+        is_percent: false,
+    };
+    let table = FigureTable {
+        corner: "Surface".into(),
+        columns: band_labels(source.lake.rig()),
+        rows: names.iter().map(row).collect(),
+        // Levels and differences are not compared with each other.
+        with_extremes: base.is_none(),
+    };
+    Ok((table, query))
+}
+
+async fn energy_table(source: &FigureSource, surfaces: &[SelectedSurface]) -> anyhow::Result<QueriedTable> {
+    let rig = source.lake.rig();
+    let names = surfaces.iter().flat_map(|surface| [surface.flat_reference.as_str(), surface.surface_id.as_str()]);
+    let mut names: Vec<_> = names.collect();
+    names.sort_unstable();
+    names.dedup();
+    let means = band_list(rig, |band| format!("avg(tnce_{band})"));
+    let list = surface_list(&names);
+    let query =
+        format!("select surface_id, {means} as means from tnce where surface_id in ({list}) group by surface_id");
+    let rows: Vec<SurfaceMeans> = source.rows(&query).await?;
+    let of = |name: &str| {
+        let row = rows.iter().find(|row| row.surface_id == name);
+        row.with_context(|| format!("surface `{name}` has no energies; hint: `echolake doctor` says what is missing"))
+    };
+    let mut table_rows = Vec::new();
+    let mut flat_names: Vec<&str> = Vec::new();
+    for surface in surfaces {
+        let flat = of(&surface.flat_reference)?;
+        if !flat_names.contains(&surface.flat_reference.as_str()) {
+            flat_names.push(&surface.flat_reference);
+            table_rows.push(energy_row(&surface.flat_reference, flat.means.clone()));
+        }
+        if surface.surface_id == surface.flat_reference {
+            continue;
+        }
+        let own = of(&surface.surface_id)?;
+        table_rows.push(energy_row(&surface.surface_id, own.means.clone()));
+        let change = |(own, flat): (&Option<f64>, &Option<f64>)| Some(100.0 * ((*own)? / (*flat)? - 1.0));
+        table_rows.push(TableRow {
+            name: format!("{}, difference", surface.surface_id),
+            values: own.means.iter().zip(&flat.means).map(change).collect(),
+            decimals: 1,
+            is_percent: true,
+        });
+    }
+    let columns = band_labels(rig);
+    Ok((FigureTable { corner: "Surface".into(), columns, rows: table_rows, with_extremes: false }, query))
+}
+
+fn energy_row(name: &str, values: Vec<Option<f64>>) -> TableRow {
+    TableRow { name: name.to_owned(), values, decimals: 3, is_percent: false }
+}

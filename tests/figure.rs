@@ -1,0 +1,109 @@
+//! `echolake figure`: files that say where they come from, and the same picture as the server's.
+
+use super::serve::http::HttpRequest;
+use super::serve::served;
+use super::{TestFolder, TestFolderTemplate};
+
+fn lake() -> TestFolder {
+    static THREE_RUNS: TestFolderTemplate = TestFolderTemplate::new();
+    THREE_RUNS.place(|place| {
+        for (surface, seed) in [("flat", "1"), ("foam", "2"), ("wood", "3")] {
+            place.acquire(surface, &["--seed", seed, "--ir-only"]);
+        }
+        place.ok(&["ingest"]);
+    })
+}
+
+fn fills(svg: &str) -> Vec<&str> {
+    let cells = svg.lines().filter(|line| line.contains("data-point="));
+    cells.map(|line| line.split(" fill=\"").nth(1).expect("a fill").split('"').next().expect("its end")).collect()
+}
+
+#[test]
+fn flat_is_black_and_wood_is_louder() {
+    let place = lake();
+    let svg = place.ok(&["figure", "grid", "flat"]);
+    let cells = fills(&svg);
+    // The blue cell of each band is the microphone's; pairs with it that are not measured are grey.
+    let black = cells.iter().filter(|fill| **fill == "#000000").count();
+    let others = cells.iter().filter(|fill| !matches!(**fill, "#000000" | "#0b5c8c" | "#a9adaa")).count();
+    assert!(black > 20 && others == 0, "{cells:?}");
+    assert!(svg.contains(">simulated · lake runs@"), "the picture says it");
+    let notes = svg.split("<metadata>").nth(1).expect("notes");
+    for said in ["echolake figure grid flat", "from tnce where surface_id = 'flat'", "runs@", "simulated"] {
+        assert!(notes.contains(said), "{said}");
+    }
+    let wood = place.ok(&["figure", "grid", "wood", "--over", "band"]);
+    let red = fills(&wood).into_iter().filter(|fill| fill.ends_with("0000") && *fill != "#000000").count();
+    assert!(red > 20, "{red} cells over 0 dB");
+}
+
+#[test]
+fn the_server_draws_the_same() {
+    let place = lake();
+    let server = served(&place, &[]);
+    let drawn =
+        |svg: &str| svg.lines().filter(|line| !line.starts_with("<metadata>")).map(str::to_owned).collect::<Vec<_>>();
+    for (args, path) in [
+        (&["grid", "wood", "--microphone", "3"][..], "grid.svg?microphone=3&width=440"),
+        (&["grid", "wood", "--microphone", "3", "--over", "total"], "grid.svg?microphone=3&width=440&over=flat-total"),
+        (&["grid", "wood", "--less", "flat", "--microphone", "3"], "grid.svg?microphone=3&width=440&less=flat"),
+        (&["nce", "wood"], "curves.svg?width=420"),
+    ] {
+        let answer = HttpRequest::get(&format!("/api/v1/surfaces/wood/{path}")).send(&server);
+        assert_eq!((answer.status, answer.header("content-type")), (200, Some("image/svg+xml")), "{path}");
+        let written = place.ok(&[&["figure"], args].concat());
+        assert_eq!(drawn(&answer.text()), drawn(&written), "{path}");
+    }
+}
+
+#[test]
+fn tables_have_the_numbers_of_the_lake() {
+    let place = lake();
+    place.ok(&["figure", "table", "wood", "flat", "-o", "out/levels.csv", "-o", "out/levels.tex"]);
+    let csv = std::fs::read_to_string(place.path("out/levels.csv")).expect("read");
+    assert!(csv.starts_with("# Title: ") && csv.contains("# Lake: runs@") && csv.contains("# Origin: simulated"));
+    let wood = csv.lines().find(|line| line.starts_with("wood,")).expect("a row");
+    let total: f64 = wood.rsplit(',').next().expect("a value").parse().expect("a number");
+    let expected = "select p90_mean_db from surface_stats where surface_id = 'wood' and band = 'total'";
+    assert!((total - place.number(expected)).abs() < 1e-9, "{total}");
+    let tex = std::fs::read_to_string(place.path("out/levels.tex")).expect("read");
+    assert!(tex.contains("\\cellcolor") && tex.contains("% Query: select surface_id, band"), "{tex}");
+    let energies = place.ok(&["figure", "table", "wood", "--values", "energies"]);
+    let flat = energies.lines().find(|line| line.starts_with("| flat")).expect("a row");
+    assert!(flat.ends_with("1.000 |"), "Flat is one of Flat: {flat}");
+}
+
+#[test]
+fn every_figure_is_a_file() {
+    let place = lake();
+    let names = ["filters", "coverage", "map"];
+    for args in [&names[..1], &names[1..2], &names[2..], &["steps", "wood", "--celsius", "30,15"], &["relief", "wood"]]
+    {
+        let name = args[0];
+        let files = ["svg", "pdf", "png"].map(|extension| format!("{name}.{extension}"));
+        let output: Vec<&str> = files.iter().flat_map(|file| ["-o", file]).collect();
+        place.ok(&[&["figure"], args, &output[..]].concat());
+        let [svg, pdf, png] = files.map(|file| std::fs::read(place.path(&file)).expect("read"));
+        assert!(svg.starts_with(b"<svg ") && svg.ends_with(b"</svg>\n"), "{name}");
+        assert!(pdf.starts_with(b"%PDF-") && pdf.windows(14).any(|w| w == b"(echolake 0.1."), "{name}");
+        assert!(png.starts_with(b"\x89PNG") && png.windows(8).any(|w| w == b"iTXtLake"), "{name}");
+    }
+    place.ok(&["figure", "grid", "--where", "surface_id <> 'foam'", "-o", "each/{surface}.svg"]);
+    let mut written: Vec<_> =
+        std::fs::read_dir(place.path("each")).expect("listed").map(|e| e.expect("an entry").file_name()).collect();
+    written.sort();
+    assert_eq!(written, ["flat.svg", "wood.svg"]);
+}
+
+#[test]
+fn refusals_say_what_is_there() {
+    let place = lake();
+    place.fails(1, &["figure", "grid", "brick"], "surface `brick` is not in the lake");
+    place.fails(1, &["figure", "grid", "--where", "surface_id = 'x'"], "selects no surface");
+    place.fails(1, &["figure", "grid", "wood", "-o", "x.gif"], "hint: svg, pdf or png");
+    place.fails(1, &["figure", "table", "wood", "-o", "x.svg"], "hint: tex, csv or md");
+    place.fails(1, &["figure", "grid", "wood", "--band", "7"], "there is no band `7`");
+    place.fails(1, &["figure", "steps", "wood", "--pair", "99999"], "has no pair 99999");
+    place.fails(2, &["figure", "grid"], "required");
+}
