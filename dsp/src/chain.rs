@@ -9,7 +9,7 @@ use crate::filter_bank::{FilterBankPlan, FilterBankScratch};
 use crate::foam::subtract;
 use crate::response_deconvolution::{ResponseDeconvolution, ResponseScratch};
 use crate::rise::{CurveShape, curve_shape};
-use crate::temperature::{TemperatureCorrection, resampling_ratio};
+use crate::temperature::{TemperatureCorrection, resampling_ratio, response_limits_hz};
 use crate::uncertainty::EnergySensitivity;
 use crate::{Error, RealSample};
 
@@ -38,9 +38,9 @@ pub struct MeasurementParams {
 /// Recording to response: deconvolve, correct the temperature, crop.
 pub struct MeasurementPlan<T: RealSample> {
     deconvolution: ResponseDeconvolution<T>,
-    correction: TemperatureCorrection<T>,
+    correction: ResponseCorrection<T>,
     ir_len: usize,
-    reference_celsius: f64,
+    range_hz: [f64; 2],
 }
 
 /// Buffers of a [`MeasurementPlan`].
@@ -69,9 +69,9 @@ impl<T: RealSample> MeasurementPlan<T> {
         })?;
         Ok(Self {
             deconvolution,
-            correction: TemperatureCorrection::new(),
+            correction: ResponseCorrection::new(params.reference_celsius, params.division),
             ir_len: params.ir_len,
-            reference_celsius: params.reference_celsius,
+            range_hz: [params.low_hz, params.high_hz],
         })
     }
 
@@ -96,9 +96,57 @@ impl<T: RealSample> MeasurementPlan<T> {
     ) -> Result<(), Error> {
         check_len("the response", ir.len(), self.ir_len)?;
         check_celsius("the temperature (C)", celsius)?;
-        self.deconvolution.run(recording, loopback, &mut scratch.raw, &mut scratch.deconvolution)?;
-        self.correction.run(&scratch.raw, resampling_ratio(celsius, self.reference_celsius), ir);
+        let limits_hz = response_limits_hz(self.range_hz, self.correction.ratio(celsius));
+        let (raw, deconvolution) = (&mut scratch.raw, &mut scratch.deconvolution);
+        self.deconvolution.run_within(limits_hz, recording, loopback, raw, deconvolution)?;
+        self.correction.run(raw, celsius, ir);
         Ok(())
+    }
+}
+
+/// Correction of responses to the reference temperature.
+///
+/// The paper's chain resamples a response and keeps its height: a stretched one has more energy, 0.007 dB a kelvin. With
+/// [`SpectralDivision::Tapered`] its spectrum keeps its height instead, so that a reflection's energy does not depend on the
+/// air; the other divisions stay what they are elsewhere.
+///
+/// ```
+/// use echolake_dsp::chain::ResponseCorrection;
+/// use echolake_schema::SpectralDivision;
+///
+/// let correction = ResponseCorrection::<f64>::new(20.0, SpectralDivision::Tapered);
+/// let (raw, mut corrected) = ([0.0, 0.0, 0.0, 1.0, 1.0, 1.0, 0.0, 0.0], [0.0; 8]);
+/// correction.run(&raw, 26.0, &mut corrected);
+/// assert!((corrected.iter().sum::<f64>() - 3.0).abs() < 0.01);
+/// ```
+pub struct ResponseCorrection<T> {
+    correction: TemperatureCorrection<T>,
+    reference_celsius: f64,
+    keeps_spectrum: bool,
+}
+
+impl<T: RealSample> ResponseCorrection<T> {
+    /// A correction to a temperature in C.
+    pub fn new(reference_celsius: f64, division: SpectralDivision) -> Self {
+        let keeps_spectrum = division == SpectralDivision::Tapered;
+        Self { correction: TemperatureCorrection::new(), reference_celsius, keeps_spectrum }
+    }
+
+    /// Returns the ratio by which times grow, of a response in air of a temperature in C.
+    pub fn ratio(&self, celsius: f64) -> f64 {
+        resampling_ratio(celsius, self.reference_celsius)
+    }
+
+    /// Corrects one response.
+    ///
+    /// raw `[any]`, corrected `[wanted]`  from the same instant
+    pub fn run(&self, raw: &[T], celsius: f64, corrected: &mut [T]) {
+        let rho = self.ratio(celsius);
+        self.correction.run(raw, rho, corrected);
+        if self.keeps_spectrum {
+            let factor = T::of(rho.recip());
+            corrected.iter_mut().for_each(|sample| *sample = *sample * factor);
+        }
     }
 }
 
@@ -317,6 +365,8 @@ fn put_over<T: RealSample>(flat: &FlatEnergies, bands: &[T], derived: &mut Deriv
 
 #[cfg(test)]
 mod tests {
+    use realfft::num_complex::Complex;
+
     use super::*;
     use crate::sweep::LinearSweep;
 
@@ -391,6 +441,55 @@ mod tests {
         // Why there is a taper.
         let floored = apart(SpectralDivision::Floored { floor_db: SpectralDivision::FLOOR_DB });
         assert!(floored > 0.1, "{floored} dB");
+    }
+
+    #[test]
+    fn levels_do_not_depend_on_the_air() {
+        let sweep = LinearSweep { rate_hz: 96e3, duration_secs: 0.05, low_hz: 2e3, high_hz: 40e3, fade_secs: 0.001 };
+        let mut loopback = sweep.samples();
+        loopback.resize(6_000, 0.0);
+        let n = loopback.len();
+        let forward = f64::plan_real_forward(n);
+        let mut spectrum = forward.make_output_vec();
+        forward.process(&mut loopback.clone(), &mut spectrum).expect("a spectrum");
+        // Delays are samples at 20 C; the air makes them shorter or longer.
+        let heard = |reflections: &[(f64, f64)], rho: f64| -> Vec<f64> {
+            let turn = |bin: usize, delay: f64| {
+                Complex::from_polar(1.0, -std::f64::consts::TAU * (bin as f64) * delay / rho / n as f64)
+            };
+            let gain = |bin| reflections.iter().map(|(delay, r)| turn(bin, *delay) * r).sum::<Complex<f64>>();
+            let mut bins: Vec<_> = spectrum.iter().enumerate().map(|(bin, s)| s * gain(bin)).collect();
+            (bins[0].im, bins[n / 2].im) = (0.0, 0.0);
+            let mut signal = vec![0.0; n];
+            f64::plan_real_inverse(n).process(&mut bins, &mut signal).expect("a signal");
+            signal.into_iter().map(|x| x / n as f64).collect()
+        };
+        let flat = [(90.0, 1.0)];
+        let relief = [(84.0, 0.4), (93.3, -0.3), (101.2, 0.5), (160.0, 0.1)];
+        // The relief is measured in this air, Flat in air of 20 C.
+        let levels = |division, celsius: f64| {
+            let params = MeasurementParams { recording_len: n, division, ..params() };
+            let plan = MeasurementPlan::<f64>::new(&params).expect("a plan");
+            let response = |reflections: &[(f64, f64)], celsius: f64| {
+                let (mut ir, rho) = (vec![0.0; 384], resampling_ratio(celsius, 20.0));
+                let recording = heard(reflections, rho);
+                plan.ir(&recording, &loopback, celsius, &mut ir, &mut plan.scratch()).expect("a response");
+                ir
+            };
+            let plan = DerivationPlan::new(384, 96e3, &[2_500.0, 5e3, 10e3, 20e3, 40e3]).expect("a plan");
+            let mut derived = plan.derived();
+            let (relief, flat) = (response(&relief, celsius), response(&flat, 20.0));
+            plan.run(&relief, &[0.0; 384], &flat, &mut derived, &mut plan.scratch()).expect("derived");
+            derived.tnce.iter().map(|tnce| 10.0 * tnce.log10()).collect::<Vec<_>>()
+        };
+        let apart = |division| {
+            let (warm, cold) = (levels(division, 25.0), levels(division, 15.0));
+            warm.iter().zip(&cold).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max)
+        };
+        let tapered = apart(SpectralDivision::Tapered);
+        assert!(tapered < 0.003, "{tapered} dB");
+        let floored = apart(SpectralDivision::Floored { floor_db: SpectralDivision::FLOOR_DB });
+        assert!(floored > 0.05, "{floored} dB");
     }
 
     // A surface that is Flat itself: bands that sum to 1 in all, and 1 in each band.

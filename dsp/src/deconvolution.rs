@@ -90,8 +90,10 @@ pub struct DeconvolutionPlan<T: RealSample> {
     inverse: PrunedInverse<T>,
     in_range: RangeInclusive<usize>,
     division: SpectralDivision,
-    /// Gains of the first bins in range, and of the last ones from the last on.
-    tapers: [Vec<T>; 2],
+    /// Distance of bins, the sweep's range, and the taper's width, Hz.
+    step_hz: f64,
+    range_hz: [f64; 2],
+    taper_hz: f64,
 }
 
 /// Buffers of a [`DeconvolutionPlan`].
@@ -140,10 +142,9 @@ impl<T: RealSample> DeconvolutionPlan<T> {
             inverse: PrunedInverse::new(n, params.output_len),
             in_range: first..=last,
             division: params.division,
-            tapers: match params.division {
-                SpectralDivision::Tapered => tapers(&params, step, first..=last),
-                SpectralDivision::Floored { .. } | SpectralDivision::Literal => Default::default(),
-            },
+            step_hz: step,
+            range_hz: [params.low_hz, params.high_hz],
+            taper_hz: params.taper_hz,
         })
     }
 
@@ -174,6 +175,21 @@ impl<T: RealSample> DeconvolutionPlan<T> {
         ir: &mut [T],
         scratch: &mut DeconvolutionScratch<T>,
     ) -> Result<(), Error> {
+        self.run_within(self.range_hz, recording, loopback, ir, scratch)
+    }
+
+    /// Deconvolves one recording; [`SpectralDivision::Tapered`] tapers at these limits within the sweep's range.
+    ///
+    /// # Errors
+    /// [`Error::Length`], [`Error::NoLoopback`], or [`Error::NotFinite`].
+    pub fn run_within(
+        &self,
+        limits_hz: [f64; 2],
+        recording: &[T],
+        loopback: &[T],
+        ir: &mut [T],
+        scratch: &mut DeconvolutionScratch<T>,
+    ) -> Result<(), Error> {
         check_len("the recording", recording.len(), self.recording_len)?;
         check_len("the loopback", loopback.len(), self.recording_len)?;
         check_len("the response", ir.len(), self.output_len)?;
@@ -182,7 +198,7 @@ impl<T: RealSample> DeconvolutionPlan<T> {
         let levels = SignalLevels::of(recording, loopback)?;
         self.transform(recording, loopback, T::of(levels.gain), joint, work);
         let (quotient, work) = work.split_at_mut(self.inverse.spectrum_len());
-        self.divide(joint, levels.rounding, quotient)?;
+        self.divide(limits_hz, joint, levels.rounding, quotient)?;
         let kept = ir.len().min(self.len);
         let (ir, rest) = ir.split_at_mut(kept);
         self.inverse.run(quotient, T::of(levels.gain / self.len as f64), ir, sums, work);
@@ -202,7 +218,13 @@ impl<T: RealSample> DeconvolutionPlan<T> {
     }
 
     // Lays X / S for the inverse transform: first the bins in range, because a floor follows from them.
-    fn divide(&self, joint: &[Complex<T>], rounding: f64, quotient: &mut [Complex<T>]) -> Result<(), Error> {
+    fn divide(
+        &self,
+        limits_hz: [f64; 2],
+        joint: &[Complex<T>],
+        rounding: f64,
+        quotient: &mut [Complex<T>],
+    ) -> Result<(), Error> {
         let (first, end) = (*self.in_range.start(), *self.in_range.end() + 1);
         let power = self.divide_bins(first..end, T::default(), |_| T::of(1.0), joint, quotient);
         let mean = power.sum() / (end - first) as f64;
@@ -216,9 +238,19 @@ impl<T: RealSample> DeconvolutionPlan<T> {
         let beyond = [0..first, end..self.len / 2 + 1];
         let floor = match self.division {
             SpectralDivision::Tapered => {
-                let [low, high] = &self.tapers;
-                self.divide_bins(first..first + low.len(), T::default(), |bin| low[bin - first], joint, quotient);
-                self.divide_bins(end - high.len()..end, T::default(), |bin| high[end - 1 - bin], joint, quotient);
+                // A half cosine from the limits on, over half of the range at most.
+                let [low_hz, high_hz] = limits_hz;
+                let width_hz = self.taper_hz.min((high_hz - low_hz) / 2.0);
+                let gain = |bin: usize| {
+                    let hz = bin as f64 * self.step_hz;
+                    let inside = ((hz - low_hz).min(high_hz - hz) / width_hz).clamp(0.0, 1.0);
+                    T::of((FRAC_PI_2 * inside).sin().powi(2))
+                };
+                // The bins that are not wholly inside.
+                let rising = (((low_hz + width_hz) / self.step_hz).ceil() as usize).clamp(first, end);
+                let falling = (((high_hz - width_hz) / self.step_hz).ceil() as usize).clamp(rising, end);
+                self.divide_bins(first..rising, T::default(), gain, joint, quotient);
+                self.divide_bins(falling..end, T::default(), gain, joint, quotient);
                 beyond.into_iter().for_each(|bins| self.silence(bins, quotient));
                 return Ok(());
             }
@@ -269,19 +301,6 @@ impl<T: RealSample> DeconvolutionPlan<T> {
         }
         total
     }
-}
-
-// Gains at both ends of the range: a half cosine from the limit on, over half of the range at most.
-fn tapers<T: RealSample>(params: &DeconvolutionParams, step: f64, bins: RangeInclusive<usize>) -> [Vec<T>; 2] {
-    let width = params.taper_hz.min((params.high_hz - params.low_hz) / 2.0);
-    let gain = |offset: f64| T::of((FRAC_PI_2 * offset / width).sin().powi(2));
-    let offsets = |bin: usize| [bin as f64 * step - params.low_hz, params.high_hz - bin as f64 * step];
-    let low = bins.clone().map(|bin| offsets(bin)[0]);
-    let high = bins.rev().map(|bin| offsets(bin)[1]);
-    [
-        low.take_while(|offset| *offset < width).map(gain).collect(),
-        high.take_while(|offset| *offset < width).map(gain).collect(),
-    ]
 }
 
 /// The least even length without prime factors above 5 that holds `len` samples.

@@ -60,26 +60,29 @@ impl<T: RealSample> ResponseDeconvolution<T> {
         }
     }
 
-    /// Deconvolves one recording.
+    /// Deconvolves one recording; tapered division tapers at these limits.
     ///
     /// # Errors
-    /// As [`DeconvolutionPlan::run`].
-    pub fn run(
+    /// As [`DeconvolutionPlan::run_within`].
+    pub fn run_within(
         &self,
+        limits_hz: [f64; 2],
         recording: &[T],
         loopback: &[T],
         ir: &mut [T],
         scratch: &mut ResponseScratch<T>,
     ) -> Result<(), Error> {
         match (&self.0, &mut scratch.0) {
-            (Precision::Same(plan), PrecisionScratch::Same(scratch)) => plan.run(recording, loopback, ir, scratch),
+            (Precision::Same(plan), PrecisionScratch::Same(scratch)) => {
+                plan.run_within(limits_hz, recording, loopback, ir, scratch)
+            }
             (Precision::Double(plan), PrecisionScratch::Double { scratch, recording: x, loopback: s, ir: wide }) => {
                 for (to, from) in [(&mut *x, recording), (&mut *s, loopback)] {
                     to.clear();
                     to.extend(from.iter().map(|sample| sample.f64()));
                 }
                 crate::error::check_len("the response", ir.len(), wide.len())?;
-                plan.run(x, s, wide, scratch)?;
+                plan.run_within(limits_hz, x, s, wide, scratch)?;
                 ir.iter_mut().zip(&*wide).for_each(|(to, from)| *to = T::of(*from));
                 Ok(())
             }
@@ -99,14 +102,15 @@ mod tests {
 
     // A length with a large prime factor, so that padding would change it.
     const LEN: usize = 4_898;
+    const RANGE_HZ: [f64; 2] = [2e3, 40e3];
 
     fn params(division: SpectralDivision) -> DeconvolutionParams {
         DeconvolutionParams {
             recording_len: LEN,
             output_len: 384,
             rate_hz: 96e3,
-            low_hz: 2e3,
-            high_hz: 40e3,
+            low_hz: RANGE_HZ[0],
+            high_hz: RANGE_HZ[1],
             division,
             taper_hz: 250.0,
             length: TransformLength::Exact,
@@ -128,7 +132,7 @@ mod tests {
         exact.run(&wide(&recording), &wide(&loopback), &mut expected, &mut exact.scratch()).expect("a response");
         let plan = ResponseDeconvolution::<f32>::new(params(division)).expect("a plan");
         let (mut found, mut scratch) = (vec![f32::NAN; plan.output_len()], plan.scratch());
-        plan.run(&recording, &loopback, &mut found, &mut scratch).expect("a response");
+        plan.run_within(RANGE_HZ, &recording, &loopback, &mut found, &mut scratch).expect("a response");
         let greatest = expected.iter().fold(0.0f64, |most, x| most.max(x.abs()));
         found.iter().zip(&expected).fold(0.0f64, |most, (a, b)| most.max((f64::from(*a) - b).abs())) / greatest
     }
@@ -149,9 +153,9 @@ mod tests {
         let [tapered, literal] = [SpectralDivision::Tapered, SpectralDivision::Literal]
             .map(|division| ResponseDeconvolution::<f32>::new(params(division)).expect("a plan"));
         let (samples, mut ir) = (vec![1.0; LEN], vec![0.0; 384]);
-        let result = tapered.run(&samples, &samples, &mut ir, &mut literal.scratch());
+        let result = tapered.run_within(RANGE_HZ, &samples, &samples, &mut ir, &mut literal.scratch());
         assert!(matches!(result, Err(Error::Setting { .. })), "{result:?}");
-        let result = literal.run(&samples, &samples, &mut ir[1..], &mut literal.scratch());
+        let result = literal.run_within(RANGE_HZ, &samples, &samples, &mut ir[1..], &mut literal.scratch());
         assert!(matches!(result, Err(Error::Length { .. })), "{result:?}");
     }
 }

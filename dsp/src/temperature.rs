@@ -31,6 +31,29 @@ pub fn resampling_ratio(celsius: f64, reference_celsius: f64) -> f64 {
     ((ZERO_CELSIUS + celsius) / (ZERO_CELSIUS + reference_celsius)).sqrt()
 }
 
+/// Share of its limits by which a response's range is narrower than the sweep's, so that it can be the same in air that
+/// is about 9 K colder or warmer than the reference.
+const RANGE_MARGIN: f64 = 0.015;
+
+/// Limits, before the correction by a ratio, of the range that responses have after it: 1.5 % inside of the sweep's, Hz.
+///
+/// The correction moves frequencies, too. Limits at the sweep's own would leave a warmer response less of its highest
+/// band than a colder one, 0.03 dB a kelvin. Beyond 9 K the sweep's own range is the limit.
+///
+/// ```
+/// use echolake_dsp::temperature::{resampling_ratio, response_limits_hz};
+///
+/// let after = |celsius: f64| {
+///     let rho = resampling_ratio(celsius, 20.0);
+///     response_limits_hz([2e3, 40e3], rho).map(|hz| hz / rho)
+/// };
+/// assert!((after(23.0)[1] - after(20.0)[1]).abs() < 1e-9 && (after(20.0)[1] - 39_400.0).abs() < 1e-9);
+/// assert!(after(35.0)[1] < 39_100.0);
+/// ```
+pub fn response_limits_hz([low, high]: [f64; 2], rho: f64) -> [f64; 2] {
+    [(low * (1.0 + RANGE_MARGIN) * rho).max(low), (high * (1.0 - RANGE_MARGIN) * rho).min(high)]
+}
+
 /// Resamples a response by the exact ratio, at the outputs that are wanted and nowhere else: an arrival over
 /// d metres moves from d/c to d/c_ref.
 ///

@@ -25,6 +25,9 @@ use crate::references::{ReferenceNames, digest};
 use crate::rows::{self, RunKeys};
 use crate::run_content::{Head, RunContent};
 
+/// Revision of the responses that follow from recordings: those of another one are derived anew.
+const RESPONSES_REVISION: &str = "2";
+
 /// Result of the ingest of one run.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct IngestedRun {
@@ -192,7 +195,7 @@ impl IngestWork {
         let span = Span::current();
         span.record("run", field::display(&keys.run)).record("surface", field::display(&keys.surface));
         tracing::debug!(measurements = content.accepted.len(), damages = content.damaged.len(), "the file is read");
-        let derivation = digest(&[content.integrity.sha256.as_str(), CODE_VERSION]);
+        let derivation = digest(&[content.integrity.sha256.as_str(), CODE_VERSION, RESPONSES_REVISION]);
         let known = snapshot.run(&keys.run);
         if let Some(known) = known {
             self.check_same(known, &content, &opened.name).await?;

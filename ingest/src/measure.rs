@@ -5,8 +5,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 
 use bytes::Bytes;
-use echolake_dsp::chain::{MeasurementParams, MeasurementPlan, MeasurementScratch};
-use echolake_dsp::temperature::{TemperatureCorrection, resampling_ratio};
+use echolake_dsp::chain::{MeasurementParams, MeasurementPlan, MeasurementScratch, ResponseCorrection};
 use echolake_lake::Lake;
 use echolake_recording::{ChunkMessage, DecodedChunk, list_damage};
 use echolake_schema::messages::{
@@ -39,7 +38,7 @@ pub(crate) struct Measurer {
     pairs: u32,
     /// Cache of plans by recording length: a run has one length, an import may have several.
     plans: Mutex<HashMap<usize, Arc<RecordingPlan>>>,
-    correction: TemperatureCorrection<f32>,
+    correction: ResponseCorrection<f32>,
 }
 
 /// Memory that the messages of one run may still take, bytes: the chunks of a hostile file can decompress to thousands
@@ -151,11 +150,12 @@ impl Event {
 
 impl Measurer {
     pub(crate) fn new(lake: &Lake) -> Self {
+        let response = &lake.rig().impulse_response;
         Self {
             rig: lake.rig().clone(),
             pairs: lake.grid().pairs().len() as u32,
             plans: Mutex::default(),
-            correction: TemperatureCorrection::new(),
+            correction: ResponseCorrection::new(response.reference_temperature_c.get(), response.division),
         }
     }
 
@@ -298,8 +298,7 @@ impl Measurer {
         } else if swept.contains(&(given.pair_id, given.attempt)) {
             return Ok(None);
         } else {
-            let reference = self.rig.impulse_response.reference_temperature_c.get();
-            self.correction.run(&given.samples, resampling_ratio(celsius.get(), reference), &mut ir);
+            self.correction.run(&given.samples, celsius.get(), &mut ir);
             ResponseSource::Ir
         };
         Ok(Some(Response {

@@ -66,6 +66,8 @@ OVER = {"tnce": "over Flat's total", "tnce_band": "over Flat's same band"}
 S24_SPLIT = 5
 ACCEPTED = 1
 KELVIN = 273.15
+# Share of the sweep's limits by which a tapered response's range is narrower.
+MARGIN = 0.015
 
 
 @dataclasses.dataclass(frozen=True)
@@ -126,7 +128,11 @@ class IndependentChain:
         self.settings = settings
         self.gains = self.band_gains(np.fft.rfftfreq(settings.length, 1 / settings.rate_hz).astype(np.float64))
 
-    def divide(self, recording: Signal, loopback: Signal) -> Signal:
+    def ratio(self, celsius: float) -> float:
+        """The speed of sound over that at the reference temperature."""
+        return float(np.sqrt((KELVIN + celsius) / (KELVIN + self.settings.reference_celsius)))
+
+    def divide(self, recording: Signal, loopback: Signal, celsius: float) -> Signal:
         """The appendix's step 1: the recording's spectrum over the loopback's."""
         rig, count = self.settings, len(recording)
         numerator, divisor = np.fft.rfft(recording), np.fft.rfft(loopback)
@@ -141,21 +147,25 @@ class IndependentChain:
             return np.fft.irfft(numerator * divisor.conj() / power, count)
         # A response of this many samples resolves this width.
         width_hz = rig.rate_hz / rig.length
-        rise = np.clip(np.minimum(hz - rig.low_hz, rig.high_hz - hz) / width_hz, 0, 1)
+        # The same limits at the reference temperature, whatever that of the air is.
+        low_hz = max(rig.low_hz * (1 + MARGIN) * self.ratio(celsius), rig.low_hz)
+        high_hz = min(rig.high_hz * (1 - MARGIN) * self.ratio(celsius), rig.high_hz)
+        rise = np.clip(np.minimum(hz - low_hz, high_hz - hz) / width_hz, 0, 1)
         quotient = np.zeros_like(numerator)
         np.divide(numerator, divisor, out=quotient, where=inside)
         return np.fft.irfft(quotient * (1 - np.cos(np.pi * rise)) / 2, count)
 
     def correct(self, response: Signal, celsius: float) -> Signal:
         """Step 2: the time axis of the reference temperature, by SciPy's polyphase filter; then 4 ms of it."""
-        ratio = np.sqrt((KELVIN + celsius) / (KELVIN + self.settings.reference_celsius))
         # So fine a fraction is off by a hundredth of a sample at sample 384 at most.
-        step = fractions.Fraction(float(ratio)).limit_denominator(20_000)
+        step = fractions.Fraction(self.ratio(celsius)).limit_denominator(20_000)
         corrected: Signal = resample_poly(response, step.numerator, step.denominator)[: self.settings.length]
         return np.pad(corrected, (0, self.settings.length - len(corrected)))
 
     def response(self, sweep: Sweep) -> Signal:
-        return self.correct(self.divide(sweep.recording, sweep.loopback), sweep.celsius)
+        corrected = self.correct(self.divide(sweep.recording, sweep.loopback, sweep.celsius), sweep.celsius)
+        # A tapered response's spectrum keeps its height.
+        return corrected / self.ratio(sweep.celsius) if self.settings.division == "tapered" else corrected
 
     def band_gains(self, hz: Signal) -> Signal:
         """Itersine windows an octave wide at -3 dB, with the cosine squared, which the paper omits in print; lowest and
@@ -191,11 +201,11 @@ class ReferenceChain(IndependentChain):
         super().__init__(settings)
         self.pipeline = pipeline
 
-    def divide(self, recording: Signal, loopback: Signal) -> Signal:
+    def divide(self, recording: Signal, loopback: Signal, celsius: float) -> Signal:
         if self.settings.division == "floored":
             quotient: Signal = self.pipeline.deconvolve(recording, loopback, floor_db=self.settings.floor_db)
             return quotient
-        return super().divide(recording, loopback)
+        return super().divide(recording, loopback, celsius)
 
     def correct(self, response: Signal, celsius: float) -> Signal:
         cropped: Signal = self.pipeline.crop(self.pipeline.temperature_correct(response, celsius))

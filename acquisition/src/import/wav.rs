@@ -9,7 +9,7 @@ use echolake_dsp::chain::raw_len;
 use echolake_dsp::deconvolution::{DeconvolutionParams, TransformLength};
 use echolake_dsp::geometry::direct_mm;
 use echolake_dsp::response_deconvolution::ResponseDeconvolution;
-use echolake_dsp::temperature::speed_of_sound;
+use echolake_dsp::temperature::{resampling_ratio, response_limits_hz, speed_of_sound};
 use echolake_schema::manifest::{Origin, RunEnd};
 use echolake_schema::messages::{AmbientSample, ImpulseResponse, Measurement, SweepRecording, Verdict};
 use echolake_schema::{Grid, Rig, SampleRate, SurfaceId, SurfaceRecord, Timestamp};
@@ -120,7 +120,9 @@ impl WavImport<'_> {
         })
         .map_err(planned)?;
         let mut samples = vec![0.0; plan.output_len()];
-        plan.run(&microphone.fractions, &loopback.fractions, &mut samples, &mut plan.scratch())
+        let rho = resampling_ratio(celsius, rig.impulse_response.reference_temperature_c.get());
+        let limits_hz = response_limits_hz([rig.sweep.low_hz, rig.sweep.high_hz], rho);
+        plan.run_within(limits_hz, &microphone.fractions, &loopback.fractions, &mut samples, &mut plan.scratch())
             .map_err(|e| unread("loopback", e.to_string()))?;
         let [m, s] = [row.pair.microphone, row.pair.speaker].map(|id| self.grid.points()[id.index()].position_mm);
         let arrival = direct_mm(m, s) / 1e3 / speed_of_sound(celsius);

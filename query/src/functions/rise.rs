@@ -25,12 +25,12 @@ pub(super) struct CurveShapeFunction {
 impl CurveShapeFunction {
     /// All functions of this file.
     pub(super) fn all(facts: &Arc<RigFacts>) -> [Self; 3] {
-        let values: [(_, fn(&CurveShape, f64) -> f64); 3] = [
-            (&RISE, |shape, per_ms| shape.rise / per_ms),
-            (&CENTRE, |shape, per_ms| shape.centre / per_ms),
-            (&SLOPE, |shape, per_ms| shape.slope * per_ms),
-        ];
-        values.map(|(description, value)| Self { facts: facts.clone(), description, value })
+        let function = |description, value| Self { facts: facts.clone(), description, value };
+        [
+            function(&RISE, |shape: &CurveShape, per_ms| shape.rise / per_ms),
+            function(&CENTRE, |shape, per_ms| shape.centre / per_ms),
+            function(&SLOPE, |shape, per_ms| shape.slope * per_ms),
+        ]
     }
 }
 

@@ -3,9 +3,9 @@
 use std::collections::HashMap;
 
 use anyhow::Context as _;
+use echolake_dsp::chain::ResponseCorrection;
 use echolake_dsp::components::PrincipalComponents;
 use echolake_dsp::heights;
-use echolake_dsp::temperature::{TemperatureCorrection, resampling_ratio};
 use echolake_figures::{
     GridFigure, GridLayer, GridPanel, LevelPalette, MapFigure, MapPosition, NceFigure, NcePanel, ReliefFigure,
     ReliefPanel, ResponseTrace, StepsFigure, StepsRow,
@@ -187,8 +187,8 @@ pub(super) async fn write_steps(source: &FigureSource, args: &StepsArgs) -> anyh
             for celsius in &args.celsius {
                 anyhow::ensure!((-60.0..=80.0).contains(celsius), "`--celsius` is {celsius}; it is -60 to 80");
                 let mut samples = vec![0.0; ir.len()];
-                let ratio = resampling_ratio(*celsius, reference);
-                TemperatureCorrection::<f32>::new().run(&raw.samples, ratio, &mut samples);
+                let correction = ResponseCorrection::<f32>::new(reference, rig.impulse_response.division);
+                correction.run(&raw.samples, *celsius, &mut samples);
                 traces.push(trace(format!("as if measured at {celsius} °C"), samples, own_step));
             }
             traces

@@ -20,7 +20,7 @@ export const meanQuery = (lake: Lake, ids: readonly string[]) =>
   `select surface_id, count(*) as pairs,\n${lake.bands.map((band) => `  avg(tnce_${band.key}) as tnce_${band.key}`).join(',\n')}\nfrom tnce\nwhere surface_id in (${ids.map(quoted).join(', ')})\ngroup by surface_id order by surface_id`
 
 export const statisticsQuery = (ids: readonly string[]) =>
-  `select surface_id, band, p90_mean_db, p5_db, p50_db, p95_db, min_db, max_db, spread_db\nfrom surface_stats\nwhere surface_id in (${ids.map(quoted).join(', ')})\norder by surface_id, band_hz`
+  `select surface_id, band, p90_mean_db, p90_mean_u_db, unbiased_p90_mean_db, p5_db, p50_db, p95_db, min_db, max_db, spread_db\nfrom surface_stats\nwhere surface_id in (${ids.map(quoted).join(', ')})\norder by surface_id, band_hz`
 
 export const curvesQuery = (lake: Lake, id: string, pair?: number) =>
   `select pair_id, ${centres(lake)

@@ -1,7 +1,7 @@
 //! One attempt at one pair: made, judged, and recorded.
 
 use echolake_dsp::geometry::direct_mm;
-use echolake_dsp::temperature::speed_of_sound;
+use echolake_dsp::temperature::{resampling_ratio, response_limits_hz, speed_of_sound};
 use echolake_schema::messages::{AmbientSample, ImpulseResponse, Measurement, SampleFormat, SweepRecording, Verdict};
 use echolake_schema::samples::split_24;
 use echolake_schema::{Celsius, Pair, Timestamp};
@@ -153,7 +153,7 @@ impl RunController<'_> {
         let mut clipped = to_fractions(&self.take.microphone, &mut self.microphone);
         clipped += to_fractions(&self.take.loopback, &mut self.loopback);
         let arrival = direct_mm(microphone, speaker) / 1e3 / speed_of_sound(reading.temperature_c);
-        match self.assess(arrival, clipped) {
+        match self.assess(arrival, clipped, reading.temperature_c) {
             Ok(assessment) => {
                 let mut objections = assessment.objections(&self.rig.validation, reading.outside_level_db);
                 objections.extend(unknowns(&assessment, reading));
@@ -167,8 +167,10 @@ impl RunController<'_> {
         }
     }
 
-    fn assess(&mut self, arrival_secs: f64, clipped: u32) -> Result<TakeAssessment, echolake_dsp::Error> {
-        self.deconvolution.run(&self.microphone, &self.loopback, &mut self.ir, &mut self.scratch)?;
+    fn assess(&mut self, arrival_secs: f64, clipped: u32, celsius: f64) -> Result<TakeAssessment, echolake_dsp::Error> {
+        let (sweep, reference) = (&self.rig.sweep, self.rig.impulse_response.reference_temperature_c.get());
+        let limits_hz = response_limits_hz([sweep.low_hz, sweep.high_hz], resampling_ratio(celsius, reference));
+        self.deconvolution.run_within(limits_hz, &self.microphone, &self.loopback, &mut self.ir, &mut self.scratch)?;
         self.assessor.assess(&self.microphone, &self.loopback, arrival_secs, clipped)
     }
 

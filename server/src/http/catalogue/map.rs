@@ -3,6 +3,7 @@
 use axum::Extension;
 use datafusion::common::ScalarValue;
 use echolake_dsp::components::PrincipalComponents;
+use echolake_dsp::self_organising_map::SelfOrganisingMap;
 use echolake_query::figure_rows::{LevelVectors, level_vectors_query};
 use serde::{Deserialize, Serialize};
 use utoipa::{IntoParams, ToSchema};
@@ -28,9 +29,19 @@ struct SurfaceMap<'a> {
     features: usize,
     /// Share of the variance by component.
     explained: Vec<f64>,
+    units: MapUnits<'a>,
     points: Vec<MapPoint<'a>>,
     /// Surfaces without TNCE, and those beyond the first 2000.
     left_out: Vec<&'a str>,
+}
+
+/// Units of a self-organising map.
+#[derive(Serialize, ToSchema)]
+struct MapUnits<'a> {
+    columns: usize,
+    rows: usize,
+    /// Mean distance of each unit from those beside it, row by row: great between groups.
+    borders_db: &'a [f64],
 }
 
 /// A surface on the map.
@@ -40,6 +51,8 @@ struct MapPoint<'a> {
     typology: &'a str,
     /// Coordinates along the components, dB.
     position: Vec<f64>,
+    /// Column and row of its unit on the self-organising map.
+    unit: [usize; 2],
     neighbours: Vec<SurfaceNeighbour<'a>>,
 }
 
@@ -54,8 +67,8 @@ pub(super) struct MapQuery {
 
 /// Surfaces as points, close together if they reflect alike, and their nearest neighbours.
 ///
-/// Principal components of the surfaces' TNCE vectors (all pairs and bands, dB over Flat's same band); once per
-/// snapshot.
+/// Principal components and a self-organising map of the surfaces' TNCE vectors (all pairs and bands, dB over Flat's same
+/// band); once per snapshot.
 #[utoipa::path(
     get,
     path = "/api/v1/map",
@@ -63,7 +76,8 @@ pub(super) struct MapQuery {
     params(MapQuery),
     responses((status = 200, description = "OK", body = SurfaceMap)),
     extensions(("x-sql" = json!([
-        "select surface_id, pair_id, tnce_band_2500, ..., tnce_band_40000 from tnce; Gram matrix, leading eigenvectors",
+        "select surface_id, pair_id, tnce_band_2500, ..., tnce_band_40000 from tnce; Gram matrix, leading eigenvectors, \
+         batch self-organising map",
     ])))
 )]
 pub(super) async fn map(
@@ -77,6 +91,7 @@ pub(super) async fn map(
         surface_id: name,
         typology: typology(name),
         position: places.components.position(i),
+        unit: places.units.units[i],
         neighbours: places.neighbours(i, query.neighbours.get()),
     };
     let names: std::collections::HashSet<_> = places.names.iter().map(String::as_str).collect();
@@ -84,6 +99,11 @@ pub(super) async fn map(
     Ok(AnswerContent::json(&SurfaceMap {
         features: places.components.features(),
         explained: places.components.explained(),
+        units: MapUnits {
+            columns: places.units.size[0],
+            rows: places.units.size[1],
+            borders_db: &places.units.borders,
+        },
         points: places.names.iter().map(String::as_str).enumerate().map(point).collect(),
         left_out: all.filter(|name| !names.contains(name)).collect(),
     })?)
@@ -108,8 +128,12 @@ async fn find_positions(request: &CatalogueRequest) -> Result<SurfacePositions, 
     while let Some(batch) = rows.next().await? {
         vectors.add(&batch).map_err(RequestFault::defect("the map's columns are not as expected"))?;
     }
-    let found =
-        request.catalogue.service().crunch(move || PrincipalComponents::of(&mut vectors.rows, COMPONENTS)).await?;
-    let components = found.map_err(RequestFault::defect("surfaces have no places"))?;
-    Ok(SurfacePositions { names, components })
+    let place = move || {
+        let components = PrincipalComponents::of(&mut vectors.rows, COMPONENTS)?;
+        let units = SelfOrganisingMap::of(&components);
+        Ok::<_, echolake_dsp::Error>((components, units))
+    };
+    let found = request.catalogue.service().crunch(place).await?;
+    let (components, units) = found.map_err(RequestFault::defect("surfaces have no places"))?;
+    Ok(SurfacePositions { names, components, units })
 }

@@ -46,6 +46,10 @@ struct PairDetail<'a> {
     tnce_db: Vec<Option<f64>>,
     /// Over Flat's same band, by band as `tnce_db`.
     tnce_band_db: Vec<Option<f64>>,
+    /// Standard uncertainties of `tnce_db`; null if they are not known.
+    tnce_u_db: Vec<Option<f64>>,
+    /// Standard uncertainties of `tnce_band_db`; null if they are not known.
+    tnce_band_u_db: Vec<Option<f64>>,
     curves: Option<CurveSet>,
     symmetries: Vec<SymmetricPair>,
     /// What the controller logged about this pair.
@@ -126,6 +130,8 @@ pub(super) struct ReflectedResponse {
 struct PairEnergies {
     total: Vec<Option<f64>>,
     band: Vec<Option<f64>>,
+    total_u_db: Vec<Option<f64>>,
+    band_u_db: Vec<Option<f64>>,
 }
 
 /// A pair that a symmetry of the grid makes of another.
@@ -270,6 +276,8 @@ pub(super) async fn pair(
         flat_reflected: flat.as_deref(),
         tnce_db: levels_db(&energies.total),
         tnce_band_db: levels_db(&energies.band),
+        tnce_u_db: energies.total_u_db,
+        tnce_band_u_db: energies.band_u_db,
         curves: Some(curves).filter(CurveSet::is_there),
         symmetries: moved,
         attempts,
@@ -293,16 +301,24 @@ async fn energies(
     run: &str,
 ) -> Result<PairEnergies, RequestFault> {
     let rig = request.catalogue.lake().rig();
-    let total = band_list(rig, |band| format!("tnce_{band}"));
-    let band =
-        band_list(rig, |band| if band == TOTAL_BAND { "tnce_total".into() } else { format!("tnce_band_{band}") });
+    let over_total = |band: &str| format!("tnce_{band}");
+    let over_band = |band: &str| if band == TOTAL_BAND { over_total(band) } else { format!("tnce_band_{band}") };
+    let (total, band) = (band_list(rig, over_total), band_list(rig, over_band));
+    let total_u = band_list(rig, |band| format!("{}_u_db", over_total(band)));
+    let band_u = band_list(rig, |band| format!("{}_u_db", over_band(band)));
     let sql = format!(
-        "select {total} as total, {band} as band from tnce where surface_id = $1 and pair_id = $2 and run_id = $3"
+        "select {total} as total, {band} as band, {total_u} as total_u_db, {band_u} as band_u_db from tnce \
+         where surface_id = $1 and pair_id = $2 and run_id = $3"
     );
     let values = vec![text(&entry.surface.surface_id), number(pair), text(run)];
     let nothing = vec![None; rig.band_names().len() + 1];
     let found = request.rows(&sql, values).await?.into_iter().next();
-    Ok(found.unwrap_or_else(|| PairEnergies { total: nothing.clone(), band: nothing }))
+    Ok(found.unwrap_or_else(|| PairEnergies {
+        total: nothing.clone(),
+        band: nothing.clone(),
+        total_u_db: nothing.clone(),
+        band_u_db: nothing,
+    }))
 }
 
 async fn symmetries(

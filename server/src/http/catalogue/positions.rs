@@ -1,6 +1,7 @@
 //! Positions of surfaces among each other, by their TNCE.
 
 use echolake_dsp::components::PrincipalComponents;
+use echolake_dsp::self_organising_map::SelfOrganisingMap;
 use serde::Serialize;
 use utoipa::ToSchema;
 
@@ -8,6 +9,7 @@ use utoipa::ToSchema;
 pub(super) struct SurfacePositions {
     pub(super) names: Vec<String>,
     pub(super) components: PrincipalComponents,
+    pub(super) units: SelfOrganisingMap,
 }
 
 impl SurfacePositions {

@@ -44,6 +44,10 @@ struct BandStatistics {
     min_db: Option<f64>,
     max_db: Option<f64>,
     spread_db: Option<f64>,
+    /// Standard uncertainty of `p90_mean_db`; null if it is not known.
+    p90_mean_u_db: Option<f64>,
+    /// `p90_mean_db` without Foam's own reflection; null if it cannot be estimated.
+    unbiased_p90_mean_db: Option<f64>,
 }
 
 #[derive(Deserialize)]
@@ -57,8 +61,8 @@ struct SurfaceRun {
     run_id: String,
 }
 
-const STATISTICS: &str = "select band, measurements, p90_mean_db, p5_db, p50_db, p95_db, min_db, max_db, spread_db \
-    from surface_stats where surface_id = $1 order by run_id desc";
+const STATISTICS: &str = "select band, measurements, p90_mean_db, p5_db, p50_db, p95_db, min_db, max_db, spread_db, \
+    p90_mean_u_db, unbiased_p90_mean_db from surface_stats where surface_id = $1 order by run_id desc";
 
 /// One surface with its statistics and means against Flat.
 #[utoipa::path(
