@@ -4,7 +4,7 @@
 //! use echolake_acquisition::panel::relief::PanelRelief;
 //!
 //! let wall = PanelRelief::by_name("stretcher_bond")?;
-//! assert_eq!(wall.material().reflection_factor, 0.83);
+//! assert_eq!(wall.material().name(), "coated print");
 //! # Ok::<(), echolake_acquisition::panel::relief::Error>(())
 //! ```
 

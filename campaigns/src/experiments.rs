@@ -15,7 +15,7 @@ use std::io::Write as _;
 use anyhow::Result;
 use echolake_acquisition::panel::relief::{HeightField, PANEL_SIZE_MM, PanelRelief};
 use echolake_dsp::filter_bank::gain;
-use echolake_dsp::kirchhoff::KirchhoffPlan;
+use echolake_dsp::kirchhoff::{KirchhoffPlan, SoundPath, TransducerPose};
 use echolake_dsp::level::{p90_mean, power_to_db};
 use echolake_schema::{Grid, Rig};
 use realfft::RealFftPlanner;
@@ -132,11 +132,10 @@ pub(crate) fn run(args: &ExperimentsArgs) -> Result<()> {
     Ok(())
 }
 
-/// The grid, and the direct sound of its pairs.
+/// The grid, and the weights of the bands.
 struct ExperimentGrid {
     points_mm: Vec<[f64; 3]>,
     pairs: Vec<[usize; 2]>,
-    direct: KirchhoffPlan,
     /// Weight of each bin in each band's energy.
     weights: Vec<[f64; COLUMNS]>,
 }
@@ -145,15 +144,12 @@ impl ExperimentGrid {
     fn new(grid: Grid, every: usize) -> Self {
         let points_mm: Vec<_> = grid.points().iter().map(|p| p.position_mm).collect();
         let pairs = grid.pairs().iter().step_by(every).map(|p| [p.microphone.index(), p.speaker.index()]).collect();
-        // A panel that reflects nothing leaves the direct sound.
-        let nothing = HeightField::from_fn(PANEL_SIZE_MM, 2, |_, _| 0.0);
-        let direct = KirchhoffPlan::new(&nothing, &points_mm, RATE_HZ, COMPUTED);
-        Self { direct, points_mm, pairs, weights: (0..SAMPLES / 2 + 1).map(weights).collect() }
+        Self { points_mm, pairs, weights: (0..SAMPLES / 2 + 1).map(weights).collect() }
     }
 
     /// Energy of the reflection in each band and in all, of each pair.
     fn energies(&self, heights: &HeightField) -> Result<Vec<[f64; COLUMNS]>, echolake_dsp::Error> {
-        let plan = KirchhoffPlan::new(heights, &self.points_mm, RATE_HZ, COMPUTED);
+        let plan = KirchhoffPlan::new(heights, RATE_HZ, COMPUTED);
         let threads = std::thread::available_parallelism().map_or(1, usize::from);
         let share = self.pairs.len().div_ceil(threads);
         std::thread::scope(|scope| {
@@ -169,15 +165,24 @@ impl ExperimentGrid {
     }
 
     fn measured(&self, plan: &KirchhoffPlan, pairs: &[[usize; 2]]) -> Result<Vec<[f64; COLUMNS]>, echolake_dsp::Error> {
-        let (mut scratch, mut direct_scratch) = (plan.scratch(), self.direct.scratch());
-        let (mut response, mut direct) = (vec![0.0; COMPUTED], vec![0.0; COMPUTED]);
+        let (mut scratch, mut response) = (plan.scratch(), vec![0.0; COMPUTED]);
+        let (silence, rigid) = (plan.filter(|_| 0.0.into()), plan.filter(|_| 1.0.into()));
         let forward = RealFftPlanner::<f32>::new().plan_fft_forward(SAMPLES);
         let (mut ir, mut spectrum) = (forward.make_input_vec(), forward.make_output_vec());
         let mut energies = Vec::with_capacity(pairs.len());
         for pair in pairs {
-            plan.response(*pair, SPEED_M_S, 1.0, &mut scratch, &mut response)?;
-            self.direct.response(*pair, SPEED_M_S, 0.0, &mut direct_scratch, &mut direct)?;
-            ir.iter_mut().zip(&response).zip(&direct).for_each(|((ir, all), direct)| *ir = all - direct);
+            let [microphone, speaker] =
+                pair.map(|point| TransducerPose { position_mm: self.points_mm[point], axis: [0.0, 0.0, -1.0] });
+            let path = SoundPath {
+                microphone,
+                speaker,
+                speed_of_sound_m_s: SPEED_M_S,
+                absorption_db_per_m: &|_| 0.0,
+                direct: &silence,
+                reflection: &rigid,
+            };
+            plan.response(&path, &mut scratch, &mut response)?;
+            ir.copy_from_slice(&response[..SAMPLES]);
             // The buffers are the plan's own.
             let _ = forward.process(&mut ir, &mut spectrum);
             let mut energy = [0.0; COLUMNS];

@@ -90,6 +90,36 @@ impl HeightField {
         lower * (1.0 - v) + upper * v
     }
 
+    /// Root mean square of the heights beside their mean over squares of this width around them, mm: of what is narrower.
+    /// Squares end at the field's edges.
+    pub fn detail_rms_mm(&self, width_mm: f64) -> f64 {
+        let cells = self.cells;
+        let reach = ((width_mm / self.pitch_mm() - 1.0) / 2.0).round().clamp(0.0, cells as f64) as usize;
+        let span = |i: usize| i.saturating_sub(reach)..(i + reach + 1).min(cells);
+        // Sums over all cells below and left.
+        let mut sums = vec![0.0; (cells + 1) * (cells + 1)];
+        for iy in 0..cells {
+            let mut row = 0.0;
+            for ix in 0..cells {
+                row += f64::from(self.at(ix, iy));
+                sums[(iy + 1) * (cells + 1) + ix + 1] = sums[iy * (cells + 1) + ix + 1] + row;
+            }
+        }
+        let sum = |ix: usize, iy: usize| sums[iy * (cells + 1) + ix];
+        let mut squares = 0.0;
+        for iy in 0..cells {
+            let rows = span(iy);
+            for ix in 0..cells {
+                let columns = span(ix);
+                let inside = sum(columns.end, rows.end) - sum(columns.start, rows.end) - sum(columns.end, rows.start)
+                    + sum(columns.start, rows.start);
+                let mean = inside / (columns.len() * rows.len()) as f64;
+                squares += (f64::from(self.at(ix, iy)) - mean).powi(2);
+            }
+        }
+        (squares / (cells * cells) as f64).sqrt()
+    }
+
     /// A NumPy file of the heights, `[cells x cells]` f32, mm, rows along x with y ascending.
     pub fn to_npy(&self) -> Vec<u8> {
         let shape = format!("{{'descr': '<f4', 'fortran_order': False, 'shape': ({0}, {0}), }}", self.cells);
@@ -121,6 +151,19 @@ mod tests {
         let again: ndarray::Array2<f32> = read.expect("its own file");
         assert_eq!((again.nrows(), again.ncols()), (7, 7));
         assert!(again.iter().eq(plane.heights_mm()));
+    }
+
+    #[test]
+    fn details_are_what_is_narrower() {
+        let stripes = HeightField::from_fn(100.0, 100, |x, _| if x.floor() as i64 % 2 == 0 { 2.0 } else { 0.0 });
+        // Over three cells the mean is a third of the height off the middle.
+        for (width_mm, expected) in [(1.0, 0.0), (3.0, 4.0 / 3.0), (51.0, 1.0)] {
+            let rms = stripes.detail_rms_mm(width_mm);
+            assert!((rms - expected).abs() < 0.02, "{width_mm}: {rms}");
+        }
+        let whole = HeightField::from_fn(100.0, 7, |x, y| x - y / 2.0);
+        let slope = HeightField::from_fn(100.0, 100, |x, _| 0.01 * x);
+        assert!(slope.detail_rms_mm(9.0) < 0.02 && (whole.detail_rms_mm(1e6) - 31.94).abs() < 0.1);
     }
 
     #[test]

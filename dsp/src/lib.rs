@@ -27,6 +27,7 @@
 //! # Ok::<(), echolake_dsp::Error>(())
 //! ```
 
+pub mod air;
 mod aligned;
 pub mod arrival;
 pub mod chain;

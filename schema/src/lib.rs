@@ -22,6 +22,7 @@ pub mod quantities;
 pub mod rig;
 pub mod robots;
 pub mod samples;
+pub mod simulation;
 pub mod symmetry;
 pub mod tables;
 pub mod topics;

@@ -5,6 +5,7 @@ use serde::{Deserialize, Serialize};
 use crate::devices::DeviceParams;
 use crate::grid::{Grid, GridParams};
 use crate::robots::RobotCell;
+use crate::simulation::SimulationParams;
 use crate::{Celsius, Error, SampleRate};
 
 /// A rig, as its TOML describes it. Settings that the TOML omits are those of Rust et al. 2021
@@ -42,6 +43,9 @@ pub struct Rig {
     /// Its devices.
     #[serde(skip_serializing_if = "DeviceParams::are_simulated")]
     pub devices: DeviceParams,
+    /// Effects that simulated devices compute.
+    #[serde(skip_serializing_if = "SimulationParams::is_default")]
+    pub simulation: SimulationParams,
 }
 
 /// The sweep that is played.
@@ -208,6 +212,7 @@ impl Default for Rig {
             grid: GridParams::default(),
             robots: RobotCell::default(),
             devices: DeviceParams::default(),
+            simulation: SimulationParams::default(),
         }
     }
 }
@@ -397,6 +402,11 @@ impl Rig {
             ),
             (self.robots.contradiction().is_none(), "robots", self.robots.contradiction().unwrap_or_default()),
             (self.devices.contradiction().is_none(), "devices", self.devices.contradiction().unwrap_or_default()),
+            (
+                self.simulation.contradiction().is_none(),
+                "simulation",
+                self.simulation.contradiction().unwrap_or_default(),
+            ),
         ];
         match rules.into_iter().find(|(holds, ..)| !holds) {
             Some((_, field, reason)) => Err(Error::Rig { rig: self.name.clone(), field, reason }),
@@ -494,6 +504,7 @@ mod tests {
             &format!("{REAL}audio.loopback = 3"),
             &format!("{REAL}robots.speed = 2.0"),
             "robots.order = \"random\"",
+            "simulation.calibration_mm = -0.1",
         ] {
             let error = Rig::from_toml(toml).expect_err(toml);
             said += &format!("{}\n    {error}\n", toml.strip_prefix(REAL).unwrap_or(toml));
@@ -528,7 +539,7 @@ mod tests {
               |
             1 | sweeep.rate_hz = 1
               | ^^^^^^
-            unknown field `sweeep`, expected one of `name`, `sweep`, `impulse_response`, `bands`, `panel`, `validation`, `grid`, `robots`, `devices`
+            unknown field `sweeep`, expected one of `name`, `sweep`, `impulse_response`, `bands`, `panel`, `validation`, `grid`, `robots`, `devices`, `simulation`
 
             [grid]
             layers = []
@@ -570,6 +581,8 @@ mod tests {
               |                ^^^^^^^^
             unknown variant `random`, expected `numbered` or `planned`
 
+            simulation.calibration_mm = -0.1
+                rig `paper`: `simulation` expected repeatability_mm and calibration_mm from 0 to 10
         "#]].assert_eq(&said);
     }
 
@@ -580,6 +593,7 @@ mod tests {
         other.name = "attic".into();
         other.sweep.duration_secs = 0.05;
         other.validation.attempts = 9;
+        other.simulation.directivity = false;
         assert_eq!(paper.differences(&other), []);
         other.impulse_response.length = 400;
         assert_eq!(paper.differences(&other), [("impulse_response.length", "384".into(), "400".into())]);

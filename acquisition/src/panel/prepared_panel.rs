@@ -5,6 +5,7 @@ use std::path::Path;
 use echolake_schema::manifest::MeshFacts;
 use echolake_schema::{Rig, SurfaceRecord};
 
+use crate::panel::material::SurfaceMaterial;
 use crate::panel::mesh::{self, BACK_MM, Format, MESH_CELLS, Mesh, PanelSide};
 use crate::panel::relief::{HeightField, PanelRelief};
 use crate::rig::devices::simulated::FACETS;
@@ -16,7 +17,7 @@ pub(crate) struct PreparedPanel {
     pub(crate) heights: HeightField,
     pub(crate) mesh: Mesh,
     pub(crate) record: SurfaceRecord,
-    pub(crate) reflection_factor: f64,
+    pub(crate) material: SurfaceMaterial,
     original: Option<(String, Format, Vec<u8>)>,
 }
 
@@ -59,15 +60,15 @@ fn generated(relief: &PanelRelief) -> PreparedPanel {
             macrostructure,
             mesostructure: Some(relief.name().to_owned()),
             microstructure,
-            material: Some(material.name.to_owned()),
-            reflection_factor: Some(material.reflection_factor),
+            material: Some(material.name().to_owned()),
+            reflection_factor: Some(material.reflection_factor()),
             parameters: relief.parameters().into(),
             mesh: Some(facts),
             ..SurfaceRecord::default()
         },
         heights,
         mesh,
-        reflection_factor: material.reflection_factor,
+        material,
         original: None,
     }
 }
@@ -89,8 +90,8 @@ fn from_file(path: &Path, side: PanelSide, rig: &Rig) -> Result<PreparedPanel, m
     Ok(PreparedPanel {
         record: SurfaceRecord {
             typology: "mesh".to_owned(),
-            material: Some(material.name.to_owned()),
-            reflection_factor: Some(material.reflection_factor),
+            material: Some(material.name().to_owned()),
+            reflection_factor: Some(material.reflection_factor()),
             // The attached file is the producer's, which shows its front.
             parameters: serde_json::json!({ "side": side.name() }),
             mesh: Some(facts),
@@ -98,7 +99,7 @@ fn from_file(path: &Path, side: PanelSide, rig: &Rig) -> Result<PreparedPanel, m
         },
         heights,
         mesh,
-        reflection_factor: material.reflection_factor,
+        material,
         original: Some((name, format, bytes)),
     })
 }

@@ -1,6 +1,10 @@
 //! The row of table `surfaces`.
 
+use std::f64::consts::TAU;
+
 use arrow::record_batch::RecordBatch;
+use echolake_dsp::height_field::HeightField;
+use echolake_dsp::temperature::speed_of_sound;
 use echolake_lake::ReferenceSurfaces;
 use echolake_schema::tables::Table;
 use echolake_schema::{Rig, SurfaceRecord};
@@ -22,8 +26,13 @@ pub(crate) fn row(
     let known = |i: usize| [relief.map(|r| r[i]).filter(|x| x.is_finite())];
     let flat = surface.flat_reference.as_ref().unwrap_or(&references.flat);
     let foam = surface.foam_reference.as_ref().unwrap_or(&references.foam);
-    let row = keys
-        .begin_rows(Table::Surfaces, rig, 1)
+    let heights = square(heights_mm, rig.panel.size_mm);
+    let mut row = keys.begin_rows(Table::Surfaces, rig, 1);
+    for (band, hz) in rig.band_names().iter().zip(&rig.bands.centres_hz) {
+        let phase = heights.as_ref().and_then(|heights| detail_phase(heights, rig, *hz));
+        row.floats(&format!("detail_phase_{band}"), [phase]);
+    }
+    let row = row
         .text("panel", keys.surface.panel())
         .ints("side", [keys.surface.side().map(i32::from)])
         .text("typology", surface.typology.as_str())
@@ -46,6 +55,20 @@ pub(crate) fn row(
     Ok(row)
 }
 
+fn square(heights_mm: &[f32], size_mm: f64) -> Option<HeightField> {
+    let side = heights_mm.len().isqrt();
+    let mut all = heights_mm.iter().copied().map(f64::from);
+    let is_square = side > 1 && side * side == heights_mm.len();
+    is_square.then(|| HeightField::from_fn(size_mm, side, |_, _| all.next().unwrap_or_default()))
+}
+
+// Of cells as wide as half a wavelength, nothing is known within one.
+fn detail_phase(heights: &HeightField, rig: &Rig, hz: f64) -> Option<f32> {
+    let wavelength_mm = 1e3 * speed_of_sound(rig.impulse_response.reference_temperature_c.get()) / hz;
+    let phase = TAU / wavelength_mm * heights.detail_rms_mm(wavelength_mm);
+    (wavelength_mm > 2.0 * heights.pitch_mm()).then_some(phase as f32)
+}
+
 // Minimum, maximum and root mean square height about the mean.
 fn relief(heights_mm: &[f32]) -> Option<[f32; 3]> {
     if heights_mm.is_empty() {
@@ -57,4 +80,24 @@ fn relief(heights_mm: &[f32]) -> Option<[f32; 3]> {
     let least = heights_mm.iter().copied().fold(f32::INFINITY, f32::min);
     let greatest = heights_mm.iter().copied().fold(f32::NEG_INFINITY, f32::max);
     Some([least, greatest, square.sqrt() as f32])
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    // A groove of a fifth of its period has a root mean square of 0.4 of its depth, and lies within all wavelengths that
+    // are longer than the period.
+    #[test]
+    fn details_are_told_where_cells_can_show_them() {
+        let rig = Rig::paper();
+        let grooves = |cells: usize| {
+            let row = move |i: usize| if i % 5 == 0 { -1.0f32 } else { 0.0 };
+            square(&(0..cells * cells).map(|i| row(i % cells)).collect::<Vec<_>>(), 585.0).expect("square")
+        };
+        let phase = detail_phase(&grooves(260), &rig, 10e3).expect("there");
+        assert!((phase - 0.4 * (TAU * 10.0 / 343.2) as f32).abs() < 0.01, "{phase}");
+        assert_eq!(detail_phase(&grooves(100), &rig, 40e3), None);
+        assert_eq!(square(&[0.0; 6], 585.0), None);
+    }
 }

@@ -16,7 +16,7 @@ pub(super) struct TableDefinition {
 impl TableDefinition {
     pub(super) fn of(table: Table) -> Self {
         match table {
-            Table::Surfaces => Self::new("surfaces", Source::Run, &["surface_id"], |_| surfaces()),
+            Table::Surfaces => Self::new("surfaces", Source::Run, &["surface_id"], surfaces),
             Table::Runs => Self::new("runs", Source::Pointer, &["run_id"], |_| runs()),
             Table::Points => Self::new("points", Source::Rig, &["point_id"], |_| points()),
             Table::Pairs => Self::new("pairs", Source::Rig, &["pair_id"], |_| pairs()),
@@ -83,7 +83,7 @@ fn references() -> Vec<Column> {
     ]
 }
 
-fn surfaces() -> Vec<Column> {
+fn surfaces(bands: &[String]) -> Vec<Column> {
     let mut columns = run_keys();
     columns.extend([
         Column::text("panel", "Physical panel that the surface is a side of"),
@@ -104,9 +104,13 @@ fn surfaces() -> Vec<Column> {
         Column::float("relief_min_mm", "mm", "Lowest point of the relief over the panel's reference plane").or_null(),
         Column::float("relief_max_mm", "mm", "Highest point of the relief over the panel's reference plane").or_null(),
         Column::float("relief_rms_mm", "mm", "Root mean square height of the relief about its mean").or_null(),
-        Column::text("origin", ORIGINS),
-        code_version(),
     ]);
+    columns.extend(bands.iter().map(|band| {
+        let comment = "Phase, rad, of the relief's details narrower than a wavelength, root mean square; over 0.18 \
+                       simulated levels of single pairs are off by more than 1 dB";
+        Column::float(format!("detail_phase_{band}"), "1", format!("{comment}, band at {band} Hz")).or_null()
+    }));
+    columns.extend([Column::text("origin", ORIGINS), code_version()]);
     columns
 }
 

@@ -25,6 +25,7 @@ pub use settings::FULL_SCALE;
 
 pub use echolake_dsp::height_field::HeightField;
 
+use crate::panel::material::SurfaceMaterial;
 use chance::SeededRandom;
 
 /// Edge of a panel, mm (Rust et al. 2021).
@@ -46,15 +47,6 @@ pub enum PanelRelief {
     Prd(PrimitiveRootDiffuser),
     /// A wall in layers, with full-scale parameters.
     Layered(LayeredWall),
-}
-
-/// Material of a surface.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct SurfaceMaterial {
-    /// Its name.
-    pub name: &'static str,
-    /// Pressure reflection factor.
-    pub reflection_factor: f64,
 }
 
 /// An error of making a relief.
@@ -261,12 +253,12 @@ impl PanelRelief {
         }
     }
 
-    /// Returns its material. Flat reflects 29.3 % less energy than Wood (Rust et al. 2021), hence 0.83.
+    /// Returns its material.
     pub fn material(&self) -> SurfaceMaterial {
         match self {
-            Self::Foam => SurfaceMaterial { name: "melamine foam", reflection_factor: 0.05 },
-            Self::Wood => SurfaceMaterial { name: "MDF", reflection_factor: 0.99 },
-            _ => SurfaceMaterial { name: "coated print", reflection_factor: 0.83 },
+            Self::Foam => SurfaceMaterial::MelamineFoam,
+            Self::Wood => SurfaceMaterial::FibreBoard,
+            _ => SurfaceMaterial::CoatedPrint,
         }
     }
 

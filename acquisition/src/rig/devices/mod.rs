@@ -2,6 +2,7 @@
 
 pub(crate) mod paced;
 pub mod simulated;
+mod transducers;
 
 use std::sync::Arc;
 
@@ -45,7 +46,7 @@ pub(crate) fn simulated_devices(request: &DeviceRequest<'_>, pace: TakePace) -> 
     let devices = devices(&RigSimulation {
         rig: request.rig,
         relief: &request.panel.heights,
-        reflection_factor: request.panel.reflection_factor,
+        material: request.panel.material,
         start: request.start,
         seed: request.seed,
         arms: request.arms.clone(),

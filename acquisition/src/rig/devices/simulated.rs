@@ -1,17 +1,21 @@
 //! The simulated rig: computed, never measured, and marked as such in every run it makes ([`Origin::Simulated`]).
 //!
-//! The room's air drifts over the simulated hours; the panel reflects as [`KirchhoffPlan`] says, times its
-//! material's factor; the direct sound goes as 1/d; both channels pass the converter; noise is added, and now and
-//! then something outside spoils a take. The same seed gives the same bits.
+//! The room's air drifts over the simulated hours and absorbs; the arms stand beside the points by some hundredths of a
+//! millimetre; the panel reflects as [`KirchhoffPlan`] and its material say; the direct sound goes as 1/d; tweeter and
+//! microphone have responses and directions; both channels pass the converter; noise is added, and now and then
+//! something outside spoils a take. The same seed gives the same bits. [`SimulationParams`] switches effects off.
 
 use std::f64::consts::{PI, TAU};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use echolake_dsp::RealSample as _;
+use echolake_dsp::air::AirAbsorption;
 use echolake_dsp::deconvolution::fast_length;
-use echolake_dsp::kirchhoff::{KirchhoffPlan, KirchhoffScratch};
+use echolake_dsp::geometry::specular_point;
+use echolake_dsp::kirchhoff::{FacetScattering, KirchhoffPlan, KirchhoffScratch, SoundPath, TransducerPose};
 use echolake_dsp::temperature::speed_of_sound;
 use echolake_schema::manifest::Origin;
+use echolake_schema::simulation::SimulationParams;
 use echolake_schema::{Grid, Rig, Timestamp};
 use rand::{Rng as _, SeedableRng as _};
 use rand_chacha::ChaCha8Rng;
@@ -19,8 +23,10 @@ use rand_distr::{Distribution as _, StandardNormal};
 use realfft::num_complex::Complex;
 use realfft::{ComplexToReal, RealToComplex};
 
+use super::transducers;
+use crate::panel::material::SurfaceMaterial;
 use crate::panel::relief::HeightField;
-use crate::rig::robots::Choreography;
+use crate::rig::robots::{Choreography, Joints, Tool};
 use crate::rig::{
     AmbientReading, AmbientSensor, ArmPositions, AudioInterface, AudioTake, DeviceFault, DrivePower, Error, RigDevices,
     RobotArms,
@@ -47,6 +53,13 @@ const SPOILED_LEVEL_DB: f64 = 78.0;
 const SPOILED_NOISE: f64 = 3e-3;
 /// Full scale of 24 bits.
 const FULL_SCALE: f64 = 8_388_608.0;
+/// Seed of the arms' calibration: it is the rig's, not the run's, so that Foam and Flat are measured at the same places.
+const CALIBRATION_SEED: u64 = 0xCA11;
+/// Told from the seed of noise and air by this.
+const PLACES_SEED: u64 = 0x91AC;
+/// Standard deviation along each axis of a displacement whose mean length is 1: Maxwell's distribution. Its 90th
+/// percentile is 1.57 then; the paper prints 0.17 and 0.28 mm.
+const AXIS_PER_MEAN: f64 = 0.626_657;
 
 /// Settings of a simulation.
 #[derive(Debug, Clone)]
@@ -55,8 +68,8 @@ pub struct RigSimulation<'a> {
     pub rig: &'a Rig,
     /// The panel.
     pub relief: &'a HeightField,
-    /// Its pressure reflection factor.
-    pub reflection_factor: f64,
+    /// Its material.
+    pub material: SurfaceMaterial,
     /// Time at which its clock begins.
     pub start: Timestamp,
     /// Seed of drift and noise.
@@ -71,10 +84,16 @@ struct SimulatedWorld {
     now: Timestamp,
     start: Timestamp,
     power: DrivePower,
-    /// Microphone's and speaker's position, as indices of the grid's points.
-    stand: [usize; 2],
+    effects: SimulationParams,
+    /// Displacement of the microphone's and the speaker's arm at each point of the grid, mm.
+    calibration_mm: [Vec<[f64; 3]>; 2],
+    /// Where microphone and speaker are.
+    microphone: TransducerPose,
+    speaker: TransducerPose,
     air: Air,
     rng: ChaCha8Rng,
+    /// Chance of the arms' places, apart from that of noise and air, so that no effect's switch changes these.
+    places: ChaCha8Rng,
     /// Level outside during the last take.
     outside_level_db: f64,
 }
@@ -84,6 +103,9 @@ struct Air {
     phase: f64,
     walk: f64,
 }
+
+/// The direction of an axis that points at the panel's plane.
+const DOWN: [f64; 3] = [0.0, 0.0, -1.0];
 
 type SharedWorld = Arc<Mutex<SimulatedWorld>>;
 
@@ -100,16 +122,34 @@ pub fn devices(simulation: &RigSimulation<'_>) -> Result<RigDevices, Error> {
     let mut rng = ChaCha8Rng::seed_from_u64(simulation.seed);
     let points: Vec<_> = grid.points().iter().map(|p| p.position_mm).collect();
     let rate_hz = simulation.rig.sweep.rate_hz.get();
-    let plan =
-        KirchhoffPlan::new(simulation.relief, &points, rate_hz, response_len(simulation.relief, &points, rate_hz));
+    let effects = simulation.rig.simulation.clone();
+    let mut plan = KirchhoffPlan::new(simulation.relief, rate_hz, response_len(simulation.relief, &points, rate_hz));
+    if !effects.steep_facets {
+        plan = plan.with_scattering(FacetScattering::FacingTangent);
+    }
+    if effects.directivity {
+        plan = plan.with_directivity(transducers::microphone_directivity, transducers::speaker_directivity);
+    }
+    let direct = plan.filter(|hz| if effects.transducer_response { transducers::response(hz) } else { 1.0.into() });
+    let is_silent = simulation.material == SurfaceMaterial::MelamineFoam && !effects.foam_reflection;
+    let reflection = plan.filter(|hz| match effects.material_spectra {
+        _ if is_silent => 0.0.into(),
+        true => simulation.material.reflection(hz),
+        false => simulation.material.reflection_factor().into(),
+    });
+    let reflection = direct.iter().zip(&reflection).map(|(transducers, relief)| transducers * relief).collect();
     let world = Arc::new(Mutex::new(SimulatedWorld {
+        calibration_mm: calibration(points.len(), effects.calibration_mm),
+        effects,
         grid,
         now: simulation.start,
         start: simulation.start,
         power: DrivePower::Off,
-        stand: [0, 1],
+        microphone: TransducerPose { position_mm: points[0], axis: DOWN },
+        speaker: TransducerPose { position_mm: points[1], axis: DOWN },
         air: Air { phase: rng.random_range(0.0..TAU), walk: 0.0 },
         rng,
+        places: ChaCha8Rng::seed_from_u64(simulation.seed ^ PLACES_SEED),
         outside_level_db: 42.0,
     }));
     Ok(RigDevices {
@@ -117,7 +157,8 @@ pub fn devices(simulation: &RigSimulation<'_>) -> Result<RigDevices, Error> {
         audio: Box::new(SimulatedAudio {
             world: world.clone(),
             rate_hz,
-            reflection_factor: simulation.reflection_factor,
+            direct,
+            reflection,
             scratch: plan.scratch(),
             response: vec![0.0; plan.len()],
             plan,
@@ -126,6 +167,16 @@ pub fn devices(simulation: &RigSimulation<'_>) -> Result<RigDevices, Error> {
         sensor: Box::new(SimulatedSensor(world)),
         origin: Origin::Simulated,
     })
+}
+
+// Displacements of both arms at each point.
+fn calibration(points: usize, mean_mm: f64) -> [Vec<[f64; 3]>; 2] {
+    let mut rng = ChaCha8Rng::seed_from_u64(CALIBRATION_SEED);
+    let mut axis = || {
+        let normal: f64 = StandardNormal.sample(&mut rng);
+        AXIS_PER_MEAN * mean_mm * normal
+    };
+    [(); 2].map(|()| (0..points).map(|_| [axis(), axis(), axis()]).collect())
 }
 
 // The farthest echo comes by a corner of the panel, between the two points that are farthest from theirs, in air of
@@ -144,12 +195,32 @@ fn lock(world: &SharedWorld) -> MutexGuard<'_, SimulatedWorld> {
 
 impl SimulatedWorld {
     fn temperature_c(&self) -> f64 {
-        let hours = (self.now.0 - self.start.0) as f64 / 3.6e12;
-        21.5 + 0.8 * (TAU * hours / 7.0 + self.air.phase).sin() + self.air.walk
+        21.5 + 0.8 * (TAU * self.hours() / 7.0 + self.air.phase).sin() + self.air.walk
+    }
+
+    fn humidity_pct(&self) -> f64 {
+        45.0 + 4.0 * (TAU * self.hours() / 9.0).sin()
+    }
+
+    fn pressure_hpa(&self) -> f64 {
+        965.0 + 1.5 * (TAU * self.hours() / 20.0).cos()
+    }
+
+    fn hours(&self) -> f64 {
+        (self.now.0 - self.start.0) as f64 / 3.6e12
     }
 
     fn normal(&mut self) -> f64 {
         StandardNormal.sample(&mut self.rng)
+    }
+
+    // Where an arm really is that was sent to a point.
+    fn displaced(&mut self, tool: Tool, point: usize) -> [f64; 3] {
+        let told = self.grid.points()[point].position_mm;
+        let calibration = self.calibration_mm[tool as usize][point];
+        let per_axis = self.effects.repeatability_mm / 3f64.sqrt();
+        let mut chance = || -> f64 { StandardNormal.sample(&mut self.places) };
+        std::array::from_fn(|i| told[i] + calibration[i] + per_axis * chance())
     }
 }
 
@@ -177,8 +248,11 @@ impl RobotArms for SimulatedRobots {
         // The model knows the roles that the grid gives.
         let known = self.arms.as_ref().filter(|_| world.grid.pair_id(a, b).is_some());
         let joints = known.and_then(|arms| arms.standing(pair).ok()).map(|stand| [stand.microphone, stand.speaker]);
-        world.stand = [microphone, speaker];
-        // The arms repeat to 0.02 mm. The residual is returned; the simulated sound does not depend on it.
+        let position_mm = [world.displaced(Tool::Microphone, microphone), world.displaced(Tool::Speaker, speaker)];
+        let axes = self.axes(joints.as_ref(), microphone_mm, speaker_mm);
+        world.microphone = TransducerPose { position_mm: position_mm[0], axis: axes[0] };
+        world.speaker = TransducerPose { position_mm: position_mm[1], axis: axes[1] };
+        // The encoders' residual, which the controller knows of; of the displacement it does not.
         let mut off = |mm: [f64; 3]| mm.map(|x| x + 0.01 * world.normal().clamp(-2.0, 2.0));
         Ok(ArmPositions { microphone_mm: off(microphone_mm), speaker_mm: off(speaker_mm), joints })
     }
@@ -189,19 +263,34 @@ impl RobotArms for SimulatedRobots {
     }
 }
 
+impl SimulatedRobots {
+    // Axes of microphone and speaker: as the arms hold them, or, without a model of the arms, the microphone straight down
+    // and the speaker at the point that mirrors to it.
+    fn axes(&self, joints: Option<&[Joints; 2]>, microphone_mm: [f64; 3], speaker_mm: [f64; 3]) -> [[f64; 3]; 2] {
+        if let (Some(arms), Some([microphone, speaker])) = (&self.arms, joints) {
+            let cell = arms.cell();
+            return [(Tool::Microphone, microphone), (Tool::Speaker, speaker)]
+                .map(|(tool, joints)| cell.arm(tool).axis(joints));
+        }
+        let [x, y] = specular_point(microphone_mm, speaker_mm);
+        let aim = [x - speaker_mm[0], y - speaker_mm[1], -speaker_mm[2]];
+        let length = aim.iter().map(|x| x * x).sum::<f64>().sqrt();
+        [DOWN, aim.map(|x| x / length)]
+    }
+}
+
 struct SimulatedSensor(SharedWorld);
 
 impl AmbientSensor for SimulatedSensor {
     fn read(&mut self) -> Result<AmbientReading, Error> {
         let mut world = lock(&self.0);
-        let hours = (world.now.0 - world.start.0) as f64 / 3.6e12;
         // A resolution of 0.01 C, and as much noise.
         let temperature_c = ((world.temperature_c() + 0.005 * world.normal()) * 100.0).round() / 100.0;
         Ok(AmbientReading {
             at: world.now,
             temperature_c,
-            humidity_pct: 45.0 + 4.0 * (TAU * hours / 9.0).sin() + 0.1 * world.normal(),
-            pressure_hpa: 965.0 + 1.5 * (TAU * hours / 20.0).cos() + 0.02 * world.normal(),
+            humidity_pct: world.humidity_pct() + 0.1 * world.normal(),
+            pressure_hpa: world.pressure_hpa() + 0.02 * world.normal(),
             outside_level_db: world.outside_level_db,
         })
     }
@@ -210,7 +299,9 @@ impl AmbientSensor for SimulatedSensor {
 struct SimulatedAudio {
     world: SharedWorld,
     rate_hz: f64,
-    reflection_factor: f64,
+    /// Spectra of the direct sound and of the reflection.
+    direct: Vec<Complex<f32>>,
+    reflection: Vec<Complex<f32>>,
     plan: KirchhoffPlan,
     scratch: KirchhoffScratch,
     response: Vec<f32>,
@@ -242,14 +333,22 @@ impl AudioInterface for SimulatedAudio {
         let spoiled = world.rng.random_bool(SPOILED);
         let level = if spoiled { SPOILED_LEVEL_DB } else { 42.0 };
         world.outside_level_db = level + 1.5 * world.normal();
-        let c = speed_of_sound(world.temperature_c());
+        let temperature_c = world.temperature_c();
+        let air = AirAbsorption::new(temperature_c, world.humidity_pct(), world.pressure_hpa());
+        let absorbs = world.effects.air_absorption;
+        let path = SoundPath {
+            microphone: world.microphone,
+            speaker: world.speaker,
+            speed_of_sound_m_s: speed_of_sound(temperature_c),
+            absorption_db_per_m: &|hz| if absorbs { air.db_per_m(hz) } else { 0.0 },
+            direct: &self.direct,
+            reflection: &self.reflection,
+        };
         let failed = |e: echolake_dsp::Error| Error::Device {
             device: "simulated room",
             reason: DeviceFault::with_cause(e.to_string(), e),
         };
-        self.plan
-            .response(world.stand, c, self.reflection_factor, &mut self.scratch, &mut self.response)
-            .map_err(failed)?;
+        self.plan.response(&path, &mut self.scratch, &mut self.response).map_err(failed)?;
         let played = match &mut self.output {
             Some(played) if played.output == output => played,
             other => other.insert(Played::new(output, self.rate_hz, self.response.len())),
@@ -328,8 +427,8 @@ mod tests {
     fn simulated(seed: u64) -> RigDevices {
         let (rig, relief) = (Rig::paper(), PanelRelief::Flat.height_field(40));
         let start = Timestamp(1_767_600_000_000_000_000);
-        devices(&RigSimulation { rig: &rig, relief: &relief, reflection_factor: 0.83, start, seed, arms: None })
-            .expect("devices")
+        let material = SurfaceMaterial::CoatedPrint;
+        devices(&RigSimulation { rig: &rig, relief: &relief, material, start, seed, arms: None }).expect("devices")
     }
 
     #[test]

@@ -47,10 +47,10 @@ pub enum Tool {
 }
 
 impl Tool {
-    /// Length along the flange's axis, m: the rod, or the neck up to the mount's bend.
+    /// Length along the flange's axis, m: the rod (Rust et al. 2021: about 0.5 m), or the neck up to the mount's bend.
     pub const fn length_m(self) -> f64 {
         match self {
-            Self::Microphone => 0.200,
+            Self::Microphone => 0.500,
             Self::Speaker => 0.080,
         }
     }
@@ -161,6 +161,11 @@ impl RobotArm {
         self.foot
     }
 
+    /// Returns the direction of its tool's acoustic axis.
+    pub fn axis(&self, joints: &Joints) -> [f64; 3] {
+        self.frames(joints)[7].transform_vector(DVec3::Z).to_array()
+    }
+
     /// Frames over the panel: foot, links 1 to 6 (the last is the flange), tool.
     pub fn frames(&self, joints: &Joints) -> [Pose; 8] {
         let mut frames = self.steps(joints);
@@ -262,7 +267,7 @@ mod tests {
     fn straight_up_it_is_as_high_as_the_data_sheet_says() {
         let [.., flange, tool] = arm(Tool::Microphone).frames(&[0.0; 6]);
         assert!((flange.translation.z - (1.295 - 0.2)).abs() < 1e-12, "{flange:?}");
-        assert!((tool.translation.z - (1.495 - 0.2)).abs() < 1e-12, "{tool:?}");
+        assert!((tool.translation.z - (1.795 - 0.2)).abs() < 1e-12, "{tool:?}");
         // 920 mm of reach: shoulder to flange.
         assert!((UPPER_ARM_M + FOREARM_M + FLANGE_M - 0.92).abs() < 1e-12);
     }

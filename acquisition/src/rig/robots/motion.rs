@@ -27,11 +27,13 @@ pub enum MotionCourse {
     SpeakerLast,
     /// Both draw back, the microphone's first, and come out, the microphone's last.
     MicrophoneLast,
+    /// Both draw back, each its own way, and come out in any order.
+    BothDrawnBack,
 }
 
 impl MotionCourse {
-    /// All of them.
-    pub const ALL: [Self; 7] = [
+    // Those that are tried first.
+    const SIMPLE: [Self; 7] = [
         Self::Together,
         Self::MicrophoneFirst,
         Self::SpeakerFirst,
@@ -42,7 +44,7 @@ impl MotionCourse {
     ];
 
     // The poses on the way, the last included.
-    fn by(self, back_deg: [f64; 2], from: &Pose, to: &Pose) -> Vec<Pose> {
+    fn stops(self, back_deg: [f64; 2], from: &Pose, to: &Pose) -> Vec<Pose> {
         let ([m0, s0], [m1, s1]) = (*from, *to);
         let [mb0, sb0, mb1, sb1] = [m0, s0, m1, s1].map(|joints| drawn_back(joints, back_deg));
         match self {
@@ -53,6 +55,7 @@ impl MotionCourse {
             Self::MicrophoneDrawnBack => vec![[mb0, s0], [mb1, s1], *to],
             Self::SpeakerLast => vec![[m0, sb0], [mb0, sb0], [mb1, sb1], [m1, sb1], *to],
             Self::MicrophoneLast => vec![[mb0, s0], [mb0, sb0], [mb1, sb1], [mb1, s1], *to],
+            Self::BothDrawnBack => vec![[mb0, sb0], [mb1, sb1], *to],
         }
     }
 }
@@ -76,18 +79,46 @@ pub struct ArmMotion {
     pub secs: f64,
 }
 
-/// Returns the quickest course on which nothing touches; None if there is none among [`MotionCourse::ALL`].
+/// Returns a course on which nothing touches, the quickest of its kind; None if no [`MotionCourse`] is one.
 pub fn course(cell: &Cell, from: &ArmPose, to: &ArmPose) -> Option<ArmMotion> {
     let [from, to] = [from, to].map(|s| [s.microphone, s.speaker]);
     let motion = |(course, back_deg): (MotionCourse, [f64; 2])| {
-        let stops = course.by(back_deg, &from, &to);
-        let secs = legs(&from, &stops).map(|(a, b)| leg_secs(a, b)).sum();
-        ArmMotion { course, stops, secs }
+        ArmMotion::new(course, &from, course.stops(back_deg, &from, &to))
     };
-    let ways = BACKS_DEG.iter().flat_map(|back_deg| MotionCourse::ALL.map(|course| (course, *back_deg)));
+    let ways = BACKS_DEG.iter().flat_map(|back_deg| MotionCourse::SIMPLE.map(|course| (course, *back_deg)));
     let mut motions: Vec<_> = ways.map(motion).collect();
     motions.sort_by(|a, b| a.secs.total_cmp(&b.secs));
-    motions.into_iter().find(|motion| legs(&from, &motion.stops).all(|(a, b)| is_clear(cell, a, b)))
+    let is_free = |motion: &ArmMotion| legs(&from, &motion.stops).all(|(a, b)| is_clear(cell, a, b));
+    motions.into_iter().find(is_free).or_else(|| both_drawn_back(cell, &from, &to))
+}
+
+// Any way out of the first pose with any way out of the second, backwards.
+fn both_drawn_back(cell: &Cell, from: &Pose, to: &Pose) -> Option<ArmMotion> {
+    let (outs, ins) = (retreats(cell, from), retreats(cell, to));
+    let pairs = outs.iter().flat_map(|out| ins.iter().map(move |back| (out, back)));
+    let motion = |(out, back): (&Vec<Pose>, &Vec<Pose>)| {
+        let stops = out.iter().chain(back.iter().rev()).chain([to]).copied().collect();
+        let joint = [out.last().copied().unwrap_or(*from), back.last().copied().unwrap_or(*to)];
+        (ArmMotion::new(MotionCourse::BothDrawnBack, from, stops), joint)
+    };
+    let mut motions: Vec<_> = pairs.map(motion).collect();
+    motions.sort_by(|(a, _), (b, _)| a.secs.total_cmp(&b.secs));
+    motions.into_iter().find(|(_, [out, back])| is_clear(cell, out, back)).map(|(motion, _)| motion)
+}
+
+// The ways in which both arms can draw back from a pose: the stops of each.
+fn retreats(cell: &Cell, from: &Pose) -> Vec<Vec<Pose>> {
+    let [m, s] = *from;
+    let backs = BACKS_DEG.iter().flat_map(|a| BACKS_DEG.iter().map(move |b| (drawn_back(m, *a), drawn_back(s, *b))));
+    let ways = backs.flat_map(|(mb, sb)| [vec![[mb, sb]], vec![[mb, s], [mb, sb]], vec![[m, sb], [mb, sb]]]);
+    ways.filter(|stops| legs(from, stops).all(|(a, b)| is_clear(cell, a, b))).collect()
+}
+
+impl ArmMotion {
+    fn new(course: MotionCourse, from: &Pose, stops: Vec<Pose>) -> Self {
+        let secs = legs(from, &stops).map(|(a, b)| leg_secs(a, b)).sum();
+        Self { course, stops, secs }
+    }
 }
 
 fn legs<'a>(from: &'a Pose, stops: &'a [Pose]) -> impl Iterator<Item = (&'a Pose, &'a Pose)> {

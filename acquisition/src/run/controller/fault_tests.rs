@@ -11,6 +11,7 @@ use echolake_schema::{Rig, RunId, Timestamp, topics};
 use prost::Message as _;
 
 use super::*;
+use crate::panel::material::SurfaceMaterial;
 use crate::panel::relief::PanelRelief;
 use crate::rig::devices::simulated::{RigSimulation, devices};
 use crate::rig::{
@@ -91,8 +92,8 @@ fn rig() -> Rig {
 
 fn simulated(rig: &Rig, fault: DeviceFault, start: Timestamp, seed: u64) -> (RigDevices, SharedFault) {
     let relief = PanelRelief::Flat.height_field(60);
-    let inner = devices(&RigSimulation { rig, relief: &relief, reflection_factor: 0.83, start, seed, arms: None })
-        .expect("devices");
+    let material = SurfaceMaterial::CoatedPrint;
+    let inner = devices(&RigSimulation { rig, relief: &relief, material, start, seed, arms: None }).expect("devices");
     let shared = SharedFault { fault, takes: Arc::default(), moves: Arc::default(), mended: Arc::default() };
     let faulty = RigDevices {
         robots: Box::new(FaultyArms(inner.robots, shared.clone())),

@@ -6,6 +6,7 @@ use std::path::Path;
 
 use anyhow::{Context as _, Result, ensure};
 use bytes::Bytes;
+use echolake_acquisition::panel::material::SurfaceMaterial;
 use echolake_acquisition::panel::mesh::Mesh;
 use echolake_acquisition::panel::relief::HeightField;
 use echolake_acquisition::rig::devices::simulated::{RigSimulation, devices};
@@ -68,8 +69,8 @@ impl FlipSpecimen {
         let relief = HeightField::from_fn(rig.panel.size_mm, 40, |x, y| 10.0 * (x / 50.0).sin() + y / 100.0);
         let mesh = Mesh::from_height_field(&HeightField::from_fn(rig.panel.size_mm, 9, |x, _| x / 50.0), -30.0);
         let surface = "0015_0".parse()?;
-        let simulation =
-            RigSimulation { rig, relief: &relief, reflection_factor: 0.83, start: START, seed: 1, arms: None };
+        let material = SurfaceMaterial::CoatedPrint;
+        let simulation = RigSimulation { rig, relief: &relief, material, start: START, seed: 1, arms: None };
         let devices = devices(&simulation)?;
         let manifest = RunManifest {
             run_id: RunId::compose(START, &surface, 0x7c1e)?,

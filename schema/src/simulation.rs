@@ -1,0 +1,64 @@
+//! The effects that simulated devices compute.
+
+use serde::{Deserialize, Serialize};
+
+/// The `[simulation]` section of a rig file: effects that the simulated rig has in common with a real one. All are on
+/// unless the file switches them off. They are no part of what a lake's numbers mean, so runs with and without them go
+/// together.
+///
+/// ```
+/// let rig = echolake_schema::Rig::from_toml("[simulation]\ncalibration_mm = 0.0")?;
+/// assert!(rig.simulation.air_absorption && rig.simulation.calibration_mm == 0.0);
+/// # Ok::<(), echolake_schema::Error>(())
+/// ```
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct SimulationParams {
+    /// Steep facets scatter as the boundary-element method says, as far as that goes without second reflections; if off,
+    /// what falls on facets that face away is lost.
+    pub steep_facets: bool,
+    /// Materials reflect each frequency as they do; if off, all frequencies alike.
+    pub material_spectra: bool,
+    /// Foam reflects a little; if off nothing, so that what is left of a panel is its own reflection alone.
+    pub foam_reflection: bool,
+    /// The air absorbs, by its temperature, humidity and pressure.
+    pub air_absorption: bool,
+    /// Distance of an arm from where it stood before at the same point, root mean square, mm. 0 for none.
+    pub repeatability_mm: f64,
+    /// Mean distance of an arm from the place that it believes to have, mm: fixed for a point and an arm. 0 for none.
+    pub calibration_mm: f64,
+    /// Speaker and microphone have axes, and hear and shine less beside them.
+    pub directivity: bool,
+    /// Speaker and microphone are louder at some frequencies.
+    pub transducer_response: bool,
+}
+
+impl Default for SimulationParams {
+    /// All effects, the distances of the arms as Rust et al. 2021 print them.
+    fn default() -> Self {
+        Self {
+            steep_facets: true,
+            material_spectra: true,
+            foam_reflection: true,
+            air_absorption: true,
+            repeatability_mm: 0.02,
+            calibration_mm: 0.17,
+            directivity: true,
+            transducer_response: true,
+        }
+    }
+}
+
+impl SimulationParams {
+    /// Returns whether this is the default, which rig files leave out.
+    pub fn is_default(&self) -> bool {
+        *self == Self::default()
+    }
+
+    /// Describes the first contradiction among the settings.
+    pub(crate) fn contradiction(&self) -> Option<String> {
+        let is_plausible = |mm: f64| (0.0..=10.0).contains(&mm);
+        let plausible = is_plausible(self.repeatability_mm) && is_plausible(self.calibration_mm);
+        (!plausible).then(|| "expected repeatability_mm and calibration_mm from 0 to 10".to_owned())
+    }
+}
