@@ -28,6 +28,8 @@ use crate::commands::serve::{self, EngineArgs, ServeArgs};
 #[cfg(feature = "lake")]
 use crate::commands::sql::{self, SqlArgs};
 #[cfg(feature = "lake")]
+use crate::commands::twin::{self, TwinArgs};
+#[cfg(feature = "lake")]
 use crate::commands::vacuum::{self, VacuumArgs};
 use crate::logging::{FORMAT_VARIABLE, LogFormat};
 
@@ -104,6 +106,8 @@ pub(crate) enum LakeCommand {
     },
     /// Merge the tables' small files into large ones; ingest and queries may go on.
     Optimize(OptimizeArgs),
+    /// Compute what the simulated rig makes of a measured panel's mesh, and show by pair and band how far both are apart.
+    Twin(TwinArgs),
     /// Delete files that are in no table any more, and what crashes left behind.
     Vacuum(VacuumArgs),
 }
@@ -157,6 +161,7 @@ impl LakeCommand {
             Self::Engine(args) => serve::engine(args, lake).await,
             Self::Token { name } => serve::token(name),
             Self::Optimize(args) => optimize::run(args, lake).await,
+            Self::Twin(args) => twin::run(args, lake).await,
             Self::Vacuum(args) => vacuum::run(args, lake).await,
         }
     }

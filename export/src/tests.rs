@@ -15,6 +15,7 @@ use echolake_acquisition::run::simulate::simulate;
 use echolake_acquisition::run::{PanelSpecimen, RunRequest};
 use echolake_ingest::{LakeIngest, complete, pending};
 use echolake_lake::{Lake, ReferenceSurfaces};
+use echolake_schema::manifest::Origin;
 use echolake_schema::{Rig, RunId, Table, Timestamp, topics};
 use futures::TryStreamExt as _;
 use parquet::arrow::arrow_reader::ParquetRecordBatchReaderBuilder;
@@ -47,7 +48,7 @@ async fn lake(home: &TempDir, keep: RecordingMode) -> Lake {
             keep,
             folder: &inbox,
         };
-        simulate(&run, &AtomicBool::new(false), &mut |_| {}).expect("a run");
+        simulate(&run, Origin::Simulated, &AtomicBool::new(false), &mut |_| {}).expect("a run");
     }
     let stop = Arc::new(AtomicBool::new(false));
     let sources = pending(&lake).await.expect("runs");

@@ -12,6 +12,7 @@ use echolake_acquisition::run::controller::RecordingMode;
 use echolake_acquisition::run::simulate::simulate;
 use echolake_acquisition::run::{PanelSpecimen, RunRequest};
 use echolake_lake::{DeletionMode, Lake, ReferenceSurfaces};
+use echolake_schema::manifest::Origin;
 use echolake_schema::tables::Table;
 use echolake_schema::{Rig, Timestamp};
 use futures::TryStreamExt as _;
@@ -48,7 +49,7 @@ fn runs(surfaces: &[&str]) -> Vec<(String, Bytes)> {
             keep: RecordingMode::ResponsesOnly,
             folder: folder.path(),
         };
-        let (path, _) = simulate(&run, &AtomicBool::new(false), &mut |_| {}).expect("a run");
+        let (path, _) = simulate(&run, Origin::Simulated, &AtomicBool::new(false), &mut |_| {}).expect("a run");
         let name = path.file_name().expect("a name").to_string_lossy().into_owned();
         (name, Bytes::from(std::fs::read(path).expect("read")))
     };

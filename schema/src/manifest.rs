@@ -43,7 +43,8 @@ pub struct RunManifest {
 }
 
 /// The labels of [`Origin`], for people.
-pub(crate) const ORIGINS: &str = "measured, simulated, imported_wav, imported_gir, imported_sofa or imported_hdf5";
+pub(crate) const ORIGINS: &str =
+    "measured, simulated, computed, imported_wav, imported_gir, imported_sofa or imported_hdf5";
 
 /// Origin of a run's signals.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
@@ -53,6 +54,8 @@ pub enum Origin {
     Measured,
     /// Computed by the simulated rig.
     Simulated,
+    /// Computed by the simulated rig for the mesh of a measured surface, to compare both.
+    Computed,
     /// Imported from WAV files of other software.
     ImportedWav,
     /// Imported from the published GIR data set.
@@ -129,6 +132,7 @@ impl Origin {
         match self {
             Self::Measured => "measured",
             Self::Simulated => "simulated",
+            Self::Computed => "computed",
             Self::ImportedWav => "imported_wav",
             Self::ImportedGir => "imported_gir",
             Self::ImportedSofa => "imported_sofa",
@@ -140,13 +144,13 @@ impl Origin {
     pub fn is_imported(self) -> bool {
         match self {
             Self::ImportedWav | Self::ImportedGir | Self::ImportedSofa | Self::ImportedHdf5 => true,
-            Self::Measured | Self::Simulated => false,
+            Self::Measured | Self::Simulated | Self::Computed => false,
         }
     }
 
     fn parse(text: &str) -> Option<Self> {
         let imported = [Self::ImportedWav, Self::ImportedGir, Self::ImportedSofa, Self::ImportedHdf5];
-        let all = [Self::Measured, Self::Simulated].into_iter().chain(imported);
+        let all = [Self::Measured, Self::Simulated, Self::Computed].into_iter().chain(imported);
         all.into_iter().find(|o| o.label() == text)
     }
 }

@@ -31,6 +31,8 @@ pub struct SimulationParams {
     pub directivity: bool,
     /// Speaker and microphone are louder at some frequencies.
     pub transducer_response: bool,
+    /// Channels and sensors have noise, the air drifts, and now and then something spoils a take.
+    pub noise_and_drift: bool,
 }
 
 impl Default for SimulationParams {
@@ -45,6 +47,7 @@ impl Default for SimulationParams {
             calibration_mm: 0.17,
             directivity: true,
             transducer_response: true,
+            noise_and_drift: true,
         }
     }
 }

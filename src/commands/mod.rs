@@ -22,6 +22,8 @@ pub(crate) mod serve;
 #[cfg(feature = "lake")]
 pub(crate) mod sql;
 #[cfg(feature = "lake")]
+pub(crate) mod twin;
+#[cfg(feature = "lake")]
 pub(crate) mod vacuum;
 
 use std::net::SocketAddr;

@@ -157,7 +157,7 @@ async fn paths(names: &[String], lake_url: &str) -> anyhow::Result<Vec<PathBuf>>
 
 // The file of a run, or of a surface's newest run.
 #[cfg(feature = "lake")]
-async fn run_file(lake: &Lake, name: &str) -> anyhow::Result<PathBuf> {
+pub(in crate::commands) async fn run_file(lake: &Lake, name: &str) -> anyhow::Result<PathBuf> {
     let folder =
         lake.folder().context("a replay needs a lake in a folder; hint: --lake FOLDER, or name .mcap files")?;
     let snapshot = lake.snapshot().await?;

@@ -11,6 +11,7 @@ use clap::ValueEnum;
 use echolake_lake::Lake;
 use echolake_query::output::{AnswerFormat, AnswerWriter, TABLE_ROWS};
 use echolake_query::{QueryAnswer, Session};
+use serde::de::DeserializeOwned;
 
 #[derive(Debug, clap::Args)]
 pub(crate) struct SqlArgs {
@@ -81,6 +82,17 @@ fn from_stdin() -> anyhow::Result<String> {
 /// Prints an answer for people.
 pub(super) async fn print_table(session: &Session, sql: &str) -> anyhow::Result<()> {
     write(session.query(sql).await?, AnswerFormat::Table, std::io::stdout()).await.map(drop)
+}
+
+/// Returns the rows of a query.
+pub(super) async fn rows<T: DeserializeOwned>(session: &Session, sql: &str) -> anyhow::Result<Vec<T>> {
+    let mut answer = session.query(sql).await?;
+    let mut rows = Vec::new();
+    while let Some(batch) = answer.next().await? {
+        let part: Vec<T> = serde_arrow::from_record_batch(&batch).context("rows are not as expected")?;
+        rows.extend(part);
+    }
+    Ok(rows)
 }
 
 async fn write(mut answer: QueryAnswer, format: AnswerFormat, to: impl Write + Send) -> anyhow::Result<usize> {

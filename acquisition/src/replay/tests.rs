@@ -5,6 +5,7 @@ use std::path::Path;
 use std::sync::atomic::AtomicBool;
 use std::time::{Duration, Instant};
 
+use echolake_schema::manifest::Origin;
 use echolake_schema::{Rig, Timestamp, topics};
 use serde_json::{Value, json};
 use tungstenite::Message;
@@ -40,7 +41,7 @@ fn run(folder: &Path, surface: &str, hours: f64) -> PathBuf {
         keep: RecordingMode::Sweeps,
         folder,
     };
-    simulate(&run, &AtomicBool::new(false), &mut |_| {}).expect("a run").0
+    simulate(&run, Origin::Simulated, &AtomicBool::new(false), &mut |_| {}).expect("a run").0
 }
 
 /// Topic, time and content.

@@ -159,7 +159,7 @@ pub fn resume(partial: &Path, session: RunSession<'_>) -> Result<MeasuredRun, Er
     let now = Timestamp::now();
     let start = match held.manifest.origin {
         // After everything recorded: the simulated clock runs ahead of ours.
-        Origin::Simulated => now.max(held.last.plus_secs(TAKE_SECS)),
+        Origin::Simulated | Origin::Computed => now.max(held.last.plus_secs(TAKE_SECS)),
         _ if now < held.last => {
             let back_secs = (held.last.0 - now.0) as f64 / 1e9;
             return Err(controller::Error::Clock { before: held.last, now, back_secs }.into());

@@ -133,14 +133,14 @@ impl RunJob<'_> {
 // A measured pair is 12 s of a rig's time.
 fn checkpoint_every(origin: Origin) -> usize {
     match origin {
-        Origin::Simulated => SIMULATED_CHECKPOINT_EVERY,
+        Origin::Simulated | Origin::Computed => SIMULATED_CHECKPOINT_EVERY,
         _ => 1,
     }
 }
 
 fn name_of(origin: Origin) -> &'static str {
     match origin {
-        Origin::Simulated => "simulated_rig",
+        Origin::Simulated | Origin::Computed => "simulated_rig",
         _ => "rig",
     }
 }

@@ -1,9 +1,10 @@
-//! Whole runs of the simulated rig, whatever devices a rig file names: for demos, benchmarks and tests.
+//! Whole runs of the simulated rig, whatever devices a rig file names: for demos, twins of measured panels, benchmarks and
+//! tests.
 
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use echolake_schema::manifest::RunEnd;
+use echolake_schema::manifest::{Origin, RunEnd};
 use echolake_schema::messages::Verdict;
 
 use crate::panel::prepared_panel::PreparedPanel;
@@ -14,12 +15,13 @@ use crate::run::session::{PreflightMode, RunSession, TakePace};
 use crate::run::{Error, RunRequest};
 
 /// Simulates all pairs, without a preflight check; returns the run's file and how it ended. Once `stop` is true it ends
-/// with the pairs that it has.
+/// with the pairs that it has. The origin is that of the signals: [`Origin::Simulated`] or [`Origin::Computed`].
 ///
 /// # Errors
 /// [`Error`]; a run that was begun leaves its `.partial` file.
 pub fn simulate(
     request: &RunRequest<'_>,
+    origin: Origin,
     stop: &AtomicBool,
     progress: &mut dyn FnMut(usize),
 ) -> Result<(PathBuf, RunEnd), Error> {
@@ -44,7 +46,8 @@ pub fn simulate(
     let panel = PreparedPanel::new(request.specimen, rig)?;
     let arms = Choreography::of(rig)?;
     let devices = DeviceRequest { rig, panel: &panel, start, seed, arms: arms.clone() };
-    let devices = simulated_devices(&devices, session.pace).map_err(controller::Error::from)?;
+    let mut devices = simulated_devices(&devices, session.pace).map_err(controller::Error::from)?;
+    devices.origin = origin;
     let measured = request.measure_with(devices, &panel, arms, session, None)?;
     Ok((measured.path, measured.outcome.end))
 }

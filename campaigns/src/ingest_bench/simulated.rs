@@ -11,7 +11,7 @@ use echolake_acquisition::run::simulate::simulate;
 use echolake_acquisition::run::{PanelSpecimen, RunRequest};
 use echolake_ingest::{FileReport as Told, LakeIngest, complete, pending};
 use echolake_lake::{Lake, ReferenceSurfaces};
-use echolake_schema::manifest::RunEnd;
+use echolake_schema::manifest::{Origin, RunEnd};
 use echolake_schema::{Rig, Timestamp};
 
 use super::meter::{CostMeter, MeasuredCost, forget_peak, peak_mib};
@@ -111,7 +111,8 @@ impl SimulationOrder<'_> {
             folder: self.folder,
         };
         let stop = AtomicBool::new(false);
-        let made = simulate(&run, &stop, &mut |done| stop.store(done >= self.pairs, Ordering::Relaxed));
+        let made =
+            simulate(&run, Origin::Simulated, &stop, &mut |done| stop.store(done >= self.pairs, Ordering::Relaxed));
         made.with_context(|| format!("surface {}", member.surface))
     }
 }

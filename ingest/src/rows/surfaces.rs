@@ -92,7 +92,7 @@ mod tests {
     fn details_are_told_where_cells_can_show_them() {
         let rig = Rig::paper();
         let grooves = |cells: usize| {
-            let row = move |i: usize| if i % 5 == 0 { -1.0f32 } else { 0.0 };
+            let row = move |i: usize| if i.is_multiple_of(5) { -1.0f32 } else { 0.0 };
             square(&(0..cells * cells).map(|i| row(i % cells)).collect::<Vec<_>>(), 585.0).expect("square")
         };
         let phase = detail_phase(&grooves(260), &rig, 10e3).expect("there");

@@ -12,7 +12,7 @@ use echolake_acquisition::run::controller::RecordingMode;
 use echolake_acquisition::run::recorder::random_tag;
 use echolake_acquisition::run::simulate::simulate;
 use echolake_acquisition::run::{PanelSpecimen, RunRequest};
-use echolake_schema::manifest::RunEnd;
+use echolake_schema::manifest::{Origin, RunEnd};
 use echolake_schema::{Rig, RunId, Timestamp};
 
 use crate::progress::{CommandProgress, TaskProgress};
@@ -184,7 +184,7 @@ impl CampaignState<'_> {
         let mut task = self.whole.is_none().then(|| self.progress.task(surface.to_string(), pairs as u64, "pairs"));
         let begun = Instant::now();
         // A demo's run takes seconds and is always completed: a stop only keeps the next one from beginning.
-        let measured = simulate(&run, &AtomicBool::new(false), &mut |done| {
+        let measured = simulate(&run, Origin::Simulated, &AtomicBool::new(false), &mut |done| {
             if let Some(task) = &mut task {
                 task.at(done as u64);
             }

@@ -41,13 +41,7 @@ impl FigureSource {
 
     /// Returns the rows of a query.
     pub(super) async fn rows<T: DeserializeOwned>(&self, sql: &str) -> anyhow::Result<Vec<T>> {
-        let mut answer = self.session.query(sql).await?;
-        let mut rows = Vec::new();
-        while let Some(batch) = answer.next().await? {
-            let part: Vec<T> = serde_arrow::from_record_batch(&batch).context("rows are not as expected")?;
-            rows.extend(part);
-        }
-        Ok(rows)
+        crate::commands::sql::rows(&self.session, sql).await
     }
 
     /// Returns the session.

@@ -195,7 +195,8 @@ fn lock(world: &SharedWorld) -> MutexGuard<'_, SimulatedWorld> {
 
 impl SimulatedWorld {
     fn temperature_c(&self) -> f64 {
-        21.5 + 0.8 * (TAU * self.hours() / 7.0 + self.air.phase).sin() + self.air.walk
+        let drift = 0.8 * (TAU * self.hours() / 7.0 + self.air.phase).sin() + self.air.walk;
+        21.5 + if self.effects.noise_and_drift { drift } else { 0.0 }
     }
 
     fn humidity_pct(&self) -> f64 {
@@ -211,7 +212,7 @@ impl SimulatedWorld {
     }
 
     fn normal(&mut self) -> f64 {
-        StandardNormal.sample(&mut self.rng)
+        if self.effects.noise_and_drift { StandardNormal.sample(&mut self.rng) } else { 0.0 }
     }
 
     // Where an arm really is that was sent to a point.
@@ -330,7 +331,7 @@ impl AudioInterface for SimulatedAudio {
         let mut world = lock(&self.world);
         world.now = world.now.plus_secs(TAKE_SECS);
         world.air.walk += 0.002 * world.normal();
-        let spoiled = world.rng.random_bool(SPOILED);
+        let spoiled = world.effects.noise_and_drift && world.rng.random_bool(SPOILED);
         let level = if spoiled { SPOILED_LEVEL_DB } else { 42.0 };
         world.outside_level_db = level + 1.5 * world.normal();
         let temperature_c = world.temperature_c();

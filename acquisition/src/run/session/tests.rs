@@ -76,7 +76,7 @@ fn a_run_that_nobody_goes_on_with_is_ended_where_it_is_stopped() {
     let (rig, specimen) = (Rig::from_toml(SMALL_RIG).expect("a rig"), flat());
     let folder = tempfile::tempdir().expect("a folder");
     let stop = AtomicBool::new(false);
-    let measured = simulate(&run(&rig, &specimen, folder.path()), &stop, &mut |done| {
+    let measured = simulate(&run(&rig, &specimen, folder.path()), Origin::Simulated, &stop, &mut |done| {
         stop.store(done >= 3, Ordering::Relaxed);
     });
     let (path, end) = measured.expect("a run");

@@ -1,0 +1,323 @@
+//! `echolake twin`: a surface's run beside the one that the simulated rig computes for the mesh that the run holds.
+
+use std::collections::HashSet;
+use std::path::{Path, PathBuf};
+use std::sync::atomic::AtomicBool;
+
+use anyhow::Context as _;
+use clap::Args;
+use echolake_acquisition::panel::material::SurfaceMaterial;
+use echolake_acquisition::panel::mesh::PanelSide;
+use echolake_acquisition::panel::relief::PanelRelief;
+use echolake_acquisition::run::controller::RecordingMode;
+use echolake_acquisition::run::simulate::simulate;
+use echolake_acquisition::run::{PanelSpecimen, RunRequest};
+use echolake_ingest::pending;
+use echolake_lake::Lake;
+use echolake_query::Session;
+use echolake_recording::{PrefixItem, PrefixReader};
+use echolake_schema::manifest::Origin;
+use echolake_schema::{Rig, RunId, SurfaceId, SurfaceRecord, Timestamp, topics};
+use serde::{Deserialize, Serialize};
+use tempfile::TempDir;
+
+use crate::CommandOutcome;
+use crate::progress::CommandProgress;
+
+#[derive(Debug, Args)]
+pub(crate) struct TwinArgs {
+    /// The measured surface.
+    pub(crate) surface: SurfaceId,
+    /// Number of pairs that are listed: those that are farthest apart.
+    #[arg(long, value_name = "N", default_value_t = 10)]
+    pub(crate) pairs: usize,
+    /// Print the differences as JSON.
+    #[arg(long)]
+    pub(crate) json: bool,
+}
+
+/// Begin of the names of computed surfaces.
+const TWIN: &str = "twin_";
+const FLAT: &str = "twin_flat";
+const FOAM: &str = "twin_foam";
+/// 2026-01-05 08:00 UTC: a computed run has no time of its own.
+const COMPUTED_AT: Timestamp = Timestamp(1_767_600_000_000_000_000);
+/// Phase of details, rad, beyond which pairs of a simulated relief are off by 1 dB (docs/devices.md).
+const GREATEST_DETAIL_PHASE: f64 = 0.18;
+
+/// Differences of a band over the pairs, measured less computed.
+#[derive(Debug, Serialize, Deserialize)]
+struct BandDifference {
+    band: String,
+    pairs: i64,
+    measured_db: Option<f64>,
+    computed_db: Option<f64>,
+    mean_db: Option<f64>,
+    rms_db: Option<f64>,
+    p5_db: Option<f64>,
+    p95_db: Option<f64>,
+    /// Phase of the relief's details, rad.
+    detail_phase: Option<f64>,
+}
+
+/// Difference of a pair in one band, measured less computed.
+#[derive(Debug, Serialize, Deserialize)]
+struct PairDifference {
+    pair_id: i64,
+    microphone: i64,
+    speaker: i64,
+    band: String,
+    measured_db: f64,
+    computed_db: f64,
+    difference_db: f64,
+}
+
+/// All differences of a surface from its twin.
+#[derive(Debug, Serialize)]
+struct TwinDifferences {
+    surface_id: SurfaceId,
+    twin_id: SurfaceId,
+    /// `computed`: the twin is no measurement.
+    twin_origin: &'static str,
+    bands: Vec<BandDifference>,
+    pairs: Vec<PairDifference>,
+}
+
+pub(crate) async fn run(args: &TwinArgs, lake_url: &str) -> anyhow::Result<CommandOutcome> {
+    let surface = &args.surface;
+    anyhow::ensure!(
+        !surface.as_str().starts_with(TWIN),
+        "surface `{surface}` is computed itself; hint: name the measured one"
+    );
+    let stop = super::stop_request()?;
+    let lake = Lake::open(lake_url).await?;
+    lake.ensure_tables().await?;
+    let progress = CommandProgress::new();
+    progress.say("simulated rig: the twin is computed, not measured");
+    let path = super::replay::run_file(&lake, surface.as_str()).await?;
+    let computing = TwinComputation::new(&lake, surface, &path).await?;
+    let flag = stop.clone();
+    tokio::task::spawn_blocking(move || computing.compute_missing(flag.flag(), &progress)).await??;
+    anyhow::ensure!(!stop.is_made(), "stopped; hint: the same command goes on where this one ended");
+    super::ingest::take_in(&lake, pending(&lake).await?, stop.flag(), &CommandProgress::new()).await?;
+    anyhow::ensure!(!stop.is_made(), "stopped; hint: the same command goes on where this one ended");
+    let differences = TwinDifferences::read(&lake, surface, args.pairs).await?;
+    match args.json {
+        true => super::print(&serde_json::to_string_pretty(&differences)?)?,
+        false => differences.print()?,
+    }
+    Ok(CommandOutcome::Whole)
+}
+
+/// The runs that are to be computed.
+struct TwinComputation {
+    rig: Rig,
+    folder: PathBuf,
+    /// The mesh, as long as runs are computed for it.
+    _mesh: TempDir,
+    runs: Vec<ComputedRun>,
+}
+
+/// A run that is to be computed.
+struct ComputedRun {
+    surface: SurfaceId,
+    specimen: PanelSpecimen,
+    tag: u64,
+}
+
+impl TwinComputation {
+    /// Plans the runs that the lake lacks: the references', and that of the mesh in the measured run's file.
+    async fn new(lake: &Lake, surface: &SurfaceId, path: &Path) -> anyhow::Result<Self> {
+        let mesh = tempfile::tempdir().context("cannot make a temporary folder")?;
+        let file = mesh.path().join(topics::MESH_ATTACHMENT);
+        let recorded = file.clone();
+        let measured = path.to_owned();
+        tokio::task::spawn_blocking(move || take_mesh(&measured, &recorded)).await??;
+        // The tag of the measured run tells whose twin it is.
+        let name = path.file_stem().unwrap_or_default().to_string_lossy();
+        let tag = name.rsplit_once('-').and_then(|(_, tag)| u64::from_str_radix(tag, 16).ok());
+        let tag = tag.with_context(|| format!("`{}` is not named as a run", path.display()))?;
+        let references = [(FLAT, PanelRelief::Flat), (FOAM, PanelRelief::Foam)];
+        let mut runs = Vec::new();
+        for (name, relief) in references {
+            runs.push(ComputedRun { surface: name.parse()?, specimen: PanelSpecimen::Relief(relief), tag: 0 });
+        }
+        let twin = format!("{TWIN}{surface}").parse()?;
+        if runs.iter().all(|run| run.surface != twin) {
+            runs.push(ComputedRun { surface: twin, specimen: PanelSpecimen::Mesh(file, PanelSide::Front), tag });
+        }
+        let snapshot = lake.snapshot().await?;
+        let known: HashSet<RunId> = snapshot.runs().map(|run| run.run.clone()).collect();
+        runs.retain(|run| run.id().is_ok_and(|id| !known.contains(&id)));
+        let mut rig = lake.rig().clone();
+        // What a model says of a panel, without the chances of a measurement.
+        rig.simulation.noise_and_drift = false;
+        rig.simulation.repeatability_mm = 0.0;
+        rig.simulation.calibration_mm = 0.0;
+        Ok(Self { rig, folder: super::inbox(lake)?, _mesh: mesh, runs })
+    }
+
+    fn compute_missing(&self, stop: &AtomicBool, progress: &CommandProgress) -> anyhow::Result<()> {
+        std::thread::scope(|scope| {
+            let computing: Vec<_> =
+                self.runs.iter().map(|run| scope.spawn(|| self.compute(run, stop, progress))).collect();
+            computing
+                .into_iter()
+                .try_for_each(|thread| thread.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic)))
+        })
+    }
+
+    fn compute(&self, run: &ComputedRun, stop: &AtomicBool, progress: &CommandProgress) -> anyhow::Result<()> {
+        let request = RunRequest {
+            rig: &self.rig,
+            surface: run.surface.clone(),
+            specimen: &run.specimen,
+            flat: Some(FLAT.parse()?),
+            foam: Some(FOAM.parse()?),
+            start: COMPUTED_AT,
+            seed: 0,
+            tag: run.tag,
+            keep: RecordingMode::ResponsesOnly,
+            folder: &self.folder,
+        };
+        // What a computation that was stopped left behind.
+        let partial = self.folder.join(format!("{}.mcap.partial", run.id()?));
+        if partial.exists() {
+            std::fs::remove_file(&partial).with_context(|| format!("cannot remove `{}`", partial.display()))?;
+        }
+        if self.folder.join(format!("{}.mcap", run.id()?)).exists() {
+            return Ok(());
+        }
+        let mut task = progress.task(run.surface.to_string(), self.rig.grid()?.pairs().len() as u64, "pairs");
+        let made = simulate(&request, Origin::Computed, stop, &mut |done| task.at(done as u64));
+        let (_, end) = made.with_context(|| format!("surface {}", run.surface))?;
+        task.done(format!("{} pairs computed", end.accepted));
+        Ok(())
+    }
+}
+
+impl ComputedRun {
+    fn id(&self) -> anyhow::Result<RunId> {
+        Ok(RunId::compose(COMPUTED_AT, &self.surface, self.tag)?)
+    }
+}
+
+// Writes the panel's mesh to a file. Both stand in the run's file before its measurements.
+fn take_mesh(run: &Path, to: &Path) -> anyhow::Result<()> {
+    let mut reader = PrefixReader::open(run)?;
+    let (mut mesh, mut record) = (None, None);
+    while let (false, Some(item)) = (mesh.is_some() && record.is_some(), reader.next_item()?) {
+        let PrefixItem::Attachment(attachment) = item else { continue };
+        match attachment.name.as_str() {
+            topics::MESH_ATTACHMENT => mesh = Some(attachment.data),
+            topics::SURFACE_ATTACHMENT => record = Some(attachment.data),
+            _ => {}
+        }
+    }
+    let lacks = |name| format!("run file `{}` has no whole attachment `{name}`", run.display());
+    let mesh =
+        mesh.with_context(|| format!("{}; hint: only runs with a mesh have a twin", lacks(topics::MESH_ATTACHMENT)))?;
+    let record = record.with_context(|| lacks(topics::SURFACE_ATTACHMENT))?;
+    let record: SurfaceRecord = serde_json::from_slice(&record)
+        .with_context(|| format!("`{}`: {}", run.display(), topics::SURFACE_ATTACHMENT))?;
+    let expected = SurfaceMaterial::CoatedPrint.name();
+    if let Some(material) = record.material.filter(|material| material != expected) {
+        anyhow::bail!("the panel is of `{material}`; hint: twins are computed of `{expected}` alone");
+    }
+    std::fs::write(to, &mesh).with_context(|| format!("cannot write `{}`", to.display()))
+}
+
+impl TwinDifferences {
+    async fn read(lake: &Lake, surface: &SurfaceId, pairs: usize) -> anyhow::Result<Self> {
+        let session = Session::new(lake)?;
+        let twin = format!("{TWIN}{surface}");
+        let bands = lake.rig().band_names();
+        let mut found = Self {
+            surface_id: surface.clone(),
+            twin_id: twin.parse()?,
+            twin_origin: Origin::Computed.label(),
+            bands: Vec::new(),
+            pairs: Vec::new(),
+        };
+        let mut every = Vec::new();
+        for band in bands.iter().map(String::as_str).chain(["total"]) {
+            let column = if band == "total" { "tnce_total".to_owned() } else { format!("tnce_band_{band}") };
+            let levels = |alias: &str| format!("10 * log10({alias}.{column})");
+            let joined = format!(
+                "select m.pair_id, m.microphone, m.speaker, '{band}' as band, {} as measured_db, {} as computed_db, \
+                 {} - {} as difference_db from tnce m join tnce c on c.pair_id = m.pair_id \
+                 where m.surface_id = '{surface}' and c.surface_id = '{twin}' \
+                 and m.run_id = (select max(run_id) from tnce where surface_id = '{surface}') \
+                 and c.run_id = (select max(run_id) from tnce where surface_id = '{twin}') \
+                 and m.{column} > 0 and c.{column} > 0",
+                levels("m"),
+                levels("c"),
+                levels("m"),
+                levels("c"),
+            );
+            let phase = if band == "total" { "null".to_owned() } else { format!("detail_phase_{band}") };
+            let summary = format!(
+                "select '{band}' as band, count(*) as pairs, avg(measured_db) as measured_db, \
+                 avg(computed_db) as computed_db, avg(difference_db) as mean_db, \
+                 sqrt(avg(difference_db * difference_db)) as rms_db, \
+                 percentile_cont(0.05) within group (order by difference_db) as p5_db, \
+                 percentile_cont(0.95) within group (order by difference_db) as p95_db, \
+                 cast((select max({phase}) from surfaces where surface_id = '{twin}') as double) as detail_phase \
+                 from ({joined})"
+            );
+            found.bands.extend(super::sql::rows::<BandDifference>(&session, &summary).await?);
+            every.push(joined);
+        }
+        let farthest = format!(
+            "select * from ({}) order by abs(difference_db) desc, pair_id, band limit {pairs}",
+            every.join(" union all ")
+        );
+        found.pairs = super::sql::rows(&session, &farthest).await?;
+        anyhow::ensure!(
+            found.bands.iter().any(|band| band.pairs > 0),
+            "surface `{surface}` has no levels to compare; hint: `echolake doctor` says which references are missing"
+        );
+        Ok(found)
+    }
+
+    fn print(&self) -> anyhow::Result<()> {
+        let level = |value: Option<f64>| value.map_or_else(String::new, |value| format!("{value:.2}"));
+        super::print(&format!(
+            "{} (measured) less {} (computed), dB over Flat's same band, the total over its total\n\n\
+             {:>6} {:>6} {:>9} {:>9} {:>6} {:>6} {:>6} {:>6}",
+            self.surface_id, self.twin_id, "band", "pairs", "measured", "computed", "mean", "rms", "P5", "P95",
+        ))?;
+        for band in &self.bands {
+            let doubted = band.detail_phase.is_some_and(|phase| phase > GREATEST_DETAIL_PHASE);
+            super::print(&format!(
+                "{:>6} {:>6} {:>9} {:>9} {:>6} {:>6} {:>6} {:>6}{}",
+                band.band,
+                band.pairs,
+                level(band.measured_db),
+                level(band.computed_db),
+                level(band.mean_db),
+                level(band.rms_db),
+                level(band.p5_db),
+                level(band.p95_db),
+                if doubted { "  single pairs of the simulation are off by 1 dB here" } else { "" },
+            ))?;
+        }
+        super::print(&format!(
+            "\n{:>6} {:>5} {:>5} {:>6} {:>9} {:>9} {:>10}",
+            "pair", "mic", "spk", "band", "measured", "computed", "difference"
+        ))?;
+        for pair in &self.pairs {
+            super::print(&format!(
+                "{:>6} {:>5} {:>5} {:>6} {:>9.2} {:>9.2} {:>10.2}",
+                pair.pair_id,
+                pair.microphone,
+                pair.speaker,
+                pair.band,
+                pair.measured_db,
+                pair.computed_db,
+                pair.difference_db
+            ))?;
+        }
+        Ok(())
+    }
+}
