@@ -21,6 +21,7 @@ mod serve;
 mod signals;
 mod sofa;
 #[cfg(feature = "web")]
+mod twin;
 mod web;
 
 use std::collections::BTreeMap;

@@ -15,7 +15,7 @@ pub struct FigureNotes {
     pub lake: String,
     /// Name and version of the program.
     pub program: String,
-    /// Origins of the data: `simulated`, `measured`, `imported`; none if it is calculated from the rig alone.
+    /// Origins of the data: `simulated`, `computed`, `measured`, `imported`; none if it is calculated from the rig alone.
     pub origins: Vec<String>,
 }
 
@@ -41,7 +41,7 @@ impl FigureNotes {
 
     /// The origin of the data in a word or two.
     pub(crate) fn origin_word(&self) -> &'static str {
-        match (self.origins.is_empty(), self.origins.iter().filter(|o| *o == "simulated").count()) {
+        match (self.origins.is_empty(), self.origins.iter().filter(|o| *o == "simulated" || *o == "computed").count()) {
             (true, _) => "calculated",
             (false, 0) => "",
             (false, n) if n == self.origins.len() => "simulated",

@@ -31,7 +31,7 @@ struct LakeDescription<'a> {
     layers: i32,
     points: Vec<GridPoint>,
     counts: LakeCounts,
-    /// Every surface comes from the simulated rig.
+    /// Every surface comes from the simulated rig, or is computed for the mesh of one.
     simulated: bool,
 }
 
@@ -108,7 +108,7 @@ pub(super) async fn lake(Extension(request): Extension<CatalogueRequest>) -> End
         layers: points.iter().map(|p| p.layer + 1).max().unwrap_or(0),
         points,
         counts,
-        simulated: !summary.entries.is_empty() && summary.entries.iter().all(|e| e.surface.origin == "simulated"),
+        simulated: !summary.entries.is_empty() && summary.entries.iter().all(|e| matches!(e.surface.origin.as_str(), "simulated" | "computed")),
     })?)
 }
 
