@@ -5,10 +5,9 @@
 //! but for the normalisation: over Flat's same band, because that is how a band's own change reads. Simulated: the
 //! Kirchhoff approximation knows no multiple reflections, no shadows, and no air in the joints.
 //!
-//! Not converged in CELLS: facets that face away are left out, and finer cells make the walls of joints and stones
-//! steeper, which costs energy in all bands alike. Joints 10 mm deep are at -0.01, -0.01, -0.04, -0.16, -0.28 dB with
-//! 512 cells, at -0.13, -0.13, -0.16, -0.32, -0.48 dB with 1024. What the lower bands lose under steep walls (slate,
-//! river rock, joints of 20 mm) is in part this.
+//! Not converged in CELLS: coarse cells round off joints that are not much wider. Joints 10 mm deep are at 0.00, -0.01,
+//! -0.04, -0.15, -0.20 dB with 512 cells, at 0.00, -0.01, -0.06, -0.21, -0.30 dB with 1024. What joints do at 20 and
+//! 40 kHz has the wrong sign beside a boundary-element method (docs/devices.md).
 
 use std::io::Write as _;
 

@@ -6,9 +6,18 @@ use super::cell::{ArmPose, Cell};
 
 /// Largest turn of a joint between two collision checks, degrees: 850 mm of arm move 15 mm.
 const STEP_DEG: f64 = 1.0;
-/// Shoulder and elbow of an arm that is drawn back, degrees: low over its foot, high, and half-way out; if one is
+/// Shoulder and elbow of an arm that is drawn back, degrees: low over its foot, high, half-way out and others; if one is
 /// blocked, another need not be.
-const BACKS_DEG: [[f64; 2]; 3] = [[-70.0, 130.0], [-30.0, 70.0], [-30.0, 115.0]];
+const BACKS_DEG: [[f64; 2]; 8] = [
+    [-70.0, 130.0],
+    [-30.0, 70.0],
+    [-30.0, 115.0],
+    [0.0, 60.0],
+    [-50.0, 100.0],
+    [-90.0, 90.0],
+    [-90.0, 140.0],
+    [20.0, 100.0],
+];
 
 /// Order in which both arms get from one pose to another.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
