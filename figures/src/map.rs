@@ -3,7 +3,7 @@
 use crate::colours::kind_colour;
 use crate::drawing::{FigureColour, FigureDrawing, SMALL_PX, TextAnchor, ellipse, sized_label};
 use crate::font::{fitted_text, text_width};
-use crate::frame::{PlotAxis, PlotFrame, draw_legend};
+use crate::frame::{PlotAxis, PlotFrame, draw_legend, legend_width};
 use crate::notes::FigureNotes;
 
 /// More points than these have no names.
@@ -54,14 +54,13 @@ impl MapFigure {
         let [x, y] = [0, 1].map(|axis| self.range(axis));
         let frame = PlotFrame { left: 64.0, top, width: self.width_px - 80.0, height, x, y };
         frame.draw_grid(&mut drawing, &x.ticks(6), &y.ticks(6), true);
+        let mut names = NameLabels::default();
         for surface in &self.positions {
             let kind = kinds.iter().position(|kind| *kind == surface.kind).unwrap_or(0);
             let at = frame.place(surface.position_db[0], surface.position_db[1]);
             drawing.add(ellipse(at, [4.0, 4.0], 0.0, kind_colour(kind)).opaque(0.85));
             if self.positions.len() <= MOST_NAMES {
-                let past = at[0] + 8.0 + text_width(&surface.name, SMALL_PX) > self.width_px;
-                let (x, anchor) = if past { (at[0] - 6.0, TextAnchor::End) } else { (at[0] + 6.0, TextAnchor::Start) };
-                drawing.add(sized_label([x, at[1] + 3.5], &surface.name, anchor, SMALL_PX, FigureColour::Ink));
+                names.add(&mut drawing, at, &surface.name);
             }
         }
         frame.draw_axes(&mut drawing);
@@ -82,11 +81,35 @@ impl MapFigure {
     }
 }
 
+/// The names that are drawn already: left, right and baseline of each.
+#[derive(Default)]
+struct NameLabels {
+    drawn: Vec<[f32; 3]>,
+}
+
+impl NameLabels {
+    /// Draws a name beside its point, below those that are in its way.
+    fn add(&mut self, drawing: &mut FigureDrawing, [x, y]: [f32; 2], name: &str) {
+        let width = text_width(name, SMALL_PX);
+        let is_right = x + 8.0 + width <= drawing.width_px;
+        let left = if is_right { x + 6.0 } else { x - 6.0 - width };
+        let mut baseline = y + 3.5;
+        let touches = |[from, to, line]: &[f32; 3], baseline: f32| {
+            *from < left + width && left < *to && (line - baseline).abs() < SMALL_PX
+        };
+        while let Some([_, _, line]) = self.drawn.iter().find(|other| touches(other, baseline)) {
+            baseline = line + SMALL_PX;
+        }
+        self.drawn.push([left, left + width, baseline]);
+        drawing.add(sized_label([left, baseline], name, TextAnchor::Start, SMALL_PX, FigureColour::Ink));
+    }
+}
+
 fn legend_rows(entries: &[(FigureColour, String)], width: f32) -> Vec<Vec<(FigureColour, String)>> {
     let mut rows: Vec<Vec<_>> = vec![Vec::new()];
     let mut used = 0.0;
     for entry in entries {
-        let own = 26.0 + text_width(&entry.1, SMALL_PX);
+        let own = legend_width(&entry.1);
         if used + own > width && used > 0.0 {
             rows.push(Vec::new());
             used = 0.0;
@@ -97,4 +120,27 @@ fn legend_rows(entries: &[(FigureColour, String)], width: f32) -> Vec<Vec<(Figur
         }
     }
     rows
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::drawing::ShapeGeometry;
+
+    #[test]
+    fn names_at_one_place_are_below_each_other() {
+        let position = |name: &str| MapPosition { name: name.into(), kind: "brick".into(), position_db: [1.0, 2.0] };
+        let positions = ["0011_1", "0012_1", "0013_1"].map(position).to_vec();
+        let drawing = MapFigure { positions, explained: [0.7, 0.2], width_px: 400.0 }.draw(&FigureNotes::default());
+        let baselines: Vec<f32> = drawing
+            .shapes
+            .iter()
+            .filter_map(|shape| match &shape.geometry {
+                ShapeGeometry::Text { at, text, .. } if text.ends_with("_1") => Some(at[1]),
+                _ => None,
+            })
+            .collect();
+        assert_eq!(baselines.len(), 3);
+        assert!(baselines.windows(2).all(|two| two[1] - two[0] >= SMALL_PX), "{baselines:?}");
+    }
 }

@@ -2,9 +2,8 @@
 //! removal of direct sound.
 
 use crate::colours::kind_colour;
-use crate::drawing::{FigureDrawing, SMALL_PX, StrokeStyle, TextAnchor, label, line};
-use crate::font::text_width;
-use crate::frame::{PlotAxis, PlotFrame, draw_legend};
+use crate::drawing::{FigureDrawing, StrokeStyle, TextAnchor, label, line};
+use crate::frame::{PlotAxis, PlotFrame, draw_legend, legend_width};
 use crate::notes::FigureNotes;
 
 const ROW: f32 = 150.0;
@@ -70,7 +69,7 @@ impl StepsFigure {
             drawing.add(label([70.0, top - 10.0], &row.title, TextAnchor::Start));
             let entries: Vec<_> =
                 row.traces.iter().enumerate().map(|(i, t)| (kind_colour(i), t.name.clone())).collect();
-            let width: f32 = entries.iter().map(|(_, name)| 26.0 + text_width(name, SMALL_PX)).sum();
+            let width: f32 = entries.iter().map(|(_, name)| legend_width(name)).sum();
             draw_legend(&mut drawing, [self.width_px - 16.0 - width, top - 10.0], &entries);
         }
         drawing.add(label([self.width_px / 2.0, height - 28.0], "Time, ms", TextAnchor::Middle));

@@ -1,7 +1,7 @@
 //! A drawing as PDF: one page, with the font inside, so that its texts can be searched and copied.
 
 use miniz_oxide::deflate::compress_to_vec_zlib;
-use pdf_writer::types::{CidFontType, FontFlags, SystemInfo, UnicodeCmap};
+use pdf_writer::types::{CidFontType, FontFlags, LineJoinStyle, SystemInfo, UnicodeCmap};
 use pdf_writer::{Content, Filter, Finish as _, Name, Pdf, Rect, Ref, Str, TextStr};
 
 use super::{ellipse_curves, text_offset};
@@ -113,6 +113,7 @@ impl<'a> PdfPage<'a> {
         if let Some(stroke) = shape.stroke {
             let [r, g, b] = stroke.colour.rgb().map(|part| f32::from(part) / 255.0);
             self.content.set_stroke_rgb(r, g, b).set_line_width(stroke.width_px);
+            self.content.set_line_join(LineJoinStyle::RoundJoin);
             if stroke.dash_px > 0.0 {
                 self.content.set_dash_pattern([stroke.dash_px], 0.0);
             }

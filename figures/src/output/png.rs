@@ -1,4 +1,4 @@
-//! A drawing as PNG, at twice its size.
+//! A drawing as PNG, at twice its size unless that is very large.
 
 use echolake_dsp::png;
 use ttf_parser::OutlineBuilder;
@@ -10,6 +10,8 @@ use crate::font::{advance, face, glyphs, outline, text_width};
 
 /// Pixels per px of a drawing: 192 dots per inch.
 const SCALE: f32 = 2.0;
+/// Drawings of more pixels have one per px.
+const MOST_PIXELS: f32 = 1e8;
 /// Pixels that are drawn at a time: their memory does not depend on the drawing's size.
 const STRIP_PIXELS: usize = 4 << 20;
 /// More than half the widest line.
@@ -18,14 +20,16 @@ const MOST_STROKE_PX: f32 = 4.0;
 impl FigureDrawing {
     /// Returns the drawing as a PNG file; its notes are texts of the file.
     pub fn to_png(&self) -> Vec<u8> {
-        let [width, height] = [self.width_px, self.height_px].map(|length| (length * SCALE).ceil().max(1.0) as usize);
+        let is_large = self.width_px * self.height_px * SCALE * SCALE > MOST_PIXELS;
+        let scale = if is_large { 1.0 } else { SCALE };
+        let [width, height] = [self.width_px, self.height_px].map(|length| (length * scale).ceil().max(1.0) as usize);
         let extents: Vec<_> = self.shapes.iter().map(|shape| vertical_extent(&shape.geometry)).collect();
         let strip_rows = (STRIP_PIXELS / width).clamp(1, height);
         let strips = (0..height).step_by(strip_rows).map(|top| {
             let rows = strip_rows.min(height - top);
             let pixels = FigureColour::Paper.rgb().map(f32::from).repeat(width * rows);
-            let mut canvas = PixelStrip { pixels, width, top, rows };
-            let [first, last] = [top, top + rows].map(|row| row as f32 / SCALE);
+            let mut canvas = PixelStrip { pixels, scale, width, top, rows };
+            let [first, last] = [top, top + rows].map(|row| row as f32 / scale);
             let shown = self.shapes.iter().zip(&extents).filter(|(_, [from, to])| *to >= first && *from <= last);
             shown.for_each(|(shape, _)| canvas.draw(shape));
             canvas.pixels.iter().map(|part| part.round() as u8).collect::<Vec<u8>>()
@@ -57,6 +61,8 @@ fn vertical_extent(geometry: &ShapeGeometry) -> [f32; 2] {
 /// Some rows of opaque pixels, red, green and blue from 0 to 255; fractions count where many faint shapes overlap.
 struct PixelStrip {
     pixels: Vec<f32>,
+    /// Pixels per px.
+    scale: f32,
     width: usize,
     /// The picture's row that is its first.
     top: usize,
@@ -92,7 +98,7 @@ impl PixelStrip {
     }
 
     fn cover(&mut self, path: &[Command], placed: Transform, style: Style<'_>, rgb: [u8; 3], opacity: f32) {
-        let transform = placed.then_scale(SCALE, SCALE).then_translate(0.0, -(self.top as f32));
+        let transform = placed.then_scale(self.scale, self.scale).then_translate(0.0, -(self.top as f32));
         let (coverage, place) = Mask::new(path).style(style).transform(Some(transform)).render();
         let columns = place.width as usize;
         for (row, line) in coverage.chunks_exact(columns.max(1)).enumerate() {
@@ -116,8 +122,9 @@ impl PixelStrip {
     }
 
     fn fill_rect(&mut self, [x, y]: [f32; 2], [width, height]: [f32; 2], rgb: [u8; 3]) {
-        let edge =
-            |at: f32, from: usize, count: usize| ((at * SCALE).round() - from as f32).clamp(0.0, count as f32) as usize;
+        let edge = |at: f32, from: usize, count: usize| {
+            ((at * self.scale).round() - from as f32).clamp(0.0, count as f32) as usize
+        };
         let [left, right] = [x, x + width].map(|at| edge(at, 0, self.width));
         let [first, end] = [y, y + height].map(|at| edge(at, self.top, self.rows));
         for row in first..end {
@@ -130,8 +137,8 @@ impl PixelStrip {
 
     // The nearest cell's brightness.
     fn draw_picture(&mut self, [x, y]: [f32; 2], side: f32, pixels: &[u8], columns: usize) {
-        let count = (side * SCALE).round() as usize;
-        let [left, top] = [x, y].map(|at| (at * SCALE).round() as usize);
+        let count = (side * self.scale).round() as usize;
+        let [left, top] = [x, y].map(|at| (at * self.scale).round() as usize);
         for (row, column) in (0..count).flat_map(|row| (0..count).map(move |column| (row, column))) {
             let cell = (row * columns / count) * columns + column * columns / count;
             if let (Some(grey), Some(y)) = (pixels.get(cell), (top + row).checked_sub(self.top)) {
@@ -218,5 +225,58 @@ impl OutlineBuilder for GlyphPen {
 
     fn close(&mut self) {
         self.path.push(Command::Close);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::drawing::TextAnchor;
+    use crate::drawing::{filled_rect, label};
+    use crate::notes::FigureNotes;
+
+    fn size(png: &[u8]) -> [u32; 2] {
+        [16, 20].map(|at| u32::from_be_bytes(png[at..at + 4].try_into().expect("four bytes")))
+    }
+
+    fn pixels(png: &[u8], width: usize) -> Vec<u8> {
+        let at = png.windows(4).position(|w| w == b"IDAT").expect("data");
+        let rows = miniz_oxide::inflate::decompress_to_vec_zlib(&png[at + 4..png.len() - 16]).expect("zlib");
+        let mut above = vec![0u8; 3 * width];
+        let mut pixels = Vec::new();
+        for row in rows.chunks_exact(1 + 3 * width) {
+            above.iter_mut().zip(&row[1..]).for_each(|(above, now)| *above = above.wrapping_add(*now));
+            pixels.extend_from_slice(&above);
+        }
+        pixels
+    }
+
+    // Three strips: what is across their limits is whole.
+    #[test]
+    fn strips_make_one_picture() {
+        let mut tall = FigureDrawing::new(1500.0, 1500.0, &FigureNotes::default());
+        let accent = FigureColour::Accent;
+        tall.add(filled_rect([10.0, 10.0], [20.0, 1480.0], accent));
+        for row in 0..100 {
+            tall.add(label([40.0, 15.0 * row as f32], "M", TextAnchor::Start));
+        }
+        let png = tall.to_png();
+        assert_eq!(size(&png), [3000, 3000]);
+        let pixels = pixels(&png, 3000);
+        let at = |x: usize, y: usize| &pixels[3 * (3000 * y + x)..][..3];
+        assert!((20..2980).all(|y| at(40, y) == accent.rgb()), "the bar");
+        assert_eq!((at(40, 19), at(40, 2980), at(2000, 1500)), (&[255; 3][..], &[255; 3][..], &[255; 3][..]));
+        let letter = |row: usize| {
+            (0..60)
+                .flat_map(|x| (0..26).map(move |y| (x, y)))
+                .map(|(x, y)| at(80 + x, 30 * row + y - 25).to_vec())
+                .collect::<Vec<_>>()
+        };
+        assert!((2..99).all(|row| letter(row) == letter(1)), "the letters");
+    }
+
+    #[test]
+    fn large_drawings_have_a_pixel_per_px() {
+        assert_eq!(size(&FigureDrawing::new(10.0, 3e6, &FigureNotes::default()).to_png()), [10, 3_000_000]);
     }
 }

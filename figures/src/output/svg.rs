@@ -91,6 +91,9 @@ impl fmt::Display for Painted {
         }
         let Some(stroke) = self.1 else { return Ok(()) };
         write!(f, " stroke=\"{}\" stroke-width=\"{}\"", Colour(stroke.colour), Number(stroke.width_px))?;
+        if self.0.is_none() {
+            f.write_str(" stroke-linejoin=\"round\"")?;
+        }
         if stroke.dash_px > 0.0 {
             write!(f, " stroke-dasharray=\"{}\"", Number(stroke.dash_px))?;
         }

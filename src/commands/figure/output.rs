@@ -49,7 +49,7 @@ impl OutputArgs {
         if self.output.is_empty() {
             return Ok(std::io::stdout().write_all(drawing.to_svg().as_bytes())?);
         }
-        for path in self.paths(surfaces) {
+        for path in self.paths(surfaces)? {
             match extension(&path) {
                 "svg" => write_file(&path, drawing.to_svg().as_bytes())?,
                 "pdf" => write_file(&path, &drawing.to_pdf())?,
@@ -70,7 +70,7 @@ impl OutputArgs {
         if self.output.is_empty() {
             return Ok(super::super::print(table.to_markdown(&FigureNotes::default()).trim_end())?);
         }
-        for path in self.paths(surfaces) {
+        for path in self.paths(surfaces)? {
             let text = match extension(&path) {
                 "tex" => table.to_latex(notes),
                 "csv" => table.to_csv(notes),
@@ -82,12 +82,15 @@ impl OutputArgs {
         Ok(())
     }
 
-    fn paths(&self, surfaces: &[SelectedSurface]) -> impl Iterator<Item = PathBuf> {
-        let surface = surfaces.first().map_or("", |surface| &surface.surface_id);
-        self.output.iter().map(move |path| match path.to_str() {
-            Some(text) => PathBuf::from(text.replace(PLACEHOLDER, surface)),
-            None => path.clone(),
-        })
+    fn paths(&self, surfaces: &[SelectedSurface]) -> anyhow::Result<Vec<PathBuf>> {
+        let path = |path: &PathBuf| match (path.to_str(), surfaces.first()) {
+            (Some(text), Some(surface)) => Ok(PathBuf::from(text.replace(PLACEHOLDER, &surface.surface_id))),
+            (Some(text), None) if text.contains(PLACEHOLDER) => {
+                bail!("`{text}` is named by a surface, and the figure is of none; hint: a name without {PLACEHOLDER}")
+            }
+            _ => Ok(path.clone()),
+        };
+        self.output.iter().map(path).collect()
     }
 }
 
