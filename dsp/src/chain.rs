@@ -84,7 +84,7 @@ impl<T: RealSample> MeasurementPlan<T> {
     /// The response of one measurement at the reference temperature.
     ///
     /// # Errors
-    /// As [`ResponseDeconvolution::run`], and [`Error::Setting`] for a temperature outside of -60 to 80 C: the plan
+    /// As [`ResponseDeconvolution::run_within`], and [`Error::Setting`] for a temperature outside of -60 to 80 C: the plan
     /// has deconvolved too little for it.
     pub fn ir(
         &self,

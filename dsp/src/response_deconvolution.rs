@@ -39,7 +39,7 @@ impl<T: RealSample> ResponseDeconvolution<T> {
         }))
     }
 
-    /// Buffers for [`Self::run`]; one per thread.
+    /// Buffers for [`Self::run_within`]; one per thread.
     pub fn scratch(&self) -> ResponseScratch<T> {
         ResponseScratch(match &self.0 {
             Precision::Same(plan) => PrecisionScratch::Same(plan.scratch()),

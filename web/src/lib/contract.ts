@@ -104,8 +104,8 @@ export interface paths {
         };
         /**
          * Surfaces as points, close together if they reflect alike, and their nearest neighbours.
-         * @description Principal components of the surfaces' TNCE vectors (all pairs and bands, dB over Flat's same band); once per
-         *     snapshot.
+         * @description Principal components and a self-organising map of the surfaces' TNCE vectors (all pairs and bands, dB over Flat's same
+         *     band); once per snapshot.
          */
         readonly get: operations["map"];
         readonly put?: never;
@@ -593,8 +593,12 @@ export interface components {
             readonly p50_db: number | null;
             readonly p5_db: number | null;
             readonly p90_mean_db: number | null;
+            /** @description Standard uncertainty of `p90_mean_db`; null if it is not known. */
+            readonly p90_mean_u_db: number | null;
             readonly p95_db: number | null;
             readonly spread_db: number | null;
+            /** @description `p90_mean_db` without Foam's own reflection; null if it cannot be estimated. */
+            readonly unbiased_p90_mean_db: number | null;
         };
         /** @description Surfaces with values from one number to another. */
         readonly Bin: {
@@ -745,6 +749,8 @@ export interface components {
         readonly Lake: {
             readonly bands: readonly components["schemas"]["Band"][];
             readonly counts: components["schemas"]["LakeCounts"];
+            /** @description Direct sound that is subtracted: `foam`, or `estimated` without Foam's own reflection. */
+            readonly direct_sound: string;
             /** @description Division of the spectra at the limits of `low_hz` and `high_hz`: `tapered`, `floored` or `literal`. */
             readonly division: string;
             readonly high_hz: number;
@@ -757,7 +763,7 @@ export interface components {
             readonly points: readonly components["schemas"]["Point"][];
             readonly rate_hz: number;
             readonly reference_temperature_c: number;
-            /** @description Every surface comes from the simulated rig. */
+            /** @description Every surface comes from the simulated rig, or is computed for the mesh of one. */
             readonly simulated: boolean;
             readonly software: string;
             /** @description Changes with every snapshot; also the ETag of what is computed from it. */
@@ -788,6 +794,15 @@ export interface components {
             readonly position: readonly number[];
             readonly surface_id: string;
             readonly typology: string;
+            /** @description Column and row of its unit on the self-organising map. */
+            readonly unit: readonly number[];
+        };
+        /** @description Units of a self-organising map. */
+        readonly MapUnits: {
+            /** @description Mean distance of each unit from those beside it, row by row: great between groups. */
+            readonly borders_db: readonly number[];
+            readonly columns: number;
+            readonly rows: number;
         };
         /** @description A measurement of a pair. */
         readonly Measurement: {
@@ -842,8 +857,12 @@ export interface components {
             readonly symmetries: readonly components["schemas"]["SymmetricPair"][];
             /** @description Over Flat's same band, by band as `tnce_db`. */
             readonly tnce_band_db: readonly (number | null)[];
+            /** @description Standard uncertainties of `tnce_band_db`; null if they are not known. */
+            readonly tnce_band_u_db: readonly (number | null)[];
             /** @description Over Flat's total. One value per band in the order of `lake.bands`, the total last; null if there is no value. */
             readonly tnce_db: readonly (number | null)[];
+            /** @description Standard uncertainties of `tnce_db`; null if they are not known. */
+            readonly tnce_u_db: readonly (number | null)[];
         };
         /** @description A point of the grid. */
         readonly Point: {
@@ -998,6 +1017,7 @@ export interface components {
             /** @description Surfaces without TNCE, and those beyond the first 2000. */
             readonly left_out: readonly string[];
             readonly points: readonly components["schemas"]["MapPoint"][];
+            readonly units: components["schemas"]["MapUnits"];
         };
         /** @description A surface that is near another one. */
         readonly SurfaceNeighbour: {
