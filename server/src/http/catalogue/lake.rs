@@ -108,7 +108,8 @@ pub(super) async fn lake(Extension(request): Extension<CatalogueRequest>) -> End
         layers: points.iter().map(|p| p.layer + 1).max().unwrap_or(0),
         points,
         counts,
-        simulated: !summary.entries.is_empty() && summary.entries.iter().all(|e| matches!(e.surface.origin.as_str(), "simulated" | "computed")),
+        simulated: !summary.entries.is_empty()
+            && summary.entries.iter().all(|e| matches!(e.surface.origin.as_str(), "simulated" | "computed")),
     })?)
 }
 
