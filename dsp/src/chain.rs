@@ -313,7 +313,8 @@ impl<T: RealSample> DerivationPlan<T> {
         self.bank.energies(reflected, energies, &mut scratch.bank)
     }
 
-    /// Computes what errors of the direct sound do to the energies of a reflected response: `sensitivities[band]`.
+    /// Computes what errors of the direct sound, and warmer air by its relative change of each bin, do to the energies of a
+    /// reflected response: `sensitivities[band]`.
     ///
     /// # Errors
     /// [`Error::Length`] or [`Error::NotFinite`].
@@ -321,10 +322,24 @@ impl<T: RealSample> DerivationPlan<T> {
         &self,
         reflected: &[T],
         direct: &[T],
+        per_kelvin: impl Fn(usize) -> f64,
         sensitivities: &mut [EnergySensitivity],
         scratch: &mut DerivationScratch<T>,
     ) -> Result<(), Error> {
-        self.bank.sensitivities(reflected, direct, sensitivities, &mut scratch.bank)
+        self.bank.sensitivities(reflected, direct, per_kelvin, sensitivities, &mut scratch.bank)
+    }
+
+    /// Computes the power spectrum of a response, `[len / 2 + 1]`, and adds it to one.
+    ///
+    /// # Errors
+    /// [`Error::Length`] or [`Error::NotFinite`].
+    pub fn add_power(
+        &self,
+        response: &[T],
+        power: &mut [f64],
+        scratch: &mut DerivationScratch<T>,
+    ) -> Result<(), Error> {
+        self.bank.add_power(response, power, &mut scratch.bank)
     }
 
     fn measure_flat(&self, flat: &[T], scratch: &mut DerivationScratch<T>) -> Result<(), Error> {

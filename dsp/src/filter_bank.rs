@@ -169,7 +169,8 @@ impl<T: RealSample> FilterBankPlan<T> {
         Ok(())
     }
 
-    /// Energy of a reflected response in each band, and what errors of the direct sound beneath it do to that energy.
+    /// Energy of a reflected response in each band, and what errors of the direct sound beneath it do to that energy, and
+    /// warmer air by its relative change in each bin.
     ///
     /// # Errors
     /// [`Error::Length`] or [`Error::NotFinite`].
@@ -177,6 +178,7 @@ impl<T: RealSample> FilterBankPlan<T> {
         &self,
         reflected: &[T],
         direct: &[T],
+        per_kelvin: impl Fn(usize) -> f64,
         sensitivities: &mut [EnergySensitivity],
         scratch: &mut FilterBankScratch<T>,
     ) -> Result<(), Error> {
@@ -189,7 +191,9 @@ impl<T: RealSample> FilterBankPlan<T> {
             for (bin, ((x, d), gain)) in scratch.spectrum.iter().zip(&direct).zip(gains).enumerate() {
                 let (weight, angle) = (self.weight(bin) * gain.f64().powi(2) / self.len as f64, angle(bin, self.len));
                 let (product, power) = ((x.conj() * d), d.norm_sqr().f64());
-                sum.energy += weight * x.norm_sqr().f64();
+                let energy = weight * x.norm_sqr().f64();
+                sum.energy += energy;
+                sum.temperature += energy * per_kelvin(bin);
                 sum.gain += 2.0 * weight * product.re.f64();
                 sum.gain_square += weight * power;
                 // A delay adds minus the first derivative, and half of its square times the second.
@@ -198,6 +202,17 @@ impl<T: RealSample> FilterBankPlan<T> {
             }
             *sensitivity = sum;
         }
+        Ok(())
+    }
+
+    /// Adds the power of each bin of a signal.
+    ///
+    /// # Errors
+    /// [`Error::Length`] or [`Error::NotFinite`].
+    pub fn add_power(&self, signal: &[T], power: &mut [f64], scratch: &mut FilterBankScratch<T>) -> Result<(), Error> {
+        check_len("the power spectrum", power.len(), self.len / 2 + 1)?;
+        self.spectrum(signal, scratch)?;
+        power.iter_mut().zip(&scratch.spectrum).for_each(|(power, x)| *power += x.norm_sqr().f64());
         Ok(())
     }
 

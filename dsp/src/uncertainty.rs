@@ -10,6 +10,7 @@ use std::sync::Arc;
 use realfft::num_complex::Complex;
 use realfft::{ComplexToReal, RealToComplex};
 
+use crate::air::AirAbsorption;
 use crate::error::check_len;
 use crate::{Error, RealSample};
 
@@ -20,6 +21,11 @@ const LEAST_SEPARATION_SECS: f64 = 0.35e-3;
 const GATE_SECS: [f64; 2] = [0.3e-3, 0.2e-3];
 /// Time before the direct sound's arrival up to which there is noise alone, s.
 const NOISE_SECS: f64 = 0.4e-3;
+/// 0 C in K.
+const KELVIN: f64 = 273.15;
+/// Air whose absorption is taken: it changes with the temperature by a third less or more in dry or damp air.
+const HUMIDITY_PCT: f64 = 45.0;
+const PRESSURE_HPA: f64 = 1_013.25;
 /// Least number of pairs for an estimate.
 pub const LEAST_PAIRS: usize = 24;
 
@@ -95,6 +101,20 @@ pub struct EnergySensitivity {
     pub delay: f64,
     /// Change of the energy per square of a delay.
     pub delay_square: f64,
+    /// Change of the energy per kelvin that the air is warmer.
+    pub temperature: f64,
+}
+
+/// Change of reflected energies with the air's temperature, that of a response at the reference temperature.
+///
+/// The correction moves frequencies, and with them what tweeter and microphone do to each; and warm air absorbs more or
+/// less than cold air.
+#[derive(Debug, Clone, PartialEq)]
+pub struct TemperatureResponse {
+    /// `[bins]`: relative change per kelvin by speaker and microphone.
+    transducers: Vec<f64>,
+    /// `[bins]`: relative change per kelvin and metre by absorption.
+    absorption: Vec<f64>,
 }
 
 /// The residuals of a run and of Flat's, whose energies are divided by one another.
@@ -246,27 +266,71 @@ impl EnergySensitivity {
             gain_square: a.gain_square + b.gain_square,
             delay: a.delay + b.delay,
             delay_square: a.delay_square + b.delay_square,
+            temperature: a.temperature + b.temperature,
         })
+    }
+}
+
+impl TemperatureResponse {
+    /// Computes the changes from the mean power spectrum of what Flat reflects, `[len / 2 + 1]`, whose slope is that of
+    /// speaker and microphone, within the sweep's range, Hz, and for air of this temperature in C.
+    ///
+    /// # Errors
+    /// [`Error::Length`].
+    pub fn new(power: &[f64], len: usize, rate_hz: f64, range_hz: [f64; 2], celsius: f64) -> Result<Self, Error> {
+        check_len("Flat's power spectrum", power.len(), len / 2 + 1)?;
+        let [low, high] = range_hz;
+        // The bins whose neighbours are within the range and no part of its tapers.
+        let step_hz = rate_hz / len as f64;
+        let first = (low * 1.02 / step_hz).ceil() as usize + 2;
+        let last = ((high * 0.98 / step_hz).floor() as usize).saturating_sub(2).min(power.len().saturating_sub(2));
+        let slope = |bin: usize| {
+            let bin = bin.clamp(first, last.max(first));
+            let (Some(below), Some(above)) = (power.get(bin - 1), power.get(bin + 1)) else { return 0.0 };
+            let slope = (above / below).ln() / ((bin + 1) as f64 / (bin - 1) as f64).ln();
+            if slope.is_finite() { slope } else { 0.0 }
+        };
+        // The speed of sound grows as the root of the absolute temperature.
+        let per_kelvin = 0.5 / (KELVIN + celsius);
+        let absorption_db =
+            |celsius: f64, hz: f64| AirAbsorption::new(celsius, HUMIDITY_PCT, PRESSURE_HPA).db_per_m(hz);
+        let change = |bin: usize| {
+            let hz = bin as f64 * step_hz;
+            -LN_10 / 10.0 * (absorption_db(celsius + 0.5, hz) - absorption_db(celsius - 0.5, hz))
+        };
+        Ok(Self {
+            transducers: (0..power.len()).map(|bin| slope(bin) * per_kelvin).collect(),
+            absorption: (0..power.len()).map(change).collect(),
+        })
+    }
+
+    /// Returns the relative change per kelvin of a bin's energy that goes so many metres.
+    pub fn per_kelvin(&self, bin: usize, metres: f64) -> f64 {
+        let of = |changes: &[f64]| changes.get(bin).copied().unwrap_or(0.0);
+        of(&self.transducers) + metres * of(&self.absorption)
     }
 }
 
 impl LevelUncertainty {
     /// Computes the relative error that a run's measurements have in common, and the variance of the rest, of the energy
-    /// of a measurement over Flat's.
-    pub fn relative_error(&self, of: &EnergySensitivity, flat: &EnergySensitivity) -> ErrorMoments {
+    /// of a measurement over Flat's; the run's air was so many kelvin warmer than Flat's.
+    pub fn relative_error(&self, of: &EnergySensitivity, flat: &EnergySensitivity, warmer: f64) -> ErrorMoments {
         let per = |s: &EnergySensitivity, change: f64| change / s.energy;
+        let both = |value: fn(&EnergySensitivity) -> f64| [of, flat].map(|s| per(s, value(s)));
         let kinds = [
-            (self.run.gain, self.flat.gain, [per(of, of.gain), per(flat, flat.gain)], per(of, of.gain_square)),
-            (self.run.delay, self.flat.delay, [per(of, of.delay), per(flat, flat.delay)], per(of, of.delay_square)),
+            (self.run.gain, self.flat.gain, both(|s| s.gain), both(|s| s.gain_square)),
+            (self.run.delay, self.flat.delay, both(|s| s.delay), both(|s| s.delay_square)),
         ];
-        let mut error = ErrorMoments::default();
-        for (run, of_flat, [s, s_flat], square) in kinds {
+        let mut error = ErrorMoments { mean: warmer * per(of, of.temperature), variance: 0.0 };
+        for (run, of_flat, [s, s_flat], [square, square_flat]) in kinds {
             if self.is_flat {
                 error.mean += run.mean * (s - s_flat);
                 error.variance += run.variance * (s - s_flat).powi(2);
                 continue;
             }
             error.mean += run.mean * s - of_flat.mean * s_flat;
+            // Whatever its sign, an error adds energy.
+            error.mean += run.variance * square - of_flat.variance * square_flat;
             // Both have Foam's error in them: half of the smaller variance.
             let shared = run.variance.min(of_flat.variance);
             error.variance += run.variance * s * s + of_flat.variance * s_flat * s_flat - shared * s * s_flat;
@@ -279,8 +343,8 @@ impl LevelUncertainty {
     }
 
     /// Computes the standard uncertainty of a level, dB; None without energy.
-    pub fn level_db(&self, of: &EnergySensitivity, flat: &EnergySensitivity) -> Option<f64> {
-        let error = self.relative_error(of, flat);
+    pub fn level_db(&self, of: &EnergySensitivity, flat: &EnergySensitivity, warmer: f64) -> Option<f64> {
+        let error = self.relative_error(of, flat, warmer);
         let db = 10.0 / LN_10 * (error.mean.powi(2) + error.variance).sqrt();
         (of.energy > 0.0 && flat.energy > 0.0 && db.is_finite()).then_some(db)
     }
@@ -323,10 +387,11 @@ mod tests {
         let mut scratch = plan.scratch();
         let mut sensitivities = |signal: &[f64]| {
             let mut found = [EnergySensitivity::default(); 5];
-            plan.sensitivities(signal, &direct, &mut found, &mut scratch).expect("sensitivities");
+            plan.sensitivities(signal, &direct, |_| 0.01, &mut found, &mut scratch).expect("sensitivities");
             found
         };
         let before = sensitivities(&reflected);
+        assert!(before.iter().all(|band| (band.temperature / band.energy - 0.01).abs() < 1e-12), "{before:?}");
         for (gain, delay) in [(0.02, 0.0), (0.0, 0.03)] {
             // The direct sound of the run, later and louder than what is subtracted.
             let left = sum(&sum(&pulse(80.0 + delay), gain, &direct), -1.0, &direct);
@@ -386,13 +451,41 @@ mod tests {
             delay: ErrorMoments { mean: 0.01, variance: 1e-4 },
             noise: 1e-8,
         };
-        let flat = EnergySensitivity { energy: 0.5, gain: 0.1, gain_square: 1.0, delay: 0.2, delay_square: 1.0 };
+        let flat = EnergySensitivity {
+            energy: 0.5,
+            gain: 0.1,
+            gain_square: 1.0,
+            delay: 0.2,
+            delay_square: 1.0,
+            temperature: 0.001,
+        };
         let mut levels = LevelUncertainty { run: residual, flat: residual, is_flat: true };
-        assert_eq!(levels.level_db(&flat, &flat), Some(0.0));
+        assert_eq!(levels.level_db(&flat, &flat, 0.0), Some(0.0));
         levels.is_flat = false;
         // The common parts cancel, as both have them; the others do not.
-        let db = levels.level_db(&flat, &flat).expect("a level");
+        let db = levels.level_db(&flat, &flat, 0.0).expect("a level");
         assert!((0.01..0.1).contains(&db), "{db}");
-        assert_eq!(levels.level_db(&EnergySensitivity::default(), &flat), None);
+        assert_eq!(levels.level_db(&EnergySensitivity::default(), &flat, 0.0), None);
+    }
+
+    // A tweeter that gets louder by 12 dB an octave, and air that is warmer by a kelvin.
+    #[test]
+    fn warmer_air_changes_energies_by_the_slope_of_the_spectrum_and_by_absorption() {
+        let power: Vec<f64> = (0..LEN / 2 + 1).map(|bin| (bin as f64).powi(4)).collect();
+        let response = TemperatureResponse::new(&power, LEN, RATE_HZ, RANGE_HZ, 20.0).expect("a response");
+        let ratio = crate::temperature::resampling_ratio(20.5, 20.0) / crate::temperature::resampling_ratio(19.5, 20.0);
+        for bin in [10, 40, 150] {
+            let change = response.per_kelvin(bin, 0.0);
+            assert!((change / (ratio.powi(4) - 1.0) - 1.0).abs() < 0.01, "{bin}: {change}");
+        }
+        let absorbed = |celsius| AirAbsorption::new(celsius, HUMIDITY_PCT, PRESSURE_HPA).db_per_m(40e3);
+        let change = (10f64.powf(-0.2 * (absorbed(20.5) - absorbed(19.5))) - 1.0) / 2.0;
+        let found = (response.per_kelvin(160, 2.0) - response.per_kelvin(160, 0.0)) / 2.0;
+        assert!((found / change - 1.0).abs() < 0.02, "{found} {change}");
+        assert!(TemperatureResponse::new(&power[1..], LEN, RATE_HZ, RANGE_HZ, 20.0).is_err());
+        assert_eq!(
+            TemperatureResponse::new(&[0.0; 5], 8, RATE_HZ, RANGE_HZ, 20.0).expect("silent").per_kelvin(2, 0.0),
+            0.0
+        );
     }
 }

@@ -3,6 +3,7 @@
 
 use std::sync::Arc;
 
+use echolake_dsp::temperature::speed_of_sound;
 use echolake_dsp::uncertainty::{EnergySensitivity, LevelUncertainty};
 use echolake_lake::{EncodedFile, FileEncoder, Lake, StagedFile, encode};
 use echolake_schema::tables::Table;
@@ -116,18 +117,23 @@ impl ReferenceDerivation {
         let failed = |cause| Error::Kernel { file: keys.run.to_string(), cause };
         let plan = derivation_plan(rig).map_err(failed)?;
         let levels = self.level_uncertainty(lake, keys, responses)?;
+        let sound_m_s = speed_of_sound(rig.impulse_response.reference_temperature_c.get());
         let (mut scratch, mut derived, mut energies) = (plan.scratch(), plan.derived(), vec![0.0; bands]);
         let mut sensitivities = vec![EnergySensitivity::default(); bands];
-        let irs = responses.pairs.chunks(SLICE).zip(responses.irs.chunks(SLICE * length));
-        for (pairs, irs) in irs {
+        let slices = responses.pairs.chunks(SLICE).zip(responses.irs.chunks(SLICE * length));
+        for ((pairs, irs), temperatures) in slices.zip(responses.celsius.chunks(SLICE)) {
             let mut slice = DerivedRows::new(bands);
-            for (pair, ir) in pairs.iter().zip(irs.chunks_exact(length)) {
+            for ((pair, ir), celsius) in pairs.iter().zip(irs.chunks_exact(length)).zip(temperatures) {
                 let Some((direct, flat)) = self.references.chosen.of_pair(*pair) else { continue };
                 plan.run_over(ir, direct, &flat.energies, &mut derived, &mut scratch).map_err(failed)?;
                 slice.push(*pair, &derived);
                 if let Some(levels) = &levels {
-                    plan.sensitivities(&derived.reflected, direct, &mut sensitivities, &mut scratch).map_err(failed)?;
-                    slice.push_errors(levels, &sensitivities, flat);
+                    let air = &self.references.chosen.air;
+                    let metres = arrivals(lake, *pair).map_or(0.0, |[_, reflected]| reflected * sound_m_s);
+                    let per_kelvin = |bin| air.per_kelvin(bin, metres);
+                    plan.sensitivities(&derived.reflected, direct, per_kelvin, &mut sensitivities, &mut scratch)
+                        .map_err(failed)?;
+                    slice.push_errors(levels, &sensitivities, flat, *celsius);
                 }
                 if let Some((direct, flat)) = self.references.estimated.as_ref().and_then(|e| e.of_pair(*pair)) {
                     plan.reflected_energies(ir, direct, &mut energies, &mut scratch).map_err(failed)?;

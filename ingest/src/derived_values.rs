@@ -4,11 +4,19 @@ use std::collections::HashMap;
 
 use echolake_dsp::chain::{DerivationPlan, DerivedResponse, FlatEnergies};
 use echolake_dsp::rise::CurveShape;
-use echolake_dsp::uncertainty::{EnergySensitivity, ErrorMoments, LevelUncertainty, ResidualFit};
+use echolake_dsp::uncertainty::{EnergySensitivity, ErrorMoments, LevelUncertainty, ResidualFit, TemperatureResponse};
 use echolake_schema::Rig;
 
 /// Mean impulse response of each pair of a reference.
-pub(crate) type MeanResponses = HashMap<u32, Vec<f32>>;
+pub(crate) type MeanResponses = HashMap<u32, MeanResponse>;
+
+/// Mean of a pair's responses.
+#[derive(Debug, Clone)]
+pub(crate) struct MeanResponse {
+    pub(crate) ir: Vec<f32>,
+    /// Mean temperature of the air, C.
+    pub(crate) celsius: f64,
+}
 
 /// Values of each pair of Flat.
 pub(crate) type FlatPairs = HashMap<u32, FlatPair>;
@@ -19,6 +27,8 @@ pub(crate) struct FlatPair {
     pub(crate) energies: FlatEnergies,
     /// `[bands]`.
     pub(crate) sensitivities: Vec<EnergySensitivity>,
+    /// Temperature of the air, C.
+    pub(crate) celsius: f64,
 }
 
 /// Returns the derivation plan for a rig's responses.
@@ -32,12 +42,25 @@ pub(crate) fn residual_fit(rig: &Rig) -> std::result::Result<ResidualFit<f32>, e
     ResidualFit::new(rig.impulse_response.length, rig.sweep.rate_hz.get(), range_hz)
 }
 
+/// Returns the change of a rig's energies with the air's temperature, from the power spectrum of what Flat reflects.
+pub(crate) fn temperature_response(
+    rig: &Rig,
+    power: &[f64],
+) -> std::result::Result<TemperatureResponse, echolake_dsp::Error> {
+    let (response, sweep) = (&rig.impulse_response, &rig.sweep);
+    let range_hz = [sweep.low_hz, sweep.high_hz];
+    let celsius = response.reference_temperature_c.get();
+    TemperatureResponse::new(power, response.length, sweep.rate_hz.get(), range_hz, celsius)
+}
+
 /// A run's impulse responses.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct RunResponses {
     pub(crate) pairs: Vec<u32>,
     /// `[pairs x length]`.
     pub(crate) irs: Vec<f32>,
+    /// `[pairs]`: temperature of the air, C.
+    pub(crate) celsius: Vec<f64>,
 }
 
 /// Values derived from some of a run's measurements.
@@ -99,13 +122,21 @@ impl DerivedRows {
         self.unbiased.extend(energies.iter().map(|energy| energy / flat.total));
     }
 
-    /// Appends the errors of one measurement from its sensitivities and Flat's.
-    pub(crate) fn push_errors(&mut self, levels: &LevelUncertainty, of: &[EnergySensitivity], flat: &FlatPair) {
+    /// Appends the errors of one measurement, in air of a temperature in C, from its sensitivities and Flat's.
+    pub(crate) fn push_errors(
+        &mut self,
+        levels: &LevelUncertainty,
+        of: &[EnergySensitivity],
+        flat: &FlatPair,
+        celsius: f64,
+    ) {
+        let warmer = celsius - flat.celsius;
         let (total, flat_total) = (EnergySensitivity::total(of), EnergySensitivity::total(&flat.sensitivities));
         let over_total = || of.iter().chain([&total]);
-        self.errors.extend(over_total().map(|of| levels.relative_error(of, &flat_total)));
-        self.uncertainties.extend(over_total().map(|of| levels.level_db(of, &flat_total)));
-        self.uncertainties.extend(of.iter().zip(&flat.sensitivities).map(|(of, flat)| levels.level_db(of, flat)));
+        self.errors.extend(over_total().map(|of| levels.relative_error(of, &flat_total, warmer)));
+        self.uncertainties.extend(over_total().map(|of| levels.level_db(of, &flat_total, warmer)));
+        self.uncertainties
+            .extend(of.iter().zip(&flat.sensitivities).map(|(of, flat)| levels.level_db(of, flat, warmer)));
     }
 
     /// Moves out the responses and curves, which are empty afterwards.

@@ -290,6 +290,7 @@ impl RunContent {
         RunResponses {
             pairs: self.accepted.iter().map(|(m, _)| m.pair_id).collect(),
             irs: self.accepted.iter().flat_map(|(_, r)| r.ir.iter().copied()).collect(),
+            celsius: self.accepted.iter().map(|(_, r)| r.temperature_c).collect(),
         }
     }
 }

@@ -2,7 +2,7 @@
 
 use arrow::array::{Array as _, AsArray as _};
 use arrow::compute::concat_batches;
-use arrow::datatypes::{Float32Type, Int32Type};
+use arrow::datatypes::{Float32Type, Float64Type, Int32Type};
 use arrow::record_batch::RecordBatch;
 use echolake_lake::{DataFile, Lake, LakeSnapshot, add_missing_columns, reader_metadata, wanted_schema};
 use echolake_schema::RunId;
@@ -23,6 +23,8 @@ pub(crate) async fn responses(lake: &Lake, snapshot: &LakeSnapshot, run: &RunId)
         for batch in responses_in(lake, &file, run).await? {
             let lost = |what: &str| Error::DataFile { file: file.path.to_string(), reason: format!("no `{what}`") };
             let pairs = batch.column_by_name("pair_id").ok_or_else(|| lost("pair_id"))?.as_primitive::<Int32Type>();
+            let celsius = batch.column_by_name("temperature_c").ok_or_else(|| lost("temperature_c"))?;
+            out.celsius.extend(celsius.as_primitive::<Float64Type>().values());
             let irs = batch.column_by_name("ir").ok_or_else(|| lost("ir"))?.as_list::<i32>();
             let (from, to) = (irs.value_offsets()[0] as usize, irs.value_offsets()[irs.len()] as usize);
             out.pairs.extend(pairs.values().iter().map(|p| *p as u32));
@@ -38,7 +40,7 @@ pub(crate) async fn responses(lake: &Lake, snapshot: &LakeSnapshot, run: &RunId)
 
 // A file of this run alone is read and checked as a whole; of a merged file only the run's pages are read.
 async fn responses_in(lake: &Lake, file: &DataFile, run: &RunId) -> Result<Vec<RecordBatch>> {
-    let columns = ["pair_id", "ir"];
+    let columns = ["pair_id", "temperature_c", "ir"];
     let place = file.visible_parts().find(|(part, _)| part.run == *run).map(|(_, rows)| rows);
     match place {
         Some(rows) => Ok(lake.rows(Table::Measurements, file, &columns, rows).await?.try_collect().await?),

@@ -6,7 +6,7 @@ use std::sync::Arc;
 use echolake_dsp::foam_reflection::FoamReflectionFit;
 use echolake_dsp::geometry::{direct_mm, image_mm};
 use echolake_dsp::temperature::speed_of_sound;
-use echolake_dsp::uncertainty::{DirectSoundResidual, EnergySensitivity};
+use echolake_dsp::uncertainty::{DirectSoundResidual, EnergySensitivity, TemperatureResponse};
 use echolake_lake::{DataFile, DirectSound, FileName, Lake, LakeSnapshot, ReferenceSurfaces};
 use echolake_schema::tables::Table;
 use echolake_schema::{PairId, SurfaceId, SurfaceRecord};
@@ -14,12 +14,14 @@ use sha2::{Digest as _, Sha256};
 use tokio::sync::Mutex;
 
 use crate::CODE_VERSION;
-use crate::derived_values::{FlatPair, FlatPairs, MeanResponses, derivation_plan, residual_fit};
+use crate::derived_values::{
+    FlatPair, FlatPairs, MeanResponse, MeanResponses, derivation_plan, residual_fit, temperature_response,
+};
 use crate::error::{Error, Result};
 use crate::read_back;
 
 /// Revision of the rows that follow from references: those of another one are derived anew.
-const ROWS_REVISION: &str = "3";
+const ROWS_REVISION: &str = "4";
 /// Number of hex digits of a digest in a version.
 const VERSION_DIGITS: usize = 12;
 
@@ -43,6 +45,8 @@ pub(crate) struct ReferenceResponses {
     flat: Arc<FlatPairs>,
     /// Residual of Flat; None if it cannot be measured.
     pub(crate) flat_residual: Option<DirectSoundResidual>,
+    /// Change of energies with the temperature of the air.
+    pub(crate) air: Arc<TemperatureResponse>,
 }
 
 /// References as the lake subtracts them, and those without Foam's reflection.
@@ -162,18 +166,22 @@ impl ReferenceFinder {
         if let Some(known) = self.means.get(&key) {
             return Ok(known.clone());
         }
-        let mut sums: HashMap<u32, (u32, Vec<f64>)> = HashMap::new();
+        // Number of responses, the sum of their temperatures, and that of their samples.
+        let mut sums: HashMap<u32, (u32, f64, Vec<f64>)> = HashMap::new();
         for run in self.snapshot.runs().filter(|r| r.surface == of.surface) {
             let responses = read_back::responses(&self.lake, &self.snapshot, &run.run).await?;
             let length = self.lake.rig().impulse_response.length;
-            for (pair, ir) in responses.pairs.iter().zip(responses.irs.chunks_exact(length)) {
-                let (count, sum) = sums.entry(*pair).or_insert_with(|| (0, vec![0.0; length]));
+            let measured = responses.pairs.iter().zip(&responses.celsius).zip(responses.irs.chunks_exact(length));
+            for ((pair, celsius), ir) in measured {
+                let (count, warmth, sum) = sums.entry(*pair).or_insert_with(|| (0, 0.0, vec![0.0; length]));
                 *count += 1;
+                *warmth += celsius;
                 sum.iter_mut().zip(ir).for_each(|(s, x)| *s += f64::from(*x));
             }
         }
-        let mean = |(pair, (count, sum)): (u32, (u32, Vec<f64>))| {
-            (pair, sum.into_iter().map(|s| (s / f64::from(count)) as f32).collect())
+        let mean = |(pair, (count, warmth, sum)): (u32, (u32, f64, Vec<f64>))| {
+            let ir = sum.into_iter().map(|s| (s / f64::from(count)) as f32).collect();
+            (pair, MeanResponse { ir, celsius: warmth / f64::from(count) })
         };
         let means: Arc<MeanResponses> = Arc::new(sums.into_iter().map(mean).collect());
         self.means.insert(key, means.clone());
@@ -206,27 +214,41 @@ fn names(file: &DataFile, references: &ReferenceSurfaces) -> Option<(SurfaceId, 
 impl ReferenceResponses {
     // `direct` is subtracted from a surface's responses, `flat_direct` from Flat's.
     fn new(lake: &Lake, direct: Arc<MeanResponses>, flat: &MeanResponses, flat_direct: &MeanResponses) -> Result<Self> {
-        let plan = derivation_plan(lake.rig()).map_err(failed)?;
+        let rig = lake.rig();
+        let plan = derivation_plan(rig).map_err(failed)?;
         let mut scratch = plan.scratch();
-        let mut residual = residual_fit(lake.rig()).map_err(failed)?;
+        let length = rig.impulse_response.length;
+        let mut power = vec![0.0; length / 2 + 1];
+        let reflected: Vec<_> = sorted(flat)
+            .into_iter()
+            .filter_map(|(pair, flat)| {
+                let direct = flat_direct.get(&pair)?;
+                let reflected: Vec<f32> = flat.ir.iter().zip(&direct.ir).map(|(a, b)| a - b).collect();
+                Some((pair, reflected, direct, flat.celsius))
+            })
+            .collect();
+        for (_, reflected, ..) in &reflected {
+            plan.add_power(reflected, &mut power, &mut scratch).map_err(failed)?;
+        }
+        let air = temperature_response(rig, &power).map_err(failed)?;
+        let mut residual = residual_fit(rig).map_err(failed)?;
         let mut pairs = FlatPairs::with_capacity(flat.len());
-        for (pair, ir) in sorted(flat) {
-            let Some(direct) = flat_direct.get(&pair) else { continue };
-            let reflected: Vec<f32> = ir.iter().zip(direct).map(|(a, b)| a - b).collect();
+        for (pair, reflected, direct, celsius) in reflected {
             let energies = plan.flat_energies(&reflected, &mut scratch).map_err(failed)?;
             let mut sensitivities = vec![EnergySensitivity::default(); energies.bands.len()];
-            plan.sensitivities(&reflected, direct, &mut sensitivities, &mut scratch).map_err(failed)?;
+            // Flat's air is what temperatures are told from.
+            plan.sensitivities(&reflected, &direct.ir, |_| 0.0, &mut sensitivities, &mut scratch).map_err(failed)?;
             if let Some([direct_secs, reflected_secs]) = arrivals(lake, pair) {
-                residual.add(&reflected, direct, direct_secs, reflected_secs).map_err(failed)?;
+                residual.add(&reflected, &direct.ir, direct_secs, reflected_secs).map_err(failed)?;
             }
-            pairs.insert(pair, FlatPair { energies, sensitivities });
+            pairs.insert(pair, FlatPair { energies, sensitivities, celsius });
         }
-        Ok(Self { direct, flat: Arc::new(pairs), flat_residual: residual.finish() })
+        Ok(Self { direct, flat: Arc::new(pairs), flat_residual: residual.finish(), air: Arc::new(air) })
     }
 
     /// Returns the direct sound of a pair and its values of Flat, if the references have the pair.
     pub(crate) fn of_pair(&self, pair: u32) -> Option<(&[f32], &FlatPair)> {
-        Some((self.direct.get(&pair)?.as_slice(), self.flat.get(&pair)?))
+        Some((self.direct.get(&pair)?.ir.as_slice(), self.flat.get(&pair)?))
     }
 }
 
@@ -243,8 +265,8 @@ pub(crate) fn arrivals(lake: &Lake, pair: u32) -> Option<[f64; 2]> {
 }
 
 // In one order, so that sums are the same in every process.
-fn sorted(means: &MeanResponses) -> Vec<(u32, &Vec<f32>)> {
-    let mut pairs: Vec<_> = means.iter().map(|(pair, ir)| (*pair, ir)).collect();
+fn sorted(means: &MeanResponses) -> Vec<(u32, &MeanResponse)> {
+    let mut pairs: Vec<_> = means.iter().map(|(pair, mean)| (*pair, mean)).collect();
     pairs.sort_unstable_by_key(|(pair, _)| *pair);
     pairs
 }
@@ -266,16 +288,16 @@ fn estimated(
         let (Some(foam), Some([direct_secs, reflected_secs])) = (flat_foam.get(&pair), arrivals(lake, pair)) else {
             continue;
         };
-        fit.add(foam, flat, direct_secs, reflected_secs).map_err(failed)?;
+        fit.add(&foam.ir, &flat.ir, direct_secs, reflected_secs).map_err(failed)?;
     }
     let Some(reflection) = fit.finish() else { return Ok(None) };
     let direct_sound = |foam: &MeanResponses| -> Result<MeanResponses> {
         let mut direct = MeanResponses::with_capacity(foam.len());
         for (pair, foam) in foam {
             let Some(flat) = flat.get(pair) else { continue };
-            let mut without = vec![0.0; foam.len()];
-            reflection.direct_sound(foam, flat, &mut without).map_err(failed)?;
-            direct.insert(*pair, without);
+            let mut ir = vec![0.0; foam.ir.len()];
+            reflection.direct_sound(&foam.ir, &flat.ir, &mut ir).map_err(failed)?;
+            direct.insert(*pair, MeanResponse { ir, celsius: foam.celsius });
         }
         Ok(direct)
     };

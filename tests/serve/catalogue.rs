@@ -30,7 +30,7 @@ fn filled(template: &str, surface: &str, run: &str, file: &str) -> String {
         [("{surface_id}", surface), ("{run_id}", run), ("{pair_id}", "7"), ("{table}", "points"), ("{file}", file)];
     let path = parts.into_iter().fold(template.to_owned(), |path, (name, value)| path.replace(name, value));
     match path.rsplit('/').next() {
-        Some("grid") => format!("{path}?microphone=0"),
+        Some("grid" | "grid.svg") => format!("{path}?microphone=0"),
         Some("slices.mcap" | "manifest") => format!("{path}?where=pair_id%3C5"),
         _ => path,
     }

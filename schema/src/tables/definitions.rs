@@ -107,7 +107,7 @@ fn surfaces(bands: &[String]) -> Vec<Column> {
     ]);
     columns.extend(bands.iter().map(|band| {
         let comment = "Phase, rad, of the relief's details narrower than a wavelength, root mean square; over 0.18 \
-                       simulated levels of single pairs are off by more than 1 dB";
+                       simulated levels of single pairs are off by about 1 dB and more";
         Column::float(format!("detail_phase_{band}"), "1", format!("{comment}, band at {band} Hz")).or_null()
     }));
     columns.extend([Column::text("origin", ORIGINS), code_version()]);
