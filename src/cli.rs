@@ -8,6 +8,8 @@ use clap::{CommandFactory as _, Parser, Subcommand};
 use crate::CommandOutcome;
 use crate::commands::acquire::{self, AcquireArgs};
 #[cfg(feature = "lake")]
+use crate::commands::campaign::{self, CampaignSubcommand};
+#[cfg(feature = "lake")]
 use crate::commands::demo::{self, DemoArgs};
 use crate::commands::doctor::{self, DoctorArgs};
 #[cfg(feature = "lake")]
@@ -81,6 +83,9 @@ pub(crate) enum CliCommand {
 pub(crate) enum LakeCommand {
     /// Measure a few surfaces with the simulated rig, ingest them, print the paper's tables and serve the catalogue.
     Demo(DemoArgs),
+    /// Measure the surfaces of a file with the simulated rig, and print the paper's tables beside what was expected.
+    #[command(subcommand)]
+    Campaign(CampaignSubcommand),
     /// Turn existing measurements into runs.
     #[command(subcommand)]
     Import(ImportCommand),
@@ -152,6 +157,7 @@ impl LakeCommand {
     async fn run(&self, lake: &str) -> anyhow::Result<CommandOutcome> {
         match self {
             Self::Demo(args) => demo::run(args, lake).await,
+            Self::Campaign(command) => campaign::run(command, lake).await,
             Self::Import(args) => import::run(args, lake).await,
             Self::Ingest(args) => ingest::run(args, lake).await,
             Self::Sql(args) => sql::run(args, lake).await.map(|()| CommandOutcome::Whole),

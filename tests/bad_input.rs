@@ -124,9 +124,11 @@ fn panels_and_groups_that_cannot_be_made() {
     place.fails(1, &["panel", "marble", "-o", "x.stl"], "no relief; hint: flat");
     place.fails(
         1,
-        &["panel", "stretcher_bond", "--set", "joint_depth_mm=50", "-o", "x.stl"],
-        "expected 0 to 40 mm full",
+        &["panel", "stretcher_bond", "--set", "joint_depth_mm=90", "-o", "x.stl"],
+        "expected 0 to 80 mm full",
     );
+    let deep = ["--set", "macrostructure=concave", "--set", "macro_depth_mm=400", "-o", "x.stl"];
+    place.fails(1, &[&["panel", "stretcher_bond"][..], &deep].concat(), "macro_depth_mm=400, joint_depth_mm=10");
     place.fails(1, &["panel", "river_rock", "-o", "x.stl", "-o", "x.step"], "no mesh file that is known");
     assert!(!place.path("x.stl").exists(), "nothing is written where something is refused");
     place.fails(2, &["panel", "river_rock"], "--output");

@@ -131,17 +131,21 @@ fn a_gir_folder_becomes_runs_with_references_of_their_own() {
     write("mean_foam_1", 0.0, 45, 400);
     write("panel_0016_r180_0", 0.25, 45, 400);
     let info = "panel id,flat reference,foam reference,macrostructure reference,mesostructure reference,sand type,binder type\n\
-                panel_0016_r180_0,mean_flat_rfl_1,mean_foam_1,flat,Primitives,GS14,Furan\n\
+                panel_0016_r180_0,mean_flat_rfl_1,mean_foam_1,mean_flat_rfl_1,Primitives,GS14,Furan\n\
                 mean_flat_rfl_1,mean_flat_rfl_1,mean_foam_1,flat,Baseline_mean,GS14,Furan\n";
     std::fs::write(folder.join("panel_info.csv"), info).expect("written");
     place.ok(&["import", "gir", "gir", "--rig", "rig.toml"]);
     place.ok(&["ingest"]);
-    let query = "select panel, side, flat_reference from surfaces where surface_id = 'panel_0016_r180_0'";
+    let query =
+        "select panel, side, flat_reference, macro_reference from surfaces where surface_id = 'panel_0016_r180_0'";
     let row = &place.sql(query)[0];
     assert_eq!(
         (&row["panel"], &row["side"], &row["flat_reference"]),
         (&"0016".into(), &0.into(), &"mean_flat_rfl_1".into())
     );
+    assert_eq!(row["macro_reference"], "mean_flat_rfl_1");
+    // Of what has no run nothing can be the difference.
+    assert_eq!(place.number("select count(*) from surfaces where macro_reference is not null"), 1.0);
     // Half of Flat's amplitude is a quarter of its energy.
     let total = place.number("select avg(tnce_total) from tnce where surface_id = 'panel_0016_r180_0'");
     assert!((total - 0.25).abs() < 1e-4, "{total}");

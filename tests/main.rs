@@ -3,6 +3,7 @@
 
 mod acquire_kills;
 mod bad_input;
+mod campaign;
 mod child;
 mod end_to_end;
 mod figure;

@@ -10,8 +10,9 @@ fn a_twin_is_computed_once_labelled_and_near_to_its_surface() {
     }
     place.ok(&["ingest"]);
     // Levels have uncertainties, but Flat over itself has none.
-    let uncertain =
-        |surface: &str| place.number(&format!("select max(tnce_band_10000_u_db) from tnce where surface_id = '{surface}'"));
+    let uncertain = |surface: &str| {
+        place.number(&format!("select max(tnce_band_10000_u_db) from tnce where surface_id = '{surface}'"))
+    };
     assert!((1e-4..1.0).contains(&uncertain("stretcher_bond")), "{}", uncertain("stretcher_bond"));
     assert!(uncertain("flat") < 1e-4, "{}", uncertain("flat"));
 

@@ -10,7 +10,6 @@ mod cancels;
 #[path = "../../tests/child.rs"]
 mod child;
 mod engine_kills;
-mod experiments;
 mod flips;
 #[path = "../../tests/forgetful.rs"]
 mod forgetful;
@@ -94,8 +93,6 @@ enum CampaignCommand {
     Slices(slices::SlicesArgs),
     /// Measure SQL's list functions beside plain loops.
     FunctionsBench,
-    /// Repeat the paper's three experiments on simulated panels.
-    Experiments(experiments::ExperimentsArgs),
     /// Compare orders in which the arms visit the grid, and show what they cannot reach.
     Motion(motion::MotionArgs),
 }
@@ -117,7 +114,6 @@ fn main() -> Result<()> {
         CampaignCommand::Readers(args) => readers::run(&args),
         CampaignCommand::Slices(args) => slices::run(&args),
         CampaignCommand::FunctionsBench => functions_bench::run(),
-        CampaignCommand::Experiments(args) => experiments::run(&args),
         CampaignCommand::Motion(args) => motion::run(&args),
     }
 }

@@ -107,6 +107,8 @@ pub struct SurfaceRecord {
     pub flat_reference: Option<SurfaceId>,
     /// The surface whose direct sound is subtracted from this one; if none is given, the lake chooses.
     pub foam_reference: Option<SurfaceId>,
+    /// The surface that has its large shape and nothing on it, if there is one.
+    pub macro_reference: Option<SurfaceId>,
     /// Parameters of the relief's generator.
     pub parameters: serde_json::Value,
     /// Facts about the producer's own mesh file.

@@ -33,7 +33,7 @@ pub(crate) struct AcquireArgs {
     #[arg(long, required_unless_present = "resume")]
     pub(crate) surface: Option<SurfaceId>,
     /// Go on with a run that was stopped or cut off: its `.mcap.partial`. What is safe in it is not measured again.
-    #[arg(long, value_name = "FILE", conflicts_with_all = ["surface", "panel", "parameters", "set", "mesh", "side", "rig", "flat", "foam", "seed", "ir_only"])]
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["surface", "panel", "parameters", "set", "mesh", "side", "rig", "flat", "foam", "macro_reference", "seed", "ir_only"])]
     pub(crate) resume: Option<PathBuf>,
     /// Relief for the simulated rig, by a name of `echolake panel --list`; by default the one that the surface's name
     /// begins with.
@@ -60,6 +60,10 @@ pub(crate) struct AcquireArgs {
     /// Surface whose direct sound is subtracted from this one, where it is not the lake's.
     #[arg(long)]
     pub(crate) foam: Option<SurfaceId>,
+    /// Surface that has the large shape of this one and nothing on it; by default that of the paper's panel, where it is
+    /// one.
+    #[arg(long, value_name = "NAME")]
+    pub(crate) macro_reference: Option<SurfaceId>,
     /// Seed of the simulation.
     #[arg(long, default_value_t = 1)]
     pub(crate) seed: u64,
@@ -108,6 +112,7 @@ struct NewRun {
     folder: PathBuf,
     flat: Option<SurfaceId>,
     foam: Option<SurfaceId>,
+    macro_reference: Option<SurfaceId>,
     start: Timestamp,
     seed: u64,
     tag: u64,
@@ -213,6 +218,7 @@ async fn fresh(args: &AcquireArgs, lake_url: &str, progress: &CommandProgress) -
         folder,
         flat: args.flat.clone(),
         foam: args.foam.clone(),
+        macro_reference: specimen::macro_reference(args)?,
         start: Timestamp::now(),
         seed: args.seed,
         tag: random_tag(),
@@ -298,6 +304,7 @@ impl NewRun {
             specimen: &self.specimen,
             flat: self.flat.clone(),
             foam: self.foam.clone(),
+            macro_reference: self.macro_reference.clone(),
             start: self.start,
             seed: self.seed,
             tag: self.tag,

@@ -1,29 +1,26 @@
 //! `echolake demo`: the main job end to end, on the simulated rig: measure, record, ingest, query, browse.
 
-mod measure;
-
 use std::path::Path;
 use std::time::Instant;
 
 use echolake_acquisition::panel::collection::{CollectionSurface, collection};
-use echolake_acquisition::panel::relief::PanelRelief;
 use echolake_acquisition::run::controller::RecordingMode;
 use echolake_ingest::pending;
 use echolake_lake::{Lake, ReferenceSurfaces};
 use echolake_query::Session;
 use echolake_schema::Rig;
 
+use super::simulated_runs::{PlannedRun, SimulationPlan, start_time};
 use crate::CommandOutcome;
 use crate::progress::CommandProgress;
-use crate::signals::StopRequest;
 use clap::Args;
 use echolake_acquisition::panel::collection::LARGEST;
-use measure::DemoCampaign;
 use std::path::PathBuf;
 
 #[derive(Debug, Args)]
 pub(crate) struct DemoArgs {
-    /// Measure this many surfaces instead: the references, then panels of every typology with random parameters.
+    /// Measure this many surfaces instead: the references, then panels of every typology with random parameters, two brick
+    /// walls for each of stone as the paper has, and the paper's own under their names.
     /// Those that are measured already are not measured again.
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=LARGEST as i64))]
     pub(crate) surfaces: Option<u32>,
@@ -62,24 +59,30 @@ pub(crate) async fn run(args: &DemoArgs, lake_url: &str) -> anyhow::Result<Comma
     let lake = Lake::open_or_create(lake_url, &rig, &ReferenceSurfaces::default()).await?;
     let progress = CommandProgress::new();
     progress.say("simulated rig: nothing here is measured");
-    let campaign = DemoCampaign {
+    let planned = |(number, member)| PlannedRun {
+        member,
+        flat: None,
+        foam: None,
+        start: start_time(args.seed, number),
+        seed: args.seed.wrapping_mul(1_000).wrapping_add(number as u64),
+    };
+    let simulation = SimulationPlan {
         rig,
-        surfaces,
+        runs: surfaces.into_iter().enumerate().map(planned).collect(),
         keep: if args.ir_only { RecordingMode::ResponsesOnly } else { RecordingMode::Sweeps },
-        seed: args.seed,
         folder: super::inbox(&lake)?,
         known: lake.snapshot().await?.runs().map(|r| r.run.untagged().to_owned()).collect(),
     };
     let measuring = stop.clone();
-    tokio::task::spawn_blocking(move || campaign.measure(measuring.flag(), &progress)).await??;
-    ensure_wanted(&stop)?;
+    tokio::task::spawn_blocking(move || simulation.measure(measuring.flag(), &progress)).await??;
+    super::ensure_wanted(&stop)?;
     if args.no_ingest {
         eprintln!("the runs are in inbox/. Next:\n  {} {}ingest", program(), lake_flag(lake_url));
         return Ok(CommandOutcome::Whole);
     }
     let sources = pending(&lake).await?;
     super::ingest::take_in(&lake, sources, stop.flag(), &CommandProgress::new()).await?;
-    ensure_wanted(&stop)?;
+    super::ensure_wanted(&stop)?;
     let example = match args.surfaces {
         Some(_) => print_typologies(&lake).await?,
         None => print_tables(&lake).await?,
@@ -93,13 +96,8 @@ pub(crate) async fn run(args: &DemoArgs, lake_url: &str) -> anyhow::Result<Comma
     super::serve::catalogue(&lake, &stop).await
 }
 
-fn ensure_wanted(stop: &StopRequest) -> anyhow::Result<()> {
-    anyhow::ensure!(!stop.is_made(), "stopped; hint: the same command goes on where this one ended");
-    Ok(())
-}
-
 fn few_surfaces() -> anyhow::Result<Vec<CollectionSurface>> {
-    let member = |name: &&str| Ok(CollectionSurface { surface: name.parse()?, relief: PanelRelief::by_name(name)? });
+    let member = |name: &&str| Ok(CollectionSurface::by_relief_name(name.parse()?, name)?);
     SURFACES.iter().map(member).collect()
 }
 

@@ -2,6 +2,8 @@
 
 pub(crate) mod acquire;
 #[cfg(feature = "lake")]
+pub(crate) mod campaign;
+#[cfg(feature = "lake")]
 pub(crate) mod demo;
 pub(crate) mod doctor;
 #[cfg(feature = "lake")]
@@ -19,6 +21,8 @@ pub(crate) mod recover;
 pub(crate) mod replay;
 #[cfg(feature = "lake")]
 pub(crate) mod serve;
+#[cfg(feature = "lake")]
+mod simulated_runs;
 #[cfg(feature = "lake")]
 pub(crate) mod sql;
 #[cfg(feature = "lake")]
@@ -87,6 +91,13 @@ fn tell_access(viewers: &ViewerArgs, address: SocketAddr, progress: &CommandProg
     if viewers.open && !address.ip().is_loopback() {
         progress.say("warning: whoever reaches this address can look on");
     }
+}
+
+/// Fails if the command was asked to stop.
+#[cfg(feature = "lake")]
+fn ensure_wanted(stop: &StopRequest) -> anyhow::Result<()> {
+    anyhow::ensure!(!stop.is_made(), "stopped; hint: the same command goes on where this one ended");
+    Ok(())
 }
 
 /// Listens for a request to stop work that ends at a clean place.

@@ -174,6 +174,7 @@ impl TwinComputation {
             specimen: &run.specimen,
             flat: Some(FLAT.parse()?),
             foam: Some(FOAM.parse()?),
+            macro_reference: None,
             start: COMPUTED_AT,
             seed: 0,
             tag: run.tag,

@@ -51,7 +51,8 @@ def check_sides(mesh, folder, name):
 
 def main(command, folder):
     reliefs = json.loads(panel(command, "--list", "--json"))
-    names = [r["relief"] for r in reliefs]
+    # Panels of the paper have their parameters' values, and are of these reliefs.
+    names = [r["relief"] for r in reliefs if "panel" not in r]
     for name, other in zip(names, names[1:] + names[:1]):
         files = [folder / f"{name}{extension}" for extension in (".stl", ".npy", ".json")]
         panel(command, name, "--back", other, *(x for file in files for x in ("-o", str(file))))

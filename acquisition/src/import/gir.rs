@@ -4,7 +4,7 @@
 #[cfg(test)]
 mod tests;
 
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet};
 use std::fs::File;
 use std::path::{Path, PathBuf};
 
@@ -232,9 +232,15 @@ fn panel_info(path: &Path) -> Result<HashMap<SurfaceId, SurfaceRecord>, Error> {
             material: some(&[c[5].as_str(), c[6].as_str()].join("; ")),
             flat_reference: Some(id(&c[1])?),
             foam_reference: Some(id(&c[2])?),
+            macro_reference: c[3].parse().ok().filter(|_| c[3] != c[0]),
             ..SurfaceRecord::default()
         };
         info.insert(id(&c[0])?, record);
+    }
+    // The column may describe the large shape instead of naming the panel that has it.
+    let known: HashSet<SurfaceId> = info.keys().cloned().collect();
+    for record in info.values_mut() {
+        record.macro_reference = record.macro_reference.take().filter(|reference| known.contains(reference));
     }
     Ok(info)
 }

@@ -1,8 +1,10 @@
-//! A simulated collection of panels of any size: the references, then both sides of panel after panel.
+//! A simulated collection of panels of any size: the references, then both sides of panel after panel. Those that have a
+//! name of the paper's are the paper's.
 
 use echolake_schema::{Error, SurfaceId};
 
-use crate::panel::relief::PanelRelief;
+use crate::panel::paper_panel::PaperPanel;
+use crate::panel::relief::{self, PanelRelief};
 
 /// The references, which are measured first.
 const REFERENCES: [(&str, PanelRelief); 3] =
@@ -17,6 +19,28 @@ pub struct CollectionSurface {
     pub surface: SurfaceId,
     /// Its geometry and material.
     pub relief: PanelRelief,
+    /// The surface that has its large shape alone.
+    pub macro_reference: Option<SurfaceId>,
+}
+
+impl CollectionSurface {
+    /// Makes a surface of the relief or the paper's panel of this name.
+    ///
+    /// # Errors
+    /// [`relief::Error::Name`] if there is none.
+    pub fn by_relief_name(surface: SurfaceId, relief: &str) -> Result<Self, relief::Error> {
+        let reference = PaperPanel::by_name(relief).and_then(|panel| panel.macro_reference);
+        let macro_reference = reference.and_then(|name| name.parse().ok());
+        Ok(Self { surface, relief: PanelRelief::by_name(relief)?, macro_reference })
+    }
+
+    // A panel of the paper if it has the name of one.
+    fn new(name: &str, relief: PanelRelief) -> Result<Self, Error> {
+        let paper = PaperPanel::by_name(name);
+        let relief = paper.and_then(|panel| panel.to_relief().ok()).unwrap_or(relief);
+        let macro_reference = paper.and_then(|panel| panel.macro_reference).map(str::parse).transpose()?;
+        Ok(Self { surface: name.parse()?, relief, macro_reference })
+    }
 }
 
 /// Returns the first `count` surfaces of the collection that `seed` names; a larger one begins with the smaller one.
@@ -31,7 +55,7 @@ pub fn collection(seed: u64, count: usize) -> Result<Vec<CollectionSurface>, Err
     let references = REFERENCES.map(|(name, relief)| (name.to_owned(), relief));
     let sides = (0u64..).map(|n| (format!("{:04}_{}", n / 2 + 1, n % 2), PanelRelief::drawn(seed, n)));
     let surfaces = references.into_iter().chain(sides).take(count);
-    surfaces.map(|(name, relief)| Ok(CollectionSurface { surface: name.parse()?, relief })).collect()
+    surfaces.map(|(name, relief)| CollectionSurface::new(&name, relief)).collect()
 }
 
 #[cfg(test)]
@@ -50,6 +74,15 @@ mod tests {
         assert_eq!((panel, side), ("0003", Some(1)));
         assert_eq!(collection(1, 4).expect("a collection"), ten[..4]);
         assert_ne!(collection(2, 10).expect("a collection"), ten);
+    }
+
+    #[test]
+    fn panels_of_the_paper_are_the_papers() {
+        let all = collection(3, 40).expect("a collection");
+        let of = |name: &str| all.iter().find(|m| m.surface.as_str() == name).expect(name);
+        assert_eq!(Ok(&of("0012_1").relief), PanelRelief::by_name("0012_1").as_ref());
+        assert_eq!(of("0012_1").macro_reference.as_ref().map(SurfaceId::as_str), Some("0015_1"));
+        assert_eq!(of("0012_0").macro_reference, None);
     }
 
     #[test]

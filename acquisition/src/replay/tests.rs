@@ -35,6 +35,7 @@ fn run(folder: &Path, surface: &str, hours: f64) -> PathBuf {
         specimen: &specimen,
         flat: None,
         foam: None,
+        macro_reference: None,
         start: Timestamp(START).plus_secs(hours * 3_600.0),
         seed: 1,
         tag: 1,

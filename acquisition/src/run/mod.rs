@@ -47,6 +47,8 @@ pub struct RunRequest<'a> {
     pub flat: Option<SurfaceId>,
     /// The surface whose direct sound is subtracted from it, if it is not the lake's.
     pub foam: Option<SurfaceId>,
+    /// The surface that has its large shape and nothing on it.
+    pub macro_reference: Option<SurfaceId>,
     /// Time of its begin.
     pub start: Timestamp,
     /// Seed of room and noise of simulated devices.
@@ -119,6 +121,7 @@ impl RunRequest<'_> {
         let mut surface = panel.record.clone();
         surface.flat_reference = self.flat.clone();
         surface.foam_reference = self.foam.clone();
+        surface.macro_reference = self.macro_reference.clone();
         let relief = RecordedRelief { heights: &panel.heights, mesh: &panel.mesh, original: panel.original() };
         let start = RunStart { manifest: &manifest, rig: self.rig, surface: &surface, relief: Some(relief), plan };
         let none = BTreeMap::new();

@@ -88,16 +88,18 @@ pub(super) async fn describe(
     let mut info = csv::Writer::from_writer(Vec::new());
     let failed = |e: csv::Error| Error::write(&folder.named("panel_info.csv"), e);
     info.write_record(GIR_PANEL_INFO).map_err(failed)?;
-    let columns = ["surface_id", "typology", "macrostructure", "material", "flat_reference", "foam_reference"];
+    let columns =
+        ["surface_id", "typology", "macrostructure", "material", "flat_reference", "foam_reference", "macro_reference"];
     for run in runs {
         let batch = rows::of_run(lake, snapshot, Table::Surfaces, &run.run, &columns).await?;
         let text = |column| rows::texts(&batch, column).first().copied().unwrap_or_default();
+        let shape = rows::optional_texts(&batch, "macro_reference").first().copied().flatten();
         let (sand, binder) = text("material").split_once("; ").unwrap_or((text("material"), ""));
         let row = [
             run.surface.as_str(),
             text("flat_reference"),
             text("foam_reference"),
-            text("macrostructure"),
+            shape.unwrap_or_else(|| text("macrostructure")),
             text("typology"),
             sand,
             binder,

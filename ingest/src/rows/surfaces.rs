@@ -7,7 +7,7 @@ use echolake_dsp::height_field::HeightField;
 use echolake_dsp::temperature::speed_of_sound;
 use echolake_lake::ReferenceSurfaces;
 use echolake_schema::tables::Table;
-use echolake_schema::{Rig, SurfaceRecord};
+use echolake_schema::{Rig, SurfaceId, SurfaceRecord};
 
 use super::RunKeys;
 use crate::error::Result;
@@ -43,6 +43,7 @@ pub(crate) fn row(
         .doubles("reflection_factor", [surface.reflection_factor])
         .text("flat_reference", flat.as_str())
         .text("foam_reference", foam.as_str())
+        .text("macro_reference", surface.macro_reference.as_ref().map(SurfaceId::as_str))
         .texts("parameters", [surface.parameters.to_string()])
         .text("mesh_file", mesh.map(|m| m.file.as_str()))
         .longs("mesh_triangles", [mesh.map(|m| m.triangles as i64)])

@@ -31,7 +31,7 @@ pub(super) fn sql(rig: &Rig) -> String {
     format!(
         "SELECT s.surface_id, s.panel, s.side, s.typology, s.macrostructure, s.mesostructure, s.microstructure, \
          s.material, s.reflection_factor, s.parameters, s.relief_min_mm, s.relief_max_mm, s.relief_rms_mm, \
-         s.mesh_triangles, s.flat_reference, s.foam_reference, s.origin, \
+         s.mesh_triangles, s.flat_reference, s.foam_reference, s.macro_reference, s.origin, \
          a.runs, a.all_measurements, a.first_started, a.last_ended, \
          r.run_id, r.state, r.missing, r.started, r.ended, r.measurements, r.rejected, r.attempts, r.damaged, \
          r.temperature_min_c, r.temperature_max_c, r.file, r.file_bytes, r.flat_version, r.foam_version, {levels} \

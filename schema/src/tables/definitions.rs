@@ -97,6 +97,7 @@ fn surfaces(bands: &[String]) -> Vec<Column> {
             .or_null(),
         Column::text("flat_reference", "Surface that normalises this one"),
         Column::text("foam_reference", "Surface whose direct sound is subtracted from this one"),
+        Column::text("macro_reference", "Surface that has the large shape of this one and nothing on it").or_null(),
         Column::text("parameters", "Parameters of the relief's generator, JSON"),
         Column::text("mesh_file", "Attachment of the run's file that holds the producer's mesh").or_null(),
         Column::long("mesh_triangles", "1", "Triangles of the mesh").or_null(),

@@ -4,6 +4,7 @@ use std::path::Path;
 
 use anyhow::Context as _;
 use echolake_acquisition::panel::mesh::PanelSide;
+use echolake_acquisition::panel::paper_panel::PaperPanel;
 use echolake_acquisition::panel::relief::PanelRelief;
 use echolake_acquisition::run::PanelSpecimen;
 use echolake_schema::SurfaceId;
@@ -26,6 +27,16 @@ pub(super) fn of(args: &AcquireArgs) -> anyhow::Result<PanelSpecimen> {
         }
         (None, None) => PanelSpecimen::Relief(relief(args.panel.as_deref(), surface, &args.set)?),
     })
+}
+
+/// The surface with the specimen's large shape alone: the one that is named, else that of the paper's panel.
+pub(super) fn macro_reference(args: &AcquireArgs) -> anyhow::Result<Option<SurfaceId>> {
+    if args.macro_reference.is_some() || args.mesh.is_some() || args.parameters.is_some() {
+        return Ok(args.macro_reference.clone());
+    }
+    let name = args.panel.as_deref().or(args.surface.as_ref().map(SurfaceId::as_str));
+    let reference = name.and_then(PaperPanel::by_name).and_then(|panel| panel.macro_reference);
+    Ok(reference.map(str::parse).transpose()?)
 }
 
 /// The named relief, or the one that the surface's name begins with, with its parameters set.
@@ -54,6 +65,7 @@ pub(in crate::commands) fn set_all(relief: &mut PanelRelief, set: &[String]) -> 
             setting.split_once('=').with_context(|| format!("`--set {setting}` has no `=`; hint: --set key=value"))?;
         relief.set(key, value)?;
     }
+    relief.check_depth()?;
     Ok(())
 }
 

@@ -1,16 +1,22 @@
 //! `echolake panel --list`: the reliefs and their parameters.
 
-use echolake_acquisition::panel::relief::{PanelRelief, ParameterDomain, ReliefParameter};
+use echolake_acquisition::panel::paper_panel::PaperPanel;
+use echolake_acquisition::panel::relief::{Error, PanelRelief, ParameterDomain, ReliefParameter};
 
 use crate::CommandOutcome;
 
 pub(super) fn run(name: Option<&str>, json: bool) -> anyhow::Result<CommandOutcome> {
+    let panels: Vec<_> =
+        PaperPanel::ALL.into_iter().filter(|panel| name.is_none_or(|name| name == panel.name)).collect();
     let names: Vec<&str> = name.map_or_else(|| PanelRelief::NAMES.to_vec(), |name| vec![name]);
-    let reliefs = names.into_iter().map(PanelRelief::by_name).collect::<Result<Vec<_>, _>>()?;
+    let is_relief = |name: &&str| PaperPanel::by_name(name).is_none();
+    let reliefs = names.into_iter().filter(is_relief).map(PanelRelief::by_name).collect::<Result<Vec<_>, _>>()?;
     let text = if json {
-        serde_json::to_string_pretty(&reliefs.iter().map(json_of).collect::<Vec<_>>())?
+        let panels = panels.iter().map(json_of_panel).collect::<Result<Vec<_>, _>>()?;
+        serde_json::to_string_pretty(&reliefs.iter().map(json_of).chain(panels).collect::<Vec<_>>())?
     } else {
-        reliefs.iter().map(described).collect::<Vec<_>>().join("\n\n")
+        let panels = panels.iter().map(described_panel);
+        reliefs.iter().map(described).chain(panels).collect::<Vec<_>>().join("\n\n")
     };
     super::super::print(&text)?;
     Ok(CommandOutcome::Whole)
@@ -20,6 +26,22 @@ fn json_of(relief: &PanelRelief) -> serde_json::Value {
     serde_json::json!({
         "relief": relief.name(), "typology": relief.typology(), "parameters": relief.describe(),
     })
+}
+
+fn json_of_panel(panel: &PaperPanel) -> Result<serde_json::Value, Error> {
+    let PaperPanel { name, macro_reference, printed, assumed, .. } = panel;
+    let mut json = panel.to_relief()?.to_json();
+    json["panel"] = serde_json::json!({
+        "name": name, "macro_reference": macro_reference, "printed": printed, "assumed": assumed,
+    });
+    Ok(json)
+}
+
+fn described_panel(panel: &PaperPanel) -> String {
+    let PaperPanel { name, relief, settings, macro_reference, printed, assumed } = panel;
+    let settings = settings.iter().map(|(key, value)| format!("\n  {key} = {value}")).collect::<String>();
+    let reference = macro_reference.map(|name| format!("\n  large shape alone: {name}")).unwrap_or_default();
+    format!("{name} (panel of the paper: {relief})\n  printed: {printed}\n  assumed: {assumed}{reference}{settings}")
 }
 
 fn described(relief: &PanelRelief) -> String {

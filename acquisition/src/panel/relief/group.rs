@@ -167,6 +167,7 @@ impl GroupRanges {
                 relief.set(key, &range.value(key, &known, part, place[n])?)?;
             }
         }
+        drawn.iter().try_for_each(PanelRelief::check_depth)?;
         Ok(drawn)
     }
 
@@ -323,12 +324,12 @@ mod tests {
         let narrower = ranges.next(&results([-1.25, 0.0, 1.25])).expect("a step");
         assert_eq!(narrower.ranges.ranges["stone_length_mm"], ParameterRange::Numbers([440.0, 760.0]));
         assert!(narrower.reasons[0].contains("far apart") && narrower.reasons.len() == 4, "{:?}", narrower.reasons);
-        // Three steps meet the parameter's limits; results that are the same are no division by zero.
+        // Six steps meet the parameter's limits; results that are the same are no division by zero.
         let mut last = ranges;
-        for _ in 0..3 {
+        for _ in 0..6 {
             last = last.next(&results([1.0, 1.0, 1.0])).expect("a step").ranges;
         }
-        assert_eq!(last.ranges["joint_depth_mm"], ParameterRange::Numbers([0.0, 40.0]));
+        assert_eq!(last.ranges["joint_depth_mm"], ParameterRange::Numbers([0.0, 80.0]));
         assert_eq!(GroupRanges::from_toml(&last.to_toml()), Ok(last));
     }
 
@@ -338,7 +339,7 @@ mod tests {
             let error = GroupRanges::from_toml(&TEXT.replace(from, to)).expect_err(to).to_string();
             assert!(error.contains(expected), "{error}");
         };
-        check("[10.0, 20.0]", "[10.0, 50.0]", "range of `joint_depth_mm` is 10 to 50, expected 0 to 40");
+        check("[10.0, 20.0]", "[10.0, 90.0]", "range of `joint_depth_mm` is 10 to 90, expected 0 to 80");
         check("[10.0, 20.0]", "[20.0, 10.0]", "low below high");
         check("[10.0, 20.0]", "[nan, 20.0]", "range of `joint_depth_mm`");
         check("joint_depth_mm", "jiont_depth_mm", "no parameter `jiont_depth_mm`");

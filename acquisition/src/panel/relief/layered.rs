@@ -1,19 +1,23 @@
 //! Walls in three layers, as the paper makes its panels: any large shape, with any stones, with any joints and skin.
 //!
-//! Parameters are full-scale: the panel is a tenth of the wall. Every parameter's range is such that all of them at
-//! their greatest still fit the relief's 40 mm, so that each combination can be made.
+//! Parameters are full-scale: the panel is a tenth of the wall. Not all of them at their greatest fit the relief's 40 mm
+//! together: [`LayeredWall::check_depth`] refuses what does not.
 
 use super::chance::SeededRandom;
 use super::macrostructure::{self, MacrostructureModel};
 use super::mesostructure::StoneArrangement;
-use super::microstructure::{MicrostructureModel, SKIN};
+use super::microstructure::{JITTER, JOINT_SHAPE, MicrostructureModel, SKIN};
 use super::parameter::{ParameterDomain, ParameterValue, ReliefParameter};
 use super::settings::{FULL_SCALE, JointShape, MacrostructureShape, WallSettings};
 use super::stones::SEED;
-use super::{HeightField, PANEL_SIZE_MM, RELIEF_MM};
+use super::{Error, HeightField, PANEL_SIZE_MM, RELIEF_MM};
 
 /// Heights of a cell are the mean of those this far apart or less, mm: a joint is 1 mm wide.
 const DETAIL_MM: f64 = 0.4;
+
+/// Greatest depth of a wall, full-scale mm.
+const DEEPEST_MM: f64 = FULL_SCALE * (RELIEF_MM[1] - RELIEF_MM[0]);
+const MACRO_DEPTH: &str = "macro_depth_mm";
 
 /// A wall in layers.
 #[derive(Debug, Clone, PartialEq)]
@@ -28,9 +32,13 @@ impl LayeredWall {
         Self::with(mesostructure, |_, parameter| parameter.default_setting())
     }
 
-    /// A wall with every parameter drawn from its range.
+    /// A wall with every parameter drawn from its range; its large shape is as deep as the rest leaves room for.
     pub(super) fn drawn(mesostructure: StoneArrangement, chance: SeededRandom) -> Self {
-        Self::with(mesostructure, |n, parameter| parameter.domain.value(chance.unit(n)))
+        let mut wall = Self::with(mesostructure, |n, parameter| parameter.domain.value(chance.unit(n)));
+        let rest: f64 = wall.depths_mm().iter().filter(|(key, _)| *key != MACRO_DEPTH).map(|(_, mm)| mm).sum();
+        let room = (10.0 * (DEEPEST_MM - rest)).floor() / 10.0;
+        wall.settings.macro_depth_mm = wall.settings.macro_depth_mm.min(room);
+        wall
     }
 
     fn with(mesostructure: StoneArrangement, value: impl Fn(u64, &ReliefParameter) -> ParameterValue) -> Self {
@@ -51,11 +59,13 @@ impl LayeredWall {
 
     /// Its joints and skin, in words.
     pub fn microstructure(&self) -> String {
-        let WallSettings { roughness_mm, joint_width_mm: width, joint_depth_mm: depth, joint_shape, .. } =
-            *self.settings;
+        let WallSettings { roughness_mm, joint_width_mm, joint_depth_mm, joint_shape, .. } = *self.settings;
         let skin = if roughness_mm == 0.0 { "smooth".to_owned() } else { format!("rough by {roughness_mm} mm") };
+        let told = |mm: f64, jitter: f64| if jitter == 0.0 { mm.to_string() } else { format!("{mm} +- {jitter}") };
+        let width = told(joint_width_mm, self.settings.joint_width_jitter_mm);
+        let depth = told(joint_depth_mm, self.settings.joint_depth_jitter_mm);
         match joint_shape {
-            _ if width == 0.0 || self.mesostructure == StoneArrangement::Macrostructure => skin,
+            _ if joint_width_mm == 0.0 || self.mesostructure == StoneArrangement::Macrostructure => skin,
             JointShape::Flush => format!("flush joints {width} mm wide, {skin}"),
             _ => {
                 let shape = self.word("joint_shape");
@@ -99,6 +109,48 @@ impl LayeredWall {
         self.settings = serde_json::from_value(all.into()).unwrap_or_default();
     }
 
+    /// Returns what its layers add to its depth at most, full-scale mm, by the parameter.
+    fn depths_mm(&self) -> Vec<(&'static str, f64)> {
+        let settings = &self.settings;
+        let mut depths = vec![
+            ("projection_mm", settings.projection_mm),
+            ("lean_mm", settings.lean_mm),
+            ("bulge_mm", settings.bulge_mm),
+            ("primitive_height_mm", settings.primitive_height_mm),
+            ("well_depth_mm", settings.well_depth_mm),
+            ("roughness_mm", settings.roughness_mm),
+        ];
+        if settings.macrostructure != MacrostructureShape::Flat {
+            depths.push((MACRO_DEPTH, settings.macro_depth_mm));
+        }
+        let has_joints = settings.joint_width_mm + settings.joint_width_jitter_mm > 0.0;
+        if has_joints && settings.joint_shape != JointShape::Flush {
+            depths.push(("joint_depth_mm", settings.joint_depth_mm));
+            depths.push(("joint_depth_jitter_mm", settings.joint_depth_jitter_mm));
+        }
+        depths.retain(|(_, mm)| *mm > 0.0);
+        depths
+    }
+
+    /// Checks that it is not deeper than a panel's side can be.
+    ///
+    /// # Errors
+    /// [`Error::Depth`], which names what it is made of.
+    pub(super) fn check_depth(&self) -> Result<(), Error> {
+        let depths = self.depths_mm();
+        let depth_mm: f64 = depths.iter().map(|(_, mm)| mm).sum();
+        if depth_mm <= DEEPEST_MM + 1e-9 {
+            return Ok(());
+        }
+        let parts: Vec<_> = depths.iter().map(|(key, mm)| format!("{key}={mm}")).collect();
+        Err(Error::Depth {
+            relief: self.mesostructure.name(),
+            depth_mm: (10.0 * depth_mm).round() / 10.0,
+            greatest_mm: DEEPEST_MM,
+            parts: parts.join(", "),
+        })
+    }
+
     /// Its heights, each the mean over its cell. Their mean is 0 if that keeps them within the relief.
     pub(super) fn height_field(&self, cells: usize) -> HeightField {
         let settings = &self.settings;
@@ -109,8 +161,8 @@ impl LayeredWall {
         let height = |x: f64, y: f64| {
             let relief = stones.as_ref().map_or(0.0, |stones| {
                 let spot = stones.spot(x, y, half_joint);
-                let inside = skin.inside(spot.to_joint);
-                if inside < 0.0 { skin.joint(inside, x, y) } else { spot.face }
+                let half_width = skin.half_width(x, y);
+                if spot.to_joint < half_width { skin.joint(spot.to_joint, half_width, x, y) } else { spot.face }
             });
             shape.height(x, y) + relief + skin.roughness(x, y)
         };
@@ -129,7 +181,14 @@ impl LayeredWall {
 pub(super) fn parameters(mesostructure: StoneArrangement) -> Vec<ReliefParameter> {
     let own = mesostructure.parameters().iter().copied();
     let seed = own.clone().all(|p| p.key != SEED.key).then_some(SEED);
-    macrostructure::PARAMETERS.into_iter().chain(own).chain(SKIN).chain(seed).collect()
+    let jitter = own.clone().any(|p| p.key == JOINT_SHAPE.key).then_some(JITTER);
+    macrostructure::PARAMETERS
+        .into_iter()
+        .chain(own)
+        .chain(jitter.into_iter().flatten())
+        .chain(SKIN)
+        .chain(seed)
+        .collect()
 }
 
 fn centred(heights: HeightField) -> HeightField {
@@ -205,10 +264,10 @@ mod tests {
     #[test]
     fn values_out_of_range_are_refused_by_name_range_and_hint() {
         let mut relief = wall("coursed_ashlar", &[]);
-        let refused = relief.set("joint_depth_mm", "50").expect_err("too deep").to_string();
+        let refused = relief.set("joint_depth_mm", "90").expect_err("too deep").to_string();
         assert_eq!(
             refused,
-            "parameter `joint_depth_mm` of relief `coursed_ashlar` is `50`, expected 0 to 40 mm full scale; \
+            "parameter `joint_depth_mm` of relief `coursed_ashlar` is `90`, expected 0 to 80 mm full scale; \
              hint: how far the joints lie behind the stones' faces"
         );
         let refused = relief.set("joint_shape", "round").expect_err("no shape").to_string();
@@ -218,6 +277,34 @@ mod tests {
         }
         let refused = relief.set("brick_length_mm", "200").expect_err("no bricks").to_string();
         assert!(refused.contains("course_height_mm"), "{refused}");
+    }
+
+    // Old files of parameters do not name the jitter: they make the walls that they made.
+    #[test]
+    fn joints_differ_from_their_width_by_their_jitter() {
+        let joints = [("joint_width_mm", "15"), ("joint_depth_mm", "40"), ("projection_mm", "0"), ("lean_mm", "0")];
+        let of = |more: &[(&str, &str)]| wall("stretcher_bond", &[&joints, more].concat());
+        let plain = of(&[]);
+        let mut old = plain.to_json();
+        old["parameters"].as_object_mut().expect("parameters").retain(|key, _| !key.contains("jitter"));
+        assert_eq!(PanelRelief::from_json(&old.to_string()).as_ref(), Ok(&plain));
+        // The share of the wall that lies in joints, along one bed joint of 0.05 mm steps.
+        let share = |relief: &PanelRelief| {
+            let PanelRelief::Layered(wall) = relief else { return Vec::new() };
+            let skin = MicrostructureModel::of(&wall.settings);
+            (0..2000).map(|n| 20.0 * skin.half_width(f64::from(n) * 0.3, 7.0)).collect::<Vec<f64>>()
+        };
+        assert!(share(&plain).iter().all(|mm| (mm - 15.0).abs() < 1e-9));
+        let uneven = share(&of(&[("joint_width_jitter_mm", "1")]));
+        assert!(uneven.iter().all(|mm| (14.0..=16.0).contains(mm)), "{uneven:?}");
+        let (least, greatest) = uneven.iter().fold((15.0f64, 15.0f64), |(a, b), mm| (a.min(*mm), b.max(*mm)));
+        assert!(least < 14.5 && greatest > 15.5, "{least} {greatest}");
+        let deepest = |relief: &PanelRelief| {
+            let [low, high] = relief.height_field(585).extent_mm();
+            high - low
+        };
+        let (level, deeper) = (deepest(&plain), deepest(&of(&[("joint_depth_jitter_mm", "10")])));
+        assert!(deeper > level + 0.5 && deeper < level + 1.0, "{level} {deeper}");
     }
 
     #[test]
@@ -272,7 +359,7 @@ mod tests {
             assert!(smooth == 0.0 && single > 0.0);
             assert!((double / single - 4.0).abs() < 1e-2, "twice as rough");
             let large = |mm| depth(&wall("macrostructure", &[("macrostructure", "convex"), ("macro_depth_mm", mm)]));
-            assert!((large("100") - 10.0).abs() < 0.2 && (large("200") - 20.0).abs() < 0.4);
+            assert!((large("100") - 10.0).abs() < 0.2 && (large("400") - 40.0).abs() < 0.8);
             for (name, key, low, high) in [
                 ("coursed_ashlar", "projection_mm", "0", "80"),
                 ("slated_stone", "lean_mm", "0", "30"),
@@ -286,7 +373,7 @@ mod tests {
             }
         }
 
-        // Ranges are chosen so that everything fits: all parameters at their greatest, under every large shape, with
+        // All parameters at their greatest, but for the large shape, which takes what room is left; every large shape,
         // every joint and every solid.
         #[test]
         fn every_combination_fits_the_relief() {
@@ -303,13 +390,21 @@ mod tests {
                         ParameterDomain::Choice { .. } => {}
                     }
                 }
+                greatest.set("macrostructure", "convex").expect("a shape");
+                let refused = greatest.check_depth().expect_err("too deep").to_string();
+                assert!(refused.contains("macro_depth_mm=400") && refused.contains("expected 400 mm"), "{refused}");
+                greatest.set("macro_depth_mm", "0").expect("in range");
+                let PanelRelief::Layered(wall) = &greatest else { continue };
+                let room = DEEPEST_MM - wall.depths_mm().iter().map(|(_, mm)| mm).sum::<f64>();
+                assert!(room >= 50.0, "{mesostructure:?}: {room}");
+                greatest.set("macro_depth_mm", &room.to_string()).expect("in range");
                 for parameter in &parameters {
                     let ParameterDomain::Choice { options, .. } = parameter.domain else { continue };
                     for option in options {
                         let mut relief = greatest.clone();
-                        relief.set("macrostructure", "convex").expect("a shape");
                         relief.set(parameter.key, option).expect("an option");
                         assert_eq!(relief.parameters()[parameter.key], *option);
+                        assert_eq!(relief.check_depth(), Ok(()));
                         let [low, high] = relief.height_field(40).extent_mm().map(f64::from);
                         let fits = low >= RELIEF_MM[0] - 1e-4 && high <= RELIEF_MM[1] + 1e-4;
                         assert!(fits, "{} {}={option}: {low} to {high}", relief.name(), parameter.key);

@@ -10,6 +10,8 @@ use super::stones::{SEED, StoneLayout, StoneSpot};
 const MESO: ParameterLayer = ParameterLayer::Mesostructure;
 
 pub(super) const PARAMETERS: [ReliefParameter; 8] = [
+    // The defaults are the German Reichsformat of 250 x 120 x 65 mm; the Swiss format is 250 x 120 x 60, NF 240 x 115 x
+    // 71, DF 240 x 115 x 52, and the paper's bricks are 215 x 102.5 x 65.
     ReliefParameter::mm(
         "brick_length_mm",
         MESO,

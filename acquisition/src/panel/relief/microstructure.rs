@@ -13,13 +13,30 @@ pub(super) const JOINT_SHAPE: ReliefParameter = ReliefParameter::choice(
     "profile of the joints: recessed has a level floor, flush is filled up to the stones, raked has an uneven floor, \
      concave is a bucket handle's arc, v has two slopes",
 );
+/// Parameters of how far the joints differ from their width and depth.
+pub(super) const JITTER: [ReliefParameter; 2] = [
+    ReliefParameter::mm(
+        "joint_width_jitter_mm",
+        LAYER,
+        [0.0, 20.0, 0.0],
+        "joints are wider and narrower than joint_width_mm by up to this",
+    ),
+    ReliefParameter::mm(
+        "joint_depth_jitter_mm",
+        LAYER,
+        [0.0, 20.0, 0.0],
+        "joints are deeper and shallower than joint_depth_mm by up to this",
+    ),
+];
+/// Distance along the wall over which the joints' width and depth change, full-scale mm: about half a brick.
+const JITTER_MM: f64 = 120.0;
 /// Parameters of the skin.
 pub(super) const SKIN: [ReliefParameter; 2] = [
     ReliefParameter::mm(
         "roughness_mm",
         LAYER,
-        [0.0, 10.0, 0.0],
-        "height of the surface's unevenness from its lowest to its highest point at most",
+        [0.0, 60.0, 0.0],
+        "height of the surface's unevenness from its lowest to its highest point at most: +-30 mm are 60",
     ),
     ReliefParameter::mm("roughness_grain_mm", LAYER, [20.0, 400.0, 60.0], "size of the unevenness along the wall"),
 ];
@@ -34,7 +51,7 @@ pub(super) const fn joint_depth(default: f64) -> ReliefParameter {
     ReliefParameter::mm(
         "joint_depth_mm",
         LAYER,
-        [0.0, 40.0, default],
+        [0.0, 80.0, default],
         "how far the joints lie behind the stones' faces",
     )
 }
@@ -46,6 +63,8 @@ pub(super) struct MicrostructureModel {
     /// Model mm.
     half_width: f64,
     depth: f64,
+    half_width_jitter: f64,
+    depth_jitter: f64,
     roughness: f64,
     grain: f64,
     chance: SeededRandom,
@@ -57,21 +76,33 @@ impl MicrostructureModel {
             shape: settings.joint_shape,
             half_width: settings.joint_width_mm / FULL_SCALE / 2.0,
             depth: settings.joint_depth_mm / FULL_SCALE,
+            half_width_jitter: settings.joint_width_jitter_mm / FULL_SCALE / 2.0,
+            depth_jitter: settings.joint_depth_jitter_mm / FULL_SCALE,
             roughness: settings.roughness_mm / FULL_SCALE,
             grain: settings.roughness_grain_mm / FULL_SCALE,
             chance: SeededRandom::new(settings.seed, 0x4A01),
         }
     }
 
-    /// Distance of a point from its stone's edge, model mm: below 0 in the joint.
-    pub(super) fn inside(&self, to_middle_of_joint: f64) -> f64 {
-        to_middle_of_joint - self.half_width
+    /// Returns half the width of the joints near a place, model mm.
+    pub(super) fn half_width(&self, x: f64, y: f64) -> f64 {
+        (self.half_width + self.jitter(2, self.half_width_jitter, x, y)).max(0.0)
     }
 
-    /// Returns the height of the joint under the wall's plane, if `inside` is below 0.
-    pub(super) fn joint(&self, inside: f64, x: f64, y: f64) -> f64 {
+    // Unevenness along the joints, up to `most` to either side.
+    fn jitter(&self, purpose: i64, most: f64, x: f64, y: f64) -> f64 {
+        if most == 0.0 {
+            return 0.0;
+        }
+        let scale = JITTER_MM / FULL_SCALE;
+        most * self.chance.at(purpose, 0).noise(x / scale, y / scale)
+    }
+
+    /// Returns the height of a joint under the wall's plane, at a distance from its middle that is below its
+    /// `half_width` here.
+    pub(super) fn joint(&self, to_middle: f64, half_width: f64, x: f64, y: f64) -> f64 {
         // 0 at the joint's edges, 1 in its middle.
-        let in_joint = (-inside / self.half_width).clamp(0.0, 1.0);
+        let in_joint = ((half_width - to_middle) / half_width).clamp(0.0, 1.0);
         let share = match self.shape {
             JointShape::Flush => 0.0,
             JointShape::Recessed => 1.0,
@@ -82,7 +113,7 @@ impl MicrostructureModel {
             JointShape::Concave => (in_joint * (2.0 - in_joint)).sqrt(),
             JointShape::V => in_joint,
         };
-        -self.depth * share
+        -(self.depth + self.jitter(3, self.depth_jitter, x, y)).max(0.0) * share
     }
 
     /// Unevenness of the skin: three octaves of noise, each half as high as the one before.

@@ -35,6 +35,8 @@ pub(super) struct WallSettings {
     pub(super) joint_shape: JointShape,
     pub(super) joint_width_mm: f64,
     pub(super) joint_depth_mm: f64,
+    pub(super) joint_width_jitter_mm: f64,
+    pub(super) joint_depth_jitter_mm: f64,
     pub(super) roughness_mm: f64,
     pub(super) roughness_grain_mm: f64,
 }

@@ -1,4 +1,4 @@
-//! The demo's measuring: surface after surface on the simulated rig, one on each core.
+//! Runs of the simulated rig for `demo` and `campaign`: surface after surface, one on each core.
 
 use std::collections::HashSet;
 use std::path::PathBuf;
@@ -13,43 +13,61 @@ use echolake_acquisition::run::recorder::random_tag;
 use echolake_acquisition::run::simulate::simulate;
 use echolake_acquisition::run::{PanelSpecimen, RunRequest};
 use echolake_schema::manifest::{Origin, RunEnd};
-use echolake_schema::{Rig, RunId, Timestamp};
+use echolake_schema::{Rig, RunId, SurfaceId, Timestamp};
 
 use crate::progress::{CommandProgress, TaskProgress};
 
 /// 2026-01-05 08:00 UTC for seed 1, and eleven hours from run to run: a run takes ten.
 const FIRST_START: Timestamp = Timestamp(1_767_600_000_000_000_000);
 const RUN_EVERY_SECS: u32 = 39_600;
+
+/// Returns the start of a run by its number. Runs of different seeds begin at different seconds (before they repeat after
+/// 39,600 seeds), so that no run is taken for one of another seed.
+pub(super) fn start_time(seed: u64, number: usize) -> Timestamp {
+    let offset_secs = (seed % u64::from(RUN_EVERY_SECS)) as f64 - 1.0;
+    FIRST_START.plus_secs(number as f64 * f64::from(RUN_EVERY_SECS) + offset_secs)
+}
+
 /// With more surfaces than this, progress counts surfaces.
 const TOLD_EACH: usize = 20;
 
-/// A collection of surfaces to measure.
-pub(super) struct DemoCampaign {
+/// A run to simulate.
+pub(super) struct PlannedRun {
+    pub(super) member: CollectionSurface,
+    /// References, if they are not the lake's.
+    pub(super) flat: Option<SurfaceId>,
+    pub(super) foam: Option<SurfaceId>,
+    /// Time of its begin: with the surface's name it tells whether the run is there already.
+    pub(super) start: Timestamp,
+    pub(super) seed: u64,
+}
+
+/// Runs to simulate.
+pub(super) struct SimulationPlan {
     pub(super) rig: Rig,
     /// In the order in which they are measured.
-    pub(super) surfaces: Vec<CollectionSurface>,
+    pub(super) runs: Vec<PlannedRun>,
     pub(super) keep: RecordingMode,
-    pub(super) seed: u64,
     /// Folder of the recordings.
     pub(super) folder: PathBuf,
     /// Names, without their tags, of the runs that are there already.
     pub(super) known: HashSet<String>,
 }
 
-/// State shared by the threads of a campaign.
-struct CampaignState<'a> {
-    campaign: &'a DemoCampaign,
+/// State shared by the threads of a simulation.
+struct SimulationState<'a> {
+    plan: &'a SimulationPlan,
     progress: &'a CommandProgress,
     stop: &'a AtomicBool,
     next: AtomicUsize,
     /// Progress over all surfaces, if they are not shown one by one.
     whole: Option<Mutex<(TaskProgress, u64)>>,
-    made: Mutex<CampaignTotals>,
+    made: Mutex<SimulationTotals>,
 }
 
 /// Totals of the new measurements, without those that were there before.
 #[derive(Default)]
-struct CampaignTotals {
+struct SimulationTotals {
     runs: u64,
     accepted: u64,
     attempts: u64,
@@ -57,24 +75,23 @@ struct CampaignTotals {
     failure: Option<anyhow::Error>,
 }
 
-impl DemoCampaign {
+impl SimulationPlan {
     /// Measures the surfaces that are missing. When `stop` becomes true, it ends after those that are being measured.
     pub(super) fn measure(mut self, stop: &AtomicBool, progress: &CommandProgress) -> anyhow::Result<()> {
         self.look_for_runs()?;
-        let campaign = &self;
+        let plan = &self;
         let cores = std::thread::available_parallelism().map_or(1, usize::from);
         let begun = Instant::now();
-        let count = campaign.surfaces.len();
+        let count = plan.runs.len();
         let whole = (count > TOLD_EACH).then(|| Mutex::new((progress.task("measure", count as u64, "surfaces"), 0)));
-        let shared =
-            CampaignState { campaign, progress, stop, next: AtomicUsize::new(0), whole, made: Mutex::default() };
+        let shared = SimulationState { plan, progress, stop, next: AtomicUsize::new(0), whole, made: Mutex::default() };
         std::thread::scope(|scope| {
             for _ in 0..cores.min(count) {
                 scope.spawn(|| shared.work());
             }
         });
-        let CampaignState { whole, made, .. } = shared;
-        let CampaignTotals { runs, accepted, attempts, bytes, failure } =
+        let SimulationState { whole, made, .. } = shared;
+        let SimulationTotals { runs, accepted, attempts, bytes, failure } =
             made.into_inner().unwrap_or_else(PoisonError::into_inner);
         if let Some(failure) = failure {
             return Err(failure);
@@ -90,9 +107,9 @@ impl DemoCampaign {
         Ok(())
     }
 
-    // Adds the runs in the folder to those that are known, and removes what a demo that was killed left behind.
+    // Adds the runs in the folder to those that are known, and removes what a simulation that was killed left behind.
     fn look_for_runs(&mut self) -> anyhow::Result<()> {
-        let ours = (0..self.surfaces.len()).map(|number| Ok(self.run_id(number, 0)?.untagged().to_owned()));
+        let ours = self.runs.iter().map(|run| Ok(run.run_id(0)?.untagged().to_owned()));
         let ours: HashSet<String> = ours.collect::<anyhow::Result<_>>()?;
         let unread = || format!("cannot read `{}`", self.folder.display());
         for entry in std::fs::read_dir(&self.folder).with_context(unread)? {
@@ -110,25 +127,20 @@ impl DemoCampaign {
         }
         Ok(())
     }
+}
 
-    fn run_id(&self, number: usize, tag: u64) -> Result<RunId, echolake_schema::Error> {
-        RunId::compose(self.start(number), &self.surfaces[number].surface, tag)
-    }
-
-    // Collections of different seeds begin at different seconds (before they repeat after 39,600 seeds), so that no run
-    // is taken for one of another seed.
-    fn start(&self, number: usize) -> Timestamp {
-        let offset_secs = (self.seed % u64::from(RUN_EVERY_SECS)) as f64 - 1.0;
-        FIRST_START.plus_secs(number as f64 * f64::from(RUN_EVERY_SECS) + offset_secs)
+impl PlannedRun {
+    fn run_id(&self, tag: u64) -> Result<RunId, echolake_schema::Error> {
+        RunId::compose(self.start, &self.member.surface, tag)
     }
 }
 
-impl CampaignState<'_> {
+impl SimulationState<'_> {
     fn work(&self) {
         while !self.stop.load(Ordering::Relaxed) {
             let number = self.next.fetch_add(1, Ordering::Relaxed);
-            let Some(member) = self.campaign.surfaces.get(number) else { return };
-            let outcome = self.surface(number, member);
+            let Some(planned) = self.plan.runs.get(number) else { return };
+            let outcome = self.measure(planned);
             let mut made = self.made.lock().unwrap_or_else(PoisonError::into_inner);
             match outcome {
                 Ok(None) => {}
@@ -158,11 +170,12 @@ impl CampaignState<'_> {
     }
 
     // Returns how the run ended and its size; nothing if it was measured before.
-    fn surface(&self, number: usize, member: &CollectionSurface) -> anyhow::Result<Option<(RunEnd, u64)>> {
-        let DemoCampaign { rig, keep, seed, folder, known, .. } = self.campaign;
+    fn measure(&self, planned: &PlannedRun) -> anyhow::Result<Option<(RunEnd, u64)>> {
+        let SimulationPlan { rig, keep, folder, known, .. } = self.plan;
+        let PlannedRun { member, flat, foam, start, seed } = planned;
         let surface = &member.surface;
         let tag = random_tag();
-        if known.contains(self.campaign.run_id(number, tag)?.untagged()) {
+        if known.contains(planned.run_id(tag)?.untagged()) {
             if self.whole.is_none() {
                 self.progress.say(format!("{surface}: measured before"));
             }
@@ -172,10 +185,11 @@ impl CampaignState<'_> {
             rig,
             surface: surface.clone(),
             specimen: &PanelSpecimen::Relief(member.relief.clone()),
-            flat: None,
-            foam: None,
-            start: self.campaign.start(number),
-            seed: seed.wrapping_mul(1_000).wrapping_add(number as u64),
+            flat: flat.clone(),
+            foam: foam.clone(),
+            macro_reference: member.macro_reference.clone(),
+            start: *start,
+            seed: *seed,
             tag,
             keep: *keep,
             folder,
@@ -183,7 +197,7 @@ impl CampaignState<'_> {
         let pairs = rig.grid()?.pairs().len();
         let mut task = self.whole.is_none().then(|| self.progress.task(surface.to_string(), pairs as u64, "pairs"));
         let begun = Instant::now();
-        // A demo's run takes seconds and is always completed: a stop only keeps the next one from beginning.
+        // A simulated run takes seconds and is always completed: a stop only keeps the next one from beginning.
         let measured = simulate(&run, Origin::Simulated, &AtomicBool::new(false), &mut |done| {
             if let Some(task) = &mut task {
                 task.at(done as u64);

@@ -1,0 +1,183 @@
+//! `echolake campaign`: measures the surfaces of a file on the simulated rig, as far as the lake lacks them, and prints the
+//! paper's tables with what was expected.
+
+mod definition;
+mod tables;
+
+use std::collections::{BTreeMap, HashSet};
+use std::io::IsTerminal as _;
+use std::path::{Path, PathBuf};
+
+use anyhow::Context as _;
+use clap::{Args, Subcommand};
+use echolake_acquisition::run::controller::RecordingMode;
+use echolake_ingest::pending;
+use echolake_lake::{Lake, ReferenceSurfaces};
+use echolake_query::Session;
+use echolake_schema::{Rig, RunId, SurfaceId};
+use serde::Deserialize;
+
+use super::simulated_runs::{PlannedRun, SimulationPlan, start_time};
+use crate::CommandOutcome;
+use crate::progress::CommandProgress;
+use definition::{CampaignDefinition, CampaignSurface};
+use tables::{LevelTable, LevelsBySurface, TableColours, make_tables};
+
+#[derive(Debug, Subcommand)]
+pub(crate) enum CampaignSubcommand {
+    /// Measure what the lake lacks, ingest it, and print levels by band beside those that are expected.
+    Run(CampaignRunArgs),
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct CampaignRunArgs {
+    /// The campaign: TOML with surfaces, references and expected levels.
+    file: PathBuf,
+    /// The rig; by default the one that the campaign names, else the lake's, or that of the paper for a new lake.
+    #[arg(long)]
+    rig: Option<PathBuf>,
+    /// Record no sweeps, only impulse responses: a tenth of the space.
+    #[arg(long)]
+    ir_only: bool,
+    /// Print the tables as JSON.
+    #[arg(long)]
+    json: bool,
+}
+
+pub(crate) async fn run(command: &CampaignSubcommand, lake_url: &str) -> anyhow::Result<CommandOutcome> {
+    let CampaignSubcommand::Run(args) = command;
+    let file = args.file.display();
+    let stop = super::stop_request()?;
+    let campaign = CampaignDefinition::read(&args.file)?;
+    // All of the file is checked before there is a lake.
+    let own_rig = campaign.rig_file(&args.file);
+    let rig = super::rig_or(args.rig.as_deref().or(own_rig.as_deref()), lake_url, Rig::paper).await?;
+    let bands: Vec<String> = rig.band_names().into_iter().chain(["total".to_owned()]).collect();
+    let check = |references: &ReferenceSurfaces| {
+        let surfaces = campaign.make_surfaces(&campaign.references(references))?;
+        campaign.check_expected(&surfaces, &bands)?;
+        anyhow::Ok(surfaces)
+    };
+    check(&ReferenceSurfaces::default()).with_context(|| format!("campaign `{file}`"))?;
+    let lake = Lake::open_or_create(lake_url, &rig, &ReferenceSurfaces::default()).await?;
+    let surfaces = check(&lake.config().references).with_context(|| format!("campaign `{file}`"))?;
+    measure(args, &campaign, &surfaces, &lake, rig, &stop).await?;
+    super::ensure_wanted(&stop)?;
+    let levels = levels(&Session::new(&lake)?).await?;
+    let named: Vec<_> =
+        surfaces.iter().map(|surface| (&surface.member.surface, surface.member.macro_reference.as_ref())).collect();
+    let tables = make_tables(&named, &levels, &campaign.expected);
+    print_tables(args, &campaign, &bands, &tables)?;
+    Ok(CommandOutcome::Whole)
+}
+
+fn print_tables(
+    args: &CampaignRunArgs,
+    campaign: &CampaignDefinition,
+    bands: &[String],
+    tables: &[LevelTable],
+) -> anyhow::Result<()> {
+    if args.json {
+        let report = serde_json::json!({
+            "campaign": campaign.name, "about": campaign.about, "bands": bands, "tables": tables,
+        });
+        super::print(&serde_json::to_string_pretty(&report)?)?;
+        return Ok(());
+    }
+    let colours = std::io::stdout().is_terminal() && std::env::var_os("NO_COLOR").is_none();
+    let colours = if colours { TableColours::Extremes } else { TableColours::None };
+    super::print(&campaign.name)?;
+    if !campaign.about.is_empty() {
+        super::print(campaign.about.trim_end())?;
+    }
+    for table in tables {
+        super::print(&format!("\n{}", table.to_text(bands, colours)))?;
+    }
+    Ok(())
+}
+
+// Simulates the runs that the lake lacks, and takes them in.
+async fn measure(
+    args: &CampaignRunArgs,
+    campaign: &CampaignDefinition,
+    surfaces: &[CampaignSurface],
+    lake: &Lake,
+    rig: Rig,
+    stop: &crate::signals::StopRequest,
+) -> anyhow::Result<()> {
+    let folder = super::inbox(lake)?;
+    let snapshot = lake.snapshot().await?;
+    let there: Vec<_> = snapshot.runs().map(|run| run.surface.to_string()).chain(surfaces_in(&folder)?).collect();
+    let runs = missing_runs(campaign, surfaces, &there);
+    if runs.is_empty() {
+        eprintln!("the lake has all runs of the campaign");
+    } else {
+        let progress = CommandProgress::new();
+        progress.say("simulated rig: nothing here is measured");
+        let keep = if args.ir_only { RecordingMode::ResponsesOnly } else { RecordingMode::Sweeps };
+        let simulation = SimulationPlan { rig, runs, keep, folder, known: HashSet::new() };
+        let measuring = stop.clone();
+        tokio::task::spawn_blocking(move || simulation.measure(measuring.flag(), &progress)).await??;
+        super::ensure_wanted(stop)?;
+    }
+    let sources = pending(lake).await?;
+    if !sources.is_empty() {
+        super::ingest::take_in(lake, sources, stop.flag(), &CommandProgress::new()).await?;
+    }
+    Ok(())
+}
+
+// A surface that has runs of any origin is not measured again.
+fn missing_runs(campaign: &CampaignDefinition, surfaces: &[CampaignSurface], there: &[String]) -> Vec<PlannedRun> {
+    let [flat, foam] = campaign.named_references();
+    let mut planned = Vec::new();
+    let mut number = 0;
+    for CampaignSurface { member, seed, runs } in surfaces {
+        let known = there.iter().filter(|surface| **surface == member.surface.as_str()).count();
+        for run in 0..*runs {
+            if run >= known {
+                planned.push(PlannedRun {
+                    member: member.clone(),
+                    flat: flat.clone(),
+                    foam: foam.clone(),
+                    start: start_time(campaign.seed, number),
+                    seed: seed.wrapping_add(run as u64),
+                });
+            }
+            number += 1;
+        }
+    }
+    planned
+}
+
+// Surfaces of the runs that wait to be taken in.
+fn surfaces_in(folder: &Path) -> anyhow::Result<Vec<String>> {
+    let entries = std::fs::read_dir(folder).with_context(|| format!("cannot read `{}`", folder.display()))?;
+    let named = entries.flatten().filter_map(|entry| {
+        let name = entry.file_name();
+        let run: RunId = name.to_str()?.strip_suffix(".mcap")?.parse().ok()?;
+        run.untagged().split_once('-').map(|(_, surface)| surface.to_owned())
+    });
+    Ok(named.collect())
+}
+
+/// A row of the query for levels.
+#[derive(Deserialize)]
+struct BandLevelRow {
+    surface_id: SurfaceId,
+    band: String,
+    level_db: Option<f64>,
+}
+
+// The levels of all surfaces, means over their runs.
+async fn levels(session: &Session) -> anyhow::Result<LevelsBySurface> {
+    let sql = "select surface_id, band, avg(p90_mean_db) as level_db from surface_stats group by surface_id, band";
+    let rows: Vec<BandLevelRow> = super::sql::rows(session, sql).await?;
+    let mut levels = BTreeMap::<String, BTreeMap<String, f64>>::new();
+    for BandLevelRow { surface_id, band, level_db } in rows {
+        if let Some(level_db) = level_db {
+            levels.entry(surface_id.to_string()).or_default().insert(band, level_db);
+        }
+    }
+    Ok(levels)
+}
