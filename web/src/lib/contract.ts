@@ -992,6 +992,11 @@ export interface components {
         /** @description One surface. */
         readonly SurfaceDetail: {
             /**
+             * @description Phase of the relief's details that are narrower than a wavelength, rad, by band without the total. Over 0.18 a
+             *     simulated relief is off by 1 dB and more in single pairs; null if it is not known.
+             */
+            readonly detail_phase: readonly (number | null)[];
+            /**
              * @description Mean over the pairs of Flat's TNCE, linear, over Flat's total. One value per band in the order of `lake.bands`, the
              *     total last; null if there is no value.
              */
