@@ -17,7 +17,7 @@ fn a_twin_is_computed_once_labelled_and_near_to_its_surface() {
     assert!(uncertain("flat") < 1e-4, "{}", uncertain("flat"));
 
     let twin: serde_json::Value = serde_json::from_str(&place.ok(&["twin", "stretcher_bond", "--json"])).expect("JSON");
-    assert_eq!(twin["twin_origin"], "computed");
+    assert_eq!((&twin["origin"], &twin["twin_origin"]), (&"simulated".into(), &"computed".into()));
     let bands = twin["bands"].as_array().expect("bands");
     assert_eq!(bands.len(), 6);
     for band in bands {
@@ -39,7 +39,10 @@ fn a_twin_is_computed_once_labelled_and_near_to_its_surface() {
     // The second time all is there.
     let runs = place.number("select count(*) from runs");
     let table = place.ok(&["twin", "stretcher_bond", "--pairs", "1"]);
-    assert!(table.contains("(computed)") && table.contains("10000"), "{table}");
+    assert!(
+        table.contains("stretcher_bond (simulated) less twin_stretcher_bond (computed)") && table.contains("10000"),
+        "{table}"
+    );
     assert_eq!(place.number("select count(*) from runs"), runs);
 
     place.fails(1, &["twin", "wood"], "the panel is of `MDF`; hint: twins are computed of `coated print` alone");

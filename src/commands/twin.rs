@@ -45,13 +45,13 @@ const COMPUTED_AT: Timestamp = Timestamp(1_767_600_000_000_000_000);
 /// Phase of details, rad, beyond which pairs of a simulated relief are off by 1 dB (docs/devices.md).
 const GREATEST_DETAIL_PHASE: f64 = 0.18;
 
-/// Differences of a band over the pairs, measured less computed.
+/// Differences of a band over the pairs, the surface less its twin.
 #[derive(Debug, Serialize, Deserialize)]
 struct BandDifference {
     band: String,
     pairs: i64,
-    measured_db: Option<f64>,
-    computed_db: Option<f64>,
+    surface_db: Option<f64>,
+    twin_db: Option<f64>,
     mean_db: Option<f64>,
     rms_db: Option<f64>,
     p5_db: Option<f64>,
@@ -60,22 +60,29 @@ struct BandDifference {
     detail_phase: Option<f64>,
 }
 
-/// Difference of a pair in one band, measured less computed.
+/// Difference of a pair in one band, the surface less its twin.
 #[derive(Debug, Serialize, Deserialize)]
 struct PairDifference {
     pair_id: i64,
     microphone: i64,
     speaker: i64,
     band: String,
-    measured_db: f64,
-    computed_db: f64,
+    surface_db: f64,
+    twin_db: f64,
     difference_db: f64,
+}
+
+#[derive(Deserialize)]
+struct SurfaceOrigin {
+    origin: Option<String>,
 }
 
 /// All differences of a surface from its twin.
 #[derive(Debug, Serialize)]
 struct TwinDifferences {
     surface_id: SurfaceId,
+    /// Origin of the surface's signals, as `measured` or `simulated`.
+    origin: String,
     twin_id: SurfaceId,
     /// `computed`: the twin is no measurement.
     twin_origin: &'static str,
@@ -233,8 +240,11 @@ impl TwinDifferences {
         let session = Session::new(lake)?;
         let twin = format!("{TWIN}{surface}");
         let bands = lake.rig().band_names();
+        let sql = format!("select max(origin) as origin from surfaces where surface_id = '{surface}'");
+        let origin = super::sql::rows::<SurfaceOrigin>(&session, &sql).await?.pop().and_then(|row| row.origin);
         let mut found = Self {
             surface_id: surface.clone(),
+            origin: origin.unwrap_or_default(),
             twin_id: twin.parse()?,
             twin_origin: Origin::Computed.label(),
             bands: Vec::new(),
@@ -245,7 +255,7 @@ impl TwinDifferences {
             let column = if band == "total" { "tnce_total".to_owned() } else { format!("tnce_band_{band}") };
             let levels = |alias: &str| format!("10 * log10({alias}.{column})");
             let joined = format!(
-                "select m.pair_id, m.microphone, m.speaker, '{band}' as band, {} as measured_db, {} as computed_db, \
+                "select m.pair_id, m.microphone, m.speaker, '{band}' as band, {} as surface_db, {} as twin_db, \
                  {} - {} as difference_db from tnce m join tnce c on c.pair_id = m.pair_id \
                  where m.surface_id = '{surface}' and c.surface_id = '{twin}' \
                  and m.run_id = (select max(run_id) from tnce where surface_id = '{surface}') \
@@ -258,8 +268,8 @@ impl TwinDifferences {
             );
             let phase = if band == "total" { "null".to_owned() } else { format!("detail_phase_{band}") };
             let summary = format!(
-                "select '{band}' as band, count(*) as pairs, avg(measured_db) as measured_db, \
-                 avg(computed_db) as computed_db, avg(difference_db) as mean_db, \
+                "select '{band}' as band, count(*) as pairs, avg(surface_db) as surface_db, \
+                 avg(twin_db) as twin_db, avg(difference_db) as mean_db, \
                  sqrt(avg(difference_db * difference_db)) as rms_db, \
                  percentile_cont(0.05) within group (order by difference_db) as p5_db, \
                  percentile_cont(0.95) within group (order by difference_db) as p95_db, \
@@ -284,9 +294,9 @@ impl TwinDifferences {
     fn print(&self) -> anyhow::Result<()> {
         let level = |value: Option<f64>| value.map_or_else(String::new, |value| format!("{value:.2}"));
         super::print(&format!(
-            "{} (measured) less {} (computed), dB over Flat's same band, the total over its total\n\n\
+            "{} ({}) less {} (computed), dB over Flat's same band, the total over its total\n\n\
              {:>6} {:>6} {:>9} {:>9} {:>6} {:>6} {:>6} {:>6}",
-            self.surface_id, self.twin_id, "band", "pairs", "measured", "computed", "mean", "rms", "P5", "P95",
+            self.surface_id, self.origin, self.twin_id, "band", "pairs", "surface", "twin", "mean", "rms", "P5", "P95",
         ))?;
         for band in &self.bands {
             let doubted = band.detail_phase.is_some_and(|phase| phase > GREATEST_DETAIL_PHASE);
@@ -294,8 +304,8 @@ impl TwinDifferences {
                 "{:>6} {:>6} {:>9} {:>9} {:>6} {:>6} {:>6} {:>6}{}",
                 band.band,
                 band.pairs,
-                level(band.measured_db),
-                level(band.computed_db),
+                level(band.surface_db),
+                level(band.twin_db),
                 level(band.mean_db),
                 level(band.rms_db),
                 level(band.p5_db),
@@ -305,7 +315,7 @@ impl TwinDifferences {
         }
         super::print(&format!(
             "\n{:>6} {:>5} {:>5} {:>6} {:>9} {:>9} {:>10}",
-            "pair", "mic", "spk", "band", "measured", "computed", "difference"
+            "pair", "mic", "spk", "band", "surface", "twin", "difference"
         ))?;
         for pair in &self.pairs {
             super::print(&format!(
@@ -314,8 +324,8 @@ impl TwinDifferences {
                 pair.microphone,
                 pair.speaker,
                 pair.band,
-                pair.measured_db,
-                pair.computed_db,
+                pair.surface_db,
+                pair.twin_db,
                 pair.difference_db
             ))?;
         }
