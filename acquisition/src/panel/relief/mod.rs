@@ -209,9 +209,9 @@ impl PanelRelief {
         matching.max_by_key(|(start, _)| start.len()).map(|(_, name)| name)
     }
 
-    /// Relief `number` of the collection that `seed` names; it does not depend on how many there are. Every
-    /// [`DECK_SIZE`] from a multiple of it have each kind of wall as often as [`SHARES`] says, in any order, but the first
-    /// nine are one of each; their parameters are from all of their ranges.
+    /// Relief `number` of the collection that `seed` names; it does not depend on how many there are. Every 150 from a
+    /// multiple of it are 92 walls of brick, 46 of stone and 12 others, in any order, but the first nine are one of each
+    /// kind; their parameters are from all of their ranges.
     pub fn drawn(seed: u64, number: u64) -> Self {
         let chance = SeededRandom::new(seed, 0xDECC);
         let deck = deck(chance.at((number / DECK_SIZE) as i64, 1));
