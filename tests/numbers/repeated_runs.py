@@ -18,12 +18,11 @@ import tempfile
 from collections.abc import Sequence
 
 import numpy as np
-from independent_chain import SMALL_GRID, MeasuredLake, Signal, print_table, rig_text
+from independent_chain import QUIET, SMALL_GRID, MeasuredLake, Signal, print_table, rig_text
 
 SECS = 0.05
 COVERAGE_FACTOR = 1.96
 SHARES = (0.93, 0.97)
-QUIET = "[simulation]\nrepeatability_mm = 0.0\nnoise_and_drift = false\n"
 
 
 def measured_lake(program: str, folder: pathlib.Path, surfaces: Sequence[str], run: int | None) -> MeasuredLake:
