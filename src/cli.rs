@@ -54,25 +54,25 @@ pub(crate) enum CliCommand {
     #[cfg(feature = "lake")]
     #[command(flatten)]
     Lake(LakeCommand),
-    /// Measure one surface with the simulated rig: one run, one MCAP file.
+    /// Measure one surface: one run, one MCAP file. Devices are simulated unless the rig file names them.
     Acquire(AcquireArgs),
     /// Write a generated relief as a mesh, heights or a picture; make groups of them.
     Panel(PanelArgs),
-    /// Show runs again to Foxglove, which plays, pauses and seeks, and to Lichtblick.
+    /// Replay runs to Foxglove (play, pause, seek) and Lichtblick (view only).
     Replay(ReplayArgs),
-    /// Rebuild a recording that was cut off or damaged, as far as every checksum is right.
+    /// Make a run of a recording that was stopped, cut off or damaged, as far as every checksum is right.
     Recover(RecoverArgs),
-    /// Say what is in the lake, what is missing and what is damaged.
+    /// Report what is in the lake, what is missing and what is damaged.
     Doctor(DoctorArgs),
     /// Print a completion script for a shell.
     Completions {
         /// The shell.
         shell: clap_complete::Shell,
     },
-    /// Write the man pages, one for each command.
+    /// Write the man pages, one per command.
     #[command(hide = true)]
     Man {
-        /// The folder they go to.
+        /// Folder for them.
         folder: PathBuf,
     },
 }
@@ -83,7 +83,7 @@ pub(crate) enum CliCommand {
 pub(crate) enum LakeCommand {
     /// Measure a few surfaces with the simulated rig, ingest them, print the paper's tables and serve the catalogue.
     Demo(DemoArgs),
-    /// Measure the surfaces of a file with the simulated rig, and print the paper's tables beside what was expected.
+    /// Measure the surfaces of a file with the simulated rig, and print the paper's tables beside the expected levels.
     #[command(subcommand)]
     Campaign(CampaignSubcommand),
     /// Turn existing measurements into runs.
@@ -91,29 +91,29 @@ pub(crate) enum LakeCommand {
     Import(ImportCommand),
     /// Turn runs into rows.
     Ingest(IngestArgs),
-    /// Ask the lake in SQL; a prompt where no query is given.
+    /// Query the lake in SQL; without a query, a prompt.
     Sql(SqlArgs),
-    /// Data out: training sets, slices of runs, SOFA, WAV, npz.
+    /// Export data: training sets, slices of runs, SOFA, WAV, npz.
     #[command(subcommand)]
     Export(ExportCommand),
-    /// The paper's pictures and tables of surfaces, as SVG, PDF, PNG, LaTeX, CSV or Markdown.
+    /// Draw the paper's pictures and tables of surfaces, as SVG, PDF, PNG, LaTeX, CSV or Markdown.
     #[command(subcommand)]
     Figure(FigureCommand),
-    /// Serve the catalogue, and the lake over HTTP, Arrow Flight SQL and Postgres' protocol, for reading.
+    /// Serve the catalogue, and read access to the lake over HTTP, Arrow Flight SQL and Postgres' protocol.
     Serve(ServeArgs),
     /// Answer one client's queries, as a child of `serve`.
     #[command(hide = true)]
     Engine(EngineArgs),
     /// Make a token for `serve --tokens`.
     Token {
-        /// Name of its holder.
+        /// Name of the token's owner.
         name: String,
     },
-    /// Merge the tables' small files into large ones; ingest and queries may go on.
+    /// Merge the tables' small files into large ones; ingest and queries may continue meanwhile.
     Optimize(OptimizeArgs),
-    /// Compute what the simulated rig makes of a measured panel's mesh, and show by pair and band how far both are apart.
+    /// Simulate a measured panel's mesh, and report the differences to the measurement by pair and band.
     Twin(TwinArgs),
-    /// Delete files that are in no table any more, and what crashes left behind.
+    /// Delete files that no table needs any more, and what crashes left behind.
     Vacuum(VacuumArgs),
 }
 

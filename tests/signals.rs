@@ -44,7 +44,7 @@ fn whoever_announces_itself_can_be_stopped() {
     check(&place, &acquire, "simulated rig", 0, "pairs left; nothing that was measured is lost");
     // More surfaces than are measured before the signal comes, however late it is.
     let demo = ["demo", "--surfaces", "2000", "--ir-only", "--rig", "rig.toml"];
-    check(&place, &demo, "simulated rig", 1, "the same command goes on");
+    check(&place, &demo, "simulated rig", 1, "run the same command again to resume");
 }
 
 #[test]

@@ -270,6 +270,7 @@ async fn a_training_set_is_repeatable_and_leaks_nothing() {
         card.contains("10.1177/1351010X20986901") && card.contains("seed 1") && card.contains("simulated"),
         "{card}"
     );
+    assert!(card.contains("\nlicense: ") && card.contains("--columns reflected_ir,"), "{card}");
     let sums = String::from_utf8(files["SHA256SUMS"].clone()).expect("text");
     assert_eq!(sums.lines().count(), files.len() - 1);
 }

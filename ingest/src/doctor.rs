@@ -153,7 +153,7 @@ async fn check_run(
         report.find(
             FindingSeverity::Note,
             &run,
-            "the run was cut off or damaged when it was taken in; what was whole is in the tables",
+            "the recording was stopped, cut off or damaged; what it holds is in the tables",
         );
     }
     if let Ok(surface) = text("surface_id").parse() {
@@ -222,7 +222,7 @@ async fn find_strays(lake: &Lake, snapshot: &LakeSnapshot, report: &mut LakeRepo
             Some("inbox") => report.find(
                 FindingSeverity::Note,
                 &path,
-                "a recording that goes on, or was stopped or cut off; hint: `echolake acquire --resume` goes on with it, \
+                "unfinished recording (still running, stopped or cut off); hint: `echolake acquire --resume` resumes it, \
                  `echolake recover` makes a run of what it holds",
             ),
             Some("runs") => report.find(FindingSeverity::Missing, &path, "in no table; hint: `echolake ingest`"),

@@ -138,7 +138,7 @@ pub enum Error {
         source: rayon::ThreadPoolBuildError,
     },
     /// The ingest was stopped.
-    #[error("stopped; hint: the same command goes on where this one ended")]
+    #[error("stopped; hint: run the same command again to resume")]
     Stopped,
     /// An error of the lake.
     #[error(transparent)]

@@ -27,6 +27,8 @@ FLOOR_DB = -40.0
 RADII_MM = (25.0, 60.0, 140.0)
 """Of the discs whose roughness is measured: about the first Fresnel zones from 40 down to 2.5 kHz."""
 SHIFTS = 4
+LEAST_RELIEFS = 20
+"""Of the training set: from fewer nothing can be learned that holds for another relief."""
 PAIRS_A_SURFACE = 150
 """Of the 2951; a surface's pairs are alike. References are left out: what is to be learned is relief."""
 
@@ -74,6 +76,8 @@ def read(folder: Path, split: str, bands: list[str], rng: np.random.Generator) -
                     np.maximum(levels[keep], FLOOR_DB).astype(np.float32),
                 ]
             )
+    if not parts:
+        return None
     surface, pair, microphone, speaker, target = (np.concatenate(column) for column in zip(*parts, strict=True))
     size = float(table.column("size_mm")[0].as_py())
     return Rows(surface, pair, microphone, speaker, target, maps.reshape(-1, cells, cells), size)
@@ -138,7 +142,7 @@ def report(name: str, bands: list[str], errors: Mapping[str, NDArray[np.floating
     """Root mean square errors in dB, a line a split."""
     for split, error in errors.items():
         each = "  ".join(f"{e:6.2f}" for e in np.sqrt((error**2).mean(0)))
-        print(f"{name:<12} {split:<11} {each}  {np.sqrt((error**2).mean()):6.2f}", flush=True)
+        print(f"{name:<13} {split:<11} {each}  {np.sqrt((error**2).mean()):6.2f}", flush=True)
 
 
 def pair_means(splits: dict[str, Rows]) -> dict[str, Floats]:
@@ -220,6 +224,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("folder", type=Path)
     parser.add_argument("--epochs", type=int, default=3)
+    parser.add_argument("--few", action="store_true", help=f"learn even from fewer than {LEAST_RELIEFS} reliefs")
     arguments = parser.parse_args()
     first = sorted((arguments.folder / "data").glob("train-*.parquet"))
     if not first:
@@ -231,7 +236,14 @@ def main() -> None:
     rng = np.random.default_rng(1)
     found = {split: read(arguments.folder, split, bands, rng) for split in SPLITS}
     splits = {split: rows for split, rows in found.items() if rows is not None}
-    print("RMS error in dB          " + "  ".join(f"{b.removeprefix('tnce_'):>6}" for b in bands) + "     all")
+    reliefs = len(np.unique(splits["train"].surface)) if "train" in splits else 0
+    if reliefs == 0 or (reliefs < LEAST_RELIEFS and not arguments.few):
+        parser.error(
+            f"`{arguments.folder}`: split train has {reliefs} reliefs besides references, expected at least "
+            f"{LEAST_RELIEFS}, because errors on other reliefs would mean nothing; hint: a lake of "
+            "`echolake demo --surfaces 50 --ir-only`, or --few"
+        )
+    print("RMS error in dB           " + "  ".join(f"{b.removeprefix('tnce_'):>6}" for b in bands) + "     all")
     report("pair mean", bands, pair_means(splits))
     x = {split: features(rows) for split, rows in splits.items()}
     weights, mean, scale = ridge(x["train"], splits["train"].target, 1e-4)

@@ -106,6 +106,16 @@ pub enum PairRule {
     Ordered,
 }
 
+impl PairRule {
+    /// Its name, as rig files spell it.
+    pub(crate) fn name(self) -> &'static str {
+        match self {
+            Self::Unordered => "unordered",
+            Self::Ordered => "ordered",
+        }
+    }
+}
+
 /// The points and pairs of a rig.
 ///
 /// ```

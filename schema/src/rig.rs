@@ -3,10 +3,13 @@
 use serde::{Deserialize, Serialize};
 
 use crate::devices::DeviceParams;
-use crate::grid::{Grid, GridParams};
+use crate::grid::{Grid, GridParams, Layer};
 use crate::robots::RobotCell;
 use crate::simulation::SimulationParams;
 use crate::{Celsius, Error, SampleRate};
+
+/// Number of single points that a difference names.
+const SHOWN_POINTS: usize = 4;
 
 /// A rig, as its TOML describes it. Settings that the TOML omits are those of Rust et al. 2021
 /// ("A data acquisition setup for data driven acoustic design", Building Acoustics 28(4)).
@@ -255,6 +258,38 @@ impl Default for Validation {
     }
 }
 
+fn describe_division(division: &SpectralDivision) -> String {
+    match division {
+        SpectralDivision::Floored { floor_db } => format!("floored at {floor_db} dB"),
+        other => other.name().to_owned(),
+    }
+}
+
+fn describe_layers(layers: &[Layer]) -> String {
+    let describe = |Layer { points_per_side, pitch_mm, height_mm }: &Layer| match points_per_side {
+        1 => format!("1 point at {height_mm} mm"),
+        n => format!("{n} x {n} points {pitch_mm} mm apart at {height_mm} mm"),
+    };
+    match layers {
+        [] => "none".to_owned(),
+        layers => layers.iter().map(describe).collect::<Vec<_>>().join(", "),
+    }
+}
+
+fn describe_points(points: &[[f64; 3]]) -> String {
+    let describe = |[x, y, z]: &[f64; 3]| format!("{x} {y} {z}");
+    let shown: Vec<_> = points.iter().take(SHOWN_POINTS).map(describe).collect();
+    match points.len() {
+        0 => "none".to_owned(),
+        count if count > SHOWN_POINTS => format!("{count} points ({}, ...)", shown.join(", ")),
+        count => format!("{count} points ({})", shown.join(", ")),
+    }
+}
+
+fn join_numbers(numbers: &[f64]) -> String {
+    numbers.iter().map(f64::to_string).collect::<Vec<_>>().join(", ")
+}
+
 impl Rig {
     /// The rig of Rust et al. 2021.
     pub fn paper() -> Self {
@@ -303,30 +338,35 @@ impl Rig {
     /// The settings that decide what the tables' numbers mean and that differ from `other`'s, as
     /// (field, here, there). A lake holds only runs for which there are none.
     pub fn differences(&self, other: &Self) -> Vec<(&'static str, String, String)> {
-        fn entry<T: PartialEq + std::fmt::Debug>(
+        fn entry<T: PartialEq>(
             field: &'static str,
-            a: &T,
-            b: &T,
+            [a, b]: [&T; 2],
+            describe: impl Fn(&T) -> String,
         ) -> Option<(&'static str, String, String)> {
-            (a != b).then(|| (field, format!("{a:?}"), format!("{b:?}")))
+            (a != b).then(|| (field, describe(a), describe(b)))
         }
-        let rates = (self.sweep.rate_hz.get(), other.sweep.rate_hz.get());
-        let references = [self, other].map(|r| r.impulse_response.reference_temperature_c.get());
-        let divisions = [self, other].map(|r| r.impulse_response.division);
-        let durations =
-            (divisions[0] != SpectralDivision::Tapered).then(|| [self, other].map(|r| r.sweep.duration_secs));
+        let rigs = [self, other];
+        let responses = rigs.map(|r| &r.impulse_response);
+        let is_tapered = self.impulse_response.division == SpectralDivision::Tapered;
+        let durations = (!is_tapered).then(|| rigs.map(|r| &r.sweep.duration_secs));
         [
-            entry("sweep.rate_hz", &rates.0, &rates.1),
-            entry("sweep.low_hz", &self.sweep.low_hz, &other.sweep.low_hz),
-            entry("sweep.high_hz", &self.sweep.high_hz, &other.sweep.high_hz),
-            entry("impulse_response.length", &self.impulse_response.length, &other.impulse_response.length),
-            entry("impulse_response.reference_temperature_c", &references[0], &references[1]),
-            entry("impulse_response.division", &divisions[0], &divisions[1]),
+            entry("sweep.rate_hz", rigs.map(|r| &r.sweep.rate_hz), |rate| rate.get().to_string()),
+            entry("sweep.low_hz", rigs.map(|r| &r.sweep.low_hz), f64::to_string),
+            entry("sweep.high_hz", rigs.map(|r| &r.sweep.high_hz), f64::to_string),
+            entry("impulse_response.length", responses.map(|r| &r.length), usize::to_string),
+            entry("impulse_response.reference_temperature_c", responses.map(|r| &r.reference_temperature_c), |t| {
+                t.get().to_string()
+            }),
+            entry("impulse_response.division", responses.map(|r| &r.division), describe_division),
             // Without a taper the numbers depend on the sweep's length.
-            durations.and_then(|[here, there]| entry("sweep.duration_secs", &here, &there)),
-            entry("bands.centres_hz", &self.bands.centres_hz, &other.bands.centres_hz),
-            entry("panel", &self.panel, &other.panel),
-            entry("grid", &self.grid, &other.grid),
+            durations.and_then(|durations| entry("sweep.duration_secs", durations, f64::to_string)),
+            entry("bands.centres_hz", rigs.map(|r| &r.bands.centres_hz), |centres| join_numbers(centres)),
+            entry("panel.size_mm", rigs.map(|r| &r.panel.size_mm), f64::to_string),
+            entry("panel.depth_mm", rigs.map(|r| &r.panel.depth_mm), f64::to_string),
+            entry("grid.pairs", rigs.map(|r| &r.grid.pairs), |rule| rule.name().to_owned()),
+            entry("grid.clearance_mm", rigs.map(|r| &r.grid.clearance_mm), f64::to_string),
+            entry("grid.layers", rigs.map(|r| &r.grid.layers), |layers| describe_layers(layers)),
+            entry("grid.points_mm", rigs.map(|r| &r.grid.points_mm), |points| describe_points(points)),
         ]
         .into_iter()
         .flatten()
@@ -597,5 +637,26 @@ mod tests {
         assert_eq!(paper.differences(&other), []);
         other.impulse_response.length = 400;
         assert_eq!(paper.differences(&other), [("impulse_response.length", "384".into(), "400".into())]);
+    }
+
+    #[test]
+    fn differences_are_in_words() {
+        let room = "impulse_response.division = \"floored\"\nbands.centres_hz = [125, 250]\npanel.size_mm = 600\n\
+            sweep = { rate_hz = 48000, high_hz = 20000 }\n\
+            grid = { pairs = \"ordered\", points_mm = [[0, 0, 1000], [2000, 0, 1000.5]] }";
+        let room = Rig::from_toml(room).expect("a rig");
+        let said: String =
+            room.differences(&Rig::paper()).iter().map(|(field, a, b)| format!("{field}: {a} | {b}\n")).collect();
+        expect_test::expect![[r#"
+            sweep.rate_hz: 48000 | 96000
+            sweep.high_hz: 20000 | 40000
+            impulse_response.division: floored at -60 dB | tapered
+            bands.centres_hz: 125, 250 | 2500, 5000, 10000, 20000, 40000
+            panel.size_mm: 600 | 585
+            grid.pairs: ordered | unordered
+            grid.layers: none | 6 x 6 points 75 mm apart at 124 mm, 5 x 5 points 93.75 mm apart at 214 mm, 4 x 4 points 125 mm apart at 304 mm, 1 point at 474 mm
+            grid.points_mm: 2 points (0 0 1000, 2000 0 1000.5) | none
+        "#]]
+        .assert_eq(&said);
     }
 }

@@ -15,7 +15,7 @@ use echolake_acquisition::run::metrics::{MetricsServer, RunMetrics};
 use echolake_acquisition::run::recorder::{Held, partial_of, random_tag};
 use echolake_acquisition::run::session::{MeasuredRun, PreflightMode, RunSession, TakePace};
 use echolake_acquisition::run::{self, PanelSpecimen, RunRequest};
-use echolake_lake::{Lake, ReferenceSurfaces};
+use echolake_lake::{Error as LakeError, Lake, ReferenceSurfaces};
 use echolake_schema::{Rig, SurfaceId, Timestamp};
 
 use crate::CommandOutcome;
@@ -32,7 +32,7 @@ pub(crate) struct AcquireArgs {
     /// Name of the measured surface, as 0015_0.
     #[arg(long, required_unless_present = "resume")]
     pub(crate) surface: Option<SurfaceId>,
-    /// Go on with a run that was stopped or cut off: its `.mcap.partial`. What is safe in it is not measured again.
+    /// Resume a run that was stopped or cut off: its `.mcap.partial`. Measurements that are safe in it are not repeated.
     #[arg(long, value_name = "FILE", conflicts_with_all = ["surface", "panel", "parameters", "set", "mesh", "side", "rig", "flat", "foam", "macro_reference", "seed", "ir_only"])]
     pub(crate) resume: Option<PathBuf>,
     /// Relief for the simulated rig, by a name of `echolake panel --list`; by default the one that the surface's name
@@ -42,26 +42,25 @@ pub(crate) struct AcquireArgs {
     /// A JSON file of parameters, as `echolake panel` writes them, in place of a name.
     #[arg(long, value_name = "FILE", conflicts_with_all = ["mesh", "panel"])]
     pub(crate) parameters: Option<PathBuf>,
-    /// A parameter of it.
+    /// Set a parameter of the relief; repeatable.
     #[arg(long, value_name = "KEY=VALUE")]
     pub(crate) set: Vec<String>,
-    /// A mesh to measure instead: GLB or STL.
+    /// Measure a mesh instead of a relief: a GLB or STL file.
     #[arg(long)]
     pub(crate) mesh: Option<PathBuf>,
     /// The side of the mesh that is measured: the back is seen when the panel is turned over about its y axis.
     #[arg(long, value_name = "front|back", value_parser = side, requires = "mesh")]
     pub(crate) side: Option<PanelSide>,
-    /// The rig; by default the lake's, or that of the paper for a new lake.
+    /// Rig file; by default the lake's rig, or the paper's for a new lake.
     #[arg(long)]
     pub(crate) rig: Option<PathBuf>,
-    /// Surface that normalises this one, where it is not the lake's.
+    /// Reference surface to normalise by; by default the lake's.
     #[arg(long)]
     pub(crate) flat: Option<SurfaceId>,
-    /// Surface whose direct sound is subtracted from this one, where it is not the lake's.
+    /// Reference surface whose direct sound is subtracted; by default the lake's.
     #[arg(long)]
     pub(crate) foam: Option<SurfaceId>,
-    /// Surface that has the large shape of this one and nothing on it; by default that of the paper's panel, where it is
-    /// one.
+    /// Surface that has the large shape of this one and nothing on it; by default known for the paper's panels.
     #[arg(long, value_name = "NAME")]
     pub(crate) macro_reference: Option<SurfaceId>,
     /// Seed of the simulation.
@@ -70,21 +69,21 @@ pub(crate) struct AcquireArgs {
     /// Record no sweeps, only impulse responses.
     #[arg(long)]
     pub(crate) ir_only: bool,
-    /// Pairs between two checkpoints: what a power cut costs at most, and how late a pair is told to be safe. By default 1
-    /// on a real rig, 200 on the simulated one.
+    /// Pairs between two checkpoints: the most that a power cut costs, and how long until a pair is reported as safe. By
+    /// default 1 on a real rig, 200 on the simulated one.
     #[arg(long, value_name = "PAIRS", value_parser = clap::value_parser!(u32).range(1..))]
     pub(crate) checkpoint_every: Option<u32>,
-    /// Seconds that a simulated take lasts at least; a real rig's are 12.3.
+    /// Minimum duration of a simulated take in seconds; a real rig needs 12.3.
     #[arg(long, value_name = "SECS", default_value_t = 0.0)]
     pub(crate) pace: f64,
-    /// Begin even where disk, sensor, level or loopback are not fit.
+    /// Start even if the disk, sensor, level or loopback check fails.
     #[arg(long)]
     pub(crate) skip_checks: bool,
-    /// Append a line to this file for every attempt once it is safe on the disk: pair, attempt, verdict, SNR in dB.
-    /// `-` is stdout.
+    /// Append one line to this file for every attempt that is safe on the disk: pair, attempt, verdict, SNR in dB. `-` is
+    /// stdout.
     #[arg(long, value_name = "FILE")]
     pub(crate) acknowledge: Option<PathBuf>,
-    /// Show the run as it happens to Foxglove and Lichtblick, which open ws://ADDR.
+    /// Serve a live view of the run to Foxglove and Lichtblick at ws://ADDR.
     #[arg(long, value_name = "ADDR")]
     pub(crate) live: Option<std::net::SocketAddr>,
     #[command(flatten)]
@@ -124,6 +123,8 @@ pub(crate) async fn run(args: &AcquireArgs, lake_url: &str) -> anyhow::Result<Co
     let control = Arc::new(RunControl::default());
     watch::obey(&control)?;
     let progress = CommandProgress::new();
+    let is_new = args.resume.is_none() && matches!(Lake::open(lake_url).await, Err(LakeError::NoLake { .. }));
+    let has_folder = Path::new(lake_url).exists();
     let job = match &args.resume {
         Some(partial) => AcquireJob::Resumed { partial: partial.clone(), held: Box::new(Held::read(partial)?) },
         None => fresh(args, lake_url, &progress).await?,
@@ -170,7 +171,10 @@ pub(crate) async fn run(args: &AcquireArgs, lake_url: &str) -> anyhow::Result<Co
         Ok(measured) => tell(&measured, lake_url),
         Err(error) => {
             if partial.exists() {
-                go_on(&partial, lake_url);
+                tell_resume(&partial, lake_url);
+            } else if is_new {
+                // The refusal matters more than what is left of an empty lake.
+                let _ = remove_new_lake(lake_url, has_folder).await;
             }
             Err(error.into())
         }
@@ -182,7 +186,7 @@ fn tell(measured: &MeasuredRun, lake_url: &str) -> anyhow::Result<CommandOutcome
     let MeasuredRun { path, outcome } = measured;
     if outcome.left > 0 {
         eprintln!("stopped with {} pairs left; nothing that was measured is lost", outcome.left);
-        go_on(path, lake_url);
+        tell_resume(path, lake_url);
         return Ok(CommandOutcome::Whole);
     }
     super::print(&path.display().to_string())?;
@@ -190,8 +194,20 @@ fn tell(measured: &MeasuredRun, lake_url: &str) -> anyhow::Result<CommandOutcome
     Ok(if outcome.end.rejected > 0 { CommandOutcome::WithLoss } else { CommandOutcome::Whole })
 }
 
-fn go_on(partial: &Path, lake_url: &str) {
-    eprintln!("to go on: echolake --lake {lake_url} acquire --resume {}", partial.display());
+// A lake that was made for a refused run would bind the next one to its rig.
+async fn remove_new_lake(lake_url: &str, has_folder: bool) -> anyhow::Result<()> {
+    let lake = Lake::open(lake_url).await?;
+    let folder = lake.folder().map(Path::to_owned);
+    if lake.remove_unused().await?
+        && let Some(folder) = folder.filter(|_| !has_folder)
+    {
+        std::fs::remove_dir(folder)?;
+    }
+    Ok(())
+}
+
+fn tell_resume(partial: &Path, lake_url: &str) {
+    eprintln!("to resume: echolake --lake {lake_url} acquire --resume {}", partial.display());
 }
 
 async fn fresh(args: &AcquireArgs, lake_url: &str, progress: &CommandProgress) -> anyhow::Result<AcquireJob> {
@@ -207,7 +223,7 @@ async fn fresh(args: &AcquireArgs, lake_url: &str, progress: &CommandProgress) -
     warn_of_missing_references(args, &lake, &surface, progress).await?;
     for unfinished in unfinished(&folder, surface.as_str()) {
         progress.say(format!(
-            "note: `{}` is unfinished; hint: `echolake acquire --resume` goes on with it",
+            "note: `{}` is unfinished; hint: `echolake acquire --resume` resumes it",
             unfinished.display()
         ));
     }

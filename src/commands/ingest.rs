@@ -9,6 +9,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use anyhow::Context as _;
+use echolake_acquisition::recovery::is_partial;
 use echolake_ingest::{
     FileReport, IngestOutcome, IngestedRun, LakeIngest, RunSource, SuspectFile, adopt_cut_off, complete, pending,
     waiting,
@@ -30,7 +31,7 @@ use clap::Args;
 pub(crate) struct IngestArgs {
     /// Run files, or names of runs in the lake; by default all that are not in the tables yet.
     pub(crate) runs: Vec<String>,
-    /// Go on: take in what comes into the lake's inbox, until Ctrl-C.
+    /// Keep running and take in new files of the lake's inbox, until Ctrl-C.
     #[arg(long, conflicts_with_all = ["runs", "json"])]
     pub(crate) watch: bool,
     /// Print what was done as JSON.
@@ -133,7 +134,8 @@ pub(crate) async fn take_in(
     progress: &CommandProgress,
 ) -> anyhow::Result<IngestSummary> {
     let mut summary = IngestSummary::default();
-    let mut task = progress.task("ingest", sources.len() as u64, "runs");
+    let count = sources.len();
+    let mut task = progress.task("ingest", count as u64, "runs");
     let mut ended = 0;
     let (suspects, sources): (Vec<_>, Vec<_>) =
         sources.into_iter().partition(|source| SuspectFile::from_source(lake, source).is_some());
@@ -153,7 +155,11 @@ pub(crate) async fn take_in(
     let added = || summary.taken.iter().filter(|t| t.outcome == IngestOutcome::Added);
     let measurements: usize = added().map(|t| t.measurements).sum();
     let derived: usize = added().filter(|t| t.derived).map(|t| t.measurements).sum();
-    task.done(format!("{} runs, {measurements} new measurements, {derived} of them derived", summary.taken.len()));
+    match count {
+        0 => task.dismiss(),
+        _ => task
+            .done(format!("{} runs, {measurements} new measurements, {derived} of them derived", summary.taken.len())),
+    }
     outcome?;
     let mut task = progress.task("complete", lake.snapshot().await?.runs().count() as u64, "runs");
     let (mut rows, mut runs) = (0, 0);
@@ -163,7 +169,10 @@ pub(crate) async fn take_in(
         task.at(runs);
     })
     .await?;
-    task.done(format!("{runs} runs, {rows} measurements derived"));
+    match runs {
+        0 => task.dismiss(),
+        _ => task.done(format!("{runs} runs, {rows} measurements derived")),
+    }
     for (run, missing) in waiting(lake).await? {
         if summary.taken.iter().any(|t| t.run == run) {
             progress.say(format!("{run}: waits for reference {missing}; ingest a run of it, and it is completed"));
@@ -298,7 +307,7 @@ fn say(progress: &CommandProgress, taken: &IngestedRun) {
         IngestOutcome::Added => progress.say(format!("{run}: {measurements} measurements")),
     }
     if !taken.whole {
-        progress.say(format!("{run}: warning: the file was cut off; what was complete is in the tables"));
+        progress.say(format!("{run}: warning: its recording was stopped or cut off; what it holds is in the tables"));
     }
     for damage in &taken.damaged {
         progress.say(format!("{run}: warning: {damage}"));
@@ -309,6 +318,11 @@ fn say(progress: &CommandProgress, taken: &IngestedRun) {
 async fn sources_of(lake: &Lake, names: &[String]) -> anyhow::Result<Vec<RunSource>> {
     let mut sources = Vec::new();
     for name in names {
+        anyhow::ensure!(
+            !is_partial(Path::new(name)),
+            "`{name}` is an unfinished recording, expected a run (.mcap); hint: `echolake acquire --resume {name}` resumes \
+             it, `echolake recover {name}` makes a run of what it holds"
+        );
         if Path::new(name).is_file() {
             sources.push(in_lake(lake, Path::new(name)).unwrap_or_else(|| RunSource::File(name.into())));
             continue;

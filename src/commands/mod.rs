@@ -86,17 +86,17 @@ fn inbox(lake: &Lake) -> anyhow::Result<std::path::PathBuf> {
 /// Prints which viewers have access at an address, and how to let in others.
 fn tell_access(viewers: &ViewerArgs, address: SocketAddr, progress: &CommandProgress) {
     if viewers.allowed_origins.is_empty() {
-        progress.say("hint: a viewer on the web needs its address: --allow-origin https://app.foxglove.dev");
+        progress.say("hint: a viewer on the web must be allowed: --allow-origin https://app.foxglove.dev");
     }
     if viewers.open && !address.ip().is_loopback() {
-        progress.say("warning: whoever reaches this address can look on");
+        progress.say("warning: anyone who reaches this address can view");
     }
 }
 
 /// Fails if the command was asked to stop.
 #[cfg(feature = "lake")]
 fn ensure_wanted(stop: &StopRequest) -> anyhow::Result<()> {
-    anyhow::ensure!(!stop.is_made(), "stopped; hint: the same command goes on where this one ended");
+    anyhow::ensure!(!stop.is_made(), "stopped; hint: run the same command again to resume");
     Ok(())
 }
 

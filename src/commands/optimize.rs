@@ -39,7 +39,7 @@ pub(crate) async fn run(args: &OptimizeArgs, lake_url: &str) -> anyhow::Result<C
         false => super::print(&text(&report.tables))?,
     }
     if report.stopped {
-        anyhow::bail!("stopped; what was merged stays so, and the same command goes on");
+        anyhow::bail!("stopped; what was merged stays merged; hint: run the same command again to resume");
     }
     Ok(CommandOutcome::Whole)
 }

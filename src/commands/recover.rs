@@ -1,9 +1,8 @@
-//! `echolake recover`: a recording that was cut off or damaged, rebuilt as far as it is proven whole.
-
-use std::path::Path;
+//! `echolake recover`: a recording that was stopped, cut off or damaged, made a run as far as it is proven whole.
 
 use anyhow::ensure;
-use echolake_acquisition::recovery::{Report, beside, recover};
+use echolake_acquisition::recovery::{Report, beside, is_partial, recover};
+use echolake_acquisition::run::recorder::Held;
 
 use crate::CommandOutcome;
 use clap::Args;
@@ -11,7 +10,7 @@ use std::path::PathBuf;
 
 #[derive(Debug, Args)]
 pub(crate) struct RecoverArgs {
-    /// The recording that was cut off or damaged; it is only read.
+    /// The recording that was stopped, cut off or damaged; it is only read.
     pub(crate) file: PathBuf,
     /// Path of the rebuilt file; by default beside it, without `.partial`.
     #[arg(short, long, value_name = "FILE")]
@@ -44,6 +43,10 @@ fn tell(report: &Report) -> anyhow::Result<()> {
         return Ok(());
     };
     super::print(&to.display().to_string())?;
+    // Recordings that are none of a rig's, as imports, have no plan of pairs.
+    if let Some((measured, planned)) = Held::read(to).ok().and_then(|held| count_pairs(&held)) {
+        eprintln!("made a run of {measured} of {planned} pairs");
+    }
     let of = |topic: &str| report.messages.get(topic).copied().unwrap_or(0);
     eprintln!(
         "kept: {} of {} bytes, {} verdicts, {} responses, {} sweeps; read back and compared",
@@ -55,17 +58,21 @@ fn tell(report: &Report) -> anyhow::Result<()> {
     );
     match &report.defect {
         Some(defect) => eprintln!("lost: {} bytes, because {defect}", report.lost_bytes()),
-        None => eprintln!("lost: nothing; its summary was missing or damaged"),
+        None => eprintln!("lost: nothing"),
     }
     if !report.has_end {
-        eprintln!("note: it does not say how its run ended; ingest takes it for a partial run");
+        eprintln!("note: its run was not finished; ingest marks it as partial");
     }
     if is_partial(&report.from) {
-        eprintln!("`{from}` is as it was; delete it when you need it no more, or go on with it: acquire --resume");
+        let to = to.display();
+        eprintln!(
+            "`{from}` is unchanged; delete it when you no longer need it, or delete `{to}` and resume the recording"
+        );
     }
     Ok(())
 }
 
-fn is_partial(path: &Path) -> bool {
-    path.extension().is_some_and(|e| e == "partial")
+// Pairs with an accepted measurement, and all pairs of the rig.
+fn count_pairs(held: &Held) -> Option<(usize, usize)> {
+    Some((held.accepted(), held.rig.grid().ok()?.pairs().len()))
 }

@@ -18,7 +18,7 @@ use echolake_acquisition::replay::SPEEDS;
 
 #[derive(Debug, Args)]
 pub(crate) struct ReplayArgs {
-    /// Names of runs, surfaces (of each its newest run), or .mcap files; they are shown one after the other.
+    /// Names of runs or surfaces (the newest run of each), or .mcap files; they are played one after the other.
     #[arg(required = true, value_name = "RUN")]
     pub(crate) runs: Vec<String>,
     /// Address to listen on.
@@ -26,10 +26,10 @@ pub(crate) struct ReplayArgs {
     pub(crate) listen: std::net::SocketAddr,
     #[command(flatten)]
     pub(crate) viewers: ViewerArgs,
-    /// Speed at first, as a factor of real time.
+    /// Initial speed, as a factor of real time.
     #[arg(long, value_name = "X", default_value_t = 1.0, value_parser = speed)]
     pub(crate) speed: f32,
-    /// Wait for a viewer's play button; without it playback begins with the first viewer.
+    /// Start paused, until a viewer presses play; by default playback begins with the first viewer.
     #[arg(long)]
     pub(crate) paused: bool,
 }
@@ -37,10 +37,10 @@ pub(crate) struct ReplayArgs {
 /// Access of viewers.
 #[derive(Debug, Args)]
 pub(crate) struct ViewerArgs {
-    /// Let a viewer that is a web page look on, beside pages of this machine, as `https://app.foxglove.dev`; repeatable.
+    /// Allow a viewer that is a web page of another origin, such as `https://app.foxglove.dev`; repeatable.
     #[arg(long = "allow-origin", value_name = "URL", value_parser = origin)]
     pub(crate) allowed_origins: Vec<String>,
-    /// Let other machines look on without the token that is part of the printed address.
+    /// Allow other machines without the token that is part of the printed address.
     #[arg(long)]
     pub(crate) open: bool,
 }

@@ -20,7 +20,7 @@ const ENGINES: u32 = 16;
 
 #[derive(Debug, clap::Args)]
 pub(crate) struct ServeArgs {
-    /// Address for HTTP, `off` for none; port 0 for any that is free, and so below.
+    /// Address for HTTP, or `off`; port 0 picks a free one (also for the two below).
     #[arg(long, value_name = "ADDRESS", default_value = "127.0.0.1:8080")]
     listen: ListenAddress,
     /// Address for Arrow Flight SQL.
@@ -29,16 +29,16 @@ pub(crate) struct ServeArgs {
     /// Address for Postgres' protocol.
     #[arg(long, value_name = "ADDRESS", default_value = "127.0.0.1:5433")]
     postgres: ListenAddress,
-    /// File of tokens, without which only this machine may ask; `echolake token` makes its lines.
+    /// File of tokens; without it only this machine has access. `echolake token` makes its lines.
     #[arg(long, value_name = "FILE")]
     tokens: Option<PathBuf>,
-    /// Memory that the queries may hold, all together; if they hold more, the largest client's engine ends.
+    /// Memory limit of all queries together, MiB; if it is exceeded, the engine of the largest client is ended.
     #[arg(long, value_name = "MIB", default_value_t = MEMORY_MIB, value_parser = clap::value_parser!(u32).range(64..))]
     memory: u32,
-    /// Clients at once. The queries of each run in an engine, a process of their own; one that is idle makes room.
+    /// Limit of concurrent clients. Each client's queries run in an engine, a process of its own; idle engines make room.
     #[arg(long, value_name = "N", default_value_t = ENGINES, value_parser = clap::value_parser!(u32).range(1..=256))]
     engines: u32,
-    /// Folder for temporary files, as of sorts that do not fit into memory; by default `temp` in the lake.
+    /// Folder for temporary files, such as sorts that do not fit into memory; by default `temp` in the lake.
     #[arg(long, value_name = "DIR")]
     temp: Option<PathBuf>,
 }

@@ -15,7 +15,7 @@ use serde::de::DeserializeOwned;
 
 #[derive(Debug, clap::Args)]
 pub(crate) struct SqlArgs {
-    /// The query; - for standard input. Without it a prompt, or standard input where that is no terminal.
+    /// The query, or `-` for standard input; by default a prompt, or standard input if that is no terminal.
     query: Option<String>,
     /// Format of the answer.
     #[arg(long, value_enum, default_value_t = FormatArg::Table)]

@@ -28,7 +28,7 @@ use crate::progress::CommandProgress;
 pub(crate) struct TwinArgs {
     /// The measured surface.
     pub(crate) surface: SurfaceId,
-    /// Number of pairs that are listed: those that are farthest apart.
+    /// Number of listed pairs, those with the largest differences.
     #[arg(long, value_name = "N", default_value_t = 10)]
     pub(crate) pairs: usize,
     /// Print the differences as JSON.
@@ -105,9 +105,9 @@ pub(crate) async fn run(args: &TwinArgs, lake_url: &str) -> anyhow::Result<Comma
     let computing = TwinComputation::new(&lake, surface, &path).await?;
     let flag = stop.clone();
     tokio::task::spawn_blocking(move || computing.compute_missing(flag.flag(), &progress)).await??;
-    anyhow::ensure!(!stop.is_made(), "stopped; hint: the same command goes on where this one ended");
+    anyhow::ensure!(!stop.is_made(), "stopped; hint: run the same command again to resume");
     super::ingest::take_in(&lake, pending(&lake).await?, stop.flag(), &CommandProgress::new()).await?;
-    anyhow::ensure!(!stop.is_made(), "stopped; hint: the same command goes on where this one ended");
+    anyhow::ensure!(!stop.is_made(), "stopped; hint: run the same command again to resume");
     let differences = TwinDifferences::read(&lake, surface, args.pairs).await?;
     match args.json {
         true => super::print(&serde_json::to_string_pretty(&differences)?)?,

@@ -10,11 +10,11 @@ use echolake_lake::KEEP_HOURS;
 
 #[derive(Debug, Args)]
 pub(crate) struct VacuumArgs {
-    /// Keep files that went out of their table less than this long ago: longer than any query runs. 168 at most,
-    /// because a table's log forgets after a week when that was.
+    /// Keep files that were removed from their table less than this many hours ago; must exceed the longest query. At
+    /// most 168: table logs drop the time of removal after a week.
     #[arg(long, value_name = "HOURS", default_value_t = KEEP_HOURS, value_parser = clap::value_parser!(u32).range(0..=KEEP_HOURS as i64))]
     pub(crate) keep_hours: u32,
-    /// Only say what would be deleted.
+    /// List what would be deleted, and delete nothing.
     #[arg(long)]
     pub(crate) dry_run: bool,
     /// Print what was done as JSON.

@@ -10,6 +10,7 @@ use object_store::{ObjectStore, ObjectStoreExt as _, PutMode};
 use crate::location::LakeLocation;
 #[cfg(feature = "tables")]
 use crate::tables::delta::DeltaLog;
+use crate::unused;
 use crate::{Error, LAKE_FORMAT, LakeConfig, ReferenceSurfaces, Result};
 
 /// A lake. Cheap to clone.
@@ -67,7 +68,7 @@ impl Lake {
     /// ```
     ///
     /// # Errors
-    /// As [`Lake::open`]; [`Error::OtherRig`] if the lake exists and was made for another rig, and
+    /// As [`Lake::open`]; [`Error::OtherRig`] if the lake has runs and was made for another rig, and
     /// [`Error::Occupied`] if other files do.
     pub async fn open_or_create(url: &str, rig: &Rig, references: &ReferenceSurfaces) -> Result<Self> {
         Self::open_or_create_at(LakeLocation::parse(url)?, rig, references).await
@@ -92,12 +93,44 @@ impl Lake {
             Some(config) => config,
             None => create_config(&location, rig, references).await?,
         };
-        let lake = Self::assemble(location, config)?;
-        lake.fits(rig)?;
+        let mut lake = Self::assemble(location, config)?;
+        if let Err(misfit) = lake.fits(rig) {
+            if !unused::is_unused(&lake).await? {
+                return Err(misfit);
+            }
+            lake = lake.change_rig(rig).await?;
+        }
         // Without them an ingest elsewhere makes them.
         #[cfg(feature = "tables")]
         lake.ensure_tables().await?;
         Ok(lake)
+    }
+
+    // The tables of grid and pairs are made anew for the rig.
+    async fn change_rig(&self, rig: &Rig) -> Result<Self> {
+        unused::delete_tables(self).await?;
+        let references = self.config().references.clone();
+        let config = LakeConfig { format: LAKE_FORMAT, references, rig: rig.clone() };
+        let failed = |e| Error::store("write", format!("{}/{CONFIG}", self.location()), e);
+        self.store().put(&Path::from(CONFIG), config.to_toml()?.into()).await.map_err(failed)?;
+        Self::assemble(self.0.location.clone(), config)
+    }
+
+    /// Removes a lake that holds no runs and no recordings; its folder stays, and other files in it. Returns whether it
+    /// did: any other lake is left as it is.
+    ///
+    /// # Errors
+    /// [`Error::Store`].
+    pub async fn remove_unused(self) -> Result<bool> {
+        let Some(folder) = self.folder() else { return Ok(false) };
+        if !unused::is_unused(&self).await? {
+            return Ok(false);
+        }
+        unused::delete_tables(&self).await?;
+        let failed = |e| Error::store("delete", format!("{}/{CONFIG}", self.location()), e);
+        self.store().delete(&Path::from(CONFIG)).await.map_err(failed)?;
+        unused::remove_empty_folders(folder);
+        Ok(true)
     }
 
     fn assemble(location: LakeLocation, config: LakeConfig) -> Result<Self> {
@@ -242,12 +275,34 @@ mod tests {
     #[tokio::test]
     async fn another_rig_is_refused_with_what_differs() {
         let folder = tempfile::tempdir().expect("a folder");
-        paper(&url(&folder)).await.expect("made");
+        let lake = paper(&url(&folder)).await.expect("made");
         let mut other = Rig::paper();
         other.impulse_response.length = 400;
-        let error =
-            Lake::open_or_create(&url(&folder), &other, &ReferenceSurfaces::default()).await.expect_err("differs");
-        assert!(error.to_string().contains("`impulse_response.length` is 400, the lake's is 384"), "{error}");
+        for used in ["inbox/x.mcap.partial", "runs/flat/x.mcap", "tables/runs/x.parquet"] {
+            lake.store().put(&Path::from(used), "x".into()).await.expect("written");
+            let error =
+                Lake::open_or_create(&url(&folder), &other, &ReferenceSurfaces::default()).await.expect_err("differs");
+            assert!(error.to_string().contains("`impulse_response.length` is 400, the lake's is 384"), "{error}");
+            assert!(!lake.clone().remove_unused().await.expect("looked at"), "{used}");
+            lake.store().delete(&Path::from(used)).await.expect("deleted");
+        }
+    }
+
+    #[tokio::test]
+    async fn a_lake_without_runs_takes_another_rig_and_can_be_removed() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let references = ReferenceSurfaces { direct_sound: crate::DirectSound::Estimated, ..Default::default() };
+        Lake::open_or_create(&url(&folder), &Rig::paper(), &references).await.expect("made");
+        let mut other = Rig::paper();
+        other.grid.layers.truncate(1);
+        paper(&url(&folder)).await.expect("the same rig");
+        Lake::open_or_create(&url(&folder), &other, &ReferenceSurfaces::default()).await.expect("another rig");
+        let lake = Lake::open(&url(&folder)).await.expect("opened");
+        assert_eq!((lake.rig(), &lake.config().references), (&other, &references), "references stay");
+        let pairs = lake.snapshot().await.expect("a view").files(Table::Pairs).iter().map(|f| f.rows).sum::<u64>();
+        assert_eq!(pairs, lake.grid().pairs().len() as u64);
+        assert!(lake.remove_unused().await.expect("removed"));
+        assert_eq!(std::fs::read_dir(folder.path().join("lake")).expect("listed").count(), 0);
     }
 
     #[tokio::test]

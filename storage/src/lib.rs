@@ -23,6 +23,7 @@ mod lake;
 mod location;
 #[cfg(feature = "tables")]
 mod tables;
+mod unused;
 
 pub use config::{DirectSound, LAKE_FORMAT, LakeConfig, ReferenceSurfaces};
 pub use error::{Error, StoreError};

@@ -14,7 +14,7 @@ use crate::durable::DurableFileSystem;
 use crate::{Error, Result};
 
 /// A lake's location, opened.
-#[derive(Debug)]
+#[derive(Debug, Clone)]
 pub(crate) struct LakeLocation {
     /// As the user wrote it.
     pub(crate) text: String,

@@ -32,12 +32,18 @@ pub enum Error {
         source: ErrorCause,
     },
     /// It does not say how to go on.
-    #[error("`{}` cannot be gone on with: {source}; hint: `echolake recover` makes a run of what it holds", path.display())]
+    #[error("`{}` cannot be resumed: {source}; hint: `echolake recover` makes a run of what it holds", path.display())]
     NoPlan {
         /// The file.
         path: PathBuf,
         /// The missing or damaged plan.
         source: ErrorCause,
+    },
+    /// The run was finished or recovered before.
+    #[error("`{}` is there already, made of this recording; hint: delete it if the recording is to be resumed", path.display())]
+    Finished {
+        /// The run's file.
+        path: PathBuf,
     },
     /// The name is taken.
     #[error("`{}` is there already; hint: give another with -o", path.display())]

@@ -24,7 +24,7 @@ pub use error::Error;
 pub struct Report {
     /// The recording.
     pub from: PathBuf,
-    /// What was written; nothing where the recording is whole.
+    /// The written run; `None` if the file is whole and has a run's name.
     pub to: Option<PathBuf>,
     /// Size of the recording, bytes.
     pub bytes: u64,
@@ -48,13 +48,14 @@ impl Report {
 /// Where a recording is rebuilt to, if nobody says otherwise: beside it, under the name that it would have had, or
 /// with `.recovered` in it where it has that name.
 pub fn beside(from: &Path) -> PathBuf {
-    match from.extension().is_some_and(|e| e == "partial") {
+    match is_partial(from) {
         true => from.with_extension(""),
         false => from.with_extension("recovered.mcap"),
     }
 }
 
-/// Rebuilds `from` as `to`, reads it back, and only then gives it its name.
+/// Rebuilds `from` as `to`, reads it back, and only then gives it its name. A whole file is left alone, unless it is a
+/// recording that was stopped: it becomes a run of what it holds.
 ///
 /// # Errors
 /// [`Error`], [`Error::Busy`] where somebody records it; nothing stands at `to` then, and `from` is as it was.
@@ -62,7 +63,7 @@ pub fn recover(from: &Path, to: &Path) -> Result<Report, Error> {
     // What is being recorded goes on growing behind the copy.
     let _lock = lock(from)?;
     let mut report = survey(from)?;
-    if report.defect.is_none() && prove_file(from).is_ok() {
+    if !is_partial(from) && report.defect.is_none() && prove_file(from).is_ok() {
         return Ok(report);
     }
     if to.exists() {
@@ -80,6 +81,11 @@ pub fn recover(from: &Path, to: &Path) -> Result<Report, Error> {
     }
     report.to = Some(to.to_owned());
     Ok(report)
+}
+
+/// Returns whether the name is that of an unfinished recording.
+pub fn is_partial(path: &Path) -> bool {
+    path.extension().is_some_and(|e| e == "partial")
 }
 
 // What there is to keep, without writing anything.

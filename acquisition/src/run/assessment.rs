@@ -59,12 +59,11 @@ impl TakeAssessor {
             taper_hz: 0.0,
             length: TransformLength::Fast,
         })?;
-        let reference = rig.impulse_response.reference_temperature_c.get();
         Ok(Self {
             scratch: plan.scratch(),
             plan,
             response: vec![0.0; recording_len],
-            signal_len: chain::raw_len(rig.impulse_response.length, reference).min(recording_len),
+            signal_len: response_len(rig).min(recording_len),
             rate_hz,
         })
     }
@@ -91,8 +90,7 @@ impl TakeAssessor {
 
     // The deconvolution spreads noise over the whole length; far behind the response there is nothing else.
     fn snr_db(&self) -> f64 {
-        let len = self.response.len();
-        let quiet = (len / 2).max(self.signal_len)..len / 4 * 3;
+        let quiet = quiet_range(self.response.len(), self.signal_len);
         let (Some(noise), signal) = (self.response.get(quiet), &self.response[..self.signal_len]) else {
             return f64::NAN;
         };
@@ -147,6 +145,16 @@ impl TakeAssessment {
         }
         reasons
     }
+}
+
+/// Samples of a rig's responses, before they are corrected to the reference temperature.
+pub(crate) fn response_len(rig: &Rig) -> usize {
+    chain::raw_len(rig.impulse_response.length, rig.impulse_response.reference_temperature_c.get())
+}
+
+/// Samples of a deconvolved recording behind the response that hold noise alone; an empty range if there are none.
+pub(crate) fn quiet_range(recorded: usize, response: usize) -> std::ops::Range<usize> {
+    (recorded / 2).max(response)..recorded / 4 * 3
 }
 
 fn mean_power(x: &[f32]) -> f64 {

@@ -215,7 +215,7 @@ impl<'a> RunController<'a> {
         let (left_out, of) = (work.pairs.len() - todo.len(), work.pairs.len());
         let what = match work.before.is_empty() {
             true => format!("{of} pairs with rig {}, {}", self.rig.name, self.devices.origin.label()),
-            false => format!("gone on with: {left_out} of {of} pairs are measured already"),
+            false => format!("resumed: {left_out} of {of} pairs are measured already"),
         };
         run.say(LogLevel::Info, &what)?;
         for (done, pair) in todo.iter().enumerate() {
@@ -255,7 +255,7 @@ impl<'a> RunController<'a> {
             }
             observe(RunEvent::Continued);
             run.ended = run.ended.max(self.air()?.at);
-            run.say(LogLevel::Info, "gone on with by hand")?;
+            run.say(LogLevel::Info, "continued by hand")?;
         }
         Ok(is_set(&control.stop))
     }

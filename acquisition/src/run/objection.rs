@@ -1,5 +1,10 @@
 //! Reasons to reject a take, with advice for the rig's operator.
 
+/// The ratio of signal to noise, as an unknown quantity.
+pub(crate) const SIGNAL_TO_NOISE: &str = "signal-to-noise ratio";
+/// The arrival of the direct sound, as an unknown quantity.
+pub(crate) const ARRIVAL: &str = "arrival of the direct sound";
+
 /// A reason to reject a take. Its text is recorded in the verdict.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum TakeObjection {
@@ -10,7 +15,7 @@ pub enum TakeObjection {
         samples: u32,
     },
     /// The loopback is too soft.
-    #[error("loopback at {dbfs:.1} dBFS, least {least_dbfs:.1}")]
+    #[error("loopback at {dbfs:.1} dBFS, expected at least {least_dbfs:.1} dBFS")]
     Loopback {
         /// Its level, dB re full scale.
         dbfs: f64,
@@ -18,7 +23,7 @@ pub enum TakeObjection {
         least_dbfs: f64,
     },
     /// Too little signal over too much noise.
-    #[error("signal-to-noise ratio {snr_db:.1} dB, least {least_db:.1}")]
+    #[error("signal-to-noise ratio {snr_db:.1} dB, expected at least {least_db:.1} dB")]
     Noise {
         /// The ratio, dB.
         snr_db: f64,
@@ -26,7 +31,7 @@ pub enum TakeObjection {
         least_db: f64,
     },
     /// The direct sound comes at another time than geometry and temperature give.
-    #[error("direct sound {off_us:.1} us off, most {most_us:.1}")]
+    #[error("direct sound {off_us:.1} us off, limit {most_us:.1} us")]
     Arrival {
         /// The difference, us.
         off_us: f64,
@@ -34,7 +39,7 @@ pub enum TakeObjection {
         most_us: f64,
     },
     /// It is loud outside.
-    #[error("{level_db:.1} dB outside, most {most_db:.1}")]
+    #[error("outside noise {level_db:.1} dB, limit {most_db:.1} dB")]
     Outside {
         /// Sound pressure level, dB re 20 uPa.
         level_db: f64,
@@ -86,6 +91,9 @@ impl TakeObjection {
             Self::Noise { .. } => "are amplifier and microphone on, and the drives off?",
             Self::Arrival { .. } => "do microphone and speaker stand where the arms say, and is the temperature right?",
             Self::Outside { .. } => "wait until it is quiet, or raise `validation.outside_level_db` in the rig file",
+            Self::Unknown { what: SIGNAL_TO_NOISE | ARRIVAL } => {
+                "are recording and response long enough? See `sweep` and `impulse_response.length` in the rig file"
+            }
             Self::Unknown { .. } | Self::Implausible { .. } => "is the ambient sensor plugged in, and the right one?",
             Self::Refused { .. } => "look at the robots' own messages; are they referenced, and is the grid the rig's?",
         }

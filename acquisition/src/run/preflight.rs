@@ -2,10 +2,10 @@
 
 use std::path::Path;
 
-use echolake_dsp::chain::raw_len;
 use echolake_schema::{Pair, Rig};
 
 use crate::disk::free_bytes;
+use crate::run::assessment::{quiet_range, response_len};
 use crate::run::controller::watch::KEPT_FREE;
 use crate::run::controller::{RecordingMode, RunController, implausible};
 
@@ -44,8 +44,7 @@ impl std::fmt::Display for PreflightFinding {
 
 /// Estimates the file size of a run of so many pairs, bytes.
 pub fn expected_bytes(rig: &Rig, keep: RecordingMode, pairs: usize) -> u64 {
-    let reference = rig.impulse_response.reference_temperature_c.get();
-    let response = raw_len(rig.impulse_response.length, reference) as f64 * RESPONSE_BYTES_A_SAMPLE;
+    let response = response_len(rig) as f64 * RESPONSE_BYTES_A_SAMPLE;
     let sweep = match keep {
         RecordingMode::Sweeps => rig.recording_len() as f64 * SWEEP_BYTES_A_SAMPLE,
         RecordingMode::ResponsesOnly => 0.0,
@@ -71,6 +70,26 @@ fn room(folder: &Path, free: u64, needed: u64) -> Option<PreflightFinding> {
         );
         PreflightFinding::new(what, "make room, or record impulse responses alone (--ir-only)")
     })
+}
+
+/// Checks that recordings have a quiet part behind the response, from which their noise is known.
+pub fn quiet_part(rig: &Rig) -> Option<PreflightFinding> {
+    let (recorded, response) = (rig.recording_len(), response_len(rig));
+    if !quiet_range(recorded, response).is_empty() {
+        return None;
+    }
+    let secs = |samples: usize| samples as f64 / rig.sweep.rate_hz.get();
+    let needed = (response + 1).div_ceil(3) * 4;
+    let what = format!(
+        "rig `{}`: a recording of {:.2} s is too short to tell the noise behind a response of {:.2} s, expected at least \
+         {:.2} s",
+        rig.name,
+        secs(recorded),
+        secs(response),
+        secs(needed)
+    );
+    let hint = "raise `sweep.duration_secs` or `sweep.tail_secs` in the rig file, or lower `impulse_response.length`";
+    Some(PreflightFinding::new(what, hint))
 }
 
 /// Checks sensor, loopback, level and room: a reading, and a take at a pair that is not recorded. A single take may be
@@ -119,6 +138,22 @@ mod tests {
             "{}",
             megabytes(RecordingMode::ResponsesOnly)
         );
+    }
+
+    #[test]
+    fn a_rig_whose_noise_cannot_be_told_is_refused_with_what_it_needs() {
+        assert_eq!(quiet_part(&Rig::paper()), None);
+        let room = |secs: f64| {
+            let text = format!("sweep = {{ rate_hz = 48000, high_hz = 20000, duration_secs = {secs}, tail_secs = 0 }}");
+            Rig::from_toml(&format!("{text}\nimpulse_response.length = 48000\nbands.centres_hz = [1000]"))
+                .expect("a rig")
+        };
+        let finding = quiet_part(&room(0.5)).expect("too short").to_string();
+        assert!(finding.contains("of 0.50 s") && finding.contains("sweep.duration_secs"), "{finding}");
+        let needed = finding.split("at least ").nth(1).and_then(|rest| rest.split(' ').next());
+        let needed: f64 = needed.and_then(|secs| secs.parse().ok()).expect("seconds");
+        assert_eq!(quiet_part(&room(needed + 0.01)), None);
+        assert!(quiet_part(&room(needed - 0.01)).is_some());
     }
 
     #[test]

@@ -91,7 +91,10 @@ impl RunJob<'_> {
     pub(crate) fn look_over(&self, controller: &mut RunController<'_>, pairs: &[Pair]) -> Vec<PreflightFinding> {
         let todo: Vec<_> = pairs.iter().filter(|p| !self.before.get(&p.id.0).is_some_and(|t| t.accepted)).collect();
         let mut findings: Vec<_> = preflight::disk(self.folder, self.rig, self.keep, todo.len()).into_iter().collect();
-        if let Some(first) = todo.first() {
+        if let Some(finding) = preflight::quiet_part(self.rig) {
+            // Takes would be refused for the same reason.
+            findings.push(finding);
+        } else if let Some(first) = todo.first() {
             findings.extend(preflight::devices(controller, **first));
         }
         findings

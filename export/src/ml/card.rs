@@ -62,7 +62,7 @@ pub(super) fn write(about: &CardContents<'_>) -> String {
     }
     let _ = writeln!(text, "\n## Splits\n\n{} (`{}`, seed {})", about.split_words(), split.by.name(), split.seed);
     text.push_str(
-        "No physical panel (column `group`) is in two splits: neither a side of it, nor a repeated run, nor a symmetry.\nSurfaces that normalise others are for training always, because they are in every number anyway.\n\n",
+        "No physical panel (column `group`) is in two splits: neither a side of it, nor a repeated run, nor a symmetry.\nSurfaces that normalise others are for training always, because they are in every number anyway: leave out rows whose `typology` is `reference` to learn reliefs. Foam has no energy, Flat is 1 by definition.\n\n",
     );
     text.push_str(
         "| split | files | panels | surfaces | rows | height maps |\n| --- | ---: | ---: | ---: | ---: | ---: |\n",
@@ -106,7 +106,7 @@ pub(super) fn write(about: &CardContents<'_>) -> String {
 
 fn front_matter(about: &CardContents<'_>) -> String {
     let mut text = String::from(
-        "---\npretty_name: Reflections of relief surfaces\ntags:\n- acoustics\n- impulse-response\nconfigs:\n",
+        "---\npretty_name: Reflections of relief surfaces\nlicense: unknown\ntags:\n- acoustics\n- impulse-response\nconfigs:\n",
     );
     let mut config = |name: &str,
                       default: bool,
@@ -175,6 +175,9 @@ rows = pl.scan_parquet("data/train-*.parquet").select("surface_id", "tnce_total"
 from echolake.torch import Measurements
 loader = Measurements(".", split="train", symmetries="all", heights=True)
 ```
+
+Responses in column `ir` have the direct sound in them, levels `tnce_*` do not: a set made with `--columns reflected_ir,tnce_total`
+has the responses that the levels are of. `license: unknown` in this file is a placeholder for the licence of the data.
 "#,
     );
 }

@@ -49,7 +49,7 @@ impl AcknowledgementWriter {
         };
         // The run is worth more than the list; its readers take a missing attempt for one that was not measured.
         if let Err(error) = written {
-            eprintln!("warning: the list of what is safe cannot be written: {error}");
+            eprintln!("warning: cannot write the list of acknowledged attempts: {error}");
         }
     }
 }

@@ -44,7 +44,7 @@ fn relief(name: Option<&str>, surface: &SurfaceId, set: &[String]) -> anyhow::Re
     let guessed = || PanelRelief::guess(surface.as_str());
     let name = name.or_else(guessed).with_context(|| {
         format!(
-            "unknown surface `{surface}`: it says nothing of its relief; hint: --panel {} or --mesh FILE",
+            "unknown surface `{surface}`: no relief is known for it; hint: --panel {} or --mesh FILE",
             PanelRelief::NAMES.join("|")
         )
     })?;

@@ -68,25 +68,31 @@ impl RunWatcher {
                 }
                 self.task.at(*accepted);
             }
-            RunEvent::Paused => self.task.say("paused: everything is safe; `p` and Enter, or SIGUSR1, goes on"),
-            RunEvent::Continued => self.task.say("going on"),
+            RunEvent::Paused => {
+                self.task.say("paused: everything measured is safe; `p` and Enter, or SIGUSR1, continues")
+            }
+            RunEvent::Continued => self.task.say("continued"),
         }
     }
 
-    /// Reports the end of the run, or that it broke off.
+    /// Reports the end of the run, or that it was aborted.
     pub(super) fn done(self, end: Option<RunEnd>) {
-        let (busy, whole) = (self.cost.busy.as_secs_f64(), self.begun.elapsed().as_secs_f64());
-        self.task.say(&format!(
-            "recording took {busy:.2} s of {whole:.2}, {:.2} of it waiting for the disk; {:.1} MB in {} checkpoints",
-            self.cost.waited.as_secs_f64(),
-            self.cost.bytes as f64 / 1e6,
-            self.cost.checkpoints
-        ));
+        if self.cost.checkpoints > 0 {
+            let (busy, whole) = (self.cost.busy.as_secs_f64(), self.begun.elapsed().as_secs_f64());
+            self.task.say(&format!(
+                "writing took {busy:.2} s of the run's {whole:.2} s ({:.2} s waiting for the disk); {:.1} MB in {} checkpoints",
+                self.cost.waited.as_secs_f64(),
+                self.cost.bytes as f64 / 1e6,
+                self.cost.checkpoints
+            ));
+        }
         match end {
             Some(RunEnd { accepted, rejected, attempts, .. }) => {
                 self.task.done(format!("{accepted} pairs accepted, {rejected} given up, {attempts} attempts"));
             }
-            None => self.task.done("broken off"),
+            // The error says why; a run that was refused never began.
+            None if self.cost.checkpoints == 0 => self.task.dismiss(),
+            None => self.task.done("aborted"),
         }
     }
 

@@ -9,7 +9,7 @@ use echolake_schema::{Celsius, Pair, Timestamp};
 use super::{Error, NAME, RecordingMode, RunController, RunProgress};
 use crate::rig::{AmbientReading, ArmPositions, DrivePower, Error as RigError};
 use crate::run::assessment::TakeAssessment;
-use crate::run::objection::TakeObjection;
+use crate::run::objection::{ARRIVAL, SIGNAL_TO_NOISE, TakeObjection};
 use crate::run::recorder::LogLevel;
 
 /// Full scale of a take's samples.
@@ -266,8 +266,8 @@ fn verdict_on(
 // A comparison with NaN raises no objection, and a take with unknown values is no good one.
 fn unknowns(found: &TakeAssessment, reading: &AmbientReading) -> Vec<TakeObjection> {
     let values = [
-        ("signal-to-noise ratio", found.snr_db),
-        ("arrival of the direct sound", found.arrival_error_us),
+        (SIGNAL_TO_NOISE, found.snr_db),
+        (ARRIVAL, found.arrival_error_us),
         // Infinite is as bad as unknown here, while a take without any noise has an infinite ratio.
         ("temperature", if reading.temperature_c.is_finite() { reading.temperature_c } else { f64::NAN }),
         ("level outside", reading.outside_level_db),

@@ -45,7 +45,7 @@ pub enum Error {
     },
     /// The clock went backwards.
     #[error(
-        "the clock went back by {back_secs:.1} s, to {now}; hint: set it right (is NTP on?), and go on when it is past {before}"
+        "the clock went back by {back_secs:.1} s, to {now}; hint: set it right (is NTP on?), and resume when it is past {before}"
     )]
     Clock {
         /// Last time before the jump.

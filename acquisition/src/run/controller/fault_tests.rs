@@ -225,7 +225,7 @@ fn lasting_clipping_is_named() {
 #[test]
 fn lasting_noise_outside_is_named() {
     let loud = |r: Result<AmbientReading, RigError>| r.map(|r| AmbientReading { outside_level_db: 81.0, ..r });
-    check(DeviceFault { reading: loud, ..NONE }, "81.0 dB outside, most 65.0; hint: wait until it is quiet");
+    check(DeviceFault { reading: loud, ..NONE }, "outside noise 81.0 dB, limit 65.0 dB; hint: wait until it is quiet");
 }
 
 #[test]

@@ -271,7 +271,7 @@ fn what_something_outside_spoils_is_measured_again() {
     assert!(!spoiled.is_empty());
     assert_eq!(attempts, 600 + spoiled.len() as u64);
     for v in spoiled {
-        assert!(v.reasons.join("; ").contains("dB outside"), "{v:?}");
+        assert!(v.reasons.join("; ").contains("outside noise"), "{v:?}");
         assert!(verdicts.iter().any(|w| w.pair_id == v.pair_id && w.verdict() == Verdict::Accepted), "{v:?}");
     }
 }

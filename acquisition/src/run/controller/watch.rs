@@ -87,7 +87,10 @@ mod tests {
         watch.accepted();
         assert!(watch.given_up(&loud).is_ok() && watch.given_up(&loud).is_ok());
         let error = watch.given_up(&loud).expect_err("the third in a row").to_string();
-        assert!(error.contains("3 pairs") && error.contains("80.0 dB outside") && error.contains("quiet"), "{error}");
+        assert!(
+            error.contains("3 pairs") && error.contains("outside noise 80.0 dB") && error.contains("quiet"),
+            "{error}"
+        );
     }
 
     #[test]

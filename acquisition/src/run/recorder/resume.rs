@@ -132,7 +132,7 @@ impl Recorder {
     /// then it is as it was, whatever happens.
     ///
     /// # Errors
-    /// As [`Held::read`]; [`Error::Busy`] where somebody records it, [`Error::Exists`] where the run is whole already,
+    /// As [`Held::read`]; [`Error::Busy`] where somebody records it, [`Error::Finished`] where the run is whole already,
     /// [`Error::Write`] where there is no room for the copy.
     pub fn resume(partial: &Path) -> Result<(Self, Held), Error> {
         let path = partial.with_extension("");
@@ -141,7 +141,7 @@ impl Recorder {
             return Err(Error::NoPlan { path: partial.to_owned(), source });
         }
         if path.exists() {
-            return Err(Error::Exists { path });
+            return Err(Error::Finished { path });
         }
         // Held until the copy stands in its place.
         let _lock = lock(partial)?;
