@@ -50,7 +50,7 @@ fn runs_are_named_in_every_way_and_damage_is_told() {
     let named = ["flat", "--allow-origin", "https://viewer.example/"];
     assert!(!replayed(&place, &named).1.contains("hint: a viewer on the web"));
     let (_, said) = replayed_at(&place, "0.0.0.0:0", &["flat"]);
-    assert!(said.contains("/?token=") && !said.contains("warning: whoever"), "{said}");
+    assert!(said.contains("/?token=") && !said.contains("warning: anyone"), "{said}");
     let (_, said) = replayed_at(&place, "0.0.0.0:0", &["flat", "--open"]);
-    assert!(!said.contains("token") && said.contains("warning: whoever"), "{said}");
+    assert!(!said.contains("token") && said.contains("warning: anyone"), "{said}");
 }
