@@ -70,6 +70,8 @@ struct BandCouple<T> {
 pub struct FilterBankScratch<T> {
     signal: Vec<T>,
     spectrum: Vec<Complex<T>>,
+    /// Spectrum of the direct sound.
+    direct: Vec<Complex<T>>,
     /// `[couples x len]`.
     coupled: Vec<Complex<T>>,
     work: Vec<Complex<T>>,
@@ -130,6 +132,7 @@ impl<T: RealSample> FilterBankPlan<T> {
         FilterBankScratch {
             signal: self.forward.make_input_vec(),
             spectrum: self.forward.make_output_vec(),
+            direct: self.forward.make_output_vec(),
             coupled: vec![Complex::default(); self.couples.len() * self.len],
             work: vec![Complex::default(); work],
         }
@@ -184,11 +187,12 @@ impl<T: RealSample> FilterBankPlan<T> {
     ) -> Result<(), Error> {
         check_len("the sensitivities", sensitivities.len(), self.bands)?;
         self.spectrum(direct, scratch)?;
-        let direct = scratch.spectrum.clone();
+        std::mem::swap(&mut scratch.spectrum, &mut scratch.direct);
         self.spectrum(reflected, scratch)?;
+        let direct = &scratch.direct;
         for (gains, sensitivity) in self.gains.chunks_exact(direct.len()).zip(sensitivities) {
             let mut sum = EnergySensitivity::default();
-            for (bin, ((x, d), gain)) in scratch.spectrum.iter().zip(&direct).zip(gains).enumerate() {
+            for (bin, ((x, d), gain)) in scratch.spectrum.iter().zip(direct).zip(gains).enumerate() {
                 let (weight, angle) = (self.weight(bin) * gain.f64().powi(2) / self.len as f64, angle(bin, self.len));
                 let (product, power) = ((x.conj() * d), d.norm_sqr().f64());
                 let energy = weight * x.norm_sqr().f64();

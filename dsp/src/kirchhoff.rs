@@ -7,7 +7,7 @@
 //! shadows; worse at grazing angles. `tests/simulation/compare_bem.py` compares it with a boundary-element method.
 //! With facets of 2.14 mm a flat plate is within 0.04 dB of its image source, 2.5 to 40 kHz.
 //!
-//! What depends on a facet's direction or distance and on the frequency, directivity and the air's absorption, is
+//! Directivity and the air's absorption, which depend on a facet's direction or distance and on the frequency, are
 //! gathered at a few frequencies at once and interpolated between them.
 
 use std::f64::consts::PI;

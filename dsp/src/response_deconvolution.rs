@@ -7,7 +7,7 @@ use crate::{Error, RealSample};
 
 /// A [`DeconvolutionPlan`] whose numbers are those of its division's definition.
 ///
-/// Where nothing is left beyond the sweep's range, padding and single precision make no difference. With a floor, and more
+/// If nothing is left beyond the sweep's range, padding and single precision make no difference. With a floor, and more
 /// so without one, bins in which the loopback has next to no power decide what is found there: the transforms have the
 /// recording's own length, and literal division is done in double precision.
 pub struct ResponseDeconvolution<T: RealSample>(Precision<T>);

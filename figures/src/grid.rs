@@ -125,7 +125,7 @@ pub struct GridFigure {
     pub with_caption: bool,
 }
 
-/// Where the parts of a panel are.
+/// Places of the parts of a panel.
 struct PanelLayout {
     labels: f32,
     side: f32,
@@ -245,7 +245,7 @@ impl GridFigure {
     }
 }
 
-/// Where the cells of a layer are: whole pixels, so that they touch.
+/// Places of the cells of a layer: whole pixels, so that they touch.
 struct BlockLayout {
     x: f32,
     y: f32,

@@ -1,8 +1,8 @@
-//! What a file says of itself: title, command, query, version of the lake, program.
+//! Notes inside a file: title, command, query, version of the lake, program.
 
 use serde::Serialize;
 
-/// What a file says of itself. It has no time and no path of a machine, so that the same lake gives the same bytes.
+/// Notes inside a file. They have no time and no path of a machine, so that the same lake gives the same bytes.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize)]
 pub struct FigureNotes {
     /// The title.

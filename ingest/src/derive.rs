@@ -3,6 +3,7 @@
 
 use std::sync::Arc;
 
+use echolake_dsp::foam::subtract;
 use echolake_dsp::temperature::speed_of_sound;
 use echolake_dsp::uncertainty::{EnergySensitivity, LevelUncertainty};
 use echolake_lake::{EncodedFile, FileEncoder, Lake, StagedFile, encode};
@@ -156,12 +157,13 @@ impl ReferenceDerivation {
         let Some(flat) = self.references.chosen.flat_residual else { return Ok(None) };
         let length = lake.rig().impulse_response.length;
         let mut fit = residual_fit(lake.rig()).map_err(failed)?;
+        let mut reflected = vec![0.0; length];
         for (pair, ir) in responses.pairs.iter().zip(responses.irs.chunks_exact(length)) {
             let (Some((direct, _)), Some(arrivals)) = (self.references.chosen.of_pair(*pair), arrivals(lake, *pair))
             else {
                 continue;
             };
-            let reflected: Vec<f32> = ir.iter().zip(direct).map(|(ir, direct)| ir - direct).collect();
+            subtract(ir, direct, &mut reflected);
             fit.add(&reflected, direct, arrivals[0], arrivals[1]).map_err(failed)?;
         }
         let is_flat = self.references.only_flat.as_ref() == Some(&keys.surface);

@@ -3,6 +3,7 @@
 use std::collections::{BTreeSet, HashMap};
 use std::sync::Arc;
 
+use echolake_dsp::foam::subtract;
 use echolake_dsp::foam_reflection::FoamReflectionFit;
 use echolake_dsp::geometry::{direct_mm, image_mm};
 use echolake_dsp::temperature::speed_of_sound;
@@ -223,7 +224,8 @@ impl ReferenceResponses {
             .into_iter()
             .filter_map(|(pair, flat)| {
                 let direct = flat_direct.get(&pair)?;
-                let reflected: Vec<f32> = flat.ir.iter().zip(&direct.ir).map(|(a, b)| a - b).collect();
+                let mut reflected = vec![0.0; length];
+                subtract(&flat.ir, &direct.ir, &mut reflected);
                 Some((pair, reflected, direct, flat.celsius))
             })
             .collect();

@@ -163,7 +163,7 @@ pub(crate) struct StepsArgs {
 pub(crate) struct MapArgs {
     #[command(flatten)]
     output: OutputArgs,
-    /// Which surfaces: an SQL predicate over the columns of table surfaces; by default all but Foam.
+    /// Selection of surfaces: an SQL predicate over the columns of table surfaces; by default all but Foam.
     #[arg(long = "where", value_name = "PREDICATE")]
     predicate: Option<String>,
 }

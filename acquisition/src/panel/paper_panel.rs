@@ -17,9 +17,9 @@ pub struct PaperPanel {
     pub settings: &'static [(&'static str, &'static str)],
     /// The panel with the same large shape and nothing on it.
     pub macro_reference: Option<&'static str>,
-    /// What the paper says of it.
+    /// Statements of the paper about it.
     pub printed: &'static str,
-    /// What the paper does not say.
+    /// Assumptions, of which the paper says nothing.
     pub assumed: &'static str,
 }
 

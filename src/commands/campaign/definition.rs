@@ -18,7 +18,7 @@ const MOST_RUNS: usize = 1_000;
 #[serde(deny_unknown_fields)]
 pub(super) struct CampaignDefinition {
     pub(super) name: String,
-    /// What it is to show; printed above its tables.
+    /// Its purpose; printed above its tables.
     #[serde(default)]
     pub(super) about: String,
     /// The rig's file, beside this one.
@@ -66,7 +66,7 @@ pub(super) struct ExpectedLevels {
     pub(super) relative_to: Option<SurfaceId>,
     /// Levels by the names of bands, and `total`.
     pub(super) levels_db: BTreeMap<String, f64>,
-    /// Where they are from.
+    /// Their source.
     #[serde(default)]
     pub(super) source: String,
 }

@@ -87,7 +87,7 @@ struct SimulatedWorld {
     effects: SimulationParams,
     /// Displacement of the microphone's and the speaker's arm at each point of the grid, mm.
     calibration_mm: [Vec<[f64; 3]>; 2],
-    /// Where microphone and speaker are.
+    /// Poses of microphone and speaker.
     microphone: TransducerPose,
     speaker: TransducerPose,
     air: Air,
