@@ -238,7 +238,8 @@ async fn a_training_set_is_repeatable_and_leaks_nothing() {
     }
     let (files, again) = (content(&folders[0]), content(&folders[1]));
     assert!(files == again, "the same lake gives the same bytes");
-    assert_eq!(exported[0].parts.iter().map(|p| p.surfaces).sum::<usize>(), SURFACES.len());
+    assert_eq!(exported[0].parts.iter().map(|p| p.surfaces).sum::<usize>(), SURFACES.len() - 2);
+    assert_eq!(exported[0].references.iter().map(|s| s.as_str()).collect::<Vec<_>>(), ["flat", "foam"]);
     let mut split_of: HashMap<String, HashSet<String>> = HashMap::new();
     let mut counted: HashMap<String, u64> = HashMap::new();
     let mut maps: HashSet<(String, String)> = HashSet::new();
@@ -270,7 +271,17 @@ async fn a_training_set_is_repeatable_and_leaks_nothing() {
         card.contains("10.1177/1351010X20986901") && card.contains("seed 1") && card.contains("simulated"),
         "{card}"
     );
-    assert!(card.contains("\nlicense: ") && card.contains("--columns reflected_ir,"), "{card}");
+    assert!(card.contains("\nlicense: unknown\n") && card.contains("--columns reflected_ir,"), "{card}");
+    assert!(card.contains("no rows of this set") && card.contains("size_categories:\n- "), "{card}");
+    let asked = TrainingSet { references: true, license: Some("cc-by-4.0".into()), ..TrainingSet::default() };
+    let folder = home.path().join("with");
+    let all = write_training_set(&lake, &folder, &asked, &mut |_, _| {}).await.expect("written");
+    assert_eq!(all.parts.iter().map(|p| p.surfaces).sum::<usize>(), SURFACES.len());
+    let read = |name: &str| std::fs::read_to_string(folder.join(name)).expect("a document");
+    assert!(read("README.md").contains("\nlicense: cc-by-4.0\n") && !read("README.md").contains("unknown"));
+    assert!(read("README.md").contains("References are among the rows"));
+    assert!(read("croissant.json").contains("\"license\": \"cc-by-4.0\""));
+    assert!(read("surfaces.csv").lines().filter(|l| l.contains("foam")).all(|l| l.contains(",train,")));
     let sums = String::from_utf8(files["SHA256SUMS"].clone()).expect("text");
     assert_eq!(sums.lines().count(), files.len() - 1);
 }

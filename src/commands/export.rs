@@ -53,9 +53,22 @@ pub(crate) struct MlArgs {
     /// Seed of the split and of the order of surfaces.
     #[arg(long, default_value_t = 1)]
     seed: u64,
+    /// Include references (Flat, Foam and other plain plates) as rows of split train.
+    #[arg(long)]
+    references: bool,
+    /// Licence of the data for the card and the metadata, as hubs name it.
+    #[arg(long, value_name = "NAME", value_parser = license)]
+    license: Option<String>,
     /// Print what was written as JSON.
     #[arg(long)]
     json: bool,
+}
+
+fn license(text: &str) -> Result<String, String> {
+    match !text.is_empty() && text.chars().all(|c| c.is_ascii_alphanumeric() || ".-+".contains(c)) {
+        true => Ok(text.to_ascii_lowercase()),
+        false => Err("letters, digits, `.`, `-` and `+` only; hint: a name such as cc-by-4.0 or other".into()),
+    }
 }
 
 // Without this, a URL would become folders of its name.
@@ -165,7 +178,13 @@ async fn ml(lake: &Lake, args: &MlArgs) -> anyhow::Result<()> {
         SymmetriesArg::All => RowSymmetries::All,
     };
     let split = SplitParams { by, test: args.test, validation: args.validation, seed: args.seed };
-    let set = TrainingSet { symmetries, split, columns: args.columns.clone() };
+    let set = TrainingSet {
+        symmetries,
+        split,
+        columns: args.columns.clone(),
+        references: args.references,
+        license: args.license.clone(),
+    };
     let (progress, mut task) = (CommandProgress::new(), None);
     let exported = write_training_set(lake, &args.output, &set, &mut |done, total| {
         step(&progress, &mut task, "surfaces", done, total);
@@ -185,6 +204,10 @@ fn in_words(exported: &ExportSummary) -> String {
             .iter()
             .map(|p| format!("{:<12} {:>6} {:>7} {:>9} {:>10}", p.part.name(), p.files, p.panels, p.surfaces, p.rows)),
     );
+    if !exported.references.is_empty() {
+        let names: Vec<_> = exported.references.iter().map(SurfaceId::as_str).collect();
+        lines.push(format!("{} left out: references (--references includes them)", names.join(", ")));
+    }
     if !exported.left_out.is_empty() {
         let count = exported.left_out.len();
         lines.push(format!("{count} surfaces left out: another side of their panel is held out"));
@@ -210,6 +233,7 @@ fn in_json(exported: &ExportSummary) -> serde_json::Result<String> {
     serde_json::to_string_pretty(&json!({
         "splits": parts,
         "left_out": exported.left_out,
+        "references_left_out": exported.references,
         "waiting": exported.waiting,
         "files": exported.files.iter().map(file).collect::<Vec<_>>(),
     }))

@@ -4,6 +4,7 @@ use std::fmt::Write as _;
 
 use arrow::datatypes::{DataType, Field};
 use echolake_lake::Lake;
+use echolake_schema::SurfaceId;
 use echolake_schema::tables::{COMMENT, UNIT};
 
 use super::split::{SplitBy, SplitPart};
@@ -62,8 +63,13 @@ pub(super) fn write(about: &CardContents<'_>) -> String {
     }
     let _ = writeln!(text, "\n## Splits\n\n{} (`{}`, seed {})", about.split_words(), split.by.name(), split.seed);
     text.push_str(
-        "No physical panel (column `group`) is in two splits: neither a side of it, nor a repeated run, nor a symmetry.\nSurfaces that normalise others are for training always, because they are in every number anyway: leave out rows whose `typology` is `reference` to learn reliefs. Foam has no energy, Flat is 1 by definition.\n\n",
+        "No physical panel (column `group`) is in two splits: neither a side of it, nor a repeated run, nor a symmetry.\n",
     );
+    text.push_str(if about.plan.set.references {
+        "References are among the rows, for training only, because they are in every number anyway: leave out rows whose `typology` is `reference` to learn reliefs. Foam has no energy, Flat is 1 by definition.\n\n"
+    } else {
+        "References (Flat, Foam and other plain plates) are no rows of this set, because Foam has no energy, Flat is 1 by definition, and the height maps of all are zero; `--references` puts them into split train.\n\n"
+    });
     text.push_str(
         "| split | files | panels | surfaces | rows | height maps |\n| --- | ---: | ---: | ---: | ---: | ---: |\n",
     );
@@ -80,12 +86,11 @@ pub(super) fn write(about: &CardContents<'_>) -> String {
         );
     }
     if !about.exported.left_out.is_empty() {
-        let names: Vec<_> = about.exported.left_out.iter().map(|s| s.as_str()).collect();
         let _ = writeln!(
             text,
             "\n{} surfaces are left out, because another side of their panel is held out: {}.",
-            names.len(),
-            names.join(", ")
+            about.exported.left_out.len(),
+            listed(&about.exported.left_out)
         );
     }
     if about.exported.waiting > 0 {
@@ -100,13 +105,20 @@ pub(super) fn write(about: &CardContents<'_>) -> String {
         columns(&mut text, schema.fields().iter().map(AsRef::as_ref));
     }
     usage(&mut text);
+    if about.plan.set.license.is_none() {
+        text.push_str(
+            "\nNo licence of the data is known (`license: unknown` above); `--license cc-by-4.0` names one.\n",
+        );
+    }
     let _ = writeln!(text, "\n## Reference\n\n{PAPER}");
     text
 }
 
 fn front_matter(about: &CardContents<'_>) -> String {
-    let mut text = String::from(
-        "---\npretty_name: Reflections of relief surfaces\nlicense: unknown\ntags:\n- acoustics\n- impulse-response\nconfigs:\n",
+    let mut text = format!(
+        "---\npretty_name: Reflections of relief surfaces\nlicense: {}\nsize_categories:\n- {}\ntags:\n- acoustics\n- impulse-response\nconfigs:\n",
+        about.plan.set.license.as_deref().unwrap_or("unknown"),
+        size_category(about.exported.parts.iter().map(|p| p.rows).sum()),
     );
     let mut config = |name: &str,
                       default: bool,
@@ -127,6 +139,24 @@ fn front_matter(about: &CardContents<'_>) -> String {
     }
     text.push_str("---\n\n");
     text
+}
+
+/// Returns the names of surfaces, separated by commas.
+pub(super) fn listed(surfaces: &[SurfaceId]) -> String {
+    surfaces.iter().map(SurfaceId::as_str).collect::<Vec<_>>().join(", ")
+}
+
+/// Returns the size category that hubs know for a number of rows.
+fn size_category(rows: u64) -> &'static str {
+    match rows {
+        0..1_000 => "n<1K",
+        1_000..10_000 => "1K<n<10K",
+        10_000..100_000 => "10K<n<100K",
+        100_000..1_000_000 => "100K<n<1M",
+        1_000_000..10_000_000 => "1M<n<10M",
+        10_000_000..100_000_000 => "10M<n<100M",
+        _ => "100M<n<1B",
+    }
 }
 
 fn files(text: &mut String, about: &CardContents<'_>) {
@@ -177,7 +207,7 @@ loader = Measurements(".", split="train", symmetries="all", heights=True)
 ```
 
 Responses in column `ir` have the direct sound in them, levels `tnce_*` do not: a set made with `--columns reflected_ir,tnce_total`
-has the responses that the levels are of. `license: unknown` in this file is a placeholder for the licence of the data.
+has the responses that the levels are of.
 "#,
     );
 }

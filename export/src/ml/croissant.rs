@@ -48,7 +48,7 @@ pub(super) fn write(about: &CardContents<'_>) -> Result<String> {
             "sha256": file.sha256,
         })
     }));
-    let document = json!({
+    let mut document = json!({
         "@context": context(),
         "@type": "sc:Dataset",
         "name": "relief-reflections",
@@ -60,6 +60,9 @@ pub(super) fn write(about: &CardContents<'_>) -> Result<String> {
         "distribution": distribution,
         "recordSet": record_sets,
     });
+    if let Some(license) = &about.plan.set.license {
+        document["license"] = json!(license);
+    }
     serde_json::to_string_pretty(&document).map(|text| text + "\n").map_err(|e| Error::damaged("croissant.json", e))
 }
 

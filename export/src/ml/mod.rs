@@ -48,11 +48,21 @@ pub struct TrainingSet {
     pub split: SplitParams,
     /// Columns of `measurements`, `nce` and `tnce`; the default columns if empty.
     pub columns: Vec<String>,
+    /// True if surfaces that normalise others, and others of typology `reference`, are training rows, too.
+    pub references: bool,
+    /// Licence of the data for the card and the metadata, an SPDX name in lower case; None if it is not known.
+    pub license: Option<String>,
 }
 
 impl Default for TrainingSet {
     fn default() -> Self {
-        Self { symmetries: RowSymmetries::None, split: SplitParams::default(), columns: Vec::new() }
+        Self {
+            symmetries: RowSymmetries::None,
+            split: SplitParams::default(),
+            columns: Vec::new(),
+            references: false,
+            license: None,
+        }
     }
 }
 
@@ -63,6 +73,8 @@ pub struct ExportSummary {
     pub parts: Vec<PartCounts>,
     /// Surfaces that are left out because another side of their panel is held out.
     pub left_out: Vec<SurfaceId>,
+    /// References that are left out, because only reliefs were asked for.
+    pub references: Vec<SurfaceId>,
     /// Runs that are left out because they wait for references.
     pub waiting: usize,
     /// All files with their checksums, by name.
@@ -93,6 +105,7 @@ struct Plan {
     moves: SymmetryMoves,
     shards: Vec<Shard>,
     left_out: Vec<SurfaceId>,
+    references: Vec<SurfaceId>,
     waiting: usize,
 }
 
@@ -107,7 +120,13 @@ struct Shard {
 impl Plan {
     async fn new(lake: &Lake, snapshot: &LakeSnapshot, set: &TrainingSet) -> Result<Self> {
         let columns = TrainingColumns::choose(lake.rig(), &set.columns)?;
-        let (surfaces, waiting) = surfaces::read(lake, snapshot).await?;
+        let (mut surfaces, waiting) = surfaces::read(lake, snapshot).await?;
+        let references: Vec<_> =
+            surfaces.extract_if(.., |s| s.reference && !set.references).map(|reference| reference.id).collect();
+        if surfaces.is_empty() {
+            let reason = format!("the lake has references only ({}); hint: --references", card::listed(&references));
+            return Err(Error::Nothing { reason });
+        }
         let parts = split::assign(&surfaces, set.split)?;
         let mut left_out = Vec::new();
         let mut of_part: [Vec<TrainingSurface>; 3] = Default::default();
@@ -120,7 +139,7 @@ impl Plan {
         let shards =
             SplitPart::ALL.into_iter().zip(of_part).flat_map(|(part, of)| shards(part, of, set.split.seed)).collect();
         let moves = SymmetryMoves::of(lake.grid(), set.symmetries);
-        Ok(Self { set: set.clone(), columns, moves, shards, left_out, waiting })
+        Ok(Self { set: set.clone(), columns, moves, shards, left_out, references, waiting })
     }
 
     fn of_part(&self, part: SplitPart) -> impl Iterator<Item = &TrainingSurface> {
@@ -181,7 +200,8 @@ pub async fn write_training_set(
         files.push(file);
     }
     files.push(pending.write("surfaces.csv", card::sources(&sources)?.as_bytes())?);
-    let mut exported = ExportSummary { parts, left_out: plan.left_out.clone(), waiting: plan.waiting, files };
+    let (left_out, references) = (plan.left_out.clone(), plan.references.clone());
+    let mut exported = ExportSummary { parts, left_out, references, waiting: plan.waiting, files };
     let about = card::CardContents { lake, plan, exported: &exported };
     let (croissant, readme) = (croissant::write(&about)?, card::write(&about));
     exported.files.push(pending.write("croissant.json", croissant.as_bytes())?);

@@ -16,7 +16,7 @@ pub(super) struct TrainingSurface {
     pub(super) typology: String,
     pub(super) macrostructure: Option<String>,
     pub(super) origin: String,
-    /// True if other surfaces name it as their Flat or Foam.
+    /// True if other surfaces name it as their Flat or Foam, or its typology is `reference`.
     pub(super) reference: bool,
     pub(super) runs: Vec<TrainingRun>,
 }
@@ -64,7 +64,7 @@ pub(super) async fn read(lake: &Lake, snapshot: &LakeSnapshot) -> Result<(Vec<Tr
         surface.runs.push(TrainingRun { visible: visible.clone(), file_sha256 });
     }
     let mut surfaces: Vec<_> = surfaces.into_values().filter(|s| !s.runs.is_empty()).collect();
-    surfaces.iter_mut().for_each(|s| s.reference = references.contains(s.id.as_str()));
+    surfaces.iter_mut().for_each(|s| s.reference = s.typology == "reference" || references.contains(s.id.as_str()));
     if surfaces.is_empty() {
         let reason = match waiting {
             0 => "the lake has no runs; hint: `echolake ingest`".to_owned(),
