@@ -198,7 +198,7 @@ fn run_files_that_are_none_or_damaged() {
     assert_eq!(place.number("select count(*) from runs"), 0.0);
 
     // Cut off near its end: what was complete is taken in.
-    ingest("cut.mcap", cut_off(&whole), 3, "its recording was stopped or cut off");
+    ingest("cut.mcap", cut_off(&whole), 3, "its recording was cut off");
     let kept = place.number("select count(*) from measurements");
     assert!(kept > 0.0 && kept < 45.0, "{kept}");
     assert_eq!(place.sql("select state from runs")[0]["state"], "partial");

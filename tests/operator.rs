@@ -69,7 +69,7 @@ fn a_recovered_run_is_taken_in_as_partial() {
     let place = TestFolder::new();
     let partial = stop_a_run(&place);
     place.ok(&["recover", partial.to_str().expect("a name")]);
-    place.fails(3, &["ingest"], "was stopped or cut off");
+    place.fails(0, &["ingest"], "was stopped before its end; all that it holds is in the tables");
     assert_eq!(place.number("select count(*) from runs where state = 'partial'"), 1.0);
     assert!(partial.exists(), "it can still be resumed");
 }
@@ -86,6 +86,11 @@ fn a_refused_first_run_leaves_no_lake_behind() {
     assert!(!place.path("lake").exists());
     std::fs::create_dir(place.path("lake")).expect("made");
     place.fails(1, &acquire, "`sweep.duration_secs`");
+    assert_eq!(std::fs::read_dir(place.path("lake")).expect("the folder stays").count(), 0);
+    // Neither does one that fails before it measures.
+    let taken = std::net::TcpListener::bind("127.0.0.1:0").expect("a port");
+    let address = taken.local_addr().expect("an address").to_string();
+    place.fails(1, &["acquire", "--surface", "flat", "--rig", "rig.toml", "--live", &address], "in use");
     assert_eq!(std::fs::read_dir(place.path("lake")).expect("the folder stays").count(), 0);
     // A lake that was there before stays, and a run of another rig is refused in words.
     place.acquire("flat", &["--ir-only"]);

@@ -50,6 +50,8 @@ pub struct IngestedRun {
     pub damaged: Vec<String>,
     /// True if the file was closed and records how the run ended.
     pub whole: bool,
+    /// True if the run was stopped before its end and nothing that was recorded is lost.
+    pub stopped: bool,
 }
 
 /// Outcome of an ingest: the run is new, or was in the lake before.
@@ -214,6 +216,7 @@ impl IngestWork {
             outcome: IngestOutcome::Added,
             damaged: content.damaged.clone(),
             whole: content.is_whole(),
+            stopped: content.is_stopped(),
         };
         if known.is_some_and(|k| k.run_derivation == derivation) {
             return Ok(ReadyJob { staged: Vec::new(), report: taken });

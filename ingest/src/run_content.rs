@@ -31,6 +31,8 @@ pub(crate) struct RunContent {
     pub(crate) events: Vec<(i64, Event)>,
     pub(crate) last_time_ns: i64,
     pub(crate) integrity: FileIntegrity,
+    /// `recover` made the file of a recording that had no defect.
+    pub(crate) recovered_whole: bool,
     /// What could not be read, in words.
     pub(crate) damaged: Vec<String>,
 }
@@ -48,7 +50,8 @@ struct Envelope {
     attachments: BTreeMap<String, Bytes>,
 }
 
-const NEEDED_METADATA: [&str; 3] = [topics::RUN_METADATA, topics::RUN_PLAN_METADATA, topics::RUN_END_METADATA];
+const NEEDED_METADATA: [&str; 4] =
+    [topics::RUN_METADATA, topics::RUN_PLAN_METADATA, topics::RUN_END_METADATA, topics::RECOVERY_METADATA];
 const NEEDED_ATTACHMENTS: [&str; 3] = [topics::RIG_ATTACHMENT, topics::SURFACE_ATTACHMENT, topics::HEIGHTS_ATTACHMENT];
 /// Largest heights that are kept: those of 2048 by 2048 points.
 const LARGEST_HEIGHTS: usize = 16 << 20;
@@ -183,6 +186,8 @@ impl RunContent {
         // How a run ended is no reason to refuse what it measured.
         let end = envelope.metadata.get(topics::RUN_END_METADATA).map(RunEnd::from_metadata);
         let end = end.and_then(|end| end.map_err(|cause| damaged.push(cause.to_string())).ok());
+        let recovery = envelope.metadata.get(topics::RECOVERY_METADATA);
+        let recovered_whole = recovery.is_some_and(|record| record.get("defect").is_some_and(String::is_empty));
         let responses = best_responses(whole.responses);
         let rejected = given_up(&whole.verdicts);
         let attempts = whole.verdicts.len() as u64;
@@ -199,6 +204,7 @@ impl RunContent {
             events: whole.events,
             last_time_ns: whole.last_time_ns,
             integrity,
+            recovered_whole,
             damaged,
         })
     }
@@ -206,6 +212,11 @@ impl RunContent {
     /// The file was closed and says how the run ended.
     pub(crate) fn is_whole(&self) -> bool {
         self.integrity.closed && self.end.is_some()
+    }
+
+    /// The run was stopped before its end, and `recover` found nothing that was lost.
+    pub(crate) fn is_stopped(&self) -> bool {
+        self.integrity.closed && self.end.is_none() && self.recovered_whole
     }
 }
 

@@ -119,12 +119,21 @@ struct NewRun {
 }
 
 pub(crate) async fn run(args: &AcquireArgs, lake_url: &str) -> anyhow::Result<CommandOutcome> {
+    let is_new = args.resume.is_none() && matches!(Lake::open(lake_url).await, Err(LakeError::NoLake { .. }));
+    let has_folder = Path::new(lake_url).exists();
+    let outcome = measure(args, lake_url).await;
+    if outcome.is_err() && is_new {
+        // The refusal matters more than what is left of an empty lake.
+        let _ = remove_new_lake(lake_url, has_folder).await;
+    }
+    outcome
+}
+
+async fn measure(args: &AcquireArgs, lake_url: &str) -> anyhow::Result<CommandOutcome> {
     let pace = if args.pace > 0.0 { TakePace::Secs(args.pace) } else { TakePace::Fast };
     let control = Arc::new(RunControl::default());
     watch::obey(&control)?;
     let progress = CommandProgress::new();
-    let is_new = args.resume.is_none() && matches!(Lake::open(lake_url).await, Err(LakeError::NoLake { .. }));
-    let has_folder = Path::new(lake_url).exists();
     let job = match &args.resume {
         Some(partial) => AcquireJob::Resumed { partial: partial.clone(), held: Box::new(Held::read(partial)?) },
         None => fresh(args, lake_url, &progress).await?,
@@ -172,9 +181,6 @@ pub(crate) async fn run(args: &AcquireArgs, lake_url: &str) -> anyhow::Result<Co
         Err(error) => {
             if partial.exists() {
                 tell_resume(&partial, lake_url);
-            } else if is_new {
-                // The refusal matters more than what is left of an empty lake.
-                let _ = remove_new_lake(lake_url, has_folder).await;
             }
             Err(error.into())
         }

@@ -25,7 +25,7 @@ use tables::{LevelTable, LevelsBySurface, TableColours, make_tables};
 
 #[derive(Debug, Subcommand)]
 pub(crate) enum CampaignSubcommand {
-    /// Measure what the lake lacks, ingest it, and print levels by band beside those that are expected.
+    /// Measure the surfaces that the lake lacks, ingest them, and print levels by band beside the expected ones.
     Run(CampaignRunArgs),
 }
 

@@ -19,9 +19,9 @@ use std::path::PathBuf;
 
 #[derive(Debug, Args)]
 pub(crate) struct DemoArgs {
-    /// Measure this many surfaces instead: the references, then panels of every typology with random parameters, two brick
-    /// walls for each of stone as the paper has, and the paper's own under their names.
-    /// Those that are measured already are not measured again.
+    /// Measure this many surfaces instead: the references, then panels of every typology with random parameters (two
+    /// brick walls per stone wall, as in the paper), and the paper's own panels by name.
+    /// Surfaces that the lake has are not measured again.
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=LARGEST as i64))]
     pub(crate) surfaces: Option<u32>,
     /// Record no sweeps, only impulse responses: a tenth of the space.

@@ -22,11 +22,11 @@ pub(crate) enum ExportCommand {
     Ml(MlArgs),
     /// A slice: the messages of some measurements, as an MCAP file.
     Mcap(McapArgs),
-    /// The responses of surfaces as SOFA, a file each (SingleRoomSRIR).
+    /// The responses of surfaces as SOFA, one file per surface (SingleRoomSRIR).
     Sofa(ResponseArgs),
-    /// The responses of surfaces as the GIR data set has them; `import gir` takes them back.
+    /// The responses of surfaces in the format of the GIR data set; `import gir` reads them.
     Npz(ResponseArgs),
-    /// The recordings of some measurements as WAV files with a manifest; `import wav` takes them back.
+    /// The recordings of some measurements as WAV files with a manifest; `import wav` reads them.
     Wav(WavArgs),
 }
 
@@ -44,10 +44,10 @@ pub(crate) struct MlArgs {
     /// Columns of measurements, nce and tnce, separated by commas; by default ir, temperature_c, snr_db and tnce_*.
     #[arg(long, value_delimiter = ',')]
     columns: Vec<String>,
-    /// Least share of the surfaces in the test set.
+    /// Minimum share of the surfaces in the test set.
     #[arg(long, default_value_t = 0.1)]
     test: f64,
-    /// Least share of the surfaces in the validation set.
+    /// Minimum share of the surfaces in the validation set.
     #[arg(long, default_value_t = 0.1)]
     validation: f64,
     /// Seed of the split and of the order of surfaces.
@@ -106,8 +106,8 @@ struct SelectionArgs {
     /// The measurements: an SQL predicate over the columns of table measurements.
     #[arg(long = "where", value_name = "PREDICATE")]
     predicate: String,
-    /// Do not read the runs' files whole to compare their SHA-256; sizes, indexes and the CRCs of what is read are
-    /// compared all the same.
+    /// Skip the comparison of whole run files by SHA-256; sizes, indexes and the CRCs of all that is read are still
+    /// checked.
     #[arg(long)]
     quick: bool,
 }
@@ -119,7 +119,7 @@ pub(crate) struct McapArgs {
     /// Topics, separated by commas; by default all, and the attachments.
     #[arg(long, value_delimiter = ',')]
     topics: Vec<String>,
-    /// In which chunks messages stand.
+    /// Order of the messages in the file's chunks.
     #[arg(long, value_enum, default_value_t = LayoutArg::ByTopic)]
     layout: LayoutArg,
     /// The new file.
@@ -129,9 +129,9 @@ pub(crate) struct McapArgs {
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 enum LayoutArg {
-    /// Heavy topics in chunks of their own: best for viewers, which read by ranges.
+    /// Heavy topics in separate chunks: for viewers, which read by ranges.
     ByTopic,
-    /// One after the other: for those who read the file as it comes.
+    /// All messages by time: for readers of the file as a stream.
     InTime,
 }
 

@@ -41,7 +41,7 @@ pub(super) struct SelectionArgs {
     /// Names of surfaces.
     #[arg(value_name = "SURFACE", required_unless_present = "predicate")]
     surfaces: Vec<SurfaceId>,
-    /// More surfaces: an SQL predicate over the columns of table surfaces.
+    /// Further surfaces, by an SQL predicate over the columns of table surfaces.
     #[arg(long = "where", value_name = "PREDICATE")]
     predicate: Option<String>,
 }
@@ -67,7 +67,7 @@ pub(crate) struct GridArgs {
     /// Amber in place of red, and a square in each cell over 0 dB.
     #[arg(long)]
     safe_colours: bool,
-    /// Surfaces in a row.
+    /// Number of surfaces per row.
     #[arg(long, default_value_t = 3, value_parser = clap::value_parser!(u32).range(1..=20))]
     columns: u32,
 }
@@ -96,7 +96,7 @@ pub(crate) struct NceArgs {
     /// Grid point whose pairs the mean is over; by default it is over all pairs.
     #[arg(long, value_name = "POINT")]
     microphone: Option<String>,
-    /// Surfaces in a row.
+    /// Number of surfaces per row.
     #[arg(long, default_value_t = 3, value_parser = clap::value_parser!(u32).range(1..=20))]
     columns: u32,
 }
@@ -174,7 +174,7 @@ pub(crate) struct ReliefArgs {
     selection: SelectionArgs,
     #[command(flatten)]
     output: OutputArgs,
-    /// Surfaces in a row.
+    /// Number of surfaces per row.
     #[arg(long, default_value_t = 4, value_parser = clap::value_parser!(u32).range(1..=20))]
     columns: u32,
 }

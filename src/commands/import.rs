@@ -16,41 +16,42 @@ use std::path::PathBuf;
 pub(crate) enum ImportCommand {
     /// Recordings and loopbacks as WAV files, listed in a CSV manifest.
     Wav {
-        /// The manifest.
+        /// CSV manifest of the recordings.
         manifest: PathBuf,
-        /// The rig that made them: sweep range, response length, bands, grid.
+        /// Rig of the recordings: sweep range, response length, bands, grid; by default the lake's, or the paper's for a new
+        /// lake.
         #[arg(long)]
         rig: Option<PathBuf>,
     },
     /// A folder of the published GIR data set.
     Gir {
-        /// The folder.
+        /// Folder of the data set.
         folder: PathBuf,
         /// The rig; by default the lake's, or the paper's with responses of 400 samples for a new lake.
         #[arg(long)]
         rig: Option<PathBuf>,
     },
-    /// Responses as SOFA files (SingleRoomSRIR, SingleRoomMIMOSRIR, GeneralFIR, SimpleFreeFieldHRIR,
-    /// FreeFieldDirectivityTF), one a surface.
+    /// Responses as SOFA files, one per surface (SingleRoomSRIR, SingleRoomMIMOSRIR, GeneralFIR, SimpleFreeFieldHRIR,
+    /// FreeFieldDirectivityTF).
     Sofa {
-        /// The files.
+        /// SOFA files.
         #[arg(required = true, value_name = "FILE")]
         files: Vec<PathBuf>,
         /// The rig; by default the lake's, or the paper's for a new lake.
         #[arg(long)]
         rig: Option<PathBuf>,
-        /// Temperature of the air, whatever files of others say of it.
+        /// Temperature of the air; overrides what foreign files say.
         #[arg(long, value_name = "C", allow_negative_numbers = true)]
         temperature_c: Option<f64>,
     },
-    /// Responses of an HDF5 file, whose datasets a mapping describes; see docs/export.md.
+    /// Responses of an HDF5 file, by a mapping of its datasets; see docs/export.md.
     Hdf5 {
-        /// The mapping.
+        /// Mapping of the datasets, a TOML file.
         mapping: PathBuf,
         /// The rig; by default the lake's, or the paper's for a new lake.
         #[arg(long)]
         rig: Option<PathBuf>,
-        /// Temperature of the air, whatever the mapping says of it.
+        /// Temperature of the air; overrides the mapping.
         #[arg(long, value_name = "C", allow_negative_numbers = true)]
         temperature_c: Option<f64>,
     },

@@ -68,7 +68,7 @@ struct RefusedFile {
 
 impl IngestSummary {
     fn lost(&self) -> bool {
-        !self.refused.is_empty() || self.taken.iter().any(|t| !t.whole || !t.damaged.is_empty())
+        !self.refused.is_empty() || self.taken.iter().any(|t| !(t.whole || t.stopped) || !t.damaged.is_empty())
     }
 
     fn add(&mut self, report: FileReport, progress: &CommandProgress) {
@@ -306,8 +306,10 @@ fn say(progress: &CommandProgress, taken: &IngestedRun) {
         IngestOutcome::Known => progress.say(format!("{run}: is in the lake already, nothing added")),
         IngestOutcome::Added => progress.say(format!("{run}: {measurements} measurements")),
     }
-    if !taken.whole {
-        progress.say(format!("{run}: warning: its recording was stopped or cut off; what it holds is in the tables"));
+    if taken.stopped {
+        progress.say(format!("{run}: its recording was stopped before its end; all that it holds is in the tables"));
+    } else if !taken.whole {
+        progress.say(format!("{run}: warning: its recording was cut off; what it holds is in the tables"));
     }
     for damage in &taken.damaged {
         progress.say(format!("{run}: warning: {damage}"));

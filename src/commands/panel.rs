@@ -23,44 +23,44 @@ const PICTURE_CELLS: usize = 1600;
 /// Arguments of `echolake panel`.
 #[derive(Debug, Args)]
 pub(crate) struct PanelArgs {
-    /// Kind of relief; --list says which there are and what can be set.
+    /// Kind of relief; --list prints all kinds and their parameters.
     #[arg(required_unless_present_any = ["list", "parameters", "group", "next"])]
     name: Option<String>,
-    /// A parameter of it.
+    /// Set a parameter of the relief; repeatable.
     #[arg(long, value_name = "KEY=VALUE")]
     set: Vec<String>,
-    /// A JSON file of parameters, as `-o FILE.json` writes them, in place of a name.
+    /// JSON file of parameters, as `-o FILE.json` writes it, instead of a kind.
     #[arg(long, value_name = "FILE", conflicts_with = "name")]
     parameters: Option<PathBuf>,
     /// Kind of relief of the panel's other side.
     #[arg(long, value_name = "NAME")]
     back: Option<String>,
-    /// A parameter of the other side.
+    /// Set a parameter of the other side; repeatable.
     #[arg(long, value_name = "KEY=VALUE", requires = "back")]
     back_set: Vec<String>,
-    /// A file to write, as often as wanted; its extension tells what: glb, stl, obj or ply the panel's mesh, png a
-    /// picture, npy 512 x 512 heights in mm, json the parameters. Of a panel with two sides FILE.png, FILE.npy and
-    /// FILE.json are two files, FILE_0 and FILE_1. With --group a folder, with --next the next ranges.
+    /// Output file; repeatable. The extension selects the content: glb, stl, obj or ply for the panel's mesh, png for a
+    /// picture, npy for 512 x 512 heights in mm, json for the parameters. The png, npy and json of a panel with two
+    /// sides are written as FILE_0 and FILE_1. With --group, the output folder; with --next, the file of the next ranges.
     #[arg(short, long, required_unless_present = "list", value_name = "FILE")]
     output: Vec<PathBuf>,
-    /// Cells along each side of the mesh; by default 585, which are 1 mm, for walls with joints, and 274 for flat, foam,
-    /// wood and prd.
+    /// Cells along each side of the mesh; by default 585 (1 mm each) for walls with joints, and 274 for flat, foam, wood
+    /// and prd.
     #[arg(long, value_parser = clap::value_parser!(u32).range(16..=2340))]
     cells: Option<u32>,
-    /// Print all reliefs and parameters with ranges, defaults and units; of one relief where it is named.
+    /// Print all kinds and parameters with ranges, defaults and units, or those of the named kind.
     #[arg(long)]
     list: bool,
     /// Print the list as JSON.
     #[arg(long, requires = "list")]
     json: bool,
-    /// Make a group of surfaces: parameters drawn from the ranges in this TOML file. One JSON file a surface and
-    /// group.csv go into the folder that -o names.
+    /// Generate a group of surfaces with parameters drawn from the ranges in this TOML file: one JSON file per surface,
+    /// and group.csv, in the folder of -o.
     #[arg(long, value_name = "RANGES", conflicts_with_all = ["name", "set", "back", "list", "parameters"])]
     group: Option<PathBuf>,
-    /// Surfaces of the group; two are a panel.
+    /// Number of surfaces in the group; two per panel.
     #[arg(long, value_name = "N", default_value_t = 8, value_parser = clap::value_parser!(u32).range(1..=10_000))]
     count: u32,
-    /// Write the ranges of the next group: wider where the last one's results are alike, else narrower.
+    /// Write the ranges of the next group: wider if the last group's results are alike, else narrower.
     #[arg(long, value_name = "RANGES", requires = "results", conflicts_with_all = ["name", "set", "back", "list", "group", "parameters"])]
     next: Option<PathBuf>,
     /// Results of the last group: CSV with surface_id, band and p90_mean_db, from `echolake sql` on surface_stats.
