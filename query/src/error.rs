@@ -104,6 +104,18 @@ impl Error {
         Self::Query { message, place, hint }
     }
 
+    /// Returns the error for a clause that is not planned; the query is marked at the clause's first word in capitals.
+    pub(crate) fn clause(sql: &str, clause: &str, hint: String) -> Self {
+        let word = clause.split(' ').find(|word| !word.is_empty() && word.chars().all(|c| c.is_ascii_uppercase()));
+        let place = word.and_then(|word| {
+            let at = sql.to_ascii_uppercase().find(word)?;
+            let line_start = sql[..at].rfind('\n').map_or(0, |newline| newline + 1);
+            let line = sql[..at].matches('\n').count() + 1;
+            mark(sql, line as u64, sql[line_start..at].chars().count() as u64 + 1)
+        });
+        Self::Query { message: format!("not supported: {clause}"), place, hint: Some(hint) }
+    }
+
     /// Converts an error of running a query.
     pub(crate) fn execution(error: &DataFusionError) -> Self {
         Self::limit(error).unwrap_or_else(|| Self::Execution { message: explain(error).0 })
@@ -149,9 +161,6 @@ fn explain(error: &DataFusionError) -> (String, Option<String>) {
             None => (text.clone(), None),
         },
         DataFusionError::Execution(text) => (text.clone(), None),
-        DataFusionError::NotImplemented(text) if text.contains("a single SQL statement") => {
-            ("one statement at a time".to_owned(), Some("the prompt takes several, each ended by ;".to_owned()))
-        }
         other => (other.strip_backtrace(), None),
     }
 }

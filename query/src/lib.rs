@@ -25,11 +25,14 @@
 mod as_of;
 mod catalog;
 mod control;
+mod dialect;
 mod engine;
 mod error;
 pub mod figure_rows;
+mod friendly_sql;
 mod functions;
 mod gate;
+mod ignored_clauses;
 mod mcap;
 mod opaque;
 pub mod output;

@@ -13,8 +13,7 @@ use datafusion::execution::session_state::SessionState;
 use datafusion::logical_expr::LogicalPlan;
 use datafusion::physical_plan::{ExecutionPlan, execute_stream};
 use datafusion::prelude::SessionContext;
-use datafusion::sql::parser::Statement;
-use datafusion::sql::sqlparser::dialect::GenericDialect;
+use datafusion::sql::parser::{DFParserBuilder, Statement};
 use echolake_lake::{Lake, LakeSnapshot, VisibleRun};
 use futures::StreamExt as _;
 use tokio::sync::mpsc;
@@ -22,10 +21,11 @@ use tokio::task::JoinHandle;
 
 use crate::control::pool::PartialPool;
 use crate::control::{QueryTicket, StopReason, WorkGuard};
+use crate::dialect::LakeDialect;
 use crate::engine::{self, EngineClient, EngineLimits, QueryEngine, QueryPermit, QueryQuota, SqlFunction};
 use crate::mcap::Contents;
 use crate::statement_bounds::check_statement_bounds;
-use crate::{Error, OpaqueValue, as_of, gate, placeholders};
+use crate::{Error, OpaqueValue, as_of, friendly_sql, gate, ignored_clauses, placeholders};
 
 /// Capacity of the queue of batches to a slow reader.
 const AHEAD: usize = 2;
@@ -244,11 +244,21 @@ impl Session {
     /// # Errors
     /// [`Error::Query`] if it is not a statement.
     pub fn parse(&self, sql: &str) -> Result<Statement, Error> {
-        let state = self.engine.template();
-        // DataFusion's default dialect; nothing sets another.
-        check_statement_bounds(sql, &GenericDialect {})?;
-        let sql = &as_of::respelled(sql);
-        state.sql_to_statement(sql, &state.config().options().sql_parser.dialect).map_err(|e| Error::plan(sql, &e))
+        check_statement_bounds(sql, &LakeDialect)?;
+        let sql = &*as_of::respelled(sql);
+        let limit = self.engine.template().config().options().sql_parser.recursion_limit.get();
+        let parser = DFParserBuilder::new(sql).with_dialect(&LakeDialect).with_recursion_limit(limit).build();
+        let statements = parser.and_then(|mut parser| parser.parse_statements()).map_err(|e| Error::plan(sql, &e))?;
+        let wrong = |message: &str, hint: &str| Error::Query {
+            message: message.to_owned(),
+            place: None,
+            hint: Some(hint.to_owned()),
+        };
+        match <[Statement; 1]>::try_from(Vec::from(statements)) {
+            Ok([statement]) => Ok(statement),
+            Err(none) if none.is_empty() => Err(wrong("no statement", "select * from surfaces")),
+            Err(_) => Err(wrong("one statement at a time", "the prompt takes several, each ended by ;")),
+        }
     }
 
     // The query's timeout starts here and includes waiting.
@@ -273,12 +283,14 @@ impl Session {
             if let Some(extend) = &session.extend {
                 extend(&context).map_err(|e| Error::execution(&e))?;
             }
-            let plan = context
-                .state()
-                .statement_to_plan(statement)
-                .await
-                .and_then(placeholders::infer_types)
-                .map_err(wrong)?;
+            friendly_sql::rewrite(&mut statement);
+            let state = context.state();
+            ignored_clauses::check(&statement, &sql, &|name| {
+                state.scalar_functions().contains_key(name)
+                    && !state.aggregate_functions().contains_key(name)
+                    && !state.window_functions().contains_key(name)
+            })?;
+            let plan = state.statement_to_plan(statement).await.and_then(placeholders::infer_types).map_err(wrong)?;
             // `SELECT INTO` reads by its first word and makes a table by its plan.
             let reading = SQLOptions::new().with_allow_ddl(false).with_allow_dml(false).with_allow_statements(false);
             reading.verify_plan(&plan).map_err(|_| Error::NotReading { statement: plan.display().to_string() })?;

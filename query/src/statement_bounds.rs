@@ -88,6 +88,17 @@ pub fn check_statement_bounds(sql: &str, dialect: &dyn Dialect) -> Result<(), Er
     let mut doublings = 0.0;
     let mut statements = 0;
     let mut before = &Token::EOF;
+    // `1_000_` is a number with a column's name behind it, and `12x` as well.
+    if let Some([Token::Number(number, _), Token::Word(word)]) =
+        tokens.array_windows().find(|[a, b]| matches!(a, Token::Number(..)) && matches!(b, Token::Word(_)))
+    {
+        let message = format!("`{number}{word}` is no number");
+        return Err(Error::Query {
+            message,
+            place: None,
+            hint: Some("a blank between a number and a name".to_owned()),
+        });
+    }
     for token in tokens.iter().filter(|t| !matches!(t, Token::Whitespace(_))) {
         let Some(innermost) = open.last_mut() else { break };
         match token {

@@ -210,6 +210,83 @@ async fn nothing_but_reading_is_allowed() {
 }
 
 #[tokio::test]
+async fn clauses_that_would_be_dropped_are_refused() {
+    let (_folder, lake) = lake().await;
+    let session = Session::new(&lake).expect("a session");
+    for (sql, clause) in [
+        ("select count(*) from points tablesample bernoulli (10)", "TABLESAMPLE"),
+        ("select count(*) from points tablesample (5 rows)", "TABLESAMPLE"),
+        ("select count(*) from (select 1) tablesample system (10)", "TABLESAMPLE"),
+        ("select count(*) from points positional join pairs", "POSITIONAL JOIN"),
+        ("select count(*) from points join pairs", "JOIN without ON or USING"),
+        ("select count(*) from (points left join pairs)", "JOIN without ON or USING"),
+        ("select count(*) from points for xml auto", "FOR XML"),
+        ("select count(*) from points partition (p0)", "PARTITION"),
+        ("select * from generate_series(1, 2) with ordinality", "ORDINALITY"),
+        ("select sum(0.5)(point_id) from points", "parameters of sum"),
+        ("select abs(point_id) over () from points", "OVER in a call of abs"),
+        ("select abs(point_id) filter (where false) from points", "FILTER in a call of abs"),
+        ("select abs(distinct point_id) from points", "DISTINCT in a call of abs"),
+        ("explain select * from points tablesample (10)", "TABLESAMPLE"),
+        // Syntax of other databases, which the parser no longer reads.
+        ("select count(*) from points prewhere point_id = 1", "prewhere"),
+        ("select point_id from points connect by point_id = 1", "connect"),
+        ("select count(*) from points settings x = 1", "settings"),
+        ("select 12x", "`12x` is no number"),
+        ("select 1_", "is no number"),
+    ] {
+        let error = session.query(sql).await.map(drop).expect_err(sql);
+        assert!(matches!(error, Error::Query { .. }), "{sql}: {error}");
+        assert!(error.to_string().contains(clause), "{sql}: {error}");
+    }
+    let sql = "select *\nfrom points\ntablesample (10)";
+    let error = session.query(sql).await.map(drop).expect_err(sql).to_string();
+    assert!(error.contains("\n  tablesample (10)\n  ^\nhint: WHERE random() < 0.1"), "{error}");
+}
+
+#[tokio::test]
+async fn friendly_syntax_is_planned() {
+    let (_folder, lake) = lake().await;
+    let session = Session::new(&lake).expect("a session");
+    for (friendly, plain) in [
+        ("from points", "select * from points"),
+        ("from points select point_id order by all", "select point_id from points order by point_id"),
+        ("select layer, count(*), from points group by all", "select layer, count(*) from points group by layer"),
+        (
+            "select point_id from points order by 1 fetch first 3 rows only",
+            "select point_id from points order by 1 limit 3",
+        ),
+        ("select 10_000 as x", "select 10000 as x"),
+        ("select * exclude (layer) from points", "select * except (layer) from points"),
+        ("select array_transform([1, 2], x -> x * 2) as x", "select [2, 4] as x"),
+        ("select list_filter([1, 2, 3], x -> x > 1) as x", "select [2, 3] as x"),
+        (
+            "select arg_max(point_id, z_mm * 1000 + point_id) as x, min_by(point_id, point_id) as y from points",
+            "select cast(77 as int) as x, cast(0 as int) as y",
+        ),
+        (
+            "select max_by(point_id, case when layer = 0 then point_id end) as x from points",
+            "select cast(35 as int) as x",
+        ),
+        (
+            "select first_value(point_id) over (order by point_id) as x from points",
+            "select cast(0 as int) as x from points",
+        ),
+    ] {
+        assert_eq!(sorted(&session, friendly).await, sorted(&session, plain).await, "{friendly}");
+    }
+}
+
+// The rows of an answer as text, in an order of their own.
+async fn sorted(session: &Session, sql: &str) -> Vec<String> {
+    let batches = rows(session, sql).await;
+    let table = arrow::util::pretty::pretty_format_batches(&batches).expect("a table").to_string();
+    let mut lines: Vec<_> = table.lines().filter(|line| line.starts_with('|')).skip(1).map(str::to_owned).collect();
+    lines.sort();
+    lines
+}
+
+#[tokio::test]
 async fn errors_point_at_the_place() {
     let (_folder, lake) = lake().await;
     let session = Session::new(&lake).expect("a session");
