@@ -41,6 +41,7 @@ mod predicate;
 mod session;
 mod small;
 mod statement_bounds;
+mod summarize;
 mod table;
 mod views;
 

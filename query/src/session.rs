@@ -1,5 +1,6 @@
 //! A session: every query sees one snapshot of the lake and may only read.
 
+use std::borrow::Cow;
 use std::sync::Arc;
 
 use arrow::datatypes::{DataType, SchemaRef};
@@ -25,7 +26,7 @@ use crate::dialect::LakeDialect;
 use crate::engine::{self, EngineClient, EngineLimits, QueryEngine, QueryPermit, QueryQuota, SqlFunction};
 use crate::mcap::Contents;
 use crate::statement_bounds::check_statement_bounds;
-use crate::{Error, OpaqueValue, as_of, friendly_sql, gate, ignored_clauses, placeholders};
+use crate::{Error, OpaqueValue, as_of, friendly_sql, gate, ignored_clauses, placeholders, summarize};
 
 /// Capacity of the queue of batches to a slow reader.
 const AHEAD: usize = 2;
@@ -192,6 +193,7 @@ impl Session {
     /// [`Error::Query`] if it is invalid, [`Error::NotReading`] if it would change something, [`Error::Lake`] if the
     /// lake cannot be read, [`Error::Busy`] if the client has no permit left, and those of [`QueryAnswer::next`].
     pub async fn query(&self, sql: &str) -> Result<QueryAnswer, Error> {
+        let sql = &*self.summarized(sql).await?;
         let started = self.start()?;
         let prepared = self.plan(sql, self.parse(sql)?, &started.ticket).await?;
         self.run(&prepared, LogicalPlan::clone(&prepared.plan), started).await
@@ -217,7 +219,16 @@ impl Session {
     /// # Errors
     /// As [`Session::query`].
     pub async fn prepare(&self, sql: &str) -> Result<PreparedQuery, Error> {
+        let sql = &*self.summarized(sql).await?;
         self.prepare_statement(sql, self.parse(sql)?).await
+    }
+
+    // `SUMMARIZE` becomes a query over the columns of what it names.
+    async fn summarized<'a>(&self, sql: &'a str) -> Result<Cow<'a, str>, Error> {
+        let Some(source) = summarize::source(sql) else { return Ok(Cow::Borrowed(sql)) };
+        let all = format!("select * from {source}");
+        let schema = self.prepare_statement(&all, self.parse(&all)?).await?.schema();
+        Ok(Cow::Owned(summarize::query(&source, &schema)))
     }
 
     /// Plans a statement that a protocol has parsed, and perhaps rewritten, from `sql`.

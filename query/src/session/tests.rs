@@ -277,6 +277,25 @@ async fn friendly_syntax_is_planned() {
     }
 }
 
+#[tokio::test]
+async fn a_summary_has_a_row_a_column() {
+    let (_folder, lake) = lake().await;
+    let session = Session::new(&lake).expect("a session");
+    let sql = "select * exclude (approx_unique, std, q25, q50, q75) from (values ('x', 'y')) as t(a, b)";
+    assert!(session.query(sql).await.is_err(), "columns that are not there are named");
+    let lines = sorted(&session, "summarize points").await;
+    assert_eq!(lines.len(), 7, "{lines:?}");
+    let layer = lines.iter().find(|line| line.starts_with("| layer")).expect("a row");
+    let cells: Vec<_> = layer.split('|').map(str::trim).collect();
+    assert_eq!(cells[1..6], ["layer", "int32", "0", "3", "4"]);
+    assert_eq!(cells[11..13], ["0", "78"], "{layer}");
+    let lines = sorted(&session, "summarize select 'a' as \"it's\", [1, 2] as l").await;
+    assert!(lines[0].starts_with("| it's") && lines[0].contains("| a "), "{lines:?}");
+    assert!(lines[1].starts_with("| l "), "{lines:?}");
+    let error = session.query("summarize nothing_here").await.map(drop).expect_err("no table").to_string();
+    assert!(error.contains("no table `nothing_here`"), "{error}");
+}
+
 // The rows of an answer as text, in an order of their own.
 async fn sorted(session: &Session, sql: &str) -> Vec<String> {
     let batches = rows(session, sql).await;
