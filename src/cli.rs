@@ -26,7 +26,7 @@ use crate::commands::panel::{self, PanelArgs};
 use crate::commands::recover::{self, RecoverArgs};
 use crate::commands::replay::{self, ReplayArgs};
 #[cfg(feature = "lake")]
-use crate::commands::serve::{self, EngineArgs, ServeArgs};
+use crate::commands::serve::{self, CertificateArgs, EngineArgs, ServeArgs};
 #[cfg(feature = "lake")]
 use crate::commands::sql::{self, SqlArgs};
 #[cfg(feature = "lake")]
@@ -104,10 +104,15 @@ pub(crate) enum LakeCommand {
     /// Answer one client's queries, as a child of `serve`.
     #[command(hide = true)]
     Engine(EngineArgs),
+    /// Make a self-signed certificate for `serve --certificate`, for a lab without a certificate authority.
+    Certificate(CertificateArgs),
     /// Make a token for `serve --tokens`.
     Token {
         /// Name of the token's owner.
         name: String,
+        /// Days until it expires; by default it does not.
+        #[arg(long, value_name = "N")]
+        days: Option<u32>,
     },
     /// Merge the tables' small files into large ones; ingest and queries may continue meanwhile.
     Optimize(OptimizeArgs),
@@ -165,7 +170,8 @@ impl LakeCommand {
             Self::Figure(args) => figure::run(args, lake).await,
             Self::Serve(args) => serve::run(args, lake).await,
             Self::Engine(args) => serve::engine(args, lake).await,
-            Self::Token { name } => serve::token(name),
+            Self::Certificate(args) => serve::certificate(args),
+            Self::Token { name, days } => serve::token(name, *days),
             Self::Optimize(args) => optimize::run(args, lake).await,
             Self::Twin(args) => twin::run(args, lake).await,
             Self::Vacuum(args) => vacuum::run(args, lake).await,

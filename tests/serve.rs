@@ -3,6 +3,7 @@
 mod attacks;
 pub(crate) mod catalogue;
 mod contract;
+mod encryption;
 mod escapes;
 pub(crate) mod http;
 mod log;
@@ -174,6 +175,16 @@ fn tokens_let_in_and_are_needed_beyond_this_machine() {
     let mut postgres = postgres::WireClient::connect(&server, None);
     assert_eq!(postgres.log_in(&token), None);
     assert_eq!(postgres.query("select 1 as one"), Ok(vec![vec![Some("1".to_owned())]]));
+    // Taken back, it ends what runs and what waits.
+    let mut running = postgres::WireClient::connect(&server, None);
+    assert_eq!(running.log_in(&token), None);
+    running.begin(ENDLESS);
+    let other = place.run(&["token", "other", "--days", "1"]);
+    std::fs::write(place.path("tokens.toml"), &other.stdout).expect("written");
+    wait_until("a new request is refused", || ask(Some(format!("Bearer {token}"))).status == 401);
+    assert_eq!(running.rows(), Err("28P01".to_owned()), "what runs is ended");
+    let renewed = super::stderr(&other).lines().next().expect("a token").to_owned();
+    assert_eq!(ask(Some(format!("Bearer {renewed}"))).status, 200);
 }
 
 #[test]

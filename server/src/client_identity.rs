@@ -35,14 +35,16 @@ pub(crate) struct ClientIdentity {
     pub(crate) memory_bytes: Option<usize>,
     pub(crate) rows: Option<u64>,
     pub(crate) concurrent: Option<usize>,
+    /// Number of its token, which another token of the same name does not have; None without tokens.
+    pub(crate) token: Option<u64>,
 }
 
 impl ClientIdentity {
     /// A client of a server without tokens.
     pub(crate) fn local(name: impl Into<String>) -> Self {
         let scopes = vec![TokenScope::Sql, TokenScope::Files, TokenScope::Metrics];
-        let (seconds, memory_bytes, rows, concurrent) = (None, None, None, None);
-        Self { name: name.into(), is_open: true, scopes, seconds, memory_bytes, rows, concurrent }
+        let (seconds, memory_bytes, rows, concurrent, token) = (None, None, None, None, None);
+        Self { name: name.into(), is_open: true, scopes, seconds, memory_bytes, rows, concurrent, token }
     }
 
     /// The server's own pages.

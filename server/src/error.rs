@@ -24,6 +24,31 @@ pub enum Error {
         /// The requested address.
         address: SocketAddr,
     },
+    /// Tokens and rows would go over the network as they are.
+    #[error(
+        "{address} can be reached from other machines, and nothing would be encrypted; hint: --certificate FILE and --key FILE, \
+         which `echolake certificate` makes, or --plain-text-behind-a-proxy"
+    )]
+    PlainText {
+        /// The requested address.
+        address: SocketAddr,
+    },
+    /// A certificate or its key cannot be read.
+    #[error("cannot use the certificate or key in `{}`; hint: PEM files, as `echolake certificate` makes them", path.display())]
+    Certificate {
+        /// The file.
+        path: PathBuf,
+        /// The cause.
+        source: Box<dyn std::error::Error + Send + Sync>,
+    },
+    /// A certificate cannot be made.
+    #[error("cannot make a certificate for {names}; hint: names such as lake.example.org, or addresses")]
+    SelfSigned {
+        /// The names.
+        names: String,
+        /// The cause.
+        source: Box<dyn std::error::Error + Send + Sync>,
+    },
     /// A file of tokens cannot be read.
     #[error("cannot read the tokens in `{}`", path.display())]
     ReadTokens {

@@ -14,6 +14,7 @@
 //! ```
 
 mod catalogue_pages;
+pub mod certificate;
 mod client_identity;
 mod door;
 pub mod engine;
@@ -31,5 +32,5 @@ mod sessions;
 pub mod tokens;
 
 pub use catalogue_pages::CataloguePages;
-pub use door::{EngineSettings, LakeServer, ServerSettings};
+pub use door::{CertificateFiles, EngineSettings, LakeServer, ServerSettings};
 pub use error::Error;

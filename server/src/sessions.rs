@@ -19,16 +19,17 @@ pub(crate) struct BrowserSessions(Mutex<Vec<BrowserSession>>);
 struct BrowserSession {
     // The time of comparing hashes reveals nothing of the secret.
     hash: [u8; 32],
-    holder: usize,
+    /// Hash of the token that began it.
+    holder: [u8; 32],
     begun: Instant,
 }
 
 impl BrowserSessions {
-    /// Begins a session of the holder of a token; returns its secret.
+    /// Begins a session of the holder of the token with this hash; returns its secret.
     ///
     /// # Errors
     /// The system gives no random bytes.
-    pub(crate) fn begin(&self, holder: usize) -> io::Result<String> {
+    pub(crate) fn begin(&self, holder: [u8; 32]) -> io::Result<String> {
         let mut random = [0; 32];
         getrandom::fill(&mut random)?;
         let secret = hex::encode(random);
@@ -41,8 +42,8 @@ impl BrowserSessions {
         Ok(secret)
     }
 
-    /// Returns the holder of the session with this secret.
-    pub(crate) fn holder(&self, secret: &str) -> Option<usize> {
+    /// Returns the hash of the token of the session with this secret.
+    pub(crate) fn holder(&self, secret: &str) -> Option<[u8; 32]> {
         let hash: [u8; 32] = Sha256::digest(secret).into();
         let sessions = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         sessions.iter().find(|s| s.hash == hash && s.begun.elapsed() < LIFETIME).map(|s| s.holder)
@@ -56,10 +57,10 @@ mod tests {
     #[test]
     fn the_oldest_goes_first() {
         let sessions = BrowserSessions::default();
-        let first = sessions.begin(1).expect("random bytes");
-        assert_eq!((sessions.holder(&first), sessions.holder("")), (Some(1), None));
+        let first = sessions.begin([1; 32]).expect("random bytes");
+        assert_eq!((sessions.holder(&first), sessions.holder("")), (Some([1; 32]), None));
         for _ in 0..MOST {
-            sessions.begin(2).expect("random bytes");
+            sessions.begin([2; 32]).expect("random bytes");
         }
         assert_eq!(sessions.holder(&first), None);
     }

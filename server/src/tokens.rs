@@ -1,13 +1,15 @@
 //! Access control: tokens, stored as hashes in a file, each with scopes and quotas.
 
 use std::fmt;
-use std::path::Path;
-use std::sync::Arc;
+use std::path::{Path, PathBuf};
+use std::sync::{Arc, PoisonError, RwLock};
+use std::time::SystemTime;
 
 use base64::Engine as _;
 use base64::alphabet::STANDARD;
 use base64::engine::GeneralPurpose;
 use base64::engine::general_purpose::NO_PAD;
+use chrono::{DateTime, Utc};
 use serde::{Deserialize, Serialize};
 use sha2::{Digest as _, Sha256};
 use subtle::{Choice, ConstantTimeEq as _};
@@ -46,11 +48,21 @@ impl fmt::Display for TokenScope {
 }
 
 /// The tokens of a file.
-pub struct TokenFile(Vec<TokenEntry>);
+pub struct TokenFile {
+    path: PathBuf,
+    entries: Vec<TokenEntry>,
+}
 
 struct TokenEntry {
     client: Arc<ClientIdentity>,
     hash: [u8; 32],
+    expires: Option<DateTime<Utc>>,
+}
+
+impl TokenEntry {
+    fn is_valid(&self) -> bool {
+        self.expires.is_none_or(|expires| Utc::now() < expires)
+    }
 }
 
 #[derive(Deserialize)]
@@ -71,6 +83,7 @@ struct Line {
     memory_mb: Option<usize>,
     rows: Option<u64>,
     concurrent: Option<usize>,
+    expires: Option<toml::value::Datetime>,
 }
 
 // What a reader of the lake needs. A client with SQL reads all rows, and the catalogue's pages show meshes and link to
@@ -101,8 +114,13 @@ impl Line {
             memory_bytes: self.memory_mb.map(|mb| mb.saturating_mul(1_000_000)),
             rows: self.rows,
             concurrent: self.concurrent,
+            token: hash.first_chunk().map(|head| u64::from_le_bytes(*head)),
         };
-        Ok(TokenEntry { client: Arc::new(client), hash })
+        let expires = self.expires.map(|time| {
+            let time = DateTime::parse_from_rfc3339(&time.to_string()).map(|time| time.to_utc());
+            time.map_err(|_| format!("expires of `{name}` is no time with a zone, as 2027-01-31T12:00:00Z"))
+        });
+        Ok(TokenEntry { client: Arc::new(client), hash, expires: expires.transpose()? })
     }
 }
 
@@ -112,12 +130,23 @@ impl TokenFile {
     /// # Errors
     /// [`Error::ReadTokens`], [`Error::Tokens`].
     pub fn read(path: &Path) -> Result<Self, Error> {
-        let text =
-            std::fs::read_to_string(path).map_err(|source| Error::ReadTokens { path: path.to_owned(), source })?;
-        Self::parse(&text).map_err(|message| Error::Tokens { path: path.to_owned(), message })
+        let file = Self::read_any(path)?;
+        if file.entries.is_empty() {
+            let message = "there is none; hint: `echolake token NAME` makes one".to_owned();
+            return Err(Error::Tokens { path: path.to_owned(), message });
+        }
+        Ok(file)
     }
 
-    fn parse(text: &str) -> Result<Self, String> {
+    // Also a file in which no token is left.
+    fn read_any(path: &Path) -> Result<Self, Error> {
+        let text =
+            std::fs::read_to_string(path).map_err(|source| Error::ReadTokens { path: path.to_owned(), source })?;
+        let entries = Self::parse(&text).map_err(|message| Error::Tokens { path: path.to_owned(), message })?;
+        Ok(Self { path: path.to_owned(), entries })
+    }
+
+    fn parse(text: &str) -> Result<Vec<TokenEntry>, String> {
         let file: TokenList = toml::from_str(text).map_err(|e| e.to_string())?;
         let entries = file.token.iter().map(Line::entry).collect::<Result<Vec<_>, _>>()?;
         for (i, entry) in entries.iter().enumerate() {
@@ -125,23 +154,19 @@ impl TokenFile {
                 return Err(format!("`{}` is there twice", entry.client.name));
             }
         }
-        if entries.is_empty() {
-            return Err("there is none; hint: `echolake token NAME` makes one".to_owned());
-        }
-        Ok(Self(entries))
+        Ok(entries)
     }
 
     // Every hash is compared to its end, so that the time does not tell which token is nearly right.
-    fn find(&self, token: &str) -> Option<usize> {
-        let hash: [u8; 32] = Sha256::digest(token.as_bytes()).into();
+    fn find(&self, hash: &[u8; 32]) -> Option<&TokenEntry> {
         let mut found = None;
-        for (i, entry) in self.0.iter().enumerate() {
-            let same: Choice = entry.hash.ct_eq(&hash);
+        for entry in &self.entries {
+            let same: Choice = entry.hash.ct_eq(hash);
             if same.into() {
-                found = Some(i);
+                found = Some(entry);
             }
         }
-        found
+        found.filter(|entry| entry.is_valid())
     }
 }
 
@@ -153,11 +178,11 @@ pub struct FreshToken {
     pub lines: String,
 }
 
-/// Makes a token.
+/// Makes a token, which expires after so many days.
 ///
 /// # Errors
 /// [`Error::Random`].
-pub fn fresh(name: &str) -> Result<FreshToken, Error> {
+pub fn fresh(name: &str, days: Option<u32>) -> Result<FreshToken, Error> {
     let mut secret = [0; 32];
     getrandom::fill(&mut secret).map_err(|failed| Error::Random(failed.into()))?;
     let token = format!("{PREFIX}{}", hex::encode(secret));
@@ -167,6 +192,11 @@ pub fn fresh(name: &str) -> Result<FreshToken, Error> {
         "[[token]]\nname = {name}\nsha256 = \"{hash}\"\nscopes = [\"sql\", \"files\"]\n\
          seconds = 60\nmemory_mb = 2000\nrows = 10_000_000\nconcurrent = 4\n"
     );
+    let expires = days.map(|days| {
+        let time = Utc::now() + chrono::Duration::days(days.into());
+        format!("expires = {}\n", time.to_rfc3339_opts(chrono::SecondsFormat::Secs, true))
+    });
+    let lines = lines + &expires.unwrap_or_default();
     Ok(FreshToken { token, lines })
 }
 
@@ -175,14 +205,14 @@ pub(crate) enum TokenAccess {
     /// All clients on this machine.
     Open,
     /// Holders of a token, or of a browser session that was begun with one.
-    Tokens(TokenFile, BrowserSessions),
+    Tokens(RwLock<TokenFile>, BrowserSessions),
 }
 
 impl TokenAccess {
     /// Access by `tokens`, or open access without them.
     pub(crate) fn new(tokens: Option<TokenFile>) -> Self {
         match tokens {
-            Some(tokens) => Self::Tokens(tokens, BrowserSessions::default()),
+            Some(tokens) => Self::Tokens(RwLock::new(tokens), BrowserSessions::default()),
             None => Self::Open,
         }
     }
@@ -201,12 +231,43 @@ impl TokenAccess {
         token: Option<&str>,
         local: impl FnOnce() -> ClientIdentity,
     ) -> Result<Arc<ClientIdentity>, RequestFault> {
-        let tokens = match self {
-            Self::Open => return Ok(Arc::new(local())),
-            Self::Tokens(tokens, _) => tokens,
-        };
-        let entry = token.and_then(|t| tokens.find(t)).ok_or(RequestFault::Unauthenticated)?;
-        Ok(tokens.0[entry].client.clone())
+        match self {
+            Self::Open => Ok(Arc::new(local())),
+            Self::Tokens(tokens, _) => holder(tokens, &hash_of(token.unwrap_or_default())),
+        }
+    }
+
+    /// Checks that a client's token was not taken back and has not expired since.
+    ///
+    /// # Errors
+    /// [`RequestFault::Unauthenticated`].
+    pub(crate) fn check_current(&self, client: &ClientIdentity) -> Result<(), RequestFault> {
+        let Self::Tokens(tokens, _) = self else { return Ok(()) };
+        let tokens = tokens.read().unwrap_or_else(PoisonError::into_inner);
+        let is_its = |entry: &TokenEntry| entry.client.token == client.token && entry.is_valid();
+        tokens.entries.iter().any(is_its).then_some(()).ok_or(RequestFault::Unauthenticated)
+    }
+
+    /// Reads the file again if it changed; returns the names of clients that may no longer ask. A file that cannot be read
+    /// changes nothing.
+    pub(crate) fn renew(&self, known: &mut TokenFileState) -> Vec<String> {
+        let Self::Tokens(tokens, _) = self else { return Vec::new() };
+        let mut tokens = tokens.write().unwrap_or_else(PoisonError::into_inner);
+        let valid_before = std::mem::take(&mut known.valid);
+        let changed =
+            std::fs::metadata(&tokens.path).ok().and_then(|about| Some((about.modified().ok()?, about.len())));
+        if known.file.replace(changed).is_some_and(|before| before != changed) {
+            match TokenFile::read_any(&tokens.path) {
+                Ok(renewed) => {
+                    *tokens = renewed;
+                    tracing::info!(tokens = tokens.entries.len(), "the file of tokens was read again");
+                }
+                Err(e) => tracing::warn!(error = &e as &dyn std::error::Error, "the tokens stay as they were"),
+            }
+        }
+        let valid = tokens.entries.iter().filter(|entry| entry.is_valid());
+        known.valid = valid.map(|entry| (entry.hash, entry.client.name.clone())).collect();
+        valid_before.into_iter().filter(|token| !known.valid.contains(token)).map(|(_, name)| name).collect()
     }
 
     /// Begins a browser's session; returns its secret.
@@ -218,9 +279,9 @@ impl TokenAccess {
             let hint = "this server has no tokens, ask right away";
             return Err(RequestFault::NotFound { what: "a session".to_owned(), hint });
         };
-        sessions
-            .begin(tokens.find(token).ok_or(RequestFault::Unauthenticated)?)
-            .map_err(RequestFault::defect("no session can begin"))
+        let hash = hash_of(token);
+        holder(tokens, &hash)?;
+        sessions.begin(hash).map_err(RequestFault::defect("no session can begin"))
     }
 
     /// Returns the client of the session with this secret; as [`TokenAccess::client`].
@@ -236,9 +297,24 @@ impl TokenAccess {
             Self::Open => return Ok(Arc::new(local())),
             Self::Tokens(tokens, sessions) => (tokens, sessions),
         };
-        let entry = sessions.holder(secret).and_then(|i| tokens.0.get(i)).ok_or(RequestFault::Unauthenticated)?;
-        Ok(entry.client.clone())
+        holder(tokens, &sessions.holder(secret).ok_or(RequestFault::Unauthenticated)?)
     }
+}
+
+/// State of a file of tokens when it was last looked at.
+#[derive(Default)]
+pub(crate) struct TokenFileState {
+    file: Option<Option<(SystemTime, u64)>>,
+    valid: Vec<([u8; 32], String)>,
+}
+
+fn hash_of(token: &str) -> [u8; 32] {
+    Sha256::digest(token.as_bytes()).into()
+}
+
+fn holder(tokens: &RwLock<TokenFile>, hash: &[u8; 32]) -> Result<Arc<ClientIdentity>, RequestFault> {
+    let tokens = tokens.read().unwrap_or_else(PoisonError::into_inner);
+    tokens.find(hash).map(|entry| entry.client.clone()).ok_or(RequestFault::Unauthenticated)
 }
 
 /// The token of an `Authorization` header: a bearer's, or the password of a basic one.
@@ -258,11 +334,49 @@ pub(crate) fn of_header(value: &str) -> Option<String> {
 mod tests {
     use super::*;
 
+    fn access_by(lines: &str) -> TokenAccess {
+        let entries = TokenFile::parse(lines).expect("tokens");
+        TokenAccess::new(Some(TokenFile { path: PathBuf::from("no-such-file.toml"), entries }))
+    }
+
+    #[test]
+    fn a_token_that_expired_or_was_taken_back_lets_nobody_in() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let path = folder.path().join("tokens.toml");
+        let hash = hex::encode(Sha256::digest("x"));
+        let line = |rest: &str| format!("[[token]]\nname = 'a'\nsha256 = '{hash}'\n{rest}\n");
+        std::fs::write(&path, line("expires = 2126-01-01T00:00:00Z")).expect("written");
+        let access = TokenAccess::new(Some(TokenFile::read(&path).expect("tokens")));
+        let mut known = TokenFileState::default();
+        assert!(access.renew(&mut known).is_empty());
+        let client = access.client(Some("x"), ClientIdentity::pages).expect("let in");
+        let session = access.begin_session("x").expect("a session");
+        let is_in = || {
+            let by_session = access.client_of_session(&session, ClientIdentity::pages).is_ok();
+            let by_token = access.client(Some("x"), ClientIdentity::pages).is_ok();
+            assert_eq!((by_session, by_token), (by_token, access.check_current(&client).is_ok()));
+            by_token
+        };
+        assert!(is_in());
+        // A half-written file changes nothing.
+        std::fs::write(&path, "[[token]]\nname = 'a").expect("written");
+        assert!(access.renew(&mut known).is_empty() && is_in());
+        std::fs::write(&path, line("expires = 2026-01-01T00:00:00Z")).expect("written");
+        assert_eq!(access.renew(&mut known), ["a"]);
+        assert!(!is_in());
+        std::fs::write(&path, line("")).expect("written");
+        assert!(access.renew(&mut known).is_empty() && is_in());
+        std::fs::write(&path, "").expect("written");
+        assert_eq!(access.renew(&mut known), ["a"]);
+        assert!(!is_in());
+        assert!(TokenFile::read(&path).map(drop).expect_err("no tokens").to_string().contains("there is none"));
+    }
+
     #[test]
     fn a_fresh_token_lets_in_and_no_other_does() {
-        let fresh = fresh("a \"quoted\" name").expect("a token");
+        let fresh = fresh("a \"quoted\" name", Some(1)).expect("a token");
         assert!(!fresh.lines.contains(&fresh.token), "only its hash is kept");
-        let access = TokenAccess::new(Some(TokenFile::parse(&fresh.lines).expect("tokens")));
+        let access = access_by(&fresh.lines);
         let local = ClientIdentity::pages;
         let client = access.client(Some(&fresh.token), local).expect("let in");
         assert_eq!(client.name, "a \"quoted\" name");
@@ -273,7 +387,7 @@ mod tests {
         assert_eq!(access.client_of_session(&secret, local).expect("let in"), client);
         assert!(matches!(access.client_of_session(&fresh.token, local), Err(RequestFault::Unauthenticated)));
         assert!(matches!(access.begin_session(&secret), Err(RequestFault::Unauthenticated)));
-        let other = super::fresh("b").expect("a token").token;
+        let other = super::fresh("b", None).expect("a token").token;
         let cut = &fresh.token[..fresh.token.len() - 1];
         for wrong in [None, Some(""), Some(other.as_str()), Some(cut)] {
             assert!(matches!(access.client(wrong, local), Err(RequestFault::Unauthenticated)), "{wrong:?}");
@@ -284,9 +398,7 @@ mod tests {
     fn scopes_are_those_that_a_line_names() {
         let hash = hex::encode(Sha256::digest("x"));
         let allowed = |scopes: &str| {
-            let file =
-                TokenFile::parse(&format!("[[token]]\nname = 'a'\nsha256 = '{hash}'\n{scopes}")).expect("tokens");
-            let access = TokenAccess::new(Some(file));
+            let access = access_by(&format!("[[token]]\nname = 'a'\nsha256 = '{hash}'\n{scopes}"));
             let client = access.client(Some("x"), ClientIdentity::pages).expect("let in");
             [TokenScope::Sql, TokenScope::Files, TokenScope::Metrics].map(|scope| client.require(scope).is_ok())
         };
@@ -299,7 +411,7 @@ mod tests {
     fn wrong_files_say_what_is_wrong() {
         let hash = "ab".repeat(32);
         for (text, expected) in [
-            (String::new(), "there is none"),
+            (format!("[[token]]\nname = 'a'\nsha256 = '{hash}'\nexpires = 2027-01-31"), "no time with a zone"),
             ("[[token]]\nname = 'a'\nsha256 = 'ab'".to_owned(), "64 hexadecimal"),
             (format!("[[token]]\nname = 'a'\nsha256 = '{hash}'\nrows = 0"), "rows of `a` is 0"),
             (format!("[[token]]\nname = 'a'\nsha256 = '{hash}'\nscopes = ['all']"), "unknown variant"),

@@ -1,14 +1,18 @@
 //! `echolake serve` and `echolake token`: the lake over HTTP, Flight SQL and Postgres, with access control.
 
+use std::fs::OpenOptions;
+use std::io::Write as _;
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
+use std::os::unix::fs::OpenOptionsExt as _;
 use std::path::PathBuf;
 use std::str::FromStr;
 
 use anyhow::Context as _;
 use echolake_lake::Lake;
+use echolake_server::certificate::self_signed;
 use echolake_server::engine::{confinement, run_engine};
 use echolake_server::tokens::{self, TokenFile};
-use echolake_server::{CataloguePages, EngineSettings, Error, LakeServer, ServerSettings};
+use echolake_server::{CataloguePages, CertificateFiles, EngineSettings, Error, LakeServer, ServerSettings};
 
 use crate::CommandOutcome;
 use crate::logging::child_variable;
@@ -32,6 +36,15 @@ pub(crate) struct ServeArgs {
     /// File of tokens; without it only this machine has access. `echolake token` makes its lines.
     #[arg(long, value_name = "FILE")]
     tokens: Option<PathBuf>,
+    /// Certificate of the server (PEM), with which all three protocols are encrypted; renewed files are taken while it runs.
+    #[arg(long, value_name = "FILE", requires = "key")]
+    certificate: Option<PathBuf>,
+    /// Private key of the certificate (PEM).
+    #[arg(long, value_name = "FILE", requires = "certificate")]
+    key: Option<PathBuf>,
+    /// Listen without encryption beyond this machine, because a proxy encrypts.
+    #[arg(long, conflicts_with = "certificate")]
+    plain_text_behind_a_proxy: bool,
     /// Memory limit of all queries together, MiB; if it is exceeded, the engine of the largest client is ended.
     #[arg(long, value_name = "MIB", default_value_t = MEMORY_MIB, value_parser = clap::value_parser!(u32).range(64..))]
     memory: u32,
@@ -111,6 +124,12 @@ pub(crate) async fn run(args: &ServeArgs, lake_url: &str) -> anyhow::Result<Comm
         flight_sql: args.flight_sql.address(),
         postgres: args.postgres.address(),
         tokens: args.tokens.as_deref().map(TokenFile::read).transpose()?,
+        certificate: args
+            .certificate
+            .clone()
+            .zip(args.key.clone())
+            .map(|(certificate, key)| CertificateFiles { certificate, key }),
+        is_behind_proxy: args.plain_text_behind_a_proxy,
         engines: engines(args.memory, args.engines, args.temp.clone())?,
     };
     let server = LakeServer::bind(&lake, settings)?;
@@ -130,6 +149,8 @@ pub(crate) async fn catalogue(lake: &Lake, stop: &StopRequest) -> anyhow::Result
         flight_sql: None,
         postgres: None,
         tokens: None,
+        certificate: None,
+        is_behind_proxy: false,
         engines: engines.clone(),
     };
     let server = match LakeServer::bind(lake, settings(HTTP)) {
@@ -163,9 +184,36 @@ async fn answer(server: LakeServer, stop: &StopRequest) -> anyhow::Result<Comman
     Ok(CommandOutcome::Whole)
 }
 
+/// Arguments of `echolake certificate`.
+#[derive(Debug, clap::Args)]
+pub(crate) struct CertificateArgs {
+    /// Names and addresses under which clients reach the server.
+    #[arg(value_name = "NAME", required = true)]
+    names: Vec<String>,
+    /// Folder for certificate.pem and key.pem; files that are there are not overwritten.
+    #[arg(short, long, value_name = "DIR", default_value = ".")]
+    output: PathBuf,
+}
+
+/// Writes a self-signed certificate and its key.
+pub(crate) fn certificate(args: &CertificateArgs) -> anyhow::Result<CommandOutcome> {
+    let made = self_signed(&args.names)?;
+    std::fs::create_dir_all(&args.output).with_context(|| format!("cannot make `{}`", args.output.display()))?;
+    // The key first: nobody but its owner reads it, from its first byte on.
+    for (name, text, mode) in [("key.pem", &made.key, 0o600), ("certificate.pem", &made.certificate, 0o644)] {
+        let path = args.output.join(name);
+        let failed = || format!("cannot write `{}`; hint: another folder, -o DIR", path.display());
+        let mut file = OpenOptions::new().write(true).create_new(true).mode(mode).open(&path).with_context(failed)?;
+        file.write_all(text.as_bytes()).and_then(|()| file.sync_all()).with_context(failed)?;
+        super::print(&path.display().to_string())?;
+    }
+    eprintln!("clients trust it by having certificate.pem; the key stays on the server");
+    Ok(CommandOutcome::Whole)
+}
+
 /// Prints a new token to stderr, once, and its lines for the file of tokens to stdout.
-pub(crate) fn token(name: &str) -> anyhow::Result<CommandOutcome> {
-    let fresh = tokens::fresh(name)?;
+pub(crate) fn token(name: &str, days: Option<u32>) -> anyhow::Result<CommandOutcome> {
+    let fresh = tokens::fresh(name, days)?;
     eprintln!("{}\nthis token is kept nowhere: only its hash is, in the lines for the file of --tokens", fresh.token);
     super::print(fresh.lines.trim_end())?;
     Ok(CommandOutcome::Whole)

@@ -37,7 +37,7 @@ impl ServedLake {
             let rest = line.split_once("://").expect("a URL").1;
             rest.split('/').next().expect("host and port").to_owned()
         };
-        let (http, flight_sql, postgres) = (address("http://"), address("grpc://"), address("postgresql://"));
+        let (http, flight_sql, postgres) = (address("  http"), address("  grpc"), address("  postgresql"));
         Self { child, http, flight_sql, postgres }
     }
 

@@ -16,6 +16,7 @@ use crate::Error;
 use crate::client_identity::ClientIdentity;
 use crate::fault::RequestFault;
 use crate::metrics::ServerMetrics;
+use crate::tokens::TokenAccess;
 
 /// Time without a request after which an engine ends.
 const IDLE: Duration = Duration::from_secs(300);
@@ -41,6 +42,7 @@ struct EnginePoolState {
     lake: Lake,
     folders: ServerFolders,
     metrics: Arc<ServerMetrics>,
+    access: Arc<TokenAccess>,
     clients: Mutex<HashMap<String, Arc<ClientEngine>>>,
     spare: Mutex<Option<Arc<EngineProcess>>>,
     spare_taken: Notify,
@@ -64,13 +66,19 @@ struct ClientState {
 }
 
 impl EnginePool {
-    pub(super) fn new(lake: &Lake, settings: EngineSettings, metrics: Arc<ServerMetrics>) -> Result<Self, Error> {
+    pub(super) fn new(
+        lake: &Lake,
+        settings: EngineSettings,
+        metrics: Arc<ServerMetrics>,
+        access: Arc<TokenAccess>,
+    ) -> Result<Self, Error> {
         let folders = ServerFolders::new(lake, settings.temp.as_deref())?;
         Ok(Self(Arc::new(EnginePoolState {
             settings,
             lake: lake.clone(),
             folders,
             metrics,
+            access,
             clients: Mutex::default(),
             spare: Mutex::default(),
             spare_taken: Notify::new(),
@@ -84,8 +92,10 @@ impl EnginePool {
     /// again waits longer each time (backoff).
     ///
     /// # Errors
-    /// [`RequestFault::TooMany`] if other clients' engines are all answering; [`RequestFault::EngineEnded`].
+    /// [`RequestFault::Unauthenticated`] if the client's token is no longer one; [`RequestFault::TooMany`] if other
+    /// clients' engines are all answering; [`RequestFault::EngineEnded`].
     pub(super) async fn lease(&self, client: &ClientIdentity) -> Result<EngineLease, RequestFault> {
+        self.0.access.check_current(client)?;
         let own = self.client(&client.name);
         if let Some(lease) = own.lease() {
             return Ok(lease);
@@ -231,6 +241,14 @@ impl EnginePool {
             }
             // Clients may come under any number of names.
             lock(&self.0.clients).retain(|_, client| client.has_engine() || Arc::strong_count(client) > 1);
+        }
+    }
+
+    /// Ends a client's engine, with all that it answers.
+    pub(super) fn end_client(&self, name: &str) {
+        let own = lock(&self.0.clients).get(name).cloned();
+        if let Some(engine) = own.and_then(|own| lock(&own.current).clone()) {
+            engine.end(EndReason::Retired);
         }
     }
 

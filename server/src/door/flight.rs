@@ -16,6 +16,7 @@ use tokio::task::JoinSet;
 use tracing::Instrument as _;
 
 use super::connection_places::{ConnectionPlaces, PlaceWork, PlacedStream};
+use super::encryption::ProtocolEncryption;
 use super::forward::EngineProtocol;
 use crate::client_identity::ClientIdentity;
 use crate::door::server_door::ServerDoor;
@@ -35,23 +36,34 @@ const STREAMS: u32 = 64;
 const INTERACTIVE: [&str; 3] = ["DoPut", "DoExchange", "Handshake"];
 
 /// Answers connections until `stopping`, then lets pending requests end.
-pub(super) async fn serve(door: ServerDoor, listener: TcpListener, stopping: watch::Receiver<bool>) {
+pub(super) async fn serve(
+    door: ServerDoor,
+    listener: TcpListener,
+    encryption: ProtocolEncryption,
+    stopping: watch::Receiver<bool>,
+) {
     let places = ConnectionPlaces::new(listener, MOST);
     let mut stopped = stopping.clone();
     let mut open = JoinSet::new();
     loop {
         tokio::select! {
             _ = stopped.wait_for(|stopping| *stopping) => break,
-            stream = places.next() => drop(open.spawn(answer(stream, door.clone(), stopping.clone()))),
+            stream = places.next() => drop(open.spawn(answer(stream, encryption.clone(), door.clone(), stopping.clone()))),
             Some(_) = open.join_next() => {}
         }
     }
     while open.join_next().await.is_some() {}
 }
 
-async fn answer(stream: PlacedStream, door: ServerDoor, mut stopping: watch::Receiver<bool>) {
+async fn answer(
+    stream: PlacedStream,
+    encryption: ProtocolEncryption,
+    door: ServerDoor,
+    mut stopping: watch::Receiver<bool>,
+) {
     let evicted = stream.evicted();
     let work = stream.work();
+    let Some(stream) = encryption.accept(stream).await else { return };
     let service = service_fn(move |mut request: Request<Incoming>| {
         work.hear_request();
         let (door, work) = (door.clone(), work.clone());

@@ -6,6 +6,7 @@ use std::time::Duration;
 use axum::Router;
 use axum::body::Body;
 use axum::extract::{Request, State};
+use axum::http::HeaderValue;
 use axum::response::{IntoResponse as _, Response};
 use hyper::body::Incoming;
 use hyper::server::conn::http1;
@@ -18,11 +19,12 @@ use tokio::task::JoinSet;
 use tracing::Instrument as _;
 
 use super::connection_places::{ConnectionPlaces, PlaceWork, PlacedStream};
+use super::encryption::ProtocolEncryption;
 use super::forward::EngineProtocol;
 use crate::client_identity::ClientIdentity;
 use crate::door::server_door::ServerDoor;
 use crate::fault::RequestFault;
-use crate::http::{ProblemResponse, RequestSite, authenticate, door_router, request_site};
+use crate::http::{FORWARDED_PROTO, ProblemResponse, RequestSite, authenticate, door_router, request_site};
 use crate::metrics::ServerProtocol;
 use crate::request_span::begin_request;
 
@@ -32,7 +34,12 @@ const MOST: usize = 512;
 const HEAD: Duration = Duration::from_secs(30);
 
 /// Answers connections until `stopping`, then lets pending requests end.
-pub(super) async fn serve(door: ServerDoor, listener: TcpListener, stopping: watch::Receiver<bool>) {
+pub(super) async fn serve(
+    door: ServerDoor,
+    listener: TcpListener,
+    encryption: ProtocolEncryption,
+    stopping: watch::Receiver<bool>,
+) {
     let router = door_router(&door);
     let places = ConnectionPlaces::new(listener, MOST);
     let mut stopped = stopping.clone();
@@ -40,19 +47,28 @@ pub(super) async fn serve(door: ServerDoor, listener: TcpListener, stopping: wat
     loop {
         tokio::select! {
             _ = stopped.wait_for(|stopping| *stopping) => break,
-            stream = places.next() => drop(open.spawn(answer(stream, router.clone(), stopping.clone()))),
+            stream = places.next() => drop(open.spawn(answer(stream, encryption.clone(), router.clone(), stopping.clone()))),
             Some(_) = open.join_next() => {}
         }
     }
     while open.join_next().await.is_some() {}
 }
 
-async fn answer(stream: PlacedStream, router: Router, mut stopping: watch::Receiver<bool>) {
+async fn answer(
+    stream: PlacedStream,
+    encryption: ProtocolEncryption,
+    router: Router,
+    mut stopping: watch::Receiver<bool>,
+) {
     let evicted = stream.evicted();
     let work = stream.work();
+    let Some(stream) = encryption.accept(stream).await else { return };
     let answers = TowerToHyperService::new(router);
     let service = service_fn(move |mut request: hyper::Request<Incoming>| {
         work.hear_request();
+        if encryption.is_on() {
+            request.headers_mut().insert(FORWARDED_PROTO, HeaderValue::from_static("https"));
+        }
         request.extensions_mut().insert(work.clone());
         answers.call(request)
     });

@@ -2,6 +2,7 @@
 //! of that client. It parses no SQL and decodes no file, so that no request can end it.
 
 mod connection_places;
+mod encryption;
 mod engine_pool;
 mod engine_process;
 mod flight;
@@ -21,6 +22,8 @@ use tokio::task::JoinSet;
 
 use crate::Error;
 use crate::tokens::TokenFile;
+pub use encryption::CertificateFiles;
+use encryption::{ProtocolEncryption, ServerEncryption};
 pub use engine_process::EngineSettings;
 use server_door::ServerDoor;
 
@@ -40,6 +43,10 @@ pub struct ServerSettings {
     pub postgres: Option<SocketAddr>,
     /// The accepted tokens; None for open access, on loopback only.
     pub tokens: Option<TokenFile>,
+    /// The certificate with which connections are encrypted; None for plain text.
+    pub certificate: Option<CertificateFiles>,
+    /// True if plain text may leave this machine, because a proxy encrypts it.
+    pub is_behind_proxy: bool,
     /// The engines.
     pub engines: EngineSettings,
 }
@@ -50,21 +57,26 @@ pub struct LakeServer {
     http: Option<TcpListener>,
     flight_sql: Option<TcpListener>,
     postgres: Option<TcpListener>,
+    encryption: Option<ServerEncryption>,
 }
 
 impl LakeServer {
     /// Listens.
     ///
     /// # Errors
-    /// [`Error::Open`], [`Error::Bind`], [`Error::Temp`].
+    /// [`Error::Open`], [`Error::PlainText`], [`Error::Certificate`], [`Error::Bind`], [`Error::Temp`].
     pub fn bind(lake: &Lake, settings: ServerSettings) -> Result<Self, Error> {
         let addresses = [settings.http, settings.flight_sql, settings.postgres];
-        if settings.tokens.is_none()
-            && let Some(address) = addresses.into_iter().flatten().find(|a| !a.ip().is_loopback())
-        {
-            return Err(Error::Open { address });
+        if let Some(address) = addresses.into_iter().flatten().find(|a| !a.ip().is_loopback()) {
+            if settings.tokens.is_none() {
+                return Err(Error::Open { address });
+            }
+            if settings.certificate.is_none() && !settings.is_behind_proxy {
+                return Err(Error::PlainText { address });
+            }
         }
         Ok(Self {
+            encryption: settings.certificate.map(ServerEncryption::new).transpose()?,
             door: ServerDoor::new(lake, settings.tokens, settings.engines)?,
             http: listen(settings.http)?,
             flight_sql: listen(settings.flight_sql)?,
@@ -74,14 +86,16 @@ impl LakeServer {
 
     /// Returns the listening addresses, as URLs.
     pub fn addresses(&self) -> Vec<String> {
-        let url = |scheme: &str, listener: &Option<TcpListener>, path: &str| {
+        let is_encrypted = self.encryption.is_some();
+        let url = |schemes: [&str; 2], listener: &Option<TcpListener>, path: &str| {
             let address = listener.as_ref()?.local_addr().ok()?;
-            Some(format!("{scheme}://{address}{path}"))
+            Some(format!("{}://{address}{path}", schemes[usize::from(is_encrypted)]))
         };
+        let database = if is_encrypted { "/datafusion?sslmode=verify-full" } else { "/datafusion" };
         let all = [
-            url("http", &self.http, ""),
-            url("grpc", &self.flight_sql, ""),
-            url("postgresql", &self.postgres, "/datafusion"),
+            url(["http", "https"], &self.http, ""),
+            url(["grpc", "grpc+tls"], &self.flight_sql, ""),
+            url(["postgresql"; 2], &self.postgres, database),
         ];
         all.into_iter().flatten().collect()
     }
@@ -95,14 +109,24 @@ impl LakeServer {
         let mut tasks = JoinSet::new();
         let mut upkeep = JoinSet::new();
         upkeep.spawn(self.door.engines().clone().keep_up());
+        upkeep.spawn(self.door.clone().watch_tokens());
+        let encrypted = |name: &[u8]| match &self.encryption {
+            Some(encryption) => encryption.of_protocol(name),
+            None => Ok(ProtocolEncryption::default()),
+        };
+        let (http_tls, flight_tls, postgres_tls) =
+            (encrypted(b"http/1.1")?, encrypted(b"h2")?, encrypted(b"postgresql")?);
+        if let Some(encryption) = self.encryption {
+            upkeep.spawn(encryption.keep_up());
+        }
         if let Some(listener) = self.http {
-            tasks.spawn(http::serve(self.door.clone(), listener, stopping.subscribe()));
+            tasks.spawn(http::serve(self.door.clone(), listener, http_tls, stopping.subscribe()));
         }
         if let Some(listener) = self.flight_sql {
-            tasks.spawn(flight::serve(self.door.clone(), listener, stopping.subscribe()));
+            tasks.spawn(flight::serve(self.door.clone(), listener, flight_tls, stopping.subscribe()));
         }
         if let Some(listener) = self.postgres {
-            tasks.spawn(postgres::serve(self.door.clone(), listener, stopping.subscribe()));
+            tasks.spawn(postgres::serve(self.door.clone(), listener, postgres_tls, stopping.subscribe()));
         }
         tokio::select! {
             () = stop => {}

@@ -20,6 +20,10 @@ use crate::fault::RequestFault;
 use crate::service::QueryService;
 use crate::tokens::{TokenAccess, TokenScope, of_header};
 
+/// Scheme of a client's connection: set by this server if it encrypts, else by a proxy that does.
+pub(crate) const FORWARDED_PROTO: HeaderName = HeaderName::from_static("x-forwarded-proto");
+/// Schemes of an own page: of a host and port only one answers.
+const ORIGIN_SCHEMES: [&str; 2] = ["http://", "https://"];
 const FETCH_SITE: HeaderName = HeaderName::from_static("sec-fetch-site");
 
 /// A client that is authorised for SQL.
@@ -40,9 +44,7 @@ pub(crate) fn authenticate(
     let token = headers.get(header::AUTHORIZATION).and_then(|v| v.to_str().ok()).and_then(of_header);
     match (token, cookie(headers)) {
         // A browser sends the cookie along whichever page of this machine asks, on whatever port it was served.
-        (None, Some(secret)) => {
-            is_same_origin(headers, &["http://", "https://"]).and_then(|()| access.client_of_session(secret, local))
-        }
+        (None, Some(secret)) => is_same_origin(headers).and_then(|()| access.client_of_session(secret, local)),
         (token, _) => access.client(token.as_deref(), local),
     }
 }
@@ -65,6 +67,11 @@ pub(crate) fn request_site(uri: &Uri, headers: &HeaderMap) -> RequestSite {
         (Ok(()), true) => RequestSite::OwnPage,
         (Ok(()), false) => RequestSite::Program,
     }
+}
+
+/// Returns whether a client's connection is encrypted, by this server or by a proxy.
+pub(super) fn is_encrypted(headers: &HeaderMap) -> bool {
+    headers.get(FORWARDED_PROTO).is_some_and(|scheme| scheme == "https")
 }
 
 fn cookie(headers: &HeaderMap) -> Option<&str> {
@@ -106,14 +113,14 @@ pub(super) fn is_own(uri: &Uri, headers: &HeaderMap) -> Result<(), RequestFault>
     if let Some(authority) = uri.authority().filter(|authority| authority.as_str() != host) {
         return Err(RequestFault::Foreign { what: "address", found: authority.to_string() });
     }
-    is_same_origin(headers, &["http://"])
+    is_same_origin(headers)
 }
 
 // Checks by the headers of browsers that a request is not made by a page of another origin.
-fn is_same_origin(headers: &HeaderMap, schemes: &[&str]) -> Result<(), RequestFault> {
+fn is_same_origin(headers: &HeaderMap) -> Result<(), RequestFault> {
     let host = text(headers, &header::HOST).unwrap_or_default();
     if let Some(origin) = text(headers, &header::ORIGIN)
-        && !schemes.iter().any(|scheme| origin.strip_prefix(scheme) == Some(&host))
+        && !ORIGIN_SCHEMES.iter().any(|scheme| origin.strip_prefix(scheme) == Some(&host))
     {
         return Err(RequestFault::Foreign { what: "origin", found: origin });
     }
@@ -209,7 +216,6 @@ mod tests {
             &[],
             &[own, ("host", "evil.example")],
             &[own, ("origin", "http://evil.example")],
-            &[own, ("origin", "https://localhost:8080")],
             &[own, ("origin", "http://localhost:9090")],
             &[own, ("origin", "null")],
             &[own, ("sec-fetch-site", "cross-site")],

@@ -13,11 +13,10 @@ use utoipa_axum::routes;
 
 use super::catalogue::{self, LakeCatalogue, is_known};
 use super::extract::QueryParams;
+use super::guard::is_encrypted;
 use super::problem::ProblemResponse;
 use crate::fault::RequestFault;
 use crate::tokens::TokenScope;
-
-const FORWARDED_PROTO: HeaderName = HeaderName::from_static("x-forwarded-proto");
 
 /// The tables that files are listed of.
 #[derive(Default, Deserialize, IntoParams)]
@@ -97,10 +96,7 @@ async fn files(
 // The origin of this server's URLs as the client sees it: behind a proxy with TLS, `https`.
 fn origin(headers: &HeaderMap) -> String {
     let text = |name: HeaderName| headers.get(name).and_then(|v| v.to_str().ok());
-    let scheme = match text(FORWARDED_PROTO) {
-        Some("https") => "https",
-        _ => "http",
-    };
+    let scheme = if is_encrypted(headers) { "https" } else { "http" };
     format!("{scheme}://{}", text(header::HOST).unwrap_or_default())
 }
 

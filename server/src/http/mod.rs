@@ -36,7 +36,7 @@ use crate::fault::RequestFault;
 use crate::request_span::trace_request;
 use crate::service::QueryService;
 use catalogue::LakeCatalogue;
-pub(crate) use guard::{RequestSite, authenticate, request_site};
+pub(crate) use guard::{FORWARDED_PROTO, RequestSite, authenticate, request_site};
 pub(crate) use problem::ProblemResponse;
 
 /// Answers HTTP on an engine's socket; a connection is one request.

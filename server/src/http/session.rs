@@ -2,13 +2,13 @@
 
 use axum::extract::State;
 use axum::extract::rejection::BytesRejection;
-use axum::http::{StatusCode, header};
+use axum::http::{HeaderMap, StatusCode, header};
 use axum::response::IntoResponse;
 use bytes::Bytes;
 use serde::Deserialize;
 use utoipa::ToSchema;
 
-use super::guard::COOKIE;
+use super::guard::{COOKIE, is_encrypted};
 use super::problem::ProblemResponse;
 use crate::door::server_door::ServerDoor;
 use crate::fault::RequestFault;
@@ -38,12 +38,16 @@ struct SessionRequest {
 )]
 pub(super) async fn post(
     State(door): State<ServerDoor>,
+    headers: HeaderMap,
     body: Result<Bytes, BytesRejection>,
 ) -> Result<impl IntoResponse, ProblemResponse> {
     let body = body.ok().filter(|b| b.len() <= LARGEST).ok_or(RequestFault::TooLarge { limit: LARGEST })?;
     let SessionRequest { token } = serde_json::from_slice(&body)
         .map_err(|_| RequestFault::request("the body is not as expected; hint: {\"token\": \"echolake_...\"}"))?;
     let secret = door.access().begin_session(&token).inspect_err(|f| door.metrics().failed(f.code()))?;
-    let cookie = format!("{COOKIE}={secret}; HttpOnly; SameSite=Strict; Path=/; Max-Age={}", LIFETIME.as_secs());
+    // Behind TLS, this server's or a proxy's, the cookie never leaves it.
+    let secure = if is_encrypted(&headers) { "; Secure" } else { "" };
+    let cookie =
+        format!("{COOKIE}={secret}; HttpOnly; SameSite=Strict; Path=/; Max-Age={}{secure}", LIFETIME.as_secs());
     Ok((StatusCode::NO_CONTENT, [(header::SET_COOKIE, cookie)]))
 }

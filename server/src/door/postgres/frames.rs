@@ -107,8 +107,8 @@ const GSS: i32 = 80_877_104;
 /// The content of a client's first packet.
 #[derive(Debug, PartialEq, Eq)]
 pub(super) enum StartupPacket {
-    /// It asks for encryption.
-    Encryption,
+    /// It asks for encryption, by TLS or by GSSAPI.
+    Encryption { is_tls: bool },
     /// It cancels the query of another connection.
     Cancel { pid: i32, secret: Vec<u8> },
     /// It begins a session, as this user.
@@ -123,7 +123,8 @@ impl StartupPacket {
     pub(super) fn parse(mut packet: &[u8]) -> Result<Self, RequestFault> {
         let wrong = || RequestFault::request("the protocol's startup is expected");
         match packet.try_get_i32().map_err(|_| wrong())? {
-            TLS | GSS => Ok(Self::Encryption),
+            TLS => Ok(Self::Encryption { is_tls: true }),
+            GSS => Ok(Self::Encryption { is_tls: false }),
             CANCEL => {
                 let pid = packet.try_get_i32().map_err(|_| wrong())?;
                 Ok(Self::Cancel { pid, secret: packet.to_vec() })
@@ -168,7 +169,7 @@ mod tests {
     #[test]
     fn startups_are_told_apart() {
         let packet = |code: i32, rest: &[u8]| [&code.to_be_bytes(), rest].concat();
-        assert_eq!(StartupPacket::parse(&packet(TLS, b"")).expect("known"), StartupPacket::Encryption);
+        assert_eq!(StartupPacket::parse(&packet(TLS, b"")).expect("known"), StartupPacket::Encryption { is_tls: true });
         let session = StartupPacket::parse(&packet(3 << 16, b"database\0x\0user\0ann\0\0")).expect("known");
         assert_eq!(session, StartupPacket::Session { user: "ann".to_owned() });
         let cancel = StartupPacket::parse(&cancel_message(7, b"abcd")[4..]).expect("known");

@@ -17,6 +17,7 @@ use tokio::task::JoinSet;
 use tracing::Instrument as _;
 
 use super::connection_places::{ConnectionPlaces, PlacedStream};
+use super::encryption::{DoorStream, ProtocolEncryption};
 use crate::client_identity::ClientIdentity;
 use crate::door::server_door::ServerDoor;
 use crate::fault::RequestFault;
@@ -36,7 +37,12 @@ const STARTUP: usize = 10_000;
 const WRONG_KEY: Duration = Duration::from_secs(1);
 
 /// Answers connections until `stopping`, then until their statements are answered.
-pub(super) async fn serve(door: ServerDoor, listener: TcpListener, stopping: watch::Receiver<bool>) {
+pub(super) async fn serve(
+    door: ServerDoor,
+    listener: TcpListener,
+    encryption: ProtocolEncryption,
+    stopping: watch::Receiver<bool>,
+) {
     let places = ConnectionPlaces::new(listener, MOST);
     let keys = Arc::new(CancelKeys::default());
     let mut stopped = stopping.clone();
@@ -45,7 +51,8 @@ pub(super) async fn serve(door: ServerDoor, listener: TcpListener, stopping: wat
         tokio::select! {
             _ = stopped.wait_for(|stopping| *stopping) => break,
             stream = places.next() => {
-                drop(open.spawn(attend(stream, door.clone(), keys.clone(), stopping.clone())));
+                let login = LoginPlace { door: door.clone(), keys: keys.clone(), encryption: encryption.clone() };
+                drop(open.spawn(attend(stream, login, stopping.clone())));
             }
             Some(_) = open.join_next() => {}
         }
@@ -53,18 +60,25 @@ pub(super) async fn serve(door: ServerDoor, listener: TcpListener, stopping: wat
     while open.join_next().await.is_some() {}
 }
 
-async fn attend(mut stream: PlacedStream, door: ServerDoor, keys: Arc<CancelKeys>, stopping: watch::Receiver<bool>) {
-    let evicted = stream.evicted();
+/// What a login needs.
+struct LoginPlace {
+    door: ServerDoor,
+    keys: Arc<CancelKeys>,
+    encryption: ProtocolEncryption,
+}
+
+async fn attend(stream: PlacedStream, place: LoginPlace, stopping: watch::Receiver<bool>) {
+    let (evicted, work) = (stream.evicted(), stream.work());
     let login = async {
         tokio::select! {
-            login = tokio::time::timeout(LOGIN, log_in(&mut stream, &door, &keys)) => login.ok().flatten(),
+            login = tokio::time::timeout(LOGIN, place.log_in(stream)) => login.ok().flatten(),
             () = evicted => None,
         }
     };
-    let Some(mut session) = login.await else { return };
-    let _working = stream.work().begin();
+    let Some((stream, mut session)) = login.await else { return };
+    let _working = work.begin();
     let span = begin_connection(&mut session.startup, &session.client.name, STARTUP);
-    MessageRelay::new(stream, door, keys, session).run(stopping).instrument(span).await;
+    MessageRelay::new(stream, place.door, place.keys, session).run(stopping).instrument(span).await;
 }
 
 /// A client that is logged in.
@@ -74,50 +88,83 @@ struct PostgresLogin {
     startup: BytesMut,
 }
 
-// None if the connection has nothing more to say.
-async fn log_in(stream: &mut PlacedStream, door: &ServerDoor, keys: &CancelKeys) -> Option<PostgresLogin> {
-    match try_log_in(stream, door, keys).await {
-        Ok(login) => login,
-        Err(fault) => {
-            door.metrics().record_failure(&fault);
-            // A client that hangs up needs no reason.
-            let _ = stream.write_all(&fatal_message(&fault)).await;
-            let _ = stream.shutdown().await;
-            None
+impl LoginPlace {
+    // None if the connection has nothing more to say.
+    async fn log_in(&self, stream: PlacedStream) -> Option<(DoorStream, PostgresLogin)> {
+        let mut stream = DoorStream::Left(stream);
+        let login = loop {
+            let step = self.take_packet(&mut stream).await;
+            match (step, stream) {
+                // What follows is encrypted.
+                (Ok(LoginStep::Encrypt), DoorStream::Left(plain)) => stream = self.encryption.accept(plain).await?,
+                (Ok(LoginStep::Again | LoginStep::Encrypt), same) => stream = same,
+                (Ok(LoginStep::Done(login)), same) => {
+                    stream = same;
+                    break Ok(login);
+                }
+                (Ok(LoginStep::Nothing), _) => return None,
+                (Err(fault), same) => {
+                    stream = same;
+                    break Err(fault);
+                }
+            }
+        };
+        match login {
+            Ok(login) => Some((stream, login)),
+            Err(fault) => {
+                self.door.metrics().record_failure(&fault);
+                // A client that hangs up needs no reason.
+                let _ = stream.write_all(&fatal_message(&fault)).await;
+                let _ = stream.shutdown().await;
+                None
+            }
+        }
+    }
+
+    async fn take_packet(&self, stream: &mut DoorStream) -> Result<LoginStep, RequestFault> {
+        let Some(startup) = read_startup(stream).await? else { return Ok(LoginStep::Nothing) };
+        let is_encrypted = matches!(stream, DoorStream::Right(_));
+        match StartupPacket::parse(&startup[4..])? {
+            StartupPacket::Encryption { is_tls } => {
+                let may = is_tls && self.encryption.is_on() && !is_encrypted;
+                match (stream.write_all(if may { b"S" } else { b"N" }).await, may) {
+                    (Err(_), _) => Ok(LoginStep::Nothing),
+                    (Ok(()), true) => Ok(LoginStep::Encrypt),
+                    (Ok(()), false) => Ok(LoginStep::Again),
+                }
+            }
+            StartupPacket::Cancel { pid, secret } => {
+                if !self.keys.cancel(pid, &secret).await {
+                    tokio::time::sleep(WRONG_KEY).await;
+                }
+                Ok(LoginStep::Nothing)
+            }
+            StartupPacket::Session { .. } if self.encryption.is_on() && !is_encrypted => {
+                Err(RequestFault::request("this server encrypts its connections; hint: sslmode=require"))
+            }
+            StartupPacket::Session { user } => {
+                let token = match self.door.access().is_open() {
+                    true => None,
+                    false => Some(read_password(stream).await?),
+                };
+                let client = self.door.access().client(token.as_deref(), || ClientIdentity::user(&user))?;
+                client.require(TokenScope::Sql)?;
+                Ok(LoginStep::Done(PostgresLogin { client, startup }))
+            }
         }
     }
 }
 
-async fn try_log_in(
-    stream: &mut PlacedStream,
-    door: &ServerDoor,
-    keys: &CancelKeys,
-) -> Result<Option<PostgresLogin>, RequestFault> {
-    loop {
-        let Some(startup) = read_startup(stream).await? else { return Ok(None) };
-        match StartupPacket::parse(&startup[4..])? {
-            StartupPacket::Encryption => {
-                if stream.write_all(b"N").await.is_err() {
-                    return Ok(None);
-                }
-            }
-            StartupPacket::Cancel { pid, secret } => {
-                if !keys.cancel(pid, &secret).await {
-                    tokio::time::sleep(WRONG_KEY).await;
-                }
-                return Ok(None);
-            }
-            StartupPacket::Session { user } => {
-                let token = match door.access().is_open() {
-                    true => None,
-                    false => Some(read_password(stream).await?),
-                };
-                let client = door.access().client(token.as_deref(), || ClientIdentity::user(&user))?;
-                client.require(TokenScope::Sql)?;
-                return Ok(Some(PostgresLogin { client, startup }));
-            }
-        }
-    }
+/// What follows on a packet before the session.
+enum LoginStep {
+    /// Another packet.
+    Again,
+    /// A handshake.
+    Encrypt,
+    /// The session.
+    Done(PostgresLogin),
+    /// Nothing.
+    Nothing,
 }
 
 fn broken() -> RequestFault {
@@ -125,7 +172,7 @@ fn broken() -> RequestFault {
 }
 
 // None at the end of the connection.
-async fn read_startup(stream: &mut PlacedStream) -> Result<Option<BytesMut>, RequestFault> {
+async fn read_startup(stream: &mut DoorStream) -> Result<Option<BytesMut>, RequestFault> {
     let mut length = [0; 4];
     if stream.read_exact(&mut length).await.is_err() {
         return Ok(None);
@@ -140,7 +187,7 @@ async fn read_startup(stream: &mut PlacedStream) -> Result<Option<BytesMut>, Req
     Ok(Some(packet))
 }
 
-async fn read_password(stream: &mut PlacedStream) -> Result<String, RequestFault> {
+async fn read_password(stream: &mut DoorStream) -> Result<String, RequestFault> {
     stream.write_all(&PASSWORD_WANTED).await.map_err(|_| broken())?;
     let mut header = [0; HEADER];
     stream.read_exact(&mut header).await.map_err(|_| broken())?;

@@ -13,7 +13,7 @@ use super::PostgresLogin;
 use super::cancel_keys::{CancelKey, CancelKeys, CancelTarget};
 use super::exchange::MessageExchange;
 use super::frames::{FrameHeader, HEADER, READY, SYNC, error_message, fatal_message, key_message};
-use crate::door::connection_places::PlacedStream;
+use crate::door::encryption::DoorStream;
 use crate::door::engine_process::{EndReason, EngineLease, EngineProcess};
 use crate::door::server_door::ServerDoor;
 use crate::engine_socket::EngineSocket;
@@ -30,8 +30,8 @@ pub(super) struct MessageRelay {
     keys: Arc<CancelKeys>,
     login: PostgresLogin,
     key: Option<CancelKey>,
-    read: ReadHalf<PlacedStream>,
-    write: WriteHalf<PlacedStream>,
+    read: ReadHalf<DoorStream>,
+    write: WriteHalf<DoorStream>,
     incoming: BytesMut,
     outgoing: BytesMut,
     /// Bytes of a long message that are still to come, and whether they are passed on.
@@ -72,7 +72,7 @@ impl Drop for MessageRelay {
 }
 
 impl MessageRelay {
-    pub(super) fn new(stream: PlacedStream, door: ServerDoor, keys: Arc<CancelKeys>, login: PostgresLogin) -> Self {
+    pub(super) fn new(stream: DoorStream, door: ServerDoor, keys: Arc<CancelKeys>, login: PostgresLogin) -> Self {
         let (read, write) = tokio::io::split(stream);
         Self {
             door,
