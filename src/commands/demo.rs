@@ -136,10 +136,14 @@ fn print_next(lake_url: &str, example: &str) {
     }
 }
 
-// The columns of a table with one column per band.
-fn band_columns(lake: &Lake, value: impl Fn(&str) -> String) -> String {
+/// Title of the tables of levels.
+const LEVELS_TITLE: &str =
+    "TNCE of the values up to the 90th percentile against Flat, dB re Flat of the same band (simulated)";
+
+// The levels against Flat of a table with one column per band.
+fn level_columns(lake: &Lake, aggregate: &str) -> String {
     let bands = lake.rig().band_names();
-    let column = |band: &str, name: &str| format!("{} as \"{name}\"", value(band));
+    let column = |band: &str, name: &str| format!("round({aggregate}(against_flat_{band}_db), 1) + 0.0 as \"{name}\"");
     let columns: Vec<_> =
         bands.iter().map(|b| column(b, &format!("{b} Hz"))).chain([column("total", "total")]).collect();
     columns.join(", ")
@@ -148,14 +152,12 @@ fn band_columns(lake: &Lake, value: impl Fn(&str) -> String) -> String {
 // One row per reference or typology: a large collection has too many surfaces to print. Returns a surface to look at.
 async fn print_typologies(lake: &Lake) -> anyhow::Result<&'static str> {
     let session = Session::new(lake)?;
-    let columns =
-        band_columns(lake, |band| format!("round(avg(s.p90_mean_db) filter (where s.band = '{band}'), 1) + 0.0"));
-    super::print("\nTNCE of the values up to the 90th percentile, dB re Flat, mean over surfaces (simulated)")?;
+    let columns = level_columns(lake, "avg");
+    super::print(&format!("\n{LEVELS_TITLE}, mean over surfaces"))?;
     let sql = format!(
-        "select case u.typology when 'reference' then u.surface_id else u.typology end as kind, \
-         count(distinct u.surface_id) as surfaces, {columns} \
-         from surfaces u left join surface_stats s on s.surface_id = u.surface_id \
-         group by kind, u.typology order by u.typology <> 'reference', kind"
+        "select case typology when 'reference' then surface_id else typology end as kind, \
+         count(*) as surfaces, {columns} \
+         from catalogue group by kind, typology order by typology <> 'reference', kind"
     );
     super::sql::print_table(&session, &sql).await?;
     Ok("flat")
@@ -164,12 +166,11 @@ async fn print_typologies(lake: &Lake) -> anyhow::Result<&'static str> {
 // The paper's two tables. Returns a surface to look at.
 async fn print_tables(lake: &Lake) -> anyhow::Result<&'static str> {
     let session = Session::new(lake)?;
-    let columns = band_columns(lake, |band| format!("round(max(p90_mean_db) filter (where band = '{band}'), 1) + 0.0"));
-    super::print("\nMean TNCE of the values up to the 90th percentile, dB re Flat (simulated)")?;
-    let sql =
-        format!("select surface_id as surface, {columns} from surface_stats group by surface_id order by surface_id");
+    let columns = level_columns(lake, "");
+    super::print(&format!("\nMean {LEVELS_TITLE}"))?;
+    let sql = format!("select surface_id as surface, {columns} from catalogue order by surface_id");
     super::sql::print_table(&session, &sql).await?;
-    super::print(&format!("\nNCE totals of {COMPARED} against Flat, mean over the pairs (simulated)"))?;
+    super::print(&format!("\nMean energy of {COMPARED} and Flat, over Flat's total (simulated)"))?;
     let row = |band: &str| {
         format!(
             "select '{band}' as band, avg(tnce_{band}) filter (where surface_id = 'flat') as flat, \

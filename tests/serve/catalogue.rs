@@ -60,6 +60,9 @@ fn every_path_keeps_the_contract() {
             }
         }
     }
+    for sort in ["run_id", "state", "duration", "measurements", "repeats", "damaged", "temperature"] {
+        check("/api/v1/runs", &format!("/api/v1/runs?sort={sort}&order=asc"), 200);
+    }
     for (template, path) in [
         ("/api/v1/surfaces", "/api/v1/surfaces?level=nonsense:1..2"),
         ("/api/v1/surfaces", "/api/v1/surfaces?level=2500:a..b"),
@@ -148,6 +151,45 @@ fn facets_leave_their_own_filter_out() {
     assert_eq!((&nothing["total"], nothing["items"].as_array().map(Vec::len)), (&Value::from(0), Some(0)));
     let sorted = json(&get(&server, "/api/v1/surfaces?sort=level&order=desc&limit=2&offset=1"));
     assert_eq!(sorted["items"].as_array().map(Vec::len), Some(2));
+}
+
+#[test]
+fn references_are_not_data() {
+    let place = lake();
+    let server = served(&place, &[]);
+    let foam = json(&get(&server, "/api/v1/surfaces/foam"));
+    assert!(
+        foam["mean"].as_array().is_some_and(|means| means.len() == 6 && means.iter().all(Value::is_null)),
+        "{foam}"
+    );
+    assert!(foam["flat_mean"][0].is_f64(), "{foam}");
+    assert_eq!(json(&get(&server, "/api/v1/surfaces/foam/curves"))["surface"]["pairs"], 0);
+    let page = json(&get(&server, "/api/v1/surfaces"));
+    for histogram in page["histograms"].as_array().expect("histograms") {
+        let bins = histogram["bins"].as_array().expect("bins");
+        let counted = bins.iter().filter_map(|bin| bin["count"].as_u64()).sum::<u64>();
+        assert_eq!(counted, if histogram["name"] == "started" { 3 } else { 1 }, "{histogram}");
+    }
+    let facets = page["facets"].as_array().expect("facets");
+    assert!(facets.iter().all(|facet| facet["distinguishes"] == false), "there is one design: {facets:?}");
+}
+
+#[test]
+fn against_flat_is_the_same_number_everywhere() {
+    let place = lake();
+    let server = served(&place, &[]);
+    let surface = &json(&get(&server, "/api/v1/surfaces/brick"))["surface"];
+    let row = &place.sql(
+        "select c.against_flat_2500_db, c.against_flat_total_db, b.p90_mean_db - f.p90_mean_db as difference
+         from catalogue c join surface_stats b using (surface_id) join surface_stats f on f.band = b.band
+         where c.surface_id = 'brick' and f.surface_id = 'flat' and b.band = '2500'",
+    )[0];
+    let (levels, number) = (&surface["against_flat_db"], |name: &str| row[name].as_f64().expect("a level"));
+    assert!((number("against_flat_2500_db") - levels[0].as_f64().expect("a level")).abs() < 1e-9, "{row:?} {levels}");
+    assert!((number("difference") - number("against_flat_2500_db")).abs() < 1e-9, "{row:?}");
+    assert!((number("against_flat_total_db") - levels[5].as_f64().expect("a level")).abs() < 1e-9, "{row:?} {levels}");
+    let grid = |over: &str| get(&server, &format!("/api/v1/surfaces/brick/grid?microphone=3{over}")).body;
+    assert_eq!(grid(""), grid("&over=flat-band"));
 }
 
 #[test]

@@ -1,8 +1,9 @@
-//! What the pages must do, tried in a browser: `node tests/behaviour.mjs http://127.0.0.1:8420`.
+//! What the pages must do, tried in a browser: `node tests/behaviour.mjs http://127.0.0.1:8420 [part of a check's name]`.
 import assert from 'node:assert/strict'
 import { contextOf, eventually, launch } from './browser.mjs'
+import './mathematics.mjs'
 
-const base = process.argv[2]
+const [base, only = ''] = process.argv.slice(2)
 const get = async (path) => (await fetch(base + path)).json()
 const sql = async (query) =>
   (
@@ -31,6 +32,7 @@ const open = (path) => page.goto(base + path, { waitUntil: 'networkidle' })
 const settled = () => page.waitForLoadState('networkidle').then(() => page.waitForTimeout(150))
 let done = 0
 async function check(name, what) {
+  if (!name.includes(only)) return
   const from = performance.now()
   await what()
   done += 1
@@ -187,7 +189,107 @@ await check('the keyboard alone reaches an impulse response from the wall', asyn
   await page.getByRole('heading', { name: 'Spectrogram' }).waitFor()
 })
 
+/** Presses Tab until `holds` is true of what has the focus; returns how often. */
+async function tabTo(holds, most = 80) {
+  for (let i = 1; i <= most; i += 1) {
+    await page.keyboard.press('Tab')
+    if (await page.evaluate(holds)) return i
+  }
+  return assert.fail(`no focus where ${holds}`)
+}
+
+/** What a download holds. */
+async function textOf(file) {
+  let text = ''
+  for await (const part of await file.createReadStream()) text += part
+  return text
+}
+
+await check('the keyboard alone finds surfaces in three stops, compares them and exports their curves', async () => {
+  await open('/')
+  await page.locator('.sheet li').first().waitFor()
+  const skip = await tabTo(() => document.activeElement.textContent === 'Skip to the surfaces')
+  await page.keyboard.press('Enter')
+  const surface = await tabTo(() => document.activeElement.matches('a.surface'))
+  assert.equal(skip + surface, 3, 'stops to the first surface')
+  await page.keyboard.press('/')
+  await page.keyboard.type(id)
+  await page.waitForURL(`**/?q=${id}`)
+  await settled()
+  await tabTo(() => document.activeElement.matches('a.surface'))
+  await page.keyboard.press('x')
+  await page.waitForURL(/pick=/)
+  await page.keyboard.press('/')
+  await page.keyboard.press('Control+A')
+  const flat = all.items.find((s) => s.surface_id === id).flat_reference
+  await page.keyboard.type(flat)
+  await page.waitForURL(new RegExp(`q=${flat}`))
+  await settled()
+  await tabTo(() => document.activeElement.matches('a.surface'))
+  await page.keyboard.press('x')
+  await tabTo(() => document.activeElement.textContent === 'Compare 2')
+  await page.keyboard.press('Enter')
+  await page.waitForURL(`**/compare?s=${id},${flat}`)
+  await page.locator('.uplot canvas').waitFor()
+  await tabTo(() => document.activeElement.textContent === 'Export NCE, mean over all pairs')
+  await page.keyboard.press('Enter')
+  await tabTo(() => document.activeElement.textContent === 'Picture, SVG')
+  const [file] = await Promise.all([page.waitForEvent('download'), page.keyboard.press('Enter')])
+  const svg = await textOf(file)
+  assert.ok(svg.includes(`>${id}<`) && svg.includes('>simulated<'), svg.slice(-300))
+})
+
+await check('levels against Flat are one number on wall, surface, compare and in SQL', async () => {
+  const flat = all.items.find((s) => s.surface_id === id).flat_reference
+  const [{ level }] = await sql(`select against_flat_2500_db as level from catalogue where surface_id = '${id}'`)
+  const text = `${level < 0 ? '−' : '+'}${Math.abs(level).toFixed(1)}`
+  const cell = (figure, column) =>
+    page.locator(`section[aria-label="${figure}"] tbody tr`).first().locator('td').nth(column)
+  await open('/?sort=level&sort_band=2500')
+  const tile = page.locator('.sheet li', { has: page.locator(`[data-id="${id}"]`) })
+  await eventually(async () =>
+    assert.ok((await tile.innerText()).includes(`2.5 kHz ${text} dB`), await tile.innerText()),
+  )
+  await open(`/surfaces/${id}`)
+  await eventually(async () => assert.equal(await cell('Levels of the pairs', 0).innerText(), text))
+  await open(`/compare?s=${id},${flat}`)
+  const levels = 'Mean levels of the pairs up to the 90th percentile'
+  await eventually(async () => assert.equal((await cell(levels, 1).innerText()).trim(), text))
+  await page.getByRole('button', { name: 're Flat total' }).first().click()
+  await page.waitForURL(/over=flat-total/)
+  const [{ total }] = await sql(`select level_2500_db as total from catalogue where surface_id = '${id}'`)
+  await eventually(async () => assert.equal((await cell(levels, 1).innerText()).trim(), `−${(-total).toFixed(1)}`))
+})
+
+await check('references are no data, and pages without data lead back', async () => {
+  const { foam_reference: foam } = all.items.find((s) => s.surface_id === id)
+  await open(`/compare?s=${id},${foam}`)
+  await page.getByText(`Not shown (no TNCE): ${foam}.`).waitFor()
+  const row = page.locator('section[aria-label="Mean energy by band"] tbody tr').nth(1)
+  assert.deepEqual(await row.locator('td').allInnerTexts(), Array(lake.bands.length).fill('–'))
+  await open('/compare')
+  const suggested = await page.locator('main a[href*="/compare?s="]').getAttribute('href')
+  const names = new URLSearchParams(suggested.split('?')[1]).get('s').split(',')
+  for (const name of names) assert.notEqual(all.items.find((s) => s.surface_id === name).typology, 'reference', name)
+  await open(`/surfaces/${id.slice(0, -1)}`)
+  await page.locator('.problem a', { hasText: id }).click()
+  await page.waitForURL(`**/surfaces/${id}`)
+  await open('/runs/nosuch')
+  await page.locator('.problem a', { hasText: 'the wall' }).click()
+  await page.locator('.sheet li').first().waitFor()
+  said.splice(0, said.length, ...said.filter((line) => !line.includes('404')))
+})
+
+await check('every heading says that the lake is simulated', async () => {
+  const [run] = (await get('/api/v1/runs?limit=1')).items
+  for (const path of ['/', `/surfaces/${id}`, `/compare?s=${id}`, '/map', '/runs', `/runs/${run.run_id}`]) {
+    await open(path)
+    await page.locator('h1', { hasText: 'simulated' }).waitFor()
+  }
+})
+
 await check('a WAV, a picture and numbers can be saved', async () => {
+  await open(`/surfaces/${id}/pairs/159`)
   const [wav] = await Promise.all([
     page.waitForEvent('download'),
     page.getByRole('link', { name: 'WAV, full scale' }).click(),
@@ -213,6 +315,47 @@ await check('a WAV, a picture and numbers can be saved', async () => {
   }
 })
 
+await check('a response’s plots follow the address, and zoom, cursor and overlays the keyboard', async () => {
+  const [other] = all.items.filter((s) => s.typology !== 'reference' && s.surface_id !== id)
+  await open(`/surfaces/${id}/pairs/159?form=etc&re=maximum&octave=3&show=group-delay&delay=reflected&ms=0.5-1.5`)
+  for (const [group, pressed] of [
+    ['Response as', 'Energy-time curve'],
+    ['Show', 'Group delay'],
+    ['Frequency axis', 'Logarithmic'],
+  ])
+    assert.equal(
+      (await page.getByRole('group', { name: group }).locator('[aria-pressed=true]').innerText()).trim(),
+      pressed,
+    )
+  const section = (title) => page.locator(`section[aria-label="${title}"]`)
+  assert.match(await section('Spectrum').innerText(), /power over 1\/3 octave, rectangular on a logarithmic axis/)
+  const { pair } = await get(`/api/v1/surfaces/${id}/pairs/159`)
+  const delay_ms = pair.image_mm / (331.3 * Math.sqrt(1 + lake.reference_temperature_c / 273.15))
+  assert.ok((await section('Group delay').innerText()).includes(`reflected path, ${delay_ms.toFixed(3)} ms`))
+  // The highest of a curve re its maximum is 0 dB; the cursor starts at the left end of what is shown.
+  const plot = page.locator('section[aria-label="Before and after Foam’s subtraction"] [role=application]')
+  const told = section('Before and after Foam’s subtraction').locator('[aria-live]')
+  await plot.focus()
+  await page.keyboard.press('ArrowRight')
+  await eventually(async () => assert.match(await told.innerText(), /^0\.500 ms: Measured −?[\d.]+, .* dB$/))
+  await page.keyboard.press('+')
+  await page.waitForURL(/ms=0\.25-0\.75/)
+  await page.keyboard.press('0')
+  await page.waitForURL((url) => !url.searchParams.has('ms'))
+  await page.getByLabel('Surface to overlay').focus()
+  await page.keyboard.type(other.surface_id)
+  await page.keyboard.press('Enter')
+  await page.waitForURL((url) => url.searchParams.get('with') === other.surface_id)
+  await section('Response over time').getByText(`${other.surface_id} 159`).waitFor()
+  await page.getByRole('heading', { name: 'Spectrogram' }).click()
+  await page.keyboard.press(']')
+  await section('Response over time').getByText(`${other.surface_id} 160`).waitFor()
+  await page.getByRole('button', { name: `Remove ${other.surface_id}, pair 160` }).focus()
+  await page.keyboard.press('Enter')
+  await page.waitForURL((url) => !url.searchParams.has('with'))
+  await plot.waitFor()
+})
+
 await check('the console shows rows of every table, integers of 64 bits to the last digit', async () => {
   const tables = await get('/api/v1/tables')
   assert.ok(tables.length > 10, `${tables.length} tables`)
@@ -236,6 +379,86 @@ await check('the console shows rows of every table, integers of 64 bits to the l
     '{"n":-5}',
   ])
 })
+
+await check('tables show rows, previews and summaries as SQL counts them', async () => {
+  await open('/sql')
+  const row = (name) => page.locator('aside li', { has: page.getByRole('button', { name, exact: true }) })
+  const counted = async (table) => (await sql(`select count(*) as n from ${table}`))[0].n
+  for (const table of ['surfaces', 'tnce'])
+    await eventually(async () => {
+      const shown = (await row(table).locator('.num').innerText()).replaceAll('\u202f', '')
+      assert.equal(Number(shown), await counted(table), table)
+    })
+  await row('surfaces').getByRole('button', { name: 'surfaces', exact: true }).click()
+  await page.waitForURL(/q=select\+\*\+from\+surfaces\+limit/)
+  await eventually(async () => assert.equal(await page.locator('.rows tbody tr').count(), all.items.length))
+  await page.getByRole('button', { name: 'Columns of tnce', exact: true }).click()
+  await page.getByRole('button', { name: 'Summarise columns' }).click()
+  await page.waitForURL(/summary=tnce/)
+  const [{ low, high, nulls }] = await sql(
+    'select min(tnce_total) as low, max(tnce_total) as high, count(*) - count(tnce_total) as nulls from tnce',
+  )
+  const column = row('tnce').locator('dl > div', { has: page.locator('dt', { hasText: /^tnce_total/ }) })
+  await column.first().locator('.summary').waitFor()
+  const said = (await column.first().locator('.summary').innerText()).replaceAll('\u202f', '')
+  const text = (value) => String(Number(value.toPrecision(5)))
+  assert.ok(said.startsWith(`${text(low)} to ${text(high)}; `), said)
+  assert.equal(said.includes(' null'), nulls > 0, said)
+})
+
+await check('an answer’s first chart says something, and numbers have one minus', async () => {
+  const drawn = async (query, form) => {
+    await open(`/sql?q=${encodeURIComponent(query)}`)
+    await page.locator('.rows tbody tr').first().waitFor()
+    const pressed = page.getByRole('group', { name: 'Drawn as' }).locator('[aria-pressed=true]')
+    if (form) assert.equal((await pressed.innerText()).trim(), form, query)
+    else assert.equal(await pressed.count(), 0, query)
+  }
+  await drawn("select surface_id, p90_mean_db, spread_db from surface_stats where band = 'total'", 'Bars')
+  await drawn('select incidence_deg, direct_mm from pairs', 'Points')
+  await drawn('select log_time, temperature_c from environment limit 100', 'Line')
+  await drawn('select microphone, speaker from pairs', 'None')
+  await drawn('select * from points limit 20', 'None')
+  await drawn('select -1.5e-7 as small, -2 as large', null)
+  assert.deepEqual(await page.locator('.rows tbody td').allInnerTexts(), ['−1.5e−7', '−2'])
+  assert.match(await page.locator('.status').innerText(), /^1\srow,/)
+})
+
+await check(
+  'completion closes, earlier queries are kept without tokens, and a failed query offers no export',
+  async () => {
+    await open(`/sql?q=${encodeURIComponent('select 41 + 1 as answer')}`)
+    await page.locator('.rows tbody td').waitFor()
+    const list = page.locator('.editor .cm-tooltip-autocomplete')
+    const type = async (text) => {
+      await page.locator('.editor').click()
+      await page.keyboard.press('Control+a')
+      await page.keyboard.type(text, { delay: 30 })
+      await list.waitFor()
+    }
+    await type('select sur')
+    await page.keyboard.press('Escape')
+    await list.waitFor({ state: 'detached' })
+    await type('select sur')
+    await page.getByRole('button', { name: 'Copy link' }).focus()
+    await list.waitFor({ state: 'detached' })
+    await type('select sur')
+    await page.keyboard.press('Control+Enter')
+    await list.waitFor({ state: 'detached' })
+    await page.getByRole('alert').waitFor()
+    assert.equal(await page.getByRole('button', { name: 'CSV' }).count(), 0)
+    said.splice(0, said.length, ...said.filter((line) => !line.includes('status of 400')))
+    await open(`/sql?q=${encodeURIComponent("select 'echolake_0123456789abcdef' as secret")}`)
+    await page.locator('.rows tbody td').waitFor()
+    const kept = await page.evaluate(() => localStorage.getItem('queries'))
+    assert.ok(kept.includes('select 41 + 1 as answer') && !kept.includes('echolake_0'), kept)
+    await page.getByText('Earlier queries').click()
+    await page.getByRole('button', { name: 'select 41 + 1 as answer' }).click()
+    await page.waitForURL(/q=select\+41/)
+    await page.getByRole('button', { name: 'Clear' }).click()
+    assert.equal(await page.evaluate(() => localStorage.getItem('queries')), null)
+  },
+)
 
 await check('names from the lake stay text', async () => {
   await page.route('**/api/v1/surfaces?*', async (route) => {

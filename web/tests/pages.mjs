@@ -23,6 +23,7 @@ const PAGES = {
   surface: `/surfaces/${id}?microphone=14&point=40&over=flat-band`,
   missing: '/surfaces/no%3Cb%3Esuch',
   ir: `/surfaces/${id}/pairs/159`,
+  overlaid: `/surfaces/${id}/pairs/159?with=${measured[1].surface_id},${id}/160&form=etc&octave=3&show=group-delay&khz=4-20`,
   compare: `/compare?s=${items
     .slice(0, 4)
     .map((s) => s.surface_id)
@@ -33,9 +34,14 @@ const PAGES = {
     .join(',')}&show=difference&band=10000`,
   nothing: '/compare',
   map: `/map?at=${id}`,
+  som: '/map?axes=som&typology=all',
   runs: '/runs',
   run: `/runs/${runs[0].run_id}`,
+  log: `/runs/${runs[0].run_id}?log=all`,
+  lost: '/nowhere',
+  help: '/',
   sql: `/sql?q=${encodeURIComponent(query)}`,
+  tables: `/sql?q=${encodeURIComponent("select surface_id, p90_mean_db from surface_stats where band = 'total'")}&tables=points&summary=points`,
   wrong: '/sql?q=select%20nope',
 }
 
@@ -50,7 +56,7 @@ const fail = (text) => {
   process.stdout.write(`FAIL ${text}\n`)
 }
 for (const theme of ['light', 'dark']) {
-  for (const width of [1280, 390]) {
+  for (const width of [1400, 390]) {
     const context = await contextOf(browser, {
       viewport: { width, height: width === 390 ? 844 : 900 },
       colorScheme: theme,
@@ -82,7 +88,8 @@ for (const theme of ['light', 'dark']) {
       page.on('pageerror', (error) => said.push(`error: ${error.stack.split('\n').slice(0, 3).join(' ')}`))
       const at = `${name}-${theme}-${width}`
       await page.goto(base + path, { waitUntil: 'networkidle' })
-      await page.waitForTimeout(['surface', 'sql', 'wrong'].includes(name) ? 900 : 250)
+      await page.waitForTimeout(['surface', 'sql', 'tables', 'wrong'].includes(name) ? 900 : 250)
+      if (name === 'help') await page.keyboard.press('?')
       const jumps = await page.evaluate(() => globalThis.jumps)
       const jumped = jumps.reduce((sum, [value]) => sum + value, 0)
       if (jumped > MOST_JUMP)

@@ -4,13 +4,13 @@ use std::collections::HashMap;
 
 use echolake_schema::Rig;
 
-use super::note;
+use super::{RE_FLAT_BAND, RE_FLAT_TOTAL, note};
 
 // Column of `surface_stats`, name of its columns here, unit and meaning.
 const STATS: [(&str, &str, &str, &str); 4] = [
-    ("p90_mean_db", "level", "dB re Flat", "Mean of the TNCE values up to their 90th percentile"),
-    ("p5_db", "p5", "dB re Flat", "5th percentile of TNCE"),
-    ("p95_db", "p95", "dB re Flat", "95th percentile of TNCE"),
+    ("p90_mean_db", "level", RE_FLAT_TOTAL, "Mean of the TNCE values up to their 90th percentile"),
+    ("p5_db", "p5", RE_FLAT_TOTAL, "5th percentile of TNCE"),
+    ("p95_db", "p95", RE_FLAT_TOTAL, "95th percentile of TNCE"),
     ("spread_db", "spread", "dB", "Standard deviation of TNCE in dB over the pairs"),
 ];
 
@@ -26,8 +26,13 @@ pub(super) fn sql(rig: &Rig) -> String {
     let pivot = |(column, name, band): &(&str, String, String)| {
         format!("max(CASE WHEN band = '{band}' THEN {column} END) AS {name}")
     };
-    let pivots: Vec<_> = names.iter().map(pivot).collect();
-    let levels: Vec<_> = names.iter().map(|(_, name, _)| format!("t.{name}")).collect();
+    let own = names.iter().map(|(_, name, _)| format!("t.{name}"));
+    let against = bands(rig).into_iter().map(|b| format!("t.level_{b}_db - f.level_{b}_db AS against_flat_{b}_db"));
+    let levels: Vec<_> = own.chain(against).collect();
+    let statistics = format!(
+        "(SELECT run_id, {} FROM surface_stats GROUP BY run_id)",
+        names.iter().map(pivot).collect::<Vec<_>>().join(", ")
+    );
     format!(
         "SELECT s.surface_id, s.panel, s.side, s.typology, s.macrostructure, s.mesostructure, s.microstructure, \
          s.material, s.reflection_factor, s.parameters, s.relief_min_mm, s.relief_max_mm, s.relief_rms_mm, \
@@ -39,9 +44,10 @@ pub(super) fn sql(rig: &Rig) -> String {
          JOIN (SELECT surface_id, count(*) AS runs, CAST(sum(measurements) AS BIGINT) AS all_measurements, \
          min(started) AS first_started, max(ended) AS last_ended FROM runs GROUP BY surface_id) a \
          ON a.surface_id = s.surface_id \
-         LEFT JOIN (SELECT run_id, {pivots} FROM surface_stats GROUP BY run_id) t ON t.run_id = s.run_id",
+         LEFT JOIN {statistics} t ON t.run_id = s.run_id \
+         LEFT JOIN surfaces flat ON flat.surface_id = s.flat_reference \
+         LEFT JOIN {statistics} f ON f.run_id = flat.run_id",
         levels = levels.join(", "),
-        pivots = pivots.join(", ")
     )
 }
 
@@ -59,5 +65,9 @@ pub(super) fn notes(rig: &Rig) -> HashMap<String, HashMap<String, String>> {
             note(format!("{name}_{b}_db"), unit, format!("{comment}, {of}, newest run"))
         })
     });
-    own.into_iter().chain(levels).collect()
+    let against = bands(rig).into_iter().map(|b| {
+        let name = format!("against_flat_{b}_db");
+        note(name, RE_FLAT_BAND, format!("level_{b}_db less that of the surface's Flat"))
+    });
+    own.into_iter().chain(levels).chain(against).collect()
 }

@@ -5,24 +5,40 @@ use std::collections::HashMap;
 use echolake_schema::Rig;
 
 use super::ir::geometry;
-use super::note;
+use super::{RE_FLAT_BAND, RE_FLAT_TOTAL, note};
 
-// Linear column, the column of its level, and the level's description.
-fn levels(rig: &Rig) -> Vec<(String, String, String)> {
+/// A level of the view.
+struct LevelColumn {
+    /// The column of `tnce` that it is of.
+    energy: String,
+    name: String,
+    unit: &'static str,
+    comment: String,
+}
+
+impl LevelColumn {
+    fn new(energy: String, unit: &'static str, energy_of: &str) -> Self {
+        let (name, comment) = (format!("{energy}_db"), format!("Level of the energy {energy_of}"));
+        Self { energy, name, unit, comment }
+    }
+}
+
+fn levels(rig: &Rig) -> Vec<LevelColumn> {
     let bands = rig.band_names();
-    let over_total = bands.iter().map(|b| (format!("tnce_{b}"), format!("of the band at {b} Hz over Flat's total")));
-    let total = [("tnce_total".to_owned(), "of all bands over Flat's total".to_owned())];
-    let over_band =
-        bands.iter().map(|b| (format!("tnce_band_{b}"), format!("of the band at {b} Hz over Flat's of the same band")));
-    let named = over_total.chain(total).chain(over_band);
-    named
-        .map(|(column, what)| (column.clone(), format!("{column}_db"), format!("Level of the energy {what}")))
-        .collect()
+    let over_total = bands.iter().map(|b| {
+        LevelColumn::new(format!("tnce_{b}"), RE_FLAT_TOTAL, &format!("of the band at {b} Hz over Flat's total"))
+    });
+    let total = [LevelColumn::new("tnce_total".to_owned(), RE_FLAT_TOTAL, "of all bands over Flat's total")];
+    let over_band = bands.iter().map(|b| {
+        let energy_of = format!("of the band at {b} Hz over Flat's of the same band");
+        LevelColumn::new(format!("tnce_band_{b}"), RE_FLAT_BAND, &energy_of)
+    });
+    over_total.chain(total).chain(over_band).collect()
 }
 
 // Zero energy has no level: null.
 pub(super) fn sql(rig: &Rig) -> String {
-    let level = |(column, name, _): &(String, String, String)| format!("10 * log10(nullif(t.{column}, 0)) AS {name}");
+    let level = |LevelColumn { energy, name, .. }: &LevelColumn| format!("10 * log10(nullif(t.{energy}, 0)) AS {name}");
     let levels: Vec<_> = levels(rig).iter().map(level).collect();
     format!(
         "SELECT t.surface_id, t.run_id, t.pair_id, t.microphone, t.speaker, {}, {} FROM tnce t",
@@ -32,5 +48,5 @@ pub(super) fn sql(rig: &Rig) -> String {
 }
 
 pub(super) fn notes(rig: &Rig) -> impl Iterator<Item = (String, HashMap<String, String>)> {
-    levels(rig).into_iter().map(|(_, name, comment)| note(name, "dB re Flat", comment))
+    levels(rig).into_iter().map(|level| note(level.name, level.unit, level.comment))
 }

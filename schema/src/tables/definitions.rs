@@ -345,12 +345,13 @@ fn surface_stats() -> Vec<Column> {
         Column::text("band", "Centre of the band in Hz, or total"),
         Column::double("band_hz", "Hz", "Centre of the band; null for the total").or_null(),
         Column::int("measurements", "1", "Measurements that the row sums up"),
-        Column::double("p90_mean_db", "dB re Flat", "Mean of the TNCE values up to their 90th percentile").or_null(),
-        Column::double("p5_db", "dB re Flat", "5th percentile of TNCE").or_null(),
-        Column::double("p50_db", "dB re Flat", "Median of TNCE").or_null(),
-        Column::double("p95_db", "dB re Flat", "95th percentile of TNCE").or_null(),
-        Column::double("min_db", "dB re Flat", "Least TNCE").or_null(),
-        Column::double("max_db", "dB re Flat", "Greatest TNCE").or_null(),
+        Column::double("p90_mean_db", "dB re Flat total", "Mean of the TNCE values up to their 90th percentile")
+            .or_null(),
+        Column::double("p5_db", "dB re Flat total", "5th percentile of TNCE").or_null(),
+        Column::double("p50_db", "dB re Flat total", "Median of TNCE").or_null(),
+        Column::double("p95_db", "dB re Flat total", "95th percentile of TNCE").or_null(),
+        Column::double("min_db", "dB re Flat total", "Least TNCE").or_null(),
+        Column::double("max_db", "dB re Flat total", "Greatest TNCE").or_null(),
         Column::double("spread_db", "dB", "Standard deviation of TNCE in dB over the pairs").or_null(),
         Column::double(
             "p90_mean_u_db",
@@ -360,7 +361,7 @@ fn surface_stats() -> Vec<Column> {
         .or_null(),
         Column::double(
             "unbiased_p90_mean_db",
-            "dB re Flat",
+            "dB re Flat total",
             "p90_mean_db without Foam's own reflection, which is estimated from Foam and Flat; null if it cannot be",
         )
         .or_null(),

@@ -1,6 +1,7 @@
 //! The rows of a query, from an Arrow stream.
 import { tableFromIPC } from '@uwdata/flechette'
 import { ApiError } from './api'
+import { plain } from './format'
 
 export interface Answer {
   readonly columns: readonly {
@@ -96,9 +97,7 @@ export function cellText(value: unknown): string {
           .toISOString()
           .replace('T', ' ')
           .replace(/\.?0*Z$/, '')
-  if (typeof value === 'bigint') return String(value).replace('-', '\u2212')
-  if (typeof value === 'number')
-    return (Number.isInteger(value) ? String(value) : String(Number(value.toPrecision(7)))).replace('-', '\u2212')
+  if (typeof value === 'bigint' || typeof value === 'number') return plain(value)
   if (ArrayBuffer.isView(value) || Array.isArray(value)) {
     const list = Array.from(value as ArrayLike<unknown>)
     return `${list.slice(0, LONG).map(cellText).join(', ')}${list.length > LONG ? `, … ${list.length} values` : ''}`

@@ -665,6 +665,8 @@ export interface components {
         };
         /** @description Surfaces by the values of a text. */
         readonly Facet: {
+            /** @description Designs differ in it, and not just as in a facet before it. References are not counted as designs. */
+            readonly distinguishes: boolean;
             readonly label: string;
             /** @description The query parameter that filters by it. */
             readonly name: string;
@@ -727,7 +729,7 @@ export interface components {
             readonly microphone: number;
             /**
              * @description The normalisation of the bands. The total is always normalised by Flat's total.
-             * @default flat-total
+             * @default flat-band
              * @enum {string}
              */
             readonly over: "flat-total" | "flat-band";
@@ -938,7 +940,7 @@ export interface components {
         /** @description One run. */
         readonly RunDetail: {
             readonly attachments: readonly components["schemas"]["RunAttachment"][];
-            /** @description Warnings and errors first, at most 200. */
+            /** @description In the order of time, at most 200: warnings and errors before others. */
             readonly events: readonly components["schemas"]["Event"][];
             readonly quality: readonly components["schemas"]["Quality"][];
             readonly repeats: readonly components["schemas"]["AttemptCount"][];
@@ -1001,7 +1003,7 @@ export interface components {
              *     total last; null if there is no value.
              */
             readonly flat_mean: readonly (number | null)[];
-            /** @description The same of this surface. */
+            /** @description The same of this surface; null of the Foam that is subtracted. */
             readonly mean: readonly (number | null)[];
             readonly mesh_triangles: number | null;
             readonly mesh_watertight: boolean | null;
@@ -1309,7 +1311,7 @@ export interface operations {
                 readonly q?: string;
                 readonly surface_id?: string;
                 readonly state?: string;
-                readonly sort?: "started" | "surface_id" | "attempts" | "file_bytes";
+                readonly sort?: "started" | "run_id" | "surface_id" | "state" | "duration" | "measurements" | "repeats" | "attempts" | "damaged" | "temperature" | "file_bytes";
                 readonly order?: "desc" | "asc";
                 readonly offset?: number;
                 readonly limit?: number;
@@ -1572,9 +1574,9 @@ export interface operations {
                 readonly origin?: readonly string[];
                 /** @description `lo..hi` in days since 1970, as the histogram's bins. */
                 readonly started?: string;
-                /** @description `lo..hi` mm, root mean square. */
+                /** @description `lo..hi` mm, root mean square. References have none. */
                 readonly relief?: string;
-                /** @description `band:lo..hi`, dB against Flat. */
+                /** @description `band:lo..hi`, dB against Flat of the same band. References have none. */
                 readonly level?: readonly string[];
                 readonly sort?: "surface_id" | "started" | "relief" | "spread" | "level";
                 /** @description A band's key, as in `lake.bands`. */
@@ -1757,8 +1759,8 @@ export interface operations {
             readonly query: {
                 /** @description A grid point. */
                 readonly microphone: number;
-                /** @description As of grid; here the paper's is the default. */
-                readonly over?: ("flat-total" | "flat-band") & Record<string, never>;
+                /** @description As of grid. */
+                readonly over?: "flat-total" | "flat-band";
                 /** @description Surfaces beside this one. */
                 readonly beside?: readonly string[];
                 /** @description A surface whose levels are subtracted from those of the others. */

@@ -3,6 +3,7 @@ import {
   acceptCompletion,
   autocompletion,
   closeBrackets,
+  closeCompletion,
   completionKeymap,
   type Completion,
   type CompletionContext,
@@ -45,6 +46,20 @@ const colours = HighlightStyle.define([
   { tag: [tags.number, tags.bool, tags.null], color: 'var(--under)' },
   { tag: tags.comment, color: 'var(--ink-2)' },
 ])
+
+/** Replaces a selection by what is typed. The browser would carry its style over to the text, as an inline style that the
+ * page's policy refuses. */
+function replaceSelection(event: InputEvent, view: EditorView): boolean {
+  const { main, ranges } = view.state.selection
+  const text = event.data
+  if (event.inputType !== 'insertText' || event.isComposing || !text || main.empty || ranges.length > 1) return false
+  event.preventDefault()
+  const insert = () =>
+    view.state.update(view.state.replaceSelection(text), { userEvent: 'input.type', scrollIntoView: true })
+  const handlers = view.state.facet(EditorView.inputHandler)
+  if (!handlers.some((handle) => handle(view, main.from, main.to, text, insert))) view.dispatch(insert())
+  return true
+}
 
 /** Functions and every column, also before a table is named. */
 function words(tables: readonly Table[], functions: readonly string[]): Completion[] {
@@ -108,6 +123,7 @@ export function editor(
         closeBrackets(),
         autocompletion({ icons: false }),
         highlightActiveLine(),
+        EditorView.domEventHandlers({ beforeinput: replaceSelection }),
         EditorView.lineWrapping,
         look,
         syntaxHighlighting(colours),
@@ -116,7 +132,8 @@ export function editor(
           keymap.of([
             {
               key: 'Mod-Enter',
-              run: () => {
+              run: (target) => {
+                closeCompletion(target)
                 run()
                 return true
               },
@@ -146,7 +163,10 @@ export function editor(
   })
   return {
     text: () => view.state.doc.toString(),
-    set: (next) => view.dispatch({ changes: { from: 0, to: view.state.doc.length, insert: next } }),
+    set(next) {
+      closeCompletion(view)
+      view.dispatch({ changes: { from: 0, to: view.state.doc.length, insert: next } })
+    },
     complete(tables, called) {
       const support = sql({ dialect: PostgreSQL, schema: names(tables), upperCaseKeywords: false })
       const options = words(tables, called)

@@ -15,6 +15,13 @@ export function signed(value: number | null | undefined, digits = 1): string {
   return typeof value === 'number' && value > 0 && Number(value.toFixed(digits)) > 0 ? `+${text}` : text
 }
 
+/** A number with as many digits as it needs, up to some; every minus is a true one, also an exponent's. */
+export const plain = (value: number | bigint, digits = 7) =>
+  (typeof value === 'bigint' || Number.isInteger(value)
+    ? String(value)
+    : String(Number(value.toPrecision(digits)))
+  ).replaceAll('-', MINUS)
+
 export const count = (value: number) => value.toLocaleString('en').replaceAll(',', '\u202f')
 
 /** `stretcher_bond_bricks` as words. */

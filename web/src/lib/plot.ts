@@ -59,6 +59,17 @@ export function yRange(spec: PlotSpec): [number, number] {
   return [spec.y.low ?? (low === 0 ? 0 : low - air), spec.y.high ?? high + air]
 }
 
+/** Numbers for a logarithmic axis: 1, 2, 5 in each decade, or round ones if the range has too few of them. */
+export function logTicks(low: number, high: number): number[] {
+  const found: number[] = []
+  for (let power = Math.floor(Math.log10(low)); power <= Math.log10(high); power += 1)
+    for (const m of [1, 2, 5]) {
+      const value = Number((m * 10 ** power).toPrecision(3))
+      if (value >= low * 0.999 && value <= high * 1.001) found.push(value)
+    }
+  return found.length >= 3 ? found : ticks(low, high, 5)
+}
+
 /** As many decimals as steps of this size need. */
 export const decimals = (step: number) => Math.max(0, Math.ceil(-Math.log10(step) - 1e-9))
 

@@ -1,5 +1,6 @@
 //! The queries behind the figures, as they can be run anywhere.
 import type { Lake } from './api'
+import type { LevelReference } from './reference'
 
 /** A string as an SQL literal. */
 export const quoted = (text: string) => `'${text.replaceAll("'", "''")}'`
@@ -19,16 +20,26 @@ export const gridQuery = (lake: Lake, id: string, microphone: number, over: stri
 export const meanQuery = (lake: Lake, ids: readonly string[]) =>
   `select surface_id, count(*) as pairs,\n${lake.bands.map((band) => `  avg(tnce_${band.key}) as tnce_${band.key}`).join(',\n')}\nfrom tnce\nwhere surface_id in (${ids.map(quoted).join(', ')})\ngroup by surface_id order by surface_id`
 
-export const statisticsQuery = (ids: readonly string[]) =>
-  `select surface_id, band, p90_mean_db, p90_mean_u_db, unbiased_p90_mean_db, p5_db, p50_db, p95_db, min_db, max_db, spread_db\nfrom surface_stats\nwhere surface_id in (${ids.map(quoted).join(', ')})\norder by surface_id, band_hz`
+/** Levels over Flat's total, or less Flat's level in the same band. */
+export function statisticsQuery(ids: readonly string[], over: LevelReference): string {
+  const level = (name: string) => (over === 'flat-total' ? `s.${name}` : `s.${name} - f.p90_mean_db as ${name}`)
+  const columns = ['p90_mean_db', 'unbiased_p90_mean_db', 'p5_db', 'p50_db', 'p95_db', 'min_db', 'max_db'].map(level)
+  const flat =
+    over === 'flat-total'
+      ? ''
+      : '\n  join surfaces flat on flat.surface_id = u.flat_reference\n  join surface_stats f on f.run_id = flat.run_id and f.band = s.band'
+  return `select s.surface_id, s.band, ${columns.join(', ')}, s.p90_mean_u_db, s.spread_db\nfrom surface_stats s join surfaces u on u.run_id = s.run_id${flat}\nwhere s.surface_id in (${ids.map(quoted).join(', ')})\norder by s.surface_id, s.band_hz`
+}
 
 export const curvesQuery = (lake: Lake, id: string, pair?: number) =>
   `select pair_id, ${centres(lake)
     .map((key) => `nce_${key}`)
     .join(', ')}\nfrom nce\nwhere surface_id = ${quoted(id)}${pair === undefined ? '' : ` and pair_id = ${pair}`}`
 
-export const responseQuery = (id: string, pair: number) =>
-  `select m.pair_id, m.ir, n.reflected_ir\nfrom measurements m left join nce n using (surface_id, pair_id)\nwhere m.surface_id = ${quoted(id)} and m.pair_id = ${pair}`
+export const responseQuery = (measurements: readonly { readonly id: string; readonly pair: number }[]) =>
+  `select m.surface_id, m.pair_id, m.ir, n.reflected_ir\nfrom measurements m left join nce n using (surface_id, pair_id)\nwhere ${measurements
+    .map(({ id, pair }) => `m.surface_id = ${quoted(id)} and m.pair_id = ${pair}`)
+    .join('\n  or ')}`
 
 export const heightsQuery = (id: string) =>
   `select cells, size_mm, heights_mm from heightmaps where surface_id = ${quoted(id)} and symmetry = 'identity'`

@@ -60,7 +60,12 @@ export function follow(): void {
     if (!link || link.target || link.hasAttribute('download') || link.origin !== location.origin) return
     if (/^\/(api|health|metrics)/.test(link.pathname)) return
     event.preventDefault()
+    // A place within the page; its address stays, because that names the view.
+    if (link.hash && link.pathname === location.pathname) {
+      document.getElementById(link.hash.slice(1))?.focus()
+      return
+    }
     go(link.pathname + link.search)
-    if (link.hash === '') scrollTo(0, 0)
+    scrollTo(0, 0)
   })
 }

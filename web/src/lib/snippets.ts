@@ -8,14 +8,14 @@ export const EXAMPLES: readonly { title: string; query: (lake: Lake) => string }
       "select surface_id, p90_mean_db, spread_db\nfrom surface_stats\nwhere band = 'total'\norder by p90_mean_db\nlimit 20",
   },
   {
-    title: 'Band levels side by side',
+    title: 'Levels against Flat by band',
     query: (lake) =>
-      `select surface_id,\n${lake.bands.map((b) => `  max(p90_mean_db) filter (where band = '${b.key}') as "${b.label}"`).join(',\n')}\nfrom surface_stats\ngroup by surface_id\norder by surface_id`,
+      `select surface_id,\n${lake.bands.map((b) => `  against_flat_${b.key}_db as "${b.label}"`).join(',\n')}\nfrom catalogue\norder by surface_id`,
   },
   {
     title: 'Incidence and level of one surface',
     query: (lake) =>
-      `select p.incidence_deg, 10 * log10(t.tnce_${lake.bands[Math.min(2, lake.bands.length - 1)].key}) as level_db\nfrom tnce t join pairs p using (pair_id)\nwhere t.surface_id = (select min(surface_id) from surfaces where typology <> 'reference')\norder by p.incidence_deg`,
+      `select p.incidence_deg, 10 * log10(t.tnce_band_${lake.bands[Math.min(2, lake.bands.length - 2)].key}) as against_flat_db\nfrom tnce t join pairs p using (pair_id)\nwhere t.surface_id = (select min(surface_id) from surfaces where typology <> 'reference')\norder by p.incidence_deg`,
   },
   {
     title: 'One impulse response',

@@ -17,8 +17,6 @@ use super::summary::SurfaceEntry;
 const LEAST: usize = 3;
 /// Parameters that are answered.
 const MOST: usize = 500;
-/// Typology of references, which are not designs and are left out.
-const REFERENCE: &str = "reference";
 /// A parameter without meaning for the shape of a relief.
 const SEED: &str = "seed";
 
@@ -69,7 +67,8 @@ pub(super) async fn correlations(
     let summary = request.summary().await?;
     let is_chosen = |entry: &&SurfaceEntry| {
         let typology = entry.surface.typology.as_str();
-        typology != REFERENCE && (query.typology.is_empty() || query.typology.iter().any(|chosen| chosen == typology))
+        !entry.surface.is_reference()
+            && (query.typology.is_empty() || query.typology.iter().any(|chosen| chosen == typology))
     };
     let chosen: Vec<_> = summary.entries.iter().filter(is_chosen).collect();
     let mut items = Vec::new();

@@ -47,8 +47,8 @@ impl PairSelection {
     fn filter(&self) -> (&'static str, Option<ScalarValue>) {
         match self {
             Self::All => ("", None),
-            Self::Point(point) => (" and (microphone = $3 or speaker = $3)", Some(number(*point))),
-            Self::Pair(pair) => (" and pair_id = $3", Some(number(*pair))),
+            Self::Point(point) => (" and (microphone = $2 or speaker = $2)", Some(number(*point))),
+            Self::Pair(pair) => (" and pair_id = $2", Some(number(*pair))),
         }
     }
 }
@@ -64,13 +64,23 @@ impl CurveSet {
     ) -> Result<Self, RequestFault> {
         let rig = request.catalogue.lake().rig();
         let (filter, value) = over.filter();
-        let sql = curves_query(rig, "$1, $2", filter);
+        let sql = curves_query(rig, "$1", filter);
+        let read = async |surface: &str| -> Result<Option<CurveRow>, RequestFault> {
+            let values = [text(surface)].into_iter().chain(value.clone()).collect();
+            Ok(request.rows(&sql, values).await?.into_iter().next())
+        };
         let (id, flat) = (&entry.surface.surface_id, &entry.surface.flat_reference);
-        let values = [text(id), text(flat)].into_iter().chain(value).collect();
-        let rows: Vec<CurveRow> = request.rows(&sql, values).await?;
+        // What is left of Foam without Foam is no energy of a surface.
+        let read_own = async || if entry.surface.is_foam() { Ok(None) } else { read(id).await };
+        let known = request.view.flat_curves(flat);
+        let read_flat = async || match over {
+            PairSelection::All => Ok(known.get_or_try_init(|| read(flat)).await?.clone()),
+            PairSelection::Point(_) | PairSelection::Pair(_) => read(flat).await,
+        };
+        let (own_row, flat_row) = tokio::try_join!(read_own(), read_flat())?;
         let kept = thinned_samples(rig.impulse_response.length, points);
-        let of = |surface: &str| thinned_curves(surface, rows.iter().find(|row| row.surface_id == surface), rig, &kept);
-        Ok(Self { time_ms: times_ms(rig, &kept), surface: of(id), flat: of(flat) })
+        let thin = |surface: &str, row: Option<CurveRow>| thinned_curves(surface, row.as_ref(), rig, &kept);
+        Ok(Self { time_ms: times_ms(rig, &kept), surface: thin(id, own_row), flat: thin(flat, flat_row) })
     }
 
     /// Returns whether the surface itself has curves.

@@ -2,7 +2,7 @@
 //! from the summary in memory, in one pass a request.
 
 use std::cmp::Ordering;
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::ops::RangeInclusive;
 
 use axum::Extension;
@@ -73,10 +73,10 @@ pub(super) struct SurfacesQuery {
     /// `lo..hi` in days since 1970, as the histogram's bins.
     #[param(inline)]
     started: Option<NumberRange>,
-    /// `lo..hi` mm, root mean square.
+    /// `lo..hi` mm, root mean square. References have none.
     #[param(inline)]
     relief: Option<NumberRange>,
-    /// `band:lo..hi`, dB against Flat.
+    /// `band:lo..hi`, dB against Flat of the same band. References have none.
     #[param(inline)]
     level: Vec<LevelRange>,
     #[param(inline)]
@@ -156,6 +156,8 @@ struct FacetCounts<'a> {
     /// The query parameter that filters by it.
     name: &'static str,
     label: &'static str,
+    /// Designs differ in it, and not just as in a facet before it. References are not counted as designs.
+    distinguishes: bool,
     values: Vec<FacetValue<'a>>,
 }
 
@@ -196,10 +198,12 @@ enum SurfaceMeasure {
 }
 
 impl SurfaceMeasure {
+    // References have neither level nor relief: they are what others are measured by.
     fn of(self, entry: &SurfaceEntry) -> Option<f64> {
+        let is_design = !entry.surface.is_reference();
         let value = match self {
-            Self::Level(band) => entry.surface.against_flat_db[band],
-            Self::Relief => entry.surface.relief_rms_mm,
+            Self::Level(band) => entry.surface.against_flat_db[band].filter(|_| is_design),
+            Self::Relief => entry.surface.relief_rms_mm.filter(|_| is_design),
             Self::Started => entry.day,
         };
         value.filter(|v| v.is_finite())
@@ -337,7 +341,19 @@ fn counts<'a>(
     let mut values: Vec<_> = counts.into_iter().map(|(value, count)| FacetValue { value, count }).collect();
     values.sort_by(|a, b| b.count.cmp(&a.count).then_with(|| a.value.cmp(b.value)));
     values.truncate(MOST_VALUES);
-    FacetCounts { name: FACETS[facet].name, label: FACETS[facet].label, values }
+    let distinguishes = distinguishes(facet, all);
+    FacetCounts { name: FACETS[facet].name, label: FACETS[facet].label, distinguishes, values }
+}
+
+fn distinguishes(facet: usize, all: &[(&SurfaceEntry, FilterOutcome)]) -> bool {
+    let designs = || all.iter().map(|(entry, _)| &entry.surface).filter(|surface| !surface.is_reference());
+    let values: BTreeSet<_> = designs().map(|surface| value(facet, surface)).collect();
+    let is_same = |earlier: usize| {
+        let both: BTreeSet<_> = designs().map(|surface| (value(facet, surface), value(earlier, surface))).collect();
+        let others: BTreeSet<_> = both.iter().map(|(_, earlier)| *earlier).collect();
+        both.len() == values.len() && both.len() == others.len()
+    };
+    values.len() > 1 && !(0..facet).any(is_same)
 }
 
 // Whether a surface is let through by all filters but one's own.

@@ -49,9 +49,9 @@ pub(super) struct GridFigureQuery {
     /// A grid point.
     #[param(value_type = usize, required = true)]
     microphone: Option<String>,
-    /// As of grid; here the paper's is the default.
-    #[serde(default = "flat_band")]
-    #[param(inline, default = "flat-band")]
+    /// As of grid.
+    #[serde(default)]
+    #[param(inline)]
     over: GridNormalisation,
     /// Surfaces beside this one.
     #[serde(default)]
@@ -70,10 +70,6 @@ pub(super) struct GridFigureQuery {
     #[serde(default)]
     #[param(inline)]
     width: WholeNumber<160, 1200, 560>,
-}
-
-fn flat_band() -> GridNormalisation {
-    GridNormalisation::FlatBand
 }
 
 /// TNCE over the grid for one microphone point, drawn.

@@ -88,9 +88,35 @@ pub(super) struct RunsQuery {
 enum RunSort {
     #[default]
     Started,
+    RunId,
     SurfaceId,
+    State,
+    Duration,
+    Measurements,
+    /// Attempts beyond the measurements.
+    Repeats,
     Attempts,
+    Damaged,
+    Temperature,
     FileBytes,
+}
+
+impl RunSort {
+    fn expression(self) -> &'static str {
+        match self {
+            Self::Started => "started_ns",
+            Self::RunId => "run_id",
+            Self::SurfaceId => "surface_id",
+            Self::State => "state",
+            Self::Duration => "ended_ns - started_ns",
+            Self::Measurements => "measurements",
+            Self::Repeats => "attempts - measurements",
+            Self::Attempts => "attempts",
+            Self::Damaged => "damaged",
+            Self::Temperature => "temperature_min_c",
+            Self::FileBytes => "file_bytes",
+        }
+    }
 }
 
 #[derive(Clone, Copy, Default, Deserialize, ToSchema)]
@@ -128,19 +154,15 @@ pub(super) async fn runs(
     Extension(request): Extension<CatalogueRequest>,
     QueryParams(query): QueryParams<RunsQuery>,
 ) -> EndpointAnswer {
-    let column = match query.sort {
-        RunSort::Started => "started_ns",
-        RunSort::SurfaceId => "surface_id",
-        RunSort::Attempts => "attempts",
-        RunSort::FileBytes => "file_bytes",
-    };
+    let column = query.sort.expression();
     let order = match query.order {
         RunDirection::Desc => "desc",
         RunDirection::Asc => "asc",
     };
     let chosen = vec![text(&query.q.to_lowercase()), text(&query.surface_id), text(&query.state)];
-    let page =
-        format!("select {COLUMNS} from runs where {CHOSEN} order by {column} {order}, run_id limit $5 offset $4");
+    let page = format!(
+        "select {COLUMNS} from runs where {CHOSEN} order by {column} {order} nulls last, run_id limit $5 offset $4"
+    );
     let count = format!("select count(*) as total from runs where {CHOSEN}");
     let whole = |n: usize| ScalarValue::Int64(Some(i64::try_from(n).unwrap_or(i64::MAX)));
     let part = [whole(query.offset.get()), whole(query.limit.get())];
@@ -159,7 +181,7 @@ struct RunDetail {
     attachments: Vec<RunAttachment>,
     quality: Vec<QualityCount>,
     repeats: Vec<AttemptCount>,
-    /// Warnings and errors first, at most 200.
+    /// In the order of time, at most 200: warnings and errors before others.
     events: Vec<RunLogEntry>,
 }
 
@@ -226,7 +248,8 @@ const FLAGS: &str = "select count(*) filter (where clipped_samples > 0) as clipp
         "select count(*) filter (where clipped_samples > 0), count(*) filter (where snr_db < 30), count(*) filter \
          (where abs(arrival_error_us) > 20), count(*) filter (where outside_level_db > 65) from measurements where \
          run_id = $1 (limits: [rig.validation])",
-        "select * from events where run_id = $1 order by level = 'info', log_time_ns limit 200",
+        "select * from (select * from events where run_id = $1 order by level = 'info', log_time_ns limit 200) \
+         order by log_time_ns",
     ])))
 )]
 pub(super) async fn run(
@@ -240,8 +263,8 @@ pub(super) async fn run(
     let flags = vec![id.clone(), real(limits.snr_db), real(limits.arrival_us), real(limits.outside_level_db)];
     let one = format!("select {COLUMNS} from runs where run_id = $1");
     let log = format!(
-        "select log_time, level, name, message from events where run_id = $1 \
-         order by level in ('debug', 'info', 'unknown'), log_time_ns limit {MOST_EVENTS}"
+        "select log_time, level, name, message from (select * from events where run_id = $1 \
+         order by level in ('debug', 'info', 'unknown'), log_time_ns limit {MOST_EVENTS}) order by log_time_ns"
     );
     let (session, service) = (request.view.session.clone(), request.catalogue.service());
     let (contents, run, repeats, flags, events) = tokio::try_join!(

@@ -8,6 +8,8 @@ use utoipa::ToSchema;
 
 use super::bands::BandDescription;
 
+/// Typology of references.
+const REFERENCE: &str = "reference";
 /// Nanoseconds of a day.
 const DAY_NS: f64 = 86_400e9;
 
@@ -25,7 +27,7 @@ pub(super) struct SurfaceSummary {
     microstructure: Option<String>,
     pub(super) material: String,
     pub(super) flat_reference: String,
-    foam_reference: String,
+    pub(super) foam_reference: String,
     pub(super) origin: String,
     #[schema(format = DateTime)]
     started: Option<String>,
@@ -39,6 +41,18 @@ pub(super) struct SurfaceSummary {
     pub(super) against_flat_db: Vec<Option<f64>>,
     /// Standard deviation of the pairs' TNCE in dB, by band as `level_db`.
     pub(super) spread_db: Vec<Option<f64>>,
+}
+
+impl SurfaceSummary {
+    /// Returns whether it is a reference, which is no design.
+    pub(super) fn is_reference(&self) -> bool {
+        self.typology == REFERENCE
+    }
+
+    /// Returns whether it is the Foam that is subtracted from it, which leaves nothing.
+    pub(super) fn is_foam(&self) -> bool {
+        self.surface_id == self.foam_reference
+    }
 }
 
 /// A surface, and what it is found and compared by.

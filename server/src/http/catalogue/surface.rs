@@ -31,7 +31,7 @@ struct SurfaceDetail<'a> {
     /// Mean over the pairs of Flat's TNCE, linear, over Flat's total. One value per band in the order of `lake.bands`, the
     /// total last; null if there is no value.
     flat_mean: Vec<Option<f64>>,
-    /// The same of this surface.
+    /// The same of this surface; null of the Foam that is subtracted.
     mean: Vec<Option<f64>>,
 }
 
@@ -124,7 +124,7 @@ pub(super) async fn surface(
         statistics: bands.iter().filter_map(|band| by_band.remove(&band.key)).collect(),
         detail_phase: phases.into_iter().next().map_or_else(|| vec![None; names.len()], |row| row.phases),
         flat_mean: mean(flat),
-        mean: mean(id),
+        mean: if entry.surface.is_foam() { vec![None; bands.len()] } else { mean(id) },
     })?)
 }
 
@@ -160,10 +160,10 @@ pub(super) struct GridQuery {
 /// The normalisation of the bands. The total is always normalised by Flat's total.
 #[derive(Clone, Copy, Default, PartialEq, Eq, Deserialize, Serialize, ToSchema)]
 #[serde(rename_all = "kebab-case")]
-#[schema(default = "flat-total")]
+#[schema(default = "flat-band")]
 pub(super) enum GridNormalisation {
-    #[default]
     FlatTotal,
+    #[default]
     FlatBand,
 }
 

@@ -5,6 +5,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
 use echolake_lake::{DataFile, LakeSnapshot};
+use echolake_query::figure_rows::CurveRow;
 use echolake_query::{EngineClient, PreparedQuery, QueryQuota, Session};
 use echolake_schema::tables::Table;
 use object_store::path::Path as StorePath;
@@ -33,6 +34,8 @@ pub(in super::super) struct SnapshotView {
     pub(super) answers: AnswerCache,
     pub(super) summary: OnceCell<CatalogueSummary>,
     pub(super) places: OnceCell<SurfacePositions>,
+    /// Mean curves over all pairs of the references that surfaces are beside, by name; there are few.
+    flat_curves: Mutex<HashMap<String, Arc<OnceCell<Option<CurveRow>>>>>,
     /// Prepared queries by their text; there are few texts, because values are bound.
     prepared: Mutex<HashMap<String, Arc<PreparedQuery>>>,
 }
@@ -46,6 +49,7 @@ impl SnapshotView {
             answers: AnswerCache::default(),
             summary: OnceCell::new(),
             places: OnceCell::new(),
+            flat_curves: Mutex::default(),
             prepared: Mutex::default(),
         }
     }
@@ -57,6 +61,12 @@ impl SnapshotView {
 
     pub(super) fn prepared(&self, sql: &str) -> Option<Arc<PreparedQuery>> {
         self.prepared.lock().unwrap_or_else(PoisonError::into_inner).get(sql).cloned()
+    }
+
+    /// The place of a reference's mean curves over all pairs.
+    pub(super) fn flat_curves(&self, flat: &str) -> Arc<OnceCell<Option<CurveRow>>> {
+        let mut known = self.flat_curves.lock().unwrap_or_else(PoisonError::into_inner);
+        known.entry(flat.to_owned()).or_default().clone()
     }
 
     pub(super) fn keep_prepared(&self, sql: &str, prepared: Arc<PreparedQuery>) {

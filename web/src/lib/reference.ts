@@ -1,0 +1,25 @@
+//! The two parts of Flat that levels are over. "Against Flat" is over the same band, on every page; the other one is always
+//! named in full.
+import type { Surface } from './api'
+import { place } from './router.svelte'
+
+export type LevelReference = 'flat-band' | 'flat-total'
+
+export const REFERENCES: readonly { key: LevelReference; label: string; unit: string }[] = [
+  { key: 'flat-band', label: 'Against Flat, same band', unit: 'dB re Flat, same band' },
+  { key: 'flat-total', label: 're Flat total', unit: 'dB re Flat total' },
+]
+
+/** The one that the address names. */
+export const chosenReference = (): LevelReference =>
+  place.params.get('over') === 'flat-total' ? 'flat-total' : 'flat-band'
+
+export const unitOf = (over: LevelReference) => REFERENCES.find(({ key }) => key === over)!.unit
+
+/** Converts a level over Flat's total of a band. */
+export function levelOver(over: LevelReference, surface: Surface, band: number, total_db: number | null | undefined) {
+  if (total_db === null || total_db === undefined) return null
+  if (over === 'flat-total') return total_db
+  const [own, against] = [surface.level_db[band], surface.against_flat_db[band]]
+  return own === null || against === null ? null : total_db - (own - against)
+}
