@@ -59,6 +59,11 @@ impl CommandProgress {
 }
 
 impl TaskProgress {
+    /// Returns whether a number that is set now is shown.
+    pub(crate) fn is_due(&self) -> bool {
+        self.bar.is_some() || self.last_line.elapsed() >= LINE_EVERY
+    }
+
     /// Sets the number of units that are done.
     pub(crate) fn at(&mut self, done: u64) {
         match &self.bar {
@@ -66,7 +71,7 @@ impl TaskProgress {
                 *self.pace.lock().unwrap_or_else(PoisonError::into_inner) = self.describe_pace(done);
                 bar.set_position(done);
             }
-            None if self.last_line.elapsed() >= LINE_EVERY => {
+            None if self.is_due() => {
                 self.last_line = Instant::now();
                 let note = if self.note.is_empty() { String::new() } else { format!("; {}", self.note) };
                 let pace = self.describe_pace(done);

@@ -10,7 +10,7 @@ use std::sync::Arc;
 use anyhow::Context as _;
 use echolake_acquisition::panel::mesh::Mesh;
 use echolake_acquisition::run::controller::{RecordingMode, RunControl, RunEvent};
-use echolake_acquisition::run::live::LiveServer;
+use echolake_acquisition::run::live::{LiveClock, LiveServer};
 use echolake_acquisition::run::metrics::{MetricsServer, RunMetrics};
 use echolake_acquisition::run::recorder::{Held, partial_of, random_tag};
 use echolake_acquisition::run::session::{MeasuredRun, PreflightMode, RunSession, TakePace};
@@ -138,13 +138,14 @@ async fn measure(args: &AcquireArgs, lake_url: &str) -> anyhow::Result<CommandOu
         Some(partial) => AcquireJob::Resumed { partial: partial.clone(), held: Box::new(Held::read(partial)?) },
         None => fresh(args, lake_url, &progress).await?,
     };
-    if job.rig().devices.are_simulated() {
+    let clock = if job.rig().devices.are_simulated() { LiveClock::Simulated } else { LiveClock::Wall };
+    if clock == LiveClock::Simulated {
         progress.say("simulated rig: nothing here is measured");
     }
     let (surface, planned, accepted) = job.size()?;
     let mut acknowledgements = args.acknowledge.as_deref().map(AcknowledgementWriter::open).transpose()?;
     let metrics = RunMetrics::new(&surface, planned, accepted);
-    let live = args.live.map(|address| LiveServer::start(address, args.viewers.access())).transpose()?;
+    let live = args.live.map(|address| LiveServer::start(address, args.viewers.access(), clock)).transpose()?;
     if let Some(live) = &live {
         progress.say(format!("live: open {} in Foxglove or Lichtblick", live.url()));
         super::tell_access(&args.viewers, live.address(), &progress);

@@ -83,15 +83,15 @@ pub(crate) async fn run(args: &ReplayArgs, lake_url: &str) -> anyhow::Result<Com
     progress.say(format!("replay: open {} in Foxglove or Lichtblick; Ctrl-C ends it", server.url()));
     super::tell_access(&args.viewers, server.address(), &progress);
     let mut task = progress.task("replay", server.length_secs().ceil() as u64, "s");
-    let mut said = 0;
+    let mut shown = ShownState::default();
     while !stop.is_made() {
         // The time that runs out is the usual end of this wait.
         let _ = tokio::time::timeout(LOOK_EVERY, stop.wait()).await;
         let standing = server.standing();
-        show(&mut task, &standing, &mut said);
+        shown.update(&mut task, &standing);
     }
     let standing = server.standing();
-    show(&mut task, &standing, &mut said);
+    shown.update(&mut task, &standing);
     tokio::task::block_in_place(|| drop(server));
     task.done(format!("{count} recordings, {:.0} s shown last", standing.shown_secs));
     Ok(if lost || !standing.damages.is_empty() { CommandOutcome::WithLoss } else { CommandOutcome::Whole })
@@ -124,16 +124,35 @@ fn open(paths: &[PathBuf], progress: &CommandProgress) -> (Vec<Recording>, bool)
     (recordings, lost)
 }
 
-fn show(task: &mut TaskProgress, standing: &ReplayState, said: &mut usize) {
-    for damage in &standing.damages[*said..] {
-        task.say(&format!("warning: {damage}"));
+/// The part of a replay's state that its user has seen.
+#[derive(Default)]
+struct ShownState {
+    damages: usize,
+    /// Position and remark.
+    progress: Option<(u64, String)>,
+}
+
+impl ShownState {
+    // A journal gets no lines while nobody looks on.
+    fn update(&mut self, task: &mut TaskProgress, standing: &ReplayState) {
+        for damage in &standing.damages[self.damages..] {
+            task.say(&format!("warning: {damage}"));
+        }
+        self.damages = standing.damages.len();
+        let now = (standing.shown_secs as u64, describe(standing));
+        if task.is_due() && self.progress.as_ref() != Some(&now) {
+            task.note(now.1.clone());
+            task.at(now.0);
+            self.progress = Some(now);
+        }
     }
-    *said = standing.damages.len();
+}
+
+fn describe(standing: &ReplayState) -> String {
     let state = if standing.is_playing { "" } else { ", stands" };
     let lost = if standing.lost == 0 { String::new() } else { format!(", {} lost", standing.lost) };
     let name = standing.recording.file_stem().unwrap_or_default().to_string_lossy();
-    task.note(format!("{name}, speed {}{state}, {} viewers{lost}", standing.speed, standing.viewers));
-    task.at(standing.shown_secs as u64);
+    format!("{name}, speed {}{state}, {} viewers{lost}", standing.speed, standing.viewers)
 }
 
 // Files by their paths, runs and surfaces by the lake's tables.

@@ -375,7 +375,7 @@ fn the_manifest_says_what_comes() {
     let data = text(&source["url"]);
     assert_eq!(get(&server, &data).status, 200);
     refused(&get(&server, &data.replace("7%20or", "8%20or")), 410, "gone");
-    // A layout says nothing of the lake.
+    // Of the lake, a layout has only the length and the rate of responses.
     let layout =
         HttpRequest::get("/api/v1/layouts/echolake.json").with("origin", "https://viewer.example").send(&server);
     assert_eq!((layout.status, layout.header("access-control-allow-origin")), (200, Some("*")));

@@ -19,7 +19,7 @@ use std::sync::mpsc;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::JoinHandle;
 
-use crate::viewer::{PlaybackControl, ViewerAccess, ViewerServer};
+use crate::viewer::{PlaybackControl, ViewerAccess, ViewerClock, ViewerServer};
 pub use clock::SPEEDS;
 pub use error::Error;
 use player::ReplayPlayer;
@@ -86,7 +86,7 @@ impl ReplayServer {
         let length_secs = recordings.iter().map(player::secs).sum();
         let topics =
             player::ReplayTopics::of(&recordings).ok_or_else(|| nothing("there are more topics than channels"))?;
-        let server = ViewerServer::start(address, access, topics.all.clone(), Some(playback))
+        let server = ViewerServer::start(address, access, topics.all.clone(), ViewerClock::Playback(playback))
             .map_err(|source| Error::Listen { address, source })?;
         let standing = Arc::new(Mutex::new(ReplayState {
             recording: first.path().to_owned(),

@@ -67,7 +67,7 @@ fn talk(
     shared: &ViewerState,
     queue: &Arc<ClientQueue>,
 ) -> Result<(), Box<dyn std::error::Error>> {
-    socket.send(Message::text(protocol::server_info(shared.playback.as_ref().map(|p| p.range))))?;
+    socket.send(Message::text(protocol::server_info(&shared.clock)))?;
     socket.send(Message::text(protocol::advertise(&shared.topics())))?;
     while !shared.has_ended() {
         listen(&mut socket, shared, queue)?;

@@ -33,6 +33,16 @@ pub(crate) struct ViewerServer {
     thread: Option<JoinHandle<()>>,
 }
 
+/// The clock that clients show messages by.
+pub(crate) enum ViewerClock {
+    /// Their own.
+    Wall,
+    /// The latest message's time, which the server announces: messages are not of the time at which they are sent.
+    Messages,
+    /// A player's, which clients may control.
+    Playback(PlaybackControl),
+}
+
 /// Playback that clients may control.
 pub(crate) struct PlaybackControl {
     /// First and last time of the data, ns since 1970.
@@ -52,7 +62,7 @@ pub(crate) enum PlayerCommand {
 /// State that the server's threads share.
 pub(crate) struct ViewerState {
     state: Mutex<State>,
-    playback: Option<PlaybackControl>,
+    clock: ViewerClock,
     access: AccessCheck,
     handshakes: PendingHandshakes,
     ended: AtomicBool,
@@ -68,6 +78,8 @@ struct State {
     /// The last message of each retained channel: new clients get it.
     last: BTreeMap<u16, PendingMessage>,
     clients: Vec<Arc<ClientQueue>>,
+    /// The time that was announced last, ns since 1970.
+    announced_nanos: Option<u64>,
 }
 
 impl ViewerServer {
@@ -76,13 +88,13 @@ impl ViewerServer {
         address: SocketAddr,
         access: ViewerAccess,
         topics: Vec<Topic>,
-        playback: Option<PlaybackControl>,
+        clock: ViewerClock,
     ) -> Result<Self, std::io::Error> {
         let listener = TcpListener::bind(address)?;
         let address = listener.local_addr()?;
         let shared = Arc::new(ViewerState {
             state: Mutex::new(State { topics, ..State::default() }),
-            playback,
+            clock,
             access: AccessCheck::new(access, address),
             handshakes: PendingHandshakes::default(),
             ended: AtomicBool::new(false),
@@ -173,6 +185,9 @@ impl ViewerState {
     /// Sends a message to all its subscribers; retains it for new clients, if `is_kept`.
     pub(crate) fn send(&self, channel: u16, log_time_nanos: u64, data: &[u8], is_kept: bool) {
         let mut state = self.state();
+        if matches!(self.clock, ViewerClock::Messages) {
+            state.announce_time(log_time_nanos);
+        }
         let wanted: Vec<_> = state.clients.iter().filter(|c| c.receives(channel)).cloned().collect();
         // Without a receiver nothing is copied.
         if wanted.is_empty() && !is_kept {
@@ -192,13 +207,13 @@ impl ViewerState {
         // No new message comes between the current state and those that follow.
         let state = self.state();
         wishes.iter().for_each(|(subscription, channel)| queue.subscribe(*channel, *subscription));
-        match &self.playback {
-            Some(playback) => {
+        match &self.clock {
+            ViewerClock::Playback(playback) => {
                 drop(state);
                 // A player that is gone has no use for it.
                 let _ = playback.commands.send(PlayerCommand::Subscribed(queue.clone(), channels));
             }
-            None => {
+            ViewerClock::Wall | ViewerClock::Messages => {
                 let known: Vec<_> = channels.iter().filter_map(|channel| state.last.get(channel)).cloned().collect();
                 self.prime(queue, &channels, &known);
             }
@@ -211,7 +226,7 @@ impl ViewerState {
     }
 
     fn control(&self, queue: &ClientQueue, request: PlaybackRequest) {
-        if let Some(playback) = &self.playback {
+        if let ViewerClock::Playback(playback) = &self.clock {
             queue.hear_of_playback();
             let _ = playback.commands.send(PlayerCommand::Playback(request));
         }
@@ -221,6 +236,9 @@ impl ViewerState {
         let mut state = self.state();
         (state.clients.len() < CLIENTS).then(|| {
             let queue = Arc::new(ClientQueue::default());
+            if let Some(nanos) = state.announced_nanos {
+                queue.tell_time(nanos);
+            }
             state.clients.push(queue.clone());
             queue
         })
@@ -229,6 +247,16 @@ impl ViewerState {
     fn leave(&self, queue: &Arc<ClientQueue>) {
         self.state().clients.retain(|client| !Arc::ptr_eq(client, queue));
         self.wishes.fetch_add(1, Ordering::Release);
+    }
+}
+
+impl State {
+    // Announces the time of a message; time that goes back would be a seek.
+    fn announce_time(&mut self, nanos: u64) {
+        if self.announced_nanos.is_none_or(|announced| announced < nanos) {
+            self.announced_nanos = Some(nanos);
+            self.clients.iter().for_each(|client| client.tell_time(nanos));
+        }
     }
 }
 

@@ -6,6 +6,7 @@ use base64::Engine as _;
 use base64::prelude::BASE64_STANDARD as BASE64;
 use serde::{Deserialize, Serialize};
 
+use super::{PlaybackControl, ViewerClock};
 use crate::run::recorder::Topic;
 
 /// The supported subprotocols; for the messages used here they are the same. The first that a client offers, too, is
@@ -104,14 +105,18 @@ pub(super) fn choose<'a>(offered: impl Iterator<Item = &'a str>) -> Option<&'sta
     SUBPROTOCOLS.into_iter().find(|p| offered.contains(p))
 }
 
-/// Returns the first message to a client; `range` is first and last time if playback can be controlled.
-pub(super) fn server_info(range: Option<(u64, u64)>) -> String {
+/// Returns the first message to a client.
+pub(super) fn server_info(clock: &ViewerClock) -> String {
     let name = concat!("echolake ", env!("CARGO_PKG_VERSION"));
-    let mut info = serde_json::json!({"op": "serverInfo", "name": name, "capabilities": []});
-    if let Some((from, to)) = range {
+    let capabilities: &[&str] = match clock {
+        ViewerClock::Wall => &[],
+        ViewerClock::Messages => &["time"],
+        ViewerClock::Playback(_) => &["playbackControl", "time"],
+    };
+    let mut info = serde_json::json!({"op": "serverInfo", "name": name, "capabilities": capabilities});
+    if let ViewerClock::Playback(PlaybackControl { range: (from, to), .. }) = clock {
         // In two numbers, because JSON's have 53 bits.
-        let time = |nanos: u64| serde_json::json!({"sec": nanos / NANOS, "nsec": nanos % NANOS});
-        info["capabilities"] = serde_json::json!(["playbackControl", "time"]);
+        let time = |nanos: &u64| serde_json::json!({"sec": nanos / NANOS, "nsec": nanos % NANOS});
         info["dataStartTime"] = time(from);
         info["dataEndTime"] = time(to);
     }
@@ -245,8 +250,10 @@ mod tests {
         };
         assert_eq!(state.encode(), [5, 3, 0x39, 0x30, 0, 0, 0, 0, 0, 0, 0, 0, 0x80, 0x3f, 1, 1, 0, 0, 0, b'i']);
         assert_eq!(time(1), [2, 1, 0, 0, 0, 0, 0, 0, 0]);
-        let info: serde_json::Value =
-            serde_json::from_str(&server_info(Some((1_000_000, 2_000_000_005)))).expect("JSON");
+        let (commands, _) = std::sync::mpsc::sync_channel(0);
+        let playback = PlaybackControl { range: (1_000_000, 2_000_000_005), commands };
+        let info = server_info(&ViewerClock::Playback(playback));
+        let info: serde_json::Value = serde_json::from_str(&info).expect("JSON");
         assert_eq!(info["dataStartTime"], serde_json::json!({"sec": 0, "nsec": 1_000_000}));
         assert_eq!(info["dataEndTime"], serde_json::json!({"sec": 2, "nsec": 5}));
     }

@@ -19,7 +19,7 @@ pub(crate) struct PendingMessage {
 pub(crate) enum OutgoingItem {
     /// A message and its subscription.
     Message(u32, PendingMessage),
-    /// The time of playback, ns since 1970.
+    /// The time that messages are shown by, ns since 1970.
     Time(u64),
     /// An encoded state of playback.
     State(Vec<u8>),

@@ -2,6 +2,7 @@
 
 mod groups;
 mod outline;
+mod repeats;
 mod source;
 mod writer;
 
@@ -20,18 +21,23 @@ use futures::stream::{self, BoxStream, StreamExt as _};
 
 use crate::error::{Error, Result};
 use crate::rows;
-use groups::Groups;
+use groups::{Groups, is_once};
 pub use outline::{Outline, OutlineSchema, OutlineTopic, outline};
+use repeats::WrittenContents;
 use source::{Message, RunFile, Source};
 use writer::SliceWriter;
 
-/// Topics that stand in a run's file once, and in every slice of it.
+/// Topics that stand in a run's file once, and in every slice of it. A run that shows what the one before it showed
+/// adds nothing.
 const ONCE: [&str; 3] = [topics::PANEL_SCENE, topics::PANEL_POINTS, topics::ROBOT_DESCRIPTION];
 /// Metadata record of a slice: what it was cut from.
 const SLICE_METADATA: &str = "echolake.slice";
 /// Metadata record of each of its runs: the run's own manifest. Under another name than in a run's file, so that no
 /// slice is ever taken for a run.
 const SLICE_RUN_METADATA: &str = "echolake.slice.run";
+/// Key in it, before an attachment's name in the run's file: the slice's attachment with these bytes, if that has another
+/// run's name.
+const SAME_ATTACHMENT: &str = "attachment.";
 
 /// A measurement that a slice is to have, as table `measurements` has it.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -199,6 +205,7 @@ pub struct Slice {
     waiting: BinaryHeap<Reverse<Waiting>>,
     arrived: u64,
     last_time: u64,
+    written: WrittenContents,
     writer: Option<SliceWriter>,
 }
 
@@ -264,6 +271,7 @@ impl Slice {
             waiting: BinaryHeap::new(),
             arrived: 0,
             last_time: 0,
+            written: WrittenContents::default(),
             writer: Some(writer),
         })
     }
@@ -320,12 +328,13 @@ impl Slice {
             Some(source) => source,
             None => Source::open(self.lake.store(), file, Check::Ends).await?,
         };
-        if let Some(writer) = &mut self.writer {
-            writer.metadata(Metadata { name: SLICE_RUN_METADATA.into(), metadata: source.manifest.clone() })?;
-        }
+        let mut metadata = source.manifest.clone();
         // They are attached where nothing is left out.
         if self.topics.is_empty() {
-            self.attach_all(&source).await?;
+            metadata.extend(self.attach_all(&source).await?);
+        }
+        if let Some(writer) = &mut self.writer {
+            writer.metadata(Metadata { name: SLICE_RUN_METADATA.into(), metadata })?;
         }
         let mut groups = Groups::new(source, &taken, &self.topics);
         while let Some(messages) = groups.next_once().await? {
@@ -337,16 +346,23 @@ impl Slice {
         Ok(())
     }
 
-    async fn attach_all(&mut self, source: &Source) -> Result<()> {
+    // Returns references to attachments that an earlier run has brought.
+    async fn attach_all(&mut self, source: &Source) -> Result<BTreeMap<String, String>> {
+        let mut references = BTreeMap::new();
         let mut number = 0;
         while let (Some(mut attachment), Some(writer)) = (source.attachment(number).await?, &mut self.writer) {
+            number += 1;
             if self.several {
-                attachment.name = format!("{}/{}", source.file.run, attachment.name);
+                let name = format!("{}/{}", source.file.run, attachment.name);
+                if let Some(known) = self.written.attached_name(&name, &attachment.data) {
+                    references.insert(format!("{SAME_ATTACHMENT}{}", attachment.name), known);
+                    continue;
+                }
+                attachment.name = name;
             }
             writer.attach(&attachment)?;
-            number += 1;
         }
-        Ok(())
+        Ok(references)
     }
 
     fn wait(&mut self, message: Message) {
@@ -366,7 +382,9 @@ impl Slice {
                 return Err(Error::Uncuttable { run, reason: "its measurements are not in the order of time".into() });
             }
             self.last_time = message.log_time;
-            writer.write(message)?;
+            if !self.written.is_repeat(&message) {
+                writer.write(message)?;
+            }
         }
         Ok(())
     }

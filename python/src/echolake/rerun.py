@@ -1,4 +1,4 @@
-"""Runs and slices in rerun: the panel, where microphone and speaker stand, responses, sound, air and log.
+"""Runs and slices in rerun: panel, arms, microphone and speaker, responses, sound, air and log.
 
 Samples at 96 kHz never become scalars, which viewers cannot hold: a response is a bar chart, a recording is sound,
 played ten times slower because the rig is at a scale of 1:10.
@@ -10,6 +10,9 @@ import io
 import os
 import urllib.request
 import wave
+import xml.etree.ElementTree as ET
+from bisect import bisect_right
+from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -25,25 +28,37 @@ __all__ = ["blueprint", "view"]
 
 SLOWER = 10
 """How many times slower sound is played."""
-_ENVIRONMENT = ("temperature_c", "humidity_pct", "pressure_hpa", "outside_level_db")
+_WORLD = "/world"
+_ENVIRONMENT = {
+    "temperature_c": "Temperature, °C",
+    "humidity_pct": "Humidity, %",
+    "pressure_hpa": "Pressure, hPa",
+    "outside_level_db": "Level outside, dB",
+}
 _LEVELS = {1: "DEBUG", 2: "INFO", 3: "WARN", 4: "ERROR", 5: "CRITICAL"}
 # GLB counts y upwards, the panel z.
 _UPRIGHT = [[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]
 
 
 def blueprint() -> Any:
-    """The views: rig, response, sound, air, verdicts and log."""
+    """The views: rig, response, one for each quantity of the air, signal-to-noise ratio, log. Time starts at the first
+    measurement."""
+    titles = {f"/environment/{name}": title for name, title in _ENVIRONMENT.items()}
+    titles["/measurement/snr_db"] = "Signal-to-noise ratio, dB"
+    legend = rrb.PlotLegend(visible=False)
+    series = [rrb.TimeSeriesView(origin=entity, name=title, plot_legend=legend) for entity, title in titles.items()]
+    eye = rrb.EyeControls3D(position=(1.4, -1.9, 2.0), look_target=(0.0, 0.0, 0.95), eye_up=(0.0, 0.0, 1.0))
     return rrb.Blueprint(
         rrb.Horizontal(
-            rrb.Spatial3DView(origin="/", contents=["/panel/**", "/microphone", "/speaker"], name="Rig"),
+            rrb.Spatial3DView(origin=_WORLD, name="Rig", eye_controls=eye),
             rrb.Vertical(
-                rrb.BarChartView(origin="/ir", name="Impulse response"),
-                rrb.TimeSeriesView(origin="/environment", name="Air"),
-                rrb.TimeSeriesView(origin="/measurement", name="Signal-to-noise ratio"),
-                rrb.TextLogView(origin="/log", name="Log"),
+                rrb.BarChartView(origin="/ir", name="Impulse response over time, ms", plot_legend=legend),
+                rrb.Grid(*series, rrb.TextLogView(origin="/log", name="Log"), grid_columns=2),
+                row_shares=[1, 2],
             ),
-            column_shares=[3, 2],
+            column_shares=[1, 1],
         ),
+        rrb.TimePanel(state="collapsed", timeline="measurement", play_state="paused", fps=5.0),
         collapse_panels=True,
     )
 
@@ -69,8 +84,10 @@ def view(
         recording.spawn(default_blueprint=blueprint())
     with _opened(source) as file:
         reader = make_reader(file, decoder_factories=[DecoderFactory()])
-        _panel(recording, reader)
-        _messages(recording, reader, None if pairs is None else set(pairs), sounds)
+        parents = _parent_frames(reader)
+        _panel(recording, reader, parents)
+        _arms(recording, reader, parents)
+        _messages(recording, reader, parents, None if pairs is None else set(pairs), sounds)
     recording.flush()
     return recording
 
@@ -83,33 +100,108 @@ def _opened(source: str | os.PathLike[str]) -> Any:
     return Path(source).open("rb")
 
 
-def _panel(recording: Any, reader: Any) -> None:
+# Each frame's parent; all messages of a run have the same frames.
+def _parent_frames(reader: Any) -> dict[str, str]:
+    for _, _, _, frames in reader.iter_decoded_messages(topics=["/tf"]):
+        return {frame.child_frame_id: frame.parent_frame_id for frame in frames.transforms}
+    return {}
+
+
+# A frame's entity stands below its parent's, so that it moves with it.
+def _entity(frame: str, parents: dict[str, str]) -> str:
+    if frame == "world":
+        return _WORLD
+    return f"{_entity(parents.get(frame, 'world'), parents)}/{frame}"
+
+
+def _panel(recording: Any, reader: Any, parents: dict[str, str]) -> None:
     recording.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-    recording.log("/panel", rr.Transform3D(mat3x3=_UPRIGHT), static=True)
+    mesh = _entity("panel", parents) + "/mesh"
+    recording.log(mesh, rr.Transform3D(mat3x3=_UPRIGHT), static=True)
     for attachment in reader.iter_attachments():
         if attachment.name.split("/")[-1] == "panel.glb":
-            recording.log("/panel", rr.Asset3D(contents=attachment.data, media_type="model/gltf-binary"), static=True)
+            recording.log(mesh, rr.Asset3D(contents=attachment.data, media_type="model/gltf-binary"), static=True)
             return
 
 
-def _messages(recording: Any, reader: Any, pairs: set[int] | None, sounds: int) -> None:
-    number = 0
+# The arms' links as the run describes them, in URDF of boxes, cylinders and spheres.
+def _arms(recording: Any, reader: Any, parents: dict[str, str]) -> None:
+    for _, _, message in reader.iter_messages(topics=["/robot_description"]):
+        # Behind the header of CDR and the text's length; the text ends with a zero.
+        description = message.data[8:].rstrip(b"\0")
+        for link in ET.fromstring(description).iter("link"):
+            for number, visual in enumerate(link.iter("visual")):
+                entity = f"{_entity(link.attrib['name'], parents)}/shape_{number}"
+                recording.log(entity, _link_shape(visual), static=True)
+        return
+
+
+def _link_shape(visual: ET.Element) -> Any:
+    shape = visual.find("geometry/*")
+    if shape is None:
+        return rr.Clear(recursive=False)
+    style = {
+        "centers": [_numbers(visual.find("origin"), "xyz", [0.0, 0.0, 0.0])],
+        "colors": [_numbers(visual.find("material/color"), "rgba", [0.7, 0.7, 0.7, 1.0])],
+        "fill_mode": "solid",
+    }
+    if shape.tag == "box":
+        return rr.Boxes3D(sizes=[_numbers(shape, "size", [0.0, 0.0, 0.0])], **style)
+    radius = float(shape.attrib["radius"])
+    if shape.tag == "cylinder":
+        return rr.Cylinders3D(lengths=[float(shape.attrib["length"])], radii=[radius], **style)
+    return rr.Ellipsoids3D(radii=[radius], **style)
+
+
+def _numbers(element: ET.Element | None, name: str, default: list[float]) -> list[float]:
+    return default if element is None else [float(number) for number in element.attrib[name].split()]
+
+
+def _messages(recording: Any, reader: Any, parents: dict[str, str], pairs: set[int] | None, sounds: int) -> None:
+    times: list[int] = []
+    # Numbers and transforms are sent as columns, which is many times faster than one by one.
+    numbers: dict[str, list[tuple[int, float]]] = defaultdict(list)
+    frames: dict[str, list[tuple[int, Any]]] = defaultdict(list)
     for attempt in _attempts(reader):
         verdict = attempt.get("/measurement")
-        if verdict is not None and (pairs is None or verdict[1].pair_id in pairs):
-            recording.set_time("measurement", sequence=number)
-            _measurement(recording, attempt, number < sounds)
-            number += 1
+        if verdict is None or (pairs is not None and verdict[1].pair_id not in pairs):
+            continue
+        number = len(times)
+        times.append(verdict[0])
+        recording.set_time("measurement", sequence=number)
+        recording.set_time("time", timestamp=np.datetime64(verdict[0], "ns"))
+        _measurement(recording, attempt, parents, number < sounds)
+        numbers["/measurement/snr_db"].append((number, verdict[1].snr_db))
+        if (found := attempt.get("/environment")) is not None:
+            for name in _ENVIRONMENT:
+                numbers[f"/environment/{name}"].append((number, getattr(found[1], name)))
+        if (found := attempt.get("/tf")) is not None:
+            for frame in found[1].transforms:
+                frames[_entity(frame.child_frame_id, parents)].append((number, frame))
+    for entity, values in numbers.items():
+        columns = rr.Scalars.columns(scalars=[value for _, value in values])
+        recording.send_columns(entity, indexes=_time_columns(times, values), columns=columns)
+    for entity, moves in frames.items():
+        positions = [(f.translation.x, f.translation.y, f.translation.z) for _, f in moves]
+        turns = [(f.rotation.x, f.rotation.y, f.rotation.z, f.rotation.w) for _, f in moves]
+        columns = rr.Transform3D.columns(translation=positions, quaternion=turns)
+        recording.send_columns(entity, indexes=_time_columns(times, moves), columns=columns)
     if pairs is None:
-        recording.reset_time()
         for _, _, message, line in reader.iter_decoded_messages(topics=["/log"]):
+            recording.set_time("measurement", sequence=max(bisect_right(times, message.log_time) - 1, 0))
             recording.set_time("time", timestamp=np.datetime64(message.log_time, "ns"))
             recording.log("/log", rr.TextLog(line.message, level=_LEVELS.get(line.level, "TRACE")))
 
 
+def _time_columns(times: list[int], rows: Sequence[tuple[int, Any]]) -> list[Any]:
+    numbers = [number for number, _ in rows]
+    stamps = np.array([times[number] for number in numbers], dtype="datetime64[ns]")
+    return [rr.TimeColumn("measurement", sequence=numbers), rr.TimeColumn("time", timestamp=stamps)]
+
+
 # What was recorded of each attempt, by topic: everything between two verdicts.
 def _attempts(reader: Any) -> Iterator[dict[str, tuple[int, Any]]]:
-    wanted = ["/microphone/pose", "/speaker/pose", "/environment", "/ir", "/sweep/audio", "/measurement"]
+    wanted = ["/tf", "/microphone/pose", "/speaker/pose", "/environment", "/ir", "/sweep/audio", "/measurement"]
     open_attempts: dict[int, dict[str, tuple[int, Any]]] = {}
     last_air: tuple[int, Any] | None = None
     for _, channel, message, decoded in reader.iter_decoded_messages(topics=wanted):
@@ -128,24 +220,25 @@ def _with_air(attempt: dict[str, tuple[int, Any]], air: tuple[int, Any] | None) 
     return attempt | ({"/environment": air} if air is not None else {})
 
 
-def _measurement(recording: Any, attempt: dict[str, tuple[int, Any]], with_sound: bool) -> None:
-    time, verdict = attempt["/measurement"]
-    recording.set_time("time", timestamp=np.datetime64(time, "ns"))
+def _measurement(
+    recording: Any, attempt: dict[str, tuple[int, Any]], parents: dict[str, str], with_sound: bool
+) -> None:
+    verdict = attempt["/measurement"][1]
+    panel = _entity("panel", parents)
     for name, colour in (("microphone", (70, 120, 255)), ("speaker", (255, 120, 40))):
         if (found := attempt.get(f"/{name}/pose")) is not None:
             at = found[1].pose.position
-            recording.log(f"/{name}", rr.Points3D([[at.x, at.y, at.z]], radii=0.012, colors=[colour], labels=[name]))
-    if (found := attempt.get("/environment")) is not None:
-        for name in _ENVIRONMENT:
-            recording.log(f"/environment/{name}", rr.Scalars(getattr(found[1], name)))
-    recording.log("/measurement/snr_db", rr.Scalars(verdict.snr_db))
+            points = rr.Points3D([[at.x, at.y, at.z]], radii=0.012, colors=[colour], labels=[name])
+            recording.log(f"{panel}/{name}", points)
     for reason in verdict.reasons:
         recording.log("/log", rr.TextLog(f"pair {verdict.pair_id}: {reason}", level="WARN"))
     if (found := attempt.get("/ir")) is not None:
+        rate_hz = found[1].sample_rate_hz
         response = np.asarray(found[1].samples, dtype=np.float32)
-        recording.log("/ir", rr.BarChart(response))
+        times_ms = np.arange(len(response), dtype=np.float32) / rate_hz * 1e3
+        recording.log("/ir", rr.BarChart(response, abscissa=times_ms, widths=np.full_like(times_ms, 1e3 / rate_hz)))
         if with_sound and "/sweep/audio" not in attempt:
-            _sound(recording, "/sound/ir", _sixteen_bits(response), found[1].sample_rate_hz / SLOWER)
+            _sound(recording, "/sound/ir", _sixteen_bits(response), rate_hz / SLOWER)
     if with_sound and (found := attempt.get("/sweep/audio")) is not None:
         # It is slowed down in the file already.
         _sound(recording, "/sound/sweep", np.frombuffer(found[1].data, dtype="<i2"), found[1].sample_rate)

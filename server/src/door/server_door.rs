@@ -8,6 +8,7 @@ use echolake_lake::Lake;
 use super::engine_pool::EnginePool;
 use super::engine_process::EngineSettings;
 use crate::Error;
+use crate::http::ViewerLayout;
 use crate::metrics::ServerMetrics;
 use crate::tokens::{TokenAccess, TokenFile, TokenFileState};
 
@@ -22,6 +23,7 @@ struct DoorState {
     access: Arc<TokenAccess>,
     metrics: Arc<ServerMetrics>,
     engines: EnginePool,
+    layout: ViewerLayout,
 }
 
 impl ServerDoor {
@@ -33,7 +35,8 @@ impl ServerDoor {
         let metrics = Arc::new(ServerMetrics::default());
         let access = Arc::new(TokenAccess::new(tokens));
         let engines = EnginePool::new(lake, settings, metrics.clone(), access.clone())?;
-        Ok(Self(Arc::new(DoorState { access, metrics, engines })))
+        let layout = ViewerLayout::new(lake.rig());
+        Ok(Self(Arc::new(DoorState { access, metrics, engines, layout })))
     }
 
     pub(crate) fn access(&self) -> &TokenAccess {
@@ -61,6 +64,11 @@ impl ServerDoor {
             ended = gone;
             tokio::time::sleep(LOOK_EVERY).await;
         }
+    }
+
+    /// The layout of its lake's runs.
+    pub(crate) fn layout(&self) -> &ViewerLayout {
+        &self.0.layout
     }
 
     /// The engines.

@@ -37,6 +37,7 @@ use crate::request_span::trace_request;
 use crate::service::QueryService;
 use catalogue::LakeCatalogue;
 pub(crate) use guard::{FORWARDED_PROTO, RequestSite, authenticate, request_site};
+pub(crate) use layout::ViewerLayout;
 pub(crate) use problem::ProblemResponse;
 
 /// Answers HTTP on an engine's socket; a connection is one request.
@@ -80,7 +81,8 @@ pub(crate) fn door_router(door: &ServerDoor) -> Router {
     let rest = pages::fallback;
     #[cfg(not(feature = "web"))]
     let rest = nothing;
-    let all = own.merge(forwarded).with_state(door.clone()).merge(layout::for_viewers()).fallback(rest);
+    let all =
+        own.merge(forwarded).with_state(door.clone()).merge(layout::for_viewers(door.layout().clone())).fallback(rest);
     with_refusals(all)
 }
 
@@ -96,8 +98,8 @@ fn door_routes() -> OpenApiRouter<ServerDoor> {
 // The contract of all routes: of those whose answers to GET have an ETag, and of the others.
 fn contract_parts() -> [OpenApi; 2] {
     let files = files::viewer_routes().merge(files::own_routes()).merge(manifest::routes());
-    let mut validated =
-        catalogue::table_routes().merge(catalogue::file_routes()).merge(layout::routes()).into_openapi();
+    let mut validated = catalogue::table_routes().merge(catalogue::file_routes()).into_openapi();
+    validated.merge(layout::routes().into_openapi());
     validated.merge(files.into_openapi());
     let mut others = sql::routes().into_openapi();
     others.merge(slices::routes().into_openapi());

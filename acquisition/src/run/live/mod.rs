@@ -1,7 +1,7 @@
 //! A live view of a run: a WebSocket server that Foxglove and Lichtblick open, with every topic as it is recorded.
 //!
 //! Messages are sent before they are on the disk. A client that does not keep up loses its oldest messages; the run
-//! never waits for it.
+//! never waits for it. The simulated rig's clock is not the wall clock, so viewers are told its time.
 
 #[cfg(test)]
 mod tests;
@@ -12,7 +12,7 @@ use std::sync::Arc;
 use echolake_schema::topics;
 
 use crate::run::recorder::{Tap, Topic};
-use crate::viewer::{ViewerAccess, ViewerServer, ViewerState};
+use crate::viewer::{ViewerAccess, ViewerClock, ViewerServer, ViewerState};
 
 /// An error that prevents the live view.
 #[derive(Debug, thiserror::Error)]
@@ -27,6 +27,15 @@ pub enum Error {
     },
 }
 
+/// The clock of a run that is shown live.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum LiveClock {
+    /// The wall clock.
+    Wall,
+    /// The simulated rig's, which runs ahead of the wall clock or behind it.
+    Simulated,
+}
+
 /// A server that shows one run. Dropped, it disconnects its clients.
 pub struct LiveServer(ViewerServer);
 
@@ -35,8 +44,12 @@ impl LiveServer {
     ///
     /// # Errors
     /// [`Error::Listen`].
-    pub fn start(address: SocketAddr, access: ViewerAccess) -> Result<Self, Error> {
-        ViewerServer::start(address, access, Vec::new(), None)
+    pub fn start(address: SocketAddr, access: ViewerAccess, clock: LiveClock) -> Result<Self, Error> {
+        let clock = match clock {
+            LiveClock::Wall => ViewerClock::Wall,
+            LiveClock::Simulated => ViewerClock::Messages,
+        };
+        ViewerServer::start(address, access, Vec::new(), clock)
             .map(Self)
             .map_err(|source| Error::Listen { address, source })
     }

@@ -61,7 +61,8 @@ fn data(socket: &mut ViewerSocket) -> (u32, u64, Vec<u8>) {
 
 #[test]
 fn a_client_sees_what_it_subscribes_to_and_what_it_came_too_late_for() {
-    let server = LiveServer::start(([127, 0, 0, 1], 0).into(), ViewerAccess::default()).expect("a server");
+    let server =
+        LiveServer::start(([127, 0, 0, 1], 0).into(), ViewerAccess::default(), LiveClock::Wall).expect("a server");
     let mut tap = server.tap();
     tap.topics(vec![topic(1, "/panel/scene"), topic(2, "/sweep"), topic(3, "/log")]);
     tap.message(1, 10, b"the panel");
@@ -86,9 +87,43 @@ fn a_client_sees_what_it_subscribes_to_and_what_it_came_too_late_for() {
     assert!(matches!(socket.read(), Ok(Message::Close(_)) | Err(_)), "it is let go");
 }
 
+fn time(socket: &mut ViewerSocket) -> u64 {
+    match socket.read().expect("a message") {
+        Message::Binary(bytes) => {
+            assert_eq!(bytes[0], 2);
+            u64::from_le_bytes(bytes[1..].try_into().expect("eight"))
+        }
+        other => panic!("{other:?}"),
+    }
+}
+
+#[test]
+fn viewers_are_told_the_time_of_a_simulated_run_alone() {
+    let start = |clock| LiveServer::start(([127, 0, 0, 1], 0).into(), ViewerAccess::default(), clock);
+    let wall = start(LiveClock::Wall).expect("a server");
+    assert_eq!(json(&mut connect(&wall))["capabilities"], serde_json::json!([]));
+    let simulated = start(LiveClock::Simulated).expect("a server");
+    let mut tap = simulated.tap();
+    tap.topics(vec![topic(1, "/tf")]);
+    tap.message(1, 10, b"first");
+    let mut socket = connect(&simulated);
+    assert_eq!(json(&mut socket)["capabilities"], serde_json::json!(["time"]));
+    json(&mut socket);
+    assert_eq!(time(&mut socket), 10, "before anything is shown");
+    socket.send(Message::text(r#"{"op":"subscribe","subscriptions":[{"id":7,"channelId":1}]}"#)).expect("sent");
+    assert_eq!(data(&mut socket), (7, 10, b"first".to_vec()));
+    for at in [22, 20] {
+        tap.message(1, at, b"next");
+    }
+    assert_eq!(time(&mut socket), 22);
+    assert_eq!(data(&mut socket).1, 22);
+    assert_eq!(data(&mut socket).1, 20, "time does not go back");
+}
+
 #[test]
 fn a_client_that_sleeps_loses_the_oldest_and_stops_nobody() {
-    let server = LiveServer::start(([127, 0, 0, 1], 0).into(), ViewerAccess::default()).expect("a server");
+    let server =
+        LiveServer::start(([127, 0, 0, 1], 0).into(), ViewerAccess::default(), LiveClock::Wall).expect("a server");
     let mut tap = server.tap();
     tap.topics(vec![topic(2, "/sweep")]);
     let mut socket = connect(&server);
@@ -115,7 +150,8 @@ fn a_client_that_sleeps_loses_the_oldest_and_stops_nobody() {
 
 #[test]
 fn browsers_that_are_no_viewers_are_told() {
-    let server = LiveServer::start(([127, 0, 0, 1], 0).into(), ViewerAccess::default()).expect("a server");
+    let server =
+        LiveServer::start(([127, 0, 0, 1], 0).into(), ViewerAccess::default(), LiveClock::Wall).expect("a server");
     let mut stream = TcpStream::connect(server.address()).expect("connected");
     stream.set_read_timeout(Some(ANSWER_LIMIT)).expect("a limit of time");
     let request = "GET / HTTP/1.1\r\nHost: a\r\nConnection: Upgrade\r\nUpgrade: websocket\r\n\
@@ -128,8 +164,12 @@ fn browsers_that_are_no_viewers_are_told() {
 
 #[test]
 fn an_address_that_is_taken_is_named() {
-    let server = LiveServer::start(([127, 0, 0, 1], 0).into(), ViewerAccess::default()).expect("a server");
-    let error = LiveServer::start(server.address(), ViewerAccess::default()).map(drop).expect_err("taken").to_string();
+    let server =
+        LiveServer::start(([127, 0, 0, 1], 0).into(), ViewerAccess::default(), LiveClock::Wall).expect("a server");
+    let error = LiveServer::start(server.address(), ViewerAccess::default(), LiveClock::Wall)
+        .map(drop)
+        .expect_err("taken")
+        .to_string();
     assert!(error.contains(&server.address().to_string()) && error.contains("taken?"), "{error}");
 }
 
@@ -152,7 +192,8 @@ fn answer(server: &LiveServer, path: &str, more: &str) -> String {
 
 #[test]
 fn pages_of_elsewhere_are_refused() {
-    let server = LiveServer::start(([127, 0, 0, 1], 0).into(), ViewerAccess::default()).expect("a server");
+    let server =
+        LiveServer::start(([127, 0, 0, 1], 0).into(), ViewerAccess::default(), LiveClock::Wall).expect("a server");
     let refused = answer(&server, "/", "Origin: https://evil.example\r\n");
     assert!(refused.starts_with("HTTP/1.1 403") && refused.contains("--allow-origin"), "{refused}");
     assert!(answer(&server, "/", "Origin: http://localhost:8090\r\n").starts_with("HTTP/1.1 101"));
@@ -160,7 +201,8 @@ fn pages_of_elsewhere_are_refused() {
 
 #[test]
 fn other_machines_need_the_token_of_the_address() {
-    let server = LiveServer::start(([0, 0, 0, 0], 0).into(), ViewerAccess::default()).expect("a server");
+    let server =
+        LiveServer::start(([0, 0, 0, 0], 0).into(), ViewerAccess::default(), LiveClock::Wall).expect("a server");
     let refused = answer(&server, "/", "");
     assert!(refused.starts_with("HTTP/1.1 403") && refused.contains("token"), "{refused}");
     let url = server.url();
@@ -170,7 +212,8 @@ fn other_machines_need_the_token_of_the_address() {
 
 #[test]
 fn handshakes_that_drip_lock_nobody_out() {
-    let server = LiveServer::start(([127, 0, 0, 1], 0).into(), ViewerAccess::default()).expect("a server");
+    let server =
+        LiveServer::start(([127, 0, 0, 1], 0).into(), ViewerAccess::default(), LiveClock::Wall).expect("a server");
     let drip = |_| {
         let mut stream = TcpStream::connect(server.address()).expect("connected");
         stream.set_read_timeout(Some(ANSWER_LIMIT)).expect("a limit of time");
