@@ -40,7 +40,8 @@ def message_class(channel):
 
 
 async def look(address, seconds):
-    """What comes: (channels by id, decoded messages by topic, times by topic)."""
+    """What comes: (channels by id, decoded messages by topic, times by topic, announced times)."""
+    announced = []
     messages, times = collections.defaultdict(list), collections.defaultdict(list)
     async with websockets.connect(address, subprotocols=["foxglove.sdk.v1"], max_size=None) as socket:
         info = json.loads(await socket.recv())
@@ -54,18 +55,21 @@ async def look(address, seconds):
                 data = await asyncio.wait_for(socket.recv(), left)
             except (asyncio.TimeoutError, websockets.ConnectionClosed):
                 break
+            if data[0] == 2:
+                announced.append(struct.unpack_from("<Q", data, 1)[0])
+                continue
             op, subscription, time = struct.unpack_from("<BIQ", data)
             assert op == 1, op
             topic = channels[subscription - 100]["topic"]
             messages[topic].append(classes[subscription - 100].FromString(data[13:]))
             times[topic].append(time)
-    return info, channels, messages, times
+    return info, channels, messages, times, announced
 
 
 def main():
     address = sys.argv[1]
     seconds = float(sys.argv[2]) if len(sys.argv) > 2 else 5.0
-    info, channels, messages, times = asyncio.run(look(address, seconds))
+    info, channels, messages, times, announced = asyncio.run(look(address, seconds))
     checks = Checks()
     checks.same("says who it is", "serverInfo", lambda: info["op"])
     checks.same("offers every topic", sorted(EXPECTED), lambda: sorted(c["topic"] for c in channels.values()))
@@ -77,6 +81,9 @@ def main():
     checks.holds("the arms are a URDF", lambda: messages["/robot_description"][0][:200], lambda t: "<robot" in t)
     checks.holds("every sweep is as long as it says",
                  lambda: {len(s.microphone) / s.sample_count for s in messages["/sweep"]}, lambda w: w == {3.0})
+    checks.same("announces the simulated run's time", ["time"], lambda: info["capabilities"])
+    checks.holds("announced times go on", lambda: announced, lambda t: t and t == sorted(set(t)))
+    checks.same("the last is the last message's", max(t for ts in times.values() for t in ts), lambda: announced[-1])
     checks.holds("time goes on", lambda: times["/measurement"], lambda t: t == sorted(set(t)))
     checks.holds("verdicts have a ratio", lambda: min(m.snr_db for m in messages["/measurement"]), lambda x: x > 0)
     return checks.done()
