@@ -337,7 +337,7 @@ await check('a response’s plots follow the address, and zoom, cursor and overl
   const told = section('Before and after Foam’s subtraction').locator('[aria-live]')
   await plot.focus()
   await page.keyboard.press('ArrowRight')
-  await eventually(async () => assert.match(await told.innerText(), /^0\.500 ms: Measured −?[\d.]+, .* dB$/))
+  await eventually(async () => assert.match(await told.innerText(), /^0\.500 ms: Measured −?[\d.]+; .* dB$/))
   await page.keyboard.press('+')
   await page.waitForURL(/ms=0\.25-0\.75/)
   await page.keyboard.press('0')

@@ -24,9 +24,9 @@ check('an impulse has a flat level, also smoothed, and its delay as group delay'
   for (const octaves of [0, 1 / 12, 1 / 6, 1 / 3, 1]) {
     const response = frequencyResponse(impulse(59, 0.5), RATE_HZ, { ...SETTINGS, octaves })
     eachNear(response.level_db, () => 20 * Math.log10(0.5), 1e-9, `level over ${octaves} octaves`)
-    eachNear(response.groupDelay_s, () => 59 / RATE_HZ, 1e-12, `group delay over ${octaves} octaves`)
-    near(response.frequency_hz[0], 2000, RATE_HZ / 4096, 'lowest frequency')
-    near(response.frequency_hz.at(-1), 40_000, RATE_HZ / 4096, 'highest frequency')
+    eachNear(response.groupDelay_s(), () => 59 / RATE_HZ, 1e-12, `group delay over ${octaves} octaves`)
+    near(response.frequency_hz[0], 2000, RATE_HZ / 2048, 'lowest frequency')
+    near(response.frequency_hz.at(-1), 40_000, RATE_HZ / 2048, 'highest frequency')
   }
   eachNear(spectrum(impulse(100), RATE_HZ).level_db, () => 0, 1e-9, 'level')
 })
@@ -34,22 +34,23 @@ check('an impulse has a flat level, also smoothed, and its delay as group delay'
 check('phase without its delay is zero, with it a straight line, and half a circle for an impulse below zero', () => {
   const removed_s = 59 / RATE_HZ
   const still = frequencyResponse(impulse(59), RATE_HZ, { ...SETTINGS, removed_s })
-  eachNear(still.phase_deg, () => 0, 1e-6, 'phase')
-  eachNear(still.groupDelay_s, () => 0, 1e-12, 'group delay')
+  eachNear(still.phase_deg(), () => 0, 1e-6, 'phase')
+  eachNear(still.groupDelay_s(), () => 0, 1e-12, 'group delay')
   const moving = frequencyResponse(impulse(62), RATE_HZ, { ...SETTINGS, removed_s })
-  eachNear(moving.phase_deg, (i) => (-360 * moving.frequency_hz[i] * 3) / RATE_HZ, 1e-6, 'phase of three samples')
+  eachNear(moving.phase_deg(), (i) => (-360 * moving.frequency_hz[i] * 3) / RATE_HZ, 1e-6, 'phase of three samples')
   const below = frequencyResponse(impulse(59, -1), RATE_HZ, { ...SETTINGS, removed_s })
-  eachNear(below.phase_deg.map(Math.abs), () => 180, 1e-6, 'phase below zero')
+  eachNear(below.phase_deg().map(Math.abs), () => 180, 1e-6, 'phase below zero')
 })
 
 check('two impulses make a comb, whose group delay between its notches is the mean by pressure', () => {
   const samples = impulse(40).with(60, 0.5)
   const { frequency_hz, level_db, groupDelay_s } = frequencyResponse(samples, RATE_HZ, SETTINGS)
+  const delays_s = groupDelay_s()
   frequency_hz.forEach((frequency, i) => {
     const angle = (2 * Math.PI * frequency * 20) / RATE_HZ
     near(level_db[i], 10 * Math.log10(1.25 + Math.cos(angle)), 1e-9, `level at ${frequency} Hz`)
     const late = (0.25 + 0.5 * Math.cos(angle)) / (1.25 + Math.cos(angle))
-    near(groupDelay_s[i], (40 + 20 * late) / RATE_HZ, 1e-12, `group delay at ${frequency} Hz`)
+    near(delays_s[i], (40 + 20 * late) / RATE_HZ, 1e-12, `group delay at ${frequency} Hz`)
   })
 })
 

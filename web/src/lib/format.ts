@@ -22,7 +22,8 @@ export const plain = (value: number | bigint, digits = 7) =>
     : String(Number(value.toPrecision(digits)))
   ).replaceAll('-', MINUS)
 
-export const count = (value: number) => value.toLocaleString('en').replaceAll(',', '\u202f')
+/** A whole number in groups of three digits. `toLocaleString` loads the browser's tables of languages first. */
+export const count = (value: number) => String(Math.round(value)).replace(/\B(?=(\d{3})+$)/g, '\u202f')
 
 /** `stretcher_bond_bricks` as words. */
 export const words = (name: string | null | undefined) => (name ? name.replaceAll('_', ' ') : '\u2013')

@@ -61,14 +61,14 @@ export function smoothed(values: Float64Array, octaves: number): Float64Array {
   })
 }
 
-/** A response over frequency. */
+/** A response over frequency; what not every page shows is computed when it is asked for. */
 export interface FrequencyResponse {
   readonly frequency_hz: readonly number[]
   readonly level_db: readonly number[]
   /** Unwrapped upwards from the range's lowest frequency, after `removed_s` was taken off; not smoothed. */
-  readonly phase_deg: readonly number[]
+  phase_deg(): number[]
   /** After the same delay; a mean by energy over the octaves. */
-  readonly groupDelay_s: readonly number[]
+  groupDelay_s(): number[]
 }
 
 /** The range of frequencies, the smoothing of power, and the delay that is taken off phase and group delay. */
@@ -85,34 +85,32 @@ export function frequencyResponse(
   rate_hz: number,
   settings: AnalysisSettings,
 ): FrequencyResponse {
-  // Eight times the length: phase turns by less than half a circle from bin to bin.
-  const n = atLeast(8 * samples.length)
+  // Four times the length: phase turns by a quarter of a circle at most from bin to bin.
+  const n = atLeast(4 * samples.length)
   const own = transform(samples, n)
-  const byTime = transform(
-    samples.map((value, i) => (value * i) / rate_hz),
-    n,
-  )
-  const power = new Float64Array(n / 2 + 1)
-  const delayed = new Float64Array(n / 2 + 1)
-  for (let k = 0; k <= n / 2; k += 1) {
-    power[k] = own.re[k] ** 2 + own.im[k] ** 2
-    // The group delay is the real part of the spectrum of t h(t) over that of h(t); here times the power.
-    delayed[k] = own.re[k] * byTime.re[k] + own.im[k] * byTime.im[k]
-  }
+  const power = own.re.slice(0, n / 2 + 1).map((re, k) => re ** 2 + own.im[k] ** 2)
   const meanPower = smoothed(power, settings.octaves)
-  const meanDelayed = smoothed(delayed, settings.octaves)
   const first = Math.max(1, Math.ceil((settings.low_hz * n) / rate_hz))
   const last = Math.min(n / 2, Math.floor((settings.high_hz * n) / rate_hz))
   const bins = Array.from({ length: last - first + 1 }, (_, i) => first + i)
-  const phases = bins.map((k) => {
-    const turned = Math.atan2(own.im[k], own.re[k]) + (2 * Math.PI * k * settings.removed_s * rate_hz) / n
-    return (turned * 180) / Math.PI
-  })
   return {
     frequency_hz: bins.map((k) => (k * rate_hz) / n),
     level_db: bins.map((k) => 10 * Math.log10(meanPower[k] + 1e-20)),
-    phase_deg: unwrapped(phases),
-    groupDelay_s: bins.map((k) => meanDelayed[k] / (meanPower[k] + 1e-30) - settings.removed_s),
+    phase_deg() {
+      const radians = (k: number) =>
+        Math.atan2(own.im[k], own.re[k]) + (2 * Math.PI * k * settings.removed_s * rate_hz) / n
+      return unwrapped(bins.map((k) => (radians(k) * 180) / Math.PI))
+    },
+    groupDelay_s() {
+      const byTime = transform(
+        samples.map((value, i) => (value * i) / rate_hz),
+        n,
+      )
+      // It is the real part of the spectrum of t h(t) over that of h(t); here times the power.
+      const delayed = power.map((_, k) => own.re[k] * byTime.re[k] + own.im[k] * byTime.im[k])
+      const meanDelayed = smoothed(delayed, settings.octaves)
+      return bins.map((k) => meanDelayed[k] / (meanPower[k] + 1e-30) - settings.removed_s)
+    },
   }
 }
 

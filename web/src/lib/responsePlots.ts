@@ -121,10 +121,7 @@ export function phasePlot(
 ): PlotSpec {
   const lines = analysed.map(({ trace, response }) => {
     const floor = highest(response.level_db) + PHASE_FLOOR_DB
-    const values =
-      what === 'phase'
-        ? response.phase_deg
-        : response.groupDelay_s.map((seconds) => Number((1000 * seconds).toFixed(6)))
+    const values = what === 'phase' ? response.phase_deg() : response.groupDelay_s().map((seconds) => 1000 * seconds)
     return { ...lineOf(trace), values: values.map((value, i) => (response.level_db[i] < floor ? null : value)) }
   })
   return {
