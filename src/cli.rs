@@ -39,7 +39,7 @@ use crate::logging::{FORMAT_VARIABLE, LogFormat};
 #[derive(Debug, Parser)]
 #[command(version, max_term_width = 100)]
 pub(crate) struct CliArguments {
-    /// The lake: a folder or a file:// URL.
+    /// The lake: a folder, a file:// URL or s3://bucket/prefix.
     #[arg(long, global = true, env = "ECHOLAKE_LAKE", default_value = "lake", value_name = "URL")]
     pub(crate) lake: String,
     /// Format of the log on stderr; RUST_LOG sets its levels.
@@ -127,7 +127,7 @@ impl CliArguments {
     pub(crate) fn confine(&self) -> anyhow::Result<()> {
         match &self.command {
             #[cfg(feature = "lake")]
-            CliCommand::Lake(LakeCommand::Engine(args)) => args.confine(),
+            CliCommand::Lake(LakeCommand::Engine(args)) => args.confine(&self.lake),
             _ => Ok(()),
         }
     }

@@ -33,7 +33,9 @@ fn one_maintains_at_a_time_and_the_second_is_told_who() {
     let place = TestFolder::new();
     place.acquire("flat", &["--ir-only"]);
     place.ok(&["ingest"]);
-    let lease = place.path("lake/tables/_maintenance.json");
+    let leases = place.path("lake/tables/_maintenance");
+    std::fs::create_dir(&leases).expect("made");
+    let lease = leases.join(format!("{:020}.json", 7));
     let held = |expires: &str| {
         let text = format!(r#"{{"holder": "x", "host": "far-away", "pid": 4711, "expires": "{expires}"}}"#);
         std::fs::write(&lease, text).expect("written");

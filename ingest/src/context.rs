@@ -40,7 +40,8 @@ impl IngestContext {
         let name = FileName::Rows { surface, run, derivation: derivation.to_owned() };
         // In parallel, because each file waits for the disk by itself.
         let staged = join_all(files.into_iter().map(|(table, file)| self.lake.stage(table, &name, file))).await;
-        Ok(staged.into_iter().collect::<std::result::Result<_, _>>()?)
+        let staged = staged.into_iter().map(|file| Ok(file?.made_from(&self.snapshot)));
+        staged.collect()
     }
 
     /// Stages a run's row of `runs`, which replaces the rows in the snapshot. After its commit readers see the files
@@ -48,6 +49,6 @@ impl IngestContext {
     pub(crate) async fn stage_pointer(&self, run: VisibleRun, row: &[RecordBatch]) -> Result<StagedFile> {
         let file = encode(Table::Runs, &Table::Runs.schema(self.lake.rig()), row)?;
         let staged = self.lake.stage(Table::Runs, &FileName::Pointer(run.clone()), file).await?;
-        Ok(staged.replacing(&run, self.snapshot.files_of(Table::Runs, &run.run)))
+        Ok(staged.made_from(&self.snapshot).replacing(&run, self.snapshot.files_of(Table::Runs, &run.run)))
     }
 }

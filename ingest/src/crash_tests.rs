@@ -22,6 +22,7 @@ use object_store::{ObjectStore, ObjectStoreExt as _};
 use parquet::arrow::arrow_reader::ParquetRecordBatchReaderBuilder;
 
 use crate::mortal::{DeathMoment, MortalStore};
+use crate::skewed::{Interlude, SkewedStore};
 use crate::{FileReport, LakeIngest, complete, pending};
 
 /// Ten points, so that a run takes milliseconds.
@@ -186,6 +187,42 @@ async fn upkeep_beside_ingest_loses_nothing_and_doubles_nothing() {
     assert!(seen == expected, "other rows");
 }
 
+/// Ahead or behind.
+const SKEW: TimeDelta = TimeDelta::minutes(5);
+
+fn skewed(store: &Arc<InMemory>, skew: TimeDelta, interlude: Option<Interlude>) -> Arc<dyn ObjectStore> {
+    SkewedStore::new(store.clone(), skew, interlude)
+}
+
+// The rows that replace others are in their logs, and another machine cleans up before `runs` names them.
+#[tokio::test(flavor = "multi_thread")]
+async fn a_clean_up_just_before_the_rows_are_named_takes_none_of_them_whatever_the_clocks_say() {
+    let runs = runs(&["flat", "foam", "wood", "flat"]);
+    let undisturbed = with_inbox(&runs[..3]).await;
+    ingest(undisturbed.clone()).await.expect("ingested");
+    let (name, bytes) = &runs[3];
+    let inbox = Path::from(format!("inbox/{name}"));
+    undisturbed.put(&inbox, bytes.clone().into()).await.expect("written");
+    ingest(undisturbed.clone()).await.expect("ingested");
+    let expected = tables(undisturbed).await;
+    for (first, second) in [(SKEW, -SKEW), (-SKEW, SKEW), (SKEW, TimeDelta::zero())] {
+        let store = with_inbox(&runs[..3]).await;
+        ingest(skewed(&store, first, None)).await.expect("ingested");
+        store.put(&inbox, bytes.clone().into()).await.expect("written");
+        let other = store.clone();
+        let clean_up: Interlude = Arc::new(move || {
+            let store = skewed(&other, first, None);
+            Box::pin(async move {
+                lake(store).await.expect("opened").remove_superseded().await.expect("cleaned up");
+            })
+        });
+        ingest(skewed(&store, second, Some(clean_up))).await.expect("ingested");
+        let (seen, logged) = tables(store).await;
+        assert_eq!(logged, expected.1, "clocks {first} and {second}");
+        assert!(seen == expected.0, "clocks {first} and {second}: other bytes");
+    }
+}
+
 #[tokio::test(flavor = "multi_thread")]
 async fn a_new_reference_run_rewrites_its_dependants_and_nothing_else() {
     let runs = runs(&["flat", "foam", "wood", "flat"]);
@@ -330,7 +367,11 @@ mod slow {
         let deaths = each_death(&start, tidy, async |inner, death| {
             assert!(rows(inner.clone()).await == before, "{death}: other rows");
             // As if the lease had expired.
-            inner.delete(&Path::from("tables/_maintenance.json")).await.ok();
+            let leases: Vec<_> =
+                inner.list(Some(&Path::from("tables/_maintenance"))).try_collect().await.expect("listed");
+            for lease in leases {
+                inner.delete(&lease.location).await.expect("deleted");
+            }
             tidy(inner.clone()).await.unwrap_or_else(|e| panic!("{death}: {e}"));
             assert!(tables(inner.clone()).await == expected, "{death}: other files");
             // Unnamed files stay for an hour, because a concurrent ingest may be about to commit them.
@@ -342,19 +383,35 @@ mod slow {
         assert!(deaths > 2 * 40, "{deaths} deaths");
     }
 
+    // Three machines: two ingest, the third cleans up without end.
     #[tokio::test(flavor = "multi_thread")]
-    async fn two_ingests_at_once_lose_nothing_and_double_nothing() {
+    async fn two_ingests_and_a_clean_up_with_any_clocks_lose_nothing_and_double_nothing() {
         let runs = runs(&["flat", "foam", "wood", "prd", "brick", "wavy", "flat_2", "wood_2"]);
         let undisturbed = with_inbox(&runs).await;
         ingest(undisturbed.clone()).await.expect("ingested");
         let expected = tables(undisturbed).await;
-        for _ in 0..5 {
+        let equal = TimeDelta::zero();
+        for [a, b, third] in [[equal, equal, equal], [SKEW, -SKEW, equal], [equal, SKEW, -SKEW], [-SKEW, equal, SKEW]] {
             let store = with_inbox(&runs).await;
-            let (a, b) = (tokio::spawn(ingest(store.clone())), tokio::spawn(ingest(store.clone())));
+            let done = Arc::new(AtomicBool::new(false));
+            let clean_up = tokio::spawn({
+                let (store, done) = (skewed(&store, third, None), done.clone());
+                async move {
+                    let lake = lake(store).await.expect("opened");
+                    while !done.load(Ordering::SeqCst) {
+                        lake.remove_superseded().await.expect("cleaned up");
+                        tokio::task::yield_now().await;
+                    }
+                }
+            });
+            let (a, b) = (ingest(skewed(&store, a, None)), ingest(skewed(&store, b, None)));
+            let (a, b) = (tokio::spawn(a), tokio::spawn(b));
             a.await.expect("no panic").expect("ingested");
             b.await.expect("no panic").expect("ingested");
             // Each completes what it saw; the last one to end has seen everything.
             ingest(store.clone()).await.expect("ingested");
+            done.store(true, Ordering::SeqCst);
+            clean_up.await.expect("no panic");
             let (seen, logged) = tables(store).await;
             assert_eq!(logged, expected.1);
             assert!(seen == expected.0, "other bytes");

@@ -4,11 +4,11 @@ use std::path::{Path as FsPath, PathBuf};
 use std::sync::Arc;
 
 use echolake_lake::{Lake, StoreError};
-use echolake_schema::RunId;
+use echolake_schema::{Rig, RunId};
 use futures::TryStreamExt as _;
 use object_store::local::LocalFileSystem;
 use object_store::path::Path;
-use object_store::{ObjectStore, ObjectStoreExt as _, WriteMultipart};
+use object_store::{ObjectMeta, ObjectStore, ObjectStoreExt as _, WriteMultipart};
 
 use crate::error::{Error, Result};
 use crate::run_content::Head;
@@ -25,6 +25,10 @@ const PARTIAL: &str = ".partial";
 const LONGEST_NAME: usize = 200;
 /// Bytes per copied part.
 const PART: u64 = 8 << 20;
+/// Parts on their way at once.
+const PARTS_AT_ONCE: usize = 2;
+/// Largest object that S3 copies in one request.
+const LARGEST_COPY: u64 = 5 << 30;
 
 /// Location of a run's file.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -91,6 +95,29 @@ pub async fn pending(lake: &Lake) -> Result<Vec<RunSource>> {
     Ok(found.into_iter().map(RunSource::Lake).collect())
 }
 
+/// Lists the run files of the inbox alone: one request to an object store, which has files as a whole or not at all.
+///
+/// # Errors
+/// [`Error::Read`] if the inbox cannot be listed.
+pub async fn arrivals(lake: &Lake) -> Result<Vec<ObjectMeta>> {
+    let listed: Vec<_> =
+        lake.store().list(Some(&Path::from(INBOX))).try_collect().await.map_err(|e| Error::read(INBOX, e))?;
+    Ok(listed.into_iter().filter(|meta| meta.location.extension() == Some("mcap")).collect())
+}
+
+/// Reads the rig of a run file of this machine, for a lake that is made for it; None if the file does not begin as a run.
+///
+/// # Errors
+/// [`Error::NoRun`] if there is no such file.
+pub async fn rig_of_run(file: &FsPath) -> Result<Option<Rig>> {
+    if !file.is_file() {
+        return Err(Error::NoRun { given: file.display().to_string() });
+    }
+    let (path, name) = (absolute(file)?, file.display().to_string());
+    let opened = Opened { store: Arc::new(LocalFileSystem::new()), path, name };
+    Ok(Head::read(&opened).await.and_then(|head| head.rig))
+}
+
 /// Renames the recordings in the inbox whose recorder died, so that ingest accepts their complete part; returns them.
 /// Recordings that are still being written, that can be resumed, or that come from imports (which are repeated from
 /// their files) are left alone.
@@ -155,12 +182,34 @@ pub(crate) async fn keep(lake: &Lake, source: &RunSource, to: &Path, bytes: u64)
             Err(e) if !matches!(e, object_store::Error::NotFound { .. }) => Err(failed(e)),
             _ => Ok(()),
         },
-        RunSource::Lake(from) => match store.rename(from, to).await {
+        RunSource::Lake(from) => match move_object(lake, from, to, bytes).await {
             Err(object_store::Error::NotFound { .. }) if store.head(to).await.is_ok() => Ok(()),
-            renamed => renamed.map_err(failed),
+            moved => moved.map_err(failed),
         },
         RunSource::File(_) if there => Ok(()),
         RunSource::File(from) => copy_in(lake, from, to).await,
+    }
+}
+
+// A folder renames. An object store copies, and only what is there as a whole is deleted where it came from.
+async fn move_object(lake: &Lake, from: &Path, to: &Path, bytes: u64) -> object_store::Result<()> {
+    let store = lake.store();
+    if !lake.is_remote() {
+        return store.rename(from, to).await;
+    }
+    if bytes <= LARGEST_COPY {
+        store.copy(from, to).await?;
+    } else {
+        copy_parts(store.as_ref(), from, bytes, store.as_ref(), to).await?;
+    }
+    let copied = store.head(to).await?.size;
+    if copied != bytes {
+        let source = format!("{copied} bytes of `{from}` arrived of {bytes}; hint: run the command again").into();
+        return Err(object_store::Error::Generic { store: "copy", source });
+    }
+    match store.delete(from).await {
+        Err(object_store::Error::NotFound { .. }) => Ok(()),
+        deleted => deleted,
     }
 }
 
@@ -179,10 +228,11 @@ pub(crate) async fn quarantine(lake: &Lake, source: &RunSource, why: &Error) -> 
     let to = free_name(lake, &name[start.unwrap_or(0)..]).await?;
     let reason = Path::from(format!("{to}.reason.txt"));
     store.put(&reason, format!("{why}\n").into()).await.map_err(|e| written(&reason, e))?;
-    match store.rename(from, &to).await {
+    let moved = async { move_object(lake, from, &to, store.head(from).await?.size).await };
+    match moved.await {
         // Another ingest refused it, too.
         Err(object_store::Error::NotFound { .. }) => Ok(None),
-        renamed => renamed.map(|()| Some(to)).map_err(|e| written(from, e)),
+        moved => moved.map(|()| Some(to)).map_err(|e| written(from, e)),
     }
 }
 
@@ -201,25 +251,44 @@ async fn free_name(lake: &Lake, name: &str) -> Result<Path> {
     }
 }
 
-// Under another name first, so that a run's own name never holds a partial file.
 async fn copy_in(lake: &Lake, from: &FsPath, to: &Path) -> Result<()> {
-    let store = lake.store();
+    let (store, source) = (lake.store(), LocalFileSystem::new());
     let failed = |e: object_store::Error| written(to, e);
-    let unread = |e: object_store::Error| Error::read(from.display(), e);
-    let staged = Path::from(format!("{INBOX}/{}.copying", to.filename().unwrap_or("run")));
-    let mut writer = WriteMultipart::new(store.put_multipart(&staged).await.map_err(failed)?);
-    let source: Arc<dyn ObjectStore> = Arc::new(LocalFileSystem::new());
     let path = absolute(from)?;
-    let size = source.head(&path).await.map_err(unread)?.size;
+    let size = source.head(&path).await.map_err(|e| Error::read(from.display(), e))?.size;
+    // An object appears as a whole; a file is under another name first, so that a run's own name never holds part of it.
+    if lake.is_remote() {
+        return copy_parts(&source, &path, size, store.as_ref(), to).await.map_err(failed);
+    }
+    let staged = Path::from(format!("{INBOX}/{}.copying", to.filename().unwrap_or("run")));
+    copy_parts(&source, &path, size, store.as_ref(), &staged).await.map_err(failed)?;
+    store.rename(&staged, to).await.map_err(failed)
+}
+
+async fn copy_parts(
+    source: &dyn ObjectStore,
+    from: &Path,
+    bytes: u64,
+    store: &dyn ObjectStore,
+    to: &Path,
+) -> object_store::Result<()> {
+    let mut writer = WriteMultipart::new(store.put_multipart(to).await?);
     let mut at = 0;
-    while at < size {
-        let end = (at + PART).min(size);
-        writer.put(source.get_range(&path, at..end).await.map_err(unread)?);
-        writer.wait_for_capacity(2).await.map_err(failed)?;
+    while at < bytes {
+        let end = (at + PART).min(bytes);
+        let part = async {
+            let part = source.get_range(from, at..end).await?;
+            writer.put(part);
+            writer.wait_for_capacity(PARTS_AT_ONCE).await
+        };
+        if let Err(error) = part.await {
+            // What was uploaded of it costs money until the upload is aborted.
+            let _ = writer.abort().await;
+            return Err(error);
+        }
         at = end;
     }
-    writer.finish().await.map_err(failed)?;
-    store.rename(&staged, to).await.map_err(failed)
+    writer.finish().await.map(drop)
 }
 
 // The lake itself cannot be written: an error of the lake, not of the run.

@@ -48,11 +48,13 @@ mod references;
 mod rows;
 mod run_channels;
 mod run_content;
+#[cfg(test)]
+mod skewed;
 
 pub use complete::{CompletedRun, complete, waiting};
 pub use echolake_recording::FileIntegrity;
 pub use error::{Error, Result};
-pub use files::{RunSource, adopt_cut_off, pending};
+pub use files::{RunSource, adopt_cut_off, arrivals, pending, rig_of_run};
 pub use ingest::{FileReport, IngestOutcome, IngestedRun, LakeIngest};
 #[doc(hidden)]
 pub use inspect::{InspectedMeasurement, RunInspection, inspect};

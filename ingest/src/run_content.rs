@@ -66,6 +66,7 @@ pub(crate) struct Head {
     pub(crate) origin: Origin,
     /// It says how the run is gone on with.
     pub(crate) has_plan: bool,
+    pub(crate) rig: Option<Rig>,
 }
 
 impl Head {
@@ -86,7 +87,8 @@ impl Head {
         let surface = envelope.surface(&opened.name).ok()?;
         let references = [surface.flat_reference, surface.foam_reference].into_iter().flatten().collect();
         let has_plan = envelope.metadata.contains_key(topics::RUN_PLAN_METADATA);
-        Some(Self { surface: manifest.surface_id, references, origin: manifest.origin, has_plan })
+        let rig = envelope.rig(&opened.name).ok();
+        Some(Self { surface: manifest.surface_id, references, origin: manifest.origin, has_plan, rig })
     }
 }
 

@@ -19,6 +19,7 @@ use datafusion::prelude::SessionContext;
 use datafusion::sql::parser::Statement;
 use echolake_lake::{DataFile, Lake, LakeMoment, LakeSnapshot, VisibleRun};
 use echolake_schema::tables::Table;
+use futures::future::try_join_all;
 use quick_cache::sync::Cache;
 
 use crate::as_of::{self, PastTableName};
@@ -29,6 +30,9 @@ use crate::{Error, error};
 
 /// Time for which a new layout of the same rows may go undetected; vacuum keeps replaced files for an hour at least.
 const LAYOUT_SEEN: Duration = Duration::from_secs(30);
+/// Time for which a look at the log of `runs` is good for all queries, if the lake is on an object store: there it is a
+/// request, which takes long and costs money.
+const REMOTE_CHECK_LASTS: Duration = Duration::from_secs(1);
 /// Maximum number of cached past tables.
 const PAST_TABLES: usize = 32;
 
@@ -52,6 +56,8 @@ struct CatalogSnapshot {
     tables: HashMap<Table, Arc<LakeTable>>,
     providers: Vec<(&'static str, Arc<dyn TableProvider>)>,
     looked: Mutex<Instant>,
+    /// The last look at the log of `runs`.
+    checked: Mutex<Instant>,
 }
 
 impl LakeCatalog {
@@ -156,9 +162,14 @@ impl LakeCatalog {
     async fn is_fresh(&self, current: &CatalogSnapshot) -> Result<bool, Error> {
         let log = self.lake.log();
         let Some(version) = current.snapshot.version(Table::Runs) else { return Ok(false) };
+        let checked = *current.checked.lock().unwrap_or_else(PoisonError::into_inner);
+        if self.lake.is_remote() && checked.elapsed() < REMOTE_CHECK_LASTS {
+            return Ok(true);
+        }
         if log.has_after(Table::Runs, version).await? {
             return Ok(false);
         }
+        *current.checked.lock().unwrap_or_else(PoisonError::into_inner) = Instant::now();
         let due = {
             let mut looked = current.looked.lock().unwrap_or_else(PoisonError::into_inner);
             let due = looked.elapsed() > LAYOUT_SEEN;
@@ -168,16 +179,16 @@ impl LakeCatalog {
             due
         };
         if due {
-            for table in Table::ALL {
-                if log.version(table).await? != current.snapshot.version(table) {
-                    return Ok(false);
-                }
+            let versions = try_join_all(Table::ALL.into_iter().map(|table| log.version(table))).await?;
+            if Table::ALL.into_iter().zip(versions).any(|(table, now)| now != current.snapshot.version(table)) {
+                return Ok(false);
             }
         }
         Ok(true)
     }
 
     async fn take(&self, before: Option<&CatalogSnapshot>) -> Result<CatalogSnapshot, Error> {
+        let taken = Instant::now();
         let snapshot = Arc::new(self.lake.snapshot().await?);
         let mut tables = HashMap::new();
         for table in Table::ALL {
@@ -196,7 +207,8 @@ impl LakeCatalog {
             let beneath = view.tables().iter().filter_map(of).collect();
             providers.push((view.name(), Arc::new(view.over(&self.lake, &self.lookups, &beneath).map_err(failed)?)));
         }
-        Ok(CatalogSnapshot { snapshot, tables, providers, looked: Mutex::new(Instant::now()) })
+        let [looked, checked] = [taken, taken].map(Mutex::new);
+        Ok(CatalogSnapshot { snapshot, tables, providers, looked, checked })
     }
 
     fn table(&self, table: Table, files: &[DataFile]) -> Result<Arc<LakeTable>, Error> {

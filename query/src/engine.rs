@@ -40,6 +40,8 @@ const BATCH_ROWS: usize = 2048;
 /// Cache size for the files' footers and page indexes, bytes. Queries read the same files again and again, and a
 /// thousand runs need more than DataFusion's default of 50 MiB.
 const METADATA_BYTES: usize = 256 << 20;
+/// Bytes that are fetched of a file's end on an object store: footer and page index of nearly all files in one request.
+const REMOTE_FOOTER_BYTES: usize = 128 << 10;
 
 /// Disk space that sorts and aggregations of all queries may use, bytes.
 const SPILL_BYTES: u64 = 16 << 30;
@@ -211,7 +213,9 @@ impl QueryEngine {
         let reader = Arc::new(CachedParquetFileReaderFactory::new(lake.store(), metadata));
         let functions = FunctionSet::all(lake.rig()).map_err(|e| Error::Execution { message: e.to_string() })?;
         let threads = |e: std::io::Error| Error::Execution { message: format!("no threads for queries: {e}") };
-        let catalog = LakeCatalog::new(lake, FileReaders { url, reader, small: Arc::new(SmallTables::new(lake)) })?;
+        let footer_bytes = lake.is_remote().then_some(REMOTE_FOOTER_BYTES);
+        let small = Arc::new(SmallTables::new(lake));
+        let catalog = LakeCatalog::new(lake, FileReaders { url, reader, footer_bytes, small })?;
         let inner = EngineState {
             template: template(runtime, &functions, catalog.rules()),
             catalog,

@@ -72,6 +72,8 @@ pub(crate) struct FileReaders {
     pub(crate) url: ObjectStoreUrl,
     /// Caches footers for all sessions.
     pub(crate) reader: Arc<dyn ParquetFileReaderFactory>,
+    /// Bytes of a file's end that the first request for a footer fetches, if a request takes long.
+    pub(crate) footer_bytes: Option<usize>,
     /// Caches the rows of small tables.
     pub(crate) small: Arc<SmallTables>,
 }
@@ -118,10 +120,13 @@ impl LakeTable {
         limit: Option<usize>,
     ) -> Result<Arc<dyn ExecutionPlan>> {
         let lists = self.reads_lists(projection.as_ref());
-        let source = ParquetSource::new(self.schema.clone())
+        let mut source = ParquetSource::new(self.schema.clone())
             .with_table_parquet_options(state.table_options().parquet.clone())
             .with_parquet_file_reader_factory(self.source.reader.clone())
             .with_pushdown_filters(lists);
+        if let Some(bytes) = self.source.footer_bytes {
+            source = source.with_metadata_size_hint(bytes);
+        }
         let config = FileScanConfigBuilder::new(self.source.url.clone(), Arc::new(source))
             .with_file_groups(groups(files, state.config().target_partitions()))
             .with_statistics(self.known(files)?)

@@ -11,13 +11,13 @@ use std::time::Duration;
 use anyhow::Context as _;
 use echolake_acquisition::recovery::is_partial;
 use echolake_ingest::{
-    FileReport, IngestOutcome, IngestedRun, LakeIngest, RunSource, SuspectFile, adopt_cut_off, complete, pending,
-    waiting,
+    FileReport, IngestOutcome, IngestedRun, LakeIngest, RunSource, SuspectFile, adopt_cut_off, arrivals, complete,
+    pending, rig_of_run, waiting,
 };
-use echolake_lake::Lake;
+use echolake_lake::{Error as LakeError, Lake, ReferenceSurfaces, remote_access};
 use futures::TryStreamExt as _;
-use object_store::ObjectStoreExt as _;
 use object_store::path::Path as ObjectPath;
+use object_store::{ObjectMeta, ObjectStoreExt as _};
 use serde::{Deserialize, Serialize};
 
 use crate::CommandOutcome;
@@ -90,7 +90,7 @@ impl IngestSummary {
 
 pub(crate) async fn run(args: &IngestArgs, lake_url: &str) -> anyhow::Result<CommandOutcome> {
     let stop = super::stop_request()?;
-    let lake = Lake::open(lake_url).await?;
+    let lake = open_or_make(lake_url, &args.runs).await?;
     lake.ensure_tables().await?;
     let progress = CommandProgress::new();
     if let Some(path) = &args.suspect {
@@ -116,6 +116,18 @@ pub(crate) async fn run(args: &IngestArgs, lake_url: &str) -> anyhow::Result<Com
         anyhow::bail!("nothing was taken in");
     }
     Ok(if summary.lost() { CommandOutcome::WithLoss } else { CommandOutcome::Whole })
+}
+
+// What makes a lake in a folder also records into it. On an object store, the first run that is taken in makes it.
+async fn open_or_make(lake_url: &str, runs: &[String]) -> anyhow::Result<Lake> {
+    let missing = match Lake::open(lake_url).await {
+        Err(e @ LakeError::NoLake { .. }) if remote_access(lake_url).is_some() => e,
+        opened => return Ok(opened?),
+    };
+    let Some(first) = runs.first().map(Path::new).filter(|run| run.is_file()) else { return Err(missing.into()) };
+    let rig = rig_of_run(first).await?;
+    let rig = rig.with_context(|| format!("no lake at `{lake_url}`, and `{}` has no rig for one", first.display()))?;
+    Ok(Lake::open_or_create(lake_url, &rig, &ReferenceSurfaces::default()).await?)
 }
 
 // All pending files, with the recordings that a crashed recorder left.
@@ -254,25 +266,32 @@ async fn watch(lake: &Lake, stop: &StopRequest, progress: &CommandProgress) -> a
     // Refused files that are still where they were.
     let mut given_up = HashMap::new();
     let mut lost = false;
+    let mut is_first = true;
     while !stop.is_made() {
         let mut settled = Vec::new();
         let mut now = HashMap::new();
         let mut states = HashMap::new();
-        for source in all_pending(lake).await? {
-            let RunSource::Lake(path) = &source else { continue };
-            // It may be gone again.
-            let Ok(meta) = lake.store().head(path).await else { continue };
-            let state = (meta.size, meta.last_modified);
+        let found = match look(lake, is_first).await {
+            Err(e) if lake.is_remote() => {
+                wait_after(&e, stop).await;
+                continue;
+            }
+            found => found?,
+        };
+        for meta in found {
+            let (path, state) = (meta.location, (meta.size, meta.last_modified));
             if given_up.get(path.as_ref()) == Some(&state) {
                 continue;
             }
             states.insert(path.to_string(), state);
-            if before.get(path) == Some(&state) {
-                settled.push(source);
+            // Object stores show no file before it is whole.
+            if lake.is_remote() || before.get(&path) == Some(&state) {
+                settled.push(RunSource::Lake(path));
             } else {
-                now.insert(path.clone(), state);
+                now.insert(path, state);
             }
         }
+        is_first = false;
         before = now;
         if settled.is_empty() {
             pause(LOOK_EVERY, stop).await;
@@ -286,13 +305,29 @@ async fn watch(lake: &Lake, stop: &StopRequest, progress: &CommandProgress) -> a
             }
             Err(e) if stop.is_made() => drop(e),
             // A full disk or an absent store passes; the files are still there.
-            Err(e) => {
-                eprintln!("error: {}; trying again in {} s", describe_error(&e), RETRY_AFTER.as_secs());
-                pause(RETRY_AFTER, stop).await;
-            }
+            Err(e) => wait_after(&e, stop).await,
         }
     }
     Ok(if lost { CommandOutcome::WithLoss } else { CommandOutcome::Whole })
+}
+
+// The pending files. On an object store the inbox alone is listed, but for the first time.
+async fn look(lake: &Lake, is_first: bool) -> anyhow::Result<Vec<ObjectMeta>> {
+    if lake.is_remote() && !is_first {
+        return Ok(arrivals(lake).await?);
+    }
+    let mut found = Vec::new();
+    for source in all_pending(lake).await? {
+        let RunSource::Lake(path) = &source else { continue };
+        // It may be gone again.
+        found.extend(lake.store().head(path).await.ok());
+    }
+    Ok(found)
+}
+
+async fn wait_after(error: &anyhow::Error, stop: &StopRequest) {
+    eprintln!("error: {}; trying again in {} s", describe_error(error), RETRY_AFTER.as_secs());
+    pause(RETRY_AFTER, stop).await;
 }
 
 // Ends early if a stop is requested.

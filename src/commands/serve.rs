@@ -8,7 +8,7 @@ use std::path::PathBuf;
 use std::str::FromStr;
 
 use anyhow::Context as _;
-use echolake_lake::Lake;
+use echolake_lake::{Lake, remote_access};
 use echolake_server::certificate::self_signed;
 use echolake_server::engine::{confinement, run_engine};
 use echolake_server::tokens::{self, TokenFile};
@@ -72,10 +72,15 @@ pub(crate) struct EngineArgs {
 
 impl EngineArgs {
     /// Gives up what an engine does not need. To be called before there are threads.
-    pub(crate) fn confine(&self) -> anyhow::Result<()> {
-        let Some(lake) = &self.confine_to else { return Ok(()) };
+    pub(crate) fn confine(&self, lake_url: &str) -> anyhow::Result<()> {
         let temp = std::env::temp_dir();
-        confinement::confine_files(lake, &[&self.sockets, &temp]).context("the engine cannot be confined")
+        let own = [self.sockets.as_path(), &temp];
+        let confined = match (&self.confine_to, remote_access(lake_url)) {
+            (Some(lake), _) => confinement::confine_files(lake, &own),
+            (None, Some(store)) => confinement::confine_to_store(&store, &own),
+            (None, None) => Ok(()),
+        };
+        confined.context("the engine cannot be confined")
     }
 }
 

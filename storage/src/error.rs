@@ -8,13 +8,17 @@ const LAKE_MAKERS: &str = "`echolake demo`, `echolake acquire` and `echolake imp
 #[cfg(not(feature = "tables"))]
 const LAKE_MAKERS: &str = "`echolake acquire` makes one";
 
+/// The locations on object stores that this build reaches, as words of a hint.
+#[cfg(feature = "tables")]
+const REMOTE_LOCATIONS: &str = "s3://bucket/prefix (gs://, az://)";
+#[cfg(not(feature = "tables"))]
+const REMOTE_LOCATIONS: &str = "use a program with tables for object stores";
+
 /// An operation that a lake could not do, by what the caller can do about it.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
     /// The location is no path and no URL that this build reaches.
-    #[error(
-        "`{location}` is not a lake's location: {source}; hint: give a folder, or file:///... (object stores are not in this build)"
-    )]
+    #[error("`{location}` is not a lake's location: {source}; hint: give a folder, file:///..., or {REMOTE_LOCATIONS}")]
     Location {
         /// The given location.
         location: String,
@@ -32,6 +36,16 @@ pub enum Error {
     Occupied {
         /// The location.
         location: String,
+    },
+    /// The object store lets several create the same object, so that writers would overwrite each other's commits.
+    #[error(
+        "the object store of `{location}` cannot hold a lake: {observed}; hint: commits need a store that refuses to create an object that exists (`If-None-Match: *`), and a bucket without versions"
+    )]
+    NotExclusive {
+        /// The lake's location.
+        location: String,
+        /// Observation of the probe.
+        observed: String,
     },
     /// `lake.toml` cannot be read.
     #[error("`{location}/lake.toml` is damaged: {source}")]
@@ -151,9 +165,9 @@ pub enum Error {
 }
 
 /// An object store's error. Its text is that of the innermost cause, which is what a user can act on: object_store wraps
-/// the system's error several times.
+/// the system's error several times. Of a request that was repeated it says how often it was tried.
 #[derive(Debug, thiserror::Error)]
-#[error("{}", root_cause(.0))]
+#[error("{}{}", cause_text(.0), tries_text(.0))]
 pub struct StoreError(#[source] pub object_store::Error);
 
 impl Error {
@@ -179,8 +193,44 @@ impl StoreError {
             }
             source = error.source();
         }
-        ""
+        match self.0 {
+            object_store::Error::PermissionDenied { .. } | object_store::Error::Unauthenticated { .. } => {
+                "; hint: look at the store's credentials in the environment, and at what they allow"
+            }
+            _ => "",
+        }
     }
+}
+
+// Stores answer errors as XML.
+fn cause_text(error: &object_store::Error) -> String {
+    let text = root_cause(error).to_string();
+    let element = |name: &str| {
+        let (_, from) = text.split_once(&format!("<{name}>"))?;
+        Some(from.split_once(&format!("</{name}>"))?.0.trim())
+    };
+    let Some((status, code)) = text.split_once(": <?xml").map(|(status, _)| status).zip(element("Code")) else {
+        return text;
+    };
+    let status = status.rsplit(": ").next().unwrap_or(status);
+    let message = element("Message").filter(|message| !message.is_empty());
+    format!("{status}, {code}{}", message.map(|message| format!(" ({message})")).unwrap_or_default())
+}
+
+// The client of object_store says in its text alone how often it repeated a request.
+fn tries_text(error: &object_store::Error) -> String {
+    let (mut tries, mut source) = (1, Some(error as &dyn std::error::Error));
+    while let Some(cause) = source {
+        #[cfg(feature = "tables")]
+        if let Some(retried) = cause.downcast_ref::<crate::remote::RetriedError>() {
+            tries = tries.max(retried.tries);
+        }
+        let text = cause.to_string();
+        let repeated = text.split_once(", after ").and_then(|(_, from)| from.split_once(" retries, max_retries"));
+        tries = tries.max(repeated.and_then(|(number, _)| number.parse::<u32>().ok()).map_or(1, |retries| retries + 1));
+        source = cause.source();
+    }
+    if tries > 1 { format!(" (tried {tries} times)") } else { String::new() }
 }
 
 fn root_cause(error: &object_store::Error) -> &dyn std::error::Error {
@@ -189,4 +239,24 @@ fn root_cause(error: &object_store::Error) -> &dyn std::error::Error {
         cause = inner;
     }
     cause
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn answers_of_stores_are_said_in_words_with_the_number_of_tries() {
+        let check = |text: &str, expected: &str| {
+            let source = object_store::Error::Generic { store: "S3", source: text.to_owned().into() };
+            assert_eq!(StoreError(source).to_string(), expected);
+        };
+        check("the power is gone", "the power is gone");
+        check(
+            "Error performing PUT http://host/x in 1.2s, after 3 retries, max_retries: 3, retry_timeout: 180s  - Server \
+             returned non-2xx status code: 503 Service Unavailable: <?xml version=\"1.0\"?><Error><Code>SlowDown</Code>\
+             <Message>Reduce your request rate.</Message></Error>",
+            "503 Service Unavailable, SlowDown (Reduce your request rate.) (tried 4 times)",
+        );
+    }
 }

@@ -87,6 +87,18 @@ impl Lake {
         Self::open_or_create_at(LakeLocation::store(name, store), rig, references).await
     }
 
+    /// The same as if the store were a remote one.
+    #[cfg(test)]
+    pub(crate) async fn open_or_create_remote(
+        store: Arc<dyn ObjectStore>,
+        name: &str,
+        rig: &Rig,
+        references: &ReferenceSurfaces,
+    ) -> Result<Self> {
+        let location = LakeLocation { remote: Some(Arc::default()), ..LakeLocation::store(name, store) };
+        Self::open_or_create_at(location, rig, references).await
+    }
+
     async fn open_or_create_at(location: LakeLocation, rig: &Rig, references: &ReferenceSurfaces) -> Result<Self> {
         rig.check()?;
         let config = match read_config(&location).await? {
@@ -136,7 +148,7 @@ impl Lake {
     fn assemble(location: LakeLocation, config: LakeConfig) -> Result<Self> {
         let grid = config.rig.grid()?;
         #[cfg(feature = "tables")]
-        let log = DeltaLog::new(location.store.clone(), config.rig.clone());
+        let log = DeltaLog::new(&location, config.rig.clone());
         Ok(Self(Arc::new(OpenLake {
             location,
             config,
@@ -177,6 +189,21 @@ impl Lake {
     /// The lake's store; paths are relative to the lake.
     pub fn store(&self) -> Arc<dyn ObjectStore> {
         self.0.location.store.clone()
+    }
+
+    /// Returns whether the lake is on an object store, where others may work on it from other machines.
+    #[cfg(feature = "tables")]
+    pub fn is_remote(&self) -> bool {
+        self.0.location.remote.is_some()
+    }
+
+    /// Probes, once in a process, if an object store is fit to be written: if one alone can create an object. A folder is.
+    ///
+    /// # Errors
+    /// [`Error::NotExclusive`], or what the store says.
+    #[cfg(feature = "tables")]
+    pub async fn ensure_exclusive(&self) -> Result<()> {
+        self.0.location.ensure_exclusive().await
     }
 
     /// Contents of `lake.toml`.
@@ -232,6 +259,8 @@ async fn create_config(location: &LakeLocation, rig: &Rig, references: &Referenc
     if !there.objects.is_empty() || !there.common_prefixes.iter().all(ours) {
         return Err(Error::Occupied { location: location.text.clone() });
     }
+    #[cfg(feature = "tables")]
+    location.ensure_exclusive().await?;
     let config = LakeConfig { format: LAKE_FORMAT, references: references.clone(), rig: rig.clone() };
     let text = config.to_toml()?;
     match location.store.put_opts(&Path::from(CONFIG), text.into(), PutMode::Create.into()).await {

@@ -22,6 +22,8 @@ mod error;
 mod lake;
 mod location;
 #[cfg(feature = "tables")]
+mod remote;
+#[cfg(feature = "tables")]
 mod tables;
 mod unused;
 
@@ -29,11 +31,14 @@ pub use config::{DirectSound, LAKE_FORMAT, LakeConfig, ReferenceSurfaces};
 pub use error::{Error, StoreError};
 pub use lake::Lake;
 #[cfg(feature = "tables")]
+pub use remote::{RemoteAccess, remote_access};
+#[cfg(feature = "tables")]
 pub use tables::{
     BatchBuilder, CommitEffect, CommitLog, CommitOutcome, DataFile, DeletedFile, DeletionMode, EncodedFile,
-    FileEncoder, FileHistory, FileName, FileStats, KEEP_HOURS, LakeMoment, LakeSnapshot, MergeProgress, NewFile,
-    NoMoment, OptimizeReport, ReplacedFiles, RunPart, StagedFile, TARGET_BYTES, TableCommit, TableOptimizeReport,
-    TableVersion, VacuumReport, VisibleRun, add_missing_columns, encode, reader_metadata, wanted_schema,
+    FileEncoder, FileHistory, FileName, FileStats, KEEP_HOURS, LakeMoment, LakeSnapshot, LoggedFile, MergeProgress,
+    NewFile, NoMoment, OptimizeReport, ReplacedFiles, RunPart, StagedFile, TARGET_BYTES, TableCommit,
+    TableOptimizeReport, TableVersion, TableView, VacuumReport, VisibleRun, add_missing_columns, encode,
+    reader_metadata, wanted_schema,
 };
 
 /// The result of what a lake does.

@@ -1,4 +1,4 @@
-//! A lake's location: a folder, `file://` or `memory://`.
+//! A lake's location: a folder, `file://`, `memory://`, or a bucket of an object store.
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -8,9 +8,13 @@ use object_store::ObjectStore;
 use object_store::memory::InMemory;
 use object_store::path::Path as ObjectPath;
 use object_store::prefix::PrefixStore;
+#[cfg(feature = "tables")]
+use tokio::sync::OnceCell;
 use url::Url;
 
 use crate::durable::DurableFileSystem;
+#[cfg(feature = "tables")]
+use crate::remote::{ExclusionFault, probe_exclusion};
 use crate::{Error, Result};
 
 /// A lake's location, opened.
@@ -22,6 +26,9 @@ pub(crate) struct LakeLocation {
     pub(crate) folder: Option<PathBuf>,
     /// The lake alone.
     pub(crate) store: Arc<dyn ObjectStore>,
+    /// If it is an object store: the result of the probe that writers make first.
+    #[cfg(feature = "tables")]
+    pub(crate) remote: Option<Arc<OnceCell<()>>>,
 }
 
 impl LakeLocation {
@@ -37,13 +44,41 @@ impl LakeLocation {
         match url.scheme() {
             "file" => Self::folder(text, &url.to_file_path().map_err(|()| wrong("it names no local folder".into()))?),
             "memory" => Ok(Self::store(text, Arc::new(InMemory::new()))),
+            #[cfg(feature = "tables")]
+            _ => {
+                let store = crate::remote::open_store(&url).map_err(wrong)?;
+                Ok(Self { remote: Some(Arc::default()), ..Self::store(text, store) })
+            }
+            #[cfg(not(feature = "tables"))]
             scheme => Err(wrong(format!("this build does not reach `{scheme}://`").into())),
         }
     }
 
+    /// Probes, before the first write of this process, if an object store lets one alone create an object. Folders do.
+    ///
+    /// # Errors
+    /// [`Error::NotExclusive`], or what the store says.
+    #[cfg(feature = "tables")]
+    pub(crate) async fn ensure_exclusive(&self) -> Result<()> {
+        let Some(probed) = &self.remote else { return Ok(()) };
+        let probe = async {
+            probe_exclusion(&self.store).await.map_err(|fault| match fault {
+                ExclusionFault::Overwrites(observed) => Error::NotExclusive { location: self.text.clone(), observed },
+                ExclusionFault::Store(cause) => Error::store("write", &self.text, cause),
+            })
+        };
+        probed.get_or_try_init(|| probe).await.copied()
+    }
+
     /// A store that holds nothing but the lake.
     pub(crate) fn store(text: &str, store: Arc<dyn ObjectStore>) -> Self {
-        Self { text: text.to_owned(), folder: None, store }
+        Self {
+            text: text.to_owned(),
+            folder: None,
+            store,
+            #[cfg(feature = "tables")]
+            remote: None,
+        }
     }
 
     fn folder(text: &str, path: &Path) -> Result<Self> {
@@ -54,7 +89,7 @@ impl LakeLocation {
         }
         let prefix = ObjectPath::from_absolute_path(&absolute).map_err(|e| wrong(e.into()))?;
         let store = Arc::new(PrefixStore::new(DurableFileSystem::new(), prefix));
-        Ok(Self { text: text.to_owned(), folder: Some(absolute), store })
+        Ok(Self { folder: Some(absolute), ..Self::store(text, store) })
     }
 }
 
@@ -64,7 +99,9 @@ mod tests {
 
     #[test]
     fn nonsense_is_refused_with_a_hint() {
-        for bad in ["", "s3://bucket/lake", "http://host/lake", "://", "/dev/null"] {
+        for bad in
+            ["", "s3://", "s3://key:secret@bucket/lake", "s3://bucket/lake?x", "http://host/lake", "://", "/dev/null"]
+        {
             let error = LakeLocation::parse(bad).expect_err(bad).to_string();
             assert!(error.contains("hint"), "{error}");
         }

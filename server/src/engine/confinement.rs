@@ -4,9 +4,10 @@
 use std::io;
 use std::path::{Path, PathBuf};
 
+use echolake_lake::RemoteAccess;
 use landlock::{
-    ABI, Access as _, AccessFs, AccessNet, CompatLevel, Compatible as _, Ruleset, RulesetAttr as _, RulesetCreated,
-    RulesetCreatedAttr as _, RulesetError, path_beneath_rules,
+    ABI, Access as _, AccessFs, AccessNet, CompatLevel, Compatible as _, NetPort, Ruleset, RulesetAttr as _,
+    RulesetCreated, RulesetCreatedAttr as _, RulesetError, path_beneath_rules,
 };
 use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
 
@@ -37,16 +38,31 @@ pub fn missing() -> Option<&'static str> {
 /// # Errors
 /// The system refuses.
 pub fn confine_files(lake: &Path, own: &[&Path]) -> io::Result<()> {
+    let readable: Vec<_> = [lake.to_owned()].into_iter().chain(linked_folders(lake)).collect();
+    confine(&readable, own, &[])
+}
+
+/// Lets the process read what it needs to reach the lake's object store, read and write `own` folders, and nothing else;
+/// connect over TCP to the store's ports alone. Otherwise as [`confine_files`].
+///
+/// # Errors
+/// The system refuses.
+pub fn confine_to_store(store: &RemoteAccess, own: &[&Path]) -> io::Result<()> {
+    confine(&store.files, own, &store.ports)
+}
+
+fn confine(readable: &[PathBuf], own: &[&Path], ports: &[u16]) -> io::Result<()> {
+    let connections = ports.iter().map(|port| Ok::<_, RulesetError>(NetPort::new(*port, AccessNet::ConnectTcp)));
     let ruleset = || -> Result<RulesetCreated, RulesetError> {
         let read = AccessFs::from_read(LANDLOCK) & !AccessFs::Execute;
         Ruleset::default()
             .handle_access(AccessFs::from_all(LANDLOCK))?
             .handle_access(AccessNet::from_all(LANDLOCK))?
             .create()?
-            .add_rules(path_beneath_rules([lake], read))?
-            .add_rules(path_beneath_rules(linked_folders(lake), read))?
+            .add_rules(path_beneath_rules(readable, read))?
             .add_rules(path_beneath_rules(SYSTEM, read))?
-            .add_rules(path_beneath_rules(own, AccessFs::from_all(LANDLOCK)))
+            .add_rules(path_beneath_rules(own, AccessFs::from_all(LANDLOCK)))?
+            .add_rules(connections)
     };
     ruleset().and_then(RulesetCreated::restrict_self).map_err(io::Error::other)?;
     // A core file would hold the lake's data, and takes seconds to write.

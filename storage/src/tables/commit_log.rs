@@ -21,8 +21,11 @@ pub struct DataFile {
     pub bytes: u64,
     /// Rows.
     pub rows: u64,
-    /// Time at which it was made.
-    pub modified: DateTime<Utc>,
+    /// The version of its table's log that added it; 0 if an earlier version of the program did.
+    pub log_version: u64,
+    /// The version of `runs` that its author had seen: what came later, its author did not know. 0 if the log does not
+    /// say.
+    pub seen_runs: u64,
     /// Least and greatest values, if the log has them.
     pub stats: Option<FileStats>,
     /// If it was merged from files of several runs: their parts, in the order of their rows, which are contiguous.
@@ -45,6 +48,11 @@ pub struct RunPart {
 }
 
 impl DataFile {
+    /// The file as its log's present version has it.
+    pub fn logged(&self) -> LoggedFile {
+        LoggedFile { name: self.path.filename().unwrap_or_default().to_owned(), log_version: self.log_version }
+    }
+
     /// Rows that readers see.
     pub fn visible_rows(&self) -> u64 {
         let hidden = self.parts.iter().filter(|p| self.hidden.contains(&p.run)).map(|p| p.rows).sum();
@@ -61,6 +69,24 @@ impl DataFile {
         });
         placed.filter(|(part, _)| !self.hidden.contains(&part.run))
     }
+}
+
+/// A file of a table as one version of the log added it: the same name added again is another.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct LoggedFile {
+    /// Name in the table's folder.
+    pub name: String,
+    /// The version that added it.
+    pub log_version: u64,
+}
+
+/// The files of one version of a table.
+#[derive(Debug, Clone, Default)]
+pub struct TableView {
+    /// The version.
+    pub version: u64,
+    /// Its files, by path.
+    pub files: Vec<DataFile>,
 }
 
 /// Least and greatest values of a file's columns, by name, as in Delta's log.
@@ -85,6 +111,11 @@ pub struct NewFile {
     pub replaces: Option<ReplacedFiles>,
     /// The parts that it was merged from, if it was merged.
     pub parts: Vec<RunPart>,
+    /// The version of `runs` that its author had seen.
+    pub seen_runs: u64,
+    /// The version of `runs` that added the row of its run which its author had seen; 0 if there was none. If the file is
+    /// in the log already, but its author had not seen that row, it is added again.
+    pub run_version: u64,
 }
 
 /// The files that a new one replaces. If other files have taken their place, the new one is not added.
@@ -92,8 +123,8 @@ pub struct NewFile {
 pub struct ReplacedFiles {
     /// Beginning of the names of all files in that place; None if the names alone are the place.
     pub prefix: Option<String>,
-    /// The names that are expected there; they go with the same commit.
-    pub names: Vec<String>,
+    /// The files that are expected there; they go with the same commit.
+    pub files: Vec<LoggedFile>,
 }
 
 /// Effect of a commit on a reader that follows a table.
@@ -111,8 +142,8 @@ pub enum CommitEffect {
 pub struct TableCommit {
     /// Files that come.
     pub add: Vec<NewFile>,
-    /// Files that go; one that is already gone is passed over.
-    pub remove: Vec<Path>,
+    /// Files that go; one that is already gone, or was added again, is passed over.
+    pub remove: Vec<LoggedFile>,
     /// Its effect on readers.
     pub effect: CommitEffect,
 }
@@ -151,8 +182,12 @@ pub enum CommitOutcome {
 pub trait CommitLog: Send + Sync + std::fmt::Debug {
     /// Makes the table if it is missing.
     async fn ensure(&self, table: Table) -> Result<()>;
+    /// The table as of now; None if there is no table.
+    async fn view(&self, table: Table) -> Result<Option<TableView>>;
     /// The table's files as of now; none if there is no table.
-    async fn files(&self, table: Table) -> Result<Vec<DataFile>>;
+    async fn files(&self, table: Table) -> Result<Vec<DataFile>> {
+        Ok(self.view(table).await?.unwrap_or_default().files)
+    }
     /// The table's newest version; None if there is no table.
     async fn version(&self, table: Table) -> Result<Option<u64>>;
     /// Returns whether there is a version after this one, in one request to the store; if the log was cleaned up since,

@@ -7,8 +7,9 @@ mod log_folder;
 mod table_state;
 
 use std::borrow::Cow;
-use std::collections::{BTreeSet, HashMap, HashSet};
+use std::collections::{BTreeSet, HashMap};
 use std::sync::Arc;
+use std::time::{Duration, Instant};
 
 use arrow::datatypes::{DataType as ArrowType, Field, SchemaRef};
 use async_trait::async_trait;
@@ -25,41 +26,74 @@ use uuid::Uuid;
 use self::actions::{AddFile, FileFormat, LogLine, TableMetadata};
 use self::log_folder::{CommitAttempt, LogFolder, REBUILD_HINT, own_protocol};
 use self::table_state::TableState;
+use crate::location::LakeLocation;
+use crate::remote::backoff;
 use crate::tables::snapshot::{decode_parts, encode_parts, is_merged};
 use crate::{
-    CommitEffect, CommitLog, CommitOutcome, DataFile, Error, FileHistory, FileStats, NewFile, Result, RunPart,
-    TableCommit, TableVersion,
+    CommitEffect, CommitLog, CommitOutcome, DataFile, Error, FileHistory, FileStats, LoggedFile, NewFile, Result,
+    RunPart, TableCommit, TableVersion, TableView,
 };
 
 /// Tries of one commit against other writers; each loses to a commit that went through.
 const COMMIT_TRIES: usize = 50;
+/// Time for which a log on an object store is taken to hold the version that was found there. A log forgets versions after
+/// 30 days; tables that somebody deletes are missed only so much later.
+const LOG_LASTS: Duration = Duration::from_secs(600);
 /// The tag of a merged file's Add that holds its parts.
 const PARTS: &str = "echolake.parts";
+/// The tag of an Add that holds the version of its commit: a checkpoint does not tell it.
+const LOG_VERSION: &str = "echolake.version";
+/// The tag of an Add that holds the version of `runs` that its author had seen.
+const SEEN_RUNS: &str = "echolake.seenRuns";
 
 /// The tables' Delta logs under `tables/`.
 #[derive(Debug)]
 pub(crate) struct DeltaLog {
     store: Arc<dyn ObjectStore>,
+    /// The log is on an object store, where a try takes long.
+    is_remote: bool,
     rig: Rig,
     /// Loaded tables; a later look reads only what has come since.
-    loaded: Mutex<HashMap<Table, Arc<TableState>>>,
+    loaded: Mutex<HashMap<Table, LoadedTable>>,
+}
+
+#[derive(Debug, Clone)]
+struct LoadedTable {
+    state: Arc<TableState>,
+    /// The last look that found its version in the log.
+    found: Instant,
 }
 
 impl DeltaLog {
-    pub(crate) fn new(store: Arc<dyn ObjectStore>, rig: Rig) -> Self {
-        Self { store, rig, loaded: Mutex::default() }
+    pub(crate) fn new(location: &LakeLocation, rig: Rig) -> Self {
+        let is_remote = location.remote.is_some();
+        Self { store: location.store.clone(), is_remote, rig, loaded: Mutex::default() }
     }
 
     fn log_folder(&self, table: Table) -> LogFolder<'_> {
         LogFolder::new(table, self.store.as_ref())
     }
 
+    // Writers that met once do not meet again at once. On a folder, the next try costs nothing.
+    async fn wait_after_loss(&self, losses: usize) {
+        if self.is_remote {
+            tokio::time::sleep(backoff(u32::try_from(losses).unwrap_or(u32::MAX))).await;
+        }
+    }
+
     /// The table as of now, or None if it has no log.
     async fn load(&self, table: Table) -> Result<Option<Arc<TableState>>> {
         let log = self.log_folder(table);
         let known = self.loaded.lock().await.get(&table).cloned();
+        let mut found = Instant::now();
         let mut state = match known {
-            Some(state) => log.advance(state).await?,
+            Some(known) => {
+                let is_in_doubt = !self.is_remote || known.found.elapsed() > LOG_LASTS;
+                if !is_in_doubt {
+                    found = known.found;
+                }
+                log.advance(known.state, is_in_doubt).await?
+            }
             None => None,
         };
         if state.is_none() {
@@ -67,7 +101,7 @@ impl DeltaLog {
         }
         let mut loaded = self.loaded.lock().await;
         match &state {
-            Some(state) => drop(loaded.insert(table, state.clone())),
+            Some(state) => drop(loaded.insert(table, LoadedTable { state: state.clone(), found })),
             None => drop(loaded.remove(&table)),
         }
         Ok(state)
@@ -83,7 +117,7 @@ impl DeltaLog {
 
     /// Adds the columns that a table of an earlier version of the program lacks; its files have nulls there.
     async fn add_columns(&self, table: Table, mut state: Arc<TableState>) -> Result<()> {
-        for _ in 0..COMMIT_TRIES {
+        for losses in 1..=COMMIT_TRIES {
             let Some((metadata, added)) = grown_metadata(table, &state, &table.schema(&self.rig))? else {
                 return Ok(());
             };
@@ -96,6 +130,7 @@ impl DeltaLog {
             if attempt == CommitAttempt::Written {
                 return Ok(());
             }
+            self.wait_after_loss(losses).await;
         }
         Err(lost_to_others(table))
     }
@@ -117,10 +152,18 @@ impl DeltaLog {
             state.apply(state.version + 1, lines);
             // The commit is done; a checkpoint only spares readers some work, and the next one makes up for it.
             let _ = log.maintain(&state, now).await;
-            self.loaded.lock().await.insert(table, Arc::new(state));
+            let written = LoadedTable { state: Arc::new(state), found: Instant::now() };
+            self.loaded.lock().await.insert(table, written);
         }
         Ok(attempt)
     }
+}
+
+/// A file that a version of a table holds.
+#[derive(Debug, Clone, Copy)]
+struct KnownFile {
+    log_version: u64,
+    seen_runs: u64,
 }
 
 /// The rest of a commit that one version of a table still lacks.
@@ -132,18 +175,19 @@ struct PendingChange<'a> {
 }
 
 impl<'a> PendingChange<'a> {
-    fn of(commit: &'a TableCommit, mut names: HashSet<String>) -> Self {
-        let gone = commit.remove.iter().filter_map(Path::filename).filter(|n| names.contains(*n));
-        let remove = gone.map(str::to_owned).collect();
+    fn of(commit: &'a TableCommit, mut known: HashMap<String, KnownFile>) -> Self {
+        let gone = commit.remove.iter().filter(|file| is_known(file, &known));
+        let remove = gone.map(|file| file.name.clone()).collect();
         let mut change = Self { outcomes: Vec::new(), add: Vec::new(), remove, effect: commit.effect };
         for file in &commit.add {
-            let outcome = change.outcome(file, &names);
+            let outcome = change.outcome(file, &known);
             if outcome == CommitOutcome::Now {
-                if let Some(replaces) = &file.replaces {
-                    names.retain(|name| !replaces.names.contains(name));
-                    change.remove.extend(replaces.names.iter().cloned());
+                for replaced in file.replaces.iter().flat_map(|replaces| &replaces.files) {
+                    known.remove(&replaced.name);
+                    change.remove.insert(replaced.name.clone());
                 }
-                names.insert(file.name.clone());
+                // Its version is not known before the commit, and no file of the same commit names it.
+                known.insert(file.name.clone(), KnownFile { log_version: u64::MAX, seen_runs: file.seen_runs });
                 change.remove.remove(&file.name);
                 change.add.push(file);
             }
@@ -164,23 +208,31 @@ impl<'a> PendingChange<'a> {
         let removed = state.files.values().filter(|f| self.remove.contains(&file_name(&f.path)));
         let removed =
             removed.map(|f| LogLine { remove: Some(f.removed_at(now_millis, data_change)), ..LogLine::default() });
-        let added =
-            self.add.iter().map(|f| LogLine { add: Some(add_file(f, now_millis, data_change)), ..LogLine::default() });
+        let added = self.add.iter().map(|f| {
+            let add = add_file(f, state.version + 1, now_millis, data_change);
+            LogLine { add: Some(add), ..LogLine::default() }
+        });
         std::iter::once(commit_info(operation, parameters, now_millis)).chain(added).chain(removed).collect()
     }
 
-    fn outcome(&self, file: &NewFile, names: &HashSet<String>) -> CommitOutcome {
-        if names.contains(&file.name) {
+    // An Add whose author had not seen the row of the run that this one will replace may be cleaned up at any moment; it
+    // is added again.
+    fn outcome(&self, file: &NewFile, known: &HashMap<String, KnownFile>) -> CommitOutcome {
+        if known.get(&file.name).is_some_and(|known| known.seen_runs >= file.run_version) {
             return CommitOutcome::Before;
         }
         let Some(replaces) = &file.replaces else { return CommitOutcome::Now };
-        let expected = replaces.names.iter().all(|n| names.contains(n));
+        let expected = replaces.files.iter().all(|file| is_known(file, known));
         let alone = replaces
             .prefix
             .as_ref()
-            .is_none_or(|prefix| names.iter().filter(|n| n.starts_with(prefix)).count() == replaces.names.len());
+            .is_none_or(|prefix| known.keys().filter(|n| n.starts_with(prefix)).count() == replaces.files.len());
         if expected && alone { CommitOutcome::Now } else { CommitOutcome::Outdated }
     }
+}
+
+fn is_known(file: &LoggedFile, known: &HashMap<String, KnownFile>) -> bool {
+    known.get(&file.name).is_some_and(|known| known.log_version == file.log_version)
 }
 
 /// A table's folder in the lake.
@@ -214,11 +266,9 @@ impl CommitLog for DeltaLog {
         self.log_folder(table).write_commit(0, &lines).await.map(drop)
     }
 
-    async fn files(&self, table: Table) -> Result<Vec<DataFile>> {
-        match self.load(table).await? {
-            Some(state) => data_files(table, &state),
-            None => Ok(Vec::new()),
-        }
+    async fn view(&self, table: Table) -> Result<Option<TableView>> {
+        let Some(state) = self.load(table).await? else { return Ok(None) };
+        Ok(Some(TableView { version: state.version, files: data_files(table, &state)? }))
     }
 
     async fn version(&self, table: Table) -> Result<Option<u64>> {
@@ -250,19 +300,21 @@ impl CommitLog for DeltaLog {
             let at = remove.deletion_timestamp.and_then(DateTime::from_timestamp_millis);
             (file_name(&remove.path), at.unwrap_or_default())
         });
-        Ok(Some(FileHistory { current: file_names(&state), removed: removed.collect() }))
+        let current = state.files.keys().map(|path| file_name(path)).collect();
+        Ok(Some(FileHistory { current, removed: removed.collect() }))
     }
 
     async fn commit(&self, table: Table, commit: &TableCommit) -> Result<Vec<CommitOutcome>> {
-        for _ in 0..COMMIT_TRIES {
+        for losses in 1..=COMMIT_TRIES {
             let state = self.require(table).await?;
-            let change = PendingChange::of(commit, file_names(&state));
+            let change = PendingChange::of(commit, known_files(&state));
             if change.add.is_empty() && change.remove.is_empty() {
                 return Ok(change.outcomes);
             }
             if self.try_commit(table, &state, &change).await? == CommitAttempt::Written {
                 return Ok(change.outcomes);
             }
+            self.wait_after_loss(losses).await;
         }
         Err(lost_to_others(table))
     }
@@ -306,7 +358,8 @@ fn data_file(table: Table, add: &AddFile) -> Result<DataFile> {
     Ok(DataFile {
         bytes: u64::try_from(add.size).unwrap_or(0),
         rows: rows.unwrap_or(0),
-        modified: DateTime::from_timestamp_millis(add.modification_time).unwrap_or(DateTime::UNIX_EPOCH),
+        log_version: number_tag(add, LOG_VERSION),
+        seen_runs: number_tag(add, SEEN_RUNS),
         stats: stats.map(file_stats),
         parts: if is_merged(&name) { parts(table, add)? } else { Vec::new() },
         hidden: Vec::new(),
@@ -314,8 +367,10 @@ fn data_file(table: Table, add: &AddFile) -> Result<DataFile> {
     })
 }
 
-fn file_names(state: &TableState) -> HashSet<String> {
-    state.files.keys().map(|path| file_name(path)).collect()
+fn known_files(state: &TableState) -> HashMap<String, KnownFile> {
+    let known =
+        |add: &AddFile| KnownFile { log_version: number_tag(add, LOG_VERSION), seen_runs: number_tag(add, SEEN_RUNS) };
+    state.files.iter().map(|(path, add)| (file_name(path), known(add))).collect()
 }
 
 /// A file's name of its path in the log.
@@ -327,9 +382,17 @@ fn decoded_name(path: &str) -> Cow<'_, str> {
     percent_decode_str(path).decode_utf8_lossy()
 }
 
+fn tag<'a>(add: &'a AddFile, name: &str) -> Option<&'a str> {
+    add.tags.as_ref()?.get(name)?.as_deref()
+}
+
+// Adds of earlier versions of the program have no such tags.
+fn number_tag(add: &AddFile, name: &str) -> u64 {
+    tag(add, name).and_then(|text| text.parse().ok()).unwrap_or(0)
+}
+
 fn parts(table: Table, add: &AddFile) -> Result<Vec<RunPart>> {
-    let text = add.tags.as_ref().and_then(|tags| tags.get(PARTS).cloned().flatten());
-    text.and_then(|text| decode_parts(&text)).ok_or_else(|| {
+    tag(add, PARTS).and_then(decode_parts).ok_or_else(|| {
         let source = format!("`{}` has lost the list of its parts; {REBUILD_HINT}", add.path).into();
         Error::Log { table: table.name(), action: "read", source }
     })
@@ -342,13 +405,17 @@ fn commit_info(operation: &str, parameters: Value, now_millis: i64) -> LogLine {
         "operation": operation,
         "operationParameters": parameters,
         "engineInfo": concat!("echolake/", env!("CARGO_PKG_VERSION")),
+        // Makes each commit unlike all others: a store whose answer is lost is asked if it holds this one.
+        "txnId": Uuid::new_v4().to_string(),
     });
     LogLine { commit_info: Some(info), ..LogLine::default() }
 }
 
 // Names of ours have no character that Delta would percent-encode.
-fn add_file(file: &NewFile, now_millis: i64, data_change: bool) -> AddFile {
-    let parts = (!file.parts.is_empty()).then(|| encode_parts(&file.parts));
+fn add_file(file: &NewFile, log_version: u64, now_millis: i64, data_change: bool) -> AddFile {
+    let parts = (!file.parts.is_empty()).then(|| (PARTS, encode_parts(&file.parts)));
+    let seen_runs = (file.seen_runs > 0).then(|| (SEEN_RUNS, file.seen_runs.to_string()));
+    let tags = [Some((LOG_VERSION, log_version.to_string())), seen_runs, parts].into_iter().flatten();
     AddFile {
         path: file.name.clone(),
         partition_values: actions::TextMap::new(),
@@ -356,7 +423,7 @@ fn add_file(file: &NewFile, now_millis: i64, data_change: bool) -> AddFile {
         modification_time: now_millis,
         data_change,
         stats: Some(file.stats.clone()),
-        tags: parts.map(|parts| actions::TextMap::from([(PARTS.to_owned(), Some(parts))])),
+        tags: Some(tags.map(|(name, text)| (name.to_owned(), Some(text))).collect()),
     }
 }
 
@@ -408,26 +475,42 @@ mod tests {
     fn file(name: &str, replaces: Option<(&str, &[&str])>) -> NewFile {
         let replaces = replaces.map(|(prefix, names)| ReplacedFiles {
             prefix: Some(prefix.to_owned()).filter(|p| !p.is_empty()),
-            names: names.iter().map(|n| (*n).to_owned()).collect(),
+            files: names.iter().map(|name| logged(name, 3)).collect(),
         });
-        NewFile { name: name.into(), bytes: 1, stats: "{}".into(), replaces, parts: Vec::new() }
+        let (stats, parts) = ("{}".into(), Vec::new());
+        NewFile { name: name.into(), bytes: 1, stats, replaces, parts, seen_runs: 0, run_version: 0 }
     }
 
-    fn names(names: &[&str]) -> HashSet<String> {
-        names.iter().map(|n| (*n).to_owned()).collect()
+    fn logged(name: &str, log_version: u64) -> LoggedFile {
+        LoggedFile { name: name.to_owned(), log_version }
+    }
+
+    /// Files that version 3 of the log added, and whose authors had seen version 5 of `runs`.
+    fn names(names: &[&str]) -> HashMap<String, KnownFile> {
+        names.iter().map(|n| ((*n).to_owned(), KnownFile { log_version: 3, seen_runs: 5 })).collect()
     }
 
     #[test]
     fn what_is_there_is_not_added_again_and_what_is_gone_not_removed() {
         let commit = TableCommit {
             add: vec![file("a", None), file("b", None), file("b", None)],
-            remove: vec![Path::from("tables/runs/c"), Path::from("tables/runs/d")],
+            remove: vec![logged("c", 3), logged("d", 3), logged("e", 2)],
             effect: CommitEffect::Rows,
         };
-        let change = PendingChange::of(&commit, names(&["a", "c"]));
+        let change = PendingChange::of(&commit, names(&["a", "c", "e"]));
         assert_eq!(change.outcomes, [CommitOutcome::Before, CommitOutcome::Now, CommitOutcome::Before]);
         assert_eq!(change.add.iter().map(|f| f.name.as_str()).collect::<Vec<_>>(), ["b"]);
         assert_eq!(change.remove.iter().collect::<Vec<_>>(), ["c"]);
+    }
+
+    #[test]
+    fn a_file_whose_author_missed_the_runs_present_row_is_added_again() {
+        let outcome = |run_version| {
+            let commit =
+                TableCommit { add: vec![NewFile { run_version, ..file("a", None) }], ..TableCommit::default() };
+            PendingChange::of(&commit, names(&["a"])).outcomes[0]
+        };
+        assert_eq!([0, 5, 6].map(outcome), [CommitOutcome::Before, CommitOutcome::Before, CommitOutcome::Now]);
     }
 
     #[test]
@@ -446,6 +529,9 @@ mod tests {
         let gone = vec!["x.1".to_owned(), "y.1".to_owned()];
         assert_eq!(outcomes(vec![merged()], &["x.1", "y.1", "x.2"]), (vec![CommitOutcome::Now], gone));
         assert_eq!(outcomes(vec![merged()], &["x.1", "y.2"]), (vec![CommitOutcome::Outdated], vec![]));
+        let mut older = new();
+        older.replaces.as_mut().expect("replaces").files[0].log_version = 2;
+        assert_eq!(outcomes(vec![older], &["x.1"]), (vec![CommitOutcome::Outdated], vec![]), "it was added again");
         let first = |name| file(name, Some(("x.", &[])));
         assert_eq!(
             outcomes(vec![first("x.1"), first("x.2")], &[]),

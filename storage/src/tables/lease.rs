@@ -1,24 +1,30 @@
-//! The maintenance lease: one object that names the process at work on the lake's files.
+//! The maintenance lease: numbered objects, of which the last names the process at work on the lake's files.
 //!
 //! It keeps two processes from doing the same work, and the error of the second one names the first. Correctness does
 //! not depend on it: a merge is a commit of its own, which fails if another was faster.
+//!
+//! To take the lease, to renew it and to give it back is to create the next number, which one process alone can. Numbers
+//! are never used again, so that a holder that was stopped for long cannot take its place a second time.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use chrono::{DateTime, TimeDelta, Utc};
+use futures::TryStreamExt as _;
 use object_store::path::Path;
 use object_store::{ObjectStore, ObjectStoreExt as _, PutMode};
 use serde::{Deserialize, Serialize};
 
 use crate::{Error, Lake, Result};
 
-/// Path of the lease's object.
-const PATH: &str = "tables/_maintenance.json";
+/// Folder of the lease's objects.
+const FOLDER: &str = "tables/_maintenance";
 /// Time that it holds after its last renewal. A dead holder blocks others that long.
 const HOLDS: TimeDelta = TimeDelta::minutes(10);
 /// Time between two renewals.
 const RENEW_EVERY: Duration = Duration::from_secs(60);
+/// Time between two looks at who holds it, if the lake is on an object store.
+const LOOK_EVERY: Duration = Duration::from_secs(10);
 
 /// The lease, held.
 #[derive(Debug)]
@@ -26,7 +32,10 @@ pub(crate) struct MaintenanceLease {
     store: Arc<dyn ObjectStore>,
     location: String,
     record: LeaseRecord,
+    number: u64,
     renewed: Instant,
+    looked: Instant,
+    look_every: Duration,
 }
 
 /// Contents of the object.
@@ -58,28 +67,23 @@ impl MaintenanceLease {
     /// # Errors
     /// [`Error::Maintained`] if another process holds it, or what the store says.
     pub(crate) async fn take(lake: &Lake) -> Result<Self> {
+        lake.ensure_exclusive().await?;
         let (store, location, record) = (lake.store(), lake.location().to_owned(), LeaseRecord::new());
-        let path = Path::from(PATH);
-        let failed = |e| Error::store("write", PATH, e);
-        if let Some(held) = read(store.as_ref()).await? {
-            if held.expires > Utc::now() {
-                let until = held.expires.format("%Y-%m-%d %H:%M:%S UTC").to_string();
-                return Err(Error::Maintained { location, host: held.host, pid: held.pid, until });
-            }
-            match store.delete(&path).await {
-                Err(e) if !matches!(e, object_store::Error::NotFound { .. }) => return Err(failed(e)),
-                _ => {}
-            }
+        let last = last_number(store.as_ref()).await?;
+        if let Some(held) = read(store.as_ref(), last).await?
+            && held.expires > Utc::now()
+        {
+            return Err(maintained(location, &held));
         }
-        match store.put_opts(&path, record.bytes().into(), PutMode::Create.into()).await {
-            Ok(_) => Ok(Self { store, location, record, renewed: Instant::now() }),
-            Err(object_store::Error::AlreadyExists { .. }) => {
-                let held = read(store.as_ref()).await?.unwrap_or(record);
-                let until = held.expires.format("%Y-%m-%d %H:%M:%S UTC").to_string();
-                Err(Error::Maintained { location, host: held.host, pid: held.pid, until })
-            }
-            Err(e) => Err(failed(e)),
+        let number = last + 1;
+        if !create(store.as_ref(), number, &record).await? {
+            let held = read(store.as_ref(), number).await?.unwrap_or(record);
+            return Err(maintained(location, &held));
         }
+        delete_before(store.as_ref(), number).await;
+        let now = Instant::now();
+        let look_every = if lake.is_remote() { LOOK_EVERY } else { Duration::ZERO };
+        Ok(Self { store, location, record, number, renewed: now, looked: now, look_every })
     }
 
     /// Checks that it is still held, and renews it if [`RENEW_EVERY`] has passed.
@@ -87,39 +91,81 @@ impl MaintenanceLease {
     /// # Errors
     /// [`Error::LeaseLost`] if another process has taken it over, or what the store says.
     pub(crate) async fn keep(&mut self) -> Result<()> {
-        let held = read(self.store.as_ref()).await?;
-        if held.is_none_or(|held| held.holder != self.record.holder) {
-            return Err(Error::LeaseLost { location: self.location.clone() });
-        }
+        let lost = || Error::LeaseLost { location: self.location.clone() };
         if self.renewed.elapsed() >= RENEW_EVERY {
             self.record.expires = Utc::now() + HOLDS;
-            let put = self.store.put(&Path::from(PATH), self.record.bytes().into()).await;
-            put.map_err(|e| Error::store("write", PATH, e))?;
+            if !create(self.store.as_ref(), self.number + 1, &self.record).await? {
+                return Err(lost());
+            }
+            self.number += 1;
+            delete_before(self.store.as_ref(), self.number).await;
             self.renewed = Instant::now();
+            self.looked = self.renewed;
+        } else if self.looked.elapsed() >= self.look_every {
+            if read(self.store.as_ref(), self.number + 1).await?.is_some() {
+                return Err(lost());
+            }
+            self.looked = Instant::now();
         }
         Ok(())
     }
 
-    /// Gives it back.
+    /// Gives it back, if it is still held: what comes next has expired.
     ///
     /// # Errors
     /// What the store says.
-    pub(crate) async fn release(self) -> Result<()> {
-        match read(self.store.as_ref()).await? {
-            Some(held) if held.holder == self.record.holder => {}
-            _ => return Ok(()),
+    pub(crate) async fn release(mut self) -> Result<()> {
+        self.record.expires = DateTime::UNIX_EPOCH;
+        if create(self.store.as_ref(), self.number + 1, &self.record).await? {
+            delete_before(self.store.as_ref(), self.number + 1).await;
         }
-        match self.store.delete(&Path::from(PATH)).await {
-            Err(e) if !matches!(e, object_store::Error::NotFound { .. }) => Err(Error::store("delete", PATH, e)),
-            _ => Ok(()),
-        }
+        Ok(())
+    }
+}
+
+fn maintained(location: String, held: &LeaseRecord) -> Error {
+    let until = held.expires.format("%Y-%m-%d %H:%M:%S UTC").to_string();
+    Error::Maintained { location, host: held.host.clone(), pid: held.pid, until }
+}
+
+fn object(number: u64) -> Path {
+    Path::from(format!("{FOLDER}/{number:020}.json"))
+}
+
+fn number_of(path: &Path) -> Option<u64> {
+    path.filename()?.strip_suffix(".json")?.parse().ok()
+}
+
+async fn numbers(store: &dyn ObjectStore) -> object_store::Result<Vec<u64>> {
+    let there: Vec<_> = store.list(Some(&Path::from(FOLDER))).try_collect().await?;
+    Ok(there.iter().filter_map(|object| number_of(&object.location)).collect())
+}
+
+async fn last_number(store: &dyn ObjectStore) -> Result<u64> {
+    let numbers = numbers(store).await.map_err(|e| Error::store("list", FOLDER, e))?;
+    Ok(numbers.into_iter().max().unwrap_or(0))
+}
+
+// Returns whether it was created; false if another process took the number.
+async fn create(store: &dyn ObjectStore, number: u64, record: &LeaseRecord) -> Result<bool> {
+    match store.put_opts(&object(number), record.bytes().into(), PutMode::Create.into()).await {
+        Ok(_) => Ok(true),
+        Err(object_store::Error::AlreadyExists { .. }) => Ok(false),
+        Err(e) => Err(Error::store("write", object(number), e)),
+    }
+}
+
+// Lower numbers say nothing any more; those that stay are deleted by the next holder.
+async fn delete_before(store: &dyn ObjectStore, number: u64) {
+    for old in numbers(store).await.unwrap_or_default().into_iter().filter(|old| *old < number) {
+        let _ = store.delete(&object(old)).await;
     }
 }
 
 // One that cannot be read holds from its making on, as any other.
-async fn read(store: &dyn ObjectStore) -> Result<Option<LeaseRecord>> {
-    let failed = |e| Error::store("read", PATH, e);
-    let found = match store.get(&Path::from(PATH)).await {
+async fn read(store: &dyn ObjectStore, number: u64) -> Result<Option<LeaseRecord>> {
+    let failed = |e| Error::store("read", object(number), e);
+    let found = match store.get(&object(number)).await {
         Ok(found) => found,
         Err(object_store::Error::NotFound { .. }) => return Ok(None),
         Err(e) => return Err(failed(e)),
@@ -166,10 +212,13 @@ mod tests {
         let lake = lake().await;
         let mut first = MaintenanceLease::take(&lake).await.expect("free");
         first.record.expires = Utc::now() - TimeDelta::seconds(1);
-        lake.store().put(&Path::from(PATH), first.record.bytes().into()).await.expect("written");
+        lake.store().put(&object(first.number), first.record.bytes().into()).await.expect("written");
         let mut second = MaintenanceLease::take(&lake).await.expect("run out");
         assert!(matches!(first.keep().await, Err(Error::LeaseLost { .. })));
         first.release().await.expect("not ours, left alone");
         second.keep().await.expect("held");
+        second.release().await.expect("given back");
+        let there = numbers(lake.store().as_ref()).await.expect("listed");
+        assert_eq!(there, [3], "taken twice and given back, and no number is used again");
     }
 }

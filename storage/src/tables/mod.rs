@@ -14,8 +14,8 @@ mod versions;
 
 pub use batch_builder::BatchBuilder;
 pub use commit_log::{
-    CommitEffect, CommitLog, CommitOutcome, DataFile, FileHistory, FileStats, NewFile, ReplacedFiles, RunPart,
-    TableCommit, TableVersion,
+    CommitEffect, CommitLog, CommitOutcome, DataFile, FileHistory, FileStats, LoggedFile, NewFile, ReplacedFiles,
+    RunPart, TableCommit, TableVersion, TableView,
 };
 pub use data_file::{EncodedFile, FileEncoder, encode};
 pub use optimize::{MergeProgress, OptimizeReport, TARGET_BYTES, TableOptimizeReport};
@@ -26,7 +26,7 @@ pub use versions::{LakeMoment, NoMoment};
 
 use arrow::record_batch::RecordBatch;
 use echolake_schema::tables::{Source, Table};
-use futures::future::join_all;
+use futures::future::{join_all, try_join_all};
 use object_store::ObjectStoreExt as _;
 
 use self::delta::folder;
@@ -40,12 +40,21 @@ pub struct StagedFile {
 }
 
 impl StagedFile {
+    /// Records the view of the lake that its rows were made from. What that view did not hold, the rows do not answer
+    /// to: a row of `runs` that it lacked supersedes them.
+    #[must_use]
+    pub fn made_from(mut self, snapshot: &LakeSnapshot) -> Self {
+        self.file.seen_runs = snapshot.version(Table::Runs).unwrap_or(0);
+        self.file.run_version = snapshot.run_version(&self.file.name);
+        self
+    }
+
     /// Makes a run's row replace its present rows, which are these files or none. If there are others by the time of
     /// the commit, the outcome is [`CommitOutcome::Outdated`].
     #[must_use]
     pub fn replacing<'a>(mut self, run: &VisibleRun, old: impl IntoIterator<Item = &'a DataFile>) -> Self {
-        let names = old.into_iter().filter_map(|f| f.path.filename()).map(str::to_owned).collect();
-        self.file.replaces = Some(ReplacedFiles { prefix: Some(run.prefix()), names });
+        let files = old.into_iter().map(DataFile::logged).collect();
+        self.file.replaces = Some(ReplacedFiles { prefix: Some(run.prefix()), files });
         self
     }
 }
@@ -56,9 +65,8 @@ impl Lake {
     /// # Errors
     /// What the store says.
     pub async fn ensure_tables(&self) -> Result<()> {
-        for table in Table::ALL {
-            self.log().ensure(table).await?;
-        }
+        self.ensure_exclusive().await?;
+        try_join_all(Table::ALL.into_iter().map(|table| self.log().ensure(table))).await?;
         let grid = self.grid();
         let derivation = || FileName::Rig { derivation: format!("v{LAKE_FORMAT}") };
         for table in Table::ALL.into_iter().filter(|t| t.source() == Source::Rig) {
@@ -109,7 +117,8 @@ impl Lake {
         let path = folder(table).join(name.as_str());
         let (bytes, stats) = (file.bytes.len() as u64, file.stats);
         self.store().put(&path, file.bytes.into()).await.map_err(|e| Error::store("write", &path, e))?;
-        Ok(StagedFile { table, file: NewFile { name, bytes, stats, replaces: None, parts: Vec::new() } })
+        let file = NewFile { name, bytes, stats, replaces: None, parts: Vec::new(), seen_runs: 0, run_version: 0 };
+        Ok(StagedFile { table, file })
     }
 
     /// Returns whether a file of this name is in the table.
@@ -186,7 +195,7 @@ impl Lake {
         let snapshot = self.snapshot().await?;
         let mut count = 0;
         for table in Table::ALL {
-            let remove: Vec<_> = snapshot.superseded(table).iter().map(|f| f.path.clone()).collect();
+            let remove: Vec<_> = snapshot.superseded(table).iter().map(DataFile::logged).collect();
             if !remove.is_empty() {
                 count += remove.len();
                 self.log().commit(table, &TableCommit { remove, ..TableCommit::default() }).await?;

@@ -149,8 +149,8 @@ impl Lake {
         }
         let parts: Vec<_> = slices.into_iter().map(|s| s.part).collect();
         let mut staged = self.stage(table, &name(&parts), encoder.finish()?).await?;
-        let names = files.iter().filter_map(|f| f.path.filename()).map(str::to_owned).collect();
-        staged.file.replaces = Some(ReplacedFiles { prefix: None, names });
+        let replaced = files.iter().map(DataFile::logged).collect();
+        staged.file.replaces = Some(ReplacedFiles { prefix: None, files: replaced });
         staged.file.parts = parts;
         if let Some(lease) = lease {
             lease.keep().await?;

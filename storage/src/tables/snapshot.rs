@@ -5,13 +5,13 @@
 
 use std::collections::{BTreeMap, HashMap, HashSet};
 
-use chrono::{DateTime, Utc};
 use echolake_schema::tables::{Source, Table};
 use echolake_schema::{RunId, SurfaceId};
+use futures::future::try_join_all;
 use object_store::path::Path;
 use serde_json::{Value, json};
 
-use crate::{CommitLog, DataFile, Result, RunPart};
+use crate::{CommitLog, DataFile, Error, Result, RunPart};
 
 /// Parsed name of a file in `tables/`.
 ///
@@ -78,11 +78,11 @@ pub struct LakeSnapshot {
     versions: HashMap<Table, u64>,
 }
 
-/// A run's row in `runs`, and when it was committed.
+/// A run's row in `runs`, and the version of `runs` that added it.
 #[derive(Debug, Clone)]
 struct CurrentRun {
     run: VisibleRun,
-    since: DateTime<Utc>,
+    log_version: u64,
 }
 
 const EXTENSION: &str = ".parquet";
@@ -128,17 +128,16 @@ impl FileName {
 impl LakeSnapshot {
     /// Takes a view. `runs` is read first, so that whatever it names was committed before.
     pub(crate) async fn take(log: &dyn CommitLog) -> Result<Self> {
-        // Versions are read before files, so that a commit between the two is taken for one that is yet to be seen.
-        let mut versions = HashMap::new();
-        versions.extend(log.version(Table::Runs).await?.map(|v| (Table::Runs, v)));
-        let pointers = log.files(Table::Runs).await?;
-        let mut snapshot = Self { runs: current_runs(&pointers), ..Self::default() };
-        for table in Table::ALL.into_iter().filter(|t| *t != Table::Runs) {
-            versions.extend(log.version(table).await?.map(|v| (table, v)));
-            snapshot.sort_in(table, log.files(table).await?);
+        let pointers = log.view(Table::Runs).await?;
+        let runs = pointers.as_ref().map(|view| current_runs(&view.files)).unwrap_or_default();
+        let mut snapshot = Self { runs, ..Self::default() };
+        let others = Table::ALL.into_iter().filter(|t| *t != Table::Runs);
+        let views = others.map(|table| async move { Ok::<_, Error>((table, log.view(table).await?)) });
+        let views = try_join_all(views).await?;
+        for (table, view) in views.into_iter().chain([(Table::Runs, pointers)]) {
+            snapshot.versions.extend(view.as_ref().map(|view| (table, view.version)));
+            snapshot.sort_in(table, view.unwrap_or_default().files);
         }
-        snapshot.sort_in(Table::Runs, pointers);
-        snapshot.versions = versions;
         Ok(snapshot)
     }
 
@@ -149,8 +148,8 @@ impl LakeSnapshot {
         snapshot
     }
 
-    /// The version of a table's log that the view was taken of, or a little before it; that of `runs` is the lake's.
-    /// None if there was no table, and for views of the past.
+    /// The version of a table's log that the view was taken of; that of `runs` is the lake's. None if there was no
+    /// table, and for views of the past.
     pub fn version(&self, table: Table) -> Option<u64> {
         self.versions.get(&table).copied()
     }
@@ -161,7 +160,7 @@ impl LakeSnapshot {
     }
 
     /// The files of a table that belong to a run that readers see, but are no longer seen themselves. Excludes files
-    /// newer than the run's row: a concurrent ingest may be about to commit them.
+    /// whose author had seen the run's present row: that ingest may be about to replace it by one that names them.
     pub fn superseded(&self, table: Table) -> &[DataFile] {
         self.hidden.get(&table).map_or(&[], Vec::as_slice)
     }
@@ -193,23 +192,25 @@ impl LakeSnapshot {
     fn sort_in(&mut self, table: Table, files: Vec<DataFile>) {
         let (merged, single): (Vec<_>, Vec<_>) = files.into_iter().partition(|f| !f.parts.is_empty());
         let mut sorted = SortedFiles::default();
-        merged.into_iter().for_each(|file| self.sort_merged(table, file, &mut sorted));
         for file in single {
             match self.sees(table, &file) {
-                // An ingest that did not know of the merge has added the same rows once more.
-                Some(true) if run_of(&file).is_some_and(|run| sorted.shown.contains(&run)) => sorted.hidden.push(file),
-                Some(true) => sorted.seen.push(file),
-                Some(false) if self.is_older_than_its_run(&file) => sorted.hidden.push(file),
+                Some(true) => {
+                    sorted.shown.extend(run_of(&file));
+                    sorted.seen.push(file);
+                }
+                Some(false) if self.is_superseded(&file) => sorted.hidden.push(file),
                 Some(false) | None => {}
             }
         }
+        merged.into_iter().for_each(|file| self.sort_merged(table, file, &mut sorted));
         sorted.seen.sort_by(|a, b| a.path.cmp(&b.path));
         self.files.insert(table, sorted.seen);
         self.hidden.insert(table, sorted.hidden);
         self.outgrown.insert(table, sorted.outgrown);
     }
 
-    // What is merged was seen before; what is no longer seen of it is superseded, whatever its age.
+    // What is merged was seen before; what is no longer seen of it is superseded. An ingest that did not know of the
+    // merge may have added the same rows again: its file is the one that counts, because it tells what its author saw.
     fn sort_merged(&self, table: Table, mut file: DataFile, sorted: &mut SortedFiles) {
         let mut superseded = 0;
         for part in &file.parts {
@@ -248,9 +249,18 @@ impl LakeSnapshot {
         Some(names && (!table.key().contains(&"surface_id") || self.latest(surface) == Some(run)))
     }
 
-    fn is_older_than_its_run(&self, file: &DataFile) -> bool {
-        let current = run_of(file).and_then(|run| self.runs.get(&run));
-        current.is_some_and(|current| file.modified <= current.since)
+    // An author that had not seen the run's present row cannot replace it, so that no row will ever name its file as
+    // the log has it now. No clock is asked.
+    fn is_superseded(&self, file: &DataFile) -> bool {
+        run_of(file).and_then(|run| self.runs.get(&run)).is_some_and(|current| file.seen_runs < current.log_version)
+    }
+
+    /// The version of `runs` that added the row of a file's run; 0 if the name is no run's rows, or the run is not seen.
+    pub(crate) fn run_version(&self, name: &str) -> u64 {
+        match FileName::parse(&Path::from(name)) {
+            Some(FileName::Rows { run, .. }) => self.runs.get(&run).map_or(0, |current| current.log_version),
+            _ => 0,
+        }
     }
 
     fn latest(&self, surface: &SurfaceId) -> Option<&RunId> {
@@ -264,7 +274,7 @@ struct SortedFiles {
     seen: Vec<DataFile>,
     hidden: Vec<DataFile>,
     outgrown: Vec<DataFile>,
-    /// The runs that merged files show.
+    /// The runs that a file shows already.
     shown: HashSet<RunId>,
 }
 
@@ -305,12 +315,12 @@ impl RunPart {
     }
 }
 
-// A crash between a run's new row and the removal of its old one leaves two; the newer one counts.
+// A row replaces its predecessor in the same commit; should two be there, the newer one counts.
 fn current_runs(pointers: &[DataFile]) -> BTreeMap<RunId, CurrentRun> {
     let mut by_age: Vec<_> = pointers.iter().collect();
-    by_age.sort_by_key(|f| (f.modified, f.path.clone()));
+    by_age.sort_by_key(|f| (f.log_version, f.path.clone()));
     let parsed = by_age.into_iter().filter_map(|f| match FileName::parse(&f.path) {
-        Some(FileName::Pointer(run)) => Some((run.run.clone(), CurrentRun { run, since: f.modified })),
+        Some(FileName::Pointer(run)) => Some((run.run.clone(), CurrentRun { run, log_version: f.log_version })),
         _ => None,
     });
     parsed.collect()
@@ -318,17 +328,17 @@ fn current_runs(pointers: &[DataFile]) -> BTreeMap<RunId, CurrentRun> {
 
 #[cfg(test)]
 mod tests {
-    use chrono::DateTime;
-
     use super::*;
 
-    fn file(table: Table, name: &str, modified: i64) -> DataFile {
+    /// A file whose number is the version of `runs` that its author had seen; of a run's row, that added it.
+    fn file(table: Table, name: &str, version: u64) -> DataFile {
         let path = crate::tables::delta::folder(table).join(name);
-        let modified = DateTime::from_timestamp(modified, 0).expect("a time");
-        DataFile { path, bytes: 1, rows: 1, modified, stats: None, parts: Vec::new(), hidden: Vec::new() }
+        let log_version = if table == Table::Runs { version } else { 0 };
+        let seen_runs = version - log_version.min(1);
+        DataFile { path, bytes: 1, rows: 1, log_version, seen_runs, stats: None, parts: Vec::new(), hidden: Vec::new() }
     }
 
-    fn view(files: &[(Table, &str, i64)]) -> LakeSnapshot {
+    fn view(files: &[(Table, &str, u64)]) -> LakeSnapshot {
         let of = |table| files.iter().filter(|f| f.0 == table).map(|f| file(f.0, f.1, f.2)).collect::<Vec<_>>();
         let mut snapshot = LakeSnapshot { runs: current_runs(&of(Table::Runs)), ..LakeSnapshot::default() };
         Table::ALL.into_iter().for_each(|table| snapshot.sort_in(table, of(table)));
@@ -365,7 +375,7 @@ mod tests {
             (Table::Measurements, "flat.r1.ab.parquet", 1),
             (Table::Nce, "flat.r1.cd.parquet", 1),
             (Table::Nce, "flat.r1.old.parquet", 0),
-            (Table::Nce, "flat.r1.ef.parquet", 3),
+            (Table::Nce, "flat.r1.ef.parquet", 2),
             (Table::Runs, "flat.r1.ab.cd.parquet", 2),
         ]);
         assert_eq!(names(after.files(Table::Measurements)), ["flat.r1.ab.parquet"]);
@@ -378,7 +388,7 @@ mod tests {
         let both = view(&[
             (Table::Runs, "flat.r1.ab.none.parquet", 1),
             (Table::Runs, "flat.r1.ab.cd.parquet", 2),
-            (Table::Tnce, "flat.r1.cd.parquet", 2),
+            (Table::Tnce, "flat.r1.cd.parquet", 1),
         ]);
         assert_eq!(names(both.files(Table::Runs)), ["flat.r1.ab.cd.parquet"]);
         assert_eq!(names(both.superseded(Table::Runs)), ["flat.r1.ab.none.parquet"]);
@@ -399,11 +409,11 @@ mod tests {
         assert_eq!(twice.files(Table::Measurements).len(), 2);
     }
 
-    fn merged(table: Table, modified: i64, parts: &[(&str, u64)]) -> DataFile {
+    fn merged(table: Table, parts: &[(&str, u64)]) -> DataFile {
         let text = serde_json::to_string(parts).expect("text");
         let parts = decode_parts(&text).expect("parts");
         assert_eq!(encode_parts(&parts), text);
-        DataFile { rows: parts.iter().map(|p| p.rows).sum(), parts, ..file(table, "merged.aa.parquet", modified) }
+        DataFile { rows: parts.iter().map(|p| p.rows).sum(), parts, ..file(table, "merged.aa.parquet", 0) }
     }
 
     #[test]
@@ -416,25 +426,26 @@ mod tests {
             };
             let files = vec![
                 file(Table::Nce, "flat.r1.cd.parquet", 9),
-                merged(Table::Nce, 9, &[("flat.r1.cd.parquet", 4), ("wood.r2.ef.parquet", 3)]),
+                merged(Table::Nce, &[("flat.r1.cd.parquet", 4), ("wood.r2.ef.parquet", 3)]),
                 file(Table::Nce, "wood.r2.gh.parquet", 9),
             ];
             snapshot.sort_in(Table::Nce, files);
             snapshot
         };
-        let (r1, r2) = ("r1".parse().expect("a run"), "r2".parse().expect("a run"));
+        let run = |name: &str| name.parse::<RunId>().expect("a run");
+        let (r1, r2) = (run("r1"), run("r2"));
         let both = runs("ef");
-        assert_eq!(names(both.files(Table::Nce)), ["merged.aa.parquet"]);
-        assert_eq!(both.files(Table::Nce)[0].visible_rows(), 7);
-        assert_eq!(names(both.superseded(Table::Nce)), ["flat.r1.cd.parquet"], "the same rows once more");
-        assert!(both.outgrown(Table::Nce).is_empty());
+        assert_eq!(names(both.files(Table::Nce)), ["flat.r1.cd.parquet", "merged.aa.parquet"]);
+        let partly = &both.files(Table::Nce)[1];
+        assert_eq!((partly.visible_rows(), &partly.hidden), (3, &vec![r1]), "the same rows once more");
+        let visible: Vec<_> = partly.visible_parts().map(|(part, rows)| (part.run.clone(), rows)).collect();
+        assert_eq!(visible, [(r2.clone(), 4..7)]);
+        assert!(both.superseded(Table::Nce).is_empty());
+        assert_eq!(names(both.outgrown(Table::Nce)), ["merged.aa.parquet"]);
         assert_eq!(both.files_of(Table::Nce, &r2).count(), 1);
 
         let replaced = runs("gh");
-        assert_eq!(names(replaced.files(Table::Nce)), ["merged.aa.parquet", "wood.r2.gh.parquet"]);
-        let partly = &replaced.files(Table::Nce)[0];
-        assert_eq!((partly.visible_rows(), &partly.hidden), (4, &vec![r2]));
-        assert_eq!(partly.visible_parts().map(|(p, rows)| (p.run.clone(), rows)).collect::<Vec<_>>(), [(r1, 0..4)]);
-        assert_eq!(names(replaced.outgrown(Table::Nce)), ["merged.aa.parquet"]);
+        assert_eq!(names(replaced.files(Table::Nce)), ["flat.r1.cd.parquet", "wood.r2.gh.parquet"]);
+        assert_eq!(names(replaced.superseded(Table::Nce)), ["merged.aa.parquet"]);
     }
 }

@@ -5,9 +5,9 @@ use std::time::SystemTime;
 
 use chrono::{DateTime, TimeDelta, Utc};
 use echolake_schema::tables::Table;
-use futures::TryStreamExt as _;
+use futures::{StreamExt as _, TryStreamExt as _};
+use object_store::ObjectStore as _;
 use object_store::path::Path;
-use object_store::{ObjectStore as _, ObjectStoreExt as _};
 use serde::Serialize;
 
 use crate::tables::delta::folder;
@@ -19,6 +19,8 @@ use crate::{Error, FileHistory, Lake, Result};
 pub const KEEP_HOURS: u32 = 168;
 /// Least age for deleting a file that no log ever named: an ingest writes files first and commits them within minutes.
 const BEFORE_COMMIT: TimeDelta = TimeDelta::hours(1);
+/// Files that one request deletes on an object store.
+const DELETED_AT_ONCE: usize = 500;
 /// Folder of recordings that are copied in.
 const INBOX: &str = "inbox";
 
@@ -88,19 +90,28 @@ impl Lake {
         lease: &mut MaintenanceLease,
     ) -> Result<VacuumReport> {
         let report = self.left_over(keep).await?;
-        for (done, file) in report.files.iter().enumerate() {
+        let mut done = 0;
+        for files in report.files.chunks(if self.is_remote() { DELETED_AT_ONCE } else { 1 }) {
             lease.keep().await?;
-            match &file.place {
-                FileAccess::Store(path) => match self.store().delete(path).await {
+            let mut stored = Vec::new();
+            for file in files {
+                match &file.place {
+                    FileAccess::Store(path) => stored.push(Ok(path.clone())),
+                    // Its writer may have taken it away.
+                    FileAccess::Local(path) => drop(std::fs::remove_file(path)),
+                }
+            }
+            let mut gone = self.store().delete_stream(futures::stream::iter(stored).boxed());
+            while let Some(one) = gone.next().await {
+                match one {
                     Err(e) if !matches!(e, object_store::Error::NotFound { .. }) => {
-                        return Err(Error::store("delete", path, e));
+                        return Err(Error::store("delete", "tables", e));
                     }
                     _ => {}
-                },
-                // Its writer may have taken it away.
-                FileAccess::Local(path) => drop(std::fs::remove_file(path)),
+                }
             }
-            deleted(done + 1, report.files.len());
+            done += files.len();
+            deleted(done, report.files.len());
         }
         Ok(report)
     }

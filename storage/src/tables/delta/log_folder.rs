@@ -23,7 +23,7 @@ const READER_VERSION: i32 = 1;
 /// The newest version of the protocol that this writes.
 const WRITER_VERSION: i32 = 2;
 /// Versions from one checkpoint to the next.
-const CHECKPOINT_INTERVAL: u64 = 100;
+const CHECKPOINT_INTERVAL: u64 = 20;
 /// Time for which versions before a checkpoint are kept: Delta's default, 30 days.
 const LOG_RETENTION: TimeDelta = TimeDelta::days(30);
 /// Commits that are read at once.
@@ -96,14 +96,18 @@ impl<'a> LogFolder<'a> {
     }
 
     /// Brings a state up to the newest version. Returns None if the log was cleaned up beyond it, so that it must be
-    /// loaded again.
-    pub(super) async fn advance(&self, mut state: Arc<TableState>) -> Result<Option<Arc<TableState>>> {
+    /// loaded again; that costs a request, and is looked at only on demand.
+    pub(super) async fn advance(
+        &self,
+        mut state: Arc<TableState>,
+        is_in_doubt: bool,
+    ) -> Result<Option<Arc<TableState>>> {
         let from = state.version;
         while let Some(lines) = self.read_commit(state.version + 1).await? {
             let next = state.version + 1;
             Arc::make_mut(&mut state).apply(next, lines);
         }
-        if state.version == from && !self.has_version(from).await? {
+        if is_in_doubt && state.version == from && !self.has_version(from).await? {
             return Ok(None);
         }
         self.check_readable(&state)?;
@@ -360,13 +364,13 @@ mod tests {
         let log = LogFolder::new(Table::Nce, &store);
         assert_eq!(log.write_commit(2, &[add("late")]).await.expect("tried"), CommitAttempt::Taken);
         log.write_commit(3, &[add("new")]).await.expect("written");
-        let advanced = log.advance(state.clone()).await.expect("read").expect("followed");
+        let advanced = log.advance(state.clone(), true).await.expect("read").expect("followed");
         assert_eq!((advanced.version, advanced.files.len()), (3, 4));
         // A log that was cleaned up beyond what is known has neither that version nor the next.
         for version in 0..4 {
             store.delete(&path(&commit_name(version))).await.expect("deleted");
         }
-        assert!(log.advance(state).await.expect("read").is_none());
+        assert!(log.advance(state, true).await.expect("read").is_none());
     }
 
     #[tokio::test]

@@ -217,7 +217,7 @@ async fn of_two_merges_at_once_one_is_made() {
     }
 }
 
-// Delta's log is condensed every hundred commits.
+// Delta's log is condensed every twenty commits.
 #[tokio::test]
 async fn parts_outlive_a_checkpoint() {
     let (store, first) = five().await;

@@ -1,0 +1,41 @@
+//! Lakes on object stores: S3 and what speaks its protocol, Google Cloud Storage, Azure Blob Storage.
+//!
+//! A bucket and a prefix name the lake; all other settings are the environment's, by the names that each store's own
+//! tools use.
+
+mod exclusion;
+mod retrying;
+mod settings;
+#[cfg(test)]
+mod tests;
+
+use std::sync::Arc;
+
+use echolake_schema::ErrorCause;
+use object_store::ObjectStore;
+use object_store::path::Path as ObjectPath;
+use object_store::prefix::PrefixStore;
+use url::Url;
+
+pub(crate) use exclusion::{ExclusionFault, probe_exclusion};
+pub(crate) use retrying::{RetriedError, RetryingStore, backoff};
+
+/// Opens the store of a URL such as `s3://bucket/prefix`, from its prefix on. Nothing is requested yet.
+///
+/// # Errors
+/// An unknown scheme, a URL with more than bucket and prefix, or settings that do not go together.
+pub(crate) fn open_store(url: &Url) -> Result<Arc<dyn ObjectStore>, ErrorCause> {
+    let bucket = url.host_str().filter(|bucket| !bucket.is_empty()).ok_or("it names no bucket")?;
+    if !url.username().is_empty() || url.password().is_some() {
+        return Err("credentials are read from the environment, never from a URL".into());
+    }
+    if url.port().is_some() || url.query().is_some() || url.fragment().is_some() {
+        return Err("expected a bucket and a prefix, and nothing else".into());
+    }
+    let prefix = ObjectPath::from_url_path(url.path())?;
+    let store = settings::store(url.scheme(), bucket)?;
+    let store: Arc<dyn ObjectStore> = Arc::new(RetryingStore::new(store));
+    Ok(if prefix.as_ref().is_empty() { store } else { Arc::new(PrefixStore::new(store, prefix)) })
+}
+
+pub use settings::{RemoteAccess, remote_access};

@@ -1,0 +1,258 @@
+//! Stores whose answers are lost, cut off or refused, and stores that overwrite.
+
+use std::fmt;
+use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
+use std::sync::{Arc, Mutex};
+
+use async_trait::async_trait;
+use echolake_schema::Rig;
+use echolake_schema::tables::Table;
+use futures::stream::{self, BoxStream};
+use futures::{StreamExt as _, TryStreamExt as _};
+use object_store::memory::InMemory;
+use object_store::path::Path;
+use object_store::{
+    CopyOptions, Error as StoreError, GetOptions, GetResult, ListResult, MultipartUpload, ObjectMeta, ObjectStore,
+    ObjectStoreExt as _, PutMode, PutMultipartOptions, PutOptions, PutPayload, PutResult, Result as StoreResult,
+};
+
+use super::{ExclusionFault, RetryingStore, probe_exclusion};
+use crate::{CommitOutcome, Error, FileName, Lake, ReferenceSurfaces, encode};
+
+/// Faults of a store.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum StoreFault {
+    /// Creating overwrites.
+    Overwrites,
+    /// Creating an object that exists is refused, unless both meet.
+    OverwritesInRaces,
+    /// Of ten commits two are made and not answered, one is lost, and one is said to conflict with nothing; of ten
+    /// listings two are cut off; of twenty reads one fails.
+    Unreliable,
+    None,
+}
+
+/// A store in memory with faults. Chance follows from a seed.
+#[derive(Debug)]
+struct FaultyStore {
+    inner: InMemory,
+    fault: StoreFault,
+    random: AtomicU64,
+    faults: AtomicUsize,
+    /// Requests, with their paths.
+    requests: Mutex<Vec<String>>,
+}
+
+impl FaultyStore {
+    fn new(fault: StoreFault, seed: u64) -> Arc<Self> {
+        let (random, faults) = (AtomicU64::new(seed), AtomicUsize::new(0));
+        Arc::new(Self { inner: InMemory::new(), fault, random, faults, requests: Mutex::default() })
+    }
+
+    fn count(&self, kind: &str, location: Option<&Path>) {
+        let location = location.map(|path| path.as_ref()).unwrap_or_default();
+        self.requests.lock().expect("no panic").push(format!("{kind} {location}"));
+    }
+
+    /// The requests since the last call.
+    fn take_requests(&self) -> Vec<String> {
+        std::mem::take(&mut *self.requests.lock().expect("no panic"))
+    }
+
+    // SplitMix64: Steele, Lea, Flood 2014, Fast splittable pseudorandom number generators.
+    fn draw(&self, of: u64) -> u64 {
+        let mut z = self.random.fetch_add(0x9e37_79b9_7f4a_7c15, Ordering::SeqCst).wrapping_add(0x9e37_79b9_7f4a_7c15);
+        z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
+        z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
+        (z ^ (z >> 31)) % of
+    }
+
+    fn lost(&self) -> StoreError {
+        self.faults.fetch_add(1, Ordering::SeqCst);
+        StoreError::Generic { store: "faulty", source: "connection reset by peer".into() }
+    }
+}
+
+impl fmt::Display for FaultyStore {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str("FaultyStore")
+    }
+}
+
+#[async_trait]
+impl ObjectStore for FaultyStore {
+    async fn put_opts(&self, location: &Path, payload: PutPayload, mut opts: PutOptions) -> StoreResult<PutResult> {
+        self.count("PUT", Some(location));
+        if opts.mode == PutMode::Create {
+            match (self.fault, self.draw(10)) {
+                (StoreFault::Overwrites, _) => opts.mode = PutMode::Overwrite,
+                (StoreFault::OverwritesInRaces, _) if location.as_ref().ends_with(".race") => {
+                    opts.mode = PutMode::Overwrite;
+                }
+                (StoreFault::Unreliable, 0 | 1) => {
+                    self.inner.put_opts(location, payload, opts).await?;
+                    return Err(self.lost());
+                }
+                (StoreFault::Unreliable, 2) => return Err(self.lost()),
+                (StoreFault::Unreliable, 3) => {
+                    let source = "409 Conflict".into();
+                    return Err(StoreError::AlreadyExists { path: location.to_string(), source });
+                }
+                _ => {}
+            }
+        }
+        self.inner.put_opts(location, payload, opts).await
+    }
+
+    async fn put_multipart_opts(
+        &self,
+        location: &Path,
+        opts: PutMultipartOptions,
+    ) -> StoreResult<Box<dyn MultipartUpload>> {
+        self.inner.put_multipart_opts(location, opts).await
+    }
+
+    async fn get_opts(&self, location: &Path, options: GetOptions) -> StoreResult<GetResult> {
+        self.count("GET", Some(location));
+        if self.fault == StoreFault::Unreliable && self.draw(20) == 0 {
+            return Err(self.lost());
+        }
+        self.inner.get_opts(location, options).await
+    }
+
+    fn delete_stream(&self, locations: BoxStream<'static, StoreResult<Path>>) -> BoxStream<'static, StoreResult<Path>> {
+        self.inner.delete_stream(locations)
+    }
+
+    fn list(&self, prefix: Option<&Path>) -> BoxStream<'static, StoreResult<ObjectMeta>> {
+        self.count("LIST", prefix);
+        if self.fault == StoreFault::Unreliable && self.draw(5) == 0 {
+            return self.inner.list(prefix).take(1).chain(stream::iter([Err(self.lost())])).boxed();
+        }
+        self.inner.list(prefix)
+    }
+
+    async fn list_with_delimiter(&self, prefix: Option<&Path>) -> StoreResult<ListResult> {
+        self.count("LIST", prefix);
+        if self.fault == StoreFault::Unreliable && self.draw(5) == 0 {
+            return Err(self.lost());
+        }
+        self.inner.list_with_delimiter(prefix).await
+    }
+
+    async fn copy_opts(&self, from: &Path, to: &Path, options: CopyOptions) -> StoreResult<()> {
+        self.inner.copy_opts(from, to, options).await
+    }
+}
+
+async fn lake(store: Arc<FaultyStore>) -> crate::Result<Lake> {
+    let store = Arc::new(RetryingStore::new(store));
+    Lake::open_or_create_remote(store, "s3://bucket/lake", &Rig::paper(), &ReferenceSurfaces::default()).await
+}
+
+#[tokio::test]
+async fn a_store_that_overwrites_is_refused_before_anything_is_written() {
+    let good: Arc<dyn ObjectStore> = Arc::new(InMemory::new());
+    probe_exclusion(&good).await.expect("it excludes");
+    let left: Vec<_> = good.list(None).try_collect().await.expect("listed");
+    assert!(left.is_empty(), "{left:?}");
+    for (fault, expected) in [
+        (StoreFault::Overwrites, "an object that was there was created again"),
+        (StoreFault::OverwritesInRaces, "8 of 8 that created the same object at once succeeded"),
+    ] {
+        let store = FaultyStore::new(fault, 1);
+        let probed = probe_exclusion(&(store.clone() as Arc<dyn ObjectStore>)).await;
+        assert!(matches!(&probed, Err(ExclusionFault::Overwrites(_))), "{probed:?}");
+        let error = lake(store.clone()).await.expect_err("refused");
+        assert!(matches!(error, Error::NotExclusive { .. }), "{error}");
+        assert!(error.to_string().contains("s3://bucket/lake") && error.to_string().contains(expected), "{error}");
+        let left: Vec<_> = store.list(None).try_collect().await.expect("listed");
+        assert!(left.is_empty(), "{left:?}");
+    }
+}
+
+// Four processes' worth of writers. Every call succeeds, says that the rows are new, and they are there once.
+#[tokio::test(flavor = "multi_thread")]
+async fn commits_whose_answers_are_lost_are_made_once_and_known_to_be_made() {
+    for seed in 1..=3 {
+        let store = FaultyStore::new(StoreFault::Unreliable, seed);
+        let rows = lake(store.clone()).await.expect("made").pairs().expect("rows");
+        let write = |writer: usize| {
+            let (store, rows) = (store.clone(), rows.clone());
+            tokio::spawn(async move {
+                let lake = lake(store).await.expect("opened");
+                for number in 0..6 {
+                    let name = FileName::Rig { derivation: format!("{writer}x{number}") };
+                    let outcome = lake.append_rows(Table::Pairs, &name, std::slice::from_ref(&rows)).await;
+                    assert_eq!(outcome.expect("committed"), CommitOutcome::Now, "seed {seed}, {writer}x{number}");
+                }
+            })
+        };
+        for writer in [0, 1, 2, 3].map(write) {
+            writer.await.expect("no panic");
+        }
+        let files = lake(store.clone()).await.expect("opened").log().files(Table::Pairs).await.expect("files");
+        assert_eq!(files.len(), 25, "seed {seed}: the rig's own and 24");
+        assert!(store.faults.load(Ordering::SeqCst) > 20, "seed {seed}");
+    }
+}
+
+#[tokio::test]
+async fn what_is_cut_off_is_fetched_again_and_what_never_comes_says_how_often_it_was_tried() {
+    let faulty = FaultyStore::new(StoreFault::Unreliable, 5);
+    let store = RetryingStore::new(faulty.clone());
+    let paths: Vec<_> = (0..10).map(|number| Path::from(format!("{number}"))).collect();
+    for path in &paths {
+        store.put(path, "x".into()).await.expect("written");
+    }
+    for _ in 0..20 {
+        let listed: Vec<_> = store.list(None).try_collect().await.expect("listed");
+        assert_eq!(listed.len(), paths.len());
+    }
+    store
+        .delete_stream(stream::iter(paths.into_iter().map(Ok)).boxed())
+        .try_collect::<Vec<_>>()
+        .await
+        .expect("deleted");
+    assert!(faulty.faults.load(Ordering::SeqCst) > 0);
+    let gone = Error::store(
+        "read",
+        "x",
+        StoreError::Generic {
+            store: "remote",
+            source: Box::new(super::RetriedError { tries: 8, source: faulty.lost() }),
+        },
+    );
+    assert_eq!(gone.to_string(), "cannot read `x`: connection reset by peer (tried 8 times)");
+}
+
+#[tokio::test]
+async fn a_view_costs_a_request_a_table_and_a_commit_of_many_runs_a_few() {
+    let store = FaultyStore::new(StoreFault::None, 1);
+    let lake = lake(store.clone()).await.expect("made");
+    lake.snapshot().await.expect("a view");
+    store.take_requests();
+    let before = lake.snapshot().await.expect("a view");
+    let requests = store.take_requests();
+    assert!(requests.len() <= 14, "{requests:?}");
+
+    let tables = [Table::Nce, Table::Tnce, Table::Runs];
+    let mut staged = Vec::new();
+    for number in 0..16 {
+        for table in tables {
+            let (surface, run) = ("flat".parse().expect("an id"), format!("r{number}").parse().expect("an id"));
+            let name = FileName::Rows { surface, run, derivation: "ab".into() };
+            let file = encode(table, &table.schema(lake.rig()), &[]).expect("encoded");
+            staged.push(lake.stage(table, &name, file).await.expect("staged").made_from(&before));
+        }
+    }
+    store.take_requests();
+    lake.commit(&staged).await.expect("committed");
+    let requests = store.take_requests();
+    for table in tables {
+        let of_table = requests.iter().filter(|r| r.contains(&format!("tables/{}/", table.name()))).count();
+        assert!((1..=6).contains(&of_table), "{table:?}: {requests:?}");
+    }
+    lake.commit(&staged).await.expect("there before");
+    assert_eq!(store.take_requests().len(), tables.len(), "a look at each");
+}
