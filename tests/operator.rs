@@ -71,7 +71,10 @@ fn a_recovered_run_is_taken_in_as_partial() {
     place.ok(&["recover", partial.to_str().expect("a name")]);
     place.fails(0, &["ingest"], "was stopped before its end; all that it holds is in the tables");
     assert_eq!(place.number("select count(*) from runs where state = 'partial'"), 1.0);
-    assert!(partial.exists(), "it can still be resumed");
+    // Resumed, it would be another file of the same run.
+    let name = partial.to_str().expect("a name");
+    place.fails(1, &["acquire", "--resume", name], "its run is in the lake");
+    assert!(partial.exists());
 }
 
 const ROOM: &str = "name = \"room\"\nbands.centres_hz = [1000]\ngrid.points_mm = [[0, 0, 1000], [500, 0, 1000]]\n\

@@ -135,7 +135,11 @@ async fn measure(args: &AcquireArgs, lake_url: &str) -> anyhow::Result<CommandOu
     watch::obey(&control)?;
     let progress = CommandProgress::new();
     let job = match &args.resume {
-        Some(partial) => AcquireJob::Resumed { partial: partial.clone(), held: Box::new(Held::read(partial)?) },
+        Some(partial) => {
+            let held = Box::new(Held::read(partial)?);
+            check_not_ingested(partial, &held)?;
+            AcquireJob::Resumed { partial: partial.clone(), held }
+        }
         None => fresh(args, lake_url, &progress).await?,
     };
     let clock = if job.rig().devices.are_simulated() { LiveClock::Simulated } else { LiveClock::Wall };
@@ -209,6 +213,23 @@ async fn remove_new_lake(lake_url: &str, has_folder: bool) -> anyhow::Result<()>
         && let Some(folder) = folder.filter(|_| !has_folder)
     {
         std::fs::remove_dir(folder)?;
+    }
+    Ok(())
+}
+
+// A run that was recovered from the recording and ingested stays as it is: a resumed one of its name would be refused.
+fn check_not_ingested(partial: &Path, held: &Held) -> anyhow::Result<()> {
+    let manifest = &held.manifest;
+    let runs = partial.canonicalize()?.parent().and_then(Path::parent).map(|lake| lake.join("runs"));
+    let run = runs.map(|runs| runs.join(manifest.surface_id.as_str()).join(format!("{}.mcap", manifest.run_id)));
+    if let Some(run) = run.filter(|run| run.exists()) {
+        anyhow::bail!(
+            "`{}` was recovered, and its run is in the lake: `{}`; hint: measure the surface anew by `echolake acquire --surface \
+             {}`, since a run never changes once it is in the lake",
+            partial.display(),
+            run.display(),
+            manifest.surface_id
+        );
     }
     Ok(())
 }
