@@ -26,6 +26,8 @@ pub(crate) struct TaskProgress {
     pace: Arc<Mutex<String>>,
     /// Units that were done before the start: they do not count in the rate.
     done_before: u64,
+    /// Time and number of the first units that were done since.
+    first: Option<(Instant, u64)>,
     begun: Instant,
     last_line: Instant,
     /// A remark below the bar or in the line.
@@ -46,7 +48,8 @@ impl CommandProgress {
             bars.add(ProgressBar::new(total).with_style(style).with_prefix(name.clone()))
         });
         let now = Instant::now();
-        TaskProgress { name, unit, total, bar, pace, done_before: 0, begun: now, last_line: now, note: String::new() }
+        let (note, first) = (String::new(), None);
+        TaskProgress { name, unit, total, bar, pace, done_before: 0, first, begun: now, last_line: now, note }
     }
 
     /// Prints a line among the bars.
@@ -68,7 +71,9 @@ impl TaskProgress {
     pub(crate) fn at(&mut self, done: u64) {
         match &self.bar {
             Some(bar) => {
-                *self.pace.lock().unwrap_or_else(PoisonError::into_inner) = self.describe_pace(done);
+                let bar = bar.clone();
+                let pace = self.describe_pace(done);
+                *self.pace.lock().unwrap_or_else(PoisonError::into_inner) = pace;
                 bar.set_position(done);
             }
             None if self.is_due() => {
@@ -81,9 +86,13 @@ impl TaskProgress {
         }
     }
 
-    fn describe_pace(&self, done: u64) -> String {
-        let left = self.total.saturating_sub(done);
-        describe_pace(done.saturating_sub(self.done_before), left, self.begun.elapsed(), Local::now())
+    // The rate counts from the first unit on: what comes before it is preparation.
+    fn describe_pace(&mut self, done: u64) -> String {
+        if done <= self.done_before {
+            return String::new();
+        }
+        let (since, before) = *self.first.get_or_insert((Instant::now(), done));
+        describe_pace(done - before, self.total.saturating_sub(done), since.elapsed(), Local::now())
     }
 
     /// Prints a line that stays.
@@ -272,7 +281,7 @@ mod tests {
         task.note("pair 2102 (microphone 41, speaker 29), SNR 66.0 dB, 1 repeated, 0 given up".to_owned());
         let shown = drawing(&task);
         assert!(shown[0].ends_with("413/2951 pairs"), "{shown:?}");
-        task.begun -= Duration::from_secs(100);
+        task.first = Some((Instant::now() - Duration::from_secs(100), 413));
         task.at(1413);
         let shown = drawing(&task);
         assert_eq!(shown.len(), 2, "{shown:?}");
