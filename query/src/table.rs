@@ -2,6 +2,7 @@
 
 use std::collections::BTreeSet;
 use std::sync::Arc;
+use std::time::SystemTime;
 
 use arrow::datatypes::{DataType, SchemaRef};
 use arrow::record_batch::RecordBatch;
@@ -192,7 +193,8 @@ impl ScanFile {
     fn new(file: DataFile, schema: &SchemaRef) -> Self {
         let meta = ObjectMeta {
             location: file.path.clone(),
-            last_modified: file.modified,
+            // A name stands for its content, so that what is cached of a file stays valid.
+            last_modified: SystemTime::UNIX_EPOCH.into(),
             size: file.bytes,
             e_tag: None,
             version: None,
