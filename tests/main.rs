@@ -15,6 +15,7 @@ mod kills;
 mod large_chunk;
 mod load;
 mod maintenance;
+mod object_stores;
 mod operator;
 mod prompt;
 mod real_data;

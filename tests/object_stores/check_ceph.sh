@@ -1,0 +1,72 @@
+#!/usr/bin/env bash
+# Lakes on Ceph's S3 gateway, through a proxy that loses, cuts off and refuses answers: check_ceph.sh ECHOLAKE [SEED]
+#
+# Two ingests at once, one clock five minutes ahead and the other five behind, take in the same runs, by copying them and
+# from the bucket's inbox; then files are merged and deleted. Afterwards all tables must hold what a lake in a folder
+# holds. Installs Ceph and faketime from Debian's packages. ECHOLAKE is the program; SEED (1) decides over the faults.
+set -euo pipefail
+echolake=$(realpath "${1:?the program}")
+seed=${2:-1}
+here=$(cd "$(dirname "$0")" && pwd)
+port=${CEPH_RGW_PORT:-7480}
+work=$(mktemp -d)
+proxy=
+finish() {
+    [ -z "$proxy" ] || kill "$proxy" 2>/dev/null || true
+    rm -rf "$work"
+}
+trap finish EXIT
+command -v faketime >/dev/null || apt-get install -y -qq --no-install-recommends faketime >&2
+"$here/ceph_rgw.sh" start >"$work/store.env"
+set -a
+# shellcheck disable=SC1091
+. "$work/store.env"
+set +a
+direct=$AWS_ENDPOINT_URL
+listen=$((port + 10))
+python3 "$here/s3_fault_proxy.py" --listen $listen --upstream "127.0.0.1:$port" --seed "$seed" \
+    --fault 'put,_delta_log,0.15,reply-lost' --fault 'put,_delta_log,0.10,done-500' --fault 'put,_delta_log,0.10,409' \
+    --fault 'get,prefix=,0.08,half-answer' --fault 'get,parquet,0.05,half-answer' --fault 'put,parquet,0.05,half-request' \
+    --fault 'get,,0.05,503' --fault '*,,0.02,reset' >"$work/proxy.log" &
+proxy=$!
+export AWS_ENDPOINT_URL=http://127.0.0.1:$listen
+
+cd "$work"
+cp "$here/../fixtures/small_rig.toml" rig.toml
+mkdir copies
+for surface in flat foam wood prd brick wavy; do
+    cp "$("$echolake" acquire --surface $surface --rig rig.toml --ir-only 2>/dev/null)" copies/
+done
+"$echolake" ingest 2>/dev/null
+runs=(copies/*.mcap)
+export ECHOLAKE_LAKE=s3://$S3_BUCKET/check-$seed-$$
+"$echolake" ingest "${runs[0]}"
+for run in "${runs[@]:3}"; do
+    curl -sf -T "$run" --aws-sigv4 aws:amz:us-east-1:s3 -H 'x-amz-content-sha256: UNSIGNED-PAYLOAD' \
+        --user "$AWS_ACCESS_KEY_ID:$AWS_SECRET_ACCESS_KEY" "$direct/${ECHOLAKE_LAKE#s3://}/inbox/$(basename "$run")"
+done
+faketime -f +5m "$echolake" ingest "${runs[@]:1}" &
+ahead=$!
+faketime -f -5m "$echolake" ingest &
+behind=$!
+wait $ahead
+wait $behind
+"$echolake" ingest
+tables() {
+    for table in runs surfaces measurements nce tnce tnce_d4 surface_stats environment events heightmaps points pairs; do
+        echo "$table"
+        "$echolake" --lake "$1" sql --format csv "select * from $table" 2>/dev/null | sort
+    done
+}
+tables lake >expected
+compare() {
+    tables "$ECHOLAKE_LAKE" >seen
+    cmp expected seen || { echo "FAILED: other rows $1; seed $seed" >&2; exit 1; }
+}
+compare "after ingest"
+"$echolake" optimize
+"$echolake" vacuum --keep-hours 1
+compare "after upkeep"
+curl -sf "http://127.0.0.1:$listen/__proxy/stats"
+echo
+echo "as in a folder: $(wc -l <expected) lines of all tables, seed $seed"
