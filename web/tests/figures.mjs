@@ -59,6 +59,37 @@ const PICTURES = `() => { const seen = [...document.querySelectorAll('.sheet li 
 // The cells of the grid plot and the curves are drawn.
 const SURFACE = `() => document.querySelectorAll('.cells [data-point]').length > 100 && document.querySelector('.uplot canvas')?.width > 10`
 
+// The curves over time and over frequency are drawn.
+const RESPONSE = `() => [...document.querySelectorAll('.uplot canvas')].filter((c) => c.width > 10).length >= 2`
+
+/** Steps to the next pair by its key, from the key to the frame that shows the other pair's facts. */
+async function nextPairs() {
+  const page = await fresh()
+  await page.goto(`${base}/surfaces/${id}/pairs/159`, { waitUntil: 'networkidle' })
+  const times = []
+  for (let i = 0; i < 5; i += 1) {
+    // The page asks for the neighbours once it has come to rest.
+    await page.waitForTimeout(1000)
+    times.push(
+      await page.evaluate(
+        () =>
+          new Promise((resolve) => {
+            const facts = () => document.querySelector('.facts').textContent
+            const [before, start] = [facts(), performance.now()]
+            document.body.dispatchEvent(new KeyboardEvent('keydown', { key: ']', bubbles: true }))
+            const look = () =>
+              facts() === before
+                ? requestAnimationFrame(look)
+                : requestAnimationFrame(() => resolve(performance.now() - start))
+            look()
+          }),
+      ),
+    )
+  }
+  await page.context().close()
+  return times
+}
+
 async function firstView() {
   const scripts = new Map()
   const page = await fresh()
@@ -139,6 +170,7 @@ const rows = {
   'first view, cards': [CARDS, '/'],
   'first view, with pictures': [PICTURES, '/'],
   'surface page': [SURFACE, `/surfaces/${id}`],
+  'response page': [RESPONSE, `/surfaces/${id}/pairs/159`],
 }
 for (const [name, [ready, path]] of Object.entries(rows)) {
   const times = []
@@ -150,6 +182,7 @@ for (const [name, [ready, path]] of Object.entries(rows)) {
   }
   say(`${name}: ${ms(times)}; load ${loadavg()[0].toFixed(1)}`)
 }
+say(`next pair: ${ms(await nextPairs())}; load ${loadavg()[0].toFixed(1)}`)
 const p95s = []
 for (let i = 0; i < Number(rounds); i += 1) p95s.push(sorted(await facetClicks())[Math.floor(CLICKS * 0.95)])
 say(`facet click, p95 of ${CLICKS}: ${ms(p95s)}; load ${loadavg()[0].toFixed(1)}`)
