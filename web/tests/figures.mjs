@@ -93,10 +93,12 @@ async function nextPairs() {
 async function firstView() {
   const scripts = new Map()
   const page = await fresh()
-  page.on('response', async (answer) => {
-    if (answer.url().endsWith('.js')) scripts.set(answer.url(), await answer.body())
+  const bodies = []
+  page.on('response', (answer) => {
+    if (answer.url().endsWith('.js')) bodies.push(answer.body().then((body) => scripts.set(answer.url(), body)))
   })
   await page.goto(base + '/', { waitUntil: 'networkidle' })
+  await Promise.all(bodies)
   const gzipped = [...scripts.values()].reduce((sum, body) => sum + gzipSync(body, { level: 9 }).length, 0)
   await page.context().close()
   return { gzipped, count: scripts.size }
