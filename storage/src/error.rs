@@ -166,9 +166,23 @@ pub enum Error {
 
 /// An object store's error. Its text is that of the innermost cause, which is what a user can act on: object_store wraps
 /// the system's error several times. Of a request that was repeated it says how often it was tried.
-#[derive(Debug, thiserror::Error)]
-#[error("{}{}", cause_text(.0), tries_text(.0))]
-pub struct StoreError(#[source] pub object_store::Error);
+#[derive(Debug)]
+pub struct StoreError(pub object_store::Error);
+
+impl std::fmt::Display for StoreError {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let answer = answer_text(&root_cause(&self.0).to_string());
+        let cause = answer.unwrap_or_else(|| root_cause(&self.0).to_string());
+        write!(f, "{cause}{}", tries_text(&self.0))
+    }
+}
+
+impl std::error::Error for StoreError {
+    // A store's answer is said in full; behind it is only its XML.
+    fn source(&self) -> Option<&(dyn std::error::Error + 'static)> {
+        answer_text(&root_cause(&self.0).to_string()).is_none().then_some(&self.0)
+    }
+}
 
 impl Error {
     pub(crate) fn store(action: &'static str, path: impl ToString, source: object_store::Error) -> Self {
@@ -202,19 +216,17 @@ impl StoreError {
     }
 }
 
-// Stores answer errors as XML.
-fn cause_text(error: &object_store::Error) -> String {
-    let text = root_cause(error).to_string();
+// Stores answer errors as XML: status, code and message of such an answer.
+fn answer_text(text: &str) -> Option<String> {
     let element = |name: &str| {
         let (_, from) = text.split_once(&format!("<{name}>"))?;
         Some(from.split_once(&format!("</{name}>"))?.0.trim())
     };
-    let Some((status, code)) = text.split_once(": <?xml").map(|(status, _)| status).zip(element("Code")) else {
-        return text;
-    };
+    let (status, _) = text.split_once(": <?xml")?;
     let status = status.rsplit(": ").next().unwrap_or(status);
     let message = element("Message").filter(|message| !message.is_empty());
-    format!("{status}, {code}{}", message.map(|message| format!(" ({message})")).unwrap_or_default())
+    let message = message.map(|message| format!(" ({message})")).unwrap_or_default();
+    Some(format!("{status}, {}{message}", element("Code")?))
 }
 
 // The client of object_store says in its text alone how often it repeated a request.
@@ -249,7 +261,9 @@ mod tests {
     fn answers_of_stores_are_said_in_words_with_the_number_of_tries() {
         let check = |text: &str, expected: &str| {
             let source = object_store::Error::Generic { store: "S3", source: text.to_owned().into() };
-            assert_eq!(StoreError(source).to_string(), expected);
+            let error = StoreError(source);
+            assert_eq!(error.to_string(), expected);
+            assert_eq!(std::error::Error::source(&error).is_none(), text.contains("<?xml"), "said in full");
         };
         check("the power is gone", "the power is gone");
         check(
