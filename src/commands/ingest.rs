@@ -319,8 +319,8 @@ async fn look(lake: &Lake, is_first: bool) -> anyhow::Result<Vec<ObjectMeta>> {
     let mut found = Vec::new();
     for source in all_pending(lake).await? {
         let RunSource::Lake(path) = &source else { continue };
-        // It may be gone again.
-        found.extend(lake.store().head(path).await.ok());
+        // It may be gone again. A folder's store tells the place of a file on the disk.
+        found.extend(lake.store().head(path).await.ok().map(|meta| ObjectMeta { location: path.clone(), ..meta }));
     }
     Ok(found)
 }
