@@ -10,6 +10,9 @@ const TEXT = /\.(html|js|css|svg|txt|json)$/
 /** Smaller files fit a packet. */
 const WORTH_PACKING = 1000
 
+/** Modules that pages share, but for what draws plots, which not every page has. */
+const SHARED = /src\/(?!components\/Plot)|node_modules\/(?!uplot)/
+
 /** Licences of all packages that are part of the pages, and served with them. */
 const LICENCES = 'licences.json'
 
@@ -67,5 +70,12 @@ export default defineConfig({
     reportCompressedSize: true,
     chunkSizeWarningLimit: 900,
     license: { fileName: LICENCES },
+    // One style sheet, and one chunk of what pages share: requests cost more than a few kB.
+    cssCodeSplit: false,
+    rolldownOptions: {
+      output: {
+        codeSplitting: { groups: [{ name: 'shared', test: SHARED, minShareCount: 2 }] },
+      },
+    },
   },
 })
