@@ -19,7 +19,7 @@ fn a_campaign_measures_what_is_missing_and_prints_tables() {
     let run = ["campaign", "run", "joints.toml", "--ir-only"];
     let printed = place.ok(&run);
     assert!(printed.starts_with("joints\nJoints on one shape.\n"), "{printed}");
-    let [over_flat, over_shape] = ["dB relative to Flat\n", "dB relative to 0015_1, expected in brackets\n"];
+    let [over_flat, over_shape] = ["dB re Flat total\n", "dB relative to 0015_1, expected in brackets\n"];
     assert!(
         printed.contains(over_flat) && printed.contains(over_shape) && printed.contains("expected: a guess"),
         "{printed}"

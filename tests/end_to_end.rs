@@ -107,6 +107,12 @@ fn answers_come_in_every_format_or_are_refused_clearly() {
     place.fails(1, &["sql", "selec 1"], "^");
     place.fails(1, &["sql", "drop table runs"], "only reading");
     place.fails(2, &["sql", "--format", "xml", "select 1"], "xml");
+    let columns = place.ok(&["sql", "\\d surface_stats"]);
+    let level = columns.lines().find(|line| line.starts_with("p90_mean_db ")).expect("a line per column");
+    assert!(level.contains("dB re Flat total"), "{level}");
+    place.fails(1, &["sql", "\\d nothing"], "no table `nothing`");
+    place.fails(1, &["sql", "\\timing"], "prompt");
+    place.fails(1, &["sql", "--json", "\\d"], "--json");
 }
 
 // A folder as the published data set has them, of the small rig's size.

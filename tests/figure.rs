@@ -104,6 +104,7 @@ fn refusals_say_what_is_there() {
     place.fails(1, &["figure", "grid", "wood", "-o", "x.gif"], "hint: svg, pdf or png");
     place.fails(1, &["figure", "filters", "-o", "{surface}.svg"], "the figure is of none");
     place.fails(1, &["figure", "table", "wood", "--less", "brick"], "surface `brick` is not in the lake");
+    place.fails(1, &["figure", "table", "wood", "--less", "flat", "--values", "energies"], "leave one of them out");
     place.fails(1, &["figure", "grid", "--where", "surface = 'x'"], "no column `surface`");
     place.fails(1, &["figure", "table", "wood", "-o", "x.svg"], "hint: tex, csv or md");
     place.fails(1, &["figure", "grid", "wood", "--band", "7"], "there is no band `7`");

@@ -133,9 +133,9 @@ struct PanelLayout {
 }
 
 impl GridFigure {
-    /// Returns the title of grid plots for a microphone point.
-    pub fn default_title(microphone: &str, reference: &str) -> String {
-        format!("TNCE for microphone {microphone}, dB over Flat\u{2019}s {reference}")
+    /// Returns the title of grid plots for a microphone point, whose levels have a unit such as "dB re Flat total".
+    pub fn default_title(microphone: &str, unit: &str) -> String {
+        format!("TNCE for microphone {microphone}, {unit}")
     }
 
     fn layout(&self) -> PanelLayout {

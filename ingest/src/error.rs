@@ -89,7 +89,7 @@ pub enum Error {
     },
     /// Processes end while they ingest it.
     #[error(
-        "`{file}` is passed over: processes that took in this file alone ended on the way ({endings}); hint: to have it tried again, move it back into `inbox/`, or delete `{mark}`"
+        "`{file}` is passed over: processes that took in this file alone ended on the way ({endings}); hint: to retry it, move it back into `inbox/`, or delete `{mark}`"
     )]
     Deadly {
         /// The file.

@@ -12,6 +12,8 @@ use echolake_schema::Rig;
 use echolake_schema::tables::Table;
 use serde::Deserialize;
 
+use crate::views::{RE_FLAT_BAND, RE_FLAT_TOTAL};
+
 /// Name of the total over all bands.
 pub const TOTAL_BAND: &str = "total";
 
@@ -25,11 +27,11 @@ pub enum LevelReference {
 }
 
 impl LevelReference {
-    /// Returns the part of Flat that levels are over, as titles name it.
-    pub fn name(self) -> &'static str {
+    /// Returns the unit of the levels, as views, pages and titles name it.
+    pub fn unit(self) -> &'static str {
         match self {
-            Self::FlatTotal => "total",
-            Self::FlatBand => "same band",
+            Self::FlatTotal => RE_FLAT_TOTAL,
+            Self::FlatBand => RE_FLAT_BAND,
         }
     }
 }

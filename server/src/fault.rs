@@ -100,7 +100,10 @@ pub(crate) enum RequestFault {
         scope: TokenScope,
     },
     /// The request comes from a web page of another origin, or names a host that is not this machine.
-    #[error("{what} `{found}` is not this server's; hint: without tokens only http://localhost is answered")]
+    #[error(
+        "{what} `{found}` is not this server's; hint: without tokens only pages of this server are answered, and others \
+         for files and slices of runs that they name (`run=RUN`)"
+    )]
     Foreign {
         /// Part of the request: host, address, origin or fetch site.
         what: &'static str,

@@ -138,7 +138,7 @@ fn print_next(lake_url: &str, example: &str) {
 
 /// Title of the tables of levels.
 const LEVELS_TITLE: &str =
-    "TNCE of the values up to the 90th percentile against Flat, dB re Flat of the same band (simulated)";
+    "TNCE of the values up to the 90th percentile against Flat, dB re Flat, same band (simulated)";
 
 // The levels against Flat of a table with one column per band.
 fn level_columns(lake: &Lake, aggregate: &str) -> String {

@@ -55,7 +55,8 @@ pub(crate) struct GridArgs {
     /// Grid point of the microphone: a number, layer/x/y, or x y z in mm. By default that in the middle of layer 0.
     #[arg(long, value_name = "POINT")]
     microphone: Option<String>,
-    /// Normalisation of the bands: Flat's same band, as in the paper's grid plots, or its total, as in its tables.
+    /// Reference of the bands' levels: Flat's energy in the same band, as in the paper's grid plots, or in all bands, as in its
+    /// tables.
     #[arg(long, value_enum, default_value_t = OverArg::Band)]
     over: OverArg,
     /// Only this band: its centre in Hz, or total.
@@ -110,14 +111,15 @@ pub(crate) struct TableArgs {
     /// Values of the table.
     #[arg(long, value_enum, default_value_t = ValuesArg::Levels)]
     values: ValuesArg,
-    /// Subtract the levels of this surface from those of the others.
+    /// Subtract the levels of this surface from those of the others; those of Flat make levels re Flat, same
+    /// band.
     #[arg(long, value_name = "SURFACE")]
     less: Option<SurfaceId>,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 enum ValuesArg {
-    /// Mean of the TNCE values up to their 90th percentile, dB over Flat's total.
+    /// Mean of the TNCE values up to their 90th percentile, dB re Flat total.
     Levels,
     /// The same without Foam's own reflection, which is estimated.
     UnbiasedLevels,

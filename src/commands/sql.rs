@@ -15,7 +15,8 @@ use serde::de::DeserializeOwned;
 
 #[derive(Debug, clap::Args)]
 pub(crate) struct SqlArgs {
-    /// The query, or `-` for standard input; by default a prompt, or standard input if that is no terminal.
+    /// The query, or `-` for standard input; by default a prompt, or standard input if that is no terminal. `\d` lists
+    /// tables, `\d TABLE` columns with units, `\df` functions.
     query: Option<String>,
     /// Format of the answer.
     #[arg(long, value_enum, default_value_t = FormatArg::Table)]
@@ -58,6 +59,11 @@ pub(crate) async fn run(args: &SqlArgs, lake_url: &str) -> anyhow::Result<()> {
         None if std::io::stdin().is_terminal() => return prompt::run(&session, &lake).await,
         None => from_stdin()?,
     };
+    if let Some(text) = prompt::command_answer(&session, &query) {
+        let is_plain = args.output.is_none() && !args.json && args.format == FormatArg::Table;
+        anyhow::ensure!(is_plain, "`{query}` answers as text; hint: leave --format, --json and -o out");
+        return Ok(super::print(&text?)?);
+    }
     let format = if args.json { AnswerFormat::Json } else { args.format.into() };
     let answer = session.query(&query).await?;
     match &args.output {

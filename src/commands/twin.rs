@@ -294,7 +294,7 @@ impl TwinDifferences {
     fn print(&self) -> anyhow::Result<()> {
         let level = |value: Option<f64>| value.map_or_else(String::new, |value| format!("{value:.2}"));
         super::print(&format!(
-            "{} ({}) less {} (computed), dB over Flat's same band, the total over its total\n\n\
+            "{} ({}) less {} (computed), dB re Flat, same band; the total: dB re Flat total\n\n\
              {:>6} {:>6} {:>9} {:>9} {:>6} {:>6} {:>6} {:>6}",
             self.surface_id, self.origin, self.twin_id, "band", "pairs", "surface", "twin", "mean", "rms", "P5", "P95",
         ))?;

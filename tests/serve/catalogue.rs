@@ -163,6 +163,10 @@ fn references_are_not_data() {
         "{foam}"
     );
     assert!(foam["flat_mean"][0].is_f64(), "{foam}");
+    let flat = json(&get(&server, "/api/v1/surfaces/flat"));
+    let statistics = flat["statistics"].as_array().expect("statistics");
+    let unbiased: Vec<_> = statistics.iter().map(|band| band["unbiased_p90_mean_db"].clone()).collect();
+    assert_eq!(foam["flat_unbiased_db"], Value::from(unbiased));
     assert_eq!(json(&get(&server, "/api/v1/surfaces/foam/curves"))["surface"]["pairs"], 0);
     let page = json(&get(&server, "/api/v1/surfaces"));
     for histogram in page["histograms"].as_array().expect("histograms") {

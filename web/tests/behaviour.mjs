@@ -252,6 +252,18 @@ await check('levels against Flat are one number on wall, surface, compare and in
   )
   await open(`/surfaces/${id}`)
   await eventually(async () => assert.equal(await cell('Levels of the pairs', 0).innerText(), text))
+  const of = (surface) =>
+    sql(
+      `select unbiased_p90_mean_db as db from surface_stats join surfaces using (run_id) where surfaces.surface_id = '${surface}' and band = '2500'`,
+    )
+  const [[own], [less]] = [await of(id), await of(flat)]
+  const without = own.db === null || less.db === null ? null : own.db - less.db
+  const shown = without === null ? '–' : `${without < -0.05 ? '−' : ''}${Math.abs(without).toFixed(1)}`
+  assert.equal(
+    await cell('Levels of the pairs', 2).innerText(),
+    shown,
+    'without Foam’s reflection, in Flat’s level too',
+  )
   await open(`/compare?s=${id},${flat}`)
   const levels = 'Mean levels of the pairs up to the 90th percentile'
   await eventually(async () => assert.equal((await cell(levels, 1).innerText()).trim(), text))

@@ -7,7 +7,7 @@ const [base, folder = '../docs'] = process.argv.slice(2)
 const MOST_BYTES = 200_000
 const get = async (path) => (await fetch(base + path)).json()
 const { items } = await get('/api/v1/surfaces?limit=500')
-const id = items.find((s) => s.typology !== 'reference').surface_id
+const id = items.findLast((s) => s.typology !== 'reference').surface_id
 const PICTURES = [
   ['wall', '/'],
   ['surface', `/surfaces/${id}?microphone=14&point=40&over=flat-band`],

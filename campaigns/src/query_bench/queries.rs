@@ -95,4 +95,4 @@ GROUP BY pair_id ORDER BY pair_id";
 
 const TEXT_SEARCH: &str = "\
 SELECT surface_id, log_time_ns, message FROM events
-WHERE level = 'warning' AND message ILIKE '%tried again%' AND message LIKE '%dB outside%' ORDER BY log_time_ns LIMIT 100";
+WHERE level = 'warning' AND message ILIKE '%retried%' AND message LIKE '%outside noise%' ORDER BY log_time_ns LIMIT 100";

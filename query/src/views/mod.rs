@@ -44,9 +44,9 @@ pub(crate) enum LakeView {
 }
 
 /// Unit of levels over Flat's energy in all bands.
-const RE_FLAT_TOTAL: &str = "dB re Flat total";
+pub(crate) const RE_FLAT_TOTAL: &str = "dB re Flat total";
 /// Unit of levels over Flat's energy in the same band, which is what "against Flat" means.
-const RE_FLAT_BAND: &str = "dB re Flat, same band";
+pub(crate) const RE_FLAT_BAND: &str = "dB re Flat, same band";
 
 /// Metadata of columns by name: unit and meaning.
 type ColumnNotes = HashMap<String, HashMap<String, String>>;

@@ -13,7 +13,7 @@ const GREATEST: &str = "\x1b[31m";
 const LEAST: &str = "\x1b[32m";
 const PLAIN: &str = "\x1b[0m";
 
-/// Levels of each surface over Flat, by band.
+/// Levels of each surface by band, dB re Flat total.
 pub(super) type LevelsBySurface = BTreeMap<String, BTreeMap<String, f64>>;
 
 /// Colours of a printed table.
@@ -43,7 +43,7 @@ struct LevelTableRow {
     source: String,
 }
 
-/// Makes the table over Flat, and one for each surface that others are relative to.
+/// Makes the table of levels re Flat total, and one for each surface that others are relative to.
 pub(super) fn make_tables(
     surfaces: &[(&SurfaceId, Option<&SurfaceId>)],
     levels: &LevelsBySurface,
@@ -115,9 +115,10 @@ impl LevelTableRow {
 impl LevelTable {
     /// Returns its text, a column for each band.
     pub(super) fn to_text(&self, bands: &[String], colours: TableColours) -> String {
-        let what = self.relative_to.as_deref().unwrap_or("Flat");
+        let relative = |surface: &String| format!("dB relative to {surface}");
+        let unit = self.relative_to.as_ref().map_or_else(|| "dB re Flat total".to_owned(), relative);
         let beside = if self.rows.iter().any(LevelTableRow::expects) { ", expected in brackets" } else { "" };
-        let mut text = format!("Mean TNCE of the values up to the 90th percentile, dB relative to {what}{beside}\n");
+        let mut text = format!("Mean TNCE of the values up to the 90th percentile, {unit}{beside}\n");
         let names = self.rows.iter().map(|row| row.surface.len()).max().unwrap_or(0).max("surface".len());
         let cells: Vec<Vec<String>> = self.rows.iter().map(|row| bands.iter().map(|b| row.cell(b)).collect()).collect();
         let heads: Vec<_> = bands.iter().map(|b| if b == "total" { b.clone() } else { format!("{b} Hz") }).collect();
@@ -192,7 +193,7 @@ mod tests {
         let texts: Vec<_> = tables.iter().map(|table| table.to_text(&bands, TableColours::None)).collect();
         assert_eq!(
             texts[0],
-            "Mean TNCE of the values up to the 90th percentile, dB relative to Flat\n\
+            "Mean TNCE of the values up to the 90th percentile, dB re Flat total\n\
              surface  2500 Hz  total\n\
              flat      -10.00   0.00\n\
              0015_1     -7.50  -0.50\n\

@@ -63,7 +63,7 @@ pub(super) async fn write_grid(source: &FigureSource, args: &GridArgs) -> anyhow
             columns: args.columns as usize,
             with_caption: true,
         };
-        let default = || GridFigure::default_title(&microphone.label(), over.name());
+        let default = || GridFigure::default_title(&microphone.label(), over.unit());
         let query = queries(group, |id| grid_query(rig, over, id, &microphone.id.index().to_string()));
         let used = group.iter().chain(base.as_ref().map(|(surface, _)| surface));
         let notes = source.notes(args.output.title(default), query, used);
@@ -244,7 +244,7 @@ pub(super) async fn write_map(source: &FigureSource, args: &MapArgs) -> anyhow::
         width_px: 720.0,
     };
     let title =
-        args.output.title(|| format!("{} surfaces by their TNCE, dB over Flat\u{2019}s same band", surfaces.len()));
+        args.output.title(|| format!("{} surfaces by their TNCE, {}", surfaces.len(), LevelReference::FlatBand.unit()));
     args.output.write_drawing(&figure.draw(&source.notes(title, query, &surfaces)), &[])
 }
 

@@ -29,6 +29,10 @@ type QueriedTable = (FigureTable, String);
 pub(super) async fn write_table(source: &FigureSource, args: &TableArgs) -> anyhow::Result<()> {
     let surfaces = source.surfaces(&args.selection).await?;
     let base = source.base(args.less.as_ref()).await?;
+    anyhow::ensure!(
+        base.is_none() || args.values != ValuesArg::Energies,
+        "--less subtracts levels, and --values energies has none; hint: leave one of them out"
+    );
     for group in args.output.groups(&surfaces)? {
         let (table, query) = match args.values {
             ValuesArg::Levels => level_table(source, group, base.as_ref(), "p90_mean_db").await?,
@@ -44,9 +48,9 @@ pub(super) async fn write_table(source: &FigureSource, args: &TableArgs) -> anyh
 
 fn default_title(values: ValuesArg) -> &'static str {
     match values {
-        ValuesArg::Levels => "Mean TNCE of the values up to the 90th percentile, dB over Flat\u{2019}s total",
+        ValuesArg::Levels => "Mean TNCE of the values up to the 90th percentile, dB re Flat total",
         ValuesArg::UnbiasedLevels => {
-            "Mean TNCE of the values up to the 90th percentile, dB over Flat\u{2019}s total, without Foam\u{2019}s reflection"
+            "Mean TNCE of the values up to the 90th percentile, dB re Flat total, without Foam\u{2019}s reflection"
         }
         ValuesArg::Energies => "Mean TNCE over the pairs, over Flat\u{2019}s total",
     }

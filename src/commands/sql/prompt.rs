@@ -107,11 +107,35 @@ fn obey(command: PromptCommand, session: &Session, settings: &mut PromptSettings
             eprintln!("answers are {}", format.name());
         }
         PromptCommand::Output(path) => settings.output = path,
-        PromptCommand::Tables => pager::show(settings.pager, &tables(session))?,
-        PromptCommand::Columns(table) => pager::show(settings.pager, &columns(session, &table))?,
-        PromptCommand::Functions(part) => pager::show(settings.pager, &functions(session, part.as_deref()))?,
+        PromptCommand::Tables | PromptCommand::Columns(_) | PromptCommand::Functions(_) => {
+            match description(session, &command) {
+                Ok(text) => pager::show(settings.pager, &text)?,
+                Err(e) => eprintln!("error: {e}"),
+            }
+        }
     }
     Ok(())
+}
+
+/// Returns what `\d` and `\df` print, for a query that is such a command; None if it is SQL.
+pub(super) fn command_answer(session: &Session, query: &str) -> Option<anyhow::Result<String>> {
+    if !query.trim_start().starts_with('\\') {
+        return None;
+    }
+    let answer = |command: Result<PromptCommand, String>| description(session, &command.map_err(anyhow::Error::msg)?);
+    command::parse(query).map(answer)
+}
+
+// Of tables, columns and functions; the other commands change the prompt.
+fn description(session: &Session, command: &PromptCommand) -> anyhow::Result<String> {
+    match command {
+        PromptCommand::Tables => Ok(tables(session)),
+        PromptCommand::Columns(table) => columns(session, table),
+        PromptCommand::Functions(part) => functions(session, part.as_deref()),
+        _ => anyhow::bail!(
+            "a command of the prompt alone; hint: `echolake sql` without a query, or \\d, \\d TABLE, \\df"
+        ),
+    }
 }
 
 fn on_or_off(is_on: bool) -> &'static str {
@@ -163,29 +187,33 @@ fn tables(session: &Session) -> String {
         .join("\n")
 }
 
-fn columns(session: &Session, table: &str) -> String {
-    let Some((_, schema)) = session.tables().find(|(name, _)| *name == table) else {
-        return format!("no table `{table}`; \\d lists them");
-    };
+fn columns(session: &Session, table: &str) -> anyhow::Result<String> {
+    let found = session.tables().find(|(name, _)| *name == table);
+    let (_, schema) = found.with_context(|| format!("no table `{table}`; hint: \\d lists them"))?;
     let line = |field: &arrow::datatypes::Field| {
         let of = |key| field.metadata().get(key).map_or("", String::as_str);
         let kind = match field.data_type() {
             arrow::datatypes::DataType::List(child) => format!("[{}]", child.data_type()),
             other => other.to_string(),
         };
-        format!("{:<24} {kind:<28} {:<12} {}", field.name(), of(UNIT), of(COMMENT))
+        format!("{:<24} {kind:<28} {:<21} {}", field.name(), of(UNIT), of(COMMENT))
     };
-    schema.fields().iter().map(|f| line(f)).collect::<Vec<_>>().join("\n")
+    Ok(schema.fields().iter().map(|f| line(f)).collect::<Vec<_>>().join("\n"))
 }
 
-fn functions(session: &Session, part: Option<&str>) -> String {
+fn functions(session: &Session, part: Option<&str>) -> anyhow::Result<String> {
     let fits = |name: &str| part.is_none_or(|part| name.contains(part));
-    let found: Vec<_> = session.functions().into_iter().filter(|f| fits(&f.name)).collect();
-    match found.as_slice() {
-        [] => format!("no function with `{}` in its name; \\df lists all", part.unwrap_or_default()),
+    let mut found: Vec<_> = session.functions().into_iter().filter(|f| fits(&f.name)).collect();
+    if let Some(whole) = found.iter().position(|f| part == Some(f.name.as_str())) {
+        found = vec![found.swap_remove(whole)];
+    }
+    Ok(match found.as_slice() {
+        [] => {
+            anyhow::bail!("no function with `{}` in its name; hint: \\df lists all", part.unwrap_or_default())
+        }
         [one] => format!("{}\n{}", one.syntax, one.description),
         many => many.iter().map(|f| format!("{:<24} {}", f.name, f.syntax)).collect::<Vec<_>>().join("\n"),
-    }
+    })
 }
 
 fn history_file() -> Option<PathBuf> {

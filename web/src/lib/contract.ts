@@ -104,7 +104,7 @@ export interface paths {
         };
         /**
          * Surfaces as points, close together if they reflect alike, and their nearest neighbours.
-         * @description Principal components and a self-organising map of the surfaces' TNCE vectors (all pairs and bands, dB over Flat's same
+         * @description Principal components and a self-organising map of the surfaces' TNCE vectors (all pairs and bands, dB re Flat, same
          *     band); once per snapshot.
          */
         readonly get: operations["map"];
@@ -969,7 +969,7 @@ export interface components {
             readonly flat_reference: string;
             readonly foam_reference: string;
             /**
-             * @description Mean TNCE of the values up to the 90th percentile, dB over Flat's total. One value per band in the order of
+             * @description Mean TNCE of the values up to the 90th percentile, dB re Flat total. One value per band in the order of
              *     `lake.bands`, the total last; null if there is no value.
              */
             readonly level_db: readonly (number | null)[];
@@ -1003,7 +1003,9 @@ export interface components {
              *     total last; null if there is no value.
              */
             readonly flat_mean: readonly (number | null)[];
-            /** @description The same of this surface; null of the Foam that is subtracted. */
+            /** @description Flat's `unbiased_p90_mean_db`, in the same order; null if there is no value. */
+            readonly flat_unbiased_db: readonly (number | null)[];
+            /** @description Mean over the pairs of this surface's TNCE, as `flat_mean`; null of the Foam that is subtracted. */
             readonly mean: readonly (number | null)[];
             readonly mesh_triangles: number | null;
             readonly mesh_watertight: boolean | null;

@@ -1,8 +1,10 @@
 //! The grid plot's numbers.
 import type { Grid, Lake } from './api'
 import type { TableData } from './plot'
+import { unitOf } from './reference'
 
 export function gridTable(lake: Lake, grid: Grid): TableData {
+  const unit = (key: string) => unitOf(key === 'total' ? 'flat-total' : grid.over)
   return {
     columns: [
       'point',
@@ -14,7 +16,7 @@ export function gridTable(lake: Lake, grid: Grid): TableData {
       'z_mm',
       'pair',
       'measured the other way round',
-      ...lake.bands.map((band) => `tnce ${band.label}, dB`),
+      ...lake.bands.map((band) => `tnce ${band.label}, ${unit(band.key)}`),
     ],
     rows: lake.points.map((p) => [
       p.point_id,

@@ -20,9 +20,10 @@ export const gridQuery = (lake: Lake, id: string, microphone: number, over: stri
 export const meanQuery = (lake: Lake, ids: readonly string[]) =>
   `select surface_id, count(*) as pairs,\n${lake.bands.map((band) => `  avg(tnce_${band.key}) as tnce_${band.key}`).join(',\n')}\nfrom tnce\nwhere surface_id in (${ids.map(quoted).join(', ')})\ngroup by surface_id order by surface_id`
 
-/** Levels over Flat's total, or less Flat's level in the same band. */
+/** Levels re Flat total, or less Flat's level in the same band. */
 export function statisticsQuery(ids: readonly string[], over: LevelReference): string {
-  const level = (name: string) => (over === 'flat-total' ? `s.${name}` : `s.${name} - f.p90_mean_db as ${name}`)
+  const ofFlat = (name: string) => (name === 'unbiased_p90_mean_db' ? name : 'p90_mean_db')
+  const level = (name: string) => (over === 'flat-total' ? `s.${name}` : `s.${name} - f.${ofFlat(name)} as ${name}`)
   const columns = ['p90_mean_db', 'unbiased_p90_mean_db', 'p5_db', 'p50_db', 'p95_db', 'min_db', 'max_db'].map(level)
   const flat =
     over === 'flat-total'

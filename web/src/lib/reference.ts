@@ -16,6 +16,10 @@ export const chosenReference = (): LevelReference =>
 
 export const unitOf = (over: LevelReference) => REFERENCES.find(({ key }) => key === over)!.unit
 
+/** A level less another; null if one is not known. */
+export const difference = (level: number | null | undefined, less: number | null | undefined) =>
+  level === null || level === undefined || less === null || less === undefined ? null : level - less
+
 /** Converts a level over Flat's total of a band. */
 export function levelOver(over: LevelReference, surface: Surface, band: number, total_db: number | null | undefined) {
   if (total_db === null || total_db === undefined) return null

@@ -223,7 +223,7 @@ impl RunController<'_> {
         }
         run.recorder.measurement(at, m)?;
         if m.verdict() != Verdict::Accepted {
-            let next = if m.verdict() == Verdict::Repeated { "tried again" } else { "given up" };
+            let next = if m.verdict() == Verdict::Repeated { "retried" } else { "given up" };
             let what = format!("pair {}, attempt {}: {}; {next}", m.pair_id, m.attempt, m.reasons.join("; "));
             run.recorder.log(at, LogLevel::Warning, NAME, &what)?;
         }

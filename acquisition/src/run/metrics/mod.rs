@@ -118,7 +118,7 @@ impl MetricValues {
             ("pairs_accepted", Gauge, "Pairs whose measurement is safe on the disk.", self.accepted as f64),
             ("pair", Gauge, "The pair that is measured now.", f64::from(self.pair)),
             ("attempts_total", Counter, "Attempts of this session.", self.attempts as f64),
-            ("repeats_total", Counter, "Attempts of this session that were tried again.", self.repeated as f64),
+            ("repeats_total", Counter, "Attempts of this session that were retried.", self.repeated as f64),
             ("given_up_total", Counter, "Pairs of this session that were given up.", self.rejected as f64),
             ("paused", Gauge, "1 while the run waits.", flag(self.paused)),
             ("broken_off", Gauge, "1 where the run broke off.", flag(self.broken_off)),

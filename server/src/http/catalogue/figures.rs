@@ -135,7 +135,7 @@ pub(super) async fn grid_figure(
     options.extend((figure.palette == LevelPalette::Safe).then(|| "--safe-colours".to_owned()));
     let used: Vec<_> = entries.iter().copied().chain(base.iter().map(|(base, _)| *base)).collect();
     let notes = FigureNotes {
-        title: GridFigure::default_title(&point, over.name()),
+        title: GridFigure::default_title(&point, over.unit()),
         command: command("grid", &entries, &options),
         query: grid_query(lake.rig(), over, &quoted(&path.surface_id), &microphone.to_string()),
         ..notes(&request, &used)

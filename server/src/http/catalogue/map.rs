@@ -67,7 +67,7 @@ pub(super) struct MapQuery {
 
 /// Surfaces as points, close together if they reflect alike, and their nearest neighbours.
 ///
-/// Principal components and a self-organising map of the surfaces' TNCE vectors (all pairs and bands, dB over Flat's same
+/// Principal components and a self-organising map of the surfaces' TNCE vectors (all pairs and bands, dB re Flat, same
 /// band); once per snapshot.
 #[utoipa::path(
     get,

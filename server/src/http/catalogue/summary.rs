@@ -34,7 +34,7 @@ pub(super) struct SurfaceSummary {
     relief_min_mm: Option<f64>,
     relief_max_mm: Option<f64>,
     pub(super) relief_rms_mm: Option<f64>,
-    /// Mean TNCE of the values up to the 90th percentile, dB over Flat's total. One value per band in the order of
+    /// Mean TNCE of the values up to the 90th percentile, dB re Flat total. One value per band in the order of
     /// `lake.bands`, the total last; null if there is no value.
     level_db: Vec<Option<f64>>,
     /// `level_db` less that of the surface's Flat.

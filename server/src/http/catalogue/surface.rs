@@ -31,8 +31,10 @@ struct SurfaceDetail<'a> {
     /// Mean over the pairs of Flat's TNCE, linear, over Flat's total. One value per band in the order of `lake.bands`, the
     /// total last; null if there is no value.
     flat_mean: Vec<Option<f64>>,
-    /// The same of this surface; null of the Foam that is subtracted.
+    /// Mean over the pairs of this surface's TNCE, as `flat_mean`; null of the Foam that is subtracted.
     mean: Vec<Option<f64>>,
+    /// Flat's `unbiased_p90_mean_db`, in the same order; null if there is no value.
+    flat_unbiased_db: Vec<Option<f64>>,
 }
 
 /// Statistics of a band.
@@ -81,7 +83,7 @@ const STATISTICS: &str = "select band, measurements, p90_mean_db, p5_db, p50_db,
     responses((status = 200, description = "OK", body = SurfaceDetail)),
     extensions(("x-sql" = json!([
         "the summary of /surfaces",
-        "select * from surface_stats where surface_id = $1",
+        "select * from surface_stats where surface_id in ($1, $flat)",
         "select surface_id, avg(tnce_2500), ..., avg(tnce_total) from tnce where surface_id in ($1, $flat) group by \
          surface_id",
     ])))
@@ -101,8 +103,9 @@ pub(super) async fn surface(
         "select make_array({}) as phases from surfaces where surface_id = $1 order by run_id desc limit 1",
         phases.join(", ")
     );
-    let (found, rows, phases, runs) = tokio::try_join!(
+    let (found, of_flat, rows, phases, runs) = tokio::try_join!(
         request.rows::<BandStatistics>(STATISTICS, vec![text(id)]),
+        request.rows::<BandStatistics>(STATISTICS, vec![text(flat)]),
         request.rows::<SurfaceMeans>(&means, vec![text(id), text(flat)]),
         request.rows::<DetailPhases>(&phases, vec![text(id)]),
         request.rows::<SurfaceRun>("select run_id from runs where surface_id = $1 order by started_ns", vec![text(id)]),
@@ -112,8 +115,9 @@ pub(super) async fn surface(
         let own = rows.iter().find(|row| row.surface_id == surface);
         own.map_or_else(|| vec![None; bands.len()], |row| row.means.clone())
     };
-    // The newest run's row of each band, in the order of the bands.
-    let mut by_band: HashMap<_, _> = found.into_iter().rev().map(|row| (row.band.clone(), row)).collect();
+    let mut by_band = newest_by_band(found);
+    let of_flat = newest_by_band(of_flat);
+    let unbiased = |band: &str| of_flat.get(band).and_then(|row| row.unbiased_p90_mean_db);
     Ok(AnswerContent::json(&SurfaceDetail {
         surface: &entry.surface,
         parameters: &entry.parameters,
@@ -125,7 +129,13 @@ pub(super) async fn surface(
         detail_phase: phases.into_iter().next().map_or_else(|| vec![None; names.len()], |row| row.phases),
         flat_mean: mean(flat),
         mean: if entry.surface.is_foam() { vec![None; bands.len()] } else { mean(id) },
+        flat_unbiased_db: bands.iter().map(|band| unbiased(&band.key)).collect(),
     })?)
+}
+
+// Rows come newest run first.
+fn newest_by_band(rows: Vec<BandStatistics>) -> HashMap<String, BandStatistics> {
+    rows.into_iter().rev().map(|row| (row.band.clone(), row)).collect()
 }
 
 /// TNCE over the grid for one microphone point.
