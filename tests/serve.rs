@@ -3,6 +3,7 @@
 mod attacks;
 pub(crate) mod catalogue;
 mod contract;
+mod dialect;
 mod encryption;
 mod escapes;
 pub(crate) mod http;

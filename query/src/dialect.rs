@@ -5,7 +5,12 @@
 
 use std::any::TypeId;
 
-use datafusion::sql::sqlparser::dialect::{Dialect, GenericDialect};
+use datafusion::sql::sqlparser::ast::{Expr, Statement};
+use datafusion::sql::sqlparser::dialect::{Dialect, GenericDialect, Precedence};
+use datafusion::sql::sqlparser::parser::{Parser, ParserError};
+use datafusion::sql::sqlparser::tokenizer::Token;
+
+use crate::friendly::parse;
 
 /// SQL as DataFusion plans it, with lambdas and other friendly syntax of DuckDB.
 #[derive(Debug)]
@@ -14,6 +19,23 @@ pub(crate) struct LakeDialect;
 impl Dialect for LakeDialect {
     fn dialect(&self) -> TypeId {
         TypeId::of::<GenericDialect>()
+    }
+
+    fn parse_prefix(&self, parser: &mut Parser<'_>) -> Option<Result<Expr, ParserError>> {
+        parse::parse_prefix(parser)
+    }
+
+    fn parse_infix(&self, parser: &mut Parser<'_>, expr: &Expr, _precedence: u8) -> Option<Result<Expr, ParserError>> {
+        parse::parse_infix(parser, expr)
+    }
+
+    // The default reads no number or text after a colon.
+    fn get_next_precedence(&self, parser: &Parser<'_>) -> Option<Result<u8, ParserError>> {
+        (parser.peek_token_ref().token == Token::Colon).then(|| Ok(self.prec_value(Precedence::Colon)))
+    }
+
+    fn parse_statement(&self, parser: &mut Parser<'_>) -> Option<Result<Statement, ParserError>> {
+        parse::parse_statement(parser)
     }
 
     fn is_identifier_start(&self, ch: char) -> bool {
@@ -72,6 +94,10 @@ impl Dialect for LakeDialect {
         true
     }
 
+    fn supports_from_trailing_commas(&self) -> bool {
+        true
+    }
+
     fn supports_group_by_expr(&self) -> bool {
         true
     }
@@ -100,6 +126,10 @@ impl Dialect for LakeDialect {
         true
     }
 
+    fn supports_notnull_operator(&self) -> bool {
+        true
+    }
+
     fn supports_numeric_literal_underscores(&self) -> bool {
         true
     }
@@ -121,6 +151,10 @@ impl Dialect for LakeDialect {
     }
 
     fn supports_select_wildcard_exclude(&self) -> bool {
+        true
+    }
+
+    fn supports_select_wildcard_rename(&self) -> bool {
         true
     }
 

@@ -2,6 +2,7 @@
 
 use std::cmp::Reverse;
 use std::collections::BTreeSet;
+use std::fmt::{self, Display, Formatter};
 use std::time::Duration;
 
 use arrow::error::ArrowError;
@@ -9,10 +10,12 @@ use datafusion::common::utils::datafusion_strsim::normalized_levenshtein;
 use datafusion::common::{Column, SchemaError};
 use datafusion::error::DataFusionError;
 use datafusion::sql::sqlparser::parser::ParserError;
+use datafusion::sql::sqlparser::tokenizer::Location;
 use echolake_schema::ErrorCause;
 use echolake_schema::tables::Table;
 
 use crate::control::StopReason;
+use crate::friendly::hints;
 
 /// Minimum similarity of a suggested name: half of the letters, as in DataFusion's own suggestions.
 const ALIKE: f64 = 0.5;
@@ -21,16 +24,35 @@ const SUGGESTED: usize = 3;
 /// Maximum number of columns in a hint if no name is similar.
 const LISTED: usize = 12;
 
+/// A place in a query's text. Lines, columns and positions count from 1.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct QueryPlace {
+    /// Line.
+    pub line: u64,
+    /// Column, in characters.
+    pub column: u64,
+    /// Position in the whole text, in characters.
+    pub position: u64,
+    /// The line, and below it a mark under the place.
+    pub mark: String,
+}
+
+impl Display for QueryPlace {
+    fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
+        write!(f, " (line {}, column {})\n{}", self.line, self.column, self.mark)
+    }
+}
+
 /// An error of a query.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
     /// The query is invalid.
-    #[error("{message}{}{}", place.as_deref().unwrap_or_default(), hint_line(hint.as_deref()))]
+    #[error("{message}{}{}", place.as_ref().map_or_else(String::new, ToString::to_string), hint_line(hint.as_deref()))]
     Query {
         /// Description of the error.
         message: String,
-        /// The line, with a mark under the place.
-        place: Option<String>,
+        /// The place in the query.
+        place: Option<QueryPlace>,
         /// A suggestion.
         hint: Option<String>,
     },
@@ -101,7 +123,29 @@ impl Error {
         let span = error.diagnostic().and_then(|d| d.span).map(|s| (s.start.line, s.start.column));
         let (message, parsed) = without_place(sql, &message);
         let place = span.or(parsed).and_then(|(line, column)| mark(sql, line, column));
-        Self::Query { message, place, hint }
+        let (message, hint) = match message.split_once("; hint: ") {
+            Some((message, own)) => (message.to_owned(), own.to_owned()),
+            None => {
+                let is_syntax = matches!(error.find_root(), DataFusionError::SQL(..));
+                let hint =
+                    hint.unwrap_or_else(|| if is_syntax { hints::of_syntax(sql) } else { hints::of_plan(&message) });
+                (hints::short(&message), hint)
+            }
+        };
+        Self::Query { message, place, hint: Some(hint) }
+    }
+
+    /// Converts an error of the tokenizer.
+    pub(crate) fn syntax(sql: &str, error: ParserError) -> Self {
+        Self::plan(sql, &DataFusionError::from(error))
+    }
+
+    /// Sets the place of an error that has none, if the query has one.
+    pub(crate) fn at(mut self, sql: &str, start: Location) -> Self {
+        if let Self::Query { place: place @ None, .. } = &mut self {
+            *place = mark(sql, start.line, start.column);
+        }
+        self
     }
 
     /// Returns the error for a clause that is not planned; the query is marked at the clause's first word in capitals.
@@ -118,7 +162,7 @@ impl Error {
 
     /// Converts an error of running a query.
     pub(crate) fn execution(error: &DataFusionError) -> Self {
-        Self::limit(error).unwrap_or_else(|| Self::Execution { message: explain(error).0 })
+        Self::limit(error).unwrap_or_else(|| Self::Execution { message: hints::with_hint(explain(error).0) })
     }
 
     // An error about a limit, not about the query.
@@ -197,7 +241,7 @@ fn column_hint(field: &Column, valid: &[Column]) -> Option<String> {
     let mut seen = BTreeSet::new();
     let names: Vec<_> = valid.iter().map(|c| c.name.as_str()).filter(|name| seen.insert(*name)).collect();
     if names.is_empty() {
-        return None;
+        return Some("FROM names the tables; without it there are no columns".to_owned());
     }
     Some(did_you_mean(&field.name, &names).unwrap_or_else(|| {
         let more = if names.len() > LISTED { ", ...; DESCRIBE lists all of a table" } else { "" };
@@ -241,11 +285,22 @@ fn end_of(sql: &str) -> Option<(u64, u64)> {
 /// Characters of a line shown before and after a marked place.
 const MARKED_CHARS: usize = 60;
 
-fn mark(sql: &str, line: u64, column: u64) -> Option<String> {
-    let text = sql.lines().nth(usize::try_from(line.checked_sub(1)?).ok()?)?;
+fn mark(sql: &str, line: u64, column: u64) -> Option<QueryPlace> {
+    let before = usize::try_from(line.checked_sub(1)?).ok()?;
+    let text = sql.lines().nth(before)?;
     let length = text.chars().count();
     let column = usize::try_from(column.checked_sub(1)?).ok()?.min(length);
-    // Shows only the surroundings of the place in a long line, such as programs generate.
+    let above: usize = sql.split_inclusive('\n').take(before).map(|line| line.chars().count()).sum();
+    Some(QueryPlace {
+        line,
+        column: column as u64 + 1,
+        position: (above + column) as u64 + 1,
+        mark: marked(text, length, column),
+    })
+}
+
+// Shows only the surroundings of the place in a long line, such as programs generate.
+fn marked(text: &str, length: usize, column: usize) -> String {
     let begin = column.saturating_sub(MARKED_CHARS);
     let around: String = text.chars().skip(begin).take(2 * MARKED_CHARS).collect();
     let (cut, column) = if begin > 0 { ("...", column - begin + 3) } else { ("", column) };
@@ -253,7 +308,7 @@ fn mark(sql: &str, line: u64, column: u64) -> Option<String> {
     let text = format!("{cut}{around}{end}");
     // Tabs stay tabs, so that the mark is under its place at any tab width.
     let blank: String = text.chars().take(column).map(|c| if c == '\t' { '\t' } else { ' ' }).collect();
-    Some(format!("\n  {text}\n  {blank}^"))
+    format!("  {text}\n  {blank}^")
 }
 
 #[cfg(test)]
@@ -266,12 +321,14 @@ mod tests {
         assert_eq!(without_place("", "meet me at Line: nowhere"), ("meet me at Line: nowhere".to_owned(), None));
         let (message, place) = without_place("select\n  1 +\n", "Expected: an expression, found: EOF");
         assert_eq!((message.as_str(), place), ("Expected: an expression, found the end of the query", Some((2, 6))));
-        assert_eq!(mark("select\nfrom x", 2, 6).as_deref(), Some("\n  from x\n       ^"));
-        assert_eq!(mark("\tx", 1, 2).as_deref(), Some("\n  \tx\n  \t^"));
+        let place = mark("sélect\nfrom x", 2, 6).expect("a place");
+        assert_eq!((place.line, place.column, place.position), (2, 6, 13));
+        assert_eq!(place.to_string(), " (line 2, column 6)\n  from x\n       ^");
+        assert_eq!(mark("\tx", 1, 2).expect("a place").mark, "  \tx\n  \t^");
         assert_eq!(mark("select", 9, 1), None);
         let long = format!("{}x{}", "a".repeat(100), "b".repeat(100));
-        let around = format!("\n  ...{}x{}...\n  {}^", "a".repeat(60), "b".repeat(59), " ".repeat(63));
-        assert_eq!(mark(&long, 1, 101), Some(around));
+        let around = format!("  ...{}x{}...\n  {}^", "a".repeat(60), "b".repeat(59), " ".repeat(63));
+        assert_eq!(mark(&long, 1, 101).expect("a place").mark, around);
     }
 
     #[test]

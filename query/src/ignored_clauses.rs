@@ -14,6 +14,9 @@ use crate::Error;
 /// Aliases that are the first word of a kind of join which the parser does not know.
 const JOIN_WORDS: [&str; 2] = ["POSITIONAL", "ASOF"];
 
+/// Replacement of an ASOF JOIN.
+const NEAREST: &str = "JOIN ... ON a.t >= b.t QUALIFY row_number() over (partition by a.id order by b.t desc) = 1";
+
 /// Accepts statements all of whose clauses are planned. `is_scalar` tells whether a function is a scalar one and nothing
 /// else.
 ///
@@ -81,6 +84,8 @@ impl Visitor for ClauseVisitor<'_> {
                 refuse_if(*with_ordinality, "ORDINALITY", "row_number() over ()")
             }
             TableFactor::NestedJoin { table_with_joins, .. } => check_joins(table_with_joins),
+            TableFactor::Pivot { .. } => refuse_if(true, "PIVOT here", "PIVOT in a subquery of FROM, or in WITH"),
+            TableFactor::Unpivot { .. } => refuse_if(true, "UNPIVOT here", "UNPIVOT in a subquery of FROM, or in WITH"),
             _ => ControlFlow::Continue(()),
         }
     }
@@ -88,6 +93,8 @@ impl Visitor for ClauseVisitor<'_> {
     fn pre_visit_expr(&mut self, expr: &Expr) -> Outcome {
         let Expr::Function(function) = expr else { return ControlFlow::Continue(()) };
         let name = function.name.to_string();
+        let is_columns = name.eq_ignore_ascii_case("columns");
+        refuse_if(is_columns, "COLUMNS here", "COLUMNS in a select list, in WHERE, HAVING or QUALIFY, or in UNPIVOT")?;
         let has_parameters = function.parameters != FunctionArguments::None;
         refuse_if(has_parameters, &format!("parameters of {name} before its arguments"), "write them as arguments")?;
         if !is_plain(&function.name, self.is_scalar) {
@@ -109,7 +116,8 @@ fn check_joins(tables: &TableWithJoins) -> Outcome {
     let mut left = &tables.relation;
     for Join { relation, join_operator, .. } in &tables.joins {
         if let Some(word) = join_word(left) {
-            refuse_if(true, &format!("{word} JOIN"), "JOIN ... ON, or quote the alias")?;
+            let hint = if word == "ASOF" { NEAREST } else { "JOIN ... ON row_number, or quote the alias" };
+            refuse_if(true, &format!("{word} JOIN"), hint)?;
         }
         let is_bare = matches!(
             join_operator,
@@ -121,6 +129,10 @@ fn check_joins(tables: &TableWithJoins) -> Outcome {
                 | JoinOperator::RightOuter(JoinConstraint::None)
                 | JoinOperator::FullOuter(JoinConstraint::None)
         );
+        let is_as_of = matches!(join_operator, JoinOperator::AsOf { .. });
+        refuse_if(is_as_of, "ASOF JOIN", NEAREST)?;
+        let is_semi = matches!(join_operator, JoinOperator::Semi(_) | JoinOperator::Anti(_));
+        refuse_if(is_semi, "SEMI and ANTI JOIN without LEFT or RIGHT", "LEFT SEMI JOIN, or WHERE x IN (SELECT ...)")?;
         refuse_if(is_bare, "JOIN without ON or USING", "CROSS JOIN if every pair of rows is meant")?;
         left = relation;
     }

@@ -29,7 +29,7 @@ mod dialect;
 mod engine;
 mod error;
 pub mod figure_rows;
-mod friendly_sql;
+mod friendly;
 mod functions;
 mod gate;
 mod ignored_clauses;
@@ -47,7 +47,7 @@ mod views;
 
 pub use control::threads::QueryThreads;
 pub use engine::{EngineClient, EngineLimits, QueryEngine, QueryPermit, QueryQuota, SqlFunction};
-pub use error::Error;
+pub use error::{Error, QueryPlace};
 pub use functions::FunctionSet;
 pub use mcap::{Attachment, Contents, Topic};
 pub use opaque::OpaqueValue;

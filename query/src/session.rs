@@ -15,6 +15,8 @@ use datafusion::logical_expr::LogicalPlan;
 use datafusion::physical_plan::{ExecutionPlan, execute_stream};
 use datafusion::prelude::SessionContext;
 use datafusion::sql::parser::{DFParserBuilder, Statement};
+use datafusion::sql::sqlparser::parser::ParserError;
+use datafusion::sql::sqlparser::tokenizer::Tokenizer;
 use echolake_lake::{Lake, LakeSnapshot, VisibleRun};
 use futures::StreamExt as _;
 use tokio::sync::mpsc;
@@ -26,7 +28,7 @@ use crate::dialect::LakeDialect;
 use crate::engine::{self, EngineClient, EngineLimits, QueryEngine, QueryPermit, QueryQuota, SqlFunction};
 use crate::mcap::Contents;
 use crate::statement_bounds::check_statement_bounds;
-use crate::{Error, OpaqueValue, as_of, friendly_sql, gate, ignored_clauses, placeholders, summarize};
+use crate::{Error, OpaqueValue, as_of, friendly, gate, ignored_clauses, placeholders, summarize};
 
 /// Capacity of the queue of batches to a slow reader.
 const AHEAD: usize = 2;
@@ -258,7 +260,9 @@ impl Session {
         check_statement_bounds(sql, &LakeDialect)?;
         let sql = &*as_of::respelled(sql);
         let limit = self.engine.template().config().options().sql_parser.recursion_limit.get();
-        let parser = DFParserBuilder::new(sql).with_dialect(&LakeDialect).with_recursion_limit(limit).build();
+        let tokens = Tokenizer::new(&LakeDialect, sql).tokenize_with_location().map_err(ParserError::from);
+        let tokens = tokens.map(friendly::tokens::rewritten).map_err(|e| Error::syntax(sql, e))?;
+        let parser = DFParserBuilder::new(tokens).with_dialect(&LakeDialect).with_recursion_limit(limit).build();
         let statements = parser.and_then(|mut parser| parser.parse_statements()).map_err(|e| Error::plan(sql, &e))?;
         let wrong = |message: &str, hint: &str| Error::Query {
             message: message.to_owned(),
@@ -294,8 +298,9 @@ impl Session {
             if let Some(extend) = &session.extend {
                 extend(&context).map_err(|e| Error::execution(&e))?;
             }
-            friendly_sql::rewrite(&mut statement);
+            friendly::rewrite(&mut statement)?;
             let state = context.state();
+            friendly::expand(&mut statement, &state, &sql).await?;
             ignored_clauses::check(&statement, &sql, &|name| {
                 state.scalar_functions().contains_key(name)
                     && !state.aggregate_functions().contains_key(name)

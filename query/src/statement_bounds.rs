@@ -50,6 +50,10 @@ const OPERATORS: [&str; 15] = [
 ];
 /// Words between two queries or tables; a comma does not end their chain.
 const QUERY_OPERATORS: [&str; 5] = ["EXCEPT", "INTERSECT", "JOIN", "MINUS", "UNION"];
+/// Words after a table that wrap it in one more query.
+const PIVOT_WORDS: [&str; 2] = ["PIVOT", "UNPIVOT"];
+/// Maximum number of pivots in one statement: each is planned for its columns.
+const MOST_PIVOTS: usize = 20;
 /// Functions whose strings are types, which nest by brackets as well.
 const TYPE_FUNCTIONS: [&str; 2] = ["ARROW_CAST", "ARROW_TRY_CAST"];
 
@@ -87,6 +91,10 @@ pub fn check_statement_bounds(sql: &str, dialect: &dyn Dialect) -> Result<(), Er
     let mut open = vec![OpenBracket::default()];
     let mut doublings = 0.0;
     let mut statements = 0;
+    let pivots = tokens.iter().filter(|t| matches!(t, Token::Word(w) if is_one_of(w, &PIVOT_WORDS))).count();
+    if pivots > MOST_PIVOTS {
+        return refused("pivots", MOST_PIVOTS, "WITH gives a name to what stands inside");
+    }
     let mut before = &Token::EOF;
     // `1_000_` is a number with a column's name behind it, and `12x` as well.
     if let Some([Token::Number(number, _), Token::Word(word)]) =

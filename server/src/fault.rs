@@ -4,7 +4,7 @@
 use std::time::Duration;
 
 use echolake_export::Error as SliceError;
-use echolake_query::Error as QueryError;
+use echolake_query::{Error as QueryError, QueryPlace};
 
 use crate::tokens::TokenScope;
 
@@ -227,7 +227,31 @@ impl FaultCode {
     }
 }
 
+/// The parts of a failure's text, for protocols that have fields for them.
+pub(crate) struct FaultParts {
+    /// What is wrong.
+    pub(crate) message: String,
+    /// The place in the query.
+    pub(crate) place: Option<QueryPlace>,
+    /// What to do.
+    pub(crate) hint: Option<String>,
+}
+
 impl RequestFault {
+    /// Returns the parts of its text.
+    pub(crate) fn parts(&self) -> FaultParts {
+        if let Self::Query(QueryError::Query { message, place, hint }) = self {
+            return FaultParts { message: message.clone(), place: place.clone(), hint: hint.clone() };
+        }
+        let text = self.to_string();
+        match text.split_once("; hint: ") {
+            Some((message, hint)) => {
+                FaultParts { message: message.to_owned(), place: None, hint: Some(hint.to_owned()) }
+            }
+            None => FaultParts { message: text, place: None, hint: None },
+        }
+    }
+
     /// A request that is not understood.
     pub(crate) fn request(message: impl Into<String>) -> Self {
         Self::Request { message: message.into() }

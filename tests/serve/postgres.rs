@@ -1,5 +1,6 @@
 //! As much of a Postgres client as these tests need: the simple protocol, a password, a CancelRequest.
 
+use std::collections::BTreeMap;
 use std::io::{Read as _, Write as _};
 use std::net::TcpStream;
 
@@ -61,6 +62,22 @@ impl WireClient {
                 (b'D', body) => rows.push(row(&body)),
                 (b'E', body) => failed = Some(state(&body)),
                 (b'Z', _) => return failed.map_or(Ok(rows), Err),
+                _ => {}
+            }
+        }
+    }
+
+    /// The fields of the error of a query that is refused.
+    pub(crate) fn refusal(&mut self, sql: &str) -> BTreeMap<char, String> {
+        self.begin(sql);
+        let mut fields = BTreeMap::new();
+        loop {
+            match self.message() {
+                (b'E', body) => fields.extend(body.split(|b| *b == 0).filter_map(|field| {
+                    let (kind, text) = field.split_first()?;
+                    Some((char::from(*kind), String::from_utf8_lossy(text).into_owned()))
+                })),
+                (b'Z', _) => return fields,
                 _ => {}
             }
         }

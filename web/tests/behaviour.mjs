@@ -436,6 +436,18 @@ await check('an answer’s first chart says something, and numbers have one minu
   assert.match(await page.locator('.status').innerText(), /^1\srow,/)
 })
 
+await check('a histogram has every row of an answer in one of its ranges', async () => {
+  await open(`/sql?q=${encodeURIComponent('select direct_mm from pairs')}&as=histogram`)
+  await page.locator('.rows tbody tr').first().waitFor()
+  const rows = Number((await page.locator('.status').innerText()).split(/\srows/)[0].replace(/\D/g, ''))
+  const counts = await page.locator('.chart .bars rect + text').allTextContents()
+  assert.ok(rows > 0 && counts.length > 1, `${rows} rows, ${counts.length} bars`)
+  assert.equal(
+    counts.reduce((sum, one) => sum + Number(one), 0),
+    rows,
+  )
+})
+
 await check(
   'completion closes, earlier queries are kept without tokens, and a failed query offers no export',
   async () => {

@@ -101,6 +101,7 @@ pub(super) fn check(description: &FunctionDescription, types: &[DataType]) -> Re
             ArgumentKind::Number => *given == DataType::Float64,
             ArgumentKind::Integer => *given == DataType::Int64,
             ArgumentKind::Text => *given == DataType::Utf8,
+            ArgumentKind::Value => true,
         };
         if !fits {
             let (i, words) = (i + 1, kind.words());

@@ -50,6 +50,8 @@ pub(super) enum ArgumentKind {
     Integer,
     /// Text.
     Text,
+    /// A value of any type.
+    Value,
 }
 
 impl FunctionFamily {
@@ -78,6 +80,7 @@ impl ArgumentKind {
             Self::Number => "a number",
             Self::Integer => "a whole number",
             Self::Text => "text",
+            Self::Value => "a value",
         }
     }
 }

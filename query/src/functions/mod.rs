@@ -25,7 +25,8 @@ mod sound;
 mod spectrum;
 mod symmetry;
 #[cfg(test)]
-mod tests;
+pub(crate) mod tests;
+mod value_counts;
 
 use std::sync::Arc;
 
@@ -85,6 +86,8 @@ impl FunctionSet {
             udaf(p90_mean::P90MeanFunction),
             udaf(diffusion::DiffusionCoefficientFunction),
             udaf(average::AvgListFunction),
+            AggregateUDF::new_from_impl(value_counts::ValueCountFunction::mode()),
+            AggregateUDF::new_from_impl(value_counts::ValueCountFunction::histogram()),
         ];
         Ok(Self {
             scalar: scalar.into_iter().map(Arc::new).collect(),

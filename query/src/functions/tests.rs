@@ -21,14 +21,14 @@ const LEN: usize = 384;
 const BANDS: [&str; 5] = ["2500", "5000", "10000", "20000", "40000"];
 
 /// A lake with two runs in it, made of the golden cases: surface `0015_0`, and its Flat.
-struct Small {
+pub(crate) struct SmallLake {
     _folder: tempfile::TempDir,
     session: Session,
     golden: Vec<RecordBatch>,
 }
 
-impl Small {
-    async fn new() -> Self {
+impl SmallLake {
+    pub(crate) async fn new() -> Self {
         let folder = tempfile::tempdir().expect("a folder");
         let url = folder.path().join("lake").display().to_string();
         let lake = Lake::open_or_create(&url, &Rig::paper(), &ReferenceSurfaces::default()).await.expect("a lake");
@@ -39,7 +39,7 @@ impl Small {
         Self { _folder: folder, session, golden }
     }
 
-    async fn batches(&self, sql: &str) -> Result<Vec<RecordBatch>, Error> {
+    pub(crate) async fn batches(&self, sql: &str) -> Result<Vec<RecordBatch>, Error> {
         let mut answer = self.session.query(sql).await?;
         let mut batches = vec![RecordBatch::new_empty(answer.schema.clone())];
         while let Some(batch) = answer.next().await? {
@@ -173,7 +173,7 @@ fn example(documentation: &datafusion::logical_expr::Documentation) -> (String, 
 
 #[tokio::test]
 async fn examples_answer_what_they_say() {
-    let small = Small::new().await;
+    let small = SmallLake::new().await;
     let functions = FunctionSet::all(&Rig::paper()).expect("the built-in rig is valid");
     let scalar = functions.scalar().iter().map(|f| (f.name(), f.documentation()));
     let all: Vec<_> = scalar.chain(functions.aggregate().iter().map(|f| (f.name(), f.documentation()))).collect();
@@ -190,7 +190,7 @@ async fn examples_answer_what_they_say() {
 
 #[tokio::test]
 async fn bands_and_curves_are_the_golden_ones() {
-    let small = Small::new().await;
+    let small = SmallLake::new().await;
     let cases: usize = small.golden.iter().map(RecordBatch::num_rows).sum();
     for (band, name) in BANDS.iter().enumerate() {
         let sql = format!(
@@ -224,7 +224,7 @@ async fn bands_and_curves_are_the_golden_ones() {
 
 #[tokio::test]
 async fn a_decay_a_spectrum_and_an_arrival_that_are_known() {
-    let small = Small::new().await;
+    let small = SmallLake::new().await;
     // x = 0.9^n falls by 20 log10(0.9) dB per sample.
     let decay = "select edc(array_agg(power(0.9, n) order by n)) from (select unnest(range(2000)) as n)";
     for (n, level) in small.numbers(decay).await.iter().enumerate().take(500) {
@@ -241,7 +241,7 @@ async fn a_decay_a_spectrum_and_an_arrival_that_are_known() {
 
 #[tokio::test]
 async fn fresnel_zones_are_those_of_table_pairs() {
-    let small = Small::new().await;
+    let small = SmallLake::new().await;
     let zone = "fresnel(m.x_mm, m.y_mm, m.z_mm, s.x_mm, s.y_mm, s.z_mm";
     let from = "from pairs p join points m on m.point_id = p.microphone join points s on s.point_id = p.speaker";
     for (hz, least, greatest) in [(2000, 227.6, 535.5), (40000, 47.3, 162.3)] {
@@ -255,7 +255,7 @@ async fn fresnel_zones_are_those_of_table_pairs() {
 
 #[tokio::test]
 async fn symmetries_are_a_group_on_points_pairs_and_maps() {
-    let small = Small::new().await;
+    let small = SmallLake::new().await;
     let inverse = |symmetry: Symmetry| match symmetry {
         Symmetry::Rot90 => Symmetry::Rot270,
         Symmetry::Rot270 => Symmetry::Rot90,
@@ -284,7 +284,7 @@ async fn symmetries_are_a_group_on_points_pairs_and_maps() {
 
 #[tokio::test]
 async fn aggregates_are_the_same_however_rows_are_divided() {
-    let small = Small::new().await;
+    let small = SmallLake::new().await;
     let values =
         "(select n, n % 7 as g, cast((n * 7919) % 1009 as double) as x from (select unnest(range(20000)) as n))";
     let all: Vec<f64> = (0..20_000u32).map(|n| f64::from((n * 7919) % 1009)).collect();
@@ -329,7 +329,7 @@ async fn aggregates_are_the_same_however_rows_are_divided() {
 
 #[tokio::test]
 async fn any_kind_of_list_gives_the_same() {
-    let small = Small::new().await;
+    let small = SmallLake::new().await;
     for kind in [
         "List(Float32)",
         "List(Float64)",
@@ -372,7 +372,7 @@ async fn any_kind_of_list_gives_the_same() {
 
 #[tokio::test]
 async fn hostile_arguments_are_refused_in_words_or_null() {
-    let small = Small::new().await;
+    let small = SmallLake::new().await;
     let mut said = String::new();
     for sql in [
         "select edc()",
@@ -415,17 +415,23 @@ async fn hostile_arguments_are_refused_in_words_or_null() {
     }
     expect![[r#"
         select edc()
-            `edc`: 0 arguments are given; hint: edc(ir)
+            `edc`: 0 arguments are given
+        hint: edc(ir)
         select nce([1])
-            `nce`: 1 argument is given; hint: nce(ir, flat_energy[, centre_hz])
+            `nce`: 1 argument is given
+        hint: nce(ir, flat_energy[, centre_hz])
         select edc('x')
-            `edc`: argument 1, `ir`, is Utf8, not a list of numbers; hint: it is the response
+            `edc`: argument 1, `ir`, is Utf8, not a list of numbers
+        hint: it is the response
         select edc(['x'])
-            `edc`: argument 1, `ir`, is List(Utf8), not a list of numbers; hint: it is the response
+            `edc`: argument 1, `ir`, is List(Utf8), not a list of numbers
+        hint: it is the response
         select db('loud')
-            `db`: argument 1, `x`, is Utf8, not a number; hint: it is ratio of energies, as tnce_total
+            `db`: argument 1, `x`, is Utf8, not a number
+        hint: it is ratio of energies, as tnce_total
         select d4_point(1.5, 'rot90')
-            `d4_point`: argument 1, `point_id`, is Float64, not a whole number; hint: it is a point of table points
+            `d4_point`: argument 1, `point_id`, is Float64, not a whole number
+        hint: it is a point of table points
         select band_energy([1, 2], 3000)
             the query failed: `band_energy`: `centre_hz` is 3000.0 in row 1 of its batch; hint: the lake's bands are at 2500, 5000, 10000, 20000, 40000 Hz
         select band_energy([1, 2], 'nan'::double)
@@ -479,7 +485,8 @@ async fn hostile_arguments_are_refused_in_words_or_null() {
         select p90_mean(distinct x), p90_mean(distinct y) from (values (1, 2), (2, 3)) as t(x, y)
             the query failed: `p90_mean` knows no DISTINCT; hint: take them from a subquery with SELECT DISTINCT
         select p90_mean('x')
-            `p90_mean`: argument 1, `x`, is Utf8, not a number; hint: it is the values, as tnce_total (linear, not dB)
+            `p90_mean`: argument 1, `x`, is Utf8, not a number
+        hint: it is the values, as tnce_total (linear, not dB)
     "#]].assert_eq(&said);
     let mut wrong = String::new();
     for null in [
@@ -582,7 +589,7 @@ fn slices_of_arrays_are_read_where_they_begin() {
 
 #[tokio::test]
 async fn functions_are_listed() {
-    let small = Small::new().await;
+    let small = SmallLake::new().await;
     let listed = "select count(distinct routine_name) from information_schema.routines where routine_name in ('edc', 'p90_mean')";
     let batch = small.rows(listed).await;
     assert_eq!(batch.column(0).as_primitive::<Int64Type>().value(0), 2);

@@ -313,34 +313,35 @@ async fn errors_point_at_the_place() {
         expected.assert_eq(&session.query(sql).await.map(drop).expect_err(sql).to_string());
     };
     check("select nonsense from runs", expect![[r#"
-        no column `nonsense`
+        no column `nonsense` (line 1, column 8)
           select nonsense from runs
                  ^
         hint: the columns are surface_id, run_id, state, missing, origin, rig, started_ns, started, ended_ns, ended, measurements, rejected, ...; DESCRIBE lists all of a table"#]]).await;
     check(
         "select pair_idd from pairs",
         expect![[r#"
-        no column `pair_idd`
-          select pair_idd from pairs
-                 ^
-        hint: did you mean `pair_id`?"#]],
+            no column `pair_idd` (line 1, column 8)
+              select pair_idd from pairs
+                     ^
+            hint: did you mean `pair_id`?"#]],
     )
     .await;
     check(
         "selec 1",
         expect![[r#"
-        Expected: an SQL statement, found: selec
-          selec 1
-          ^"#]],
+            Expected: an SQL statement, found: selec (line 1, column 1)
+              selec 1
+              ^
+            hint: docs/clients.md lists the syntax, docs/functions.md the functions; DESCRIBE (query) shows columns and types"#]],
     )
     .await;
     check(
         "select * from rums",
         expect![[r#"
-        no table `rums`
-          select * from rums
-                        ^
-        hint: did you mean `runs`?"#]],
+            no table `rums` (line 1, column 15)
+              select * from rums
+                            ^
+            hint: did you mean `runs`?"#]],
     )
     .await;
     check(
@@ -353,9 +354,10 @@ async fn errors_point_at_the_place() {
     check(
         "select 1 +",
         expect![[r#"
-        Expected: an expression, found the end of the query
-          select 1 +
-                    ^"#]],
+            Expected: an expression, found the end of the query (line 1, column 11)
+              select 1 +
+                        ^
+            hint: docs/clients.md lists the syntax, docs/functions.md the functions; DESCRIBE (query) shows columns and types"#]],
     )
     .await;
 }

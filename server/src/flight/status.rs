@@ -1,4 +1,5 @@
-//! Failures as gRPC statuses, with the code that stays the same in the metadata `echolake-code`.
+//! Failures as gRPC statuses: the text with place, mark and hint, and in the metadata the code that stays the same
+//! (`echolake-code`) and the place in the query (`echolake-line`, `echolake-column`).
 
 use tonic::metadata::{MetadataMap, MetadataValue};
 use tonic::{Code as Grpc, Status};
@@ -7,12 +8,20 @@ use crate::fault::{FaultCode, RequestFault};
 
 /// The metadata key of the code that stays the same.
 const CODE: &str = "echolake-code";
+/// The metadata key of the line of an error in a query.
+const LINE: &str = "echolake-line";
+/// The metadata key of its column.
+const COLUMN: &str = "echolake-column";
 
 /// A failure as a status.
 pub(crate) fn status(fault: &RequestFault) -> Status {
     let code = fault.code();
     let mut metadata = MetadataMap::new();
     metadata.insert(CODE, MetadataValue::from_static(code.name()));
+    if let Some(place) = fault.parts().place {
+        metadata.insert(LINE, MetadataValue::from(place.line));
+        metadata.insert(COLUMN, MetadataValue::from(place.column));
+    }
     Status::with_metadata(grpc(code), fault.to_string(), metadata)
 }
 

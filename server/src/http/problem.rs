@@ -2,6 +2,7 @@
 
 use axum::http::{HeaderValue, StatusCode, header};
 use axum::response::{IntoResponse, Response};
+use echolake_query::QueryPlace;
 use serde::Serialize;
 use utoipa::ToSchema;
 use utoipa::openapi::{ObjectBuilder, RefOr, Schema, Type};
@@ -21,9 +22,32 @@ pub(super) struct ProblemBody<'a> {
     status: u16,
     #[schema(schema_with = code_schema)]
     code: &'a str,
-    /// What is wrong; what to do follows after `; hint: `.
+    /// What is wrong, where, and what to do: the text that all protocols and the prompt have.
     #[schema(required = false)]
     detail: String,
+    /// What to do.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    hint: Option<String>,
+    /// The place of an error in a query's text.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    place: Option<ProblemPlace>,
+}
+
+/// A place in a query's text; all count from 1, in characters.
+#[derive(Serialize, ToSchema)]
+pub(super) struct ProblemPlace {
+    line: u64,
+    column: u64,
+    /// Position in the whole text.
+    position: u64,
+    /// The line, and below it a mark under the place.
+    mark: String,
+}
+
+impl From<QueryPlace> for ProblemPlace {
+    fn from(QueryPlace { line, column, position, mark }: QueryPlace) -> Self {
+        Self { line, column, position, mark }
+    }
 }
 
 fn code_schema() -> RefOr<Schema> {
@@ -42,12 +66,15 @@ impl ProblemResponse {
     pub(crate) fn answer(&self) -> Response {
         let code = self.0.code();
         let (status, title) = status(code);
+        let parts = self.0.parts();
         let body = ProblemBody {
             kind: format!("urn:echolake:problem:{}", code.name()),
             title,
             status: status.as_u16(),
             code: code.name(),
             detail: self.0.to_string(),
+            hint: parts.hint,
+            place: parts.place.map(ProblemPlace::from),
         };
         let mut response = (status, axum::Json(body)).into_response();
         response.extensions_mut().insert(code);

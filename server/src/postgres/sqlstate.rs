@@ -3,7 +3,7 @@
 use echolake_query::Error as QueryError;
 use pgwire::error::{ErrorInfo, PgWireError};
 
-use crate::fault::{FaultCode, RequestFault};
+use crate::fault::{FaultCode, FaultParts, RequestFault};
 
 /// A failure that leaves the connection open.
 pub(crate) fn error(fault: &RequestFault) -> PgWireError {
@@ -15,23 +15,13 @@ pub(crate) fn fatal(fault: &RequestFault) -> PgWireError {
     info("FATAL", fault)
 }
 
+// Clients mark the place in their own copy of the text.
 fn info(severity: &str, fault: &RequestFault) -> PgWireError {
-    let (message, place, hint) = parts(fault);
+    let FaultParts { message, place, hint } = fault.parts();
     let mut info = ErrorInfo::new(severity.to_owned(), state(fault).to_owned(), message);
-    info.detail = place;
+    info.position = place.map(|place| place.position.to_string());
     info.hint = hint;
     PgWireError::UserError(Box::new(info))
-}
-
-fn parts(fault: &RequestFault) -> (String, Option<String>, Option<String>) {
-    if let RequestFault::Query(QueryError::Query { message, place, hint }) = fault {
-        return (message.clone(), place.clone(), hint.clone());
-    }
-    let text = fault.to_string();
-    match text.split_once("; hint: ") {
-        Some((message, hint)) => (message.to_owned(), None, Some(hint.to_owned())),
-        None => (text, None, None),
-    }
 }
 
 // Appendix A of Postgres' manual.

@@ -49,7 +49,7 @@ export function apiHref(path: string, params: Record<string, Param | readonly st
 async function refusal(response: Response): Promise<ApiError> {
   try {
     const problem = (await response.json()) as Schemas['Problem']
-    const [detail, hint = ''] = (problem.detail ?? problem.title).split('; hint: ')
+    const [detail = '', hint = ''] = (problem.detail ?? problem.title).split(/(?:; |\n)hint: /)
     return new ApiError(problem.status, problem.code, detail, hint)
   } catch {
     return new ApiError(response.status, 'internal', `the server answered ${response.status}`, '')

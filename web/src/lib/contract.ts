@@ -880,11 +880,23 @@ export interface components {
         readonly Problem: {
             /** @enum {string} */
             readonly code: "query_invalid" | "read_only" | "query_failed" | "format_impossible" | "lake_unreadable" | "request_invalid" | "unsupported" | "not_found" | "gone" | "file_changed" | "no_data" | "method_not_allowed" | "range_not_satisfiable" | "request_too_large" | "unauthenticated" | "forbidden" | "foreign_origin" | "cancelled" | "time_limit" | "memory_limit" | "row_limit" | "too_many" | "query_ended_engine" | "internal";
-            /** @description What is wrong; what to do follows after `; hint: `. */
+            /** @description What is wrong, where, and what to do: the text that all protocols and the prompt have. */
             readonly detail?: string;
+            /** @description What to do. */
+            readonly hint: string | null;
+            readonly place: components["schemas"]["ProblemPlace"] | null;
             readonly status: number;
             readonly title: string;
             readonly type: string;
+        };
+        /** @description A place in a query's text; all count from 1, in characters. */
+        readonly ProblemPlace: {
+            readonly column: number;
+            readonly line: number;
+            /** @description The line, and below it a mark under the place. */
+            readonly mark: string;
+            /** @description Position in the whole text. */
+            readonly position: number;
         };
         /** @description Measurements with a flag. */
         readonly Quality: {

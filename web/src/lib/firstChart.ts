@@ -1,7 +1,14 @@
 //! The chart of an answer that says something: bars of numbers over names, points of two quantities, a line over time.
 import type { Answer } from './answer'
 
-export const CHART_FORMS = { none: 'None', bars: 'Bars', points: 'Points', line: 'Line' } as const
+export const CHART_FORMS = {
+  none: 'None',
+  bars: 'Bars',
+  histogram: 'Histogram',
+  points: 'Points',
+  line: 'Line',
+  grid: 'Grid',
+} as const
 export type ChartForm = keyof typeof CHART_FORMS
 
 export interface ChartChoice {

@@ -1,0 +1,121 @@
+//! SQL over the three protocols and the prompt: errors have place and hint, and all but Postgres' read one dialect.
+
+use arrow_flight::error::FlightError;
+use arrow_flight::sql::client::FlightSqlServiceClient;
+use futures::TryStreamExt as _;
+use tonic::transport::{Channel, Endpoint};
+
+use super::server::{ANSWER_LIMIT, ServedLake};
+use super::{json, lake, postgres, served, sql};
+
+/// A wrong statement, and what every protocol says of it.
+struct WrongStatement {
+    sql: &'static str,
+    /// Line and column, from 1.
+    place: (u64, u64),
+    hint: &'static str,
+}
+
+const WRONG: [WrongStatement; 7] = [
+    WrongStatement { sql: "select nonsense from runs", place: (1, 8), hint: "the columns are surface_id" },
+    WrongStatement { sql: "select 'é',\n  pair_idd from pairs", place: (2, 3), hint: "did you mean `pair_id`?" },
+    WrongStatement { sql: "select * from rums", place: (1, 15), hint: "did you mean `runs`?" },
+    WrongStatement { sql: "selec 1", place: (1, 1), hint: "docs/clients.md" },
+    WrongStatement { sql: "select *\nfrom points\ntablesample (10)", place: (3, 1), hint: "random()" },
+    WrongStatement { sql: "select 1 +", place: (1, 11), hint: "docs/clients.md" },
+    WrongStatement { sql: "select formatt(1)", place: (1, 8), hint: "SHOW FUNCTIONS" },
+];
+
+/// Friendly statements, and the one cell of their answers.
+const FRIENDLY: [(&str, &str); 5] = [
+    ("from pairs select count()", "45"),
+    ("select [x * 2 for x in [1, 2]][2] as twice", "4"),
+    ("select n: count(*), n + 1 as more from pairs", "45"),
+    ("select max(columns('pair_.*')) from pairs", "44"),
+    ("select 'flat'.upper()", "FLAT"),
+];
+
+fn position(sql: &str, (line, column): (u64, u64)) -> String {
+    let above: usize = sql.split_inclusive('\n').take(line as usize - 1).map(|line| line.chars().count()).sum();
+    (above as u64 + column).to_string()
+}
+
+#[test]
+fn errors_over_http_have_place_and_hint() {
+    let folder = lake();
+    let server = served(&folder, &[]);
+    for WrongStatement { sql: text, place, hint } in WRONG {
+        let problem = json(&sql(&server, text));
+        let detail = problem["detail"].as_str().expect("a detail");
+        assert!(problem["hint"].as_str().is_some_and(|given| given.contains(hint)), "{problem}");
+        assert!(detail.contains("hint: "), "{detail}");
+        let given = &problem["place"];
+        assert_eq!(given["line"].as_u64().zip(given["column"].as_u64()), Some(place), "{problem}");
+        assert_eq!(given["position"].to_string(), position(text, place), "{problem}");
+        let mark = given["mark"].as_str().expect("a mark");
+        assert!(mark.ends_with('^') && detail.contains(mark), "{problem}");
+    }
+}
+
+#[test]
+fn errors_over_postgres_have_position_and_hint() {
+    let folder = lake();
+    let server = served(&folder, &[]);
+    let mut client = postgres::WireClient::connect(&server, None);
+    for WrongStatement { sql, place, hint } in WRONG {
+        let fields = client.refusal(sql);
+        assert_eq!(fields.get(&'P').cloned(), Some(position(sql, place)), "{sql}: {fields:?}");
+        assert!(fields.get(&'H').is_some_and(|given| given.contains(hint)), "{sql}: {fields:?}");
+        assert!(fields.get(&'M').is_some_and(|message| !message.contains("hint:")), "{sql}: {fields:?}");
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn errors_over_flight_sql_have_place_and_hint() {
+    let folder = lake();
+    let server = served(&folder, &[]);
+    let mut client = connect(&server).await;
+    for WrongStatement { sql, place, hint } in WRONG {
+        let Err(FlightError::Tonic(status)) = first_cell(&mut client, sql).await else { panic!("{sql}: no refusal") };
+        let text = status.message();
+        assert!(text.split_once("hint: ").is_some_and(|(_, given)| given.contains(hint)), "{text}");
+        let number = |key: &str| status.metadata().get(key)?.to_str().ok()?.parse::<u64>().ok();
+        assert_eq!(number("echolake-line").zip(number("echolake-column")), Some(place), "{text}");
+        assert!(text.contains('^'), "{text}");
+    }
+    drop(client);
+    tokio::task::spawn_blocking(move || drop(server)).await.expect("ended");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn http_flight_sql_and_the_prompt_read_one_dialect() {
+    let folder = lake();
+    let server = served(&folder, &[]);
+    let mut client = connect(&server).await;
+    for (text, expected) in FRIENDLY {
+        let rows = json(&sql(&server, text));
+        let cell = rows[0].as_object().and_then(|row| row.values().next()).expect("a cell").clone();
+        assert_eq!(cell.as_str().map_or_else(|| cell.to_string(), str::to_owned), expected, "{text}");
+        let over_flight = first_cell(&mut client, text).await.unwrap_or_else(|e| panic!("{text}: {e}"));
+        assert_eq!(over_flight, expected, "{text}");
+        let printed = folder.ok(&["sql", text, "--format", "csv"]);
+        let cell = printed.lines().nth(1).and_then(|line| line.split(',').next());
+        assert_eq!(cell, Some(expected), "{text}: {printed}");
+    }
+    drop(client);
+    tokio::task::spawn_blocking(move || drop(server)).await.expect("ended");
+}
+
+async fn connect(server: &ServedLake) -> FlightSqlServiceClient<Channel> {
+    let endpoint = Endpoint::from_shared(format!("http://{}", server.flight_sql)).expect("a URL");
+    let channel = endpoint.connect_timeout(ANSWER_LIMIT).timeout(ANSWER_LIMIT).connect().await;
+    FlightSqlServiceClient::new(channel.expect("connected"))
+}
+
+async fn first_cell(client: &mut FlightSqlServiceClient<Channel>, sql: &str) -> Result<String, FlightError> {
+    let info = client.execute(sql.to_owned(), None).await?;
+    let ticket = info.endpoint.into_iter().find_map(|endpoint| endpoint.ticket).expect("a ticket");
+    let batches: Vec<_> = client.do_get(ticket).await?.try_collect().await?;
+    let batch = batches.iter().find(|batch| batch.num_rows() > 0).expect("a row");
+    Ok(arrow::util::display::array_value_to_string(batch.column(0), 0).expect("a cell"))
+}
