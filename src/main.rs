@@ -3,6 +3,8 @@
 
 mod cli;
 mod commands;
+#[cfg(feature = "lake")]
+mod duration;
 mod error_text;
 mod logging;
 mod progress;

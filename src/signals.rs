@@ -1,6 +1,7 @@
 //! Ctrl-C and SIGTERM as a request to stop. A command listens before it prints its first line: whoever waits for that
 //! line may send the signal next.
 
+use std::fmt::Display;
 use std::io::Write as _;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -32,7 +33,7 @@ impl StopRequest {
     ///
     /// # Errors
     /// The system refused a handler.
-    pub(crate) fn listen(reply: &'static str) -> anyhow::Result<Self> {
+    pub(crate) fn listen(reply: impl Display + Send + 'static) -> anyhow::Result<Self> {
         let mut signals = StopSignals::register()?;
         let request = Self { flag: Arc::new(AtomicBool::new(false)), made: Arc::new(Notify::new()) };
         let listener = request.clone();

@@ -4,6 +4,7 @@ mod attacks;
 pub(crate) mod catalogue;
 mod contract;
 mod dialect;
+mod drain;
 mod encryption;
 mod escapes;
 pub(crate) mod http;
@@ -11,6 +12,7 @@ mod log;
 pub(crate) mod postgres;
 pub(crate) mod server;
 mod slices;
+mod watched;
 
 use std::io::{self, Read as _};
 use std::net::TcpStream;

@@ -24,6 +24,7 @@ use quick_cache::sync::Cache;
 
 use crate::as_of::{self, PastTableName};
 use crate::mcap::{self, Contents};
+use crate::system::{self, SystemSource};
 use crate::table::{FileReaders, LakeTable};
 use crate::views::{LakeView, LookupFunctions, PairJoin, SortedNulls, UnusedJoin};
 use crate::{Error, error};
@@ -54,7 +55,7 @@ pub(crate) struct LakeCatalog {
 struct CatalogSnapshot {
     snapshot: Arc<LakeSnapshot>,
     tables: HashMap<Table, Arc<LakeTable>>,
-    providers: Vec<(&'static str, Arc<dyn TableProvider>)>,
+    providers: Vec<(TableReference, Arc<dyn TableProvider>)>,
     looked: Mutex<Instant>,
     /// The last look at the log of `runs`.
     checked: Mutex<Instant>,
@@ -92,11 +93,19 @@ impl LakeCatalog {
     /// # Errors
     /// [`Error::Lake`] if the lake cannot be read, or not as of the moment that the statement names;
     /// [`Error::Query`] if that is no moment.
-    pub(crate) async fn register(&self, context: &SessionContext, statement: &mut Statement) -> Result<(), Error> {
+    pub(crate) async fn register(
+        &self,
+        context: &SessionContext,
+        system: Option<&Arc<dyn SystemSource>>,
+        statement: &mut Statement,
+    ) -> Result<(), Error> {
         let past = as_of::named(statement);
         let current = self.current().await?;
         for (name, provider) in &current.providers {
-            context.register_table(TableReference::bare(*name), provider.clone()).map_err(failed)?;
+            context.register_table(name.clone(), provider.clone()).map_err(failed)?;
+        }
+        for (name, provider) in system.into_iter().flat_map(system::source_tables) {
+            context.register_table(TableReference::partial(system::SCHEMA, name), provider).map_err(failed)?;
         }
         for past in past {
             let provider = self.at(&past).await?;
@@ -200,12 +209,20 @@ impl LakeCatalog {
             };
             tables.insert(table, provider);
         }
-        let mut providers: Vec<(&'static str, Arc<dyn TableProvider>)> =
-            tables.iter().map(|(table, provider)| (table.name(), provider.clone() as _)).collect();
+        let mut providers: Vec<(TableReference, Arc<dyn TableProvider>)> = tables
+            .iter()
+            .map(|(table, provider)| (TableReference::bare(table.name()), provider.clone() as _))
+            .collect();
         for view in LakeView::ALL {
             let of = |table: &Table| Some((*table, tables.get(table)?.clone() as Arc<dyn TableProvider>));
             let beneath = view.tables().iter().filter_map(of).collect();
-            providers.push((view.name(), Arc::new(view.over(&self.lake, &self.lookups, &beneath).map_err(failed)?)));
+            let view_table = view.over(&self.lake, &self.lookups, &beneath).map_err(failed)?;
+            providers.push((TableReference::bare(view.name()), Arc::new(view_table)));
+        }
+        if let Some(runs) = tables.get(&Table::Runs) {
+            let of_lake = system::lake_tables(&self.lake, &snapshot, runs.clone());
+            let named = of_lake.into_iter().map(|(name, table)| (TableReference::partial(system::SCHEMA, name), table));
+            providers.extend(named);
         }
         let [looked, checked] = [taken, taken].map(Mutex::new);
         Ok(CatalogSnapshot { snapshot, tables, providers, looked, checked })

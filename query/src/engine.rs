@@ -1,8 +1,7 @@
 //! The engine: the lake, cached file footers, memory and limits that all sessions of a process share.
 
 use std::collections::BTreeSet;
-use std::sync::Arc;
-use std::sync::atomic::AtomicUsize;
+use std::sync::{Arc, OnceLock};
 use std::time::Duration;
 
 use datafusion::catalog::{CatalogProvider as _, CatalogProviderList as _};
@@ -23,11 +22,12 @@ use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 use tokio::task::JoinHandle;
 
 use crate::catalog::LakeCatalog;
-use crate::control::pool::PartialPool;
+use crate::control::pool::{HeldMemory, PartialPool};
 use crate::control::threads::QueryThreads;
 use crate::control::{QueryTicket, RunningQueries, StopReason};
 use crate::functions::octet_length_of_bytes;
 use crate::small::SmallTables;
+use crate::system::{self, SystemSource};
 use crate::table::FileReaders;
 use crate::{Error, FunctionSet, OpaqueValue, Session};
 
@@ -78,6 +78,7 @@ struct EngineState {
     own: BTreeSet<String>,
     // A thread for timeouts, which busy query threads cannot delay.
     watch: QueryThreads,
+    system: OnceLock<Arc<dyn SystemSource>>,
 }
 
 /// Limits on all queries of a process together.
@@ -126,7 +127,7 @@ pub struct EngineClient {
     quota: QueryQuota,
     places: Option<Arc<Semaphore>>,
     /// Bytes that operators of its queries have reserved.
-    held: Arc<AtomicUsize>,
+    held: Arc<HeldMemory>,
 }
 
 impl EngineClient {
@@ -224,8 +225,19 @@ impl QueryEngine {
             limits,
             own: functions.names().map(str::to_owned).collect(),
             watch: QueryThreads::new("query-watch", 1).map_err(threads)?,
+            system: OnceLock::new(),
         };
         Ok(Self(OpaqueValue::new(inner)))
+    }
+
+    /// Adds tables to the schema `system`; to be called once.
+    pub fn add_system_tables(&self, source: Arc<dyn SystemSource>) {
+        let _ = self.0.system.set(source);
+    }
+
+    /// Returns who has further tables of the schema `system`.
+    pub(crate) fn system_source(&self) -> Option<&Arc<dyn SystemSource>> {
+        self.0.system.get()
     }
 
     /// Creates a session of a client, one per connection.
@@ -339,7 +351,9 @@ impl QueryEngine {
         let names = &self.0.template.config_options().catalog;
         let catalog = MemoryCatalogProvider::new();
         // A new catalogue accepts any name.
-        let _ = catalog.register_schema(&names.default_schema, Arc::new(MemorySchemaProvider::new()));
+        for schema in [&names.default_schema, system::SCHEMA] {
+            let _ = catalog.register_schema(schema, Arc::new(MemorySchemaProvider::new()));
+        }
         let catalogs = MemoryCatalogProviderList::new();
         catalogs.register_catalog(names.default_catalog.clone(), Arc::new(catalog));
         let state = SessionStateBuilder::new_from_existing(self.0.template.clone())

@@ -42,6 +42,7 @@ mod session;
 mod small;
 mod statement_bounds;
 mod summarize;
+mod system;
 mod table;
 mod views;
 
@@ -54,3 +55,4 @@ pub use opaque::OpaqueValue;
 pub use predicate::PredicateForm;
 pub use session::{CancelHandle, ContextExtension, PreparedQuery, QueryAnswer, Session};
 pub use statement_bounds::check_statement_bounds;
+pub use system::SystemSource;

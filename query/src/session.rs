@@ -53,6 +53,11 @@ pub struct PreparedQuery {
 }
 
 impl PreparedQuery {
+    /// Returns its text.
+    pub fn sql(&self) -> &str {
+        &self.sql
+    }
+
     /// Returns the schema of its answers.
     pub fn schema(&self) -> SchemaRef {
         Arc::new(self.plan.schema().as_arrow().clone())
@@ -124,6 +129,11 @@ impl QueryAnswer {
             return Err(Error::RowLimit { limit });
         }
         Ok(Some(batch))
+    }
+
+    /// Returns the most memory that its operators have held, bytes.
+    pub fn peak_memory(&self) -> usize {
+        self.ticket.held().peak()
     }
 
     /// Returns a handle that cancels this answer's query.
@@ -294,7 +304,8 @@ impl Session {
             let sql = text;
             let wrong = |e: DataFusionError| Error::plan(&sql, &e);
             let context = session.engine.context();
-            session.engine.catalog().register(&context, &mut statement).await?;
+            let system = session.engine.system_source();
+            session.engine.catalog().register(&context, system, &mut statement).await?;
             if let Some(extend) = &session.extend {
                 extend(&context).map_err(|e| Error::execution(&e))?;
             }

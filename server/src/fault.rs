@@ -5,6 +5,7 @@ use std::time::Duration;
 
 use echolake_export::Error as SliceError;
 use echolake_query::{Error as QueryError, QueryPlace};
+use serde::{Deserialize, Serialize};
 
 use crate::tokens::TokenScope;
 
@@ -127,6 +128,18 @@ pub(crate) enum RequestFault {
         /// The limit.
         limit: usize,
     },
+    /// The server is stopping, and takes no new request.
+    #[error("the server is stopping; hint: ask again in a moment")]
+    Draining,
+    /// The server is stopping, and ends an idle connection.
+    #[error("the server is stopping and ends this connection; hint: connect again in a moment")]
+    Disconnected,
+    /// Requests cannot be answered at present.
+    #[error("the server is not ready: {reason}; hint: its log says more")]
+    NotReady {
+        /// The missing part.
+        reason: &'static str,
+    },
     /// The engine process that ran the query ended. Queries of other clients continue.
     #[error("the query ended the engine that ran it: {reason}; hint: ask for less at a time, or for fewer rows")]
     EngineEnded {
@@ -139,7 +152,8 @@ pub(crate) enum RequestFault {
 }
 
 /// Codes by which a client's program distinguishes failures; never renamed.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
 pub(crate) enum FaultCode {
     Query,
     ReadOnly,
@@ -165,11 +179,13 @@ pub(crate) enum FaultCode {
     TooMany,
     EngineEnded,
     Internal,
+    Stopping,
+    NotReady,
 }
 
 impl FaultCode {
     /// All of them.
-    pub(crate) const ALL: [Self; 24] = [
+    pub(crate) const ALL: [Self; 26] = [
         Self::Query,
         Self::ReadOnly,
         Self::Execution,
@@ -194,6 +210,8 @@ impl FaultCode {
         Self::TooMany,
         Self::EngineEnded,
         Self::Internal,
+        Self::Stopping,
+        Self::NotReady,
     ];
 
     /// As clients and metrics see it.
@@ -223,6 +241,8 @@ impl FaultCode {
             Self::TooMany => "too_many",
             Self::EngineEnded => "query_ended_engine",
             Self::Internal => "internal",
+            Self::Stopping => "server_stopping",
+            Self::NotReady => "not_ready",
         }
     }
 }
@@ -306,6 +326,8 @@ impl RequestFault {
             Self::TooMany { .. } => FaultCode::TooMany,
             Self::EngineEnded { .. } => FaultCode::EngineEnded,
             Self::Internal => FaultCode::Internal,
+            Self::Draining | Self::Disconnected => FaultCode::Stopping,
+            Self::NotReady { .. } => FaultCode::NotReady,
         }
     }
 }

@@ -13,6 +13,7 @@
 //! # }
 //! ```
 
+mod activity;
 mod catalogue_pages;
 pub mod certificate;
 mod client_identity;

@@ -1,13 +1,20 @@
-//! Figures of the server, in Prometheus' text format.
+//! Figures of the server, for Prometheus: what is counted since the start, and the gauges of one moment. Engines report
+//! their part to the door, which alone has figures.
 
-use std::fmt::Write as _;
-use std::sync::atomic::{AtomicI64, AtomicU64, Ordering};
-use std::time::{Duration, Instant};
+mod gauges;
 
+use prometheus::{
+    HistogramOpts, HistogramVec, IntCounter, IntCounterVec, IntGauge, Opts, Registry, Result, TextEncoder,
+};
+use serde::{Deserialize, Serialize};
+
+use crate::activity::QueryEnd;
 use crate::fault::{FaultCode, RequestFault};
+pub(crate) use gauges::{PoolGauges, ServerGauges};
 
 /// The protocol of a query.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
 pub(crate) enum ServerProtocol {
     Http,
     FlightSql,
@@ -15,7 +22,7 @@ pub(crate) enum ServerProtocol {
 }
 
 impl ServerProtocol {
-    const ALL: [Self; 3] = [Self::Http, Self::FlightSql, Self::Postgres];
+    pub(crate) const ALL: [Self; 3] = [Self::Http, Self::FlightSql, Self::Postgres];
 
     /// As metrics and the log have it.
     pub(crate) fn name(self) -> &'static str {
@@ -27,50 +34,97 @@ impl ServerProtocol {
     }
 }
 
-/// Upper bounds of the buckets of a query's time, in milliseconds.
-const BUCKETS: [u64; 7] = [3, 10, 30, 100, 300, 1_000, 10_000];
+/// Upper bounds of the buckets of a query's time, in seconds.
+const BUCKETS: [f64; 7] = [0.003, 0.01, 0.03, 0.1, 0.3, 1.0, 10.0];
+/// The outcome of a query that was answered to its end.
+const ANSWERED: &str = "answered";
 
-/// Counters since the start.
-#[derive(Default)]
+/// What is counted since the start.
 pub(crate) struct ServerMetrics {
-    queries: [AtomicU64; ServerProtocol::ALL.len()],
-    failures: [AtomicU64; FaultCode::ALL.len()],
-    rows: AtomicU64,
-    running: AtomicI64,
-    micros: AtomicU64,
-    finished: AtomicU64,
-    buckets: [AtomicU64; BUCKETS.len()],
-}
-
-/// A query that runs; dropping it counts its time.
-pub(crate) struct QueryTimer<'a> {
-    metrics: &'a ServerMetrics,
-    begun: Instant,
-}
-
-impl Drop for QueryTimer<'_> {
-    fn drop(&mut self) {
-        self.metrics.running.fetch_sub(1, Ordering::Relaxed);
-        self.metrics.took(self.begun.elapsed());
-    }
+    registry: Registry,
+    queries: IntCounterVec,
+    failures: IntCounterVec,
+    rows: IntCounter,
+    bytes: IntCounter,
+    running: IntGauge,
+    seconds: HistogramVec,
+    requests: HistogramVec,
 }
 
 impl ServerMetrics {
-    /// Counts a query that begins; its time is measured until the timer is dropped.
-    pub(crate) fn begin(&self, protocol: ServerProtocol) -> QueryTimer<'_> {
-        self.queries[protocol as usize].fetch_add(1, Ordering::Relaxed);
-        self.running.fetch_add(1, Ordering::Relaxed);
-        QueryTimer { metrics: self, begun: Instant::now() }
+    /// Counters at zero.
+    ///
+    /// # Errors
+    /// A defect: two metrics of one name.
+    pub(crate) fn new() -> Result<Self> {
+        let histogram = |name: &str, help: &str| HistogramOpts::new(name, help).buckets(BUCKETS.to_vec());
+        let query_time = histogram("echolake_query_seconds", "Time of a query, to its last row sent.");
+        let request_time = histogram("echolake_http_request_seconds", "Time of a request, to the head of its answer.");
+        let metrics = Self {
+            registry: Registry::new(),
+            queries: IntCounterVec::new(
+                Opts::new("echolake_queries_total", "Queries that were begun."),
+                &["protocol"],
+            )?,
+            failures: IntCounterVec::new(Opts::new("echolake_failures_total", "Requests that failed."), &["code"])?,
+            rows: IntCounter::new("echolake_rows_total", "Rows of all answers.")?,
+            bytes: IntCounter::new(
+                "echolake_answer_bytes_total",
+                "Bytes of the rows of all answers, before they are encoded.",
+            )?,
+            running: IntGauge::new("echolake_running_queries", "Queries that run now.")?,
+            seconds: HistogramVec::new(query_time, &["protocol", "outcome"])?,
+            requests: HistogramVec::new(request_time, &["status"])?,
+        };
+        let Self { registry, queries, failures, rows, bytes, running, seconds, requests } = &metrics;
+        registry.register(Box::new(queries.clone()))?;
+        registry.register(Box::new(failures.clone()))?;
+        registry.register(Box::new(rows.clone()))?;
+        registry.register(Box::new(bytes.clone()))?;
+        registry.register(Box::new(running.clone()))?;
+        registry.register(Box::new(seconds.clone()))?;
+        registry.register(Box::new(requests.clone()))?;
+        // What did not happen yet is zero, and not unknown.
+        for protocol in ServerProtocol::ALL {
+            queries.with_label_values(&[protocol.name()]);
+            seconds.with_label_values(&[protocol.name(), ANSWERED]);
+        }
+        for code in FaultCode::ALL {
+            failures.with_label_values(&[code.name()]);
+        }
+        Ok(metrics)
     }
 
-    /// Counts rows of an answer.
-    pub(crate) fn rows(&self, rows: usize) {
-        self.rows.fetch_add(rows as u64, Ordering::Relaxed);
+    /// Counts a query that begins.
+    pub(crate) fn begin(&self, protocol: ServerProtocol) {
+        self.queries.with_label_values(&[protocol.name()]).inc();
+        self.running.inc();
+    }
+
+    /// Counts a query that has ended.
+    pub(crate) fn end(&self, protocol: ServerProtocol, end: &QueryEnd) {
+        let outcome = end.failure.map_or(ANSWERED, FaultCode::name);
+        self.seconds.with_label_values(&[protocol.name(), outcome]).observe(end.seconds);
+        self.rows.inc_by(end.rows);
+        self.bytes.inc_by(end.bytes);
+        self.running.dec();
+    }
+
+    /// Counts queries that ended with their engine.
+    pub(crate) fn lose(&self, queries: usize) {
+        self.running.sub(i64::try_from(queries).unwrap_or(i64::MAX));
+    }
+
+    /// Counts an answer over HTTP by the first digit of its status.
+    pub(crate) fn answered(&self, status: u16, seconds: f64) {
+        let class = ["1xx", "2xx", "3xx", "4xx", "5xx"];
+        let class = class.get(usize::from(status / 100).wrapping_sub(1)).copied().unwrap_or("other");
+        self.requests.with_label_values(&[class]).observe(seconds);
     }
 
     /// Counts a failed request.
     pub(crate) fn failed(&self, code: FaultCode) {
-        self.failures[code as usize].fetch_add(1, Ordering::Relaxed);
+        self.failures.with_label_values(&[code.name()]).inc();
     }
 
     /// Counts a failed request and writes it to the log.
@@ -79,71 +133,16 @@ impl ServerMetrics {
         fault.log();
     }
 
-    fn took(&self, time: Duration) {
-        self.finished.fetch_add(1, Ordering::Relaxed);
-        self.micros.fetch_add(time.as_micros() as u64, Ordering::Relaxed);
-        for (bound, count) in BUCKETS.iter().zip(&self.buckets) {
-            if time <= Duration::from_millis(*bound) {
-                count.fetch_add(1, Ordering::Relaxed);
-            }
-        }
-    }
-
-    /// All counters, always in the same order; the gauge of running queries is the last.
-    pub(crate) fn counters(&self) -> Vec<u64> {
-        let all = self.queries.iter().chain(&self.failures).chain(&self.buckets);
-        let single = [&self.rows, &self.micros, &self.finished];
-        let counters = all.chain(single).map(|counter| counter.load(Ordering::Relaxed));
-        counters.chain([self.running.load(Ordering::Relaxed).unsigned_abs()]).collect()
-    }
-
-    /// Adds what another process counted between two readings of its counters.
-    pub(crate) fn add(&self, before: &[u64], after: &[u64]) {
-        let all = self.queries.iter().chain(&self.failures).chain(&self.buckets);
-        let counters = all.chain([&self.rows, &self.micros, &self.finished]);
-        let difference = |at: usize| {
-            let value = |counters: &[u64]| counters.get(at).copied().unwrap_or(0);
-            value(after).wrapping_sub(value(before))
-        };
-        let mut last = 0;
-        for (at, counter) in counters.enumerate() {
-            counter.fetch_add(difference(at), Ordering::Relaxed);
-            last = at + 1;
-        }
-        self.running.fetch_add(difference(last).cast_signed(), Ordering::Relaxed);
-    }
-
-    /// Returns all counters in Prometheus' text format.
-    pub(crate) fn text(&self) -> String {
-        let mut text = String::new();
-        let get = |counter: &AtomicU64| counter.load(Ordering::Relaxed);
-        let mut family = |name: &str, kind: &str, help: &str, lines: &[(String, String)]| {
-            let _ = writeln!(text, "# HELP {name} {help}\n# TYPE {name} {kind}");
-            for (suffix, value) in lines {
-                let _ = writeln!(text, "{name}{suffix} {value}");
-            }
-        };
-        let by_protocol = ServerProtocol::ALL
-            .map(|p| (format!("{{protocol=\"{}\"}}", p.name()), get(&self.queries[p as usize]).to_string()));
-        family("echolake_queries_total", "counter", "Queries that were begun.", &by_protocol);
-        let by_code =
-            FaultCode::ALL.map(|c| (format!("{{code=\"{}\"}}", c.name()), get(&self.failures[c as usize]).to_string()));
-        family("echolake_failures_total", "counter", "Requests that failed.", &by_code);
-        let plain = |value: String| [(String::new(), value)];
-        family("echolake_rows_total", "counter", "Rows of all answers.", &plain(get(&self.rows).to_string()));
-        let running = self.running.load(Ordering::Relaxed).to_string();
-        family("echolake_running_queries", "gauge", "Queries that run now.", &plain(running));
-        let mut seconds: Vec<_> = BUCKETS
-            .iter()
-            .zip(&self.buckets)
-            .map(|(bound, count)| (format!("_bucket{{le=\"{}\"}}", *bound as f64 / 1e3), get(count).to_string()))
-            .collect();
-        let finished = get(&self.finished).to_string();
-        seconds.push(("_bucket{le=\"+Inf\"}".to_owned(), finished.clone()));
-        seconds.push(("_sum".to_owned(), (get(&self.micros) as f64 / 1e6).to_string()));
-        seconds.push(("_count".to_owned(), finished));
-        family("echolake_query_seconds", "histogram", "Time of a query, to its last row sent.", &seconds);
-        text
+    /// Returns all figures in Prometheus' text format.
+    ///
+    /// # Errors
+    /// A defect: two metrics of one name, or values that are not as their metric.
+    pub(crate) fn text(&self, gauges: &ServerGauges) -> Result<String> {
+        let moment = Registry::new();
+        gauges.register(&moment)?;
+        let mut families = self.registry.gather();
+        families.extend(moment.gather());
+        TextEncoder::new().encode_to_string(&families)
     }
 }
 
@@ -153,44 +152,47 @@ mod tests {
 
     #[test]
     fn what_happened_is_counted() {
-        let metrics = ServerMetrics::default();
-        let timed = metrics.begin(ServerProtocol::Postgres);
-        metrics.rows(3);
+        let metrics = ServerMetrics::new().expect("distinct names");
+        metrics.begin(ServerProtocol::Postgres);
         metrics.failed(FaultCode::ReadOnly);
-        let text = metrics.text();
+        metrics.answered(404, 0.5);
+        let text = metrics.text(&ServerGauges::default()).expect("a text");
+        let has = |text: &str, line: &str| assert!(text.lines().any(|l| l == line), "{line} in {text}");
         for line in [
             "echolake_queries_total{protocol=\"postgres\"} 1",
             "echolake_queries_total{protocol=\"http\"} 0",
             "echolake_failures_total{code=\"read_only\"} 1",
-            "echolake_rows_total 3",
             "echolake_running_queries 1",
-            "echolake_query_seconds_count 0",
+            "echolake_http_request_seconds_count{status=\"4xx\"} 1",
+            "echolake_query_seconds_count{outcome=\"answered\",protocol=\"postgres\"} 0",
         ] {
-            assert!(text.lines().any(|l| l == line), "{line} in {text}");
+            has(&text, line);
         }
-        drop(timed);
-        let text = metrics.text();
-        assert!(text.contains("echolake_running_queries 0\n") && text.contains("_bucket{le=\"+Inf\"} 1\n"), "{text}");
-    }
-
-    #[test]
-    fn counters_of_another_process_are_added() {
-        let (engine, all) = (ServerMetrics::default(), ServerMetrics::default());
-        let before = engine.counters();
-        let timed = engine.begin(ServerProtocol::FlightSql);
-        engine.rows(7);
-        engine.failed(FaultCode::TimeLimit);
-        let running = engine.counters();
-        all.add(&before, &running);
-        drop(timed);
-        all.add(&running, &engine.counters());
-        assert_eq!(all.counters(), engine.counters());
-    }
-
-    #[test]
-    fn counters_stand_where_their_code_says() {
-        for (i, code) in FaultCode::ALL.into_iter().enumerate() {
-            assert_eq!(code as usize, i, "{}", code.name());
+        let (failure, plan_seconds, first_row_seconds) = (Some(FaultCode::TimeLimit), None, None);
+        let end = QueryEnd {
+            number: 0,
+            failure,
+            plan_seconds,
+            first_row_seconds,
+            seconds: 2.0,
+            rows: 3,
+            bytes: 9,
+            memory: 0,
+        };
+        metrics.end(ServerProtocol::Postgres, &end);
+        let text = metrics.text(&ServerGauges::default()).expect("a text");
+        for line in [
+            "echolake_rows_total 3",
+            "echolake_answer_bytes_total 9",
+            "echolake_running_queries 0",
+            "echolake_query_seconds_bucket{outcome=\"time_limit\",protocol=\"postgres\",le=\"1\"} 0",
+            "echolake_query_seconds_bucket{outcome=\"time_limit\",protocol=\"postgres\",le=\"10\"} 1",
+            "echolake_query_seconds_sum{outcome=\"time_limit\",protocol=\"postgres\"} 2",
+        ] {
+            has(&text, line);
         }
+        metrics.begin(ServerProtocol::Http);
+        metrics.lose(1);
+        has(&metrics.text(&ServerGauges::default()).expect("a text"), "echolake_running_queries 0");
     }
 }

@@ -1,6 +1,7 @@
 //! Spans of requests in the log. The door numbers requests and connections, and the engine's lines about one carry the
 //! same number. Spans are at the level of errors: no filter that lets a line through takes its spans away.
 
+use std::sync::OnceLock;
 use std::sync::atomic::{AtomicU64, Ordering};
 
 use axum::extract::Request;
@@ -17,12 +18,51 @@ const HEADER: HeaderName = HeaderName::from_static("echolake-request");
 /// The same of a connection of Postgres' protocol, as a parameter of its startup packet.
 pub(crate) const PARAMETER: &str = "echolake.connection";
 
-/// Begins the span of a request that the door forwards, and marks the request with its number; a client's own mark is
-/// replaced. The client is recorded once it is known.
-pub(crate) fn begin_request(headers: &mut HeaderMap, protocol: ServerProtocol) -> Span {
+/// The header by which clients and proxies name a request, and every answer names it again.
+pub(crate) const REQUEST_ID: HeaderName = HeaderName::from_static("x-request-id");
+/// W3C's header of a trace that the request is part of.
+const TRACE_PARENT: HeaderName = HeaderName::from_static("traceparent");
+/// Characters of a request's name that is taken over.
+const LONGEST_ID: usize = 128;
+
+/// Begins the span of a request, and marks the request with its number and name; a client's own number is replaced. Returns
+/// the name for the answer, too. The client is recorded once it is known.
+pub(crate) fn begin_request(headers: &mut HeaderMap, protocol: ServerProtocol) -> (Span, HeaderValue) {
     let number = next_number();
     headers.insert(HEADER, HeaderValue::from(number));
-    tracing::error_span!("request", number, protocol = protocol.name(), client = field::Empty)
+    let id = headers.remove(REQUEST_ID).filter(is_sane).unwrap_or_else(|| own_id(number));
+    headers.insert(REQUEST_ID, id.clone());
+    let (request_id, protocol) = (id.to_str().unwrap_or_default(), protocol.name());
+    let span =
+        tracing::error_span!("request", number, request_id, trace = field::Empty, protocol, client = field::Empty);
+    if let Some(trace) = trace_id(headers) {
+        span.record("trace", trace);
+    }
+    (span, id)
+}
+
+// Nothing that could be taken for more than a name, in a log or by a shell.
+fn is_sane(id: &HeaderValue) -> bool {
+    let is_plain = |byte: &u8| byte.is_ascii_alphanumeric() || b"-_.:/+=@".contains(byte);
+    (1..=LONGEST_ID).contains(&id.len()) && id.as_bytes().iter().all(is_plain)
+}
+
+// Numbers begin anew with the server, so that they alone would name two requests.
+fn own_id(number: u64) -> HeaderValue {
+    static START: OnceLock<u32> = OnceLock::new();
+    let start = START.get_or_init(|| getrandom::u32().unwrap_or(0));
+    HeaderValue::from_str(&format!("{start:08x}-{number}")).unwrap_or_else(|_| HeaderValue::from(number))
+}
+
+// The trace of `00-TRACE-PARENT-FLAGS`.
+fn trace_id(headers: &HeaderMap) -> Option<&str> {
+    let text = headers.get(TRACE_PARENT)?.to_str().ok()?;
+    let is_hex =
+        |part: &str, length| part.len() == length && part.bytes().all(|b| matches!(b, b'0'..=b'9' | b'a'..=b'f'));
+    let mut parts = text.split('-');
+    let (version, trace, parent, flags) = (parts.next()?, parts.next()?, parts.next()?, parts.next()?);
+    let is_right = is_hex(version, 2) && is_hex(trace, 32) && is_hex(parent, 16) && is_hex(flags, 2);
+    (is_right && version != "ff" && trace.bytes().any(|b| b != b'0')).then_some(trace)
 }
 
 /// Begins the span of a connection of Postgres' protocol that the door forwards, and marks its startup packet unless that
@@ -43,7 +83,13 @@ pub(crate) fn begin_connection(startup: &mut BytesMut, client: &str, limit: usiz
 
 /// Continues, in an engine, the span of a request that the door has marked.
 pub(crate) fn continue_request(headers: &HeaderMap) -> Span {
-    let span = tracing::error_span!("request", number = field::Empty);
+    let span = tracing::error_span!("request", number = field::Empty, request_id = field::Empty, trace = field::Empty);
+    if let Some(id) = headers.get(REQUEST_ID).and_then(|id| id.to_str().ok()) {
+        span.record("request_id", id);
+    }
+    if let Some(trace) = trace_id(headers) {
+        span.record("trace", trace);
+    }
     if let Some(number) = headers.get(HEADER).and_then(|number| number.to_str().ok()?.parse::<u64>().ok()) {
         span.record("number", number);
     }
@@ -86,6 +132,43 @@ mod tests {
         let marks: Vec<_> = headers.get_all(HEADER).iter().collect();
         let number = marks[0].to_str().expect("text").parse::<u64>();
         assert!(marks.len() == 1 && number.is_ok(), "{marks:?}");
+    }
+
+    #[test]
+    fn a_sane_name_is_taken_over() {
+        let id = |id: &[u8]| {
+            let mut headers = HeaderMap::new();
+            headers.insert(REQUEST_ID, HeaderValue::from_bytes(id).expect("a header"));
+            let (_, named) = begin_request(&mut headers, ServerProtocol::Http);
+            assert_eq!(headers.get(REQUEST_ID), Some(&named));
+            named.to_str().expect("text").to_owned()
+        };
+        assert_eq!(id(b"01J9ZK-a_b.c:d/e+f=@"), "01J9ZK-a_b.c:d/e+f=@");
+        for wrong in [&b""[..], b"two words", b"a\"b", b"{}", b"caf\xe9", &[b'x'; LONGEST_ID + 1]] {
+            let named = id(wrong);
+            let (start, number) = named.split_once('-').expect("two parts");
+            assert!(start.len() == 8 && number.parse::<u64>().is_ok(), "{wrong:?} became {named}");
+        }
+    }
+
+    #[test]
+    fn traces_are_those_of_the_standard() {
+        let trace = |text: &'static str| {
+            let headers = HeaderMap::from_iter([(TRACE_PARENT, HeaderValue::from_static(text))]);
+            trace_id(&headers).map(str::to_owned)
+        };
+        let id = "4bf92f3577b34da6a3ce929d0e0e4736";
+        assert_eq!(trace("00-4bf92f3577b34da6a3ce929d0e0e4736-00f067aa0ba902b7-01").as_deref(), Some(id));
+        for wrong in [
+            "",
+            "00-4bf92f3577b34da6a3ce929d0e0e4736-00f067aa0ba902b7",
+            "00-4BF92F3577B34DA6A3CE929D0E0E4736-00f067aa0ba902b7-01",
+            "00-00000000000000000000000000000000-00f067aa0ba902b7-01",
+            "ff-4bf92f3577b34da6a3ce929d0e0e4736-00f067aa0ba902b7-01",
+            "00-4bf92f3577b34da6-00f067aa0ba902b7-01",
+        ] {
+            assert_eq!(trace(wrong), None, "{wrong}");
+        }
     }
 
     #[test]

@@ -1,6 +1,7 @@
 //! A query that runs: computed and encoded on threads of its own, handed over as it is fetched, ended when it is
 //! dropped.
 
+use std::sync::Arc;
 use std::time::Duration;
 
 use arrow::datatypes::SchemaRef;
@@ -10,6 +11,7 @@ use tokio::task::JoinSet;
 use tokio::time::Instant;
 use tracing::Span;
 
+use crate::activity::QueryWatch;
 use crate::fault::RequestFault;
 use crate::service::QueryService;
 
@@ -75,6 +77,7 @@ pub(crate) struct RunningQuery<T> {
     pub(crate) stop: StopSignal,
     pub(crate) limit: Option<SessionTimeLimit>,
     pub(crate) service: QueryService,
+    pub(crate) watch: Arc<QueryWatch>,
     pub(crate) span: Span,
 }
 
@@ -102,8 +105,9 @@ impl<T: Send + 'static> RunningQuery<T> {
         tokio::select! {
             biased;
             fault = ended(&self.stop, limit) => {
+                self.watch.finish(Err(&fault));
                 self.task.abort_all();
-                self.span.in_scope(|| self.service.metrics().record_failure(&fault));
+                self.span.in_scope(|| self.service.record_failure(&fault));
                 return Err(fault);
             }
             item = self.items.recv() => if let Some(item) = item {
@@ -147,8 +151,6 @@ pub(crate) fn parts(batch: &RecordBatch) -> impl Iterator<Item = RecordBatch> {
 
 #[cfg(test)]
 mod tests {
-    use std::sync::Arc;
-
     use arrow::array::{ArrayRef, Int64Array};
 
     use super::*;

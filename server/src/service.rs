@@ -13,9 +13,13 @@ use tokio::task::JoinSet;
 use tracing::Instrument as _;
 
 use crate::Error;
+use crate::activity::{QueryTimer, QueryWatch, RunningWatches};
 use crate::client_identity::ClientIdentity;
-use crate::fault::RequestFault;
-use crate::metrics::{ServerMetrics, ServerProtocol};
+use crate::engine::door_message::DoorMessage;
+use crate::engine::door_rows::DoorRows;
+use crate::engine::report::EngineReport;
+use crate::fault::{FaultCode, RequestFault};
+use crate::metrics::ServerProtocol;
 use crate::running::{AnswerEncoder, RunningQuery, SessionTimeLimit, StopSignal, WAITING, ended, finish, parts};
 use crate::tokens::TokenScope;
 
@@ -35,7 +39,8 @@ struct ServiceState {
     identity: ClientIdentity,
     client: Arc<EngineClient>,
     activity: ActivityCounter,
-    metrics: ServerMetrics,
+    watches: Arc<RunningWatches>,
+    door_rows: Arc<DoorRows>,
     // Answers are encoded on threads of their own: connections are answered, and queries cancelled, while all are busy.
     encoders: QueryThreads,
 }
@@ -46,6 +51,15 @@ pub(crate) enum QueryWork {
     Sql(String),
     /// A prepared plan, with values for its placeholders.
     Prepared(Arc<PreparedQuery>, ParamValues),
+}
+
+impl QueryWork {
+    fn statement(&self) -> &str {
+        match self {
+            Self::Sql(sql) => sql,
+            Self::Prepared(prepared, _) => prepared.sql(),
+        }
+    }
 }
 
 /// A query to run.
@@ -84,14 +98,22 @@ impl ActivityCounter {
 }
 
 impl QueryService {
-    pub(crate) fn new(lake: &Lake, engine: QueryEngine, identity: ClientIdentity) -> Result<Self, Error> {
+    pub(crate) fn new(
+        lake: &Lake,
+        engine: QueryEngine,
+        identity: ClientIdentity,
+        slow: Option<Duration>,
+    ) -> Result<Self, Error> {
+        let door_rows = Arc::new(DoorRows::default());
+        engine.add_system_tables(door_rows.clone());
         Ok(Self(Arc::new(ServiceState {
             lake: lake.clone(),
             engine,
             client: Arc::new(EngineClient::new(identity.name.clone(), identity.quota())),
             identity,
             activity: ActivityCounter::default(),
-            metrics: ServerMetrics::default(),
+            watches: Arc::new(RunningWatches::new(slow)),
+            door_rows,
             encoders: QueryThreads::per_core("encode").map_err(Error::System)?,
         })))
     }
@@ -114,7 +136,7 @@ impl QueryService {
     /// # Errors
     /// [`RequestFault::Forbidden`].
     pub(crate) fn client(&self, scope: TokenScope) -> Result<Arc<EngineClient>, RequestFault> {
-        self.0.identity.require(scope).inspect_err(|fault| self.0.metrics.record_failure(fault))?;
+        self.0.identity.require(scope).inspect_err(|fault| self.record_failure(fault))?;
         Ok(self.0.client.clone())
     }
 
@@ -123,8 +145,32 @@ impl QueryService {
         &self.0.activity
     }
 
-    pub(crate) fn metrics(&self) -> &ServerMetrics {
-        &self.0.metrics
+    /// Reports a failed request to the door, which counts them.
+    pub(crate) fn failed(&self, code: FaultCode) {
+        EngineReport::Failure(code).send();
+    }
+
+    /// Reports a failed request and writes it to the log.
+    pub(crate) fn record_failure(&self, fault: &RequestFault) {
+        self.failed(fault.code());
+        fault.log();
+    }
+
+    /// Watches a query, or other work that is listed among queries, until the timer is dropped.
+    pub(crate) fn watch(&self, protocol: ServerProtocol, statement: &str, stop: &StopSignal) -> QueryTimer {
+        self.0.watches.begin(protocol, statement, stop)
+    }
+
+    /// Does what the door says; ends with the door.
+    pub(crate) async fn obey(&self, mut messages: mpsc::UnboundedReceiver<DoorMessage>) {
+        while let Some(message) = messages.recv().await {
+            match message {
+                DoorMessage::Cancel(number) => self.0.watches.cancel(number),
+                DoorMessage::Rows { number, rows } => self.0.door_rows.answer(number, rows),
+                // An engine has one client.
+                DoorMessage::Client(_) => {}
+            }
+        }
     }
 
     /// Begins a session: one per connection, or one per request if the protocol has no connections.
@@ -170,7 +216,7 @@ impl QueryService {
             work.await
         };
         let planned = self.0.engine.supervise(client.quota().time, work.in_current_span()).await;
-        planned.inspect_err(|fault| self.0.metrics.record_failure(fault))
+        planned.inspect_err(|fault| self.record_failure(fault))
     }
 
     /// Computes something long, which waits for nothing.
@@ -200,22 +246,29 @@ impl QueryService {
         let (columns, known) = oneshot::channel();
         let (to, items) = mpsc::channel(WAITING);
         let (stop, limit) = (job.stop.clone(), job.limit);
-        let inner = self.0.clone();
+        let service = self.clone();
         let span = tracing::error_span!("query", protocol = job.protocol.name(), client = self.0.identity.name);
+        let timer = span.in_scope(|| self.watch(job.protocol, job.work.statement(), &job.stop));
+        let (watch, stopped) = (timer.watch().clone(), stop.clone());
         let work = async move {
-            let _timed = inner.metrics.begin(job.protocol);
-            let done = run(&inner.metrics, job, encode, columns, to).await;
-            done.inspect_err(|fault| inner.metrics.record_failure(fault))
+            let done = tokio::select! {
+                done = run(timer.watch(), job, encode, columns, to) => done,
+                // Also if nobody fetches rows at present; who does says so.
+                () = stopped.stopped() => return Err(RequestFault::Cancelled),
+            };
+            timer.watch().finish(done.as_ref().map(|()| ()));
+            done.inspect_err(|fault| service.record_failure(fault))
         };
         let mut task = self.spawn(work.instrument(span.clone()));
         tokio::select! {
             biased;
             fault = ended(&stop, limit) => {
-                span.in_scope(|| self.0.metrics.record_failure(&fault));
+                watch.finish(Err(&fault));
+                span.in_scope(|| self.record_failure(&fault));
                 Err(fault)
             }
             schema = known => match schema {
-                Ok(schema) => Ok(RunningQuery { schema, items, task, stop, limit, service: self.clone(), span }),
+                Ok(schema) => Ok(RunningQuery { schema, items, task, stop, limit, service: self.clone(), watch, span }),
                 // It ended without having any: it says why.
                 Err(_) => finish(&mut task).await.and(Err(RequestFault::Internal)),
             }
@@ -224,7 +277,7 @@ impl QueryService {
 }
 
 async fn run<E: AnswerEncoder>(
-    metrics: &ServerMetrics,
+    watch: &QueryWatch,
     job: QueryJob,
     encode: impl FnOnce(&SchemaRef) -> Result<E, RequestFault>,
     columns: oneshot::Sender<SchemaRef>,
@@ -234,13 +287,15 @@ async fn run<E: AnswerEncoder>(
         QueryWork::Sql(sql) => job.session.query(&sql).await?,
         QueryWork::Prepared(prepared, values) => job.session.execute(&prepared, values).await?,
     };
+    watch.planned();
     let mut encoder = encode(&answer.schema)?;
     // If sending fails, here and below, the receiver is gone: the query ends by being dropped.
     if columns.send(answer.schema.clone()).is_err() {
         return Ok(());
     }
     while let Some(batch) = answer.next().await? {
-        metrics.rows(batch.num_rows());
+        watch.answered(&batch);
+        watch.held(answer.peak_memory());
         for part in parts(&batch) {
             for item in encoder.batch(part)? {
                 if to.send(item).await.is_err() {
@@ -249,6 +304,7 @@ async fn run<E: AnswerEncoder>(
             }
         }
     }
+    watch.held(answer.peak_memory());
     for item in encoder.end()? {
         if to.send(item).await.is_err() {
             return Ok(());

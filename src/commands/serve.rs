@@ -6,21 +6,26 @@ use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 use std::os::unix::fs::OpenOptionsExt as _;
 use std::path::PathBuf;
 use std::str::FromStr;
+use std::time::Duration;
 
 use anyhow::Context as _;
 use echolake_lake::{Lake, remote_access};
 use echolake_server::certificate::self_signed;
-use echolake_server::engine::{confinement, run_engine};
+use echolake_server::engine::{EngineRun, confinement, run_engine};
 use echolake_server::tokens::{self, TokenFile};
 use echolake_server::{CataloguePages, CertificateFiles, EngineSettings, Error, LakeServer, ServerSettings};
+use tokio::signal::unix::{SignalKind, signal};
 
 use crate::CommandOutcome;
+use crate::duration::parse_duration;
 use crate::logging::child_variable;
 use crate::signals::StopRequest;
 
 /// Memory for queries, and engines at once, by default.
 const MEMORY_MIB: u32 = 4096;
 const ENGINES: u32 = 16;
+/// Time for which the demo's answers may go on after Ctrl-C.
+const CATALOGUE_DRAIN: Duration = Duration::from_secs(5);
 
 #[derive(Debug, clap::Args)]
 pub(crate) struct ServeArgs {
@@ -51,6 +56,12 @@ pub(crate) struct ServeArgs {
     /// Limit of concurrent clients. Each client's queries run in an engine, a process of its own; idle engines make room.
     #[arg(long, value_name = "N", default_value_t = ENGINES, value_parser = clap::value_parser!(u32).range(1..=256))]
     engines: u32,
+    /// Time for which answers may go on after SIGTERM or Ctrl-C, as 30s or 5m; nothing new is taken meanwhile.
+    #[arg(long, value_name = "TIME", default_value = "30s", value_parser = parse_duration)]
+    drain: Duration,
+    /// Log queries that take this long or longer, with their statements, as 1s or 500ms.
+    #[arg(long, value_name = "TIME", value_parser = parse_duration)]
+    log_slow: Option<Duration>,
     /// Folder for temporary files, such as sorts that do not fit into memory; by default `temp` in the lake.
     #[arg(long, value_name = "DIR")]
     temp: Option<PathBuf>,
@@ -68,6 +79,9 @@ pub(crate) struct EngineArgs {
     /// Bytes that its queries may hold.
     #[arg(long)]
     memory_bytes: usize,
+    /// Milliseconds from which a query is logged.
+    #[arg(long)]
+    log_slow_ms: Option<u64>,
 }
 
 impl EngineArgs {
@@ -86,8 +100,11 @@ impl EngineArgs {
 
 /// Answers one client's queries, until the door that started it ends.
 pub(crate) async fn engine(args: &EngineArgs, lake_url: &str) -> anyhow::Result<CommandOutcome> {
+    // A service manager may signal all processes of a service: an engine ends with its door.
+    let _ignored = signal(SignalKind::terminate()).context("cannot listen to SIGTERM")?;
     let lake = Lake::open(lake_url).await?;
-    run_engine(&lake, &args.sockets, Some(args.memory_bytes)).await?;
+    let slow = args.log_slow_ms.map(Duration::from_millis);
+    run_engine(&lake, &args.sockets, EngineRun { memory: Some(args.memory_bytes), slow }).await?;
     Ok(CommandOutcome::Whole)
 }
 
@@ -122,7 +139,8 @@ impl ListenAddress {
 const HTTP: SocketAddr = SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 8080);
 
 pub(crate) async fn run(args: &ServeArgs, lake_url: &str) -> anyhow::Result<CommandOutcome> {
-    let stop = StopRequest::listen("stopping: answers may go on for five seconds; Ctrl-C again stops at once")?;
+    let reply = format!("stopping: answers may go on for {:?}; Ctrl-C again stops at once", args.drain);
+    let stop = StopRequest::listen(reply)?;
     let lake = Lake::open(lake_url).await?;
     let settings = ServerSettings {
         http: args.listen.address(),
@@ -135,7 +153,8 @@ pub(crate) async fn run(args: &ServeArgs, lake_url: &str) -> anyhow::Result<Comm
             .zip(args.key.clone())
             .map(|(certificate, key)| CertificateFiles { certificate, key }),
         is_behind_proxy: args.plain_text_behind_a_proxy,
-        engines: engines(args.memory, args.engines, args.temp.clone())?,
+        drain: args.drain,
+        engines: EngineSettings { slow: args.log_slow, ..engines(args.memory, args.engines, args.temp.clone())? },
     };
     let server = LakeServer::bind(&lake, settings)?;
     anyhow::ensure!(!server.addresses().is_empty(), "nothing to listen on; hint: all three are off");
@@ -156,6 +175,7 @@ pub(crate) async fn catalogue(lake: &Lake, stop: &StopRequest) -> anyhow::Result
         tokens: None,
         certificate: None,
         is_behind_proxy: false,
+        drain: CATALOGUE_DRAIN,
         engines: engines.clone(),
     };
     let server = match LakeServer::bind(lake, settings(HTTP)) {
@@ -175,6 +195,7 @@ fn engines(memory_mib: u32, count: u32, temp: Option<PathBuf>) -> anyhow::Result
         memory: (memory_mib as usize) << 20,
         count: count as usize,
         temp,
+        slow: None,
     })
 }
 

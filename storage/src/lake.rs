@@ -50,6 +50,17 @@ impl Lake {
         }
     }
 
+    /// Checks that the lake is there and can be read, by one request to its store.
+    ///
+    /// # Errors
+    /// As [`Lake::open`].
+    pub async fn check_readable(&self) -> Result<()> {
+        match read_config(&self.0.location).await? {
+            Some(_) => Ok(()),
+            None => Err(Error::NoLake { location: self.location().to_owned() }),
+        }
+    }
+
     /// Opens a lake, or makes one for this rig if the location is empty; then makes the tables that are missing, in a
     /// build that has tables.
     ///

@@ -36,7 +36,7 @@ pub use remote::{RemoteAccess, remote_access};
 pub use tables::{
     BatchBuilder, CommitEffect, CommitLog, CommitOutcome, DataFile, DeletedFile, DeletionMode, EncodedFile,
     FileEncoder, FileHistory, FileName, FileStats, KEEP_HOURS, LakeMoment, LakeSnapshot, LoggedFile, MergeProgress,
-    NewFile, NoMoment, OptimizeReport, ReplacedFiles, RunPart, StagedFile, TARGET_BYTES, TableCommit,
+    NewFile, NoMoment, OptimizeReport, ReplacedFiles, RunPart, StagedFile, TARGET_BYTES, TableChange, TableCommit,
     TableOptimizeReport, TableVersion, TableView, VacuumReport, VisibleRun, add_missing_columns, encode,
     reader_metadata, wanted_schema,
 };

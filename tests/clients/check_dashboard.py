@@ -1,9 +1,9 @@
-"""Checks docs/grafana/run.json against a run: `check_dashboard.py http://127.0.0.1:9108/metrics http://127.0.0.1:8428 [SECONDS]`.
+"""Checks a dashboard of docs/grafana: `check_dashboard.py http://127.0.0.1:9108/metrics http://127.0.0.1:8428 [SECONDS [run|server]]`.
 
-The first address is that of `echolake acquire --metrics`, the second that of VictoriaMetrics or Prometheus (2.x), which
-asks it at least every five seconds. Every query of the dashboard is asked there as Grafana would, for all surfaces, and has
-to answer with numbers within SECONDS (60). Every metric of the dashboard has to be one of the run's. Needs nothing beside
-Python. Prints a line a check, exits with 1 where one fails.
+The first address is that of `echolake acquire --metrics` or of a server, the second that of VictoriaMetrics or Prometheus
+(2.x), which asks it at least every five seconds. Every query of the dashboard is asked there as Grafana would, for all
+surfaces or servers, and has to answer with numbers within SECONDS (60). Every metric of the dashboard has to be one of the
+first address. A server wants a query now and then meanwhile, else nothing has a mean. Needs nothing beside Python. Prints a line a check, exits with 1 where one fails.
 """
 import json
 import pathlib
@@ -16,7 +16,7 @@ import urllib.request
 
 from checks import Checks
 
-DASHBOARD = pathlib.Path(__file__).parents[2] / "docs" / "grafana" / "run.json"
+DASHBOARDS = pathlib.Path(__file__).parents[2] / "docs" / "grafana"
 METRIC = re.compile(r"\becholake_[a-z_]+")
 LABEL_VALUES = re.compile(r"label_values\((\w+), (\w+)\)")
 # A ratio to a rate that is not there yet, or not above nothing, has no value; so has a run that measured nothing yet.
@@ -42,13 +42,13 @@ def numbers(store, query, until):
         time.sleep(1)
 
 
-def main(metrics, store, seconds=PATIENCE_SECS):
+def main(metrics, store, seconds=PATIENCE_SECS, name="run"):
     checks = Checks()
-    dashboard = json.loads(DASHBOARD.read_text())
+    dashboard = json.loads((DASHBOARDS / f"{name}.json").read_text())
     targets = [(panel["title"], target["expr"]) for panel in dashboard["panels"] for target in panel["targets"]]
-    offered = {line.split("{")[0] for line in asked(metrics).splitlines() if not line.startswith("#")}
+    offered = {re.split("[{ ]", line)[0] for line in asked(metrics).splitlines() if not line.startswith("#")}
     wanted = {name for _, expression in targets for name in METRIC.findall(expression)}
-    checks.same("metrics that the run does not have", set(), lambda: wanted - offered)
+    checks.same("metrics that are not there", set(), lambda: wanted - offered)
     until = time.monotonic() + float(seconds)
     for variable in dashboard["templating"]["list"]:
         if variable["type"] == "query":
@@ -56,7 +56,7 @@ def main(metrics, store, seconds=PATIENCE_SECS):
             address = f"{store}/api/v1/label/{label}/values?{urllib.parse.urlencode({'match[]': metric})}"
             checks.holds(f"values of ${variable['name']}", lambda: json.loads(asked(address))["data"], bool)
     for title, expression in targets:
-        query = expression.replace("$surface", ".*")
+        query = expression.replace("$surface", ".*").replace("$instance", ".*")
         checks.holds(f"{title}: {query}", lambda: numbers(store, query, until), lambda found: isinstance(found, list) and found)
     return checks.done()
 

@@ -107,7 +107,8 @@ impl HttpRequest {
 }
 
 impl HttpResponse {
-    fn read(bytes: &[u8]) -> Option<Self> {
+    /// Reads an answer; None if its head is not whole.
+    pub(crate) fn read(bytes: &[u8]) -> Option<Self> {
         let end = bytes.windows(4).position(|w| w == b"\r\n\r\n")?;
         let head = std::str::from_utf8(&bytes[..end]).expect("text");
         let mut lines = head.lines();

@@ -19,6 +19,11 @@ pub(crate) type TextRows = Result<Vec<Vec<Option<String>>>, String>;
 impl WireClient {
     /// Connects; if no token is required, the session has begun.
     pub(crate) fn connect(server: &ServedLake, options: Option<&str>) -> Self {
+        Self::attempt(server, options).unwrap_or_else(|state| panic!("refused: {state}"))
+    }
+
+    /// The same; the error is the state of the refusal.
+    pub(crate) fn attempt(server: &ServedLake, options: Option<&str>) -> Result<Self, String> {
         let mut stream = ServedLake::connect(&server.postgres);
         let mut body = 196_608_i32.to_be_bytes().to_vec();
         for (name, value) in
@@ -31,11 +36,21 @@ impl WireClient {
         stream.write_all(&body).expect("sent");
         let mut client = Self { stream, key: Vec::new() };
         let (kind, body) = client.message();
+        if kind == b'E' {
+            return Err(state(&body));
+        }
         assert_eq!(kind, b'R', "{}", String::from_utf8_lossy(&body));
         if body == [0; 4] {
             assert_eq!(client.ready(), None);
         }
-        client
+        Ok(client)
+    }
+
+    /// The state of the message with which the server ends the connection.
+    pub(crate) fn farewell(&mut self) -> String {
+        let (kind, body) = self.message();
+        assert_eq!(kind, b'E', "{}", String::from_utf8_lossy(&body));
+        state(&body)
     }
 
     /// Sends a token; returns the state of the refusal.

@@ -73,7 +73,17 @@ impl ServedLake {
 
     /// Stops it; returns its exit code.
     pub(crate) fn terminate(&mut self) -> Option<i32> {
-        self.child.signal("TERM");
+        self.signal("TERM");
+        self.wait()
+    }
+
+    /// Sends it a signal.
+    pub(crate) fn signal(&self, name: &str) {
+        self.child.signal(name);
+    }
+
+    /// Waits for its end; returns its exit code.
+    pub(crate) fn wait(&mut self) -> Option<i32> {
         self.child.wait().status.code()
     }
 }

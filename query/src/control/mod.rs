@@ -15,6 +15,8 @@ use std::time::{Duration, Instant};
 
 use tokio::sync::Notify;
 
+use pool::HeldMemory;
+
 /// Reason for which a query was stopped.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) enum StopReason {
@@ -29,7 +31,7 @@ pub(crate) struct QueryTicket {
     stop: OnceLock<(StopReason, Instant)>,
     stopped: Notify,
     /// Bytes that its operators have reserved.
-    held: Arc<AtomicUsize>,
+    held: Arc<HeldMemory>,
     /// Number of live work guards.
     working: AtomicUsize,
 }
@@ -78,7 +80,7 @@ impl QueryTicket {
     }
 
     /// Bytes that its operators have reserved.
-    pub(crate) fn held(&self) -> &Arc<AtomicUsize> {
+    pub(crate) fn held(&self) -> &Arc<HeldMemory> {
         &self.held
     }
 

@@ -15,11 +15,42 @@ pub(crate) struct PartialPool {
     /// The holder of the share, for error messages.
     holder: &'static str,
     limit: usize,
-    held: Arc<AtomicUsize>,
+    held: Arc<HeldMemory>,
+}
+
+/// Bytes that operators hold, and the most that they held.
+#[derive(Debug, Default)]
+pub(crate) struct HeldMemory {
+    now: AtomicUsize,
+    peak: AtomicUsize,
+}
+
+impl HeldMemory {
+    /// Returns the most that was held, bytes.
+    pub(crate) fn peak(&self) -> usize {
+        self.peak.load(Ordering::Relaxed)
+    }
+
+    fn grow(&self, additional: usize) {
+        let before = self.now.fetch_add(additional, Ordering::Relaxed);
+        self.peak.fetch_max(before.saturating_add(additional), Ordering::Relaxed);
+    }
+
+    fn shrink(&self, bytes: usize) {
+        self.now.fetch_sub(bytes, Ordering::Relaxed);
+    }
+
+    // The error is what is held already.
+    fn try_grow(&self, additional: usize, limit: usize) -> std::result::Result<(), usize> {
+        let within = |held: usize| held.checked_add(additional).filter(|sum| *sum <= limit);
+        let before = self.now.fetch_update(Ordering::Relaxed, Ordering::Relaxed, within)?;
+        self.peak.fetch_max(before + additional, Ordering::Relaxed);
+        Ok(())
+    }
 }
 
 impl PartialPool {
-    pub(crate) fn new(all: Arc<dyn MemoryPool>, holder: &'static str, limit: usize, held: Arc<AtomicUsize>) -> Self {
+    pub(crate) fn new(all: Arc<dyn MemoryPool>, holder: &'static str, limit: usize, held: Arc<HeldMemory>) -> Self {
         Self { all, holder, limit, held }
     }
 
@@ -55,27 +86,24 @@ impl MemoryPool for PartialPool {
     }
 
     fn grow(&self, reservation: &MemoryReservation, additional: usize) {
-        self.held.fetch_add(additional, Ordering::Relaxed);
+        self.held.grow(additional);
         self.all.grow(reservation, additional);
     }
 
     fn shrink(&self, reservation: &MemoryReservation, shrink: usize) {
-        self.held.fetch_sub(shrink, Ordering::Relaxed);
+        self.held.shrink(shrink);
         self.all.shrink(reservation, shrink);
     }
 
     fn try_grow(&self, reservation: &MemoryReservation, additional: usize) -> Result<()> {
-        let within = |held: usize| held.checked_add(additional).filter(|sum| *sum <= self.limit);
         let consumer = reservation.consumer().name();
-        let counted = self.held.fetch_update(Ordering::Relaxed, Ordering::Relaxed, within);
+        let counted = self.held.try_grow(additional, self.limit);
         counted.map_err(|held| self.refused(consumer, additional, held))?;
-        self.all.try_grow(reservation, additional).inspect_err(|_| {
-            self.held.fetch_sub(additional, Ordering::Relaxed);
-        })
+        self.all.try_grow(reservation, additional).inspect_err(|_| self.held.shrink(additional))
     }
 
     fn reserved(&self) -> usize {
-        self.held.load(Ordering::Relaxed)
+        self.held.now.load(Ordering::Relaxed)
     }
 
     fn memory_limit(&self) -> MemoryLimit {
@@ -92,8 +120,8 @@ mod tests {
     #[test]
     fn queries_share_what_their_client_and_all_may_hold() {
         let all: Arc<dyn MemoryPool> = Arc::new(GreedyMemoryPool::new(25));
-        let client_held = Arc::<AtomicUsize>::default();
-        let reserve = |held: &Arc<AtomicUsize>| {
+        let client_held = Arc::<HeldMemory>::default();
+        let reserve = |held: &Arc<HeldMemory>| {
             let client = Arc::new(PartialPool::new(all.clone(), "the client's queries hold", 10, held.clone()));
             let query: Arc<dyn MemoryPool> = Arc::new(PartialPool::new(client, "the query holds", 8, Arc::default()));
             MemoryConsumer::new("sort").register(&query)
@@ -109,5 +137,6 @@ mod tests {
         first.free();
         second.try_grow(6).expect("what is given back is free");
         assert_eq!(all.reserved(), 14);
+        assert_eq!((client_held.now.load(Ordering::Relaxed), client_held.peak()), (6, 6));
     }
 }

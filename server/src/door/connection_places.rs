@@ -5,17 +5,22 @@
 use std::cmp::Reverse;
 use std::collections::HashMap;
 use std::io::{self, IoSlice};
-use std::net::IpAddr;
+use std::net::{IpAddr, SocketAddr};
 use std::pin::Pin;
-use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::task::{Context, Poll};
 use std::time::Duration;
 
+use chrono::Utc;
 use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
 use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::Notify;
+use tokio::task::JoinSet;
 use tokio::time::Sleep;
+
+use crate::activity::OpenConnection;
+use crate::metrics::ServerProtocol;
 
 /// Time to wait if the system has no more sockets.
 const PAUSE: Duration = Duration::from_millis(100);
@@ -26,6 +31,8 @@ const TURN_BYTES: usize = 16 << 10;
 const IDLE_BYTES: usize = 1 << 20;
 /// Time for which a client may read nothing of an answer.
 const STALL: Duration = Duration::from_secs(300);
+/// Time without work or bytes after which nothing of an answer is on its way any more.
+const QUIET: Duration = Duration::from_secs(1);
 
 /// An address, and its places.
 pub(super) struct ConnectionPlaces {
@@ -42,16 +49,70 @@ struct TakenPlaces {
 }
 
 struct PlaceState {
+    id: u64,
+    peer: SocketAddr,
     address: IpAddr,
+    /// Microseconds since 1970.
+    started: i64,
+    client: Mutex<Option<String>>,
+    requests: AtomicU64,
     working: AtomicUsize,
     /// Bytes since the last request.
     idle_bytes: AtomicUsize,
+    /// Bytes that were written.
+    written: AtomicUsize,
     evicted: Notify,
 }
 
 impl PlaceState {
+    fn client(&self) -> MutexGuard<'_, Option<String>> {
+        self.client.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
     fn is_idle(&self) -> bool {
         self.working.load(Ordering::Relaxed) == 0
+    }
+
+    fn row(&self, protocol: ServerProtocol) -> OpenConnection {
+        OpenConnection {
+            id: self.id,
+            client: self.client().clone(),
+            protocol: protocol.name().to_owned(),
+            peer: self.peer.to_string(),
+            started: self.started,
+            requests: self.requests.load(Ordering::Relaxed),
+            is_working: !self.is_idle(),
+        }
+    }
+}
+
+/// The connections of all protocols.
+#[derive(Default)]
+pub(crate) struct OpenConnections(Mutex<Vec<ProtocolPlaces>>);
+
+struct ProtocolPlaces {
+    protocol: ServerProtocol,
+    most: usize,
+    taken: Arc<TakenPlaces>,
+}
+
+impl OpenConnections {
+    /// The number of open connections of each protocol, and its limit.
+    pub(crate) fn counts(&self) -> Vec<(ServerProtocol, usize, usize)> {
+        let all = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        all.iter().map(|places| (places.protocol, places.taken.lock().len(), places.most)).collect()
+    }
+
+    /// The connections of a client, or of all.
+    pub(crate) fn rows(&self, client: &str, all: bool) -> Vec<OpenConnection> {
+        let protocols = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut rows = Vec::new();
+        for places in protocols.iter() {
+            let taken = places.taken.lock();
+            let seen = taken.iter().filter(|place| all || place.client().as_deref() == Some(client));
+            rows.extend(seen.map(|place| place.row(places.protocol)));
+        }
+        rows
     }
 }
 
@@ -59,6 +120,13 @@ impl ConnectionPlaces {
     /// Places of an address.
     pub(super) fn new(listener: TcpListener, most: usize) -> Self {
         Self { listener, most, taken: Arc::default() }
+    }
+
+    /// Lists its connections among those of all protocols.
+    pub(super) fn listed(self, connections: &OpenConnections, protocol: ServerProtocol) -> Self {
+        let places = ProtocolPlaces { protocol, most: self.most, taken: self.taken.clone() };
+        connections.0.lock().unwrap_or_else(PoisonError::into_inner).push(places);
+        self
     }
 
     /// The next connection in its place. If all places are taken by connections that work, it waits.
@@ -69,7 +137,7 @@ impl ConnectionPlaces {
                     // Answers are written whole: waiting for more of them only delays.
                     let _ = stream.set_nodelay(true);
                     if self.make_room(peer.ip()).await {
-                        return self.place(stream, peer.ip());
+                        return self.place(stream, peer);
                     }
                 }
                 // A client that hung up already is no problem; a lack of sockets passes.
@@ -78,11 +146,29 @@ impl ConnectionPlaces {
         }
     }
 
-    fn place(&self, stream: TcpStream, address: IpAddr) -> PlacedStream {
+    /// Attends to connections, each in a task of its own; never ends.
+    pub(super) async fn attend<F: Future<Output = ()> + Send + 'static>(self, attend: impl Fn(PlacedStream) -> F) {
+        let mut open = JoinSet::new();
+        loop {
+            tokio::select! {
+                stream = self.next() => drop(open.spawn(attend(stream))),
+                Some(_) = open.join_next() => {}
+            }
+        }
+    }
+
+    fn place(&self, stream: TcpStream, peer: SocketAddr) -> PlacedStream {
+        static LAST: AtomicU64 = AtomicU64::new(0);
         let state = PlaceState {
-            address,
+            id: LAST.fetch_add(1, Ordering::Relaxed) + 1,
+            peer,
+            address: peer.ip(),
+            started: Utc::now().timestamp_micros(),
+            client: Mutex::default(),
+            requests: AtomicU64::new(0),
             working: AtomicUsize::new(0),
             idle_bytes: AtomicUsize::new(0),
+            written: AtomicUsize::new(0),
             evicted: Notify::new(),
         };
         let state = Arc::new(state);
@@ -154,8 +240,9 @@ impl PlacedStream {
     }
 
     fn watch(&mut self, context: &mut Context<'_>, written: Poll<io::Result<usize>>) -> Poll<io::Result<usize>> {
-        if written.is_ready() {
+        if let Poll::Ready(done) = &written {
             self.stalled = None;
+            self.state.written.fetch_add(*done.as_ref().unwrap_or(&0), Ordering::Relaxed);
             return written;
         }
         let stalled = self.stalled.get_or_insert_with(|| Box::pin(tokio::time::sleep(STALL)));
@@ -177,7 +264,32 @@ pub(super) struct PlaceWork(Arc<PlaceState>);
 impl PlaceWork {
     /// Takes note of a request: what was sent up to here was one.
     pub(super) fn hear_request(&self) {
+        self.0.requests.fetch_add(1, Ordering::Relaxed);
         self.0.idle_bytes.store(0, Ordering::Relaxed);
+    }
+
+    /// Takes note of the client of a request; returns true if the one before was another's.
+    pub(super) fn name_client(&self, name: &str) -> bool {
+        let mut known = self.0.client();
+        let is_other = known.as_deref() != Some(name);
+        if is_other {
+            *known = Some(name.to_owned());
+        }
+        is_other
+    }
+
+    /// The address of the other side.
+    pub(super) fn peer(&self) -> SocketAddr {
+        self.0.peer
+    }
+
+    /// Waits until the connection does no work, and sends nothing more of what was done.
+    pub(super) async fn quiet(&self) {
+        let mut written = None;
+        while !(self.0.is_idle() && written == Some(self.0.written.load(Ordering::Relaxed))) {
+            written = self.0.is_idle().then(|| self.0.written.load(Ordering::Relaxed));
+            tokio::time::sleep(QUIET).await;
+        }
     }
 
     pub(super) fn begin(&self) -> WorkingPlace {

@@ -2,7 +2,6 @@
 //! are idle or take too much.
 
 use std::collections::HashMap;
-use std::fmt::Write as _;
 use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
@@ -13,9 +12,11 @@ use tokio::sync::Notify;
 use super::engine_process::{EndReason, EngineLease, EngineProcess, EngineSettings, EngineStart};
 use super::temp_folder::ServerFolders;
 use crate::Error;
+use crate::activity::ServerActivity;
 use crate::client_identity::ClientIdentity;
+use crate::engine::door_message::DoorMessage;
 use crate::fault::RequestFault;
-use crate::metrics::ServerMetrics;
+use crate::metrics::PoolGauges;
 use crate::tokens::TokenAccess;
 
 /// Time without a request after which an engine ends.
@@ -30,6 +31,8 @@ const CACHE_BYTES: usize = 96 << 20;
 /// Clients wait this long for a new engine after the second one that their queries ended, and twice as long each time.
 const FIRST_BACKOFF: Duration = Duration::from_millis(250);
 const LONGEST_BACKOFF: Duration = Duration::from_secs(30);
+/// Time until a spare engine that did not start is started again.
+const START_AGAIN: Duration = Duration::from_secs(2);
 /// Time without an end after which a client's earlier ones are forgotten.
 const FORGIVEN: Duration = Duration::from_secs(60);
 
@@ -41,7 +44,7 @@ struct EnginePoolState {
     settings: EngineSettings,
     lake: Lake,
     folders: ServerFolders,
-    metrics: Arc<ServerMetrics>,
+    activity: Arc<ServerActivity>,
     access: Arc<TokenAccess>,
     clients: Mutex<HashMap<String, Arc<ClientEngine>>>,
     spare: Mutex<Option<Arc<EngineProcess>>>,
@@ -49,6 +52,15 @@ struct EnginePoolState {
     freed: Notify,
     started: AtomicUsize,
     failed: AtomicU64,
+    /// How the last start of an engine went; None until the first has.
+    last_start: Mutex<Option<StartOutcome>>,
+}
+
+/// How the start of an engine went.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum StartOutcome {
+    Ready,
+    Failed,
 }
 
 /// A client's engine. The lock is held while one is started, so that a client's requests wait for the same.
@@ -69,7 +81,7 @@ impl EnginePool {
     pub(super) fn new(
         lake: &Lake,
         settings: EngineSettings,
-        metrics: Arc<ServerMetrics>,
+        activity: Arc<ServerActivity>,
         access: Arc<TokenAccess>,
     ) -> Result<Self, Error> {
         let folders = ServerFolders::new(lake, settings.temp.as_deref())?;
@@ -77,7 +89,7 @@ impl EnginePool {
             settings,
             lake: lake.clone(),
             folders,
-            metrics,
+            activity,
             access,
             clients: Mutex::default(),
             spare: Mutex::default(),
@@ -85,6 +97,7 @@ impl EnginePool {
             freed: Notify::new(),
             started: AtomicUsize::new(0),
             failed: AtomicU64::new(0),
+            last_start: Mutex::default(),
         })))
     }
 
@@ -110,6 +123,7 @@ impl EnginePool {
         self.make_room(&own).await?;
         let engine = self.take_spare().map_err(RequestFault::defect("no engine can be started"))?;
         if let Err(EndReason::Failed(reason)) = engine.assign(client).await {
+            self.record_start(false);
             state.ends += 1;
             state.last_end = Some(Instant::now());
             tracing::error!(reason, "an engine did not start");
@@ -183,7 +197,7 @@ impl EnginePool {
             sockets: self.0.folders.sockets.path().join(&name),
             spills: self.0.folders.spills.path().join(&name),
         };
-        EngineProcess::start(start, self.0.metrics.clone())
+        EngineProcess::start(start, self.0.activity.clone())
     }
 
     /// Keeps a spare engine, ends idle ones, and those that take more memory than they may; never ends.
@@ -191,20 +205,60 @@ impl EnginePool {
         tokio::join!(self.keep_spare(), self.watch_memory(), self.retire_idle());
     }
 
+    /// Checks that engines can be started, by how the last start went.
+    ///
+    /// # Errors
+    /// [`RequestFault::NotReady`].
+    pub(super) fn check_start(&self) -> Result<(), RequestFault> {
+        let reason = match *lock(&self.0.last_start) {
+            Some(StartOutcome::Ready) => return Ok(()),
+            Some(StartOutcome::Failed) => "no engine can be started",
+            None => "its first engine is starting",
+        };
+        Err(RequestFault::NotReady { reason })
+    }
+
+    fn record_start(&self, is_ready: bool) {
+        *lock(&self.0.last_start) = Some(if is_ready { StartOutcome::Ready } else { StartOutcome::Failed });
+    }
+
     async fn keep_spare(&self) {
         loop {
             let taken = self.0.spare_taken.notified();
-            if lock(&self.0.spare).as_ref().is_none_or(|spare| spare.has_ended()) {
-                match self.start() {
-                    Ok(engine) => *lock(&self.0.spare) = Some(engine),
-                    Err(failed) => {
-                        tracing::error!(error = &failed as &dyn std::error::Error, "no spare engine can be started");
-                        tokio::time::sleep(LONGEST_BACKOFF).await;
-                    }
+            let spare = match self.spare_or_start() {
+                Ok(spare) => spare,
+                Err(failed) => {
+                    self.record_start(false);
+                    tracing::error!(error = &failed as &dyn std::error::Error, "no spare engine can be started");
+                    tokio::time::sleep(START_AGAIN).await;
+                    continue;
                 }
+            };
+            let watch = async {
+                if let Err(reason) = spare.started().await {
+                    self.record_start(false);
+                    tracing::error!(?reason, "a spare engine did not start");
+                    tokio::time::sleep(START_AGAIN).await;
+                    return;
+                }
+                self.record_start(true);
+                spare.wait_for_end().await;
+            };
+            tokio::select! {
+                () = taken => {}
+                () = watch => {}
             }
-            taken.await;
         }
+    }
+
+    fn spare_or_start(&self) -> std::io::Result<Arc<EngineProcess>> {
+        let spare = lock(&self.0.spare).clone().filter(|spare| !spare.has_ended());
+        if let Some(spare) = spare {
+            return Ok(spare);
+        }
+        let started = self.start()?;
+        *lock(&self.0.spare) = Some(started.clone());
+        Ok(started)
     }
 
     async fn watch_memory(&self) {
@@ -261,17 +315,26 @@ impl EnginePool {
         }
     }
 
-    /// Figures in Prometheus' text format.
-    pub(super) fn figures(&self) -> String {
-        let mut text = String::new();
-        let (engines, failed) = (self.live().len(), self.0.failed.load(Ordering::Relaxed));
-        for (name, kind, help, value) in [
-            ("echolake_engines", "gauge", "Engines that have a client.", engines as u64),
-            ("echolake_engine_failures_total", "counter", "Engines that ended while they had a client.", failed),
-        ] {
-            let _ = writeln!(text, "# HELP {name} {help}\n# TYPE {name} {kind}\n{name} {value}");
+    /// Cancels a query of an engine's process by its number there.
+    pub(super) async fn cancel(&self, pid: u32, number: u64) {
+        let engine = self.live().into_iter().find(|engine| engine.pid() == pid);
+        if let Some(engine) = engine {
+            // One that ends meanwhile runs nothing.
+            let _ = engine.send(&DoorMessage::Cancel(number)).await;
         }
-        text
+    }
+
+    /// Gauges of the engines.
+    pub(super) fn gauges(&self) -> PoolGauges {
+        let live = self.live();
+        PoolGauges {
+            engines: live.len(),
+            most_engines: self.0.settings.count,
+            bytes: live.iter().map(|engine| engine.grown_bytes()).sum(),
+            most_bytes: self.0.settings.memory,
+            started: self.0.started.load(Ordering::Relaxed),
+            failed: self.0.failed.load(Ordering::Relaxed),
+        }
     }
 }
 

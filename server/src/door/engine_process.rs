@@ -1,5 +1,6 @@
 //! One engine: a child process, its folder with sockets, and how it ended.
 
+use std::collections::HashMap;
 use std::ffi::OsStr;
 use std::io;
 use std::path::{Path, PathBuf};
@@ -14,10 +15,12 @@ use tokio::net::UnixStream;
 use tokio::process::{Child, ChildStdin, ChildStdout, Command};
 use tokio::sync::{Notify, SetOnce};
 
+use crate::activity::ServerActivity;
 use crate::client_identity::{ClientIdentity, counted_bytes};
+use crate::engine::door_message::DoorMessage;
 use crate::engine::report::EngineReport;
 use crate::engine_socket::EngineSocket;
-use crate::metrics::ServerMetrics;
+use crate::metrics::ServerProtocol;
 
 /// Time for which a request that lost its engine waits for the reason.
 const REASON_WAIT: Duration = Duration::from_secs(2);
@@ -36,6 +39,8 @@ pub struct EngineSettings {
     pub environment: Vec<(String, String)>,
     /// The folder for temporary files; None for one in the lake.
     pub temp: Option<PathBuf>,
+    /// Time from which a query is logged as slow; None for never.
+    pub slow: Option<Duration>,
 }
 
 /// The reason for which an engine ended.
@@ -56,6 +61,7 @@ pub(super) struct EngineProcess {
     base_bytes: OnceLock<usize>,
     /// Memory limit of its client's queries.
     memory_limit: OnceLock<usize>,
+    client: OnceLock<ClientIdentity>,
     ready: SetOnce<()>,
     kill: Notify,
     why_killed: OnceLock<EndReason>,
@@ -85,7 +91,7 @@ impl EngineProcess {
     ///
     /// # Errors
     /// The system gives no folder or process.
-    pub(super) fn start(start: EngineStart<'_>, metrics: Arc<ServerMetrics>) -> io::Result<Arc<Self>> {
+    pub(super) fn start(start: EngineStart<'_>, activity: Arc<ServerActivity>) -> io::Result<Arc<Self>> {
         std::fs::create_dir(&start.sockets)?;
         std::fs::create_dir(&start.spills)?;
         let mut child = Command::new(&start.settings.program)
@@ -94,6 +100,9 @@ impl EngineProcess {
             .args(start.lake_folder.iter().flat_map(|folder| [OsStr::new("--confine-to"), folder.as_os_str()]))
             .arg("--memory-bytes")
             .arg(counted_bytes(start.settings.memory).to_string())
+            .args(
+                start.settings.slow.iter().flat_map(|slow| ["--log-slow-ms".to_owned(), slow.as_millis().to_string()]),
+            )
             .envs(start.settings.environment.iter().map(|(name, value)| (name, value)))
             .env("TMPDIR", &start.spills)
             // Memory that is reserved and not used would count against the limit.
@@ -114,14 +123,26 @@ impl EngineProcess {
             usage: Mutex::new(EngineUsage { requests: 0, last_used: Instant::now(), is_ending: false }),
             base_bytes: OnceLock::new(),
             memory_limit: OnceLock::new(),
+            client: OnceLock::new(),
             ready: SetOnce::new(),
             kill: Notify::new(),
             why_killed: OnceLock::new(),
             ended: SetOnce::new(),
             flight: tokio::sync::Mutex::default(),
         });
-        tokio::spawn(supervise(engine.clone(), child, stdout, start.spills, metrics));
+        tokio::spawn(supervise(engine.clone(), child, stdout, start.spills, activity));
         Ok(engine)
+    }
+
+    /// Waits until it is ready.
+    ///
+    /// # Errors
+    /// It ended before that.
+    pub(super) async fn started(&self) -> Result<(), EndReason> {
+        tokio::select! {
+            _ = self.ready.wait() => Ok(()),
+            reason = self.ended.wait() => Err(reason.clone()),
+        }
     }
 
     /// Waits until it is ready, and assigns it to a client.
@@ -130,17 +151,28 @@ impl EngineProcess {
     /// It ended before that.
     pub(super) async fn assign(&self, client: &ClientIdentity) -> Result<(), EndReason> {
         let failed = |e: io::Error| EndReason::Failed(format!("it could not be told whose it is: {e}"));
-        tokio::select! {
-            _ = self.ready.wait() => {}
-            reason = self.ended.wait() => return Err(reason.clone()),
-        }
+        self.started().await?;
         let _ = self.base_bytes.set(private_bytes(self.pid).unwrap_or(0));
         if let Some(limit) = client.memory_bytes {
             let _ = self.memory_limit.set(limit);
         }
-        let mut line = serde_json::to_vec(client).map_err(|e| failed(e.into()))?;
+        let _ = self.client.set(client.clone());
+        self.send(&DoorMessage::Client(client.clone())).await.map_err(failed)
+    }
+
+    /// Sends it a message.
+    ///
+    /// # Errors
+    /// It has ended.
+    pub(super) async fn send(&self, message: &DoorMessage) -> io::Result<()> {
+        let mut line = serde_json::to_vec(message)?;
         line.push(b'\n');
-        self.stdin.lock().await.write_all(&line).await.map_err(failed)
+        self.stdin.lock().await.write_all(&line).await
+    }
+
+    /// Its process id.
+    pub(super) fn pid(&self) -> u32 {
+        self.pid
     }
 
     /// Connects to one of its sockets.
@@ -257,9 +289,9 @@ async fn supervise(
     mut child: Child,
     stdout: ChildStdout,
     spills: PathBuf,
-    metrics: Arc<ServerMetrics>,
+    activity: Arc<ServerActivity>,
 ) {
-    let mut reports = EngineReports { metrics, counters: Vec::new(), why: None };
+    let mut reports = EngineReports { activity, protocols: HashMap::new(), why: None };
     let mut lines = BufReader::new(stdout).lines();
     loop {
         tokio::select! {
@@ -276,7 +308,7 @@ async fn supervise(
     // Its output has ended, so that it is ending, too, or was never meant to.
     let _ = child.start_kill();
     let status = child.wait().await;
-    reports.forget_running();
+    reports.activity.metrics.lose(reports.activity.queries.end_engine(engine.pid));
     let found =
         || reports.why.clone().unwrap_or_else(|| status.map_or_else(|e| e.to_string(), |s| format!("it ended by {s}")));
     let why = engine.why_killed.get().cloned().unwrap_or_else(|| EndReason::Failed(found()));
@@ -288,32 +320,40 @@ async fn supervise(
 }
 
 struct EngineReports {
-    metrics: Arc<ServerMetrics>,
-    counters: Vec<u64>,
+    activity: Arc<ServerActivity>,
+    /// Protocols of the queries that run.
+    protocols: HashMap<u64, ServerProtocol>,
     why: Option<String>,
 }
 
 impl EngineReports {
-    fn take(&mut self, line: &str, engine: &EngineProcess) {
+    fn take(&mut self, line: &str, engine: &Arc<EngineProcess>) {
+        let activity = &self.activity;
         match serde_json::from_str(line) {
             Ok(EngineReport::Ready) => drop(engine.ready.set(())),
             Ok(EngineReport::Ending(why)) => self.why = Some(why),
-            Ok(EngineReport::Counters(counters)) => {
-                self.metrics.add(&self.counters, &counters);
-                self.counters = counters;
+            Ok(EngineReport::Started(start)) => {
+                activity.metrics.begin(start.protocol);
+                self.protocols.insert(start.number, start.protocol);
+                let client = engine.client.get().map_or("", |client| client.name.as_str());
+                activity.queries.begin(client, engine.pid, start);
+            }
+            Ok(EngineReport::Ended(end)) => {
+                if let Some(protocol) = self.protocols.remove(&end.number) {
+                    activity.metrics.end(protocol, &end);
+                    activity.queries.end(engine.pid, &end);
+                }
+            }
+            Ok(EngineReport::Failure(code)) => activity.metrics.failed(code),
+            Ok(EngineReport::Lake(figures)) => activity.set_lake(figures),
+            Ok(EngineReport::Ask { number, table }) => {
+                let Some(client) = engine.client.get() else { return };
+                let message = DoorMessage::Rows { number, rows: activity.rows(table, client) };
+                let engine = engine.clone();
+                // Beside this: an engine that does not read must not keep its reports from being read.
+                tokio::spawn(async move { drop(engine.send(&message).await) });
             }
             Err(_) => tracing::warn!(line, "an engine wrote what is no report"),
-        }
-    }
-
-    // What it counted stays counted; what it ran does not run any more.
-    fn forget_running(&mut self) {
-        if let Some((running, counted)) = self.counters.split_last_mut() {
-            let mut after: Vec<u64> = counted.to_vec();
-            after.push(0);
-            let mut before = counted.to_vec();
-            before.push(*running);
-            self.metrics.add(&before, &after);
         }
     }
 }

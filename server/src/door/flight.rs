@@ -11,8 +11,6 @@ use hyper::server::conn::http2;
 use hyper::service::service_fn;
 use hyper_util::rt::{TokioExecutor, TokioIo, TokioTimer};
 use tokio::net::TcpListener;
-use tokio::sync::watch;
-use tokio::task::JoinSet;
 use tracing::Instrument as _;
 
 use super::connection_places::{ConnectionPlaces, PlaceWork, PlacedStream};
@@ -23,7 +21,7 @@ use crate::door::server_door::ServerDoor;
 use crate::fault::RequestFault;
 use crate::flight::{WINDOW_BYTES, status};
 use crate::metrics::ServerProtocol;
-use crate::request_span::begin_request;
+use crate::request_span::{REQUEST_ID, begin_request};
 use crate::tokens::of_header;
 
 /// Connections at once. With those of the other protocols they are within the 1024 files that systems often allow.
@@ -35,44 +33,29 @@ const STREAMS: u32 = 64;
 /// Methods whose clients may wait for an answer before they end their request.
 const INTERACTIVE: [&str; 3] = ["DoPut", "DoExchange", "Handshake"];
 
-/// Answers connections until `stopping`, then lets pending requests end.
-pub(super) async fn serve(
-    door: ServerDoor,
-    listener: TcpListener,
-    encryption: ProtocolEncryption,
-    stopping: watch::Receiver<bool>,
-) {
-    let places = ConnectionPlaces::new(listener, MOST);
-    let mut stopped = stopping.clone();
-    let mut open = JoinSet::new();
-    loop {
-        tokio::select! {
-            _ = stopped.wait_for(|stopping| *stopping) => break,
-            stream = places.next() => drop(open.spawn(answer(stream, encryption.clone(), door.clone(), stopping.clone()))),
-            Some(_) = open.join_next() => {}
-        }
-    }
-    while open.join_next().await.is_some() {}
+/// Answers connections; never ends.
+pub(super) async fn serve(door: ServerDoor, listener: TcpListener, encryption: ProtocolEncryption) {
+    let places = ConnectionPlaces::new(listener, MOST).listed(&door.activity().connections, ServerProtocol::FlightSql);
+    places.attend(|stream| answer(stream, encryption.clone(), door.clone())).await;
 }
 
-async fn answer(
-    stream: PlacedStream,
-    encryption: ProtocolEncryption,
-    door: ServerDoor,
-    mut stopping: watch::Receiver<bool>,
-) {
+async fn answer(stream: PlacedStream, encryption: ProtocolEncryption, door: ServerDoor) {
     let evicted = stream.evicted();
     let work = stream.work();
     let Some(stream) = encryption.accept(stream).await else { return };
+    let drain = door.drain().clone();
+    let awaited = drain.enter();
+    let place = work.clone();
     let service = service_fn(move |mut request: Request<Incoming>| {
         work.hear_request();
         let (door, work) = (door.clone(), work.clone());
-        let span = begin_request(request.headers_mut(), ServerProtocol::FlightSql);
+        let (span, id) = begin_request(request.headers_mut(), ServerProtocol::FlightSql);
         let answer = async move {
-            let response = door.answer_flight(request, &work).await.unwrap_or_else(|fault| {
+            let mut response = door.answer_flight(request, &work).await.unwrap_or_else(|fault| {
                 door.metrics().record_failure(&fault);
                 status(&fault).into_http()
             });
+            response.headers_mut().insert(REQUEST_ID, id);
             Ok::<_, Infallible>(response)
         };
         answer.instrument(span)
@@ -88,9 +71,13 @@ async fn answer(
     tokio::select! {
         _ = connection.as_mut() => return,
         () = evicted => return,
-        _ = stopping.wait_for(|stopping| *stopping) => connection.as_mut().graceful_shutdown(),
+        // One that comes later may ask, and is told that nothing is taken.
+        () = drain.begun(), if awaited.is_some() => connection.as_mut().graceful_shutdown(),
     }
-    let _ = connection.await;
+    tokio::select! {
+        _ = connection => {}
+        () = place.quiet() => {}
+    }
 }
 
 impl ServerDoor {
@@ -99,8 +86,12 @@ impl ServerDoor {
         request: Request<Incoming>,
         work: &PlaceWork,
     ) -> Result<Response<Body>, RequestFault> {
+        if self.drain().is_begun() {
+            return Err(RequestFault::Draining);
+        }
         let token = request.headers().get(header::AUTHORIZATION).and_then(|v| v.to_str().ok()).and_then(of_header);
-        let client = self.access().client(token.as_deref(), ClientIdentity::programs)?;
+        let found = self.access().client(token.as_deref(), ClientIdentity::programs);
+        let client = self.note_client(work, ServerProtocol::FlightSql, found)?;
         let is_interactive = INTERACTIVE.iter().any(|method| request.uri().path().ends_with(method));
         let wire = if is_interactive { EngineProtocol::InteractiveGrpc } else { EngineProtocol::Grpc };
         let response = self.engines().forward(&client, request.map(Body::new), wire, work).await?;

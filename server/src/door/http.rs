@@ -1,12 +1,13 @@
 //! HTTP connections of the door: so many at once, each of which must say what it wants in time.
 
 use std::pin::pin;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use axum::Router;
 use axum::body::Body;
 use axum::extract::{Request, State};
 use axum::http::HeaderValue;
+use axum::middleware::Next;
 use axum::response::{IntoResponse as _, Response};
 use hyper::body::Incoming;
 use hyper::server::conn::http1;
@@ -14,55 +15,38 @@ use hyper::service::{Service as _, service_fn};
 use hyper_util::rt::{TokioIo, TokioTimer};
 use hyper_util::service::TowerToHyperService;
 use tokio::net::TcpListener;
-use tokio::sync::watch;
-use tokio::task::JoinSet;
 use tracing::Instrument as _;
 
+use super::audit;
 use super::connection_places::{ConnectionPlaces, PlaceWork, PlacedStream};
+use super::drain::ServerDrain;
 use super::encryption::ProtocolEncryption;
 use super::forward::EngineProtocol;
 use crate::client_identity::ClientIdentity;
 use crate::door::server_door::ServerDoor;
-use crate::fault::RequestFault;
+use crate::fault::{FaultCode, RequestFault};
 use crate::http::{FORWARDED_PROTO, ProblemResponse, RequestSite, authenticate, door_router, request_site};
 use crate::metrics::ServerProtocol;
-use crate::request_span::begin_request;
+use crate::request_span::{REQUEST_ID, begin_request};
 
 /// Connections at once. Systems often allow a process 1024 open files.
 const MOST: usize = 512;
 /// Time limit for a request's head, and for an idle connection between two requests.
 const HEAD: Duration = Duration::from_secs(30);
 
-/// Answers connections until `stopping`, then lets pending requests end.
-pub(super) async fn serve(
-    door: ServerDoor,
-    listener: TcpListener,
-    encryption: ProtocolEncryption,
-    stopping: watch::Receiver<bool>,
-) {
+/// Answers connections; never ends.
+pub(super) async fn serve(door: ServerDoor, listener: TcpListener, encryption: ProtocolEncryption) {
     let router = door_router(&door);
-    let places = ConnectionPlaces::new(listener, MOST);
-    let mut stopped = stopping.clone();
-    let mut open = JoinSet::new();
-    loop {
-        tokio::select! {
-            _ = stopped.wait_for(|stopping| *stopping) => break,
-            stream = places.next() => drop(open.spawn(answer(stream, encryption.clone(), router.clone(), stopping.clone()))),
-            Some(_) = open.join_next() => {}
-        }
-    }
-    while open.join_next().await.is_some() {}
+    let places = ConnectionPlaces::new(listener, MOST).listed(&door.activity().connections, ServerProtocol::Http);
+    places.attend(|stream| answer(stream, encryption.clone(), router.clone(), door.drain().clone())).await;
 }
 
-async fn answer(
-    stream: PlacedStream,
-    encryption: ProtocolEncryption,
-    router: Router,
-    mut stopping: watch::Receiver<bool>,
-) {
+async fn answer(stream: PlacedStream, encryption: ProtocolEncryption, router: Router, drain: ServerDrain) {
     let evicted = stream.evicted();
     let work = stream.work();
     let Some(stream) = encryption.accept(stream).await else { return };
+    let awaited = drain.enter();
+    let place = work.clone();
     let answers = TowerToHyperService::new(router);
     let service = service_fn(move |mut request: hyper::Request<Incoming>| {
         work.hear_request();
@@ -81,22 +65,38 @@ async fn answer(
     tokio::select! {
         _ = connection.as_mut() => return,
         () = evicted => return,
-        _ = stopping.wait_for(|stopping| *stopping) => connection.as_mut().graceful_shutdown(),
+        // One that comes later may ask, and is told that nothing is taken.
+        () = drain.begun(), if awaited.is_some() => connection.as_mut().graceful_shutdown(),
     }
-    let _ = connection.await;
+    tokio::select! {
+        _ = connection => {}
+        () = place.quiet() => {}
+    }
 }
 
 impl ServerDoor {
     /// Forwards a request to the client's engine.
-    pub(crate) async fn forward_http(State(door): State<Self>, mut request: Request) -> Response {
-        let span = begin_request(request.headers_mut(), ServerProtocol::Http);
-        let answer = async {
-            door.answer_http(request).await.unwrap_or_else(|fault| {
-                door.metrics().record_failure(&fault);
-                ProblemResponse(fault).into_response()
-            })
-        };
-        answer.instrument(span).await
+    pub(crate) async fn forward_http(State(door): State<Self>, request: Request) -> Response {
+        door.answer_http(request).await.unwrap_or_else(|fault| {
+            door.metrics().record_failure(&fault);
+            ProblemResponse(fault).into_response()
+        })
+    }
+
+    /// Answers a request within its span, and names it in the answer; the layer of all routes.
+    pub(crate) async fn name_request(State(door): State<Self>, mut request: Request, next: Next) -> Response {
+        let begun = Instant::now();
+        let (span, id) = begin_request(request.headers_mut(), ServerProtocol::Http);
+        let peer = request.extensions().get::<PlaceWork>().map(PlaceWork::peer);
+        let mut response = next.run(request).instrument(span.clone()).await;
+        if let (Some(peer), Some(code)) = (peer, response.extensions().get::<FaultCode>())
+            && !door.access().is_open()
+        {
+            span.in_scope(|| audit::record_refusal(peer, ServerProtocol::Http, *code));
+        }
+        response.headers_mut().insert(REQUEST_ID, id);
+        door.metrics().answered(response.status().as_u16(), begun.elapsed().as_secs_f64());
+        response
     }
 
     async fn answer_http(&self, request: Request) -> Result<Response, RequestFault> {
@@ -106,8 +106,14 @@ impl ServerDoor {
             RequestSite::OwnPage => ClientIdentity::pages(),
             RequestSite::Program => ClientIdentity::programs(),
         };
+        // A refusal is noted with those of the other routes.
         let client = authenticate(self.access(), request.headers(), local)?;
+        let client = self.note_client(&work, ServerProtocol::Http, Ok(client))?;
+        let (method, path) = (request.method().clone(), request.uri().path().to_owned());
         let response = self.engines().forward(&client, request, EngineProtocol::Http, &work).await?;
+        if !self.access().is_open() {
+            audit::record_file(work.peer(), &client.name, &method, &path, response.status());
+        }
         Ok(response.map(Body::new))
     }
 }

@@ -1,7 +1,9 @@
 //! The door: the process that clients reach. It holds connections, finds out who asks, and forwards requests to the engine
 //! of that client. It parses no SQL and decodes no file, so that no request can end it.
 
-mod connection_places;
+mod audit;
+pub(crate) mod connection_places;
+pub(crate) mod drain;
 mod encryption;
 mod engine_pool;
 mod engine_process;
@@ -9,6 +11,7 @@ mod flight;
 mod forward;
 mod http;
 mod postgres;
+mod readiness;
 pub(crate) mod server_door;
 mod temp_folder;
 
@@ -17,7 +20,6 @@ use std::time::Duration;
 
 use echolake_lake::Lake;
 use tokio::net::{TcpListener, TcpSocket};
-use tokio::sync::watch;
 use tokio::task::JoinSet;
 
 use crate::Error;
@@ -27,8 +29,6 @@ use encryption::{ProtocolEncryption, ServerEncryption};
 pub use engine_process::EngineSettings;
 use server_door::ServerDoor;
 
-/// Time for which answers may continue after the server was asked to stop.
-const GRACE: Duration = Duration::from_secs(5);
 /// Bytes that the system keeps for a connection until they are read, and connections until they are accepted.
 const RECEIVED_BYTES: u32 = 128 << 10;
 const BACKLOG: u32 = 1024;
@@ -47,6 +47,8 @@ pub struct ServerSettings {
     pub certificate: Option<CertificateFiles>,
     /// True if plain text may leave this machine, because a proxy encrypts it.
     pub is_behind_proxy: bool,
+    /// Time for which answers may continue after the server was asked to stop.
+    pub drain: Duration,
     /// The engines.
     pub engines: EngineSettings,
 }
@@ -58,6 +60,7 @@ pub struct LakeServer {
     flight_sql: Option<TcpListener>,
     postgres: Option<TcpListener>,
     encryption: Option<ServerEncryption>,
+    drain_limit: Duration,
 }
 
 impl LakeServer {
@@ -81,6 +84,7 @@ impl LakeServer {
             http: listen(settings.http)?,
             flight_sql: listen(settings.flight_sql)?,
             postgres: listen(settings.postgres)?,
+            drain_limit: settings.drain,
         })
     }
 
@@ -100,12 +104,11 @@ impl LakeServer {
         all.into_iter().flatten().collect()
     }
 
-    /// Answers until `stop`, then lets answers continue for five seconds.
+    /// Answers until `stop`, then takes nothing new and lets answers continue, for as long as the settings say.
     ///
     /// # Errors
     /// [`Error::System`].
     pub async fn run(self, stop: impl Future<Output = ()>) -> Result<(), Error> {
-        let stopping = watch::Sender::new(false);
         let mut tasks = JoinSet::new();
         let mut upkeep = JoinSet::new();
         upkeep.spawn(self.door.engines().clone().keep_up());
@@ -120,22 +123,24 @@ impl LakeServer {
             upkeep.spawn(encryption.keep_up());
         }
         if let Some(listener) = self.http {
-            tasks.spawn(http::serve(self.door.clone(), listener, http_tls, stopping.subscribe()));
+            tasks.spawn(http::serve(self.door.clone(), listener, http_tls));
         }
         if let Some(listener) = self.flight_sql {
-            tasks.spawn(flight::serve(self.door.clone(), listener, flight_tls, stopping.subscribe()));
+            tasks.spawn(flight::serve(self.door.clone(), listener, flight_tls));
         }
         if let Some(listener) = self.postgres {
-            tasks.spawn(postgres::serve(self.door.clone(), listener, postgres_tls, stopping.subscribe()));
+            tasks.spawn(postgres::serve(self.door.clone(), listener, postgres_tls));
         }
         tokio::select! {
             () = stop => {}
             Some(Err(failed)) = tasks.join_next() => return Err(Error::System(std::io::Error::other(failed))),
         }
-        stopping.send_replace(true);
-        let rest = async { while tasks.join_next().await.is_some() {} };
-        // What is not done by then ends with the process.
-        let _ = tokio::time::timeout(GRACE, rest).await;
+        let drain = self.door.drain();
+        drain.begin();
+        // Connections that come now are told so, until the others have their answers.
+        if tokio::time::timeout(self.drain_limit, drain.emptied()).await.is_err() {
+            tracing::warn!(connections = drain.open(), "answers that took too long are broken off");
+        }
         self.door.engines().end_all().await;
         Ok(())
     }

@@ -5,12 +5,19 @@ use std::time::Duration;
 
 use echolake_lake::Lake;
 
+use super::audit;
+use super::connection_places::PlaceWork;
+use super::drain::ServerDrain;
 use super::engine_pool::EnginePool;
 use super::engine_process::EngineSettings;
+use super::readiness::ReadinessCheck;
 use crate::Error;
+use crate::activity::ServerActivity;
+use crate::client_identity::ClientIdentity;
+use crate::fault::RequestFault;
 use crate::http::ViewerLayout;
-use crate::metrics::ServerMetrics;
-use crate::tokens::{TokenAccess, TokenFile, TokenFileState};
+use crate::metrics::{ServerGauges, ServerMetrics, ServerProtocol};
+use crate::tokens::{TokenAccess, TokenFile, TokenFileState, TokenScope};
 
 /// Time between two looks at the file of tokens.
 const LOOK_EVERY: Duration = Duration::from_secs(1);
@@ -21,8 +28,10 @@ pub(crate) struct ServerDoor(Arc<DoorState>);
 
 struct DoorState {
     access: Arc<TokenAccess>,
-    metrics: Arc<ServerMetrics>,
+    activity: Arc<ServerActivity>,
     engines: EnginePool,
+    readiness: ReadinessCheck,
+    drain: ServerDrain,
     layout: ViewerLayout,
 }
 
@@ -32,11 +41,12 @@ impl ServerDoor {
     /// # Errors
     /// [`Error::Temp`].
     pub(super) fn new(lake: &Lake, tokens: Option<TokenFile>, settings: EngineSettings) -> Result<Self, Error> {
-        let metrics = Arc::new(ServerMetrics::default());
+        let activity = Arc::new(ServerActivity::new()?);
         let access = Arc::new(TokenAccess::new(tokens));
-        let engines = EnginePool::new(lake, settings, metrics.clone(), access.clone())?;
+        let engines = EnginePool::new(lake, settings, activity.clone(), access.clone())?;
         let layout = ViewerLayout::new(lake.rig());
-        Ok(Self(Arc::new(DoorState { access, metrics, engines, layout })))
+        let (readiness, drain) = (ReadinessCheck::new(lake), ServerDrain::default());
+        Ok(Self(Arc::new(DoorState { access, activity, engines, readiness, drain, layout })))
     }
 
     pub(crate) fn access(&self) -> &TokenAccess {
@@ -44,12 +54,28 @@ impl ServerDoor {
     }
 
     pub(crate) fn metrics(&self) -> &ServerMetrics {
-        &self.0.metrics
+        &self.0.activity.metrics
+    }
+
+    /// What the server does.
+    pub(crate) fn activity(&self) -> &ServerActivity {
+        &self.0.activity
     }
 
     /// The figures of the door and of all engines, in Prometheus' text format.
-    pub(crate) fn figures(&self) -> String {
-        self.0.metrics.text() + &self.0.engines.figures()
+    ///
+    /// # Errors
+    /// [`RequestFault::Internal`].
+    pub(crate) async fn figures(&self) -> Result<String, RequestFault> {
+        let activity = self.activity();
+        let gauges = ServerGauges {
+            pool: self.0.engines.gauges(),
+            connections: activity.connections.counts(),
+            lake: activity.lake().map(|(at, figures)| (at.elapsed(), figures)),
+            is_ready: self.check_ready().await.is_ok(),
+            process_start: activity.started().timestamp_micros() as f64 / 1e6,
+        };
+        activity.metrics.text(&gauges).map_err(RequestFault::defect("the figures cannot be written"))
     }
 
     /// Reads the file of tokens again when it changes, and ends what clients without a token were doing; never ends.
@@ -64,6 +90,58 @@ impl ServerDoor {
             ended = gone;
             tokio::time::sleep(LOOK_EVERY).await;
         }
+    }
+
+    /// Checks that requests can be answered.
+    ///
+    /// # Errors
+    /// [`RequestFault::Draining`], [`RequestFault::NotReady`].
+    pub(crate) async fn check_ready(&self) -> Result<(), RequestFault> {
+        if self.0.drain.is_begun() {
+            return Err(RequestFault::Draining);
+        }
+        self.0.engines.check_start()?;
+        self.0.readiness.check_lake(self.activity()).await
+    }
+
+    /// Ends a query of a client, or of any if the client may see the server's figures.
+    ///
+    /// # Errors
+    /// [`RequestFault::NotFound`] if none that the client may end runs.
+    pub(crate) async fn cancel_query(&self, client: &ClientIdentity, id: u64) -> Result<(), RequestFault> {
+        let may_any = client.require(TokenScope::Metrics).is_ok();
+        let running = self.activity().queries.find(id).filter(|query| may_any || query.client == client.name);
+        let Some(query) = running else {
+            let hint = "select id from system.queries where outcome = 'running'";
+            return Err(RequestFault::NotFound { what: format!("query {id}"), hint });
+        };
+        self.0.engines.cancel(query.engine, query.number).await;
+        Ok(())
+    }
+
+    /// The server's end.
+    pub(crate) fn drain(&self) -> &ServerDrain {
+        &self.0.drain
+    }
+
+    /// Takes note of who asks on a connection, or of a refusal; returns `found`.
+    pub(super) fn note_client(
+        &self,
+        work: &PlaceWork,
+        protocol: ServerProtocol,
+        found: Result<Arc<ClientIdentity>, RequestFault>,
+    ) -> Result<Arc<ClientIdentity>, RequestFault> {
+        let is_audited = !self.0.access.is_open();
+        match &found {
+            Ok(client) => {
+                if work.name_client(&client.name) && is_audited {
+                    audit::record_login(work.peer(), protocol, &client.name);
+                }
+            }
+            Err(fault) if is_audited => audit::record_refusal(work.peer(), protocol, fault.code()),
+            Err(_) => {}
+        }
+        found
     }
 
     /// The layout of its lake's runs.

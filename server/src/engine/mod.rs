@@ -2,26 +2,43 @@
 //! folder that only its user may enter; the door, which started it, is its only peer and has authenticated the client.
 
 pub mod confinement;
+pub(crate) mod door_message;
+pub(crate) mod door_rows;
 pub(crate) mod report;
 mod watchdog;
 
+use std::convert::Infallible;
 use std::io::BufRead as _;
 use std::path::Path;
 use std::sync::Arc;
+use std::time::Duration;
 
 use echolake_lake::Lake;
 use echolake_query::{EngineClient, EngineLimits, QueryEngine, QueryQuota};
 use futures::FutureExt as _;
-use tokio::sync::oneshot;
+use tokio::sync::mpsc;
 
+use crate::activity::LakeFigures;
 use crate::client_identity::ClientIdentity;
 use crate::engine_socket::EngineSocket;
 use crate::service::QueryService;
 use crate::{Error, flight, http, postgres};
+use door_message::DoorMessage;
 use report::EngineReport;
 
 /// A query that has a new engine read what every query reads.
 const WARM_UP: &str = "select count(*) from runs";
+/// Time between two looks at the lake for its figures.
+const LAKE_LOOK: Duration = Duration::from_secs(15);
+
+/// Settings of an engine.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct EngineRun {
+    /// Bytes that its queries may hold; None for no limit.
+    pub memory: Option<usize>,
+    /// Time from which a query is logged as slow; None for never.
+    pub slow: Option<Duration>,
+}
 
 /// Answers one client's requests until standard input ends, which the door holds.
 ///
@@ -30,22 +47,29 @@ const WARM_UP: &str = "select count(*) from runs";
 ///
 /// # Errors
 /// [`Error::System`], [`Error::Query`], [`Error::Transport`].
-pub async fn run_engine(lake: &Lake, sockets: &Path, memory: Option<usize>) -> Result<(), Error> {
-    let assigned = read_assignment();
+pub async fn run_engine(lake: &Lake, sockets: &Path, settings: EngineRun) -> Result<(), Error> {
+    let memory = settings.memory;
+    let mut messages = read_messages();
     let http = EngineSocket::Http.listen(sockets)?;
     let flight_sql = EngineSocket::FlightSql.listen(sockets)?;
     let postgres = EngineSocket::Postgres.listen(sockets)?;
     let engine = QueryEngine::new(lake, EngineLimits { memory })?;
     warm_up(&engine).await?;
     EngineReport::Ready.send();
+    let identity = tokio::select! {
+        identity = next_client(&mut messages) => identity,
+        never = report_lake(lake, &engine) => match never {},
+    };
     // The door went away before it had a use for this engine.
-    let Ok(identity) = assigned.await else { return Ok(()) };
+    let Some(identity) = identity else { return Ok(()) };
     let limit = identity.memory_bytes.into_iter().chain(memory).min();
-    let service = QueryService::new(lake, engine, identity)?;
+    let service = QueryService::new(lake, engine, identity, settings.slow)?;
     // Behind the start of its threads, whose stacks count.
     limit.map(confinement::limit_memory).transpose().map_err(Error::System)?;
     watchdog::start(&service).map_err(Error::System)?;
+    let obeying = service.clone();
     tokio::select! {
+        () = obeying.obey(messages) => Ok(()),
         failed = http::serve(service.clone(), http) => failed,
         failed = flight::serve(service.clone(), flight_sql) => failed,
         failed = postgres::serve(service, postgres) => failed,
@@ -53,20 +77,41 @@ pub async fn run_engine(lake: &Lake, sockets: &Path, memory: Option<usize>) -> R
 }
 
 // A thread of its own, so that an engine ends with its door whatever its other threads do.
-fn read_assignment() -> oneshot::Receiver<ClientIdentity> {
-    let (send, receive) = oneshot::channel();
+fn read_messages() -> mpsc::UnboundedReceiver<DoorMessage> {
+    let (send, receive) = mpsc::unbounded_channel();
     std::thread::spawn(move || {
-        let mut send = Some(send);
         for line in std::io::stdin().lock().lines().map_while(Result::ok) {
-            let identity = serde_json::from_str(&line).ok();
-            if let (Some(identity), Some(send)) = (identity, send.take()) {
+            match serde_json::from_str(&line) {
                 // The receiver is gone if the engine has failed meanwhile.
-                let _ = send.send(identity);
+                Ok(message) => drop(send.send(message)),
+                Err(e) => tracing::error!(error = &e as &dyn std::error::Error, "the door wrote what is no message"),
             }
         }
         std::process::exit(0);
     });
     receive
+}
+
+async fn next_client(messages: &mut mpsc::UnboundedReceiver<DoorMessage>) -> Option<ClientIdentity> {
+    loop {
+        if let DoorMessage::Client(identity) = messages.recv().await? {
+            return Some(identity);
+        }
+    }
+}
+
+// Reports the lake's figures again and again: an engine that waits for a client has nothing else to do.
+async fn report_lake(lake: &Lake, engine: &QueryEngine) -> Infallible {
+    let session = engine.session(&Arc::new(EngineClient::new("lake figures", QueryQuota::default())));
+    loop {
+        let figures = match session.snapshot().await {
+            Ok(snapshot) => LakeFigures::read(lake, &snapshot).await.map_err(|e| e.to_string()),
+            Err(e) => Err(e.to_string()),
+        };
+        let figures = figures.inspect_err(|error| tracing::warn!(error, "the lake cannot be read")).ok();
+        EngineReport::Lake(figures).send();
+        tokio::time::sleep(LAKE_LOOK).await;
+    }
 }
 
 async fn warm_up(engine: &QueryEngine) -> Result<(), Error> {

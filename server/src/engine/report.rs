@@ -4,16 +4,32 @@ use std::io::Write as _;
 
 use serde::{Deserialize, Serialize};
 
+use crate::activity::{ActivityTable, LakeFigures, QueryEnd, QueryStart};
+use crate::fault::FaultCode;
+
 /// A line.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub(crate) enum EngineReport {
     /// It has read the lake and can be assigned to a client.
     Ready,
     /// It ends itself, for this reason.
     Ending(String),
-    /// Its counters, as [`crate::metrics::ServerMetrics::counters`] lists them.
-    Counters(Vec<u64>),
+    /// A query begins.
+    Started(QueryStart),
+    /// A query has ended.
+    Ended(QueryEnd),
+    /// A request failed.
+    Failure(FaultCode),
+    /// State of the lake; None if it cannot be read.
+    Lake(Option<LakeFigures>),
+    /// It asks for its client's rows of a table of the server's activity.
+    Ask {
+        /// Number of the answer.
+        number: u64,
+        /// The table.
+        table: ActivityTable,
+    },
 }
 
 impl EngineReport {

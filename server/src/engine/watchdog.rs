@@ -8,7 +8,7 @@ use rustix::time::{ClockId, clock_gettime};
 use super::report::EngineReport;
 use crate::service::QueryService;
 
-/// Time between two looks; the door's figures are sent as often.
+/// Time between two looks.
 const INTERVAL: Duration = Duration::from_millis(50);
 /// Time for which work may continue after its query was cancelled, ran out of time, or lost its client.
 const GRACE: Duration = Duration::from_millis(250);
@@ -27,7 +27,6 @@ pub(super) fn start(service: &QueryService) -> std::io::Result<()> {
 
 fn watch(service: &QueryService) {
     let mut idle = IdleWork::default();
-    let mut sent = Vec::new();
     loop {
         std::thread::sleep(INTERVAL);
         if service.engine().overdue().is_some_and(|time| time > GRACE) {
@@ -35,11 +34,6 @@ fn watch(service: &QueryService) {
         }
         if idle.look(service.activity().count() == 0) > GRACE {
             end("work that nobody waits for did not stop");
-        }
-        let counters = service.metrics().counters();
-        if counters != sent {
-            EngineReport::Counters(counters.clone()).send();
-            sent = counters;
         }
     }
 }

@@ -1,9 +1,10 @@
-//! `GET /health` and `GET /metrics`, for operators of the server.
+//! `GET /health`, `GET /ready` and `GET /metrics`, for operators of the server; answered while it drains, too.
 
 use axum::Json;
-use axum::extract::State;
+use axum::extract::{Request, State};
 use axum::http::{HeaderMap, header};
-use axum::response::IntoResponse;
+use axum::middleware::Next;
+use axum::response::{IntoResponse, Response};
 use serde::Serialize;
 use utoipa::ToSchema;
 
@@ -11,6 +12,7 @@ use super::guard::authenticate;
 use super::problem::ProblemResponse;
 use crate::client_identity::ClientIdentity;
 use crate::door::server_door::ServerDoor;
+use crate::fault::{FaultCode, RequestFault};
 use crate::tokens::TokenScope;
 
 /// The state of the server.
@@ -31,6 +33,30 @@ pub(super) async fn health() -> Json<ServerHealth> {
     Json(ServerHealth { status: "ok", version: env!("CARGO_PKG_VERSION") })
 }
 
+/// Answers whether the server takes requests, for balancers.
+///
+/// 503 while it stops, while the lake cannot be read, and while no engine can be started.
+#[utoipa::path(
+    get,
+    path = "/ready",
+    tag = "operation",
+    responses((status = 200, description = "It takes requests", body = ServerHealth))
+)]
+pub(super) async fn ready(State(door): State<ServerDoor>) -> Result<Json<ServerHealth>, ProblemResponse> {
+    door.check_ready().await?;
+    Ok(Json(ServerHealth { status: "ready", version: env!("CARGO_PKG_VERSION") }))
+}
+
+/// Refuses requests while the server drains, but for those of operators.
+pub(super) async fn refuse_while_draining(State(door): State<ServerDoor>, request: Request, next: Next) -> Response {
+    let is_operators = matches!(request.uri().path(), "/health" | "/ready" | "/metrics");
+    if door.drain().is_begun() && !is_operators {
+        door.metrics().failed(FaultCode::Stopping);
+        return ProblemResponse(RequestFault::Draining).into_response();
+    }
+    next.run(request).await
+}
+
 /// The figures, in Prometheus' text format.
 #[utoipa::path(
     get,
@@ -44,5 +70,5 @@ pub(super) async fn metrics(
 ) -> Result<impl IntoResponse, ProblemResponse> {
     let client = authenticate(door.access(), &headers, ClientIdentity::pages);
     client.and_then(|client| client.require(TokenScope::Metrics)).inspect_err(|f| door.metrics().failed(f.code()))?;
-    Ok(([(header::CONTENT_TYPE, "text/plain; version=0.0.4; charset=utf-8")], door.figures()))
+    Ok(([(header::CONTENT_TYPE, "text/plain; version=0.0.4; charset=utf-8")], door.figures().await?))
 }

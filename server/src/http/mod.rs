@@ -13,6 +13,7 @@ mod openapi;
 #[cfg(feature = "web")]
 mod pages;
 mod problem;
+mod queries;
 mod ranges;
 mod session;
 mod slices;
@@ -83,16 +84,19 @@ pub(crate) fn door_router(door: &ServerDoor) -> Router {
     let rest = nothing;
     let all =
         own.merge(forwarded).with_state(door.clone()).merge(layout::for_viewers(door.layout().clone())).fallback(rest);
-    with_refusals(all)
+    let all = with_refusals(all.layer(from_fn_with_state(door.clone(), health::refuse_while_draining)));
+    all.layer(from_fn_with_state(door.clone(), ServerDoor::name_request))
 }
 
 // What the door answers itself, but for pages and the layout.
 fn door_routes() -> OpenApiRouter<ServerDoor> {
     OpenApiRouter::new()
         .routes(routes!(session::post))
+        .routes(routes!(queries::cancel))
         .routes(routes!(openapi::get))
         .routes(routes!(health::metrics))
         .routes(routes!(health::health))
+        .routes(routes!(health::ready))
 }
 
 // The contract of all routes: of those whose answers to GET have an ETag, and of the others.

@@ -9,6 +9,9 @@ use utoipa::openapi::{ObjectBuilder, RefOr, Schema, Type};
 
 use crate::fault::{FaultCode, RequestFault};
 
+/// Seconds after which a client may ask again a server that stops or is not ready: a restart takes some.
+const RETRY_AFTER_SECS: &str = "5";
+
 /// A failure, to be answered.
 pub(crate) struct ProblemResponse(pub(crate) RequestFault);
 
@@ -80,6 +83,12 @@ impl ProblemResponse {
         response.extensions_mut().insert(code);
         let headers = response.headers_mut();
         headers.insert(header::CONTENT_TYPE, HeaderValue::from_static("application/problem+json"));
+        if matches!(code, FaultCode::Stopping | FaultCode::NotReady) {
+            headers.insert(header::RETRY_AFTER, HeaderValue::from_static(RETRY_AFTER_SECS));
+        }
+        if code == FaultCode::Stopping {
+            headers.insert(header::CONNECTION, HeaderValue::from_static("close"));
+        }
         if status == StatusCode::UNAUTHORIZED {
             headers.insert(header::WWW_AUTHENTICATE, HeaderValue::from_static("Bearer realm=\"echolake\""));
         }
@@ -119,5 +128,7 @@ fn status(code: FaultCode) -> (StatusCode, &'static str) {
         FaultCode::TooMany => (StatusCode::TOO_MANY_REQUESTS, "Too much at once"),
         FaultCode::EngineEnded => (StatusCode::INTERNAL_SERVER_ERROR, "The query ended its engine"),
         FaultCode::Internal => (StatusCode::INTERNAL_SERVER_ERROR, "The server failed"),
+        FaultCode::Stopping => (StatusCode::SERVICE_UNAVAILABLE, "The server is stopping"),
+        FaultCode::NotReady => (StatusCode::SERVICE_UNAVAILABLE, "The server is not ready"),
     }
 }

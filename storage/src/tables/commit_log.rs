@@ -166,6 +166,23 @@ pub struct TableVersion {
     pub committed: DateTime<Utc>,
 }
 
+/// A version of a table, and what its commit changed.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct TableChange {
+    /// The version.
+    pub version: TableVersion,
+    /// The operation by its author's word, if it says one.
+    pub operation: Option<String>,
+    /// Files that came.
+    pub files_added: u64,
+    /// Files that went.
+    pub files_removed: u64,
+    /// Rows of the files that came; None if one of them does not say.
+    pub rows_added: Option<u64>,
+    /// Rows of the files that went; None if one of them came before the oldest version that the log holds.
+    pub rows_removed: Option<u64>,
+}
+
 /// Outcome of adding a new file.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum CommitOutcome {
@@ -195,6 +212,8 @@ pub trait CommitLog: Send + Sync + std::fmt::Debug {
     async fn has_after(&self, table: Table, version: u64) -> Result<bool>;
     /// The versions that the log still holds, oldest first.
     async fn versions(&self, table: Table) -> Result<Vec<TableVersion>>;
+    /// The versions that the log still holds with their changes, oldest first: a request to the store for each.
+    async fn changes(&self, table: Table) -> Result<Vec<TableChange>>;
     /// The table's files as of a version that the log still holds.
     async fn files_at(&self, table: Table, version: u64) -> Result<Vec<DataFile>>;
     /// Returns whether a file of this name is in the log.

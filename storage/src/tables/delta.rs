@@ -31,7 +31,7 @@ use crate::remote::backoff;
 use crate::tables::snapshot::{decode_parts, encode_parts, is_merged};
 use crate::{
     CommitEffect, CommitLog, CommitOutcome, DataFile, Error, FileHistory, FileStats, LoggedFile, NewFile, Result,
-    RunPart, TableCommit, TableVersion, TableView,
+    RunPart, TableChange, TableCommit, TableVersion, TableView,
 };
 
 /// Tries of one commit against other writers; each loses to a commit that went through.
@@ -281,6 +281,10 @@ impl CommitLog for DeltaLog {
 
     async fn versions(&self, table: Table) -> Result<Vec<TableVersion>> {
         self.log_folder(table).list_versions().await
+    }
+
+    async fn changes(&self, table: Table) -> Result<Vec<TableChange>> {
+        self.log_folder(table).list_changes().await
     }
 
     async fn files_at(&self, table: Table, version: u64) -> Result<Vec<DataFile>> {

@@ -15,7 +15,7 @@ mod versions;
 pub use batch_builder::BatchBuilder;
 pub use commit_log::{
     CommitEffect, CommitLog, CommitOutcome, DataFile, FileHistory, FileStats, LoggedFile, NewFile, ReplacedFiles,
-    RunPart, TableCommit, TableVersion, TableView,
+    RunPart, TableChange, TableCommit, TableVersion, TableView,
 };
 pub use data_file::{EncodedFile, FileEncoder, encode};
 pub use optimize::{MergeProgress, OptimizeReport, TARGET_BYTES, TableOptimizeReport};

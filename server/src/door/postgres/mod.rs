@@ -12,15 +12,14 @@ use std::time::Duration;
 use bytes::{Buf as _, BytesMut};
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
 use tokio::net::TcpListener;
-use tokio::sync::watch;
-use tokio::task::JoinSet;
 use tracing::Instrument as _;
 
-use super::connection_places::{ConnectionPlaces, PlacedStream};
+use super::connection_places::{ConnectionPlaces, PlaceWork, PlacedStream};
 use super::encryption::{DoorStream, ProtocolEncryption};
 use crate::client_identity::ClientIdentity;
 use crate::door::server_door::ServerDoor;
 use crate::fault::RequestFault;
+use crate::metrics::ServerProtocol;
 use crate::request_span::begin_connection;
 use crate::tokens::TokenScope;
 use cancel_keys::CancelKeys;
@@ -36,28 +35,17 @@ const STARTUP: usize = 10_000;
 /// Delay of the answer to a wrong cancel key.
 const WRONG_KEY: Duration = Duration::from_secs(1);
 
-/// Answers connections until `stopping`, then until their statements are answered.
-pub(super) async fn serve(
-    door: ServerDoor,
-    listener: TcpListener,
-    encryption: ProtocolEncryption,
-    stopping: watch::Receiver<bool>,
-) {
-    let places = ConnectionPlaces::new(listener, MOST);
+/// Answers connections; never ends.
+pub(super) async fn serve(door: ServerDoor, listener: TcpListener, encryption: ProtocolEncryption) {
+    let places = ConnectionPlaces::new(listener, MOST).listed(&door.activity().connections, ServerProtocol::Postgres);
     let keys = Arc::new(CancelKeys::default());
-    let mut stopped = stopping.clone();
-    let mut open = JoinSet::new();
-    loop {
-        tokio::select! {
-            _ = stopped.wait_for(|stopping| *stopping) => break,
-            stream = places.next() => {
-                let login = LoginPlace { door: door.clone(), keys: keys.clone(), encryption: encryption.clone() };
-                drop(open.spawn(attend(stream, login, stopping.clone())));
-            }
-            Some(_) = open.join_next() => {}
-        }
-    }
-    while open.join_next().await.is_some() {}
+    places
+        .attend(|stream| {
+            let (door, keys, encryption) = (door.clone(), keys.clone(), encryption.clone());
+            let place = LoginPlace { door, keys, encryption, work: stream.work() };
+            attend(stream, place)
+        })
+        .await;
 }
 
 /// What a login needs.
@@ -65,20 +53,26 @@ struct LoginPlace {
     door: ServerDoor,
     keys: Arc<CancelKeys>,
     encryption: ProtocolEncryption,
+    work: PlaceWork,
 }
 
-async fn attend(stream: PlacedStream, place: LoginPlace, stopping: watch::Receiver<bool>) {
-    let (evicted, work) = (stream.evicted(), stream.work());
+async fn attend(stream: PlacedStream, place: LoginPlace) {
+    let (evicted, work) = (stream.evicted(), place.work.clone());
     let login = async {
         tokio::select! {
             login = tokio::time::timeout(LOGIN, place.log_in(stream)) => login.ok().flatten(),
             () = evicted => None,
         }
     };
-    let Some((stream, mut session)) = login.await else { return };
+    let Some((mut stream, mut session)) = login.await else { return };
+    let Some(_awaited) = place.door.drain().enter() else {
+        place.refuse(&mut stream, &RequestFault::Draining).await;
+        return;
+    };
+    work.hear_request();
     let _working = work.begin();
     let span = begin_connection(&mut session.startup, &session.client.name, STARTUP);
-    MessageRelay::new(stream, place.door, place.keys, session).run(stopping).instrument(span).await;
+    MessageRelay::new(stream, place.door, place.keys, session).run().instrument(span).await;
 }
 
 /// A client that is logged in.
@@ -112,13 +106,17 @@ impl LoginPlace {
         match login {
             Ok(login) => Some((stream, login)),
             Err(fault) => {
-                self.door.metrics().record_failure(&fault);
-                // A client that hangs up needs no reason.
-                let _ = stream.write_all(&fatal_message(&fault)).await;
-                let _ = stream.shutdown().await;
+                self.refuse(&mut stream, &fault).await;
                 None
             }
         }
+    }
+
+    async fn refuse(&self, stream: &mut DoorStream, fault: &RequestFault) {
+        self.door.metrics().record_failure(fault);
+        // A client that hangs up needs no reason.
+        let _ = stream.write_all(&fatal_message(fault)).await;
+        let _ = stream.shutdown().await;
     }
 
     async fn take_packet(&self, stream: &mut DoorStream) -> Result<LoginStep, RequestFault> {
@@ -142,13 +140,15 @@ impl LoginPlace {
             StartupPacket::Session { .. } if self.encryption.is_on() && !is_encrypted => {
                 Err(RequestFault::request("this server encrypts its connections; hint: sslmode=require"))
             }
+            StartupPacket::Session { .. } if self.door.drain().is_begun() => Err(RequestFault::Draining),
             StartupPacket::Session { user } => {
                 let token = match self.door.access().is_open() {
                     true => None,
                     false => Some(read_password(stream).await?),
                 };
-                let client = self.door.access().client(token.as_deref(), || ClientIdentity::user(&user))?;
-                client.require(TokenScope::Sql)?;
+                let found = self.door.access().client(token.as_deref(), || ClientIdentity::user(&user));
+                let found = found.and_then(|client| client.require(TokenScope::Sql).map(|()| client));
+                let client = self.door.note_client(&self.work, ServerProtocol::Postgres, found)?;
                 Ok(LoginStep::Done(PostgresLogin { client, startup }))
             }
         }

@@ -7,7 +7,6 @@ use bytes::{Buf as _, BytesMut};
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _, ReadHalf, WriteHalf};
 use tokio::net::UnixStream;
 use tokio::net::unix::{OwnedReadHalf, OwnedWriteHalf};
-use tokio::sync::watch;
 
 use super::PostgresLogin;
 use super::cancel_keys::{CancelKey, CancelKeys, CancelTarget};
@@ -90,9 +89,9 @@ impl MessageRelay {
         }
     }
 
-    /// Answers the client until it goes, or until `stopping` and nothing is asked.
-    pub(super) async fn run(mut self, stopping: watch::Receiver<bool>) {
-        if let Err(Some(fault)) = self.converse(stopping).await {
+    /// Answers the client until it goes, or until the server drains and nothing is asked.
+    pub(super) async fn run(mut self) {
+        if let Err(Some(fault)) = self.converse().await {
             self.door.metrics().record_failure(&fault);
             self.outgoing.extend_from_slice(&fatal_message(&fault));
         }
@@ -102,10 +101,10 @@ impl MessageRelay {
     }
 
     // The error is the last message to the client; None if the client is gone, or has it already.
-    async fn converse(&mut self, mut stopping: watch::Receiver<bool>) -> Result<(), Option<RequestFault>> {
+    async fn converse(&mut self) -> Result<(), Option<RequestFault>> {
         let mut link = self.connect(true).await?;
         loop {
-            match self.pass_on(&mut link, &mut stopping).await {
+            match self.pass_on(&mut link).await {
                 RelayEnd::Client => return Ok(()),
                 RelayEnd::Broken(fault) => return Err(Some(fault)),
                 RelayEnd::Engine => link = self.recover(link).await?,
@@ -113,14 +112,18 @@ impl MessageRelay {
         }
     }
 
-    async fn pass_on(&mut self, link: &mut EngineLink, stopping: &mut watch::Receiver<bool>) -> RelayEnd {
+    async fn pass_on(&mut self, link: &mut EngineLink) -> RelayEnd {
+        let drain = self.door.drain().clone();
         loop {
             if let Err(end) = self.take_messages(link).and_then(|()| self.take_answers(link)) {
                 return end;
             }
             let is_idle = !self.exchange.is_waiting() && self.outgoing.is_empty();
             tokio::select! {
-                _ = stopping.wait_for(|stopping| *stopping), if is_idle => return RelayEnd::Client,
+                () = drain.begun(), if is_idle => {
+                    self.outgoing = fatal_message(&RequestFault::Disconnected);
+                    return RelayEnd::Client;
+                }
                 written = self.write.write_buf(&mut self.outgoing), if !self.outgoing.is_empty() => {
                     if written.is_err() {
                         return RelayEnd::Client;
@@ -272,9 +275,14 @@ impl MessageRelay {
     async fn wait_for_client(&mut self) -> Result<(), Option<RequestFault>> {
         self.write.write_all_buf(&mut self.outgoing).await.map_err(|_| None)?;
         while self.incoming.is_empty() {
-            let read = self.read.read_buf(&mut self.incoming).await;
-            if read.unwrap_or(0) == 0 {
-                return Err(None);
+            tokio::select! {
+                () = self.door.drain().begun() => {
+                    self.outgoing = fatal_message(&RequestFault::Disconnected);
+                    return Err(None);
+                }
+                read = self.read.read_buf(&mut self.incoming) => if read.unwrap_or(0) == 0 {
+                    return Err(None);
+                }
             }
         }
         Ok(())

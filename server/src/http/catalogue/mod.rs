@@ -141,7 +141,7 @@ async fn respond(
         Ok(answer) => Ok(with_validators(answer.respond(&headers), &etag)),
         Err(failed) => {
             let code = failed.extensions().get::<FaultCode>().copied();
-            catalogue.service().metrics().failed(code.unwrap_or(FaultCode::Internal));
+            catalogue.service().failed(code.unwrap_or(FaultCode::Internal));
             Ok(failed)
         }
     }

@@ -12,7 +12,7 @@ use tokio::task::JoinSet;
 
 use crate::fault::RequestFault;
 use crate::metrics::ServerProtocol;
-use crate::running::{WAITING, finish};
+use crate::running::{StopSignal, WAITING, finish};
 use crate::service::QueryService;
 
 /// Time for which a slice waits for its reader to take the next piece.
@@ -20,6 +20,8 @@ const PATIENCE: Duration = Duration::from_secs(300);
 
 /// Time for which a slice waits for a query permit of its client: cancelled work releases its own a moment later.
 const HANDOVER: Duration = Duration::from_secs(1);
+/// Its place among queries, in the stead of a statement.
+const LISTED_AS: &str = "(a slice of run files)";
 
 /// A slice that is being cut.
 pub(super) struct SliceTask {
@@ -48,10 +50,17 @@ impl SliceTask {
         let SliceResources { place: room, turns } = room;
         let task = service.spawn(async move {
             let work = async {
-                let _held = (client.place_within(HANDOVER).await?, room, of.metrics().begin(ServerProtocol::Http));
-                cut(&of, &snapshot, params, client.quota().time, &turns, to).await
+                let stop = StopSignal::new();
+                let timer = of.watch(ServerProtocol::Http, LISTED_AS, &stop);
+                let _held = (client.place_within(HANDOVER).await?, room);
+                let done = tokio::select! {
+                    done = cut(&of, &snapshot, params, client.quota().time, &turns, to) => done,
+                    () = stop.stopped() => Err(RequestFault::Cancelled),
+                };
+                timer.watch().finish(done.as_ref().map(|()| ()));
+                done
             };
-            work.await.inspect_err(|fault| of.metrics().failed(fault.code()))
+            work.await.inspect_err(|fault| of.failed(fault.code()))
         });
         Self { pieces, task }
     }

@@ -1,6 +1,6 @@
 //! The files of one table's `_delta_log`: a JSON file per version, and checkpoints.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::sync::Arc;
 
 use chrono::{DateTime, TimeDelta, Utc};
@@ -16,7 +16,7 @@ use super::checkpoint::{decode_checkpoint, encode_checkpoint};
 use super::commit_files::{commit_name, commit_number, list_versions};
 use super::folder;
 use super::table_state::TableState;
-use crate::{Error, Result, TableVersion};
+use crate::{Error, Result, TableChange, TableVersion};
 
 /// The newest version of the protocol that this reads.
 const READER_VERSION: i32 = 1;
@@ -117,6 +117,20 @@ impl<'a> LogFolder<'a> {
     /// Lists its versions, oldest first.
     pub(super) async fn list_versions(&self) -> Result<Vec<TableVersion>> {
         list_versions(self.store, &self.path).await
+    }
+
+    /// Lists its versions with what they changed, oldest first.
+    pub(super) async fn list_changes(&self) -> Result<Vec<TableChange>> {
+        let versions = self.list_versions().await?;
+        let commits = futures::stream::iter(versions)
+            .map(|version| async move { Ok::<_, Error>((version, self.read_commit(version.version).await?)) });
+        let mut commits = commits.buffered(CONCURRENT_READS);
+        let (mut changes, mut rows) = (Vec::new(), HashMap::new());
+        while let Some((version, lines)) = commits.try_next().await? {
+            // One that is gone by now was cleaned up.
+            changes.extend(lines.map(|lines| change(version, lines, &mut rows)));
+        }
+        Ok(changes)
     }
 
     pub(super) async fn has_version(&self, version: u64) -> Result<bool> {
@@ -292,6 +306,36 @@ fn checkpoint_number(path: &Path) -> Option<(u64, usize)> {
         [_, parts, "parquet"] => Some((version, parts.parse().ok()?)),
         _ => None,
     }
+}
+
+// `rows` are those of each file that came so far.
+fn change(version: TableVersion, lines: Vec<LogLine>, rows: &mut HashMap<String, Option<u64>>) -> TableChange {
+    let mut change = TableChange {
+        version,
+        operation: None,
+        files_added: 0,
+        files_removed: 0,
+        rows_added: Some(0),
+        rows_removed: Some(0),
+    };
+    let sum = |total: Option<u64>, more: Option<u64>| Some(total? + more?);
+    for line in lines {
+        if let Some(info) = line.commit_info {
+            change.operation = info.get("operation").and_then(|name| name.as_str()).map(str::to_owned);
+        }
+        if let Some(add) = line.add {
+            let stats = add.stats.and_then(|stats| serde_json::from_str::<serde_json::Value>(&stats).ok());
+            let of_file = stats.and_then(|stats| stats.get("numRecords")?.as_u64());
+            change.files_added += 1;
+            change.rows_added = sum(change.rows_added, of_file);
+            rows.insert(add.path, of_file);
+        }
+        if let Some(remove) = line.remove {
+            change.files_removed += 1;
+            change.rows_removed = sum(change.rows_removed, rows.remove(&remove.path).flatten());
+        }
+    }
+    change
 }
 
 #[cfg(test)]

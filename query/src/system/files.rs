@@ -1,0 +1,75 @@
+//! `system.files`: the data files of the snapshot.
+
+use std::sync::Arc;
+
+use arrow::array::{Int64Array, StringArray};
+use arrow::datatypes::{DataType, SchemaRef};
+use arrow::record_batch::RecordBatch;
+use async_trait::async_trait;
+use datafusion::catalog::Session;
+use datafusion::error::Result;
+use echolake_lake::{DataFile, FileName, LakeSnapshot};
+use echolake_schema::tables::Table;
+
+use super::{SystemRows, batch, column, schema};
+
+#[derive(Debug)]
+pub(super) struct LakeFiles {
+    pub(super) snapshot: Arc<LakeSnapshot>,
+}
+
+#[async_trait]
+impl SystemRows for LakeFiles {
+    fn schema(&self) -> SchemaRef {
+        schema([
+            column("table", DataType::Utf8, false, "", "Table that the file is of"),
+            column("path", DataType::Utf8, false, "", "Path of the file in the lake"),
+            column("bytes", DataType::Int64, false, "B", "Size"),
+            column("rows", DataType::Int64, false, "1", "Rows that readers see"),
+            column("runs", DataType::Int64, false, "1", "Runs whose rows readers see in it; 0 for tables of the rig"),
+            column("surface_id", DataType::Utf8, true, "", "Surface of its run; null unless it has one run"),
+            column("run_id", DataType::Utf8, true, "", "Its run; null unless it has one"),
+            column("version", DataType::Int64, false, "1", "Version of the table that added it"),
+        ])
+    }
+
+    async fn rows(&self, _: &dyn Session) -> Result<RecordBatch> {
+        let all = Table::ALL.into_iter().flat_map(|table| self.snapshot.files(table).iter().map(move |f| (table, f)));
+        let files: Vec<_> = all.map(|(table, file)| (table, file, runs_of(file))).collect();
+        let long = |value: &dyn Fn(&DataFile) -> u64| {
+            Arc::new(Int64Array::from_iter_values(files.iter().map(|(_, file, _)| value(file) as i64)))
+        };
+        let only = |part: fn(&(String, String)) -> &String| {
+            let single = files.iter().map(|(_, _, runs)| match &runs[..] {
+                [run] => Some(part(run).clone()),
+                _ => None,
+            });
+            Arc::new(single.collect::<StringArray>())
+        };
+        let table = StringArray::from_iter_values(files.iter().map(|(table, _, _)| table.name()));
+        let path = StringArray::from_iter_values(files.iter().map(|(_, file, _)| file.path.as_ref()));
+        let runs = Int64Array::from_iter_values(files.iter().map(|(_, _, runs)| runs.len() as i64));
+        batch(
+            self.schema(),
+            vec![
+                Arc::new(table),
+                Arc::new(path),
+                long(&|file| file.bytes),
+                long(&DataFile::visible_rows),
+                Arc::new(runs),
+                only(|(surface, _)| surface),
+                only(|(_, run)| run),
+                long(&|file| file.log_version),
+            ],
+        )
+    }
+}
+
+// Surface and run of each run that readers see in a file.
+fn runs_of(file: &DataFile) -> Vec<(String, String)> {
+    match FileName::parse(&file.path) {
+        Some(FileName::Rows { surface, run, .. }) => vec![(surface.to_string(), run.to_string())],
+        Some(FileName::Pointer(run)) => vec![(run.surface.to_string(), run.run.to_string())],
+        _ => file.visible_parts().map(|(part, _)| (part.surface.to_string(), part.run.to_string())).collect(),
+    }
+}

@@ -1,0 +1,113 @@
+//! Tables of the schema `system`: versions and files of the lake and how its runs came into it, all as the query's
+//! snapshot has them; and those that the program around the engine has of itself ([`SystemSource`]).
+
+mod files;
+mod ingests;
+mod source;
+mod versions;
+
+use std::collections::HashMap;
+use std::sync::Arc;
+
+use arrow::array::ArrayRef;
+use arrow::datatypes::{DataType, Field, Schema, SchemaRef, TimeUnit};
+use arrow::record_batch::RecordBatch;
+use async_trait::async_trait;
+use datafusion::catalog::Session;
+use datafusion::datasource::memory::MemorySourceConfig;
+use datafusion::datasource::{TableProvider, TableType};
+use datafusion::error::Result;
+use datafusion::logical_expr::Expr;
+use datafusion::physical_plan::ExecutionPlan;
+use echolake_lake::{Lake, LakeSnapshot};
+use echolake_schema::tables::{COMMENT, UNIT};
+
+use files::LakeFiles;
+use ingests::LakeIngests;
+use source::SourceRows;
+pub use source::SystemSource;
+use versions::LakeVersions;
+
+/// The schema of these tables.
+pub(crate) const SCHEMA: &str = "system";
+
+/// Computes the rows of a table when it is scanned.
+#[async_trait]
+trait SystemRows: std::fmt::Debug + Send + Sync {
+    /// Returns its columns.
+    fn schema(&self) -> SchemaRef;
+
+    /// Returns its rows.
+    async fn rows(&self, session: &dyn Session) -> Result<RecordBatch>;
+}
+
+/// A table whose rows are computed when it is scanned.
+#[derive(Debug)]
+struct SystemTable(Box<dyn SystemRows>);
+
+#[async_trait]
+impl TableProvider for SystemTable {
+    fn schema(&self) -> SchemaRef {
+        self.0.schema()
+    }
+
+    fn table_type(&self) -> TableType {
+        TableType::Temporary
+    }
+
+    async fn scan(
+        &self,
+        session: &dyn Session,
+        projection: Option<&Vec<usize>>,
+        _: &[Expr],
+        _: Option<usize>,
+    ) -> Result<Arc<dyn ExecutionPlan>> {
+        let rows = self.0.rows(session).await?;
+        Ok(MemorySourceConfig::try_new_exec(&[vec![rows]], self.0.schema(), projection.cloned())?)
+    }
+}
+
+/// The tables of one snapshot; `runs` is its table of that name.
+pub(crate) fn lake_tables(
+    lake: &Lake,
+    snapshot: &Arc<LakeSnapshot>,
+    runs: Arc<dyn TableProvider>,
+) -> [(&'static str, Arc<dyn TableProvider>); 3] {
+    let table = |rows: Box<dyn SystemRows>| Arc::new(SystemTable(rows)) as Arc<dyn TableProvider>;
+    [
+        ("versions", table(Box::new(LakeVersions { lake: lake.clone() }))),
+        ("files", table(Box::new(LakeFiles { snapshot: snapshot.clone() }))),
+        ("ingests", table(Box::new(LakeIngests { lake: lake.clone(), snapshot: snapshot.clone(), runs }))),
+    ]
+}
+
+/// The tables of a source.
+pub(crate) fn source_tables(source: &Arc<dyn SystemSource>) -> Vec<(&'static str, Arc<dyn TableProvider>)> {
+    let table = |(name, schema)| {
+        let rows = SourceRows { source: source.clone(), name, schema };
+        (name, Arc::new(SystemTable(Box::new(rows))) as Arc<dyn TableProvider>)
+    };
+    source.tables().into_iter().map(table).collect()
+}
+
+/// A column with its unit, empty if it has none, and its meaning.
+fn column(name: &str, kind: DataType, is_nullable: bool, unit: &str, comment: &str) -> Field {
+    let metadata = [(UNIT.to_owned(), unit.to_owned()), (COMMENT.to_owned(), comment.to_owned())];
+    Field::new(name, kind, is_nullable).with_metadata(HashMap::from(metadata))
+}
+
+/// The type of times.
+fn time() -> DataType {
+    DataType::Timestamp(TimeUnit::Microsecond, Some("UTC".into()))
+}
+
+fn schema(columns: impl IntoIterator<Item = Field>) -> SchemaRef {
+    Arc::new(Schema::new(columns.into_iter().collect::<Vec<_>>()))
+}
+
+fn batch(schema: SchemaRef, columns: Vec<ArrayRef>) -> Result<RecordBatch> {
+    Ok(RecordBatch::try_new(schema, columns)?)
+}
+
+#[cfg(test)]
+mod tests;

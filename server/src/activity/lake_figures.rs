@@ -1,0 +1,55 @@
+//! Figures of the lake, for `/metrics`. An engine that waits for a client reads them: the door decodes no log.
+
+use echolake_lake::{Lake, LakeSnapshot};
+use echolake_schema::tables::Table;
+use futures::TryStreamExt as _;
+use object_store::path::Path;
+use serde::{Deserialize, Serialize};
+
+/// Figures of the lake.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub(crate) struct LakeFigures {
+    /// Version of the lake, which is that of `runs`.
+    pub(crate) version: u64,
+    pub(crate) surfaces: u64,
+    pub(crate) runs: u64,
+    /// Bytes of the tables' files.
+    pub(crate) table_bytes: u64,
+    /// Run files that wait for ingest, and those that were refused.
+    pub(crate) inbox: FolderFigures,
+    pub(crate) quarantine: FolderFigures,
+}
+
+/// Run files of a folder.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub(crate) struct FolderFigures {
+    pub(crate) files: u64,
+    pub(crate) bytes: u64,
+}
+
+impl LakeFigures {
+    /// Counts what a snapshot and the two folders hold.
+    ///
+    /// # Errors
+    /// The store does not list a folder.
+    pub(crate) async fn read(lake: &Lake, snapshot: &LakeSnapshot) -> Result<Self, object_store::Error> {
+        let bytes = |table: Table| snapshot.files(table).iter().map(|file| file.bytes).sum::<u64>();
+        Ok(Self {
+            version: snapshot.version(Table::Runs).unwrap_or(0),
+            surfaces: snapshot.files(Table::Surfaces).iter().map(echolake_lake::DataFile::visible_rows).sum(),
+            runs: snapshot.runs().count() as u64,
+            table_bytes: Table::ALL.into_iter().map(bytes).sum(),
+            inbox: FolderFigures::read(lake, "inbox").await?,
+            quarantine: FolderFigures::read(lake, "quarantine").await?,
+        })
+    }
+}
+
+impl FolderFigures {
+    async fn read(lake: &Lake, folder: &str) -> Result<Self, object_store::Error> {
+        let store = lake.store();
+        let all: Vec<_> = store.list(Some(&Path::from(folder))).try_collect().await?;
+        let runs = all.iter().filter(|object| object.location.as_ref().ends_with(".mcap"));
+        Ok(runs.fold(Self::default(), |sum, object| Self { files: sum.files + 1, bytes: sum.bytes + object.size }))
+    }
+}

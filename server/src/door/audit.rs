@@ -1,0 +1,53 @@
+//! The audit: who was refused, who came in, and which files were handed out, as lines of the log. A server without
+//! tokens has none: it knows nobody.
+
+use std::net::SocketAddr;
+
+use axum::http::{Method, StatusCode};
+
+use crate::fault::FaultCode;
+use crate::metrics::ServerProtocol;
+
+/// The target of its lines, by which a log's levels leave them out.
+const TARGET: &str = "echolake_server::audit";
+
+/// Writes a line about a client that was refused.
+pub(super) fn record_refusal(peer: SocketAddr, protocol: ServerProtocol, code: FaultCode) {
+    if matches!(code, FaultCode::Unauthenticated | FaultCode::Forbidden | FaultCode::Foreign) {
+        tracing::warn!(target: TARGET, %peer, protocol = protocol.name(), code = code.name(), "a client was refused");
+    }
+}
+
+/// Writes a line about a client that has shown its token on a connection.
+pub(super) fn record_login(peer: SocketAddr, protocol: ServerProtocol, client: &str) {
+    tracing::info!(target: TARGET, %peer, protocol = protocol.name(), client, "a client has logged in");
+}
+
+/// Writes a line about a file that is handed out, if a path is one of files. `path` has no parameters: they may be texts of
+/// statements.
+pub(super) fn record_file(peer: SocketAddr, client: &str, method: &Method, path: &str, status: StatusCode) {
+    if is_file(path) && *method == Method::GET && status.is_success() {
+        let status = status.as_u16();
+        tracing::info!(target: TARGET, %peer, client, path, status, "a file is handed out");
+    }
+}
+
+fn is_file(path: &str) -> bool {
+    const ENDINGS: [&str; 4] = [".mcap", ".parquet", ".wav", ".glb"];
+    path.starts_with("/api/") && ENDINGS.iter().any(|ending| path.ends_with(ending))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn files_are_told_by_their_paths() {
+        for path in ["/api/v1/slices.mcap", "/api/v1/runs/r/file.mcap", "/api/v1/tables/tnce/x.parquet"] {
+            assert!(is_file(path), "{path}");
+        }
+        for path in ["/api/v1/sql", "/api/v1/files", "/assets/x.glb", "/api/v1/runs"] {
+            assert!(!is_file(path), "{path}");
+        }
+    }
+}

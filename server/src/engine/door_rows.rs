@@ -1,0 +1,195 @@
+//! `system.queries` and `system.connections` in an engine: the door has their rows, and is asked for them.
+
+use std::collections::HashMap;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
+
+use arrow::array::{ArrayRef, BooleanArray, Float64Array, StringArray, TimestampMicrosecondArray, UInt64Array};
+use arrow::datatypes::{DataType, Field, Schema, SchemaRef, TimeUnit};
+use arrow::error::ArrowError;
+use arrow::record_batch::RecordBatch;
+use async_trait::async_trait;
+use echolake_query::SystemSource;
+use echolake_schema::tables::{COMMENT, UNIT};
+use tokio::sync::oneshot;
+
+use super::report::EngineReport;
+use crate::activity::{ActivityRows, ActivityTable, LoggedQuery, OpenConnection};
+
+/// Time for which an engine waits for rows.
+const ANSWER_LIMIT: Duration = Duration::from_secs(10);
+/// The tables.
+const TABLES: [(&str, ActivityTable); 2] =
+    [("queries", ActivityTable::Queries), ("connections", ActivityTable::Connections)];
+
+/// Rows that the door is asked for.
+#[derive(Debug, Default)]
+pub(crate) struct DoorRows {
+    last: AtomicU64,
+    waiting: Mutex<HashMap<u64, oneshot::Sender<ActivityRows>>>,
+}
+
+impl DoorRows {
+    /// Takes the door's answer.
+    pub(crate) fn answer(&self, number: u64, rows: ActivityRows) {
+        if let Some(waiting) = self.lock().remove(&number) {
+            // Who asked may be gone.
+            let _ = waiting.send(rows);
+        }
+    }
+
+    async fn ask(&self, table: ActivityTable) -> Result<ActivityRows, String> {
+        let number = self.last.fetch_add(1, Ordering::Relaxed);
+        let (send, answer) = oneshot::channel();
+        self.lock().insert(number, send);
+        EngineReport::Ask { number, table }.send();
+        let rows = tokio::time::timeout(ANSWER_LIMIT, answer).await;
+        self.lock().remove(&number);
+        rows.ok().and_then(Result::ok).ok_or_else(|| "the server did not list its activity".to_owned())
+    }
+
+    fn lock(&self) -> MutexGuard<'_, HashMap<u64, oneshot::Sender<ActivityRows>>> {
+        self.waiting.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+#[async_trait]
+impl SystemSource for DoorRows {
+    fn tables(&self) -> Vec<(&'static str, SchemaRef)> {
+        TABLES.map(|(name, table)| (name, schema(table))).to_vec()
+    }
+
+    async fn rows(&self, table: &'static str) -> Result<RecordBatch, String> {
+        let Some((_, table)) = TABLES.into_iter().find(|(name, _)| *name == table) else {
+            return Err(format!("there is no table system.{table}"));
+        };
+        let batch = match self.ask(table).await? {
+            ActivityRows::Queries(queries) => query_batch(&queries),
+            ActivityRows::Connections(connections) => connection_batch(&connections),
+        };
+        batch.map_err(|e| e.to_string())
+    }
+}
+
+fn schema(table: ActivityTable) -> SchemaRef {
+    let column = |(name, kind, is_nullable, unit, comment): (&str, DataType, bool, &str, &str)| {
+        let metadata = [(UNIT.to_owned(), unit.to_owned()), (COMMENT.to_owned(), comment.to_owned())];
+        Field::new(name, kind, is_nullable).with_metadata(HashMap::from(metadata))
+    };
+    let (text, count, flag) = (|| DataType::Utf8, || DataType::UInt64, || DataType::Boolean);
+    let (seconds, time) = (|| DataType::Float64, || DataType::Timestamp(TimeUnit::Microsecond, Some("UTC".into())));
+    let columns = match table {
+        ActivityTable::Queries => vec![
+            ("id", count(), false, "", "Number since the start of the server, by which it is cancelled"),
+            ("client", text(), false, "", "Name of the token, or of the client of a server without tokens"),
+            ("protocol", text(), false, "", "http, flight_sql or postgres"),
+            ("statement", text(), true, "", "Text, its first 2000 characters; null for queries of other clients"),
+            ("outcome", text(), false, "", "running, answered, or the code of the failure"),
+            ("started", time(), false, "", "Start, UTC"),
+            ("plan_seconds", seconds(), true, "s", "Time until it was planned"),
+            ("first_row_seconds", seconds(), true, "s", "Time until it had its first rows"),
+            ("seconds", seconds(), true, "s", "Time until its last row was sent; null while it runs"),
+            ("rows", count(), true, "1", "Rows of the answer; null while it runs"),
+            ("bytes", count(), true, "B", "Bytes of these rows before they are encoded"),
+            ("memory_bytes", count(), true, "B", "The most that its operators held"),
+        ],
+        ActivityTable::Connections => vec![
+            ("id", count(), false, "", "Number since the start of the server"),
+            ("client", text(), true, "", "Client of its last request; null before the first"),
+            ("protocol", text(), false, "", "http, flight_sql or postgres"),
+            ("peer", text(), false, "", "Address of the other side"),
+            ("started", time(), false, "", "Start, UTC"),
+            ("requests", count(), false, "1", "Requests so far; a session of Postgres' protocol is one"),
+            ("is_working", flag(), false, "", "Whether a request is being answered"),
+        ],
+    };
+    Arc::new(Schema::new(columns.into_iter().map(column).collect::<Vec<_>>()))
+}
+
+fn query_batch(queries: &[LoggedQuery]) -> Result<RecordBatch, ArrowError> {
+    let text = |value: fn(&LoggedQuery) -> &str| -> ArrayRef {
+        Arc::new(StringArray::from_iter_values(queries.iter().map(value)))
+    };
+    let count = |value: fn(&LoggedQuery) -> Option<u64>| -> ArrayRef {
+        Arc::new(queries.iter().map(value).collect::<UInt64Array>())
+    };
+    let seconds = |value: fn(&LoggedQuery) -> Option<f64>| -> ArrayRef {
+        Arc::new(queries.iter().map(value).collect::<Float64Array>())
+    };
+    let statement: StringArray = queries.iter().map(|query| query.statement.as_deref()).collect();
+    let columns = vec![
+        count(|query| Some(query.id)),
+        text(|query| &query.client),
+        text(|query| &query.protocol),
+        Arc::new(statement),
+        text(|query| &query.outcome),
+        times(queries.iter().map(|query| query.started)),
+        seconds(|query| query.plan_seconds),
+        seconds(|query| query.first_row_seconds),
+        seconds(|query| query.seconds),
+        count(|query| query.rows),
+        count(|query| query.bytes),
+        count(|query| query.memory_bytes),
+    ];
+    RecordBatch::try_new(schema(ActivityTable::Queries), columns)
+}
+
+fn connection_batch(connections: &[OpenConnection]) -> Result<RecordBatch, ArrowError> {
+    let text = |value: fn(&OpenConnection) -> Option<&str>| -> ArrayRef {
+        Arc::new(connections.iter().map(value).collect::<StringArray>())
+    };
+    let count = |value: fn(&OpenConnection) -> u64| -> ArrayRef {
+        Arc::new(UInt64Array::from_iter_values(connections.iter().map(value)))
+    };
+    let working: BooleanArray = connections.iter().map(|connection| Some(connection.is_working)).collect();
+    let columns = vec![
+        count(|connection| connection.id),
+        text(|connection| connection.client.as_deref()),
+        text(|connection| Some(&connection.protocol)),
+        text(|connection| Some(&connection.peer)),
+        times(connections.iter().map(|connection| connection.started)),
+        count(|connection| connection.requests),
+        Arc::new(working),
+    ];
+    RecordBatch::try_new(schema(ActivityTable::Connections), columns)
+}
+
+fn times(micros: impl Iterator<Item = i64>) -> ArrayRef {
+    Arc::new(TimestampMicrosecondArray::from_iter_values(micros).with_timezone("UTC"))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn rows_fit_their_schemas() {
+        let query = LoggedQuery {
+            id: 1,
+            client: "ann".to_owned(),
+            protocol: "http".to_owned(),
+            statement: None,
+            outcome: "running".to_owned(),
+            started: 5,
+            plan_seconds: None,
+            first_row_seconds: None,
+            seconds: Some(0.5),
+            rows: None,
+            bytes: None,
+            memory_bytes: None,
+        };
+        assert_eq!(query_batch(&[query.clone(), query]).map(|batch| batch.num_rows()).ok(), Some(2));
+        assert_eq!(query_batch(&[]).map(|batch| batch.num_rows()).ok(), Some(0));
+        let connection = OpenConnection {
+            id: 1,
+            client: None,
+            protocol: "http".to_owned(),
+            peer: "127.0.0.1:4000".to_owned(),
+            started: 5,
+            requests: 1,
+            is_working: true,
+        };
+        assert_eq!(connection_batch(&[connection]).map(|batch| batch.num_rows()).ok(), Some(1));
+    }
+}
