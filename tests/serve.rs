@@ -73,7 +73,7 @@ fn running_of(metrics: &HttpResponse) -> f64 {
     line.parse().expect("a number")
 }
 
-fn wait_until(what: &str, mut done: impl FnMut() -> bool) {
+pub(crate) fn wait_until(what: &str, mut done: impl FnMut() -> bool) {
     let begun = Instant::now();
     while !done() {
         assert!(begun.elapsed() < EVENT_LIMIT, "{what}");

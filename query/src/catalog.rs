@@ -70,6 +70,7 @@ impl LakeCatalog {
         for view in LakeView::ALL {
             names.push((view.name(), view.schema(lake, &lookups).map_err(failed)?));
         }
+        let small = source.small.clone();
         Ok(Self {
             lake: lake.clone(),
             source,
@@ -78,7 +79,7 @@ impl LakeCatalog {
             current: Mutex::default(),
             taking: tokio::sync::Mutex::default(),
             past: Cache::new(PAST_TABLES),
-            runs: Arc::new(mcap::Files::new(lake.store())),
+            runs: Arc::new(mcap::Files::new(lake, &small)),
         })
     }
 
@@ -107,8 +108,10 @@ impl LakeCatalog {
         for (name, provider) in system.into_iter().flat_map(system::source_tables) {
             context.register_table(TableReference::partial(system::SCHEMA, name), provider).map_err(failed)?;
         }
+        // A time stands for one version in all of a statement, even if a version with an earlier time comes meanwhile.
+        let mut versions = HashMap::new();
         for past in past {
-            let provider = self.at(&past).await?;
+            let provider = self.at(&past, &mut versions).await?;
             context.register_table(TableReference::bare(past.name), provider).map_err(failed)?;
         }
         mcap::register(context, &current.snapshot, &self.runs, statement).await
@@ -127,7 +130,7 @@ impl LakeCatalog {
     /// # Errors
     /// [`Error::Execution`] if the file cannot be read.
     pub(crate) async fn contents(&self, run: &VisibleRun) -> Result<Contents, Error> {
-        mcap::contents(run, &self.runs).await
+        mcap::contents(run, &self.current().await?.snapshot, &self.runs).await
     }
 
     /// Returns the bytes of the first attachment of a run's file whose name has this ending; None if there is none.
@@ -135,7 +138,7 @@ impl LakeCatalog {
     /// # Errors
     /// As [`LakeCatalog::contents`].
     pub(crate) async fn attachment(&self, run: &VisibleRun, ending: &str) -> Result<Option<Bytes>, Error> {
-        mcap::attachment(run, ending, &self.runs).await
+        mcap::attachment(run, &self.current().await?.snapshot, ending, &self.runs).await
     }
 
     /// Returns the tables and views with their schemas.
@@ -233,29 +236,39 @@ impl LakeCatalog {
         Ok(Arc::new(LakeTable::new(table, schema, files.to_vec(), self.source.clone()).map_err(failed)?))
     }
 
-    async fn at(&self, past: &PastTableName) -> Result<Arc<dyn TableProvider>, Error> {
+    async fn at(
+        &self,
+        past: &PastTableName,
+        versions: &mut HashMap<LakeMoment, u64>,
+    ) -> Result<Arc<dyn TableProvider>, Error> {
         let moment = past.moment()?;
-        if let Some(table) = Table::by_name(&past.table) {
-            return Ok(self.table_at(moment, table).await?);
+        let table = Table::by_name(&past.table);
+        let view = LakeView::by_name(&past.table);
+        if table.is_none() && view.is_none() {
+            return Err(error::missing(&past.table));
         }
-        let Some(view) = LakeView::by_name(&past.table) else { return Err(error::missing(&past.table)) };
+        let version = match versions.get(&moment) {
+            Some(version) => *version,
+            None => self.lake.version_at(moment).await?,
+        };
+        versions.insert(moment, version);
+        if let Some(table) = table {
+            return Ok(self.table_at(version, table).await?);
+        }
+        let Some(view) = view else { return Err(error::missing(&past.table)) };
         let mut beneath = HashMap::new();
         for table in view.tables() {
-            beneath.insert(*table, self.table_at(moment, *table).await? as Arc<dyn TableProvider>);
+            beneath.insert(*table, self.table_at(version, *table).await? as Arc<dyn TableProvider>);
         }
         Ok(Arc::new(view.over(&self.lake, &self.lookups, &beneath).map_err(failed)?))
     }
 
-    async fn table_at(&self, moment: LakeMoment, table: Table) -> Result<Arc<LakeTable>, Error> {
+    async fn table_at(&self, version: u64, table: Table) -> Result<Arc<LakeTable>, Error> {
         let read = async {
-            let snapshot = self.lake.snapshot_at(moment, table).await?;
+            let snapshot = self.lake.snapshot_at(version, table).await?;
             self.table(table, snapshot.files(table))
         };
-        match moment {
-            LakeMoment::Version(version) => self.past.get_or_insert_async(&(version, table), read).await,
-            // The table as of a time may still change.
-            LakeMoment::Time(_) => read.await,
-        }
+        self.past.get_or_insert_async(&(version, table), read).await
     }
 }
 

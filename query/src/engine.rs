@@ -6,7 +6,6 @@ use std::time::Duration;
 
 use datafusion::catalog::{CatalogProvider as _, CatalogProviderList as _};
 use datafusion::catalog::{MemoryCatalogProvider, MemoryCatalogProviderList, MemorySchemaProvider};
-use datafusion::datasource::physical_plan::parquet::CachedParquetFileReaderFactory;
 use datafusion::error::DataFusionError;
 use datafusion::execution::FunctionRegistry as _;
 use datafusion::execution::disk_manager::DiskManagerBuilder;
@@ -26,6 +25,7 @@ use crate::control::pool::{HeldMemory, PartialPool};
 use crate::control::threads::QueryThreads;
 use crate::control::{QueryTicket, RunningQueries, StopReason};
 use crate::functions::octet_length_of_bytes;
+use crate::scan_readers::LakeReaderFactory;
 use crate::small::SmallTables;
 use crate::system::{self, SystemSource};
 use crate::table::FileReaders;
@@ -211,7 +211,7 @@ impl QueryEngine {
         let url = ObjectStoreUrl::parse(STORE).map_err(failed)?;
         let runtime = runtime(lake, &url, limits).map_err(failed)?;
         let metadata = runtime.cache_manager.get_file_metadata_cache();
-        let reader = Arc::new(CachedParquetFileReaderFactory::new(lake.store(), metadata));
+        let reader = Arc::new(LakeReaderFactory::new(lake, metadata));
         let functions = FunctionSet::all(lake.rig()).map_err(|e| Error::Execution { message: e.to_string() })?;
         let threads = |e: std::io::Error| Error::Execution { message: format!("no threads for queries: {e}") };
         let footer_bytes = lake.is_remote().then_some(REMOTE_FOOTER_BYTES);

@@ -38,6 +38,9 @@ mod opaque;
 pub mod output;
 mod placeholders;
 mod predicate;
+#[cfg(test)]
+mod request_tests;
+mod scan_readers;
 mod session;
 mod small;
 mod statement_bounds;

@@ -3,6 +3,7 @@
 
 mod gauges;
 
+use echolake_lake::CacheCounts;
 use prometheus::{
     HistogramOpts, HistogramVec, IntCounter, IntCounterVec, IntGauge, Opts, Registry, Result, TextEncoder,
 };
@@ -49,6 +50,9 @@ pub(crate) struct ServerMetrics {
     running: IntGauge,
     seconds: HistogramVec,
     requests: HistogramVec,
+    cache_blocks: IntCounterVec,
+    cache_requests: IntCounter,
+    cache_bytes: IntCounter,
 }
 
 impl ServerMetrics {
@@ -75,8 +79,22 @@ impl ServerMetrics {
             running: IntGauge::new("echolake_running_queries", "Queries that run now.")?,
             seconds: HistogramVec::new(query_time, &["protocol", "outcome"])?,
             requests: HistogramVec::new(request_time, &["status"])?,
+            cache_blocks: IntCounterVec::new(
+                Opts::new("echolake_cache_blocks_total", "Blocks of a lake on an object store that were read."),
+                &["from"],
+            )?,
+            cache_requests: IntCounter::new(
+                "echolake_cache_store_requests_total",
+                "Requests to the object store for blocks that were not cached.",
+            )?,
+            cache_bytes: IntCounter::new("echolake_cache_fetched_bytes_total", "Bytes of these blocks.")?,
         };
-        let Self { registry, queries, failures, rows, bytes, running, seconds, requests } = &metrics;
+        metrics.register()?;
+        Ok(metrics)
+    }
+
+    fn register(&self) -> Result<()> {
+        let Self { registry, queries, failures, rows, bytes, running, seconds, requests, .. } = self;
         registry.register(Box::new(queries.clone()))?;
         registry.register(Box::new(failures.clone()))?;
         registry.register(Box::new(rows.clone()))?;
@@ -84,6 +102,9 @@ impl ServerMetrics {
         registry.register(Box::new(running.clone()))?;
         registry.register(Box::new(seconds.clone()))?;
         registry.register(Box::new(requests.clone()))?;
+        registry.register(Box::new(self.cache_blocks.clone()))?;
+        registry.register(Box::new(self.cache_requests.clone()))?;
+        registry.register(Box::new(self.cache_bytes.clone()))?;
         // What did not happen yet is zero, and not unknown.
         for protocol in ServerProtocol::ALL {
             queries.with_label_values(&[protocol.name()]);
@@ -92,7 +113,8 @@ impl ServerMetrics {
         for code in FaultCode::ALL {
             failures.with_label_values(&[code.name()]);
         }
-        Ok(metrics)
+        self.cached(&CacheCounts::default());
+        Ok(())
     }
 
     /// Counts a query that begins.
@@ -120,6 +142,16 @@ impl ServerMetrics {
         let class = ["1xx", "2xx", "3xx", "4xx", "5xx"];
         let class = class.get(usize::from(status / 100).wrapping_sub(1)).copied().unwrap_or("other");
         self.requests.with_label_values(&[class]).observe(seconds);
+    }
+
+    /// Counts what an engine read of an object store.
+    pub(crate) fn cached(&self, counts: &CacheCounts) {
+        let CacheCounts { memory_hits, disk_hits, misses, requests, fetched_bytes } = *counts;
+        for (from, blocks) in [("memory", memory_hits), ("disk", disk_hits), ("store", misses)] {
+            self.cache_blocks.with_label_values(&[from]).inc_by(blocks);
+        }
+        self.cache_requests.inc_by(requests);
+        self.cache_bytes.inc_by(fetched_bytes);
     }
 
     /// Counts a failed request.
@@ -191,6 +223,10 @@ mod tests {
         ] {
             has(&text, line);
         }
+        metrics.cached(&CacheCounts { memory_hits: 3, disk_hits: 2, misses: 5, requests: 1, fetched_bytes: 4096 });
+        let text = metrics.text(&ServerGauges::default()).expect("a text");
+        has(&text, "echolake_cache_blocks_total{from=\"disk\"} 2");
+        has(&text, "echolake_cache_fetched_bytes_total 4096");
         metrics.begin(ServerProtocol::Http);
         metrics.lose(1);
         has(&metrics.text(&ServerGauges::default()).expect("a text"), "echolake_running_queries 0");

@@ -2,6 +2,8 @@
 
 pub(crate) mod acquire;
 #[cfg(feature = "lake")]
+mod cache;
+#[cfg(feature = "lake")]
 pub(crate) mod campaign;
 #[cfg(feature = "lake")]
 pub(crate) mod demo;

@@ -16,6 +16,7 @@ use echolake_server::tokens::{self, TokenFile};
 use echolake_server::{CataloguePages, CertificateFiles, EngineSettings, Error, LakeServer, ServerSettings};
 use tokio::signal::unix::{SignalKind, signal};
 
+use super::cache::CacheArgs;
 use crate::CommandOutcome;
 use crate::duration::parse_duration;
 use crate::logging::child_variable;
@@ -65,6 +66,8 @@ pub(crate) struct ServeArgs {
     /// Folder for temporary files, such as sorts that do not fit into memory; by default `temp` in the lake.
     #[arg(long, value_name = "DIR")]
     temp: Option<PathBuf>,
+    #[command(flatten)]
+    cache: CacheArgs,
 }
 
 /// Arguments with which `serve` starts its engines.
@@ -82,13 +85,19 @@ pub(crate) struct EngineArgs {
     /// Milliseconds from which a query is logged.
     #[arg(long)]
     log_slow_ms: Option<u64>,
+    #[command(flatten)]
+    cache: CacheArgs,
 }
 
 impl EngineArgs {
     /// Gives up what an engine does not need. To be called before there are threads.
     pub(crate) fn confine(&self, lake_url: &str) -> anyhow::Result<()> {
         let temp = std::env::temp_dir();
-        let own = [self.sockets.as_path(), &temp];
+        let cache = self.cache.folder();
+        let own: Vec<_> = [self.sockets.as_path(), &temp]
+            .into_iter()
+            .chain(cache.as_ref().map(|cache| cache.path.as_path()))
+            .collect();
         let confined = match (&self.confine_to, remote_access(lake_url)) {
             (Some(lake), _) => confinement::confine_files(lake, &own),
             (None, Some(store)) => confinement::confine_to_store(&store, &own),
@@ -102,7 +111,7 @@ impl EngineArgs {
 pub(crate) async fn engine(args: &EngineArgs, lake_url: &str) -> anyhow::Result<CommandOutcome> {
     // A service manager may signal all processes of a service: an engine ends with its door.
     let _ignored = signal(SignalKind::terminate()).context("cannot listen to SIGTERM")?;
-    let lake = Lake::open(lake_url).await?;
+    let lake = args.cache.open_lake(lake_url).await?;
     let slow = args.log_slow_ms.map(Duration::from_millis);
     run_engine(&lake, &args.sockets, EngineRun { memory: Some(args.memory_bytes), slow }).await?;
     Ok(CommandOutcome::Whole)
@@ -141,7 +150,7 @@ const HTTP: SocketAddr = SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 8080);
 pub(crate) async fn run(args: &ServeArgs, lake_url: &str) -> anyhow::Result<CommandOutcome> {
     let reply = format!("stopping: answers may go on for {:?}; Ctrl-C again stops at once", args.drain);
     let stop = StopRequest::listen(reply)?;
-    let lake = Lake::open(lake_url).await?;
+    let lake = args.cache.open_lake(lake_url).await?;
     let settings = ServerSettings {
         http: args.listen.address(),
         flight_sql: args.flight_sql.address(),
@@ -154,7 +163,11 @@ pub(crate) async fn run(args: &ServeArgs, lake_url: &str) -> anyhow::Result<Comm
             .map(|(certificate, key)| CertificateFiles { certificate, key }),
         is_behind_proxy: args.plain_text_behind_a_proxy,
         drain: args.drain,
-        engines: EngineSettings { slow: args.log_slow, ..engines(args.memory, args.engines, args.temp.clone())? },
+        engines: EngineSettings {
+            cache: args.cache.folder().filter(|_| lake.is_remote()),
+            slow: args.log_slow,
+            ..engines(args.memory, args.engines, args.temp.clone())?
+        },
     };
     let server = LakeServer::bind(&lake, settings)?;
     anyhow::ensure!(!server.addresses().is_empty(), "nothing to listen on; hint: all three are off");
@@ -196,6 +209,7 @@ fn engines(memory_mib: u32, count: u32, temp: Option<PathBuf>) -> anyhow::Result
         count: count as usize,
         temp,
         slow: None,
+        cache: None,
     })
 }
 

@@ -8,10 +8,11 @@ use std::path::{Path, PathBuf};
 
 use anyhow::Context as _;
 use clap::ValueEnum;
-use echolake_lake::Lake;
 use echolake_query::output::{AnswerFormat, AnswerWriter, TABLE_ROWS};
 use echolake_query::{QueryAnswer, Session};
 use serde::de::DeserializeOwned;
+
+use super::cache::CacheArgs;
 
 #[derive(Debug, clap::Args)]
 pub(crate) struct SqlArgs {
@@ -27,6 +28,8 @@ pub(crate) struct SqlArgs {
     /// File for the answer.
     #[arg(short, long)]
     output: Option<PathBuf>,
+    #[command(flatten)]
+    cache: CacheArgs,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
@@ -51,7 +54,7 @@ impl From<FormatArg> for AnswerFormat {
 }
 
 pub(crate) async fn run(args: &SqlArgs, lake_url: &str) -> anyhow::Result<()> {
-    let lake = Lake::open(lake_url).await?;
+    let lake = args.cache.open_lake(lake_url).await?;
     let session = Session::new(&lake)?;
     let query = match args.query.as_deref() {
         Some("-") => from_stdin()?,

@@ -2,6 +2,8 @@
 
 use echolake_schema::ErrorCause;
 
+use crate::location::object_text;
+
 /// The commands of this build that make a missing lake, as words of a hint.
 #[cfg(feature = "tables")]
 const LAKE_MAKERS: &str = "`echolake demo`, `echolake acquire` and `echolake import` make one";
@@ -48,7 +50,7 @@ pub enum Error {
         observed: String,
     },
     /// `lake.toml` cannot be read.
-    #[error("`{location}/lake.toml` is damaged: {source}")]
+    #[error("`{}` is damaged: {source}", object_text(location, "lake.toml"))]
     Config {
         /// The lake's location.
         location: String,
@@ -116,6 +118,14 @@ pub enum Error {
         file: String,
         /// The damage.
         source: ErrorCause,
+    },
+    /// The folder for a cache is not fit for it.
+    #[error("`{}` cannot hold a cache: {source}; hint: --cache names a folder that can be written", folder.display())]
+    CacheFolder {
+        /// The folder.
+        folder: std::path::PathBuf,
+        /// The system's error.
+        source: std::io::Error,
     },
     /// Another process holds the maintenance lease.
     #[error(

@@ -3,11 +3,15 @@
 use std::path::Path as FsPath;
 use std::sync::Arc;
 
+#[cfg(feature = "tables")]
+use echolake_schema::tables::Table;
 use echolake_schema::{Grid, Rig, RunId, SurfaceId};
 use object_store::path::Path;
 use object_store::{ObjectStore, ObjectStoreExt as _, PutMode};
 
-use crate::location::LakeLocation;
+use crate::location::{LakeLocation, object_text};
+#[cfg(feature = "tables")]
+use crate::remote::{BlockCache, BlockFolder, CacheCounters, CacheCounts, CacheFolder, CachedStore};
 #[cfg(feature = "tables")]
 use crate::tables::delta::DeltaLog;
 use crate::unused;
@@ -23,7 +27,7 @@ struct OpenLake {
     config: LakeConfig,
     grid: Grid,
     #[cfg(feature = "tables")]
-    log: DeltaLog,
+    log: Arc<DeltaLog>,
 }
 
 const CONFIG: &str = "lake.toml";
@@ -85,7 +89,8 @@ impl Lake {
         Self::open_or_create_at(LakeLocation::parse(url)?, rig, references).await
     }
 
-    /// The same in a store that holds nothing but the lake; `name` is what messages call it.
+    /// The same in a store that holds nothing but the lake; `name` is what messages call it. If it is a URL of an object
+    /// store, such as `s3://bucket/lake`, the store is taken for a remote one.
     ///
     /// # Errors
     /// As [`Lake::open_or_create`].
@@ -95,19 +100,7 @@ impl Lake {
         rig: &Rig,
         references: &ReferenceSurfaces,
     ) -> Result<Self> {
-        Self::open_or_create_at(LakeLocation::store(name, store), rig, references).await
-    }
-
-    /// The same as if the store were a remote one.
-    #[cfg(test)]
-    pub(crate) async fn open_or_create_remote(
-        store: Arc<dyn ObjectStore>,
-        name: &str,
-        rig: &Rig,
-        references: &ReferenceSurfaces,
-    ) -> Result<Self> {
-        let location = LakeLocation { remote: Some(Arc::default()), ..LakeLocation::store(name, store) };
-        Self::open_or_create_at(location, rig, references).await
+        Self::open_or_create_at(LakeLocation::named_store(name, store), rig, references).await
     }
 
     async fn open_or_create_at(location: LakeLocation, rig: &Rig, references: &ReferenceSurfaces) -> Result<Self> {
@@ -134,7 +127,7 @@ impl Lake {
         unused::delete_tables(self).await?;
         let references = self.config().references.clone();
         let config = LakeConfig { format: LAKE_FORMAT, references, rig: rig.clone() };
-        let failed = |e| Error::store("write", format!("{}/{CONFIG}", self.location()), e);
+        let failed = |e| Error::store("write", object_text(self.location(), CONFIG), e);
         self.store().put(&Path::from(CONFIG), config.to_toml()?.into()).await.map_err(failed)?;
         Self::assemble(self.0.location.clone(), config)
     }
@@ -150,7 +143,7 @@ impl Lake {
             return Ok(false);
         }
         unused::delete_tables(&self).await?;
-        let failed = |e| Error::store("delete", format!("{}/{CONFIG}", self.location()), e);
+        let failed = |e| Error::store("delete", object_text(self.location(), CONFIG), e);
         self.store().delete(&Path::from(CONFIG)).await.map_err(failed)?;
         unused::remove_empty_folders(folder);
         Ok(true)
@@ -159,7 +152,7 @@ impl Lake {
     fn assemble(location: LakeLocation, config: LakeConfig) -> Result<Self> {
         let grid = config.rig.grid()?;
         #[cfg(feature = "tables")]
-        let log = DeltaLog::new(&location, config.rig.clone());
+        let log = Arc::new(DeltaLog::new(&location, config.rig.clone()));
         Ok(Self(Arc::new(OpenLake {
             location,
             config,
@@ -208,6 +201,47 @@ impl Lake {
         self.0.location.remote.is_some()
     }
 
+    /// Returns the lake with a cache of what never changes in it, in memory, and in a folder if there is one. A lake in a
+    /// folder needs none and is returned as it is.
+    ///
+    /// # Errors
+    /// [`Error::CacheFolder`], or what the store says.
+    #[cfg(feature = "tables")]
+    pub async fn with_cache(&self, folder: Option<&CacheFolder>) -> Result<Self> {
+        if !self.is_remote() {
+            return Ok(self.clone());
+        }
+        let mut blocks = None;
+        if let Some(folder) = folder {
+            let failed = |source| Error::CacheFolder { folder: folder.path.clone(), source };
+            folder.create().map_err(failed)?;
+            // A lake without tables has nothing to cache yet.
+            let id = self.0.log.table_id(Table::Runs).await?;
+            blocks = id.map(|id| BlockFolder::open(folder, &id)).transpose().map_err(failed)?;
+        }
+        let cached = CachedStore::new(self.store(), Arc::new(BlockCache::new(blocks)));
+        let store = Arc::new(cached.clone());
+        Ok(Self(Arc::new(OpenLake {
+            location: LakeLocation { store, cached: Some(cached), ..self.0.location.clone() },
+            config: self.0.config.clone(),
+            grid: self.0.grid.clone(),
+            log: self.0.log.clone(),
+        })))
+    }
+
+    /// Returns what the cache has counted since it was made; None if there is no cache.
+    #[cfg(feature = "tables")]
+    pub fn cache_counts(&self) -> Option<CacheCounts> {
+        Some(self.0.location.cached.as_ref()?.cache().counts())
+    }
+
+    /// Returns the store for one scan, with counters of its own; None if there is no cache.
+    #[cfg(feature = "tables")]
+    pub fn store_for_scan(&self, counters: Arc<CacheCounters>) -> Option<Arc<dyn ObjectStore>> {
+        let cached = self.0.location.cached.as_ref()?;
+        Some(Arc::new(cached.for_scan(counters)))
+    }
+
     /// Probes, once in a process, if an object store is fit to be written: if one alone can create an object. A folder is.
     ///
     /// # Errors
@@ -235,7 +269,7 @@ impl Lake {
     /// The commit log.
     #[cfg(feature = "tables")]
     pub fn log(&self) -> &dyn crate::CommitLog {
-        &self.0.log
+        self.0.log.as_ref()
     }
 
     /// Path of a run's file.
@@ -252,7 +286,7 @@ impl Lake {
 
 async fn read_config(location: &LakeLocation) -> Result<Option<LakeConfig>> {
     let path = Path::from(CONFIG);
-    let failed = |e| Error::store("read", format!("{}/{CONFIG}", location.text), e);
+    let failed = |e| Error::store("read", object_text(&location.text, CONFIG), e);
     let bytes = match location.store.get(&path).await {
         Ok(found) => found.bytes().await.map_err(failed)?,
         Err(object_store::Error::NotFound { .. }) => return Ok(None),
@@ -264,7 +298,7 @@ async fn read_config(location: &LakeLocation) -> Result<Option<LakeConfig>> {
 }
 
 async fn create_config(location: &LakeLocation, rig: &Rig, references: &ReferenceSurfaces) -> Result<LakeConfig> {
-    let failed = |e| Error::store("write", format!("{}/{CONFIG}", location.text), e);
+    let failed = |e| Error::store("write", object_text(&location.text, CONFIG), e);
     let there = location.store.list_with_delimiter(None).await.map_err(failed)?;
     let ours = |p: &Path| p.filename().is_some_and(|n| matches!(n, "runs" | "inbox" | "quarantine" | "tables"));
     if !there.objects.is_empty() || !there.common_prefixes.iter().all(ours) {
@@ -286,8 +320,6 @@ async fn create_config(location: &LakeLocation, rig: &Rig, references: &Referenc
 
 #[cfg(test)]
 mod tests {
-    use echolake_schema::tables::Table;
-
     use super::*;
 
     async fn paper(url: &str) -> Result<Lake> {

@@ -31,7 +31,7 @@ pub use config::{DirectSound, LAKE_FORMAT, LakeConfig, ReferenceSurfaces};
 pub use error::{Error, StoreError};
 pub use lake::Lake;
 #[cfg(feature = "tables")]
-pub use remote::{RemoteAccess, remote_access};
+pub use remote::{CACHE_MEMORY_BYTES, CacheCounters, CacheCounts, CacheFolder, RemoteAccess, remote_access};
 #[cfg(feature = "tables")]
 pub use tables::{
     BatchBuilder, CommitEffect, CommitLog, CommitOutcome, DataFile, DeletedFile, DeletionMode, EncodedFile,

@@ -1,5 +1,6 @@
 //! A lake's location: a folder, `file://`, `memory://`, or a bucket of an object store.
 
+use std::fmt::Display;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -14,7 +15,7 @@ use url::Url;
 
 use crate::durable::DurableFileSystem;
 #[cfg(feature = "tables")]
-use crate::remote::{ExclusionFault, probe_exclusion};
+use crate::remote::{CachedStore, ExclusionFault, probe_exclusion};
 use crate::{Error, Result};
 
 /// A lake's location, opened.
@@ -29,11 +30,14 @@ pub(crate) struct LakeLocation {
     /// If it is an object store: the result of the probe that writers make first.
     #[cfg(feature = "tables")]
     pub(crate) remote: Option<Arc<OnceCell<()>>>,
+    /// The same store, if it has a cache.
+    #[cfg(feature = "tables")]
+    pub(crate) cached: Option<CachedStore>,
 }
 
 impl LakeLocation {
     pub(crate) fn parse(text: &str) -> Result<Self> {
-        let wrong = |source: ErrorCause| Error::Location { location: text.to_owned(), source };
+        let wrong = |source: ErrorCause| Error::Location { location: without_secrets(text), source };
         if text.trim().is_empty() {
             return Err(wrong("it is empty".into()));
         }
@@ -47,7 +51,7 @@ impl LakeLocation {
             #[cfg(feature = "tables")]
             _ => {
                 let store = crate::remote::open_store(&url).map_err(wrong)?;
-                Ok(Self { remote: Some(Arc::default()), ..Self::store(text, store) })
+                Ok(Self { remote: Some(Arc::default()), ..Self::store(text.trim_end_matches('/'), store) })
             }
             #[cfg(not(feature = "tables"))]
             scheme => Err(wrong(format!("this build does not reach `{scheme}://`").into())),
@@ -78,11 +82,22 @@ impl LakeLocation {
             store,
             #[cfg(feature = "tables")]
             remote: None,
+            #[cfg(feature = "tables")]
+            cached: None,
+        }
+    }
+
+    /// The same, of a store that is taken for a remote one if its name is a URL of one.
+    pub(crate) fn named_store(name: &str, store: Arc<dyn ObjectStore>) -> Self {
+        Self {
+            #[cfg(feature = "tables")]
+            remote: crate::remote_access(name).map(|_| Arc::default()),
+            ..Self::store(name, store)
         }
     }
 
     fn folder(text: &str, path: &Path) -> Result<Self> {
-        let wrong = |source: ErrorCause| Error::Location { location: text.to_owned(), source };
+        let wrong = |source: ErrorCause| Error::Location { location: without_secrets(text), source };
         let absolute = std::path::absolute(path).map_err(|e| wrong(e.into()))?;
         if absolute.exists() && !absolute.is_dir() {
             return Err(wrong("it is a file".into()));
@@ -90,6 +105,26 @@ impl LakeLocation {
         let prefix = ObjectPath::from_absolute_path(&absolute).map_err(|e| wrong(e.into()))?;
         let store = Arc::new(PrefixStore::new(DurableFileSystem::new(), prefix));
         Ok(Self { folder: Some(absolute), ..Self::store(text, store) })
+    }
+}
+
+/// Names an object of a lake in messages.
+pub(crate) fn object_text(location: &str, path: impl Display) -> String {
+    format!("{}/{path}", location.strip_suffix('/').unwrap_or(location))
+}
+
+/// Replaces the parts of a URL that may hold credentials: what precedes its host, and its query. A password may hold
+/// characters that end a host, and the text may be no valid URL.
+pub(crate) fn without_secrets(text: &str) -> String {
+    let Some((scheme, rest)) = text.split_once("://") else { return text.to_owned() };
+    let host = rest.split(['/', '?', '#']).next().unwrap_or_default();
+    let named = match rest.rsplit_once('@') {
+        Some((_, named)) if host.contains(['@', ':']) => format!("***@{named}"),
+        _ => rest.to_owned(),
+    };
+    match named.split_once(['?', '#']) {
+        Some((path, _)) => format!("{scheme}://{path}?***"),
+        None => format!("{scheme}://{named}"),
     }
 }
 
@@ -104,6 +139,37 @@ mod tests {
         {
             let error = LakeLocation::parse(bad).expect_err(bad).to_string();
             assert!(error.contains("hint"), "{error}");
+        }
+    }
+
+    #[test]
+    fn what_may_be_secret_is_not_repeated() {
+        for bad in [
+            "s3://key:s3cret@bucket/lake",
+            "s3://key:s3c/ret@bucket/lake",
+            "s3://key:s3cret@bu cket",
+            "s3://s3cret@bucket",
+            "az://container/lake?sig=s3cret",
+            "http://key:s3c@ret@host/lake?x=s3cret",
+            "gs://bucket/lake#s3cret",
+        ] {
+            let error = LakeLocation::parse(bad).expect_err(bad).to_string();
+            assert!(!error.contains("s3c") && !error.contains("ret@") && error.contains("***"), "{error}");
+        }
+        assert_eq!(without_secrets("s3://bucket/team@lab"), "s3://bucket/team@lab");
+        assert_eq!(without_secrets("http://host:9000"), "http://host:9000");
+    }
+
+    #[test]
+    fn names_of_objects_have_one_slash() {
+        for (text, expected) in [
+            ("s3://bucket", "s3://bucket/lake.toml"),
+            ("s3://bucket/", "s3://bucket/lake.toml"),
+            ("s3://bucket/a/", "s3://bucket/a/lake.toml"),
+            ("lake/", "lake/lake.toml"),
+            ("memory://", "memory://lake.toml"),
+        ] {
+            assert_eq!(object_text(text, "lake.toml"), expected);
         }
     }
 

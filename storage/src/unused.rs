@@ -6,6 +6,7 @@ use futures::TryStreamExt as _;
 use object_store::path::Path;
 use object_store::{ObjectMeta, ObjectStoreExt as _};
 
+use crate::location::object_text;
 use crate::{Error, Lake, Result};
 
 /// Folder of the tables.
@@ -35,7 +36,7 @@ pub(crate) async fn is_unused(lake: &Lake) -> Result<bool> {
 /// [`Error::Store`].
 pub(crate) async fn delete_tables(lake: &Lake) -> Result<()> {
     for meta in list(lake, Some(&Path::from(TABLES))).await? {
-        let failed = |e| Error::store("delete", format!("{}/{}", lake.location(), meta.location), e);
+        let failed = |e| Error::store("delete", object_text(lake.location(), &meta.location), e);
         lake.store().delete(&meta.location).await.map_err(failed)?;
     }
     Ok(())

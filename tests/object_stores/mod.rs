@@ -1,6 +1,7 @@
 //! Lakes on an object store: what is ingested there is what a folder would hold, whatever answers are lost; and a store
 //! that overwrites is not written to.
 
+mod requests;
 mod s3_double;
 
 use std::collections::BTreeMap;

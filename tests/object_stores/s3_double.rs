@@ -38,6 +38,7 @@ struct StoreState {
     random: ChaCha8Rng,
     faults: usize,
     requests: usize,
+    log: Vec<String>,
 }
 
 #[derive(Clone)]
@@ -83,6 +84,7 @@ impl S3Double {
             random: ChaCha8Rng::seed_from_u64(seed),
             faults: 0,
             requests: 0,
+            log: Vec::new(),
         }));
         let shared = state.clone();
         std::thread::spawn(move || {
@@ -116,6 +118,11 @@ impl S3Double {
 
     pub(crate) fn keys(&self) -> Vec<String> {
         self.state().objects.keys().cloned().collect()
+    }
+
+    /// The requests since the last call: method and key.
+    pub(crate) fn take_requests(&self) -> Vec<String> {
+        std::mem::take(&mut self.state().log)
     }
 
     /// Requests, and faults among them.
@@ -221,6 +228,7 @@ fn stored(bytes: &[u8]) -> String {
 impl StoreState {
     fn draw_fault(&mut self, request: &HttpRequest) -> RequestFault {
         self.requests += 1;
+        self.log.push(format!("{} {}", request.method, request.key));
         if !matches!(self.behaviour, StoreBehaviour::Unreliable(_)) {
             return RequestFault::None;
         }

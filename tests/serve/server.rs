@@ -22,16 +22,20 @@ pub(crate) struct ServedLake {
 impl ServedLake {
     /// Serves the lake `lake` of a folder.
     pub(crate) fn start(binary: &Path, folder: &Path, more: &[&str]) -> Self {
-        let any = "127.0.0.1:0";
         let mut command = Command::new(binary);
+        command.args(["--lake", "lake"]).current_dir(folder).env_remove("ECHOLAKE_LAKE");
+        Self::start_command(&mut command, more)
+    }
+
+    /// Serves the lake that a command's first arguments name.
+    pub(crate) fn start_command(command: &mut Command, more: &[&str]) -> Self {
+        let any = "127.0.0.1:0";
         command
-            .args(["--lake", "lake", "serve", "--listen", any, "--flight-sql", any, "--postgres", any])
+            .args(["serve", "--listen", any, "--flight-sql", any, "--postgres", any])
             .args(more)
-            .current_dir(folder)
-            .env_remove("ECHOLAKE_LAKE")
             // If something panics, its caller is printed.
             .env("RUST_BACKTRACE", "1");
-        let mut child = ChildProcess::start(&mut command).expect("the command starts");
+        let mut child = ChildProcess::start(command).expect("the command starts");
         let mut address = |scheme: &str| {
             let line = child.wait_for_line(scheme);
             let rest = line.split_once("://").expect("a URL").1;

@@ -14,7 +14,7 @@ use echolake_recording::{
 use echolake_schema::tables::Table;
 use echolake_schema::{ErrorCause, RunId, SurfaceId, topics};
 use object_store::path::Path;
-use object_store::{ObjectStore, ObjectStoreExt as _};
+use object_store::{GetOptions, ObjectStore, ObjectStoreExt as _};
 use sha2::{Digest as _, Sha256};
 
 use super::Check;
@@ -78,13 +78,7 @@ impl RunFile {
 impl Source {
     /// Opens a run's file and checks that it is the one that was ingested.
     pub(super) async fn open(store: Arc<dyn ObjectStore>, file: RunFile, check: Check) -> Result<Self> {
-        let meta = store.head(&file.path).await.map_err(|e| match e {
-            object_store::Error::NotFound { .. } => file.changed("it is not there; was it moved?"),
-            other => file.changed(other),
-        })?;
-        if meta.size != file.bytes {
-            return Err(file.changed(format!("it has {} bytes, expected {}", meta.size, file.bytes)));
-        }
+        let tail = read_tail(store.as_ref(), &file).await?;
         let mut source = Self {
             file,
             store,
@@ -96,7 +90,7 @@ impl Source {
         if check == Check::Whole {
             source.hash().await?;
         }
-        source.read_summary().await?;
+        source.read_summary(&tail).await?;
         Ok(source)
     }
 
@@ -116,10 +110,9 @@ impl Source {
         self.store.get_range(&self.file.path, range).await.map_err(|e| self.file.changed(e))
     }
 
-    async fn read_summary(&mut self) -> Result<()> {
+    async fn read_summary(&mut self, tail: &Bytes) -> Result<()> {
         let bytes = self.file.bytes;
-        let tail = self.read(tail_range(bytes)).await?;
-        let Some(range) = summary_range(&tail, bytes) else {
+        let Some(range) = summary_range(tail, bytes) else {
             let reason = "its file has no index, because it was cut off while it was recorded".to_owned();
             return Err(Error::Uncuttable { run: self.file.run.clone(), reason });
         };
@@ -194,5 +187,23 @@ impl Source {
             });
         }
         Ok(messages)
+    }
+}
+
+// The answer to the first read tells the file's size, so that the store need not be asked for it.
+async fn read_tail(store: &dyn ObjectStore, file: &RunFile) -> Result<Bytes> {
+    let found = store.get_opts(&file.path, GetOptions::new().with_range(Some(tail_range(file.bytes)))).await;
+    let (size, tail) = match found {
+        Ok(found) => (found.meta.size, found.bytes().await.map_err(|e| file.changed(e))?),
+        Err(object_store::Error::NotFound { .. }) => return Err(file.changed("it is not there; was it moved?")),
+        // A shorter file has no such range.
+        Err(error) => match store.head(&file.path).await {
+            Ok(meta) if meta.size != file.bytes => (meta.size, Bytes::new()),
+            _ => return Err(file.changed(error)),
+        },
+    };
+    match size == file.bytes {
+        true => Ok(tail),
+        false => Err(file.changed(format!("it has {size} bytes, expected {}", file.bytes))),
     }
 }

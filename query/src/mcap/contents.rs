@@ -4,7 +4,7 @@ use std::collections::HashMap;
 use std::sync::Arc;
 
 use bytes::Bytes;
-use echolake_lake::{Lake, VisibleRun};
+use echolake_lake::{Lake, LakeSnapshot, VisibleRun};
 use echolake_recording::limits::LARGEST_CHUNK;
 use echolake_recording::{FRAME_BYTES, Record, RecordCursor, opcode, parse_record};
 use futures::{StreamExt as _, TryStreamExt as _};
@@ -44,8 +44,8 @@ pub struct Contents {
 }
 
 /// What the file of a run holds.
-pub(crate) async fn contents(run: &VisibleRun, files: &Arc<Files>) -> Result<Contents, Error> {
-    let file = files.open(&Lake::run_path(&run.surface, &run.run)).await?;
+pub(crate) async fn contents(run: &VisibleRun, snapshot: &LakeSnapshot, files: &Arc<Files>) -> Result<Contents, Error> {
+    let file = open(run, snapshot, files).await?;
     let bytes = sizes(&file, files).await?;
     let topic = |(id, channel): (&u16, &super::file::Channel)| Topic {
         topic: channel.topic.clone(),
@@ -60,8 +60,13 @@ pub(crate) async fn contents(run: &VisibleRun, files: &Arc<Files>) -> Result<Con
 }
 
 /// The bytes of the first attachment whose name ends so.
-pub(crate) async fn attachment(run: &VisibleRun, ending: &str, files: &Arc<Files>) -> Result<Option<Bytes>, Error> {
-    let file = files.open(&Lake::run_path(&run.surface, &run.run)).await?;
+pub(crate) async fn attachment(
+    run: &VisibleRun,
+    snapshot: &LakeSnapshot,
+    ending: &str,
+    files: &Arc<Files>,
+) -> Result<Option<Bytes>, Error> {
+    let file = open(run, snapshot, files).await?;
     let Some(found) = file.attachments.iter().find(|a| a.name.ends_with(ending)) else { return Ok(None) };
     let range = found.range.clone();
     let damaged = |what: &str| Fault::Damaged { file: file.path.to_string(), offset: range.start, what: what.into() };
@@ -76,6 +81,11 @@ pub(crate) async fn attachment(run: &VisibleRun, ending: &str, files: &Arc<Files
         }
         _ => Err(damaged("there is no sound attachment where its index says").into()),
     }
+}
+
+async fn open(run: &VisibleRun, snapshot: &LakeSnapshot, files: &Files) -> Result<Arc<McapFile>, Fault> {
+    let path = Lake::run_path(&run.surface, &run.run);
+    files.open(&path, files.known_sizes(snapshot).await.get(&path).copied()).await
 }
 
 // Bytes by channel; None where the file does not tell.

@@ -4,11 +4,12 @@
 //! writer makes none, or with one that is damaged or does not account for all that the file holds, is walked from its
 //! first byte, one record in memory at a time.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::ops::Range;
 use std::sync::Arc;
 
 use bytes::Bytes;
+use echolake_lake::{Lake, LakeSnapshot};
 use echolake_recording::{
     ChannelDefinitions, FRAME_BYTES, MAGIC, Record, RecordFrame, RecordSplitter, RunSummary, SplitRecord, describe,
     opcode, parse_record, summary_range, tail_range,
@@ -20,7 +21,9 @@ use quick_cache::sync::Cache;
 
 use super::chunk::{PieceKind, PieceRecords, ReadStep, ReadStop};
 use super::error::Fault;
+use super::run_sizes::RunSizes;
 use super::schema::RawSchema;
+use crate::small::SmallTables;
 
 /// What is read at a time of a file that is walked.
 const BLOCK: u64 = 4 << 20;
@@ -94,6 +97,8 @@ impl Piece {
 #[derive(Debug)]
 pub(crate) struct Files {
     pub(super) store: Arc<dyn ObjectStore>,
+    /// None for a lake in a folder, where a look at a file costs nothing and shows if somebody changed it.
+    sizes: Option<RunSizes>,
     cache: Cache<FileVersion, Arc<McapFile>, SummaryWeighter>,
 }
 
@@ -111,16 +116,33 @@ impl Weighter<FileVersion, Arc<McapFile>> for SummaryWeighter {
 }
 
 impl Files {
-    pub(crate) fn new(store: Arc<dyn ObjectStore>) -> Self {
+    pub(crate) fn new(lake: &Lake, small: &Arc<SmallTables>) -> Self {
+        let sizes = lake.is_remote().then(|| RunSizes::new(lake, small));
         // So few items are one shard, in which a summary may take all the room.
-        Self { store, cache: Cache::with_weighter(32, CACHED_BYTES, SummaryWeighter) }
+        Self { store: lake.store(), sizes, cache: Cache::with_weighter(32, CACHED_BYTES, SummaryWeighter) }
     }
 
-    /// Opens a file of the lake's store.
-    pub(super) async fn open(&self, path: &Path) -> Result<Arc<McapFile>, Fault> {
-        let meta = self.store.head(path).await.map_err(|source| Fault::Read { file: path.to_string(), source })?;
-        let opening = Opening { store: self.store.as_ref(), path, bytes: meta.size };
-        let version = (path.clone(), meta.size, meta.last_modified.timestamp_micros());
+    /// Returns the sizes of the runs' files, if files need not be asked for them.
+    pub(super) async fn known_sizes(&self, snapshot: &LakeSnapshot) -> HashMap<Path, u64> {
+        match &self.sizes {
+            Some(sizes) => sizes.read(snapshot).await,
+            None => HashMap::new(),
+        }
+    }
+
+    /// Opens a file of the lake's store, whose size may be known.
+    pub(super) async fn open(&self, path: &Path, known_bytes: Option<u64>) -> Result<Arc<McapFile>, Fault> {
+        let (bytes, modified) = match known_bytes {
+            // A run's file never changes.
+            Some(bytes) => (bytes, 0),
+            None => {
+                let meta = self.store.head(path).await;
+                let meta = meta.map_err(|source| Fault::Read { file: path.to_string(), source })?;
+                (meta.size, meta.last_modified.timestamp_micros())
+            }
+        };
+        let opening = Opening { store: self.store.as_ref(), path, bytes };
+        let version = (path.clone(), bytes, modified);
         self.cache.get_or_insert_async(&version, async { opening.file().await.map(Arc::new) }).await
     }
 }

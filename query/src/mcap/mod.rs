@@ -13,6 +13,7 @@ mod json;
 mod protobuf;
 mod ros;
 mod rows;
+mod run_sizes;
 mod scan;
 mod schema;
 mod table;

@@ -37,7 +37,11 @@ impl Target {
                 meant.extend(runs(part, snapshot)?);
             }
         }
-        let open = |(path, run)| async move { Ok(Self { run, file: files.open(&path).await? }) };
+        let sizes = &files.known_sizes(snapshot).await;
+        let open = |(path, run)| async move {
+            let file = files.open(&path, sizes.get(&path).copied()).await?;
+            Ok(Self { run, file })
+        };
         futures::stream::iter(meant).map(open).buffered(OPENED_AT_ONCE).try_collect().await
     }
 }

@@ -6,7 +6,7 @@ use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
-use echolake_lake::Lake;
+use echolake_lake::{CACHE_MEMORY_BYTES, Lake};
 use tokio::sync::Notify;
 
 use super::engine_process::{EndReason, EngineLease, EngineProcess, EngineSettings, EngineStart};
@@ -262,10 +262,11 @@ impl EnginePool {
     }
 
     async fn watch_memory(&self) {
+        let blocks = if self.0.lake.is_remote() { CACHE_MEMORY_BYTES as usize } else { 0 };
         loop {
             let is_busy = self.live().iter().any(|engine| engine.requests() > 0);
             tokio::time::sleep(if is_busy { LOOK } else { IDLE_LOOK }).await;
-            let size = |engine: &EngineProcess| engine.grown_bytes().saturating_sub(CACHE_BYTES);
+            let size = |engine: &EngineProcess| engine.grown_bytes().saturating_sub(CACHE_BYTES + blocks);
             let sizes: Vec<_> = self.live().into_iter().map(|engine| (size(&engine), engine)).collect();
             for (bytes, engine) in &sizes {
                 if let Some(limit) = engine.memory_limit().filter(|limit| bytes > limit) {

@@ -1,7 +1,7 @@
 //! One engine: a child process, its folder with sockets, and how it ended.
 
 use std::collections::HashMap;
-use std::ffi::OsStr;
+use std::ffi::{OsStr, OsString};
 use std::io;
 use std::path::{Path, PathBuf};
 use std::process::Stdio;
@@ -9,6 +9,7 @@ use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
 use std::time::{Duration, Instant};
 
 use axum::body::Body;
+use echolake_lake::CacheFolder;
 use hyper::client::conn::http2;
 use tokio::io::{AsyncBufReadExt as _, AsyncWriteExt as _, BufReader};
 use tokio::net::UnixStream;
@@ -41,6 +42,8 @@ pub struct EngineSettings {
     pub temp: Option<PathBuf>,
     /// Time from which a query is logged as slow; None for never.
     pub slow: Option<Duration>,
+    /// The folder in which they cache what they read of an object store.
+    pub cache: Option<CacheFolder>,
 }
 
 /// The reason for which an engine ended.
@@ -86,6 +89,10 @@ pub(super) struct EngineStart<'a> {
     pub(super) spills: PathBuf,
 }
 
+fn cache_arguments(cache: &CacheFolder) -> [OsString; 4] {
+    ["--cache".into(), cache.path.clone().into(), "--cache-size".into(), cache.bytes.to_string().into()]
+}
+
 impl EngineProcess {
     /// Starts a process that reads the lake and waits for its client.
     ///
@@ -103,6 +110,7 @@ impl EngineProcess {
             .args(
                 start.settings.slow.iter().flat_map(|slow| ["--log-slow-ms".to_owned(), slow.as_millis().to_string()]),
             )
+            .args(start.settings.cache.iter().flat_map(cache_arguments))
             .envs(start.settings.environment.iter().map(|(name, value)| (name, value)))
             .env("TMPDIR", &start.spills)
             // Memory that is reserved and not used would count against the limit.
@@ -346,6 +354,7 @@ impl EngineReports {
             }
             Ok(EngineReport::Failure(code)) => activity.metrics.failed(code),
             Ok(EngineReport::Lake(figures)) => activity.set_lake(figures),
+            Ok(EngineReport::Cache(counts)) => activity.metrics.cached(&counts),
             Ok(EngineReport::Ask { number, table }) => {
                 let Some(client) = engine.client.get() else { return };
                 let message = DoorMessage::Rows { number, rows: activity.rows(table, client) };

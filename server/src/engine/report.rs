@@ -2,6 +2,7 @@
 
 use std::io::Write as _;
 
+use echolake_lake::CacheCounts;
 use serde::{Deserialize, Serialize};
 
 use crate::activity::{ActivityTable, LakeFigures, QueryEnd, QueryStart};
@@ -23,6 +24,8 @@ pub(crate) enum EngineReport {
     Failure(FaultCode),
     /// State of the lake; None if it cannot be read.
     Lake(Option<LakeFigures>),
+    /// What it read of an object store through its cache since the last such line.
+    Cache(CacheCounts),
     /// It asks for its client's rows of a table of the server's activity.
     Ask {
         /// Number of the answer.

@@ -3,6 +3,7 @@
 
 use std::time::{Duration, Instant};
 
+use echolake_lake::CacheCounts;
 use rustix::time::{ClockId, clock_gettime};
 
 use super::report::EngineReport;
@@ -27,6 +28,7 @@ pub(super) fn start(service: &QueryService) -> std::io::Result<()> {
 
 fn watch(service: &QueryService) {
     let mut idle = IdleWork::default();
+    let mut cached = CacheCounts::default();
     loop {
         std::thread::sleep(INTERVAL);
         if service.engine().overdue().is_some_and(|time| time > GRACE) {
@@ -34,6 +36,12 @@ fn watch(service: &QueryService) {
         }
         if idle.look(service.activity().count() == 0) > GRACE {
             end("work that nobody waits for did not stop");
+        }
+        if let Some(counts) = service.lake().cache_counts()
+            && counts != cached
+        {
+            EngineReport::Cache(counts.since(&cached)).send();
+            cached = counts;
         }
     }
 }

@@ -11,7 +11,7 @@ use axum::response::Response;
 use echolake_lake::Lake;
 use futures::TryStreamExt as _;
 use object_store::path::Path as StorePath;
-use object_store::{GetOptions, GetRange, ObjectStore as _, ObjectStoreExt as _};
+use object_store::{GetOptions, GetRange, ObjectStore as _};
 use serde::Deserialize;
 use utoipa::IntoParams;
 use utoipa_axum::router::OpenApiRouter;
@@ -69,14 +69,15 @@ async fn run_file(
     catalogue.service().client(TokenScope::Files)?;
     let view = catalogue.view().await?;
     let run = catalogue::run(&view, &path.run_id)?;
-    let etag = digest(&catalogue, &view, run.run.as_str()).await?;
+    let FileRow { file_sha256, file_bytes } = file_row(&catalogue, &view, run.run.as_str()).await?;
     let described = FileDescription {
-        etag: format!("\"{etag}\""),
+        etag: format!("\"{file_sha256}\""),
         media_type: "application/octet-stream",
         // A page elsewhere may embed what it may read.
         policy: "cross-origin",
     };
-    let stored = RangedFile { path: Lake::run_path(&run.surface, &run.run), described };
+    let bytes = u64::try_from(file_bytes).unwrap_or(0);
+    let stored = RangedFile { path: Lake::run_path(&run.surface, &run.run), bytes, described };
     Ok(stored.answer(catalogue.lake(), &headers).await?)
 }
 
@@ -110,28 +111,27 @@ async fn table_file(
         media_type: "application/vnd.apache.parquet",
         policy: "same-origin",
     };
-    Ok(RangedFile { path: file.path.clone(), described }.answer(catalogue.lake(), &headers).await?)
+    Ok(RangedFile { path: file.path.clone(), bytes: file.bytes, described }.answer(catalogue.lake(), &headers).await?)
 }
 
 #[derive(Deserialize)]
-struct FileDigest {
+struct FileRow {
     file_sha256: String,
+    file_bytes: i64,
 }
 
-// The digest that a run's row has of its file.
-async fn digest(catalogue: &LakeCatalogue, view: &Arc<SnapshotView>, run: &str) -> Result<String, RequestFault> {
-    let sql = "select file_sha256 from runs where run_id = $1";
-    let rows: Vec<FileDigest> = CatalogueRequest::new(catalogue, view, false).rows(sql, vec![text(run)]).await?;
+// What a run's row says of its file.
+async fn file_row(catalogue: &LakeCatalogue, view: &Arc<SnapshotView>, run: &str) -> Result<FileRow, RequestFault> {
+    let sql = "select file_sha256, file_bytes from runs where run_id = $1";
+    let rows: Vec<FileRow> = CatalogueRequest::new(catalogue, view, false).rows(sql, vec![text(run)]).await?;
     let hint = "GET /api/v1/runs lists what there is";
-    rows.into_iter()
-        .next()
-        .map(|row| row.file_sha256)
-        .ok_or(RequestFault::NotFound { what: format!("run `{run}`"), hint })
+    rows.into_iter().next().ok_or(RequestFault::NotFound { what: format!("run `{run}`"), hint })
 }
 
 /// A file of the lake's store that never changes.
 struct RangedFile {
     path: StorePath,
+    bytes: u64,
     described: FileDescription,
 }
 
@@ -147,8 +147,7 @@ impl RangedFile {
                 RequestFault::Unreadable
             }
         };
-        let bytes = store.head(&self.path).await.map_err(unread)?.size;
-        let part = match self.described.asked(headers, bytes) {
+        let part = match self.described.asked(headers, self.bytes) {
             RangeAnswer::Answer(answer) => return Ok(answer),
             RangeAnswer::Part(part) => part,
         };
@@ -157,7 +156,12 @@ impl RangedFile {
             false => {
                 let range = Some(GetRange::Bounded(part.range.clone()));
                 let found = store.get_opts(&self.path, GetOptions { range, ..GetOptions::default() }).await;
-                let stream = found.map_err(unread)?.into_stream();
+                let found = found.map_err(unread)?;
+                if found.meta.size != self.bytes {
+                    tracing::warn!(path = %self.path, actual = found.meta.size, expected = self.bytes, "a file changed");
+                    return Err(RequestFault::Unreadable);
+                }
+                let stream = found.into_stream();
                 Body::from_stream(stream.inspect_err(|e| {
                     tracing::warn!(error = e as &dyn std::error::Error, "a file broke off");
                 }))

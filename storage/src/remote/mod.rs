@@ -3,6 +3,7 @@
 //! A bucket and a prefix name the lake; all other settings are the environment's, by the names that each store's own
 //! tools use.
 
+mod cache;
 mod exclusion;
 mod retrying;
 mod settings;
@@ -17,6 +18,8 @@ use object_store::path::Path as ObjectPath;
 use object_store::prefix::PrefixStore;
 use url::Url;
 
+pub(crate) use cache::{BlockCache, BlockFolder, CachedStore};
+pub use cache::{CACHE_MEMORY_BYTES, CacheCounters, CacheCounts, CacheFolder};
 pub(crate) use exclusion::{ExclusionFault, probe_exclusion};
 pub(crate) use retrying::{RetriedError, RetryingStore, backoff};
 

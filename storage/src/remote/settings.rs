@@ -10,6 +10,8 @@ use object_store::gcp::{GoogleCloudStorageBuilder, GoogleConfigKey};
 use object_store::{ClientConfigKey, ObjectStore, RetryConfig};
 use url::Url;
 
+use crate::location::without_secrets;
+
 /// Time for one request with its body: a part of an upload over a slow line takes long.
 const REQUEST_TIMEOUT: &str = "120 seconds";
 /// Variable with the number of tries of a request, as AWS's own tools have it.
@@ -86,7 +88,8 @@ pub(super) fn store(scheme: &str, bucket: &str) -> Result<Arc<dyn ObjectStore>, 
                 && allows_http.is_none_or(|allowed| allowed != "true")
             {
                 return Err(format!(
-                    "the endpoint `{endpoint}` is not encrypted; hint: set AWS_ALLOW_HTTP=true if that is meant"
+                    "the endpoint `{}` is not encrypted; hint: set AWS_ALLOW_HTTP=true if that is meant",
+                    without_secrets(&endpoint)
                 )
                 .into());
             }

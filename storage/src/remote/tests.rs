@@ -21,7 +21,7 @@ use crate::{CommitOutcome, Error, FileName, Lake, ReferenceSurfaces, encode};
 
 /// Faults of a store.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum StoreFault {
+pub(super) enum StoreFault {
     /// Creating overwrites.
     Overwrites,
     /// Creating an object that exists is refused, unless both meet.
@@ -34,7 +34,7 @@ enum StoreFault {
 
 /// A store in memory with faults. Chance follows from a seed.
 #[derive(Debug)]
-struct FaultyStore {
+pub(super) struct FaultyStore {
     inner: InMemory,
     fault: StoreFault,
     random: AtomicU64,
@@ -44,7 +44,7 @@ struct FaultyStore {
 }
 
 impl FaultyStore {
-    fn new(fault: StoreFault, seed: u64) -> Arc<Self> {
+    pub(super) fn new(fault: StoreFault, seed: u64) -> Arc<Self> {
         let (random, faults) = (AtomicU64::new(seed), AtomicUsize::new(0));
         Arc::new(Self { inner: InMemory::new(), fault, random, faults, requests: Mutex::default() })
     }
@@ -55,7 +55,7 @@ impl FaultyStore {
     }
 
     /// The requests since the last call.
-    fn take_requests(&self) -> Vec<String> {
+    pub(super) fn take_requests(&self) -> Vec<String> {
         std::mem::take(&mut *self.requests.lock().expect("no panic"))
     }
 
@@ -147,7 +147,7 @@ impl ObjectStore for FaultyStore {
 
 async fn lake(store: Arc<FaultyStore>) -> crate::Result<Lake> {
     let store = Arc::new(RetryingStore::new(store));
-    Lake::open_or_create_remote(store, "s3://bucket/lake", &Rig::paper(), &ReferenceSurfaces::default()).await
+    Lake::open_or_create_in(store, "s3://bucket/lake", &Rig::paper(), &ReferenceSurfaces::default()).await
 }
 
 #[tokio::test]

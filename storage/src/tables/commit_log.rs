@@ -216,6 +216,8 @@ pub trait CommitLog: Send + Sync + std::fmt::Debug {
     async fn changes(&self, table: Table) -> Result<Vec<TableChange>>;
     /// The table's files as of a version that the log still holds.
     async fn files_at(&self, table: Table, version: u64) -> Result<Vec<DataFile>>;
+    /// The files of all versions that the log still holds; none if there is no table.
+    async fn files_of_all_versions(&self, table: Table) -> Result<Vec<DataFile>>;
     /// Returns whether a file of this name is in the log.
     async fn has(&self, table: Table, name: &str) -> Result<bool>;
     /// Names of the current and the removed files; None if there is no log.

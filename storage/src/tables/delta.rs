@@ -107,6 +107,11 @@ impl DeltaLog {
         Ok(state)
     }
 
+    /// The id that a table was given when it was made.
+    pub(crate) async fn table_id(&self, table: Table) -> Result<Option<String>> {
+        Ok(self.load(table).await?.and_then(|state| Some(state.metadata.as_ref()?.id.clone())))
+    }
+
     async fn require(&self, table: Table) -> Result<Arc<TableState>> {
         self.load(table).await?.ok_or_else(|| Error::Log {
             table: table.name(),
@@ -289,6 +294,13 @@ impl CommitLog for DeltaLog {
 
     async fn files_at(&self, table: Table, version: u64) -> Result<Vec<DataFile>> {
         match self.log_folder(table).load(Some(version)).await? {
+            Some(state) => data_files(table, &state),
+            None => Ok(Vec::new()),
+        }
+    }
+
+    async fn files_of_all_versions(&self, table: Table) -> Result<Vec<DataFile>> {
+        match self.log_folder(table).load_all_versions().await? {
             Some(state) => data_files(table, &state),
             None => Ok(Vec::new()),
         }

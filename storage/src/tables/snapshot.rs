@@ -189,6 +189,11 @@ impl LakeSnapshot {
         })
     }
 
+    /// The runs whose rows are in the files of a table that readers see.
+    pub(crate) fn shown_runs(&self, table: Table) -> HashSet<RunId> {
+        self.files(table).iter().flat_map(shown_by).collect()
+    }
+
     fn sort_in(&mut self, table: Table, files: Vec<DataFile>) {
         let (merged, single): (Vec<_>, Vec<_>) = files.into_iter().partition(|f| !f.parts.is_empty());
         let mut sorted = SortedFiles::default();
@@ -283,6 +288,14 @@ fn run_of(file: &DataFile) -> Option<RunId> {
         FileName::Rows { run, .. } => Some(run),
         FileName::Pointer(pointer) => Some(pointer.run),
         FileName::Rig { .. } | FileName::Merged { .. } => None,
+    }
+}
+
+/// The runs whose rows a file shows; none for rows that come from the rig.
+pub(crate) fn shown_by(file: &DataFile) -> Vec<RunId> {
+    match file.parts.is_empty() {
+        true => run_of(file).into_iter().collect(),
+        false => file.visible_parts().map(|(part, _)| part.run.clone()).collect(),
     }
 }
 

@@ -1,15 +1,20 @@
 //! Time travel: the versions that a table's log still holds, and the lake as it was at one of them.
 //!
-//! The lake's version is that of its table `runs`, because `runs` decides the rest. The other tables are seen as of
-//! the time of that version; whatever it names was committed before it.
+//! The lake's version is that of its table `runs`, because `runs` decides the rest: it names the derivations of the rows
+//! that are seen, and the same derivation means the same rows, whichever version of a table's log added their file. So the
+//! other tables' files are looked for in all versions of their logs. A time selects a version of `runs`, nothing else:
+//! the logs of two tables may have been written with clocks that differ.
 
+use std::collections::HashSet;
 use std::str::FromStr;
 
 use chrono::{DateTime, NaiveDate, NaiveDateTime, SecondsFormat, Utc};
-use echolake_schema::tables::Table;
+use echolake_schema::tables::{Source, Table};
+use object_store::path::Path;
 
 use crate::tables::delta::folder;
-use crate::{Error, Lake, LakeSnapshot, Result, TableVersion};
+use crate::tables::snapshot::shown_by;
+use crate::{DataFile, Error, Lake, LakeSnapshot, Result, TableVersion};
 
 /// Formats of times beside RFC 3339.
 const TIMES: [&str; 4] = ["%Y-%m-%dT%H:%M:%S%.f", "%Y-%m-%d %H:%M:%S%.f", "%Y-%m-%dT%H:%M", "%Y-%m-%d %H:%M"];
@@ -75,45 +80,62 @@ impl Lake {
         self.log().versions(Table::Runs).await
     }
 
-    /// One table as readers saw it at a moment.
+    /// The lake's version at a moment: for a time, the newest that was committed by then.
     ///
     /// # Errors
-    /// [`Error::NoMoment`] if the log does not hold it, [`Error::Vacuumed`] if files of it are deleted.
-    pub async fn snapshot_at(&self, moment: LakeMoment, table: Table) -> Result<LakeSnapshot> {
+    /// [`Error::NoMoment`] if the log does not hold it.
+    pub async fn version_at(&self, moment: LakeMoment) -> Result<u64> {
         let versions = self.versions().await?;
         let found = match moment {
             LakeMoment::Version(number) => versions.iter().find(|v| v.version == number),
             LakeMoment::Time(time) => versions.iter().rfind(|v| v.committed <= time),
         };
-        let found = found.ok_or_else(|| no_moment(moment, &versions))?;
-        let pointers = self.log().files_at(Table::Runs, found.version).await?;
-        let files = match table {
-            Table::Runs => pointers.clone(),
-            _ => {
-                let then = self.log().versions(table).await?;
-                match then.iter().rfind(|v| v.committed <= found.committed) {
-                    Some(version) => self.log().files_at(table, version.version).await?,
-                    None => Vec::new(),
-                }
-            }
-        };
-        let snapshot = LakeSnapshot::of(&pointers, table, files);
-        self.are_there(moment, table, &snapshot).await?;
-        Ok(snapshot)
+        found.map(|v| v.version).ok_or_else(|| no_moment(moment, &versions))
     }
 
-    async fn are_there(&self, moment: LakeMoment, table: Table, snapshot: &LakeSnapshot) -> Result<()> {
+    /// One table as readers saw it at a version of the lake. Rows that come from the rig are as they are now.
+    ///
+    /// # Errors
+    /// [`Error::Vacuumed`] if files of it are deleted, or what the store says.
+    pub async fn snapshot_at(&self, version: u64, table: Table) -> Result<LakeSnapshot> {
+        let pointers = self.log().files_at(Table::Runs, version).await?;
+        let mut files = match table {
+            Table::Runs => pointers.clone(),
+            _ => self.log().files(table).await?,
+        };
+        if !matches!(table.source(), Source::Rig | Source::Pointer) && !shows_all(&pointers, table, &files) {
+            files = self.log().files_of_all_versions(table).await?;
+        }
+        let there = self.list_files(table).await?;
+        let wanted = LakeSnapshot::of(&pointers, table, files.clone());
+        files.retain(|file| there.contains(&file.path));
+        let snapshot = LakeSnapshot::of(&pointers, table, files);
+        let shown = snapshot.shown_runs(table);
+        // Another file may have the same rows.
+        let is_missing = |file: &&DataFile| {
+            let runs = shown_by(file);
+            !there.contains(&file.path) && (runs.is_empty() || runs.iter().any(|run| !shown.contains(run)))
+        };
+        let missing = wanted.files(table).iter().filter(is_missing).count();
+        if missing == 0 {
+            return Ok(snapshot);
+        }
+        let (moment, files) = (LakeMoment::Version(version).to_string(), wanted.files(table).len());
+        Err(Error::Vacuumed { moment, table: table.name(), missing, files })
+    }
+
+    async fn list_files(&self, table: Table) -> Result<HashSet<Path>> {
         let folder = folder(table);
         let there = self.store().list_with_delimiter(Some(&folder)).await;
         let there = there.map_err(|e| Error::store("list", &folder, e))?;
-        let there: std::collections::HashSet<_> = there.objects.into_iter().map(|o| o.location).collect();
-        let files = snapshot.files(table);
-        let missing = files.iter().filter(|f| !there.contains(&f.path)).count();
-        if missing == 0 {
-            return Ok(());
-        }
-        Err(Error::Vacuumed { moment: moment.to_string(), table: table.name(), missing, files: files.len() })
+        Ok(there.objects.into_iter().map(|o| o.location).collect())
     }
+}
+
+// Returns whether these files have the rows of all runs.
+fn shows_all(pointers: &[DataFile], table: Table, files: &[DataFile]) -> bool {
+    let snapshot = LakeSnapshot::of(pointers, table, files.to_vec());
+    snapshot.shown_runs(table).len() == snapshot.runs().count()
 }
 
 fn no_moment(moment: LakeMoment, versions: &[TableVersion]) -> Error {
@@ -129,7 +151,81 @@ fn no_moment(moment: LakeMoment, versions: &[TableVersion]) -> Error {
 
 #[cfg(test)]
 mod tests {
+    use echolake_schema::{Rig, RunId};
+
     use super::*;
+    use crate::{CommitOutcome, FileName, ReferenceSurfaces, StagedFile, VisibleRun, encode};
+
+    async fn stage(lake: &Lake, table: Table, name: &FileName) -> StagedFile {
+        let file = encode(table, &table.schema(lake.rig()), &[]).expect("encoded");
+        lake.stage(table, name, file).await.expect("staged").made_from(&lake.snapshot().await.expect("a view"))
+    }
+
+    // Commits rows of `nce`, then the run's row in place of its present one; returns the lake's version.
+    async fn ingest(lake: &Lake, run: &str, derivation: &str) -> u64 {
+        let visible = VisibleRun {
+            surface: "flat".parse().expect("an id"),
+            run: RunId::from_str(run).expect("an id"),
+            run_derivation: "run".to_owned(),
+            reference_derivation: Some(derivation.to_owned()),
+        };
+        let VisibleRun { surface, run, .. } = visible.clone();
+        let rows = FileName::Rows { surface, run, derivation: derivation.to_owned() };
+        let snapshot = lake.snapshot().await.expect("a view");
+        let old: Vec<_> = snapshot.files_of(Table::Runs, &visible.run).cloned().collect();
+        let pointer = stage(lake, Table::Runs, &FileName::Pointer(visible.clone())).await.replacing(&visible, &old);
+        let staged = [stage(lake, Table::Nce, &rows).await, pointer];
+        assert_eq!(lake.commit(&staged).await.expect("committed"), [CommitOutcome::Now; 2]);
+        lake.snapshot().await.expect("a view").version(Table::Runs).expect("a log")
+    }
+
+    /// Writes the times of a table's commits: a minute from each to the next, by a clock that is off by some hours.
+    fn set_commit_times(lake: &Lake, table: Table, hours: i64) {
+        let folder = lake.folder().expect("a folder").join(format!("tables/{}/_delta_log", table.name()));
+        for path in std::fs::read_dir(folder).expect("listed").map(|entry| entry.expect("an entry").path()) {
+            if path.extension().is_none_or(|extension| extension != "json") {
+                continue;
+            }
+            let version: i64 = path.file_stem().and_then(|stem| stem.to_str()?.parse().ok()).expect("a version");
+            let text = std::fs::read_to_string(&path).expect("read");
+            let (head, rest) = text.split_once("\"timestamp\":").expect("a time");
+            let end = rest.find(|c: char| !c.is_ascii_digit()).expect("an end");
+            let time = 1_795_000_000_000 + version * 60_000 + hours * 3_600_000;
+            std::fs::write(&path, format!("{head}\"timestamp\":{time}{}", &rest[end..])).expect("written");
+        }
+    }
+
+    #[tokio::test]
+    async fn a_version_shows_the_rows_that_it_named_whatever_clocks_said() {
+        for (table, hours) in [(Table::Nce, 1), (Table::Nce, -1), (Table::Runs, 1), (Table::Runs, -1)] {
+            let folder = tempfile::tempdir().expect("a folder");
+            let url = folder.path().join("lake").display().to_string();
+            let made = Lake::open_or_create(&url, &Rig::paper(), &ReferenceSurfaces::default()).await.expect("made");
+            let mut expected = vec![(ingest(&made, "r1", "a").await, vec!["flat.r1.a.parquet"])];
+            expected.push((ingest(&made, "r2", "b").await, vec!["flat.r1.a.parquet", "flat.r2.b.parquet"]));
+            expected.push((ingest(&made, "r1", "c").await, vec!["flat.r1.c.parquet", "flat.r2.b.parquet"]));
+            assert!(made.remove_superseded().await.expect("removed") > 0, "the clean-up has something to do");
+            set_commit_times(&made, Table::Runs, 0);
+            set_commit_times(&made, table, hours);
+
+            let lake = Lake::open(&url).await.expect("opened");
+            let versions = lake.versions().await.expect("versions");
+            for (version, names) in &expected {
+                let committed = versions.iter().find(|v| v.version == *version).expect("held").committed;
+                let at = lake.version_at(LakeMoment::Time(committed)).await.expect("a version");
+                let snapshot = lake.snapshot_at(at, Table::Nce).await.expect("seen");
+                let seen: Vec<_> = snapshot.files(Table::Nce).iter().filter_map(|f| f.path.filename()).collect();
+                assert_eq!((at, &seen), (*version, names), "{table:?} {hours} h");
+            }
+            // What is deleted is said, and only of the versions that had it.
+            let gone = folder.path().join("lake/tables/nce/flat.r1.a.parquet");
+            std::fs::remove_file(gone).expect("deleted");
+            for (version, missing) in [(expected[0].0, true), (expected[1].0, true), (expected[2].0, false)] {
+                let seen = lake.snapshot_at(version, Table::Nce).await;
+                assert_eq!(matches!(seen, Err(Error::Vacuumed { missing: 1, .. })), missing, "{seen:?}");
+            }
+        }
+    }
 
     #[test]
     fn times_without_a_zone_are_utc() {

@@ -1,6 +1,7 @@
 //! The files of one table's `_delta_log`: a JSON file per version, and checkpoints.
 
 use std::collections::{BTreeMap, BTreeSet, HashMap};
+use std::ops::RangeInclusive;
 use std::sync::Arc;
 
 use chrono::{DateTime, TimeDelta, Utc};
@@ -75,24 +76,60 @@ impl<'a> LogFolder<'a> {
         let Some(newest) = listing.newest() else { return Ok(None) };
         let last = at.unwrap_or(newest).min(newest);
         let mut state = TableState::default();
-        let mut next = 0;
-        if let Some((version, checkpoint)) = listing.checkpoint_before(last) {
-            for file in &checkpoint.files {
-                state.apply(version, self.read_checkpoint(file).await?);
+        let next = match listing.checkpoint_before(last) {
+            Some((version, checkpoint)) => self.apply_checkpoint(&mut state, version, checkpoint).await?,
+            None => 0,
+        };
+        self.apply_commits(&mut state, next..=last, TableState::apply).await?;
+        self.check_readable(&state)?;
+        Ok(Some(state))
+    }
+
+    /// The table at its newest version, with the files of all versions that the log still holds.
+    pub(super) async fn load_all_versions(&self) -> Result<Option<TableState>> {
+        let listing = self.list().await?;
+        let Some(newest) = listing.newest() else { return Ok(None) };
+        let mut state = TableState::default();
+        let next = match listing.checkpoints.first_key_value() {
+            Some((version, checkpoint)) if !listing.commits.contains(&0) => {
+                self.apply_checkpoint(&mut state, *version, checkpoint).await?
             }
-            next = version + 1;
+            _ => 0,
+        };
+        self.apply_commits(&mut state, next..=newest, TableState::apply_additions).await?;
+        self.check_readable(&state)?;
+        Ok(Some(state))
+    }
+
+    // Returns the version behind the checkpoint.
+    async fn apply_checkpoint(
+        &self,
+        state: &mut TableState,
+        version: u64,
+        checkpoint: &CheckpointFiles,
+    ) -> Result<u64> {
+        for file in &checkpoint.files {
+            state.apply(version, self.read_checkpoint(file).await?);
         }
-        let commits = futures::stream::iter(next..=last).map(|version| async move {
+        Ok(version + 1)
+    }
+
+    async fn apply_commits(
+        &self,
+        state: &mut TableState,
+        versions: RangeInclusive<u64>,
+        apply: impl Fn(&mut TableState, u64, Vec<LogLine>),
+    ) -> Result<()> {
+        let commits = futures::stream::iter(versions).map(|version| async move {
             let lines = self.read_commit(version).await?;
             let missing = || self.damaged(&format!("version {version} is missing, `{}`", commit_name(version)));
             Ok::<_, Error>((version, lines.ok_or_else(missing)?))
         });
         let mut commits = commits.buffered(CONCURRENT_READS);
         while let Some((version, lines)) = commits.try_next().await? {
-            state.apply(version, lines);
+            apply(state, version, lines);
         }
-        self.check_readable(&state)?;
-        Ok(Some(state))
+        Ok(())
     }
 
     /// Brings a state up to the newest version. Returns None if the log was cleaned up beyond it, so that it must be

@@ -29,6 +29,11 @@ impl TableState {
         }
     }
 
+    /// Applies the actions of a version but for removals.
+    pub(super) fn apply_additions(&mut self, version: u64, lines: Vec<LogLine>) {
+        self.apply(version, lines.into_iter().map(|line| LogLine { remove: None, ..line }).collect());
+    }
+
     fn apply_line(&mut self, line: LogLine) {
         if let Some(add) = line.add {
             self.removed.remove(&add.path);
