@@ -31,6 +31,8 @@ use crate::commands::serve::{self, CertificateArgs, EngineArgs, ServeArgs};
 use crate::commands::sql::{self, SqlArgs};
 #[cfg(feature = "lake")]
 use crate::commands::twin::{self, TwinArgs};
+#[cfg(feature = "upload")]
+use crate::commands::upload::{self, UploadArgs};
 #[cfg(feature = "lake")]
 use crate::commands::vacuum::{self, VacuumArgs};
 use crate::logging::{FORMAT_VARIABLE, LogFormat};
@@ -62,6 +64,9 @@ pub(crate) enum CliCommand {
     Replay(ReplayArgs),
     /// Make a run of a recording that was stopped, cut off or damaged, as far as every checksum is right.
     Recover(RecoverArgs),
+    /// Upload closed runs to the lake's inbox, in a folder or an object store; continues after any cut.
+    #[cfg(feature = "upload")]
+    Upload(UploadArgs),
     /// Report what is in the lake, what is missing and what is damaged.
     Doctor(DoctorArgs),
     /// Print a completion script for a shell.
@@ -142,6 +147,8 @@ impl CliArguments {
             CliCommand::Panel(args) => panel::run(args),
             CliCommand::Replay(args) => replay::run(args, lake).await,
             CliCommand::Recover(args) => recover::run(args),
+            #[cfg(feature = "upload")]
+            CliCommand::Upload(args) => upload::run(args, lake).await,
             CliCommand::Doctor(args) => doctor::run(args, lake).await,
             CliCommand::Completions { shell } => {
                 clap_complete::generate(*shell, &mut Self::command(), "echolake", &mut std::io::stdout());

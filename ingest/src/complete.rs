@@ -1,16 +1,17 @@
 //! Derives the rows that need references, for every run whose references exist and differ from those its rows used.
 
 use std::sync::Arc;
-use std::sync::atomic::AtomicBool;
+use std::sync::atomic::{AtomicBool, Ordering};
 
-use echolake_lake::{CommitOutcome, Lake, VisibleRun};
+use echolake_lake::{ClaimOutcome, ClaimTimes, CommitOutcome, DataFile, Lake, VisibleRun, WorkClaims};
 use echolake_schema::tables::Table;
 use echolake_schema::{RunId, SurfaceId};
 use tracing::Instrument as _;
 
 use crate::context::IngestContext;
 use crate::derive::ReferenceDerivation;
-use crate::error::Result;
+use crate::error::{Error, Result};
+use crate::ingest::LOOK_EVERY;
 use crate::pipeline::{self, Cores, ReadyJob};
 use crate::read_back;
 use crate::references::{ReferenceFinder, WantedReferences};
@@ -36,15 +37,35 @@ pub struct CompletedRun {
 /// # Errors
 /// [`crate::Error`]; runs completed before stay so, and the same call resumes with the rest.
 pub async fn complete(lake: &Lake, stop: &AtomicBool, done: &mut (dyn FnMut(&CompletedRun) + Send)) -> Result<usize> {
-    let (cores, mut count) = (Cores::all()?, 0);
-    for _ in 0..ROUNDS {
-        let (changed, overtaken) = round(lake, &cores, stop, done).await?;
-        count += changed;
-        if !overtaken {
-            break;
+    let claims = lake.is_remote().then(|| Arc::new(WorkClaims::start(lake, ClaimTimes::default())));
+    let completed = complete_sharing(lake, stop, claims.as_ref(), done).await;
+    // Whoever waits need not wait until they are dead.
+    if let Some(claims) = claims.and_then(Arc::into_inner) {
+        claims.close().await;
+    }
+    let count = completed?;
+    lake.remove_superseded().await?;
+    Ok(count)
+}
+
+/// The same, with claims on the runs if several ingests share the work.
+pub(crate) async fn complete_sharing(
+    lake: &Lake,
+    stop: &AtomicBool,
+    claims: Option<&Arc<WorkClaims>>,
+    done: &mut (dyn FnMut(&CompletedRun) + Send),
+) -> Result<usize> {
+    let (cores, mut count, mut rounds) = (Cores::all()?, 0, 0);
+    while rounds < ROUNDS {
+        let round = do_round(lake, &cores, stop, claims, done).await?;
+        count += round.changed;
+        match round {
+            CompletionRound { claimed: true, .. } if stop.load(Ordering::Relaxed) => return Err(Error::Stopped),
+            CompletionRound { claimed: true, .. } => tokio::time::sleep(LOOK_EVERY).await,
+            CompletionRound { overtaken: true, .. } => rounds += 1,
+            _ => break,
         }
     }
-    lake.remove_superseded().await?;
     Ok(count)
 }
 
@@ -59,13 +80,24 @@ pub async fn waiting(lake: &Lake) -> Result<Vec<(RunId, String)>> {
     Ok(snapshot.runs().map(missing).filter(|(_, missing)| !missing.is_empty()).collect())
 }
 
-// Returns the number of changed runs, and whether another ingest changed one of them meanwhile.
-async fn round(
+/// Result of a look at all runs.
+#[derive(Default)]
+struct CompletionRound {
+    /// Number of changed runs.
+    changed: usize,
+    /// Another ingest changed one of them meanwhile.
+    overtaken: bool,
+    /// Another ingest is completing one of them.
+    claimed: bool,
+}
+
+async fn do_round(
     lake: &Lake,
     cores: &Cores,
     stop: &AtomicBool,
+    claims: Option<&Arc<WorkClaims>>,
     done: &mut (dyn FnMut(&CompletedRun) + Send),
-) -> Result<(usize, bool)> {
+) -> Result<CompletionRound> {
     let context = IngestContext::now(lake, cores).await?;
     let mut jobs = Vec::new();
     for run in context.snapshot.runs() {
@@ -74,23 +106,58 @@ async fn round(
             jobs.push((run.clone(), wanted));
         }
     }
-    let (mut count, mut overtaken) = (0, false);
+    let mut round = CompletionRound::default();
+    let shared = claims.cloned();
     let do_one = move |(run, wanted): (VisibleRun, WantedReferences)| {
-        let context = context.clone();
+        let (context, claims) = (context.clone(), shared.clone());
         let span = tracing::error_span!("complete", run = %run.run, surface = %run.surface);
-        async move { complete_run(&context, &run, &wanted).await }.instrument(span)
+        let work = async move {
+            if let Some(claims) = &claims {
+                claim(&context, claims, &run).await?;
+            }
+            complete_run(&context, &run, &wanted).await
+        };
+        work.instrument(span)
     };
-    let ended = &mut |(_, result): pipeline::JobOutcome<_, CompletedRun>| {
-        let (completed, outcome) = result?;
-        if outcome == Some(CommitOutcome::Now) {
-            count += 1;
-            done(&completed);
+    let ended = &mut |((run, _), result): pipeline::JobOutcome<(VisibleRun, WantedReferences), CompletedRun>| {
+        match result {
+            Err(Error::Claimed { .. }) => {
+                round.claimed = true;
+                return Ok(());
+            }
+            Err(Error::Gone { .. }) if claims.is_some() => round.overtaken = true,
+            Err(error) => return Err(error),
+            Ok((completed, outcome)) => {
+                if outcome == Some(CommitOutcome::Now) {
+                    round.changed += 1;
+                    done(&completed);
+                }
+                round.overtaken |= outcome == Some(CommitOutcome::Outdated);
+            }
         }
-        overtaken |= outcome == Some(CommitOutcome::Outdated);
+        claims.iter().for_each(|claims| claims.release(&work_name(&run)));
         Ok(())
     };
     pipeline::run(lake, cores, jobs, stop, do_one, ended).await?;
-    Ok((count, overtaken))
+    Ok(round)
+}
+
+fn work_name(run: &VisibleRun) -> String {
+    format!("complete {}", run.run)
+}
+
+// Claims a run; another ingest may have completed it since the snapshot.
+async fn claim(context: &IngestContext, claims: &WorkClaims, run: &VisibleRun) -> Result<()> {
+    let file = run.run.to_string();
+    if claims.claim(&work_name(run)).await == ClaimOutcome::Denied {
+        return Err(Error::Claimed { file });
+    }
+    let rows = context.lake.log().files(Table::Runs).await?;
+    let is_there = |row: &DataFile| rows.iter().any(|there| there.logged() == row.logged());
+    match context.snapshot.files_of(Table::Runs, &run.run).all(is_there) {
+        true => Ok(()),
+        false => Err(Error::Gone { file }),
+    }
 }
 
 async fn complete_run(

@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Duration;
 
 use arrow::row::{RowConverter, SortField};
 use bytes::Bytes;
@@ -11,7 +12,7 @@ use echolake_acquisition::panel::relief::PanelRelief;
 use echolake_acquisition::run::controller::RecordingMode;
 use echolake_acquisition::run::simulate::simulate;
 use echolake_acquisition::run::{PanelSpecimen, RunRequest};
-use echolake_lake::{DeletionMode, Lake, ReferenceSurfaces};
+use echolake_lake::{ClaimOutcome, ClaimTimes, DeletionMode, Lake, ReferenceSurfaces, WorkClaims};
 use echolake_schema::manifest::Origin;
 use echolake_schema::tables::Table;
 use echolake_schema::{Rig, Timestamp};
@@ -23,7 +24,8 @@ use parquet::arrow::arrow_reader::ParquetRecordBatchReaderBuilder;
 
 use crate::mortal::{DeathMoment, MortalStore};
 use crate::skewed::{Interlude, SkewedStore};
-use crate::{FileReport, LakeIngest, complete, pending};
+use crate::complete::complete_sharing;
+use crate::{CompletedRun, FileReport, LakeIngest, RunSource, complete, pending};
 
 /// Ten points, so that a run takes milliseconds.
 const SMALL_RIG: &str = include_str!("../../tests/fixtures/small_rig.toml");
@@ -417,4 +419,98 @@ mod slow {
             assert!(seen == expected.0, "other bytes");
         }
     }
+}
+
+/// Claims of processes that died are dead soon.
+const IMPATIENT: ClaimTimes =
+    ClaimTimes { renew_every: Duration::from_millis(100), dead_after: Duration::from_secs(3) };
+
+// Of eight runs, a process that died had claimed one, and had brought it to its place; a live one gives its own back.
+#[tokio::test(flavor = "multi_thread")]
+async fn what_others_claimed_and_did_not_do_is_done_after_a_while_and_by_one_ingest_alone() {
+    let runs = runs(&["flat", "foam", "wood", "prd", "brick", "wavy", "flat_2", "wood_2"]);
+    let undisturbed = with_inbox(&runs).await;
+    ingest(undisturbed.clone()).await.expect("ingested");
+    let expected = rows(undisturbed).await;
+    let store = with_inbox(&runs).await;
+    let lake = lake(store.clone()).await.expect("a lake");
+    let never = ClaimTimes { renew_every: Duration::from_secs(3600), ..IMPATIENT };
+    let dead = WorkClaims::start(&lake, never);
+    assert_eq!(dead.claim(&runs[2].0).await, ClaimOutcome::Granted);
+    let (from, to) = (format!("inbox/{}", runs[2].0), format!("runs/wood/{}", runs[2].0));
+    store.rename(&Path::from(from), &Path::from(to)).await.expect("moved");
+    let alive = WorkClaims::start(&lake, IMPATIENT);
+    assert_eq!(alive.claim(&runs[3].0).await, ClaimOutcome::Granted);
+    let work = async || {
+        let (mut taken, mut claimed) = (Vec::new(), 0);
+        let sources = pending(&lake).await.expect("listed");
+        let ingest = LakeIngest::new(&lake, Arc::default()).sharing(IMPATIENT);
+        let report = &mut |report: FileReport| match report {
+            FileReport::Taken(run) => taken.push(run.run.to_string()),
+            FileReport::Claimed(_) => claimed += 1,
+            FileReport::Gone(_) => {}
+            FileReport::Refused { source, why, .. } => panic!("{source}: {why}"),
+        };
+        ingest.take_in(sources, report).await.expect("ingested");
+        (taken, claimed)
+    };
+    let give_back = async {
+        tokio::time::sleep(Duration::from_secs(1)).await;
+        alive.close().await;
+    };
+    let ((mut taken, claimed), (more, more_claimed), ()) = tokio::join!(work(), work(), give_back);
+    assert!(claimed + more_claimed >= 3, "both waited: {claimed} {more_claimed}");
+    taken.extend(more);
+    taken.sort();
+    let mut names: Vec<_> = runs.iter().map(|(name, _)| name.trim_end_matches(".mcap").to_owned()).collect();
+    names.sort();
+    assert_eq!(taken, names, "each once");
+    complete(&lake, &AtomicBool::new(false), &mut |_| {}).await.expect("completed");
+    assert!(rows(store).await == expected, "other rows");
+}
+
+// Two complete what waited for references, and the references themselves; each run once.
+#[tokio::test(flavor = "multi_thread")]
+async fn completions_are_shared() {
+    let runs = runs(&["wood", "prd", "brick", "wavy", "flat", "foam"]);
+    let store = with_inbox(&runs[..4]).await;
+    ingest(store.clone()).await.expect("ingested");
+    for (name, bytes) in &runs[4..] {
+        store.put(&Path::from(format!("inbox/{name}")), bytes.clone().into()).await.expect("written");
+    }
+    let lake = lake(store.clone()).await.expect("a lake");
+    let sources = pending(&lake).await.expect("listed");
+    LakeIngest::new(&lake, Arc::default()).take_in(sources, &mut |_| {}).await.expect("ingested");
+    let work = async || {
+        let (claims, mut completed) = (Arc::new(WorkClaims::start(&lake, ClaimTimes::default())), Vec::new());
+        let done = &mut |run: &CompletedRun| completed.push(run.run.to_string());
+        let count = complete_sharing(&lake, &AtomicBool::new(false), Some(&claims), done).await.expect("completed");
+        assert_eq!(count, completed.len());
+        completed
+    };
+    let (mut completed, more) = tokio::join!(work(), work());
+    completed.extend(more);
+    completed.sort();
+    let mut names: Vec<_> = runs.iter().map(|(name, _)| name.trim_end_matches(".mcap").to_owned()).collect();
+    names.sort();
+    assert_eq!(completed, names);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn another_file_in_a_runs_place_is_not_taken_for_it_though_it_is_as_long() {
+    let runs = runs(&["flat"]);
+    let (name, bytes) = &runs[0];
+    let store = with_inbox(&runs).await;
+    let mut other = bytes.to_vec();
+    let middle = other.len() / 2;
+    other[middle] ^= 1;
+    let place = Path::from(format!("runs/flat/{name}"));
+    store.put(&place, other.clone().into()).await.expect("written");
+    let (lake, mut reports) = (lake(store.clone()).await.expect("a lake"), Vec::new());
+    let source = RunSource::Lake(Path::from(format!("inbox/{name}")));
+    LakeIngest::new(&lake, Arc::default()).take_in(vec![source], &mut |r| reports.push(r)).await.expect("ingested");
+    let [FileReport::Refused { why, moved: Some(moved), .. }] = reports.as_slice() else { panic!("{reports:?}") };
+    assert!(why.to_string().contains("already in the lake with other content"), "{why}");
+    assert_eq!(store.get(moved).await.expect("there").bytes().await.expect("bytes"), bytes);
+    assert_eq!(store.get(&place).await.expect("there").bytes().await.expect("bytes"), other);
 }

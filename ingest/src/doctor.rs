@@ -216,6 +216,12 @@ async fn find_strays(lake: &Lake, snapshot: &LakeSnapshot, report: &mut LakeRepo
         let path = meta.location;
         let parts: Vec<_> = path.parts().map(|p| p.as_ref().to_owned()).collect();
         match parts.first().map(String::as_str) {
+            // The digest of the run beside it.
+            Some("inbox" | "runs") if path.extension() == Some("sha256") => {}
+            Some("inbox") if path.extension() == Some("uploading") => {
+                let what = "part of a run that is being uploaded; hint: `echolake upload` of it resumes";
+                report.find(FindingSeverity::Note, &path, what);
+            }
             Some("inbox") if path.extension() == Some("mcap") => {
                 report.find(FindingSeverity::Missing, &path, "not yet taken in; hint: `echolake ingest`");
             }

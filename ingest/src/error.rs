@@ -87,6 +87,24 @@ pub enum Error {
         /// The file.
         file: String,
     },
+    /// Another ingest is at it.
+    #[error("`{file}` is being taken in by another ingest")]
+    Claimed {
+        /// The file.
+        file: String,
+    },
+    /// The file is not the one that was uploaded.
+    #[error(
+        "`{file}` is not what was uploaded: it has SHA-256 {actual}, and `{file}.sha256` says {recorded}; hint: upload it again"
+    )]
+    OtherDigest {
+        /// The file.
+        file: String,
+        /// The digest beside it.
+        recorded: String,
+        /// Its own.
+        actual: String,
+    },
     /// Processes end while they ingest it.
     #[error(
         "`{file}` is passed over: processes that took in this file alone ended on the way ({endings}); hint: to retry it, move it back into `inbox/`, or delete `{mark}`"
@@ -164,6 +182,7 @@ impl Error {
         match self {
             Self::Read { .. } | Self::NotMcap { .. } | Self::Foreign { .. } | Self::Manifest { .. } => true,
             Self::Attachment { .. } | Self::OtherContent { .. } | Self::NoRun { .. } | Self::Gone { .. } => true,
+            Self::Claimed { .. } | Self::OtherDigest { .. } => true,
             Self::Deadly { .. }
             | Self::Doubtful { .. }
             | Self::Kernel { .. }

@@ -3,7 +3,8 @@
 use std::path::{Path as FsPath, PathBuf};
 use std::sync::Arc;
 
-use echolake_lake::{Lake, StoreError};
+use echolake_lake::{Lake, StoreError, digest_record, digest_record_path, object_sha256, read_digest_record};
+use echolake_recording::FileIntegrity;
 use echolake_schema::{Rig, RunId};
 use futures::TryStreamExt as _;
 use object_store::local::LocalFileSystem;
@@ -67,6 +68,21 @@ impl RunSource {
                 Ok(Opened { store: Arc::new(LocalFileSystem::new()), path, name })
             }
         }
+    }
+
+    /// Name of the work on it, for claims: that of its file, which most often stays the same when it is moved.
+    pub(crate) fn work_name(&self) -> &str {
+        let name = match self {
+            Self::Lake(path) => path.filename(),
+            Self::File(path) => path.file_name().and_then(|name| name.to_str()),
+        };
+        name.unwrap_or_default()
+    }
+
+    /// The run whose place in the lake it is; None if it is elsewhere.
+    pub(crate) fn run_in_place(&self) -> Option<RunId> {
+        let Self::Lake(path) = self else { return None };
+        path.filename()?.strip_suffix(".mcap")?.parse().ok().filter(|_| !self.is_in_inbox())
     }
 
     fn is_in_inbox(&self) -> bool {
@@ -166,51 +182,206 @@ async fn is_made_whole_otherwise(partial: &FsPath) -> bool {
     Head::read(&opened).await.is_some_and(is)
 }
 
-/// Moves or copies a run's file to its place, before any row names it.
-pub(crate) async fn keep(lake: &Lake, source: &RunSource, to: &Path, bytes: u64) -> Result<()> {
-    let store = lake.store();
-    let failed = |e: object_store::Error| written(to, e);
-    let there = match store.head(to).await {
-        Ok(meta) => meta.size == bytes,
-        Err(object_store::Error::NotFound { .. }) => false,
-        Err(e) => return Err(failed(e)),
-    };
-    match source {
-        RunSource::Lake(from) if from == to => Ok(()),
-        // If it has disappeared, another ingest has moved it there.
-        RunSource::Lake(from) if there => match store.delete(from).await {
-            Err(e) if !matches!(e, object_store::Error::NotFound { .. }) => Err(failed(e)),
-            _ => Ok(()),
-        },
-        RunSource::Lake(from) => match move_object(lake, from, to, bytes).await {
-            Err(object_store::Error::NotFound { .. }) if store.head(to).await.is_ok() => Ok(()),
-            moved => moved.map_err(failed),
-        },
-        RunSource::File(_) if there => Ok(()),
-        RunSource::File(from) => copy_in(lake, from, to).await,
+/// A run's file as it was read.
+pub(crate) struct ReadFile<'a> {
+    pub(crate) integrity: &'a FileIntegrity,
+    /// Tag of the object when its reading began, if its store has tags.
+    pub(crate) e_tag: Option<String>,
+    /// SHA-256 that was recorded when it was uploaded.
+    pub(crate) recorded: Option<String>,
+}
+
+impl<'a> ReadFile<'a> {
+    /// Compares what was read with what was uploaded, if an upload recorded it.
+    ///
+    /// # Errors
+    /// [`Error::OtherDigest`], or an error of the lake.
+    pub(crate) async fn check(
+        lake: &Lake,
+        source: &RunSource,
+        e_tag: Option<String>,
+        integrity: &'a FileIntegrity,
+    ) -> Result<Self> {
+        let recorded = match source {
+            RunSource::Lake(path) if source.is_in_inbox() => read_digest_record(lake.store().as_ref(), path).await,
+            _ => Ok(None),
+        };
+        let recorded = recorded.map_err(|e| Error::read(source, e))?;
+        match recorded {
+            Some(recorded) if recorded != integrity.sha256 => {
+                let actual = integrity.sha256.clone();
+                Err(Error::OtherDigest { file: source.to_string(), recorded, actual })
+            }
+            recorded => Ok(Self { integrity, e_tag, recorded }),
+        }
     }
 }
 
-// A folder renames. An object store copies, and only what is there as a whole is deleted where it came from.
-async fn move_object(lake: &Lake, from: &Path, to: &Path, bytes: u64) -> object_store::Result<()> {
+/// Returns the tag of an object in the inbox of an object store, before it is read.
+pub(crate) async fn inbox_tag(lake: &Lake, source: &RunSource) -> Option<String> {
+    match source {
+        RunSource::Lake(path) if lake.is_remote() && source.is_in_inbox() => lake.store().head(path).await.ok()?.e_tag,
+        _ => None,
+    }
+}
+
+/// Content of a run's place.
+#[derive(PartialEq, Eq)]
+enum PlaceContent {
+    Empty,
+    Same,
+    /// Another file: its SHA-256, or its size.
+    Other(String),
+}
+
+/// Moves or copies a run's file to its place, before any row names it. `is_known` says that rows name this content, so that
+/// another one in its place is damage.
+///
+/// # Errors
+/// [`Error::OtherContent`] if another file is there, [`Error::Read`] if the copy is not what was read, or an error of the
+/// lake.
+pub(crate) async fn keep(
+    lake: &Lake,
+    source: &RunSource,
+    to: &Path,
+    file: &ReadFile<'_>,
+    is_known: bool,
+) -> Result<()> {
+    if matches!(source, RunSource::Lake(from) if from == to) {
+        return Ok(());
+    }
+    let there = look_at_place(lake, to, file.integrity, is_known).await?;
+    if let PlaceContent::Other(there) = &there {
+        // A folder's file may be what a power cut left of a copy.
+        let is_left_over = matches!(source, RunSource::File(_)) && !lake.is_remote();
+        if !is_known && !is_left_over {
+            let run = to.filename().unwrap_or_default().trim_end_matches(".mcap").to_owned();
+            let (file, given, there) = (source.to_string(), file.integrity.sha256.clone(), there.clone());
+            return Err(Error::OtherContent { run, file, given, there });
+        }
+    }
+    match source {
+        RunSource::File(_) if there == PlaceContent::Same => Ok(()),
+        RunSource::File(from) => copy_in(lake, from, to).await,
+        RunSource::Lake(from) => {
+            move_record(lake, from, to, file).await.map_err(|e| written(to, e))?;
+            if there == PlaceContent::Same {
+                return delete(lake, from).await.map_err(|e| written(from, e));
+            }
+            match move_object(lake, from, to, file.integrity.bytes, Some(file)).await {
+                // Another ingest has moved it.
+                Err(StoreFault::Store(object_store::Error::NotFound { .. })) if lake.store().head(to).await.is_ok() => {
+                    Ok(())
+                }
+                moved => moved.map_err(|fault| fault.into_error(to)),
+            }
+        }
+    }
+}
+
+async fn look_at_place(lake: &Lake, to: &Path, file: &FileIntegrity, is_known: bool) -> Result<PlaceContent> {
+    let store = lake.store();
+    let bytes = match store.head(to).await {
+        Ok(meta) => meta.size,
+        Err(object_store::Error::NotFound { .. }) => return Ok(PlaceContent::Empty),
+        Err(e) => return Err(written(to, e)),
+    };
+    if bytes != file.bytes {
+        return Ok(PlaceContent::Other(format!("{bytes} bytes")));
+    }
+    // The digest was compared when the rows were made.
+    if is_known {
+        return Ok(PlaceContent::Same);
+    }
+    let sha256 = object_sha256(store.as_ref(), to, bytes, &mut |_| {}).await.map_err(|e| Error::read(to, e))?;
+    Ok(if sha256 == file.sha256 { PlaceContent::Same } else { PlaceContent::Other(sha256) })
+}
+
+// The record of an uploaded run's digest stays beside it.
+async fn move_record(lake: &Lake, from: &Path, to: &Path, file: &ReadFile<'_>) -> object_store::Result<()> {
+    if file.recorded.is_none() {
+        return Ok(());
+    }
+    let text = digest_record(&file.integrity.sha256, to);
+    lake.store().put(&digest_record_path(to), text.into()).await?;
+    delete(lake, &digest_record_path(from)).await
+}
+
+async fn delete(lake: &Lake, path: &Path) -> object_store::Result<()> {
+    match lake.store().delete(path).await {
+        Err(object_store::Error::NotFound { .. }) => Ok(()),
+        deleted => deleted,
+    }
+}
+
+/// A failed move.
+enum StoreFault {
+    Store(object_store::Error),
+    /// The copy is not what was read.
+    Changed { expected: String, actual: String },
+}
+
+impl From<object_store::Error> for StoreFault {
+    fn from(error: object_store::Error) -> Self {
+        Self::Store(error)
+    }
+}
+
+impl StoreFault {
+    fn into_error(self, to: &Path) -> Error {
+        match self {
+            Self::Store(error) => written(to, error),
+            Self::Changed { expected, actual } => Error::read(
+                to,
+                format!("its copy has {actual}, expected {expected}; hint: the copy is deleted, run the command again"),
+            ),
+        }
+    }
+}
+
+// A folder renames. An object store copies, and only what is there as it was read is deleted where it came from.
+async fn move_object(
+    lake: &Lake,
+    from: &Path,
+    to: &Path,
+    bytes: u64,
+    read: Option<&ReadFile<'_>>,
+) -> std::result::Result<(), StoreFault> {
     let store = lake.store();
     if !lake.is_remote() {
-        return store.rename(from, to).await;
+        return Ok(store.rename(from, to).await?);
     }
     if bytes <= LARGEST_COPY {
         store.copy(from, to).await?;
     } else {
         copy_parts(store.as_ref(), from, bytes, store.as_ref(), to).await?;
     }
-    let copied = store.head(to).await?.size;
-    if copied != bytes {
-        let source = format!("{copied} bytes of `{from}` arrived of {bytes}; hint: run the command again").into();
-        return Err(object_store::Error::Generic { store: "copy", source });
+    if let Some((expected, actual)) = find_change(store.as_ref(), to, bytes, read).await? {
+        delete(lake, to).await?;
+        return Err(StoreFault::Changed { expected, actual });
     }
-    match store.delete(from).await {
-        Err(object_store::Error::NotFound { .. }) => Ok(()),
-        deleted => deleted,
+    Ok(delete(lake, from).await?)
+}
+
+// Compares a copy with what was read: by the store's own tag, which an object keeps as long as its content is the same,
+// or by its SHA-256. Stores may give a copy another tag.
+async fn find_change(
+    store: &dyn ObjectStore,
+    copy: &Path,
+    bytes: u64,
+    read: Option<&ReadFile<'_>>,
+) -> object_store::Result<Option<(String, String)>> {
+    let there = store.head(copy).await?;
+    if there.size != bytes {
+        return Ok(Some((format!("{bytes} bytes"), format!("{} bytes", there.size))));
     }
+    let Some(read) = read else { return Ok(None) };
+    let is_strong = |tag: &String| !tag.starts_with("W/");
+    if there.e_tag.as_ref().is_some_and(is_strong) && there.e_tag == read.e_tag {
+        return Ok(None);
+    }
+    let (actual, expected) = (object_sha256(store, copy, bytes, &mut |_| {}).await?, &read.integrity.sha256);
+    Ok((actual != *expected).then(|| (format!("SHA-256 {expected}"), format!("SHA-256 {actual}"))))
 }
 
 /// Moves a refused file of the inbox to `quarantine/`, the reason first; returns its path. Files outside the inbox
@@ -228,11 +399,13 @@ pub(crate) async fn quarantine(lake: &Lake, source: &RunSource, why: &Error) -> 
     let to = free_name(lake, &name[start.unwrap_or(0)..]).await?;
     let reason = Path::from(format!("{to}.reason.txt"));
     store.put(&reason, format!("{why}\n").into()).await.map_err(|e| written(&reason, e))?;
-    let moved = async { move_object(lake, from, &to, store.head(from).await?.size).await };
+    // The name is free for another upload.
+    delete(lake, &digest_record_path(from)).await.map_err(|e| written(from, e))?;
+    let moved = async { move_object(lake, from, &to, store.head(from).await?.size, None).await };
     match moved.await {
         // Another ingest refused it, too.
-        Err(object_store::Error::NotFound { .. }) => Ok(None),
-        moved => moved.map(|()| Some(to)).map_err(|e| written(from, e)),
+        Err(StoreFault::Store(object_store::Error::NotFound { .. })) => Ok(None),
+        moved => moved.map(|()| Some(to)).map_err(|fault| fault.into_error(from)),
     }
 }
 

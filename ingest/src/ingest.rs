@@ -2,9 +2,12 @@
 
 use std::collections::BTreeSet;
 use std::sync::Arc;
-use std::sync::atomic::AtomicBool;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Duration;
 
-use echolake_lake::{CommitOutcome, EncodedFile, Lake, VisibleRun, encode};
+use echolake_lake::{
+    ClaimOutcome, ClaimTimes, CommitOutcome, EncodedFile, FileName, Lake, VisibleRun, WorkClaims, encode,
+};
 use echolake_schema::tables::Table;
 use echolake_schema::{RunId, SurfaceId};
 use object_store::path::Path;
@@ -16,7 +19,7 @@ use crate::context::IngestContext;
 use crate::derive::ReferenceDerivation;
 use crate::derived_values::RunResponses;
 use crate::error::{Error, Result};
-use crate::files::{self, RunSource};
+use crate::files::{self, ReadFile, RunSource};
 use crate::marks::ReadingMark;
 use crate::measure::Measurer;
 use crate::pipeline::{self, Cores, ReadyJob};
@@ -27,6 +30,9 @@ use crate::run_content::{Head, RunContent};
 
 /// Revision of the responses that follow from recordings: those of another one are derived anew.
 const RESPONSES_REVISION: &str = "2";
+
+/// Time between two looks at other ingests' claims.
+pub(crate) const LOOK_EVERY: Duration = Duration::from_secs(2);
 
 /// Result of the ingest of one run.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -92,6 +98,8 @@ pub enum FileReport {
     },
     /// Another ingest has moved it meanwhile.
     Gone(RunSource),
+    /// Another ingest is at it; this one waits for its end. Another report follows.
+    Claimed(RunSource),
 }
 
 /// Ingests runs into a lake.
@@ -99,6 +107,8 @@ pub enum FileReport {
 pub struct LakeIngest<'a> {
     lake: &'a Lake,
     stop: Arc<AtomicBool>,
+    /// Times of claims, if several ingests share the work.
+    sharing: Option<ClaimTimes>,
 }
 
 /// State shared by the workers.
@@ -106,12 +116,28 @@ pub struct LakeIngest<'a> {
 struct IngestWork {
     context: IngestContext,
     measurer: Arc<Measurer>,
+    shared: Option<SharedWork>,
+}
+
+/// What an ingest needs to share its work with others.
+#[derive(Clone)]
+struct SharedWork {
+    claims: Arc<WorkClaims>,
+    /// Runs that were in the tables at its start: whoever wants them ingested wants them again.
+    known: Arc<BTreeSet<RunId>>,
 }
 
 impl<'a> LakeIngest<'a> {
-    /// Creates an ingest into this lake. Once `stop` is set, no run is started; runs in progress are completed.
+    /// Creates an ingest into this lake. Once `stop` is set, no run is started; runs in progress are completed. On an object
+    /// store it shares the work with other ingests.
     pub fn new(lake: &'a Lake, stop: Arc<AtomicBool>) -> Self {
-        Self { lake, stop }
+        Self { lake, stop, sharing: lake.is_remote().then(ClaimTimes::default) }
+    }
+
+    /// Shares the work with other ingests on whatever store the lake is.
+    #[cfg(test)]
+    pub(crate) fn sharing(self, times: ClaimTimes) -> Self {
+        Self { sharing: Some(times), ..self }
     }
 
     /// Ingests runs, references first so that the others are derived with them at once. It is idempotent: runs that are
@@ -121,27 +147,85 @@ impl<'a> LakeIngest<'a> {
     /// [`Error::Stopped`], or an error of the lake. Readers do not see files that are not reported yet; the same call
     /// resumes with them.
     pub async fn take_in(&self, sources: Vec<RunSource>, report: &mut (dyn FnMut(FileReport) + Send)) -> Result<()> {
+        let Some(times) = self.sharing else { return self.take_in_sharing(sources, None, report).await };
+        let known = self.lake.snapshot().await?.runs().map(|run| run.run.clone()).collect();
+        let shared = SharedWork { claims: Arc::new(WorkClaims::start(self.lake, times)), known: Arc::new(known) };
+        let done = self.take_in_sharing(sources, Some(&shared), report).await;
+        // Whoever waits need not wait until they are dead.
+        if let Some(claims) = Arc::into_inner(shared.claims) {
+            claims.close().await;
+        }
+        done
+    }
+
+    async fn take_in_sharing(
+        &self,
+        sources: Vec<RunSource>,
+        shared: Option<&SharedWork>,
+        report: &mut (dyn FnMut(FileReport) + Send),
+    ) -> Result<()> {
         let (references, others) = self.in_order(sources).await?;
         let (cores, measurer) = (Cores::all()?, Arc::new(Measurer::new(self.lake)));
-        for sources in [references, others].into_iter().filter(|s| !s.is_empty()) {
-            let context = IngestContext::now(self.lake, &cores).await?;
-            self.take_in_group(IngestWork { context, measurer: measurer.clone() }, sources, report).await?;
+        for sources in [references, others] {
+            let mut claimed: Vec<RunSource> = Vec::new();
+            let mut free = sources;
+            while !free.is_empty() {
+                let context = IngestContext::now(self.lake, &cores).await?;
+                let work = IngestWork { context, measurer: measurer.clone(), shared: shared.cloned() };
+                for source in self.take_in_group(work, free, report).await? {
+                    if !claimed.contains(&source) {
+                        report(FileReport::Claimed(source.clone()));
+                        claimed.push(source);
+                    }
+                }
+                free = self.wait_for_claims(shared, &mut claimed).await?;
+            }
         }
         Ok(())
     }
 
+    // Waits until nobody alive works on some of the claimed files; takes them out of `claimed`.
+    async fn wait_for_claims(
+        &self,
+        shared: Option<&SharedWork>,
+        claimed: &mut Vec<RunSource>,
+    ) -> Result<Vec<RunSource>> {
+        let Some(SharedWork { claims, .. }) = shared else { return Ok(Vec::new()) };
+        while !claimed.is_empty() {
+            if self.stop.load(Ordering::Relaxed) {
+                return Err(Error::Stopped);
+            }
+            claims.look().await;
+            let all = std::mem::take(claimed).into_iter();
+            let (free, held): (Vec<_>, Vec<_>) = all.partition(|source| claims.is_free(source.work_name()));
+            *claimed = held;
+            if !free.is_empty() {
+                return Ok(free);
+            }
+            tokio::time::sleep(LOOK_EVERY).await;
+        }
+        Ok(Vec::new())
+    }
+
+    // Returns the files that other ingests have claimed.
     async fn take_in_group(
         &self,
         work: IngestWork,
         sources: Vec<RunSource>,
         report: &mut (dyn FnMut(FileReport) + Send),
-    ) -> Result<()> {
-        let cores = work.context.cores.clone();
-        let mut refused = Vec::new();
+    ) -> Result<Vec<RunSource>> {
+        let (cores, claims) = (work.context.cores.clone(), work.shared.as_ref().map(|shared| shared.claims.clone()));
+        let release = |source: &RunSource| claims.iter().for_each(|claims| claims.release(source.work_name()));
+        let (mut refused, mut claimed) = (Vec::new(), Vec::new());
         let ended = &mut |(source, done): pipeline::JobOutcome<RunSource, IngestedRun>| match done {
             Ok((taken, outcome)) => {
                 let outcome = IngestOutcome::from(outcome == Some(CommitOutcome::Now));
+                release(&source);
                 report(FileReport::Taken(IngestedRun { outcome, ..taken }));
+                Ok(())
+            }
+            Err(Error::Claimed { .. }) => {
+                claimed.push(source);
                 Ok(())
             }
             Err(why) if why.is_refusal() => {
@@ -157,12 +241,14 @@ impl<'a> LakeIngest<'a> {
         };
         let done = pipeline::run(self.lake, &cores, sources, &self.stop, do_one, ended).await;
         for (source, why) in refused {
+            let name = source.work_name().to_owned();
             report(match why {
                 Error::Gone { .. } => FileReport::Gone(source),
                 why => FileReport::Refused { moved: files::quarantine(self.lake, &source, &why).await?, source, why },
             });
+            claims.iter().for_each(|claims| claims.release(&name));
         }
-        done
+        done.map(|()| claimed)
     }
 
     // Runs of surfaces that others name as references, and the rest. The order only saves time: rows are derived again
@@ -190,8 +276,10 @@ impl<'a> LakeIngest<'a> {
 impl IngestWork {
     async fn take_in(&self, source: &RunSource) -> Result<ReadyJob<IngestedRun>> {
         let IngestContext { lake, cores, snapshot, finder } = &self.context;
+        self.claim(source).await?;
         let mut mark = ReadingMark::new(lake, source);
         let opened = source.open(lake)?;
+        let e_tag = files::inbox_tag(lake, source).await;
         let content = Arc::new(RunContent::read(lake, &self.measurer, cores, &opened).await?);
         let keys = RunKeys { surface: content.manifest.surface_id.clone(), run: content.manifest.run_id.clone() };
         let span = Span::current();
@@ -203,7 +291,8 @@ impl IngestWork {
             self.check_same(known, &content, &opened.name).await?;
         }
         let place = Lake::run_path(&keys.surface, &keys.run);
-        files::keep(lake, source, &place, content.integrity.bytes).await?;
+        let file = ReadFile::check(lake, source, e_tag, &content.integrity).await?;
+        files::keep(lake, source, &place, &file, known.is_some()).await?;
         mark = mark.and_then(|mark| mark.follow(lake, &RunSource::Lake(place)));
         let names = ReferenceNames::of(&content.surface, &lake.config().references);
         let wanted = finder.lock().await.wanted_by(names);
@@ -252,6 +341,20 @@ impl IngestWork {
         drop(mark);
         tracing::debug!(files = staged.len(), missing = taken.missing, "the rows are written and not committed yet");
         Ok(ReadyJob { staged, report: taken })
+    }
+
+    // Claims a file, if several ingests share the work.
+    async fn claim(&self, source: &RunSource) -> Result<()> {
+        let Some(SharedWork { claims, known }) = &self.shared else { return Ok(()) };
+        let file = source.to_string();
+        if claims.claim(source.work_name()).await == ClaimOutcome::Denied {
+            return Err(Error::Claimed { file });
+        }
+        // Another ingest may have finished it meanwhile. In the inbox it would be gone.
+        let Some(run) = source.run_in_place().filter(|run| !known.contains(run)) else { return Ok(()) };
+        let is_of_run = |path: &Path| matches!(FileName::parse(path), Some(FileName::Pointer(row)) if row.run == run);
+        let rows = self.context.lake.log().files(Table::Runs).await?;
+        if rows.iter().any(|row| is_of_run(&row.path)) { Err(Error::Gone { file }) } else { Ok(()) }
     }
 
     async fn check_same(&self, known: &VisibleRun, content: &RunContent, file: &str) -> Result<()> {

@@ -20,7 +20,11 @@ use echolake_schema::{Rig, SurfaceId, Timestamp};
 
 use crate::CommandOutcome;
 use crate::commands::replay::ViewerArgs;
+#[cfg(feature = "upload")]
+use crate::error_text::describe_error;
 use crate::progress::CommandProgress;
+#[cfg(feature = "upload")]
+use crate::signals::StopRequest;
 use acknowledge::AcknowledgementWriter;
 use clap::Args;
 use echolake_acquisition::panel::mesh::PanelSide;
@@ -91,6 +95,22 @@ pub(crate) struct AcquireArgs {
     /// Serve metrics for Prometheus under http://ADDR/metrics.
     #[arg(long, value_name = "ADDR")]
     pub(crate) metrics: Option<std::net::SocketAddr>,
+    /// Upload the run, once it is closed, to the lake at this location, as s3://bucket/prefix. The recording stays here.
+    #[cfg(feature = "upload")]
+    #[arg(long, value_name = "URL")]
+    pub(crate) upload: Option<String>,
+}
+
+impl AcquireArgs {
+    #[cfg(feature = "upload")]
+    fn upload_location(&self) -> Option<&str> {
+        self.upload.as_deref()
+    }
+
+    #[cfg(not(feature = "upload"))]
+    fn upload_location(&self) -> Option<&str> {
+        None
+    }
 }
 
 fn side(text: &str) -> Result<PanelSide, String> {
@@ -132,7 +152,8 @@ pub(crate) async fn run(args: &AcquireArgs, lake_url: &str) -> anyhow::Result<Co
 async fn measure(args: &AcquireArgs, lake_url: &str) -> anyhow::Result<CommandOutcome> {
     let pace = if args.pace > 0.0 { TakePace::Secs(args.pace) } else { TakePace::Fast };
     let control = Arc::new(RunControl::default());
-    watch::obey(&control)?;
+    #[cfg_attr(not(feature = "upload"), expect(unused_variables, reason = "it ends uploads"))]
+    let stop = watch::obey(&control)?;
     let progress = CommandProgress::new();
     let job = match &args.resume {
         Some(partial) => {
@@ -142,6 +163,10 @@ async fn measure(args: &AcquireArgs, lake_url: &str) -> anyhow::Result<CommandOu
         }
         None => fresh(args, lake_url, &progress).await?,
     };
+    #[cfg(feature = "upload")]
+    if let Some(location) = args.upload_location() {
+        super::upload::check_location(location, job.rig(), &progress).await?;
+    }
     let clock = if job.rig().devices.are_simulated() { LiveClock::Simulated } else { LiveClock::Wall };
     if clock == LiveClock::Simulated {
         progress.say("simulated rig: nothing here is measured");
@@ -182,7 +207,18 @@ async fn measure(args: &AcquireArgs, lake_url: &str) -> anyhow::Result<CommandOu
     // Viewers are disconnected before the command ends.
     drop((served, live));
     match measured {
-        Ok(measured) => tell(&measured, lake_url),
+        Ok(measured) => {
+            let outcome = tell(&measured, lake_url)?;
+            if measured.outcome.left > 0 {
+                return Ok(outcome);
+            }
+            #[cfg(feature = "upload")]
+            if let Some(location) = args.upload_location() {
+                upload_run(&measured.path, location, &stop, &progress).await?;
+            }
+            eprintln!("next: echolake --lake {} ingest", args.upload_location().unwrap_or(lake_url));
+            Ok(outcome)
+        }
         Err(error) => {
             if partial.exists() {
                 tell_resume(&partial, lake_url);
@@ -192,7 +228,28 @@ async fn measure(args: &AcquireArgs, lake_url: &str) -> anyhow::Result<CommandOu
     }
 }
 
-// Reports the path of the run's file, and the next step.
+// Whatever fails, the run's file stays where it is.
+#[cfg(feature = "upload")]
+async fn upload_run(
+    path: &Path,
+    location: &str,
+    stop: &StopRequest,
+    progress: &CommandProgress,
+) -> anyhow::Result<()> {
+    let uploaded = tokio::select! {
+        uploaded = super::upload::upload_one(path, location, progress) => uploaded,
+        () = stop.wait() => Err(anyhow::anyhow!("stopped")),
+    };
+    uploaded.map_err(|cause| {
+        let (path, cause) = (path.display(), describe_error(&cause));
+        anyhow::anyhow!(
+            "the run stays in `{path}` and was not uploaded to `{location}`: {cause}; hint: `echolake --lake {location} \
+             upload {path}` continues"
+        )
+    })
+}
+
+// Reports the path of the run's file, or how to resume it.
 fn tell(measured: &MeasuredRun, lake_url: &str) -> anyhow::Result<CommandOutcome> {
     let MeasuredRun { path, outcome } = measured;
     if outcome.left > 0 {
@@ -201,7 +258,6 @@ fn tell(measured: &MeasuredRun, lake_url: &str) -> anyhow::Result<CommandOutcome
         return Ok(CommandOutcome::Whole);
     }
     super::print(&path.display().to_string())?;
-    eprintln!("next: echolake --lake {lake_url} ingest");
     Ok(if outcome.end.rejected > 0 { CommandOutcome::WithLoss } else { CommandOutcome::Whole })
 }
 

@@ -55,6 +55,9 @@ const PANICKED: i32 = 101;
 pub(crate) struct IngestSummary {
     pub(crate) taken: Vec<IngestedRun>,
     refused: Vec<RefusedFile>,
+    /// Number of files that other ingests took.
+    #[serde(skip)]
+    gone: usize,
 }
 
 /// A file that cannot be taken in.
@@ -83,7 +86,11 @@ impl IngestSummary {
                 let (file, reason, moved_to) = (source.to_string(), why.to_string(), moved.map(|m| m.to_string()));
                 self.refused.push(RefusedFile { file, reason, moved_to });
             }
-            FileReport::Gone(source) => progress.say(format!("{source}: another ingest has taken it")),
+            FileReport::Gone(source) => {
+                progress.say(format!("{source}: another ingest has taken it"));
+                self.gone += 1;
+            }
+            FileReport::Claimed(source) => progress.say(format!("{source}: another ingest is at it; waiting for its end")),
         }
     }
 }
@@ -104,7 +111,10 @@ pub(crate) async fn run(args: &IngestArgs, lake_url: &str) -> anyhow::Result<Com
         names => sources_of(&lake, names).await?,
     };
     let nothing = sources.is_empty();
-    let summary = take_in(&lake, sources, stop.flag(), &progress).await?;
+    let mut summary = take_in(&lake, sources, stop.flag(), &progress).await?;
+    if args.runs.is_empty() {
+        finish_for_others(&lake, &mut summary, stop.flag(), &progress).await?;
+    }
     if args.json {
         super::print(&serde_json::to_string_pretty(&summary)?)?;
     }
@@ -138,6 +148,27 @@ async fn all_pending(lake: &Lake) -> anyhow::Result<Vec<RunSource>> {
     Ok(pending(lake).await?)
 }
 
+// What another ingest took on an object store and did not finish, because it died, is in `runs/` and in no table.
+async fn finish_for_others(
+    lake: &Lake,
+    summary: &mut IngestSummary,
+    stop: &Arc<AtomicBool>,
+    progress: &CommandProgress,
+) -> anyhow::Result<()> {
+    while lake.is_remote() && std::mem::take(&mut summary.gone) > 0 {
+        let mut left = pending(lake).await?;
+        left.retain(|source| summary.refused.iter().all(|refused| refused.file != source.to_string()));
+        if left.is_empty() {
+            break;
+        }
+        let mut more = take_in(lake, left, stop, progress).await?;
+        summary.taken.append(&mut more.taken);
+        summary.refused.append(&mut more.refused);
+        summary.gone = more.gone;
+    }
+    Ok(())
+}
+
 /// Ingests runs, then completes rows that waited for references.
 pub(crate) async fn take_in(
     lake: &Lake,
@@ -152,7 +183,7 @@ pub(crate) async fn take_in(
     let (suspects, sources): (Vec<_>, Vec<_>) =
         sources.into_iter().partition(|source| SuspectFile::from_source(lake, source).is_some());
     let mut report = |report: FileReport| {
-        ended += 1;
+        ended += u64::from(!matches!(report, FileReport::Claimed(_)));
         summary.add(report, progress);
         task.at(ended);
     };
@@ -300,6 +331,8 @@ async fn watch(lake: &Lake, stop: &StopRequest, progress: &CommandProgress) -> a
         match take_in(lake, settled, stop.flag(), progress).await {
             Ok(summary) => {
                 lost |= summary.lost();
+                // They are looked for in `runs/`, in case that ingest died.
+                is_first |= summary.gone > 0;
                 let stay = summary.refused.iter().filter(|refused| refused.moved_to.is_none());
                 given_up.extend(stay.filter_map(|refused| states.remove_entry(&refused.file)));
             }

@@ -29,6 +29,8 @@ mod simulated_runs;
 pub(crate) mod sql;
 #[cfg(feature = "lake")]
 pub(crate) mod twin;
+#[cfg(feature = "upload")]
+pub(crate) mod upload;
 #[cfg(feature = "lake")]
 pub(crate) mod vacuum;
 
@@ -74,7 +76,8 @@ async fn rig_or(file: Option<&Path>, lake_url: &str, otherwise: impl FnOnce() ->
 
 /// The folder of the lake that new recordings go to.
 fn inbox(lake: &Lake) -> anyhow::Result<std::path::PathBuf> {
-    let folder = lake.folder().context("recordings need a lake in a folder; hint: --lake FOLDER")?.join("inbox");
+    let missing = "recordings need a lake in a folder; hint: --lake FOLDER, and `echolake upload` for one on an object store";
+    let folder = lake.folder().context(missing)?.join("inbox");
     std::fs::create_dir_all(&folder).with_context(|| format!("cannot make `{}`", folder.display()))?;
     // A synced recording is of no use if its folder's name, or the lake's, is not synced.
     for above in folder.ancestors().skip(1).take(2) {

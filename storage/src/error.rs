@@ -1,5 +1,7 @@
 //! Errors of a lake.
 
+use std::path::PathBuf;
+
 use echolake_schema::ErrorCause;
 
 use crate::location::object_text;
@@ -11,10 +13,10 @@ const LAKE_MAKERS: &str = "`echolake demo`, `echolake acquire` and `echolake imp
 const LAKE_MAKERS: &str = "`echolake acquire` makes one";
 
 /// The locations on object stores that this build reaches, as words of a hint.
-#[cfg(feature = "tables")]
+#[cfg(feature = "remote")]
 const REMOTE_LOCATIONS: &str = "s3://bucket/prefix (gs://, az://)";
-#[cfg(not(feature = "tables"))]
-const REMOTE_LOCATIONS: &str = "use a program with tables for object stores";
+#[cfg(not(feature = "remote"))]
+const REMOTE_LOCATIONS: &str = "use a program with the feature `upload` for object stores";
 
 /// An operation that a lake could not do, by what the caller can do about it.
 #[derive(Debug, thiserror::Error)]
@@ -169,6 +171,64 @@ pub enum Error {
         /// Files that it had.
         files: usize,
     },
+    /// The run file that is uploaded, or the journal of its upload beside it, cannot be used.
+    #[error("cannot {action} `{}`: {source}{hint}", file.display())]
+    UploadFile {
+        /// The attempted operation.
+        action: &'static str,
+        /// The file.
+        file: PathBuf,
+        /// The cause.
+        source: std::io::Error,
+        /// What to do about it, with `; hint: ` before it; may be empty.
+        hint: &'static str,
+    },
+    /// Another process uploads the same file.
+    #[error("`{}` is being uploaded by another process; hint: wait for its end", file.display())]
+    UploadBusy {
+        /// The run file.
+        file: PathBuf,
+    },
+    /// A run of this name is in the lake, or on its way there, with other content.
+    #[error(
+        "`{path}` of `{location}` is another file than the given one: it has {there}, the given file {given}; hint: a run file never changes once closed, so record it under another name; if an upload was given up, delete `{record}`"
+    )]
+    OtherUpload {
+        /// The lake's location.
+        location: String,
+        /// Path of the run in the lake.
+        path: String,
+        /// SHA-256 or size of the lake's.
+        there: String,
+        /// SHA-256 or size of the given file.
+        given: String,
+        /// Path of the object that keeps the name for a digest.
+        record: String,
+    },
+    /// The uploaded object is not what was sent. It is deleted.
+    #[error(
+        "`{path}` of `{location}` does not hold what was uploaded: it has SHA-256 {actual}, expected {expected}; hint: it is deleted, run the command again"
+    )]
+    UploadDamaged {
+        /// The lake's location.
+        location: String,
+        /// Path of the object.
+        path: String,
+        /// Digest of the run file.
+        expected: String,
+        /// Digest of the object.
+        actual: String,
+    },
+    /// The uploaded object disappeared before it was compared.
+    #[error(
+        "`{path}` of `{location}` disappeared before its SHA-256 was compared; hint: look into `quarantine/`, then run the command again"
+    )]
+    UploadGone {
+        /// The lake's location.
+        location: String,
+        /// Path of the object.
+        path: String,
+    },
     /// A rig or id that is not valid.
     #[error(transparent)]
     Schema(#[from] echolake_schema::Error),
@@ -243,7 +303,7 @@ fn answer_text(text: &str) -> Option<String> {
 fn tries_text(error: &object_store::Error) -> String {
     let (mut tries, mut source) = (1, Some(error as &dyn std::error::Error));
     while let Some(cause) = source {
-        #[cfg(feature = "tables")]
+        #[cfg(feature = "remote")]
         if let Some(retried) = cause.downcast_ref::<crate::remote::RetriedError>() {
             tries = tries.max(retried.tries);
         }

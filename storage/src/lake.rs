@@ -10,6 +10,8 @@ use object_store::path::Path;
 use object_store::{ObjectStore, ObjectStoreExt as _, PutMode};
 
 use crate::location::{LakeLocation, object_text};
+#[cfg(feature = "remote")]
+use crate::remote::PartStore;
 #[cfg(feature = "tables")]
 use crate::remote::{BlockCache, BlockFolder, CacheCounters, CacheCounts, CacheFolder, CachedStore};
 #[cfg(feature = "tables")]
@@ -196,7 +198,7 @@ impl Lake {
     }
 
     /// Returns whether the lake is on an object store, where others may work on it from other machines.
-    #[cfg(feature = "tables")]
+    #[cfg(feature = "remote")]
     pub fn is_remote(&self) -> bool {
         self.0.location.remote.is_some()
     }
@@ -246,9 +248,15 @@ impl Lake {
     ///
     /// # Errors
     /// [`Error::NotExclusive`], or what the store says.
-    #[cfg(feature = "tables")]
+    #[cfg(feature = "remote")]
     pub async fn ensure_exclusive(&self) -> Result<()> {
         self.0.location.ensure_exclusive().await
+    }
+
+    /// Uploads in parts, if the lake is on an object store.
+    #[cfg(feature = "remote")]
+    pub(crate) fn parts(&self) -> Option<&PartStore> {
+        self.0.location.remote.as_ref()?.parts.as_ref()
     }
 
     /// Contents of `lake.toml`.
@@ -304,7 +312,7 @@ async fn create_config(location: &LakeLocation, rig: &Rig, references: &Referenc
     if !there.objects.is_empty() || !there.common_prefixes.iter().all(ours) {
         return Err(Error::Occupied { location: location.text.clone() });
     }
-    #[cfg(feature = "tables")]
+    #[cfg(feature = "remote")]
     location.ensure_exclusive().await?;
     let config = LakeConfig { format: LAKE_FORMAT, references: references.clone(), rig: rig.clone() };
     let text = config.to_toml()?;

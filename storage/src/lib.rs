@@ -21,25 +21,35 @@ mod durable;
 mod error;
 mod lake;
 mod location;
-#[cfg(feature = "tables")]
+#[cfg(feature = "remote")]
 mod remote;
+#[cfg(feature = "remote")]
+mod run_digest;
 #[cfg(feature = "tables")]
 mod tables;
 mod unused;
+#[cfg(feature = "remote")]
+mod upload;
 
 pub use config::{DirectSound, LAKE_FORMAT, LakeConfig, ReferenceSurfaces};
 pub use error::{Error, StoreError};
 pub use lake::Lake;
 #[cfg(feature = "tables")]
-pub use remote::{CACHE_MEMORY_BYTES, CacheCounters, CacheCounts, CacheFolder, RemoteAccess, remote_access};
+pub use remote::{CACHE_MEMORY_BYTES, CacheCounters, CacheCounts, CacheFolder};
+#[cfg(feature = "remote")]
+pub use remote::{RemoteAccess, remote_access};
+#[cfg(feature = "remote")]
+pub use run_digest::{digest_record, digest_record_path, file_sha256, object_sha256, read_digest_record};
 #[cfg(feature = "tables")]
 pub use tables::{
-    BatchBuilder, CommitEffect, CommitLog, CommitOutcome, DataFile, DeletedFile, DeletionMode, EncodedFile,
+    BatchBuilder, ClaimOutcome, ClaimTimes, CommitEffect, CommitLog, CommitOutcome, DataFile, DeletedFile, DeletionMode, EncodedFile,
     FileEncoder, FileHistory, FileName, FileStats, KEEP_HOURS, LakeMoment, LakeSnapshot, LoggedFile, MergeProgress,
     NewFile, NoMoment, OptimizeReport, ReplacedFiles, RunPart, StagedFile, TARGET_BYTES, TableChange, TableCommit,
-    TableOptimizeReport, TableVersion, TableView, VacuumReport, VisibleRun, add_missing_columns, encode,
+    TableOptimizeReport, TableVersion, TableView, VacuumReport, VisibleRun, WorkClaims, add_missing_columns, encode,
     reader_metadata, wanted_schema,
 };
+#[cfg(feature = "remote")]
+pub use upload::{RunUpload, UploadOutcome, UploadStep};
 
 /// The result of what a lake does.
 pub type Result<T> = std::result::Result<T, Error>;

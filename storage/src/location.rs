@@ -9,13 +9,13 @@ use object_store::ObjectStore;
 use object_store::memory::InMemory;
 use object_store::path::Path as ObjectPath;
 use object_store::prefix::PrefixStore;
-#[cfg(feature = "tables")]
-use tokio::sync::OnceCell;
 use url::Url;
 
 use crate::durable::DurableFileSystem;
 #[cfg(feature = "tables")]
-use crate::remote::{CachedStore, ExclusionFault, probe_exclusion};
+use crate::remote::CachedStore;
+#[cfg(feature = "remote")]
+use crate::remote::{ExclusionFault, RemoteStore, probe_exclusion};
 use crate::{Error, Result};
 
 /// A lake's location, opened.
@@ -27,9 +27,9 @@ pub(crate) struct LakeLocation {
     pub(crate) folder: Option<PathBuf>,
     /// The lake alone.
     pub(crate) store: Arc<dyn ObjectStore>,
-    /// If it is an object store: the result of the probe that writers make first.
-    #[cfg(feature = "tables")]
-    pub(crate) remote: Option<Arc<OnceCell<()>>>,
+    /// If it is an object store: what it does beyond `store`.
+    #[cfg(feature = "remote")]
+    pub(crate) remote: Option<Arc<RemoteStore>>,
     /// The same store, if it has a cache.
     #[cfg(feature = "tables")]
     pub(crate) cached: Option<CachedStore>,
@@ -48,12 +48,13 @@ impl LakeLocation {
         match url.scheme() {
             "file" => Self::folder(text, &url.to_file_path().map_err(|()| wrong("it names no local folder".into()))?),
             "memory" => Ok(Self::store(text, Arc::new(InMemory::new()))),
-            #[cfg(feature = "tables")]
+            #[cfg(feature = "remote")]
             _ => {
-                let store = crate::remote::open_store(&url).map_err(wrong)?;
-                Ok(Self { remote: Some(Arc::default()), ..Self::store(text.trim_end_matches('/'), store) })
+                let (store, parts) = crate::remote::open_store(&url).map_err(wrong)?;
+                let remote = RemoteStore { parts: Some(parts), ..RemoteStore::default() };
+                Ok(Self { remote: Some(Arc::new(remote)), ..Self::store(text.trim_end_matches('/'), store) })
             }
-            #[cfg(not(feature = "tables"))]
+            #[cfg(not(feature = "remote"))]
             scheme => Err(wrong(format!("this build does not reach `{scheme}://`").into())),
         }
     }
@@ -62,16 +63,16 @@ impl LakeLocation {
     ///
     /// # Errors
     /// [`Error::NotExclusive`], or what the store says.
-    #[cfg(feature = "tables")]
+    #[cfg(feature = "remote")]
     pub(crate) async fn ensure_exclusive(&self) -> Result<()> {
-        let Some(probed) = &self.remote else { return Ok(()) };
+        let Some(remote) = &self.remote else { return Ok(()) };
         let probe = async {
             probe_exclusion(&self.store).await.map_err(|fault| match fault {
                 ExclusionFault::Overwrites(observed) => Error::NotExclusive { location: self.text.clone(), observed },
                 ExclusionFault::Store(cause) => Error::store("write", &self.text, cause),
             })
         };
-        probed.get_or_try_init(|| probe).await.copied()
+        remote.probed.get_or_try_init(|| probe).await.copied()
     }
 
     /// A store that holds nothing but the lake.
@@ -80,7 +81,7 @@ impl LakeLocation {
             text: text.to_owned(),
             folder: None,
             store,
-            #[cfg(feature = "tables")]
+            #[cfg(feature = "remote")]
             remote: None,
             #[cfg(feature = "tables")]
             cached: None,
@@ -90,7 +91,7 @@ impl LakeLocation {
     /// The same, of a store that is taken for a remote one if its name is a URL of one.
     pub(crate) fn named_store(name: &str, store: Arc<dyn ObjectStore>) -> Self {
         Self {
-            #[cfg(feature = "tables")]
+            #[cfg(feature = "remote")]
             remote: crate::remote_access(name).map(|_| Arc::default()),
             ..Self::store(name, store)
         }

@@ -3,6 +3,7 @@
 
 mod requests;
 mod s3_double;
+mod uploads;
 
 use std::collections::BTreeMap;
 use std::process::{Command, Output};

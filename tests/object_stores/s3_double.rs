@@ -20,6 +20,8 @@ pub(crate) enum StoreBehaviour {
     Faultless,
     /// `If-None-Match` is passed over.
     Overwrites,
+    /// Copies of objects that came in parts have one byte changed.
+    DamagesCopies,
     /// A fifth of the commits is made and not answered; of the rest a tenth is refused by 503, and a tenth by a 409 that
     /// means nothing; a tenth of the listings is cut off, a twentieth of the reads is refused by 503.
     Unreliable(u64),
@@ -39,11 +41,19 @@ struct StoreState {
     faults: usize,
     requests: usize,
     log: Vec<String>,
+    /// Open connections.
+    connections: usize,
+    /// Parts of uploads that were stored.
+    parts: usize,
+    /// The number of parts behind which further ones are lost on their way.
+    part_limit: usize,
 }
 
 #[derive(Clone)]
 struct StoredObject {
     bytes: Vec<u8>,
+    /// As S3 has it: of an object that came in parts it is another one than of a copy of it.
+    e_tag: String,
     modified: DateTime<Utc>,
 }
 
@@ -66,6 +76,8 @@ struct HttpAnswer {
 #[derive(Clone, Copy, PartialEq, Eq)]
 enum RequestFault {
     None,
+    /// It does not arrive.
+    Lost,
     Unanswered,
     Unavailable,
     Conflict,
@@ -85,13 +97,20 @@ impl S3Double {
             faults: 0,
             requests: 0,
             log: Vec::new(),
+            connections: 0,
+            parts: 0,
+            part_limit: usize::MAX,
         }));
         let shared = state.clone();
         std::thread::spawn(move || {
             for client in listener.incoming().flatten() {
                 let state = shared.clone();
+                state.lock().expect("no panic").connections += 1;
                 // A client that hangs up, and a fault that ends its connection, end this thread.
-                std::thread::spawn(move || drop(answer_client(client, &state)));
+                std::thread::spawn(move || {
+                    drop(answer_client(client, &state));
+                    state.lock().expect("no panic").connections -= 1;
+                });
             }
         });
         Self { endpoint, state }
@@ -113,7 +132,11 @@ impl S3Double {
     }
 
     pub(crate) fn put(&self, key: &str, bytes: Vec<u8>) {
-        self.state().objects.insert(key.to_owned(), StoredObject { bytes, modified: Utc::now() });
+        self.state().put(key, bytes);
+    }
+
+    pub(crate) fn set_behaviour(&self, behaviour: StoreBehaviour) {
+        self.state().behaviour = behaviour;
     }
 
     pub(crate) fn keys(&self) -> Vec<String> {
@@ -123,6 +146,31 @@ impl S3Double {
     /// The requests since the last call: method and key.
     pub(crate) fn take_requests(&self) -> Vec<String> {
         std::mem::take(&mut self.state().log)
+    }
+
+    pub(crate) fn get(&self, key: &str) -> Vec<u8> {
+        let state = self.state();
+        state.objects.get(key).unwrap_or_else(|| panic!("no `{key}` in {:?}", state.objects.keys())).bytes.clone()
+    }
+
+    /// Loses all parts behind so many.
+    pub(crate) fn limit_parts(&self, limit: usize) {
+        self.state().part_limit = limit;
+    }
+
+    /// Number of open connections.
+    pub(crate) fn connections(&self) -> usize {
+        self.state().connections
+    }
+
+    /// Number of parts that were stored.
+    pub(crate) fn parts(&self) -> usize {
+        self.state().parts
+    }
+
+    /// Forgets all uploads that are not complete, as a bucket's rule does after a day.
+    pub(crate) fn abort_uploads(&self) {
+        self.state().uploads.clear();
     }
 
     /// Requests, and faults among them.
@@ -143,11 +191,12 @@ fn answer_client(client: TcpStream, state: &Mutex<StoreState>) -> io::Result<()>
             let answer = match fault {
                 RequestFault::Unavailable => refusal("503 Service Unavailable", "SlowDown"),
                 RequestFault::Conflict => refusal("409 Conflict", "ConditionalRequestConflict"),
+                RequestFault::Lost => refusal("503 Service Unavailable", "SlowDown"),
                 RequestFault::None | RequestFault::Unanswered | RequestFault::CutOff => state.answer(&request),
             };
             (fault, answer)
         };
-        if fault == RequestFault::Unanswered {
+        if matches!(fault, RequestFault::Unanswered | RequestFault::Lost) {
             return Ok(());
         }
         let HttpAnswer { status, headers, body } = answer;
@@ -221,14 +270,21 @@ fn refusal(status: &'static str, code: &str) -> HttpAnswer {
     HttpAnswer { status, headers: String::new(), body: body.into_bytes() }
 }
 
-fn stored(bytes: &[u8]) -> String {
-    format!("ETag: \"{:08x}\"\r\n", bytes.iter().fold(0_u32, |sum, b| sum.wrapping_mul(31).wrapping_add(u32::from(*b))))
+fn e_tag(bytes: &[u8]) -> String {
+    format!("{:08x}", bytes.iter().fold(0_u32, |sum, b| sum.wrapping_mul(31).wrapping_add(u32::from(*b))))
+}
+
+fn tag_header(e_tag: &str) -> String {
+    format!("ETag: \"{e_tag}\"\r\n")
 }
 
 impl StoreState {
     fn draw_fault(&mut self, request: &HttpRequest) -> RequestFault {
         self.requests += 1;
         self.log.push(format!("{} {}", request.method, request.key));
+        if request.query.contains_key("partNumber") && self.parts >= self.part_limit {
+            return RequestFault::Lost;
+        }
         if !matches!(self.behaviour, StoreBehaviour::Unreliable(_)) {
             return RequestFault::None;
         }
@@ -254,9 +310,12 @@ impl StoreState {
             "GET" | "HEAD" => self.read(request),
             "PUT" if has("partNumber") => {
                 let number = request.query["partNumber"].parse().expect("a number");
-                let upload = self.uploads.entry(request.query["uploadId"].clone()).or_default();
+                let Some(upload) = self.uploads.get_mut(&request.query["uploadId"]) else {
+                    return refusal("404 Not Found", "NoSuchUpload");
+                };
                 upload.insert(number, request.body.clone());
-                ok(stored(&request.body), Vec::new())
+                self.parts += 1;
+                ok(tag_header(&e_tag(&request.body)), Vec::new())
             }
             "PUT" if request.headers.contains_key("x-amz-copy-source") => {
                 let source = decode(&request.headers["x-amz-copy-source"]);
@@ -264,7 +323,12 @@ impl StoreState {
                 let Some(found) = self.objects.get(source).cloned() else {
                     return refusal("404 Not Found", "NoSuchKey");
                 };
-                self.put(key, found.bytes);
+                let mut bytes = found.bytes;
+                if self.behaviour == StoreBehaviour::DamagesCopies && found.e_tag.contains('-') {
+                    let middle = bytes.len() / 2;
+                    bytes[middle] ^= 1;
+                }
+                self.put(key, bytes);
                 xml("<CopyObjectResult><ETag>x</ETag></CopyObjectResult>".to_owned())
             }
             "PUT" => {
@@ -274,16 +338,23 @@ impl StoreState {
                     return refusal("412 Precondition Failed", "PreconditionFailed");
                 }
                 self.put(key, request.body.clone());
-                ok(stored(&request.body), Vec::new())
+                ok(tag_header(&e_tag(&request.body)), Vec::new())
             }
             "POST" if has("uploads") => {
                 let id = format!("upload-{}", self.requests);
+                self.uploads.insert(id.clone(), BTreeMap::new());
                 xml(format!("<InitiateMultipartUploadResult><UploadId>{id}</UploadId></InitiateMultipartUploadResult>"))
             }
             "POST" if has("delete") => self.delete_many(&request.body),
             "POST" => {
-                let parts = self.uploads.remove(&request.query["uploadId"]).unwrap_or_default();
+                let Some(parts) = self.uploads.remove(&request.query["uploadId"]) else {
+                    return refusal("404 Not Found", "NoSuchUpload");
+                };
+                let count = parts.len();
                 self.put(key, parts.into_values().flatten().collect());
+                if let Some(object) = self.objects.get_mut(key) {
+                    object.e_tag = format!("{}-{count}", object.e_tag);
+                }
                 let tag = "<ETag>\"x\"</ETag>";
                 xml(format!("<CompleteMultipartUploadResult>{tag}</CompleteMultipartUploadResult>"))
             }
@@ -295,7 +366,8 @@ impl StoreState {
     }
 
     fn put(&mut self, key: &str, bytes: Vec<u8>) {
-        self.objects.insert(key.to_owned(), StoredObject { bytes, modified: Utc::now() });
+        let e_tag = e_tag(&bytes);
+        self.objects.insert(key.to_owned(), StoredObject { bytes, e_tag, modified: Utc::now() });
     }
 
     fn delete_many(&mut self, body: &[u8]) -> HttpAnswer {
@@ -313,7 +385,7 @@ impl StoreState {
         let Some(object) = self.objects.get(&request.key) else { return refusal("404 Not Found", "NoSuchKey") };
         let (bytes, length) = (&object.bytes, object.bytes.len());
         let modified = object.modified.format("%a, %d %b %Y %H:%M:%S GMT");
-        let headers = format!("{}Last-Modified: {modified}\r\n", stored(bytes));
+        let headers = format!("{}Last-Modified: {modified}\r\n", tag_header(&object.e_tag));
         let Some(range) = request.headers.get("range").and_then(|text| text.strip_prefix("bytes=")) else {
             return ok(headers, bytes.clone());
         };

@@ -103,16 +103,16 @@ impl RunWatcher {
 }
 
 /// Lets signals and the terminal control a run from now on: Ctrl-C and SIGTERM stop it after the current pair, a second
-/// one at once; SIGUSR1, or `p` and Enter on a terminal, pauses or resumes it.
+/// one at once; SIGUSR1, or `p` and Enter on a terminal, pauses or resumes it. Returns the request to stop.
 ///
 /// # Errors
 /// The system refused a handler.
-pub(super) fn obey(control: &Arc<RunControl>) -> anyhow::Result<()> {
+pub(super) fn obey(control: &Arc<RunControl>) -> anyhow::Result<StopRequest> {
     let stop = StopRequest::listen("stopping after the current pair; Ctrl-C again stops at once")?;
     let mut pauses = signal(SignalKind::user_defined1()).context("cannot listen to SIGUSR1")?;
-    let stopped = control.clone();
+    let (stopped, made) = (control.clone(), stop.clone());
     tokio::spawn(async move {
-        stop.wait().await;
+        made.wait().await;
         stopped.stop.store(true, Ordering::Relaxed);
     });
     let paused = control.clone();
@@ -131,7 +131,7 @@ pub(super) fn obey(control: &Arc<RunControl>) -> anyhow::Result<()> {
             }
         });
     }
-    Ok(())
+    Ok(stop)
 }
 
 fn toggle(control: &RunControl) {

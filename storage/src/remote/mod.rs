@@ -3,8 +3,10 @@
 //! A bucket and a prefix name the lake; all other settings are the environment's, by the names that each store's own
 //! tools use.
 
+#[cfg(feature = "tables")]
 mod cache;
 mod exclusion;
+mod part_store;
 mod retrying;
 mod settings;
 #[cfg(test)]
@@ -16,18 +18,33 @@ use echolake_schema::ErrorCause;
 use object_store::ObjectStore;
 use object_store::path::Path as ObjectPath;
 use object_store::prefix::PrefixStore;
+use tokio::sync::OnceCell;
 use url::Url;
 
+#[cfg(feature = "tables")]
 pub(crate) use cache::{BlockCache, BlockFolder, CachedStore};
+#[cfg(feature = "tables")]
 pub use cache::{CACHE_MEMORY_BYTES, CacheCounters, CacheCounts, CacheFolder};
 pub(crate) use exclusion::{ExclusionFault, probe_exclusion};
-pub(crate) use retrying::{RetriedError, RetryingStore, backoff};
+pub(crate) use part_store::PartStore;
+#[cfg(feature = "tables")]
+pub(crate) use retrying::backoff;
+pub(crate) use retrying::{RetriedError, RetryingStore};
+
+/// What an object store does beyond reads and writes of whole objects.
+#[derive(Debug, Default)]
+pub(crate) struct RemoteStore {
+    /// The result of the probe that writers make first.
+    pub(crate) probed: OnceCell<()>,
+    /// Uploads in parts.
+    pub(crate) parts: Option<PartStore>,
+}
 
 /// Opens the store of a URL such as `s3://bucket/prefix`, from its prefix on. Nothing is requested yet.
 ///
 /// # Errors
 /// An unknown scheme, a URL with more than bucket and prefix, or settings that do not go together.
-pub(crate) fn open_store(url: &Url) -> Result<Arc<dyn ObjectStore>, ErrorCause> {
+pub(crate) fn open_store(url: &Url) -> Result<(Arc<dyn ObjectStore>, PartStore), ErrorCause> {
     let bucket = url.host_str().filter(|bucket| !bucket.is_empty()).ok_or("it names no bucket")?;
     if !url.username().is_empty() || url.password().is_some() {
         return Err("credentials are read from the environment, never from a URL".into());
@@ -36,9 +53,11 @@ pub(crate) fn open_store(url: &Url) -> Result<Arc<dyn ObjectStore>, ErrorCause> 
         return Err("expected a bucket and a prefix, and nothing else".into());
     }
     let prefix = ObjectPath::from_url_path(url.path())?;
-    let store = settings::store(url.scheme(), bucket)?;
+    let (store, parts) = settings::store(url.scheme(), bucket)?;
+    let parts = PartStore::new(parts, prefix.clone());
     let store: Arc<dyn ObjectStore> = Arc::new(RetryingStore::new(store));
-    Ok(if prefix.as_ref().is_empty() { store } else { Arc::new(PrefixStore::new(store, prefix)) })
+    let has_prefix = !prefix.as_ref().is_empty();
+    Ok((if has_prefix { Arc::new(PrefixStore::new(store, prefix)) } else { store }, parts))
 }
 
 pub use settings::{RemoteAccess, remote_access};

@@ -64,7 +64,8 @@ impl RetryingStore {
     }
 }
 
-async fn retry<T, F: Future<Output = StoreResult<T>>>(work: impl Fn() -> F) -> StoreResult<T> {
+/// Repeats an operation that may be repeated until it succeeds, fails for good, or was tried too often.
+pub(super) async fn retry<T, F: Future<Output = StoreResult<T>>>(work: impl Fn() -> F) -> StoreResult<T> {
     let begun = Instant::now();
     let mut tries = 1;
     loop {

@@ -7,6 +7,7 @@ use echolake_schema::ErrorCause;
 use object_store::aws::{AmazonS3Builder, AmazonS3ConfigKey};
 use object_store::azure::{AzureConfigKey, MicrosoftAzureBuilder};
 use object_store::gcp::{GoogleCloudStorageBuilder, GoogleConfigKey};
+use object_store::multipart::MultipartStore;
 use object_store::{ClientConfigKey, ObjectStore, RetryConfig};
 use url::Url;
 
@@ -75,8 +76,11 @@ pub fn remote_access(location: &str) -> Option<RemoteAccess> {
     Some(RemoteAccess { ports, files: files.collect() })
 }
 
+/// A bucket, by both of its interfaces.
+pub(super) type BucketStore = (Arc<dyn ObjectStore>, Arc<dyn MultipartStore>);
+
 /// The store of a bucket.
-pub(super) fn store(scheme: &str, bucket: &str) -> Result<Arc<dyn ObjectStore>, ErrorCause> {
+pub(super) fn store(scheme: &str, bucket: &str) -> Result<BucketStore, ErrorCause> {
     let (timeout, key) = (REQUEST_TIMEOUT, ClientConfigKey::Timeout);
     Ok(match scheme {
         "s3" => {
@@ -93,18 +97,23 @@ pub(super) fn store(scheme: &str, bucket: &str) -> Result<Arc<dyn ObjectStore>, 
                 )
                 .into());
             }
-            Arc::new(builder.with_config(AmazonS3ConfigKey::Client(key), timeout).build()?)
+            both(builder.with_config(AmazonS3ConfigKey::Client(key), timeout).build()?)
         }
         "gs" => {
             let builder = GoogleCloudStorageBuilder::from_env().with_bucket_name(bucket).with_retry(retries()?);
-            Arc::new(builder.with_config(GoogleConfigKey::Client(key), timeout).build()?)
+            both(builder.with_config(GoogleConfigKey::Client(key), timeout).build()?)
         }
         "az" => {
             let builder = MicrosoftAzureBuilder::from_env().with_container_name(bucket).with_retry(retries()?);
-            Arc::new(builder.with_config(AzureConfigKey::Client(key), timeout).build()?)
+            both(builder.with_config(AzureConfigKey::Client(key), timeout).build()?)
         }
         scheme => return Err(format!("this build does not reach `{scheme}://`").into()),
     })
+}
+
+fn both<S: ObjectStore + MultipartStore>(store: S) -> BucketStore {
+    let store = Arc::new(store);
+    (store.clone(), store)
 }
 
 fn retries() -> Result<RetryConfig, ErrorCause> {

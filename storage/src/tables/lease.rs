@@ -180,7 +180,8 @@ async fn read(store: &dyn ObjectStore, number: u64) -> Result<Option<LeaseRecord
     Ok(Some(serde_json::from_slice(&bytes).unwrap_or_else(|_| unreadable())))
 }
 
-fn host() -> String {
+/// Name of this machine, for people.
+pub(super) fn host() -> String {
     let named = std::fs::read_to_string("/proc/sys/kernel/hostname").ok().or_else(|| std::env::var("HOSTNAME").ok());
     named.map_or_else(|| "this machine".to_owned(), |name| name.trim().to_owned())
 }

@@ -1,6 +1,7 @@
 //! A lake's tables: rows in, and a view of them.
 
 mod batch_builder;
+mod claims;
 mod commit_log;
 mod data_file;
 pub(crate) mod delta;
@@ -13,6 +14,7 @@ mod vacuum;
 mod versions;
 
 pub use batch_builder::BatchBuilder;
+pub use claims::{ClaimOutcome, ClaimTimes, WorkClaims};
 pub use commit_log::{
     CommitEffect, CommitLog, CommitOutcome, DataFile, FileHistory, FileStats, LoggedFile, NewFile, ReplacedFiles,
     RunPart, TableChange, TableCommit, TableVersion, TableView,

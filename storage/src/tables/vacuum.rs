@@ -10,6 +10,7 @@ use object_store::ObjectStore as _;
 use object_store::path::Path;
 use serde::Serialize;
 
+use crate::tables::claims;
 use crate::tables::delta::folder;
 use crate::tables::lease::MaintenanceLease;
 use crate::{Error, FileHistory, Lake, Result};
@@ -137,8 +138,14 @@ impl Lake {
             .try_collect()
             .await
             .map_err(|e| Error::store("list", INBOX, e))?;
-        let copying = inbox.into_iter().filter(|m| m.location.extension() == Some("copying") && old(m.last_modified));
-        files.extend(copying.map(|meta| DeletedFile::stored(meta.location, meta.size)));
+        let is_unfinished = |path: &Path| matches!(path.extension(), Some("copying" | "uploading"));
+        let unfinished = inbox.into_iter().filter(|m| is_unfinished(&m.location) && old(m.last_modified));
+        // Claims of processes that died.
+        let claims = Path::from(claims::FOLDER);
+        let claims: Vec<_> =
+            self.store().list(Some(&claims)).try_collect().await.map_err(|e| Error::store("list", claims, e))?;
+        let claims = claims.into_iter().filter(|meta| old(meta.last_modified));
+        files.extend(unfinished.chain(claims).map(|meta| DeletedFile::stored(meta.location, meta.size)));
         if let Some(lake) = self.folder() {
             let mut temporaries = Vec::new();
             ["tables", INBOX].iter().for_each(|name| find_temporaries(&lake.join(name), &mut temporaries));
