@@ -22,9 +22,9 @@ use object_store::path::Path;
 use object_store::{ObjectStore, ObjectStoreExt as _};
 use parquet::arrow::arrow_reader::ParquetRecordBatchReaderBuilder;
 
+use crate::complete::complete_sharing;
 use crate::mortal::{DeathMoment, MortalStore};
 use crate::skewed::{Interlude, SkewedStore};
-use crate::complete::complete_sharing;
 use crate::{CompletedRun, FileReport, LakeIngest, RunSource, complete, pending};
 
 /// Ten points, so that a run takes milliseconds.

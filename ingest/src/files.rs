@@ -318,7 +318,10 @@ async fn delete(lake: &Lake, path: &Path) -> object_store::Result<()> {
 enum StoreFault {
     Store(object_store::Error),
     /// The copy is not what was read.
-    Changed { expected: String, actual: String },
+    Changed {
+        expected: String,
+        actual: String,
+    },
 }
 
 impl From<object_store::Error> for StoreFault {

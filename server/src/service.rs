@@ -256,7 +256,7 @@ impl QueryService {
                 // Also if nobody fetches rows at present; who does says so.
                 () = stopped.stopped() => return Err(RequestFault::Cancelled),
             };
-            timer.watch().finish(done.as_ref().map(|()| ()));
+            timer.watch().finish(done.as_ref().copied());
             done.inspect_err(|fault| service.record_failure(fault))
         };
         let mut task = self.spawn(work.instrument(span.clone()));

@@ -230,12 +230,7 @@ async fn measure(args: &AcquireArgs, lake_url: &str) -> anyhow::Result<CommandOu
 
 // Whatever fails, the run's file stays where it is.
 #[cfg(feature = "upload")]
-async fn upload_run(
-    path: &Path,
-    location: &str,
-    stop: &StopRequest,
-    progress: &CommandProgress,
-) -> anyhow::Result<()> {
+async fn upload_run(path: &Path, location: &str, stop: &StopRequest, progress: &CommandProgress) -> anyhow::Result<()> {
     let uploaded = tokio::select! {
         uploaded = super::upload::upload_one(path, location, progress) => uploaded,
         () = stop.wait() => Err(anyhow::anyhow!("stopped")),

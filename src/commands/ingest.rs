@@ -90,7 +90,9 @@ impl IngestSummary {
                 progress.say(format!("{source}: another ingest has taken it"));
                 self.gone += 1;
             }
-            FileReport::Claimed(source) => progress.say(format!("{source}: another ingest is at it; waiting for its end")),
+            FileReport::Claimed(source) => {
+                progress.say(format!("{source}: another ingest is at it; waiting for its end"))
+            }
         }
     }
 }

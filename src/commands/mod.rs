@@ -76,7 +76,8 @@ async fn rig_or(file: Option<&Path>, lake_url: &str, otherwise: impl FnOnce() ->
 
 /// The folder of the lake that new recordings go to.
 fn inbox(lake: &Lake) -> anyhow::Result<std::path::PathBuf> {
-    let missing = "recordings need a lake in a folder; hint: --lake FOLDER, and `echolake upload` for one on an object store";
+    let missing =
+        "recordings need a lake in a folder; hint: --lake FOLDER, and `echolake upload` for one on an object store";
     let folder = lake.folder().context(missing)?.join("inbox");
     std::fs::create_dir_all(&folder).with_context(|| format!("cannot make `{}`", folder.display()))?;
     // A synced recording is of no use if its folder's name, or the lake's, is not synced.

@@ -42,11 +42,11 @@ pub use remote::{RemoteAccess, remote_access};
 pub use run_digest::{digest_record, digest_record_path, file_sha256, object_sha256, read_digest_record};
 #[cfg(feature = "tables")]
 pub use tables::{
-    BatchBuilder, ClaimOutcome, ClaimTimes, CommitEffect, CommitLog, CommitOutcome, DataFile, DeletedFile, DeletionMode, EncodedFile,
-    FileEncoder, FileHistory, FileName, FileStats, KEEP_HOURS, LakeMoment, LakeSnapshot, LoggedFile, MergeProgress,
-    NewFile, NoMoment, OptimizeReport, ReplacedFiles, RunPart, StagedFile, TARGET_BYTES, TableChange, TableCommit,
-    TableOptimizeReport, TableVersion, TableView, VacuumReport, VisibleRun, WorkClaims, add_missing_columns, encode,
-    reader_metadata, wanted_schema,
+    BatchBuilder, ClaimOutcome, ClaimTimes, CommitEffect, CommitLog, CommitOutcome, DataFile, DeletedFile,
+    DeletionMode, EncodedFile, FileEncoder, FileHistory, FileName, FileStats, KEEP_HOURS, LakeMoment, LakeSnapshot,
+    LoggedFile, MergeProgress, NewFile, NoMoment, OptimizeReport, ReplacedFiles, RunPart, StagedFile, TARGET_BYTES,
+    TableChange, TableCommit, TableOptimizeReport, TableVersion, TableView, VacuumReport, VisibleRun, WorkClaims,
+    add_missing_columns, encode, reader_metadata, wanted_schema,
 };
 #[cfg(feature = "remote")]
 pub use upload::{RunUpload, UploadOutcome, UploadStep};

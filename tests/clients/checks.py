@@ -1,4 +1,17 @@
-"""What the checks of served lakes share: a line each, and an exit code."""
+"""What the checks of served lakes share: a line each, and an exit code; and how tables are written into pages."""
+import re
+import sys
+
+
+def write_table(path, script, table):
+    """Replaces the table of a script in a page: what stands between its marks."""
+    with open(path, encoding="utf-8") as file:
+        page = file.read()
+    marked = re.compile(rf"(<!-- {re.escape(script)} -->\n).*?(<!-- end -->)", re.DOTALL)
+    if not marked.search(page):
+        sys.exit(f"{path} has no place for the table of {script}")
+    with open(path, "w", encoding="utf-8") as file:
+        file.write(marked.sub(lambda m: f"{m[1]}{table}\n{m[2]}", page))
 
 
 class Checks:

@@ -1,7 +1,10 @@
 """Runs Postgres' clients against a served lake and prints a table of what passed: client, passed of tried.
 
-    postgres_clients.py postgresql://me@127.0.0.1:5433/datafusion
-    postgres_clients.py URL --control postgresql://postgres@127.0.0.1:5432/lake
+    postgres_clients.py postgresql://me@127.0.0.1:5433/datafusion --lake LAKE --flight grpc://127.0.0.1:8081
+    postgres_clients.py ... --control postgresql://postgres@127.0.0.1:5432/lake
+
+Each driver also reads samples of all tables and views, whose names, types and values must be those that pyarrow reads from
+the lake's folder, and for views from Arrow Flight SQL (`lake_samples.py`).
 
 With `--control`, the lake's tables are first loaded into that database of a real PostgreSQL (some rows of each), and the
 same checks are run against it: its figures say which failures are the checks' own. `--client NAME` runs one client alone,
@@ -9,8 +12,8 @@ same checks are run against it: its figures say which failures are the checks' o
 
 A client that is not installed is left out with a line on stderr. Needed for all: psql, perl with DBD::Pg, a JDK with
 pgjdbc in /usr/share/java, Go with lib/pq, pyodbc with Debian's odbc-postgresql, in this folder's `postgres/` the npm
-packages pg, postgres and knex, and the PyPI packages psycopg[binary], psycopg2-binary, pg8000, asyncpg, sqlalchemy,
-pandas, polars, connectorx, sqlacodegen, ibis-framework[postgres], pgcli and adbc-driver-postgresql.
+packages pg, pg-cursor, postgres and knex, and the PyPI packages psycopg[binary], psycopg2-binary, pg8000, asyncpg,
+sqlalchemy[asyncio], pandas, polars, connectorx, sqlacodegen, ibis-framework[postgres], pgcli and adbc-driver-postgresql.
 """
 import argparse
 import asyncio
@@ -29,9 +32,11 @@ import urllib.parse
 
 import psycopg
 
+from checks import write_table
+from lake_samples import NUMBERS, load_samples, type_of_arrow
+
 HERE = os.path.dirname(os.path.abspath(__file__))
 PROGRAMS = os.path.join(HERE, "postgres")
-SAMPLE_ROWS = 50
 TIMEOUT_SECS = 120
 CHECK_SECS = 20
 
@@ -45,8 +50,10 @@ COMMANDS = r"""\d;\d pairs;\d runs;\dS pg_class;\da;\dA;\dAc;\dAf;\dAo;\dAp;\db;
 class ClientRun:
     """The checks of one client against one server."""
 
-    def __init__(self, url):
+    def __init__(self, url, samples, flight):
         self.url = url
+        self.samples = samples
+        self.flight = flight
         self.results = {}
 
     def check(self, name, act, expected=None):
@@ -62,11 +69,28 @@ class ClientRun:
             self.results[name] = f"{type(error).__name__}: {error}"[:600]
 
     def run_program(self, arguments, **options):
-        """Takes the results of a program that prints a JSON object per check."""
+        """Takes the results of a program that prints a JSON object per check, and one per sample, whose queries it is given."""
+        with tempfile.NamedTemporaryFile("w", suffix=".tsv", encoding="utf-8") as file:
+            file.writelines(f"{sample.table}\t{sample.sql}\n" for sample in self.samples)
+            file.flush()
+            self.take_results([*arguments, file.name], options)
+
+    def take_results(self, arguments, options):
+        """Runs the program."""
         ran = subprocess.run(arguments, capture_output=True, text=True, timeout=TIMEOUT_SECS, **options)
         lines = [json.loads(line) for line in ran.stdout.splitlines() if line.startswith("{")]
+        answers = {line["table"]: line for line in lines if "table" in line}
         for line in lines:
-            self.results[line["check"]] = line.get("error")
+            if "check" in line:
+                self.results[line["check"]] = line.get("error")
+        for sample in self.samples:
+            line = answers.get(sample.table, {"error": "no rows"})
+            def compare():
+                if "error" in line:
+                    raise RuntimeError(line["error"])
+                sample.compare([(name, type_name(kind)) for name, kind in line["columns"]], line["rows"])
+                return True
+            self.check(f"values of {sample.table}", compare)
         if ran.returncode or not lines:
             self.results["the program"] = (ran.stderr or ran.stdout)[-600:]
 
@@ -80,6 +104,12 @@ def split_url(url):
     """Host, port, user and database, as the drivers take them that know no URL."""
     parts = urllib.parse.urlsplit(url)
     return {"host": parts.hostname, "port": parts.port, "user": parts.username, "database": parts.path.strip("/")}
+
+
+def type_name(kind):
+    """Postgres' name of a type in lower case, of its name in a driver or its number."""
+    name = NUMBERS.get(int(kind), str(kind)) if str(kind).isdigit() else str(kind).lower()
+    return f"_{name[:-2]}" if name.endswith("[]") else name
 
 
 def list_tables(url):
@@ -121,10 +151,20 @@ def check_values(run, query, style, skip=()):
         run.check(sql, lambda: tuple(query(asked, values)), expected)
 
 
-def check_tables(run, query_all):
-    """Reads all columns of all tables and views."""
-    for table in list_tables(run.url):
-        run.check(f"select * from {table}", lambda: query_all(f'select * from "{table}" limit 5') is not None)
+def check_samples(run, fetch):
+    """Reads a sample of each table and view; `fetch` returns columns with their types, and rows, of a query."""
+    for sample in run.samples:
+        def compare():
+            columns, rows = fetch(sample.sql)
+            sample.compare([(name, type_name(kind)) for name, kind in columns], rows)
+            return True
+        run.check(f"values of {sample.table}", compare)
+
+
+def fetch_described(cursor, sql, values=None):
+    """Columns with their types, and rows, of a cursor of Python's database interface."""
+    cursor.execute(sql, values)
+    return [(column[0], column[1]) for column in cursor.description], cursor.fetchall()
 
 
 def psql(run):
@@ -142,9 +182,8 @@ def psycopg_3(run):
     with psycopg.connect(run.url, autocommit=True) as lake:
         one = lambda sql, values: lake.execute(sql, values or None).fetchone()
         check_values(run, one, lambda n: "%s")
-        check_tables(run, lambda sql: lake.execute(sql).fetchall())
-        binary = lambda sql: lake.cursor(binary=True).execute(sql).fetchall()
-        run.check("binary", lambda: len(binary("select * from measurements limit 3")), 3)
+        check_samples(run, lambda sql: fetch_described(lake.cursor(binary=True), sql))
+        run.check("text", lambda: len(lake.execute("select * from measurements limit 3").fetchall()), 3)
         run.check("stream", lambda: sum(1 for _ in lake.cursor().stream("select * from pairs limit 9")), 9)
         def copied():
             with lake.cursor().copy("copy (select pair_id from pairs limit 4) to stdout") as copy:
@@ -174,7 +213,7 @@ def psycopg_2(run):
             cursor.execute(sql, values)
             return cursor.fetchall()
     check_values(run, lambda sql, values: ask(sql, values or None)[0], lambda n: "%s")
-    check_tables(run, ask)
+    check_samples(run, lambda sql: fetch_described(lake.cursor(), sql))
     def named():
         own = psycopg2.connect(run.url)
         cursor = own.cursor("named")
@@ -195,7 +234,10 @@ def pg8000(run):
         return lake.run(sql, **named)[0]
     # pg8000 takes a colon for a placeholder of its own; casts are written out.
     check_values(run, lambda sql, values: one(sql, values), lambda n: f":v{n}")
-    check_tables(run, lake.run)
+    def fetch(sql):
+        rows = lake.run(sql)
+        return [(column["name"], column["type_oid"]) for column in lake.columns], rows
+    check_samples(run, fetch)
     prepared = lambda: lake.prepare("select pair_id from pairs where pair_id < :n").run(n=4)
     run.check("prepared", lambda: len(prepared()), 4)
     lake.close()
@@ -212,7 +254,10 @@ def asyncpg(run):
             lake.terminate()
     ask = lambda act: asyncio.run(connected(act))
     check_values(run, lambda sql, values: ask(lambda lake: lake.fetchrow(sql, *values)), lambda n: f"${n}")
-    check_tables(run, lambda sql: ask(lambda lake: lake.fetch(sql)))
+    async def fetch(lake, sql):
+        statement = await lake.prepare(sql)
+        return [(a.name, a.type.name) for a in statement.get_attributes()], [tuple(row) for row in await statement.fetch()]
+    check_samples(run, lambda sql: ask(lambda lake: fetch(lake, sql)))
     when = datetime.datetime(2020, 1, 1, tzinfo=datetime.timezone.utc)
     run.check("a time", lambda: ask(lambda lake: lake.fetchval("select $1::timestamptz", when)), when)
     run.check("any without a type", lambda: ask(lambda lake: lake.fetchval("select count(*) from pairs where pair_id = any($1)", [1, 2])), 2)
@@ -235,6 +280,19 @@ def asyncpg(run):
         statement = await lake.prepare("select pair_id, direct_mm from pairs where pair_id = $1")
         return [p.name for p in statement.get_parameters()], [a.type.name for a in statement.get_attributes()]
     run.check("prepared types", lambda: ask(prepared), (["int4"], ["int4", "float8"]))
+
+
+# Postgres' names of types by SQLAlchemy's.
+SQL_TYPES = {
+    "TEXT": "text", "BOOLEAN": "bool", "SMALLINT": "int2", "INTEGER": "int4", "BIGINT": "int8", "REAL": "float4", "DOUBLE PRECISION": "float8",
+    "TIMESTAMP WITH TIME ZONE": "timestamptz", "REAL[]": "_float4", "DOUBLE PRECISION[]": "_float8", "INTEGER[]": "_int4", "TEXT[]": "_text", "BYTEA": "bytea",
+}
+
+
+def sql_type(kind, engine):
+    """Postgres' name of a type of SQLAlchemy's."""
+    written = kind.compile(dialect=engine.dialect)
+    return SQL_TYPES.get(written, written)
 
 
 def sqlalchemy(run):
@@ -263,10 +321,16 @@ def sqlalchemy(run):
         run.check(name("column's comment"), lambda: bool(inspector().get_columns("pairs")[0]["comment"]))
         run.check(name("has_table"), lambda: inspector().has_table("pairs"))
         run.check(name("enums"), lambda: inspector().get_enums() == [])
+        def reflected(sql):
+            table = sa.Table(re.search('from "(.*?)"', sql)[1], sa.MetaData(), autoload_with=engine)
+            with engine.connect() as own:
+                return [(c.name, sql_type(c.type, engine)) for c in table.columns], [tuple(row) for row in own.execute(sa.text(sql))]
+        if driver == "psycopg":
+            check_samples(run, reflected)
         def types():
             table = sa.Table("measurements", sa.MetaData(), autoload_with=engine)
-            return {str(table.c[n].type) for n in ("ir",)}
-        run.check(name("list's type"), types, {"REAL[]"})
+            return sql_type(table.c.ir.type, engine)
+        run.check(name("list's type"), types, "_float4")
         def reflect():
             known = sa.MetaData()
             known.reflect(engine, views=True)
@@ -336,6 +400,20 @@ def pgcli(run):
         run.check(command, ask)
 
 
+def fetch_arrow(table):
+    """Columns with their types, and rows, of an answer of ADBC."""
+    return [(field.name, type_of_arrow(field.type)) for field in table.schema], list(zip(*(c.to_pylist() for c in table.columns)))
+
+
+def flight_sql(run):
+    import adbc_driver_flightsql.dbapi as driver
+    with driver.connect(run.flight, autocommit=True) as lake, lake.cursor() as cursor:
+        def fetch(sql):
+            cursor.execute(sql)
+            return fetch_arrow(cursor.fetch_arrow_table())
+        check_samples(run, fetch)
+
+
 def adbc(run):
     import adbc_driver_postgresql.dbapi as driver
     with driver.connect(run.url, autocommit=True) as lake:
@@ -345,7 +423,7 @@ def adbc(run):
                 return cursor.fetch_arrow_table()
         row = lambda sql, values: tuple(ask(sql, values).to_pylist()[0].values())
         check_values(run, row, lambda n: f"${n}", skip={"select 1, 1", "select count(*) from pairs where pair_id = any($1::int[])"})
-        check_tables(run, ask)
+        check_samples(run, lambda sql: fetch_arrow(ask(sql)))
         for depth in "catalogs", "db_schemas", "tables", "columns", "all":
             run.check(f"get_objects {depth}", lambda: lake.adbc_get_objects(depth=depth).read_all().num_rows > 0)
         run.check("get_objects of a table", lambda: "pairs" in str(lake.adbc_get_objects(depth="columns", table_name_filter="pairs").read_all().to_pylist()))
@@ -362,8 +440,12 @@ def odbc(run):
     lake = pyodbc.connect(settings, autocommit=True)
     arrays = [sql for sql, values, expected in VALUES if "array" in sql or "any(" in sql]
     check_values(run, lambda sql, values: lake.execute(sql, *values).fetchone(), lambda n: "?", skip=arrays)
-    check_tables(run, lambda sql: lake.execute(sql).fetchall())
     cursor = lake.cursor()
+    def fetch(sql):
+        table = re.search('from "(.*?)"', sql)[1]
+        types = [(row.column_name, row.type_name) for row in lake.cursor().columns(table=table, schema="public").fetchall()]
+        return types, lake.execute(sql).fetchall()
+    check_samples(run, fetch)
     for name, arguments in [
         ("tables", {}), ("columns", {"table": "pairs"}), ("statistics", {"table": "pairs"}), ("primaryKeys", {"table": "pairs"}),
         ("foreignKeys", {"table": "pairs"}), ("getTypeInfo", {}), ("procedures", {}), ("rowIdColumns", {"table": "pairs"}),
@@ -436,6 +518,7 @@ CLIENTS = [
     ("sqlacodegen", sqlacodegen, ["sqlacodegen"]),
     ("ibis", ibis, ["ibis"]),
     ("pgcli", pgcli, ["pgcli"]),
+    ("ADBC Flight SQL", flight_sql, []),
     ("ADBC", adbc, ["adbc_driver_postgresql"]),
     ("polars, connectorx", polars, ["polars", "connectorx"]),
     ("ODBC", odbc, ["pyodbc"]),
@@ -461,8 +544,8 @@ def find_missing(needs):
     return None
 
 
-def run_clients(url, names):
-    """The results by client: check and text of its failure, None if it passed."""
+def run_clients(url, names, samples, flight):
+    """The results by client: check and text of its failure, None if it passed; without `flight` not over Flight SQL."""
     results = {}
     for name, act, needs in CLIENTS:
         if names and not any(asked.lower() in name.lower() for asked in names):
@@ -470,7 +553,9 @@ def run_clients(url, names):
         if missing := find_missing(needs):
             print(f"left out: {name} ({missing} is not installed)", file=sys.stderr)
             continue
-        run = ClientRun(url)
+        if act is flight_sql and not flight:
+            continue
+        run = ClientRun(url, samples, flight)
         try:
             act(run)
         except Exception as error:  # a client that cannot even connect
@@ -485,11 +570,12 @@ def count_passed(results):
     return sum(error is None for error in results.values())
 
 
-def load_control(url, control):
-    """Loads some rows of each table, and views of them under the views' names."""
+def load_control(url, control, samples):
+    """Loads all pairs and the samples of the other tables, and views of them under the views' names."""
     with psycopg.connect(url, autocommit=True) as lake, psycopg.connect(control, autocommit=True) as own:
         kinds = dict(lake.execute("select table_name, table_type from information_schema.tables where table_schema = 'public'").fetchall())
         own.execute("drop schema if exists public, stored cascade; create schema public; create schema stored")
+        queries = {sample.table: sample.sql for sample in samples} | {"pairs": "select * from pairs"}
         for name, kind in kinds.items():
             is_view = kind == "VIEW" or name not in BASE_TABLES
             stored = f"{name}_rows" if is_view else name
@@ -497,8 +583,7 @@ def load_control(url, control):
             types = [own.execute("select format_type(%s, -1)", (c.type_code,)).fetchone()[0] for c in answer.description]
             columns = ", ".join(f'"{c.name}" {kind}' for c, kind in zip(answer.description, types))
             own.execute(f'create table "{stored}" ({columns})')
-            rows = 100_000 if name == "pairs" else SAMPLE_ROWS
-            with lake.cursor().copy(f'copy (select * from "{name}" limit {rows}) to stdout') as source, own.cursor().copy(f'copy "{stored}" from stdin') as target:
+            with lake.cursor().copy(f"copy ({queries[name]}) to stdout") as source, own.cursor().copy(f'copy "{stored}" from stdin') as target:
                 for part in source:
                     target.write(part)
             if is_view:
@@ -521,33 +606,25 @@ def format_table(results, control):
     return "\n".join(lines)
 
 
-def write_table(path, table):
-    """Replaces what stands between the marks in a page."""
-    with open(path, encoding="utf-8") as file:
-        page = file.read()
-    marked = re.compile(r"(<!-- postgres_clients\.py -->\n).*?(<!-- end -->)", re.DOTALL)
-    if not marked.search(page):
-        sys.exit(f"{path} has no place for the table")
-    with open(path, "w", encoding="utf-8") as file:
-        file.write(marked.sub(lambda m: f"{m[1]}{table}\n{m[2]}", page))
-
-
 def main():
     signal.signal(signal.SIGALRM, stop_check)
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("url")
+    parser.add_argument("--lake", required=True, help="the folder of the lake that is served")
+    parser.add_argument("--flight", required=True, help="where it is served over Arrow Flight SQL")
     parser.add_argument("--control", help="an empty database of a real PostgreSQL; its schema public is replaced")
     parser.add_argument("--client", action="append", default=[], help="a part of a client's name")
     parser.add_argument("--json", action="store_true")
     parser.add_argument("--write", help="the page whose table is replaced")
     given = parser.parse_args()
+    samples = load_samples(given.lake, given.flight)
     control = {}
     if given.control:
-        load_control(given.url, given.control)
+        load_control(given.url, given.control, samples)
         print("PostgreSQL:", file=sys.stderr)
-        control = run_clients(given.control, given.client)
+        control = run_clients(given.control, given.client, samples, None)
         print("echolake:", file=sys.stderr)
-    results = run_clients(given.url, given.client)
+    results = run_clients(given.url, given.client, samples, given.flight)
     if given.json:
         print(json.dumps({"results": results, "control": control}, indent=1))
         return 0
@@ -558,7 +635,7 @@ def main():
                 beside = " (PostgreSQL, too)" if control.get(name, {}).get(check) else ""
                 print(f"FAIL {name}: {check}{beside}: {' '.join(failure.split())[:300]}")
     if given.write:
-        write_table(given.write, format_table(results, control))
+        write_table(given.write, "postgres_clients.py", format_table(results, control))
     return int(any(failure for checks in results.values() for failure in checks.values()))
 
 

@@ -75,7 +75,8 @@ fn a_large_upload_that_is_cut_off_ten_times_sends_no_part_twice_that_is_known_to
         wait_until("the end of the killed one's connections", || store.connections() == 0);
         store.limit_parts(store.parts() + 1);
         let expected = store.parts() + 1;
-        let mut upload = ChildProcess::start(&mut command(&place, &store, &["upload", "large.mcap"])).expect("it starts");
+        let mut upload =
+            ChildProcess::start(&mut command(&place, &store, &["upload", "large.mcap"])).expect("it starts");
         wait_until("a part more", || store.parts() >= expected);
         // A kill between the two costs that part.
         wait_until("its line in the journal", || {
@@ -137,7 +138,11 @@ fn uploaded_runs_are_ingested_by_their_digest_and_known_ever_after() {
     assert_eq!(uploaded(&ok(&place, &store, &["upload", &runs[0], &runs[1], "--json"])), inbox(false));
 
     ok(&place, &store, &["ingest"]);
-    assert!(store.keys().iter().all(|key| !key.contains("/inbox/") && !key.contains("/_claims/")), "{:?}", store.keys());
+    assert!(
+        store.keys().iter().all(|key| !key.contains("/inbox/") && !key.contains("/_claims/")),
+        "{:?}",
+        store.keys()
+    );
     let in_runs = [format!("runs/flat/{}", names[0]), format!("runs/foam/{}", names[1])];
     for (path, run) in in_runs.iter().zip(&runs) {
         assert!(store.get(&key(path)) == std::fs::read(run).expect("read"));
@@ -165,7 +170,8 @@ fn what_is_not_closed_and_what_is_another_file_is_refused_and_the_rest_goes_up()
     let end = other.len() - 100;
     other[end] ^= 1;
     store.put(&key(&format!("inbox/{name}")), other.clone());
-    let output = run(&place, &store, &["upload", "cut.mcap", "going.mcap.partial", "text.mcap", &runs[0], "absent.mcap"]);
+    let output =
+        run(&place, &store, &["upload", "cut.mcap", "going.mcap.partial", "text.mcap", &runs[0], "absent.mcap"]);
     let said = stderr(&output);
     assert_eq!(output.status.code(), Some(1), "{said}");
     for expected in [
@@ -269,11 +275,16 @@ fn three_ingests_share_an_inbox_without_doing_anything_twice() {
         .collect();
     for run in &runs {
         let name = run.rsplit('/').next().and_then(|name| name.strip_suffix(".mcap")).expect("a run");
-        let taken = said.lines().filter(|line| line.starts_with(&format!("{name}: ")) && line.ends_with(" measurements"));
+        let taken =
+            said.lines().filter(|line| line.starts_with(&format!("{name}: ")) && line.ends_with(" measurements"));
         assert_eq!(taken.count(), 1, "{name}: {said}");
     }
     assert!(!said.contains("is in the lake already"), "{said}");
     let count = ok(&place, &store, &["sql", "--format", "csv", "select count(*) as n from runs"]);
     assert_eq!(count, format!("n\n{}\n", surfaces.len()));
-    assert!(store.keys().iter().all(|key| !key.contains("/inbox/") && !key.contains("/_claims/")), "{:?}", store.keys());
+    assert!(
+        store.keys().iter().all(|key| !key.contains("/inbox/") && !key.contains("/_claims/")),
+        "{:?}",
+        store.keys()
+    );
 }

@@ -109,6 +109,7 @@ impl SourceColumns {
             Some(FunctionArgExpr::QualifiedWildcard(table)) => self.all(|column| column.is_of(table)),
             Some(FunctionArgExpr::WildcardWithOptions(options)) if only_excludes(options) => {
                 let excluded = excluded(options);
+                self.check_names(&excluded)?;
                 self.all(|column| !excluded.contains(&column.name))
             }
             Some(FunctionArgExpr::Expr(Expr::Value(ValueWithSpan {
@@ -123,6 +124,17 @@ impl SourceColumns {
             return Err(refused(format!("`{function}` chooses no column"), self.listed()));
         }
         Ok(chosen)
+    }
+
+    /// Accepts names of columns.
+    ///
+    /// # Errors
+    /// [`Error::Query`] if one is not there.
+    pub(super) fn check_names<'a>(&self, names: impl IntoIterator<Item = &'a String>) -> Result<(), Error> {
+        match names.into_iter().find(|name| !self.has(name)) {
+            Some(unknown) => Err(refused(format!("no column `{unknown}`"), self.listed())),
+            None => Ok(()),
+        }
     }
 
     fn all(&self, is_chosen: impl Fn(&SourceColumn) -> bool) -> Vec<ChosenColumn> {
@@ -230,6 +242,11 @@ pub(super) fn excluded(options: &WildcardAdditionalOptions) -> Vec<String> {
         names.extend(all.into_iter().map(tree::normalized));
     }
     names
+}
+
+/// Returns whether a wildcard has no options.
+pub(super) fn is_plain(options: &WildcardAdditionalOptions) -> bool {
+    options.opt_exclude.is_none() && options.opt_except.is_none() && only_excludes(options)
 }
 
 fn only_excludes(options: &WildcardAdditionalOptions) -> bool {

@@ -12,6 +12,9 @@ use super::columns::{self, ChosenColumn, SourceColumn, SourceColumns, refused};
 use super::tree;
 use crate::Error;
 
+/// Maximum number of columns that a condition is repeated for: the repetitions are one chain of AND.
+const MOST_CONDITIONS: usize = 300;
+
 /// Writes out the select lists and conditions of a query whose tables have these columns.
 pub(super) struct SelectExpansion<'a> {
     pub(super) source: &'a SourceColumns,
@@ -89,7 +92,7 @@ impl SelectExpansion<'_> {
                 if !self.source.iter().any(|column| column.is_of(&name)) =>
             {
                 self.budget.take_choice(self.source.len())?;
-                match self.fields(&name) {
+                match self.fields(&name, &options) {
                     Some(fields) => items.extend(fields),
                     None => items.push(SelectItem::QualifiedWildcard(
                         SelectItemQualifiedWildcardKind::ObjectName(name),
@@ -121,6 +124,10 @@ impl SelectExpansion<'_> {
 
     fn expand_condition(&mut self, condition: &mut Expr) -> Result<(), Error> {
         let copies = self.copies(condition.clone())?;
+        if copies.len() > MOST_CONDITIONS {
+            let hint = "a regular expression that fewer columns match".to_owned();
+            return Err(refused(format!("more than {MOST_CONDITIONS} columns in a condition"), hint));
+        }
         if let Some(all) = copies.into_iter().map(|(expr, _)| expr).reduce(tree::and) {
             *condition = all;
         }
@@ -164,14 +171,17 @@ impl SelectExpansion<'_> {
             Some(RenameSelectItem::Multiple(many)) => many.iter().collect(),
             None => Vec::new(),
         };
-        if let Some(unknown) = renamed.iter().find(|one| !self.source.has(&tree::normalized(&one.ident))) {
-            let hint = "DESCRIBE shows the columns of a table or query".to_owned();
-            return Err(refused(format!("no column `{}` to rename", unknown.ident.value), hint));
-        }
         let excluded = columns::excluded(options);
         let replaced = options.opt_replace.iter().flat_map(|replace| &replace.items);
         let replaced: Vec<_> =
             replaced.map(|element| (tree::normalized(&element.column_name), &element.expr)).collect();
+        let names = renamed.iter().map(|one| tree::normalized(&one.ident));
+        let left: Vec<_> = names.chain(replaced.iter().map(|(name, _)| name.clone())).collect();
+        self.source.check_names(excluded.iter().chain(&left))?;
+        if let Some(name) = left.iter().find(|name| excluded.contains(name)) {
+            let hint = format!("EXCLUDE without `{name}`, or only EXCLUDE");
+            return Err(refused(format!("`{name}` is left out and has a new name or value"), hint));
+        }
         for column in self.source.iter().filter(|c| is_wanted(c) && !excluded.contains(&c.name)) {
             let alias = renamed.iter().find(|one| tree::normalized(&one.ident) == column.name);
             let alias = alias.map(|one| tree::quoted(&tree::normalized(&one.alias)));
@@ -184,7 +194,11 @@ impl SelectExpansion<'_> {
         Ok(())
     }
 
-    fn fields(&self, name: &ObjectName) -> Option<Vec<SelectItem>> {
+    // None if it is no struct, or has options that the planner refuses.
+    fn fields(&self, name: &ObjectName, options: &WildcardAdditionalOptions) -> Option<Vec<SelectItem>> {
+        if !columns::is_plain(options) {
+            return None;
+        }
         let name = name.0.last().and_then(|part| part.as_ident()).map(tree::normalized)?;
         let column = self.source.iter().find(|column| column.name == name)?;
         let DataType::Struct(fields) = &column.data_type else { return None };

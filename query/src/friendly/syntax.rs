@@ -100,11 +100,10 @@ impl VisitorMut for FriendlyVisitor {
 
     fn pre_visit_expr(&mut self, expr: &mut Expr) -> ControlFlow<Box<Error>> {
         match expr {
-            Expr::CompoundFieldAccess { root, access_chain } => {
-                if access_chain.iter().any(|access| matches!(access, AccessExpr::Dot(Expr::Function(_)))) {
-                    *expr =
-                        chained_calls(std::mem::replace(&mut **root, tree::number(0)), std::mem::take(access_chain));
-                }
+            Expr::CompoundFieldAccess { root, access_chain }
+                if access_chain.iter().any(|access| matches!(access, AccessExpr::Dot(Expr::Function(_)))) =>
+            {
+                *expr = chained_calls(std::mem::replace(&mut **root, tree::number(0)), std::mem::take(access_chain));
             }
             Expr::Function(function) => call_on_column(function),
             _ => {}

@@ -14,8 +14,7 @@ use crate::{Error, Result};
 
 /// Suffix of a journal's name.
 const SUFFIX: &str = "upload";
-const HINT: &str =
-    "; hint: the journal of an upload stands beside the run file; make its folder writable, or upload a copy of the file";
+const HINT: &str = "; hint: the journal of an upload stands beside the run file; make its folder writable, or upload a copy of the file";
 
 /// A journal, locked while its upload runs.
 #[derive(Debug)]
@@ -62,8 +61,7 @@ impl UploadJournal {
         path.push(SUFFIX);
         let path = PathBuf::from(path);
         let failed = |source| journal_error("open", &path, source);
-        let mut file =
-            OpenOptions::new().read(true).append(true).create(true).open(&path).map_err(failed)?;
+        let mut file = OpenOptions::new().read(true).append(true).create(true).open(&path).map_err(failed)?;
         match file.try_lock() {
             Ok(()) => {}
             Err(TryLockError::WouldBlock) => return Err(Error::UploadBusy { file: run.file.clone() }),
@@ -197,10 +195,8 @@ mod tests {
     fn a_journal_of_another_upload_is_begun_anew() {
         let folder = tempfile::tempdir().expect("a folder");
         let first = run(&folder);
-        let others = [
-            RunUpload { sha256: "cd".to_owned(), ..first.clone() },
-            RunUpload { bytes: 101, ..first.clone() },
-        ];
+        let others =
+            [RunUpload { sha256: "cd".to_owned(), ..first.clone() }, RunUpload { bytes: 101, ..first.clone() }];
         for other in others {
             open(&first).expect("new").begin("id".to_owned()).expect("written");
             assert!(!open(&other).expect("there").is_begun(), "{other:?}");

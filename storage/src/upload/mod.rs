@@ -157,8 +157,7 @@ impl Lake {
             Ok(actual) if actual == run.sha256 => Ok(UploadOutcome::Uploaded(inbox.clone())),
             Ok(actual) => {
                 store.delete(inbox).await.map_err(|e| Error::store("delete", inbox, e))?;
-                let (location, path, expected) =
-                    (self.location().to_owned(), inbox.to_string(), run.sha256.clone());
+                let (location, path, expected) = (self.location().to_owned(), inbox.to_string(), run.sha256.clone());
                 Err(Error::UploadDamaged { location, path, expected, actual })
             }
             // An ingest has compared it, and moved it.

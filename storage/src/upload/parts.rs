@@ -84,7 +84,8 @@ async fn try_send(
         let begin = number as u64 * size;
         begin..(begin + size).min(run.bytes)
     };
-    let mut sent: u64 = journal.parts().keys().map(|number| range(*number)).map(|r| r.end.saturating_sub(r.start)).sum();
+    let mut sent: u64 =
+        journal.parts().keys().map(|number| range(*number)).map(|r| r.end.saturating_sub(r.start)).sum();
     progress(UploadStep::Send, sent);
     let missing: Vec<_> = (0..count).filter(|number| !journal.parts().contains_key(number)).collect();
     let send_one = |number: usize| {

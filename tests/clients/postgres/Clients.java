@@ -1,15 +1,18 @@
+import java.nio.file.Files;
+import java.nio.file.Path;
+import java.sql.Array;
 import java.sql.Connection;
 import java.sql.DatabaseMetaData;
 import java.sql.DriverManager;
 import java.sql.PreparedStatement;
 import java.sql.ResultSet;
+import java.sql.ResultSetMetaData;
 import java.sql.Statement;
 import java.sql.Timestamp;
-import java.util.ArrayList;
-import java.util.List;
+import java.time.OffsetDateTime;
 import java.util.Objects;
 
-/** Checks a server with pgjdbc: the URL is given, a JSON object per check is printed. */
+/** Checks a server with pgjdbc: given are the URL and a file of queries, printed are a JSON object per check and per query. */
 public class Clients {
     interface Act {
         Object run() throws Exception;
@@ -58,6 +61,41 @@ public class Clients {
         }
         rows.close();
         return count;
+    }
+
+    static String sample(Connection lake, String sql) throws Exception {
+        StringBuilder columns = new StringBuilder();
+        StringBuilder all = new StringBuilder();
+        try (Statement statement = lake.createStatement(); ResultSet rows = statement.executeQuery(sql)) {
+            ResultSetMetaData about = rows.getMetaData();
+            for (int i = 1; i <= about.getColumnCount(); i++) {
+                columns.append(i > 1 ? ", " : "").append("[" + quote(about.getColumnName(i)) + ", " + quote(about.getColumnTypeName(i)) + "]");
+            }
+            while (rows.next()) {
+                all.append(all.length() > 0 ? ", [" : "[");
+                for (int i = 1; i <= about.getColumnCount(); i++) {
+                    boolean isTime = about.getColumnTypeName(i).equals("timestamptz");
+                    Object value = isTime ? rows.getObject(i, OffsetDateTime.class) : rows.getObject(i);
+                    all.append(i > 1 ? ", " : "").append(json(value));
+                }
+                all.append("]");
+            }
+        }
+        return "\"columns\": [" + columns + "], \"rows\": [" + all + "]";
+    }
+
+    static String json(Object value) throws Exception {
+        if (value == null) {
+            return "null";
+        }
+        if (!(value instanceof Array list)) {
+            return quote(String.valueOf(value));
+        }
+        StringBuilder items = new StringBuilder("[");
+        for (Object item : (Object[]) list.getArray()) {
+            items.append(items.length() > 1 ? ", " : "").append(json(item));
+        }
+        return items.append("]").toString();
     }
 
     public static void main(String[] arguments) throws Exception {
@@ -163,14 +201,15 @@ public class Clients {
             check("getMaxColumnNameLength", 63, about::getMaxColumnNameLength);
             check("getMaxColumnsInIndex", 32, about::getMaxColumnsInIndex);
             check("getDatabaseProductName", "PostgreSQL", about::getDatabaseProductName);
-            List<String> tables = new ArrayList<>();
-            try (Statement s = lake.createStatement(); ResultSet rows = s.executeQuery("select table_name from information_schema.tables where table_schema = 'public'")) {
-                while (rows.next()) {
-                    tables.add(rows.getString(1));
+            for (String line : Files.readAllLines(Path.of(arguments[1]))) {
+                String[] parts = line.split("\t", 2);
+                String answer;
+                try {
+                    answer = sample(lake, parts[1]);
+                } catch (Exception e) {
+                    answer = "\"error\": " + quote(String.valueOf(e.getMessage()));
                 }
-            }
-            for (String table : tables) {
-                check("select * from " + table, null, () -> count(lake.createStatement().executeQuery("select * from \"" + table + "\" limit 3")));
+                System.out.println("{\"table\": " + quote(parts[0]) + ", " + answer + "}");
             }
         }
     }

@@ -1,11 +1,14 @@
-// Checks a server with Go's lib/pq: the URL is given, a JSON object per check is printed.
+// Checks a server with Go's lib/pq: given are the URL and a file of queries, printed are a JSON object per check and per
+// query.
 package main
 
 import (
 	"database/sql"
+	"encoding/hex"
 	"encoding/json"
 	"fmt"
 	"os"
+	"strings"
 	"time"
 
 	"github.com/lib/pq"
@@ -98,26 +101,76 @@ func main() {
 		_, err := lake.Exec("select * from nope")
 		return err.(*pq.Error).Code, nil
 	})
-	rows, err := lake.Query("select table_name from information_schema.tables where table_schema = 'public'")
+	queries, err := os.ReadFile(os.Args[2])
 	if err != nil {
 		panic(err)
 	}
-	var tables []string
-	for rows.Next() {
-		var table string
-		rows.Scan(&table)
-		tables = append(tables, table)
+	for _, line := range strings.Split(strings.TrimSpace(string(queries)), "\n") {
+		parts := strings.SplitN(line, "\t", 2)
+		answer := map[string]interface{}{"table": parts[0]}
+		if columns, rows, err := sample(lake, parts[1]); err != nil {
+			answer["error"] = err.Error()
+		} else {
+			answer["columns"], answer["rows"] = columns, rows
+		}
+		text, _ := json.Marshal(answer)
+		fmt.Println(string(text))
 	}
-	for _, table := range tables {
-		check("select * from "+table, nil, func() (interface{}, error) {
-			rows, err := lake.Query(fmt.Sprintf("select * from %s limit 3", pq.QuoteIdentifier(table)))
-			if err != nil {
-				return nil, err
+}
+
+func sample(lake *sql.DB, query string) (columns [][]string, all [][]interface{}, err error) {
+	rows, err := lake.Query(query)
+	if err != nil {
+		return nil, nil, err
+	}
+	defer rows.Close()
+	types, err := rows.ColumnTypes()
+	if err != nil {
+		return nil, nil, err
+	}
+	for _, kind := range types {
+		columns = append(columns, []string{kind.Name(), kind.DatabaseTypeName()})
+	}
+	for rows.Next() {
+		values := make([]interface{}, len(types))
+		places := make([]interface{}, len(types))
+		for i, kind := range types {
+			places[i] = &values[i]
+			if strings.HasPrefix(kind.DatabaseTypeName(), "_") {
+				values[i] = &[]sql.NullString{}
+				places[i] = pq.Array(values[i])
 			}
-			defer rows.Close()
-			for rows.Next() {
+		}
+		if err = rows.Scan(places...); err != nil {
+			return nil, nil, err
+		}
+		for i := range values {
+			values[i] = printable(values[i])
+		}
+		all = append(all, values)
+	}
+	return columns, all, rows.Err()
+}
+
+func printable(value interface{}) interface{} {
+	switch value := value.(type) {
+	case nil:
+		return nil
+	case *[]sql.NullString:
+		items := []interface{}{}
+		for _, item := range *value {
+			if item.Valid {
+				items = append(items, item.String)
+			} else {
+				items = append(items, nil)
 			}
-			return nil, rows.Err()
-		})
+		}
+		return items
+	case time.Time:
+		return value.UTC().Format(time.RFC3339Nano)
+	case []byte:
+		return hex.EncodeToString(value)
+	default:
+		return fmt.Sprint(value)
 	}
 }

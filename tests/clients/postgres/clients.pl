@@ -1,10 +1,11 @@
-# Checks a server with Perl's DBD::Pg: `clients.pl HOST PORT USER DATABASE` prints a JSON object per check.
+# Checks a server with Perl's DBD::Pg: `clients.pl HOST PORT USER DATABASE QUERIES` prints a JSON object per check
+# and per query of the file.
 use strict;
 use warnings;
 use DBI;
 use JSON::PP;
 
-my ($host, $port, $user, $database) = @ARGV;
+my ($host, $port, $user, $database, $queries) = @ARGV;
 my $dbh = DBI->connect("dbi:Pg:host=$host;port=$port;dbname=$database", $user, '', { RaiseError => 1, PrintError => 0 });
 
 $| = 1;
@@ -56,6 +57,27 @@ check('copy', sub {
     $count++ while $dbh->pg_getcopydata($line) >= 0;
     return $count;
 }, 3);
-my $tables = $dbh->selectcol_arrayref(q{select table_name from information_schema.tables where table_schema = 'public'});
-check("select * from $_", do { my $table = $_; sub { @{ $dbh->selectall_arrayref(qq{select * from "$table" limit 3}) } >= 0 } }) for @$tables;
+open(my $file, '<', $queries) or die "$queries: $!";
+while (my $line = <$file>) {
+    chomp $line;
+    my ($table, $sql) = split /\t/, $line, 2;
+    my %answer = (table => $table);
+    eval {
+        my $statement = $dbh->prepare($sql);
+        $statement->execute;
+        my ($names, $types) = ($statement->{NAME}, $statement->{pg_type});
+        $answer{columns} = [ map { [ $names->[$_], $types->[$_] ] } 0 .. $#$names ];
+        $answer{rows} = [ map { my $row = $_; [ map { printable($row->[$_], $types->[$_]) } 0 .. $#$row ] } @{ $statement->fetchall_arrayref } ];
+        1;
+    } or $answer{error} = "$@";
+    print encode_json(\%answer), "\n";
+}
 $dbh->disconnect;
+
+sub printable {
+    my ($value, $type) = @_;
+    return undef unless defined $value;
+    return [ map { printable($_, $type) } @$value ] if ref $value;
+    # Perl prints numbers with fifteen digits.
+    return $type =~ /float/ ? sprintf('%.17g', $value) : "$value";
+}

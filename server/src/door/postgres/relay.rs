@@ -59,7 +59,11 @@ struct EngineLink {
 enum RelayEnd {
     Client,
     Engine,
-    Broken(RequestFault),
+    Broken(Box<RequestFault>),
+}
+
+fn broken(fault: RequestFault) -> RelayEnd {
+    RelayEnd::Broken(Box::new(fault))
 }
 
 impl Drop for MessageRelay {
@@ -106,7 +110,7 @@ impl MessageRelay {
         loop {
             match self.pass_on(&mut link).await {
                 RelayEnd::Client => return Ok(()),
-                RelayEnd::Broken(fault) => return Err(Some(fault)),
+                RelayEnd::Broken(fault) => return Err(Some(*fault)),
                 RelayEnd::Engine => link = self.recover(link).await?,
             }
         }
@@ -161,8 +165,8 @@ impl MessageRelay {
                     return Ok(());
                 }
             }
-            let Some(header) = FrameHeader::peek(&self.incoming).map_err(RelayEnd::Broken)? else { return Ok(()) };
-            header.check().map_err(RelayEnd::Broken)?;
+            let Some(header) = FrameHeader::peek(&self.incoming).map_err(broken)? else { return Ok(()) };
+            header.check().map_err(broken)?;
             let there = header.bytes.min(self.incoming.len());
             if there < header.bytes.min(ASK_BYTES) {
                 return Ok(());
