@@ -69,6 +69,17 @@ fn tables_have_the_numbers_of_the_lake() {
     assert!((total - place.number(expected)).abs() < 1e-9, "{total}");
     let tex = std::fs::read_to_string(place.path("out/levels.tex")).expect("read");
     assert!(tex.contains("\\cellcolor") && tex.contains("% Query: select surface_id, band"), "{tex}");
+    for (surfaces, base, unit) in [
+        (&["wood"][..], "flat", "dB re Flat, same band"),
+        (&["flat"], "wood", "dB, less wood"),
+        (&["wood", "flat"], "flat", "dB, less flat"),
+    ] {
+        let file = format!("out/{}-less-{base}.csv", surfaces.join("-"));
+        place.ok(&[&["figure", "table"], surfaces, &["--less", base, "-o", &file]].concat());
+        let csv = std::fs::read_to_string(place.path(&file)).expect("read");
+        assert!(csv.lines().next().is_some_and(|title| title.ends_with(unit)), "{csv}");
+    }
+    assert!(csv.lines().next().is_some_and(|title| title.ends_with("dB re Flat total")), "{csv}");
     let energies = place.ok(&["figure", "table", "wood", "--values", "energies"]);
     let flat = energies.lines().find(|line| line.starts_with("| flat")).expect("a row");
     assert!(flat.ends_with("1.000 |"), "Flat is one of Flat: {flat}");

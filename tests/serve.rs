@@ -178,6 +178,10 @@ fn tokens_let_in_and_are_needed_beyond_this_machine() {
     let mut postgres = postgres::WireClient::connect(&server, None);
     assert_eq!(postgres.log_in(&token), None);
     assert_eq!(postgres.query("select 1 as one"), Ok(vec![vec![Some("1".to_owned())]]));
+    // By its own name it is not sent: SCRAM, and a proof that is none.
+    let (mut named, request) = postgres::WireClient::start(&server, "analyst", None);
+    assert_eq!(request, b"\0\0\0\x0aSCRAM-SHA-256\0\0");
+    assert_eq!(named.log_in(&token).as_deref(), Some("22023"));
     // Taken back, it ends what runs and what waits.
     let mut running = postgres::WireClient::connect(&server, None);
     assert_eq!(running.log_in(&token), None);
@@ -235,6 +239,9 @@ fn postgres_answers_and_refuses() {
     assert_eq!(client.query("show server_version_num"), one("160006"));
     assert_eq!(client.query("select relname from pg_class where relname = 'pairs'"), one("pairs"));
     assert_eq!(client.query("select user"), one("postgres"));
+    let pid = client.pid().to_string();
+    assert_eq!(client.query("select pg_backend_pid()"), one(&pid));
+    assert_eq!(client.query("select pid from pg_stat_activity"), one(&pid));
     assert_eq!(client.query("select name from pg_timezone_names"), one("UTC"));
     for (sql, state) in [
         ("drop table runs", "25006"),

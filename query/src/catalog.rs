@@ -141,6 +141,11 @@ impl LakeCatalog {
         mcap::attachment(run, &self.current().await?.snapshot, ending, &self.runs).await
     }
 
+    /// Returns the views with their definitions.
+    pub(crate) fn view_definitions(&self) -> impl Iterator<Item = (&'static str, String)> {
+        LakeView::ALL.into_iter().map(|view| (view.name(), view.sql(&self.lake)))
+    }
+
     /// Returns the tables and views with their schemas.
     pub(crate) fn tables(&self) -> impl Iterator<Item = (&'static str, SchemaRef)> {
         self.names.iter().cloned()

@@ -389,6 +389,11 @@ impl Session {
     pub fn tables(&self) -> impl Iterator<Item = (&'static str, SchemaRef)> {
         self.engine.catalog().tables()
     }
+
+    /// Returns the views with their definitions, SQL over the tables.
+    pub fn view_definitions(&self) -> impl Iterator<Item = (&'static str, String)> {
+        self.engine.catalog().view_definitions()
+    }
 }
 
 /// A started query with its permit, before it is planned.

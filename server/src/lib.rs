@@ -28,6 +28,7 @@ mod metrics;
 mod postgres;
 mod request_span;
 mod running;
+mod scram_verifier;
 mod service;
 mod sessions;
 pub mod tokens;

@@ -69,7 +69,13 @@ fn trace_id(headers: &HeaderMap) -> Option<&str> {
 /// would be larger than `limit`.
 pub(crate) fn begin_connection(startup: &mut BytesMut, client: &str, limit: usize) -> Span {
     let number = next_number();
-    let mark = format!("{PARAMETER}\0{number}\0\0");
+    mark_startup(startup, PARAMETER, &number.to_string(), limit);
+    tracing::error_span!("connection", number, protocol = ServerProtocol::Postgres.name(), client)
+}
+
+/// Adds a parameter to a startup packet of Postgres' protocol, unless that would be larger than `limit`.
+pub(crate) fn mark_startup(startup: &mut BytesMut, name: &str, value: &str, limit: usize) {
+    let mark = format!("{name}\0{value}\0\0");
     // The last byte ends the list of parameters.
     if let (Some((0, _)), Ok(length)) = (startup.split_last(), i32::try_from(startup.len() + mark.len() - 1))
         && startup.len() + mark.len() <= limit
@@ -78,7 +84,6 @@ pub(crate) fn begin_connection(startup: &mut BytesMut, client: &str, limit: usiz
         startup.put_slice(mark.as_bytes());
         startup[..4].copy_from_slice(&length.to_be_bytes());
     }
-    tracing::error_span!("connection", number, protocol = ServerProtocol::Postgres.name(), client)
 }
 
 /// Continues, in an engine, the span of a request that the door has marked.

@@ -105,7 +105,7 @@ impl<T: Send + 'static> RunningQuery<T> {
         tokio::select! {
             biased;
             fault = ended(&self.stop, limit) => {
-                self.watch.finish(Err(&fault));
+                self.watch.finish(Some(&fault));
                 self.task.abort_all();
                 self.span.in_scope(|| self.service.record_failure(&fault));
                 return Err(fault);

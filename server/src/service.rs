@@ -1,5 +1,6 @@
 //! State shared by the three protocols: the query engine, its client, encoder threads, and metrics.
 
+use std::collections::HashMap;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::Duration;
@@ -147,7 +148,7 @@ impl QueryService {
 
     /// Reports a failed request to the door, which counts them.
     pub(crate) fn failed(&self, code: FaultCode) {
-        EngineReport::Failure(code).send();
+        EngineReport::Failure(code).queue();
     }
 
     /// Reports a failed request and writes it to the log.
@@ -182,6 +183,12 @@ impl QueryService {
     pub(crate) fn tables(&self) -> Vec<(&'static str, SchemaRef)> {
         let nobody = Arc::new(EngineClient::new("tables", QueryQuota::default()));
         self.session(&nobody).tables().collect()
+    }
+
+    /// The views' definitions by their names.
+    pub(crate) fn view_definitions(&self) -> HashMap<&'static str, String> {
+        let nobody = Arc::new(EngineClient::new("views", QueryQuota::default()));
+        self.session(&nobody).view_definitions().collect()
     }
 
     /// The field's functions.
@@ -256,14 +263,14 @@ impl QueryService {
                 // Also if nobody fetches rows at present; who does says so.
                 () = stopped.stopped() => return Err(RequestFault::Cancelled),
             };
-            timer.watch().finish(done.as_ref().copied());
+            timer.watch().finish(done.as_ref().err());
             done.inspect_err(|fault| service.record_failure(fault))
         };
         let mut task = self.spawn(work.instrument(span.clone()));
         tokio::select! {
             biased;
             fault = ended(&stop, limit) => {
-                watch.finish(Err(&fault));
+                watch.finish(Some(&fault));
                 span.in_scope(|| self.record_failure(&fault));
                 Err(fault)
             }

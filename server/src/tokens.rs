@@ -17,6 +17,7 @@ use subtle::{Choice, ConstantTimeEq as _};
 use crate::Error;
 use crate::client_identity::ClientIdentity;
 use crate::fault::RequestFault;
+use crate::scram_verifier::ScramVerifier;
 use crate::sessions::BrowserSessions;
 
 /// Of basic credentials; padding is cut off before, since gRPC's clients leave it out.
@@ -56,6 +57,8 @@ pub struct TokenFile {
 struct TokenEntry {
     client: Arc<ClientIdentity>,
     hash: [u8; 32],
+    /// For logins that do not send the token; a line from an older version has none.
+    scram: Option<Arc<ScramVerifier>>,
     expires: Option<DateTime<Utc>>,
 }
 
@@ -77,6 +80,7 @@ struct TokenList {
 struct Line {
     name: String,
     sha256: String,
+    scram: Option<String>,
     #[serde(default = "reading")]
     scopes: Vec<TokenScope>,
     seconds: Option<u64>,
@@ -120,7 +124,10 @@ impl Line {
             let time = DateTime::parse_from_rfc3339(&time.to_string()).map(|time| time.to_utc());
             time.map_err(|_| format!("expires of `{name}` is no time with a zone, as 2027-01-31T12:00:00Z"))
         });
-        Ok(TokenEntry { client: Arc::new(client), hash, expires: expires.transpose()? })
+        let scram = self.scram.as_ref().map(|text| {
+            text.parse().map(Arc::new).map_err(|wrong: String| format!("the scram of `{name}` is wrong: {wrong}"))
+        });
+        Ok(TokenEntry { client: Arc::new(client), hash, scram: scram.transpose()?, expires: expires.transpose()? })
     }
 }
 
@@ -187,9 +194,10 @@ pub fn fresh(name: &str, days: Option<u32>) -> Result<FreshToken, Error> {
     getrandom::fill(&mut secret).map_err(|failed| Error::Random(failed.into()))?;
     let token = format!("{PREFIX}{}", hex::encode(secret));
     let hash = hex::encode(Sha256::digest(token.as_bytes()));
+    let scram = ScramVerifier::new(&token).map_err(|failed| Error::Random(failed.into()))?;
     let name = toml::Value::from(name);
     let lines = format!(
-        "[[token]]\nname = {name}\nsha256 = \"{hash}\"\nscopes = [\"sql\", \"files\"]\n\
+        "[[token]]\nname = {name}\nsha256 = \"{hash}\"\nscram = \"{scram}\"\nscopes = [\"sql\", \"files\"]\n\
          seconds = 60\nmemory_mb = 2000\nrows = 10_000_000\nconcurrent = 4\n"
     );
     let expires = days.map(|days| {
@@ -235,6 +243,14 @@ impl TokenAccess {
             Self::Open => Ok(Arc::new(local())),
             Self::Tokens(tokens, _) => holder(tokens, &hash_of(token.unwrap_or_default())),
         }
+    }
+
+    /// Returns the client of a token's name, and what tells whether it has the token; None if its line has no such verifier.
+    pub(crate) fn scram_client(&self, name: &str) -> Option<(Arc<ClientIdentity>, Arc<ScramVerifier>)> {
+        let Self::Tokens(tokens, _) = self else { return None };
+        let tokens = tokens.read().unwrap_or_else(PoisonError::into_inner);
+        let entry = tokens.entries.iter().find(|entry| entry.client.name == name && entry.is_valid())?;
+        Some((entry.client.clone(), entry.scram.clone()?))
     }
 
     /// Checks that a client's token was not taken back and has not expired since.
@@ -375,7 +391,7 @@ mod tests {
     #[test]
     fn a_fresh_token_lets_in_and_no_other_does() {
         let fresh = fresh("a \"quoted\" name", Some(1)).expect("a token");
-        assert!(!fresh.lines.contains(&fresh.token), "only its hash is kept");
+        assert!(!fresh.lines.contains(&fresh.token), "only hashes of it are kept");
         let access = access_by(&fresh.lines);
         let local = ClientIdentity::pages;
         let client = access.client(Some(&fresh.token), local).expect("let in");
@@ -387,6 +403,9 @@ mod tests {
         assert_eq!(access.client_of_session(&secret, local).expect("let in"), client);
         assert!(matches!(access.client_of_session(&fresh.token, local), Err(RequestFault::Unauthenticated)));
         assert!(matches!(access.begin_session(&secret), Err(RequestFault::Unauthenticated)));
+        let (by_name, _) = access.scram_client("a \"quoted\" name").expect("a verifier");
+        assert_eq!(by_name, client);
+        assert!(access.scram_client("b").is_none());
         let other = super::fresh("b", None).expect("a token").token;
         let cut = &fresh.token[..fresh.token.len() - 1];
         for wrong in [None, Some(""), Some(other.as_str()), Some(cut)] {
@@ -413,6 +432,7 @@ mod tests {
         for (text, expected) in [
             (format!("[[token]]\nname = 'a'\nsha256 = '{hash}'\nexpires = 2027-01-31"), "no time with a zone"),
             ("[[token]]\nname = 'a'\nsha256 = 'ab'".to_owned(), "64 hexadecimal"),
+            (format!("[[token]]\nname = 'a'\nsha256 = '{hash}'\nscram = 'md5'"), "the scram of `a` is wrong"),
             (format!("[[token]]\nname = 'a'\nsha256 = '{hash}'\nrows = 0"), "rows of `a` is 0"),
             (format!("[[token]]\nname = 'a'\nsha256 = '{hash}'\nscopes = ['all']"), "unknown variant"),
             (format!("[[token]]\nname = 'a'\nsha256 = '{hash}'\n").repeat(2), "twice"),

@@ -191,7 +191,7 @@ pub enum Error {
     },
     /// A run of this name is in the lake, or on its way there, with other content.
     #[error(
-        "`{path}` of `{location}` is another file than the given one: it has {there}, the given file {given}; hint: a run file never changes once closed, so record it under another name; if an upload was given up, delete `{record}`"
+        "`{path}` of `{location}` is another file than the given one: it has {there}, the given file {given}; hint: a run file never changes once closed, so record it under another name; if an upload was given up, delete `{path}.sha256`"
     )]
     OtherUpload {
         /// The lake's location.
@@ -202,8 +202,6 @@ pub enum Error {
         there: String,
         /// SHA-256 or size of the given file.
         given: String,
-        /// Path of the object that keeps the name for a digest.
-        record: String,
     },
     /// The uploaded object is not what was sent. It is deleted.
     #[error(

@@ -1,7 +1,7 @@
 //! A lake's location: a folder, `file://`, `memory://`, or a bucket of an object store.
 
 use std::fmt::Display;
-use std::path::{Path, PathBuf};
+use std::path::{Component, Path, PathBuf};
 use std::sync::Arc;
 
 use echolake_schema::ErrorCause;
@@ -99,7 +99,7 @@ impl LakeLocation {
 
     fn folder(text: &str, path: &Path) -> Result<Self> {
         let wrong = |source: ErrorCause| Error::Location { location: without_secrets(text), source };
-        let absolute = std::path::absolute(path).map_err(|e| wrong(e.into()))?;
+        let absolute = resolved_path(path).map_err(|e| wrong(e.into()))?;
         if absolute.exists() && !absolute.is_dir() {
             return Err(wrong("it is a file".into()));
         }
@@ -127,6 +127,21 @@ pub(crate) fn without_secrets(text: &str) -> String {
         Some((path, _)) => format!("{scheme}://{path}?***"),
         None => format!("{scheme}://{named}"),
     }
+}
+
+/// Returns the absolute path without `..`, which paths of object stores cannot hold. Links are followed before a `..`
+/// alone, as the system does.
+fn resolved_path(path: &Path) -> std::io::Result<PathBuf> {
+    let mut resolved = PathBuf::new();
+    for part in std::path::absolute(path)?.components() {
+        if part == Component::ParentDir {
+            resolved = resolved.canonicalize()?;
+            resolved.pop();
+        } else {
+            resolved.push(part);
+        }
+    }
+    Ok(resolved)
 }
 
 #[cfg(test)]
@@ -181,5 +196,22 @@ mod tests {
         let url = Url::from_directory_path(folder.path()).expect("its URL");
         let url = LakeLocation::parse(url.as_str()).expect("a folder");
         assert_eq!(plain.folder, url.folder);
+    }
+
+    #[test]
+    fn parent_folders_are_resolved() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let root = folder.path().canonicalize().expect("it is there");
+        std::fs::create_dir_all(root.join("a/b")).expect("made");
+        let resolved =
+            |path: &str| LakeLocation::parse(&root.join(path).display().to_string()).map(|found| found.folder);
+        assert_eq!(resolved("a/b/../lake").expect("a folder"), Some(root.join("a/lake")));
+        assert_eq!(resolved("a/../a/b/../../lake").expect("a folder"), Some(root.join("lake")));
+        assert!(resolved("missing/../lake").is_err(), "the system does not find it either");
+        #[cfg(unix)]
+        {
+            std::os::unix::fs::symlink(root.join("a/b"), root.join("link")).expect("linked");
+            assert_eq!(resolved("link/../lake").expect("a folder"), Some(root.join("a/lake")));
+        }
     }
 }

@@ -2,8 +2,8 @@
 # Uploads to Ceph's S3 gateway, and ingests that share them, through a proxy that loses and refuses answers:
 # check_uploads.sh ECHOLAKE [SEED] [ROUNDS]
 #
-# 1. A run of the paper's whole rig with its sweeps (about 3 GB, some minutes; LARGE_RUN names one that is there) is uploaded,
-#    and killed ten times on the way. What the store holds then must have the run's SHA-256.
+# 1. A run of the paper's grid with long sweeps (about 3 GB, some minutes; LARGE_RUN names one that is there) is uploaded, and
+#    the upload killed ten times on the way. What the store holds then must have the run's SHA-256.
 # 2. ROUNDS (1) times: four ingests take in 40 runs of one inbox while they are killed at random. All tables must hold what a
 #    lake in a folder holds.
 #
@@ -44,7 +44,10 @@ RANDOM=$seed
 
 upload_large_run() {
     local run=${LARGE_RUN:-} lines parts cut upload path
-    [ -n "$run" ] || run=$("$echolake" --lake large acquire --surface flat 2>/dev/null)
+    if [ -z "$run" ]; then
+        printf '[sweep]\nduration_secs = 1.8\n' >long_rig.toml
+        run=$("$echolake" --lake large acquire --surface flat --rig long_rig.toml 2>/dev/null)
+    fi
     parts=$((($(stat -c %s "$run") + 8388607) / 8388608))
     export ECHOLAKE_LAKE=s3://$S3_BUCKET/upload-$seed-$$
     for cut in $(seq 10); do

@@ -30,7 +30,7 @@ const WRONG: [WrongStatement; 7] = [
 const FRIENDLY: [(&str, &str); 5] = [
     ("from pairs select count()", "45"),
     ("select [x * 2 for x in [1, 2]][2] as twice", "4"),
-    ("select n: count(*), n + 1 as more from pairs", "45"),
+    ("select n: count(*), n + 1 as plus from pairs", "45"),
     ("select max(columns('pair_.*')) from pairs", "44"),
     ("select 'flat'.upper()", "FLAT"),
 ];

@@ -63,8 +63,21 @@ fn what_takes_too_long_is_broken_off() {
     let mut server = served(&place, &["--drain", "500ms"]);
     let _running = HttpRequest::post("/api/v1/sql", ENDLESS).with("content-type", "text/plain").begin(&server);
     wait_until("it runs", || running(&server) == 1.0);
-    assert_eq!(server.terminate(), Some(0));
-    assert!(server.said().iter().any(|line| line.contains("broken off")), "{:?}", server.said());
+    server.signal("TERM");
+    server.wait_for_line("are broken off");
+    assert_eq!(server.wait(), Some(0));
+}
+
+#[test]
+fn a_second_signal_ends_at_once() {
+    let place = lake();
+    let mut server = served(&place, &[]);
+    let _running = HttpRequest::post("/api/v1/sql", ENDLESS).with("content-type", "text/plain").begin(&server);
+    wait_until("it runs", || running(&server) == 1.0);
+    server.signal("INT");
+    wait_until("it drains", || get(&server, "/ready").status == 503);
+    server.signal("INT");
+    assert_eq!(server.wait(), Some(130));
 }
 
 #[test]

@@ -24,10 +24,23 @@ impl WireClient {
 
     /// The same; the error is the state of the refusal.
     pub(crate) fn attempt(server: &ServedLake, options: Option<&str>) -> Result<Self, String> {
+        let (mut client, request) = Self::begin_login(server, "me", options)?;
+        if request == [0; 4] {
+            assert_eq!(client.ready(), None);
+        }
+        Ok(client)
+    }
+
+    /// Connects as this user; returns how the server wants to know that it is.
+    pub(crate) fn start(server: &ServedLake, user: &str, options: Option<&str>) -> (Self, Vec<u8>) {
+        Self::begin_login(server, user, options).unwrap_or_else(|state| panic!("refused: {state}"))
+    }
+
+    fn begin_login(server: &ServedLake, user: &str, options: Option<&str>) -> Result<(Self, Vec<u8>), String> {
         let mut stream = ServedLake::connect(&server.postgres);
         let mut body = 196_608_i32.to_be_bytes().to_vec();
         for (name, value) in
-            [("user", "me"), ("database", "datafusion")].into_iter().chain(options.map(|o| ("options", o)))
+            [("user", user), ("database", "datafusion")].into_iter().chain(options.map(|o| ("options", o)))
         {
             body.extend([name.as_bytes(), b"\0", value.as_bytes(), b"\0"].concat());
         }
@@ -40,10 +53,12 @@ impl WireClient {
             return Err(state(&body));
         }
         assert_eq!(kind, b'R', "{}", String::from_utf8_lossy(&body));
-        if body == [0; 4] {
-            assert_eq!(client.ready(), None);
-        }
-        Ok(client)
+        Ok((client, body))
+    }
+
+    /// The number of the connection, as the server announces it.
+    pub(crate) fn pid(&self) -> i32 {
+        self.key.first_chunk().map_or(0, |pid| i32::from_be_bytes(*pid))
     }
 
     /// The state of the message with which the server ends the connection.

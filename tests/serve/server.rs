@@ -86,6 +86,11 @@ impl ServedLake {
         self.child.signal(name);
     }
 
+    /// Waits for a line on stderr with this text in it.
+    pub(crate) fn wait_for_line(&mut self, part: &str) {
+        self.child.wait_for_line(part);
+    }
+
     /// Waits for its end; returns its exit code.
     pub(crate) fn wait(&mut self) -> Option<i32> {
         self.child.wait().status.code()

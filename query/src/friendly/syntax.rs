@@ -100,9 +100,7 @@ impl VisitorMut for FriendlyVisitor {
 
     fn pre_visit_expr(&mut self, expr: &mut Expr) -> ControlFlow<Box<Error>> {
         match expr {
-            Expr::CompoundFieldAccess { root, access_chain }
-                if access_chain.iter().any(|access| matches!(access, AccessExpr::Dot(Expr::Function(_)))) =>
-            {
+            Expr::CompoundFieldAccess { root, access_chain } if access_chain.iter().any(is_call) => {
                 *expr = chained_calls(std::mem::replace(&mut **root, tree::number(0)), std::mem::take(access_chain));
             }
             Expr::Function(function) => call_on_column(function),
@@ -119,6 +117,10 @@ impl VisitorMut for FriendlyVisitor {
         }
         ControlFlow::Continue(())
     }
+}
+
+fn is_call(access: &AccessExpr) -> bool {
+    matches!(access, AccessExpr::Dot(Expr::Function(_)))
 }
 
 // `x.f().g(2)` becomes `g(f(x), 2)`.

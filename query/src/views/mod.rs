@@ -80,7 +80,8 @@ impl LakeView {
         }
     }
 
-    fn sql(self, lake: &Lake) -> String {
+    /// Returns its definition over the tables.
+    pub(crate) fn sql(self, lake: &Lake) -> String {
         match self {
             Self::Ir => ir::sql(),
             Self::TnceDb => tnce_db::sql(lake.rig()),

@@ -98,7 +98,7 @@ impl RunningWatches {
             outcome: OnceLock::new(),
         };
         let (statement, started) = (watch.statement.clone(), Utc::now().timestamp_micros());
-        EngineReport::Started(QueryStart { number, protocol, statement, started }).send();
+        EngineReport::Started(QueryStart { number, protocol, statement, started }).queue();
         QueryTimer { watch: Arc::new(watch), watches: self.clone() }
     }
 
@@ -138,7 +138,7 @@ impl Drop for QueryTimer {
                 "a slow query"
             );
         }
-        EngineReport::Ended(end).send();
+        EngineReport::Ended(end).queue();
     }
 }
 
@@ -161,9 +161,9 @@ impl QueryWatch {
         self.memory.fetch_max(bytes as u64, Ordering::Relaxed);
     }
 
-    /// Records its outcome; the first counts. A query without one was abandoned by its client.
-    pub(crate) fn finish(&self, done: Result<(), &RequestFault>) {
-        let _ = self.outcome.set(done.err().map(RequestFault::code));
+    /// Records its outcome, a failure or none; the first counts. A query without one was abandoned by its client.
+    pub(crate) fn finish(&self, failure: Option<&RequestFault>) {
+        let _ = self.outcome.set(failure.map(RequestFault::code));
     }
 
     fn end(&self) -> QueryEnd {
@@ -192,8 +192,8 @@ mod tests {
         let watches = Arc::new(RunningWatches::default());
         let timer = watches.begin(ServerProtocol::Http, "select 1", &StopSignal::new());
         assert_eq!(timer.watch().end().failure, Some(FaultCode::Cancelled));
-        timer.watch().finish(Ok(()));
-        timer.watch().finish(Err(&RequestFault::Internal));
+        timer.watch().finish(None);
+        timer.watch().finish(Some(&RequestFault::Internal));
         assert_eq!(timer.watch().end().failure, None, "the first outcome counts");
     }
 

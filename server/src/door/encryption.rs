@@ -15,6 +15,7 @@ use tokio_rustls::rustls::{self, ServerConfig};
 use tokio_rustls::server::TlsStream;
 use tokio_util::either::Either;
 
+use super::certificate_hash::certificate_hash;
 use super::connection_places::PlacedStream;
 use crate::Error;
 
@@ -71,9 +72,15 @@ impl CertificateFiles {
 #[derive(Debug)]
 struct CurrentCertificate(RwLock<Arc<CertifiedKey>>);
 
+impl CurrentCertificate {
+    fn get(&self) -> Arc<CertifiedKey> {
+        self.0.read().unwrap_or_else(PoisonError::into_inner).clone()
+    }
+}
+
 impl ResolvesServerCert for CurrentCertificate {
     fn resolve(&self, _: ClientHello<'_>) -> Option<Arc<CertifiedKey>> {
-        Some(self.0.read().unwrap_or_else(PoisonError::into_inner).clone())
+        Some(self.get())
     }
 }
 
@@ -105,7 +112,7 @@ impl ServerEncryption {
             .with_no_client_auth()
             .with_cert_resolver(self.current.clone());
         config.alpn_protocols = vec![name.to_vec()];
-        Ok(ProtocolEncryption(Some(TlsAcceptor::from(Arc::new(config)))))
+        Ok(ProtocolEncryption(Some((TlsAcceptor::from(Arc::new(config)), self.current.clone()))))
     }
 
     /// Takes changed files for new connections; open ones keep the certificate with which they began. Never ends.
@@ -132,7 +139,7 @@ impl ServerEncryption {
 
 /// Encryption of one protocol's connections, or none.
 #[derive(Clone, Default)]
-pub(super) struct ProtocolEncryption(Option<TlsAcceptor>);
+pub(super) struct ProtocolEncryption(Option<(TlsAcceptor, Arc<CurrentCertificate>)>);
 
 impl ProtocolEncryption {
     /// Returns whether connections are encrypted.
@@ -140,9 +147,15 @@ impl ProtocolEncryption {
         self.0.is_some()
     }
 
+    /// Returns the hash of the certificate by which logins are bound to it.
+    pub(super) fn certificate_hash(&self) -> Option<Vec<u8>> {
+        let (_, current) = self.0.as_ref()?;
+        certificate_hash(current.get().cert.first()?)
+    }
+
     /// Shakes hands with a client, if connections are encrypted; None if that fails, or takes too long.
     pub(super) async fn accept(&self, stream: PlacedStream) -> Option<DoorStream> {
-        let Some(acceptor) = &self.0 else { return Some(Either::Left(stream)) };
+        let Some((acceptor, _)) = &self.0 else { return Some(Either::Left(stream)) };
         let evicted = stream.evicted();
         tokio::select! {
             shaken = tokio::time::timeout(HANDSHAKE, acceptor.accept(stream)) => match shaken {

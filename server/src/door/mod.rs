@@ -2,6 +2,7 @@
 //! of that client. It parses no SQL and decodes no file, so that no request can end it.
 
 mod audit;
+mod certificate_hash;
 pub(crate) mod connection_places;
 pub(crate) mod drain;
 mod encryption;

@@ -28,8 +28,9 @@ use report::EngineReport;
 
 /// A query that has a new engine read what every query reads.
 const WARM_UP: &str = "select count(*) from runs";
-/// Time between two looks at the lake for its figures.
+/// Time between two looks at the lake for its figures: in a folder, and on an object store, where three requests cost money.
 const LAKE_LOOK: Duration = Duration::from_secs(15);
+const REMOTE_LAKE_LOOK: Duration = Duration::from_secs(60);
 
 /// Settings of an engine.
 #[derive(Debug, Clone, Copy, Default)]
@@ -110,7 +111,7 @@ async fn report_lake(lake: &Lake, engine: &QueryEngine) -> Infallible {
         };
         let figures = figures.inspect_err(|error| tracing::warn!(error, "the lake cannot be read")).ok();
         EngineReport::Lake(figures).send();
-        tokio::time::sleep(LAKE_LOOK).await;
+        tokio::time::sleep(if lake.is_remote() { REMOTE_LAKE_LOOK } else { LAKE_LOOK }).await;
     }
 }
 

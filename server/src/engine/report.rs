@@ -1,6 +1,7 @@
 //! Lines that an engine writes to standard output, for its door.
 
 use std::io::Write as _;
+use std::sync::{Mutex, PoisonError};
 
 use echolake_lake::CacheCounts;
 use serde::{Deserialize, Serialize};
@@ -35,13 +36,36 @@ pub(crate) enum EngineReport {
     },
 }
 
+/// Lines that wait to be written.
+static QUEUED: Mutex<Vec<u8>> = Mutex::new(Vec::new());
+
 impl EngineReport {
-    /// Writes the line.
+    /// Writes the line, and those that wait before it.
     pub(crate) fn send(&self) {
-        let mut line = serde_json::to_vec(self).unwrap_or_default();
-        line.push(b'\n');
-        let mut stdout = std::io::stdout().lock();
-        // If the door is gone, standard input ends too, and the engine with it.
-        let _ = stdout.write_all(&line).and_then(|()| stdout.flush());
+        self.queue();
+        Self::send_queued();
+    }
+
+    /// Lets the line wait for [`EngineReport::send_queued`]: a write for each of a thousand queries a second would slow them
+    /// down.
+    pub(crate) fn queue(&self) {
+        let mut queued = QUEUED.lock().unwrap_or_else(PoisonError::into_inner);
+        let whole = queued.len();
+        match serde_json::to_writer(&mut *queued, self) {
+            Ok(()) => queued.push(b'\n'),
+            Err(_) => queued.truncate(whole),
+        }
+    }
+
+    /// Writes the lines that wait.
+    pub(crate) fn send_queued() {
+        // Held while it is written, so that lines stay in order.
+        let mut queued = QUEUED.lock().unwrap_or_else(PoisonError::into_inner);
+        if !queued.is_empty() {
+            let mut stdout = std::io::stdout().lock();
+            // If the door is gone, standard input ends too, and the engine with it.
+            let _ = stdout.write_all(&queued).and_then(|()| stdout.flush());
+            queued.clear();
+        }
     }
 }

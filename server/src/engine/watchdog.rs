@@ -9,7 +9,7 @@ use rustix::time::{ClockId, clock_gettime};
 use super::report::EngineReport;
 use crate::service::QueryService;
 
-/// Time between two looks.
+/// Time between two looks; what was reported meanwhile is sent as often.
 const INTERVAL: Duration = Duration::from_millis(50);
 /// Time for which work may continue after its query was cancelled, ran out of time, or lost its client.
 const GRACE: Duration = Duration::from_millis(250);
@@ -31,6 +31,7 @@ fn watch(service: &QueryService) {
     let mut cached = CacheCounts::default();
     loop {
         std::thread::sleep(INTERVAL);
+        EngineReport::send_queued();
         if service.engine().overdue().is_some_and(|time| time > GRACE) {
             end("a query that was ended did not stop");
         }

@@ -29,9 +29,11 @@ pub(super) struct ProblemBody<'a> {
     #[schema(required = false)]
     detail: String,
     /// What to do.
+    #[schema(required = false, nullable = false)]
     #[serde(skip_serializing_if = "Option::is_none")]
     hint: Option<String>,
     /// The place of an error in a query's text.
+    #[schema(required = false, nullable = false)]
     #[serde(skip_serializing_if = "Option::is_none")]
     place: Option<ProblemPlace>,
 }

@@ -53,8 +53,12 @@ pub(super) struct PgCatalog {
 }
 
 impl PgCatalog {
-    /// For a lake of these tables, and the field's functions.
-    pub(super) fn new(tables: Vec<(&'static str, SchemaRef)>, own: Vec<SqlFunction>) -> Result<Self, Error> {
+    /// For a lake of these tables and views, and the field's functions.
+    pub(super) fn new(
+        tables: Vec<(&'static str, SchemaRef)>,
+        views: HashMap<&'static str, String>,
+        own: Vec<SqlFunction>,
+    ) -> Result<Self, Error> {
         let fixed = Arc::new(PgCatalogStaticTables::try_new()?);
         let (types, procedures) = (numbers_of(&fixed.pg_type, "typname")?, numbers_of(&fixed.pg_proc, "proname")?);
         set_function_names(&procedures);
@@ -69,7 +73,7 @@ impl PgCatalog {
         // What the field's functions return depends on what they are given.
         signatures.extend(own.iter().zip(OWN_NUMBERS..).map(|(f, n)| (n, (f.arguments().to_owned(), String::new()))));
         let schemas: Vec<_> = typed.iter().map(|(name, batches)| (name.clone(), batches[0].schema())).collect();
-        let relations = CatalogRelations::new(&tables, &schemas);
+        let relations = CatalogRelations::new(&tables, views, &schemas);
         let descriptions = typed.iter().find(|(name, _)| name == "pg_description");
         let comments = descriptions.map(|(_, batches)| batches.clone()).unwrap_or_default();
         let mut all = NamedTables::new();
@@ -88,6 +92,7 @@ impl PgCatalog {
             schemas: relations::schemas().map(|(number, name)| (name.to_owned(), number)).into(),
             signatures,
             comments: relations.comments(),
+            definitions: relations.definitions(),
         }));
         Ok(Self {
             tables: Arc::new(all),

@@ -45,7 +45,7 @@ pub(super) struct PostgresState {
 
 impl PostgresState {
     pub(super) fn new(service: QueryService) -> Result<Self, Error> {
-        let catalog = PgCatalog::new(service.tables(), service.functions())?;
+        let catalog = PgCatalog::new(service.tables(), service.view_definitions(), service.functions())?;
         let parser = PostgresCompatibilityParser::new();
         Ok(Self { service, parser, catalog, next_pid: AtomicI32::new(1), running: Mutex::default() })
     }
@@ -119,11 +119,17 @@ impl PostgresConnection {
         &self.shared
     }
 
-    /// Logs a client in; returns what a CancelRequest must show. `wide` keys are of protocol 3.2.
-    pub(super) fn log_in(&self, client: &Arc<EngineClient>, wide: bool) -> Result<(i32, SecretKey), RequestFault> {
+    /// Logs a client in, whose connection has a number if the door gave one; returns what a CancelRequest must show.
+    /// `wide` keys are of protocol 3.2.
+    pub(super) fn log_in(
+        &self,
+        client: &Arc<EngineClient>,
+        pid: Option<i32>,
+        wide: bool,
+    ) -> Result<(i32, SecretKey), RequestFault> {
         let mut secret = [0; 32];
         getrandom::fill(&mut secret).map_err(RequestFault::defect("no random bytes"))?;
-        let pid = self.shared.next_pid.fetch_add(1, Ordering::Relaxed);
+        let pid = pid.unwrap_or_else(|| self.shared.next_pid.fetch_add(1, Ordering::Relaxed));
         let key = match wide {
             true => SecretKey::Bytes(Bytes::copy_from_slice(&secret)),
             false => SecretKey::I32(i32::from_be_bytes([secret[0], secret[1], secret[2], secret[3]])),

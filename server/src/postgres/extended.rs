@@ -1,5 +1,6 @@
 //! The extended query protocol: parse, bind, describe, execute, with values and in parts.
 
+use std::borrow::Cow;
 use std::fmt::Debug;
 use std::sync::Arc;
 
@@ -23,6 +24,7 @@ use pgwire::messages::extendedquery::{
 };
 use pgwire::messages::response::{EmptyQueryResponse, ReadyForQuery, TransactionStatus};
 
+use super::array_texts::without_spaces;
 use super::catalog::OID;
 use super::command::{StatementReply, act, columns};
 use super::connection::{NamedObject, PostgresConnection};
@@ -88,6 +90,28 @@ fn kinds(statement: &ClientStatement) -> Result<Vec<Option<DataType>>, RequestFa
     }
 }
 
+// Lists that are sent as texts.
+fn tidy_lists(message: &mut Bind, statement: &StoredStatement<ClientStatement>) {
+    let kinds = kinds(&statement.statement).unwrap_or_default();
+    for (i, value) in message.parameters.iter_mut().enumerate() {
+        let is_text = match message.parameter_format_codes.as_slice() {
+            [] => true,
+            [all] => *all == 0,
+            codes => codes.get(i) == Some(&0),
+        };
+        let is_list = match statement.parameter_types.get(i).and_then(Option::as_ref) {
+            // Postgres writes a type of arrays so.
+            Some(told) if *told != Type::UNKNOWN => told.name().starts_with('_'),
+            _ => matches!(kinds.get(i), Some(Some(DataType::List(_)))),
+        };
+        if let (true, true, Some(text)) = (is_text, is_list, value.as_deref().and_then(|v| str::from_utf8(v).ok()))
+            && let Cow::Owned(dense) = without_spaces(text)
+        {
+            *value = Some(dense.into());
+        }
+    }
+}
+
 fn values(portal: &Portal<ClientStatement>) -> Result<ParamValues, RequestFault> {
     let kinds = kinds(&portal.statement.statement)?;
     let given = portal.parameter_len();
@@ -140,22 +164,23 @@ impl ExtendedQueryHandler for ExtendedQueries {
     }
 
     // As the library's own, but that portals are counted.
-    async fn on_bind<C>(&self, client: &mut C, message: Bind) -> PgWireResult<()>
+    async fn on_bind<C>(&self, client: &mut C, mut message: Bind) -> PgWireResult<()>
     where
         C: ClientInfo + ClientPortalStore + Sink<PgWireBackendMessage> + Unpin + Send + Sync,
         C::PortalStore: PortalStore<Statement = ClientStatement>,
         C::Error: Debug,
         PgWireError: From<<C as Sink<PgWireBackendMessage>>::Error>,
     {
-        let statement = message.statement_name.as_deref().unwrap_or(DEFAULT_NAME);
-        let portal = message.portal_name.as_deref().unwrap_or(DEFAULT_NAME);
-        self.connection.remember(NamedObject::Portal, portal).map_err(|fault| error(&fault))?;
-        match client.portal_store().get_statement(statement) {
+        let name = message.statement_name.clone().unwrap_or_else(|| DEFAULT_NAME.to_owned());
+        let portal = message.portal_name.clone().unwrap_or_else(|| DEFAULT_NAME.to_owned());
+        self.connection.remember(NamedObject::Portal, &portal).map_err(|fault| error(&fault))?;
+        match client.portal_store().get_statement(&name) {
             Some(Entry::Value(statement)) => {
+                tidy_lists(&mut message, &statement);
                 client.portal_store().put_portal(Arc::new(Portal::try_new(&message, statement)?));
             }
-            Some(Entry::Empty) => client.portal_store().put_empty_portal(portal),
-            None => return Err(PgWireError::StatementNotFound(statement.to_owned())),
+            Some(Entry::Empty) => client.portal_store().put_empty_portal(&portal),
+            None => return Err(PgWireError::StatementNotFound(name)),
         }
         client.feed(PgWireBackendMessage::BindComplete(BindComplete::new())).await?;
         Ok(())

@@ -56,7 +56,6 @@ pub(super) fn fixed() -> Vec<Arc<ScalarUDF>> {
         ("pg_get_function_sqlbody", None),
         ("pg_get_functiondef", None),
         ("pg_get_indexdef", None),
-        ("pg_get_viewdef", None),
         ("pg_get_triggerdef", None),
         ("pg_get_ruledef", None),
         ("pg_get_serial_sequence", None),
@@ -107,11 +106,13 @@ pub(super) struct CatalogNumbers {
     pub(super) signatures: HashMap<i32, (String, String)>,
     /// Comments by table and column; those of tables by column 0.
     pub(super) comments: HashMap<(i32, i32), String>,
+    /// Definitions of views.
+    pub(super) definitions: HashMap<i32, String>,
 }
 
 /// Functions that look something up in the catalogue: NULL if it is not there.
 pub(super) fn lookups(numbers: CatalogNumbers) -> Vec<Arc<ScalarUDF>> {
-    let CatalogNumbers { types, procedures, relations, schemas, signatures, comments } = numbers;
+    let CatalogNumbers { types, procedures, relations, schemas, signatures, comments, definitions } = numbers;
     let (signatures, comments) = (Arc::new(signatures), Arc::new(comments));
     let arguments = |name| {
         let signatures = signatures.clone();
@@ -121,7 +122,7 @@ pub(super) fn lookups(numbers: CatalogNumbers) -> Vec<Arc<ScalarUDF>> {
     let tables = comments.clone();
     vec![
         text_of_number("function_name", |number| function_name(number).map(str::to_owned)),
-        number_of_name("to_regtype", move |name| types.get(standard(name)).copied()),
+        number_of_name("to_regtype", move |name| types.get(short_type_name(name)).copied()),
         number_of_name("to_regproc", move |name| procedures.get(name.split('(').next().unwrap_or(name)).copied()),
         number_of_name("to_regclass", move |name| relations.get(name).copied()),
         number_of_name("to_regnamespace", move |name| schemas.get(name).copied()),
@@ -141,6 +142,7 @@ pub(super) fn lookups(numbers: CatalogNumbers) -> Vec<Arc<ScalarUDF>> {
                 Ok(ColumnarValue::Array(Arc::new(visible.collect::<BooleanArray>())))
             }),
         )),
+        Arc::new(text_functions::view_definition("pg_get_viewdef", definitions)),
         Arc::new(text_functions::comment_of_table("obj_description", tables)),
         Arc::new(text_functions::comment_of_column("col_description", comments)),
     ]
@@ -169,8 +171,8 @@ fn text_of_number(name: &'static str, find: impl Fn(i32) -> Option<String> + Sen
     Arc::new(create_udf(name, vec![DataType::Int32], DataType::Utf8, Volatility::Stable, Arc::new(find)))
 }
 
-// `pg_type` has the short names.
-fn standard(name: &str) -> &str {
+/// The short name of a type, as `pg_type` has it.
+pub(super) fn short_type_name(name: &str) -> &str {
     match name {
         "boolean" => "bool",
         "smallint" => "int2",

@@ -1,6 +1,8 @@
 //! Postgres' wire protocol, for psql, drivers and tools that speak it: reading only, one session per connection.
 
+mod array_texts;
 mod catalog;
+mod column_names;
 mod command;
 mod connection;
 mod copy;
@@ -38,6 +40,9 @@ use crate::request_span::continue_connection;
 use crate::service::QueryService;
 use connection::PostgresConnection;
 use startup::LoginHandler;
+
+/// Parameter of a startup packet from the door: the number that the client knows its connection by.
+pub(crate) const PID_PARAMETER: &str = "echolake.pid";
 
 /// Answers Postgres' protocol on an engine's socket.
 pub(crate) async fn serve(service: QueryService, listener: UnixListener) -> Result<(), Error> {

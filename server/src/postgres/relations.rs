@@ -50,7 +50,7 @@ const FIXED: [(&str, i32); 12] = [
 
 /// Tables of `pg_catalog`: name, and columns with their types. A question mark is for a column that may be NULL, and is
 /// unless a row says otherwise; the others are 0, false or empty.
-const CATALOG_TABLES: [(&str, &str); 20] = [
+const CATALOG_TABLES: [(&str, &str); 19] = [
     (
         "pg_class",
         "oid:oid relname:name relnamespace:regnamespace reltype:oid reloftype:oid relowner:oid relam:oid relfilenode:oid \
@@ -105,10 +105,6 @@ const CATALOG_TABLES: [(&str, &str); 20] = [
     ("pg_user_mappings", "umid:oid srvid:oid srvname:name umuser:oid usename:name umoptions:text[]?"),
     ("pg_ts_config_map", "mapcfg:oid maptokentype:int4 mapseqno:int4 mapdict:oid"),
     (
-        "pg_stat_activity",
-        "datid:oid datname:name pid:int4 usesysid:oid usename:name application_name:text? state:text?",
-    ),
-    (
         "pg_shadow",
         "usename:name usesysid:oid usecreatedb:bool usesuper:bool userepl:bool usebypassrls:bool passwd:text?",
     ),
@@ -131,9 +127,10 @@ pub(super) const SESSION_TABLES: [(&str, &str); 2] = [
     ),
     (
         "pg_stat_activity",
-        "datid:oid datname:name pid:int4 usesysid:oid usename:name application_name:text client_addr:text? \
-         client_port:int4? query_start:timestamptz? state_change:timestamptz? wait_event_type:text? wait_event:text? \
-         state:text query:text backend_type:text",
+        "datid:oid datname:name pid:int4 leader_pid:int4? usesysid:oid usename:name application_name:text client_addr:text? \
+         client_hostname:text? client_port:int4? backend_start:timestamptz? xact_start:timestamptz? \
+         query_start:timestamptz? state_change:timestamptz? wait_event_type:text? wait_event:text? state:text \
+         backend_xid:int4? backend_xmin:int4? query_id:int8? query:text backend_type:text",
     ),
 ];
 
@@ -275,6 +272,8 @@ struct CatalogRelation {
     schema: SchemaRef,
     is_view: bool,
     is_own: bool,
+    /// The SQL of a view of the lake.
+    definition: Option<String>,
 }
 
 /// What the catalogue tells of a lake's tables.
@@ -283,8 +282,12 @@ pub(super) struct CatalogRelations {
 }
 
 impl CatalogRelations {
-    /// Of the lake's tables, and of those of `pg_catalog` that are not in this file.
-    pub(super) fn new(lake: &[(&'static str, SchemaRef)], fixed: &[(String, SchemaRef)]) -> Self {
+    /// Of the lake's tables and its views' definitions, and of those of `pg_catalog` that are not in this file.
+    pub(super) fn new(
+        lake: &[(&'static str, SchemaRef)],
+        mut definitions: HashMap<&'static str, String>,
+        fixed: &[(String, SchemaRef)],
+    ) -> Self {
         let own = (FIRST_TABLE..).zip(lake).map(|(number, (name, schema))| CatalogRelation {
             number,
             namespace: (PUBLIC, SCHEMA),
@@ -292,6 +295,7 @@ impl CatalogRelations {
             schema: schema.clone(),
             is_view: Table::by_name(name).is_none(),
             is_own: true,
+            definition: definitions.remove(name),
         });
         let here = CATALOG_TABLES
             .iter()
@@ -306,6 +310,7 @@ impl CatalogRelations {
             schema,
             is_view: false,
             is_own: false,
+            definition: None,
         });
         let of_information =
             (INFORMATION_SCHEMA + 1..).zip(INFORMATION_TABLES).map(|(number, (name, columns))| CatalogRelation {
@@ -315,8 +320,14 @@ impl CatalogRelations {
                 schema: schema_of(columns),
                 is_view: true,
                 is_own: false,
+                definition: None,
             });
         Self { relations: own.chain(of_catalog).chain(of_information).collect() }
+    }
+
+    /// Definitions of views by their numbers.
+    pub(super) fn definitions(&self) -> HashMap<i32, String> {
+        self.relations.iter().filter_map(|of| Some((of.number, of.definition.clone()?))).collect()
     }
 
     /// Numbers of tables by name, and by schema and name.
@@ -413,6 +424,8 @@ pub(super) fn session_table(
     settings: &[(&'static str, String)],
 ) -> Result<Option<Arc<dyn TableProvider>>> {
     let Some((_, columns)) = SESSION_TABLES.iter().find(|(known, _)| *known == name) else { return Ok(None) };
+    let setting =
+        |name: &str| settings.iter().find(|(known, _)| *known == name).map_or("", |(_, value)| value.as_str());
     let rows = match name {
         "pg_settings" => settings.iter().map(|(name, value)| setting_row(name, value)).collect(),
         _ => vec![vec![
@@ -421,6 +434,7 @@ pub(super) fn session_table(
             ("pid", number(pid)),
             ("usesysid", number(OWNER)),
             ("usename", text(ROLE)),
+            ("application_name", text(setting("application_name"))),
             ("state", text("active")),
             ("backend_type", text("client backend")),
         ]],
@@ -567,7 +581,12 @@ fn table_row(of: &CatalogRelation) -> RowValues {
 }
 
 fn view_row(of: &CatalogRelation) -> RowValues {
-    vec![("schemaname", text(of.namespace.1)), ("viewname", text(&of.name)), ("viewowner", text(ROLE))]
+    vec![
+        ("schemaname", text(of.namespace.1)),
+        ("viewname", text(&of.name)),
+        ("viewowner", text(ROLE)),
+        ("definition", ScalarValue::Utf8(of.definition.clone())),
+    ]
 }
 
 fn place(of: &CatalogRelation) -> RowValues {
@@ -588,7 +607,10 @@ fn listed_view(of: &CatalogRelation) -> RowValues {
         "is_trigger_deletable",
         "is_trigger_insertable_into",
     ];
-    let rest = flags.map(|flag| (flag, text("NO"))).into_iter().chain([("check_option", text("NONE"))]);
+    let rest = flags
+        .map(|flag| (flag, text("NO")))
+        .into_iter()
+        .chain([("check_option", text("NONE")), ("view_definition", ScalarValue::Utf8(of.definition.clone()))]);
     place(of).into_iter().chain(rest).collect()
 }
 

@@ -4,19 +4,33 @@ use std::ops::ControlFlow;
 
 use datafusion::sql::sqlparser::ast::{
     AccessExpr, BinaryOperator, Expr, Function, FunctionArg, FunctionArgExpr, FunctionArgumentList, FunctionArguments,
-    GroupByExpr, Ident, ObjectName, ObjectNamePart, Query, Select, SelectItem, SetExpr, Statement, TableFactor, Value,
-    ValueWithSpan, VisitMut, VisitorMut,
+    GroupByExpr, Ident, ObjectName, ObjectNamePart, Query, Select, SelectItem, SetExpr, Statement, TableAlias,
+    TableAliasColumnDef, TableFactor, UnaryOperator, Value, ValueWithSpan, VisitMut, VisitorMut,
 };
 use datafusion::sql::sqlparser::dialect::PostgreSqlDialect;
 use datafusion::sql::sqlparser::parser::Parser;
 use pgwire::api::Type;
 
+use super::column_names::{name_columns, order_by_columns};
+
 /// Columns of `pg_type` that name a function by its number.
 const FUNCTIONS: [&str; 6] = ["typinput", "typoutput", "typreceive", "typsend", "typmodin", "typmodout"];
+/// Truths that clients compare with `t` and `f`, beside those of `pg_index`.
+const TRUTHS: [&str; 2] = ["condeferrable", "condeferred"];
 /// Aggregates that a subquery may have already.
 const AGGREGATES: [&str; 8] = ["array_agg", "avg", "bool_or", "count", "max", "min", "string_agg", "sum"];
-/// Tables about what no column of the lake has.
-const NOTHING: [&str; 3] = ["pg_attrdef", "pg_collation", "pg_sequence"];
+/// Tables about what no table or column of the lake has.
+const NOTHING: [&str; 4] = ["pg_attrdef", "pg_collation", "pg_policy", "pg_sequence"];
+/// Functions that give rows about what the lake has not, and their columns.
+const FUNCTIONS_OF_NOTHING: [(&str, &str); 2] = [
+    (
+        "pg_partition_tree",
+        "CAST(0 AS OID) AS relid, CAST(0 AS OID) AS parentrelid, false AS isleaf, CAST(0 AS INT) AS level",
+    ),
+    ("pg_options_to_table", "CAST('' AS TEXT) AS option_name, CAST('' AS TEXT) AS option_value"),
+];
+/// Columns of lists that clients compare with texts.
+const LISTS: [&str; 4] = ["confkey", "conkey", "indkey", "polroles"];
 /// What `datafusion-pg-catalog` makes of a name that is cast to a number, before and after the name, and the function
 /// that does the same without a subquery, and for more names.
 const CASTS: [(&str, &str, &str); 4] = [
@@ -30,8 +44,6 @@ const CASTS: [(&str, &str, &str); 4] = [
     ("SELECT oid FROM pg_catalog.pg_type WHERE typname = ", "", "to_regtype"),
     ("SELECT oid FROM pg_catalog.pg_proc WHERE proname = ", "", "to_regproc"),
 ];
-/// Begins what tells columns of one name apart; clients do not see it.
-pub(super) const REPEATED: char = '\u{1}';
 
 /// Tables of `pg_catalog` that are found without its name, beside those that `datafusion-pg-catalog` knows.
 const OWN_TABLES: [&str; 13] = [
@@ -147,6 +159,7 @@ impl VisitorMut for StatementAdapter<'_> {
         }
         if let Some(better) = array_of_query(expr)
             .or_else(|| subscripts(expr))
+            .or_else(|| split_text(expr))
             .or_else(|| expanded(expr))
             .or_else(|| number_of_name(expr))
             .or_else(|| case_of_truth(expr))
@@ -167,24 +180,38 @@ impl VisitorMut for StatementAdapter<'_> {
             one_row(query);
         }
         self.any_of_text(expr);
+        not_a_value(expr);
         escape_by_backslash(expr);
         type_of_integer(expr);
         ControlFlow::Continue(())
     }
 
+    // Names are those of the statement before it is adapted.
+    fn pre_visit_query(&mut self, query: &mut Query) -> ControlFlow<()> {
+        if let SetExpr::Select(select) = query.body.as_mut() {
+            name_columns(select);
+        }
+        order_by_columns(query);
+        ControlFlow::Continue(())
+    }
+
+    fn pre_visit_table_factor(&mut self, factor: &mut TableFactor) -> ControlFlow<()> {
+        name_elements(factor);
+        if let Some(none) = table_without_rows(factor).or_else(|| keys_of_nothing(factor)) {
+            *factor = none;
+        }
+        ControlFlow::Continue(())
+    }
+
     fn pre_visit_select(&mut self, select: &mut Select) -> ControlFlow<()> {
+        name_columns(select);
+        series_rows(&mut select.projection);
         for item in &mut select.projection {
             if let SelectItem::UnnamedExpr(expr) | SelectItem::ExprWithAlias { expr, .. } = item {
                 // It never breaks off.
                 let _ = VisitMut::visit(expr, &mut ExistsAdapter { depth: 0 });
             }
         }
-        ControlFlow::Continue(())
-    }
-
-    // What was adapted may have become equal.
-    fn post_visit_select(&mut self, select: &mut Select) -> ControlFlow<()> {
-        name_apart(&mut select.projection);
         ControlFlow::Continue(())
     }
 }
@@ -225,57 +252,6 @@ impl VisitorMut for ExistsAdapter {
             }
         }
         ControlFlow::Continue(())
-    }
-}
-
-// Postgres allows columns of one name.
-fn name_apart(items: &mut [SelectItem]) {
-    let mut seen: Vec<String> = Vec::new();
-    let names: Vec<_> = items.iter().map(item_name).collect();
-    for (at, (item, (key, name))) in items.iter_mut().zip(&names).enumerate() {
-        let Some(key) = key else { continue };
-        let repeated = seen.contains(key);
-        let repeats = repeated || names.iter().skip(at + 1).any(|(other, _)| other.as_ref() == Some(key));
-        if repeats {
-            let alias = match repeated {
-                true => format!("{name}{REPEATED}{at}"),
-                false => name.clone(),
-            };
-            let alias = Ident::with_quote('"', alias);
-            match item {
-                SelectItem::UnnamedExpr(expr) => *item = SelectItem::ExprWithAlias { expr: expr.clone(), alias },
-                SelectItem::ExprWithAlias { alias: own, .. } => *own = alias,
-                _ => {}
-            }
-        }
-        seen.push(key.clone());
-    }
-}
-
-// What DataFusion tells a column by, and its name in Postgres.
-fn item_name(item: &SelectItem) -> (Option<String>, String) {
-    match item {
-        SelectItem::ExprWithAlias { alias, .. } => {
-            let name = match alias.quote_style {
-                Some(_) => alias.value.clone(),
-                None => alias.value.to_lowercase(),
-            };
-            (Some(name.clone()), name)
-        }
-        SelectItem::UnnamedExpr(expr) => (Some(expr.to_string().to_lowercase()), column_name(expr)),
-        _ => (None, String::new()),
-    }
-}
-
-fn column_name(expr: &Expr) -> String {
-    match expr {
-        Expr::Identifier(name) => name.value.clone(),
-        Expr::CompoundIdentifier(parts) => parts.last().map(|name| name.value.clone()).unwrap_or_default(),
-        Expr::Function(function) => {
-            function.name.0.last().and_then(|n| n.as_ident()).map(|n| n.value.to_lowercase()).unwrap_or_default()
-        }
-        Expr::Cast { expr, .. } | Expr::Nested(expr) => column_name(expr),
-        _ => "?column?".to_owned(),
     }
 }
 
@@ -367,8 +343,12 @@ fn compared_with_text(expr: &Expr) -> Option<Expr> {
         _ => return None,
     };
     match (name.value.as_str(), text.as_str()) {
-        ("polroles", list) => parsed(&format!("array_to_string({left}, ',') {op} '{}'", list.trim_matches(['{', '}']))),
-        (truth, "t" | "f") if truth.starts_with("indis") => parsed(&format!("{left} {op} {}", text == "t")),
+        (column, list) if LISTS.contains(&column) => {
+            parsed(&format!("array_to_string({left}, ',') {op} '{}'", list.trim_matches(['{', '}'])))
+        }
+        (truth, "t" | "f") if truth.starts_with("indis") || TRUTHS.contains(&truth) => {
+            parsed(&format!("{left} {op} {}", text == "t"))
+        }
         _ => None,
     }
 }
@@ -456,7 +436,7 @@ fn array_of_query(expr: &Expr) -> Option<Expr> {
         TableFactor::Table { name, args: Some(_), .. } => name.to_string().eq_ignore_ascii_case("unnest"),
         _ => false,
     };
-    if select.from.iter().any(|from| unnests(&from.relation)) {
+    if select.from.iter().any(|from| unnests(&from.relation)) || asks_for_nothing(query) {
         return parsed("CAST(NULL AS TEXT[])");
     }
     let mut select = select.clone();
@@ -470,6 +450,72 @@ fn subscripts(expr: &Expr) -> Option<Expr> {
     let Expr::Function(Function { name, args: FunctionArguments::List(args), .. }) = expr else { return None };
     let asked = name.to_string().eq_ignore_ascii_case("generate_subscripts");
     asked.then(|| parsed(&format!("unnest(generate_series(1, array_length({args})))"))).flatten()
+}
+
+// A series in a select list gives a row for each of its numbers.
+fn series_rows(items: &mut [SelectItem]) {
+    for item in items {
+        let (SelectItem::UnnamedExpr(expr) | SelectItem::ExprWithAlias { expr, .. }) = item else { continue };
+        let Expr::Function(function) = &*expr else { continue };
+        if function.name.0.last().and_then(|name| name.as_ident()).is_some_and(|name| name.value == "generate_series") {
+            *expr = call("unnest", expr.clone(), &function.clone());
+        }
+    }
+}
+
+// regexp_split_to_table(text, pattern): a row for each part of a text.
+fn split_text(expr: &Expr) -> Option<Expr> {
+    let Expr::Function(Function { name, args: FunctionArguments::List(args), .. }) = expr else { return None };
+    let [text, pattern] = &args.args[..] else { return None };
+    let asked = name.0.last()?.as_ident()?.value == "regexp_split_to_table";
+    let parts = format!("string_to_array(regexp_replace({text}, {pattern}, chr(1), 'g'), chr(1))");
+    asked.then(|| parsed(&format!("unnest({parts})"))).flatten()
+}
+
+// NOT $1, whose value is a truth.
+fn not_a_value(expr: &mut Expr) {
+    let Expr::UnaryOp { op: UnaryOperator::Not, expr: inner } = expr else { return };
+    let value = match inner.as_ref() {
+        Expr::Nested(value) => value.as_ref(),
+        value => value,
+    };
+    if matches!(value, Expr::Value(ValueWithSpan { value: Value::Placeholder(_), .. }))
+        && let Some(truth) = parsed(&format!("CAST({value} AS BOOLEAN)"))
+    {
+        **inner = truth;
+    }
+}
+
+// The one column of a list's elements has the name of their table.
+fn name_elements(factor: &mut TableFactor) {
+    if let TableFactor::UNNEST { alias: Some(alias), array_exprs, .. } = factor
+        && let ([_], true) = (&array_exprs[..], alias.columns.is_empty())
+    {
+        alias.columns = vec![TableAliasColumnDef { name: alias.name.clone(), data_type: None }];
+    }
+}
+
+// The elements of a key, of which no table has one. DataFusion cannot unnest a column of the query around.
+fn keys_of_nothing(factor: &TableFactor) -> Option<TableFactor> {
+    let TableFactor::UNNEST { alias, array_exprs, .. } = factor else { return None };
+    let name = match &array_exprs[..] {
+        [Expr::Identifier(name)] => name,
+        [Expr::CompoundIdentifier(parts)] => parts.last()?,
+        _ => return None,
+    };
+    LISTS.contains(&name.value.as_str()).then(|| without_rows("CAST(0 AS SMALLINT)", alias.as_ref())).flatten()
+}
+
+fn without_rows(columns: &str, alias: Option<&TableAlias>) -> Option<TableFactor> {
+    let Expr::Subquery(subquery) = parsed(&format!("(SELECT {columns} WHERE false)"))? else { return None };
+    Some(TableFactor::Derived { lateral: false, subquery, alias: alias.cloned(), sample: None })
+}
+
+fn table_without_rows(factor: &TableFactor) -> Option<TableFactor> {
+    let TableFactor::Table { name, args: Some(_), alias, .. } = factor else { return None };
+    let name = &name.0.last()?.as_ident()?.value;
+    let (_, columns) = FUNCTIONS_OF_NOTHING.iter().find(|(known, _)| known == name)?;
+    without_rows(columns, alias.as_ref())
 }
 
 fn parsed(sql: &str) -> Option<Expr> {
@@ -553,7 +599,7 @@ mod tests {
     fn only_what_needs_it_is_adapted() {
         check(
             "SELECT ARRAY(SELECT b.n FROM m b WHERE b.i = r.i ORDER BY 1) FROM r",
-            "SELECT (SELECT array_agg(b.n) FROM m b WHERE b.i = r.i) FROM r",
+            "SELECT (SELECT array_agg(b.n) AS \"array_agg\" FROM m b WHERE b.i = r.i) AS \"array\" FROM r",
         );
         check(
             "SELECT x FROM t WHERE x LIKE 'pg/_%' ESCAPE '/'",
@@ -561,40 +607,44 @@ mod tests {
         );
         check("SELECT x FROM t WHERE x LIKE $1 ESCAPE '\\'", "SELECT x FROM t WHERE x LIKE $1 ESCAPE '\\'");
         check("SELECT 1, 1", "SELECT CAST(1 AS INT) AS \"?column?\", CAST(1 AS INT) AS \"?column?\u{1}1\"");
-        check("SELECT a.x, b.x, y FROM a, b", "SELECT a.x, b.x, y FROM a, b");
         check(
             "SELECT EXISTS(SELECT 1 FROM k WHERE k.i = t.i LIMIT 1) AS e FROM t",
-            "SELECT (SELECT count(*) FROM k WHERE k.i = t.i) > 0 AS e FROM t",
+            "SELECT (SELECT count(*) AS \"count\" FROM k WHERE k.i = t.i) > 0 AS e FROM t",
         );
-        check("SELECT x FROM t WHERE EXISTS (SELECT 1 FROM k)", "SELECT x FROM t WHERE EXISTS (SELECT 1 FROM k)");
+        check("SELECT x FROM t WHERE EXISTS (SELECT y FROM k)", "SELECT x FROM t WHERE EXISTS (SELECT y FROM k)");
         check(
             "SELECT (SELECT oid FROM pg_catalog.pg_type WHERE typname = 'integer' LIMIT 1)",
-            "SELECT to_regtype('integer')",
+            "SELECT to_regtype('integer') AS \"oid\"",
         );
-        check("SELECT to_timestamp(x, 'YYYY-MM-DD HH24:MI:SS.US')", "SELECT to_timestamp(x, '%Y-%m-%d %H:%M:%S%.f')");
+        check(
+            "SELECT to_timestamp(x, 'YYYY-MM-DD HH24:MI:SS.US') AS t",
+            "SELECT to_timestamp(x, '%Y-%m-%d %H:%M:%S%.f') AS t",
+        );
         check("WITH RECURSIVE typeinfo_tree(oid) AS (SELECT 1) SELECT * FROM typeinfo_tree", &{
             let known = Parser::parse_sql(&PostgreSqlDialect {}, TYPES).expect("SQL");
             known[0].to_string()
         });
         check(
             "SELECT CASE x WHEN 't' THEN 1 ELSE 0 END",
-            "SELECT CASE replace(replace(CAST(x AS TEXT), 'true', 't'), 'false', 'f') WHEN 't' THEN 1 ELSE 0 END",
-        );
-        check("SELECT (SELECT d.x FROM pg_catalog.pg_attrdef d WHERE d.i = a.i LIMIT 1) FROM a", "SELECT NULL FROM a");
-        check(
-            "SELECT (SELECT count(*) FROM pg_catalog.pg_attrdef) FROM a",
-            "SELECT (SELECT count(*) FROM pg_catalog.pg_attrdef) FROM a",
+            "SELECT CASE replace(replace(CAST(x AS TEXT), 'true', 't'), 'false', 'f') WHEN 't' THEN 1 ELSE 0 END AS \"case\"",
         );
         check(
-            "SELECT (SELECT d.x FROM pg_catalog.pg_class d WHERE d.i = a.i LIMIT 1) FROM a",
-            "SELECT (SELECT max(d.x) FROM pg_catalog.pg_class d WHERE d.i = a.i) FROM a",
+            "SELECT (SELECT d.x FROM pg_catalog.pg_attrdef d WHERE d.i = a.i LIMIT 1) FROM a",
+            "SELECT NULL AS \"x\" FROM a",
         );
-        check("SELECT (SELECT d.x FROM d) FROM a", "SELECT (SELECT d.x FROM d) FROM a");
-        check("SELECT (SELECT count(*) FROM pg_class) FROM a", "SELECT (SELECT count(*) FROM pg_class) FROM a");
+        check(
+            "SELECT (SELECT count(*) AS n FROM pg_catalog.pg_attrdef) AS n FROM a",
+            "SELECT (SELECT count(*) AS n FROM pg_catalog.pg_attrdef) AS n FROM a",
+        );
+        check(
+            "SELECT (SELECT d.x FROM pg_catalog.pg_class d WHERE d.i = a.i LIMIT 1) AS n FROM a",
+            "SELECT (SELECT max(d.x) AS \"max\" FROM pg_catalog.pg_class d WHERE d.i = a.i) AS n FROM a",
+        );
+        check("SELECT (SELECT d.x FROM d) AS n FROM a", "SELECT (SELECT d.x FROM d) AS n FROM a");
         check("SELECT x FROM pg_indexes", "SELECT x FROM pg_catalog.pg_indexes");
         check(
-            "SELECT array_contains($1, x), array_contains($2, x), array_contains($3, x) FROM t",
-            "SELECT array_contains(string_to_array(replace(replace(btrim($1, '{}'), '\"', ''), ', ', ','), ','), x), array_contains($2, x), array_contains($3, x) FROM t",
+            "SELECT x FROM t WHERE array_contains($1, x) AND array_contains($2, x)",
+            "SELECT x FROM t WHERE array_contains(string_to_array(replace(replace(btrim($1, '{}'), '\"', ''), ', ', ','), ','), x) AND array_contains($2, x)",
         );
         check(
             "SELECT x FROM t WHERE ctid BETWEEN '(0,0)'::tid AND '(4294967295,0)'::tid AND n < 1",
@@ -604,17 +654,38 @@ mod tests {
             "SELECT x FROM t WHERE ctid BETWEEN '(1,0)'::tid AND '(4294967295,0)'::tid",
             "SELECT x FROM t WHERE ctid BETWEEN '(1,0)'::tid AND '(4294967295,0)'::tid",
         );
-        check("SELECT array(SELECT 'a' || x FROM unnest(t.o) x) FROM t", "SELECT CAST(NULL AS TEXT[]) FROM t");
-        check("SELECT (keys).n FROM t", "SELECT get_field((keys), 'n') FROM t");
+        check(
+            "SELECT array(SELECT 'a' || x FROM unnest(t.o) x) AS n, array(SELECT y FROM pg_catalog.pg_policy) AS m FROM t",
+            "SELECT CAST(NULL AS TEXT[]) AS n, CAST(NULL AS TEXT[]) AS m FROM t",
+        );
+        check("SELECT (keys).n FROM t", "SELECT get_field((keys), 'n') AS \"n\" FROM t");
         check(
             "SELECT x FROM t WHERE i.indisprimary = 't' AND x = 't'",
             "SELECT x FROM t WHERE i.indisprimary = true AND x = 't'",
         );
-        check("SELECT CAST(format('%I', x) AS REGCLASS) FROM t", "SELECT to_regclass(format('%I', x)) FROM t");
         check(
-            "SELECT unnest(i.k), generate_subscripts(i.k, $1::INT) AS n FROM i",
-            "SELECT unnest(i.k), unnest(generate_series(1, array_length(i.k, $1::INT))) AS n FROM i",
+            "SELECT CAST(format('%I', x) AS REGCLASS) AS n FROM t",
+            "SELECT to_regclass(format('%I', x)) AS n FROM t",
         );
-        check("SELECT x <> 0, ARRAY[1] FROM t", "SELECT x <> 0, ARRAY[1] FROM t");
+        check(
+            "SELECT unnest(i.k) AS k, generate_subscripts(i.k, $1::INT) AS n FROM i",
+            "SELECT unnest(i.k) AS k, unnest(generate_series(1, array_length(i.k, $1::INT))) AS n FROM i",
+        );
+        check("SELECT generate_series(1, 2) AS i", "SELECT unnest(generate_series(1, 2)) AS i");
+        check(
+            "SELECT regexp_split_to_table(x, ',') AS w FROM t",
+            "SELECT unnest(string_to_array(regexp_replace(x, ',', chr(1), 'g'), chr(1))) AS w FROM t",
+        );
+        check(
+            "SELECT k FROM c CROSS JOIN UNNEST(c.conkey) AS k WHERE c.condeferrable = 'f'",
+            "SELECT k FROM c CROSS JOIN (SELECT CAST(0 AS SMALLINT) AS \"int2\" WHERE false) AS k (k) WHERE c.condeferrable = false",
+        );
+        check("SELECT k FROM UNNEST(ARRAY[1, 2]) AS k", "SELECT k FROM UNNEST(ARRAY[1, 2]) AS k (k)");
+        check("SELECT x FROM t WHERE x OR NOT($1)", "SELECT x FROM t WHERE x OR NOT CAST($1 AS BOOLEAN)");
+        check("SELECT x FROM c WHERE conkey = '{1,2}'", "SELECT x FROM c WHERE array_to_string(conkey, ',') = '1,2'");
+        check(
+            "SELECT o.option_name FROM pg_catalog.pg_options_to_table(t.o) o",
+            "SELECT o.option_name FROM (SELECT CAST('' AS TEXT) AS option_name, CAST('' AS TEXT) AS option_value WHERE false) o",
+        );
     }
 }

@@ -16,8 +16,8 @@ use pgwire::api::results::{DataRowEncoder, FieldFormat, FieldInfo, QueryResponse
 use pgwire::error::{PgWireError, PgWireResult};
 use pgwire::messages::data::DataRow;
 
+use super::column_names::REPEATED;
 use super::fixed_tables::{VECTOR_KEY, function_name};
-use super::rewrite::REPEATED;
 use super::sqlstate::error;
 use crate::fault::RequestFault;
 use crate::running::{AnswerEncoder, RunningQuery};

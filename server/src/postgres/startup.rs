@@ -13,6 +13,7 @@ use pgwire::api::{ClientInfo, METADATA_USER, PgWireConnectionState};
 use pgwire::error::{PgWireError, PgWireResult};
 use pgwire::messages::{PgWireBackendMessage, PgWireFrontendMessage, ProtocolVersion};
 
+use super::PID_PARAMETER;
 use super::connection::PostgresConnection;
 use super::settings::VERSION;
 use super::sqlstate::fatal;
@@ -54,7 +55,8 @@ impl LoginHandler {
         let service = &self.0.shared().service;
         let who = service.client(TokenScope::Sql).map_err(|fault| fatal(&fault))?;
         let wide = client.protocol_version() != ProtocolVersion::PROTOCOL3_0;
-        let (pid, key) = self.0.log_in(&who, wide).map_err(|fault| fatal(&fault))?;
+        let given = client.metadata().get(PID_PARAMETER).and_then(|pid| pid.parse().ok());
+        let (pid, key) = self.0.log_in(&who, given, wide).map_err(|fault| fatal(&fault))?;
         client.set_pid_and_secret_key(pid, key);
         let mut parameters = DefaultServerParameterProvider::default();
         parameters.server_version = VERSION.to_owned();

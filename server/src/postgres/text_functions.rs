@@ -108,6 +108,11 @@ pub(super) fn all() -> Vec<ScalarUDF> {
             let pretty = sizes.as_primitive::<Int64Type>().iter().map(|size| size.map(pretty_size));
             Ok(Arc::new(pretty.collect::<StringArray>()))
         }),
+        AnyFunction::udf("quote_literal", text, |args, _| {
+            let texts = cast(first(args)?, &DataType::Utf8)?;
+            let quoted = texts.as_string::<i32>().iter().map(|text| text.map(quote_literal));
+            Ok(Arc::new(quoted.collect::<StringArray>()))
+        }),
         AnyFunction::udf("pg_typeof", text, |args, rows| {
             let name = type_name(first(args)?.data_type());
             Ok(Arc::new(StringArray::from_iter_values(std::iter::repeat_n(name, rows))))
@@ -124,6 +129,19 @@ pub(super) fn all() -> Vec<ScalarUDF> {
     let truth = |_: &[DataType]| DataType::Boolean;
     all.extend(PRIVILEGES.map(|name| AnyFunction::udf(name, truth, may_read)));
     all
+}
+
+/// `pg_get_viewdef(view [, pretty])`.
+pub(super) fn view_definition(name: &'static str, definitions: HashMap<i32, String>) -> ScalarUDF {
+    AnyFunction::udf(
+        name,
+        |_| DataType::Utf8,
+        move |args, _| {
+            let views = cast(first(args)?, &DataType::Int32)?;
+            let one = |view: Option<i32>| definitions.get(&view?);
+            Ok(Arc::new(views.as_primitive::<Int32Type>().iter().map(one).collect::<StringArray>()))
+        },
+    )
 }
 
 /// `obj_description(table [, catalogue])`.
@@ -267,7 +285,7 @@ fn format_text(pattern: &str, values: &[Option<&str>]) -> Result<String> {
             Some('s') => formatted.push_str(value.unwrap_or_default()),
             Some('I') => formatted.push_str(&quote_name(value.ok_or_else(|| wrong("a name that is NULL"))?)),
             Some('L') => match value {
-                Some(value) => formatted.push_str(&format!("'{}'", value.replace('\'', "''"))),
+                Some(value) => formatted.push_str(&quote_literal(value)),
                 None => formatted.push_str("NULL"),
             },
             _ => return Err(wrong("only %s, %I and %L are known")),
@@ -276,6 +294,12 @@ fn format_text(pattern: &str, values: &[Option<&str>]) -> Result<String> {
     }
     formatted.push_str(rest);
     Ok(formatted)
+}
+
+// With a backslash it is a literal of its own kind.
+fn quote_literal(text: &str) -> String {
+    let quoted = text.replace('\'', "''");
+    if text.contains('\\') { format!("E'{}'", quoted.replace('\\', "\\\\")) } else { format!("'{quoted}'") }
 }
 
 fn quote_name(name: &str) -> String {
@@ -355,6 +379,13 @@ mod tests {
             assert_eq!(format_text(pattern, &values).expect(pattern), expected);
         }
         assert!(format_text("%4$s", &values).is_err() && format_text("%x", &values).is_err());
+    }
+
+    #[test]
+    fn literals_are_quoted() {
+        for (text, expected) in [("a", "'a'"), ("it's", "'it''s'"), (r"a\b", r"E'a\\b'")] {
+            assert_eq!(quote_literal(text), expected);
+        }
     }
 
     #[test]

@@ -4,7 +4,7 @@ use std::collections::HashMap;
 
 use anyhow::Context as _;
 use echolake_figures::{FigureTable, TableRow};
-use echolake_query::figure_rows::{TOTAL_BAND, band_labels, band_list, quoted};
+use echolake_query::figure_rows::{LevelReference, TOTAL_BAND, band_labels, band_list, quoted};
 use serde::Deserialize;
 
 use super::source::{FigureSource, SelectedSurface};
@@ -39,21 +39,30 @@ pub(super) async fn write_table(source: &FigureSource, args: &TableArgs) -> anyh
             ValuesArg::UnbiasedLevels => level_table(source, group, base.as_ref(), "unbiased_p90_mean_db").await?,
             ValuesArg::Energies => energy_table(source, group).await?,
         };
-        let title = args.output.title(|| default_title(args.values).into());
+        let title = args.output.title(|| default_title(args.values, group, base.as_ref()));
         let notes = source.notes(title, query, group.iter().chain(&base));
         args.output.write_table(&table, &notes, group)?;
     }
     Ok(())
 }
 
-fn default_title(values: ValuesArg) -> &'static str {
+fn default_title(values: ValuesArg, surfaces: &[SelectedSurface], base: Option<&SelectedSurface>) -> String {
+    let unit = level_unit(surfaces, base);
     match values {
-        ValuesArg::Levels => "Mean TNCE of the values up to the 90th percentile, dB re Flat total",
+        ValuesArg::Levels => format!("Mean TNCE of the values up to the 90th percentile, {unit}"),
         ValuesArg::UnbiasedLevels => {
-            "Mean TNCE of the values up to the 90th percentile, dB re Flat total, without Foam\u{2019}s reflection"
+            format!("Mean TNCE of the values up to the 90th percentile, {unit}, without Foam\u{2019}s reflection")
         }
-        ValuesArg::Energies => "Mean TNCE over the pairs, over Flat\u{2019}s total",
+        ValuesArg::Energies => "Mean TNCE over the pairs, over Flat\u{2019}s total".to_owned(),
     }
+}
+
+// Levels less those of their Flat are over the same band.
+fn level_unit(surfaces: &[SelectedSurface], base: Option<&SelectedSurface>) -> String {
+    let Some(base) = base else { return LevelReference::FlatTotal.unit().to_owned() };
+    let id = &base.surface_id;
+    let is_flat = surfaces.iter().all(|surface| surface.flat_reference == *id && surface.surface_id != *id);
+    if is_flat { LevelReference::FlatBand.unit().to_owned() } else { format!("dB, less {id}") }
 }
 
 fn surface_list(surfaces: &[&str]) -> String {

@@ -203,7 +203,7 @@ impl ClaimState {
             return;
         }
         let mut numbers = self.numbers().await.unwrap_or_default();
-        numbers.sort_unstable_by_key(|claim| std::cmp::Reverse(claim.1));
+        numbers.sort_unstable_by_key(|(_, number)| std::cmp::Reverse(*number));
         for (key, number) in numbers.iter().filter(|(key, _)| held.contains(&key)) {
             // One that stays is dead after a while.
             let _ = self.store.delete(&object(key, *number)).await;

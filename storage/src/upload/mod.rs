@@ -172,8 +172,7 @@ impl Lake {
     }
 
     fn other_upload(&self, path: &Path, there: String, given: String) -> Error {
-        let (location, record) = (self.location().to_owned(), digest_record_path(path).to_string());
-        Error::OtherUpload { location, path: path.to_string(), there, given, record }
+        Error::OtherUpload { location: self.location().to_owned(), path: path.to_string(), there, given }
     }
 }
 

@@ -923,8 +923,9 @@ export interface components {
             /** @description What is wrong, where, and what to do: the text that all protocols and the prompt have. */
             readonly detail?: string;
             /** @description What to do. */
-            readonly hint: string | null;
-            readonly place: components["schemas"]["ProblemPlace"] | null;
+            readonly hint?: string;
+            /** @description The place of an error in a query's text. */
+            readonly place?: components["schemas"]["ProblemPlace"];
             readonly status: number;
             readonly title: string;
             readonly type: string;

@@ -23,22 +23,47 @@ pub(super) struct CancelKey {
     pub(super) secret: Vec<u8>,
 }
 
+/// The target of a key, and whether it was used since the connection's last statement began: an engine that ends does not
+/// pass that on to the next.
+struct KnownKey {
+    target: CancelTarget,
+    is_used: bool,
+}
+
 /// The keys of all connections.
 #[derive(Default)]
-pub(super) struct CancelKeys(Mutex<HashMap<(i32, Vec<u8>), CancelTarget>>);
+pub(super) struct CancelKeys(Mutex<HashMap<(i32, Vec<u8>), KnownKey>>);
 
 impl CancelKeys {
+    /// A number for a connection, random as well.
+    ///
+    /// # Errors
+    /// If the system gives no random bytes.
+    pub(super) fn make_pid() -> Result<i32, getrandom::Error> {
+        let mut random = [0; 4];
+        getrandom::fill(&mut random)?;
+        Ok((i32::from_be_bytes(random) & i32::MAX).max(1))
+    }
+
     /// A key of `bytes` random bytes: four in protocol 3.0, more in 3.2. None if the system gives none.
-    pub(super) fn make(bytes: usize) -> Option<CancelKey> {
-        let mut random = [0; 36];
-        getrandom::fill(&mut random).ok()?;
-        let (pid, secret) = random.split_first_chunk()?;
-        Some(CancelKey { pid: i32::from_be_bytes(*pid) & i32::MAX, secret: secret.get(..bytes.min(32))?.to_vec() })
+    pub(super) fn make(pid: i32, bytes: usize) -> Option<CancelKey> {
+        let mut secret = vec![0; bytes.min(32)];
+        getrandom::fill(&mut secret).ok()?;
+        Some(CancelKey { pid, secret })
     }
 
     /// Lets this key cancel queries of the target's connection from now on.
     pub(super) fn set(&self, key: &CancelKey, target: CancelTarget) {
-        self.lock().insert((key.pid, key.secret.clone()), target);
+        let mut keys = self.lock();
+        let place = (key.pid, key.secret.clone());
+        let is_used = keys.get(&place).is_some_and(|known| known.is_used);
+        keys.insert(place, KnownKey { target, is_used });
+    }
+
+    /// Returns whether a key was used since this was asked last.
+    pub(super) fn take_use(&self, key: &CancelKey) -> bool {
+        let mut keys = self.lock();
+        keys.get_mut(&(key.pid, key.secret.clone())).is_some_and(|known| std::mem::take(&mut known.is_used))
     }
 
     /// Removes a key.
@@ -48,7 +73,10 @@ impl CancelKeys {
 
     /// Cancels the query on the connection of a key; false if there is none.
     pub(super) async fn cancel(&self, pid: i32, secret: &[u8]) -> bool {
-        let found = self.lock().get(&(pid, secret.to_vec())).cloned();
+        let found = self.lock().get_mut(&(pid, secret.to_vec())).map(|known| {
+            known.is_used = true;
+            known.target.clone()
+        });
         let Some(target) = found else { return false };
         // An engine that is gone runs nothing.
         if let Ok(mut stream) = target.engine.connect(EngineSocket::Postgres).await
@@ -60,7 +88,7 @@ impl CancelKeys {
         true
     }
 
-    fn lock(&self) -> MutexGuard<'_, HashMap<(i32, Vec<u8>), CancelTarget>> {
+    fn lock(&self) -> MutexGuard<'_, HashMap<(i32, Vec<u8>), KnownKey>> {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }

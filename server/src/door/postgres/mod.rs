@@ -5,6 +5,7 @@ mod cancel_keys;
 mod exchange;
 mod frames;
 mod relay;
+mod scram;
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -20,11 +21,14 @@ use crate::client_identity::ClientIdentity;
 use crate::door::server_door::ServerDoor;
 use crate::fault::RequestFault;
 use crate::metrics::ServerProtocol;
-use crate::request_span::begin_connection;
+use crate::postgres::PID_PARAMETER;
+use crate::request_span::{begin_connection, mark_startup};
+use crate::scram_verifier::ScramVerifier;
 use crate::tokens::TokenScope;
 use cancel_keys::CancelKeys;
 use frames::{FrameHeader, HEADER, PASSWORD_WANTED, StartupPacket, fatal_message};
 use relay::MessageRelay;
+use scram::{ScramExchange, methods_message};
 
 /// Connections at once.
 const MOST: usize = 128;
@@ -70,6 +74,7 @@ async fn attend(stream: PlacedStream, place: LoginPlace) {
         return;
     };
     work.hear_request();
+    mark_startup(&mut session.startup, PID_PARAMETER, &session.pid.to_string(), STARTUP);
     let _working = work.begin();
     let span = begin_connection(&mut session.startup, &session.client.name, STARTUP);
     MessageRelay::new(stream, place.door, place.keys, session).run().instrument(span).await;
@@ -80,17 +85,25 @@ struct PostgresLogin {
     client: Arc<ClientIdentity>,
     /// The packet that it began with, which each of its engines is sent.
     startup: BytesMut,
+    /// The number of its connection in each of them, and in its cancel key.
+    pid: i32,
 }
 
 impl LoginPlace {
     // None if the connection has nothing more to say.
     async fn log_in(&self, stream: PlacedStream) -> Option<(DoorStream, PostgresLogin)> {
         let mut stream = DoorStream::Left(stream);
+        let mut certificate = None;
         let login = loop {
-            let step = self.take_packet(&mut stream).await;
+            let step = self.take_packet(&mut stream, certificate.as_deref()).await;
             match (step, stream) {
                 // What follows is encrypted.
-                (Ok(LoginStep::Encrypt), DoorStream::Left(plain)) => stream = self.encryption.accept(plain).await?,
+                (Ok(LoginStep::Encrypt), DoorStream::Left(plain)) => {
+                    let before = self.encryption.certificate_hash();
+                    stream = self.encryption.accept(plain).await?;
+                    // If it was renewed meanwhile, the client may have got either.
+                    certificate = before.filter(|before| self.encryption.certificate_hash().as_ref() == Some(before));
+                }
                 (Ok(LoginStep::Again | LoginStep::Encrypt), same) => stream = same,
                 (Ok(LoginStep::Done(login)), same) => {
                     stream = same;
@@ -119,7 +132,11 @@ impl LoginPlace {
         let _ = stream.shutdown().await;
     }
 
-    async fn take_packet(&self, stream: &mut DoorStream) -> Result<LoginStep, RequestFault> {
+    async fn take_packet(
+        &self,
+        stream: &mut DoorStream,
+        certificate: Option<&[u8]>,
+    ) -> Result<LoginStep, RequestFault> {
         let Some(startup) = read_startup(stream).await? else { return Ok(LoginStep::Nothing) };
         let is_encrypted = matches!(stream, DoorStream::Right(_));
         match StartupPacket::parse(&startup[4..])? {
@@ -142,17 +159,49 @@ impl LoginPlace {
             }
             StartupPacket::Session { .. } if self.door.drain().is_begun() => Err(RequestFault::Draining),
             StartupPacket::Session { user } => {
-                let token = match self.door.access().is_open() {
-                    true => None,
-                    false => Some(read_password(stream).await?),
-                };
-                let found = self.door.access().client(token.as_deref(), || ClientIdentity::user(&user));
+                let found = self.authenticate(stream, &user, certificate).await;
                 let found = found.and_then(|client| client.require(TokenScope::Sql).map(|()| client));
                 let client = self.door.note_client(&self.work, ServerProtocol::Postgres, found)?;
-                Ok(LoginStep::Done(PostgresLogin { client, startup }))
+                let pid = CancelKeys::make_pid().map_err(RequestFault::defect("no random bytes"))?;
+                Ok(LoginStep::Done(PostgresLogin { client, startup, pid }))
             }
         }
     }
+}
+
+impl LoginPlace {
+    // If the user is a token's name, and its line has a verifier, the client proves that it has the token. Else it sends it.
+    async fn authenticate(
+        &self,
+        stream: &mut DoorStream,
+        user: &str,
+        certificate: Option<&[u8]>,
+    ) -> Result<Arc<ClientIdentity>, RequestFault> {
+        let access = self.door.access();
+        if let Some((client, verifier)) = access.scram_client(user) {
+            prove_token(stream, &verifier, certificate).await?;
+            access.check_current(&client)?;
+            return Ok(client);
+        }
+        let token = match access.is_open() {
+            true => None,
+            false => Some(read_password(stream).await?),
+        };
+        access.client(token.as_deref(), || ClientIdentity::user(user))
+    }
+}
+
+async fn prove_token(
+    stream: &mut DoorStream,
+    verifier: &ScramVerifier,
+    certificate: Option<&[u8]>,
+) -> Result<(), RequestFault> {
+    stream.write_all(&methods_message(certificate.is_some())).await.map_err(|_| broken())?;
+    let first = read_response(stream).await?;
+    let exchange = ScramExchange::begin(&first, verifier, certificate)?;
+    stream.write_all(&exchange.first_message()).await.map_err(|_| broken())?;
+    let last = read_response(stream).await?;
+    stream.write_all(&exchange.finish(&last)?).await.map_err(|_| broken())
 }
 
 /// What follows on a packet before the session.
@@ -189,6 +238,13 @@ async fn read_startup(stream: &mut DoorStream) -> Result<Option<BytesMut>, Reque
 
 async fn read_password(stream: &mut DoorStream) -> Result<String, RequestFault> {
     stream.write_all(&PASSWORD_WANTED).await.map_err(|_| broken())?;
+    let mut password = read_response(stream).await?;
+    let end = password.iter().position(|byte| *byte == 0).unwrap_or(password.len());
+    String::from_utf8(password.copy_to_bytes(end).to_vec()).map_err(|_| RequestFault::Unauthenticated)
+}
+
+// What a client answers to a request for a password, or for a part of a proof.
+async fn read_response(stream: &mut DoorStream) -> Result<BytesMut, RequestFault> {
     let mut header = [0; HEADER];
     stream.read_exact(&mut header).await.map_err(|_| broken())?;
     let Some(header) = FrameHeader::peek(&header)? else { return Err(broken()) };
@@ -196,9 +252,7 @@ async fn read_password(stream: &mut DoorStream) -> Result<String, RequestFault> 
         return Err(RequestFault::request("a password is expected"));
     }
     header.check()?;
-    let mut password = BytesMut::zeroed(header.bytes - HEADER);
-    stream.read_exact(&mut password).await.map_err(|_| broken())?;
-    let end = password.iter().position(|byte| *byte == 0).unwrap_or(password.len());
-    password.truncate(end);
-    String::from_utf8(password.copy_to_bytes(end).to_vec()).map_err(|_| RequestFault::Unauthenticated)
+    let mut response = BytesMut::zeroed(header.bytes - HEADER);
+    stream.read_exact(&mut response).await.map_err(|_| broken())?;
+    Ok(response)
 }

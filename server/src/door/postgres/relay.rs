@@ -186,6 +186,10 @@ impl MessageRelay {
                 }
                 continue;
             }
+            if !self.exchange.is_waiting() {
+                // What came before this statement was not about it.
+                self.take_cancel();
+            }
             self.exchange.ask(header, &bytes);
             link.outgoing.extend_from_slice(&bytes);
         }
@@ -250,6 +254,9 @@ impl MessageRelay {
             }
             match self.connect(false).await {
                 Ok(mut link) => {
+                    if self.exchange.is_waiting() && self.take_cancel() {
+                        self.tell(&RequestFault::Cancelled);
+                    }
                     if self.exchange.is_waiting() {
                         link.known = self.exchange.repeat();
                         link.outgoing.extend_from_slice(self.exchange.unanswered());
@@ -264,6 +271,11 @@ impl MessageRelay {
             }
             self.tell(&fault);
         }
+    }
+
+    // Whether the client has cancelled the statement that runs; an engine that ended may not have heard of it.
+    fn take_cancel(&self) -> bool {
+        self.key.as_ref().is_some_and(|key| self.keys.take_use(key))
     }
 
     fn tell(&mut self, fault: &RequestFault) {
@@ -351,7 +363,7 @@ impl MessageRelay {
     fn take_key(&mut self, link: &EngineLink, mut engine_key: &[u8]) -> BytesMut {
         let pid = engine_key.try_get_i32().unwrap_or(0);
         if self.key.is_none() {
-            self.key = CancelKeys::make(engine_key.len());
+            self.key = CancelKeys::make(self.login.pid, engine_key.len());
         }
         let Some(key) = &self.key else { return BytesMut::new() };
         self.keys.set(key, CancelTarget { engine: link.engine.clone(), pid, secret: engine_key.to_vec() });

@@ -57,7 +57,7 @@ impl SliceTask {
                     done = cut(&of, &snapshot, params, client.quota().time, &turns, to) => done,
                     () = stop.stopped() => Err(RequestFault::Cancelled),
                 };
-                timer.watch().finish(done.as_ref().copied());
+                timer.watch().finish(done.as_ref().err());
                 done
             };
             work.await.inspect_err(|fault| of.failed(fault.code()))

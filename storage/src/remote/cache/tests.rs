@@ -23,6 +23,7 @@ fn content() -> Bytes {
 async fn store() -> Arc<FaultyStore> {
     let store = FaultyStore::new(StoreFault::None, 1);
     store.put(&Path::from(FILE), content().into()).await.expect("written");
+    store.take_requests();
     store
 }
 
