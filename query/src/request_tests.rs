@@ -201,7 +201,8 @@ async fn queries_stay_within_their_budgets_of_requests() {
     // Footer, page index, the columns of the predicate, the response.
     assert!(cold.len() <= 4 && cold.iter().all(|r| r.starts_with("GET")), "{cold:?}");
     let warm = requests(&session, &store, &response(1, 2000), 1).await;
-    assert!(warm.len() <= 2, "{warm:?}");
+    // The cache, which `serve` and `sql` read through, spares the first two.
+    assert!(warm.len() <= 3, "{warm:?}");
     let cold = requests(&session, &store, ALL_TNCE, 1).await;
     assert!(cold.len() <= 2 * RUNS && cold.iter().all(|r| r.starts_with("GET")), "{cold:?}");
     let warm = requests(&session, &store, ALL_TNCE, 1).await;
