@@ -1,8 +1,9 @@
 """Checks clients of a server that encrypts and asks for tokens: `encrypted_clients.py ECHOLAKE LAKE [--write docs/clients.md]`.
 
 It makes a certificate and tokens by the command of this name, serves the lake, and has each client verify the certificate,
-log in and ask; then refuse another certificate, and be refused with a wrong token and without encryption. Over Postgres'
-protocol a token's own name logs in by SCRAM-SHA-256. `--write` replaces the table in that page. Needs psql, curl, a JDK with
+log in and ask; then refuse another certificate, and be refused with a wrong token and without encryption. Nothing of the
+token, the statement and the answer's column may be readable in the packets of the first (captured on loopback, which root
+alone may do). Over Postgres' protocol a token's own name logs in by SCRAM-SHA-256. `--write` replaces the table in that page. Needs psql, curl, a JDK with
 pgjdbc in /usr/share/java, and the PyPI packages psycopg[binary], asyncpg and adbc-driver-flightsql.
 """
 import argparse
@@ -15,12 +16,13 @@ import ssl
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 
 from checks import write_table
 
 HERE = os.path.dirname(os.path.abspath(__file__))
-SQL = "select count(*) from points"
+SQL = "select count(*) as number_of_grid_points from points"
 NAME = "ann"
 OLD = "old"
 
@@ -56,6 +58,52 @@ class EncryptedServer:
         """Ends it."""
         self.process.send_signal(signal.SIGINT)
         self.process.wait(20)
+
+
+class PacketCapture:
+    """What passes on loopback from and to these ports while it is open."""
+
+    ALL_PROTOCOLS = 3
+
+    def __init__(self, *ports):
+        self.ports = set(ports)
+        self.payloads = []
+
+    def __enter__(self):
+        self.socket = socket.socket(socket.AF_PACKET, socket.SOCK_RAW, socket.htons(self.ALL_PROTOCOLS))
+        self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 26)
+        self.socket.bind(("lo", 0))
+        self.socket.settimeout(0.2)
+        self.is_open = True
+        self.thread = threading.Thread(target=self.read)
+        self.thread.start()
+        return self
+
+    def read(self):
+        while True:
+            try:
+                packet = self.socket.recv(1 << 17)
+            except TimeoutError:
+                if not self.is_open:
+                    return
+                continue
+            # Ethernet's header, then IPv4's, whose length is in words of 32 bits, then TCP's with both ports.
+            transport = 14 + 4 * (packet[14] & 15)
+            numbers = {int.from_bytes(packet[transport + at : transport + at + 2], "big") for at in (0, 2)}
+            if packet[12:14] == b"\x08\x00" and packet[23] == socket.IPPROTO_TCP and numbers & self.ports:
+                self.payloads.append(packet[transport + 4 * (packet[transport + 12] >> 4) :])
+
+    def __exit__(self, *_):
+        self.is_open = False
+        self.thread.join()
+        self.socket.close()
+
+    def readable(self, *texts):
+        """Those of the texts that can be read, and an error if nothing was captured."""
+        payload = b"".join(self.payloads)
+        if len(payload) < 1000:
+            raise RuntimeError(f"{len(payload)} bytes were captured, expected thousands")
+        return [text for text in texts if text.encode() in payload]
 
 
 def wait_for(port):
@@ -171,10 +219,30 @@ def is_answered(act):
         return f"{type(error).__name__}: {error}"
 
 
+def unreadable_answer(server, act):
+    """Failures of an answer over an encrypted connection, and of its secrecy; None for what passed."""
+    with PacketCapture(server.http, server.flight, server.postgres) as capture:
+        answered = is_answered(lambda: act(server, server.certificate, server.token))
+    texts = {"the token": server.token, "the statement": SQL, "the column": "number_of_grid_points"}
+    found = capture.readable(*texts.values())
+    names = [name for name, text in texts.items() if text in found]
+    return answered, f"{' and '.join(names)} can be read" if names else None
+
+
+def capture_reads():
+    """None if the capture reads what is sent in plain text, so that it would show a token, too."""
+    with socket.create_server(("127.0.0.1", 0)) as listener, PacketCapture(listener.getsockname()[1]) as capture:
+        with socket.create_connection(listener.getsockname()) as stream:
+            stream.sendall(SQL.encode() * 50)
+    return None if capture.readable(SQL) else "the capture does not read plain text"
+
+
 def check_client(server, name, act, login):
     """Failures by check; None for what passed."""
+    answered, secrecy = unreadable_answer(server, act)
     results = {
-        "verified": is_answered(lambda: act(server, server.certificate, server.token)),
+        "verified": answered,
+        "packets": secrecy,
         "another certificate": is_refused(lambda: act(server, server.other, server.token)),
         "a wrong token": is_refused(lambda: act(server, server.certificate, server.token[:-1] + "x")),
         "not encrypted": is_refused(lambda: act(server, None, server.token)),
@@ -203,6 +271,10 @@ def main():
     parser.add_argument("--port", type=int, default=9443, help="the first of three ports")
     parser.add_argument("--write", help="the page whose table is replaced")
     given = parser.parse_args()
+    if os.geteuid() != 0:
+        sys.exit("packets are captured by root alone; hint: sudo, or a container")
+    if failure := capture_reads():
+        sys.exit(failure)
     with tempfile.TemporaryDirectory() as folder:
         server = EncryptedServer(given.program, given.lake, folder, given.port)
         try:
