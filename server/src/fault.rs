@@ -128,6 +128,12 @@ pub(crate) enum RequestFault {
         /// The limit.
         limit: usize,
     },
+    /// Too many failed logins of an address.
+    #[error("too many failed logins from this address; hint: log in with a valid token in {} s", wait.as_secs() + 1)]
+    FailedLogins {
+        /// Time after which it may try again.
+        wait: Duration,
+    },
     /// The server is stopping, and takes no new request.
     #[error("the server is stopping; hint: ask again in a moment")]
     Draining,
@@ -323,7 +329,7 @@ impl RequestFault {
             Self::Foreign { .. } => FaultCode::Foreign,
             Self::Cancelled => FaultCode::Cancelled,
             Self::Timeout { .. } => FaultCode::TimeLimit,
-            Self::TooMany { .. } => FaultCode::TooMany,
+            Self::TooMany { .. } | Self::FailedLogins { .. } => FaultCode::TooMany,
             Self::EngineEnded { .. } => FaultCode::EngineEnded,
             Self::Internal => FaultCode::Internal,
             Self::Draining | Self::Disconnected => FaultCode::Stopping,

@@ -90,7 +90,11 @@ impl ServerDoor {
             return Err(RequestFault::Draining);
         }
         let token = request.headers().get(header::AUTHORIZATION).and_then(|v| v.to_str().ok()).and_then(of_header);
+        self.failed_logins().check(work.peer())?;
         let found = self.access().client(token.as_deref(), ClientIdentity::programs);
+        if let (Some(_), Err(RequestFault::Unauthenticated)) = (&token, &found) {
+            self.failed_logins().count(work.peer());
+        }
         let client = self.note_client(work, ServerProtocol::FlightSql, found)?;
         let is_interactive = INTERACTIVE.iter().any(|method| request.uri().path().ends_with(method));
         let wire = if is_interactive { EngineProtocol::InteractiveGrpc } else { EngineProtocol::Grpc };

@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 use axum::Router;
 use axum::body::Body;
 use axum::extract::{Request, State};
-use axum::http::HeaderValue;
+use axum::http::{HeaderValue, header};
 use axum::middleware::Next;
 use axum::response::{IntoResponse as _, Response};
 use hyper::body::Incoming;
@@ -29,6 +29,8 @@ use crate::http::{FORWARDED_PROTO, ProblemResponse, RequestSite, authenticate, d
 use crate::metrics::ServerProtocol;
 use crate::request_span::{REQUEST_ID, begin_request};
 
+/// Where a browser shows a token.
+const SESSION_PATH: &str = "/api/v1/session";
 /// Connections at once. Systems often allow a process 1024 open files.
 const MOST: usize = 512;
 /// Time limit for a request's head, and for an idle connection between two requests.
@@ -74,6 +76,10 @@ async fn answer(stream: PlacedStream, encryption: ProtocolEncryption, router: Ro
     }
 }
 
+fn shows_token(request: &Request) -> bool {
+    request.headers().contains_key(header::AUTHORIZATION) || request.uri().path() == SESSION_PATH
+}
+
 impl ServerDoor {
     /// Forwards a request to the client's engine.
     pub(crate) async fn forward_http(State(door): State<Self>, request: Request) -> Response {
@@ -88,10 +94,18 @@ impl ServerDoor {
         let begun = Instant::now();
         let (span, id) = begin_request(request.headers_mut(), ServerProtocol::Http);
         let peer = request.extensions().get::<PlaceWork>().map(PlaceWork::peer);
-        let mut response = next.run(request).instrument(span.clone()).await;
+        // A page that nobody has logged in to shows no token.
+        let login = peer.filter(|_| shows_token(&request));
+        let mut response = match login.map_or(Ok(()), |peer| door.failed_logins().check(peer)) {
+            Ok(()) => next.run(request).instrument(span.clone()).await,
+            Err(fault) => ProblemResponse(fault).into_response(),
+        };
         if let (Some(peer), Some(code)) = (peer, response.extensions().get::<FaultCode>())
             && !door.access().is_open()
         {
+            if let (Some(peer), FaultCode::Unauthenticated) = (login, code) {
+                door.failed_logins().count(peer);
+            }
             span.in_scope(|| audit::record_refusal(peer, ServerProtocol::Http, *code));
         }
         response.headers_mut().insert(REQUEST_ID, id);

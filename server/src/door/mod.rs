@@ -8,6 +8,7 @@ pub(crate) mod drain;
 mod encryption;
 mod engine_pool;
 mod engine_process;
+mod failed_logins;
 mod flight;
 mod forward;
 mod http;
@@ -81,7 +82,7 @@ impl LakeServer {
         }
         Ok(Self {
             encryption: settings.certificate.map(ServerEncryption::new).transpose()?,
-            door: ServerDoor::new(lake, settings.tokens, settings.engines)?,
+            door: ServerDoor::new(lake, settings.tokens, settings.is_behind_proxy, settings.engines)?,
             http: listen(settings.http)?,
             flight_sql: listen(settings.flight_sql)?,
             postgres: listen(settings.postgres)?,

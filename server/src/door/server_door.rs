@@ -10,6 +10,7 @@ use super::connection_places::PlaceWork;
 use super::drain::ServerDrain;
 use super::engine_pool::EnginePool;
 use super::engine_process::EngineSettings;
+use super::failed_logins::FailedLogins;
 use super::readiness::ReadinessCheck;
 use crate::Error;
 use crate::activity::ServerActivity;
@@ -33,6 +34,7 @@ struct DoorState {
     readiness: ReadinessCheck,
     drain: ServerDrain,
     layout: ViewerLayout,
+    failed_logins: FailedLogins,
 }
 
 impl ServerDoor {
@@ -40,13 +42,24 @@ impl ServerDoor {
     ///
     /// # Errors
     /// [`Error::Temp`].
-    pub(super) fn new(lake: &Lake, tokens: Option<TokenFile>, settings: EngineSettings) -> Result<Self, Error> {
+    pub(super) fn new(
+        lake: &Lake,
+        tokens: Option<TokenFile>,
+        is_behind_proxy: bool,
+        settings: EngineSettings,
+    ) -> Result<Self, Error> {
+        let failed_logins = FailedLogins::new(tokens.is_some() && !is_behind_proxy);
         let activity = Arc::new(ServerActivity::new()?);
         let access = Arc::new(TokenAccess::new(tokens));
         let engines = EnginePool::new(lake, settings, activity.clone(), access.clone())?;
         let layout = ViewerLayout::new(lake.rig());
         let (readiness, drain) = (ReadinessCheck::new(lake), ServerDrain::default());
-        Ok(Self(Arc::new(DoorState { access, activity, engines, readiness, drain, layout })))
+        Ok(Self(Arc::new(DoorState { access, activity, engines, readiness, drain, layout, failed_logins })))
+    }
+
+    /// Failed logins of the last minute.
+    pub(super) fn failed_logins(&self) -> &FailedLogins {
+        &self.0.failed_logins
     }
 
     pub(crate) fn access(&self) -> &TokenAccess {

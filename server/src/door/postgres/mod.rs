@@ -159,7 +159,11 @@ impl LoginPlace {
             }
             StartupPacket::Session { .. } if self.door.drain().is_begun() => Err(RequestFault::Draining),
             StartupPacket::Session { user } => {
+                self.door.failed_logins().check(self.work.peer())?;
                 let found = self.authenticate(stream, &user, certificate).await;
+                if let Err(RequestFault::Unauthenticated) = &found {
+                    self.door.failed_logins().count(self.work.peer());
+                }
                 let found = found.and_then(|client| client.require(TokenScope::Sql).map(|()| client));
                 let client = self.door.note_client(&self.work, ServerProtocol::Postgres, found)?;
                 let pid = CancelKeys::make_pid().map_err(RequestFault::defect("no random bytes"))?;
