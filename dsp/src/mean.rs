@@ -25,7 +25,7 @@ impl SignalMean {
     /// [`Error::Length`] if it is not as long as those before.
     pub fn add<T: RealSample>(&mut self, signal: &[T]) -> Result<(), Error> {
         self.fit(signal.len())?;
-        self.sums.iter_mut().zip(signal).for_each(|(sum, x)| *sum += x.f64());
+        T::add_to(signal, &mut self.sums);
         self.count += 1;
         Ok(())
     }

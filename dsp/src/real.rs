@@ -18,6 +18,8 @@ pub trait RealSample: FftNum + PartialOrd + Default {
     fn epsilon() -> f64;
     /// The largest that is finite.
     fn max_value() -> Self;
+    /// Adds each sample of a signal to its sum, `[n]`; compiled with the kernels, however its caller is.
+    fn add_to(signal: &[Self], sums: &mut [f64]);
     /// Plans the transform of `len` complex samples.
     fn plan_fft(len: usize, direction: FftDirection) -> Arc<dyn Fft<Self>>;
     /// Plans the transform of `len` real samples.
@@ -41,6 +43,10 @@ impl RealSample for f32 {
 
     fn max_value() -> Self {
         Self::MAX
+    }
+
+    fn add_to(signal: &[Self], sums: &mut [f64]) {
+        sums.iter_mut().zip(signal).for_each(|(sum, x)| *sum += x.f64());
     }
 
     fn plan_fft(len: usize, direction: FftDirection) -> Arc<dyn Fft<Self>> {
@@ -71,6 +77,10 @@ impl RealSample for f64 {
 
     fn max_value() -> Self {
         Self::MAX
+    }
+
+    fn add_to(signal: &[Self], sums: &mut [f64]) {
+        sums.iter_mut().zip(signal).for_each(|(sum, x)| *sum += x.f64());
     }
 
     fn plan_fft(len: usize, direction: FftDirection) -> Arc<dyn Fft<Self>> {

@@ -4,6 +4,7 @@
 use std::sync::Arc;
 
 use echolake_dsp::foam::subtract;
+use echolake_dsp::mean::SignalMean;
 use echolake_dsp::temperature::speed_of_sound;
 use echolake_dsp::uncertainty::{EnergySensitivity, LevelUncertainty};
 use echolake_lake::{EncodedFile, FileEncoder, Lake, StagedFile, encode};
@@ -72,6 +73,7 @@ impl ReferenceDerivation {
         responses: &RunResponses,
     ) -> Result<(Vec<(Table, EncodedFile)>, usize)> {
         let (rig, grid) = (lake.rig(), lake.grid());
+        let failed = |cause| Error::Kernel { file: keys.run.to_string(), cause };
         let moved = rows::derived::SymmetryPairs::of(grid);
         let of = ReferenceVersions { flat: &self.flat_version, foam: &self.foam_version };
         let mut encoders =
@@ -79,6 +81,7 @@ impl ReferenceDerivation {
         let mut totals: Vec<Vec<f64>> = vec![Vec::new(); rig.bands.centres_hz.len() + 1];
         let mut unbiased = totals.clone();
         let mut errors = vec![Vec::new(); totals.len()];
+        let mut curves = vec![SignalMean::default(); rig.bands.centres_hz.len()];
         let mut paired = 0;
         self.slices(lake, keys, responses, &mut |slice| {
             paired += slice.pairs.len();
@@ -87,6 +90,7 @@ impl ReferenceDerivation {
             errors.iter_mut().zip(slice.error_columns()).for_each(|(all, some)| all.extend(some));
             let [nce, tnce, tnce_d4] = &mut encoders;
             let lists = slice.take_lists();
+            lists.add_curves(rig.impulse_response.length, &mut curves).map_err(failed)?;
             // Lists take most of the time; an idle core can encode the rest meanwhile.
             let (first, second) = rayon::join(
                 || Ok(nce.1.write(&rows::derived::nce(rig, grid, keys, lists, of)?)?),
@@ -101,7 +105,7 @@ impl ReferenceDerivation {
         for (table, encoder) in encoders {
             files.push((table, encoder.finish()?));
         }
-        let stats = rows::stats::rows(rig, keys, &SurfaceLevels { tnce: totals, unbiased, errors }, of)?;
+        let stats = rows::stats::rows(rig, keys, &SurfaceLevels { tnce: totals, unbiased, errors, curves }, of)?;
         files.push((Table::SurfaceStats, encode(Table::SurfaceStats, &Table::SurfaceStats.schema(rig), &[stats])?));
         Ok((files, responses.pairs.len() - paired))
     }

@@ -3,6 +3,7 @@
 use std::collections::HashMap;
 
 use echolake_dsp::chain::{DerivationPlan, DerivedResponse, FlatEnergies};
+use echolake_dsp::mean::SignalMean;
 use echolake_dsp::rise::CurveShape;
 use echolake_dsp::uncertainty::{EnergySensitivity, ErrorMoments, LevelUncertainty, ResidualFit, TemperatureResponse};
 use echolake_schema::Rig;
@@ -95,6 +96,16 @@ pub(crate) struct DerivedLists {
     pub(crate) reflected: Vec<f32>,
     /// `[bands][pairs x length]`.
     pub(crate) curves: Vec<Vec<f32>>,
+}
+
+impl DerivedLists {
+    /// Adds the curves, `length` samples each, to the means of their bands.
+    pub(crate) fn add_curves(&self, length: usize, means: &mut [SignalMean]) -> Result<(), echolake_dsp::Error> {
+        for (mean, curves) in means.iter_mut().zip(&self.curves) {
+            curves.chunks_exact(length).try_for_each(|curve| mean.add(curve))?;
+        }
+        Ok(())
+    }
 }
 
 impl DerivedRows {

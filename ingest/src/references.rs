@@ -22,7 +22,7 @@ use crate::error::{Error, Result};
 use crate::read_back;
 
 /// Revision of the rows that follow from references: those of another one are derived anew.
-const ROWS_REVISION: &str = "4";
+const ROWS_REVISION: &str = "5";
 /// Number of hex digits of a digest in a version.
 const VERSION_DIGITS: usize = 12;
 

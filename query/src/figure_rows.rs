@@ -138,6 +138,19 @@ pub fn curves_query(rig: &Rig, surfaces: &str, filter: &str) -> String {
     )
 }
 
+/// Returns the query of [`CurveRow`] for surfaces' means over all pairs, as ingest keeps them; no row for surfaces of
+/// several runs, or of a version that kept none.
+pub fn kept_curves_query(rig: &Rig, surfaces: &str) -> String {
+    let of_band = |band| format!("avg_list(mean_nce) filter (where band = '{band}')");
+    let bands: Vec<_> = rig.band_names().into_iter().map(of_band).collect();
+    format!(
+        "select surface_id, cast(max(measurements) as bigint) as pairs, make_array({}) as bands from surface_stats \
+         where surface_id in ({surfaces}) group by surface_id having count(*) = {all} and count(mean_nce) = {all}",
+        bands.join(", "),
+        all = bands.len() + 1
+    )
+}
+
 /// NCE of a surface, a mean over pairs.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 pub struct CurveRow {

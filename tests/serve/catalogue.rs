@@ -109,6 +109,17 @@ fn numbers_are_those_of_sql() {
         let level = grid["bands"][2][point].as_f64().expect("a level");
         assert!((level - row["level"].as_f64().expect("a level")).abs() < 1e-5, "{row:?} {level}");
     }
+    // As ingest kept them, and as the curves give them.
+    let kept = &place.sql(
+        "select max(abs(k - m)) as most, max(m) as top from (select unnest(s.mean_nce) as k, unnest(n.mean) as m
+         from surface_stats s join (select run_id, avg_list(nce_10000) as mean from nce group by run_id) n using (run_id)
+         where s.surface_id = 'brick' and s.band = '10000')",
+    )[0];
+    let (most, top) = (kept["most"].as_f64().expect("a difference"), kept["top"].as_f64().expect("a mean"));
+    assert!(most <= 1e-6 * top && top > 0.0, "{kept:?}");
+    let curves = json(&get(&server, "/api/v1/surfaces/brick/curves?points=4096"));
+    let last = curves["surface"]["bands"][2].as_array().and_then(|curve| curve.last()?.as_f64()).expect("a curve");
+    assert!((last - top).abs() <= 1e-6 * top, "{last} {kept:?}");
     let pair = json(&get(&server, "/api/v1/surfaces/brick/pairs/7"));
     let ir = &place.sql("select ir from measurements where surface_id = 'brick' and pair_id = 7")[0]["ir"];
     assert_eq!(&pair["measured"], ir);

@@ -4,6 +4,7 @@ use std::f64::consts::LN_10;
 
 use arrow::record_batch::RecordBatch;
 use echolake_dsp::level::{p90_mean, percentile, power_to_db};
+use echolake_dsp::mean::SignalMean;
 use echolake_dsp::uncertainty::ErrorMoments;
 use echolake_schema::Rig;
 use echolake_schema::tables::{BandStatistics, Table};
@@ -20,6 +21,8 @@ pub(crate) struct SurfaceLevels {
     pub(crate) unbiased: Vec<Vec<f64>>,
     /// Relative errors of TNCE; none if they are not known.
     pub(crate) errors: Vec<Vec<ErrorMoments>>,
+    /// Mean NCE curves of the bands.
+    pub(crate) curves: Vec<SignalMean>,
 }
 
 /// Builds one row per band and one for the total.
@@ -51,10 +54,19 @@ pub(crate) fn rows(
         .doubles("spread_db", stats.iter().map(|s| s.spread_db))
         .doubles("p90_mean_u_db", stats.iter().map(|s| s.p90_mean_u_db))
         .doubles("unbiased_p90_mean_db", stats.iter().map(|s| s.unbiased_p90_mean_db))
+        .lists("mean_nce", mean_curves(&levels.curves))
         .text("flat_version", of.flat)
         .text("foam_version", of.foam)
         .finish()?;
     Ok(batch)
+}
+
+// The bands' curves, then their sum; nothing without measurements.
+fn mean_curves(bands: &[SignalMean]) -> Vec<f32> {
+    let means: Vec<Vec<f64>> = bands.iter().map(|band| band.values().collect()).collect();
+    let length = means.first().map_or(0, Vec::len);
+    let total = (0..length).map(|i| means.iter().map(|mean| mean[i]).sum());
+    means.iter().flatten().copied().chain(total).map(|x: f64| x as f32).collect()
 }
 
 // Means are of power, as in the paper's tables; no energy at all has no level.
@@ -122,6 +134,16 @@ mod tests {
         assert!((u(&error(0.01, 0.0)) - 0.0434).abs() < 1e-4);
         assert!((u(&error(0.0, 1e-4)) - 0.00434).abs() < 1e-5);
         assert_eq!(p90_mean_uncertainty(&[0.5; 100], &[]), None);
+    }
+
+    #[test]
+    fn mean_curves_end_with_their_sum() {
+        let mut bands = vec![SignalMean::default(); 2];
+        assert!(mean_curves(&bands).is_empty());
+        for (band, curves) in bands.iter_mut().zip([[[0.0f32, 2.0], [1.0, 4.0]], [[0.0, 1.0], [0.0, 3.0]]]) {
+            curves.iter().for_each(|curve| band.add(curve).expect("equally long"));
+        }
+        assert_eq!(mean_curves(&bands), [0.5, 3.0, 0.0, 2.0, 0.5, 5.0]);
     }
 
     #[test]

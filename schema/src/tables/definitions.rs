@@ -365,6 +365,8 @@ fn surface_stats() -> Vec<Column> {
             "p90_mean_db without Foam's own reflection, which is estimated from Foam and Flat; null if it cannot be",
         )
         .or_null(),
+        Column::floats("mean_nce", "1", "Mean of the NCE curves over the pairs, along time; total is the bands' sum")
+            .or_null(),
     ]);
     columns.extend(references());
     columns.push(code_version());

@@ -6,7 +6,7 @@ use arrow::array::{ArrayRef, Float64Array};
 use arrow::record_batch::RecordBatch;
 use axum::Extension;
 use datafusion::common::ScalarValue;
-use echolake_query::figure_rows::{CurveRow, curves_query, thinned_samples};
+use echolake_query::figure_rows::{CurveRow, curves_query, kept_curves_query, thinned_samples};
 use echolake_schema::Rig;
 use serde::{Deserialize, Serialize};
 use utoipa::{IntoParams, ToSchema};
@@ -65,9 +65,17 @@ impl CurveSet {
         let rig = request.catalogue.lake().rig();
         let (filter, value) = over.filter();
         let sql = curves_query(rig, "$1", filter);
+        let kept_sql = matches!(over, PairSelection::All).then(|| kept_curves_query(rig, "$1"));
+        let first = async |sql: &str, values| -> Result<Option<CurveRow>, RequestFault> {
+            Ok(request.rows(sql, values).await?.into_iter().next())
+        };
         let read = async |surface: &str| -> Result<Option<CurveRow>, RequestFault> {
-            let values = [text(surface)].into_iter().chain(value.clone()).collect();
-            Ok(request.rows(&sql, values).await?.into_iter().next())
+            if let Some(sql) = &kept_sql
+                && let Some(row) = first(sql, vec![text(surface)]).await?
+            {
+                return Ok(Some(row));
+            }
+            first(&sql, [text(surface)].into_iter().chain(value.clone()).collect()).await
         };
         let (id, flat) = (&entry.surface.surface_id, &entry.surface.flat_reference);
         // What is left of Foam without Foam is no energy of a surface.
@@ -149,7 +157,8 @@ pub(super) struct CurvesQuery {
         (inline(BinaryContent) = "application/vnd.apache.arrow.stream")
     ))),
     extensions(("x-sql" = json!([
-        "select nce_2500, ..., nce_40000 from nce where surface_id in ($1, $flat) [and (microphone = $2 or speaker = \
+        "select band_hz, mean_nce from surface_stats where surface_id in ($1, $flat); of a microphone, and of surfaces of \
+         several runs: select nce_2500, ..., nce_40000 from nce where surface_id in ($1, $flat) [and (microphone = $2 or speaker = \
          $2)]; averaged sample by sample",
     ])))
 )]
