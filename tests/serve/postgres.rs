@@ -178,6 +178,8 @@ fn the_catalogue_is_as_in_postgres() {
         ("select 1, 1", "1,1"),
         ("select pg_typeof(1)", "integer"),
         ("select pg_typeof(1.5::real), pg_typeof(array[1.5::real])", "real,real[]"),
+        ("select pg_typeof(row_number() over ()), row_number() over () from pairs limit 1", "bigint,1"),
+        ("select make_array(make_array(1, 2), make_array(3)), map(['a'], [1])", "[[1,2],[3]],{\"a\":1}"),
         ("select pg_size_pretty(20480::bigint)", "20 kB"),
         ("select format('%s-%I', 'a', 'b c')", "a-\"b c\""),
         ("select pg_backend_pid() > 0", "t"),

@@ -11,6 +11,7 @@ mod extended;
 mod fixed_tables;
 mod functions;
 mod information;
+mod json_columns;
 mod relations;
 mod rewrite;
 mod rows;

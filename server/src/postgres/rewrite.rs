@@ -19,6 +19,8 @@ const FUNCTIONS: [&str; 6] = ["typinput", "typoutput", "typreceive", "typsend", 
 const TRUTHS: [&str; 2] = ["condeferrable", "condeferred"];
 /// Aggregates that a subquery may have already.
 const AGGREGATES: [&str; 8] = ["array_agg", "avg", "bool_or", "count", "max", "min", "string_agg", "sum"];
+/// Window functions whose numbers are of 64 bits.
+const RANKS: [&str; 4] = ["row_number", "rank", "dense_rank", "ntile"];
 /// Tables about what no table or column of the lake has.
 const NOTHING: [&str; 4] = ["pg_attrdef", "pg_collation", "pg_policy", "pg_sequence"];
 /// Functions that give rows about what the lake has not, and their columns.
@@ -183,6 +185,14 @@ impl VisitorMut for StatementAdapter<'_> {
         not_a_value(expr);
         escape_by_backslash(expr);
         type_of_integer(expr);
+        ControlFlow::Continue(())
+    }
+
+    // The call stays within what replaces it.
+    fn post_visit_expr(&mut self, expr: &mut Expr) -> ControlFlow<()> {
+        if let Some(signed) = signed_rank(expr) {
+            *expr = signed;
+        }
         ControlFlow::Continue(())
     }
 
@@ -365,6 +375,13 @@ fn name_of_function(expr: &Expr) -> Option<Expr> {
     let is_text = kind.ends_with("text") || kind.ends_with("varchar");
     let names_function = FUNCTIONS.iter().any(|column| name.value.eq_ignore_ascii_case(column));
     (is_text && names_function).then(|| parsed(&format!("function_name({inner})"))).flatten()
+}
+
+// Numbers of rows and ranks are unsigned in DataFusion, which no integer of Postgres is.
+fn signed_rank(expr: &Expr) -> Option<Expr> {
+    let Expr::Function(function) = expr else { return None };
+    let is_rank = RANKS.contains(&function.name.to_string().to_lowercase().as_str());
+    (is_rank && function.over.is_some()).then(|| parsed(&format!("CAST({function} AS BIGINT)"))).flatten()
 }
 
 // to_timestamp(text, 'YYYY-MM-DD'), whose letters are others in DataFusion.
@@ -657,6 +674,10 @@ mod tests {
         check(
             "SELECT array(SELECT 'a' || x FROM unnest(t.o) x) AS n, array(SELECT y FROM pg_catalog.pg_policy) AS m FROM t",
             "SELECT CAST(NULL AS TEXT[]) AS n, CAST(NULL AS TEXT[]) AS m FROM t",
+        );
+        check(
+            "SELECT x, row_number() OVER (ORDER BY x) FROM t",
+            "SELECT x, CAST(row_number() OVER (ORDER BY x) AS BIGINT) AS \"row_number\" FROM t",
         );
         check("SELECT (keys).n FROM t", "SELECT get_field((keys), 'n') AS \"n\" FROM t");
         check(

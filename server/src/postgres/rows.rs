@@ -5,6 +5,7 @@ use std::sync::Arc;
 use arrow::array::{Array as _, ArrayRef, AsArray as _, StringArray};
 use arrow::compute::cast;
 use arrow::datatypes::{DataType, Field, FieldRef, Int32Type, Schema, SchemaRef};
+use arrow::error::ArrowError;
 use arrow::record_batch::RecordBatch;
 use arrow_pg::datatypes::{PG_OID_ALIAS_KEY, arrow_schema_to_pg_fields};
 use arrow_pg::encode_recordbatch;
@@ -18,6 +19,7 @@ use pgwire::messages::data::DataRow;
 
 use super::column_names::REPEATED;
 use super::fixed_tables::{VECTOR_KEY, function_name};
+use super::json_columns::{is_json, json_texts};
 use super::sqlstate::error;
 use crate::fault::RequestFault;
 use crate::running::{AnswerEncoder, RunningQuery};
@@ -34,21 +36,23 @@ pub(super) fn fields(schema: &Schema, format: &Format) -> Result<Arc<Vec<FieldIn
     let own = |field: &FieldRef| match field.data_type() {
         DataType::List(_) if field.metadata().contains_key(VECTOR_KEY) => field.clone(),
         DataType::Int32 | DataType::Utf8 if !is_cast_number(field) => field.clone(),
+        kind if is_json(kind) => Arc::new(Field::new(field.name(), DataType::Utf8, field.is_nullable())),
         kind => Arc::new(Field::new(field.name(), kind.clone(), field.is_nullable())),
     };
-    let schema = Schema::new(schema.fields().iter().map(own).collect::<Vec<_>>());
-    let fields = arrow_schema_to_pg_fields(&schema, format, None).map_err(|e| encoding(&e))?;
-    let settled = |(field, own): (FieldInfo, &FieldRef)| {
+    let sent = Schema::new(schema.fields().iter().map(own).collect::<Vec<_>>());
+    let fields = arrow_schema_to_pg_fields(&sent, format, None).map_err(|e| encoding(&e))?;
+    let settled = |(field, (own, column)): (FieldInfo, (&FieldRef, &FieldRef))| {
         // A column of nothing but NULL is a text to Postgres' clients.
         let kind = match *field.datatype() {
             Type::UNKNOWN => Type::TEXT,
+            _ if is_json(column.data_type()) => Type::JSON,
             _ if own.metadata().contains_key(VECTOR_KEY) && field.format() == FieldFormat::Text => Type::TEXT,
             ref kind => kind.clone(),
         };
         let name = field.name().split(REPEATED).next().unwrap_or_default();
         FieldInfo::new(name.to_owned(), None, None, kind, field.format())
     };
-    Ok(Arc::new(fields.into_iter().zip(schema.fields()).map(settled).collect()))
+    Ok(Arc::new(fields.into_iter().zip(sent.fields().iter().zip(schema.fields())).map(settled).collect()))
 }
 
 // The numbers of a list, with spaces between them.
@@ -82,27 +86,31 @@ impl RowEncoder {
 
     /// The rows of a batch.
     pub(super) fn encode(&self, batch: RecordBatch) -> Result<Vec<DataRow>, RequestFault> {
-        let batch = self.write_texts(batch);
+        let batch = self.write_texts(batch).map_err(|e| encoding(&PgWireError::ApiError(e.into())))?;
         let rows: PgWireResult<Vec<_>> = encode_recordbatch(self.0.clone(), batch).collect();
         rows.map_err(|e| encoding(&e))
     }
 }
 
 impl RowEncoder {
-    // In texts a function's number is its name, and some lists have no brackets.
-    fn write_texts(&self, batch: RecordBatch) -> RecordBatch {
+    // In texts a function's number is its name, and some lists have no brackets. What Postgres has no type for is JSON.
+    fn write_texts(&self, batch: RecordBatch) -> Result<RecordBatch, ArrowError> {
         let is_written = |(field, column): (&FieldInfo, &ArrayRef)| {
             let is_list = matches!(column.data_type(), DataType::List(_)) && *field.datatype() == Type::TEXT;
-            field.format() == FieldFormat::Text && (is_list || *field.datatype() == Type::REGPROC)
+            let is_named = field.format() == FieldFormat::Text && (is_list || *field.datatype() == Type::REGPROC);
+            is_named || is_json(column.data_type())
         };
         if !self.0.iter().zip(batch.columns()).any(is_written) {
-            return batch;
+            return Ok(batch);
         }
-        let column = |(field, column): (&FieldInfo, &ArrayRef)| -> ArrayRef {
-            if !is_written((field, column)) {
-                return column.clone();
+        let column = |(field, column): (&FieldInfo, &ArrayRef)| -> Result<ArrayRef, ArrowError> {
+            if is_json(column.data_type()) {
+                return json_texts(column);
             }
-            match (column.as_primitive_opt::<Int32Type>(), column.as_list_opt::<i32>()) {
+            if !is_written((field, column)) {
+                return Ok(column.clone());
+            }
+            Ok(match (column.as_primitive_opt::<Int32Type>(), column.as_list_opt::<i32>()) {
                 (Some(numbers), _) => {
                     let names = numbers.iter().map(|number| function_name(number?));
                     Arc::new(names.collect::<StringArray>())
@@ -111,14 +119,14 @@ impl RowEncoder {
                     Arc::new(lists.iter().map(|list| list.and_then(spaced)).collect::<StringArray>())
                 }
                 (None, None) => column.clone(),
-            }
+            })
         };
-        let columns: Vec<_> = self.0.iter().zip(batch.columns()).map(column).collect();
+        let columns: Vec<_> = self.0.iter().zip(batch.columns()).map(column).collect::<Result<_, _>>()?;
         let own = batch.schema();
         let typed = own.fields().iter().zip(&columns);
         let fields = typed.map(|(field, column)| Field::new(field.name(), column.data_type().clone(), true));
         let schema = Arc::new(Schema::new(fields.collect::<Vec<_>>()));
-        RecordBatch::try_new(schema, columns).unwrap_or(batch)
+        RecordBatch::try_new(schema, columns)
     }
 }
 
