@@ -227,6 +227,8 @@ fn the_catalogue_is_as_in_postgres() {
         };
         assert_eq!(rows.iter().map(text).collect::<Vec<_>>().join(";"), expected, "{sql}");
     }
+    let copied = client.query("copy (select make_array(make_array(1, 2)), map(['a'], [1])) to stdout (format binary)");
+    assert!(copied.is_ok(), "{copied:?}");
     assert_eq!(client.query("unlisten *"), Ok(Vec::new()));
     assert_eq!(client.query("listen news"), Err("25006".to_owned()));
 }

@@ -21,7 +21,7 @@ use pgwire::error::{PgWireError, PgWireResult};
 use pgwire::messages::PgWireBackendMessage;
 use pgwire::messages::copy::{CopyData, CopyDone, CopyOutResponse};
 
-use super::rows::{encoding, fields};
+use super::rows::{encoding, fields, sent_columns};
 use super::sqlstate::error;
 use crate::fault::RequestFault;
 use crate::running::{AnswerEncoder, RunningQuery};
@@ -200,6 +200,7 @@ impl AnswerEncoder for CopyRowEncoder {
     type Item = Vec<CopyData>;
 
     fn batch(&mut self, batch: RecordBatch) -> Result<Vec<Vec<CopyData>>, RequestFault> {
+        let batch = sent_columns(&self.fields, batch)?;
         let schema = batch.schema();
         let mut rows = Vec::with_capacity(batch.num_rows());
         for row in 0..batch.num_rows() {

@@ -6,7 +6,7 @@ use arrow::array::{Array as _, ArrayRef, AsArray as _, StringArray};
 use arrow::compute::cast;
 use arrow::datatypes::{DataType, Field, FieldRef, Int32Type, Schema, SchemaRef};
 use arrow::error::ArrowError;
-use arrow::record_batch::RecordBatch;
+use arrow::record_batch::{RecordBatch, RecordBatchOptions};
 use arrow_pg::datatypes::{PG_OID_ALIAS_KEY, arrow_schema_to_pg_fields};
 use arrow_pg::encode_recordbatch;
 use echolake_query::Error as QueryError;
@@ -86,48 +86,46 @@ impl RowEncoder {
 
     /// The rows of a batch.
     pub(super) fn encode(&self, batch: RecordBatch) -> Result<Vec<DataRow>, RequestFault> {
-        let batch = self.write_texts(batch).map_err(|e| encoding(&PgWireError::ApiError(e.into())))?;
+        let batch = sent_columns(&self.0, batch)?;
         let rows: PgWireResult<Vec<_>> = encode_recordbatch(self.0.clone(), batch).collect();
         rows.map_err(|e| encoding(&e))
     }
 }
 
-impl RowEncoder {
-    // In texts a function's number is its name, and some lists have no brackets. What Postgres has no type for is JSON.
-    fn write_texts(&self, batch: RecordBatch) -> Result<RecordBatch, ArrowError> {
-        let is_written = |(field, column): (&FieldInfo, &ArrayRef)| {
-            let is_list = matches!(column.data_type(), DataType::List(_)) && *field.datatype() == Type::TEXT;
-            let is_named = field.format() == FieldFormat::Text && (is_list || *field.datatype() == Type::REGPROC);
-            is_named || is_json(column.data_type())
-        };
-        if !self.0.iter().zip(batch.columns()).any(is_written) {
-            return Ok(batch);
-        }
-        let column = |(field, column): (&FieldInfo, &ArrayRef)| -> Result<ArrayRef, ArrowError> {
-            if is_json(column.data_type()) {
-                return json_texts(column);
-            }
-            if !is_written((field, column)) {
-                return Ok(column.clone());
-            }
-            Ok(match (column.as_primitive_opt::<Int32Type>(), column.as_list_opt::<i32>()) {
-                (Some(numbers), _) => {
-                    let names = numbers.iter().map(|number| function_name(number?));
-                    Arc::new(names.collect::<StringArray>())
-                }
-                (None, Some(lists)) => {
-                    Arc::new(lists.iter().map(|list| list.and_then(spaced)).collect::<StringArray>())
-                }
-                (None, None) => column.clone(),
-            })
-        };
-        let columns: Vec<_> = self.0.iter().zip(batch.columns()).map(column).collect::<Result<_, _>>()?;
-        let own = batch.schema();
-        let typed = own.fields().iter().zip(&columns);
-        let fields = typed.map(|(field, column)| Field::new(field.name(), column.data_type().clone(), true));
-        let schema = Arc::new(Schema::new(fields.collect::<Vec<_>>()));
-        RecordBatch::try_new(schema, columns)
+/// Columns as Postgres has them: in texts a function's number is its name, and some lists have no brackets; what Postgres
+/// has no type for is JSON.
+///
+/// # Errors
+/// If a value has no JSON.
+pub(super) fn sent_columns(infos: &[FieldInfo], batch: RecordBatch) -> Result<RecordBatch, RequestFault> {
+    let columns = infos.iter().zip(batch.columns()).map(|(info, column)| sent_column(info, column));
+    let columns: Result<Vec<_>, ArrowError> = columns.collect();
+    let refused = |e: ArrowError| encoding(&PgWireError::ApiError(e.into()));
+    let columns = columns.map_err(refused)?;
+    let own = batch.schema();
+    let field = |(field, column): (&FieldRef, &ArrayRef)| match column.data_type() {
+        kind if kind == field.data_type() => field.clone(),
+        kind => Arc::new(Field::new(field.name(), kind.clone(), true)),
+    };
+    let fields: Vec<_> = own.fields().iter().zip(&columns).map(field).collect();
+    let options = RecordBatchOptions::new().with_row_count(Some(batch.num_rows()));
+    RecordBatch::try_new_with_options(Arc::new(Schema::new(fields)), columns, &options).map_err(refused)
+}
+
+fn sent_column(info: &FieldInfo, column: &ArrayRef) -> Result<ArrayRef, ArrowError> {
+    if is_json(column.data_type()) {
+        return json_texts(column);
     }
+    let is_text = info.format() == FieldFormat::Text;
+    Ok(match (column.as_primitive_opt::<Int32Type>(), column.as_list_opt::<i32>()) {
+        (Some(numbers), _) if is_text && *info.datatype() == Type::REGPROC => {
+            Arc::new(numbers.iter().map(|number| function_name(number?)).collect::<StringArray>())
+        }
+        (_, Some(lists)) if is_text && *info.datatype() == Type::TEXT => {
+            Arc::new(lists.iter().map(|list| list.and_then(spaced)).collect::<StringArray>())
+        }
+        _ => column.clone(),
+    })
 }
 
 impl AnswerEncoder for RowEncoder {
