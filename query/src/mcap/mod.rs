@@ -9,6 +9,7 @@ mod column;
 mod contents;
 mod error;
 mod file;
+mod flatbuffer;
 mod json;
 mod protobuf;
 mod ros;

@@ -8,7 +8,7 @@ use prost_reflect::MessageDescriptor;
 use super::error::Malformed;
 use super::json::JsonEncoding;
 use super::ros::RosVersion;
-use super::{json, protobuf, ros};
+use super::{flatbuffer, json, protobuf, ros};
 
 /// A channel's schema as it stands in the file.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, Default)]
@@ -36,6 +36,7 @@ enum Kind {
     /// By its properties, or one column with the text.
     Json(json::Shape, JsonEncoding),
     Ros(ros::Definition),
+    Flatbuffer(flatbuffer::Definition),
     /// Messages of an encoding that is not known, which have no columns.
     Unknown,
 }
@@ -44,7 +45,8 @@ enum Kind {
 pub(super) const BYTE_ORDER_MARK: &[u8] = b"\xef\xbb\xbf";
 
 /// The encodings that have columns, in words.
-const KNOWN: &str = "protobuf, json and cbor with jsonschema or none, cdr with ros2msg, and ros1 with ros1msg";
+const KNOWN: &str =
+    "protobuf, flatbuffer, json and cbor with jsonschema or none, cdr with ros2msg, and ros1 with ros1msg";
 
 impl Layout {
     /// Understands a schema; the text of an error says what is wrong with it.
@@ -63,6 +65,10 @@ impl Layout {
                 let text = std::str::from_utf8(text).map_err(|e| format!("its schema is no text: {e}"))?;
                 let definition = ros::Definition::parse(&schema.name, text, version)?;
                 (definition.fields()?, Kind::Ros(definition))
+            }
+            Some(Encoding::Flatbuffer) => {
+                let definition = flatbuffer::Definition::parse(&schema.name, &schema.data)?;
+                (definition.fields(), Kind::Flatbuffer(definition))
             }
             None => {
                 let (messages, encoding) = (&schema.messages, &schema.encoding);
@@ -92,6 +98,9 @@ impl Layout {
             Kind::Protobuf(message) => Decoder::Protobuf(protobuf::Decoder::new(message, &self.fields, wanted)),
             Kind::Json(shape, encoding) => Decoder::Json(json::Decoder::new(*shape, *encoding, &self.fields, wanted)),
             Kind::Ros(definition) => Decoder::Ros(ros::Decoder::new(definition, &self.fields, wanted)),
+            Kind::Flatbuffer(definition) => {
+                Decoder::Flatbuffer(flatbuffer::Decoder::new(definition, &self.fields, wanted))
+            }
             Kind::Unknown => Decoder::None,
         }
     }
@@ -103,6 +112,7 @@ enum Encoding {
     Protobuf,
     Json(JsonEncoding),
     Ros(RosVersion),
+    Flatbuffer,
 }
 
 impl Encoding {
@@ -111,6 +121,7 @@ impl Encoding {
             ("protobuf", "protobuf") => Self::Protobuf,
             ("json", "jsonschema" | "") => Self::Json(JsonEncoding::Text),
             ("cbor", "jsonschema" | "") => Self::Json(JsonEncoding::Cbor),
+            ("flatbuffer", "flatbuffer") => Self::Flatbuffer,
             ("cdr", "ros2msg") => Self::Ros(RosVersion::Two),
             ("ros1", "ros1msg") => Self::Ros(RosVersion::One),
             _ => return None,
@@ -123,6 +134,7 @@ pub(super) enum Decoder {
     Protobuf(protobuf::Decoder),
     Json(json::Decoder),
     Ros(ros::Decoder),
+    Flatbuffer(flatbuffer::Decoder),
     /// Passes messages over.
     None,
 }
@@ -134,6 +146,7 @@ impl Decoder {
             Self::Protobuf(decoder) => decoder.push(data),
             Self::Json(decoder) => decoder.push(data),
             Self::Ros(decoder) => decoder.push(data),
+            Self::Flatbuffer(decoder) => decoder.push(data),
             Self::None => Ok(()),
         }
     }
@@ -144,6 +157,7 @@ impl Decoder {
             Self::Protobuf(decoder) => decoder.spent.bytes(),
             Self::Json(decoder) => decoder.spent.bytes(),
             Self::Ros(decoder) => decoder.spent.bytes(),
+            Self::Flatbuffer(decoder) => decoder.spent.bytes(),
             Self::None => 0,
         }
     }
@@ -152,7 +166,7 @@ impl Decoder {
     pub(super) fn take_unfit(&mut self) -> usize {
         match self {
             Self::Json(decoder) => std::mem::take(&mut decoder.unfit),
-            Self::Protobuf(_) | Self::Ros(_) | Self::None => 0,
+            Self::Protobuf(_) | Self::Ros(_) | Self::Flatbuffer(_) | Self::None => 0,
         }
     }
 
@@ -162,6 +176,7 @@ impl Decoder {
             Self::Protobuf(decoder) => decoder.columns(),
             Self::Json(decoder) => decoder.columns(),
             Self::Ros(decoder) => decoder.columns(),
+            Self::Flatbuffer(decoder) => decoder.columns(),
             Self::None => &mut [],
         };
         columns.iter_mut().map(super::column::Column::finish).collect()
