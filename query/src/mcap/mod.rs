@@ -13,6 +13,7 @@ mod flatbuffer;
 mod json;
 mod protobuf;
 mod ros;
+mod ros_idl;
 mod rows;
 mod run_sizes;
 mod scan;

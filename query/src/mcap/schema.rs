@@ -1,5 +1,7 @@
 //! What a channel's schema says of its messages: their columns, and the decoder that fills them.
 
+use std::borrow::Cow;
+
 use arrow::array::ArrayRef;
 use arrow::datatypes::Fields;
 use arrow::error::ArrowError;
@@ -8,7 +10,7 @@ use prost_reflect::MessageDescriptor;
 use super::error::Malformed;
 use super::json::JsonEncoding;
 use super::ros::RosVersion;
-use super::{flatbuffer, json, protobuf, ros};
+use super::{flatbuffer, json, protobuf, ros, ros_idl};
 
 /// A channel's schema as it stands in the file.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, Default)]
@@ -46,7 +48,7 @@ pub(super) const BYTE_ORDER_MARK: &[u8] = b"\xef\xbb\xbf";
 
 /// The encodings that have columns, in words.
 const KNOWN: &str =
-    "protobuf, flatbuffer, json and cbor with jsonschema or none, cdr with ros2msg, and ros1 with ros1msg";
+    "protobuf, flatbuffer, json and cbor with jsonschema or none, cdr with ros2msg or ros2idl, and ros1 with ros1msg";
 
 impl Layout {
     /// Understands a schema; the text of an error says what is wrong with it.
@@ -61,9 +63,13 @@ impl Layout {
                 let (fields, shape) = json::columns(text)?;
                 (fields, Kind::Json(shape, encoding))
             }
-            Some(Encoding::Ros(version)) => {
+            Some(Encoding::Ros(version, notation)) => {
                 let text = std::str::from_utf8(text).map_err(|e| format!("its schema is no text: {e}"))?;
-                let definition = ros::Definition::parse(&schema.name, text, version)?;
+                let text = match notation {
+                    RosNotation::Message => Cow::Borrowed(text),
+                    RosNotation::Idl => Cow::Owned(ros_idl::message_definitions(&schema.name, text)?),
+                };
+                let definition = ros::Definition::parse(&schema.name, &text, version)?;
                 (definition.fields()?, Kind::Ros(definition))
             }
             Some(Encoding::Flatbuffer) => {
@@ -111,8 +117,15 @@ impl Layout {
 enum Encoding {
     Protobuf,
     Json(JsonEncoding),
-    Ros(RosVersion),
+    Ros(RosVersion, RosNotation),
     Flatbuffer,
+}
+
+/// How ROS' messages are defined.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum RosNotation {
+    Message,
+    Idl,
 }
 
 impl Encoding {
@@ -122,8 +135,9 @@ impl Encoding {
             ("json", "jsonschema" | "") => Self::Json(JsonEncoding::Text),
             ("cbor", "jsonschema" | "") => Self::Json(JsonEncoding::Cbor),
             ("flatbuffer", "flatbuffer") => Self::Flatbuffer,
-            ("cdr", "ros2msg") => Self::Ros(RosVersion::Two),
-            ("ros1", "ros1msg") => Self::Ros(RosVersion::One),
+            ("cdr", "ros2msg") => Self::Ros(RosVersion::Two, RosNotation::Message),
+            ("cdr", "ros2idl") => Self::Ros(RosVersion::Two, RosNotation::Idl),
+            ("ros1", "ros1msg") => Self::Ros(RosVersion::One, RosNotation::Message),
             _ => return None,
         })
     }
