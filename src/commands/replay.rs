@@ -152,7 +152,7 @@ fn describe(standing: &ReplayState) -> String {
     let state = if standing.is_playing { "" } else { ", stands" };
     let lost = if standing.lost == 0 { String::new() } else { format!(", {} lost", standing.lost) };
     let name = standing.recording.file_stem().unwrap_or_default().to_string_lossy();
-    format!("{name}, speed {}{state}, {} viewers{lost}", standing.speed, standing.viewers)
+    format!("{name}, speed {}{state}, viewers {}{lost}", standing.speed, standing.viewers)
 }
 
 // Files by their paths, runs and surfaces by the lake's tables.
