@@ -21,14 +21,14 @@ fn web() -> PathBuf {
 }
 
 /// Runs a program to its end; returns its output, as an error if it failed.
-fn run(command: &mut Command) -> Result<String, String> {
+pub(crate) fn run(command: &mut Command) -> Result<String, String> {
     let output = run_long_command(command).map_err(|e| format!("{command:?}: {e}"))?;
     let said = [output.stdout, output.stderr].map(|bytes| String::from_utf8_lossy(&bytes).into_owned()).concat();
     if output.status.success() { Ok(said) } else { Err(format!("{command:?}: {}\n{said}", output.status)) }
 }
 
 /// Returns the prerequisite of a test; None, with a message, if it is missing.
-fn or_skip<T>(test: &str, ready: Result<T, String>) -> Option<T> {
+pub(crate) fn or_skip<T>(test: &str, ready: Result<T, String>) -> Option<T> {
     match ready {
         Ok(ready) => Some(ready),
         Err(why) if env::var_os(NO_SKIP).is_some() => panic!("{test} cannot run: {why}"),
@@ -51,7 +51,14 @@ fn browser() -> Result<PathBuf, String> {
     if let Some(path) = known() {
         return Ok(path);
     }
-    run(Command::new("apt-get").args(["install", "-y", "--no-install-recommends", "chromium"]))?;
+    run(Command::new("apt-get").args([
+        "-o",
+        "DPkg::Lock::Timeout=900",
+        "install",
+        "-y",
+        "--no-install-recommends",
+        "chromium",
+    ]))?;
     known().ok_or_else(|| "there is no Chromium; hint: name it in $CHROMIUM".to_owned())
 }
 

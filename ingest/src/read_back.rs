@@ -58,8 +58,8 @@ pub(crate) async fn run_row(lake: &Lake, file: &DataFile) -> Result<RecordBatch>
 /// Reads the named columns of a file; all if `columns` is empty.
 pub(crate) async fn batches(lake: &Lake, table: Table, file: &DataFile, columns: &[&str]) -> Result<Vec<RecordBatch>> {
     let damaged = |reason: String| Error::DataFile { file: file.path.to_string(), reason };
-    let found = lake.store().get(&file.path).await.map_err(|e| damaged(e.to_string()))?;
-    let bytes = found.bytes().await.map_err(|e| damaged(e.to_string()))?;
+    let bytes = async { lake.store().get(&file.path).await?.bytes().await };
+    let bytes = bytes.await.map_err(|e| echolake_lake::Error::unread_file(&file.path, e))?;
     if bytes.len() as u64 != file.bytes {
         return Err(damaged(format!("it has {} bytes, its log says {}", bytes.len(), file.bytes)));
     }

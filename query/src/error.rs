@@ -162,7 +162,10 @@ impl Error {
 
     /// Converts an error of running a query.
     pub(crate) fn execution(error: &DataFusionError) -> Self {
-        Self::limit(error).unwrap_or_else(|| Self::Execution { message: hints::with_hint(explain(error).0) })
+        Self::limit(error).unwrap_or_else(|| {
+            let message = explain(error).0;
+            Self::Execution { message: store_fault(&message).unwrap_or_else(|| hints::with_hint(message)) }
+        })
     }
 
     // An error about a limit, not about the query.
@@ -207,6 +210,17 @@ fn explain(error: &DataFusionError) -> (String, Option<String>) {
         DataFusionError::Execution(text) => (text.clone(), None),
         other => (other.strip_backtrace(), None),
     }
+}
+
+// Returns what is to be said of a store that did not answer. The readers of files keep such faults as texts alone.
+fn store_fault(message: &str) -> Option<String> {
+    let (_, request) = message.split_once("Error performing ")?;
+    let (request, outcome) = request.split_once(" in ")?;
+    let (_, url) = request.split_once("://")?;
+    let path = url.split_once('/').map_or(url, |(_, path)| path);
+    let (_, cause) = outcome.split_once(" - ")?;
+    let cause = cause.split(": <?xml").next().unwrap_or(cause).trim();
+    Some(format!("cannot read `{path}` of the lake's store: {cause}; hint: run the query again when the store answers"))
 }
 
 fn arrow_message(error: &ArrowError) -> String {
@@ -329,6 +343,17 @@ mod tests {
         let long = format!("{}x{}", "a".repeat(100), "b".repeat(100));
         let around = format!("  ...{}x{}...\n  {}^", "a".repeat(60), "b".repeat(59), " ".repeat(63));
         assert_eq!(mark(&long, 1, 101).expect("a place").mark, around);
+    }
+
+    #[test]
+    fn a_store_that_does_not_answer_is_named_without_the_layers_above_it() {
+        let fault = "Parquet error: Failed to fetch metadata for file x.parquet: Object Store error: Generic remote error: \
+                     Generic S3 error: Error performing GET http://host:7480/lake/tables/x.parquet in 250.4ms, after 1 \
+                     retries, max_retries: 1, retry_timeout: 180s  - HTTP error: error sending request";
+        let expected = "cannot read `lake/tables/x.parquet` of the lake's store: HTTP error: error sending request; hint: \
+                        run the query again when the store answers";
+        assert_eq!(store_fault(fault).as_deref(), Some(expected));
+        assert_eq!(store_fault("division by zero"), None);
     }
 
     #[test]

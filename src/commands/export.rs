@@ -1,6 +1,6 @@
 //! `echolake export`: training sets, slices of runs, and the formats of acousticians.
 
-use std::path::PathBuf;
+mod export_target;
 
 use anyhow::Context as _;
 use clap::{Args, Subcommand, ValueEnum};
@@ -12,6 +12,8 @@ use echolake_lake::Lake;
 use echolake_query::{PredicateForm, Session};
 use echolake_schema::SurfaceId;
 use serde_json::json;
+
+use export_target::{ExportTarget, PendingExport};
 
 use crate::CommandOutcome;
 use crate::progress::{CommandProgress, TaskProgress};
@@ -32,9 +34,9 @@ pub(crate) enum ExportCommand {
 
 #[derive(Debug, Args)]
 pub(crate) struct MlArgs {
-    /// The new folder.
-    #[arg(short, long, value_name = "DIR", value_parser = local)]
-    output: PathBuf,
+    /// The new folder, on this machine or as s3://bucket/prefix.
+    #[arg(short, long, value_name = "DIR", value_parser = ExportTarget::parse)]
+    output: ExportTarget,
     /// Rows as measured, or under all eight symmetries of the square.
     #[arg(long, value_enum, default_value_t = SymmetriesArg::None)]
     symmetries: SymmetriesArg,
@@ -68,17 +70,6 @@ fn license(text: &str) -> Result<String, String> {
     match !text.is_empty() && text.chars().all(|c| c.is_ascii_alphanumeric() || ".-+".contains(c)) {
         true => Ok(text.to_ascii_lowercase()),
         false => Err("letters, digits, `.`, `-` and `+` only; hint: a name such as cc-by-4.0 or other".into()),
-    }
-}
-
-// Without this, a URL would become folders of its name.
-fn local(text: &str) -> Result<PathBuf, String> {
-    match text.split_once("://") {
-        None => Ok(text.into()),
-        Some(("file", path)) if path.starts_with('/') => Ok(path.into()),
-        Some(_) => Err("exports are written to this machine's disks only; hint: name a path, and copy it from there, \
-                        as with `aws s3 cp --recursive`"
-            .into()),
     }
 }
 
@@ -122,9 +113,9 @@ pub(crate) struct McapArgs {
     /// Order of the messages in the file's chunks.
     #[arg(long, value_enum, default_value_t = LayoutArg::ByTopic)]
     layout: LayoutArg,
-    /// The new file.
-    #[arg(short, long, value_name = "FILE", value_parser = local)]
-    output: PathBuf,
+    /// The new file, on this machine or as s3://bucket/name.
+    #[arg(short, long, value_name = "FILE", value_parser = ExportTarget::parse)]
+    output: ExportTarget,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
@@ -140,18 +131,18 @@ pub(crate) struct ResponseArgs {
     /// Surfaces, separated by commas; by default all.
     #[arg(long, value_delimiter = ',')]
     surfaces: Vec<SurfaceId>,
-    /// The new folder.
-    #[arg(short, long, value_name = "DIR", value_parser = local)]
-    output: PathBuf,
+    /// The new folder, on this machine or as s3://bucket/prefix.
+    #[arg(short, long, value_name = "DIR", value_parser = ExportTarget::parse)]
+    output: ExportTarget,
 }
 
 #[derive(Debug, Args)]
 pub(crate) struct WavArgs {
     #[command(flatten)]
     selection: SelectionArgs,
-    /// The new folder.
-    #[arg(short, long, value_name = "DIR", value_parser = local)]
-    output: PathBuf,
+    /// The new folder, on this machine or as s3://bucket/prefix.
+    #[arg(short, long, value_name = "DIR", value_parser = ExportTarget::parse)]
+    output: ExportTarget,
 }
 
 pub(crate) async fn run(command: &ExportCommand, lake_url: &str) -> anyhow::Result<CommandOutcome> {
@@ -186,12 +177,14 @@ async fn ml(lake: &Lake, args: &MlArgs) -> anyhow::Result<()> {
         license: args.license.clone(),
     };
     let (progress, mut task) = (CommandProgress::new(), None);
-    let exported = write_training_set(lake, &args.output, &set, &mut |done, total| {
+    let pending = PendingExport::folder(&args.output).await?;
+    let exported = write_training_set(lake, pending.path(), &set, &mut |done, total| {
         step(&progress, &mut task, "surfaces", done, total);
     })
     .await?;
     let bytes: u64 = exported.files.iter().map(|f| f.bytes).sum();
     finish(task, format!("{} files, {}", exported.files.len(), super::size(bytes)));
+    pending.publish().await?;
     super::print(&if args.json { in_json(&exported)? } else { in_words(&exported) })?;
     Ok(())
 }
@@ -240,7 +233,8 @@ fn in_json(exported: &ExportSummary) -> serde_json::Result<String> {
 }
 
 async fn mcap(lake: &Lake, args: &McapArgs) -> anyhow::Result<()> {
-    let mut file = PendingFile::create(&args.output)?;
+    let pending = PendingExport::file(&args.output).await?;
+    let mut file = PendingFile::create(pending.path())?;
     let taken = taken(lake, &args.selection).await?;
     let layout = match args.layout {
         LayoutArg::ByTopic => Layout::ByTopic,
@@ -255,30 +249,36 @@ async fn mcap(lake: &Lake, args: &McapArgs) -> anyhow::Result<()> {
         file.write(&piece)?;
     }
     file.publish()?;
-    eprintln!("{}: {count} measurements, {}", args.output.display(), super::size(bytes));
+    pending.publish().await?;
+    eprintln!("{}: {count} measurements, {}", args.output, super::size(bytes));
     Ok(())
 }
 
 async fn responses(lake: &Lake, args: &ResponseArgs, format: ResponseFormat) -> anyhow::Result<()> {
     let (progress, mut task) = (CommandProgress::new(), None);
-    let files = write_responses(lake, &args.output, format, &args.surfaces, &mut |done, total| {
+    let pending = PendingExport::folder(&args.output).await?;
+    let files = write_responses(lake, pending.path(), format, &args.surfaces, &mut |done, total| {
         step(&progress, &mut task, "surfaces", done, total);
     })
     .await?;
     let bytes: u64 = files.iter().map(|f| f.bytes).sum();
     finish(task, format!("{} files, {}", files.len(), super::size(bytes)));
-    Ok(())
+    pending.publish().await
 }
 
 async fn wav(lake: &Lake, args: &WavArgs) -> anyhow::Result<()> {
     let taken = taken(lake, &args.selection).await?;
     let (progress, mut task) = (CommandProgress::new(), None);
-    let count = write_wav(lake, &args.output, &taken, check(&args.selection), &mut |done, total| {
+    let pending = PendingExport::folder(&args.output).await?;
+    let count = write_wav(lake, pending.path(), &taken, check(&args.selection), &mut |done, total| {
         step(&progress, &mut task, "recordings", done, total);
     })
     .await?;
     finish(task, format!("{count} recordings"));
-    eprintln!("next: echolake --lake NEW import wav {}", args.output.join("manifest.csv").display());
+    pending.publish().await?;
+    if let ExportTarget::Local(folder) = &args.output {
+        eprintln!("next: echolake --lake NEW import wav {}", folder.join("manifest.csv").display());
+    }
     Ok(())
 }
 

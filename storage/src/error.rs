@@ -85,6 +85,12 @@ pub enum Error {
         /// Field by field, what differs.
         differences: String,
     },
+    /// Something is there already, and nothing is overwritten.
+    #[error("`{path}` is there already; hint: name a new place")]
+    ObjectExists {
+        /// The object or folder.
+        path: String,
+    },
     /// The store refused.
     #[error("cannot {action} `{path}`: {source}{}", source.hint())]
     Store {
@@ -256,6 +262,28 @@ impl Error {
     pub(crate) fn store(action: &'static str, path: impl ToString, source: object_store::Error) -> Self {
         Self::Store { action, path: path.to_string(), source: StoreError(source) }
     }
+
+    /// Returns the error of a store that was asked for an object again and again in vain; any other fault is given back.
+    ///
+    /// # Errors
+    /// The given fault.
+    #[cfg(feature = "tables")]
+    pub fn unanswered(
+        path: &object_store::path::Path,
+        source: object_store::Error,
+    ) -> std::result::Result<Self, object_store::Error> {
+        if is_unanswered(&source) { Ok(Self::store("read", path, source)) } else { Err(source) }
+    }
+
+    /// Returns the error for a table's file that a store did not give: an absent one is damage to the lake, any other
+    /// fault is the store's.
+    #[cfg(feature = "tables")]
+    pub fn unread_file(file: &object_store::path::Path, source: object_store::Error) -> Self {
+        match source {
+            object_store::Error::NotFound { .. } => Self::DataFile { file: file.to_string(), source: source.into() },
+            source => Self::store("read", file, source),
+        }
+    }
 }
 
 impl StoreError {
@@ -274,6 +302,14 @@ impl StoreError {
                 };
             }
             source = error.source();
+        }
+        let answer = answer_text(&root_cause(&self.0).to_string()).unwrap_or_default();
+        if answer.contains("NoSuchBucket") {
+            return "; hint: is the bucket's name right, and AWS_ENDPOINT_URL that of its store?";
+        }
+        #[cfg(feature = "remote")]
+        if is_unanswered(&self.0) {
+            return "; hint: run the same command again when the store answers; what was done stays";
         }
         match self.0 {
             object_store::Error::PermissionDenied { .. } | object_store::Error::Unauthenticated { .. } => {
@@ -313,6 +349,22 @@ fn tries_text(error: &object_store::Error) -> String {
     if tries > 1 { format!(" (tried {tries} times)") } else { String::new() }
 }
 
+// Returns whether the request was repeated in vain, and not because it is wrong.
+#[cfg(feature = "remote")]
+fn is_unanswered(error: &object_store::Error) -> bool {
+    if answer_text(&root_cause(error).to_string()).is_some_and(|answer| answer.starts_with('4')) {
+        return false;
+    }
+    let mut source = Some(error as &dyn std::error::Error);
+    while let Some(cause) = source {
+        if cause.is::<crate::remote::RetriedError>() {
+            return true;
+        }
+        source = cause.source();
+    }
+    false
+}
+
 fn root_cause(error: &object_store::Error) -> &dyn std::error::Error {
     let mut cause: &dyn std::error::Error = error;
     while let Some(inner) = cause.source() {
@@ -340,5 +392,12 @@ mod tests {
              <Message>Reduce your request rate.</Message></Error>",
             "503 Service Unavailable, SlowDown (Reduce your request rate.) (tried 4 times)",
         );
+        check(
+            "GET http://host/x: 404 Not Found: <?xml?><Error><Code>NoSuchBucket</Code></Error>",
+            "404 Not Found, NoSuchBucket",
+        );
+        let absent = "404 Not Found: <?xml?><Error><Code>NoSuchBucket</Code></Error>".to_owned();
+        let error = Error::store("list", "s3://x", object_store::Error::Generic { store: "S3", source: absent.into() });
+        assert!(error.to_string().contains("NoSuchBucket; hint: is the bucket's name right"), "{error}");
     }
 }

@@ -35,7 +35,7 @@ pub use config::{DirectSound, LAKE_FORMAT, LakeConfig, ReferenceSurfaces};
 pub use error::{Error, StoreError};
 pub use lake::Lake;
 #[cfg(feature = "tables")]
-pub use remote::{CACHE_MEMORY_BYTES, CacheCounters, CacheCounts, CacheFolder};
+pub use remote::{CACHE_MEMORY_BYTES, CacheCounters, CacheCounts, CacheFolder, ObjectFolder};
 #[cfg(feature = "remote")]
 pub use remote::{RemoteAccess, remote_access};
 #[cfg(feature = "remote")]

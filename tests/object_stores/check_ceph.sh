@@ -16,7 +16,6 @@ finish() {
     rm -rf "$work"
 }
 trap finish EXIT
-command -v faketime >/dev/null || apt-get install -y -qq --no-install-recommends faketime >&2
 "$here/ceph_rgw.sh" start >"$work/store.env"
 set -a
 # shellcheck disable=SC1091

@@ -1,6 +1,8 @@
 //! Lakes on an object store: what is ingested there is what a folder would hold, whatever answers are lost; and a store
 //! that overwrites is not written to.
 
+mod ceph;
+mod exports;
 mod requests;
 mod s3_double;
 mod uploads;

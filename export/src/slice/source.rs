@@ -70,6 +70,11 @@ impl RunFile {
         Ok(Self { run: run.clone(), surface, path: Path::from(path), bytes, sha256, started_ns })
     }
 
+    // A store that is away says nothing of the file.
+    fn unread(&self, fault: object_store::Error) -> Error {
+        echolake_lake::Error::unanswered(&self.path, fault).map_or_else(|fault| self.changed(fault), Error::from)
+    }
+
     fn changed(&self, source: impl Into<ErrorCause>) -> Error {
         Error::Changed { run: self.run.clone(), file: self.path.to_string(), source: source.into() }
     }
@@ -107,7 +112,7 @@ impl Source {
     }
 
     async fn read(&self, range: Range<u64>) -> Result<Bytes> {
-        self.store.get_range(&self.file.path, range).await.map_err(|e| self.file.changed(e))
+        self.store.get_range(&self.file.path, range).await.map_err(|e| self.file.unread(e))
     }
 
     async fn read_summary(&mut self, tail: &Bytes) -> Result<()> {
@@ -194,12 +199,12 @@ impl Source {
 async fn read_tail(store: &dyn ObjectStore, file: &RunFile) -> Result<Bytes> {
     let found = store.get_opts(&file.path, GetOptions::new().with_range(Some(tail_range(file.bytes)))).await;
     let (size, tail) = match found {
-        Ok(found) => (found.meta.size, found.bytes().await.map_err(|e| file.changed(e))?),
+        Ok(found) => (found.meta.size, found.bytes().await.map_err(|e| file.unread(e))?),
         Err(object_store::Error::NotFound { .. }) => return Err(file.changed("it is not there; was it moved?")),
         // A shorter file has no such range.
         Err(error) => match store.head(&file.path).await {
             Ok(meta) if meta.size != file.bytes => (meta.size, Bytes::new()),
-            _ => return Err(file.changed(error)),
+            _ => return Err(file.unread(error)),
         },
     };
     match size == file.bytes {

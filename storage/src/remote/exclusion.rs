@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use futures::future::join_all;
+use futures::future::{join, join_all};
 use object_store::path::Path;
 use object_store::{Error as StoreError, ObjectStore, ObjectStoreExt as _, PutMode, Result as StoreResult};
 use uuid::Uuid;
@@ -30,16 +30,10 @@ pub(crate) enum ExclusionFault {
 pub(crate) async fn probe_exclusion(store: &Arc<dyn ObjectStore>) -> Result<(), ExclusionFault> {
     let path = |name: &str| Path::from(format!("{FOLDER}/{}.{name}", Uuid::new_v4().simple()));
     let (twice, race) = (path("twice"), path("race"));
-    let probed = async {
-        create_twice(store.as_ref(), &twice).await?;
-        race_for(store.as_ref(), &race).await
-    };
-    let probed = probed.await;
-    for path in [twice, race] {
-        // An object that stays does no harm.
-        let _ = store.delete(&path).await;
-    }
-    probed
+    let (repeated, raced) = join(create_twice(store.as_ref(), &twice), race_for(store.as_ref(), &race)).await;
+    // An object that stays does no harm.
+    let _ = join(store.delete(&twice), store.delete(&race)).await;
+    repeated.and(raced)
 }
 
 async fn create_twice(store: &dyn ObjectStore, path: &Path) -> Result<(), ExclusionFault> {

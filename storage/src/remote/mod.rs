@@ -6,6 +6,8 @@
 #[cfg(feature = "tables")]
 mod cache;
 mod exclusion;
+#[cfg(feature = "tables")]
+mod object_folder;
 mod part_store;
 mod retrying;
 mod settings;
@@ -26,6 +28,8 @@ pub(crate) use cache::{BlockCache, BlockFolder, CachedStore};
 #[cfg(feature = "tables")]
 pub use cache::{CACHE_MEMORY_BYTES, CacheCounters, CacheCounts, CacheFolder};
 pub(crate) use exclusion::{ExclusionFault, probe_exclusion};
+#[cfg(feature = "tables")]
+pub use object_folder::ObjectFolder;
 pub(crate) use part_store::PartStore;
 #[cfg(feature = "tables")]
 pub(crate) use retrying::backoff;

@@ -2,8 +2,8 @@
 //!
 //! A claim is a row of numbered objects in `tables/_claims/`. To claim work is to create its number 1, which one process
 //! alone can. The holder creates the next number every few seconds; who waits sees the highest number change. A claim is
-//! dead if its number has not changed for a while by the clock of the one who waits, so that no two clocks need agree;
-//! who takes it over creates the next number. At its end the holder deletes the numbers, the first of them last.
+//! dead if its number has not changed for a while by the clock of the one who waits, so that no two clocks need agree, or
+//! if its holder ran on the machine of the one who waits and has ended; who takes it over creates the next number. At its end the holder deletes the numbers, the first of them last.
 //!
 //! A claim saves work, and nothing rests on it: if the store fails, or a holder was stopped for long, two do the same
 //! work, and commits add it once.
@@ -12,7 +12,9 @@ use std::collections::HashMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
+use bytes::Bytes;
 use futures::TryStreamExt as _;
+use futures::future::join_all;
 use object_store::path::Path;
 use object_store::{Error as StoreError, ObjectStore, ObjectStoreExt as _, PutMode, Result as StoreResult};
 use sha2::{Digest as _, Sha256};
@@ -21,6 +23,7 @@ use tokio::task::JoinHandle;
 use uuid::Uuid;
 
 use super::lease::host;
+use super::process_identity::ProcessIdentity;
 use crate::Lake;
 
 /// Folder of the claims' objects.
@@ -65,23 +68,44 @@ struct ClaimState {
     store: Arc<dyn ObjectStore>,
     /// Distinguishes all that ever claimed work; for people, too.
     holder: String,
+    /// Its identity as JSON, `null` if the system does not tell.
+    process: String,
     times: ClaimTimes,
     board: Mutex<ClaimBoard>,
 }
 
 #[derive(Debug, Default)]
 struct ClaimBoard {
-    /// Highest numbers of others' claims, and when each was first seen, by key.
-    seen: HashMap<String, (u64, Instant)>,
+    /// Others' claims by key.
+    seen: HashMap<String, SeenClaim>,
     /// Highest numbers of the own claims, by key.
     held: HashMap<String, u64>,
+}
+
+/// A claim of another process.
+#[derive(Debug, Clone)]
+struct SeenClaim {
+    /// Its highest number.
+    number: u64,
+    /// The time at which that was first seen.
+    since: Instant,
+    /// Its holder, if the system there tells.
+    holder: Option<ProcessIdentity>,
+}
+
+impl SeenClaim {
+    fn has_ended(&self) -> bool {
+        self.holder.as_ref().is_some_and(ProcessIdentity::has_ended)
+    }
 }
 
 impl WorkClaims {
     /// Starts to hold claims on a lake's work; needs a Tokio runtime.
     pub fn start(lake: &Lake, times: ClaimTimes) -> Self {
         let holder = format!("{} {} {}", host(), std::process::id(), Uuid::new_v4().simple());
-        let state = Arc::new(ClaimState { store: lake.store(), holder, times, board: Mutex::default() });
+        // A struct of texts and numbers always has a JSON form.
+        let process = serde_json::to_string(&ProcessIdentity::current()).unwrap_or_default();
+        let state = Arc::new(ClaimState { store: lake.store(), holder, process, times, board: Mutex::default() });
         let (ended, released) = mpsc::unbounded_channel();
         let keeper = tokio::spawn(keep_claims(state.clone(), released));
         Self { state, ended, keeper }
@@ -100,7 +124,7 @@ impl WorkClaims {
         let _ = self.ended.send(key_of(work));
     }
 
-    /// Looks at all claims, in one request.
+    /// Looks at all claims, in one request and one for each claim that is new.
     pub async fn look(&self) {
         // A store that fails will fail the work, too, and say so.
         let _ = self.state.look().await;
@@ -125,20 +149,25 @@ impl ClaimState {
         self.board.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    fn is_dead(&self, (_, since): &(u64, Instant)) -> bool {
-        since.elapsed() >= self.times.dead_after
+    fn is_dead(&self, claim: &SeenClaim) -> bool {
+        claim.has_ended() || claim.since.elapsed() >= self.times.dead_after
     }
 
     async fn claim(&self, key: &str) -> StoreResult<ClaimOutcome> {
-        let dead = || self.board().seen.get(key).copied().filter(|seen| self.is_dead(seen));
+        let dead = || self.board().seen.get(key).filter(|claim| self.is_dead(claim)).cloned();
         // What was seen long ago may be gone since.
         if dead().is_some() {
             self.look().await?;
         }
-        let number = dead().map_or(1, |(last, _)| last + 1);
+        let mut number = dead().map_or(1, |claim| claim.number + 1);
         if !self.create(key, number).await? {
             self.look().await?;
-            return Ok(ClaimOutcome::Denied);
+            let ended = self.board().seen.get(key).filter(|claim| claim.has_ended()).map(|claim| claim.number);
+            let Some(last) = ended else { return Ok(ClaimOutcome::Denied) };
+            number = last + 1;
+            if !self.create(key, number).await? {
+                return Ok(ClaimOutcome::Denied);
+            }
         }
         let mut board = self.board();
         board.seen.remove(key);
@@ -153,20 +182,33 @@ impl ClaimState {
             let last = highest.entry(key).or_default();
             *last = number.max(*last);
         }
+        let news: Vec<_> = {
+            let mut board = self.board();
+            let ClaimBoard { seen, held } = &mut *board;
+            seen.retain(|key, claim| highest.get(key) == Some(&claim.number));
+            highest.retain(|key, _| !held.contains_key(key) && !seen.contains_key(key));
+            highest.into_iter().collect()
+        };
+        let claims = news.iter().map(|(key, number)| self.read(key, *number));
+        let claims = join_all(claims).await;
         let mut board = self.board();
-        let ClaimBoard { seen, held } = &mut *board;
-        seen.retain(|key, (last, _)| highest.get(key) == Some(last));
-        for (key, number) in highest {
-            if !held.contains_key(&key) {
-                seen.entry(key).or_insert_with(|| (number, Instant::now()));
-            }
-        }
+        let claims = news.into_iter().zip(claims).filter(|((key, _), _)| !board.held.contains_key(key));
+        let claims: Vec<_> = claims.map(|((key, _), claim)| (key, claim)).collect();
+        board.seen.extend(claims);
         Ok(())
+    }
+
+    // One that cannot be read lives until its time is over.
+    async fn read(&self, key: &str, number: u64) -> SeenClaim {
+        let since = Instant::now();
+        let text = async { self.store.get(&object(key, number)).await?.bytes().await };
+        let process = |text: &Bytes| serde_json::from_slice(text.split(|byte| *byte == b'\n').nth(1)?).ok();
+        SeenClaim { number, since, holder: text.await.ok().as_ref().and_then(process) }
     }
 
     // Returns whether it was created; false if another process has the number.
     async fn create(&self, key: &str, number: u64) -> StoreResult<bool> {
-        let text = format!("{} {number}\n", self.holder);
+        let text = format!("{} {number}\n{}\n", self.holder, self.process);
         match self.store.put_opts(&object(key, number), text.into(), PutMode::Create.into()).await {
             Ok(_) => Ok(true),
             Err(StoreError::AlreadyExists { .. }) => Ok(false),
@@ -291,6 +333,25 @@ mod tests {
         assert!(objects(&lake).await.is_empty());
         let next = WorkClaims::start(&lake, ClaimTimes::default());
         assert_eq!(next.claim(WORK).await, ClaimOutcome::Granted);
+    }
+
+    #[tokio::test]
+    async fn a_claim_of_a_process_that_was_killed_on_this_machine_is_dead_at_once() {
+        let lake = lake().await;
+        let mut child = std::process::Command::new("sleep").arg("600").spawn().expect("it starts");
+        let running = ProcessIdentity::find(child.id()).expect("it runs");
+        let text = format!("host 1 x 1\n{}\n", serde_json::to_string(&running).expect("text"));
+        lake.store().put(&object(&key_of(WORK), 1), text.into()).await.expect("written");
+        let patient = || WorkClaims::start(&lake, ClaimTimes { renew_every: Duration::from_secs(3600), ..LIVELY });
+        let first = patient();
+        assert_eq!(first.claim(WORK).await, ClaimOutcome::Denied);
+        assert!(!first.is_free(WORK));
+        child.kill().expect("killed");
+        child.wait().expect("ended");
+        assert!(first.is_free(WORK), "it looked before");
+        let (second, third) = (patient(), patient());
+        assert_eq!(second.claim(WORK).await, ClaimOutcome::Granted);
+        assert_eq!(third.claim(WORK).await, ClaimOutcome::Denied, "the second one runs");
     }
 
     #[tokio::test]

@@ -15,11 +15,12 @@ use object_store::path::Path;
 use object_store::{ObjectStore, ObjectStoreExt as _, PutMode};
 use serde::{Deserialize, Serialize};
 
+use super::process_identity::ProcessIdentity;
 use crate::{Error, Lake, Result};
 
 /// Folder of the lease's objects.
 const FOLDER: &str = "tables/_maintenance";
-/// Time that it holds after its last renewal. A dead holder blocks others that long.
+/// Time that it holds after its last renewal. A dead holder blocks other machines that long.
 const HOLDS: TimeDelta = TimeDelta::minutes(10);
 /// Time between two renewals.
 const RENEW_EVERY: Duration = Duration::from_secs(60);
@@ -45,6 +46,9 @@ struct LeaseRecord {
     holder: String,
     host: String,
     pid: u32,
+    /// None if its system does not tell, or an older version wrote it.
+    #[serde(default)]
+    process: Option<ProcessIdentity>,
     expires: DateTime<Utc>,
 }
 
@@ -52,7 +56,11 @@ impl LeaseRecord {
     fn new() -> Self {
         let (host, pid, now) = (host(), std::process::id(), Utc::now());
         let holder = format!("{host}.{pid}.{}", now.timestamp_nanos_opt().unwrap_or_default());
-        Self { holder, host, pid, expires: now + HOLDS }
+        Self { holder, host, pid, process: ProcessIdentity::current(), expires: now + HOLDS }
+    }
+
+    fn is_held(&self) -> bool {
+        self.expires > Utc::now() && !self.process.as_ref().is_some_and(ProcessIdentity::has_ended)
     }
 
     fn bytes(&self) -> Vec<u8> {
@@ -71,7 +79,7 @@ impl MaintenanceLease {
         let (store, location, record) = (lake.store(), lake.location().to_owned(), LeaseRecord::new());
         let last = last_number(store.as_ref()).await?;
         if let Some(held) = read(store.as_ref(), last).await?
-            && held.expires > Utc::now()
+            && held.is_held()
         {
             return Err(maintained(location, &held));
         }
@@ -176,7 +184,8 @@ async fn read(store: &dyn ObjectStore, number: u64) -> Result<Option<LeaseRecord
         Err(object_store::Error::NotFound { .. }) => return Ok(None),
         Err(e) => return Err(failed(e)),
     };
-    let unreadable = || LeaseRecord { holder: String::new(), host: "?".into(), pid: 0, expires: made + HOLDS };
+    let unreadable =
+        || LeaseRecord { holder: String::new(), host: "?".into(), pid: 0, process: None, expires: made + HOLDS };
     Ok(Some(serde_json::from_slice(&bytes).unwrap_or_else(|_| unreadable())))
 }
 
@@ -206,6 +215,20 @@ mod tests {
         assert!(error.contains(&format!("process {}", std::process::id())) && error.contains(&host()), "{error}");
         first.release().await.expect("given back");
         MaintenanceLease::take(&lake).await.expect("free again");
+    }
+
+    #[tokio::test]
+    async fn a_holder_that_was_killed_on_this_machine_blocks_nobody() {
+        let lake = lake().await;
+        let mut first = MaintenanceLease::take(&lake).await.expect("free");
+        let mut child = std::process::Command::new("sleep").arg("600").spawn().expect("it starts");
+        let running = ProcessIdentity::find(child.id()).expect("it runs");
+        first.record.process = Some(running);
+        lake.store().put(&object(first.number), first.record.bytes().into()).await.expect("written");
+        assert!(matches!(MaintenanceLease::take(&lake).await, Err(Error::Maintained { .. })));
+        child.kill().expect("killed");
+        child.wait().expect("ended");
+        MaintenanceLease::take(&lake).await.expect("at once");
     }
 
     #[tokio::test]

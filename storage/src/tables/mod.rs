@@ -7,6 +7,7 @@ mod data_file;
 pub(crate) mod delta;
 mod lease;
 mod optimize;
+mod process_identity;
 mod rig_tables;
 mod rows;
 mod snapshot;
@@ -71,14 +72,14 @@ impl Lake {
         try_join_all(Table::ALL.into_iter().map(|table| self.log().ensure(table))).await?;
         let grid = self.grid();
         let derivation = || FileName::Rig { derivation: format!("v{LAKE_FORMAT}") };
-        for table in Table::ALL.into_iter().filter(|t| t.source() == Source::Rig) {
+        let of_rig = Table::ALL.into_iter().filter(|t| t.source() == Source::Rig).map(|table| async move {
             let rows = match table {
                 Table::Points => rig_tables::points(self.rig(), grid)?,
                 _ => self.pairs()?,
             };
-            self.append_rows(table, &derivation(), &[rows]).await?;
-        }
-        Ok(())
+            self.append_rows(table, &derivation(), &[rows]).await
+        });
+        try_join_all(of_rig).await.map(drop)
     }
 
     /// The rows of table `pairs`, which follow from the rig: row i is pair i.

@@ -8,12 +8,13 @@ use arrow::datatypes::{FieldRef, Fields, Schema, SchemaRef};
 use arrow::error::ArrowError;
 use arrow::record_batch::{RecordBatch, RecordBatchOptions};
 use bytes::Bytes;
+use echolake_schema::ErrorCause;
 use echolake_schema::tables::Table;
 use futures::future::BoxFuture;
 use futures::stream::BoxStream;
 use futures::{FutureExt as _, StreamExt as _, TryFutureExt as _, TryStreamExt as _};
 use object_store::path::Path;
-use object_store::{ObjectStore, ObjectStoreExt as _};
+use object_store::{Error as StoreError, ObjectStore, ObjectStoreExt as _};
 use parquet::arrow::arrow_reader::{ArrowReaderMetadata, ArrowReaderOptions, RowSelection, RowSelector};
 use parquet::arrow::async_reader::AsyncFileReader;
 use parquet::arrow::{ParquetRecordBatchStreamBuilder, ProjectionMask};
@@ -85,8 +86,8 @@ impl Lake {
         columns: &[&str],
         rows: Range<u64>,
     ) -> Result<BoxStream<'static, Result<RecordBatch>>> {
-        let name = file.path.to_string();
-        let damaged = move |e: ParquetError| Error::DataFile { file: name.clone(), source: e.into() };
+        let path = file.path.clone();
+        let damaged = move |e: ParquetError| unread(&path, e);
         let mut reader = StoredFile { store: self.store(), path: file.path.clone(), bytes: file.bytes };
         let options = ArrowReaderOptions::new().with_page_index_policy(PageIndexPolicy::Optional);
         let metadata = reader.get_metadata(Some(&options)).await.map_err(damaged.clone())?;
@@ -111,6 +112,17 @@ impl Lake {
         let wanted = wanted_schema(&schema, columns);
         let complete = move |batch: RecordBatch| add_missing_columns(&batch, &wanted).map_err(ParquetError::from);
         Ok(stream.map(move |batch| batch.and_then(&complete)).map_err(damaged).boxed())
+    }
+}
+
+fn unread(path: &Path, error: ParquetError) -> Error {
+    let damaged = |source: ErrorCause| Error::DataFile { file: path.to_string(), source };
+    match error {
+        ParquetError::External(source) => match source.downcast::<StoreError>() {
+            Ok(fault) => Error::unread_file(path, *fault),
+            Err(source) => damaged(source),
+        },
+        error => damaged(error.into()),
     }
 }
 
@@ -150,4 +162,23 @@ pub fn add_missing_columns(batch: &RecordBatch, schema: &SchemaRef) -> std::resu
     let columns = schema.fields().iter().map(column).collect();
     let rows = RecordBatchOptions::new().with_row_count(Some(batch.num_rows()));
     RecordBatch::try_new_with_options(schema.clone(), columns, &rows)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    // Damage is mended by deleting tables, which nobody should do because a cable is loose.
+    #[test]
+    fn a_store_that_does_not_answer_is_no_damage_and_an_absent_file_is() {
+        let path = Path::from("tables/nce/x.parquet");
+        let fault = |fault: StoreError| unread(&path, ParquetError::External(Box::new(fault)));
+        let source: ErrorCause = "connection reset".into();
+        let away = fault(StoreError::Generic { store: "S3", source });
+        assert_eq!(away.to_string(), "cannot read `tables/nce/x.parquet`: connection reset");
+        let absent = fault(StoreError::NotFound { path: path.to_string(), source: "404".into() });
+        assert!(matches!(absent, Error::DataFile { .. }), "{absent}");
+        let damaged = unread(&path, ParquetError::EOF("too short".into()));
+        assert!(matches!(damaged, Error::DataFile { .. }), "{damaged}");
+    }
 }

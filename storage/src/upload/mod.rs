@@ -20,6 +20,8 @@ use object_store::{Error as StoreError, ObjectStoreExt as _, PutMode};
 use crate::run_digest::{digest_record, digest_record_path, object_sha256, read_digest_record};
 use crate::{Error, Lake, Result};
 use journal::UploadJournal;
+#[cfg(feature = "tables")]
+pub(crate) use parts::{PARTS_AT_ONCE, part_bytes, read_part};
 
 /// Folder of runs that are not ingested yet.
 const INBOX: &str = "inbox";

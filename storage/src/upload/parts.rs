@@ -18,7 +18,7 @@ const PART: u64 = 8 << 20;
 /// Most parts of an object of S3.
 const MOST_PARTS: u64 = 10_000;
 /// Parts on their way at once.
-const PARTS_AT_ONCE: usize = 2;
+pub(crate) const PARTS_AT_ONCE: usize = 2;
 /// Granularity of the parts of large files.
 const PART_STEP: u64 = 1 << 20;
 
@@ -36,7 +36,7 @@ impl From<Error> for SendFault {
 }
 
 // All parts of a file but the last have the same size, which follows from the file's alone.
-fn part_bytes(bytes: u64) -> u64 {
+pub(crate) fn part_bytes(bytes: u64) -> u64 {
     PART.max(bytes.div_ceil(MOST_PARTS).next_multiple_of(PART_STEP))
 }
 
@@ -112,7 +112,7 @@ async fn try_send(
     }
 }
 
-async fn read_part(file: &FsPath, range: std::ops::Range<u64>) -> Result<Vec<u8>> {
+pub(crate) async fn read_part(file: &FsPath, range: std::ops::Range<u64>) -> Result<Vec<u8>> {
     let path = file.to_owned();
     let read = move || {
         let mut part = vec![0; (range.end - range.start) as usize];
