@@ -86,7 +86,7 @@ impl ImportFolder {
 
     /// Settings of an import into it.
     pub fn options(&self) -> ImportOptions<'_> {
-        ImportOptions { started: STARTED, folder: &self.inbox }
+        ImportOptions { started: STARTED, folder: &self.inbox, project: None }
     }
 
     /// Removes the runs of an import, and says how many files there were.

@@ -4,6 +4,8 @@ use std::path::PathBuf;
 
 use anyhow::Context as _;
 use clap::{CommandFactory as _, Parser, Subcommand};
+#[cfg(feature = "lake")]
+use echolake_schema::ProjectName;
 
 use crate::CommandOutcome;
 use crate::commands::acquire::{self, AcquireArgs};
@@ -17,7 +19,7 @@ use crate::commands::export::{self, ExportCommand};
 #[cfg(feature = "lake")]
 use crate::commands::figure::{self, FigureCommand};
 #[cfg(feature = "lake")]
-use crate::commands::import::{self, ImportCommand};
+use crate::commands::import::{self, ImportArgs};
 #[cfg(feature = "lake")]
 use crate::commands::ingest::{self, IngestArgs};
 #[cfg(feature = "lake")]
@@ -92,8 +94,7 @@ pub(crate) enum LakeCommand {
     #[command(subcommand)]
     Campaign(CampaignSubcommand),
     /// Turn existing measurements into runs.
-    #[command(subcommand)]
-    Import(ImportCommand),
+    Import(ImportArgs),
     /// Turn runs into rows.
     Ingest(IngestArgs),
     /// Query the lake in SQL; without a query, a prompt.
@@ -118,6 +119,9 @@ pub(crate) enum LakeCommand {
         /// Days until it expires; by default it does not.
         #[arg(long, value_name = "N")]
         days: Option<u32>,
+        /// Project that the token may see, and no other; repeatable. By default it sees all.
+        #[arg(long, value_name = "NAME")]
+        project: Vec<ProjectName>,
     },
     /// Merge the tables' small files into large ones; ingest and queries may continue meanwhile.
     Optimize(OptimizeArgs),
@@ -178,7 +182,7 @@ impl LakeCommand {
             Self::Serve(args) => serve::run(args, lake).await,
             Self::Engine(args) => serve::engine(args, lake).await,
             Self::Certificate(args) => serve::certificate(args),
-            Self::Token { name, days } => serve::token(name, *days),
+            Self::Token { name, days, project } => serve::token(name, *days, project),
             Self::Optimize(args) => optimize::run(args, lake).await,
             Self::Twin(args) => twin::run(args, lake).await,
             Self::Vacuum(args) => vacuum::run(args, lake).await,

@@ -10,6 +10,7 @@ mod escapes;
 pub(crate) mod http;
 mod log;
 pub(crate) mod postgres;
+mod projects;
 pub(crate) mod server;
 mod slices;
 mod watched;

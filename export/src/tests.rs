@@ -43,6 +43,7 @@ async fn lake(home: &TempDir, keep: RecordingMode) -> Lake {
             flat: None,
             foam: None,
             macro_reference: None,
+            project: None,
             start: Timestamp(1_767_600_000_000_000_000).plus_secs(number as f64 * 3_600.0),
             seed: number as u64 + 1,
             tag: number as u64 + 1,
@@ -337,7 +338,7 @@ async fn recordings_and_responses_come_back() {
     assert_eq!(count, taken.len());
     let again = home.path().join("again");
     std::fs::create_dir(&again).expect("a folder");
-    let options = ImportOptions { started: Timestamp(0), folder: &again };
+    let options = ImportOptions { started: Timestamp(0), folder: &again, project: None };
     let runs = import_wav(&wav.join("manifest.csv"), lake.rig(), options, &mut |_, _| {}).expect("imported");
     let sweeps = |file: Vec<u8>| -> Vec<(u64, f64, Vec<f32>)> {
         use echolake_schema::messages::SweepRecording;

@@ -47,6 +47,7 @@ fn runs(surfaces: &[&str]) -> Vec<(String, Bytes)> {
             flat: None,
             foam: None,
             macro_reference: None,
+            project: None,
             start: Timestamp(1_767_600_000_000_000_000).plus_secs(number as f64 * 3_600.0),
             seed: number as u64 + 1,
             tag: number as u64 + 1,

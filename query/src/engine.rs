@@ -216,7 +216,8 @@ impl QueryEngine {
         let threads = |e: std::io::Error| Error::Execution { message: format!("no threads for queries: {e}") };
         let footer_bytes = lake.is_remote().then_some(REMOTE_FOOTER_BYTES);
         let small = Arc::new(SmallTables::new(lake));
-        let catalog = LakeCatalog::new(lake, FileReaders { url, reader, footer_bytes, small })?;
+        let restricted = lake.is_restricted().then(|| lake.clone());
+        let catalog = LakeCatalog::new(lake, FileReaders { url, reader, footer_bytes, small, restricted })?;
         let inner = EngineState {
             template: template(runtime, &functions, catalog.rules()),
             catalog,

@@ -9,7 +9,6 @@ use arrow::error::ArrowError;
 use arrow::record_batch::RecordBatch;
 use echolake_lake::LakeSnapshot;
 use echolake_schema::Rig;
-use echolake_schema::tables::Table;
 use serde::Deserialize;
 
 use crate::views::{RE_FLAT_BAND, RE_FLAT_TOTAL};
@@ -64,7 +63,7 @@ pub fn levels_db(linear: &[Option<f64>]) -> Vec<Option<f64>> {
 
 /// Returns the version of a snapshot as queries name it: that of table `runs`.
 pub fn lake_version(snapshot: &LakeSnapshot) -> String {
-    format!("runs@{}", snapshot.version(Table::Runs).unwrap_or(0))
+    format!("runs@{}", snapshot.lake_version().unwrap_or(0))
 }
 
 /// Returns the query of [`GridCell`] for a surface and a grid point.

@@ -36,6 +36,7 @@ mod ignored_clauses;
 mod mcap;
 mod opaque;
 pub mod output;
+mod part_rows;
 mod placeholders;
 mod predicate;
 #[cfg(test)]

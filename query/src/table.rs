@@ -29,17 +29,19 @@ use datafusion::physical_plan::ExecutionPlan;
 use datafusion::physical_plan::empty::EmptyExec;
 use datafusion::physical_plan::filter::{FilterExec, FilterExecBuilder};
 use datafusion::physical_plan::union::UnionExec;
-use echolake_lake::DataFile;
+use echolake_lake::{DataFile, Lake};
 use echolake_schema::tables::Table;
 use object_store::ObjectMeta;
 use tokio::sync::OnceCell;
 
+use crate::part_rows::visible_rows_scan;
 use crate::small::SmallTables;
 
 /// Delta writers truncate texts in statistics to 32 characters; a shorter text is complete.
 const WHOLE_TEXT: usize = 32;
 /// The column that tells the runs of a merged file apart.
 const RUN: &str = "run_id";
+const SURFACE: &str = "surface_id";
 /// Maximum number of files whose statistics are merged for each plan; those of all files are merged once.
 const FEW: usize = 8;
 /// Rows per batch of a scan without lists: the engine's kernels are fastest with it.
@@ -77,6 +79,9 @@ pub(crate) struct FileReaders {
     pub(crate) footer_bytes: Option<usize>,
     /// Caches the rows of small tables.
     pub(crate) small: Arc<SmallTables>,
+    /// The lake as its reader sees it, if files may hold rows that are none of its business: of such files, only the
+    /// rows that it may see are read.
+    pub(crate) restricted: Option<Lake>,
 }
 
 impl LakeTable {
@@ -84,7 +89,8 @@ impl LakeTable {
     /// If the schema names a column twice.
     pub(crate) fn new(table: Table, schema: SchemaRef, files: Vec<DataFile>, source: FileReaders) -> Result<Self> {
         let columns = DFSchema::try_from(schema.clone())?;
-        let files: Vec<_> = files.into_iter().map(|file| ScanFile::new(file, &schema)).collect();
+        let is_restricted = source.restricted.is_some();
+        let files: Vec<_> = files.into_iter().map(|file| ScanFile::new(file, &schema, is_restricted)).collect();
         let all = Statistics::try_merge_iter(files.iter().map(|f| f.known.as_ref()), &schema)?;
         Ok(Self { table, schema, columns, files, all, source, rows: OnceCell::new() })
     }
@@ -163,6 +169,10 @@ impl LakeTable {
         state: &dyn Session,
         projection: Option<&Vec<usize>>,
     ) -> Result<Arc<dyn ExecutionPlan>> {
+        if let Some(lake) = &self.source.restricted {
+            let files = files.iter().map(|file| file.file.clone());
+            return visible_rows_scan(lake, self.table, &self.schema, files, projection);
+        }
         let mut columns = projection.cloned().unwrap_or_else(|| (0..self.schema.fields().len()).collect());
         let wanted: Vec<_> = (0..columns.len()).collect();
         let run = self.schema.index_of(RUN)?;
@@ -190,7 +200,7 @@ impl LakeTable {
 }
 
 impl ScanFile {
-    fn new(file: DataFile, schema: &SchemaRef) -> Self {
+    fn new(file: DataFile, schema: &SchemaRef, is_restricted: bool) -> Self {
         let meta = ObjectMeta {
             location: file.path.clone(),
             // A name stands for its content, so that what is cached of a file stays valid.
@@ -199,7 +209,9 @@ impl ScanFile {
             e_tag: None,
             version: None,
         };
-        let known = Arc::new(known(&file, schema));
+        // Where hidden rows are none of the reader's business, a scan does not meet them; elsewhere it filters them out.
+        let only_visible = is_restricted && !file.hidden.is_empty();
+        let known = Arc::new(if only_visible { known_of_parts(&file, schema) } else { known(&file, schema) });
         let part = PartitionedFile::new_from_meta(meta).with_statistics(known.clone());
         Self { file, part, known }
     }
@@ -221,6 +233,23 @@ fn known(file: &DataFile, schema: &SchemaRef) -> Statistics {
             column.min_value = Precision::Exact(least);
             column.max_value = Precision::Exact(greatest);
         }
+    }
+    known
+}
+
+// The log's extremes are those of hidden rows, too; of the rows that are seen, the parts tell surfaces and runs.
+fn known_of_parts(file: &DataFile, schema: &SchemaRef) -> Statistics {
+    let mut known = Statistics::new_unknown(schema);
+    known.num_rows = Precision::Exact(file.visible_rows() as usize);
+    let surfaces: BTreeSet<_> = file.visible_parts().map(|(part, _)| part.surface.as_str()).collect();
+    let runs: BTreeSet<_> = file.visible_parts().map(|(part, _)| part.run.as_str()).collect();
+    for (name, texts) in [(SURFACE, surfaces), (RUN, runs)] {
+        let extremes = texts.first().zip(texts.last());
+        let Some((column, (least, greatest))) = schema.index_of(name).ok().zip(extremes) else { continue };
+        let column = &mut known.column_statistics[column];
+        column.null_count = Precision::Exact(0);
+        column.min_value = Precision::Exact(ScalarValue::from(*least));
+        column.max_value = Precision::Exact(ScalarValue::from(*greatest));
     }
     known
 }

@@ -1,4 +1,4 @@
-//! Names of surfaces and runs, and the numbers of points and pairs.
+//! Names of surfaces, runs and projects, and the numbers of points and pairs.
 
 use std::fmt;
 use std::str::FromStr;
@@ -9,6 +9,8 @@ use crate::Error;
 
 const SURFACE_MAX: usize = 64;
 const RUN_MAX: usize = 128;
+/// The log's statistics of a run's row hold the whole name.
+const PROJECT_MAX: usize = 31;
 
 /// Name of one side of a panel (`0015_0`), of a reference (`flat`) or of anything else measured.
 ///
@@ -41,6 +43,21 @@ pub struct SurfaceId(String);
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[serde(try_from = "String", into = "String")]
 pub struct RunId(String);
+
+/// Name of a project: a label of surfaces that tokens of the query service may be limited to.
+///
+/// One to 31 of `A-Z a-z 0-9 _ -`, beginning with a letter or a digit.
+///
+/// ```
+/// use echolake_schema::ProjectName;
+///
+/// assert_eq!("brick-walls".parse::<ProjectName>()?.as_str(), "brick-walls");
+/// assert!("brick walls".parse::<ProjectName>().is_err());
+/// # Ok::<(), echolake_schema::Error>(())
+/// ```
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+#[serde(try_from = "String", into = "String")]
+pub struct ProjectName(String);
 
 /// Number of a pair, 0-based in (microphone, speaker) order.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
@@ -97,6 +114,13 @@ impl RunId {
         self.0.rsplit_once('-').map_or(&self.0, |(untagged, _)| untagged)
     }
 
+    /// The name as text.
+    pub fn as_str(&self) -> &str {
+        &self.0
+    }
+}
+
+impl ProjectName {
     /// The name as text.
     pub fn as_str(&self) -> &str {
         &self.0
@@ -161,6 +185,7 @@ macro_rules! checked_name {
 }
 checked_name!(SurfaceId, "surface id", SURFACE_MAX);
 checked_name!(RunId, "run id", RUN_MAX);
+checked_name!(ProjectName, "project name", PROJECT_MAX);
 
 impl fmt::Display for PairId {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
@@ -199,6 +224,7 @@ mod tests {
             assert!(bad.parse::<SurfaceId>().is_err(), "{bad:?}");
         }
         assert!("x".repeat(129).parse::<RunId>().is_err());
+        assert!("x".repeat(32).parse::<crate::ProjectName>().is_err());
         assert!(serde_json_like("a/b").is_err());
     }
 

@@ -29,7 +29,7 @@ pub mod topics;
 
 pub use error::{Error, ErrorCause};
 pub use grid::{Grid, Pair, Point};
-pub use ids::{PairId, PointId, RunId, SurfaceId};
+pub use ids::{PairId, PointId, ProjectName, RunId, SurfaceId};
 pub use manifest::{RunManifest, SurfaceRecord};
 pub use quantities::{Celsius, SampleRate, Timestamp};
 pub use rig::{Rig, SpectralDivision};

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use serde::{Deserialize, Serialize};
 
-use crate::{Error, RunId, SurfaceId, Timestamp};
+use crate::{Error, ProjectName, RunId, SurfaceId, Timestamp};
 
 /// Format of run files that this version writes, and the newest that it reads.
 pub const RUN_FORMAT: u32 = 1;
@@ -109,6 +109,8 @@ pub struct SurfaceRecord {
     pub foam_reference: Option<SurfaceId>,
     /// The surface that has its large shape and nothing on it, if there is one.
     pub macro_reference: Option<SurfaceId>,
+    /// The project that it belongs to, if it was given one.
+    pub project: Option<ProjectName>,
     /// Parameters of the relief's generator.
     pub parameters: serde_json::Value,
     /// Facts about the producer's own mesh file.

@@ -1,8 +1,11 @@
 //! The identity of a client: the door determines it and passes it to the client's engine.
 
+use std::collections::BTreeSet;
 use std::time::Duration;
 
+use echolake_lake::Lake;
 use echolake_query::QueryQuota;
+use echolake_schema::ProjectName;
 use serde::{Deserialize, Serialize};
 
 use crate::fault::RequestFault;
@@ -30,6 +33,8 @@ pub(crate) struct ClientIdentity {
     /// True if the server has no tokens, so that requests of foreign pages must be distinguished from others.
     pub(crate) is_open: bool,
     pub(crate) scopes: Vec<TokenScope>,
+    /// The projects whose runs it may see; None for all runs.
+    pub(crate) projects: Option<BTreeSet<ProjectName>>,
     /// Limits, as [`QueryQuota`] has them.
     pub(crate) seconds: Option<u64>,
     pub(crate) memory_bytes: Option<usize>,
@@ -43,8 +48,17 @@ impl ClientIdentity {
     /// A client of a server without tokens.
     pub(crate) fn local(name: impl Into<String>) -> Self {
         let scopes = vec![TokenScope::Sql, TokenScope::Files, TokenScope::Metrics];
-        let (seconds, memory_bytes, rows, concurrent, token) = (None, None, None, None, None);
-        Self { name: name.into(), is_open: true, scopes, seconds, memory_bytes, rows, concurrent, token }
+        Self {
+            name: name.into(),
+            is_open: true,
+            scopes,
+            projects: None,
+            seconds: None,
+            memory_bytes: None,
+            rows: None,
+            concurrent: None,
+            token: None,
+        }
     }
 
     /// The server's own pages.
@@ -74,6 +88,14 @@ impl ClientIdentity {
             memory: self.memory_bytes.map(counted_bytes),
             rows: self.rows,
             concurrent: self.concurrent,
+        }
+    }
+
+    /// The lake as the client sees it.
+    pub(crate) fn visible_lake(&self, lake: &Lake) -> Lake {
+        match &self.projects {
+            Some(projects) => lake.restricted_to(projects.clone()),
+            None => lake.clone(),
         }
     }
 

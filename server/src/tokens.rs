@@ -1,5 +1,6 @@
 //! Access control: tokens, stored as hashes in a file, each with scopes and quotas.
 
+use std::collections::BTreeSet;
 use std::fmt;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, PoisonError, RwLock};
@@ -10,6 +11,7 @@ use base64::alphabet::STANDARD;
 use base64::engine::GeneralPurpose;
 use base64::engine::general_purpose::NO_PAD;
 use chrono::{DateTime, Utc};
+use echolake_schema::ProjectName;
 use serde::{Deserialize, Serialize};
 use sha2::{Digest as _, Sha256};
 use subtle::{Choice, ConstantTimeEq as _};
@@ -83,6 +85,7 @@ struct Line {
     scram: Option<String>,
     #[serde(default = "reading")]
     scopes: Vec<TokenScope>,
+    projects: Option<BTreeSet<ProjectName>>,
     seconds: Option<u64>,
     memory_mb: Option<usize>,
     rows: Option<u64>,
@@ -110,10 +113,12 @@ impl Line {
         at_least_one("memory_mb", self.memory_mb.map(|v| v as u64))?;
         at_least_one("rows", self.rows)?;
         at_least_one("concurrent", self.concurrent.map(|v| v as u64))?;
+        self.check_projects()?;
         let client = ClientIdentity {
             name: name.clone(),
             is_open: false,
             scopes: self.scopes.clone(),
+            projects: self.projects.clone(),
             seconds: self.seconds,
             memory_bytes: self.memory_mb.map(|mb| mb.saturating_mul(1_000_000)),
             rows: self.rows,
@@ -128,6 +133,21 @@ impl Line {
             text.parse().map(Arc::new).map_err(|wrong: String| format!("the scram of `{name}` is wrong: {wrong}"))
         });
         Ok(TokenEntry { client: Arc::new(client), hash, scram: scram.transpose()?, expires: expires.transpose()? })
+    }
+
+    fn check_projects(&self) -> Result<(), String> {
+        let Some(projects) = &self.projects else { return Ok(()) };
+        let name = &self.name;
+        if projects.is_empty() {
+            return Err(format!("projects of `{name}` are none; hint: leave them out where it may see all"));
+        }
+        // They count runs and queries of all projects.
+        if self.scopes.contains(&TokenScope::Metrics) {
+            return Err(format!(
+                "`{name}` has projects and the scope metrics; hint: the server's figures are of all projects"
+            ));
+        }
+        Ok(())
     }
 }
 
@@ -185,11 +205,11 @@ pub struct FreshToken {
     pub lines: String,
 }
 
-/// Makes a token, which expires after so many days.
+/// Makes a token, which expires after so many days and sees these projects; without any it sees all.
 ///
 /// # Errors
 /// [`Error::Random`].
-pub fn fresh(name: &str, days: Option<u32>) -> Result<FreshToken, Error> {
+pub fn fresh(name: &str, days: Option<u32>, projects: &[ProjectName]) -> Result<FreshToken, Error> {
     let mut secret = [0; 32];
     getrandom::fill(&mut secret).map_err(|failed| Error::Random(failed.into()))?;
     let token = format!("{PREFIX}{}", hex::encode(secret));
@@ -204,7 +224,9 @@ pub fn fresh(name: &str, days: Option<u32>) -> Result<FreshToken, Error> {
         let time = Utc::now() + chrono::Duration::days(days.into());
         format!("expires = {}\n", time.to_rfc3339_opts(chrono::SecondsFormat::Secs, true))
     });
-    let lines = lines + &expires.unwrap_or_default();
+    let names: Vec<_> = projects.iter().map(|project| format!("\"{project}\"")).collect();
+    let projects = (!names.is_empty()).then(|| format!("projects = [{}]\n", names.join(", ")));
+    let lines = lines + &expires.unwrap_or_default() + &projects.unwrap_or_default();
     Ok(FreshToken { token, lines })
 }
 
@@ -253,18 +275,20 @@ impl TokenAccess {
         Some((entry.client.clone(), entry.scram.clone()?))
     }
 
-    /// Checks that a client's token was not taken back and has not expired since.
+    /// Checks that a client's token was not taken back and has not expired since, and sees the same projects.
     ///
     /// # Errors
     /// [`RequestFault::Unauthenticated`].
     pub(crate) fn check_current(&self, client: &ClientIdentity) -> Result<(), RequestFault> {
         let Self::Tokens(tokens, _) = self else { return Ok(()) };
         let tokens = tokens.read().unwrap_or_else(PoisonError::into_inner);
-        let is_its = |entry: &TokenEntry| entry.client.token == client.token && entry.is_valid();
+        let is_its = |entry: &TokenEntry| {
+            entry.client.token == client.token && entry.client.projects == client.projects && entry.is_valid()
+        };
         tokens.entries.iter().any(is_its).then_some(()).ok_or(RequestFault::Unauthenticated)
     }
 
-    /// Reads the file again if it changed; returns the names of clients that may no longer ask. A file that cannot be read
+    /// Reads the file again if it changed; returns the names of clients that may no longer ask, or see other projects now. A file that cannot be read
     /// changes nothing.
     pub(crate) fn renew(&self, known: &mut TokenFileState) -> Vec<String> {
         let Self::Tokens(tokens, _) = self else { return Vec::new() };
@@ -282,8 +306,11 @@ impl TokenAccess {
             }
         }
         let valid = tokens.entries.iter().filter(|entry| entry.is_valid());
-        known.valid = valid.map(|entry| (entry.hash, entry.client.name.clone())).collect();
-        valid_before.into_iter().filter(|token| !known.valid.contains(token)).map(|(_, name)| name).collect()
+        known.valid = valid.map(|entry| (entry.hash, entry.client.clone())).collect();
+        let is_same = |(hash, client): &(_, Arc<ClientIdentity>)| {
+            known.valid.iter().any(|(h, c)| h == hash && c.name == client.name && c.projects == client.projects)
+        };
+        valid_before.into_iter().filter(|token| !is_same(token)).map(|(_, client)| client.name.clone()).collect()
     }
 
     /// Begins a browser's session; returns its secret.
@@ -321,7 +348,7 @@ impl TokenAccess {
 #[derive(Default)]
 pub(crate) struct TokenFileState {
     file: Option<Option<(SystemTime, u64)>>,
-    valid: Vec<([u8; 32], String)>,
+    valid: Vec<([u8; 32], Arc<ClientIdentity>)>,
 }
 
 fn hash_of(token: &str) -> [u8; 32] {
@@ -382,6 +409,13 @@ mod tests {
         assert!(!is_in());
         std::fs::write(&path, line("")).expect("written");
         assert!(access.renew(&mut known).is_empty() && is_in());
+        // Other projects are another view of the lake: what was asked so far ends.
+        std::fs::write(&path, line("projects = ['brick']")).expect("written");
+        assert_eq!(access.renew(&mut known), ["a"]);
+        assert!(access.check_current(&client).is_err());
+        std::fs::write(&path, line("")).expect("written");
+        assert_eq!(access.renew(&mut known), ["a"]);
+        assert!(is_in());
         std::fs::write(&path, "").expect("written");
         assert_eq!(access.renew(&mut known), ["a"]);
         assert!(!is_in());
@@ -390,12 +424,14 @@ mod tests {
 
     #[test]
     fn a_fresh_token_lets_in_and_no_other_does() {
-        let fresh = fresh("a \"quoted\" name", Some(1)).expect("a token");
+        let project: ProjectName = "brick".parse().expect("a name");
+        let fresh = fresh("a \"quoted\" name", Some(1), std::slice::from_ref(&project)).expect("a token");
         assert!(!fresh.lines.contains(&fresh.token), "only hashes of it are kept");
         let access = access_by(&fresh.lines);
         let local = ClientIdentity::pages;
         let client = access.client(Some(&fresh.token), local).expect("let in");
         assert_eq!(client.name, "a \"quoted\" name");
+        assert_eq!(client.projects, Some([project].into()));
         assert_eq!(client.quota().time, Some(std::time::Duration::from_secs(60)));
         assert!(client.require(TokenScope::Files).is_ok(), "pages show meshes and link to files");
         assert!(matches!(client.require(TokenScope::Metrics), Err(RequestFault::Forbidden { .. })));
@@ -406,7 +442,7 @@ mod tests {
         let (by_name, _) = access.scram_client("a \"quoted\" name").expect("a verifier");
         assert_eq!(by_name, client);
         assert!(access.scram_client("b").is_none());
-        let other = super::fresh("b", None).expect("a token").token;
+        let other = super::fresh("b", None, &[]).expect("a token").token;
         let cut = &fresh.token[..fresh.token.len() - 1];
         for wrong in [None, Some(""), Some(other.as_str()), Some(cut)] {
             assert!(matches!(access.client(wrong, local), Err(RequestFault::Unauthenticated)), "{wrong:?}");
@@ -435,6 +471,12 @@ mod tests {
             (format!("[[token]]\nname = 'a'\nsha256 = '{hash}'\nscram = 'md5'"), "the scram of `a` is wrong"),
             (format!("[[token]]\nname = 'a'\nsha256 = '{hash}'\nrows = 0"), "rows of `a` is 0"),
             (format!("[[token]]\nname = 'a'\nsha256 = '{hash}'\nscopes = ['all']"), "unknown variant"),
+            (format!("[[token]]\nname = 'a'\nsha256 = '{hash}'\nprojects = []"), "projects of `a` are none"),
+            (format!("[[token]]\nname = 'a'\nsha256 = '{hash}'\nprojects = ['a b']"), "not a valid project name"),
+            (
+                format!("[[token]]\nname = 'a'\nsha256 = '{hash}'\nscopes = ['metrics']\nprojects = ['x']"),
+                "has projects and the scope metrics",
+            ),
             (format!("[[token]]\nname = 'a'\nsha256 = '{hash}'\n").repeat(2), "twice"),
         ] {
             let error = TokenFile::parse(&text).map(|_| ()).expect_err(&text);

@@ -16,7 +16,7 @@ use echolake_acquisition::run::recorder::{Held, partial_of, random_tag};
 use echolake_acquisition::run::session::{MeasuredRun, PreflightMode, RunSession, TakePace};
 use echolake_acquisition::run::{self, PanelSpecimen, RunRequest};
 use echolake_lake::{Error as LakeError, Lake, ReferenceSurfaces};
-use echolake_schema::{Rig, SurfaceId, Timestamp};
+use echolake_schema::{ProjectName, Rig, SurfaceId, Timestamp};
 
 use crate::CommandOutcome;
 use crate::commands::replay::ViewerArgs;
@@ -37,7 +37,7 @@ pub(crate) struct AcquireArgs {
     #[arg(long, required_unless_present = "resume")]
     pub(crate) surface: Option<SurfaceId>,
     /// Resume a run that was stopped or cut off: its `.mcap.partial`. Measurements that are safe in it are not repeated.
-    #[arg(long, value_name = "FILE", conflicts_with_all = ["surface", "panel", "parameters", "set", "mesh", "side", "rig", "flat", "foam", "macro_reference", "seed", "ir_only"])]
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["surface", "panel", "parameters", "set", "mesh", "side", "rig", "flat", "foam", "macro_reference", "project", "seed", "ir_only"])]
     pub(crate) resume: Option<PathBuf>,
     /// Relief for the simulated rig, by a name of `echolake panel --list`; by default the one that the surface's name
     /// begins with.
@@ -67,6 +67,9 @@ pub(crate) struct AcquireArgs {
     /// Surface that has the large shape of this one and nothing on it; by default known for the paper's panels.
     #[arg(long, value_name = "NAME")]
     pub(crate) macro_reference: Option<SurfaceId>,
+    /// Project that the surface belongs to; tokens of the query service may be limited to projects.
+    #[arg(long, value_name = "NAME")]
+    pub(crate) project: Option<ProjectName>,
     /// Seed of the simulation.
     #[arg(long, default_value_t = 1)]
     pub(crate) seed: u64,
@@ -132,6 +135,7 @@ struct NewRun {
     flat: Option<SurfaceId>,
     foam: Option<SurfaceId>,
     macro_reference: Option<SurfaceId>,
+    project: Option<ProjectName>,
     start: Timestamp,
     seed: u64,
     tag: u64,
@@ -314,6 +318,7 @@ async fn fresh(args: &AcquireArgs, lake_url: &str, progress: &CommandProgress) -
         flat: args.flat.clone(),
         foam: args.foam.clone(),
         macro_reference: specimen::macro_reference(args)?,
+        project: args.project.clone(),
         start: Timestamp::now(),
         seed: args.seed,
         tag: random_tag(),
@@ -400,6 +405,7 @@ impl NewRun {
             flat: self.flat.clone(),
             foam: self.foam.clone(),
             macro_reference: self.macro_reference.clone(),
+            project: self.project.clone(),
             start: self.start,
             seed: self.seed,
             tag: self.tag,

@@ -140,6 +140,7 @@ fn missing_runs(campaign: &CampaignDefinition, surfaces: &[CampaignSurface], the
                     member: member.clone(),
                     flat: flat.clone(),
                     foam: foam.clone(),
+                    project: campaign.project.clone(),
                     start: start_time(campaign.seed, number),
                     seed: seed.wrapping_add(run as u64),
                 });

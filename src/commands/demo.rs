@@ -63,6 +63,7 @@ pub(crate) async fn run(args: &DemoArgs, lake_url: &str) -> anyhow::Result<Comma
         member,
         flat: None,
         foam: None,
+        project: None,
         start: start_time(args.seed, number),
         seed: args.seed.wrapping_mul(1_000).wrapping_add(number as u64),
     };

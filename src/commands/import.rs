@@ -5,15 +5,25 @@ use echolake_acquisition::import::{
     import_sofa, import_wav, sampling_rate_of,
 };
 use echolake_lake::{Lake, ReferenceSurfaces};
-use echolake_schema::{Celsius, Rig, SpectralDivision, Timestamp};
+use echolake_schema::{Celsius, ProjectName, Rig, SpectralDivision, Timestamp};
 
 use crate::CommandOutcome;
 use crate::progress::{CommandProgress, TaskProgress};
-use clap::Subcommand;
+use clap::{Args, Subcommand};
 use std::path::PathBuf;
 
+#[derive(Debug, Args)]
+pub(crate) struct ImportArgs {
+    /// Project that the surfaces belong to; tokens of the query service may be limited to projects.
+    #[arg(long, value_name = "NAME", global = true)]
+    project: Option<ProjectName>,
+    #[command(subcommand)]
+    format: ImportCommand,
+}
+
+/// Formats of existing measurements.
 #[derive(Debug, Subcommand)]
-pub(crate) enum ImportCommand {
+enum ImportCommand {
     /// Recordings and loopbacks as WAV files, listed in a CSV manifest.
     Wav {
         /// CSV manifest of the recordings.
@@ -57,7 +67,8 @@ pub(crate) enum ImportCommand {
     },
 }
 
-pub(crate) async fn run(args: &ImportCommand, lake_url: &str) -> anyhow::Result<CommandOutcome> {
+pub(crate) async fn run(args: &ImportArgs, lake_url: &str) -> anyhow::Result<CommandOutcome> {
+    let ImportArgs { project, format: args } = args;
     let rig = match args {
         ImportCommand::Wav { manifest, rig } => {
             let rate = sampling_rate_of(manifest)?;
@@ -103,7 +114,7 @@ pub(crate) async fn run(args: &ImportCommand, lake_url: &str) -> anyhow::Result<
     let folder = super::inbox(&lake)?;
     let progress = CommandProgress::new();
     let mut task = None;
-    let options = ImportOptions { started: Timestamp::now(), folder: &folder };
+    let options = ImportOptions { started: Timestamp::now(), folder: &folder, project: project.as_ref() };
     let mut step = |unit: &'static str, done: usize, total: usize| {
         task.get_or_insert_with(|| progress.task("import", total as u64, unit)).at(done as u64);
     };

@@ -10,6 +10,7 @@ use std::time::Duration;
 
 use anyhow::Context as _;
 use echolake_lake::{Lake, remote_access};
+use echolake_schema::ProjectName;
 use echolake_server::certificate::self_signed;
 use echolake_server::engine::{EngineRun, confinement, run_engine};
 use echolake_server::tokens::{self, TokenFile};
@@ -252,8 +253,8 @@ pub(crate) fn certificate(args: &CertificateArgs) -> anyhow::Result<CommandOutco
 }
 
 /// Prints a new token to stderr, once, and its lines for the file of tokens to stdout.
-pub(crate) fn token(name: &str, days: Option<u32>) -> anyhow::Result<CommandOutcome> {
-    let fresh = tokens::fresh(name, days)?;
+pub(crate) fn token(name: &str, days: Option<u32>, projects: &[ProjectName]) -> anyhow::Result<CommandOutcome> {
+    let fresh = tokens::fresh(name, days, projects)?;
     eprintln!("{}\nthis token is kept nowhere: only its hash is, in the lines for the file of --tokens", fresh.token);
     super::print(fresh.lines.trim_end())?;
     Ok(CommandOutcome::Whole)

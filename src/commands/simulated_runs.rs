@@ -13,7 +13,7 @@ use echolake_acquisition::run::recorder::random_tag;
 use echolake_acquisition::run::simulate::simulate;
 use echolake_acquisition::run::{PanelSpecimen, RunRequest};
 use echolake_schema::manifest::{Origin, RunEnd};
-use echolake_schema::{Rig, RunId, SurfaceId, Timestamp};
+use echolake_schema::{ProjectName, Rig, RunId, SurfaceId, Timestamp};
 
 use crate::progress::{CommandProgress, TaskProgress};
 
@@ -37,6 +37,7 @@ pub(super) struct PlannedRun {
     /// References, if they are not the lake's.
     pub(super) flat: Option<SurfaceId>,
     pub(super) foam: Option<SurfaceId>,
+    pub(super) project: Option<ProjectName>,
     /// Time of its begin: with the surface's name it tells whether the run is there already.
     pub(super) start: Timestamp,
     pub(super) seed: u64,
@@ -172,7 +173,7 @@ impl SimulationState<'_> {
     // Returns how the run ended and its size; nothing if it was measured before.
     fn measure(&self, planned: &PlannedRun) -> anyhow::Result<Option<(RunEnd, u64)>> {
         let SimulationPlan { rig, keep, folder, known, .. } = self.plan;
-        let PlannedRun { member, flat, foam, start, seed } = planned;
+        let PlannedRun { member, flat, foam, project, start, seed } = planned;
         let surface = &member.surface;
         let tag = random_tag();
         if known.contains(planned.run_id(tag)?.untagged()) {
@@ -188,6 +189,7 @@ impl SimulationState<'_> {
             flat: flat.clone(),
             foam: foam.clone(),
             macro_reference: member.macro_reference.clone(),
+            project: project.clone(),
             start: *start,
             seed: *seed,
             tag,

@@ -17,7 +17,7 @@ use echolake_lake::Lake;
 use echolake_query::Session;
 use echolake_recording::{PrefixItem, PrefixReader};
 use echolake_schema::manifest::Origin;
-use echolake_schema::{Rig, RunId, SurfaceId, SurfaceRecord, Timestamp, topics};
+use echolake_schema::{ProjectName, Rig, RunId, SurfaceId, SurfaceRecord, Timestamp, topics};
 use serde::{Deserialize, Serialize};
 use tempfile::TempDir;
 
@@ -128,6 +128,8 @@ struct TwinComputation {
 /// A run that is to be computed.
 struct ComputedRun {
     surface: SurfaceId,
+    /// That of the measured surface.
+    project: Option<ProjectName>,
     specimen: PanelSpecimen,
     tag: u64,
 }
@@ -139,7 +141,7 @@ impl TwinComputation {
         let file = mesh.path().join(topics::MESH_ATTACHMENT);
         let recorded = file.clone();
         let measured = path.to_owned();
-        tokio::task::spawn_blocking(move || take_mesh(&measured, &recorded)).await??;
+        let project = tokio::task::spawn_blocking(move || take_mesh(&measured, &recorded)).await??;
         // The tag of the measured run tells whose twin it is.
         let name = path.file_stem().unwrap_or_default().to_string_lossy();
         let tag = name.rsplit_once('-').and_then(|(_, tag)| u64::from_str_radix(tag, 16).ok());
@@ -147,11 +149,17 @@ impl TwinComputation {
         let references = [(FLAT, PanelRelief::Flat), (FOAM, PanelRelief::Foam)];
         let mut runs = Vec::new();
         for (name, relief) in references {
-            runs.push(ComputedRun { surface: name.parse()?, specimen: PanelSpecimen::Relief(relief), tag: 0 });
+            runs.push(ComputedRun {
+                surface: name.parse()?,
+                project: None,
+                specimen: PanelSpecimen::Relief(relief),
+                tag: 0,
+            });
         }
         let twin = format!("{TWIN}{surface}").parse()?;
         if runs.iter().all(|run| run.surface != twin) {
-            runs.push(ComputedRun { surface: twin, specimen: PanelSpecimen::Mesh(file, PanelSide::Front), tag });
+            let specimen = PanelSpecimen::Mesh(file, PanelSide::Front);
+            runs.push(ComputedRun { surface: twin, project, specimen, tag });
         }
         let snapshot = lake.snapshot().await?;
         let known: HashSet<RunId> = snapshot.runs().map(|run| run.run.clone()).collect();
@@ -182,6 +190,7 @@ impl TwinComputation {
             flat: Some(FLAT.parse()?),
             foam: Some(FOAM.parse()?),
             macro_reference: None,
+            project: run.project.clone(),
             start: COMPUTED_AT,
             seed: 0,
             tag: run.tag,
@@ -210,8 +219,8 @@ impl ComputedRun {
     }
 }
 
-// Writes the panel's mesh to a file. Both stand in the run's file before its measurements.
-fn take_mesh(run: &Path, to: &Path) -> anyhow::Result<()> {
+// Writes the panel's mesh to a file; returns the surface's project. Both stand in the run's file before its measurements.
+fn take_mesh(run: &Path, to: &Path) -> anyhow::Result<Option<ProjectName>> {
     let mut reader = PrefixReader::open(run)?;
     let (mut mesh, mut record) = (None, None);
     while let (false, Some(item)) = (mesh.is_some() && record.is_some(), reader.next_item()?) {
@@ -232,7 +241,8 @@ fn take_mesh(run: &Path, to: &Path) -> anyhow::Result<()> {
     if let Some(material) = record.material.filter(|material| material != expected) {
         anyhow::bail!("the panel is of `{material}`; hint: twins are computed of `{expected}` alone");
     }
-    std::fs::write(to, &mesh).with_context(|| format!("cannot write `{}`", to.display()))
+    std::fs::write(to, &mesh).with_context(|| format!("cannot write `{}`", to.display()))?;
+    Ok(record.project)
 }
 
 impl TwinDifferences {

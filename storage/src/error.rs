@@ -111,6 +111,14 @@ pub enum Error {
         /// The fault.
         source: ErrorCause,
     },
+    /// The lake is as a reader of some projects sees it.
+    #[error("table `{table}` cannot be {action} by a reader of some projects; hint: open the lake without projects")]
+    Restricted {
+        /// The table.
+        table: &'static str,
+        /// The attempted operation.
+        action: &'static str,
+    },
     /// Rows could not be encoded.
     #[error("rows of table `{table}` cannot be encoded: {reason}")]
     Encode {

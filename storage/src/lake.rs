@@ -1,11 +1,13 @@
 //! A lake, opened.
 
+#[cfg(feature = "tables")]
+use std::collections::BTreeSet;
 use std::path::Path as FsPath;
 use std::sync::Arc;
 
-#[cfg(feature = "tables")]
-use echolake_schema::tables::Table;
 use echolake_schema::{Grid, Rig, RunId, SurfaceId};
+#[cfg(feature = "tables")]
+use echolake_schema::{ProjectName, tables::Table};
 use object_store::path::Path;
 use object_store::{ObjectStore, ObjectStoreExt as _, PutMode};
 
@@ -15,7 +17,7 @@ use crate::remote::PartStore;
 #[cfg(feature = "tables")]
 use crate::remote::{BlockCache, BlockFolder, CacheCounters, CacheCounts, CacheFolder, CachedStore};
 #[cfg(feature = "tables")]
-use crate::tables::delta::DeltaLog;
+use crate::tables::{ProjectLog, delta::DeltaLog};
 use crate::unused;
 use crate::{Error, LAKE_FORMAT, LakeConfig, ReferenceSurfaces, Result};
 
@@ -30,6 +32,9 @@ struct OpenLake {
     grid: Grid,
     #[cfg(feature = "tables")]
     log: Arc<DeltaLog>,
+    /// What is seen of the log, if that is not all.
+    #[cfg(feature = "tables")]
+    projects: Option<ProjectLog>,
 }
 
 const CONFIG: &str = "lake.toml";
@@ -161,6 +166,8 @@ impl Lake {
             grid,
             #[cfg(feature = "tables")]
             log,
+            #[cfg(feature = "tables")]
+            projects: None,
         })))
     }
 
@@ -228,7 +235,44 @@ impl Lake {
             config: self.0.config.clone(),
             grid: self.0.grid.clone(),
             log: self.0.log.clone(),
+            projects: self.0.projects.clone(),
         })))
+    }
+
+    /// Returns the lake as a reader of these projects sees it: with their runs, and those of the surfaces that `lake.toml`
+    /// names as references. All other runs do not exist in it, as of no version; it cannot be written.
+    ///
+    /// ```
+    /// use echolake_lake::{Error, Lake, ReferenceSurfaces};
+    /// use echolake_schema::Rig;
+    ///
+    /// # tokio::runtime::Runtime::new()?.block_on(async {
+    /// let lake = Lake::open_or_create("memory://", &Rig::paper(), &ReferenceSurfaces::default()).await?;
+    /// let seen = lake.restricted_to(["brick".parse()?].into());
+    /// assert!(seen.is_restricted() && !lake.is_restricted());
+    /// assert!(matches!(seen.ensure_tables().await, Err(Error::Restricted { .. })));
+    /// # Ok::<(), Box<dyn std::error::Error>>(())
+    /// # })?;
+    /// # Ok::<(), Box<dyn std::error::Error>>(())
+    /// ```
+    #[cfg(feature = "tables")]
+    #[must_use]
+    pub fn restricted_to(&self, projects: BTreeSet<ProjectName>) -> Self {
+        let references = &self.config().references;
+        let common = [references.flat.clone(), references.foam.clone()];
+        Self(Arc::new(OpenLake {
+            location: self.0.location.clone(),
+            config: self.0.config.clone(),
+            grid: self.0.grid.clone(),
+            log: self.0.log.clone(),
+            projects: Some(ProjectLog::new(self.0.log.clone(), projects, common)),
+        }))
+    }
+
+    /// Returns whether this is the lake as a reader of some projects sees it.
+    #[cfg(feature = "tables")]
+    pub fn is_restricted(&self) -> bool {
+        self.0.projects.is_some()
     }
 
     /// Returns what the cache has counted since it was made; None if there is no cache.
@@ -274,10 +318,13 @@ impl Lake {
         &self.0.grid
     }
 
-    /// The commit log.
+    /// The commit log, as far as it may be seen.
     #[cfg(feature = "tables")]
     pub fn log(&self) -> &dyn crate::CommitLog {
-        self.0.log.as_ref()
+        match &self.0.projects {
+            Some(projects) => projects,
+            None => self.0.log.as_ref(),
+        }
     }
 
     /// Path of a run's file.

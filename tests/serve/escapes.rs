@@ -160,7 +160,7 @@ async fn none_over_flight_sql() {
     tokio::task::spawn_blocking(|| scene.unharmed()).await.expect("unharmed");
 }
 
-type FlightSqlClient = FlightSqlServiceClient<Channel>;
+pub(super) type FlightSqlClient = FlightSqlServiceClient<Channel>;
 
 async fn flight(client: &mut FlightSqlClient, sql: &str) -> Result<String, FlightError> {
     let info = client.execute(sql.to_owned(), None).await?;

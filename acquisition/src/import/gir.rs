@@ -73,8 +73,8 @@ impl GirImport<'_> {
         let temperatures = temperatures(file, pairs.len())?;
         let heights = self.heights(file, &surface)?;
         let mesh = heights.as_ref().map(|h| Mesh::from_height_field(&smaller(h), BACK_MM));
-        let mut record =
-            info.cloned().unwrap_or_else(|| SurfaceRecord { typology: "unknown".into(), ..Default::default() });
+        let mut record = info.cloned().unwrap_or_else(|| self.options.surface_record("unknown"));
+        record.project = self.options.project.cloned();
         record.mesh = heights.as_ref().zip(mesh.as_ref()).map(|(h, m)| MeshFacts {
             file: echolake_schema::topics::MESH_ATTACHMENT.into(),
             triangles: m.triangles.len() as u64,

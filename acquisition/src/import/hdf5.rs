@@ -8,7 +8,7 @@ use std::collections::HashMap;
 use std::path::Path;
 
 use echolake_schema::manifest::{Origin, RunEnd};
-use echolake_schema::{Celsius, ErrorCause, Grid, Pair, PairId, Point, Rig, SurfaceId, SurfaceRecord};
+use echolake_schema::{Celsius, ErrorCause, Grid, Pair, PairId, Point, Rig, SurfaceId};
 
 use super::batch::ImportBatch;
 use super::hdf5_file::{Hdf5Dataset, Hdf5File, Hdf5Variable, place};
@@ -153,7 +153,7 @@ impl<'g> ResponseSet<'g> {
     ) -> Result<ImportedRun, Error> {
         let started = import.options.started.plus_secs(number as f64 * RUN_SECS);
         let manifest = super::manifest(Origin::ImportedHdf5, &self.surfaces[number], import.rig, started)?;
-        let record = SurfaceRecord { typology: "imported".into(), ..SurfaceRecord::default() };
+        let record = import.options.surface_record("imported");
         let path = import.options.folder.join(format!("{}.mcap", manifest.run_id));
         let start = RunStart { manifest: &manifest, rig: import.rig, surface: &record, relief: None, plan: None };
         let mut recorder = batch.create(&path, &start)?;

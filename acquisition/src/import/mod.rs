@@ -16,7 +16,7 @@ mod wav_manifest;
 use std::path::{Path, PathBuf};
 
 use echolake_schema::manifest::{Origin, RunManifest};
-use echolake_schema::{ErrorCause, Rig, RunId, SurfaceId, Timestamp};
+use echolake_schema::{ErrorCause, ProjectName, Rig, RunId, SurfaceId, SurfaceRecord, Timestamp};
 
 use crate::run::recorder::random_tag;
 
@@ -50,6 +50,16 @@ pub struct ImportOptions<'a> {
     pub started: Timestamp,
     /// Folder of the runs' files.
     pub folder: &'a Path,
+    /// The project that all runs belong to.
+    pub project: Option<&'a ProjectName>,
+}
+
+impl ImportOptions<'_> {
+    /// Makes the record of a surface that nothing else is known of.
+    fn surface_record(&self, typology: &str) -> SurfaceRecord {
+        let project = self.project.cloned();
+        SurfaceRecord { typology: typology.to_owned(), project, ..SurfaceRecord::default() }
+    }
 }
 
 /// An error that refuses an import. Nothing of it is left behind.

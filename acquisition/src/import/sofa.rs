@@ -11,7 +11,7 @@ use std::collections::HashSet;
 use std::path::{Path, PathBuf};
 
 use echolake_schema::manifest::{Origin, RunEnd};
-use echolake_schema::{Celsius, ErrorCause, Grid, Pair, PairId, Point, Rig, SurfaceId, SurfaceRecord, Timestamp};
+use echolake_schema::{Celsius, ErrorCause, Grid, Pair, PairId, Point, Rig, SurfaceId, Timestamp};
 
 use super::batch::ImportBatch;
 use super::hdf5_file::{Hdf5File, Hdf5Variable, place};
@@ -170,7 +170,7 @@ impl Sofa {
         let times = self.times(import.options.started.plus_secs(f64::from(import.number) * RUN_SECS));
         let (started, ended) = (times[0], times[times.len() - 1]);
         let manifest = super::manifest(Origin::ImportedSofa, &self.surface, import.rig, started)?;
-        let record = SurfaceRecord { typology: "imported".into(), ..SurfaceRecord::default() };
+        let record = import.options.surface_record("imported");
         let path = import.options.folder.join(format!("{}.mcap", manifest.run_id));
         let start = RunStart { manifest: &manifest, rig: import.rig, surface: &record, relief: None, plan: None };
         let mut recorder = batch.create(&path, &start)?;

@@ -12,7 +12,7 @@ use echolake_dsp::response_deconvolution::ResponseDeconvolution;
 use echolake_dsp::temperature::{resampling_ratio, response_limits_hz, speed_of_sound};
 use echolake_schema::manifest::{Origin, RunEnd};
 use echolake_schema::messages::{AmbientSample, ImpulseResponse, Measurement, SweepRecording, Verdict};
-use echolake_schema::{Grid, Rig, SampleRate, SurfaceId, SurfaceRecord, Timestamp};
+use echolake_schema::{Grid, Rig, SampleRate, SurfaceId, Timestamp};
 
 use super::batch::ImportBatch;
 use super::wav_manifest::{self, ManifestRow};
@@ -79,7 +79,7 @@ impl WavImport<'_> {
         timed.sort_by_key(|(time, _)| *time);
         let started = timed.first().map_or(self.options.started, |(time, _)| *time);
         let manifest = super::manifest(Origin::ImportedWav, &surface, self.rig, started)?;
-        let record = SurfaceRecord { typology: "imported".into(), ..SurfaceRecord::default() };
+        let record = self.options.surface_record("imported");
         let path = self.options.folder.join(format!("{}.mcap", manifest.run_id));
         let start = RunStart { manifest: &manifest, rig: self.rig, surface: &record, relief: None, plan: None };
         let mut recorder = batch.create(&path, &start)?;

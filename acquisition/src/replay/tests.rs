@@ -36,6 +36,7 @@ fn run(folder: &Path, surface: &str, hours: f64) -> PathBuf {
         flat: None,
         foam: None,
         macro_reference: None,
+        project: None,
         start: Timestamp(START).plus_secs(hours * 3_600.0),
         seed: 1,
         tag: 1,

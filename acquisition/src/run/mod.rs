@@ -16,7 +16,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use echolake_schema::manifest::{Origin, RunManifest};
-use echolake_schema::{Rig, RunId, SurfaceId, Timestamp};
+use echolake_schema::{ProjectName, Rig, RunId, SurfaceId, Timestamp};
 use tracing::Span;
 
 use crate::disk::folder_of;
@@ -49,6 +49,8 @@ pub struct RunRequest<'a> {
     pub foam: Option<SurfaceId>,
     /// The surface that has its large shape and nothing on it.
     pub macro_reference: Option<SurfaceId>,
+    /// The project that it belongs to.
+    pub project: Option<ProjectName>,
     /// Time of its begin.
     pub start: Timestamp,
     /// Seed of room and noise of simulated devices.
@@ -122,6 +124,7 @@ impl RunRequest<'_> {
         surface.flat_reference = self.flat.clone();
         surface.foam_reference = self.foam.clone();
         surface.macro_reference = self.macro_reference.clone();
+        surface.project = self.project.clone();
         let relief = RecordedRelief { heights: &panel.heights, mesh: &panel.mesh, original: panel.original() };
         let start = RunStart { manifest: &manifest, rig: self.rig, surface: &surface, relief: Some(relief), plan };
         let none = BTreeMap::new();

@@ -105,6 +105,7 @@ impl SimulationOrder<'_> {
             flat: None,
             foam: None,
             macro_reference: None,
+            project: None,
             start: FIRST_START.plus_secs(number as f64 * RUN_EVERY_SECS),
             seed: self.seed.wrapping_mul(1_000).wrapping_add(number as u64),
             tag: number as u64,

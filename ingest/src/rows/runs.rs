@@ -2,9 +2,9 @@
 
 use arrow::record_batch::RecordBatch;
 use echolake_lake::{BatchBuilder, Lake};
-use echolake_schema::Rig;
 use echolake_schema::messages::Measurement;
 use echolake_schema::tables::Table;
+use echolake_schema::{ProjectName, Rig};
 
 use super::RunKeys;
 use crate::error::Result;
@@ -49,6 +49,7 @@ pub(crate) fn row(
     }
     columns
         .text("origin", content.manifest.origin.label())
+        .text("project", content.surface.project.as_ref().map(ProjectName::as_str))
         .text("rig", content.manifest.rig.as_str())
         .times("started", [content.manifest.started.0])
         .times("ended", [ended])

@@ -7,7 +7,7 @@ use echolake_dsp::height_field::HeightField;
 use echolake_dsp::temperature::speed_of_sound;
 use echolake_lake::ReferenceSurfaces;
 use echolake_schema::tables::Table;
-use echolake_schema::{Rig, SurfaceId, SurfaceRecord};
+use echolake_schema::{ProjectName, Rig, SurfaceId, SurfaceRecord};
 
 use super::RunKeys;
 use crate::error::Result;
@@ -52,6 +52,7 @@ pub(crate) fn row(
         .floats("relief_max_mm", known(1))
         .floats("relief_rms_mm", known(2))
         .text("origin", origin)
+        .text("project", surface.project.as_ref().map(ProjectName::as_str))
         .finish()?;
     Ok(row)
 }

@@ -16,6 +16,8 @@ const EXTENSION: &str = ".mcap";
 const FORMS: &str = "a surface (`0015_0`), a run, either with * and ?, or a file in the lake (`inbox/x.mcap`); \
                      several with commas between them";
 
+const RUNS_ALONE: &str = "tokens of projects read files of their runs alone; select file from runs";
+
 /// A file that a call means.
 #[derive(Debug, Clone)]
 pub(super) struct Target {
@@ -32,6 +34,9 @@ impl Target {
             if part.contains('/') || part.ends_with(EXTENSION) {
                 let path = path(part)?;
                 let run = snapshot.runs().find(|r| Lake::run_path(&r.surface, &r.run) == path);
+                if run.is_none() && snapshot.is_restricted() {
+                    return Err(Fault::call(format!("`{part}` is the file of no run that you may see"), RUNS_ALONE));
+                }
                 meant.insert(path, run.map(names));
             } else {
                 meant.extend(runs(part, snapshot)?);

@@ -2,7 +2,7 @@
 
 use std::sync::atomic::AtomicBool;
 
-use arrow::array::{ArrayRef, AsArray as _, Int64Array, StringArray};
+use arrow::array::{ArrayRef, AsArray as _, Int64Array, StringArray, new_null_array};
 use arrow::compute::cast;
 use arrow::datatypes::{DataType, Field, Float64Type, Int64Type};
 use datafusion::execution::object_store::ObjectStoreUrl;
@@ -316,7 +316,7 @@ async fn errors_point_at_the_place() {
         no column `nonsense` (line 1, column 8)
           select nonsense from runs
                  ^
-        hint: the columns are surface_id, run_id, state, missing, origin, rig, started_ns, started, ended_ns, ended, measurements, rejected, ...; DESCRIBE lists all of a table"#]]).await;
+        hint: the columns are surface_id, run_id, state, missing, origin, project, rig, started_ns, started, ended_ns, ended, measurements, ...; DESCRIBE lists all of a table"#]]).await;
     check(
         "select pair_idd from pairs",
         expect![[r#"
@@ -386,6 +386,7 @@ async fn put_events(lake: &Lake, surface: &str, run: &str, derivation: &str, lin
                 _ => derivation,
             };
             match field.data_type() {
+                kind if field.name() == "project" => new_null_array(kind, count),
                 DataType::Utf8 => Arc::new(StringArray::from(vec![text; count])),
                 kind => cast(&(0..count as i64).collect::<Int64Array>(), kind).expect("numbers"),
             }

@@ -24,7 +24,13 @@ impl SystemRows for LakeFiles {
         schema([
             column("table", DataType::Utf8, false, "", "Table that the file is of"),
             column("path", DataType::Utf8, false, "", "Path of the file in the lake"),
-            column("bytes", DataType::Int64, false, "B", "Size"),
+            column(
+                "bytes",
+                DataType::Int64,
+                false,
+                "B",
+                "Size; if it has rows of other projects, the share of those seen",
+            ),
             column("rows", DataType::Int64, false, "1", "Rows that readers see"),
             column("runs", DataType::Int64, false, "1", "Runs whose rows readers see in it; 0 for tables of the rig"),
             column("surface_id", DataType::Utf8, true, "", "Surface of its run; null unless it has one run"),
@@ -54,7 +60,7 @@ impl SystemRows for LakeFiles {
             vec![
                 Arc::new(table),
                 Arc::new(path),
-                long(&|file| file.bytes),
+                long(&|file| seen_bytes(&self.snapshot, file)),
                 long(&DataFile::visible_rows),
                 Arc::new(runs),
                 only(|(surface, _)| surface),
@@ -62,6 +68,13 @@ impl SystemRows for LakeFiles {
                 long(&|file| file.log_version),
             ],
         )
+    }
+}
+
+fn seen_bytes(snapshot: &LakeSnapshot, file: &DataFile) -> u64 {
+    match snapshot.is_restricted() {
+        true => (u128::from(file.bytes) * u128::from(file.visible_rows()) / u128::from(file.rows.max(1))) as u64,
+        false => file.bytes,
     }
 }
 

@@ -73,6 +73,11 @@ fn code_version() -> Column {
     Column::text("code_version", "Version of the code that derived this row")
 }
 
+fn project() -> Column {
+    Column::text("project", "Project that the run was recorded for; tokens of projects see the rows of their runs")
+        .or_null()
+}
+
 fn references() -> Vec<Column> {
     vec![
         Column::text(
@@ -111,7 +116,7 @@ fn surfaces(bands: &[String]) -> Vec<Column> {
                        simulated levels of single pairs are off by about 1 dB and more";
         Column::float(format!("detail_phase_{band}"), "1", format!("{comment}, band at {band} Hz")).or_null()
     }));
-    columns.extend([Column::text("origin", ORIGINS), code_version()]);
+    columns.extend([Column::text("origin", ORIGINS), project(), code_version()]);
     columns
 }
 
@@ -121,6 +126,7 @@ fn runs() -> Vec<Column> {
         Column::text("state", "complete; waiting: references are missing; partial: the file was cut off"),
         Column::text("missing", "References that are missing, separated by commas; empty where none is"),
         Column::text("origin", ORIGINS),
+        project(),
         Column::text("rig", "Name of the rig"),
         Column::long("started_ns", "ns", "Start since 1970-01-01 UTC"),
         Column::time("started", "Start, UTC"),

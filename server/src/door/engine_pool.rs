@@ -110,14 +110,15 @@ impl EnginePool {
     pub(super) async fn lease(&self, client: &ClientIdentity) -> Result<EngineLease, RequestFault> {
         self.0.access.check_current(client)?;
         let own = self.client(&client.name);
-        if let Some(lease) = own.lease() {
+        if let Some(lease) = own.lease(client) {
             return Ok(lease);
         }
         let mut state = own.state.lock().await;
         // Another request that held the lock may have started one.
-        if let Some(lease) = own.lease() {
+        if let Some(lease) = own.lease(client) {
             return Ok(lease);
         }
+        own.end_outdated(client);
         self.count_end(&own, &mut state).await;
         tokio::time::sleep(state.backoff()).await;
         self.make_room(&own).await?;
@@ -131,6 +132,11 @@ impl EnginePool {
         }
         let lease =
             engine.lease().ok_or_else(|| RequestFault::EngineEnded { reason: "it ended at once".to_owned() })?;
+        // The file of tokens may have changed while the engine started.
+        if let Err(refused) = self.0.access.check_current(client) {
+            engine.end(EndReason::Retired);
+            return Err(refused);
+        }
         *lock(&own.current) = Some(engine);
         Ok(lease)
     }
@@ -340,8 +346,15 @@ impl EnginePool {
 }
 
 impl ClientEngine {
-    fn lease(&self) -> Option<EngineLease> {
-        lock(&self.current).as_ref().and_then(EngineProcess::lease)
+    fn lease(&self, client: &ClientIdentity) -> Option<EngineLease> {
+        lock(&self.current).as_ref().filter(|engine| engine.sees_projects_of(client)).and_then(EngineProcess::lease)
+    }
+
+    // An engine sees the same projects all its life.
+    fn end_outdated(&self, client: &ClientIdentity) {
+        if let Some(engine) = lock(&self.current).as_ref().filter(|engine| !engine.sees_projects_of(client)) {
+            engine.end(EndReason::Retired);
+        }
     }
 
     fn has_engine(&self) -> bool {

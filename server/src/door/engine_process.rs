@@ -168,6 +168,11 @@ impl EngineProcess {
         self.send(&DoorMessage::Client(client.clone())).await.map_err(failed)
     }
 
+    /// Returns whether it sees the projects that a client may see.
+    pub(super) fn sees_projects_of(&self, client: &ClientIdentity) -> bool {
+        self.client.get().is_some_and(|own| own.projects == client.projects)
+    }
+
     /// Sends it a message.
     ///
     /// # Errors

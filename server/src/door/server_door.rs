@@ -97,7 +97,9 @@ impl ServerDoor {
         let mut ended = Vec::new();
         loop {
             let gone = self.0.access.renew(&mut known);
-            gone.iter().for_each(|client| tracing::warn!(client, "its token was taken back or has expired"));
+            gone.iter().for_each(|client| {
+                tracing::warn!(client, "its token was taken back, has expired, or sees other projects now")
+            });
             // Those of the last look again: a request may have begun between its check and its engine's end.
             ended.iter().chain(&gone).for_each(|client: &String| self.0.engines.end_client(client));
             ended = gone;

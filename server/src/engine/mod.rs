@@ -64,6 +64,12 @@ pub async fn run_engine(lake: &Lake, sockets: &Path, settings: EngineRun) -> Res
     // The door went away before it had a use for this engine.
     let Some(identity) = identity else { return Ok(()) };
     let limit = identity.memory_bytes.into_iter().chain(memory).min();
+    let lake = &identity.visible_lake(lake);
+    // Whatever the spare engine has read of the lake, it read as a reader of all projects.
+    let engine = match lake.is_restricted() {
+        true => QueryEngine::new(lake, EngineLimits { memory })?,
+        false => engine,
+    };
     let service = QueryService::new(lake, engine, identity, settings.slow)?;
     // Behind the start of its threads, whose stacks count.
     limit.map(confinement::limit_memory).transpose().map_err(Error::System)?;

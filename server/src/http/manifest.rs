@@ -4,7 +4,7 @@
 use axum::extract::State;
 use axum::http::{HeaderMap, HeaderName, StatusCode, header};
 use axum::response::{IntoResponse as _, Response};
-use echolake_lake::DataFile;
+use echolake_lake::{DataFile, LakeSnapshot};
 use echolake_schema::tables::Table;
 use serde::{Deserialize, Serialize};
 use utoipa::{IntoParams, ToSchema};
@@ -34,6 +34,15 @@ struct FileManifest<'a> {
     /// Of the snapshot; another one, another version.
     version: &'a str,
     files: Vec<ManifestFile>,
+    /// Rows that only queries give, because their files hold rows of projects that the client may not see.
+    rows_elsewhere: Vec<RowsElsewhere>,
+}
+
+/// Rows of a table that are in no file of the manifest.
+#[derive(Serialize, ToSchema)]
+struct RowsElsewhere {
+    table: &'static str,
+    rows: u64,
 }
 
 /// A Parquet file with its address.
@@ -84,12 +93,14 @@ async fn files(
     if is_known(&headers, &etag) {
         return Ok((StatusCode::NOT_MODIFIED, validators).into_response());
     }
-    let all = Table::ALL.into_iter().filter(|table| tables.is_empty() || tables.contains(table));
-    let files = all.flat_map(|table| {
+    let all: Vec<_> = Table::ALL.into_iter().filter(|table| tables.is_empty() || tables.contains(table)).collect();
+    let snapshot = &view.snapshot;
+    let files = all.iter().flat_map(|table| {
         let origin = &origin;
-        view.snapshot.files(table).iter().filter_map(move |file| ManifestFile::of(origin, table, file))
+        snapshot.readable_files(*table).filter_map(move |file| ManifestFile::of(origin, *table, file))
     });
-    let manifest = FileManifest { version: &view.version, files: files.collect() };
+    let rows_elsewhere = all.iter().filter_map(|table| RowsElsewhere::of(snapshot, *table)).collect();
+    let manifest = FileManifest { version: &view.version, files: files.collect(), rows_elsewhere };
     Ok((validators, axum::Json(manifest)).into_response())
 }
 
@@ -98,6 +109,14 @@ fn origin(headers: &HeaderMap) -> String {
     let text = |name: HeaderName| headers.get(name).and_then(|v| v.to_str().ok());
     let scheme = if is_encrypted(headers) { "https" } else { "http" };
     format!("{scheme}://{}", text(header::HOST).unwrap_or_default())
+}
+
+impl RowsElsewhere {
+    fn of(snapshot: &LakeSnapshot, table: Table) -> Option<Self> {
+        let all: u64 = snapshot.files(table).iter().map(DataFile::visible_rows).sum();
+        let readable: u64 = snapshot.readable_files(table).map(DataFile::visible_rows).sum();
+        (all > readable).then(|| Self { table: table.name(), rows: all - readable })
+    }
 }
 
 impl ManifestFile {

@@ -7,7 +7,7 @@ use anyhow::{Context as _, bail, ensure};
 use echolake_acquisition::panel::collection::CollectionSurface;
 use echolake_acquisition::panel::relief::PanelRelief;
 use echolake_lake::ReferenceSurfaces;
-use echolake_schema::SurfaceId;
+use echolake_schema::{ProjectName, SurfaceId};
 use serde::Deserialize;
 
 /// Runs of one surface at most.
@@ -23,6 +23,8 @@ pub(super) struct CampaignDefinition {
     pub(super) about: String,
     /// The rig's file, beside this one.
     rig: Option<PathBuf>,
+    /// The project that its surfaces belong to.
+    pub(super) project: Option<ProjectName>,
     /// Seed of the simulation.
     #[serde(default = "default_seed")]
     pub(super) seed: u64,

@@ -8,6 +8,7 @@ pub(crate) mod delta;
 mod lease;
 mod optimize;
 mod process_identity;
+mod project_log;
 mod rig_tables;
 mod rows;
 mod snapshot;
@@ -22,6 +23,7 @@ pub use commit_log::{
 };
 pub use data_file::{EncodedFile, FileEncoder, encode};
 pub use optimize::{MergeProgress, OptimizeReport, TARGET_BYTES, TableOptimizeReport};
+pub(crate) use project_log::ProjectLog;
 pub use rows::{add_missing_columns, reader_metadata, wanted_schema};
 pub use snapshot::{FileName, LakeSnapshot, VisibleRun};
 pub use vacuum::{DeletedFile, DeletionMode, KEEP_HOURS, VacuumReport};
@@ -108,7 +110,7 @@ impl Lake {
     /// # Errors
     /// [`Error::Log`] if a table's log is damaged.
     pub async fn snapshot(&self) -> Result<LakeSnapshot> {
-        LakeSnapshot::take(self.log()).await
+        Ok(LakeSnapshot::take(self.log()).await?.restricted(self.is_restricted()))
     }
 
     /// Puts a file's bytes into the store, for a commit to name. No reader sees them before that.

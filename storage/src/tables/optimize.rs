@@ -2,10 +2,12 @@
 //!
 //! A merged file's Add lists its parts, (surface, run, derivation) each with its number of rows; a snapshot decides
 //! over every part as it would over a file of its own. `runs` and `surfaces` keep one file per run: ingest reads them
-//! by name and by their statistics, and all of them together are small.
+//! by name and by their statistics, and all of them together are small. Runs of several projects are not merged, so that
+//! whoever may see one project has whole files of it.
 
 use std::sync::atomic::{AtomicBool, Ordering};
 
+use echolake_schema::ProjectName;
 use echolake_schema::tables::{Source, Table};
 use futures::TryStreamExt as _;
 use serde::Serialize;
@@ -13,8 +15,8 @@ use sha2::{Digest as _, Sha256};
 
 use crate::tables::lease::MaintenanceLease;
 use crate::{
-    CommitEffect, CommitOutcome, DataFile, Error, FileEncoder, FileName, Lake, LakeSnapshot, ReplacedFiles, Result,
-    RunPart, TableCommit,
+    CommitEffect, CommitOutcome, DataFile, Error, FileEncoder, FileName, Lake, LakeSnapshot, ReferenceSurfaces,
+    ReplacedFiles, Result, RunPart, TableCommit,
 };
 
 /// Default size that files are merged to: few enough for a million responses, small enough to be held in memory.
@@ -86,7 +88,9 @@ impl Lake {
     ) -> Result<OptimizeReport> {
         self.remove_superseded().await?;
         let snapshot = self.snapshot().await?;
-        let plans: Vec<_> = Table::ALL.into_iter().map(|table| (table, plan(&snapshot, table, target_bytes))).collect();
+        let readers = FileReaders::of(self, &snapshot);
+        let plans: Vec<_> =
+            Table::ALL.into_iter().map(|table| (table, plan(&snapshot, &readers, table, target_bytes))).collect();
         let total = plans.iter().flat_map(|(_, groups)| groups).map(Vec::len).sum();
         let (mut report, mut done) = (OptimizeReport::default(), 0);
         for (table, groups) in plans.into_iter().filter(|(_, groups)| !groups.is_empty()) {
@@ -190,8 +194,48 @@ fn name(parts: &[RunPart]) -> FileName {
     FileName::Merged { digest: hex::encode(sha.finalize())[..DIGEST_DIGITS].to_owned() }
 }
 
+/// Who reads a run's rows.
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
+enum RunAudience {
+    /// All projects.
+    Common,
+    /// A project, or readers of all projects alone.
+    Project(Option<ProjectName>),
+    /// Differs between the runs of a file.
+    Mixed,
+}
+
+/// Tells who reads the rows of a file.
+struct FileReaders<'a> {
+    snapshot: &'a LakeSnapshot,
+    references: &'a ReferenceSurfaces,
+    /// A lake without projects has readers of one kind.
+    has_projects: bool,
+}
+
+impl<'a> FileReaders<'a> {
+    fn of(lake: &'a Lake, snapshot: &'a LakeSnapshot) -> Self {
+        let has_projects = snapshot.runs().any(|run| snapshot.project(&run.run).is_some());
+        Self { snapshot, references: &lake.config().references, has_projects }
+    }
+
+    fn audience(&self, file: &DataFile) -> RunAudience {
+        let of = |slice: &RunSlice<'_>| match &slice.part {
+            _ if !self.has_projects => RunAudience::Common,
+            part if [&self.references.flat, &self.references.foam].contains(&&part.surface) => RunAudience::Common,
+            part => RunAudience::Project(self.snapshot.project(&part.run).cloned()),
+        };
+        let mut audiences = slices(file).iter().map(of).collect::<Vec<_>>();
+        audiences.dedup();
+        match audiences.len() {
+            1 => audiences.remove(0),
+            _ => RunAudience::Mixed,
+        }
+    }
+}
+
 // Neighbours by surface and run in groups of about the wanted size, so that a query for a surface opens few files.
-fn plan(snapshot: &LakeSnapshot, table: Table, target_bytes: u64) -> Vec<Vec<DataFile>> {
+fn plan(snapshot: &LakeSnapshot, readers: &FileReaders<'_>, table: Table, target_bytes: u64) -> Vec<Vec<DataFile>> {
     let merges = matches!(table.source(), Source::Run | Source::References) && table != Table::Surfaces;
     if !merges {
         return Vec::new();
@@ -199,13 +243,16 @@ fn plan(snapshot: &LakeSnapshot, table: Table, target_bytes: u64) -> Vec<Vec<Dat
     let is_small = |f: &&DataFile| f.bytes < target_bytes / 2 && f.hidden.is_empty();
     let first = |f: &DataFile| slices(f).first().map(|s| (s.part.surface.clone(), s.part.run.clone()));
     let mut small: Vec<_> = snapshot.files(table).iter().filter(is_small).cloned().collect();
-    small.sort_by_cached_key(first);
+    small.sort_by_cached_key(|file| (readers.audience(file), first(file)));
     let (mut groups, mut bytes) = (vec![Vec::new()], 0);
+    let mut last = None;
     for file in small {
-        if bytes + file.bytes > target_bytes {
+        let audience = Some(readers.audience(&file));
+        if bytes + file.bytes > target_bytes || audience != last {
             groups.push(Vec::new());
             bytes = 0;
         }
+        last = audience;
         bytes += file.bytes;
         if let Some(group) = groups.last_mut() {
             group.push(file);

@@ -6,11 +6,12 @@
 use std::collections::{BTreeMap, HashMap, HashSet};
 
 use echolake_schema::tables::{Source, Table};
-use echolake_schema::{RunId, SurfaceId};
+use echolake_schema::{ProjectName, RunId, SurfaceId};
 use futures::future::try_join_all;
 use object_store::path::Path;
 use serde_json::{Value, json};
 
+use crate::tables::project_log::project_of;
 use crate::{CommitLog, DataFile, Error, Result, RunPart};
 
 /// Parsed name of a file in `tables/`.
@@ -76,6 +77,7 @@ pub struct LakeSnapshot {
     hidden: HashMap<Table, Vec<DataFile>>,
     outgrown: HashMap<Table, Vec<DataFile>>,
     versions: HashMap<Table, u64>,
+    is_restricted: bool,
 }
 
 /// A run's row in `runs`, and the version of `runs` that added it.
@@ -83,6 +85,7 @@ pub struct LakeSnapshot {
 struct CurrentRun {
     run: VisibleRun,
     log_version: u64,
+    project: Option<ProjectName>,
 }
 
 const EXTENSION: &str = ".parquet";
@@ -148,6 +151,26 @@ impl LakeSnapshot {
         snapshot
     }
 
+    /// The same view, of a reader of some projects.
+    #[must_use]
+    pub(crate) fn restricted(self, is_restricted: bool) -> Self {
+        Self { is_restricted, ..self }
+    }
+
+    /// Returns whether this is a reader's of some projects: what it hides is none of the reader's business.
+    pub fn is_restricted(&self) -> bool {
+        self.is_restricted
+    }
+
+    /// The version of the lake in which readers saw this for the first time, or the present one: how many versions others
+    /// added since is shown to nobody else. None if there was no table, and for views of the past.
+    pub fn lake_version(&self) -> Option<u64> {
+        match self.is_restricted {
+            false => self.version(Table::Runs),
+            true => self.runs.values().map(|current| current.log_version).max(),
+        }
+    }
+
     /// The version of a table's log that the view was taken of; that of `runs` is the lake's. None if there was no
     /// table, and for views of the past.
     pub fn version(&self, table: Table) -> Option<u64> {
@@ -157,6 +180,11 @@ impl LakeSnapshot {
     /// The files of a table that readers see.
     pub fn files(&self, table: Table) -> &[DataFile] {
         self.files.get(&table).map_or(&[], Vec::as_slice)
+    }
+
+    /// The files of a table that its readers may have as they are: for readers of some projects, those without hidden rows.
+    pub fn readable_files(&self, table: Table) -> impl Iterator<Item = &DataFile> {
+        self.files(table).iter().filter(|file| !self.is_restricted || file.hidden.is_empty())
     }
 
     /// The files of a table that belong to a run that readers see, but are no longer seen themselves. Excludes files
@@ -178,6 +206,11 @@ impl LakeSnapshot {
     /// One run.
     pub fn run(&self, run: &RunId) -> Option<&VisibleRun> {
         self.runs.get(run).map(|current| &current.run)
+    }
+
+    /// The project of a run; None if it was given none.
+    pub(crate) fn project(&self, run: &RunId) -> Option<&ProjectName> {
+        self.runs.get(run)?.project.as_ref()
     }
 
     /// The files of one run in a table, and the merged ones that show its rows.
@@ -291,6 +324,14 @@ fn run_of(file: &DataFile) -> Option<RunId> {
     }
 }
 
+/// The surface of a run, by the file of its row in `runs`.
+pub(crate) fn surface_of(pointer: &DataFile) -> Option<SurfaceId> {
+    match FileName::parse(&pointer.path)? {
+        FileName::Pointer(run) => Some(run.surface),
+        _ => None,
+    }
+}
+
 /// The runs whose rows a file shows; none for rows that come from the rig.
 pub(crate) fn shown_by(file: &DataFile) -> Vec<RunId> {
     match file.parts.is_empty() {
@@ -333,7 +374,10 @@ fn current_runs(pointers: &[DataFile]) -> BTreeMap<RunId, CurrentRun> {
     let mut by_age: Vec<_> = pointers.iter().collect();
     by_age.sort_by_key(|f| (f.log_version, f.path.clone()));
     let parsed = by_age.into_iter().filter_map(|f| match FileName::parse(&f.path) {
-        Some(FileName::Pointer(run)) => Some((run.run.clone(), CurrentRun { run, log_version: f.log_version })),
+        Some(FileName::Pointer(run)) => {
+            let current = CurrentRun { run, log_version: f.log_version, project: project_of(f) };
+            Some((current.run.run.clone(), current))
+        }
         _ => None,
     });
     parsed.collect()

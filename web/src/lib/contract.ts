@@ -526,7 +526,7 @@ export interface paths {
             readonly path?: never;
             readonly cookie?: never;
         };
-        /** The Parquet files of a table's snapshot. */
+        /** The Parquet files of a table's snapshot; `GET /api/v1/files` counts the rows that are in none of them. */
         readonly get: operations["table_files"];
         readonly put?: never;
         readonly post?: never;
@@ -720,6 +720,8 @@ export interface components {
         /** @description The Parquet files of a snapshot. */
         readonly FileManifest: {
             readonly files: readonly components["schemas"]["ManifestFile"][];
+            /** @description Rows that only queries give, because their files hold rows of projects that the client may not see. */
+            readonly rows_elsewhere: readonly components["schemas"]["RowsElsewhere"][];
             /** @description Of the snapshot; another one, another version. */
             readonly version: string;
         };
@@ -953,6 +955,11 @@ export interface components {
              */
             readonly format?: "json" | "arrow" | "csv" | "parquet";
             readonly query: string;
+        };
+        /** @description Rows of a table that are in no file of the manifest. */
+        readonly RowsElsewhere: {
+            readonly rows: number;
+            readonly table: string;
         };
         /** @description A run. */
         readonly Run: {

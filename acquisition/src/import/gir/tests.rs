@@ -41,7 +41,8 @@ impl GirFolders {
     }
 
     fn import(&self, progress: &mut dyn FnMut(usize, usize)) -> Result<Vec<ImportedRun>, Error> {
-        let options = ImportOptions { started: Timestamp(1_767_600_000_000_000_000), folder: &self.inbox };
+        let options =
+            ImportOptions { started: Timestamp(1_767_600_000_000_000_000), folder: &self.inbox, project: None };
         import_gir(&self.gir, &rig(), options, progress)
     }
 

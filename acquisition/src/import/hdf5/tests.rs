@@ -80,7 +80,7 @@ impl Hdf5Folder {
 
     fn import(&self, mapping: &Path, celsius: Option<f64>) -> Result<Vec<ImportedRun>, Error> {
         let inbox = self.inbox();
-        let options = ImportOptions { started: Timestamp(1_767_700_000_000_000_000), folder: &inbox };
+        let options = ImportOptions { started: Timestamp(1_767_700_000_000_000_000), folder: &inbox, project: None };
         let celsius = celsius.map(|c| Celsius::new(c).expect("a temperature"));
         import_hdf5(mapping, &rig(), celsius, options, &mut |_, _| {})
     }

@@ -120,7 +120,7 @@ impl SofaFolder {
             })
             .collect();
         let (started, inbox) = (Timestamp(1_767_700_000_000_000_000), self.inbox());
-        let options = ImportOptions { started, folder: &inbox };
+        let options = ImportOptions { started, folder: &inbox, project: None };
         let celsius = celsius.map(|c| Celsius::new(c).expect("a temperature"));
         import_sofa(&files, &rig(), celsius, options, &mut |_, _| {})
     }

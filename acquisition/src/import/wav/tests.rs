@@ -45,7 +45,7 @@ impl WavFolder {
     fn import(&self, progress: &mut dyn FnMut(usize, usize)) -> Result<Vec<ImportedRun>, Error> {
         let rig = Rig::from_toml("sweep.duration_secs = 0.03").expect("a rig");
         let inbox = self.inbox();
-        let options = ImportOptions { started: Timestamp(1_767_600_000_000_000_000), folder: &inbox };
+        let options = ImportOptions { started: Timestamp(1_767_600_000_000_000_000), folder: &inbox, project: None };
         import_wav(&self.manifest(), &rig, options, progress)
     }
 

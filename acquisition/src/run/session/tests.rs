@@ -20,6 +20,7 @@ fn run<'a>(rig: &'a Rig, specimen: &'a PanelSpecimen, folder: &'a Path) -> RunRe
         flat: None,
         foam: None,
         macro_reference: None,
+        project: None,
         start: Timestamp(1_767_600_000_000_000_000),
         seed: 1,
         tag: 1,

@@ -78,7 +78,7 @@ struct TableFile<'a> {
     rows: Option<u64>,
 }
 
-/// The Parquet files of a table's snapshot.
+/// The Parquet files of a table's snapshot; `GET /api/v1/files` counts the rows that are in none of them.
 #[utoipa::path(
     get,
     path = "/api/v1/tables/{table}",
@@ -91,7 +91,7 @@ pub(super) async fn table_files(
     Extension(request): Extension<CatalogueRequest>,
     PathParams(path): PathParams<TablePath>,
 ) -> EndpointAnswer {
-    let files = request.view.snapshot.files(table(&path.table)?).iter();
+    let files = request.view.snapshot.readable_files(table(&path.table)?);
     let file = |file: &'_ echolake_lake::DataFile| {
         let rows = Some(file.visible_rows());
         file.path.filename().map(|name| (name.to_owned(), file.bytes, rows))

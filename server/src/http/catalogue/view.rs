@@ -145,9 +145,9 @@ impl SnapshotViews {
         }
     }
 
-    /// A file that a view shows, or that an earlier one did.
+    /// A file that a view shows, or that an earlier one did. A file with rows of other projects is none for a client of some.
     pub(super) fn shown(&self, view: &SnapshotView, table: Table, name: &str) -> Option<VisibleFile> {
-        let now = view.snapshot.files(table).iter().find(|file| file.path.filename() == Some(name));
+        let now = view.snapshot.readable_files(table).find(|file| file.path.filename() == Some(name));
         let earlier = || self.seen().earlier.iter().find(|file| file.is(table, name)).cloned();
         now.map(|file| VisibleFile::of(table, file)).or_else(earlier)
     }
@@ -162,7 +162,7 @@ fn gone(before: &LakeSnapshot, after: &LakeSnapshot) -> Vec<VisibleFile> {
     let mut gone = Vec::new();
     for table in Table::ALL {
         let stay: HashSet<_> = after.files(table).iter().map(|file| &file.path).collect();
-        let left = before.files(table).iter().filter(|file| !stay.contains(&file.path));
+        let left = before.readable_files(table).filter(|file| !stay.contains(&file.path));
         gone.extend(left.map(|file| VisibleFile::of(table, file)));
     }
     gone

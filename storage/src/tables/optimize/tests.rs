@@ -34,6 +34,8 @@ fn column(field: &Field, surface: &str, run: &str, value: usize) -> ArrayRef {
     match (field.name().as_str(), field.data_type()) {
         ("surface_id", _) => Arc::new(StringArray::from(vec![surface; ROWS])),
         ("run_id", _) => Arc::new(StringArray::from(vec![run; ROWS])),
+        // A surface `a-wall` belongs to project `a`.
+        ("project", _) => Arc::new(StringArray::from(vec![surface.split_once('-').map(|(project, _)| project); ROWS])),
         (_, DataType::Utf8) => Arc::new(StringArray::from(vec![value.to_string(); ROWS])),
         (_, DataType::Int32) => Arc::new((0..ROWS as i32).collect::<Int32Array>()),
         (_, DataType::Int64) => Arc::new((0..ROWS as i64).collect::<Int64Array>()),
@@ -254,4 +256,77 @@ async fn vacuum_deletes_what_is_merged_and_nothing_that_is_named() {
     object_store::ObjectStoreExt::head(store.as_ref(), &singles[0].path).await.expect_err("deleted");
     assert!(seen(&lake).await == before, "other rows");
     assert!(vacuum(0, crate::DeletionMode::Real).await.files.is_empty());
+}
+
+/// Runs of two projects, of references and of none.
+async fn of_projects() -> Lake {
+    let lake = lake(&Arc::new(InMemory::new())).await;
+    for (number, surface) in ["flat", "foam", "a-wall", "a-hall", "b-wall", "b-hall", "old", "older"].iter().enumerate()
+    {
+        put(&lake, surface, &format!("r{number}"), "d1", number).await;
+    }
+    lake
+}
+
+fn reader_of(lake: &Lake, projects: &[&str]) -> Lake {
+    lake.restricted_to(projects.iter().map(|project| project.parse().expect("a name")).collect())
+}
+
+async fn seen_runs(lake: &Lake) -> Vec<String> {
+    let snapshot = lake.snapshot().await.expect("a view");
+    let mut rows: Vec<_> = snapshot.files(TABLE).iter().flat_map(slices).map(|s| s.part.run.to_string()).collect();
+    rows.sort();
+    assert_eq!(rows, snapshot.runs().map(|run| run.run.to_string()).collect::<Vec<_>>());
+    rows
+}
+
+#[tokio::test]
+async fn readers_of_projects_see_their_runs_and_the_references() {
+    let lake = of_projects().await;
+    let check = async |projects: &[&str], expected: &[&str]| {
+        let reader = reader_of(&lake, projects);
+        assert_eq!(seen_runs(&reader).await, expected, "{projects:?}");
+        let newest: u64 = expected.last().map_or(0, |run| run[1..].parse().expect("a number"));
+        let versions = reader.versions().await.expect("versions");
+        assert_eq!(versions.last().map(|version| version.version), Some(newest + 1), "{projects:?}");
+        for version in versions.iter().map(|version| version.version) {
+            let then = reader.snapshot_at(version, TABLE).await.expect("held");
+            let runs: Vec<_> = then.runs().map(|run| run.run.to_string()).collect();
+            let expected = expected.iter().filter(|run| run[1..].parse::<u64>().expect("a number") < version);
+            assert_eq!(runs, expected.copied().collect::<Vec<_>>(), "{projects:?} {version}");
+        }
+        let changes = reader.log().changes(TABLE).await.expect("changes");
+        assert_eq!(changes.iter().map(|change| change.files_added).sum::<u64>(), expected.len() as u64);
+    };
+    check(&["a"], &["r0", "r1", "r2", "r3"]).await;
+    check(&["b"], &["r0", "r1", "r4", "r5"]).await;
+    check(&["a", "b"], &["r0", "r1", "r2", "r3", "r4", "r5"]).await;
+    check(&["c"], &["r0", "r1"]).await;
+    assert_eq!(seen_runs(&lake).await.len(), 8, "all is seen without projects");
+}
+
+#[tokio::test]
+async fn projects_are_not_merged_and_readers_see_parts_of_files_that_were() {
+    let lake = of_projects().await;
+    let pairs = [["r0", "r1"], ["r2", "r3"], ["r4", "r5"], ["r6", "r7"]].map(|pair| pair.map(str::to_owned));
+    optimize(&lake).await;
+    let merged = files(&lake).await;
+    let mut parts: Vec<_> = merged.iter().map(|f| f.parts.iter().map(|p| p.run.to_string()).collect()).collect();
+    parts.iter_mut().for_each(|runs: &mut Vec<String>| runs.sort());
+    parts.sort();
+    assert_eq!(parts, pairs);
+    let whole = |lake: &Lake| {
+        let lake = lake.clone();
+        async move { lake.snapshot().await.expect("a view").readable_files(TABLE).count() }
+    };
+    assert_eq!((seen_runs(&reader_of(&lake, &["a"])).await.len(), whole(&reader_of(&lake, &["a"])).await), (4, 2));
+    // As a version without projects merged them.
+    lake.merge(TABLE, &merged, CommitEffect::Layout, None).await.expect("merged");
+    assert_eq!(files(&lake).await.len(), 1);
+    let reader = reader_of(&lake, &["a"]);
+    assert_eq!(
+        (seen_runs(&reader).await, whole(&reader).await),
+        (["r0", "r1", "r2", "r3"].map(str::to_owned).to_vec(), 0)
+    );
+    assert_eq!((seen_runs(&lake).await.len(), whole(&lake).await), (8, 1));
 }

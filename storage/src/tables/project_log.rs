@@ -1,0 +1,136 @@
+//! The commit log as a reader of some projects sees it.
+//!
+//! `runs` decides what readers see, so this is the one place that leaves out runs of other projects: their rows in `runs`
+//! are in no version here, and therefore no snapshot shows a file of theirs. A run's project stands in the log itself,
+//! in the statistics of its row.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::sync::Arc;
+
+use async_trait::async_trait;
+use echolake_schema::tables::Table;
+use echolake_schema::{ProjectName, SurfaceId};
+use serde_json::Value;
+
+use crate::tables::delta::DeltaLog;
+use crate::tables::snapshot::surface_of;
+use crate::{
+    CommitLog, CommitOutcome, DataFile, Error, FileHistory, LakeSnapshot, Result, TableChange, TableCommit,
+    TableVersion, TableView,
+};
+
+/// The column of `runs` that holds a run's project.
+const PROJECT: &str = "project";
+
+/// A log without the runs of other projects.
+#[derive(Debug, Clone)]
+pub(crate) struct ProjectLog {
+    log: Arc<DeltaLog>,
+    projects: BTreeSet<ProjectName>,
+    /// Surfaces that all projects see: each one's rows rest on them.
+    common: [SurfaceId; 2],
+}
+
+impl ProjectLog {
+    pub(crate) fn new(log: Arc<DeltaLog>, projects: BTreeSet<ProjectName>, common: [SurfaceId; 2]) -> Self {
+        Self { log, projects, common }
+    }
+
+    // Files of the other tables are seen if a run's row names them.
+    fn keep_visible(&self, table: Table, files: &mut Vec<DataFile>) {
+        if table == Table::Runs {
+            files.retain(|file| self.shows_run(file));
+        }
+    }
+
+    fn shows_run(&self, pointer: &DataFile) -> bool {
+        let is_common = surface_of(pointer).is_some_and(|surface| self.common.contains(&surface));
+        is_common || project_of(pointer).is_some_and(|project| self.projects.contains(&project))
+    }
+
+    fn refuse<T>(table: Table, action: &'static str) -> Result<T> {
+        Err(Error::Restricted { table: table.name(), action })
+    }
+}
+
+/// The project of a run, by the file of its row in `runs`; None if it was given none.
+pub(crate) fn project_of(pointer: &DataFile) -> Option<ProjectName> {
+    let stats = pointer.stats.as_ref()?;
+    let [least, greatest] = [&stats.min, &stats.max].map(|values| values.get(PROJECT).and_then(Value::as_str));
+    least.filter(|_| least == greatest)?.parse().ok()
+}
+
+#[async_trait]
+impl CommitLog for ProjectLog {
+    async fn ensure(&self, table: Table) -> Result<()> {
+        Self::refuse(table, "made")
+    }
+
+    async fn view(&self, table: Table) -> Result<Option<TableView>> {
+        let mut view = self.log.view(table).await?;
+        if let Some(view) = &mut view {
+            self.keep_visible(table, &mut view.files);
+        }
+        Ok(view)
+    }
+
+    async fn version(&self, table: Table) -> Result<Option<u64>> {
+        self.log.version(table).await
+    }
+
+    async fn has_after(&self, table: Table, version: u64) -> Result<bool> {
+        self.log.has_after(table, version).await
+    }
+
+    // Up to the one that added the newest row that is seen: how many came after it is a matter of other projects.
+    async fn versions(&self, table: Table) -> Result<Vec<TableVersion>> {
+        let newest = self.files(Table::Runs).await?.iter().map(|file| file.log_version).max();
+        let mut versions = self.log.versions(table).await?;
+        if table == Table::Runs {
+            versions.retain(|version| newest.is_some_and(|newest| version.version <= newest));
+        }
+        Ok(versions)
+    }
+
+    // The versions that added what is seen now. A commit may change files of several projects.
+    async fn changes(&self, table: Table) -> Result<Vec<TableChange>> {
+        let snapshot = LakeSnapshot::take(self).await?;
+        let mut added = BTreeMap::<u64, (u64, u64)>::new();
+        for file in snapshot.files(table) {
+            let (files, rows) = added.entry(file.log_version).or_default();
+            *files += 1;
+            *rows += file.visible_rows();
+        }
+        let versions = self.log.versions(table).await?.into_iter();
+        let seen = versions.filter_map(|version| {
+            let (files_added, rows_added) = *added.get(&version.version)?;
+            let (rows_added, files_removed, rows_removed) = (Some(rows_added), 0, None);
+            Some(TableChange { version, operation: None, files_added, files_removed, rows_added, rows_removed })
+        });
+        Ok(seen.collect())
+    }
+
+    async fn files_at(&self, table: Table, version: u64) -> Result<Vec<DataFile>> {
+        let mut files = self.log.files_at(table, version).await?;
+        self.keep_visible(table, &mut files);
+        Ok(files)
+    }
+
+    async fn files_of_all_versions(&self, table: Table) -> Result<Vec<DataFile>> {
+        let mut files = self.log.files_of_all_versions(table).await?;
+        self.keep_visible(table, &mut files);
+        Ok(files)
+    }
+
+    async fn has(&self, table: Table, _: &str) -> Result<bool> {
+        Self::refuse(table, "searched for names")
+    }
+
+    async fn history(&self, table: Table) -> Result<Option<FileHistory>> {
+        Self::refuse(table, "searched for names")
+    }
+
+    async fn commit(&self, table: Table, _: &TableCommit) -> Result<Vec<CommitOutcome>> {
+        Self::refuse(table, "written")
+    }
+}
