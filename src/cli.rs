@@ -23,6 +23,8 @@ use crate::commands::import::{self, ImportArgs};
 #[cfg(feature = "lake")]
 use crate::commands::ingest::{self, IngestArgs};
 #[cfg(feature = "lake")]
+use crate::commands::mcp::{self, McpArgs};
+#[cfg(feature = "lake")]
 use crate::commands::optimize::{self, OptimizeArgs};
 use crate::commands::panel::{self, PanelArgs};
 use crate::commands::recover::{self, RecoverArgs};
@@ -107,6 +109,8 @@ pub(crate) enum LakeCommand {
     Figure(FigureCommand),
     /// Serve the catalogue, and read access to the lake over HTTP, Arrow Flight SQL and Postgres' protocol.
     Serve(ServeArgs),
+    /// Let an agent on this machine ask the lake, by the Model Context Protocol on standard input and output.
+    Mcp(McpArgs),
     /// Answer one client's queries, as a child of `serve`.
     #[command(hide = true)]
     Engine(EngineArgs),
@@ -180,6 +184,7 @@ impl LakeCommand {
             Self::Export(args) => export::run(args, lake).await,
             Self::Figure(args) => figure::run(args, lake).await,
             Self::Serve(args) => serve::run(args, lake).await,
+            Self::Mcp(args) => mcp::run(args, lake).await,
             Self::Engine(args) => serve::engine(args, lake).await,
             Self::Certificate(args) => serve::certificate(args),
             Self::Token { name, days, project } => serve::token(name, *days, project),

@@ -1,5 +1,6 @@
 //! `echolake serve` as its clients see it: answers, refusals, queries that end with their client, and its own end.
 
+mod agents;
 mod attacks;
 pub(crate) mod catalogue;
 mod contract;

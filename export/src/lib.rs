@@ -20,7 +20,7 @@ mod slice;
 #[cfg(test)]
 mod tests;
 
-pub use acoustics::{ResponseFormat, write_responses, write_wav};
+pub use acoustics::{ResponseFormat, SOFA_COLUMNS, write_responses, write_sofa_file, write_wav};
 pub use error::{Error, Result};
 pub use ml::{
     ExportSummary, PartCounts, RowSymmetries, SHARDS, SplitBy, SplitParams, SplitPart, TrainingSet, write_training_set,

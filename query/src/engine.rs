@@ -97,6 +97,8 @@ pub struct SqlFunction {
     pub syntax: String,
     /// Its description.
     pub description: String,
+    /// A query with it, if there is one.
+    pub example: Option<String>,
     /// True for echolake's own functions, false for those of DataFusion.
     pub is_own: bool,
 }
@@ -274,6 +276,7 @@ impl QueryEngine {
             name: name.to_owned(),
             syntax: doc.map_or_else(|| format!("{name}(...)"), |d| d.syntax_example.clone()),
             description: doc.map_or_else(String::new, |d| d.description.clone()),
+            example: doc.and_then(|d| d.sql_example.clone()),
             is_own: self.0.own.contains(name),
         }
     }

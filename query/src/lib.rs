@@ -60,3 +60,4 @@ pub use predicate::PredicateForm;
 pub use session::{CancelHandle, ContextExtension, PreparedQuery, QueryAnswer, Session};
 pub use statement_bounds::check_statement_bounds;
 pub use system::SystemSource;
+pub use views::table_meaning;

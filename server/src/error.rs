@@ -76,6 +76,12 @@ pub enum Error {
         /// The cause.
         source: io::Error,
     },
+    /// The address of the pages is not one.
+    #[error("`{found}` is not the address of a server; hint: scheme, host and port alone, as http://localhost:8080")]
+    Pages {
+        /// The given address.
+        found: String,
+    },
     /// The system gives no threads or tasks to compute on, or takes a listener back.
     #[error("the server cannot go on")]
     System(#[source] io::Error),

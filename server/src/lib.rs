@@ -31,8 +31,9 @@ mod running;
 mod scram_verifier;
 mod service;
 mod sessions;
+mod signed_address;
 pub mod tokens;
 
 pub use catalogue_pages::CataloguePages;
-pub use door::{CertificateFiles, EngineSettings, LakeServer, ServerSettings};
+pub use door::{AgentDoor, CertificateFiles, EngineSettings, LakeServer, ServerSettings};
 pub use error::Error;

@@ -96,6 +96,12 @@ impl SessionTimeLimit {
 }
 
 impl<T: Send + 'static> RunningQuery<T> {
+    /// Ends the query, whose further rows nobody wants: it was answered.
+    pub(crate) fn finish_early(mut self) {
+        self.watch.finish(None);
+        self.task.abort_all();
+    }
+
     /// The next part; None after the last.
     ///
     /// # Errors

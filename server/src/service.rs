@@ -197,6 +197,11 @@ impl QueryService {
         self.session(&nobody).functions().into_iter().filter(|f| f.is_own).collect()
     }
 
+    /// All functions, the field's and DataFusion's.
+    pub(crate) fn all_functions(&self) -> Vec<SqlFunction> {
+        self.session(&self.0.client).functions()
+    }
+
     /// Spawns work on the encoder threads; dropping the returned task aborts it.
     pub(crate) fn spawn<T: Send + 'static>(&self, work: impl Future<Output = T> + Send + 'static) -> JoinSet<T> {
         let mut task = JoinSet::new();

@@ -275,6 +275,25 @@ impl TokenAccess {
         Some((entry.client.clone(), entry.scram.clone()?))
     }
 
+    /// Returns the client of a token's name; on a server without tokens, the one of this name that asks over HTTP.
+    ///
+    /// # Errors
+    /// [`RequestFault::Unauthenticated`].
+    pub(crate) fn client_of_name(&self, name: &str) -> Result<Arc<ClientIdentity>, RequestFault> {
+        match self {
+            Self::Open => {
+                let known = [ClientIdentity::pages(), ClientIdentity::programs()];
+                let found = known.into_iter().find(|client| client.name == name);
+                found.map(Arc::new).ok_or(RequestFault::Unauthenticated)
+            }
+            Self::Tokens(tokens, _) => {
+                let tokens = tokens.read().unwrap_or_else(PoisonError::into_inner);
+                let found = tokens.entries.iter().find(|entry| entry.client.name == name && entry.is_valid());
+                found.map(|entry| entry.client.clone()).ok_or(RequestFault::Unauthenticated)
+            }
+        }
+    }
+
     /// Checks that a client's token was not taken back and has not expired since, and sees the same projects.
     ///
     /// # Errors

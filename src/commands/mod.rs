@@ -17,6 +17,8 @@ pub(crate) mod import;
 #[cfg(feature = "lake")]
 pub(crate) mod ingest;
 #[cfg(feature = "lake")]
+pub(crate) mod mcp;
+#[cfg(feature = "lake")]
 pub(crate) mod optimize;
 pub(crate) mod panel;
 pub(crate) mod recover;

@@ -24,7 +24,7 @@ use crate::logging::child_variable;
 use crate::signals::StopRequest;
 
 /// Memory for queries, and engines at once, by default.
-const MEMORY_MIB: u32 = 4096;
+pub(super) const MEMORY_MIB: u32 = 4096;
 const ENGINES: u32 = 16;
 /// Time for which the demo's answers may go on after Ctrl-C.
 const CATALOGUE_DRAIN: Duration = Duration::from_secs(5);
@@ -200,7 +200,8 @@ pub(crate) async fn catalogue(lake: &Lake, stop: &StopRequest) -> anyhow::Result
     answer(server, stop).await
 }
 
-fn engines(memory_mib: u32, count: u32, temp: Option<PathBuf>) -> anyhow::Result<EngineSettings> {
+/// Settings of engines, without cache and log.
+pub(super) fn engines(memory_mib: u32, count: u32, temp: Option<PathBuf>) -> anyhow::Result<EngineSettings> {
     let program = std::env::current_exe().context("this program does not know its own path")?;
     let (name, value) = child_variable();
     Ok(EngineSettings {

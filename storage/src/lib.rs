@@ -46,7 +46,7 @@ pub use tables::{
     DeletionMode, EncodedFile, FileEncoder, FileHistory, FileName, FileStats, KEEP_HOURS, LakeMoment, LakeSnapshot,
     LoggedFile, MergeProgress, NewFile, NoMoment, OptimizeReport, ReplacedFiles, RunPart, StagedFile, TARGET_BYTES,
     TableChange, TableCommit, TableOptimizeReport, TableVersion, TableView, VacuumReport, VisibleRun, WorkClaims,
-    add_missing_columns, encode, reader_metadata, wanted_schema,
+    add_missing_columns, delta_schema, encode, reader_metadata, wanted_schema,
 };
 #[cfg(feature = "remote")]
 pub use upload::{RunUpload, UploadOutcome, UploadStep};

@@ -1,4 +1,4 @@
-//! The attempts to get out of the gate, over each of the three protocols, and ways out that only one of them has: none
+//! The attempts to get out of the gate, over each of the three protocols and by agents' tools, and ways out that only one of them has: none
 //! reads, writes or changes anything, and the server answers afterwards.
 
 #[path = "../../query/src/session/attempts.rs"]
@@ -97,6 +97,32 @@ fn none_by_slices() {
         let answer = get(&scene.server, &slice(&format!("exists ({attempt})"), ""));
         assert!(answer.status < 500, "{attempt}: {}", answer.status);
         assert!(!String::from_utf8_lossy(&answer.body).contains(SECRET), "{attempt}");
+    }
+    scene.unharmed();
+}
+
+// As every text that an agent's tools take.
+#[test]
+fn none_by_agents() {
+    let scene = EscapeScene::new();
+    for attempt in &scene.attempts() {
+        let calls = [
+            ("query", serde_json::json!({ "sql": attempt })),
+            ("slice_url", serde_json::json!({ "where": attempt })),
+            ("describe_table", serde_json::json!({ "table": attempt })),
+            ("surface_summary", serde_json::json!({ "surface_id": attempt })),
+            ("run_summary", serde_json::json!({ "run_id": attempt })),
+        ];
+        for (tool, arguments) in calls {
+            let params = serde_json::json!({ "name": tool, "arguments": arguments });
+            let message = serde_json::json!({ "jsonrpc": "2.0", "id": 1, "method": "tools/call", "params": params });
+            let answer = HttpRequest::post("/mcp", &message.to_string()).send(&scene.server);
+            assert_eq!(answer.status, 200, "{tool}: {attempt}");
+            let text = String::from_utf8_lossy(&answer.body);
+            assert!(!text.contains(SECRET), "{tool}: {attempt}");
+            let is_plain = tool == "query" || text.contains("\"isError\":true");
+            assert!(is_plain, "{tool}: {attempt}: {text}");
+        }
     }
     scene.unharmed();
 }

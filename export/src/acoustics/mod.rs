@@ -8,6 +8,7 @@ use std::path::Path;
 
 use arrow::array::AsArray as _;
 use arrow::datatypes::{Float32Type, Float64Type, Int32Type, Int64Type};
+use arrow::record_batch::RecordBatch;
 use echolake_lake::{Lake, LakeSnapshot, VisibleRun};
 use echolake_schema::SurfaceId;
 use echolake_schema::tables::Table;
@@ -68,6 +69,18 @@ pub async fn write_responses(
     Ok(files)
 }
 
+/// Creates a SOFA file at `path`, of rows of a run's measurements with the columns [`SOFA_COLUMNS`].
+///
+/// # Errors
+/// [`Error::Damaged`] if a response is not of the rig's length, and others.
+pub fn write_sofa_file(lake: &Lake, run: &VisibleRun, rows: &RecordBatch, path: &Path) -> Result<()> {
+    let responses = SurfaceResponses::from_rows(lake, run, rows)?;
+    sofa::create(path, lake, &responses).map_err(|e| Error::write(path, e))
+}
+
+/// The columns of `measurements` that a SOFA file is made of.
+pub const SOFA_COLUMNS: [&str; 4] = ["pair_id", "log_time_ns", "temperature_c", "ir"];
+
 // The newest run of each surface, sorted by surface id.
 fn newest_runs(snapshot: &LakeSnapshot, surfaces: &[SurfaceId]) -> Result<Vec<VisibleRun>> {
     let mut newest: std::collections::BTreeMap<&SurfaceId, &VisibleRun> = std::collections::BTreeMap::new();
@@ -85,12 +98,15 @@ fn newest_runs(snapshot: &LakeSnapshot, surfaces: &[SurfaceId]) -> Result<Vec<Vi
 
 impl SurfaceResponses {
     async fn read(lake: &Lake, snapshot: &LakeSnapshot, run: &VisibleRun) -> Result<Self> {
-        let columns = ["pair_id", "log_time_ns", "temperature_c", "ir"];
-        let batch = rows::of_run(lake, snapshot, Table::Measurements, &run.run, &columns).await?;
+        let batch = rows::of_run(lake, snapshot, Table::Measurements, &run.run, &SOFA_COLUMNS).await?;
+        Self::from_rows(lake, run, &batch)
+    }
+
+    fn from_rows(lake: &Lake, run: &VisibleRun, batch: &RecordBatch) -> Result<Self> {
         let damaged = |reason: String| Error::damaged(format!("measurements, run {}", run.run), reason);
-        let ids = rows::numbers::<Int32Type>(&batch, "pair_id")?;
-        let times = rows::numbers::<Int64Type>(&batch, "log_time_ns")?;
-        let temperatures = rows::numbers::<Float64Type>(&batch, "temperature_c")?;
+        let ids = rows::numbers::<Int32Type>(batch, "pair_id")?;
+        let times = rows::numbers::<Int64Type>(batch, "log_time_ns")?;
+        let temperatures = rows::numbers::<Float64Type>(batch, "temperature_c")?;
         let lists = batch.column_by_name("ir").and_then(|c| c.as_list_opt::<i32>());
         let lists = lists.ok_or_else(|| damaged("no `ir`".into()))?;
         let values = lists.values().as_primitive::<Float32Type>().values();

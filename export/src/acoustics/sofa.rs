@@ -1,6 +1,8 @@
 //! A surface's responses as SOFA (AES69-2022), convention SingleRoomSRIR 1.0: one measurement per pair, the microphone
 //! as listener and the speaker as source, in metres over the panel.
 
+use std::path::Path;
+
 use echolake_lake::Lake;
 use echolake_schema::{Point, Timestamp};
 use rust_hdf5::{H5Dataset, H5File, Hdf5Error};
@@ -21,12 +23,16 @@ struct Dimensions(Vec<(char, usize, H5Dataset)>);
 pub(super) fn write(lake: &Lake, responses: &SurfaceResponses, folder: &PendingFolder) -> Result<WrittenFile> {
     let name = format!("{}.sofa", responses.run.surface);
     let path = folder.meanwhile(&name);
-    let failed = |e: Hdf5Error| Error::write(&folder.named(&name), e);
-    let file = H5File::options().track_order(true).track_times(false).create(&path).map_err(failed)?;
-    fill(&file, lake, responses).map_err(failed)?;
-    file.close().map_err(failed)?;
+    create(&path, lake, responses).map_err(|e| Error::write(&folder.named(&name), e))?;
     let bytes = std::fs::read(&path).map_err(|e| Error::write(&folder.named(&name), e))?;
     Ok(WrittenFile { name, bytes: bytes.len() as u64, sha256: hex::encode(Sha256::digest(&bytes)) })
+}
+
+/// Creates a file at `path`.
+pub(super) fn create(path: &Path, lake: &Lake, responses: &SurfaceResponses) -> std::result::Result<(), Hdf5Error> {
+    let file = H5File::options().track_order(true).track_times(false).create(path)?;
+    fill(&file, lake, responses)?;
+    file.close()
 }
 
 fn fill(file: &H5File, lake: &Lake, responses: &SurfaceResponses) -> std::result::Result<(), Hdf5Error> {

@@ -51,6 +51,16 @@ pub(crate) const RE_FLAT_BAND: &str = "dB re Flat, same band";
 /// Metadata of columns by name: unit and meaning.
 type ColumnNotes = HashMap<String, HashMap<String, String>>;
 
+/// Returns what a row of a table or view is; None if there is none of this name.
+///
+/// ```
+/// assert_eq!(echolake_query::table_meaning("pairs"), Some("One row per pair of grid points: distances and angles."));
+/// assert_eq!(echolake_query::table_meaning("postgres"), None);
+/// ```
+pub fn table_meaning(name: &str) -> Option<&'static str> {
+    Table::by_name(name).map(Table::meaning).or_else(|| LakeView::by_name(name).map(LakeView::meaning))
+}
+
 impl LakeView {
     /// All views.
     pub(crate) const ALL: [Self; 4] = [Self::Ir, Self::TnceDb, Self::Augmented, Self::Catalogue];
@@ -62,6 +72,15 @@ impl LakeView {
             Self::TnceDb => "tnce_db",
             Self::Augmented => "augmented",
             Self::Catalogue => "catalogue",
+        }
+    }
+
+    fn meaning(self) -> &'static str {
+        match self {
+            Self::Ir => "One row per measurement: geometry of the pair, responses and curves.",
+            Self::TnceDb => "One row per measurement: TNCE in dB by band, with the geometry of the pair.",
+            Self::Augmented => "One row per measurement and symmetry: moved geometry, responses, moved height map.",
+            Self::Catalogue => "One row per surface: its description, its run and the statistics of its levels.",
         }
     }
 

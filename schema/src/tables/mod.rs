@@ -79,6 +79,24 @@ impl Table {
         TableDefinition::of(self).name
     }
 
+    /// What a row of it is.
+    pub fn meaning(self) -> &'static str {
+        match self {
+            Self::Surfaces => "One row per surface: its description, as its newest run has it.",
+            Self::Runs => "One row per run: a measurement of one surface, with its file, air, counts and state.",
+            Self::Points => "One row per grid point: its coordinates.",
+            Self::Pairs => "One row per pair of grid points: distances and angles.",
+            Self::Measurements => "One row per accepted measurement: its impulse response, air and quality.",
+            Self::Nce => "One row per measurement: the reflected response and its cumulative energy curves.",
+            Self::Tnce => "One row per measurement: energies by band and over Flat's, linear.",
+            Self::TnceD4 => "One row per measurement and symmetry: energies with moved positions.",
+            Self::Heightmaps => "One row per surface and symmetry: the relief's heights.",
+            Self::Environment => "One row per reading of the ambient sensor.",
+            Self::Events => "One row per line of a run's log.",
+            Self::SurfaceStats => "One row per surface and band: statistics of its levels.",
+        }
+    }
+
     /// The table of a name.
     pub fn by_name(name: &str) -> Option<Self> {
         Self::ALL.into_iter().find(|t| t.name() == name)

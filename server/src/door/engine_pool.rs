@@ -211,6 +211,11 @@ impl EnginePool {
         tokio::join!(self.keep_spare(), self.watch_memory(), self.retire_idle());
     }
 
+    /// Ends the engines that are idle or take more memory than they may, and keeps no spare; never ends.
+    pub(super) async fn watch(self) {
+        tokio::join!(self.watch_memory(), self.retire_idle());
+    }
+
     /// Checks that engines can be started, by how the last start went.
     ///
     /// # Errors

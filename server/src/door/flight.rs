@@ -98,7 +98,7 @@ impl ServerDoor {
         let client = self.note_client(work, ServerProtocol::FlightSql, found)?;
         let is_interactive = INTERACTIVE.iter().any(|method| request.uri().path().ends_with(method));
         let wire = if is_interactive { EngineProtocol::InteractiveGrpc } else { EngineProtocol::Grpc };
-        let response = self.engines().forward(&client, request.map(Body::new), wire, work).await?;
+        let response = self.engines().forward(&client, request.map(Body::new), wire, Some(work)).await?;
         Ok(response.map(Body::new))
     }
 }

@@ -65,7 +65,7 @@ enum RequestBody {
 type BodyFault = Arc<Mutex<Option<RequestFault>>>;
 
 impl EnginePool {
-    /// Answers a request by the engine of `client`. If the engine ends before its answer begins, a new one is asked once.
+    /// Answers a request by the engine of `client`; `work` marks its connection, if it came on one. If the engine ends before its answer begins, a new one is asked once.
     ///
     /// # Errors
     /// [`RequestFault::EngineEnded`], [`RequestFault::TooMany`], [`RequestFault::TooLarge`], [`RequestFault::Request`].
@@ -74,7 +74,7 @@ impl EnginePool {
         client: &ClientIdentity,
         request: Request<Body>,
         wire: EngineProtocol,
-        work: &PlaceWork,
+        work: Option<&PlaceWork>,
     ) -> Result<Response<EngineBody>, RequestFault> {
         Span::current().record("client", &client.name);
         let (mut parts, body) = request.into_parts();
@@ -86,7 +86,7 @@ impl EnginePool {
             EngineProtocol::Http => read_body(body, &parts.headers, LARGEST_HTTP).await?,
             EngineProtocol::Grpc => read_body(body, &parts.headers, LARGEST_GRPC).await?,
         };
-        let working = work.begin();
+        let working = work.map(PlaceWork::begin);
         loop {
             let lease = self.lease(client).await?;
             let (sent, fault, again) = body.send();
@@ -250,7 +250,7 @@ impl EngineAnswer {
         Ok(Self { response, connection, wire })
     }
 
-    fn with(self, lease: EngineLease, working: WorkingPlace) -> Response<EngineBody> {
+    fn with(self, lease: EngineLease, working: Option<WorkingPlace>) -> Response<EngineBody> {
         let Self { response, connection, wire } = self;
         response.map(|incoming| {
             let is_ended = false;
@@ -297,7 +297,7 @@ pub(super) struct EngineBody {
     wire: EngineProtocol,
     lease: EngineLease,
     _connection: JoinSet<()>,
-    _working: WorkingPlace,
+    _working: Option<WorkingPlace>,
     span: Span,
     is_ended: bool,
 }

@@ -1,6 +1,7 @@
 //! The door: the process that clients reach. It holds connections, finds out who asks, and forwards requests to the engine
 //! of that client. It parses no SQL and decodes no file, so that no request can end it.
 
+mod agent;
 mod audit;
 mod certificate_hash;
 pub(crate) mod connection_places;
@@ -26,6 +27,7 @@ use tokio::task::JoinSet;
 
 use crate::Error;
 use crate::tokens::TokenFile;
+pub use agent::AgentDoor;
 pub use encryption::CertificateFiles;
 use encryption::{ProtocolEncryption, ServerEncryption};
 pub use engine_process::EngineSettings;

@@ -18,6 +18,7 @@ use crate::client_identity::ClientIdentity;
 use crate::fault::RequestFault;
 use crate::http::ViewerLayout;
 use crate::metrics::{ServerGauges, ServerMetrics, ServerProtocol};
+use crate::signed_address::SigningSecret;
 use crate::tokens::{TokenAccess, TokenFile, TokenFileState, TokenScope};
 
 /// Time between two looks at the file of tokens.
@@ -35,13 +36,14 @@ struct DoorState {
     drain: ServerDrain,
     layout: ViewerLayout,
     failed_logins: FailedLogins,
+    signing: SigningSecret,
 }
 
 impl ServerDoor {
     /// The door of a lake.
     ///
     /// # Errors
-    /// [`Error::Temp`].
+    /// [`Error::Temp`], [`Error::Random`].
     pub(super) fn new(
         lake: &Lake,
         tokens: Option<TokenFile>,
@@ -54,7 +56,13 @@ impl ServerDoor {
         let engines = EnginePool::new(lake, settings, activity.clone(), access.clone())?;
         let layout = ViewerLayout::new(lake.rig());
         let (readiness, drain) = (ReadinessCheck::new(lake), ServerDrain::default());
-        Ok(Self(Arc::new(DoorState { access, activity, engines, readiness, drain, layout, failed_logins })))
+        let signing = SigningSecret::new()?;
+        Ok(Self(Arc::new(DoorState { access, activity, engines, readiness, drain, layout, failed_logins, signing })))
+    }
+
+    /// The secret of signed addresses.
+    pub(super) fn signing(&self) -> &SigningSecret {
+        &self.0.signing
     }
 
     /// Failed logins of the last minute.

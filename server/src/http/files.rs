@@ -9,6 +9,7 @@ use axum::extract::State;
 use axum::http::HeaderMap;
 use axum::response::Response;
 use echolake_lake::Lake;
+use echolake_schema::tables::Table;
 use futures::TryStreamExt as _;
 use object_store::path::Path as StorePath;
 use object_store::{GetOptions, GetRange, ObjectStore as _};
@@ -100,18 +101,31 @@ async fn table_file(
     headers: HeaderMap,
 ) -> Result<Response, ProblemResponse> {
     catalogue.service().client(TokenScope::Files)?;
-    let TableFilePath { table, file: name } = path;
+    Ok(table_file_answer(&catalogue, catalogue::table(&path.table)?, &path.file, &headers).await?)
+}
+
+/// Answers a request for a table's file.
+///
+/// # Errors
+/// [`RequestFault::NotFound`] if no snapshot has shown it; [`RequestFault::Gone`], [`RequestFault::Unreadable`].
+pub(super) async fn table_file_answer(
+    catalogue: &LakeCatalogue,
+    table: Table,
+    name: &str,
+    headers: &HeaderMap,
+) -> Result<Response, RequestFault> {
     let view = catalogue.view().await?;
     let hint = "GET /api/v1/tables/{table} lists what there is";
-    let file = catalogue.shown(&view, catalogue::table(&table)?, &name);
-    let file = file.ok_or(RequestFault::NotFound { what: format!("file `{name}` of table `{table}`"), hint })?;
+    let file = catalogue.shown(&view, table, name);
+    let file = file
+        .ok_or_else(|| RequestFault::NotFound { what: format!("file `{name}` of table `{}`", table.name()), hint })?;
     let described = FileDescription {
         // Its name is a digest of what it was made of.
         etag: format!("\"{name}-{}\"", file.bytes),
         media_type: "application/vnd.apache.parquet",
         policy: "same-origin",
     };
-    Ok(RangedFile { path: file.path.clone(), bytes: file.bytes, described }.answer(catalogue.lake(), &headers).await?)
+    RangedFile { path: file.path.clone(), bytes: file.bytes, described }.answer(catalogue.lake(), headers).await
 }
 
 #[derive(Deserialize)]

@@ -104,8 +104,8 @@ async fn files(
     Ok((validators, axum::Json(manifest)).into_response())
 }
 
-// The origin of this server's URLs as the client sees it: behind a proxy with TLS, `https`.
-fn origin(headers: &HeaderMap) -> String {
+/// The origin of this server's URLs as the client sees it: behind a proxy with TLS, `https`.
+pub(super) fn origin(headers: &HeaderMap) -> String {
     let text = |name: HeaderName| headers.get(name).and_then(|v| v.to_str().ok());
     let scheme = if is_encrypted(headers) { "https" } else { "http" };
     format!("{scheme}://{}", text(header::HOST).unwrap_or_default())

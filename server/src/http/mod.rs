@@ -9,6 +9,7 @@ mod guard;
 mod health;
 mod layout;
 mod manifest;
+mod mcp;
 mod openapi;
 #[cfg(feature = "web")]
 mod pages;
@@ -16,6 +17,7 @@ mod problem;
 mod queries;
 mod ranges;
 mod session;
+mod sharing;
 mod slices;
 mod sql;
 
@@ -36,10 +38,14 @@ use crate::door::server_door::ServerDoor;
 use crate::fault::RequestFault;
 use crate::request_span::trace_request;
 use crate::service::QueryService;
+use crate::signed_address::SIGNED_ROUTE;
 use catalogue::LakeCatalogue;
 pub(crate) use guard::{FORWARDED_PROTO, RequestSite, authenticate, request_site};
 pub(crate) use layout::ViewerLayout;
+pub(crate) use mcp::MCP;
 pub(crate) use problem::ProblemResponse;
+use sharing::SHARING;
+use slices::SliceService;
 
 /// Answers HTTP on an engine's socket; a connection is one request.
 pub(crate) async fn serve(service: QueryService, listener: UnixListener) -> Result<(), Error> {
@@ -58,26 +64,31 @@ pub(crate) async fn serve(service: QueryService, listener: UnixListener) -> Resu
 
 fn engine_router(service: &QueryService) -> Router {
     let catalogue = LakeCatalogue::new(service.clone());
+    let slices = SliceService::new(&catalogue);
     let files = files::own_routes().merge(manifest::routes());
     let own = Router::from(sql::routes())
         .with_state(service.clone())
         .merge(catalogue.router())
         .merge(Router::from(files).with_state(catalogue.clone()))
+        .merge(mcp::routes(&catalogue, &slices))
+        .merge(sharing::routes(&catalogue, &slices))
         .layer(from_fn_with_state(service.is_open(), guard::own_pages_only));
     let viewers = Router::from(files::viewer_routes()).with_state(catalogue.clone());
-    let all = own.merge(viewers).merge(slices::for_viewers(&catalogue)).fallback(nothing);
+    let all = own.merge(viewers).merge(slices::for_viewers(slices)).fallback(nothing);
     with_refusals(all).layer(from_fn(trace_request))
 }
 
 /// The paths of the server: those of the door, and those that it forwards to the client's engine.
 pub(crate) fn door_router(door: &ServerDoor) -> Router {
     let own = Router::from(door_routes()).layer(from_fn_with_state(door.access().is_open(), guard::own_pages_only));
-    let viewers = [files::RUN, slices::SLICE, slices::FOXGLOVE_MANIFEST];
+    let viewers = [files::RUN, slices::SLICE, slices::SOFA, slices::FOXGLOVE_MANIFEST];
     // Here and not for all routes: a preflight must come to the layer.
     let viewers =
         viewers.into_iter().fold(Router::new(), |router, path| router.route(path, any(ServerDoor::forward_http)));
-    let forwarded =
-        Router::new().route("/api/{*path}", any(ServerDoor::forward_http)).merge(viewers.layer(ranges::cors()));
+    let forwarded = ["/api/{*path}", MCP, SHARING]
+        .into_iter()
+        .fold(Router::new(), |router, path| router.route(path, any(ServerDoor::forward_http)));
+    let forwarded = forwarded.route(SIGNED_ROUTE, any(ServerDoor::forward_signed)).merge(viewers.layer(ranges::cors()));
     #[cfg(feature = "web")]
     let rest = pages::fallback;
     #[cfg(not(feature = "web"))]

@@ -18,7 +18,7 @@ const INDEX: &str = "/index.html";
 /// Path of files that have a digest in their name.
 const ASSETS: &str = "/assets/";
 /// Paths that are no page's.
-const OTHERS: [&str; 4] = ["/api", "/assets", "/health", "/metrics"];
+const OTHERS: [&str; 6] = ["/api", "/assets", "/delta-sharing", "/health", "/mcp", "/metrics"];
 
 /// A file of the pages; `build.rs` lists them.
 struct PageFile {

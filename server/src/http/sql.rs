@@ -114,7 +114,11 @@ fn rest(
     })
 }
 
-fn whole(body: Result<Bytes, BytesRejection>) -> Result<Bytes, RequestFault> {
+/// The body of a request.
+///
+/// # Errors
+/// [`RequestFault::TooLarge`], [`RequestFault::Request`].
+pub(super) fn whole(body: Result<Bytes, BytesRejection>) -> Result<Bytes, RequestFault> {
     body.map_err(|rejection| match rejection.status() {
         StatusCode::PAYLOAD_TOO_LARGE => RequestFault::TooLarge { limit: LARGEST },
         _ => RequestFault::request("the request's body did not come whole"),

@@ -451,7 +451,8 @@ fn file_stats(mut stats: Map<String, Value>) -> FileStats {
     FileStats { min: take("minValues"), max: take("maxValues") }
 }
 
-fn delta_schema(schema: &SchemaRef) -> Value {
+/// Returns a schema as Delta's log has it.
+pub fn delta_schema(schema: &SchemaRef) -> Value {
     let fields: Vec<_> = schema.fields().iter().map(|f| delta_column(f)).collect();
     json!({ "type": "struct", "fields": fields })
 }

@@ -266,6 +266,26 @@ export interface paths {
         readonly patch?: never;
         readonly trace?: never;
     };
+    readonly "/api/v1/slices.sofa": {
+        readonly parameters: {
+            readonly query?: never;
+            readonly header?: never;
+            readonly path?: never;
+            readonly cookie?: never;
+        };
+        /**
+         * The responses of one run's measurements as SOFA (AES69, convention SingleRoomSRIR 1.0).
+         * @description What `export sofa` writes of the same measurements. Needs the scopes sql and files.
+         */
+        readonly get: operations["sofa"];
+        readonly put?: never;
+        readonly post?: never;
+        readonly delete?: never;
+        readonly options?: never;
+        readonly head?: never;
+        readonly patch?: never;
+        readonly trace?: never;
+    };
     readonly "/api/v1/sql": {
         readonly parameters: {
             readonly query?: never;
@@ -1608,6 +1628,43 @@ export interface operations {
                 content?: never;
             };
             readonly 416: components["responses"]["Problem"];
+            readonly default: components["responses"]["Problem"];
+        };
+    };
+    readonly sofa: {
+        readonly parameters: {
+            readonly query?: {
+                /** @description The run; the only one of the measurements if there is none. */
+                readonly run?: string;
+                /**
+                 * @description An SQL predicate over the columns of table measurements; all measurements of the run if there is none.
+                 * @example pair_id < 5
+                 */
+                readonly where?: string;
+            };
+            readonly header?: never;
+            readonly path?: never;
+            readonly cookie?: never;
+        };
+        readonly requestBody?: never;
+        readonly responses: {
+            /** @description The file */
+            readonly 200: {
+                headers: {
+                    readonly ETag?: string;
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "application/x-hdf5": string;
+                };
+            };
+            /** @description Not changed since the ETag of If-None-Match */
+            readonly 304: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content?: never;
+            };
             readonly default: components["responses"]["Problem"];
         };
     };

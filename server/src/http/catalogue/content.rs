@@ -6,6 +6,7 @@ use axum::http::{HeaderValue, header};
 use axum::response::{IntoResponse, Response};
 use bytes::Bytes;
 use serde::Serialize;
+use serde_json::Value;
 
 use super::super::problem::ProblemResponse;
 use crate::fault::RequestFault;
@@ -40,6 +41,14 @@ impl AnswerContent {
     pub(super) fn json(value: &impl Serialize) -> Result<Self, RequestFault> {
         let bytes = serde_json::to_vec(value).map_err(RequestFault::defect("an answer makes no JSON"))?;
         Ok(Self::new("application/json", bytes))
+    }
+
+    /// Reads JSON back as a value.
+    ///
+    /// # Errors
+    /// As [`AnswerContent::json`].
+    pub(super) fn value(&self) -> Result<Value, RequestFault> {
+        serde_json::from_slice(&self.bytes).map_err(RequestFault::defect("an answer is no JSON"))
     }
 
     /// Rows as an Arrow stream.

@@ -27,23 +27,26 @@ mod wav;
 
 use std::sync::Arc;
 
-use axum::Router;
 use axum::extract::{Request, State};
 use axum::http::{HeaderMap, HeaderValue, Method, StatusCode, header};
 use axum::middleware::{Next, from_fn_with_state};
 use axum::response::{IntoResponse as _, Response};
+use axum::{Extension, Router};
 use echolake_lake::Lake;
 use echolake_schema::tables::Table;
+use serde_json::Value;
 use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
+use super::extract::PathParams;
 use super::format;
 use super::problem::ProblemResponse;
 use crate::fault::{FaultCode, RequestFault};
 use crate::service::QueryService;
 use crate::tokens::TokenScope;
+use request::SurfacePath;
 pub(super) use request::{CatalogueRequest, RunPath, run, text};
-pub(super) use tables::table;
+pub(super) use tables::{ColumnDescription, table};
 use view::SnapshotViews;
 pub(super) use view::{SnapshotView, VisibleFile};
 
@@ -95,6 +98,26 @@ impl LakeCatalogue {
             Router::from(routes).route_layer(from_fn_with_state((self.clone(), scope), respond))
         };
         cached(table_routes(), TokenScope::Sql).merge(cached(file_routes(), TokenScope::Files))
+    }
+
+    /// What the endpoint of a surface answers.
+    ///
+    /// # Errors
+    /// [`RequestFault::NotFound`], or those of its queries.
+    pub(super) async fn surface_value(&self, surface: &str) -> Result<Value, RequestFault> {
+        let request = CatalogueRequest::new(self, &self.view().await?, false);
+        let path = PathParams(SurfacePath { surface_id: surface.to_owned() });
+        surface::surface(Extension(request), path).await.map_err(|problem| problem.0)?.value()
+    }
+
+    /// What the endpoint of a run answers.
+    ///
+    /// # Errors
+    /// As [`LakeCatalogue::surface_value`].
+    pub(super) async fn run_value(&self, run: &str) -> Result<Value, RequestFault> {
+        let request = CatalogueRequest::new(self, &self.view().await?, false);
+        let path = PathParams(RunPath { run_id: run.to_owned() });
+        runs::run(Extension(request), path).await.map_err(|problem| problem.0)?.value()
     }
 
     pub(super) fn service(&self) -> &QueryService {

@@ -22,7 +22,7 @@ struct TableDescription {
 /// A column.
 #[derive(Serialize, ToSchema)]
 #[schema(as = Column)]
-struct ColumnDescription {
+pub(in super::super) struct ColumnDescription {
     name: String,
     /// As Arrow writes it.
     #[serde(rename = "type")]
@@ -33,7 +33,8 @@ struct ColumnDescription {
 }
 
 impl ColumnDescription {
-    fn of(field: &Field) -> Self {
+    /// The column of a field.
+    pub(in super::super) fn of(field: &Field) -> Self {
         let metadata = |key: &str| field.metadata().get(key).filter(|text| !text.is_empty()).cloned();
         Self {
             name: field.name().clone(),

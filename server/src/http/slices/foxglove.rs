@@ -146,7 +146,7 @@ async fn source(
     };
     let digest = digest(&request.view, &request.question, taken);
     Ok(FoxgloveSource::Streamed {
-        url: format!("{SLICE}?{}&id={digest}", request.question.query_of(&taken[0].run)),
+        url: format!("{SLICE}?{}&id={digest}", request.question.query_of([&taken[0].run])),
         id: format!("echolake-{digest}"),
         topics: found.topics.into_iter().map(topic).collect(),
         schemas: found.schemas.into_iter().enumerate().filter_map(schema).collect(),

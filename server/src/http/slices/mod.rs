@@ -8,6 +8,7 @@ mod cutting;
 mod foxglove;
 mod query;
 mod selection;
+mod sofa;
 mod spool;
 
 use std::sync::Arc;
@@ -19,6 +20,7 @@ use axum::http::{HeaderMap, Method, Uri};
 use axum::response::Response;
 use echolake_export::{Check, SliceParams, Taken};
 use echolake_query::{EngineClient, PredicateForm};
+use echolake_schema::RunId;
 use futures::stream;
 use tokio::sync::Semaphore;
 use utoipa_axum::router::OpenApiRouter;
@@ -32,9 +34,12 @@ use super::ranges::{FileDescription, RangeAnswer, needs_length};
 use crate::fault::RequestFault;
 use crate::tokens::TokenScope;
 use cutting::{SliceResources, SliceTask};
-use query::{SliceParameters, SliceQuery};
+pub(super) use query::SliceParameters;
+use query::SliceQuery;
 use selection::{SelectionCache, SliceSelection};
+pub(in crate::http) use sofa::SOFA;
 use spool::SliceSpool;
+pub(super) use spool::SpooledSlice;
 
 /// Foxglove's manifest of slices.
 pub(in crate::http) use foxglove::MANIFEST as FOXGLOVE_MANIFEST;
@@ -61,18 +66,11 @@ struct SlicesState {
 
 /// Routes of slices and of their manifest.
 pub(super) fn routes() -> OpenApiRouter<SliceService> {
-    OpenApiRouter::new().routes(routes!(slice)).routes(routes!(foxglove::manifest))
+    OpenApiRouter::new().routes(routes!(slice)).routes(routes!(foxglove::manifest)).routes(routes!(sofa::sofa))
 }
 
 /// Slices and their manifest for viewers on pages of any origin.
-pub(super) fn for_viewers(catalogue: &LakeCatalogue) -> Router {
-    let slices = SliceService(Arc::new(SlicesState {
-        catalogue: catalogue.clone(),
-        selections: SelectionCache::default(),
-        spool: SliceSpool::default(),
-        places: Arc::new(Semaphore::new(MOST)),
-        turns: Arc::new(Semaphore::new(TURNS)),
-    }));
+pub(super) fn for_viewers(slices: SliceService) -> Router {
     Router::from(routes()).method_not_allowed_fallback(super::wrong_method).with_state(slices)
 }
 
@@ -83,22 +81,77 @@ struct SliceRequest {
     question: SliceQuery,
 }
 
+/// The addresses of a slice, and what is in it.
+pub(super) struct SliceAddress {
+    pub(super) path: String,
+    pub(super) manifest_path: String,
+    pub(super) measurements: usize,
+    pub(super) runs: Vec<RunId>,
+}
+
 impl SliceService {
+    /// Slices of a lake.
+    pub(super) fn new(catalogue: &LakeCatalogue) -> Self {
+        Self(Arc::new(SlicesState {
+            catalogue: catalogue.clone(),
+            selections: SelectionCache::default(),
+            spool: SliceSpool::default(),
+            places: Arc::new(Semaphore::new(MOST)),
+            turns: Arc::new(Semaphore::new(TURNS)),
+        }))
+    }
+
+    /// The cache of what is read by ranges.
+    pub(super) fn spool(&self) -> &SliceSpool {
+        &self.0.spool
+    }
+
+    /// The addresses of a slice. Who asks is this server's page or a program.
+    ///
+    /// # Errors
+    /// A defect of the predicate, a missing scope, or a slice without measurements.
+    pub(super) async fn address(&self, params: SliceParameters) -> Result<SliceAddress, RequestFault> {
+        let client = self.authorise()?;
+        let question = SliceQuery::new(params)?;
+        let request = self.known_runs(client, question).await?;
+        let selection = self.selection(&request).await?;
+        let query = request.question.query_of(&request.question.runs);
+        let mut runs: Vec<_> = selection.taken.iter().map(|taken| taken.run.clone()).collect();
+        runs.dedup();
+        Ok(SliceAddress {
+            path: format!("{SLICE}?{query}"),
+            manifest_path: format!("{FOXGLOVE_MANIFEST}?{query}"),
+            measurements: selection.taken.len(),
+            runs,
+        })
+    }
+
     // A slice holds what files do, and is chosen by SQL.
+    fn authorise(&self) -> Result<Arc<EngineClient>, RequestFault> {
+        let service = self.0.catalogue.service();
+        service.client(TokenScope::Files)?;
+        service.client(TokenScope::Sql)
+    }
+
+    async fn known_runs(&self, client: Arc<EngineClient>, question: SliceQuery) -> Result<SliceRequest, RequestFault> {
+        let view = self.0.catalogue.view().await?;
+        for run in &question.runs {
+            super::catalogue::run(&view, run.as_str())?;
+        }
+        Ok(SliceRequest { client, view, question })
+    }
+
     async fn request(
         &self,
         params: SliceParameters,
         uri: &Uri,
         headers: &HeaderMap,
     ) -> Result<SliceRequest, RequestFault> {
-        let service = self.0.catalogue.service();
-        service.client(TokenScope::Files)?;
-        let client = service.client(TokenScope::Sql)?;
+        let client = self.authorise()?;
         let mut question = SliceQuery::new(params)?;
-        let view = self.0.catalogue.view().await?;
         // Without tokens a page of elsewhere may read the runs whose names it knows, and ask nothing of others, nor
         // anything that costs more than reading them.
-        if service.is_open()
+        if self.0.catalogue.service().is_open()
             && let Err(foreign) = guard::is_own(uri, headers)
         {
             if question.runs.is_empty() {
@@ -106,10 +159,7 @@ impl SliceService {
             }
             question.form = PredicateForm::Comparisons;
         }
-        for run in &question.runs {
-            super::catalogue::run(&view, run.as_str())?;
-        }
-        Ok(SliceRequest { client, view, question })
+        self.known_runs(client, question).await
     }
 
     async fn selection(&self, request: &SliceRequest) -> Result<Arc<SliceSelection>, RequestFault> {
@@ -180,7 +230,7 @@ async fn slice(
         let first = cutting.next().await?;
         return Ok(described.stream(Body::from_stream(rest(first, cutting))));
     }
-    let cut = || slices.cut(&request, &selection);
+    let cut = async { slices.cut(&request, &selection) };
     let whole = slices.0.spool.once(&selection.digest, cut).await?;
     Ok(match described.asked(&headers, whole.bytes()) {
         RangeAnswer::Answer(answer) => answer,

@@ -15,7 +15,7 @@ pub(super) const MOST_RUNS: usize = 100;
 #[derive(Default, Deserialize, IntoParams)]
 #[serde(default, deny_unknown_fields)]
 #[into_params(parameter_in = Query)]
-pub(super) struct SliceParameters {
+pub(in super::super) struct SliceParameters {
     /// An SQL predicate over the columns of table measurements; all measurements of the runs if there is none.
     #[serde(rename = "where")]
     #[param(example = "pair_id < 5")]
@@ -40,6 +40,13 @@ enum SliceLayout {
     #[default]
     ByTopic,
     InTime,
+}
+
+impl SliceParameters {
+    /// A slice by topic.
+    pub(in super::super) fn new(predicate: Option<String>, run: Vec<String>, topics: Vec<String>) -> Self {
+        Self { predicate, run, topics, layout: SliceLayout::ByTopic, id: None }
+    }
 }
 
 /// The slice that is requested.
@@ -94,10 +101,15 @@ impl SliceQuery {
 
     /// The beginning of the query, which the predicate completes.
     pub(super) fn select(&self) -> String {
+        self.select_of(&Taken::COLUMNS.join(", "))
+    }
+
+    /// The same with other columns.
+    pub(super) fn select_of(&self, columns: &str) -> String {
         // Names of runs have letters, digits, `_` and `-` alone.
         let named: Vec<_> = self.runs.iter().map(|run| format!("'{run}'")).collect();
         let runs = if named.is_empty() { String::new() } else { format!(" run_id in ({}) and", named.join(", ")) };
-        format!("select {} from measurements where{runs}", Taken::COLUMNS.join(", "))
+        format!("select {columns} from measurements where{runs}")
     }
 
     /// Returns whether it selects all of the runs that it names.
@@ -105,11 +117,11 @@ impl SliceQuery {
         self.predicate.is_none() && self.topics.is_empty()
     }
 
-    /// Returns its parameters for one run, as the query part of a URL.
-    pub(super) fn query_of(&self, run: &RunId) -> String {
+    /// Returns its parameters for some runs, as the query part of a URL.
+    pub(super) fn query_of<'a>(&'a self, runs: impl IntoIterator<Item = &'a RunId>) -> String {
         let mut pairs = vec![("layout", self.layout_name())];
         pairs.extend(self.predicate.as_deref().map(|predicate| ("where", predicate)));
-        pairs.push(("run", run.as_str()));
+        pairs.extend(runs.into_iter().map(|run| ("run", run.as_str())));
         pairs.extend(self.topics.iter().map(|topic| ("topics", topic.as_str())));
         pairs.iter().map(|(name, value)| format!("{name}={}", encoded(value))).collect::<Vec<_>>().join("&")
     }
@@ -151,7 +163,7 @@ mod tests {
         assert_eq!(asked.predicate.as_deref(), Some("snr_db < 35 and '\u{e9}&'='+'"));
         assert_eq!((&asked.topics[..], asked.layout), (&["/ir".to_owned(), "/tf".to_owned()][..], Layout::ByTopic));
         assert!(asked.select().ends_with("where run_id in ('a', 'b') and"), "{}", asked.select());
-        let again = question(&asked.query_of(&asked.runs[1])).unwrap_or_else(|e| panic!("{e}"));
+        let again = question(&asked.query_of(&asked.runs[1..])).unwrap_or_else(|e| panic!("{e}"));
         assert_eq!(
             (&again.predicate, &again.topics, &again.runs[..]),
             (&asked.predicate, &asked.topics, &asked.runs[1..])

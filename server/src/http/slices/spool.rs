@@ -17,15 +17,37 @@ use tokio::sync::OnceCell;
 
 use super::SliceTask;
 use crate::fault::RequestFault;
+use crate::running::RunningQuery;
 
 /// Bytes of all slices that are kept, and of one.
 const MOST_BYTES: u64 = 2 << 30;
 /// Bytes that are read at a time.
 const BLOCK: u64 = 256 << 10;
 
+/// Something that comes in pieces, of which a file is kept.
+pub(in crate::http) trait PieceSource: Send {
+    /// The next bytes; None after the last.
+    ///
+    /// # Errors
+    /// What keeps it from coming to its end.
+    fn next_piece(&mut self) -> impl Future<Output = Result<Option<Bytes>, RequestFault>> + Send;
+}
+
+impl PieceSource for SliceTask {
+    fn next_piece(&mut self) -> impl Future<Output = Result<Option<Bytes>, RequestFault>> + Send {
+        self.next()
+    }
+}
+
+impl PieceSource for RunningQuery<Bytes> {
+    fn next_piece(&mut self) -> impl Future<Output = Result<Option<Bytes>, RequestFault>> + Send {
+        self.next()
+    }
+}
+
 /// Cache of slices, by their digest.
 #[derive(Clone, Default)]
-pub(super) struct SliceSpool(Arc<Mutex<SpoolState>>);
+pub(in crate::http) struct SliceSpool(Arc<Mutex<SpoolState>>);
 
 #[derive(Default)]
 struct SpoolState {
@@ -37,7 +59,7 @@ struct SpoolState {
 }
 
 /// A slice in a file without a name: the system deletes it when it is closed, even by a crash.
-pub(super) struct SpooledSlice {
+pub(in crate::http) struct SpooledSlice {
     file: File,
     /// Those that are counted in its spool.
     bytes: u64,
@@ -73,22 +95,23 @@ impl SliceSpool {
     ///
     /// # Errors
     /// Those of cutting, and [`RequestFault::NoRoom`].
-    pub(super) async fn once(
+    pub(in crate::http) async fn once<S: PieceSource>(
         &self,
         key: &str,
-        cut: impl FnOnce() -> Result<SliceTask, RequestFault>,
+        cut: impl Future<Output = Result<S, RequestFault>> + Send,
     ) -> Result<Arc<SpooledSlice>, RequestFault> {
         let cell = self.kept().slices.entry(key.to_owned()).or_default().clone();
         let waiting = SliceWaiter { spool: self, cell, key };
-        let spooled = waiting.cell.get_or_try_init(|| async { self.fill(cut()?).await.map(Arc::new) }).await?.clone();
+        let spooled =
+            waiting.cell.get_or_try_init(|| async { self.fill(cut.await?).await.map(Arc::new) }).await?.clone();
         self.touch(key, &waiting.cell);
         Ok(spooled)
     }
 
-    async fn fill(&self, mut cutting: SliceTask) -> Result<SpooledSlice, RequestFault> {
+    async fn fill(&self, mut cutting: impl PieceSource) -> Result<SpooledSlice, RequestFault> {
         let file = on_disk(tempfile::tempfile).await.map_err(no_room)?;
         let mut slice = SpooledSlice { file, bytes: 0, spool: self.clone() };
-        while let Some(piece) = cutting.next().await? {
+        while let Some(piece) = cutting.next_piece().await? {
             self.make_room(piece.len() as u64)?;
             slice.bytes += piece.len() as u64;
             // It moves along: even if the request is dropped meanwhile, its bytes count as long as it is written to.
@@ -142,12 +165,12 @@ fn no_room(error: io::Error) -> RequestFault {
 
 impl SpooledSlice {
     /// Its length.
-    pub(super) fn bytes(&self) -> u64 {
+    pub(in crate::http) fn bytes(&self) -> u64 {
         self.bytes
     }
 
     /// Bytes of it, a block at a time.
-    pub(super) fn read(
+    pub(in crate::http) fn read(
         self: &Arc<Self>,
         range: Range<u64>,
     ) -> impl Stream<Item = Result<Bytes, RequestFault>> + Send + use<> {
