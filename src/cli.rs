@@ -61,7 +61,7 @@ pub(crate) enum CliCommand {
     #[command(flatten)]
     Lake(LakeCommand),
     /// Measure one surface: one run, one MCAP file. Devices are simulated unless the rig file names them.
-    Acquire(AcquireArgs),
+    Acquire(Box<AcquireArgs>),
     /// Write a generated relief as a mesh, heights or a picture; make groups of them.
     Panel(PanelArgs),
     /// Replay runs to Foxglove (play, pause, seek) and Lichtblick (view only).
@@ -141,6 +141,8 @@ impl CliArguments {
         match &self.command {
             #[cfg(feature = "lake")]
             CliCommand::Lake(LakeCommand::Engine(args)) => args.confine(&self.lake),
+            #[cfg(feature = "lake")]
+            CliCommand::Lake(LakeCommand::Serve(args)) => args.confine(&self.lake),
             _ => Ok(()),
         }
     }

@@ -15,6 +15,7 @@ mod projects;
 pub(crate) mod server;
 mod slices;
 mod watched;
+mod workers;
 
 use std::io::{self, Read as _};
 use std::net::TcpStream;

@@ -14,6 +14,7 @@ use bytes::Bytes;
 use datafusion::common::TableReference;
 use datafusion::datasource::TableProvider;
 use datafusion::error::DataFusionError;
+use datafusion::logical_expr::ScalarUDF;
 use datafusion::optimizer::OptimizerRule;
 use datafusion::prelude::SessionContext;
 use datafusion::sql::parser::Statement;
@@ -81,6 +82,11 @@ impl LakeCatalog {
             past: Cache::new(PAST_TABLES),
             runs: Arc::new(mcap::Files::new(lake, &small)),
         })
+    }
+
+    /// Returns the functions that views look values up with.
+    pub(crate) fn lookups(&self) -> &[Arc<ScalarUDF>] {
+        self.lookups.functions()
     }
 
     /// Returns the optimizer rules for plans over these tables and views, the same for every snapshot.

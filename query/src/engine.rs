@@ -1,6 +1,7 @@
 //! The engine: the lake, cached file footers, memory and limits that all sessions of a process share.
 
 use std::collections::BTreeSet;
+use std::path::PathBuf;
 use std::sync::{Arc, OnceLock};
 use std::time::Duration;
 
@@ -8,7 +9,7 @@ use datafusion::catalog::{CatalogProvider as _, CatalogProviderList as _};
 use datafusion::catalog::{MemoryCatalogProvider, MemoryCatalogProviderList, MemorySchemaProvider};
 use datafusion::error::DataFusionError;
 use datafusion::execution::FunctionRegistry as _;
-use datafusion::execution::disk_manager::DiskManagerBuilder;
+use datafusion::execution::disk_manager::{DiskManagerBuilder, DiskManagerMode};
 use datafusion::execution::memory_pool::{GreedyMemoryPool, MemoryPool};
 use datafusion::execution::object_store::{DefaultObjectStoreRegistry, ObjectStoreRegistry as _, ObjectStoreUrl};
 use datafusion::execution::runtime_env::{RuntimeEnv, RuntimeEnvBuilder};
@@ -27,6 +28,8 @@ use crate::control::{QueryTicket, RunningQueries, StopReason};
 use crate::functions::octet_length_of_bytes;
 use crate::scan_readers::LakeReaderFactory;
 use crate::small::SmallTables;
+use crate::spread::WorkerCluster;
+use crate::spread::read_only::ReadOnlyStore;
 use crate::system::{self, SystemSource};
 use crate::table::FileReaders;
 use crate::{Error, FunctionSet, OpaqueValue, Session};
@@ -79,13 +82,16 @@ struct EngineState {
     // A thread for timeouts, which busy query threads cannot delay.
     watch: QueryThreads,
     system: OnceLock<Arc<dyn SystemSource>>,
+    cluster: OnceLock<Arc<WorkerCluster>>,
 }
 
 /// Limits on all queries of a process together.
-#[derive(Debug, Clone, Copy, Default)]
+#[derive(Debug, Clone, Default)]
 pub struct EngineLimits {
     /// Bytes that queries may hold; None for no limit.
     pub memory: Option<usize>,
+    /// The folder for sorts that do not fit; None for the system's.
+    pub temp: Option<PathBuf>,
 }
 
 /// A function that queries may call.
@@ -211,7 +217,7 @@ impl QueryEngine {
     pub fn new(lake: &Lake, limits: EngineLimits) -> Result<Self, Error> {
         let failed = |e: DataFusionError| Error::execution(&e);
         let url = ObjectStoreUrl::parse(STORE).map_err(failed)?;
-        let runtime = runtime(lake, &url, limits).map_err(failed)?;
+        let runtime = runtime(lake, &url, &limits).map_err(failed)?;
         let metadata = runtime.cache_manager.get_file_metadata_cache();
         let reader = Arc::new(LakeReaderFactory::new(lake, metadata));
         let functions = FunctionSet::all(lake.rig()).map_err(|e| Error::Execution { message: e.to_string() })?;
@@ -229,6 +235,7 @@ impl QueryEngine {
             own: functions.names().map(str::to_owned).collect(),
             watch: QueryThreads::new("query-watch", 1).map_err(threads)?,
             system: OnceLock::new(),
+            cluster: OnceLock::new(),
         };
         Ok(Self(OpaqueValue::new(inner)))
     }
@@ -236,6 +243,16 @@ impl QueryEngine {
     /// Adds tables to the schema `system`; to be called once.
     pub fn add_system_tables(&self, source: Arc<dyn SystemSource>) {
         let _ = self.0.system.set(source);
+    }
+
+    /// Has heavy queries spread over workers from now on; to be called once.
+    pub fn spread_over(&self, cluster: Arc<WorkerCluster>) {
+        let _ = self.0.cluster.set(cluster);
+    }
+
+    /// Returns the workers over which heavy queries are spread.
+    pub fn cluster(&self) -> Option<&Arc<WorkerCluster>> {
+        self.0.cluster.get()
     }
 
     /// Returns who has further tables of the schema `system`.
@@ -349,6 +366,45 @@ impl QueryEngine {
         &self.0.template
     }
 
+    /// Returns whether a query's settings are those of every query here, which workers have, too.
+    pub(crate) fn has_own_settings(&self, state: &SessionState) -> bool {
+        let (own, its) = (&self.0.template.config_options().execution, &state.config_options().execution);
+        own.time_zone == its.time_zone && own.batch_size == its.batch_size
+    }
+
+    /// Builds the state of a task that runs here for an engine elsewhere: functions, settings and store of this engine's
+    /// queries; its operators may hold `memory` bytes.
+    ///
+    /// # Errors
+    /// If a function cannot be registered.
+    pub(crate) fn task_state(
+        &self,
+        mut builder: SessionStateBuilder,
+        memory: Option<usize>,
+    ) -> Result<SessionState, DataFusionError> {
+        let template = &self.0.template;
+        let mut runtime = template.runtime_env().as_ref().clone();
+        if let Some(limit) = memory {
+            let pool = PartialPool::new(runtime.memory_pool, "the task holds", limit, Arc::default());
+            runtime.memory_pool = Arc::new(pool);
+        }
+        if let Some(config) = builder.config() {
+            config.options_mut().execution = template.config_options().execution.clone();
+        }
+        let mut state = builder
+            .with_runtime_env(Arc::new(runtime))
+            .with_scalar_functions(template.scalar_functions().values().cloned().collect())
+            .with_aggregate_functions(template.aggregate_functions().values().cloned().collect())
+            .with_window_functions(template.window_functions().values().cloned().collect())
+            .build();
+        // Last: they replace functions with the same names and aliases.
+        let own = self.0.own.iter().filter_map(|name| template.scalar_functions().get(name));
+        for function in own.chain(self.0.catalog.lookups()) {
+            state.register_udf(function.clone())?;
+        }
+        Ok(state)
+    }
+
     // One new context per query: its tables are of one snapshot, and nothing a query does outlives it. Functions and
     // optimizer rules are those of the template.
     pub(crate) fn context(&self) -> SessionContext {
@@ -395,16 +451,20 @@ fn config() -> SessionConfig {
     config
 }
 
-fn runtime(lake: &Lake, url: &ObjectStoreUrl, limits: EngineLimits) -> Result<Arc<RuntimeEnv>, DataFusionError> {
+fn runtime(lake: &Lake, url: &ObjectStoreUrl, limits: &EngineLimits) -> Result<Arc<RuntimeEnv>, DataFusionError> {
     let stores = DefaultObjectStoreRegistry::new();
     stores.deregister_store(ObjectStoreUrl::parse(MACHINE)?.as_ref())?;
-    stores.register_store(url.as_ref(), lake.store());
+    stores.register_store(url.as_ref(), Arc::new(ReadOnlyStore::new(lake.store())));
     let mut builder = RuntimeEnvBuilder::new();
     if let Some(memory) = limits.memory {
         builder = builder.with_memory_pool(Arc::new(GreedyMemoryPool::new(memory)));
     }
+    let mut disk = DiskManagerBuilder::default().with_max_temp_directory_size(SPILL_BYTES);
+    if let Some(folder) = &limits.temp {
+        disk.set_mode(DiskManagerMode::Directories(vec![folder.clone()]));
+    }
     builder
-        .with_disk_manager_builder(DiskManagerBuilder::default().with_max_temp_directory_size(SPILL_BYTES))
+        .with_disk_manager_builder(disk)
         .with_object_store_registry(Arc::new(stores))
         .with_metadata_cache_limit(METADATA_BYTES)
         .build_arc()

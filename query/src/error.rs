@@ -16,6 +16,7 @@ use echolake_schema::tables::Table;
 
 use crate::control::StopReason;
 use crate::friendly::hints;
+use crate::spread::WorkerLoss;
 
 /// Minimum similarity of a suggested name: half of the letters, as in DataFusion's own suggestions.
 const ALIKE: f64 = 0.5;
@@ -76,6 +77,12 @@ pub enum Error {
     TimeLimit {
         /// The client's time for a query.
         limit: Duration,
+    },
+    /// A worker that ran a part of it was lost after rows had been sent.
+    #[error("a worker was lost while the query ran: {message}; hint: ask again, the others go on")]
+    WorkerLost {
+        /// What is known of it.
+        message: String,
     },
     /// It needed more memory than there is for it.
     #[error("the query needs more memory than it may have: {message}; hint: ask for less, or for fewer columns")]
@@ -168,10 +175,14 @@ impl Error {
         })
     }
 
-    // An error about a limit, not about the query.
+    // An error about a limit or a worker, not about the query.
     fn limit(error: &DataFusionError) -> Option<Self> {
         match error.find_root() {
             DataFusionError::ResourcesExhausted(text) => Some(Self::MemoryLimit { message: text.clone() }),
+            DataFusionError::External(cause) => {
+                let loss = cause.downcast_ref::<WorkerLoss>()?;
+                Some(Self::WorkerLost { message: loss.message().to_owned() })
+            }
             _ => None,
         }
     }

@@ -44,6 +44,7 @@ mod request_tests;
 mod scan_readers;
 mod session;
 mod small;
+mod spread;
 mod statement_bounds;
 mod summarize;
 mod system;
@@ -58,6 +59,10 @@ pub use mcap::{Attachment, Contents, Topic};
 pub use opaque::OpaqueValue;
 pub use predicate::PredicateForm;
 pub use session::{CancelHandle, ContextExtension, PreparedQuery, QueryAnswer, Session};
+pub use spread::{
+    ClusterSettings, SpreadCounts, SpreadTasks, SpreadWorker, TASK_HEADER, TaskLease, WorkerCluster, WorkerIdentity,
+    WorkerStatus, WorkerToken,
+};
 pub use statement_bounds::check_statement_bounds;
 pub use system::SystemSource;
 pub use views::table_meaning;

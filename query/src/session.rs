@@ -4,7 +4,7 @@ use std::borrow::Cow;
 use std::sync::Arc;
 
 use arrow::datatypes::{DataType, SchemaRef};
-use arrow::record_batch::RecordBatch;
+use arrow::record_batch::{RecordBatch, RecordBatchOptions};
 use bytes::Bytes;
 use datafusion::common::ParamValues;
 use datafusion::error::DataFusionError;
@@ -12,7 +12,7 @@ use datafusion::execution::TaskContext;
 use datafusion::execution::context::SQLOptions;
 use datafusion::execution::session_state::SessionState;
 use datafusion::logical_expr::LogicalPlan;
-use datafusion::physical_plan::{ExecutionPlan, execute_stream};
+use datafusion::physical_plan::execute_stream;
 use datafusion::prelude::SessionContext;
 use datafusion::sql::parser::{DFParserBuilder, Statement};
 use datafusion::sql::sqlparser::parser::ParserError;
@@ -27,6 +27,8 @@ use crate::control::{QueryTicket, StopReason, WorkGuard};
 use crate::dialect::LakeDialect;
 use crate::engine::{self, EngineClient, EngineLimits, QueryEngine, QueryPermit, QueryQuota, SqlFunction};
 use crate::mcap::Contents;
+use crate::spread::attempt::{QueryAttempt, QueryAttempts, SpreadQuery, explain_spread};
+use crate::spread::decision::SpreadDecision;
 use crate::statement_bounds::check_statement_bounds;
 use crate::{Error, OpaqueValue, as_of, friendly, gate, ignored_clauses, placeholders, summarize};
 
@@ -328,14 +330,11 @@ impl Session {
 
     async fn run(&self, prepared: &PreparedQuery, plan: LogicalPlan, started: Started) -> Result<QueryAnswer, Error> {
         let Started { ticket, place } = started;
-        let (state, sql) = (prepared.state.clone(), prepared.sql.clone());
-        let physical = async move { state.create_physical_plan(&plan).await.map_err(|e| Error::plan(&sql, &e)) };
-        let plan = self.engine.on_threads(&ticket, physical).await?;
+        let planned = self.clone().physical_plan(prepared.state.clone(), prepared.sql.clone(), plan, ticket.clone());
+        let (schema, attempts) = self.engine.on_threads(&ticket, planned).await?;
         let Some(threads) = self.engine.threads().handle() else { return Err(engine::ended()) };
         let (send, batches) = mpsc::channel(AHEAD);
-        let schema = plan.schema();
-        let context = self.task_context(&prepared.state, &ticket);
-        let query = threads.spawn(drive(plan, context, send, ticket.begin_work(), place));
+        let query = threads.spawn(drive(schema.clone(), attempts, send, ticket.begin_work(), place));
         Ok(QueryAnswer {
             schema,
             batches,
@@ -345,6 +344,38 @@ impl Session {
             limit: self.client.quota().rows,
             _engine: self.engine.clone(),
         })
+    }
+
+    // The plan for this process, and what plans it for workers if it is for them.
+    async fn physical_plan(
+        self,
+        state: OpaqueValue<SessionState>,
+        sql: String,
+        query: LogicalPlan,
+        ticket: Arc<QueryTicket>,
+    ) -> Result<(SchemaRef, QueryAttempts), Error> {
+        let wrong = |e: DataFusionError| Error::plan(&sql, &e);
+        let mut plan = state.create_physical_plan(&query).await.map_err(wrong)?;
+        let context = self.task_context(&state, &ticket);
+        let mut spread = None;
+        if let Some(cluster) = self.engine.cluster().filter(|_| self.engine.has_own_settings(&state)) {
+            if let LogicalPlan::Explain(explain) = &query {
+                plan = explain_spread(cluster, &state, explain, plan).await.map_err(wrong)?;
+            } else if let SpreadDecision::Spread { .. } =
+                SpreadDecision::of_plan(&plan, cluster.least_bytes()).map_err(wrong)?
+            {
+                let memory = self.engine.memory(self.client.quota());
+                spread = Some(SpreadQuery {
+                    cluster: cluster.clone(),
+                    state: SessionState::clone(&state),
+                    query,
+                    memory,
+                    contexts: Box::new(move |state| self.task_context(state, &ticket)),
+                });
+            }
+        }
+        let schema = plan.schema();
+        Ok((schema, QueryAttempts::new(plan, context, spread)))
     }
 
     // As DataFusion builds it, except for the memory pool.
@@ -404,29 +435,75 @@ struct Started {
 
 // Runs a query. It holds its permit until its operators are dropped, even if the reader is gone.
 async fn drive(
-    plan: Arc<dyn ExecutionPlan>,
-    context: Arc<TaskContext>,
+    schema: SchemaRef,
+    mut attempts: QueryAttempts,
     send: mpsc::Sender<Result<RecordBatch, DataFusionError>>,
     work: WorkGuard,
     _place: QueryPermit,
 ) {
-    let mut batches = match execute_stream(plan, context) {
-        Ok(batches) => batches,
-        Err(e) => return drop(send.send(Err(e)).await),
+    let run = async {
+        let mut attempt = attempts.first().await;
+        while let Some(current) = attempt {
+            attempt = match run_attempt(&schema, &current, &send).await {
+                AttemptEnd::Done => None,
+                AttemptEnd::Failed { error, has_sent } => {
+                    let next = if has_sent { None } else { attempts.after(&current, &error).await };
+                    if next.is_none() {
+                        // An error of `send` means that the answer was dropped.
+                        let _ = send.send(Err(current.final_error(error))).await;
+                    }
+                    next
+                }
+            };
+        }
     };
-    loop {
-        let batch = tokio::select! {
-            biased;
-            _ = work.ticket().stopped() => return,
-            batch = batches.next() => batch,
-        };
-        let Some(batch) = batch else { return };
-        let is_last = batch.is_err();
-        // An error of `send` means that the answer was dropped.
-        if send.send(batch).await.is_err() || is_last {
-            return;
+    tokio::select! {
+        biased;
+        _ = work.ticket().stopped() => {}
+        () = run => {}
+    }
+}
+
+/// The end of an attempt to run a query.
+enum AttemptEnd {
+    /// All rows were sent, or nobody reads them.
+    Done,
+    Failed {
+        error: DataFusionError,
+        /// True if batches were sent before.
+        has_sent: bool,
+    },
+}
+
+async fn run_attempt(
+    schema: &SchemaRef,
+    attempt: &QueryAttempt,
+    send: &mpsc::Sender<Result<RecordBatch, DataFusionError>>,
+) -> AttemptEnd {
+    let mut has_sent = false;
+    let mut batches = match execute_stream(attempt.plan.clone(), attempt.context.clone()) {
+        Ok(batches) => batches,
+        Err(error) => return AttemptEnd::Failed { error, has_sent },
+    };
+    while let Some(batch) = batches.next().await {
+        let batch = batch.and_then(|batch| if attempt.is_spread() { with_schema(batch, schema) } else { Ok(batch) });
+        match batch {
+            Ok(batch) => {
+                has_sent = true;
+                if send.send(Ok(batch)).await.is_err() {
+                    return AttemptEnd::Done;
+                }
+            }
+            Err(error) => return AttemptEnd::Failed { error, has_sent },
         }
     }
+    AttemptEnd::Done
+}
+
+// What a function returns loses its unit between machines.
+fn with_schema(batch: RecordBatch, schema: &SchemaRef) -> Result<RecordBatch, DataFusionError> {
+    let options = RecordBatchOptions::new().with_row_count(Some(batch.num_rows()));
+    Ok(RecordBatch::try_new_with_options(schema.clone(), batch.columns().to_vec(), &options)?)
 }
 
 #[cfg(test)]

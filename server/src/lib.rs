@@ -33,6 +33,7 @@ mod service;
 mod sessions;
 mod signed_address;
 pub mod tokens;
+pub mod worker;
 
 pub use catalogue_pages::CataloguePages;
 pub use door::{AgentDoor, CertificateFiles, EngineSettings, LakeServer, ServerSettings};

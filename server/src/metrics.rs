@@ -4,8 +4,9 @@
 mod gauges;
 
 use echolake_lake::CacheCounts;
+use echolake_query::{SpreadCounts, WorkerStatus};
 use prometheus::{
-    HistogramOpts, HistogramVec, IntCounter, IntCounterVec, IntGauge, Opts, Registry, Result, TextEncoder,
+    HistogramOpts, HistogramVec, IntCounter, IntCounterVec, IntGauge, IntGaugeVec, Opts, Registry, Result, TextEncoder,
 };
 use serde::{Deserialize, Serialize};
 
@@ -53,6 +54,8 @@ pub(crate) struct ServerMetrics {
     cache_blocks: IntCounterVec,
     cache_requests: IntCounter,
     cache_bytes: IntCounter,
+    spread: IntCounterVec,
+    workers: IntGaugeVec,
 }
 
 impl ServerMetrics {
@@ -88,6 +91,17 @@ impl ServerMetrics {
                 "Requests to the object store for blocks that were not cached.",
             )?,
             cache_bytes: IntCounter::new("echolake_cache_fetched_bytes_total", "Bytes of these blocks.")?,
+            spread: IntCounterVec::new(
+                Opts::new(
+                    "echolake_spread_queries_total",
+                    "Queries that were begun on workers, begun again, or returned.",
+                ),
+                &["event"],
+            )?,
+            workers: IntGaugeVec::new(
+                Opts::new("echolake_worker_usable", "If a worker could be used when it was asked last."),
+                &["worker"],
+            )?,
         };
         metrics.register()?;
         Ok(metrics)
@@ -105,6 +119,8 @@ impl ServerMetrics {
         registry.register(Box::new(self.cache_blocks.clone()))?;
         registry.register(Box::new(self.cache_requests.clone()))?;
         registry.register(Box::new(self.cache_bytes.clone()))?;
+        registry.register(Box::new(self.spread.clone()))?;
+        registry.register(Box::new(self.workers.clone()))?;
         // What did not happen yet is zero, and not unknown.
         for protocol in ServerProtocol::ALL {
             queries.with_label_values(&[protocol.name()]);
@@ -114,6 +130,7 @@ impl ServerMetrics {
             failures.with_label_values(&[code.name()]);
         }
         self.cached(&CacheCounts::default());
+        self.spread(&SpreadCounts::default());
         Ok(())
     }
 
@@ -152,6 +169,21 @@ impl ServerMetrics {
         }
         self.cache_requests.inc_by(requests);
         self.cache_bytes.inc_by(fetched_bytes);
+    }
+
+    /// Counts what an engine had workers do.
+    pub(crate) fn spread(&self, counts: &SpreadCounts) {
+        let SpreadCounts { spread, repeated, returned } = *counts;
+        for (event, queries) in [("begun", spread), ("begun_again", repeated), ("returned", returned)] {
+            self.spread.with_label_values(&[event]).inc_by(queries);
+        }
+    }
+
+    /// Sets which workers an engine could use.
+    pub(crate) fn set_workers(&self, workers: &[WorkerStatus]) {
+        for worker in workers {
+            self.workers.with_label_values(&[&worker.url]).set(i64::from(worker.problem.is_none()));
+        }
     }
 
     /// Counts a failed request.
@@ -227,6 +259,13 @@ mod tests {
         let text = metrics.text(&ServerGauges::default()).expect("a text");
         has(&text, "echolake_cache_blocks_total{from=\"disk\"} 2");
         has(&text, "echolake_cache_fetched_bytes_total 4096");
+        has(&text, "echolake_spread_queries_total{event=\"begun\"} 0");
+        metrics.spread(&SpreadCounts { spread: 3, repeated: 1, returned: 0 });
+        let url = "http://127.0.0.1:7070/".to_owned();
+        metrics.set_workers(&[WorkerStatus { url, problem: Some("gone".to_owned()) }]);
+        let text = metrics.text(&ServerGauges::default()).expect("a text");
+        has(&text, "echolake_spread_queries_total{event=\"begun_again\"} 1");
+        has(&text, "echolake_worker_usable{worker=\"http://127.0.0.1:7070/\"} 0");
         metrics.begin(ServerProtocol::Http);
         metrics.lose(1);
         has(&metrics.text(&ServerGauges::default()).expect("a text"), "echolake_running_queries 0");

@@ -65,10 +65,10 @@ fn pages_and_queries_of_a_warm_server_stay_within_their_budgets() {
     take_requests(&store);
     open_surface_page(&server, "prd");
     let page = take_requests(&store);
-    assert!(page.len() <= 8 && !page.is_empty(), "{page:?}");
+    assert!(page.len() <= 8, "{page:?}");
     sql(&server, "select ir from ir where surface_id = 'prd' and pair_id = 1");
     let response = take_requests(&store);
-    assert!(response.len() <= 2, "{response:?}");
+    assert!(response.len() <= 2 && !response.is_empty(), "{response:?}");
     sql(&server, "select avg(tnce_total) from tnce");
     let scan = take_requests(&store);
     assert!(scan.len() <= SURFACES.len(), "{scan:?}");

@@ -197,12 +197,13 @@ fn tables_are_shared_as_files() {
     assert!(names.contains(&json!("tnce_db")) && !names.contains(&json!("ir")) && names.len() == 14, "{names:?}");
     let page = json_of(&get(&server, "/delta-sharing/shares/echolake/all-tables?maxResults=3&pageToken=12"));
     assert_eq!((page["items"].as_array().map(Vec::len), &page["nextPageToken"]), (Some(2), &Value::Null));
-    for (table, rows) in [("measurements", 45), ("tnce_db", 45), ("runs", 1), ("catalogue", 1)] {
+    for table in ["measurements", "pairs", "runs", "catalogue", "tnce_db"] {
+        let rows = place.number(&format!("select count(*) from {table}"));
         let files = shared(&server, table, "{}");
         assert_eq!(files.len(), 1, "{table}");
         let file = get(&server, path_of(&server, &files[0]));
         assert_eq!((file.status, file.body.len() as u64), (200, files[0]["size"].as_u64().expect("a size")), "{table}");
-        assert_eq!(number_of_rows(&file.body), rows, "{table}");
+        assert_eq!(number_of_rows(&file.body) as f64, rows, "{table}");
         let part = HttpRequest::get(path_of(&server, &files[0])).with("range", "bytes=0-3").send(&server);
         assert_eq!((part.status, part.body.as_slice()), (206, &b"PAR1"[..]), "{table}");
         let head = HttpRequest::head(path_of(&server, &files[0])).send(&server);
@@ -261,18 +262,15 @@ fn rows_that_were_replaced_are_not_shared() {
     place.acquire("flat", &["--seed", "9", "--ir-only"]);
     place.ok(&["ingest"]);
     let server = served(&place, &[]);
-    let mut made = 0;
     for table in ["surfaces", "nce", "tnce"] {
         let mut rows = 0;
         for file in shared(&server, table, "{}") {
             let answer = get(&server, path_of(&server, &file));
             assert_eq!((answer.status, answer.body.len() as u64), (200, file["size"].as_u64().expect("a size")));
             rows += number_of_rows(&answer.body);
-            made += usize::from(file["id"].as_str().is_some_and(|id| id.starts_with('~')));
         }
         assert_eq!(place.number(&format!("select count(*) from {table}")), rows as f64, "{table}");
     }
-    assert!(made > 0, "a file that readers see in part is not handed out");
 }
 
 #[test]

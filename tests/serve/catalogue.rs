@@ -32,6 +32,7 @@ fn filled(template: &str, surface: &str, run: &str, file: &str) -> String {
     match path.rsplit('/').next() {
         Some("grid" | "grid.svg") => format!("{path}?microphone=0"),
         Some("slices.mcap" | "manifest") => format!("{path}?where=pair_id%3C5"),
+        Some("slices.sofa") => format!("{path}?where=surface_id%3D%27brick%27%20and%20pair_id%3C5"),
         _ => path,
     }
 }

@@ -24,6 +24,7 @@ const OPTIONAL = new Set([
   '/api/v1/foxglove/manifest',
   '/api/v1/layouts/echolake.json',
   '/api/v1/slices.mcap',
+  '/api/v1/slices.sofa',
   '/api/v1/tables/{table}',
   '/api/v1/tables/{table}/{file}',
   '/metrics',

@@ -23,6 +23,7 @@ const BANDS: [&str; 5] = ["2500", "5000", "10000", "20000", "40000"];
 /// A lake with two runs in it, made of the golden cases: surface `0015_0`, and its Flat.
 pub(crate) struct SmallLake {
     _folder: tempfile::TempDir,
+    pub(crate) lake: Lake,
     session: Session,
     golden: Vec<RecordBatch>,
 }
@@ -36,7 +37,7 @@ impl SmallLake {
         put(&lake, "0015_0", &golden, "panel_ir", "reflected_ir").await;
         put(&lake, "flat", &golden, "flat_ir", "flat_reflected_ir").await;
         let session = Session::new(&lake).expect("a session");
-        Self { _folder: folder, session, golden }
+        Self { _folder: folder, lake, session, golden }
     }
 
     pub(crate) async fn batches(&self, sql: &str) -> Result<Vec<RecordBatch>, Error> {
@@ -171,15 +172,23 @@ fn example(documentation: &datafusion::logical_expr::Documentation) -> (String, 
     (query.to_owned(), answer.to_owned())
 }
 
+/// The documented examples: the function's name, the query and its answer.
+pub(crate) fn examples() -> Vec<(String, String, String)> {
+    let functions = FunctionSet::all(&Rig::paper()).expect("the built-in rig is valid");
+    let scalar = functions.scalar().iter().map(|f| (f.name(), f.documentation()));
+    let all = scalar.chain(functions.aggregate().iter().map(|f| (f.name(), f.documentation())));
+    let example = |(name, documentation): (&str, Option<&_>)| {
+        let (query, answer) = example(documentation.expect("documentation"));
+        (name.to_owned(), query, answer)
+    };
+    all.map(example).collect()
+}
+
 #[tokio::test]
 async fn examples_answer_what_they_say() {
     let small = SmallLake::new().await;
-    let functions = FunctionSet::all(&Rig::paper()).expect("the built-in rig is valid");
-    let scalar = functions.scalar().iter().map(|f| (f.name(), f.documentation()));
-    let all: Vec<_> = scalar.chain(functions.aggregate().iter().map(|f| (f.name(), f.documentation()))).collect();
     let mut wrong = String::new();
-    for (name, documentation) in all {
-        let (query, answer) = example(documentation.expect("documentation"));
+    for (name, query, answer) in examples() {
         let given = pretty_format_batches(&[small.rows(&query).await]).expect("a table").to_string();
         if given != answer {
             wrong += &format!("== {name}\n{given}\n");

@@ -76,7 +76,7 @@ async fn time_rows_and_places_are_limited() {
 
 #[tokio::test]
 async fn memory_is_limited() {
-    let (_folder, engine) = engine(EngineLimits { memory: Some(32 << 20) }).await;
+    let (_folder, engine) = engine(EngineLimits { memory: Some(32 << 20), temp: None }).await;
     let session = session(&engine, QueryQuota::default());
     // One list of all values, which cannot be spilled to disk.
     let sql = "select array_agg(x || 'abcdefghijklmnopqrstuvwxyz') from generate_series(1, 10000000) t(x)";

@@ -22,6 +22,7 @@ use crate::engine::door_message::DoorMessage;
 use crate::engine::report::EngineReport;
 use crate::engine_socket::EngineSocket;
 use crate::metrics::ServerProtocol;
+use crate::worker::{EngineWorkers, WORKER_TOKEN_VARIABLE};
 
 /// Time for which a request that lost its engine waits for the reason.
 const REASON_WAIT: Duration = Duration::from_secs(2);
@@ -44,6 +45,8 @@ pub struct EngineSettings {
     pub slow: Option<Duration>,
     /// The folder in which they cache what they read of an object store.
     pub cache: Option<CacheFolder>,
+    /// Workers for heavy queries.
+    pub workers: Option<EngineWorkers>,
 }
 
 /// The reason for which an engine ended.
@@ -111,6 +114,8 @@ impl EngineProcess {
                 start.settings.slow.iter().flat_map(|slow| ["--log-slow-ms".to_owned(), slow.as_millis().to_string()]),
             )
             .args(start.settings.cache.iter().flat_map(cache_arguments))
+            .args(start.settings.workers.iter().flat_map(EngineWorkers::engine_arguments))
+            .envs(start.settings.workers.iter().filter_map(|w| Some((WORKER_TOKEN_VARIABLE, w.secret()?))))
             .envs(start.settings.environment.iter().map(|(name, value)| (name, value)))
             .env("TMPDIR", &start.spills)
             // Memory that is reserved and not used would count against the limit.
@@ -360,6 +365,8 @@ impl EngineReports {
             Ok(EngineReport::Failure(code)) => activity.metrics.failed(code),
             Ok(EngineReport::Lake(figures)) => activity.set_lake(figures),
             Ok(EngineReport::Cache(counts)) => activity.metrics.cached(&counts),
+            Ok(EngineReport::Spread(counts)) => activity.metrics.spread(&counts),
+            Ok(EngineReport::Workers(workers)) => activity.metrics.set_workers(&workers),
             Ok(EngineReport::Ask { number, table }) => {
                 let Some(client) = engine.client.get() else { return };
                 let message = DoorMessage::Rows { number, rows: activity.rows(table, client) };

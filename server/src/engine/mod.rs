@@ -22,6 +22,7 @@ use crate::activity::LakeFigures;
 use crate::client_identity::ClientIdentity;
 use crate::engine_socket::EngineSocket;
 use crate::service::QueryService;
+use crate::worker::EngineWorkers;
 use crate::{Error, flight, http, postgres};
 use door_message::DoorMessage;
 use report::EngineReport;
@@ -33,12 +34,14 @@ const LAKE_LOOK: Duration = Duration::from_secs(15);
 const REMOTE_LAKE_LOOK: Duration = Duration::from_secs(60);
 
 /// Settings of an engine.
-#[derive(Debug, Clone, Copy, Default)]
+#[derive(Debug, Clone, Default)]
 pub struct EngineRun {
     /// Bytes that its queries may hold; None for no limit.
     pub memory: Option<usize>,
     /// Time from which a query is logged as slow; None for never.
     pub slow: Option<Duration>,
+    /// Workers for heavy queries.
+    pub workers: Option<EngineWorkers>,
 }
 
 /// Answers one client's requests until standard input ends, which the door holds.
@@ -54,7 +57,13 @@ pub async fn run_engine(lake: &Lake, sockets: &Path, settings: EngineRun) -> Res
     let http = EngineSocket::Http.listen(sockets)?;
     let flight_sql = EngineSocket::FlightSql.listen(sockets)?;
     let postgres = EngineSocket::Postgres.listen(sockets)?;
-    let engine = QueryEngine::new(lake, EngineLimits { memory })?;
+    let engine = QueryEngine::new(lake, EngineLimits { memory, temp: None })?;
+    if let Some(workers) = settings.workers {
+        match workers.cluster(lake).await {
+            Ok(cluster) => engine.spread_over(Arc::new(cluster)),
+            Err(e) => tracing::warn!(error = &e as &dyn std::error::Error, "queries run without workers"),
+        }
+    }
     warm_up(&engine).await?;
     EngineReport::Ready.send();
     let identity = tokio::select! {
@@ -67,7 +76,7 @@ pub async fn run_engine(lake: &Lake, sockets: &Path, settings: EngineRun) -> Res
     let lake = &identity.visible_lake(lake);
     // Whatever the spare engine has read of the lake, it read as a reader of all projects.
     let engine = match lake.is_restricted() {
-        true => QueryEngine::new(lake, EngineLimits { memory })?,
+        true => QueryEngine::new(lake, EngineLimits { memory, temp: None })?,
         false => engine,
     };
     let service = QueryService::new(lake, engine, identity, settings.slow)?;

@@ -4,6 +4,7 @@ use std::io::Write as _;
 use std::sync::{Mutex, PoisonError};
 
 use echolake_lake::CacheCounts;
+use echolake_query::{SpreadCounts, WorkerStatus};
 use serde::{Deserialize, Serialize};
 
 use crate::activity::{ActivityTable, LakeFigures, QueryEnd, QueryStart};
@@ -27,6 +28,10 @@ pub(crate) enum EngineReport {
     Lake(Option<LakeFigures>),
     /// What it read of an object store through its cache since the last such line.
     Cache(CacheCounts),
+    /// Queries over workers since the last such line.
+    Spread(SpreadCounts),
+    /// The workers, as they were when it asked them.
+    Workers(Vec<WorkerStatus>),
     /// It asks for its client's rows of a table of the server's activity.
     Ask {
         /// Number of the answer.

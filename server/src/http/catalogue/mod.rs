@@ -107,7 +107,7 @@ impl LakeCatalogue {
     pub(super) async fn surface_value(&self, surface: &str) -> Result<Value, RequestFault> {
         let request = CatalogueRequest::new(self, &self.view().await?, false);
         let path = PathParams(SurfacePath { surface_id: surface.to_owned() });
-        surface::surface(Extension(request), path).await.map_err(|problem| problem.0)?.value()
+        Box::pin(surface::surface(Extension(request), path)).await.map_err(|problem| problem.0)?.value()
     }
 
     /// What the endpoint of a run answers.
@@ -117,7 +117,7 @@ impl LakeCatalogue {
     pub(super) async fn run_value(&self, run: &str) -> Result<Value, RequestFault> {
         let request = CatalogueRequest::new(self, &self.view().await?, false);
         let path = PathParams(RunPath { run_id: run.to_owned() });
-        runs::run(Extension(request), path).await.map_err(|problem| problem.0)?.value()
+        Box::pin(runs::run(Extension(request), path)).await.map_err(|problem| problem.0)?.value()
     }
 
     pub(super) fn service(&self) -> &QueryService {

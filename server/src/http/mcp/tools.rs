@@ -193,7 +193,7 @@ impl ToolCall<'_> {
             }
             AgentTool::Query => {
                 let QueryArguments { sql, max_rows } = tool.parse(arguments)?;
-                self.query(&client, sql, max_rows).await
+                Box::pin(self.query(&client, sql, max_rows)).await
             }
             AgentTool::ListFunctions => {
                 let FunctionArguments { search } = tool.parse(arguments)?;
@@ -201,11 +201,11 @@ impl ToolCall<'_> {
             }
             AgentTool::SurfaceSummary => {
                 let SurfaceArguments { surface_id } = tool.parse(arguments)?;
-                self.surface_summary(&surface_id).await
+                Box::pin(self.surface_summary(&surface_id)).await
             }
             AgentTool::RunSummary => {
                 let RunArguments { run_id } = tool.parse(arguments)?;
-                self.run_summary(&run_id).await
+                Box::pin(self.run_summary(&run_id)).await
             }
             AgentTool::SliceUrl => self.slice_url(tool.parse::<SliceArguments>(arguments)?).await,
         }

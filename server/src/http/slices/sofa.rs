@@ -38,7 +38,7 @@ pub(super) struct SofaParameters {
     run: Option<String>,
     /// An SQL predicate over the columns of table measurements; all measurements of the run if there is none.
     #[serde(rename = "where")]
-    #[param(example = "pair_id < 5")]
+    #[param(example = "surface_id = 'flat' and pair_id < 5")]
     predicate: Option<String>,
 }
 

@@ -1,0 +1,191 @@
+//! The workers that an engine may ask, and which of them answer now.
+
+use std::collections::HashMap;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::{Duration, Instant};
+
+use datafusion_distributed::{ChannelResolver as _, GetWorkerInfoRequest};
+use futures::future::join_all;
+use serde::{Deserialize, Serialize};
+use url::Url;
+
+use super::channels::{CONNECT_LIMIT, WorkerChannels};
+use super::loss::WorkerLoss;
+use super::{WorkerIdentity, WorkerToken};
+use crate::Error;
+
+/// Time for which a worker's answer is good.
+const CHECK_LASTS: Duration = Duration::from_secs(5);
+
+/// The workers of an engine, and when they are asked.
+#[derive(Debug, Clone)]
+pub struct ClusterSettings {
+    /// Addresses of the workers, as `http://10.0.0.7:7070`.
+    pub workers: Vec<Url>,
+    /// The secret that they share; None for workers on this machine.
+    pub token: Option<WorkerToken>,
+    /// The engine's build and lake.
+    pub identity: WorkerIdentity,
+    /// Bytes from which a query is spread.
+    pub least_bytes: u64,
+}
+
+/// Workers that run parts of heavy queries.
+///
+/// ```
+/// use echolake_query::{ClusterSettings, WorkerCluster, WorkerIdentity};
+///
+/// let identity = WorkerIdentity { build: "0.1.0-1a".to_owned(), lake: "lake".to_owned() };
+/// let workers = vec!["http://127.0.0.1:7070".parse()?];
+/// let cluster = WorkerCluster::new(ClusterSettings { workers, token: None, identity, least_bytes: 64 << 20 })?;
+/// // Nobody was asked yet.
+/// assert!(cluster.workers()[0].problem.is_none());
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
+#[derive(Debug)]
+pub struct WorkerCluster {
+    settings: ClusterSettings,
+    channels: WorkerChannels,
+    checks: Mutex<HashMap<Url, WorkerCheck>>,
+    counts: Mutex<SpreadCounts>,
+}
+
+/// Queries over workers since the start of an engine.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct SpreadCounts {
+    /// Queries that were begun on workers.
+    pub spread: u64,
+    /// Queries that were begun again, on the workers that were left, because one was lost.
+    pub repeated: u64,
+    /// Queries that the engine ran itself after workers could not.
+    pub returned: u64,
+}
+
+/// A worker as it was when it was asked last.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct WorkerStatus {
+    /// Its address.
+    pub url: String,
+    /// What keeps it from being used; None if nothing does.
+    pub problem: Option<String>,
+}
+
+#[derive(Debug, Clone)]
+struct WorkerCheck {
+    at: Instant,
+    problem: Option<String>,
+}
+
+impl WorkerCluster {
+    /// Takes workers to use; it asks none of them yet.
+    ///
+    /// # Errors
+    /// [`Error::Execution`] if the token cannot be sent.
+    pub fn new(mut settings: ClusterSettings) -> Result<Self, Error> {
+        // In one order everywhere, so that files stay with their workers.
+        settings.workers.sort();
+        settings.workers.dedup();
+        let channels = WorkerChannels::new(settings.token.as_ref()).map_err(|e| Error::execution(&e))?;
+        Ok(Self { settings, channels, checks: Mutex::default(), counts: Mutex::default() })
+    }
+
+    /// Returns all workers as they were when they were asked last.
+    pub fn workers(&self) -> Vec<WorkerStatus> {
+        let checks = self.checks();
+        let status = |url: &Url| WorkerStatus {
+            url: url.to_string(),
+            problem: checks.get(url).and_then(|check| check.problem.clone()),
+        };
+        self.settings.workers.iter().map(status).collect()
+    }
+
+    /// Returns what was counted since the start.
+    pub fn counts(&self) -> SpreadCounts {
+        *self.counts.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    pub(super) fn count(&self, add: impl FnOnce(&mut SpreadCounts)) {
+        add(&mut self.counts.lock().unwrap_or_else(PoisonError::into_inner));
+    }
+
+    /// Returns the workers that answer, in order, after asking those that were not asked for a while.
+    pub(super) async fn usable_workers(&self) -> Vec<Url> {
+        self.check_workers(CHECK_LASTS).await
+    }
+
+    /// Returns the workers that answer now.
+    pub(super) async fn remaining_workers(&self) -> Vec<Url> {
+        self.check_workers(Duration::ZERO).await
+    }
+
+    async fn check_workers(&self, lasts: Duration) -> Vec<Url> {
+        let is_old = |url: &&Url| self.checks().get(*url).is_none_or(|check| check.at.elapsed() >= lasts);
+        let old: Vec<_> = self.settings.workers.iter().filter(is_old).collect();
+        join_all(old.into_iter().map(|url| self.check_worker(url))).await;
+        let checks = self.checks();
+        let answers = |url: &&Url| checks.get(*url).is_some_and(|check| check.problem.is_none());
+        self.settings.workers.iter().filter(answers).cloned().collect()
+    }
+
+    async fn check_worker(&self, url: &Url) {
+        let problem = match tokio::time::timeout(CONNECT_LIMIT, self.ask_worker(url)).await {
+            Ok(problem) => problem,
+            Err(_) => Some(format!("it did not answer within {} s", CONNECT_LIMIT.as_secs())),
+        };
+        let check = WorkerCheck { at: Instant::now(), problem };
+        let problem = check.problem.clone();
+        let before = self.checks().insert(url.clone(), check).and_then(|before| before.problem);
+        match problem {
+            Some(problem) if before.as_ref() != Some(&problem) => {
+                tracing::warn!(worker = %url, problem, "a worker is not used");
+            }
+            None if before.is_some() => tracing::info!(worker = %url, "a worker is used again"),
+            _ => {}
+        }
+    }
+
+    async fn ask_worker(&self, url: &Url) -> Option<String> {
+        let answer = async {
+            let mut client = self.channels.get_worker_client_for_url(url).await?;
+            client.get_worker_info(GetWorkerInfoRequest {}).await
+        };
+        match answer.await {
+            Ok(info) => match WorkerIdentity::parse(&info.version) {
+                Some(other) => self.settings.identity.difference(&other),
+                None => Some(format!("it is no worker of echolake: it says `{}`", info.version)),
+            },
+            Err(e) => Some(WorkerLoss::find(&e).map_or_else(|| e.to_string(), |loss| loss.message().to_owned())),
+        }
+    }
+
+    pub(super) fn channels(&self) -> &WorkerChannels {
+        &self.channels
+    }
+
+    pub(crate) fn least_bytes(&self) -> u64 {
+        self.settings.least_bytes
+    }
+
+    pub(super) fn size(&self) -> usize {
+        self.settings.workers.len()
+    }
+
+    fn checks(&self) -> MutexGuard<'_, HashMap<Url, WorkerCheck>> {
+        self.checks.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl SpreadCounts {
+    /// Returns what was counted since `before`.
+    #[must_use]
+    pub fn since(&self, before: &Self) -> Self {
+        Self {
+            spread: self.spread.saturating_sub(before.spread),
+            repeated: self.repeated.saturating_sub(before.repeated),
+            returned: self.returned.saturating_sub(before.returned),
+        }
+    }
+}
+
+/// A cluster is shared by all sessions of an engine.
+pub(crate) type SharedCluster = Arc<WorkerCluster>;

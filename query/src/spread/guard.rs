@@ -1,0 +1,263 @@
+//! The end of a worker's tasks. A task is over when the call by which it was sent is: its engine holds that call open for
+//! as long as the query runs. The library then forgets the task's plan, at a time that is its cache's to choose; until that,
+//! operators that compute on threads of their own would go on. So the leaves and the head of each plan are guarded.
+
+use std::collections::HashMap;
+use std::pin::Pin;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::task::{Context, Poll};
+use std::time::Duration;
+
+use arrow::datatypes::SchemaRef;
+use arrow::record_batch::RecordBatch;
+use datafusion::common::tree_node::TreeNodeRecursion;
+use datafusion::error::{DataFusionError, Result};
+use datafusion::execution::{RecordBatchStream, SendableRecordBatchStream, TaskContext};
+use datafusion::physical_expr::PhysicalExpr;
+use datafusion::physical_plan::metrics::MetricsSet;
+use datafusion::physical_plan::{
+    ChildrenPropertiesMode, DisplayAs, DisplayFormatType, ExecutionPlan, PlanProperties, ReplaceChildrenOptions,
+};
+use datafusion_distributed::{WorkerPlanRewriteEvent, WorkerPlanRewriteEventResponse, WorkerPlanRewriteHandler};
+use futures::future::BoxFuture;
+use futures::{FutureExt as _, Stream, StreamExt as _};
+use tonic::codegen::http::{HeaderMap, HeaderValue};
+
+use crate::control::{QueryTicket, RunningQueries, StopReason};
+
+/// The header by which a worker's server tells its tasks apart.
+pub const TASK_HEADER: &str = "x-echolake-task";
+
+/// The error of rows that come after the end of their task.
+pub(super) const OVER: &str = "the task's query is over";
+
+/// The tasks of a worker that are not over.
+#[derive(Debug, Clone, Default)]
+pub struct SpreadTasks(Arc<OpenTasks>);
+
+#[derive(Debug, Default)]
+struct OpenTasks {
+    last: AtomicU64,
+    tickets: Mutex<HashMap<u64, Arc<QueryTicket>>>,
+    /// Those that are over, too, as long as they compute.
+    computing: RunningQueries,
+}
+
+/// A task that is not over. Dropping it ends its work.
+#[derive(Debug)]
+pub struct TaskLease {
+    number: u64,
+    ticket: Arc<QueryTicket>,
+    tasks: SpreadTasks,
+}
+
+impl SpreadTasks {
+    /// Begins a task, to be called before its request is passed on with [`TaskLease::header`] as [`TASK_HEADER`].
+    pub fn begin(&self) -> TaskLease {
+        let number = self.0.last.fetch_add(1, Ordering::Relaxed) + 1;
+        let ticket = Arc::new(QueryTicket::new());
+        self.tickets().insert(number, ticket.clone());
+        self.0.computing.add(&ticket);
+        TaskLease { number, ticket, tasks: self.clone() }
+    }
+
+    /// Returns the number of tasks that are not over.
+    pub fn count(&self) -> usize {
+        self.tickets().len()
+    }
+
+    /// Returns the longest time for which one step of a task has gone on after the task was over; None if none does.
+    pub fn overdue(&self) -> Option<Duration> {
+        self.0.computing.overdue()
+    }
+
+    /// Returns the guard of the task that a request belongs to.
+    pub(super) fn guard(&self, headers: &HeaderMap) -> Option<TaskGuard> {
+        let number: u64 = headers.get(TASK_HEADER)?.to_str().ok()?.parse().ok()?;
+        self.tickets().get(&number).cloned().map(TaskGuard)
+    }
+
+    fn tickets(&self) -> MutexGuard<'_, HashMap<u64, Arc<QueryTicket>>> {
+        self.0.tickets.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl TaskLease {
+    /// Returns the header's value.
+    pub fn header(&self) -> HeaderValue {
+        HeaderValue::from(self.number)
+    }
+}
+
+impl Drop for TaskLease {
+    fn drop(&mut self) {
+        self.ticket.stop(StopReason::Cancelled);
+        self.tasks.tickets().remove(&self.number);
+    }
+}
+
+/// Guards a task's plan.
+pub(super) struct TaskGuard(Arc<QueryTicket>);
+
+impl WorkerPlanRewriteHandler for TaskGuard {
+    fn rewrite_worker_plan(&self, event: WorkerPlanRewriteEvent<'_>) -> Result<WorkerPlanRewriteEventResponse> {
+        Ok(WorkerPlanRewriteEventResponse::new(self.guard_plan(event.plan, 0)?))
+    }
+}
+
+impl TaskGuard {
+    // The library replaces some heads by others, so that what is below is guarded as well.
+    fn guard_plan(&self, plan: Arc<dyn ExecutionPlan>, depth: usize) -> Result<Arc<dyn ExecutionPlan>> {
+        let children: Vec<_> = plan.children().into_iter().cloned().collect();
+        let is_leaf = children.is_empty();
+        let mut guarded = plan;
+        if !is_leaf {
+            let children =
+                children.into_iter().map(|child| self.guard_plan(child, depth + 1)).collect::<Result<_>>()?;
+            let options = ReplaceChildrenOptions::new(ChildrenPropertiesMode::Recompute);
+            guarded = guarded.replace_children(children, options)?;
+        }
+        if is_leaf || depth < 2 {
+            guarded = Arc::new(GuardedExec { inner: guarded, ticket: self.0.clone() });
+        }
+        Ok(guarded)
+    }
+}
+
+/// An operator whose rows end in an error when its task is over. It passes for the operator itself.
+#[derive(Debug)]
+struct GuardedExec {
+    inner: Arc<dyn ExecutionPlan>,
+    ticket: Arc<QueryTicket>,
+}
+
+impl DisplayAs for GuardedExec {
+    fn fmt_as(&self, format: DisplayFormatType, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        self.inner.fmt_as(format, f)
+    }
+}
+
+impl ExecutionPlan for GuardedExec {
+    fn name(&self) -> &str {
+        self.inner.name()
+    }
+
+    fn downcast_delegate(&self) -> Option<&dyn ExecutionPlan> {
+        Some(self.inner.as_ref())
+    }
+
+    fn properties(&self) -> &Arc<PlanProperties> {
+        self.inner.properties()
+    }
+
+    fn maintains_input_order(&self) -> Vec<bool> {
+        self.inner.maintains_input_order()
+    }
+
+    fn children(&self) -> Vec<&Arc<dyn ExecutionPlan>> {
+        self.inner.children()
+    }
+
+    fn apply_expressions(
+        &self,
+        visit: &mut dyn FnMut(&Arc<dyn PhysicalExpr>) -> Result<TreeNodeRecursion>,
+    ) -> Result<TreeNodeRecursion> {
+        self.inner.apply_expressions(visit)
+    }
+
+    fn replace_children(
+        self: Arc<Self>,
+        children: Vec<Arc<dyn ExecutionPlan>>,
+        options: ReplaceChildrenOptions,
+    ) -> Result<Arc<dyn ExecutionPlan>> {
+        let inner = self.inner.clone().replace_children(children, options)?;
+        Ok(Arc::new(Self { inner, ticket: self.ticket.clone() }))
+    }
+
+    fn with_new_children(self: Arc<Self>, children: Vec<Arc<dyn ExecutionPlan>>) -> Result<Arc<dyn ExecutionPlan>> {
+        self.replace_children(children, ReplaceChildrenOptions::new(ChildrenPropertiesMode::Recompute))
+    }
+
+    fn execute(&self, partition: usize, context: Arc<TaskContext>) -> Result<SendableRecordBatchStream> {
+        let inner = self.inner.execute(partition, context)?;
+        let (ticket, ended) = (self.ticket.clone(), self.ticket.clone());
+        let over = async move { ended.stopped().await }.boxed();
+        Ok(Box::pin(GuardedStream { schema: inner.schema(), inner: Some(inner), over, ticket }))
+    }
+
+    fn metrics(&self) -> Option<MetricsSet> {
+        self.inner.metrics()
+    }
+}
+
+struct GuardedStream {
+    schema: SchemaRef,
+    /// None after its task is over.
+    inner: Option<SendableRecordBatchStream>,
+    over: BoxFuture<'static, StopReason>,
+    ticket: Arc<QueryTicket>,
+}
+
+impl Stream for GuardedStream {
+    type Item = Result<RecordBatch>;
+
+    fn poll_next(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<Option<Self::Item>> {
+        let step = self.ticket.begin_work();
+        let Some(inner) = &mut self.inner else { return Poll::Ready(None) };
+        let next = inner.poll_next_unpin(context);
+        drop(step);
+        // An end that comes too early would look like an end of the rows.
+        if !matches!(next, Poll::Ready(None)) && self.over.poll_unpin(context).is_ready() {
+            self.inner = None;
+            return Poll::Ready(Some(Err(DataFusionError::Execution(OVER.to_owned()))));
+        }
+        next
+    }
+}
+
+impl RecordBatchStream for GuardedStream {
+    fn schema(&self) -> SchemaRef {
+        self.schema.clone()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use datafusion::prelude::SessionContext;
+
+    use super::*;
+
+    #[tokio::test]
+    async fn a_plan_ends_with_its_task() {
+        let tasks = SpreadTasks::default();
+        let lease = tasks.begin();
+        let headers =
+            HeaderMap::from_iter([(tonic::codegen::http::HeaderName::from_static(TASK_HEADER), lease.header())]);
+        let guard = tasks.guard(&headers).expect("a task");
+        assert!(tasks.guard(&HeaderMap::new()).is_none());
+        let context = SessionContext::new();
+        let sql = "select value % 3, count(*) from generate_series(1, 100000000000) group by 1";
+        let plan = context.sql(sql).await.expect("a query").create_physical_plan().await.expect("a plan");
+        let guarded = guard.guard_plan(plan.clone(), 0).expect("guarded");
+        assert_eq!(guarded.schema(), plan.schema());
+        let mut rows = datafusion::physical_plan::execute_stream(guarded, context.task_ctx()).expect("rows");
+        assert_eq!(tasks.count(), 1);
+        let ending = tokio::spawn(async move { rows.next().await });
+        drop(lease);
+        let end = tokio::time::timeout(Duration::from_secs(60), ending).await.expect("in time");
+        let error = end.expect("no panic").expect("an error, not an end").expect_err("it is over");
+        assert!(error.to_string().contains(OVER), "{error}");
+        assert_eq!((tasks.count(), tasks.guard(&headers).is_none()), (0, true));
+        let begun = std::time::Instant::now();
+        while tasks.overdue().is_some() {
+            assert!(begun.elapsed() < Duration::from_secs(60), "the operators' threads go on");
+            tokio::time::sleep(Duration::from_millis(10)).await;
+        }
+        // A step that goes on is found.
+        let step = guard.0.begin_work();
+        assert!(tasks.overdue().is_some());
+        drop(step);
+        assert_eq!(tasks.overdue(), None);
+    }
+}
