@@ -38,7 +38,7 @@ enum Kind {
     /// By its properties, or one column with the text.
     Json(json::Shape, JsonEncoding),
     Ros(ros::Definition),
-    Flatbuffer(flatbuffer::Definition),
+    Flatbuffer(flatbuffer::FlatbufferDefinition),
     /// Messages of an encoding that is not known, which have no columns.
     Unknown,
 }
@@ -73,7 +73,7 @@ impl Layout {
                 (definition.fields()?, Kind::Ros(definition))
             }
             Some(Encoding::Flatbuffer) => {
-                let definition = flatbuffer::Definition::parse(&schema.name, &schema.data)?;
+                let definition = flatbuffer::FlatbufferDefinition::parse(&schema.name, &schema.data)?;
                 (definition.fields(), Kind::Flatbuffer(definition))
             }
             None => {
@@ -105,7 +105,7 @@ impl Layout {
             Kind::Json(shape, encoding) => Decoder::Json(json::Decoder::new(*shape, *encoding, &self.fields, wanted)),
             Kind::Ros(definition) => Decoder::Ros(ros::Decoder::new(definition, &self.fields, wanted)),
             Kind::Flatbuffer(definition) => {
-                Decoder::Flatbuffer(flatbuffer::Decoder::new(definition, &self.fields, wanted))
+                Decoder::Flatbuffer(flatbuffer::FlatbufferDecoder::new(definition, &self.fields, wanted))
             }
             Kind::Unknown => Decoder::None,
         }
@@ -121,7 +121,7 @@ enum Encoding {
     Flatbuffer,
 }
 
-/// How ROS' messages are defined.
+/// Notation of ROS' message definitions.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum RosNotation {
     Message,
@@ -148,7 +148,7 @@ pub(super) enum Decoder {
     Protobuf(protobuf::Decoder),
     Json(json::Decoder),
     Ros(ros::Decoder),
-    Flatbuffer(flatbuffer::Decoder),
+    Flatbuffer(flatbuffer::FlatbufferDecoder),
     /// Passes messages over.
     None,
 }

@@ -5,40 +5,40 @@ use super::super::error::Malformed;
 
 /// Bytes of an offset, and of a vector's length.
 pub(super) const OFFSET_BYTES: usize = 4;
-/// What a table's list of places begins with: its own length and the table's.
+/// Bytes before a table's slots: their own length and the table's.
 const SLOTS_HEAD: usize = 4;
 
 /// A FlatBuffer.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Buffer<'a>(pub(super) &'a [u8]);
+pub(super) struct FlatbufferBytes<'a>(pub(super) &'a [u8]);
 
 /// A table in a FlatBuffer.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Table<'a> {
-    pub(super) buffer: Buffer<'a>,
+pub(super) struct FlatbufferTable<'a> {
+    pub(super) buffer: FlatbufferBytes<'a>,
     at: usize,
     /// By slot, where a field stands behind `at`; 0 where it is not there.
     slots: &'a [u8],
 }
 
-impl<'a> Buffer<'a> {
+impl<'a> FlatbufferBytes<'a> {
     /// The bytes of a number.
     pub(super) fn array<const N: usize>(self, at: usize) -> Result<[u8; N], Malformed> {
         self.0.get(at..).and_then(|rest| rest.first_chunk::<N>()).copied().ok_or(Malformed::Ends)
     }
 
-    /// Where the offset at a place leads.
+    /// Follows the offset at a place.
     pub(super) fn follow(self, at: usize) -> Result<usize, Malformed> {
         at.checked_add(u32::from_le_bytes(self.array(at)?) as usize).ok_or(Malformed::Ends)
     }
 
     /// The table that a FlatBuffer begins with.
-    pub(super) fn root(self) -> Result<Table<'a>, Malformed> {
+    pub(super) fn root(self) -> Result<FlatbufferTable<'a>, Malformed> {
         self.table(self.follow(0)?)
     }
 
     /// The table at a place.
-    pub(super) fn table(self, at: usize) -> Result<Table<'a>, Malformed> {
+    pub(super) fn table(self, at: usize) -> Result<FlatbufferTable<'a>, Malformed> {
         let back = i64::from(i32::from_le_bytes(self.array(at)?));
         let begin = i64::try_from(at).ok().and_then(|at| at.checked_sub(back)).ok_or(Malformed::Ends)?;
         let begin = usize::try_from(begin).map_err(|_| Malformed::Ends)?;
@@ -47,10 +47,10 @@ impl<'a> Buffer<'a> {
         if slots.len() < SLOTS_HEAD {
             return Err(Malformed::Ends);
         }
-        Ok(Table { buffer: self, at, slots })
+        Ok(FlatbufferTable { buffer: self, at, slots })
     }
 
-    /// How many elements of `size` bytes the vector at a place has, and where the first stands; all of them are there.
+    /// Number of elements of `size` bytes in the vector at a place, and place of the first; all of them are there.
     pub(super) fn vector(self, at: usize, size: usize) -> Result<(usize, usize), Malformed> {
         let count = u32::from_le_bytes(self.array(at)?) as usize;
         let first = at + OFFSET_BYTES;
@@ -71,8 +71,8 @@ impl<'a> Buffer<'a> {
     }
 }
 
-impl<'a> Table<'a> {
-    /// Where a field stands; None if it is not there.
+impl<'a> FlatbufferTable<'a> {
+    /// Place of a field; None if it is not there.
     pub(super) fn place(&self, slot: u16) -> Option<usize> {
         let place = self.slots.get(usize::from(slot)..).and_then(|rest| rest.first_chunk::<2>())?;
         match u16::from_le_bytes(*place) {

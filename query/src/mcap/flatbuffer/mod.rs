@@ -9,7 +9,7 @@ use echolake_schema::tables::LIST_CHILD;
 
 use super::column::{Column, Record, duration_type, time_type, width};
 use super::error::{Malformed, Spent};
-use buffer::Buffer;
+use buffer::FlatbufferBytes;
 
 mod buffer;
 mod schema;
@@ -17,7 +17,7 @@ mod values;
 
 /// A table or a struct: its members in the order of their places.
 #[derive(Debug, Clone, PartialEq)]
-pub(super) struct Definition {
+pub(super) struct FlatbufferDefinition {
     name: String,
     members: Vec<Member>,
     is_struct: bool,
@@ -28,7 +28,7 @@ pub(super) struct Definition {
 #[derive(Debug, Clone, PartialEq)]
 struct Member {
     name: String,
-    /// Where a table says where it stands, or where it stands in a struct.
+    /// Slot of a table, or offset in a struct.
     slot: u16,
     kind: Kind,
     count: Count,
@@ -40,7 +40,7 @@ struct Member {
     is_optional: bool,
 }
 
-/// How many values a member has.
+/// Number of values of a member.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Count {
     One,
@@ -60,12 +60,12 @@ enum Kind {
     Text,
     Time,
     Duration,
-    Object(Definition),
+    Object(FlatbufferDefinition),
     /// By the number that the member before it has: what it may be.
     Union(Vec<(i64, Member)>),
 }
 
-impl Definition {
+impl FlatbufferDefinition {
     /// Reads the type of a message from a binary schema. The text of an error says what is wrong.
     pub(super) fn parse(name: &str, data: &[u8]) -> Result<Self, String> {
         schema::parse(name, data)
@@ -114,28 +114,28 @@ impl Kind {
 }
 
 /// Decodes messages.
-pub(super) struct Decoder {
-    definition: Definition,
+pub(super) struct FlatbufferDecoder {
+    definition: FlatbufferDefinition,
     record: Record,
     width: usize,
     pub(super) spent: Spent,
 }
 
-impl Decoder {
-    /// A decoder of some of a message's columns, by their place in [`Definition::fields`].
-    pub(super) fn new(definition: &Definition, all: &Fields, wanted: &[usize]) -> Self {
+impl FlatbufferDecoder {
+    /// A decoder of some of a message's columns, by their place in [`FlatbufferDefinition::fields`].
+    pub(super) fn new(definition: &FlatbufferDefinition, all: &Fields, wanted: &[usize]) -> Self {
         let some: Fields = wanted.iter().map(|i| all[*i].clone()).collect();
         let members = wanted.iter().map(|i| definition.members[*i].clone()).collect();
         let width = some.iter().map(|f| width(f.data_type())).sum();
-        let definition = Definition { members, ..definition.clone() };
+        let definition = FlatbufferDefinition { members, ..definition.clone() };
         Self { definition, record: Record::new(&some), width, spent: Spent::default() }
     }
 
     /// Adds a message as one row.
     pub(super) fn push(&mut self, data: &[u8]) -> Result<(), Malformed> {
         self.spent.add(self.width)?;
-        let root = Buffer(data).root()?;
-        self.definition.read(&values::Row::Table(root), &mut self.record.columns, &mut self.spent)
+        let root = FlatbufferBytes(data).root()?;
+        self.definition.read(&values::FlatbufferRow::Table(root), &mut self.record.columns, &mut self.spent)
     }
 
     /// The columns, which are empty afterwards.

@@ -7,8 +7,8 @@ use arrow::datatypes::DataType;
 
 use super::super::column::{DEEPEST, MOST_LEAVES};
 use super::super::error::Malformed;
-use super::buffer::{Buffer, OFFSET_BYTES, Table};
-use super::{Count, Definition, EnumNames, Kind, Member};
+use super::buffer::{FlatbufferBytes, FlatbufferTable, OFFSET_BYTES};
+use super::{Count, EnumNames, FlatbufferDefinition, Kind, Member};
 
 /// Places of fields in the tables of `reflection.fbs`.
 mod slot {
@@ -48,15 +48,15 @@ mod base {
 const TIME: &str = "foxglove.Time";
 const DURATION: &str = "foxglove.Duration";
 const TIME_BYTES: usize = 8;
-/// What the names of a schema may take.
+/// Most bytes of a schema's names.
 const MOST_NAME_BYTES: usize = 16 << 20;
 
 /// Reads the type of a message from a schema. The text of an error says what is wrong.
-pub(super) fn parse(name: &str, data: &[u8]) -> Result<Definition, String> {
-    let root = Buffer(data).root().map_err(damaged)?;
+pub(super) fn parse(name: &str, data: &[u8]) -> Result<FlatbufferDefinition, String> {
+    let root = FlatbufferBytes(data).root().map_err(damaged)?;
     let objects = root.children(slot::SCHEMA_OBJECTS).map_err(damaged)?;
     let enums = root.children(slot::SCHEMA_ENUMS).map_err(damaged)?;
-    let is_named = |object: &Table<'_>| object.text(slot::NAME).is_ok_and(|own| own == name.as_bytes());
+    let is_named = |object: &FlatbufferTable<'_>| object.text(slot::NAME).is_ok_and(|own| own == name.as_bytes());
     let message = objects.iter().position(is_named);
     let message = message.ok_or_else(|| format!("its schema does not describe `{name}`"))?;
     let enum_names = HashMap::new();
@@ -68,18 +68,18 @@ fn damaged(error: Malformed) -> String {
 }
 
 struct Parser<'a> {
-    objects: Vec<Table<'a>>,
-    enums: Vec<Table<'a>>,
+    objects: Vec<FlatbufferTable<'a>>,
+    enums: Vec<FlatbufferTable<'a>>,
     enum_names: HashMap<usize, EnumNames>,
     /// The objects that the one at hand stands in.
     within: Vec<usize>,
     leaves: usize,
-    /// What names and values took so far: a schema can have the same ones in many places.
+    /// Bytes of names and values so far: a schema can have the same ones in many places.
     name_bytes: usize,
 }
 
 impl<'a> Parser<'a> {
-    fn name(&mut self, of: &Table<'_>) -> Result<String, String> {
+    fn name(&mut self, of: &FlatbufferTable<'_>) -> Result<String, String> {
         let name = of.text(slot::NAME).map_err(damaged)?;
         self.spend(name.len())?;
         Ok(String::from_utf8_lossy(name).into_owned())
@@ -93,7 +93,7 @@ impl<'a> Parser<'a> {
         }
     }
 
-    fn definition(&mut self, index: usize) -> Result<Definition, String> {
+    fn definition(&mut self, index: usize) -> Result<FlatbufferDefinition, String> {
         let object = *self.objects.get(index).ok_or_else(|| format!("its schema has no object {index}"))?;
         let name = self.name(&object)?;
         if self.within.contains(&index) || self.within.len() >= DEEPEST {
@@ -106,10 +106,10 @@ impl<'a> Parser<'a> {
         members.sort_by_key(|member| member.slot);
         let is_struct = object.number(slot::OBJECT_IS_STRUCT).map_err(damaged)? == Some([1]);
         let bytes = object.number(slot::OBJECT_BYTES).map_err(damaged)?.map_or(0, i32::from_le_bytes);
-        Ok(Definition { name, members, is_struct, bytes: usize::try_from(bytes).unwrap_or(0) })
+        Ok(FlatbufferDefinition { name, members, is_struct, bytes: usize::try_from(bytes).unwrap_or(0) })
     }
 
-    fn member(&mut self, field: &Table<'_>) -> Result<Member, String> {
+    fn member(&mut self, field: &FlatbufferTable<'_>) -> Result<Member, String> {
         let name = self.name(field)?;
         let kind = field.child(slot::FIELD_TYPE).map_err(damaged)?;
         let kind = kind.ok_or_else(|| format!("its field `{name}` has no type"))?;
@@ -170,10 +170,10 @@ impl<'a> Parser<'a> {
         }
     }
 
-    fn values(&mut self, index: usize) -> Result<Vec<Table<'a>>, String> {
+    fn values(&mut self, index: usize) -> Result<Vec<FlatbufferTable<'a>>, String> {
         let found = self.enums.get(index).ok_or_else(|| format!("its schema has no enum {index}"))?;
         let values = found.children(slot::ENUM_VALUES).map_err(damaged)?;
-        self.spend(values.len() * size_of::<Table<'_>>())?;
+        self.spend(values.len() * size_of::<FlatbufferTable<'_>>())?;
         Ok(values)
     }
 
@@ -210,7 +210,7 @@ impl<'a> Parser<'a> {
     }
 }
 
-fn value_number(value: &Table<'_>) -> Result<i64, Malformed> {
+fn value_number(value: &FlatbufferTable<'_>) -> Result<i64, Malformed> {
     Ok(value.number(slot::VALUE_NUMBER)?.map_or(0, i64::from_le_bytes))
 }
 
@@ -231,7 +231,7 @@ fn number_type(base: u8) -> Option<DataType> {
     })
 }
 
-impl Definition {
+impl FlatbufferDefinition {
     fn is_inline(&self, bytes: usize) -> bool {
         self.is_struct && self.bytes == bytes
     }

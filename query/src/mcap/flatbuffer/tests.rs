@@ -11,11 +11,11 @@ const NAME: &str = "lab.Reading";
 
 // As JSON, without the columns that are null.
 fn decoded(message: &[u8], wanted: Option<&[&str]>) -> Result<String, Malformed> {
-    let definition = Definition::parse(NAME, SCHEMA).expect("a schema");
+    let definition = FlatbufferDefinition::parse(NAME, SCHEMA).expect("a schema");
     let all = definition.fields();
     let is_wanted = |name: &str| wanted.is_none_or(|wanted| wanted.contains(&name));
     let chosen: Vec<_> = (0..all.len()).filter(|i| is_wanted(all[*i].name())).collect();
-    let mut decoder = Decoder::new(&definition, &all, &chosen);
+    let mut decoder = FlatbufferDecoder::new(&definition, &all, &chosen);
     decoder.push(message)?;
     let fields: Fields = chosen.iter().map(|i| all[*i].clone()).collect();
     let columns = decoder.columns().iter_mut().map(|column| column.finish().expect("a column")).collect();
@@ -47,7 +47,7 @@ fn all_kinds_of_member_are_columns() {
 
 #[test]
 fn schemas_that_say_less_are_refused() {
-    let error = |name, data: &[u8]| Definition::parse(name, data).expect_err("refused");
+    let error = |name, data: &[u8]| FlatbufferDefinition::parse(name, data).expect_err("refused");
     assert!(error("lab.Nothing", SCHEMA).contains("does not describe `lab.Nothing`"));
     assert!(error(NAME, b"lab.Reading").contains("no binary schema of FlatBuffers"));
     assert!(error(NAME, b"").contains("it ends within a value"));
@@ -67,17 +67,17 @@ fn damage_is_an_error_or_a_row() {
         }
     }
     for at in 0..SCHEMA.len() {
-        count(Definition::parse(NAME, &SCHEMA[..at]).is_ok());
+        count(FlatbufferDefinition::parse(NAME, &SCHEMA[..at]).is_ok());
         for value in [0, 1, 0x7f, 0x80, 0xff] {
             let mut damaged = SCHEMA.to_vec();
             damaged[at] = value;
-            let Ok(definition) = Definition::parse(NAME, &damaged) else {
+            let Ok(definition) = FlatbufferDefinition::parse(NAME, &damaged) else {
                 count(false);
                 continue;
             };
             let all = definition.fields();
             let chosen: Vec<_> = (0..all.len()).collect();
-            count(Decoder::new(&definition, &all, &chosen).push(MESSAGE).is_ok());
+            count(FlatbufferDecoder::new(&definition, &all, &chosen).push(MESSAGE).is_ok());
         }
     }
     assert!(failed > 1000 && read > 1000, "{failed} {read}");

@@ -4,21 +4,21 @@ use arrow::datatypes::DataType;
 
 use super::super::column::{Column, width};
 use super::super::error::{Malformed, Spent};
-use super::buffer::{Buffer, OFFSET_BYTES, Table};
-use super::{Count, Definition, Kind, Member};
+use super::buffer::{FlatbufferBytes, FlatbufferTable, OFFSET_BYTES};
+use super::{Count, FlatbufferDefinition, Kind, Member};
 
 const NANOS: i64 = 1_000_000_000;
 /// Bytes by which the number of a union's type stands before the union in a table's slots.
 const UNION_TYPE_SLOT: u16 = 2;
 
 /// A table, or the place of a struct.
-pub(super) enum Row<'a> {
-    Table(Table<'a>),
-    Struct(Buffer<'a>, usize),
+pub(super) enum FlatbufferRow<'a> {
+    Table(FlatbufferTable<'a>),
+    Struct(FlatbufferBytes<'a>, usize),
 }
 
-impl<'a> Row<'a> {
-    fn buffer(&self) -> Buffer<'a> {
+impl<'a> FlatbufferRow<'a> {
+    fn buffer(&self) -> FlatbufferBytes<'a> {
         match self {
             Self::Table(table) => table.buffer,
             Self::Struct(buffer, _) => *buffer,
@@ -33,16 +33,27 @@ impl<'a> Row<'a> {
     }
 }
 
-impl Definition {
+impl FlatbufferDefinition {
     /// Adds a value to each member's column.
-    pub(super) fn read(&self, row: &Row<'_>, columns: &mut [Column], spent: &mut Spent) -> Result<(), Malformed> {
+    pub(super) fn read(
+        &self,
+        row: &FlatbufferRow<'_>,
+        columns: &mut [Column],
+        spent: &mut Spent,
+    ) -> Result<(), Malformed> {
         self.members.iter().zip(columns).try_for_each(|(member, column)| member.read(row, column, spent))
     }
 
-    fn read_at(&self, buffer: Buffer<'_>, at: usize, column: &mut Column, spent: &mut Spent) -> Result<(), Malformed> {
+    fn read_at(
+        &self,
+        buffer: FlatbufferBytes<'_>,
+        at: usize,
+        column: &mut Column,
+        spent: &mut Spent,
+    ) -> Result<(), Malformed> {
         let row = match self.is_struct {
-            true => Row::Struct(buffer, at),
-            false => Row::Table(buffer.table(buffer.follow(at)?)?),
+            true => FlatbufferRow::Struct(buffer, at),
+            false => FlatbufferRow::Table(buffer.table(buffer.follow(at)?)?),
         };
         match column {
             Column::Struct(record) => {
@@ -57,7 +68,7 @@ impl Definition {
 }
 
 impl Member {
-    fn read(&self, row: &Row<'_>, column: &mut Column, spent: &mut Spent) -> Result<(), Malformed> {
+    fn read(&self, row: &FlatbufferRow<'_>, column: &mut Column, spent: &mut Spent) -> Result<(), Malformed> {
         let buffer = row.buffer();
         let Some(at) = row.place(self.slot) else {
             self.push_default(column);
@@ -103,7 +114,7 @@ impl Member {
 
     fn read_list(
         &self,
-        buffer: Buffer<'_>,
+        buffer: FlatbufferBytes<'_>,
         first: usize,
         count: usize,
         column: &mut Column,
@@ -139,7 +150,7 @@ impl Member {
 fn read_union(
     parts: &[(i64, Member)],
     number: i64,
-    buffer: Buffer<'_>,
+    buffer: FlatbufferBytes<'_>,
     at: usize,
     column: &mut Column,
     spent: &mut Spent,
@@ -174,7 +185,13 @@ impl Kind {
         }
     }
 
-    fn read(&self, buffer: Buffer<'_>, at: usize, column: &mut Column, spent: &mut Spent) -> Result<(), Malformed> {
+    fn read(
+        &self,
+        buffer: FlatbufferBytes<'_>,
+        at: usize,
+        column: &mut Column,
+        spent: &mut Spent,
+    ) -> Result<(), Malformed> {
         match (self, column) {
             (Self::Object(definition), column) => return definition.read_at(buffer, at, column, spent),
             (Self::Text, Column::Text(c)) => {
@@ -211,11 +228,11 @@ impl Kind {
     }
 }
 
-fn nanos(buffer: Buffer<'_>, at: usize) -> Result<i64, Malformed> {
+fn nanos(buffer: FlatbufferBytes<'_>, at: usize) -> Result<i64, Malformed> {
     Ok(i64::from(u32::from_le_bytes(buffer.array(at + 4)?)))
 }
 
-fn integer(kind: &DataType, buffer: Buffer<'_>, at: usize) -> Result<i64, Malformed> {
+fn integer(kind: &DataType, buffer: FlatbufferBytes<'_>, at: usize) -> Result<i64, Malformed> {
     Ok(match kind {
         DataType::Boolean | DataType::UInt8 => u8::from_le_bytes(buffer.array(at)?).into(),
         DataType::Int8 => i8::from_le_bytes(buffer.array(at)?).into(),
