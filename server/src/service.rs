@@ -74,6 +74,13 @@ pub(crate) struct QueryJob {
     pub(crate) stop: StopSignal,
 }
 
+impl QueryJob {
+    /// A query of an HTTP request: it ends with the request, or by its client's quota.
+    pub(crate) fn of_http(session: Arc<Session>, work: QueryWork) -> Self {
+        Self { protocol: ServerProtocol::Http, session, work, limit: None, stop: StopSignal::new() }
+    }
+}
+
 /// Counts requests, and work for them.
 #[derive(Clone, Default)]
 pub(crate) struct ActivityCounter(Arc<AtomicUsize>);

@@ -21,8 +21,7 @@ use super::format::{FormatEncoder, accepted, format_names, media_type, named};
 use super::guard::MayQuery;
 use super::problem::ProblemResponse;
 use crate::fault::RequestFault;
-use crate::metrics::ServerProtocol;
-use crate::running::{RunningQuery, StopSignal};
+use crate::running::RunningQuery;
 use crate::service::{QueryJob, QueryService, QueryWork};
 
 /// Bytes of a request, axum's own limit.
@@ -86,13 +85,7 @@ async fn post(
         params.map_err(|_| RequestFault::request("the path's parameters are not right; hint: ?format=csv"))?;
     let request = parse_body(&headers, &whole(body)?)?;
     let format = format(&headers, params.format.or(request.format))?;
-    let job = QueryJob {
-        protocol: ServerProtocol::Http,
-        session: Arc::new(service.session(&client)),
-        work: QueryWork::Sql(request.query),
-        limit: None,
-        stop: StopSignal::new(),
-    };
+    let job = QueryJob::of_http(Arc::new(service.session(&client)), QueryWork::Sql(request.query));
     let mut running = service.begin(job, move |schema| FormatEncoder::new(format, schema)).await?;
     // A query that fails at once still has a status to say so with.
     let first = running.next().await?;

@@ -17,8 +17,7 @@ use super::rows::RowDecoder;
 use super::summary::{BAND_STATISTICS, CatalogueSummary, SURFACES, SurfaceEntry};
 use super::view::SnapshotView;
 use crate::fault::RequestFault;
-use crate::metrics::ServerProtocol;
-use crate::running::{AnswerEncoder, BatchEncoder, RunningQuery, StopSignal};
+use crate::running::{AnswerEncoder, BatchEncoder, RunningQuery};
 use crate::service::{QueryJob, QueryWork};
 
 /// A request to an endpoint.
@@ -138,13 +137,8 @@ impl CatalogueRequest {
                 planned
             }
         };
-        let job = QueryJob {
-            protocol: ServerProtocol::Http,
-            session: self.view.session.clone(),
-            work: QueryWork::Prepared(prepared, ParamValues::from(values)),
-            limit: None,
-            stop: StopSignal::new(),
-        };
+        let job =
+            QueryJob::of_http(self.view.session.clone(), QueryWork::Prepared(prepared, ParamValues::from(values)));
         service.begin(job, encode).await
     }
 }

@@ -11,8 +11,7 @@ use serde_json::{Map, Value, json};
 
 use super::tools::ToolCall;
 use crate::fault::RequestFault;
-use crate::metrics::ServerProtocol;
-use crate::running::{AnswerEncoder, StopSignal};
+use crate::running::AnswerEncoder;
 use crate::service::{QueryJob, QueryWork};
 
 /// Rows of an answer if the call does not say, and at most.
@@ -27,7 +26,7 @@ impl ToolCall<'_> {
     /// Runs a query.
     ///
     /// # Errors
-    /// What is wrong with it, or ended it.
+    /// A defect of the statement, or the cause of its end.
     pub(super) async fn query(
         &self,
         client: &Arc<EngineClient>,
@@ -40,13 +39,7 @@ impl ToolCall<'_> {
             return Err(RequestFault::request(message));
         }
         let service = self.agents.catalogue.service();
-        let job = QueryJob {
-            protocol: ServerProtocol::Http,
-            session: Arc::new(service.session(client)),
-            work: QueryWork::Sql(sql),
-            limit: None,
-            stop: StopSignal::new(),
-        };
+        let job = QueryJob::of_http(Arc::new(service.session(client)), QueryWork::Sql(sql));
         let most = usize::try_from(most).unwrap_or(usize::MAX);
         let mut running = service.begin(job, move |schema| Ok(CappedRows::new(schema, most))).await?;
         let mut rows = Vec::new();
@@ -76,7 +69,7 @@ impl ToolCall<'_> {
     }
 }
 
-/// Where an answer ends.
+/// Reason that an answer ends.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum AnswerEnd {
     Whole,

@@ -24,8 +24,7 @@ use super::super::slices::SpooledSlice;
 use super::SharingService;
 use super::tables::SharedTable;
 use crate::fault::RequestFault;
-use crate::metrics::ServerProtocol;
-use crate::running::{RunningQuery, StopSignal};
+use crate::running::RunningQuery;
 use crate::service::{QueryJob, QueryWork};
 use crate::signed_address::{SigningKey, VALID};
 use crate::tokens::TokenScope;
@@ -155,13 +154,7 @@ impl SharingService {
     async fn begin(&self, sql: String) -> Result<RunningQuery<Bytes>, RequestFault> {
         let service = self.catalogue.service();
         let client = service.client(TokenScope::Sql)?;
-        let job = QueryJob {
-            protocol: ServerProtocol::Http,
-            session: Arc::new(service.session(&client)),
-            work: QueryWork::Sql(sql),
-            limit: None,
-            stop: StopSignal::new(),
-        };
+        let job = QueryJob::of_http(Arc::new(service.session(&client)), QueryWork::Sql(sql));
         service.begin(job, |schema| FormatEncoder::new(AnswerFormat::Parquet, schema)).await
     }
 }

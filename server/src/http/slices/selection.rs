@@ -2,6 +2,7 @@
 
 use std::sync::Arc;
 
+use arrow::record_batch::RecordBatch;
 use echolake_export::Taken;
 use quick_cache::Weighter;
 use quick_cache::sync::Cache;
@@ -10,9 +11,8 @@ use sha2::{Digest as _, Sha256};
 use super::super::catalogue::{LakeCatalogue, SnapshotView};
 use super::{SliceQuery, SliceRequest};
 use crate::fault::RequestFault;
-use crate::metrics::ServerProtocol;
-use crate::running::{BatchEncoder, StopSignal};
-use crate::service::{QueryJob, QueryWork};
+use crate::running::{BatchEncoder, RunningQuery};
+use crate::service::{QueryJob, QueryService, QueryWork};
 
 /// Measurements of a slice, of a hundred runs and more.
 const MOST: usize = 400_000;
@@ -78,20 +78,25 @@ impl SelectionCache {
     }
 }
 
+impl SliceRequest {
+    /// Begins the client's query for the rows that the request selects.
+    ///
+    /// # Errors
+    /// A defect of the predicate, or a limit.
+    pub(super) async fn begin(
+        &self,
+        service: &QueryService,
+        select: String,
+    ) -> Result<RunningQuery<RecordBatch>, RequestFault> {
+        let session = Arc::new(service.session(&self.client));
+        let (asking, predicate, form) = (session.clone(), self.question.predicate().to_owned(), self.question.form);
+        let sql = service.plan(&self.client, async move { Ok(asking.selecting(&select, &predicate, form)?) }).await?;
+        service.begin(QueryJob::of_http(session, QueryWork::Sql(sql)), |_| Ok(BatchEncoder)).await
+    }
+}
+
 async fn taken(catalogue: &LakeCatalogue, request: &SliceRequest) -> Result<Vec<Taken>, RequestFault> {
-    let SliceRequest { client, question, .. } = request;
-    let (service, predicate) = (catalogue.service(), question.predicate().to_owned());
-    let session = Arc::new(service.session(client));
-    let (asking, select, form) = (session.clone(), question.select(), question.form);
-    let sql = service.plan(client, async move { Ok(asking.selecting(&select, &predicate, form)?) }).await?;
-    let job = QueryJob {
-        protocol: ServerProtocol::Http,
-        session,
-        work: QueryWork::Sql(sql),
-        limit: None,
-        stop: StopSignal::new(),
-    };
-    let mut running = service.begin(job, |_| Ok(BatchEncoder)).await?;
+    let mut running = request.begin(catalogue.service(), request.question.select()).await?;
     let mut taken = Vec::new();
     while let Some(batch) = running.next().await? {
         taken.extend(Taken::of_batch(&batch)?);

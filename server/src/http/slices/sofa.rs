@@ -1,8 +1,6 @@
 //! `GET /api/v1/slices.sofa`: responses of chosen measurements of one run as a SOFA file, which is made in memory: a run's
 //! responses are some ten megabytes.
 
-use std::sync::Arc;
-
 use arrow::array::{ArrayRef, AsArray as _};
 use arrow::compute::concat_batches;
 use arrow::record_batch::RecordBatch;
@@ -22,9 +20,6 @@ use super::super::ranges::FileDescription;
 use super::query::SliceParameters;
 use super::{SliceRequest, SliceService};
 use crate::fault::RequestFault;
-use crate::metrics::ServerProtocol;
-use crate::running::{BatchEncoder, StopSignal};
-use crate::service::{QueryJob, QueryWork};
 
 /// SOFA files.
 pub(in crate::http) const SOFA: &str = "/api/v1/slices.sofa";
@@ -44,7 +39,7 @@ pub(super) struct SofaParameters {
 
 /// The responses of one run's measurements as SOFA (AES69, convention SingleRoomSRIR 1.0).
 ///
-/// What `export sofa` writes of the same measurements. Needs the scopes sql and files.
+/// The file that `export sofa` writes of the same measurements. Needs the scopes sql and files.
 #[utoipa::path(
     get,
     path = SOFA,
@@ -94,22 +89,9 @@ pub(super) async fn sofa(
 impl SliceService {
     // The rows of the measurements, read by the client's own query.
     async fn responses(&self, request: &SliceRequest) -> Result<RecordBatch, RequestFault> {
-        let service = self.0.catalogue.service();
-        let session = Arc::new(service.session(&request.client));
-        let columns = format!("run_id, {}", SOFA_COLUMNS.join(", "));
-        let (select, predicate) = (request.question.select_of(&columns), request.question.predicate().to_owned());
-        let (asking, form) = (session.clone(), request.question.form);
-        let sql =
-            service.plan(&request.client, async move { Ok(asking.selecting(&select, &predicate, form)?) }).await?;
-        let job = QueryJob {
-            protocol: ServerProtocol::Http,
-            session,
-            work: QueryWork::Sql(sql),
-            limit: None,
-            stop: StopSignal::new(),
-        };
+        let select = request.question.select_of(&format!("run_id, {}", SOFA_COLUMNS.join(", ")));
+        let mut running = request.begin(self.0.catalogue.service(), select).await?;
         let most = self.0.catalogue.lake().grid().pairs().len();
-        let mut running = service.begin(job, |_| Ok(BatchEncoder)).await?;
         let mut batches: Vec<RecordBatch> = Vec::new();
         while let Some(batch) = running.next().await? {
             batches.push(batch);

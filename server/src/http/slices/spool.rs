@@ -29,7 +29,7 @@ pub(in crate::http) trait PieceSource: Send {
     /// The next bytes; None after the last.
     ///
     /// # Errors
-    /// What keeps it from coming to its end.
+    /// Cause that it does not come to its end.
     fn next_piece(&mut self) -> impl Future<Output = Result<Option<Bytes>, RequestFault>> + Send;
 }
 
