@@ -7,30 +7,11 @@
 set -euo pipefail
 echolake=$(realpath "${1:?the program}")
 seed=${2:-1}
-here=$(cd "$(dirname "$0")" && pwd)
-port=${CEPH_RGW_PORT:-7480}
-work=$(mktemp -d)
-proxy=
-finish() {
-    [ -z "$proxy" ] || kill "$proxy" 2>/dev/null || true
-    rm -rf "$work"
-}
-trap finish EXIT
-"$here/ceph_rgw.sh" start >"$work/store.env"
-set -a
-# shellcheck disable=SC1091
-. "$work/store.env"
-set +a
-direct=$AWS_ENDPOINT_URL
-listen=$((port + 10))
-python3 "$here/s3_fault_proxy.py" --listen $listen --upstream "127.0.0.1:$port" --seed "$seed" \
-    --fault 'put,_delta_log,0.15,reply-lost' --fault 'put,_delta_log,0.10,done-500' --fault 'put,_delta_log,0.10,409' \
-    --fault 'get,prefix=,0.08,half-answer' --fault 'get,parquet,0.05,half-answer' --fault 'put,parquet,0.05,half-request' \
-    --fault 'get,,0.05,503' --fault '*,,0.02,reset' >"$work/proxy.log" &
-proxy=$!
-export AWS_ENDPOINT_URL=http://127.0.0.1:$listen
+# shellcheck source=tests/object_stores/faulty_gateway.sh
+. "$(dirname "$0")/faulty_gateway.sh" "$seed" 'put,_delta_log,0.15,reply-lost' 'put,_delta_log,0.10,done-500' \
+    'put,_delta_log,0.10,409' 'get,prefix=,0.08,half-answer' 'get,parquet,0.05,half-answer' \
+    'put,parquet,0.05,half-request' 'get,,0.05,503' '*,,0.02,reset'
 
-cd "$work"
 cp "$here/../fixtures/small_rig.toml" rig.toml
 mkdir copies
 for surface in flat foam wood prd brick wavy; do

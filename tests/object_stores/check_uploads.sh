@@ -8,34 +8,15 @@
 set -euo pipefail
 echolake=$(realpath "${1:?the program}")
 seed=${2:-1}
-here=$(cd "$(dirname "$0")" && pwd)
-port=${CEPH_RGW_PORT:-7480}
-work=$(mktemp -d)
-proxy=
-finish() {
-    [ -z "$proxy" ] || kill "$proxy" 2>/dev/null || true
-    rm -rf "$work"
-}
-trap finish EXIT
 fail() {
     echo "FAILED: $*; seed $seed" >&2
     exit 1
 }
 export CEPH_RGW_BYTES=${CEPH_RGW_BYTES:-$((8 << 30))}
-"$here/ceph_rgw.sh" start >"$work/store.env"
-set -a
-# shellcheck disable=SC1091
-. "$work/store.env"
-set +a
-direct=$AWS_ENDPOINT_URL
-listen=$((port + 10))
-python3 "$here/s3_fault_proxy.py" --listen $listen --upstream "127.0.0.1:$port" --seed "$seed" \
-    --fault 'put,partNumber,0.03,reply-lost' --fault 'put,partNumber,0.03,half-request' --fault 'post,uploadId,0.5,done-500' \
-    --fault 'put,_claims,0.10,reply-lost' --fault 'put,_delta_log,0.10,reply-lost' --fault 'put,_delta_log,0.10,409' \
-    --fault 'get,prefix=,0.05,half-answer' --fault 'get,,0.03,503' --fault '*,,0.01,reset' >"$work/proxy.log" &
-proxy=$!
-export AWS_ENDPOINT_URL=http://127.0.0.1:$listen
-cd "$work"
+# shellcheck source=tests/object_stores/faulty_gateway.sh
+. "$(dirname "$0")/faulty_gateway.sh" "$seed" 'put,partNumber,0.03,reply-lost' 'put,partNumber,0.03,half-request' \
+    'post,uploadId,0.5,done-500' 'put,_claims,0.10,reply-lost' 'put,_delta_log,0.10,reply-lost' \
+    'put,_delta_log,0.10,409' 'get,prefix=,0.05,half-answer' 'get,,0.03,503' '*,,0.01,reset'
 
 upload_large_run() {
     local run=${LARGE_RUN:-} lines parts cut upload path
