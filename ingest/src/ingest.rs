@@ -119,7 +119,7 @@ struct IngestWork {
     shared: Option<SharedWork>,
 }
 
-/// What an ingest needs to share its work with others.
+/// The parts of an ingest that shares its work with others.
 #[derive(Clone)]
 struct SharedWork {
     claims: Arc<WorkClaims>,

@@ -41,7 +41,7 @@ const BUCKETS: [f64; 7] = [0.003, 0.01, 0.03, 0.1, 0.3, 1.0, 10.0];
 /// The outcome of a query that was answered to its end.
 const ANSWERED: &str = "answered";
 
-/// What is counted since the start.
+/// Counters since the start.
 pub(crate) struct ServerMetrics {
     registry: Registry,
     queries: IntCounterVec,

@@ -21,7 +21,7 @@ const SALT_BYTES: usize = 16;
 /// Iterations of a verifier at most: its client has to compute them.
 const MOST_ITERATIONS: u32 = 1_000_000;
 
-/// What is known of a token.
+/// Verifier of a token.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct ScramVerifier {
     iterations: NonZeroU32,

@@ -30,7 +30,7 @@ use crate::signals::StopRequest;
 /// Memory for queries, and engines at once, by default.
 pub(super) const MEMORY_MIB: u32 = 4096;
 const ENGINES: u32 = 16;
-/// What a query reads at least to be spread, by default: a second of one core's work.
+/// Least MiB that a query reads to be spread, by default: a second of one core's work.
 const SPREAD_MIB: u32 = 64;
 /// Time for which the demo's answers may go on after Ctrl-C.
 const CATALOGUE_DRAIN: Duration = Duration::from_secs(5);

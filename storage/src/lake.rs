@@ -32,7 +32,7 @@ struct OpenLake {
     grid: Grid,
     #[cfg(feature = "tables")]
     log: Arc<DeltaLog>,
-    /// What is seen of the log, if that is not all.
+    /// The part of the log that is seen, if not all.
     #[cfg(feature = "tables")]
     projects: Option<ProjectLog>,
 }

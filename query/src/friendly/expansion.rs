@@ -47,7 +47,7 @@ fn query_of_sql(sql: &mut Sql) -> Option<&mut Query> {
     }
 }
 
-/// Where a query stands: as a table its names are its own tables', in an expression those around as well.
+/// Place of a query: as a table its names are its own tables', in an expression those around as well.
 #[derive(Clone, Copy, PartialEq, Eq)]
 enum QueryPosition {
     Table,

@@ -66,7 +66,7 @@ pub struct SpreadCounts {
 pub struct WorkerStatus {
     /// Its address.
     pub url: String,
-    /// What keeps it from being used; None if nothing does.
+    /// Reason not to use it; None if there is none.
     pub problem: Option<String>,
 }
 

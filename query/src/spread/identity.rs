@@ -1,4 +1,4 @@
-//! What a worker and an engine must have in common before they work together: the build, the lake, and a secret.
+//! Common ground of a worker and an engine, without which they do not work together: the build, the lake, and a secret.
 
 use std::fmt;
 

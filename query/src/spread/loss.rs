@@ -12,7 +12,7 @@ use super::guard::OVER;
 const MARK: &str = "worker lost: ";
 /// The beginning of a tonic status as text: one worker's error about another.
 const STATUS: &str = "code: '";
-/// What a worker says whose plan never came, because its sender, or the way to it, is gone.
+/// Text of a worker whose plan never came, because its sender, or the way to it, is gone.
 const NO_PLAN: &str = "timed-out while waiting for the plan";
 
 /// A worker did not answer, or not to the end.

@@ -19,7 +19,7 @@ pub trait SystemSource: std::fmt::Debug + Send + Sync {
     /// Returns the rows of a table, as they are now.
     ///
     /// # Errors
-    /// Why there are none.
+    /// Reason that there are none.
     async fn rows(&self, table: &'static str) -> std::result::Result<RecordBatch, String>;
 }
 

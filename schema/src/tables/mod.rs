@@ -79,7 +79,7 @@ impl Table {
         TableDefinition::of(self).name
     }
 
-    /// What a row of it is.
+    /// Meaning of a row of it.
     pub fn meaning(self) -> &'static str {
         match self {
             Self::Surfaces => "One row per surface: its description, as its newest run has it.",

@@ -21,7 +21,7 @@ use crate::door::connection_places::OpenConnections;
 use crate::metrics::ServerMetrics;
 use crate::tokens::TokenScope;
 
-/// What the door knows of the server.
+/// The door's knowledge of the server.
 pub(crate) struct ServerActivity {
     pub(crate) metrics: ServerMetrics,
     pub(crate) queries: QueryLog,

@@ -52,11 +52,11 @@ struct EnginePoolState {
     freed: Notify,
     started: AtomicUsize,
     failed: AtomicU64,
-    /// How the last start of an engine went; None until the first has.
+    /// Outcome of the last start of an engine; None before the first.
     last_start: Mutex<Option<StartOutcome>>,
 }
 
-/// How the start of an engine went.
+/// Outcome of an engine's start.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum StartOutcome {
     Ready,

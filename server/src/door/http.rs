@@ -31,7 +31,7 @@ use crate::metrics::ServerProtocol;
 use crate::request_span::{REQUEST_ID, begin_request};
 use crate::signed_address::{SIGNED_FILES, SignedAddress};
 
-/// Where a browser shows a token.
+/// Path to which a browser shows a token.
 const SESSION_PATH: &str = "/api/v1/session";
 /// Connections at once. Systems often allow a process 1024 open files.
 const MOST: usize = 512;

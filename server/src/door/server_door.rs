@@ -78,7 +78,7 @@ impl ServerDoor {
         &self.0.activity.metrics
     }
 
-    /// What the server does.
+    /// Queries and connections of the server.
     pub(crate) fn activity(&self) -> &ServerActivity {
         &self.0.activity
     }

@@ -15,7 +15,7 @@ use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
 const LANDLOCK: ABI = ABI::V5;
 /// The process's own figures, those of the processors, and random bytes.
 const SYSTEM: [&str; 4] = ["/proc", "/sys/fs/cgroup", "/sys/devices/system/cpu", "/dev/urandom"];
-/// What names of other machines are looked up with.
+/// Files with which names of other machines are looked up.
 const NAMES: [&str; 5] =
     ["/etc/resolv.conf", "/etc/hosts", "/etc/nsswitch.conf", "/etc/host.conf", "/run/systemd/resolve"];
 /// Address space over what queries may hold, for a process that is running: stacks of threads that are still to come,

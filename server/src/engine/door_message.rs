@@ -9,7 +9,7 @@ use crate::client_identity::ClientIdentity;
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub(crate) enum DoorMessage {
-    /// Whose engine it is; the first line.
+    /// The client of the engine; the first line.
     Client(ClientIdentity),
     /// Cancel the query with this number.
     Cancel(u64),

@@ -26,7 +26,7 @@ pub(crate) enum EngineReport {
     Failure(FaultCode),
     /// State of the lake; None if it cannot be read.
     Lake(Option<LakeFigures>),
-    /// What it read of an object store through its cache since the last such line.
+    /// Counts of its cache of an object store since the last such line.
     Cache(CacheCounts),
     /// Queries over workers since the last such line.
     Spread(SpreadCounts),

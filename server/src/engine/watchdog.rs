@@ -52,7 +52,7 @@ fn watch(service: &QueryService) {
     }
 }
 
-/// What the door knows of workers.
+/// The door's knowledge of workers.
 #[derive(Default)]
 struct ReportedCluster {
     counts: SpreadCounts,

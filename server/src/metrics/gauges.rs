@@ -16,7 +16,7 @@ pub(crate) struct ServerGauges {
     pub(crate) pool: PoolGauges,
     /// Open connections of each protocol that is served, and their limit.
     pub(crate) connections: Vec<(ServerProtocol, usize, usize)>,
-    /// What was last found in the lake, and how long ago.
+    /// The last figures of the lake, and their age.
     pub(crate) lake: Option<(Duration, LakeFigures)>,
     pub(crate) is_ready: bool,
     /// Seconds since 1970.

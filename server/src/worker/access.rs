@@ -1,4 +1,4 @@
-//! Who may use a worker, and how an engine proves that it is one of them.
+//! Access to a worker, and an engine's proof that it may use one.
 
 use std::path::Path;
 
@@ -8,7 +8,7 @@ use tonic::{Request, Status};
 
 use crate::Error;
 
-/// How workers and engines reach each other.
+/// Connection between workers and engines.
 #[derive(Debug, Clone, Default)]
 pub struct WorkerLink {
     /// The secret that they share; None on one machine.

@@ -46,7 +46,7 @@ const STEP_GRACE: Duration = Duration::from_secs(2);
 pub struct WorkerSettings {
     /// Its address; port 0 for any that is free.
     pub address: SocketAddr,
-    /// Who may use it.
+    /// Access to it.
     pub link: WorkerLink,
     /// Bytes that all its tasks may hold together.
     pub memory: usize,

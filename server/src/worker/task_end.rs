@@ -16,7 +16,7 @@ use tonic::Status;
 /// The end of the path of the call that sends a task.
 const TASK_CALL: &str = "/CoordinatorChannel";
 
-/// What calls need beside their request.
+/// State of calls beside their request.
 #[derive(Clone)]
 pub(super) struct WorkerCalls {
     pub(super) tasks: SpreadTasks,

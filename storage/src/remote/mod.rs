@@ -35,7 +35,7 @@ pub(crate) use part_store::PartStore;
 pub(crate) use retrying::backoff;
 pub(crate) use retrying::{RetriedError, RetryingStore};
 
-/// What an object store does beyond reads and writes of whole objects.
+/// Abilities of an object store beyond reads and writes of whole objects.
 #[derive(Debug, Default)]
 pub(crate) struct RemoteStore {
     /// The result of the probe that writers make first.

@@ -194,7 +194,7 @@ fn name(parts: &[RunPart]) -> FileName {
     FileName::Merged { digest: hex::encode(sha.finalize())[..DIGEST_DIGITS].to_owned() }
 }
 
-/// Who reads a run's rows.
+/// Readers of a run's rows.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
 enum RunAudience {
     /// All projects.

@@ -28,7 +28,7 @@ pub(super) struct UploadJournal {
     parts: BTreeMap<usize, String>,
 }
 
-/// What makes an upload the same one.
+/// Identity of an upload.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 struct UploadHead {
     location: String,

@@ -275,7 +275,7 @@ export interface paths {
         };
         /**
          * The responses of one run's measurements as SOFA (AES69, convention SingleRoomSRIR 1.0).
-         * @description What `export sofa` writes of the same measurements. Needs the scopes sql and files.
+         * @description The file that `export sofa` writes of the same measurements. Needs the scopes sql and files.
          */
         readonly get: operations["sofa"];
         readonly put?: never;

@@ -42,7 +42,7 @@ fn sasl_message(code: i32, content: &[u8]) -> BytesMut {
 /// A login after the client's first message.
 pub(super) struct ScramExchange<'a> {
     verifier: &'a ScramVerifier,
-    /// What the client's last message must say about the certificate.
+    /// The client's last message must say this about the certificate.
     binding: Vec<u8>,
     nonce: String,
     /// The first messages of both.

@@ -100,7 +100,7 @@ impl LakeCatalogue {
         cached(table_routes(), TokenScope::Sql).merge(cached(file_routes(), TokenScope::Files))
     }
 
-    /// What the endpoint of a surface answers.
+    /// Returns the answer of a surface's endpoint.
     ///
     /// # Errors
     /// [`RequestFault::NotFound`], or those of its queries.
@@ -110,7 +110,7 @@ impl LakeCatalogue {
         Box::pin(surface::surface(Extension(request), path)).await.map_err(|problem| problem.0)?.value()
     }
 
-    /// What the endpoint of a run answers.
+    /// Returns the answer of a run's endpoint.
     ///
     /// # Errors
     /// As [`LakeCatalogue::surface_value`].

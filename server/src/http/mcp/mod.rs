@@ -38,7 +38,7 @@ const INSTRUCTIONS: &str = "A lake of acoustic measurements: impulse responses b
     per surface. SQL is DataFusion's with functions of the field (list_functions). Answers of `query` are cut off at a number \
     of rows and bytes and say so, so aggregate in SQL instead of fetching rows. Links lead to pages for people.";
 
-/// What the tools ask.
+/// The catalogue that tools ask, and its slices.
 #[derive(Clone)]
 pub(in crate::http) struct AgentService {
     catalogue: LakeCatalogue,

@@ -84,7 +84,7 @@ struct PageQuery {
     page_token: Option<usize>,
 }
 
-/// What is asked of a table. Hints about predicates are not followed: files that they would leave out are listed.
+/// A question about a table. Hints about predicates are not followed: files that they would leave out are listed.
 #[derive(Default, Deserialize)]
 #[serde(rename_all = "camelCase")]
 struct TableQuery {

@@ -1,4 +1,4 @@
-//! What is shared: the tables, and the views without lists, for programs that have no use for 384 samples in a cell.
+//! The shared tables: the tables, and the views without lists, for programs that have no use for 384 samples in a cell.
 
 use arrow::datatypes::SchemaRef;
 use echolake_lake::delta_schema;
