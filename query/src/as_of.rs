@@ -12,13 +12,14 @@ use std::str::CharIndices;
 
 use datafusion::sql::parser::Statement;
 use datafusion::sql::sqlparser::ast::{
-    Ident, ObjectName, ObjectNamePart, Statement as Sql, TableAlias, TableFactor, VisitMut as _, VisitorMut,
+    Ident, ObjectName, ObjectNamePart, Statement as Sql, TableAlias, TableFactor, VisitorMut,
 };
 use datafusion::sql::sqlparser::dialect::GenericDialect;
 use datafusion::sql::sqlparser::tokenizer::{Location, Token, TokenWithSpan, Tokenizer};
 use echolake_lake::LakeMoment;
 
 use crate::Error;
+use crate::syntax_walk::walk_mut;
 
 /// Separator between a table's name and the moment.
 const MARK: char = '@';
@@ -163,7 +164,7 @@ pub(crate) fn named(statement: &mut Statement) -> BTreeSet<PastTableName> {
 
 fn named_in(sql: &mut Sql) -> BTreeSet<PastTableName> {
     let mut found = PastTableVisitor::default();
-    let ControlFlow::<()>::Continue(()) = sql.visit(&mut found) else { return BTreeSet::new() };
+    let ControlFlow::<()>::Continue(()) = walk_mut(sql, &mut found) else { return BTreeSet::new() };
     found.0
 }
 

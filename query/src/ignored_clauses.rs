@@ -6,10 +6,11 @@ use std::ops::ControlFlow;
 use datafusion::sql::parser::Statement;
 use datafusion::sql::sqlparser::ast::{
     Expr, Function, FunctionArgumentClause, FunctionArguments, Join, JoinConstraint, JoinOperator, ObjectName,
-    ObjectNamePart, Query, Select, TableFactor, TableWithJoins, Visit as _, Visitor,
+    ObjectNamePart, Query, Select, TableFactor, TableWithJoins, Visitor,
 };
 
 use crate::Error;
+use crate::syntax_walk::walk;
 
 /// Aliases that are the first word of a kind of join which the parser does not know.
 const JOIN_WORDS: [&str; 2] = ["POSITIONAL", "ASOF"];
@@ -24,7 +25,7 @@ const NEAREST: &str = "JOIN ... ON a.t >= b.t QUALIFY row_number() over (partiti
 /// [`Error::Query`] with the clause and what to write instead.
 pub(crate) fn check(statement: &Statement, sql: &str, is_scalar: &dyn Fn(&str) -> bool) -> Result<(), Error> {
     match statement {
-        Statement::Statement(parsed) => match parsed.visit(&mut ClauseVisitor { is_scalar }) {
+        Statement::Statement(parsed) => match walk(parsed.as_ref(), &mut ClauseVisitor { is_scalar }) {
             ControlFlow::Break(ignored) => Err(Error::clause(sql, &ignored.clause, ignored.hint)),
             ControlFlow::Continue(()) => Ok(()),
         },

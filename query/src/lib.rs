@@ -47,6 +47,7 @@ mod small;
 mod spread;
 mod statement_bounds;
 mod summarize;
+mod syntax_walk;
 mod system;
 mod table;
 mod views;
@@ -64,5 +65,6 @@ pub use spread::{
     WorkerStatus, WorkerToken,
 };
 pub use statement_bounds::check_statement_bounds;
+pub use syntax_walk::{walk_expr, walk_statement};
 pub use system::SystemSource;
 pub use views::table_meaning;

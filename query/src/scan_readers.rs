@@ -1,7 +1,9 @@
-//! Readers of data files. If the lake has a cache, each tells `EXPLAIN ANALYZE` what the cache had.
+//! Readers of data files, which read a footer once for all that ask at the same time. If the lake has a cache, each tells
+//! `EXPLAIN ANALYZE` what the cache had.
 
+use std::collections::HashMap;
 use std::ops::Range;
-use std::sync::Arc;
+use std::sync::{Arc, Mutex, PoisonError, Weak};
 
 use bytes::Bytes;
 use datafusion::datasource::listing::PartitionedFile;
@@ -13,21 +15,24 @@ use datafusion::physical_plan::metrics::{Count, ExecutionPlanMetricsSet, MetricB
 use echolake_lake::{CacheCounters, CacheCounts, Lake};
 use futures::FutureExt as _;
 use futures::future::BoxFuture;
+use object_store::path::Path;
 use parquet::arrow::arrow_reader::ArrowReaderOptions;
 use parquet::arrow::async_reader::AsyncFileReader;
 use parquet::errors::Result as ParquetResult;
 use parquet::file::metadata::ParquetMetaData;
+use tokio::sync::Mutex as AsyncMutex;
 
 /// Makes readers of a lake's data files, which share the files' footers.
 #[derive(Debug)]
 pub(crate) struct LakeReaderFactory {
     lake: Lake,
     metadata: Arc<FileMetadataCache>,
+    footer_reads: FooterReads,
 }
 
 impl LakeReaderFactory {
     pub(crate) fn new(lake: &Lake, metadata: Arc<FileMetadataCache>) -> Self {
-        Self { lake: lake.clone(), metadata }
+        Self { lake: lake.clone(), metadata, footer_reads: FooterReads::default() }
     }
 }
 
@@ -42,8 +47,10 @@ impl ParquetFileReaderFactory for LakeReaderFactory {
         let counters = Arc::new(CacheCounters::default());
         let cached = self.lake.store_for_scan(counters.clone());
         let store = cached.clone().unwrap_or_else(|| self.lake.store());
+        let footer_read = self.footer_reads.of(&file.object_meta.location);
         let readers = CachedParquetFileReaderFactory::new(store, self.metadata.clone());
         let reader = readers.create_reader(partition_index, file, metadata_size_hint, metrics)?;
+        let reader = Box::new(FooterReader { reader, footer_read });
         if cached.is_none() {
             return Ok(reader);
         }
@@ -58,6 +65,51 @@ impl ParquetFileReaderFactory for LakeReaderFactory {
     }
 }
 
+/// Locks of the files that have readers: partitions of one file ask for its footer at the same time, and the second one
+/// finds it in the cache.
+#[derive(Debug, Default)]
+struct FooterReads(Mutex<HashMap<Path, Weak<AsyncMutex<()>>>>);
+
+impl FooterReads {
+    fn of(&self, path: &Path) -> Arc<AsyncMutex<()>> {
+        let mut reads = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some(read) = reads.get(path).and_then(Weak::upgrade) {
+            return read;
+        }
+        reads.retain(|_, read| read.strong_count() > 0);
+        let read = Arc::default();
+        reads.insert(path.clone(), Arc::downgrade(&read));
+        read
+    }
+}
+
+/// A reader that waits while another one reads the file's footer.
+struct FooterReader {
+    reader: Box<dyn AsyncFileReader + Send>,
+    footer_read: Arc<AsyncMutex<()>>,
+}
+
+impl AsyncFileReader for FooterReader {
+    fn get_bytes(&mut self, range: Range<u64>) -> BoxFuture<'_, ParquetResult<Bytes>> {
+        self.reader.get_bytes(range)
+    }
+
+    fn get_byte_ranges(&mut self, ranges: Vec<Range<u64>>) -> BoxFuture<'_, ParquetResult<Vec<Bytes>>> {
+        self.reader.get_byte_ranges(ranges)
+    }
+
+    fn get_metadata<'a>(
+        &'a mut self,
+        options: Option<&'a ArrowReaderOptions>,
+    ) -> BoxFuture<'a, ParquetResult<Arc<ParquetMetaData>>> {
+        async move {
+            let _reading = self.footer_read.lock().await;
+            self.reader.get_metadata(options).await
+        }
+        .boxed()
+    }
+}
+
 /// Metrics of a scan.
 struct CacheMetrics {
     memory_hits: Count,
@@ -68,7 +120,7 @@ struct CacheMetrics {
 
 /// A reader that reports after each read.
 struct CountingReader {
-    reader: Box<dyn AsyncFileReader + Send>,
+    reader: Box<FooterReader>,
     counters: Arc<CacheCounters>,
     reported: CacheCounts,
     counts: CacheMetrics,
@@ -115,5 +167,25 @@ impl AsyncFileReader for CountingReader {
             read
         }
         .boxed()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[tokio::test]
+    async fn readers_of_a_footer_wait_for_each_other_and_leave_nothing() {
+        let reads = FooterReads::default();
+        let (file, other) = (Path::from("a.parquet"), Path::from("b.parquet"));
+        let first = reads.of(&file);
+        let reading = first.lock().await;
+        assert!(reads.of(&file).try_lock().is_err());
+        assert!(reads.of(&other).try_lock().is_ok());
+        drop(reading);
+        assert!(reads.of(&file).try_lock().is_ok());
+        drop(first);
+        let _third = reads.of(&other);
+        assert_eq!(reads.0.lock().unwrap().len(), 1);
     }
 }

@@ -8,14 +8,14 @@ use std::ops::ControlFlow;
 use datafusion::execution::session_state::SessionState;
 use datafusion::logical_expr::Volatility;
 use datafusion::sql::sqlparser::ast::{
-    Expr, LambdaFunction, OneOrManyWithParens, Query, Select, SelectItem, Visit as _, VisitMut as _, Visitor,
-    VisitorMut,
+    Expr, LambdaFunction, OneOrManyWithParens, Query, Select, SelectItem, Visitor, VisitorMut,
 };
 
 use super::budget::RewriteBudget;
 use super::columns::{SourceColumns, refused};
 use super::tree;
 use crate::Error;
+use crate::syntax_walk::{walk, walk_mut};
 
 /// Maximum length of a chain of aliases of aliases.
 const MOST_CHAINED: usize = 30;
@@ -78,7 +78,7 @@ fn substitute(
     budget: &mut RewriteBudget,
 ) -> Result<usize, Error> {
     let mut visitor = AliasVisitor { known, budget, chained: 0, queries: 0, shadows: Vec::new() };
-    match expr.visit(&mut visitor) {
+    match walk_mut(expr, &mut visitor) {
         ControlFlow::Continue(()) => Ok(visitor.chained),
         ControlFlow::Break(error) => Err(*error),
     }
@@ -93,12 +93,12 @@ fn expr_of(item: &SelectItem) -> Option<&Expr> {
 
 fn names(expr: &Expr) -> HashSet<String> {
     let mut found = BareNameVisitor::default();
-    let ControlFlow::<()>::Continue(()) = expr.visit(&mut found) else { return HashSet::new() };
+    let ControlFlow::<()>::Continue(()) = walk(expr, &mut found) else { return HashSet::new() };
     found.0
 }
 
 fn is_volatile(expr: &Expr, state: &SessionState) -> bool {
-    expr.visit(&mut VolatileVisitor(state)).is_break()
+    walk(expr, &mut VolatileVisitor(state)).is_break()
 }
 
 #[derive(Default)]

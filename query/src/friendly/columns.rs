@@ -11,8 +11,8 @@ use datafusion::error::{DataFusionError, Result as PlanResult};
 use datafusion::execution::session_state::SessionState;
 use datafusion::sql::sqlparser::ast::{
     Array, ExceptSelectItem, ExcludeSelectItem, Expr, ExprWithAlias, Function, FunctionArg, FunctionArgExpr,
-    FunctionArguments, Ident, LambdaFunction, ObjectName, OneOrManyWithParens, Value, ValueWithSpan, Visit as _,
-    VisitMut as _, Visitor, VisitorMut, WildcardAdditionalOptions,
+    FunctionArguments, Ident, LambdaFunction, ObjectName, OneOrManyWithParens, Value, ValueWithSpan, Visitor,
+    VisitorMut, WildcardAdditionalOptions,
 };
 use datafusion::sql::sqlparser::tokenizer::Location;
 use regex::RegexBuilder;
@@ -20,6 +20,7 @@ use regex::RegexBuilder;
 use super::budget::RewriteBudget;
 use super::tree;
 use crate::Error;
+use crate::syntax_walk::{walk, walk_mut};
 
 /// Maximum size of a compiled regular expression, bytes.
 const REGEX_BYTES: usize = 1 << 16;
@@ -215,13 +216,13 @@ pub(super) fn place(function: &Function) -> Location {
 /// Returns the calls of `COLUMNS` in an expression, outermost first.
 pub(super) fn calls(expr: &Expr) -> Vec<Function> {
     let mut found = CallVisitor(Vec::new());
-    let ControlFlow::<()>::Continue(()) = expr.visit(&mut found) else { return Vec::new() };
+    let ControlFlow::<()>::Continue(()) = walk(expr, &mut found) else { return Vec::new() };
     found.0
 }
 
 /// Replaces the calls of `COLUMNS` in an expression by columns, in the order of [`calls`].
 pub(super) fn replace(expr: &mut Expr, columns: Vec<Expr>) {
-    let ControlFlow::<()>::Continue(()) = expr.visit(&mut ReplaceVisitor(columns.into_iter())) else { return };
+    let ControlFlow::<()>::Continue(()) = walk_mut(expr, &mut ReplaceVisitor(columns.into_iter())) else { return };
 }
 
 /// Returns an error with a hint and without a place.

@@ -9,8 +9,7 @@ use datafusion::sql::parser::Statement;
 use datafusion::sql::sqlparser::ast::helpers::attached_token::AttachedToken;
 use datafusion::sql::sqlparser::ast::{
     Cte, Expr, ExprWithAlias, OrderBy, OrderByExpr, OrderByKind, PivotValueSource, Query, Select, SelectItem, SetExpr,
-    Statement as Sql, TableAlias, TableFactor, TableWithJoins, Values, VisitMut as _, VisitorMut,
-    WildcardAdditionalOptions, With,
+    Statement as Sql, TableAlias, TableFactor, TableWithJoins, Values, VisitorMut, WildcardAdditionalOptions, With,
 };
 use futures::FutureExt as _;
 use futures::future::BoxFuture;
@@ -20,6 +19,7 @@ use super::columns::{self, ChosenColumn, SourceColumns, refused};
 use super::select_items::{self, SelectExpansion};
 use super::{aliases, pivot, tree};
 use crate::Error;
+use crate::syntax_walk::walk_mut;
 
 /// Writes out `COLUMNS`, `RENAME`, `PIVOT`, `UNPIVOT`, fields of structs and aliases that are used again.
 ///
@@ -271,10 +271,10 @@ impl SubqueryVisitor {
 
     fn walk(&mut self, select: &mut Select) {
         for item in &mut select.projection {
-            let ControlFlow::<()>::Continue(()) = item.visit(self) else { return };
+            let ControlFlow::<()>::Continue(()) = walk_mut(item, self) else { return };
         }
         for condition in [&mut select.selection, &mut select.having, &mut select.qualify].into_iter().flatten() {
-            let ControlFlow::<()>::Continue(()) = condition.visit(self) else { return };
+            let ControlFlow::<()>::Continue(()) = walk_mut(condition, self) else { return };
         }
     }
 }

@@ -5,13 +5,14 @@ use std::ops::ControlFlow;
 
 use datafusion::sql::sqlparser::ast::{
     Array, BinaryOperator, Expr, ExprWithAlias, Function, GroupByExpr, Ident, NullInclusion, Select, SelectItem,
-    TableFactor, TableWithJoins, Value, ValueWithSpan, Visit as _, Visitor, WildcardAdditionalOptions,
+    TableFactor, TableWithJoins, Value, ValueWithSpan, Visitor, WildcardAdditionalOptions,
 };
 
 use super::budget::RewriteBudget;
 use super::columns::{ChosenColumn, SourceColumns};
 use super::tree;
 use crate::Error;
+use crate::syntax_walk::walk;
 
 /// Returns the select that has a column per value and aggregate: `sum(x) FILTER (WHERE column = value) AS "value"`.
 ///
@@ -54,7 +55,7 @@ pub(super) fn groups(source: &SourceColumns, aggregates: &[ExprWithAlias], colum
     let mut named = NameVisitor::default();
     let exprs = aggregates.iter().map(|aggregate| &aggregate.expr).chain([column]);
     for expr in exprs {
-        let ControlFlow::<()>::Continue(()) = expr.visit(&mut named) else { continue };
+        let ControlFlow::<()>::Continue(()) = walk(expr, &mut named) else { continue };
     }
     source.iter().filter(|column| !named.0.contains(&column.name)).map(|column| column.expr()).collect()
 }

@@ -7,14 +7,14 @@ use datafusion::sql::sqlparser::ast::helpers::attached_token::AttachedToken;
 use datafusion::sql::sqlparser::ast::{
     AccessExpr, CaseWhen, Expr, Fetch, Function, FunctionArg, FunctionArgExpr, FunctionArgumentClause,
     FunctionArguments, Ident, JoinOperator, LimitClause, ObjectName, ObjectNamePart, OrderByExpr, OrderByOptions,
-    Query, Select, SelectFlavor, SelectItem, Subscript, Value, ValueWithSpan, VisitMut as _, VisitorMut,
-    WildcardAdditionalOptions,
+    Query, Select, SelectFlavor, SelectItem, Subscript, Value, ValueWithSpan, VisitorMut, WildcardAdditionalOptions,
 };
 
 use super::budget::RewriteBudget;
 use super::columns::refused;
 use super::tree;
 use crate::Error;
+use crate::syntax_walk::walk_mut;
 
 /// Aggregates that take the first argument at the greatest (true) or least value of the second.
 const ARGUMENT_AT_EXTREME: [(&str, bool); 6] =
@@ -36,7 +36,7 @@ const SCHEMAS: [&str; 4] = ["pg_catalog", "information_schema", "public", "dataf
 /// [`Error::Query`] if the statement would become too long.
 pub(crate) fn rewrite(statement: &mut Statement) -> Result<(), Error> {
     match statement {
-        Statement::Statement(sql) => match sql.visit(&mut FriendlyVisitor { budget: RewriteBudget::new() }) {
+        Statement::Statement(sql) => match walk_mut(sql, &mut FriendlyVisitor { budget: RewriteBudget::new() }) {
             ControlFlow::Break(error) => Err(*error),
             ControlFlow::Continue(()) => Ok(()),
         },

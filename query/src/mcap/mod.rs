@@ -36,11 +36,12 @@ use datafusion::logical_expr::Expr;
 use datafusion::prelude::SessionContext;
 use datafusion::sql::parser::Statement;
 use datafusion::sql::sqlparser::ast::{
-    Expr as SqlExpr, FunctionArg, FunctionArgExpr, ObjectNamePart, TableFactor, VisitMut as _, VisitorMut,
+    Expr as SqlExpr, FunctionArg, FunctionArgExpr, ObjectNamePart, TableFactor, VisitorMut,
 };
 use echolake_lake::LakeSnapshot;
 
 use crate::Error;
+use crate::syntax_walk::walk_mut;
 pub use contents::{Contents, Topic};
 pub(crate) use contents::{attachment, contents};
 use error::Fault;
@@ -143,7 +144,7 @@ fn calls(statement: &mut Statement) -> Vec<Call> {
     let mut calls = Calls(Vec::new());
     match statement {
         Statement::Statement(sql) => {
-            let _ = sql.visit(&mut calls);
+            let _ = walk_mut(sql.as_mut(), &mut calls);
         }
         Statement::Explain(explain) => return self::calls(&mut explain.statement),
         _ => {}

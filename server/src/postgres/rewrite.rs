@@ -5,10 +5,11 @@ use std::ops::ControlFlow;
 use datafusion::sql::sqlparser::ast::{
     AccessExpr, BinaryOperator, Expr, Function, FunctionArg, FunctionArgExpr, FunctionArgumentList, FunctionArguments,
     GroupByExpr, Ident, ObjectName, ObjectNamePart, Query, Select, SelectItem, SetExpr, Statement, TableAlias,
-    TableAliasColumnDef, TableFactor, UnaryOperator, Value, ValueWithSpan, VisitMut, VisitorMut,
+    TableAliasColumnDef, TableFactor, UnaryOperator, Value, ValueWithSpan, VisitorMut,
 };
 use datafusion::sql::sqlparser::dialect::PostgreSqlDialect;
 use datafusion::sql::sqlparser::parser::Parser;
+use echolake_query::{walk_expr, walk_statement};
 use pgwire::api::Type;
 
 use super::column_names::{name_columns, order_by_columns};
@@ -87,7 +88,7 @@ pub(super) fn rewrite(mut statement: Statement, types: &[Option<Type>]) -> State
         return known;
     }
     // It never breaks off.
-    let _ = statement.visit(&mut StatementAdapter(types));
+    let _ = walk_statement(&mut statement, &mut StatementAdapter(types));
     type_integers(&mut statement);
     statement
 }
@@ -219,7 +220,7 @@ impl VisitorMut for StatementAdapter<'_> {
         for item in &mut select.projection {
             if let SelectItem::UnnamedExpr(expr) | SelectItem::ExprWithAlias { expr, .. } = item {
                 // It never breaks off.
-                let _ = VisitMut::visit(expr, &mut ExistsAdapter { depth: 0 });
+                let _ = walk_expr(expr, &mut ExistsAdapter { depth: 0 });
             }
         }
         ControlFlow::Continue(())
