@@ -25,7 +25,7 @@ use quick_cache::sync::Cache;
 
 use crate::as_of::{self, PastTableName};
 use crate::mcap::{self, Contents};
-use crate::system::{self, SystemSource};
+use crate::system;
 use crate::table::{FileReaders, LakeTable};
 use crate::views::{LakeView, LookupFunctions, PairJoin, SortedNulls, UnusedJoin};
 use crate::{Error, error};
@@ -94,7 +94,8 @@ impl LakeCatalog {
         [Arc::new(UnusedJoin), Arc::new(PairJoin::new(&self.lookups)), Arc::new(SortedNulls)]
     }
 
-    /// Registers everything that `statement` may name, all of one snapshot of the lake. It is called before planning,
+    /// Registers everything that `statement` may name, all of one snapshot of the lake, and the program's own tables in
+    /// `system`. It is called before planning,
     /// because the lookup of these names is asynchronous and planning is not.
     ///
     /// # Errors
@@ -103,7 +104,7 @@ impl LakeCatalog {
     pub(crate) async fn register(
         &self,
         context: &SessionContext,
-        system: Option<&Arc<dyn SystemSource>>,
+        system: Vec<(&'static str, Arc<dyn TableProvider>)>,
         statement: &mut Statement,
     ) -> Result<(), Error> {
         let past = as_of::named(statement);
@@ -111,7 +112,7 @@ impl LakeCatalog {
         for (name, provider) in &current.providers {
             context.register_table(name.clone(), provider.clone()).map_err(failed)?;
         }
-        for (name, provider) in system.into_iter().flat_map(system::source_tables) {
+        for (name, provider) in system {
             context.register_table(TableReference::partial(system::SCHEMA, name), provider).map_err(failed)?;
         }
         // A time stands for one version in all of a statement, even if a version with an earlier time comes meanwhile.
@@ -145,6 +146,11 @@ impl LakeCatalog {
     /// As [`LakeCatalog::contents`].
     pub(crate) async fn attachment(&self, run: &VisibleRun, ending: &str) -> Result<Option<Bytes>, Error> {
         mcap::attachment(run, &self.current().await?.snapshot, ending, &self.runs).await
+    }
+
+    /// Returns the run files, as `mcap` reads them.
+    pub(crate) fn run_files(&self) -> &Arc<mcap::Files> {
+        &self.runs
     }
 
     /// Returns the views with their definitions.

@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use std::sync::{Arc, OnceLock};
 use std::time::Duration;
 
-use datafusion::catalog::{CatalogProvider as _, CatalogProviderList as _};
+use datafusion::catalog::{CatalogProvider as _, CatalogProviderList as _, TableProvider};
 use datafusion::catalog::{MemoryCatalogProvider, MemoryCatalogProviderList, MemorySchemaProvider};
 use datafusion::error::DataFusionError;
 use datafusion::execution::FunctionRegistry as _;
@@ -255,9 +255,9 @@ impl QueryEngine {
         self.0.cluster.get()
     }
 
-    /// Returns who has further tables of the schema `system`.
-    pub(crate) fn system_source(&self) -> Option<&Arc<dyn SystemSource>> {
-        self.0.system.get()
+    /// Returns the tables of the schema `system` that are not the lake's; none without a program around that has some.
+    pub(crate) fn system_tables(&self) -> Vec<(&'static str, Arc<dyn TableProvider>)> {
+        self.0.system.get().map_or_else(Vec::new, |source| system::engine_tables(source, self.cluster()))
     }
 
     /// Creates a session of a client, one per connection.

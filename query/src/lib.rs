@@ -61,8 +61,8 @@ pub use opaque::OpaqueValue;
 pub use predicate::PredicateForm;
 pub use session::{CancelHandle, ContextExtension, PreparedQuery, QueryAnswer, Session};
 pub use spread::{
-    ClusterSettings, SpreadCounts, SpreadTasks, SpreadWorker, TASK_HEADER, TaskLease, WorkerCluster, WorkerIdentity,
-    WorkerStatus, WorkerToken,
+    ClusterSettings, SpreadCounts, SpreadTasks, SpreadWorker, TASK_HEADER, TaskLease, WORKER_FIGURES_PATH,
+    WorkerCluster, WorkerFigures, WorkerIdentity, WorkerLink, WorkerStatus, WorkerToken, WorkerTrust,
 };
 pub use statement_bounds::check_statement_bounds;
 pub use syntax_walk::{walk_expr, walk_statement};

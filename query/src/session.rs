@@ -12,6 +12,8 @@ use datafusion::execution::TaskContext;
 use datafusion::execution::context::SQLOptions;
 use datafusion::execution::session_state::SessionState;
 use datafusion::logical_expr::LogicalPlan;
+#[cfg(test)]
+use datafusion::physical_plan::ExecutionPlan;
 use datafusion::physical_plan::execute_stream;
 use datafusion::prelude::SessionContext;
 use datafusion::sql::parser::{DFParserBuilder, Statement};
@@ -306,7 +308,7 @@ impl Session {
             let sql = text;
             let wrong = |e: DataFusionError| Error::plan(&sql, &e);
             let context = session.engine.context();
-            let system = session.engine.system_source();
+            let system = session.engine.system_tables();
             session.engine.catalog().register(&context, system, &mut statement).await?;
             if let Some(extend) = &session.extend {
                 extend(&context).map_err(|e| Error::execution(&e))?;
@@ -424,6 +426,15 @@ impl Session {
     /// Returns the views with their definitions, SQL over the tables.
     pub fn view_definitions(&self) -> impl Iterator<Item = (&'static str, String)> {
         self.engine.catalog().view_definitions()
+    }
+}
+
+#[cfg(test)]
+impl Session {
+    /// Plans a query for this process.
+    pub(crate) async fn local_plan(&self, sql: &str) -> Arc<dyn ExecutionPlan> {
+        let prepared = self.prepare(sql).await.unwrap_or_else(|e| panic!("{sql}: {e}"));
+        prepared.state.create_physical_plan(&prepared.plan).await.unwrap_or_else(|e| panic!("{sql}: {e}"))
     }
 }
 

@@ -44,8 +44,9 @@ pub enum Error {
     },
     /// Rows and the token would go over the network as they are.
     #[error(
-        "{address} is beyond this machine, and what goes to workers is not encrypted; hint: --plain-text-to-workers if the \
-         network between them is private, such as WireGuard's"
+        "{address} is beyond this machine, and what goes to workers is not encrypted; hint: --certificate and --key with \
+         --worker, and https:// in --workers; or --plain-text-to-workers if the network between them is private, such as \
+         WireGuard's"
     )]
     PlainTextWorker {
         /// The worker's address.
@@ -59,8 +60,11 @@ pub enum Error {
         /// The cause.
         message: String,
     },
+    /// Nobody vouches for workers' certificates.
+    #[error("this system trusts no authority of certificates; hint: --worker-ca FILE with the workers' certificates")]
+    NoAuthorities,
     /// A worker's address is none.
-    #[error("`{given}` is no address of a worker; hint: as http://10.0.0.7:7070, which `serve --worker` prints")]
+    #[error("`{given}` is no address of a worker; hint: as https://10.0.0.7:7070, which `serve --worker` prints")]
     WorkerAddress {
         /// The given text.
         given: String,

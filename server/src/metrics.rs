@@ -2,17 +2,19 @@
 //! their part to the door, which alone has figures.
 
 mod gauges;
+mod workers;
 
 use echolake_lake::CacheCounts;
 use echolake_query::{SpreadCounts, WorkerStatus};
 use prometheus::{
-    HistogramOpts, HistogramVec, IntCounter, IntCounterVec, IntGauge, IntGaugeVec, Opts, Registry, Result, TextEncoder,
+    HistogramOpts, HistogramVec, IntCounter, IntCounterVec, IntGauge, Opts, Registry, Result, TextEncoder,
 };
 use serde::{Deserialize, Serialize};
 
 use crate::activity::QueryEnd;
 use crate::fault::{FaultCode, RequestFault};
 pub(crate) use gauges::{PoolGauges, ServerGauges};
+use workers::WorkerGauges;
 
 /// The protocol of a query.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
@@ -55,7 +57,7 @@ pub(crate) struct ServerMetrics {
     cache_requests: IntCounter,
     cache_bytes: IntCounter,
     spread: IntCounterVec,
-    workers: IntGaugeVec,
+    workers: WorkerGauges,
 }
 
 impl ServerMetrics {
@@ -67,8 +69,10 @@ impl ServerMetrics {
         let histogram = |name: &str, help: &str| HistogramOpts::new(name, help).buckets(BUCKETS.to_vec());
         let query_time = histogram("echolake_query_seconds", "Time of a query, to its last row sent.");
         let request_time = histogram("echolake_http_request_seconds", "Time of a request, to the head of its answer.");
+        let registry = Registry::new();
         let metrics = Self {
-            registry: Registry::new(),
+            workers: WorkerGauges::register(&registry)?,
+            registry,
             queries: IntCounterVec::new(
                 Opts::new("echolake_queries_total", "Queries that were begun."),
                 &["protocol"],
@@ -98,10 +102,6 @@ impl ServerMetrics {
                 ),
                 &["event"],
             )?,
-            workers: IntGaugeVec::new(
-                Opts::new("echolake_worker_usable", "If a worker could be used when it was asked last."),
-                &["worker"],
-            )?,
         };
         metrics.register()?;
         Ok(metrics)
@@ -120,7 +120,6 @@ impl ServerMetrics {
         registry.register(Box::new(self.cache_requests.clone()))?;
         registry.register(Box::new(self.cache_bytes.clone()))?;
         registry.register(Box::new(self.spread.clone()))?;
-        registry.register(Box::new(self.workers.clone()))?;
         // What did not happen yet is zero, and not unknown.
         for protocol in ServerProtocol::ALL {
             queries.with_label_values(&[protocol.name()]);
@@ -179,11 +178,9 @@ impl ServerMetrics {
         }
     }
 
-    /// Sets which workers an engine could use.
+    /// Takes what an engine was told by workers.
     pub(crate) fn set_workers(&self, workers: &[WorkerStatus]) {
-        for worker in workers {
-            self.workers.with_label_values(&[&worker.url]).set(i64::from(worker.problem.is_none()));
-        }
+        self.workers.set(workers);
     }
 
     /// Counts a failed request.
@@ -212,6 +209,8 @@ impl ServerMetrics {
 
 #[cfg(test)]
 mod tests {
+    use echolake_query::WorkerFigures;
+
     use super::*;
 
     #[test]
@@ -262,10 +261,13 @@ mod tests {
         has(&text, "echolake_spread_queries_total{event=\"begun\"} 0");
         metrics.spread(&SpreadCounts { spread: 3, repeated: 1, returned: 0 });
         let url = "http://127.0.0.1:7070/".to_owned();
-        metrics.set_workers(&[WorkerStatus { url, problem: Some("gone".to_owned()) }]);
+        let figures = Some(WorkerFigures { read_bytes: 7, ..WorkerFigures::default() });
+        let problem = Some("gone".to_owned());
+        metrics.set_workers(&[WorkerStatus { url, problem, build: None, last_seen: None, figures }]);
         let text = metrics.text(&ServerGauges::default()).expect("a text");
         has(&text, "echolake_spread_queries_total{event=\"begun_again\"} 1");
         has(&text, "echolake_worker_usable{worker=\"http://127.0.0.1:7070/\"} 0");
+        has(&text, "echolake_worker_read_bytes{worker=\"http://127.0.0.1:7070/\"} 7");
         metrics.begin(ServerProtocol::Http);
         metrics.lose(1);
         has(&metrics.text(&ServerGauges::default()).expect("a text"), "echolake_running_queries 0");

@@ -10,13 +10,14 @@ use std::time::Duration;
 
 use anyhow::Context as _;
 use echolake_lake::{Lake, remote_access};
-use echolake_query::WorkerToken;
+use echolake_query::{WorkerLink, WorkerToken};
 use echolake_schema::ProjectName;
 use echolake_server::certificate::self_signed;
 use echolake_server::engine::{EngineRun, confinement, run_engine};
 use echolake_server::tokens::{self, TokenFile};
 use echolake_server::worker::{
-    EngineWorkers, LakeWorker, WORKER_TOKEN_VARIABLE, WorkerLink, WorkerSettings, program_build, read_worker_token,
+    EngineWorkers, LakeWorker, WORKER_TOKEN_VARIABLE, WorkerSettings, program_build, read_worker_token,
+    read_worker_trust, worker_trust_files,
 };
 use echolake_server::{CataloguePages, CertificateFiles, EngineSettings, Error, LakeServer, ServerSettings};
 use tokio::signal::unix::{SignalKind, signal};
@@ -49,7 +50,7 @@ pub(crate) struct ServeArgs {
     /// File of tokens; without it only this machine has access. `echolake token` makes its lines.
     #[arg(long, value_name = "FILE")]
     tokens: Option<PathBuf>,
-    /// Certificate of the server (PEM), with which all three protocols are encrypted; renewed files are taken while it runs.
+    /// Certificate of the server or worker (PEM), with which all connections to it are encrypted; renewed files are taken while it runs.
     #[arg(long, value_name = "FILE", requires = "key")]
     certificate: Option<PathBuf>,
     /// Private key of the certificate (PEM).
@@ -73,18 +74,21 @@ pub(crate) struct ServeArgs {
     /// Folder for temporary files, such as sorts that do not fit into memory; by default `temp` in the lake.
     #[arg(long, value_name = "DIR")]
     temp: Option<PathBuf>,
-    /// Workers for heavy queries, as http://10.0.0.7:7070; light queries run here.
+    /// Workers for heavy queries, as https://10.0.0.7:7070; light queries run here.
     #[arg(long, value_name = "URL,...", value_delimiter = ',')]
     workers: Vec<String>,
     /// MiB that a query must read to be spread over workers.
     #[arg(long, value_name = "MIB", default_value_t = SPREAD_MIB, requires = "workers")]
     spread_from: u32,
     /// Be a worker of other servers of this lake, at this address; nothing else is served.
-    #[arg(long, value_name = "ADDRESS", conflicts_with_all = ["listen", "flight_sql", "postgres", "tokens", "certificate", "workers"])]
+    #[arg(long, value_name = "ADDRESS", conflicts_with_all = ["listen", "flight_sql", "postgres", "tokens", "workers"])]
     worker: Option<SocketAddr>,
     /// File of the token that servers and workers share; without it, workers are on this machine.
     #[arg(long, value_name = "FILE")]
     worker_token: Option<PathBuf>,
+    /// Certificates of the workers, or of their issuers (PEM); without it, those of authorities that the system trusts.
+    #[arg(long, value_name = "FILE")]
+    worker_ca: Option<PathBuf>,
     /// Send rows and the token to workers beyond this machine without encryption, because that network is private.
     #[arg(long)]
     plain_text_to_workers: bool,
@@ -114,6 +118,9 @@ pub(crate) struct EngineArgs {
     spread_bytes: u64,
     #[arg(long, default_value = "")]
     build: String,
+    /// The file of authorities of workers' certificates.
+    #[arg(long)]
+    worker_ca: Option<PathBuf>,
     #[command(flatten)]
     cache: CacheArgs,
 }
@@ -127,10 +134,15 @@ impl EngineArgs {
             .into_iter()
             .chain(cache.as_ref().map(|cache| cache.path.as_path()))
             .collect();
-        let ports: Vec<_> = self.workers()?.iter().flat_map(EngineWorkers::ports).collect();
+        let workers = self.workers()?;
+        let ports: Vec<_> = workers.iter().flat_map(EngineWorkers::ports).collect();
+        let trusted: Vec<_> = workers.iter().flat_map(EngineWorkers::files).collect();
         let confined = match (&self.confine_to, remote_access(lake_url)) {
-            (Some(lake), _) => confinement::confine_files(lake, &own, &ports),
-            (None, Some(store)) => confinement::confine_to_store(&store, &own, &ports),
+            (Some(lake), _) => confinement::confine_files(lake, &trusted, &own, &ports),
+            (None, Some(mut store)) => {
+                store.files.extend(trusted);
+                confinement::confine_to_store(&store, &own, &ports)
+            }
             (None, None) => Ok(()),
         };
         confined.context("the engine cannot be confined")
@@ -142,8 +154,10 @@ impl EngineArgs {
         }
         let secret = std::env::var(WORKER_TOKEN_VARIABLE).ok();
         // The door has checked that the network may be used.
-        let link = WorkerLink { token: secret.as_deref().and_then(WorkerToken::parse), is_private: true };
-        Ok(Some(EngineWorkers::new(&self.workers, link, self.spread_bytes, self.build.clone())?))
+        let token = secret.as_deref().and_then(WorkerToken::parse);
+        let link = WorkerLink { token, trust: None, is_private: true };
+        let (authorities, build) = (self.worker_ca.as_deref(), self.build.clone());
+        Ok(Some(EngineWorkers::new(&self.workers, link, authorities, self.spread_bytes, build)?))
     }
 }
 
@@ -203,6 +217,12 @@ impl ServeArgs {
             None => confinement::lake_folders(Path::new(lake_url.strip_prefix("file://").unwrap_or(lake_url))),
         };
         readable.extend(self.worker_token.clone());
+        if let Some(certificate) = self.certificate_files() {
+            readable.extend(certificate.folders());
+        }
+        if self.certificate.is_some() || self.worker_ca.is_some() {
+            readable.extend(worker_trust_files(self.worker_ca.as_deref()));
+        }
         // Its checksum is taken.
         readable.extend(std::env::current_exe());
         confinement::confine_worker(readable, &own).context("the worker cannot be confined")
@@ -214,7 +234,12 @@ impl ServeArgs {
 
     fn link(&self) -> anyhow::Result<WorkerLink> {
         let token = self.worker_token.as_deref().map(read_worker_token).transpose()?;
-        Ok(WorkerLink { token, is_private: self.plain_text_to_workers })
+        Ok(WorkerLink { token, trust: None, is_private: self.plain_text_to_workers })
+    }
+
+    fn certificate_files(&self) -> Option<CertificateFiles> {
+        let (certificate, key) = self.certificate.clone().zip(self.key.clone())?;
+        Some(CertificateFiles { certificate, key })
     }
 
     fn workers(&self) -> anyhow::Result<Option<EngineWorkers>> {
@@ -223,7 +248,7 @@ impl ServeArgs {
         }
         let build = program_build().context("cannot read this program")?;
         let least_bytes = u64::from(self.spread_from) << 20;
-        Ok(Some(EngineWorkers::new(&self.workers, self.link()?, least_bytes, build)?))
+        Ok(Some(EngineWorkers::new(&self.workers, self.link()?, self.worker_ca.as_deref(), least_bytes, build)?))
     }
 }
 
@@ -232,8 +257,13 @@ impl ServeArgs {
 async fn work(args: &ServeArgs, address: SocketAddr, lake_url: &str) -> anyhow::Result<CommandOutcome> {
     let stop = StopRequest::listen("stopping: engines run their queries elsewhere".to_owned())?;
     let lake = args.cache.open_lake(lake_url).await?;
-    let (link, memory, temp) = (args.link()?, (args.memory as usize) << 20, args.worker_temp());
-    let worker = LakeWorker::bind(&lake, WorkerSettings { address, link, memory, temp }).await?;
+    let (mut link, certificate) = (args.link()?, args.certificate_files());
+    // A stage may read from other workers, which have certificates as this one has.
+    if certificate.is_some() || args.worker_ca.is_some() {
+        link.trust = Some(read_worker_trust(args.worker_ca.as_deref())?);
+    }
+    let (memory, temp) = ((args.memory as usize) << 20, args.worker_temp());
+    let worker = LakeWorker::bind(&lake, WorkerSettings { address, link, certificate, memory, temp }).await?;
     let default = std::panic::take_hook();
     std::panic::set_hook(Box::new(move |panic| {
         default(panic);
@@ -260,11 +290,7 @@ pub(crate) async fn run(args: &ServeArgs, lake_url: &str) -> anyhow::Result<Comm
         flight_sql: args.flight_sql.address(),
         postgres: args.postgres.address(),
         tokens: args.tokens.as_deref().map(TokenFile::read).transpose()?,
-        certificate: args
-            .certificate
-            .clone()
-            .zip(args.key.clone())
-            .map(|(certificate, key)| CertificateFiles { certificate, key }),
+        certificate: args.certificate_files(),
         is_behind_proxy: args.plain_text_behind_a_proxy,
         drain: args.drain,
         engines: EngineSettings {

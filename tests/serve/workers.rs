@@ -4,7 +4,7 @@
 use std::process::Command;
 
 use super::attacks::workers::WorkerProcesses;
-use super::{TestFolder, json, lake, served, sql};
+use super::{TestFolder, get, json, lake, served, sql, wait_until};
 use crate::child::ChildProcess;
 
 const TOKEN: &str = "0123456789abcdef0123456789abcdef";
@@ -13,15 +13,17 @@ const TOKEN: &str = "0123456789abcdef0123456789abcdef";
 fn worker(place: &TestFolder, more: &[&str]) -> (ChildProcess, String) {
     let mut command: Command = place.command(&[&["serve", "--worker", "127.0.0.1:0"], more].concat());
     let mut child = ChildProcess::start(&mut command).expect("it starts");
-    let line = child.wait_for_line("  worker http://");
+    let line = child.wait_for_line("  worker http");
     (child, line.trim().trim_start_matches("worker ").to_owned())
 }
 
+/// Reads all responses.
+const HEAVY: &str = "select surface_id, count(*) from measurements where ir[1] <> 7 group by surface_id";
+
 fn explained(place: &TestFolder, workers: &str, more: &[&str]) -> String {
     let server = served(place, &[&["--workers", workers, "--spread-from", "0"], more].concat());
-    let query = "select surface_id, count(*) from measurements where ir[1] <> 7 group by surface_id";
-    let plan = json(&sql(&server, &format!("explain {query}"))).to_string();
-    let count = json(&sql(&server, query));
+    let plan = json(&sql(&server, &format!("explain {HEAVY}"))).to_string();
+    let count = json(&sql(&server, HEAVY));
     assert!(count[0]["surface_id"] == "flat", "{count}");
     plan
 }
@@ -57,6 +59,73 @@ fn a_worker_is_of_the_same_lake_and_token() {
     let (_other, url) = worker(&elsewhere, &[]);
     let plan = explained(&place, &url, &[]);
     assert!(plan.contains("not spread over workers: none of 1 answers"), "{plan}");
+}
+
+const CERTIFIED: [&str; 8] = [
+    "--certificate",
+    "tls/certificate.pem",
+    "--key",
+    "tls/key.pem",
+    "--worker-ca",
+    "tls/certificate.pem",
+    "--worker-token",
+    "worker.token",
+];
+
+#[test]
+fn workers_are_encrypted() {
+    let place = lake();
+    std::fs::write(place.path("worker.token"), TOKEN).expect("written");
+    for folder in ["tls", "next"] {
+        place.ok(&["certificate", "127.0.0.1", "localhost", "-o", folder]);
+    }
+    place.fails(1, &["serve", "--workers", "https://127.0.0.1:7070", "--worker-ca", "none.pem"], "none.pem");
+    let (_first, one) = worker(&place, &CERTIFIED);
+    let (_second, two) = worker(&place, &CERTIFIED);
+    assert!(one.starts_with("https://127.0.0.1:"), "{one}");
+    let urls = format!("{one},{two}");
+    let trusting =
+        |authority: &str| explained(&place, &urls, &["--worker-token", "worker.token", "--worker-ca", authority]);
+    let plan = trusting("tls/certificate.pem");
+    assert!(plan.contains("spread over 2 of 2 workers"), "{plan}");
+
+    // A certificate that is not known, and plain text.
+    let strange = ["--workers", &one, "--spread-from", "0", "--worker-token", "worker.token", "--worker-ca"];
+    let mut server = served(&place, &[&strange[..], &["next/certificate.pem"]].concat());
+    assert_eq!(json(&sql(&server, HEAVY))[0]["surface_id"], "flat");
+    server.wait_for_line("invalid peer certificate");
+    let plan = explained(&place, &one.replace("https", "http"), &["--worker-token", "worker.token"]);
+    assert!(plan.contains("not spread over workers: none of 1 answers"), "{plan}");
+
+    // Renewed files are taken while the workers run.
+    for file in ["certificate.pem", "key.pem"] {
+        std::fs::rename(place.path("next").join(file), place.path("tls").join(file)).expect("renamed");
+    }
+    wait_until("the renewed certificate", || trusting("tls/certificate.pem").contains("spread over 2 of 2 workers"));
+}
+
+#[test]
+fn workers_tell_what_they_did() {
+    let place = lake();
+    let (_first, one) = worker(&place, &[]);
+    let (_second, two) = worker(&place, &[]);
+    let server = served(&place, &["--workers", &format!("{one},{two},http://127.0.0.1:1"), "--spread-from", "0"]);
+    let figures = || json(&sql(&server, "select * from system.workers order by state desc, address"));
+    assert_eq!(json(&sql(&server, HEAVY))[0]["surface_id"], "flat");
+    // Tasks are over when their engine says so, and workers are asked every five seconds at most.
+    wait_until("tasks that read", || {
+        let rows = figures();
+        (0..2).map(|n| rows[n]["read_bytes"].as_u64().unwrap_or(0)).sum::<u64>() > 0
+    });
+    let rows = figures();
+    assert_eq!(rows.as_array().map(Vec::len), Some(3), "{rows}");
+    assert_eq!((rows[0]["state"].as_str(), rows[2]["state"].as_str()), (Some("used"), Some("not used")), "{rows}");
+    assert!(rows[2]["problem"].as_str().is_some_and(|reason| reason.contains("refused")), "{rows}");
+    assert!(rows[2]["last_seen"].is_null() && rows[0]["build"].is_string(), "{rows}");
+    let metrics = get(&server, "/metrics").text();
+    let read = metrics.lines().filter(|line| line.starts_with("echolake_worker_read_bytes{")).count();
+    assert_eq!(read, 2, "{metrics}");
+    assert!(metrics.contains("echolake_worker_imbalance "), "{metrics}");
 }
 
 mod slow {

@@ -5,6 +5,7 @@
 
 mod cbor;
 mod chunk;
+mod codec;
 mod column;
 mod contents;
 mod error;
@@ -21,7 +22,7 @@ mod schema;
 mod table;
 mod target;
 #[cfg(test)]
-mod tests;
+pub(crate) mod tests;
 mod topics;
 
 use std::collections::HashMap;
@@ -42,11 +43,13 @@ use echolake_lake::LakeSnapshot;
 
 use crate::Error;
 use crate::syntax_walk::walk_mut;
+pub(crate) use codec::McapCodec;
 pub use contents::{Contents, Topic};
 pub(crate) use contents::{attachment, contents};
 use error::Fault;
 pub use file::Attachment;
 pub(crate) use file::Files;
+pub(crate) use scan::{McapExec, RunPiece};
 use target::Target;
 
 /// What one of the functions may be called with, for whoever calls it otherwise.

@@ -24,6 +24,7 @@ use echolake_recording::Record;
 use futures::stream::{self, BoxStream};
 use futures::{StreamExt as _, TryStreamExt as _};
 use object_store::ObjectStoreExt as _;
+use object_store::path::Path;
 
 use super::chunk::{PieceRecords, ReadProgress, ReadStep, ReadStop};
 use super::error::Fault;
@@ -53,21 +54,40 @@ pub(super) struct Scan {
 
 /// The plan of a scan.
 #[derive(Debug)]
-pub(super) struct McapExec {
+pub(crate) struct McapExec {
     scan: Arc<Scan>,
     partitions: Vec<Vec<Read>>,
-    /// Pieces that are read, all pieces, and bytes that are fetched.
-    chosen: (usize, usize, u64),
+    /// Pieces that need not be read.
+    pruned: usize,
     properties: Arc<PlanProperties>,
     metrics: ExecutionPlanMetricsSet,
 }
 
 /// Bytes of one file that are fetched at once, and the pieces in them.
 #[derive(Debug, Clone)]
-struct Read {
-    source: usize,
-    range: Range<u64>,
-    pieces: Vec<Piece>,
+pub(super) struct Read {
+    pub(super) source: usize,
+    pub(super) range: Range<u64>,
+    pub(super) pieces: Vec<Piece>,
+}
+
+/// A part of a scan that can be read on its own.
+#[derive(Debug, Clone)]
+pub(crate) struct RunPiece {
+    path: Path,
+    read: Read,
+}
+
+impl RunPiece {
+    /// Returns the path of its file.
+    pub(crate) fn path(&self) -> &str {
+        self.path.as_ref()
+    }
+
+    /// Returns where it is in its file.
+    pub(crate) fn range(&self) -> &Range<u64> {
+        &self.read.range
+    }
 }
 
 impl McapExec {
@@ -88,7 +108,11 @@ impl McapExec {
                 add(reads, source, piece);
             }
         }
-        let fetched = partitions.iter().flatten().map(|r| r.range.end - r.range.start).sum();
+        Self::of_partitions(Arc::new(scan), partitions, all - count)
+    }
+
+    /// A plan of these partitions, which leave out so many pieces.
+    pub(super) fn of_partitions(scan: Arc<Scan>, partitions: Vec<Vec<Read>>, pruned: usize) -> Self {
         let properties = PlanProperties::new(
             EquivalenceProperties::new(scan.schema.clone()),
             Partitioning::UnknownPartitioning(partitions.len()),
@@ -97,8 +121,39 @@ impl McapExec {
         );
         let properties = Arc::new(properties.with_scheduling_type(SchedulingType::Cooperative));
         let metrics = ExecutionPlanMetricsSet::new();
-        MetricBuilder::new(&metrics).global_counter("chunks_pruned").add(all - count);
-        Self { scan: Arc::new(scan), partitions, chosen: (count, all, fetched), properties, metrics }
+        MetricBuilder::new(&metrics).global_counter("chunks_pruned").add(pruned);
+        Self { scan, partitions, pruned, properties, metrics }
+    }
+
+    pub(super) fn scan(&self) -> &Scan {
+        &self.scan
+    }
+
+    pub(super) fn partitions(&self) -> &[Vec<Read>] {
+        &self.partitions
+    }
+
+    /// Returns the bytes that it fetches.
+    pub(crate) fn fetched_bytes(&self) -> u64 {
+        self.partitions.iter().flatten().map(|r| r.range.end - r.range.start).sum()
+    }
+
+    /// Returns true if it ends once it has enough rows.
+    pub(crate) fn is_limited(&self) -> bool {
+        self.scan.limit.is_some()
+    }
+
+    /// Returns the parts that it reads.
+    pub(crate) fn pieces(&self) -> Vec<RunPiece> {
+        let piece =
+            |read: &Read| RunPiece { path: self.scan.parts.sources[read.source].path.clone(), read: read.clone() };
+        self.partitions.iter().flatten().map(piece).collect()
+    }
+
+    /// Returns a plan that reads these parts of this one, in these partitions.
+    pub(crate) fn with_partitions(&self, partitions: Vec<Vec<RunPiece>>) -> Self {
+        let reads = |pieces: Vec<RunPiece>| pieces.into_iter().map(|piece| piece.read).collect();
+        Self::of_partitions(self.scan.clone(), partitions.into_iter().map(reads).collect(), self.pruned)
     }
 }
 
@@ -119,7 +174,8 @@ fn add(reads: &mut Vec<Read>, source: usize, piece: Piece) {
 
 impl DisplayAs for McapExec {
     fn fmt_as(&self, _: DisplayFormatType, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let (chosen, all, bytes) = self.chosen;
+        let chosen: usize = self.partitions.iter().flatten().map(|read| read.pieces.len()).sum();
+        let (all, bytes) = (chosen + self.pruned, self.fetched_bytes());
         let (parts, fields) = (&self.scan.parts, self.scan.schema.fields());
         let columns: Vec<_> = fields.iter().map(|f| f.name().as_str()).collect();
         write!(f, "McapExec: {}, files={}, chunks={chosen} of {all}", parts.name, parts.sources.len())?;
@@ -196,7 +252,7 @@ fn fetch(parts: Arc<Parts>, reads: Vec<Read>, bytes_read: Count) -> BoxStream<'s
     let one = move |read: Read| {
         let (parts, bytes_read) = (parts.clone(), bytes_read.clone());
         async move {
-            let path = &parts.sources[read.source].file.path;
+            let path = &parts.sources[read.source].path;
             let failed = |source| Fault::Read { file: path.to_string(), source };
             let bytes = parts.files.store.get_range(path, read.range.clone()).await.map_err(failed)?;
             bytes_read.add(bytes.len());
@@ -301,10 +357,10 @@ impl Scanner {
         let mut sink = |record: Record<'_>| {
             let Record::Message { header, data } = &record else { return Ok(ReadStep::Continue) };
             let Some((topic, mapping)) = source.channels.get(&header.channel_id) else {
-                if source.file.channels.contains_key(&header.channel_id) {
+                if source.described.contains(&header.channel_id) {
                     return Ok(ReadStep::Continue);
                 }
-                let (file, what) = (source.file.path.to_string(), undescribed(header.channel_id));
+                let (file, what) = (source.path.to_string(), undescribed(header.channel_id));
                 return Err(Fault::Damaged { file, offset, what }.into());
             };
             let within =
@@ -315,7 +371,7 @@ impl Scanner {
             let message = Message { run: source.run.as_ref(), topic, header, data };
             let mapping = parts.mappings.as_ref().map(|all| (*mapping, &all[*mapping]));
             let ready = rows.push(&message, mapping)?.map_err(|what| Fault::Message {
-                file: source.file.path.to_string(),
+                file: source.path.to_string(),
                 topic: topic.clone(),
                 sequence: header.sequence,
                 offset,
@@ -341,6 +397,6 @@ impl Scanner {
     }
 
     fn damaged(&self, source: usize, offset: u64, what: String) -> Fault {
-        Fault::Damaged { file: self.scan.parts.sources[source].file.path.to_string(), offset, what }
+        Fault::Damaged { file: self.scan.parts.sources[source].path.to_string(), offset, what }
     }
 }

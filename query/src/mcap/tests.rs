@@ -68,7 +68,7 @@ async fn refused(lake: &TestLake, sql: &str, expected: &[&str]) {
     }
 }
 
-fn options(compression: Option<Compression>) -> WriteOptions {
+pub(crate) fn options(compression: Option<Compression>) -> WriteOptions {
     WriteOptions::new().compression(compression).chunk_size(Some(1000))
 }
 
@@ -77,7 +77,7 @@ const POINT: &str = r#"{"type":"object","properties":{"x":{"type":"number"},"nam
     "sequence":{"type":"integer"}}}"#;
 
 /// A second of `/point` at ten a second for each of `seconds`, and one `/note` a second, in small chunks.
-fn json_file(options: WriteOptions, seconds: u64) -> Vec<u8> {
+pub(crate) fn json_file(options: WriteOptions, seconds: u64) -> Vec<u8> {
     let mut file = Cursor::new(Vec::new());
     let mut writer = options.create(&mut file).expect("a writer");
     let schema = writer.add_schema("Point", "jsonschema", POINT.as_bytes()).expect("added");

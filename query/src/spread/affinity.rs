@@ -7,7 +7,7 @@ use std::sync::Arc;
 
 use async_trait::async_trait;
 use datafusion::datasource::listing::PartitionedFile;
-use datafusion::datasource::physical_plan::FileGroup;
+use datafusion::datasource::physical_plan::{FileGroup, FileScanConfig};
 use datafusion::datasource::source::DataSourceExec;
 use datafusion::error::Result;
 use datafusion::physical_plan::{ExecutionPlan, ExecutionPlanProperties as _};
@@ -18,7 +18,8 @@ use datafusion_distributed::{
 };
 use url::Url;
 
-use super::decision::{file_scan, read_bytes};
+use super::decision::{file_scan, read_bytes, run_scan};
+use crate::mcap::{McapExec, RunPiece};
 
 /// Bytes of a file that one worker reads as one piece.
 const PIECE_BYTES: u64 = 32 << 20;
@@ -40,19 +41,23 @@ impl QueryWorkers {
         Self { urls: Arc::new(urls), is_eager }
     }
 
-    // Pieces of files, by the worker that reads them.
-    fn assign(&self, files: impl Iterator<Item = PartitionedFile>) -> Vec<Vec<PartitionedFile>> {
-        let mut pieces: Vec<_> = whole_files(files).into_iter().flat_map(pieces_of).collect();
+    // Files of a table, by the worker that reads them.
+    fn assign_files(&self, files: impl Iterator<Item = PartitionedFile>) -> Vec<Vec<PartitionedFile>> {
+        self.assign(whole_files(files).into_iter().flat_map(pieces_of).collect(), self.urls.len())
+    }
+
+    // Pieces of files, by the worker that reads them, one of the first `count`.
+    fn assign<P: FilePiece>(&self, mut pieces: Vec<P>, count: usize) -> Vec<Vec<P>> {
         // Large ones first: what comes late finds workers with room.
-        pieces.sort_by(|a, b| b.effective_size().cmp(&a.effective_size()).then_with(|| key(a).cmp(&key(b))));
-        let total: u64 = pieces.iter().map(PartitionedFile::effective_size).sum();
-        let most = (total as f64 / self.urls.len() as f64 * MOST_OF_MEAN) as u64;
-        let mut loads = vec![0_u64; self.urls.len()];
-        let mut assigned = vec![Vec::new(); self.urls.len()];
+        pieces.sort_by(|a, b| b.bytes().cmp(&a.bytes()).then_with(|| a.place().cmp(&b.place())));
+        let total: u64 = pieces.iter().map(P::bytes).sum();
+        let most = (total as f64 / count as f64 * MOST_OF_MEAN) as u64;
+        let mut loads = vec![0_u64; count];
+        let mut assigned: Vec<_> = (0..count).map(|_| Vec::new()).collect();
         for piece in pieces {
-            let size = piece.effective_size();
-            let fitting = self.order_of(&piece).into_iter().find(|worker| loads[*worker] + size <= most);
-            let worker = fitting.or_else(|| (0..loads.len()).min_by_key(|worker| loads[*worker]));
+            let size = piece.bytes();
+            let fitting = self.order_of(&piece, count).into_iter().find(|worker| loads[*worker] + size <= most);
+            let worker = fitting.or_else(|| (0..count).min_by_key(|worker| loads[*worker]));
             if let Some(worker) = worker {
                 loads[worker] += size;
                 assigned[worker].push(piece);
@@ -62,20 +67,61 @@ impl QueryWorkers {
     }
 
     // The workers, from the one that a piece belongs to.
-    fn order_of(&self, piece: &PartitionedFile) -> Vec<usize> {
-        let mut order: Vec<_> = (0..self.urls.len()).collect();
+    fn order_of(&self, piece: &impl FilePiece, count: usize) -> Vec<usize> {
+        let mut order: Vec<_> = (0..count).collect();
         order.sort_by_key(|worker| {
             let mut hasher = DefaultHasher::new();
-            (self.urls[*worker].as_str(), key(piece)).hash(&mut hasher);
+            (self.urls[*worker].as_str(), piece.place()).hash(&mut hasher);
             hasher.finish()
         });
         order
     }
+
+    fn file_tasks(&self, scan: &FileScanConfig, partitions: usize) -> Vec<Arc<dyn ExecutionPlan>> {
+        let files = scan.file_groups.iter().flat_map(|group| group.iter().cloned());
+        let task = |pieces| {
+            let mut scan = scan.clone();
+            scan.file_groups = groups(pieces, partitions).into_iter().map(FileGroup::new).collect();
+            DataSourceExec::from_data_source(scan) as Arc<dyn ExecutionPlan>
+        };
+        self.assign_files(files).into_iter().map(task).collect()
+    }
+
+    fn run_tasks(&self, scan: &McapExec, count: usize, partitions: usize) -> Vec<Arc<dyn ExecutionPlan>> {
+        let task = |pieces| Arc::new(scan.with_partitions(groups(pieces, partitions))) as Arc<dyn ExecutionPlan>;
+        self.assign(scan.pieces(), count).into_iter().map(task).collect()
+    }
 }
 
-// The name stands for the content.
-fn key(piece: &PartitionedFile) -> (&str, i64) {
-    (piece.object_meta.location.as_ref(), piece.range.as_ref().map_or(0, |range| range.start))
+/// A part of a file that one worker reads.
+trait FilePiece {
+    /// Returns its file, whose name stands for its content, and its place there.
+    fn place(&self) -> (&str, u64);
+
+    /// Returns its size.
+    fn bytes(&self) -> u64;
+}
+
+impl FilePiece for PartitionedFile {
+    fn place(&self) -> (&str, u64) {
+        let start = self.range.as_ref().map_or(0, |range| range.start);
+        (self.object_meta.location.as_ref(), start.unsigned_abs())
+    }
+
+    fn bytes(&self) -> u64 {
+        self.effective_size()
+    }
+}
+
+impl FilePiece for RunPiece {
+    // Other queries read other chunks: what is near to them belongs to the same worker.
+    fn place(&self) -> (&str, u64) {
+        (self.path(), self.range().start / PIECE_BYTES)
+    }
+
+    fn bytes(&self) -> u64 {
+        self.range().end - self.range().start
+    }
 }
 
 // Scans cut files where it suits their partitions, which are others in every query.
@@ -106,15 +152,15 @@ fn pieces_of(file: PartitionedFile) -> Vec<PartitionedFile> {
 }
 
 // Into partitions of about the same size.
-fn groups(pieces: Vec<PartitionedFile>, count: usize) -> Vec<FileGroup> {
-    let mut groups = vec![(0_u64, Vec::new()); count];
+fn groups<P: FilePiece>(pieces: Vec<P>, count: usize) -> Vec<Vec<P>> {
+    let mut groups: Vec<_> = (0..count).map(|_| (0_u64, Vec::new())).collect();
     for piece in pieces {
         if let Some((bytes, group)) = groups.iter_mut().min_by_key(|group| group.0) {
-            *bytes += piece.effective_size();
+            *bytes += piece.bytes();
             group.push(piece);
         }
     }
-    groups.into_iter().map(|(_, pieces)| FileGroup::new(pieces)).collect()
+    groups.into_iter().map(|(_, pieces)| pieces).collect()
 }
 
 impl WorkerResolver for QueryWorkers {
@@ -126,7 +172,10 @@ impl WorkerResolver for QueryWorkers {
 #[async_trait]
 impl DesiredTaskCountHandler for QueryWorkers {
     async fn handle(&self, event: DesiredTaskCountEvent<'_>) -> Option<Result<DesiredTaskCountEventResponse>> {
-        let bytes = read_bytes(file_scan(event.plan)?);
+        let bytes = match file_scan(event.plan) {
+            Some(scan) => read_bytes(scan),
+            None => run_scan(event.plan)?.fetched_bytes(),
+        };
         let count = if self.is_eager || bytes >= SMALL_SCAN_BYTES { self.urls.len() } else { 1 };
         Some(Ok(DesiredTaskCountEventResponse::desired(count)))
     }
@@ -134,22 +183,22 @@ impl DesiredTaskCountHandler for QueryWorkers {
 
 impl ScaleUpLeafNodeHandler for QueryWorkers {
     fn handle(&self, event: ScaleUpLeafNodeEvent<'_>) -> Option<Result<ScaleUpLeafNodeEventResponse>> {
-        let scan = file_scan(event.plan)?;
-        // What has an order or a partitioning of its own is the library's to split.
-        if event.task_count != self.urls.len()
-            || event.task_count == 1
-            || scan.output_partitioning.is_some()
-            || !scan.output_ordering.is_empty()
-        {
-            return None;
-        }
         let partitions = event.plan.output_partitioning().partition_count();
-        let files = scan.file_groups.iter().flat_map(|group| group.iter().cloned());
-        let tasks = self.assign(files).into_iter().map(|pieces| {
-            let mut scan = scan.clone();
-            scan.file_groups = groups(pieces, partitions);
-            DataSourceExec::from_data_source(scan) as Arc<dyn ExecutionPlan>
-        });
+        let tasks = match (file_scan(event.plan), run_scan(event.plan)) {
+            _ if event.task_count == 1 => return None,
+            // What has an order or a partitioning of its own is the library's to split.
+            (Some(scan), _)
+                if event.task_count == self.urls.len()
+                    && scan.output_partitioning.is_none()
+                    && scan.output_ordering.is_empty() =>
+            {
+                self.file_tasks(scan, partitions)
+            }
+            (None, Some(scan)) if event.task_count <= self.urls.len() => {
+                self.run_tasks(scan, event.task_count, partitions)
+            }
+            _ => return None,
+        };
         let leaf = DistributedLeafExec::try_new(event.plan.clone(), tasks);
         Some(leaf.map(|leaf| ScaleUpLeafNodeEventResponse::new(Arc::new(leaf))))
     }
@@ -174,11 +223,11 @@ mod tests {
     }
 
     // By the workers' addresses.
-    fn places(workers: &QueryWorkers, files: &[PartitionedFile]) -> HashMap<(String, i64), String> {
-        let assigned = workers.assign(files.iter().cloned());
+    fn places(workers: &QueryWorkers, files: &[PartitionedFile]) -> HashMap<(String, u64), String> {
+        let assigned = workers.assign_files(files.iter().cloned());
         let of_worker = |(worker, pieces): (usize, Vec<PartitionedFile>)| {
             let url = workers.urls[worker].to_string();
-            pieces.into_iter().map(move |piece| ((key(&piece).0.to_owned(), key(&piece).1), url.clone()))
+            pieces.into_iter().map(move |piece| ((piece.place().0.to_owned(), piece.place().1), url.clone()))
         };
         assigned.into_iter().enumerate().flat_map(of_worker).collect()
     }
@@ -192,7 +241,7 @@ mod tests {
         let mut reversed = files.clone();
         reversed.reverse();
         assert_eq!(places(&workers(4), &reversed), four, "the order of the files changes nothing");
-        let counts = workers(4).assign(files.iter().cloned()).iter().map(Vec::len).max();
+        let counts = workers(4).assign_files(files.iter().cloned()).iter().map(Vec::len).max();
         assert!(counts.expect("four") <= 115, "{counts:?}");
         // A fifth worker takes files from the others, and moves few among them.
         let five = places(&workers(5), &files);
@@ -222,8 +271,7 @@ mod tests {
             end = range.end;
         }
         assert_eq!((end, pieces.len()), (1_000_000_007, 30));
-        let loads =
-            workers(4).assign(pieces.into_iter()).into_iter().map(|p| p.iter().map(|p| p.effective_size()).sum());
+        let loads = workers(4).assign(pieces, 4).into_iter().map(|p| p.iter().map(|p| p.effective_size()).sum());
         let loads: Vec<u64> = loads.collect();
         assert!(loads.iter().all(|load| *load as f64 <= 1.3 * 250_000_000.0), "{loads:?}");
         assert_eq!(loads.iter().sum::<u64>(), 1_000_000_007);

@@ -24,6 +24,7 @@ use futures::future::BoxFuture;
 use futures::{FutureExt as _, Stream, StreamExt as _};
 use tonic::codegen::http::{HeaderMap, HeaderValue};
 
+use super::WorkerFigures;
 use crate::control::{QueryTicket, RunningQueries, StopReason};
 
 /// The header by which a worker's server tells its tasks apart.
@@ -39,16 +40,25 @@ pub struct SpreadTasks(Arc<OpenTasks>);
 #[derive(Debug, Default)]
 struct OpenTasks {
     last: AtomicU64,
-    tickets: Mutex<HashMap<u64, Arc<QueryTicket>>>,
+    open: Mutex<HashMap<u64, Arc<OpenTask>>>,
+    /// Figures of those that are over.
+    figures: Mutex<WorkerFigures>,
     /// Those that are over, too, as long as they compute.
     computing: RunningQueries,
+}
+
+#[derive(Debug)]
+struct OpenTask {
+    ticket: Arc<QueryTicket>,
+    /// The leaves of its plan, once that has come.
+    leaves: Mutex<Vec<Arc<dyn ExecutionPlan>>>,
 }
 
 /// A task that is not over. Dropping it ends its work.
 #[derive(Debug)]
 pub struct TaskLease {
     number: u64,
-    ticket: Arc<QueryTicket>,
+    task: Arc<OpenTask>,
     tasks: SpreadTasks,
 }
 
@@ -56,15 +66,22 @@ impl SpreadTasks {
     /// Begins a task, to be called before its request is passed on with [`TaskLease::header`] as [`TASK_HEADER`].
     pub fn begin(&self) -> TaskLease {
         let number = self.0.last.fetch_add(1, Ordering::Relaxed) + 1;
-        let ticket = Arc::new(QueryTicket::new());
-        self.tickets().insert(number, ticket.clone());
-        self.0.computing.add(&ticket);
-        TaskLease { number, ticket, tasks: self.clone() }
+        let task = Arc::new(OpenTask { ticket: Arc::new(QueryTicket::new()), leaves: Mutex::default() });
+        self.open().insert(number, task.clone());
+        self.0.computing.add(&task.ticket);
+        TaskLease { number, task, tasks: self.clone() }
     }
 
     /// Returns the number of tasks that are not over.
     pub fn count(&self) -> usize {
-        self.tickets().len()
+        self.open().len()
+    }
+
+    /// Returns the figures of all tasks so far.
+    pub fn figures(&self) -> WorkerFigures {
+        let running = self.count() as u64;
+        let counted = *self.0.figures.lock().unwrap_or_else(PoisonError::into_inner);
+        WorkerFigures { running, ..counted }
     }
 
     /// Returns the longest time for which one step of a task has gone on after the task was over; None if none does.
@@ -75,11 +92,11 @@ impl SpreadTasks {
     /// Returns the guard of the task that a request belongs to.
     pub(super) fn guard(&self, headers: &HeaderMap) -> Option<TaskGuard> {
         let number: u64 = headers.get(TASK_HEADER)?.to_str().ok()?.parse().ok()?;
-        self.tickets().get(&number).cloned().map(TaskGuard)
+        self.open().get(&number).cloned().map(TaskGuard)
     }
 
-    fn tickets(&self) -> MutexGuard<'_, HashMap<u64, Arc<QueryTicket>>> {
-        self.0.tickets.lock().unwrap_or_else(PoisonError::into_inner)
+    fn open(&self) -> MutexGuard<'_, HashMap<u64, Arc<OpenTask>>> {
+        self.0.open.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
@@ -92,13 +109,15 @@ impl TaskLease {
 
 impl Drop for TaskLease {
     fn drop(&mut self) {
-        self.ticket.stop(StopReason::Cancelled);
-        self.tasks.tickets().remove(&self.number);
+        self.task.ticket.stop(StopReason::Cancelled);
+        self.tasks.open().remove(&self.number);
+        let leaves = std::mem::take(&mut *self.task.leaves.lock().unwrap_or_else(PoisonError::into_inner));
+        self.tasks.0.figures.lock().unwrap_or_else(PoisonError::into_inner).add_task(&leaves);
     }
 }
 
 /// Guards a task's plan.
-pub(super) struct TaskGuard(Arc<QueryTicket>);
+pub(super) struct TaskGuard(Arc<OpenTask>);
 
 impl WorkerPlanRewriteHandler for TaskGuard {
     fn rewrite_worker_plan(&self, event: WorkerPlanRewriteEvent<'_>) -> Result<WorkerPlanRewriteEventResponse> {
@@ -112,14 +131,16 @@ impl TaskGuard {
         let children: Vec<_> = plan.children().into_iter().cloned().collect();
         let is_leaf = children.is_empty();
         let mut guarded = plan;
-        if !is_leaf {
+        if is_leaf {
+            self.0.leaves.lock().unwrap_or_else(PoisonError::into_inner).push(guarded.clone());
+        } else {
             let children =
                 children.into_iter().map(|child| self.guard_plan(child, depth + 1)).collect::<Result<_>>()?;
             let options = ReplaceChildrenOptions::new(ChildrenPropertiesMode::Recompute);
             guarded = guarded.replace_children(children, options)?;
         }
         if is_leaf || depth < 2 {
-            guarded = Arc::new(GuardedExec { inner: guarded, ticket: self.0.clone() });
+            guarded = Arc::new(GuardedExec { inner: guarded, ticket: self.0.ticket.clone() });
         }
         Ok(guarded)
     }
@@ -249,13 +270,14 @@ mod tests {
         let error = end.expect("no panic").expect("an error, not an end").expect_err("it is over");
         assert!(error.to_string().contains(OVER), "{error}");
         assert_eq!((tasks.count(), tasks.guard(&headers).is_none()), (0, true));
+        assert_eq!(tasks.figures(), WorkerFigures { tasks: 1, ..WorkerFigures::default() }, "it read no file");
         let begun = std::time::Instant::now();
         while tasks.overdue().is_some() {
             assert!(begun.elapsed() < Duration::from_secs(60), "the operators' threads go on");
             tokio::time::sleep(Duration::from_millis(10)).await;
         }
         // A step that goes on is found.
-        let step = guard.0.begin_work();
+        let step = guard.0.ticket.begin_work();
         assert!(tasks.overdue().is_some());
         drop(step);
         assert_eq!(tasks.overdue(), None);

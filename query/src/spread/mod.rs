@@ -8,22 +8,29 @@ mod affinity;
 pub(crate) mod attempt;
 mod channels;
 mod cluster;
+mod connector;
 pub(crate) mod decision;
+mod figures;
 mod guard;
 mod identity;
+mod link;
 mod loss;
 mod planner;
 pub(crate) mod read_only;
 mod worker;
 
 pub use cluster::{ClusterSettings, SpreadCounts, WorkerCluster, WorkerStatus};
+pub use figures::{WORKER_FIGURES_PATH, WorkerFigures};
 pub use guard::{SpreadTasks, TASK_HEADER, TaskLease};
 pub use identity::{WorkerIdentity, WorkerToken};
+pub use link::{WorkerLink, WorkerTrust};
 pub(crate) use loss::WorkerLoss;
 pub use worker::SpreadWorker;
 
 /// The header in which an engine tells workers how many bytes a task of its client's query may hold.
 const MEMORY_HEADER: &str = "x-echolake-memory";
 
+#[cfg(test)]
+mod hostile_tests;
 #[cfg(test)]
 mod tests;

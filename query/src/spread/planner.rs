@@ -14,6 +14,7 @@ use url::Url;
 use super::MEMORY_HEADER;
 use super::affinity::QueryWorkers;
 use super::cluster::WorkerCluster;
+use crate::mcap::McapCodec;
 
 /// A plan whose stages run on workers, with the state that it runs under.
 pub(super) struct SpreadPlan {
@@ -36,6 +37,7 @@ impl SpreadPlan {
         let workers = QueryWorkers::new(workers, cluster.least_bytes() == 0);
         let state = SessionStateBuilder::new_from_existing(state.clone())
             .with_distributed_worker_resolver(workers.clone())
+            .with_distributed_user_codec(McapCodec::encoder())
             .with_distributed_channel_resolver(cluster.channels().clone())
             .with_distributed_desired_task_count_handler(workers.clone())
             .with_distributed_scale_up_leaf_node_handler(workers.clone())

@@ -9,6 +9,8 @@ use arrow::record_batch::RecordBatch;
 use arrow::util::display::array_value_to_string;
 use datafusion::common::DataFusionError;
 use echolake_lake::Lake;
+use object_store::ObjectStoreExt as _;
+use object_store::path::Path;
 use tokio::net::TcpListener;
 use tokio::runtime::Runtime;
 use tonic::transport::Server;
@@ -16,6 +18,7 @@ use tonic::transport::server::TcpIncoming;
 
 use super::*;
 use crate::functions::tests::{SmallLake, examples};
+use crate::mcap::tests as mcap_tests;
 use crate::{EngineClient, EngineLimits, Error, QueryEngine, QueryQuota, Session};
 
 const BUILD: &str = "0.1.0-test";
@@ -25,16 +28,16 @@ fn identity(lake: &str) -> WorkerIdentity {
 }
 
 /// A worker on threads of its own; its connections end with them.
-struct TestWorker {
-    address: SocketAddr,
+pub(super) struct TestWorker {
+    pub(super) address: SocketAddr,
     runtime: Option<Runtime>,
 }
 
 impl TestWorker {
-    fn start(lake: &Lake) -> Self {
+    pub(super) fn start(lake: &Lake) -> Self {
         let runtime = Runtime::new().expect("threads");
         let engine = QueryEngine::new(lake, EngineLimits::default()).expect("an engine");
-        let worker = SpreadWorker::new(&engine, &identity("small"), None).expect("a worker");
+        let worker = SpreadWorker::new(&engine, &identity("small"), &WorkerLink::default()).expect("a worker");
         let listening = std::net::TcpListener::bind("127.0.0.1:0").expect("a port");
         listening.set_nonblocking(true).expect("tokio's");
         let address = listening.local_addr().expect("an address");
@@ -63,7 +66,12 @@ impl Drop for TestWorker {
 
 fn settings(workers: &[TestWorker]) -> ClusterSettings {
     let urls = workers.iter().map(|worker| format!("http://{}", worker.address).parse().expect("a URL"));
-    ClusterSettings { workers: urls.collect(), token: None, identity: identity("small"), least_bytes: 0 }
+    ClusterSettings {
+        workers: urls.collect(),
+        link: WorkerLink::default(),
+        identity: identity("small"),
+        least_bytes: 0,
+    }
 }
 
 fn session(lake: &Lake, workers: &[TestWorker], change: impl FnOnce(&mut ClusterSettings)) -> Session {
@@ -78,7 +86,7 @@ fn session_over(lake: &Lake, cluster: &Arc<WorkerCluster>) -> Session {
     engine.session(&Arc::new(EngineClient::new("somebody", QueryQuota::default())))
 }
 
-async fn answer(session: &Session, sql: &str) -> Result<(SchemaRef, Vec<RecordBatch>), Error> {
+pub(super) async fn answer(session: &Session, sql: &str) -> Result<(SchemaRef, Vec<RecordBatch>), Error> {
     let mut answer = session.query(sql).await?;
     let mut batches = Vec::new();
     while let Some(batch) = answer.next().await? {
@@ -102,7 +110,7 @@ fn cell(column: &ArrayRef, row: usize) -> String {
     }
 }
 
-fn lines(batches: &[RecordBatch], is_ordered: bool) -> Vec<String> {
+pub(super) fn lines(batches: &[RecordBatch], is_ordered: bool) -> Vec<String> {
     let line = |batch: &RecordBatch, row| batch.columns().iter().map(|c| cell(c, row)).collect::<Vec<_>>().join(" | ");
     let of_batch = |batch: &RecordBatch| (0..batch.num_rows()).map(|row| line(batch, row)).collect::<Vec<_>>();
     let mut lines: Vec<_> = batches.iter().flat_map(of_batch).collect();
@@ -120,7 +128,7 @@ async fn explained(session: &Session, sql: &str) -> String {
 /// Queries of the lake's kinds; in each, all that is not ordered is compared as a set.
 const QUERIES: [&str; 16] = [
     "select surface_id, run_id, pair_id, ir from measurements order by surface_id, pair_id",
-    "select * from nce order by surface_id, pair_id limit 7",
+    "select * from nce where pair_id < 7 order by surface_id, pair_id",
     "select * from measurements",
     "select surface_id, count(*), avg(snr_db), max(ir[1]) from measurements group by surface_id order by surface_id",
     "select count(*) from nce where nce_2500[10] > 0",
@@ -193,11 +201,45 @@ async fn functions_answer_over_workers_what_they_do_here() {
     let examples: Vec<_> = examples().into_iter().map(|(_, query, _)| query).collect();
     let spread = check_answers(&small.lake, &workers, &examples).await;
     assert!(spread > 0, "none of {} examples is spread", examples.len());
-    let from = "from measurements order by surface_id, pair_id limit 20";
+    let from = "from measurements where pair_id < 10 order by surface_id, pair_id";
     let mut queries: Vec<_> = FUNCTIONS.map(|call| format!("select {call} as x, ir[1] as y {from}")).into();
     queries.push("select surface_id, p90_mean(ir[9]), avg_list(ir) from measurements group by 1 order by 1".to_owned());
     let spread = check_answers(&small.lake, &workers, &queries).await;
     assert_eq!(spread, queries.len());
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn run_files_are_read_by_workers() {
+    let small = SmallLake::new().await;
+    for (name, seconds) in [("a", 30), ("b", 3), ("c", 11)] {
+        let file = mcap_tests::json_file(mcap_tests::options(None), seconds);
+        let path = Path::from(format!("inbox/{name}.mcap"));
+        small.lake.store().put(&path, file.into()).await.expect("written");
+    }
+    let files = "inbox/a.mcap,inbox/b.mcap,inbox/c.mcap";
+    let queries = [
+        format!(
+            "select run_id, log_time, x, name, tags, \"at\" from mcap('{files}', '/point') order by name, log_time"
+        ),
+        format!(
+            "select topic, count(*), sum(size), max(data) from mcap_messages('{files}') group by topic order by topic"
+        ),
+        format!(
+            "select p.name, m.pair_id from mcap('{files}', '/point') p join measurements m on p.sequence = m.pair_id \
+             order by p.name, m.surface_id"
+        ),
+        format!("select count(*) from mcap('{files}', '/point') where x > 3 and log_time_ns % 3 = 0"),
+        format!("select name from mcap('{files}', '/point') where log_time_ns < 1767657605000000000"),
+    ];
+    for count in [2, 3] {
+        let workers: Vec<_> = (0..count).map(|_| TestWorker::start(&small.lake)).collect();
+        assert_eq!(check_answers(&small.lake, &workers, &queries).await, queries.len());
+    }
+    // Few rows of a run file are few bytes.
+    let workers = [TestWorker::start(&small.lake), TestWorker::start(&small.lake)];
+    let usual = session(&small.lake, &workers, |settings| settings.least_bytes = 1);
+    let text = explained(&usual, &format!("select name from mcap('{files}', '/point') limit 3")).await;
+    assert!(text.contains("not spread over workers: it reads about 0 MiB"), "{text}");
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
@@ -213,10 +255,15 @@ async fn explain_says_what_is_spread_and_why_not() {
         ("select 1", "it reads no table file"),
         ("select count(*) from pairs", "it reads no table file"),
         ("select count(*) from generate_series(1, 10)", "is not sent to workers"),
+        ("select * from nce order by surface_id, pair_id limit 7", "asks for the first rows of an order"),
     ] {
         let text = explained(&eager, sql).await;
         assert!(text.contains("not spread over workers: ") && text.contains(reason), "{sql}: {text}");
     }
+    // No statistics exclude files from what is computed.
+    let computed = "select pair_id from measurements order by list_energy(ir) limit 3";
+    let text = explained(&eager, computed).await;
+    assert!(text.contains("spread over 2 of 2 workers"), "{text}");
     let usual = session(&small.lake, &workers, |settings| settings.least_bytes = 64 << 20);
     let text = explained(&usual, heavy).await;
     assert!(text.contains("not spread over workers: it reads about 1 MiB, less than 64 MiB"), "{text}");

@@ -9,7 +9,8 @@ use tonic::service::Routes;
 
 use super::channels::WorkerChannels;
 use super::guard::SpreadTasks;
-use super::{MEMORY_HEADER, WorkerIdentity, WorkerToken};
+use super::{MEMORY_HEADER, WorkerIdentity, WorkerLink};
+use crate::mcap::McapCodec;
 use crate::{Error, QueryEngine};
 
 /// A worker's service. Who may use it is for the server that offers it to check.
@@ -19,12 +20,12 @@ pub struct SpreadWorker {
 }
 
 impl SpreadWorker {
-    /// Makes the service of an engine; `token` is sent to the other workers that a stage reads from.
+    /// Makes the service of an engine; `link` is to the other workers that a stage reads from.
     ///
     /// # Errors
     /// [`Error::Execution`] if the token cannot be sent.
-    pub fn new(engine: &QueryEngine, identity: &WorkerIdentity, token: Option<&WorkerToken>) -> Result<Self, Error> {
-        let channels = WorkerChannels::new(token).map_err(|e| Error::execution(&e))?;
+    pub fn new(engine: &QueryEngine, identity: &WorkerIdentity, link: &WorkerLink) -> Result<Self, Error> {
+        let channels = WorkerChannels::new(link).map_err(|e| Error::execution(&e))?;
         let tasks = SpreadTasks::default();
         let sessions = TaskSessions { engine: engine.clone(), channels, tasks: tasks.clone() };
         let worker = Worker::from_session_builder(sessions)
@@ -55,7 +56,10 @@ struct TaskSessions {
 impl WorkerSessionBuilder for TaskSessions {
     async fn build_session_state(&self, context: WorkerQueryContext) -> Result<SessionState> {
         let memory = memory_limit(&context.headers)?;
-        let mut builder = context.builder.with_distributed_channel_resolver(self.channels.clone());
+        let mut builder = context
+            .builder
+            .with_distributed_user_codec(McapCodec::new(self.engine.catalog().run_files().clone()))
+            .with_distributed_channel_resolver(self.channels.clone());
         if let Some(guard) = self.tasks.guard(&context.headers) {
             builder.set_distributed_worker_plan_rewrite_handler(guard);
         }

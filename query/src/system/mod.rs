@@ -1,10 +1,11 @@
 //! Tables of the schema `system`: versions and files of the lake and how its runs came into it, all as the query's
-//! snapshot has them; and those that the program around the engine has of itself ([`SystemSource`]).
+//! snapshot has them; those that the program around the engine has of itself ([`SystemSource`]), and its workers.
 
 mod files;
 mod ingests;
 mod source;
 mod versions;
+mod workers;
 
 use std::collections::HashMap;
 use std::sync::Arc;
@@ -27,6 +28,9 @@ use ingests::LakeIngests;
 use source::SourceRows;
 pub use source::SystemSource;
 use versions::LakeVersions;
+use workers::ClusterWorkers;
+
+use crate::WorkerCluster;
 
 /// The schema of these tables.
 pub(crate) const SCHEMA: &str = "system";
@@ -81,13 +85,18 @@ pub(crate) fn lake_tables(
     ]
 }
 
-/// The tables of a source.
-pub(crate) fn source_tables(source: &Arc<dyn SystemSource>) -> Vec<(&'static str, Arc<dyn TableProvider>)> {
-    let table = |(name, schema)| {
+/// The tables of an engine's program: those of its source, and the workers of its cluster.
+pub(crate) fn engine_tables(
+    source: &Arc<dyn SystemSource>,
+    cluster: Option<&Arc<WorkerCluster>>,
+) -> Vec<(&'static str, Arc<dyn TableProvider>)> {
+    let table = |rows: Box<dyn SystemRows>| Arc::new(SystemTable(rows)) as Arc<dyn TableProvider>;
+    let of_source = source.tables().into_iter().map(|(name, schema)| {
         let rows = SourceRows { source: source.clone(), name, schema };
-        (name, Arc::new(SystemTable(Box::new(rows))) as Arc<dyn TableProvider>)
-    };
-    source.tables().into_iter().map(table).collect()
+        (name, table(Box::new(rows)))
+    });
+    let workers = ClusterWorkers { cluster: cluster.cloned() };
+    of_source.chain([("workers", table(Box::new(workers)))]).collect()
 }
 
 /// A column with its unit, empty if it has none, and its meaning.

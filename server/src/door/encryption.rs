@@ -40,6 +40,18 @@ pub struct CertificateFiles {
 type FileStates = [Option<(SystemTime, u64)>; 2];
 
 impl CertificateFiles {
+    /// Returns the folders that a process reads to take renewed files: those of the files, and of what they link to.
+    pub fn folders(&self) -> Vec<PathBuf> {
+        let files = [&self.certificate, &self.key];
+        let targets = files.into_iter().filter_map(|path| path.canonicalize().ok());
+        let all = files.into_iter().cloned().chain(targets);
+        let folder = |path: PathBuf| match path.parent() {
+            Some(parent) if !parent.as_os_str().is_empty() => parent.to_owned(),
+            _ => PathBuf::from("."),
+        };
+        all.map(folder).collect()
+    }
+
     fn states(&self) -> FileStates {
         [&self.certificate, &self.key].map(|path| {
             let about = std::fs::metadata(path).ok()?;
@@ -85,7 +97,7 @@ impl ResolvesServerCert for CurrentCertificate {
 }
 
 /// Encryption of a server.
-pub(super) struct ServerEncryption {
+pub(crate) struct ServerEncryption {
     files: CertificateFiles,
     current: Arc<CurrentCertificate>,
 }
@@ -95,7 +107,7 @@ impl ServerEncryption {
     ///
     /// # Errors
     /// [`Error::Certificate`].
-    pub(super) fn new(files: CertificateFiles) -> Result<Self, Error> {
+    pub(crate) fn new(files: CertificateFiles) -> Result<Self, Error> {
         let current = Arc::new(CurrentCertificate(RwLock::new(Arc::new(files.load()?))));
         Ok(Self { files, current })
     }
@@ -105,6 +117,14 @@ impl ServerEncryption {
     /// # Errors
     /// [`Error::System`].
     pub(super) fn of_protocol(&self, name: &[u8]) -> Result<ProtocolEncryption, Error> {
+        Ok(ProtocolEncryption(Some((self.acceptor(name)?, self.current.clone()))))
+    }
+
+    /// Returns what shakes hands with clients of a protocol.
+    ///
+    /// # Errors
+    /// [`Error::System`].
+    pub(crate) fn acceptor(&self, name: &[u8]) -> Result<TlsAcceptor, Error> {
         let failed = |e: rustls::Error| Error::System(io::Error::other(e));
         let mut config = ServerConfig::builder_with_provider(Arc::new(ring::default_provider()))
             .with_protocol_versions(&[&rustls::version::TLS13, &rustls::version::TLS12])
@@ -112,11 +132,11 @@ impl ServerEncryption {
             .with_no_client_auth()
             .with_cert_resolver(self.current.clone());
         config.alpn_protocols = vec![name.to_vec()];
-        Ok(ProtocolEncryption(Some((TlsAcceptor::from(Arc::new(config)), self.current.clone()))))
+        Ok(TlsAcceptor::from(Arc::new(config)))
     }
 
     /// Takes changed files for new connections; open ones keep the certificate with which they began. Never ends.
-    pub(super) async fn keep_up(self) {
+    pub(crate) async fn keep_up(self) {
         let mut known = self.files.states();
         loop {
             tokio::time::sleep(LOOK_EVERY).await;

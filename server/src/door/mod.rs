@@ -29,7 +29,8 @@ use crate::Error;
 use crate::tokens::TokenFile;
 pub use agent::AgentDoor;
 pub use encryption::CertificateFiles;
-use encryption::{ProtocolEncryption, ServerEncryption};
+use encryption::ProtocolEncryption;
+pub(crate) use encryption::ServerEncryption;
 pub use engine_process::EngineSettings;
 use server_door::ServerDoor;
 

@@ -35,13 +35,14 @@ pub fn missing() -> Option<&'static str> {
     )
 }
 
-/// Lets the process read `lake`, read and write `own` folders, and nothing else; connect over TCP to the ports of `workers`
-/// alone. To be called before there are threads. A kernel without Landlock leaves the process as it is.
+/// Lets the process read `lake` and the files `trusted`, read and write `own` folders, and nothing else; connect over TCP
+/// to the ports of `workers` alone. To be called before there are threads. A kernel without Landlock leaves the process as it is.
 ///
 /// # Errors
 /// The system refuses.
-pub fn confine_files(lake: &Path, own: &[&Path], workers: &[u16]) -> io::Result<()> {
+pub fn confine_files(lake: &Path, trusted: &[PathBuf], own: &[&Path], workers: &[u16]) -> io::Result<()> {
     let mut readable = lake_folders(lake);
+    readable.extend_from_slice(trusted);
     if !workers.is_empty() {
         readable.extend(NAMES.map(PathBuf::from));
     }

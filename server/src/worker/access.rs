@@ -2,32 +2,26 @@
 
 use std::path::Path;
 
-use echolake_query::WorkerToken;
+use echolake_query::{WorkerLink, WorkerToken};
 use subtle::ConstantTimeEq as _;
 use tonic::{Request, Status};
 
 use crate::Error;
 
-/// Connection between workers and engines.
-#[derive(Debug, Clone, Default)]
-pub struct WorkerLink {
-    /// The secret that they share; None on one machine.
-    pub token: Option<WorkerToken>,
-    /// True if plain text may leave this machine, because the network between them is private.
-    pub is_private: bool,
-}
-
-impl WorkerLink {
-    /// Checks that an address may be used with it.
-    ///
-    /// # Errors
-    /// [`Error::OpenWorker`], [`Error::PlainTextWorker`].
-    pub(crate) fn check(&self, address: &str, is_loopback: bool) -> Result<(), Error> {
-        match (is_loopback, &self.token, self.is_private) {
-            (true, ..) | (false, Some(_), true) => Ok(()),
-            (false, None, _) => Err(Error::OpenWorker { address: address.to_owned() }),
-            (false, Some(_), false) => Err(Error::PlainTextWorker { address: address.to_owned() }),
-        }
+/// Checks that a worker's address may be used with a link, encrypted or not.
+///
+/// # Errors
+/// [`Error::OpenWorker`], [`Error::PlainTextWorker`].
+pub(super) fn check_address(
+    link: &WorkerLink,
+    address: &str,
+    is_loopback: bool,
+    is_encrypted: bool,
+) -> Result<(), Error> {
+    match (is_loopback, &link.token, is_encrypted || link.is_private) {
+        (true, ..) | (false, Some(_), true) => Ok(()),
+        (false, None, _) => Err(Error::OpenWorker { address: address.to_owned() }),
+        (false, Some(_), false) => Err(Error::PlainTextWorker { address: address.to_owned() }),
     }
 }
 
@@ -93,14 +87,16 @@ mod tests {
     }
 
     #[test]
-    fn beyond_this_machine_there_is_a_token_and_a_private_network() {
+    fn beyond_this_machine_there_is_a_token_and_encryption_or_a_private_network() {
         let token = WorkerToken::parse("0123456789abcdef0123456789abcdef");
-        let check = |token: Option<WorkerToken>, is_private, is_loopback| {
-            WorkerLink { token, is_private }.check("10.0.0.7", is_loopback)
+        let check = |token: &Option<WorkerToken>, is_private, is_loopback, is_encrypted| {
+            let link = WorkerLink { token: token.clone(), trust: None, is_private };
+            check_address(&link, "10.0.0.7", is_loopback, is_encrypted)
         };
-        assert!(check(None, false, true).is_ok());
-        assert!(check(token.clone(), true, false).is_ok());
-        assert!(matches!(check(None, true, false), Err(Error::OpenWorker { .. })));
-        assert!(matches!(check(token, false, false), Err(Error::PlainTextWorker { .. })));
+        assert!(check(&None, false, true, false).is_ok());
+        assert!(check(&token, true, false, false).is_ok());
+        assert!(check(&token, false, false, true).is_ok());
+        assert!(matches!(check(&None, true, false, true), Err(Error::OpenWorker { .. })));
+        assert!(matches!(check(&token, false, false, false), Err(Error::PlainTextWorker { .. })));
     }
 }
