@@ -6,6 +6,7 @@
 mod acquire_kills;
 mod attacks;
 mod cancels;
+mod catalogue_client;
 #[allow(dead_code, reason = "the tests' helper, of which this wants a part")]
 #[path = "../../tests/child.rs"]
 mod child;
@@ -30,6 +31,7 @@ mod mcap_bench;
 mod memory;
 mod motion;
 mod observed_server;
+mod overhead;
 mod percentile;
 mod query_bench;
 mod readers;
@@ -92,6 +94,8 @@ enum CampaignCommand {
     McapBench(mcap_bench::McapBenchArgs),
     /// Measure many readers of a served catalogue at once.
     Readers(readers::ReadersArgs),
+    /// Measure what encryption, tokens, audit and traces cost: readers and one response, with all of it and without.
+    Overhead(overhead::OverheadArgs),
     /// Measure slices of a served run, for one reader and for many.
     Slices(slices::SlicesArgs),
     /// Measure SQL's list functions beside plain loops.
@@ -116,6 +120,7 @@ fn main() -> Result<()> {
         CampaignCommand::QueryBench(args) => block_on(query_bench::run(&args)),
         CampaignCommand::McapBench(args) => block_on(mcap_bench::run(&args)),
         CampaignCommand::Readers(args) => readers::run(&args),
+        CampaignCommand::Overhead(args) => overhead::run(&args),
         CampaignCommand::Slices(args) => slices::run(&args),
         CampaignCommand::FunctionsBench => functions_bench::run(),
         CampaignCommand::Motion(args) => motion::run(&args),

@@ -3,20 +3,21 @@
 //! Nothing of it comes out of a browser's cache; what the server keeps, it keeps.
 #![allow(clippy::print_stdout, reason = "its figures are what it is for")]
 
-use std::io::{BufRead as _, BufReader, Read as _, Write as _};
-use std::net::TcpStream;
+use std::path::PathBuf;
+use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
-use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
-use anyhow::{Context as _, Result, anyhow};
+use anyhow::{Result, anyhow};
 use serde_json::Value;
 
+use super::catalogue_client::CatalogueServer;
 use super::memory::resident_mib;
+use super::percentile::{millis, percentile};
 
 /// Kind of requests that a reader sends.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
-enum QuestionKind {
+pub(crate) enum QuestionKind {
     /// All requests that pages send.
     All,
     /// A new combination of filters each time.
@@ -38,52 +39,19 @@ pub(crate) struct ReadersArgs {
     /// Kind of requests that they send.
     #[arg(long = "ask", value_name = "KIND", value_enum, default_value_t = QuestionKind::All)]
     kind: QuestionKind,
+    /// The server's certificate; without it, nothing is encrypted.
+    #[arg(long, value_name = "FILE")]
+    certificate: Option<PathBuf>,
+    /// A token, if the server wants one.
+    #[arg(long)]
+    token: Option<String>,
     /// The server's process, whose memory is watched then.
     #[arg(long)]
     pid: Option<u32>,
 }
 
-/// A connection that is kept open.
-struct CatalogueConnection {
-    address: String,
-    stream: BufReader<TcpStream>,
-}
-
-impl CatalogueConnection {
-    fn open(address: &str) -> Result<Self> {
-        let stream = TcpStream::connect(address)?;
-        stream.set_nodelay(true)?;
-        stream.set_read_timeout(Some(Duration::from_secs(60)))?;
-        Ok(Self { address: address.to_owned(), stream: BufReader::new(stream) })
-    }
-
-    /// Asks; returns status and body.
-    fn get(&mut self, path: &str) -> Result<(u16, Vec<u8>)> {
-        let head = format!("GET {path} HTTP/1.1\r\nhost: {}\r\naccept: application/json, */*\r\n\r\n", self.address);
-        self.stream.get_mut().write_all(head.as_bytes())?;
-        let (mut status, mut length) = (0, None);
-        for line in (&mut self.stream).lines() {
-            let line = line?;
-            if line.is_empty() {
-                break;
-            }
-            if let Some(rest) = line.strip_prefix("HTTP/1.1 ") {
-                status = rest.split(' ').next().unwrap_or_default().parse()?;
-            }
-            if let Some((name, value)) = line.split_once(": ")
-                && name.eq_ignore_ascii_case("content-length")
-            {
-                length = Some(value.parse::<usize>()?);
-            }
-        }
-        let mut body = vec![0; length.context("an answer without a length")?];
-        self.stream.read_exact(&mut body)?;
-        Ok((status, body))
-    }
-}
-
 /// Surfaces, facets, runs and pairs that requests name.
-struct CatalogueContents {
+pub(crate) struct CatalogueContents {
     surfaces: Vec<String>,
     facets: Vec<(String, String)>,
     runs: Vec<String>,
@@ -91,8 +59,12 @@ struct CatalogueContents {
 }
 
 impl CatalogueContents {
-    fn read(address: &str) -> Result<Self> {
-        let mut connection = CatalogueConnection::open(address)?;
+    /// Asks a server for them.
+    ///
+    /// # Errors
+    /// The server does not answer.
+    pub(crate) fn read(server: &CatalogueServer) -> Result<Self> {
+        let mut connection = server.connect()?;
         let mut json = |path: &str| -> Result<Value> { Ok(serde_json::from_slice(&connection.get(path)?.1)?) };
         let text = |value: &Value| value.as_str().unwrap_or_default().to_owned();
         let page = json("/api/v1/surfaces?limit=500")?;
@@ -161,61 +133,97 @@ impl RequestRandom {
     }
 }
 
-pub(crate) fn run(args: &ReadersArgs) -> Result<()> {
-    let args = Arc::new(args.clone());
-    let lake = Arc::new(CatalogueContents::read(&args.address)?);
-    let (times, errors) = (Arc::new(Mutex::new(Vec::new())), Arc::new(AtomicU64::new(0)));
-    let end = Instant::now() + Duration::from_secs(args.seconds);
-    let reader = |number: u64| {
-        let (args, lake, times, errors) = (args.clone(), lake.clone(), times.clone(), errors.clone());
-        std::thread::spawn(move || {
-            let mut chance = RequestRandom(number.wrapping_mul(0x9e37_79b9_7f4a_7c15) | 1);
-            (0..10).for_each(|_| {
-                let _ = chance.below(1);
-            });
-            let mut own = Vec::new();
-            let mut connection = None;
-            while Instant::now() < end {
-                let path = lake.path(args.kind, &mut chance);
-                let begun = Instant::now();
-                let asked = match connection.take() {
-                    Some(open) => Ok(open),
-                    None => CatalogueConnection::open(&args.address),
-                };
-                match asked.and_then(|mut open| open.get(&path).map(|answer| (open, answer))) {
-                    // Not every surface has every pair.
-                    Ok((open, (200 | 404, _))) => {
-                        own.push(begun.elapsed());
-                        connection = Some(open);
-                    }
-                    Ok((_, (status, body))) => {
-                        eprintln!("{path}: {status} {}", String::from_utf8_lossy(&body));
-                        errors.fetch_add(1, Ordering::Relaxed);
-                    }
-                    Err(why) => {
-                        eprintln!("{path}: {why}");
-                        errors.fetch_add(1, Ordering::Relaxed);
-                    }
+/// Readers that ask for a while.
+#[derive(Clone)]
+pub(crate) struct ReaderLoad {
+    pub(crate) server: CatalogueServer,
+    pub(crate) contents: Arc<CatalogueContents>,
+    pub(crate) kind: QuestionKind,
+    pub(crate) readers: u64,
+    pub(crate) time: Duration,
+}
+
+/// Times of all answers, and the number of requests that failed.
+pub(crate) struct ReaderTimes {
+    pub(crate) answers: Vec<Duration>,
+    pub(crate) errors: u64,
+}
+
+impl ReaderLoad {
+    /// Lets the readers ask, and `watch` be called meanwhile.
+    ///
+    /// # Errors
+    /// A reader panicked.
+    pub(crate) fn measure(&self, mut watch: impl FnMut()) -> Result<ReaderTimes> {
+        let errors = Arc::new(AtomicU64::new(0));
+        let end = Instant::now() + self.time;
+        let reader = |number| {
+            let (load, errors) = (self.clone(), errors.clone());
+            std::thread::spawn(move || load.read(number, end, &errors))
+        };
+        let readers: Vec<_> = (1..=self.readers).map(reader).collect();
+        while Instant::now() < end {
+            watch();
+            std::thread::sleep(Duration::from_millis(200));
+        }
+        let mut answers = Vec::new();
+        for reader in readers {
+            answers.extend(reader.join().map_err(|_| anyhow!("a reader panicked"))?);
+        }
+        Ok(ReaderTimes { answers, errors: errors.load(Ordering::Relaxed) })
+    }
+
+    fn read(&self, number: u64, end: Instant, errors: &AtomicU64) -> Vec<Duration> {
+        let mut chance = RequestRandom(number.wrapping_mul(0x9e37_79b9_7f4a_7c15) | 1);
+        (0..10).for_each(|_| {
+            let _ = chance.below(1);
+        });
+        let mut own = Vec::new();
+        let mut connection = None;
+        while Instant::now() < end {
+            let path = self.contents.path(self.kind, &mut chance);
+            let begun = Instant::now();
+            let asked = match connection.take() {
+                Some(open) => Ok(open),
+                None => self.server.connect(),
+            };
+            match asked.and_then(|mut open| open.get(&path).map(|answer| (open, answer))) {
+                // Not every surface has every pair.
+                Ok((open, (200 | 404, _))) => {
+                    own.push(begun.elapsed());
+                    connection = Some(open);
+                }
+                Ok((_, (status, body))) => {
+                    eprintln!("{path}: {status} {}", String::from_utf8_lossy(&body));
+                    errors.fetch_add(1, Ordering::Relaxed);
+                }
+                Err(why) => {
+                    eprintln!("{path}: {why}");
+                    errors.fetch_add(1, Ordering::Relaxed);
                 }
             }
-            times.lock().unwrap_or_else(PoisonError::into_inner).extend(own);
-        })
-    };
-    let readers: Vec<_> = (1..=args.readers).map(reader).collect();
+        }
+        own
+    }
+}
+
+pub(crate) fn run(args: &ReadersArgs) -> Result<()> {
+    let mut server = CatalogueServer::new(&args.address);
+    if let Some(token) = &args.token {
+        server = server.with_token(token);
+    }
+    if let Some(certificate) = &args.certificate {
+        server = server.with_certificate(certificate)?;
+    }
+    let contents = Arc::new(CatalogueContents::read(&server)?);
+    let (readers, time) = (args.readers, Duration::from_secs(args.seconds));
     let mut heaviest = 0;
-    while Instant::now() < end {
-        heaviest = heaviest.max(args.pid.and_then(resident_mib).unwrap_or(0));
-        std::thread::sleep(Duration::from_millis(200));
-    }
-    for reader in readers {
-        reader.join().map_err(|_| anyhow!("a reader panicked"))?;
-    }
-    let mut times = times.lock().unwrap_or_else(PoisonError::into_inner);
-    times.sort_unstable();
-    let at = |share: f64| times.get((share * times.len() as f64) as usize).map_or(f64::NAN, |t| t.as_secs_f64() * 1e3);
+    let load = ReaderLoad { server, contents, kind: args.kind, readers, time };
+    let times = load.measure(|| heaviest = heaviest.max(args.pid.and_then(resident_mib).unwrap_or(0)))?;
+    let at = |share: f64| millis(percentile(&times.answers, share));
     println!("{:?}: {} readers, {} s", args.kind, args.readers, args.seconds);
-    println!("  answers {}, {:.0} a second", times.len(), times.len() as f64 / args.seconds as f64);
-    println!("  errors {}", errors.load(Ordering::Relaxed));
+    println!("  answers {}, {:.0} a second", times.answers.len(), times.answers.len() as f64 / args.seconds as f64);
+    println!("  errors {}", times.errors);
     println!("  p50 {:.1} ms, p95 {:.1} ms, p99 {:.1} ms", at(0.5), at(0.95), at(0.99));
     if heaviest > 0 {
         println!("  the server's memory at most {heaviest} MiB");

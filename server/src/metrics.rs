@@ -13,7 +13,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::activity::QueryEnd;
 use crate::fault::{FaultCode, RequestFault};
-pub(crate) use gauges::{PoolGauges, ServerGauges};
+pub(crate) use gauges::{DiskSpace, PoolGauges, ServerGauges};
 use workers::WorkerGauges;
 
 /// The protocol of a query.

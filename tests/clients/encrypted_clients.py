@@ -28,9 +28,9 @@ OLD = "old"
 
 
 class EncryptedServer:
-    """A server with a certificate and two tokens, one of them from a version without SCRAM."""
+    """A server with a certificate and two tokens, one of them from a version without SCRAM; without encryption for comparison."""
 
-    def __init__(self, program, lake, folder, port):
+    def __init__(self, program, lake, folder, port, is_encrypted=True):
         self.folder = folder
         self.http, self.flight, self.postgres = port, port + 1, port + 2
         for name in "tls", "other":
@@ -44,7 +44,9 @@ class EncryptedServer:
             file.write(lines + re.sub(r"^scram = .*\n", "", old_lines, flags=re.MULTILINE))
         addresses = zip(["--listen", "--flight-sql", "--postgres"], [self.http, self.flight, self.postgres])
         listen = [part for option, number in addresses for part in (option, f"127.0.0.1:{number}")]
-        files = ["--tokens", tokens, "--certificate", self.certificate, "--key", os.path.join(folder, "tls", "key.pem")]
+        files = ["--tokens", tokens]
+        if is_encrypted:
+            files += ["--certificate", self.certificate, "--key", os.path.join(folder, "tls", "key.pem")]
         self.process = subprocess.Popen([program, "--lake", lake, "serve", *listen, *files], stderr=subprocess.DEVNULL)
         wait_for(self.postgres)
 

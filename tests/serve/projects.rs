@@ -2,6 +2,8 @@
 //! over all protocols. What such a token is answered is what it would be answered if these runs did not exist.
 
 mod attempts;
+mod timings;
+mod tools;
 
 use std::path::PathBuf;
 
@@ -90,12 +92,13 @@ fn check_marks(marks: &[String], asked: &str, answer: &str) {
     for mark in marks.iter().filter(|mark| !asked.contains(mark.as_str())) {
         assert!(!rest.contains(mark), "{asked}: {answer}");
     }
-    for name in ["wood_secret", "prd_older", "theirs"].iter().filter(|name| !asked.contains(*name)) {
+    for name in ["wood_secret", "prd_older", "wood_waiting", "theirs"].iter().filter(|name| !asked.contains(*name)) {
         assert!(!rest.contains(name), "{asked}: {answer}");
     }
 }
 
-/// References, one surface of project `ours`; the same runs in both folders, and in the second two others' that come last.
+/// References, one surface of project `ours`; the same runs in both folders, and in the second two others' that come last, and
+/// one that nobody has ingested.
 fn with_and_without() -> [TestFolder; 2] {
     static WITHOUT: TestFolderTemplate = TestFolderTemplate::new();
     static WITH: TestFolderTemplate = TestFolderTemplate::new();
@@ -112,6 +115,7 @@ fn with_and_without() -> [TestFolder; 2] {
         place.acquire("prd_older", &["--ir-only"]);
         place.acquire("wood_secret", &["--ir-only", "--project", "theirs"]);
         place.ok(&["ingest"]);
+        place.acquire("wood_waiting", &["--ir-only", "--project", "theirs"]);
     });
     [without, with]
 }
@@ -244,6 +248,7 @@ fn files_with_rows_of_several_projects_show_those_that_may_be_seen() {
         place.acquire(surface, &["--ir-only", "--project", project]);
         place.ok(&["ingest"]);
     }
+    place.acquire("wood_waiting", &["--ir-only", "--project", "theirs"]);
     let scene = ProjectScene::serve(place);
     let (marks, hidden) = (scene.marks(), scene.hidden());
     for ProjectAttempt { sql, is_exact } in statements(&hidden, scene.version()) {

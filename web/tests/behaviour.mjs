@@ -484,6 +484,75 @@ await check(
   },
 )
 
+await check('operations show what SQL says, and a query that runs is cancelled by keyboard', async () => {
+  const section = (title) => page.locator(`section[aria-label="${title}"]`)
+  const lines = (title) => section(title).locator('tbody tr')
+  await open('/operations')
+  const [stored] = await sql('select sum(file_bytes) as bytes, count(*) as files from runs')
+  const runs = lines('Disk').filter({ hasText: 'run files' })
+  await eventually(async () => assert.equal(await runs.locator('td').first().innerText(), String(stored.files)))
+  const files = await sql("select state = 'refused' as refused, reason from system.inbox")
+  assert.equal(await lines('Quarantine').count(), files.filter((file) => file.refused).length)
+  assert.equal(await lines('Inbox').count(), files.filter((file) => !file.refused).length)
+  const ingested = (await sql('select count(*) as n from system.ingests'))[0].n
+  assert.equal(await lines('Ingests').count(), Math.min(20, ingested))
+  const endless =
+    'select count(*) from generate_series(1, 1000000) a cross join generate_series(1, 1000000) b where a.value + b.value = 7'
+  const asked = page.evaluate(
+    (query) =>
+      fetch('/api/v1/sql', {
+        method: 'POST',
+        headers: { accept: 'application/json', 'content-type': 'application/json' },
+        body: JSON.stringify({ query }),
+      }).then((answer) => answer.text(), String),
+    endless,
+  )
+  await page.getByRole('group', { name: 'Show queries' }).getByRole('button', { name: 'running' }).focus()
+  await page.keyboard.press('Enter')
+  await page.waitForURL(/queries=running/)
+  const cancel = section('Queries').locator('tr', { hasText: 'generate_series' }).getByRole('button')
+  await eventually(async () => {
+    await page.getByRole('button', { name: 'Look again' }).click()
+    // The query itself keeps the network from being idle.
+    await page.waitForTimeout(300)
+    assert.equal(await cancel.count(), 1)
+  })
+  await cancel.focus()
+  await page.keyboard.press('Enter')
+  await eventually(async () => assert.equal(await cancel.count(), 0))
+  assert.match(await asked, /cancelled/)
+  await page.getByRole('group', { name: 'Show queries' }).getByRole('button', { name: 'failed' }).click()
+  await section('Queries').locator('tr', { hasText: 'generate_series' }).getByText('cancelled').first().waitFor()
+  assert.equal(await section('Queries').getByText('operations page').count(), 0)
+  said.splice(0, said.length, ...said.filter((line) => !/status of (4|5)/.test(line)))
+})
+
+await check('operations say what a token may not see', async () => {
+  const refusal = (hint) => ({
+    status: 403,
+    json: { status: 403, code: 'forbidden', title: 'Forbidden', detail: `it may not; hint: ${hint}` },
+  })
+  await page.route('**/metrics', (route) => route.fulfill(refusal('scope metrics')))
+  await open('/operations')
+  await page.getByText('need a token with the scope metrics').waitFor()
+  await page.locator('section[aria-label="Versions"] tbody tr').first().waitFor()
+  const bold = '<b>no magic</b>'
+  const file = { state: 'refused', path: 'quarantine/a.mcap', bytes: 5, changed: '2026-01-07T04:00:00Z', reason: bold }
+  await page.route('**/api/v1/sql', (route) =>
+    route.request().postDataJSON().query.includes('system.inbox') ? route.fulfill({ json: [file] }) : route.fallback(),
+  )
+  await open('/operations')
+  await page.locator('section[aria-label="Quarantine"] td', { hasText: bold }).waitFor()
+  await page.unroute('**/api/v1/sql')
+  await page.route('**/api/v1/sql', (route) => route.fulfill(refusal('scope sql')))
+  await open('/operations')
+  await page.getByRole('alert').getByText('scope sql').waitFor()
+  assert.equal(await page.getByRole('alert').count(), 1)
+  await page.unroute('**/metrics')
+  await page.unroute('**/api/v1/sql')
+  said.splice(0, said.length, ...said.filter((line) => !line.includes('status of 403')))
+})
+
 await check('names from the lake stay text', async () => {
   await page.route('**/api/v1/surfaces?*', async (route) => {
     const answer = await (await route.fetch()).json()

@@ -43,6 +43,7 @@ const PAGES = {
   sql: `/sql?q=${encodeURIComponent(query)}`,
   tables: `/sql?q=${encodeURIComponent("select surface_id, p90_mean_db from surface_stats where band = 'total'")}&tables=points&summary=points`,
   wrong: '/sql?q=select%20nope',
+  operations: '/operations',
 }
 
 /** Of the screen, while a page comes up; browsers call up to 0.1 good. */

@@ -1,7 +1,9 @@
 //! Tables of the schema `system`: versions and files of the lake and how its runs came into it, all as the query's
-//! snapshot has them; those that the program around the engine has of itself ([`SystemSource`]), and its workers.
+//! snapshot has them; run files that are not in it yet; those that the program around the engine has of itself
+//! ([`SystemSource`]), and its workers.
 
 mod files;
+mod inbox;
 mod ingests;
 mod source;
 mod versions;
@@ -24,6 +26,7 @@ use echolake_lake::{Lake, LakeSnapshot};
 use echolake_schema::tables::{COMMENT, UNIT};
 
 use files::LakeFiles;
+use inbox::LakeInbox;
 use ingests::LakeIngests;
 use source::SourceRows;
 pub use source::SystemSource;
@@ -76,11 +79,12 @@ pub(crate) fn lake_tables(
     lake: &Lake,
     snapshot: &Arc<LakeSnapshot>,
     runs: Arc<dyn TableProvider>,
-) -> [(&'static str, Arc<dyn TableProvider>); 3] {
+) -> [(&'static str, Arc<dyn TableProvider>); 4] {
     let table = |rows: Box<dyn SystemRows>| Arc::new(SystemTable(rows)) as Arc<dyn TableProvider>;
     [
         ("versions", table(Box::new(LakeVersions { lake: lake.clone() }))),
         ("files", table(Box::new(LakeFiles { snapshot: snapshot.clone() }))),
+        ("inbox", table(Box::new(LakeInbox { lake: lake.clone() }))),
         ("ingests", table(Box::new(LakeIngests { lake: lake.clone(), snapshot: snapshot.clone(), runs }))),
     ]
 }

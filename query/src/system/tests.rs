@@ -8,6 +8,8 @@ use arrow::record_batch::RecordBatch;
 use async_trait::async_trait;
 use echolake_lake::{Lake, ReferenceSurfaces};
 use echolake_schema::Rig;
+use object_store::ObjectStoreExt as _;
+use object_store::path::Path;
 
 use super::SystemSource;
 use crate::{EngineClient, EngineLimits, Error, QueryEngine, QueryQuota, Session};
@@ -28,9 +30,16 @@ impl SystemSource for Numbers {
     }
 }
 
+async fn empty_lake() -> Lake {
+    Lake::open_or_create("memory://", &Rig::paper(), &ReferenceSurfaces::default()).await.expect("a lake")
+}
+
 async fn session(source: Option<Arc<dyn SystemSource>>) -> Session {
-    let lake = Lake::open_or_create("memory://", &Rig::paper(), &ReferenceSurfaces::default()).await.expect("a lake");
-    let engine = QueryEngine::new(&lake, EngineLimits::default()).expect("an engine");
+    session_of(&empty_lake().await, source)
+}
+
+fn session_of(lake: &Lake, source: Option<Arc<dyn SystemSource>>) -> Session {
+    let engine = QueryEngine::new(lake, EngineLimits::default()).expect("an engine");
     if let Some(source) = source {
         engine.add_system_tables(source);
     }
@@ -54,12 +63,44 @@ async fn the_lake_has_versions_and_files() {
 }
 
 #[tokio::test]
+async fn the_inbox_has_what_waits_and_why_files_were_refused() {
+    let lake = empty_lake().await;
+    let session = session_of(&lake, None);
+    assert_eq!(number(&session, "select count(*) from system.inbox").await, 0);
+    for (path, content) in [
+        ("inbox/a.mcap", "12345"),
+        ("inbox/b.mcap.partial", "1"),
+        ("inbox/notes.txt", "no run"),
+        ("quarantine/c.mcap", "123"),
+        ("quarantine/c.mcap.reason.txt", "no magic\n"),
+        ("quarantine/d.mcap", "1"),
+        ("quarantine/e.mcap", "1"),
+        ("quarantine/e.mcap.reason.txt", &"x".repeat(5000)),
+    ] {
+        lake.store().put(&Path::from(path), content.to_owned().into()).await.expect("written");
+    }
+    for (rows, condition) in [
+        (5, "changed > timestamp '2026-01-01T00:00:00Z'"),
+        (1, "state = 'waiting' and path = 'inbox/a.mcap' and bytes = 5 and reason is null"),
+        (1, "state = 'recording' and path = 'inbox/b.mcap.partial'"),
+        (1, "state = 'refused' and path = 'quarantine/c.mcap' and bytes = 3 and reason = 'no magic'"),
+        (1, "path = 'quarantine/d.mcap' and reason is null"),
+        (1, "path = 'quarantine/e.mcap' and length(reason) = 4096"),
+    ] {
+        let sql = format!("select count(*) from system.inbox where {condition}");
+        assert_eq!(number(&session, &sql).await, rows, "{condition}");
+    }
+    let restricted = session_of(&lake.restricted_to(["ours".parse().expect("a name")].into()), None);
+    assert_eq!(number(&restricted, "select count(*) from system.inbox").await, 0);
+}
+
+#[tokio::test]
 async fn a_source_adds_tables() {
     let without = session(None).await;
     assert!(matches!(without.query("select * from system.numbers").await, Err(Error::Query { .. })));
     let with = session(Some(Arc::new(Numbers))).await;
     assert_eq!(number(&with, "select sum(n) from system.numbers where n > 1").await, 2);
     let listed = "select count(*) from information_schema.tables where table_schema = 'system'";
-    assert_eq!(number(&with, listed).await, 5);
+    assert_eq!(number(&with, listed).await, 6);
     assert_eq!(number(&with, "select count(*) from system.workers").await, 0);
 }

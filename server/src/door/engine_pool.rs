@@ -10,13 +10,13 @@ use echolake_lake::{CACHE_MEMORY_BYTES, Lake};
 use tokio::sync::Notify;
 
 use super::engine_process::{EndReason, EngineLease, EngineProcess, EngineSettings, EngineStart};
-use super::temp_folder::ServerFolders;
+use super::temp_folder::{ServerFolders, disk_space};
 use crate::Error;
 use crate::activity::ServerActivity;
 use crate::client_identity::ClientIdentity;
 use crate::engine::door_message::DoorMessage;
 use crate::fault::RequestFault;
-use crate::metrics::PoolGauges;
+use crate::metrics::{DiskSpace, PoolGauges};
 use crate::tokens::TokenAccess;
 
 /// Time without a request after which an engine ends.
@@ -347,6 +347,12 @@ impl EnginePool {
             started: self.0.started.load(Ordering::Relaxed),
             failed: self.0.failed.load(Ordering::Relaxed),
         }
+    }
+
+    /// Space on the disks of the lake, if it is in a folder, and of temporary files.
+    pub(super) fn disks(&self) -> Vec<(&'static str, DiskSpace)> {
+        let folders = [("lake", self.0.lake.folder()), ("temp", Some(self.0.folders.spills.path()))];
+        folders.into_iter().filter_map(|(name, folder)| Some((name, disk_space(folder?)?))).collect()
     }
 }
 

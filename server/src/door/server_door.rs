@@ -89,11 +89,14 @@ impl ServerDoor {
     /// [`RequestFault::Internal`].
     pub(crate) async fn figures(&self) -> Result<String, RequestFault> {
         let activity = self.activity();
+        let is_ready = self.check_ready().await.is_ok();
         let gauges = ServerGauges {
             pool: self.0.engines.gauges(),
             connections: activity.connections.counts(),
+            // A lake that does not answer may be on a disk that does not answer either.
+            disks: if is_ready { self.0.engines.disks() } else { Vec::new() },
             lake: activity.lake().map(|(at, figures)| (at.elapsed(), figures)),
-            is_ready: self.check_ready().await.is_ok(),
+            is_ready,
             process_start: activity.started().timestamp_micros() as f64 / 1e6,
         };
         activity.metrics.text(&gauges).map_err(RequestFault::defect("the figures cannot be written"))

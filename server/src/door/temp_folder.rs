@@ -4,10 +4,11 @@ use std::io;
 use std::path::{Path, PathBuf};
 
 use echolake_lake::Lake;
-use rustix::fs::statfs;
+use rustix::fs::{statfs, statvfs};
 use tempfile::{Builder, TempDir};
 
 use crate::Error;
+use crate::metrics::DiskSpace;
 
 /// The folder in the lake for temporary files, if no other is given.
 const IN_LAKE: &str = "temp";
@@ -55,6 +56,12 @@ impl ServerFolders {
         }
         Ok(Self { sockets, spills })
     }
+}
+
+/// Space of the file system that a folder is on; None if the system does not tell.
+pub(super) fn disk_space(folder: &Path) -> Option<DiskSpace> {
+    let system = statvfs(folder).ok()?;
+    Some(DiskSpace { free_bytes: system.f_bavail * system.f_frsize, bytes: system.f_blocks * system.f_frsize })
 }
 
 fn spill_folder(parent: &Path) -> io::Result<TempDir> {

@@ -16,11 +16,21 @@ pub(crate) struct ServerGauges {
     pub(crate) pool: PoolGauges,
     /// Open connections of each protocol that is served, and their limit.
     pub(crate) connections: Vec<(ServerProtocol, usize, usize)>,
+    /// Space on the disks of `lake` and `temp`.
+    pub(crate) disks: Vec<(&'static str, DiskSpace)>,
     /// The last figures of the lake, and their age.
     pub(crate) lake: Option<(Duration, LakeFigures)>,
     pub(crate) is_ready: bool,
     /// Seconds since 1970.
     pub(crate) process_start: f64,
+}
+
+/// Space of a file system.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) struct DiskSpace {
+    /// Bytes that this user may still write.
+    pub(crate) free_bytes: u64,
+    pub(crate) bytes: u64,
 }
 
 /// Gauges of the engines.
@@ -52,6 +62,16 @@ impl ServerGauges {
             let label = ("protocol", protocol.name());
             moment.constant("echolake_connections", "Open connections.", label, *open as f64)?;
             moment.constant("echolake_connections_limit", "Connections that may be open.", label, *most as f64)?;
+        }
+        for (folder, disk) in &self.disks {
+            let label = ("folder", *folder);
+            moment.constant(
+                "echolake_disk_free_bytes",
+                "Free space on the folder's disk.",
+                label,
+                disk.free_bytes as f64,
+            )?;
+            moment.constant("echolake_disk_bytes", "Size of the folder's disk.", label, disk.bytes as f64)?;
         }
         self.register_lake(&moment)?;
         self.register_process(&moment)
@@ -150,6 +170,10 @@ mod tests {
         let lake = LakeFigures { runs: 7, ..LakeFigures::default() };
         let gauges = ServerGauges {
             connections: vec![(ServerProtocol::Http, 2, 512), (ServerProtocol::Postgres, 1, 128)],
+            disks: vec![
+                ("lake", DiskSpace { free_bytes: 10, bytes: 40 }),
+                ("temp", DiskSpace { free_bytes: 1, bytes: 2 }),
+            ],
             lake: Some((Duration::from_secs(3), lake)),
             is_ready: true,
             ..ServerGauges::default()
@@ -158,6 +182,8 @@ mod tests {
         for line in [
             "echolake_connections{protocol=\"http\"} 2",
             "echolake_connections_limit{protocol=\"postgres\"} 128",
+            "echolake_disk_free_bytes{folder=\"lake\"} 10",
+            "echolake_disk_bytes{folder=\"temp\"} 2",
             "echolake_lake_runs 7",
             "echolake_lake_look_age_seconds 3",
             "echolake_quarantine_runs 0",

@@ -128,6 +128,8 @@ fn system(HiddenRun { surface, run }: &HiddenRun) -> Vec<String> {
         "select count(*) as n from system.ingests".to_owned(),
         "select \"table\", max(version) as newest, count(*) as n from system.versions group by 1 order by 1".to_owned(),
         "select sum(files_added) as files, sum(rows_added) as rows from system.versions".to_owned(),
+        "select * from system.inbox order by path".to_owned(),
+        "select count(*) as n, sum(bytes) as bytes from system.inbox".to_owned(),
         "select max(committed) as latest from system.versions where \"table\" = 'runs'".to_owned(),
     ]
 }

@@ -107,6 +107,12 @@ export const sql = (query: string, accept: string, signal?: AbortSignal): Promis
     ...(signal ? { signal } : {}),
   })
 
+/** The server's figures in Prometheus' format, as they are now. */
+export const figures = async (): Promise<string> => (await ask('/metrics')).text()
+
+/** Ends a query that runs, by its number in `system.queries`. */
+export const cancelQuery = (id: number): Promise<Response> => ask(`/api/v1/queries/${id}/cancel`, { method: 'POST' })
+
 /** Shows the server a token; it answers with a cookie, which pictures and downloads send too. */
 export const login = (token: string): Promise<Response> =>
   ask('/api/v1/session', {

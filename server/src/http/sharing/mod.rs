@@ -258,7 +258,7 @@ fn past_fault(now: u64) -> RequestFault {
 }
 
 fn lake_version(view: &SnapshotView) -> u64 {
-    view.snapshot.version(echolake_schema::tables::Table::Runs).unwrap_or(0)
+    view.snapshot.lake_version().unwrap_or(0)
 }
 
 // Clients that read Delta's own actions alone are told that there are none, before they read Parquet's as such.

@@ -1,0 +1,118 @@
+//! Connections to a served catalogue over HTTP, plain or encrypted, that are kept open.
+
+use std::io::{BufRead as _, BufReader, Read, Write};
+use std::net::TcpStream;
+use std::path::Path;
+use std::sync::Arc;
+use std::time::Duration;
+
+use anyhow::{Context as _, Result};
+use tokio_rustls::rustls::crypto::ring;
+use tokio_rustls::rustls::pki_types::pem::PemObject as _;
+use tokio_rustls::rustls::pki_types::{CertificateDer, ServerName};
+use tokio_rustls::rustls::{ClientConfig, ClientConnection, RootCertStore, StreamOwned};
+
+/// Time limit for the next bytes of an answer.
+const ANSWER_LIMIT: Duration = Duration::from_secs(60);
+
+/// A served catalogue, and how it is asked.
+#[derive(Clone)]
+pub(crate) struct CatalogueServer {
+    address: String,
+    /// Lines of each request's head.
+    headers: String,
+    encryption: Option<Arc<ClientConfig>>,
+}
+
+/// A connection that is kept open.
+pub(crate) struct CatalogueConnection {
+    headers: String,
+    stream: BufReader<Box<dyn ByteStream>>,
+}
+
+trait ByteStream: Read + Write + Send {}
+
+impl<T: Read + Write + Send> ByteStream for T {}
+
+impl CatalogueServer {
+    /// A server at `127.0.0.1:8080`, in plain text, without a token.
+    pub(crate) fn new(address: &str) -> Self {
+        let headers = format!("host: {address}\r\naccept: application/json, */*\r\n");
+        Self { address: address.to_owned(), headers, encryption: None }
+    }
+
+    /// Shows it a token.
+    pub(crate) fn with_token(self, token: &str) -> Self {
+        self.with_header("authorization", &format!("Bearer {token}"))
+    }
+
+    /// Sends it a header with each request.
+    pub(crate) fn with_header(mut self, name: &str, value: &str) -> Self {
+        self.headers += &format!("{name}: {value}\r\n");
+        self
+    }
+
+    /// Encrypts, and trusts this certificate alone.
+    ///
+    /// # Errors
+    /// The file is no certificate.
+    pub(crate) fn with_certificate(mut self, certificate: &Path) -> Result<Self> {
+        let read = || format!("`{}` is no certificate as PEM", certificate.display());
+        let mut roots = RootCertStore::empty();
+        roots.add(CertificateDer::from_pem_file(certificate).with_context(read)?).with_context(read)?;
+        let config = ClientConfig::builder_with_provider(Arc::new(ring::default_provider()))
+            .with_safe_default_protocol_versions()?
+            .with_root_certificates(roots)
+            .with_no_client_auth();
+        self.encryption = Some(Arc::new(config));
+        Ok(self)
+    }
+
+    /// Connects.
+    ///
+    /// # Errors
+    /// The server does not listen, or is another one.
+    pub(crate) fn connect(&self) -> Result<CatalogueConnection> {
+        let stream = TcpStream::connect(&self.address)?;
+        stream.set_nodelay(true)?;
+        stream.set_read_timeout(Some(ANSWER_LIMIT))?;
+        let stream: Box<dyn ByteStream> = match &self.encryption {
+            None => Box::new(stream),
+            Some(config) => {
+                let name = ServerName::try_from("localhost")?;
+                Box::new(StreamOwned::new(ClientConnection::new(config.clone(), name)?, stream))
+            }
+        };
+        Ok(CatalogueConnection { headers: self.headers.clone(), stream: BufReader::new(stream) })
+    }
+}
+
+impl CatalogueConnection {
+    /// Asks; returns status and body.
+    ///
+    /// # Errors
+    /// The connection ends, or the answer is none.
+    pub(crate) fn get(&mut self, path: &str) -> Result<(u16, Vec<u8>)> {
+        let head = format!("GET {path} HTTP/1.1\r\n{}\r\n", self.headers);
+        self.stream.get_mut().write_all(head.as_bytes())?;
+        self.stream.get_mut().flush()?;
+        let (mut status, mut length) = (0, None);
+        for line in (&mut self.stream).lines() {
+            let line = line?;
+            if line.is_empty() {
+                break;
+            }
+            if let Some(rest) = line.strip_prefix("HTTP/1.1 ") {
+                status = rest.split(' ').next().unwrap_or_default().parse()?;
+            }
+            if let Some((name, value)) = line.split_once(": ")
+                && name.eq_ignore_ascii_case("content-length")
+            {
+                length = Some(value.parse::<usize>()?);
+            }
+        }
+        let mut body = vec![0; length.context("an answer without a length")?];
+        self.stream.read_exact(&mut body)?;
+        Ok((status, body))
+    }
+}
