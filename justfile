@@ -47,7 +47,7 @@ paper *LAKE:
 campaign NAME *OPTIONS:
     cargo run --release --locked -p echolake-campaigns -- {{ NAME }} {{ OPTIONS }}
 
-# Fuzzes a reader of foreign files with coverage, as `just fuzz sofa 3600`; targets are in fuzz/targets/.
+# Fuzzes a reader of foreign bytes with coverage, as `just fuzz sofa 3600`; targets are in fuzz/targets/ and fuzz/wires/targets/.
 fuzz TARGET *OPTIONS:
     fuzz/run {{ TARGET }} {{ OPTIONS }}
 

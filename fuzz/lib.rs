@@ -10,7 +10,7 @@ use echolake_schema::{Rig, Timestamp};
 use ndarray::{Array1, Array2};
 use ndarray_npy::NpzWriter;
 
-pub use seeds::write_seeds_on_request;
+pub use seeds::{run_of_wav, write_seeds_on_request};
 
 /// Samples of responses.
 pub const LENGTH: usize = 400;

@@ -90,6 +90,14 @@ fn wav(bits_per_sample: u16, sample_format: SampleFormat) -> Vec<u8> {
     bytes.into_inner()
 }
 
+/// Returns the run of a WAV import.
+///
+/// # Panics
+/// It cannot be written.
+pub fn run_of_wav() -> Vec<u8> {
+    run(&wav(16, SampleFormat::Int))
+}
+
 // The run of an import.
 fn run(wav: &[u8]) -> Vec<u8> {
     let folder = ImportFolder::new();

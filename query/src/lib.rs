@@ -56,6 +56,8 @@ pub use control::threads::QueryThreads;
 pub use engine::{EngineClient, EngineLimits, QueryEngine, QueryPermit, QueryQuota, SqlFunction};
 pub use error::{Error, QueryPlace};
 pub use functions::FunctionSet;
+#[cfg(fuzzing)]
+pub use mcap::fuzzing::EncodedMessage;
 pub use mcap::{Attachment, Contents, Topic};
 pub use opaque::OpaqueValue;
 pub use predicate::PredicateForm;

@@ -186,6 +186,6 @@ mod tests {
         assert!(reads.of(&file).try_lock().is_ok());
         drop(first);
         let _third = reads.of(&other);
-        assert_eq!(reads.0.lock().unwrap().len(), 1);
+        assert_eq!(reads.0.lock().expect("locked").len(), 1);
     }
 }

@@ -57,10 +57,14 @@ const MOST_PIVOTS: usize = 20;
 /// Functions whose strings are types, which nest by brackets as well.
 const TYPE_FUNCTIONS: [&str; 2] = ["ARROW_CAST", "ARROW_TRY_CAST"];
 
-/// Counts within an open bracket of a statement.
+/// Words between the branches of CASE, each of which is an expression of its own.
+const BRANCH_WORDS: [&str; 3] = ["WHEN", "THEN", "ELSE"];
+
+/// Counts within an open bracket of a statement. CASE and its END are brackets, too.
 #[derive(Default)]
 struct OpenBracket {
-    /// Operators since the last comma.
+    is_case: bool,
+    /// Operators since the last comma, or the last word between branches.
     operators: usize,
     /// Set operators and joins.
     query_operators: usize,
@@ -132,6 +136,11 @@ pub fn check_statement_bounds(sql: &str, dialect: &dyn Dialect) -> Result<(), Er
                 statements += 1;
                 *innermost = OpenBracket { doublings: innermost.doublings, ..OpenBracket::default() };
             }
+            Token::Word(word) if is_one_of(word, &["CASE"]) => {
+                open.push(OpenBracket { is_case: true, ..OpenBracket::default() });
+            }
+            Token::Word(word) if innermost.is_case && is_one_of(word, &BRANCH_WORDS) => innermost.operators = 0,
+            Token::Word(word) if innermost.is_case && is_one_of(word, &["END"]) => drop(open.pop()),
             Token::Word(word) if is_one_of(word, &QUERY_OPERATORS) => innermost.query_operators += 1,
             Token::Word(word) => innermost.operators += usize::from(is_one_of(word, &OPERATORS)),
             Token::Number(..) | Token::Placeholder(_) => {}
@@ -231,6 +240,9 @@ mod tests {
             format!("select cast(NULL as int{})", "[]".repeat(8_000)),
             chain("'a'", "||'b'", 8_000),
             chain("1", "::int", 8_000),
+            chain("1", " + case when a then b end", 8_000),
+            chain("", "case when a then ", 8_000),
+            chain("case when a then b", " + b", 8_000),
             chain("1", " is null", 8_000),
             chain("true", " and true", 8_000),
             format!("select arrow_cast(NULL, '{}Int8{}')", "List(".repeat(8_000), ")".repeat(8_000)),
@@ -258,6 +270,7 @@ mod tests {
             format!("select 1 where 1 in ({})", list("-1")),
             format!("select * from (values {})", list("(1 + 1, 'a(((')")),
             format!("select {}", list("a + b")),
+            format!("select case{} else c end", " when a = 1 then -2".repeat(5_000)),
             format!("select {}1{}", "coalesce(".repeat(13), ")".repeat(13)),
             format!("select {}1{}", "cast(".repeat(6), " as int)".repeat(6)),
             format!("select 1 {}", "union all select 1 + 1 ".repeat(1_000)),

@@ -23,6 +23,8 @@ mod engine_socket;
 mod error;
 mod fault;
 mod flight;
+#[cfg(fuzzing)]
+pub mod fuzzing;
 mod http;
 mod metrics;
 mod postgres;

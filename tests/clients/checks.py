@@ -3,6 +3,13 @@ import re
 import sys
 
 
+def read_table(path, script):
+    """The lines of a script's table in a page."""
+    with open(path, encoding="utf-8") as file:
+        _, _, behind = file.read().partition(f"<!-- {script} -->\n")
+    return behind.partition("<!-- end -->")[0].splitlines()
+
+
 def write_table(path, script, table):
     """Replaces the table of a script in a page: what stands between its marks."""
     with open(path, encoding="utf-8") as file:

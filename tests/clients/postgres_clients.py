@@ -3,23 +3,28 @@
     postgres_clients.py postgresql://me@127.0.0.1:5433/datafusion --lake LAKE --flight grpc://127.0.0.1:8081
     postgres_clients.py ... --control postgresql://postgres@127.0.0.1:5432/lake
 
-Each driver also reads samples of all tables and views, whose names, types and values must be those that pyarrow reads from
-the lake's folder, and for views from Arrow Flight SQL (`lake_samples.py`).
+Each driver also reads all rows of all tables and views, streamed if it can: names, types and values must be those that
+pyarrow reads from the lake's folder, and for views from Arrow Flight SQL (`lake_tables.py`). The lake should therefore be a
+small one: `echolake --lake LAKE demo --rig tests/fixtures/small_rig.toml --surfaces 4 --no-serve`.
 
-With `--control`, the lake's tables are first loaded into that database of a real PostgreSQL (some rows of each), and the
-same checks are run against it: its figures say which failures are the checks' own. `--client NAME` runs one client alone,
-`--json` prints the results with the texts of failures, and `--write docs/clients.md` replaces the table in that page.
+With `--control`, the lake's tables and views are first loaded into that database of a real PostgreSQL, and the same checks
+are run against it: its figures say which failures are the checks' own. `--client NAME` runs one client alone,
+`--json` prints the results with the texts of failures, and `--write docs/clients.md` replaces the table in that page, with
+`--client` the client's row.
 
 A client that is not installed is left out with a line on stderr. Needed for all: psql, perl with DBD::Pg, a JDK with
-pgjdbc in /usr/share/java, Go with lib/pq, pyodbc with Debian's odbc-postgresql, in this folder's `postgres/` the npm
-packages pg, pg-cursor, postgres and knex, and the PyPI packages psycopg[binary], psycopg2-binary, pg8000, asyncpg,
-sqlalchemy[asyncio], pandas, polars, connectorx, sqlacodegen, ibis-framework[postgres], pgcli and adbc-driver-postgresql.
+pgjdbc in /usr/share/java, Go with lib/pq and pgx 4 in /usr/share/gocode, pyodbc with Debian's odbc-postgresql, in this
+folder's `postgres/` the npm packages pg, pg-cursor, postgres and knex, and the PyPI packages psycopg[binary], psycopg2-binary,
+pg8000, asyncpg, sqlalchemy[asyncio], pandas, polars, connectorx, sqlacodegen, ibis-framework[postgres], pgcli and
+adbc-driver-postgresql.
 """
 import argparse
 import asyncio
+import collections
 import datetime
 import decimal
 import importlib
+import itertools
 import json
 import os
 import re
@@ -28,17 +33,23 @@ import signal
 import subprocess
 import sys
 import tempfile
+import threading
 import urllib.parse
 
 import psycopg
 
-from checks import write_table
-from lake_samples import NUMBERS, load_samples, type_of_arrow
+from checks import read_table, write_table
+from lake_tables import NUMBERS, load_tables, type_of_arrow
 
 HERE = os.path.dirname(os.path.abspath(__file__))
 PROGRAMS = os.path.join(HERE, "postgres")
-TIMEOUT_SECS = 120
-CHECK_SECS = 20
+GO_PACKAGES = "/usr/share/gocode"
+# Generous, because a machine may be busy: of a program, of a check, and of the check of a whole table.
+TIMEOUT_SECS = 1200
+CHECK_SECS = 60
+TABLE_SECS = 300
+# Rows that drivers fetch at a time if they stream.
+FETCHED_ROWS = 100
 
 COMMANDS = r"""\d;\d pairs;\d runs;\dS pg_class;\da;\dA;\dAc;\dAf;\dAo;\dAp;\db;\dc;\dC;\dd;\dD;\ddp;\dE;\des;\det;\deu;\dew;\df
 \dF;\dFd;\dFp;\dFt;\dg;\di;\dl;\dL;\dm;\dn;\do;\dO;\dp;\dP;\drds;\dRp;\dRs;\ds;\dt;\dT;\du;\dv;\dx;\dX;\dy;\l;\z;\sf upper
@@ -50,16 +61,16 @@ COMMANDS = r"""\d;\d pairs;\d runs;\dS pg_class;\da;\dA;\dAc;\dAf;\dAo;\dAp;\db;
 class ClientRun:
     """The checks of one client against one server."""
 
-    def __init__(self, url, samples, flight):
+    def __init__(self, url, tables, flight):
         self.url = url
-        self.samples = samples
+        self.tables = tables
         self.flight = flight
         self.results = {}
 
-    def check(self, name, act, expected=None):
-        """Passes if `act` returns what is expected, or anything true, without an exception."""
+    def check(self, name, act, expected=None, limit_secs=CHECK_SECS):
+        """Passes if `act` returns what is expected, or anything true, without an exception; 0 seconds are no limit."""
         try:
-            signal.alarm(CHECK_SECS)
+            signal.alarm(limit_secs)
             value = act()
             signal.alarm(0)
             wrong = value != expected if expected is not None else value is False or value is None
@@ -69,35 +80,64 @@ class ClientRun:
             self.results[name] = f"{type(error).__name__}: {error}"[:600]
 
     def run_program(self, arguments, **options):
-        """Takes the results of a program that prints a JSON object per check, and one per sample, whose queries it is given."""
-        with tempfile.NamedTemporaryFile("w", suffix=".tsv", encoding="utf-8") as file:
-            file.writelines(f"{sample.table}\t{sample.sql}\n" for sample in self.samples)
-            file.flush()
-            self.take_results([*arguments, file.name], options)
+        """Takes the results of a program that prints JSON objects, a line each, and is given a file of queries.
 
-    def take_results(self, arguments, options):
-        """Runs the program."""
-        ran = subprocess.run(arguments, capture_output=True, text=True, timeout=TIMEOUT_SECS, **options)
-        lines = [json.loads(line) for line in ran.stdout.splitlines() if line.startswith("{")]
-        answers = {line["table"]: line for line in lines if "table" in line}
+        An object has `check` and may have `error`; or it has `table` and `columns`, and then follow the table's rows, an object
+        with `row` each, and one with `end`; or it has `end` and `error`. A program of several drivers names the `driver`.
+        """
+        with tempfile.NamedTemporaryFile("w", suffix=".tsv", encoding="utf-8") as queries, tempfile.TemporaryFile("w+") as said:
+            queries.writelines(f"{table.table}\t{table.sql}\n" for table in self.tables)
+            queries.flush()
+            pipes = {"stdout": subprocess.PIPE, "stderr": said, "text": True}
+            with subprocess.Popen([*arguments, queries.name], **pipes, **options) as program:
+                limit = threading.Timer(TIMEOUT_SECS, program.kill)
+                limit.start()
+                lines = (json.loads(line) for line in program.stdout if line.startswith("{"))
+                self.take_results(lines)
+                program.wait()
+                limit.cancel()
+            said.seek(0)
+            if program.returncode:
+                self.results["the program"] = said.read()[-600:] or f"ended with {program.returncode}"
+
+    def take_results(self, lines):
+        """Takes the results of these objects; a table's rows are compared as they come."""
+        known = {table.table: table for table in self.tables}
         for line in lines:
             if "check" in line:
                 self.results[line["check"]] = line.get("error")
-        for sample in self.samples:
-            line = answers.get(sample.table, {"error": "no rows"})
-            def compare():
-                if "error" in line:
-                    raise RuntimeError(line["error"])
-                sample.compare([(name, type_name(kind)) for name, kind in line["columns"]], line["rows"])
-                return True
-            self.check(f"values of {sample.table}", compare)
-        if ran.returncode or not lines:
-            self.results["the program"] = (ran.stderr or ran.stdout)[-600:]
+            elif "end" in line:
+                self.results[value_check(line["end"], line)] = line.get("error", "no columns")
+            elif "table" in line:
+                rows = take_rows(lines)
+                columns = [(column, type_name(kind)) for column, kind in line["columns"]]
+                # The program has a limit as a whole.
+                self.check(value_check(line["table"], line), lambda: known[line["table"]].compare(columns, rows) is None, limit_secs=0)
+                collections.deque(rows, maxlen=0)
+        for name in map(value_check, known):
+            if not any(result.endswith(name) for result in self.results):
+                self.results[name] = "no rows"
+
+
+def value_check(table, line=None):
+    """The name of the check of a table's values; a program with several drivers names the one."""
+    driver = (line or {}).get("driver")
+    return f"{driver}: values of {table}" if driver else f"values of {table}"
+
+
+def take_rows(lines):
+    """The rows up to the object that ends them; a RuntimeError if that has an error."""
+    for line in lines:
+        if "row" not in line:
+            if "error" in line:
+                raise RuntimeError(line["error"])
+            return
+        yield line["row"]
 
 
 def stop_check(*_):
     """Ends a check that takes too long."""
-    raise TimeoutError(f"no answer in {CHECK_SECS} s")
+    raise TimeoutError("no answer in time")
 
 
 def split_url(url):
@@ -106,8 +146,17 @@ def split_url(url):
     return {"host": parts.hostname, "port": parts.port, "user": parts.username, "database": parts.path.strip("/")}
 
 
+# Postgres' names of types by SQL's.
+SQL_TYPES = {
+    "TEXT": "text", "BOOLEAN": "bool", "SMALLINT": "int2", "INTEGER": "int4", "BIGINT": "int8", "REAL": "float4", "DOUBLE PRECISION": "float8",
+    "TIMESTAMP WITH TIME ZONE": "timestamptz", "REAL[]": "_float4", "DOUBLE PRECISION[]": "_float8", "INTEGER[]": "_int4", "TEXT[]": "_text", "BYTEA": "bytea",
+}
+
+
 def type_name(kind):
-    """Postgres' name of a type in lower case, of its name in a driver or its number."""
+    """Postgres' name of a type in lower case, of its name in a driver or in SQL, or of its number."""
+    if written := SQL_TYPES.get(str(kind).upper()):
+        return written
     name = NUMBERS.get(int(kind), str(kind)) if str(kind).isdigit() else str(kind).lower()
     return f"_{name[:-2]}" if name.endswith("[]") else name
 
@@ -151,38 +200,52 @@ def check_values(run, query, style, skip=()):
         run.check(sql, lambda: tuple(query(asked, values)), expected)
 
 
-def check_samples(run, fetch):
-    """Reads a sample of each table and view; `fetch` returns columns with their types, and rows, of a query."""
-    for sample in run.samples:
+def check_tables(run, fetch):
+    """Reads each table and view; `fetch` returns columns with their types, None for a type of the driver's own, and rows."""
+    for table in run.tables:
         def compare():
-            columns, rows = fetch(sample.sql)
-            sample.compare([(name, type_name(kind)) for name, kind in columns], rows)
+            columns, rows = fetch(table.sql)
+            table.compare([(name, kind and type_name(kind)) for name, kind in columns], rows)
             return True
-        run.check(f"values of {sample.table}", compare)
+        run.check(f"values of {table.table}", compare, limit_secs=TABLE_SECS)
 
 
-def fetch_described(cursor, sql, values=None):
-    """Columns with their types, and rows, of a cursor of Python's database interface."""
-    cursor.execute(sql, values)
-    return [(column[0], column[1]) for column in cursor.description], cursor.fetchall()
+def describe_rows(cursor, rows):
+    """Columns with their types, and rows, of a cursor that knows its columns once it has given a row."""
+    first = list(itertools.islice(rows, 1))
+    return [(column[0], column[1]) for column in cursor.description], itertools.chain(first, rows)
+
+
+def run_psql(run, command, *options):
+    """What psql prints for a line of input; a RuntimeError if it failed."""
+    ran = subprocess.run(["psql", "-X", "-v", "ON_ERROR_STOP=1", *options, run.url], input=command, capture_output=True, text=True, timeout=TIMEOUT_SECS)
+    said = ran.stdout + ran.stderr
+    if ran.returncode or "ERROR" in said:
+        raise RuntimeError(said.strip())
+    return ran.stdout
 
 
 def psql(run):
     for command in COMMANDS:
-        def ask():
-            ran = subprocess.run(["psql", "-X", run.url, "-c", command], capture_output=True, text=True, timeout=TIMEOUT_SECS)
-            said = ran.stdout + ran.stderr
-            if ran.returncode or "ERROR" in said:
-                raise RuntimeError(said.strip())
-            return True
-        run.check(command, ask)
+        run.check(command, lambda: run_psql(run, command) is not None)
+    # Separators and a text for null that no value has.
+    raw = ["-qAt", "-F", "\x1f", "-R", "\x1e", "-P", "null=\x1d", "-v", f"FETCH_COUNT={FETCHED_ROWS}"]
+    def fetch(sql):
+        types = run_psql(run, f"{sql} \\gdesc", *raw[:5])
+        columns = [line.split("\x1f") for line in types.rstrip("\n").split("\x1e")]
+        rows = (row.split("\x1f") for row in run_psql(run, sql, *raw).rstrip("\n").split("\x1e"))
+        return columns, ([None if value == "\x1d" else value for value in row] for row in rows)
+    check_tables(run, fetch)
 
 
 def psycopg_3(run):
     with psycopg.connect(run.url, autocommit=True) as lake:
         one = lambda sql, values: lake.execute(sql, values or None).fetchone()
         check_values(run, one, lambda n: "%s")
-        check_samples(run, lambda sql: fetch_described(lake.cursor(binary=True), sql))
+        def fetch(sql):
+            cursor = lake.cursor(binary=True)
+            return describe_rows(cursor, cursor.stream(sql))
+        check_tables(run, fetch)
         run.check("text", lambda: len(lake.execute("select * from measurements limit 3").fetchall()), 3)
         run.check("stream", lambda: sum(1 for _ in lake.cursor().stream("select * from pairs limit 9")), 9)
         def copied():
@@ -213,7 +276,12 @@ def psycopg_2(run):
             cursor.execute(sql, values)
             return cursor.fetchall()
     check_values(run, lambda sql, values: ask(sql, values or None)[0], lambda n: "%s")
-    check_samples(run, lambda sql: fetch_described(lake.cursor(), sql))
+    def fetch(sql):
+        cursor = psycopg2.connect(run.url).cursor("all_rows")
+        cursor.itersize = FETCHED_ROWS
+        cursor.execute(sql)
+        return describe_rows(cursor, iter(cursor))
+    check_tables(run, fetch)
     def named():
         own = psycopg2.connect(run.url)
         cursor = own.cursor("named")
@@ -237,7 +305,7 @@ def pg8000(run):
     def fetch(sql):
         rows = lake.run(sql)
         return [(column["name"], column["type_oid"]) for column in lake.columns], rows
-    check_samples(run, fetch)
+    check_tables(run, fetch)
     prepared = lambda: lake.prepare("select pair_id from pairs where pair_id < :n").run(n=4)
     run.check("prepared", lambda: len(prepared()), 4)
     lake.close()
@@ -256,8 +324,10 @@ def asyncpg(run):
     check_values(run, lambda sql, values: ask(lambda lake: lake.fetchrow(sql, *values)), lambda n: f"${n}")
     async def fetch(lake, sql):
         statement = await lake.prepare(sql)
-        return [(a.name, a.type.name) for a in statement.get_attributes()], [tuple(row) for row in await statement.fetch()]
-    check_samples(run, lambda sql: ask(lambda lake: fetch(lake, sql)))
+        async with lake.transaction(readonly=True):
+            rows = [tuple(row) async for row in statement.cursor(prefetch=FETCHED_ROWS)]
+        return [(a.name, a.type.name) for a in statement.get_attributes()], rows
+    check_tables(run, lambda sql: ask(lambda lake: fetch(lake, sql)))
     when = datetime.datetime(2020, 1, 1, tzinfo=datetime.timezone.utc)
     run.check("a time", lambda: ask(lambda lake: lake.fetchval("select $1::timestamptz", when)), when)
     run.check("any without a type", lambda: ask(lambda lake: lake.fetchval("select count(*) from pairs where pair_id = any($1)", [1, 2])), 2)
@@ -273,20 +343,13 @@ def asyncpg(run):
     run.check("pool", lambda: asyncio.run(pooled()), 3)
     async def cursor(lake):
         async with lake.transaction(readonly=True):
-            return len([row async for row in lake.cursor("select pair_id from pairs limit 70")])
-    run.check("cursor", lambda: ask(cursor), 70)
+            return len([row async for row in lake.cursor("select pair_id from pairs limit 40", prefetch=7)])
+    run.check("cursor", lambda: ask(cursor), 40)
     run.check("introspection", lambda: ask(lambda lake: lake.fetchval("select 'x'::name")), "x")
     async def prepared(lake):
         statement = await lake.prepare("select pair_id, direct_mm from pairs where pair_id = $1")
         return [p.name for p in statement.get_parameters()], [a.type.name for a in statement.get_attributes()]
     run.check("prepared types", lambda: ask(prepared), (["int4"], ["int4", "float8"]))
-
-
-# Postgres' names of types by SQLAlchemy's.
-SQL_TYPES = {
-    "TEXT": "text", "BOOLEAN": "bool", "SMALLINT": "int2", "INTEGER": "int4", "BIGINT": "int8", "REAL": "float4", "DOUBLE PRECISION": "float8",
-    "TIMESTAMP WITH TIME ZONE": "timestamptz", "REAL[]": "_float4", "DOUBLE PRECISION[]": "_float8", "INTEGER[]": "_int4", "TEXT[]": "_text", "BYTEA": "bytea",
-}
 
 
 def sql_type(kind, engine):
@@ -323,10 +386,11 @@ def sqlalchemy(run):
         run.check(name("enums"), lambda: inspector().get_enums() == [])
         def reflected(sql):
             table = sa.Table(re.search('from "(.*?)"', sql)[1], sa.MetaData(), autoload_with=engine)
-            with engine.connect() as own:
-                return [(c.name, sql_type(c.type, engine)) for c in table.columns], [tuple(row) for row in own.execute(sa.text(sql))]
+            own = engine.connect().execution_options(stream_results=True, max_row_buffer=FETCHED_ROWS)
+            rows = own.execute(sa.text(sql).columns(*table.columns))
+            return [(c.name, sql_type(c.type, engine)) for c in table.columns], (tuple(row) for row in rows)
         if driver == "psycopg":
-            check_samples(run, reflected)
+            check_tables(run, reflected)
         def types():
             table = sa.Table("measurements", sa.MetaData(), autoload_with=engine)
             return sql_type(table.c.ir.type, engine)
@@ -374,6 +438,10 @@ def ibis(run):
     run.check("type of a list", lambda: str(lake.table("measurements").schema()["ir"]).strip("!"), "array<float32>")
     run.check("sql", lambda: len(lake.sql("select 1 as a").execute()), 1)
     run.check("to_pyarrow", lambda: lake.table("pairs").limit(2).to_pyarrow().num_rows, 2)
+    def fetch(sql):
+        table, *keys = re.findall('"(.*?)"', sql)
+        return fetch_arrow(lake.table(table).order_by(keys).to_pyarrow_batches(chunk_size=FETCHED_ROWS))
+    check_tables(run, fetch)
 
 
 def pgcli(run):
@@ -400,9 +468,14 @@ def pgcli(run):
         run.check(command, ask)
 
 
-def fetch_arrow(table):
-    """Columns with their types, and rows, of an answer of ADBC."""
-    return [(field.name, type_of_arrow(field.type)) for field in table.schema], list(zip(*(c.to_pylist() for c in table.columns)))
+def fetch_arrow(batches):
+    """Columns with their types, and rows, of a reader of record batches."""
+    return [(field.name, type_of_arrow(field.type)) for field in batches.schema], take_batches(batches)
+
+
+def take_batches(batches):
+    """The rows of record batches, as they come."""
+    return (row for batch in batches for row in zip(*(column.to_pylist() for column in batch.columns)))
 
 
 def flight_sql(run):
@@ -410,8 +483,8 @@ def flight_sql(run):
     with driver.connect(run.flight, autocommit=True) as lake, lake.cursor() as cursor:
         def fetch(sql):
             cursor.execute(sql)
-            return fetch_arrow(cursor.fetch_arrow_table())
-        check_samples(run, fetch)
+            return fetch_arrow(cursor.fetch_record_batch())
+        check_tables(run, fetch)
 
 
 def adbc(run):
@@ -423,7 +496,11 @@ def adbc(run):
                 return cursor.fetch_arrow_table()
         row = lambda sql, values: tuple(ask(sql, values).to_pylist()[0].values())
         check_values(run, row, lambda n: f"${n}", skip={"select 1, 1", "select count(*) from pairs where pair_id = any($1::int[])"})
-        check_samples(run, lambda sql: fetch_arrow(ask(sql)))
+        with lake.cursor() as cursor:
+            def fetch(sql):
+                cursor.execute(sql)
+                return fetch_arrow(cursor.fetch_record_batch())
+            check_tables(run, fetch)
         for depth in "catalogs", "db_schemas", "tables", "columns", "all":
             run.check(f"get_objects {depth}", lambda: lake.adbc_get_objects(depth=depth).read_all().num_rows > 0)
         run.check("get_objects of a table", lambda: "pairs" in str(lake.adbc_get_objects(depth="columns", table_name_filter="pairs").read_all().to_pylist()))
@@ -436,7 +513,7 @@ def adbc(run):
 def odbc(run):
     import pyodbc
     where = split_url(run.url)
-    settings = f"Driver={{PostgreSQL Unicode}};Server={where['host']};Port={where['port']};Uid={where['user']};Database={where['database']}"
+    settings = f"Driver={{PostgreSQL Unicode}};Server={where['host']};Port={where['port']};Uid={where['user']};Database={where['database']};UseDeclareFetch=1;Fetch={FETCHED_ROWS}"
     lake = pyodbc.connect(settings, autocommit=True)
     arrays = [sql for sql, values, expected in VALUES if "array" in sql or "any(" in sql]
     check_values(run, lambda sql, values: lake.execute(sql, *values).fetchone(), lambda n: "?", skip=arrays)
@@ -444,8 +521,8 @@ def odbc(run):
     def fetch(sql):
         table = re.search('from "(.*?)"', sql)[1]
         types = [(row.column_name, row.type_name) for row in lake.cursor().columns(table=table, schema="public").fetchall()]
-        return types, lake.execute(sql).fetchall()
-    check_samples(run, fetch)
+        return types, lake.execute(sql)
+    check_tables(run, fetch)
     for name, arguments in [
         ("tables", {}), ("columns", {"table": "pairs"}), ("statistics", {"table": "pairs"}), ("primaryKeys", {"table": "pairs"}),
         ("foreignKeys", {"table": "pairs"}), ("getTypeInfo", {}), ("procedures", {}), ("rowIdColumns", {"table": "pairs"}),
@@ -465,6 +542,11 @@ def polars(run):
     run.check("read_database_uri adbc", lambda: pl.read_database_uri(sql, run.url, engine="adbc").shape, (7, 3))
     for table in list_tables(run.url):
         run.check(f"adbc {table}", lambda: pl.read_database_uri(f"select * from {table} limit 3", run.url, engine="adbc") is not None)
+    def fetch(sql):
+        batches = connectorx.read_sql(run.url, sql, return_type="arrow_stream", batch_size=FETCHED_ROWS)
+        # It makes all numbers 64 bits wide.
+        return [(name, None) for name in batches.schema.names], take_batches(batches)
+    check_tables(run, fetch)
 
 
 def node(run):
@@ -481,12 +563,24 @@ def jdbc(run):
     run.run_program(["java", "-cp", "/usr/share/java/postgresql.jar", os.path.join(PROGRAMS, "Clients.java"), url])
 
 
-def go(run):
+def go(run, driver):
     with tempfile.TemporaryDirectory() as folder:
         program = os.path.join(folder, "clients")
-        outside = {**os.environ, "GOPATH": "/usr/share/gocode", "GO111MODULE": "off", "GOCACHE": os.path.join(tempfile.gettempdir(), "go-build")}
-        subprocess.run(["go", "build", "-o", program, os.path.join(PROGRAMS, "clients.go")], env=outside, check=True, capture_output=True, text=True)
+        cache = os.path.join(tempfile.gettempdir(), "go-build")
+        outside = {**os.environ, "GOPATH": GO_PACKAGES, "GO111MODULE": "off", "GOCACHE": cache}
+        files = [os.path.join(PROGRAMS, name) for name in ("clients.go", f"{driver}.go")]
+        built = subprocess.run(["go", "build", "-o", program, *files], env=outside, capture_output=True, text=True)
+        if built.returncode:
+            raise RuntimeError(built.stderr)
         run.run_program([program, run.url + "?sslmode=disable"])
+
+
+def lib_pq(run):
+    go(run, "lib_pq")
+
+
+def pgx(run):
+    go(run, "pgx")
 
 
 def tools(run):
@@ -507,7 +601,7 @@ def tools(run):
             run.check(title, ask)
 
 
-# The name of each client in the table, what runs it, and what it needs: modules of Python or programs.
+# The name of each client in the table, what runs it, and what it needs: modules of Python, programs, or folders.
 CLIENTS = [
     ("psql", psql, ["psql"]),
     ("psycopg 3", psycopg_3, []),
@@ -525,7 +619,8 @@ CLIENTS = [
     ("Node: pg, postgres.js, knex", node, ["node"]),
     ("Perl: DBD::Pg", perl, ["perl"]),
     ("Java: pgjdbc", jdbc, ["java"]),
-    ("Go: lib/pq", go, ["go"]),
+    ("Go: lib/pq", lib_pq, ["go", f"{GO_PACKAGES}/src/github.com/lib/pq"]),
+    ("Go: pgx", pgx, ["go", f"{GO_PACKAGES}/src/github.com/jackc/pgx/v4"]),
     ("catalogue queries of DBeaver, Grafana, Metabase, Superset, Tableau, Power BI, DataGrip", tools, []),
 ]
 
@@ -533,6 +628,10 @@ CLIENTS = [
 def find_missing(needs):
     """What is needed and not installed."""
     for need in needs:
+        if need.startswith("/"):
+            if not os.path.isdir(need):
+                return need
+            continue
         if need in ("psql", "node", "perl", "java", "go"):
             if not shutil.which(need):
                 return need
@@ -544,7 +643,7 @@ def find_missing(needs):
     return None
 
 
-def run_clients(url, names, samples, flight):
+def run_clients(url, names, tables, flight):
     """The results by client: check and text of its failure, None if it passed; without `flight` not over Flight SQL."""
     results = {}
     for name, act, needs in CLIENTS:
@@ -555,7 +654,7 @@ def run_clients(url, names, samples, flight):
             continue
         if act is flight_sql and not flight:
             continue
-        run = ClientRun(url, samples, flight)
+        run = ClientRun(url, tables, flight)
         try:
             act(run)
         except Exception as error:  # a client that cannot even connect
@@ -570,12 +669,12 @@ def count_passed(results):
     return sum(error is None for error in results.values())
 
 
-def load_control(url, control, samples):
-    """Loads all pairs and the samples of the other tables, and views of them under the views' names."""
+def load_control(url, control, tables):
+    """Loads all tables, and the rows of views as tables with views of them under the views' names."""
     with psycopg.connect(url, autocommit=True) as lake, psycopg.connect(control, autocommit=True) as own:
         kinds = dict(lake.execute("select table_name, table_type from information_schema.tables where table_schema = 'public'").fetchall())
         own.execute("drop schema if exists public, stored cascade; create schema public; create schema stored")
-        queries = {sample.table: sample.sql for sample in samples} | {"pairs": "select * from pairs"}
+        queries = {table.table: table.sql for table in tables}
         for name, kind in kinds.items():
             is_view = kind == "VIEW" or name not in BASE_TABLES
             stored = f"{name}_rows" if is_view else name
@@ -597,13 +696,14 @@ def load_control(url, control, samples):
 BASE_TABLES = {"surfaces", "runs", "points", "pairs", "measurements", "nce", "tnce", "tnce_d4", "heightmaps", "environment", "events", "surface_stats"}
 
 
-def format_table(results, control):
-    """The table as Markdown."""
-    lines = ["| client | passed | tried | PostgreSQL |", "| --- | --- | --- | --- |"]
+def format_table(results, control, before=()):
+    """The table as Markdown; the lines `before` are those of clients that did not run."""
+    rows = {line.split(" | ")[0].removeprefix("| "): line for line in before}
     for name, checks in results.items():
         beside = count_passed(control[name]) if name in control else ""
-        lines.append(f"| {name} | {count_passed(checks)} | {len(checks)} | {beside} |")
-    return "\n".join(lines)
+        rows[name] = f"| {name} | {count_passed(checks)} | {len(checks)} | {beside} |"
+    lines = [rows[name] for name, *_ in CLIENTS if name in rows]
+    return "\n".join(["| client | passed | tried | PostgreSQL |", "| --- | --- | --- | --- |", *lines])
 
 
 def main():
@@ -617,14 +717,14 @@ def main():
     parser.add_argument("--json", action="store_true")
     parser.add_argument("--write", help="the page whose table is replaced")
     given = parser.parse_args()
-    samples = load_samples(given.lake, given.flight)
+    tables = load_tables(given.lake, given.flight)
     control = {}
     if given.control:
-        load_control(given.url, given.control, samples)
+        load_control(given.url, given.control, tables)
         print("PostgreSQL:", file=sys.stderr)
-        control = run_clients(given.control, given.client, samples, None)
+        control = run_clients(given.control, given.client, tables, None)
         print("echolake:", file=sys.stderr)
-    results = run_clients(given.url, given.client, samples, given.flight)
+    results = run_clients(given.url, given.client, tables, given.flight)
     if given.json:
         print(json.dumps({"results": results, "control": control}, indent=1))
         return 0
@@ -635,7 +735,8 @@ def main():
                 beside = " (PostgreSQL, too)" if control.get(name, {}).get(check) else ""
                 print(f"FAIL {name}: {check}{beside}: {' '.join(failure.split())[:300]}")
     if given.write:
-        write_table(given.write, "postgres_clients.py", format_table(results, control))
+        before = read_table(given.write, "postgres_clients.py") if given.client else ()
+        write_table(given.write, "postgres_clients.py", format_table(results, control, before))
     return int(any(failure for checks in results.values() for failure in checks.values()))
 
 

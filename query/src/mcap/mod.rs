@@ -11,6 +11,8 @@ mod contents;
 mod error;
 mod file;
 mod flatbuffer;
+#[cfg(fuzzing)]
+pub(crate) mod fuzzing;
 mod json;
 mod protobuf;
 mod ros;

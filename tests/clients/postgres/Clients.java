@@ -12,8 +12,10 @@ import java.sql.Timestamp;
 import java.time.OffsetDateTime;
 import java.util.Objects;
 
-/** Checks a server with pgjdbc: given are the URL and a file of queries, printed are a JSON object per check and per query. */
+/** Checks a server with pgjdbc: given are the URL and a file of queries, printed are a JSON object per check, and of the queries the columns, the rows and the end. */
 public class Clients {
+    static final int FETCHED_ROWS = 100;
+
     interface Act {
         Object run() throws Exception;
     }
@@ -63,25 +65,30 @@ public class Clients {
         return count;
     }
 
-    static String sample(Connection lake, String sql) throws Exception {
-        StringBuilder columns = new StringBuilder();
-        StringBuilder all = new StringBuilder();
-        try (Statement statement = lake.createStatement(); ResultSet rows = statement.executeQuery(sql)) {
-            ResultSetMetaData about = rows.getMetaData();
-            for (int i = 1; i <= about.getColumnCount(); i++) {
-                columns.append(i > 1 ? ", " : "").append("[" + quote(about.getColumnName(i)) + ", " + quote(about.getColumnTypeName(i)) + "]");
-            }
-            while (rows.next()) {
-                all.append(all.length() > 0 ? ", [" : "[");
+    static void printTable(Connection lake, String table, String sql) throws Exception {
+        try (Statement statement = lake.createStatement()) {
+            statement.setFetchSize(FETCHED_ROWS);
+            try (ResultSet rows = statement.executeQuery(sql)) {
+                ResultSetMetaData about = rows.getMetaData();
+                StringBuilder columns = new StringBuilder();
                 for (int i = 1; i <= about.getColumnCount(); i++) {
-                    boolean isTime = about.getColumnTypeName(i).equals("timestamptz");
-                    Object value = isTime ? rows.getObject(i, OffsetDateTime.class) : rows.getObject(i);
-                    all.append(i > 1 ? ", " : "").append(json(value));
+                    columns.append(i > 1 ? ", " : "").append("[" + quote(about.getColumnName(i)) + ", " + quote(about.getColumnTypeName(i)) + "]");
                 }
-                all.append("]");
+                System.out.println("{\"table\": " + quote(table) + ", \"columns\": [" + columns + "]}");
+                while (rows.next()) {
+                    System.out.println("{\"row\": [" + row(rows, about) + "]}");
+                }
             }
         }
-        return "\"columns\": [" + columns + "], \"rows\": [" + all + "]";
+    }
+
+    static String row(ResultSet rows, ResultSetMetaData about) throws Exception {
+        StringBuilder values = new StringBuilder();
+        for (int i = 1; i <= about.getColumnCount(); i++) {
+            boolean isTime = about.getColumnTypeName(i).equals("timestamptz");
+            values.append(i > 1 ? ", " : "").append(json(isTime ? rows.getObject(i, OffsetDateTime.class) : rows.getObject(i)));
+        }
+        return values.toString();
     }
 
     static String json(Object value) throws Exception {
@@ -129,11 +136,11 @@ public class Clients {
                 }
                 return sum;
             });
-            check("fetch size", 50, () -> {
+            check("fetch size", 40, () -> {
                 lake.setAutoCommit(false);
                 try (Statement s = lake.createStatement()) {
                     s.setFetchSize(7);
-                    return count(s.executeQuery("select * from pairs limit 50"));
+                    return count(s.executeQuery("select * from pairs limit 40"));
                 } finally {
                     lake.rollback();
                     lake.setAutoCommit(true);
@@ -201,15 +208,18 @@ public class Clients {
             check("getMaxColumnNameLength", 63, about::getMaxColumnNameLength);
             check("getMaxColumnsInIndex", 32, about::getMaxColumnsInIndex);
             check("getDatabaseProductName", "PostgreSQL", about::getDatabaseProductName);
+            // Drivers stream within transactions alone.
+            lake.setAutoCommit(false);
             for (String line : Files.readAllLines(Path.of(arguments[1]))) {
                 String[] parts = line.split("\t", 2);
-                String answer;
+                String error = "";
                 try {
-                    answer = sample(lake, parts[1]);
+                    printTable(lake, parts[0], parts[1]);
                 } catch (Exception e) {
-                    answer = "\"error\": " + quote(String.valueOf(e.getMessage()));
+                    lake.rollback();
+                    error = ", \"error\": " + quote(String.valueOf(e.getMessage()));
                 }
-                System.out.println("{\"table\": " + quote(parts[0]) + ", " + answer + "}");
+                System.out.println("{\"end\": " + quote(parts[0]) + error + "}");
             }
         }
     }

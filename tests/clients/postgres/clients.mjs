@@ -1,5 +1,5 @@
 // Checks a server with Node's clients of Postgres: `clients.mjs URL QUERIES` prints a JSON object per check, with `error` if it
-// failed, and one per query of the file.
+// failed, and of the file's queries the columns, the rows and the end.
 import knex from "knex";
 import pg from "pg";
 import Cursor from "pg-cursor";
@@ -49,16 +49,35 @@ await check("pg: an error's code", async () => {
   }
 }, "42P01");
 // A Date has no microseconds.
-const types = { getTypeParser: (number, format) => (number === 1184 ? String : pg.types.getTypeParser(number, format)) };
+const TIME = 1184;
+const types = { getTypeParser: (number, format) => (number === TIME ? String : pg.types.getTypeParser(number, format)) };
+const FETCHED_ROWS = 100;
 const printable = (value) => (value === null ? null : Array.isArray(value) ? value.map(printable) : Buffer.isBuffer(value) ? value.toString("hex") : String(value));
-for (const line of readFileSync(process.argv[3], "utf8").trim().split("\n")) {
-  const [table, text] = line.split("\t");
+const print = (line) => console.log(JSON.stringify(line));
+
+// Prints a query's columns, rows and end; `fetch` calls back with the columns and each part of the rows.
+async function printTable(driver, table, fetch) {
+  let columns;
   try {
-    const answer = await client.query({ text, rowMode: "array", types });
-    console.log(JSON.stringify({ table, columns: answer.fields.map((f) => [f.name, String(f.dataTypeID)]), rows: answer.rows.map(printable) }));
+    await fetch((names, rows) => {
+      if (!columns) print({ driver, table, columns: (columns = names) });
+      for (const row of rows) print({ row: row.map(printable) });
+    });
+    print({ driver, end: table });
   } catch (error) {
-    console.log(JSON.stringify({ table, error: String(error.message ?? error).slice(0, 600) }));
+    print({ driver, end: table, error: String(error.message ?? error).slice(0, 600) });
   }
+}
+
+const queries = readFileSync(process.argv[3], "utf8").trim().split("\n").map((line) => line.split("\t"));
+for (const [table, text] of queries) {
+  await printTable("pg", table, async (take) => {
+    const cursor = client.query(new Cursor(text, [], { rowMode: "array", types }));
+    const read = () => new Promise((resolve, reject) => cursor.read(FETCHED_ROWS, (error, rows, result) => (error ? reject(error) : resolve([rows, result]))));
+    for (let [rows, result] = await read(); rows.length > 0; [rows, result] = await read()) {
+      take(result.fields.map((field) => [field.name, String(field.dataTypeID)]), rows);
+    }
+  });
 }
 await client.end();
 const pool = new pg.Pool({ connectionString: url, max: 2 });
@@ -82,6 +101,18 @@ await check("postgres.js: transaction", async () => (await sql.begin("read only"
 await check("postgres.js: unsafe", async () => (await sql.unsafe("select 1 as a; select 2 as b")).length, 2);
 await check("postgres.js: describe", async () => (await sql`select pair_id from pairs where pair_id = ${1}`.describe()).types.length, 1);
 await sql.end();
+
+const plain = postgres(url, { max: 1, onnotice: () => {}, types: { time: { to: TIME, from: [TIME], serialize: String, parse: String } } });
+for (const [table, text] of queries) {
+  await printTable("postgres.js", table, async (take) => {
+    let columns;
+    for await (const rows of plain.unsafe(text).cursor(FETCHED_ROWS)) {
+      columns ??= rows.columns;
+      take(columns.map((column) => [column.name, String(column.type)]), rows.map((row) => columns.map((column) => row[column.name])));
+    }
+  });
+}
+await plain.end();
 
 const query = knex({ client: "pg", connection: url, pool: { min: 0, max: 2 } });
 await check("knex: select", async () => (await query("pairs").select("*").where("pair_id", "<", 5).limit(2).offset(1)).length, 2);

@@ -1,5 +1,5 @@
-# Checks a server with Perl's DBD::Pg: `clients.pl HOST PORT USER DATABASE QUERIES` prints a JSON object per check
-# and per query of the file.
+# Checks a server with Perl's DBD::Pg: `clients.pl HOST PORT USER DATABASE QUERIES` prints a JSON object per check,
+# and of the file's queries the columns, the rows and the end.
 use strict;
 use warnings;
 use DBI;
@@ -61,16 +61,18 @@ open(my $file, '<', $queries) or die "$queries: $!";
 while (my $line = <$file>) {
     chomp $line;
     my ($table, $sql) = split /\t/, $line, 2;
-    my %answer = (table => $table);
+    my %end = (end => $table);
     eval {
         my $statement = $dbh->prepare($sql);
         $statement->execute;
         my ($names, $types) = ($statement->{NAME}, $statement->{pg_type});
-        $answer{columns} = [ map { [ $names->[$_], $types->[$_] ] } 0 .. $#$names ];
-        $answer{rows} = [ map { my $row = $_; [ map { printable($row->[$_], $types->[$_]) } 0 .. $#$row ] } @{ $statement->fetchall_arrayref } ];
+        print encode_json({ table => $table, columns => [ map { [ $names->[$_], $types->[$_] ] } 0 .. $#$names ] }), "\n";
+        while (my $row = $statement->fetchrow_arrayref) {
+            print encode_json({ row => [ map { printable($row->[$_], $types->[$_]) } 0 .. $#$row ] }), "\n";
+        }
         1;
-    } or $answer{error} = "$@";
-    print encode_json(\%answer), "\n";
+    } or $end{error} = "$@";
+    print encode_json(\%end), "\n";
 }
 $dbh->disconnect;
 

@@ -1,0 +1,11 @@
+//! What a client of Arrow Flight SQL sends: the preface of HTTP/2, and frames.
+#![no_main]
+
+use std::sync::LazyLock;
+
+use echolake_fuzz_wires::{FuzzedServer, ServerWire};
+use libfuzzer_sys::fuzz_target;
+
+static SERVER: LazyLock<FuzzedServer> = LazyLock::new(FuzzedServer::start);
+
+fuzz_target!(init: echolake_fuzz_wires::write_seeds_on_request(), |bytes: &[u8]| SERVER.send(ServerWire::Flight, bytes));

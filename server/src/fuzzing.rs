@@ -1,0 +1,33 @@
+//! An engine within the process of a fuzz target, whose coverage counts there. It has no watchdog, which would end the process
+//! for work of the fuzzer itself.
+
+use std::path::Path;
+
+use echolake_lake::Lake;
+use echolake_query::{EngineLimits, QueryEngine};
+
+use crate::client_identity::ClientIdentity;
+use crate::engine_socket::EngineSocket;
+use crate::service::QueryService;
+use crate::{Error, flight, http, postgres};
+
+/// Limits of a query: seconds, and rows of the answer.
+const QUERY_SECONDS: u64 = 2;
+const QUERY_ROWS: u64 = 10_000;
+
+/// Answers the three protocols on the sockets of an engine, which are in this folder.
+///
+/// # Errors
+/// [`Error::System`], [`Error::Query`], [`Error::Transport`].
+pub async fn serve_engine(lake: &Lake, sockets: &Path, memory: usize) -> Result<(), Error> {
+    let engine = QueryEngine::new(lake, EngineLimits { memory: Some(memory), temp: None })?;
+    let mut identity = ClientIdentity::programs();
+    identity.seconds = Some(QUERY_SECONDS);
+    identity.rows = Some(QUERY_ROWS);
+    let service = QueryService::new(lake, engine, identity, None)?;
+    tokio::select! {
+        failed = http::serve(service.clone(), EngineSocket::Http.listen(sockets)?) => failed,
+        failed = flight::serve(service.clone(), EngineSocket::FlightSql.listen(sockets)?) => failed,
+        failed = postgres::serve(service, EngineSocket::Postgres.listen(sockets)?) => failed,
+    }
+}
