@@ -108,7 +108,7 @@ pub(crate) enum LakeCommand {
     #[command(subcommand)]
     Figure(FigureCommand),
     /// Serve the catalogue, and read access to the lake over HTTP, Arrow Flight SQL and Postgres' protocol.
-    Serve(ServeArgs),
+    Serve(Box<ServeArgs>),
     /// Let an agent on this machine ask the lake, by the Model Context Protocol on standard input and output.
     Mcp(McpArgs),
     /// Answer one client's queries, as a child of `serve`.

@@ -3,13 +3,16 @@
 mod agents;
 mod attacks;
 pub(crate) mod catalogue;
+mod certificates;
 mod contract;
 mod dialect;
 mod drain;
 mod encryption;
 mod escapes;
 pub(crate) mod http;
+mod lichtblick;
 mod log;
+mod oidc;
 pub(crate) mod postgres;
 mod projects;
 pub(crate) mod server;
@@ -110,6 +113,14 @@ fn answers_in_every_format() {
     let pairs = tables.as_array().expect("a list").iter().find(|t| t["name"] == "pairs").expect("pairs");
     let direct = pairs["columns"].as_array().expect("a list").iter().find(|c| c["name"] == "direct_mm");
     assert_eq!(direct.expect("a column")["unit"], "mm");
+    for name in ["versions", "files", "ingests", "queries", "connections"] {
+        let name = format!("system.{name}");
+        let listed = tables.as_array().expect("a list").iter().find(|t| t["name"] == name).expect(&name);
+        let columns = listed["columns"].as_array().expect("a list").iter().map(|c| c["name"].as_str().expect("a name"));
+        let quoted: Vec<_> = columns.map(|column| format!("\"{column}\"")).collect();
+        let all = sql(&server, &format!("select {} from {name}", quoted.join(", ")));
+        assert_eq!(all.status, 200, "{name}: {}", all.text());
+    }
     assert_eq!(get(&server, "/health").status, 200);
 }
 

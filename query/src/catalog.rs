@@ -113,7 +113,7 @@ impl LakeCatalog {
             context.register_table(name.clone(), provider.clone()).map_err(failed)?;
         }
         for (name, provider) in system {
-            context.register_table(TableReference::partial(system::SCHEMA, name), provider).map_err(failed)?;
+            context.register_table(TableReference::partial(system::SYSTEM_SCHEMA, name), provider).map_err(failed)?;
         }
         // A time stands for one version in all of a statement, even if a version with an earlier time comes meanwhile.
         let mut versions = HashMap::new();
@@ -156,6 +156,11 @@ impl LakeCatalog {
     /// Returns the views with their definitions.
     pub(crate) fn view_definitions(&self) -> impl Iterator<Item = (&'static str, String)> {
         LakeView::ALL.into_iter().map(|view| (view.name(), view.sql(&self.lake)))
+    }
+
+    /// Returns the system tables that every lake has, with their schemas.
+    pub(crate) fn system_tables(&self) -> [(&'static str, SchemaRef); 4] {
+        system::lake_columns(&Table::Runs.schema(self.lake.rig()))
     }
 
     /// Returns the tables and views with their schemas.
@@ -241,7 +246,8 @@ impl LakeCatalog {
         }
         if let Some(runs) = tables.get(&Table::Runs) {
             let of_lake = system::lake_tables(&self.lake, &snapshot, runs.clone());
-            let named = of_lake.into_iter().map(|(name, table)| (TableReference::partial(system::SCHEMA, name), table));
+            let named =
+                of_lake.into_iter().map(|(name, table)| (TableReference::partial(system::SYSTEM_SCHEMA, name), table));
             providers.extend(named);
         }
         let [looked, checked] = [taken, taken].map(Mutex::new);

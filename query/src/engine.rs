@@ -411,7 +411,7 @@ impl QueryEngine {
         let names = &self.0.template.config_options().catalog;
         let catalog = MemoryCatalogProvider::new();
         // A new catalogue accepts any name.
-        for schema in [&names.default_schema, system::SCHEMA] {
+        for schema in [&names.default_schema, system::SYSTEM_SCHEMA] {
             let _ = catalog.register_schema(schema, Arc::new(MemorySchemaProvider::new()));
         }
         let catalogs = MemoryCatalogProviderList::new();

@@ -68,5 +68,5 @@ pub use spread::{
 };
 pub use statement_bounds::check_statement_bounds;
 pub use syntax_walk::{walk_expr, walk_statement};
-pub use system::SystemSource;
+pub use system::{SYSTEM_SCHEMA, SystemSource};
 pub use views::table_meaning;

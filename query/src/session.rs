@@ -32,6 +32,7 @@ use crate::mcap::Contents;
 use crate::spread::attempt::{QueryAttempt, QueryAttempts, SpreadQuery, explain_spread};
 use crate::spread::decision::SpreadDecision;
 use crate::statement_bounds::check_statement_bounds;
+use crate::system::SYSTEM_SCHEMA;
 use crate::{Error, OpaqueValue, as_of, friendly, gate, ignored_clauses, placeholders, summarize};
 
 /// Capacity of the queue of batches to a slow reader.
@@ -421,6 +422,20 @@ impl Session {
     /// Returns the tables and views with their schemas.
     pub fn tables(&self) -> impl Iterator<Item = (&'static str, SchemaRef)> {
         self.engine.catalog().tables()
+    }
+
+    /// Returns the tables of the schema `system` with their schemas.
+    pub fn system_tables(&self) -> Vec<(&'static str, SchemaRef)> {
+        let of_engine = self.engine.system_tables().into_iter().map(|(name, table)| (name, table.schema()));
+        self.engine.catalog().system_tables().into_iter().chain(of_engine).collect()
+    }
+
+    /// Returns all tables and views by the names that SQL has for them, and their schemas: those of the lake, then those
+    /// of the schema `system`.
+    pub fn all_tables(&self) -> Vec<(String, SchemaRef)> {
+        let own = self.tables().map(|(name, schema)| (name.to_owned(), schema));
+        let system = self.system_tables().into_iter();
+        own.chain(system.map(|(name, schema)| (format!("{SYSTEM_SCHEMA}.{name}"), schema))).collect()
     }
 
     /// Returns the views with their definitions, SQL over the tables.

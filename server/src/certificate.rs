@@ -1,6 +1,6 @@
 //! Self-signed certificates, for a lab without a certificate authority.
 
-use rcgen::{CertificateParams, DnType, ExtendedKeyUsagePurpose, KeyPair, KeyUsagePurpose};
+use rcgen::{CertificateParams, DistinguishedName, DnType, ExtendedKeyUsagePurpose, KeyPair, KeyUsagePurpose};
 
 use crate::Error;
 
@@ -15,20 +15,37 @@ pub struct SelfSigned {
     pub key: String,
 }
 
-/// Makes a certificate for a server of these names and addresses, valid for 397 days.
+/// Who shows a certificate.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum CertificateUse {
+    /// A server of the names and addresses.
+    Server,
+    /// A client of the first name.
+    Client,
+}
+
+/// Makes a certificate of these names and addresses, valid for 397 days.
 ///
 /// # Errors
 /// [`Error::SelfSigned`] if a name cannot be one.
-pub fn self_signed(names: &[String]) -> Result<SelfSigned, Error> {
+pub fn self_signed(names: &[String], shown_by: CertificateUse) -> Result<SelfSigned, Error> {
     let make = || {
         let key = KeyPair::generate()?;
-        let mut params = CertificateParams::new(names)?;
+        // A client's name need not be one of a machine.
+        let mut params = match shown_by {
+            CertificateUse::Server => CertificateParams::new(names)?,
+            CertificateUse::Client => CertificateParams::default(),
+        };
+        params.distinguished_name = DistinguishedName::new();
         let now = time::OffsetDateTime::now_utc();
         params.not_before = now - time::Duration::hours(1);
         params.not_after = now + time::Duration::days(DAYS);
         params.distinguished_name.push(DnType::CommonName, names.first().map_or("echolake", String::as_str));
         params.key_usages = vec![KeyUsagePurpose::DigitalSignature];
-        params.extended_key_usages = vec![ExtendedKeyUsagePurpose::ServerAuth];
+        params.extended_key_usages = vec![match shown_by {
+            CertificateUse::Server => ExtendedKeyUsagePurpose::ServerAuth,
+            CertificateUse::Client => ExtendedKeyUsagePurpose::ClientAuth,
+        }];
         let certificate = params.self_signed(&key)?.pem();
         Ok(SelfSigned { certificate, key: key.serialize_pem() })
     };

@@ -40,7 +40,7 @@ pub(crate) struct ClientIdentity {
     pub(crate) memory_bytes: Option<usize>,
     pub(crate) rows: Option<u64>,
     pub(crate) concurrent: Option<usize>,
-    /// Number of its token, which another token of the same name does not have; None without tokens.
+    /// Number of its token, which another token of the same name does not have; None if it has none.
     pub(crate) token: Option<u64>,
 }
 

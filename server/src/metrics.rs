@@ -23,10 +23,14 @@ pub(crate) enum ServerProtocol {
     Http,
     FlightSql,
     Postgres,
+    /// The Model Context Protocol.
+    Mcp,
+    /// Delta Sharing.
+    Sharing,
 }
 
 impl ServerProtocol {
-    pub(crate) const ALL: [Self; 3] = [Self::Http, Self::FlightSql, Self::Postgres];
+    pub(crate) const ALL: [Self; 5] = [Self::Http, Self::FlightSql, Self::Postgres, Self::Mcp, Self::Sharing];
 
     /// As metrics and the log have it.
     pub(crate) fn name(self) -> &'static str {
@@ -34,6 +38,8 @@ impl ServerProtocol {
             Self::Http => "http",
             Self::FlightSql => "flight_sql",
             Self::Postgres => "postgres",
+            Self::Mcp => "mcp",
+            Self::Sharing => "sharing",
         }
     }
 }

@@ -20,6 +20,7 @@ use crate::engine::door_message::DoorMessage;
 use crate::engine::door_rows::DoorRows;
 use crate::engine::report::EngineReport;
 use crate::fault::{FaultCode, RequestFault};
+use crate::http::request_protocol;
 use crate::metrics::ServerProtocol;
 use crate::running::{AnswerEncoder, RunningQuery, SessionTimeLimit, StopSignal, WAITING, ended, finish, parts};
 use crate::tokens::TokenScope;
@@ -75,9 +76,9 @@ pub(crate) struct QueryJob {
 }
 
 impl QueryJob {
-    /// A query of an HTTP request: it ends with the request, or by its client's quota.
+    /// A query of the HTTP request that this task answers: it ends with the request, or by its client's quota.
     pub(crate) fn of_http(session: Arc<Session>, work: QueryWork) -> Self {
-        Self { protocol: ServerProtocol::Http, session, work, limit: None, stop: StopSignal::new() }
+        Self { protocol: request_protocol(), session, work, limit: None, stop: StopSignal::new() }
     }
 }
 
@@ -190,6 +191,18 @@ impl QueryService {
     pub(crate) fn tables(&self) -> Vec<(&'static str, SchemaRef)> {
         let nobody = Arc::new(EngineClient::new("tables", QueryQuota::default()));
         self.session(&nobody).tables().collect()
+    }
+
+    /// The tables of the schema `system`, and their schemas.
+    pub(crate) fn system_tables(&self) -> Vec<(&'static str, SchemaRef)> {
+        let nobody = Arc::new(EngineClient::new("tables", QueryQuota::default()));
+        self.session(&nobody).system_tables()
+    }
+
+    /// All tables by the names that SQL has for them, and their schemas: those of the lake, then those of the schema
+    /// `system`.
+    pub(crate) fn all_tables(&self) -> Vec<(String, SchemaRef)> {
+        self.session(&self.0.client).all_tables()
     }
 
     /// The views' definitions by their names.

@@ -1,10 +1,9 @@
-//! Access control: tokens, stored as hashes in a file, each with scopes and quotas.
+//! The file of tokens, stored as hashes, each with scopes and quotas; and the groups of an identity provider's users.
 
 use std::collections::BTreeSet;
 use std::fmt;
 use std::path::{Path, PathBuf};
-use std::sync::{Arc, PoisonError, RwLock};
-use std::time::SystemTime;
+use std::sync::Arc;
 
 use base64::Engine as _;
 use base64::alphabet::STANDARD;
@@ -18,15 +17,16 @@ use subtle::{Choice, ConstantTimeEq as _};
 
 use crate::Error;
 use crate::client_identity::ClientIdentity;
-use crate::fault::RequestFault;
 use crate::scram_verifier::ScramVerifier;
-use crate::sessions::BrowserSessions;
 
 /// Of basic credentials; padding is cut off before, since gRPC's clients leave it out.
 const BASE64: GeneralPurpose = GeneralPurpose::new(&STANDARD, NO_PAD.with_decode_allow_trailing_bits(true));
 
 /// Prefix of all tokens, so that leaked ones can be found by searching.
 const PREFIX: &str = "echolake_";
+
+/// Prefix of the names of an identity provider's users, which no line of a token has.
+pub(crate) const OIDC_PREFIX: &str = "oidc:";
 
 /// A permission of a token.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
@@ -50,22 +50,35 @@ impl fmt::Display for TokenScope {
     }
 }
 
-/// The tokens of a file.
+/// The tokens of a file, and the groups of an identity provider's users.
 pub struct TokenFile {
     path: PathBuf,
-    entries: Vec<TokenEntry>,
+    pub(crate) entries: Vec<TokenEntry>,
+    groups: Vec<ClientIdentity>,
 }
 
-struct TokenEntry {
-    client: Arc<ClientIdentity>,
-    hash: [u8; 32],
+/// The logins of a server beside tokens.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct OtherLogins {
+    /// True if clients may log in by a certificate.
+    pub by_certificate: bool,
+    /// True if users of an identity provider may log in.
+    pub by_oidc: bool,
+}
+
+/// A line of a token.
+pub(crate) struct TokenEntry {
+    pub(crate) client: Arc<ClientIdentity>,
+    /// None if the client logs in by certificate alone.
+    hash: Option<[u8; 32]>,
     /// For logins that do not send the token; a line from an older version has none.
-    scram: Option<Arc<ScramVerifier>>,
+    pub(crate) scram: Option<Arc<ScramVerifier>>,
     expires: Option<DateTime<Utc>>,
 }
 
 impl TokenEntry {
-    fn is_valid(&self) -> bool {
+    /// Returns whether it has not expired.
+    pub(crate) fn is_valid(&self) -> bool {
         self.expires.is_none_or(|expires| Utc::now() < expires)
     }
 }
@@ -75,13 +88,15 @@ impl TokenEntry {
 struct TokenList {
     #[serde(default)]
     token: Vec<Line>,
+    #[serde(default)]
+    group: Vec<Line>,
 }
 
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Line {
     name: String,
-    sha256: String,
+    sha256: Option<String>,
     scram: Option<String>,
     #[serde(default = "reading")]
     scopes: Vec<TokenScope>,
@@ -102,9 +117,40 @@ fn reading() -> Vec<TokenScope> {
 impl Line {
     fn entry(&self) -> Result<TokenEntry, String> {
         let name = &self.name;
-        let mut hash = [0; 32];
-        hex::decode_to_slice(&self.sha256, &mut hash)
-            .map_err(|_| format!("the sha256 of `{name}` is not 64 hexadecimal digits"))?;
+        if name.starts_with(OIDC_PREFIX) {
+            return Err(format!(
+                "`{name}` is no name of a token; hint: users of an identity provider have `[[group]]`"
+            ));
+        }
+        let hash = self.sha256.as_ref().map(|text| {
+            let mut hash = [0; 32];
+            let decoded = hex::decode_to_slice(text, &mut hash).map(|()| hash);
+            decoded.map_err(|_| format!("the sha256 of `{name}` is not 64 hexadecimal digits"))
+        });
+        let hash = hash.transpose()?;
+        let token = hash.as_ref().and_then(|hash| hash.first_chunk()).map(|head| u64::from_le_bytes(*head));
+        let expires = self.expires.map(|time| {
+            let time = DateTime::parse_from_rfc3339(&time.to_string()).map(|time| time.to_utc());
+            time.map_err(|_| format!("expires of `{name}` is no time with a zone, as 2027-01-31T12:00:00Z"))
+        });
+        let scram = self.scram.as_ref().map(|text| {
+            text.parse().map(Arc::new).map_err(|wrong: String| format!("the scram of `{name}` is wrong: {wrong}"))
+        });
+        let client = Arc::new(self.identity(token)?);
+        Ok(TokenEntry { client, hash, scram: scram.transpose()?, expires: expires.transpose()? })
+    }
+
+    // What its users may; their names are their own.
+    fn group(&self) -> Result<ClientIdentity, String> {
+        if self.sha256.is_some() || self.scram.is_some() || self.expires.is_some() {
+            let name = &self.name;
+            return Err(format!("the group `{name}` has sha256, scram or expires; hint: these are of `[[token]]`"));
+        }
+        self.identity(None)
+    }
+
+    fn identity(&self, token: Option<u64>) -> Result<ClientIdentity, String> {
+        let name = &self.name;
         let at_least_one = |what: &str, value: Option<u64>| match value {
             Some(0) => Err(format!("{what} of `{name}` is 0; hint: leave it out where there is no limit")),
             _ => Ok(()),
@@ -114,7 +160,7 @@ impl Line {
         at_least_one("rows", self.rows)?;
         at_least_one("concurrent", self.concurrent.map(|v| v as u64))?;
         self.check_projects()?;
-        let client = ClientIdentity {
+        Ok(ClientIdentity {
             name: name.clone(),
             is_open: false,
             scopes: self.scopes.clone(),
@@ -123,16 +169,8 @@ impl Line {
             memory_bytes: self.memory_mb.map(|mb| mb.saturating_mul(1_000_000)),
             rows: self.rows,
             concurrent: self.concurrent,
-            token: hash.first_chunk().map(|head| u64::from_le_bytes(*head)),
-        };
-        let expires = self.expires.map(|time| {
-            let time = DateTime::parse_from_rfc3339(&time.to_string()).map(|time| time.to_utc());
-            time.map_err(|_| format!("expires of `{name}` is no time with a zone, as 2027-01-31T12:00:00Z"))
-        });
-        let scram = self.scram.as_ref().map(|text| {
-            text.parse().map(Arc::new).map_err(|wrong: String| format!("the scram of `{name}` is wrong: {wrong}"))
-        });
-        Ok(TokenEntry { client: Arc::new(client), hash, scram: scram.transpose()?, expires: expires.transpose()? })
+            token,
+        })
     }
 
     fn check_projects(&self) -> Result<(), String> {
@@ -158,42 +196,95 @@ impl TokenFile {
     /// [`Error::ReadTokens`], [`Error::Tokens`].
     pub fn read(path: &Path) -> Result<Self, Error> {
         let file = Self::read_any(path)?;
-        if file.entries.is_empty() {
-            let message = "there is none; hint: `echolake token NAME` makes one".to_owned();
-            return Err(Error::Tokens { path: path.to_owned(), message });
+        if file.entries.is_empty() && file.groups.is_empty() {
+            return Err(file.wrong("there is none; hint: `echolake token NAME` makes one".to_owned()));
         }
         Ok(file)
     }
 
-    // Also a file in which no token is left.
-    fn read_any(path: &Path) -> Result<Self, Error> {
+    /// Reads a file in which no token may be left.
+    ///
+    /// # Errors
+    /// As [`TokenFile::read`].
+    pub(crate) fn read_any(path: &Path) -> Result<Self, Error> {
         let text =
             std::fs::read_to_string(path).map_err(|source| Error::ReadTokens { path: path.to_owned(), source })?;
-        let entries = Self::parse(&text).map_err(|message| Error::Tokens { path: path.to_owned(), message })?;
-        Ok(Self { path: path.to_owned(), entries })
+        Self::parse(path, &text).map_err(|message| Error::Tokens { path: path.to_owned(), message })
     }
 
-    fn parse(text: &str) -> Result<Vec<TokenEntry>, String> {
+    /// Parses a file's text.
+    ///
+    /// # Errors
+    /// The defect.
+    pub(crate) fn parse(path: &Path, text: &str) -> Result<Self, String> {
         let file: TokenList = toml::from_str(text).map_err(|e| e.to_string())?;
         let entries = file.token.iter().map(Line::entry).collect::<Result<Vec<_>, _>>()?;
         for (i, entry) in entries.iter().enumerate() {
-            if entries[..i].iter().any(|e| e.client.name == entry.client.name || e.hash == entry.hash) {
+            let is_same = |e: &TokenEntry| {
+                e.client.name == entry.client.name || entry.hash.is_some_and(|hash| e.hash == Some(hash))
+            };
+            if entries[..i].iter().any(is_same) {
                 return Err(format!("`{}` is there twice", entry.client.name));
             }
         }
-        Ok(entries)
+        let groups = file.group.iter().map(Line::group).collect::<Result<Vec<_>, _>>()?;
+        if let Some(twice) = (1..groups.len()).find(|i| groups[..*i].iter().any(|g| g.name == groups[*i].name)) {
+            return Err(format!("the group `{}` is there twice", groups[twice].name));
+        }
+        Ok(Self { path: path.to_owned(), entries, groups })
     }
 
+    /// Checks that each line can let somebody in.
+    ///
+    /// # Errors
+    /// [`Error::Tokens`].
+    pub(crate) fn check_logins(&self, other: OtherLogins) -> Result<(), Error> {
+        let without = self.entries.iter().find(|entry| entry.hash.is_none()).filter(|_| !other.by_certificate);
+        if let Some(entry) = without {
+            let name = &entry.client.name;
+            return Err(self.wrong(format!(
+                "`{name}` has no sha256, and no certificate can log it in; hint: --client-ca FILE, or `echolake token NAME`"
+            )));
+        }
+        match self.groups.first().filter(|_| !other.by_oidc) {
+            Some(group) => {
+                Err(self.wrong(format!("the group `{}` is nobody's; hint: --oidc ISSUER names its users", group.name)))
+            }
+            None => Ok(()),
+        }
+    }
+
+    fn wrong(&self, message: String) -> Error {
+        Error::Tokens { path: self.path.clone(), message }
+    }
+
+    /// The file's path.
+    pub(crate) fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// Finds a token's line by its hash.
     // Every hash is compared to its end, so that the time does not tell which token is nearly right.
-    fn find(&self, hash: &[u8; 32]) -> Option<&TokenEntry> {
+    pub(crate) fn find(&self, hash: &[u8; 32]) -> Option<&TokenEntry> {
         let mut found = None;
         for entry in &self.entries {
-            let same: Choice = entry.hash.ct_eq(hash);
+            let same: Choice = entry.hash.map_or(Choice::from(0), |own| own.ct_eq(hash));
             if same.into() {
                 found = Some(entry);
             }
         }
         found.filter(|entry| entry.is_valid())
+    }
+
+    /// Finds a line by its name.
+    pub(crate) fn find_name(&self, name: &str) -> Option<&TokenEntry> {
+        self.entries.iter().find(|entry| entry.client.name == name && entry.is_valid())
+    }
+
+    /// Returns the identity of a user in these groups: the first group of the file that is among them decides.
+    pub(crate) fn user(&self, name: &str, groups: &[String]) -> Option<ClientIdentity> {
+        let group = self.groups.iter().find(|group| groups.contains(&group.name))?;
+        Some(ClientIdentity { name: format!("{OIDC_PREFIX}{name}"), ..group.clone() })
     }
 }
 
@@ -230,155 +321,6 @@ pub fn fresh(name: &str, days: Option<u32>, projects: &[ProjectName]) -> Result<
     Ok(FreshToken { token, lines })
 }
 
-/// The access rule of a server.
-pub(crate) enum TokenAccess {
-    /// All clients on this machine.
-    Open,
-    /// Holders of a token, or of a browser session that was begun with one.
-    Tokens(RwLock<TokenFile>, BrowserSessions),
-}
-
-impl TokenAccess {
-    /// Access by `tokens`, or open access without them.
-    pub(crate) fn new(tokens: Option<TokenFile>) -> Self {
-        match tokens {
-            Some(tokens) => Self::Tokens(RwLock::new(tokens), BrowserSessions::default()),
-            None => Self::Open,
-        }
-    }
-
-    /// Returns whether no token is required.
-    pub(crate) fn is_open(&self) -> bool {
-        matches!(self, Self::Open)
-    }
-
-    /// Returns the client of a token; on a server without tokens, the client that `local` makes.
-    ///
-    /// # Errors
-    /// [`RequestFault::Unauthenticated`].
-    pub(crate) fn client(
-        &self,
-        token: Option<&str>,
-        local: impl FnOnce() -> ClientIdentity,
-    ) -> Result<Arc<ClientIdentity>, RequestFault> {
-        match self {
-            Self::Open => Ok(Arc::new(local())),
-            Self::Tokens(tokens, _) => holder(tokens, &hash_of(token.unwrap_or_default())),
-        }
-    }
-
-    /// Returns the client of a token's name, and what tells whether it has the token; None if its line has no such verifier.
-    pub(crate) fn scram_client(&self, name: &str) -> Option<(Arc<ClientIdentity>, Arc<ScramVerifier>)> {
-        let Self::Tokens(tokens, _) = self else { return None };
-        let tokens = tokens.read().unwrap_or_else(PoisonError::into_inner);
-        let entry = tokens.entries.iter().find(|entry| entry.client.name == name && entry.is_valid())?;
-        Some((entry.client.clone(), entry.scram.clone()?))
-    }
-
-    /// Returns the client of a token's name; on a server without tokens, the one of this name that asks over HTTP.
-    ///
-    /// # Errors
-    /// [`RequestFault::Unauthenticated`].
-    pub(crate) fn client_of_name(&self, name: &str) -> Result<Arc<ClientIdentity>, RequestFault> {
-        match self {
-            Self::Open => {
-                let known = [ClientIdentity::pages(), ClientIdentity::programs()];
-                let found = known.into_iter().find(|client| client.name == name);
-                found.map(Arc::new).ok_or(RequestFault::Unauthenticated)
-            }
-            Self::Tokens(tokens, _) => {
-                let tokens = tokens.read().unwrap_or_else(PoisonError::into_inner);
-                let found = tokens.entries.iter().find(|entry| entry.client.name == name && entry.is_valid());
-                found.map(|entry| entry.client.clone()).ok_or(RequestFault::Unauthenticated)
-            }
-        }
-    }
-
-    /// Checks that a client's token was not taken back and has not expired since, and sees the same projects.
-    ///
-    /// # Errors
-    /// [`RequestFault::Unauthenticated`].
-    pub(crate) fn check_current(&self, client: &ClientIdentity) -> Result<(), RequestFault> {
-        let Self::Tokens(tokens, _) = self else { return Ok(()) };
-        let tokens = tokens.read().unwrap_or_else(PoisonError::into_inner);
-        let is_its = |entry: &TokenEntry| {
-            entry.client.token == client.token && entry.client.projects == client.projects && entry.is_valid()
-        };
-        tokens.entries.iter().any(is_its).then_some(()).ok_or(RequestFault::Unauthenticated)
-    }
-
-    /// Reads the file again if it changed; returns the names of clients that may no longer ask, or see other projects now. A file that cannot be read
-    /// changes nothing.
-    pub(crate) fn renew(&self, known: &mut TokenFileState) -> Vec<String> {
-        let Self::Tokens(tokens, _) = self else { return Vec::new() };
-        let mut tokens = tokens.write().unwrap_or_else(PoisonError::into_inner);
-        let valid_before = std::mem::take(&mut known.valid);
-        let changed =
-            std::fs::metadata(&tokens.path).ok().and_then(|about| Some((about.modified().ok()?, about.len())));
-        if known.file.replace(changed).is_some_and(|before| before != changed) {
-            match TokenFile::read_any(&tokens.path) {
-                Ok(renewed) => {
-                    *tokens = renewed;
-                    tracing::info!(tokens = tokens.entries.len(), "the file of tokens was read again");
-                }
-                Err(e) => tracing::warn!(error = &e as &dyn std::error::Error, "the tokens stay as they were"),
-            }
-        }
-        let valid = tokens.entries.iter().filter(|entry| entry.is_valid());
-        known.valid = valid.map(|entry| (entry.hash, entry.client.clone())).collect();
-        let is_same = |(hash, client): &(_, Arc<ClientIdentity>)| {
-            known.valid.iter().any(|(h, c)| h == hash && c.name == client.name && c.projects == client.projects)
-        };
-        valid_before.into_iter().filter(|token| !is_same(token)).map(|(_, client)| client.name.clone()).collect()
-    }
-
-    /// Begins a browser's session; returns its secret.
-    ///
-    /// # Errors
-    /// [`RequestFault::Unauthenticated`]; [`RequestFault::NotFound`] if there are no tokens.
-    pub(crate) fn begin_session(&self, token: &str) -> Result<String, RequestFault> {
-        let Self::Tokens(tokens, sessions) = self else {
-            let hint = "this server has no tokens, ask right away";
-            return Err(RequestFault::NotFound { what: "a session".to_owned(), hint });
-        };
-        let hash = hash_of(token);
-        holder(tokens, &hash)?;
-        sessions.begin(hash).map_err(RequestFault::defect("no session can begin"))
-    }
-
-    /// Returns the client of the session with this secret; as [`TokenAccess::client`].
-    ///
-    /// # Errors
-    /// As [`TokenAccess::client`].
-    pub(crate) fn client_of_session(
-        &self,
-        secret: &str,
-        local: impl FnOnce() -> ClientIdentity,
-    ) -> Result<Arc<ClientIdentity>, RequestFault> {
-        let (tokens, sessions) = match self {
-            Self::Open => return Ok(Arc::new(local())),
-            Self::Tokens(tokens, sessions) => (tokens, sessions),
-        };
-        holder(tokens, &sessions.holder(secret).ok_or(RequestFault::Unauthenticated)?)
-    }
-}
-
-/// State of a file of tokens when it was last looked at.
-#[derive(Default)]
-pub(crate) struct TokenFileState {
-    file: Option<Option<(SystemTime, u64)>>,
-    valid: Vec<([u8; 32], Arc<ClientIdentity>)>,
-}
-
-fn hash_of(token: &str) -> [u8; 32] {
-    Sha256::digest(token.as_bytes()).into()
-}
-
-fn holder(tokens: &RwLock<TokenFile>, hash: &[u8; 32]) -> Result<Arc<ClientIdentity>, RequestFault> {
-    let tokens = tokens.read().unwrap_or_else(PoisonError::into_inner);
-    tokens.find(hash).map(|entry| entry.client.clone()).ok_or(RequestFault::Unauthenticated)
-}
-
 /// The token of an `Authorization` header: a bearer's, or the password of a basic one.
 pub(crate) fn of_header(value: &str) -> Option<String> {
     let (scheme, rest) = value.split_once(' ')?;
@@ -396,91 +338,6 @@ pub(crate) fn of_header(value: &str) -> Option<String> {
 mod tests {
     use super::*;
 
-    fn access_by(lines: &str) -> TokenAccess {
-        let entries = TokenFile::parse(lines).expect("tokens");
-        TokenAccess::new(Some(TokenFile { path: PathBuf::from("no-such-file.toml"), entries }))
-    }
-
-    #[test]
-    fn a_token_that_expired_or_was_taken_back_lets_nobody_in() {
-        let folder = tempfile::tempdir().expect("a folder");
-        let path = folder.path().join("tokens.toml");
-        let hash = hex::encode(Sha256::digest("x"));
-        let line = |rest: &str| format!("[[token]]\nname = 'a'\nsha256 = '{hash}'\n{rest}\n");
-        std::fs::write(&path, line("expires = 2126-01-01T00:00:00Z")).expect("written");
-        let access = TokenAccess::new(Some(TokenFile::read(&path).expect("tokens")));
-        let mut known = TokenFileState::default();
-        assert!(access.renew(&mut known).is_empty());
-        let client = access.client(Some("x"), ClientIdentity::pages).expect("let in");
-        let session = access.begin_session("x").expect("a session");
-        let is_in = || {
-            let by_session = access.client_of_session(&session, ClientIdentity::pages).is_ok();
-            let by_token = access.client(Some("x"), ClientIdentity::pages).is_ok();
-            assert_eq!((by_session, by_token), (by_token, access.check_current(&client).is_ok()));
-            by_token
-        };
-        assert!(is_in());
-        // A half-written file changes nothing.
-        std::fs::write(&path, "[[token]]\nname = 'a").expect("written");
-        assert!(access.renew(&mut known).is_empty() && is_in());
-        std::fs::write(&path, line("expires = 2026-01-01T00:00:00Z")).expect("written");
-        assert_eq!(access.renew(&mut known), ["a"]);
-        assert!(!is_in());
-        std::fs::write(&path, line("")).expect("written");
-        assert!(access.renew(&mut known).is_empty() && is_in());
-        // Other projects are another view of the lake: what was asked so far ends.
-        std::fs::write(&path, line("projects = ['brick']")).expect("written");
-        assert_eq!(access.renew(&mut known), ["a"]);
-        assert!(access.check_current(&client).is_err());
-        std::fs::write(&path, line("")).expect("written");
-        assert_eq!(access.renew(&mut known), ["a"]);
-        assert!(is_in());
-        std::fs::write(&path, "").expect("written");
-        assert_eq!(access.renew(&mut known), ["a"]);
-        assert!(!is_in());
-        assert!(TokenFile::read(&path).map(drop).expect_err("no tokens").to_string().contains("there is none"));
-    }
-
-    #[test]
-    fn a_fresh_token_lets_in_and_no_other_does() {
-        let project: ProjectName = "brick".parse().expect("a name");
-        let fresh = fresh("a \"quoted\" name", Some(1), std::slice::from_ref(&project)).expect("a token");
-        assert!(!fresh.lines.contains(&fresh.token), "only hashes of it are kept");
-        let access = access_by(&fresh.lines);
-        let local = ClientIdentity::pages;
-        let client = access.client(Some(&fresh.token), local).expect("let in");
-        assert_eq!(client.name, "a \"quoted\" name");
-        assert_eq!(client.projects, Some([project].into()));
-        assert_eq!(client.quota().time, Some(std::time::Duration::from_secs(60)));
-        assert!(client.require(TokenScope::Files).is_ok(), "pages show meshes and link to files");
-        assert!(matches!(client.require(TokenScope::Metrics), Err(RequestFault::Forbidden { .. })));
-        let secret = access.begin_session(&fresh.token).expect("a session");
-        assert_eq!(access.client_of_session(&secret, local).expect("let in"), client);
-        assert!(matches!(access.client_of_session(&fresh.token, local), Err(RequestFault::Unauthenticated)));
-        assert!(matches!(access.begin_session(&secret), Err(RequestFault::Unauthenticated)));
-        let (by_name, _) = access.scram_client("a \"quoted\" name").expect("a verifier");
-        assert_eq!(by_name, client);
-        assert!(access.scram_client("b").is_none());
-        let other = super::fresh("b", None, &[]).expect("a token").token;
-        let cut = &fresh.token[..fresh.token.len() - 1];
-        for wrong in [None, Some(""), Some(other.as_str()), Some(cut)] {
-            assert!(matches!(access.client(wrong, local), Err(RequestFault::Unauthenticated)), "{wrong:?}");
-        }
-    }
-
-    #[test]
-    fn scopes_are_those_that_a_line_names() {
-        let hash = hex::encode(Sha256::digest("x"));
-        let allowed = |scopes: &str| {
-            let access = access_by(&format!("[[token]]\nname = 'a'\nsha256 = '{hash}'\n{scopes}"));
-            let client = access.client(Some("x"), ClientIdentity::pages).expect("let in");
-            [TokenScope::Sql, TokenScope::Files, TokenScope::Metrics].map(|scope| client.require(scope).is_ok())
-        };
-        assert_eq!(allowed(""), [true, true, false]);
-        assert_eq!(allowed("scopes = ['sql']"), [true, false, false]);
-        assert_eq!(allowed("scopes = ['metrics']"), [false, false, true]);
-    }
-
     #[test]
     fn wrong_files_say_what_is_wrong() {
         let hash = "ab".repeat(32);
@@ -497,8 +354,12 @@ mod tests {
                 "has projects and the scope metrics",
             ),
             (format!("[[token]]\nname = 'a'\nsha256 = '{hash}'\n").repeat(2), "twice"),
+            ("[[token]]\nname = 'oidc:a'".to_owned(), "is no name of a token"),
+            (format!("[[group]]\nname = 'a'\nsha256 = '{hash}'"), "the group `a` has sha256"),
+            ("[[group]]\nname = 'a'\nrows = 0".to_owned(), "rows of `a` is 0"),
+            ("[[group]]\nname = 'a'\n".repeat(2), "the group `a` is there twice"),
         ] {
-            let error = TokenFile::parse(&text).map(|_| ()).expect_err(&text);
+            let error = TokenFile::parse(Path::new("tokens.toml"), &text).map(|_| ()).expect_err(&text);
             assert!(error.contains(expected), "{text}: {error}");
         }
     }
@@ -517,5 +378,28 @@ mod tests {
         ] {
             assert_eq!(of_header(value).as_deref(), expected, "{value}");
         }
+    }
+
+    #[test]
+    fn lines_that_let_nobody_in_are_refused() {
+        let check = |text: &str, by_certificate, by_oidc| {
+            let file = TokenFile::parse(Path::new("tokens.toml"), text).expect("tokens");
+            file.check_logins(OtherLogins { by_certificate, by_oidc }).map_err(|e| e.to_string())
+        };
+        let (certified, group) = ("[[token]]\nname = 'ann'", "[[group]]\nname = 'lab'");
+        assert!(check(certified, false, true).expect_err("no certificates").contains("`ann` has no sha256"));
+        assert!(check(group, true, false).expect_err("no provider").contains("the group `lab` is nobody's"));
+        assert_eq!(check(&format!("{certified}\n{group}"), true, true), Ok(()));
+    }
+
+    #[test]
+    fn the_first_group_decides() {
+        let text = "[[group]]\nname = 'brick'\nprojects = ['brick']\n[[group]]\nname = 'lab'\nscopes = ['sql']";
+        let file = TokenFile::parse(Path::new("tokens.toml"), text).expect("groups");
+        let user = |groups: &[&str]| file.user("ann", &groups.iter().map(|g| g.to_string()).collect::<Vec<_>>());
+        let both = user(&["lab", "brick"]).expect("a user");
+        assert_eq!((both.name.as_str(), both.projects.is_some()), ("oidc:ann", true));
+        assert_eq!(user(&["lab"]).expect("a user").scopes, [TokenScope::Sql]);
+        assert_eq!(user(&["Lab", ""]), None);
     }
 }

@@ -12,14 +12,16 @@ use anyhow::Context as _;
 use echolake_lake::{Lake, remote_access};
 use echolake_query::{WorkerLink, WorkerToken};
 use echolake_schema::ProjectName;
-use echolake_server::certificate::self_signed;
+use echolake_server::certificate::{CertificateUse, self_signed};
 use echolake_server::engine::{EngineRun, confinement, run_engine};
 use echolake_server::tokens::{self, TokenFile};
 use echolake_server::worker::{
     EngineWorkers, LakeWorker, WORKER_TOKEN_VARIABLE, WorkerSettings, program_build, read_worker_token,
     read_worker_trust, worker_trust_files,
 };
-use echolake_server::{CataloguePages, CertificateFiles, EngineSettings, Error, LakeServer, ServerSettings};
+use echolake_server::{
+    CataloguePages, CertificateFiles, EngineSettings, Error, LakeServer, OidcSettings, ServerSettings,
+};
 use tokio::signal::unix::{SignalKind, signal};
 
 use super::cache::CacheArgs;
@@ -56,6 +58,11 @@ pub(crate) struct ServeArgs {
     /// Private key of the certificate (PEM).
     #[arg(long, value_name = "FILE", requires = "certificate")]
     key: Option<PathBuf>,
+    /// Certificates of those who issue clients' certificates (PEM): a client's name is that of a line in the file of tokens.
+    #[arg(long, value_name = "FILE", requires = "certificate", requires = "tokens")]
+    client_ca: Option<PathBuf>,
+    #[command(flatten)]
+    oidc: OidcArgs,
     /// Listen without encryption beyond this machine, because a proxy encrypts.
     #[arg(long, conflicts_with = "certificate")]
     plain_text_behind_a_proxy: bool,
@@ -94,6 +101,34 @@ pub(crate) struct ServeArgs {
     plain_text_to_workers: bool,
     #[command(flatten)]
     cache: CacheArgs,
+}
+
+/// The identity provider of `serve`.
+#[derive(Debug, clap::Args)]
+struct OidcArgs {
+    /// Identity provider (OpenID Connect) whose tokens are accepted; `[[group]]` in the file of tokens says who may what.
+    #[arg(long, value_name = "ISSUER", requires = "tokens", requires = "oidc_audience")]
+    oidc: Option<String>,
+    /// Audience of its tokens: what the provider calls this server.
+    #[arg(long, value_name = "AUDIENCE", requires = "oidc")]
+    oidc_audience: Option<String>,
+    /// Claim with a user's name; users must not be able to choose it.
+    #[arg(long, value_name = "CLAIM", default_value = "sub")]
+    oidc_name: String,
+    /// Claim with a user's groups.
+    #[arg(long, value_name = "CLAIM", default_value = "groups")]
+    oidc_groups: String,
+}
+
+impl OidcArgs {
+    fn settings(&self) -> Option<OidcSettings> {
+        Some(OidcSettings {
+            issuer: self.oidc.clone()?,
+            audience: self.oidc_audience.clone()?,
+            name_claim: self.oidc_name.clone(),
+            groups_claim: self.oidc_groups.clone(),
+        })
+    }
 }
 
 /// Arguments with which `serve` starts its engines.
@@ -239,7 +274,7 @@ impl ServeArgs {
 
     fn certificate_files(&self) -> Option<CertificateFiles> {
         let (certificate, key) = self.certificate.clone().zip(self.key.clone())?;
-        Some(CertificateFiles { certificate, key })
+        Some(CertificateFiles { certificate, key, client_ca: self.client_ca.clone() })
     }
 
     fn workers(&self) -> anyhow::Result<Option<EngineWorkers>> {
@@ -291,6 +326,7 @@ pub(crate) async fn run(args: &ServeArgs, lake_url: &str) -> anyhow::Result<Comm
         postgres: args.postgres.address(),
         tokens: args.tokens.as_deref().map(TokenFile::read).transpose()?,
         certificate: args.certificate_files(),
+        oidc: args.oidc.settings(),
         is_behind_proxy: args.plain_text_behind_a_proxy,
         drain: args.drain,
         engines: EngineSettings {
@@ -318,6 +354,7 @@ pub(crate) async fn catalogue(lake: &Lake, stop: &StopRequest) -> anyhow::Result
         postgres: None,
         tokens: None,
         certificate: None,
+        oidc: None,
         is_behind_proxy: false,
         drain: CATALOGUE_DRAIN,
         engines: engines.clone(),
@@ -363,6 +400,9 @@ pub(crate) struct CertificateArgs {
     /// Names and addresses under which clients reach the server.
     #[arg(value_name = "NAME", required = true)]
     names: Vec<String>,
+    /// Make the certificate of a client, whose one NAME is that of a line in the file of tokens.
+    #[arg(long)]
+    client: bool,
     /// Folder for certificate.pem and key.pem; files that are there are not overwritten.
     #[arg(short, long, value_name = "DIR", default_value = ".")]
     output: PathBuf,
@@ -370,7 +410,11 @@ pub(crate) struct CertificateArgs {
 
 /// Writes a self-signed certificate and its key.
 pub(crate) fn certificate(args: &CertificateArgs) -> anyhow::Result<CommandOutcome> {
-    let made = self_signed(&args.names)?;
+    let made = match (args.client, args.names.as_slice()) {
+        (false, names) => self_signed(names, CertificateUse::Server)?,
+        (true, [_]) => self_signed(&args.names, CertificateUse::Client)?,
+        (true, names) => anyhow::bail!("{} names, expected one; hint: a certificate for each client", names.len()),
+    };
     std::fs::create_dir_all(&args.output).with_context(|| format!("cannot make `{}`", args.output.display()))?;
     // The key first: nobody but its owner reads it, from its first byte on.
     for (name, text, mode) in [("key.pem", &made.key, 0o600), ("certificate.pem", &made.certificate, 0o644)] {
@@ -380,7 +424,14 @@ pub(crate) fn certificate(args: &CertificateArgs) -> anyhow::Result<CommandOutco
         file.write_all(text.as_bytes()).and_then(|()| file.sync_all()).with_context(failed)?;
         super::print(&path.display().to_string())?;
     }
-    eprintln!("clients trust it by having certificate.pem; the key stays on the server");
+    eprintln!(
+        "{}",
+        match args.client {
+            false => "clients trust it by having certificate.pem; the key stays on the server",
+            true =>
+                "a server lets it in by having certificate.pem in the file of --client-ca; the key stays with the client",
+        }
+    );
     Ok(CommandOutcome::Whole)
 }
 

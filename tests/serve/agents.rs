@@ -55,7 +55,7 @@ fn an_agent_asks_by_tools() {
 
     let tables = call(&server, "list_tables", json!({})).expect("tables");
     let meanings: Vec<_> = tables["tables"].as_array().expect("a list").iter().map(|t| &t["meaning"]).collect();
-    assert!(meanings.len() == 16 && meanings.iter().all(|meaning| meaning.is_string()), "{tables}");
+    assert!(meanings.len() == 23 && meanings.iter().all(|meaning| meaning.is_string()), "{tables}");
     let described = call(&server, "describe_table", json!({ "table": "pairs" })).expect("a table");
     let direct = described["columns"].as_array().expect("a list").iter().find(|c| c["name"] == "direct_mm");
     assert_eq!(direct.expect("a column")["unit"], "mm");
@@ -72,6 +72,8 @@ fn an_agent_asks_by_tools() {
     assert!(long["row_count"].as_u64().expect("a number") < 100 && long["truncated"] == true, "{}", long["note"]);
     let listed = rows("select statement, outcome from system.queries where statement like '%order by pair_id'", 10);
     assert_eq!(listed["rows"][0][1], "answered", "rows that nobody wanted are no failure: {listed}");
+    let protocols = "select distinct protocol from system.queries";
+    assert_eq!(rows(protocols, 10)["rows"], json!([["mcp"]]));
 
     let found = call(&server, "list_functions", json!({ "search": "itersine" })).expect("functions");
     assert!(found["functions"].is_array());
@@ -197,6 +199,10 @@ fn tables_are_shared_as_files() {
     assert!(names.contains(&json!("tnce_db")) && !names.contains(&json!("ir")) && names.len() == 14, "{names:?}");
     let page = json_of(&get(&server, "/delta-sharing/shares/echolake/all-tables?maxResults=3&pageToken=12"));
     assert_eq!((page["items"].as_array().map(Vec::len), &page["nextPageToken"]), (Some(2), &Value::Null));
+    shared(&server, "catalogue", "{}");
+    let protocol =
+        super::sql(&server, "select protocol from system.queries where statement like 'select * from catalogue%'");
+    assert_eq!(json_of(&protocol)[0]["protocol"], "sharing");
     for table in ["measurements", "pairs", "runs", "catalogue", "tnce_db"] {
         let rows = place.number(&format!("select count(*) from {table}"));
         let files = shared(&server, table, "{}");

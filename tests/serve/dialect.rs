@@ -1,6 +1,7 @@
 //! SQL over the three protocols and the prompt: errors have place and hint, and all but Postgres' read one dialect.
 
 use arrow_flight::error::FlightError;
+use arrow_flight::sql::CommandGetTables;
 use arrow_flight::sql::client::FlightSqlServiceClient;
 use futures::TryStreamExt as _;
 use tonic::transport::{Channel, Endpoint};
@@ -104,6 +105,22 @@ async fn http_flight_sql_and_the_prompt_read_one_dialect() {
     }
     drop(client);
     tokio::task::spawn_blocking(move || drop(server)).await.expect("ended");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn system_tables_are_listed_over_flight_sql() {
+    let place = lake();
+    let server = served(&place, &[]);
+    let mut client = connect(&server).await;
+    let wanted = CommandGetTables {
+        db_schema_filter_pattern: Some("system".to_owned()),
+        include_schema: true,
+        ..CommandGetTables::default()
+    };
+    let info = client.get_tables(wanted).await.expect("a list");
+    let ticket = info.endpoint.into_iter().find_map(|endpoint| endpoint.ticket).expect("a ticket");
+    let batches: Vec<_> = client.do_get(ticket).await.expect("rows").try_collect().await.expect("rows");
+    assert_eq!(batches.iter().map(|batch| batch.num_rows()).sum::<usize>(), 7);
 }
 
 async fn connect(server: &ServedLake) -> FlightSqlServiceClient<Channel> {

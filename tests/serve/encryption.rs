@@ -7,34 +7,51 @@ use std::sync::Arc;
 
 use tokio_rustls::rustls::crypto::ring;
 use tokio_rustls::rustls::pki_types::pem::PemObject as _;
-use tokio_rustls::rustls::pki_types::{CertificateDer, ServerName};
+use tokio_rustls::rustls::pki_types::{CertificateDer, PrivateKeyDer, ServerName};
 use tokio_rustls::rustls::{ClientConfig, ClientConnection, RootCertStore, StreamOwned};
 
 use super::super::TestFolder;
 use super::server::ServedLake;
 use super::{lake, served, wait_until};
 
-type TlsClient = StreamOwned<ClientConnection, TcpStream>;
+pub(super) type TlsClient = StreamOwned<ClientConnection, TcpStream>;
 
 /// A lake with a certificate in the folder `tls`.
-fn certified() -> TestFolder {
+pub(super) fn certified() -> TestFolder {
     let place = lake();
     place.ok(&["certificate", "localhost", "127.0.0.1", "-o", "tls"]);
     place
 }
 
-const FILES: [&str; 4] = ["--certificate", "tls/certificate.pem", "--key", "tls/key.pem"];
+pub(super) const FILES: [&str; 4] = ["--certificate", "tls/certificate.pem", "--key", "tls/key.pem"];
+
+/// A client of a protocol that trusts one certificate, and shows the one in the folder `own`.
+pub(super) fn client_config(certificate: &Path, own: Option<&Path>, protocol: &str) -> ClientConfig {
+    let mut roots = RootCertStore::empty();
+    roots.add(CertificateDer::from_pem_file(certificate).expect("PEM")).expect("a certificate");
+    let config = ClientConfig::builder_with_provider(Arc::new(ring::default_provider()))
+        .with_safe_default_protocol_versions()
+        .expect("versions")
+        .with_root_certificates(roots);
+    let mut config = match own {
+        Some(own) => {
+            let shown = CertificateDer::from_pem_file(own.join("certificate.pem")).expect("PEM");
+            let key = PrivateKeyDer::from_pem_file(own.join("key.pem")).expect("PEM");
+            config.with_client_auth_cert(vec![shown], key).expect("a certificate and its key")
+        }
+        None => config.with_no_client_auth(),
+    };
+    config.alpn_protocols = vec![protocol.as_bytes().to_vec()];
+    config
+}
 
 /// Shakes hands on a connection, as a client of a protocol that trusts one certificate.
 fn shake(stream: TcpStream, certificate: &Path, protocol: &str) -> std::io::Result<TlsClient> {
-    let mut roots = RootCertStore::empty();
-    roots.add(CertificateDer::from_pem_file(certificate).expect("PEM")).expect("a certificate");
-    let mut config = ClientConfig::builder_with_provider(Arc::new(ring::default_provider()))
-        .with_safe_default_protocol_versions()
-        .expect("versions")
-        .with_root_certificates(roots)
-        .with_no_client_auth();
-    config.alpn_protocols = vec![protocol.as_bytes().to_vec()];
+    shake_as(stream, client_config(certificate, None, protocol), protocol)
+}
+
+/// Shakes hands on a connection.
+pub(super) fn shake_as(stream: TcpStream, config: ClientConfig, protocol: &str) -> std::io::Result<TlsClient> {
     let name = ServerName::try_from("localhost").expect("a name");
     let mut client = StreamOwned::new(ClientConnection::new(Arc::new(config), name).expect("a client"), stream);
     client.flush()?;
@@ -46,7 +63,7 @@ fn shake(stream: TcpStream, certificate: &Path, protocol: &str) -> std::io::Resu
 }
 
 /// Asks for a path; the connection stays.
-fn get(client: &mut TlsClient, path: &str, more: &str) -> String {
+pub(super) fn get(client: &mut TlsClient, path: &str, more: &str) -> String {
     write!(client, "GET {path} HTTP/1.1\r\nHost: localhost\r\n{more}\r\n").expect("sent");
     let mut text = String::new();
     while !text.contains("\r\n\r\n") {
@@ -59,6 +76,24 @@ fn get(client: &mut TlsClient, path: &str, more: &str) -> String {
     let mut body = vec![0; length];
     client.read_exact(&mut body).expect("the body");
     text + &String::from_utf8_lossy(&body)
+}
+
+/// Begins a session of a user over Postgres' protocol.
+pub(super) fn begin_session(stream: &mut dyn std::io::Write, user: &str) {
+    let mut body = 196_608_i32.to_be_bytes().to_vec();
+    body.extend(format!("user\0{user}\0database\0datafusion\0\0").as_bytes());
+    let length = ((body.len() + 4) as i32).to_be_bytes();
+    stream.write_all(&[&length[..], &body].concat()).expect("sent");
+}
+
+/// Connects over Postgres' protocol, up to the handshake.
+pub(super) fn ask_for_tls(server: &ServedLake) -> TcpStream {
+    let mut asked = ServedLake::connect(&server.postgres);
+    let mut answer = [0; 1];
+    asked.write_all(&[0, 0, 0, 8, 0x04, 0xd2, 0x16, 0x2f]).expect("sent");
+    asked.read_exact(&mut answer).expect("an answer");
+    assert_eq!(&answer, b"S");
+    asked
 }
 
 #[test]
@@ -77,24 +112,13 @@ fn all_protocols_are_encrypted() {
     let mut said = Vec::new();
     let _ = plain.read_to_end(&mut said);
     assert!(!String::from_utf8_lossy(&said).contains("HTTP/1.1"), "{said:?}");
-    let startup = |stream: &mut dyn std::io::Write| {
-        let mut body = 196_608_i32.to_be_bytes().to_vec();
-        body.extend(b"user\0me\0database\0datafusion\0\0");
-        let length = ((body.len() + 4) as i32).to_be_bytes();
-        stream.write_all(&[&length[..], &body].concat()).expect("sent");
-    };
     let mut plain = ServedLake::connect(&server.postgres);
-    startup(&mut plain);
+    begin_session(&mut plain, "me");
     let mut said = String::new();
     let _ = plain.read_to_string(&mut said);
     assert!(said.starts_with('E') && said.contains("sslmode=require"), "{said:?}");
-    let mut asked = ServedLake::connect(&server.postgres);
-    let mut answer = [0; 1];
-    asked.write_all(&[0, 0, 0, 8, 0x04, 0xd2, 0x16, 0x2f]).expect("sent");
-    asked.read_exact(&mut answer).expect("an answer");
-    assert_eq!(&answer, b"S");
-    let mut postgres = shake(asked, &certificate, "postgresql").expect("a handshake");
-    startup(&mut postgres);
+    let mut postgres = shake(ask_for_tls(&server), &certificate, "postgresql").expect("a handshake");
+    begin_session(&mut postgres, "me");
     let mut header = [0; 9];
     postgres.read_exact(&mut header).expect("an answer");
     assert_eq!(header, [b'R', 0, 0, 0, 8, 0, 0, 0, 0], "the session has begun");

@@ -86,6 +86,16 @@ fn the_lake_and_connections_are_tables_over_postgres_too() {
     let own = "select count(*) from system.connections where protocol = 'postgres' and is_working";
     assert_eq!(client.query(own), one("1"));
     assert_eq!(client.query("select origin from system.ingests"), one("simulated"));
+    let listed = "select count(*) from pg_class c join pg_namespace n on n.oid = c.relnamespace \
+                  where n.nspname = 'system' and not pg_table_is_visible(c.oid) and c.relkind = 'r'";
+    assert_eq!(client.query(listed), one("7"));
+    assert_eq!(
+        client.query("select obj_description('system.queries'::regclass, 'pg_class') like 'One row per query%'"),
+        one("t")
+    );
+    let columns =
+        "select count(*) from information_schema.columns where table_schema = 'system' and table_name = 'files'";
+    assert_eq!(client.query(columns), one("8"));
     let time = "select ingested is not null and version > 0 from system.ingests";
     assert_eq!(client.query(time), one("t"));
     let files =
@@ -160,6 +170,9 @@ fn files_that_are_handed_out_are_audited() {
     let said = server.said();
     let handed = said.iter().filter(|line| line.contains("a file is handed out")).count();
     assert_eq!(handed, 2, "{said:?}");
+    let of_slice = said.iter().find(|line| line.contains("slices.mcap")).expect("a line of the slice");
+    assert!(of_slice.contains(&format!("runs=\"{run}\"")), "{of_slice}");
+    assert_eq!(slice.header("echolake-sliced-runs"), None, "that is between engine and door");
     assert!(!said.iter().any(|line| line.contains("pair_id")), "a predicate is a statement: {said:?}");
 }
 

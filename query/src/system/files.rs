@@ -18,25 +18,24 @@ pub(super) struct LakeFiles {
     pub(super) snapshot: Arc<LakeSnapshot>,
 }
 
+/// The columns of the table.
+pub(super) fn columns() -> SchemaRef {
+    schema([
+        column("table", DataType::Utf8, false, "", "Table that the file is of"),
+        column("path", DataType::Utf8, false, "", "Path of the file in the lake"),
+        column("bytes", DataType::Int64, false, "B", "Size; if it has rows of other projects, the share of those seen"),
+        column("rows", DataType::Int64, false, "1", "Rows that readers see"),
+        column("runs", DataType::Int64, false, "1", "Runs whose rows readers see in it; 0 for tables of the rig"),
+        column("surface_id", DataType::Utf8, true, "", "Surface of its run; null unless it has one run"),
+        column("run_id", DataType::Utf8, true, "", "Its run; null unless it has one"),
+        column("version", DataType::Int64, false, "1", "Version of the table that added it"),
+    ])
+}
+
 #[async_trait]
 impl SystemRows for LakeFiles {
     fn schema(&self) -> SchemaRef {
-        schema([
-            column("table", DataType::Utf8, false, "", "Table that the file is of"),
-            column("path", DataType::Utf8, false, "", "Path of the file in the lake"),
-            column(
-                "bytes",
-                DataType::Int64,
-                false,
-                "B",
-                "Size; if it has rows of other projects, the share of those seen",
-            ),
-            column("rows", DataType::Int64, false, "1", "Rows that readers see"),
-            column("runs", DataType::Int64, false, "1", "Runs whose rows readers see in it; 0 for tables of the rig"),
-            column("surface_id", DataType::Utf8, true, "", "Surface of its run; null unless it has one run"),
-            column("run_id", DataType::Utf8, true, "", "Its run; null unless it has one"),
-            column("version", DataType::Int64, false, "1", "Version of the table that added it"),
-        ])
+        columns()
     }
 
     async fn rows(&self, _: &dyn Session) -> Result<RecordBatch> {

@@ -35,22 +35,21 @@ struct InboxFile {
     reason: Option<ObjectMeta>,
 }
 
+/// The columns of the table.
+pub(super) fn columns() -> SchemaRef {
+    schema([
+        column("state", DataType::Utf8, false, "", "waiting (for ingest), recording (not closed), or refused"),
+        column("path", DataType::Utf8, false, "", "Path of the file in the lake"),
+        column("bytes", DataType::Int64, false, "B", "Size"),
+        column("changed", time(), false, "", "Time of its last change, UTC"),
+        column("reason", DataType::Utf8, true, "", "Why ingest refused it, the first 4096 bytes; null if it did not"),
+    ])
+}
+
 #[async_trait]
 impl SystemRows for LakeInbox {
     fn schema(&self) -> SchemaRef {
-        schema([
-            column("state", DataType::Utf8, false, "", "waiting (for ingest), recording (not closed), or refused"),
-            column("path", DataType::Utf8, false, "", "Path of the file in the lake"),
-            column("bytes", DataType::Int64, false, "B", "Size"),
-            column("changed", time(), false, "", "Time of its last change, UTC"),
-            column(
-                "reason",
-                DataType::Utf8,
-                true,
-                "",
-                "Why ingest refused it, the first 4096 bytes; null if it did not",
-            ),
-        ])
+        columns()
     }
 
     async fn rows(&self, _: &dyn Session) -> Result<RecordBatch> {

@@ -28,16 +28,20 @@ pub(super) struct LakeIngests {
     pub(super) runs: Arc<dyn TableProvider>,
 }
 
+/// The columns of the table, by those of `runs`.
+pub(super) fn columns(runs: &SchemaRef) -> SchemaRef {
+    let own = [
+        column("version", DataType::Int64, true, "1", "Version of the lake in which the run has its present rows"),
+        column("ingested", time(), true, "", "Time of that version, UTC; null if the log no longer has it"),
+    ];
+    let of_runs = OF_RUNS.iter().filter_map(|name| runs.field_with_name(name).ok().cloned());
+    schema(own.into_iter().chain(of_runs))
+}
+
 #[async_trait]
 impl SystemRows for LakeIngests {
     fn schema(&self) -> SchemaRef {
-        let runs = self.runs.schema();
-        let own = [
-            column("version", DataType::Int64, true, "1", "Version of the lake in which the run has its present rows"),
-            column("ingested", time(), true, "", "Time of that version, UTC; null if the log no longer has it"),
-        ];
-        let of_runs = OF_RUNS.iter().filter_map(|name| runs.field_with_name(name).ok().cloned());
-        schema(own.into_iter().chain(of_runs))
+        columns(&self.runs.schema())
     }
 
     async fn rows(&self, session: &dyn Session) -> Result<RecordBatch> {

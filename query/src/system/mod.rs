@@ -35,8 +35,8 @@ use workers::ClusterWorkers;
 
 use crate::WorkerCluster;
 
-/// The schema of these tables.
-pub(crate) const SCHEMA: &str = "system";
+/// The schema of the system tables.
+pub const SYSTEM_SCHEMA: &str = "system";
 
 /// Computes the rows of a table when it is scanned.
 #[async_trait]
@@ -87,6 +87,32 @@ pub(crate) fn lake_tables(
         ("inbox", table(Box::new(LakeInbox { lake: lake.clone() }))),
         ("ingests", table(Box::new(LakeIngests { lake: lake.clone(), snapshot: snapshot.clone(), runs }))),
     ]
+}
+
+/// Returns the names and columns of the tables that every lake has; `runs` are the columns of its table of that name.
+pub(crate) fn lake_columns(runs: &SchemaRef) -> [(&'static str, SchemaRef); 4] {
+    [
+        ("versions", versions::columns()),
+        ("files", files::columns()),
+        ("inbox", inbox::columns()),
+        ("ingests", ingests::columns(runs)),
+    ]
+}
+
+/// Returns the meaning of a system table.
+pub(crate) fn meaning(name: &str) -> Option<&'static str> {
+    Some(match name {
+        "versions" => "One row per version of a table: time, operation, files and rows that came and went.",
+        "files" => "One row per data file of the snapshot: table, path, bytes, rows, surface and run.",
+        "inbox" => "One row per run file that is in no table yet: waiting, being recorded, or refused with a reason.",
+        "ingests" => {
+            "One row per run of the snapshot: the version of the lake that has its present rows, and its time."
+        }
+        "queries" => "One row per query of the server that runs, or ran lately: client, statement, times, outcome.",
+        "connections" => "One row per open connection to the server: client, protocol, address.",
+        "workers" => "One row per worker over which heavy queries are spread: address, state, figures.",
+        _ => return None,
+    })
 }
 
 /// The tables of an engine's program: those of its source, and the workers of its cluster.

@@ -19,31 +19,30 @@ pub(super) struct LakeVersions {
     pub(super) lake: Lake,
 }
 
+/// The columns of the table.
+pub(super) fn columns() -> SchemaRef {
+    schema([
+        column("table", DataType::Utf8, false, "", "The table"),
+        column("version", DataType::Int64, false, "1", "Version, for VERSION AS OF; the lake's is that of runs"),
+        column("committed", time(), false, "", "Time of its commit, UTC"),
+        column("operation", DataType::Utf8, true, "", "What the writer says it did"),
+        column("files_added", DataType::Int64, false, "1", "Files that came"),
+        column("files_removed", DataType::Int64, false, "1", "Files that went"),
+        column("rows_added", DataType::Int64, true, "1", "Rows of the files that came; null if a file does not say"),
+        column(
+            "rows_removed",
+            DataType::Int64,
+            true,
+            "1",
+            "Rows of the files that went; null if one of them is older than the log",
+        ),
+    ])
+}
+
 #[async_trait]
 impl SystemRows for LakeVersions {
     fn schema(&self) -> SchemaRef {
-        schema([
-            column("table", DataType::Utf8, false, "", "The table"),
-            column("version", DataType::Int64, false, "1", "Version, for VERSION AS OF; the lake's is that of runs"),
-            column("committed", time(), false, "", "Time of its commit, UTC"),
-            column("operation", DataType::Utf8, true, "", "What the writer says it did"),
-            column("files_added", DataType::Int64, false, "1", "Files that came"),
-            column("files_removed", DataType::Int64, false, "1", "Files that went"),
-            column(
-                "rows_added",
-                DataType::Int64,
-                true,
-                "1",
-                "Rows of the files that came; null if a file does not say",
-            ),
-            column(
-                "rows_removed",
-                DataType::Int64,
-                true,
-                "1",
-                "Rows of the files that went; null if one of them is older than the log",
-            ),
-        ])
+        columns()
     }
 
     async fn rows(&self, _: &dyn Session) -> Result<RecordBatch> {

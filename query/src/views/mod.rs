@@ -25,6 +25,8 @@ use echolake_lake::Lake;
 use echolake_schema::tables::{COMMENT, Table, UNIT};
 use futures::FutureExt as _;
 
+use crate::system::{self, SYSTEM_SCHEMA};
+
 pub(crate) use lookup::LookupFunctions;
 pub(crate) use pair_join::PairJoin;
 pub(crate) use sorted_nulls::SortedNulls;
@@ -58,6 +60,9 @@ type ColumnNotes = HashMap<String, HashMap<String, String>>;
 /// assert_eq!(echolake_query::table_meaning("postgres"), None);
 /// ```
 pub fn table_meaning(name: &str) -> Option<&'static str> {
+    if let Some((SYSTEM_SCHEMA, name)) = name.split_once('.') {
+        return system::meaning(name);
+    }
     Table::by_name(name).map(Table::meaning).or_else(|| LakeView::by_name(name).map(LakeView::meaning))
 }
 

@@ -24,7 +24,7 @@ use crate::fault::RequestFault;
 use crate::http::{FORWARDED_PROTO, MCP};
 use crate::metrics::ServerProtocol;
 use crate::request_span::begin_request;
-use crate::tokens::TokenAccess;
+use crate::token_access::TokenAccess;
 
 /// Name of the client.
 const AGENT: &str = "agent";
@@ -67,7 +67,7 @@ impl AgentDoor {
     pub fn new(lake: &Lake, engines: EngineSettings, pages: &str) -> Result<Self, Error> {
         let (scheme, host) = origin_headers(pages).ok_or_else(|| Error::Pages { found: pages.to_owned() })?;
         let activity = Arc::new(ServerActivity::new()?);
-        let engines = EnginePool::new(lake, engines, activity, Arc::new(TokenAccess::new(None)))?;
+        let engines = EnginePool::new(lake, engines, activity, Arc::new(TokenAccess::new(None, None)))?;
         // No page of elsewhere reaches standard input.
         let client = ClientIdentity { is_open: false, ..ClientIdentity::local(AGENT) };
         Ok(Self { route: Arc::new(AgentRoute { engines, client, host, scheme }) })
@@ -135,7 +135,7 @@ impl AgentRoute {
         let headers = request.headers_mut();
         headers.insert(header::HOST, self.host.clone());
         headers.insert(FORWARDED_PROTO, self.scheme.clone());
-        let (span, _) = begin_request(headers, ServerProtocol::Http);
+        let (span, _) = begin_request(headers, ServerProtocol::Mcp);
         let work = async {
             let response = self.engines.forward(&self.client, request, EngineProtocol::Http, None).await?;
             if response.status() == StatusCode::ACCEPTED {

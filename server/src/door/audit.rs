@@ -4,6 +4,7 @@
 use std::net::SocketAddr;
 
 use axum::http::{Method, StatusCode};
+use tokio_rustls::rustls::CertificateError;
 
 use crate::fault::FaultCode;
 use crate::metrics::ServerProtocol;
@@ -19,17 +20,31 @@ pub(super) fn record_refusal(peer: SocketAddr, protocol: ServerProtocol, code: F
     }
 }
 
+/// Writes a line about a client whose certificate was refused.
+pub(super) fn record_certificate(peer: SocketAddr, reason: &CertificateError) {
+    tracing::warn!(target: TARGET, %peer, %reason, "a client's certificate was refused");
+}
+
 /// Writes a line about a client that has shown its token on a connection.
 pub(super) fn record_login(peer: SocketAddr, protocol: ServerProtocol, client: &str) {
     tracing::info!(target: TARGET, %peer, protocol = protocol.name(), client, "a client has logged in");
 }
 
-/// Writes a line about a file that is handed out, if a path is one of files. `path` has no parameters: they may be texts of
-/// statements.
-pub(super) fn record_file(peer: SocketAddr, client: &str, method: &Method, path: &str, status: StatusCode) {
+/// An answer that may be a file.
+pub(super) struct HandedFile<'a> {
+    pub(super) client: &'a str,
+    /// Its path without parameters: they may be texts of statements.
+    pub(super) path: &'a str,
+    /// The runs of a slice.
+    pub(super) runs: Option<&'a str>,
+}
+
+/// Writes a line about a file that is handed out, if its path is one of files.
+pub(super) fn record_file(peer: SocketAddr, method: &Method, status: StatusCode, file: &HandedFile<'_>) {
+    let HandedFile { client, path, runs } = file;
     if is_file(path) && *method == Method::GET && status.is_success() {
         let status = status.as_u16();
-        tracing::info!(target: TARGET, %peer, client, path, status, "a file is handed out");
+        tracing::info!(target: TARGET, %peer, client, path, runs, status, "a file is handed out");
     }
 }
 

@@ -2,6 +2,8 @@
 
 use ring::digest;
 
+use super::der_element::DerElement;
+
 /// Object identifiers of signature algorithms: RSA's with a hash (PKCS #1), and elliptic curves' with one.
 const RSA: &[u8] = &[0x2a, 0x86, 0x48, 0x86, 0xf7, 0x0d, 0x01, 0x01];
 const ECDSA_SHA1: &[u8] = &[0x2a, 0x86, 0x48, 0xce, 0x3d, 0x04, 0x01];
@@ -9,11 +11,10 @@ const ECDSA: &[u8] = &[0x2a, 0x86, 0x48, 0xce, 0x3d, 0x04, 0x03];
 
 /// Returns the hash of a certificate (DER), by the hash of its own signature; None if that has none of its own.
 pub(super) fn certificate_hash(certificate: &[u8]) -> Option<Vec<u8>> {
-    let (content, _) = element(certificate)?;
-    let (_, rest) = element(content)?;
-    let (algorithm, _) = element(rest)?;
-    let (identifier, _) = element(algorithm)?;
-    let (last, family) = identifier.split_last()?;
+    let certified = DerElement::first(certificate)?.content;
+    let algorithm = DerElement::first(DerElement::first(certified)?.rest)?;
+    let identifier = DerElement::first(algorithm.content)?;
+    let (last, family) = identifier.content.split_last()?;
     let hash = match (family, last) {
         // MD5 and SHA-1 are replaced.
         (RSA, 4 | 5 | 11) | (ECDSA_SHA1, 1) | (ECDSA, 2) => &digest::SHA256,
@@ -24,31 +25,17 @@ pub(super) fn certificate_hash(certificate: &[u8]) -> Option<Vec<u8>> {
     Some(digest::digest(hash, certificate).as_ref().to_vec())
 }
 
-// The first element of DER, without its kind and length, and what follows it.
-fn element(der: &[u8]) -> Option<(&[u8], &[u8])> {
-    let (&[_, length], rest) = der.split_first_chunk()?;
-    let (bytes, rest) = match length {
-        0..=0x7f => (usize::from(length), rest),
-        0x81..=0x84 => {
-            let (length, rest) = rest.split_at_checked(usize::from(length & 0x7f))?;
-            (length.iter().fold(0, |bytes, byte| bytes << 8 | usize::from(*byte)), rest)
-        }
-        _ => return None,
-    };
-    rest.split_at_checked(bytes)
-}
-
 #[cfg(test)]
 mod tests {
     use tokio_rustls::rustls::pki_types::CertificateDer;
     use tokio_rustls::rustls::pki_types::pem::PemObject as _;
 
     use super::*;
-    use crate::certificate::self_signed;
+    use crate::certificate::{CertificateUse, self_signed};
 
     #[test]
     fn the_hash_is_that_of_the_signature() {
-        let made = self_signed(&["localhost".to_owned()]).expect("a certificate");
+        let made = self_signed(&["localhost".to_owned()], CertificateUse::Server).expect("a certificate");
         let der = CertificateDer::from_pem_slice(made.certificate.as_bytes()).expect("PEM");
         let expected = digest::digest(&digest::SHA256, &der);
         assert_eq!(certificate_hash(&der).as_deref(), Some(expected.as_ref()));

@@ -1,4 +1,5 @@
-//! TLS of all three protocols: a certificate and its key from files, which are read again when they change.
+//! TLS of all three protocols: the server's certificate and the authority of its clients', from files that are read again
+//! when they change.
 
 use std::io;
 use std::path::PathBuf;
@@ -7,15 +8,18 @@ use std::time::{Duration, SystemTime};
 
 use tokio_rustls::TlsAcceptor;
 use tokio_rustls::rustls::crypto::ring;
+use tokio_rustls::rustls::pki_types::PrivateKeyDer;
 use tokio_rustls::rustls::pki_types::pem::PemObject as _;
-use tokio_rustls::rustls::pki_types::{CertificateDer, PrivateKeyDer};
-use tokio_rustls::rustls::server::{ClientHello, ResolvesServerCert};
-use tokio_rustls::rustls::sign::CertifiedKey;
+use tokio_rustls::rustls::server::WebPkiClientVerifier;
+use tokio_rustls::rustls::server::danger::ClientCertVerifier;
+use tokio_rustls::rustls::sign::{CertifiedKey, SingleCertAndKey};
 use tokio_rustls::rustls::{self, ServerConfig};
 use tokio_rustls::server::TlsStream;
 use tokio_util::either::Either;
 
+use super::audit;
 use super::certificate_hash::certificate_hash;
+use super::client_certificate::{client_name, client_verifier, read_certificates};
 use super::connection_places::PlacedStream;
 use crate::Error;
 
@@ -27,17 +31,25 @@ const LOOK_EVERY: Duration = Duration::from_secs(2);
 /// A connection, encrypted or not.
 pub(super) type DoorStream = Either<PlacedStream, Box<TlsStream<PlacedStream>>>;
 
-/// A server's certificate and key, as PEM files.
+/// A server's certificate and key, and the authority of its clients' certificates, as PEM files.
 #[derive(Debug, Clone)]
 pub struct CertificateFiles {
     /// The certificate, then those of its issuers.
     pub certificate: PathBuf,
     /// Its private key.
     pub key: PathBuf,
+    /// The certificates of those who issue clients' certificates, and lists of revoked ones; None if clients have none.
+    pub client_ca: Option<PathBuf>,
 }
 
-/// Times of change and lengths of the two files.
-type FileStates = [Option<(SystemTime, u64)>; 2];
+/// Times of change and lengths of the files.
+type FileStates = Vec<Option<(SystemTime, u64)>>;
+
+/// The content of the files.
+struct LoadedCertificates {
+    server: Arc<CertifiedKey>,
+    clients: Option<Arc<dyn ClientCertVerifier>>,
+}
 
 impl CertificateFiles {
     /// Returns the folders that a process reads to take renewed files: those of the files, and of what they link to.
@@ -53,53 +65,39 @@ impl CertificateFiles {
     }
 
     fn states(&self) -> FileStates {
-        [&self.certificate, &self.key].map(|path| {
+        let state = |path: &PathBuf| {
             let about = std::fs::metadata(path).ok()?;
             Some((about.modified().ok()?, about.len()))
+        };
+        [&self.certificate, &self.key].into_iter().chain(&self.client_ca).map(state).collect()
+    }
+
+    fn load(&self) -> Result<LoadedCertificates, Error> {
+        Ok(LoadedCertificates {
+            server: Arc::new(self.load_key()?),
+            clients: self.client_ca.as_deref().map(client_verifier).transpose()?,
         })
     }
 
-    fn load(&self) -> Result<CertifiedKey, Error> {
-        type AnyError = Box<dyn std::error::Error + Send + Sync>;
-        let wrong = |path: &PathBuf, source: AnyError| Error::Certificate { path: path.clone(), source };
-        let of_certificate = |e: AnyError| wrong(&self.certificate, e);
-        let chain = CertificateDer::pem_file_iter(&self.certificate)
-            .and_then(Iterator::collect::<Result<Vec<_>, _>>)
-            .map_err(|e| of_certificate(e.into()))?;
-        if chain.is_empty() {
-            return Err(of_certificate("it has no `BEGIN CERTIFICATE`".into()));
-        }
-        let key = PrivateKeyDer::from_pem_file(&self.key).map_err(|e| wrong(&self.key, e.into()))?;
-        let key = ring::sign::any_supported_type(&key).map_err(|e| wrong(&self.key, e.into()))?;
+    fn load_key(&self) -> Result<CertifiedKey, Error> {
+        let wrong = |source| Error::Certificate { path: self.key.clone(), source };
+        let chain = read_certificates(&self.certificate)?;
+        let key = PrivateKeyDer::from_pem_file(&self.key).map_err(|e| wrong(e.into()))?;
+        let key = ring::sign::any_supported_type(&key).map_err(|e| wrong(e.into()))?;
         let certified = CertifiedKey::new(chain, key);
         match certified.keys_match() {
             // Some kinds of keys cannot be compared.
             Ok(()) | Err(rustls::Error::InconsistentKeys(rustls::InconsistentKeys::Unknown)) => Ok(certified),
-            Err(e) => Err(wrong(&self.key, e.into())),
+            Err(e) => Err(wrong(e.into())),
         }
-    }
-}
-
-/// The certificate in use.
-#[derive(Debug)]
-struct CurrentCertificate(RwLock<Arc<CertifiedKey>>);
-
-impl CurrentCertificate {
-    fn get(&self) -> Arc<CertifiedKey> {
-        self.0.read().unwrap_or_else(PoisonError::into_inner).clone()
-    }
-}
-
-impl ResolvesServerCert for CurrentCertificate {
-    fn resolve(&self, _: ClientHello<'_>) -> Option<Arc<CertifiedKey>> {
-        Some(self.get())
     }
 }
 
 /// Encryption of a server.
 pub(crate) struct ServerEncryption {
     files: CertificateFiles,
-    current: Arc<CurrentCertificate>,
+    loaded: LoadedCertificates,
+    protocols: Vec<Arc<RwLock<ProtocolTls>>>,
 }
 
 impl ServerEncryption {
@@ -108,34 +106,21 @@ impl ServerEncryption {
     /// # Errors
     /// [`Error::Certificate`].
     pub(crate) fn new(files: CertificateFiles) -> Result<Self, Error> {
-        let current = Arc::new(CurrentCertificate(RwLock::new(Arc::new(files.load()?))));
-        Ok(Self { files, current })
+        Ok(Self { loaded: files.load()?, files, protocols: Vec::new() })
     }
 
-    /// Returns the encryption of a protocol, which clients may name in the handshake.
+    /// Returns the encryption of a protocol, which clients may name in the handshake by one of these names.
     ///
     /// # Errors
     /// [`Error::System`].
-    pub(super) fn of_protocol(&self, name: &[u8]) -> Result<ProtocolEncryption, Error> {
-        Ok(ProtocolEncryption(Some((self.acceptor(name)?, self.current.clone()))))
+    pub(crate) fn of_protocol(&mut self, names: &'static [&'static [u8]]) -> Result<ProtocolEncryption, Error> {
+        let tls = ProtocolTls::new(names, &self.loaded).map_err(|e| Error::System(io::Error::other(e)))?;
+        let tls = Arc::new(RwLock::new(tls));
+        self.protocols.push(tls.clone());
+        Ok(ProtocolEncryption(Some(tls)))
     }
 
-    /// Returns what shakes hands with clients of a protocol.
-    ///
-    /// # Errors
-    /// [`Error::System`].
-    pub(crate) fn acceptor(&self, name: &[u8]) -> Result<TlsAcceptor, Error> {
-        let failed = |e: rustls::Error| Error::System(io::Error::other(e));
-        let mut config = ServerConfig::builder_with_provider(Arc::new(ring::default_provider()))
-            .with_protocol_versions(&[&rustls::version::TLS13, &rustls::version::TLS12])
-            .map_err(failed)?
-            .with_no_client_auth()
-            .with_cert_resolver(self.current.clone());
-        config.alpn_protocols = vec![name.to_vec()];
-        Ok(TlsAcceptor::from(Arc::new(config)))
-    }
-
-    /// Takes changed files for new connections; open ones keep the certificate with which they began. Never ends.
+    /// Takes changed files for new connections; open ones keep what they began with. Never ends.
     pub(crate) async fn keep_up(self) {
         let mut known = self.files.states();
         loop {
@@ -145,21 +130,50 @@ impl ServerEncryption {
                 continue;
             }
             match self.files.load() {
-                Ok(certified) => {
-                    *self.current.0.write().unwrap_or_else(PoisonError::into_inner) = Arc::new(certified);
-                    tracing::info!("the certificate was renewed");
-                }
-                // One of the two may be still to come.
-                Err(e) => tracing::warn!(error = &e as &dyn std::error::Error, "the old certificate stays in use"),
+                Ok(loaded) => self.renew(&loaded),
+                // One of them may be still to come.
+                Err(e) => tracing::warn!(error = &e as &dyn std::error::Error, "the old certificates stay in use"),
             }
             known = states;
         }
+    }
+
+    // Sessions that began with the old files are not resumed: a client's certificate may be revoked by now.
+    fn renew(&self, loaded: &LoadedCertificates) {
+        for protocol in &self.protocols {
+            let names = protocol.read().unwrap_or_else(PoisonError::into_inner).names;
+            match ProtocolTls::new(names, loaded) {
+                Ok(tls) => *protocol.write().unwrap_or_else(PoisonError::into_inner) = tls,
+                Err(e) => tracing::error!(error = &e as &dyn std::error::Error, "a certificate cannot be used"),
+            }
+        }
+        tracing::info!("the certificates were read again");
+    }
+}
+
+/// The settings of one protocol.
+struct ProtocolTls {
+    names: &'static [&'static [u8]],
+    acceptor: TlsAcceptor,
+    certificate: Arc<CertifiedKey>,
+}
+
+impl ProtocolTls {
+    fn new(names: &'static [&'static [u8]], loaded: &LoadedCertificates) -> Result<Self, rustls::Error> {
+        let clients = loaded.clients.clone().unwrap_or_else(WebPkiClientVerifier::no_client_auth);
+        let certificate = loaded.server.clone();
+        let mut config = ServerConfig::builder_with_provider(Arc::new(ring::default_provider()))
+            .with_protocol_versions(&[&rustls::version::TLS13, &rustls::version::TLS12])?
+            .with_client_cert_verifier(clients)
+            .with_cert_resolver(Arc::new(SingleCertAndKey::from(certificate.clone())));
+        config.alpn_protocols = names.iter().map(|name| name.to_vec()).collect();
+        Ok(Self { names, acceptor: TlsAcceptor::from(Arc::new(config)), certificate })
     }
 }
 
 /// Encryption of one protocol's connections, or none.
 #[derive(Clone, Default)]
-pub(super) struct ProtocolEncryption(Option<(TlsAcceptor, Arc<CurrentCertificate>)>);
+pub(crate) struct ProtocolEncryption(Option<Arc<RwLock<ProtocolTls>>>);
 
 impl ProtocolEncryption {
     /// Returns whether connections are encrypted.
@@ -167,26 +181,51 @@ impl ProtocolEncryption {
         self.0.is_some()
     }
 
+    /// Returns what shakes hands with the next client; None if connections are not encrypted.
+    pub(crate) fn acceptor(&self) -> Option<TlsAcceptor> {
+        let tls = self.0.as_ref()?.read().unwrap_or_else(PoisonError::into_inner);
+        Some(tls.acceptor.clone())
+    }
+
     /// Returns the hash of the certificate by which logins are bound to it.
     pub(super) fn certificate_hash(&self) -> Option<Vec<u8>> {
-        let (_, current) = self.0.as_ref()?;
-        certificate_hash(current.get().cert.first()?)
+        let tls = self.0.as_ref()?.read().unwrap_or_else(PoisonError::into_inner);
+        certificate_hash(tls.certificate.cert.first()?)
     }
 
     /// Shakes hands with a client, if connections are encrypted; None if that fails, or takes too long.
     pub(super) async fn accept(&self, stream: PlacedStream) -> Option<DoorStream> {
-        let Some((acceptor, _)) = &self.0 else { return Some(Either::Left(stream)) };
-        let evicted = stream.evicted();
+        let Some(acceptor) = self.acceptor() else { return Some(Either::Left(stream)) };
+        let (evicted, peer) = (stream.evicted(), stream.work().peer());
         tokio::select! {
             shaken = tokio::time::timeout(HANDSHAKE, acceptor.accept(stream)) => match shaken {
                 Ok(Ok(encrypted)) => Some(Either::Right(Box::new(encrypted))),
                 Ok(Err(e)) => {
-                    tracing::debug!(error = &e as &dyn std::error::Error, "a handshake failed");
+                    match e.get_ref().and_then(|inner| inner.downcast_ref()) {
+                        Some(rustls::Error::InvalidCertificate(reason)) => audit::record_certificate(peer, reason),
+                        _ => tracing::debug!(error = &e as &dyn std::error::Error, "a handshake failed"),
+                    }
                     None
                 }
                 Err(_) => None,
             },
             () = evicted => None,
         }
+    }
+}
+
+/// Returns the protocol that was agreed on in the handshake, if there was one.
+pub(super) fn agreed_protocol(stream: &DoorStream) -> Option<&[u8]> {
+    match stream {
+        Either::Left(_) => None,
+        Either::Right(encrypted) => encrypted.get_ref().1.alpn_protocol(),
+    }
+}
+
+/// Returns the name in the certificate that the client has shown, if it has.
+pub(super) fn certificate_name(stream: &DoorStream) -> Option<String> {
+    match stream {
+        Either::Left(_) => None,
+        Either::Right(encrypted) => client_name(encrypted.get_ref().1.peer_certificates()?.first()?),
     }
 }

@@ -17,7 +17,7 @@ use crate::client_identity::ClientIdentity;
 use crate::engine::door_message::DoorMessage;
 use crate::fault::RequestFault;
 use crate::metrics::{DiskSpace, PoolGauges};
-use crate::tokens::TokenAccess;
+use crate::token_access::TokenAccess;
 
 /// Time without a request after which an engine ends.
 const IDLE: Duration = Duration::from_secs(300);
@@ -358,12 +358,12 @@ impl EnginePool {
 
 impl ClientEngine {
     fn lease(&self, client: &ClientIdentity) -> Option<EngineLease> {
-        lock(&self.current).as_ref().filter(|engine| engine.sees_projects_of(client)).and_then(EngineProcess::lease)
+        lock(&self.current).as_ref().filter(|engine| engine.is_of(client)).and_then(EngineProcess::lease)
     }
 
-    // An engine sees the same projects all its life.
+    // An engine knows what its client may do from its start.
     fn end_outdated(&self, client: &ClientIdentity) {
-        if let Some(engine) = lock(&self.current).as_ref().filter(|engine| !engine.sees_projects_of(client)) {
+        if let Some(engine) = lock(&self.current).as_ref().filter(|engine| !engine.is_of(client)) {
             engine.end(EndReason::Retired);
         }
     }

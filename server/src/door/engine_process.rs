@@ -173,9 +173,9 @@ impl EngineProcess {
         self.send(&DoorMessage::Client(client.clone())).await.map_err(failed)
     }
 
-    /// Returns whether it sees the projects that a client may see.
-    pub(super) fn sees_projects_of(&self, client: &ClientIdentity) -> bool {
-        self.client.get().is_some_and(|own| own.projects == client.projects)
+    /// Returns whether it is the engine of a client who may do just this.
+    pub(super) fn is_of(&self, client: &ClientIdentity) -> bool {
+        self.client.get().is_some_and(|own| own == client)
     }
 
     /// Sends it a message.

@@ -1,35 +1,30 @@
 //! Flight SQL connections of the door: HTTP/2, whose requests are forwarded to the client's engine.
 
 use std::convert::Infallible;
-use std::pin::pin;
-use std::time::Duration;
 
 use axum::body::Body;
 use axum::http::{Request, Response, header};
 use hyper::body::Incoming;
-use hyper::server::conn::http2;
 use hyper::service::service_fn;
-use hyper_util::rt::{TokioExecutor, TokioIo, TokioTimer};
+use hyper_util::rt::TokioIo;
 use tokio::net::TcpListener;
 use tracing::Instrument as _;
 
 use super::connection_places::{ConnectionPlaces, PlaceWork, PlacedStream};
 use super::encryption::ProtocolEncryption;
 use super::forward::EngineProtocol;
+use super::http_connection::{client_certificate, drive, http2_builder};
 use crate::client_identity::ClientIdentity;
 use crate::door::server_door::ServerDoor;
 use crate::fault::RequestFault;
 use crate::flight::{WINDOW_BYTES, status};
+use crate::http::CertificateName;
 use crate::metrics::ServerProtocol;
 use crate::request_span::{REQUEST_ID, begin_request};
 use crate::tokens::of_header;
 
 /// Connections at once. With those of the other protocols they are within the 1024 files that systems often allow.
 const MOST: usize = 128;
-/// Silence after which a client is asked whether it still lives; its queries end when it does not.
-const KEEPALIVE: Duration = Duration::from_secs(20);
-/// Requests of one connection at once.
-const STREAMS: u32 = 64;
 /// Methods whose clients may wait for an answer before they end their request.
 const INTERACTIVE: [&str; 3] = ["DoPut", "DoExchange", "Handshake"];
 
@@ -43,15 +38,14 @@ async fn answer(stream: PlacedStream, encryption: ProtocolEncryption, door: Serv
     let evicted = stream.evicted();
     let work = stream.work();
     let Some(stream) = encryption.accept(stream).await else { return };
-    let drain = door.drain().clone();
-    let awaited = drain.enter();
-    let place = work.clone();
+    let certificate = client_certificate(&stream);
+    let (drain, place) = (door.drain().clone(), work.clone());
     let service = service_fn(move |mut request: Request<Incoming>| {
         work.hear_request();
-        let (door, work) = (door.clone(), work.clone());
+        let (door, work, certificate) = (door.clone(), work.clone(), certificate.clone());
         let (span, id) = begin_request(request.headers_mut(), ServerProtocol::FlightSql);
         let answer = async move {
-            let mut response = door.answer_flight(request, &work).await.unwrap_or_else(|fault| {
+            let mut response = door.answer_flight(request, &certificate, &work).await.unwrap_or_else(|fault| {
                 door.metrics().record_failure(&fault);
                 status(&fault).into_http()
             });
@@ -60,30 +54,16 @@ async fn answer(stream: PlacedStream, encryption: ProtocolEncryption, door: Serv
         };
         answer.instrument(span)
     });
-    let connection = http2::Builder::new(TokioExecutor::new())
-        .timer(TokioTimer::new())
-        .keep_alive_interval(KEEPALIVE)
-        .max_concurrent_streams(STREAMS)
-        .initial_stream_window_size(WINDOW_BYTES)
-        .serve_connection(TokioIo::new(stream), service);
-    let mut connection = pin!(connection);
-    // A connection that breaks off is its client's matter.
-    tokio::select! {
-        _ = connection.as_mut() => return,
-        () = evicted => return,
-        // One that comes later may ask, and is told that nothing is taken.
-        () = drain.begun(), if awaited.is_some() => connection.as_mut().graceful_shutdown(),
-    }
-    tokio::select! {
-        _ = connection => {}
-        () = place.quiet() => {}
-    }
+    let mut builder = http2_builder();
+    let connection = builder.initial_stream_window_size(WINDOW_BYTES).serve_connection(TokioIo::new(stream), service);
+    drive(connection, |connection| connection.graceful_shutdown(), evicted, &drain, &place).await;
 }
 
 impl ServerDoor {
     async fn answer_flight(
         &self,
         request: Request<Incoming>,
+        certificate: &CertificateName,
         work: &PlaceWork,
     ) -> Result<Response<Body>, RequestFault> {
         if self.drain().is_begun() {
@@ -91,7 +71,12 @@ impl ServerDoor {
         }
         let token = request.headers().get(header::AUTHORIZATION).and_then(|v| v.to_str().ok()).and_then(of_header);
         self.failed_logins().check(work.peer())?;
-        let found = self.access().client(token.as_deref(), ClientIdentity::programs);
+        self.access().await_key(token.as_deref()).await;
+        let certified = certificate.0.as_deref().filter(|_| token.is_none());
+        let found = match certified.and_then(|name| self.access().certified_client(name)) {
+            Some(client) => Ok(client),
+            None => self.access().client(token.as_deref(), ClientIdentity::programs),
+        };
         if let (Some(_), Err(RequestFault::Unauthenticated)) = (&token, &found) {
             self.failed_logins().count(work.peer());
         }

@@ -1,6 +1,5 @@
 //! HTTP connections of the door: so many at once, each of which must say what it wants in time.
 
-use std::pin::pin;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
@@ -18,15 +17,19 @@ use hyper_util::service::TowerToHyperService;
 use tokio::net::TcpListener;
 use tracing::Instrument as _;
 
-use super::audit;
+use super::audit::{self, HandedFile};
 use super::connection_places::{ConnectionPlaces, PlaceWork, PlacedStream};
 use super::drain::ServerDrain;
-use super::encryption::ProtocolEncryption;
+use super::encryption::{ProtocolEncryption, agreed_protocol};
 use super::forward::EngineProtocol;
+use super::http_connection::{HTTP_2, client_certificate, drive, http2_builder, restate};
 use crate::client_identity::ClientIdentity;
 use crate::door::server_door::ServerDoor;
 use crate::fault::{FaultCode, RequestFault};
-use crate::http::{FORWARDED_PROTO, ProblemResponse, RequestSite, authenticate, door_router, request_site};
+use crate::http::{
+    CertificateName, FORWARDED_PROTO, ProblemResponse, RequestSite, SLICED_RUNS, authenticate, door_router,
+    request_site,
+};
 use crate::metrics::ServerProtocol;
 use crate::request_span::{REQUEST_ID, begin_request};
 use crate::signed_address::{SIGNED_FILES, SignedAddress};
@@ -49,32 +52,27 @@ async fn answer(stream: PlacedStream, encryption: ProtocolEncryption, router: Ro
     let evicted = stream.evicted();
     let work = stream.work();
     let Some(stream) = encryption.accept(stream).await else { return };
-    let awaited = drain.enter();
+    let (certificate, is_http2) = (client_certificate(&stream), agreed_protocol(&stream) == Some(HTTP_2));
     let place = work.clone();
     let answers = TowerToHyperService::new(router);
     let service = service_fn(move |mut request: hyper::Request<Incoming>| {
         work.hear_request();
+        restate(&mut request);
         if encryption.is_on() {
             request.headers_mut().insert(FORWARDED_PROTO, HeaderValue::from_static("https"));
         }
         request.extensions_mut().insert(work.clone());
+        request.extensions_mut().insert(certificate.clone());
         answers.call(request)
     });
-    let connection = http1::Builder::new()
-        .timer(TokioTimer::new())
-        .header_read_timeout(HEAD)
-        .serve_connection(TokioIo::new(stream), service);
-    let mut connection = pin!(connection);
-    // A connection that breaks off is its client's matter.
-    tokio::select! {
-        _ = connection.as_mut() => return,
-        () = evicted => return,
-        // One that comes later may ask, and is told that nothing is taken.
-        () = drain.begun(), if awaited.is_some() => connection.as_mut().graceful_shutdown(),
-    }
-    tokio::select! {
-        _ = connection => {}
-        () = place.quiet() => {}
+    let stream = TokioIo::new(stream);
+    if is_http2 {
+        let connection = http2_builder().serve_connection(stream, service);
+        drive(connection, |connection| connection.graceful_shutdown(), evicted, &drain, &place).await;
+    } else {
+        let mut builder = http1::Builder::new();
+        let connection = builder.timer(TokioTimer::new()).header_read_timeout(HEAD).serve_connection(stream, service);
+        drive(connection, |connection| connection.graceful_shutdown(), evicted, &drain, &place).await;
     }
 }
 
@@ -125,13 +123,15 @@ impl ServerDoor {
 
     async fn answer_http(&self, request: Request) -> Result<Response, RequestFault> {
         let work = request.extensions().get::<PlaceWork>().cloned().ok_or(RequestFault::Internal)?;
-        let local = || match request_site(request.uri(), request.headers()) {
+        let site = request_site(request.uri(), request.headers());
+        let local = || match site {
             RequestSite::Foreign => ClientIdentity::foreign(),
             RequestSite::OwnPage => ClientIdentity::pages(),
             RequestSite::Program => ClientIdentity::programs(),
         };
         // A refusal is noted with those of the other routes.
-        let client = authenticate(self.access(), request.headers(), local)?;
+        let certificate = request.extensions().get::<CertificateName>().cloned().unwrap_or_default();
+        let client = authenticate(self.access(), request.headers(), &certificate, local).await?;
         let path = request.uri().path().to_owned();
         self.answer_client(client, request, &path, &work).await
     }
@@ -162,9 +162,12 @@ impl ServerDoor {
         let client = self.note_client(work, ServerProtocol::Http, Ok(client))?;
         self.signing().key_of(&client).send(request.headers_mut());
         let method = request.method().clone();
-        let response = self.engines().forward(&client, request, EngineProtocol::Http, Some(work)).await?;
+        let mut response = self.engines().forward(&client, request, EngineProtocol::Http, Some(work)).await?;
+        let runs = response.headers_mut().remove(SLICED_RUNS);
         if !self.access().is_open() {
-            audit::record_file(work.peer(), &client.name, &method, path, response.status());
+            let runs = runs.as_ref().and_then(|runs| runs.to_str().ok());
+            let file = HandedFile { client: &client.name, path, runs };
+            audit::record_file(work.peer(), &method, response.status(), &file);
         }
         Ok(response.map(Body::new))
     }

@@ -4,7 +4,9 @@
 mod agent;
 mod audit;
 mod certificate_hash;
+mod client_certificate;
 pub(crate) mod connection_places;
+mod der_element;
 pub(crate) mod drain;
 mod encryption;
 mod engine_pool;
@@ -13,12 +15,14 @@ mod failed_logins;
 mod flight;
 mod forward;
 mod http;
+mod http_connection;
 mod postgres;
 mod readiness;
 pub(crate) mod server_door;
 mod temp_folder;
 
 use std::net::SocketAddr;
+use std::sync::Arc;
 use std::time::Duration;
 
 use echolake_lake::Lake;
@@ -26,12 +30,14 @@ use tokio::net::{TcpListener, TcpSocket};
 use tokio::task::JoinSet;
 
 use crate::Error;
-use crate::tokens::TokenFile;
+use crate::oidc::{IdentityProvider, OidcSettings};
+use crate::token_access::TokenAccess;
+use crate::tokens::{OtherLogins, TokenFile};
 pub use agent::AgentDoor;
 pub use encryption::CertificateFiles;
-use encryption::ProtocolEncryption;
-pub(crate) use encryption::ServerEncryption;
+pub(crate) use encryption::{ProtocolEncryption, ServerEncryption};
 pub use engine_process::EngineSettings;
+use http_connection::HTTP_2;
 use server_door::ServerDoor;
 
 /// Bytes that the system keeps for a connection until they are read, and connections until they are accepted.
@@ -48,6 +54,8 @@ pub struct ServerSettings {
     pub postgres: Option<SocketAddr>,
     /// The accepted tokens; None for open access, on loopback only.
     pub tokens: Option<TokenFile>,
+    /// The identity provider whose users may log in; their groups are in the file of tokens.
+    pub oidc: Option<OidcSettings>,
     /// The certificate with which connections are encrypted; None for plain text.
     pub certificate: Option<CertificateFiles>,
     /// True if plain text may leave this machine, because a proxy encrypts it.
@@ -65,6 +73,7 @@ pub struct LakeServer {
     flight_sql: Option<TcpListener>,
     postgres: Option<TcpListener>,
     encryption: Option<ServerEncryption>,
+    provider: Option<Arc<IdentityProvider>>,
     drain_limit: Duration,
 }
 
@@ -72,7 +81,8 @@ impl LakeServer {
     /// Listens.
     ///
     /// # Errors
-    /// [`Error::Open`], [`Error::PlainText`], [`Error::Certificate`], [`Error::Bind`], [`Error::Temp`].
+    /// [`Error::Open`], [`Error::PlainText`], [`Error::Tokens`], [`Error::Oidc`], [`Error::Certificate`], [`Error::Bind`],
+    /// [`Error::Temp`].
     pub fn bind(lake: &Lake, settings: ServerSettings) -> Result<Self, Error> {
         let addresses = [settings.http, settings.flight_sql, settings.postgres];
         if let Some(address) = addresses.into_iter().flatten().find(|a| !a.ip().is_loopback()) {
@@ -83,9 +93,15 @@ impl LakeServer {
                 return Err(Error::PlainText { address });
             }
         }
+        let by_certificate = settings.certificate.as_ref().is_some_and(|files| files.client_ca.is_some());
+        let other_logins = OtherLogins { by_certificate, by_oidc: settings.oidc.is_some() };
+        settings.tokens.as_ref().map_or(Ok(()), |tokens| tokens.check_logins(other_logins))?;
+        let provider = settings.oidc.map(IdentityProvider::new).transpose()?;
+        let access = Arc::new(TokenAccess::new(settings.tokens, provider.clone()));
         Ok(Self {
             encryption: settings.certificate.map(ServerEncryption::new).transpose()?,
-            door: ServerDoor::new(lake, settings.tokens, settings.is_behind_proxy, settings.engines)?,
+            door: ServerDoor::new(lake, access, settings.is_behind_proxy, settings.engines)?,
+            provider,
             http: listen(settings.http)?,
             flight_sql: listen(settings.flight_sql)?,
             postgres: listen(settings.postgres)?,
@@ -118,13 +134,18 @@ impl LakeServer {
         let mut upkeep = JoinSet::new();
         upkeep.spawn(self.door.engines().clone().keep_up());
         upkeep.spawn(self.door.clone().watch_tokens());
-        let encrypted = |name: &[u8]| match &self.encryption {
-            Some(encryption) => encryption.of_protocol(name),
+        if let Some(provider) = self.provider {
+            upkeep.spawn(provider.keep_up());
+        }
+        let mut encryption = self.encryption;
+        let mut encrypted = |names| match &mut encryption {
+            Some(encryption) => encryption.of_protocol(names),
             None => Ok(ProtocolEncryption::default()),
         };
-        let (http_tls, flight_tls, postgres_tls) =
-            (encrypted(b"http/1.1")?, encrypted(b"h2")?, encrypted(b"postgresql")?);
-        if let Some(encryption) = self.encryption {
+        let http_tls = encrypted(&[HTTP_2, b"http/1.1"])?;
+        let flight_tls = encrypted(&[HTTP_2])?;
+        let postgres_tls = encrypted(&[b"postgresql"])?;
+        if let Some(encryption) = encryption {
             upkeep.spawn(encryption.keep_up());
         }
         if let Some(listener) = self.http {

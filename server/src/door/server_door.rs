@@ -19,7 +19,8 @@ use crate::fault::RequestFault;
 use crate::http::ViewerLayout;
 use crate::metrics::{ServerGauges, ServerMetrics, ServerProtocol};
 use crate::signed_address::SigningSecret;
-use crate::tokens::{TokenAccess, TokenFile, TokenFileState, TokenScope};
+use crate::token_access::{TokenAccess, TokenFileState};
+use crate::tokens::TokenScope;
 
 /// Time between two looks at the file of tokens.
 const LOOK_EVERY: Duration = Duration::from_secs(1);
@@ -46,13 +47,12 @@ impl ServerDoor {
     /// [`Error::Temp`], [`Error::Random`].
     pub(super) fn new(
         lake: &Lake,
-        tokens: Option<TokenFile>,
+        access: Arc<TokenAccess>,
         is_behind_proxy: bool,
         settings: EngineSettings,
     ) -> Result<Self, Error> {
-        let failed_logins = FailedLogins::new(tokens.is_some() && !is_behind_proxy);
+        let failed_logins = FailedLogins::new(!access.is_open() && !is_behind_proxy);
         let activity = Arc::new(ServerActivity::new()?);
-        let access = Arc::new(TokenAccess::new(tokens));
         let engines = EnginePool::new(lake, settings, activity.clone(), access.clone())?;
         let layout = ViewerLayout::new(lake.rig());
         let (readiness, drain) = (ReadinessCheck::new(lake), ServerDrain::default());
@@ -108,9 +108,7 @@ impl ServerDoor {
         let mut ended = Vec::new();
         loop {
             let gone = self.0.access.renew(&mut known);
-            gone.iter().for_each(|client| {
-                tracing::warn!(client, "its token was taken back, has expired, or sees other projects now")
-            });
+            gone.iter().for_each(|client| tracing::warn!(client, "it may no longer ask, or may do other things now"));
             // Those of the last look again: a request may have begun between its check and its engine's end.
             ended.iter().chain(&gone).for_each(|client: &String| self.0.engines.end_client(client));
             ended = gone;

@@ -23,7 +23,7 @@ use arrow_flight::{
 };
 use bytes::Bytes;
 use datafusion::common::{ParamValues, ScalarValue};
-use echolake_query::{EngineClient, Error as QueryError, PreparedQuery, Session};
+use echolake_query::{EngineClient, Error as QueryError, PreparedQuery, SYSTEM_SCHEMA, Session};
 use futures::{Stream, StreamExt as _, stream};
 use prost::Message as _;
 use tonic::metadata::MetadataValue;
@@ -322,6 +322,7 @@ impl FlightSqlService for LakeFlightService {
         self.client()?;
         let mut schemas = query.into_builder();
         schemas.append(CATALOG, SCHEMA);
+        schemas.append(CATALOG, SYSTEM_SCHEMA);
         answer::batch(schemas.build())
     }
 
@@ -341,8 +342,10 @@ impl FlightSqlService for LakeFlightService {
     ) -> Result<Response<<Self as FlightService>::DoGetStream>, Status> {
         self.client()?;
         let mut tables = query.into_builder();
-        for (name, schema) in self.service.tables() {
-            tables.append(CATALOG, SCHEMA, name, TABLE, &schema).map_err(|e| Status::internal(e.to_string()))?;
+        let own = self.service.tables().into_iter().map(|table| (SCHEMA, table));
+        let system = self.service.system_tables().into_iter().map(|table| (SYSTEM_SCHEMA, table));
+        for (of, (name, schema)) in own.chain(system) {
+            tables.append(CATALOG, of, name, TABLE, &schema).map_err(|e| Status::internal(e.to_string()))?;
         }
         answer::batch(tables.build())
     }

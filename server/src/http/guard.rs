@@ -2,6 +2,7 @@
 //! browser lets every page of the web send requests to loopback, and a name that its owner points there (DNS rebinding)
 //! lets it read the answers too; so without tokens `Host` and `Origin` must be this machine's.
 
+use std::convert::Infallible;
 use std::net::IpAddr;
 use std::sync::Arc;
 
@@ -18,7 +19,8 @@ use super::ranges::POLICY;
 use crate::client_identity::ClientIdentity;
 use crate::fault::RequestFault;
 use crate::service::QueryService;
-use crate::tokens::{TokenAccess, TokenScope, of_header};
+use crate::token_access::TokenAccess;
+use crate::tokens::{TokenScope, of_header};
 
 /// Scheme of a client's connection: set by this server if it encrypts, else by a proxy that does.
 pub(crate) const FORWARDED_PROTO: HeaderName = HeaderName::from_static("x-forwarded-proto");
@@ -32,21 +34,40 @@ pub(super) struct MayQuery(pub(super) Arc<EngineClient>);
 /// The cookie of a browser's session.
 pub(super) const COOKIE: &str = "echolake";
 
-/// Authenticates a client by token or by session; `local` makes the client of a server that has no tokens.
+/// The name in the certificate that the client of a connection has shown; None if it has shown none. An extension of its
+/// requests.
+#[derive(Debug, Clone, Default)]
+pub(crate) struct CertificateName(pub(crate) Option<Arc<str>>);
+
+impl<S: Send + Sync> FromRequestParts<S> for CertificateName {
+    type Rejection = Infallible;
+
+    async fn from_request_parts(parts: &mut Parts, _: &S) -> Result<Self, Infallible> {
+        Ok(parts.extensions.get::<Self>().cloned().unwrap_or_default())
+    }
+}
+
+/// Authenticates a client by token, by session or by certificate; `local` makes the client of a server that has no tokens.
 ///
 /// # Errors
 /// [`RequestFault::Unauthenticated`], [`RequestFault::Foreign`].
-pub(crate) fn authenticate(
+pub(crate) async fn authenticate(
     access: &TokenAccess,
     headers: &HeaderMap,
-    local: impl FnOnce() -> ClientIdentity,
+    certificate: &CertificateName,
+    local: impl Fn() -> ClientIdentity,
 ) -> Result<Arc<ClientIdentity>, RequestFault> {
     let token = headers.get(header::AUTHORIZATION).and_then(|v| v.to_str().ok()).and_then(of_header);
-    match (token, cookie(headers)) {
-        // A browser sends the cookie along whichever page of this machine asks, on whatever port it was served.
-        (None, Some(secret)) => is_same_origin(headers).and_then(|()| access.client_of_session(secret, local)),
-        (token, _) => access.client(token.as_deref(), local),
+    if token.is_some() || access.is_open() {
+        access.await_key(token.as_deref()).await;
+        return access.client(token.as_deref(), local);
     }
+    let session = cookie(headers).and_then(|secret| access.client_of_session(secret, &local).ok());
+    let certified = || certificate.0.as_deref().and_then(|name| access.certified_client(name));
+    let client = session.or_else(certified).ok_or(RequestFault::Unauthenticated)?;
+    // A browser sends cookies and certificates along whichever page asks.
+    is_same_origin(headers)?;
+    Ok(client)
 }
 
 /// The origin of a request, according to its headers.

@@ -16,6 +16,7 @@ mod pages;
 mod problem;
 mod queries;
 mod ranges;
+mod request_protocol;
 mod session;
 mod sharing;
 mod slices;
@@ -36,15 +37,18 @@ use utoipa_axum::routes;
 use crate::Error;
 use crate::door::server_door::ServerDoor;
 use crate::fault::RequestFault;
+use crate::metrics::ServerProtocol;
 use crate::request_span::trace_request;
 use crate::service::QueryService;
 use crate::signed_address::SIGNED_ROUTE;
 use catalogue::LakeCatalogue;
-pub(crate) use guard::{FORWARDED_PROTO, RequestSite, authenticate, request_site};
+pub(crate) use guard::{CertificateName, FORWARDED_PROTO, RequestSite, authenticate, request_site};
 pub(crate) use layout::ViewerLayout;
 pub(crate) use mcp::MCP;
 pub(crate) use problem::ProblemResponse;
+pub(crate) use request_protocol::request_protocol;
 use sharing::SHARING;
+pub(crate) use slices::SLICED_RUNS;
 use slices::SliceService;
 
 /// Answers HTTP on an engine's socket; a connection is one request.
@@ -70,18 +74,22 @@ fn engine_router(service: &QueryService) -> Router {
         .with_state(service.clone())
         .merge(catalogue.router())
         .merge(Router::from(files).with_state(catalogue.clone()))
-        .merge(mcp::routes(&catalogue, &slices))
-        .merge(sharing::routes(&catalogue, &slices))
+        .merge(of_protocol(ServerProtocol::Mcp, mcp::routes(&catalogue, &slices)))
+        .merge(of_protocol(ServerProtocol::Sharing, sharing::routes(&catalogue, &slices)))
         .layer(from_fn_with_state(service.is_open(), guard::own_pages_only));
     let viewers = Router::from(files::viewer_routes()).with_state(catalogue.clone());
     let all = own.merge(viewers).merge(slices::for_viewers(slices)).fallback(nothing);
     with_refusals(all).layer(from_fn(trace_request))
 }
 
+fn of_protocol(protocol: ServerProtocol, routes: Router) -> Router {
+    routes.layer(from_fn_with_state(protocol, request_protocol::set_protocol))
+}
+
 /// The paths of the server: those of the door, and those that it forwards to the client's engine.
 pub(crate) fn door_router(door: &ServerDoor) -> Router {
     let own = Router::from(door_routes()).layer(from_fn_with_state(door.access().is_open(), guard::own_pages_only));
-    let viewers = [files::RUN, slices::SLICE, slices::SOFA, slices::FOXGLOVE_MANIFEST];
+    let viewers = [files::RUN, slices::SLICE, slices::SOFA, slices::FOXGLOVE_MANIFEST, slices::LICHTBLICK_SESSION];
     // Here and not for all routes: a preflight must come to the layer.
     let viewers =
         viewers.into_iter().fold(Router::new(), |router, path| router.route(path, any(ServerDoor::forward_http)));

@@ -13,6 +13,7 @@ use crate::fault::RequestFault;
 
 /// The header that says which origins may embed an answer.
 pub(super) const POLICY: HeaderName = HeaderName::from_static("cross-origin-resource-policy");
+const API_VERSION: HeaderName = HeaderName::from_static("api-version");
 const FETCH_MODE: HeaderName = HeaderName::from_static("sec-fetch-mode");
 
 /// The CORS headers of routes that other origins may read: from anywhere, without credentials, with what ranges need.
@@ -20,7 +21,15 @@ pub(super) fn cors() -> CorsLayer {
     CorsLayer::new()
         .allow_origin(Any)
         .allow_methods([Method::GET, Method::HEAD])
-        .allow_headers([header::RANGE, header::IF_RANGE, header::IF_NONE_MATCH, header::AUTHORIZATION])
+        // Lichtblick sends the last two with every question.
+        .allow_headers([
+            header::RANGE,
+            header::IF_RANGE,
+            header::IF_NONE_MATCH,
+            header::AUTHORIZATION,
+            header::CONTENT_TYPE,
+            API_VERSION,
+        ])
         .expose_headers([header::ACCEPT_RANGES, header::CONTENT_LENGTH, header::CONTENT_RANGE, header::ETAG])
         .allow_private_network(true)
 }

@@ -6,7 +6,7 @@ use std::sync::Arc;
 
 use arrow::array::{ArrayRef, AsArray as _, Int32Array, RecordBatch, StringArray, UInt32Array};
 use arrow::compute::{cast, take_record_batch};
-use arrow::datatypes::{DataType, Field, FieldRef, Int32Type, SchemaRef, TimeUnit};
+use arrow::datatypes::{DataType, Field, FieldRef, Int32Type, TimeUnit};
 use async_trait::async_trait;
 use datafusion::catalog::information_schema::INFORMATION_SCHEMA;
 use datafusion::catalog::{CatalogProviderList, MemTable, MemoryCatalogProviderList, SchemaProvider, TableProvider};
@@ -30,7 +30,7 @@ use super::information::InformationSchema;
 use super::relations::{self, CatalogRelations, NamedTables, long_name};
 use super::settings::SessionSettings;
 use crate::Error;
-use crate::service::CATALOG;
+use crate::service::{CATALOG, QueryService};
 
 const PG_CATALOG: &str = "pg_catalog";
 /// The first number of the field's functions; Postgres keeps those below for itself, and tables have those from 16384.
@@ -53,12 +53,9 @@ pub(super) struct PgCatalog {
 }
 
 impl PgCatalog {
-    /// For a lake of these tables and views, and the field's functions.
-    pub(super) fn new(
-        tables: Vec<(&'static str, SchemaRef)>,
-        views: HashMap<&'static str, String>,
-        own: Vec<SqlFunction>,
-    ) -> Result<Self, Error> {
+    /// For a lake's tables, views and functions.
+    pub(super) fn new(service: &QueryService) -> Result<Self, Error> {
+        let own = service.functions();
         let fixed = Arc::new(PgCatalogStaticTables::try_new()?);
         let (types, procedures) = (numbers_of(&fixed.pg_type, "typname")?, numbers_of(&fixed.pg_proc, "proname")?);
         set_function_names(&procedures);
@@ -73,7 +70,7 @@ impl PgCatalog {
         // What the field's functions return depends on what they are given.
         signatures.extend(own.iter().zip(OWN_NUMBERS..).map(|(f, n)| (n, (f.arguments().to_owned(), String::new()))));
         let schemas: Vec<_> = typed.iter().map(|(name, batches)| (name.clone(), batches[0].schema())).collect();
-        let relations = CatalogRelations::new(&tables, views, &schemas);
+        let relations = CatalogRelations::new(service, &schemas);
         let descriptions = typed.iter().find(|(name, _)| name == "pg_description");
         let comments = descriptions.map(|(_, batches)| batches.clone()).unwrap_or_default();
         let mut all = NamedTables::new();

@@ -45,7 +45,7 @@ pub(super) struct PostgresState {
 
 impl PostgresState {
     pub(super) fn new(service: QueryService) -> Result<Self, Error> {
-        let catalog = PgCatalog::new(service.tables(), service.view_definitions(), service.functions())?;
+        let catalog = PgCatalog::new(&service)?;
         let parser = PostgresCompatibilityParser::new();
         Ok(Self { service, parser, catalog, next_pid: AtomicI32::new(1), running: Mutex::default() })
     }

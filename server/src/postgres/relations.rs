@@ -10,12 +10,13 @@ use arrow_pg::datatypes::{PG_CHAR_KEY, PG_OID_ALIAS_KEY, field_into_pg_type};
 use datafusion::catalog::{MemTable, TableProvider};
 use datafusion::common::ScalarValue;
 use datafusion::error::Result;
+use echolake_query::{SYSTEM_SCHEMA, table_meaning};
 use echolake_schema::tables::{COMMENT, Table};
 use pgwire::api::Type;
 
 use super::catalog::ROLE;
 use super::text_functions::CatalogComments;
-use crate::service::{CATALOG, SCHEMA};
+use crate::service::{CATALOG, QueryService, SCHEMA};
 
 /// Number of the schema `pg_catalog` in Postgres.
 const PG_CATALOG: i32 = 11;
@@ -30,6 +31,9 @@ const PG_CLASS: i32 = 1259;
 const FIRST_TABLE: i32 = 16_384;
 /// First number of the tables of `pg_catalog` whose numbers in Postgres are not fixed.
 const FIRST_CATALOG_TABLE: i32 = 12_000;
+/// Number of the schema of the system tables, and the first of these.
+const SYSTEM: i32 = 26_000;
+const FIRST_SYSTEM_TABLE: i32 = SYSTEM + 1;
 const DATABASE: i32 = 5;
 
 /// Tables of `pg_catalog` whose numbers clients know.
@@ -233,9 +237,9 @@ pub(super) fn number_of(table: &str) -> Option<i32> {
     FIXED.iter().find(|(known, _)| *known == table).map(|(_, number)| *number)
 }
 
-/// True for a table that is found without its schema: all but those of `information_schema`.
+/// True for a table that is found without its schema: all but those of `information_schema` and `system`.
 pub(super) fn is_searched(number: i32) -> bool {
-    !(INFORMATION_SCHEMA..FIRST_TABLE).contains(&number)
+    !(INFORMATION_SCHEMA..FIRST_TABLE).contains(&number) && number < FIRST_SYSTEM_TABLE
 }
 
 /// Comments of the lake's tables and views.
@@ -282,21 +286,28 @@ pub(super) struct CatalogRelations {
 }
 
 impl CatalogRelations {
-    /// Of the lake's tables and its views' definitions, and of those of `pg_catalog` that are not in this file.
-    pub(super) fn new(
-        lake: &[(&'static str, SchemaRef)],
-        mut definitions: HashMap<&'static str, String>,
-        fixed: &[(String, SchemaRef)],
-    ) -> Self {
-        let own = (FIRST_TABLE..).zip(lake).map(|(number, (name, schema))| CatalogRelation {
+    /// Of the lake's tables and views, the system tables, and those of `pg_catalog` that are not in this file.
+    pub(super) fn new(service: &QueryService, fixed: &[(String, SchemaRef)]) -> Self {
+        let mut definitions = service.view_definitions();
+        let own = (FIRST_TABLE..).zip(service.tables()).map(|(number, (name, schema))| CatalogRelation {
             number,
             namespace: (PUBLIC, SCHEMA),
-            name: (*name).to_owned(),
-            schema: schema.clone(),
+            name: name.to_owned(),
+            schema,
             is_view: Table::by_name(name).is_none(),
             is_own: true,
             definition: definitions.remove(name),
         });
+        let system =
+            (FIRST_SYSTEM_TABLE..).zip(service.system_tables()).map(|(number, (name, schema))| CatalogRelation {
+                number,
+                namespace: (SYSTEM, SYSTEM_SCHEMA),
+                name: name.to_owned(),
+                schema,
+                is_view: false,
+                is_own: true,
+                definition: None,
+            });
         let here = CATALOG_TABLES
             .iter()
             .chain(&SESSION_TABLES)
@@ -322,7 +333,7 @@ impl CatalogRelations {
                 is_own: false,
                 definition: None,
             });
-        Self { relations: own.chain(of_catalog).chain(of_information).collect() }
+        Self { relations: own.chain(system).chain(of_catalog).chain(of_information).collect() }
     }
 
     /// Definitions of views by their numbers.
@@ -333,7 +344,8 @@ impl CatalogRelations {
     /// Numbers of tables by name, and by schema and name.
     pub(super) fn numbers(&self) -> HashMap<String, i32> {
         let both = |of: &CatalogRelation| {
-            [(of.name.clone(), of.number), (format!("{}.{}", of.namespace.1, of.name), of.number)]
+            let alone = (of.namespace.0 != SYSTEM).then(|| (of.name.clone(), of.number));
+            [(format!("{}.{}", of.namespace.1, of.name), of.number)].into_iter().chain(alone)
         };
         // A name without a schema is the lake's, then that of `pg_catalog`.
         self.relations.iter().rev().flat_map(both).collect()
@@ -345,8 +357,10 @@ impl CatalogRelations {
             Some(((of.number, i32::from(at)), field.metadata().get(COMMENT)?.clone()))
         };
         let of_table = |of: &CatalogRelation| {
-            let (_, comment) = COMMENTS.iter().find(|(name, _)| of.is_own && *name == of.name)?;
-            Some(((of.number, 0), (*comment).to_owned()))
+            let known = COMMENTS.iter().find(|(name, _)| of.namespace.0 == PUBLIC && *name == of.name);
+            let of_system = || table_meaning(&format!("{}.{}", of.namespace.1, of.name));
+            let comment = known.map(|(_, comment)| *comment).or_else(of_system)?;
+            Some(((of.number, 0), comment.to_owned()))
         };
         self.fields().filter_map(of_column).chain(self.relations.iter().filter_map(of_table)).collect()
     }
@@ -541,8 +555,8 @@ fn comment_row((place, comment): (&(i32, i32), &String)) -> RowValues {
 }
 
 /// Numbers and names of the schemas.
-pub(super) fn schemas() -> [(i32, &'static str); 3] {
-    [(PG_CATALOG, "pg_catalog"), (PUBLIC, SCHEMA), (INFORMATION_SCHEMA, "information_schema")]
+pub(super) fn schemas() -> [(i32, &'static str); 4] {
+    [(PG_CATALOG, "pg_catalog"), (PUBLIC, SCHEMA), (SYSTEM, SYSTEM_SCHEMA), (INFORMATION_SCHEMA, "information_schema")]
 }
 
 fn namespaces() -> Vec<RowValues> {

@@ -17,6 +17,8 @@ use tokio_rustls::server::TlsStream;
 use tokio_util::either::Either;
 use tonic::transport::server::Connected;
 
+use crate::door::ProtocolEncryption;
+
 /// Handshakes at once; more connections wait.
 const HANDSHAKES: usize = 1024;
 /// Time limit for a handshake.
@@ -24,18 +26,18 @@ const HANDSHAKE: Duration = Duration::from_secs(10);
 /// Time until the next try if the system gives no connection.
 const PAUSE: Duration = Duration::from_millis(100);
 
-/// Returns the connections of a listener as they come; encrypted by `acceptor`, if there is one.
+/// Returns the connections of a listener as they come; encrypted, if they are to be.
 pub(super) fn incoming(
     listener: TcpListener,
-    acceptor: Option<TlsAcceptor>,
+    encryption: ProtocolEncryption,
 ) -> impl Stream<Item = io::Result<WorkerStream>> {
     let (send, receive) = mpsc::channel(1);
-    tokio::spawn(accept(listener, acceptor, send));
+    tokio::spawn(accept(listener, encryption, send));
     stream::unfold(receive, |mut receive| async move { Some((Ok(receive.recv().await?), receive)) })
 }
 
 // Until nobody wants them any more.
-async fn accept(listener: TcpListener, acceptor: Option<TlsAcceptor>, send: mpsc::Sender<WorkerStream>) {
+async fn accept(listener: TcpListener, encryption: ProtocolEncryption, send: mpsc::Sender<WorkerStream>) {
     let places = Arc::new(Semaphore::new(HANDSHAKES));
     while let Ok(place) = places.clone().acquire_owned().await {
         let accepted = tokio::select! {
@@ -44,7 +46,7 @@ async fn accept(listener: TcpListener, acceptor: Option<TlsAcceptor>, send: mpsc
         };
         match accepted {
             Ok((stream, _)) => {
-                let (acceptor, send) = (acceptor.clone(), send.clone());
+                let (acceptor, send) = (encryption.acceptor(), send.clone());
                 tokio::spawn(async move {
                     let _place = place;
                     if let Some(stream) = shake_hands(stream, acceptor).await {

@@ -124,17 +124,18 @@ impl LakeWorker {
         let lake = self.lake;
         let figures = get(move || std::future::ready(Json(worker_figures(&tasks, &lake))));
         let routes = Routes::from(routes.route(WORKER_FIGURES_PATH, figures));
-        let acceptor = self.encryption.as_ref().map(|encryption| encryption.acceptor(HTTP_2)).transpose()?;
+        let mut own = self.encryption;
+        let encryption = own.as_mut().map(|own| own.of_protocol(&[HTTP_2])).transpose()?.unwrap_or_default();
         let serving = Server::builder()
             .initial_stream_window_size(STREAM_WINDOW)
             .initial_connection_window_size(CONNECTION_WINDOW)
             .max_concurrent_streams(CONNECTION_STREAMS)
             .layer(InterceptorLayer::new(move |request: Request<()>| access.check(request)))
             .add_routes(routes)
-            .serve_with_incoming(incoming(self.listener, acceptor));
+            .serve_with_incoming(incoming(self.listener, encryption));
         let renewal = async {
-            match self.encryption {
-                Some(encryption) => encryption.keep_up().await,
+            match own {
+                Some(own) => own.keep_up().await,
                 None => std::future::pending().await,
             }
         };

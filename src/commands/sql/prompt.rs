@@ -181,14 +181,15 @@ async fn give(session: &Session, sql: &str, settings: &PromptSettings) -> anyhow
 
 fn tables(session: &Session) -> String {
     session
-        .tables()
-        .map(|(name, schema)| format!("{name:<14} {} columns", schema.fields().len()))
+        .all_tables()
+        .into_iter()
+        .map(|(name, schema)| format!("{name:<15} {} columns", schema.fields().len()))
         .collect::<Vec<_>>()
         .join("\n")
 }
 
 fn columns(session: &Session, table: &str) -> anyhow::Result<String> {
-    let found = session.tables().find(|(name, _)| *name == table);
+    let found = session.all_tables().into_iter().find(|(name, _)| *name == table);
     let (_, schema) = found.with_context(|| format!("no table `{table}`; hint: \\d lists them"))?;
     let line = |field: &arrow::datatypes::Field| {
         let of = |key| field.metadata().get(key).map_or("", String::as_str);

@@ -50,7 +50,8 @@ export type Language = (typeof LANGUAGES)[number]
 
 export function snippet(language: Language, query: string, origin: string, tables: readonly string[]): string {
   const url = `${origin}/api/v1/sql`
-  const named = tables.filter((name) => new RegExp(`\\b${name}\\b`, 'i').test(query))
+  // Those of the schema `system` are no Delta tables.
+  const named = tables.filter((name) => !name.includes('.') && new RegExp(`\\b${name}\\b`, 'i').test(query))
   switch (language) {
     case 'curl':
       return `curl --fail-with-body ${url} \\\n  -H 'content-type: application/json' -H 'accept: text/csv' \\\n  -d '${JSON.stringify({ query }).replaceAll("'", "'\\''")}'`

@@ -21,6 +21,8 @@ export interface ColumnSummary {
 }
 
 const identifier = (name: string) => `"${name.replaceAll('"', '""')}"`
+/** A table's name, with its schema before a dot unless it is the lake's. */
+const tableName = (name: string) => name.split('.').map(identifier).join('.')
 const literal = (text: string) => `'${text.replaceAll("'", "''")}'`
 const isNumber = ({ type }: Column) => /^(U?Int|Float)\d+$/.test(type)
 const isText = ({ type }: Column) => type === 'Utf8' || type === 'Boolean' || type.startsWith('Timestamp')
@@ -28,7 +30,7 @@ const isText = ({ type }: Column) => type === 'Utf8' || type === 'Boolean' || ty
 /** Columns below each other, as names and values of one type. */
 const unpivoted = (table: string, columns: readonly Column[], type: string) =>
   `select unnest([${columns.map(({ name }) => literal(name)).join(', ')}]) as name, ` +
-  `unnest([${columns.map(({ name }) => `cast(${identifier(name)} as ${type})`).join(', ')}]) as value from ${identifier(table)}`
+  `unnest([${columns.map(({ name }) => `cast(${identifier(name)} as ${type})`).join(', ')}]) as value from ${tableName(table)}`
 
 /** The query that summarises a table's numbers, texts and times; lists are left out. Undefined if it has nothing else. */
 export function summaryQuery(table: string, columns: readonly Column[]): string | undefined {
@@ -106,8 +108,10 @@ export async function loadSummary(table: string, columns: readonly Column[]): Pr
 
 /** Asks how many rows the tables have. */
 export async function loadRowCounts(tables: readonly string[]): Promise<Map<string, number>> {
-  if (tables.length === 0) return new Map()
-  const query = tables.map((name) => `select ${literal(name)} as name, count(*) as rows from ${identifier(name)}`)
+  // Those of the schema `system` are not counted: the log of a large lake takes long to read.
+  const counted = tables.filter((name) => !name.includes('.'))
+  if (counted.length === 0) return new Map()
+  const query = counted.map((name) => `select ${literal(name)} as name, count(*) as rows from ${identifier(name)}`)
   const rows = (await (await sql(query.join(' union all '), 'application/json')).json()) as {
     name: string
     rows: number

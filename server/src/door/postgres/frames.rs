@@ -15,6 +15,8 @@ const TEXT: usize = (2 << 20) + (1 << 10);
 const VALUES: usize = 4 << 20;
 /// Bytes of what only names a statement or a portal.
 const NAMES: usize = 4 << 10;
+/// Of a password, which may be a token of an identity provider.
+const PASSWORD: usize = 18 << 10;
 
 /// The first bytes of a message.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -45,7 +47,8 @@ impl FrameHeader {
         let limit = match self.kind {
             b'Q' | b'P' => TEXT,
             b'B' => VALUES,
-            b'D' | b'C' | b'E' | b'H' | b'S' | b'X' | b'p' | b'c' | b'f' | b'd' | b'F' => NAMES,
+            b'p' => PASSWORD,
+            b'D' | b'C' | b'E' | b'H' | b'S' | b'X' | b'c' | b'f' | b'd' | b'F' => NAMES,
             other => return Err(RequestFault::request(format!("a message of the type {other:#04x}, which is none"))),
         };
         match self.bytes <= limit {

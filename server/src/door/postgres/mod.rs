@@ -16,7 +16,7 @@ use tokio::net::TcpListener;
 use tracing::Instrument as _;
 
 use super::connection_places::{ConnectionPlaces, PlaceWork, PlacedStream};
-use super::encryption::{DoorStream, ProtocolEncryption};
+use super::encryption::{DoorStream, ProtocolEncryption, certificate_name};
 use crate::client_identity::ClientIdentity;
 use crate::door::server_door::ServerDoor;
 use crate::fault::RequestFault;
@@ -34,7 +34,7 @@ use scram::{ScramExchange, methods_message};
 const MOST: usize = 128;
 /// Time limit for a login.
 const LOGIN: Duration = Duration::from_secs(10);
-/// Bytes of a startup packet, as in Postgres, and of a password.
+/// Bytes of a startup packet, as in Postgres.
 const STARTUP: usize = 10_000;
 /// Delay of the answer to a wrong cancel key.
 const WRONG_KEY: Duration = Duration::from_secs(1);
@@ -174,7 +174,8 @@ impl LoginPlace {
 }
 
 impl LoginPlace {
-    // If the user is a token's name, and its line has a verifier, the client proves that it has the token. Else it sends it.
+    // A client whose certificate has the user's name is logged in. Else, if the user is a token's name, and its line has a
+    // verifier, the client proves that it has the token; all others send it.
     async fn authenticate(
         &self,
         stream: &mut DoorStream,
@@ -182,6 +183,10 @@ impl LoginPlace {
         certificate: Option<&[u8]>,
     ) -> Result<Arc<ClientIdentity>, RequestFault> {
         let access = self.door.access();
+        let certified = certificate_name(stream).filter(|name| name == user);
+        if let Some(client) = certified.and_then(|name| access.certified_client(&name)) {
+            return Ok(client);
+        }
         if let Some((client, verifier)) = access.scram_client(user) {
             prove_token(stream, &verifier, certificate).await?;
             access.check_current(&client)?;
@@ -191,6 +196,7 @@ impl LoginPlace {
             true => None,
             false => Some(read_password(stream).await?),
         };
+        access.await_key(token.as_deref()).await;
         access.client(token.as_deref(), || ClientIdentity::user(user))
     }
 }

@@ -1,6 +1,6 @@
 //! Tables: what can be asked, with units, and the Parquet files of their snapshot.
 
-use arrow::datatypes::Field;
+use arrow::datatypes::{Field, SchemaRef};
 use axum::Extension;
 use echolake_schema::tables::{COMMENT, Table, UNIT};
 use serde::{Deserialize, Serialize};
@@ -15,7 +15,7 @@ use crate::fault::RequestFault;
 #[derive(Serialize, ToSchema)]
 #[schema(as = Table)]
 struct TableDescription {
-    name: &'static str,
+    name: String,
     columns: Vec<ColumnDescription>,
 }
 
@@ -57,11 +57,11 @@ impl ColumnDescription {
     extensions(("x-sql" = json!(["the tables' own schemas"])))
 )]
 pub(super) async fn tables(Extension(request): Extension<CatalogueRequest>) -> EndpointAnswer {
-    let table = |(name, schema): (_, arrow::datatypes::SchemaRef)| TableDescription {
+    let table = |(name, schema): (String, SchemaRef)| TableDescription {
         name,
         columns: schema.fields().iter().map(|f| ColumnDescription::of(f)).collect(),
     };
-    Ok(AnswerContent::json(&request.catalogue.service().tables().into_iter().map(table).collect::<Vec<_>>())?)
+    Ok(AnswerContent::json(&request.catalogue.service().all_tables().into_iter().map(table).collect::<Vec<_>>())?)
 }
 
 /// The path of a table.

@@ -19,9 +19,8 @@ impl ToolCall<'_> {
             let kind = if views.contains_key(name) { "view" } else { "table" };
             json!({ "name": name, "kind": kind, "meaning": table_meaning(name) })
         };
-        let tables: Vec<_> = service.tables().iter().map(|(name, _)| table(name)).collect();
-        let further = "the schema `system` has queries, versions and files of the server and the lake; `mcap('RUN')` reads a \
-                       run's file in place";
+        let tables: Vec<_> = service.all_tables().iter().map(|(name, _)| table(name)).collect();
+        let further = "`mcap('RUN')` reads a run's file in place";
         json!({ "tables": tables, "note": further })
     }
 
@@ -31,9 +30,9 @@ impl ToolCall<'_> {
     /// [`RequestFault::NotFound`].
     pub(super) fn describe_table(&self, name: &str) -> Result<Value, RequestFault> {
         let service = self.agents.catalogue.service();
-        let found = service.tables().into_iter().find(|(known, _)| *known == name);
-        let Some((name, schema)) = found else {
-            let hint = "list_tables names all; describe system.queries is SQL for `query`";
+        let found = service.all_tables().into_iter().find(|(known, _)| known == name);
+        let Some((_, schema)) = found else {
+            let hint = "list_tables names all";
             return Err(RequestFault::NotFound { what: format!("table `{name}`"), hint });
         };
         let columns: Vec<_> = schema.fields().iter().map(|field| ColumnDescription::of(field)).collect();

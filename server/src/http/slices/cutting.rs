@@ -11,7 +11,7 @@ use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc};
 use tokio::task::JoinSet;
 
 use crate::fault::RequestFault;
-use crate::metrics::ServerProtocol;
+use crate::http::request_protocol;
 use crate::running::{StopSignal, WAITING, finish};
 use crate::service::QueryService;
 
@@ -48,10 +48,11 @@ impl SliceTask {
         let (to, pieces) = mpsc::channel(WAITING);
         let (of, client) = (service.clone(), client.clone());
         let SliceResources { place: room, turns } = room;
+        let protocol = request_protocol();
         let task = service.spawn(async move {
             let work = async {
                 let stop = StopSignal::new();
-                let timer = of.watch(ServerProtocol::Http, LISTED_AS, &stop);
+                let timer = of.watch(protocol, LISTED_AS, &stop);
                 let _held = (client.place_within(HANDOVER).await?, room);
                 let done = tokio::select! {
                     done = cut(&of, &snapshot, params, client.quota().time, &turns, to) => done,

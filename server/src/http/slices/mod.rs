@@ -6,6 +6,7 @@
 
 mod cutting;
 mod foxglove;
+mod lichtblick;
 mod query;
 mod selection;
 mod sofa;
@@ -16,8 +17,9 @@ use std::sync::Arc;
 use axum::Router;
 use axum::body::Body;
 use axum::extract::State;
-use axum::http::{HeaderMap, Method, Uri};
+use axum::http::{HeaderMap, HeaderName, HeaderValue, Method, Uri};
 use axum::response::Response;
+use axum::routing::get;
 use echolake_export::{Check, SliceParams, Taken};
 use echolake_query::{EngineClient, PredicateForm};
 use echolake_schema::RunId;
@@ -43,9 +45,15 @@ pub(super) use spool::SpooledSlice;
 
 /// Foxglove's manifest of slices.
 pub(in crate::http) use foxglove::MANIFEST as FOXGLOVE_MANIFEST;
+/// Lichtblick's sessions of runs and slices.
+pub(in crate::http) use lichtblick::SESSION as LICHTBLICK_SESSION;
 
 /// A slice.
 pub(in crate::http) const SLICE: &str = "/api/v1/slices.mcap";
+/// Header of an engine's answer with the runs of a slice, for the door's audit.
+pub(crate) const SLICED_RUNS: HeaderName = HeaderName::from_static("echolake-sliced-runs");
+/// Bytes of that header's names.
+const NAMED_BYTES: usize = 8 << 10;
 /// Slices that are open at once: each holds some 8 MB.
 const MOST: usize = 128;
 /// Slices that are worked at, at any moment, beside those that begin: a few a thread, so that one that begins does not
@@ -71,7 +79,8 @@ pub(super) fn routes() -> OpenApiRouter<SliceService> {
 
 /// Slices and their manifest for viewers on pages of any origin.
 pub(super) fn for_viewers(slices: SliceService) -> Router {
-    Router::from(routes()).method_not_allowed_fallback(super::wrong_method).with_state(slices)
+    let routes = Router::from(routes()).route(LICHTBLICK_SESSION, get(lichtblick::session));
+    routes.method_not_allowed_fallback(super::wrong_method).with_state(slices)
 }
 
 /// An authorised request for a slice.
@@ -176,6 +185,35 @@ impl SliceService {
         }
     }
 
+    async fn answer(
+        &self,
+        request: &SliceRequest,
+        selection: &SliceSelection,
+        method: &Method,
+        headers: &HeaderMap,
+    ) -> Result<Response, RequestFault> {
+        let described = FileDescription {
+            etag: format!("\"{}\"", selection.digest),
+            media_type: "application/octet-stream",
+            policy: "cross-origin",
+        };
+        if let Some(known) = described.known(headers) {
+            return Ok(known);
+        }
+        if !needs_length(method, headers) {
+            let mut cutting = self.cut(request, selection)?;
+            // What fails at once still has a status to say so with.
+            let first = cutting.next().await?;
+            return Ok(described.stream(Body::from_stream(rest(first, cutting))));
+        }
+        let cut = async { self.cut(request, selection) };
+        let whole = self.0.spool.once(&selection.digest, cut).await?;
+        Ok(match described.asked(headers, whole.bytes()) {
+            RangeAnswer::Answer(answer) => answer,
+            RangeAnswer::Part(part) => described.part(&part, Body::from_stream(whole.read(part.range.clone()))),
+        })
+    }
+
     fn cut(&self, request: &SliceRequest, selection: &SliceSelection) -> Result<SliceTask, RequestFault> {
         let params = Self::params(request, selection.taken.clone());
         let places = self.0.places.clone();
@@ -216,26 +254,29 @@ async fn slice(
     if request.question.id.as_ref().is_some_and(|id| *id != selection.digest) {
         return Err(RequestFault::Gone { what: "this slice", hint: "ask for the manifest again" }.into());
     }
-    let described = FileDescription {
-        etag: format!("\"{}\"", selection.digest),
-        media_type: "application/octet-stream",
-        policy: "cross-origin",
-    };
-    if let Some(known) = described.known(&headers) {
-        return Ok(known);
+    let answer = slices.answer(&request, &selection, &method, &headers).await?;
+    let mut runs: Vec<_> = selection.taken.iter().map(|taken| &taken.run).collect();
+    runs.dedup();
+    Ok(name_runs(answer, &runs))
+}
+
+// Adds the names of a slice's runs to its answer, up to a number of bytes.
+fn name_runs(mut answer: Response, runs: &[&RunId]) -> Response {
+    let mut names = String::new();
+    for (index, run) in runs.iter().enumerate() {
+        if names.len() + run.as_str().len() > NAMED_BYTES {
+            names += &format!(" and {} more", runs.len() - index);
+            break;
+        }
+        if index > 0 {
+            names.push(' ');
+        }
+        names += run.as_str();
     }
-    if !needs_length(&method, &headers) {
-        let mut cutting = slices.cut(&request, &selection)?;
-        // What fails at once still has a status to say so with.
-        let first = cutting.next().await?;
-        return Ok(described.stream(Body::from_stream(rest(first, cutting))));
+    if let Ok(names) = HeaderValue::try_from(names) {
+        answer.headers_mut().insert(SLICED_RUNS, names);
     }
-    let cut = async { slices.cut(&request, &selection) };
-    let whole = slices.0.spool.once(&selection.digest, cut).await?;
-    Ok(match described.asked(&headers, whole.bytes()) {
-        RangeAnswer::Answer(answer) => answer,
-        RangeAnswer::Part(part) => described.part(&part, Body::from_stream(whole.read(part.range.clone()))),
-    })
+    answer
 }
 
 // A failure on the way breaks the connection off: a short slice would look like a whole one.

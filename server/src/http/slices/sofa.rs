@@ -18,7 +18,7 @@ use super::super::extract::{BinaryContent, QueryParams};
 use super::super::problem::ProblemResponse;
 use super::super::ranges::FileDescription;
 use super::query::SliceParameters;
-use super::{SliceRequest, SliceService};
+use super::{SliceRequest, SliceService, name_runs};
 use crate::fault::RequestFault;
 
 /// SOFA files.
@@ -65,7 +65,7 @@ pub(super) async fn sofa(
     let request = slices.request(params, &uri, &headers).await?;
     let rows = slices.responses(&request).await?;
     let run = only_run(&request, &rows)?;
-    let name = format!("{}.sofa", run.surface);
+    let (name, run_id) = (format!("{}.sofa", run.surface), run.run.clone());
     let lake = slices.0.catalogue.lake().clone();
     let made = slices.0.catalogue.service().crunch(move || sofa_bytes(&lake, &run, &rows)).await??;
     let described = FileDescription {
@@ -83,7 +83,7 @@ pub(super) async fn sofa(
     }
     // Made anew for each request: a range would cost as much.
     response.headers_mut().remove(header::ACCEPT_RANGES);
-    Ok(response)
+    Ok(name_runs(response, &[&run_id]))
 }
 
 impl SliceService {

@@ -64,7 +64,7 @@ impl WordCompleter {
     pub(super) fn of(session: &Session) -> Self {
         let columns = |schema: &arrow::datatypes::Schema| schema.fields().iter().map(|f| f.name().clone()).collect();
         Self {
-            tables: session.tables().map(|(name, schema)| (name.to_owned(), columns(&schema))).collect(),
+            tables: session.all_tables().into_iter().map(|(name, schema)| (name, columns(&schema))).collect(),
             functions: session.functions().into_iter().map(|f| f.name).collect(),
         }
     }

@@ -1,0 +1,329 @@
+//! Access control: who a client is, by its token, certificate, browser session, or identity provider.
+
+use std::sync::{Arc, PoisonError, RwLock, RwLockReadGuard};
+use std::time::SystemTime;
+
+use sha2::{Digest as _, Sha256};
+
+use crate::client_identity::ClientIdentity;
+use crate::fault::RequestFault;
+use crate::oidc::IdentityProvider;
+use crate::scram_verifier::ScramVerifier;
+use crate::sessions::BrowserSessions;
+use crate::tokens::{OIDC_PREFIX, TokenFile};
+
+/// The access rule of a server.
+pub(crate) enum TokenAccess {
+    /// All clients on this machine.
+    Open,
+    /// Those whom the file of tokens names.
+    Named(Box<NamedAccess>),
+}
+
+/// Access of those whom a file names.
+pub(crate) struct NamedAccess {
+    file: RwLock<TokenFile>,
+    sessions: BrowserSessions,
+    provider: Option<Arc<IdentityProvider>>,
+}
+
+impl NamedAccess {
+    fn file(&self) -> RwLockReadGuard<'_, TokenFile> {
+        self.file.read().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    // The client of a token that was shown before, or is in the file.
+    fn holder(&self, hash: &[u8; 32]) -> Result<Arc<ClientIdentity>, RequestFault> {
+        let file = self.file();
+        if let Some(entry) = file.find(hash) {
+            return Ok(entry.client.clone());
+        }
+        let login = self.provider.as_ref().and_then(|provider| provider.known_login(hash));
+        let user = login.and_then(|login| file.user(&login.name, &login.groups));
+        user.map(Arc::new).ok_or(RequestFault::Unauthenticated)
+    }
+
+    // The clients of a name that may ask now: one of the file, and a user by each token that was shown.
+    fn clients_of(&self, name: &str) -> Vec<Arc<ClientIdentity>> {
+        let file = self.file();
+        let entry = file.find_name(name).map(|entry| entry.client.clone());
+        let user = name.strip_prefix(OIDC_PREFIX).zip(self.provider.as_ref());
+        let logins = user.into_iter().flat_map(|(user, provider)| provider.known_logins(|login| login.name == user));
+        let users = logins.filter_map(|login| file.user(&login.name, &login.groups)).map(Arc::new);
+        entry.into_iter().chain(users).collect()
+    }
+
+    // All clients that may ask now.
+    fn current(&self) -> Vec<Arc<ClientIdentity>> {
+        let file = self.file();
+        let entries = file.entries.iter().filter(|entry| entry.is_valid()).map(|entry| entry.client.clone());
+        let logins = self.provider.iter().flat_map(|provider| provider.known_logins(|_| true));
+        let users = logins.filter_map(|login| file.user(&login.name, &login.groups)).map(Arc::new);
+        entries.chain(users).collect()
+    }
+
+    fn client(&self, token: &str) -> Result<Arc<ClientIdentity>, RequestFault> {
+        let hash = hash_of(token);
+        if let Ok(holder) = self.holder(&hash) {
+            return Ok(holder);
+        }
+        let login = self.provider.as_ref().and_then(|provider| provider.log_in(token, hash));
+        let Some(login) = login else { return Err(RequestFault::Unauthenticated) };
+        self.holder(&hash).inspect_err(|_| {
+            tracing::info!(user = login.name, groups = ?login.groups, "a user is in no group of the file of tokens");
+        })
+    }
+}
+
+impl TokenAccess {
+    /// Access by `tokens`, and by a provider whose users' groups they name; open access without them.
+    pub(crate) fn new(tokens: Option<TokenFile>, provider: Option<Arc<IdentityProvider>>) -> Self {
+        match tokens {
+            Some(file) => {
+                let (file, sessions) = (RwLock::new(file), BrowserSessions::default());
+                Self::Named(Box::new(NamedAccess { file, sessions, provider }))
+            }
+            None => Self::Open,
+        }
+    }
+
+    /// Returns whether no token is required.
+    pub(crate) fn is_open(&self) -> bool {
+        matches!(self, Self::Open)
+    }
+
+    /// Waits, for a few seconds at most, for the key of a token of the identity provider that is signed with a new one.
+    pub(crate) async fn await_key(&self, token: Option<&str>) {
+        if let (Self::Named(named), Some(token)) = (self, token)
+            && let Some(provider) = &named.provider
+            && named.holder(&hash_of(token)).is_err()
+        {
+            provider.await_key(token).await;
+        }
+    }
+
+    /// Returns the client of a token; on a server without tokens, the client that `local` makes.
+    ///
+    /// # Errors
+    /// [`RequestFault::Unauthenticated`].
+    pub(crate) fn client(
+        &self,
+        token: Option<&str>,
+        local: impl FnOnce() -> ClientIdentity,
+    ) -> Result<Arc<ClientIdentity>, RequestFault> {
+        match self {
+            Self::Open => Ok(Arc::new(local())),
+            Self::Named(named) => named.client(token.unwrap_or_default()),
+        }
+    }
+
+    /// Returns the client of the name in a certificate; None on a server without tokens, or if the name has no line.
+    pub(crate) fn certified_client(&self, name: &str) -> Option<Arc<ClientIdentity>> {
+        let Self::Named(named) = self else { return None };
+        named.file().find_name(name).map(|entry| entry.client.clone())
+    }
+
+    /// Returns the client of a token's name, and what tells whether it has the token; None if its line has no such verifier.
+    pub(crate) fn scram_client(&self, name: &str) -> Option<(Arc<ClientIdentity>, Arc<ScramVerifier>)> {
+        let Self::Named(named) = self else { return None };
+        let file = named.file();
+        let entry = file.find_name(name)?;
+        Some((entry.client.clone(), entry.scram.clone()?))
+    }
+
+    /// Returns the client of a name; on a server without tokens, the one of this name that asks over HTTP.
+    ///
+    /// # Errors
+    /// [`RequestFault::Unauthenticated`].
+    pub(crate) fn client_of_name(&self, name: &str) -> Result<Arc<ClientIdentity>, RequestFault> {
+        let found = match self {
+            Self::Open => {
+                let known = [ClientIdentity::pages(), ClientIdentity::programs()];
+                known.into_iter().find(|client| client.name == name).map(Arc::new)
+            }
+            Self::Named(named) => named.clients_of(name).pop(),
+        };
+        found.ok_or(RequestFault::Unauthenticated)
+    }
+
+    /// Checks that what a client may do has not changed, and that it may still ask.
+    ///
+    /// # Errors
+    /// [`RequestFault::Unauthenticated`].
+    pub(crate) fn check_current(&self, client: &ClientIdentity) -> Result<(), RequestFault> {
+        let Self::Named(named) = self else { return Ok(()) };
+        let is_current = named.clients_of(&client.name).iter().any(|current| **current == *client);
+        is_current.then_some(()).ok_or(RequestFault::Unauthenticated)
+    }
+
+    /// Reads the file again if it changed; returns the names of clients that may no longer ask, or may do other things now. A
+    /// file that cannot be read changes nothing.
+    pub(crate) fn renew(&self, known: &mut TokenFileState) -> Vec<String> {
+        let Self::Named(named) = self else { return Vec::new() };
+        let path = named.file().path().to_owned();
+        // Some of them logged in since the last look.
+        let mut before = named.current();
+        let changed = std::fs::metadata(&path).ok().and_then(|about| Some((about.modified().ok()?, about.len())));
+        if known.file.replace(changed).is_some_and(|before| before != changed) {
+            match TokenFile::read_any(&path) {
+                Ok(renewed) => {
+                    tracing::info!(tokens = renewed.entries.len(), "the file of tokens was read again");
+                    *named.file.write().unwrap_or_else(PoisonError::into_inner) = renewed;
+                }
+                Err(e) => tracing::warn!(error = &e as &dyn std::error::Error, "the tokens stay as they were"),
+            }
+        }
+        before.retain(|client| !known.clients.contains(client));
+        before.extend(std::mem::replace(&mut known.clients, named.current()));
+        let gone = before.into_iter().filter(|client| !known.clients.contains(client));
+        gone.map(|client| client.name.clone()).collect()
+    }
+
+    /// Begins a browser's session; returns its secret.
+    ///
+    /// # Errors
+    /// [`RequestFault::Unauthenticated`]; [`RequestFault::NotFound`] if there are no tokens.
+    pub(crate) fn begin_session(&self, token: &str) -> Result<String, RequestFault> {
+        let Self::Named(named) = self else {
+            let hint = "this server has no tokens, ask right away";
+            return Err(RequestFault::NotFound { what: "a session".to_owned(), hint });
+        };
+        named.client(token)?;
+        named.sessions.begin(hash_of(token)).map_err(RequestFault::defect("no session can begin"))
+    }
+
+    /// Returns the client of the session with this secret; as [`TokenAccess::client`].
+    ///
+    /// # Errors
+    /// As [`TokenAccess::client`].
+    pub(crate) fn client_of_session(
+        &self,
+        secret: &str,
+        local: impl FnOnce() -> ClientIdentity,
+    ) -> Result<Arc<ClientIdentity>, RequestFault> {
+        match self {
+            Self::Open => Ok(Arc::new(local())),
+            Self::Named(named) => named.holder(&named.sessions.holder(secret).ok_or(RequestFault::Unauthenticated)?),
+        }
+    }
+}
+
+/// State of the file of tokens, and the clients that might ask, when it was last looked at.
+#[derive(Default)]
+pub(crate) struct TokenFileState {
+    file: Option<Option<(SystemTime, u64)>>,
+    clients: Vec<Arc<ClientIdentity>>,
+}
+
+fn hash_of(token: &str) -> [u8; 32] {
+    Sha256::digest(token.as_bytes()).into()
+}
+
+#[cfg(test)]
+mod tests {
+    use std::path::Path;
+
+    use echolake_schema::ProjectName;
+
+    use super::*;
+    use crate::tokens::{TokenScope, fresh};
+
+    fn access_by(lines: &str) -> TokenAccess {
+        let file = TokenFile::parse(Path::new("no-such-file.toml"), lines).expect("tokens");
+        TokenAccess::new(Some(file), None)
+    }
+
+    #[test]
+    fn a_token_that_expired_or_was_taken_back_lets_nobody_in() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let path = folder.path().join("tokens.toml");
+        let hash = hex::encode(Sha256::digest("x"));
+        let line = |rest: &str| format!("[[token]]\nname = 'a'\nsha256 = '{hash}'\n{rest}\n");
+        std::fs::write(&path, line("expires = 2126-01-01T00:00:00Z")).expect("written");
+        let access = TokenAccess::new(Some(TokenFile::read(&path).expect("tokens")), None);
+        let mut known = TokenFileState::default();
+        assert!(access.renew(&mut known).is_empty());
+        let client = access.client(Some("x"), ClientIdentity::pages).expect("let in");
+        let session = access.begin_session("x").expect("a session");
+        let is_in = || {
+            let by_session = access.client_of_session(&session, ClientIdentity::pages).is_ok();
+            let by_token = access.client(Some("x"), ClientIdentity::pages).is_ok();
+            assert_eq!((by_session, by_token), (by_token, access.check_current(&client).is_ok()));
+            by_token
+        };
+        assert!(is_in());
+        // A half-written file changes nothing.
+        std::fs::write(&path, "[[token]]\nname = 'a").expect("written");
+        assert!(access.renew(&mut known).is_empty() && is_in());
+        std::fs::write(&path, line("expires = 2026-01-01T00:00:00Z")).expect("written");
+        assert_eq!(access.renew(&mut known), ["a"]);
+        assert!(!is_in());
+        std::fs::write(&path, line("")).expect("written");
+        assert!(access.renew(&mut known).is_empty() && is_in());
+        // Other projects are another view of the lake: what was asked so far ends.
+        std::fs::write(&path, line("projects = ['brick']")).expect("written");
+        assert_eq!(access.renew(&mut known), ["a"]);
+        assert!(access.check_current(&client).is_err());
+        std::fs::write(&path, line("")).expect("written");
+        assert_eq!(access.renew(&mut known), ["a"]);
+        assert!(is_in());
+        std::fs::write(&path, "").expect("written");
+        assert_eq!(access.renew(&mut known), ["a"]);
+        assert!(!is_in());
+        assert!(TokenFile::read(&path).map(drop).expect_err("no tokens").to_string().contains("there is none"));
+    }
+
+    #[test]
+    fn a_fresh_token_lets_in_and_no_other_does() {
+        let project: ProjectName = "brick".parse().expect("a name");
+        let fresh = fresh("a \"quoted\" name", Some(1), std::slice::from_ref(&project)).expect("a token");
+        assert!(!fresh.lines.contains(&fresh.token), "only hashes of it are kept");
+        let access = access_by(&fresh.lines);
+        let local = ClientIdentity::pages;
+        let client = access.client(Some(&fresh.token), local).expect("let in");
+        assert_eq!(client.name, "a \"quoted\" name");
+        assert_eq!(client.projects, Some([project].into()));
+        assert_eq!(client.quota().time, Some(std::time::Duration::from_secs(60)));
+        assert!(client.require(TokenScope::Files).is_ok(), "pages show meshes and link to files");
+        assert!(matches!(client.require(TokenScope::Metrics), Err(RequestFault::Forbidden { .. })));
+        let secret = access.begin_session(&fresh.token).expect("a session");
+        assert_eq!(access.client_of_session(&secret, local).expect("let in"), client);
+        assert!(matches!(access.client_of_session(&fresh.token, local), Err(RequestFault::Unauthenticated)));
+        assert!(matches!(access.begin_session(&secret), Err(RequestFault::Unauthenticated)));
+        let (by_name, _) = access.scram_client("a \"quoted\" name").expect("a verifier");
+        assert_eq!(by_name, client);
+        assert!(access.scram_client("b").is_none());
+        let other = crate::tokens::fresh("b", None, &[]).expect("a token").token;
+        let cut = &fresh.token[..fresh.token.len() - 1];
+        for wrong in [None, Some(""), Some(other.as_str()), Some(cut)] {
+            assert!(matches!(access.client(wrong, local), Err(RequestFault::Unauthenticated)), "{wrong:?}");
+        }
+    }
+
+    #[test]
+    fn scopes_are_those_that_a_line_names() {
+        let hash = hex::encode(Sha256::digest("x"));
+        let allowed = |scopes: &str| {
+            let access = access_by(&format!("[[token]]\nname = 'a'\nsha256 = '{hash}'\n{scopes}"));
+            let client = access.client(Some("x"), ClientIdentity::pages).expect("let in");
+            [TokenScope::Sql, TokenScope::Files, TokenScope::Metrics].map(|scope| client.require(scope).is_ok())
+        };
+        assert_eq!(allowed(""), [true, true, false]);
+        assert_eq!(allowed("scopes = ['sql']"), [true, false, false]);
+        assert_eq!(allowed("scopes = ['metrics']"), [false, false, true]);
+    }
+
+    #[test]
+    fn a_certificate_stands_for_the_token_of_its_name() {
+        let hash = hex::encode(Sha256::digest("x"));
+        let access =
+            access_by(&format!("[[token]]\nname = 'a'\nsha256 = '{hash}'\n[[token]]\nname = 'b'\nscopes = ['sql']"));
+        let by_token = access.client(Some("x"), ClientIdentity::pages).expect("let in");
+        assert_eq!(access.certified_client("a"), Some(by_token));
+        let certified = access.certified_client("b").expect("let in");
+        assert_eq!((certified.scopes.as_slice(), certified.token), (&[TokenScope::Sql][..], None));
+        assert!(access.check_current(&certified).is_ok());
+        assert_eq!(access.certified_client("c"), None);
+        assert_eq!(TokenAccess::new(None, None).certified_client("a"), None, "there all are local");
+    }
+}
