@@ -62,10 +62,24 @@ def crate_components(source: Path, targets: list[str]) -> list[Component]:
     inside: set[tuple[str, str]] = set()
     for target in targets:
         listed = output_of(
-            "cargo", "tree", "--locked", "-p", "echolake", "-e", "normal,no-proc-macro", "--target", target,
-            "--prefix", "none", "--format", "{p}", folder=source,
+            "cargo",
+            "tree",
+            "--locked",
+            "-p",
+            "echolake",
+            "-e",
+            "normal,no-proc-macro",
+            "--target",
+            target,
+            "--prefix",
+            "none",
+            "--format",
+            "{p}",
+            folder=source,
         )
-        inside |= {(name, version.lstrip("v")) for name, version, *_ in map(str.split, filter(None, listed.splitlines()))}
+        inside |= {
+            (name, version.lstrip("v")) for name, version, *_ in map(str.split, filter(None, listed.splitlines()))
+        }
     standard = standard_texts(source)
     metadata = json.loads(output_of("cargo", "metadata", "--locked", "--format-version", "1", folder=source))
     return [
@@ -121,7 +135,9 @@ def page_components(source: Path) -> list[Component]:
 
 def toolchain_components(targets: list[str]) -> list[Component]:
     """What the compiler links into every program: Rust's standard library, and musl where it is static."""
-    rustc = dict(line.split(": ", 1) for line in output_of("rustc", "-vV", folder=Path(".")).splitlines() if ": " in line)
+    rustc = dict(
+        line.split(": ", 1) for line in output_of("rustc", "-vV", folder=Path(".")).splitlines() if ": " in line
+    )
     documents = Path(output_of("rustc", "--print", "sysroot", folder=Path(".")).strip()) / "share/doc/rust"
     texts = [path.read_text(encoding="utf-8").strip() for path in sorted(documents.glob("licenses/[AM][pI]*.txt"))]
     std = Component("Rust standard library", rustc["release"], "MIT OR Apache-2.0", "https://www.rust-lang.org", texts)
@@ -155,7 +171,10 @@ def licence_text(components: list[Component]) -> str:
             used.append(f"[{number + 1}]")
         rows.append(f"{component.name} {component.version}\n    {component.licence}\n    {component.origin}")
         rows.append(f"    texts: {' '.join(dict.fromkeys(used)) or 'none in the package'}")
-    out = ["echolake itself is licensed under Apache-2.0 or MIT, at your choice. It contains the following packages.", ""]
+    out = [
+        "echolake itself is licensed under Apache-2.0 or MIT, at your choice. It contains the following packages.",
+        "",
+    ]
     out += [*rows, ""]
     for number, (text, names) in enumerate(zip(texts, users, strict=True), start=1):
         out += [LINE, f"[{number}] {', '.join(names)}", LINE, "", text, ""]

@@ -27,18 +27,3 @@ pub(crate) fn all(surface: &str, pair: i64) -> Vec<BenchQuery> {
     }
     queries
 }
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn each_of_the_twelve_has_its_text() {
-        let queries = all("Flat", 7);
-        assert_eq!(queries.len(), 12);
-        for query in &queries {
-            assert!(query.sql.starts_with("SELECT ") && !query.sql.contains(['$', ';']), "{}", query.sql);
-            assert_eq!(query.peer.is_some(), query.name == "augmented_surface");
-        }
-    }
-}
