@@ -20,7 +20,7 @@ const ROS_DEFINITION: &str = "# a reading\nstd_msgs/Header header\nuint8 FAST=2\
 const IDL_DEFINITION: &str = "#include \"a.idl\"\nmodule a { module msg { typedef double double__3[3]; enum Layer { near, far };\n\
                               struct Point { double x; }; @verbatim (language=\"comment\", text=\"one\")\n\
                               struct B { builtin_interfaces::msg::Time stamp; sequence<Point, 5> points; string<10> name, other;\n\
-                              wstring wide; sequence<octet> data; double__3 low; Layer layer; /* rows */ long long count; }; }; };\n\
+                              sequence<octet> data; double__3 low; Layer layer; /* rows */ long long count; }; }; };\n\
                               ===\nIDL: builtin_interfaces/msg/Time\nmodule builtin_interfaces { module msg { struct Time \
                               { int32 sec; uint32 nanosec; }; }; };\n";
 
@@ -28,7 +28,7 @@ const IDL_DEFINITION: &str = "#include \"a.idl\"\nmodule a { module msg { typede
 /// variable it does nothing.
 ///
 /// # Panics
-/// A file cannot be written.
+/// A file cannot be written, or a message is refused.
 pub fn write_seeds_on_request() {
     if let Some(folder) = std::env::var_os("ECHOLAKE_SEEDS") {
         let folder = PathBuf::from(folder);
@@ -61,17 +61,24 @@ fn message_seeds() -> Vec<Vec<u8>> {
     let measurement = [&[0x08, 7, 0x10, 1, 0x31][..], &12.5f64.to_le_bytes(), &[0x72, 1, b'a', 0x72, 0]].concat();
     let json = br#"{"a": 1e3, "b": [0.5, null, -1], "c": {"d": "AAEC"}, "e": "a"}"#;
     let cbor = b"\xa3\x61a\x19\x03\xe8\x61b\x82\xfb\x3f\xe0\0\0\0\0\0\0\xf6\x61c\xa1\x61d\x43\0\x01\x02";
+    // What ROS 1 has as words are messages in ROS 2.
+    let ros_2 = ROS_DEFINITION.replace("time stamp", "builtin_interfaces/Time stamp");
+    let ros_2 = ros_2.replace("duration took", "builtin_interfaces/Duration took");
     let kinds: [(&str, &[u8], &[u8]); ENCODINGS.len()] = [
         ("echolake.v1.Measurement", FILE_DESCRIPTOR_SET, &measurement),
         ("a", JSON_SCHEMA.as_bytes(), json),
         ("a", JSON_SCHEMA.as_bytes(), cbor),
         ("", b"", json),
-        ("a/msg/B", ROS_DEFINITION.as_bytes(), &cdr),
+        ("a/msg/B", ros_2.as_bytes(), &cdr),
         ("a/msg/B", IDL_DEFINITION.as_bytes(), &cdr),
         ("a/B", ROS_DEFINITION.as_bytes(), &cdr[4..]),
         ("lab.Reading", READING[0], READING[1]),
     ];
-    let input = |(encoding, (type_name, schema, data))| MessageInput { encoding, type_name, schema, data }.to_bytes();
+    let input = |(encoding, (type_name, schema, data))| {
+        let input = MessageInput { encoding, type_name, schema, data };
+        assert!(input.message().decode().is_some(), "{input:?} is refused");
+        input.to_bytes()
+    };
     kinds.into_iter().enumerate().map(input).collect()
 }
 
