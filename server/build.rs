@@ -181,17 +181,16 @@ fn list(dist: &Path) -> io::Result<String> {
         let ending = file.extension().and_then(OsStr::to_str).unwrap_or_default();
         let Some((_, media_type)) = TYPES.iter().find(|(known, _)| *known == ending) else { continue };
         let name = file.strip_prefix(dist).map_err(io::Error::other)?.to_string_lossy().replace('\\', "/");
-        let packed = |ending: &str| {
-            let packed = PathBuf::from(format!("{}.{ending}", file.display()));
-            if packed.exists() { format!("Some(include_bytes!({packed:?}))") } else { "None".to_owned() }
-        };
+        let packed = |ending: &str| Some(PathBuf::from(format!("{}.{ending}", file.display()))).filter(|p| p.exists());
+        let (gzip, brotli) = (packed("gz"), packed("br"));
+        let brotli = brotli.map_or("None".to_owned(), |file| format!("Some(include_bytes!({file:?}))"));
         let _ = writeln!(
             list,
-            "PageFile {{ path: {:?}, media_type: {media_type:?}, bytes: include_bytes!({file:?}), \
-             gzip: {}, brotli: {} }},",
+            "PageFile {{ path: {:?}, media_type: {media_type:?}, bytes: include_bytes!({:?}), is_gzip: {}, brotli: \
+             {brotli} }},",
             format!("/{name}"),
-            packed("gz"),
-            packed("br")
+            gzip.as_ref().unwrap_or(file),
+            gzip.is_some(),
         );
     }
     list.push(']');

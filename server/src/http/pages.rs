@@ -1,9 +1,12 @@
 //! The catalogue's pages, which are part of the program. They hold no data, so they need no token.
 
+use std::io::Read as _;
 use std::sync::LazyLock;
 
+use axum::body::Bytes;
 use axum::http::{HeaderMap, HeaderValue, Method, StatusCode, Uri, header};
 use axum::response::{IntoResponse as _, Response};
+use flate2::read::GzDecoder;
 use sha2::{Digest as _, Sha256};
 
 use super::catalogue::is_known;
@@ -24,8 +27,9 @@ const OTHERS: [&str; 6] = ["/api", "/assets", "/delta-sharing", "/health", "/mcp
 struct PageFile {
     path: &'static str,
     media_type: &'static str,
+    /// As it is, or packed by gzip: few clients want it unpacked, and it is a megabyte less of the program.
     bytes: &'static [u8],
-    gzip: Option<&'static [u8]>,
+    is_gzip: bool,
     brotli: Option<&'static [u8]>,
 }
 
@@ -37,7 +41,7 @@ static PAGES: &[PageFile] = &[PageFile {
     path: INDEX,
     media_type: "text/html; charset=utf-8",
     bytes: include_bytes!("pages_not_built.html"),
-    gzip: None,
+    is_gzip: false,
     brotli: None,
 }];
 
@@ -58,11 +62,7 @@ pub(super) async fn fallback(method: Method, uri: Uri, headers: HeaderMap) -> Re
     }
     let known = is_known(&headers, tag);
     let (body, encoding) = page.body(&headers);
-    let mut response = if known {
-        StatusCode::NOT_MODIFIED.into_response()
-    } else {
-        axum::body::Bytes::from_static(body).into_response()
-    };
+    let mut response = if known { StatusCode::NOT_MODIFIED.into_response() } else { body.into_response() };
     let caching = if page.path.starts_with(ASSETS) { "public, max-age=31536000, immutable" } else { "no-cache" };
     let out = response.headers_mut();
     for (name, value) in [
@@ -92,12 +92,20 @@ fn page(path: &str) -> Option<&'static (&'static PageFile, String)> {
 }
 
 impl PageFile {
-    fn body(&self, headers: &HeaderMap) -> (&'static [u8], Option<&'static str>) {
-        match (self.brotli.filter(|_| takes(headers, "br")), self.gzip.filter(|_| takes(headers, "gzip"))) {
-            (Some(packed), _) => (packed, Some("br")),
-            (None, Some(packed)) => (packed, Some("gzip")),
-            (None, None) => (self.bytes, None),
+    fn body(&self, headers: &HeaderMap) -> (Bytes, Option<&'static str>) {
+        match self.brotli.filter(|_| takes(headers, "br")) {
+            Some(packed) => (Bytes::from_static(packed), Some("br")),
+            None if self.is_gzip && takes(headers, "gzip") => (Bytes::from_static(self.bytes), Some("gzip")),
+            None if self.is_gzip => (self.unpack().into(), None),
+            None => (Bytes::from_static(self.bytes), None),
         }
+    }
+
+    fn unpack(&self) -> Vec<u8> {
+        let mut bytes = Vec::new();
+        // It was packed by the build, and what cannot be read of it is not there.
+        let _ = GzDecoder::new(self.bytes).read_to_end(&mut bytes);
+        bytes
     }
 }
 
@@ -123,6 +131,14 @@ mod tests {
         assert_eq!(path("/theme.js"), Some("/theme.js"));
         let script = PAGES.iter().find(|p| p.path.starts_with("/assets/index-") && p.path.ends_with(".js"));
         let script = script.expect("a script");
-        assert!(script.gzip.is_some_and(|packed| packed.len() < script.bytes.len()));
+        let packed = HeaderMap::from_iter([(header::ACCEPT_ENCODING, HeaderValue::from_static("gzip"))]);
+        let (gzip, named) = script.body(&packed);
+        assert_eq!(named, Some("gzip"));
+        let (plain, named) = script.body(&HeaderMap::new());
+        assert_eq!(named, None);
+        // gzip ends with the length of what it packed.
+        let length = gzip.last_chunk().map(|length| u32::from_le_bytes(*length));
+        assert_eq!(length, u32::try_from(plain.len()).ok());
+        assert!(gzip.len() < plain.len());
     }
 }
