@@ -9,6 +9,8 @@ folder=${1:-$(mktemp -d)}
 trap 'rm -rf --one-file-system "$folder"' EXIT
 version=$(basename dist/echolake-*.tar.gz .tar.gz)
 version=${version#echolake-}
+# It is the root of other users, too.
+chmod 755 "$folder"
 debootstrap --variant=minbase --include=python3-venv bookworm "$folder" >/dev/null
 cp -r dist "$folder/root/dist"
 # The indented lines below the first heading that installs something.
@@ -21,6 +23,8 @@ for tool in cc gcc cargo rustc node npm; do
     ! command -v "$tool" || { echo "error: $tool is here"; exit 1; }
 done
 fetch() { python3 -c 'import sys, urllib.request; print(urllib.request.urlopen(sys.argv[1]).read().decode())' "$1"; }
+# The server is the oldest of its processes.
+server() { pidof echolake | tr ' ' '\n' | sort -n | head -1; }
 LIMIT=90
 
 echo "== the README's commands"
@@ -35,7 +39,7 @@ echo "the catalogue is served after $((SECONDS - began)) s"
 [ "$((SECONDS - began))" -le "$LIMIT" ] || { echo "error: more than $LIMIT s"; exit 1; }
 tail -3 demo.log
 fetch "$(grep -o 'http://[^ ]*' demo.log | tail -1)" | grep -q '/assets/index-' || { echo "error: no pages"; exit 1; }
-kill -INT "$(pidof echolake)"
+kill -INT "$(server)"
 wait
 ls -l env/bin/echolake
 env/bin/echolake doctor --self
@@ -49,7 +53,7 @@ runuser -u echolake -- echolake --lake /var/lib/echolake doctor | head -2
 (. /etc/default/echolake && cd / && ECHOLAKE_LAKE=$ECHOLAKE_LAKE exec runuser -u echolake -- echolake serve $ECHOLAKE_SERVE_OPTIONS) 2>serve.log &
 until grep -q 'postgresql://' serve.log; do sleep 0.2; done
 fetch http://127.0.0.1:8080/health
-kill -TERM "$(pidof echolake)"
+kill -TERM "$(server)"
 wait
 runuser -u nobody -- echolake --lake /var/lib/echolake doctor --self | grep "lake's files"
 before=$(cd /var/lib/echolake && find . -type f -print0 | sort -z | xargs -0 sha256sum | sha256sum)
