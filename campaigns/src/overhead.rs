@@ -56,7 +56,7 @@ struct RoundFigures {
 /// A figure by its name, and whether more of it is better.
 type FigureColumn = (&'static str, fn(&RoundFigures) -> f64, FigureSense);
 
-/// What is better of a figure.
+/// The direction in which a figure is better.
 #[derive(Clone, Copy, PartialEq, Eq)]
 enum FigureSense {
     More,

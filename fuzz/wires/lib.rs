@@ -1,4 +1,4 @@
-//! What the targets of messages and wires share: a lake of three points in memory, a server of it, and seeds.
+//! Shared by the targets of messages and wires: a lake of three points in memory, a server of it, and seeds.
 
 mod message_input;
 mod seeds;

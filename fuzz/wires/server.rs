@@ -14,7 +14,7 @@ use echolake_server::{EngineSettings, LakeServer, ServerSettings};
 
 use crate::FuzzedLake;
 
-/// What the door starts for an engine: it says that it is ready, and leads to the engine in this process.
+/// The program that the door starts for an engine: it says that it is ready, and leads to the engine in this process.
 const ENGINE_PROGRAM: &str = "#!/bin/sh\nwhile [ \"$1\" != --sockets ]; do shift; done\n\
                               ln -s \"$FUZZED_ENGINE\"/* \"$2\"\necho '\"ready\"'\nexec cat > /dev/null\n";
 /// Sockets of an engine.

@@ -64,7 +64,7 @@ pub use predicate::PredicateForm;
 pub use session::{CancelHandle, ContextExtension, PreparedQuery, QueryAnswer, Session};
 pub use spread::{
     ClusterSettings, SpreadCounts, SpreadTasks, SpreadWorker, TASK_HEADER, TaskLease, WORKER_FIGURES_PATH,
-    WorkerCluster, WorkerFigures, WorkerIdentity, WorkerLink, WorkerStatus, WorkerToken, WorkerTrust,
+    WorkerCluster, WorkerFigures, WorkerIdentity, WorkerLink, WorkerStatus, WorkerToken, WorkerTrust, is_loopback_url,
 };
 pub use statement_bounds::check_statement_bounds;
 pub use syntax_walk::{walk_expr, walk_statement};

@@ -15,7 +15,7 @@ pub struct SelfSigned {
     pub key: String,
 }
 
-/// Who shows a certificate.
+/// The side that shows a certificate.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum CertificateUse {
     /// A server of the names and addresses.

@@ -1,4 +1,4 @@
-//! What a client of Arrow Flight SQL sends: the preface of HTTP/2, and frames.
+//! Bytes of a client of Arrow Flight SQL: the preface of HTTP/2, and frames.
 #![no_main]
 
 use std::sync::LazyLock;

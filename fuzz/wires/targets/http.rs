@@ -1,4 +1,4 @@
-//! What a client of HTTP sends: one request or more.
+//! Bytes of a client of HTTP: one request or more.
 #![no_main]
 
 use std::sync::LazyLock;

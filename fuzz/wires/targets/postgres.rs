@@ -1,4 +1,4 @@
-//! What a client of Postgres' protocol sends, from its startup packet on.
+//! Bytes of a client of Postgres' protocol, from its startup packet on.
 #![no_main]
 
 use std::sync::LazyLock;

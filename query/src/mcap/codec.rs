@@ -18,7 +18,7 @@ use prost::Message;
 use super::chunk::PieceKind;
 use super::file::{Files, Piece};
 use super::rows::{Head, Mapping};
-use super::scan::{McapExec, Read, Scan};
+use super::scan::{FileRead, McapExec, Scan};
 use super::schema::{Layout, RawSchema};
 use super::table::{LARGEST_SCHEMA, Parts, Source};
 use super::target::EXTENSION;
@@ -173,7 +173,7 @@ impl ScanMessage {
         let parts = &scan.parts;
         let mappings = parts.mappings.as_deref().unwrap_or_default();
         let partition =
-            |reads: &Vec<Read>| PartitionMessage { reads: reads.iter().map(ReadMessage::from_read).collect() };
+            |reads: &Vec<FileRead>| PartitionMessage { reads: reads.iter().map(ReadMessage::from_read).collect() };
         Ok(Self {
             name: parts.name.clone(),
             is_raw: parts.mappings.is_none(),
@@ -278,7 +278,7 @@ impl MappingMessage {
 }
 
 impl ReadMessage {
-    fn from_read(read: &Read) -> Self {
+    fn from_read(read: &FileRead) -> Self {
         let piece = |piece: &Piece| PieceMessage {
             start: piece.range.start,
             end: piece.range.end,
@@ -288,7 +288,7 @@ impl ReadMessage {
     }
 
     // Of one of so many sources.
-    fn into_read(self, sources: usize) -> Result<Read> {
+    fn into_read(self, sources: usize) -> Result<FileRead> {
         let pieces: Vec<_> = self.pieces.into_iter().map(PieceMessage::into_piece).collect();
         let is_ordered = pieces.windows(2).all(|pair| pair[0].range.end <= pair[1].range.start);
         let range = match (pieces.first(), pieces.last()) {
@@ -298,7 +298,7 @@ impl ReadMessage {
         if self.source as usize >= sources || !is_ordered || pieces.iter().any(|piece| piece.range.is_empty()) {
             return Err(wrong("its pieces are not in the order of a file"));
         }
-        Ok(Read { source: self.source as usize, range, pieces })
+        Ok(FileRead { source: self.source as usize, range, pieces })
     }
 }
 

@@ -56,7 +56,7 @@ pub(super) struct Scan {
 #[derive(Debug)]
 pub(crate) struct McapExec {
     scan: Arc<Scan>,
-    partitions: Vec<Vec<Read>>,
+    partitions: Vec<Vec<FileRead>>,
     /// Pieces that need not be read.
     pruned: usize,
     properties: Arc<PlanProperties>,
@@ -65,7 +65,7 @@ pub(crate) struct McapExec {
 
 /// Bytes of one file that are fetched at once, and the pieces in them.
 #[derive(Debug, Clone)]
-pub(super) struct Read {
+pub(super) struct FileRead {
     pub(super) source: usize,
     pub(super) range: Range<u64>,
     pub(super) pieces: Vec<Piece>,
@@ -75,7 +75,7 @@ pub(super) struct Read {
 #[derive(Debug, Clone)]
 pub(crate) struct RunPiece {
     path: Path,
-    read: Read,
+    read: FileRead,
 }
 
 impl RunPiece {
@@ -96,7 +96,7 @@ impl McapExec {
         let count = pieces.len();
         let bytes: u64 = pieces.iter().map(|(_, p)| p.range.end - p.range.start).sum();
         let share = bytes.div_ceil(most.max(1) as u64).max(1);
-        let mut partitions: Vec<Vec<Read>> = vec![Vec::new()];
+        let mut partitions: Vec<Vec<FileRead>> = vec![Vec::new()];
         let mut taken = 0;
         for (source, piece) in pieces {
             if taken >= share {
@@ -112,7 +112,7 @@ impl McapExec {
     }
 
     /// A plan of these partitions, which leave out so many pieces.
-    pub(super) fn of_partitions(scan: Arc<Scan>, partitions: Vec<Vec<Read>>, pruned: usize) -> Self {
+    pub(super) fn of_partitions(scan: Arc<Scan>, partitions: Vec<Vec<FileRead>>, pruned: usize) -> Self {
         let properties = PlanProperties::new(
             EquivalenceProperties::new(scan.schema.clone()),
             Partitioning::UnknownPartitioning(partitions.len()),
@@ -129,7 +129,7 @@ impl McapExec {
         &self.scan
     }
 
-    pub(super) fn partitions(&self) -> &[Vec<Read>] {
+    pub(super) fn partitions(&self) -> &[Vec<FileRead>] {
         &self.partitions
     }
 
@@ -146,7 +146,7 @@ impl McapExec {
     /// Returns the parts that it reads.
     pub(crate) fn pieces(&self) -> Vec<RunPiece> {
         let piece =
-            |read: &Read| RunPiece { path: self.scan.parts.sources[read.source].path.clone(), read: read.clone() };
+            |read: &FileRead| RunPiece { path: self.scan.parts.sources[read.source].path.clone(), read: read.clone() };
         self.partitions.iter().flatten().map(piece).collect()
     }
 
@@ -158,8 +158,8 @@ impl McapExec {
 }
 
 // To the last read, where the piece is near enough, or as another one.
-fn add(reads: &mut Vec<Read>, source: usize, piece: Piece) {
-    let near = |r: &&mut Read| {
+fn add(reads: &mut Vec<FileRead>, source: usize, piece: Piece) {
+    let near = |r: &&mut FileRead| {
         let gap = piece.range.start.checked_sub(r.range.end);
         r.source == source && gap.is_some_and(|gap| gap <= GAP) && piece.range.end - r.range.start <= READ
     };
@@ -168,7 +168,7 @@ fn add(reads: &mut Vec<Read>, source: usize, piece: Piece) {
             read.range.end = piece.range.end;
             read.pieces.push(piece);
         }
-        None => reads.push(Read { source, range: piece.range.clone(), pieces: vec![piece] }),
+        None => reads.push(FileRead { source, range: piece.range.clone(), pieces: vec![piece] }),
     }
 }
 
@@ -248,8 +248,12 @@ impl ExecutionPlan for McapExec {
 }
 
 // The next ones are on their way while one is decoded.
-fn fetch(parts: Arc<Parts>, reads: Vec<Read>, bytes_read: Count) -> BoxStream<'static, Result<(Read, Bytes), Fault>> {
-    let one = move |read: Read| {
+fn fetch(
+    parts: Arc<Parts>,
+    reads: Vec<FileRead>,
+    bytes_read: Count,
+) -> BoxStream<'static, Result<(FileRead, Bytes), Fault>> {
+    let one = move |read: FileRead| {
         let (parts, bytes_read) = (parts.clone(), bytes_read.clone());
         async move {
             let path = &parts.sources[read.source].path;
@@ -269,7 +273,7 @@ fn fetch(parts: Arc<Parts>, reads: Vec<Read>, bytes_read: Count) -> BoxStream<'s
 /// One partition on its way.
 struct Scanner {
     scan: Arc<Scan>,
-    reads: BoxStream<'static, Result<(Read, Bytes), Fault>>,
+    reads: BoxStream<'static, Result<(FileRead, Bytes), Fault>>,
     fetched: Option<Fetched>,
     current: Option<Current>,
     rows: Rows,

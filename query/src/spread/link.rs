@@ -56,7 +56,7 @@ impl fmt::Debug for WorkerTrust {
 impl WorkerLink {
     /// Returns why a worker's address is not connected to; None if it is. Plans name addresses, too.
     pub(super) fn refusal(&self, url: &Url) -> Option<String> {
-        if self.token.is_none() && !is_loopback(url) {
+        if self.token.is_none() && !is_loopback_url(url) {
             return Some(format!("`{url}` is not of this machine, and there is no token"));
         }
         match url.scheme() {
@@ -64,14 +64,14 @@ impl WorkerLink {
                 Some(format!("`{url}` is encrypted, and no certificate is trusted here"))
             }
             "https" => None,
-            _ if is_loopback(url) || self.is_private => None,
+            _ if is_loopback_url(url) || self.is_private => None,
             _ => Some(format!("`{url}` is not of this machine, and not encrypted")),
         }
     }
 }
 
 /// Returns whether a URL is of this machine, whatever a resolver says.
-pub(super) fn is_loopback(url: &Url) -> bool {
+pub fn is_loopback_url(url: &Url) -> bool {
     match url.host() {
         Some(Host::Ipv4(address)) => address.is_loopback(),
         Some(Host::Ipv6(address)) => address.is_loopback(),
@@ -98,7 +98,7 @@ mod tests {
             ("http://10.0.0.7:7070", false),
             ("http://[2001:db8::1]:7070", false),
         ] {
-            assert_eq!(is_loopback(&url(text)), is_own, "{text}");
+            assert_eq!(is_loopback_url(&url(text)), is_own, "{text}");
         }
     }
 

@@ -23,7 +23,7 @@ pub use cluster::{ClusterSettings, SpreadCounts, WorkerCluster, WorkerStatus};
 pub use figures::{WORKER_FIGURES_PATH, WorkerFigures};
 pub use guard::{SpreadTasks, TASK_HEADER, TaskLease};
 pub use identity::{WorkerIdentity, WorkerToken};
-pub use link::{WorkerLink, WorkerTrust};
+pub use link::{WorkerLink, WorkerTrust, is_loopback_url};
 pub(crate) use loss::WorkerLoss;
 pub use worker::SpreadWorker;
 

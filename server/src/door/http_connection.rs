@@ -1,4 +1,4 @@
-//! What connections of both versions of HTTP have in common.
+//! Connections of HTTP, of both of its versions.
 
 use std::pin::{Pin, pin};
 use std::sync::Arc;

@@ -9,7 +9,8 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 use chrono::Utc;
-use url::{Host, Url};
+use echolake_query::is_loopback_url;
+use url::Url;
 
 use crate::Error;
 use provider_keys::ProviderKeys;
@@ -150,15 +151,9 @@ fn user_name(claims: &TokenClaims, claim: &str) -> Result<String, String> {
 // Keys that came over plain text would be anybody's.
 fn check_address(address: &str) -> Result<Url, String> {
     let url = Url::parse(address).map_err(|e| format!("it is no address: {e}"))?;
-    let is_local = match url.host() {
-        Some(Host::Domain(name)) => name == "localhost",
-        Some(Host::Ipv4(ip)) => ip.is_loopback(),
-        Some(Host::Ipv6(ip)) => ip.is_loopback(),
-        None => false,
-    };
     match url.scheme() {
         "https" => Ok(url),
-        "http" if is_local => Ok(url),
+        "http" if is_loopback_url(&url) => Ok(url),
         other => Err(format!("it is {other}, expected https")),
     }
 }

@@ -4,8 +4,8 @@ use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 
 use echolake_lake::Lake;
-use echolake_query::{ClusterSettings, WorkerCluster, WorkerLink};
-use url::{Host, Url};
+use echolake_query::{ClusterSettings, WorkerCluster, WorkerLink, is_loopback_url};
+use url::Url;
 
 use super::access::check_address;
 use super::identity::worker_identity;
@@ -39,7 +39,7 @@ impl EngineWorkers {
     ) -> Result<Self, Error> {
         let urls: Vec<_> = addresses.iter().map(|given| parse_address(given)).collect::<Result<_, _>>()?;
         for url in &urls {
-            check_address(&link, url.as_str(), is_loopback(url), is_encrypted(url))?;
+            check_address(&link, url.as_str(), is_loopback_url(url), is_encrypted(url))?;
         }
         if authorities.is_some() || urls.iter().any(is_encrypted) {
             link.trust = Some(read_worker_trust(authorities)?);
@@ -101,15 +101,6 @@ fn parse_address(given: &str) -> Result<Url, Error> {
 
 fn is_encrypted(url: &Url) -> bool {
     url.scheme() == "https"
-}
-
-fn is_loopback(url: &Url) -> bool {
-    match url.host() {
-        Some(Host::Ipv4(address)) => address.is_loopback(),
-        Some(Host::Ipv6(address)) => address.is_loopback(),
-        Some(Host::Domain(name)) => name == "localhost",
-        None => false,
-    }
 }
 
 #[cfg(test)]

@@ -13,7 +13,8 @@ pub(super) struct ProjectAttempt {
     pub(super) is_exact: bool,
 }
 
-const TABLES: [&str; 14] = [
+/// Tables and views that have rows of runs.
+pub(super) const TABLES: [&str; 14] = [
     "surfaces",
     "runs",
     "measurements",

@@ -1,4 +1,4 @@
-//! What the operations page asks: the server's own tables by SQL, and its figures as Prometheus gets them.
+//! Queries of the operations page: the server's own tables by SQL, and its figures as Prometheus gets them.
 import { figures, sql } from './api'
 
 /** Begins each statement of the page, so that its list of queries can leave them out. */
