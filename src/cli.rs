@@ -147,6 +147,12 @@ impl CliArguments {
         }
     }
 
+    /// Returns whether the command has clients of its own, whose requests are spans.
+    #[cfg(feature = "otlp")]
+    pub(crate) fn answers_clients(&self) -> bool {
+        matches!(&self.command, CliCommand::Lake(LakeCommand::Serve(args)) if !args.is_worker())
+    }
+
     /// Runs the command.
     pub(crate) async fn run(self) -> anyhow::Result<CommandOutcome> {
         let lake = &self.lake;

@@ -4,7 +4,7 @@ use tracing::Level;
 use tracing_subscriber::filter::Targets;
 use tracing_subscriber::layer::SubscriberExt as _;
 use tracing_subscriber::util::SubscriberInitExt as _;
-use tracing_subscriber::{Layer as _, fmt};
+use tracing_subscriber::{Layer, Registry, fmt};
 
 /// The variable that sets the format; `serve` and `ingest` pass it to their child processes.
 pub(crate) const FORMAT_VARIABLE: &str = "ECHOLAKE_LOG_FORMAT";
@@ -26,8 +26,11 @@ pub(crate) enum LogFormat {
     Json,
 }
 
-/// Starts the log of this process. To be called once.
-pub(crate) fn start_log(format: LogFormat) {
+/// A layer below the log's levels.
+pub(crate) type LogLayer = Box<dyn Layer<Registry> + Send + Sync>;
+
+/// Starts the log of this process, with another layer for its spans. To be called once.
+pub(crate) fn start_log(format: LogFormat, spans: Option<LogLayer>) {
     #[cfg(feature = "lake")]
     let _ = FORMAT.set(format);
     let given = std::env::var(LEVELS_VARIABLE).unwrap_or_default();
@@ -40,7 +43,7 @@ pub(crate) fn start_log(format: LogFormat) {
         LogFormat::Text => lines.boxed(),
         LogFormat::Json => lines.json().boxed(),
     };
-    tracing_subscriber::registry().with(levels).with(lines).init();
+    tracing_subscriber::registry().with(spans).with(levels).with(lines).init();
     if let Some(refused) = refused {
         tracing::warn!("{LEVELS_VARIABLE} is not as `{DEFAULT_LEVELS}`: {refused}");
     }

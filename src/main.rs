@@ -9,6 +9,8 @@ mod error_text;
 mod logging;
 mod progress;
 mod signals;
+#[cfg(feature = "otlp")]
+mod span_export;
 
 use std::process::ExitCode;
 
@@ -39,7 +41,6 @@ const DONE_WITH_LOSS: u8 = 3;
 fn main() -> ExitCode {
     // clap itself ends with 2 on wrong usage.
     let cli = cli::CliArguments::parse();
-    logging::start_log(cli.log_format);
     let runtime = || {
         tokio::runtime::Builder::new_multi_thread()
             .enable_all()
@@ -49,7 +50,7 @@ fn main() -> ExitCode {
             .max_blocking_threads(BLOCKING_THREADS)
             .build()
     };
-    let outcome = cli.confine().and_then(|()| Ok(runtime()?)).and_then(|runtime| runtime.block_on(cli.run()));
+    let outcome = cli.confine().and_then(|()| Ok(runtime()?)).and_then(|runtime| runtime.block_on(run(cli)));
     match outcome {
         Ok(CommandOutcome::Whole) => ExitCode::SUCCESS,
         Ok(CommandOutcome::WithLoss) => ExitCode::from(DONE_WITH_LOSS),
@@ -59,6 +60,17 @@ fn main() -> ExitCode {
             ExitCode::from(FAILED)
         }
     }
+}
+
+async fn run(cli: cli::CliArguments) -> anyhow::Result<CommandOutcome> {
+    #[cfg(feature = "otlp")]
+    let export = if cli.answers_clients() { span_export::SpanExport::start()? } else { None };
+    #[cfg(feature = "otlp")]
+    let spans = export.as_ref().map(span_export::SpanExport::layer);
+    #[cfg(not(feature = "otlp"))]
+    let spans = None;
+    logging::start_log(cli.log_format, spans);
+    cli.run().await
 }
 
 // The reader that closed the pipe wants no more.

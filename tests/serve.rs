@@ -17,6 +17,8 @@ pub(crate) mod postgres;
 mod projects;
 pub(crate) mod server;
 mod slices;
+#[allow(dead_code, reason = "campaigns want the rest")]
+pub(crate) mod tunnel;
 mod watched;
 mod workers;
 
@@ -344,14 +346,24 @@ mod slow {
 
     use crate::ECHOLAKE;
     use crate::fuzz::{FuzzCampaign, FuzzTarget};
+    use crate::serve::server::ServedLake;
 
     // Long form: campaign `fuzz`.
     #[test]
     fn changed_input_harms_nothing() {
         for target in FuzzTarget::ALL {
-            let mut campaign = FuzzCampaign::new(Path::new(ECHOLAKE), 1);
-            let outcome = campaign.throw(target, &mut |so_far| so_far.rounds < 100);
-            assert!(outcome.answered > 0, "{}: some are right all the same", target.name());
+            throw(target, ServedLake::start);
         }
+    }
+
+    #[test]
+    fn changed_bytes_in_encrypted_connections_harm_nothing() {
+        throw(FuzzTarget::Wire, ServedLake::start_encrypted);
+    }
+
+    fn throw(target: FuzzTarget, serve: fn(&Path, &Path, &[&str]) -> ServedLake) {
+        let mut campaign = FuzzCampaign::new(Path::new(ECHOLAKE), 1, serve);
+        let outcome = campaign.throw(target, &mut |so_far| so_far.rounds < 100);
+        assert!(outcome.answered > 0, "{}: some are right all the same", target.name());
     }
 }

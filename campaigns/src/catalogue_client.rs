@@ -7,10 +7,10 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use anyhow::{Context as _, Result};
-use tokio_rustls::rustls::crypto::ring;
-use tokio_rustls::rustls::pki_types::pem::PemObject as _;
-use tokio_rustls::rustls::pki_types::{CertificateDer, ServerName};
-use tokio_rustls::rustls::{ClientConfig, ClientConnection, RootCertStore, StreamOwned};
+use tokio_rustls::rustls::pki_types::ServerName;
+use tokio_rustls::rustls::{ClientConfig, ClientConnection, StreamOwned};
+
+use crate::serve::tunnel::{CERTIFIED_NAME, trusting_config};
 
 /// Time limit for the next bytes of an answer.
 const ANSWER_LIMIT: Duration = Duration::from_secs(60);
@@ -57,14 +57,7 @@ impl CatalogueServer {
     /// # Errors
     /// The file is no certificate.
     pub(crate) fn with_certificate(mut self, certificate: &Path) -> Result<Self> {
-        let read = || format!("`{}` is no certificate as PEM", certificate.display());
-        let mut roots = RootCertStore::empty();
-        roots.add(CertificateDer::from_pem_file(certificate).with_context(read)?).with_context(read)?;
-        let config = ClientConfig::builder_with_provider(Arc::new(ring::default_provider()))
-            .with_safe_default_protocol_versions()?
-            .with_root_certificates(roots)
-            .with_no_client_auth();
-        self.encryption = Some(Arc::new(config));
+        self.encryption = Some(Arc::new(trusting_config(certificate)?));
         Ok(self)
     }
 
@@ -79,7 +72,7 @@ impl CatalogueServer {
         let stream: Box<dyn ByteStream> = match &self.encryption {
             None => Box::new(stream),
             Some(config) => {
-                let name = ServerName::try_from("localhost")?;
+                let name = ServerName::try_from(CERTIFIED_NAME)?;
                 Box::new(StreamOwned::new(ClientConnection::new(config.clone(), name)?, stream))
             }
         };

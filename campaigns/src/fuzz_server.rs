@@ -7,6 +7,7 @@ use std::time::{Duration, Instant};
 use anyhow::Result;
 
 use super::fuzz::{FuzzCampaign, FuzzTarget};
+use crate::serve::server::ServedLake;
 
 /// Between two lines about how far it is.
 const TELL_EVERY: Duration = Duration::from_secs(30);
@@ -33,7 +34,7 @@ pub(crate) fn run(args: &FuzzArgs) -> Result<()> {
     let FuzzArgs { target, seconds, seed } = *args;
     let binary = super::echolake_path()?;
     let (begun, mut told) = (Instant::now(), Instant::now());
-    let outcome = FuzzCampaign::new(&binary, seed).throw(target, &mut |so_far| {
+    let outcome = FuzzCampaign::new(&binary, seed, ServedLake::start).throw(target, &mut |so_far| {
         if told.elapsed() > TELL_EVERY {
             told = Instant::now();
             // Progress is not worth an error.

@@ -40,6 +40,7 @@ mod readers;
 mod serve {
     pub(crate) mod http;
     pub(crate) mod server;
+    pub(crate) mod tunnel;
 }
 mod slices;
 mod workers;

@@ -30,6 +30,8 @@ mod metrics;
 mod oidc;
 mod postgres;
 mod request_span;
+#[cfg(feature = "otlp")]
+mod request_trace;
 mod running;
 mod scram_verifier;
 mod service;

@@ -35,6 +35,8 @@ pub(crate) fn begin_request(headers: &mut HeaderMap, protocol: ServerProtocol) -
     let (request_id, protocol) = (id.to_str().unwrap_or_default(), protocol.name());
     let span =
         tracing::error_span!("request", number, request_id, trace = field::Empty, protocol, client = field::Empty);
+    #[cfg(feature = "otlp")]
+    crate::request_trace::join_trace(&span, headers);
     if let Some(trace) = trace_id(headers) {
         span.record("trace", trace);
     }

@@ -263,6 +263,12 @@ impl ServeArgs {
         confinement::confine_worker(readable, &own).context("the worker cannot be confined")
     }
 
+    /// Returns whether it has no clients but servers.
+    #[cfg(feature = "otlp")]
+    pub(crate) fn is_worker(&self) -> bool {
+        self.worker.is_some()
+    }
+
     fn worker_temp(&self) -> PathBuf {
         self.temp.clone().unwrap_or_else(std::env::temp_dir)
     }

@@ -72,8 +72,8 @@ pub(crate) struct FuzzCampaign {
 }
 
 impl FuzzCampaign {
-    /// Measures a surface, ingests it, and serves the lake.
-    pub(crate) fn new(binary: &Path, seed: u64) -> Self {
+    /// Measures a surface, ingests it, and serves the lake by [`ServedLake::start`] or its like.
+    pub(crate) fn new(binary: &Path, seed: u64, serve: fn(&Path, &Path, &[&str]) -> ServedLake) -> Self {
         let folder = tempfile::tempdir().expect("a folder");
         let path = |name: &str| folder.path().join(name);
         std::fs::write(path("rig.toml"), SMALL_RIG).expect("written");
@@ -91,7 +91,7 @@ impl FuzzCampaign {
         let entry = String::from_utf8(made.stdout).expect("text");
         let named = entry.split("seconds").next().expect("who it is");
         std::fs::write(path("tokens.toml"), format!("{named}{LIMITS}")).expect("written");
-        let server = ServedLake::start(binary, folder.path(), &["--tokens", "tokens.toml", "--memory", "1000"]);
+        let server = serve(binary, folder.path(), &["--tokens", "tokens.toml", "--memory", "1000"]);
         let file = run_file(&path("lake/runs/flat"));
         let bytes = std::fs::read(file).expect("a run");
         Self { server, token, random: ChaCha8Rng::seed_from_u64(seed), run: bytes, folder }

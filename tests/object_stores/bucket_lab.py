@@ -369,7 +369,16 @@ class ServerConnection:
 
     def sql(self, query):
         """Returns a query's answer as CSV."""
-        self.http.request("POST", "/api/v1/sql?format=csv", query.encode(), {"content-type": "application/sql"})
+        return self._ask(query, "csv")
+
+    def schema(self, query):
+        """Returns the schema of a query's answer, as the bytes of its message in Arrow's stream."""
+        stream = self._ask(query, "arrow")
+        # After a mark of four bytes, the length of the message.
+        return stream[8 : 8 + int.from_bytes(stream[4:8], "little")]
+
+    def _ask(self, query, form):
+        self.http.request("POST", f"/api/v1/sql?format={form}", query.encode(), {"content-type": "application/sql"})
         return self._body(query)
 
     def _body(self, asked):

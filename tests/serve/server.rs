@@ -5,14 +5,20 @@ use std::path::Path;
 use std::process::Command;
 use std::time::Duration;
 
-use super::super::child::ChildProcess;
+use super::super::child::{ChildProcess, run_command};
+use super::tunnel::{CERTIFIED_NAME, ServerTunnels, TunnelOpening};
 
 /// Time for which a client waits for the next bytes of an answer, or until it may send more of a request.
 pub(crate) const ANSWER_LIMIT: Duration = Duration::from_secs(120);
 
+/// The variable by which servers have certificates, and their clients are encrypted: campaigns and tests with TLS.
+const ENCRYPTED_VARIABLE: &str = "ECHOLAKE_ENCRYPTED";
+
 /// A server; dropping it ends it.
 pub(crate) struct ServedLake {
     child: ChildProcess,
+    /// What its addresses lead through if it is encrypted.
+    _tunnels: Option<ServerTunnels>,
     /// `host:port` of each protocol.
     pub(crate) http: String,
     pub(crate) flight_sql: String,
@@ -22,6 +28,35 @@ pub(crate) struct ServedLake {
 impl ServedLake {
     /// Serves the lake `lake` of a folder.
     pub(crate) fn start(binary: &Path, folder: &Path, more: &[&str]) -> Self {
+        if std::env::var_os(ENCRYPTED_VARIABLE).is_some() {
+            return Self::start_encrypted(binary, folder, more);
+        }
+        Self::start_in(binary, folder, more)
+    }
+
+    /// Serves it with a certificate; the addresses are those of tunnels, which encrypt what clients send.
+    pub(crate) fn start_encrypted(binary: &Path, folder: &Path, more: &[&str]) -> Self {
+        // A server that is started again keeps its certificate.
+        if !folder.join("tls").exists() {
+            let mut command = Command::new(binary);
+            let made = run_command(command.args(["certificate", CERTIFIED_NAME, "-o", "tls"]).current_dir(folder));
+            assert!(made.is_ok_and(|made| made.status.success()), "a certificate");
+        }
+        let encrypted = ["--certificate", "tls/certificate.pem", "--key", "tls/key.pem"];
+        let mut served = Self::start_in(binary, folder, &[&encrypted, more].concat());
+        let tunnels = ServerTunnels::new(&folder.join("tls/certificate.pem")).expect("tunnels");
+        for (address, opening) in [
+            (&mut served.http, TunnelOpening::Http),
+            (&mut served.flight_sql, TunnelOpening::FlightSql),
+            (&mut served.postgres, TunnelOpening::Postgres),
+        ] {
+            *address = tunnels.open(std::mem::take(address), opening).expect("a port");
+        }
+        served._tunnels = Some(tunnels);
+        served
+    }
+
+    fn start_in(binary: &Path, folder: &Path, more: &[&str]) -> Self {
         let mut command = Command::new(binary);
         command.args(["--lake", "lake"]).current_dir(folder).env_remove("ECHOLAKE_LAKE");
         Self::start_command(&mut command, more)
@@ -42,7 +77,7 @@ impl ServedLake {
             rest.split('/').next().expect("host and port").to_owned()
         };
         let (http, flight_sql, postgres) = (address("  http"), address("  grpc"), address("  postgresql"));
-        Self { child, http, flight_sql, postgres }
+        Self { child, _tunnels: None, http, flight_sql, postgres }
     }
 
     /// A connection to one of its addresses, on which nothing is waited for without a limit.
