@@ -258,8 +258,6 @@ impl ServeArgs {
         if self.certificate.is_some() || self.worker_ca.is_some() {
             readable.extend(worker_trust_files(self.worker_ca.as_deref()));
         }
-        // Its checksum is taken.
-        readable.extend(std::env::current_exe());
         confinement::confine_worker(readable, &own).context("the worker cannot be confined")
     }
 

@@ -36,7 +36,7 @@ pub fn missing() -> Option<&'static str> {
     )
 }
 
-/// Lets the process read `lake` and the files `trusted`, read and write `own` folders, and nothing else; connect over TCP
+/// Lets the process read `lake`, the files `trusted` and its own program, read and write `own` folders, and nothing else; connect over TCP
 /// to the ports of `workers` alone. To be called before there are threads. A kernel without Landlock leaves the process as it is.
 ///
 /// # Errors
@@ -77,6 +77,8 @@ pub fn confine_to_store(store: &RemoteAccess, own: &[&Path], workers: &[u16]) ->
 fn confine(readable: &[PathBuf], own: &[&Path], ports: Option<&[u16]>) -> io::Result<()> {
     let connections = ports.unwrap_or(&[]).iter();
     let connections = connections.map(|port| Ok::<_, RulesetError>(NetPort::new(*port, AccessNet::ConnectTcp)));
+    // The names of its functions, for the place of a panic in the log.
+    let program = std::env::current_exe();
     let ruleset = || -> Result<RulesetCreated, RulesetError> {
         let read = AccessFs::from_read(LANDLOCK) & !AccessFs::Execute;
         let mut handled = Ruleset::default().handle_access(AccessFs::from_all(LANDLOCK))?;
@@ -87,6 +89,7 @@ fn confine(readable: &[PathBuf], own: &[&Path], ports: Option<&[u16]>) -> io::Re
             .create()?
             .add_rules(path_beneath_rules(readable, read))?
             .add_rules(path_beneath_rules(SYSTEM, read))?
+            .add_rules(path_beneath_rules(program.as_ref(), read))?
             .add_rules(path_beneath_rules(own, AccessFs::from_all(LANDLOCK)))?
             .add_rules(connections)
     };

@@ -56,6 +56,71 @@ impl FrameHeader {
             false => Err(RequestFault::TooLarge { limit }),
         }
     }
+
+    /// Checks that the parts of a client's message, all of which is there, are within it: the library that decodes it panics if
+    /// they are not.
+    ///
+    /// # Errors
+    /// [`RequestFault::Request`].
+    pub(super) fn check_parts(self, message: &[u8]) -> Result<(), RequestFault> {
+        let body = message.get(HEADER..).unwrap_or_default();
+        let kind = char::from(self.kind);
+        let wrong = || RequestFault::request(format!("a message of the type `{kind}` that ends before its last part"));
+        MessageParts(body).skip_all(self.kind).ok_or_else(wrong)
+    }
+}
+
+/// The rest of a message's body.
+struct MessageParts<'a>(&'a [u8]);
+
+impl MessageParts<'_> {
+    fn skip_all(mut self, kind: u8) -> Option<()> {
+        match kind {
+            b'Q' => self.skip_text(),
+            b'D' | b'C' => {
+                self.skip(1)?;
+                self.skip_text()
+            }
+            b'E' => {
+                self.skip_text()?;
+                self.skip(4)
+            }
+            b'P' => {
+                self.skip_text()?;
+                self.skip_text()?;
+                self.skip_numbers(4)
+            }
+            b'B' => {
+                self.skip_text()?;
+                self.skip_text()?;
+                self.skip_numbers(2)?;
+                for _ in 0..self.0.try_get_u16().ok()? {
+                    // A negative length is that of a null.
+                    let bytes = usize::try_from(self.0.try_get_i32().ok()?).unwrap_or(0);
+                    self.skip(bytes)?;
+                }
+                self.skip_numbers(2)
+            }
+            _ => Some(()),
+        }
+    }
+
+    // Up to and with the zero byte.
+    fn skip_text(&mut self) -> Option<()> {
+        let end = self.0.iter().position(|byte| *byte == 0)?;
+        self.skip(end + 1)
+    }
+
+    // A count, and so many numbers.
+    fn skip_numbers(&mut self, bytes_each: usize) -> Option<()> {
+        let count = self.0.try_get_u16().ok()?;
+        self.skip(usize::from(count) * bytes_each)
+    }
+
+    fn skip(&mut self, bytes: usize) -> Option<()> {
+        self.0 = self.0.get(bytes..)?;
+        Some(())
+    }
 }
 
 /// A failure that leaves the connection open.
@@ -166,6 +231,29 @@ mod tests {
         assert!(check(b'Q', 2 << 20).is_ok() && check(b'B', 4 << 20).is_err() && check(b'S', 4).is_ok());
         for (kind, length) in [(b'Q', 0x3fff_fff0), (b'P', i32::MAX), (b'E', 5000), (b'!', 4), (b'd', 1 << 20)] {
             assert!(check(kind, length).is_err(), "{kind} {length}");
+        }
+    }
+
+    #[test]
+    fn a_message_that_ends_early_is_refused() {
+        let parse = b"s\0select $1, $2\0\0\x02\0\0\0\x17\0\0\0\x17";
+        let bind = b"p\0s\0\0\x01\0\x01\0\x02\0\0\0\x01x\xff\xff\xff\xff\0\x01\0\x01";
+        for (kind, body) in [
+            (b'Q', &b"select 1\0"[..]),
+            (b'D', b"Ss\0"),
+            (b'C', b"Pp\0"),
+            (b'E', b"p\0\0\0\0\x02"),
+            (b'P', parse),
+            (b'B', bind),
+        ] {
+            let check = |body: &[u8]| {
+                let message = [&[kind, 0, 0, 0, 0], body].concat();
+                FrameHeader { kind, bytes: message.len() }.check_parts(&message)
+            };
+            assert!(check(body).is_ok(), "{kind}");
+            for end in 0..body.len() {
+                assert!(check(&body[..end]).is_err(), "{kind} {end}");
+            }
         }
     }
 
