@@ -69,14 +69,17 @@ impl ServerTunnels {
         }
         let connector = TlsConnector::from(Arc::new(config));
         let runtime = self.runtime.as_ref().context("the tunnels are closed")?;
-        let listener = runtime.block_on(TcpListener::bind("127.0.0.1:0"))?;
+        let listener = std::net::TcpListener::bind("127.0.0.1:0")?;
+        listener.set_nonblocking(true)?;
         let address = listener.local_addr()?.to_string();
         runtime.spawn(async move {
+            let listener = TcpListener::from_std(listener)?;
             while let Ok((client, _)) = listener.accept().await {
                 let (connector, target) = (connector.clone(), target.clone());
                 // A connection that fails is one that ends, for its client.
                 tokio::spawn(async move { forward(client, &target, opening, &connector).await });
             }
+            io::Result::Ok(())
         });
         Ok(address)
     }
