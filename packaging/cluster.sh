@@ -4,7 +4,7 @@
 set -eu
 count=${1:?hint: packaging/cluster.sh 4}
 shift
-program=${ECHOLAKE:-target/release/echolake}
+program=${ECHOLAKE:-${CARGO_TARGET_DIR:-target}/release/echolake}
 [ -x "$program" ] || { echo "error: $program is missing; hint: cargo build --release" >&2; exit 1; }
 folder=$(mktemp -d)
 pids=
