@@ -2,9 +2,8 @@
 """Asks a server that sends its spans to a collector of this check: `check_traces.py ECHOLAKE`.
 
 ECHOLAKE was built with `--features otlp`. It makes a small lake, serves it, and asks over HTTP with a trace of its own and
-without one, and over Postgres' protocol. Each request must be one span of its client's trace, or of
-a new one, which its answer's line in the log names, too; no text of a statement may be in a span; and without a collector
-answers must come all the same. Needs grpcio and opentelemetry-proto from PyPI.
+without one, and over Postgres' protocol. Each request must be one span of its client's trace, or of a new one, which its line
+in the log names, too; no text of a statement may be in a span; and without a collector answers must come all the same. Needs grpcio and opentelemetry-proto from PyPI.
 """
 import concurrent.futures
 import http.client
