@@ -3,7 +3,8 @@
 
 ECHOLAKE was built with `--features otlp`. It makes a small lake, serves it, and asks over HTTP with a trace of its own and
 without one, and over Postgres' protocol. Each request must be one span of its client's trace, or of a new one, which its line
-in the log names, too; no text of a statement may be in a span; and without a collector answers must come all the same. Needs grpcio and opentelemetry-proto from PyPI.
+in the log names, too; no text of a statement may be in a span; and without a collector answers must come all the same.
+Needs grpcio and opentelemetry-proto from PyPI.
 """
 import concurrent.futures
 import http.client
@@ -128,7 +129,7 @@ def check(program, folder, checks):
     with TracedServer(program, folder, collector.url) as server:
         begun = time.monotonic()
         checks.same("without a collector, a request is answered", 200, lambda: server.ask(SQL)[0])
-        checks.holds("at once", lambda: time.monotonic() - begun, lambda took: took < SENT_WITHIN_SECONDS)
+        checks.holds("within 30 s", lambda: time.monotonic() - begun, lambda took: took < SENT_WITHIN_SECONDS)
     checks.holds("and the log says what was not sent", server.log.read_text, lambda text: "pentelemetry" in text)
 
 

@@ -114,7 +114,7 @@ class LakeStore:
         self.address = settings["AWS_ENDPOINT_URL"].removeprefix("http://")
 
     @classmethod
-    def of_folder(cls, lake, stack):
+    def from_folder(cls, lake, stack):
         """Starts the simulated server."""
         command = [sys.executable, str(lab.HERE / "s3_folder.py"), str(lake.parent), "--listen", "0"]
         server = stack.enter_context(subprocess.Popen(command, stdout=subprocess.PIPE, text=True))
@@ -126,7 +126,7 @@ class LakeStore:
         return cls(settings, "folder", lake.name)
 
     @classmethod
-    def of_ceph(cls, lake):
+    def copied_to_ceph(cls, lake):
         """Starts Ceph's gateway, and copies what queries read."""
         settings = lab.Gateway().start()
         bucket, prefix = lab.Bucket(settings), f"workers-{os.getpid()}"
@@ -289,7 +289,7 @@ def is_number(text):
 def main(args):
     with lab.work_folder() as folder, contextlib.ExitStack() as stack:
         lake = args.lake.resolve()
-        store = LakeStore.of_ceph(lake) if args.ceph else LakeStore.of_folder(lake, stack)
+        store = LakeStore.copied_to_ceph(lake) if args.ceph else LakeStore.from_folder(lake, stack)
         check = WorkersCheck(args, folder, store)
         some = f" and surface_id <= '{args.last_surface}'" if args.last_surface else ""
         if "answers" in args.only:

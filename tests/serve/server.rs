@@ -17,7 +17,7 @@ const ENCRYPTED_VARIABLE: &str = "ECHOLAKE_ENCRYPTED";
 /// A server; dropping it ends it.
 pub(crate) struct ServedLake {
     child: ChildProcess,
-    /// What its addresses lead through if it is encrypted.
+    /// Tunnels that its addresses lead through if it is encrypted.
     _tunnels: Option<ServerTunnels>,
     /// `host:port` of each protocol.
     pub(crate) http: String,

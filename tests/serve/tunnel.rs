@@ -34,7 +34,7 @@ pub(crate) fn trusting_config(certificate: &Path) -> Result<ClientConfig> {
     Ok(config.with_safe_default_protocol_versions()?.with_root_certificates(roots).with_no_client_auth())
 }
 
-/// How an encrypted connection begins.
+/// Beginning of an encrypted connection, which each protocol has its own of.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum TunnelOpening {
     Http,

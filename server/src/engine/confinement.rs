@@ -77,7 +77,7 @@ pub fn confine_to_store(store: &RemoteAccess, own: &[&Path], workers: &[u16]) ->
 fn confine(readable: &[PathBuf], own: &[&Path], ports: Option<&[u16]>) -> io::Result<()> {
     let connections = ports.unwrap_or(&[]).iter();
     let connections = connections.map(|port| Ok::<_, RulesetError>(NetPort::new(*port, AccessNet::ConnectTcp)));
-    // The names of its functions, for the place of a panic in the log.
+    // A worker takes its checksum, and the place of a panic in the log has the names of its functions.
     let program = std::env::current_exe();
     let ruleset = || -> Result<RulesetCreated, RulesetError> {
         let read = AccessFs::from_read(LANDLOCK) & !AccessFs::Execute;
