@@ -28,9 +28,12 @@ pub(crate) async fn of_run(
     together(lake, table, columns, &batches).map_err(|e| Error::damaged(format!("{}, run {run}", table.name()), e))
 }
 
-/// Reads the named columns of a whole file.
+/// Reads the named columns of all rows of a file that readers see.
 pub(crate) async fn of_file(lake: &Lake, table: Table, file: &DataFile, columns: &[&str]) -> Result<RecordBatch> {
-    let batches: Vec<_> = lake.rows(table, file, columns, 0..file.rows).await?.try_collect().await?;
+    let mut batches = Vec::new();
+    for range in file.visible_ranges() {
+        batches.extend(lake.rows(table, file, columns, range).await?.try_collect::<Vec<_>>().await?);
+    }
     together(lake, table, columns, &batches).map_err(|e| Error::damaged(&file.path, e))
 }
 

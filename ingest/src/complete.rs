@@ -175,7 +175,7 @@ async fn complete_run(
     let (mut staged, references) = derivation.stage(context, &keys, responses).await?;
     let mut row = Vec::new();
     for file in context.snapshot.files_of(Table::Runs, &run.run) {
-        let before = read_back::run_row(lake, file).await?;
+        let before = read_back::run_row(lake, file, &run.run).await?;
         row.push(rows::runs::with_references(lake.rig(), &keys, &before, &references)?);
     }
     let pointer = VisibleRun { reference_derivation: references.derivation.clone(), ..run.clone() };

@@ -113,14 +113,15 @@ pub async fn examine(lake: &Lake, progress: &mut dyn FnMut(CheckStep<'_>)) -> Re
             bytes: files.iter().map(|f| f.bytes).sum(),
         });
     }
-    let pointers: Vec<_> = snapshot.files(Table::Runs).to_vec();
-    for file in pointers {
-        progress(CheckStep { subject: file.path.as_ref(), done, total });
-        done += 1;
-        match read_back::run_row(lake, &file).await {
-            Ok(row) => check_run(lake, &snapshot, &row, &mut report).await?,
-            // Reported above, when the table's files were decoded.
-            Err(_) => continue,
+    for run in snapshot.runs() {
+        for file in snapshot.files_of(Table::Runs, &run.run) {
+            progress(CheckStep { subject: file.path.as_ref(), done, total });
+            done += 1;
+            match read_back::run_row(lake, file, &run.run).await {
+                Ok(row) => check_run(lake, &snapshot, &row, &mut report).await?,
+                // Reported above, when the table's files were decoded.
+                Err(_) => continue,
+            }
         }
     }
     find_strays(lake, &snapshot, &mut report).await?;

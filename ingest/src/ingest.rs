@@ -5,9 +5,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
-use echolake_lake::{
-    ClaimOutcome, ClaimTimes, CommitOutcome, EncodedFile, FileName, Lake, VisibleRun, WorkClaims, encode,
-};
+use echolake_lake::{ClaimOutcome, ClaimTimes, CommitOutcome, EncodedFile, Lake, VisibleRun, WorkClaims, encode};
 use echolake_schema::tables::Table;
 use echolake_schema::{RunId, SurfaceId};
 use object_store::path::Path;
@@ -352,14 +350,13 @@ impl IngestWork {
         }
         // Another ingest may have finished it meanwhile. In the inbox it would be gone.
         let Some(run) = source.run_in_place().filter(|run| !known.contains(run)) else { return Ok(()) };
-        let is_of_run = |path: &Path| matches!(FileName::parse(path), Some(FileName::Pointer(row)) if row.run == run);
         let rows = self.context.lake.log().files(Table::Runs).await?;
-        if rows.iter().any(|row| is_of_run(&row.path)) { Err(Error::Gone { file }) } else { Ok(()) }
+        if rows.iter().any(|row| row.shown_runs().contains(&run)) { Err(Error::Gone { file }) } else { Ok(()) }
     }
 
     async fn check_same(&self, known: &VisibleRun, content: &RunContent, file: &str) -> Result<()> {
         let Some(row) = self.context.snapshot.files_of(Table::Runs, &known.run).next() else { return Ok(()) };
-        let row = read_back::run_row(&self.context.lake, row).await?;
+        let row = read_back::run_row(&self.context.lake, row, &known.run).await?;
         let there = rows::runs::text_of(&row, "file_sha256").unwrap_or_default();
         if there == content.integrity.sha256 {
             return Ok(());

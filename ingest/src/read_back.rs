@@ -20,7 +20,7 @@ pub(crate) async fn responses(lake: &Lake, snapshot: &LakeSnapshot, run: &RunId)
     let mut out = RunResponses::default();
     let files: Vec<_> = snapshot.files_of(Table::Measurements, run).cloned().collect();
     for file in files {
-        for batch in responses_in(lake, &file, run).await? {
+        for batch in rows_of_run(lake, Table::Measurements, &file, run, &["pair_id", "temperature_c", "ir"]).await? {
             let lost = |what: &str| Error::DataFile { file: file.path.to_string(), reason: format!("no `{what}`") };
             let pairs = batch.column_by_name("pair_id").ok_or_else(|| lost("pair_id"))?.as_primitive::<Int32Type>();
             let celsius = batch.column_by_name("temperature_c").ok_or_else(|| lost("temperature_c"))?;
@@ -39,18 +39,23 @@ pub(crate) async fn responses(lake: &Lake, snapshot: &LakeSnapshot, run: &RunId)
 }
 
 // A file of this run alone is read and checked as a whole; of a merged file only the run's pages are read.
-async fn responses_in(lake: &Lake, file: &DataFile, run: &RunId) -> Result<Vec<RecordBatch>> {
-    let columns = ["pair_id", "temperature_c", "ir"];
+async fn rows_of_run(
+    lake: &Lake,
+    table: Table,
+    file: &DataFile,
+    run: &RunId,
+    columns: &[&str],
+) -> Result<Vec<RecordBatch>> {
     let place = file.visible_parts().find(|(part, _)| part.run == *run).map(|(_, rows)| rows);
     match place {
-        Some(rows) => Ok(lake.rows(Table::Measurements, file, &columns, rows).await?.try_collect().await?),
-        None => batches(lake, Table::Measurements, file, &columns).await,
+        Some(rows) => Ok(lake.rows(table, file, columns, rows).await?.try_collect().await?),
+        None => batches(lake, table, file, columns).await,
     }
 }
 
-/// Reads a run's row of `runs`.
-pub(crate) async fn run_row(lake: &Lake, file: &DataFile) -> Result<RecordBatch> {
-    let batches = batches(lake, Table::Runs, file, &[]).await?;
+/// Reads a run's row of `runs` from a file that shows it.
+pub(crate) async fn run_row(lake: &Lake, file: &DataFile, run: &RunId) -> Result<RecordBatch> {
+    let batches = rows_of_run(lake, Table::Runs, file, run, &[]).await?;
     concat_batches(&Table::Runs.schema(lake.rig()), &batches)
         .map_err(|e| Error::DataFile { file: file.path.to_string(), reason: e.to_string() })
 }

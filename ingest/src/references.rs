@@ -110,8 +110,7 @@ impl ReferenceFinder {
             (surface, version)
         };
         let versions = runs.into_iter().map(version).collect();
-        let names =
-            snapshot.files(Table::Surfaces).iter().filter_map(|f| names(f, &lake.config().references)).collect();
+        let names = snapshot.files(Table::Surfaces).iter().flat_map(|f| names(f, &lake.config().references)).collect();
         Self { lake: lake.clone(), snapshot, names, versions, means: HashMap::new(), loaded: HashMap::new() }
     }
 
@@ -201,15 +200,18 @@ impl ReferenceFinder {
     }
 }
 
-// The names in a surface's row, taken from its file's statistics.
-fn names(file: &DataFile, references: &ReferenceSurfaces) -> Option<(SurfaceId, ReferenceNames)> {
-    let Some(FileName::Rows { surface, .. }) = FileName::parse(&file.path) else { return None };
+// The names in the rows of a file's surfaces, which are the same in all of them, taken from the file's statistics.
+fn names(file: &DataFile, references: &ReferenceSurfaces) -> Vec<(SurfaceId, ReferenceNames)> {
+    let surfaces = match FileName::parse(&file.path) {
+        Some(FileName::Rows { surface, .. }) => vec![surface],
+        _ => file.visible_parts().map(|(part, _)| part.surface.clone()).collect(),
+    };
     let text = |column: &str| file.stats.as_ref()?.min.get(column)?.as_str()?.parse().ok();
     let names = ReferenceNames {
         flat: text("flat_reference").unwrap_or_else(|| references.flat.clone()),
         foam: text("foam_reference").unwrap_or_else(|| references.foam.clone()),
     };
-    Some((surface, names))
+    surfaces.into_iter().map(|surface| (surface, names.clone())).collect()
 }
 
 impl ReferenceResponses {

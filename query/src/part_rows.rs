@@ -1,7 +1,6 @@
 //! Rows of merged files whose other rows are none of the reader's business: read by their places in the files, so that no
 //! plan names or counts what is left out.
 
-use std::ops::Range;
 use std::sync::Arc;
 
 use arrow::array::RecordBatchOptions;
@@ -62,7 +61,7 @@ impl PartitionStream for VisibleRows {
 
     fn execute(&self, _: Arc<TaskContext>) -> SendableRecordBatchStream {
         let (lake, table, file, schema) = (self.lake.clone(), self.table, self.file.clone(), self.schema.clone());
-        let rows = futures::stream::iter(visible_ranges(&file)).then(move |range| {
+        let rows = futures::stream::iter(file.visible_ranges()).then(move |range| {
             let (lake, file, schema) = (lake.clone(), file.clone(), schema.clone());
             async move {
                 let names: Vec<_> = schema.fields().iter().map(|field| field.name().as_str()).collect();
@@ -80,58 +79,10 @@ fn unread(error: echolake_lake::Error) -> DataFusionError {
     DataFusionError::External(Box::new(error))
 }
 
-// Neighbouring parts are read at once.
-fn visible_ranges(file: &DataFile) -> Vec<Range<u64>> {
-    let mut ranges: Vec<Range<u64>> = Vec::new();
-    for (_, range) in file.visible_parts() {
-        match ranges.last_mut() {
-            Some(last) if last.end == range.start => last.end = range.end,
-            _ => ranges.push(range),
-        }
-    }
-    ranges
-}
-
 // The columns of a batch in the wanted order.
 fn with_columns(batch: &RecordBatch, schema: &SchemaRef) -> Result<RecordBatch> {
     let columns =
         schema.fields().iter().map(|field| Ok(batch.column(batch.schema_ref().index_of(field.name())?).clone()));
     let rows = RecordBatchOptions::new().with_row_count(Some(batch.num_rows()));
     Ok(RecordBatch::try_new_with_options(schema.clone(), columns.collect::<Result<Vec<_>>>()?, &rows)?)
-}
-
-#[cfg(test)]
-mod tests {
-    use echolake_lake::RunPart;
-
-    use super::*;
-
-    #[test]
-    fn neighbours_are_read_at_once_and_hidden_rows_never() {
-        let part = |run: &str, rows| RunPart {
-            surface: "flat".parse().expect("an id"),
-            run: run.parse().expect("an id"),
-            derivation: "d".to_owned(),
-            rows,
-        };
-        let mut file = DataFile {
-            path: "tables/nce/merged.x.parquet".into(),
-            bytes: 1,
-            rows: 15,
-            log_version: 1,
-            seen_runs: 1,
-            stats: None,
-            parts: vec![part("a", 1), part("b", 2), part("c", 4), part("d", 8)],
-            hidden: Vec::new(),
-        };
-        let check = |file: &DataFile, expected: &[(u64, u64)]| {
-            let ranges: Vec<_> = visible_ranges(file).iter().map(|range| (range.start, range.end)).collect();
-            assert_eq!(ranges, expected);
-        };
-        check(&file, &[(0, 15)]);
-        file.hidden = vec!["b".parse().expect("an id")];
-        check(&file, &[(0, 1), (3, 15)]);
-        file.hidden = ["a", "c", "d"].map(|run| run.parse().expect("an id")).to_vec();
-        check(&file, &[(1, 3)]);
-    }
 }

@@ -1,5 +1,5 @@
-//! Cache of the rows of small tables: `runs` and `surfaces` have one row per file, and most queries read them. A file
-//! never changes, so its rows are read once per process.
+//! Cache of the rows of small tables: `runs` and `surfaces` have one row per file until they are merged, and most queries
+//! read them. A file never changes, so its rows are read once per process.
 
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -9,6 +9,7 @@ use arrow::datatypes::SchemaRef;
 use arrow::record_batch::RecordBatch;
 use datafusion::error::{DataFusionError, Result};
 use echolake_lake::{DataFile, Lake};
+use echolake_schema::RunId;
 use echolake_schema::tables::Table;
 use futures::{StreamExt as _, TryStreamExt as _};
 use object_store::path::Path;
@@ -25,9 +26,17 @@ const TOGETHER_REMOTE: usize = 64;
 #[derive(Debug)]
 pub(crate) struct SmallTables {
     lake: Lake,
-    files: Mutex<HashMap<Table, HashMap<Path, RecordBatch>>>,
+    files: Mutex<HashMap<Table, HashMap<Path, KnownRows>>>,
     /// Held by who reads files of a table, so that no two queries fetch the same ones.
     reading: Mutex<HashMap<Table, Arc<AsyncMutex<()>>>>,
+}
+
+/// The rows of a file that readers see.
+#[derive(Debug, Clone)]
+struct KnownRows {
+    /// The runs whose rows are left out.
+    hidden: Vec<RunId>,
+    rows: RecordBatch,
 }
 
 impl SmallTables {
@@ -35,14 +44,13 @@ impl SmallTables {
         Self { lake: lake.clone(), files: Mutex::default(), reading: Mutex::default() }
     }
 
-    /// Returns whether a table is cached: few rows, no lists, no hidden rows.
-    pub(crate) fn keeps<'a>(schema: &SchemaRef, mut files: impl Iterator<Item = &'a DataFile>) -> bool {
+    /// Returns whether a table is cached: few rows, no lists.
+    pub(crate) fn keeps<'a>(schema: &SchemaRef, files: impl Iterator<Item = &'a DataFile>) -> bool {
         let narrow = !schema.fields().iter().any(|f| f.data_type().is_nested());
-        let rows = files.try_fold(0, |rows, file| file.hidden.is_empty().then_some(rows + file.rows));
-        narrow && rows.is_some_and(|rows| rows <= SMALL_ROWS)
+        narrow && files.map(DataFile::visible_rows).sum::<u64>() <= SMALL_ROWS
     }
 
-    /// Returns the rows of these files, which must be all files of the table.
+    /// Returns the rows of these files that readers see. They must be all files of the table.
     ///
     /// # Errors
     /// If a file does not agree with its log.
@@ -62,7 +70,7 @@ impl SmallTables {
         let together = if self.lake.is_remote() { TOGETHER_REMOTE } else { TOGETHER };
         let read: Vec<_> = futures::stream::iter(read).buffered(together).try_collect().await?;
         rows.extend(read);
-        let all = concat_batches(schema, files.iter().filter_map(|f| rows.get(&f.path)))?;
+        let all = concat_batches(schema, files.iter().filter_map(|f| Some(&rows.get(&f.path)?.rows)))?;
         let mut known = self.files.lock().unwrap_or_else(PoisonError::into_inner);
         let known = known.entry(table).or_default();
         // Evicts removed files once they outnumber the table's files; not sooner, because queries of past versions
@@ -74,16 +82,24 @@ impl SmallTables {
         Ok(all)
     }
 
-    fn known(&self, table: Table, files: &[&DataFile]) -> HashMap<Path, RecordBatch> {
+    fn known(&self, table: Table, files: &[&DataFile]) -> HashMap<Path, KnownRows> {
         let known = self.files.lock().unwrap_or_else(PoisonError::into_inner);
         let known = known.get(&table);
-        files.iter().filter_map(|f| known?.get_key_value(&f.path)).map(|(p, b)| (p.clone(), b.clone())).collect()
+        let rows = |file: &&DataFile| {
+            let rows = known?.get(&file.path).filter(|rows| rows.hidden == file.hidden)?;
+            Some((file.path.clone(), rows.clone()))
+        };
+        files.iter().filter_map(rows).collect()
     }
 
-    async fn read(&self, table: Table, schema: &SchemaRef, file: DataFile) -> Result<(Path, RecordBatch)> {
+    async fn read(&self, table: Table, schema: &SchemaRef, file: DataFile) -> Result<(Path, KnownRows)> {
         let failed = |e: echolake_lake::Error| DataFusionError::External(Box::new(e));
-        let stream = self.lake.rows(table, &file, &[], 0..file.rows).await.map_err(failed)?;
-        let batches: Vec<_> = stream.try_collect().await.map_err(failed)?;
-        Ok((file.path, concat_batches(schema, &batches)?))
+        let mut batches = Vec::new();
+        for range in file.visible_ranges() {
+            let stream = self.lake.rows(table, &file, &[], range).await.map_err(failed)?;
+            batches.extend(stream.try_collect::<Vec<_>>().await.map_err(failed)?);
+        }
+        let rows = concat_batches(schema, &batches)?;
+        Ok((file.path, KnownRows { hidden: file.hidden, rows }))
     }
 }

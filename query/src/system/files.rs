@@ -8,7 +8,7 @@ use arrow::record_batch::RecordBatch;
 use async_trait::async_trait;
 use datafusion::catalog::Session;
 use datafusion::error::Result;
-use echolake_lake::{DataFile, FileName, LakeSnapshot};
+use echolake_lake::{DataFile, FileName, LakeSnapshot, VisibleRun};
 use echolake_schema::tables::Table;
 
 use super::{SystemRows, batch, column, schema};
@@ -80,8 +80,9 @@ fn seen_bytes(snapshot: &LakeSnapshot, file: &DataFile) -> u64 {
 // Surface and run of each run that readers see in a file.
 fn runs_of(file: &DataFile) -> Vec<(String, String)> {
     match FileName::parse(&file.path) {
-        Some(FileName::Rows { surface, run, .. }) => vec![(surface.to_string(), run.to_string())],
-        Some(FileName::Pointer(run)) => vec![(run.surface.to_string(), run.run.to_string())],
+        Some(FileName::Rows { surface, run, .. } | FileName::Pointer(VisibleRun { surface, run, .. })) => {
+            vec![(surface.to_string(), run.to_string())]
+        }
         _ => file.visible_parts().map(|(part, _)| (part.surface.to_string(), part.run.to_string())).collect(),
     }
 }

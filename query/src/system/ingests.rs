@@ -12,7 +12,7 @@ use datafusion::catalog::Session;
 use datafusion::datasource::TableProvider;
 use datafusion::error::{DataFusionError, Result};
 use datafusion::physical_plan::collect;
-use echolake_lake::{FileName, Lake, LakeSnapshot};
+use echolake_lake::{Lake, LakeSnapshot};
 use echolake_schema::tables::Table;
 
 use super::{SystemRows, batch, column, schema, time};
@@ -53,10 +53,9 @@ impl SystemRows for LakeIngests {
         let failed = |e: echolake_lake::Error| DataFusionError::External(Box::new(e));
         let times = self.lake.log().versions(Table::Runs).await.map_err(failed)?;
         let times: HashMap<_, _> = times.iter().map(|v| (v.version, v.committed.timestamp_micros())).collect();
-        let versions = self.versions();
         let names = rows.column(1).as_string_opt::<i32>();
         let names = names.ok_or_else(|| DataFusionError::Internal("names of runs are texts".to_owned()))?;
-        let version = || names.iter().map(|name| versions.get(name?).copied());
+        let version = || names.iter().map(|name| self.snapshot.row_version(&name?.parse().ok()?));
         let mut columns: Vec<ArrayRef> = vec![
             Arc::new(version().map(|version| version.map(|version| version as i64)).collect::<Int64Array>()),
             Arc::new(
@@ -68,17 +67,5 @@ impl SystemRows for LakeIngests {
         ];
         columns.extend(rows.columns().iter().cloned());
         batch(self.schema(), columns)
-    }
-}
-
-impl LakeIngests {
-    // Of `runs`, by the names of their files.
-    fn versions(&self) -> HashMap<String, u64> {
-        let files = self.snapshot.files(Table::Runs).iter();
-        let named = files.filter_map(|file| match FileName::parse(&file.path)? {
-            FileName::Pointer(run) => Some((run.run.to_string(), file.log_version)),
-            _ => None,
-        });
-        named.collect()
     }
 }

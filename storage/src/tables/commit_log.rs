@@ -41,10 +41,12 @@ pub struct RunPart {
     pub surface: SurfaceId,
     /// The run.
     pub run: RunId,
-    /// Digest of what the rows were made from.
+    /// Digest of what the rows were made from; of a row of `runs` both digests of its name.
     pub derivation: String,
     /// Number of its rows.
     pub rows: u64,
+    /// Of a row of `runs`: the version of `runs` that added it, whichever file it was in then.
+    pub row_version: Option<u64>,
 }
 
 impl DataFile {
@@ -68,6 +70,21 @@ impl DataFile {
             (part, start..end)
         });
         placed.filter(|(part, _)| !self.hidden.contains(&part.run))
+    }
+
+    /// The ranges of the rows that readers see, neighbouring parts as one.
+    pub fn visible_ranges(&self) -> Vec<Range<u64>> {
+        if self.parts.is_empty() {
+            return std::iter::once(0..self.rows).collect();
+        }
+        let mut ranges: Vec<Range<u64>> = Vec::new();
+        for (_, range) in self.visible_parts() {
+            match ranges.last_mut() {
+                Some(last) if last.end == range.start => last.end = range.end,
+                _ => ranges.push(range),
+            }
+        }
+        ranges
     }
 }
 
@@ -118,13 +135,22 @@ pub struct NewFile {
     pub run_version: u64,
 }
 
-/// The files that a new one replaces. If other files have taken their place, the new one is not added.
+/// The files that a new one replaces. If other files have taken their place, the new one is not added. A merged file in a
+/// place with a beginning stays, because it has other runs' rows: the newer row of the run counts.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct ReplacedFiles {
     /// Beginning of the names of all files in that place; None if the names alone are the place.
     pub prefix: Option<String>,
-    /// The files that are expected there; they go with the same commit.
+    /// The files that are expected there; those of the place go with the same commit.
     pub files: Vec<LoggedFile>,
+}
+
+impl ReplacedFiles {
+    /// The files that go.
+    pub(crate) fn removed(&self) -> impl Iterator<Item = &LoggedFile> {
+        let is_of_place = |name: &str| self.prefix.as_deref().is_none_or(|prefix| name.starts_with(prefix));
+        self.files.iter().filter(move |file| is_of_place(&file.name))
+    }
 }
 
 /// Effect of a commit on a reader that follows a table.
@@ -224,4 +250,39 @@ pub trait CommitLog: Send + Sync + std::fmt::Debug {
     async fn history(&self, table: Table) -> Result<Option<FileHistory>>;
     /// Makes a change; returns the outcome of each new file, in order. Repeating the same change adds nothing.
     async fn commit(&self, table: Table, commit: &TableCommit) -> Result<Vec<CommitOutcome>>;
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn neighbours_are_read_at_once_and_hidden_rows_never() {
+        let part = |run: &str, rows| RunPart {
+            surface: "flat".parse().expect("an id"),
+            run: run.parse().expect("an id"),
+            derivation: "d".to_owned(),
+            rows,
+            row_version: None,
+        };
+        let mut file = DataFile {
+            path: "tables/nce/merged.x.parquet".into(),
+            bytes: 1,
+            rows: 15,
+            log_version: 1,
+            seen_runs: 1,
+            stats: None,
+            parts: vec![part("a", 1), part("b", 2), part("c", 4), part("d", 8)],
+            hidden: Vec::new(),
+        };
+        let check = |file: &DataFile, expected: &[(u64, u64)]| {
+            let ranges: Vec<_> = file.visible_ranges().iter().map(|range| (range.start, range.end)).collect();
+            assert_eq!(ranges, expected);
+        };
+        check(&file, &[(0, 15)]);
+        file.hidden = vec!["b".parse().expect("an id")];
+        check(&file, &[(0, 1), (3, 15)]);
+        file.hidden = ["a", "c", "d"].map(|run| run.parse().expect("an id")).to_vec();
+        check(&file, &[(1, 3)]);
+    }
 }

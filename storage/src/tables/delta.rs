@@ -30,8 +30,8 @@ use crate::location::LakeLocation;
 use crate::remote::backoff;
 use crate::tables::snapshot::{decode_parts, encode_parts, is_merged};
 use crate::{
-    CommitEffect, CommitLog, CommitOutcome, DataFile, Error, FileHistory, FileStats, LoggedFile, NewFile, Result,
-    RunPart, TableChange, TableCommit, TableVersion, TableView,
+    CommitEffect, CommitLog, CommitOutcome, DataFile, Error, FileHistory, FileStats, LoggedFile, NewFile,
+    ReplacedFiles, Result, RunPart, TableChange, TableCommit, TableVersion, TableView,
 };
 
 /// Tries of one commit against other writers; each loses to a commit that went through.
@@ -187,7 +187,7 @@ impl<'a> PendingChange<'a> {
         for file in &commit.add {
             let outcome = change.outcome(file, &known);
             if outcome == CommitOutcome::Now {
-                for replaced in file.replaces.iter().flat_map(|replaces| &replaces.files) {
+                for replaced in file.replaces.iter().flat_map(ReplacedFiles::removed) {
                     known.remove(&replaced.name);
                     change.remove.insert(replaced.name.clone());
                 }
@@ -231,7 +231,7 @@ impl<'a> PendingChange<'a> {
         let alone = replaces
             .prefix
             .as_ref()
-            .is_none_or(|prefix| known.keys().filter(|n| n.starts_with(prefix)).count() == replaces.files.len());
+            .is_none_or(|prefix| known.keys().filter(|n| n.starts_with(prefix)).count() == replaces.removed().count());
         if expected && alone { CommitOutcome::Now } else { CommitOutcome::Outdated }
     }
 }
@@ -487,7 +487,6 @@ fn delta_type(data_type: &ArrowType) -> Value {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::ReplacedFiles;
 
     fn file(name: &str, replaces: Option<(&str, &[&str])>) -> NewFile {
         let replaces = replaces.map(|(prefix, names)| ReplacedFiles {
@@ -546,6 +545,11 @@ mod tests {
         let gone = vec!["x.1".to_owned(), "y.1".to_owned()];
         assert_eq!(outcomes(vec![merged()], &["x.1", "y.1", "x.2"]), (vec![CommitOutcome::Now], gone));
         assert_eq!(outcomes(vec![merged()], &["x.1", "y.2"]), (vec![CommitOutcome::Outdated], vec![]));
+        // Of a merged file one row is replaced, and the file stays.
+        let of_merged = || file("x.2", Some(("x.", &["m"])));
+        assert_eq!(outcomes(vec![of_merged()], &["m", "y.1"]), (vec![CommitOutcome::Now], vec![]));
+        assert_eq!(outcomes(vec![of_merged()], &["m", "x.3"]), (vec![CommitOutcome::Outdated], vec![]));
+        assert_eq!(outcomes(vec![of_merged()], &["y.1"]), (vec![CommitOutcome::Outdated], vec![]), "merged anew");
         let mut older = new();
         older.replaces.as_mut().expect("replaces").files[0].log_version = 2;
         assert_eq!(outcomes(vec![older], &["x.1"]), (vec![CommitOutcome::Outdated], vec![]), "it was added again");

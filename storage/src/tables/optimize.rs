@@ -1,9 +1,10 @@
 //! Merges small files of a table into large ones. Neither the rows that readers see nor their storage format changes.
 //!
 //! A merged file's Add lists its parts, (surface, run, derivation) each with its number of rows; a snapshot decides
-//! over every part as it would over a file of its own. `runs` and `surfaces` keep one file per run: ingest reads them
-//! by name and by their statistics, and all of them together are small. Runs of several projects are not merged, so that
-//! whoever may see one project has whole files of it.
+//! over every part as it would over a file of its own. A part of `runs` has, in addition, the version that added it: which
+//! of two rows of a run is newer does not change when one is merged. Runs of several projects are not merged, so that
+//! whoever may see one project has whole files of it; surfaces are merged with those of the same references alone, whose
+//! names ingest takes from the files' statistics.
 
 use std::sync::atomic::{AtomicBool, Ordering};
 
@@ -174,8 +175,7 @@ struct RunSlice<'a> {
 }
 
 fn slices(file: &DataFile) -> Vec<RunSlice<'_>> {
-    if let Some(FileName::Rows { surface, run, derivation }) = FileName::parse(&file.path) {
-        let part = RunPart { surface, run, derivation, rows: file.rows };
+    if let Some(part) = RunPart::of_file(file) {
         return vec![RunSlice { file, rows: 0..file.rows, part }];
     }
     file.visible_parts().map(|(part, rows)| RunSlice { file, part: part.clone(), rows }).collect()
@@ -188,8 +188,10 @@ fn key(part: &RunPart) -> (&str, &str) {
 fn name(parts: &[RunPart]) -> FileName {
     let mut sha = Sha256::new();
     for part in parts {
-        sha.update(part.file_name().compose());
+        sha.update(part.file_name());
         sha.update("\n");
+        // The same name added again may be another row.
+        sha.update(part.row_version.map(|version| format!("{version}\n")).unwrap_or_default());
     }
     FileName::Merged { digest: hex::encode(sha.finalize())[..DIGEST_DIGITS].to_owned() }
 }
@@ -197,8 +199,10 @@ fn name(parts: &[RunPart]) -> FileName {
 /// Readers of a run's rows.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
 enum RunAudience {
-    /// All projects.
+    /// Everybody, in a lake without projects.
     Common,
+    /// All projects. In `runs`, a file has runs of one project even so: it tells their project.
+    References(Option<ProjectName>),
     /// A project, or readers of all projects alone.
     Project(Option<ProjectName>),
     /// Differs between the runs of a file.
@@ -219,11 +223,14 @@ impl<'a> FileReaders<'a> {
         Self { snapshot, references: &lake.config().references, has_projects }
     }
 
-    fn audience(&self, file: &DataFile) -> RunAudience {
-        let of = |slice: &RunSlice<'_>| match &slice.part {
-            _ if !self.has_projects => RunAudience::Common,
-            part if [&self.references.flat, &self.references.foam].contains(&&part.surface) => RunAudience::Common,
-            part => RunAudience::Project(self.snapshot.project(&part.run).cloned()),
+    fn audience(&self, table: Table, file: &DataFile) -> RunAudience {
+        let of = |slice: &RunSlice<'_>| {
+            let project = self.snapshot.project(&slice.part.run).cloned();
+            match [&self.references.flat, &self.references.foam].contains(&&slice.part.surface) {
+                _ if !self.has_projects => RunAudience::Common,
+                true => RunAudience::References(project.filter(|_| table == Table::Runs)),
+                false => RunAudience::Project(project),
+            }
         };
         let mut audiences = slices(file).iter().map(of).collect::<Vec<_>>();
         audiences.dedup();
@@ -236,23 +243,23 @@ impl<'a> FileReaders<'a> {
 
 // Neighbours by surface and run in groups of about the wanted size, so that a query for a surface opens few files.
 fn plan(snapshot: &LakeSnapshot, readers: &FileReaders<'_>, table: Table, target_bytes: u64) -> Vec<Vec<DataFile>> {
-    let merges = matches!(table.source(), Source::Run | Source::References) && table != Table::Surfaces;
-    if !merges {
+    if table.source() == Source::Rig {
         return Vec::new();
     }
     let is_small = |f: &&DataFile| f.bytes < target_bytes / 2 && f.hidden.is_empty();
     let first = |f: &DataFile| slices(f).first().map(|s| (s.part.surface.clone(), s.part.run.clone()));
     let mut small: Vec<_> = snapshot.files(table).iter().filter(is_small).cloned().collect();
-    small.sort_by_cached_key(|file| (readers.audience(file), first(file)));
+    let place = |file: &DataFile| (readers.audience(table, file), references(table, file));
+    small.sort_by_cached_key(|file| (place(file), first(file)));
     let (mut groups, mut bytes) = (vec![Vec::new()], 0);
     let mut last = None;
     for file in small {
-        let audience = Some(readers.audience(&file));
-        if bytes + file.bytes > target_bytes || audience != last {
+        let place = Some(place(&file));
+        if bytes + file.bytes > target_bytes || place != last {
             groups.push(Vec::new());
             bytes = 0;
         }
-        last = audience;
+        last = place;
         bytes += file.bytes;
         if let Some(group) = groups.last_mut() {
             group.push(file);
@@ -260,6 +267,12 @@ fn plan(snapshot: &LakeSnapshot, readers: &FileReaders<'_>, table: Table, target
     }
     groups.retain(|group| group.len() > 1);
     groups
+}
+
+// The references of a file's surfaces, which are the same for all of them.
+fn references(table: Table, file: &DataFile) -> Option<[Option<String>; 2]> {
+    let text = |column| Some(file.stats.as_ref()?.min.get(column)?.as_str()?.to_owned());
+    (table == Table::Surfaces).then(|| [text("flat_reference"), text("foam_reference")])
 }
 
 #[cfg(test)]

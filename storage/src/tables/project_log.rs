@@ -9,11 +9,11 @@ use std::sync::Arc;
 
 use async_trait::async_trait;
 use echolake_schema::tables::Table;
-use echolake_schema::{ProjectName, SurfaceId};
+use echolake_schema::{ProjectName, RunId, SurfaceId};
 use serde_json::Value;
 
 use crate::tables::delta::DeltaLog;
-use crate::tables::snapshot::surface_of;
+use crate::tables::snapshot::pointers;
 use crate::{
     CommitLog, CommitOutcome, DataFile, Error, FileHistory, LakeSnapshot, Result, TableChange, TableCommit,
     TableVersion, TableView,
@@ -39,13 +39,19 @@ impl ProjectLog {
     // Files of the other tables are seen if a run's row names them.
     fn keep_visible(&self, table: Table, files: &mut Vec<DataFile>) {
         if table == Table::Runs {
-            files.retain(|file| self.shows_run(file));
+            files.retain_mut(|file| {
+                file.hidden = self.hidden_runs(file);
+                !pointers(file).is_empty()
+            });
         }
     }
 
-    fn shows_run(&self, pointer: &DataFile) -> bool {
-        let is_common = surface_of(pointer).is_some_and(|surface| self.common.contains(&surface));
-        is_common || project_of(pointer).is_some_and(|project| self.projects.contains(&project))
+    fn hidden_runs(&self, file: &DataFile) -> Vec<RunId> {
+        if project_of(file).is_some_and(|project| self.projects.contains(&project)) {
+            return Vec::new();
+        }
+        let runs = pointers(file).into_iter().map(|(run, _)| run);
+        runs.filter(|run| !self.common.contains(&run.surface)).map(|run| run.run).collect()
     }
 
     fn refuse<T>(table: Table, action: &'static str) -> Result<T> {
@@ -53,7 +59,7 @@ impl ProjectLog {
     }
 }
 
-/// The project of a run, by the file of its row in `runs`; None if it was given none.
+/// The project of the runs of a file of `runs`, which is the same for all of them; None if they were given none.
 pub(crate) fn project_of(pointer: &DataFile) -> Option<ProjectName> {
     let stats = pointer.stats.as_ref()?;
     let [least, greatest] = [&stats.min, &stats.max].map(|values| values.get(PROJECT).and_then(Value::as_str));
@@ -84,7 +90,7 @@ impl CommitLog for ProjectLog {
 
     // Up to the one that added the newest row that is seen: how many came after it is a matter of other projects.
     async fn versions(&self, table: Table) -> Result<Vec<TableVersion>> {
-        let newest = self.files(Table::Runs).await?.iter().map(|file| file.log_version).max();
+        let newest = self.files(Table::Runs).await?.iter().flat_map(pointers).map(|(_, version)| version).max();
         let mut versions = self.log.versions(table).await?;
         if table == Table::Runs {
             versions.retain(|version| newest.is_some_and(|newest| version.version <= newest));

@@ -4,11 +4,13 @@
 //! row carries in its name the derivations that are current; files of other derivations are not seen.
 
 use std::collections::{BTreeMap, HashMap, HashSet};
+use std::ops::Bound;
 
 use echolake_schema::tables::{Source, Table};
 use echolake_schema::{ProjectName, RunId, SurfaceId};
 use futures::future::try_join_all;
 use object_store::path::Path;
+use serde::Deserialize;
 use serde_json::{Value, json};
 
 use crate::tables::project_log::project_of;
@@ -67,6 +69,11 @@ impl VisibleRun {
     pub(crate) fn prefix(&self) -> String {
         format!("{}.{}.", self.surface, self.run)
     }
+
+    /// Both derivations, as the name of the run's row has them.
+    fn derivations(&self) -> String {
+        format!("{}.{}", self.run_derivation, self.reference_derivation.as_deref().unwrap_or(WITHOUT))
+    }
 }
 
 /// A frozen view of all tables.
@@ -99,10 +106,7 @@ impl FileName {
             Self::Rig { derivation } => format!("rig.{derivation}{EXTENSION}"),
             Self::Merged { digest } => format!("{MERGED}.{digest}{EXTENSION}"),
             Self::Rows { surface, run, derivation } => format!("{surface}.{run}.{derivation}{EXTENSION}"),
-            Self::Pointer(VisibleRun { surface, run, run_derivation, reference_derivation }) => {
-                let references = reference_derivation.as_deref().unwrap_or(WITHOUT);
-                format!("{surface}.{run}.{run_derivation}.{references}{EXTENSION}")
-            }
+            Self::Pointer(run) => format!("{}{}{EXTENSION}", run.prefix(), run.derivations()),
         }
     }
 
@@ -213,31 +217,35 @@ impl LakeSnapshot {
         self.runs.get(run)?.project.as_ref()
     }
 
+    /// The version of `runs` that added a run's present row; None if the run is not seen.
+    pub fn row_version(&self, run: &RunId) -> Option<u64> {
+        Some(self.runs.get(run)?.log_version)
+    }
+
     /// The files of one run in a table, and the merged ones that show its rows.
     pub fn files_of<'a>(&'a self, table: Table, run: &'a RunId) -> impl Iterator<Item = &'a DataFile> {
-        self.files(table).iter().filter(move |f| match FileName::parse(&f.path) {
-            Some(FileName::Rows { run: of, .. }) => of == *run,
-            Some(FileName::Pointer(pointer)) => pointer.run == *run,
-            _ => f.visible_parts().any(|(part, _)| part.run == *run),
+        self.files(table).iter().filter(move |file| match file.parts.is_empty() {
+            true => run_of(file).as_ref() == Some(run),
+            false => file.visible_parts().any(|(part, _)| part.run == *run),
         })
     }
 
     /// The runs whose rows are in the files of a table that readers see.
     pub(crate) fn shown_runs(&self, table: Table) -> HashSet<RunId> {
-        self.files(table).iter().flat_map(shown_by).collect()
+        self.files(table).iter().flat_map(DataFile::shown_runs).collect()
     }
 
     fn sort_in(&mut self, table: Table, files: Vec<DataFile>) {
         let (merged, single): (Vec<_>, Vec<_>) = files.into_iter().partition(|f| !f.parts.is_empty());
         let mut sorted = SortedFiles::default();
         for file in single {
-            match self.sees(table, &file) {
-                Some(true) => {
+            match self.file_place(table, &file) {
+                RowsPlace::Seen => {
                     sorted.shown.extend(run_of(&file));
                     sorted.seen.push(file);
                 }
-                Some(false) if self.is_superseded(&file) => sorted.hidden.push(file),
-                Some(false) | None => {}
+                RowsPlace::Superseded if self.is_superseded(&file) => sorted.hidden.push(file),
+                RowsPlace::Superseded | RowsPlace::Unseen => {}
             }
         }
         merged.into_iter().for_each(|file| self.sort_merged(table, file, &mut sorted));
@@ -247,44 +255,63 @@ impl LakeSnapshot {
         self.outgrown.insert(table, sorted.outgrown);
     }
 
-    // What is merged was seen before; what is no longer seen of it is superseded. An ingest that did not know of the
-    // merge may have added the same rows again: its file is the one that counts, because it tells what its author saw.
+    // What is merged was seen before. An ingest that did not know of the merge may have added the same rows again: its
+    // file is the one that counts, because it tells what its author saw.
     fn sort_merged(&self, table: Table, mut file: DataFile, sorted: &mut SortedFiles) {
-        let mut superseded = 0;
+        let mut superseded = Vec::new();
+        file.hidden.clear();
         for part in &file.parts {
-            match self.sees_rows(table, &part.surface, &part.run, &part.derivation) {
-                Some(true) if sorted.shown.insert(part.run.clone()) => continue,
-                Some(_) => superseded += 1,
-                None => {}
+            match self.rows_place(table, &part.surface, &part.run, &part.derivation) {
+                RowsPlace::Seen if sorted.shown.insert(part.run.clone()) => continue,
+                RowsPlace::Seen | RowsPlace::Superseded => superseded.push(part.run.clone()),
+                RowsPlace::Unseen => {}
             }
             file.hidden.push(part.run.clone());
         }
-        if superseded == file.parts.len() {
+        if superseded.len() == file.parts.len() {
             sorted.hidden.push(file);
-        } else if file.hidden.len() < file.parts.len() {
-            sorted.outgrown.extend((superseded > 0).then(|| file.clone()));
-            sorted.seen.push(file);
+        } else {
+            if !superseded.is_empty() {
+                sorted.outgrown.push(DataFile { hidden: superseded, ..file.clone() });
+            }
+            if file.hidden.len() < file.parts.len() {
+                sorted.seen.push(file);
+            }
         }
     }
 
-    // None for what belongs to no run that is seen: another ingest may be about to name it.
-    fn sees(&self, table: Table, file: &DataFile) -> Option<bool> {
-        match FileName::parse(&file.path)? {
-            FileName::Rig { .. } => Some(table.source() == Source::Rig),
-            FileName::Pointer(pointer) => Some(self.run(&pointer.run) == Some(&pointer)),
-            FileName::Rows { surface, run, derivation } => self.sees_rows(table, &surface, &run, &derivation),
-            FileName::Merged { .. } => None,
+    fn file_place(&self, table: Table, file: &DataFile) -> RowsPlace {
+        match FileName::parse(&file.path) {
+            Some(FileName::Rig { .. }) if table.source() == Source::Rig => RowsPlace::Seen,
+            Some(FileName::Pointer(pointer)) if self.run(&pointer.run) == Some(&pointer) => RowsPlace::Seen,
+            Some(FileName::Pointer(_)) => RowsPlace::Superseded,
+            Some(FileName::Rows { surface, run, derivation }) => self.rows_place(table, &surface, &run, &derivation),
+            Some(FileName::Rig { .. } | FileName::Merged { .. }) | None => RowsPlace::Unseen,
         }
     }
 
-    fn sees_rows(&self, table: Table, surface: &SurfaceId, run: &RunId, derivation: &str) -> Option<bool> {
-        let current = self.run(run)?;
-        let names = match table.source() {
-            Source::References => current.reference_derivation.as_deref() == Some(derivation),
-            _ => current.run_derivation == derivation,
+    fn rows_place(&self, table: Table, surface: &SurfaceId, run: &RunId, derivation: &str) -> RowsPlace {
+        let Some(current) = self.runs.get(run) else { return RowsPlace::Unseen };
+        let is_named = match table.source() {
+            Source::References => current.run.reference_derivation.as_deref() == Some(derivation),
+            Source::Pointer => current.run.derivations() == derivation,
+            _ => current.run.run_derivation == derivation,
         };
-        // A surface that was measured twice is still one surface: its newest run describes it.
-        Some(names && (!table.key().contains(&"surface_id") || self.latest(surface) == Some(run)))
+        if !is_named {
+            return RowsPlace::Superseded;
+        }
+        if !table.key().contains(&"surface_id") {
+            return RowsPlace::Seen;
+        }
+        // A surface that was measured twice is still one surface: of the runs that a reader sees, the newest describes it.
+        let newer = self.runs.range((Bound::Excluded(run), Bound::Unbounded)).map(|(_, newer)| newer);
+        let newer: Vec<_> = newer.filter(|newer| newer.run.surface == *surface).collect();
+        let is_seen_with = |newer: &&CurrentRun| current.project.is_none() || newer.project == current.project;
+        match newer.is_empty() {
+            true => RowsPlace::Seen,
+            false if newer.iter().any(is_seen_with) => RowsPlace::Superseded,
+            false => RowsPlace::Unseen,
+        }
     }
 
     // An author that had not seen the run's present row cannot replace it, so that no row will ever name its file as
@@ -300,10 +327,18 @@ impl LakeSnapshot {
             _ => 0,
         }
     }
+}
 
-    fn latest(&self, surface: &SurfaceId) -> Option<&RunId> {
-        self.runs().rev().find(|r| r.surface == *surface).map(|r| &r.run)
-    }
+/// What a snapshot makes of rows in its log.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum RowsPlace {
+    /// Readers see them.
+    Seen,
+    /// No reader will see them again.
+    Superseded,
+    /// They belong to a run that readers of this snapshot do not see, which another ingest may be about to name, or to one
+    /// that readers of another project see.
+    Unseen,
 }
 
 /// A table's files on their way into a snapshot.
@@ -324,19 +359,27 @@ fn run_of(file: &DataFile) -> Option<RunId> {
     }
 }
 
-/// The surface of a run, by the file of its row in `runs`.
-pub(crate) fn surface_of(pointer: &DataFile) -> Option<SurfaceId> {
-    match FileName::parse(&pointer.path)? {
-        FileName::Pointer(run) => Some(run.surface),
+/// The runs whose rows in `runs` a file of that table shows, each with the version that added its row.
+pub(crate) fn pointers(file: &DataFile) -> Vec<(VisibleRun, u64)> {
+    let pointer = |path: &Path, version| match FileName::parse(path)? {
+        FileName::Pointer(run) => Some((run, version)),
         _ => None,
+    };
+    if file.parts.is_empty() {
+        let row = pointer(&file.path, file.log_version);
+        return row.into_iter().filter(|(run, _)| !file.hidden.contains(&run.run)).collect();
     }
+    let parts = file.visible_parts().map(|(part, _)| part);
+    parts.filter_map(|part| pointer(&part.file_name().into(), part.row_version?)).collect()
 }
 
-/// The runs whose rows a file shows; none for rows that come from the rig.
-pub(crate) fn shown_by(file: &DataFile) -> Vec<RunId> {
-    match file.parts.is_empty() {
-        true => run_of(file).into_iter().collect(),
-        false => file.visible_parts().map(|(part, _)| part.run.clone()).collect(),
+impl DataFile {
+    /// The runs whose rows the file shows; none for rows that come from the rig.
+    pub fn shown_runs(&self) -> Vec<RunId> {
+        match self.parts.is_empty() {
+            true => run_of(self).into_iter().collect(),
+            false => self.visible_parts().map(|(part, _)| part.run.clone()).collect(),
+        }
     }
 }
 
@@ -345,42 +388,66 @@ pub(crate) fn is_merged(name: &str) -> bool {
     matches!(FileName::parse(&Path::from(name)), Some(FileName::Merged { .. }))
 }
 
-/// Parts as text: the name that each had as a file of its own, and its rows.
+/// A part in the log: the name that it had as a file of its own, and its rows; in `runs` also the version that added it.
+#[derive(Deserialize)]
+#[serde(untagged)]
+enum LoggedPart {
+    Rows(String, u64),
+    Pointer(String, u64, u64),
+}
+
+/// Parts as text.
 pub(crate) fn encode_parts(parts: &[RunPart]) -> String {
-    let one = |part: &RunPart| json!([part.file_name().compose(), part.rows]);
+    let one = |part: &RunPart| match part.row_version {
+        Some(version) => json!([part.file_name(), part.rows, version]),
+        None => json!([part.file_name(), part.rows]),
+    };
     Value::Array(parts.iter().map(one).collect()).to_string()
 }
 
 /// Decodes the parts from such a text; None if it is none.
 pub(crate) fn decode_parts(text: &str) -> Option<Vec<RunPart>> {
-    let parts: Vec<(String, u64)> = serde_json::from_str(text).ok()?;
-    let one = |(name, rows): (String, u64)| match FileName::parse(&Path::from(name))? {
-        FileName::Rows { surface, run, derivation } => Some(RunPart { surface, run, derivation, rows }),
-        _ => None,
+    let parts: Vec<LoggedPart> = serde_json::from_str(text).ok()?;
+    let one = |part: LoggedPart| match part {
+        LoggedPart::Rows(name, rows) => RunPart::parse(&name.into(), rows, None),
+        LoggedPart::Pointer(name, rows, version) => RunPart::parse(&name.into(), rows, Some(version)),
     };
     parts.into_iter().map(one).collect::<Option<Vec<_>>>().filter(|parts| !parts.is_empty())
 }
 
 impl RunPart {
+    /// The only part of a file of one run; None if the file has another name.
+    pub(crate) fn of_file(file: &DataFile) -> Option<Self> {
+        Self::parse(&file.path, file.rows, Some(file.log_version))
+    }
+
+    fn parse(path: &Path, rows: u64, row_version: Option<u64>) -> Option<Self> {
+        match FileName::parse(path)? {
+            FileName::Rows { surface, run, derivation } => {
+                Some(Self { surface, run, derivation, rows, row_version: None })
+            }
+            FileName::Pointer(pointer) => {
+                let derivation = pointer.derivations();
+                let row_version = Some(row_version?);
+                Some(Self { surface: pointer.surface, run: pointer.run, derivation, rows, row_version })
+            }
+            FileName::Rig { .. } | FileName::Merged { .. } => None,
+        }
+    }
+
     /// The name of a file with these rows alone.
-    pub fn file_name(&self) -> FileName {
-        let Self { surface, run, derivation, .. } = self.clone();
-        FileName::Rows { surface, run, derivation }
+    pub(crate) fn file_name(&self) -> String {
+        format!("{}.{}.{}{EXTENSION}", self.surface, self.run, self.derivation)
     }
 }
 
-// A row replaces its predecessor in the same commit; should two be there, the newer one counts.
-fn current_runs(pointers: &[DataFile]) -> BTreeMap<RunId, CurrentRun> {
-    let mut by_age: Vec<_> = pointers.iter().collect();
-    by_age.sort_by_key(|f| (f.log_version, f.path.clone()));
-    let parsed = by_age.into_iter().filter_map(|f| match FileName::parse(&f.path) {
-        Some(FileName::Pointer(run)) => {
-            let current = CurrentRun { run, log_version: f.log_version, project: project_of(f) };
-            Some((current.run.run.clone(), current))
-        }
-        _ => None,
-    });
-    parsed.collect()
+// A row replaces its predecessor, in the same commit unless that one is in a merged file; of two the newer one counts.
+fn current_runs(files: &[DataFile]) -> BTreeMap<RunId, CurrentRun> {
+    let mut rows: Vec<_> =
+        files.iter().flat_map(|file| pointers(file).into_iter().map(move |row| (row, file))).collect();
+    rows.sort_by_key(|((run, version), _)| (*version, run.derivations()));
+    let current = |((run, log_version), file)| CurrentRun { run, log_version, project: project_of(file) };
+    rows.into_iter().map(current).map(|row| (row.run.run.clone(), row)).collect()
 }
 
 #[cfg(test)]

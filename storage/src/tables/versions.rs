@@ -13,7 +13,6 @@ use echolake_schema::tables::{Source, Table};
 use object_store::path::Path;
 
 use crate::tables::delta::folder;
-use crate::tables::snapshot::shown_by;
 use crate::{DataFile, Error, Lake, LakeSnapshot, Result, TableVersion};
 
 /// Formats of times beside RFC 3339.
@@ -99,11 +98,8 @@ impl Lake {
     /// [`Error::Vacuumed`] if files of it are deleted, or what the store says.
     pub async fn snapshot_at(&self, version: u64, table: Table) -> Result<LakeSnapshot> {
         let pointers = self.log().files_at(Table::Runs, version).await?;
-        let mut files = match table {
-            Table::Runs => pointers.clone(),
-            _ => self.log().files(table).await?,
-        };
-        if !matches!(table.source(), Source::Rig | Source::Pointer) && !shows_all(&pointers, table, &files) {
+        let mut files = self.log().files(table).await?;
+        if table.source() != Source::Rig && !shows_all(&pointers, table, &files) {
             files = self.log().files_of_all_versions(table).await?;
         }
         let there = self.list_files(table).await?;
@@ -113,7 +109,7 @@ impl Lake {
         let shown = snapshot.shown_runs(table);
         // Another file may have the same rows.
         let is_missing = |file: &&DataFile| {
-            let runs = shown_by(file);
+            let runs = file.shown_runs();
             !there.contains(&file.path) && (runs.is_empty() || runs.iter().any(|run| !shown.contains(run)))
         };
         let missing = wanted.files(table).iter().filter(is_missing).count();

@@ -22,7 +22,7 @@ use crate::{ReferenceSurfaces, VisibleRun, encode};
 const TABLE: Table = Table::Nce;
 const ROWS: usize = 20;
 
-async fn lake(store: &Arc<InMemory>) -> Lake {
+async fn open(store: &Arc<InMemory>) -> Lake {
     let store: Arc<dyn ObjectStore> = store.clone();
     Lake::open_or_create_in(store, "a lake under test", &Rig::paper(), &ReferenceSurfaces::default())
         .await
@@ -34,8 +34,13 @@ fn column(field: &Field, surface: &str, run: &str, value: usize) -> ArrayRef {
     match (field.name().as_str(), field.data_type()) {
         ("surface_id", _) => Arc::new(StringArray::from(vec![surface; ROWS])),
         ("run_id", _) => Arc::new(StringArray::from(vec![run; ROWS])),
-        // A surface `a-wall` belongs to project `a`.
-        ("project", _) => Arc::new(StringArray::from(vec![surface.split_once('-').map(|(project, _)| project); ROWS])),
+        // A surface `a-wall` belongs to project `a`, and a run `r1-b` to project `b`.
+        ("project", _) => {
+            let project = run.split_once('-').map(|(_, project)| project);
+            let project = project.or_else(|| surface.split_once('-').map(|(project, _)| project));
+            Arc::new(StringArray::from(vec![project; ROWS]))
+        }
+        ("flat_reference" | "foam_reference", _) => Arc::new(StringArray::from(vec!["flat"; ROWS])),
         (_, DataType::Utf8) => Arc::new(StringArray::from(vec![value.to_string(); ROWS])),
         (_, DataType::Int32) => Arc::new((0..ROWS as i32).collect::<Int32Array>()),
         (_, DataType::Int64) => Arc::new((0..ROWS as i64).collect::<Int64Array>()),
@@ -70,8 +75,14 @@ async fn put(lake: &Lake, surface: &str, run: &str, derivation: &str, value: usi
         derivation: derivation.to_owned(),
     };
     let old: Vec<_> = lake.snapshot().await.expect("a view").files_of(Table::Runs, &pointer.run).cloned().collect();
+    let described = FileName::Rows {
+        surface: pointer.surface.clone(),
+        run: pointer.run.clone(),
+        derivation: pointer.run_derivation.clone(),
+    };
     let mut staged = Vec::new();
-    for (table, name) in [(TABLE, part), (Table::Runs, FileName::Pointer(pointer.clone()))] {
+    let row = FileName::Pointer(pointer.clone());
+    for (table, name) in [(TABLE, part), (Table::Surfaces, described), (Table::Runs, row)] {
         let schema = table.schema(lake.rig());
         let columns = schema.fields().iter().map(|f| column(f, surface, run, value)).collect();
         let rows = RecordBatch::try_new(schema.clone(), columns).expect("rows");
@@ -107,7 +118,7 @@ async fn optimize(lake: &Lake) -> OptimizeReport {
 /// Five runs, of surfaces and in an order that are not sorted.
 async fn five() -> (Arc<InMemory>, Lake) {
     let store = Arc::new(InMemory::new());
-    let lake = lake(&store).await;
+    let lake = open(&store).await;
     for (number, surface) in ["wood", "flat", "prd", "foam", "brick"].iter().enumerate() {
         put(&lake, surface, &format!("r{number}"), "d1", number).await;
     }
@@ -119,7 +130,8 @@ async fn readers_see_the_same_rows_in_the_same_layout() {
     let (store, lake) = five().await;
     let (before, singles) = (seen(&lake).await, files(&lake).await);
     let report = optimize(&lake).await;
-    assert_eq!((report.tables.len(), report.tables[0].merged, report.tables[0].files), (1, 5, 1), "{report:?}");
+    let merged: Vec<_> = report.tables.iter().map(|table| (table.table, table.merged, table.files)).collect();
+    assert_eq!(merged, [("surfaces", 5, 1), ("runs", 5, 1), ("nce", 5, 1)]);
     let merged = files(&lake).await;
     assert_eq!(merged.len(), 1, "nothing else is left in the log");
     let surfaces: Vec<_> = merged[0].parts.iter().map(|p| (p.surface.as_str(), p.rows)).collect();
@@ -206,7 +218,7 @@ async fn of_two_merges_at_once_one_is_made() {
         let merge = |range: std::ops::Range<usize>| {
             let (store, planned) = (store.clone(), planned.clone());
             tokio::spawn(async move {
-                let lake = lake(&store).await;
+                let lake = open(&store).await;
                 lake.merge(TABLE, &planned[range], CommitEffect::Layout, None).await.expect("no error").0
             })
         };
@@ -230,7 +242,7 @@ async fn parts_outlive_a_checkpoint() {
     }
     let checkpoint = object_store::path::Path::from("tables/nce/_delta_log/_last_checkpoint");
     object_store::ObjectStoreExt::head(store.as_ref(), &checkpoint).await.expect("a checkpoint");
-    let anew = lake(&store).await;
+    let anew = open(&store).await;
     let merged: Vec<_> = files(&anew).await.into_iter().filter(|f| !f.parts.is_empty()).collect();
     assert_eq!(merged.len(), 1);
     assert_eq!(merged[0].parts, parts);
@@ -239,7 +251,10 @@ async fn parts_outlive_a_checkpoint() {
 #[tokio::test]
 async fn vacuum_deletes_what_is_merged_and_nothing_that_is_named() {
     let (store, lake) = five().await;
-    let singles = files(&lake).await;
+    let mut singles = Vec::new();
+    for table in [TABLE, Table::Runs, Table::Surfaces] {
+        singles.extend(lake.log().files(table).await.expect("a log"));
+    }
     optimize(&lake).await;
     let before = seen(&lake).await;
     let vacuum = |hours, deletion| {
@@ -260,7 +275,7 @@ async fn vacuum_deletes_what_is_merged_and_nothing_that_is_named() {
 
 /// Runs of two projects, of references and of none.
 async fn of_projects() -> Lake {
-    let lake = lake(&Arc::new(InMemory::new())).await;
+    let lake = open(&Arc::new(InMemory::new())).await;
     for (number, surface) in ["flat", "foam", "a-wall", "a-hall", "b-wall", "b-hall", "old", "older"].iter().enumerate()
     {
         put(&lake, surface, &format!("r{number}"), "d1", number).await;
@@ -329,4 +344,166 @@ async fn projects_are_not_merged_and_readers_see_parts_of_files_that_were() {
         (["r0", "r1", "r2", "r3"].map(str::to_owned).to_vec(), 0)
     );
     assert_eq!((seen_runs(&lake).await.len(), whole(&lake).await), (8, 1));
+}
+
+/// What a lake's snapshot says of its runs: name, derivation of the derived rows, version that added the row.
+async fn rows_of_runs(lake: &Lake) -> Vec<(String, String, u64)> {
+    let snapshot = lake.snapshot().await.expect("a view");
+    let row = |run: &VisibleRun| {
+        let derivation = run.reference_derivation.clone().expect("derived");
+        (run.run.to_string(), derivation, snapshot.row_version(&run.run).expect("seen"))
+    };
+    let rows: Vec<_> = snapshot.runs().map(row).collect();
+    for table in [Table::Runs, Table::Surfaces, TABLE] {
+        let mut shown: Vec<_> = snapshot.files(table).iter().flat_map(DataFile::shown_runs).collect();
+        shown.sort();
+        assert_eq!(shown.len(), rows.len(), "{table:?} shows {shown:?}");
+    }
+    rows
+}
+
+async fn only_merged(lake: &Lake, table: Table) -> DataFile {
+    let mut merged = lake.log().files(table).await.expect("a log");
+    merged.retain(|file| !file.parts.is_empty());
+    assert_eq!(merged.len(), 1, "{table:?}");
+    merged.remove(0)
+}
+
+#[tokio::test]
+async fn a_merged_row_of_a_run_keeps_its_version_and_its_newer_one_counts() {
+    let (store, lake) = five().await;
+    let before = rows_of_runs(&lake).await;
+    optimize(&lake).await;
+    assert_eq!(rows_of_runs(&lake).await, before);
+    assert_eq!(lake.log().files(Table::Runs).await.expect("a log").len(), 1);
+    put(&lake, "flat", "r1", "d2", 77).await;
+    let then = lake.snapshot().await.expect("a view");
+    put(&lake, "wood", "r0", "d2", 78).await;
+    put(&lake, "cube", "r9", "d1", 9).await;
+    let row = |run: &str, derivation: &str, version| (run.to_owned(), derivation.to_owned(), version);
+    let mut expected = before.clone();
+    (expected[0], expected[1]) = (row("r0", "d2", 8), row("r1", "d2", 7));
+    expected.push(row("r9", "d1", 9));
+    assert_eq!(rows_of_runs(&lake).await, expected);
+    // A clean-up that began before the second one puts the older row of r0 into a newer file.
+    lake.rewrite(Table::Runs, &then.outgrown(Table::Runs)[0]).await.expect("written anew");
+    let merged = only_merged(&lake, Table::Runs).await;
+    assert_eq!((merged.log_version, merged.parts.len()), (10, 4));
+    assert_eq!(rows_of_runs(&lake).await, expected);
+    lake.remove_superseded().await.expect("cleaned up");
+    assert_eq!(only_merged(&lake, Table::Runs).await.parts.len(), 3);
+    assert_eq!(rows_of_runs(&lake).await, expected);
+    optimize(&lake).await;
+    assert_eq!(only_merged(&lake, Table::Runs).await.parts.len(), 6);
+    assert_eq!(rows_of_runs(&lake).await, expected);
+    drop(lake);
+    assert_eq!(rows_of_runs(&open(&store).await).await, expected);
+}
+
+#[tokio::test]
+async fn of_two_who_replace_a_merged_row_one_does() {
+    let (_, lake) = five().await;
+    optimize(&lake).await;
+    let view = lake.snapshot().await.expect("a view");
+    let run = |name: &str| view.run(&name.parse().expect("an id")).expect("seen").clone();
+    let (flat, wood) = (run("r1"), run("r0"));
+    let replace = async |run: &VisibleRun, derivation: &str| {
+        let pointer = VisibleRun { reference_derivation: Some(derivation.to_owned()), ..run.clone() };
+        let file = encode(Table::Runs, &Table::Runs.schema(lake.rig()), &[]).expect("encoded");
+        let staged = lake.stage(Table::Runs, &FileName::Pointer(pointer.clone()), file).await.expect("staged");
+        let staged = staged.made_from(&view).replacing(&pointer, view.files_of(Table::Runs, &run.run));
+        lake.commit(&[staged]).await.expect("no error")[0]
+    };
+    assert_eq!(replace(&flat, "d2").await, CommitOutcome::Now);
+    assert_eq!(replace(&flat, "d3").await, CommitOutcome::Outdated, "another one's row is there");
+    assert_eq!(replace(&wood, "d2").await, CommitOutcome::Now, "a row of the same file");
+    lake.remove_superseded().await.expect("cleaned up");
+    assert_eq!(replace(&flat, "d3").await, CommitOutcome::Outdated);
+    let seen = lake.snapshot().await.expect("a view");
+    let derivations = ["r0", "r1", "r2"].map(|run| {
+        let run: echolake_schema::RunId = run.parse().expect("an id");
+        seen.run(&run).expect("seen").reference_derivation.clone().expect("derived")
+    });
+    assert_eq!(derivations, ["d2", "d2", "d1"]);
+}
+
+#[tokio::test]
+async fn a_past_version_of_runs_is_seen_once_its_files_are_merged_and_deleted() {
+    let (_, lake) = five().await;
+    let version = lake.snapshot().await.expect("a view").version(Table::Runs).expect("a log");
+    optimize(&lake).await;
+    put(&lake, "cube", "r9", "d1", 9).await;
+    optimize(&lake).await;
+    lake.vacuum(chrono::TimeDelta::zero(), crate::DeletionMode::Real, &mut |_, _| {}).await.expect("deleted");
+    let then = lake.snapshot_at(version, Table::Runs).await.expect("held");
+    assert_eq!(then.files(Table::Runs).iter().map(DataFile::visible_rows).sum::<u64>() as usize, 5 * ROWS);
+    put(&lake, "flat", "r1", "d2", 77).await;
+    optimize(&lake).await;
+    lake.vacuum(chrono::TimeDelta::zero(), crate::DeletionMode::Real, &mut |_, _| {}).await.expect("deleted");
+    let gone = lake.snapshot_at(version, Table::Runs).await;
+    assert!(matches!(gone, Err(Error::Vacuumed { .. })), "the older row of r1: {gone:?}");
+}
+
+// What tells a surface to readers of one project may not be what tells it to others.
+#[tokio::test]
+async fn a_surface_that_two_projects_measured_is_described_to_both() {
+    let lake = of_projects().await;
+    let check = async |expected: [&[&str]; 3]| {
+        for (reader, expected) in
+            [reader_of(&lake, &["a"]), reader_of(&lake, &["b"]), lake.clone()].iter().zip(expected)
+        {
+            let snapshot = reader.snapshot().await.expect("a view");
+            let files = snapshot.files(Table::Surfaces).iter();
+            let mut shown: Vec<_> = files.flat_map(DataFile::shown_runs).map(|run| run.to_string()).collect();
+            shown.sort();
+            assert_eq!(shown, expected);
+        }
+    };
+    let all = ["r0", "r1", "r2", "r3", "r4", "r5", "r6", "r7"];
+    check([&["r0", "r1", "r2", "r3"], &["r0", "r1", "r4", "r5"], &all]).await;
+    optimize(&lake).await;
+    check([&["r0", "r1", "r2", "r3"], &["r0", "r1", "r4", "r5"], &all]).await;
+    // Project b measures one of project a's surfaces, and a row of the same merged file is superseded.
+    put(&lake, "a-wall", "r8-b", "d1", 8).await;
+    put(&lake, "a-hall", "r9", "d1", 9).await;
+    put(&lake, "a-hall", "r3", "d2", 3).await;
+    let expected: [&[&str]; 3] = [
+        &["r0", "r1", "r2", "r9"],
+        &["r0", "r1", "r4", "r5", "r8-b"],
+        &["r0", "r1", "r4", "r5", "r6", "r7", "r8-b", "r9"],
+    ];
+    check(expected).await;
+    lake.remove_superseded().await.expect("cleaned up");
+    optimize(&lake).await;
+    check(expected).await;
+}
+
+#[tokio::test]
+async fn projects_have_rows_of_runs_of_their_own() {
+    let lake = of_projects().await;
+    let before = [rows_of_runs(&reader_of(&lake, &["a"])).await, rows_of_runs(&reader_of(&lake, &["b"])).await];
+    optimize(&lake).await;
+    let merged = lake.log().files(Table::Runs).await.expect("a log");
+    assert_eq!(merged.iter().map(|file| file.parts.len().max(1)).sum::<usize>(), 8);
+    assert_eq!(merged.len(), 4, "references, of a, of b, and of none: {merged:?}");
+    let after = [rows_of_runs(&reader_of(&lake, &["a"])).await, rows_of_runs(&reader_of(&lake, &["b"])).await];
+    assert_eq!(after, before);
+}
+
+#[tokio::test]
+async fn references_are_seen_in_a_file_that_was_merged_before_there_were_projects() {
+    let (_, lake) = five().await;
+    optimize(&lake).await;
+    put(&lake, "a-wall", "r5", "d1", 5).await;
+    let reader = reader_of(&lake, &["a"]);
+    let runs: Vec<_> = rows_of_runs(&reader).await.into_iter().map(|(run, _, version)| (run, version)).collect();
+    assert_eq!(runs, [("r1".to_owned(), 2), ("r3".to_owned(), 4), ("r5".to_owned(), 7)]);
+    let versions = reader.versions().await.expect("versions");
+    assert_eq!(versions.last().map(|version| version.version), Some(7));
+    let snapshot = reader.snapshot().await.expect("a view");
+    let partly: Vec<_> = snapshot.files(Table::Runs).iter().filter(|file| !file.hidden.is_empty()).collect();
+    assert_eq!((partly.len(), partly[0].visible_parts().count(), partly[0].parts.len()), (1, 2, 5));
+    put(&lake, "cube", "r6", "d1", 6).await;
+    optimize(&lake).await;
+    assert_eq!((rows_of_runs(&lake).await.len(), rows_of_runs(&reader).await.len()), (7, 3));
 }
