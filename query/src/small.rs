@@ -1,5 +1,5 @@
-//! Cache of the rows of small tables: `runs` and `surfaces` have one row per file until they are merged, and most queries
-//! read them. A file never changes, so its rows are read once per process.
+//! Cache of the rows of small tables: `runs`, `surfaces` and `surface_stats` have one file per run until they are merged,
+//! and most queries read them. A file never changes, so its rows are read once per process, many files concurrently.
 
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -17,6 +17,9 @@ use tokio::sync::Mutex as AsyncMutex;
 
 /// Maximum rows of a small table: some ten megabytes of the widest one.
 const SMALL_ROWS: u64 = 20_000;
+/// Maximum size of each file of a small table with lists, whose other columns are cached: `surface_stats` has ten
+/// kilobytes a run.
+const SMALL_FILE_BYTES: u64 = 128 << 10;
 /// Number of files that are read concurrently from a folder.
 const TOGETHER: usize = 16;
 /// The same from an object store, where waiting costs nothing else: six rounds for 350 runs.
@@ -44,13 +47,21 @@ impl SmallTables {
         Self { lake: lake.clone(), files: Mutex::default(), reading: Mutex::default() }
     }
 
-    /// Returns whether a table is cached: few rows, no lists.
-    pub(crate) fn keeps<'a>(schema: &SchemaRef, files: impl Iterator<Item = &'a DataFile>) -> bool {
-        let narrow = !schema.fields().iter().any(|f| f.data_type().is_nested());
-        narrow && files.map(DataFile::visible_rows).sum::<u64>() <= SMALL_ROWS
+    /// Returns the columns of a table that are cached, those without lists; None if it is not small.
+    pub(crate) fn cached_columns<'a>(
+        schema: &SchemaRef,
+        files: impl Iterator<Item = &'a DataFile> + Clone,
+    ) -> Option<Vec<usize>> {
+        let is_cached = |i: &usize| !schema.field(*i).data_type().is_nested();
+        let columns: Vec<_> = (0..schema.fields().len()).filter(is_cached).collect();
+        let is_narrow = columns.len() == schema.fields().len();
+        let has_few_rows = files.clone().map(DataFile::visible_rows).sum::<u64>() <= SMALL_ROWS;
+        let is_small = has_few_rows && (is_narrow || files.map(|f| f.bytes).all(|bytes| bytes <= SMALL_FILE_BYTES));
+        is_small.then_some(columns)
     }
 
-    /// Returns the rows of these files that readers see. They must be all files of the table.
+    /// Returns the rows of these files that readers see, with the columns of `schema`. They must be all files of the
+    /// table, and the columns those that are cached.
     ///
     /// # Errors
     /// If a file does not agree with its log.
@@ -94,9 +105,10 @@ impl SmallTables {
 
     async fn read(&self, table: Table, schema: &SchemaRef, file: DataFile) -> Result<(Path, KnownRows)> {
         let failed = |e: echolake_lake::Error| DataFusionError::External(Box::new(e));
+        let columns: Vec<_> = schema.fields().iter().map(|field| field.name().as_str()).collect();
         let mut batches = Vec::new();
         for range in file.visible_ranges() {
-            let stream = self.lake.rows(table, &file, &[], range).await.map_err(failed)?;
+            let stream = self.lake.rows(table, &file, &columns, range).await.map_err(failed)?;
             batches.extend(stream.try_collect::<Vec<_>>().await.map_err(failed)?);
         }
         let rows = concat_batches(schema, &batches)?;

@@ -56,7 +56,7 @@ pub(crate) struct LakeTable {
     files: Vec<ScanFile>,
     all: Statistics,
     source: FileReaders,
-    /// All rows, if the table is small and was queried.
+    /// The cached columns of all rows, if the table is small and was queried.
     rows: OnceCell<RecordBatch>,
 }
 
@@ -144,9 +144,22 @@ impl LakeTable {
         Ok(DataSourceExec::from_data_source(config))
     }
 
-    async fn small_rows(&self) -> Result<RecordBatch> {
-        let files: Vec<_> = self.files.iter().map(|f| &f.file).collect();
-        self.source.small.rows(self.table, &self.schema, &files).await
+    // The columns in memory, if the table is small and the wanted ones are among them: each one's place in the cache.
+    async fn cached(&self, projection: Option<&Vec<usize>>) -> Result<Option<(RecordBatch, Vec<usize>)>> {
+        let files = || self.files.iter().map(|f| &f.file);
+        let Some(columns) = SmallTables::cached_columns(&self.schema, files()) else { return Ok(None) };
+        let place = |column: usize| columns.iter().position(|cached| *cached == column);
+        let wanted = match projection {
+            Some(wanted) => wanted.iter().map(|column| place(*column)).collect(),
+            None => (0..self.schema.fields().len()).map(place).collect::<Option<Vec<_>>>(),
+        };
+        let Some(wanted) = wanted else { return Ok(None) };
+        let read = async || {
+            let schema = Arc::new(self.schema.project(&columns)?);
+            self.source.small.rows(self.table, &schema, &files().collect::<Vec<_>>()).await
+        };
+        let rows = self.rows.get_or_try_init(read).await?;
+        Ok(Some((rows.clone(), wanted)))
     }
 
     fn known(&self, files: &[&ScanFile]) -> Result<Statistics> {
@@ -309,11 +322,9 @@ impl TableProvider for LakeTable {
         filters: &[Expr],
         limit: Option<usize>,
     ) -> Result<Arc<dyn ExecutionPlan>> {
-        if SmallTables::keeps(&self.schema, self.files.iter().map(|f| &f.file)) {
-            let rows = self.rows.get_or_try_init(|| self.small_rows()).await?;
-            let exec =
-                MemorySourceConfig::try_new_exec(&[vec![rows.clone()]], self.schema.clone(), projection.cloned())?;
-            return Ok(exec);
+        if let Some((rows, wanted)) = self.cached(projection).await? {
+            let schema = rows.schema();
+            return Ok(MemorySourceConfig::try_new_exec(&[vec![rows]], schema, Some(wanted))?);
         }
         let kept = self.kept(state, filters)?;
         let (whole, partial): (Vec<_>, Vec<_>) = kept.into_iter().partition(|f| f.file.hidden.is_empty());
