@@ -17,9 +17,6 @@ use tokio::sync::Mutex as AsyncMutex;
 
 /// Maximum rows of a small table: some ten megabytes of the widest one.
 const SMALL_ROWS: u64 = 20_000;
-/// Maximum size of each file of a small table with lists, whose other columns are cached: `surface_stats` has ten
-/// kilobytes a run.
-const SMALL_FILE_BYTES: u64 = 128 << 10;
 /// Number of files that are read concurrently from a folder.
 const TOGETHER: usize = 16;
 /// The same from an object store, where waiting costs nothing else: six rounds for 350 runs.
@@ -47,17 +44,17 @@ impl SmallTables {
         Self { lake: lake.clone(), files: Mutex::default(), reading: Mutex::default() }
     }
 
-    /// Returns the columns of a table that are cached, those without lists; None if it is not small.
+    /// Returns the columns of a table that are cached; None if it is not small: few rows, no lists. Of `surface_stats`,
+    /// which has a curve in each row, the other columns are cached.
     pub(crate) fn cached_columns<'a>(
+        table: Table,
         schema: &SchemaRef,
-        files: impl Iterator<Item = &'a DataFile> + Clone,
+        files: impl Iterator<Item = &'a DataFile>,
     ) -> Option<Vec<usize>> {
         let is_cached = |i: &usize| !schema.field(*i).data_type().is_nested();
         let columns: Vec<_> = (0..schema.fields().len()).filter(is_cached).collect();
-        let is_narrow = columns.len() == schema.fields().len();
-        let has_few_rows = files.clone().map(DataFile::visible_rows).sum::<u64>() <= SMALL_ROWS;
-        let is_small = has_few_rows && (is_narrow || files.map(|f| f.bytes).all(|bytes| bytes <= SMALL_FILE_BYTES));
-        is_small.then_some(columns)
+        let is_narrow = table == Table::SurfaceStats || columns.len() == schema.fields().len();
+        (is_narrow && files.map(DataFile::visible_rows).sum::<u64>() <= SMALL_ROWS).then_some(columns)
     }
 
     /// Returns the rows of these files that readers see, with the columns of `schema`. They must be all files of the

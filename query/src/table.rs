@@ -147,7 +147,7 @@ impl LakeTable {
     // The columns in memory, if the table is small and the wanted ones are among them: each one's place in the cache.
     async fn cached(&self, projection: Option<&Vec<usize>>) -> Result<Option<(RecordBatch, Vec<usize>)>> {
         let files = || self.files.iter().map(|f| &f.file);
-        let Some(columns) = SmallTables::cached_columns(&self.schema, files()) else { return Ok(None) };
+        let Some(columns) = SmallTables::cached_columns(self.table, &self.schema, files()) else { return Ok(None) };
         let place = |column: usize| columns.iter().position(|cached| *cached == column);
         let wanted = match projection {
             Some(wanted) => wanted.iter().map(|column| place(*column)).collect(),

@@ -27,7 +27,7 @@ impl RunSizes {
     /// Returns the sizes that are known. A file that is missing here is asked for its size.
     pub(super) async fn read(&self, snapshot: &LakeSnapshot) -> HashMap<Path, u64> {
         let files: Vec<_> = snapshot.files(Table::Runs).iter().collect();
-        if SmallTables::cached_columns(&self.schema, files.iter().copied()).is_none() {
+        if SmallTables::cached_columns(Table::Runs, &self.schema, files.iter().copied()).is_none() {
             return HashMap::new();
         }
         let rows = self.small.rows(Table::Runs, &self.schema, &files).await;

@@ -174,14 +174,14 @@ impl MessageRelay {
             if header.kind == b'X' {
                 return Err(RelayEnd::Client);
             }
+            // Of a longer one, the engine ends the connection.
+            if there == header.bytes {
+                header.check_parts(&self.incoming[..there]).map_err(broken)?;
+            }
             if link.lease.is_none() && !self.is_skipping {
                 link.lease = Some(link.engine.lease().ok_or(RelayEnd::Engine)?);
             }
             let bytes = self.incoming.split_to(there);
-            // Of a longer one, the engine ends the connection.
-            if there == header.bytes {
-                header.check_parts(&bytes).map_err(broken)?;
-            }
             (self.rest, self.is_rest_dropped) = (header.bytes - there, self.is_skipping);
             if self.is_skipping {
                 if header.kind == b'S' {
