@@ -55,7 +55,7 @@ async fn lake(home: &TempDir, keep: RecordingMode) -> Lake {
     let stop = Arc::new(AtomicBool::new(false));
     let sources = pending(&lake).await.expect("runs");
     LakeIngest::new(&lake, stop.clone()).take_in(sources, &mut |_| {}).await.expect("ingested");
-    complete(&lake, &stop, &mut |_| {}).await.expect("derived");
+    complete(&lake, &stop, &mut |_, _| {}).await.expect("derived");
     lake
 }
 

@@ -3,7 +3,7 @@
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use echolake_lake::{ClaimOutcome, ClaimTimes, CommitOutcome, DataFile, Lake, VisibleRun, WorkClaims};
+use echolake_lake::{ClaimOutcome, ClaimTimes, CommitOutcome, DataFile, Lake, LakeSnapshot, VisibleRun, WorkClaims};
 use echolake_schema::tables::Table;
 use echolake_schema::{RunId, SurfaceId};
 use tracing::Instrument as _;
@@ -31,53 +31,62 @@ pub struct CompletedRun {
     pub measurements: usize,
 }
 
-/// Brings every run's derived rows up to date; returns the number of changed runs. A run whose rows used the current
-/// references is left alone.
+/// A completion, as long as it goes on: a run, and the number of runs to complete.
+pub type CompletionReport<'a> = dyn FnMut(&CompletedRun, usize) + Send + 'a;
+
+/// Result of a completion.
+#[derive(Debug)]
+pub struct Completion {
+    /// Number of changed runs.
+    pub changed: usize,
+    /// The runs that wait for references, with the names of the missing references.
+    pub waiting: Vec<(RunId, String)>,
+}
+
+/// Brings every run's derived rows up to date, and removes superseded rows. A run whose rows used the current references
+/// is left alone.
 ///
 /// # Errors
 /// [`crate::Error`]; runs completed before stay so, and the same call resumes with the rest.
-pub async fn complete(lake: &Lake, stop: &AtomicBool, done: &mut (dyn FnMut(&CompletedRun) + Send)) -> Result<usize> {
+pub async fn complete(lake: &Lake, stop: &AtomicBool, done: &mut CompletionReport<'_>) -> Result<Completion> {
     let claims = lake.is_remote().then(|| Arc::new(WorkClaims::start(lake, ClaimTimes::default())));
     let completed = complete_sharing(lake, stop, claims.as_ref(), done).await;
     // Whoever waits need not wait until they are dead.
     if let Some(claims) = claims.and_then(Arc::into_inner) {
         claims.close().await;
     }
-    let count = completed?;
-    lake.remove_superseded().await?;
-    Ok(count)
+    let (changed, snapshot) = completed?;
+    lake.remove_superseded_in(&snapshot).await?;
+    Ok(Completion { changed, waiting: waiting(lake, snapshot) })
 }
 
-/// The same, with claims on the runs if several ingests share the work.
+/// Completes runs, with claims on them if several ingests share the work; returns the number of changed runs, and the
+/// lake's snapshot thereafter.
 pub(crate) async fn complete_sharing(
     lake: &Lake,
     stop: &AtomicBool,
     claims: Option<&Arc<WorkClaims>>,
-    done: &mut (dyn FnMut(&CompletedRun) + Send),
-) -> Result<usize> {
+    done: &mut CompletionReport<'_>,
+) -> Result<(usize, Arc<LakeSnapshot>)> {
     let (cores, mut count, mut rounds) = (Cores::all()?, 0, 0);
     while rounds < ROUNDS {
         let round = do_round(lake, &cores, stop, claims, done).await?;
         count += round.changed;
         match round {
+            CompletionRound { unchanged: Some(snapshot), .. } => return Ok((count, snapshot)),
             CompletionRound { claimed: true, .. } if stop.load(Ordering::Relaxed) => return Err(Error::Stopped),
             CompletionRound { claimed: true, .. } => tokio::time::sleep(LOOK_EVERY).await,
             CompletionRound { overtaken: true, .. } => rounds += 1,
             _ => break,
         }
     }
-    Ok(count)
+    Ok((count, Arc::new(lake.snapshot().await?)))
 }
 
-/// Lists the runs that wait for references, with the names of the missing references.
-///
-/// # Errors
-/// [`crate::Error::Lake`] if the lake cannot be read.
-pub async fn waiting(lake: &Lake) -> Result<Vec<(RunId, String)>> {
-    let snapshot = Arc::new(lake.snapshot().await?);
+fn waiting(lake: &Lake, snapshot: Arc<LakeSnapshot>) -> Vec<(RunId, String)> {
     let finder = ReferenceFinder::new(lake, snapshot.clone());
     let missing = |run: &VisibleRun| (run.run.clone(), finder.wanted(&run.surface).missing());
-    Ok(snapshot.runs().map(missing).filter(|(_, missing)| !missing.is_empty()).collect())
+    snapshot.runs().map(missing).filter(|(_, missing)| !missing.is_empty()).collect()
 }
 
 /// Result of a look at all runs.
@@ -89,6 +98,8 @@ struct CompletionRound {
     overtaken: bool,
     /// Another ingest is completing one of them.
     claimed: bool,
+    /// The snapshot, if nothing was to be done.
+    unchanged: Option<Arc<LakeSnapshot>>,
 }
 
 async fn do_round(
@@ -96,7 +107,7 @@ async fn do_round(
     cores: &Cores,
     stop: &AtomicBool,
     claims: Option<&Arc<WorkClaims>>,
-    done: &mut (dyn FnMut(&CompletedRun) + Send),
+    done: &mut CompletionReport<'_>,
 ) -> Result<CompletionRound> {
     let context = IngestContext::now(lake, cores).await?;
     let mut jobs = Vec::new();
@@ -106,6 +117,10 @@ async fn do_round(
             jobs.push((run.clone(), wanted));
         }
     }
+    if jobs.is_empty() {
+        return Ok(CompletionRound { unchanged: Some(context.snapshot), ..CompletionRound::default() });
+    }
+    let total = jobs.len();
     let mut round = CompletionRound::default();
     let shared = claims.cloned();
     let do_one = move |(run, wanted): (VisibleRun, WantedReferences)| {
@@ -130,7 +145,7 @@ async fn do_round(
             Ok((completed, outcome)) => {
                 if outcome == Some(CommitOutcome::Now) {
                     round.changed += 1;
-                    done(&completed);
+                    done(&completed, total);
                 }
                 round.overtaken |= outcome == Some(CommitOutcome::Outdated);
             }

@@ -80,7 +80,7 @@ async fn ingest(store: Arc<dyn ObjectStore>) -> crate::Result<Vec<FileReport>> {
     let mut reports = Vec::new();
     let sources = pending(&lake).await?;
     LakeIngest::new(&lake, stop.clone()).take_in(sources, &mut |report| reports.push(report)).await?;
-    complete(&lake, &stop, &mut |_| {}).await?;
+    complete(&lake, &stop, &mut |_, _| {}).await?;
     Ok(reports)
 }
 
@@ -466,7 +466,7 @@ async fn what_others_claimed_and_did_not_do_is_done_after_a_while_and_by_one_ing
     let mut names: Vec<_> = runs.iter().map(|(name, _)| name.trim_end_matches(".mcap").to_owned()).collect();
     names.sort();
     assert_eq!(taken, names, "each once");
-    complete(&lake, &AtomicBool::new(false), &mut |_| {}).await.expect("completed");
+    complete(&lake, &AtomicBool::new(false), &mut |_, _| {}).await.expect("completed");
     assert!(rows(store).await == expected, "other rows");
 }
 
@@ -484,8 +484,9 @@ async fn completions_are_shared() {
     LakeIngest::new(&lake, Arc::default()).take_in(sources, &mut |_| {}).await.expect("ingested");
     let work = async || {
         let (claims, mut completed) = (Arc::new(WorkClaims::start(&lake, ClaimTimes::default())), Vec::new());
-        let done = &mut |run: &CompletedRun| completed.push(run.run.to_string());
-        let count = complete_sharing(&lake, &AtomicBool::new(false), Some(&claims), done).await.expect("completed");
+        let done = &mut |run: &CompletedRun, _| completed.push(run.run.to_string());
+        let (count, _) =
+            complete_sharing(&lake, &AtomicBool::new(false), Some(&claims), done).await.expect("completed");
         assert_eq!(count, completed.len());
         completed
     };

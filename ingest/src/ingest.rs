@@ -121,7 +121,7 @@ struct IngestWork {
 #[derive(Clone)]
 struct SharedWork {
     claims: Arc<WorkClaims>,
-    /// Runs that were in the tables at its start: whoever wants them ingested wants them again.
+    /// Runs that were in the tables before the first file was taken in: whoever wants them ingested wants them again.
     known: Arc<BTreeSet<RunId>>,
 }
 
@@ -146,11 +146,10 @@ impl<'a> LakeIngest<'a> {
     /// resumes with them.
     pub async fn take_in(&self, sources: Vec<RunSource>, report: &mut (dyn FnMut(FileReport) + Send)) -> Result<()> {
         let Some(times) = self.sharing else { return self.take_in_sharing(sources, None, report).await };
-        let known = self.lake.snapshot().await?.runs().map(|run| run.run.clone()).collect();
-        let shared = SharedWork { claims: Arc::new(WorkClaims::start(self.lake, times)), known: Arc::new(known) };
-        let done = self.take_in_sharing(sources, Some(&shared), report).await;
+        let claims = Arc::new(WorkClaims::start(self.lake, times));
+        let done = self.take_in_sharing(sources, Some(&claims), report).await;
         // Whoever waits need not wait until they are dead.
-        if let Some(claims) = Arc::into_inner(shared.claims) {
+        if let Some(claims) = Arc::into_inner(claims) {
             claims.close().await;
         }
         done
@@ -159,9 +158,10 @@ impl<'a> LakeIngest<'a> {
     async fn take_in_sharing(
         &self,
         sources: Vec<RunSource>,
-        shared: Option<&SharedWork>,
+        claims: Option<&Arc<WorkClaims>>,
         report: &mut (dyn FnMut(FileReport) + Send),
     ) -> Result<()> {
+        let mut known: Option<Arc<BTreeSet<RunId>>> = None;
         let (references, others) = self.in_order(sources).await?;
         let (cores, measurer) = (Cores::all()?, Arc::new(Measurer::new(self.lake)));
         for sources in [references, others] {
@@ -169,14 +169,17 @@ impl<'a> LakeIngest<'a> {
             let mut free = sources;
             while !free.is_empty() {
                 let context = IngestContext::now(self.lake, &cores).await?;
-                let work = IngestWork { context, measurer: measurer.clone(), shared: shared.cloned() };
+                let runs = || Arc::new(context.snapshot.runs().map(|run| run.run.clone()).collect());
+                let known = known.get_or_insert_with(runs).clone();
+                let shared = claims.map(|claims| SharedWork { claims: claims.clone(), known });
+                let work = IngestWork { context, measurer: measurer.clone(), shared };
                 for source in self.take_in_group(work, free, report).await? {
                     if !claimed.contains(&source) {
                         report(FileReport::Claimed(source.clone()));
                         claimed.push(source);
                     }
                 }
-                free = self.wait_for_claims(shared, &mut claimed).await?;
+                free = self.wait_for_claims(claims, &mut claimed).await?;
             }
         }
         Ok(())
@@ -185,10 +188,10 @@ impl<'a> LakeIngest<'a> {
     // Waits until nobody alive works on some of the claimed files; takes them out of `claimed`.
     async fn wait_for_claims(
         &self,
-        shared: Option<&SharedWork>,
+        claims: Option<&Arc<WorkClaims>>,
         claimed: &mut Vec<RunSource>,
     ) -> Result<Vec<RunSource>> {
-        let Some(SharedWork { claims, .. }) = shared else { return Ok(Vec::new()) };
+        let Some(claims) = claims else { return Ok(Vec::new()) };
         while !claimed.is_empty() {
             if self.stop.load(Ordering::Relaxed) {
                 return Err(Error::Stopped);
@@ -275,7 +278,7 @@ impl IngestWork {
     async fn take_in(&self, source: &RunSource) -> Result<ReadyJob<IngestedRun>> {
         let IngestContext { lake, cores, snapshot, finder } = &self.context;
         self.claim(source).await?;
-        let mut mark = ReadingMark::new(lake, source);
+        let mark = ReadingMark::new(lake, source);
         let opened = source.open(lake)?;
         let e_tag = files::inbox_tag(lake, source).await;
         let content = Arc::new(RunContent::read(lake, &self.measurer, cores, &opened).await?);
@@ -290,8 +293,10 @@ impl IngestWork {
         }
         let place = Lake::run_path(&keys.surface, &keys.run);
         let file = ReadFile::check(lake, source, e_tag, &content.integrity).await?;
-        files::keep(lake, source, &place, &file, known.is_some()).await?;
-        mark = mark.and_then(|mark| mark.follow(lake, &RunSource::Lake(place)));
+        let kept = async {
+            files::keep(lake, source, &place, &file, known.is_some()).await?;
+            Ok(mark.and_then(|mark| mark.follow(lake, &RunSource::Lake(place.clone()))))
+        };
         let names = ReferenceNames::of(&content.surface, &lake.config().references);
         let wanted = finder.lock().await.wanted_by(names);
         let mut taken = IngestedRun {
@@ -306,6 +311,7 @@ impl IngestWork {
             stopped: content.is_stopped(),
         };
         if known.is_some_and(|k| k.run_derivation == derivation) {
+            kept.await?;
             return Ok(ReadyJob { staged: Vec::new(), report: taken });
         }
         let (its_lake, for_rows, its_content) = (lake.clone(), keys.clone(), content.clone());
@@ -319,7 +325,8 @@ impl IngestWork {
                 None => Ok(None),
             }
         };
-        let (mut staged, derived) = tokio::try_join!(of_the_run, of_references)?;
+        // The file comes to its place meanwhile.
+        let (mut staged, derived, mark) = tokio::try_join!(of_the_run, of_references, kept)?;
         let mut references =
             rows::runs::RunReferences { missing: taken.missing.clone(), ..rows::runs::RunReferences::default() };
         if let Some((files, used)) = derived {

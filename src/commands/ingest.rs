@@ -12,7 +12,7 @@ use anyhow::Context as _;
 use echolake_acquisition::recovery::is_partial;
 use echolake_ingest::{
     FileReport, IngestOutcome, IngestedRun, LakeIngest, RunSource, SuspectFile, adopt_cut_off, arrivals, complete,
-    pending, rig_of_run, waiting,
+    pending, rig_of_run,
 };
 use echolake_lake::{Error as LakeError, Lake, ReferenceSurfaces, remote_access};
 use futures::TryStreamExt as _;
@@ -206,19 +206,17 @@ pub(crate) async fn take_in(
             .done(format!("{} runs, {measurements} new measurements, {derived} of them derived", summary.taken.len())),
     }
     outcome?;
-    let mut task = progress.task("complete", lake.snapshot().await?.runs().count() as u64, "runs");
-    let (mut rows, mut runs) = (0, 0);
-    complete(lake, stop, &mut |completed| {
+    let (mut task, mut rows, mut runs) = (None, 0, 0);
+    let completion = complete(lake, stop, &mut |completed, total| {
         rows += completed.measurements;
         runs += 1;
-        task.at(runs);
+        task.get_or_insert_with(|| progress.task("complete", total as u64, "runs")).at(runs);
     })
     .await?;
-    match runs {
-        0 => task.dismiss(),
-        _ => task.done(format!("{runs} runs, {rows} measurements derived")),
+    if let Some(task) = task {
+        task.done(format!("{runs} runs, {rows} measurements derived"));
     }
-    for (run, missing) in waiting(lake).await? {
+    for (run, missing) in completion.waiting {
         if summary.taken.iter().any(|t| t.run == run) {
             progress.say(format!("{run}: waits for reference {missing}; ingest a run of it, and it is completed"));
         }

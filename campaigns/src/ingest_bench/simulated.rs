@@ -140,7 +140,7 @@ impl SimulatedRuns {
             put_into_inbox(files, folder)?;
             let meter = CostMeter::start()?;
             LakeIngest::new(&lake, stop.clone()).take_in(pending(&lake).await?, &mut report).await?;
-            complete(&lake, &stop, &mut |_| {}).await?;
+            complete(&lake, &stop, &mut |_, _| {}).await?;
             *cost = meter.stop()?;
         }
         ensure!(refused.is_empty(), "refused: {}", refused.join("; "));

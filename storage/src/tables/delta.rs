@@ -112,6 +112,12 @@ impl DeltaLog {
         Ok(self.load(table).await?.and_then(|state| Some(state.metadata.as_ref()?.id.clone())))
     }
 
+    // The state of a recent look, where a look takes long; what is written against an older one than the newest fails.
+    async fn known(&self, table: Table) -> Option<Arc<TableState>> {
+        let known = self.loaded.lock().await.get(&table).cloned();
+        known.filter(|known| self.is_remote && known.found.elapsed() <= LOG_LASTS).map(|known| known.state)
+    }
+
     async fn require(&self, table: Table) -> Result<Arc<TableState>> {
         self.load(table).await?.ok_or_else(|| Error::Log {
             table: table.name(),
@@ -201,6 +207,11 @@ impl<'a> PendingChange<'a> {
         change
     }
 
+    fn is_all_of(&self, commit: &TableCommit) -> bool {
+        self.outcomes.iter().all(|outcome| *outcome == CommitOutcome::Now)
+            && commit.remove.iter().all(|file| self.remove.contains(&file.name))
+    }
+
     /// The commit's lines, against the version whose state is given.
     fn log_lines(&self, state: &TableState, now_millis: i64) -> Vec<LogLine> {
         let data_change = self.effect == CommitEffect::Rows;
@@ -248,7 +259,11 @@ pub(crate) fn folder(table: Table) -> Path {
 #[async_trait]
 impl CommitLog for DeltaLog {
     async fn ensure(&self, table: Table) -> Result<()> {
-        if let Some(state) = self.load(table).await? {
+        let known = match self.known(table).await {
+            Some(state) => Some(state),
+            None => self.load(table).await?,
+        };
+        if let Some(state) = known {
             return self.add_columns(table, state).await;
         }
         let now_millis = Utc::now().timestamp_millis();
@@ -307,7 +322,11 @@ impl CommitLog for DeltaLog {
     }
 
     async fn has(&self, table: Table, name: &str) -> Result<bool> {
-        Ok(self.load(table).await?.is_some_and(|state| state.files.keys().any(|path| decoded_name(path) == name)))
+        let has = |state: &TableState| state.files.keys().any(|path| decoded_name(path) == name);
+        if self.known(table).await.is_some_and(|state| has(&state)) {
+            return Ok(true);
+        }
+        Ok(self.load(table).await?.is_some_and(|state| has(&state)))
     }
 
     async fn history(&self, table: Table) -> Result<Option<FileHistory>> {
@@ -321,9 +340,17 @@ impl CommitLog for DeltaLog {
     }
 
     async fn commit(&self, table: Table, commit: &TableCommit) -> Result<Vec<CommitOutcome>> {
+        let mut known = self.known(table).await;
         for losses in 1..=COMMIT_TRIES {
-            let state = self.require(table).await?;
+            let (state, is_newest) = match known.take() {
+                Some(state) => (state, false),
+                None => (self.require(table).await?, true),
+            };
             let change = PendingChange::of(commit, known_files(&state));
+            // Only the newest version tells what is not to be written.
+            if !is_newest && !change.is_all_of(commit) {
+                continue;
+            }
             if change.add.is_empty() && change.remove.is_empty() {
                 return Ok(change.outcomes);
             }

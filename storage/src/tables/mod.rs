@@ -32,7 +32,7 @@ pub use versions::{LakeMoment, NoMoment};
 
 use arrow::record_batch::RecordBatch;
 use echolake_schema::tables::{Source, Table};
-use futures::future::{join_all, try_join_all};
+use futures::future::{join, join_all, try_join_all};
 use object_store::ObjectStoreExt as _;
 
 use self::delta::folder;
@@ -71,7 +71,9 @@ impl Lake {
     /// # Errors
     /// What the store says.
     pub async fn ensure_tables(&self) -> Result<()> {
-        self.ensure_exclusive().await?;
+        // The logs are read meanwhile; nothing is written before the store's answer.
+        let (exclusive, _) = join(self.ensure_exclusive(), self.snapshot()).await;
+        exclusive?;
         try_join_all(Table::ALL.into_iter().map(|table| self.log().ensure(table))).await?;
         let grid = self.grid();
         let derivation = || FileName::Rig { derivation: format!("v{LAKE_FORMAT}") };
@@ -198,7 +200,14 @@ impl Lake {
     /// # Errors
     /// What the store says.
     pub async fn remove_superseded(&self) -> Result<usize> {
-        let snapshot = self.snapshot().await?;
+        self.remove_superseded_in(&self.snapshot().await?).await
+    }
+
+    /// The same, of what a view shows to be superseded. What came later stays.
+    ///
+    /// # Errors
+    /// What the store says.
+    pub async fn remove_superseded_in(&self, snapshot: &LakeSnapshot) -> Result<usize> {
         let mut count = 0;
         for table in Table::ALL {
             let remove: Vec<_> = snapshot.superseded(table).iter().map(DataFile::logged).collect();
