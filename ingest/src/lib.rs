@@ -16,7 +16,7 @@
 //!         }
 //!     })
 //!     .await?;
-//! complete(&lake, &stop, &mut |_| {}).await?;
+//! complete(&lake, &stop, &mut |_, _| {}).await?;
 //! # Ok(())
 //! # }
 //! ```
