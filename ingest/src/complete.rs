@@ -36,7 +36,7 @@ pub type CompletionReport<'a> = dyn FnMut(&CompletedRun, usize) + Send + 'a;
 
 /// Result of a completion.
 #[derive(Debug)]
-pub struct Completion {
+pub struct CompletionSummary {
     /// Number of changed runs.
     pub changed: usize,
     /// The runs that wait for references, with the names of the missing references.
@@ -48,7 +48,7 @@ pub struct Completion {
 ///
 /// # Errors
 /// [`crate::Error`]; runs completed before stay so, and the same call resumes with the rest.
-pub async fn complete(lake: &Lake, stop: &AtomicBool, done: &mut CompletionReport<'_>) -> Result<Completion> {
+pub async fn complete(lake: &Lake, stop: &AtomicBool, done: &mut CompletionReport<'_>) -> Result<CompletionSummary> {
     let claims = lake.is_remote().then(|| Arc::new(WorkClaims::start(lake, ClaimTimes::default())));
     let completed = complete_sharing(lake, stop, claims.as_ref(), done).await;
     // Whoever waits need not wait until they are dead.
@@ -57,7 +57,7 @@ pub async fn complete(lake: &Lake, stop: &AtomicBool, done: &mut CompletionRepor
     }
     let (changed, snapshot) = completed?;
     lake.remove_superseded_in(&snapshot).await?;
-    Ok(Completion { changed, waiting: waiting(lake, snapshot) })
+    Ok(CompletionSummary { changed, waiting: waiting(lake, snapshot) })
 }
 
 /// Completes runs, with claims on them if several ingests share the work; returns the number of changed runs, and the

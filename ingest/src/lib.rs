@@ -51,7 +51,7 @@ mod run_content;
 #[cfg(test)]
 mod skewed;
 
-pub use complete::{CompletedRun, Completion, CompletionReport, complete};
+pub use complete::{CompletedRun, CompletionReport, CompletionSummary, complete};
 pub use echolake_recording::FileIntegrity;
 pub use error::{Error, Result};
 pub use files::{RunSource, adopt_cut_off, arrivals, pending, rig_of_run};

@@ -329,7 +329,7 @@ impl LakeSnapshot {
     }
 }
 
-/// What a snapshot makes of rows in its log.
+/// Place of logged rows in a snapshot.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum RowsPlace {
     /// Readers see them.

@@ -346,7 +346,7 @@ async fn projects_are_not_merged_and_readers_see_parts_of_files_that_were() {
     assert_eq!((seen_runs(&lake).await.len(), whole(&lake).await), (8, 1));
 }
 
-/// What a lake's snapshot says of its runs: name, derivation of the derived rows, version that added the row.
+/// Runs of a lake's snapshot: name, derivation of the derived rows, version that added the row.
 async fn rows_of_runs(lake: &Lake) -> Vec<(String, String, u64)> {
     let snapshot = lake.snapshot().await.expect("a view");
     let row = |run: &VisibleRun| {
