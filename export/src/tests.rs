@@ -13,7 +13,7 @@ use echolake_acquisition::panel::relief::PanelRelief;
 use echolake_acquisition::run::controller::RecordingMode;
 use echolake_acquisition::run::simulate::simulate;
 use echolake_acquisition::run::{PanelSpecimen, RunRequest};
-use echolake_ingest::{LakeIngest, complete, pending};
+use echolake_ingest::{LakeIngest, pending};
 use echolake_lake::{Lake, ReferenceSurfaces};
 use echolake_schema::manifest::Origin;
 use echolake_schema::{Rig, RunId, Table, Timestamp, topics};
@@ -52,10 +52,9 @@ async fn lake(home: &TempDir, keep: RecordingMode) -> Lake {
         };
         simulate(&run, Origin::Simulated, &AtomicBool::new(false), &mut |_| {}).expect("a run");
     }
-    let stop = Arc::new(AtomicBool::new(false));
-    let sources = pending(&lake).await.expect("runs");
-    LakeIngest::new(&lake, stop.clone()).take_in(sources, &mut |_| {}).await.expect("ingested");
-    complete(&lake, &stop, &mut |_, _| {}).await.expect("derived");
+    let ingest = LakeIngest::new(&lake, Arc::default());
+    ingest.take_in(pending(&lake).await.expect("runs"), &mut |_| {}).await.expect("ingested");
+    ingest.complete(&mut |_, _| {}).await.expect("derived");
     lake
 }
 

@@ -1,9 +1,9 @@
 //! Derives the rows that need references, for every run whose references exist and differ from those its rows used.
 
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::Ordering;
 
-use echolake_lake::{ClaimOutcome, ClaimTimes, CommitOutcome, DataFile, Lake, LakeSnapshot, VisibleRun, WorkClaims};
+use echolake_lake::{ClaimOutcome, CommitOutcome, DataFile, Lake, LakeSnapshot, VisibleRun, WorkClaims};
 use echolake_schema::tables::Table;
 use echolake_schema::{RunId, SurfaceId};
 use tracing::Instrument as _;
@@ -11,7 +11,7 @@ use tracing::Instrument as _;
 use crate::context::IngestContext;
 use crate::derive::ReferenceDerivation;
 use crate::error::{Error, Result};
-use crate::ingest::LOOK_EVERY;
+use crate::ingest::{LOOK_EVERY, LakeIngest};
 use crate::pipeline::{self, Cores, ReadyJob};
 use crate::read_back;
 use crate::references::{ReferenceFinder, WantedReferences};
@@ -43,44 +43,36 @@ pub struct CompletionSummary {
     pub waiting: Vec<(RunId, String)>,
 }
 
-/// Brings every run's derived rows up to date, and removes superseded rows. A run whose rows used the current references
-/// is left alone.
-///
-/// # Errors
-/// [`crate::Error`]; runs completed before stay so, and the same call resumes with the rest.
-pub async fn complete(lake: &Lake, stop: &AtomicBool, done: &mut CompletionReport<'_>) -> Result<CompletionSummary> {
-    let claims = lake.is_remote().then(|| Arc::new(WorkClaims::start(lake, ClaimTimes::default())));
-    let completed = complete_sharing(lake, stop, claims.as_ref(), done).await;
-    // Whoever waits need not wait until they are dead.
-    if let Some(claims) = claims.and_then(Arc::into_inner) {
-        claims.close().await;
+impl LakeIngest<'_> {
+    /// Brings every run's derived rows up to date, and removes superseded rows. A run whose rows used the current references
+    /// is left alone.
+    ///
+    /// # Errors
+    /// [`crate::Error`]; runs completed before stay so, and the same call resumes with the rest.
+    pub async fn complete(&self, done: &mut CompletionReport<'_>) -> Result<CompletionSummary> {
+        let (changed, snapshot) = self.complete_runs(done).await?;
+        self.lake.remove_superseded_in(&snapshot).await?;
+        Ok(CompletionSummary { changed, waiting: waiting(self.lake, snapshot) })
     }
-    let (changed, snapshot) = completed?;
-    lake.remove_superseded_in(&snapshot).await?;
-    Ok(CompletionSummary { changed, waiting: waiting(lake, snapshot) })
-}
 
-/// Completes runs, with claims on them if several ingests share the work; returns the number of changed runs, and the
-/// lake's snapshot thereafter.
-pub(crate) async fn complete_sharing(
-    lake: &Lake,
-    stop: &AtomicBool,
-    claims: Option<&Arc<WorkClaims>>,
-    done: &mut CompletionReport<'_>,
-) -> Result<(usize, Arc<LakeSnapshot>)> {
-    let (cores, mut count, mut rounds) = (Cores::all()?, 0, 0);
-    while rounds < ROUNDS {
-        let round = do_round(lake, &cores, stop, claims, done).await?;
-        count += round.changed;
-        match round {
-            CompletionRound { unchanged: Some(snapshot), .. } => return Ok((count, snapshot)),
-            CompletionRound { claimed: true, .. } if stop.load(Ordering::Relaxed) => return Err(Error::Stopped),
-            CompletionRound { claimed: true, .. } => tokio::time::sleep(LOOK_EVERY).await,
-            CompletionRound { overtaken: true, .. } => rounds += 1,
-            _ => break,
+    // Returns the number of changed runs, and the lake's snapshot thereafter.
+    async fn complete_runs(&self, done: &mut CompletionReport<'_>) -> Result<(usize, Arc<LakeSnapshot>)> {
+        let (cores, mut count, mut rounds) = (Cores::all()?, 0, 0);
+        while rounds < ROUNDS {
+            let round = do_round(self, &cores, done).await?;
+            count += round.changed;
+            match round {
+                CompletionRound { unchanged: Some(snapshot), .. } => return Ok((count, snapshot)),
+                CompletionRound { claimed: true, .. } if self.stop.load(Ordering::Relaxed) => {
+                    return Err(Error::Stopped);
+                }
+                CompletionRound { claimed: true, .. } => tokio::time::sleep(LOOK_EVERY).await,
+                CompletionRound { overtaken: true, .. } => rounds += 1,
+                _ => break,
+            }
         }
+        Ok((count, Arc::new(self.lake.snapshot().await?)))
     }
-    Ok((count, Arc::new(lake.snapshot().await?)))
 }
 
 fn waiting(lake: &Lake, snapshot: Arc<LakeSnapshot>) -> Vec<(RunId, String)> {
@@ -102,14 +94,9 @@ struct CompletionRound {
     unchanged: Option<Arc<LakeSnapshot>>,
 }
 
-async fn do_round(
-    lake: &Lake,
-    cores: &Cores,
-    stop: &AtomicBool,
-    claims: Option<&Arc<WorkClaims>>,
-    done: &mut CompletionReport<'_>,
-) -> Result<CompletionRound> {
-    let context = IngestContext::now(lake, cores).await?;
+async fn do_round(ingest: &LakeIngest<'_>, cores: &Cores, done: &mut CompletionReport<'_>) -> Result<CompletionRound> {
+    let LakeIngest { lake, stop, claims } = ingest;
+    let context = IngestContext::new(lake, cores, lake.snapshot().await?);
     let mut jobs = Vec::new();
     for run in context.snapshot.runs() {
         let wanted = context.finder.lock().await.wanted(&run.surface);
@@ -122,7 +109,7 @@ async fn do_round(
     }
     let total = jobs.len();
     let mut round = CompletionRound::default();
-    let shared = claims.cloned();
+    let shared = claims.clone();
     let do_one = move |(run, wanted): (VisibleRun, WantedReferences)| {
         let (context, claims) = (context.clone(), shared.clone());
         let span = tracing::error_span!("complete", run = %run.run, surface = %run.surface);
@@ -184,16 +171,15 @@ async fn complete_run(
     let responses = read_back::responses(lake, &context.snapshot, &run.run).await?;
     let report =
         CompletedRun { run: run.run.clone(), surface: run.surface.clone(), measurements: responses.pairs.len() };
-    let Some(derivation) = ReferenceDerivation::new(&run.run_derivation, wanted, &context.finder).await? else {
+    let Some(derivation) = ReferenceDerivation::new(context, &run.run_derivation, wanted).await? else {
         return Ok(ReadyJob { staged: Vec::new(), report });
     };
-    let (mut staged, references) = derivation.stage(context, &keys, responses).await?;
+    let (files, references) = derivation.derive(context, &keys, responses).await?;
     let mut row = Vec::new();
     for file in context.snapshot.files_of(Table::Runs, &run.run) {
         let before = read_back::run_row(lake, file, &run.run).await?;
         row.push(rows::runs::with_references(lake.rig(), &keys, &before, &references)?);
     }
     let pointer = VisibleRun { reference_derivation: references.derivation.clone(), ..run.clone() };
-    staged.push(context.stage_pointer(pointer, &row).await?);
-    Ok(ReadyJob { staged, report })
+    Ok(ReadyJob { staged: context.stage_derived(pointer, &row, files).await?, report })
 }

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use arrow::record_batch::RecordBatch;
 use echolake_lake::{EncodedFile, FileName, Lake, LakeSnapshot, StagedFile, VisibleRun, encode};
 use echolake_schema::tables::Table;
-use futures::future::join_all;
+use futures::future::{join_all, try_join};
 
 use crate::error::Result;
 use crate::pipeline::Cores;
@@ -22,11 +22,10 @@ pub(crate) struct IngestContext {
 }
 
 impl IngestContext {
-    /// Returns a context with the current snapshot of the lake.
-    pub(crate) async fn now(lake: &Lake, cores: &Cores) -> Result<Self> {
-        let snapshot = Arc::new(lake.snapshot().await?);
+    pub(crate) fn new(lake: &Lake, cores: &Cores, snapshot: LakeSnapshot) -> Self {
+        let snapshot = Arc::new(snapshot);
         let finder = ReferenceFinder::shared(lake, snapshot.clone());
-        Ok(Self { lake: lake.clone(), cores: cores.clone(), snapshot, finder })
+        Self { lake: lake.clone(), cores: cores.clone(), snapshot, finder }
     }
 
     /// Stages a run's files of one derivation.
@@ -44,9 +43,24 @@ impl IngestContext {
         staged.collect()
     }
 
-    /// Stages a run's row of `runs`, which replaces the rows in the snapshot. After its commit readers see the files
-    /// that the row names, and nothing else of the run.
-    pub(crate) async fn stage_pointer(&self, run: VisibleRun, row: &[RecordBatch]) -> Result<StagedFile> {
+    /// Stages the files that follow from a run's references, then in the list its row of `runs`, which replaces the rows in
+    /// the snapshot. After its commit readers see the files that the row names, and nothing else of the run.
+    pub(crate) async fn stage_derived(
+        &self,
+        run: VisibleRun,
+        row: &[RecordBatch],
+        files: Vec<(Table, EncodedFile)>,
+    ) -> Result<Vec<StagedFile>> {
+        let keys = RunKeys { surface: run.surface.clone(), run: run.run.clone() };
+        // Without references there are no files.
+        let derivation = run.reference_derivation.clone().unwrap_or_default();
+        let pointer = self.stage_pointer(run, row);
+        let (mut staged, pointer) = try_join(self.stage_rows(&keys, &derivation, files), pointer).await?;
+        staged.push(pointer);
+        Ok(staged)
+    }
+
+    async fn stage_pointer(&self, run: VisibleRun, row: &[RecordBatch]) -> Result<StagedFile> {
         let file = encode(Table::Runs, &Table::Runs.schema(self.lake.rig()), row)?;
         let staged = self.lake.stage(Table::Runs, &FileName::Pointer(run.clone()), file).await?;
         Ok(staged.made_from(&self.snapshot).replacing(&run, self.snapshot.files_of(Table::Runs, &run.run)))

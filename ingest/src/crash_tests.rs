@@ -22,10 +22,9 @@ use object_store::path::Path;
 use object_store::{ObjectStore, ObjectStoreExt as _};
 use parquet::arrow::arrow_reader::ParquetRecordBatchReaderBuilder;
 
-use crate::complete::complete_sharing;
 use crate::mortal::{DeathMoment, MortalStore};
 use crate::skewed::{Interlude, SkewedStore};
-use crate::{CompletedRun, FileReport, LakeIngest, RunSource, complete, pending};
+use crate::{CompletedRun, FileReport, LakeIngest, RunSource, pending};
 
 /// Ten points, so that a run takes milliseconds.
 const SMALL_RIG: &str = include_str!("../../tests/fixtures/small_rig.toml");
@@ -76,11 +75,10 @@ async fn with_inbox(runs: &[(String, Bytes)]) -> Arc<InMemory> {
 }
 
 async fn ingest(store: Arc<dyn ObjectStore>) -> crate::Result<Vec<FileReport>> {
-    let (lake, stop) = (lake(store).await?, Arc::new(AtomicBool::new(false)));
-    let mut reports = Vec::new();
-    let sources = pending(&lake).await?;
-    LakeIngest::new(&lake, stop.clone()).take_in(sources, &mut |report| reports.push(report)).await?;
-    complete(&lake, &stop, &mut |_, _| {}).await?;
+    let (lake, mut reports) = (lake(store).await?, Vec::new());
+    let ingest = LakeIngest::new(&lake, Arc::default());
+    ingest.take_in(pending(&lake).await?, &mut |report| reports.push(report)).await?;
+    ingest.complete(&mut |_, _| {}).await?;
     Ok(reports)
 }
 
@@ -453,6 +451,7 @@ async fn what_others_claimed_and_did_not_do_is_done_after_a_while_and_by_one_ing
             FileReport::Refused { source, why, .. } => panic!("{source}: {why}"),
         };
         ingest.take_in(sources, report).await.expect("ingested");
+        ingest.close().await;
         (taken, claimed)
     };
     let give_back = async {
@@ -466,7 +465,7 @@ async fn what_others_claimed_and_did_not_do_is_done_after_a_while_and_by_one_ing
     let mut names: Vec<_> = runs.iter().map(|(name, _)| name.trim_end_matches(".mcap").to_owned()).collect();
     names.sort();
     assert_eq!(taken, names, "each once");
-    complete(&lake, &AtomicBool::new(false), &mut |_, _| {}).await.expect("completed");
+    LakeIngest::new(&lake, Arc::default()).complete(&mut |_, _| {}).await.expect("completed");
     assert!(rows(store).await == expected, "other rows");
 }
 
@@ -483,11 +482,12 @@ async fn completions_are_shared() {
     let sources = pending(&lake).await.expect("listed");
     LakeIngest::new(&lake, Arc::default()).take_in(sources, &mut |_| {}).await.expect("ingested");
     let work = async || {
-        let (claims, mut completed) = (Arc::new(WorkClaims::start(&lake, ClaimTimes::default())), Vec::new());
+        let mut completed = Vec::new();
+        let ingest = LakeIngest::new(&lake, Arc::default()).sharing(ClaimTimes::default());
         let done = &mut |run: &CompletedRun, _| completed.push(run.run.to_string());
-        let (count, _) =
-            complete_sharing(&lake, &AtomicBool::new(false), Some(&claims), done).await.expect("completed");
-        assert_eq!(count, completed.len());
+        let summary = ingest.complete(done).await.expect("completed");
+        ingest.close().await;
+        assert_eq!(summary.changed, completed.len());
         completed
     };
     let (mut completed, more) = tokio::join!(work(), work());

@@ -1,5 +1,4 @@
-//! Derives reflected responses, curves and energies from a run's impulse responses and references, and stages the
-//! files.
+//! Derives reflected responses, curves and energies from a run's impulse responses and references.
 
 use std::sync::Arc;
 
@@ -7,13 +6,13 @@ use echolake_dsp::foam::subtract;
 use echolake_dsp::mean::SignalMean;
 use echolake_dsp::temperature::speed_of_sound;
 use echolake_dsp::uncertainty::{EnergySensitivity, LevelUncertainty};
-use echolake_lake::{EncodedFile, FileEncoder, Lake, StagedFile, encode};
+use echolake_lake::{EncodedFile, FileEncoder, Lake, encode};
 use echolake_schema::tables::Table;
 
 use crate::context::IngestContext;
 use crate::derived_values::{DerivedRows, RunResponses, derivation_plan, residual_fit};
 use crate::error::{Error, Result};
-use crate::references::{LoadedReferences, SharedFinder, WantedReferences, arrivals};
+use crate::references::{LoadedReferences, WantedReferences, arrivals};
 use crate::rows::derived::ReferenceVersions;
 use crate::rows::runs::RunReferences;
 use crate::rows::stats::SurfaceLevels;
@@ -33,36 +32,35 @@ pub(crate) struct ReferenceDerivation {
 impl ReferenceDerivation {
     /// Loads the wanted references; None if one is missing.
     pub(crate) async fn new(
+        context: &IngestContext,
         run_derivation: &str,
         wanted: &WantedReferences,
-        finder: &SharedFinder,
     ) -> Result<Option<Self>> {
         let (Some((flat_version, foam_version)), Some(name)) = (wanted.versions(), wanted.derivation(run_derivation))
         else {
             return Ok(None);
         };
-        let Some(references) = finder.lock().await.load(wanted).await? else { return Ok(None) };
+        let Some(references) = context.finder.lock().await.load(wanted, &context.cores).await? else { return Ok(None) };
         Ok(Some(Self { name, flat_version, foam_version, references }))
     }
 
-    /// Derives every pair that both references have, and stages the files. Returns them and the run row's references.
-    pub(crate) async fn stage(
+    /// Derives every pair that both references have. Returns the files, and the run row's references.
+    pub(crate) async fn derive(
         self,
         context: &IngestContext,
         keys: &RunKeys,
         responses: RunResponses,
-    ) -> Result<(Vec<StagedFile>, RunReferences)> {
+    ) -> Result<(Vec<(Table, EncodedFile)>, RunReferences)> {
         let (this, for_rows, lake) = (Arc::new(self), keys.clone(), context.lake.clone());
         let derivation = this.clone();
         let (files, unpaired) = context.cores.compute(move || derivation.encode(&lake, &for_rows, &responses)).await?;
-        let staged = context.stage_rows(keys, &this.name, files).await?;
         let references = RunReferences {
             missing: if unpaired == 0 { String::new() } else { format!("references of {unpaired} pairs") },
             derivation: Some(this.name.clone()),
             flat_version: Some(this.flat_version.clone()),
             foam_version: Some(this.foam_version.clone()),
         };
-        Ok((staged, references))
+        Ok((files, references))
     }
 
     // Returns the files, and the number of pairs that a reference lacks.

@@ -23,6 +23,7 @@ use crate::measure::Measurer;
 use crate::pipeline::{self, Cores, ReadyJob};
 use crate::read_back;
 use crate::references::{ReferenceNames, digest};
+use crate::rows::runs::RunReferences;
 use crate::rows::{self, RunKeys};
 use crate::run_content::{Head, RunContent};
 
@@ -103,10 +104,10 @@ pub enum FileReport {
 /// Ingests runs into a lake.
 #[derive(Debug, Clone)]
 pub struct LakeIngest<'a> {
-    lake: &'a Lake,
-    stop: Arc<AtomicBool>,
-    /// Times of claims, if several ingests share the work.
-    sharing: Option<ClaimTimes>,
+    pub(crate) lake: &'a Lake,
+    pub(crate) stop: Arc<AtomicBool>,
+    /// Claims, if several ingests share the work.
+    pub(crate) claims: Option<Arc<WorkClaims>>,
 }
 
 /// State shared by the workers.
@@ -127,40 +128,33 @@ struct SharedWork {
 
 impl<'a> LakeIngest<'a> {
     /// Creates an ingest into this lake. Once `stop` is set, no run is started; runs in progress are completed. On an object
-    /// store it shares the work with other ingests.
+    /// store it shares the work with other ingests, for which it needs a Tokio runtime.
     pub fn new(lake: &'a Lake, stop: Arc<AtomicBool>) -> Self {
-        Self { lake, stop, sharing: lake.is_remote().then(ClaimTimes::default) }
+        let claims = lake.is_remote().then(|| Arc::new(WorkClaims::start(lake, ClaimTimes::default())));
+        Self { lake, stop, claims }
     }
 
     /// Shares the work with other ingests on whatever store the lake is.
     #[cfg(test)]
     pub(crate) fn sharing(self, times: ClaimTimes) -> Self {
-        Self { sharing: Some(times), ..self }
+        Self { claims: Some(Arc::new(WorkClaims::start(self.lake, times))), ..self }
+    }
+
+    /// Waits until all claims are given back: whoever waits for them need not wait until they are dead.
+    pub async fn close(self) {
+        if let Some(claims) = self.claims.and_then(Arc::into_inner) {
+            claims.close().await;
+        }
     }
 
     /// Ingests runs, references first so that the others are derived with them at once. It is idempotent: runs that are
-    /// in the lake add nothing. `report` is called for each file when it is finished.
+    /// in the lake add nothing. `report` is called for each file when it is finished. Tables that are missing are made.
     ///
     /// # Errors
     /// [`Error::Stopped`], or an error of the lake. Readers do not see files that are not reported yet; the same call
     /// resumes with them.
     pub async fn take_in(&self, sources: Vec<RunSource>, report: &mut (dyn FnMut(FileReport) + Send)) -> Result<()> {
-        let Some(times) = self.sharing else { return self.take_in_sharing(sources, None, report).await };
-        let claims = Arc::new(WorkClaims::start(self.lake, times));
-        let done = self.take_in_sharing(sources, Some(&claims), report).await;
-        // Whoever waits need not wait until they are dead.
-        if let Some(claims) = Arc::into_inner(claims) {
-            claims.close().await;
-        }
-        done
-    }
-
-    async fn take_in_sharing(
-        &self,
-        sources: Vec<RunSource>,
-        claims: Option<&Arc<WorkClaims>>,
-        report: &mut (dyn FnMut(FileReport) + Send),
-    ) -> Result<()> {
+        let mut first = Some(self.lake.ensure_tables().await?);
         let mut known: Option<Arc<BTreeSet<RunId>>> = None;
         let (references, others) = self.in_order(sources).await?;
         let (cores, measurer) = (Cores::all()?, Arc::new(Measurer::new(self.lake)));
@@ -168,10 +162,14 @@ impl<'a> LakeIngest<'a> {
             let mut claimed: Vec<RunSource> = Vec::new();
             let mut free = sources;
             while !free.is_empty() {
-                let context = IngestContext::now(self.lake, &cores).await?;
+                let snapshot = match first.take() {
+                    Some(first) => first,
+                    None => self.lake.snapshot().await?,
+                };
+                let context = IngestContext::new(self.lake, &cores, snapshot);
                 let runs = || Arc::new(context.snapshot.runs().map(|run| run.run.clone()).collect());
                 let known = known.get_or_insert_with(runs).clone();
-                let shared = claims.map(|claims| SharedWork { claims: claims.clone(), known });
+                let shared = self.claims.clone().map(|claims| SharedWork { claims, known });
                 let work = IngestWork { context, measurer: measurer.clone(), shared };
                 for source in self.take_in_group(work, free, report).await? {
                     if !claimed.contains(&source) {
@@ -179,19 +177,15 @@ impl<'a> LakeIngest<'a> {
                         claimed.push(source);
                     }
                 }
-                free = self.wait_for_claims(claims, &mut claimed).await?;
+                free = self.wait_for_claims(&mut claimed).await?;
             }
         }
         Ok(())
     }
 
     // Waits until nobody alive works on some of the claimed files; takes them out of `claimed`.
-    async fn wait_for_claims(
-        &self,
-        claims: Option<&Arc<WorkClaims>>,
-        claimed: &mut Vec<RunSource>,
-    ) -> Result<Vec<RunSource>> {
-        let Some(claims) = claims else { return Ok(Vec::new()) };
+    async fn wait_for_claims(&self, claimed: &mut Vec<RunSource>) -> Result<Vec<RunSource>> {
+        let Some(claims) = &self.claims else { return Ok(Vec::new()) };
         while !claimed.is_empty() {
             if self.stop.load(Ordering::Relaxed) {
                 return Err(Error::Stopped);
@@ -320,29 +314,25 @@ impl IngestWork {
             self.context.stage_rows(&keys, &derivation, files).await
         };
         let of_references = async {
-            match ReferenceDerivation::new(&derivation, &wanted, finder).await? {
-                Some(derived) => derived.stage(&self.context, &keys, content.responses()).await.map(Some),
-                None => Ok(None),
-            }
+            let (files, references) = match ReferenceDerivation::new(&self.context, &derivation, &wanted).await? {
+                Some(derived) => derived.derive(&self.context, &keys, content.responses()).await?,
+                None => (Vec::new(), RunReferences { missing: wanted.missing(), ..RunReferences::default() }),
+            };
+            let run = VisibleRun {
+                surface: keys.surface.clone(),
+                run: keys.run.clone(),
+                run_derivation: derivation.clone(),
+                reference_derivation: references.derivation.clone(),
+            };
+            let row = rows::runs::row(lake, &keys, &content, &derivation, &references)?;
+            Ok((self.context.stage_derived(run, &[row], files).await?, references))
         };
         // The file comes to its place meanwhile.
-        let (mut staged, derived, mark) = tokio::try_join!(of_the_run, of_references, kept)?;
-        let mut references =
-            rows::runs::RunReferences { missing: taken.missing.clone(), ..rows::runs::RunReferences::default() };
-        if let Some((files, used)) = derived {
-            staged.extend(files);
-            taken.derived = true;
-            taken.missing.clone_from(&used.missing);
-            references = used;
-        }
-        let run = VisibleRun {
-            surface: keys.surface.clone(),
-            run: keys.run.clone(),
-            run_derivation: derivation.clone(),
-            reference_derivation: references.derivation.clone(),
-        };
-        let row = rows::runs::row(lake, &keys, &content, &derivation, &references)?;
-        staged.push(self.context.stage_pointer(run, &[row]).await?);
+        let (mut staged, (derived, references), mark) = tokio::try_join!(of_the_run, of_references, kept)?;
+        // The row of `runs` is the last one.
+        staged.extend(derived);
+        taken.derived = references.derivation.is_some();
+        taken.missing = references.missing;
         drop(mark);
         tracing::debug!(files = staged.len(), missing = taken.missing, "the rows are written and not committed yet");
         Ok(ReadyJob { staged, report: taken })

@@ -1,14 +1,13 @@
 //! From a run's MCAP file to rows.
 //!
 //! A run's rows are committed first and its row in `runs` last: after that commit readers see them. Then
-//! [`complete()`] derives again the rows that used outdated references, and nothing else.
+//! [`LakeIngest::complete`] derives again the rows that used outdated references, and nothing else.
 //!
 //! ```no_run,standalone_crate
-//! use echolake_ingest::{FileReport, LakeIngest, complete, pending};
+//! use echolake_ingest::{FileReport, LakeIngest, pending};
 //! # async fn example() -> Result<(), Box<dyn std::error::Error>> {
 //! let lake = echolake_lake::Lake::open("lake").await?;
-//! let stop = std::sync::Arc::default();
-//! let ingest = LakeIngest::new(&lake, std::sync::Arc::clone(&stop));
+//! let ingest = LakeIngest::new(&lake, std::sync::Arc::default());
 //! ingest
 //!     .take_in(pending(&lake).await?, &mut |report| {
 //!         if let FileReport::Taken(taken) = report {
@@ -16,7 +15,8 @@
 //!         }
 //!     })
 //!     .await?;
-//! complete(&lake, &stop, &mut |_, _| {}).await?;
+//! ingest.complete(&mut |_, _| {}).await?;
+//! ingest.close().await;
 //! # Ok(())
 //! # }
 //! ```
@@ -51,7 +51,7 @@ mod run_content;
 #[cfg(test)]
 mod skewed;
 
-pub use complete::{CompletedRun, CompletionReport, CompletionSummary, complete};
+pub use complete::{CompletedRun, CompletionReport, CompletionSummary};
 pub use echolake_recording::FileIntegrity;
 pub use error::{Error, Result};
 pub use files::{RunSource, adopt_cut_off, arrivals, pending, rig_of_run};

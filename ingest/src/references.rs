@@ -1,6 +1,6 @@
 //! The references that a surface names: their runs, their versions, and their mean responses.
 
-use std::collections::{BTreeSet, HashMap};
+use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::sync::Arc;
 
 use echolake_dsp::foam::subtract;
@@ -11,6 +11,7 @@ use echolake_dsp::uncertainty::{DirectSoundResidual, EnergySensitivity, Temperat
 use echolake_lake::{DataFile, DirectSound, FileName, Lake, LakeSnapshot, ReferenceSurfaces};
 use echolake_schema::tables::Table;
 use echolake_schema::{PairId, SurfaceId, SurfaceRecord};
+use futures::future::try_join_all;
 use sha2::{Digest as _, Sha256};
 use tokio::sync::Mutex;
 
@@ -19,6 +20,7 @@ use crate::derived_values::{
     FlatPair, FlatPairs, MeanResponse, MeanResponses, derivation_plan, residual_fit, temperature_response,
 };
 use crate::error::{Error, Result};
+use crate::pipeline::Cores;
 use crate::read_back;
 
 /// Revision of the rows that follow from references: those of another one are derived anew.
@@ -98,6 +100,13 @@ pub(crate) struct ReferenceVersion {
     pub(crate) version: Option<String>,
 }
 
+impl ReferenceVersion {
+    // Means are known by it.
+    fn key(&self) -> &str {
+        self.version.as_deref().unwrap_or_default()
+    }
+}
+
 impl ReferenceFinder {
     pub(crate) fn new(lake: &Lake, snapshot: Arc<LakeSnapshot>) -> Self {
         let mut runs: HashMap<_, Vec<_>> = HashMap::new();
@@ -138,22 +147,26 @@ impl ReferenceFinder {
     ///
     /// # Errors
     /// [`Error::FoamReflection`] if the lake wants it estimated and it cannot be.
-    pub(crate) async fn load(&mut self, wanted: &WantedReferences) -> Result<Option<LoadedReferences>> {
+    pub(crate) async fn load(&mut self, wanted: &WantedReferences, cores: &Cores) -> Result<Option<LoadedReferences>> {
         let Some(versions) = wanted.versions() else { return Ok(None) };
         if let Some(known) = self.loaded.get(&versions) {
             return Ok(Some(known.clone()));
         }
-        let foam = self.mean(&wanted.foam).await?;
-        let flat_foam = self.mean(&wanted.flat_foam).await?;
-        let flat = self.mean(&wanted.flat).await?;
-        let estimated = estimated(&self.lake, &flat, &flat_foam, &foam)?;
-        let chosen = match wanted.direct_sound {
-            DirectSound::Foam => ReferenceResponses::new(&self.lake, foam, &flat, &flat_foam)?,
-            DirectSound::Estimated => estimated.clone().ok_or_else(|| Error::FoamReflection {
-                foam: wanted.foam.surface.to_string(),
-                flat: wanted.flat.surface.to_string(),
-            })?,
+        // One after the other, each would wait for its store.
+        let [foam, flat_foam, flat] = [&wanted.foam, &wanted.flat_foam, &wanted.flat];
+        self.read_means(&[foam, flat_foam, flat]).await?;
+        let [foam, flat_foam, flat] = [foam, flat_foam, flat].map(|of| self.means[of.key()].clone());
+        let (lake, is_foam_chosen) = (self.lake.clone(), wanted.direct_sound == DirectSound::Foam);
+        let derive = move || {
+            let of_foam = || ReferenceResponses::new(&lake, foam.clone(), &flat, &flat_foam);
+            rayon::join(|| is_foam_chosen.then(of_foam).transpose(), || estimated(&lake, &flat, &flat_foam, &foam))
         };
+        let (of_foam, estimated) = cores.compute(derive).await;
+        let (of_foam, estimated) = (of_foam?, estimated?);
+        let chosen = of_foam.or_else(|| estimated.clone()).ok_or_else(|| Error::FoamReflection {
+            foam: wanted.foam.surface.to_string(),
+            flat: wanted.flat.surface.to_string(),
+        })?;
         let flat_runs = self.snapshot.runs().filter(|run| run.surface == wanted.flat.surface).count();
         let only_flat = (flat_runs == 1).then(|| wanted.flat.surface.clone());
         let loaded = LoadedReferences { chosen, estimated, only_flat };
@@ -161,11 +174,20 @@ impl ReferenceFinder {
         Ok(Some(loaded))
     }
 
-    async fn mean(&mut self, of: &ReferenceVersion) -> Result<Arc<MeanResponses>> {
-        let key = of.version.clone().unwrap_or_default();
-        if let Some(known) = self.means.get(&key) {
-            return Ok(known.clone());
-        }
+    // Reads the means that are not known yet side by side.
+    async fn read_means(&mut self, wanted: &[&ReferenceVersion]) -> Result<()> {
+        let unknown: BTreeMap<_, _> =
+            wanted.iter().map(|of| (of.key(), *of)).filter(|(key, _)| !self.means.contains_key(*key)).collect();
+        let read = unknown.into_iter().map(|(key, of)| {
+            let means = self.mean(of);
+            async move { Ok::<_, Error>((key.to_owned(), Arc::new(means.await?))) }
+        });
+        let read = try_join_all(read).await?;
+        self.means.extend(read);
+        Ok(())
+    }
+
+    async fn mean(&self, of: &ReferenceVersion) -> Result<MeanResponses> {
         // Number of responses, the sum of their temperatures, and that of their samples.
         let mut sums: HashMap<u32, (u32, f64, Vec<f64>)> = HashMap::new();
         for run in self.snapshot.runs().filter(|r| r.surface == of.surface) {
@@ -183,9 +205,7 @@ impl ReferenceFinder {
             let ir = sum.into_iter().map(|s| (s / f64::from(count)) as f32).collect();
             (pair, MeanResponse { ir, celsius: warmth / f64::from(count) })
         };
-        let means: Arc<MeanResponses> = Arc::new(sums.into_iter().map(mean).collect());
-        self.means.insert(key, means.clone());
-        Ok(means)
+        Ok(sums.into_iter().map(mean).collect())
     }
 
     fn found(&self, surface: SurfaceId) -> ReferenceVersion {

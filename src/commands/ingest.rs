@@ -11,7 +11,7 @@ use std::time::Duration;
 use anyhow::Context as _;
 use echolake_acquisition::recovery::is_partial;
 use echolake_ingest::{
-    FileReport, IngestOutcome, IngestedRun, LakeIngest, RunSource, SuspectFile, adopt_cut_off, arrivals, complete,
+    CompletedRun, FileReport, IngestOutcome, IngestedRun, LakeIngest, RunSource, SuspectFile, adopt_cut_off, arrivals,
     pending, rig_of_run,
 };
 use echolake_lake::{Error as LakeError, Lake, ReferenceSurfaces, remote_access};
@@ -100,7 +100,6 @@ impl IngestSummary {
 pub(crate) async fn run(args: &IngestArgs, lake_url: &str) -> anyhow::Result<CommandOutcome> {
     let stop = super::stop_request()?;
     let lake = open_or_make(lake_url, &args.runs).await?;
-    lake.ensure_tables().await?;
     let progress = CommandProgress::new();
     if let Some(path) = &args.suspect {
         return take_in_suspect(&lake, path, stop.flag(), &progress).await;
@@ -178,6 +177,19 @@ pub(crate) async fn take_in(
     stop: &Arc<AtomicBool>,
     progress: &CommandProgress,
 ) -> anyhow::Result<IngestSummary> {
+    let ingest = LakeIngest::new(lake, stop.clone());
+    let taken = take_in_and_complete(&ingest, lake, sources, stop, progress).await;
+    ingest.close().await;
+    taken
+}
+
+async fn take_in_and_complete(
+    ingest: &LakeIngest<'_>,
+    lake: &Lake,
+    sources: Vec<RunSource>,
+    stop: &Arc<AtomicBool>,
+    progress: &CommandProgress,
+) -> anyhow::Result<IngestSummary> {
     let mut summary = IngestSummary::default();
     let count = sources.len();
     let mut task = progress.task("ingest", count as u64, "runs");
@@ -189,8 +201,7 @@ pub(crate) async fn take_in(
         summary.add(report, progress);
         task.at(ended);
     };
-    let mut outcome =
-        LakeIngest::new(lake, stop.clone()).take_in(sources, &mut report).await.map_err(anyhow::Error::from);
+    let mut outcome = ingest.take_in(sources, &mut report).await.map_err(anyhow::Error::from);
     // All others first: these may end the process of which this one is a part.
     for mut suspect in suspects.iter().filter_map(|source| SuspectFile::from_source(lake, source)) {
         if outcome.is_ok() {
@@ -207,12 +218,12 @@ pub(crate) async fn take_in(
     }
     outcome?;
     let (mut task, mut rows, mut runs) = (None, 0, 0);
-    let completion = complete(lake, stop, &mut |completed, total| {
+    let completed = &mut |completed: &CompletedRun, total: usize| {
         rows += completed.measurements;
         runs += 1;
         task.get_or_insert_with(|| progress.task("complete", total as u64, "runs")).at(runs);
-    })
-    .await?;
+    };
+    let completion = ingest.complete(completed).await?;
     if let Some(task) = task {
         task.done(format!("{runs} runs, {rows} measurements derived"));
     }
@@ -284,7 +295,9 @@ async fn take_in_suspect(
     });
     let mut summary = IngestSummary::default();
     let source = RunSource::Lake(ObjectPath::parse(path)?);
-    LakeIngest::new(lake, stop.clone()).take_in(vec![source], &mut |report| summary.add(report, progress)).await?;
+    let ingest = LakeIngest::new(lake, stop.clone());
+    ingest.take_in(vec![source], &mut |report| summary.add(report, progress)).await?;
+    ingest.close().await;
     super::print(&serde_json::to_string(&summary)?)?;
     Ok(CommandOutcome::Whole)
 }

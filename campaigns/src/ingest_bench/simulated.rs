@@ -9,7 +9,7 @@ use echolake_acquisition::panel::collection::{CollectionSurface, collection};
 use echolake_acquisition::run::controller::RecordingMode;
 use echolake_acquisition::run::simulate::simulate;
 use echolake_acquisition::run::{PanelSpecimen, RunRequest};
-use echolake_ingest::{FileReport as Told, LakeIngest, complete, pending};
+use echolake_ingest::{FileReport as Told, LakeIngest, pending};
 use echolake_lake::{Lake, ReferenceSurfaces};
 use echolake_schema::manifest::{Origin, RunEnd};
 use echolake_schema::{Rig, Timestamp};
@@ -127,7 +127,7 @@ impl SimulatedRuns {
         }
         let lake =
             Lake::open_or_create(&folder.display().to_string(), &Rig::paper(), &ReferenceSurfaces::default()).await?;
-        let stop = Arc::new(AtomicBool::new(false));
+        let ingest = LakeIngest::new(&lake, Arc::default());
         let (mut accepted, mut refused) = (0, Vec::new());
         let mut report = |told| match told {
             Told::Taken(taken) => accepted += taken.measurements as u64,
@@ -139,8 +139,8 @@ impl SimulatedRuns {
         for (files, cost) in [references, panels].into_iter().zip(&mut costs) {
             put_into_inbox(files, folder)?;
             let meter = CostMeter::start()?;
-            LakeIngest::new(&lake, stop.clone()).take_in(pending(&lake).await?, &mut report).await?;
-            complete(&lake, &stop, &mut |_, _| {}).await?;
+            ingest.take_in(pending(&lake).await?, &mut report).await?;
+            ingest.complete(&mut |_, _| {}).await?;
             *cost = meter.stop()?;
         }
         ensure!(refused.is_empty(), "refused: {}", refused.join("; "));

@@ -231,6 +231,8 @@ pub trait CommitLog: Send + Sync + std::fmt::Debug {
     async fn files(&self, table: Table) -> Result<Vec<DataFile>> {
         Ok(self.view(table).await?.unwrap_or_default().files)
     }
+    /// The version that an earlier look found, without a look; None if there was none.
+    async fn known_version(&self, table: Table) -> Option<u64>;
     /// The table's newest version; None if there is no table.
     async fn version(&self, table: Table) -> Result<Option<u64>>;
     /// Returns whether there is a version after this one, in one request to the store; if the log was cleaned up since,

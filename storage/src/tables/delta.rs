@@ -291,6 +291,10 @@ impl CommitLog for DeltaLog {
         Ok(Some(TableView { version: state.version, files: data_files(table, &state)? }))
     }
 
+    async fn known_version(&self, table: Table) -> Option<u64> {
+        self.loaded.lock().await.get(&table).map(|known| known.state.version)
+    }
+
     async fn version(&self, table: Table) -> Result<Option<u64>> {
         Ok(self.load(table).await?.map(|state| state.version))
     }

@@ -66,13 +66,13 @@ impl StagedFile {
 }
 
 impl Lake {
-    /// Makes the tables that are missing, and the rows that come from the rig alone.
+    /// Makes the tables that are missing, and the rows that come from the rig alone. Returns what readers saw before.
     ///
     /// # Errors
     /// What the store says.
-    pub async fn ensure_tables(&self) -> Result<()> {
+    pub async fn ensure_tables(&self) -> Result<LakeSnapshot> {
         // The logs are read meanwhile; nothing is written before the store's answer.
-        let (exclusive, _) = join(self.ensure_exclusive(), self.snapshot()).await;
+        let (exclusive, snapshot) = join(self.ensure_exclusive(), self.snapshot()).await;
         exclusive?;
         try_join_all(Table::ALL.into_iter().map(|table| self.log().ensure(table))).await?;
         let grid = self.grid();
@@ -84,7 +84,8 @@ impl Lake {
             };
             self.append_rows(table, &derivation(), &[rows]).await
         });
-        try_join_all(of_rig).await.map(drop)
+        try_join_all(of_rig).await?;
+        snapshot
     }
 
     /// The rows of table `pairs`, which follow from the rig: row i is pair i.

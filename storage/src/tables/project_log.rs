@@ -80,6 +80,10 @@ impl CommitLog for ProjectLog {
         Ok(view)
     }
 
+    async fn known_version(&self, table: Table) -> Option<u64> {
+        self.log.known_version(table).await
+    }
+
     async fn version(&self, table: Table) -> Result<Option<u64>> {
         self.log.version(table).await
     }

@@ -8,13 +8,13 @@ use std::ops::Bound;
 
 use echolake_schema::tables::{Source, Table};
 use echolake_schema::{ProjectName, RunId, SurfaceId};
-use futures::future::try_join_all;
+use futures::future::{try_join, try_join_all};
 use object_store::path::Path;
 use serde::Deserialize;
 use serde_json::{Value, json};
 
 use crate::tables::project_log::project_of;
-use crate::{CommitLog, DataFile, Error, Result, RunPart};
+use crate::{CommitLog, DataFile, Result, RunPart, TableView};
 
 /// Parsed name of a file in `tables/`.
 ///
@@ -132,15 +132,22 @@ impl FileName {
     }
 }
 
+async fn views_of_others(log: &dyn CommitLog) -> Result<Vec<(Table, Option<TableView>)>> {
+    let others = Table::ALL.into_iter().filter(|table| *table != Table::Runs);
+    try_join_all(others.map(|table| async move { Ok((table, log.view(table).await?)) })).await
+}
+
 impl LakeSnapshot {
-    /// Takes a view. `runs` is read first, so that whatever it names was committed before.
+    /// Takes a view. The other tables are read after the version of `runs` was there, so that they hold whatever it names:
+    /// all at once if it is still the version of the last look.
     pub(crate) async fn take(log: &dyn CommitLog) -> Result<Self> {
-        let pointers = log.view(Table::Runs).await?;
+        let known = log.known_version(Table::Runs).await;
+        let (pointers, mut views) = try_join(log.view(Table::Runs), views_of_others(log)).await?;
+        if known.is_none() || pointers.as_ref().map(|view| view.version) != known {
+            views = views_of_others(log).await?;
+        }
         let runs = pointers.as_ref().map(|view| current_runs(&view.files)).unwrap_or_default();
         let mut snapshot = Self { runs, ..Self::default() };
-        let others = Table::ALL.into_iter().filter(|t| *t != Table::Runs);
-        let views = others.map(|table| async move { Ok::<_, Error>((table, log.view(table).await?)) });
-        let views = try_join_all(views).await?;
         for (table, view) in views.into_iter().chain([(Table::Runs, pointers)]) {
             snapshot.versions.extend(view.as_ref().map(|view| (table, view.version)));
             snapshot.sort_in(table, view.unwrap_or_default().files);
