@@ -1,6 +1,8 @@
 //! Merges of files of made-up rows: what readers see before and after, and what others do meanwhile.
 
+use std::collections::BTreeSet;
 use std::sync::Arc;
+use std::time::Duration;
 
 use arrow::array::{
     ArrayRef, BooleanArray, Float32Array, Float64Array, Int32Array, Int64Array, ListArray, StringArray,
@@ -13,6 +15,7 @@ use arrow::record_batch::RecordBatch;
 use echolake_schema::Rig;
 use object_store::ObjectStore;
 use object_store::memory::InMemory;
+use object_store::throttle::{ThrottleConfig, ThrottledStore};
 use parquet::basic::Encoding;
 use parquet::file::metadata::{PageIndexPolicy, ParquetMetaDataReader};
 
@@ -506,4 +509,31 @@ async fn references_are_seen_in_a_file_that_was_merged_before_there_were_project
     put(&lake, "cube", "r6", "d1", 6).await;
     optimize(&lake).await;
     assert_eq!((rows_of_runs(&lake).await.len(), rows_of_runs(&reader).await.len()), (7, 3));
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn whoever_looks_while_runs_come_sees_all_rows_of_each() {
+    const RUNS: usize = 30;
+    let store = Arc::new(InMemory::new());
+    let lake = open(&store).await;
+    // Requests that are made at once are answered in any order.
+    let config = ThrottleConfig { wait_get_per_call: Duration::from_millis(1), ..ThrottleConfig::default() };
+    let slow: Arc<dyn ObjectStore> = Arc::new(ThrottledStore::new(store, config));
+    let (rig, references) = (Rig::paper(), ReferenceSurfaces::default());
+    let reader = Lake::open_or_create_in(slow, "a slow lake", &rig, &references).await.expect("a lake");
+    let writing = tokio::spawn(async move {
+        for number in 0..RUNS {
+            put(&lake, "wood", &format!("r{number}"), "d1", number).await;
+        }
+    });
+    let mut looks = BTreeSet::new();
+    while looks.last() != Some(&RUNS) {
+        let snapshot = reader.snapshot().await.expect("a view");
+        for run in snapshot.runs() {
+            assert_eq!(snapshot.files_of(TABLE, &run.run).count(), 1, "rows of {} of {looks:?}", run.run);
+        }
+        looks.insert(snapshot.runs().count());
+    }
+    assert!(looks.len() > 2, "it looked while runs came: {looks:?}");
+    writing.await.expect("written");
 }
