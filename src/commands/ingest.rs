@@ -105,6 +105,8 @@ pub(crate) async fn run(args: &IngestArgs, lake_url: &str) -> anyhow::Result<Com
         return take_in_suspect(&lake, path, stop.flag(), &progress).await;
     }
     if args.watch {
+        // Later errors are waited out; this one is the store's nature.
+        lake.ensure_tables().await?;
         return watch(&lake, &stop, &progress).await;
     }
     let sources = match args.runs.as_slice() {
