@@ -11,6 +11,7 @@ use std::time::Duration;
 
 use echolake_server::fuzzing::serve_engine;
 use echolake_server::{EngineSettings, LakeServer, ServerSettings};
+use tokio::signal::unix::{self, SignalKind};
 
 use crate::FuzzedLake;
 
@@ -78,6 +79,8 @@ impl FuzzedServer {
             std::thread::sleep(QUIET);
         }
         let entered = lake.runtime.enter();
+        // Without Rust's own `main` a client that is gone ends the process; a handler that is set stays.
+        unix::signal(SignalKind::pipe()).expect("a handler");
         let server = LakeServer::bind(&lake.lake, settings).expect("a server");
         drop(entered);
         let addresses = server.addresses().iter().map(|url| address(url)).collect();
