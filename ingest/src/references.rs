@@ -153,9 +153,9 @@ impl ReferenceFinder {
             return Ok(Some(known.clone()));
         }
         // One after the other, each would wait for its store.
-        let [foam, flat_foam, flat] = [&wanted.foam, &wanted.flat_foam, &wanted.flat];
-        self.read_means(&[foam, flat_foam, flat]).await?;
-        let [foam, flat_foam, flat] = [foam, flat_foam, flat].map(|of| self.means[of.key()].clone());
+        let named = [&wanted.foam, &wanted.flat_foam, &wanted.flat];
+        self.read_means(named).await?;
+        let [foam, flat_foam, flat] = named.map(|of| self.means[of.key()].clone());
         let (lake, is_foam_chosen) = (self.lake.clone(), wanted.direct_sound == DirectSound::Foam);
         let derive = move || {
             let of_foam = || ReferenceResponses::new(&lake, foam.clone(), &flat, &flat_foam);
@@ -175,9 +175,10 @@ impl ReferenceFinder {
     }
 
     // Reads the means that are not known yet side by side.
-    async fn read_means(&mut self, wanted: &[&ReferenceVersion]) -> Result<()> {
-        let unknown: BTreeMap<_, _> =
-            wanted.iter().map(|of| (of.key(), *of)).filter(|(key, _)| !self.means.contains_key(*key)).collect();
+    async fn read_means(&mut self, named: [&ReferenceVersion; 3]) -> Result<()> {
+        // Foam is most often that of Flat, too.
+        let named = named.into_iter().map(|of| (of.key(), of));
+        let unknown: BTreeMap<_, _> = named.filter(|(key, _)| !self.means.contains_key(*key)).collect();
         let read = unknown.into_iter().map(|(key, of)| {
             let means = self.mean(of);
             async move { Ok::<_, Error>((key.to_owned(), Arc::new(means.await?))) }
