@@ -1,6 +1,6 @@
 //! Threads that plan and run queries, separate from those that serve connections.
 
-use std::sync::{Mutex, PoisonError};
+use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
 use tokio::runtime::{Builder, Handle, Runtime};
@@ -9,7 +9,7 @@ use tokio::task::JoinHandle;
 /// Stack size of a thread, bytes: twice the need of the longest accepted chain of operators.
 const STACK_BYTES: usize = 16 << 20;
 
-/// Most groups of threads of an engine, so that one query fewer may hold all threads of its group.
+/// Most groups of threads of an engine: while all of one fewer are held, the next query still runs.
 const MOST_GROUPS: usize = 8;
 
 /// A Tokio runtime that may be dropped anywhere, even in asynchronous code.
@@ -59,7 +59,7 @@ impl Drop for QueryThreads {
 /// wait, such as a join without rows, holds all threads of its group, and whatever else needs them waits for its end.
 pub(crate) struct QueryThreadGroups {
     name: &'static str,
-    groups: Mutex<Vec<QueryThreads>>,
+    groups: Mutex<Vec<Arc<QueryThreads>>>,
 }
 
 impl QueryThreadGroups {
@@ -68,7 +68,7 @@ impl QueryThreadGroups {
     /// # Errors
     /// As [`QueryThreads::new`].
     pub(crate) fn new(name: &'static str) -> std::io::Result<Self> {
-        Ok(Self { name, groups: Mutex::new(vec![QueryThreads::per_core(name)?]) })
+        Ok(Self { name, groups: Mutex::new(vec![Arc::new(QueryThreads::per_core(name)?)]) })
     }
 
     /// Spawns work on a group without other work; on the one with the least if there are no more groups, or the system
@@ -77,15 +77,28 @@ impl QueryThreadGroups {
         &self,
         work: impl Future<Output = T> + Send + 'static,
     ) -> Option<JoinHandle<T>> {
+        let group = self.least_loaded()?;
+        let threads = group.handle()?.clone();
+        Some(threads.spawn(async move {
+            let _group = group;
+            work.await
+        }))
+    }
+
+    fn least_loaded(&self) -> Option<Arc<QueryThreads>> {
+        // Work holds its group. Tasks are also connections to stores and workers, and what is left of ended work.
+        let load = |group: &&Arc<QueryThreads>| {
+            let tasks = group.handle().map_or(0, |threads| threads.metrics().num_alive_tasks());
+            (Arc::strong_count(group) - 1, tasks)
+        };
         let mut groups = self.groups.lock().unwrap_or_else(PoisonError::into_inner);
-        let tasks = |handle: &&Handle| handle.metrics().num_alive_tasks();
-        let least = groups.iter().filter_map(QueryThreads::handle).min_by_key(tasks)?;
-        if tasks(&least) == 0 || groups.len() == MOST_GROUPS {
-            return Some(least.spawn(work));
+        let least = groups.iter().min_by_key(load)?;
+        if load(&least) == (0, 0) || groups.len() == MOST_GROUPS {
+            return Some(least.clone());
         }
-        let Ok(another) = QueryThreads::per_core(self.name) else { return Some(least.spawn(work)) };
-        let spawned = another.handle().map(|handle| handle.spawn(work));
-        groups.push(another);
-        spawned
+        let Ok(another) = QueryThreads::per_core(self.name) else { return Some(least.clone()) };
+        let another = Arc::new(another);
+        groups.push(another.clone());
+        Some(another)
     }
 }
