@@ -19,7 +19,10 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         [option] if option == "--check" => true,
         other => return Err(format!("expected --check or nothing, not {other:?}").into()),
     };
-    let schema = Path::new(env!("CARGO_MANIFEST_DIR")).join("..");
+    // Of this run: checkouts that share a folder of build products share this program.
+    let manifest =
+        std::env::var_os("CARGO_MANIFEST_DIR").ok_or("no CARGO_MANIFEST_DIR; hint: start it by cargo run")?;
+    let schema = Path::new(&manifest).join("..");
     let descriptors = protox::compile(FILES, [schema.join("proto")])?;
     let compiled = tempfile::tempdir()?;
     std::fs::write(compiled.path().join("echolake.v1.fds"), descriptors.encode_to_vec())?;
