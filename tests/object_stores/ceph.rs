@@ -1,6 +1,8 @@
 //! The checks on Ceph's S3 gateway, in short. Its Debian packages are installed if that is possible; if it is not, the test
 //! is skipped and says so, and fails with `ECHOLAKE_NO_SKIP`.
 
+use std::fs::File;
+use std::net::TcpListener;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
@@ -10,20 +12,41 @@ use super::ECHOLAKE;
 /// A gateway of the test's own; dropping it ends its processes and deletes what they hold.
 struct CephGateway {
     folder: tempfile::TempDir,
-    port: u32,
+    port: u16,
+    _lock: File,
 }
 
 fn script(name: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/object_stores").join(name)
 }
 
+/// Ports of a gateway, its proxies and its clients, from the first on; the monitor has one of its own, this far above.
+const PORTS: u16 = 40;
+const MONITOR_DISTANCE: u16 = 1000;
+
+/// Returns a first port with a lock on it, so that no other test of this machine takes the same, even of another suite.
+fn lock_ports() -> Result<(u16, File), String> {
+    // Below the ports that the system gives to others, and no monitor among the ports of another.
+    let starts = (20_000..30_000).step_by(2 * usize::from(MONITOR_DISTANCE));
+    let blocks = starts.flat_map(|start| (start..start + MONITOR_DISTANCE).step_by(usize::from(PORTS)));
+    let is_free = |port: u16| TcpListener::bind(("127.0.0.1", port)).is_ok();
+    for port in blocks {
+        let path = std::env::temp_dir().join(format!("echolake-ports-{port}.lock"));
+        // One that cannot be opened is somebody else's.
+        let Ok(lock) = File::create(path) else { continue };
+        if lock.try_lock().is_ok() && is_free(port) && is_free(port + MONITOR_DISTANCE) {
+            return Ok((port, lock));
+        }
+    }
+    Err("no ports are free for Ceph's gateway".to_owned())
+}
+
 impl CephGateway {
     fn install() -> Result<Self, String> {
         run(Command::new("bash").arg(script("ceph_rgw.sh")).arg("install"))?;
         let folder = tempfile::tempdir().map_err(|e| e.to_string())?;
-        // Below the ports that the system gives to others; the daemons and proxies of one test have 40 of them.
-        let port = 20_000 + 40 * (std::process::id() % 250);
-        Ok(Self { folder, port })
+        let (port, lock) = lock_ports()?;
+        Ok(Self { folder, port, _lock: lock })
     }
 
     /// A program that finds this gateway, and starts it if it does not run.
