@@ -23,7 +23,7 @@ use tokio::task::JoinHandle;
 
 use crate::catalog::LakeCatalog;
 use crate::control::pool::{HeldMemory, PartialPool};
-use crate::control::threads::{QueryThreadGroups, QueryThreads};
+use crate::control::threads::QueryThreads;
 use crate::control::{QueryTicket, RunningQueries, StopReason};
 use crate::functions::octet_length_of_bytes;
 use crate::scan_readers::LakeReaderFactory;
@@ -74,7 +74,7 @@ pub struct QueryEngine(OpaqueValue<EngineState>);
 struct EngineState {
     template: SessionState,
     catalog: LakeCatalog,
-    threads: QueryThreadGroups,
+    threads: QueryThreads,
     running: RunningQueries,
     limits: EngineLimits,
     /// Names of echolake's own functions.
@@ -229,7 +229,7 @@ impl QueryEngine {
         let inner = EngineState {
             template: template(runtime, &functions, catalog.rules()),
             catalog,
-            threads: QueryThreadGroups::new("query").map_err(threads)?,
+            threads: QueryThreads::per_core("query").map_err(threads)?,
             running: RunningQueries::default(),
             limits,
             own: functions.names().map(str::to_owned).collect(),
@@ -333,12 +333,12 @@ impl QueryEngine {
         ticket: &Arc<QueryTicket>,
         work: impl Future<Output = Result<T, E>> + Send + 'static,
     ) -> Result<T, E> {
+        let Some(threads) = self.0.threads.handle() else { return Err(ended().into()) };
         let guard = ticket.begin_work();
-        let guarded = async move {
+        let work = threads.spawn(async move {
             let _guard = guard;
             work.await
-        };
-        let Some(work) = self.0.threads.spawn(guarded) else { return Err(ended().into()) };
+        });
         let mut work = StopOnDrop { work, ticket: ticket.clone() };
         tokio::select! {
             done = &mut work.work => done.unwrap_or_else(|_| Err(defect().into())),
@@ -352,7 +352,7 @@ impl QueryEngine {
     }
 
     /// Returns the threads that plan and run queries.
-    pub(crate) fn threads(&self) -> &QueryThreadGroups {
+    pub(crate) fn threads(&self) -> &QueryThreads {
         &self.0.threads
     }
 

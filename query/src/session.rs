@@ -335,9 +335,9 @@ impl Session {
         let Started { ticket, place } = started;
         let planned = self.clone().physical_plan(prepared.state.clone(), prepared.sql.clone(), plan, ticket.clone());
         let (schema, attempts) = self.engine.on_threads(&ticket, planned).await?;
+        let Some(threads) = self.engine.threads().handle() else { return Err(engine::ended()) };
         let (send, batches) = mpsc::channel(AHEAD);
-        let query = drive(schema.clone(), attempts, send, ticket.begin_work(), place);
-        let Some(query) = self.engine.threads().spawn(query) else { return Err(engine::ended()) };
+        let query = threads.spawn(drive(schema.clone(), attempts, send, ticket.begin_work(), place));
         Ok(QueryAnswer {
             schema,
             batches,

@@ -1,16 +1,11 @@
 //! Threads that plan and run queries, separate from those that serve connections.
 
-use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
 use tokio::runtime::{Builder, Handle, Runtime};
-use tokio::task::JoinHandle;
 
 /// Stack size of a thread, bytes: twice the need of the longest accepted chain of operators.
 const STACK_BYTES: usize = 16 << 20;
-
-/// Most groups of threads of an engine: while all of one fewer are held, the next query still runs.
-const MOST_GROUPS: usize = 8;
 
 /// A Tokio runtime that may be dropped anywhere, even in asynchronous code.
 pub struct QueryThreads(Option<Runtime>);
@@ -52,53 +47,5 @@ impl Drop for QueryThreads {
         if let Some(runtime) = self.0.take() {
             runtime.shutdown_background();
         }
-    }
-}
-
-/// Groups of threads, one thread per core each, of which a query gets one without other work: an operator that does not
-/// wait, such as a join without rows, holds all threads of its group, and whatever else needs them waits for its end.
-pub(crate) struct QueryThreadGroups {
-    name: &'static str,
-    groups: Mutex<Vec<Arc<QueryThreads>>>,
-}
-
-impl QueryThreadGroups {
-    /// Starts one group; others are started when they are needed, and are kept.
-    ///
-    /// # Errors
-    /// As [`QueryThreads::new`].
-    pub(crate) fn new(name: &'static str) -> std::io::Result<Self> {
-        Ok(Self { name, groups: Mutex::new(vec![Arc::new(QueryThreads::per_core(name)?)]) })
-    }
-
-    /// Spawns work on a group without other work; on the one with the least if there are no more groups, or the system
-    /// has no more threads. None during shutdown.
-    pub(crate) fn spawn<T: Send + 'static>(
-        &self,
-        work: impl Future<Output = T> + Send + 'static,
-    ) -> Option<JoinHandle<T>> {
-        let group = self.least_loaded()?;
-        let threads = group.handle()?.clone();
-        Some(threads.spawn(async move {
-            let _group = group;
-            work.await
-        }))
-    }
-
-    fn least_loaded(&self) -> Option<Arc<QueryThreads>> {
-        // Work holds its group. Tasks are also connections to stores and workers, and what is left of ended work.
-        let load = |group: &&Arc<QueryThreads>| {
-            let tasks = group.handle().map_or(0, |threads| threads.metrics().num_alive_tasks());
-            (Arc::strong_count(group) - 1, tasks)
-        };
-        let mut groups = self.groups.lock().unwrap_or_else(PoisonError::into_inner);
-        let least = groups.iter().min_by_key(load)?;
-        if load(&least) == (0, 0) || groups.len() == MOST_GROUPS {
-            return Some(least.clone());
-        }
-        let Ok(another) = QueryThreads::per_core(self.name) else { return Some(least.clone()) };
-        let another = Arc::new(another);
-        groups.push(another.clone());
-        Some(another)
     }
 }
