@@ -18,12 +18,12 @@ use datafusion::logical_expr::Documentation;
 use datafusion::optimizer::OptimizerRule;
 use datafusion::prelude::{SessionConfig, SessionContext};
 use echolake_lake::Lake;
+use futures::FutureExt as _;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};
-use tokio::task::JoinHandle;
 
 use crate::catalog::LakeCatalog;
 use crate::control::pool::{HeldMemory, PartialPool};
-use crate::control::threads::QueryThreads;
+use crate::control::threads::{QueryThreadGroups, QueryThreads};
 use crate::control::{QueryTicket, RunningQueries, StopReason};
 use crate::functions::octet_length_of_bytes;
 use crate::scan_readers::LakeReaderFactory;
@@ -74,7 +74,7 @@ pub struct QueryEngine(OpaqueValue<EngineState>);
 struct EngineState {
     template: SessionState,
     catalog: LakeCatalog,
-    threads: QueryThreads,
+    threads: QueryThreadGroups,
     running: RunningQueries,
     limits: EngineLimits,
     /// Names of echolake's own functions.
@@ -229,7 +229,7 @@ impl QueryEngine {
         let inner = EngineState {
             template: template(runtime, &functions, catalog.rules()),
             catalog,
-            threads: QueryThreads::per_core("query").map_err(threads)?,
+            threads: QueryThreadGroups::per_core("query").map_err(threads)?,
             running: RunningQueries::default(),
             limits,
             own: functions.names().map(str::to_owned).collect(),
@@ -333,17 +333,28 @@ impl QueryEngine {
         ticket: &Arc<QueryTicket>,
         work: impl Future<Output = Result<T, E>> + Send + 'static,
     ) -> Result<T, E> {
-        let Some(threads) = self.0.threads.handle() else { return Err(ended().into()) };
-        let guard = ticket.begin_work();
-        let work = threads.spawn(async move {
-            let _guard = guard;
-            work.await
-        });
-        let mut work = StopOnDrop { work, ticket: ticket.clone() };
-        tokio::select! {
-            done = &mut work.work => done.unwrap_or_else(|_| Err(defect().into())),
+        let mut stop = StopOnDrop { ticket: ticket.clone(), is_done: false };
+        let begun = ticket.clone();
+        let guarded = async move {
+            let _guard = begun.begin_work();
+            tokio::select! {
+                biased;
+                why = begun.stopped() => Err(Error::stopped(&why).into()),
+                done = work => done,
+            }
+        };
+        let guarded = guarded.boxed();
+        let work = async {
+            let Some(task) = self.0.threads.begin(guarded).await else { return Err(ended().into()) };
+            let done = task.await.unwrap_or_else(|_| Some(Err(defect().into())));
+            done.unwrap_or_else(|| Err(ended().into()))
+        };
+        let done = tokio::select! {
+            done = work => done,
             why = ticket.stopped() => Err(Error::stopped(&why).into()),
-        }
+        };
+        stop.is_done = true;
+        done
     }
 
     /// Returns the catalogue of tables and views.
@@ -352,7 +363,7 @@ impl QueryEngine {
     }
 
     /// Returns the threads that plan and run queries.
-    pub(crate) fn threads(&self) -> &QueryThreads {
+    pub(crate) fn threads(&self) -> &QueryThreadGroups {
         &self.0.threads
     }
 
@@ -470,17 +481,16 @@ fn runtime(lake: &Lake, url: &ObjectStoreUrl, limits: &EngineLimits) -> Result<A
         .build_arc()
 }
 
-/// Cancels the query and aborts its planning when the waiting caller is dropped; the task ends at its next await.
-struct StopOnDrop<T> {
-    work: JoinHandle<T>,
+/// Stops the work of a caller that is dropped while it waits; it ends at its next await.
+struct StopOnDrop {
     ticket: Arc<QueryTicket>,
+    is_done: bool,
 }
 
-impl<T> Drop for StopOnDrop<T> {
+impl Drop for StopOnDrop {
     fn drop(&mut self) {
-        if !self.work.is_finished() {
+        if !self.is_done {
             self.ticket.stop(StopReason::Cancelled);
-            self.work.abort();
         }
     }
 }

@@ -20,12 +20,12 @@ use datafusion::sql::parser::{DFParserBuilder, Statement};
 use datafusion::sql::sqlparser::parser::ParserError;
 use datafusion::sql::sqlparser::tokenizer::Tokenizer;
 use echolake_lake::{Lake, LakeSnapshot, VisibleRun};
-use futures::StreamExt as _;
+use futures::{FutureExt as _, StreamExt as _};
 use tokio::sync::mpsc;
 use tokio::task::JoinHandle;
 
 use crate::control::pool::PartialPool;
-use crate::control::{QueryTicket, StopReason, WorkGuard};
+use crate::control::{QueryTicket, StopReason};
 use crate::dialect::LakeDialect;
 use crate::engine::{self, EngineClient, EngineLimits, QueryEngine, QueryPermit, QueryQuota, SqlFunction};
 use crate::mcap::Contents;
@@ -95,7 +95,7 @@ pub struct QueryAnswer {
     /// Its columns.
     pub schema: SchemaRef,
     batches: mpsc::Receiver<Result<RecordBatch, DataFusionError>>,
-    query: Option<JoinHandle<()>>,
+    query: Option<JoinHandle<Option<()>>>,
     ticket: Arc<QueryTicket>,
     rows: u64,
     limit: Option<u64>,
@@ -150,7 +150,7 @@ impl QueryAnswer {
     async fn end(&mut self) -> Result<Option<RecordBatch>, Error> {
         let Some(query) = self.query.take() else { return Ok(None) };
         match query.await {
-            Ok(()) => self.ticket.why().map_or(Ok(None), |why| Err(Error::stopped(why))),
+            Ok(_) => self.ticket.why().map_or(Ok(None), |why| Err(Error::stopped(why))),
             Err(_) => Err(engine::defect()),
         }
     }
@@ -335,18 +335,23 @@ impl Session {
         let Started { ticket, place } = started;
         let planned = self.clone().physical_plan(prepared.state.clone(), prepared.sql.clone(), plan, ticket.clone());
         let (schema, attempts) = self.engine.on_threads(&ticket, planned).await?;
-        let Some(threads) = self.engine.threads().handle() else { return Err(engine::ended()) };
         let (send, batches) = mpsc::channel(AHEAD);
-        let query = threads.spawn(drive(schema.clone(), attempts, send, ticket.begin_work(), place));
-        Ok(QueryAnswer {
+        let query = drive(schema.clone(), attempts, send, ticket.clone(), place).boxed();
+        // Dropped, it stops the query, which may have begun.
+        let mut answer = QueryAnswer {
             schema,
             batches,
-            query: Some(query),
+            query: None,
             ticket,
             rows: 0,
             limit: self.client.quota().rows,
             _engine: self.engine.clone(),
-        })
+        };
+        tokio::select! {
+            begun = self.engine.threads().begin(query) => answer.query = Some(begun.ok_or_else(engine::ended)?),
+            why = answer.ticket.stopped() => return Err(Error::stopped(&why)),
+        }
+        Ok(answer)
     }
 
     // The plan for this process, and what plans it for workers if it is for them.
@@ -464,9 +469,10 @@ async fn drive(
     schema: SchemaRef,
     mut attempts: QueryAttempts,
     send: mpsc::Sender<Result<RecordBatch, DataFusionError>>,
-    work: WorkGuard,
+    ticket: Arc<QueryTicket>,
     _place: QueryPermit,
 ) {
+    let _work = ticket.begin_work();
     let run = async {
         let mut attempt = attempts.first().await;
         while let Some(current) = attempt {
@@ -485,7 +491,7 @@ async fn drive(
     };
     tokio::select! {
         biased;
-        _ = work.ticket().stopped() => {}
+        _ = ticket.stopped() => {}
         () = run => {}
     }
 }

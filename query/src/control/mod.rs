@@ -39,12 +39,6 @@ pub(crate) struct QueryTicket {
 /// A guard for work on a query, dropped on the thread that does the work.
 pub(crate) struct WorkGuard(Arc<QueryTicket>);
 
-impl WorkGuard {
-    pub(crate) fn ticket(&self) -> &QueryTicket {
-        &self.0
-    }
-}
-
 impl Drop for WorkGuard {
     fn drop(&mut self) {
         self.0.working.fetch_sub(1, Ordering::Relaxed);

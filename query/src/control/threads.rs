@@ -1,11 +1,23 @@
 //! Threads that plan and run queries, separate from those that serve connections.
 
+use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
+use futures::future::BoxFuture;
 use tokio::runtime::{Builder, Handle, Runtime};
+use tokio::sync::oneshot;
+use tokio::task::JoinHandle;
+use tokio::time::timeout;
 
 /// Stack size of a thread, bytes: twice the need of the longest accepted chain of operators.
 const STACK_BYTES: usize = 16 << 20;
+
+/// Groups of threads of an engine: one fewer can be held, and queries still run. Each thread allocates between two looks
+/// at the memory that is left, so that there are few.
+const GROUPS: usize = 3;
+
+/// Time in which a group begins work; then another may, too.
+const RESPONSE_LIMIT: Duration = Duration::from_millis(20);
 
 /// A Tokio runtime that may be dropped anywhere, even in asynchronous code.
 pub struct QueryThreads(Option<Runtime>);
@@ -48,4 +60,62 @@ impl Drop for QueryThreads {
             runtime.shutdown_background();
         }
     }
+}
+
+/// Groups of threads, one thread per core each. An operator that does not wait, such as a join without rows, holds all
+/// threads of its group; other work then begins on another group.
+pub(crate) struct QueryThreadGroups(Vec<ThreadGroup>);
+
+struct ThreadGroup {
+    threads: QueryThreads,
+    /// Work on the group holds a copy.
+    work: Arc<()>,
+}
+
+impl QueryThreadGroups {
+    /// Starts all groups.
+    ///
+    /// # Errors
+    /// As [`QueryThreads::new`].
+    pub(crate) fn per_core(name: &str) -> std::io::Result<Self> {
+        let group = || Ok(ThreadGroup { threads: QueryThreads::per_core(name)?, work: Arc::default() });
+        Ok(Self(std::iter::repeat_with(group).take(GROUPS).collect::<std::io::Result<_>>()?))
+    }
+
+    /// Begins work on the group with the least of it, or on another if its threads do not respond; returns its task,
+    /// whose output is always `Some`. None during shutdown. If the caller stops waiting, the work may have begun.
+    pub(crate) async fn begin<T: Send + 'static>(&self, work: BoxFuture<'static, T>) -> Option<JoinHandle<Option<T>>> {
+        let mut groups: Vec<_> = self.0.iter().collect();
+        groups.sort_by_cached_key(|group| group.load());
+        let mut groups = groups.into_iter();
+        let (begin, mut begun) = oneshot::channel();
+        let offer = Arc::new(Mutex::new(Some((work, begin))));
+        let mut tasks = Vec::new();
+        let number = loop {
+            let Some(group) = groups.next() else { break begun.await };
+            tasks.push(group.threads.handle()?.spawn(accept(offer.clone(), tasks.len(), group.work.clone())));
+            if let Ok(number) = timeout(RESPONSE_LIMIT, &mut begun).await {
+                break number;
+            }
+        };
+        number.ok().map(|number| tasks.swap_remove(number))
+    }
+}
+
+impl ThreadGroup {
+    // Tasks are also connections to stores and workers, and what is left of ended work.
+    fn load(&self) -> (usize, usize) {
+        let tasks = self.threads.handle().map_or(0, |threads| threads.metrics().num_alive_tasks());
+        (Arc::strong_count(&self.work) - 1, tasks)
+    }
+}
+
+/// Work that several groups may begin, and what tells which one has.
+type WorkOffer<T> = Arc<Mutex<Option<(BoxFuture<'static, T>, oneshot::Sender<usize>)>>>;
+
+// Returns None if another group has begun the work, or nobody waits for it any more.
+async fn accept<T>(offer: WorkOffer<T>, number: usize, _counted: Arc<()>) -> Option<T> {
+    let (work, begin) = offer.lock().unwrap_or_else(PoisonError::into_inner).take()?;
+    begin.send(number).ok()?;
+    Some(work.await)
 }

@@ -1,5 +1,6 @@
 //! Queries that must end: cancelled, over their time, row or memory limit, or because the answer was dropped.
 
+use std::sync::Mutex;
 use std::time::{Duration, Instant};
 
 use datafusion::sql::sqlparser::dialect::GenericDialect;
@@ -98,6 +99,51 @@ async fn what_does_not_end_is_found() {
         assert!(begun.elapsed() < END_LIMIT, "the call is over, and is not forgotten");
         tokio::time::sleep(Duration::from_millis(50)).await;
     }
+}
+
+#[tokio::test]
+async fn work_that_holds_its_threads_delays_no_query() {
+    let (_folder, engine) = engine(EngineLimits::default()).await;
+    let cores = std::thread::available_parallelism().map_or(1, usize::from);
+    let (release, released) = std::sync::mpsc::channel::<()>();
+    let released = Arc::new(Mutex::new(released));
+    let (begin, mut begun) = mpsc::unbounded_channel();
+    // As an operator that does not wait, on one thread.
+    let begin_holding = begin.clone();
+    let hold = move || {
+        let (released, begin) = (released.clone(), begin_holding.clone());
+        async move {
+            begin.send(()).expect("somebody counts");
+            let _ = released.lock().expect("no panic").recv();
+        }
+    };
+    let hold_all = async move {
+        let holding: Vec<_> = (0..cores).map(|_| tokio::spawn(hold())).collect();
+        for one in holding {
+            one.await.expect("no panic");
+        }
+        Ok::<(), Error>(())
+    };
+    let holder = engine.clone();
+    let holding = tokio::spawn(async move { holder.supervise(None, hold_all).await });
+    for _ in 0..cores {
+        tokio::time::timeout(END_LIMIT, begun.recv()).await.expect("in time").expect("it begins");
+    }
+    // With these, the threads that are held have the least work.
+    for _ in 0..8 {
+        let (busy, begin) = (engine.clone(), begin.clone());
+        tokio::spawn(async move {
+            let work = async move {
+                begin.send(()).expect("somebody counts");
+                std::future::pending::<Result<(), Error>>().await
+            };
+            busy.supervise(None, work).await
+        });
+        tokio::time::timeout(END_LIMIT, begun.recv()).await.expect("in time").expect("it begins");
+    }
+    assert_eq!(outcome(&session(&engine, QueryQuota::default()), "select 1").await.expect("a row"), 1);
+    drop(release);
+    holding.await.expect("no panic").expect("it ends");
 }
 
 #[tokio::test]
