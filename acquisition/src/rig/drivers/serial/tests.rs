@@ -1,9 +1,13 @@
 //! The sensor over a pair of pseudo terminals, one end of which the test holds.
 
-use std::path::Path;
+use std::os::fd::AsRawFd as _;
+use std::os::unix::fs::symlink;
+use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex};
 use std::thread::JoinHandle;
+
+use tempfile::TempDir;
 
 use super::*;
 use crate::rig::conformance;
@@ -16,7 +20,9 @@ pub(in crate::rig::drivers) const GOOD: &str = "T=21.50 RH=45.0 P=965.0 L=42.0\n
 
 /// The sensor's end: sends a text again and again until it is dropped, which unplugs it.
 pub(in crate::rig::drivers) struct FakeSensor {
-    path: String,
+    /// A link to its terminal, whose number the system soon gives to others.
+    link: PathBuf,
+    _folder: TempDir,
     text: Arc<Mutex<&'static str>>,
     /// Number of times that the text was sent.
     count: Arc<AtomicUsize>,
@@ -27,7 +33,9 @@ pub(in crate::rig::drivers) struct FakeSensor {
 impl FakeSensor {
     pub(in crate::rig::drivers) fn sending(text: &'static str) -> Self {
         let (ours, theirs) = SerialPort::pair().expect("a pair of pseudo terminals");
-        let path = path_of(&theirs);
+        let folder = tempfile::tempdir().expect("a folder");
+        let link = folder.path().join("sensor");
+        symlink(path_of(&theirs), &link).expect("linked");
         let stop = Arc::new(AtomicBool::new(false));
         let stopped = stop.clone();
         let text = Arc::new(Mutex::new(text));
@@ -44,11 +52,11 @@ impl FakeSensor {
                 std::thread::sleep(Duration::from_millis(50));
             }
         });
-        Self { path, text, count, stop, thread: Some(thread) }
+        Self { link, _folder: folder, text, count, stop, thread: Some(thread) }
     }
 
     pub(in crate::rig::drivers) fn params(&self, timeout_secs: f64) -> SerialParams {
-        SerialParams { path: self.path.clone(), timeout_secs, ..SerialParams::default() }
+        SerialParams { path: self.link.display().to_string(), timeout_secs, ..SerialParams::default() }
     }
 
     /// Waits until its text was sent twice from now on, and is whole in the line; then it is silent.
@@ -75,6 +83,7 @@ impl FakeSensor {
 
     /// Its end of the line is gone.
     pub(in crate::rig::drivers) fn unplug(&mut self) {
+        let _ = std::fs::remove_file(&self.link);
         self.stop.store(true, Ordering::Relaxed);
         let _ = self.thread.take().map(JoinHandle::join);
     }
@@ -86,10 +95,8 @@ impl Drop for FakeSensor {
     }
 }
 
-fn path_of(port: &SerialPort) -> String {
-    use std::os::fd::AsRawFd as _;
-    let link = format!("/proc/self/fd/{}", port.as_raw_fd());
-    std::fs::read_link(link).expect("a terminal").to_string_lossy().into_owned()
+fn path_of(port: &SerialPort) -> PathBuf {
+    std::fs::read_link(format!("/proc/self/fd/{}", port.as_raw_fd())).expect("a terminal")
 }
 
 fn message(sensor: &mut SerialSensor) -> String {
@@ -150,25 +157,16 @@ fn a_sensor_that_is_not_there_is_named() {
 
 #[test]
 fn an_unplugged_sensor_is_named_and_found_again() {
-    let folder = tempfile::tempdir().expect("a folder");
-    let link = folder.path().join("sensor");
-    let plug = |fake: &FakeSensor| {
-        let _ = std::fs::remove_file(&link);
-        std::os::unix::fs::symlink(&fake.path, &link).expect("linked");
-    };
-    let first = FakeSensor::sending(GOOD);
-    plug(&first);
-    let params = SerialParams { path: Path::display(&link).to_string(), ..first.params(PATIENT_SECS) };
-    let mut sensor = SerialSensor::open(&params).expect("open");
+    let mut first = FakeSensor::sending(GOOD);
+    let mut sensor = SerialSensor::open(&first.params(PATIENT_SECS)).expect("open");
     sensor.read().expect("a reading");
     sensor.params.timeout_secs = IMPATIENT_SECS;
-    std::fs::remove_file(&link).expect("removed");
-    drop(first);
+    first.unplug();
     // What the line still held may be read once more.
     let error = (0..3).find_map(|_| sensor.read().err()).expect("unplugged").to_string();
     assert!(error.contains("lost `") && error.contains("still plugged in"), "{error}");
     let second = FakeSensor::sending(GOOD);
-    plug(&second);
+    symlink(&second.link, &first.link).expect("linked");
     sensor.params.timeout_secs = PATIENT_SECS;
     sensor.read().expect("found again");
     let notices = sensor.notices().join("\n");
