@@ -83,17 +83,18 @@ impl QueryThreadGroups {
     }
 
     /// Begins work on the group with the least of it, or on another if its threads do not respond; returns its task,
-    /// whose output is always `Some`. None during shutdown. If the caller stops waiting, the work may have begun.
+    /// whose output is always `Some`. None during shutdown. If the caller stops waiting, the work has begun already or is
+    /// dropped.
     pub(crate) async fn begin<T: Send + 'static>(&self, work: BoxFuture<'static, T>) -> Option<JoinHandle<Option<T>>> {
         let mut groups: Vec<_> = self.0.iter().collect();
         groups.sort_by_cached_key(|group| group.load());
         let mut groups = groups.into_iter();
         let (begin, mut begun) = oneshot::channel();
-        let offer = Arc::new(Mutex::new(Some((work, begin))));
+        let offer = WorkOffer(Arc::new(Mutex::new(Some((work, begin)))));
         let mut tasks = Vec::new();
         let number = loop {
             let Some(group) = groups.next() else { break begun.await };
-            tasks.push(group.threads.handle()?.spawn(accept(offer.clone(), tasks.len(), group.work.clone())));
+            tasks.push(group.threads.handle()?.spawn(accept(offer.0.clone(), tasks.len(), group.work.clone())));
             if let Ok(number) = timeout(RESPONSE_LIMIT, &mut begun).await {
                 break number;
             }
@@ -111,11 +112,56 @@ impl ThreadGroup {
 }
 
 /// Work that several groups may begin, and what tells which one has.
-type WorkOffer<T> = Arc<Mutex<Option<(BoxFuture<'static, T>, oneshot::Sender<usize>)>>>;
+type UnbegunWork<T> = Arc<Mutex<Option<(BoxFuture<'static, T>, oneshot::Sender<usize>)>>>;
 
-// Returns None if another group has begun the work, or nobody waits for it any more.
-async fn accept<T>(offer: WorkOffer<T>, number: usize, _counted: Arc<()>) -> Option<T> {
+/// Withdraws work when it is dropped, unless a group has begun it.
+struct WorkOffer<T>(UnbegunWork<T>);
+
+impl<T> Drop for WorkOffer<T> {
+    fn drop(&mut self) {
+        let unbegun = self.0.lock().unwrap_or_else(PoisonError::into_inner).take();
+        drop(unbegun);
+    }
+}
+
+// Returns None if another group has begun the work, or it was withdrawn.
+async fn accept<T>(offer: UnbegunWork<T>, number: usize, _counted: Arc<()>) -> Option<T> {
     let (work, begin) = offer.lock().unwrap_or_else(PoisonError::into_inner).take()?;
     begin.send(number).ok()?;
     Some(work.await)
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::mpsc;
+
+    use futures::FutureExt as _;
+
+    use super::*;
+
+    #[tokio::test]
+    async fn work_that_nobody_waits_for_is_dropped_before_it_begins() {
+        let groups = QueryThreadGroups::per_core("test").expect("threads");
+        let (release, released) = mpsc::channel::<()>();
+        let released = Arc::new(Mutex::new(released));
+        let (begin, begun) = mpsc::channel();
+        for group in &groups.0 {
+            let threads = group.threads.handle().expect("it runs");
+            for _ in 0..threads.metrics().num_workers() {
+                let (released, begin) = (released.clone(), begin.clone());
+                threads.spawn(async move {
+                    begin.send(()).expect("somebody counts");
+                    let _ = released.lock().expect("no panic").recv();
+                });
+                begun.recv().expect("a thread is free");
+            }
+        }
+        let place = Arc::new(());
+        let held = place.clone();
+        let work = async move { drop(held) }.boxed();
+        let waiting = timeout(RESPONSE_LIMIT * 10, groups.begin(work)).await;
+        assert!(waiting.is_err(), "all threads are held");
+        assert_eq!(Arc::strong_count(&place), 1);
+        drop(release);
+    }
 }

@@ -79,7 +79,7 @@ impl AgentDoor {
     /// [`Error::System`].
     pub async fn run(self, stop: impl Future<Output = ()>) -> Result<(), Error> {
         let mut upkeep = JoinSet::new();
-        upkeep.spawn(self.route.engines.clone().watch());
+        upkeep.spawn(self.route.engines.clone().retire_idle());
         tokio::select! {
             () = answer_lines(&self.route, read_lines()) => {}
             () = stop => {}

@@ -3,7 +3,8 @@
 
 use std::collections::HashMap;
 use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
+use std::thread::Thread;
 use std::time::{Duration, Instant};
 
 use echolake_lake::{CACHE_MEMORY_BYTES, Lake};
@@ -21,9 +22,12 @@ use crate::token_access::TokenAccess;
 
 /// Time without a request after which an engine ends.
 const IDLE: Duration = Duration::from_secs(300);
-/// Time between two looks at the memory of engines, while one answers and while none does.
-const LOOK: Duration = Duration::from_millis(20);
+/// Time between two looks at the memory of engines, while one works and while none does. A core allocates 1.3 MiB in a
+/// millisecond.
+const LOOK: Duration = Duration::from_millis(10);
 const IDLE_LOOK: Duration = Duration::from_millis(250);
+/// Time for which an engine may go on with a request that has ended, until it ends itself; longer on a busy machine.
+const AFTERWORK: Duration = Duration::from_secs(2);
 /// Time for which a client without an engine waits for a place among the engines.
 const PLACE_WAIT: Duration = Duration::from_secs(10);
 /// Memory of an engine that is not of its queries: footers of files, small tables, what the allocator keeps.
@@ -54,6 +58,7 @@ struct EnginePoolState {
     failed: AtomicU64,
     /// Outcome of the last start of an engine; None before the first.
     last_start: Mutex<Option<StartOutcome>>,
+    memory_watcher: OnceLock<Thread>,
 }
 
 /// Outcome of an engine's start.
@@ -85,7 +90,7 @@ impl EnginePool {
         access: Arc<TokenAccess>,
     ) -> Result<Self, Error> {
         let folders = ServerFolders::new(lake, settings.temp.as_deref())?;
-        Ok(Self(Arc::new(EnginePoolState {
+        let state = Arc::new(EnginePoolState {
             settings,
             lake: lake.clone(),
             folders,
@@ -98,7 +103,25 @@ impl EnginePool {
             started: AtomicUsize::new(0),
             failed: AtomicU64::new(0),
             last_start: Mutex::default(),
-        })))
+            memory_watcher: OnceLock::new(),
+        });
+        // A thread of its own: it must not wait for what the door does for clients.
+        let watched = Arc::downgrade(&state);
+        let watch = move || {
+            while let Some(pool) = watched.upgrade().map(EnginePool) {
+                let is_busy = pool.watch_memory();
+                drop(pool);
+                std::thread::sleep(LOOK);
+                if !is_busy {
+                    // Until the next request, at most.
+                    std::thread::park_timeout(IDLE_LOOK);
+                }
+            }
+        };
+        let watcher =
+            std::thread::Builder::new().name("memory-watch".to_owned()).spawn(watch).map_err(Error::System)?;
+        let _ = state.memory_watcher.set(watcher.thread().clone());
+        Ok(Self(state))
     }
 
     /// Leases a client's engine for one request. It is started if there is none; a client whose engines end again and
@@ -108,6 +131,12 @@ impl EnginePool {
     /// [`RequestFault::Unauthenticated`] if the client's token is no longer one; [`RequestFault::TooMany`] if other
     /// clients' engines are all answering; [`RequestFault::EngineEnded`].
     pub(super) async fn lease(&self, client: &ClientIdentity) -> Result<EngineLease, RequestFault> {
+        let lease = self.lease_engine(client).await?;
+        self.0.memory_watcher.get().inspect(|watcher| watcher.unpark());
+        Ok(lease)
+    }
+
+    async fn lease_engine(&self, client: &ClientIdentity) -> Result<EngineLease, RequestFault> {
         self.0.access.check_current(client)?;
         let own = self.client(&client.name);
         if let Some(lease) = own.lease(client) {
@@ -206,14 +235,9 @@ impl EnginePool {
         EngineProcess::start(start, self.0.activity.clone())
     }
 
-    /// Keeps a spare engine, ends idle ones, and those that take more memory than they may; never ends.
+    /// Keeps a spare engine, and ends idle ones; never ends.
     pub(super) async fn keep_up(self) {
-        tokio::join!(self.keep_spare(), self.watch_memory(), self.retire_idle());
-    }
-
-    /// Ends the engines that are idle or take more memory than they may, and keeps no spare; never ends.
-    pub(super) async fn watch(self) {
-        tokio::join!(self.watch_memory(), self.retire_idle());
+        tokio::join!(self.keep_spare(), self.clone().retire_idle());
     }
 
     /// Checks that engines can be started, by how the last start went.
@@ -272,34 +296,30 @@ impl EnginePool {
         Ok(started)
     }
 
-    async fn watch_memory(&self) {
+    // Returns whether an engine works.
+    fn watch_memory(&self) -> bool {
         let blocks = if self.0.lake.is_remote() { CACHE_MEMORY_BYTES as usize } else { 0 };
-        loop {
-            let is_busy = self.live().iter().any(|engine| engine.requests() > 0);
-            tokio::time::sleep(if is_busy { LOOK } else { IDLE_LOOK }).await;
-            let size = |engine: &EngineProcess| engine.grown_bytes().saturating_sub(CACHE_BYTES + blocks);
-            let sizes: Vec<_> = self.live().into_iter().map(|engine| (size(&engine), engine)).collect();
-            for (bytes, engine) in &sizes {
-                if let Some(limit) = engine.memory_limit().filter(|limit| bytes > limit) {
-                    engine.end(EndReason::Failed(format!(
-                        "its client's queries took more than {} MB",
-                        limit / 1_000_000
-                    )));
-                }
-            }
-            let limit = self.0.settings.memory;
-            if sizes.iter().map(|(bytes, _)| bytes).sum::<usize>() > limit
-                && let Some((_, largest)) = sizes.iter().max_by_key(|(bytes, _)| *bytes)
-                // One that only keeps what it once had has done nothing wrong.
-                && !largest.retire_after(Duration::ZERO)
-            {
-                let reason = format!("queries took more than {} MiB, and its client's the most", limit >> 20);
-                largest.end(EndReason::Failed(reason));
+        let size = |engine: &EngineProcess| engine.grown_bytes().saturating_sub(CACHE_BYTES + blocks);
+        let sizes: Vec<_> = self.live().into_iter().map(|engine| (size(&engine), engine)).collect();
+        for (bytes, engine) in &sizes {
+            if let Some(limit) = engine.memory_limit().filter(|limit| bytes > limit) {
+                engine.end(EndReason::Failed(format!("its client's queries took more than {} MB", limit / 1_000_000)));
             }
         }
+        let limit = self.0.settings.memory;
+        if sizes.iter().map(|(bytes, _)| bytes).sum::<usize>() > limit
+            && let Some((_, largest)) = sizes.iter().max_by_key(|(bytes, _)| *bytes)
+            // One that only keeps what it once had has done nothing wrong.
+            && !largest.retire_after(Duration::ZERO)
+        {
+            let reason = format!("queries took more than {} MiB, and its client's the most", limit >> 20);
+            largest.end(EndReason::Failed(reason));
+        }
+        sizes.iter().any(|(_, engine)| engine.requests() > 0 || engine.idle_time() < AFTERWORK)
     }
 
-    async fn retire_idle(&self) {
+    /// Ends the engines that are idle; never ends.
+    pub(super) async fn retire_idle(self) {
         loop {
             tokio::time::sleep(IDLE / 10).await;
             for engine in self.live() {

@@ -3,6 +3,7 @@
 use std::collections::HashMap;
 use std::ffi::{OsStr, OsString};
 use std::io;
+use std::os::fd::OwnedFd;
 use std::path::{Path, PathBuf};
 use std::process::Stdio;
 use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
@@ -11,10 +12,11 @@ use std::time::{Duration, Instant};
 use axum::body::Body;
 use echolake_lake::CacheFolder;
 use hyper::client::conn::http2;
+use rustix::process::{Pid, PidfdFlags, Signal, pidfd_open, pidfd_send_signal};
 use tokio::io::{AsyncBufReadExt as _, AsyncWriteExt as _, BufReader};
 use tokio::net::UnixStream;
 use tokio::process::{Child, ChildStdin, ChildStdout, Command};
-use tokio::sync::{Notify, SetOnce};
+use tokio::sync::SetOnce;
 
 use crate::activity::ServerActivity;
 use crate::client_identity::{ClientIdentity, counted_bytes};
@@ -69,7 +71,8 @@ pub(super) struct EngineProcess {
     memory_limit: OnceLock<usize>,
     client: OnceLock<ClientIdentity>,
     ready: SetOnce<()>,
-    kill: Notify,
+    /// Its process, even if another has its number after its end.
+    process: OwnedFd,
     why_killed: OnceLock<EndReason>,
     ended: SetOnce<EndReason>,
     pub(super) flight: tokio::sync::Mutex<Option<http2::SendRequest<Body>>>,
@@ -129,6 +132,8 @@ impl EngineProcess {
         let (Some(stdin), Some(stdout), Some(pid)) = (child.stdin.take(), child.stdout.take(), child.id()) else {
             return Err(io::Error::other("the engine has no pipes"));
         };
+        let number = Pid::from_raw(pid.cast_signed()).ok_or(io::ErrorKind::InvalidData)?;
+        let process = pidfd_open(number, PidfdFlags::empty())?;
         let engine = Arc::new(Self {
             pid,
             folder: start.sockets,
@@ -138,7 +143,7 @@ impl EngineProcess {
             memory_limit: OnceLock::new(),
             client: OnceLock::new(),
             ready: SetOnce::new(),
-            kill: Notify::new(),
+            process,
             why_killed: OnceLock::new(),
             ended: SetOnce::new(),
             flight: tokio::sync::Mutex::default(),
@@ -215,7 +220,8 @@ impl EngineProcess {
     pub(super) fn end(&self, why: EndReason) {
         self.usage().is_ending = true;
         let _ = self.why_killed.set(why);
-        self.kill.notify_one();
+        // One that is gone already needs no kill.
+        let _ = pidfd_send_signal(&self.process, Signal::KILL);
     }
 
     /// Kills it if it has answered nothing for longer than `time`, and answers nothing now.
@@ -311,17 +317,8 @@ async fn supervise(
 ) {
     let mut reports = EngineReports { activity, protocols: HashMap::new(), why: None };
     let mut lines = BufReader::new(stdout).lines();
-    loop {
-        tokio::select! {
-            () = engine.kill.notified() => {
-                // An engine that is gone already needs no kill.
-                let _ = child.start_kill();
-            }
-            line = lines.next_line() => match line {
-                Ok(Some(line)) => reports.take(&line, &engine),
-                _ => break,
-            },
-        }
+    while let Ok(Some(line)) = lines.next_line().await {
+        reports.take(&line, &engine);
     }
     // Its output has ended, so that it is ending, too, or was never meant to.
     let _ = child.start_kill();
