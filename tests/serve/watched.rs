@@ -181,6 +181,7 @@ fn figures_are_as_prometheus_wants_them() {
     let place = lake();
     let server = served(&place, &[]);
     rows(&server, "select value from generate_series(1, 2951)");
+    assert_eq!(get(&server, "/ready").status, 200, "it has answered");
     let has = |text: &str, line: &str| text.lines().any(|l| l == line);
     let text = || get(&server, "/metrics").text();
     wait_until("an engine has looked at the lake", || has(&text(), "echolake_lake_runs 1"));

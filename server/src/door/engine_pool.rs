@@ -161,6 +161,7 @@ impl EnginePool {
         }
         let lease =
             engine.lease().ok_or_else(|| RequestFault::EngineEnded { reason: "it ended at once".to_owned() })?;
+        self.record_start(true);
         // The file of tokens may have changed while the engine started.
         if let Err(refused) = self.0.access.check_current(client) {
             engine.end(EndReason::Retired);
