@@ -288,8 +288,11 @@ impl IngestWork {
         let place = Lake::run_path(&keys.surface, &keys.run);
         let file = ReadFile::check(lake, source, e_tag, &content.integrity).await?;
         let kept = async {
+            let there = RunSource::Lake(place.clone());
+            // Both names are marked while it moves: what is computed meanwhile may end the process.
+            let next_mark = if *source == there { None } else { ReadingMark::new(lake, &there) };
             files::keep(lake, source, &place, &file, known.is_some()).await?;
-            Ok(mark.and_then(|mark| mark.follow(lake, &RunSource::Lake(place.clone()))))
+            Ok(next_mark.or(mark))
         };
         let names = ReferenceNames::of(&content.surface, &lake.config().references);
         let wanted = finder.lock().await.wanted_by(names);

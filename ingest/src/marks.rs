@@ -37,14 +37,6 @@ impl ReadingMark {
         lock.try_lock().ok()?;
         Some(Self { path, _lock: lock })
     }
-
-    /// Marks the file under its new name.
-    pub(crate) fn follow(mut self, lake: &Lake, source: &RunSource) -> Option<Self> {
-        let path = mark_path(lake, source)?;
-        fs::rename(&self.path, &path).ok()?;
-        self.path = path;
-        Some(self)
-    }
 }
 
 impl Drop for ReadingMark {
