@@ -13,7 +13,7 @@ use crate::serve::http::HttpRequest;
 
 /// Between the beginnings of two probes.
 const PROBE_EVERY: Duration = Duration::from_millis(200);
-/// A probe that takes longer is given up, and counts as a failure: so long waits no query for its turn, even on a busy machine.
+/// A probe that takes longer is given up, and counts as a failure; on a busy machine one takes seconds.
 const PROBE_LIMIT: Duration = Duration::from_secs(30);
 /// Other clients than the attackers come from another address.
 const LIGHT_SOURCE: Ipv4Addr = Ipv4Addr::new(127, 0, 0, 2);

@@ -3,7 +3,7 @@
 
 use std::collections::HashMap;
 use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
-use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::thread::Thread;
 use std::time::{Duration, Instant};
 
@@ -22,8 +22,7 @@ use crate::token_access::TokenAccess;
 
 /// Time without a request after which an engine ends.
 const IDLE: Duration = Duration::from_secs(300);
-/// Time between two looks at the memory of engines, while one works and while none does. A core allocates 1.3 MiB in a
-/// millisecond.
+/// Time between two looks at the memory of engines, while one works and while none does.
 const LOOK: Duration = Duration::from_millis(10);
 const IDLE_LOOK: Duration = Duration::from_millis(250);
 /// Time for which an engine may go on with a request that has ended, until it ends itself; longer on a busy machine.
@@ -50,7 +49,7 @@ struct EnginePoolState {
     folders: ServerFolders,
     activity: Arc<ServerActivity>,
     access: Arc<TokenAccess>,
-    clients: Mutex<HashMap<String, Arc<ClientEngine>>>,
+    clients: Arc<ClientEngines>,
     spare: Mutex<Option<Arc<EngineProcess>>>,
     spare_taken: Notify,
     freed: Notify,
@@ -58,8 +57,11 @@ struct EnginePoolState {
     failed: AtomicU64,
     /// Outcome of the last start of an engine; None before the first.
     last_start: Mutex<Option<StartOutcome>>,
-    memory_watcher: OnceLock<Thread>,
+    memory_watcher: Thread,
 }
+
+/// The engines of clients, by the clients' names.
+type ClientEngines = Mutex<HashMap<String, Arc<ClientEngine>>>;
 
 /// Outcome of an engine's start.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -90,27 +92,15 @@ impl EnginePool {
         access: Arc<TokenAccess>,
     ) -> Result<Self, Error> {
         let folders = ServerFolders::new(lake, settings.temp.as_deref())?;
-        let state = Arc::new(EnginePoolState {
-            settings,
-            lake: lake.clone(),
-            folders,
-            activity,
-            access,
-            clients: Mutex::default(),
-            spare: Mutex::default(),
-            spare_taken: Notify::new(),
-            freed: Notify::new(),
-            started: AtomicUsize::new(0),
-            failed: AtomicU64::new(0),
-            last_start: Mutex::default(),
-            memory_watcher: OnceLock::new(),
-        });
+        let clients = Arc::<ClientEngines>::default();
+        let blocks = if lake.is_remote() { CACHE_MEMORY_BYTES as usize } else { 0 };
+        let (memory, uncounted) = (settings.memory, CACHE_BYTES + blocks);
         // A thread of its own: it must not wait for what the door does for clients.
-        let watched = Arc::downgrade(&state);
+        let watched = Arc::downgrade(&clients);
         let watch = move || {
-            while let Some(pool) = watched.upgrade().map(EnginePool) {
-                let is_busy = pool.watch_memory();
-                drop(pool);
+            while let Some(clients) = watched.upgrade() {
+                let is_busy = end_large_engines(&clients, memory, uncounted);
+                drop(clients);
                 std::thread::sleep(LOOK);
                 if !is_busy {
                     // Until the next request, at most.
@@ -120,8 +110,21 @@ impl EnginePool {
         };
         let watcher =
             std::thread::Builder::new().name("memory-watch".to_owned()).spawn(watch).map_err(Error::System)?;
-        let _ = state.memory_watcher.set(watcher.thread().clone());
-        Ok(Self(state))
+        Ok(Self(Arc::new(EnginePoolState {
+            settings,
+            lake: lake.clone(),
+            folders,
+            activity,
+            access,
+            clients,
+            spare: Mutex::default(),
+            spare_taken: Notify::new(),
+            freed: Notify::new(),
+            started: AtomicUsize::new(0),
+            failed: AtomicU64::new(0),
+            last_start: Mutex::default(),
+            memory_watcher: watcher.thread().clone(),
+        })))
     }
 
     /// Leases a client's engine for one request. It is started if there is none; a client whose engines end again and
@@ -132,7 +135,7 @@ impl EnginePool {
     /// clients' engines are all answering; [`RequestFault::EngineEnded`].
     pub(super) async fn lease(&self, client: &ClientIdentity) -> Result<EngineLease, RequestFault> {
         let lease = self.lease_engine(client).await?;
-        self.0.memory_watcher.get().inspect(|watcher| watcher.unpark());
+        self.0.memory_watcher.unpark();
         Ok(lease)
     }
 
@@ -211,11 +214,8 @@ impl EnginePool {
         tokio::time::timeout(PLACE_WAIT, free).await.map_err(|_| RequestFault::TooMany { what: "clients", limit })
     }
 
-    // The engines that have a client.
     fn live(&self) -> Vec<Arc<EngineProcess>> {
-        let clients = lock(&self.0.clients);
-        let engines = clients.values().filter_map(|client| lock(&client.current).clone());
-        engines.filter(|engine| !engine.has_ended()).collect()
+        live_engines(&self.0.clients)
     }
 
     fn take_spare(&self) -> std::io::Result<Arc<EngineProcess>> {
@@ -295,28 +295,6 @@ impl EnginePool {
         let started = self.start()?;
         *lock(&self.0.spare) = Some(started.clone());
         Ok(started)
-    }
-
-    // Returns whether an engine works.
-    fn watch_memory(&self) -> bool {
-        let blocks = if self.0.lake.is_remote() { CACHE_MEMORY_BYTES as usize } else { 0 };
-        let size = |engine: &EngineProcess| engine.grown_bytes().saturating_sub(CACHE_BYTES + blocks);
-        let sizes: Vec<_> = self.live().into_iter().map(|engine| (size(&engine), engine)).collect();
-        for (bytes, engine) in &sizes {
-            if let Some(limit) = engine.memory_limit().filter(|limit| bytes > limit) {
-                engine.end(EndReason::Failed(format!("its client's queries took more than {} MB", limit / 1_000_000)));
-            }
-        }
-        let limit = self.0.settings.memory;
-        if sizes.iter().map(|(bytes, _)| bytes).sum::<usize>() > limit
-            && let Some((_, largest)) = sizes.iter().max_by_key(|(bytes, _)| *bytes)
-            // One that only keeps what it once had has done nothing wrong.
-            && !largest.retire_after(Duration::ZERO)
-        {
-            let reason = format!("queries took more than {} MiB, and its client's the most", limit >> 20);
-            largest.end(EndReason::Failed(reason));
-        }
-        sizes.iter().any(|(_, engine)| engine.requests() > 0 || engine.idle_time() < AFTERWORK)
     }
 
     /// Ends the engines that are idle; never ends.
@@ -401,6 +379,33 @@ impl ClientState {
             ends => LONGEST_BACKOFF.min(FIRST_BACKOFF * 2_u32.saturating_pow(ends - 2)),
         }
     }
+}
+
+// The engines that have a client.
+fn live_engines(clients: &ClientEngines) -> Vec<Arc<EngineProcess>> {
+    let clients = lock(clients);
+    let engines = clients.values().filter_map(|client| lock(&client.current).clone());
+    engines.filter(|engine| !engine.has_ended()).collect()
+}
+
+// Ends engines that take more memory than they may, beside `uncounted` bytes each; returns whether an engine works.
+fn end_large_engines(clients: &ClientEngines, memory: usize, uncounted: usize) -> bool {
+    let size = |engine: &EngineProcess| engine.grown_bytes().saturating_sub(uncounted);
+    let sizes: Vec<_> = live_engines(clients).into_iter().map(|engine| (size(&engine), engine)).collect();
+    for (bytes, engine) in &sizes {
+        if let Some(limit) = engine.memory_limit().filter(|limit| bytes > limit) {
+            engine.end(EndReason::Failed(format!("its client's queries took more than {} MB", limit / 1_000_000)));
+        }
+    }
+    if sizes.iter().map(|(bytes, _)| bytes).sum::<usize>() > memory
+        && let Some((_, largest)) = sizes.iter().max_by_key(|(bytes, _)| *bytes)
+        // One that only keeps what it once had has done nothing wrong.
+        && !largest.retire_after(Duration::ZERO)
+    {
+        let reason = format!("queries took more than {} MiB, and its client's the most", memory >> 20);
+        largest.end(EndReason::Failed(reason));
+    }
+    sizes.iter().any(|(_, engine)| engine.requests() > 0 || engine.idle_time() < AFTERWORK)
 }
 
 fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
