@@ -4,16 +4,17 @@
 use std::hint::black_box;
 
 use criterion::{BenchmarkId, Criterion, Throughput, criterion_group, criterion_main};
-use echolake_dsp::Error;
 use echolake_dsp::chain::{DerivationPlan, MeasurementParams, MeasurementPlan, raw_len};
 use echolake_dsp::deconvolution::{DeconvolutionParams, DeconvolutionPlan, SpectralDivision, TransformLength};
 use echolake_dsp::energy::{cumulative_energy, nce, tnce};
 use echolake_dsp::filter_bank::FilterBankPlan;
+use echolake_dsp::height_field::HeightField;
+use echolake_dsp::kirchhoff::{KirchhoffPlan, SoundPath, TransducerPose};
 use echolake_dsp::sweep::LinearSweep;
 use echolake_dsp::temperature::{TemperatureCorrection, resampling_ratio};
-use realfft::RealFftPlanner;
-use realfft::num_complex::Complex;
-use rustfft::FftPlanner;
+use echolake_dsp::{Error, RealSample as _};
+use rustfft::FftDirection;
+use rustfft::num_complex::Complex;
 
 const RATE_HZ: f64 = 96e3;
 const LOW_HZ: f64 = 2e3;
@@ -22,7 +23,17 @@ const REFERENCE_CELSIUS: f64 = 20.0;
 const IR_LEN: usize = 384;
 const CENTRES_HZ: [f64; 5] = [2_500.0, 5_000.0, 10_000.0, 20_000.0, 40_000.0];
 
-criterion_group!(kernels, transforms, deconvolution, temperature, measurement, filter_bank, energy, derivation);
+criterion_group!(
+    kernels,
+    transforms,
+    deconvolution,
+    temperature,
+    measurement,
+    filter_bank,
+    energy,
+    derivation,
+    reflection
+);
 criterion_main!(kernels);
 
 /// The sweep, and what a microphone hears of it 90 samples later.
@@ -46,7 +57,7 @@ fn transforms(criterion: &mut Criterion) {
     let n = recording.len();
     let mut group = criterion.benchmark_group("transform");
     group.throughput(Throughput::Elements(n as u64));
-    let forward = RealFftPlanner::<f32>::new().plan_fft_forward(n);
+    let forward = f32::plan_real_forward(n);
     let (mut input, mut spectrum) = (forward.make_input_vec(), forward.make_output_vec());
     let mut work = forward.make_scratch_vec();
     group.bench_function(BenchmarkId::new("two_real", n), |bencher| {
@@ -58,7 +69,7 @@ fn transforms(criterion: &mut Criterion) {
             }
         });
     });
-    let joint = FftPlanner::<f32>::new().plan_fft_forward(n);
+    let joint = f32::plan_fft(n, FftDirection::Forward);
     let mut signals = vec![Complex::default(); n];
     let mut work = vec![Complex::default(); joint.get_inplace_scratch_len()];
     group.bench_function(BenchmarkId::new("one_complex", n), |bencher| {
@@ -179,5 +190,28 @@ fn derivation(criterion: &mut Criterion) {
     });
     group.bench_function(BenchmarkId::new("with_known_flat", IR_LEN), |bencher| {
         bencher.iter(|| plan.run_over(black_box(&ir), &foam, &energies, &mut derived, &mut scratch));
+    });
+}
+
+/// The simulation of a relief with facets of the size that the rig's simulation has.
+fn reflection(criterion: &mut Criterion) {
+    const CELLS: usize = 274;
+    let relief = HeightField::from_fn(585.0, CELLS, |x, y| 5.0 * (x / 60.0).sin() + 3.0 * (y / 45.0).cos());
+    let plan = KirchhoffPlan::new(&relief, RATE_HZ, IR_LEN).with_directivity(|cosine, _| cosine, |cosine, _| cosine);
+    let pose = |x| TransducerPose { position_mm: [x, 37.5, 124.0], axis: [0.0, 0.0, -1.0] };
+    let one = plan.filter(|_| 1.0.into());
+    let path = SoundPath {
+        microphone: pose(-187.5),
+        speaker: pose(112.5),
+        speed_of_sound_m_s: 343.0,
+        absorption_db_per_m: &|_| 1.0,
+        direct: &one,
+        reflection: &one,
+    };
+    let (mut scratch, mut ir) = (plan.scratch(), vec![0.0; IR_LEN]);
+    let mut group = criterion.benchmark_group("kirchhoff");
+    group.throughput(Throughput::Elements((CELLS * CELLS) as u64));
+    group.bench_function(BenchmarkId::new("response", CELLS), |bencher| {
+        bencher.iter(|| plan.response(black_box(&path), &mut scratch, &mut ir));
     });
 }

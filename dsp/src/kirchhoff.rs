@@ -15,6 +15,7 @@ use std::sync::Arc;
 
 use realfft::num_complex::Complex;
 use realfft::{ComplexToReal, RealToComplex};
+use wide::{f32x4, f32x8, i32x8};
 
 use crate::error::check_len;
 use crate::height_field::HeightField;
@@ -31,6 +32,8 @@ const NODES: usize = 4;
 const HIGHEST_NODE: f64 = 42.0 / 96.0;
 /// Directions of a directivity table, evenly by cosine.
 const DIRECTIONS: usize = 2048;
+/// Facets that are weighed at once.
+const LANES: usize = 8;
 /// dB of one neper.
 const DB_PER_NEPER: f64 = 20.0 * std::f64::consts::LOG10_E;
 
@@ -118,55 +121,55 @@ pub struct SoundPath<'a> {
 
 /// The relief's facets, lengths in m.
 struct ReliefFacets {
-    cells: usize,
-    /// Coordinate of each column and row.
-    centre: Vec<f32>,
-    /// `[cells x cells]`
-    height: Vec<f32>,
-    slope_x: Vec<f32>,
-    slope_y: Vec<f32>,
     area: f32,
+    groups: Vec<FacetGroup>,
+}
+
+/// Neighbours of one row, which are weighed at once. The last group of a row is filled up with facets that weigh nothing.
+struct FacetGroup {
+    place: [f32x8; 3],
+    slope: [f32x8; 2],
+    /// 1 where there is a facet, else 0.
+    presence: f32x8,
 }
 
 /// Gain by direction and node.
-struct DirectivityTable(Vec<[f32; NODES]>);
+struct DirectivityTable(Vec<f32x4>);
 
 /// A microphone or speaker as facets see it, m.
 #[derive(Clone, Copy)]
 struct ViewPoint {
-    position: [f32; 3],
-    axis: [f32; 3],
+    position: [f32x8; 3],
+    axis: [f32x8; 3],
 }
 
-/// A facet as seen from a point.
-#[derive(Clone, Copy)]
+/// Facets as seen from a point.
 struct FacetView {
-    distance: f32,
+    distance: f32x8,
     /// Unit vector to the point.
-    way: [f32; 3],
+    way: [f32x8; 3],
     /// 1 over the distance.
-    nearness: f32,
+    nearness: f32x8,
     /// Cosine against the un-normalised normal, which is as long as the facet is larger than its cell.
-    cosine: f32,
+    cosine: f32x8,
     /// Place of the direction in a directivity table.
-    direction: f32,
+    direction: f32x8,
 }
 
-/// Weights of a row of facets.
-struct FacetRow {
-    path: Vec<f32>,
-    derivative: Vec<f32>,
-    plain: Vec<f32>,
-    from_microphone: Vec<f32>,
-    from_speaker: Vec<f32>,
+/// Weights of a group of facets.
+struct FacetWeights {
+    path: f32x8,
+    derivative: f32x8,
+    plain: f32x8,
+    from_microphone: f32x8,
+    from_speaker: f32x8,
 }
 
 /// Buffers of a [`KirchhoffPlan`].
 pub struct KirchhoffScratch {
-    row: FacetRow,
     /// Weights of d' at each node, and of d, by time. Of d alone there is one: it matters at low frequencies only, where
     /// directivity and absorption do not.
-    derivative: Vec<[f32; NODES]>,
+    derivative: Vec<f32x4>,
     plain: Vec<f32>,
     wide: Vec<f32>,
     spectrum: Vec<Complex<f32>>,
@@ -222,8 +225,7 @@ impl KirchhoffPlan {
     pub fn scratch(&self) -> KirchhoffScratch {
         let wide = self.len * OVERSAMPLING;
         KirchhoffScratch {
-            row: FacetRow::new(self.facets.cells),
-            derivative: vec![[0.0; NODES]; wide],
+            derivative: vec![f32x4::ZERO; wide],
             plain: vec![0.0; wide],
             wide: vec![0.0; wide],
             spectrum: self.forward.make_output_vec(),
@@ -245,7 +247,7 @@ impl KirchhoffPlan {
         check_len("the direct sound's filter", path.direct.len(), self.fade.len())?;
         check_len("the reflection's filter", path.reflection.len(), self.fade.len())?;
         let per_metre = self.rate_hz * OVERSAMPLING as f64 / path.speed_of_sound_m_s;
-        scratch.derivative.fill([0.0; NODES]);
+        scratch.derivative.fill(f32x4::ZERO);
         scratch.plain.fill(0.0);
         self.gather(path, per_metre as f32, scratch);
         absorb(&mut scratch.derivative, self.attenuation(path, per_metre));
@@ -265,35 +267,36 @@ impl KirchhoffPlan {
     }
 
     fn gather(&self, path: &SoundPath<'_>, per_metre: f32, scratch: &mut KirchhoffScratch) {
-        let KirchhoffScratch { row, derivative, plain, .. } = scratch;
+        let KirchhoffScratch { derivative, plain, .. } = scratch;
         let ends = [ViewPoint::from_pose(path.microphone), ViewPoint::from_pose(path.speaker)];
         let last = plain.len() - 2;
-        for iy in 0..self.facets.cells {
-            row.weigh(&self.facets, iy, ends, self.scattering);
-            let weights = row.derivative.iter().zip(&row.plain);
-            let directions = row.from_microphone.iter().zip(&row.from_speaker);
-            for ((length, (slope, level)), (from_microphone, from_speaker)) in
-                row.path.iter().zip(weights).zip(directions)
-            {
-                let at = length * per_metre;
-                let index = at as usize;
+        let end = f32x8::splat((last + 1) as f32);
+        for group in &self.facets.groups {
+            let weights = group.weights(ends, self.scattering);
+            let arrival = weights.path * per_metre;
+            let index = arrival.fast_trunc_int();
+            let after = arrival - f32x8::from_i32x8(index);
+            // What arrives past the end weighs nothing.
+            let heard = arrival.simd_lt(end);
+            let [slopes, levels] = [weights.derivative & heard, weights.plain & heard].map(f32x8::to_array);
+            let [here, after] = [1.0 - after, after].map(f32x8::to_array);
+            let [index, from_microphone, from_speaker] =
+                [index, weights.from_microphone.fast_trunc_int(), weights.from_speaker.fast_trunc_int()]
+                    .map(i32x8::to_array);
+            for lane in 0..LANES {
+                let start = (index[lane] as usize).min(last);
                 let (Some([sum, sum_after]), Some([plain, plain_after])) =
-                    (first_two(&mut derivative[index.min(last)..]), first_two(&mut plain[index.min(last)..]))
+                    (first_two(&mut derivative[start..]), first_two(&mut plain[start..]))
                 else {
                     continue;
                 };
-                // What arrives past the end weighs nothing.
-                let (slope, level) = if index > last { (0.0, 0.0) } else { (*slope, *level) };
-                let after = at - index as f32;
-                let here = 1.0 - after;
-                *plain += level * here;
-                *plain_after += level * after;
-                let (a, b) = (self.microphone.gains(*from_microphone), self.speaker.gains(*from_speaker));
-                let weight = [slope * a[0] * b[0], slope * a[1] * b[1], slope * a[2] * b[2], slope * a[3] * b[3]];
-                for node in 0..NODES {
-                    sum[node] += weight[node] * here;
-                    sum_after[node] += weight[node] * after;
-                }
+                let (here, after) = (here[lane], after[lane]);
+                *plain += levels[lane] * here;
+                *plain_after += levels[lane] * after;
+                let (a, b) = (self.microphone.gains(from_microphone[lane]), self.speaker.gains(from_speaker[lane]));
+                let weight = slopes[lane] * a * b;
+                *sum += weight * here;
+                *sum_after += weight * after;
             }
         }
     }
@@ -310,7 +313,7 @@ impl KirchhoffPlan {
         // Lengths are the plan's own, so the transforms cannot refuse.
         narrow.fill(Complex::default());
         for node in 0..NODES {
-            wide.iter_mut().zip(&*derivative).for_each(|(x, weights)| *x = weights[node]);
+            wide.iter_mut().zip(&*derivative).for_each(|(x, weights)| *x = weights.as_array()[node]);
             let _ = self.forward.process_with_scratch(wide, spectrum, work);
             for ((to, from), weights) in narrow.iter_mut().zip(&*spectrum).zip(&self.interpolation) {
                 *to += from * weights[node];
@@ -334,7 +337,7 @@ impl KirchhoffPlan {
         let distance = dot(way, way).sqrt();
         let microphone = self.microphone.gains(direction(-dot(path.microphone.axis, way) / distance));
         let speaker = self.speaker.gains(direction(dot(path.speaker.axis, way) / distance));
-        let gains: [f32; NODES] = std::array::from_fn(|node| microphone[node] * speaker[node]);
+        let gains = (microphone * speaker).to_array();
         for (k, to) in scratch.narrow.iter_mut().enumerate() {
             let hz = self.frequency_hz(k);
             let gain: f32 = gains.iter().zip(&self.interpolation[k]).map(|(gain, weight)| gain * weight).sum();
@@ -349,16 +352,42 @@ impl KirchhoffPlan {
 impl ReliefFacets {
     fn new(relief: &HeightField) -> Self {
         let cells = relief.cells();
-        let metres = |mm: f64| (mm / 1e3) as f32;
-        let places = || (0..cells * cells).map(|i| (i % cells, i / cells));
         let pitch = metres(relief.pitch_mm());
+        let firsts = (0..cells).flat_map(|iy| (0..cells).step_by(LANES).map(move |first| (first, iy)));
+        Self { area: pitch * pitch, groups: firsts.map(|(first, iy)| FacetGroup::new(relief, first, iy)).collect() }
+    }
+}
+
+impl FacetGroup {
+    fn new(relief: &HeightField, first: usize, iy: usize) -> Self {
+        let last = relief.cells() - 1;
+        let lanes =
+            |value: &dyn Fn(usize) -> f32| f32x8::new(std::array::from_fn(|lane| value((first + lane).min(last))));
         Self {
-            cells,
-            centre: (0..cells).map(|i| metres(relief.centre_mm(i))).collect(),
-            height: places().map(|(ix, iy)| metres(f64::from(relief.at(ix, iy)))).collect(),
-            slope_x: places().map(|(ix, iy)| relief.gradient(ix, iy)[0]).collect(),
-            slope_y: places().map(|(ix, iy)| relief.gradient(ix, iy)[1]).collect(),
-            area: pitch * pitch,
+            place: [
+                lanes(&|ix| metres(relief.centre_mm(ix))),
+                lanes(&|_| metres(relief.centre_mm(iy))),
+                lanes(&|ix| metres(relief.at(ix, iy).into())),
+            ],
+            slope: [0, 1].map(|axis| lanes(&|ix| relief.gradient(ix, iy)[axis])),
+            presence: f32x8::new(std::array::from_fn(|lane| if first + lane <= last { 1.0 } else { 0.0 })),
+        }
+    }
+
+    #[inline]
+    fn weights(&self, [microphone, speaker]: [ViewPoint; 2], scattering: FacetScattering) -> FacetWeights {
+        let (near, far) = (microphone.view(self), speaker.view(self));
+        let [derivative, plain] = match scattering {
+            FacetScattering::FacingTangent => facing_tangent(&near, &far),
+            FacetScattering::Blended => blended(&near, &far),
+        };
+        let product = near.nearness * far.nearness * self.presence;
+        FacetWeights {
+            path: near.distance + far.distance,
+            derivative: derivative * product,
+            plain: plain * product,
+            from_microphone: near.direction,
+            from_speaker: far.direction,
         }
     }
 }
@@ -368,25 +397,27 @@ impl DirectivityTable {
         let gain = &gain;
         let at = |direction: usize| {
             let cosine = 1.0 - 2.0 * direction as f64 / (DIRECTIONS - 1) as f64;
-            std::array::from_fn(|node| gain(cosine, node_hz(node, rate_hz)) as f32)
+            f32x4::new(std::array::from_fn(|node| gain(cosine, node_hz(node, rate_hz)) as f32))
         };
         Self((0..DIRECTIONS).map(at).collect())
     }
 
     #[inline]
-    fn gains(&self, direction: f32) -> &[f32; NODES] {
-        &self.0[(direction as usize).min(DIRECTIONS - 1)]
+    fn gains(&self, direction: i32) -> f32x4 {
+        self.0[(direction as usize).min(DIRECTIONS - 1)]
     }
 }
 
 impl ViewPoint {
     fn from_pose(pose: TransducerPose) -> Self {
-        Self { position: pose.position_mm.map(|x| (x / 1e3) as f32), axis: pose.axis.map(|x| x as f32) }
+        let lanes = |x: f32| f32x8::splat(x);
+        Self { position: pose.position_mm.map(|x| lanes(metres(x))), axis: pose.axis.map(|x| lanes(x as f32)) }
     }
 
     #[inline]
-    fn view(&self, place: [f32; 3], slope: [f32; 2]) -> FacetView {
-        let (dx, dy, dz) = (self.position[0] - place[0], self.position[1] - place[1], self.position[2] - place[2]);
+    fn view(&self, facets: &FacetGroup) -> FacetView {
+        let [dx, dy, dz] = [0, 1, 2].map(|i| self.position[i] - facets.place[i]);
+        let [slope_x, slope_y] = facets.slope;
         let distance = (dx * dx + dy * dy + dz * dz).sqrt();
         let nearness = 1.0 / distance;
         let [ax, ay, az] = self.axis;
@@ -396,70 +427,28 @@ impl ViewPoint {
             way: [dx * nearness, dy * nearness, dz * nearness],
             nearness,
             // N = (-sx, -sy, 1).
-            cosine: (dz - slope[0] * dx - slope[1] * dy) * nearness,
+            cosine: (dz - slope_x * dx - slope_y * dy) * nearness,
             direction: (1.0 + aim) * HALF_DIRECTIONS + 0.5,
-        }
-    }
-}
-
-impl FacetRow {
-    fn new(cells: usize) -> Self {
-        let row = || vec![0.0; cells];
-        Self { path: row(), derivative: row(), plain: row(), from_microphone: row(), from_speaker: row() }
-    }
-
-    fn weigh(&mut self, facets: &ReliefFacets, iy: usize, ends: [ViewPoint; 2], scattering: FacetScattering) {
-        match scattering {
-            FacetScattering::FacingTangent => self.weigh_with(facets, iy, ends, facing_tangent),
-            FacetScattering::Blended => self.weigh_with(facets, iy, ends, blended),
-        }
-    }
-
-    fn weigh_with(
-        &mut self,
-        facets: &ReliefFacets,
-        iy: usize,
-        [microphone, speaker]: [ViewPoint; 2],
-        weights: impl Fn(&FacetView, &FacetView) -> [f32; 2],
-    ) {
-        let cells = facets.cells;
-        let [height, slope_x, slope_y] =
-            [&facets.height, &facets.slope_x, &facets.slope_y].map(|values| &values[iy * cells..(iy + 1) * cells]);
-        let (centre, y) = (&facets.centre[..cells], facets.centre[iy]);
-        let Self { path, derivative, plain, from_microphone, from_speaker } = self;
-        let (path, derivative, plain) = (&mut path[..cells], &mut derivative[..cells], &mut plain[..cells]);
-        let (from_microphone, from_speaker) = (&mut from_microphone[..cells], &mut from_speaker[..cells]);
-        for ix in 0..cells {
-            let (place, slope) = ([centre[ix], y, height[ix]], [slope_x[ix], slope_y[ix]]);
-            let (near, far) = (microphone.view(place, slope), speaker.view(place, slope));
-            path[ix] = near.distance + far.distance;
-            let product = near.nearness * far.nearness;
-            let [of_derivative, of_plain] = weights(&near, &far);
-            derivative[ix] = of_derivative * product;
-            plain[ix] = of_plain * product;
-            from_microphone[ix] = near.direction;
-            from_speaker[ix] = far.direction;
         }
     }
 }
 
 // Weights of the derivative and of the plain pulse, but for 1/(r1 r2).
 #[inline]
-fn tangent(a: &FacetView, b: &FacetView) -> [f32; 2] {
+fn tangent(a: &FacetView, b: &FacetView) -> [f32x8; 2] {
     [a.cosine + b.cosine, a.cosine * a.nearness + b.cosine * b.nearness]
 }
 
 #[inline]
-fn facing_tangent(a: &FacetView, b: &FacetView) -> [f32; 2] {
-    let faces = if a.cosine.min(b.cosine) > 0.0 { 1.0 } else { 0.0 };
-    let [derivative, plain] = tangent(a, b);
-    [derivative * faces, plain * faces]
+fn facing_tangent(a: &FacetView, b: &FacetView) -> [f32x8; 2] {
+    let faces = a.cosine.fast_min(b.cosine).simd_gt(f32x8::ZERO);
+    tangent(a, b).map(|weight| weight & faces)
 }
 
 #[inline]
-fn blended(a: &FacetView, b: &FacetView) -> [f32; 2] {
+fn blended(a: &FacetView, b: &FacetView) -> [f32x8; 2] {
     let along = a.way[0] * b.way[0] + a.way[1] * b.way[1];
-    let small_slope = 4.0 * (1.0 + along) / (a.way[2] + b.way[2]).max(LEAST_RISE);
+    let small_slope = 4.0 * (1.0 + along) / (a.way[2] + b.way[2]).fast_max(f32x8::splat(LEAST_RISE));
     let [derivative, plain] = tangent(a, b);
     [0.5 * (derivative + small_slope), 0.5 * (plain + small_slope * 0.5 * (a.nearness + b.nearness))]
 }
@@ -475,8 +464,12 @@ fn first_two<T>(values: &mut [T]) -> Option<&mut [T; 2]> {
 }
 
 // Place of a cosine in a directivity table.
-fn direction(cosine: f64) -> f32 {
-    (1.0 - cosine as f32) * HALF_DIRECTIONS + 0.5
+fn direction(cosine: f64) -> i32 {
+    ((1.0 - cosine as f32) * HALF_DIRECTIONS + 0.5) as i32
+}
+
+fn metres(mm: f64) -> f32 {
+    (mm / 1e3) as f32
 }
 
 fn dot(a: [f64; 3], b: [f64; 3]) -> f64 {
@@ -501,13 +494,11 @@ fn interpolation(frequency_over_rate: f64) -> [f32; NODES] {
 }
 
 // Sound that arrives later has come farther.
-fn absorb(weights: &mut [[f32; NODES]], per_step: [f32; NODES]) {
-    let mut left = [1.0; NODES];
+fn absorb(weights: &mut [f32x4], per_step: [f32; NODES]) {
+    let mut left = f32x4::ONE;
     for weight in weights {
-        for node in 0..NODES {
-            weight[node] *= left[node];
-            left[node] *= per_step[node];
-        }
+        *weight *= left;
+        left *= f32x4::new(per_step);
     }
 }
 
