@@ -1,10 +1,13 @@
 //! Folders of a server: engines' sockets, which only its user may reach, and temporary files, on the lake's disk.
 
+use std::fs::{File, OpenOptions};
 use std::io;
-use std::path::{Path, PathBuf};
+use std::os::unix::fs::MetadataExt as _;
+use std::path::Path;
 
 use echolake_lake::Lake;
 use rustix::fs::{statfs, statvfs};
+use rustix::process::geteuid;
 use tempfile::{Builder, TempDir};
 
 use crate::Error;
@@ -12,15 +15,25 @@ use crate::metrics::DiskSpace;
 
 /// The folder in the lake for temporary files, if no other is given.
 const IN_LAKE: &str = "temp";
-/// Prefix of a server's folder, before its process's number.
-const PREFIX: &str = "serve-";
+/// Start of the names of servers' folders: for spilled rows, and for sockets.
+const SPILLS_PREFIX: &str = "serve-";
+const SOCKETS_PREFIX: &str = "echolake-serve-";
+/// The file in a server's folder that it holds locked, so that servers of other machines or containers can tell, too.
+const LOCK_FILE: &str = "echolake.lock";
 /// The number that statfs tells of a file system in memory (`TMPFS_MAGIC` in linux/magic.h).
 const TMPFS: u64 = 0x0102_1994;
 
 /// The folders of a server; they are removed when this is dropped.
 pub(super) struct ServerFolders {
-    pub(super) sockets: TempDir,
-    pub(super) spills: TempDir,
+    pub(super) sockets: LockedFolder,
+    pub(super) spills: LockedFolder,
+}
+
+/// A folder whose process lives: its lock file is locked. It is removed when this is dropped.
+pub(super) struct LockedFolder {
+    folder: TempDir,
+    // Let go after the folder is removed.
+    _lock: File,
 }
 
 impl ServerFolders {
@@ -35,10 +48,10 @@ impl ServerFolders {
             move |source| Error::Temp { path, source }
         };
         // A socket's path has some hundred bytes at most, so that the lake's own would often be too long.
-        let sockets = Builder::new().prefix("echolake-").tempdir().map_err(failed(&system))?;
+        let sockets = LockedFolder::new(&system, SOCKETS_PREFIX).map_err(failed(&system))?;
         let spills = match (temp, lake.folder()) {
-            (Some(temp), _) => spill_folder(temp).map_err(failed(temp))?,
-            (None, Some(lake)) => match spill_folder(&lake.join(IN_LAKE)) {
+            (Some(temp), _) => LockedFolder::new(temp, SPILLS_PREFIX).map_err(failed(temp))?,
+            (None, Some(lake)) => match LockedFolder::new(&lake.join(IN_LAKE), SPILLS_PREFIX) {
                 Ok(folder) => folder,
                 Err(refused) => {
                     tracing::warn!(
@@ -46,10 +59,10 @@ impl ServerFolders {
                         "temporary files are in `{}`, because the lake's folder takes none",
                         system.display()
                     );
-                    spill_folder(&system).map_err(failed(&system))?
+                    LockedFolder::new(&system, SPILLS_PREFIX).map_err(failed(&system))?
                 }
             },
-            (None, None) => spill_folder(&system).map_err(failed(&system))?,
+            (None, None) => LockedFolder::new(&system, SPILLS_PREFIX).map_err(failed(&system))?,
         };
         if statfs(spills.path()).is_ok_and(|system| u64::try_from(system.f_type) == Ok(TMPFS)) {
             tracing::warn!("temporary files in `{}` are in memory; hint: --temp DIR", spills.path().display());
@@ -58,32 +71,48 @@ impl ServerFolders {
     }
 }
 
+impl LockedFolder {
+    fn new(parent: &Path, prefix: &str) -> io::Result<Self> {
+        std::fs::create_dir_all(parent)?;
+        remove_left_folders(parent, prefix)?;
+        loop {
+            let folder = Builder::new().prefix(prefix).tempdir_in(parent)?;
+            let lock = File::create_new(folder.path().join(LOCK_FILE))?;
+            // Where a file system has no locks, what is left stays.
+            let _ = lock.lock();
+            // Another server may have taken it for a left one before it was locked.
+            if lock.metadata()?.nlink() > 0 {
+                return Ok(Self { folder, _lock: lock });
+            }
+        }
+    }
+
+    pub(super) fn path(&self) -> &Path {
+        self.folder.path()
+    }
+}
+
+fn remove_left_folders(parent: &Path, prefix: &str) -> io::Result<()> {
+    for entry in std::fs::read_dir(parent)? {
+        let entry = entry?;
+        // Others' folders in the system's are not looked into.
+        let is_own = entry.metadata().is_ok_and(|entry| entry.is_dir() && entry.uid() == geteuid().as_raw());
+        if !is_own || !entry.file_name().as_encoded_bytes().starts_with(prefix.as_bytes()) {
+            continue;
+        }
+        let lock = OpenOptions::new().write(true).open(entry.path().join(LOCK_FILE));
+        if lock.as_ref().is_ok_and(|lock| lock.try_lock().is_ok()) {
+            // Another server may be removing it, too.
+            let _ = std::fs::remove_dir_all(entry.path());
+        }
+    }
+    Ok(())
+}
+
 /// Space of the file system that a folder is on; None if the system does not tell.
 pub(super) fn disk_space(folder: &Path) -> Option<DiskSpace> {
     let system = statvfs(folder).ok()?;
     Some(DiskSpace { free_bytes: system.f_bavail * system.f_frsize, bytes: system.f_blocks * system.f_frsize })
-}
-
-fn spill_folder(parent: &Path) -> io::Result<TempDir> {
-    std::fs::create_dir_all(parent)?;
-    for left in left_folders(parent)? {
-        // Another server may be removing it, too.
-        let _ = std::fs::remove_dir_all(left);
-    }
-    Builder::new().prefix(&format!("{PREFIX}{}-", std::process::id())).tempdir_in(parent)
-}
-
-fn left_folders(parent: &Path) -> io::Result<Vec<PathBuf>> {
-    let mut left = Vec::new();
-    for entry in std::fs::read_dir(parent)? {
-        let entry = entry?;
-        let name = entry.file_name().to_string_lossy().into_owned();
-        let process = name.strip_prefix(PREFIX).and_then(|rest| rest.split('-').next()?.parse::<u32>().ok());
-        if process.is_some_and(|process| !Path::new(&format!("/proc/{process}")).exists()) {
-            left.push(entry.path());
-        }
-    }
-    Ok(left)
 }
 
 #[cfg(test)]
@@ -93,13 +122,21 @@ mod tests {
     #[test]
     fn folders_of_dead_servers_are_removed() {
         let parent = tempfile::tempdir().expect("a folder");
-        // No process has this number: it is above the most that Linux gives.
-        let dead = parent.path().join("serve-99999999-abc");
+        let dead = parent.path().join("serve-dead");
+        let unlocked = parent.path().join("serve-unlocked");
         let other = parent.path().join("somebody-else");
-        std::fs::create_dir_all(dead.join("engine-1")).expect("a folder");
-        std::fs::create_dir(&other).expect("a folder");
-        let live = spill_folder(parent.path()).expect("a folder");
-        let second = spill_folder(parent.path()).expect("a folder");
-        assert!(!dead.exists() && other.exists() && live.path().exists() && second.path().exists());
+        for folder in [&dead, &unlocked, &other] {
+            std::fs::create_dir_all(folder.join("engine-1")).expect("a folder");
+        }
+        for folder in [&dead, &other] {
+            std::fs::write(folder.join(LOCK_FILE), "").expect("a file");
+        }
+        let live = LockedFolder::new(parent.path(), SPILLS_PREFIX).expect("a folder");
+        let second = LockedFolder::new(parent.path(), SPILLS_PREFIX).expect("a folder");
+        assert!(!dead.exists() && unlocked.exists() && other.exists());
+        assert!(live.path().exists() && second.path().exists());
+        drop(live);
+        let left: Vec<_> = std::fs::read_dir(parent.path()).expect("a folder").collect();
+        assert_eq!(left.len(), 3, "{left:?}");
     }
 }
