@@ -1,8 +1,8 @@
-//! Folders of a server: engines' sockets, which only its user may reach, and temporary files, on the lake's disk.
+//! Folders of a server, which only its user may look into: engines' sockets, and temporary files, on the lake's disk.
 
-use std::fs::{File, OpenOptions};
+use std::fs::{File, OpenOptions, Permissions};
 use std::io;
-use std::os::unix::fs::MetadataExt as _;
+use std::os::unix::fs::{MetadataExt as _, PermissionsExt as _};
 use std::path::Path;
 
 use echolake_lake::Lake;
@@ -20,6 +20,8 @@ const SPILLS_PREFIX: &str = "serve-";
 const SOCKETS_PREFIX: &str = "echolake-serve-";
 /// The file in a server's folder that it holds locked, so that servers of other machines or containers can tell, too.
 const LOCK_FILE: &str = "echolake.lock";
+/// A folder that only its user may look into: sockets answer without a token, and spilled rows are of any client.
+const PRIVATE_MODE: u32 = 0o700;
 /// The number that statfs tells of a file system in memory (`TMPFS_MAGIC` in linux/magic.h).
 const TMPFS: u64 = 0x0102_1994;
 
@@ -75,8 +77,9 @@ impl LockedFolder {
     fn new(parent: &Path, prefix: &str) -> io::Result<Self> {
         std::fs::create_dir_all(parent)?;
         remove_left_folders(parent, prefix)?;
+        let private = Permissions::from_mode(PRIVATE_MODE);
         loop {
-            let folder = Builder::new().prefix(prefix).tempdir_in(parent)?;
+            let folder = Builder::new().prefix(prefix).permissions(private.clone()).tempdir_in(parent)?;
             let lock = File::create_new(folder.path().join(LOCK_FILE))?;
             // Where a file system has no locks, what is left stays.
             let _ = lock.lock();
@@ -134,7 +137,8 @@ mod tests {
         let live = LockedFolder::new(parent.path(), SPILLS_PREFIX).expect("a folder");
         let second = LockedFolder::new(parent.path(), SPILLS_PREFIX).expect("a folder");
         assert!(!dead.exists() && unlocked.exists() && other.exists());
-        assert!(live.path().exists() && second.path().exists());
+        assert!(second.path().exists());
+        assert_eq!(live.path().metadata().expect("a folder").mode() & 0o777, PRIVATE_MODE);
         drop(live);
         let left: Vec<_> = std::fs::read_dir(parent.path()).expect("a folder").collect();
         assert_eq!(left.len(), 3, "{left:?}");
