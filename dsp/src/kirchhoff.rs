@@ -15,7 +15,7 @@ use std::sync::Arc;
 
 use realfft::num_complex::Complex;
 use realfft::{ComplexToReal, RealToComplex};
-use wide::{f32x4, f32x8, i32x8};
+use wide::{f32x4, f32x8};
 
 use crate::error::check_len;
 use crate::height_field::HeightField;
@@ -278,11 +278,11 @@ impl KirchhoffPlan {
             let after = arrival - f32x8::from_i32x8(index);
             // What arrives past the end weighs nothing.
             let heard = arrival.simd_lt(end);
-            let [slopes, levels] = [weights.derivative & heard, weights.plain & heard].map(f32x8::to_array);
-            let [here, after] = [1.0 - after, after].map(f32x8::to_array);
-            let [index, from_microphone, from_speaker] =
-                [index, weights.from_microphone.fast_trunc_int(), weights.from_speaker.fast_trunc_int()]
-                    .map(i32x8::to_array);
+            let (slopes, levels) = ((weights.derivative & heard).to_array(), (weights.plain & heard).to_array());
+            let (here, after) = ((1.0 - after).to_array(), after.to_array());
+            let index = index.to_array();
+            let from_microphone = weights.from_microphone.fast_trunc_int().to_array();
+            let from_speaker = weights.from_speaker.fast_trunc_int().to_array();
             for lane in 0..LANES {
                 let start = (index[lane] as usize).min(last);
                 let (Some([sum, sum_after]), Some([plain, plain_after])) =
@@ -416,7 +416,9 @@ impl ViewPoint {
 
     #[inline]
     fn view(&self, facets: &FacetGroup) -> FacetView {
-        let [dx, dy, dz] = [0, 1, 2].map(|i| self.position[i] - facets.place[i]);
+        let [px, py, pz] = self.position;
+        let [x, y, z] = facets.place;
+        let (dx, dy, dz) = (px - x, py - y, pz - z);
         let [slope_x, slope_y] = facets.slope;
         let distance = (dx * dx + dy * dy + dz * dz).sqrt();
         let nearness = 1.0 / distance;
@@ -442,7 +444,8 @@ fn tangent(a: &FacetView, b: &FacetView) -> [f32x8; 2] {
 #[inline]
 fn facing_tangent(a: &FacetView, b: &FacetView) -> [f32x8; 2] {
     let faces = a.cosine.fast_min(b.cosine).simd_gt(f32x8::ZERO);
-    tangent(a, b).map(|weight| weight & faces)
+    let [derivative, plain] = tangent(a, b);
+    [derivative & faces, plain & faces]
 }
 
 #[inline]
