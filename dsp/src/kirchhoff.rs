@@ -32,7 +32,7 @@ const NODES: usize = 4;
 const HIGHEST_NODE: f64 = 42.0 / 96.0;
 /// Directions of a directivity table, evenly by cosine.
 const DIRECTIONS: usize = 2048;
-/// Facets that are weighed at once.
+/// Facets that are weighed at once: the lanes of an `f32x8`.
 const LANES: usize = 8;
 /// dB of one neper.
 const DB_PER_NEPER: f64 = 20.0 * std::f64::consts::LOG10_E;
@@ -410,8 +410,10 @@ impl DirectivityTable {
 
 impl ViewPoint {
     fn from_pose(pose: TransducerPose) -> Self {
-        let lanes = |x: f32| f32x8::splat(x);
-        Self { position: pose.position_mm.map(|x| lanes(metres(x))), axis: pose.axis.map(|x| lanes(x as f32)) }
+        Self {
+            position: pose.position_mm.map(|x| f32x8::splat(metres(x))),
+            axis: pose.axis.map(|x| f32x8::splat(x as f32)),
+        }
     }
 
     #[inline]

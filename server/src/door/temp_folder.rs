@@ -98,9 +98,11 @@ impl LockedFolder {
 fn remove_left_folders(parent: &Path, prefix: &str) -> io::Result<()> {
     for entry in std::fs::read_dir(parent)? {
         let entry = entry?;
+        if !entry.file_name().as_encoded_bytes().starts_with(prefix.as_bytes()) {
+            continue;
+        }
         // Others' folders in the system's are not looked into.
-        let is_own = entry.metadata().is_ok_and(|entry| entry.is_dir() && entry.uid() == geteuid().as_raw());
-        if !is_own || !entry.file_name().as_encoded_bytes().starts_with(prefix.as_bytes()) {
+        if !entry.metadata().is_ok_and(|entry| entry.is_dir() && entry.uid() == geteuid().as_raw()) {
             continue;
         }
         let lock = OpenOptions::new().write(true).open(entry.path().join(LOCK_FILE));
