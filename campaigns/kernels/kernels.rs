@@ -13,6 +13,8 @@ use echolake_dsp::kirchhoff::{KirchhoffPlan, SoundPath, TransducerPose};
 use echolake_dsp::sweep::LinearSweep;
 use echolake_dsp::temperature::{TemperatureCorrection, resampling_ratio};
 use echolake_dsp::{Error, RealSample as _};
+use echolake_schema::messages::SampleFormat;
+use echolake_schema::samples::{decode, split_24};
 use rustfft::FftDirection;
 use rustfft::num_complex::Complex;
 
@@ -25,6 +27,7 @@ const CENTRES_HZ: [f64; 5] = [2_500.0, 5_000.0, 10_000.0, 20_000.0, 40_000.0];
 
 criterion_group!(
     kernels,
+    samples,
     transforms,
     deconvolution,
     temperature,
@@ -49,6 +52,18 @@ fn recordings() -> [Vec<f32>; 2] {
 fn response() -> Vec<f32> {
     let [_, loopback] = recordings();
     loopback[..IR_LEN].to_vec()
+}
+
+/// Samples as a run's file has them.
+fn samples(criterion: &mut Criterion) {
+    let [recording, _] = recordings();
+    let mut out = vec![0.0; recording.len()];
+    let stored = split_24(&recording.iter().map(|x| (x * 8_388_607.0) as i32).collect::<Vec<_>>());
+    let mut group = criterion.benchmark_group("samples");
+    group.throughput(Throughput::Elements(out.len() as u64));
+    group.bench_function(BenchmarkId::new("decode", out.len()), |bencher| {
+        bencher.iter(|| decode(SampleFormat::S24Split, black_box(&stored), &mut out));
+    });
 }
 
 /// What the chain has to be compared with: transforms of recording and loopback, one by one and as one.

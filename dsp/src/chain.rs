@@ -119,7 +119,7 @@ impl<T: RealSample> MeasurementPlan<T> {
 /// correction.run(&raw, 26.0, &mut corrected);
 /// assert!((corrected.iter().sum::<f64>() - 3.0).abs() < 0.01);
 /// ```
-pub struct ResponseCorrection<T> {
+pub struct ResponseCorrection<T: RealSample> {
     correction: TemperatureCorrection<T>,
     reference_celsius: f64,
     keeps_spectrum: bool,

@@ -12,7 +12,7 @@ use crate::aligned::AlignedBuffer;
 use crate::error::check_len;
 use crate::joint::{BinPower, SignalLevels};
 use crate::pruned::PrunedInverse;
-use crate::{Error, RealSample};
+use crate::{Error, RealSample, SampleVector as _, VECTOR_LANES};
 
 /// Settings of a deconvolution.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -287,20 +287,46 @@ impl<T: RealSample> DeconvolutionPlan<T> {
         let mut total = BinPower::none();
         for first in bins.clone().step_by(PIECE) {
             let count = PIECE.min(bins.end - first);
-            let mirrored = &joint[self.len + 1 - first - count..=self.len - first];
-            let pairs = joint[first..first + count].iter().zip(mirrored.iter().rev());
-            for (bin, (((z, m), to), power)) in (first..).zip(pairs.zip(&mut piece).zip(&mut powers)) {
-                // With d = Z - b = 2i S and u = Z + b = 2 X, X / S = i u conj(d) / |d|^2.
-                let (u, d) = (Complex::new(z.re + m.re, z.im - m.im), Complex::new(z.re - m.re, z.im + m.im));
-                *power = d.re * d.re + d.im * d.im;
-                let raised = gain(bin) / if *power > floor { *power } else { floor };
-                *to = Complex::new((u.re * d.im - u.im * d.re) * raised, (u.re * d.re + u.im * d.im) * raised);
+            let (whole, rest) = joint[first..first + count].as_chunks();
+            let (mirrored_rest, mirrored) = joint[self.len + 1 - first - count..=self.len - first].as_rchunks();
+            // What is left is filled up to a vector.
+            let (mut last, mut mirrored_last) =
+                ([Complex::default(); VECTOR_LANES], [Complex::default(); VECTOR_LANES]);
+            last[..rest.len()].copy_from_slice(rest);
+            mirrored_last[VECTOR_LANES - rest.len()..].copy_from_slice(mirrored_rest);
+            let pairs = whole.iter().zip(mirrored.iter().rev()).chain([(&last, &mirrored_last)]);
+            let outputs = piece.as_chunks_mut().0.iter_mut().zip(powers.as_chunks_mut().0);
+            for (bin, ((z, mirrored), (to, power))) in (first..).step_by(VECTOR_LANES).zip(pairs.zip(outputs)) {
+                let gains = [gain(bin), gain(bin + 1), gain(bin + 2), gain(bin + 3)];
+                (*to, *power) = divide_lanes::<T>(z, mirrored, gains, floor);
             }
             self.inverse.lay(first, &piece[..count], quotient);
             total.add(&powers[..count]);
         }
         total
     }
+}
+
+// Gain X / S of neighbouring bins, and the power of 2 S before it is raised to `floor`. Mirror images are in their own
+// order, so the last belongs to the first bin.
+#[inline]
+fn divide_lanes<T: RealSample>(
+    z: &[Complex<T>; VECTOR_LANES],
+    [m3, m2, m1, m0]: &[Complex<T>; VECTOR_LANES],
+    gains: [T; VECTOR_LANES],
+    floor: T,
+) -> ([Complex<T>; VECTOR_LANES], [T; VECTOR_LANES]) {
+    let [z0, z1, z2, z3] = z;
+    let (z_re, z_im) = (T::Vector::from([z0.re, z1.re, z2.re, z3.re]), T::Vector::from([z0.im, z1.im, z2.im, z3.im]));
+    let (m_re, m_im) = (T::Vector::from([m0.re, m1.re, m2.re, m3.re]), T::Vector::from([m0.im, m1.im, m2.im, m3.im]));
+    // With d = Z - b = 2i S and u = Z + b = 2 X, X / S = i u conj(d) / |d|^2.
+    let ((u_re, u_im), (d_re, d_im)) = ((z_re + m_re, z_im - m_im), (z_re - m_re, z_im + m_im));
+    let power = d_re * d_re + d_im * d_im;
+    let raised = T::Vector::from(gains) / power.greater(floor.into());
+    let [re0, re1, re2, re3]: [T; VECTOR_LANES] = ((u_re * d_im - u_im * d_re) * raised).into();
+    let [im0, im1, im2, im3]: [T; VECTOR_LANES] = ((u_re * d_re + u_im * d_im) * raised).into();
+    let quotient = [Complex::new(re0, im0), Complex::new(re1, im1), Complex::new(re2, im2), Complex::new(re3, im3)];
+    (quotient, power.into())
 }
 
 /// The least even length without prime factors above 5 that holds `len` samples.

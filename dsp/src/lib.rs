@@ -63,4 +63,4 @@ pub mod temperature;
 pub mod uncertainty;
 
 pub use error::Error;
-pub use real::RealSample;
+pub use real::{RealSample, SampleVector, VECTOR_LANES};

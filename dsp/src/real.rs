@@ -1,15 +1,32 @@
 //! The two kinds of sample: f32 for the product, f64 for its oracle.
 
+use std::ops::{Add, Div, Mul, Sub};
 use std::sync::Arc;
 
 use realfft::{ComplexToReal, FftNum, RealFftPlanner, RealToComplex};
 use rustfft::{Fft, FftDirection, FftPlanner};
+use wide::{f32x4, f64x4};
+
+/// Samples of a [`RealSample::Vector`].
+pub const VECTOR_LANES: usize = 4;
+
+/// Samples that are computed with at once: written so, loops are vectors at each level of link-time optimisation.
+pub trait SampleVector:
+    Copy + Add<Output = Self> + Sub<Output = Self> + Mul<Output = Self> + Div<Output = Self>
+{
+    /// The lesser of each lane.
+    fn lesser(self, other: Self) -> Self;
+    /// The greater of each lane.
+    fn greater(self, other: Self) -> Self;
+}
 
 /// A sample.
 ///
 /// Transforms are planned here and nowhere else: rustfft's planner is generic, and each crate that calls it compiles all
 /// of rustfft's kernels once more (20 s of a first build).
 pub trait RealSample: FftNum + PartialOrd + Default {
+    /// Samples side by side.
+    type Vector: SampleVector + From<Self> + From<[Self; VECTOR_LANES]> + Into<[Self; VECTOR_LANES]>;
     /// Nearest to an f64.
     fn of(value: f64) -> Self;
     /// As f64, exactly.
@@ -29,6 +46,8 @@ pub trait RealSample: FftNum + PartialOrd + Default {
 }
 
 impl RealSample for f32 {
+    type Vector = f32x4;
+
     fn of(value: f64) -> Self {
         value as Self
     }
@@ -63,6 +82,8 @@ impl RealSample for f32 {
 }
 
 impl RealSample for f64 {
+    type Vector = f64x4;
+
     fn of(value: f64) -> Self {
         value
     }
@@ -93,5 +114,29 @@ impl RealSample for f64 {
 
     fn plan_real_inverse(len: usize) -> Arc<dyn ComplexToReal<Self>> {
         RealFftPlanner::new().plan_fft_inverse(len)
+    }
+}
+
+impl SampleVector for f32x4 {
+    #[inline]
+    fn lesser(self, other: Self) -> Self {
+        self.fast_min(other)
+    }
+
+    #[inline]
+    fn greater(self, other: Self) -> Self {
+        self.fast_max(other)
+    }
+}
+
+impl SampleVector for f64x4 {
+    #[inline]
+    fn lesser(self, other: Self) -> Self {
+        self.fast_min(other)
+    }
+
+    #[inline]
+    fn greater(self, other: Self) -> Self {
+        self.fast_max(other)
     }
 }

@@ -3,7 +3,7 @@
 use std::f64::consts::PI;
 use std::sync::{Arc, LazyLock};
 
-use crate::RealSample;
+use crate::{RealSample, VECTOR_LANES};
 
 /// Speed of sound at 0 C, m/s (Rust et al. 2021, appendix, step 2).
 const C0: f64 = 331.3;
@@ -75,16 +75,18 @@ pub fn response_limits_hz([low, high]: [f64; 2], rho: f64) -> [f64; 2] {
 /// // In air of 20 C, what arrived after 100 samples arrives after 101.7.
 /// assert_eq!((0..120).max_by(|a, b| corrected[*a].total_cmp(&corrected[*b])), Some(102));
 /// ```
-#[derive(Debug, Clone)]
-pub struct TemperatureCorrection<T> {
+#[derive(Clone)]
+pub struct TemperatureCorrection<T: RealSample> {
     table: Arc<[KernelPiece<T>]>,
 }
 
+/// A value for each tap.
+type TapVectors<T> = [<T as RealSample>::Vector; TAPS / VECTOR_LANES];
 /// Coefficients of 1, t, t^2 and t^3 of each tap, t from 0 to 1 along a piece.
-type KernelPiece<T> = [[T; TAPS]; 4];
+type KernelPiece<T> = [TapVectors<T>; 4];
 
 // Tap j is k(fraction + CENTRE - j), piece i for fractions from i / PIECES to (i + 1) / PIECES.
-static TABLE: LazyLock<Vec<KernelPiece<f64>>> = LazyLock::new(|| {
+static TABLE: LazyLock<Vec<[[f64; TAPS]; 4]>> = LazyLock::new(|| {
     let cubic = |i: usize, j: usize| {
         let at = |t: f64| kernel((i as f64 + t) / PIECES as f64 + CENTRE as f64 - j as f64);
         let [a, b, c, d] = [-1.0, 0.0, 1.0, 2.0].map(at);
@@ -106,7 +108,10 @@ impl<T: RealSample> Default for TemperatureCorrection<T> {
 impl<T: RealSample> TemperatureCorrection<T> {
     /// The plan; it serves every ratio.
     pub fn new() -> Self {
-        Self { table: TABLE.iter().map(|piece| piece.map(|taps| taps.map(T::of))).collect() }
+        let vectors = |taps: [f64; TAPS]| -> TapVectors<T> {
+            std::array::from_fn(|i| std::array::from_fn(|lane| T::of(taps[VECTOR_LANES * i + lane])).into())
+        };
+        Self { table: TABLE.iter().map(|piece| piece.map(vectors)).collect() }
     }
 
     /// Samples of input that `output_len` samples of output depend on.
@@ -134,7 +139,7 @@ impl<T: RealSample> TemperatureCorrection<T> {
         for (m, out) in ir_out.iter_mut().enumerate() {
             let (at, taps) = self.taps(m as f64 * step);
             let inside = at.checked_sub(CENTRE).and_then(|first| ir_in.get(first..)?.first_chunk());
-            let x = inside.copied().unwrap_or_else(|| {
+            let x: [T; TAPS] = inside.copied().unwrap_or_else(|| {
                 std::array::from_fn(|j| {
                     (at + j).checked_sub(CENTRE).and_then(|n| ir_in.get(n)).copied().unwrap_or_default()
                 })
@@ -155,33 +160,41 @@ impl<T: RealSample> TemperatureCorrection<T> {
             if let Some(out) =
                 at.checked_sub(CENTRE).and_then(|first| ir_out.get_mut(first..)?.first_chunk_mut::<TAPS>())
             {
-                out.iter_mut().zip(&taps).for_each(|(out, tap)| *out = *out + x * *tap);
+                let x = T::Vector::from(x);
+                for (out, taps) in out.as_chunks_mut().0.iter_mut().zip(taps) {
+                    *out = (T::Vector::from(*out) + x * taps).into();
+                }
             } else {
                 let skipped = CENTRE.saturating_sub(at);
                 let out = ir_out[(at + skipped).saturating_sub(CENTRE)..].iter_mut();
-                out.zip(&taps[skipped..]).for_each(|(out, tap)| *out = *out + x * *tap);
+                let taps = taps.into_iter().flat_map(|taps| -> [T; VECTOR_LANES] { taps.into() });
+                out.zip(taps.skip(skipped)).for_each(|(out, tap)| *out = *out + x * tap);
             }
         }
     }
 
     /// The sample at or before a position, which tap `CENTRE` belongs to, and the kernel around it.
-    fn taps(&self, position: f64) -> (usize, [T; TAPS]) {
+    fn taps(&self, position: f64) -> (usize, TapVectors<T>) {
         let at = position as usize;
         let along = (position - at as f64) * PIECES as f64;
         let index = (along as usize).min(PIECES - 1);
-        let t = T::of(along - index as f64);
+        let t = T::Vector::from(T::of(along - index as f64));
         let [c0, c1, c2, c3] = &self.table[index];
-        (at, std::array::from_fn(|j| c0[j] + t * (c1[j] + t * (c2[j] + t * c3[j]))))
+        let mut taps = *c3;
+        for (i, taps) in taps.iter_mut().enumerate() {
+            *taps = c0[i] + t * (c1[i] + t * (c2[i] + t * *taps));
+        }
+        (at, taps)
     }
 }
 
-// Four sums side by side, which the compiler makes a vector of.
-fn dot<T: RealSample>(x: &[T; TAPS], taps: &[T; TAPS]) -> T {
-    let mut sums = [T::default(); 4];
-    for (x, taps) in x.as_chunks::<4>().0.iter().zip(taps.as_chunks::<4>().0) {
-        sums.iter_mut().zip(x.iter().zip(taps)).for_each(|(sum, (x, tap))| *sum = *sum + *x * *tap);
+fn dot<T: RealSample>(x: &[T; TAPS], taps: &TapVectors<T>) -> T {
+    let mut sums = T::Vector::from(T::default());
+    for (x, taps) in x.as_chunks().0.iter().zip(taps) {
+        sums = sums + T::Vector::from(*x) * *taps;
     }
-    (sums[0] + sums[1]) + (sums[2] + sums[3])
+    let [a, b, c, d] = sums.into();
+    (a + b) + (c + d)
 }
 
 /// The first samples, with zeros if there are fewer.
@@ -223,7 +236,8 @@ mod tests {
             let position = f64::from(i) / 1_234.5;
             let (at, taps) = plan.taps(position);
             assert_eq!(at, position.floor() as usize);
-            for (j, tap) in taps.iter().enumerate() {
+            let taps = taps.into_iter().flat_map(<[f64; VECTOR_LANES]>::from);
+            for (j, tap) in taps.enumerate() {
                 let u = position - (at + j) as f64 + CENTRE as f64;
                 assert!((tap - kernel(u)).abs() < 5e-8, "{u}: {tap} {}", kernel(u));
             }
