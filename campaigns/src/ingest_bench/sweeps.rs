@@ -7,12 +7,12 @@ use std::process::Command;
 
 use anyhow::{Context as _, Result, ensure};
 use echolake_acquisition::run::controller::RecordingMode;
+use echolake_dsp::RealSample as _;
 use echolake_dsp::deconvolution::fast_length;
 use echolake_schema::messages::SweepRecording;
 use echolake_schema::{samples, topics};
 use mcap::MessageStream;
 use prost::Message as _;
-use realfft::RealFftPlanner;
 
 use super::IngestBenchArgs;
 use super::meter::{CostMeter, MeasuredCost};
@@ -115,7 +115,7 @@ impl SampledRecording {
 
 // CPU seconds that the two transforms of a recording take, of `length` samples each.
 fn transforms(recordings: &[SampledRecording], length: usize) -> Result<f64> {
-    let forward = RealFftPlanner::<f32>::new().plan_fft_forward(length);
+    let forward = f32::plan_real_forward(length);
     let (mut input, mut spectrum) = (forward.make_input_vec(), forward.make_output_vec());
     let mut work = forward.make_scratch_vec();
     let meter = CostMeter::start()?;
